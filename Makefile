@@ -1,0 +1,150 @@
+# cbctd: cone-beam reconstruction as a service. `make help` lists the targets.
+# Everything is built out of tree under build/.
+
+.DEFAULT_GOAL := all
+BUILD ?= build
+CC ?= gcc
+NVCC ?= nvcc
+# CUDA=0 leaves the CUDA backend out; otherwise it is built where nvcc is found.
+CUDA ?= $(if $(shell command -v $(NVCC) 2>/dev/null),1,0)
+# Machine code for these cards, and PTX for later ones. CUDA_ARCH=90 for a quick build.
+CUDA_ARCH ?= 75 80 86 89 90 100 120
+SANITIZE ?=
+WERROR ?= 1
+prefix ?= /usr/local
+
+# pkg-config name:Debian package, then command:Debian package.
+PACKAGES := libmicrohttpd:libmicrohttpd-dev libcjson:libcjson-dev libzstd:libzstd-dev sqlite3:libsqlite3-dev \
+            kissfft-float:libkissfft-dev libpng:libpng-dev libcurl:libcurl4-openssl-dev libcrypto:libssl-dev \
+            check:check
+COMMANDS := gcc:gcc pkg-config:pkg-config curl:curl jq:jq zstd:zstd
+
+core_libs   := kissfft-float
+proto_libs  := libcjson libzstd libcrypto libpng
+daemon_libs := libmicrohttpd sqlite3
+cbct_libs   := libcurl
+all_libs    := $(core_libs) $(proto_libs) $(daemon_libs) $(cbct_libs)
+
+pkg = $(shell pkg-config $(1) $(2) 2>/dev/null)
+
+WARN   := -Wall -Wextra -Wpedantic $(if $(filter 1,$(WERROR)),-Werror)
+CFLAGS ?= -O2 -g
+OPENMP ?= -fopenmp
+# Errors of the maths library are not read from errno, traps are off: the compiler may vectorise.
+override CFLAGS += -std=c11 -D_GNU_SOURCE -I. $(WARN) $(or $(OPENMP),-Wno-unknown-pragmas) -fno-math-errno -fno-trapping-math -MMD -MP \
+                   $(call pkg,--cflags,$(all_libs)) $(if $(SANITIZE),-fsanitize=$(SANITIZE) -fno-omit-frame-pointer)
+override LDFLAGS += $(OPENMP) $(if $(SANITIZE),-fsanitize=$(SANITIZE))
+LIBM := -lm -lpthread
+
+# core/*_simd.c are compiled once for each instruction set; core/cpu.c picks one at run time.
+SIMD_ISAS    := base avx2 avx512
+flags_base   :=
+flags_avx2   := -mavx2 -mfma -mf16c
+flags_avx512 := -mavx512f -mavx512bw -mavx512dq -mavx512vl -mfma -mprefer-vector-width=512
+
+simd_sources   := $(wildcard core/*_simd.c)
+core_sources   := $(filter-out $(simd_sources),$(wildcard core/*.c))
+proto_sources  := $(wildcard proto/*.c)
+daemon_sources := $(filter-out daemon/worker.c,$(wildcard daemon/*.c))
+cbct_sources   := $(wildcard clients/cbct/*.c)
+unit_sources   := $(wildcard tests/unit/*.c)
+
+objects      = $(patsubst %.c,$(BUILD)/%.o,$(1))
+simd_objects := $(foreach isa,$(SIMD_ISAS),$(patsubst %.c,$(BUILD)/%.$(isa).o,$(simd_sources)))
+core_objects := $(call objects,$(core_sources)) $(simd_objects)
+library      := $(BUILD)/libcbct.a
+
+ifeq ($(CUDA),1)
+cuda_objects := $(patsubst %.cu,$(BUILD)/%.o,$(wildcard kernels/*.cu))
+cuda_home    := $(patsubst %/bin/nvcc,%,$(realpath $(shell command -v $(NVCC))))
+cuda_libs    := -L$(cuda_home)/lib64 -Wl,-rpath,$(cuda_home)/lib64 -lcufft -lcudart -lstdc++
+cuda_code    := $(foreach a,$(CUDA_ARCH),-gencode arch=compute_$(a),code=sm_$(a)) \
+                -gencode arch=compute_$(lastword $(CUDA_ARCH)),code=compute_$(lastword $(CUDA_ARCH))
+endif
+
+programs := $(BUILD)/cbctd $(BUILD)/cbct-worker $(BUILD)/cbct
+
+all: $(programs) ## the programs, in build/
+
+$(BUILD)/%.o: %.c
+	@mkdir -p $(@D)
+	$(CC) $(CFLAGS) -c -o $@ $<
+
+define simd_rule
+$(BUILD)/%.$(1).o: %.c
+	@mkdir -p $$(@D)
+	$$(CC) $$(CFLAGS) -O3 $$(flags_$(1)) -DSIMD_ISA=$(1) -DSIMD_$(1)=1 -c -o $$@ $$<
+endef
+$(foreach isa,$(SIMD_ISAS),$(eval $(call simd_rule,$(isa))))
+
+$(BUILD)/kernels/%.o: kernels/%.cu
+	@mkdir -p $(@D)
+	$(NVCC) -std=c++17 -O3 -lineinfo -I. $(cuda_code) -Xcompiler -Wall,-Wextra -MMD -MP -c -o $@ $<
+
+# The daemon and the client use the library's backends by table; only the worker,
+# the client's `recon` and the GPU tests know of CUDA's row (core/backend.c).
+$(library): $(core_objects) $(call objects,$(proto_sources))
+	@rm -f $@
+	$(AR) rcs $@ $^
+
+$(BUILD)/cbctd: $(call objects,$(daemon_sources)) $(library)
+	$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(daemon_libs) $(proto_libs) $(core_libs)) $(LIBM)
+
+$(BUILD)/cbct-worker: $(call objects,daemon/worker.c) $(library) $(cuda_objects)
+	$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(cuda_libs) $(LIBM)
+
+$(BUILD)/cbct: $(call objects,$(cbct_sources)) $(library)
+	$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(cbct_libs) $(proto_libs) $(core_libs)) $(LIBM)
+
+$(BUILD)/unit: $(call objects,$(unit_sources)) $(library)
+	$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,check $(proto_libs) $(core_libs)) $(LIBM)
+
+setup: ## install the Debian packages that are missing
+	@missing=""; \
+	for pair in $(COMMANDS); do command -v $${pair%%:*} >/dev/null 2>&1 || missing="$$missing $${pair##*:}"; done; \
+	for pair in $(PACKAGES); do pkg-config --exists $${pair%%:*} 2>/dev/null || missing="$$missing $${pair##*:}"; done; \
+	[ -z "$$missing" ] && exit 0; \
+	echo "installing:$$missing"; \
+	run=""; [ "$$(id -u)" = 0 ] || run="sudo -n"; \
+	if [ "$$(id -u)" != 0 ] && ! sudo -n true 2>/dev/null; then \
+		echo "please type:  sudo apt-get install -y --no-install-recommends$$missing" >&2; exit 1; fi; \
+	{ $$run apt-get install -y -qq --no-install-recommends $$missing >/dev/null 2>&1 || \
+	  { $$run apt-get update -qq && DEBIAN_FRONTEND=noninteractive $$run apt-get install -y -qq --no-install-recommends $$missing >/dev/null; }; }
+
+demo: setup ## a C-arm scan posted with curl, reconstructed, its volumes coming back
+	@$(MAKE) --no-print-directory -j$$(nproc) all
+	@BUILD=$(BUILD) clients/curl/demo.sh
+
+check: setup ## every test; what cannot run here is skipped aloud
+	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/unit
+	@BUILD=$(BUILD) tests/run.sh
+
+bench: setup ## CPU and HTTP benchmarks, results in build/bench/
+	@$(MAKE) --no-print-directory -j$$(nproc) all
+	@BUILD=$(BUILD) tests/bench/run.sh
+
+asan: setup ## the tests under the address and undefined-behaviour sanitizers
+	@$(MAKE) --no-print-directory check BUILD=build/asan SANITIZE=address,undefined CUDA=0
+
+tsan: setup ## the daemon's tests under the thread sanitizer (OpenMP's runtime left out)
+	@$(MAKE) --no-print-directory check BUILD=build/tsan SANITIZE=thread OPENMP= CUDA=0
+
+lint: ## who includes whom, and the house's other rules
+	@tests/lint.sh
+
+format: ## clang-format over everything
+	@clang-format -i $$(git ls-files '*.c' '*.h' '*.cu' '*.cuh')
+
+install: all ## programs, units and example configuration under $(DESTDIR)$(prefix)
+	install -D -m 755 -t $(DESTDIR)$(prefix)/bin $(programs)
+	install -D -m 644 -t $(DESTDIR)$(prefix)/lib/systemd/system systemd/cbctd.service
+
+clean: ## removes build/
+	rm -rf $(BUILD)
+
+help: ## this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+.PHONY: all setup demo check bench asan tsan lint format install clean help
+.SECONDARY:
+-include $(shell find $(BUILD) -name '*.d' 2>/dev/null)

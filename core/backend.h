@@ -1,0 +1,211 @@
+#ifndef CBCT_CORE_BACKEND_H
+#define CBCT_CORE_BACKEND_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include "core/error.h"
+#include "core/filter.h"
+#include "core/geometry.h"
+#include "core/grid.h"
+#include "core/orbit.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/*
+ * One table of operations for each kind of device. The algorithms in fdk.c,
+ * sart.c and recon.c are written once above it; the CPU's table is the readable
+ * reference and every other one is tested against it, row by row.
+ *
+ * Rules for all of them:
+ * - The four structs are each backend's own; nobody else looks inside.
+ * - A device and what hangs on it belong to one thread at a time.
+ * - Everything is allocated by *_new and plan_new; the other operations allocate
+ *   nothing. They may return before the device has finished; volume_download,
+ *   stack_download, sart_iterate, norms and sync do not.
+ * - The same inputs give the same bits, on every run and for any number of threads.
+ * - A failed device (ERR_DEVICE) is good for nothing but closing.
+ */
+struct device; /* a card, or the CPU's cores */
+struct volume; /* [z][y][x] float, 1/mm */
+struct stack;  /* [slot][row][column] float, line integrals: one slot for each view, or a few as scratch */
+struct plan;   /* one geometry, one grid, one set of weights, and all scratch that a job needs */
+
+struct device_options {
+	int threads;         /* CPU: 0 = all the process may use */
+	size_t memory_limit; /* bytes to use at most; 0 = what is free */
+};
+
+struct device_info {
+	char name[96];     /* "Intel Xeon ... (2 threads, AVX-512)", "NVIDIA H200" */
+	char driver[64];   /* "" on the CPU */
+	size_t bytes_total, bytes_free;
+};
+
+/* How raw samples become line integrals. */
+enum sample { SAMPLE_FLOAT32, SAMPLE_UINT16 };
+enum quantity { QUANTITY_LINE_INTEGRAL, QUANTITY_INTENSITY };
+struct linearise {
+	enum sample sample;
+	enum quantity quantity;
+	double air;         /* counts; used when flat is NULL */
+	const float *flat;  /* [row][column] counts, or NULL; host memory that outlives the plan */
+	const float *dark;  /* [row][column] counts, or NULL for none */
+	double saturation;  /* counts at and above this are defects; 0 = 65535 for uint16, none for float32 */
+};
+
+/*
+ * TV in gray levels u = v / unit. Differences are weighted by (smallest spacing
+ * / spacing) along each axis, so that isotropic voxels have h = 1.
+ */
+enum tv_method { TV_GRADIENT, TV_PROXIMAL, TV_METHOD_COUNT };
+extern const char *const tv_method_names[TV_METHOD_COUNT];
+struct tv_options {
+	enum tv_method method;
+	double alpha, step;
+	int iterations;
+	double unit; /* 1/mm for one gray level */
+};
+
+/* An order of all views, cut into subsets: subset s is order[start[s]] .. order[start[s+1] - 1]. */
+struct subsets {
+	int count;
+	int *order; /* [views] */
+	int *start; /* [count + 1] */
+};
+
+struct sart_options {
+	struct subsets subsets; /* borrowed, must outlive the plan */
+	double relaxation;
+	bool nonnegative;
+};
+
+/* What a plan is made from. Everything pointed to is borrowed and must outlive the plan. */
+struct plan_options {
+	const struct geometry *geometry;
+	const struct grid *grid;
+	struct linearise linearise;
+	/* FDK, or NULL when none runs: orbit_column_weights and filter_response (pitch 1, length filter_length(columns)). */
+	const float *column_weights;  /* [count][columns] */
+	const float *filter_response; /* [length/2 + 1] */
+	const struct sart_options *sart; /* NULL: no SART */
+	const struct tv_options *tv;     /* NULL: no TV */
+	bool reference_precision;        /* float everywhere; otherwise storage may be packed within the stated bound */
+};
+
+/* Bytes, known before anything is allocated. */
+struct plan_bytes {
+	size_t stack;   /* all projections as line integrals */
+	size_t volumes; /* the iterate and the copies that the recipe needs */
+	size_t scratch; /* the rest */
+	size_t raw;     /* one projection on its way in */
+};
+
+struct sart_sums {
+	double residual2;   /* sum of (p - A v)^2, each view's as it is met */
+	double projection2; /* sum of p^2 */
+};
+
+struct volume_norms {
+	double norm2, difference2; /* sum v^2, sum (v - other)^2 (0 without other) */
+	double tv;                 /* sum |grad u| with u = v / unit, forward differences */
+	double minimum, maximum, mean;
+	size_t not_finite;
+};
+
+/* Asked between steps; true ends the operation with ERR_CANCELLED. */
+struct cancel {
+	bool (*asked)(void *context);
+	void *context;
+};
+
+enum backprojection { BACKPROJECT_PLAIN, BACKPROJECT_FDK /* times (D/depth)^2 */ };
+
+struct backend {
+	const char *name;    /* "cpu", "cuda" */
+	const char *summary; /* for --help */
+
+	/* Devices that answer now; 0 when there is none. Never fails. */
+	int (*count)(void);
+	int (*open)(int index, const struct device_options *options, struct device **ret_device, struct error *err);
+	void (*close)(struct device *device); /* NULL is fine */
+	void (*describe)(struct device *device, struct device_info *ret_info);
+
+	int (*volume_new)(struct device *device, const struct grid *grid, struct volume **ret_volume, struct error *err);
+	void (*volume_free)(struct volume *volume); /* NULL is fine */
+	int (*volume_upload)(struct volume *volume, const float *from, struct error *err);
+	/* Slices z_first .. z_first + z_count - 1. */
+	int (*volume_download)(struct volume *volume, int z_first, int z_count, float *ret_to, struct error *err);
+	int (*volume_fill)(struct volume *volume, float value, struct error *err);
+	int (*volume_copy)(struct volume *to, const struct volume *from, struct error *err);
+
+	int (*stack_new)(struct device *device, int columns, int rows, int slots, struct stack **ret_stack,
+	                 struct error *err);
+	void (*stack_free)(struct stack *stack); /* NULL is fine */
+	int (*stack_download)(struct stack *stack, int slot, int count, float *ret_to, struct error *err);
+
+	/* plan_bytes touches no device memory; it is how a job that cannot fit is refused beforehand. */
+	int (*plan_bytes)(struct device *device, const struct plan_options *options, struct plan_bytes *ret_bytes,
+	                  struct error *err);
+	int (*plan_new)(struct device *device, const struct plan_options *options, struct plan **ret_plan,
+	                struct error *err);
+	void (*plan_free)(struct plan *plan); /* NULL is fine */
+	/* How this plan does its work, e.g. "untilted, 16 x 16 tiles, AVX-512": said in the job's document. */
+	const char *(*plan_summary)(const struct plan *plan);
+	/* Views that FDK should filter and backproject in one go. */
+	int (*plan_batch)(const struct plan *plan);
+
+	/*
+	 * Raw samples of `count` views -> line integrals in the slots named by `slots`.
+	 * Defects (zero, negative, saturated, not finite) are replaced from their
+	 * neighbours in the row and column and added to *defects, never reset.
+	 */
+	int (*linearise)(struct plan *plan, const void *samples, int count, const int *slots, struct stack *to,
+	                 size_t *defects, struct error *err);
+	/* q = ramp of weights and cosine times p: view views[i] from slot views[i] of `from` into slot i of `to`. */
+	int (*filter)(struct plan *plan, const struct stack *from, const int *views, int count, struct stack *to,
+	              struct error *err);
+	/* volume += sum over i of (weight) * slot i, seen from views[i]. Bilinear; outside of the detector is 0. */
+	int (*backproject)(struct plan *plan, const struct stack *from, const int *views, int count,
+	                   enum backprojection weight, struct volume *to, struct error *err);
+	/*
+	 * Slot i = line integrals of the volume along the rays of views[i]: Joseph's
+	 * method, one bilinear sample in every slice of the ray's dominant axis
+	 * between entry and exit, times the step's length in mm. The object ends half
+	 * a voxel beyond the outer centres in every direction, values there held.
+	 */
+	int (*project)(struct plan *plan, const struct volume *from, const int *views, int count, struct stack *to,
+	               struct error *err);
+	/*
+	 * One iteration over all subsets, in place:
+	 *   v_j += relaxation * (sum_S w_ij (p_i - sum_m w_im v_m) / sum_m w_im) / sum_S w_ij
+	 * forward weights are those of `project`, backward ones those of plain
+	 * `backproject`; row and column sums come from the same operators. Rays that
+	 * miss the grid and voxels that no ray of the subset sees stay as they are.
+	 */
+	int (*sart_iterate)(struct plan *plan, const struct stack *projections, struct volume *volume,
+	                    const struct cancel *cancel, struct sart_sums *ret_sums, struct error *err);
+	/* The plan's TV, in place. */
+	int (*tv)(struct plan *plan, struct volume *volume, const struct cancel *cancel, struct error *err);
+	/* `other` may be NULL; unit as in tv_options. */
+	int (*norms)(struct plan *plan, const struct volume *volume, const struct volume *other, double unit,
+	             struct volume_norms *ret_norms, struct error *err);
+	int (*sync)(struct device *device, struct error *err);
+};
+
+/*
+ * The table of backends, best first. A row is NULL where the program was linked
+ * without it: the daemon and a build without nvcc have no CUDA.
+ */
+enum { BACKEND_COUNT = 2 };
+extern const struct backend *const backends[BACKEND_COUNT];
+extern const struct backend backend_cpu;
+/* By name; "auto" gives the first that has a device. NULL when there is none. */
+const struct backend *backend_find(const char *name);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif

@@ -1,0 +1,47 @@
+#ifndef CBCT_CORE_ERROR_H
+#define CBCT_CORE_ERROR_H
+
+/*
+ * What went wrong, in one value that the caller owns and passes down.
+ *
+ * A function that can fail returns 0, or a negative enum error_code, and takes
+ * a `struct error *` last. It fills the error exactly once, where the cause is
+ * known; everybody above only returns the code. `err` is never NULL. Outputs
+ * named ret_x stay untouched on failure.
+ */
+
+enum error_code {
+	ERR_INVALID = -1,    /* malformed: breaks the rules of the format (HTTP 400) */
+	ERR_IMPOSSIBLE = -2, /* well-formed, but cannot be done (422) */
+	ERR_NOT_FOUND = -3,  /* no such thing (404) */
+	ERR_CONFLICT = -4,   /* contradicts what is there (409) */
+	ERR_TOO_LARGE = -5,  /* longer than allowed (413) */
+	ERR_NO_MEMORY = -6,  /* host or device memory (422 when known beforehand) */
+	ERR_NO_SPACE = -7,   /* the disk is full (507) */
+	ERR_IO = -8,         /* a file or socket failed (500) */
+	ERR_DEVICE = -9,     /* the accelerator failed; the process must end (500) */
+	ERR_CANCELLED = -10, /* somebody asked for it */
+	ERR_BUSY = -11,      /* later, perhaps (503) */
+	ERR_INTERNAL = -12   /* a promise of our own was broken (500) */
+};
+
+struct error {
+	int code;          /* enum error_code, 0 while nothing went wrong */
+	char pointer[192]; /* RFC 6901 pointer to the guilty field, "" when there is none */
+	char text[320];    /* one sentence with the number found and the one expected */
+};
+
+/* Fills err and returns code. */
+int error_set(struct error *err, int code, const char *format, ...) __attribute__((format(printf, 3, 4)));
+
+/* The same with the field that is to blame, e.g. "/grid/size/0". */
+int error_set_at(struct error *err, int code, const char *pointer, const char *format, ...)
+    __attribute__((format(printf, 4, 5)));
+
+/* Puts a prefix before the pointer: a parser of a part does not know where the part stands. */
+void error_nest(struct error *err, const char *prefix);
+
+/* ERR_NO_SPACE for ENOSPC and EDQUOT, ERR_NO_MEMORY for ENOMEM, else ERR_IO; text "what: strerror". */
+int error_set_errno(struct error *err, int errno_value, const char *format, ...) __attribute__((format(printf, 3, 4)));
+
+#endif

@@ -1,0 +1,90 @@
+#ifndef CBCT_CORE_GEOMETRY_H
+#define CBCT_CORE_GEOMETRY_H
+
+#include "core/error.h"
+
+/*
+ * Where source and detector stood in each view.
+ *
+ * World frame in mm, right-handed, isocentre at the origin, z the rotation
+ * axis. Circular orbits, angle lists and 3x4 matrices all become the one
+ * vector form below on entry; nothing after that knows which it was. All of it
+ * is double; a geometry is const once made and may be read by any thread.
+ *
+ * Pixel centres are the integers: the point of column c, row r is
+ * pixel0 + c column_step + r row_step.
+ */
+struct view {
+	double source[3];      /* mm */
+	double pixel0[3];      /* mm, centre of column 0, row 0 */
+	double column_step[3]; /* mm from one column to the next: the detector's u */
+	double row_step[3];    /* mm from one row to the next: the detector's v */
+};
+
+struct geometry {
+	int columns, rows;  /* of the detector, pixels */
+	int count;          /* views */
+	struct view *views; /* [count], owned */
+};
+
+/* A circular orbit, as the contract writes it. */
+struct circular {
+	double source_to_isocentre, source_to_detector; /* mm */
+	double pixel[2];                                /* mm, along u and v */
+	double detector_offset[2];                      /* mm, moves the detector along +u and +v */
+	double source_offset[2];                        /* mm, moves the source along +u and +v */
+};
+
+enum { VIEWS_MAX = 20000, DETECTOR_MAX = 16384 };
+
+/*
+ * Each of these allocates ret->views (free with geometry_clear) and checks the
+ * result: finite, source not on the detector's plane, steps not parallel.
+ * Errors point into the geometry's JSON ("/matrices/3").
+ */
+int geometry_circular(struct geometry *ret_geometry, int columns, int rows, int count, const struct circular *orbit,
+                      const double *angles /* [count], radians */, struct error *err);
+/*
+ * P = [M | p4] takes (x, y, z, 1) in mm to w (column, row, 1), any scale and
+ * sign. S = -M^-1 p4; the columns of M^-1 are t (u, v, D - S), with t fixed by
+ * |u| = pixel_mm[0].
+ */
+int geometry_matrices(struct geometry *ret_geometry, int columns, int rows, int count,
+                      const double *matrices /* [count][12] */, const double pixel_mm[2], struct error *err);
+int geometry_views(struct geometry *ret_geometry, int columns, int rows, int count, const struct view *views,
+                   struct error *err);
+int geometry_copy(struct geometry *ret_geometry, const struct geometry *geometry, struct error *err);
+void geometry_clear(struct geometry *geometry);
+
+/*
+ * The 3x4 matrix of a view, row by row, scaled so that w is the depth in mm:
+ * the distance from the source along the detector's normal, positive in front.
+ * With D = pixel0, u = column_step, v = row_step, w = D - S:
+ * A = [(v x w)^T; (w x u)^T; (u x v)^T], P = [A | -A S] / |u x v|, sign for w > 0 at the detector.
+ */
+void view_matrix(const struct view *view, double ret_matrix[12]);
+
+/* Depth of a point and its pixel coordinates; the depth may be <= 0, then the pixel means nothing. */
+double view_project(const double matrix[12], const double point[3], double *ret_column, double *ret_row);
+
+/*
+ * True when every detector row is across z and every column along z, the
+ * source's rays to one column thus share their x and y: the fast kernels'
+ * case. Tolerance: the error over the whole detector is below 1e-3 pixel.
+ */
+int geometry_is_untilted(const struct geometry *geometry);
+
+/* ---- small vectors, used all over core ---- */
+static inline double vec_dot(const double a[3], const double b[3])
+{
+	return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
+static inline void vec_cross(const double a[3], const double b[3], double ret[3])
+{
+	ret[0] = a[1] * b[2] - a[2] * b[1];
+	ret[1] = a[2] * b[0] - a[0] * b[2];
+	ret[2] = a[0] * b[1] - a[1] * b[0];
+}
+double vec_norm(const double a[3]);
+
+#endif

@@ -1,0 +1,32 @@
+#ifndef CBCT_CORE_GRID_H
+#define CBCT_CORE_GRID_H
+
+#include <stddef.h>
+
+#include "core/error.h"
+#include "core/geometry.h"
+
+/* A box of voxels, data as [z][y][x] float32. Voxel (i, j, k) has its centre at origin + (i, j, k) * spacing. */
+struct grid {
+	int size[3];       /* nx, ny, nz */
+	double spacing[3]; /* mm */
+	double origin[3];  /* mm, centre of voxel 0,0,0 */
+};
+
+enum { GRID_SIZE_MAX = 8192 };
+
+static inline size_t grid_voxels(const struct grid *grid)
+{
+	return (size_t)grid->size[0] * (size_t)grid->size[1] * (size_t)grid->size[2];
+}
+
+/* Centred on the isocentre. */
+void grid_centre(struct grid *grid);
+
+/* Sizes 1..GRID_SIZE_MAX, spacing positive, all finite. Pointers relative to the grid ("/size/0"). */
+int grid_check(const struct grid *grid, struct error *err);
+
+/* No source may lie inside the grid, nor a corner behind a source or its detector. */
+int grid_check_geometry(const struct grid *grid, const struct geometry *geometry, struct error *err);
+
+#endif

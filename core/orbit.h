@@ -1,0 +1,66 @@
+#ifndef CBCT_CORE_ORBIT_H
+#define CBCT_CORE_ORBIT_H
+
+#include <stdbool.h>
+
+#include "core/geometry.h"
+#include "core/grid.h"
+
+/*
+ * What a radiographer would say of a geometry: the arc, which way round, short
+ * or full, how wide the fan is, how far the detector is off centre. Found from
+ * the actual sources, so it holds for calibrated C-arms as well; and the FDK
+ * weights that follow from it. Nothing here changes silently: what was decided
+ * stands in these fields, which the scan's `derived` shows.
+ */
+struct orbit {
+	int count;
+	double *angle;          /* [count], radians, gantry angle of each view's source, in 0..2 pi */
+	double *weight;         /* [count], radians: half the gaps to both neighbours; the ends of a short scan only the inner gap */
+	double arc;             /* radians, from the first source to the last, 2 pi for a full turn */
+	int direction;          /* +1 counter-clockwise seen from +z, -1 clockwise, 0 for one view */
+	int first;              /* the view at which the arc begins, in the sense of `direction` */
+	bool short_scan;        /* the arc has a gap: Parker weights apply */
+	double fan;             /* radians, full fan angle that the detector sees */
+	double half_fan_min, half_fan_max; /* radians, the ray angles at column 0 and the last, smallest and largest */
+	double source_radius;   /* mm, mean distance of the sources from the z axis */
+	double source_to_detector; /* mm, mean, along the normal */
+	double field_of_view;   /* mm, diameter of the cylinder that all views see */
+	double displacement;    /* mm at the detector, of its centre from the central ray, mean */
+	bool displaced;         /* half-fan weights apply (full turn, displaced by more than a few pixels and 2 % of the width) */
+	double parker_delta;    /* radians, (arc - pi) / 2 */
+	bool arc_too_short;     /* arc < pi + fan: a warning, not an error */
+	double pixel_at_isocentre[2]; /* mm, mean */
+};
+
+/* Allocates the arrays; free with orbit_clear. Fails for no memory only: any checked geometry has an orbit. */
+int orbit_analyse(struct orbit *ret_orbit, const struct geometry *geometry, struct error *err);
+void orbit_clear(struct orbit *orbit);
+
+/*
+ * The part of the FDK weight that changes with view and column only, so that
+ *
+ *   f(x) = sum over views of (D/depth(x))^2 * q(column(x), row(x)),
+ *   q = ramp (pitch 1 pixel) along the row of (weight[view][column] * cos(gamma) * p)
+ *
+ * is Feldkamp's integral in 1/mm for any source radius R, any perpendicular
+ * detector distance d and any turn of the detector about the source:
+ *
+ *   weight = 1/2 * angular weight * short-scan or displaced weight * R d / (pitch D^2),
+ *
+ * D = depth of the isocentre, gamma = angle between the ray and the line from
+ * the source to the isocentre (a change of variables in the fan-beam formula;
+ * for an untilted detector it is the usual SDD / ray length and D^2/depth^2).
+ * Parker: conjugate rays sum to 2; 1 everywhere on a full turn. Fan angles are
+ * those of the rays in the middle row about the rotation axis, signed by the
+ * direction of the rotation. ret is [count][columns].
+ */
+void orbit_column_weights(const struct orbit *orbit, const struct geometry *geometry, float *ret_weights);
+
+/*
+ * A grid for who gives none: the field of view at the resolution of the
+ * detector at the isocentre, coarsened so that no side has more than `most` voxels.
+ */
+void orbit_default_grid(const struct orbit *orbit, const struct geometry *geometry, int most, struct grid *ret_grid);
+
+#endif

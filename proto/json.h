@@ -1,0 +1,59 @@
+#ifndef CBCT_PROTO_JSON_H
+#define CBCT_PROTO_JSON_H
+
+#include <stdbool.h>
+#include <stddef.h>
+
+#include <cjson/cJSON.h>
+
+#include "core/error.h"
+
+/*
+ * JSON that comes from outside, read strictly: cJSON alone accepts text after
+ * the end, duplicate and case-insensitive names, leading zeros, raw control
+ * characters, bad UTF-8 and numbers that overflow to infinity. All of those are
+ * ERR_INVALID here, with a pointer to the place.
+ */
+enum { JSON_BYTES_MAX = 16 << 20, JSON_DEPTH_MAX = 32 };
+
+/* The whole text must be one value. Free with cJSON_Delete. */
+int json_parse(const char *text, size_t length, cJSON **ret_value, struct error *err);
+
+/*
+ * A reader of one object that remembers which members were asked for, so that
+ * json_end can refuse the rest by pointer. Members absent or null leave the
+ * output as it is and return 0 (ERR_INVALID when required). Each error carries
+ * base + "/" + name as its pointer.
+ */
+struct json_reader {
+	const cJSON *object;
+	char base[160];
+	unsigned long long seen; /* bit i: the i-th member was asked for (objects of at most 64 members) */
+	struct error *err;
+	int code; /* first error; every later call does nothing, so that one check at the end is enough */
+};
+
+void json_begin(struct json_reader *reader, const cJSON *value, const char *base, struct error *err);
+bool json_has(struct json_reader *reader, const char *name); /* present and not null; marks it as known */
+const cJSON *json_member(struct json_reader *reader, const char *name, bool required);
+void json_number(struct json_reader *reader, const char *name, bool required, double least, double most, double *ret);
+void json_integer(struct json_reader *reader, const char *name, bool required, long least, long most, long *ret);
+void json_bool(struct json_reader *reader, const char *name, bool required, bool *ret);
+/* At most size - 1 bytes of UTF-8 without control characters. */
+void json_string(struct json_reader *reader, const char *name, bool required, char *ret, size_t size);
+/* One of `names` (`count` entries); gives its index. */
+void json_choice(struct json_reader *reader, const char *name, bool required, const char *const *names, int count,
+                 int *ret);
+/* Exactly `count` numbers. */
+void json_numbers(struct json_reader *reader, const char *name, bool required, int count, double least, double most,
+                  double *ret);
+int json_end(struct json_reader *reader); /* refuses members that nobody asked for; returns the first error's code */
+
+/* Fails the reader at member `name` ("" for the object itself). */
+int json_fail(struct json_reader *reader, int code, const char *name, const char *format, ...)
+    __attribute__((format(printf, 4, 5)));
+
+/* Adds [first, last] pairs of the runs of `value` in flags[count], as `received` and `missing` are written. */
+cJSON *json_runs(const unsigned char *flags, int count, bool value);
+
+#endif

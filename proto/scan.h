@@ -1,0 +1,36 @@
+#ifndef CBCT_PROTO_SCAN_H
+#define CBCT_PROTO_SCAN_H
+
+#include "core/backend.h"
+#include "core/orbit.h"
+#include "proto/json.h"
+
+/* A scan as it is posted: what the detector and the orbit are, not the samples themselves. */
+struct scan {
+	char name[256];
+	double pixel_mm[2];
+	int count; /* projections */
+	enum sample sample;
+	enum quantity quantity;
+	double air;        /* counts; 0 = not given: a flat image must come */
+	double saturation; /* counts; 0 = the sample type's own */
+	struct geometry geometry;
+	struct orbit orbit;
+	cJSON *document; /* as posted, checked: members name, detector, projections, geometry */
+};
+
+extern const char *const sample_names[2];   /* "float32", "uint16" */
+extern const char *const quantity_names[2]; /* "line_integral", "intensity" */
+
+/* Reads and checks the document of POST /v1/scans. Free with scan_free. */
+int scan_parse(const char *text, size_t length, struct scan **ret_scan, struct error *err);
+void scan_free(struct scan *scan);
+
+size_t sample_bytes(enum sample sample);
+size_t scan_projection_bytes(const struct scan *scan); /* columns * rows * sample */
+
+/* `derived` and `warnings` of the reply, new cJSON values of the caller's. */
+cJSON *scan_derived(const struct scan *scan);
+cJSON *scan_warnings(const struct scan *scan);
+
+#endif
