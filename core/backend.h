@@ -145,7 +145,7 @@ struct backend {
 	void (*stack_free)(struct stack *stack); /* NULL is fine */
 	int (*stack_download)(struct stack *stack, int slot, int count, float *ret_to, struct error *err);
 
-	/* plan_bytes touches no device memory; it is how a job that cannot fit is refused beforehand. */
+	/* Touches no device memory, device may be NULL: it is how a job that cannot fit is refused beforehand. */
 	int (*plan_bytes)(struct device *device, const struct plan_options *options, struct plan_bytes *ret_bytes,
 	                  struct error *err);
 	int (*plan_new)(struct device *device, const struct plan_options *options, struct plan **ret_plan,

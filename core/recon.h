@@ -79,7 +79,7 @@ struct recon_memory {
 	size_t available;                            /* bytes free there */
 };
 
-/* What a job will take, before it is opened. */
+/* What a job will take, before it is opened. device NULL (the daemon, that opens none): available is 0. */
 int recon_memory(const struct backend *backend, struct device *device, const struct geometry *geometry,
                  const struct recipe *recipe, struct recon_memory *ret_memory, struct error *err);
 
