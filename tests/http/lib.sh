@@ -1,0 +1,178 @@
+# The black-box tests' tools, sourced by test_*.sh: a real cbctd on a free port,
+# curl, and checks that say what they expected. A file defines test_* functions
+# and ends with `run_tests`; each runs in a subshell that stops at its first
+# failure. `skip WHY` ends a test that cannot run here, aloud.
+
+here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
+top=$(cd "$here/../.." && pwd)
+BUILD=$(cd "$top" && realpath "${BUILD:-build}")
+DATA=${CBCT_TEST_DATA:-$top/../shared/data}
+PATH=$BUILD:$PATH
+work=$BUILD/test/$(basename "${BASH_SOURCE[1]}" .sh)
+RESULTS=${RESULTS:-/dev/null}
+daemon_pid=
+rm -rf "$work"
+mkdir -p "$work"
+
+# start_daemon [OPTION ...]: sets $url; the state directory is $state (kept over restarts).
+state=$work/state
+start_daemon() {
+	local out=$work/cbctd.out i
+	: >"$out"
+	"$BUILD/cbctd" --listen 127.0.0.1:0 --state-dir "$state" --backend cpu "$@" >"$out" 2>>"$work/cbctd.err" &
+	daemon_pid=$!
+	for ((i = 0; i < 300; i++)); do
+		url=$(sed -n 's/^listening on //p' "$out")
+		[ -n "$url" ] && break
+		kill -0 "$daemon_pid" 2>/dev/null || break
+		sleep 0.05
+	done
+	if [ -z "$url" ]; then
+		echo "cbctd did not start: $(tail -5 "$work/cbctd.err")" >&2
+		return 1
+	fi
+	export CBCT_URL=$url
+	# A worker must have said hello before jobs are judged by its memory.
+	for ((i = 0; i < 200; i++)); do
+		[ "$(curl -s -o /dev/null -w '%{http_code}' "$url/readyz")" = 200 ] && return 0
+		sleep 0.05
+	done
+	echo "cbctd is not ready after 10 s" >&2
+	return 1
+}
+
+# stop_daemon [SIGNAL]: waits for the end; $stop_status is its exit status.
+stop_daemon() {
+	stop_status=0
+	[ -n "$daemon_pid" ] || return 0
+	kill "-${1:-TERM}" "$daemon_pid" 2>/dev/null || true
+	wait "$daemon_pid" 2>/dev/null || stop_status=$?
+	daemon_pid=
+}
+trap stop_daemon EXIT
+
+fail() {
+	echo "expected: $*" >&2
+	exit 1
+}
+skip() {
+	echo "$*" >"$work/skip"
+	exit 77
+}
+need_data() {
+	local name
+	for name; do [ -e "$DATA/$name" ] || skip "test data $name is not here"; done
+}
+
+# req METHOD PATH [CURL OPTION ...]: sets $status, $body (a file) and $headers (a file).
+body=$work/body
+headers=$work/headers
+req() {
+	local method=$1 path=$2
+	shift 2
+	local how=(-X "$method")
+	[ "$method" = HEAD ] && how=(--head)
+	: >"$headers"
+	status=$(curl -sS "${how[@]}" -o "$body" -D "$headers" -w '%{http_code}' --max-time 120 "$@" "$url$path") || true
+}
+header() { # NAME: the value in the last reply
+	awk -v name="$(tr 'A-Z' 'a-z' <<<"$1")" 'BEGIN { FS = ": *" } tolower($1) == name { sub(/^[^:]*: */, ""); sub(/\r$/, ""); print; exit }' "$headers"
+}
+expect_status() {
+	[ "$status" = "$1" ] || fail "status $1, got $status: $(head -c 600 "$body" 2>/dev/null)"
+}
+json() { jq -er "$1" "$body"; }
+expect_json() { # FILTER: a jq condition that must be true of the last body
+	jq -e "$1" "$body" >/dev/null 2>&1 || fail "$1 of $(head -c 1200 "$body")"
+}
+# A problem document of this status; a pointer where one is given.
+expect_problem() {
+	expect_status "$1"
+	[[ $(header content-type) == application/problem+json* ]] || fail "application/problem+json, got $(header content-type): $(head -c 300 "$body")"
+	expect_json ".status == $1 and (.type | startswith(\"urn:cbctd:problem:\")) and (.title | length > 0) and (.detail | length > 0) and (.request_id | length > 0)"
+	[ $# -lt 2 ] || expect_json ".pointer == \"$2\""
+}
+expect_number() { # VALUE OP LIMIT NAME, OP one of <= >= < > ==
+	awk -v a="$1" -v b="$3" "BEGIN { exit !(a == a && a != \"\" && a + 0 $2 b + 0) }" || fail "$4 $2 $3, got $1"
+	echo "  $4 = $1 ($2 $3)"
+}
+
+# A scan of DIR (scan.json, projections.raw) posted with curl alone; sets $scan.
+post_scan() {
+	req POST /v1/scans -H 'Content-Type: application/json' --data-binary @"$1/scan.json"
+	expect_status 201
+	scan=$(json .id)
+	[ "$(header location)" = "/v1/scans/$scan" ] || fail "Location /v1/scans/$scan"
+}
+post_projections() {
+	local image
+	for image in flat dark; do
+		[ -e "$1/$image.f32" ] || continue
+		req PUT "/v1/scans/$scan/$image" --data-binary @"$1/$image.f32"
+		[[ $status == 20[014] ]] || fail "$image stored, got $status"
+	done
+	req PUT "/v1/scans/$scan/projections" -T "$1/projections.raw"
+	expect_status 201
+}
+# post_job JSON, with SCAN standing for the scan's id; sets $job.
+post_job() {
+	req POST /v1/jobs -H 'Content-Type: application/json' --data-binary "${1//SCAN/$scan}"
+	expect_status 202
+	job=$(json .id)
+}
+# wait_job STATE [SECONDS]
+wait_job() {
+	local end=$((SECONDS + ${2:-300}))
+	while :; do
+		req GET "/v1/jobs/$job?wait=20"
+		expect_status 200
+		case $(json .state) in
+		succeeded | failed | cancelled) break ;;
+		esac
+		[ $SECONDS -lt $end ] || fail "the end of job $job: $(head -c 600 "$body")"
+	done
+	expect_json ".state == \"$1\""
+}
+get_volume() { # NAME FILE [QUERY]
+	req GET "/v1/jobs/$job/volumes/$1${3:+?$3}"
+	expect_status 200
+	mv "$body" "$2"
+}
+# reconstruct DIR JOB-JSON: the whole way by curl; volumes are then fetched with get_volume.
+reconstruct() {
+	post_scan "$1"
+	post_projections "$1"
+	post_job "$2"
+	wait_job succeeded 600
+}
+
+run_tests() {
+	local name status started
+	for name in $(sed -n 's/^\(test_[a-z0-9_]*\)().*/\1/p' "$0"); do
+		rm -f "$work/skip"
+		started=$SECONDS
+		(
+			set -eEuo pipefail
+			trap 'echo "failed at ${BASH_SOURCE[0]##*/}:$LINENO: $BASH_COMMAND" >&2' ERR
+			trap - EXIT
+			"$name"
+		) >"$work/$name.log" 2>&1
+		status=$?
+		case $status in
+		0)
+			echo "pass $name ($((SECONDS - started)) s)"
+			grep '^  .* = ' "$work/$name.log"
+			echo "pass $(basename "$0") $name" >>"$RESULTS"
+			;;
+		77)
+			echo "SKIP $name: $(cat "$work/skip")"
+			echo "skip $(basename "$0") $name: $(cat "$work/skip")" >>"$RESULTS"
+			;;
+		*)
+			echo "FAIL $name"
+			sed 's/^/    /' "$work/$name.log" | tail -25
+			echo "fail $(basename "$0") $name" >>"$RESULTS"
+			;;
+		esac
+	done
+}

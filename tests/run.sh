@@ -1,0 +1,67 @@
+#!/usr/bin/env bash
+# Every test: the house's rules, the unit tests, then the black-box tests over HTTP.
+# What cannot run here is skipped aloud. Closes with `N passed, N failed, N skipped`.
+# Usage: tests/run.sh [FILTER ...]   only the parts whose path has one of the words in it
+set -uo pipefail
+cd "$(dirname "$0")/.."
+export BUILD=${BUILD:-build}
+mkdir -p "$BUILD/test"
+results=$BUILD/test/results
+: >"$results"
+
+wanted() {
+	local path=$1
+	shift
+	[ $# = 0 ] && return 0
+	local word
+	for word; do [[ $path == *$word* ]] && return 0; done
+	return 1
+}
+
+part() {
+	printf '\n== %s\n' "$1"
+}
+
+if wanted lint "$@"; then
+	part "lint"
+	if tests/lint.sh; then echo "pass lint" >>"$results"; else echo "fail lint" >>"$results"; fi
+fi
+
+if wanted unit "$@"; then
+	part "unit"
+	log=$BUILD/test/unit.log
+	CK_LOG_FILE_NAME=$BUILD/test/unit.check "$BUILD/unit" 2>&1 | tee "$log"
+	status=${PIPESTATUS[0]}
+	# check's closing line: "100%: Checks: 42, Failures: 0, Errors: 0"
+	counts=$(grep -oE 'Checks: [0-9]+, Failures: [0-9]+, Errors: [0-9]+' "$log" | tail -1)
+	read -r checks failures errors <<<"$(tr -dc '0-9 ' <<<"$counts")"
+	if [ -z "${checks:-}" ] || { [ "$status" != 0 ] && [ "$((failures + errors))" = 0 ]; }; then
+		echo "FAIL unit: ended with status $status before its summary"
+		echo "fail unit" >>"$results"
+	else
+		for ((i = 0; i < checks - failures - errors; i++)); do echo "pass unit"; done >>"$results"
+		for ((i = 0; i < failures + errors; i++)); do echo "fail unit"; done >>"$results"
+	fi
+	# A unit test that finds no data says "SKIP name: why" and passes nothing.
+	grep -E '^SKIP ' "$log" | sed 's/^SKIP /skip /' >>"$results"
+fi
+
+for file in tests/http/test_*.sh; do
+	wanted "$file" "$@" || continue
+	part "$file"
+	RESULTS=$results bash "$file" || true
+done
+
+passed=$(grep -c '^pass' "$results")
+failed=$(grep -c '^fail' "$results")
+skipped=$(grep -c '^skip' "$results")
+if [ "$skipped" != 0 ]; then
+	printf '\nskipped:\n'
+	grep '^skip' "$results" | sed 's/^skip /  /'
+fi
+if [ "$failed" != 0 ]; then
+	printf '\nfailed:\n'
+	grep '^fail' "$results" | sed 's/^fail /  /' | sort | uniq -c
+fi
+printf '\n%d passed, %d failed, %d skipped\n' "$passed" "$failed" "$skipped"
+[ "$failed" = 0 ] && [ "$passed" != 0 ]
