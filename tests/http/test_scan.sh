@@ -1,0 +1,253 @@
+#!/usr/bin/env bash
+# Scans and their projections over HTTP: the rules of the contract's section 3.
+. "$(dirname "$0")/lib.sh"
+
+columns=24 rows=10 count=12
+one=$((columns * rows * 4)) # bytes of one projection
+
+scan_json() { # [jq filter on the document]
+	jq -n --argjson c $columns --argjson r $rows --argjson n $count '{name: "test", detector: {columns: $c, rows: $r, pixel_mm: [2, 2]},
+	  projections: {count: $n, sample: "float32", quantity: "line_integral"},
+	  geometry: {kind: "circular", source_to_isocentre_mm: 600, source_to_detector_mm: 1000, first_angle_deg: 0, angle_step_deg: 30}}' |
+		jq "${1:-.}"
+}
+new_scan() {
+	scan_json "${1:-.}" >"$work/scan.json"
+	post_scan "$work"
+}
+# fill BYTE COUNT: COUNT projections of one byte value, repeated; 0x40 makes the float 3.0039
+fill() { head -c $((one * $2)) /dev/zero | tr '\0' "\\$1"; }
+put() { req PUT "/v1/scans/$scan/projections$1" "${@:2}"; }
+
+test_document_says_what_was_understood() {
+	new_scan
+	req GET "/v1/scans/$scan"
+	expect_status 200
+	expect_json '.id and .name == "test" and .received == [] and .missing == [[0, 11]]'
+	expect_json '.derived.arc_deg == 360 and .derived.short_scan == false'
+	expect_json '(.derived.source_radius_mm - 600 | fabs) < 1e-6'
+	expect_json '.derived.direction == "counter-clockwise" and (.warnings | type) == "array"'
+	# 24 columns of 2 mm at 1000 mm: the rays reach +-23 mm at the outer centres, 24 at the edges
+	expect_json '.derived.fan_angle_deg > 2.6 and .derived.fan_angle_deg < 2.8'
+	new_scan '.geometry.angle_step_deg = -17'
+	req GET "/v1/scans/$scan"
+	expect_json '.derived.direction == "clockwise" and .derived.short_scan == true and .derived.arc_deg == 187'
+	expect_json '[.warnings[].code] | length > 0'
+	new_scan '.geometry.angle_step_deg = 5'
+	req GET "/v1/scans/$scan"
+	expect_json '[.warnings[] | select(.code | test("arc"))] | length == 1'
+}
+
+test_every_kind_of_geometry_is_the_same_scan() {
+	local kinds=0
+	new_scan
+	req GET "/v1/scans/$scan"
+	jq -S '.derived | map_values(if type == "number" then . * 1000 | round else . end)' "$body" >"$work/derived.circular"
+	new_scan '.geometry.angles_deg = [range(12) | . * 30] | del(.geometry.first_angle_deg, .geometry.angle_step_deg)'
+	req GET "/v1/scans/$scan"
+	jq -S '.derived | map_values(if type == "number" then . * 1000 | round else . end)' "$body" >"$work/derived.angles"
+	diff "$work/derived.circular" "$work/derived.angles" || fail "the same derived values for a list of angles"
+	# S = 600 (cos, sin, 0), the detector's centre at -400 (cos, sin, 0)
+	new_scan '.geometry = {kind: "views", views: [range(12) | . * 30 * 3.14159265358979312 / 180 | {c: cos, s: sin} |
+	  {source_mm: [600 * .c, 600 * .s, 0], pixel0_mm: [-400 * .c + 23 * .s, -400 * .s - 23 * .c, -9],
+	   column_step_mm: [-2 * .s, 2 * .c, 0], row_step_mm: [0, 0, 2]}]}'
+	req GET "/v1/scans/$scan"
+	jq -S '.derived | map_values(if type == "number" then . * 1000 | round else . end)' "$body" >"$work/derived.views"
+	diff "$work/derived.circular" "$work/derived.views" || fail "the same derived values for views"
+	# u = 500 (-s x + c y) + 11.5 depth, v = 500 z + 4.5 depth, depth = 600 - c x - s y; an odd scale and sign
+	new_scan '.geometry = {kind: "matrices", matrices: [range(12) | . * 30 * 3.14159265358979312 / 180 | {c: cos, s: sin} |
+	  [-500 * .s - 11.5 * .c, 500 * .c - 11.5 * .s, 0, 6900, -4.5 * .c, -4.5 * .s, 500, 2700, -.c, -.s, 0, 600] | map(. * -0.37)]}'
+	req GET "/v1/scans/$scan"
+	jq -S '.derived | map_values(if type == "number" then . * 1000 | round else . end)' "$body" >"$work/derived.matrices"
+	diff "$work/derived.circular" "$work/derived.matrices" || fail "the same derived values for matrices"
+}
+
+test_projections_in_any_order_one_run_all() {
+	new_scan
+	fill 100 1 >"$work/a"
+	fill 101 3 >"$work/b"
+	put /5 -T "$work/a"
+	expect_status 201
+	put /8-10 -T "$work/b"
+	expect_status 201
+	req GET "/v1/scans/$scan"
+	expect_json '.received == [[5, 5], [8, 10]] and .missing == [[0, 4], [6, 7], [11, 11]]'
+	put /5 -T "$work/a"
+	expect_status 200
+	put /8-10 -T "$work/b"
+	expect_status 200
+	fill 102 1 >"$work/c"
+	put /5 -T "$work/c"
+	expect_problem 409
+	req GET "/v1/scans/$scan/projections/5"
+	expect_status 200
+	cmp "$body" "$work/a" || fail "the bytes that were stored first"
+	req GET "/v1/scans/$scan/projections/6"
+	expect_problem 404
+	# all of them: what is there already is the same, the rest is new
+	{ fill 103 5; cat "$work/a"; fill 103 2; cat "$work/b"; fill 103 1; } >"$work/all"
+	put "" -T "$work/all"
+	expect_status 201
+	req GET "/v1/scans/$scan"
+	expect_json '.received == [[0, 11]] and .missing == []'
+	put "" -T "$work/all"
+	expect_status 200
+}
+
+test_chunked_and_compressed_bodies() {
+	new_scan
+	fill 100 4 >"$work/a"
+	put /0-3 -T - -H 'Transfer-Encoding: chunked' <"$work/a"
+	expect_status 201
+	zstd -q -f "$work/a" -o "$work/a.zst"
+	put /4-7 -H 'Content-Encoding: zstd' -T "$work/a.zst"
+	expect_status 201
+	put /4-7 -T "$work/a"
+	expect_status 200
+	put /8 -H 'Content-Encoding: br' -T "$work/a.zst"
+	expect_problem 415
+	head -c 20 "$work/a.zst" >"$work/cut.zst"
+	put /8-11 -H 'Content-Encoding: zstd' -T "$work/cut.zst"
+	expect_problem 400
+	put /8-11 -H 'Content-Encoding: zstd' -T "$work/a"
+	expect_problem 400
+	req GET "/v1/scans/$scan"
+	expect_json '.missing == [[8, 11]]'
+}
+
+test_digest_is_checked_and_a_wrong_one_stores_nothing() {
+	local right wrong
+	new_scan
+	fill 100 2 >"$work/a"
+	right=$(openssl dgst -sha256 -binary "$work/a" | base64)
+	wrong=$(printf x | openssl dgst -sha256 -binary | base64)
+	put /0-1 -H "Content-Digest: sha-256=:$wrong:" -T "$work/a"
+	expect_problem 400
+	req GET "/v1/scans/$scan"
+	expect_json '.received == []'
+	put /0-1 -H "Content-Digest: sha-256=:$right:" -T "$work/a"
+	expect_status 201
+	req GET "/v1/scans/$scan"
+	expect_json '.received == [[0, 1]]'
+	put /2-3 -H "Content-Digest: sha-256=oops" -T "$work/a"
+	expect_problem 400
+}
+
+test_a_broken_connection_keeps_the_whole_projections_before_it() {
+	local i
+	new_scan
+	fill 100 12 >"$work/all"
+	# two projections and a half, then the connection closes
+	{
+		printf 'PUT /v1/scans/%s/projections HTTP/1.1\r\nHost: t\r\nContent-Length: %d\r\n\r\n' "$scan" $((one * 12))
+		head -c $((one * 5 / 2)) "$work/all"
+	} | timeout 5 bash -c 'exec 3<>"/dev/tcp/127.0.0.1/$0"; cat >&3; exec 3>&-' "${url##*:}" || true
+	for ((i = 0; i < 100; i++)); do
+		req GET "/v1/scans/$scan"
+		[ "$(jq -c .received "$body")" = '[[0,1]]' ] && break
+		sleep 0.05
+	done
+	expect_json '.received == [[0, 1]] and .missing == [[2, 11]]'
+	put /2-11 --data-binary @<(fill 100 10)
+	expect_status 201
+}
+
+test_several_connections_at_once_with_repeats() {
+	local k pids=() codes
+	new_scan
+	fill 100 1 >"$work/a"
+	for k in 0 1 2 3 4 5 6 7 8 9 10 11 0 1 2 3 4 5 6 7 8 9 10 11; do
+		curl -s -o /dev/null -w '%{http_code}\n' -T "$work/a" "$url/v1/scans/$scan/projections/$k" >>"$work/codes" &
+		pids+=($!)
+	done
+	wait "${pids[@]}"
+	codes=$(sort "$work/codes" | uniq -c | tr -s ' \n' ' ')
+	[ "$codes" = " 12 200 12 201 " ] || fail "12 times 201 and 12 times 200, got $codes"
+	req GET "/v1/scans/$scan"
+	expect_json '.missing == []'
+}
+
+test_uint16_intensities_with_flat_and_dark() {
+	new_scan '.projections.sample = "uint16" | .projections.quantity = "intensity"'
+	fill 100 1 | head -c $((one / 2)) >"$work/half"
+	put /0 -T "$work/half"
+	expect_status 201
+	fill 100 1 >"$work/whole"
+	put /1 -T "$work/whole"
+	expect_problem 400
+	req PUT "/v1/scans/$scan/flat" -T "$work/whole" # float32
+	[[ $status == 20[01] ]] || fail "flat stored, got $status"
+	req PUT "/v1/scans/$scan/dark" -T "$work/half" # the sample's type
+	[[ $status == 20[01] ]] || fail "dark stored, got $status"
+	req PUT "/v1/scans/$scan/flat" --data-binary 123
+	expect_problem 400
+}
+
+test_lists_newest_first_in_pages() {
+	local first second third
+	new_scan && first=$scan
+	new_scan && second=$scan
+	new_scan && third=$scan
+	req GET '/v1/scans?limit=2'
+	expect_status 200
+	expect_json "[.scans[].id] == [\"$third\", \"$second\"] and (.next | length > 0)"
+	req GET "/v1/scans?limit=1&after=$(json .next)"
+	expect_json "[.scans[].id] == [\"$first\"]"
+	req GET '/v1/scans?limit=nonsense'
+	expect_problem 400
+}
+
+test_delete() {
+	new_scan
+	req DELETE "/v1/scans/$scan"
+	expect_status 204
+	req GET "/v1/scans/$scan"
+	expect_problem 404
+	req DELETE "/v1/scans/$scan"
+	expect_problem 404
+	[ ! -e "$state/scans/$scan" ] || fail "the scan's directory gone"
+	new_scan
+	post_job '{"scan": "SCAN", "fdk": {}}'
+	req DELETE "/v1/scans/$scan"
+	expect_problem 409
+	req DELETE "/v1/jobs/$job"
+	expect_status 202
+	wait_job cancelled
+	req DELETE "/v1/scans/$scan"
+	expect_status 204
+}
+
+test_methods_and_paths() {
+	new_scan
+	req PUT /v1/scans
+	expect_problem 405
+	[[ $(header allow) == *POST* ]] || fail "Allow with POST"
+	req DELETE /livez
+	expect_problem 405
+	req GET /v1/nothing
+	expect_problem 404
+	req GET "/v1/scans/../../etc/passwd" --path-as-is
+	expect_problem 404
+	req HEAD "/v1/scans/$scan"
+	expect_status 200
+	req GET /livez
+	expect_status 200
+	req GET /v1/devices
+	expect_json '.devices | length >= 1'
+	req GET /metrics
+	expect_status 200
+	grep -q '^# TYPE ' "$body" || fail "Prometheus text"
+}
+
+test_a_projection_as_a_picture() {
+	new_scan
+	fill 100 1 >"$work/a"
+	put /0 -T "$work/a"
+	req GET "/v1/scans/$scan/projections/0?format=png"
+	expect_status 200
+	[ "$(header content-type)" = image/png ] || fail "image/png"
+	[ "$(head -c 8 "$body" | od -An -tx1 | tr -d ' ')" = 89504e470d0a1a0a ] || fail "a PNG"
+}
+
+start_daemon || exit 1
+run_tests
