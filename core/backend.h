@@ -163,9 +163,12 @@ struct backend {
 	 */
 	int (*linearise)(struct plan *plan, const void *samples, int count, const int *slots, struct stack *to,
 	                 size_t *defects, struct error *err);
-	/* q = ramp of weights and cosine times p: view views[i] from slot views[i] of `from` into slot i of `to`. */
-	int (*filter)(struct plan *plan, const struct stack *from, const int *views, int count, struct stack *to,
-	              struct error *err);
+	/*
+	 * q = ramp of weights and cosine times p: view views[i] from slot slots[i] of `from` into slot i of `to`.
+	 * slots NULL: slot = view. FDK alone keeps no stack of all views, its slots are those of one batch.
+	 */
+	int (*filter)(struct plan *plan, const struct stack *from, const int *slots, const int *views, int count,
+	              struct stack *to, struct error *err);
 	/* volume += sum over i of (weight) * slot i, seen from views[i]. Bilinear; outside of the detector is 0. */
 	int (*backproject)(struct plan *plan, const struct stack *from, const int *views, int count,
 	                   enum backprojection weight, struct volume *to, struct error *err);
