@@ -23,10 +23,13 @@ static inline size_t grid_voxels(const struct grid *grid)
 /* Centred on the isocentre. */
 void grid_centre(struct grid *grid);
 
-/* Sizes 1..GRID_SIZE_MAX, spacing positive, all finite. Pointers relative to the grid ("/size/0"). */
+/* Sizes 1..GRID_SIZE_MAX, spacing positive, all finite. Pointers relative to the grid ("/size/0", "/spacing_mm/1", "/origin_mm/2"). */
 int grid_check(const struct grid *grid, struct error *err);
 
-/* No source may lie inside the grid, nor a corner behind a source or its detector. */
+/*
+ * ERR_IMPOSSIBLE when a source lies inside the grid (half a voxel beyond the
+ * outer centres included) or a part of it beside or behind a source.
+ */
 int grid_check_geometry(const struct grid *grid, const struct geometry *geometry, struct error *err);
 
 #endif
