@@ -1,0 +1,225 @@
+#!/usr/bin/env bash
+# Jobs and volumes over HTTP: the rules of the contract's section 4, on a small scan.
+. "$(dirname "$0")/lib.sh"
+
+scan_dir=$work/ball
+small='{"scan": "SCAN", "grid": {"size": [32, 24, 16], "spacing_mm": [3, 4, 5]}, '
+simulate_ball() {
+	[ -e "$scan_dir/scan.json" ] || cbct simulate --phantom ball --scale 30 --density 0.02 --shift 5,-8,6 --views 60 --arc 360 \
+		--columns 64 --rows 48 --pixel 4 --source-to-isocentre 600 --source-to-detector 1000 -o "$scan_dir"
+}
+uploaded_scan() {
+	simulate_ball
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+}
+slow='"sart": {"iterations": 100000, "subsets": "views"}'
+
+test_pipeline_keeps_the_volumes_asked_for() {
+	uploaded_scan
+	post_job "$small"'"fdk": {}, "sart": {"iterations": 5, "subsets": 6}, "tv": {}, "emit": ["fdk", "fdk-tv", 1, 3]}'
+	[ "$(header location)" = "/v1/jobs/$job" ] || fail "Location /v1/jobs/$job"
+	wait_job succeeded
+	expect_json '.stage and .iteration == 5 and .iterations == 5 and .progress == 1 and .attempts == 1 and .error == null'
+	expect_json '.backend == "cpu" and (.device | length > 0) and (.timings | type) == "object" and (.warnings | type) == "array"'
+	expect_json '[.history[].iteration] == [1, 2, 3, 4, 5]'
+	expect_json '.history | all(.residual > 0 and .residual < 1 and .change >= 0 and .tv > 0 and .seconds > 0)'
+	expect_json '.history[4].residual < .history[0].residual'
+	req GET "/v1/jobs/$job/volumes"
+	expect_status 200
+	expect_json '[.volumes[].name] == ["fdk", "fdk-tv", "iter-1", "iter-3", "final"]'
+	expect_json '.volumes | all(.size == [32, 24, 16] and (.href | startswith("/v1/jobs/")) and (.digest | length > 20))'
+	expect_json '[.volumes[].iteration] == [0, 0, 1, 3, 5]'
+	expect_json '.volumes[0].statistics | .minimum < .mean and .mean < .maximum'
+}
+
+test_every_stage_may_be_left_out() {
+	uploaded_scan
+	local stages
+	for stages in '"fdk": {}' '"sart": {"iterations": 2}' '"fdk": null, "sart": {"iterations": 1}, "tv": {"method": "proximal"}' \
+		'"fdk": {}, "tv": {"after": "sart"}' '"fdk": {"window": "ram-lak", "cutoff": 0.8}, "sart": null'; do
+		post_job "$small$stages}"
+		wait_job succeeded
+		req GET "/v1/jobs/$job/volumes"
+		expect_json '[.volumes[].name] | index("final") != null'
+	done
+}
+
+test_grid_is_chosen_when_none_is_given() {
+	uploaded_scan
+	post_job '{"scan": "SCAN", "fdk": {}}'
+	wait_job succeeded
+	expect_json '.grid.size | length == 3 and all(. > 10)'
+	expect_json '.grid.spacing_mm | length == 3 and all(. > 0)'
+}
+
+test_volumes_come_in_every_format() {
+	local voxels=$((32 * 24 * 16)) etag full
+	uploaded_scan
+	post_job "$small"'"fdk": {}}'
+	wait_job succeeded
+	get_volume final "$work/v.nii"
+	[ "$(stat -c %s "$work/v.nii")" = $((352 + voxels * 4)) ] || fail "a NIfTI of $((352 + voxels * 4)) bytes"
+	get_volume final "$work/v.raw" format=raw
+	tail -c +353 "$work/v.nii" | cmp - "$work/v.raw" || fail "the same voxels in raw"
+	get_volume final "$work/v.mha" format=mha
+	grep -a -q '^ElementType = MET_FLOAT' "$work/v.mha" || fail "a MetaImage header"
+	grep -a -q '^Offset = -46.5 -46 -37.5' "$work/v.mha" || fail "the centre of voxel 0,0,0 as Offset"
+	tail -c $((voxels * 4)) "$work/v.mha" | cmp - "$work/v.raw" || fail "the same voxels in mha"
+	get_volume final "$work/hu.raw" "format=raw&type=int16"
+	[ "$(stat -c %s "$work/hu.raw")" = $((voxels * 2)) ] || fail "int16"
+	# zstd
+	req GET "/v1/jobs/$job/volumes/final" -H 'Accept-Encoding: zstd'
+	[ "$(header content-encoding)" = zstd ] || fail "Content-Encoding: zstd"
+	zstd -q -d -c <"$body" | cmp - "$work/v.nii" || fail "the same bytes through zstd"
+	etag=$(header etag)
+	req GET "/v1/jobs/$job/volumes/final"
+	[ "$(header etag)" != "$etag" ] || fail "another ETag for another encoding"
+	etag=$(header etag)
+	[[ $etag == '"'*'"' ]] || fail "a strong ETag, got $etag"
+	req GET "/v1/jobs/$job/volumes/final" -H "If-None-Match: $etag"
+	expect_status 304
+	req GET "/v1/jobs/$job/volumes/final" -H 'If-None-Match: "other"'
+	expect_status 200
+	req HEAD "/v1/jobs/$job/volumes/final"
+	expect_status 200
+	[ "$(header content-length)" = $((352 + voxels * 4)) ] || fail "HEAD with the length"
+	[ "$(header accept-ranges)" = bytes ] || fail "Accept-Ranges: bytes"
+	# ranges, of a file and of one converted on the way out
+	for full in v.nii: v.mha:format=mha hu.raw:"format=raw&type=int16"; do
+		req GET "/v1/jobs/$job/volumes/final?${full#*:}" -r 300-1099
+		expect_status 206
+		tail -c +301 "$work/${full%%:*}" | head -c 800 | cmp - "$body" || fail "bytes 300-1099 of ${full%%:*}"
+		[[ $(header content-range) == "bytes 300-1099/$(stat -c %s "$work/${full%%:*}")" ]] || fail "Content-Range"
+		req GET "/v1/jobs/$job/volumes/final?${full#*:}" -r -500
+		expect_status 206
+		tail -c 500 "$work/${full%%:*}" | cmp - "$body" || fail "the last 500 bytes of ${full%%:*}"
+	done
+	req GET "/v1/jobs/$job/volumes/final" -r 99999999-
+	expect_problem 416
+	[ "$(header content-range)" = "bytes */$((352 + voxels * 4))" ] || fail "Content-Range: bytes */N"
+	req GET "/v1/jobs/$job/volumes/final" -r 0-9 -H 'If-Range: "other"'
+	expect_status 200
+	req GET "/v1/jobs/$job/volumes/final?format=jpeg"
+	expect_problem 400
+	req GET "/v1/jobs/$job/volumes/final?type=float16"
+	expect_problem 400
+	req GET "/v1/jobs/$job/volumes/iter-9"
+	expect_problem 404
+}
+
+test_waiting_until_the_projections_are_complete() {
+	simulate_ball
+	post_scan "$scan_dir"
+	post_job "$small"'"fdk": {}}'
+	expect_json '.state == "waiting"'
+	req GET "/v1/jobs/$job?wait=0"
+	expect_json '.state == "waiting"'
+	post_projections "$scan_dir"
+	wait_job succeeded
+}
+
+test_wait_returns_early_and_not_too_late() {
+	local before
+	uploaded_scan
+	post_job "$small$slow}"
+	before=$SECONDS
+	req GET "/v1/jobs/$job" -H 'Prefer: wait=1'
+	expect_status 200
+	expect_json '.state == "running" or .state == "queued"'
+	[ $((SECONDS - before)) -le 10 ] || fail "an answer after about a second"
+	(sleep 1; curl -s -o /dev/null -X DELETE "$url/v1/jobs/$job") &
+	wait_job cancelled 30
+	[ $((SECONDS - before)) -le 25 ] || fail "an answer when the job ends"
+	req GET "/v1/jobs/$job?wait=soon"
+	expect_problem 400
+}
+
+test_idempotency_key() {
+	local first
+	uploaded_scan
+	local document="${small//SCAN/$scan}\"fdk\": {}}"
+	req POST /v1/jobs -H 'Content-Type: application/json' -H 'Idempotency-Key: abc-1' --data-binary "$document"
+	expect_status 202
+	first=$(json .id)
+	req POST /v1/jobs -H 'Content-Type: application/json' -H 'Idempotency-Key: abc-1' --data-binary "$document"
+	[[ $status == 20[02] ]] || fail "2xx for a repeat, got $status"
+	[ "$(json .id)" = "$first" ] || fail "the same job"
+	req POST /v1/jobs -H 'Content-Type: application/json' -H 'Idempotency-Key: abc-1' --data-binary "${document/32/30}"
+	[[ $status == 409 || $status == 422 ]] || fail "409 or 422 for the key with another request, got $status"
+}
+
+test_stop_rules() {
+	uploaded_scan
+	post_job "$small"'"sart": {"iterations": 500, "stop": {"residual": 0.2}}}'
+	wait_job succeeded
+	expect_json '(.history | length) < 500 and .history[-1].residual <= 0.2 and (.history[:-1] | all(.residual > 0.2))'
+	post_job "$small"'"sart": {"iterations": 500, "stop": {"change": 0.05}}}'
+	wait_job succeeded
+	expect_json '(.history | length) < 500 and .history[-1].change <= 0.05'
+}
+
+test_cancel_and_delete() {
+	uploaded_scan
+	post_job "$small$slow}"
+	req DELETE "/v1/jobs/$job"
+	expect_status 202
+	wait_job cancelled 30
+	req DELETE "/v1/jobs/$job"
+	expect_status 204
+	req GET "/v1/jobs/$job"
+	expect_problem 404
+	[ ! -e "$state/jobs/$job" ] || fail "the job's directory gone"
+}
+
+test_higher_priority_goes_first_and_the_lower_one_goes_on() {
+	local long urgent
+	uploaded_scan
+	post_job "$small"'"sart": {"iterations": 400, "subsets": "views"}}'
+	long=$job
+	for ((i = 0; i < 200; i++)); do
+		req GET "/v1/jobs/$long"
+		[ "$(json '.iteration // 0')" -ge 2 ] && break
+		sleep 0.05
+	done
+	post_job "$small"'"fdk": {}, "priority": "stat"}'
+	urgent=$job
+	wait_job succeeded 60
+	req GET "/v1/jobs/$long"
+	expect_json '.state != "succeeded"'
+	job=$long
+	wait_job succeeded 240
+	expect_json '[.history[].iteration] == [range(1; 401)]'
+}
+
+test_lists() {
+	uploaded_scan
+	post_job "$small"'"fdk": {}}'
+	wait_job succeeded
+	req GET '/v1/jobs?limit=1'
+	expect_json "[.jobs[].id] == [\"$job\"] and (.next | length > 0)"
+	req GET "/v1/jobs?limit=1&after=$(json .next)"
+	expect_json ".jobs | length == 1 and .[0].id != \"$job\""
+}
+
+test_the_same_inputs_give_the_same_bits() {
+	uploaded_scan
+	local recipe="$small"'"fdk": {}, "sart": {"iterations": 3, "subsets": 7}, "tv": {}}' first
+	post_job "$recipe"
+	wait_job succeeded
+	req GET "/v1/jobs/$job/volumes"
+	first=$(json '.volumes[-1].digest')
+	post_job "$recipe"
+	wait_job succeeded
+	req GET "/v1/jobs/$job/volumes"
+	[ "$(json '.volumes[-1].digest')" = "$first" ] || fail "the digest of the first run"
+	stop_daemon
+	start_daemon --threads 1
+	post_job "$recipe"
+	wait_job succeeded
+	req GET "/v1/jobs/$job/volumes"
+	[ "$(json '.volumes[-1].digest')" = "$first" ] || fail "the digest of the first run with another number of threads"
+}
+
+start_daemon || exit 1
+run_tests
