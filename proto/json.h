@@ -14,16 +14,33 @@
  * characters, bad UTF-8 and numbers that overflow to infinity. All of those are
  * ERR_INVALID here, with a pointer to the place.
  */
-enum { JSON_BYTES_MAX = 16 << 20, JSON_DEPTH_MAX = 32 };
+enum {
+	JSON_BYTES_MAX = 16 << 20,
+	JSON_DEPTH_MAX = 32,
+	JSON_NUMBER_MAX = 63,    /* characters; cJSON's own limit */
+	JSON_VALUES_MAX = 500000 /* a tree costs about 80 bytes a value; 20000 views take 340000 */
+};
 
-/* The whole text must be one value. Free with cJSON_Delete. */
+/*
+ * The whole text must be one value. Free with cJSON_Delete. ERR_TOO_LARGE for
+ * more bytes or values than above, otherwise ERR_INVALID; the text of
+ * the error names the byte, its pointer the value where one had begun.
+ */
 int json_parse(const char *text, size_t length, cJSON **ret_value, struct error *err);
+
+/*
+ * Compact text of a tree, to be freed with free, NULL for no memory. Unlike
+ * cJSON's own printer, numbers come back as the same double, what is not finite
+ * is null, and bytes that are not UTF-8 become U+FFFD: it is always JSON.
+ */
+char *json_print(const cJSON *value, size_t *ret_length /* may be NULL */);
 
 /*
  * A reader of one object that remembers which members were asked for, so that
  * json_end can refuse the rest by pointer. Members absent or null leave the
- * output as it is and return 0 (ERR_INVALID when required). Each error carries
- * base + "/" + name as its pointer.
+ * output as it is (ERR_INVALID when required). A wrong type, an unknown name or
+ * choice is ERR_INVALID, a number out of its range ERR_IMPOSSIBLE. Each error
+ * carries base + "/" + name as its pointer.
  */
 struct json_reader {
 	const cJSON *object;
@@ -43,13 +60,16 @@ void json_bool(struct json_reader *reader, const char *name, bool required, bool
 void json_string(struct json_reader *reader, const char *name, bool required, char *ret, size_t size);
 /* One of `names` (`count` entries); gives its index. */
 void json_choice(struct json_reader *reader, const char *name, bool required, const char *const *names, int count,
-                 int *ret);
+		 int *ret);
 /* Exactly `count` numbers. */
 void json_numbers(struct json_reader *reader, const char *name, bool required, int count, double least, double most,
-                  double *ret);
+		  double *ret);
 int json_end(struct json_reader *reader); /* refuses members that nobody asked for; returns the first error's code */
 
-/* Fails the reader at member `name` ("" for the object itself). */
+/*
+ * Fails the reader at member `name` ("" for the object itself, "size/0" for a
+ * part of one); the first failure of all is the one that stays.
+ */
 int json_fail(struct json_reader *reader, int code, const char *name, const char *format, ...)
     __attribute__((format(printf, 4, 5)));
 

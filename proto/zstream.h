@@ -10,15 +10,19 @@
 struct zdecoder;
 int zdecoder_new(struct zdecoder **ret_decoder, struct error *err);
 void zdecoder_free(struct zdecoder *decoder);
-/* Consumes from in, produces into out; both counts come back. *ret_ended at the end of the last frame. */
+/*
+ * Consumes from in, produces into out; both counts come back. *ret_ended at the
+ * end of a frame; more frames may follow, so a body is whole when it holds after
+ * the body's last byte. Go on while input is left or the output was filled.
+ */
 int zdecoder_step(struct zdecoder *decoder, const void *in, size_t in_size, size_t *ret_consumed, void *out,
-                  size_t out_size, size_t *ret_produced, bool *ret_ended, struct error *err);
+		  size_t out_size, size_t *ret_produced, bool *ret_ended, struct error *err);
 
 struct zencoder;
 int zencoder_new(int level, struct zencoder **ret_encoder, struct error *err);
 void zencoder_free(struct zencoder *encoder);
 /* last: no input after this; call until *ret_ended. */
 int zencoder_step(struct zencoder *encoder, const void *in, size_t in_size, size_t *ret_consumed, bool last, void *out,
-                  size_t out_size, size_t *ret_produced, bool *ret_ended, struct error *err);
+		  size_t out_size, size_t *ret_produced, bool *ret_ended, struct error *err);
 
 #endif

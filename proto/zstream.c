@@ -1,0 +1,102 @@
+/*
+ * Zstandard (RFC 8878) in pieces, for Content-Encoding: zstd. The decoder
+ * refuses frames whose window is beyond 8 MiB (RFC 9659), so that a sender
+ * cannot choose how much memory we hold.
+ */
+#include "proto/zstream.h"
+
+#include <stdlib.h>
+#include <zstd.h>
+
+enum { WINDOW_LOG_MAX = 23 /* 8 MiB */ };
+
+struct zdecoder {
+	ZSTD_DCtx *context;
+	bool ended;
+};
+
+struct zencoder {
+	ZSTD_CCtx *context;
+};
+
+int zdecoder_new(struct zdecoder **ret_decoder, struct error *err)
+{
+	struct zdecoder *decoder = calloc(1, sizeof(*decoder));
+
+	if (decoder == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a zstd decoder");
+	decoder->context = ZSTD_createDCtx();
+	if (decoder->context == NULL ||
+	    ZSTD_isError(ZSTD_DCtx_setParameter(decoder->context, ZSTD_d_windowLogMax, WINDOW_LOG_MAX))) {
+		zdecoder_free(decoder);
+		return error_set(err, ERR_NO_MEMORY, "no memory for a zstd decoder");
+	}
+	*ret_decoder = decoder;
+	return 0;
+}
+
+void zdecoder_free(struct zdecoder *decoder)
+{
+	if (decoder == NULL)
+		return;
+	ZSTD_freeDCtx(decoder->context);
+	free(decoder);
+}
+
+int zdecoder_step(struct zdecoder *decoder, const void *in, size_t in_size, size_t *ret_consumed, void *out,
+		  size_t out_size, size_t *ret_produced, bool *ret_ended, struct error *err)
+{
+	ZSTD_inBuffer input = {in, in_size, 0};
+	ZSTD_outBuffer output = {out, out_size, 0};
+	size_t hint = ZSTD_decompressStream(decoder->context, &output, &input);
+
+	if (ZSTD_isError(hint))
+		return error_set(err, ERR_INVALID, "the zstd data cannot be decoded: %s", ZSTD_getErrorName(hint));
+	*ret_consumed = input.pos;
+	*ret_produced = output.pos;
+	/* A call that moves nothing asks for the next frame's header: that is no end, but none is lost either. */
+	if (input.pos > 0 || output.pos > 0)
+		decoder->ended = hint == 0;
+	*ret_ended = decoder->ended;
+	return 0;
+}
+
+int zencoder_new(int level, struct zencoder **ret_encoder, struct error *err)
+{
+	struct zencoder *encoder = calloc(1, sizeof(*encoder));
+
+	if (encoder == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a zstd encoder");
+	encoder->context = ZSTD_createCCtx();
+	if (encoder->context == NULL ||
+	    ZSTD_isError(ZSTD_CCtx_setParameter(encoder->context, ZSTD_c_compressionLevel, level)) ||
+	    ZSTD_isError(ZSTD_CCtx_setParameter(encoder->context, ZSTD_c_checksumFlag, 1))) {
+		zencoder_free(encoder);
+		return error_set(err, ERR_NO_MEMORY, "no memory for a zstd encoder");
+	}
+	*ret_encoder = encoder;
+	return 0;
+}
+
+void zencoder_free(struct zencoder *encoder)
+{
+	if (encoder == NULL)
+		return;
+	ZSTD_freeCCtx(encoder->context);
+	free(encoder);
+}
+
+int zencoder_step(struct zencoder *encoder, const void *in, size_t in_size, size_t *ret_consumed, bool last, void *out,
+		  size_t out_size, size_t *ret_produced, bool *ret_ended, struct error *err)
+{
+	ZSTD_inBuffer input = {in, in_size, 0};
+	ZSTD_outBuffer output = {out, out_size, 0};
+	size_t left = ZSTD_compressStream2(encoder->context, &output, &input, last ? ZSTD_e_end : ZSTD_e_continue);
+
+	if (ZSTD_isError(left))
+		return error_set(err, ERR_NO_MEMORY, "zstd encoder: %s", ZSTD_getErrorName(left));
+	*ret_consumed = input.pos;
+	*ret_produced = output.pos;
+	*ret_ended = last && left == 0;
+	return 0;
+}
