@@ -10,17 +10,17 @@ DATA=${CBCT_TEST_DATA:-$top/../shared/data}
 PATH=$BUILD:$PATH
 work=$BUILD/test/$(basename "${BASH_SOURCE[1]}" .sh)
 RESULTS=${RESULTS:-/dev/null}
-daemon_pid=
 rm -rf "$work"
 mkdir -p "$work"
 
 # start_daemon [OPTION ...]: sets $url; the state directory is $state (kept over restarts).
 state=$work/state
 start_daemon() {
-	local out=$work/cbctd.out i
+	local out=$work/cbctd.out i daemon_pid
 	: >"$out"
 	"$BUILD/cbctd" --listen 127.0.0.1:0 --state-dir "$state" --backend cpu "$@" >"$out" 2>>"$work/cbctd.err" &
 	daemon_pid=$!
+	echo "$daemon_pid" >"$work/daemon.pid"
 	for ((i = 0; i < 300; i++)); do
 		url=$(sed -n 's/^listening on //p' "$out")
 		[ -n "$url" ] && break
@@ -41,13 +41,16 @@ start_daemon() {
 	return 1
 }
 
-# stop_daemon [SIGNAL]: waits for the end; $stop_status is its exit status.
+# stop_daemon [SIGNAL]: waits for the end; $stop_status is its exit status where this
+# shell started it (a test that restarts the daemon runs in a subshell).
 stop_daemon() {
+	local pid
 	stop_status=0
-	[ -n "$daemon_pid" ] || return 0
-	kill "-${1:-TERM}" "$daemon_pid" 2>/dev/null || true
-	wait "$daemon_pid" 2>/dev/null || stop_status=$?
-	daemon_pid=
+	pid=$(cat "$work/daemon.pid" 2>/dev/null) || return 0
+	rm -f "$work/daemon.pid"
+	kill "-${1:-TERM}" "$pid" 2>/dev/null || true
+	wait "$pid" 2>/dev/null || stop_status=$?
+	while kill -0 "$pid" 2>/dev/null; do sleep 0.05; done
 }
 trap stop_daemon EXIT
 

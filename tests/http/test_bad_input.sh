@@ -68,7 +68,7 @@ test_text_that_is_not_strict_json() {
 
 test_a_hundred_megabytes_of_json() {
 	local before after
-	before=$(awk '/VmRSS/ { print $2 }' "/proc/$daemon_pid/status")
+	before=$(awk '/VmRSS/ { print $2 }' "/proc/$(cat "$work/daemon.pid")/status")
 	{ printf '{"name": ['; head -c 100000000 /dev/zero | tr '\0' 1; printf ']}'; } >"$work/big"
 	req POST /v1/scans -H 'Content-Type: application/json' -T "$work/big"
 	expect_problem 413
@@ -77,7 +77,7 @@ test_a_hundred_megabytes_of_json() {
 	{ printf '['; head -c 15000000 /dev/zero | sed 's/\x0/1,/g'; printf '1]'; } | head -c 15000000 >"$work/many"
 	req POST /v1/scans -H 'Content-Type: application/json' -T "$work/many"
 	[[ $status == 4* ]] || fail "4xx for millions of values, got $status"
-	after=$(awk '/VmRSS/ { print $2 }' "/proc/$daemon_pid/status")
+	after=$(awk '/VmRSS/ { print $2 }' "/proc/$(cat "$work/daemon.pid")/status")
 	expect_number $((after - before)) '<' 200000 "growth of the daemon in KiB"
 	rm -f "$work/big" "$work/many"
 	req GET /livez

@@ -1,0 +1,200 @@
+#!/usr/bin/env bash
+# What was acknowledged is there after kill -9, SIGTERM, a dead worker and a full disk.
+. "$(dirname "$0")/lib.sh"
+
+scan_dir=$work/ball
+cbct simulate --phantom ball --scale 30 --density 0.02 --views 60 --arc 360 --columns 64 --rows 48 --pixel 4 \
+	--source-to-isocentre 600 --source-to-detector 1000 -o "$scan_dir" >/dev/null || exit 1
+one=$((64 * 48 * 4))
+grid='"grid": {"size": [32, 32, 16], "spacing_mm": [3, 3, 4]}'
+
+running_at() { # ITERATION: waits until the job is there
+	local i
+	for ((i = 0; i < 400; i++)); do
+		req GET "/v1/jobs/$job"
+		[ "$(json '.iteration // 0')" -ge "$1" ] && return 0
+		sleep 0.05
+	done
+	fail "iteration $1 of job $job: $(head -c 400 "$body")"
+}
+
+test_everything_is_known_again_after_kill_9() {
+	local k finished
+	start_daemon
+	post_scan "$scan_dir"
+	finished=$scan
+	post_projections "$scan_dir"
+	post_job "{\"scan\": \"SCAN\", $grid, \"fdk\": {}, \"sart\": {\"iterations\": 2}}"
+	wait_job succeeded
+	cp "$body" "$work/before"
+	get_volume final "$work/final.before"
+	post_scan "$scan_dir"
+	for k in 3 4 17; do
+		tail -c +$((one * k + 1)) "$scan_dir/projections.raw" | head -c $one >"$work/one"
+		req PUT "/v1/scans/$scan/projections/$k" -T "$work/one"
+		expect_status 201
+	done
+	stop_daemon KILL
+	start_daemon
+	req GET "/v1/scans/$scan"
+	expect_json '.received == [[3, 4], [17, 17]]'
+	for k in 3 4 17; do
+		tail -c +$((one * k + 1)) "$scan_dir/projections.raw" | head -c $one >"$work/one"
+		req GET "/v1/scans/$scan/projections/$k"
+		cmp "$body" "$work/one" || fail "projection $k as it was sent"
+		req PUT "/v1/scans/$scan/projections/$k" -T "$work/one"
+		expect_status 200
+	done
+	req GET "/v1/jobs/$job"
+	diff <(jq -S '{state, history, grid, scan, attempts}' "$body") <(jq -S '{state, history, grid, scan, attempts}' "$work/before") || fail "the job as it was"
+	get_volume final "$work/final.after"
+	cmp "$work/final.before" "$work/final.after" || fail "the volume as it was"
+	req GET /v1/scans
+	expect_json "[.scans[].id] == [\"$scan\", \"$finished\"]"
+	stop_daemon
+}
+
+test_kill_9_in_the_middle_of_uploads_loses_nothing_that_was_acknowledged() {
+	local round k pids
+	start_daemon
+	post_scan "$scan_dir"
+	: >"$work/acknowledged"
+	for round in 1 2 3 4; do
+		pids=()
+		for k in $(seq $(((round - 1) * 15)) $((round * 15 - 1))); do
+			(
+				code=$(tail -c +$((one * k + 1)) "$scan_dir/projections.raw" | head -c $one |
+					curl -s -o /dev/null -w '%{http_code}' --data-binary @- -X PUT "$url/v1/scans/$scan/projections/$k") || true
+				[[ $code == 20[01] ]] && echo "$k" >>"$work/acknowledged"
+				true
+			) &
+			pids+=($!)
+			[ "$k" = $((round * 15 - 6)) ] && stop_daemon KILL
+		done
+		wait "${pids[@]}" || true
+		start_daemon
+	done
+	echo "  acknowledged projections = $(wc -l <"$work/acknowledged") (of 60)"
+	req GET "/v1/scans/$scan"
+	cp "$body" "$work/scan"
+	while read -r k; do
+		jq -e ".received | any(.[0] <= $k and .[1] >= $k)" "$work/scan" >/dev/null || fail "projection $k, acknowledged"
+		req GET "/v1/scans/$scan/projections/$k"
+		tail -c +$((one * k + 1)) "$scan_dir/projections.raw" | head -c $one | cmp - "$body" || fail "projection $k as it was sent"
+	done <"$work/acknowledged"
+	[ -s "$work/acknowledged" ] || fail "some projections acknowledged"
+	stop_daemon
+}
+
+test_a_running_job_is_queued_again_after_kill_9() {
+	start_daemon
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "{\"scan\": \"SCAN\", $grid, \"sart\": {\"iterations\": 300, \"subsets\": \"views\"}, \"emit\": [1, 300]}"
+	running_at 3
+	stop_daemon KILL
+	start_daemon
+	wait_job succeeded 240
+	expect_json '.attempts == 2 and ([.history[].iteration] == [range(1; 301)])'
+	req GET "/v1/jobs/$job/volumes"
+	expect_json '[.volumes[].name] == ["iter-1", "iter-300", "final"]'
+	stop_daemon
+}
+
+test_sigterm_leaves_a_checkpoint_and_exits_0() {
+	local at
+	start_daemon
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "{\"scan\": \"SCAN\", $grid, \"sart\": {\"iterations\": 400, \"subsets\": \"views\"}}"
+	running_at 5
+	at=$(json .iteration)
+	stop_daemon TERM
+	[ "$stop_status" = 0 ] || fail "exit status 0, got $stop_status"
+	start_daemon
+	req GET "/v1/jobs/$job"
+	expect_json ".iteration >= $at"
+	wait_job succeeded 240
+	expect_json '[.history[].iteration] == [range(1; 401)]'
+	stop_daemon
+}
+
+test_a_dead_worker_takes_nothing_with_it() {
+	local worker
+	start_daemon
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "{\"scan\": \"SCAN\", $grid, \"sart\": {\"iterations\": 300, \"subsets\": \"views\"}}"
+	running_at 2
+	worker=$(pgrep -P "$(cat "$work/daemon.pid")" | head -1)
+	kill -9 "$worker"
+	wait_job succeeded 240
+	expect_json '.attempts == 2'
+	stop_daemon
+}
+
+test_a_full_disk_is_507_and_loses_nothing() {
+	local small=$work/small
+	mkdir -p "$small"
+	mount -t tmpfs -o size=6m none "$small" 2>/dev/null || skip "no permission to mount a small tmpfs"
+	trap 'stop_daemon; umount "$small"' EXIT
+	state=$small/state start_daemon
+	jq '.projections.count = 60000 | .projections.count = 600' "$scan_dir/scan.json" >"$work/big.json"
+	jq '.projections.count = 100 | .geometry.angles_deg = [range(100)] | del(.geometry.first_angle_deg, .geometry.angle_step_deg, .geometry.angles_deg)
+	    | .geometry += {first_angle_deg: 0, angle_step_deg: 3}' "$scan_dir/scan.json" >"$work/fits.json"
+	req POST /v1/scans -H 'Content-Type: application/json' --data-binary @<(jq '.projections.count = 600 | .geometry = {kind: "circular",
+	    source_to_isocentre_mm: 600, source_to_detector_mm: 1000, first_angle_deg: 0, angle_step_deg: 0.6}' "$scan_dir/scan.json")
+	expect_problem 507
+	req POST /v1/scans -H 'Content-Type: application/json' --data-binary @"$scan_dir/scan.json"
+	expect_status 201
+	scan=$(json .id)
+	post_projections "$scan_dir"
+	# a volume that does not fit any more: the job fails and says so, the scan stays
+	post_job '{"scan": "SCAN", "grid": {"size": [128, 128, 128], "spacing_mm": [1, 1, 1]}, "fdk": {}}'
+	wait_job failed
+	expect_json '.error.detail | test("space")'
+	req GET "/v1/scans/$scan"
+	expect_json '.missing == []'
+	post_job '{"scan": "SCAN", "grid": {"size": [16, 16, 16], "spacing_mm": [5, 5, 5]}, "fdk": {}}'
+	wait_job succeeded
+	stop_daemon
+}
+
+test_two_daemons_do_not_share_a_state_directory() {
+	start_daemon
+	if timeout 10 "$BUILD/cbctd" --listen 127.0.0.1:0 --state-dir "$state" --backend cpu >"$work/second.out" 2>&1; then
+		fail "a refusal"
+	fi
+	grep -qi 'use' "$work/second.out" || fail "a message that says it is in use: $(cat "$work/second.out")"
+	stop_daemon
+}
+
+test_settings_as_flag_line_and_environment() {
+	"$BUILD/cbctd" --help | grep -q -- --state-dir || fail "--help with --state-dir"
+	"$BUILD/cbctd" --print-config >"$work/config"
+	grep -q '^listen' "$work/config" || fail "listen in --print-config"
+	CBCTD_LISTEN=127.0.0.1:3333 "$BUILD/cbctd" --print-config | grep -q '127.0.0.1:3333' || fail "the environment's value"
+	sed 's/^listen.*/listen = 127.0.0.1:4444/' "$work/config" >"$work/config2"
+	"$BUILD/cbctd" --config "$work/config2" --print-config | grep -q '127.0.0.1:4444' || fail "the config file's value"
+	"$BUILD/cbctd" --config "$work/config2" --listen 127.0.0.1:5555 --print-config | grep -q '127.0.0.1:5555' || fail "the flag before the file"
+	if "$BUILD/cbctd" --listen 0.0.0.0:0 --state-dir "$work/other" >"$work/out" 2>&1; then
+		fail "a refusal to listen beyond loopback without tokens and TLS"
+	fi
+	if "$BUILD/cbctd" --no-such-flag >"$work/out" 2>&1; then
+		fail "a refusal of an unknown flag"
+	fi
+}
+
+test_a_unix_socket() {
+	local socket=$work/s i
+	"$BUILD/cbctd" --listen "unix:$socket" --state-dir "$work/unix-state" --backend cpu >"$work/unix.out" 2>&1 &
+	echo $! >"$work/daemon.pid"
+	for ((i = 0; i < 100; i++)); do
+		[ "$(curl -s -o /dev/null -w '%{http_code}' --unix-socket "$socket" http://localhost/livez)" = 200 ] && break
+		sleep 0.05
+	done
+	[ "$(curl -s -o /dev/null -w '%{http_code}' --unix-socket "$socket" http://localhost/livez)" = 200 ] || fail "an answer over the socket"
+	stop_daemon
+}
+
+run_tests
