@@ -663,15 +663,25 @@ bool json_has(struct json_reader *reader, const char *name)
 	return json_member(reader, name, false) != NULL;
 }
 
-/* A number in its range, wherever it stands; `place` is relative to the reader. */
-static int read_number(struct json_reader *reader, const cJSON *value, const char *place, double least, double most,
-		       double *ret)
+/* A number in its range, wherever it stands; errors have no pointer yet. */
+static int check_number(const cJSON *value, double least, double most, struct error *err)
 {
 	if (!cJSON_IsNumber(value))
-		return json_fail(reader, ERR_INVALID, place, "%s, a number is expected", type_name(value));
+		return error_set(err, ERR_INVALID, "%s, a number is expected", type_name(value));
 	if (!(value->valuedouble >= least && value->valuedouble <= most))
-		return json_fail(reader, ERR_IMPOSSIBLE, place, "%.10g, a number from %.10g to %.10g is expected",
+		return error_set(err, ERR_IMPOSSIBLE, "%.10g, a number from %.10g to %.10g is expected",
 				 value->valuedouble, least, most);
+	return 0;
+}
+
+static int read_number(struct json_reader *reader, const cJSON *value, const char *name, double least, double most,
+		       double *ret)
+{
+	struct error problem;
+	int code = check_number(value, least, most, &problem);
+
+	if (code != 0)
+		return json_fail(reader, code, name, "%s", problem.text);
 	*ret = value->valuedouble;
 	return 0;
 }
@@ -755,32 +765,42 @@ void json_choice(struct json_reader *reader, const char *name, bool required, co
 		  cJSON_IsString(member) ? "an unknown word" : type_name(member), list);
 }
 
+int json_array(const cJSON *array, const char *pointer, int count, double least, double most, double *ret,
+	       struct error *err)
+{
+	const cJSON *element;
+	int index = 0;
+
+	if (!cJSON_IsArray(array))
+		return error_set_at(err, ERR_INVALID, pointer, "%s, an array of %d numbers is expected",
+				    type_name(array), count);
+	if (cJSON_GetArraySize(array) != count)
+		return error_set_at(err, ERR_INVALID, pointer, "%d numbers, %d are expected", cJSON_GetArraySize(array),
+				    count);
+	cJSON_ArrayForEach(element, array)
+	{
+		int code = check_number(element, least, most, err);
+
+		if (code != 0) {
+			snprintf(err->pointer, sizeof(err->pointer), "%.170s/%d", pointer, index);
+			return code;
+		}
+		index++;
+	}
+	cJSON_ArrayForEach(element, array) *ret++ = element->valuedouble;
+	return 0;
+}
+
 void json_numbers(struct json_reader *reader, const char *name, bool required, int count, double least, double most,
 		  double *ret)
 {
-	const cJSON *member = json_member(reader, name, required), *element;
-	int index = 0;
+	const cJSON *member = json_member(reader, name, required);
+	char pointer[POINTER_MAX];
 
 	if (member == NULL)
 		return;
-	if (!cJSON_IsArray(member)) {
-		json_fail(reader, ERR_INVALID, name, "%s, an array of %d numbers is expected", type_name(member),
-			  count);
-		return;
-	}
-	if (cJSON_GetArraySize(member) != count) {
-		json_fail(reader, ERR_INVALID, name, "%d numbers, %d are expected", cJSON_GetArraySize(member), count);
-		return;
-	}
-	cJSON_ArrayForEach(element, member)
-	{
-		char place[128];
-
-		snprintf(place, sizeof(place), "%.100s/%d", name, index);
-		if (read_number(reader, element, place, least, most, &ret[index]) != 0)
-			return;
-		index++;
-	}
+	snprintf(pointer, sizeof(pointer), "%s/%s", reader->base, name);
+	reader->code = json_array(member, pointer, count, least, most, ret, reader->err);
 }
 
 int json_end(struct json_reader *reader)

@@ -64,6 +64,9 @@ void json_choice(struct json_reader *reader, const char *name, bool required, co
 /* Exactly `count` numbers. */
 void json_numbers(struct json_reader *reader, const char *name, bool required, int count, double least, double most,
 		  double *ret);
+/* The same for an array that is no member of an object, e.g. one of a list; `pointer` is its own. */
+int json_array(const cJSON *array, const char *pointer, int count, double least, double most, double *ret,
+	       struct error *err);
 int json_end(struct json_reader *reader); /* refuses members that nobody asked for; returns the first error's code */
 
 /*

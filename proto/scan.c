@@ -1,0 +1,453 @@
+/*
+ * The document of a scan: read strictly, turned into a geometry in vectors, and
+ * told back in a radiographer's words, so that a wrong sign or a missing turn is
+ * seen before the first projection is sent.
+ */
+#include "proto/scan.h"
+
+#include <math.h>
+#include <stdarg.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+const char *const sample_names[2] = {"float32", "uint16"};
+const char *const quantity_names[2] = {"line_integral", "intensity"};
+
+static const double degree = M_PI / 180;
+static const double length_least = 1e-6, length_most = 1e7; /* mm */
+static const double count_most = 1e12;                      /* of photons or digital units */
+static const uint64_t bytes_most = 1ull << 40;              /* of one scan's projections */
+
+size_t sample_bytes(enum sample sample)
+{
+	return sample == SAMPLE_UINT16 ? 2 : 4;
+}
+
+size_t scan_projection_bytes(const struct scan *scan)
+{
+	return (size_t)scan->geometry.columns * (size_t)scan->geometry.rows * sample_bytes(scan->sample);
+}
+
+/* ---- reading ---- */
+
+static int read_detector(struct scan *scan, const cJSON *detector, struct error *err)
+{
+	struct json_reader reader;
+	long columns = 0, rows = 0;
+
+	json_begin(&reader, detector, "/detector", err);
+	json_integer(&reader, "columns", true, 1, DETECTOR_MAX, &columns);
+	json_integer(&reader, "rows", true, 1, DETECTOR_MAX, &rows);
+	json_numbers(&reader, "pixel_mm", true, 2, length_least, length_most, scan->pixel_mm);
+	scan->geometry.columns = (int)columns;
+	scan->geometry.rows = (int)rows;
+	return json_end(&reader);
+}
+
+static int read_projections(struct scan *scan, const cJSON *projections, struct error *err)
+{
+	struct json_reader reader;
+	long count = 0;
+	int sample = 0, quantity = 0;
+	uint64_t bytes;
+
+	json_begin(&reader, projections, "/projections", err);
+	json_integer(&reader, "count", true, 1, VIEWS_MAX, &count);
+	json_choice(&reader, "sample", true, sample_names, 2, &sample);
+	json_choice(&reader, "quantity", true, quantity_names, 2, &quantity);
+	json_number(&reader, "air", false, 1e-6, count_most, &scan->air);
+	json_number(&reader, "saturation", false, 1e-6, count_most, &scan->saturation);
+	if (quantity == QUANTITY_LINE_INTEGRAL && scan->air != 0)
+		json_fail(&reader, ERR_INVALID, "air", "line integrals have no air value, it belongs to intensity");
+	if (quantity == QUANTITY_LINE_INTEGRAL && scan->saturation != 0)
+		json_fail(&reader, ERR_INVALID, "saturation", "line integrals do not saturate, intensities do");
+	scan->count = (int)count;
+	scan->sample = (enum sample)sample;
+	scan->quantity = (enum quantity)quantity;
+	bytes = scan_projection_bytes(scan) * (uint64_t)count;
+	if (bytes > bytes_most)
+		json_fail(&reader, ERR_IMPOSSIBLE, "count", "projections of %.4g GB in all, at most %.4g are accepted",
+			  (double)bytes * 1e-9, (double)bytes_most * 1e-9);
+	return json_end(&reader);
+}
+
+/* A list as long as there are projections. */
+static const cJSON *view_list(struct json_reader *reader, const char *name, int count)
+{
+	const cJSON *list = json_member(reader, name, true);
+
+	if (list == NULL)
+		return NULL;
+	if (!cJSON_IsArray(list))
+		json_fail(reader, ERR_INVALID, name, "a list of %d entries is expected", count);
+	else if (cJSON_GetArraySize(list) != count)
+		json_fail(reader, ERR_INVALID, name, "%d entries, but projections.count is %d",
+			  cJSON_GetArraySize(list), count);
+	return reader->code == 0 ? list : NULL;
+}
+
+/* In degrees on both sides of the border; `circular` has either a list or first and step. */
+static void read_angles(struct json_reader *reader, int count, double *ret_angles)
+{
+	const double most = 1e6; /* degrees; beyond it a double no longer tells 1e-10 */
+	double first = 0, step = 0;
+
+	if (json_has(reader, "angles_deg")) {
+		if (view_list(reader, "angles_deg", count) == NULL)
+			return;
+		json_numbers(reader, "angles_deg", true, count, -most, most, ret_angles);
+		if (json_has(reader, "first_angle_deg") || json_has(reader, "angle_step_deg"))
+			json_fail(reader, ERR_INVALID, "angles_deg",
+				  "stands in place of first_angle_deg and angle_step_deg");
+	} else {
+		json_number(reader, "first_angle_deg", false, -most, most, &first);
+		json_number(reader, "angle_step_deg", count > 1, -360, 360, &step);
+		for (int i = 0; i < count; i++)
+			ret_angles[i] = first + i * step;
+	}
+	for (int i = 0; i < count; i++)
+		ret_angles[i] *= degree;
+}
+
+static int read_circular(struct scan *scan, struct json_reader *reader)
+{
+	struct circular orbit = {.pixel = {scan->pixel_mm[0], scan->pixel_mm[1]}};
+	double *angles = calloc((size_t)scan->count, sizeof(*angles));
+	int code;
+
+	if (angles == NULL)
+		return json_fail(reader, ERR_NO_MEMORY, "", "no memory for %d angles", scan->count);
+	json_number(reader, "source_to_isocentre_mm", true, length_least, length_most, &orbit.source_to_isocentre);
+	json_number(reader, "source_to_detector_mm", true, length_least, length_most, &orbit.source_to_detector);
+	json_numbers(reader, "detector_offset_mm", false, 2, -length_most, length_most, orbit.detector_offset);
+	json_numbers(reader, "source_offset_mm", false, 2, -length_most, length_most, orbit.source_offset);
+	read_angles(reader, scan->count, angles);
+	if (orbit.source_to_detector <= orbit.source_to_isocentre)
+		json_fail(reader, ERR_IMPOSSIBLE, "source_to_detector_mm",
+			  "%.10g, more than source_to_isocentre_mm, %.10g, is expected", orbit.source_to_detector,
+			  orbit.source_to_isocentre);
+	code = json_end(reader);
+	if (code == 0) {
+		code = geometry_circular(&scan->geometry, scan->geometry.columns, scan->geometry.rows, scan->count,
+					 &orbit, angles, reader->err);
+		if (code != 0 && !json_has(reader, "angles_deg"))
+			reader->err->pointer[0] = '\0'; /* there is no list that it could point into */
+		if (code != 0)
+			error_nest(reader->err, "/geometry");
+	}
+	free(angles);
+	return code;
+}
+
+static int read_matrices(struct scan *scan, struct json_reader *reader)
+{
+	const cJSON *list = view_list(reader, "matrices", scan->count), *matrix;
+	double *numbers = NULL;
+	int code = json_end(reader), index = 0;
+
+	if (code != 0)
+		return code;
+	numbers = calloc((size_t)scan->count, 12 * sizeof(*numbers));
+	if (numbers == NULL)
+		return error_set(reader->err, ERR_NO_MEMORY, "no memory for %d matrices", scan->count);
+	cJSON_ArrayForEach(matrix, list)
+	{
+		char pointer[64];
+
+		snprintf(pointer, sizeof(pointer), "/geometry/matrices/%d", index);
+		code = json_array(matrix, pointer, 12, -1e100, 1e100, numbers + 12 * (size_t)index, reader->err);
+		if (code != 0)
+			goto out;
+		index++;
+	}
+	code = geometry_matrices(&scan->geometry, scan->geometry.columns, scan->geometry.rows, scan->count, numbers,
+				 scan->pixel_mm, reader->err);
+	if (code != 0)
+		error_nest(reader->err, "/geometry");
+out:
+	free(numbers);
+	return code;
+}
+
+static int read_view(const cJSON *value, int index, struct view *ret_view, struct error *err)
+{
+	struct json_reader reader;
+	char base[64];
+
+	snprintf(base, sizeof(base), "/geometry/views/%d", index);
+	json_begin(&reader, value, base, err);
+	json_numbers(&reader, "source_mm", true, 3, -length_most, length_most, ret_view->source);
+	json_numbers(&reader, "pixel0_mm", true, 3, -length_most, length_most, ret_view->pixel0);
+	json_numbers(&reader, "column_step_mm", true, 3, -length_most, length_most, ret_view->column_step);
+	json_numbers(&reader, "row_step_mm", true, 3, -length_most, length_most, ret_view->row_step);
+	return json_end(&reader);
+}
+
+static int read_views(struct scan *scan, struct json_reader *reader)
+{
+	const cJSON *list = view_list(reader, "views", scan->count), *value;
+	struct view *views = NULL;
+	int code = json_end(reader), index = 0;
+
+	if (code != 0)
+		return code;
+	views = calloc((size_t)scan->count, sizeof(*views));
+	if (views == NULL)
+		return error_set(reader->err, ERR_NO_MEMORY, "no memory for %d views", scan->count);
+	cJSON_ArrayForEach(value, list)
+	{
+		code = read_view(value, index, &views[index], reader->err);
+		if (code != 0)
+			goto out;
+		index++;
+	}
+	code = geometry_views(&scan->geometry, scan->geometry.columns, scan->geometry.rows, scan->count, views,
+			      reader->err);
+	if (code != 0)
+		error_nest(reader->err, "/geometry");
+out:
+	free(views);
+	return code;
+}
+
+static const struct {
+	const char *name;
+	int (*read)(struct scan *scan, struct json_reader *reader);
+} kinds[] = {{"circular", read_circular}, {"matrices", read_matrices}, {"views", read_views}};
+enum { KIND_COUNT = sizeof(kinds) / sizeof(kinds[0]) };
+
+static int read_geometry(struct scan *scan, const cJSON *geometry, struct error *err)
+{
+	struct json_reader reader;
+	const char *names[KIND_COUNT];
+	int kind = 0;
+
+	for (int i = 0; i < KIND_COUNT; i++)
+		names[i] = kinds[i].name;
+	json_begin(&reader, geometry, "/geometry", err);
+	json_choice(&reader, "kind", true, names, KIND_COUNT, &kind);
+	return reader.code != 0 ? reader.code : kinds[kind].read(scan, &reader);
+}
+
+/* A member that is null says no more than one that is absent. */
+static void drop_nulls(cJSON *object)
+{
+	cJSON *member = object->child;
+
+	while (member != NULL) {
+		cJSON *next = member->next;
+
+		if (cJSON_IsNull(member))
+			cJSON_Delete(cJSON_DetachItemViaPointer(object, member));
+		else if (cJSON_IsObject(member))
+			drop_nulls(member);
+		member = next;
+	}
+}
+
+static int read_document(struct scan *scan, struct error *err)
+{
+	struct json_reader reader;
+	const cJSON *detector, *projections, *geometry;
+	int code;
+
+	json_begin(&reader, scan->document, "", err);
+	json_string(&reader, "name", false, scan->name, sizeof(scan->name));
+	detector = json_member(&reader, "detector", true);
+	projections = json_member(&reader, "projections", true);
+	geometry = json_member(&reader, "geometry", true);
+	code = json_end(&reader);
+	if (code == 0)
+		code = read_detector(scan, detector, err);
+	if (code == 0)
+		code = read_projections(scan, projections, err);
+	if (code == 0)
+		code = read_geometry(scan, geometry, err);
+	if (code == 0)
+		code = orbit_analyse(&scan->orbit, &scan->geometry, err);
+	return code;
+}
+
+int scan_parse(const char *text, size_t length, struct scan **ret_scan, struct error *err)
+{
+	struct scan *scan = calloc(1, sizeof(*scan));
+	int code;
+
+	if (scan == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a scan");
+	code = json_parse(text, length, &scan->document, err);
+	if (code == 0)
+		code = read_document(scan, err);
+	if (code != 0) {
+		scan_free(scan);
+		return code;
+	}
+	drop_nulls(scan->document);
+	*ret_scan = scan;
+	return 0;
+}
+
+void scan_free(struct scan *scan)
+{
+	if (scan == NULL)
+		return;
+	orbit_clear(&scan->orbit);
+	geometry_clear(&scan->geometry);
+	cJSON_Delete(scan->document);
+	free(scan);
+}
+
+/* ---- telling back ---- */
+
+/* To a millionth: what a different way to write the same orbit changes is not shown. */
+static double shown(double value)
+{
+	return rint(value * 1e6) / 1e6 + 0.0;
+}
+
+static void add_number(cJSON *object, const char *name, double value)
+{
+	cJSON_AddNumberToObject(object, name, shown(value));
+}
+
+static const char *weights_name(const struct orbit *orbit)
+{
+	if (orbit->count > 1 && orbit->short_scan)
+		return "parker";
+	return orbit->displaced ? "displaced" : "none";
+}
+
+cJSON *scan_derived(const struct scan *scan)
+{
+	const struct orbit *orbit = &scan->orbit;
+	const char *direction = "none", *kind = "single view";
+	cJSON *derived = cJSON_CreateObject(), *pixel;
+
+	if (orbit->direction != 0)
+		direction = orbit->direction > 0 ? "counter-clockwise" : "clockwise";
+	if (orbit->count > 1)
+		kind = orbit->short_scan ? "short" : "full";
+	add_number(derived, "arc_deg", orbit->arc / degree);
+	cJSON_AddStringToObject(derived, "direction", direction); /* seen from +z */
+	cJSON_AddStringToObject(derived, "scan", kind);
+	cJSON_AddBoolToObject(derived, "short_scan", orbit->count > 1 && orbit->short_scan);
+	cJSON_AddStringToObject(derived, "weights", weights_name(orbit));
+	add_number(derived, "fan_angle_deg", orbit->fan / degree);
+	add_number(derived, "source_radius_mm", orbit->source_radius);
+	add_number(derived, "source_to_detector_mm", orbit->source_to_detector);
+	add_number(derived, "field_of_view_mm", orbit->field_of_view);
+	add_number(derived, "detector_displacement_mm", orbit->displacement);
+	cJSON_AddBoolToObject(derived, "untilted", geometry_is_untilted(&scan->geometry));
+	pixel = cJSON_AddArrayToObject(derived, "pixel_at_isocentre_mm");
+	for (int i = 0; i < 2; i++)
+		cJSON_AddItemToArray(pixel, cJSON_CreateNumber(shown(orbit->pixel_at_isocentre[i])));
+	cJSON_AddNumberToObject(derived, "projection_bytes", (double)scan_projection_bytes(scan));
+	return derived;
+}
+
+__attribute__((format(printf, 3, 4))) static void warn(cJSON *list, const char *code, const char *format, ...)
+{
+	cJSON *warning = cJSON_CreateObject();
+	char detail[320];
+	va_list args;
+
+	va_start(args, format);
+	vsnprintf(detail, sizeof(detail), format, args);
+	va_end(args);
+	cJSON_AddStringToObject(warning, "code", code);
+	cJSON_AddStringToObject(warning, "detail", detail);
+	cJSON_AddItemToArray(list, warning);
+}
+
+/* What follows from the arc and the detector's place: which weights, and what they cannot mend. */
+static void warn_weights(cJSON *list, const struct orbit *orbit)
+{
+	double arc = orbit->arc / degree, fan = orbit->fan / degree;
+
+	if (orbit->arc_too_short)
+		warn(list, "arc_too_short",
+		     "the sources cover %.2f degrees; FDK needs 180 and the fan angle of %.2f, %.2f degrees: expect "
+		     "streaks "
+		     "and shading from FDK",
+		     arc, fan, 180 + fan);
+	if (orbit->short_scan)
+		warn(list, "parker_weights", "a short scan of %.2f degrees: Parker weights will apply in FDK", arc);
+	if (orbit->displaced)
+		warn(list, "displaced_detector",
+		     "the detector is displaced by %.2f mm: displaced-detector weights will apply in FDK",
+		     orbit->displacement);
+	if (orbit->field_of_view <= 0)
+		warn(list, "no_field_of_view", "no point of the rotation axis is seen by every view");
+}
+
+struct placed_view {
+	double angle; /* degrees */
+	int index;
+};
+
+static int compare_angles(const void *a, const void *b)
+{
+	const struct placed_view *x = a, *y = b;
+
+	return (x->angle > y->angle) - (x->angle < y->angle);
+}
+
+/* Views at the same angle as another, and holes in the arc. */
+static void warn_angles(cJSON *list, const struct orbit *orbit)
+{
+	const double same = 1e-4; /* degrees: below what any encoder tells */
+	const double hole = 3;    /* times the mean gap; real arms speed up and slow down by less */
+	struct placed_view *views = calloc((size_t)orbit->count, sizeof(*views));
+	int repeated = 0, pair[2] = {0, 0};
+	bool own_gap = orbit->short_scan;
+	double widest = 0, at = 0, mean = orbit->arc / degree / (orbit->count - (orbit->short_scan ? 1 : 0));
+
+	if (views == NULL)
+		return;
+	for (int i = 0; i < orbit->count; i++)
+		views[i] = (struct placed_view){orbit->angle[i] / degree, i};
+	qsort(views, (size_t)orbit->count, sizeof(*views), compare_angles);
+	/* What lies outside of a short arc is no hole in it: passed over once. */
+	for (int i = 0; i < orbit->count; i++) {
+		int next = (i + 1) % orbit->count;
+		double gap = views[next].angle - views[i].angle + (next == 0 ? 360 : 0);
+
+		if (gap < same || gap > 360 - same) {
+			if (repeated++ == 0) {
+				pair[0] = views[i].index;
+				pair[1] = views[next].index;
+			}
+		} else if (own_gap && gap > 360 - orbit->arc / degree - same) {
+			own_gap = false;
+		} else if (gap > widest) {
+			widest = gap;
+			at = views[i].angle;
+		}
+	}
+	if (repeated > 0)
+		warn(list, "duplicate_angles", "%d of %d views repeat the angle of another, such as views %d and %d",
+		     repeated, orbit->count, pair[0], pair[1]);
+	if (widest > hole * mean && widest > same)
+		warn(list, "uneven_angles", "no view within %.2f degrees behind %.2f; the mean gap is %.2f", widest, at,
+		     mean);
+	free(views);
+}
+
+cJSON *scan_warnings(const struct scan *scan)
+{
+	const struct orbit *orbit = &scan->orbit;
+	cJSON *list = cJSON_CreateArray();
+
+	if (orbit->count > 1) {
+		warn_weights(list, orbit);
+		warn_angles(list, orbit);
+	} else {
+		warn(list, "single_view", "one view only: depth cannot be told");
+	}
+	if (scan->air > 0 && scan->saturation > 0 && scan->air >= scan->saturation)
+		warn(list, "air_saturated", "air is %.6g, not below the saturation at %.6g: all of it are defects",
+		     scan->air, scan->saturation);
+	return list;
+}
