@@ -40,22 +40,36 @@ struct recipe {
 };
 enum { SUBSETS_DEFAULT = 0, SUBSETS_VIEWS = -1 };
 
+enum { ITERATIONS_MAX = 100000, GRID_DEFAULT_MOST = 512 };
+
 void recipe_defaults(struct recipe *ret_recipe); /* nothing on; the values that `{}` stages take */
 void recipe_clear(struct recipe *recipe);
+/* Pointers are those of the job's JSON, "/grid/size/0", "/sart/subsets"; ERR_IMPOSSIBLE for all that is out of range. */
 int recipe_check(const struct recipe *recipe, const struct geometry *geometry, struct error *err);
+/*
+ * Writes out what was left open: the grid (orbit_default_grid, at most
+ * GRID_DEFAULT_MOST voxels a side) or its origin, and tv.options.unit =
+ * mu_water / 1000; then checks. A resolved recipe stays as it is.
+ */
+int recipe_resolve(struct recipe *recipe, const struct geometry *geometry, const struct orbit *orbit,
+                   struct error *err);
 
+/* Always finite. */
 struct history_row {
 	int iteration;
-	double residual, change, tv, seconds;
+	double residual; /* ||p - A v|| / ||p||, each view's as it was met; 0 where all of it is zero */
+	double change;   /* ||v - v_before|| / ||v_before|| over the iteration, TV included; 1 where v_before was zero */
+	double tv;       /* sum |grad u| of the volume in gray levels */
+	double seconds;  /* that the iteration took */
 };
 
 enum stage { STAGE_LOAD, STAGE_FDK, STAGE_SART, STAGE_TV, STAGE_SAVE, STAGE_COUNT };
 extern const char *const stage_names[STAGE_COUNT]; /* "load", "fdk", "sart", "tv", "save" */
 
 struct kept_volume {
-	const char *name; /* "fdk", "fdk-tv", "iter-5", "final" */
-	const char *stage; /* "fdk", "tv", "sart" */
-	int iteration;    /* 0 for fdk */
+	const char *name;  /* "fdk", "fdk-tv", "iter-5", "final" */
+	const char *stage; /* "fdk", "tv" (TV after the FDK), "sart" (an iteration, its TV included) */
+	int iteration;     /* 0 before the first */
 	const struct grid *grid;
 	struct volume_norms norms;
 };
@@ -65,39 +79,59 @@ struct recon;
 struct recon_hooks {
 	void *context;
 	bool (*cancelled)(void *context);
-	/* Asked after each iteration; true ends the run with ERR_BUSY, recon_iterate_state tells where. */
+	/*
+	 * Asked after each iteration but the last; true ends the run with ERR_BUSY:
+	 * recon_iteration and recon_read then give what recon_resume wants.
+	 */
 	bool (*yield)(void *context);
-	void (*progress)(void *context, enum stage stage, int iteration, double fraction /* of the whole, 0..1 */);
+	/* At the beginning of what `stage` says; the fraction is of the whole, 0..1. */
+	void (*progress)(void *context, enum stage stage, int iteration, double fraction);
 	void (*row)(void *context, const struct history_row *row);
-	/* Called for each volume that is to be kept; reads it with recon_read. Non-zero ends the run. */
+	/*
+	 * Called for each volume that is to be kept; reads it with recon_read. Below zero ends the run. The last volume
+	 * comes as "final", and before that under its own name where the recipe asks for that too.
+	 */
 	int (*keep)(void *context, struct recon *recon, const struct kept_volume *volume, struct error *err);
+	/* "defects": samples were replaced; "short_arc": FDK of less than 180 degrees plus the fan. */
 	void (*warning)(void *context, const char *code, const char *detail);
-};
+}; /* any of them may be NULL */
 
 struct recon_memory {
 	size_t projections, volumes, scratch, total; /* bytes on the device */
 	size_t available;                            /* bytes free there */
 };
 
-/* What a job will take, before it is opened. device NULL (the daemon, that opens none): available is 0. */
+/*
+ * What a job will take at most, before it is opened. The projections are all
+ * kept for SART; FDK alone needs a few at a time. device NULL (the daemon, that
+ * opens none): available is 0.
+ */
 int recon_memory(const struct backend *backend, struct device *device, const struct geometry *geometry,
                  const struct recipe *recipe, struct recon_memory *ret_memory, struct error *err);
 
-/* geometry, linearise's images and hooks are borrowed until recon_free; the recipe is copied. */
+/*
+ * geometry, linearise's images, hooks, backend and device are borrowed until
+ * recon_free; the recipe is copied and resolved. Checks, then refuses with
+ * ERR_NO_MEMORY what does not fit, then allocates.
+ */
 int recon_open(const struct backend *backend, struct device *device, const struct geometry *geometry,
                const struct linearise *linearise, const struct recipe *recipe, const struct recon_hooks *hooks,
                struct recon **ret_recon, struct error *err);
 void recon_free(struct recon *recon);
 
-/* Views as raw samples, in any order, each once: linearised, and filtered and backprojected where FDK is on. */
+/*
+ * Views as raw samples [view][row][column], in any order, each once (ERR_CONFLICT):
+ * linearised, and filtered and backprojected where FDK is on, however many a call brings.
+ */
 int recon_push(struct recon *recon, const void *samples, const int *views, int count, struct error *err);
 
-/* After the last view: finishes FDK, then TV, SART and TV in turn, calling the hooks. */
+/* Once, after the last view: finishes FDK, then TV, SART and TV in turn, calling the hooks. */
 int recon_run(struct recon *recon, struct error *err);
 
 /*
- * Goes on behind `iteration` with the iterate that was there: instead of the
- * FDK that recon_run would finish. Call before the first recon_push, which then skips FDK.
+ * Goes on behind `iteration` (0 .. sart.iterations) with the iterate that was
+ * there, instead of FDK: the same bits as if it had never stopped. Call before
+ * the first recon_push, which then skips FDK. A recipe without SART is refused.
  */
 int recon_resume(struct recon *recon, const float *volume, int iteration, struct error *err);
 
@@ -111,9 +145,10 @@ const char *recon_plan(const struct recon *recon); /* how the backend does it */
 
 /* ---- sart.c: subsets ---- */
 /*
- * Views ordered by largest angular distance to those before, then cut into
- * `count` ordered subsets: subset s takes every count-th view, so that each is
- * spread over the whole arc. Free with subsets_clear.
+ * `count` (1 .. views) ordered subsets, each of every count-th view along the
+ * arc, so that each is spread over all of it; sizes differ by one at most. They
+ * are ordered so that each is far in angle from those before it. The same orbit
+ * gives the same order. Free with subsets_clear.
  */
 int subsets_make(struct subsets *ret_subsets, const struct orbit *orbit, int count, struct error *err);
 void subsets_clear(struct subsets *subsets);

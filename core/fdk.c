@@ -1,0 +1,96 @@
+/*
+ * FDK: the cone-beam algorithm of Feldkamp, Davis and Kress (J. Opt. Soc. Am. A
+ * 1, 1984, eq. 28), view by view as the projections arrive:
+ *
+ *   f(x) = sum over views of (D / depth(x))^2 q(column(x), row(x)),
+ *   q    = ramp along the row of (weight[view][column] cos(gamma) p).
+ *
+ * The sum has no order of its own, so a scan can be reconstructed while it is
+ * still being acquired. What depends on the view alone (angular, short-scan and
+ * displaced weights, orbit.h) and the filter (filter.h) are made once.
+ */
+#include "core/fdk.h"
+
+#include <assert.h>
+#include <stdlib.h>
+
+int fdk_weights_make(struct fdk_weights *ret_weights, const struct orbit *orbit, const struct geometry *geometry,
+		     enum window window, double cutoff, struct error *err)
+{
+	int length = filter_length(geometry->columns), code = 0;
+	struct fdk_weights weights = {
+	    .columns = malloc(sizeof(float) * (size_t)geometry->count * (size_t)geometry->columns),
+	    .response = malloc(sizeof(float) * ((size_t)length / 2 + 1)),
+	};
+
+	if (weights.columns == NULL || weights.response == NULL) {
+		code = error_set(err, ERR_NO_MEMORY, "no memory for the FDK weights of %d views", geometry->count);
+		goto out;
+	}
+	code = filter_response(window, cutoff, 1, length, weights.response, err);
+	if (code < 0)
+		goto out;
+	orbit_column_weights(orbit, geometry, weights.columns);
+	*ret_weights = weights;
+out:
+	if (code < 0)
+		fdk_weights_clear(&weights);
+	return code;
+}
+
+void fdk_weights_clear(struct fdk_weights *weights)
+{
+	free(weights->columns);
+	free(weights->response);
+	*weights = (struct fdk_weights){0};
+}
+
+int fdk_batch(const struct backend *backend, const struct plan *plan, int views)
+{
+	int batch = backend->plan_batch(plan);
+
+	if (batch > FDK_BATCH_MOST)
+		batch = FDK_BATCH_MOST;
+	return batch < views ? batch : views;
+}
+
+int fdk_open(struct fdk *ret_fdk, const struct backend *backend, struct device *device, struct plan *plan,
+	     const struct geometry *geometry, struct error *err)
+{
+	struct fdk fdk = {.backend = backend, .plan = plan, .batch = fdk_batch(backend, plan, geometry->count)};
+	int code = backend->stack_new(device, geometry->columns, geometry->rows, fdk.batch, &fdk.filtered, err);
+
+	if (code < 0)
+		return code;
+	*ret_fdk = fdk;
+	return 0;
+}
+
+void fdk_clear(struct fdk *fdk)
+{
+	if (fdk->backend != NULL)
+		fdk->backend->stack_free(fdk->filtered);
+	*fdk = (struct fdk){0};
+}
+
+int fdk_add(struct fdk *fdk, int view, int slot, const struct stack *from, struct volume *to, struct error *err)
+{
+	assert(fdk->pending < fdk->batch);
+	fdk->views[fdk->pending] = view;
+	fdk->slots[fdk->pending] = slot;
+	fdk->pending++;
+	return fdk->pending < fdk->batch ? 0 : fdk_flush(fdk, from, to, err);
+}
+
+int fdk_flush(struct fdk *fdk, const struct stack *from, struct volume *to, struct error *err)
+{
+	int count = fdk->pending, code;
+
+	if (count == 0)
+		return 0;
+	fdk->pending = 0;
+	code = fdk->backend->filter(fdk->plan, from, fdk->slots, fdk->views, count, fdk->filtered, err);
+	if (code < 0)
+		return code;
+	return fdk->backend->backproject(fdk->plan, fdk->filtered, fdk->views, count, BACKPROJECT_FDK, to, err);
+}

@@ -1,0 +1,46 @@
+#ifndef CBCT_CORE_FDK_H
+#define CBCT_CORE_FDK_H
+
+#include "core/backend.h"
+
+/* The FDK stage of core/recon.c, and nobody else's. */
+
+/* What the backend's `filter` needs beside the projections. */
+struct fdk_weights {
+	float *columns;  /* [view][column], owned */
+	float *response; /* [length/2 + 1], owned */
+};
+
+/* Free with fdk_weights_clear. */
+int fdk_weights_make(struct fdk_weights *ret_weights, const struct orbit *orbit, const struct geometry *geometry,
+		     enum window window, double cutoff, struct error *err);
+void fdk_weights_clear(struct fdk_weights *weights);
+
+/*
+ * Views that are filtered and backprojected in one go, at most: memory is
+ * counted with it before any plan can be asked, and by 32 views the pass over
+ * the volume that a batch costs is long hidden behind the samples it takes.
+ */
+enum { FDK_BATCH_MOST = 32 };
+
+struct fdk {
+	const struct backend *backend;
+	struct plan *plan;                                /* borrowed */
+	struct stack *filtered;                           /* [batch][row][column], owned */
+	int batch;                                        /* views in one go */
+	int pending;                                      /* views that wait for their batch to be full */
+	int views[FDK_BATCH_MOST], slots[FDK_BATCH_MOST]; /* of those, and where they lie */
+};
+
+/* Views in one go for this plan and this many views. */
+int fdk_batch(const struct backend *backend, const struct plan *plan, int views);
+int fdk_open(struct fdk *ret_fdk, const struct backend *backend, struct device *device, struct plan *plan,
+	     const struct geometry *geometry, struct error *err);
+void fdk_clear(struct fdk *fdk);
+
+/* Takes the view that lies in this slot of `from`; when the batch is full, fdk_flush. */
+int fdk_add(struct fdk *fdk, int view, int slot, const struct stack *from, struct volume *to, struct error *err);
+/* Filters what is pending and adds it to the volume. */
+int fdk_flush(struct fdk *fdk, const struct stack *from, struct volume *to, struct error *err);
+
+#endif

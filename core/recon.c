@@ -1,0 +1,763 @@
+/*
+ * One reconstruction: FDK, then SART, with TV after the FDK volume and after
+ * each SART iteration, over any backend. Everything is allocated when it is
+ * opened, after the bytes it needs were compared with those that are free.
+ */
+#include "core/recon.h"
+
+#include <math.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+
+#include "core/fdk.h"
+#include "core/sart.h"
+
+const char *const stage_names[STAGE_COUNT] = {"load", "fdk", "sart", "tv", "save"};
+
+/* ---- the recipe ---- */
+
+void recipe_defaults(struct recipe *ret_recipe)
+{
+	*ret_recipe = (struct recipe){
+	    .fdk = {.window = WINDOW_HANN, .cutoff = 1},
+	    .sart = {.iterations = 10, .relaxation = 1, .subsets = SUBSETS_DEFAULT, .nonnegative = true},
+	    .tv = {.after_fdk = true, .options = {.method = TV_GRADIENT, .alpha = 0.1, .step = 0.1, .iterations = 10}},
+	    .mu_water = 0.0192,
+	};
+}
+
+void recipe_clear(struct recipe *recipe)
+{
+	free(recipe->emit);
+	*recipe = (struct recipe){0};
+}
+
+static int recipe_copy(struct recipe *ret_recipe, const struct recipe *recipe, struct error *err)
+{
+	struct recipe copy = *recipe;
+
+	if (recipe->emits > 0) {
+		size_t bytes = sizeof(int) * (size_t)recipe->emits;
+
+		copy.emit = malloc(bytes);
+		if (copy.emit == NULL)
+			return error_set(err, ERR_NO_MEMORY, "no memory for %d emitted iterations", recipe->emits);
+		memcpy(copy.emit, recipe->emit, bytes);
+	} else {
+		copy.emit = NULL;
+	}
+	*ret_recipe = copy;
+	return 0;
+}
+
+/* A NaN is in no range. */
+static int check_range(double value, double least, double most, bool least_too, const char *pointer, struct error *err)
+{
+	if (value <= most && (value > least || (least_too && value == least)))
+		return 0;
+	if (most == INFINITY)
+		return error_set_at(err, ERR_IMPOSSIBLE, pointer, "%g is not %s %g", value,
+				    least_too ? "at least" : "above", least);
+	return error_set_at(err, ERR_IMPOSSIBLE, pointer, "%g is not %s %g and at most %g", value,
+			    least_too ? "at least" : "above", least, most);
+}
+
+static int check_finite(double value, const char *pointer, struct error *err)
+{
+	if (isfinite(value))
+		return 0;
+	return error_set_at(err, ERR_IMPOSSIBLE, pointer, "%g is not a finite number", value);
+}
+
+static int check_positive(double value, bool zero_too, const char *pointer, struct error *err)
+{
+	int code = check_finite(value, pointer, err);
+
+	return code < 0 ? code : check_range(value, 0, INFINITY, zero_too, pointer, err);
+}
+
+static int check_sart(const struct recipe *recipe, int views, struct error *err)
+{
+	int code = check_range(recipe->sart.iterations, 1, ITERATIONS_MAX, true, "/sart/iterations", err);
+
+	/* Each update is a projection for 1, a reflection for 2, and grows beyond that. */
+	if (code == 0)
+		code = check_range(recipe->sart.relaxation, 0, 2, false, "/sart/relaxation", err);
+	if (code == 0 && recipe->sart.subsets != SUBSETS_DEFAULT && recipe->sart.subsets != SUBSETS_VIEWS &&
+	    (recipe->sart.subsets < 1 || recipe->sart.subsets > views))
+		code = error_set_at(err, ERR_IMPOSSIBLE, "/sart/subsets",
+				    "%d subsets of %d views: there can be 1 to %d, or \"views\"", recipe->sart.subsets,
+				    views, views);
+	if (code == 0)
+		code = check_positive(recipe->sart.stop_residual, true, "/sart/stop/residual", err);
+	if (code == 0)
+		code = check_positive(recipe->sart.stop_change, true, "/sart/stop/change", err);
+	return code;
+}
+
+static int check_tv(const struct recipe *recipe, struct error *err)
+{
+	const struct tv_options *tv = &recipe->tv.options;
+	int code = check_positive(tv->alpha, tv->method == TV_GRADIENT, "/tv/alpha", err);
+
+	if (code == 0)
+		code = check_positive(tv->step, false, "/tv/step", err);
+	if (code == 0)
+		code = check_range(tv->iterations, 1, ITERATIONS_MAX, true, "/tv/iterations", err);
+	if (code == 0)
+		code = check_positive(tv->unit, true, "/tv/unit", err);
+	return code;
+}
+
+/* A volume that can never come is refused here, not missed at the end. */
+static int check_emit(const struct recipe *recipe, struct error *err)
+{
+	for (int i = 0; i < recipe->emits; i++) {
+		int emit = recipe->emit[i], last = recipe->sart.on ? recipe->sart.iterations : 0;
+		char pointer[32];
+
+		snprintf(pointer, sizeof(pointer), "/emit/%d", i);
+		if (emit == EMIT_FDK && !recipe->fdk.on)
+			return error_set_at(err, ERR_IMPOSSIBLE, pointer, "\"fdk\" is wanted, but no FDK is run");
+		if (emit == EMIT_FDK_TV && !(recipe->fdk.on && recipe->tv.on && recipe->tv.after_fdk))
+			return error_set_at(err, ERR_IMPOSSIBLE, pointer,
+					    "\"fdk-tv\" is wanted, but no TV is run after an FDK");
+		if (emit != EMIT_FDK && emit != EMIT_FDK_TV && (emit < 1 || emit > last))
+			return error_set_at(err, ERR_IMPOSSIBLE, pointer,
+					    "iteration %d is wanted, but %d iterations are run", emit, last);
+	}
+	return 0;
+}
+
+static int check_grid(const struct recipe *recipe, const struct geometry *geometry, struct error *err)
+{
+	struct grid grid = recipe->grid;
+	int code = grid_check(&grid, err);
+
+	if (code == 0) {
+		if (!recipe->has_origin)
+			grid_centre(&grid);
+		code = grid_check_geometry(&grid, geometry, err);
+	}
+	if (code < 0)
+		error_nest(err, "/grid");
+	return code;
+}
+
+int recipe_check(const struct recipe *recipe, const struct geometry *geometry, struct error *err)
+{
+	int code = 0;
+
+	if (!recipe->fdk.on && !recipe->sart.on)
+		return error_set(err, ERR_IMPOSSIBLE, "neither \"fdk\" nor \"sart\" is given, there is nothing to run");
+	if (recipe->fdk.on)
+		code = check_range(recipe->fdk.cutoff, 0, 1, false, "/fdk/cutoff", err);
+	if (code == 0 && recipe->sart.on)
+		code = check_sart(recipe, geometry->count, err);
+	if (code == 0 && recipe->tv.on)
+		code = check_tv(recipe, err);
+	if (code == 0)
+		code = check_positive(recipe->mu_water, false, "/mu_water", err);
+	if (code == 0)
+		code = check_emit(recipe, err);
+	if (code == 0 && recipe->has_grid)
+		code = check_grid(recipe, geometry, err);
+	return code;
+}
+
+int recipe_resolve(struct recipe *recipe, const struct geometry *geometry, const struct orbit *orbit, struct error *err)
+{
+	struct recipe resolved = *recipe;
+	int code;
+
+	if (!resolved.has_grid) {
+		orbit_default_grid(orbit, geometry, GRID_DEFAULT_MOST, &resolved.grid);
+		resolved.has_origin = true;
+	} else if (!resolved.has_origin && grid_check(&resolved.grid, err) == 0) {
+		grid_centre(&resolved.grid);
+		resolved.has_origin = true;
+	}
+	resolved.has_grid = true;
+	if (resolved.tv.options.unit == 0)
+		resolved.tv.options.unit = resolved.mu_water / 1000;
+	code = recipe_check(&resolved, geometry, err);
+	if (code == 0)
+		*recipe = resolved;
+	return code;
+}
+
+/* ---- opening ---- */
+
+struct recon {
+	const struct backend *backend;
+	struct device *device;
+	const struct geometry *geometry;
+	const struct recon_hooks *hooks;
+	struct cancel cancel;
+
+	struct recipe recipe; /* resolved */
+	struct orbit orbit;
+	struct linearise linearise;
+	struct fdk_weights weights;
+	struct sart_options sart;
+
+	struct plan *plan;
+	struct fdk fdk;            /* where FDK is on */
+	struct stack *projections; /* a slot for each view with SART, else for each view of an FDK batch */
+	struct volume *volume;     /* the iterate */
+	struct volume *before;     /* the iterate before the iteration; NULL without SART */
+
+	unsigned char *pushed; /* [views] */
+	int pushed_count;
+	size_t defects;      /* samples */
+	int defective_views; /* views with any */
+
+	bool resumed, ran;
+	int iteration; /* done so far */
+	struct volume_norms norms;
+	double work_done, work_total; /* in FDKs of the whole scan */
+};
+
+/*
+ * What the stages cost beside an FDK of the whole scan, roughly, as measured on
+ * CPU and GPU alike: only the progress bar lives on it.
+ */
+static const double WORK_LOAD = 0.2, WORK_FDK = 1, WORK_SART = 4, WORK_TV = 0.2;
+
+static double recipe_work(const struct recipe *recipe)
+{
+	double work = WORK_LOAD;
+
+	if (recipe->fdk.on)
+		work += WORK_FDK + (recipe->tv.on && recipe->tv.after_fdk ? WORK_TV : 0);
+	if (recipe->sart.on)
+		work += recipe->sart.iterations * (WORK_SART + (recipe->tv.on ? WORK_TV : 0));
+	return work;
+}
+
+static struct plan_options plan_options(const struct recipe *recipe, const struct geometry *geometry,
+					const struct linearise *linearise, const struct fdk_weights *weights,
+					const struct sart_options *sart)
+{
+	return (struct plan_options){
+	    .geometry = geometry,
+	    .grid = &recipe->grid,
+	    .linearise = *linearise,
+	    .column_weights = recipe->fdk.on ? weights->columns : NULL,
+	    .filter_response = recipe->fdk.on ? weights->response : NULL,
+	    .sart = recipe->sart.on ? sart : NULL,
+	    .tv = recipe->tv.on ? &recipe->tv.options : NULL,
+	    .reference_precision = recipe->reference_precision,
+	};
+}
+
+static int sart_options_make(struct sart_options *ret_sart, const struct recipe *recipe, const struct orbit *orbit,
+			     struct error *err)
+{
+	struct sart_options sart = {.relaxation = recipe->sart.relaxation, .nonnegative = recipe->sart.nonnegative};
+	int code = subsets_make(&sart.subsets, orbit, subsets_count(recipe->sart.subsets, orbit->count), err);
+
+	if (code == 0)
+		*ret_sart = sart;
+	return code;
+}
+
+static int memory_needed(const struct backend *backend, struct device *device, const struct plan_options *options,
+			 struct recon_memory *ret_memory, struct error *err)
+{
+	struct recon_memory memory = {0};
+	struct plan_bytes bytes;
+	struct device_info info;
+	int views = options->geometry->count;
+	size_t slot, batch;
+	int code = backend->plan_bytes(device, options, &bytes, err);
+
+	if (code < 0)
+		return code;
+	slot = (bytes.stack + (size_t)views - 1) / (size_t)views;
+	batch = slot * (size_t)(views < FDK_BATCH_MOST ? views : FDK_BATCH_MOST);
+	memory.projections = options->sart != NULL ? bytes.stack : batch;
+	memory.volumes = bytes.volumes;
+	memory.scratch = bytes.scratch + bytes.raw + (options->column_weights != NULL ? batch : 0);
+	memory.total = memory.projections + memory.volumes + memory.scratch;
+	if (device != NULL) {
+		backend->describe(device, &info);
+		memory.available = info.bytes_free;
+	}
+	*ret_memory = memory;
+	return 0;
+}
+
+int recon_memory(const struct backend *backend, struct device *device, const struct geometry *geometry,
+		 const struct recipe *recipe, struct recon_memory *ret_memory, struct error *err)
+{
+	float some = 0; /* stands for the weights: only whether there are any is asked here */
+	const struct fdk_weights weights = {.columns = &some, .response = &some};
+	const struct linearise linearise = {.sample = SAMPLE_FLOAT32};
+	struct recipe resolved = *recipe;
+	struct orbit orbit;
+	struct sart_options sart = {0};
+	struct plan_options options;
+	int code = orbit_analyse(&orbit, geometry, err);
+
+	if (code < 0)
+		return code;
+	code = recipe_resolve(&resolved, geometry, &orbit, err);
+	if (code == 0 && resolved.sart.on)
+		code = sart_options_make(&sart, &resolved, &orbit, err);
+	if (code == 0) {
+		options = plan_options(&resolved, geometry, &linearise, &weights, &sart);
+		code = memory_needed(backend, device, &options, ret_memory, err);
+	}
+	subsets_clear(&sart.subsets);
+	orbit_clear(&orbit);
+	return code;
+}
+
+static int refuse_what_does_not_fit(const struct recon *recon, const struct plan_options *options, struct error *err)
+{
+	const double mib = 1 << 20;
+	struct recon_memory memory;
+	int code = memory_needed(recon->backend, recon->device, options, &memory, err);
+
+	if (code == 0 && memory.total > memory.available)
+		return error_set_at(
+		    err, ERR_NO_MEMORY, "/grid",
+		    "%.1f MiB are needed (projections %.1f, volumes %.1f, scratch %.1f), %.1f MiB are free",
+		    (double)memory.total / mib, (double)memory.projections / mib, (double)memory.volumes / mib,
+		    (double)memory.scratch / mib, (double)memory.available / mib);
+	return code;
+}
+
+/* What the plan is made from: everything that is known before any device memory is taken. */
+static int recon_prepare(struct recon *recon, const struct recipe *recipe, struct error *err)
+{
+	const struct geometry *geometry = recon->geometry;
+	int code = recipe_copy(&recon->recipe, recipe, err);
+
+	if (code == 0)
+		code = orbit_analyse(&recon->orbit, geometry, err);
+	if (code == 0)
+		code = recipe_resolve(&recon->recipe, geometry, &recon->orbit, err);
+	if (code == 0 && recon->recipe.fdk.on)
+		code = fdk_weights_make(&recon->weights, &recon->orbit, geometry, recon->recipe.fdk.window,
+					recon->recipe.fdk.cutoff, err);
+	if (code == 0 && recon->recipe.sart.on)
+		code = sart_options_make(&recon->sart, &recon->recipe, &recon->orbit, err);
+	if (code < 0)
+		return code;
+	recon->work_total = recipe_work(&recon->recipe);
+	recon->pushed = calloc((size_t)geometry->count, 1);
+	if (recon->pushed == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for the list of %d views", geometry->count);
+	return 0;
+}
+
+static int recon_allocate(struct recon *recon, struct error *err)
+{
+	const struct backend *backend = recon->backend;
+	const struct geometry *geometry = recon->geometry;
+	const struct recipe *recipe = &recon->recipe;
+	const struct plan_options options =
+	    plan_options(recipe, geometry, &recon->linearise, &recon->weights, &recon->sart);
+	int code = refuse_what_does_not_fit(recon, &options, err);
+
+	if (code == 0)
+		code = backend->plan_new(recon->device, &options, &recon->plan, err);
+	if (code == 0 && recipe->fdk.on)
+		code = fdk_open(&recon->fdk, backend, recon->device, recon->plan, geometry, err);
+	if (code == 0)
+		code =
+		    backend->stack_new(recon->device, geometry->columns, geometry->rows,
+				       recipe->sart.on ? geometry->count : recon->fdk.batch, &recon->projections, err);
+	if (code == 0)
+		code = backend->volume_new(recon->device, &recipe->grid, &recon->volume, err);
+	if (code == 0)
+		code = backend->volume_fill(recon->volume, 0, err);
+	if (code == 0 && recipe->sart.on)
+		code = backend->volume_new(recon->device, &recipe->grid, &recon->before, err);
+	return code;
+}
+
+int recon_open(const struct backend *backend, struct device *device, const struct geometry *geometry,
+	       const struct linearise *linearise, const struct recipe *recipe, const struct recon_hooks *hooks,
+	       struct recon **ret_recon, struct error *err)
+{
+	struct recon *recon = calloc(1, sizeof(*recon));
+	int code;
+
+	if (recon == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a reconstruction");
+	recon->backend = backend;
+	recon->device = device;
+	recon->geometry = geometry;
+	recon->linearise = *linearise;
+	recon->hooks = hooks;
+	recon->cancel = (struct cancel){.asked = hooks->cancelled, .context = hooks->context};
+	code = recon_prepare(recon, recipe, err);
+	if (code == 0)
+		code = recon_allocate(recon, err);
+	if (code < 0) {
+		recon_free(recon);
+		return code;
+	}
+	*ret_recon = recon;
+	return 0;
+}
+
+void recon_free(struct recon *recon)
+{
+	if (recon == NULL)
+		return;
+	recon->backend->volume_free(recon->before);
+	recon->backend->volume_free(recon->volume);
+	recon->backend->stack_free(recon->projections);
+	fdk_clear(&recon->fdk);
+	recon->backend->plan_free(recon->plan);
+	subsets_clear(&recon->sart.subsets);
+	fdk_weights_clear(&recon->weights);
+	orbit_clear(&recon->orbit);
+	recipe_clear(&recon->recipe);
+	free(recon->pushed);
+	free(recon);
+}
+
+/* ---- hooks ---- */
+
+static void tell_progress(struct recon *recon, enum stage stage, int iteration)
+{
+	double fraction = recon->work_done / recon->work_total;
+
+	if (recon->hooks->progress != NULL)
+		recon->hooks->progress(recon->hooks->context, stage, iteration, fraction < 1 ? fraction : 1);
+}
+
+static int check_cancelled(const struct recon *recon, struct error *err)
+{
+	if (recon->cancel.asked != NULL && recon->cancel.asked(recon->cancel.context))
+		return error_set(err, ERR_CANCELLED, "cancelled");
+	return 0;
+}
+
+static const struct cancel *cancel_of(const struct recon *recon)
+{
+	return recon->cancel.asked != NULL ? &recon->cancel : NULL;
+}
+
+static bool is_wanted(const struct recipe *recipe, int emit)
+{
+	for (int i = 0; i < recipe->emits; i++)
+		if (recipe->emit[i] == emit)
+			return true;
+	return false;
+}
+
+static int keep(struct recon *recon, const char *name, const char *stage, struct error *err)
+{
+	const struct kept_volume kept = {
+	    .name = name,
+	    .stage = stage,
+	    .iteration = recon->iteration,
+	    .grid = &recon->recipe.grid,
+	    .norms = recon->norms,
+	};
+
+	if (recon->hooks->keep == NULL)
+		return 0;
+	tell_progress(recon, STAGE_SAVE, recon->iteration);
+	return recon->hooks->keep(recon->hooks->context, recon, &kept, err);
+}
+
+static void warn_of_the_input(struct recon *recon)
+{
+	const double degrees = 57.29577951308232;
+	size_t samples =
+	    (size_t)recon->geometry->count * (size_t)recon->geometry->columns * (size_t)recon->geometry->rows;
+	char detail[256];
+
+	if (recon->hooks->warning == NULL)
+		return;
+	if (recon->defects > 0) {
+		snprintf(detail, sizeof(detail),
+			 "%zu samples (%.3g %%) in %d projections were replaced from their neighbours", recon->defects,
+			 100.0 * (double)recon->defects / (double)samples, recon->defective_views);
+		recon->hooks->warning(recon->hooks->context, "defects", detail);
+	}
+	if (recon->recipe.fdk.on && recon->orbit.arc_too_short) {
+		snprintf(detail, sizeof(detail),
+			 "FDK of an arc of %.1f degrees; a complete one has 180 degrees and the fan of %.1f degrees",
+			 recon->orbit.arc * degrees, recon->orbit.fan * degrees);
+		recon->hooks->warning(recon->hooks->context, "short_arc", detail);
+	}
+}
+
+/* ---- views in ---- */
+
+static bool fdk_runs(const struct recon *recon)
+{
+	return recon->recipe.fdk.on && !recon->resumed;
+}
+
+static int check_views(const struct recon *recon, const int *views, int count, struct error *err)
+{
+	int all = recon->geometry->count;
+
+	if (recon->ran)
+		return error_set(err, ERR_CONFLICT, "views came after the reconstruction had run");
+	for (int i = 0; i < count; i++) {
+		if (views[i] < 0 || views[i] >= all)
+			return error_set(err, ERR_INVALID, "view %d: there are 0 to %d", views[i], all - 1);
+		if (recon->pushed[views[i]])
+			return error_set(err, ERR_CONFLICT, "view %d came a second time", views[i]);
+	}
+	return 0;
+}
+
+static int push_view(struct recon *recon, const void *samples, int view, struct error *err)
+{
+	int slot = recon->recipe.sart.on ? view : recon->fdk.pending, code;
+	size_t defects = 0;
+
+	/* Again here: the list of one call may name a view twice. */
+	if (recon->pushed[view])
+		return error_set(err, ERR_CONFLICT, "view %d came a second time", view);
+	/* One by one, so that the projections with defects can be counted. */
+	code = recon->backend->linearise(recon->plan, samples, 1, &slot, recon->projections, &defects, err);
+	if (code < 0)
+		return code;
+	recon->pushed[view] = 1;
+	recon->pushed_count++;
+	recon->defects += defects;
+	recon->defective_views += defects > 0;
+	recon->work_done += WORK_LOAD / recon->geometry->count;
+	if (!fdk_runs(recon))
+		return 0;
+	recon->work_done += WORK_FDK / recon->geometry->count;
+	return fdk_add(&recon->fdk, view, slot, recon->projections, recon->volume, err);
+}
+
+int recon_push(struct recon *recon, const void *samples, const int *views, int count, struct error *err)
+{
+	size_t sample = recon->linearise.sample == SAMPLE_UINT16 ? sizeof(uint16_t) : sizeof(float);
+	size_t view_bytes = sample * (size_t)recon->geometry->columns * (size_t)recon->geometry->rows;
+	int code = check_views(recon, views, count, err);
+
+	if (code < 0)
+		return code;
+	tell_progress(recon, fdk_runs(recon) ? STAGE_FDK : STAGE_LOAD, recon->iteration);
+	for (int i = 0; i < count; i++) {
+		code = check_cancelled(recon, err);
+		if (code == 0)
+			code = push_view(recon, (const char *)samples + (size_t)i * view_bytes, views[i], err);
+		if (code < 0)
+			return code;
+	}
+	return 0;
+}
+
+int recon_resume(struct recon *recon, const float *volume, int iteration, struct error *err)
+{
+	int code;
+
+	if (!recon->recipe.sart.on)
+		return error_set(err, ERR_INVALID, "without SART there is no iteration to go on from");
+	if (iteration < 0 || iteration > recon->recipe.sart.iterations)
+		return error_set(err, ERR_INVALID, "iteration %d to go on from: there are 0 to %d", iteration,
+				 recon->recipe.sart.iterations);
+	if (recon->pushed_count > 0 || recon->ran)
+		return error_set(err, ERR_CONFLICT, "an iterate came after %d views", recon->pushed_count);
+	code = recon->backend->volume_upload(recon->volume, volume, err);
+	if (code < 0)
+		return code;
+	recon->resumed = true;
+	recon->iteration = iteration;
+	recon->work_done =
+	    recon->work_total - WORK_LOAD -
+	    (recon->recipe.sart.iterations - iteration) * (WORK_SART + (recon->recipe.tv.on ? WORK_TV : 0));
+	return 0;
+}
+
+/* ---- the run ---- */
+
+static int measure(struct recon *recon, const struct volume *other, struct error *err)
+{
+	return recon->backend->norms(recon->plan, recon->volume, other, recon->recipe.tv.options.unit, &recon->norms,
+				     err);
+}
+
+static int run_tv(struct recon *recon, int iteration, struct error *err)
+{
+	int code;
+
+	tell_progress(recon, STAGE_TV, iteration);
+	code = recon->backend->tv(recon->plan, recon->volume, cancel_of(recon), err);
+	recon->work_done += WORK_TV;
+	return code;
+}
+
+/* The FDK volume and what is made of it before the first iteration. */
+static int finish_fdk(struct recon *recon, struct error *err)
+{
+	const struct recipe *recipe = &recon->recipe;
+	int code = fdk_flush(&recon->fdk, recon->projections, recon->volume, err);
+
+	if (code == 0)
+		code = measure(recon, NULL, err);
+	if (code == 0 && recon->norms.not_finite > 0)
+		code = error_set(err, ERR_IMPOSSIBLE,
+				 "%zu voxels of the FDK volume are not finite: the projections' values are too large",
+				 recon->norms.not_finite);
+	if (code == 0 && is_wanted(recipe, EMIT_FDK))
+		code = keep(recon, "fdk", "fdk", err);
+	if (code < 0 || !recipe->tv.on || !recipe->tv.after_fdk)
+		return code;
+	code = check_cancelled(recon, err);
+	if (code == 0)
+		code = run_tv(recon, 0, err);
+	if (code == 0)
+		code = measure(recon, NULL, err);
+	if (code == 0 && recon->norms.not_finite > 0)
+		code = error_set(err, ERR_IMPOSSIBLE,
+				 "TV has diverged: %zu voxels are not finite; a smaller step is needed",
+				 recon->norms.not_finite);
+	if (code == 0 && is_wanted(recipe, EMIT_FDK_TV))
+		code = keep(recon, "fdk-tv", "tv", err);
+	return code;
+}
+
+static double now(void)
+{
+	struct timespec time;
+
+	clock_gettime(CLOCK_MONOTONIC, &time);
+	return (double)time.tv_sec + 1e-9 * (double)time.tv_nsec;
+}
+
+/* One iteration, TV included, and its row of the history. */
+static int iterate(struct recon *recon, struct history_row *ret_row, struct error *err)
+{
+	const struct backend *backend = recon->backend;
+	int iteration = recon->iteration + 1;
+	double begin = now(), norm2_before = recon->norms.norm2;
+	struct sart_sums sums;
+	int code;
+
+	tell_progress(recon, STAGE_SART, iteration);
+	code = backend->volume_copy(recon->before, recon->volume, err);
+	if (code == 0)
+		code =
+		    backend->sart_iterate(recon->plan, recon->projections, recon->volume, cancel_of(recon), &sums, err);
+	if (code < 0)
+		return code;
+	recon->work_done += WORK_SART;
+	if (recon->recipe.tv.on)
+		code = run_tv(recon, iteration, err);
+	if (code == 0)
+		code = measure(recon, recon->before, err);
+	if (code == 0)
+		code = sart_row(iteration, &sums, &recon->norms, norm2_before, ret_row, err);
+	if (code < 0)
+		return code;
+	ret_row->seconds = now() - begin;
+	recon->iteration = iteration;
+	return 0;
+}
+
+static bool is_last(const struct recipe *recipe, const struct history_row *row)
+{
+	return row->iteration >= recipe->sart.iterations ||
+	       (recipe->sart.stop_residual > 0 && row->residual <= recipe->sart.stop_residual) ||
+	       (recipe->sart.stop_change > 0 && row->change <= recipe->sart.stop_change);
+}
+
+static int run_sart(struct recon *recon, struct error *err)
+{
+	const struct recon_hooks *hooks = recon->hooks;
+	bool last = recon->iteration >= recon->recipe.sart.iterations;
+
+	while (!last) {
+		struct history_row row;
+		char name[32];
+		int code = check_cancelled(recon, err);
+
+		if (code == 0)
+			code = iterate(recon, &row, err);
+		if (code < 0)
+			return code;
+		last = is_last(&recon->recipe, &row);
+		if (hooks->row != NULL)
+			hooks->row(hooks->context, &row);
+		snprintf(name, sizeof(name), "iter-%d", row.iteration);
+		if (is_wanted(&recon->recipe, row.iteration))
+			code = keep(recon, name, "sart", err);
+		if (code < 0)
+			return code;
+		if (!last && hooks->yield != NULL && hooks->yield(hooks->context))
+			return error_set(err, ERR_BUSY, "yielded after iteration %d", row.iteration);
+	}
+	return 0;
+}
+
+static int check_complete(const struct recon *recon, struct error *err)
+{
+	int all = recon->geometry->count, view = 0;
+
+	if (recon->ran)
+		return error_set(err, ERR_CONFLICT, "the reconstruction has run already");
+	if (recon->pushed_count == all)
+		return 0;
+	while (recon->pushed[view])
+		view++;
+	return error_set(err, ERR_CONFLICT, "%d of %d views have not come, the first of them is %d",
+			 all - recon->pushed_count, all, view);
+}
+
+int recon_run(struct recon *recon, struct error *err)
+{
+	const struct recipe *recipe = &recon->recipe;
+	const char *stage = recipe->sart.on ? "sart" : recipe->tv.on && recipe->tv.after_fdk ? "tv" : "fdk";
+	int code = check_complete(recon, err);
+
+	if (code < 0)
+		return code;
+	recon->ran = true;
+	if (!recon->resumed)
+		warn_of_the_input(recon);
+	code = check_cancelled(recon, err);
+	if (code == 0)
+		code = fdk_runs(recon) ? finish_fdk(recon, err) : measure(recon, NULL, err);
+	if (code == 0 && recipe->sart.on)
+		code = run_sart(recon, err);
+	if (code < 0)
+		return code;
+	recon->work_done = recon->work_total; /* a stop rule may have ended it early */
+	return keep(recon, "final", stage, err);
+}
+
+int recon_read(struct recon *recon, int z_first, int z_count, float *ret_slices, struct error *err)
+{
+	return recon->backend->volume_download(recon->volume, z_first, z_count, ret_slices, err);
+}
+
+const struct grid *recon_grid(const struct recon *recon)
+{
+	return &recon->recipe.grid;
+}
+
+int recon_iteration(const struct recon *recon)
+{
+	return recon->iteration;
+}
+
+size_t recon_defects(const struct recon *recon)
+{
+	return recon->defects;
+}
+
+const char *recon_plan(const struct recon *recon)
+{
+	return recon->backend->plan_summary(recon->plan);
+}
