@@ -1,0 +1,29 @@
+#ifndef CBCT_DAEMON_DOCUMENT_H
+#define CBCT_DAEMON_DOCUMENT_H
+
+#include <cjson/cJSON.h>
+
+#include "daemon/job.h"
+#include "daemon/supervise.h"
+
+/*
+ * What the API shows of scans, jobs, volumes and workers. New values of the
+ * caller's (cJSON_Delete); NULL when memory ran out or the catalogue could not
+ * be read. Any thread.
+ */
+
+/* Seconds since 1970 as "2025-01-31T12:34:56.789Z". */
+enum { TIME_TEXT_SIZE = 32 };
+void time_text(double seconds, char ret_text[TIME_TEXT_SIZE]);
+
+/* brief: for lists, without geometry, derived, received and missing. Memory only. */
+cJSON *scan_document(struct stored_scan *scan, bool brief);
+/* The job with its request; brief: without history and warnings. */
+cJSON *job_document(struct job *job, bool brief);
+/* name, stage, iteration, size, spacing_mm, origin_mm, bytes, digest, statistics, created, href. */
+cJSON *volume_document(const char *job, const struct volume_record *volume);
+cJSON *history_row_document(const struct history_row *row);
+/* index, state, backend, device, driver, memory, job, restarts. */
+cJSON *worker_document(const struct worker_facts *facts);
+
+#endif

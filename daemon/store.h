@@ -1,0 +1,240 @@
+#ifndef CBCT_DAEMON_STORE_H
+#define CBCT_DAEMON_STORE_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#include "daemon/id.h"
+#include "daemon/watch.h"
+#include "proto/recipe.h"
+
+/*
+ * Everything that outlives the process: the catalogue (SQLite) and the files.
+ *
+ *   STATE/lock              held by the one daemon that uses STATE
+ *   STATE/catalogue.sqlite  scans, projections, jobs, volumes, history, warnings, events
+ *   STATE/scans/ID/         scan.json projections.raw flat.f32 dark.f32 (proto/spool.h)
+ *   STATE/jobs/ID/          NAME.nii, checkpoint.f32
+ *
+ * A call that returns 0 has its change on the disk. The order is always: files
+ * first, synced, then the row; and on the way out: the row, then the files. So
+ * a crash leaves at most files that no row knows, and store_open removes them.
+ *
+ * Threads: every function may be called from any thread. Writing calls wait for
+ * one commit at a time (about 0.3 ms each); reading calls never wait for them.
+ * None is called with a lock held, except where a lock says so itself.
+ *
+ * A commit or sync that fails for any other reason than a full disk is final:
+ * hooks.failed is called (once, in the thread of the failure), every later
+ * writing call returns ERR_IO, and the process should end without acknowledging
+ * anything more. A full disk is ERR_NO_SPACE, changes nothing, and may pass.
+ */
+struct store;
+struct stored_scan; /* counted references */
+
+struct store_hooks {
+	void *context;
+	/* Optional. Must not call into the store. */
+	void (*failed)(void *context, const char *what);
+};
+
+/* Makes STATE where it is missing. ERR_CONFLICT: another process has it. hooks may be NULL, else are copied. */
+int store_open(const char *directory, const struct store_hooks *hooks, struct store **ret_store, struct error *err);
+void store_close(struct store *store); /* NULL is fine; all references must be back */
+
+struct store_statistics {
+	long scans, jobs;
+	unsigned long long projections_stored; /* since the start */
+	unsigned long long commits;
+	double commit_seconds; /* sum */
+};
+void store_statistics(struct store *store, struct store_statistics *ret);
+
+/* ---- scans ---- */
+
+/*
+ * Takes the parsed scan over (on success only), makes its directory with
+ * scan.json and projections.raw at full size. ERR_NO_SPACE when the disk cannot
+ * hold all of it. The reference is the caller's.
+ */
+int store_scan_create(struct store *store, struct scan *scan, struct stored_scan **ret_scan, struct error *err);
+/* ERR_NOT_FOUND. Reads scan.json when the scan has not been used for a while; otherwise memory only. */
+int store_scan_find(struct store *store, const char *id, struct stored_scan **ret_scan, struct error *err);
+void stored_scan_release(struct stored_scan *scan); /* NULL is fine */
+
+/*
+ * Newest first: at most `limit` scans that are older than `after` (an id, or
+ * NULL; it need not exist any more). The references in ret_scans[limit] are the
+ * caller's. *ret_more: there are older ones. Good for brief documents and ids.
+ */
+int store_scan_list(struct store *store, const char *after, int limit, struct stored_scan **ret_scans, int *ret_count,
+		    bool *ret_more, struct error *err);
+
+/* Removes rows, then files; see jobs_delete_scan, which asks first whether a job needs it. */
+int store_scan_delete(struct store *store, struct stored_scan *scan, struct error *err);
+
+/* Constant while the reference lives; NULL for references from store_scan_list. */
+const struct scan *stored_scan_parsed(const struct stored_scan *scan);
+const char *stored_scan_id(const struct stored_scan *scan);
+/* STATE/scans/ID */
+void store_scan_directory(const struct store *store, const char *id, char ret_path[1024]);
+
+/* Memory only. Complete: every projection is there. Ready: and whatever else makes line integrals of them. */
+struct scan_facts {
+	int count, received; /* projections */
+	bool flat, dark;     /* images that are there */
+	bool complete, ready;
+	bool deleted;
+	double created; /* seconds since 1970 */
+};
+void stored_scan_facts(struct stored_scan *scan, struct scan_facts *ret);
+/* flags[count]: 1 where the projection is stored. */
+void stored_scan_received(struct stored_scan *scan, unsigned char *ret_flags);
+/* False when it is not stored. */
+bool stored_scan_digest(struct stored_scan *scan, int index, uint8_t ret_sha256[32]);
+
+/* Woken when a projection is stored, a claim given back, an image set, the scan deleted. */
+void stored_scan_watch(struct stored_scan *scan, struct watch *watch);
+void stored_scan_unwatch(struct stored_scan *scan, struct watch *watch);
+/* Woken when any scan becomes ready. */
+void store_watch_ready(struct store *store, struct watch *watch);
+void store_unwatch_ready(struct store *store, struct watch *watch);
+
+/* ---- projections on their way in ---- */
+/*
+ * Who wants to write projection k into projections.raw claims it first:
+ *
+ *   CLAIM_GRANTED  it is yours: pwrite at k * scan_projection_bytes(), fdatasync,
+ *                  then store_put_projections; or stored_scan_unclaim, and what was
+ *                  written counts for nothing
+ *   CLAIM_STORED   it is there already: hash the body and compare with stored_scan_digest
+ *                  (200 or 409), write nothing
+ *   CLAIM_BUSY     another request is writing it: watch the scan and ask again
+ *
+ * Never write without a claim: a stored projection is never touched again.
+ */
+enum claim { CLAIM_GRANTED, CLAIM_STORED, CLAIM_BUSY };
+/* ERR_NOT_FOUND when the scan was deleted meanwhile. Memory only. */
+int stored_scan_claim(struct stored_scan *scan, int index, enum claim *ret_claim, struct error *err);
+void stored_scan_unclaim(struct stored_scan *scan, int index);
+
+/* A descriptor of projections.raw, the caller's to close; close-on-exec. */
+int stored_scan_open(struct stored_scan *scan, bool writing, int *ret_descriptor, struct error *err);
+
+/*
+ * Group commit: many claimed projections, of one scan or several, in one
+ * transaction, after the caller's fdatasync of their bytes. On success every
+ * claim is given back, and `stored` says for each whether it is there now
+ * (false: the scan was deleted meanwhile). On failure none is stored and the
+ * claims are still the caller's.
+ */
+struct received_projection {
+	struct stored_scan *scan;
+	int index;
+	uint8_t sha256[32]; /* of the raw samples */
+	bool stored;        /* out */
+};
+int store_put_projections(struct store *store, struct received_projection *batch, int count, struct error *err);
+
+/*
+ * The flat or dark image, [row][column] counts. *ret_new false: the same pixels
+ * were there. ERR_CONFLICT: other pixels are there. ERR_BUSY: another request is
+ * writing it just now.
+ */
+enum image { IMAGE_FLAT, IMAGE_DARK, IMAGE_COUNT };
+int store_put_image(struct store *store, struct stored_scan *scan, enum image image, const float *pixels, bool *ret_new,
+		    struct error *err);
+
+/* ---- rows of jobs: for job.c, which keeps the rules; everybody else uses job.h ---- */
+
+enum job_state { JOB_WAITING, JOB_QUEUED, JOB_RUNNING, JOB_SUCCEEDED, JOB_FAILED, JOB_CANCELLED, JOB_STATE_COUNT };
+
+struct job_record {
+	char id[ID_SIZE], scan[ID_SIZE];
+	enum job_state state;
+	enum priority priority;
+	long long ticket; /* place among its priority, 0 before it was ever queued */
+	char *request;    /* job_request_json as text, owned; constant after creation */
+	double mu_water;  /* 1/mm */
+	int iterations;   /* that SART will run, 0 without */
+	char *key;        /* Idempotency-Key or NULL, owned; constant after creation */
+	uint8_t digest[32];
+	bool cancel_asked;
+	int attempts;   /* runs from the start; going on after a yield is none */
+	int crashes;    /* workers that died with it */
+	int checkpoint; /* iteration that checkpoint.f32 holds, 0: none */
+	char backend[16], device[96], plan[160];
+	struct recon_memory memory;
+	int error_code; /* 0: none */
+	char error_pointer[192], error_text[320];
+	double created, queued, started, ended; /* seconds since 1970, 0: not yet */
+	double seconds[STAGE_COUNT];            /* spent in each stage, all attempts together */
+	enum stage stage;
+	int iteration;
+	double fraction;
+};
+
+struct volume_record {
+	char name[32], stage[16];
+	int iteration;
+	struct grid grid;
+	size_t bytes;       /* of the voxels */
+	uint8_t sha256[32]; /* of the voxels */
+	struct volume_norms norms;
+	double created; /* seconds since 1970 */
+};
+
+struct warning_record {
+	char code[64], detail[512];
+};
+
+/* An entry of a job's events: numbers grow, are never used twice, and are what Last-Event-ID holds. */
+struct event_record {
+	long long number;
+	char job[ID_SIZE];
+	char kind[16]; /* "state", "progress", "volume", "warning", "end" */
+	char *data;    /* JSON text, owned */
+};
+
+/* Every one of these writes the event (NULL: none) in the same transaction. */
+struct event {
+	const char *kind;
+	char *data; /* JSON text */
+};
+int store_job_insert(struct store *store, const struct job_record *job, const struct event *event, struct error *err);
+/* All columns that can change. `end`, when not NULL, is a second event. With `rewind`, history rows behind the
+ * checkpoint go. */
+int store_job_update(struct store *store, const struct job_record *job, const struct event *event,
+		     const struct event *end, bool rewind, struct error *err);
+int store_job_delete(struct store *store, const char *id, struct error *err); /* rows, then the directory */
+int store_job_add_row(struct store *store, const char *id, const struct history_row *row, const struct event *event,
+		      struct error *err);
+int store_job_add_volume(struct store *store, const char *id, const struct volume_record *volume,
+			 const struct event *event, struct error *err);
+/* *ret_new false, and no event, when this very warning is there already. */
+int store_job_add_warning(struct store *store, const char *id, const struct warning_record *warning,
+			  const struct event *event, bool *ret_new, struct error *err);
+
+/* All jobs, oldest first; free the array with job_records_free. */
+int store_job_load(struct store *store, struct job_record **ret_jobs, int *ret_count, struct error *err);
+void job_record_clear(struct job_record *job);
+void job_records_free(struct job_record *jobs, int count);
+
+/* Reading, in order of making; arrays are the caller's (free). An unknown job has none of them. */
+int store_job_rows(struct store *store, const char *id, struct history_row **ret_rows, int *ret_count,
+		   struct error *err);
+int store_job_volumes(struct store *store, const char *id, struct volume_record **ret_volumes, int *ret_count,
+		      struct error *err);
+int store_job_warnings(struct store *store, const char *id, struct warning_record **ret_warnings, int *ret_count,
+		       struct error *err);
+/* At most `limit` events with number > after; id NULL: of all jobs. Free with event_records_free. */
+int store_job_events(struct store *store, const char *id, long long after, int limit, struct event_record **ret_events,
+		     int *ret_count, struct error *err);
+void event_records_free(struct event_record *events, int count);
+
+/* STATE/jobs/ID; STATE/jobs/ID/NAME.nii */
+void store_job_directory(const struct store *store, const char *id, char ret_path[1024]);
+void store_volume_path(const struct store *store, const char *id, const char *name, char ret_path[1024]);
+
+#endif
