@@ -44,6 +44,7 @@ enum { ITERATIONS_MAX = 100000, GRID_DEFAULT_MOST = 512 };
 
 void recipe_defaults(struct recipe *ret_recipe); /* nothing on; the values that `{}` stages take */
 void recipe_clear(struct recipe *recipe);
+int recipe_copy(struct recipe *ret_recipe, const struct recipe *recipe, struct error *err);
 /* Pointers are those of the job's JSON, "/grid/size/0", "/sart/subsets"; ERR_IMPOSSIBLE for all that is out of range. */
 int recipe_check(const struct recipe *recipe, const struct geometry *geometry, struct error *err);
 /*
