@@ -15,23 +15,47 @@
  */
 struct orbit {
 	int count;
-	double *angle;          /* [count], radians, gantry angle of each view's source, in 0..2 pi */
-	double *weight;         /* [count], radians: half the gaps to both neighbours; the ends of a short scan only the inner gap */
-	double arc;             /* radians, from the first source to the last, 2 pi for a full turn */
-	int direction;          /* +1 counter-clockwise seen from +z, -1 clockwise, 0 for one view */
-	int first;              /* the view at which the arc begins, in the sense of `direction` */
-	bool short_scan;        /* the arc has a gap: Parker weights apply */
-	double fan;             /* radians, full fan angle that the detector sees */
-	double half_fan_min, half_fan_max; /* radians, the ray angles at column 0 and the last, smallest and largest */
-	double source_radius;   /* mm, mean distance of the sources from the z axis */
+	/* [count], radians, gantry angle of each view's source, 0 <= angle < 2 pi */
+	double *angle;
+	/*
+	 * [count], radians: half of the gaps to both neighbours; the ends of a short
+	 * scan have one neighbour only, views at one angle share. Their sum is the arc,
+	 * or pi when all stand at one angle.
+	 */
+	double *weight;
+	double arc;      /* radians, from the first source to the last, 2 pi for a full turn */
+	int direction;   /* +1 counter-clockwise seen from +z, -1 clockwise, 0 when all views stand at one angle */
+	int first;       /* the view at which the arc begins, in the sense of `direction` */
+	bool short_scan; /* the arc has a gap: Parker weights apply */
+	/*
+	 * Radians: mean angles of the rays through the detector's two outer edges
+	 * against the line from source to axis, signed as Parker's formula wants them;
+	 * fan is their difference, the full fan angle that the detector sees.
+	 */
+	double fan, half_fan_min, half_fan_max;
+	double source_radius;      /* mm, mean distance of the sources from the z axis */
 	double source_to_detector; /* mm, mean, along the normal */
-	double field_of_view;   /* mm, diameter of the cylinder that all views see */
-	double displacement;    /* mm at the detector, of its centre from the central ray, mean */
-	bool displaced;         /* half-fan weights apply (full turn, displaced by more than a few pixels and 2 % of the width) */
-	double parker_delta;    /* radians, (arc - pi) / 2 */
-	bool arc_too_short;     /* arc < pi + fan: a warning, not an error */
+	double field_of_view;      /* mm, diameter of the cylinder that all views see, or one half when displaced */
+	double displacement;       /* mm at the detector, along +u, of its centre from the ray through the axis, mean */
+	bool displaced;      /* half-fan weights: full turn, displaced by more than 4 pixels and 2 % of the width */
+	double parker_delta; /* radians, (arc - pi) / 2 */
+	bool arc_too_short;  /* arc < pi + fan: a warning, not an error */
 	double pixel_at_isocentre[2]; /* mm, mean */
+	/*
+	 * Radians, mean angle between the detector's rows and the plane across z. FDK
+	 * filters along the rows: near pi/2, a detector on its side, that is the wrong
+	 * direction.
+	 */
+	double tilt;
 };
+
+/*
+ * The rule for a full turn: of the gaps between neighbouring angles, the largest
+ * is at most 5 degrees or at most 2.25 times the second largest, so that 359
+ * degrees, 4 views a quarter turn apart, a lost view and uneven steps are full
+ * turns. With a displaced detector, whose views have no conjugates to spare, up
+ * to 20 degrees. Otherwise the largest gap is what the arc leaves out.
+ */
 
 /* Allocates the arrays; free with orbit_clear. Fails for no memory only: any checked geometry has an orbit. */
 int orbit_analyse(struct orbit *ret_orbit, const struct geometry *geometry, struct error *err);
@@ -51,15 +75,18 @@ void orbit_clear(struct orbit *orbit);
  * D = depth of the isocentre, gamma = angle between the ray and the line from
  * the source to the isocentre (a change of variables in the fan-beam formula;
  * for an untilted detector it is the usual SDD / ray length and D^2/depth^2).
- * Parker: conjugate rays sum to 2; 1 everywhere on a full turn. Fan angles are
- * those of the rays in the middle row about the rotation axis, signed by the
- * direction of the rotation. ret is [count][columns].
+ * Parker: a ray and its conjugate sum to 2 when both are measured, and a ray that
+ * is measured once has 2, however short the arc; 1 everywhere on a full turn.
+ * Fan angles are those of the rays in the middle row about the rotation axis,
+ * signed by the direction of the rotation. ret is [count][columns].
  */
 void orbit_column_weights(const struct orbit *orbit, const struct geometry *geometry, float *ret_weights);
 
 /*
- * A grid for who gives none: the field of view at the resolution of the
- * detector at the isocentre, coarsened so that no side has more than `most` voxels.
+ * A grid for who gives none: centred on the isocentre, cubic voxels, the field of
+ * view across and what the cone covers on the axis along z (one slice for a
+ * detector of one row), at the resolution of the detector at the isocentre,
+ * coarsened so that no side has more than `most` voxels.
  */
 void orbit_default_grid(const struct orbit *orbit, const struct geometry *geometry, int most, struct grid *ret_grid);
 

@@ -1,0 +1,361 @@
+/*
+ * The orbit behind a geometry, and FDK's weights by view and column.
+ *
+ * Parker 1982 (with the measured arc), Cho et al. 1996 for displaced detectors.
+ * A view is named by b, its source's angle from the first view in the sense of
+ * the rotation, a ray in it by its fan angle alpha, turned in the same sense from
+ * the line source - axis. The same line is seen from the other side at
+ * b + pi + 2 alpha, with the fan angle -alpha: its conjugate.
+ */
+#include "core/orbit.h"
+
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+static const double FULL_GAP = 5 * M_PI / 180, FULL_GAP_DISPLACED = 20 * M_PI / 180, FULL_GAP_RATIO = 2.25;
+static const double SAME_ANGLE = 1e-6; /* radians, a micrometre on a C-arm's orbit */
+static const double DISPLACED_PIXELS = 4, DISPLACED_WIDTH = 0.02;
+
+struct placed {
+	double angle;
+	int view;
+};
+
+/* Views that stand at one angle, and the gap to the next such group, round the circle. */
+struct station {
+	int begin, end; /* in the sorted views */
+	double gap;     /* radians */
+};
+
+static double wrap(double angle)
+{
+	angle = fmod(angle, 2 * M_PI);
+	if (angle < 0)
+		angle += 2 * M_PI;
+	return angle < 2 * M_PI ? angle : 0;
+}
+
+static int by_angle(const void *a, const void *b)
+{
+	const struct placed *x = a, *y = b;
+
+	if (x->angle != y->angle)
+		return x->angle < y->angle ? -1 : 1;
+	return x->view - y->view;
+}
+
+/* Angle of the ray through (column, middle row) against the line source - axis, counter-clockwise seen from +z. */
+static double ray_angle(const struct geometry *geometry, const struct view *view, double column)
+{
+	double row = 0.5 * (geometry->rows - 1);
+	double x = view->pixel0[0] + column * view->column_step[0] + row * view->row_step[0] - view->source[0];
+	double y = view->pixel0[1] + column * view->column_step[1] + row * view->row_step[1] - view->source[1];
+	double to_axis_x = -view->source[0], to_axis_y = -view->source[1];
+
+	return atan2(to_axis_x * y - to_axis_y * x, to_axis_x * x + to_axis_y * y);
+}
+
+/* The detector's displacement along u from the ray through the axis, mm. */
+static double view_displacement(const struct geometry *geometry, const struct view *view, const double matrix[12])
+{
+	double on_axis[3] = {0, 0, view->source[2]}, column, row;
+
+	/* A detector tilted so far that it does not face the axis horizontally is measured against the isocentre. */
+	if (view_project(matrix, on_axis, &column, &row) < 0.1 * matrix[11]) {
+		on_axis[2] = 0;
+		view_project(matrix, on_axis, &column, &row);
+	}
+	return (0.5 * (geometry->columns - 1) - column) * vec_norm(view->column_step);
+}
+
+static void take_means(struct orbit *orbit, const struct geometry *geometry)
+{
+	double share = 1.0 / geometry->count;
+
+	for (int k = 0; k < geometry->count; k++) {
+		const struct view *view = &geometry->views[k];
+		double matrix[12], to_detector[3], depth, magnification;
+
+		view_matrix(view, matrix);
+		for (int i = 0; i < 3; i++)
+			to_detector[i] = view->pixel0[i] - view->source[i];
+		depth = vec_dot(matrix + 8, to_detector);
+		magnification = depth / matrix[11];
+		orbit->source_radius += share * hypot(view->source[0], view->source[1]);
+		orbit->source_to_detector += share * depth;
+		orbit->displacement += share * view_displacement(geometry, view, matrix);
+		orbit->pixel_at_isocentre[0] += share * vec_norm(view->column_step) / magnification;
+		orbit->pixel_at_isocentre[1] += share * vec_norm(view->row_step) / magnification;
+		orbit->tilt += share * asin(fmin(1, fabs(view->column_step[2]) / vec_norm(view->column_step)));
+	}
+}
+
+/* Cuts the sorted views into stations; returns how many. */
+static int find_stations(const struct placed *placed, int count, struct station *ret)
+{
+	int stations = 0;
+
+	for (int i = 0; i < count; i++) {
+		if (i == 0 || placed[i].angle - placed[i - 1].angle > SAME_ANGLE)
+			ret[stations++] = (struct station){.begin = i};
+		ret[stations - 1].end = i + 1;
+	}
+	for (int s = 0; s < stations; s++) {
+		double next = s + 1 < stations ? placed[ret[s + 1].begin].angle : placed[0].angle + 2 * M_PI;
+
+		ret[s].gap = next - placed[ret[s].end - 1].angle;
+	}
+	return stations;
+}
+
+/* The sense in which most steps from view to view go. */
+static int find_direction(const double *angle, int count)
+{
+	int balance = 0;
+
+	for (int k = 1; k < count; k++) {
+		double step = wrap(angle[k] - angle[k - 1]);
+
+		if (step > SAME_ANGLE && step < 2 * M_PI - SAME_ANGLE)
+			balance += step < M_PI ? 1 : -1;
+	}
+	return balance < 0 ? -1 : 1;
+}
+
+/* Arc, direction, first view and angular weights. */
+static void follow(struct orbit *orbit, const struct placed *placed, const struct station *station, int stations,
+		   bool displaced)
+{
+	double second = 0, largest;
+	int widest = 0;
+
+	for (int s = 1; s < stations; s++)
+		if (station[s].gap > station[widest].gap)
+			widest = s;
+	for (int s = 0; s < stations; s++)
+		if (s != widest)
+			second = fmax(second, station[s].gap);
+	largest = station[widest].gap;
+
+	orbit->short_scan = largest > FULL_GAP_RATIO * second && largest > (displaced ? FULL_GAP_DISPLACED : FULL_GAP);
+	orbit->direction = stations > 1 ? find_direction(orbit->angle, orbit->count) : 0;
+	orbit->arc = orbit->short_scan ? 2 * M_PI - largest : 2 * M_PI;
+	orbit->first = 0;
+	if (stations == 1)
+		orbit->arc = 0;
+	else if (orbit->short_scan && orbit->direction < 0)
+		orbit->first = placed[station[widest].begin].view;
+	else if (orbit->short_scan)
+		orbit->first = placed[station[(widest + 1) % stations].begin].view;
+
+	for (int s = 0; s < stations; s++) {
+		int before = (s + stations - 1) % stations;
+		double sum = 0;
+
+		if (!orbit->short_scan || s != widest)
+			sum += 0.5 * station[s].gap;
+		if (!orbit->short_scan || before != widest)
+			sum += 0.5 * station[before].gap;
+		/* One direction stands for all of them. */
+		if (stations == 1)
+			sum = M_PI;
+		for (int i = station[s].begin; i < station[s].end; i++)
+			orbit->weight[placed[i].view] = sum / (station[s].end - station[s].begin);
+	}
+}
+
+/* Fan angles at the detector's outer edges, signed as alpha is, and the cylinder that the edges leave. */
+static void find_fan(struct orbit *orbit, const struct geometry *geometry)
+{
+	double sense = orbit->direction < 0 ? -1 : 1, low_side = INFINITY, high_side = INFINITY;
+
+	for (int k = 0; k < geometry->count; k++) {
+		const struct view *view = &geometry->views[k];
+		double radius = hypot(view->source[0], view->source[1]);
+		double edge0 = sense * ray_angle(geometry, view, -0.5);
+		double edge1 = sense * ray_angle(geometry, view, geometry->columns - 0.5);
+
+		orbit->half_fan_min += fmin(edge0, edge1) / geometry->count;
+		orbit->half_fan_max += fmax(edge0, edge1) / geometry->count;
+		/* Beyond a right angle a ray leads away from the axis: the whole circle is seen. */
+		low_side = fmin(low_side, radius * sin(fmin(0.5 * M_PI, -fmin(edge0, edge1))));
+		high_side = fmin(high_side, radius * sin(fmin(0.5 * M_PI, fmax(edge0, edge1))));
+	}
+	orbit->fan = orbit->half_fan_max - orbit->half_fan_min;
+	orbit->field_of_view = 2 * fmax(0, orbit->displaced ? fmax(low_side, high_side) : fmin(low_side, high_side));
+}
+
+int orbit_analyse(struct orbit *ret_orbit, const struct geometry *geometry, struct error *err)
+{
+	size_t count = (size_t)geometry->count;
+	struct orbit orbit = {.count = geometry->count};
+	struct placed *placed = malloc(count * sizeof(*placed));
+	struct station *station = calloc(count, sizeof(*station));
+	double width = 0;
+	bool aside;
+	int code = 0;
+
+	orbit.angle = calloc(count, sizeof(*orbit.angle));
+	orbit.weight = calloc(count, sizeof(*orbit.weight));
+	if (placed == NULL || station == NULL || orbit.angle == NULL || orbit.weight == NULL) {
+		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views", geometry->count);
+		goto out;
+	}
+	for (int k = 0; k < geometry->count; k++) {
+		const struct view *view = &geometry->views[k];
+
+		orbit.angle[k] = wrap(atan2(view->source[1], view->source[0]));
+		placed[k] = (struct placed){.angle = orbit.angle[k], .view = k};
+		width += vec_norm(view->column_step) / geometry->count;
+	}
+	qsort(placed, count, sizeof(*placed), by_angle);
+	take_means(&orbit, geometry);
+	aside = fabs(orbit.displacement) > DISPLACED_PIXELS * width &&
+		fabs(orbit.displacement) > DISPLACED_WIDTH * width * geometry->columns;
+	follow(&orbit, placed, station, find_stations(placed, geometry->count, station), aside);
+	orbit.displaced = aside && !orbit.short_scan;
+	find_fan(&orbit, geometry);
+	orbit.parker_delta = 0.5 * (orbit.arc - M_PI);
+	orbit.arc_too_short = orbit.short_scan && orbit.arc < M_PI + orbit.fan - SAME_ANGLE;
+	*ret_orbit = orbit;
+out:
+	free(placed);
+	free(station);
+	if (code < 0)
+		orbit_clear(&orbit);
+	return code;
+}
+
+void orbit_clear(struct orbit *orbit)
+{
+	free(orbit->angle);
+	free(orbit->weight);
+	memset(orbit, 0, sizeof(*orbit));
+}
+
+/*
+ * Parker's weights for an arc of pi + 2 delta. Rays at the beginning have a
+ * conjugate inside the arc while b <= 2 delta - 2 alpha, those at the end from
+ * b = pi - 2 alpha on; either range is empty where the arc is too short for it.
+ */
+static double parker(double b, double alpha, double delta)
+{
+	double s;
+
+	if (b < 2 * delta - 2 * alpha)
+		s = sin(0.25 * M_PI * b / (delta - alpha));
+	else if (b > M_PI - 2 * alpha && delta + alpha > 0)
+		s = sin(0.25 * M_PI * (M_PI + 2 * delta - b) / (delta + alpha));
+	else
+		return 2;
+	return 2 * s * s;
+}
+
+/* alpha counts towards the wide side; the overlap of both sides is +-theta. */
+static double half_fan(double alpha, double theta)
+{
+	if (fabs(alpha) < theta)
+		return 1 + sin(0.5 * M_PI * alpha / theta);
+	return alpha > 0 ? 2 : 0;
+}
+
+/* The fan angle up to which a displaced detector sees both sides of the axis in every view. */
+static double overlap(const struct orbit *orbit, const struct geometry *geometry, double sense)
+{
+	bool wide_high = orbit->half_fan_max > -orbit->half_fan_min;
+	double theta = INFINITY;
+
+	for (int k = 0; k < geometry->count; k++) {
+		double edge0 = sense * ray_angle(geometry, &geometry->views[k], -0.5);
+		double edge1 = sense * ray_angle(geometry, &geometry->views[k], geometry->columns - 0.5);
+
+		theta = fmin(theta, wide_high ? -fmin(edge0, edge1) : fmax(edge0, edge1));
+	}
+	return theta;
+}
+
+void orbit_column_weights(const struct orbit *orbit, const struct geometry *geometry, float *ret_weights)
+{
+	double sense = orbit->direction < 0 ? -1 : 1, outside = 2 * M_PI - orbit->arc;
+	double wide = orbit->half_fan_max > -orbit->half_fan_min ? 1 : -1;
+	double theta = orbit->displaced ? overlap(orbit, geometry, sense) : 0;
+
+#pragma omp parallel for schedule(static)
+	for (int k = 0; k < geometry->count; k++) {
+		const struct view *view = &geometry->views[k];
+		float *weights = ret_weights + (size_t)k * (size_t)geometry->columns;
+		double b = wrap(sense * (orbit->angle[k] - orbit->angle[orbit->first]));
+		double matrix[12], to_detector[3], pitch = vec_norm(view->column_step), constant;
+
+		/* A view beside the first one by a rounding error is at the beginning, not a turn later. */
+		if (orbit->short_scan && b > orbit->arc + 0.5 * outside)
+			b = 0;
+		view_matrix(view, matrix);
+		for (int i = 0; i < 3; i++)
+			to_detector[i] = view->pixel0[i] - view->source[i];
+		constant = 0.5 * orbit->weight[k] * hypot(view->source[0], view->source[1]) *
+			   vec_dot(matrix + 8, to_detector) / (pitch * matrix[11] * matrix[11]);
+		for (int column = 0; column < geometry->columns; column++) {
+			double alpha = sense * ray_angle(geometry, view, column), weight = 1;
+
+			if (orbit->short_scan)
+				weight = parker(fmin(b, orbit->arc), alpha, orbit->parker_delta);
+			else if (orbit->displaced)
+				weight = half_fan(wide * alpha, theta);
+			weights[column] = (float)(constant * weight);
+		}
+	}
+}
+
+/* Half of the height on the axis that the detector's middle column covers, mm, to the farther side of the isocentre. */
+static double half_height(const struct geometry *geometry)
+{
+	double farthest = 0;
+
+	for (int k = 0; k < geometry->count; k++) {
+		const struct view *view = &geometry->views[k];
+		double radius = hypot(view->source[0], view->source[1]);
+
+		for (int end = 0; end < 2; end++) {
+			double row = end ? geometry->rows - 0.5 : -0.5, ray[3];
+
+			for (int i = 0; i < 3; i++)
+				ray[i] = view->pixel0[i] + 0.5 * (geometry->columns - 1) * view->column_step[i] +
+					 row * view->row_step[i] - view->source[i];
+			if (hypot(ray[0], ray[1]) > 0)
+				farthest =
+				    fmax(farthest, fabs(view->source[2] + ray[2] * radius / hypot(ray[0], ray[1])));
+		}
+	}
+	return farthest;
+}
+
+void orbit_default_grid(const struct orbit *orbit, const struct geometry *geometry, int most, struct grid *ret_grid)
+{
+	double width = orbit->field_of_view, height = 2 * half_height(geometry), nearest = INFINITY;
+	double spacing = orbit->pixel_at_isocentre[0];
+
+	for (int k = 0; k < geometry->count; k++)
+		nearest = fmin(nearest, hypot(geometry->views[k].source[0], geometry->views[k].source[1]));
+	/* Where the views have no common cylinder: as wide as the detector. */
+	if (!(width > spacing))
+		width = spacing * geometry->columns;
+	/* The square's corners stay in front of the sources, however wide the fan: 1.4 of the radius is the limit. */
+	width = fmin(width, 1.3 * nearest);
+	if (geometry->rows > 1)
+		spacing = fmin(spacing, orbit->pixel_at_isocentre[1]);
+	spacing = fmax(spacing, width / most);
+	if (geometry->rows > 1)
+		spacing = fmax(spacing, height / most);
+	for (int i = 0; i < 3; i++) {
+		double side = i < 2 ? width : height;
+
+		/* A part of a millionth is rounding, not another voxel. */
+		ret_grid->size[i] = (int)fmin(most, fmax(1, ceil(side / spacing - 1e-6)));
+		ret_grid->spacing[i] = spacing;
+	}
+	if (geometry->rows == 1)
+		ret_grid->size[2] = 1;
+	grid_centre(ret_grid);
+}
