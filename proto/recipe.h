@@ -14,6 +14,8 @@ struct job_request {
 	struct recipe recipe; /* owned: recipe_clear */
 };
 
+enum { EMITS_MAX = 10000 }; /* each is a volume on the disk, and all of them fit into one message to the worker */
+
 /*
  * Two steps, since the scan's name must be read before its geometry is known:
  * job_request_parse checks all that the text alone tells; job_request_resolve
@@ -21,9 +23,16 @@ struct job_request {
  * and fills the grid that was left out.
  */
 int job_request_parse(const char *text, size_t length, struct job_request *ret_request, struct error *err);
+int job_request_read(const cJSON *value, struct job_request *ret_request, struct error *err); /* from a parsed one */
+/* Also sorts `emit` and drops what stands there twice. On failure the request stays as it was. */
 int job_request_resolve(struct job_request *request, const struct scan *scan, struct error *err);
 
-/* The request with every default written out; parses back to the same request. */
+/*
+ * The request with every default written out; parses back to the same request
+ * (print it with json_print: cJSON's own printer drops digits). NULL for no memory.
+ */
 cJSON *job_request_json(const struct job_request *request);
+/* What a stage that is off would have done does not count. */
+bool job_request_same(const struct job_request *a, const struct job_request *b);
 
 #endif
