@@ -5,9 +5,9 @@
 #include "core/grid.h"
 
 /*
- * Ellipsoids and elliptic cylinders with exact line integrals: the independent
- * truth that every reconstruction is held against. Densities add where shapes
- * overlap.
+ * Ellipsoids, elliptic cylinders and boxes with exact line integrals: the
+ * independent truth that every reconstruction is held against. Densities add
+ * where shapes overlap.
  */
 enum shape { SHAPE_ELLIPSOID, SHAPE_CYLINDER, SHAPE_BOX };
 
@@ -26,9 +26,13 @@ struct phantom {
 
 /*
  * By name: "shepp-logan" (Kak and Slaney's 3D head, densities 2, -.98, ...),
- * "head" (its high-contrast form, 1, -.8, -.2 ...), "ball", "cylinder", "disc".
- * `scale` mm is the unit of lengths, `density` 1/mm multiplies the densities.
- * phantom_names ends with NULL.
+ * "head" (its high-contrast form, 1, -.8, -.2 ...), "ball" of radius 1, "cylinder"
+ * of radius and half length 1, "disc" (the same, .05 half length), "asymmetric"
+ * (small parts of different densities off-centre in x, y and z inside an ellipsoid
+ * that fits into radius .9, so that mirrored or swapped axes show). `scale` mm is
+ * the unit of lengths, `density` 1/mm multiplies the densities. phantom_names ends
+ * with NULL. ERR_INVALID for an unknown name, a scale that is not positive, or
+ * numbers that are not finite.
  */
 extern const char *const phantom_names[];
 int phantom_named(struct phantom *ret_phantom, const char *name, double scale, double density, struct error *err);
@@ -45,11 +49,12 @@ void phantom_project(const struct phantom *phantom, const struct geometry *geome
 void phantom_voxelise(const struct phantom *phantom, const struct grid *grid, int samples, float *ret_volume);
 
 /*
- * The study's way: line integrals of a voxel object by fine ray sampling, nearest
- * or trilinear, `step` mm apart. Deliberately not the reconstruction's projector.
+ * Line integrals of a voxel object [z][y][x] by fine ray sampling, nearest or
+ * trilinear, at most `step` mm apart; the object ends half a voxel beyond the
+ * outer centres. Deliberately not the reconstruction's projector. OpenMP over rows.
  */
 enum sampling { SAMPLE_NEAREST, SAMPLE_TRILINEAR };
 void volume_project_fine(const float *volume, const struct grid *grid, const struct geometry *geometry, int view,
-                         enum sampling sampling, double step, float *ret_projection);
+			 enum sampling sampling, double step, float *ret_projection);
 
 #endif
