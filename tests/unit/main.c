@@ -1,0 +1,58 @@
+/*
+ * Runs the suites of the table below; `unit NAME ...` runs those named only.
+ * CK_FORK=no keeps the tests in one process, for debuggers and sanitizers.
+ *
+ * A new suite is a file tests/unit/test_NAME.c that exports NAME_suite, and a row.
+ */
+#include <check.h>
+#include <stdbool.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define SUITES(row)                                                                                                    \
+	row(geometry) row(orbit) row(filter) row(phantom) row(recon) row(study) row(backend) row(json) row(scan)       \
+	    row(recipe) row(format) row(spool) row(message)
+
+/* Weak: a row may stand here before its file does. What is missing is said aloud. */
+#define DECLARE(name) Suite *name##_suite(void) __attribute__((weak));
+SUITES(DECLARE)
+
+#define ROW(name) {#name, name##_suite},
+static const struct {
+	const char *name;
+	Suite *(*make)(void);
+} suites[] = {SUITES(ROW)};
+
+static bool wanted(const char *name, int count, char **names)
+{
+	for (int i = 0; i < count; i++)
+		if (strcmp(name, names[i]) == 0)
+			return true;
+	return count == 0;
+}
+
+int main(int argc, char **argv)
+{
+	SRunner *runner = srunner_create(NULL);
+	int failed, found = 0;
+
+	for (size_t i = 0; i < sizeof(suites) / sizeof(*suites); i++) {
+		if (!wanted(suites[i].name, argc - 1, argv + 1))
+			continue;
+		found++;
+		if (suites[i].make != NULL)
+			srunner_add_suite(runner, suites[i].make());
+		else
+			printf("skipped: suite %s is not linked\n", suites[i].name);
+	}
+	if (found < argc - 1) {
+		fprintf(stderr, "unit: a suite of that name does not exist\n");
+		srunner_free(runner);
+		return EXIT_FAILURE;
+	}
+	srunner_run_all(runner, CK_ENV);
+	failed = srunner_ntests_failed(runner);
+	srunner_free(runner);
+	return failed == 0 ? EXIT_SUCCESS : EXIT_FAILURE;
+}
