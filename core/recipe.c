@@ -126,13 +126,13 @@ static int check_emit(const struct recipe *recipe, struct error *err)
 static int check_grid(const struct recipe *recipe, const struct geometry *geometry, struct error *err)
 {
 	struct grid grid = recipe->grid;
-	int code = grid_check(&grid, err);
+	int code;
 
-	if (code == 0) {
-		if (!recipe->has_origin)
-			grid_centre(&grid);
+	if (!recipe->has_origin)
+		grid_centre(&grid);
+	code = grid_check(&grid, err);
+	if (code == 0)
 		code = grid_check_geometry(&grid, geometry, err);
-	}
 	if (code < 0)
 		error_nest(err, "/grid");
 	return code;
@@ -164,14 +164,11 @@ int recipe_resolve(struct recipe *recipe, const struct geometry *geometry, const
 	struct recipe resolved = *recipe;
 	int code;
 
-	if (!resolved.has_grid) {
+	if (!resolved.has_grid)
 		orbit_default_grid(orbit, geometry, GRID_DEFAULT_MOST, &resolved.grid);
-		resolved.has_origin = true;
-	} else if (!resolved.has_origin && grid_check(&resolved.grid, err) == 0) {
+	else if (!resolved.has_origin)
 		grid_centre(&resolved.grid);
-		resolved.has_origin = true;
-	}
-	resolved.has_grid = true;
+	resolved.has_grid = resolved.has_origin = true;
 	if (resolved.tv.options.unit == 0)
 		resolved.tv.options.unit = resolved.mu_water / 1000;
 	code = recipe_check(&resolved, geometry, err);
