@@ -488,20 +488,21 @@ static void put(struct printer *p, const char *text, size_t length)
 	p->text[p->length] = '\0';
 }
 
-/* The shortest of 15, 16 or 17 digits that reads back to the same double. */
-static void put_number(struct printer *p, double number)
+void number_print(double number, char ret_text[NUMBER_TEXT_MAX])
 {
-	char text[32];
-
-	if (!isfinite(number)) {
-		put(p, "null", 4);
-		return;
-	}
 	for (int digits = 15; digits <= 17; digits++) {
-		snprintf(text, sizeof(text), "%.*g", digits, number);
-		if (strtod(text, NULL) == number)
+		snprintf(ret_text, NUMBER_TEXT_MAX, "%.*g", digits, number);
+		if (strtod(ret_text, NULL) == number)
 			break;
 	}
+}
+
+static void put_number(struct printer *p, double number)
+{
+	char text[NUMBER_TEXT_MAX] = "null";
+
+	if (isfinite(number))
+		number_print(number, text);
 	put(p, text, strlen(text));
 }
 

@@ -35,6 +35,10 @@ int json_parse(const char *text, size_t length, cJSON **ret_value, struct error 
  */
 char *json_print(const cJSON *value, size_t *ret_length /* may be NULL */);
 
+/* The shortest of 15, 16 or 17 digits that reads back to the same double; the number is finite. */
+enum { NUMBER_TEXT_MAX = 32 };
+void number_print(double number, char ret_text[NUMBER_TEXT_MAX]);
+
 /*
  * A reader of one object that remembers which members were asked for, so that
  * json_end can refuse the rest by pointer. Members absent or null leave the
