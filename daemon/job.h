@@ -26,7 +26,6 @@
 struct jobs;
 struct job; /* counted references */
 
-extern const char *const job_state_names[JOB_STATE_COUNT];
 bool job_state_ended(enum job_state state);
 bool job_state_may_follow(enum job_state from, enum job_state to);
 

@@ -44,7 +44,7 @@ int store_open(const char *directory, const struct store_hooks *hooks, struct st
 void store_close(struct store *store); /* NULL is fine; all references must be back */
 
 struct store_statistics {
-	long scans, jobs;
+	long scans;
 	unsigned long long projections_stored; /* since the start */
 	unsigned long long commits;
 	double commit_seconds; /* sum */
@@ -74,19 +74,25 @@ int store_scan_list(struct store *store, const char *after, int limit, struct st
 /* Removes rows, then files; see jobs_delete_scan, which asks first whether a job needs it. */
 int store_scan_delete(struct store *store, struct stored_scan *scan, struct error *err);
 
-/* Constant while the reference lives; NULL for references from store_scan_list. */
-const struct scan *stored_scan_parsed(const struct stored_scan *scan);
+/* Constant while the reference lives; references from store_scan_list may have none (NULL). */
+const struct scan *stored_scan_parsed(struct stored_scan *scan);
 const char *stored_scan_id(const struct stored_scan *scan);
 /* STATE/scans/ID */
 void store_scan_directory(const struct store *store, const char *id, char ret_path[1024]);
 
 /* Memory only. Complete: every projection is there. Ready: and whatever else makes line integrals of them. */
 struct scan_facts {
-	int count, received; /* projections */
-	bool flat, dark;     /* images that are there */
+	char name[256];
+	double created; /* seconds since 1970 */
+	int columns, rows, count;
+	enum sample sample;
+	enum quantity quantity;
+	double air;      /* counts, 0: not given */
+	int received;    /* projections */
+	bool flat, dark; /* images that are there */
 	bool complete, ready;
 	bool deleted;
-	double created; /* seconds since 1970 */
+	bool damaged; /* its files were not there at the start */
 };
 void stored_scan_facts(struct stored_scan *scan, struct scan_facts *ret);
 /* flags[count]: 1 where the projection is stored. */
@@ -149,6 +155,7 @@ int store_put_image(struct store *store, struct stored_scan *scan, enum image im
 /* ---- rows of jobs: for job.c, which keeps the rules; everybody else uses job.h ---- */
 
 enum job_state { JOB_WAITING, JOB_QUEUED, JOB_RUNNING, JOB_SUCCEEDED, JOB_FAILED, JOB_CANCELLED, JOB_STATE_COUNT };
+extern const char *const job_state_names[JOB_STATE_COUNT];
 
 struct job_record {
 	char id[ID_SIZE], scan[ID_SIZE];

@@ -1,0 +1,538 @@
+/*
+ * The catalogue: one SQLite database in WAL mode.
+ *
+ * Every commit is synced (synchronous = FULL): one append to the log and one
+ * fdatasync. The log is moved into the database by a thread of its own, so that
+ * no commit waits for that. One connection writes, another reads and never
+ * waits for the writer.
+ */
+#include "daemon/store_db.h"
+
+#include <assert.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/file.h>
+#include <time.h>
+#include <unistd.h>
+
+#include "daemon/files.h"
+#include "daemon/log.h"
+
+/* Pages in the log (4 KiB each) before they are moved: enough to make it rare, few enough to keep reading fast. */
+enum { CHECKPOINT_PAGES = 1000 };
+
+/*
+ * Step i takes a catalogue of version i to i + 1. Steps are never changed once
+ * they were released: add one.
+ */
+static const char *const migrations[] = {
+    "CREATE TABLE scans ("
+    " number INTEGER PRIMARY KEY,"
+    " id TEXT NOT NULL UNIQUE,"
+    " name TEXT NOT NULL,"
+    " created REAL NOT NULL,"
+    " columns INTEGER NOT NULL,"
+    " rows INTEGER NOT NULL,"
+    " count INTEGER NOT NULL,"
+    " sample TEXT NOT NULL,"
+    " quantity TEXT NOT NULL,"
+    " air REAL NOT NULL,"
+    " flat BLOB," /* SHA-256 of the float32 pixels */
+    " dark BLOB);"
+    "CREATE TABLE projections (" /* a row: the samples are on the disk */
+    " scan INTEGER NOT NULL REFERENCES scans(number) ON DELETE CASCADE,"
+    " view INTEGER NOT NULL,"
+    " sha256 BLOB NOT NULL,"
+    " PRIMARY KEY (scan, view)) WITHOUT ROWID;"
+    "CREATE TABLE jobs ("
+    " number INTEGER PRIMARY KEY,"
+    " id TEXT NOT NULL UNIQUE,"
+    " scan TEXT NOT NULL," /* its id; the scan may be gone once the job has ended */
+    " state TEXT NOT NULL,"
+    " priority TEXT NOT NULL,"
+    " ticket INTEGER NOT NULL,"
+    " request TEXT NOT NULL,"
+    " mu_water REAL NOT NULL,"
+    " iterations INTEGER NOT NULL,"
+    " idempotency_key TEXT UNIQUE,"
+    " request_sha256 BLOB,"
+    " cancel_asked INTEGER NOT NULL,"
+    " attempts INTEGER NOT NULL,"
+    " crashes INTEGER NOT NULL,"
+    " checkpoint INTEGER NOT NULL,"
+    " backend TEXT NOT NULL,"
+    " device TEXT NOT NULL,"
+    " plan TEXT NOT NULL,"
+    " memory BLOB NOT NULL," /* five little-endian 64-bit numbers of bytes: struct recon_memory */
+    " error_code INTEGER NOT NULL,"
+    " error_pointer TEXT NOT NULL,"
+    " error_text TEXT NOT NULL,"
+    " created REAL NOT NULL,"
+    " queued REAL NOT NULL,"
+    " started REAL NOT NULL,"
+    " ended REAL NOT NULL,"
+    " seconds BLOB NOT NULL," /* a double for each stage */
+    " stage TEXT NOT NULL,"
+    " iteration INTEGER NOT NULL,"
+    " fraction REAL NOT NULL);"
+    "CREATE TABLE volumes ("
+    " number INTEGER PRIMARY KEY,"
+    " job INTEGER NOT NULL REFERENCES jobs(number) ON DELETE CASCADE,"
+    " name TEXT NOT NULL,"
+    " stage TEXT NOT NULL,"
+    " iteration INTEGER NOT NULL,"
+    " nx INTEGER NOT NULL, ny INTEGER NOT NULL, nz INTEGER NOT NULL,"
+    " dx REAL NOT NULL, dy REAL NOT NULL, dz REAL NOT NULL,"
+    " x0 REAL NOT NULL, y0 REAL NOT NULL, z0 REAL NOT NULL,"
+    " bytes INTEGER NOT NULL,"
+    " sha256 BLOB NOT NULL,"
+    " norm2 REAL, difference2 REAL, tv REAL, minimum REAL, maximum REAL, mean REAL,"
+    " not_finite INTEGER NOT NULL,"
+    " created REAL NOT NULL,"
+    " UNIQUE (job, name));"
+    "CREATE TABLE history ("
+    " job INTEGER NOT NULL REFERENCES jobs(number) ON DELETE CASCADE,"
+    " iteration INTEGER NOT NULL,"
+    " residual REAL, change REAL, tv REAL, seconds REAL,"
+    " PRIMARY KEY (job, iteration)) WITHOUT ROWID;"
+    "CREATE TABLE warnings ("
+    " number INTEGER PRIMARY KEY,"
+    " job INTEGER NOT NULL REFERENCES jobs(number) ON DELETE CASCADE,"
+    " code TEXT NOT NULL,"
+    " detail TEXT NOT NULL,"
+    " UNIQUE (job, code, detail));"
+    "CREATE TABLE events ("
+    " number INTEGER PRIMARY KEY AUTOINCREMENT," /* never used twice: clients resume from it */
+    " job INTEGER NOT NULL REFERENCES jobs(number) ON DELETE CASCADE,"
+    " created REAL NOT NULL,"
+    " kind TEXT NOT NULL,"
+    " data TEXT NOT NULL);"
+    "CREATE INDEX events_of_job ON events (job, number);",
+};
+enum { MIGRATIONS = sizeof(migrations) / sizeof(migrations[0]) };
+
+double time_now(void)
+{
+	struct timespec now;
+
+	clock_gettime(CLOCK_REALTIME, &now);
+	return (double)now.tv_sec + (double)now.tv_nsec * 1e-9;
+}
+
+/* ---- queries ---- */
+
+/* The disk can no longer be trusted with what is acknowledged. */
+static void store_fail(struct store *store, const char *what)
+{
+	atomic_store(&store->failed, true);
+	if (!atomic_flag_test_and_set(&store->failure_told)) {
+		log_line(LEVEL_ERROR, "the catalogue has failed, nothing more is accepted: %s", what);
+		if (store->hooks.failed != NULL)
+			store->hooks.failed(store->hooks.context, what);
+	}
+}
+
+static int connection_error(struct connection *connection, int result, const char *what, struct error *err)
+{
+	struct store *store = connection->store;
+	int cause = sqlite3_system_errno(connection->db);
+	bool full = result == SQLITE_FULL ||
+		    (result == SQLITE_IOERR && sqlite3_extended_errcode(connection->db) != SQLITE_IOERR_FSYNC &&
+		     (cause == ENOSPC || cause == EDQUOT));
+	char text[200];
+
+	snprintf(text, sizeof(text), "%.60s: %.120s", what, sqlite3_errmsg(connection->db));
+	if (full)
+		return error_set(err, ERR_NO_SPACE, "the disk of the catalogue is full (%s)", text);
+	if (result == SQLITE_NOMEM)
+		return error_set(err, ERR_NO_MEMORY, "catalogue: %s", text);
+	if (result == SQLITE_CONSTRAINT)
+		return error_set(err, ERR_INTERNAL, "catalogue: %s", text);
+	if (connection == &store->writer)
+		store_fail(store, text);
+	return error_set(err, ERR_IO, "catalogue: %s", text);
+}
+
+static void query_check(struct query *query, int result)
+{
+	if (query->code == 0 && result != SQLITE_OK)
+		query->code =
+		    connection_error(query->connection, result & 0xff, sqlite3_sql(query->statement), query->err);
+}
+
+void query_begin(struct query *query, struct connection *connection, const char *sql, struct error *err)
+{
+	int i = 0, result;
+
+	*query = (struct query){.connection = connection, .err = err};
+	while (i < connection->cached && connection->cache[i].sql != sql)
+		i++;
+	if (i == connection->cached) {
+		assert(i < STATEMENTS_MAX);
+		result = sqlite3_prepare_v3(connection->db, sql, -1, SQLITE_PREPARE_PERSISTENT,
+					    &connection->cache[i].statement, NULL);
+		if (result != SQLITE_OK) {
+			query->code = connection_error(connection, result & 0xff, sql, err);
+			return;
+		}
+		connection->cache[i].sql = sql;
+		connection->cached++;
+	}
+	query->statement = connection->cache[i].statement;
+}
+
+void query_text(struct query *query, const char *text)
+{
+	if (query->code == 0)
+		query_check(query, sqlite3_bind_text(query->statement, ++query->bound, text, -1, SQLITE_STATIC));
+}
+
+void query_integer(struct query *query, long long value)
+{
+	if (query->code == 0)
+		query_check(query, sqlite3_bind_int64(query->statement, ++query->bound, value));
+}
+
+void query_real(struct query *query, double value)
+{
+	if (query->code == 0)
+		query_check(query, sqlite3_bind_double(query->statement, ++query->bound, value));
+}
+
+void query_blob(struct query *query, const void *data, int size)
+{
+	if (query->code == 0)
+		query_check(query, sqlite3_bind_blob(query->statement, ++query->bound, data, size, SQLITE_STATIC));
+}
+
+bool query_row(struct query *query)
+{
+	int result;
+
+	if (query->code != 0)
+		return false;
+	result = sqlite3_step(query->statement);
+	if (result == SQLITE_ROW)
+		return true;
+	if (result != SQLITE_DONE)
+		query_check(query, result);
+	return false;
+}
+
+int query_end(struct query *query)
+{
+	if (query->statement != NULL) {
+		sqlite3_reset(query->statement);
+		sqlite3_clear_bindings(query->statement);
+	}
+	return query->code;
+}
+
+int query_run(struct query *query)
+{
+	while (query_row(query))
+		;
+	return query_end(query);
+}
+
+void column_text(struct query *query, int column, char *ret, size_t size)
+{
+	const unsigned char *text = sqlite3_column_text(query->statement, column);
+
+	snprintf(ret, size, "%s", text == NULL ? "" : (const char *)text);
+}
+
+int name_index(const char *name, const char *const *names, int count)
+{
+	for (int i = 0; i < count; i++) {
+		if (strcmp(name, names[i]) == 0)
+			return i;
+	}
+	return -1;
+}
+
+/* ---- transactions ---- */
+
+static int run_plain(struct connection *connection, const char *sql, struct error *err)
+{
+	struct query query;
+
+	query_begin(&query, connection, sql, err);
+	return query_run(&query);
+}
+
+int store_begin(struct store *store, struct error *err)
+{
+	int code;
+
+	pthread_mutex_lock(&store->writer.lock);
+	if (atomic_load(&store->failed))
+		code = error_set(err, ERR_IO, "the catalogue has failed before; nothing more is stored");
+	else
+		code = run_plain(&store->writer, "BEGIN IMMEDIATE", err);
+	if (code != 0)
+		pthread_mutex_unlock(&store->writer.lock);
+	return code;
+}
+
+int store_end(struct store *store, int code, struct error *err)
+{
+	struct error ignored;
+	double before = time_now();
+
+	if (code == 0)
+		code = run_plain(&store->writer, "COMMIT", err);
+	/* A failed COMMIT may have rolled back by itself. */
+	if (code != 0 && !sqlite3_get_autocommit(store->writer.db))
+		run_plain(&store->writer, "ROLLBACK", &ignored);
+	pthread_mutex_unlock(&store->writer.lock);
+	if (code == 0) {
+		atomic_fetch_add(&store->commits, 1);
+		atomic_fetch_add(&store->commit_microseconds, (unsigned long long)((time_now() - before) * 1e6));
+	}
+	return code;
+}
+
+/* ---- the log and the database ---- */
+
+static int on_commit(void *context, sqlite3 *db, const char *name, int pages)
+{
+	struct store *store = context;
+
+	(void)db;
+	(void)name;
+	pthread_mutex_lock(&store->checkpoint_lock);
+	store->log_pages = pages;
+	if (pages >= CHECKPOINT_PAGES)
+		pthread_cond_signal(&store->checkpoint_due);
+	pthread_mutex_unlock(&store->checkpoint_lock);
+	return SQLITE_OK;
+}
+
+static void *checkpoint_loop(void *context)
+{
+	struct store *store = context;
+	sqlite3 *db = NULL;
+	char path[1024];
+	int result;
+
+	snprintf(path, sizeof(path), "%s/catalogue.sqlite", store->directory);
+	result = sqlite3_open_v2(path, &db, SQLITE_OPEN_READWRITE | SQLITE_OPEN_NOMUTEX, NULL);
+	if (result == SQLITE_OK) {
+		sqlite3_extended_result_codes(db, 1);
+		result = sqlite3_exec(db, "PRAGMA synchronous = FULL", NULL, NULL, NULL);
+	}
+	if (result != SQLITE_OK)
+		store_fail(store, "no connection for checkpoints");
+	pthread_mutex_lock(&store->checkpoint_lock);
+	while (!store->closing) {
+		if (store->log_pages < CHECKPOINT_PAGES || atomic_load(&store->failed)) {
+			pthread_cond_wait(&store->checkpoint_due, &store->checkpoint_lock);
+			continue;
+		}
+		store->log_pages = 0;
+		pthread_mutex_unlock(&store->checkpoint_lock);
+		/* Passive: takes what no reader still needs, makes nobody wait. A full disk passes; the log only grows.
+		 */
+		result = sqlite3_wal_checkpoint_v2(db, NULL, SQLITE_CHECKPOINT_PASSIVE, NULL, NULL);
+		if ((result & 0xff) == SQLITE_IOERR && sqlite3_system_errno(db) != ENOSPC)
+			store_fail(store, sqlite3_errmsg(db));
+		else if (result != SQLITE_OK && (result & 0xff) != SQLITE_BUSY)
+			log_line(LEVEL_WARNING, "checkpoint of the catalogue: %s", sqlite3_errmsg(db));
+		pthread_mutex_lock(&store->checkpoint_lock);
+	}
+	pthread_mutex_unlock(&store->checkpoint_lock);
+	sqlite3_close(db);
+	return NULL;
+}
+
+/* ---- opening ---- */
+
+static int connection_open(struct store *store, struct connection *connection, struct error *err)
+{
+	char path[1024];
+	int result;
+
+	connection->store = store;
+	snprintf(path, sizeof(path), "%s/catalogue.sqlite", store->directory);
+	result = sqlite3_open_v2(path, &connection->db,
+				 SQLITE_OPEN_READWRITE | SQLITE_OPEN_CREATE | SQLITE_OPEN_NOMUTEX, NULL);
+	if (result == SQLITE_OK) {
+		sqlite3_busy_timeout(connection->db, 10000);
+		result = sqlite3_exec(connection->db,
+				      "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; PRAGMA foreign_keys = ON;",
+				      NULL, NULL, NULL);
+	}
+	if (result != SQLITE_OK)
+		return error_set(err, ERR_IO, "open %s: %s", path, sqlite3_errmsg(connection->db));
+	return 0;
+}
+
+static void connection_close(struct connection *connection)
+{
+	for (int i = 0; i < connection->cached; i++)
+		sqlite3_finalize(connection->cache[i].statement);
+	sqlite3_close(connection->db);
+	pthread_mutex_destroy(&connection->lock);
+}
+
+static int catalogue_version(struct store *store, int *ret_version, struct error *err)
+{
+	struct query query;
+	int version = 0;
+
+	query_begin(&query, &store->writer, "PRAGMA user_version", err);
+	if (query_row(&query))
+		version = sqlite3_column_int(query.statement, 0);
+	if (query_end(&query) == 0)
+		*ret_version = version;
+	return query.code;
+}
+
+static int migrate(struct store *store, bool *ret_fresh, struct error *err)
+{
+	int version, code = catalogue_version(store, &version, err);
+	char number[64];
+
+	if (code != 0)
+		return code;
+	if (version > MIGRATIONS)
+		return error_set(err, ERR_CONFLICT,
+				 "the catalogue has version %d, made by a later cbctd; this one knows %d", version,
+				 MIGRATIONS);
+	*ret_fresh = version == 0;
+	for (; version < MIGRATIONS; version++) {
+		snprintf(number, sizeof(number), "PRAGMA user_version = %d", version + 1);
+		code = store_begin(store, err);
+		if (code != 0)
+			return code;
+		if (sqlite3_exec(store->writer.db, migrations[version], NULL, NULL, NULL) != SQLITE_OK ||
+		    sqlite3_exec(store->writer.db, number, NULL, NULL, NULL) != SQLITE_OK)
+			code = error_set(err, ERR_IO, "catalogue, step to version %d: %s", version + 1,
+					 sqlite3_errmsg(store->writer.db));
+		code = store_end(store, code, err);
+		if (code != 0)
+			return code;
+	}
+	return 0;
+}
+
+static int take_directory(struct store *store, struct error *err)
+{
+	static const char *const rooms[] = {"", "/scans", "/jobs"};
+	char path[1024];
+	int code;
+
+	for (size_t i = 0; i < sizeof(rooms) / sizeof(rooms[0]); i++) {
+		snprintf(path, sizeof(path), "%s%s", store->directory, rooms[i]);
+		code = directory_make(path, err);
+		if (code != 0)
+			return code;
+	}
+	snprintf(path, sizeof(path), "%s/lock", store->directory);
+	store->lock_file = open(path, O_RDWR | O_CREAT | O_CLOEXEC, 0640);
+	if (store->lock_file < 0)
+		return error_set_errno(err, errno, "open %s", path);
+	if (flock(store->lock_file, LOCK_EX | LOCK_NB) < 0) {
+		if (errno == EWOULDBLOCK)
+			return error_set(err, ERR_CONFLICT, "%s is in use by another cbctd", store->directory);
+		return error_set_errno(err, errno, "lock %s", path);
+	}
+	return 0;
+}
+
+static int open_catalogue(struct store *store, struct error *err)
+{
+	bool fresh = false;
+	int code = take_directory(store, err);
+
+	if (code == 0)
+		code = connection_open(store, &store->writer, err);
+	if (code == 0)
+		code = connection_open(store, &store->reader, err);
+	if (code == 0)
+		code = migrate(store, &fresh, err);
+	if (code == 0)
+		code = store_load_scans(store, err);
+	if (code == 0)
+		code = store_sweep_scans(store, fresh, err);
+	if (code == 0)
+		code = store_sweep_jobs(store, fresh, err);
+	if (code != 0)
+		return code;
+	sqlite3_wal_hook(store->writer.db, on_commit, store);
+	code = pthread_create(&store->checkpointer, NULL, checkpoint_loop, store);
+	if (code != 0)
+		return error_set_errno(err, code, "thread for checkpoints");
+	store->has_checkpointer = true;
+	return 0;
+}
+
+int store_open(const char *directory, const struct store_hooks *hooks, struct store **ret_store, struct error *err)
+{
+	struct store *store = calloc(1, sizeof(*store));
+	int code;
+
+	if (store == NULL)
+		return error_set_errno(err, ENOMEM, "store");
+	if ((size_t)snprintf(store->directory, sizeof(store->directory), "%s", directory) >= sizeof(store->directory)) {
+		free(store);
+		return error_set(err, ERR_INVALID, "state directory: a path of at most %zu bytes",
+				 sizeof(store->directory) - 1);
+	}
+	if (hooks != NULL)
+		store->hooks = *hooks;
+	store->lock_file = -1;
+	atomic_flag_clear(&store->failure_told);
+	pthread_mutex_init(&store->writer.lock, NULL);
+	pthread_mutex_init(&store->reader.lock, NULL);
+	pthread_mutex_init(&store->scans_lock, NULL);
+	pthread_mutex_init(&store->checkpoint_lock, NULL);
+	pthread_cond_init(&store->checkpoint_due, NULL);
+	watch_list_init(&store->ready);
+	code = open_catalogue(store, err);
+	if (code != 0) {
+		store_close(store);
+		return code;
+	}
+	*ret_store = store;
+	return 0;
+}
+
+void store_close(struct store *store)
+{
+	if (store == NULL)
+		return;
+	if (store->has_checkpointer) {
+		pthread_mutex_lock(&store->checkpoint_lock);
+		store->closing = true;
+		pthread_cond_signal(&store->checkpoint_due);
+		pthread_mutex_unlock(&store->checkpoint_lock);
+		pthread_join(store->checkpointer, NULL);
+	}
+	store_free_scans(store);
+	connection_close(&store->reader);
+	connection_close(&store->writer);
+	watch_list_destroy(&store->ready);
+	pthread_cond_destroy(&store->checkpoint_due);
+	pthread_mutex_destroy(&store->checkpoint_lock);
+	pthread_mutex_destroy(&store->scans_lock);
+	if (store->lock_file >= 0)
+		close(store->lock_file);
+	free(store);
+}
+
+void store_statistics(struct store *store, struct store_statistics *ret)
+{
+	*ret = (struct store_statistics){
+	    .projections_stored = atomic_load(&store->projections_stored),
+	    .commits = atomic_load(&store->commits),
+	    .commit_seconds = (double)atomic_load(&store->commit_microseconds) * 1e-6,
+	};
+	pthread_mutex_lock(&store->scans_lock);
+	ret->scans = store->scan_count;
+	pthread_mutex_unlock(&store->scans_lock);
+}

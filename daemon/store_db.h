@@ -1,0 +1,97 @@
+#ifndef CBCT_DAEMON_STORE_DB_H
+#define CBCT_DAEMON_STORE_DB_H
+
+#include <pthread.h>
+#include <sqlite3.h>
+#include <stdatomic.h>
+
+#include "daemon/store.h"
+
+/*
+ * Inside of the store, for store*.c only: connections, queries, transactions.
+ *
+ * Locks, in the order in which they may be taken: writer.lock (held over a
+ * commit; makes one transaction at a time) or reader.lock (held over a SELECT),
+ * then scans_lock, then a scan's own lock, then checkpoint_lock or a watch list's.
+ */
+enum { STATEMENTS_MAX = 48, RECENT_SCANS = 16 };
+
+/* One connection and its prepared statements, found by the address of their text; all guarded by lock. */
+struct connection {
+	pthread_mutex_t lock;
+	struct store *store;
+	sqlite3 *db;
+	struct {
+		const char *sql;
+		sqlite3_stmt *statement;
+	} cache[STATEMENTS_MAX];
+	int cached;
+};
+
+struct store {
+	char directory[900]; /* constant, as hooks */
+	struct store_hooks hooks;
+	int lock_file;
+	struct connection writer, reader;
+	_Atomic bool failed; /* a commit did not reach the disk: nothing is acknowledged any more */
+	atomic_flag failure_told;
+
+	/* The checkpointer moves the log into the database, off the path of the commits. */
+	pthread_t checkpointer;
+	bool has_checkpointer;
+	pthread_mutex_t checkpoint_lock; /* guards the next two */
+	pthread_cond_t checkpoint_due;
+	int log_pages;
+	bool closing;
+
+	pthread_mutex_t scans_lock; /* guards the array, and of each scan: references, parsed, recent */
+	struct stored_scan **scans; /* [scan_count], by id */
+	int scan_count, scan_space;
+	struct stored_scan *recent[RECENT_SCANS]; /* whose parsed form is kept though nobody uses it */
+	int recent_next;
+	struct watch_list ready;
+
+	_Atomic unsigned long long projections_stored, commits, commit_microseconds;
+};
+
+/* A statement on its way: the first failure sticks, and query_end returns it. The connection's lock is held. */
+struct query {
+	struct connection *connection;
+	sqlite3_stmt *statement;
+	int bound;
+	int code;
+	struct error *err;
+};
+
+/* sql: a string literal. Parameters are bound in order. */
+void query_begin(struct query *query, struct connection *connection, const char *sql, struct error *err);
+void query_text(struct query *query, const char *text); /* NULL is NULL; must stay until query_end */
+void query_integer(struct query *query, long long value);
+void query_real(struct query *query, double value);
+void query_blob(struct query *query, const void *data, int size); /* NULL data is NULL; must stay until query_end */
+bool query_row(struct query *query); /* true: a row is there, read it with sqlite3_column_* */
+int query_end(struct query *query);
+/* Runs to the end: for statements that give no rows. */
+int query_run(struct query *query);
+
+/* Text column into a field of fixed size. */
+void column_text(struct query *query, int column, char *ret, size_t size);
+
+/* The place of a name in a table of names, -1 when it is not there. */
+int name_index(const char *name, const char *const *names, int count);
+
+/* Locks the writer and begins; on failure nothing is locked. */
+int store_begin(struct store *store, struct error *err);
+/* Commits when code is 0, else rolls back; unlocks. Returns code, or why the commit failed. */
+int store_end(struct store *store, int code, struct error *err);
+
+/* Seconds since 1970. */
+double time_now(void);
+
+/* store_scan.c, store_job.c: what store_open loads and tidies up. `fresh`: the catalogue was made just now. */
+int store_load_scans(struct store *store, struct error *err);
+int store_sweep_scans(struct store *store, bool fresh, struct error *err);
+int store_sweep_jobs(struct store *store, bool fresh, struct error *err);
+void store_free_scans(struct store *store);
+
+#endif

@@ -1,0 +1,644 @@
+/* Rows of jobs: what they are, what became of them, what they kept, and what is told of it. */
+#include <errno.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <unistd.h>
+
+#include "daemon/files.h"
+#include "daemon/log.h"
+#include "daemon/store_db.h"
+
+const char *const job_state_names[JOB_STATE_COUNT] = {"waiting",   "queued", "running",
+						      "succeeded", "failed", "cancelled"};
+
+void store_job_directory(const struct store *store, const char *id, char ret_path[1024])
+{
+	snprintf(ret_path, 1024, "%s/jobs/%s", store->directory, id);
+}
+
+void store_volume_path(const struct store *store, const char *id, const char *name, char ret_path[1024])
+{
+	snprintf(ret_path, 1024, "%s/jobs/%s/%s.nii", store->directory, id, name);
+}
+
+void job_record_clear(struct job_record *job)
+{
+	free(job->request);
+	free(job->key);
+	job->request = job->key = NULL;
+}
+
+void job_records_free(struct job_record *jobs, int count)
+{
+	for (int i = 0; i < count; i++)
+		job_record_clear(&jobs[i]);
+	free(jobs);
+}
+
+/* ---- writing ---- */
+
+static int add_event(struct store *store, const char *id, const struct event *event, struct error *err)
+{
+	struct query query;
+
+	if (event == NULL)
+		return 0;
+	query_begin(&query, &store->writer,
+		    "INSERT INTO events (job, created, kind, data)"
+		    " VALUES ((SELECT number FROM jobs WHERE id = ?), ?, ?, ?)",
+		    err);
+	query_text(&query, id);
+	query_real(&query, time_now());
+	query_text(&query, event->kind);
+	query_text(&query, event->data);
+	return query_run(&query);
+}
+
+/* The columns that can change, in the order of both statements below. */
+static void bind_changing(struct query *query, const struct job_record *job)
+{
+	query_text(query, job_state_names[job->state]);
+	query_integer(query, job->ticket);
+	query_integer(query, job->cancel_asked);
+	query_integer(query, job->attempts);
+	query_integer(query, job->crashes);
+	query_integer(query, job->checkpoint);
+	query_text(query, job->backend);
+	query_text(query, job->device);
+	query_text(query, job->plan);
+	query_blob(query, &job->memory, sizeof(job->memory));
+	query_integer(query, job->error_code);
+	query_text(query, job->error_pointer);
+	query_text(query, job->error_text);
+	query_real(query, job->queued);
+	query_real(query, job->started);
+	query_real(query, job->ended);
+	query_blob(query, job->seconds, sizeof(job->seconds));
+	query_text(query, stage_names[job->stage]);
+	query_integer(query, job->iteration);
+	query_real(query, job->fraction);
+	query_text(query, job->id);
+}
+
+int store_job_insert(struct store *store, const struct job_record *job, const struct event *event, struct error *err)
+{
+	struct query query;
+	int code = store_begin(store, err);
+
+	if (code != 0)
+		return code;
+	query_begin(
+	    &query, &store->writer,
+	    "INSERT INTO jobs (state, ticket, cancel_asked, attempts, crashes, checkpoint, backend, device, plan,"
+	    " memory, error_code, error_pointer, error_text, queued, started, ended, seconds, stage, iteration,"
+	    " fraction, id, scan, priority, request, mu_water, iterations, idempotency_key, request_sha256,"
+	    " created) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?,"
+	    " ?)",
+	    err);
+	bind_changing(&query, job);
+	query_text(&query, job->scan);
+	query_text(&query, priority_names[job->priority]);
+	query_text(&query, job->request);
+	query_real(&query, job->mu_water);
+	query_integer(&query, job->iterations);
+	query_text(&query, job->key);
+	query_blob(&query, job->digest, sizeof(job->digest));
+	query_real(&query, job->created);
+	code = query_run(&query);
+	if (code == 0)
+		code = add_event(store, job->id, event, err);
+	return store_end(store, code, err);
+}
+
+static int rewind_history(struct store *store, const struct job_record *job, struct error *err)
+{
+	struct query query;
+
+	query_begin(&query, &store->writer,
+		    "DELETE FROM history WHERE job = (SELECT number FROM jobs WHERE id = ?) AND iteration > ?", err);
+	query_text(&query, job->id);
+	query_integer(&query, job->checkpoint);
+	return query_run(&query);
+}
+
+int store_job_update(struct store *store, const struct job_record *job, const struct event *event,
+		     const struct event *end, bool rewind, struct error *err)
+{
+	struct query query;
+	int code = store_begin(store, err);
+
+	if (code != 0)
+		return code;
+	query_begin(
+	    &query, &store->writer,
+	    "UPDATE jobs SET state = ?, ticket = ?, cancel_asked = ?, attempts = ?, crashes = ?, checkpoint = ?,"
+	    " backend = ?, device = ?, plan = ?, memory = ?, error_code = ?, error_pointer = ?, error_text = ?,"
+	    " queued = ?, started = ?, ended = ?, seconds = ?, stage = ?, iteration = ?, fraction = ?"
+	    " WHERE id = ?",
+	    err);
+	bind_changing(&query, job);
+	code = query_run(&query);
+	if (code == 0 && rewind)
+		code = rewind_history(store, job, err);
+	if (code == 0)
+		code = add_event(store, job->id, event, err);
+	if (code == 0)
+		code = add_event(store, job->id, end, err);
+	return store_end(store, code, err);
+}
+
+int store_job_delete(struct store *store, const char *id, struct error *err)
+{
+	struct query query;
+	struct error ignored;
+	char directory[1024];
+	int code = store_begin(store, err);
+
+	if (code != 0)
+		return code;
+	query_begin(&query, &store->writer, "DELETE FROM jobs WHERE id = ?", err);
+	query_text(&query, id);
+	code = store_end(store, query_run(&query), err);
+	if (code != 0)
+		return code;
+	store_job_directory(store, id, directory);
+	if (directory_remove(directory, &ignored) != 0)
+		log_line(LEVEL_WARNING, "job %s: files stay until the next start: %s", id, ignored.text);
+	return 0;
+}
+
+int store_job_add_row(struct store *store, const char *id, const struct history_row *row, const struct event *event,
+		      struct error *err)
+{
+	struct query query;
+	int code = store_begin(store, err);
+
+	if (code != 0)
+		return code;
+	query_begin(&query, &store->writer,
+		    "INSERT OR REPLACE INTO history (job, iteration, residual, change, tv, seconds)"
+		    " VALUES ((SELECT number FROM jobs WHERE id = ?), ?, ?, ?, ?, ?)",
+		    err);
+	query_text(&query, id);
+	query_integer(&query, row->iteration);
+	query_real(&query, row->residual);
+	query_real(&query, row->change);
+	query_real(&query, row->tv);
+	query_real(&query, row->seconds);
+	code = query_run(&query);
+	if (code == 0)
+		code = add_event(store, id, event, err);
+	return store_end(store, code, err);
+}
+
+int store_job_add_volume(struct store *store, const char *id, const struct volume_record *volume,
+			 const struct event *event, struct error *err)
+{
+	struct query query;
+	int code = store_begin(store, err);
+
+	if (code != 0)
+		return code;
+	/* A job that starts again keeps its volumes again: the later one is what the file holds. */
+	query_begin(
+	    &query, &store->writer,
+	    "INSERT OR REPLACE INTO volumes (job, name, stage, iteration, nx, ny, nz, dx, dy, dz, x0, y0, z0,"
+	    " bytes, sha256, norm2, difference2, tv, minimum, maximum, mean, not_finite, created)"
+	    " VALUES ((SELECT number FROM jobs WHERE id = ?), ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?,"
+	    " ?, ?, ?, ?, ?)",
+	    err);
+	query_text(&query, id);
+	query_text(&query, volume->name);
+	query_text(&query, volume->stage);
+	query_integer(&query, volume->iteration);
+	for (int i = 0; i < 3; i++)
+		query_integer(&query, volume->grid.size[i]);
+	for (int i = 0; i < 3; i++)
+		query_real(&query, volume->grid.spacing[i]);
+	for (int i = 0; i < 3; i++)
+		query_real(&query, volume->grid.origin[i]);
+	query_integer(&query, (long long)volume->bytes);
+	query_blob(&query, volume->sha256, sizeof(volume->sha256));
+	query_real(&query, volume->norms.norm2);
+	query_real(&query, volume->norms.difference2);
+	query_real(&query, volume->norms.tv);
+	query_real(&query, volume->norms.minimum);
+	query_real(&query, volume->norms.maximum);
+	query_real(&query, volume->norms.mean);
+	query_integer(&query, (long long)volume->norms.not_finite);
+	query_real(&query, volume->created);
+	code = query_run(&query);
+	if (code == 0)
+		code = add_event(store, id, event, err);
+	return store_end(store, code, err);
+}
+
+int store_job_add_warning(struct store *store, const char *id, const struct warning_record *warning,
+			  const struct event *event, bool *ret_new, struct error *err)
+{
+	struct query query;
+	bool new = false;
+	int code = store_begin(store, err);
+
+	if (code != 0)
+		return code;
+	query_begin(&query, &store->writer,
+		    "INSERT OR IGNORE INTO warnings (job, code, detail)"
+		    " VALUES ((SELECT number FROM jobs WHERE id = ?), ?, ?)",
+		    err);
+	query_text(&query, id);
+	query_text(&query, warning->code);
+	query_text(&query, warning->detail);
+	code = query_run(&query);
+	new = code == 0 && sqlite3_changes(store->writer.db) > 0;
+	if (new)
+		code = add_event(store, id, event, err);
+	code = store_end(store, code, err);
+	if (code == 0)
+		*ret_new = new;
+	return code;
+}
+
+/* ---- reading ---- */
+
+static int column_name(struct query *query, int column, const char *const *names, int count)
+{
+	const unsigned char *text = sqlite3_column_text(query->statement, column);
+
+	return text == NULL ? -1 : name_index((const char *)text, names, count);
+}
+
+static bool column_copy(struct query *query, int column, char **ret_text)
+{
+	const unsigned char *text = sqlite3_column_text(query->statement, column);
+
+	*ret_text = text == NULL ? NULL : strdup((const char *)text);
+	return text == NULL || *ret_text != NULL;
+}
+
+/* Leaves ret as it is when the blob has another size: made by a build with other stages. */
+static void column_bytes(struct query *query, int column, void *ret, size_t size)
+{
+	if ((size_t)sqlite3_column_bytes(query->statement, column) == size)
+		memcpy(ret, sqlite3_column_blob(query->statement, column), size);
+}
+
+/* Room for one more element in an array that doubles; NULL: no memory, the array stays. */
+static void *grow(void *array, int count, size_t size)
+{
+	if (count != 0 && (count & (count - 1)) != 0)
+		return array;
+	return realloc(array, (size_t)(count == 0 ? 1 : 2 * count) * size);
+}
+
+static int read_job(struct query *query, struct job_record *job, struct error *err)
+{
+	sqlite3_stmt *row = query->statement;
+	int state, priority, stage;
+
+	*job = (struct job_record){0};
+	column_text(query, 0, job->id, sizeof(job->id));
+	column_text(query, 1, job->scan, sizeof(job->scan));
+	state = column_name(query, 2, job_state_names, JOB_STATE_COUNT);
+	priority = column_name(query, 3, priority_names, PRIORITY_COUNT);
+	job->ticket = sqlite3_column_int64(row, 4);
+	job->mu_water = sqlite3_column_double(row, 6);
+	job->iterations = sqlite3_column_int(row, 7);
+	column_bytes(query, 9, job->digest, sizeof(job->digest));
+	job->cancel_asked = sqlite3_column_int(row, 10) != 0;
+	job->attempts = sqlite3_column_int(row, 11);
+	job->crashes = sqlite3_column_int(row, 12);
+	job->checkpoint = sqlite3_column_int(row, 13);
+	column_text(query, 14, job->backend, sizeof(job->backend));
+	column_text(query, 15, job->device, sizeof(job->device));
+	column_text(query, 16, job->plan, sizeof(job->plan));
+	column_bytes(query, 17, &job->memory, sizeof(job->memory));
+	job->error_code = sqlite3_column_int(row, 18);
+	column_text(query, 19, job->error_pointer, sizeof(job->error_pointer));
+	column_text(query, 20, job->error_text, sizeof(job->error_text));
+	job->created = sqlite3_column_double(row, 21);
+	job->queued = sqlite3_column_double(row, 22);
+	job->started = sqlite3_column_double(row, 23);
+	job->ended = sqlite3_column_double(row, 24);
+	column_bytes(query, 25, job->seconds, sizeof(job->seconds));
+	stage = column_name(query, 26, stage_names, STAGE_COUNT);
+	job->iteration = sqlite3_column_int(row, 27);
+	job->fraction = sqlite3_column_double(row, 28);
+	if (state < 0 || priority < 0 || stage < 0 || !id_valid(job->id))
+		return error_set(err, ERR_IO, "catalogue: the row of job \"%s\" makes no sense", job->id);
+	job->state = (enum job_state)state;
+	job->priority = (enum priority)priority;
+	job->stage = (enum stage)stage;
+	if (!column_copy(query, 5, &job->request) || !column_copy(query, 8, &job->key))
+		return error_set_errno(err, ENOMEM, "list of jobs");
+	return 0;
+}
+
+int store_job_load(struct store *store, struct job_record **ret_jobs, int *ret_count, struct error *err)
+{
+	struct job_record *jobs = NULL, *more;
+	struct query query;
+	int count = 0, code = 0;
+
+	pthread_mutex_lock(&store->reader.lock);
+	query_begin(
+	    &query, &store->reader,
+	    "SELECT id, scan, state, priority, ticket, request, mu_water, iterations, idempotency_key,"
+	    " request_sha256, cancel_asked, attempts, crashes, checkpoint, backend, device, plan, memory,"
+	    " error_code, error_pointer, error_text, created, queued, started, ended, seconds, stage, iteration,"
+	    " fraction FROM jobs ORDER BY id",
+	    err);
+	while (code == 0 && query_row(&query)) {
+		more = grow(jobs, count, sizeof(*jobs));
+		if (more == NULL) {
+			code = error_set_errno(err, ENOMEM, "list of jobs");
+			break;
+		}
+		jobs = more;
+		code = read_job(&query, &jobs[count++], err);
+	}
+	if (query_end(&query) != 0)
+		code = query.code;
+	pthread_mutex_unlock(&store->reader.lock);
+	if (code != 0) {
+		job_records_free(jobs, count);
+		return code;
+	}
+	*ret_jobs = jobs;
+	*ret_count = count;
+	return 0;
+}
+
+static void read_row(struct query *query, void *element)
+{
+	struct history_row *row = element;
+
+	row->iteration = sqlite3_column_int(query->statement, 0);
+	row->residual = sqlite3_column_double(query->statement, 1);
+	row->change = sqlite3_column_double(query->statement, 2);
+	row->tv = sqlite3_column_double(query->statement, 3);
+	row->seconds = sqlite3_column_double(query->statement, 4);
+}
+
+static void read_volume(struct query *query, void *element)
+{
+	struct volume_record *volume = element;
+	sqlite3_stmt *row = query->statement;
+
+	*volume = (struct volume_record){0};
+	column_text(query, 0, volume->name, sizeof(volume->name));
+	column_text(query, 1, volume->stage, sizeof(volume->stage));
+	volume->iteration = sqlite3_column_int(row, 2);
+	for (int i = 0; i < 3; i++) {
+		volume->grid.size[i] = sqlite3_column_int(row, 3 + i);
+		volume->grid.spacing[i] = sqlite3_column_double(row, 6 + i);
+		volume->grid.origin[i] = sqlite3_column_double(row, 9 + i);
+	}
+	volume->bytes = (size_t)sqlite3_column_int64(row, 12);
+	column_bytes(query, 13, volume->sha256, sizeof(volume->sha256));
+	volume->norms.norm2 = sqlite3_column_double(row, 14);
+	volume->norms.difference2 = sqlite3_column_double(row, 15);
+	volume->norms.tv = sqlite3_column_double(row, 16);
+	volume->norms.minimum = sqlite3_column_double(row, 17);
+	volume->norms.maximum = sqlite3_column_double(row, 18);
+	volume->norms.mean = sqlite3_column_double(row, 19);
+	volume->norms.not_finite = (size_t)sqlite3_column_int64(row, 20);
+	volume->created = sqlite3_column_double(row, 21);
+}
+
+static void read_warning(struct query *query, void *element)
+{
+	struct warning_record *warning = element;
+
+	column_text(query, 0, warning->code, sizeof(warning->code));
+	column_text(query, 1, warning->detail, sizeof(warning->detail));
+}
+
+/* All rows that belong to a job, into an array of elements of `size` bytes. */
+static int read_all(struct store *store, const char *sql, const char *id, size_t size,
+		    void (*read)(struct query *query, void *element), void **ret_array, int *ret_count,
+		    struct error *err)
+{
+	char *array = NULL, *more;
+	struct query query;
+	int count = 0, code = 0;
+
+	pthread_mutex_lock(&store->reader.lock);
+	query_begin(&query, &store->reader, sql, err);
+	query_text(&query, id);
+	while (query_row(&query)) {
+		more = grow(array, count, size);
+		if (more == NULL) {
+			code = error_set_errno(err, ENOMEM, "rows of job %s", id);
+			break;
+		}
+		array = more;
+		read(&query, array + (size_t)count++ * size);
+	}
+	if (query_end(&query) != 0)
+		code = query.code;
+	pthread_mutex_unlock(&store->reader.lock);
+	if (code != 0) {
+		free(array);
+		return code;
+	}
+	*ret_array = array;
+	*ret_count = count;
+	return 0;
+}
+
+int store_job_rows(struct store *store, const char *id, struct history_row **ret_rows, int *ret_count,
+		   struct error *err)
+{
+	void *array;
+	int code = read_all(store,
+			    "SELECT iteration, residual, change, tv, seconds FROM history"
+			    " WHERE job = (SELECT number FROM jobs WHERE id = ?) ORDER BY iteration",
+			    id, sizeof(**ret_rows), read_row, &array, ret_count, err);
+
+	if (code == 0)
+		*ret_rows = array;
+	return code;
+}
+
+int store_job_volumes(struct store *store, const char *id, struct volume_record **ret_volumes, int *ret_count,
+		      struct error *err)
+{
+	void *array;
+	int code = read_all(store,
+			    "SELECT name, stage, iteration, nx, ny, nz, dx, dy, dz, x0, y0, z0, bytes, sha256, norm2,"
+			    " difference2, tv, minimum, maximum, mean, not_finite, created FROM volumes"
+			    " WHERE job = (SELECT number FROM jobs WHERE id = ?) ORDER BY number",
+			    id, sizeof(**ret_volumes), read_volume, &array, ret_count, err);
+
+	if (code == 0)
+		*ret_volumes = array;
+	return code;
+}
+
+int store_job_warnings(struct store *store, const char *id, struct warning_record **ret_warnings, int *ret_count,
+		       struct error *err)
+{
+	void *array;
+	int code = read_all(store,
+			    "SELECT code, detail FROM warnings WHERE job = (SELECT number FROM jobs WHERE id = ?)"
+			    " ORDER BY number",
+			    id, sizeof(**ret_warnings), read_warning, &array, ret_count, err);
+
+	if (code == 0)
+		*ret_warnings = array;
+	return code;
+}
+
+void event_records_free(struct event_record *events, int count)
+{
+	for (int i = 0; i < count; i++)
+		free(events[i].data);
+	free(events);
+}
+
+int store_job_events(struct store *store, const char *id, long long after, int limit, struct event_record **ret_events,
+		     int *ret_count, struct error *err)
+{
+	struct event_record *events = NULL, *more;
+	struct query query;
+	int count = 0, code = 0;
+
+	pthread_mutex_lock(&store->reader.lock);
+	if (id != NULL) {
+		query_begin(&query, &store->reader,
+			    "SELECT events.number, jobs.id, kind, data FROM events, jobs"
+			    " WHERE jobs.id = ? AND events.job = jobs.number AND events.number > ?"
+			    " ORDER BY events.number LIMIT ?",
+			    err);
+		query_text(&query, id);
+	} else {
+		query_begin(&query, &store->reader,
+			    "SELECT events.number, jobs.id, kind, data FROM events, jobs"
+			    " WHERE events.job = jobs.number AND events.number > ? ORDER BY events.number LIMIT ?",
+			    err);
+	}
+	query_integer(&query, after);
+	query_integer(&query, limit);
+	while (code == 0 && query_row(&query)) {
+		more = grow(events, count, sizeof(*events));
+		if (more == NULL) {
+			code = error_set_errno(err, ENOMEM, "events");
+			break;
+		}
+		events = more;
+		events[count].number = sqlite3_column_int64(query.statement, 0);
+		column_text(&query, 1, events[count].job, sizeof(events[count].job));
+		column_text(&query, 2, events[count].kind, sizeof(events[count].kind));
+		if (!column_copy(&query, 3, &events[count].data))
+			code = error_set_errno(err, ENOMEM, "events");
+		count++;
+	}
+	if (query_end(&query) != 0)
+		code = query.code;
+	pthread_mutex_unlock(&store->reader.lock);
+	if (code != 0) {
+		event_records_free(events, count);
+		return code;
+	}
+	*ret_events = events;
+	*ret_count = count;
+	return 0;
+}
+
+/* ---- at the start ---- */
+
+struct sweep {
+	struct store *store;
+	const char *id;
+	struct volume_record *volumes;
+	int count;
+};
+
+/* Half-written files, and volumes whose row was never written: the job makes them again. */
+static int sweep_file(void *context, const char *name, struct error *err)
+{
+	const struct sweep *sweep = context;
+	const char *extension = strrchr(name, '.');
+	char directory[1024], path[1400];
+	bool stray = name_is_temporary(name);
+
+	if (!stray && extension != NULL && strcmp(extension, ".nii") == 0) {
+		stray = true;
+		for (int i = 0; i < sweep->count; i++) {
+			if (strlen(sweep->volumes[i].name) == (size_t)(extension - name) &&
+			    strncmp(sweep->volumes[i].name, name, (size_t)(extension - name)) == 0)
+				stray = false;
+		}
+	}
+	if (!stray)
+		return 0;
+	store_job_directory(sweep->store, sweep->id, directory);
+	snprintf(path, sizeof(path), "%s/%s", directory, name);
+	if (unlink(path) < 0)
+		return error_set_errno(err, errno, "unlink %s", path);
+	return 0;
+}
+
+static void check_volumes(const struct sweep *sweep)
+{
+	char path[1024];
+
+	for (int i = 0; i < sweep->count; i++) {
+		store_volume_path(sweep->store, sweep->id, sweep->volumes[i].name, path);
+		if (access(path, R_OK) != 0)
+			log_line(LEVEL_ERROR, "job %s: its volume %s is in the catalogue, but %s is not there",
+				 sweep->id, sweep->volumes[i].name, path);
+	}
+}
+
+static int job_is_known(struct store *store, const char *id, bool *ret_known, struct error *err)
+{
+	struct query query;
+	bool known;
+
+	query_begin(&query, &store->reader, "SELECT 1 FROM jobs WHERE id = ?", err);
+	query_text(&query, id);
+	known = query_row(&query);
+	if (query_end(&query) == 0)
+		*ret_known = known;
+	return query.code;
+}
+
+static int sweep_directory(void *context, const char *name, struct error *err)
+{
+	struct sweep sweep = {.store = context, .id = name};
+	char path[1024];
+	bool known = false;
+	int code;
+
+	if (!id_valid(name))
+		return 0; /* not ours */
+	store_job_directory(sweep.store, name, path);
+	code = job_is_known(sweep.store, name, &known, err);
+	if (code != 0)
+		return code;
+	if (!known) {
+		log_line(LEVEL_INFO, "job %s is deleted: its files are removed", name);
+		return directory_remove(path, err);
+	}
+	code = store_job_volumes(sweep.store, name, &sweep.volumes, &sweep.count, err);
+	if (code != 0)
+		return code;
+	check_volumes(&sweep);
+	code = directory_visit(path, sweep_file, &sweep, err);
+	free(sweep.volumes);
+	return code;
+}
+
+int store_sweep_jobs(struct store *store, bool fresh, struct error *err)
+{
+	char path[1024];
+
+	/* A catalogue that was lost must not take the volumes with it. */
+	if (fresh)
+		return 0;
+	snprintf(path, sizeof(path), "%s/jobs", store->directory);
+	return directory_visit(path, sweep_directory, store, err);
+}

@@ -1,0 +1,891 @@
+/*
+ * Scans: their rows, their files, and what of them is kept in memory.
+ *
+ * Which projections are stored, and their digests, stay in memory, so that a
+ * question after `missing` costs no disk. The parsed document (geometries can
+ * be large) is read when a scan is used and kept for a few recent ones.
+ */
+#include <assert.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <openssl/evp.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include "daemon/files.h"
+#include "daemon/log.h"
+#include "daemon/store_db.h"
+#include "proto/spool.h"
+
+/* Left on the disk for the catalogue when room for projections is set aside. */
+static const unsigned long long SPACE_FOR_CATALOGUE = 4ull << 20;
+
+enum { DOCUMENT_BYTES_MAX = 64 << 20 };
+enum progress { MISSING, CLAIMED, STORED };
+
+static const char *const image_files[IMAGE_COUNT] = {"flat.f32", "dark.f32"};
+
+struct stored_scan {
+	/* Constant. */
+	struct store *store;
+	char id[ID_SIZE];
+	long long number; /* in the catalogue */
+	char name[256];
+	double created;
+	int columns, rows, count;
+	enum sample sample;
+	enum quantity quantity;
+	double air;
+	bool damaged;
+
+	/* Guarded by store->scans_lock. */
+	int references; /* one of them is the array's */
+	struct scan *parsed;
+	bool recent;
+
+	pthread_mutex_t lock;    /* guards what follows */
+	unsigned char *progress; /* [count], enum progress */
+	uint8_t (*sha256)[32];   /* [count], of those that are stored */
+	int received;
+	enum progress image[IMAGE_COUNT];
+	uint8_t image_sha256[IMAGE_COUNT][32];
+	bool deleted; /* written with writer.lock held too */
+
+	struct watch_list watchers;
+};
+
+static struct stored_scan *scan_free_memory(struct stored_scan *scan)
+{
+	if (scan == NULL)
+		return NULL;
+	scan_free(scan->parsed);
+	free(scan->progress);
+	free(scan->sha256);
+	watch_list_destroy(&scan->watchers);
+	pthread_mutex_destroy(&scan->lock);
+	free(scan);
+	return NULL;
+}
+
+static struct stored_scan *scan_new(struct store *store, int count)
+{
+	struct stored_scan *scan = calloc(1, sizeof(*scan));
+
+	if (scan == NULL)
+		return NULL;
+	pthread_mutex_init(&scan->lock, NULL);
+	watch_list_init(&scan->watchers);
+	scan->store = store;
+	scan->count = count;
+	scan->references = 1;
+	scan->progress = calloc((size_t)count, 1);
+	scan->sha256 = calloc((size_t)count, sizeof(scan->sha256[0]));
+	return scan->progress == NULL || scan->sha256 == NULL ? scan_free_memory(scan) : scan;
+}
+
+/* ---- the array ---- */
+
+/* The place of the first scan whose id is not below `id`; scans_lock is held. */
+static int place_of(const struct store *store, const char *id)
+{
+	int low = 0, high = store->scan_count;
+
+	while (low < high) {
+		int middle = low + (high - low) / 2;
+
+		if (strcmp(store->scans[middle]->id, id) < 0)
+			low = middle + 1;
+		else
+			high = middle;
+	}
+	return low;
+}
+
+/* Room for one more, so that the insertion after a commit cannot fail; scans_lock is held. */
+static int array_reserve(struct store *store, struct error *err)
+{
+	int space = store->scan_space == 0 ? 64 : 2 * store->scan_space;
+	struct stored_scan **scans;
+
+	if (store->scan_count < store->scan_space)
+		return 0;
+	scans = realloc(store->scans, (size_t)space * sizeof(*scans));
+	if (scans == NULL)
+		return error_set_errno(err, ENOMEM, "list of %d scans", space);
+	store->scans = scans;
+	store->scan_space = space;
+	return 0;
+}
+
+static void array_insert(struct store *store, struct stored_scan *scan)
+{
+	int place = place_of(store, scan->id);
+
+	memmove(store->scans + place + 1, store->scans + place,
+		(size_t)(store->scan_count - place) * sizeof(store->scans[0]));
+	store->scans[place] = scan;
+	store->scan_count++;
+}
+
+static void array_remove(struct store *store, const struct stored_scan *scan)
+{
+	int place = place_of(store, scan->id);
+
+	assert(place < store->scan_count && store->scans[place] == scan);
+	store->scan_count--;
+	memmove(store->scans + place, store->scans + place + 1,
+		(size_t)(store->scan_count - place) * sizeof(store->scans[0]));
+}
+
+/* ---- references and the parsed document ---- */
+
+/* Only the array refers to it and it was not used for a while; scans_lock is held. */
+static void forget_parsed(struct stored_scan *scan)
+{
+	if (scan->references > 1 || scan->recent)
+		return;
+	scan_free(scan->parsed);
+	scan->parsed = NULL;
+}
+
+static void forget_recent(struct store *store, struct stored_scan *scan)
+{
+	for (int i = 0; i < RECENT_SCANS; i++) {
+		if (store->recent[i] == scan)
+			store->recent[i] = NULL;
+	}
+	scan->recent = false;
+}
+
+static void make_recent(struct store *store, struct stored_scan *scan)
+{
+	struct stored_scan **slot = &store->recent[store->recent_next];
+
+	if (scan->recent)
+		return;
+	if (*slot != NULL) {
+		(*slot)->recent = false;
+		forget_parsed(*slot);
+	}
+	*slot = scan;
+	scan->recent = true;
+	store->recent_next = (store->recent_next + 1) % RECENT_SCANS;
+}
+
+void stored_scan_release(struct stored_scan *scan)
+{
+	struct store *store;
+	bool last;
+
+	if (scan == NULL)
+		return;
+	store = scan->store;
+	pthread_mutex_lock(&store->scans_lock);
+	last = --scan->references == 0;
+	if (!last)
+		forget_parsed(scan);
+	pthread_mutex_unlock(&store->scans_lock);
+	if (last)
+		scan_free_memory(scan);
+}
+
+static int read_document(struct stored_scan *scan, struct scan **ret_parsed, struct error *err)
+{
+	char directory[1024], path[1100];
+	char *text = NULL;
+	size_t length;
+	int code;
+
+	store_scan_directory(scan->store, scan->id, directory);
+	snprintf(path, sizeof(path), "%s/scan.json", directory);
+	code = file_read(path, DOCUMENT_BYTES_MAX, &text, &length, err);
+	if (code != 0)
+		/* The row is there, so its file must be: this is our disk's fault, not the client's. */
+		return error_set(err, ERR_IO, "scan %s: its document cannot be read from %s", scan->id, path);
+	code = scan_parse(text, length, ret_parsed, err);
+	if (code != 0) {
+		log_line(LEVEL_ERROR, "scan %s: %s is damaged: %s", scan->id, path, err->text);
+		code = error_set(err, ERR_IO, "scan %s: its document on the disk is damaged", scan->id);
+	}
+	free(text);
+	return code;
+}
+
+/* The caller holds a reference, so a parsed document that is there stays. */
+static int load_parsed(struct stored_scan *scan, struct error *err)
+{
+	struct store *store = scan->store;
+	struct scan *parsed = NULL;
+	bool there;
+	int code;
+
+	pthread_mutex_lock(&store->scans_lock);
+	there = scan->parsed != NULL;
+	pthread_mutex_unlock(&store->scans_lock);
+	if (there)
+		return 0;
+	code = read_document(scan, &parsed, err);
+	if (code != 0)
+		return code;
+	pthread_mutex_lock(&store->scans_lock);
+	if (scan->parsed == NULL) {
+		scan->parsed = parsed;
+		parsed = NULL;
+	}
+	pthread_mutex_unlock(&store->scans_lock);
+	scan_free(parsed); /* somebody else was faster */
+	return 0;
+}
+
+int store_scan_find(struct store *store, const char *id, struct stored_scan **ret_scan, struct error *err)
+{
+	struct stored_scan *scan = NULL;
+	int place, code;
+
+	pthread_mutex_lock(&store->scans_lock);
+	place = place_of(store, id);
+	if (place < store->scan_count && strcmp(store->scans[place]->id, id) == 0) {
+		scan = store->scans[place];
+		scan->references++;
+		make_recent(store, scan);
+	}
+	pthread_mutex_unlock(&store->scans_lock);
+	if (scan == NULL)
+		return error_set(err, ERR_NOT_FOUND, "there is no scan \"%.64s\"", id);
+	code = load_parsed(scan, err);
+	if (code != 0) {
+		stored_scan_release(scan);
+		return code;
+	}
+	*ret_scan = scan;
+	return 0;
+}
+
+int store_scan_list(struct store *store, const char *after, int limit, struct stored_scan **ret_scans, int *ret_count,
+		    bool *ret_more, struct error *err)
+{
+	int end, count;
+
+	(void)err;
+	pthread_mutex_lock(&store->scans_lock);
+	end = after == NULL ? store->scan_count : place_of(store, after);
+	count = end < limit ? end : limit;
+	for (int i = 0; i < count; i++) {
+		ret_scans[i] = store->scans[end - 1 - i];
+		ret_scans[i]->references++;
+	}
+	pthread_mutex_unlock(&store->scans_lock);
+	*ret_count = count;
+	*ret_more = end > count;
+	return 0;
+}
+
+/* ---- making ---- */
+
+static int check_space(const struct store *store, unsigned long long bytes, struct error *err)
+{
+	unsigned long long available;
+	int code = space_free(store->directory, &available, err);
+
+	if (code == 0 && bytes + SPACE_FOR_CATALOGUE > available)
+		code =
+		    error_set_at(err, ERR_NO_SPACE, "/projections/count",
+				 "the projections need %llu bytes on the disk, which has %llu free", bytes, available);
+	return code;
+}
+
+/* The whole file is there before anything is accepted for it: no projection fails half-way on a full disk. */
+static int make_projections(const char *directory, unsigned long long bytes, struct error *err)
+{
+	char path[1100];
+	int file, code = 0, result;
+
+	snprintf(path, sizeof(path), "%s/projections.raw", directory);
+	file = open(path, O_RDWR | O_CREAT | O_EXCL | O_CLOEXEC, 0640);
+	if (file < 0)
+		return error_set_errno(err, errno, "make %s", path);
+	result = posix_fallocate(file, 0, (off_t)bytes);
+	if (result == EFBIG)
+		result = ENOSPC;
+	if (result != 0)
+		code = error_set_errno(err, result, "room for %llu bytes of projections", bytes);
+	else if (fsync(file) < 0)
+		code = error_set_errno(err, errno, "fsync %s", path);
+	close(file);
+	return code;
+}
+
+static int make_files(struct store *store, const struct scan *parsed, const char *id, struct error *err)
+{
+	unsigned long long bytes =
+	    (unsigned long long)scan_projection_bytes(parsed) * (unsigned long long)parsed->count;
+	char directory[1024], path[1100];
+	char *text;
+	int code = check_space(store, bytes, err);
+
+	if (code != 0)
+		return code;
+	text = cJSON_PrintUnformatted(parsed->document);
+	if (text == NULL)
+		return error_set_errno(err, ENOMEM, "scan document");
+	store_scan_directory(store, id, directory);
+	snprintf(path, sizeof(path), "%s/scan.json", directory);
+	code = directory_make(directory, err);
+	if (code == 0)
+		code = make_projections(directory, bytes, err);
+	if (code == 0)
+		code = file_write_durable(path, text, strlen(text), err);
+	if (code == 0)
+		code = directory_sync(directory, err);
+	cJSON_free(text);
+	return code;
+}
+
+static int insert_row(struct store *store, struct stored_scan *scan, struct error *err)
+{
+	struct query query;
+	int code = store_begin(store, err);
+
+	if (code != 0)
+		return code;
+	query_begin(&query, &store->writer,
+		    "INSERT INTO scans (id, name, created, columns, rows, count, sample, quantity, air)"
+		    " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
+		    err);
+	query_text(&query, scan->id);
+	query_text(&query, scan->name);
+	query_real(&query, scan->created);
+	query_integer(&query, scan->columns);
+	query_integer(&query, scan->rows);
+	query_integer(&query, scan->count);
+	query_text(&query, sample_names[scan->sample]);
+	query_text(&query, quantity_names[scan->quantity]);
+	query_real(&query, scan->air);
+	code = query_run(&query);
+	scan->number = sqlite3_last_insert_rowid(store->writer.db);
+	return store_end(store, code, err);
+}
+
+static void remove_files(const struct store *store, const char *id)
+{
+	char directory[1024];
+	struct error err;
+
+	store_scan_directory(store, id, directory);
+	if (directory_remove(directory, &err) != 0)
+		log_line(LEVEL_WARNING, "scan %s: files stay until the next start: %s", id, err.text);
+}
+
+int store_scan_create(struct store *store, struct scan *parsed, struct stored_scan **ret_scan, struct error *err)
+{
+	struct stored_scan *scan = scan_new(store, parsed->count);
+	int code;
+
+	if (scan == NULL)
+		return error_set_errno(err, ENOMEM, "scan of %d projections", parsed->count);
+	memcpy(scan->name, parsed->name, sizeof(scan->name));
+	scan->created = time_now();
+	scan->columns = parsed->geometry.columns;
+	scan->rows = parsed->geometry.rows;
+	scan->sample = parsed->sample;
+	scan->quantity = parsed->quantity;
+	scan->air = parsed->air;
+	code = id_make(scan->id, err);
+	if (code != 0)
+		goto out;
+	code = make_files(store, parsed, scan->id, err);
+	if (code == 0) {
+		pthread_mutex_lock(&store->scans_lock);
+		code = array_reserve(store, err);
+		pthread_mutex_unlock(&store->scans_lock);
+	}
+	if (code == 0)
+		code = insert_row(store, scan, err);
+	if (code != 0) {
+		remove_files(store, scan->id);
+		goto out;
+	}
+	pthread_mutex_lock(&store->scans_lock);
+	array_insert(store, scan);
+	scan->parsed = parsed;
+	scan->references++;
+	make_recent(store, scan);
+	pthread_mutex_unlock(&store->scans_lock);
+	log_line(LEVEL_INFO, "scan %s \"%s\": %d projections of %d x %d", scan->id, scan->name, scan->count,
+		 scan->columns, scan->rows);
+	*ret_scan = scan;
+	return 0;
+out:
+	scan_free_memory(scan);
+	return code;
+}
+
+int store_scan_delete(struct store *store, struct stored_scan *scan, struct error *err)
+{
+	struct query query;
+	bool gone;
+	int code = store_begin(store, err);
+
+	if (code != 0)
+		return code;
+	/* First the flag, so that no projection is recorded after the row has gone. */
+	pthread_mutex_lock(&scan->lock);
+	gone = scan->deleted;
+	scan->deleted = true;
+	pthread_mutex_unlock(&scan->lock);
+	if (gone)
+		return store_end(store, error_set(err, ERR_NOT_FOUND, "there is no scan \"%s\" any more", scan->id),
+				 err);
+	query_begin(&query, &store->writer, "DELETE FROM scans WHERE number = ?", err);
+	query_integer(&query, scan->number);
+	code = store_end(store, query_run(&query), err);
+	if (code != 0) {
+		pthread_mutex_lock(&scan->lock);
+		scan->deleted = false;
+		pthread_mutex_unlock(&scan->lock);
+		return code;
+	}
+	pthread_mutex_lock(&store->scans_lock);
+	array_remove(store, scan);
+	forget_recent(store, scan);
+	scan->references--; /* the array's; the caller holds another */
+	pthread_mutex_unlock(&store->scans_lock);
+	remove_files(store, scan->id);
+	log_line(LEVEL_INFO, "scan %s removed", scan->id);
+	watch_wake(&scan->watchers);
+	return 0;
+}
+
+/* ---- what is known of one ---- */
+
+const struct scan *stored_scan_parsed(struct stored_scan *scan)
+{
+	const struct scan *parsed;
+
+	pthread_mutex_lock(&scan->store->scans_lock);
+	parsed = scan->parsed;
+	pthread_mutex_unlock(&scan->store->scans_lock);
+	return parsed;
+}
+
+const char *stored_scan_id(const struct stored_scan *scan)
+{
+	return scan->id;
+}
+
+void store_scan_directory(const struct store *store, const char *id, char ret_path[1024])
+{
+	snprintf(ret_path, 1024, "%s/scans/%s", store->directory, id);
+}
+
+/* The scan's lock is held. */
+static bool is_ready(const struct stored_scan *scan)
+{
+	return scan->received == scan->count &&
+	       (scan->quantity == QUANTITY_LINE_INTEGRAL || scan->air > 0 || scan->image[IMAGE_FLAT] == STORED);
+}
+
+void stored_scan_facts(struct stored_scan *scan, struct scan_facts *ret)
+{
+	*ret = (struct scan_facts){
+	    .created = scan->created,
+	    .columns = scan->columns,
+	    .rows = scan->rows,
+	    .count = scan->count,
+	    .sample = scan->sample,
+	    .quantity = scan->quantity,
+	    .air = scan->air,
+	    .damaged = scan->damaged,
+	};
+	memcpy(ret->name, scan->name, sizeof(ret->name));
+	pthread_mutex_lock(&scan->lock);
+	ret->received = scan->received;
+	ret->flat = scan->image[IMAGE_FLAT] == STORED;
+	ret->dark = scan->image[IMAGE_DARK] == STORED;
+	ret->complete = scan->received == scan->count;
+	ret->ready = is_ready(scan);
+	ret->deleted = scan->deleted;
+	pthread_mutex_unlock(&scan->lock);
+}
+
+void stored_scan_received(struct stored_scan *scan, unsigned char *ret_flags)
+{
+	pthread_mutex_lock(&scan->lock);
+	for (int i = 0; i < scan->count; i++)
+		ret_flags[i] = scan->progress[i] == STORED;
+	pthread_mutex_unlock(&scan->lock);
+}
+
+bool stored_scan_digest(struct stored_scan *scan, int index, uint8_t ret_sha256[32])
+{
+	bool stored;
+
+	pthread_mutex_lock(&scan->lock);
+	stored = scan->progress[index] == STORED;
+	if (stored)
+		memcpy(ret_sha256, scan->sha256[index], 32);
+	pthread_mutex_unlock(&scan->lock);
+	return stored;
+}
+
+void stored_scan_watch(struct stored_scan *scan, struct watch *watch)
+{
+	watch_add(&scan->watchers, watch);
+}
+
+void stored_scan_unwatch(struct stored_scan *scan, struct watch *watch)
+{
+	watch_remove(&scan->watchers, watch);
+}
+
+void store_watch_ready(struct store *store, struct watch *watch)
+{
+	watch_add(&store->ready, watch);
+}
+
+void store_unwatch_ready(struct store *store, struct watch *watch)
+{
+	watch_remove(&store->ready, watch);
+}
+
+/* ---- projections on their way in ---- */
+
+int stored_scan_claim(struct stored_scan *scan, int index, enum claim *ret_claim, struct error *err)
+{
+	int code = 0;
+
+	if (index < 0 || index >= scan->count)
+		return error_set(err, ERR_NOT_FOUND, "projection %d of a scan that has 0 .. %d", index,
+				 scan->count - 1);
+	pthread_mutex_lock(&scan->lock);
+	if (scan->deleted) {
+		code = error_set(err, ERR_NOT_FOUND, "scan %s was deleted meanwhile", scan->id);
+	} else if (scan->progress[index] == MISSING) {
+		scan->progress[index] = CLAIMED;
+		*ret_claim = CLAIM_GRANTED;
+	} else {
+		*ret_claim = scan->progress[index] == STORED ? CLAIM_STORED : CLAIM_BUSY;
+	}
+	pthread_mutex_unlock(&scan->lock);
+	return code;
+}
+
+void stored_scan_unclaim(struct stored_scan *scan, int index)
+{
+	pthread_mutex_lock(&scan->lock);
+	assert(scan->progress[index] == CLAIMED);
+	scan->progress[index] = MISSING;
+	pthread_mutex_unlock(&scan->lock);
+	watch_wake(&scan->watchers);
+}
+
+int stored_scan_open(struct stored_scan *scan, bool writing, int *ret_descriptor, struct error *err)
+{
+	char directory[1024], path[1100];
+	int file;
+
+	store_scan_directory(scan->store, scan->id, directory);
+	snprintf(path, sizeof(path), "%s/projections.raw", directory);
+	file = open(path, (writing ? O_RDWR : O_RDONLY) | O_CLOEXEC);
+	if (file < 0)
+		return error_set_errno(err, errno, "open %s", path);
+	*ret_descriptor = file;
+	return 0;
+}
+
+static int insert_projections(struct store *store, struct received_projection *batch, int count, struct error *err)
+{
+	struct query query;
+	int code = 0;
+
+	for (int i = 0; i < count && code == 0; i++) {
+		batch[i].stored = !batch[i].scan->deleted; /* cannot change: writer.lock is held */
+		if (!batch[i].stored)
+			continue;
+		query_begin(&query, &store->writer, "INSERT INTO projections (scan, view, sha256) VALUES (?, ?, ?)",
+			    err);
+		query_integer(&query, batch[i].scan->number);
+		query_integer(&query, batch[i].index);
+		query_blob(&query, batch[i].sha256, sizeof(batch[i].sha256));
+		code = query_run(&query);
+	}
+	return code;
+}
+
+/* Shows in memory what is on the disk now; true when that made the scan ready. */
+static bool show_projection(const struct received_projection *projection)
+{
+	struct stored_scan *scan = projection->scan;
+	bool ready = false;
+
+	pthread_mutex_lock(&scan->lock);
+	assert(scan->progress[projection->index] == CLAIMED);
+	scan->progress[projection->index] = projection->stored ? STORED : MISSING;
+	if (projection->stored) {
+		memcpy(scan->sha256[projection->index], projection->sha256, 32);
+		scan->received++;
+		ready = is_ready(scan);
+	}
+	pthread_mutex_unlock(&scan->lock);
+	return ready;
+}
+
+int store_put_projections(struct store *store, struct received_projection *batch, int count, struct error *err)
+{
+	unsigned stored = 0;
+	bool ready = false;
+	int code = store_begin(store, err);
+
+	if (code == 0)
+		code = store_end(store, insert_projections(store, batch, count, err), err);
+	if (code != 0)
+		return code;
+	for (int i = 0; i < count; i++) {
+		ready |= show_projection(&batch[i]);
+		stored += batch[i].stored;
+		if (i + 1 == count || batch[i + 1].scan != batch[i].scan)
+			watch_wake(&batch[i].scan->watchers);
+	}
+	atomic_fetch_add(&store->projections_stored, stored);
+	if (ready)
+		watch_wake(&store->ready);
+	return 0;
+}
+
+/* ---- flat and dark ---- */
+
+/* Nobody else may write this image until claim_image's caller has set its progress again. */
+static int claim_image(struct stored_scan *scan, enum image image, const uint8_t sha256[32], bool *ret_there,
+		       struct error *err)
+{
+	int code = 0;
+
+	*ret_there = false;
+	pthread_mutex_lock(&scan->lock);
+	if (scan->deleted)
+		code = error_set(err, ERR_NOT_FOUND, "scan %s was deleted meanwhile", scan->id);
+	else if (scan->image[image] == CLAIMED)
+		code = error_set(err, ERR_BUSY, "another request is writing this image");
+	else if (scan->image[image] == MISSING)
+		scan->image[image] = CLAIMED;
+	else if (memcmp(scan->image_sha256[image], sha256, 32) == 0)
+		*ret_there = true;
+	else
+		code = error_set(err, ERR_CONFLICT, "the scan has another %s image already",
+				 image == IMAGE_FLAT ? "flat" : "dark");
+	pthread_mutex_unlock(&scan->lock);
+	return code;
+}
+
+static int write_image(struct store *store, struct stored_scan *scan, enum image image, const float *pixels,
+		       const uint8_t sha256[32], struct error *err)
+{
+	static const char *const statements[IMAGE_COUNT] = {"UPDATE scans SET flat = ? WHERE number = ?",
+							    "UPDATE scans SET dark = ? WHERE number = ?"};
+	char directory[1024], path[1100];
+	struct query query;
+	int code;
+
+	store_scan_directory(store, scan->id, directory);
+	snprintf(path, sizeof(path), "%s/%s", directory, image_files[image]);
+	code = file_write_durable(path, pixels, (size_t)scan->columns * (size_t)scan->rows * sizeof(float), err);
+	if (code == 0)
+		code = store_begin(store, err);
+	if (code != 0)
+		return code;
+	query_begin(&query, &store->writer, statements[image], err);
+	query_blob(&query, sha256, 32);
+	query_integer(&query, scan->number);
+	return store_end(store, query_run(&query), err);
+}
+
+int store_put_image(struct store *store, struct stored_scan *scan, enum image image, const float *pixels, bool *ret_new,
+		    struct error *err)
+{
+	uint8_t sha256[32];
+	bool there, ready;
+	int code;
+
+	if (EVP_Digest(pixels, (size_t)scan->columns * (size_t)scan->rows * sizeof(float), sha256, NULL, EVP_sha256(),
+		       NULL) != 1)
+		return error_set(err, ERR_INTERNAL, "SHA-256 failed");
+	code = claim_image(scan, image, sha256, &there, err);
+	if (code != 0)
+		return code;
+	if (there) {
+		*ret_new = false;
+		return 0;
+	}
+	code = write_image(store, scan, image, pixels, sha256, err);
+	pthread_mutex_lock(&scan->lock);
+	scan->image[image] = code == 0 ? STORED : MISSING;
+	memcpy(scan->image_sha256[image], sha256, 32);
+	ready = code == 0 && is_ready(scan);
+	pthread_mutex_unlock(&scan->lock);
+	watch_wake(&scan->watchers);
+	if (ready)
+		watch_wake(&store->ready);
+	if (code == 0)
+		*ret_new = true;
+	return code;
+}
+
+/* ---- at the start ---- */
+
+static void read_image_digest(struct query *query, int column, struct stored_scan *scan, enum image image)
+{
+	if (sqlite3_column_bytes(query->statement, column) != 32)
+		return;
+	memcpy(scan->image_sha256[image], sqlite3_column_blob(query->statement, column), 32);
+	scan->image[image] = STORED;
+}
+
+static int load_scan(struct store *store, struct query *query, struct error *err)
+{
+	sqlite3_stmt *row = query->statement;
+	struct stored_scan *scan;
+	char text[32];
+	int sample, quantity, code = array_reserve(store, err);
+
+	if (code != 0)
+		return code;
+	scan = scan_new(store, sqlite3_column_int(row, 6));
+	if (scan == NULL)
+		return error_set_errno(err, ENOMEM, "list of scans");
+	scan->number = sqlite3_column_int64(row, 0);
+	column_text(query, 1, scan->id, sizeof(scan->id));
+	column_text(query, 2, scan->name, sizeof(scan->name));
+	scan->created = sqlite3_column_double(row, 3);
+	scan->columns = sqlite3_column_int(row, 4);
+	scan->rows = sqlite3_column_int(row, 5);
+	column_text(query, 7, text, sizeof(text));
+	sample = name_index(text, sample_names, 2);
+	column_text(query, 8, text, sizeof(text));
+	quantity = name_index(text, quantity_names, 2);
+	scan->air = sqlite3_column_double(row, 9);
+	read_image_digest(query, 10, scan, IMAGE_FLAT);
+	read_image_digest(query, 11, scan, IMAGE_DARK);
+	if (sample < 0 || quantity < 0 || !id_valid(scan->id)) {
+		code = error_set(err, ERR_IO, "catalogue: the row of scan \"%s\" makes no sense", scan->id);
+		scan_free_memory(scan);
+		return code;
+	}
+	scan->sample = (enum sample)sample;
+	scan->quantity = (enum quantity)quantity;
+	id_floor(scan->id);
+	array_insert(store, scan);
+	return 0;
+}
+
+static void load_projection(struct stored_scan *scan, sqlite3_stmt *row)
+{
+	int view = sqlite3_column_int(row, 1);
+
+	if (view < 0 || view >= scan->count || sqlite3_column_bytes(row, 2) != 32) {
+		log_line(LEVEL_ERROR, "scan %s: the row of projection %d makes no sense", scan->id, view);
+		return;
+	}
+	memcpy(scan->sha256[view], sqlite3_column_blob(row, 2), 32);
+	scan->progress[view] = STORED;
+	scan->received++;
+}
+
+/* Called while nobody else has the store: no locks. */
+int store_load_scans(struct store *store, struct error *err)
+{
+	struct stored_scan *scan = NULL;
+	struct query query;
+	int code = 0;
+
+	query_begin(&query, &store->reader,
+		    "SELECT number, id, name, created, columns, rows, count, sample, quantity, air, flat, dark"
+		    " FROM scans ORDER BY id",
+		    err);
+	while (code == 0 && query_row(&query))
+		code = load_scan(store, &query, err);
+	if (query_end(&query) != 0)
+		code = query.code;
+	for (int i = 0; i < store->scan_count && code == 0; i++) {
+		scan = store->scans[i];
+		query_begin(&query, &store->reader, "SELECT scan, view, sha256 FROM projections WHERE scan = ?", err);
+		query_integer(&query, scan->number);
+		while (query_row(&query))
+			load_projection(scan, query.statement);
+		code = query_end(&query);
+	}
+	return code;
+}
+
+void store_free_scans(struct store *store)
+{
+	for (int i = 0; i < store->scan_count; i++) {
+		assert(store->scans[i]->references == 1);
+		scan_free_memory(store->scans[i]);
+	}
+	free(store->scans);
+}
+
+/* Files that were on their way when the process died, and images whose row was never written. */
+static int sweep_file(void *context, const char *name, struct error *err)
+{
+	struct stored_scan *scan = context;
+	char directory[1024], path[1400];
+	bool stray = name_is_temporary(name);
+
+	for (int i = 0; i < IMAGE_COUNT; i++)
+		stray |= strcmp(name, image_files[i]) == 0 && scan->image[i] != STORED;
+	if (!stray)
+		return 0;
+	store_scan_directory(scan->store, scan->id, directory);
+	snprintf(path, sizeof(path), "%s/%s", directory, name);
+	if (unlink(path) < 0)
+		return error_set_errno(err, errno, "unlink %s", path);
+	return 0;
+}
+
+static int sweep_directory(void *context, const char *name, struct error *err)
+{
+	struct store *store = context;
+	int place = place_of(store, name);
+	char path[1024];
+
+	if (!id_valid(name))
+		return 0; /* not ours */
+	store_scan_directory(store, name, path);
+	if (place < store->scan_count && strcmp(store->scans[place]->id, name) == 0)
+		return directory_visit(path, sweep_file, store->scans[place], err);
+	log_line(LEVEL_INFO, "scan %s was never finished or is deleted: its files are removed", name);
+	return directory_remove(path, err);
+}
+
+static void check_files(struct stored_scan *scan)
+{
+	unsigned long long wanted = (unsigned long long)scan->columns * (unsigned long long)scan->rows *
+				    sample_bytes(scan->sample) * (unsigned long long)scan->count;
+	char directory[1024], path[1100];
+	struct stat status;
+
+	store_scan_directory(scan->store, scan->id, directory);
+	snprintf(path, sizeof(path), "%s/projections.raw", directory);
+	if (stat(path, &status) == 0 && (unsigned long long)status.st_size == wanted)
+		return;
+	scan->damaged = true;
+	log_line(LEVEL_ERROR, "scan %s is in the catalogue, but %s is not there with its %llu bytes", scan->id, path,
+		 wanted);
+}
+
+int store_sweep_scans(struct store *store, bool fresh, struct error *err)
+{
+	char path[1024];
+
+	for (int i = 0; i < store->scan_count; i++)
+		check_files(store->scans[i]);
+	/* A catalogue that was lost must not take the scans with it. */
+	if (fresh)
+		return 0;
+	snprintf(path, sizeof(path), "%s/scans", store->directory);
+	return directory_visit(path, sweep_directory, store, err);
+}
