@@ -1,0 +1,398 @@
+/* One table of settings; flags, environment, config file, help and --print-config are made from it. */
+#include "daemon/config.h"
+
+#include <ctype.h>
+#include <math.h>
+#include <stdbool.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "core/backend.h"
+#include "proto/spool.h"
+
+enum kind {
+	KIND_TEXT,
+	KIND_LIST, /* text; a flag given again adds to it */
+	KIND_CHOICE,
+	KIND_INTEGER,
+	KIND_BYTES,
+	KIND_SECONDS
+};
+
+static const char *const backend_choices[] = {"auto", "cuda", "cpu", NULL};
+static const char *const level_choices[] = {"error", "warning", "info", "debug", NULL};
+
+/* The default is read by the same parser as any other value. */
+static const struct setting {
+	const char *name, *metavar;
+	enum kind kind;
+	size_t offset;       /* in struct config */
+	const char *initial; /* NULL: state_dir_default */
+	double least, most;
+	const char *const *choices;
+	const char *help;
+} settings[] = {
+#define FIELD(member) offsetof(struct config, member)
+    {"listen", "ADDR:PORT|unix:PATH", KIND_LIST, FIELD(listen), "127.0.0.1:2228", 0, 0, NULL,
+     "where to accept requests; loopback or Unix sockets; may be given again; port 0: the kernel chooses"},
+    {"state-dir", "DIR", KIND_TEXT, FIELD(state_dir), NULL, 0, 0, NULL,
+     "where scans, volumes and the catalogue are kept; $STATE_DIRECTORY, else $XDG_STATE_HOME/cbctd"},
+    {"backend", "NAME", KIND_CHOICE, FIELD(backend), "auto", 0, 0, backend_choices,
+     "auto, cuda or cpu; auto: CUDA where a device answers, else the CPU"},
+    {"config", "FILE", KIND_TEXT, FIELD(config_file), "", 0, 0, NULL,
+     "a file of lines NAME = VALUE; # begins a comment"},
+    {"worker", "PATH", KIND_TEXT, FIELD(worker), "", 0, 0, NULL,
+     "the worker program; empty: cbct-worker beside cbctd, else from PATH"},
+    {"workers", "N", KIND_INTEGER, FIELD(workers), "1", 1, 64, NULL, "worker processes, one for each device"},
+    {"threads", "N", KIND_INTEGER, FIELD(threads), "0", 0, 4096, NULL,
+     "threads of a CPU worker; 0: all that the process may use"},
+    {"device-memory", "BYTES", KIND_BYTES, FIELD(device_memory), "0", 0, 1e15, NULL,
+     "memory that a worker may use; 0: what is free"},
+    {"log-level", "LEVEL", KIND_CHOICE, FIELD(log_level), "info", 0, 0, level_choices,
+     "error, warning, info or debug; debug has a line for every request"},
+    {"http-threads", "N", KIND_INTEGER, FIELD(http_threads), "4", 2, 64, NULL, "threads that serve requests"},
+    {"max-connections", "N", KIND_INTEGER, FIELD(max_connections), "2048", 1, 100000, NULL,
+     "connections at a time; more are answered 503"},
+    {"max-connections-per-address", "N", KIND_INTEGER, FIELD(max_connections_per_address), "2048", 1, 100000, NULL,
+     "connections at a time from one address; more are answered 429"},
+    {"upload-buffer", "BYTES", KIND_BYTES, FIELD(upload_buffer), "256M", 1, 1e13, NULL,
+     "projections held in memory between socket and disk"},
+    {"max-wait", "SECONDS", KIND_SECONDS, FIELD(max_wait), "300", 0, 86400, NULL,
+     "longest ?wait=; a longer one is cut to it"},
+    {"header-timeout", "SECONDS", KIND_SECONDS, FIELD(header_timeout), "60", 0.1, 86400, NULL,
+     "a connection whose next request is not there in full by then is closed"},
+    {"transfer-grace", "SECONDS", KIND_SECONDS, FIELD(transfer_grace), "30", 0.1, 86400, NULL,
+     "time that any body may take, beside its length at the minimum rate"},
+    {"minimum-rate", "BYTES", KIND_BYTES, FIELD(minimum_rate), "16K", 1, 1e12, NULL,
+     "a body slower than that many bytes a second is cut off"},
+    {"stop-timeout", "SECONDS", KIND_SECONDS, FIELD(stop_timeout), "20", 0.1, 3600, NULL,
+     "at SIGTERM, time for workers to leave a checkpoint"},
+#undef FIELD
+};
+enum { SETTING_COUNT = sizeof(settings) / sizeof(settings[0]) };
+
+static const char variable_prefix[] = "CBCTD_";
+
+static void *field(const struct setting *setting, struct config *config)
+{
+	return (char *)config + setting->offset;
+}
+
+static bool is_text(const struct setting *setting)
+{
+	return setting->kind == KIND_TEXT || setting->kind == KIND_LIST || setting->kind == KIND_CHOICE;
+}
+
+static const struct setting *setting_find(const char *name, size_t length)
+{
+	for (int i = 0; i < SETTING_COUNT; i++) {
+		if (strlen(settings[i].name) == length && memcmp(settings[i].name, name, length) == 0)
+			return &settings[i];
+	}
+	return NULL;
+}
+
+/* "CBCTD_STATE_DIR" of "state-dir". */
+static void variable_name(const struct setting *setting, char *ret_name, size_t size)
+{
+	int length = snprintf(ret_name, size, "%s%s", variable_prefix, setting->name);
+
+	for (int i = 0; i < length && (size_t)i < size; i++)
+		ret_name[i] = ret_name[i] == '-' ? '_' : (char)toupper((unsigned char)ret_name[i]);
+}
+
+static int set_text(char **text, const char *value, bool add, struct error *err)
+{
+	char *fresh = NULL;
+
+	if (!add || *text == NULL)
+		fresh = strdup(value);
+	else if (asprintf(&fresh, "%s, %s", *text, value) < 0)
+		fresh = NULL;
+	if (fresh == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for settings");
+	free(*text);
+	*text = fresh;
+	return 0;
+}
+
+/* A number with an optional K, M, G or T (powers of 1024); NAN for anything else. */
+static double parse_amount(const char *value, bool units)
+{
+	static const char letters[] = "KMGT";
+	char *end;
+	double number;
+
+	if (!isdigit((unsigned char)value[0]))
+		return NAN;
+	number = strtod(value, &end);
+	if (units && *end != '\0') {
+		const char *letter = strchr(letters, toupper((unsigned char)*end));
+
+		if (letter == NULL)
+			return NAN;
+		number *= exp2(10.0 * (double)(letter - letters + 1));
+		end++;
+	}
+	return *end == '\0' ? number : NAN;
+}
+
+/* `source` is how the user wrote it, "--threads" or "cbctd.conf:7: threads". */
+static int setting_set(const struct setting *setting, struct config *config, const char *value, bool add,
+		       const char *source, struct error *err)
+{
+	double number;
+
+	if (setting->kind == KIND_CHOICE) {
+		int i = 0;
+
+		while (setting->choices[i] != NULL && strcmp(setting->choices[i], value) != 0)
+			i++;
+		if (setting->choices[i] == NULL)
+			return error_set(err, ERR_INVALID, "%s: \"%s\" is none of its values: %s", source, value,
+					 setting->help);
+	}
+	if (is_text(setting))
+		return set_text(field(setting, config), value, add, err);
+
+	number = parse_amount(value, setting->kind == KIND_BYTES);
+	if (!(number >= setting->least && number <= setting->most) ||
+	    (setting->kind == KIND_INTEGER && number != floor(number)))
+		return error_set(err, ERR_INVALID, "%s: \"%s\" is not a%s from %g to %g%s", source, value,
+				 setting->kind == KIND_INTEGER ? " whole number" : " number", setting->least,
+				 setting->most, setting->kind == KIND_BYTES ? " (K, M, G, T are known)" : "");
+	if (setting->kind == KIND_INTEGER)
+		*(long *)field(setting, config) = (long)number;
+	else if (setting->kind == KIND_BYTES)
+		*(size_t *)field(setting, config) = (size_t)number;
+	else
+		*(double *)field(setting, config) = number;
+	return 0;
+}
+
+/* systemd gives several directories separated by colons; the first is ours. */
+static int state_dir_default(char **ret_path, struct error *err)
+{
+	const char *given = getenv("STATE_DIRECTORY"), *xdg = getenv("XDG_STATE_HOME"), *home = getenv("HOME");
+	char *path = NULL;
+	int wrote;
+
+	if (given != NULL && given[0] != '\0')
+		wrote = asprintf(&path, "%.*s", (int)strcspn(given, ":"), given);
+	else if (xdg != NULL && xdg[0] == '/')
+		wrote = asprintf(&path, "%s/cbctd", xdg);
+	else
+		wrote = asprintf(&path, "%s/.local/state/cbctd", home != NULL ? home : "");
+	if (wrote < 0)
+		return error_set(err, ERR_NO_MEMORY, "no memory for settings");
+	*ret_path = path;
+	return 0;
+}
+
+static int load_defaults(struct config *config, struct error *err)
+{
+	int code = 0;
+
+	for (int i = 0; i < SETTING_COUNT && code == 0; i++) {
+		if (settings[i].initial == NULL)
+			code = state_dir_default(field(&settings[i], config), err);
+		else
+			code = setting_set(&settings[i], config, settings[i].initial, false, settings[i].name, err);
+	}
+	return code;
+}
+
+static char *trim(char *text)
+{
+	size_t length;
+
+	while (isspace((unsigned char)*text))
+		text++;
+	length = strlen(text);
+	while (length > 0 && isspace((unsigned char)text[length - 1]))
+		text[--length] = '\0';
+	return text;
+}
+
+/* One line of a config file; `given` remembers what this file has set already. */
+static int load_line(struct config *config, char *line, const char *place, bool given[SETTING_COUNT], struct error *err)
+{
+	const struct setting *setting;
+	char source[256], *value;
+
+	line = trim(line);
+	if (line[0] == '\0' || line[0] == '#')
+		return 0;
+	value = strchr(line, '=');
+	if (value == NULL)
+		return error_set(err, ERR_INVALID, "%s: \"%s\" is not NAME = VALUE", place, line);
+	*value++ = '\0';
+	line = trim(line);
+	setting = setting_find(line, strlen(line));
+	if (setting == NULL || strcmp(setting->name, "config") == 0)
+		return error_set(err, ERR_INVALID, "%s: no setting is called \"%s\"", place, line);
+	if (given[setting - settings] && setting->kind != KIND_LIST)
+		return error_set(err, ERR_INVALID, "%s: \"%s\" is set a second time", place, line);
+	snprintf(source, sizeof(source), "%s: %s", place, line);
+	if (setting_set(setting, config, trim(value), given[setting - settings], source, err) != 0)
+		return err->code;
+	given[setting - settings] = true;
+	return 0;
+}
+
+static int load_file(struct config *config, const char *path, struct error *err)
+{
+	enum { CONFIG_BYTES_MAX = 1 << 20 };
+	bool given[SETTING_COUNT] = {false};
+	char *text, *next, *line, place[128];
+	size_t length;
+	int number = 0, code;
+
+	code = file_read(path, CONFIG_BYTES_MAX, &text, &length, err);
+	if (code != 0)
+		return code;
+	next = text;
+	while (code == 0 && (line = strsep(&next, "\n")) != NULL) {
+		snprintf(place, sizeof(place), "%.100s:%d", path, ++number);
+		code = load_line(config, line, place, given, err);
+	}
+	free(text);
+	return code;
+}
+
+static int load_environment(struct config *config, struct error *err)
+{
+	char name[96];
+	int code = 0;
+
+	for (int i = 0; i < SETTING_COUNT && code == 0; i++) {
+		const char *value;
+
+		variable_name(&settings[i], name, sizeof(name));
+		value = getenv(name);
+		if (value != NULL)
+			code = setting_set(&settings[i], config, value, false, name, err);
+	}
+	return code;
+}
+
+/* only_config: looks for --config alone. */
+static int each_flag(int argc, char **argv, struct config *config, enum config_action *action, bool only_config,
+		     struct error *err)
+{
+	bool given[SETTING_COUNT] = {false};
+
+	for (int i = 1; i < argc; i++) {
+		const char *name = argv[i], *value;
+		const struct setting *setting;
+		size_t length;
+
+		if (strcmp(name, "--help") == 0 || strcmp(name, "-h") == 0) {
+			*action = CONFIG_HELP;
+			continue;
+		}
+		if (strcmp(name, "--print-config") == 0) {
+			*action = CONFIG_PRINT;
+			continue;
+		}
+		length = strcspn(name, "=");
+		setting = strncmp(name, "--", 2) == 0 ? setting_find(name + 2, length - 2) : NULL;
+		if (setting == NULL)
+			return error_set(err, ERR_INVALID, "%s: there is no such flag; --help shows all", name);
+		value = name[length] == '=' ? name + length + 1 : i + 1 < argc ? argv[++i] : NULL;
+		if (value == NULL)
+			return error_set(err, ERR_INVALID, "%s: its value %s is missing", name, setting->metavar);
+		if (only_config && strcmp(setting->name, "config") != 0)
+			continue;
+		if (setting_set(setting, config, value, given[setting - settings] && setting->kind == KIND_LIST, name,
+				err) != 0)
+			return err->code;
+		given[setting - settings] = true;
+	}
+	return 0;
+}
+
+int config_load(int argc, char **argv, struct config *ret_config, enum config_action *ret_action, struct error *err)
+{
+	struct config config = {0};
+	enum config_action action = CONFIG_RUN;
+	const char *variable = getenv("CBCTD_CONFIG");
+	int code;
+
+	code = load_defaults(&config, err);
+	if (code == 0 && variable != NULL)
+		code = set_text(&config.config_file, variable, false, err);
+	/* The flags are read twice: first for the name of the file that goes before the other flags. */
+	if (code == 0)
+		code = each_flag(argc, argv, &config, &action, true, err);
+	if (code == 0 && config.config_file[0] != '\0' && action != CONFIG_HELP)
+		code = load_file(&config, config.config_file, err);
+	if (code == 0 && action != CONFIG_HELP)
+		code = load_environment(&config, err);
+	if (code == 0)
+		code = each_flag(argc, argv, &config, &action, false, err);
+	if (code != 0) {
+		config_clear(&config);
+		return code;
+	}
+	*ret_config = config;
+	*ret_action = action;
+	return 0;
+}
+
+void config_clear(struct config *config)
+{
+	for (int i = 0; i < SETTING_COUNT; i++) {
+		if (is_text(&settings[i])) {
+			char **text = field(&settings[i], config);
+
+			free(*text);
+			*text = NULL;
+		}
+	}
+}
+
+void config_help(FILE *out)
+{
+	fputs("usage: cbctd [--NAME VALUE ...]\n\n"
+	      "Cone-beam reconstruction as a service: projections in over HTTP, volumes out.\n"
+	      "Each setting is a flag, a line NAME = VALUE of the config file, or CBCTD_NAME in the\n"
+	      "environment (upper case, _ for -); a flag goes first, then the environment, then the file.\n\n",
+	      out);
+	for (int i = 0; i < SETTING_COUNT; i++) {
+		const struct setting *setting = &settings[i];
+
+		fprintf(out, "  --%s %s\n        %s", setting->name, setting->metavar, setting->help);
+		if (setting->initial != NULL && setting->initial[0] != '\0')
+			fprintf(out, " (%s)", setting->initial);
+		fputc('\n', out);
+	}
+	fputs("  --print-config\n        every setting as it is now, as a config file\n"
+	      "  --help\n        this list\n\nbackends:\n",
+	      out);
+	/* The daemon itself has no CUDA; the worker has, and its row is weak here. */
+	for (int i = 0; i < BACKEND_COUNT; i++) {
+		if (backends[i] != NULL)
+			fprintf(out, "  %-6s %s\n", backends[i]->name, backends[i]->summary);
+	}
+}
+
+void config_print(const struct config *config, FILE *out)
+{
+	for (int i = 0; i < SETTING_COUNT; i++) {
+		const struct setting *setting = &settings[i];
+		const void *value = (const char *)config + setting->offset;
+
+		fprintf(out, "# %s\n", setting->help);
+		if (strcmp(setting->name, "config") == 0)
+			fprintf(out, "# config = %s\n", *(char *const *)value); /* no line of a config file itself */
+		else if (is_text(setting))
+			fprintf(out, "%s = %s\n", setting->name, *(char *const *)value);
+		else if (setting->kind == KIND_INTEGER)
+			fprintf(out, "%s = %ld\n", setting->name, *(const long *)value);
+		else if (setting->kind == KIND_BYTES)
+			fprintf(out, "%s = %zu\n", setting->name, *(const size_t *)value);
+		else
+			fprintf(out, "%s = %g\n", setting->name, *(const double *)value);
+	}
+}
