@@ -17,6 +17,7 @@
 #include <unistd.h>
 
 #include "proto/json.h"
+#include "proto/spool.h"
 
 const char *const volume_type_names[VOLUME_TYPE_COUNT] = {"float32", "int16"};
 
@@ -621,23 +622,6 @@ static double element_value(const uint8_t *at, enum element element)
 	return 0;
 }
 
-static int read_exactly(int file, void *to, size_t size, size_t offset, const char *path, struct error *err)
-{
-	for (size_t done = 0; done < size;) {
-		ssize_t got = pread(file, (char *)to + done, size - done, (off_t)(offset + done));
-
-		if (got < 0 && errno == EINTR)
-			continue;
-		if (got < 0)
-			return error_set_errno(err, errno, "%s cannot be read", path);
-		if (got == 0)
-			return error_set(err, ERR_INVALID, "%.200s: %zu bytes, at least %zu are expected", path,
-					 offset + done, offset + size);
-		done += (size_t)got;
-	}
-	return 0;
-}
-
 /* Row after row, each to its place. */
 static int read_voxels(int file, const char *path, const struct layout *layout, const struct grid *grid,
 		       const bool flip[3], float *ret_voxels, struct error *err)
@@ -652,7 +636,7 @@ static int read_voxels(int file, const char *path, const struct layout *layout, 
 	for (size_t z = 0; z < nz && code == 0; z++) {
 		size_t to_z = flip[2] ? nz - 1 - z : z;
 
-		code = read_exactly(file, slice, plane, layout->start + z * plane, path, err);
+		code = file_read_at(file, slice, plane, layout->start + z * plane, path, err);
 		for (size_t y = 0; y < ny && code == 0; y++) {
 			size_t to_y = flip[1] ? ny - 1 - y : y;
 			float *row = ret_voxels + (to_z * ny + to_y) * nx;
@@ -698,7 +682,7 @@ int volume_read(const char *path, struct grid *grid, float **ret_voxels, struct 
 	}
 	if ((size_t)status.st_size < sizeof(head))
 		memset(head, 0, sizeof(head));
-	code = read_exactly(file, head, (size_t)status.st_size < sizeof(head) ? (size_t)status.st_size : sizeof(head),
+	code = file_read_at(file, head, (size_t)status.st_size < sizeof(head) ? (size_t)status.st_size : sizeof(head),
 			    0, path, err);
 	if (code == 0)
 		code = read_header(head, sizeof(head), &layout, grid, err);

@@ -21,9 +21,18 @@
  */
 enum { SPOOL_VOLUME_OFFSET = 352 };
 
-/* Whole small file; *ret_text ends with a zero byte beyond its length. Free with free. */
+/*
+ * Whole small file; *ret_text ends with a zero byte beyond its length. Free with
+ * free. ERR_NOT_FOUND where there is none, ERR_TOO_LARGE beyond `most` bytes.
+ */
 int file_read(const char *path, size_t most, char **ret_text, size_t *ret_length, struct error *err);
-/* Beside the path, fsync, rename, fsync of the directory: there whole or not at all. */
+/* `size` bytes from `offset` of an open file, all of them; `path` is for the error's text. */
+int file_read_at(int file, void *ret_to, size_t size, size_t offset, const char *path, struct error *err);
+/*
+ * Beside the path as PATH.tmp, fsync, rename, fsync of the directory: there
+ * whole or not at all. One writer of a path at a time. A sync that failed is
+ * final (the kernel may have dropped the pages): it is reported, never tried again.
+ */
 int file_write_durable(const char *path, const void *data, size_t length, struct error *err);
 
 /* A scan directory opened for reading. */
@@ -32,8 +41,13 @@ struct scan_files {
 	int projections;    /* descriptor */
 	float *flat, *dark; /* [row][column] or NULL */
 };
+/*
+ * Reads scan.json and the images and checks that every file is as long as the
+ * scan says; whether all projections have arrived only the owner of the
+ * directory knows. ERR_NOT_FOUND where a file is missing.
+ */
 int scan_files_open(const char *directory, struct scan_files *ret_files, struct error *err);
-void scan_files_close(struct scan_files *files);
+void scan_files_close(struct scan_files *files); /* NULL and a closed one are fine */
 
 /* One kept volume on its way to disk. */
 struct saved_volume {
@@ -43,22 +57,31 @@ struct saved_volume {
 };
 
 /*
- * The pipeline over a directory: opens the recon, pushes the views in [views]
- * (NULL: all), runs, and writes each kept volume into out_directory before it
- * calls on_volume. Used by the worker and by `cbct recon`, so that both do the
- * same thing. checkpoint: path of an iterate to resume from, or NULL; `iteration` is the one it holds.
+ * The pipeline over a directory: opens the recon, pushes all views a few at a
+ * time, runs, and writes each kept volume durably into out_directory before it
+ * calls on_volume. Where "final" is the same iterate as the volume before it,
+ * it is another link to that file. Used by the worker and by `cbct recon`, so
+ * that both do the same thing.
+ *
+ * A run that hooks->recon.yield ended returns ERR_BUSY and has left its iterate
+ * as OUT/checkpoint.f32, durably. `checkpoint` is the path of one to resume from,
+ * or NULL; `iteration` the one it holds as far as the caller knows. The file
+ * itself knows better (a crash may lie between its writing and the caller's
+ * note): where they differ, the file counts and a warning "checkpoint" says so.
  */
 struct spool_hooks {
-	struct recon_hooks recon; /* keep is spool_run's own and must be NULL here */
+	struct recon_hooks recon; /* any may be NULL, its context goes to all of these; keep is spool_run's own and must
+				     be NULL here */
 	int (*on_volume)(void *context, const struct kept_volume *volume, const struct saved_volume *saved,
-	                 struct error *err);
+			 struct error *err);
 	void (*on_open)(void *context, const struct recon_memory *memory, const char *plan);
 };
 int spool_run(const struct backend *backend, struct device *device, const char *scan_directory,
-              const struct recipe *recipe, const char *out_directory, const char *checkpoint, int iteration,
-              const struct spool_hooks *hooks, struct error *err);
+	      const struct recipe *recipe, const char *out_directory, const char *checkpoint, int iteration,
+	      const struct spool_hooks *hooks, struct error *err);
 
-/* Where a yielding run leaves its iterate: OUT/checkpoint.f32, written when recon.yield ended the run. */
+/* A line of text padded to SPOOL_CHECKPOINT_OFFSET bytes with iteration and size, then float32 voxels [z][y][x]. */
 #define SPOOL_CHECKPOINT "checkpoint.f32"
+enum { SPOOL_CHECKPOINT_OFFSET = 64 };
 
 #endif

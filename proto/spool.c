@@ -1,0 +1,631 @@
+/*
+ * The spool: scan directories in, volumes out. Whatever a path names is there
+ * whole or not at all: it is written beside it, synced, renamed, and the
+ * directory synced; every return value on that way counts.
+ */
+#include "proto/spool.h"
+
+#include <errno.h>
+#include <fcntl.h>
+#include <limits.h>
+#include <openssl/evp.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/mman.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include "proto/format.h"
+
+_Static_assert(SPOOL_VOLUME_OFFSET == 352, "a NIfTI-1 header and its four extension bytes");
+
+enum {
+	READ_BYTES = 8 << 20, /* projections in one go: small beside the scan, large beside a system call */
+	SLAB_BYTES = 8 << 20  /* voxels in one go, on their way to the disk */
+};
+
+/* ---- files ---- */
+
+int file_read_at(int file, void *ret_to, size_t size, size_t offset, const char *path, struct error *err)
+{
+	for (size_t done = 0; done < size;) {
+		ssize_t got = pread(file, (char *)ret_to + done, size - done, (off_t)(offset + done));
+
+		if (got < 0 && errno == EINTR)
+			continue;
+		if (got < 0)
+			return error_set_errno(err, errno, "%s cannot be read", path);
+		if (got == 0)
+			return error_set(err, ERR_IO, "%.200s ends at byte %zu, %zu are expected", path, offset + done,
+					 offset + size);
+		done += (size_t)got;
+	}
+	return 0;
+}
+
+static int write_all(int file, const void *from, size_t size, const char *path, struct error *err)
+{
+	for (size_t done = 0; done < size;) {
+		ssize_t put = write(file, (const char *)from + done, size - done);
+
+		if (put < 0 && errno == EINTR)
+			continue;
+		if (put < 0)
+			return error_set_errno(err, errno, "%s cannot be written", path);
+		done += (size_t)put;
+	}
+	return 0;
+}
+
+int file_read(const char *path, size_t most, char **ret_text, size_t *ret_length, struct error *err)
+{
+	int file = open(path, O_RDONLY | O_CLOEXEC), code = 0;
+	struct stat status;
+	char *text = NULL;
+
+	if (file < 0 && errno == ENOENT)
+		return error_set(err, ERR_NOT_FOUND, "%.200s does not exist", path);
+	if (file < 0)
+		return error_set_errno(err, errno, "%s cannot be opened", path);
+	if (fstat(file, &status) != 0) {
+		code = error_set_errno(err, errno, "%s cannot be read", path);
+		goto out;
+	}
+	if ((size_t)status.st_size > most) {
+		code = error_set(err, ERR_TOO_LARGE, "%.200s: %zu bytes, at most %zu are expected", path,
+				 (size_t)status.st_size, most);
+		goto out;
+	}
+	text = malloc((size_t)status.st_size + 1);
+	if (text == NULL) {
+		code = error_set(err, ERR_NO_MEMORY, "no memory for the %zu bytes of %.200s", (size_t)status.st_size,
+				 path);
+		goto out;
+	}
+	code = file_read_at(file, text, (size_t)status.st_size, 0, path, err);
+	if (code == 0) {
+		text[status.st_size] = '\0';
+		*ret_text = text;
+		*ret_length = (size_t)status.st_size;
+		text = NULL;
+	}
+out:
+	free(text);
+	close(file);
+	return code;
+}
+
+/* The names in the directory of `path` reach the disk. */
+static int sync_directory_of(const char *path, struct error *err)
+{
+	char directory[PATH_MAX];
+	const char *slash = strrchr(path, '/');
+	int file, code = 0;
+
+	snprintf(directory, sizeof(directory), "%.*s", slash == NULL ? 1 : (int)(slash - path) + 1,
+		 slash == NULL ? "." : path);
+	file = open(directory, O_RDONLY | O_DIRECTORY | O_CLOEXEC);
+	if (file < 0)
+		return error_set_errno(err, errno, "%s cannot be opened", directory);
+	if (fsync(file) != 0)
+		code = error_set_errno(err, errno, "%s cannot be synced", directory);
+	close(file);
+	return code;
+}
+
+/* A file on its way to its name. */
+struct durable {
+	int file; /* descriptor, -1 once closed */
+	const char *path;
+	char beside[PATH_MAX];
+};
+
+/* `size` bytes are set aside at once, so that a full disk is met before the work and not within it. */
+static int durable_open(struct durable *ret, const char *path, size_t size, struct error *err)
+{
+	struct durable d = {.path = path};
+	int code;
+
+	if (snprintf(d.beside, sizeof(d.beside), "%s.tmp", path) >= (int)sizeof(d.beside))
+		return error_set(err, ERR_INVALID, "a path of %zu bytes is too long", strlen(path));
+	d.file = open(d.beside, O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, 0640);
+	if (d.file < 0)
+		return error_set_errno(err, errno, "%s cannot be created", d.beside);
+	/* File systems that cannot set space aside say so; the writes will then tell. */
+	if (size > 0 && fallocate(d.file, 0, 0, (off_t)size) != 0 && errno != EOPNOTSUPP && errno != EINTR) {
+		code = error_set_errno(err, errno, "%zu bytes for %s", size, d.beside);
+		close(d.file);
+		unlink(d.beside);
+		return code;
+	}
+	*ret = d;
+	return 0;
+}
+
+/* Nothing half-written stays behind. */
+static void durable_abandon(struct durable *d)
+{
+	if (d->file >= 0)
+		close(d->file);
+	d->file = -1;
+	unlink(d->beside);
+}
+
+static int durable_rename(struct durable *d, struct error *err)
+{
+	int code = 0;
+
+	if (rename(d->beside, d->path) != 0)
+		code = error_set_errno(err, errno, "%s cannot be renamed", d->beside);
+	return code != 0 ? code : sync_directory_of(d->path, err);
+}
+
+/* Gives the file its name, or abandons it. */
+static int durable_commit(struct durable *d, struct error *err)
+{
+	int code = 0;
+
+	if (fdatasync(d->file) != 0)
+		code = error_set_errno(err, errno, "%s cannot be synced", d->beside);
+	if (close(d->file) != 0 && code == 0)
+		code = error_set_errno(err, errno, "%s cannot be closed", d->beside);
+	d->file = -1;
+	if (code == 0)
+		code = durable_rename(d, err);
+	if (code != 0)
+		durable_abandon(d);
+	return code;
+}
+
+int file_write_durable(const char *path, const void *data, size_t length, struct error *err)
+{
+	struct durable d;
+	int code = durable_open(&d, path, length, err);
+
+	if (code != 0)
+		return code;
+	code = write_all(d.file, data, length, d.beside, err);
+	if (code != 0) {
+		durable_abandon(&d);
+		return code;
+	}
+	return durable_commit(&d, err);
+}
+
+/* ---- a scan directory ---- */
+
+static int join(char *ret_path, size_t size, const char *directory, const char *name, const char *extension,
+		struct error *err)
+{
+	if (snprintf(ret_path, size, "%s/%s%s", directory, name, extension) >= (int)size)
+		return error_set(err, ERR_INVALID, "the path of %s in %.200s is too long", name, directory);
+	return 0;
+}
+
+static int read_scan(const char *directory, struct scan **ret_scan, struct error *err)
+{
+	char path[PATH_MAX], *text = NULL;
+	size_t length = 0;
+	int code = join(path, sizeof(path), directory, "scan.json", "", err);
+
+	if (code == 0)
+		code = file_read(path, JSON_BYTES_MAX, &text, &length, err);
+	if (code == 0)
+		code = scan_parse(text, length, ret_scan, err);
+	free(text);
+	return code;
+}
+
+static int open_projections(const char *directory, const struct scan *scan, int *ret_file, struct error *err)
+{
+	size_t expected = scan_projection_bytes(scan) * (size_t)scan->count;
+	char path[PATH_MAX];
+	struct stat status;
+	int code = join(path, sizeof(path), directory, "projections.raw", "", err), file;
+
+	if (code != 0)
+		return code;
+	file = open(path, O_RDONLY | O_CLOEXEC);
+	if (file < 0 && errno == ENOENT)
+		return error_set(err, ERR_NOT_FOUND, "%.200s does not exist", path);
+	if (file < 0)
+		return error_set_errno(err, errno, "%s cannot be opened", path);
+	if (fstat(file, &status) != 0)
+		code = error_set_errno(err, errno, "%s cannot be read", path);
+	else if ((size_t)status.st_size != expected)
+		code = error_set(err, ERR_INVALID, "%.150s: %zu bytes, but %d projections of %d x %d %s have %zu", path,
+				 (size_t)status.st_size, scan->count, scan->geometry.columns, scan->geometry.rows,
+				 sample_names[scan->sample], expected);
+	if (code != 0)
+		close(file);
+	else
+		*ret_file = file;
+	return code;
+}
+
+/* A flat or dark image, float32; *ret_image stays NULL where there is none. */
+static int read_image(const char *directory, const char *name, const struct scan *scan, float **ret_image,
+		      struct error *err)
+{
+	size_t expected = (size_t)scan->geometry.columns * (size_t)scan->geometry.rows * sizeof(float), length = 0;
+	char path[PATH_MAX], *bytes = NULL;
+	int code = join(path, sizeof(path), directory, name, ".f32", err);
+
+	if (code != 0)
+		return code;
+	code = file_read(path, expected, &bytes, &length, err);
+	if (code == ERR_NOT_FOUND)
+		return 0;
+	if (code == 0 && length != expected) {
+		free(bytes);
+		return error_set(err, ERR_INVALID, "%.200s: %zu bytes, %zu are expected", path, length, expected);
+	}
+	if (code == 0)
+		*ret_image = (float *)(void *)bytes; /* malloc's alignment suits any type */
+	return code;
+}
+
+int scan_files_open(const char *directory, struct scan_files *ret_files, struct error *err)
+{
+	struct scan_files files = {.projections = -1};
+	int code = read_scan(directory, &files.scan, err);
+
+	if (code == 0)
+		code = open_projections(directory, files.scan, &files.projections, err);
+	if (code == 0)
+		code = read_image(directory, "flat", files.scan, &files.flat, err);
+	if (code == 0)
+		code = read_image(directory, "dark", files.scan, &files.dark, err);
+	if (code != 0)
+		scan_files_close(&files);
+	else
+		*ret_files = files;
+	return code;
+}
+
+void scan_files_close(struct scan_files *files)
+{
+	if (files == NULL)
+		return;
+	scan_free(files->scan);
+	if (files->projections >= 0)
+		close(files->projections);
+	free(files->flat);
+	free(files->dark);
+	*files = (struct scan_files){.projections = -1};
+}
+
+/* ---- the pipeline ---- */
+
+struct run {
+	const struct spool_hooks *hooks;
+	const char *directory;
+	/* The volume that was written last: "final" may be the same iterate. */
+	struct saved_volume saved;
+	char saved_stage[16];
+	int saved_iteration;
+};
+
+static bool run_cancelled(void *context)
+{
+	const struct spool_hooks *hooks = ((struct run *)context)->hooks;
+
+	return hooks->recon.cancelled != NULL && hooks->recon.cancelled(hooks->recon.context);
+}
+
+static bool run_yield(void *context)
+{
+	const struct spool_hooks *hooks = ((struct run *)context)->hooks;
+
+	return hooks->recon.yield != NULL && hooks->recon.yield(hooks->recon.context);
+}
+
+static void run_progress(void *context, enum stage stage, int iteration, double fraction)
+{
+	const struct spool_hooks *hooks = ((struct run *)context)->hooks;
+
+	if (hooks->recon.progress != NULL)
+		hooks->recon.progress(hooks->recon.context, stage, iteration, fraction);
+}
+
+static void run_row(void *context, const struct history_row *row)
+{
+	const struct spool_hooks *hooks = ((struct run *)context)->hooks;
+
+	if (hooks->recon.row != NULL)
+		hooks->recon.row(hooks->recon.context, row);
+}
+
+static void run_warning(void *context, const char *code, const char *detail)
+{
+	const struct spool_hooks *hooks = ((struct run *)context)->hooks;
+
+	if (hooks->recon.warning != NULL)
+		hooks->recon.warning(hooks->recon.context, code, detail);
+}
+
+/* The iterate behind what the file holds already, slab by slab; digest may be NULL. */
+static int write_iterate(struct recon *recon, struct durable *d, EVP_MD_CTX *digest, struct error *err)
+{
+	const struct grid *grid = recon_grid(recon);
+	size_t slice = (size_t)grid->size[0] * (size_t)grid->size[1] * sizeof(float);
+	int slab = slice < SLAB_BYTES ? (int)(SLAB_BYTES / slice) : 1, code = 0;
+	float *voxels;
+
+	if (slab > grid->size[2])
+		slab = grid->size[2];
+	voxels = malloc((size_t)slab * slice);
+	if (voxels == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a slab of %zu bytes", (size_t)slab * slice);
+	for (int z = 0; z < grid->size[2] && code == 0; z += slab) {
+		int count = z + slab <= grid->size[2] ? slab : grid->size[2] - z;
+		size_t bytes = (size_t)count * slice;
+
+		code = recon_read(recon, z, count, voxels, err);
+		if (code == 0 && digest != NULL && EVP_DigestUpdate(digest, voxels, bytes) != 1)
+			code = error_set(err, ERR_INTERNAL, "SHA-256 failed");
+		if (code == 0)
+			code = write_all(d->file, voxels, bytes, d->beside, err);
+	}
+	free(voxels);
+	return code;
+}
+
+/* Header and voxels under the volume's own name. */
+static int save_volume(struct recon *recon, const struct kept_volume *kept, struct saved_volume *ret_saved,
+		       struct error *err)
+{
+	uint8_t header[FORMAT_HEADER_MAX];
+	char description[80];
+	struct durable d;
+	EVP_MD_CTX *digest = EVP_MD_CTX_new();
+	size_t length;
+	int code;
+
+	if (digest == NULL || EVP_DigestInit_ex(digest, EVP_sha256(), NULL) != 1) {
+		EVP_MD_CTX_free(digest);
+		return error_set(err, ERR_NO_MEMORY, "no memory for SHA-256");
+	}
+	code = durable_open(&d, ret_saved->path, SPOOL_VOLUME_OFFSET + ret_saved->bytes, err);
+	if (code != 0)
+		goto out;
+	/* Nothing of the name: "final" may be a link to this file. */
+	snprintf(description, sizeof(description), "attenuation in 1/mm, %s, iteration %d", kept->stage,
+		 kept->iteration);
+	length = volume_formats[0].header(kept->grid, VOLUME_FLOAT32, description, header);
+	code = write_all(d.file, header, length, d.beside, err);
+	if (code == 0)
+		code = write_iterate(recon, &d, digest, err);
+	if (code == 0 && EVP_DigestFinal_ex(digest, ret_saved->sha256, NULL) != 1)
+		code = error_set(err, ERR_INTERNAL, "SHA-256 failed");
+	if (code != 0)
+		durable_abandon(&d);
+	else
+		code = durable_commit(&d, err);
+out:
+	EVP_MD_CTX_free(digest);
+	return code;
+}
+
+/* Another name for a volume that is on the disk; *ret_linked false where the file system knows no links. */
+static int link_volume(const char *from, const char *path, bool *ret_linked, struct error *err)
+{
+	struct durable d = {.file = -1, .path = path};
+	int code;
+
+	if (snprintf(d.beside, sizeof(d.beside), "%s.tmp", path) >= (int)sizeof(d.beside))
+		return error_set(err, ERR_INVALID, "a path of %zu bytes is too long", strlen(path));
+	unlink(d.beside); /* what a crash left */
+	if (link(from, d.beside) != 0) {
+		if (errno == ENOSPC || errno == EDQUOT || errno == EIO)
+			return error_set_errno(err, errno, "%s cannot be linked", d.beside);
+		*ret_linked = false;
+		return 0;
+	}
+	code = durable_rename(&d, err);
+	unlink(d.beside); /* still there when that failed, or did nothing because both were one file already */
+	if (code == 0)
+		*ret_linked = true;
+	return code;
+}
+
+static int run_keep(void *context, struct recon *recon, const struct kept_volume *kept, struct error *err)
+{
+	struct run *run = context;
+	struct saved_volume saved = {.bytes = grid_voxels(kept->grid) * sizeof(float)};
+	bool linked = false;
+	int code = join(saved.path, sizeof(saved.path), run->directory, kept->name, ".nii", err);
+
+	if (code == 0 && run->saved.bytes > 0 && run->saved_iteration == kept->iteration &&
+	    strcmp(run->saved_stage, kept->stage) == 0) {
+		memcpy(saved.sha256, run->saved.sha256, sizeof(saved.sha256));
+		code = link_volume(run->saved.path, saved.path, &linked, err);
+	}
+	if (code == 0 && !linked)
+		code = save_volume(recon, kept, &saved, err);
+	if (code != 0)
+		return code;
+	run->saved = saved;
+	run->saved_iteration = kept->iteration;
+	snprintf(run->saved_stage, sizeof(run->saved_stage), "%s", kept->stage);
+	if (run->hooks->on_volume != NULL)
+		code = run->hooks->on_volume(run->hooks->recon.context, kept, &saved, err);
+	return code;
+}
+
+/* ---- checkpoints ---- */
+
+static void checkpoint_line(char ret_line[SPOOL_CHECKPOINT_OFFSET], int iteration, const struct grid *grid)
+{
+	char text[SPOOL_CHECKPOINT_OFFSET];
+
+	memset(ret_line, ' ', SPOOL_CHECKPOINT_OFFSET);
+	snprintf(text, sizeof(text), "cbctd checkpoint %d of %d %d %d", iteration, grid->size[0], grid->size[1],
+		 grid->size[2]);
+	memcpy(ret_line, text, strlen(text));
+	ret_line[SPOOL_CHECKPOINT_OFFSET - 1] = '\n';
+}
+
+static int save_checkpoint(struct recon *recon, const char *directory, struct error *err)
+{
+	char path[PATH_MAX], header[SPOOL_CHECKPOINT_OFFSET];
+	struct durable d;
+	int code = join(path, sizeof(path), directory, SPOOL_CHECKPOINT, "", err);
+
+	if (code == 0)
+		code = durable_open(&d, path, sizeof(header) + grid_voxels(recon_grid(recon)) * sizeof(float), err);
+	if (code != 0)
+		return code;
+	checkpoint_line(header, recon_iteration(recon), recon_grid(recon));
+	code = write_all(d.file, header, sizeof(header), d.beside, err);
+	if (code == 0)
+		code = write_iterate(recon, &d, NULL, err);
+	if (code != 0) {
+		durable_abandon(&d);
+		return code;
+	}
+	return durable_commit(&d, err);
+}
+
+static int check_checkpoint(const char *path, const char *bytes, size_t size, const struct grid *grid,
+			    int *ret_iteration, struct error *err)
+{
+	size_t expected = SPOOL_CHECKPOINT_OFFSET + grid_voxels(grid) * sizeof(float);
+	char text[SPOOL_CHECKPOINT_OFFSET + 1] = "", line[SPOOL_CHECKPOINT_OFFSET];
+	int iteration;
+
+	if (size != expected)
+		return error_set(err, ERR_INVALID, "%.200s: %zu bytes, %zu are expected", path, size, expected);
+	memcpy(text, bytes, SPOOL_CHECKPOINT_OFFSET);
+	if (sscanf(text, "cbctd checkpoint %d of", &iteration) != 1)
+		return error_set(err, ERR_INVALID, "%.200s is no checkpoint", path);
+	checkpoint_line(line, iteration, grid);
+	if (memcmp(line, bytes, sizeof(line)) != 0)
+		return error_set(err, ERR_INVALID, "%.200s is of another grid", path);
+	*ret_iteration = iteration;
+	return 0;
+}
+
+/* Mapped, not read: one volume less in memory at the worst moment. */
+static int resume(struct run *run, struct recon *recon, const char *path, int expected, struct error *err)
+{
+	int file = open(path, O_RDONLY | O_CLOEXEC), code, iteration = 0;
+	struct stat status;
+	char *bytes = MAP_FAILED;
+
+	if (file < 0)
+		return error_set_errno(err, errno, "%s cannot be opened", path);
+	if (fstat(file, &status) == 0 && status.st_size > 0)
+		bytes = mmap(NULL, (size_t)status.st_size, PROT_READ, MAP_PRIVATE, file, 0);
+	if (bytes == MAP_FAILED) {
+		code = error_set(err, ERR_IO, "%.200s cannot be mapped", path);
+		goto out;
+	}
+	code = check_checkpoint(path, bytes, (size_t)status.st_size, recon_grid(recon), &iteration, err);
+	if (code == 0)
+		code =
+		    recon_resume(recon, (const float *)(const void *)(bytes + SPOOL_CHECKPOINT_OFFSET), iteration, err);
+	if (code == 0 && iteration != expected) {
+		char detail[128];
+
+		snprintf(detail, sizeof(detail), "the checkpoint holds iteration %d, not %d: the run goes on behind %d",
+			 iteration, expected, iteration);
+		run_warning(run, "checkpoint", detail);
+	}
+	munmap(bytes, (size_t)status.st_size);
+out:
+	close(file);
+	return code;
+}
+
+/* ---- views ---- */
+
+static int push_views(struct recon *recon, const struct scan_files *files, struct error *err)
+{
+	size_t bytes = scan_projection_bytes(files->scan);
+	int count = files->scan->count, most = bytes < READ_BYTES ? (int)(READ_BYTES / bytes) : 1, code = 0;
+	int *views;
+	char *samples;
+
+	if (most > count)
+		most = count;
+	views = malloc((size_t)most * sizeof(*views));
+	samples = malloc((size_t)most * bytes);
+	if (views == NULL || samples == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for %d projections of %zu bytes", most, bytes);
+	for (int first = 0; first < count && code == 0; first += most) {
+		int some = first + most <= count ? most : count - first;
+
+		for (int i = 0; i < some; i++)
+			views[i] = first + i;
+		code = file_read_at(files->projections, samples, (size_t)some * bytes, (size_t)first * bytes,
+				    "projections.raw", err);
+		if (code == 0)
+			code = recon_push(recon, samples, views, some, err);
+	}
+	free(samples);
+	free(views);
+	return code;
+}
+
+static int run_pipeline(struct run *run, struct recon *recon, const struct scan_files *files, const char *checkpoint,
+			int iteration, struct error *err)
+{
+	struct error trouble;
+	int code = 0;
+
+	if (checkpoint != NULL)
+		code = resume(run, recon, checkpoint, iteration, err);
+	if (code == 0)
+		code = push_views(recon, files, err);
+	if (code == 0)
+		code = recon_run(recon, err);
+	if (code == ERR_BUSY && save_checkpoint(recon, run->directory, &trouble) != 0) {
+		*err = trouble;
+		code = trouble.code;
+	}
+	return code;
+}
+
+int spool_run(const struct backend *backend, struct device *device, const char *scan_directory,
+	      const struct recipe *recipe, const char *out_directory, const char *checkpoint, int iteration,
+	      const struct spool_hooks *hooks, struct error *err)
+{
+	struct run run = {.hooks = hooks, .directory = out_directory};
+	const struct recon_hooks recon_hooks = {.context = &run,
+						.cancelled = run_cancelled,
+						.yield = run_yield,
+						.progress = run_progress,
+						.row = run_row,
+						.keep = run_keep,
+						.warning = run_warning};
+	struct scan_files files;
+	struct linearise linearise;
+	struct recon_memory memory;
+	struct recon *recon = NULL;
+	int code = scan_files_open(scan_directory, &files, err);
+
+	if (code != 0)
+		return code;
+	linearise = (struct linearise){.sample = files.scan->sample,
+				       .quantity = files.scan->quantity,
+				       .air = files.scan->air,
+				       .flat = files.flat,
+				       .dark = files.dark,
+				       .saturation = files.scan->saturation};
+	if (linearise.quantity == QUANTITY_INTENSITY && linearise.air <= 0 && linearise.flat == NULL)
+		code = error_set(err, ERR_IMPOSSIBLE, "intensities need an air value or a flat image, none is there");
+	if (code == 0)
+		code = recon_memory(backend, device, &files.scan->geometry, recipe, &memory, err);
+	if (code == 0)
+		code =
+		    recon_open(backend, device, &files.scan->geometry, &linearise, recipe, &recon_hooks, &recon, err);
+	if (code == 0 && hooks->on_open != NULL)
+		hooks->on_open(hooks->recon.context, &memory, recon_plan(recon));
+	if (code == 0)
+		code = run_pipeline(&run, recon, &files, checkpoint, iteration, err);
+	recon_free(recon);
+	scan_files_close(&files);
+	return code;
+}
