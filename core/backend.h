@@ -35,6 +35,7 @@ struct plan;   /* one geometry, one grid, one set of weights, and all scratch th
 struct device_options {
 	int threads;         /* CPU: 0 = all the process may use */
 	size_t memory_limit; /* bytes to use at most; 0 = what is free */
+	const char *isa;     /* CPU: "base", "avx2", "avx512"; NULL = the best that it has */
 };
 
 struct device_info {
@@ -120,6 +121,9 @@ struct cancel {
 	void *context;
 };
 
+/* Of the smallest voxel spacing: what a ray must have inside the grid to correct it, see sart_iterate. */
+#define RAY_LENGTH_LEAST 0.5
+
 enum backprojection { BACKPROJECT_PLAIN, BACKPROJECT_FDK /* times (D/depth)^2 */ };
 
 struct backend {
@@ -177,6 +181,10 @@ struct backend {
 	 * method, one bilinear sample in every slice of the ray's dominant axis
 	 * between entry and exit, times the step's length in mm. The object ends half
 	 * a voxel beyond the outer centres in every direction, values there held.
+	 * Dominant is the axis along which the ray passes the most voxels (x before y
+	 * before z where equal). A slice stands for half a voxel to either side of its
+	 * centres; the first and last count with the part that lies between entry and
+	 * exit, so that the weights of a ray add up to its length inside the grid.
 	 */
 	int (*project)(struct plan *plan, const struct volume *from, const int *views, int count, struct stack *to,
 	               struct error *err);
@@ -185,7 +193,9 @@ struct backend {
 	 *   v_j += relaxation * (sum_S w_ij (p_i - sum_m w_im v_m) / sum_m w_im) / sum_S w_ij
 	 * forward weights are those of `project`, backward ones those of plain
 	 * `backproject`; row and column sums come from the same operators. Rays that
-	 * miss the grid and voxels that no ray of the subset sees stay as they are.
+	 * miss the grid and voxels that no ray of the subset sees stay as they are;
+	 * a ray that only grazes it, with less than RAY_LENGTH_LEAST of the smallest
+	 * spacing inside, counts as one that misses.
 	 */
 	int (*sart_iterate)(struct plan *plan, const struct stack *projections, struct volume *volume,
 	                    const struct cancel *cancel, struct sart_sums *ret_sums, struct error *err);

@@ -1,0 +1,250 @@
+#ifndef CBCT_CORE_CPU_H
+#define CBCT_CORE_CPU_H
+
+#include <math.h>
+#include <stdint.h>
+
+#include "core/backend.h"
+
+/*
+ * The CPU backend's own: what cpu.c, cpu_*.c and *_simd.c share.
+ *
+ * Layout. Volumes are kept as [y][x][z] and stacks as [slot][column][row]: z is
+ * the rotation axis and rows lie along it, so in an untilted geometry a column
+ * of voxels along z and a column of pixels see each other through one line, and
+ * both directions run over contiguous memory. Rows of the ramp filter are then
+ * taken many at a time. Uploads and downloads turn the order.
+ *
+ * Threads. A piece of work that is handed out (a few columns of one view, a
+ * tile of voxels, a plane) is computed by one thread in one order whatever the
+ * number of threads, so that the bits are the same for any number.
+ *
+ * Reads may run over the end of a column, never past SLACK floats behind the
+ * last one; every allocation has them, zeroed.
+ */
+enum {
+	SLACK = 64,
+	LANES_MOST = 16,    /* of any instruction set */
+	BLOCK_COLUMNS = 16, /* of a projection that are handed out together */
+};
+
+struct device {
+	int threads;
+	const struct cpu_kernels *kernels;
+	size_t memory_limit, memory_used; /* bytes */
+	char name[96];
+};
+
+struct volume {
+	struct device *device;
+	int size[3];  /* nx, ny, nz */
+	size_t row;   /* floats from one x to the next: nz */
+	size_t plane; /* floats from one y to the next, a little more than nx nz: see volume_strides */
+	float *data;  /* [y][x][z], 1/mm */
+};
+
+struct stack {
+	struct device *device;
+	int columns, rows, slots;
+	float *data; /* [slot][column][row], line integrals */
+};
+
+/* A view in voxel units (indices of the grid, counted from voxel 0,0,0). */
+struct cpu_view {
+	double source[3];
+	double pixel0[3], column_step[3], row_step[3]; /* pixel0: from the source to pixel 0,0 */
+	double matrix[12];                             /* (i, j, k, 1) to depth (column, row, 1), depth in mm */
+	double isocentre_depth;                        /* mm */
+};
+
+struct filter_engine; /* cpu_filter.c */
+
+struct plan {
+	struct device *device;
+	int columns, rows, views;
+	struct grid grid;
+	size_t row, plane; /* strides of every volume of this grid, floats */
+	struct cpu_view *view;
+	double spacing_least; /* mm */
+	bool along_z;         /* backprojection takes voxels along z together, else along x */
+	bool along_rows;      /* projection takes pixels along a column of the detector together, else along a row */
+	char summary[96];
+
+	struct linearise linearise;
+	unsigned char *defective; /* [column][row] of one view */
+
+	struct filter_engine *filter; /* NULL without FDK */
+	int filter_batch;             /* views that FDK should filter at once */
+
+	struct sart_options sart;
+	int batch;           /* views whose corrections are held at once; 0 without SART */
+	float *corrections;  /* [batch][column][row], 1/mm */
+	double *ray_sums;    /* [batch][blocks of columns][2]: squares of p - A v and of p */
+	struct volume *work; /* SART's numerators when a subset takes several batches; TV's f */
+
+	bool has_tv;
+	struct tv_options tv;
+	struct volume *dual[3], *ahead; /* proximal TV */
+	float *planes;                  /* TV's rolling planes, [threads][planes_floats] */
+	size_t planes_floats;
+
+	float *scratch;        /* [threads][scratch_floats] */
+	size_t scratch_floats; /* of one thread */
+	double *reduce;        /* [ny][REDUCE] partial sums */
+};
+
+/* Partial results of one plane: norm2, difference2, tv, minimum, maximum, sum, not finite. */
+enum { REDUCE = 8 };
+
+/* A box of voxels. Its sums are lines along z (along x when the grid is flat), each of `stride` floats. */
+struct tile {
+	int first[3], count[3]; /* along x, y, z */
+	size_t stride;
+};
+
+/* ---- rows of TV's passes, cpu_tv.c ---- */
+struct tv_weights {
+	float slow, middle, fast; /* smallest spacing / spacing along each axis */
+};
+/* A row and the two behind it; where there is none, the row itself. */
+struct tv_row {
+	int count;
+	const float *u, *middle, *slow;
+};
+struct tv_flux {
+	float *slow, *middle, *fast; /* [count]; fast[-1] is 0 where a divergence is taken */
+};
+struct tv_step {
+	float flow, fidelity; /* v += flow div p + fidelity (f - v) */
+	float epsilon2;       /* explicit: what smooths |grad v|, squared */
+	float sigma, theta;   /* proximal */
+};
+
+/*
+ * The inner loops, one table for each instruction set. `scratch` is one
+ * thread's part of plan->scratch.
+ */
+struct cpu_kernels {
+	const char *isa;  /* "avx512": device_options.isa */
+	const char *name; /* "AVX-512" */
+
+	/*
+	 * Line integrals of columns column .. column + count - 1 of one view, all rows;
+	 * ret and ret_length (mm inside the grid) are [column][row] from `column` on.
+	 */
+	void (*project)(const struct plan *plan, int view, int column, int count, const float *volume, float *ret,
+			float *ret_length, float *scratch);
+	/*
+	 * Adds weight * bilinear sample of the projection to the tile's sums, [line][stride],
+	 * and the sum of the bilinear weights to `cover`; either may be NULL. Returns
+	 * true when every voxel lies inside of the detector; the cover is 1 all over
+	 * then and `cover` is left alone.
+	 */
+	bool (*backproject)(const struct plan *plan, int view, const struct tile *tile, enum backprojection weight,
+			    const float *projection, float *sums, float *cover, float *scratch);
+
+	void (*tv_flux)(const struct tv_row *row, const struct tv_weights *weights, float epsilon2,
+			const struct tv_flux *ret);
+	void (*tv_dual)(const struct tv_row *row, const struct tv_weights *weights, float sigma,
+			const struct tv_flux *old, const struct tv_flux *ret);
+	void (*tv_update)(int count, const struct tv_flux *flux, const struct tv_flux *before,
+			  const struct tv_weights *weights, const struct tv_step *step, const float *f, float *v,
+			  float *ahead);
+};
+
+extern const struct cpu_kernels cpu_kernels_base;
+#if defined(__x86_64__)
+extern const struct cpu_kernels cpu_kernels_avx2, cpu_kernels_avx512;
+#endif
+
+/* Zeroed, SLACK floats longer than asked, counted against the device's limit. NULL: no memory, err is filled. */
+float *cpu_floats(struct device *device, size_t count, const char *what, struct error *err);
+void cpu_floats_free(struct device *device, float *floats, size_t count);
+
+/* Which thread of the current parallel region this is. */
+int cpu_thread(void);
+/* The number that 0 stands for, else what was asked; 1 without OpenMP. */
+int cpu_threads(int asked);
+
+static inline size_t volume_floats(const struct volume *volume)
+{
+	return volume->plane * (size_t)volume->size[1];
+}
+
+static inline const float *stack_slot(const struct stack *stack, int slot)
+{
+	return stack->data + (size_t)slot * (size_t)stack->columns * (size_t)stack->rows;
+}
+
+static inline size_t stack_floats(const struct stack *stack)
+{
+	return (size_t)stack->slots * (size_t)stack->columns * (size_t)stack->rows;
+}
+
+static inline float *plan_scratch(const struct plan *plan)
+{
+	return plan->scratch + (size_t)cpu_thread() * plan->scratch_floats;
+}
+
+/* to[i * to_stride + j] = from[j * from_stride + i], i < from_columns, j < from_rows. */
+void transpose(const float *from, size_t from_stride, int from_rows, int from_columns, float *to, size_t to_stride);
+void volume_strides(const struct grid *grid, size_t *ret_row, size_t *ret_plane);
+
+/* cpu_plan.c */
+int cpu_plan_bytes(struct device *device, const struct plan_options *options, struct plan_bytes *ret_bytes,
+		   struct error *err);
+int cpu_plan_new(struct device *device, const struct plan_options *options, struct plan **ret_plan, struct error *err);
+void cpu_plan_free(struct plan *plan);
+const char *cpu_plan_summary(const struct plan *plan);
+int cpu_plan_batch(const struct plan *plan);
+
+/* cpu_linearise.c */
+int cpu_linearise(struct plan *plan, const void *samples, int count, const int *slots, struct stack *to,
+		  size_t *defects, struct error *err);
+
+/* cpu_filter.c */
+size_t filter_engine_bytes(const struct plan_options *options, int threads);
+int filter_engine_new(const struct plan_options *options, int threads, struct filter_engine **ret_engine,
+		      struct error *err);
+void filter_engine_free(struct filter_engine *engine);
+int cpu_filter(struct plan *plan, const struct stack *from, const int *slots, const int *views, int count,
+	       struct stack *to, struct error *err);
+
+/* cpu_project.c */
+int cpu_project(struct plan *plan, const struct volume *from, const int *views, int count, struct stack *to,
+		struct error *err);
+/* Blocks of columns that a view is handed out in. */
+int column_blocks(const struct plan *plan);
+
+/* cpu_backproject.c */
+int cpu_backproject(struct plan *plan, const struct stack *from, const int *views, int count,
+		    enum backprojection weight, struct volume *to, struct error *err);
+/* Tiles that the grid is cut into; tile_at gives one of them. */
+int tile_count(const struct plan *plan);
+void tile_at(const struct plan *plan, int index, struct tile *ret_tile);
+size_t tile_floats(const struct plan *plan); /* of the largest tile's sums */
+int tile_lines(const struct plan *plan, const struct tile *tile);
+/* The voxels of one line of a tile: first float in a volume, floats from one to the next, how many. */
+size_t tile_line(const struct plan *plan, const struct tile *tile, int line, size_t *ret_stride, int *ret_count);
+
+/* cpu_sart.c */
+int cpu_sart_iterate(struct plan *plan, const struct stack *projections, struct volume *volume,
+		     const struct cancel *cancel, struct sart_sums *ret_sums, struct error *err);
+
+/* cpu_tv.c */
+size_t tv_planes_floats(const struct plan *plan);
+int cpu_tv(struct plan *plan, struct volume *volume, const struct cancel *cancel, struct error *err);
+
+/* cpu_norms.c */
+int cpu_norms(struct plan *plan, const struct volume *volume, const struct volume *other, double unit,
+	      struct volume_norms *ret_norms, struct error *err);
+
+/* ERR_CANCELLED when somebody asked. */
+static inline int cancel_check(const struct cancel *cancel, struct error *err)
+{
+	if (cancel != NULL && cancel->asked != NULL && cancel->asked(cancel->context))
+		return error_set(err, ERR_CANCELLED, "cancelled");
+	return 0;
+}
+
+#endif
