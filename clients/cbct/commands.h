@@ -1,0 +1,10 @@
+#ifndef CBCT_CLIENTS_COMMANDS_H
+#define CBCT_CLIENTS_COMMANDS_H
+
+#include "clients/cbct/options.h"
+
+/* One file for each; main.c has the table. */
+extern const struct command command_simulate, command_upload, command_submit, command_watch, command_get, command_recon,
+    command_compare, command_slice, command_scans, command_jobs, command_status, command_rm;
+
+#endif

@@ -1,0 +1,161 @@
+/* cbct scans, jobs, status, rm: what the daemon knows, a line each. */
+#include <stdlib.h>
+#include <string.h>
+
+#include "clients/cbct/commands.h"
+#include "clients/cbct/http.h"
+#include "proto/json.h"
+
+struct list_options {
+	const char *id;
+	long limit;
+	bool json;
+	struct http_options http;
+};
+
+#define ROW(name, kind, member, argument, help, least, most)                                                           \
+	{                                                                                                              \
+		name, 0, kind, offsetof(struct list_options, member), argument, help, least, most, 0, NULL             \
+	}
+static const struct option json_rows[] = {
+    ROW("json", OPTION_FLAG, json, NULL, "the daemon's document as it is", 0, 0),
+    {0},
+};
+static const struct option list_rows[] = {
+    ROW("limit", OPTION_INTEGER, limit, "N", "the newest so many", 1, 1000),
+    {0},
+};
+static const struct option_group list_groups[] = {
+    {"options", list_rows, 0},
+    {"", json_rows, 0},
+    {"", http_option_rows, offsetof(struct list_options, http)},
+    {0},
+};
+static const struct option_group status_groups[] = {
+    {"options", json_rows, 0},
+    {"", http_option_rows, offsetof(struct list_options, http)},
+    {0},
+};
+static const struct option_group rm_groups[] = {
+    {"options", http_option_rows, offsetof(struct list_options, http)},
+    {0},
+};
+
+static int fetch(const struct list_options *options, const char *method, const char *path, cJSON **ret_document,
+		 struct error *err)
+{
+	struct http *http = NULL;
+	int code = http_new(&options->http, &http, err);
+
+	if (code == 0)
+		code = http_json(http, method, path, ret_document, err);
+	http_free(http);
+	return code;
+}
+
+static int print_document(const cJSON *document, struct error *err)
+{
+	char *text = json_print(document, NULL);
+
+	if (text == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a document");
+	puts(text);
+	free(text);
+	return 0;
+}
+
+static void print_scan(const cJSON *scan)
+{
+	const cJSON *projections = cJSON_GetObjectItemCaseSensitive(scan, "projections");
+	const cJSON *missing = cJSON_GetObjectItemCaseSensitive(scan, "missing");
+
+	printf("%-20s %5.0f projections%s  %s\n", member_text(scan, "id", "?"), member_number(projections, "count", 0),
+	       cJSON_GetArraySize(missing) > 0 ? ", some missing" : "", member_text(scan, "name", ""));
+}
+
+static void print_job(const cJSON *job)
+{
+	printf("%-20s %-10s %3.0f %%  scan %s\n", member_text(job, "id", "?"), member_text(job, "state", "?"),
+	       100 * member_number(job, "progress", 0), member_text(job, "scan", "?"));
+}
+
+static void print_device(const cJSON *device)
+{
+	printf("%-6s %s\n", member_text(device, "backend", "?"), member_text(device, "name", "?"));
+}
+
+/* The members of array `name` of the document at `path`, one line each. */
+static int list(const struct list_options *options, const char *path, const char *name, void (*print)(const cJSON *),
+		struct error *err)
+{
+	cJSON *document = NULL;
+	const cJSON *entry;
+	int code = fetch(options, "GET", path, &document, err);
+
+	if (code == 0 && options->json) {
+		code = print_document(document, err);
+	} else if (code == 0) {
+		cJSON_ArrayForEach(entry, cJSON_GetObjectItemCaseSensitive(document, name)) print(entry);
+	}
+	cJSON_Delete(document);
+	return code;
+}
+
+static int scans_run(const void *values, struct error *err)
+{
+	const struct list_options *options = values;
+	char path[80];
+
+	snprintf(path, sizeof(path), "/v1/scans?limit=%ld", options->limit);
+	return list(options, path, "scans", print_scan, err);
+}
+
+static int jobs_run(const void *values, struct error *err)
+{
+	const struct list_options *options = values;
+	char path[80];
+
+	snprintf(path, sizeof(path), "/v1/jobs?limit=%ld", options->limit);
+	return list(options, path, "jobs", print_job, err);
+}
+
+static int status_run(const void *values, struct error *err)
+{
+	return list(values, "/v1/devices", "devices", print_device, err);
+}
+
+/* An id says not whether it is a scan's or a job's: both are tried. */
+static int rm_run(const void *values, struct error *err)
+{
+	const struct list_options *options = values;
+	cJSON *document = NULL;
+	char path[100];
+	int code;
+
+	snprintf(path, sizeof(path), "/v1/jobs/%.63s", options->id);
+	code = fetch(options, "DELETE", path, &document, err);
+	if (code == ERR_NOT_FOUND) {
+		snprintf(path, sizeof(path), "/v1/scans/%.63s", options->id);
+		code = fetch(options, "DELETE", path, &document, err);
+	}
+	cJSON_Delete(document);
+	return code;
+}
+
+static const struct list_options defaults = {.limit = 20};
+static const struct positional none[] = {{0}};
+static const struct positional rm_positionals[] = {
+    {"ID", "of a job or a scan", offsetof(struct list_options, id), true},
+    {0},
+};
+
+const struct command command_scans = {"scans",   "the newest scans", none,     list_groups,
+				      &defaults, sizeof(defaults),   scans_run};
+const struct command command_jobs = {"jobs",    "the newest jobs", none,    list_groups,
+				     &defaults, sizeof(defaults),  jobs_run};
+const struct command command_status = {
+    "status", "the devices that reconstruct", none, status_groups, &defaults, sizeof(defaults), status_run};
+const struct command command_rm = {"rm",           "cancels a running job, removes a finished one or a scan",
+				   rm_positionals, rm_groups,
+				   &defaults,      sizeof(defaults),
+				   rm_run};

@@ -1,0 +1,98 @@
+/*
+ * cbct: simulated scans, the daemon's client, reconstruction with no daemon, and
+ * measures and pictures of volumes. `cbct help` lists the subcommands; each is
+ * one row below and one file beside this one.
+ *
+ * Exit status: 0 done, 1 failed, 2 the command line is wrong.
+ */
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "clients/cbct/commands.h"
+
+static const struct command *const commands[] = {
+    &command_simulate, &command_upload, &command_submit, &command_watch, &command_get,    &command_recon,
+    &command_compare,  &command_slice,  &command_scans,  &command_jobs,  &command_status, &command_rm,
+};
+enum { COMMAND_COUNT = sizeof(commands) / sizeof(commands[0]) };
+
+static int help_all(FILE *to)
+{
+	fprintf(to, "usage: cbct COMMAND [arguments]\n\n");
+	for (int i = 0; i < COMMAND_COUNT; i++)
+		fprintf(to, "  %-10s %s\n", commands[i]->name, commands[i]->summary);
+	fprintf(to, "\n`cbct COMMAND --help` says more.\n");
+	return to == stdout ? EXIT_SUCCESS : 2;
+}
+
+static const struct command *command_find(const char *name)
+{
+	for (int i = 0; i < COMMAND_COUNT; i++)
+		if (strcmp(commands[i]->name, name) == 0)
+			return commands[i];
+	return NULL;
+}
+
+static int report(const struct command *command, const struct error *err)
+{
+	fprintf(stderr, "cbct %s: %s", command->name, err->text);
+	if (err->pointer[0] != 0)
+		fprintf(stderr, "\n  at %s", err->pointer);
+	fputc('\n', stderr);
+	if (err->code != ERR_USAGE)
+		return EXIT_FAILURE;
+	fprintf(stderr, "`cbct %s --help` lists the arguments.\n", command->name);
+	return 2;
+}
+
+static int command_run(const struct command *command, int count, char *const *arguments)
+{
+	struct error err = {0};
+	void *values;
+	int code;
+
+	for (int i = 0; i < count; i++)
+		if (strcmp(arguments[i], "--help") == 0 || strcmp(arguments[i], "-h") == 0) {
+			options_help(command, stdout);
+			return EXIT_SUCCESS;
+		}
+	values = malloc(command->size);
+	if (values == NULL)
+		code = error_set(&err, ERR_NO_MEMORY, "no memory for the options");
+	else
+		code = options_parse(command, count, arguments, values, &err);
+	if (code == 0)
+		code = command->run(values, &err);
+	free(values);
+	if (code == 0 && fflush(stdout) != 0)
+		code = error_set(&err, ERR_IO, "standard output cannot be written");
+	return code == 0 ? EXIT_SUCCESS : report(command, &err);
+}
+
+int main(int count, char **arguments)
+{
+	const struct command *command;
+
+	if (count < 2)
+		return help_all(stderr);
+	if (strcmp(arguments[1], "help") == 0 || strcmp(arguments[1], "--help") == 0 ||
+	    strcmp(arguments[1], "-h") == 0) {
+		if (count < 3)
+			return help_all(stdout);
+		arguments++;
+		count--;
+		command = command_find(arguments[1]);
+		if (command != NULL) {
+			options_help(command, stdout);
+			return EXIT_SUCCESS;
+		}
+	} else {
+		command = command_find(arguments[1]);
+	}
+	if (command == NULL) {
+		fprintf(stderr, "cbct: there is no command '%s'\n\n", arguments[1]);
+		return help_all(stderr);
+	}
+	return command_run(command, count - 2, arguments + 2);
+}

@@ -1,0 +1,213 @@
+/* Job documents from the command line: see recipe_options.h. */
+#include "clients/cbct/recipe_options.h"
+
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "proto/recipe.h"
+#include "proto/spool.h"
+
+#define ROW(name, kind, member, argument, help, least, most, count, names)                                             \
+	{                                                                                                              \
+		name, 0, kind, offsetof(struct recipe_options, member), argument, help, least, most, count, names      \
+	}
+const struct option recipe_option_rows[] = {
+    ROW("grid", OPTION_EACH, size, "N[,N,N]", "voxels along x, y, z (default: chosen from the field of view)", 1,
+	GRID_SIZE_MAX, 3, NULL),
+    ROW("spacing", OPTION_EACH, spacing, "MM[,MM,MM]", "of the voxels", 1e-6, 1e3, 3, NULL),
+    ROW("origin", OPTION_NUMBERS, origin, "X,Y,Z", "centre of the first voxel (default: centred)", -1e7, 1e7, 3, NULL),
+    ROW("fdk", OPTION_CHOICE, window, "WINDOW", "of the ramp filter", 0, 0, WINDOW_COUNT, window_names),
+    ROW("cutoff", OPTION_NUMBER, cutoff, "SHARE", "of the highest frequency", 0, 0, 0, NULL),
+    ROW("no-fdk", OPTION_FLAG, no_fdk, NULL, "start from zero", 0, 0, 0, NULL),
+    ROW("sart", OPTION_INTEGER, iterations, "N", "iterations", 0, 0, 0, NULL),
+    ROW("subsets", OPTION_TEXT, subsets, "N|views", "ordered subsets of the views; 1 is the simultaneous form", 0, 0, 0,
+	NULL),
+    ROW("relaxation", OPTION_NUMBER, relaxation, "R", "of each SART update", 0, 0, 0, NULL),
+    ROW("negative", OPTION_FLAG, negative, NULL, "let SART's voxels be negative", 0, 0, 0, NULL),
+    ROW("stop-residual", OPTION_NUMBER, stop_residual, "R", "end when ||p - A v|| / ||p|| is at most R", 0, 0, 0, NULL),
+    ROW("stop-change", OPTION_NUMBER, stop_change, "C", "end when an iteration changes the volume by at most C", 0, 0,
+	0, NULL),
+    ROW("tv", OPTION_CHOICE, method, "METHOD", "total variation after FDK and each iteration", 0, 0, TV_METHOD_COUNT,
+	tv_method_names),
+    ROW("tv-alpha", OPTION_NUMBER, alpha, "A", "weight of the volume that entered the stage", 0, 0, 0, NULL),
+    ROW("tv-step", OPTION_NUMBER, step, "S", "of the gradient method", 0, 0, 0, NULL),
+    ROW("tv-iterations", OPTION_INTEGER, tv_iterations, "N", "steps", 0, 0, 0, NULL),
+    ROW("tv-unit", OPTION_NUMBER, unit, "MU", "one gray level, 1/mm", 0, 0, 0, NULL),
+    ROW("tv-after-sart", OPTION_FLAG, tv_after_sart, NULL, "leave the FDK volume alone", 0, 0, 0, NULL),
+    ROW("emit", OPTION_TEXT, emit, "LIST", "volumes to keep beside the last one, e.g. fdk,fdk-tv,1,5", 0, 0, 0, NULL),
+    ROW("priority", OPTION_CHOICE, priority, "PRIORITY", "in the queue", 0, 0, PRIORITY_COUNT, priority_names),
+    ROW("mu-water", OPTION_NUMBER, mu_water, "MU", "water, 1/mm", 0, 0, 0, NULL),
+    ROW("reference-precision", OPTION_FLAG, reference_precision, NULL, "float32 everywhere, however slow", 0, 0, 0,
+	NULL),
+    {0},
+};
+
+static void put(cJSON *object, const char *name, cJSON *value)
+{
+	cJSON_DeleteItemFromObjectCaseSensitive(object, name);
+	cJSON_AddItemToObject(object, name, value);
+}
+
+static void put_number(cJSON *object, const char *name, double value)
+{
+	if (!isnan(value))
+		put(object, name, cJSON_CreateNumber(value));
+}
+
+static void put_integer(cJSON *object, const char *name, long value)
+{
+	if (value != OPTION_UNSET_INTEGER)
+		put(object, name, cJSON_CreateNumber((double)value));
+}
+
+/* The stage, made where it is missing. */
+static cJSON *stage(cJSON *document, const char *name)
+{
+	cJSON *object = cJSON_GetObjectItemCaseSensitive(document, name);
+
+	if (!cJSON_IsObject(object)) {
+		object = cJSON_CreateObject();
+		put(document, name, object);
+	}
+	return object;
+}
+
+/* A word between commas as a number where it is one. */
+static cJSON *word_json(const char *word, size_t length)
+{
+	char text[32], *end;
+	double number;
+
+	snprintf(text, sizeof(text), "%.*s", (int)length, word);
+	number = strtod(text, &end);
+	return end != text && *end == 0 ? cJSON_CreateNumber(number) : cJSON_CreateString(text);
+}
+
+static void put_emit(cJSON *document, const char *list)
+{
+	cJSON *emit = cJSON_CreateArray();
+
+	for (const char *at = list; *at != 0; at += at[0] == ',') {
+		size_t length = strcspn(at, ",");
+
+		cJSON_AddItemToArray(emit, word_json(at, length));
+		at += length;
+	}
+	put(document, "emit", emit);
+}
+
+static void put_grid(cJSON *document, const struct recipe_options *options)
+{
+	cJSON *grid;
+
+	if (isnan(options->size[0]) && isnan(options->spacing[0]) && isnan(options->origin[0]))
+		return;
+	grid = stage(document, "grid");
+	if (!isnan(options->size[0]))
+		put(grid, "size", cJSON_CreateDoubleArray(options->size, 3));
+	if (!isnan(options->spacing[0]))
+		put(grid, "spacing_mm", cJSON_CreateDoubleArray(options->spacing, 3));
+	if (!isnan(options->origin[0]))
+		put(grid, "origin_mm", cJSON_CreateDoubleArray(options->origin, 3));
+}
+
+static void put_fdk(cJSON *document, const struct recipe_options *options)
+{
+	if (options->no_fdk)
+		put(document, "fdk", cJSON_CreateNull());
+	if (options->window != OPTION_UNSET_CHOICE)
+		put(stage(document, "fdk"), "window", cJSON_CreateString(window_names[options->window]));
+	if (!isnan(options->cutoff))
+		put_number(stage(document, "fdk"), "cutoff", options->cutoff);
+}
+
+static void put_sart(cJSON *document, const struct recipe_options *options)
+{
+	bool stops = !isnan(options->stop_residual) || !isnan(options->stop_change);
+	cJSON *sart;
+
+	if (options->iterations == OPTION_UNSET_INTEGER && options->subsets == NULL && isnan(options->relaxation) &&
+	    !options->negative && !stops)
+		return;
+	sart = stage(document, "sart");
+	put_integer(sart, "iterations", options->iterations);
+	put_number(sart, "relaxation", options->relaxation);
+	if (options->subsets != NULL)
+		put(sart, "subsets", word_json(options->subsets, strlen(options->subsets)));
+	if (options->negative)
+		put(sart, "nonnegative", cJSON_CreateFalse());
+	if (stops) {
+		put_number(stage(sart, "stop"), "residual", options->stop_residual);
+		put_number(stage(sart, "stop"), "change", options->stop_change);
+	}
+}
+
+static void put_tv(cJSON *document, const struct recipe_options *options)
+{
+	cJSON *tv;
+
+	if (options->method == OPTION_UNSET_CHOICE && isnan(options->alpha) && isnan(options->step) &&
+	    options->tv_iterations == OPTION_UNSET_INTEGER && isnan(options->unit) && !options->tv_after_sart)
+		return;
+	tv = stage(document, "tv");
+	if (options->method != OPTION_UNSET_CHOICE)
+		put(tv, "method", cJSON_CreateString(tv_method_names[options->method]));
+	put_number(tv, "alpha", options->alpha);
+	put_number(tv, "step", options->step);
+	put_integer(tv, "iterations", options->tv_iterations);
+	put_number(tv, "unit", options->unit);
+	if (options->tv_after_sart)
+		put(tv, "after", cJSON_CreateString("sart"));
+}
+
+static int recipe_read(const char *path, cJSON **ret_document, struct error *err)
+{
+	char *text = NULL;
+	size_t length = 0;
+	cJSON *document = NULL;
+	int code = file_read(path, JSON_BYTES_MAX, &text, &length, err);
+
+	if (code == 0)
+		code = json_parse(text, length, &document, err);
+	free(text);
+	if (code == 0 && !cJSON_IsObject(document)) {
+		cJSON_Delete(document);
+		code = error_set(err, ERR_INVALID, "%s: an object is expected", path);
+	}
+	if (code == 0)
+		*ret_document = document;
+	return code;
+}
+
+int recipe_document(const struct recipe_options *options, const char *path, const char *scan, cJSON **ret_document,
+		    struct error *err)
+{
+	cJSON *document = NULL;
+
+	if (options->no_fdk && (options->window != OPTION_UNSET_CHOICE || !isnan(options->cutoff)))
+		return error_set(err, ERR_USAGE, "--no-fdk together with options of the FDK");
+	if (path != NULL) {
+		int code = recipe_read(path, &document, err);
+
+		if (code != 0)
+			return code;
+	} else {
+		document = cJSON_CreateObject();
+		stage(document, "fdk");
+	}
+	put(document, "scan", cJSON_CreateString(scan));
+	put_grid(document, options);
+	put_fdk(document, options);
+	put_sart(document, options);
+	put_tv(document, options);
+	if (options->emit != NULL)
+		put_emit(document, options->emit);
+	if (options->priority != OPTION_UNSET_CHOICE)
+		put(document, "priority", cJSON_CreateString(priority_names[options->priority]));
+	put_number(document, "mu_water", options->mu_water);
+	if (options->reference_precision)
+		put(document, "precision", cJSON_CreateString("reference"));
+	*ret_document = document;
+	return 0;
+}

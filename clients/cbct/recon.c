@@ -1,0 +1,152 @@
+/* cbct recon: the pipeline over a scan directory with no daemon, as a worker runs it. */
+#include <errno.h>
+#include <string.h>
+#include <sys/stat.h>
+
+#include "clients/cbct/commands.h"
+#include "clients/cbct/progress.h"
+#include "clients/cbct/recipe_options.h"
+#include "proto/spool.h"
+
+struct recon_options {
+	const char *directory, *recipe, *output, *backend;
+	long threads, device;
+	bool quiet;
+	struct recipe_options pipeline;
+};
+
+#define ROW(name, letter, kind, member, argument, help, least, most)                                                   \
+	{                                                                                                              \
+		name, letter, kind, offsetof(struct recon_options, member), argument, help, least, most, 0, NULL       \
+	}
+static const struct option rows[] = {
+    ROW("output", 'o', OPTION_TEXT, output, "DIR", "where NAME.nii files go (default: the scan's directory)", 0, 0),
+    ROW("backend", 0, OPTION_TEXT, backend, "NAME", "auto, cpu or cuda", 0, 0),
+    ROW("device", 0, OPTION_INTEGER, device, "N", "of the backend", 0, 1000),
+    ROW("threads", 0, OPTION_INTEGER, threads, "N", "0 is all there are", 0, 4096),
+    ROW("quiet", 0, OPTION_FLAG, quiet, NULL, "no progress", 0, 0),
+    {0},
+};
+static const struct option_group groups[] = {
+    {"options", rows, 0},
+    {"pipeline (over what RECIPE says)", recipe_option_rows, offsetof(struct recon_options, pipeline)},
+    {0},
+};
+
+/* What the hooks show. */
+struct display {
+	struct progress *progress;
+	int iterations;
+	double residual; /* < 0 before the first iteration */
+};
+
+static void on_progress(void *context, enum stage stage, int iteration, double fraction)
+{
+	struct display *display = context;
+
+	if (display->residual < 0)
+		progress_show(display->progress, fraction, -1, "%s", stage_names[stage]);
+	else
+		progress_show(display->progress, fraction, -1, "%s  iteration %d of %d  residual %.4g",
+			      stage_names[stage], iteration, display->iterations, display->residual);
+}
+
+static void on_row(void *context, const struct history_row *row)
+{
+	struct display *display = context;
+
+	display->residual = row->residual;
+}
+
+static void on_warning(void *context, const char *code, const char *detail)
+{
+	(void)context;
+	fprintf(stderr, "warning: %s: %s\n", code, detail);
+}
+
+static int on_volume(void *context, const struct kept_volume *volume, const struct saved_volume *saved,
+		     struct error *err)
+{
+	(void)context;
+	(void)volume;
+	(void)err;
+	puts(saved->path);
+	fflush(stdout);
+	return 0;
+}
+
+static int request_make(const struct recon_options *options, struct job_request *ret_request, struct error *err)
+{
+	cJSON *document = NULL;
+	struct job_request request = {0};
+	struct scan_files files;
+	int code = recipe_document(&options->pipeline, options->recipe, "directory", &document, err);
+
+	if (code == 0)
+		code = job_request_read(document, &request, err);
+	cJSON_Delete(document);
+	if (code != 0)
+		return code;
+	code = scan_files_open(options->directory, &files, err);
+	if (code == 0) {
+		code = job_request_resolve(&request, files.scan, err);
+		scan_files_close(&files);
+	}
+	if (code == 0)
+		*ret_request = request;
+	else
+		recipe_clear(&request.recipe);
+	return code;
+}
+
+static int pipeline_run(const struct recon_options *options, const struct recipe *recipe, struct error *err)
+{
+	const struct backend *backend = backend_find(options->backend);
+	const char *output = options->output != NULL ? options->output : options->directory;
+	const struct device_options device_options = {.threads = (int)options->threads};
+	struct display display = {.iterations = recipe->sart.on ? recipe->sart.iterations : 0, .residual = -1};
+	const struct spool_hooks hooks = {
+	    .recon = {.context = &display, .progress = on_progress, .row = on_row, .warning = on_warning},
+	    .on_volume = on_volume,
+	};
+	struct device *device = NULL;
+	int code;
+
+	if (backend == NULL)
+		return error_set(err, ERR_USAGE, "--backend: '%s' is none that this program has", options->backend);
+	if (mkdir(output, 0777) != 0 && errno != EEXIST)
+		return error_set_errno(err, errno, "%s", output);
+	code = backend->open((int)options->device, &device_options, &device, err);
+	if (code != 0)
+		return code;
+	if (!options->quiet)
+		display.progress = progress_new(stderr, PROGRESS_BAR_ONLY, backend->name);
+	code = spool_run(backend, device, options->directory, recipe, output, NULL, 0, &hooks, err);
+	progress_free(display.progress);
+	backend->close(device);
+	return code;
+}
+
+static int recon_run_command(const void *values, struct error *err)
+{
+	const struct recon_options *options = values;
+	struct job_request request;
+	int code = request_make(options, &request, err);
+
+	if (code != 0)
+		return code;
+	code = pipeline_run(options, &request.recipe, err);
+	recipe_clear(&request.recipe);
+	return code;
+}
+
+static const struct recon_options defaults = {.backend = "auto", .pipeline = RECIPE_OPTIONS_DEFAULTS};
+static const struct positional positionals[] = {
+    {"DIR", "a scan directory: scan.json, projections.raw", offsetof(struct recon_options, directory), true},
+    {"RECIPE", "a job document; without it, FDK with its defaults", offsetof(struct recon_options, recipe), false},
+    {0},
+};
+
+const struct command command_recon = {
+    "recon",          "reconstructs a scan directory with no daemon", positionals, groups, &defaults, sizeof(defaults),
+    recon_run_command};

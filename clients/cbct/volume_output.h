@@ -1,0 +1,9 @@
+#ifndef CBCT_CLIENTS_VOLUME_OUTPUT_H
+#define CBCT_CLIENTS_VOLUME_OUTPUT_H
+
+#include "proto/format.h"
+
+/* float32 voxels [z][y][x] as a file of the format that its extension names, otherwise NIfTI. */
+int volume_write(const char *path, const struct grid *grid, const float *voxels, struct error *err);
+
+#endif
