@@ -23,6 +23,8 @@ cJSON *job_document(struct job *job, bool brief);
 /* name, stage, iteration, size, spacing_mm, origin_mm, bytes, digest, statistics, created, href. */
 cJSON *volume_document(const char *job, const struct volume_record *volume);
 cJSON *history_row_document(const struct history_row *row);
+/* type (urn:cbctd:problem:NAME), detail, pointer where there is one: how a job says what went wrong. */
+cJSON *error_document(int code, const char *pointer, const char *text);
 /* index, state, backend, device, driver, memory, job, restarts. */
 cJSON *worker_document(const struct worker_facts *facts);
 

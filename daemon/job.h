@@ -57,6 +57,7 @@ int jobs_post(struct jobs *jobs, const struct job_request *request, struct store
 int jobs_find(struct jobs *jobs, const char *id, struct job **ret_job, struct error *err); /* ERR_NOT_FOUND */
 struct job *job_reference(struct job *job);
 void job_release(struct job *job); /* NULL is fine */
+struct jobs *job_jobs(const struct job *job);
 
 /* Newest first, as store_scan_list. */
 int jobs_list(struct jobs *jobs, const char *after, int limit, struct job **ret_jobs, int *ret_count, bool *ret_more,
@@ -68,10 +69,10 @@ int jobs_list(struct jobs *jobs, const char *after, int limit, struct job **ret_
  * removed with its rows and files. *ret_removed tells which it was.
  */
 int jobs_delete(struct jobs *jobs, struct job *job, bool *ret_removed, struct error *err);
-/* ERR_CONFLICT, naming the job, while one that has not ended uses the scan. */
+/* With its files. ERR_CONFLICT, naming the job, while one that has not ended uses the scan. */
 int jobs_delete_scan(struct jobs *jobs, struct stored_scan *scan, struct error *err);
 
-/* Woken at each change of this job that a document or an event shows; of any job. See watch.h. */
+/* Woken at each change of state and each new event of this job, or of any; not at mere progress. See watch.h. */
 void job_watch(struct job *job, struct watch *watch);
 void job_unwatch(struct job *job, struct watch *watch);
 void jobs_watch(struct jobs *jobs, struct watch *watch);

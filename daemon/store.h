@@ -71,8 +71,9 @@ void stored_scan_release(struct stored_scan *scan); /* NULL is fine */
 int store_scan_list(struct store *store, const char *after, int limit, struct stored_scan **ret_scans, int *ret_count,
 		    bool *ret_more, struct error *err);
 
-/* Removes rows, then files; see jobs_delete_scan, which asks first whether a job needs it. */
+/* Removes the rows; then the files may go. See jobs_delete_scan, which asks first whether a job needs it. */
 int store_scan_delete(struct store *store, struct stored_scan *scan, struct error *err);
+void store_scan_remove_files(const struct store *store, const char *id);
 
 /* Constant while the reference lives; references from store_scan_list may have none (NULL). */
 const struct scan *stored_scan_parsed(struct stored_scan *scan);
@@ -214,7 +215,9 @@ int store_job_insert(struct store *store, const struct job_record *job, const st
  * checkpoint go. */
 int store_job_update(struct store *store, const struct job_record *job, const struct event *event,
 		     const struct event *end, bool rewind, struct error *err);
-int store_job_delete(struct store *store, const char *id, struct error *err); /* rows, then the directory */
+/* Removes the rows; then the files may go. */
+int store_job_delete(struct store *store, const char *id, struct error *err);
+void store_job_remove_files(const struct store *store, const char *id);
 int store_job_add_row(struct store *store, const char *id, const struct history_row *row, const struct event *event,
 		      struct error *err);
 int store_job_add_volume(struct store *store, const char *id, const struct volume_record *volume,

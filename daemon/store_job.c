@@ -1,5 +1,6 @@
 /* Rows of jobs: what they are, what became of them, what they kept, and what is told of it. */
 #include <errno.h>
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -151,21 +152,23 @@ int store_job_update(struct store *store, const struct job_record *job, const st
 int store_job_delete(struct store *store, const char *id, struct error *err)
 {
 	struct query query;
-	struct error ignored;
-	char directory[1024];
 	int code = store_begin(store, err);
 
 	if (code != 0)
 		return code;
 	query_begin(&query, &store->writer, "DELETE FROM jobs WHERE id = ?", err);
 	query_text(&query, id);
-	code = store_end(store, query_run(&query), err);
-	if (code != 0)
-		return code;
+	return store_end(store, query_run(&query), err);
+}
+
+void store_job_remove_files(const struct store *store, const char *id)
+{
+	char directory[1024];
+	struct error err;
+
 	store_job_directory(store, id, directory);
-	if (directory_remove(directory, &ignored) != 0)
-		log_line(LEVEL_WARNING, "job %s: files stay until the next start: %s", id, ignored.text);
-	return 0;
+	if (directory_remove(directory, &err) != 0)
+		log_line(LEVEL_WARNING, "job %s: files stay until the next start: %s", id, err.text);
 }
 
 int store_job_add_row(struct store *store, const char *id, const struct history_row *row, const struct event *event,
@@ -370,15 +373,23 @@ int store_job_load(struct store *store, struct job_record **ret_jobs, int *ret_c
 	return 0;
 }
 
+/* SQLite keeps a NaN as NULL. */
+static double column_real(struct query *query, int column)
+{
+	return sqlite3_column_type(query->statement, column) == SQLITE_NULL
+		   ? NAN
+		   : sqlite3_column_double(query->statement, column);
+}
+
 static void read_row(struct query *query, void *element)
 {
 	struct history_row *row = element;
 
 	row->iteration = sqlite3_column_int(query->statement, 0);
-	row->residual = sqlite3_column_double(query->statement, 1);
-	row->change = sqlite3_column_double(query->statement, 2);
-	row->tv = sqlite3_column_double(query->statement, 3);
-	row->seconds = sqlite3_column_double(query->statement, 4);
+	row->residual = column_real(query, 1);
+	row->change = column_real(query, 2);
+	row->tv = column_real(query, 3);
+	row->seconds = column_real(query, 4);
 }
 
 static void read_volume(struct query *query, void *element)
@@ -397,12 +408,12 @@ static void read_volume(struct query *query, void *element)
 	}
 	volume->bytes = (size_t)sqlite3_column_int64(row, 12);
 	column_bytes(query, 13, volume->sha256, sizeof(volume->sha256));
-	volume->norms.norm2 = sqlite3_column_double(row, 14);
-	volume->norms.difference2 = sqlite3_column_double(row, 15);
-	volume->norms.tv = sqlite3_column_double(row, 16);
-	volume->norms.minimum = sqlite3_column_double(row, 17);
-	volume->norms.maximum = sqlite3_column_double(row, 18);
-	volume->norms.mean = sqlite3_column_double(row, 19);
+	volume->norms.norm2 = column_real(query, 14);
+	volume->norms.difference2 = column_real(query, 15);
+	volume->norms.tv = column_real(query, 16);
+	volume->norms.minimum = column_real(query, 17);
+	volume->norms.maximum = column_real(query, 18);
+	volume->norms.mean = column_real(query, 19);
 	volume->norms.not_finite = (size_t)sqlite3_column_int64(row, 20);
 	volume->created = sqlite3_column_double(row, 21);
 }

@@ -369,7 +369,7 @@ static int insert_row(struct store *store, struct stored_scan *scan, struct erro
 	return store_end(store, code, err);
 }
 
-static void remove_files(const struct store *store, const char *id)
+void store_scan_remove_files(const struct store *store, const char *id)
 {
 	char directory[1024];
 	struct error err;
@@ -405,7 +405,7 @@ int store_scan_create(struct store *store, struct scan *parsed, struct stored_sc
 	if (code == 0)
 		code = insert_row(store, scan, err);
 	if (code != 0) {
-		remove_files(store, scan->id);
+		store_scan_remove_files(store, scan->id);
 		goto out;
 	}
 	pthread_mutex_lock(&store->scans_lock);
@@ -453,7 +453,6 @@ int store_scan_delete(struct store *store, struct stored_scan *scan, struct erro
 	forget_recent(store, scan);
 	scan->references--; /* the array's; the caller holds another */
 	pthread_mutex_unlock(&store->scans_lock);
-	remove_files(store, scan->id);
 	log_line(LEVEL_INFO, "scan %s removed", scan->id);
 	watch_wake(&scan->watchers);
 	return 0;

@@ -1,0 +1,983 @@
+/* The life of a job: job.h. */
+#include "daemon/job.h"
+
+#include <assert.h>
+#include <errno.h>
+#include <stddef.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+#include <unistd.h>
+
+#include "daemon/document.h"
+#include "daemon/log.h"
+#include "proto/spool.h"
+
+/* The one table of transitions: [from][to]. */
+static const bool transitions[JOB_STATE_COUNT][JOB_STATE_COUNT] = {
+    [JOB_WAITING] = {[JOB_QUEUED] = true, [JOB_FAILED] = true, [JOB_CANCELLED] = true},
+    [JOB_QUEUED] = {[JOB_RUNNING] = true, [JOB_FAILED] = true, [JOB_CANCELLED] = true},
+    [JOB_RUNNING] = {[JOB_QUEUED] = true, [JOB_SUCCEEDED] = true, [JOB_FAILED] = true, [JOB_CANCELLED] = true},
+};
+
+struct job {
+	/* Constant. */
+	struct jobs *jobs;
+	char id[ID_SIZE], scan[ID_SIZE];
+
+	struct watch_list watchers;
+
+	/* Guarded by jobs->lock; all but the running job's progress is changed with jobs->change held too. */
+	struct job_record record;
+	struct queue_entry entry;
+	int references; /* one of them is the array's */
+	bool removed;
+	bool yielded;        /* goes on where it was: the next run is no new attempt */
+	double stage_since;  /* monotonic seconds, while running */
+	double run_since;    /* monotonic seconds */
+	double run_fraction; /* at run_since */
+	double row_at;       /* monotonic seconds of the last history row, or of the last moment before the first */
+	double row_seconds;  /* smoothed time from row to row, 0 before the first */
+};
+
+struct jobs {
+	struct store *store; /* constant */
+	struct watch_list watchers;
+	pthread_mutex_t change; /* one change at a time; held over its commit; guards next_ticket */
+	long long next_ticket;
+	pthread_mutex_t lock; /* guards what follows and each job's fields; held for copying only */
+	struct job **all;     /* [count], by id: oldest first */
+	int count, space;
+	struct queue queue;
+	struct jobs_statistics statistics; /* count[] is made on demand */
+};
+
+bool job_state_ended(enum job_state state)
+{
+	return state == JOB_SUCCEEDED || state == JOB_FAILED || state == JOB_CANCELLED;
+}
+
+bool job_state_may_follow(enum job_state from, enum job_state to)
+{
+	return transitions[from][to];
+}
+
+static double time_monotonic(void)
+{
+	struct timespec now;
+
+	clock_gettime(CLOCK_MONOTONIC, &now);
+	return (double)now.tv_sec + (double)now.tv_nsec * 1e-9;
+}
+
+static double time_of_day(void)
+{
+	struct timespec now;
+
+	clock_gettime(CLOCK_REALTIME, &now);
+	return (double)now.tv_sec + (double)now.tv_nsec * 1e-9;
+}
+
+/* ---- references ---- */
+
+/* Takes the texts of the record over. */
+static struct job *job_new(struct jobs *jobs, struct job_record *record)
+{
+	struct job *job = calloc(1, sizeof(*job));
+
+	if (job == NULL)
+		return NULL;
+	job->jobs = jobs;
+	job->record = *record;
+	record->request = record->key = NULL;
+	memcpy(job->id, record->id, sizeof(job->id));
+	memcpy(job->scan, record->scan, sizeof(job->scan));
+	job->references = 1;
+	watch_list_init(&job->watchers);
+	return job;
+}
+
+static void job_free(struct job *job)
+{
+	if (job == NULL)
+		return;
+	job_record_clear(&job->record);
+	watch_list_destroy(&job->watchers);
+	free(job);
+}
+
+struct job *job_reference(struct job *job)
+{
+	pthread_mutex_lock(&job->jobs->lock);
+	job->references++;
+	pthread_mutex_unlock(&job->jobs->lock);
+	return job;
+}
+
+void job_release(struct job *job)
+{
+	struct jobs *jobs;
+	bool last;
+
+	if (job == NULL)
+		return;
+	jobs = job->jobs;
+	pthread_mutex_lock(&jobs->lock);
+	last = --job->references == 0;
+	pthread_mutex_unlock(&jobs->lock);
+	if (last)
+		job_free(job);
+}
+
+struct jobs *job_jobs(const struct job *job)
+{
+	return job->jobs;
+}
+
+static void wake(struct job *job)
+{
+	watch_wake(&job->watchers);
+	watch_wake(&job->jobs->watchers);
+}
+
+void job_watch(struct job *job, struct watch *watch)
+{
+	watch_add(&job->watchers, watch);
+}
+
+void job_unwatch(struct job *job, struct watch *watch)
+{
+	watch_remove(&job->watchers, watch);
+}
+
+void jobs_watch(struct jobs *jobs, struct watch *watch)
+{
+	watch_add(&jobs->watchers, watch);
+}
+
+void jobs_unwatch(struct jobs *jobs, struct watch *watch)
+{
+	watch_remove(&jobs->watchers, watch);
+}
+
+/* ---- the array; jobs->lock is held ---- */
+
+static int place_of(const struct jobs *jobs, const char *id)
+{
+	int low = 0, high = jobs->count;
+
+	while (low < high) {
+		int middle = low + (high - low) / 2;
+
+		if (strcmp(jobs->all[middle]->id, id) < 0)
+			low = middle + 1;
+		else
+			high = middle;
+	}
+	return low;
+}
+
+static struct job *array_find(const struct jobs *jobs, const char *id)
+{
+	int place = place_of(jobs, id);
+
+	return place < jobs->count && strcmp(jobs->all[place]->id, id) == 0 ? jobs->all[place] : NULL;
+}
+
+static int array_reserve(struct jobs *jobs, struct error *err)
+{
+	int space = jobs->space == 0 ? 64 : 2 * jobs->space;
+	struct job **all;
+
+	if (jobs->count < jobs->space)
+		return 0;
+	all = realloc(jobs->all, (size_t)space * sizeof(*all));
+	if (all == NULL)
+		return error_set_errno(err, ENOMEM, "list of %d jobs", space);
+	jobs->all = all;
+	jobs->space = space;
+	return 0;
+}
+
+static void array_insert(struct jobs *jobs, struct job *job)
+{
+	int place = place_of(jobs, job->id);
+
+	memmove(jobs->all + place + 1, jobs->all + place, (size_t)(jobs->count - place) * sizeof(jobs->all[0]));
+	jobs->all[place] = job;
+	jobs->count++;
+}
+
+static void array_remove(struct jobs *jobs, const struct job *job)
+{
+	int place = place_of(jobs, job->id);
+
+	assert(place < jobs->count && jobs->all[place] == job);
+	jobs->count--;
+	memmove(jobs->all + place, jobs->all + place + 1, (size_t)(jobs->count - place) * sizeof(jobs->all[0]));
+}
+
+int jobs_find(struct jobs *jobs, const char *id, struct job **ret_job, struct error *err)
+{
+	struct job *job;
+
+	pthread_mutex_lock(&jobs->lock);
+	job = array_find(jobs, id);
+	if (job != NULL)
+		job->references++;
+	pthread_mutex_unlock(&jobs->lock);
+	if (job == NULL)
+		return error_set(err, ERR_NOT_FOUND, "there is no job \"%.64s\"", id);
+	*ret_job = job;
+	return 0;
+}
+
+int jobs_list(struct jobs *jobs, const char *after, int limit, struct job **ret_jobs, int *ret_count, bool *ret_more,
+	      struct error *err)
+{
+	int end, count;
+
+	(void)err;
+	pthread_mutex_lock(&jobs->lock);
+	end = after == NULL ? jobs->count : place_of(jobs, after);
+	count = end < limit ? end : limit;
+	for (int i = 0; i < count; i++) {
+		ret_jobs[i] = jobs->all[end - 1 - i];
+		ret_jobs[i]->references++;
+	}
+	pthread_mutex_unlock(&jobs->lock);
+	*ret_count = count;
+	*ret_more = end > count;
+	return 0;
+}
+
+/* ---- events ---- */
+
+/* A NULL document becomes an error, so that callers check once. */
+static int event_make(struct event *ret_event, const char *kind, cJSON *document, struct error *err)
+{
+	char *data = document == NULL ? NULL : cJSON_PrintUnformatted(document);
+
+	cJSON_Delete(document);
+	if (data == NULL)
+		return error_set_errno(err, ENOMEM, "event \"%s\"", kind);
+	*ret_event = (struct event){.kind = kind, .data = data};
+	return 0;
+}
+
+static cJSON *state_document(const struct job_record *record)
+{
+	cJSON *document = cJSON_CreateObject();
+
+	if (document == NULL)
+		return NULL;
+	cJSON_AddStringToObject(document, "state", job_state_names[record->state]);
+	cJSON_AddNumberToObject(document, "iteration", record->iteration);
+	cJSON_AddNumberToObject(document, "attempts", record->attempts);
+	if (record->error_code != 0)
+		cJSON_AddItemToObject(document, "error",
+				      error_document(record->error_code, record->error_pointer, record->error_text));
+	return document;
+}
+
+/* ---- changes of state ---- */
+
+/* Time since the last look belongs to the stage that ran; jobs->lock is held. */
+static void account_stage(struct job *job)
+{
+	double now = time_monotonic();
+
+	if (job->record.state == JOB_RUNNING)
+		job->record.seconds[job->record.stage] += now - job->stage_since;
+	job->stage_since = now;
+}
+
+static void enter_queue(struct job_record *record, const struct job_change *change, struct jobs *jobs)
+{
+	if (record->ticket == 0) {
+		record->ticket = jobs->next_ticket++;
+		record->queued = time_of_day();
+		return;
+	}
+	record->checkpoint = change->checkpoint;
+	record->iteration = change->checkpoint;
+	record->stage = STAGE_LOAD;
+	if (change->checkpoint == 0)
+		record->fraction = 0;
+}
+
+static void enter_running(struct job_record *record, const struct job_change *change, bool goes_on)
+{
+	if (!goes_on || record->attempts == 0)
+		record->attempts++;
+	if (record->started == 0)
+		record->started = time_of_day();
+	record->stage = STAGE_LOAD;
+	record->iteration = record->checkpoint;
+	if (change->backend != NULL)
+		snprintf(record->backend, sizeof(record->backend), "%s", change->backend);
+	if (change->device != NULL)
+		snprintf(record->device, sizeof(record->device), "%s", change->device);
+}
+
+static void enter_end(struct job_record *record, const struct job_change *change)
+{
+	record->ended = time_of_day();
+	record->checkpoint = 0;
+	if (record->state == JOB_SUCCEEDED)
+		record->fraction = 1;
+	if (record->state != JOB_FAILED)
+		return;
+	record->error_code = change->error_code != 0 ? change->error_code : ERR_INTERNAL;
+	snprintf(record->error_pointer, sizeof(record->error_pointer), "%s",
+		 change->error_pointer == NULL ? "" : change->error_pointer);
+	snprintf(record->error_text, sizeof(record->error_text), "%s",
+		 change->error_text == NULL ? "" : change->error_text);
+}
+
+static int save_state(struct jobs *jobs, const struct job_record *record, bool rewind, struct error *err)
+{
+	struct event event = {0}, end = {0};
+	bool ended = job_state_ended(record->state);
+	int code = event_make(&event, "state", state_document(record), err);
+
+	if (code == 0 && ended)
+		code = event_make(&end, "end", state_document(record), err);
+	if (code == 0)
+		code = store_job_update(jobs->store, record, &event, ended ? &end : NULL, rewind, err);
+	cJSON_free(event.data);
+	cJSON_free(end.data);
+	return code;
+}
+
+/* The record as it will be; jobs->change is held. */
+static void next_record(struct job *job, enum job_state to, const struct job_change *change, struct job_record *ret)
+{
+	bool goes_on;
+
+	pthread_mutex_lock(&job->jobs->lock);
+	account_stage(job);
+	*ret = job->record;
+	goes_on = job->yielded;
+	pthread_mutex_unlock(&job->jobs->lock);
+	ret->state = to;
+	ret->crashes += change->crashed;
+	if (to == JOB_QUEUED)
+		enter_queue(ret, change, job->jobs);
+	else if (to == JOB_RUNNING)
+		enter_running(ret, change, goes_on);
+	else
+		enter_end(ret, change);
+}
+
+static void show_state(struct job *job, const struct job_record *record, const struct job_change *change)
+{
+	struct jobs *jobs = job->jobs;
+	enum job_state from;
+
+	pthread_mutex_lock(&jobs->lock);
+	from = job->record.state;
+	job->record = *record;
+	queue_remove(&jobs->queue, &job->entry);
+	if (record->state == JOB_QUEUED) {
+		job->entry.priority = record->priority;
+		job->entry.ticket = record->ticket;
+		queue_add(&jobs->queue, &job->entry);
+		job->yielded = from == JOB_RUNNING && record->checkpoint > 0 && !change->crashed;
+		jobs->statistics.yielded += job->yielded;
+	} else if (record->state == JOB_RUNNING) {
+		job->run_since = job->stage_since = job->row_at = time_monotonic();
+		job->run_fraction = record->fraction;
+		job->row_seconds = 0;
+		jobs->statistics.started++;
+	}
+	jobs->statistics.crashed += change->crashed;
+	pthread_mutex_unlock(&jobs->lock);
+	log_line(record->state == JOB_FAILED ? LEVEL_WARNING : LEVEL_INFO, "job %s: %s -> %s%s%s%s%s", record->id,
+		 job_state_names[from], job_state_names[record->state], change->reason != NULL ? ", " : "",
+		 change->reason != NULL ? change->reason : "", record->state == JOB_FAILED ? ": " : "",
+		 record->state == JOB_FAILED ? record->error_text : "");
+}
+
+static void remove_checkpoint(const struct jobs *jobs, const char *id)
+{
+	char directory[1024], path[1100];
+
+	store_job_directory(jobs->store, id, directory);
+	snprintf(path, sizeof(path), "%s/%s", directory, SPOOL_CHECKPOINT);
+	if (unlink(path) < 0 && errno != ENOENT && errno != ENOTDIR)
+		log_line(LEVEL_WARNING, "job %s: %s stays: %s", id, path, strerror(errno));
+}
+
+/* jobs->change is held; the caller wakes the watchers after it. */
+static int change_state(struct job *job, enum job_state to, const struct job_change *change, struct error *err)
+{
+	static const struct job_change nothing;
+	struct job_record record;
+	bool removed;
+	enum job_state from;
+	int code;
+
+	if (change == NULL)
+		change = &nothing;
+	pthread_mutex_lock(&job->jobs->lock);
+	from = job->record.state;
+	removed = job->removed;
+	pthread_mutex_unlock(&job->jobs->lock);
+	if (removed || !job_state_may_follow(from, to))
+		return error_set(err, ERR_CONFLICT, "job %s is %s and cannot become %s", job->id,
+				 removed ? "removed" : job_state_names[from], job_state_names[to]);
+	next_record(job, to, change, &record);
+	code = save_state(job->jobs, &record, from == JOB_RUNNING && to == JOB_QUEUED, err);
+	if (code != 0)
+		return code;
+	show_state(job, &record, change);
+	if (job_state_ended(to))
+		remove_checkpoint(job->jobs, record.id);
+	return 0;
+}
+
+int job_set_state(struct job *job, enum job_state to, const struct job_change *change, struct error *err)
+{
+	int code;
+
+	pthread_mutex_lock(&job->jobs->change);
+	code = change_state(job, to, change, err);
+	pthread_mutex_unlock(&job->jobs->change);
+	if (code == 0)
+		wake(job);
+	return code;
+}
+
+/* ---- at the start ---- */
+
+/* What the files say of the iteration that the row promises. */
+static int checkpoint_there(const struct jobs *jobs, const struct job_record *record)
+{
+	char directory[1024], path[1100];
+
+	store_job_directory(jobs->store, record->id, directory);
+	snprintf(path, sizeof(path), "%s/%s", directory, SPOOL_CHECKPOINT);
+	return record->checkpoint > 0 && access(path, R_OK) == 0 ? record->checkpoint : 0;
+}
+
+static int recover(struct job *job, struct error *err)
+{
+	struct job_change change = {.reason = "the daemon was started again"};
+
+	change.checkpoint = checkpoint_there(job->jobs, &job->record);
+	if (change.checkpoint == 0) {
+		job->record.checkpoint = 0;
+		remove_checkpoint(job->jobs, job->id);
+	}
+	switch (job->record.state) {
+	case JOB_RUNNING:
+		return change_state(job, job->record.cancel_asked ? JOB_CANCELLED : JOB_QUEUED, &change, err);
+	case JOB_QUEUED:
+		job->entry.priority = job->record.priority;
+		job->entry.ticket = job->record.ticket;
+		queue_add(&job->jobs->queue, &job->entry);
+		return 0;
+	default:
+		return 0;
+	}
+}
+
+static int load_jobs(struct jobs *jobs, struct error *err)
+{
+	struct job_record *records;
+	struct job *job;
+	int count, code = store_job_load(jobs->store, &records, &count, err);
+
+	if (code != 0)
+		return code;
+	for (int i = 0; i < count && code == 0; i++) {
+		job = job_new(jobs, &records[i]);
+		if (job == NULL || array_reserve(jobs, err) != 0) {
+			job_free(job);
+			code = error_set_errno(err, ENOMEM, "list of jobs");
+			break;
+		}
+		array_insert(jobs, job);
+		id_floor(job->id);
+		if (job->record.ticket >= jobs->next_ticket)
+			jobs->next_ticket = job->record.ticket + 1;
+	}
+	job_records_free(records, count);
+	pthread_mutex_lock(&jobs->change);
+	for (int i = 0; i < jobs->count && code == 0; i++)
+		code = recover(jobs->all[i], err);
+	pthread_mutex_unlock(&jobs->change);
+	return code;
+}
+
+int jobs_open(struct store *store, struct jobs **ret_jobs, struct error *err)
+{
+	struct jobs *jobs = calloc(1, sizeof(*jobs));
+	int code;
+
+	if (jobs == NULL)
+		return error_set_errno(err, ENOMEM, "jobs");
+	jobs->store = store;
+	jobs->next_ticket = 1;
+	pthread_mutex_init(&jobs->change, NULL);
+	pthread_mutex_init(&jobs->lock, NULL);
+	watch_list_init(&jobs->watchers);
+	code = load_jobs(jobs, err);
+	if (code != 0) {
+		jobs_close(jobs);
+		return code;
+	}
+	*ret_jobs = jobs;
+	return 0;
+}
+
+void jobs_close(struct jobs *jobs)
+{
+	if (jobs == NULL)
+		return;
+	for (int i = 0; i < jobs->count; i++) {
+		assert(jobs->all[i]->references == 1);
+		job_free(jobs->all[i]);
+	}
+	free(jobs->all);
+	watch_list_destroy(&jobs->watchers);
+	pthread_mutex_destroy(&jobs->lock);
+	pthread_mutex_destroy(&jobs->change);
+	free(jobs);
+}
+
+struct store *jobs_store(const struct jobs *jobs)
+{
+	return jobs->store;
+}
+
+/* ---- what the API does ---- */
+
+int jobs_repeat(struct jobs *jobs, const char *key, const uint8_t digest[32], struct job **ret_job, struct error *err)
+{
+	struct job *job = NULL;
+	bool same = false;
+
+	pthread_mutex_lock(&jobs->lock);
+	for (int i = jobs->count - 1; i >= 0 && job == NULL; i--) {
+		if (jobs->all[i]->record.key != NULL && strcmp(jobs->all[i]->record.key, key) == 0)
+			job = jobs->all[i];
+	}
+	if (job != NULL)
+		same = memcmp(job->record.digest, digest, sizeof(job->record.digest)) == 0;
+	if (same)
+		job->references++;
+	pthread_mutex_unlock(&jobs->lock);
+	if (job != NULL && !same)
+		return error_set(err, ERR_CONFLICT, "this Idempotency-Key came with another request before");
+	*ret_job = job;
+	return 0;
+}
+
+static int fill_record(struct job_record *record, const struct job_request *request, const char *scan,
+		       const struct recon_memory *memory, const char *key, const uint8_t digest[32], struct error *err)
+{
+	cJSON *document = job_request_json(request);
+	char *text = document == NULL ? NULL : cJSON_PrintUnformatted(document);
+
+	cJSON_Delete(document);
+	record->request = text == NULL ? NULL : strdup(text);
+	cJSON_free(text);
+	record->key = key == NULL ? NULL : strdup(key);
+	if (record->request == NULL || (key != NULL && record->key == NULL))
+		return error_set_errno(err, ENOMEM, "job");
+	memcpy(record->scan, scan, sizeof(record->scan));
+	record->priority = request->priority;
+	record->mu_water = request->recipe.mu_water;
+	record->iterations = request->recipe.sart.on ? request->recipe.sart.iterations : 0;
+	if (memory != NULL)
+		record->memory = *memory;
+	if (key != NULL)
+		memcpy(record->digest, digest, sizeof(record->digest));
+	record->created = time_of_day();
+	return id_make(record->id, err);
+}
+
+/* jobs->change is held. */
+static int insert_job(struct jobs *jobs, struct job *job, struct stored_scan *scan, struct error *err)
+{
+	struct job_record *record = &job->record;
+	struct scan_facts facts;
+	struct event event;
+	int code;
+
+	stored_scan_facts(scan, &facts);
+	if (facts.deleted)
+		return error_set_at(err, ERR_NOT_FOUND, "/scan", "there is no scan \"%s\" any more", record->scan);
+	record->state = facts.ready ? JOB_QUEUED : JOB_WAITING;
+	if (facts.ready) {
+		record->ticket = jobs->next_ticket++;
+		record->queued = record->created;
+	}
+	pthread_mutex_lock(&jobs->lock);
+	code = array_reserve(jobs, err);
+	pthread_mutex_unlock(&jobs->lock);
+	if (code == 0)
+		code = event_make(&event, "state", state_document(record), err);
+	if (code != 0)
+		return code;
+	code = store_job_insert(jobs->store, record, &event, err);
+	cJSON_free(event.data);
+	if (code != 0)
+		return code;
+	pthread_mutex_lock(&jobs->lock);
+	array_insert(jobs, job);
+	job->references++;
+	if (record->state == JOB_QUEUED) {
+		job->entry.priority = record->priority;
+		job->entry.ticket = record->ticket;
+		queue_add(&jobs->queue, &job->entry);
+	}
+	pthread_mutex_unlock(&jobs->lock);
+	return 0;
+}
+
+int jobs_post(struct jobs *jobs, const struct job_request *request, struct stored_scan *scan,
+	      const struct recon_memory *memory, const char *key, const uint8_t digest[32], struct job **ret_job,
+	      bool *ret_new, struct error *err)
+{
+	struct job_record record = {0};
+	struct job *repeat = NULL, *job = NULL;
+	struct job_facts facts;
+	int code = fill_record(&record, request, stored_scan_id(scan), memory, key, digest, err);
+
+	if (code == 0) {
+		job = job_new(jobs, &record);
+		if (job == NULL)
+			code = error_set_errno(err, ENOMEM, "job");
+	}
+	job_record_clear(&record);
+	if (code != 0)
+		return code;
+	pthread_mutex_lock(&jobs->change);
+	if (key != NULL)
+		code = jobs_repeat(jobs, key, digest, &repeat, err);
+	if (code == 0 && repeat == NULL)
+		code = insert_job(jobs, job, scan, err);
+	pthread_mutex_unlock(&jobs->change);
+	if (code != 0 || repeat != NULL) {
+		job_free(job);
+		if (code == 0) {
+			*ret_job = repeat;
+			*ret_new = false;
+		}
+		return code;
+	}
+	job_facts(job, &facts);
+	log_line(LEVEL_INFO, "job %s of scan %s: %s, %s", job->id, job->scan, job_state_names[facts.state],
+		 priority_names[request->priority]);
+	wake(job);
+	*ret_job = job;
+	*ret_new = true;
+	return 0;
+}
+
+/* jobs->change is held: the wish is on the disk before it is shown, so that a restart carries it out. */
+static int ask_cancel(struct job *job, struct error *err)
+{
+	struct job_record record;
+	int code;
+
+	pthread_mutex_lock(&job->jobs->lock);
+	record = job->record;
+	pthread_mutex_unlock(&job->jobs->lock);
+	if (record.cancel_asked)
+		return 0;
+	record.cancel_asked = true;
+	code = store_job_update(job->jobs->store, &record, NULL, NULL, false, err);
+	if (code != 0)
+		return code;
+	pthread_mutex_lock(&job->jobs->lock);
+	job->record.cancel_asked = true;
+	pthread_mutex_unlock(&job->jobs->lock);
+	return 0;
+}
+
+/* jobs->change is held. */
+static int remove_job(struct jobs *jobs, struct job *job, struct error *err)
+{
+	int code = store_job_delete(jobs->store, job->id, err);
+
+	if (code != 0)
+		return code;
+	pthread_mutex_lock(&jobs->lock);
+	array_remove(jobs, job);
+	job->removed = true;
+	job->references--; /* the array's; the caller holds another */
+	pthread_mutex_unlock(&jobs->lock);
+	log_line(LEVEL_INFO, "job %s removed", job->id);
+	return 0;
+}
+
+int jobs_delete(struct jobs *jobs, struct job *job, bool *ret_removed, struct error *err)
+{
+	static const struct job_change asked = {.reason = "as asked"};
+	struct job_facts facts;
+	int code;
+
+	pthread_mutex_lock(&jobs->change);
+	job_facts(job, &facts);
+	if (facts.removed)
+		code = error_set(err, ERR_NOT_FOUND, "there is no job \"%s\" any more", facts.id);
+	else if (facts.ended)
+		code = remove_job(jobs, job, err);
+	else if (facts.state == JOB_RUNNING)
+		code = ask_cancel(job, err);
+	else
+		code = change_state(job, JOB_CANCELLED, &asked, err);
+	pthread_mutex_unlock(&jobs->change);
+	if (code != 0)
+		return code;
+	wake(job);
+	if (facts.ended)
+		store_job_remove_files(jobs->store, facts.id);
+	*ret_removed = facts.ended;
+	return 0;
+}
+
+int jobs_delete_scan(struct jobs *jobs, struct stored_scan *scan, struct error *err)
+{
+	const char *id = stored_scan_id(scan);
+	char user[ID_SIZE] = "";
+	int code;
+
+	pthread_mutex_lock(&jobs->change);
+	pthread_mutex_lock(&jobs->lock);
+	for (int i = 0; i < jobs->count && user[0] == '\0'; i++) {
+		if (!job_state_ended(jobs->all[i]->record.state) && strcmp(jobs->all[i]->scan, id) == 0)
+			memcpy(user, jobs->all[i]->id, sizeof(user));
+	}
+	pthread_mutex_unlock(&jobs->lock);
+	if (user[0] != '\0')
+		code = error_set(err, ERR_CONFLICT, "job %s still uses scan %s", user, id);
+	else
+		code = store_scan_delete(jobs->store, scan, err);
+	pthread_mutex_unlock(&jobs->change);
+	if (code == 0)
+		store_scan_remove_files(jobs->store, id);
+	return code;
+}
+
+void job_facts(struct job *job, struct job_facts *ret)
+{
+	pthread_mutex_lock(&job->jobs->lock);
+	memcpy(ret->id, job->id, sizeof(ret->id));
+	memcpy(ret->scan, job->scan, sizeof(ret->scan));
+	ret->state = job->record.state;
+	ret->ended = job_state_ended(job->record.state);
+	ret->removed = job->removed;
+	ret->cancel_asked = job->record.cancel_asked;
+	ret->mu_water = job->record.mu_water;
+	pthread_mutex_unlock(&job->jobs->lock);
+}
+
+void job_record(struct job *job, struct job_record *ret_record)
+{
+	pthread_mutex_lock(&job->jobs->lock);
+	account_stage(job);
+	*ret_record = job->record;
+	pthread_mutex_unlock(&job->jobs->lock);
+}
+
+int job_queue_position(struct job *job)
+{
+	int position;
+
+	pthread_mutex_lock(&job->jobs->lock);
+	position = queue_position(&job->entry);
+	pthread_mutex_unlock(&job->jobs->lock);
+	return position;
+}
+
+/* From the time between history rows; before the first one, from the share of the whole that is done. */
+double job_eta(struct job *job)
+{
+	double now = time_monotonic(), eta = -1;
+	const struct job_record *record = &job->record;
+
+	pthread_mutex_lock(&job->jobs->lock);
+	if (record->state == JOB_RUNNING) {
+		double done = record->fraction - job->run_fraction;
+
+		if (job->row_seconds > 0 && record->iterations > 0) {
+			eta = (record->iterations - record->iteration) * job->row_seconds - (now - job->row_at);
+			eta = eta < 0 ? 0 : eta;
+		} else if (done > 0.01) {
+			eta = (now - job->run_since) * (1 - record->fraction) / done;
+		}
+	}
+	pthread_mutex_unlock(&job->jobs->lock);
+	return eta;
+}
+
+void jobs_statistics(struct jobs *jobs, struct jobs_statistics *ret)
+{
+	pthread_mutex_lock(&jobs->lock);
+	*ret = jobs->statistics;
+	for (int i = 0; i < jobs->count; i++)
+		ret->count[jobs->all[i]->record.state]++;
+	pthread_mutex_unlock(&jobs->lock);
+}
+
+/* ---- what the supervisor does ---- */
+
+static int promote(struct jobs *jobs, struct job *job, struct error *err)
+{
+	struct job_change change = {.reason = "its scan is ready"};
+	struct stored_scan *scan;
+	struct scan_facts facts;
+	struct error why;
+	int code = store_scan_find(jobs->store, job->scan, &scan, &why);
+
+	if (code != 0) {
+		change = (struct job_change){.error_code = code, .error_text = why.text};
+		return job_set_state(job, JOB_FAILED, &change, err);
+	}
+	stored_scan_facts(scan, &facts);
+	stored_scan_release(scan);
+	return facts.ready ? job_set_state(job, JOB_QUEUED, &change, err) : 0;
+}
+
+int jobs_promote(struct jobs *jobs, struct error *err)
+{
+	struct job **waiting = NULL;
+	int count = 0, code = 0, result;
+
+	pthread_mutex_lock(&jobs->lock);
+	for (int i = 0; i < jobs->count; i++)
+		count += jobs->all[i]->record.state == JOB_WAITING;
+	if (count > 0)
+		waiting = calloc((size_t)count, sizeof(struct job *));
+	count = 0;
+	for (int i = 0; i < jobs->count && waiting != NULL; i++) {
+		if (jobs->all[i]->record.state != JOB_WAITING)
+			continue;
+		waiting[count++] = jobs->all[i];
+		jobs->all[i]->references++;
+	}
+	pthread_mutex_unlock(&jobs->lock);
+	for (int i = 0; i < count; i++) {
+		result = code == 0 ? promote(jobs, waiting[i], err) : 0;
+		/* Cancelled meanwhile: somebody else's business. */
+		if (result != ERR_CONFLICT && code == 0)
+			code = result;
+		job_release(waiting[i]);
+	}
+	free(waiting);
+	return code;
+}
+
+struct job *jobs_next(struct jobs *jobs)
+{
+	struct job *job = NULL;
+
+	pthread_mutex_lock(&jobs->lock);
+	if (jobs->queue.first != NULL) {
+		job = (struct job *)((char *)jobs->queue.first - offsetof(struct job, entry));
+		job->references++;
+	}
+	pthread_mutex_unlock(&jobs->lock);
+	return job;
+}
+
+int jobs_victim(struct jobs *jobs, const struct queue_running *running, int count, int idle)
+{
+	int victim;
+
+	pthread_mutex_lock(&jobs->lock);
+	victim = queue_victim(&jobs->queue, running, count, idle);
+	pthread_mutex_unlock(&jobs->lock);
+	return victim;
+}
+
+void job_set_plan(struct job *job, const struct recon_memory *memory, const char *plan)
+{
+	pthread_mutex_lock(&job->jobs->lock);
+	job->record.memory = *memory;
+	snprintf(job->record.plan, sizeof(job->record.plan), "%s", plan);
+	pthread_mutex_unlock(&job->jobs->lock);
+}
+
+void job_progress(struct job *job, enum stage stage, int iteration, double fraction)
+{
+	pthread_mutex_lock(&job->jobs->lock);
+	account_stage(job);
+	job->record.stage = stage;
+	job->record.iteration = iteration;
+	/* Only forward, and no surprise from a worker's arithmetic. */
+	if (fraction > job->record.fraction)
+		job->record.fraction = fraction > 1 ? 1 : fraction;
+	pthread_mutex_unlock(&job->jobs->lock);
+}
+
+static void note_row(struct job *job, int iteration)
+{
+	double now = time_monotonic(), seconds;
+
+	pthread_mutex_lock(&job->jobs->lock);
+	seconds = now - job->row_at;
+	/* The first row's time holds the loading too, the later ones count more. */
+	job->row_seconds = job->row_seconds == 0 ? seconds : 0.5 * (job->row_seconds + seconds);
+	job->row_at = now;
+	job->record.iteration = iteration;
+	pthread_mutex_unlock(&job->jobs->lock);
+}
+
+int job_add_row(struct job *job, const struct history_row *row, struct error *err)
+{
+	struct event event;
+	int code = event_make(&event, "progress", history_row_document(row), err);
+
+	if (code != 0)
+		return code;
+	code = store_job_add_row(job->jobs->store, job->id, row, &event, err);
+	cJSON_free(event.data);
+	if (code != 0)
+		return code;
+	note_row(job, row->iteration);
+	wake(job);
+	return 0;
+}
+
+int job_add_volume(struct job *job, const struct volume_record *volume, struct error *err)
+{
+	struct event event;
+	int code = event_make(&event, "volume", volume_document(job->id, volume), err);
+
+	if (code != 0)
+		return code;
+	code = store_job_add_volume(job->jobs->store, job->id, volume, &event, err);
+	cJSON_free(event.data);
+	if (code == 0)
+		wake(job);
+	return code;
+}
+
+int job_add_warning(struct job *job, const char *code_name, const char *detail, struct error *err)
+{
+	struct warning_record warning;
+	struct event event;
+	cJSON *document = cJSON_CreateObject();
+	bool new;
+	int code;
+
+	snprintf(warning.code, sizeof(warning.code), "%s", code_name);
+	snprintf(warning.detail, sizeof(warning.detail), "%s", detail);
+	cJSON_AddStringToObject(document, "code", warning.code);
+	cJSON_AddStringToObject(document, "detail", warning.detail);
+	code = event_make(&event, "warning", document, err);
+	if (code != 0)
+		return code;
+	code = store_job_add_warning(job->jobs->store, job->id, &warning, &event, &new, err);
+	cJSON_free(event.data);
+	if (code == 0 && new)
+		wake(job);
+	return code;
+}
