@@ -186,6 +186,22 @@ static void find_fan(struct orbit *orbit, const struct geometry *geometry)
 	orbit->field_of_view = 2 * fmax(0, orbit->displaced ? fmax(low_side, high_side) : fmin(low_side, high_side));
 }
 
+/* As many columns as make the near side of a displaced detector as wide as the far one, in every view. */
+static int find_padding(const struct orbit *orbit, const struct geometry *geometry)
+{
+	double sign = orbit->displacement > 0 ? 1 : -1, most = 0;
+
+	for (int k = 0; k < geometry->count; k++) {
+		double matrix[12];
+
+		view_matrix(&geometry->views[k], matrix);
+		most = fmax(most, 2 * sign * view_displacement(geometry, &geometry->views[k], matrix) /
+				      vec_norm(geometry->views[k].column_step));
+	}
+	/* A view as far off as that is not a displaced detector any more. */
+	return (int)fmin(ceil(most - 1e-6), 2 * geometry->columns);
+}
+
 int orbit_analyse(struct orbit *ret_orbit, const struct geometry *geometry, struct error *err)
 {
 	size_t count = (size_t)geometry->count;
@@ -216,6 +232,8 @@ int orbit_analyse(struct orbit *ret_orbit, const struct geometry *geometry, stru
 	follow(&orbit, placed, station, find_stations(placed, geometry->count, station), aside);
 	orbit.displaced = aside && !orbit.short_scan;
 	find_fan(&orbit, geometry);
+	if (orbit.displaced)
+		orbit.pad[orbit.displacement > 0 ? 0 : 1] = find_padding(&orbit, geometry);
 	orbit.parker_delta = 0.5 * (orbit.arc - M_PI);
 	orbit.arc_too_short = orbit.short_scan && orbit.arc < M_PI + orbit.fan - SAME_ANGLE;
 	*ret_orbit = orbit;

@@ -37,9 +37,16 @@ struct orbit {
 	double source_to_detector; /* mm, mean, along the normal */
 	double field_of_view;      /* mm, diameter of the cylinder that all views see, or one half when displaced */
 	double displacement;       /* mm at the detector, along +u, of its centre from the ray through the axis, mean */
-	bool displaced;      /* half-fan weights: full turn, displaced by more than 4 pixels and 2 % of the width */
-	double parker_delta; /* radians, (arc - pi) / 2 */
-	bool arc_too_short;  /* arc < pi + fan: a warning, not an error */
+	bool displaced; /* half-fan weights: full turn, displaced by more than 4 pixels and 2 % of the width */
+	/*
+	 * Columns that FDK adds before column 0 and behind the last one, zero before
+	 * the filter, when displaced; else 0. The filtered row has tails there, and
+	 * points that one view in two does not see need them: without them the density
+	 * is wrong by some percent.
+	 */
+	int pad[2];
+	double parker_delta;          /* radians, (arc - pi) / 2 */
+	bool arc_too_short;           /* arc < pi + fan: a warning, not an error */
 	double pixel_at_isocentre[2]; /* mm, mean */
 	/*
 	 * Radians, mean angle between the detector's rows and the plane across z. FDK

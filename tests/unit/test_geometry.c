@@ -8,6 +8,7 @@
 #include <string.h>
 
 #include "core/grid.h"
+#include "tests/unit/data.h"
 
 /* Of double arithmetic over numbers of a thousand, with four digits to spare. */
 static const double ROUNDING = 1e-9;
@@ -210,34 +211,10 @@ START_TEST(the_pitch_sets_the_distance_of_the_detector_and_nothing_else)
 }
 END_TEST
 
-/* Little-endian float64, C order, as numpy writes version 1 files. */
-static double *read_npy(const char *name, size_t numbers)
-{
-	const char *data = getenv("CBCT_TEST_DATA");
-	char path[1024];
-	unsigned char head[10];
-	double *values = NULL;
-	FILE *file;
-
-	snprintf(path, sizeof(path), "%s/%s", data ? data : "../shared/data", name);
-	file = fopen(path, "rbe");
-	if (file == NULL) {
-		printf("skipped: %s is not there\n", path);
-		return NULL;
-	}
-	ck_assert_uint_eq(fread(head, 1, sizeof(head), file), sizeof(head));
-	ck_assert_int_eq(fseek(file, 10 + head[8] + 256 * head[9], SEEK_SET), 0);
-	values = malloc(numbers * sizeof(*values));
-	ck_assert_ptr_nonnull(values);
-	ck_assert_uint_eq(fread(values, sizeof(*values), numbers, file), numbers);
-	fclose(file);
-	return values;
-}
-
 START_TEST(a_real_c_arm_s_matrices_come_back)
 {
 	enum { VIEWS = 248 };
-	double *matrices = read_npy("carm_kct_248.npy", VIEWS * 12), pitch[2] = {0.616, 0.616};
+	double *matrices = data_npy("carm_kct_248.npy", VIEWS * 12), pitch[2] = {0.616, 0.616};
 	struct geometry geometry;
 	struct error err = {0};
 

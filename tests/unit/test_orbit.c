@@ -1,0 +1,740 @@
+/* What is read off an orbit, and the weights that follow: conjugate rays, and filtered backprojection at points. */
+#include <check.h>
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "core/orbit.h"
+#include "core/phantom.h"
+#include "tests/unit/data.h"
+
+static const double DEGREE = M_PI / 180;
+
+/* A sweep over a C-arm's orbit. */
+struct sweep {
+	int columns, rows;
+	double pixel, first, step; /* mm, degrees, degrees */
+	int views;
+	double detector_offset[2], source_offset; /* mm; the source's along u */
+};
+
+static struct circular circular_of(const struct sweep *sweep)
+{
+	return (struct circular){.source_to_isocentre = 620,
+				 .source_to_detector = 1100,
+				 .pixel = {sweep->pixel, sweep->pixel},
+				 .detector_offset = {sweep->detector_offset[0], sweep->detector_offset[1]},
+				 .source_offset = {sweep->source_offset, 0}};
+}
+
+/* order: NULL, or the view to make k-th. */
+static struct geometry geometry_of(const struct sweep *sweep, const int *order)
+{
+	struct circular circular = circular_of(sweep);
+	double *angles = malloc((size_t)sweep->views * sizeof(*angles));
+	struct geometry geometry;
+	struct error err = {0};
+
+	ck_assert_ptr_nonnull(angles);
+	for (int k = 0; k < sweep->views; k++)
+		angles[k] = (sweep->first + (order ? order[k] : k) * sweep->step) * DEGREE;
+	ck_assert_msg(
+	    geometry_circular(&geometry, sweep->columns, sweep->rows, sweep->views, &circular, angles, &err) == 0, "%s",
+	    err.text);
+	free(angles);
+	return geometry;
+}
+
+static struct orbit orbit_of(const struct geometry *geometry)
+{
+	struct orbit orbit;
+	struct error err = {0};
+
+	ck_assert_msg(orbit_analyse(&orbit, geometry, &err) == 0, "%s", err.text);
+	return orbit;
+}
+
+static double sum_of(const double *values, int count)
+{
+	double sum = 0;
+
+	for (int i = 0; i < count; i++)
+		sum += values[i];
+	return sum;
+}
+
+START_TEST(arcs_are_read_off_the_sources)
+{
+	static const struct {
+		const char *what;
+		double first, step;
+		int views;
+		double arc;
+		int direction;
+		bool short_scan, too_short;
+	} rows[] = {
+	    {"full turn", 0, 3.6, 100, 360, 1, false, false},
+	    {"full turn, clockwise", 0, -3.6, 100, 360, -1, false, false},
+	    {"359 degrees", 10, 1, 360, 360, 1, false, false},
+	    {"its last view lost", 10, 1, 359, 360, 1, false, false},
+	    {"first view repeated at the end", 0, 1, 361, 360, 1, false, false},
+	    {"26 views", 0, 360.0 / 26, 26, 360, 1, false, false},
+	    {"26 views, one lost", 0, 360.0 / 26, 25, 360, 1, false, false},
+	    {"4 views", 45, 90, 4, 360, 1, false, false},
+	    {"two turns", 0, 3.6, 200, 360, 1, false, false},
+	    {"two turns and a half, clockwise", -90, -1, 900, 360, -1, false, false},
+	    {"golden angle", 0, 137.50776405, 233, 360, 1, false, false},
+	    {"short scan", 30, 1, 221, 220, 1, true, false},
+	    {"short scan, clockwise", 30, -1, 221, 220, -1, true, false},
+	    {"short scan across 360", 300, 2, 121, 240, 1, true, false},
+	    {"short scan beyond 360", 1000, 1, 221, 220, 1, true, false},
+	    {"sparse short scan", 0, 10, 22, 210, 1, true, false},
+	    {"overscan", 0, 1, 301, 300, 1, true, false},
+	    {"350 degrees", 0, 1, 351, 350, 1, true, false},
+	    {"half a turn", 0, 1, 181, 180, 1, true, true},
+	    {"tomosynthesis", -20, 1, 41, 40, 1, true, true},
+	    {"two views", 0, 1, 2, 1, 1, true, true},
+	    {"one view", 77, 1, 1, 0, 0, true, true},
+	    {"one angle", 77, 0, 9, 0, 0, true, true},
+	    {"one angle, turns apart", 77, 360, 9, 0, 0, true, true},
+	};
+
+	for (size_t i = 0; i < sizeof(rows) / sizeof(*rows); i++) {
+		struct sweep sweep = {559, 5, 0.8, rows[i].first, rows[i].step, rows[i].views, {0, 0}, 0};
+		struct geometry geometry = geometry_of(&sweep, NULL);
+		struct orbit orbit = orbit_of(&geometry);
+		float *weights = malloc((size_t)sweep.views * 559 * sizeof(*weights));
+		int bad = 0;
+
+		ck_assert_msg(fabs(orbit.arc - rows[i].arc * DEGREE) < 1e-9, "%s: arc %g", rows[i].what,
+			      orbit.arc / DEGREE);
+		ck_assert_msg(orbit.direction == rows[i].direction, "%s: direction %d", rows[i].what, orbit.direction);
+		ck_assert_msg(orbit.short_scan == rows[i].short_scan, "%s: short scan", rows[i].what);
+		ck_assert_msg(orbit.arc_too_short == rows[i].too_short, "%s: too short", rows[i].what);
+		ck_assert_msg(!orbit.displaced, "%s: displaced", rows[i].what);
+		if (orbit.short_scan)
+			ck_assert_msg(orbit.first == 0, "%s: first %d", rows[i].what, orbit.first);
+		ck_assert_double_eq_tol(orbit.parker_delta, (orbit.arc - M_PI) / 2, 1e-12);
+		ck_assert_double_eq_tol(sum_of(orbit.weight, orbit.count), orbit.arc > 0 ? orbit.arc : M_PI, 1e-9);
+		for (int k = 0; k < orbit.count; k++) {
+			double away = remainder(orbit.angle[k] - (rows[i].first + k * rows[i].step) * DEGREE, 2 * M_PI);
+
+			ck_assert(orbit.angle[k] >= 0 && orbit.angle[k] < 2 * M_PI && orbit.weight[k] >= 0);
+			ck_assert_double_eq_tol(away, 0, 1e-9);
+		}
+		/* However odd the orbit, the weights are numbers. */
+		ck_assert_ptr_nonnull(weights);
+		orbit_column_weights(&orbit, &geometry, weights);
+		for (size_t w = 0; w < (size_t)sweep.views * 559; w++)
+			bad += !(weights[w] >= 0 && isfinite(weights[w]));
+		ck_assert_msg(bad == 0, "%s: %d bad weights", rows[i].what, bad);
+		free(weights);
+		orbit_clear(&orbit);
+		geometry_clear(&geometry);
+	}
+}
+END_TEST
+
+START_TEST(angular_weights_are_half_the_gaps_to_both_neighbours)
+{
+	static const double degrees[] = {10, 12, 15, 16, 16, 120, 160, 200};
+	static const double expected[] = {1, 2.5, 2, 26.25, 26.25, 72, 40, 20};
+	struct circular circular = {.source_to_isocentre = 500, .source_to_detector = 900, .pixel = {1, 1}};
+	struct geometry geometry;
+	struct error err = {0};
+	struct orbit orbit;
+	double angles[8];
+
+	for (int i = 0; i < 8; i++)
+		angles[i] = degrees[i] * DEGREE;
+	ck_assert_int_eq(geometry_circular(&geometry, 8, 1, 8, &circular, angles, &err), 0);
+	orbit = orbit_of(&geometry);
+	/* The widest gap, 170 degrees, is not wider than 2.25 times the next: a full turn with large gaps. */
+	ck_assert(!orbit.short_scan);
+	ck_assert_double_eq_tol(orbit.weight[0], 86 * DEGREE, 1e-9);
+	for (int i = 1; i < 7; i++)
+		ck_assert_double_eq_tol(orbit.weight[i], expected[i] * DEGREE, 1e-9);
+	orbit_clear(&orbit);
+	geometry_clear(&geometry);
+	/* Without the two in the middle, 184 degrees wide, the end views keep their inner gap only. */
+	angles[5] = 17 * DEGREE;
+	angles[6] = 18 * DEGREE;
+	angles[7] = 20 * DEGREE;
+	ck_assert_int_eq(geometry_circular(&geometry, 8, 1, 8, &circular, angles, &err), 0);
+	orbit = orbit_of(&geometry);
+	ck_assert(orbit.short_scan);
+	ck_assert_double_eq_tol(orbit.weight[0], 1 * DEGREE, 1e-9);
+	ck_assert_double_eq_tol(orbit.weight[3], 0.5 * DEGREE, 1e-9);
+	ck_assert_double_eq_tol(orbit.weight[7], 1 * DEGREE, 1e-9);
+	orbit_clear(&orbit);
+	geometry_clear(&geometry);
+}
+END_TEST
+
+START_TEST(the_order_of_the_views_does_not_matter)
+{
+	enum { VIEWS = 221, COLUMNS = 51 };
+	struct sweep sweep = {COLUMNS, 1, 8, 100, 1, VIEWS, {3, 0}, 0};
+	struct geometry straight = geometry_of(&sweep, NULL), mixed;
+	static float weights[VIEWS * COLUMNS], again[VIEWS * COLUMNS];
+	struct orbit orbit = orbit_of(&straight), other;
+	int order[VIEWS];
+
+	for (int k = 0; k < VIEWS; k++)
+		order[k] = 80 * k % VIEWS;
+	mixed = geometry_of(&sweep, order);
+	other = orbit_of(&mixed);
+	ck_assert_double_eq_tol(other.arc, orbit.arc, 1e-12);
+	ck_assert(other.short_scan);
+	orbit_column_weights(&orbit, &straight, weights);
+	orbit_column_weights(&other, &mixed, again);
+	/* Seen the other way round the formula is the same but for rounding; weights are about 1e-2. */
+	for (int k = 0; k < VIEWS; k++)
+		for (int c = 0; c < COLUMNS; c++)
+			ck_assert_float_eq_tol(again[k * COLUMNS + c], weights[order[k] * COLUMNS + c], 1e-8f);
+	orbit_clear(&orbit);
+	orbit_clear(&other);
+	geometry_clear(&straight);
+	geometry_clear(&mixed);
+}
+END_TEST
+
+START_TEST(a_circular_orbit_has_its_textbook_numbers)
+{
+	struct sweep sweep = {559, 401, 0.8, 0, 3.6, 100, {0, 0}, 0};
+	struct geometry geometry = geometry_of(&sweep, NULL);
+	struct orbit orbit = orbit_of(&geometry);
+	double half = atan(559 * 0.8 / 2 / 1100);
+
+	ck_assert_double_eq_tol(orbit.fan, 2 * half, 1e-12);
+	ck_assert_double_eq_tol(orbit.half_fan_min, -half, 1e-12);
+	ck_assert_double_eq_tol(orbit.half_fan_max, half, 1e-12);
+	ck_assert_double_eq_tol(orbit.source_radius, 620, 1e-9);
+	ck_assert_double_eq_tol(orbit.source_to_detector, 1100, 1e-9);
+	ck_assert_double_eq_tol(orbit.field_of_view, 2 * 620 * sin(half), 1e-9);
+	ck_assert_double_eq_tol(orbit.displacement, 0, 1e-9);
+	ck_assert_double_eq_tol(orbit.pixel_at_isocentre[0], 0.8 * 620 / 1100, 1e-12);
+	ck_assert_double_eq_tol(orbit.pixel_at_isocentre[1], 0.8 * 620 / 1100, 1e-12);
+	ck_assert_double_eq_tol(orbit.tilt, 0, 1e-12);
+	orbit_clear(&orbit);
+	geometry_clear(&geometry);
+}
+END_TEST
+
+START_TEST(only_a_clear_displacement_on_a_full_turn_counts)
+{
+	static const struct {
+		int columns;
+		double offset, source_offset;
+		int views; /* a degree apart */
+		bool displaced;
+	} rows[] = {
+	    {559, 0.4, 0, 360, false},  {559, 8.8, 0, 360, false}, {559, 9.2, 0, 360, true}, {559, -120, 0, 360, true},
+	    {559, 120, 0, 221, false},  {559, 120, 0, 350, true},  {559, 3, 0, 221, false},  {64, 3, 0, 360, false},
+	    {64, 3.4, 0, 360, true},    {559, 500, 0, 360, true},  {559, 0, 10, 360, false}, {559, 0, 30, 360, true},
+	    {559, 24, -31, 360, false},
+	};
+
+	for (size_t i = 0; i < sizeof(rows) / sizeof(*rows); i++) {
+		struct sweep sweep = {rows[i].columns,      3, 0.8, 0, 1, rows[i].views, {rows[i].offset, 0},
+				      rows[i].source_offset};
+		struct geometry geometry = geometry_of(&sweep, NULL);
+		struct orbit orbit = orbit_of(&geometry);
+
+		ck_assert_msg(orbit.displaced == rows[i].displaced, "row %zu: %g mm", i, orbit.displacement);
+		/* A source beside the middle sees the axis on the other side of it, magnified. */
+		if (rows[i].source_offset == 0)
+			ck_assert_double_eq_tol(orbit.displacement, rows[i].offset, 1e-6);
+		orbit_clear(&orbit);
+		geometry_clear(&geometry);
+	}
+}
+END_TEST
+
+/* True when every view sees the point of the middle plane at (r, angle). */
+static bool seen(const struct geometry *geometry, double r, double angle)
+{
+	for (int k = 0; k < geometry->count; k++) {
+		double matrix[12], point[3] = {r * cos(angle), r * sin(angle), 0}, column, row;
+
+		view_matrix(&geometry->views[k], matrix);
+		view_project(matrix, point, &column, &row);
+		if (column < -0.5 || column > geometry->columns - 0.5)
+			return false;
+	}
+	return true;
+}
+
+START_TEST(the_field_of_view_is_what_all_views_see)
+{
+	static const struct sweep sweeps[] = {
+	    {101, 1, 4, 0, 1, 360, {0, 0}, 0},   {101, 1, 4, 0, 1, 221, {0, 0}, 0},   {101, 1, 4, 0, 1, 360, {7, 0}, 0},
+	    {101, 1, 4, 0, -1, 360, {-7, 0}, 0}, {101, 1, 4, 0, -1, 221, {60, 0}, 0}, {101, 1, 4, 0, 1, 360, {0, 0}, 8},
+	};
+
+	for (size_t i = 0; i < sizeof(sweeps) / sizeof(*sweeps); i++) {
+		struct geometry geometry = geometry_of(&sweeps[i], NULL);
+		struct orbit orbit = orbit_of(&geometry);
+		double r = orbit.field_of_view / 2;
+		bool all = true, beyond = true;
+
+		for (int d = 0; d < 360; d++) {
+			all = all && seen(&geometry, r * 0.9999, d * DEGREE);
+			beyond = beyond && seen(&geometry, r * 1.001, d * DEGREE);
+		}
+		ck_assert_msg(all && !beyond, "sweep %zu: %g mm", i, orbit.field_of_view);
+		orbit_clear(&orbit);
+		geometry_clear(&geometry);
+	}
+}
+END_TEST
+
+START_TEST(a_displaced_detector_widens_the_field_of_view)
+{
+	for (int side = -1; side <= 1; side += 2) {
+		struct sweep sweep = {101, 1, 4, 0, 1, 360, {side * 120, 0}, 0};
+		struct geometry geometry = geometry_of(&sweep, NULL);
+		struct orbit orbit = orbit_of(&geometry);
+
+		ck_assert(orbit.displaced);
+		ck_assert_double_eq_tol(orbit.field_of_view, 2 * 620 * sin(atan((202 + 120) / 1100.0)), 1e-9);
+		/* With as many columns as are missing on the near side, both sides are as wide: 2 * 120 / 4. */
+		ck_assert_int_eq(orbit.pad[0], side > 0 ? 60 : 0);
+		ck_assert_int_eq(orbit.pad[1], side > 0 ? 0 : 60);
+		orbit_clear(&orbit);
+		geometry_clear(&geometry);
+	}
+}
+END_TEST
+
+START_TEST(a_real_c_arm_s_orbit_is_a_short_scan)
+{
+	double *matrices = data_npy("carm_kct_248.npy", 248 * 12), pitch[2] = {0.616, 0.616};
+	struct geometry geometry;
+	struct error err = {0};
+	struct orbit orbit;
+
+	if (matrices == NULL)
+		return;
+	ck_assert_int_eq(geometry_matrices(&geometry, 616, 480, 248, matrices, pitch, &err), 0);
+	orbit = orbit_of(&geometry);
+	/* As those who published it say: 197.6 degrees, 750 mm, 1199 mm. */
+	ck_assert_double_eq_tol(orbit.arc / DEGREE, 197.6, 0.05);
+	ck_assert_int_eq(orbit.direction, 1);
+	ck_assert_int_eq(orbit.first, 0);
+	ck_assert(orbit.short_scan && !orbit.displaced);
+	ck_assert_double_eq_tol(orbit.source_radius, 750, 2);
+	ck_assert_double_eq_tol(orbit.source_to_detector, 1199, 2);
+	orbit_clear(&orbit);
+	geometry_clear(&geometry);
+	free(matrices);
+}
+END_TEST
+
+/* ---- weights: a line measured from both sides has 2 in all ---- */
+
+/* Weights without the angular part and the constants: Parker's or the half fan's. */
+static float *bare_weights(const struct orbit *orbit, const struct geometry *geometry, const struct circular *circular)
+{
+	size_t columns = (size_t)geometry->columns;
+	float *weights = malloc((size_t)geometry->count * columns * sizeof(*weights));
+	/* Offset along u turns the source's radius, not the isocentre's depth. */
+	double constant = 0.5 * hypot(circular->source_to_isocentre, circular->source_offset[0]) *
+			  circular->source_to_detector /
+			  (circular->pixel[0] * circular->source_to_isocentre * circular->source_to_isocentre);
+
+	ck_assert_ptr_nonnull(weights);
+	orbit_column_weights(orbit, geometry, weights);
+	for (size_t i = 0; i < (size_t)geometry->count * columns; i++)
+		weights[i] = (float)(weights[i] / (constant * orbit->weight[i / columns]));
+	return weights;
+}
+
+/* Where the ray from view k to a column comes out of the sources' circle: as a view and a column, fractions included.
+ */
+static void conjugate(const struct sweep *sweep, const struct geometry *geometry, int k, int column, double *ret_view,
+		      double *ret_column)
+{
+	const struct view *view = &geometry->views[k];
+	struct circular circular = circular_of(sweep);
+	double d[2], middle[3] = {0}, t, angle, matrix[12], row;
+	struct geometry there;
+	struct error err = {0};
+
+	for (int i = 0; i < 2; i++)
+		d[i] = view->pixel0[i] + column * view->column_step[i] - view->source[i];
+	t = -2 * (d[0] * view->source[0] + d[1] * view->source[1]) / (d[0] * d[0] + d[1] * d[1]);
+	angle = atan2(view->source[1] + t * d[1], view->source[0] + t * d[0]) - atan(sweep->source_offset / 620);
+	for (int i = 0; i < 2; i++)
+		middle[i] = view->source[i] + t / 2 * d[i];
+	/* Not by check's macros, which write a mark to a file at each of a million calls. */
+	if (geometry_circular(&there, sweep->columns, 1, 1, &circular, &angle, &err) < 0)
+		ck_abort_msg("%s", err.text);
+	view_matrix(&there.views[0], matrix);
+	view_project(matrix, middle, ret_column, &row);
+	geometry_clear(&there);
+	*ret_view = (angle / DEGREE - sweep->first) / sweep->step;
+	*ret_view -= floor(*ret_view * fabs(sweep->step) / 360) * 360 / fabs(sweep->step);
+}
+
+static double interpolate(const float *weights, int columns, double view, double column)
+{
+	int k = (int)view, c = (int)column;
+	double a = view - k, b = column - c;
+	const float *at = weights + (size_t)k * (size_t)columns + c;
+
+	return (1 - a) * ((1 - b) * (double)at[0] + b * (double)at[1]) +
+	       a * ((1 - b) * (double)at[columns] + b * (double)at[columns + 1]);
+}
+
+START_TEST(conjugate_rays_sum_to_two)
+{
+	static const struct sweep sweeps[] = {
+	    {281, 1, 1.6, 20, 0.125, 1761, {0, 0}, 0},    /* 220 degrees, fan 23 */
+	    {281, 1, 1.6, 20, -0.125, 1761, {0, 0}, 0},   /* clockwise */
+	    {281, 1, 1.6, 20, 0.125, 1761, {11.3, 0}, 0}, /* offsets, both ways round */
+	    {281, 1, 1.6, 20, -0.125, 1761, {11.3, 0}, 0},
+	    {281, 1, 1.6, 20, 0.125, 1761, {-4, 0}, 7},
+	    {281, 1, 1.6, 20, -0.125, 1761, {0, 0}, -7},
+	    {281, 1, 1.6, 0, 0.125, 2401, {0, 0}, 0}, /* overscan */
+	    {281, 1, 1.6, 0, -0.125, 2401, {9, 0}, 0},
+	    {281, 1, 1.6, 0, 0.125, 1521, {0, 0}, 0}, /* 190: too short */
+	    {281, 1, 1.6, 0, -0.125, 1521, {5, 0}, 0},
+	    {281, 1, 1.6, 0, 0.125, 1361, {0, 0}, 0},  /* 170 */
+	    {281, 1, 1.6, 0, 0.125, 2880, {0, 0}, 0},  /* full turn */
+	    {281, 1, 1.6, 0, 0.125, 2880, {90, 0}, 0}, /* displaced, both sides, both ways round */
+	    {281, 1, 1.6, 0, 0.125, 2880, {-90, 0}, 0},
+	    {281, 1, 1.6, 0, -0.125, 2880, {90, 0}, 0},
+	    {281, 1, 1.6, 0, -0.125, 2880, {-90, 0}, 0},
+	    {281, 1, 1.6, 0, 0.125, 2880, {0, 0}, 40},
+	};
+
+	for (size_t i = 0; i < sizeof(sweeps) / sizeof(*sweeps); i++) {
+		const struct sweep *sweep = &sweeps[i];
+		struct circular circular = circular_of(sweep);
+		struct geometry geometry = geometry_of(sweep, NULL);
+		struct orbit orbit = orbit_of(&geometry);
+		float *weights = bare_weights(&orbit, &geometry, &circular);
+		int pairs = 0, alone = 0;
+		double worst = 0;
+
+		for (int k = 1; k < geometry.count - 1; k += 23)
+			for (int c = 0; c < geometry.columns; c += 5) {
+				double view, column, weight = weights[k * geometry.columns + c];
+				double alpha = atan((c - 140 + sweep->detector_offset[0] / 1.6) * 1.6 / 1100);
+
+				/* Near |alpha| = delta Parker's ramp is steeper than the sampling. */
+				if (orbit.short_scan && fabs(fabs(alpha) - fabs(orbit.parker_delta)) < 0.05)
+					continue;
+				conjugate(sweep, &geometry, k, c, &view, &column);
+				/* On the edge of what is measured: neither. */
+				if (fabs(view - (geometry.count - 1)) < 2 ||
+				    (orbit.short_scan && (view < 2 || view > 360 / fabs(sweep->step) - 2)))
+					continue;
+				if (fabs(column) < 2 || fabs(column - (geometry.columns - 1)) < 2)
+					continue;
+				if (view < geometry.count - 1 && column > 0 && column < geometry.columns - 1) {
+					weight += interpolate(weights, geometry.columns, view, column);
+					pairs++;
+				} else if (orbit.displaced || (orbit.short_scan && view > geometry.count - 1)) {
+					alone++;
+				} else {
+					continue; /* at the edge of an offset detector, beyond the field of view */
+				}
+				worst = fmax(worst, fabs(weight - 2));
+			}
+		/* Interpolation between samples: step^2 / 8 times the second derivative, at most 1000. */
+		ck_assert_msg(worst < 3e-3, "sweep %zu: wrong by %g", i, worst);
+		ck_assert_int_gt(pairs, 100);
+		if (orbit.displaced || orbit.short_scan)
+			ck_assert_int_gt(alone, 100);
+		free(weights);
+		orbit_clear(&orbit);
+		geometry_clear(&geometry);
+	}
+}
+END_TEST
+
+/* ---- filtered backprojection at points, by the header's formula ---- */
+
+/* A long cylinder off the axis, with a rod in it. */
+static struct phantom object(double x, double y)
+{
+	struct phantom phantom = {.count = 2, .parts = calloc(2, sizeof(struct ellipsoid))};
+
+	ck_assert_ptr_nonnull(phantom.parts);
+	phantom.parts[0] = (struct ellipsoid){SHAPE_CYLINDER, {60, 50, 1000}, {x, y, 0}, 0.3, 0.02};
+	phantom.parts[1] = (struct ellipsoid){SHAPE_CYLINDER, {20, 20, 1000}, {x + 25, y - 10, 0}, 0, 0.01};
+	return phantom;
+}
+
+/*
+ * One row: weighted by column and cosine of the fan angle, convolved with the ramp for a pitch of one pixel, from
+ * pad[0] columns before the detector to pad[1] behind it.
+ */
+static void filter_row(const struct geometry *geometry, int k, const int pad[2], const float *weights, const float *row,
+		       double *ret)
+{
+	const struct view *view = &geometry->views[k];
+	int columns = geometry->columns;
+	double *weighted = malloc((size_t)columns * sizeof(*weighted));
+
+	ck_assert_ptr_nonnull(weighted);
+	for (int c = 0; c < columns; c++) {
+		double ray[3], axis[3] = {-view->source[0], -view->source[1], 0};
+
+		for (int i = 0; i < 3; i++)
+			ray[i] = view->pixel0[i] + c * view->column_step[i] - view->source[i];
+		weighted[c] = weights[c] * row[c] * vec_dot(ray, axis) / (vec_norm(ray) * vec_norm(axis));
+	}
+	for (int c = -pad[0]; c < columns + pad[1]; c++) {
+		double sum = c >= 0 && c < columns ? weighted[c] / 4 : 0;
+
+		for (int other = (c & 1) ^ 1; other < columns; other += 2)
+			sum -= weighted[other] / (M_PI * M_PI * (c - other) * (c - other));
+		ret[c + pad[0]] = sum;
+	}
+	free(weighted);
+}
+
+enum { PATCH = 7 };
+/* Adds one view to a patch of points, 1 mm apart, around (x, y); column 0 is filtered[before]. */
+static void add_view(const struct view *view, int before, int columns, const double *filtered, double x, double y,
+		     double *sum)
+{
+	double matrix[12];
+
+	view_matrix(view, matrix);
+	for (int i = 0; i < PATCH * PATCH; i++) {
+		double point[3] = {x + i % PATCH - PATCH / 2, y + i / PATCH - PATCH / 2, view->source[2]};
+		double column, row, depth = view_project(matrix, point, &column, &row), part;
+		int c = (int)floor(column + before);
+
+		part = column + before - c;
+		if (c >= 0 && c < columns - 1)
+			*sum += ((1 - part) * filtered[c] + part * filtered[c + 1]) * matrix[11] * matrix[11] /
+				(depth * depth) / (PATCH * PATCH);
+	}
+}
+
+enum { PLACES = 3 };
+static void backproject(const struct geometry *geometry, const struct phantom *phantom, double places[PLACES][2],
+			double ret[PLACES])
+{
+	struct orbit orbit = orbit_of(geometry);
+	size_t columns = (size_t)geometry->columns;
+	int width = orbit.pad[0] + geometry->columns + orbit.pad[1];
+	float *weights = malloc((size_t)geometry->count * columns * sizeof(*weights));
+	float *row = malloc(columns * sizeof(*row));
+	double *filtered = malloc((size_t)width * sizeof(*filtered));
+
+	ck_assert(weights != NULL && row != NULL && filtered != NULL);
+	orbit_column_weights(&orbit, geometry, weights);
+	memset(ret, 0, PLACES * sizeof(*ret));
+	for (int k = 0; k < geometry->count; k++) {
+		phantom_project(phantom, geometry, k, row);
+		filter_row(geometry, k, orbit.pad, weights + (size_t)k * columns, row, filtered);
+		for (int i = 0; i < PLACES; i++)
+			add_view(&geometry->views[k], orbit.pad[0], width, filtered, places[i][0], places[i][1],
+				 &ret[i]);
+	}
+	free(weights);
+	free(row);
+	free(filtered);
+	orbit_clear(&orbit);
+}
+
+static void assert_density_comes_back(const struct geometry *geometry, const char *what, double x, double y)
+{
+	struct phantom phantom = object(x, y);
+	double places[PLACES][2] = {{x - 15, y + 10}, {x + 25, y - 10}, {x - 5, y - 75}};
+	double expected[PLACES] = {0.02, 0.03, 0}, got[PLACES];
+
+	backproject(geometry, &phantom, places, got);
+	/* Ramp filtering without a window at 1 mm: 1 % of the object, as the bins and views leave it. */
+	for (int i = 0; i < PLACES; i++)
+		ck_assert_msg(fabs(got[i] - expected[i]) < 2e-4, "%s: %.6f in place %d, expected %.2f", what, got[i], i,
+			      expected[i]);
+	phantom_clear(&phantom);
+}
+
+START_TEST(filtered_backprojection_gives_the_density_back)
+{
+	static const struct {
+		const char *what;
+		struct sweep sweep;
+		double x, y; /* of the object */
+	} rows[] = {
+	    {"full turn", {251, 1, 1.6, 0, 1, 360, {0, 0}, 0}, 10, -20},
+	    {"clockwise", {251, 1, 1.6, 0, -1, 360, {0, 0}, 0}, 10, -20},
+	    {"two turns", {251, 1, 1.6, 0, 2, 360, {0, 0}, 0}, 10, -20},
+	    {"359 views", {251, 1, 1.6, 0, 1, 359, {0, 0}, 0}, 10, -20},
+	    {"short scan", {251, 1, 1.6, 40, 0.75, 281, {0, 0}, 0}, 10, -20},
+	    {"short scan, clockwise", {251, 1, 1.6, 40, -0.75, 281, {0, 0}, 0}, 10, -20},
+	    {"short scan, offset", {251, 1, 1.6, 40, -0.75, 287, {13, 0}, 0}, 10, -20},
+	    {"overscan", {251, 1, 1.6, 40, 1, 291, {0, 0}, 0}, 10, -20},
+	    {"350 degrees", {251, 1, 1.6, 40, 1, 351, {0, 0}, 0}, 10, -20},
+	    {"small offset", {251, 1, 1.6, 0, 1, 360, {3, 0}, 0}, 10, -20},
+	    {"source offset", {251, 1, 1.6, 0, 1, 360, {0, 0}, 9}, 10, -20},
+	    {"source offset, short scan", {251, 1, 1.6, 0, 1, 216, {-12, 0}, 15}, 10, -20},
+	    {"displaced", {251, 1, 1.6, 0, 0.5, 720, {120, 0}, 0}, 50, -40},
+	    {"displaced the other way", {251, 1, 1.6, 0, 0.5, 720, {-120, 0}, 0}, 50, -40},
+	    {"displaced, clockwise", {251, 1, 1.6, 0, -0.5, 720, {120, 0}, 0}, 50, -40},
+	    {"displaced beyond the axis", {251, 1, 1.6, 0, 0.5, 720, {150, 0}, 0}, 40, -30},
+	};
+
+	for (size_t i = 0; i < sizeof(rows) / sizeof(*rows); i++) {
+		struct geometry geometry = geometry_of(&rows[i].sweep, NULL);
+
+		assert_density_comes_back(&geometry, rows[i].what, rows[i].x, rows[i].y);
+		geometry_clear(&geometry);
+	}
+}
+END_TEST
+
+/* Turns a view's detector about the vertical through its middle. */
+static void turn_detector(const struct geometry *geometry, struct view *view, double angle)
+{
+	double middle = 0.5 * (geometry->columns - 1), x = view->column_step[0], y = view->column_step[1];
+
+	for (int i = 0; i < 2; i++)
+		view->pixel0[i] += middle * view->column_step[i];
+	view->column_step[0] = cos(angle) * x - sin(angle) * y;
+	view->column_step[1] = sin(angle) * x + cos(angle) * y;
+	for (int i = 0; i < 2; i++)
+		view->pixel0[i] -= middle * view->column_step[i];
+}
+
+START_TEST(turned_detectors_and_uneven_steps_give_the_density_back)
+{
+	static const struct sweep sweeps[] = {{251, 1, 1.6, 0, 1, 360, {0, 0}, 0},
+					      {251, 1, 1.6, 40, -0.75, 291, {0, 0}, 0}};
+
+	for (int i = 0; i < 2; i++) {
+		struct geometry geometry = geometry_of(&sweeps[i], NULL);
+
+		for (int k = 0; k < geometry.count; k++)
+			turn_detector(&geometry, &geometry.views[k], 0.3);
+		assert_density_comes_back(&geometry, "turned", 10, -20);
+		geometry_clear(&geometry);
+	}
+	for (int i = 0; i < 2; i++) {
+		struct sweep sweep = sweeps[i];
+		struct geometry geometry = geometry_of(&sweep, NULL);
+
+		/* Steps between a third and five thirds, a slightly wandering detector. */
+		for (int k = 0; k < geometry.count; k++) {
+			struct geometry one;
+
+			sweep = sweeps[i];
+			sweep.first += sweep.step * (k + sin(0.7 * k));
+			sweep.detector_offset[0] = 2 * sin(0.05 * k);
+			sweep.views = 1;
+			one = geometry_of(&sweep, NULL);
+			geometry.views[k] = one.views[0];
+			geometry_clear(&one);
+		}
+		assert_density_comes_back(&geometry, "uneven", 10, -20);
+		geometry_clear(&geometry);
+	}
+}
+END_TEST
+
+/* ---- the grid for who gives none ---- */
+
+START_TEST(a_default_grid_covers_what_is_seen_and_no_more)
+{
+	static const struct {
+		struct sweep sweep;
+		int most;
+		int size[3];
+		double spacing;
+	} rows[] = {
+	    /* 2 * 620 * sin(atan(223.6 / 1100)) = 247.0 mm across, 252.0 mm high, pixels of 0.451 mm */
+	    {{559, 559, 0.8, 0, 3.6, 100, {0, 0}, 0}, 1024, {548, 548, 559}, 0.8 * 620 / 1100},
+	    {{559, 559, 0.8, 0, 3.6, 100, {0, 0}, 0}, 256, {251, 251, 256}, 559 * 0.8 * 620 / 1100 / 256},
+	    {{559, 101, 0.8, 0, 3.6, 100, {0, 0}, 0}, 1024, {548, 548, 101}, 0.8 * 620 / 1100},
+	    {{559, 1, 0.8, 0, 3.6, 100, {0, 0}, 0}, 1024, {548, 548, 1}, 0.8 * 620 / 1100},
+	    {{559, 1, 0.8, 0, 3.6, 100, {0, 0}, 0}, 128, {128, 128, 1}, 247.007 / 128},
+	    {{1, 1, 0.8, 0, 3.6, 100, {0, 0}, 0}, 128, {1, 1, 1}, 0.8 * 620 / 1100},
+	    /* The rows are 80 mm up: as far down as up is covered. */
+	    {{559, 101, 0.8, 0, 3.6, 100, {0, 80}, 0}, 1024, {548, 548, 301}, 0.8 * 620 / 1100},
+	};
+
+	for (size_t i = 0; i < sizeof(rows) / sizeof(*rows); i++) {
+		struct geometry geometry = geometry_of(&rows[i].sweep, NULL);
+		struct orbit orbit = orbit_of(&geometry);
+		struct grid grid;
+		struct error err = {0};
+
+		orbit_default_grid(&orbit, &geometry, rows[i].most, &grid);
+		for (int axis = 0; axis < 3; axis++) {
+			ck_assert_msg(grid.size[axis] == rows[i].size[axis], "row %zu: axis %d has %d voxels", i, axis,
+				      grid.size[axis]);
+			ck_assert_double_eq_tol(grid.spacing[axis], rows[i].spacing, 1e-5);
+			ck_assert_double_eq_tol(grid.origin[axis], -0.5 * (grid.size[axis] - 1) * grid.spacing[axis],
+						1e-9);
+		}
+		ck_assert_int_eq(grid_check(&grid, &err), 0);
+		ck_assert_int_eq(grid_check_geometry(&grid, &geometry, &err), 0);
+		orbit_clear(&orbit);
+		geometry_clear(&geometry);
+	}
+}
+END_TEST
+
+START_TEST(a_default_grid_exists_for_any_orbit)
+{
+	static const struct sweep sweeps[] = {
+	    {64, 64, 0.8, 0, 3.6, 1, {0, 0}, 0},
+	    {64, 64, 0.8, 0, 1, 220, {400, 0}, 0}, /* the axis is out of sight */
+	    {64, 64, 100, 0, 3.6, 100, {0, 0}, 0}, /* a fan of 142 degrees */
+	    {64, 64, 0.8, 0, 3.6, 100, {0, 5000}, 0},
+	    {2, 500, 0.8, 0, 3.6, 100, {0, 0}, 0},
+	};
+
+	for (size_t i = 0; i < sizeof(sweeps) / sizeof(*sweeps); i++) {
+		struct geometry geometry = geometry_of(&sweeps[i], NULL);
+		struct orbit orbit = orbit_of(&geometry);
+		struct grid grid;
+		struct error err = {0};
+
+		orbit_default_grid(&orbit, &geometry, 256, &grid);
+		ck_assert_msg(grid_check(&grid, &err) == 0 && grid_check_geometry(&grid, &geometry, &err) == 0,
+			      "sweep %zu: %s", i, err.text);
+		for (int axis = 0; axis < 3; axis++)
+			ck_assert_int_le(grid.size[axis], 256);
+		orbit_clear(&orbit);
+		geometry_clear(&geometry);
+	}
+}
+END_TEST
+
+Suite *orbit_suite(void);
+Suite *orbit_suite(void)
+{
+	Suite *suite = suite_create("orbit");
+	TCase *facts = tcase_create("facts"), *weights = tcase_create("weights"), *grids = tcase_create("grid");
+
+	tcase_add_test(facts, arcs_are_read_off_the_sources);
+	tcase_add_test(facts, angular_weights_are_half_the_gaps_to_both_neighbours);
+	tcase_add_test(facts, the_order_of_the_views_does_not_matter);
+	tcase_add_test(facts, a_circular_orbit_has_its_textbook_numbers);
+	tcase_add_test(facts, only_a_clear_displacement_on_a_full_turn_counts);
+	tcase_add_test(facts, the_field_of_view_is_what_all_views_see);
+	tcase_add_test(facts, a_displaced_detector_widens_the_field_of_view);
+	tcase_add_test(facts, a_real_c_arm_s_orbit_is_a_short_scan);
+	suite_add_tcase(suite, facts);
+	tcase_add_test(weights, conjugate_rays_sum_to_two);
+	tcase_add_test(weights, filtered_backprojection_gives_the_density_back);
+	tcase_add_test(weights, turned_detectors_and_uneven_steps_give_the_density_back);
+	/* Sanitizers are slow. */
+	tcase_set_timeout(weights, 120);
+	tcase_set_timeout(facts, 60);
+	suite_add_tcase(suite, weights);
+	tcase_add_test(grids, a_default_grid_covers_what_is_seen_and_no_more);
+	tcase_add_test(grids, a_default_grid_exists_for_any_orbit);
+	suite_add_tcase(suite, grids);
+	return suite;
+}
