@@ -28,7 +28,7 @@ static void read_size(struct json_reader *reader, int ret_size[3])
 		return;
 	json_numbers(reader, "size", true, 3, -1e100, 1e100, size);
 	for (int i = 0; i < 3 && reader->code == 0; i++) {
-		char place[16];
+		char place[24];
 
 		snprintf(place, sizeof(place), "size/%d", i);
 		if (size[i] != rint(size[i]))
