@@ -282,7 +282,8 @@ void phantom_project(const struct phantom *phantom, const struct geometry *geome
 	const struct view *view = &geometry->views[view_index];
 	int columns = geometry->columns;
 
-#pragma omp parallel for schedule(dynamic, 4)
+/* Threads for a row or two would wait for each other longer than they work. */
+#pragma omp parallel for schedule(dynamic, 4) if (geometry->rows >= 8)
 	for (int row = 0; row < geometry->rows; row++) {
 		float *line = ret_projection + (size_t)row * (size_t)columns;
 

@@ -11,8 +11,8 @@
 #include <string.h>
 
 #define SUITES(row)                                                                                                    \
-	row(geometry) row(orbit) row(filter) row(phantom) row(recon) row(study) row(backend) row(json) row(scan)       \
-	    row(recipe) row(format) row(spool) row(message)
+	row(error) row(geometry) row(orbit) row(filter) row(phantom) row(recon) row(study) row(backend) row(json)      \
+	    row(scan) row(recipe) row(format) row(spool) row(message)
 
 /* Weak: a row may stand here before its file does. What is missing is said aloud. */
 #define DECLARE(name) Suite *name##_suite(void) __attribute__((weak));
