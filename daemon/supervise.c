@@ -1,0 +1,846 @@
+/*
+ * Workers: supervise.h.
+ *
+ * One thread, one poll over the workers' sockets, their pidfds and an eventfd
+ * that everybody may write. A turn of the loop: look at the clock, move what can
+ * be moved (waiting jobs, cancels, preemption, idle workers), sleep, read.
+ * Everything of a worker belongs to that thread; the copies that others read are
+ * under supervise->lock.
+ */
+#include "daemon/supervise.h"
+
+#include <errno.h>
+#include <poll.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/eventfd.h>
+#include <time.h>
+#include <unistd.h>
+
+#include "daemon/files.h"
+#include "daemon/log.h"
+#include "daemon/spawn.h"
+#include "proto/message.h"
+
+enum {
+	WORKERS_MAX = 64,
+	CRASHES_MAX = 3, /* workers that may die with one job */
+};
+static const double RESTART_FIRST = 0.1, RESTART_LAST = 30; /* s between a death and the next start */
+static const double STEADY = 60;                            /* s of life after which earlier deaths are forgotten */
+static const double RETRY = 1;                              /* s until a change that the disk refused is tried again */
+static const double EXIT = 2;                               /* s that a worker has to exit by itself */
+static const double NEVER = 1e300;
+
+const char *const worker_state_names[WORKER_STATE_COUNT] = {"absent", "starting", "idle", "busy", "ending"};
+
+/* What is to become of a worker's job; kept until the catalogue has taken it. */
+struct ending {
+	bool due;
+	enum job_state to;
+	int error_code;
+	char error_text[320];
+	int checkpoint;
+	bool crashed;
+	double again; /* monotonic: not before */
+};
+
+struct worker {
+	int index;
+	enum worker_state state;
+	struct child child;
+	double born, start_at; /* monotonic: of this process; of the next one */
+	double deadline;       /* monotonic: killed then; NEVER */
+	unsigned failures;     /* in a row */
+	unsigned starts;
+	char backend[16];
+	struct device_info info; /* of the last hello */
+	char last_error[160];
+
+	struct job *job; /* reference; NULL: none */
+	struct queue_running running;
+	int checkpoint; /* that it began from */
+	bool cancelling, yielding;
+	int failure_code; /* why we told it to stop, 0: we did not */
+	char failure_text[320];
+	struct ending ending;
+};
+
+struct supervise {
+	struct jobs *jobs; /* constant, as the next four */
+	char worker[1024], backend[16];
+	struct supervise_options options;
+	int count;
+	int wake; /* eventfd */
+	struct watch jobs_watch, ready_watch;
+	pthread_t thread;
+
+	struct worker workers[WORKERS_MAX]; /* the thread's own */
+	double dispatch_at;                 /* monotonic; the thread's own */
+
+	pthread_mutex_t lock; /* guards what follows */
+	struct worker_facts facts[WORKERS_MAX];
+	bool stop;
+};
+
+static double now_monotonic(void)
+{
+	struct timespec now;
+
+	clock_gettime(CLOCK_MONOTONIC, &now);
+	return (double)now.tv_sec + (double)now.tv_nsec * 1e-9;
+}
+
+static void wake_up(void *context)
+{
+	struct supervise *supervise = context;
+	const uint64_t one = 1;
+
+	/* Full means that it is awake already. */
+	if (write(supervise->wake, &one, sizeof(one)) < 0)
+		return;
+}
+
+/* What others see of a worker. */
+static void publish(struct supervise *supervise, const struct worker *worker)
+{
+	struct worker_facts facts = {.index = worker->index, .state = worker->state, .pid = worker->child.pid};
+	struct job_facts job;
+
+	snprintf(facts.backend, sizeof(facts.backend), "%s", worker->backend);
+	snprintf(facts.device, sizeof(facts.device), "%s", worker->info.name);
+	snprintf(facts.driver, sizeof(facts.driver), "%s", worker->info.driver);
+	snprintf(facts.last_error, sizeof(facts.last_error), "%s", worker->last_error);
+	facts.bytes_total = worker->info.bytes_total;
+	facts.bytes_free = worker->info.bytes_free;
+	facts.restarts = worker->starts > 0 ? worker->starts - 1 : 0;
+	if (worker->job != NULL) {
+		job_facts(worker->job, &job);
+		memcpy(facts.job, job.id, sizeof(facts.job));
+	}
+	pthread_mutex_lock(&supervise->lock);
+	supervise->facts[worker->index] = facts;
+	pthread_mutex_unlock(&supervise->lock);
+}
+
+/* ---- the end of a job ---- */
+
+/* The job's new state reaches the catalogue now, or is tried again: a full disk must not lose how it ended. */
+static void finish(struct supervise *supervise, struct worker *worker)
+{
+	struct ending *ending = &worker->ending;
+	struct job_change change = {.error_code = ending->error_code,
+				    .error_text = ending->error_text,
+				    .checkpoint = ending->checkpoint,
+				    .crashed = ending->crashed,
+				    .reason = ending->to == JOB_QUEUED ? ending->error_text : NULL};
+	struct error err;
+	int code = job_set_state(worker->job, ending->to, &change, &err);
+
+	if (code != 0 && code != ERR_CONFLICT) {
+		ending->again = now_monotonic() + RETRY;
+		log_line(LEVEL_ERROR, "the end of a job cannot be recorded yet: %s", err.text);
+		return;
+	}
+	job_release(worker->job);
+	worker->job = NULL;
+	*ending = (struct ending){0};
+	publish(supervise, worker);
+}
+
+static void end_job(struct supervise *supervise, struct worker *worker, enum job_state to, int error_code,
+		    const char *text, int checkpoint, bool crashed)
+{
+	struct ending *ending = &worker->ending;
+
+	*ending = (struct ending){
+	    .due = true, .to = to, .error_code = error_code, .checkpoint = checkpoint, .crashed = crashed};
+	snprintf(ending->error_text, sizeof(ending->error_text), "%.319s", text);
+	finish(supervise, worker);
+}
+
+/* The worker is lost, and its job with it unless it may try again. */
+static void lose_job(struct supervise *supervise, struct worker *worker, int error_code, const char *how)
+{
+	struct job_record record;
+	char text[320];
+
+	job_record(worker->job, &record);
+	if (record.cancel_asked) {
+		end_job(supervise, worker, JOB_CANCELLED, 0, "", 0, false);
+	} else if (worker->failure_code != 0) {
+		end_job(supervise, worker, JOB_FAILED, worker->failure_code, worker->failure_text, 0, false);
+	} else if (record.crashes + 1 >= CRASHES_MAX) {
+		snprintf(text, sizeof(text), "the worker died with it %d times, last: %.250s", record.crashes + 1, how);
+		end_job(supervise, worker, JOB_FAILED, error_code, text, 0, true);
+	} else {
+		end_job(supervise, worker, JOB_QUEUED, error_code, how, record.checkpoint, true);
+	}
+}
+
+/* The worker said how its job ended. */
+static void job_ended(struct supervise *supervise, struct worker *worker, const struct message *message)
+{
+	struct job_facts facts;
+
+	job_facts(worker->job, &facts);
+	worker->deadline = NEVER;
+	worker->state = WORKER_IDLE;
+	if (message->code == 0) {
+		worker->failures = 0;
+		end_job(supervise, worker, JOB_SUCCEEDED, 0, "", 0, false);
+	} else if (message->code == ERR_DEVICE) {
+		/* It is about to exit: a failed device is good for nothing more in that process. */
+		worker->state = WORKER_ENDING;
+		worker->deadline = now_monotonic() + EXIT;
+		lose_job(supervise, worker, ERR_DEVICE, message->text);
+	} else if (facts.cancel_asked) {
+		end_job(supervise, worker, JOB_CANCELLED, 0, "", 0, false);
+	} else if (worker->failure_code != 0) {
+		end_job(supervise, worker, JOB_FAILED, worker->failure_code, worker->failure_text, 0, false);
+	} else if (message->code == ERR_BUSY) {
+		end_job(supervise, worker, JOB_QUEUED, 0, "it made room", message->iteration, false);
+	} else if (message->code == ERR_INVALID && worker->checkpoint > 0) {
+		end_job(supervise, worker, JOB_QUEUED, 0, "its checkpoint is damaged: from the start", 0, true);
+	} else {
+		end_job(supervise, worker, JOB_FAILED, message->code, message->text, 0, false);
+	}
+	publish(supervise, worker);
+}
+
+/* ---- what workers say ---- */
+
+static void tell(struct worker *worker, enum message_kind kind)
+{
+	struct message message = {.kind = kind};
+	struct job_facts facts;
+	struct error err;
+
+	if (worker->job != NULL) {
+		job_facts(worker->job, &facts);
+		snprintf(message.job, sizeof(message.job), "%s", facts.id);
+	}
+	/* Gone already: its pidfd tells. */
+	if (message_send(worker->child.socket, &message, &err) != 0)
+		log_line(LEVEL_DEBUG, "worker %d: %s", worker->index, err.text);
+}
+
+/* Something of the job could not be kept: then it must not seem to have succeeded. */
+static void stop_job(struct supervise *supervise, struct worker *worker, const struct error *why)
+{
+	if (worker->failure_code != 0)
+		return;
+	log_line(LEVEL_ERROR, "worker %d: its job is stopped: %s", worker->index, why->text);
+	worker->failure_code = why->code;
+	snprintf(worker->failure_text, sizeof(worker->failure_text), "%s", why->text);
+	if (!worker->cancelling) {
+		tell(worker, MESSAGE_CANCEL);
+		worker->cancelling = true;
+		worker->deadline = now_monotonic() + supervise->options.cancel_seconds;
+	}
+}
+
+static void hello(struct supervise *supervise, struct worker *worker, const struct message *message)
+{
+	worker->info = message->info;
+	snprintf(worker->backend, sizeof(worker->backend), "%s", message->backend);
+	worker->last_error[0] = '\0';
+	worker->deadline = NEVER;
+	worker->state = WORKER_IDLE;
+	log_line(LEVEL_INFO, "worker %d (pid %ld): %s, %s, %zu of %zu MiB free", worker->index, (long)worker->child.pid,
+		 worker->backend, worker->info.name, worker->info.bytes_free >> 20, worker->info.bytes_total >> 20);
+	publish(supervise, worker);
+}
+
+static int add_volume(struct worker *worker, const struct message *message, struct error *err)
+{
+	struct volume_record volume = {
+	    .iteration = message->iteration, .grid = message->grid, .bytes = message->bytes, .norms = message->norms};
+	struct timespec now;
+
+	snprintf(volume.name, sizeof(volume.name), "%s", message->name);
+	snprintf(volume.stage, sizeof(volume.stage), "%s", message->volume_stage);
+	memcpy(volume.sha256, message->sha256, sizeof(volume.sha256));
+	clock_gettime(CLOCK_REALTIME, &now);
+	volume.created = (double)now.tv_sec + (double)now.tv_nsec * 1e-9;
+	return job_add_volume(worker->job, &volume, err);
+}
+
+static void on_message(struct supervise *supervise, struct worker *worker, const struct message *message)
+{
+	struct job_facts facts = {0};
+	struct error err;
+	int code = 0;
+
+	if (message->kind == MESSAGE_HELLO) {
+		if (worker->state == WORKER_STARTING)
+			hello(supervise, worker, message);
+		return;
+	}
+	if (worker->job != NULL)
+		job_facts(worker->job, &facts);
+	if (worker->job == NULL || worker->ending.due || strcmp(facts.id, message->job) != 0)
+		return;
+	switch (message->kind) {
+	case MESSAGE_OPENED:
+		job_set_plan(worker->job, &message->memory, message->plan);
+		break;
+	case MESSAGE_PROGRESS:
+		job_progress(worker->job, message->stage, message->iteration, message->fraction);
+		break;
+	case MESSAGE_ROW:
+		code = job_add_row(worker->job, &message->row, &err);
+		break;
+	case MESSAGE_VOLUME:
+		code = add_volume(worker, message, &err);
+		break;
+	case MESSAGE_WARNING:
+		code = job_add_warning(worker->job, message->code_name, message->text, &err);
+		break;
+	case MESSAGE_ENDED:
+		job_ended(supervise, worker, message);
+		break;
+	default:
+		break;
+	}
+	if (code != 0)
+		stop_job(supervise, worker, &err);
+}
+
+/* All that is there to read; *ret_gone at the end of the stream or when it makes no sense. */
+static void read_messages(struct supervise *supervise, struct worker *worker, bool *ret_gone)
+{
+	struct message *message = malloc(sizeof(*message));
+	struct error err;
+	bool got = true;
+	int code = message == NULL ? error_set_errno(&err, ENOMEM, "message") : 0;
+
+	while (code == 0 && got) {
+		code = message_receive(worker->child.socket, 0, message, &got, &err);
+		if (code == 0 && got) {
+			on_message(supervise, worker, message);
+			message_clear(message);
+		}
+	}
+	free(message);
+	*ret_gone = code != 0;
+	if (code != 0 && code != ERR_IO)
+		log_line(LEVEL_ERROR, "worker %d: %s", worker->index, err.text);
+}
+
+/* ---- the life of a worker ---- */
+
+static void start_worker(struct supervise *supervise, struct worker *worker)
+{
+	const struct spawn_options options = {.worker = supervise->worker,
+					      .backend = supervise->backend,
+					      .device = worker->index,
+					      .threads = supervise->options.threads,
+					      .device_memory = supervise->options.device_memory};
+	struct error err;
+	double now = now_monotonic();
+
+	worker->starts++;
+	if (child_spawn(&options, &worker->child, &err) != 0) {
+		worker->failures++;
+		worker->start_at = now + RESTART_LAST;
+		snprintf(worker->last_error, sizeof(worker->last_error), "%.150s", err.text);
+		log_line(LEVEL_ERROR, "worker %d: %s", worker->index, err.text);
+	} else {
+		worker->state = WORKER_STARTING;
+		worker->born = now;
+		worker->deadline = now + supervise->options.hello_seconds;
+	}
+	publish(supervise, worker);
+}
+
+static double restart_delay(unsigned failures)
+{
+	double delay = RESTART_FIRST;
+
+	while (failures-- > 1 && delay < RESTART_LAST)
+		delay *= 2;
+	return delay < RESTART_LAST ? delay : RESTART_LAST;
+}
+
+static void worker_died(struct supervise *supervise, struct worker *worker, bool stopping)
+{
+	char how[128], text[160];
+	double now = now_monotonic();
+	bool gone;
+
+	/* Its last words first: they may say that the job is done. */
+	read_messages(supervise, worker, &gone);
+	child_reap(&worker->child, how, sizeof(how));
+	snprintf(text, sizeof(text), "its worker ended with %s", how);
+	worker->state = WORKER_ABSENT;
+	worker->deadline = NEVER;
+	if (worker->job != NULL && !worker->ending.due) {
+		if (stopping)
+			end_job(supervise, worker, JOB_QUEUED, 0, "the daemon stops", worker->checkpoint, false);
+		else
+			lose_job(supervise, worker, ERR_INTERNAL, text);
+	}
+	if (!stopping) {
+		worker->failures = now - worker->born > STEADY ? 1 : worker->failures + 1;
+		worker->start_at = now + restart_delay(worker->failures);
+		snprintf(worker->last_error, sizeof(worker->last_error), "%s", how);
+		log_line(LEVEL_WARNING, "worker %d ended with %s, the next one starts in %.1f s", worker->index, how,
+			 worker->start_at - now);
+	}
+	publish(supervise, worker);
+}
+
+/* ---- giving work ---- */
+
+static int make_start(struct supervise *supervise, const struct job_record *record, struct message *message,
+		      struct error *err)
+{
+	struct store *store = jobs_store(supervise->jobs);
+	struct stored_scan *scan;
+	int code = store_scan_find(store, record->scan, &scan, err);
+
+	if (code != 0)
+		return code;
+	*message = (struct message){.kind = MESSAGE_START, .iteration = record->checkpoint};
+	snprintf(message->job, sizeof(message->job), "%s", record->id);
+	store_scan_directory(store, record->scan, message->scan_directory);
+	store_job_directory(store, record->id, message->job_directory);
+	code = job_request_parse(record->request, strlen(record->request), &message->request, err);
+	if (code == 0)
+		code = job_request_resolve(&message->request, stored_scan_parsed(scan), err);
+	if (code == 0)
+		code = directory_make(message->job_directory, err);
+	if (code != 0)
+		message_clear(message);
+	stored_scan_release(scan);
+	return code;
+}
+
+static void begin(struct supervise *supervise, struct worker *worker, struct job *job, const struct job_record *record,
+		  const struct message *message)
+{
+	struct error err;
+
+	worker->job = job_reference(job);
+	worker->running = (struct queue_running){.priority = record->priority, .ticket = record->ticket};
+	worker->checkpoint = record->checkpoint;
+	worker->cancelling = worker->yielding = false;
+	worker->failure_code = 0;
+	worker->state = WORKER_BUSY;
+	worker->deadline = NEVER;
+	if (message_send(worker->child.socket, message, &err) != 0) {
+		/* Most likely it has just died; its job comes back when that is seen. */
+		log_line(LEVEL_WARNING, "worker %d: %s", worker->index, err.text);
+		child_kill(&worker->child);
+		worker->state = WORKER_ENDING;
+	}
+	publish(supervise, worker);
+}
+
+/* The queue's first job to this idle worker; a code when no more can be given just now. */
+static int give_job(struct supervise *supervise, struct worker *worker, struct job *job, struct error *err)
+{
+	struct job_change change = {.backend = worker->backend, .device = worker->info.name};
+	struct message *message = calloc(1, sizeof(*message));
+	struct job_record record;
+	struct error why;
+	int code;
+
+	if (message == NULL)
+		return error_set_errno(err, ENOMEM, "message");
+	job_record(job, &record);
+	code = make_start(supervise, &record, message, &why);
+	if (code == ERR_NO_SPACE || code == ERR_NO_MEMORY) {
+		*err = why;
+	} else if (code != 0) {
+		change = (struct job_change){.error_code = code, .error_pointer = why.pointer, .error_text = why.text};
+		code = job_set_state(job, JOB_FAILED, &change, err);
+	} else {
+		code = job_set_state(job, JOB_RUNNING, &change, err);
+		if (code == 0)
+			begin(supervise, worker, job, &record, message);
+		message_clear(message);
+	}
+	free(message);
+	return code == ERR_CONFLICT ? 0 : code; /* cancelled in this very moment */
+}
+
+static void dispatch(struct supervise *supervise)
+{
+	struct error err;
+	int code = 0;
+
+	for (int i = 0; i < supervise->count && code == 0;) {
+		struct worker *worker = &supervise->workers[i];
+		struct job *job = NULL;
+
+		if (worker->state == WORKER_IDLE && worker->job == NULL)
+			job = jobs_next(supervise->jobs);
+		if (job == NULL) {
+			i++;
+			continue;
+		}
+		code = give_job(supervise, worker, job, &err);
+		job_release(job);
+	}
+	if (code != 0) {
+		log_line(LEVEL_ERROR, "no job can be started: %s", err.text);
+		supervise->dispatch_at = now_monotonic() + RETRY;
+	}
+}
+
+static void carry_out_cancels(struct supervise *supervise)
+{
+	struct job_facts facts;
+
+	for (int i = 0; i < supervise->count; i++) {
+		struct worker *worker = &supervise->workers[i];
+
+		if (worker->state != WORKER_BUSY || worker->job == NULL || worker->cancelling)
+			continue;
+		job_facts(worker->job, &facts);
+		if (!facts.cancel_asked)
+			continue;
+		tell(worker, MESSAGE_CANCEL);
+		worker->cancelling = true;
+		worker->deadline = now_monotonic() + supervise->options.cancel_seconds;
+	}
+}
+
+/* Who runs with a lower priority than somebody who waits makes room. */
+static void preempt(struct supervise *supervise)
+{
+	struct queue_running running[WORKERS_MAX];
+	int of[WORKERS_MAX], busy, idle, victim;
+
+	do {
+		busy = idle = 0;
+		for (int i = 0; i < supervise->count; i++) {
+			struct worker *worker = &supervise->workers[i];
+
+			idle += worker->state == WORKER_IDLE && worker->job == NULL;
+			if (worker->state != WORKER_BUSY || worker->job == NULL)
+				continue;
+			running[busy] = worker->running;
+			running[busy].leaving = worker->cancelling || worker->yielding;
+			of[busy++] = i;
+		}
+		victim = jobs_victim(supervise->jobs, running, busy, idle);
+		if (victim >= 0) {
+			tell(&supervise->workers[of[victim]], MESSAGE_YIELD);
+			supervise->workers[of[victim]].yielding = true;
+		}
+	} while (victim >= 0);
+}
+
+/* ---- the loop ---- */
+
+static void look_at_clock(struct supervise *supervise, bool stopping)
+{
+	double now = now_monotonic();
+
+	for (int i = 0; i < supervise->count; i++) {
+		struct worker *worker = &supervise->workers[i];
+
+		if (worker->ending.due && now >= worker->ending.again)
+			finish(supervise, worker);
+		if (worker->state == WORKER_ABSENT && !stopping && now >= worker->start_at)
+			start_worker(supervise, worker);
+		if (worker->state != WORKER_ABSENT && now >= worker->deadline) {
+			log_line(LEVEL_WARNING, "worker %d does not %s: killed", worker->index,
+				 worker->state == WORKER_STARTING ? "start"
+				 : worker->cancelling             ? "cancel"
+								  : "end");
+			child_kill(&worker->child);
+			worker->state = WORKER_ENDING;
+			worker->deadline = NEVER;
+		}
+	}
+}
+
+static int poll_timeout(const struct supervise *supervise, bool stopping)
+{
+	double next = NEVER, left;
+
+	for (int i = 0; i < supervise->count; i++) {
+		const struct worker *worker = &supervise->workers[i];
+
+		if (worker->ending.due && worker->ending.again < next)
+			next = worker->ending.again;
+		if (worker->state == WORKER_ABSENT && !stopping && worker->start_at < next)
+			next = worker->start_at;
+		if (worker->state != WORKER_ABSENT && worker->deadline < next)
+			next = worker->deadline;
+	}
+	if (!stopping && supervise->dispatch_at > 0 && supervise->dispatch_at < next)
+		next = supervise->dispatch_at;
+	if (next == NEVER)
+		return -1;
+	left = (next - now_monotonic()) * 1000;
+	return left <= 0 ? 0 : left > 60000 ? 60000 : (int)left + 1;
+}
+
+static void move_jobs(struct supervise *supervise)
+{
+	struct error err;
+
+	if (supervise->dispatch_at > now_monotonic())
+		return;
+	supervise->dispatch_at = 0;
+	if (jobs_promote(supervise->jobs, &err) != 0) {
+		log_line(LEVEL_ERROR, "no job can be queued: %s", err.text);
+		supervise->dispatch_at = now_monotonic() + RETRY;
+		return;
+	}
+	dispatch(supervise);
+	preempt(supervise);
+}
+
+static void read_workers(struct supervise *supervise, const struct pollfd *fds, bool stopping)
+{
+	for (int i = 0; i < supervise->count; i++) {
+		struct worker *worker = &supervise->workers[i];
+		bool gone = false;
+
+		if (worker->state == WORKER_ABSENT)
+			continue;
+		if (fds[2 * i].revents != 0)
+			read_messages(supervise, worker, &gone);
+		if (fds[2 * i + 1].revents != 0) {
+			worker_died(supervise, worker, stopping);
+		} else if (gone && worker->state != WORKER_ENDING) {
+			/* It closed its socket or speaks nonsense, but lives. */
+			worker->state = WORKER_ENDING;
+			worker->deadline = now_monotonic() + EXIT;
+			publish(supervise, worker);
+		}
+	}
+}
+
+/* Sleeps until something happens, and reads it. */
+static void wait_and_read(struct supervise *supervise, bool stopping)
+{
+	struct pollfd fds[2 * WORKERS_MAX + 1];
+	int count = supervise->count;
+	uint64_t ignored;
+
+	for (int i = 0; i < count; i++) {
+		const struct worker *worker = &supervise->workers[i];
+		bool there = worker->state != WORKER_ABSENT;
+
+		/* A closed socket is always readable: once it is known to end, its pidfd is enough. */
+		fds[2 * i] = (struct pollfd){.fd = there && worker->state != WORKER_ENDING ? worker->child.socket : -1,
+					     .events = POLLIN};
+		fds[2 * i + 1] = (struct pollfd){.fd = there ? worker->child.pidfd : -1, .events = POLLIN};
+	}
+	fds[2 * count] = (struct pollfd){.fd = supervise->wake, .events = POLLIN};
+	if (poll(fds, (nfds_t)(2 * count + 1), poll_timeout(supervise, stopping)) < 0)
+		return;
+	/* Empty is fine: awake is awake. */
+	if (fds[2 * count].revents != 0 && read(supervise->wake, &ignored, sizeof(ignored)) < 0)
+		log_line(LEVEL_DEBUG, "eventfd: %s", strerror(errno));
+	read_workers(supervise, fds, stopping);
+}
+
+static void quit_workers(struct supervise *supervise)
+{
+	for (int i = 0; i < supervise->count; i++) {
+		struct worker *worker = &supervise->workers[i];
+
+		if (worker->state == WORKER_ABSENT)
+			continue;
+		tell(worker, MESSAGE_QUIT);
+		if (worker->deadline == NEVER || worker->state == WORKER_STARTING)
+			worker->deadline = now_monotonic() + supervise->options.stop_seconds;
+	}
+}
+
+static bool all_absent(const struct supervise *supervise)
+{
+	for (int i = 0; i < supervise->count; i++) {
+		if (supervise->workers[i].state != WORKER_ABSENT)
+			return false;
+	}
+	return true;
+}
+
+static bool stop_asked(struct supervise *supervise)
+{
+	bool stop;
+
+	pthread_mutex_lock(&supervise->lock);
+	stop = supervise->stop;
+	pthread_mutex_unlock(&supervise->lock);
+	return stop;
+}
+
+static void *supervise_loop(void *context)
+{
+	struct supervise *supervise = context;
+
+	while (!stop_asked(supervise)) {
+		look_at_clock(supervise, false);
+		carry_out_cancels(supervise);
+		move_jobs(supervise);
+		wait_and_read(supervise, false);
+	}
+	quit_workers(supervise);
+	while (!all_absent(supervise)) {
+		look_at_clock(supervise, true);
+		wait_and_read(supervise, true);
+	}
+	/* What the catalogue would not take stays `running` there; the next start queues it again. */
+	for (int i = 0; i < supervise->count; i++) {
+		job_release(supervise->workers[i].job);
+		supervise->workers[i].job = NULL;
+	}
+	return NULL;
+}
+
+/* ---- from other threads ---- */
+
+static void set_options(struct supervise *supervise, const struct supervise_options *options)
+{
+	if (options->worker != NULL && options->worker[0] != '\0')
+		snprintf(supervise->worker, sizeof(supervise->worker), "%s", options->worker);
+	else
+		worker_path(supervise->worker, sizeof(supervise->worker));
+	snprintf(supervise->backend, sizeof(supervise->backend), "%s", options->backend);
+	supervise->options = *options;
+	supervise->options.worker = supervise->worker;
+	supervise->options.backend = supervise->backend;
+	if (options->hello_seconds <= 0)
+		supervise->options.hello_seconds = 30;
+	if (options->cancel_seconds <= 0)
+		supervise->options.cancel_seconds = 10;
+	if (options->stop_seconds <= 0)
+		supervise->options.stop_seconds = 20;
+	supervise->count = options->workers < 1 ? 1 : options->workers > WORKERS_MAX ? WORKERS_MAX : options->workers;
+}
+
+int supervise_start(struct jobs *jobs, const struct supervise_options *options, struct supervise **ret_supervise,
+		    struct error *err)
+{
+	struct supervise *supervise = calloc(1, sizeof(*supervise));
+	int result;
+
+	if (supervise == NULL)
+		return error_set_errno(err, ENOMEM, "supervisor");
+	supervise->jobs = jobs;
+	set_options(supervise, options);
+	for (int i = 0; i < supervise->count; i++) {
+		supervise->workers[i] =
+		    (struct worker){.index = i, .child = {.pidfd = -1, .socket = -1}, .deadline = NEVER};
+		supervise->facts[i].index = i;
+	}
+	pthread_mutex_init(&supervise->lock, NULL);
+	supervise->wake = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
+	if (supervise->wake < 0) {
+		result = errno;
+		goto out;
+	}
+	supervise->jobs_watch = (struct watch){.wake = wake_up, .context = supervise};
+	supervise->ready_watch = supervise->jobs_watch;
+	jobs_watch(jobs, &supervise->jobs_watch);
+	store_watch_ready(jobs_store(jobs), &supervise->ready_watch);
+	result = pthread_create(&supervise->thread, NULL, supervise_loop, supervise);
+	if (result == 0) {
+		*ret_supervise = supervise;
+		return 0;
+	}
+	store_unwatch_ready(jobs_store(jobs), &supervise->ready_watch);
+	jobs_unwatch(jobs, &supervise->jobs_watch);
+	close(supervise->wake);
+out:
+	pthread_mutex_destroy(&supervise->lock);
+	free(supervise);
+	return error_set_errno(err, result, "supervisor");
+}
+
+void supervise_stop(struct supervise *supervise)
+{
+	if (supervise == NULL)
+		return;
+	pthread_mutex_lock(&supervise->lock);
+	supervise->stop = true;
+	pthread_mutex_unlock(&supervise->lock);
+	wake_up(supervise);
+	pthread_join(supervise->thread, NULL);
+	store_unwatch_ready(jobs_store(supervise->jobs), &supervise->ready_watch);
+	jobs_unwatch(supervise->jobs, &supervise->jobs_watch);
+	close(supervise->wake);
+	pthread_mutex_destroy(&supervise->lock);
+	free(supervise);
+}
+
+bool supervise_ready(struct supervise *supervise)
+{
+	bool ready = false;
+
+	pthread_mutex_lock(&supervise->lock);
+	for (int i = 0; i < supervise->count; i++)
+		ready |= supervise->facts[i].state == WORKER_IDLE || supervise->facts[i].state == WORKER_BUSY;
+	pthread_mutex_unlock(&supervise->lock);
+	return ready;
+}
+
+int supervise_workers(struct supervise *supervise, struct worker_facts *ret_facts, int most)
+{
+	int count = supervise->count < most ? supervise->count : most;
+
+	pthread_mutex_lock(&supervise->lock);
+	memcpy(ret_facts, supervise->facts, (size_t)count * sizeof(*ret_facts));
+	pthread_mutex_unlock(&supervise->lock);
+	return supervise->count;
+}
+
+/*
+ * The daemon has no CUDA to ask, so for a card it takes what no recipe can do
+ * without: the projections as floats, the iterate and its copy.
+ */
+static int memory_needed(const char *backend, const struct scan *scan, const struct recipe *recipe,
+			 struct recon_memory *ret_memory, struct error *err)
+{
+	const struct backend *row = backend_find(backend);
+	const struct geometry *geometry = &scan->geometry;
+
+	if (row != NULL)
+		return recon_memory(row, NULL, geometry, recipe, ret_memory, err);
+	*ret_memory = (struct recon_memory){.projections = (size_t)geometry->columns * (size_t)geometry->rows *
+							   (size_t)geometry->count * sizeof(float),
+					    .volumes = 2 * grid_voxels(&recipe->grid) * sizeof(float)};
+	ret_memory->total = ret_memory->projections + ret_memory->volumes;
+	return 0;
+}
+
+int supervise_check_memory(struct supervise *supervise, const struct scan *scan, const struct recipe *recipe,
+			   struct recon_memory *ret_memory, struct error *err)
+{
+	struct worker_facts facts[WORKERS_MAX];
+	struct recon_memory memory, best = {0};
+	size_t most = 0;
+	int count = supervise_workers(supervise, facts, WORKERS_MAX), code;
+
+	for (int i = 0; i < count; i++) {
+		if (facts[i].bytes_free == 0)
+			continue; /* has not said yet */
+		code = memory_needed(facts[i].backend, scan, recipe, &memory, err);
+		if (code != 0)
+			return code;
+		memory.available = facts[i].bytes_free;
+		if (memory.total <= memory.available) {
+			*ret_memory = memory;
+			return 0;
+		}
+		if (memory.available > most) {
+			most = memory.available;
+			best = memory;
+		}
+	}
+	if (most > 0)
+		return error_set_at(err, ERR_IMPOSSIBLE, "/grid/size",
+				    "the job needs %zu bytes of memory, and %zu are available", best.total, most);
+	return memory_needed("cpu", scan, recipe, ret_memory, err);
+}

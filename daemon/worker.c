@@ -1,0 +1,364 @@
+/*
+ * cbct-worker: one process for one device, in the daemon's service.
+ *
+ * It says hello, then takes one job at a time from the socket and runs it in
+ * its only thread (the backends bring their own). While a job runs, the socket
+ * is looked at whenever the pipeline asks whether to go on, which it does
+ * between steps; so cancel and yield need no second thread. It dies with the
+ * daemon, and it may die alone: everything that it has finished is on the disk.
+ */
+#include <errno.h>
+#include <getopt.h>
+#include <signal.h>
+#include <stdbool.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/prctl.h>
+#include <time.h>
+#include <unistd.h>
+
+#include "proto/message.h"
+
+enum { EXIT_START = 1, EXIT_USAGE = 2, EXIT_DEVICE = 3 };
+
+/* The daemon and the desktop go before it, and it goes first when memory is short. */
+enum { NICENESS = 5, OOM_SCORE = 500 };
+
+static const double PROGRESS_LEAST = 0.1; /* s between two reports of mere progress */
+static const double CHANGE_LEAST = 0.005; /* s between two reports of a new stage or iteration */
+
+struct arguments {
+	const char *backend;
+	int device, socket;
+	struct device_options options;
+};
+
+struct worker {
+	int socket;
+	const struct backend *backend;
+	struct device *device;
+
+	char job[64]; /* that runs */
+	bool cancel, yield, quit;
+	int iteration; /* done */
+	double reported;
+	enum stage stage;
+	int stage_iteration;
+};
+
+/* SIGTERM: as MESSAGE_QUIT while a job runs, the end at once otherwise. */
+static volatile sig_atomic_t terminated, working;
+
+static void on_terminate(int number)
+{
+	(void)number;
+	if (!working)
+		_exit(0);
+	terminated = 1;
+}
+
+static double now_monotonic(void)
+{
+	struct timespec now;
+
+	clock_gettime(CLOCK_MONOTONIC, &now);
+	return (double)now.tv_sec + (double)now.tv_nsec * 1e-9;
+}
+
+static void say(const struct error *err)
+{
+	fprintf(stderr, "cbct-worker: %s\n", err->text);
+}
+
+/* A daemon that is gone wants nothing any more: the job ends as if cancelled. */
+static int report(struct worker *worker, struct message *message)
+{
+	struct error err;
+	int code;
+
+	snprintf(message->job, sizeof(message->job), "%s", worker->job);
+	code = message_send(worker->socket, message, &err);
+	if (code != 0) {
+		say(&err);
+		worker->cancel = worker->quit = true;
+	}
+	return code;
+}
+
+static void obey(struct worker *worker, const struct message *message)
+{
+	bool mine = strcmp(message->job, worker->job) == 0;
+
+	worker->cancel |= message->kind == MESSAGE_CANCEL && mine;
+	worker->yield |= message->kind == MESSAGE_YIELD && mine;
+	worker->quit |= message->kind == MESSAGE_QUIT;
+}
+
+static void look_at_socket(struct worker *worker)
+{
+	struct message message;
+	struct error err;
+	bool got = true;
+
+	while (got && !worker->cancel) {
+		if (message_receive(worker->socket, 0, &message, &got, &err) != 0) {
+			worker->cancel = worker->quit = true;
+			return;
+		}
+		if (got) {
+			obey(worker, &message);
+			message_clear(&message);
+		}
+	}
+}
+
+/* ---- what the pipeline asks and tells ---- */
+
+static bool on_cancelled(void *context)
+{
+	struct worker *worker = context;
+
+	look_at_socket(worker);
+	return worker->cancel;
+}
+
+static bool on_yield(void *context)
+{
+	struct worker *worker = context;
+
+	look_at_socket(worker);
+	return worker->yield || worker->quit || terminated;
+}
+
+static void on_progress(void *context, enum stage stage, int iteration, double fraction)
+{
+	struct worker *worker = context;
+	struct message message = {
+	    .kind = MESSAGE_PROGRESS, .stage = stage, .iteration = iteration, .fraction = fraction};
+	bool changed = stage != worker->stage || iteration != worker->stage_iteration;
+	double now = now_monotonic();
+
+	if (now - worker->reported < (changed ? CHANGE_LEAST : PROGRESS_LEAST))
+		return;
+	worker->reported = now;
+	worker->stage = stage;
+	worker->stage_iteration = iteration;
+	report(worker, &message);
+}
+
+static void on_row(void *context, const struct history_row *row)
+{
+	struct worker *worker = context;
+	struct message message = {.kind = MESSAGE_ROW, .row = *row};
+
+	worker->iteration = row->iteration;
+	report(worker, &message);
+}
+
+static void on_warning(void *context, const char *code, const char *detail)
+{
+	struct message message = {.kind = MESSAGE_WARNING};
+
+	snprintf(message.code_name, sizeof(message.code_name), "%s", code);
+	snprintf(message.text, sizeof(message.text), "%s", detail);
+	report(context, &message);
+}
+
+static void on_open(void *context, const struct recon_memory *memory, const char *plan)
+{
+	struct message message = {.kind = MESSAGE_OPENED, .memory = *memory};
+
+	snprintf(message.plan, sizeof(message.plan), "%s", plan);
+	report(context, &message);
+}
+
+static int on_volume(void *context, const struct kept_volume *volume, const struct saved_volume *saved,
+		     struct error *err)
+{
+	struct message message = {.kind = MESSAGE_VOLUME,
+				  .iteration = volume->iteration,
+				  .grid = *volume->grid,
+				  .norms = volume->norms,
+				  .bytes = saved->bytes};
+
+	snprintf(message.name, sizeof(message.name), "%s", volume->name);
+	snprintf(message.volume_stage, sizeof(message.volume_stage), "%s", volume->stage);
+	memcpy(message.sha256, saved->sha256, sizeof(message.sha256));
+	return report(context, &message) == 0 ? 0 : error_set(err, ERR_CANCELLED, "the daemon is gone");
+}
+
+/* ---- jobs ---- */
+
+static int run_job(struct worker *worker, const struct message *start, struct error *err)
+{
+	const struct spool_hooks hooks = {.recon = {.context = worker,
+						    .cancelled = on_cancelled,
+						    .yield = on_yield,
+						    .progress = on_progress,
+						    .row = on_row,
+						    .warning = on_warning},
+					  .on_volume = on_volume,
+					  .on_open = on_open};
+	char checkpoint[1100];
+
+	snprintf(checkpoint, sizeof(checkpoint), "%s/%s", start->job_directory, SPOOL_CHECKPOINT);
+	return spool_run(worker->backend, worker->device, start->scan_directory, &start->request.recipe,
+			 start->job_directory, start->iteration > 0 ? checkpoint : NULL, start->iteration, &hooks, err);
+}
+
+/* Returns the exit status, or negative to go on. */
+static int serve_job(struct worker *worker, const struct message *start)
+{
+	struct message ended = {.kind = MESSAGE_ENDED};
+	struct error err = {0};
+
+	snprintf(worker->job, sizeof(worker->job), "%s", start->job);
+	worker->cancel = worker->yield = false;
+	worker->iteration = start->iteration;
+	worker->reported = 0;
+	working = 1;
+	ended.code = run_job(worker, start, &err);
+	ended.iteration = worker->iteration;
+	if (ended.code != 0)
+		snprintf(ended.text, sizeof(ended.text), "%s", err.text);
+	report(worker, &ended);
+	worker->job[0] = '\0';
+	working = 0;
+	if (ended.code == ERR_DEVICE) {
+		say(&err);
+		return EXIT_DEVICE;
+	}
+	return worker->quit || terminated ? 0 : -1;
+}
+
+static int serve(struct worker *worker)
+{
+	struct message message;
+	struct error err;
+	bool got;
+	int status = -1;
+
+	while (status < 0) {
+		/* The end of the stream is the daemon's end. */
+		if (message_receive(worker->socket, -1, &message, &got, &err) != 0)
+			return 0;
+		if (!got)
+			continue;
+		if (message.kind == MESSAGE_START)
+			status = serve_job(worker, &message);
+		else if (message.kind == MESSAGE_QUIT)
+			status = 0;
+		message_clear(&message);
+	}
+	return status;
+}
+
+/* ---- the start ---- */
+
+static void lower_priority(void)
+{
+	char text[16];
+	FILE *file = fopen("/proc/self/oom_score_adj", "we");
+
+	/* Good manners, not conditions: where they are not allowed it works all the same. */
+	if (file != NULL) {
+		snprintf(text, sizeof(text), "%d", OOM_SCORE);
+		fputs(text, file);
+		fclose(file);
+	}
+	errno = 0;
+	if (nice(NICENESS) == -1 && errno != 0)
+		perror("cbct-worker: nice");
+}
+
+static int open_device(struct worker *worker, const struct arguments *arguments, struct error *err)
+{
+	struct message hello = {.kind = MESSAGE_HELLO};
+	int code;
+
+	worker->backend = backend_find(arguments->backend);
+	if (worker->backend == NULL)
+		return error_set(err, ERR_NOT_FOUND, "there is no backend \"%s\" here", arguments->backend);
+	code = worker->backend->open(arguments->device, &arguments->options, &worker->device, err);
+	if (code != 0)
+		return code;
+	worker->backend->describe(worker->device, &hello.info);
+	snprintf(hello.backend, sizeof(hello.backend), "%s", worker->backend->name);
+	return message_send(worker->socket, &hello, err);
+}
+
+static int usage(void)
+{
+	fputs("cbct-worker is started by cbctd:\n"
+	      "  --backend auto|cuda|cpu  --device N  --threads N  --device-memory BYTES  --socket DESCRIPTOR\n",
+	      stderr);
+	return EXIT_USAGE;
+}
+
+static bool read_number(const char *text, unsigned long long most, unsigned long long *ret)
+{
+	char *end;
+	unsigned long long value;
+
+	errno = 0;
+	value = strtoull(text, &end, 10);
+	if (errno != 0 || end == text || *end != '\0' || value > most)
+		return false;
+	*ret = value;
+	return true;
+}
+
+static bool read_arguments(int argc, char **argv, struct arguments *ret)
+{
+	static const struct option options[] = {
+	    {"backend", required_argument, NULL, 'b'}, {"device", required_argument, NULL, 'd'},
+	    {"threads", required_argument, NULL, 't'}, {"device-memory", required_argument, NULL, 'm'},
+	    {"socket", required_argument, NULL, 's'},  {0}};
+	unsigned long long value = 0;
+	int option;
+
+	*ret = (struct arguments){.backend = "auto", .socket = 3};
+	while ((option = getopt_long(argc, argv, "", options, NULL)) != -1) {
+		if (option == '?' ||
+		    (option != 'b' && !read_number(optarg, option == 'm' ? 1ull << 60 : 65535, &value)))
+			return false;
+		if (option == 'b')
+			ret->backend = optarg;
+		else if (option == 'd')
+			ret->device = (int)value;
+		else if (option == 't')
+			ret->options.threads = (int)value;
+		else if (option == 'm')
+			ret->options.memory_limit = (size_t)value;
+		else
+			ret->socket = (int)value;
+	}
+	return optind == argc;
+}
+
+int main(int argc, char **argv)
+{
+	struct sigaction terminate = {.sa_handler = on_terminate};
+	struct worker worker = {0};
+	struct arguments arguments;
+	struct error err;
+	int status;
+
+	if (!read_arguments(argc, argv, &arguments))
+		return usage();
+	/* Two workers must never write one job's files: this one ends when its daemon does, however that ends. */
+	prctl(PR_SET_PDEATHSIG, SIGKILL);
+	sigaction(SIGTERM, &terminate, NULL);
+	lower_priority();
+	worker.socket = arguments.socket;
+	if (open_device(&worker, &arguments, &err) != 0) {
+		say(&err);
+		status = EXIT_START;
+	} else {
+		status = serve(&worker);
+	}
+	if (worker.device != NULL)
+		worker.backend->close(worker.device);
+	return status;
+}
