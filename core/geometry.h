@@ -43,16 +43,16 @@ enum { VIEWS_MAX = 20000, DETECTOR_MAX = 16384 };
  * Errors point into the geometry's JSON ("/matrices/3").
  */
 int geometry_circular(struct geometry *ret_geometry, int columns, int rows, int count, const struct circular *orbit,
-                      const double *angles /* [count], radians */, struct error *err);
+		      const double *angles /* [count], radians */, struct error *err);
 /*
  * P = [M | p4] takes (x, y, z, 1) in mm to w (column, row, 1), any scale and
  * sign. S = -M^-1 p4; the columns of M^-1 are t (u, v, D - S), with t fixed by
  * |u| = pixel_mm[0].
  */
 int geometry_matrices(struct geometry *ret_geometry, int columns, int rows, int count,
-                      const double *matrices /* [count][12] */, const double pixel_mm[2], struct error *err);
+		      const double *matrices /* [count][12] */, const double pixel_mm[2], struct error *err);
 int geometry_views(struct geometry *ret_geometry, int columns, int rows, int count, const struct view *views,
-                   struct error *err);
+		   struct error *err);
 int geometry_copy(struct geometry *ret_geometry, const struct geometry *geometry, struct error *err);
 void geometry_clear(struct geometry *geometry);
 

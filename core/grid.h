@@ -23,7 +23,8 @@ static inline size_t grid_voxels(const struct grid *grid)
 /* Centred on the isocentre. */
 void grid_centre(struct grid *grid);
 
-/* Sizes 1..GRID_SIZE_MAX, spacing positive, all finite. Pointers relative to the grid ("/size/0", "/spacing_mm/1", "/origin_mm/2"). */
+/* Sizes 1..GRID_SIZE_MAX, spacing positive, all finite. Pointers relative to the grid ("/size/0", "/spacing_mm/1",
+ * "/origin_mm/2"). */
 int grid_check(const struct grid *grid, struct error *err);
 
 /*
