@@ -1,0 +1,136 @@
+#ifndef CBCT_DAEMON_HTTP_INTERNAL_H
+#define CBCT_DAEMON_HTTP_INTERNAL_H
+
+#include <pthread.h>
+#include <stdatomic.h>
+#include <sys/socket.h>
+
+#include <microhttpd.h>
+
+#include "daemon/http.h"
+
+/* Shared by http.c, http_clock.c, http_listen.c, http_reply.c and http_request.c; nobody else includes it. */
+
+enum { ARGUMENTS_MAX = 4, QUERIES_MAX = 16, SEGMENTS_MAX = 12, LISTENERS_MAX = 8, REQUEST_ID_SIZE = 24 };
+
+/* Where a connection stands; the clock judges its pace by it. */
+enum phase {
+	PHASE_IDLE,   /* the next request's header is not whole yet */
+	PHASE_BODY,   /* it comes in */
+	PHASE_HANDLE, /* it is whole, the answer is being made */
+	PHASE_SEND    /* the answer goes out */
+};
+
+struct connection {
+	struct http *http;
+	struct MHD_Connection *mhd;
+	int socket;
+	struct sockaddr_storage address;
+	struct connection *previous, *next; /* guarded by http->lock */
+	int refused;                        /* status of every answer, when it is one too many; 0: welcome */
+
+	pthread_mutex_t lock; /* guards all below */
+	enum phase phase;
+	double since;   /* of this phase */
+	double paused;  /* s of this phase that we made the client wait */
+	uint64_t bytes; /* of this phase's body so far, or in all when sending */
+	bool suspended; /* out of the library's hands until resumed */
+	double suspended_at;
+	bool woken;        /* request_wake came while it was not suspended */
+	double wait_until; /* of a suspended one */
+	bool cut;          /* shut down for its pace */
+};
+
+struct request {
+	struct http *http;
+	struct connection *connection;
+	struct MHD_Connection *mhd;
+	char id[REQUEST_ID_SIZE];
+	double started;
+	char *target;  /* as it was sent; owned */
+	char *decoded; /* what arguments and queries point into; owned */
+	char method[16];
+	const struct route *route;
+	const char *arguments[ARGUMENTS_MAX];
+	struct {
+		const char *name, *value;
+	} queries[QUERIES_MAX];
+	int query_count;
+
+	bool begun; /* the header was looked at */
+	bool chunked;
+	bool dropping; /* the answer is known, the rest of the body is not wanted */
+	int64_t content_length;
+	uint64_t received, dropped; /* bytes of body */
+	char *body;
+	size_t body_length, body_room;
+
+	struct MHD_Response *response;
+	int status;
+	uint64_t response_size; /* UNKNOWN_SIZE or bytes */
+	bool close;             /* no further request on this connection */
+
+	double wait_until; /* for the next suspension */
+	void *state;
+	void (*state_free)(void *state);
+};
+
+struct listener {
+	int socket;          /* -1 once closed */
+	char name[160];      /* "http://127.0.0.1:2228", "unix:/run/x" */
+	char unix_path[108]; /* to be removed at the end; "" for TCP */
+	struct MHD_Daemon *daemon;
+};
+
+struct http {
+	struct http_options options;
+	struct listener listeners[LISTENERS_MAX];
+	int listener_count;
+
+	pthread_mutex_t lock; /* guards the list, the clock's fields; taken before a connection's lock */
+	struct connection *connections;
+	long connection_count;
+	pthread_t clock;
+	bool clock_runs, clock_stop;
+	pthread_cond_t clock_kick;
+	double clock_next; /* when the clock looks again */
+
+	atomic_bool stopping; /* whoever waits should answer */
+	atomic_bool closing;  /* nothing may be suspended any more */
+	atomic_size_t bodies; /* bytes of whole bodies in memory */
+	atomic_ullong requests[6], bytes_in, bytes_out, request_number;
+	uint32_t id_prefix;
+};
+
+/* ---- http_listen.c: addresses and sockets ---- */
+int listeners_open(const char *listen, struct listener ret_listeners[LISTENERS_MAX], int *ret_count, struct error *err);
+void listener_close(struct listener *listener);
+
+/* ---- http_clock.c: deadlines, and connections that wait ---- */
+int clock_start(struct http *http, struct error *err);
+void clock_end(struct http *http);
+void connection_phase(struct connection *connection, enum phase phase, uint64_t bytes);
+void connection_progress(struct connection *connection, uint64_t bytes);
+enum suspension {
+	SUSPENDED,
+	WOKEN,  /* not suspended: something has happened already, look again */
+	REFUSED /* the daemon closes: give the connection up */
+};
+enum suspension connection_suspend(struct connection *connection, double until);
+/* All that are suspended. */
+void connections_wake(struct http *http);
+/* None has a request under way. */
+bool connections_idle(struct http *http);
+
+/* ---- http_request.c: what the request line and headers say ---- */
+struct request *request_new(struct http *http, struct connection *connection, const char *target);
+void request_free(struct request *request); /* NULL is fine */
+/* Method, framing, route; 0, or the reply is set (code < 0 when it is not). */
+int request_read_header(struct request *request, const char *method, struct error *err);
+
+/* ---- http_reply.c ---- */
+int reply_problem_of(struct request *request, const struct error *err);
+/* The reply takes its way; false when the connection has to be given up. */
+bool reply_send(struct request *request);
+
+#endif

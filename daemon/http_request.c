@@ -1,0 +1,340 @@
+/*
+ * What a request line and its headers say: target, query, framing, route.
+ *
+ * The target is read from the line as it was sent: the library decodes %2F
+ * before anybody has looked for slashes. And it takes a length beside chunks
+ * and two different lengths, about which two parties on the way may disagree:
+ * refused here.
+ */
+#include "daemon/http_internal.h"
+
+#include <inttypes.h>
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <strings.h>
+
+#include "daemon/http_text.h"
+
+static const uint64_t drop_max = 1ull << 30; /* a body that is read to its end only to give an answer */
+
+struct request *request_new(struct http *http, struct connection *connection, const char *target)
+{
+	struct request *request = calloc(1, sizeof(*request));
+
+	if (request == NULL)
+		return NULL;
+	request->http = http;
+	request->connection = connection;
+	request->mhd = connection->mhd;
+	request->started = http_now();
+	request->wait_until = INFINITY;
+	request->target = strdup(target);
+	request->decoded = strdup(target);
+	snprintf(request->id, sizeof(request->id), "%08" PRIx32 "-%llx", http->id_prefix,
+		 atomic_fetch_add(&http->request_number, 1) + 1);
+	if (request->target == NULL || request->decoded == NULL) {
+		request_free(request);
+		return NULL;
+	}
+	return request;
+}
+
+void request_free(struct request *request)
+{
+	if (request == NULL)
+		return;
+	if (request->state_free != NULL)
+		request->state_free(request->state);
+	if (request->response != NULL)
+		MHD_destroy_response(request->response);
+	atomic_fetch_sub(&request->http->bodies, request->body_room);
+	free(request->body);
+	free(request->target);
+	free(request->decoded);
+	free(request);
+}
+
+/* ---- the target ---- */
+
+static bool read_query(struct request *request, char *text)
+{
+	char *pair;
+
+	while ((pair = strsep(&text, "&")) != NULL) {
+		char *value = strchr(pair, '=');
+
+		if (pair[0] == '\0')
+			continue;
+		if (value != NULL)
+			*value++ = '\0';
+		if (request->query_count == QUERIES_MAX || !percent_decode(pair, true) ||
+		    (value != NULL && !percent_decode(value, true)))
+			return false;
+		request->queries[request->query_count].name = pair;
+		request->queries[request->query_count++].value = value != NULL ? value : "";
+	}
+	return true;
+}
+
+/* Segments of the path, decoded; -1 for a bad escape. */
+static int read_path(char *path, char *segments[SEGMENTS_MAX])
+{
+	int count = 0;
+	char *segment;
+
+	if (path[0] != '/')
+		return -1;
+	path++;
+	while ((segment = strsep(&path, "/")) != NULL) {
+		if (!percent_decode(segment, false))
+			return -1;
+		if (count == SEGMENTS_MAX)
+			return count + 1; /* longer than any route */
+		segments[count++] = segment;
+	}
+	return count;
+}
+
+/* Does the pattern "/v1/scans/{}" have these segments? Fills the arguments. */
+static bool path_matches(const char *pattern, char *const segments[], int count, const char *arguments[ARGUMENTS_MAX])
+{
+	int used = 0;
+
+	for (int i = 0; i < count; i++) {
+		size_t length;
+
+		if (*pattern++ != '/')
+			return false;
+		length = strcspn(pattern, "/");
+		if (length == 2 && memcmp(pattern, "{}", 2) == 0) {
+			if (segments[i][0] == '\0')
+				return false;
+			arguments[used++] = segments[i];
+		} else if (strlen(segments[i]) != length || memcmp(pattern, segments[i], length) != 0) {
+			return false;
+		}
+		pattern += length;
+	}
+	return *pattern == '\0';
+}
+
+static void allow_add(char *allow, size_t size, const char *method)
+{
+	size_t length = strlen(allow);
+
+	snprintf(allow + length, size - length, "%s%s", length > 0 ? ", " : "", method);
+	if (strcmp(method, "GET") == 0)
+		allow_add(allow, size, "HEAD");
+}
+
+static int find_route(struct request *request, char *const segments[], int count, struct error *err)
+{
+	const char *method = request_is_head(request) ? "GET" : request->method;
+	char allow[64] = "";
+
+	for (const struct route *route = request->http->options.routes; route->method != NULL; route++) {
+		const char *arguments[ARGUMENTS_MAX] = {"", "", "", ""};
+
+		if (count > SEGMENTS_MAX || !path_matches(route->path, segments, count, arguments))
+			continue;
+		if (strcmp(route->method, method) == 0) {
+			request->route = route;
+			memcpy(request->arguments, arguments, sizeof(arguments));
+			return 0;
+		}
+		allow_add(allow, sizeof(allow), route->method);
+	}
+	if (allow[0] == '\0')
+		return error_set(err, ERR_NOT_FOUND, "there is nothing at %.200s", request->target);
+	if (request_reply_problem(request, 405, err, "%s is not for this resource; allowed: %s", request->method,
+				  allow) != 0)
+		return err->code;
+	request_reply_header(request, "Allow", "%s", allow);
+	return 0;
+}
+
+static int read_target(struct request *request, struct error *err)
+{
+	char *path = request->decoded, *query, *segments[SEGMENTS_MAX];
+	int count;
+
+	if (strncasecmp(path, "http://", 7) == 0) /* the absolute form, as for a proxy */
+		path = path + 7 + strcspn(path + 7, "/");
+	path[strcspn(path, "#")] = '\0';
+	query = strchr(path, '?');
+	if (query != NULL)
+		*query++ = '\0';
+	if (query != NULL && !read_query(request, query))
+		return error_set(err, ERR_INVALID, "the query has a bad %%-escape or more than %d parameters",
+				 QUERIES_MAX);
+	count = read_path(path, segments);
+	if (count < 0)
+		return error_set(err, ERR_INVALID, "the path has a bad %%-escape or does not begin with /");
+	return find_route(request, segments, count, err);
+}
+
+/* ---- framing ---- */
+
+struct framing {
+	int lengths, encodings;
+	const char *length, *encoding;
+};
+
+static enum MHD_Result count_header(void *context, enum MHD_ValueKind kind, const char *name, const char *value)
+{
+	struct framing *framing = context;
+
+	(void)kind;
+	if (strcasecmp(name, "Content-Length") == 0) {
+		framing->lengths++;
+		framing->length = value;
+	} else if (strcasecmp(name, "Transfer-Encoding") == 0) {
+		framing->encodings++;
+		framing->encoding = value;
+	}
+	return MHD_YES;
+}
+
+/* RFC 9112, 6: exactly one way to tell where the body ends. */
+static int read_framing(struct request *request, struct error *err)
+{
+	struct framing framing = {0};
+	double length = 0;
+
+	MHD_get_connection_values(request->mhd, MHD_HEADER_KIND, count_header, &framing);
+	if (framing.lengths > 1)
+		return error_set(err, ERR_INVALID, "%d Content-Length headers, expected one", framing.lengths);
+	if (framing.lengths > 0 && framing.encodings > 0)
+		return error_set(err, ERR_INVALID, "Content-Length beside Transfer-Encoding: where does the body end?");
+	if (framing.encodings > 1 || (framing.encodings == 1 && strcasecmp(framing.encoding, "chunked") != 0))
+		return error_set(err, ERR_INVALID, "Transfer-Encoding is \"%.60s\", expected chunked",
+				 framing.encoding);
+	request->chunked = framing.encodings == 1;
+	request->content_length = request->chunked ? -1 : 0;
+	if (framing.lengths == 0)
+		return 0;
+	if (strspn(framing.length, "0123456789") != strlen(framing.length) ||
+	    !number_parse(framing.length, 0, 1e15, &length))
+		return error_set(err, ERR_INVALID, "Content-Length is \"%.60s\", expected a number up to 10^15",
+				 framing.length);
+	request->content_length = (int64_t)length;
+	return 0;
+}
+
+static int check_body(struct request *request, struct error *err)
+{
+	const struct route *route = request->route;
+
+	if (route->body == BODY_WHOLE && request->content_length > (int64_t)route->body_max)
+		return error_set(err, ERR_TOO_LARGE, "the body has %" PRId64 " bytes, at most %zu are taken",
+				 request->content_length, route->body_max);
+	return route->begin != NULL ? route->begin(request->http->options.context, request, err) : 0;
+}
+
+static int refuse_connection(struct request *request, struct error *err)
+{
+	int status = request->connection->refused;
+
+	request->close = true;
+	if (request_reply_problem(request, status, err, "%ld connections%s are open already",
+				  status == 429 ? request->http->options.max_connections_per_address
+						: request->http->options.max_connections,
+				  status == 429 ? " of this address" : "") != 0)
+		return err->code;
+	request_reply_header(request, "Retry-After", "1");
+	return 0;
+}
+
+/* A refused body is read and dropped, so that the client comes to reading the answer; unless it waits for our word. */
+static bool should_drop(struct request *request)
+{
+	if (request->close || MHD_lookup_connection_value(request->mhd, MHD_HEADER_KIND, "Expect") != NULL)
+		return false;
+	return request->chunked || (uint64_t)request->content_length <= drop_max;
+}
+
+int request_read_header(struct request *request, const char *method, struct error *err)
+{
+	int code = read_framing(request, err);
+
+	snprintf(request->method, sizeof(request->method), "%s", method);
+	if (code != 0)
+		request->close = true; /* what comes next may be anything */
+	else if (request->connection->refused != 0)
+		code = refuse_connection(request, err);
+	else if (atomic_load(&request->http->stopping))
+		code = error_set(err, ERR_BUSY, "the daemon is stopping");
+	else
+		code = read_target(request, err);
+	if (code == 0 && request->response == NULL)
+		code = check_body(request, err);
+	if (code != 0)
+		code = reply_problem_of(request, err);
+	request->dropping = request->response != NULL && should_drop(request);
+	return code;
+}
+
+/* ---- what handlers ask ---- */
+
+const char *request_id(const struct request *request)
+{
+	return request->id;
+}
+
+const char *request_argument(const struct request *request, int i)
+{
+	return request->arguments[i];
+}
+
+const char *request_query(const struct request *request, const char *name)
+{
+	for (int i = 0; i < request->query_count; i++) {
+		if (strcmp(request->queries[i].name, name) == 0)
+			return request->queries[i].value;
+	}
+	return NULL;
+}
+
+const char *request_header(struct request *request, const char *name)
+{
+	return MHD_lookup_connection_value(request->mhd, MHD_HEADER_KIND, name);
+}
+
+bool request_is_head(const struct request *request)
+{
+	return strcmp(request->method, "HEAD") == 0;
+}
+
+int64_t request_content_length(const struct request *request)
+{
+	return request->content_length;
+}
+
+const char *request_body(const struct request *request, size_t *ret_length)
+{
+	*ret_length = request->body_length;
+	return request->body != NULL ? request->body : "";
+}
+
+void request_set_state(struct request *request, void *state, void (*state_free)(void *state))
+{
+	request->state = state;
+	request->state_free = state_free;
+}
+
+void *request_state(const struct request *request)
+{
+	return request->state;
+}
+
+void request_wait_until(struct request *request, double time)
+{
+	request->wait_until = time;
+}
+
+bool request_stopping(const struct request *request)
+{
+	return atomic_load(&request->http->stopping);
+}

@@ -1,0 +1,49 @@
+#ifndef CBCT_DAEMON_HTTP_TEXT_H
+#define CBCT_DAEMON_HTTP_TEXT_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#include "core/error.h"
+
+/* What stands in targets and headers, read by the letter of the RFCs. Pure functions of their texts. */
+
+/*
+ * Decodes %XX in place; plus: '+' is a space (queries). False for a bad escape
+ * and for a zero byte.
+ */
+bool percent_decode(char *text, bool plus);
+
+/* Range (RFC 9110, 14.2) over a body of `size` bytes. */
+enum range {
+	RANGE_NONE,   /* absent, of another unit, malformed or several: send all of it */
+	RANGE_ONE,    /* *ret_first, *ret_length */
+	RANGE_OUTSIDE /* 416 */
+};
+enum range range_parse(const char *header /* or NULL */, uint64_t size, uint64_t *ret_first, uint64_t *ret_length);
+
+/* Whether an Accept-Encoding names zstd with a quality above 0. NULL: no. */
+bool accepts_zstd(const char *header);
+
+/*
+ * Whether a list of entity tags, or *, has this one (a strong one, quoted). weak:
+ * W/ before a tag of the list is ignored (If-None-Match); otherwise such a tag never matches (If-Range).
+ */
+bool etag_in(const char *header, const char *etag, bool weak);
+
+/*
+ * Content-Digest (RFC 9530): *ret_given tells whether it has a sha-256; other
+ * algorithms are ignored. ERR_INVALID for one that is not 32 bytes of base64 between colons.
+ */
+int content_digest_parse(const char *header /* or NULL */, bool *ret_given, uint8_t ret_sha256[32], struct error *err);
+
+/* The N of "wait=N" in a Prefer header (RFC 7240); false when there is none. */
+bool prefer_wait(const char *header /* or NULL */, double *ret_seconds);
+
+/* A plain decimal number from `least` to `most`, nothing around it. */
+bool number_parse(const char *text, double least, double most, double *ret);
+/* Digits only; false when it is none or above `most`. */
+bool index_parse(const char *text, size_t length, long most, long *ret);
+
+#endif
