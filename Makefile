@@ -99,6 +99,11 @@ $(BUILD)/cbct: $(call objects,$(cbct_sources)) $(library)
 $(BUILD)/unit: $(call objects,$(unit_sources)) $(library)
 	$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,check $(proto_libs) $(core_libs)) $(LIBM)
 
+# The GPU's checks and benchmarks need the mathematics and the kernels only, so that they run on a bare machine.
+gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench
+$(gpu_programs): $(BUILD)/%: $(call objects,tests/bench/%.c tests/bench/gpu_scene.c) $(core_objects) $(cuda_objects)
+	$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(cuda_libs) $(LIBM)
+
 setup: ## install the Debian packages that are missing
 	@missing=""; \
 	for pair in $(COMMANDS); do command -v $${pair%%:*} >/dev/null 2>&1 || missing="$$missing $${pair##*:}"; done; \
@@ -123,6 +128,15 @@ bench: setup ## CPU and HTTP benchmarks, results in build/bench/
 	@$(MAKE) --no-print-directory -j$$(nproc) all
 	@BUILD=$(BUILD) tests/bench/run.sh
 
+check-gpu: ## the CUDA backend against the CPU's; skipped aloud without a GPU
+	@$(MAKE) --no-print-directory $(BUILD)/gpu_check
+	@$(BUILD)/gpu_check
+
+bench-gpu: ## times of the CUDA backend beside their goals, results in build/bench/
+	@$(MAKE) --no-print-directory $(BUILD)/gpu_bench
+	@mkdir -p $(BUILD)/bench
+	@$(BUILD)/gpu_bench --json $(BUILD)/bench/gpu.json
+
 asan: setup ## the tests under the address and undefined-behaviour sanitizers
 	@$(MAKE) --no-print-directory check BUILD=build/asan SANITIZE=address,undefined CUDA=0
 
@@ -145,6 +159,6 @@ clean: ## removes build/
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-.PHONY: all setup demo check bench asan tsan lint format install clean help
+.PHONY: all setup demo check bench check-gpu bench-gpu asan tsan lint format install clean help
 .SECONDARY:
 -include $(shell find $(BUILD) -name '*.d' 2>/dev/null)

@@ -1,0 +1,349 @@
+/*
+ * Backprojection: voxel-driven, bilinear, all views of a call in one launch; a
+ * thread has a run of voxels along z, whose sums stay in registers while it goes
+ * through the views. What lies outside of the detector is 0.
+ *
+ * General: any 3x4 matrix. Of every four voxels three are sampled by the texture
+ * unit and one by four plain loads, about the ratio of what the two pipes can do;
+ * loads alone for reference precision.
+ *
+ * Untilted: a voxel column along z has one detector column u, one depth and an
+ * even spacing 1 + e of rows in each view. VOXELS of them need VOXELS + 2 rows:
+ * these are interpolated across once, scaled by the weight, and then, with
+ * B = floor of the first row and t = row - B + k e,
+ *   q[k+1] - saturate(1 - t) (q[k+1] - q[k]) + saturate(t - 1) (q[k+2] - q[k+1])
+ * is the linear interpolation along z without a branch or a dynamic index, exact
+ * while (VOXELS - 1) |e| <= 1, which plan.cu sees to.
+ *
+ * Matrices are read from constant memory, one broadcast for a block.
+ */
+#include "kernels/rays.cuh"
+
+static __constant__ float matrices[VIEWS_AT_ONCE][12];
+
+struct backprojection_job {
+	cudaTextureObject_t texture;
+	const float *from; /* row 0, column 0 of the first slot */
+	int pitch;
+	size_t slot;
+	float columns, rows;
+	int views;
+	int nx, ny, nz;
+	float *volume;
+	struct voxel_use use;
+};
+
+/* The matrices of the views in hand, one after the other, for the copy into constant memory. */
+static __global__ void gather(const device_view *geometry, const int *views, int count, float *to)
+{
+	int i = blockIdx.x * blockDim.x + threadIdx.x;
+
+	if (i < count * 12)
+		to[i] = geometry[views[i / 12]].matrix[i % 12 / 4][i % 4];
+}
+
+static __device__ __forceinline__ float reciprocal(float x)
+{
+	float r;
+
+	asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x));
+	return r;
+}
+
+/* What the sums of `COUNT` voxels from z on do to the volume. */
+template <int COUNT>
+static __device__ __forceinline__ void put_voxels(const backprojection_job &job, int x, int y, int z,
+						  const float sum[COUNT])
+{
+	if (x >= job.nx || y >= job.ny)
+		return;
+	size_t plane = (size_t)job.nx * job.ny, at = ((size_t)z * job.ny + y) * job.nx + x;
+	float held[COUNT];
+
+#pragma unroll
+	for (int k = 0; k < COUNT; k++)
+		if (z + k < job.nz)
+			held[k] = job.volume[at + k * plane];
+#pragma unroll
+	for (int k = 0; k < COUNT; k++) {
+		if (z + k >= job.nz)
+			continue;
+		float value = sum[k];
+
+		if (job.use.update) {
+			if (job.use.coverage != NULL) {
+				float coverage = job.use.coverage[at + k * plane];
+
+				if (!(coverage > 0))
+					continue; /* no ray sees it */
+				value /= coverage;
+			}
+			value = fmaf(job.use.scale, value, held[k]);
+			if (job.use.nonnegative)
+				value = fmaxf(value, 0.0f);
+		} else {
+			value += held[k];
+		}
+		job.volume[at + k * plane] = value;
+	}
+}
+
+template <int VOXELS, int ACROSS, int ALONG, bool TEXTURE>
+static __global__ void __launch_bounds__(ACROSS *ALONG) backproject_general(const backprojection_job job)
+{
+	int x = blockIdx.x * ACROSS + threadIdx.x, y = blockIdx.y * ALONG + threadIdx.y, z = blockIdx.z * VOXELS;
+	float sum[VOXELS], fx = (float)x, fy = (float)y, fz = (float)z;
+	const float *p = job.from;
+
+#pragma unroll
+	for (int k = 0; k < VOXELS; k++)
+		sum[k] = 0;
+	for (int i = 0; i < job.views; i++, p += job.slot) {
+		const float *m = matrices[i];
+		float a = fmaf(m[0], fx, fmaf(m[1], fy, fmaf(m[2], fz, m[3])));
+		float b = fmaf(m[4], fx, fmaf(m[5], fy, fmaf(m[6], fz, m[7])));
+		float c = fmaf(m[8], fx, fmaf(m[9], fy, fmaf(m[10], fz, m[11])));
+
+#pragma unroll
+		for (int k = 0; k < VOXELS; k++) {
+			float w = reciprocal(fmaf((float)k, m[10], c));
+			float u = fmaf((float)k, m[2], a) * w, v = fmaf((float)k, m[6], b) * w, value;
+
+			if (TEXTURE && k % 4 != 3) {
+				value = tex2DLayered<float>(job.texture, u + 0.5f, v + 0.5f, i);
+			} else {
+				u = fminf(fmaxf(u, -1.0f), job.columns);
+				v = fminf(fmaxf(v, -1.0f), job.rows);
+				value = sample(p, job.pitch, 1, u, v);
+			}
+			sum[k] = job.use.fdk ? fmaf(value, w * w, sum[k]) : sum[k] + value;
+		}
+	}
+	put_voxels<VOXELS>(job, x, y, z, sum);
+}
+
+template <int VOXELS, int WINDOWS, int ACROSS, int ALONG>
+static __global__ void __launch_bounds__(ACROSS *ALONG) backproject_untilted(const backprojection_job job)
+{
+	const int run = VOXELS * WINDOWS;
+	int x = blockIdx.x * ACROSS + threadIdx.x, y = blockIdx.y * ALONG + threadIdx.y, z = blockIdx.z * run;
+	float sum[run], fx = (float)x, fy = (float)y, fz = (float)z;
+	const float *p = job.from;
+
+#pragma unroll
+	for (int k = 0; k < run; k++)
+		sum[k] = 0;
+	for (int i = 0; i < job.views; i++, p += job.slot) {
+		const float *m = matrices[i];
+		float a = fmaf(m[0], fx, fmaf(m[1], fy, m[3])), c = fmaf(m[8], fx, fmaf(m[9], fy, m[11]));
+		float b = fmaf(m[4], fx, fmaf(m[5], fy, fmaf(m[6], fz, m[7]))), w = reciprocal(c);
+		float u = fminf(fmaxf(a * w, -1.0f), job.columns), first = b * w, rise = m[6] * w, e = rise - 1.0f;
+		float weight = job.use.fdk ? w * w : 1.0f, across, lowest = fminf(0.0f, (float)(VOXELS - 1) * e);
+		int column = split(u, across);
+		float right = across * weight, left = weight - right;
+
+#pragma unroll
+		for (int n = 0; n < WINDOWS; n++) {
+			float row = fmaf((float)(n * VOXELS), rise, first), unused;
+			float base = fminf(fmaxf(row + lowest, (float)-STACK_PAD), job.rows);
+			int low = split(base, unused);
+			float t = row - (float)low, q[VOXELS + 2];
+			const float *r = p + (low * job.pitch + column);
+
+#pragma unroll
+			for (int j = 0; j < VOXELS + 2; j++)
+				q[j] = fmaf(left, r[j * job.pitch], right * r[j * job.pitch + 1]);
+			float below = q[1] - q[0];
+#pragma unroll
+			for (int k = 0; k < VOXELS; k++) {
+				float down = __saturatef(fmaf((float)-k, e, 1.0f - t));
+				float up = __saturatef(fmaf((float)k, e, t - 1.0f)), above = q[k + 2] - q[k + 1];
+				float &s = sum[n * VOXELS + k];
+
+				s += q[k + 1];
+				s = fmaf(-down, below, s);
+				s = fmaf(up, above, s);
+				below = above;
+			}
+		}
+	}
+	put_voxels<run>(job, x, y, z, sum);
+}
+
+/* sum_S w_ij: how much of the four pixels around its projection each view has. */
+static __global__ void __launch_bounds__(256) sum_coverage(const backprojection_job job)
+{
+	int x = blockIdx.x * 32 + threadIdx.x, y = blockIdx.y * 8 + threadIdx.y, z = blockIdx.z;
+	float fx = (float)x, fy = (float)y, fz = (float)z, sum = 0;
+
+	if (x >= job.nx || y >= job.ny)
+		return;
+	for (int i = 0; i < job.views; i++) {
+		const float *m = matrices[i];
+		float a = fmaf(m[0], fx, fmaf(m[1], fy, fmaf(m[2], fz, m[3])));
+		float b = fmaf(m[4], fx, fmaf(m[5], fy, fmaf(m[6], fz, m[7])));
+		float w = reciprocal(fmaf(m[8], fx, fmaf(m[9], fy, fmaf(m[10], fz, m[11]))));
+		float u = a * w, v = b * w;
+
+		sum += __saturatef(fminf(u + 1.0f, job.columns - u)) * __saturatef(fminf(v + 1.0f, job.rows - v));
+	}
+	job.volume[((size_t)z * job.ny + y) * job.nx + x] += sum;
+}
+
+/* The update from a sum that was made in parts. */
+static __global__ void __launch_bounds__(256) update_from(const float *__restrict__ sum, const backprojection_job job)
+{
+	int x = blockIdx.x * 256 + threadIdx.x, y = blockIdx.y, z = blockIdx.z;
+
+	if (x < job.nx)
+		put_voxels<1>(job, x, y, z, sum + ((size_t)z * job.ny + y) * job.nx + x);
+}
+
+static int load_matrices(struct plan *plan, int first, int count, struct error *err)
+{
+	cudaStream_t stream = plan->device->stream;
+
+	gather<<<divide_up(count * 12, 256), 256, 0, stream>>>(plan->geometry, plan->views + first, count, plan->matrices);
+	LAUNCHED();
+	CUDA_TRY(cudaMemcpyToSymbolAsync(matrices, plan->matrices, (size_t)count * 12 * sizeof(float), 0,
+					 cudaMemcpyDeviceToDevice, stream));
+	return 0;
+}
+
+static int load_array(struct plan *plan, const float *from, int count, struct error *err)
+{
+	const struct stack_shape *shape = &plan->stack;
+	cudaMemcpy3DParms copy = {};
+
+	copy.srcPtr = make_cudaPitchedPtr((void *)from, (size_t)shape->pitch * sizeof(float), (size_t)shape->columns,
+					  shape->slot / (size_t)shape->pitch);
+	copy.dstArray = plan->projections.array;
+	copy.extent = make_cudaExtent((size_t)shape->columns, (size_t)shape->rows, (size_t)count);
+	copy.kind = cudaMemcpyDeviceToDevice;
+	CUDA_TRY(cudaMemcpy3DAsync(&copy, plan->device->stream));
+	return 0;
+}
+
+template <int VOXELS, int WINDOWS, int ACROSS, int ALONG>
+static void launch_untilted(const backprojection_job &job, cudaStream_t stream)
+{
+	dim3 blocks(divide_up(job.nx, ACROSS), divide_up(job.ny, ALONG), divide_up(job.nz, VOXELS * WINDOWS));
+
+	backproject_untilted<VOXELS, WINDOWS, ACROSS, ALONG><<<blocks, dim3(ACROSS, ALONG), 0, stream>>>(job);
+}
+
+template <bool TEXTURE> static void launch_general(const backprojection_job &job, cudaStream_t stream)
+{
+	const int voxels = 8, side = 16;
+	dim3 blocks(divide_up(job.nx, side), divide_up(job.ny, side), divide_up(job.nz, voxels));
+
+	backproject_general<voxels, side, side, TEXTURE><<<blocks, dim3(side, side), 0, stream>>>(job);
+}
+
+static backprojection_job job_make(const struct plan *plan, float *volume, struct voxel_use use)
+{
+	backprojection_job job = {};
+
+	job.texture = plan->projections.texture;
+	job.pitch = plan->stack.pitch;
+	job.slot = plan->stack.slot;
+	job.columns = (float)plan->stack.columns;
+	job.rows = (float)plan->stack.rows;
+	job.nx = plan->grid.size[0];
+	job.ny = plan->grid.size[1];
+	job.nz = plan->grid.size[2];
+	job.volume = volume;
+	job.use = use;
+	return job;
+}
+
+static int launch(struct plan *plan, backprojection_job &job, struct error *err)
+{
+	cudaStream_t stream = plan->device->stream;
+
+	switch (plan->shape.back_voxels) {
+	case 3:
+		launch_untilted<3, 4, 16, 8>(job, stream);
+		break;
+	case 4:
+		launch_untilted<4, 4, 16, 8>(job, stream);
+		break;
+	case 5:
+		launch_untilted<5, 3, 16, 8>(job, stream);
+		break;
+	case 6:
+		launch_untilted<6, 2, 16, 8>(job, stream);
+		break;
+	default:
+		if (plan->shape.textures) {
+			TRY(load_array(plan, job.from, job.views, err));
+			launch_general<true>(job, stream);
+		} else {
+			launch_general<false>(job, stream);
+		}
+	}
+	LAUNCHED();
+	return 0;
+}
+
+static int update_volume(struct plan *plan, struct voxel_use use, float *volume, struct error *err)
+{
+	backprojection_job job = job_make(plan, volume, use);
+	dim3 blocks(divide_up(job.nx, 256), job.ny, job.nz);
+
+	update_from<<<blocks, 256, 0, plan->device->stream>>>(plan->work, job);
+	LAUNCHED();
+	return 0;
+}
+
+int backproject_views(struct plan *plan, const float *from, int first, int count, struct voxel_use use, float *volume,
+		      struct error *err)
+{
+	int most = plan->shape.views_at_once;
+	/* An update takes the whole sum: all parts but the last are summed aside. */
+	bool parts = use.update && count > most;
+	struct voxel_use sum = use;
+
+	if (parts) {
+		sum.update = false;
+		CUDA_TRY(cudaMemsetAsync(plan->work, 0, grid_voxels(plan->options.grid) * sizeof(float),
+					 plan->device->stream));
+	}
+	for (int done = 0; done < count; done += most) {
+		backprojection_job job = job_make(plan, parts ? plan->work : volume, sum);
+
+		job.from = from + (size_t)done * plan->stack.slot;
+		job.views = count - done < most ? count - done : most;
+		TRY(load_matrices(plan, first + done, job.views, err));
+		TRY(launch(plan, job, err));
+	}
+	return parts ? update_volume(plan, use, volume, err) : 0;
+}
+
+int coverage_sum(struct plan *plan, int first, int count, struct error *err)
+{
+	cudaStream_t stream = plan->device->stream;
+
+	CUDA_TRY(cudaMemsetAsync(plan->coverage, 0, grid_voxels(plan->options.grid) * sizeof(float), stream));
+	for (int done = 0; done < count; done += VIEWS_AT_ONCE) {
+		backprojection_job job = job_make(plan, plan->coverage, {});
+		dim3 blocks(divide_up(job.nx, 32), divide_up(job.ny, 8), job.nz);
+
+		job.views = count - done < VIEWS_AT_ONCE ? count - done : VIEWS_AT_ONCE;
+		TRY(load_matrices(plan, first + done, job.views, err));
+		sum_coverage<<<blocks, dim3(32, 8), 0, stream>>>(job);
+		LAUNCHED();
+	}
+	return 0;
+}
+
+int cuda_backproject(struct plan *plan, const struct stack *from, const int *views, int count,
+		     enum backprojection weight, struct volume *to, struct error *err)
+{
+	struct voxel_use use = {};
+
+	use.fdk = weight == BACKPROJECT_FDK;
+	TRY(plan_check_views(plan, views, count, from, count, err));
+	TRY(plan_set_views(plan, views, count, err));
+	return backproject_views(plan, from->data, 0, count, use, to->data, err);
+}

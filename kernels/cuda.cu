@@ -1,0 +1,175 @@
+/*
+ * The CUDA backend: its devices and its table of operations. Nothing outside of
+ * kernels/ sees anything but the last line.
+ */
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+
+#include "kernels/internal.cuh"
+
+int cuda_error(struct error *err, cudaError_t status, const char *what)
+{
+	if (status == cudaErrorMemoryAllocation) {
+		cudaGetLastError(); /* not sticky: the device goes on */
+		return error_set(err, ERR_NO_MEMORY, "%s: %s", what, cudaGetErrorString(status));
+	}
+	return error_set(err, ERR_DEVICE, "%s: %s", what, cudaGetErrorString(status));
+}
+
+int device_enter(struct device *device, struct error *err)
+{
+	CUDA_TRY(cudaSetDevice(device->index));
+	return 0;
+}
+
+int device_allocate(struct device *device, size_t bytes, void **ret_memory, struct error *err)
+{
+	const double mib = 1 << 20;
+	void *memory = NULL;
+
+	TRY(device_enter(device, err));
+	if (bytes > device->limit - device->used)
+		return error_set(err, ERR_NO_MEMORY, "%.1f MiB of device memory are needed, %.1f MiB of %.1f are left",
+				 (double)bytes / mib, (double)(device->limit - device->used) / mib,
+				 (double)device->limit / mib);
+	CUDA_TRY(cudaMalloc(&memory, bytes > 0 ? bytes : 1));
+	device->used += bytes;
+	*ret_memory = memory;
+	return 0;
+}
+
+void device_release(struct device *device, void *memory, size_t bytes)
+{
+	if (memory == NULL)
+		return;
+	cudaSetDevice(device->index);
+	cudaFree(memory);
+	device->used -= bytes;
+}
+
+int device_wait(struct device *device, struct error *err)
+{
+	CUDA_TRY(cudaStreamSynchronize(device->stream));
+	return 0;
+}
+
+static int cuda_count(void)
+{
+	int count = 0;
+
+	if (cudaGetDeviceCount(&count) != cudaSuccess) {
+		cudaGetLastError();
+		return 0;
+	}
+	return count;
+}
+
+static void cuda_close(struct device *device)
+{
+	if (device == NULL)
+		return;
+	cudaSetDevice(device->index);
+	if (device->sums != NULL)
+		cudaFreeHost(device->sums);
+	if (device->copy != NULL)
+		cudaStreamDestroy(device->copy);
+	if (device->stream != NULL)
+		cudaStreamDestroy(device->stream);
+	free(device);
+}
+
+static int device_prepare(struct device *device, const struct device_options *options, struct error *err)
+{
+	size_t bytes_free, bytes_total;
+	void *mapped;
+
+	TRY(device_enter(device, err));
+	CUDA_TRY(cudaDeviceGetAttribute(&device->multiprocessors, cudaDevAttrMultiProcessorCount, device->index));
+	CUDA_TRY(cudaStreamCreateWithFlags(&device->stream, cudaStreamNonBlocking));
+	CUDA_TRY(cudaStreamCreateWithFlags(&device->copy, cudaStreamNonBlocking));
+	CUDA_TRY(cudaHostAlloc((void **)&device->sums, SUMS * sizeof(double), cudaHostAllocMapped));
+	CUDA_TRY(cudaHostGetDevicePointer(&mapped, device->sums, 0));
+	device->sums_device = (double *)mapped;
+	CUDA_TRY(cudaMemGetInfo(&bytes_free, &bytes_total));
+	device->limit = bytes_free;
+	if (options != NULL && options->memory_limit > 0 && options->memory_limit < bytes_free)
+		device->limit = options->memory_limit;
+	return 0;
+}
+
+static int cuda_open(int index, const struct device_options *options, struct device **ret_device, struct error *err)
+{
+	struct device *device;
+	int code;
+
+	if (index < 0 || index >= cuda_count())
+		return error_set(err, ERR_NOT_FOUND, "CUDA device %d, there are %d", index, cuda_count());
+	device = (struct device *)calloc(1, sizeof(*device));
+	if (device == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a device");
+	device->index = index;
+	code = device_prepare(device, options, err);
+	if (code < 0) {
+		cuda_close(device);
+		return code;
+	}
+	*ret_device = device;
+	return 0;
+}
+
+static void cuda_describe(struct device *device, struct device_info *ret_info)
+{
+	struct device_info info = {};
+	cudaDeviceProp properties;
+	int driver = 0;
+	size_t bytes_free = 0, bytes_total = 0;
+
+	cudaSetDevice(device->index);
+	if (cudaGetDeviceProperties(&properties, device->index) == cudaSuccess)
+		snprintf(info.name, sizeof(info.name), "%.*s", (int)sizeof(info.name) - 1, properties.name);
+	if (cudaDriverGetVersion(&driver) == cudaSuccess)
+		snprintf(info.driver, sizeof(info.driver), "CUDA %d.%d", driver / 1000, driver % 1000 / 10);
+	cudaMemGetInfo(&bytes_free, &bytes_total);
+	info.bytes_total = bytes_total;
+	info.bytes_free = device->limit - device->used < bytes_free ? device->limit - device->used : bytes_free;
+	*ret_info = info;
+}
+
+static int cuda_sync(struct device *device, struct error *err)
+{
+	TRY(device_enter(device, err));
+	return device_wait(device, err);
+}
+
+extern "C" const struct backend backend_cuda;
+const struct backend backend_cuda = {
+    .name = "cuda",
+    .summary = "NVIDIA GPUs",
+    .count = cuda_count,
+    .open = cuda_open,
+    .close = cuda_close,
+    .describe = cuda_describe,
+    .volume_new = cuda_volume_new,
+    .volume_free = cuda_volume_free,
+    .volume_upload = cuda_volume_upload,
+    .volume_download = cuda_volume_download,
+    .volume_fill = cuda_volume_fill,
+    .volume_copy = cuda_volume_copy,
+    .stack_new = cuda_stack_new,
+    .stack_free = cuda_stack_free,
+    .stack_download = cuda_stack_download,
+    .plan_bytes = cuda_plan_bytes,
+    .plan_new = cuda_plan_new,
+    .plan_free = cuda_plan_free,
+    .plan_summary = cuda_plan_summary,
+    .plan_batch = cuda_plan_batch,
+    .linearise = cuda_linearise,
+    .filter = cuda_filter,
+    .backproject = cuda_backproject,
+    .project = cuda_project,
+    .sart_iterate = cuda_sart_iterate,
+    .tv = cuda_tv,
+    .norms = cuda_norms,
+    .sync = cuda_sync,
+};

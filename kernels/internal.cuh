@@ -1,0 +1,317 @@
+#ifndef CBCT_KERNELS_INTERNAL_CUH
+#define CBCT_KERNELS_INTERNAL_CUH
+
+/*
+ * What the files of the CUDA backend share: the four structs, the layouts of
+ * their memory, and how errors and allocations go.
+ *
+ * All work of a device runs on one stream in the order it was asked for; raw
+ * projections come in on a second one beside it. Lengths on the device are in
+ * voxels and pixels, counted from the centre of the grid and of the detector,
+ * so that float32 keeps four digits behind the point.
+ */
+#include <cstddef>
+#include <cstdint>
+#include <cuda_runtime.h>
+
+extern "C" {
+#include "core/backend.h"
+}
+
+/* Returns from the calling function, which has `err`, when a CUDA call fails. */
+#define CUDA_TRY(call)                                                                                                 \
+	do {                                                                                                           \
+		cudaError_t status_ = (call);                                                                          \
+		if (status_ != cudaSuccess)                                                                            \
+			return cuda_error(err, status_, #call);                                                        \
+	} while (0)
+#define TRY(call)                                                                                                      \
+	do {                                                                                                           \
+		int code_ = (call);                                                                                    \
+		if (code_ < 0)                                                                                         \
+			return code_;                                                                                  \
+	} while (0)
+/* After a kernel's launch: a wrong configuration shows here, a fault in the kernel at the next synchronisation. */
+#define LAUNCHED() CUDA_TRY(cudaGetLastError())
+
+int cuda_error(struct error *err, cudaError_t status, const char *what);
+
+static inline int divide_up(int a, int b)
+{
+	return (a + b - 1) / b;
+}
+static inline int round_up(int a, int b)
+{
+	return divide_up(a, b) * b;
+}
+
+struct device {
+	int index;
+	int multiprocessors;
+	cudaStream_t stream; /* everything that computes */
+	cudaStream_t copy;   /* raw projections on their way in */
+	size_t limit;        /* bytes that may be allocated in all */
+	size_t used;
+	double *sums;      /* pinned, [SUMS]: results of reductions, written by the device */
+	double *sums_device; /* the same memory as the device sees it */
+};
+enum { SUMS = 16 };
+
+int device_enter(struct device *device, struct error *err);
+/* Counted against the limit; ERR_NO_MEMORY names what was wanted and what is left. */
+int device_allocate(struct device *device, size_t bytes, void **ret_memory, struct error *err);
+void device_release(struct device *device, void *memory, size_t bytes);
+int device_wait(struct device *device, struct error *err);
+
+/* [z][y][x], no padding. */
+struct volume {
+	struct device *device;
+	int size[3];
+	size_t bytes;
+	float *data;
+};
+
+/*
+ * [slot][row][column] with rows of `pitch` floats and STACK_PAD rows of zeros
+ * before, between and behind the slots; at least two zeros end each row. So a
+ * bilinear sample anywhere needs its coordinates clamped to -1..count only, and
+ * reads the zeros that surround a detector. The zeros are written at creation
+ * and by nobody later.
+ */
+enum { STACK_PAD = 8 };
+struct stack_shape {
+	int columns, rows;
+	int pitch;         /* floats from row to row */
+	size_t slot;       /* floats from slot to slot */
+	size_t floats;     /* in all */
+};
+struct stack {
+	struct device *device;
+	struct stack_shape shape;
+	int slots;
+	float *memory; /* allocation */
+	float *data;   /* row 0, column 0 of slot 0 */
+};
+
+struct stack_shape stack_shape_make(int columns, int rows, int slots);
+size_t stack_bytes(int columns, int rows, int slots);
+
+/*
+ * One view as the kernels need it, in centred voxels g = index - (size - 1) / 2
+ * and centred pixels c' = column - (columns - 1) / 2, r' likewise.
+ *
+ * A ray is a line through the source s along d(c', r'), both linear forms in c' and r':
+ * value = [0] + [1] c' + [2] r'. With its moment m = s x d (Pluecker), the
+ * ray crosses the plane x = t at y = (-m_z + d_y t) / d_x, z = (m_y + d_z t) / d_x
+ * and so on around, without the source's large coordinates cancelling.
+ */
+struct device_view {
+	float direction[3][3];
+	float moment[3][3];
+	float matrix[3][4]; /* of voxel indices: column * w, row * w, w = depth / depth of the isocentre */
+	float central[2];   /* unit vector, horizontal, from the source to the axis */
+};
+
+/* The volume as a stack of slices across one axis, for the forward projection. */
+struct slices {
+	const float *data; /* sample 0 of row 0 of slice 0 */
+	size_t slice;      /* floats from slice to slice */
+	int row;           /* floats from row to row; neighbours along the fast axis are adjacent */
+};
+
+/* Padded copies, [slice][row][fast]: rows of `row` floats, SLICE_PAD rows between the slices, edge values held around. */
+enum { SLICE_PAD = 8, SLICE_HELD = 2 };
+struct slices_shape {
+	int slices, rows, fast;
+	int row;
+	size_t slice, floats;
+};
+struct slices_shape slices_shape_make(int slices, int rows, int fast);
+struct slices slices_at(const float *memory, const struct slices_shape *shape);
+
+/* The volume with z fastest, [x][y][z], columns of `pitch` floats. */
+struct columns_shape {
+	int nx, ny, nz, pitch;
+	size_t floats;
+};
+struct columns_shape columns_shape_make(const int size[3]);
+
+struct layered { /* a layered 2D array with its texture: hardware bilinear samples */
+	cudaArray_t array;
+	cudaTextureObject_t texture;
+	int width, height, layers;
+	size_t bytes;
+};
+int layered_new(struct device *device, int width, int height, int layers, cudaTextureAddressMode outside,
+                struct layered *ret_layered, struct error *err);
+void layered_free(struct device *device, struct layered *layered);
+
+struct device_grid {
+	int size[3];
+	float spacing[3];
+};
+
+/* How a plan does its work; chosen once from geometry and options. */
+struct plan_shape {
+	bool untilted;     /* the fast kernels apply */
+	bool rows_down;    /* untilted, and rows count against z */
+	int forward_rows;  /* rows of one thread in the untilted forward projection; 0: the general one */
+	int back_voxels;   /* voxels of one window in the untilted backprojection; 0: the general one */
+	bool textures;     /* 8-bit interpolation weights are allowed */
+	bool z_rays;       /* some ray runs closer to z than to x and y */
+	int batch;         /* views filtered and backprojected in one go */
+	int correction;    /* slots of the correction stack, 0 without SART */
+	int views_at_once; /* that one launch of the backprojection takes; layers of the projection array */
+	bool by_view;      /* SART goes view by view over a z-fastest copy */
+	bool by_subset;    /* SART has updates of several views */
+	bool covered;      /* every view sees the whole grid: sum_S w_ij = views of S */
+	int filter_length; /* of the fused filter, 0 for cuFFT */
+	int fft_length;    /* of cuFFT */
+	int fft_rows;      /* rows that cuFFT takes at once */
+};
+
+struct fft; /* filter.cu: cuFFT's plans */
+
+struct plan {
+	struct device *device;
+	struct plan_options options;
+	struct plan_shape shape;
+	struct plan_bytes bytes;
+	struct device_grid grid;
+	struct slices_shape along_x, along_y;
+	struct columns_shape columns;
+	struct stack_shape stack;
+	char summary[192];
+
+	int *views_host; /* what `views` holds, so that the same list is not copied again */
+	int views_held;
+	int *views; /* [count], device: the views of the call in hand */
+	int *slots; /* [count], device: their slots, for those that need them */
+	struct device_view *geometry; /* [count], device */
+
+	/* One block that the stages use in turn: slices of the forward projection, z-fastest copy, TV's copies. */
+	float *scratch;
+	size_t scratch_bytes;
+	struct layered slices[2];   /* slices across x and y, with textures */
+	struct layered projections; /* a batch of projections, with textures */
+	float *coverage;            /* [z][y][x], sum_S w_ij of subset `coverage_subset`, where not all is covered */
+	int coverage_subset;
+	float *work;                /* [z][y][x], where an update takes more views than one launch */
+	struct stack *correction;
+	float2 *partial; /* SART: squares of residuals and projections, one for each block of the forward projection */
+	size_t partial_count;
+	double *reduce;  /* partial sums of reductions */
+	float *matrices; /* of the views in hand, on their way into constant memory */
+
+	float *column_weights; /* [count][columns] */
+	float *response;       /* the filter's, in the order of the kernel */
+	float2 *twiddles;
+	struct fft *fft;
+
+	/* linearise: raw samples, pinned and on the device, twice, so that copying goes on during the kernels. */
+	int raw_views; /* projections of one buffer */
+	void *raw_pinned[2], *raw[2];
+	cudaEvent_t raw_copied[2];
+	int raw_next;
+	cudaEvent_t asked, linearised;
+	float *flat, *dark;
+	unsigned char *marks[2];     /* defects of one view */
+	unsigned long long *defects; /* device */
+
+	/* A whole SART iteration, recorded at its first run for this volume and this stack. */
+	cudaGraphExec_t sweep;
+	const float *sweep_volume, *sweep_stack;
+};
+
+/* The list of views on the device; nothing is copied when it is there already. */
+int plan_set_views(struct plan *plan, const int *views, int count, struct error *err);
+int plan_set_slots(struct plan *plan, const int *slots, int count, const struct stack *from, struct error *err);
+int plan_check_views(const struct plan *plan, const int *views, int count, const struct stack *stack, int slots,
+                     struct error *err);
+
+/* ---- layout.cu ---- */
+int layout_slices(struct plan *plan, const float *volume, struct error *err); /* -> scratch, arrays */
+int layout_to_columns(struct plan *plan, const float *volume, float *columns, struct error *err);
+int layout_from_columns(struct plan *plan, const float *columns, float *volume, struct error *err);
+
+/* ---- project.cu ---- */
+/* What becomes of a ray's sum. */
+struct ray_use {
+	const float *measured;  /* NULL: the sum itself is wanted; else (p - sum) / row sum, slot = view */
+	float2 *partial;        /* one a block: residual^2, p^2 */
+	float least;            /* mm that a ray must have in the grid to correct it */
+};
+/* The slices must be there. Rays of plan->views[first .. first + count - 1] into slots 0 .. count - 1. */
+int project_rays(struct plan *plan, const float *volume, int first, int count, struct ray_use use, float *to,
+                 struct error *err);
+size_t project_blocks(const struct plan *plan, int count);
+
+/* ---- backproject.cu ---- */
+/* What becomes of a voxel's sum. */
+struct voxel_use {
+	bool update;           /* false: added to the volume */
+	bool fdk;              /* weight (D/depth)^2 */
+	bool nonnegative;
+	float scale;           /* update: relaxation, over the number of views where all is covered */
+	const float *coverage; /* update: else divided by this, voxel by voxel */
+};
+int backproject_views(struct plan *plan, const float *from, int first, int count, struct voxel_use use, float *volume,
+                      struct error *err);
+/* Views that one launch takes. */
+enum { VIEWS_AT_ONCE = 1024 };
+int coverage_sum(struct plan *plan, int first, int count, struct error *err);
+
+/* ---- filter.cu ---- */
+int filter_choose(int columns);
+int filter_prepare(struct plan *plan, struct error *err);
+void filter_release(struct plan *plan);
+size_t filter_bytes(const struct plan_shape *shape, int columns);
+
+/* ---- norms.cu ---- */
+size_t reduce_bytes(void);
+/* partial[0 .. count - 1] -> sums[0], sums[1] += in a fixed order. */
+int reduce_pairs(struct plan *plan, const float2 *partial, size_t count, double *sums, struct error *err);
+
+/* ---- tv.cu, sart.cu ---- */
+size_t tv_scratch_bytes(const struct plan_options *options);
+size_t sweep_partials(const struct plan *plan);
+
+static inline int cancel_check(const struct cancel *cancel, struct error *err)
+{
+	if (cancel != NULL && cancel->asked != NULL && cancel->asked(cancel->context))
+		return error_set(err, ERR_CANCELLED, "cancelled");
+	return 0;
+}
+
+/* ---- the operations of the table ---- */
+int cuda_linearise(struct plan *plan, const void *samples, int count, const int *slots, struct stack *to,
+                   size_t *defects, struct error *err);
+int cuda_filter(struct plan *plan, const struct stack *from, const int *slots, const int *views, int count,
+                struct stack *to, struct error *err);
+int cuda_backproject(struct plan *plan, const struct stack *from, const int *views, int count,
+                     enum backprojection weight, struct volume *to, struct error *err);
+int cuda_project(struct plan *plan, const struct volume *from, const int *views, int count, struct stack *to,
+                 struct error *err);
+int cuda_sart_iterate(struct plan *plan, const struct stack *projections, struct volume *volume,
+                      const struct cancel *cancel, struct sart_sums *ret_sums, struct error *err);
+int cuda_tv(struct plan *plan, struct volume *volume, const struct cancel *cancel, struct error *err);
+int cuda_norms(struct plan *plan, const struct volume *volume, const struct volume *other, double unit,
+               struct volume_norms *ret_norms, struct error *err);
+int cuda_plan_bytes(struct device *device, const struct plan_options *options, struct plan_bytes *ret_bytes,
+                    struct error *err);
+int cuda_plan_new(struct device *device, const struct plan_options *options, struct plan **ret_plan, struct error *err);
+void cuda_plan_free(struct plan *plan);
+const char *cuda_plan_summary(const struct plan *plan);
+int cuda_plan_batch(const struct plan *plan);
+int cuda_volume_new(struct device *device, const struct grid *grid, struct volume **ret_volume, struct error *err);
+void cuda_volume_free(struct volume *volume);
+int cuda_volume_upload(struct volume *volume, const float *from, struct error *err);
+int cuda_volume_download(struct volume *volume, int z_first, int z_count, float *ret_to, struct error *err);
+int cuda_volume_fill(struct volume *volume, float value, struct error *err);
+int cuda_volume_copy(struct volume *to, const struct volume *from, struct error *err);
+int cuda_stack_new(struct device *device, int columns, int rows, int slots, struct stack **ret_stack,
+                   struct error *err);
+void cuda_stack_free(struct stack *stack);
+int cuda_stack_download(struct stack *stack, int slot, int count, float *ret_to, struct error *err);
+
+#endif

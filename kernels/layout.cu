@@ -1,0 +1,164 @@
+/*
+ * The volume in the orders in which the projectors read it. [z][y][x] is what
+ * everybody else sees; here it is copied into slices across x and across y with
+ * edge values held around, into texture arrays, or with z fastest.
+ */
+#include "kernels/internal.cuh"
+
+struct slices_shape slices_shape_make(int slices, int rows, int fast)
+{
+	struct slices_shape shape;
+
+	shape.slices = slices;
+	shape.rows = rows;
+	shape.fast = fast;
+	shape.row = round_up(fast + 2, 32);
+	shape.slice = (size_t)shape.row * (size_t)(rows + SLICE_PAD);
+	/* Before the first slice and behind the last, SLICE_PAD rows and one value can be read. */
+	shape.floats = shape.slice * (size_t)slices + (size_t)shape.row * (SLICE_PAD + 2);
+	return shape;
+}
+
+struct slices slices_at(const float *memory, const struct slices_shape *shape)
+{
+	return {memory + (size_t)shape->row * (SLICE_PAD + 1), shape->slice, shape->row};
+}
+
+struct columns_shape columns_shape_make(const int size[3])
+{
+	struct columns_shape shape;
+
+	shape.nx = size[0];
+	shape.ny = size[1];
+	shape.nz = size[2];
+	/* Long columns start on cache lines, short ones on sectors; the next value behind a column can be read. */
+	shape.pitch = round_up(size[2] + 1, size[2] >= 128 ? 32 : 8);
+	shape.floats = (size_t)shape.nx * (size_t)shape.ny * (size_t)shape.pitch + 32;
+	return shape;
+}
+
+enum { TILE = 32, TILE_ROWS = 8 };
+
+/* Writes a value and, at the ends of the fast and the row axis, what is held beyond them. */
+static __device__ __forceinline__ void put_held(float *slice, int stride, int row, int rows, int fast, int count,
+						float value)
+{
+	int from = row == 0 ? -SLICE_HELD : row, to = row == rows - 1 ? rows - 1 + SLICE_HELD : row;
+
+	for (int j = from; j <= to; j++) {
+		slice[j * stride + fast] = value;
+		if (fast == 0)
+			slice[j * stride - 1] = value;
+		if (fast == count - 1)
+			slice[j * stride + count] = value;
+	}
+}
+
+/* One tile of x and y in one plane; across x it is turned over in shared memory. */
+static __global__ void __launch_bounds__(TILE *TILE_ROWS)
+    to_slices(const float *__restrict__ volume, int nx, int ny, int nz, float *across_x, size_t slice_x, int stride_x,
+	      float *across_y, size_t slice_y, int stride_y)
+{
+	__shared__ float tile[TILE][TILE + 1];
+	int x0 = blockIdx.x * TILE, y0 = blockIdx.y * TILE, z = blockIdx.z;
+
+	for (int j = threadIdx.y; j < TILE; j += TILE_ROWS) {
+		int x = x0 + threadIdx.x, y = y0 + j;
+
+		if (x < nx && y < ny) {
+			float value = volume[((size_t)z * ny + y) * nx + x];
+
+			tile[j][threadIdx.x] = value;
+			put_held(across_y + slice_y * y, stride_y, z, nz, x, nx, value);
+		}
+	}
+	__syncthreads();
+	for (int j = threadIdx.y; j < TILE; j += TILE_ROWS) {
+		int x = x0 + j, y = y0 + threadIdx.x;
+
+		if (x < nx && y < ny)
+			put_held(across_x + slice_x * x, stride_x, z, nz, y, ny, tile[threadIdx.x][j]);
+	}
+}
+
+static int copy_to_array(const struct layered *to, const struct slices_shape *shape, const float *data,
+			 cudaStream_t stream, struct error *err)
+{
+	cudaMemcpy3DParms copy = {};
+
+	copy.srcPtr = make_cudaPitchedPtr((void *)data, (size_t)shape->row * sizeof(float), (size_t)shape->fast,
+					  shape->slice / (size_t)shape->row);
+	copy.dstArray = to->array;
+	copy.extent = make_cudaExtent((size_t)shape->fast, (size_t)shape->rows, (size_t)shape->slices);
+	copy.kind = cudaMemcpyDeviceToDevice;
+	CUDA_TRY(cudaMemcpy3DAsync(&copy, stream));
+	return 0;
+}
+
+int layout_slices(struct plan *plan, const float *volume, struct error *err)
+{
+	const int *size = plan->grid.size;
+	cudaStream_t stream = plan->device->stream;
+	struct slices x = slices_at(plan->scratch, &plan->along_x);
+	struct slices y = slices_at(plan->scratch + plan->along_x.floats, &plan->along_y);
+	dim3 blocks(divide_up(size[0], TILE), divide_up(size[1], TILE), size[2]), threads(TILE, TILE_ROWS);
+
+	to_slices<<<blocks, threads, 0, stream>>>(volume, size[0], size[1], size[2], (float *)x.data, x.slice, x.row,
+						  (float *)y.data, y.slice, y.row);
+	LAUNCHED();
+	if (plan->slices[0].array != NULL) {
+		TRY(copy_to_array(&plan->slices[0], &plan->along_x, x.data, stream, err));
+		TRY(copy_to_array(&plan->slices[1], &plan->along_y, y.data, stream, err));
+	}
+	return 0;
+}
+
+/* Planes of one y, turned over between x and z; FORWARD from [z][y][x] to [x][y][z]. */
+template <bool FORWARD>
+static __global__ void __launch_bounds__(TILE *TILE_ROWS)
+    turn_columns(float *volume, float *columns, int nx, int ny, int nz, int pitch)
+{
+	__shared__ float tile[TILE][TILE + 1];
+	int x0 = blockIdx.x * TILE, z0 = blockIdx.y * TILE, y = blockIdx.z;
+
+	for (int j = threadIdx.y; j < TILE; j += TILE_ROWS) {
+		int x = x0 + (FORWARD ? threadIdx.x : j), z = z0 + (FORWARD ? j : threadIdx.x);
+
+		if (x < nx && z < nz)
+			tile[j][threadIdx.x] = FORWARD ? volume[((size_t)z * ny + y) * nx + x]
+						       : columns[((size_t)x * ny + y) * pitch + z];
+	}
+	__syncthreads();
+	for (int j = threadIdx.y; j < TILE; j += TILE_ROWS) {
+		int x = x0 + (FORWARD ? j : threadIdx.x), z = z0 + (FORWARD ? threadIdx.x : j);
+
+		if (x < nx && z < nz) {
+			if (FORWARD)
+				columns[((size_t)x * ny + y) * pitch + z] = tile[threadIdx.x][j];
+			else
+				volume[((size_t)z * ny + y) * nx + x] = tile[threadIdx.x][j];
+		}
+	}
+}
+
+int layout_to_columns(struct plan *plan, const float *volume, float *columns, struct error *err)
+{
+	const struct columns_shape *shape = &plan->columns;
+	dim3 blocks(divide_up(shape->nx, TILE), divide_up(shape->nz, TILE), shape->ny), threads(TILE, TILE_ROWS);
+
+	turn_columns<true><<<blocks, threads, 0, plan->device->stream>>>((float *)volume, columns, shape->nx, shape->ny,
+									 shape->nz, shape->pitch);
+	LAUNCHED();
+	return 0;
+}
+
+int layout_from_columns(struct plan *plan, const float *columns, float *volume, struct error *err)
+{
+	const struct columns_shape *shape = &plan->columns;
+	dim3 blocks(divide_up(shape->nx, TILE), divide_up(shape->nz, TILE), shape->ny), threads(TILE, TILE_ROWS);
+
+	turn_columns<false><<<blocks, threads, 0, plan->device->stream>>>(volume, (float *)columns, shape->nx,
+									  shape->ny, shape->nz, shape->pitch);
+	LAUNCHED();
+	return 0;
+}

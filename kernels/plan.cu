@@ -1,0 +1,574 @@
+/*
+ * The plan: which kernels a geometry and a grid allow, what memory they take,
+ * and the views in the form that the kernels read.
+ */
+#include <cmath>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+
+#include "kernels/internal.cuh"
+
+/* ---- which kernels ---- */
+
+enum { LAYERS_MOST = 2048 };   /* of a layered array, on every card */
+enum { SIDE_MOST = 32768 };    /* its width and height */
+enum { BATCH_MOST = 128 };     /* views that FDK filters and backprojects in one go */
+static const size_t RAW_BYTES = (size_t)16 << 20; /* of each of the two buffers of raw samples */
+static const size_t FFT_BYTES = (size_t)64 << 20; /* of the rows that cuFFT takes at once */
+
+static int largest_subset(const struct subsets *subsets)
+{
+	int most = 0;
+
+	for (int i = 0; i < subsets->count; i++)
+		if (subsets->start[i + 1] - subsets->start[i] > most)
+			most = subsets->start[i + 1] - subsets->start[i];
+	return most;
+}
+
+/* The corner of the box, half a voxel beyond the outer centres or on them, mm. */
+static void corner_of(const struct grid *grid, int corner, double beyond, double ret[3])
+{
+	for (int i = 0; i < 3; i++)
+		ret[i] = grid->origin[i] +
+			 grid->spacing[i] * (corner >> i & 1 ? grid->size[i] - 1 + beyond : -beyond);
+}
+
+/* Every view sees the whole grid: all corners fall well inside of the detector, so all voxels do. */
+static bool is_covered(const struct geometry *geometry, const struct grid *grid)
+{
+	const double margin = 1e-2; /* pixels, above what float32 may err */
+
+	for (int k = 0; k < geometry->count; k++) {
+		double matrix[12], point[3], column, row;
+
+		view_matrix(&geometry->views[k], matrix);
+		for (int corner = 0; corner < 8; corner++) {
+			corner_of(grid, corner, 0, point);
+			if (!(view_project(matrix, point, &column, &row) > 0) || column < margin || row < margin ||
+			    column > geometry->columns - 1 - margin || row > geometry->rows - 1 - margin)
+				return false;
+		}
+	}
+	return true;
+}
+
+/*
+ * Some ray runs closer to z than to x and y. A raster of pixels is looked at; the
+ * margin covers the rays in between, as long as a view is less than 60 degrees wide.
+ */
+static bool has_z_rays(const struct geometry *geometry, const struct grid *grid)
+{
+	const int steps = 16;
+	const double margin = 0.9;
+
+	for (int k = 0; k < geometry->count; k++) {
+		const struct view *view = &geometry->views[k];
+
+		for (int i = 0; i <= steps * (steps + 2); i++) {
+			double c = (geometry->columns - 1.0) * (i % (steps + 1)) / steps, d[3];
+			double r = (geometry->rows - 1.0) * (i / (steps + 1)) / steps;
+
+			for (int a = 0; a < 3; a++)
+				d[a] = fabs(view->pixel0[a] - view->source[a] + c * view->column_step[a] +
+					    r * view->row_step[a]) /
+				       grid->spacing[a];
+			if (d[2] >= margin * fmax(d[0], d[1]))
+				return true;
+		}
+	}
+	return false;
+}
+
+/*
+ * Smallest and largest distance, in voxels along z, of the rays of neighbouring
+ * rows where they cross the grid: the magnification varies with the depth, which is extreme at corners.
+ */
+static void row_spacing(const struct geometry *geometry, const struct grid *grid, double *ret_least, double *ret_most,
+			int *ret_sign)
+{
+	double least = INFINITY, most = 0;
+	int up = 0;
+
+	for (int k = 0; k < geometry->count; k++) {
+		const struct view *view = &geometry->views[k];
+		double matrix[12], point[3], column, row, detector = view_project((view_matrix(view, matrix), matrix),
+										  view->pixel0, &column, &row);
+
+		up += view->row_step[2] > 0 ? 1 : -1;
+		for (int corner = 0; corner < 4; corner++) {
+			double depth;
+
+			corner_of(grid, corner, 0.5, point);
+			depth = view_project(matrix, point, &column, &row);
+			least = fmin(least, depth / detector * fabs(view->row_step[2]) / grid->spacing[2]);
+			most = fmax(most, depth / detector * fabs(view->row_step[2]) / grid->spacing[2]);
+		}
+	}
+	*ret_least = least;
+	*ret_most = most;
+	*ret_sign = abs(up) == geometry->count ? (up > 0 ? 1 : -1) : 0;
+}
+
+/* How many neighbours one window of evenly spaced ones may hold: (n - 1) |e| <= 1, 0 when fewer than 3. */
+static int window_size(double least, double most)
+{
+	double e = fmax(fabs(most - 1), fabs(least - 1)) + 1e-4;
+	int size = (int)fmin(1 + 1 / e, 6);
+
+	return size >= 3 ? size : 0;
+}
+
+static void choose_untilted(const struct plan_options *options, struct plan_shape *shape)
+{
+	double least, most;
+	int sign;
+
+	if (!geometry_is_untilted(options->geometry))
+		return;
+	row_spacing(options->geometry, options->grid, &least, &most, &sign);
+	if (sign == 0)
+		return;
+	shape->untilted = true;
+	shape->rows_down = sign < 0;
+	if (!shape->z_rays)
+		shape->forward_rows = window_size(least, most);
+	/* Seen from the detector the same spacing is upside down. */
+	if (!shape->rows_down)
+		shape->back_voxels = window_size(1 / most, 1 / least);
+}
+
+static struct plan_shape shape_of(const struct plan_options *options)
+{
+	const struct geometry *geometry = options->geometry;
+	const struct grid *grid = options->grid;
+	struct plan_shape shape = {};
+	int most = grid->size[0] > grid->size[1] ? grid->size[0] : grid->size[1], subset = 0;
+	bool fits = most <= LAYERS_MOST && grid->size[2] <= SIDE_MOST;
+
+	if (options->sart != NULL)
+		subset = largest_subset(&options->sart->subsets);
+	shape.z_rays = has_z_rays(geometry, grid);
+	choose_untilted(options, &shape);
+	shape.textures = !options->reference_precision && fits && geometry->columns <= SIDE_MOST &&
+			 geometry->rows <= SIDE_MOST;
+	shape.batch = geometry->count < BATCH_MOST ? geometry->count : BATCH_MOST;
+	shape.by_view = subset == 1 && columns_shape_make(grid->size).floats < (size_t)1 << 31;
+	shape.by_subset = subset > 0 && !shape.by_view;
+	shape.correction = shape.by_subset ? subset : 0;
+	shape.covered = is_covered(geometry, grid);
+	shape.views_at_once = geometry->count < VIEWS_AT_ONCE ? geometry->count : VIEWS_AT_ONCE;
+	if (options->column_weights != NULL) {
+		shape.filter_length = filter_choose(geometry->columns);
+		if (shape.filter_length == 0) {
+			shape.fft_length = filter_length(geometry->columns);
+			shape.fft_rows = (int)(FFT_BYTES / ((size_t)(shape.fft_length + 2) * sizeof(float)));
+			if ((size_t)shape.fft_rows > (size_t)shape.batch * (size_t)geometry->rows)
+				shape.fft_rows = shape.batch * geometry->rows;
+		}
+	}
+	return shape;
+}
+
+/* ---- what memory ---- */
+
+static void plan_describe(struct plan *plan, const struct plan_options *options)
+{
+	const struct geometry *geometry = options->geometry;
+	const struct grid *grid = options->grid;
+	const int *size = grid->size;
+
+	plan->options = *options;
+	plan->shape = shape_of(options);
+	for (int i = 0; i < 3; i++) {
+		plan->grid.size[i] = size[i];
+		plan->grid.spacing[i] = (float)grid->spacing[i];
+	}
+	plan->along_x = slices_shape_make(size[0], size[2], size[1]);
+	plan->along_y = slices_shape_make(size[1], size[2], size[0]);
+	plan->columns = columns_shape_make(size);
+	plan->stack = stack_shape_make(geometry->columns, geometry->rows, 1);
+	plan->scratch_bytes = (plan->along_x.floats + plan->along_y.floats) * sizeof(float);
+	if (plan->shape.by_view && plan->columns.floats * sizeof(float) > plan->scratch_bytes)
+		plan->scratch_bytes = plan->columns.floats * sizeof(float);
+	if (tv_scratch_bytes(options) > plan->scratch_bytes)
+		plan->scratch_bytes = tv_scratch_bytes(options);
+	if (plan->shape.by_view)
+		plan->partial_count = sweep_partials(plan);
+	else if (plan->shape.by_subset)
+		plan->partial_count = project_blocks(plan, geometry->count);
+	plan->raw_views = 1;
+	plan->bytes.raw = (size_t)geometry->columns * (size_t)geometry->rows *
+			  (options->linearise.sample == SAMPLE_UINT16 ? 2 : 4);
+	if (plan->bytes.raw < RAW_BYTES)
+		plan->raw_views = (int)(RAW_BYTES / plan->bytes.raw);
+	if (plan->raw_views > geometry->count)
+		plan->raw_views = geometry->count;
+}
+
+static bool needs_arrays_forward(const struct plan *plan)
+{
+	return plan->shape.textures && plan->shape.forward_rows == 0;
+}
+static bool needs_arrays_back(const struct plan *plan)
+{
+	return plan->shape.textures && plan->shape.back_voxels == 0;
+}
+static int array_layers(const struct plan *plan)
+{
+	int subset = plan->shape.correction, batch = plan->shape.batch;
+	int views = subset > batch ? subset : batch;
+
+	return views < plan->shape.views_at_once ? views : plan->shape.views_at_once;
+}
+static bool needs_coverage(const struct plan *plan)
+{
+	return plan->shape.by_subset && !plan->shape.covered;
+}
+static bool needs_work(const struct plan *plan)
+{
+	return plan->shape.correction > plan->shape.views_at_once;
+}
+static size_t pixels_of(const struct plan *plan)
+{
+	return (size_t)plan->stack.columns * (size_t)plan->stack.rows;
+}
+
+int cuda_plan_bytes(struct device *device, const struct plan_options *options, struct plan_bytes *ret_bytes,
+		    struct error *err)
+{
+	struct plan plan = {};
+	struct plan_bytes bytes = {};
+	const struct geometry *geometry = options->geometry;
+	size_t voxels = grid_voxels(options->grid) * sizeof(float), views = (size_t)geometry->count;
+
+	(void)device;
+	(void)err;
+	plan_describe(&plan, options);
+	bytes.stack = stack_bytes(geometry->columns, geometry->rows, geometry->count);
+	bytes.volumes = voxels * (options->sart != NULL ? 2 : 1);
+	bytes.raw = 2 * plan.bytes.raw * (size_t)plan.raw_views;
+	bytes.scratch = plan.scratch_bytes + views * (sizeof(struct device_view) + 2 * sizeof(int)) +
+			plan.partial_count * sizeof(float2) + reduce_bytes() + VIEWS_AT_ONCE * 12 * sizeof(float) +
+			pixels_of(&plan) * 2 + sizeof(unsigned long long);
+	if (needs_arrays_forward(&plan))
+		bytes.scratch += 2 * voxels;
+	if (needs_arrays_back(&plan))
+		bytes.scratch += pixels_of(&plan) * (size_t)array_layers(&plan) * sizeof(float);
+	if (needs_coverage(&plan))
+		bytes.scratch += voxels;
+	if (needs_work(&plan))
+		bytes.scratch += voxels;
+	if (plan.shape.by_view)
+		bytes.scratch += stack_bytes(geometry->rows, geometry->columns, 1);
+	if (plan.shape.by_subset)
+		bytes.scratch += stack_bytes(geometry->columns, geometry->rows, plan.shape.correction);
+	if (options->column_weights != NULL)
+		bytes.scratch +=
+		    views * (size_t)geometry->columns * sizeof(float) + filter_bytes(&plan.shape, geometry->columns);
+	if (options->linearise.flat != NULL)
+		bytes.scratch += pixels_of(&plan) * sizeof(float);
+	if (options->linearise.dark != NULL)
+		bytes.scratch += pixels_of(&plan) * sizeof(float);
+	*ret_bytes = bytes;
+	return 0;
+}
+
+/* ---- making it ---- */
+
+/* World to voxels counted from the grid's centre. */
+static void to_voxels(const struct grid *grid, const double point[3], bool is_place, double ret[3])
+{
+	for (int i = 0; i < 3; i++) {
+		double centre = grid->origin[i] + 0.5 * (grid->size[i] - 1) * grid->spacing[i];
+
+		ret[i] = (point[i] - (is_place ? centre : 0)) / grid->spacing[i];
+	}
+}
+
+static struct device_view view_make(const struct geometry *geometry, const struct grid *grid, int index)
+{
+	const struct view *view = &geometry->views[index];
+	const double isocentre[3] = {0, 0, 0};
+	double source[3], ray[3], forms[3][3], matrix[12], depth, column, row, horizontal;
+	struct device_view result = {};
+
+	to_voxels(grid, view->source, true, source);
+	for (int i = 0; i < 3; i++)
+		ray[i] = view->pixel0[i] + 0.5 * (geometry->columns - 1) * view->column_step[i] +
+			 0.5 * (geometry->rows - 1) * view->row_step[i] - view->source[i];
+	to_voxels(grid, ray, false, forms[0]);
+	to_voxels(grid, view->column_step, false, forms[1]);
+	to_voxels(grid, view->row_step, false, forms[2]);
+	for (int k = 0; k < 3; k++) {
+		double moment[3];
+
+		vec_cross(source, forms[k], moment);
+		for (int i = 0; i < 3; i++) {
+			result.direction[i][k] = (float)forms[k][i];
+			result.moment[i][k] = (float)moment[i];
+		}
+	}
+	view_matrix(view, matrix);
+	depth = view_project(matrix, isocentre, &column, &row);
+	if (!(depth > 0))
+		depth = 1; /* the isocentre is behind the source: there is no FDK weight then, any scale will do */
+	for (int r = 0; r < 3; r++) {
+		double offset = matrix[4 * r + 3];
+
+		for (int i = 0; i < 3; i++) {
+			offset += matrix[4 * r + i] * grid->origin[i];
+			result.matrix[r][i] = (float)(matrix[4 * r + i] * grid->spacing[i] / depth);
+		}
+		result.matrix[r][3] = (float)(offset / depth);
+	}
+	horizontal = hypot(view->source[0], view->source[1]);
+	for (int i = 0; i < 2; i++)
+		result.central[i] = horizontal > 0 ? (float)(-view->source[i] / horizontal) : 0.0f;
+	return result;
+}
+
+static int prepare_geometry(struct plan *plan, struct error *err)
+{
+	const struct geometry *geometry = plan->options.geometry;
+	size_t bytes = (size_t)geometry->count * sizeof(struct device_view);
+	struct device_view *views = (struct device_view *)malloc(bytes);
+	cudaError_t status;
+	int code;
+
+	if (views == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for %d views", geometry->count);
+	for (int i = 0; i < geometry->count; i++)
+		views[i] = view_make(geometry, plan->options.grid, i);
+	code = device_allocate(plan->device, bytes, (void **)&plan->geometry, err);
+	if (code == 0) {
+		status = cudaMemcpy(plan->geometry, views, bytes, cudaMemcpyHostToDevice);
+		if (status != cudaSuccess)
+			code = cuda_error(err, status, "uploading the geometry");
+	}
+	free(views);
+	return code;
+}
+
+static int prepare_image(struct plan *plan, const float *from, float **ret_to, struct error *err)
+{
+	size_t bytes = pixels_of(plan) * sizeof(float);
+
+	if (from == NULL)
+		return 0;
+	TRY(device_allocate(plan->device, bytes, (void **)ret_to, err));
+	CUDA_TRY(cudaMemcpy(*ret_to, from, bytes, cudaMemcpyHostToDevice));
+	return 0;
+}
+
+static int prepare_linearise(struct plan *plan, struct error *err)
+{
+	size_t raw = plan->bytes.raw * (size_t)plan->raw_views;
+
+	for (int i = 0; i < 2; i++) {
+		TRY(device_allocate(plan->device, raw, &plan->raw[i], err));
+		TRY(device_allocate(plan->device, pixels_of(plan), (void **)&plan->marks[i], err));
+		CUDA_TRY(cudaMallocHost(&plan->raw_pinned[i], raw));
+		CUDA_TRY(cudaEventCreateWithFlags(&plan->raw_copied[i], cudaEventDisableTiming));
+	}
+	CUDA_TRY(cudaEventCreateWithFlags(&plan->asked, cudaEventDisableTiming));
+	CUDA_TRY(cudaEventCreateWithFlags(&plan->linearised, cudaEventDisableTiming));
+	TRY(device_allocate(plan->device, sizeof(*plan->defects), (void **)&plan->defects, err));
+	TRY(prepare_image(plan, plan->options.linearise.flat, &plan->flat, err));
+	return prepare_image(plan, plan->options.linearise.dark, &plan->dark, err);
+}
+
+static int prepare_sart(struct plan *plan, struct error *err)
+{
+	const struct geometry *geometry = plan->options.geometry;
+	size_t voxels = grid_voxels(plan->options.grid) * sizeof(float);
+
+	if (plan->partial_count > 0)
+		TRY(device_allocate(plan->device, plan->partial_count * sizeof(float2), (void **)&plan->partial, err));
+	plan->coverage_subset = -1;
+	if (needs_coverage(plan))
+		TRY(device_allocate(plan->device, voxels, (void **)&plan->coverage, err));
+	if (needs_work(plan))
+		TRY(device_allocate(plan->device, voxels, (void **)&plan->work, err));
+	if (plan->shape.by_view) /* turned: [column][row] */
+		return cuda_stack_new(plan->device, geometry->rows, geometry->columns, 1, &plan->correction, err);
+	if (plan->shape.by_subset)
+		return cuda_stack_new(plan->device, geometry->columns, geometry->rows, plan->shape.correction,
+				      &plan->correction, err);
+	return 0;
+}
+
+static int prepare_arrays(struct plan *plan, struct error *err)
+{
+	const int *size = plan->grid.size;
+
+	if (needs_arrays_forward(plan)) {
+		TRY(layered_new(plan->device, size[1], size[2], size[0], cudaAddressModeClamp, &plan->slices[0], err));
+		TRY(layered_new(plan->device, size[0], size[2], size[1], cudaAddressModeClamp, &plan->slices[1], err));
+	}
+	if (needs_arrays_back(plan)) {
+		plan->shape.views_at_once = array_layers(plan);
+		TRY(layered_new(plan->device, plan->stack.columns, plan->stack.rows, plan->shape.views_at_once,
+				cudaAddressModeBorder, &plan->projections, err));
+	}
+	return 0;
+}
+
+static int plan_prepare(struct plan *plan, struct error *err)
+{
+	size_t count = (size_t)plan->options.geometry->count;
+
+	TRY(device_enter(plan->device, err));
+	TRY(prepare_geometry(plan, err));
+	plan->views_host = (int *)malloc(count * sizeof(int));
+	if (plan->views_host == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a plan of %zu views", count);
+	TRY(device_allocate(plan->device, count * sizeof(int), (void **)&plan->views, err));
+	TRY(device_allocate(plan->device, count * sizeof(int), (void **)&plan->slots, err));
+	TRY(device_allocate(plan->device, reduce_bytes(), (void **)&plan->reduce, err));
+	TRY(device_allocate(plan->device, VIEWS_AT_ONCE * 12 * sizeof(float), (void **)&plan->matrices, err));
+	TRY(device_allocate(plan->device, plan->scratch_bytes, (void **)&plan->scratch, err));
+	/* Samples with weight 0 are read from what no copy has written: it must be a number. */
+	CUDA_TRY(cudaMemsetAsync(plan->scratch, 0, plan->scratch_bytes, plan->device->stream));
+	TRY(prepare_arrays(plan, err));
+	TRY(prepare_linearise(plan, err));
+	TRY(prepare_sart(plan, err));
+	if (plan->options.column_weights != NULL)
+		TRY(filter_prepare(plan, err));
+	return device_wait(plan->device, err);
+}
+
+static void summarise(struct plan *plan)
+{
+	const struct plan_shape *shape = &plan->shape;
+	char forward[64] = "general", back[64] = "general";
+
+	if (shape->forward_rows > 0)
+		snprintf(forward, sizeof(forward), "untilted, %d rows a thread", shape->forward_rows);
+	if (shape->back_voxels > 0)
+		snprintf(back, sizeof(back), "untilted, %d voxels a window", shape->back_voxels);
+	snprintf(plan->summary, sizeof(plan->summary), "forward %s; back %s; %s; %s", forward, back,
+		 shape->textures ? "texture sampling" : "float32 sampling",
+		 shape->filter_length > 0 ? "fused filter" : shape->fft_length > 0 ? "cuFFT" : "no filter");
+}
+
+int cuda_plan_new(struct device *device, const struct plan_options *options, struct plan **ret_plan, struct error *err)
+{
+	struct plan *plan = (struct plan *)calloc(1, sizeof(*plan));
+	int code;
+
+	if (plan == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a plan");
+	plan->device = device;
+	plan_describe(plan, options);
+	code = plan_prepare(plan, err);
+	if (code < 0) {
+		cuda_plan_free(plan);
+		return code;
+	}
+	summarise(plan);
+	*ret_plan = plan;
+	return 0;
+}
+
+void cuda_plan_free(struct plan *plan)
+{
+	struct device *device;
+	size_t count, voxels;
+
+	if (plan == NULL)
+		return;
+	device = plan->device;
+	count = (size_t)plan->options.geometry->count;
+	voxels = grid_voxels(plan->options.grid) * sizeof(float);
+	cudaSetDevice(device->index);
+	cudaStreamSynchronize(device->copy);
+	cudaStreamSynchronize(device->stream);
+	if (plan->sweep != NULL)
+		cudaGraphExecDestroy(plan->sweep);
+	filter_release(plan);
+	device_release(device, plan->geometry, count * sizeof(struct device_view));
+	device_release(device, plan->views, count * sizeof(int));
+	device_release(device, plan->slots, count * sizeof(int));
+	device_release(device, plan->reduce, reduce_bytes());
+	device_release(device, plan->matrices, VIEWS_AT_ONCE * 12 * sizeof(float));
+	device_release(device, plan->scratch, plan->scratch_bytes);
+	for (int i = 0; i < 2; i++) {
+		layered_free(device, &plan->slices[i]);
+		device_release(device, plan->raw[i], plan->bytes.raw * (size_t)plan->raw_views);
+		device_release(device, plan->marks[i], pixels_of(plan));
+		if (plan->raw_pinned[i] != NULL)
+			cudaFreeHost(plan->raw_pinned[i]);
+		if (plan->raw_copied[i] != NULL)
+			cudaEventDestroy(plan->raw_copied[i]);
+	}
+	if (plan->asked != NULL)
+		cudaEventDestroy(plan->asked);
+	if (plan->linearised != NULL)
+		cudaEventDestroy(plan->linearised);
+	layered_free(device, &plan->projections);
+	device_release(device, plan->defects, sizeof(*plan->defects));
+	device_release(device, plan->flat, pixels_of(plan) * sizeof(float));
+	device_release(device, plan->dark, pixels_of(plan) * sizeof(float));
+	device_release(device, plan->partial, plan->partial_count * sizeof(float2));
+	device_release(device, plan->coverage, voxels);
+	device_release(device, plan->work, voxels);
+	cuda_stack_free(plan->correction);
+	free(plan->views_host);
+	free(plan);
+}
+
+const char *cuda_plan_summary(const struct plan *plan)
+{
+	return plan->summary;
+}
+
+int cuda_plan_batch(const struct plan *plan)
+{
+	return plan->shape.batch;
+}
+
+/* ---- lists of views ---- */
+
+int plan_check_views(const struct plan *plan, const int *views, int count, const struct stack *stack, int slots,
+		     struct error *err)
+{
+	int all = plan->options.geometry->count;
+
+	if (count < 0 || count > all)
+		return error_set(err, ERR_INTERNAL, "%d views at once, there are %d", count, all);
+	if (stack->shape.columns != plan->stack.columns || stack->shape.rows != plan->stack.rows ||
+	    stack->slots < slots)
+		return error_set(err, ERR_INTERNAL, "a stack of %d projections of %d x %d, expected %d of %d x %d",
+				 stack->slots, stack->shape.columns, stack->shape.rows, slots, plan->stack.columns,
+				 plan->stack.rows);
+	for (int i = 0; i < count; i++)
+		if (views[i] < 0 || views[i] >= all)
+			return error_set(err, ERR_INTERNAL, "view %d of %d", views[i], all);
+	return 0;
+}
+
+int plan_set_views(struct plan *plan, const int *views, int count, struct error *err)
+{
+	size_t bytes = (size_t)count * sizeof(int);
+
+	TRY(device_enter(plan->device, err));
+	if (count <= plan->views_held && memcmp(views, plan->views_host, bytes) == 0)
+		return 0;
+	memcpy(plan->views_host, views, bytes);
+	plan->views_held = count;
+	/* From pageable memory: it has been read when the call returns. */
+	CUDA_TRY(cudaMemcpyAsync(plan->views, views, bytes, cudaMemcpyHostToDevice, plan->device->stream));
+	return 0;
+}
+
+int plan_set_slots(struct plan *plan, const int *slots, int count, const struct stack *from, struct error *err)
+{
+	for (int i = 0; i < count; i++)
+		if (slots[i] < 0 || slots[i] >= from->slots)
+			return error_set(err, ERR_INTERNAL, "slot %d of a stack of %d", slots[i], from->slots);
+	CUDA_TRY(cudaMemcpyAsync(plan->slots, slots, (size_t)count * sizeof(int), cudaMemcpyHostToDevice,
+				 plan->device->stream));
+	return 0;
+}

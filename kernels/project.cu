@@ -1,0 +1,402 @@
+/*
+ * Forward projection: Joseph's method (rays.cuh), all views of a call in one launch.
+ *
+ * General: a thread has one ray and a warp 32 neighbours in a row, which walk the
+ * slices of their axis together. Samples are alternately taken by the texture
+ * unit and by four plain loads: either pipe alone is the limit, both together
+ * nearly add up. Reference precision has loads only, since the texture unit's
+ * weights have 8 bits.
+ *
+ * Untilted: the rays of a column share their way across the rows' direction,
+ * and in every slice adjacent rows of the detector are evenly spaced along z,
+ * 1 + e voxels apart. A thread has ROWS of them: it interpolates ROWS + 2 values
+ * across once, x[0] at the floor B of the lowest row, and row k lies at
+ * t = z - B + k e beyond k, 0 <= t <= 2, where the two pieces of
+ *   x[k+1] - saturate(1 - t) (x[k+1] - x[k]) + saturate(t - 1) (x[k+2] - x[k+1])
+ * give the linear interpolation without a branch or a dynamic index. This holds
+ * while (ROWS - 1) |e| <= 1, which plan.cu sees to.
+ *
+ * Blocks are ordered by groups of views, then by tiles of the detector, then by
+ * views: those that run at one time see the same part of the volume from many
+ * sides, and the second cache keeps it.
+ */
+#include "kernels/rays.cuh"
+
+/* Views of a group: as many as fill the card with blocks of one or two tiles. */
+static const int GROUP = 128;
+
+struct projection {
+	const device_view *geometry;
+	const int *views;
+	int count;
+	int tiles_across, tiles;
+	device_grid grid;
+	struct slices across[2];
+	cudaTextureObject_t texture[2];
+	const float *volume; /* [z][y][x], for rays along z */
+	int columns, rows, pitch;
+	size_t slot;
+	bool rows_down;
+	struct ray_use use;
+	float *to;
+};
+
+struct place {
+	int slot, tile_column, tile_row;
+};
+static __device__ __forceinline__ place place_of(const projection &p)
+{
+	int block = blockIdx.x, whole = GROUP * p.tiles, group = block / whole, rest = block - group * whole;
+	int views = min(GROUP, p.count - group * GROUP), tile = rest / views, row = tile / p.tiles_across;
+
+	return {group * GROUP + rest - tile * views, tile - row * p.tiles_across, row};
+}
+
+/* Stores a ray's line integral, or what SART makes of it, and gives the squares for the sums. */
+static __device__ __forceinline__ float2 finish(const projection &p, int slot, int view, int column, int row, float sum,
+						float slices, float step)
+{
+	size_t pixel = (size_t)row * p.pitch + column;
+	float integral = sum * step, length = slices * step, value = integral;
+	float2 squares = {0, 0};
+
+	if (p.use.measured != NULL) {
+		float measured = p.use.measured[(size_t)view * p.slot + pixel], residual = measured - integral;
+
+		value = slices > 0 && length >= p.use.least ? residual / length : 0.0f;
+		squares = {residual * residual, measured * measured};
+	}
+	p.to[(size_t)slot * p.slot + pixel] = value;
+	return squares;
+}
+
+enum { GENERAL_ROWS = 8 }; /* of a block, 32 columns wide: a warp a row */
+
+template <bool TEXTURE, bool ALONG_Z>
+static __global__ void __launch_bounds__(32 * GENERAL_ROWS) project_general(const projection p)
+{
+	place at = place_of(p);
+	int view = p.views[at.slot];
+	const device_view &g = p.geometry[view];
+	int column = at.tile_column * 32 + threadIdx.x, row = at.tile_row * GENERAL_ROWS + threadIdx.y;
+	bool valid = column < p.columns && row < p.rows;
+	float c = (float)column - 0.5f * (float)(p.columns - 1), r = (float)row - 0.5f * (float)(p.rows - 1);
+	float d[3] = {form(g.direction[0], c, r), form(g.direction[1], c, r), form(g.direction[2], c, r)};
+	float m[3] = {form(g.moment[0], c, r), form(g.moment[1], c, r), form(g.moment[2], c, r)};
+	int own = dominant_axis(d[0], d[1], d[2]);
+	float sum = 0, slices = 0, step = 0;
+
+	/* Warps near the diagonals hold rays of both axes: they walk twice. */
+	for (int axis = ACROSS_X; axis <= ACROSS_Y; axis++) {
+		bool mine = valid && own == axis;
+
+		if (!__any_sync(~0u, mine))
+			continue;
+		slice_axes axes = axes_of(p.grid, axis);
+		ray s = ray_idle(axes);
+		if (mine) {
+			ray full = ray_make(crossing_of(d, m, axis), axes);
+
+			if (full.end > full.begin)
+				s = full;
+		}
+		bool hits = s.end > s.begin;
+		int first = first_slice(s.begin), last = last_slice(s.end);
+		walk w = walk_together(hits, first, last + 1, first + 1, last);
+		const float *data = p.across[axis].data;
+		size_t slice = p.across[axis].slice;
+		int stride = p.across[axis].row;
+		cudaTextureObject_t texture = p.texture[axis];
+		auto hard = [&](int i) {
+			return tex2DLayered<float>(texture, fmaf((float)i, s.fast_step, s.fast + 0.5f),
+						   fmaf((float)i, s.row_step, s.row + 0.5f), i);
+		};
+		auto soft = [&](int i) {
+			return sample(data + slice * (size_t)i, stride, 1, fmaf((float)i, s.fast_step, s.fast),
+				      fmaf((float)i, s.row_step, s.row));
+		};
+		float total = 0;
+		auto edge = [&](int from, int to) {
+			for (int i = from; i < to; i++) {
+				float fast = fminf(fmaxf(fmaf((float)i, s.fast_step, s.fast), -1.0f), (float)axes.fast);
+				float up = fminf(fmaxf(fmaf((float)i, s.row_step, s.row), -1.0f), (float)axes.rows);
+
+				total = fmaf(part_of(i, s.begin, s.end),
+					     sample(data + slice * (size_t)i, stride, 1, fast, up), total);
+			}
+		};
+
+		edge(w.first, w.inner_first);
+		int i = w.inner_first;
+		if (TEXTURE)
+			for (; i + 2 <= w.inner_end; i += 2)
+				total += hard(i) + soft(i + 1);
+#pragma unroll 4
+		for (; i < w.inner_end; i++)
+			total += soft(i);
+		edge(w.inner_end, w.end);
+		if (hits) {
+			sum = total;
+			slices = s.end - s.begin;
+			step = s.step;
+		}
+	}
+	if (ALONG_Z && valid && own == ACROSS_Z) {
+		slice_axes axes = axes_of(p.grid, ACROSS_Z);
+		ray s = ray_make(crossing_of(d, m, ACROSS_Z), axes);
+		size_t slice = (size_t)axes.fast * (size_t)axes.rows;
+
+		if (s.end > s.begin) {
+			for (int i = first_slice(s.begin), last = last_slice(s.end); i <= last; i++)
+				sum = fmaf(part_of(i, s.begin, s.end),
+					   sample_held(p.volume + slice * (size_t)i, axes.fast, 1,
+						       fmaf((float)i, s.fast_step, s.fast),
+						       fmaf((float)i, s.row_step, s.row), axes),
+					   sum);
+			slices = s.end - s.begin;
+		}
+		step = s.step;
+	}
+	float2 squares = {0, 0};
+	if (valid)
+		squares = finish(p, at.slot, view, column, row, sum, slices, step);
+	if (p.use.measured != NULL) {
+		squares = block_sum(squares);
+		if (threadIdx.x == 0 && threadIdx.y == 0)
+			p.use.partial[blockIdx.x] = squares;
+	}
+}
+
+/* ---- untilted ---- */
+
+enum { UNTILTED_WARPS = 4 }; /* of a block: 32 columns wide, UNTILTED_WARPS * ROWS rows high */
+
+/* A column's rays: row k, counted upwards, crosses slice i at row + i row_step + k (1 + spread + i spread_step). */
+struct fan {
+	float fast, fast_step, row, row_step, spread, spread_step;
+	float from, to;        /* where all are inside across z, counted from the middle slice */
+	float middle_row, middle_spread; /* row and spread in the middle slice, of centred z */
+};
+
+template <int ROWS, bool GUARD>
+static __device__ __forceinline__ void add_rows(const float *__restrict__ slice, int stride, const fan &f, int i,
+						const slice_axes &axes, const float begin[ROWS],
+						const float end[ROWS], float sum[ROWS])
+{
+	float fast = fmaf((float)i, f.fast_step, f.fast), row = fmaf((float)i, f.row_step, f.row);
+	float e = fmaf((float)i, f.spread_step, f.spread), right, base = row + fminf(0.0f, (float)(ROWS - 1) * e), unused;
+	float x[ROWS + 2];
+
+	if (GUARD) {
+		fast = fminf(fmaxf(fast, -1.0f), (float)axes.fast);
+		base = fminf(fmaxf(base, (float)-SLICE_PAD), (float)axes.rows);
+	}
+	int column = split(fast, right), low = split(base, unused);
+	const float *q = slice + (low * stride + column);
+#pragma unroll
+	for (int j = 0; j < ROWS + 2; j++)
+		x[j] = mix(q[j * stride], q[j * stride + 1], right);
+	float t = row - (float)low, below = x[1] - x[0];
+#pragma unroll
+	for (int k = 0; k < ROWS; k++) {
+		float down = __saturatef(fmaf((float)-k, e, 1.0f - t)), up = __saturatef(fmaf((float)k, e, t - 1.0f));
+		float above = x[k + 2] - x[k + 1];
+
+		if (GUARD) {
+			sum[k] = fmaf(part_of(i, begin[k], end[k]), fmaf(up, above, fmaf(-down, below, x[k + 1])), sum[k]);
+		} else {
+			sum[k] += x[k + 1];
+			sum[k] = fmaf(-down, below, sum[k]);
+			sum[k] = fmaf(up, above, sum[k]);
+		}
+		below = above;
+	}
+}
+
+/* Where row k is inside of the box, in slices. */
+static __device__ __forceinline__ void row_range(const fan &f, int k, const slice_axes &axes, float &begin, float &end)
+{
+	float from = f.from, to = f.to, middle = 0.5f * (float)(axes.across - 1);
+
+	clip(fmaf((float)k, f.middle_spread, f.middle_row), fmaf((float)k, f.spread_step, f.row_step),
+	     0.5f * (float)axes.rows, from, to);
+	begin = from + middle;
+	end = to + middle;
+}
+
+template <int ROWS>
+static __global__ void __launch_bounds__(32 * UNTILTED_WARPS) project_untilted(const projection p)
+{
+	place at = place_of(p);
+	int view = p.views[at.slot];
+	const device_view &g = p.geometry[view];
+	int column = at.tile_column * 32 + threadIdx.x, low = (at.tile_row * UNTILTED_WARPS + threadIdx.y) * ROWS;
+	bool valid = column < p.columns && low < p.rows;
+	float upwards = p.rows_down ? -1.0f : 1.0f;
+	float c = (float)column - 0.5f * (float)(p.columns - 1);
+	float r = upwards * ((float)low - 0.5f * (float)(p.rows - 1));
+	float d[3] = {form(g.direction[0], c, r), form(g.direction[1], c, r), form(g.direction[2], c, r)};
+	float m[3] = {form(g.moment[0], c, r), form(g.moment[1], c, r), form(g.moment[2], c, r)};
+	int own = fabsf(d[0]) >= fabsf(d[1]) ? ACROSS_X : ACROSS_Y;
+	float2 squares = {0, 0};
+
+	for (int axis = ACROSS_X; axis <= ACROSS_Y; axis++) {
+		bool mine = valid && own == axis;
+
+		if (!__any_sync(~0u, mine))
+			continue;
+		slice_axes axes = axes_of(p.grid, axis);
+		crossing cross = crossing_of(d, m, axis);
+		float inverse = upwards / (axis == ACROSS_X ? d[0] : d[1]), middle = 0.5f * (float)(axes.across - 1);
+		float moment_rise = axis == ACROSS_X ? g.moment[1][2] : -g.moment[0][2];
+		fan f;
+		int any_first = 1 << 28, any_end = -1, all_first = 0, all_end = 1 << 28;
+		float begin[ROWS], end[ROWS], sum[ROWS];
+
+		f.from = -0.5f * (float)axes.across;
+		f.to = -f.from;
+		clip(cross.fast, cross.fast_step, 0.5f * (float)axes.fast, f.from, f.to);
+		f.middle_row = cross.row;
+		f.middle_spread = moment_rise * inverse;
+		f.row_step = cross.row_step;
+		f.spread_step = g.direction[2][2] * inverse;
+		f.fast_step = cross.fast_step;
+		f.fast = fmaf(-middle, f.fast_step, cross.fast + 0.5f * (float)(axes.fast - 1));
+		f.row = fmaf(-middle, f.row_step, f.middle_row + 0.5f * (float)(axes.rows - 1));
+		f.spread = fmaf(-middle, f.spread_step, f.middle_spread) - 1.0f;
+#pragma unroll
+		for (int k = 0; k < ROWS; k++) {
+			sum[k] = 0;
+			begin[k] = end[k] = 0;
+			if (!mine || low + k >= p.rows)
+				continue;
+			row_range(f, k, axes, begin[k], end[k]);
+			bool crosses = end[k] > begin[k];
+			int first = first_slice(begin[k]), last = last_slice(end[k]);
+
+			any_first = min(any_first, crosses ? first : 1 << 28);
+			any_end = max(any_end, crosses ? last + 1 : -1);
+			all_first = max(all_first, crosses ? first + 1 : 1 << 28);
+			all_end = min(all_end, crosses ? last : -1);
+		}
+		bool hits = any_end > any_first;
+		if (!hits)
+			f = {0.5f * (float)(axes.fast - 1), 0, 0.5f * (float)(axes.rows - 1), 0, 0, 0, 0, 0, 0, 0};
+		walk w = walk_together(hits, any_first, any_end, all_first, all_end);
+		const float *data = p.across[axis].data;
+		size_t slice = p.across[axis].slice;
+		int stride = p.across[axis].row;
+
+		for (int i = w.first; i < w.inner_first; i++)
+			add_rows<ROWS, true>(data + slice * (size_t)i, stride, f, i, axes, begin, end, sum);
+		for (int i = w.inner_end; i < w.end; i++)
+			add_rows<ROWS, true>(data + slice * (size_t)i, stride, f, i, axes, begin, end, sum);
+		const float *at_slice = data + slice * (size_t)w.inner_first;
+		for (int i = w.inner_first; i < w.inner_end; i++, at_slice += slice)
+			add_rows<ROWS, false>(at_slice, stride, f, i, axes, begin, end, sum);
+		if (!mine)
+			continue;
+#pragma unroll
+		for (int k = 0; k < ROWS; k++) {
+			if (low + k >= p.rows)
+				continue;
+			float fast_mm = cross.fast_step * axes.spacing_fast;
+			float row_mm = fmaf((float)k, g.direction[2][2] * inverse, cross.row_step) * axes.spacing_row;
+			float step = sqrtf(axes.spacing_across * axes.spacing_across + fast_mm * fast_mm +
+					   row_mm * row_mm);
+			int row = p.rows_down ? p.rows - 1 - (low + k) : low + k;
+			float from = 0, to = 0;
+
+			if (hits)
+				row_range(f, k, axes, from, to);
+			float2 square = finish(p, at.slot, view, column, row, to > from ? sum[k] : 0.0f, to - from, step);
+			squares.x += square.x;
+			squares.y += square.y;
+		}
+	}
+	if (p.use.measured != NULL) {
+		squares = block_sum(squares);
+		if (threadIdx.x == 0 && threadIdx.y == 0)
+			p.use.partial[blockIdx.x] = squares;
+	}
+}
+
+static int rows_of_a_tile(const plan_shape &shape)
+{
+	return shape.forward_rows > 0 ? UNTILTED_WARPS * shape.forward_rows : GENERAL_ROWS;
+}
+
+static void count_tiles(const struct plan *plan, int *ret_across, int *ret_tiles)
+{
+	*ret_across = divide_up(plan->stack.columns, 32);
+	*ret_tiles = *ret_across * divide_up(plan->stack.rows, rows_of_a_tile(plan->shape));
+}
+
+size_t project_blocks(const struct plan *plan, int count)
+{
+	int across, tiles;
+
+	count_tiles(plan, &across, &tiles);
+	return (size_t)tiles * (size_t)count;
+}
+
+int project_rays(struct plan *plan, const float *volume, int first, int count, struct ray_use use, float *to,
+		 struct error *err)
+{
+	cudaStream_t stream = plan->device->stream;
+	projection p = {};
+	unsigned blocks = (unsigned)project_blocks(plan, count);
+
+	p.geometry = plan->geometry;
+	p.views = plan->views + first;
+	p.count = count;
+	count_tiles(plan, &p.tiles_across, &p.tiles);
+	p.grid = plan->grid;
+	p.across[0] = slices_at(plan->scratch, &plan->along_x);
+	p.across[1] = slices_at(plan->scratch + plan->along_x.floats, &plan->along_y);
+	p.texture[0] = plan->slices[0].texture;
+	p.texture[1] = plan->slices[1].texture;
+	p.volume = volume;
+	p.columns = plan->stack.columns;
+	p.rows = plan->stack.rows;
+	p.pitch = plan->stack.pitch;
+	p.slot = plan->stack.slot;
+	p.rows_down = plan->shape.rows_down;
+	p.use = use;
+	p.to = to;
+	dim3 untilted(32, UNTILTED_WARPS), general(32, GENERAL_ROWS);
+	switch (plan->shape.forward_rows) {
+	case 3:
+		project_untilted<3><<<blocks, untilted, 0, stream>>>(p);
+		break;
+	case 4:
+		project_untilted<4><<<blocks, untilted, 0, stream>>>(p);
+		break;
+	case 5:
+		project_untilted<5><<<blocks, untilted, 0, stream>>>(p);
+		break;
+	case 6:
+		project_untilted<6><<<blocks, untilted, 0, stream>>>(p);
+		break;
+	default:
+		if (plan->shape.textures && plan->shape.z_rays)
+			project_general<true, true><<<blocks, general, 0, stream>>>(p);
+		else if (plan->shape.textures)
+			project_general<true, false><<<blocks, general, 0, stream>>>(p);
+		else if (plan->shape.z_rays)
+			project_general<false, true><<<blocks, general, 0, stream>>>(p);
+		else
+			project_general<false, false><<<blocks, general, 0, stream>>>(p);
+	}
+	LAUNCHED();
+	return 0;
+}
+
+int cuda_project(struct plan *plan, const struct volume *from, const int *views, int count, struct stack *to,
+		 struct error *err)
+{
+	TRY(plan_check_views(plan, views, count, to, count, err));
+	TRY(plan_set_views(plan, views, count, err));
+	TRY(layout_slices(plan, from->data, err));
+	return project_rays(plan, from->data, 0, count, {}, to->data, err);
+}

@@ -1,0 +1,222 @@
+#ifndef CBCT_KERNELS_RAYS_CUH
+#define CBCT_KERNELS_RAYS_CUH
+
+/*
+ * A ray among the slices across its dominant axis, as Joseph's method walks it
+ * (IEEE Trans. Med. Imaging 1, 1982): one bilinear sample where it crosses the
+ * middle of each slice, times the distance from one slice to the next along the
+ * ray. The box ends half a voxel beyond the outer centres, with the outer values
+ * held there; the first and the last slice count with the part of them between
+ * the ray's entry and exit. The row sum of a ray, sum_m w_im, is thus its length
+ * inside the box.
+ */
+#include "kernels/internal.cuh"
+
+/* Axes of a slice: across (the dominant one), fast (contiguous in the copies) and row. */
+enum { ACROSS_X, ACROSS_Y, ACROSS_Z };
+
+struct ray {
+	float fast, fast_step; /* index along the fast axis in slice i: fast + i fast_step */
+	float row, row_step;
+	float step;       /* mm from slice to slice */
+	float begin, end; /* between entry and exit, in slices; begin >= end: it misses the box */
+};
+
+static __device__ __forceinline__ float form(const float coefficients[3], float column, float row)
+{
+	return fmaf(coefficients[2], row, fmaf(coefficients[1], column, coefficients[0]));
+}
+
+/* The axis along which a direction, in voxels, is longest; the first of equal ones. */
+static __device__ __forceinline__ int dominant_axis(float x, float y, float z)
+{
+	x = fabsf(x), y = fabsf(y), z = fabsf(z);
+	return x >= y && x >= z ? ACROSS_X : y >= z ? ACROSS_Y : ACROSS_Z;
+}
+
+/* Narrows [from, to] to where |at + t slope| <= half; a slope of 0 leaves it or empties it. */
+static __device__ __forceinline__ void clip(float at, float slope, float half, float &from, float &to)
+{
+	float inverse = 1.0f / slope, a = (-half - at) * inverse, b = (half - at) * inverse;
+
+	from = fmaxf(from, fminf(a, b));
+	to = fminf(to, fmaxf(a, b));
+}
+
+/* The part of slice i that lies between entry and exit. */
+static __device__ __forceinline__ float part_of(int i, float begin, float end)
+{
+	return fmaxf(fminf((float)i + 0.5f, end) - fmaxf((float)i - 0.5f, begin), 0.0f);
+}
+
+/* The slices that a ray crosses, first .. last, of which those in between count as a whole. */
+static __device__ __forceinline__ int first_slice(float begin)
+{
+	return (int)floorf(begin + 0.5f);
+}
+static __device__ __forceinline__ int last_slice(float end)
+{
+	return (int)ceilf(end - 0.5f);
+}
+
+/* Sizes and spacings of the grid along the axes of a slice. */
+struct slice_axes {
+	int across, fast, rows;
+	float spacing_across, spacing_fast, spacing_row;
+};
+static __device__ __forceinline__ slice_axes axes_of(const device_grid &grid, int axis)
+{
+	if (axis == ACROSS_X)
+		return {grid.size[0],    grid.size[1],	  grid.size[2],
+			grid.spacing[0], grid.spacing[1], grid.spacing[2]};
+	if (axis == ACROSS_Y)
+		return {grid.size[1],    grid.size[0],	  grid.size[2],
+			grid.spacing[1], grid.spacing[0], grid.spacing[2]};
+	return {grid.size[2], grid.size[0], grid.size[1], grid.spacing[2], grid.spacing[0], grid.spacing[1]};
+}
+
+/* The ray's coordinates on the plane through the middle of the grid, and their change per slice. */
+struct crossing {
+	float fast, row, fast_step, row_step;
+};
+static __device__ __forceinline__ crossing crossing_of(const float d[3], const float m[3], int axis)
+{
+	float along = axis == ACROSS_X ? d[0] : axis == ACROSS_Y ? d[1] : d[2];
+	float inverse = 1.0f / along;
+
+	if (axis == ACROSS_X)
+		return {-m[2] * inverse, m[1] * inverse, d[1] * inverse, d[2] * inverse};
+	if (axis == ACROSS_Y)
+		return {m[2] * inverse, -m[0] * inverse, d[0] * inverse, d[2] * inverse};
+	return {-m[1] * inverse, m[0] * inverse, d[0] * inverse, d[1] * inverse};
+}
+
+static __device__ __forceinline__ ray ray_make(const crossing &at, const slice_axes &axes)
+{
+	float middle = 0.5f * (float)(axes.across - 1), to = 0.5f * (float)axes.across, from = -to;
+	ray r;
+
+	clip(at.fast, at.fast_step, 0.5f * (float)axes.fast, from, to);
+	clip(at.row, at.row_step, 0.5f * (float)axes.rows, from, to);
+	r.begin = from + middle;
+	r.end = to + middle;
+	r.fast_step = at.fast_step;
+	r.row_step = at.row_step;
+	r.fast = fmaf(-middle, at.fast_step, at.fast + 0.5f * (float)(axes.fast - 1));
+	r.row = fmaf(-middle, at.row_step, at.row + 0.5f * (float)(axes.rows - 1));
+	r.step = sqrtf(axes.spacing_across * axes.spacing_across +
+		       at.fast_step * axes.spacing_fast * at.fast_step * axes.spacing_fast +
+		       at.row_step * axes.spacing_row * at.row_step * axes.spacing_row);
+	return r;
+}
+
+/* A ray that stays in the middle of the box: what a lane without one of its own follows. */
+static __device__ __forceinline__ ray ray_idle(const slice_axes &axes)
+{
+	return {0.5f * (float)(axes.fast - 1), 0, 0.5f * (float)(axes.rows - 1), 0, 0, 0, 0};
+}
+
+/*
+ * floor(x) and what is above it for |x| < 2^22, without a conversion: adding
+ * 1.5 * 2^23 with rounding down leaves the integer in the lowest bits.
+ */
+static __device__ __forceinline__ int split(float x, float &fraction)
+{
+	const float shift = 12582912.0f;
+	float shifted = __fadd_rd(x, shift);
+
+	fraction = x - (shifted - shift);
+	return __float_as_int(shifted) - 0x4B400000;
+}
+
+static __device__ __forceinline__ float mix(float a, float b, float part)
+{
+	return fmaf(part, b - a, a);
+}
+
+/* Bilinear sample; all four neighbours must be readable. */
+static __device__ __forceinline__ float sample(const float *__restrict__ slice, int row_stride, int fast_stride,
+					       float fast, float row)
+{
+	float across, up;
+	int i = split(fast, across), j = split(row, up);
+	const float *p = slice + (j * row_stride + i * fast_stride), *q = p + row_stride;
+
+	return mix(mix(p[0], p[fast_stride], across), mix(q[0], q[fast_stride], across), up);
+}
+
+/* The same with the outer voxels held beyond the edges. */
+static __device__ __forceinline__ float sample_held(const float *__restrict__ slice, int row_stride, int fast_stride,
+						    float fast, float row, const slice_axes &axes)
+{
+	float across, up;
+	int i = split(fast, across), j = split(row, up);
+	int i0 = min(max(i, 0), axes.fast - 1) * fast_stride, i1 = min(max(i + 1, 0), axes.fast - 1) * fast_stride;
+	int j0 = min(max(j, 0), axes.rows - 1) * row_stride, j1 = min(max(j + 1, 0), axes.rows - 1) * row_stride;
+
+	return mix(mix(slice[j0 + i0], slice[j0 + i1], across), mix(slice[j1 + i0], slice[j1 + i1], across), up);
+}
+
+static __device__ __forceinline__ int warp_min(int value)
+{
+#if __CUDA_ARCH__ >= 800
+	return __reduce_min_sync(~0u, value);
+#else
+	for (int lane = 16; lane > 0; lane >>= 1)
+		value = min(value, __shfl_xor_sync(~0u, value, lane));
+	return value;
+#endif
+}
+
+static __device__ __forceinline__ int warp_max(int value)
+{
+	return -warp_min(-value);
+}
+
+/*
+ * Slices that a warp walks together, so that its lanes read neighbours: all
+ * from `first` to before `end`; from `inner_first` to before `inner_end` every
+ * lane that has a ray counts them as a whole and no lane asks.
+ */
+struct walk {
+	int first, inner_first, inner_end, end;
+};
+static __device__ __forceinline__ walk walk_together(bool hits, int first, int end, int inner_first, int inner_end)
+{
+	const int far = 1 << 28;
+	walk w;
+
+	w.first = warp_min(hits ? first : far);
+	w.end = warp_max(hits ? end : -far);
+	w.inner_first = max(w.first, warp_max(hits ? inner_first : -far));
+	w.inner_end = min(w.end, warp_min(hits ? inner_end : far));
+	if (w.first >= w.end)
+		w = {0, 0, 0, 0};
+	else if (w.inner_first >= w.inner_end)
+		w.inner_first = w.inner_end = w.end;
+	return w;
+}
+
+/* Sums over the block in a fixed order; thread 0 has the result. Every thread must come here. */
+static __device__ __forceinline__ float2 block_sum(float2 value)
+{
+	__shared__ float2 warps[32];
+	int thread = (threadIdx.z * blockDim.y + threadIdx.y) * blockDim.x + threadIdx.x;
+	int count = (blockDim.x * blockDim.y * blockDim.z + 31) / 32;
+
+	for (int lane = 16; lane > 0; lane >>= 1) {
+		value.x += __shfl_down_sync(~0u, value.x, lane);
+		value.y += __shfl_down_sync(~0u, value.y, lane);
+	}
+	if (thread % 32 == 0)
+		warps[thread / 32] = value;
+	__syncthreads();
+	if (thread == 0)
+		for (int i = 1; i < count; i++) {
+			value.x += warps[i].x;
+			value.y += warps[i].y;
+		}
+	return value;
+}
+
+#endif

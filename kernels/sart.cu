@@ -1,0 +1,352 @@
+/*
+ * SART, OS-SART and SIRT (core/sart.c has the formula). Row sums are lengths
+ * (rays.cuh), column sums are numbers of views where the whole grid is seen, so
+ * neither needs memory.
+ *
+ * Updates of several views: forward projection with the correction
+ * (p - A v) / L as its result, then backprojection that ends in the update.
+ *
+ * An update after each view: one view cannot fill the card, and turning the
+ * volume into the forward projection's layouts would cost more than the rest.
+ * So the sweep runs on one copy with z fastest, in which both directions of the
+ * slices are alike: lanes are neighbours along z, rows forward and voxels back,
+ * and a ray is cut into parts that several warps walk.
+ *
+ * The launches of an iteration are recorded once and replayed, so that small
+ * problems do not wait for the host.
+ */
+#include "kernels/rays.cuh"
+
+/* ---- view by view ---- */
+
+struct sweep_view {
+	const device_view *geometry; /* of this view */
+	device_grid grid;
+	float *volume; /* [x][y][z] */
+	int pitch;
+	int columns, rows;
+	const float *measured; /* [row][column] */
+	int measured_pitch;
+	float *correction; /* [column][row], with zeros around */
+	int correction_pitch;
+	float2 *partial;
+	float least; /* mm that a ray must have in the grid */
+	float relaxation;
+	bool nonnegative;
+};
+
+enum { SWEEP_COLUMNS = 4, SWEEP_PARTS = 4 };
+
+static __global__ void __launch_bounds__(32 * SWEEP_COLUMNS *SWEEP_PARTS) project_view(const sweep_view s)
+{
+	__shared__ float sums[SWEEP_PARTS][SWEEP_COLUMNS][32];
+	const device_view &g = *s.geometry;
+	int row = blockIdx.y * 32 + threadIdx.x, column = blockIdx.x * SWEEP_COLUMNS + threadIdx.y;
+	int part = threadIdx.z;
+	bool valid = column < s.columns && row < s.rows;
+	float c = (float)column - 0.5f * (float)(s.columns - 1), r = (float)row - 0.5f * (float)(s.rows - 1);
+	float d[3] = {form(g.direction[0], c, r), form(g.direction[1], c, r), form(g.direction[2], c, r)};
+	float m[3] = {form(g.moment[0], c, r), form(g.moment[1], c, r), form(g.moment[2], c, r)};
+	int own = dominant_axis(d[0], d[1], d[2]);
+	int x_stride = s.grid.size[1] * s.pitch, y_stride = s.pitch;
+	float sum = 0, length = 0, step = 0;
+
+	for (int axis = ACROSS_X; axis <= ACROSS_Z; axis++) {
+		bool mine = valid && own == axis;
+
+		if (!__any_sync(~0u, mine))
+			continue;
+		slice_axes axes = axes_of(s.grid, axis);
+		int slice = axis == ACROSS_X ? x_stride : axis == ACROSS_Y ? y_stride : 1;
+		int fast = axis == ACROSS_X ? y_stride : x_stride, up = axis == ACROSS_Z ? y_stride : 1;
+		ray a = ray_idle(axes);
+		float from = 0, to = 0, total = 0;
+		if (mine) {
+			crossing at = crossing_of(d, m, axis);
+			ray full = ray_make(at, axes);
+
+			if (full.end > full.begin) {
+				a = full;
+				/* Between the outer centres all four neighbours are there; a thousandth for rounding. */
+				to = 0.5f * (float)(axes.across - 1);
+				from = -to;
+				clip(at.fast, at.fast_step, 0.5f * (float)(axes.fast - 1) - 1e-3f, from, to);
+				clip(at.row, at.row_step, 0.5f * (float)(axes.rows - 1) - 1e-3f, from, to);
+				from = fminf(from, 1e6f) + 0.5f * (float)(axes.across - 1);
+				to = fmaxf(to, -1e6f) + 0.5f * (float)(axes.across - 1);
+			}
+		}
+		bool hits = a.end > a.begin;
+		int first = first_slice(a.begin), last = last_slice(a.end);
+		walk w = walk_together(hits, first, last + 1, max(first + 1, (int)ceilf(from)),
+				       min(last, (int)floorf(to) + 1));
+		/* This warp's part of the way. */
+		int each = (w.end - w.first + SWEEP_PARTS - 1) / SWEEP_PARTS, begin = w.first + part * each;
+		int end = min(begin + each, w.end), inner = min(max(w.inner_first, begin), end);
+		int outer = min(max(w.inner_end, inner), end);
+		auto edge = [&](int i, int until) {
+			for (; i < until; i++)
+				total = fmaf(part_of(i, a.begin, a.end),
+					     sample_held(s.volume + (size_t)slice * i, up, fast,
+							 fmaf((float)i, a.fast_step, a.fast),
+							 fmaf((float)i, a.row_step, a.row), axes),
+					     total);
+		};
+
+		edge(begin, inner);
+		const float *at_slice = s.volume + (size_t)slice * inner;
+#pragma unroll 4
+		for (int i = inner; i < outer; i++, at_slice += slice)
+			total += sample(at_slice, up, fast, fmaf((float)i, a.fast_step, a.fast),
+					fmaf((float)i, a.row_step, a.row));
+		edge(outer, end);
+		if (hits) {
+			sum = total;
+			length = (a.end - a.begin) * a.step;
+			step = a.step;
+		}
+	}
+	sums[part][threadIdx.y][threadIdx.x] = sum;
+	__syncthreads();
+	float2 squares = {0, 0};
+	if (part == 0 && valid) {
+		for (int k = 1; k < SWEEP_PARTS; k++)
+			sum += sums[k][threadIdx.y][threadIdx.x];
+		float measured = s.measured[(size_t)row * s.measured_pitch + column];
+		float residual = measured - sum * step;
+
+		s.correction[(size_t)column * s.correction_pitch + row] =
+		    length >= s.least && length > 0 ? residual / length : 0.0f;
+		squares = {residual * residual, measured * measured};
+	}
+	squares = block_sum(squares);
+	if (part == 0 && threadIdx.x == 0 && threadIdx.y == 0)
+		s.partial[blockIdx.y * gridDim.x + blockIdx.x] = squares;
+}
+
+enum { UPDATE_LINES = 8 }; /* of voxels along z, side by side in a block */
+
+/* The update from one view; a thread has CHUNKS voxels, 32 apart along z. */
+template <int CHUNKS>
+static __global__ void __launch_bounds__(32 * UPDATE_LINES) update_view(const sweep_view s)
+{
+	const float(&m)[3][4] = s.geometry->matrix;
+	int y = blockIdx.x * UPDATE_LINES + threadIdx.y, x = blockIdx.z, z = blockIdx.y * 32 * CHUNKS + threadIdx.x;
+	int nz = s.grid.size[2];
+	float fx = (float)x, fy = (float)y, fz = (float)z, value[CHUNKS];
+	float columns = (float)s.columns, rows = (float)s.rows;
+
+	if (y >= s.grid.size[1])
+		return;
+	float *at = s.volume + ((size_t)x * s.grid.size[1] + y) * s.pitch + z;
+	float a = fmaf(m[0][0], fx, fmaf(m[0][1], fy, fmaf(m[0][2], fz, m[0][3])));
+	float b = fmaf(m[1][0], fx, fmaf(m[1][1], fy, fmaf(m[1][2], fz, m[1][3])));
+	float c = fmaf(m[2][0], fx, fmaf(m[2][1], fy, fmaf(m[2][2], fz, m[2][3])));
+#pragma unroll
+	for (int k = 0; k < CHUNKS; k++)
+		value[k] = z + 32 * k < nz ? at[32 * k] : 0.0f;
+#pragma unroll
+	for (int k = 0; k < CHUNKS; k++) {
+		float w = 1.0f / fmaf((float)(32 * k), m[2][2], c);
+		float u = fmaf((float)(32 * k), m[0][2], a) * w, v = fmaf((float)(32 * k), m[1][2], b) * w;
+		float coverage = __saturatef(fminf(u + 1.0f, columns - u)) * __saturatef(fminf(v + 1.0f, rows - v));
+		float sum = sample(s.correction, 1, s.correction_pitch, fminf(fmaxf(u, -1.0f), columns),
+				   fminf(fmaxf(v, -1.0f), rows));
+
+		if (coverage > 0) {
+			value[k] += s.relaxation * sum / coverage;
+			if (s.nonnegative)
+				value[k] = fmaxf(value[k], 0.0f);
+		}
+	}
+#pragma unroll
+	for (int k = 0; k < CHUNKS; k++)
+		if (z + 32 * k < nz)
+			at[32 * k] = value[k];
+}
+
+static dim3 sweep_blocks(const struct plan *plan)
+{
+	return dim3(divide_up(plan->stack.columns, SWEEP_COLUMNS), divide_up(plan->stack.rows, 32));
+}
+
+size_t sweep_partials(const struct plan *plan)
+{
+	dim3 blocks = sweep_blocks(plan);
+
+	return (size_t)blocks.x * blocks.y * (size_t)plan->options.geometry->count;
+}
+
+static float length_least(const struct plan *plan)
+{
+	const float *spacing = plan->grid.spacing;
+
+	return (float)RAY_LENGTH_LEAST * fminf(fminf(spacing[0], spacing[1]), spacing[2]);
+}
+
+static void launch_update(const sweep_view &s, cudaStream_t stream)
+{
+	const int *size = s.grid.size;
+	dim3 threads(32, UPDATE_LINES);
+	unsigned lines = (unsigned)divide_up(size[1], UPDATE_LINES), nx = (unsigned)size[0];
+
+	if (size[2] <= 32)
+		update_view<1><<<dim3(lines, 1, nx), threads, 0, stream>>>(s);
+	else if (size[2] <= 64)
+		update_view<2><<<dim3(lines, 1, nx), threads, 0, stream>>>(s);
+	else
+		update_view<4><<<dim3(lines, divide_up(size[2], 128), nx), threads, 0, stream>>>(s);
+}
+
+static int sweep_views(struct plan *plan, const float *projections, float *volume, const struct cancel *cancel,
+		       struct error *err)
+{
+	const int *order = plan->options.sart->subsets.order;
+	cudaStream_t stream = plan->device->stream;
+	struct stack *correction = plan->correction;
+	dim3 blocks = sweep_blocks(plan);
+	sweep_view s = {};
+
+	TRY(layout_to_columns(plan, volume, plan->scratch, err));
+	s.grid = plan->grid;
+	s.volume = plan->scratch;
+	s.pitch = plan->columns.pitch;
+	s.columns = plan->stack.columns;
+	s.rows = plan->stack.rows;
+	s.measured_pitch = plan->stack.pitch;
+	s.correction = correction->data;
+	s.correction_pitch = correction->shape.pitch;
+	s.least = length_least(plan);
+	s.relaxation = (float)plan->options.sart->relaxation;
+	s.nonnegative = plan->options.sart->nonnegative;
+	for (int i = 0; i < plan->options.geometry->count; i++) {
+		TRY(cancel_check(cancel, err));
+		s.geometry = plan->geometry + order[i];
+		s.measured = projections + (size_t)order[i] * plan->stack.slot;
+		s.partial = plan->partial + (size_t)i * blocks.x * blocks.y;
+		project_view<<<blocks, dim3(32, SWEEP_COLUMNS, SWEEP_PARTS), 0, stream>>>(s);
+		LAUNCHED();
+		launch_update(s, stream);
+		LAUNCHED();
+	}
+	TRY(layout_from_columns(plan, plan->scratch, volume, err));
+	return reduce_pairs(plan, plan->partial, sweep_partials(plan), plan->device->sums_device, err);
+}
+
+/* ---- several views an update ---- */
+
+static int update_subset(struct plan *plan, int subset, const float *projections, float *volume, float2 *partial,
+			 struct error *err)
+{
+	const struct sart_options *sart = plan->options.sart;
+	int first = sart->subsets.start[subset], count = sart->subsets.start[subset + 1] - first;
+	struct ray_use rays = {projections, partial, length_least(plan)};
+	struct voxel_use voxels = {};
+
+	voxels.update = true;
+	voxels.nonnegative = sart->nonnegative;
+	voxels.scale = (float)(plan->shape.covered ? sart->relaxation / count : sart->relaxation);
+	voxels.coverage = plan->shape.covered ? NULL : plan->coverage;
+	TRY(layout_slices(plan, volume, err));
+	TRY(project_rays(plan, volume, first, count, rays, plan->correction->data, err));
+	if (!plan->shape.covered && plan->coverage_subset != subset) {
+		TRY(coverage_sum(plan, first, count, err));
+		plan->coverage_subset = sart->subsets.count > 1 ? -1 : subset;
+	}
+	return backproject_views(plan, plan->correction->data, first, count, voxels, volume, err);
+}
+
+static int sweep_subsets(struct plan *plan, const float *projections, float *volume, const struct cancel *cancel,
+			 struct error *err)
+{
+	const struct subsets *subsets = &plan->options.sart->subsets;
+	size_t blocks = 0;
+
+	for (int i = 0; i < subsets->count; i++) {
+		int count = subsets->start[i + 1] - subsets->start[i];
+
+		TRY(cancel_check(cancel, err));
+		if (count == 0)
+			continue;
+		TRY(update_subset(plan, i, projections, volume, plan->partial + blocks, err));
+		blocks += project_blocks(plan, count);
+	}
+	return reduce_pairs(plan, plan->partial, blocks, plan->device->sums_device, err);
+}
+
+static int sweep(struct plan *plan, const float *projections, float *volume, const struct cancel *cancel,
+		 struct error *err)
+{
+	return plan->shape.by_view ? sweep_views(plan, projections, volume, cancel, err)
+				   : sweep_subsets(plan, projections, volume, cancel, err);
+}
+
+/* ---- recording ---- */
+
+/*
+ * An iteration that takes seconds is launched piece by piece, and may be
+ * cancelled between them; a recorded one ends before it is asked.
+ */
+static bool worth_recording(const struct plan *plan)
+{
+	const double updates_a_second = 5e11;
+
+	return (double)grid_voxels(plan->options.grid) * plan->options.geometry->count < 0.5 * updates_a_second;
+}
+
+static int record(struct plan *plan, const float *projections, float *volume, struct error *err)
+{
+	cudaStream_t stream = plan->device->stream;
+	cudaGraph_t graph = NULL;
+	int code;
+
+	if (plan->sweep != NULL) {
+		cudaGraphExecDestroy(plan->sweep);
+		plan->sweep = NULL;
+	}
+	CUDA_TRY(cudaStreamBeginCapture(stream, cudaStreamCaptureModeThreadLocal));
+	code = sweep(plan, projections, volume, NULL, err);
+	cudaError_t status = cudaStreamEndCapture(stream, &graph);
+	if (code == 0 && status == cudaSuccess)
+		status = cudaGraphInstantiate(&plan->sweep, graph, 0);
+	if (graph != NULL)
+		cudaGraphDestroy(graph);
+	if (code < 0)
+		return code;
+	CUDA_TRY(status);
+	plan->sweep_volume = volume;
+	plan->sweep_stack = projections;
+	return 0;
+}
+
+int cuda_sart_iterate(struct plan *plan, const struct stack *projections, struct volume *volume,
+		      const struct cancel *cancel, struct sart_sums *ret_sums, struct error *err)
+{
+	const struct sart_options *sart = plan->options.sart;
+	struct device *device = plan->device;
+
+	if (sart == NULL)
+		return error_set(err, ERR_INTERNAL, "the plan was made without SART");
+	TRY(device_enter(device, err));
+	TRY(plan_check_views(plan, sart->subsets.order, plan->options.geometry->count, projections,
+			     plan->options.geometry->count, err));
+	TRY(plan_set_views(plan, sart->subsets.order, plan->options.geometry->count, err));
+	if (!worth_recording(plan)) {
+		TRY(sweep(plan, projections->data, volume->data, cancel, err));
+	} else {
+		TRY(cancel_check(cancel, err));
+		if (plan->sweep == NULL || plan->sweep_volume != volume->data ||
+		    plan->sweep_stack != projections->data) {
+			/* With one subset the column sums are made now and not again and again. */
+			if (plan->coverage != NULL && sart->subsets.count == 1 && plan->coverage_subset != 0) {
+				TRY(coverage_sum(plan, 0, plan->options.geometry->count, err));
+				plan->coverage_subset = 0;
+			}
+			TRY(record(plan, projections->data, volume->data, err));
+		}
+		CUDA_TRY(cudaGraphLaunch(plan->sweep, device->stream));
+	}
+	TRY(device_wait(device, err));
+	*ret_sums = {device->sums[0], device->sums[1]};
+	return 0;
+}

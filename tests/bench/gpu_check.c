@@ -1,0 +1,376 @@
+/*
+ * Every operation of the CUDA backend against the CPU's, over all kinds of
+ * geometry and odd sizes, in both precisions; the same bits on a repeat; memory
+ * given back. Prints one line for each scene and ends with 1 when anything is
+ * further off than its tolerance.
+ *
+ * Tolerances are relative L2 norms. Reference precision is float32 throughout:
+ * what is left is rounding, of coordinates above all (1e-4 of a voxel, on noise
+ * that changes by its own size from voxel to voxel). In standard precision the
+ * texture unit's weights have 8 bits: up to 1/512 of the difference of
+ * neighbours, which here is noise, in each sample.
+ */
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "tests/bench/gpu_scene.h"
+
+extern const struct backend backend_cuda;
+
+static const double REFERENCE = 1e-4, STANDARD = 2e-3;
+static int failures;
+
+struct side { /* one backend at work */
+	const struct backend *backend;
+	struct device *device;
+	struct plan *plan;
+	struct volume *volume, *other;
+	struct stack *stack, *result;
+};
+
+static void side_open(struct side *side, const struct backend *backend, struct device *device,
+		      const struct plan_options *options)
+{
+	const struct geometry *geometry = options->geometry;
+	struct error err = {0};
+
+	side->backend = backend;
+	side->device = device;
+	must(backend->plan_new(device, options, &side->plan, &err), &err, "plan");
+	must(backend->volume_new(device, options->grid, &side->volume, &err), &err, "volume");
+	must(backend->volume_new(device, options->grid, &side->other, &err), &err, "volume");
+	must(backend->stack_new(device, geometry->columns, geometry->rows, geometry->count, &side->stack, &err), &err,
+	     "stack");
+	must(backend->stack_new(device, geometry->columns, geometry->rows, geometry->count, &side->result, &err), &err,
+	     "stack");
+}
+
+static void side_close(struct side *side)
+{
+	side->backend->stack_free(side->stack);
+	side->backend->stack_free(side->result);
+	side->backend->volume_free(side->volume);
+	side->backend->volume_free(side->other);
+	side->backend->plan_free(side->plan);
+}
+
+static double difference(const float *a, const float *b, size_t count)
+{
+	double sum = 0, norm = 0;
+
+	for (size_t i = 0; i < count; i++) {
+		double d = (double)a[i] - (double)b[i];
+
+		if (!isfinite(a[i]))
+			return INFINITY;
+		sum += d * d;
+		norm += (double)b[i] * b[i];
+	}
+	return norm > 0 ? sqrt(sum / norm) : sqrt(sum);
+}
+
+static void expect(const struct scene *scene, const char *what, double found, double tolerance)
+{
+	bool bad = !(found <= tolerance);
+
+	if (bad)
+		printf("FAILED  %-34s %-22s %.2e, at most %.0e\n", scene->name, what, found, tolerance);
+	failures += bad;
+}
+
+/* What an operation left, from both sides: [0] CPU, [1] CUDA. */
+struct outcome {
+	float *values[2];
+	size_t count;
+};
+
+static void read_volume(const struct side *side, const struct scene *scene, float *values)
+{
+	struct error err = {0};
+
+	must(side->backend->volume_download(side->volume, 0, scene->grid.size[2], values, &err), &err, "download");
+}
+
+static void read_stack(const struct side *side, const struct scene *scene, float *values)
+{
+	struct error err = {0};
+
+	must(side->backend->stack_download(side->result, 0, scene->geometry.count, values, &err), &err, "download");
+}
+
+static int *all_views(int count)
+{
+	int *views = malloc(sizeof(*views) * (size_t)count);
+
+	/* not in order, so that slots and views are told apart */
+	for (int i = 0; i < count; i++)
+		views[i] = count - 1 - i;
+	return views;
+}
+
+static void check_norms(const struct scene *scene, const struct side sides[2])
+{
+	struct volume_norms norms[2];
+	struct error err = {0};
+
+	for (int s = 0; s < 2; s++)
+		must(sides[s].backend->norms(sides[s].plan, sides[s].volume, sides[s].other, 1e-3, &norms[s], &err), &err,
+		     "norms");
+	expect(scene, "norm2", fabs(norms[1].norm2 / norms[0].norm2 - 1), 1e-5);
+	expect(scene, "difference2", fabs(norms[1].difference2 / norms[0].difference2 - 1), 1e-5);
+	expect(scene, "tv norm", norms[0].tv > 0 ? fabs(norms[1].tv / norms[0].tv - 1) : norms[1].tv, 1e-5);
+	expect(scene, "mean", fabs(norms[1].mean / norms[0].mean - 1), 1e-5);
+	expect(scene, "range", fabs(norms[1].minimum - norms[0].minimum) + fabs(norms[1].maximum - norms[0].maximum), 0);
+}
+
+static void check_scene(const struct scene *scene, struct device *devices[2], int subsets, bool reference)
+{
+	const struct backend *backends_here[2] = {&backend_cpu, &backend_cuda};
+	const struct geometry *geometry = &scene->geometry;
+	const double tolerance = reference ? REFERENCE : STANDARD;
+	size_t voxels = grid_voxels(&scene->grid);
+	size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows * (size_t)geometry->count;
+	struct sart_options sart = {.relaxation = 0.9, .nonnegative = true};
+	struct tv_options tv = {.method = reference ? TV_PROXIMAL : TV_GRADIENT, .alpha = 0.1, .step = 0.1, .iterations = 5,
+				.unit = 0.05};
+	struct plan_options options = scene_plan(scene, &sart, subsets, &tv, reference);
+	float *volume = malloc(voxels * sizeof(float)), *stack = malloc(pixels * sizeof(float));
+	float *got[3] = {NULL};
+	int *views = all_views(geometry->count), *slots = malloc(sizeof(int) * (size_t)geometry->count);
+	double worst[8] = {0};
+	struct side sides[2];
+	struct error err = {0};
+
+	fill_random(volume, voxels, 1);
+	fill_random(stack, pixels, 2);
+	for (int s = 0; s < 3; s++)
+		got[s] = malloc((voxels > pixels ? voxels : pixels) * sizeof(float));
+	for (int s = 0; s < 2; s++) {
+		side_open(&sides[s], backends_here[s], devices[s], &options);
+		must(sides[s].backend->volume_upload(sides[s].volume, volume, &err), &err, "upload");
+	}
+	for (int i = 0; i < geometry->count; i++)
+		slots[i] = i;
+
+	for (int s = 0; s < 2; s++) {
+		must(sides[s].backend->project(sides[s].plan, sides[s].volume, views, geometry->count, sides[s].result, &err),
+		     &err, "project");
+		read_stack(&sides[s], scene, got[s]);
+	}
+	worst[0] = difference(got[1], got[0], pixels);
+	expect(scene, "project", worst[0], tolerance);
+
+	for (int s = 0; s < 2; s++) {
+		size_t defects = 0;
+
+		must(sides[s].backend->linearise(sides[s].plan, stack, geometry->count, slots, sides[s].stack, &defects, &err),
+		     &err, "linearise");
+		must(sides[s].backend->stack_download(sides[s].stack, 0, geometry->count, got[s], &err), &err, "download");
+	}
+	expect(scene, "linearise", difference(got[1], got[0], pixels), 0);
+
+	for (int s = 0; s < 2; s++) {
+		must(sides[s].backend->filter(sides[s].plan, sides[s].stack, NULL, views, geometry->count, sides[s].result,
+					      &err),
+		     &err, "filter");
+		read_stack(&sides[s], scene, got[s]);
+	}
+	worst[1] = difference(got[1], got[0], pixels);
+	expect(scene, "filter", worst[1], 1e-5);
+
+	for (int w = 0; w < 2; w++) {
+		for (int s = 0; s < 2; s++) {
+			must(sides[s].backend->volume_upload(sides[s].volume, volume, &err), &err, "upload");
+			must(sides[s].backend->backproject(sides[s].plan, sides[s].stack, slots, geometry->count,
+							   w ? BACKPROJECT_FDK : BACKPROJECT_PLAIN, sides[s].volume, &err),
+			     &err, "backproject");
+			read_volume(&sides[s], scene, got[s]);
+		}
+		worst[2 + w] = difference(got[1], got[0], voxels);
+		expect(scene, w ? "backproject, FDK" : "backproject", worst[2 + w], tolerance);
+	}
+
+	/* SART: from zero against a forward projection of the volume, so that it does not just fit noise. */
+	for (int s = 0; s < 2; s++) {
+		struct sart_sums sums = {0};
+
+		must(sides[s].backend->volume_upload(sides[s].volume, volume, &err), &err, "upload");
+		must(sides[s].backend->project(sides[s].plan, sides[s].volume, slots, geometry->count, sides[s].stack, &err),
+		     &err, "project");
+		must(sides[s].backend->volume_fill(sides[s].volume, 0, &err), &err, "fill");
+		for (int i = 0; i < 2; i++)
+			must(sides[s].backend->sart_iterate(sides[s].plan, sides[s].stack, sides[s].volume, NULL, &sums, &err),
+			     &err, "sart");
+		worst[4 + s] = sqrt(sums.residual2 / sums.projection2);
+		read_volume(&sides[s], scene, got[s]);
+	}
+	expect(scene, "SART's residual", fabs(worst[5] / worst[4] - 1), 50 * tolerance);
+	worst[4] = difference(got[1], got[0], voxels);
+	expect(scene, "SART", worst[4], 2 * tolerance);
+	/* the same bits again */
+	must(backend_cuda.volume_fill(sides[1].volume, 0, &err), &err, "fill");
+	for (int i = 0; i < 2; i++) {
+		struct sart_sums sums = {0};
+
+		must(backend_cuda.sart_iterate(sides[1].plan, sides[1].stack, sides[1].volume, NULL, &sums, &err), &err, "sart");
+	}
+	read_volume(&sides[1], scene, got[2]);
+	expect(scene, "SART's bits", memcmp(got[1], got[2], voxels * sizeof(float)) != 0, 0);
+
+	for (int s = 0; s < 2; s++) {
+		must(sides[s].backend->volume_upload(sides[s].volume, volume, &err), &err, "upload");
+		must(sides[s].backend->volume_copy(sides[s].other, sides[s].volume, &err), &err, "copy");
+		must(sides[s].backend->tv(sides[s].plan, sides[s].volume, NULL, &err), &err, "tv");
+		read_volume(&sides[s], scene, got[s]);
+	}
+	worst[5] = difference(got[1], got[0], voxels);
+	expect(scene, "TV", worst[5], 1e-5);
+	check_norms(scene, sides);
+	printf("%-34s %-9s %3d subsets: project %.1e filter %.1e back %.1e FDK %.1e SART %.1e TV %.1e  [%s]\n", scene->name,
+	       reference ? "reference" : "standard", subsets, worst[0], worst[1], worst[2], worst[3], worst[4], worst[5],
+	       backend_cuda.plan_summary(sides[1].plan));
+	fflush(stdout);
+	for (int s = 0; s < 2; s++)
+		side_close(&sides[s]);
+	for (int s = 0; s < 3; s++)
+		free(got[s]);
+	subsets_clear(&sart.subsets);
+	free(volume);
+	free(stack);
+	free(views);
+	free(slots);
+}
+
+/* Raw counts with flats, darks and every kind of defect. */
+static void check_counts(struct device *devices[2])
+{
+	enum { COLUMNS = 67, ROWS = 41, VIEWS = 5 };
+	const struct scene_options at = {
+	    .columns = COLUMNS, .rows = ROWS, .views = VIEWS, .arc = 6.28, .pixel = {1, 1}, .size = {16, 16, 16},
+	    .spacing = {1, 1, 1}};
+	const struct backend *sides[2] = {&backend_cpu, &backend_cuda};
+	size_t pixels = COLUMNS * ROWS, defects[2] = {0};
+	float *flat = malloc(pixels * 4), *dark = malloc(pixels * 4), *got[2];
+	unsigned short *raw = malloc(pixels * VIEWS * 2);
+	const int slots[VIEWS] = {3, 1, 4, 0, 2};
+	struct plan_options options;
+	struct scene scene;
+	struct error err = {0};
+
+	scene_make(&scene, "raw counts", &at);
+	fill_random(flat, pixels, 5);
+	fill_random(dark, pixels, 6);
+	for (size_t i = 0; i < pixels; i++) {
+		flat[i] = 50000 + 5000 * flat[i];
+		dark[i] = 100 * dark[i];
+	}
+	for (size_t i = 0; i < pixels * VIEWS; i++) {
+		size_t pixel = i % pixels, row = pixel / COLUMNS, column = pixel % COLUMNS;
+
+		raw[i] = (unsigned short)(2000 + (i * 7919) % 40000);
+		if (i % 97 == 0 || row == 7 || column == 13)
+			raw[i] = i % 2 ? 0 : 65535;
+		if (i / pixels == 4)
+			raw[i] = 0; /* nothing to go by */
+	}
+	options = scene_plan(&scene, NULL, 0, NULL, true);
+	options.linearise = (struct linearise){
+	    .sample = SAMPLE_UINT16, .quantity = QUANTITY_INTENSITY, .flat = flat, .dark = dark};
+	for (int s = 0; s < 2; s++) {
+		struct side side;
+
+		got[s] = malloc(pixels * VIEWS * sizeof(float));
+		side_open(&side, sides[s], devices[s], &options);
+		must(sides[s]->linearise(side.plan, raw, VIEWS, slots, side.stack, &defects[s], &err), &err, "linearise");
+		must(sides[s]->stack_download(side.stack, 0, VIEWS, got[s], &err), &err, "download");
+		side_close(&side);
+	}
+	expect(&scene, "defects", fabs((double)defects[0] - (double)defects[1]), 0);
+	expect(&scene, "linearise", difference(got[1], got[0], pixels * VIEWS), 1e-6);
+	printf("%-34s defects %zu of %zu, difference %.1e\n", scene.name, defects[1], pixels * VIEWS,
+	       difference(got[1], got[0], pixels * VIEWS));
+	for (int s = 0; s < 2; s++)
+		free(got[s]);
+	free(flat);
+	free(dark);
+	free(raw);
+	scene_clear(&scene);
+}
+
+struct kind {
+	const char *name;
+	struct scene_options options;
+	int subsets;
+};
+
+#define TURN 6.283185307179586
+/* Sizes that fit no tile, grids seen in part, thin, flat and tiny ones, every bend. */
+static const struct kind kinds[] = {
+    {"cube", {.columns = 97, .rows = 83, .views = 30, .arc = TURN, .pixel = {2, 2}, .size = {61, 61, 61}, .spacing = {1, 1, 1}}, 1},
+    {"by view", {.columns = 97, .rows = 83, .views = 30, .arc = TURN, .pixel = {2, 2}, .size = {61, 61, 61}, .spacing = {1, 1, 1}}, 30},
+    {"cut off", {.columns = 67, .rows = 29, .views = 31, .arc = TURN, .pixel = {1.7, 1.9}, .offset = {11, 3}, .size = {67, 59, 47}, .spacing = {1, 1.1, 1.2}}, 4},
+    {"cut off by view", {.columns = 67, .rows = 29, .views = 31, .arc = TURN, .pixel = {1.7, 1.9}, .offset = {11, 3}, .size = {67, 59, 47}, .spacing = {1, 1.1, 1.2}}, 31},
+    {"short scan", {.columns = 257, .rows = 33, .views = 17, .arc = 3.6, .pixel = {.7, 1.1}, .size = {131, 127, 29}, .spacing = {.5, .5, .6}}, 3},
+    {"flat", {.columns = 127, .rows = 1, .views = 37, .arc = TURN, .pixel = {1, 1}, .size = {64, 65, 1}, .spacing = {1, 1, 1}}, 5},
+    {"thin", {.columns = 67, .rows = 90, .views = 13, .arc = TURN, .pixel = {2, 1}, .size = {33, 1, 40}, .spacing = {1, 1, 1}}, 13},
+    {"one voxel", {.columns = 5, .rows = 3, .views = 3, .arc = TURN, .pixel = {1, 1}, .size = {1, 1, 1}, .spacing = {1, 1, 1}}, 1},
+    {"one pixel", {.columns = 1, .rows = 1, .views = 4, .arc = TURN, .pixel = {3, 3}, .size = {9, 7, 5}, .spacing = {1, 1, 1}}, 4},
+    {"coarse detector", {.columns = 33, .rows = 31, .views = 20, .arc = TURN, .pixel = {5, 6}, .size = {65, 66, 67}, .spacing = {1, 1, 1}}, 2},
+    {"fine detector", {.columns = 300, .rows = 200, .views = 11, .arc = TURN, .pixel = {.4, .5}, .size = {43, 41, 37}, .spacing = {1.5, 1.5, 1.5}}, 11},
+};
+static const int wide[] = {43, 500, 600, 1000, 1200, 1500, 2000, 2100}; /* columns: each length of the filter, and cuFFT */
+
+int main(void)
+{
+	struct device *devices[2];
+	struct device_info before, after;
+	struct error err = {0};
+
+	if (backend_cuda.count() == 0) {
+		printf("SKIPPED: no CUDA device answers\n");
+		return 0;
+	}
+	must(backend_cpu.open(0, &(struct device_options){0}, &devices[0], &err), &err, "CPU");
+	must(backend_cuda.open(0, &(struct device_options){0}, &devices[1], &err), &err, "CUDA");
+	backend_cuda.describe(devices[1], &before);
+	printf("%s, %s, %.1f GiB free\n", before.name, before.driver, (double)before.bytes_free / (1 << 30));
+	for (size_t k = 0; k < sizeof(kinds) / sizeof(kinds[0]); k++) {
+		for (int bend = 0; bend < BEND_COUNT; bend++) {
+			struct scene_options options = kinds[k].options;
+			struct scene scene;
+			char name[64];
+
+			options.bend = (enum bend)bend;
+			snprintf(name, sizeof(name), "%s, %s", kinds[k].name, bend_names[bend]);
+			scene_make(&scene, name, &options);
+			check_scene(&scene, devices, kinds[k].subsets, true);
+			check_scene(&scene, devices, kinds[k].subsets, false);
+			scene_clear(&scene);
+		}
+	}
+	for (size_t k = 0; k < sizeof(wide) / sizeof(wide[0]); k++) {
+		const struct scene_options options = {.columns = wide[k], .rows = 3, .views = 5, .arc = TURN,
+						      .pixel = {200. / wide[k], 1}, .size = {8, 8, 3}, .spacing = {1, 1, 1},
+						      .window = (enum window)(k % WINDOW_COUNT)};
+		struct scene scene;
+		char name[64];
+
+		snprintf(name, sizeof(name), "%d columns", wide[k]);
+		scene_make(&scene, name, &options);
+		check_scene(&scene, devices, 1, true);
+		scene_clear(&scene);
+	}
+	check_counts(devices);
+	backend_cuda.describe(devices[1], &after);
+	if (before.bytes_free - after.bytes_free > (size_t)64 << 20 && after.bytes_free < before.bytes_free) {
+		printf("FAILED  %.1f MiB of device memory did not come back\n",
+		       (double)(before.bytes_free - after.bytes_free) / (1 << 20));
+		failures++;
+	}
+	backend_cuda.close(devices[1]);
+	backend_cpu.close(devices[0]);
+	printf("%d failures\n", failures);
+	return failures > 0;
+}
