@@ -1,0 +1,607 @@
+/* The spool: durable files, scan directories, and the pipeline over one: volumes, links, checkpoints. */
+#include <check.h>
+#include <dirent.h>
+#include <fcntl.h>
+#include <math.h>
+#include <openssl/evp.h>
+#include <signal.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/resource.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include "core/phantom.h"
+#include "proto/format.h"
+#include "proto/spool.h"
+
+static char directory[64], path[128], out[128];
+
+static void remove_all(const char *name)
+{
+	DIR *stream = opendir(name);
+	struct dirent *entry;
+
+	while (stream != NULL && (entry = readdir(stream)) != NULL) {
+		char inner[512];
+
+		if (entry->d_name[0] == '.')
+			continue;
+		snprintf(inner, sizeof(inner), "%s/%s", name, entry->d_name);
+		if (unlink(inner) != 0)
+			remove_all(inner);
+	}
+	if (stream != NULL)
+		closedir(stream);
+	rmdir(name);
+}
+
+static void make_directory(void)
+{
+	snprintf(directory, sizeof(directory), "/tmp/cbct-spool-XXXXXX");
+	ck_assert_ptr_nonnull(mkdtemp(directory));
+	snprintf(path, sizeof(path), "%s/file", directory);
+	snprintf(out, sizeof(out), "%s/out", directory);
+	ck_assert_int_eq(mkdir(out, 0700), 0);
+}
+
+static void remove_directory(void)
+{
+	remove_all(directory);
+}
+
+static int count_files(const char *name)
+{
+	DIR *stream = opendir(name);
+	struct dirent *entry;
+	int count = 0;
+
+	ck_assert_ptr_nonnull(stream);
+	while ((entry = readdir(stream)) != NULL)
+		count += entry->d_name[0] != '.';
+	closedir(stream);
+	return count;
+}
+
+static bool is_there(const char *where, const char *name)
+{
+	char inner[512];
+
+	snprintf(inner, sizeof(inner), "%s/%s", where, name);
+	return access(inner, F_OK) == 0;
+}
+
+/* ---- files ---- */
+
+static void assert_content(const char *expected)
+{
+	char *text = NULL;
+	size_t length = 99;
+	struct error err = {0};
+
+	ck_assert_msg(file_read(path, 100, &text, &length, &err) == 0, "%s", err.text);
+	ck_assert_uint_eq(length, strlen(expected));
+	ck_assert_str_eq(text, expected); /* the zero beyond its length */
+	free(text);
+}
+
+START_TEST(a_durable_file_is_there_whole_and_alone)
+{
+	struct error err = {0};
+
+	ck_assert_int_eq(file_write_durable(path, "first", 5, &err), 0);
+	assert_content("first");
+	ck_assert_int_eq(file_write_durable(path, "2", 1, &err), 0);
+	assert_content("2");
+	ck_assert_int_eq(file_write_durable(path, "", 0, &err), 0);
+	assert_content("");
+	ck_assert_int_eq(count_files(directory), 2); /* it and out/: nothing beside it */
+	ck_assert_int_eq(chdir(directory), 0);
+	ck_assert_int_eq(file_write_durable("here", "x", 1, &err), 0); /* a path without a directory */
+	ck_assert(is_there(directory, "here"));
+}
+END_TEST
+
+START_TEST(what_a_crash_left_is_written_over)
+{
+	struct error err = {0};
+	char beside[160];
+	FILE *file;
+
+	snprintf(beside, sizeof(beside), "%s.tmp", path);
+	file = fopen(beside, "w");
+	ck_assert_ptr_nonnull(file);
+	ck_assert_int_gt(fprintf(file, "half of something longer"), 0);
+	ck_assert_int_eq(fclose(file), 0);
+	ck_assert_int_eq(file_write_durable(path, "whole", 5, &err), 0);
+	assert_content("whole");
+	ck_assert_int_ne(access(beside, F_OK), 0);
+}
+END_TEST
+
+START_TEST(a_write_that_fails_leaves_what_was_there)
+{
+	struct error err = {0};
+	struct rlimit before, tight;
+	char data[5000] = "";
+
+	ck_assert_int_eq(file_write_durable(path, "before", 6, &err), 0);
+	ck_assert_int_eq(getrlimit(RLIMIT_FSIZE, &before), 0);
+	tight = before;
+	tight.rlim_cur = 4096; /* fails in the middle */
+	signal(SIGXFSZ, SIG_IGN);
+	ck_assert_int_eq(setrlimit(RLIMIT_FSIZE, &tight), 0);
+	ck_assert_int_eq(file_write_durable(path, data, sizeof(data), &err), ERR_IO);
+	ck_assert_int_eq(setrlimit(RLIMIT_FSIZE, &before), 0);
+	assert_content("before");
+	ck_assert_int_eq(count_files(directory), 2);
+	snprintf(data, sizeof(data), "%s/none/file", directory);
+	ck_assert_int_lt(file_write_durable(data, "x", 1, &err), 0);
+}
+END_TEST
+
+START_TEST(a_file_that_cannot_be_read_says_why)
+{
+	char *text = NULL;
+	size_t length = 0;
+	struct error err = {0};
+
+	ck_assert_int_eq(file_read(path, 10, &text, &length, &err), ERR_NOT_FOUND);
+	ck_assert_int_eq(file_write_durable(path, "eleven char", 11, &err), 0);
+	ck_assert_int_eq(file_read(path, 10, &text, &length, &err), ERR_TOO_LARGE);
+	ck_assert_ptr_nonnull(strstr(err.text, "11"));
+	ck_assert_int_lt(file_read(directory, 1 << 20, &text, &length, &err), 0);
+	ck_assert_ptr_null(text);
+}
+END_TEST
+
+/* ---- scan directories ---- */
+
+enum { COLUMNS = 24, ROWS = 20, VIEWS = 18, PIXELS = COLUMNS * ROWS };
+
+static void put(const char *name, const void *data, size_t length)
+{
+	struct error err = {0};
+	char file[160];
+
+	snprintf(file, sizeof(file), "%s/%s", directory, name);
+	ck_assert_msg(file_write_durable(file, data, length, &err) == 0, "%s", err.text);
+}
+
+static void put_document(const char *projections)
+{
+	char text[600];
+
+	snprintf(text, sizeof(text),
+		 "{\"detector\":{\"columns\":%d,\"rows\":%d,\"pixel_mm\":[6,6]},\"projections\":{\"count\":%d,%s},"
+		 "\"geometry\":{\"kind\":\"circular\",\"source_to_isocentre_mm\":600,\"source_to_detector_mm\":1000,"
+		 "\"angle_step_deg\":20}}",
+		 COLUMNS, ROWS, VIEWS, projections);
+	put("scan.json", text, strlen(text));
+}
+
+/* A ball off the centre, from its exact line integrals. */
+static void put_scan(void)
+{
+	static float projections[VIEWS][PIXELS];
+	const double shift[3] = {4, -6, 3};
+	struct phantom ball;
+	struct scan_files files;
+	struct error err = {0};
+
+	put_document("\"sample\":\"float32\",\"quantity\":\"line_integral\"");
+	put("projections.raw", projections, sizeof(projections));
+	ck_assert_int_eq(scan_files_open(directory, &files, &err), 0);
+	ck_assert_int_eq(phantom_named(&ball, "ball", 25, 0.02, &err), 0);
+	phantom_move(&ball, shift);
+	for (int i = 0; i < VIEWS; i++)
+		phantom_project(&ball, &files.scan->geometry, i, projections[i]);
+	phantom_clear(&ball);
+	scan_files_close(&files);
+	put("projections.raw", projections, sizeof(projections));
+}
+
+START_TEST(a_scan_directory_is_read)
+{
+	struct scan_files files = {.projections = -1};
+	struct error err = {0};
+	float image[PIXELS] = {1, 2, 3};
+
+	put_scan();
+	put("flat.f32", image, sizeof(image));
+	ck_assert_msg(scan_files_open(directory, &files, &err) == 0, "%s", err.text);
+	ck_assert_int_eq(files.scan->count, VIEWS);
+	ck_assert_int_ne(fcntl(files.projections, F_GETFD) & FD_CLOEXEC, 0);
+	ck_assert_mem_eq(files.flat, image, sizeof(image));
+	ck_assert_ptr_null(files.dark);
+	scan_files_close(&files);
+	scan_files_close(&files);
+	scan_files_close(NULL);
+}
+END_TEST
+
+START_TEST(a_scan_directory_with_a_fault_is_refused)
+{
+	static float projections[VIEWS * PIXELS + 1];
+	struct scan_files files = {.projections = -7};
+	struct error err = {0};
+
+	ck_assert_int_eq(scan_files_open(directory, &files, &err), ERR_NOT_FOUND);
+	put("scan.json", "{", 1);
+	ck_assert_int_eq(scan_files_open(directory, &files, &err), ERR_INVALID);
+	put_document("\"sample\":\"float32\",\"quantity\":\"line_integral\"");
+	ck_assert_int_eq(scan_files_open(directory, &files, &err), ERR_NOT_FOUND);
+	ck_assert_ptr_nonnull(strstr(err.text, "projections.raw"));
+	put("projections.raw", projections, sizeof(projections) - 5);
+	ck_assert_int_eq(scan_files_open(directory, &files, &err), ERR_INVALID);
+	put("projections.raw", projections, sizeof(projections));
+	ck_assert_int_eq(scan_files_open(directory, &files, &err), ERR_INVALID);
+	put("projections.raw", projections, sizeof(projections) - 4);
+	put("dark.f32", projections, PIXELS * 4 - 4);
+	ck_assert_int_eq(scan_files_open(directory, &files, &err), ERR_INVALID);
+	put("dark.f32", projections, PIXELS * 4 + 4);
+	ck_assert_int_lt(scan_files_open(directory, &files, &err), 0);
+	ck_assert_int_eq(files.projections, -7); /* untouched */
+	put("dark.f32", projections, PIXELS * 4);
+	ck_assert_int_eq(scan_files_open(directory, &files, &err), 0);
+	scan_files_close(&files);
+}
+END_TEST
+
+/* ---- the pipeline ---- */
+
+enum { KEPT_MOST = 16 };
+
+struct watched {
+	int yield_at, cancel_at; /* after this row; 0: never */
+	int fail_at;             /* the n-th volume is refused */
+	int rows, last_row, kept, opened;
+	struct saved_volume saved[KEPT_MOST];
+	char names[KEPT_MOST][32];
+	char warnings[256];
+};
+
+static bool watched_yield(void *context)
+{
+	struct watched *watched = context;
+
+	return watched->yield_at > 0 && watched->last_row >= watched->yield_at;
+}
+
+static bool watched_cancelled(void *context)
+{
+	struct watched *watched = context;
+
+	return watched->cancel_at > 0 && watched->last_row >= watched->cancel_at;
+}
+
+static void watched_row(void *context, const struct history_row *row)
+{
+	struct watched *watched = context;
+
+	watched->rows++;
+	watched->last_row = row->iteration;
+}
+
+static void watched_warning(void *context, const char *code, const char *detail)
+{
+	struct watched *watched = context;
+
+	(void)detail;
+	snprintf(watched->warnings + strlen(watched->warnings), sizeof(watched->warnings) - strlen(watched->warnings),
+		 "%s ", code);
+}
+
+static int watched_volume(void *context, const struct kept_volume *volume, const struct saved_volume *saved,
+			  struct error *err)
+{
+	struct watched *watched = context;
+
+	ck_assert_int_eq(access(saved->path, R_OK), 0); /* it is there before it is told of */
+	ck_assert_int_lt(watched->kept, KEPT_MOST);
+	watched->saved[watched->kept] = *saved;
+	snprintf(watched->names[watched->kept++], 32, "%s", volume->name);
+	if (watched->kept == watched->fail_at)
+		return error_set(err, ERR_CONFLICT, "not this one");
+	return 0;
+}
+
+static void watched_open(void *context, const struct recon_memory *memory, const char *plan)
+{
+	struct watched *watched = context;
+
+	watched->opened++;
+	ck_assert_uint_gt(memory->total, 0);
+	ck_assert_ptr_nonnull(plan);
+}
+
+static int run(const char *request_text, const char *where, const char *checkpoint, int iteration,
+	       struct watched *watched, struct error *err)
+{
+	const struct spool_hooks hooks = {.recon = {.context = watched,
+						    .cancelled = watched_cancelled,
+						    .yield = watched_yield,
+						    .row = watched_row,
+						    .warning = watched_warning},
+					  .on_volume = watched_volume,
+					  .on_open = watched_open};
+	const struct device_options options = {.threads = 2};
+	struct job_request request;
+	struct device *device = NULL;
+	int code;
+
+	ck_assert_msg(job_request_parse(request_text, strlen(request_text), &request, err) == 0, "%s", err->text);
+	ck_assert_msg(backend_cpu.open(0, &options, &device, err) == 0, "%s", err->text);
+	code = spool_run(&backend_cpu, device, directory, &request.recipe, where, checkpoint, iteration, &hooks, err);
+	backend_cpu.close(device);
+	recipe_clear(&request.recipe);
+	return code;
+}
+
+static void load(const char *where, const char *name, char **ret_bytes, size_t *ret_length)
+{
+	struct error err = {0};
+	char file[512];
+
+	snprintf(file, sizeof(file), "%s/%s", where, name);
+	ck_assert_msg(file_read(file, 1 << 24, ret_bytes, ret_length, &err) == 0, "%s", err.text);
+}
+
+static void assert_same_file(const char *a, const char *b, const char *name)
+{
+	char *x, *y;
+	size_t m, n;
+
+	load(a, name, &x, &m);
+	load(b, name, &y, &n);
+	ck_assert_uint_eq(m, n);
+	ck_assert_msg(memcmp(x, y, m) == 0, "%s differs", name);
+	free(x);
+	free(y);
+}
+
+#define GRID "\"grid\":{\"size\":[20,16,12],\"spacing_mm\":[4,5,6]}"
+static const char pipeline[] =
+    "{\"scan\":\"s\"," GRID ",\"fdk\":{},\"sart\":{\"iterations\":4,\"subsets\":3},\"tv\":{},"
+    "\"emit\":[\"fdk\",\"fdk-tv\",2,4]}";
+
+START_TEST(kept_volumes_are_files_that_say_what_they_are)
+{
+	static const char *const names[] = {"fdk", "fdk-tv", "iter-2", "iter-4", "final"};
+	struct watched watched = {0};
+	struct error err = {0};
+	size_t bytes = 20 * 16 * 12 * sizeof(float);
+
+	put_scan();
+	ck_assert_msg(run(pipeline, out, NULL, 0, &watched, &err) == 0, "%s", err.text);
+	ck_assert_int_eq(watched.opened, 1);
+	ck_assert_int_eq(watched.rows, 4);
+	ck_assert_int_eq(watched.kept, 5);
+	ck_assert_int_eq(count_files(out), 5);
+	for (int i = 0; i < 5; i++) {
+		char expected[256], *content, digest[32];
+		struct grid grid = {.size = {0}};
+		float *voxels = NULL;
+		size_t length;
+
+		ck_assert_str_eq(watched.names[i], names[i]);
+		snprintf(expected, sizeof(expected), "%s/%s.nii", out, names[i]);
+		ck_assert_str_eq(watched.saved[i].path, expected);
+		ck_assert_uint_eq(watched.saved[i].bytes, bytes);
+		load(out, strrchr(expected, '/') + 1, &content, &length);
+		ck_assert_uint_eq(length, SPOOL_VOLUME_OFFSET + bytes);
+		EVP_Digest(content + SPOOL_VOLUME_OFFSET, bytes, (unsigned char *)digest, NULL, EVP_sha256(), NULL);
+		ck_assert_mem_eq(digest, watched.saved[i].sha256, 32);
+		ck_assert_int_eq(volume_read(expected, &grid, &voxels, &err), 0);
+		ck_assert_int_eq(grid.size[1], 16);
+		ck_assert_double_eq_tol(grid.spacing[2], 6, 1e-6); /* single precision in the header */
+		ck_assert_mem_eq(voxels, content + SPOOL_VOLUME_OFFSET, bytes);
+		/* The middle of the ball at (4, -6, 3), 18 views: within a few percent. */
+		ck_assert_double_eq_tol(voxels[(6 * 16 + 6) * 20 + 10], 0.02, 0.002);
+		free(voxels);
+		free(content);
+	}
+	ck_assert_mem_eq(watched.saved[3].sha256, watched.saved[4].sha256, 32);
+	ck_assert_mem_ne(watched.saved[2].sha256, watched.saved[3].sha256, 32);
+}
+END_TEST
+
+START_TEST(the_same_iterate_is_one_file_with_two_names)
+{
+	struct watched watched = {0};
+	struct error err = {0};
+	struct stat last, final, early;
+
+	put_scan();
+	for (int again = 0; again < 2; again++) { /* over what the first run left */
+		memset(&watched, 0, sizeof(watched));
+		ck_assert_int_eq(run(pipeline, out, NULL, 0, &watched, &err), 0);
+		ck_assert_int_eq(stat(watched.saved[2].path, &early), 0);
+		ck_assert_int_eq(stat(watched.saved[3].path, &last), 0);
+		ck_assert_int_eq(stat(watched.saved[4].path, &final), 0);
+		ck_assert_uint_eq(last.st_ino, final.st_ino);
+		ck_assert_uint_ne(early.st_ino, final.st_ino);
+		ck_assert_int_eq(count_files(out), 5);
+	}
+	/* An FDK that TV has changed is not the final volume, one that it has not is. */
+	remove_all(out);
+	ck_assert_int_eq(mkdir(out, 0700), 0);
+	memset(&watched, 0, sizeof(watched));
+	ck_assert_int_eq(
+	    run("{\"scan\":\"s\"," GRID ",\"fdk\":{},\"tv\":{},\"emit\":[\"fdk\"]}", out, NULL, 0, &watched, &err), 0);
+	ck_assert_int_eq(watched.kept, 2);
+	ck_assert_mem_ne(watched.saved[0].sha256, watched.saved[1].sha256, 32);
+	memset(&watched, 0, sizeof(watched));
+	ck_assert_int_eq(run("{\"scan\":\"s\"," GRID ",\"fdk\":{},\"emit\":[\"fdk\"]}", out, NULL, 0, &watched, &err),
+			 0);
+	ck_assert_mem_eq(watched.saved[0].sha256, watched.saved[1].sha256, 32);
+	ck_assert_int_eq(stat(watched.saved[0].path, &last), 0);
+	ck_assert_int_eq(stat(watched.saved[1].path, &final), 0);
+	ck_assert_uint_eq(last.st_ino, final.st_ino);
+}
+END_TEST
+
+START_TEST(a_run_that_yields_goes_on_to_the_same_bits)
+{
+	struct watched whole = {0}, first = {.yield_at = 1}, second = {.yield_at = 3}, third = {0};
+	struct error err = {0};
+	char straight[160], checkpoint[200];
+
+	put_scan();
+	snprintf(straight, sizeof(straight), "%s/straight", directory);
+	snprintf(checkpoint, sizeof(checkpoint), "%s/%s", out, SPOOL_CHECKPOINT);
+	ck_assert_int_eq(mkdir(straight, 0700), 0);
+	ck_assert_int_eq(run(pipeline, straight, NULL, 0, &whole, &err), 0);
+	ck_assert_int_eq(run(pipeline, out, NULL, 0, &first, &err), ERR_BUSY);
+	ck_assert_int_eq(first.last_row, 1);
+	ck_assert(is_there(out, SPOOL_CHECKPOINT));
+	ck_assert_int_eq(run(pipeline, out, checkpoint, 1, &second, &err), ERR_BUSY);
+	ck_assert_int_eq(second.rows, 2);
+	ck_assert_int_eq(second.last_row, 3);
+	ck_assert_int_eq(run(pipeline, out, checkpoint, 3, &third, &err), 0);
+	ck_assert_int_eq(third.rows, 1);
+	ck_assert_str_eq(third.warnings, whole.warnings);
+	for (int i = 0; i < whole.kept; i++) {
+		char name[64];
+
+		snprintf(name, sizeof(name), "%s.nii", whole.names[i]);
+		assert_same_file(straight, out, name);
+	}
+	ck_assert_int_eq(count_files(out), 6); /* five volumes and the checkpoint */
+}
+END_TEST
+
+START_TEST(a_checkpoint_knows_its_own_iteration)
+{
+	struct watched first = {.yield_at = 2}, second = {0};
+	struct error err = {0};
+	char checkpoint[200];
+
+	put_scan();
+	snprintf(checkpoint, sizeof(checkpoint), "%s/%s", out, SPOOL_CHECKPOINT);
+	ck_assert_int_eq(run(pipeline, out, NULL, 0, &first, &err), ERR_BUSY);
+	ck_assert_int_eq(run(pipeline, out, checkpoint, 1, &second, &err), 0); /* the caller missed the second */
+	ck_assert_int_eq(second.rows, 2);
+	ck_assert_ptr_nonnull(strstr(second.warnings, "checkpoint"));
+}
+END_TEST
+
+START_TEST(a_checkpoint_of_something_else_is_refused)
+{
+	static const char other[] =
+	    "{\"scan\":\"s\",\"grid\":{\"size\":[16,20,12],\"spacing_mm\":[4,5,6]},\"sart\":{}}";
+	struct watched first = {.yield_at = 2}, second = {0};
+	struct error err = {0};
+	char checkpoint[200], *bytes;
+	size_t length;
+
+	put_scan();
+	snprintf(checkpoint, sizeof(checkpoint), "%s/%s", out, SPOOL_CHECKPOINT);
+	ck_assert_int_lt(run(pipeline, out, checkpoint, 2, &second, &err), 0); /* none there */
+	ck_assert_int_eq(run(pipeline, out, NULL, 0, &first, &err), ERR_BUSY);
+	ck_assert_int_eq(run(other, out, checkpoint, 2, &second, &err), ERR_INVALID);
+	load(out, SPOOL_CHECKPOINT, &bytes, &length);
+	ck_assert_int_eq(file_write_durable(checkpoint, bytes, length - 1, &err), 0);
+	ck_assert_int_eq(run(pipeline, out, checkpoint, 2, &second, &err), ERR_INVALID);
+	bytes[0] = 'x';
+	ck_assert_int_eq(file_write_durable(checkpoint, bytes, length, &err), 0);
+	ck_assert_int_eq(run(pipeline, out, checkpoint, 2, &second, &err), ERR_INVALID);
+	ck_assert_int_eq(file_write_durable(checkpoint, "", 0, &err), 0);
+	ck_assert_int_lt(run(pipeline, out, checkpoint, 2, &second, &err), 0);
+	ck_assert_int_eq(second.rows, 0);
+	free(bytes);
+}
+END_TEST
+
+START_TEST(a_run_that_is_stopped_leaves_nothing_half_written)
+{
+	struct watched cancelled = {.cancel_at = 2}, refused = {.fail_at = 2}, full = {0};
+	struct error err = {0};
+	struct rlimit before, tight;
+
+	put_scan();
+	ck_assert_int_eq(run(pipeline, out, NULL, 0, &cancelled, &err), ERR_CANCELLED);
+	ck_assert_int_eq(cancelled.last_row, 2);
+	ck_assert(!is_there(out, "final.nii") && !is_there(out, "final.nii.tmp"));
+	ck_assert_int_eq(run(pipeline, out, NULL, 0, &refused, &err), ERR_CONFLICT);
+	ck_assert_str_eq(err.text, "not this one");
+	ck_assert_int_eq(refused.kept, 2);
+	/* A disk that takes only a part of a volume. */
+	remove_all(out);
+	ck_assert_int_eq(mkdir(out, 0700), 0);
+	ck_assert_int_eq(getrlimit(RLIMIT_FSIZE, &before), 0);
+	tight = before;
+	tight.rlim_cur = 8192;
+	signal(SIGXFSZ, SIG_IGN);
+	ck_assert_int_eq(setrlimit(RLIMIT_FSIZE, &tight), 0);
+	ck_assert_int_eq(run(pipeline, out, NULL, 0, &full, &err), ERR_IO);
+	ck_assert_int_eq(setrlimit(RLIMIT_FSIZE, &before), 0);
+	ck_assert_int_eq(full.kept, 0);
+	ck_assert_int_eq(count_files(out), 0);
+}
+END_TEST
+
+START_TEST(intensities_need_air_or_a_flat_image)
+{
+	static uint16_t counts[VIEWS][PIXELS];
+	static float flat[PIXELS];
+	struct watched watched = {0};
+	struct error err = {0};
+	static const char fdk[] = "{\"scan\":\"s\"," GRID ",\"fdk\":{}}";
+	float *voxels, *twice;
+	struct grid grid;
+
+	for (int i = 0; i < VIEWS; i++)
+		for (int k = 0; k < PIXELS; k++)
+			counts[i][k] = (uint16_t)(40000 - 20 * ((k * 7 + i) % 100));
+	for (int k = 0; k < PIXELS; k++)
+		flat[k] = 40000;
+	put_document("\"sample\":\"uint16\",\"quantity\":\"intensity\"");
+	put("projections.raw", counts, sizeof(counts));
+	ck_assert_int_eq(run(fdk, out, NULL, 0, &watched, &err), ERR_IMPOSSIBLE);
+	ck_assert_ptr_nonnull(strstr(err.text, "flat"));
+	ck_assert_int_eq(watched.opened, 0);
+	put("flat.f32", flat, sizeof(flat));
+	ck_assert_msg(run(fdk, out, NULL, 0, &watched, &err) == 0, "%s", err.text);
+	ck_assert_int_eq(volume_read(watched.saved[0].path, &grid, &voxels, &err), 0);
+	/* One number says the same as an even image. */
+	snprintf(path, sizeof(path), "%s/flat.f32", directory);
+	ck_assert_int_eq(unlink(path), 0);
+	put_document("\"sample\":\"uint16\",\"quantity\":\"intensity\",\"air\":40000");
+	memset(&watched, 0, sizeof(watched));
+	ck_assert_int_eq(run(fdk, out, NULL, 0, &watched, &err), 0);
+	ck_assert_int_eq(volume_read(watched.saved[0].path, &grid, &twice, &err), 0);
+	for (size_t i = 0; i < grid_voxels(&grid); i++)
+		/* Single precision of values of a thousandth, before and after the logarithm. */
+		ck_assert_float_eq_tol(voxels[i], twice[i], 1e-7f);
+	free(voxels);
+	free(twice);
+}
+END_TEST
+
+Suite *spool_suite(void)
+{
+	Suite *suite = suite_create("spool");
+	TCase *files = tcase_create("files"), *pipelines = tcase_create("pipeline");
+
+	tcase_add_checked_fixture(files, make_directory, remove_directory);
+	tcase_add_test(files, a_durable_file_is_there_whole_and_alone);
+	tcase_add_test(files, what_a_crash_left_is_written_over);
+	tcase_add_test(files, a_write_that_fails_leaves_what_was_there);
+	tcase_add_test(files, a_file_that_cannot_be_read_says_why);
+	tcase_add_test(files, a_scan_directory_is_read);
+	tcase_add_test(files, a_scan_directory_with_a_fault_is_refused);
+	suite_add_tcase(suite, files);
+	tcase_set_timeout(pipelines, 120); /* sanitizers on a loaded machine */
+	tcase_add_checked_fixture(pipelines, make_directory, remove_directory);
+	tcase_add_test(pipelines, kept_volumes_are_files_that_say_what_they_are);
+	tcase_add_test(pipelines, the_same_iterate_is_one_file_with_two_names);
+	tcase_add_test(pipelines, a_run_that_yields_goes_on_to_the_same_bits);
+	tcase_add_test(pipelines, a_checkpoint_knows_its_own_iteration);
+	tcase_add_test(pipelines, a_checkpoint_of_something_else_is_refused);
+	tcase_add_test(pipelines, a_run_that_is_stopped_leaves_nothing_half_written);
+	tcase_add_test(pipelines, intensities_need_air_or_a_flat_image);
+	suite_add_tcase(suite, pipelines);
+	return suite;
+}
