@@ -388,49 +388,50 @@ void phantom_voxelise(const struct phantom *phantom, const struct grid *grid, in
 struct box {
 	const float *volume;
 	const struct grid *grid;
-	size_t stride[3];
+	size_t next[3]; /* from a voxel to its neighbour; 0 along an axis of one voxel */
+	float last[3];  /* the outer voxel's centre */
+	int low[3];     /* the last voxel that has a neighbour above it */
 };
 
-/* p in voxels, inside the grid. */
-static double take_nearest(const struct box *box, const double p[3])
+static struct box box_make(const float *volume, const struct grid *grid)
 {
-	size_t at = 0;
+	struct box box = {.volume = volume, .grid = grid};
+	size_t stride = 1;
 
 	for (int i = 0; i < 3; i++) {
-		int voxel = (int)floor(p[i] + 0.5);
-
-		voxel = voxel < 0 ? 0 : voxel;
-		voxel = voxel < box->grid->size[i] ? voxel : box->grid->size[i] - 1;
-		at += (size_t)voxel * box->stride[i];
+		box.next[i] = grid->size[i] > 1 ? stride : 0;
+		box.last[i] = (float)(grid->size[i] - 1);
+		box.low[i] = grid->size[i] > 1 ? grid->size[i] - 2 : 0;
+		stride *= (size_t)grid->size[i];
 	}
-	return box->volume[at];
+	return box;
 }
 
-static double take_trilinear(const struct box *box, const double p[3])
+static inline int at_most(int value, int most)
 {
-	size_t low[3], high[3];
-	double part[3], sum = 0;
+	return value < most ? value : most;
+}
 
-	/* Beyond the outer centres the values there are held. */
-	for (int i = 0; i < 3; i++) {
-		double held = fmin(fmax(p[i], 0), box->grid->size[i] - 1);
-		int voxel = (int)held;
+/* x, y, z in voxels; beyond the outer centres the values there are held. */
+static inline float take_nearest(const struct box *box, const float p[3])
+{
+	return box->volume[(size_t)(p[0] + 0.5f) * box->next[0] + (size_t)(p[1] + 0.5f) * box->next[1] +
+			   (size_t)(p[2] + 0.5f) * box->next[2]];
+}
 
-		part[i] = held - voxel;
-		low[i] = (size_t)voxel * box->stride[i];
-		high[i] = voxel + 1 < box->grid->size[i] ? low[i] + box->stride[i] : low[i];
-	}
-	for (int corner = 0; corner < 8; corner++) {
-		double weight = 1;
-		size_t at = 0;
+static inline float take_trilinear(const struct box *box, const float p[3])
+{
+	int x = at_most((int)p[0], box->low[0]), y = at_most((int)p[1], box->low[1]),
+	    z = at_most((int)p[2], box->low[2]);
+	float fx = p[0] - (float)x, fy = p[1] - (float)y, fz = p[2] - (float)z;
+	size_t dx = box->next[0], dy = box->next[1];
+	const float *near = box->volume + (size_t)x * dx + (size_t)y * dy + (size_t)z * box->next[2];
+	const float *far = near + box->next[2];
+	float n0 = near[0] + fx * (near[dx] - near[0]), n1 = near[dy] + fx * (near[dy + dx] - near[dy]);
+	float f0 = far[0] + fx * (far[dx] - far[0]), f1 = far[dy] + fx * (far[dy + dx] - far[dy]);
+	float n = n0 + fy * (n1 - n0), f = f0 + fy * (f1 - f0);
 
-		for (int i = 0; i < 3; i++) {
-			weight *= corner >> i & 1 ? part[i] : 1 - part[i];
-			at += corner >> i & 1 ? high[i] : low[i];
-		}
-		sum += weight * box->volume[at];
-	}
-	return sum;
+	return n + fz * (f - n);
 }
 
 /* Integral over the ray source + t way, 0 <= t <= 1, at the middles of equal steps between entry and exit. */
@@ -439,6 +440,7 @@ static double sample_ray(const struct box *box, const double source[3], const do
 {
 	struct span inside = {0, 1};
 	double s[3], d[3], length, sum = 0;
+	float first[3], by[3];
 	long count;
 
 	for (int i = 0; i < 3; i++) {
@@ -450,11 +452,22 @@ static double sample_ray(const struct box *box, const double source[3], const do
 	}
 	length = span_length(inside) * vec_norm(way);
 	count = (long)ceil(length / step);
-	for (long n = 0; n < count; n++) {
-		double t = inside.from + (n + 0.5) / (double)count * (inside.to - inside.from);
-		double p[3] = {s[0] + t * d[0], s[1] + t * d[1], s[2] + t * d[2]};
+	for (int i = 0; i < 3 && count > 0; i++) {
+		double width = (inside.to - inside.from) / (double)count;
 
-		sum += sampling == SAMPLE_NEAREST ? take_nearest(box, p) : take_trilinear(box, p);
+		first[i] = (float)(s[i] + (inside.from + 0.5 * width) * d[i]);
+		by[i] = (float)(width * d[i]);
+	}
+	for (long n = 0; n < count; n++) {
+		float p[3];
+
+		for (int i = 0; i < 3; i++) {
+			float along = first[i] + (float)n * by[i];
+
+			along = along > 0 ? along : 0;
+			p[i] = along < box->last[i] ? along : box->last[i];
+		}
+		sum += (double)(sampling == SAMPLE_NEAREST ? take_nearest(box, p) : take_trilinear(box, p));
 	}
 	return count > 0 ? sum * length / (double)count : 0;
 }
@@ -463,8 +476,7 @@ void volume_project_fine(const float *volume, const struct grid *grid, const str
 			 enum sampling sampling, double step, float *ret_projection)
 {
 	const struct view *view = &geometry->views[view_index];
-	const struct box box = {
-	    volume, grid, {1, (size_t)grid->size[0], (size_t)grid->size[0] * (size_t)grid->size[1]}};
+	const struct box box = box_make(volume, grid);
 
 #pragma omp parallel for schedule(dynamic, 1)
 	for (int row = 0; row < geometry->rows; row++)

@@ -42,7 +42,7 @@ test_abdomen_through_a_calibrated_c_arm() {
 	    projections: {count: length, sample: "float32", quantity: "line_integral"},
 	    geometry: {kind: "matrices", matrices: .}}' "$dir/matrices.json" >"$dir/scan-in.json"
 	cbct simulate -o "$dir" --scan "$dir/scan-in.json" --volume "$dir/hu.raw" --size 122,101,112 --spacing 1.5 --hu \
-		--photons 20000 --seed 7 --truth "$dir/truth.nii"
+		--step 1.5 --photons 20000 --seed 7 --truth "$dir/truth.nii"
 	reconstruct "$dir" '{"scan": "SCAN", "grid": {"size": [122, 101, 112], "spacing_mm": [1.5, 1.5, 1.5]},
 	    "fdk": {"window": "hann"}, "sart": {}, "tv": {"after": "sart"}, "emit": ["fdk"]}'
 	local name
