@@ -1,0 +1,34 @@
+/*
+ * The API: one row for each endpoint. The schema of record is
+ * proto/openapi.yaml; /v1/jobs/{}/events, /stream, /slice, /v1/openapi.json and
+ * the web page at / get their rows here when they come.
+ */
+#include "daemon/api.h"
+
+#include "proto/json.h"
+
+/* GET is HEAD as well. A body that is streamed has begin and data beside handle. */
+const struct route api_routes[] = {
+    {"GET", "/livez", live_get, BODY_NONE, 0, NULL, NULL},
+    {"GET", "/readyz", ready_get, BODY_NONE, 0, NULL, NULL},
+    {"GET", "/metrics", metrics_get, BODY_NONE, 0, NULL, NULL},
+    {"GET", "/v1/devices", device_list, BODY_NONE, 0, NULL, NULL},
+
+    {"GET", "/v1/scans", scan_list, BODY_NONE, 0, NULL, NULL},
+    {"POST", "/v1/scans", scan_post, BODY_WHOLE, JSON_BYTES_MAX, NULL, NULL},
+    {"GET", "/v1/scans/{}", scan_get, BODY_NONE, 0, NULL, NULL},
+    {"DELETE", "/v1/scans/{}", scan_delete, BODY_NONE, 0, NULL, NULL},
+    {"PUT", "/v1/scans/{}/flat", image_put, BODY_STREAM, 0, flat_begin, upload_take},
+    {"PUT", "/v1/scans/{}/dark", image_put, BODY_STREAM, 0, dark_begin, upload_take},
+    {"PUT", "/v1/scans/{}/projections", projections_put, BODY_STREAM, 0, projections_begin, upload_take},
+    {"GET", "/v1/scans/{}/projections/{}", projection_get, BODY_NONE, 0, NULL, NULL},
+    {"PUT", "/v1/scans/{}/projections/{}", projections_put, BODY_STREAM, 0, projections_begin, upload_take},
+
+    {"GET", "/v1/jobs", job_list, BODY_NONE, 0, NULL, NULL},
+    {"POST", "/v1/jobs", job_post, BODY_WHOLE, JSON_BYTES_MAX, NULL, NULL},
+    {"GET", "/v1/jobs/{}", job_get, BODY_NONE, 0, NULL, NULL},
+    {"DELETE", "/v1/jobs/{}", job_delete, BODY_NONE, 0, NULL, NULL},
+    {"GET", "/v1/jobs/{}/volumes", volume_list, BODY_NONE, 0, NULL, NULL},
+    {"GET", "/v1/jobs/{}/volumes/{}", volume_get, BODY_NONE, 0, NULL, NULL},
+    {NULL, NULL, NULL, BODY_NONE, 0, NULL, NULL},
+};

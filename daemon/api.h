@@ -1,0 +1,84 @@
+#ifndef CBCT_DAEMON_API_H
+#define CBCT_DAEMON_API_H
+
+#include "daemon/http.h"
+#include "daemon/job.h"
+#include "daemon/store.h"
+#include "daemon/supervise.h"
+#include "daemon/upload.h"
+
+/* What the handlers work on; constant while the server runs. */
+struct api {
+	struct store *store;
+	struct jobs *jobs;
+	struct supervise *supervise;
+	struct uploads *uploads;
+	struct http *http;
+	double max_wait; /* s */
+	double started;  /* http_now */
+};
+
+/* Every endpoint; their context is a struct api. Ends with method == NULL. */
+extern const struct route api_routes[];
+
+/* ---- the handlers, as struct route wants them ---- */
+int scan_post(void *context, struct request *request, struct error *err);
+int scan_list(void *context, struct request *request, struct error *err);
+int scan_get(void *context, struct request *request, struct error *err);
+int scan_delete(void *context, struct request *request, struct error *err);
+
+int projection_get(void *context, struct request *request, struct error *err);
+int projections_begin(void *context, struct request *request, struct error *err);
+int flat_begin(void *context, struct request *request, struct error *err);
+int dark_begin(void *context, struct request *request, struct error *err);
+int upload_take(void *context, struct request *request, const void *data, size_t size, size_t *ret_taken,
+		struct error *err);
+int projections_put(void *context, struct request *request, struct error *err);
+int image_put(void *context, struct request *request, struct error *err);
+
+int job_post(void *context, struct request *request, struct error *err);
+int job_list(void *context, struct request *request, struct error *err);
+int job_get(void *context, struct request *request, struct error *err);
+int job_delete(void *context, struct request *request, struct error *err);
+
+int volume_list(void *context, struct request *request, struct error *err);
+int volume_get(void *context, struct request *request, struct error *err);
+
+int live_get(void *context, struct request *request, struct error *err);
+int ready_get(void *context, struct request *request, struct error *err);
+int metrics_get(void *context, struct request *request, struct error *err);
+int device_list(void *context, struct request *request, struct error *err);
+
+/* ---- what several of them need: api_common.c ---- */
+enum { PAGE_DEFAULT = 100, PAGE_MAX = 1000 };
+struct page {
+	int limit;
+	const char *after; /* an id or NULL */
+};
+/* ?limit= and ?after=. */
+int page_read(struct request *request, struct page *ret_page, struct error *err);
+
+/* The value of a query parameter among `names` (which ends with NULL); its index, 0 when it is absent. */
+int query_choice(struct request *request, const char *name, const char *const *names, int *ret_index,
+		 struct error *err);
+
+/* Bytes that do not change while they bear this tag. */
+struct entity {
+	const char *etag; /* quoted, strong */
+	uint64_t size;    /* UNKNOWN_SIZE: no ranges */
+	const char *media_type;
+	const char *filename;
+};
+/*
+ * If-None-Match, Range and If-Range. *ret_done: the reply is set (304, 416);
+ * otherwise send bytes first .. first + length - 1 with that status, then call entity_headers.
+ */
+struct selection {
+	int status; /* 200 or 206 */
+	uint64_t first, length;
+};
+int entity_select(struct request *request, const struct entity *entity, struct selection *ret_selection, bool *ret_done,
+		  struct error *err);
+void entity_headers(struct request *request, const struct entity *entity, const struct selection *selection);
+
+#endif

@@ -1,0 +1,101 @@
+/* What several handlers need: pages, choices, conditional and partial requests (RFC 9110, 13 and 14). */
+#include <inttypes.h>
+#include <stdio.h>
+#include <string.h>
+
+#include "daemon/api.h"
+#include "daemon/http_text.h"
+
+int page_read(struct request *request, struct page *ret_page, struct error *err)
+{
+	const char *limit = request_query(request, "limit"), *after = request_query(request, "after");
+	long number = PAGE_DEFAULT;
+
+	if (limit != NULL && (!index_parse(limit, strlen(limit), PAGE_MAX, &number) || number == 0))
+		return error_set(err, ERR_INVALID, "limit is \"%.40s\", expected a whole number from 1 to %d", limit,
+				 PAGE_MAX);
+	if (after != NULL && !id_valid(after))
+		return error_set(err, ERR_INVALID, "after is \"%.40s\", expected an id", after);
+	ret_page->limit = (int)number;
+	ret_page->after = after;
+	return 0;
+}
+
+int query_choice(struct request *request, const char *name, const char *const *names, int *ret_index, struct error *err)
+{
+	const char *value = request_query(request, name);
+	char known[160] = "";
+	int index = 0;
+
+	for (; value != NULL && names[index] != NULL; index++) {
+		size_t length = strlen(known);
+
+		if (strcmp(value, names[index]) == 0)
+			break;
+		snprintf(known + length, sizeof(known) - length, "%s%s", length > 0 ? ", " : "", names[index]);
+	}
+	if (value != NULL && names[index] == NULL)
+		return error_set(err, ERR_INVALID, "%s is \"%.40s\", expected one of %s", name, value, known);
+	*ret_index = index;
+	return 0;
+}
+
+static int reply_not_modified(struct request *request, const struct entity *entity, struct error *err)
+{
+	if (request_reply_empty(request, 304, err) != 0)
+		return err->code;
+	request_reply_header(request, "ETag", "%s", entity->etag);
+	request_reply_header(request, "Vary", "Accept-Encoding");
+	return 0;
+}
+
+static int reply_range_outside(struct request *request, const struct entity *entity, struct error *err)
+{
+	if (request_reply_problem(request, 416, err, "Range is \"%.60s\", the body has %" PRIu64 " bytes",
+				  request_header(request, "Range"), entity->size) != 0)
+		return err->code;
+	request_reply_header(request, "Content-Range", "bytes */%" PRIu64, entity->size);
+	return 0;
+}
+
+int entity_select(struct request *request, const struct entity *entity, struct selection *ret_selection, bool *ret_done,
+		  struct error *err)
+{
+	const char *condition = request_header(request, "If-Range");
+	struct selection selection = {200, 0, entity->size};
+	bool ranges = entity->size != UNKNOWN_SIZE && !request_is_head(request) &&
+		      (condition == NULL || etag_in(condition, entity->etag, false));
+
+	*ret_done = true;
+	if (etag_in(request_header(request, "If-None-Match"), entity->etag, true))
+		return reply_not_modified(request, entity, err);
+	if (ranges) {
+		switch (
+		    range_parse(request_header(request, "Range"), entity->size, &selection.first, &selection.length)) {
+		case RANGE_OUTSIDE:
+			return reply_range_outside(request, entity, err);
+		case RANGE_ONE:
+			selection.status = 206;
+			break;
+		case RANGE_NONE:
+			break;
+		}
+	}
+	*ret_done = false;
+	*ret_selection = selection;
+	return 0;
+}
+
+void entity_headers(struct request *request, const struct entity *entity, const struct selection *selection)
+{
+	request_reply_header(request, "Content-Type", "%s", entity->media_type);
+	request_reply_header(request, "Content-Disposition", "attachment; filename=\"%s\"", entity->filename);
+	request_reply_header(request, "ETag", "%s", entity->etag);
+	request_reply_header(request, "Vary", "Accept-Encoding");
+	request_reply_header(request, "Cache-Control", "private, no-cache");
+	if (entity->size != UNKNOWN_SIZE)
+		request_reply_header(request, "Accept-Ranges", "bytes");
+	if (selection->status == 206)
+		request_reply_header(request, "Content-Range", "bytes %" PRIu64 "-%" PRIu64 "/%" PRIu64,
+				     selection->first, selection->first + selection->length - 1, entity->size);
+}

@@ -1,0 +1,260 @@
+/* /v1/scans/{}/projections, flat, dark */
+#include <errno.h>
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <unistd.h>
+
+#include "daemon/api.h"
+#include "daemon/http_text.h"
+#include "daemon/picture.h"
+
+/* ---- in ---- */
+
+/* "" (all), "k" or "a-b". */
+static int read_run(const char *text, int count, struct upload_target *target, struct error *err)
+{
+	const char *dash = strchr(text, '-');
+	size_t length = dash != NULL ? (size_t)(dash - text) : strlen(text);
+	long first = 0, last = count - 1;
+
+	if (text[0] != '\0') {
+		if (!index_parse(text, length, 1000000000, &first))
+			return error_set(err, ERR_NOT_FOUND, "\"%.60s\" is neither a projection nor a run of them",
+					 text);
+		last = first;
+		if (dash != NULL && !index_parse(dash + 1, strlen(dash + 1), 1000000000, &last))
+			return error_set(err, ERR_NOT_FOUND, "\"%.60s\" is no run of projections", text);
+	}
+	if (first >= count || last >= count)
+		return error_set(err, ERR_NOT_FOUND, "projection %ld is asked for, the scan has 0 to %d",
+				 last > first ? last : first, count - 1);
+	if (last < first)
+		return error_set(err, ERR_INVALID, "the run %.60s ends before it begins", text);
+	*target = (struct upload_target){.kind = UPLOAD_PROJECTIONS, .first = (int)first, .last = (int)last};
+	return 0;
+}
+
+static void release_upload(void *state)
+{
+	upload_release(state);
+}
+
+static int begin(struct api *api, struct request *request, struct stored_scan *scan, const struct upload_target *target,
+		 struct error *err)
+{
+	struct upload *upload = NULL;
+
+	if (upload_new(api->uploads, request, scan, target, &upload, err) != 0)
+		return err->code;
+	request_set_state(request, upload, release_upload);
+	return 0;
+}
+
+int projections_begin(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	struct upload_target target;
+	struct stored_scan *scan;
+
+	if (store_scan_find(api->store, request_argument(request, 0), &scan, err) != 0)
+		return err->code;
+	if (read_run(request_argument(request, 1), stored_scan_parsed(scan)->count, &target, err) != 0) {
+		stored_scan_release(scan);
+		return err->code;
+	}
+	return begin(api, request, scan, &target, err);
+}
+
+static int image_begin(struct api *api, struct request *request, enum image image, struct error *err)
+{
+	const struct upload_target target = {.kind = UPLOAD_IMAGE, .image = image};
+	struct stored_scan *scan;
+
+	if (store_scan_find(api->store, request_argument(request, 0), &scan, err) != 0)
+		return err->code;
+	if (stored_scan_parsed(scan)->quantity != QUANTITY_INTENSITY) {
+		stored_scan_release(scan);
+		return error_set(err, ERR_IMPOSSIBLE,
+				 "the scan's quantity is line_integral; flat and dark images are for intensity");
+	}
+	return begin(api, request, scan, &target, err);
+}
+
+int flat_begin(void *context, struct request *request, struct error *err)
+{
+	return image_begin(context, request, IMAGE_FLAT, err);
+}
+
+int dark_begin(void *context, struct request *request, struct error *err)
+{
+	return image_begin(context, request, IMAGE_DARK, err);
+}
+
+int upload_take(void *context, struct request *request, const void *data, size_t size, size_t *ret_taken,
+		struct error *err)
+{
+	(void)context;
+	return upload_data(request_state(request), data, size, ret_taken, err);
+}
+
+int projections_put(void *context, struct request *request, struct error *err)
+{
+	struct upload_outcome outcome;
+	cJSON *document;
+	int code = upload_end(request_state(request), &outcome, err);
+
+	(void)context;
+	if (code != 0)
+		return code;
+	document = cJSON_CreateObject();
+	cJSON_AddStringToObject(document, "scan", request_argument(request, 0));
+	cJSON_AddNumberToObject(document, "stored", outcome.created);
+	cJSON_AddNumberToObject(document, "same", outcome.same);
+	return request_reply_json(request, outcome.created > 0 ? 201 : 200, document, err);
+}
+
+int image_put(void *context, struct request *request, struct error *err)
+{
+	return projections_put(context, request, err);
+}
+
+/* ---- out ---- */
+
+/* The file's descriptor when the projection is stored. */
+static int open_projection(struct stored_scan *scan, int index, int *ret_descriptor, uint8_t ret_sha256[32],
+			   struct error *err)
+{
+	if (!stored_scan_digest(scan, index, ret_sha256))
+		return error_set(err, ERR_NOT_FOUND, "projection %d has not been stored yet", index);
+	return stored_scan_open(scan, false, ret_descriptor, err);
+}
+
+static int read_whole(int descriptor, off_t offset, void *to, size_t size, struct error *err)
+{
+	for (size_t done = 0; done < size;) {
+		ssize_t got = pread(descriptor, (char *)to + done, size - done, offset + (off_t)done);
+
+		if (got < 0 && errno == EINTR)
+			continue;
+		if (got <= 0)
+			return error_set_errno(err, got < 0 ? errno : EIO, "read a projection");
+		done += (size_t)got;
+	}
+	return 0;
+}
+
+/* Samples as float, the smallest finite one black, the largest white. */
+static int draw(const void *samples, const struct scan *scan, char **ret_png, size_t *ret_length, struct error *err)
+{
+	int width = scan->geometry.columns, height = scan->geometry.rows, code;
+	size_t count = (size_t)width * (size_t)height;
+	float *values = malloc(count * sizeof(*values)), black = INFINITY, white = -INFINITY;
+
+	if (values == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a picture");
+	for (size_t i = 0; i < count; i++) {
+		uint16_t counts;
+
+		if (scan->sample == SAMPLE_UINT16) {
+			memcpy(&counts, (const char *)samples + i * sizeof(counts), sizeof(counts));
+			values[i] = counts;
+		} else {
+			memcpy(&values[i], (const char *)samples + i * sizeof(float), sizeof(float));
+		}
+		if (isfinite(values[i])) {
+			black = fminf(black, values[i]);
+			white = fmaxf(white, values[i]);
+		}
+	}
+	code = picture_make(values, width, height, black, white, ret_png, ret_length, err);
+	free(values);
+	return code;
+}
+
+static int reply_picture(struct request *request, const struct scan *scan, int descriptor, int index, struct error *err)
+{
+	enum { PICTURE_PIXELS_MAX = 64 << 20 };
+	size_t size = scan_projection_bytes(scan), length;
+	char *png;
+	void *samples;
+	int code;
+
+	if (size > PICTURE_PIXELS_MAX * sample_bytes(scan->sample))
+		return error_set(err, ERR_IMPOSSIBLE, "a picture has at most %d pixels, the projection %zu",
+				 PICTURE_PIXELS_MAX, size / sample_bytes(scan->sample));
+	samples = malloc(size);
+	if (samples == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a picture");
+	code = read_whole(descriptor, (off_t)index * (off_t)size, samples, size, err);
+	if (code == 0)
+		code = draw(samples, scan, &png, &length, err);
+	if (code == 0)
+		code = request_reply_text(request, 200, "image/png", png, length, err);
+	free(samples);
+	return code;
+}
+
+/* Takes the descriptor. */
+static int reply_samples(struct request *request, const struct scan *scan, int descriptor, int index,
+			 const uint8_t sha256[32], struct error *err)
+{
+	char etag[40] = "\"", filename[96];
+	struct entity entity = {.etag = etag,
+				.size = scan_projection_bytes(scan),
+				.media_type = "application/octet-stream",
+				.filename = filename};
+	struct selection selection;
+	bool done;
+
+	for (int i = 0; i < 16; i++)
+		snprintf(etag + 1 + 2 * i, sizeof(etag) - 1 - 2 * (size_t)i, "%02x", sha256[i]);
+	snprintf(etag + 33, sizeof(etag) - 33, "\"");
+	snprintf(filename, sizeof(filename), "%.40s-%d.raw", request_argument(request, 0), index);
+	if (entity_select(request, &entity, &selection, &done, err) != 0 || done) {
+		close(descriptor);
+		return done ? 0 : err->code;
+	}
+	if (request_reply_file(request, selection.status, descriptor, (uint64_t)index * entity.size + selection.first,
+			       selection.length, err) != 0)
+		return err->code;
+	entity_headers(request, &entity, &selection);
+	return 0;
+}
+
+static int reply_projection(struct request *request, struct stored_scan *stored, struct error *err)
+{
+	static const char *const formats[] = {"raw", "png", NULL};
+	const struct scan *scan = stored_scan_parsed(stored);
+	const char *text = request_argument(request, 1);
+	int format, descriptor, code;
+	uint8_t sha256[32];
+	long index;
+
+	if (query_choice(request, "format", formats, &format, err) != 0)
+		return err->code;
+	if (!index_parse(text, strlen(text), scan->count - 1, &index))
+		return error_set(err, ERR_NOT_FOUND, "projection \"%.40s\" is asked for, the scan has 0 to %d", text,
+				 scan->count - 1);
+	if (open_projection(stored, (int)index, &descriptor, sha256, err) != 0)
+		return err->code;
+	if (format == 0)
+		return reply_samples(request, scan, descriptor, (int)index, sha256, err);
+	code = reply_picture(request, scan, descriptor, (int)index, err);
+	close(descriptor);
+	return code;
+}
+
+int projection_get(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	struct stored_scan *scan;
+	int code;
+
+	if (store_scan_find(api->store, request_argument(request, 0), &scan, err) != 0)
+		return err->code;
+	code = reply_projection(request, scan, err);
+	stored_scan_release(scan);
+	return code;
+}

@@ -1,0 +1,199 @@
+/* /v1/jobs/{}/volumes */
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "daemon/api.h"
+#include "daemon/content.h"
+#include "daemon/document.h"
+#include "daemon/http_text.h"
+
+int volume_list(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	struct volume_record *volumes = NULL;
+	struct job_facts facts;
+	cJSON *document, *list;
+	struct job *job;
+	int count = 0, code;
+
+	if (jobs_find(api->jobs, request_argument(request, 0), &job, err) != 0)
+		return err->code;
+	job_facts(job, &facts);
+	job_release(job);
+	code = store_job_volumes(api->store, facts.id, &volumes, &count, err);
+	if (code != 0)
+		return code;
+	document = cJSON_CreateObject();
+	list = cJSON_AddArrayToObject(document, "volumes");
+	for (int i = 0; i < count; i++)
+		cJSON_AddItemToArray(list, volume_document(facts.id, &volumes[i]));
+	cJSON_AddNullToObject(document, "next"); /* a job has as many as its recipe names: one page */
+	free(volumes);
+	return request_reply_json(request, 200, document, err);
+}
+
+static int find_volume(struct api *api, struct request *request, struct job_facts *ret_facts,
+		       struct volume_record *ret_volume, struct error *err)
+{
+	const char *name = request_argument(request, 1);
+	struct volume_record *volumes;
+	struct job *job;
+	int count, found = -1;
+
+	if (jobs_find(api->jobs, request_argument(request, 0), &job, err) != 0)
+		return err->code;
+	job_facts(job, ret_facts);
+	job_release(job);
+	if (store_job_volumes(api->store, ret_facts->id, &volumes, &count, err) != 0)
+		return err->code;
+	for (int i = 0; i < count && found < 0; i++) {
+		if (strcmp(volumes[i].name, name) == 0)
+			found = i;
+	}
+	if (found >= 0)
+		*ret_volume = volumes[found];
+	free(volumes);
+	if (found < 0)
+		return error_set(err, ERR_NOT_FOUND, "job %s has no volume \"%.40s\"%s", ret_facts->id, name,
+				 ret_facts->ended ? "" : " yet");
+	return 0;
+}
+
+static int read_options(struct request *request, const struct job_facts *facts, struct content_options *ret_options,
+			struct error *err)
+{
+	const char *const types[] = {volume_type_names[VOLUME_FLOAT32], volume_type_names[VOLUME_INT16], NULL};
+	const char *scale_text = request_query(request, "scale");
+	const char *formats[16] = {NULL};
+	int format, type;
+	long scale = 1;
+
+	for (int i = 0; volume_formats[i].name != NULL && i < 15; i++)
+		formats[i] = volume_formats[i].name;
+	if (query_choice(request, "format", formats, &format, err) != 0 ||
+	    query_choice(request, "type", types, &type, err) != 0)
+		return err->code;
+	if (scale_text != NULL &&
+	    (!index_parse(scale_text, strlen(scale_text), CONTENT_SCALE_MAX, &scale) || scale == 0))
+		return error_set(err, ERR_INVALID, "scale is \"%.40s\", expected a whole number from 1 to %d",
+				 scale_text, CONTENT_SCALE_MAX);
+	ret_options->format = &volume_formats[format];
+	ret_options->type = (enum volume_type)type;
+	ret_options->scale = (int)scale;
+	ret_options->mu_water = facts->mu_water;
+	ret_options->name = request_argument(request, 1);
+	return 0;
+}
+
+/* Tells voxels, format, type, scale and encoding apart. */
+static void make_etag(const struct volume_record *volume, const struct content_options *options, bool zstd,
+		      char *ret_etag, size_t size)
+{
+	char digest[33];
+
+	for (int i = 0; i < 16; i++)
+		snprintf(digest + 2 * i, sizeof(digest) - 2 * (size_t)i, "%02x", volume->sha256[i]);
+	snprintf(ret_etag, size, "\"%s-%s-%s-%d%s\"", digest, options->format->name, volume_type_names[options->type],
+		 options->scale, zstd ? "-zstd" : "");
+}
+
+/* A part of the content that is made as it is sent. */
+struct part {
+	struct content *content;
+	uint64_t first;
+};
+
+static ssize_t part_read(void *context, uint64_t offset, void *to, size_t size)
+{
+	struct part *part = context;
+
+	return content_read(part->content, part->first + offset, to, size);
+}
+
+static void part_free(void *context)
+{
+	struct part *part = context;
+
+	content_close(part->content);
+	free(part);
+}
+
+static ssize_t stream_read(void *context, uint64_t offset, void *to, size_t size)
+{
+	(void)offset;
+	return content_stream_read(context, to, size);
+}
+
+static void stream_free(void *context)
+{
+	content_stream_free(context);
+}
+
+/* Takes the content. */
+static int reply_plain(struct request *request, struct content *content, const struct selection *selection,
+		       struct error *err)
+{
+	uint64_t offset;
+	int descriptor = content_descriptor(content, &offset);
+	struct part *part;
+
+	if (descriptor >= 0) {
+		content_close(content);
+		return request_reply_file(request, selection->status, descriptor, offset + selection->first,
+					  selection->length, err);
+	}
+	part = malloc(sizeof(*part));
+	if (part == NULL) {
+		content_close(content);
+		return error_set(err, ERR_NO_MEMORY, "no memory for a reply");
+	}
+	*part = (struct part){content, selection->first};
+	return request_reply_read(request, selection->status, selection->length, part_read, part, part_free, err);
+}
+
+/* Takes the content. */
+static int reply_zstd(struct request *request, struct content *content, struct error *err)
+{
+	struct content_stream *stream;
+
+	if (content_stream_new(content, &stream, err) != 0 ||
+	    request_reply_read(request, 200, UNKNOWN_SIZE, stream_read, stream, stream_free, err) != 0)
+		return err->code;
+	request_reply_header(request, "Content-Encoding", "zstd");
+	return 0;
+}
+
+int volume_get(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	struct content_options options;
+	struct volume_record volume;
+	struct selection selection;
+	struct content *content;
+	struct job_facts facts;
+	struct entity entity;
+	char etag[96], filename[96], path[1024];
+	/* Ranges are of the plain bytes: a frame of zstd cannot be entered in the middle. */
+	bool zstd = accepts_zstd(request_header(request, "Accept-Encoding")) &&
+		    (request_header(request, "Range") == NULL || request_is_head(request));
+	bool done;
+
+	if (find_volume(api, request, &facts, &volume, err) != 0 || read_options(request, &facts, &options, err) != 0)
+		return err->code;
+	store_volume_path(api->store, facts.id, volume.name, path);
+	if (content_open(path, &volume.grid, &options, &content, err) != 0)
+		return err->code;
+	make_etag(&volume, &options, zstd, etag, sizeof(etag));
+	snprintf(filename, sizeof(filename), "%s-%s%s", facts.id, volume.name, options.format->extension);
+	entity =
+	    (struct entity){etag, zstd ? UNKNOWN_SIZE : content_size(content), options.format->media_type, filename};
+	if (entity_select(request, &entity, &selection, &done, err) != 0 || done) {
+		content_close(content);
+		return done ? 0 : err->code;
+	}
+	if ((zstd ? reply_zstd(request, content, err) : reply_plain(request, content, &selection, err)) != 0)
+		return err->code;
+	entity_headers(request, &entity, &selection);
+	return 0;
+}

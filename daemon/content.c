@@ -1,0 +1,295 @@
+/* A kept volume as a file of any format: content.h. */
+#include "daemon/content.h"
+
+#include <errno.h>
+#include <fcntl.h>
+#include <stdbool.h>
+#include <stdlib.h>
+#include <string.h>
+#include <unistd.h>
+
+#include "proto/spool.h"
+#include "proto/zstream.h"
+
+enum {
+	CHUNK = 16384,            /* voxels converted at a time: fits the first two levels of cache */
+	STREAM_BLOCK = 256 << 10, /* bytes given to the encoder at a time */
+	STREAM_LEVEL = 1          /* higher ones cost 2 to 4 times the time for a few percent */
+};
+
+struct content {
+	int descriptor;
+	struct grid grid, scaled; /* of the file, and as it is sent */
+	int factor[3];            /* voxels averaged along each axis */
+	struct content_options options;
+	uint8_t header[FORMAT_HEADER_MAX];
+	size_t header_size;
+	size_t voxel_bytes;
+	float *rows;          /* [factor[1]][nx], for means */
+	float voxels[CHUNK];  /* a piece of the scaled volume, 1/mm */
+	int16_t units[CHUNK]; /* the same in HU */
+};
+
+static void scale_grid(struct content *content, int scale)
+{
+	struct grid *to = &content->scaled;
+	const struct grid *from = &content->grid;
+
+	*to = *from;
+	for (int axis = 0; axis < 3; axis++) {
+		/* A single slice stays one. */
+		int factor = scale < from->size[axis] ? scale : from->size[axis];
+
+		content->factor[axis] = factor;
+		to->size[axis] = from->size[axis] / factor;
+		to->spacing[axis] = from->spacing[axis] * factor;
+		to->origin[axis] = from->origin[axis] + 0.5 * (factor - 1) * from->spacing[axis];
+	}
+}
+
+int content_open(const char *path, const struct grid *grid, const struct content_options *options,
+		 struct content **ret_content, struct error *err)
+{
+	struct content *content = calloc(1, sizeof(*content));
+
+	if (content == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory to read a volume");
+	content->grid = *grid;
+	content->options = *options;
+	content->voxel_bytes = volume_type_bytes(options->type);
+	scale_grid(content, options->scale);
+	content->descriptor = open(path, O_RDONLY | O_CLOEXEC);
+	content->rows = malloc((size_t)content->factor[1] * (size_t)grid->size[0] * sizeof(float));
+	if (content->descriptor < 0 || content->rows == NULL) {
+		if (content->descriptor < 0 && errno == ENOENT) /* removed since its row was read */
+			error_set(err, ERR_NOT_FOUND, "the volume is not there any more");
+		else
+			error_set_errno(err, errno, "open a volume");
+		content_close(content);
+		return err->code;
+	}
+	content->header_size = options->format->header(&content->scaled, options->type, options->name, content->header);
+	*ret_content = content;
+	return 0;
+}
+
+void content_close(struct content *content)
+{
+	if (content == NULL)
+		return;
+	if (content->descriptor >= 0)
+		close(content->descriptor);
+	free(content->rows);
+	free(content);
+}
+
+uint64_t content_size(const struct content *content)
+{
+	return content->header_size + (uint64_t)grid_voxels(&content->scaled) * content->voxel_bytes;
+}
+
+static bool is_plain(const struct content *content)
+{
+	return content->options.type == VOLUME_FLOAT32 && content->options.scale == 1;
+}
+
+int content_descriptor(const struct content *content, uint64_t *ret_offset)
+{
+	/* The file is a NIfTI; without its header it is raw. */
+	if (!is_plain(content) || (content->options.format != volume_formats && content->header_size != 0))
+		return -1;
+	*ret_offset = content->header_size != 0 ? 0 : SPOOL_VOLUME_OFFSET;
+	return fcntl(content->descriptor, F_DUPFD_CLOEXEC, 0);
+}
+
+static int read_file(const struct content *content, uint64_t offset, void *to, size_t size)
+{
+	while (size > 0) {
+		ssize_t got = pread(content->descriptor, to, size, (off_t)offset);
+
+		if (got < 0 && errno == EINTR)
+			continue;
+		if (got <= 0)
+			return -1;
+		to = (char *)to + got;
+		offset += (uint64_t)got;
+		size -= (size_t)got;
+	}
+	return 0;
+}
+
+/* Part of a row of means: voxels x .. x + count - 1 of row (y, z). */
+static int read_means(struct content *content, size_t x, size_t y, size_t z, size_t count, float *to)
+{
+	const int *factor = content->factor;
+	size_t nx = (size_t)content->grid.size[0], ny = (size_t)content->grid.size[1];
+	size_t wx = (size_t)factor[0], wy = (size_t)factor[1], wz = (size_t)factor[2];
+	float weight = 1.0f / (float)(wx * wy * wz);
+
+	memset(to, 0, count * sizeof(*to));
+	for (size_t dz = 0; dz < wz; dz++) {
+		uint64_t first = ((z * wz + dz) * ny + y * wy) * nx;
+
+		if (read_file(content, SPOOL_VOLUME_OFFSET + first * sizeof(float), content->rows,
+			      wy * nx * sizeof(float)) != 0)
+			return -1;
+		for (size_t dy = 0; dy < wy; dy++) {
+			const float *row = content->rows + dy * nx + x * wx;
+
+			for (size_t i = 0; i < count; i++) {
+				for (size_t dx = 0; dx < wx; dx++)
+					to[i] += row[i * wx + dx];
+			}
+		}
+	}
+	for (size_t i = 0; i < count; i++)
+		to[i] *= weight;
+	return 0;
+}
+
+/* Voxels first .. first + count - 1 of the scaled volume. */
+static int read_voxels(struct content *content, uint64_t first, size_t count, float *to)
+{
+	size_t nx = (size_t)content->scaled.size[0], ny = (size_t)content->scaled.size[1];
+
+	if (content->options.scale == 1)
+		return read_file(content, SPOOL_VOLUME_OFFSET + first * sizeof(float), to, count * sizeof(float));
+	while (count > 0) {
+		size_t x = first % nx, y = first / nx % ny, z = first / nx / ny;
+		size_t part = nx - x < count ? nx - x : count;
+
+		if (read_means(content, x, y, z, part, to) != 0)
+			return -1;
+		first += part;
+		to += part;
+		count -= part;
+	}
+	return 0;
+}
+
+/* Bytes of the voxels, `offset` counted from the first. */
+static ssize_t read_converted(struct content *content, uint64_t offset, char *to, size_t size)
+{
+	size_t done = 0;
+
+	while (done < size) {
+		uint64_t first = (offset + done) / content->voxel_bytes;
+		size_t skip = (size_t)((offset + done) % content->voxel_bytes);
+		size_t count = (skip + size - done + content->voxel_bytes - 1) / content->voxel_bytes;
+		const void *made = content->voxels;
+		size_t part;
+
+		if (count > CHUNK)
+			count = CHUNK;
+		if (read_voxels(content, first, count, content->voxels) != 0)
+			return -1;
+		if (content->options.type == VOLUME_INT16) {
+			volume_to_hu(content->voxels, count, content->options.mu_water, content->units);
+			made = content->units;
+		}
+		part = count * content->voxel_bytes - skip;
+		if (part > size - done)
+			part = size - done;
+		memcpy(to + done, (const char *)made + skip, part);
+		done += part;
+	}
+	return (ssize_t)done;
+}
+
+ssize_t content_read(struct content *content, uint64_t offset, void *to, size_t size)
+{
+	uint64_t whole = content_size(content);
+	size_t head = 0;
+
+	if (offset >= whole)
+		return 0;
+	if (size > whole - offset)
+		size = (size_t)(whole - offset);
+	if (offset < content->header_size) {
+		head = content->header_size - (size_t)offset;
+		if (head > size)
+			head = size;
+		memcpy(to, content->header + offset, head);
+	}
+	if (size > head) {
+		uint64_t from = offset + head - content->header_size;
+		char *rest = (char *)to + head;
+		bool read = is_plain(content) ? read_file(content, SPOOL_VOLUME_OFFSET + from, rest, size - head) == 0
+					      : read_converted(content, from, rest, size - head) >= 0;
+
+		if (!read)
+			return -1;
+	}
+	return (ssize_t)size;
+}
+
+/* ---- compressed on the way ---- */
+
+struct content_stream {
+	struct content *content;
+	struct zencoder *encoder;
+	uint64_t offset; /* of the content, read so far */
+	size_t filled, used;
+	bool ended;
+	char block[STREAM_BLOCK];
+};
+
+int content_stream_new(struct content *content, struct content_stream **ret_stream, struct error *err)
+{
+	struct content_stream *stream = malloc(sizeof(*stream));
+
+	if (stream == NULL) {
+		content_close(content);
+		return error_set(err, ERR_NO_MEMORY, "no memory to compress a volume");
+	}
+	*stream = (struct content_stream){.content = content};
+	if (zencoder_new(STREAM_LEVEL, &stream->encoder, err) != 0) {
+		content_stream_free(stream);
+		return err->code;
+	}
+	*ret_stream = stream;
+	return 0;
+}
+
+void content_stream_free(struct content_stream *stream)
+{
+	if (stream == NULL)
+		return;
+	content_close(stream->content);
+	zencoder_free(stream->encoder);
+	free(stream);
+}
+
+static int refill(struct content_stream *stream)
+{
+	ssize_t got = content_read(stream->content, stream->offset, stream->block, sizeof(stream->block));
+
+	if (got < 0)
+		return -1;
+	stream->offset += (uint64_t)got;
+	stream->filled = (size_t)got;
+	stream->used = 0;
+	return 0;
+}
+
+ssize_t content_stream_read(struct content_stream *stream, void *to, size_t size)
+{
+	size_t made = 0;
+	struct error err;
+
+	/* The encoder gathers input before it gives anything; 0 would mean the end. */
+	while (made == 0 && !stream->ended) {
+		size_t consumed = 0, produced = 0;
+		bool last;
+
+		if (stream->used == stream->filled && refill(stream) != 0)
+			return -1;
+		last = stream->offset == content_size(stream->content);
+		if (zencoder_step(stream->encoder, stream->block + stream->used, stream->filled - stream->used,
+				  &consumed, last, to, size, &produced, &stream->ended, &err) != 0)
+			return -1;
+		stream->used += consumed;
+		made += produced;
+	}
+	return (ssize_t)made;
+}

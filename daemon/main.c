@@ -1,0 +1,149 @@
+/*
+ * cbctd: settings, then the parts from the disk up to the network, then a wait
+ * for SIGTERM, then the same parts down again. The worker processes are
+ * supervise's; nothing of CUDA is in this program.
+ */
+#include <signal.h>
+#include <stdatomic.h>
+#include <stdio.h>
+#include <string.h>
+#include <sys/resource.h>
+#include <unistd.h>
+
+#include "daemon/api.h"
+#include "daemon/config.h"
+#include "daemon/log.h"
+
+static atomic_bool failed; /* the disk did: nothing more is acknowledged, and the exit status is 1 */
+
+static void on_failure(void *context, const char *what)
+{
+	(void)context;
+	log_line(LEVEL_ERROR, "the disk failed, stopping: %s", what);
+	atomic_store(&failed, true);
+	kill(getpid(), SIGTERM);
+}
+
+static enum log_level level_named(const char *name)
+{
+	int level = 0;
+
+	while (level < LEVEL_COUNT - 1 && strcmp(log_level_names[level], name) != 0)
+		level++;
+	return (enum log_level)level;
+}
+
+/* A descriptor for each connection and more: as many as we may have. */
+static void raise_descriptors(void)
+{
+	struct rlimit limit;
+
+	if (getrlimit(RLIMIT_NOFILE, &limit) == 0 && limit.rlim_cur < limit.rlim_max) {
+		limit.rlim_cur = limit.rlim_max;
+		setrlimit(RLIMIT_NOFILE, &limit);
+	}
+}
+
+/* Blocked in every thread, so that only the wait in main sees them. */
+static void block_signals(sigset_t *ret_stops)
+{
+	sigemptyset(ret_stops);
+	sigaddset(ret_stops, SIGTERM);
+	sigaddset(ret_stops, SIGINT);
+	pthread_sigmask(SIG_BLOCK, ret_stops, NULL);
+	signal(SIGPIPE, SIG_IGN);
+}
+
+static int start_http(const struct config *config, struct api *api, struct error *err)
+{
+	const struct http_options options = {.listen = config->listen,
+					     .routes = api_routes,
+					     .context = api,
+					     .threads = (int)config->http_threads,
+					     .max_connections = config->max_connections,
+					     .max_connections_per_address = config->max_connections_per_address,
+					     .header_timeout = config->header_timeout,
+					     .transfer_grace = config->transfer_grace,
+					     .minimum_rate = config->minimum_rate};
+
+	return http_new(&options, &api->http, err);
+}
+
+static int start_parts(const struct config *config, struct api *api, struct error *err)
+{
+	const struct store_hooks hooks = {.failed = on_failure};
+	const struct uploads_options uploads = {.buffer = config->upload_buffer, .failed = on_failure};
+	const struct supervise_options supervise = {.worker = config->worker[0] != '\0' ? config->worker : NULL,
+						    .backend = config->backend,
+						    .workers = (int)config->workers,
+						    .threads = (int)config->threads,
+						    .device_memory = config->device_memory,
+						    .stop_seconds = config->stop_timeout};
+	int code;
+
+	/* The addresses first: a mistake there should be said before anything is touched. */
+	code = start_http(config, api, err);
+	if (code == 0)
+		code = store_open(config->state_dir, &hooks, &api->store, err);
+	if (code == 0)
+		code = jobs_open(api->store, &api->jobs, err);
+	if (code == 0)
+		code = supervise_start(api->jobs, &supervise, &api->supervise, err);
+	if (code == 0)
+		code = uploads_new(api->store, &uploads, &api->uploads, err);
+	if (code == 0)
+		code = http_start(api->http, err);
+	return code;
+}
+
+static void stop_parts(struct api *api)
+{
+	http_free(api->http);
+	uploads_free(api->uploads);
+	supervise_stop(api->supervise);
+	jobs_close(api->jobs);
+	store_close(api->store);
+}
+
+static int run(const struct config *config)
+{
+	struct api api = {.max_wait = config->max_wait, .started = http_now()};
+	struct error err = {0};
+	sigset_t stops;
+	int signal_number = 0, code;
+
+	log_set_level(level_named(config->log_level));
+	raise_descriptors();
+	block_signals(&stops);
+	code = start_parts(config, &api, &err);
+	if (code != 0)
+		log_line(LEVEL_ERROR, "cbctd cannot start: %s", err.text);
+	else
+		sigwait(&stops, &signal_number);
+	if (signal_number != 0)
+		log_line(LEVEL_INFO, "stopping: %s",
+			 atomic_load(&failed) ? "the disk failed" : strsignal(signal_number));
+	stop_parts(&api);
+	return code != 0 || atomic_load(&failed) ? 1 : 0;
+}
+
+int main(int argc, char **argv)
+{
+	enum config_action action;
+	struct config config;
+	struct error err = {0};
+	int status = 0;
+
+	if (config_load(argc, argv, &config, &action, &err) != 0) {
+		fprintf(stderr, "cbctd: %s\n", err.text);
+		return 2;
+	}
+	if (action == CONFIG_HELP)
+		config_help(stdout);
+	else if (action == CONFIG_PRINT)
+		config_print(&config, stdout);
+	else
+		status = run(&config);
+	config_clear(&config);
+	return status;
+}
