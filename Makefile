@@ -46,6 +46,8 @@ simd_sources   := $(wildcard core/*_simd.c)
 core_sources   := $(filter-out $(simd_sources),$(wildcard core/*.c))
 proto_sources  := $(wildcard proto/*.c)
 daemon_sources := $(filter-out daemon/worker.c,$(wildcard daemon/*.c))
+# What the unit tests know of the daemon: its state, without HTTP.
+state_sources  := $(wildcard daemon/store*.c) $(patsubst %,daemon/%.c,job queue document supervise spawn files id log watch)
 cbct_sources   := $(wildcard clients/cbct/*.c)
 unit_sources   := $(wildcard tests/unit/*.c)
 
@@ -96,8 +98,8 @@ $(BUILD)/cbct-worker: $(call objects,daemon/worker.c) $(library) $(cuda_objects)
 $(BUILD)/cbct: $(call objects,$(cbct_sources)) $(library)
 	$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(cbct_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
-$(BUILD)/unit: $(call objects,$(unit_sources)) $(library)
-	$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,check $(proto_libs) $(core_libs)) $(LIBM)
+$(BUILD)/unit: $(call objects,$(unit_sources) $(state_sources)) $(library)
+	$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,check sqlite3 $(proto_libs) $(core_libs)) $(LIBM)
 
 # The GPU's checks and benchmarks need the mathematics and the kernels only, so that they run on a bare machine.
 gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench

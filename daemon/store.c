@@ -394,7 +394,7 @@ static int catalogue_version(struct store *store, int *ret_version, struct error
 
 static int migrate(struct store *store, bool *ret_fresh, struct error *err)
 {
-	int version, code = catalogue_version(store, &version, err);
+	int version = 0, code = catalogue_version(store, &version, err);
 	char number[64];
 
 	if (code != 0)

@@ -1,0 +1,451 @@
+/* The life of a job: its states, its place in the queue, what a restart makes of it. */
+#include <check.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "daemon/document.h"
+#include "daemon/files.h"
+#include "tests/unit/state.h"
+
+static struct state state;
+static struct stored_scan *scan; /* complete; NULL after a restart */
+
+static void set_up(void)
+{
+	state_open(&state);
+	scan = state_scan(&state, 4, false);
+	state_put(&state, scan, 0, 3, 1);
+}
+
+static void tear_down(void)
+{
+	stored_scan_release(scan);
+	scan = NULL;
+	state_remove(&state);
+}
+
+static void restart(void)
+{
+	stored_scan_release(scan);
+	scan = NULL;
+	state_reopen(&state);
+}
+
+static struct job *find(const char *id)
+{
+	struct job *job = NULL;
+	struct error err = {0};
+
+	ck_assert_msg(jobs_find(state.jobs, id, &job, &err) == 0, "%s", err.text);
+	return job;
+}
+
+static void keep_id(struct job *job, char ret_id[ID_SIZE])
+{
+	struct job_facts facts;
+
+	job_facts(job, &facts);
+	memcpy(ret_id, facts.id, ID_SIZE);
+}
+
+static void add_row(struct job *job, int iteration)
+{
+	const struct history_row row = {
+	    .iteration = iteration, .residual = 0.5 / iteration, .change = 0.1, .tv = 3, .seconds = 2};
+	struct error err = {0};
+
+	ck_assert_msg(job_add_row(job, &row, &err) == 0, "%s", err.text);
+}
+
+static int rows_of(const char *id)
+{
+	struct history_row *rows;
+	struct error err = {0};
+	int count;
+
+	ck_assert_int_eq(store_job_rows(state.store, id, &rows, &count, &err), 0);
+	free(rows);
+	return count;
+}
+
+START_TEST(the_table_of_transitions_is_the_contracts)
+{
+	/* rows: from, columns: to; waiting, queued, running, succeeded, failed, cancelled */
+	static const char *const expected[JOB_STATE_COUNT] = {".q..fc", "..r.fc", ".q.sfc",
+							      "......", "......", "......"};
+
+	for (int from = 0; from < JOB_STATE_COUNT; from++)
+		for (int to = 0; to < JOB_STATE_COUNT; to++)
+			ck_assert_msg(job_state_may_follow((enum job_state)from, (enum job_state)to) ==
+					  (expected[from][to] != '.'),
+				      "%s -> %s", job_state_names[from], job_state_names[to]);
+}
+END_TEST
+
+START_TEST(what_the_table_forbids_changes_nothing)
+{
+	struct job *job = state_post(&state, scan, "routine");
+	struct error err = {0};
+
+	ck_assert_int_eq(job_set_state(job, JOB_SUCCEEDED, NULL, &err), ERR_CONFLICT);
+	ck_assert_int_eq(state_of(job), JOB_QUEUED);
+	ck_assert_int_eq(job_queue_position(job), 1);
+	job_release(job);
+}
+END_TEST
+
+START_TEST(a_job_waits_for_its_last_projection)
+{
+	struct stored_scan *growing = state_scan(&state, 3, false);
+	struct job *job = state_post(&state, growing, "routine");
+	struct error err = {0};
+
+	ck_assert_int_eq(state_of(job), JOB_WAITING);
+	state_put(&state, growing, 0, 1, 1);
+	ck_assert_int_eq(jobs_promote(state.jobs, &err), 0);
+	ck_assert_int_eq(state_of(job), JOB_WAITING);
+	state_put(&state, growing, 2, 2, 1);
+	ck_assert_int_eq(jobs_promote(state.jobs, &err), 0);
+	ck_assert_int_eq(state_of(job), JOB_QUEUED);
+	job_release(job);
+	stored_scan_release(growing);
+}
+END_TEST
+
+START_TEST(one_that_yielded_stands_in_front_of_its_class)
+{
+	struct job *first = state_post(&state, scan, "routine"), *second = state_post(&state, scan, "routine");
+	struct job *stat = state_post(&state, scan, "stat"), *next;
+	const struct job_change yielded = {.checkpoint = 1};
+
+	state_set(stat, JOB_CANCELLED, NULL);
+	next = jobs_next(state.jobs);
+	ck_assert_ptr_eq(next, first);
+	job_release(next);
+	state_set(first, JOB_RUNNING, NULL);
+	ck_assert_int_eq(job_queue_position(second), 1);
+	state_set(first, JOB_QUEUED, &yielded);
+	ck_assert_int_eq(job_queue_position(first), 1);
+	ck_assert_int_eq(job_queue_position(second), 2);
+	job_release(first);
+	job_release(second);
+	job_release(stat);
+}
+END_TEST
+
+START_TEST(only_a_run_from_the_start_is_an_attempt)
+{
+	struct job *job = state_post(&state, scan, "routine");
+	const struct job_change yielded = {.checkpoint = 1}, died = {.checkpoint = 1, .crashed = true};
+	struct job_record record;
+
+	state_set(job, JOB_RUNNING, NULL);
+	state_set(job, JOB_QUEUED, &yielded);
+	state_set(job, JOB_RUNNING, NULL);
+	job_record(job, &record);
+	ck_assert_int_eq(record.attempts, 1);
+	ck_assert_int_eq(record.iteration, 1);
+	state_set(job, JOB_QUEUED, &died);
+	state_set(job, JOB_RUNNING, NULL);
+	job_record(job, &record);
+	ck_assert_int_eq(record.attempts, 2);
+	ck_assert_int_eq(record.crashes, 1);
+	job_release(job);
+}
+END_TEST
+
+START_TEST(a_running_job_is_queued_again_after_a_restart)
+{
+	struct job *first = state_post(&state, scan, "routine"), *second = state_post(&state, scan, "routine");
+	struct job_record record;
+	char first_id[ID_SIZE], second_id[ID_SIZE];
+
+	keep_id(first, first_id);
+	keep_id(second, second_id);
+	state_set(first, JOB_RUNNING, NULL);
+	add_row(first, 1);
+	job_release(first);
+	job_release(second);
+	restart();
+	first = find(first_id);
+	second = find(second_id);
+	ck_assert_int_eq(state_of(first), JOB_QUEUED);
+	ck_assert_int_eq(job_queue_position(first), 1);
+	ck_assert_int_eq(job_queue_position(second), 2);
+	ck_assert_int_eq(rows_of(first_id), 0); /* it starts anew */
+	state_set(first, JOB_RUNNING, NULL);
+	job_record(first, &record);
+	ck_assert_int_eq(record.attempts, 2);
+	ck_assert_int_eq(record.crashes, 0);
+	job_release(first);
+	job_release(second);
+}
+END_TEST
+
+START_TEST(a_checkpoint_is_kept_over_a_restart_where_its_file_is)
+{
+	struct job *with = state_post(&state, scan, "routine"), *without = state_post(&state, scan, "routine");
+	const struct job_change yielded = {.checkpoint = 1};
+	struct job_record record;
+	struct error err = {0};
+	char with_id[ID_SIZE], without_id[ID_SIZE];
+
+	keep_id(with, with_id);
+	keep_id(without, without_id);
+	ck_assert_int_eq(directory_make(state_path(&state, "jobs/%s", with_id), &err), 0);
+	path_fill(state_path(&state, "jobs/%s/checkpoint.f32", with_id));
+	for (int i = 0; i < 2; i++) {
+		struct job *job = i == 0 ? with : without;
+
+		state_set(job, JOB_RUNNING, NULL);
+		add_row(job, 1);
+		state_set(job, JOB_QUEUED, &yielded);
+		state_set(job, JOB_RUNNING, NULL);
+		add_row(job, 2);
+		job_release(job);
+	}
+	restart();
+	with = find(with_id);
+	without = find(without_id);
+	job_record(with, &record);
+	ck_assert_int_eq(record.checkpoint, 1);
+	ck_assert_int_eq(rows_of(with_id), 1); /* what came behind the checkpoint comes again */
+	job_record(without, &record);
+	ck_assert_int_eq(record.checkpoint, 0);
+	ck_assert_int_eq(rows_of(without_id), 0);
+	state_set(with, JOB_RUNNING, NULL);
+	state_set(with, JOB_SUCCEEDED, NULL);
+	ck_assert(!path_exists(state_path(&state, "jobs/%s/checkpoint.f32", with_id)));
+	job_release(with);
+	job_release(without);
+}
+END_TEST
+
+START_TEST(a_cancel_that_was_asked_for_survives_a_restart)
+{
+	struct job *job = state_post(&state, scan, "routine");
+	struct error err = {0};
+	char id[ID_SIZE];
+	bool removed;
+
+	keep_id(job, id);
+	state_set(job, JOB_RUNNING, NULL);
+	ck_assert_int_eq(jobs_delete(state.jobs, job, &removed, &err), 0);
+	ck_assert(!removed);
+	ck_assert_int_eq(state_of(job), JOB_RUNNING); /* until its worker has heard of it */
+	job_release(job);
+	restart();
+	job = find(id);
+	ck_assert_int_eq(state_of(job), JOB_CANCELLED);
+	job_release(job);
+}
+END_TEST
+
+START_TEST(deleting_cancels_first_and_then_removes)
+{
+	struct job *job = state_post(&state, scan, "routine"), *gone = NULL;
+	struct error err = {0};
+	char id[ID_SIZE];
+	bool removed;
+
+	keep_id(job, id);
+	ck_assert_int_eq(directory_make(state_path(&state, "jobs/%s", id), &err), 0);
+	path_fill(state_path(&state, "jobs/%s/final.nii", id));
+	ck_assert_int_eq(jobs_delete(state.jobs, job, &removed, &err), 0);
+	ck_assert(!removed);
+	ck_assert_int_eq(state_of(job), JOB_CANCELLED);
+	ck_assert_int_eq(jobs_delete(state.jobs, job, &removed, &err), 0);
+	ck_assert(removed);
+	ck_assert_int_eq(jobs_find(state.jobs, id, &gone, &err), ERR_NOT_FOUND);
+	ck_assert(!path_exists(state_path(&state, "jobs/%s", id)));
+	ck_assert_int_eq(jobs_delete(state.jobs, job, &removed, &err), ERR_NOT_FOUND);
+	job_release(job);
+}
+END_TEST
+
+START_TEST(a_scan_stays_while_a_job_needs_it)
+{
+	struct job *job = state_post(&state, scan, "routine");
+	struct error err = {0};
+
+	ck_assert_int_eq(jobs_delete_scan(state.jobs, scan, &err), ERR_CONFLICT);
+	state_set(job, JOB_CANCELLED, NULL);
+	ck_assert_int_eq(jobs_delete_scan(state.jobs, scan, &err), 0);
+	job_release(job);
+}
+END_TEST
+
+static int post_with_key(const char *key, int mark, struct job **ret_job, bool *ret_new, struct error *err)
+{
+	struct job_request request;
+	uint8_t digest[32];
+	char text[128];
+	int code;
+
+	memset(digest, mark, sizeof(digest));
+	snprintf(text, sizeof(text), "{\"scan\": \"%s\", \"fdk\": {}}", stored_scan_id(scan));
+	ck_assert_int_eq(job_request_parse(text, strlen(text), &request, err), 0);
+	ck_assert_int_eq(job_request_resolve(&request, stored_scan_parsed(scan), err), 0);
+	code = jobs_post(state.jobs, &request, scan, NULL, key, digest, ret_job, ret_new, err);
+	recipe_clear(&request.recipe);
+	return code;
+}
+
+START_TEST(a_key_makes_one_job_also_over_a_restart)
+{
+	struct job *job = NULL, *again = NULL;
+	struct error err = {0};
+	uint8_t digest[32];
+	char id[ID_SIZE];
+	bool new;
+
+	ck_assert_int_eq(post_with_key("a key", 1, &job, &new, &err), 0);
+	ck_assert(new);
+	ck_assert_int_eq(post_with_key("a key", 1, &again, &new, &err), 0);
+	ck_assert(!new);
+	ck_assert_ptr_eq(job, again);
+	job_release(again);
+	ck_assert_int_eq(post_with_key("a key", 2, &again, &new, &err), ERR_CONFLICT);
+	ck_assert_int_eq(post_with_key("another", 2, &again, &new, &err), 0);
+	ck_assert(new);
+	job_release(again);
+	keep_id(job, id);
+	job_release(job);
+	restart();
+	memset(digest, 1, sizeof(digest));
+	ck_assert_int_eq(jobs_repeat(state.jobs, "a key", digest, &job, &err), 0);
+	ck_assert_ptr_nonnull(job);
+	keep_id(job, id);
+	job_release(job);
+	ck_assert_int_eq(jobs_repeat(state.jobs, "unheard of", digest, &job, &err), 0);
+	ck_assert_ptr_null(job);
+}
+END_TEST
+
+START_TEST(events_come_in_order_from_where_one_left_off)
+{
+	static const char *const expected[] = {"state",  "state",    "warning", "progress",
+					       "volume", "progress", "state",   "end"};
+	const struct volume_record volume = {
+	    .name = "iter-1", .stage = "sart", .iteration = 1, .grid = {.size = {4, 4, 4}}, .bytes = 256};
+	struct job *job = state_post(&state, scan, "routine");
+	struct event_record *events;
+	struct error err = {0};
+	char id[ID_SIZE];
+	long long third;
+	int count;
+
+	keep_id(job, id);
+	state_set(job, JOB_RUNNING, NULL);
+	ck_assert_int_eq(job_add_warning(job, "arc", "too short", &err), 0);
+	ck_assert_int_eq(job_add_warning(job, "arc", "too short", &err), 0); /* said once */
+	add_row(job, 1);
+	ck_assert_int_eq(job_add_volume(job, &volume, &err), 0);
+	add_row(job, 2);
+	state_set(job, JOB_SUCCEEDED, NULL);
+	job_release(job);
+	restart();
+	ck_assert_int_eq(store_job_events(state.store, id, 0, 100, &events, &count, &err), 0);
+	ck_assert_int_eq(count, 8);
+	for (int i = 0; i < count; i++) {
+		ck_assert_str_eq(events[i].kind, expected[i]);
+		ck_assert_str_eq(events[i].job, id);
+		if (i > 0)
+			ck_assert_int_gt(events[i].number, events[i - 1].number);
+	}
+	third = events[2].number;
+	event_records_free(events, count);
+	ck_assert_int_eq(store_job_events(state.store, NULL, third, 2, &events, &count, &err), 0);
+	ck_assert_int_eq(count, 2);
+	ck_assert_str_eq(events[0].kind, "progress");
+	ck_assert_str_eq(events[1].kind, "volume");
+	event_records_free(events, count);
+}
+END_TEST
+
+START_TEST(a_volume_whose_row_is_missing_is_made_again)
+{
+	const struct volume_record volume = {.name = "fdk", .stage = "fdk", .bytes = 256};
+	struct job *job = state_post(&state, scan, "routine");
+	struct error err = {0};
+	char id[ID_SIZE];
+
+	keep_id(job, id);
+	state_set(job, JOB_RUNNING, NULL);
+	ck_assert_int_eq(directory_make(state_path(&state, "jobs/%s", id), &err), 0);
+	path_fill(state_path(&state, "jobs/%s/fdk.nii", id));
+	path_fill(state_path(&state, "jobs/%s/iter-1.nii", id));
+	path_fill(state_path(&state, "jobs/%s/iter-2.nii.tmp", id));
+	ck_assert_int_eq(job_add_volume(job, &volume, &err), 0);
+	job_release(job);
+	restart();
+	ck_assert(path_exists(state_path(&state, "jobs/%s/fdk.nii", id)));
+	ck_assert(!path_exists(state_path(&state, "jobs/%s/iter-1.nii", id)));
+	ck_assert(!path_exists(state_path(&state, "jobs/%s/iter-2.nii.tmp", id)));
+}
+END_TEST
+
+START_TEST(the_document_has_what_the_contract_names)
+{
+	static const char *const members[] = {
+	    "id",       "state",   "stage",   "iteration", "iterations", "progress", "eta_s",
+	    "device",   "backend", "timings", "error",     "warnings",   "history",  "scan",
+	    "attempts", "grid",    "fdk",     "sart",      "tv",         "emit",     "priority",
+	    "created",  "started", "ended",   "volumes",   "memory",     "plan",     "queue_position"};
+	const struct job_change failed = {
+	    .error_code = ERR_NO_MEMORY, .error_pointer = "/grid/size", .error_text = "too much"};
+	struct job *job = state_post(&state, scan, "urgent");
+	cJSON *document, *error;
+
+	state_set(job, JOB_RUNNING, NULL);
+	add_row(job, 1);
+	state_set(job, JOB_FAILED, &failed);
+	document = job_document(job, false);
+	for (size_t i = 0; i < sizeof(members) / sizeof(members[0]); i++)
+		ck_assert_msg(cJSON_HasObjectItem(document, members[i]), "%s", members[i]);
+	error = cJSON_GetObjectItem(document, "error");
+	ck_assert_str_eq(cJSON_GetStringValue(cJSON_GetObjectItem(error, "type")), "urn:cbctd:problem:no-memory");
+	ck_assert_str_eq(cJSON_GetStringValue(cJSON_GetObjectItem(error, "pointer")), "/grid/size");
+	ck_assert_str_eq(cJSON_GetStringValue(cJSON_GetObjectItem(document, "state")), "failed");
+	ck_assert_int_eq(cJSON_GetArraySize(cJSON_GetObjectItem(document, "history")), 1);
+	cJSON_Delete(document);
+	job_release(job);
+}
+END_TEST
+
+START_TEST(times_are_written_as_iso_8601)
+{
+	char text[TIME_TEXT_SIZE];
+
+	time_text(0.25, text);
+	ck_assert_str_eq(text, "1970-01-01T00:00:00.250Z");
+	time_text(951782400, text); /* the 29th of February 2000 */
+	ck_assert_str_eq(text, "2000-02-29T00:00:00.000Z");
+}
+END_TEST
+
+Suite *job_suite(void)
+{
+	Suite *suite = suite_create("job");
+	TCase *tests = tcase_create("job");
+
+	tcase_add_checked_fixture(tests, set_up, tear_down);
+	tcase_add_test(tests, the_table_of_transitions_is_the_contracts);
+	tcase_add_test(tests, what_the_table_forbids_changes_nothing);
+	tcase_add_test(tests, a_job_waits_for_its_last_projection);
+	tcase_add_test(tests, one_that_yielded_stands_in_front_of_its_class);
+	tcase_add_test(tests, only_a_run_from_the_start_is_an_attempt);
+	tcase_add_test(tests, a_running_job_is_queued_again_after_a_restart);
+	tcase_add_test(tests, a_checkpoint_is_kept_over_a_restart_where_its_file_is);
+	tcase_add_test(tests, a_cancel_that_was_asked_for_survives_a_restart);
+	tcase_add_test(tests, deleting_cancels_first_and_then_removes);
+	tcase_add_test(tests, a_scan_stays_while_a_job_needs_it);
+	tcase_add_test(tests, a_key_makes_one_job_also_over_a_restart);
+	tcase_add_test(tests, events_come_in_order_from_where_one_left_off);
+	tcase_add_test(tests, a_volume_whose_row_is_missing_is_made_again);
+	tcase_add_test(tests, the_document_has_what_the_contract_names);
+	tcase_add_test(tests, times_are_written_as_iso_8601);
+	suite_add_tcase(suite, tests);
+	return suite;
+}

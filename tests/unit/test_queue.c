@@ -1,0 +1,146 @@
+/* Who is next, who makes room, and ids that sort by time. */
+#include <check.h>
+#include <stdio.h>
+#include <string.h>
+
+#include "daemon/id.h"
+#include "daemon/queue.h"
+
+/* The tickets of the queue from its front, "3 1 2". */
+static const char *order_of(const struct queue *queue)
+{
+	static char text[256];
+	size_t length = 0;
+
+	text[0] = '\0';
+	for (const struct queue_entry *entry = queue->first; entry != NULL; entry = entry->next)
+		length += (size_t)snprintf(text + length, sizeof(text) - length, "%s%lld",
+					   entry == queue->first ? "" : " ", entry->ticket);
+	return text;
+}
+
+START_TEST(higher_priority_goes_first_and_equals_in_their_order)
+{
+	struct queue queue = {0};
+	struct queue_entry entries[] = {
+	    {.priority = PRIORITY_ROUTINE, .ticket = 1}, {.priority = PRIORITY_URGENT, .ticket = 2},
+	    {.priority = PRIORITY_ROUTINE, .ticket = 3}, {.priority = PRIORITY_STAT, .ticket = 4},
+	    {.priority = PRIORITY_URGENT, .ticket = 5},  {.priority = PRIORITY_STAT, .ticket = 6}};
+
+	for (int i = 5; i >= 0; i--)
+		queue_add(&queue, &entries[i]);
+	ck_assert_str_eq(order_of(&queue), "4 6 2 5 1 3");
+	ck_assert_int_eq(queue_position(&entries[3]), 1);
+	ck_assert_int_eq(queue_position(&entries[2]), 6);
+	queue_remove(&queue, &entries[1]);
+	queue_remove(&queue, &entries[3]);
+	queue_remove(&queue, &entries[2]);
+	ck_assert_str_eq(order_of(&queue), "6 5 1");
+	ck_assert_int_eq(queue_position(&entries[2]), 0);
+	queue_remove(&queue, &entries[2]); /* not queued: nothing happens */
+	/* One that yielded keeps its ticket and stands in front of its class. */
+	queue_add(&queue, &entries[1]);
+	ck_assert_str_eq(order_of(&queue), "6 2 5 1");
+}
+END_TEST
+
+START_TEST(the_lowest_and_latest_makes_room_for_the_higher)
+{
+	static const struct {
+		int queued[3], queued_count;
+		struct queue_running running[3];
+		int running_count, idle, victim;
+		const char *why;
+	} cases[] = {
+	    {{PRIORITY_STAT}, 0, {{PRIORITY_ROUTINE, 1, false}}, 1, 0, -1, "an empty queue"},
+	    {{PRIORITY_ROUTINE}, 1, {{PRIORITY_ROUTINE, 1, false}}, 1, 0, -1, "an equal waits"},
+	    {{PRIORITY_URGENT}, 1, {{PRIORITY_STAT, 1, false}}, 1, 0, -1, "a lower one waits"},
+	    {{PRIORITY_URGENT}, 1, {{PRIORITY_ROUTINE, 1, false}}, 1, 0, 0, "a higher one pushes"},
+	    {{PRIORITY_STAT}, 1, {{PRIORITY_ROUTINE, 1, false}}, 1, 1, -1, "a worker is idle"},
+	    {{PRIORITY_STAT}, 1, {{PRIORITY_ROUTINE, 1, true}}, 1, 0, -1, "room is being made"},
+	    {{PRIORITY_STAT, PRIORITY_STAT},
+	     2,
+	     {{PRIORITY_ROUTINE, 1, true}, {PRIORITY_URGENT, 2, false}},
+	     2,
+	     0,
+	     1,
+	     "room for two"},
+	    {{PRIORITY_STAT},
+	     1,
+	     {{PRIORITY_URGENT, 1, false}, {PRIORITY_ROUTINE, 2, false}, {PRIORITY_ROUTINE, 3, false}},
+	     3,
+	     0,
+	     2,
+	     "the latest of the lowest"},
+	    {{PRIORITY_STAT, PRIORITY_URGENT},
+	     2,
+	     {{PRIORITY_URGENT, 1, true}, {PRIORITY_URGENT, 2, false}},
+	     2,
+	     0,
+	     -1,
+	     "the second pushes no equal"},
+	};
+
+	for (size_t i = 0; i < sizeof(cases) / sizeof(cases[0]); i++) {
+		struct queue queue = {0};
+		struct queue_entry entries[3] = {0};
+
+		for (int k = 0; k < cases[i].queued_count; k++) {
+			entries[k].priority = (enum priority)cases[i].queued[k];
+			entries[k].ticket = 100 + k;
+			queue_add(&queue, &entries[k]);
+		}
+		ck_assert_msg(queue_victim(&queue, cases[i].running, cases[i].running_count, cases[i].idle) ==
+				  cases[i].victim,
+			      "%s", cases[i].why);
+	}
+}
+END_TEST
+
+START_TEST(ids_sort_by_the_time_of_making)
+{
+	char before[ID_SIZE], id[ID_SIZE];
+	struct error err = {0};
+
+	ck_assert_int_eq(id_make(before, &err), 0);
+	for (int i = 0; i < 1000; i++) {
+		ck_assert_int_eq(id_make(id, &err), 0);
+		ck_assert(id_valid(id));
+		ck_assert_str_gt(id, before);
+		memcpy(before, id, sizeof(id));
+	}
+	/* A clock that was set back: what is in the catalogue is from the year 2100. */
+	id_floor("3rzzzzzzz0000000");
+	ck_assert_int_eq(id_make(id, &err), 0);
+	ck_assert_str_gt(id, "3rzzzzzzzzzzzzzz");
+}
+END_TEST
+
+START_TEST(what_is_no_id_is_refused)
+{
+	static const char *const wrong[] = {"",
+					    "1m7xy0w9je9g8xv",
+					    "1m7xy0w9je9g8xvww",
+					    "1M7XY0W9JE9G8XVW",
+					    "../../etc/passwd",
+					    "1m7xy0w9je9g8xv/",
+					    "1m7xy0w9je9g8xvl"};
+
+	ck_assert(id_valid("1m7xy0w9je9g8xvw"));
+	for (size_t i = 0; i < sizeof(wrong) / sizeof(wrong[0]); i++)
+		ck_assert_msg(!id_valid(wrong[i]), "%s", wrong[i]);
+}
+END_TEST
+
+Suite *queue_suite(void)
+{
+	Suite *suite = suite_create("queue");
+	TCase *tests = tcase_create("queue");
+
+	tcase_add_test(tests, higher_priority_goes_first_and_equals_in_their_order);
+	tcase_add_test(tests, the_lowest_and_latest_makes_room_for_the_higher);
+	tcase_add_test(tests, ids_sort_by_the_time_of_making);
+	tcase_add_test(tests, what_is_no_id_is_refused);
+	suite_add_tcase(suite, tests);
+	return suite;
+}

@@ -1,0 +1,358 @@
+/* What was acknowledged is there after a restart, and nothing else is. */
+#include <check.h>
+#include <errno.h>
+#include <signal.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/resource.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include "daemon/files.h"
+#include "tests/unit/state.h"
+
+static struct state state;
+
+static void set_up(void)
+{
+	state_open(&state);
+}
+
+static void tear_down(void)
+{
+	state_remove(&state);
+}
+
+static struct stored_scan *find(const char *id)
+{
+	struct stored_scan *scan = NULL;
+	struct error err = {0};
+
+	ck_assert_msg(store_scan_find(state.store, id, &scan, &err) == 0, "%s", err.text);
+	return scan;
+}
+
+static struct scan_facts facts_of(struct stored_scan *scan)
+{
+	struct scan_facts facts;
+
+	stored_scan_facts(scan, &facts);
+	return facts;
+}
+
+START_TEST(projections_are_known_again_after_a_restart)
+{
+	struct stored_scan *scan = state_scan(&state, 10, false);
+	unsigned char flags[10];
+	uint8_t digest[32];
+	char id[ID_SIZE];
+
+	memcpy(id, stored_scan_id(scan), sizeof(id));
+	state_put(&state, scan, 7, 8, 0xab);
+	state_put(&state, scan, 0, 0, 0xcd);
+	stored_scan_release(scan);
+	state_reopen(&state);
+	scan = find(id);
+	stored_scan_received(scan, flags);
+	ck_assert_mem_eq(flags, ((unsigned char[]){1, 0, 0, 0, 0, 0, 0, 1, 1, 0}), 10);
+	ck_assert(stored_scan_digest(scan, 8, digest));
+	for (int i = 0; i < 32; i++)
+		ck_assert_uint_eq(digest[i], 0xab);
+	ck_assert(!stored_scan_digest(scan, 9, digest));
+	ck_assert_int_eq(facts_of(scan).received, 3);
+	ck_assert(!facts_of(scan).complete);
+	ck_assert_str_eq(stored_scan_parsed(scan)->name, "a scan");
+	ck_assert_int_eq(stored_scan_parsed(scan)->count, 10);
+	stored_scan_release(scan);
+}
+END_TEST
+
+START_TEST(a_projection_has_one_writer_at_a_time)
+{
+	struct stored_scan *scan = state_scan(&state, 3, false);
+	struct error err = {0};
+	enum claim claim;
+
+	ck_assert_int_eq(stored_scan_claim(scan, 1, &claim, &err), 0);
+	ck_assert_int_eq(claim, CLAIM_GRANTED);
+	ck_assert_int_eq(stored_scan_claim(scan, 1, &claim, &err), 0);
+	ck_assert_int_eq(claim, CLAIM_BUSY);
+	stored_scan_unclaim(scan, 1);
+	state_put(&state, scan, 1, 1, 1);
+	ck_assert_int_eq(stored_scan_claim(scan, 1, &claim, &err), 0);
+	ck_assert_int_eq(claim, CLAIM_STORED);
+	ck_assert_int_eq(stored_scan_claim(scan, 3, &claim, &err), ERR_NOT_FOUND);
+	stored_scan_release(scan);
+}
+END_TEST
+
+START_TEST(the_file_of_the_projections_has_its_full_size_at_once)
+{
+	struct stored_scan *scan = state_scan(&state, 10, false);
+	struct stat status;
+
+	ck_assert_int_eq(stat(state_path(&state, "scans/%s/projections.raw", stored_scan_id(scan)), &status), 0);
+	ck_assert_int_eq(status.st_size, 10 * 4 * 3 * 4);
+	ck_assert_int_ge(status.st_blocks * 512, status.st_size);
+	stored_scan_release(scan);
+}
+END_TEST
+
+START_TEST(a_scan_beyond_the_disk_is_refused_before_anything_is_made)
+{
+	static const char text[] =
+	    "{\"name\": \"\", \"detector\": {\"columns\": 4000, \"rows\": 3400, \"pixel_mm\": [1, 1]},"
+	    " \"projections\": {\"count\": 20000, \"sample\": \"float32\", \"quantity\": \"line_integral\"},"
+	    " \"geometry\": {\"kind\": \"circular\", \"source_to_isocentre_mm\": 6000, \"source_to_detector_mm\": "
+	    "11000,"
+	    " \"first_angle_deg\": 0, \"angle_step_deg\": 0.018}}";
+	struct stored_scan *stored = NULL;
+	struct scan *scan = NULL;
+	struct error err = {0};
+	unsigned long long available = 0;
+
+	ck_assert_msg(scan_parse(text, strlen(text), &scan, &err) == 0, "%s", err.text);
+	ck_assert_int_eq(space_free(state.directory, &available, &err), 0);
+	if (available > scan_projection_bytes(scan) * 20000ull) {
+		printf("skipped: a disk of more than a terabyte cannot be too small\n");
+	} else {
+		ck_assert_int_eq(store_scan_create(state.store, scan, &stored, &err), ERR_NO_SPACE);
+		ck_assert_str_eq(err.pointer, "/projections/count");
+		ck_assert_ptr_null(stored);
+		ck_assert_int_eq(rmdir(state_path(&state, "scans")), 0); /* nothing is in it */
+	}
+	scan_free(scan);
+}
+END_TEST
+
+START_TEST(scans_are_listed_newest_first_from_a_cursor)
+{
+	struct stored_scan *made[5], *listed[5];
+	struct error err = {0};
+	char after[ID_SIZE];
+	bool more;
+	int count;
+
+	for (int i = 0; i < 5; i++)
+		made[i] = state_scan(&state, 1, false);
+	ck_assert_int_eq(store_scan_list(state.store, NULL, 3, listed, &count, &more, &err), 0);
+	ck_assert_int_eq(count, 3);
+	ck_assert(more);
+	for (int i = 0; i < 3; i++) {
+		ck_assert_ptr_eq(listed[i], made[4 - i]);
+		stored_scan_release(listed[i]);
+	}
+	/* The cursor may be deleted between two pages. */
+	memcpy(after, stored_scan_id(made[2]), sizeof(after));
+	ck_assert_int_eq(store_scan_delete(state.store, made[2], &err), 0);
+	ck_assert_int_eq(store_scan_list(state.store, after, 3, listed, &count, &more, &err), 0);
+	ck_assert_int_eq(count, 2);
+	ck_assert(!more);
+	for (int i = 0; i < 2; i++) {
+		ck_assert_ptr_eq(listed[i], made[1 - i]);
+		stored_scan_release(listed[i]);
+	}
+	for (int i = 0; i < 5; i++)
+		stored_scan_release(made[i]);
+}
+END_TEST
+
+START_TEST(a_deleted_scan_takes_no_more_projections)
+{
+	struct stored_scan *scan = state_scan(&state, 2, false), *other = NULL;
+	struct received_projection late = {.scan = scan, .index = 1, .stored = true};
+	struct error err = {0};
+	enum claim claim;
+
+	ck_assert_int_eq(stored_scan_claim(scan, 1, &claim, &err), 0);
+	ck_assert_int_eq(store_scan_delete(state.store, scan, &err), 0);
+	store_scan_remove_files(state.store, stored_scan_id(scan));
+	ck_assert_int_eq(store_put_projections(state.store, &late, 1, &err), 0);
+	ck_assert(!late.stored);
+	ck_assert_int_eq(stored_scan_claim(scan, 0, &claim, &err), ERR_NOT_FOUND);
+	ck_assert_int_eq(store_scan_delete(state.store, scan, &err), ERR_NOT_FOUND);
+	ck_assert_int_eq(store_scan_find(state.store, stored_scan_id(scan), &other, &err), ERR_NOT_FOUND);
+	ck_assert(!path_exists(state_path(&state, "scans/%s", stored_scan_id(scan))));
+	stored_scan_release(scan);
+}
+END_TEST
+
+START_TEST(intensities_are_ready_with_their_flat_image)
+{
+	struct stored_scan *scan = state_scan(&state, 2, true);
+	float flat[12] = {60000}, other[12] = {1};
+	struct error err = {0};
+	char id[ID_SIZE];
+	bool new;
+
+	memcpy(id, stored_scan_id(scan), sizeof(id));
+	state_put(&state, scan, 0, 1, 1);
+	ck_assert(facts_of(scan).complete);
+	ck_assert(!facts_of(scan).ready);
+	ck_assert_int_eq(store_put_image(state.store, scan, IMAGE_FLAT, flat, &new, &err), 0);
+	ck_assert(new);
+	ck_assert(facts_of(scan).ready);
+	ck_assert_int_eq(store_put_image(state.store, scan, IMAGE_FLAT, flat, &new, &err), 0);
+	ck_assert(!new);
+	ck_assert_int_eq(store_put_image(state.store, scan, IMAGE_FLAT, other, &new, &err), ERR_CONFLICT);
+	stored_scan_release(scan);
+	state_reopen(&state);
+	scan = find(id);
+	ck_assert(facts_of(scan).flat);
+	ck_assert(!facts_of(scan).dark);
+	ck_assert(facts_of(scan).ready);
+	ck_assert_int_eq(store_put_image(state.store, scan, IMAGE_FLAT, other, &new, &err), ERR_CONFLICT);
+	stored_scan_release(scan);
+}
+END_TEST
+
+START_TEST(what_a_crash_left_is_tidied_up)
+{
+	struct stored_scan *scan = state_scan(&state, 2, true);
+	char id[ID_SIZE];
+
+	memcpy(id, stored_scan_id(scan), sizeof(id));
+	stored_scan_release(scan);
+	path_fill(state_path(&state, "scans/%s/flat.f32.tmp", id));
+	path_fill(state_path(&state, "scans/%s/dark.f32", id)); /* its row was never written */
+	ck_assert_int_eq(mkdir(state_path(&state, "scans/1m7xy0w9je9g8xvw"), 0700), 0);
+	path_fill(state_path(&state, "scans/1m7xy0w9je9g8xvw/projections.raw"));
+	ck_assert_int_eq(mkdir(state_path(&state, "jobs/1m7xy0w9je9g8xvw"), 0700), 0);
+	ck_assert_int_eq(mkdir(state_path(&state, "scans/somebody-elses"), 0700), 0);
+	state_reopen(&state);
+	ck_assert(path_exists(state_path(&state, "scans/%s/scan.json", id)));
+	ck_assert(!path_exists(state_path(&state, "scans/%s/flat.f32.tmp", id)));
+	ck_assert(!path_exists(state_path(&state, "scans/%s/dark.f32", id)));
+	ck_assert(!path_exists(state_path(&state, "scans/1m7xy0w9je9g8xvw")));
+	ck_assert(!path_exists(state_path(&state, "jobs/1m7xy0w9je9g8xvw")));
+	ck_assert(path_exists(state_path(&state, "scans/somebody-elses")));
+}
+END_TEST
+
+START_TEST(a_lost_catalogue_does_not_take_the_scans_with_it)
+{
+	struct stored_scan *scan = state_scan(&state, 2, false);
+	char id[ID_SIZE];
+
+	memcpy(id, stored_scan_id(scan), sizeof(id));
+	stored_scan_release(scan);
+	state_close(&state);
+	ck_assert_int_eq(unlink(state_path(&state, "catalogue.sqlite")), 0);
+	state_reopen(&state);
+	ck_assert(path_exists(state_path(&state, "scans/%s/projections.raw", id)));
+}
+END_TEST
+
+START_TEST(a_scan_whose_files_are_gone_says_so)
+{
+	struct stored_scan *scan = state_scan(&state, 2, false);
+	char id[ID_SIZE];
+
+	memcpy(id, stored_scan_id(scan), sizeof(id));
+	stored_scan_release(scan);
+	ck_assert_int_eq(truncate(state_path(&state, "scans/%s/projections.raw", id), 5), 0);
+	state_reopen(&state);
+	scan = find(id);
+	ck_assert(facts_of(scan).damaged);
+	stored_scan_release(scan);
+}
+END_TEST
+
+START_TEST(a_state_directory_has_one_daemon)
+{
+	struct store *second = NULL;
+	struct error err = {0};
+
+	ck_assert_int_eq(store_open(state.directory, NULL, &second, &err), ERR_CONFLICT);
+	ck_assert_ptr_null(second);
+}
+END_TEST
+
+/* No file may grow: the log of the catalogue cannot take a commit. */
+START_TEST(a_failed_commit_is_final_and_nothing_is_acknowledged)
+{
+	struct stored_scan *scan = state_scan(&state, 3, false);
+	struct received_projection late = {.scan = scan, .index = 1};
+	struct rlimit limit, small;
+	struct error err = {0};
+	enum claim claim;
+	char id[ID_SIZE];
+	int code;
+
+	memcpy(id, stored_scan_id(scan), sizeof(id));
+	state_put(&state, scan, 0, 0, 1);
+	ck_assert_int_eq(stored_scan_claim(scan, 1, &claim, &err), 0);
+	signal(SIGXFSZ, SIG_IGN);
+	ck_assert_int_eq(getrlimit(RLIMIT_FSIZE, &limit), 0);
+	small = limit;
+	small.rlim_cur = 4096;
+	ck_assert_int_eq(setrlimit(RLIMIT_FSIZE, &small), 0);
+	code = store_put_projections(state.store, &late, 1, &err);
+	ck_assert_int_eq(setrlimit(RLIMIT_FSIZE, &limit), 0);
+	ck_assert_int_eq(code, ERR_IO);
+	ck_assert_int_eq(state.failures, 1);
+	ck_assert_int_eq(facts_of(scan).received, 1);
+	/* The disk is well again, but what it holds is not known: still no. */
+	ck_assert_int_eq(store_put_projections(state.store, &late, 1, &err), ERR_IO);
+	ck_assert_int_eq(store_scan_delete(state.store, scan, &err), ERR_IO);
+	ck_assert_int_eq(state.failures, 1);
+	stored_scan_unclaim(scan, 1);
+	stored_scan_release(scan);
+	state_reopen(&state);
+	scan = find(id);
+	ck_assert_int_eq(facts_of(scan).received, 1);
+	state_put(&state, scan, 1, 2, 1);
+	ck_assert(facts_of(scan).ready);
+	stored_scan_release(scan);
+}
+END_TEST
+
+static void count_wake(void *context)
+{
+	++*(int *)context;
+}
+
+START_TEST(watchers_hear_of_projections_and_of_the_last_one)
+{
+	struct stored_scan *scan = state_scan(&state, 4, false);
+	int wakes = 0, ready = 0;
+	struct watch watch = {.wake = count_wake, .context = &wakes};
+	struct watch ready_watch = {.wake = count_wake, .context = &ready};
+
+	stored_scan_watch(scan, &watch);
+	store_watch_ready(state.store, &ready_watch);
+	state_put(&state, scan, 0, 2, 1);
+	ck_assert_int_eq(wakes, 1); /* a batch is one piece of news */
+	ck_assert_int_eq(ready, 0);
+	state_put(&state, scan, 3, 3, 1);
+	ck_assert_int_eq(wakes, 2);
+	ck_assert_int_eq(ready, 1);
+	stored_scan_unwatch(scan, &watch);
+	store_unwatch_ready(state.store, &ready_watch);
+	stored_scan_release(scan);
+}
+END_TEST
+
+Suite *store_suite(void)
+{
+	Suite *suite = suite_create("store");
+	TCase *tests = tcase_create("store");
+
+	tcase_add_checked_fixture(tests, set_up, tear_down);
+	tcase_add_test(tests, projections_are_known_again_after_a_restart);
+	tcase_add_test(tests, a_projection_has_one_writer_at_a_time);
+	tcase_add_test(tests, the_file_of_the_projections_has_its_full_size_at_once);
+	tcase_add_test(tests, a_scan_beyond_the_disk_is_refused_before_anything_is_made);
+	tcase_add_test(tests, scans_are_listed_newest_first_from_a_cursor);
+	tcase_add_test(tests, a_deleted_scan_takes_no_more_projections);
+	tcase_add_test(tests, intensities_are_ready_with_their_flat_image);
+	tcase_add_test(tests, what_a_crash_left_is_tidied_up);
+	tcase_add_test(tests, a_lost_catalogue_does_not_take_the_scans_with_it);
+	tcase_add_test(tests, a_scan_whose_files_are_gone_says_so);
+	tcase_add_test(tests, a_state_directory_has_one_daemon);
+	tcase_add_test(tests, a_failed_commit_is_final_and_nothing_is_acknowledged);
+	tcase_add_test(tests, watchers_hear_of_projections_and_of_the_last_one);
+	suite_add_tcase(suite, tests);
+	return suite;
+}
