@@ -126,6 +126,20 @@ check: setup ## every test; what cannot run here is skipped aloud
 	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/unit
 	@BUILD=$(BUILD) tests/run.sh
 
+FUZZ_SECONDS ?= 10
+fuzzers := $(patsubst tests/fuzz/%.c,$(BUILD)/%,$(wildcard tests/fuzz/fuzz_*.c))
+
+$(BUILD)/fuzz_%: $(BUILD)/tests/fuzz/fuzz_%.o $(BUILD)/daemon/http_text.o $(library)
+	$(CC) $(LDFLAGS) -fsanitize=fuzzer -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(LIBM)
+
+fuzzers: $(fuzzers)
+
+fuzz: setup ## each fuzz target for FUZZ_SECONDS=10 (needs clang)
+	@command -v clang >/dev/null || { echo "make fuzz needs clang: apt-get install clang" >&2; exit 1; }
+	@$(MAKE) --no-print-directory -j$$(nproc) fuzzers BUILD=$(BUILD)/fuzz CC=clang \
+		SANITIZE=fuzzer-no-link,address,undefined OPENMP= CUDA=0
+	@BUILD=$(BUILD)/fuzz FUZZ_SECONDS=$(FUZZ_SECONDS) tests/fuzz/run.sh
+
 bench: setup ## CPU and HTTP benchmarks, results in build/bench/
 	@$(MAKE) --no-print-directory -j$$(nproc) all
 	@BUILD=$(BUILD) tests/bench/run.sh
@@ -161,6 +175,6 @@ clean: ## removes build/
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-.PHONY: all setup demo check bench check-gpu bench-gpu asan tsan lint format install clean help
+.PHONY: all setup demo check fuzz fuzzers bench check-gpu bench-gpu asan tsan lint format install clean help
 .SECONDARY:
 -include $(shell find $(BUILD) -name '*.d' 2>/dev/null)

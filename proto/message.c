@@ -265,13 +265,22 @@ static void read_grid(struct json_reader *reader, const char *name, struct grid 
 static void read_text(struct json_reader *reader, const char *name, char *ret, size_t size)
 {
 	const cJSON *member = json_member(reader, name, true);
+	size_t length;
 
 	if (member == NULL)
 		return;
-	if (!cJSON_IsString(member))
+	if (!cJSON_IsString(member)) {
 		json_fail(reader, ERR_INVALID, name, "a text is expected");
-	else
-		snprintf(ret, size, "%s", member->valuestring);
+		return;
+	}
+	length = strlen(member->valuestring);
+	if (length >= size) {
+		length = size - 1;
+		while (length > 0 && (member->valuestring[length] & 0xc0) == 0x80) /* not within a character again */
+			length--;
+	}
+	memcpy(ret, member->valuestring, length);
+	ret[length] = '\0';
 }
 
 static void read_request(struct json_reader *reader, const char *name, struct job_request *ret_request)
