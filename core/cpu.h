@@ -24,8 +24,9 @@
  */
 enum {
 	SLACK = 64,
-	LANES_MOST = 16,    /* of any instruction set */
-	BLOCK_COLUMNS = 16, /* of a projection that are handed out together */
+	LANES_MOST = 16,               /* of any instruction set */
+	BLOCK_COLUMNS = 16,            /* of a projection that are handed out together */
+	BLEND_MARGIN = 2 * LANES_MOST, /* floats around a column of voxels in scratch, for windows beyond its ends */
 };
 
 struct device {
@@ -66,6 +67,8 @@ struct plan {
 	size_t row, plane; /* strides of every volume of this grid, floats */
 	struct cpu_view *view;
 	double spacing_least; /* mm */
+	bool untilted;        /* rows of the detector across z, columns along z, lanes along both */
+	bool fans;            /* untilted, and no ray passes more voxels along z than across */
 	bool along_z;         /* backprojection takes voxels along z together, else along x */
 	bool along_rows;      /* projection takes pixels along a column of the detector together, else along a row */
 	char summary[96];
@@ -121,8 +124,7 @@ struct tv_step {
 };
 
 /*
- * The inner loops, one table for each instruction set. `scratch` is one
- * thread's part of plan->scratch.
+ * The inner loops, one table for each instruction set.
  */
 struct cpu_kernels {
 	const char *isa;  /* "avx512": device_options.isa */
@@ -131,6 +133,7 @@ struct cpu_kernels {
 	/*
 	 * Line integrals of columns column .. column + count - 1 of one view, all rows;
 	 * ret and ret_length (mm inside the grid) are [column][row] from `column` on.
+	 * scratch: project_scratch_floats.
 	 */
 	void (*project)(const struct plan *plan, int view, int column, int count, const float *volume, float *ret,
 			float *ret_length, float *scratch);
@@ -141,7 +144,7 @@ struct cpu_kernels {
 	 * then and `cover` is left alone.
 	 */
 	bool (*backproject)(const struct plan *plan, int view, const struct tile *tile, enum backprojection weight,
-			    const float *projection, float *sums, float *cover, float *scratch);
+			    const float *projection, float *sums, float *cover);
 
 	void (*tv_flux)(const struct tv_row *row, const struct tv_weights *weights, float epsilon2,
 			const struct tv_flux *ret);
@@ -179,6 +182,17 @@ static inline const float *stack_slot(const struct stack *stack, int slot)
 static inline size_t stack_floats(const struct stack *stack)
 {
 	return (size_t)stack->slots * (size_t)stack->columns * (size_t)stack->rows;
+}
+
+static inline size_t lanes_padded(int count)
+{
+	return ((size_t)count + LANES_MOST - 1) / LANES_MOST * LANES_MOST;
+}
+
+/* Three floats and, for groups of no less than four, four integers for each row; two columns of voxels. */
+static inline size_t project_scratch_floats(const struct plan *plan)
+{
+	return 4 * lanes_padded(plan->rows) + 2 * (lanes_padded(plan->grid.size[2]) + 2 * BLEND_MARGIN);
 }
 
 static inline float *plan_scratch(const struct plan *plan)

@@ -99,14 +99,14 @@ int cpu_backproject(struct plan *plan, const struct stack *from, const int *view
 				 from->slots);
 #pragma omp parallel for num_threads(plan->device->threads) schedule(dynamic)
 	for (int t = 0; t < tiles; t++) {
-		float *sums = plan_scratch(plan), *scratch = sums + 2 * tile_floats(plan);
+		float *sums = plan_scratch(plan);
 		struct tile tile;
 
 		tile_at(plan, t, &tile);
 		memset(sums, 0, tile_floats(plan) * sizeof(float));
 		for (int i = 0; i < count; i++)
 			plan->device->kernels->backproject(plan, views[i], &tile, weight, stack_slot(from, i), sums,
-							   NULL, scratch);
+							   NULL);
 		tile_add(plan, &tile, sums, to->data);
 	}
 	return 0;

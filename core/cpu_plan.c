@@ -30,6 +30,41 @@ static int largest_subset(const struct subsets *subsets)
 	return most;
 }
 
+/*
+ * True when no ray passes more voxels along z than along x or y. Across z the
+ * direction is linear in the column, so the largest of its two components is
+ * least at an end, where one of them is 0 or where both are equal.
+ */
+static bool rays_lie_flat(const struct geometry *geometry, const struct grid *grid)
+{
+	for (int k = 0; k < geometry->count; k++) {
+		const struct view *view = &geometry->views[k];
+		double from[3], step[3], least = INFINITY, rise;
+
+		for (int i = 0; i < 3; i++) {
+			from[i] = (view->pixel0[i] - view->source[i]) / grid->spacing[i];
+			step[i] = view->column_step[i] / grid->spacing[i];
+		}
+		rise = view->row_step[2] / grid->spacing[2] * (geometry->rows - 1);
+		rise = fmax(fabs(from[2]), fabs(from[2] + rise));
+		const double columns[] = {0,
+					  geometry->columns - 1,
+					  -from[0] / step[0],
+					  -from[1] / step[1],
+					  (from[1] - from[0]) / (step[0] - step[1]),
+					  -(from[1] + from[0]) / (step[0] + step[1])};
+
+		for (size_t i = 0; i < sizeof(columns) / sizeof(columns[0]); i++) {
+			const double c = fmin(fmax(columns[i], 0), geometry->columns - 1);
+
+			least = fmin(least, fmax(fabs(from[0] + c * step[0]), fabs(from[1] + c * step[1])));
+		}
+		if (!(rise < least))
+			return false;
+	}
+	return true;
+}
+
 /* Everything about the plan that takes no memory to know. */
 static void plan_shape(const struct plan_options *options, struct plan *ret)
 {
@@ -46,6 +81,8 @@ static void plan_shape(const struct plan_options *options, struct plan *ret)
 	ret->spacing_least = fmin(fmin(grid->spacing[0], grid->spacing[1]), grid->spacing[2]);
 	ret->along_z = grid->size[2] >= ALONG_LEAST || grid->size[2] >= grid->size[0];
 	ret->along_rows = geometry->rows >= ALONG_LEAST || geometry->rows >= geometry->columns;
+	ret->untilted = ret->along_z && ret->along_rows && geometry_is_untilted(geometry);
+	ret->fans = ret->untilted && rays_lie_flat(geometry, grid);
 	ret->linearise = options->linearise;
 	ret->filter_batch = at_least_one(share, geometry->count);
 	if (options->sart != NULL) {
@@ -57,9 +94,9 @@ static void plan_shape(const struct plan_options *options, struct plan *ret)
 		ret->tv = *options->tv;
 		ret->planes_floats = tv_planes_floats(ret);
 	}
-	ret->scratch_floats = 2 * tile_floats(ret) + LANES_MOST;
-	if (ret->scratch_floats < (size_t)BLOCK_COLUMNS * (size_t)ret->rows)
-		ret->scratch_floats = (size_t)BLOCK_COLUMNS * (size_t)ret->rows;
+	ret->scratch_floats = (size_t)BLOCK_COLUMNS * (size_t)ret->rows + project_scratch_floats(ret);
+	if (ret->scratch_floats < 2 * tile_floats(ret))
+		ret->scratch_floats = 2 * tile_floats(ret);
 }
 
 static bool needs_work(const struct plan *plan)
@@ -179,8 +216,9 @@ int cpu_plan_new(struct device *device, const struct plan_options *options, stru
 	}
 	for (int i = 0; i < plan->views; i++)
 		view_set(&options->geometry->views[i], &plan->grid, &plan->view[i]);
-	snprintf(plan->summary, sizeof(plan->summary), "any geometry, %d thread%s, %s", device->threads,
-		 device->threads == 1 ? "" : "s", device->kernels->name);
+	snprintf(plan->summary, sizeof(plan->summary), "%s, %d thread%s, %s",
+		 plan->untilted ? "untilted" : "any geometry", device->threads, device->threads == 1 ? "" : "s",
+		 device->kernels->name);
 	*ret_plan = plan;
 	return 0;
 }

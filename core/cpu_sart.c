@@ -81,19 +81,17 @@ static void update_tile(const struct plan *plan, const struct subset *subset, in
 	const struct cpu_kernels *kernels = plan->device->kernels;
 	const size_t pixels = (size_t)plan->rows * (size_t)plan->columns, floats = tile_floats(plan);
 	const bool first = begin == 0, last = begin + count == subset->count;
-	float *sums = plan_scratch(plan), *cover = sums + floats, *scratch = cover + floats;
+	float *sums = plan_scratch(plan), *cover = sums + floats;
 	int everywhere = 0;
 	struct tile tile;
 
 	tile_at(plan, index, &tile);
 	memset(sums, 0, 2 * floats * sizeof(float));
 	for (int i = 0; i < count; i++)
-		everywhere +=
-		    kernels->backproject(plan, subset->views[begin + i], &tile, BACKPROJECT_PLAIN,
-					 plan->corrections + (size_t)i * pixels, sums, last ? cover : NULL, scratch);
+		everywhere += kernels->backproject(plan, subset->views[begin + i], &tile, BACKPROJECT_PLAIN,
+						   plan->corrections + (size_t)i * pixels, sums, last ? cover : NULL);
 	for (int i = 0; last && i < begin; i++)
-		everywhere +=
-		    kernels->backproject(plan, subset->views[i], &tile, BACKPROJECT_PLAIN, NULL, NULL, cover, scratch);
+		everywhere += kernels->backproject(plan, subset->views[i], &tile, BACKPROJECT_PLAIN, NULL, NULL, cover);
 	for (int line = 0; line < tile_lines(plan, &tile); line++) {
 		float *line_sums = sums + (size_t)line * tile.stride;
 		int length;

@@ -184,7 +184,7 @@ static void project_rays(const struct plan *plan, const struct rays *rays, const
 }
 
 static void project_general(const struct plan *plan, int view_index, int column, int count, const float *volume,
-			    float *ret, float *ret_length, float *scratch)
+			    float *ret, float *ret_length)
 {
 	const struct cpu_view *view = &plan->view[view_index];
 	const int lanes_along = plan->along_rows ? plan->rows : count;
@@ -192,7 +192,6 @@ static void project_general(const struct plan *plan, int view_index, int column,
 	const size_t lane_stride = plan->along_rows ? 1 : (size_t)plan->rows;
 	const size_t line_stride = plan->along_rows ? (size_t)plan->rows : 1;
 
-	(void)scratch;
 	for (int line = 0; line < lines; line++) {
 		for (int first = 0; first < lanes_along; first += LANES) {
 			struct rays rays;
@@ -214,8 +213,249 @@ static void project_general(const struct plan *plan, int view_index, int column,
 	}
 }
 
+/*
+ * ---- untilted ----
+ * All rays to one column of the detector cross a slice in one line along z, at
+ * evenly spaced heights. So the two columns of voxels on either side of that line
+ * are blended once, and every LANES rows look up theirs in a window of 2 LANES
+ * voxels of the blend.
+ */
+enum { GROUPS_MOST = 64 }; /* groups of LANES rows whose positions are worked out together */
+
+/* The plane of rays to one column. Slices are counted along a, the axis in which all of them are fastest. */
+struct fan {
+	int a, b;                 /* x and y, or y and x */
+	double enter, leave;      /* along a, where the plane meets the grid's sides */
+	double source_a, inverse; /* slice i is q = (i - source_a) * inverse of the way to the detector */
+	double source_b, direction_b;
+	double source_z, direction_z, row_z; /* height at q: source_z + q (direction_z + row * row_z) */
+	double across2;                      /* mm^2, of the way to the detector across z */
+};
+
+/* What the rows of a column need in every slice, [rows rounded up to LANES_MOST]. */
+struct fan_rows {
+	float *begin, *end; /* in slices, begin >= end: misses the grid */
+	float *sum;
+	float *blend[2]; /* [nz] with BLEND_MARGIN on both sides, used in turn */
+	/* Slices in which any row of a group has a part, and those in which all rows have a whole one. */
+	int *any_first, *any_last, *full_first, *full_last;
+};
+
+static void fan_rows_at(const struct plan *plan, float *scratch, struct fan_rows *ret)
+{
+	const size_t rows = lanes_padded(plan->rows), blend = lanes_padded(plan->grid.size[2]) + 2 * BLEND_MARGIN;
+	int *integers = (int *)(scratch + 3 * rows + 2 * blend);
+
+	ret->begin = scratch;
+	ret->end = scratch + rows;
+	ret->sum = scratch + 2 * rows;
+	ret->blend[0] = scratch + 3 * rows + BLEND_MARGIN;
+	ret->blend[1] = ret->blend[0] + blend;
+	ret->any_first = integers;
+	ret->any_last = integers + rows / LANES;
+	ret->full_first = integers + 2 * (rows / LANES);
+	ret->full_last = integers + 3 * (rows / LANES);
+}
+
+static void fan_set(const struct plan *plan, const struct cpu_view *view, int column, struct fan *ret)
+{
+	double d[3], mm2[2];
+
+	for (int i = 0; i < 3; i++)
+		d[i] = view->pixel0[i] + column * view->column_step[i];
+	for (int i = 0; i < 2; i++)
+		mm2[i] = d[i] * d[i] * plan->grid.spacing[i] * plan->grid.spacing[i];
+	ret->a = fabs(d[1]) > fabs(d[0]);
+	ret->b = 1 - ret->a;
+	ret->source_a = view->source[ret->a];
+	ret->inverse = 1 / d[ret->a];
+	ret->source_b = view->source[ret->b];
+	ret->direction_b = d[ret->b];
+	ret->source_z = view->source[2];
+	ret->direction_z = d[2];
+	ret->row_z = view->row_step[2];
+	ret->across2 = mm2[0] + mm2[1];
+	ret->enter = -.5;
+	ret->leave = plan->grid.size[ret->a] - .5;
+	if (fabs(d[ret->b]) > 1e-12) {
+		double low = ret->source_a + (-.5 - ret->source_b) / (ret->inverse * d[ret->b]);
+		double high =
+		    ret->source_a + (plan->grid.size[ret->b] - .5 - ret->source_b) / (ret->inverse * d[ret->b]);
+
+		ret->enter = fmax(ret->enter, fmin(low, high));
+		ret->leave = fmin(ret->leave, fmax(low, high));
+	} else if (ret->source_b < -.5 || ret->source_b > plan->grid.size[ret->b] - .5) {
+		ret->leave = ret->enter;
+	}
+}
+
+/* Clips every row to the grid along z and finds the slices of every group; returns false when all miss. */
+static bool fan_clip(const struct plan *plan, const struct fan *fan, const struct fan_rows *rows, int *ret_first,
+		     int *ret_last)
+{
+	const double low = -.5 - fan->source_z, high = plan->grid.size[2] - .5 - fan->source_z;
+	const int padded = (int)lanes_padded(plan->rows), slices = plan->grid.size[fan->a];
+	int first = slices, last = -1;
+
+	for (int r = 0; r < padded; r++) {
+		double height = (fan->direction_z + r * fan->row_z) * fan->inverse, inverse = 1 / height;
+		double to_low = fan->source_a + low * inverse, to_high = fan->source_a + high * inverse;
+		double enter = to_low < to_high ? to_low : to_high, leave = to_low < to_high ? to_high : to_low;
+
+		if (fabs(height) < 1e-12) {
+			enter = low <= 0 && high >= 0 ? fan->enter : fan->leave;
+			leave = fan->leave;
+		}
+		rows->begin[r] = (float)(enter > fan->enter ? enter : fan->enter);
+		rows->end[r] = (float)(leave < fan->leave ? leave : fan->leave);
+		rows->sum[r] = 0;
+	}
+	for (int g = 0; g * LANES < padded; g++) {
+		float begin_least = INFINITY, begin_most = -INFINITY, end_least = INFINITY, end_most = -INFINITY;
+		bool missing = false;
+
+		for (int r = g * LANES; r < (g + 1) * LANES; r++) {
+			const float begin = rows->begin[r], end = rows->end[r];
+
+			if (!(begin < end)) {
+				missing = true;
+				continue;
+			}
+			begin_least = begin < begin_least ? begin : begin_least;
+			begin_most = begin > begin_most ? begin : begin_most;
+			end_least = end < end_least ? end : end_least;
+			end_most = end > end_most ? end : end_most;
+		}
+		rows->any_first[g] = slices;
+		rows->any_last[g] = -1;
+		if (begin_least < end_most) {
+			rows->any_first[g] = (int)fmaxf(floorf(begin_least + .5f), 0);
+			rows->any_last[g] = (int)fminf(ceilf(end_most - .5f), (float)(slices - 1));
+		}
+		rows->full_first[g] = missing ? slices : (int)ceilf(begin_most + .5f);
+		rows->full_last[g] = missing ? -1 : (int)floorf(end_least - .5f);
+		first = rows->any_first[g] < first ? rows->any_first[g] : first;
+		last = rows->any_last[g] > last ? rows->any_last[g] : last;
+	}
+	*ret_first = first;
+	*ret_last = last;
+	return first <= last;
+}
+
+/* The line along z in which slice i is crossed, its ends held for one voxel more. */
+static void fan_blend(const struct plan *plan, const struct fan *fan, int i, const float *volume, float *ret)
+{
+	const size_t strides[2] = {plan->row, plan->plane};
+	const int size = plan->grid.size[fan->b], nz = plan->grid.size[2];
+	const double at = fan->source_b + (i - fan->source_a) * fan->inverse * fan->direction_b;
+	const double held = at < 0 ? 0 : at > size - 1 ? size - 1 : at;
+	const int j = (int)held < size - 1 ? (int)held : size > 1 ? size - 2 : 0;
+	const float *left = volume + (size_t)i * strides[fan->a] + (size_t)j * strides[fan->b];
+	const float *right = left + (size > 1 ? strides[fan->b] : 0);
+	const vf weight = vf_all((float)(held - j));
+
+	for (int z = 0; z < nz; z += LANES) {
+		vf l = vf_load(left + z);
+
+		vf_store(ret + z, vf_fma(weight, vf_load(right + z) - l, l));
+	}
+	ret[-1] = ret[0];
+	for (int z = nz; z < nz + LANES; z++)
+		ret[z] = ret[nz - 1];
+}
+
+/* A group of rows of which some leave or enter, or that lie too far apart for a window. */
+static void fan_sample_edge(const struct plan *plan, const struct fan_rows *rows, int g, int i, double height,
+			    double step, const float *blend)
+{
+	const vf begin = vf_load(rows->begin + g * LANES), end = vf_load(rows->end + g * LANES);
+	const vf weight = vf_min(vf_all((float)i + .5f), end) - vf_max(vf_all((float)i - .5f), begin);
+	const vf z = vf_fma(vf_iota(), vf_all((float)step), vf_all((float)height));
+	vf fraction, a, b;
+	vi index = vf_split(vf_clamp(z, vf_all(-1), vf_all((float)plan->grid.size[2])) + 1, &fraction);
+
+	vf_gather_pair(blend - 1, index, &a, &b);
+	a = vf_fma(fraction, b - a, a);
+	vf_store(rows->sum + g * LANES, vf_fma(vf_max(weight, vf_all(0)), a, vf_load(rows->sum + g * LANES)));
+}
+
+/* Slice i for all groups: `begin` .. `end` - 1 are those with any part in any slice. */
+static void fan_sample(const struct plan *plan, const struct fan *fan, const struct fan_rows *rows, int i, int begin,
+		       int end, const float *blend)
+{
+	const double q = (i - fan->source_a) * fan->inverse, step = q * fan->row_z;
+	const double height = fan->source_z + q * fan->direction_z;
+	const double lowest = step < 0 ? (LANES - 1) * step : 0; /* of a group, from its first */
+	const bool windowed = window_holds(step);
+	const vf along = vf_iota() * (float)step;
+	int32_t base[GROUPS_MOST];
+	float offset[GROUPS_MOST];
+
+	for (; begin < end; begin += GROUPS_MOST) {
+		const int count = end - begin < GROUPS_MOST ? end - begin : GROUPS_MOST;
+
+		for (int k = 0; k < count; k++) {
+			double position = height + (begin + k) * (LANES * step) + lowest + 1;
+
+			base[k] = (int32_t)position - 1;
+			offset[k] = (float)(position - 1 - base[k] - lowest);
+		}
+		for (int k = 0; k < count; k++) {
+			const int g = begin + k;
+			float *sum = rows->sum + g * LANES;
+
+			if (windowed && i >= rows->full_first[g] && i <= rows->full_last[g]) {
+				vf low = vf_load(blend + base[k]), high = vf_load(blend + base[k] + LANES);
+
+				vf_store(sum, vf_load(sum) + vf_window_sample(low, high, along + offset[k]));
+			} else if (i >= rows->any_first[g] && i <= rows->any_last[g]) {
+				fan_sample_edge(plan, rows, g, i, height + g * LANES * step, step, blend);
+			}
+		}
+	}
+}
+
+static void project_column(const struct plan *plan, int view, int column, const float *volume, float *ret,
+			   float *ret_length, float *scratch)
+{
+	const int groups = (plan->rows + LANES - 1) / LANES;
+	struct fan fan;
+	struct fan_rows rows;
+	int first, last, begin = 0, end = groups;
+
+	fan_rows_at(plan, scratch, &rows);
+	fan_set(plan, &plan->view[view], column, &fan);
+	if (fan_clip(plan, &fan, &rows, &first, &last)) {
+		while (rows.any_last[begin] < 0)
+			begin++;
+		while (rows.any_last[end - 1] < 0)
+			end--;
+		/* One slice ahead, so that the blend is in the cache by the time that windows of it are read. */
+		fan_blend(plan, &fan, first, volume, rows.blend[first & 1]);
+		for (int i = first; i <= last; i++) {
+			if (i < last)
+				fan_blend(plan, &fan, i + 1, volume, rows.blend[(i + 1) & 1]);
+			fan_sample(plan, &fan, &rows, i, begin, end, rows.blend[i & 1]);
+		}
+	}
+	for (int r = 0; r < plan->rows; r++) {
+		const double height = (fan.direction_z + r * fan.row_z) * plan->grid.spacing[2];
+		const float step = (float)(sqrt(fan.across2 + height * height) * fabs(fan.inverse));
+		const float slices = rows.end[r] - rows.begin[r];
+
+		ret[r] = rows.sum[r] * step;
+		ret_length[r] = slices > 0 ? slices * step : 0;
+	}
+}
+
 void SIMD_NAME(project)(const struct plan *plan, int view, int column, int count, const float *volume, float *ret,
 			float *ret_length, float *scratch)
 {
-	project_general(plan, view, column, count, volume, ret, ret_length, scratch);
+	if (!plan->fans) {
+		project_general(plan, view, column, count, volume, ret, ret_length);
+		return;
+	}
+	for (int c = 0; c < count; c++)
+		project_column(plan, view, column + c, volume, ret + (size_t)c * (size_t)plan->rows,
+			       ret_length + (size_t)c * (size_t)plan->rows, scratch);
 }

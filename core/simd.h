@@ -89,6 +89,31 @@ static inline vf vf_from(vi v)
 	return __builtin_convertvector(v, vf);
 }
 
+/* a b + c, in one rounding where the processor can. */
+static inline vf vf_fma(vf a, vf b, vf c)
+{
+#if defined(SIMD_avx512)
+	return (vf)_mm512_fmadd_ps((__m512)a, (__m512)b, (__m512)c);
+#elif defined(SIMD_avx2)
+	return (vf)_mm256_fmadd_ps((__m256)a, (__m256)b, (__m256)c);
+#else
+	return a * b + c;
+#endif
+}
+
+/* Whole and fractional part of what is not negative. */
+static inline vi vf_split(vf v, vf *ret_fraction)
+{
+	vi whole = vi_from(v);
+
+#if defined(SIMD_avx512)
+	*ret_fraction = (vf)_mm512_reduce_ps((__m512)v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC);
+#else
+	*ret_fraction = v - vf_from(whole);
+#endif
+	return whole;
+}
+
 #if defined(SIMD_avx512)
 
 static inline vf vf_min(vf a, vf b)
@@ -236,6 +261,26 @@ static inline vf vf_window(vf low, vf high, vi index)
 
 #endif
 
+/*
+ * Linear interpolation in a row at positions that are not negative and below
+ * 2 LANES - 1: two registers hold all that the lanes need, and a permutation does
+ * what a gather would.
+ */
+static inline vf vf_window_sample(vf low, vf high, vf position)
+{
+	vf fraction;
+	vi index = vf_split(position, &fraction);
+	vf a = vf_window(low, high, index), b = vf_window(low, high, index + 1);
+
+	return vf_fma(fraction, b - a, a);
+}
+
+/* Whether LANES samples so far apart fall into such a window, wherever in its first cell the first lies. */
+static inline int window_holds(double step)
+{
+	return (LANES - 1) * (step < 0 ? -step : step) < 2 * LANES - 2;
+}
+
 static inline vf vf_clamp(vf v, vf low, vf high)
 {
 	return vf_min(vf_max(v, low), high);
@@ -263,7 +308,7 @@ static inline float vf_lowest(vf v)
 void SIMD_NAME(project)(const struct plan *plan, int view, int column, int count, const float *volume, float *ret,
 			float *ret_length, float *scratch);
 bool SIMD_NAME(backproject)(const struct plan *plan, int view, const struct tile *tile, enum backprojection weight,
-			    const float *projection, float *sums, float *cover, float *scratch);
+			    const float *projection, float *sums, float *cover);
 
 void SIMD_NAME(tv_flux)(const struct tv_row *row, const struct tv_weights *weights, float epsilon2,
 			const struct tv_flux *ret);
