@@ -200,6 +200,11 @@ static void job_ended(struct supervise *supervise, struct worker *worker, const 
 	} else if (worker->failure_code != 0) {
 		end_job(supervise, worker, JOB_FAILED, worker->failure_code, worker->failure_text, 0, false);
 	} else if (message->code == ERR_BUSY) {
+		/* Unasked: somebody told the process itself to end, it takes no more jobs. */
+		if (!worker->yielding) {
+			worker->state = WORKER_ENDING;
+			worker->deadline = now_monotonic() + EXIT;
+		}
 		end_job(supervise, worker, JOB_QUEUED, 0, "it made room", message->iteration, false);
 	} else if (message->code == ERR_INVALID && worker->checkpoint > 0) {
 		end_job(supervise, worker, JOB_QUEUED, 0, "its checkpoint is damaged: from the start", 0, true);
@@ -651,8 +656,12 @@ static void quit_workers(struct supervise *supervise)
 
 		if (worker->state == WORKER_ABSENT)
 			continue;
-		tell(worker, MESSAGE_QUIT);
-		if (worker->deadline == NEVER || worker->state == WORKER_STARTING)
+		/* One that has not even said hello has nothing to lose. */
+		if (worker->state == WORKER_STARTING)
+			child_kill(&worker->child);
+		else
+			tell(worker, MESSAGE_QUIT);
+		if (worker->deadline == NEVER)
 			worker->deadline = now_monotonic() + supervise->options.stop_seconds;
 	}
 }
