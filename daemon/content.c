@@ -47,6 +47,40 @@ static void scale_grid(struct content *content, int scale)
 	}
 }
 
+static bool is_plain(const struct content *content)
+{
+	return content->options.type == VOLUME_FLOAT32 && content->options.scale == 1;
+}
+
+static int read_file(const struct content *content, uint64_t offset, void *to, size_t size)
+{
+	while (size > 0) {
+		ssize_t got = pread(content->descriptor, to, size, (off_t)offset);
+
+		if (got < 0 && errno == EINTR)
+			continue;
+		if (got <= 0)
+			return -1;
+		to = (char *)to + got;
+		offset += (uint64_t)got;
+		size -= (size_t)got;
+	}
+	return 0;
+}
+
+/* Of the file itself where it is sent as it is: the same bytes, whichever way they go. */
+static int make_header(struct content *content, struct error *err)
+{
+	const struct content_options *options = &content->options;
+
+	content->header_size = options->format->header(&content->scaled, options->type, options->name, content->header);
+	if (!is_plain(content) || options->format != volume_formats)
+		return 0;
+	if (read_file(content, 0, content->header, content->header_size) != 0)
+		return error_set(err, ERR_IO, "the volume's file cannot be read");
+	return 0;
+}
+
 int content_open(const char *path, const struct grid *grid, const struct content_options *options,
 		 struct content **ret_content, struct error *err)
 {
@@ -68,7 +102,10 @@ int content_open(const char *path, const struct grid *grid, const struct content
 		content_close(content);
 		return err->code;
 	}
-	content->header_size = options->format->header(&content->scaled, options->type, options->name, content->header);
+	if (make_header(content, err) != 0) {
+		content_close(content);
+		return err->code;
+	}
 	*ret_content = content;
 	return 0;
 }
@@ -88,11 +125,6 @@ uint64_t content_size(const struct content *content)
 	return content->header_size + (uint64_t)grid_voxels(&content->scaled) * content->voxel_bytes;
 }
 
-static bool is_plain(const struct content *content)
-{
-	return content->options.type == VOLUME_FLOAT32 && content->options.scale == 1;
-}
-
 int content_descriptor(const struct content *content, uint64_t *ret_offset)
 {
 	/* The file is a NIfTI; without its header it is raw. */
@@ -100,22 +132,6 @@ int content_descriptor(const struct content *content, uint64_t *ret_offset)
 		return -1;
 	*ret_offset = content->header_size != 0 ? 0 : SPOOL_VOLUME_OFFSET;
 	return fcntl(content->descriptor, F_DUPFD_CLOEXEC, 0);
-}
-
-static int read_file(const struct content *content, uint64_t offset, void *to, size_t size)
-{
-	while (size > 0) {
-		ssize_t got = pread(content->descriptor, to, size, (off_t)offset);
-
-		if (got < 0 && errno == EINTR)
-			continue;
-		if (got <= 0)
-			return -1;
-		to = (char *)to + got;
-		offset += (uint64_t)got;
-		size -= (size_t)got;
-	}
-	return 0;
 }
 
 /* Part of a row of means: voxels x .. x + count - 1 of row (y, z). */

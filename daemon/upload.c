@@ -1,10 +1,10 @@
 /*
  * Projections and images from a request's body to the disk: upload.h.
  *
- *   connection  fills a slot ---> queue ---> writer: check, hash, claim, pwrite
- *                                    ^                  |            |
- *                                    |               busy: park      v
- *                                    '---- a claim came free   sync, commit, settle
+ *   connection  fills and checks a slot ---> queue ---> writer: hash, claim, pwrite
+ *                                               ^             |          |
+ *                                               |          busy: park    v
+ *                                               '--- a claim came free   sync, commit, settle
  *
  * uploads.lock guards the queue, the pool and the part of each upload that says
  * so; it is never held over disk work or hashing. request_wake is called under it.
@@ -13,6 +13,7 @@
 
 #include <assert.h>
 #include <errno.h>
+#include <fcntl.h>
 #include <inttypes.h>
 #include <math.h>
 #include <pthread.h>
@@ -34,7 +35,7 @@ enum {
 	BUSY_SECONDS = 30       /* to wait for another request's claim */
 };
 
-/* One projection or image between socket and disk; or, without data, the wish to commit what an upload holds. */
+/* One projection or image between socket and disk; or, without data, an upload's wish to commit what it holds. */
 struct slot {
 	struct slot *next;
 	struct upload *upload;
@@ -55,7 +56,7 @@ struct slot_list {
 	struct slot *first, **end;
 };
 
-/* A projection that is written, but must not count before the digest was right. */
+/* A projection that is written, but must not count yet. */
 struct held {
 	int index;
 	uint8_t sha256[32];
@@ -78,7 +79,8 @@ struct upload {
 	bool decoder_ended;
 	EVP_MD_CTX *digest; /* of the bytes as sent; NULL: none was promised */
 	uint8_t promised[32];
-	bool body_ended;
+	bool holds;   /* projections count only when the body's end, or a break, has shown that they are right */
+	bool spoiled; /* the body was wrong */
 
 	/* Guarded by uploads.lock. */
 	struct request *request; /* NULL once it is over */
@@ -91,6 +93,9 @@ struct upload {
 	struct error error; /* the first failure; code 0: none */
 	struct held *held;  /* [held_count], room for all */
 	int held_count;
+	bool body_ended; /* and was right */
+	bool keeps;      /* the connection broke: what is held shall count */
+	struct slot wish;
 };
 
 struct uploads {
@@ -294,6 +299,28 @@ static void unreference_and_unlock(struct upload *upload)
 	free(upload);
 }
 
+/* Hands a slot to the writers; with uploads.lock held. */
+static void enqueue(struct upload *upload, struct slot *slot)
+{
+	slot->upload = upload;
+	upload->pending++;
+	upload->references++;
+	list_add(&upload->uploads->queue, slot);
+	pthread_cond_signal(&upload->uploads->work);
+}
+
+/* Once all is written that will be, and may count. With uploads.lock held. */
+static void commit_held(struct upload *upload)
+{
+	bool right = upload->body_ended || upload->keeps;
+
+	if (!right || upload->pending > 0 || upload->held_count == 0 || upload->error.code != 0)
+		return;
+	memset(&upload->wish, 0, sizeof(upload->wish));
+	upload->wish.weight = upload->held_count;
+	enqueue(upload, &upload->wish);
+}
+
 void upload_release(struct upload *upload)
 {
 	struct uploads *uploads;
@@ -303,6 +330,8 @@ void upload_release(struct upload *upload)
 	uploads = upload->uploads;
 	pthread_mutex_lock(&uploads->lock);
 	upload->request = NULL;
+	upload->keeps = !upload->body_ended && !upload->spoiled && upload->digest == NULL;
+	commit_held(upload);
 	leave_starved(upload);
 	if (upload->granted)
 		uploads->used -= upload->slot_bytes;
@@ -388,10 +417,25 @@ static int read_digest(struct upload *upload, struct error *err)
 	if (!given)
 		return 0;
 	upload->digest = EVP_MD_CTX_new();
-	upload->held = calloc((size_t)(upload->target.last - upload->target.first + 1), sizeof(*upload->held));
-	if (upload->digest == NULL || upload->held == NULL ||
-	    EVP_DigestInit_ex(upload->digest, EVP_sha256(), NULL) != 1)
+	if (upload->digest == NULL || EVP_DigestInit_ex(upload->digest, EVP_sha256(), NULL) != 1)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a digest");
+	return 0;
+}
+
+/*
+ * What a digest is promised for counts when it was right. What is compressed
+ * counts when the body has ended well: a frame's checksum comes last, and wrong
+ * bytes once stored could never be replaced.
+ */
+static int prepare_holding(struct upload *upload, struct error *err)
+{
+	upload->holds =
+	    upload->target.kind == UPLOAD_PROJECTIONS && (upload->digest != NULL || upload->decoder != NULL);
+	if (!upload->holds)
+		return 0;
+	upload->held = calloc((size_t)(upload->target.last - upload->target.first + 1), sizeof(*upload->held));
+	if (upload->held == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for an upload");
 	return 0;
 }
 
@@ -419,6 +463,8 @@ int upload_new(struct uploads *uploads, struct request *request, struct stored_s
 	code = read_encoding(upload, &known, err);
 	if (code == 0 && known)
 		code = read_digest(upload, err);
+	if (code == 0 && known)
+		code = prepare_holding(upload, err);
 	if (code == 0 && known && target->kind == UPLOAD_PROJECTIONS)
 		code = stored_scan_open(scan, true, &upload->descriptor, err);
 	if (code != 0 || !known) {
@@ -434,15 +480,51 @@ int upload_new(struct uploads *uploads, struct request *request, struct stored_s
 
 static void submit(struct upload *upload, struct slot *slot)
 {
-	struct uploads *uploads = upload->uploads;
+	pthread_mutex_lock(&upload->uploads->lock);
+	enqueue(upload, slot);
+	pthread_mutex_unlock(&upload->uploads->lock);
+}
 
-	slot->upload = upload;
-	pthread_mutex_lock(&uploads->lock);
-	upload->pending++;
-	upload->references++;
-	list_add(&uploads->queue, slot);
-	pthread_cond_signal(&uploads->work);
-	pthread_mutex_unlock(&uploads->lock);
+/* Index of the first value that is not finite, or count. Infinity and NaN have all bits of the exponent set. */
+static size_t first_not_finite(const unsigned char *samples, size_t count)
+{
+	enum { BLOCK = 4096 };
+
+	for (size_t start = 0; start < count; start += BLOCK) {
+		size_t length = count - start < BLOCK ? count - start : BLOCK;
+		uint32_t bits[BLOCK], largest = 0;
+
+		memcpy(bits, samples + start * sizeof(float), length * sizeof(float));
+		for (size_t i = 0; i < length; i++) {
+			uint32_t magnitude = bits[i] & 0x7fffffff;
+
+			largest = magnitude > largest ? magnitude : largest;
+		}
+		if (largest < 0x7f800000)
+			continue;
+		for (size_t i = 0; i < length; i++) {
+			if ((bits[i] & 0x7fffffff) >= 0x7f800000)
+				return start + i;
+		}
+	}
+	return count;
+}
+
+static int check_finite(const struct upload *upload, const struct slot *slot, struct error *err)
+{
+	const struct scan *scan = stored_scan_parsed(upload->scan);
+	size_t count = slot->size / sizeof(float), columns = (size_t)scan->geometry.columns, at;
+	float value;
+
+	if (scan->sample != SAMPLE_FLOAT32 || scan->quantity != QUANTITY_LINE_INTEGRAL)
+		return 0; /* counts that are not finite are defects, replaced from their neighbours later */
+	at = first_not_finite(slot->data, count);
+	if (at == count)
+		return 0;
+	memcpy(&value, slot->data + at * sizeof(float), sizeof(value));
+	return error_set(err, ERR_IMPOSSIBLE,
+			 "projection %d: pixel (column %zu, row %zu) is %s; line integrals must be finite", slot->index,
+			 at % columns, at / columns, isnan(value) ? "NaN" : "infinite");
 }
 
 /* A slot to fill; HTTP_WAIT while there is none, the failure of an earlier projection when there was one. */
@@ -532,6 +614,9 @@ static int consume(struct upload *upload, const unsigned char *in, size_t size, 
 		if (at != &spill)
 			upload->filling->filled += produced;
 		if (at != &spill && produced == room && upload->target.kind == UPLOAD_PROJECTIONS) {
+			/* Here and not by a writer: then nothing behind a bad one is on its way already. */
+			if (check_finite(upload, upload->filling, err) != 0)
+				return err->code;
 			submit(upload, upload->filling);
 			upload->filling = NULL;
 		} else if (taken == size && produced < room) {
@@ -555,6 +640,8 @@ int upload_data(struct upload *upload, const void *data, size_t size, size_t *re
 				 "the encoded body has more than %" PRIu64 " bytes, for %" PRIu64 " decoded ones", most,
 				 upload->expected);
 	*ret_taken = taken;
+	if (code < 0)
+		upload->spoiled = true;
 	return code;
 }
 
@@ -593,91 +680,38 @@ static int end_body(struct upload *upload, struct error *err)
 	code = check_digest(upload, err);
 	if (code != 0)
 		return code;
-	if (upload->filling != NULL) { /* an image is whole only now */
-		submit(upload, upload->filling);
-		upload->filling = NULL;
-	}
+	pthread_mutex_lock(&upload->uploads->lock);
+	if (upload->filling != NULL) /* an image is whole only now */
+		enqueue(upload, upload->filling);
+	upload->filling = NULL;
 	upload->body_ended = true;
-	return 0;
-}
-
-/* All was written under its claims and the digest was right: now it may count. */
-static int commit_held(struct upload *upload, struct error *err)
-{
-	struct slot *wish = calloc(1, sizeof(*wish));
-
-	if (wish == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for an upload");
-	wish->weight = upload->held_count; /* none is under way any more: it stays */
-	submit(upload, wish);
+	commit_held(upload);
+	pthread_mutex_unlock(&upload->uploads->lock);
 	return 0;
 }
 
 int upload_end(struct upload *upload, struct upload_outcome *ret_outcome, struct error *err)
 {
 	struct uploads *uploads = upload->uploads;
-	bool pending, commit;
+	bool pending;
 	int code = upload->body_ended ? 0 : end_body(upload, err);
 
+	if (code < 0)
+		upload->spoiled = true;
 	if (code != 0)
 		return code;
 	pthread_mutex_lock(&uploads->lock);
 	code = upload->error.code;
 	pending = upload->pending > 0;
-	commit = !pending && upload->held_count > 0;
 	if (code != 0)
 		*err = upload->error;
-	else if (!pending && !commit)
+	else if (!pending)
 		*ret_outcome = upload->outcome;
 	pthread_mutex_unlock(&uploads->lock);
-	if (code == 0 && commit)
-		code = commit_held(upload, err);
-	return code != 0 ? code : pending || commit ? HTTP_WAIT : 0;
+	return code != 0 ? code : pending ? HTTP_WAIT : 0;
 }
 
 /* ---- the writers' side ---- */
-
-/* Index of the first value that is not finite, or count. Infinity and NaN have all bits of the exponent set. */
-static size_t first_not_finite(const unsigned char *samples, size_t count)
-{
-	enum { BLOCK = 4096 };
-
-	for (size_t start = 0; start < count; start += BLOCK) {
-		size_t length = count - start < BLOCK ? count - start : BLOCK;
-		uint32_t bits[BLOCK], largest = 0;
-
-		memcpy(bits, samples + start * sizeof(float), length * sizeof(float));
-		for (size_t i = 0; i < length; i++) {
-			uint32_t magnitude = bits[i] & 0x7fffffff;
-
-			largest = magnitude > largest ? magnitude : largest;
-		}
-		if (largest < 0x7f800000)
-			continue;
-		for (size_t i = 0; i < length; i++) {
-			if ((bits[i] & 0x7fffffff) >= 0x7f800000)
-				return start + i;
-		}
-	}
-	return count;
-}
-
-static int check_finite(const struct slot *slot, struct error *err)
-{
-	const struct scan *scan = stored_scan_parsed(slot->upload->scan);
-	size_t count = slot->size / sizeof(float), columns = (size_t)scan->geometry.columns, at;
-	float value;
-
-	if (scan->sample != SAMPLE_FLOAT32 || scan->quantity != QUANTITY_LINE_INTEGRAL)
-		return 0; /* counts that are not finite are defects, replaced from their neighbours later */
-	at = first_not_finite(slot->data, count);
-	if (at == count)
-		return 0;
-	memcpy(&value, slot->data + at * sizeof(float), sizeof(value));
-	return error_set(err, ERR_IMPOSSIBLE,
-			 "projection %d: pixel (column %zu, row %zu) is %s; line integrals must be finite", slot->index,
-			 at % columns, at / columns, isnan(value) ? "NaN" : "infinite");
-}
 
 static int write_slot(const struct slot *slot, struct error *err)
 {
@@ -709,14 +743,12 @@ static int compare_with_stored(struct slot *slot, struct error *err)
 	return 0;
 }
 
-/* Check, hash, claim and write; slot->outcome tells how far it came. */
+/* Hash, claim and write; slot->outcome tells how far it came. */
 static int process_projection(struct slot *slot, struct error *err)
 {
 	enum claim claim;
 
 	if (!slot->hashed) {
-		if (check_finite(slot, err) != 0)
-			return err->code;
 		if (EVP_Digest(slot->data, slot->size, slot->sha256, NULL, EVP_sha256(), NULL) != 1)
 			return error_set(err, ERR_INTERNAL, "the digest of a projection cannot be made");
 		slot->hashed = true;
@@ -740,7 +772,11 @@ static int process_projection(struct slot *slot, struct error *err)
 		stored_scan_unclaim(slot->upload->scan, slot->index);
 		return err->code;
 	}
-	slot->outcome = slot->upload->digest != NULL ? SLOT_HELD : SLOT_WRITTEN;
+	/* The sync of what is held comes much later: the disk may begin now. */
+	if (slot->upload->holds)
+		sync_file_range(slot->upload->descriptor, (off_t)slot->index * (off_t)slot->size, (off_t)slot->size,
+				SYNC_FILE_RANGE_WRITE);
+	slot->outcome = slot->upload->holds ? SLOT_HELD : SLOT_WRITTEN;
 	return 0;
 }
 
@@ -921,9 +957,11 @@ static void settle(struct uploads *uploads, struct slot *slot)
 		break;
 	}
 	upload->pending--;
-	if (upload->request != NULL)
+	if (slot != &upload->wish)
+		pool_give_back(uploads, slot);
+	commit_held(upload);
+	if (upload->request != NULL && (upload->pending == 0 || upload->error.code != 0))
 		request_wake(upload->request);
-	pool_give_back(uploads, slot);
 	unreference_and_unlock(upload);
 	pthread_mutex_lock(&uploads->lock);
 }
