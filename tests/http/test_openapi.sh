@@ -1,0 +1,42 @@
+#!/usr/bin/env bash
+# proto/openapi.yaml is the schema of record: it names exactly the endpoints that the daemon's table of routes has.
+. "$(dirname "$0")/lib.sh"
+
+# METHOD /path/{} of each operation; those marked x-planned when $1 is "planned", else the others.
+operations() {
+	awk -v planned="$1" '
+		/^components:/ { exit }
+		/^  \/.*:$/ { path = $1; sub(/:$/, "", path); gsub(/\{[a-z]+\}/, "{}", path); later = 0 }
+		/^    x-planned: true$/ { later = 1 }
+		/^    (get|put|post|delete):$/ { method = toupper($1); sub(/:/, "", method); if (later == (planned == "planned")) print method, path }
+	' "$top/proto/openapi.yaml" | sort
+}
+routes() {
+	sed -nE 's/^[[:space:]]*\{"([A-Z]+)", "([^"]+)",.*/\1 \2/p' "$top/daemon/api.c" | sort
+}
+
+test_schema_and_routes_name_the_same_operations() {
+	[ "$(routes | wc -l)" -gt 10 ] || fail "the table of routes in daemon/api.c"
+	diff <(operations served) <(routes) || fail "proto/openapi.yaml (<) and daemon/api.c (>) with the same operations"
+}
+
+test_what_is_planned_is_not_there_yet() {
+	local both
+	both=$(comm -12 <(operations planned) <(routes))
+	[ -z "$both" ] || fail "no x-planned mark at what is served: $both"
+}
+
+test_every_reference_of_the_schema_has_its_target() {
+	local target name kind
+	while read -r target; do
+		kind=${target%/*} name=${target##*/}
+		awk -v kind="  $kind:" -v name="    $name:" '
+			/^components:/ { inside = 1 }
+			inside && /^  [a-zA-Z]+:$/ { here = ($0 == kind) }
+			inside && here && index($0, name) == 1 { found = 1 }
+			END { exit !found }
+		' "$top/proto/openapi.yaml" || fail "components/$target"
+	done < <(grep -oE '#/components/[A-Za-z]+/[A-Za-z]+' "$top/proto/openapi.yaml" | sed 's,#/components/,,' | sort -u)
+}
+
+run_tests
