@@ -161,6 +161,7 @@ run_tests() {
 			"$name"
 		) >"$work/$name.log" 2>&1
 		status=$?
+		[ -z "${stop_after_each:-}" ] || stop_daemon
 		case $status in
 		0)
 			echo "pass $name ($((SECONDS - started)) s)"

@@ -49,7 +49,7 @@ test_scans() {
 400|/geometry/tilt|.geometry.tilt = 3
 400|/geometry/matrices|.geometry = {kind: "matrices", matrices: [[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]]}
 422|/geometry/matrices/2|.geometry = {kind: "matrices", matrices: [range(6) | if . == 2 then [1, 2, 3, 4, 2, 4, 6, 8, 0, 0, 1, 5] else [-8, 250, 0, 4800, -6, 0, 250, 3600, -1, 0, 0, 600] end]}
-400|/geometry/matrices/1|.geometry = {kind: "matrices", matrices: [range(6) | [1, 2, 3][0:if . == 1 then 2 else 3 end] * 1] | map(. + [0, 0, 0, 0, 0, 0, 0, 0, 0])}
+400|/geometry/matrices/1|.geometry = {kind: "matrices", matrices: [range(6) | if . == 1 then [1, 2, 3] else [-8, 250, 0, 4800, -6, 0, 250, 3600, -1, 0, 0, 600] end]}
 422|/geometry/views/4|.geometry = {kind: "views", views: [range(6) | {source_mm: [600, 0, 0], pixel0_mm: [-400, -30, -22], column_step_mm: [0, 4, 0], row_step_mm: (if . == 4 then [0, 8, 0] else [0, 0, 4] end)}]}
 TABLE
 }
@@ -74,7 +74,7 @@ test_a_hundred_megabytes_of_json() {
 	expect_problem 413
 	req POST /v1/scans -H 'Content-Type: application/json' -H 'Transfer-Encoding: chunked' -T "$work/big"
 	[ "$status" = 413 ] || [ "$status" = 000 ] || fail "413 for a chunked body, got $status"
-	{ printf '['; head -c 15000000 /dev/zero | sed 's/\x0/1,/g'; printf '1]'; } | head -c 15000000 >"$work/many"
+	{ printf '['; head -c 7500000 /dev/zero | sed 's/\x0/1,/g'; printf '1]'; } >"$work/many"
 	req POST /v1/scans -H 'Content-Type: application/json' -T "$work/many"
 	[[ $status == 4* ]] || fail "4xx for millions of values, got $status"
 	after=$(awk '/VmRSS/ { print $2 }' "/proc/$(cat "$work/daemon.pid")/status")
@@ -116,11 +116,12 @@ test_projections() {
 	json .detail | grep -q 3 || fail "the view named in the detail"
 	head -c $one /dev/zero >"$work/inf"
 	printf '\0\0\200\377' | dd of="$work/inf" bs=1 seek=40 conv=notrunc status=none
-	req PUT "/v1/scans/$scan/projections/4" -T "$work/inf"
+	req PUT "/v1/scans/$scan/projections/3" -T "$work/inf"
 	expect_problem 422
 	req GET "/v1/scans/$scan"
 	expect_json '[.missing[] | select(.[0] <= 3 and .[1] >= 3)] | length == 1'
-	expect_json '[.missing[] | select(.[0] <= 4 and .[1] >= 4)] | length == 1'
+	req PUT "/v1/scans/$scan/projections/3" -T "$work/right"
+	expect_status 201
 }
 
 test_jobs() {

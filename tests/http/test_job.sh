@@ -20,7 +20,7 @@ test_pipeline_keeps_the_volumes_asked_for() {
 	post_job "$small"'"fdk": {}, "sart": {"iterations": 5, "subsets": 6}, "tv": {}, "emit": ["fdk", "fdk-tv", 1, 3]}'
 	[ "$(header location)" = "/v1/jobs/$job" ] || fail "Location /v1/jobs/$job"
 	wait_job succeeded
-	expect_json '.stage and .iteration == 5 and .iterations == 5 and .progress == 1 and .attempts == 1 and .error == null'
+	expect_json 'has("stage") and .iteration == 5 and .iterations == 5 and .progress == 1 and .attempts == 1 and .error == null'
 	expect_json '.backend == "cpu" and (.device | length > 0) and (.timings | type) == "object" and (.warnings | type) == "array"'
 	expect_json '[.history[].iteration] == [1, 2, 3, 4, 5]'
 	expect_json '.history | all(.residual > 0 and .residual < 1 and .change >= 0 and .tv > 0 and .seconds > 0)'

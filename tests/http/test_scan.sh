@@ -106,7 +106,7 @@ test_chunked_and_compressed_bodies() {
 	expect_status 200
 	put /8 -H 'Content-Encoding: br' -T "$work/a.zst"
 	expect_problem 415
-	head -c 20 "$work/a.zst" >"$work/cut.zst"
+	head -c 8 "$work/a.zst" >"$work/cut.zst"
 	put /8-11 -H 'Content-Encoding: zstd' -T "$work/cut.zst"
 	expect_problem 400
 	put /8-11 -H 'Content-Encoding: zstd' -T "$work/a"
