@@ -33,8 +33,7 @@ struct job {
 	struct queue_entry entry;
 	int references; /* one of them is the array's */
 	bool removed;
-	bool yielded;        /* goes on where it was: the next run is no new attempt */
-	double stage_since;  /* monotonic seconds, while running */
+	double stage_since;  /* monotonic seconds, while running; 0 before this process saw it run */
 	double run_since;    /* monotonic seconds */
 	double run_fraction; /* at run_since */
 	double row_at;       /* monotonic seconds of the last history row, or of the last moment before the first */
@@ -288,7 +287,7 @@ static void account_stage(struct job *job)
 {
 	double now = time_monotonic();
 
-	if (job->record.state == JOB_RUNNING)
+	if (job->record.state == JOB_RUNNING && job->stage_since > 0)
 		job->record.seconds[job->record.stage] += now - job->stage_since;
 	job->stage_since = now;
 }
@@ -300,6 +299,7 @@ static void enter_queue(struct job_record *record, const struct job_change *chan
 		record->queued = time_of_day();
 		return;
 	}
+	record->attempts += !change->yielded;
 	record->checkpoint = change->checkpoint;
 	record->iteration = change->checkpoint;
 	record->stage = STAGE_LOAD;
@@ -307,10 +307,10 @@ static void enter_queue(struct job_record *record, const struct job_change *chan
 		record->fraction = 0;
 }
 
-static void enter_running(struct job_record *record, const struct job_change *change, bool goes_on)
+static void enter_running(struct job_record *record, const struct job_change *change)
 {
-	if (!goes_on || record->attempts == 0)
-		record->attempts++;
+	if (record->attempts == 0)
+		record->attempts = 1;
 	if (record->started == 0)
 		record->started = time_of_day();
 	record->stage = STAGE_LOAD;
@@ -354,19 +354,16 @@ static int save_state(struct jobs *jobs, const struct job_record *record, bool r
 /* The record as it will be; jobs->change is held. */
 static void next_record(struct job *job, enum job_state to, const struct job_change *change, struct job_record *ret)
 {
-	bool goes_on;
-
 	pthread_mutex_lock(&job->jobs->lock);
 	account_stage(job);
 	*ret = job->record;
-	goes_on = job->yielded;
 	pthread_mutex_unlock(&job->jobs->lock);
 	ret->state = to;
 	ret->crashes += change->crashed;
 	if (to == JOB_QUEUED)
 		enter_queue(ret, change, job->jobs);
 	else if (to == JOB_RUNNING)
-		enter_running(ret, change, goes_on);
+		enter_running(ret, change);
 	else
 		enter_end(ret, change);
 }
@@ -384,8 +381,7 @@ static void show_state(struct job *job, const struct job_record *record, const s
 		job->entry.priority = record->priority;
 		job->entry.ticket = record->ticket;
 		queue_add(&jobs->queue, &job->entry);
-		job->yielded = from == JOB_RUNNING && record->checkpoint > 0 && !change->crashed;
-		jobs->statistics.yielded += job->yielded;
+		jobs->statistics.yielded += change->yielded;
 	} else if (record->state == JOB_RUNNING) {
 		job->run_since = job->stage_since = job->row_at = time_monotonic();
 		job->run_fraction = record->fraction;

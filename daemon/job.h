@@ -107,6 +107,7 @@ struct job_change {
 	const char *error_pointer, *error_text;
 	int checkpoint;               /* to JOB_QUEUED: the iteration that checkpoint.f32 holds, 0: none */
 	bool crashed;                 /* to JOB_QUEUED or JOB_FAILED: the worker died with it */
+	bool yielded;                 /* to JOB_QUEUED: it goes on later, which is no new attempt */
 	const char *backend, *device; /* to JOB_RUNNING */
 	const char *reason;           /* for the log */
 };

@@ -169,8 +169,8 @@ struct job_record {
 	char *key;        /* Idempotency-Key or NULL, owned; constant after creation */
 	uint8_t digest[32];
 	bool cancel_asked;
-	int attempts;   /* runs from the start; going on after a yield is none */
-	int crashes;    /* workers that died with it */
+	int attempts; /* 1 with the first run, one more each time that a run was lost; going on after a yield is none */
+	int crashes;  /* workers that died with it */
 	int checkpoint; /* iteration that checkpoint.f32 holds, 0: none */
 	char backend[16], device[96], plan[160];
 	struct recon_memory memory;

@@ -42,7 +42,7 @@ struct ending {
 	int error_code;
 	char error_text[320];
 	int checkpoint;
-	bool crashed;
+	bool crashed, yielded;
 	double again; /* monotonic: not before */
 };
 
@@ -134,6 +134,7 @@ static void finish(struct supervise *supervise, struct worker *worker)
 				    .error_text = ending->error_text,
 				    .checkpoint = ending->checkpoint,
 				    .crashed = ending->crashed,
+				    .yielded = ending->yielded,
 				    .reason = ending->to == JOB_QUEUED ? ending->error_text : NULL};
 	struct error err;
 	int code = job_set_state(worker->job, ending->to, &change, &err);
@@ -149,14 +150,11 @@ static void finish(struct supervise *supervise, struct worker *worker)
 	publish(supervise, worker);
 }
 
-static void end_job(struct supervise *supervise, struct worker *worker, enum job_state to, int error_code,
-		    const char *text, int checkpoint, bool crashed)
+static void end_job(struct supervise *supervise, struct worker *worker, struct ending ending, const char *text)
 {
-	struct ending *ending = &worker->ending;
-
-	*ending = (struct ending){
-	    .due = true, .to = to, .error_code = error_code, .checkpoint = checkpoint, .crashed = crashed};
-	snprintf(ending->error_text, sizeof(ending->error_text), "%.319s", text);
+	ending.due = true;
+	snprintf(ending.error_text, sizeof(ending.error_text), "%.319s", text);
+	worker->ending = ending;
 	finish(supervise, worker);
 }
 
@@ -168,14 +166,20 @@ static void lose_job(struct supervise *supervise, struct worker *worker, int err
 
 	job_record(worker->job, &record);
 	if (record.cancel_asked) {
-		end_job(supervise, worker, JOB_CANCELLED, 0, "", 0, false);
+		end_job(supervise, worker, (struct ending){.to = JOB_CANCELLED}, "");
 	} else if (worker->failure_code != 0) {
-		end_job(supervise, worker, JOB_FAILED, worker->failure_code, worker->failure_text, 0, false);
+		end_job(supervise, worker, (struct ending){.to = JOB_FAILED, .error_code = worker->failure_code},
+			worker->failure_text);
 	} else if (record.crashes + 1 >= CRASHES_MAX) {
 		snprintf(text, sizeof(text), "the worker died with it %d times, last: %.250s", record.crashes + 1, how);
-		end_job(supervise, worker, JOB_FAILED, error_code, text, 0, true);
+		end_job(supervise, worker, (struct ending){.to = JOB_FAILED, .error_code = error_code, .crashed = true},
+			text);
 	} else {
-		end_job(supervise, worker, JOB_QUEUED, error_code, how, record.checkpoint, true);
+		end_job(
+		    supervise, worker,
+		    (struct ending){
+			.to = JOB_QUEUED, .error_code = error_code, .checkpoint = record.checkpoint, .crashed = true},
+		    how);
 	}
 }
 
@@ -189,27 +193,32 @@ static void job_ended(struct supervise *supervise, struct worker *worker, const 
 	worker->state = WORKER_IDLE;
 	if (message->code == 0) {
 		worker->failures = 0;
-		end_job(supervise, worker, JOB_SUCCEEDED, 0, "", 0, false);
+		end_job(supervise, worker, (struct ending){.to = JOB_SUCCEEDED}, "");
 	} else if (message->code == ERR_DEVICE) {
 		/* It is about to exit: a failed device is good for nothing more in that process. */
 		worker->state = WORKER_ENDING;
 		worker->deadline = now_monotonic() + EXIT;
 		lose_job(supervise, worker, ERR_DEVICE, message->text);
 	} else if (facts.cancel_asked) {
-		end_job(supervise, worker, JOB_CANCELLED, 0, "", 0, false);
+		end_job(supervise, worker, (struct ending){.to = JOB_CANCELLED}, "");
 	} else if (worker->failure_code != 0) {
-		end_job(supervise, worker, JOB_FAILED, worker->failure_code, worker->failure_text, 0, false);
+		end_job(supervise, worker, (struct ending){.to = JOB_FAILED, .error_code = worker->failure_code},
+			worker->failure_text);
 	} else if (message->code == ERR_BUSY) {
 		/* Unasked: somebody told the process itself to end, it takes no more jobs. */
 		if (!worker->yielding) {
 			worker->state = WORKER_ENDING;
 			worker->deadline = now_monotonic() + EXIT;
 		}
-		end_job(supervise, worker, JOB_QUEUED, 0, "it made room", message->iteration, false);
+		end_job(supervise, worker,
+			(struct ending){.to = JOB_QUEUED, .checkpoint = message->iteration, .yielded = true},
+			"it made room");
 	} else if (message->code == ERR_INVALID && worker->checkpoint > 0) {
-		end_job(supervise, worker, JOB_QUEUED, 0, "its checkpoint is damaged: from the start", 0, true);
+		end_job(supervise, worker, (struct ending){.to = JOB_QUEUED, .crashed = true},
+			"its checkpoint is damaged: from the start");
 	} else {
-		end_job(supervise, worker, JOB_FAILED, message->code, message->text, 0, false);
+		end_job(supervise, worker, (struct ending){.to = JOB_FAILED, .error_code = message->code},
+			message->text);
 	}
 	publish(supervise, worker);
 }
@@ -383,7 +392,8 @@ static void worker_died(struct supervise *supervise, struct worker *worker, bool
 	worker->deadline = NEVER;
 	if (worker->job != NULL && !worker->ending.due) {
 		if (stopping)
-			end_job(supervise, worker, JOB_QUEUED, 0, "the daemon stops", worker->checkpoint, false);
+			end_job(supervise, worker, (struct ending){.to = JOB_QUEUED, .checkpoint = worker->checkpoint},
+				"the daemon stops");
 		else
 			lose_job(supervise, worker, ERR_INTERNAL, text);
 	}

@@ -117,7 +117,7 @@ START_TEST(one_that_yielded_stands_in_front_of_its_class)
 {
 	struct job *first = state_post(&state, scan, "routine"), *second = state_post(&state, scan, "routine");
 	struct job *stat = state_post(&state, scan, "stat"), *next;
-	const struct job_change yielded = {.checkpoint = 1};
+	const struct job_change yielded = {.checkpoint = 1, .yielded = true};
 
 	state_set(stat, JOB_CANCELLED, NULL);
 	next = jobs_next(state.jobs);
@@ -137,7 +137,7 @@ END_TEST
 START_TEST(only_a_run_from_the_start_is_an_attempt)
 {
 	struct job *job = state_post(&state, scan, "routine");
-	const struct job_change yielded = {.checkpoint = 1}, died = {.checkpoint = 1, .crashed = true};
+	const struct job_change yielded = {.checkpoint = 1, .yielded = true}, died = {.checkpoint = 1, .crashed = true};
 	struct job_record record;
 
 	state_set(job, JOB_RUNNING, NULL);
@@ -178,6 +178,8 @@ START_TEST(a_running_job_is_queued_again_after_a_restart)
 	job_record(first, &record);
 	ck_assert_int_eq(record.attempts, 2);
 	ck_assert_int_eq(record.crashes, 0);
+	/* The time before the restart is not known, so none is made up. */
+	ck_assert_double_lt(record.seconds[STAGE_LOAD], 60);
 	job_release(first);
 	job_release(second);
 }
@@ -186,7 +188,7 @@ END_TEST
 START_TEST(a_checkpoint_is_kept_over_a_restart_where_its_file_is)
 {
 	struct job *with = state_post(&state, scan, "routine"), *without = state_post(&state, scan, "routine");
-	const struct job_change yielded = {.checkpoint = 1};
+	const struct job_change yielded = {.checkpoint = 1, .yielded = true};
 	struct job_record record;
 	struct error err = {0};
 	char with_id[ID_SIZE], without_id[ID_SIZE];
