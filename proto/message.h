@@ -52,7 +52,8 @@ enum { MESSAGE_BYTES_MAX = 200000 };
 
 /* Blocking; any thread, one packet each. ERR_IO when the other side is gone. */
 int message_send(int socket, const struct message *message, struct error *err);
-/* Waits at most timeout_ms (-1: for ever; 0: only looks). *ret_got false when nothing came. ERR_IO at the end of the stream. */
+/* Waits at most timeout_ms (-1: for ever; 0: only looks). *ret_got false when nothing came. ERR_IO at the end of the
+ * stream. */
 int message_receive(int socket, int timeout_ms, struct message *ret_message, bool *ret_got, struct error *err);
 void message_clear(struct message *message);
 
