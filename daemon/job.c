@@ -827,17 +827,14 @@ void jobs_statistics(struct jobs *jobs, struct jobs_statistics *ret)
 static int promote(struct jobs *jobs, struct job *job, struct error *err)
 {
 	struct job_change change = {.reason = "its scan is ready"};
-	struct stored_scan *scan;
 	struct scan_facts facts;
 	struct error why;
-	int code = store_scan_find(jobs->store, job->scan, &scan, &why);
+	int code = store_scan_look(jobs->store, job->scan, &facts, &why);
 
 	if (code != 0) {
 		change = (struct job_change){.error_code = code, .error_text = why.text};
 		return job_set_state(job, JOB_FAILED, &change, err);
 	}
-	stored_scan_facts(scan, &facts);
-	stored_scan_release(scan);
 	return facts.ready ? job_set_state(job, JOB_QUEUED, &change, err) : 0;
 }
 

@@ -96,6 +96,8 @@ struct scan_facts {
 	bool damaged; /* its files were not there at the start */
 };
 void stored_scan_facts(struct stored_scan *scan, struct scan_facts *ret);
+/* The same by id, without a reference. ERR_NOT_FOUND. */
+int store_scan_look(struct store *store, const char *id, struct scan_facts *ret, struct error *err);
 /* flags[count]: 1 where the projection is stored. */
 void stored_scan_received(struct stored_scan *scan, unsigned char *ret_flags);
 /* False when it is not stored. */

@@ -240,19 +240,29 @@ static int load_parsed(struct stored_scan *scan, struct error *err)
 	return 0;
 }
 
-int store_scan_find(struct store *store, const char *id, struct stored_scan **ret_scan, struct error *err)
+/* A reference, or NULL. */
+static struct stored_scan *array_find(struct store *store, const char *id, bool will_use)
 {
 	struct stored_scan *scan = NULL;
-	int place, code;
+	int place;
 
 	pthread_mutex_lock(&store->scans_lock);
 	place = place_of(store, id);
 	if (place < store->scan_count && strcmp(store->scans[place]->id, id) == 0) {
 		scan = store->scans[place];
 		scan->references++;
-		make_recent(store, scan);
+		if (will_use)
+			make_recent(store, scan);
 	}
 	pthread_mutex_unlock(&store->scans_lock);
+	return scan;
+}
+
+int store_scan_find(struct store *store, const char *id, struct stored_scan **ret_scan, struct error *err)
+{
+	struct stored_scan *scan = array_find(store, id, true);
+	int code;
+
 	if (scan == NULL)
 		return error_set(err, ERR_NOT_FOUND, "there is no scan \"%.64s\"", id);
 	code = load_parsed(scan, err);
@@ -508,6 +518,17 @@ void stored_scan_facts(struct stored_scan *scan, struct scan_facts *ret)
 	ret->ready = is_ready(scan);
 	ret->deleted = scan->deleted;
 	pthread_mutex_unlock(&scan->lock);
+}
+
+int store_scan_look(struct store *store, const char *id, struct scan_facts *ret, struct error *err)
+{
+	struct stored_scan *scan = array_find(store, id, false);
+
+	if (scan == NULL)
+		return error_set(err, ERR_NOT_FOUND, "there is no scan \"%.64s\"", id);
+	stored_scan_facts(scan, ret);
+	stored_scan_release(scan);
+	return 0;
 }
 
 void stored_scan_received(struct stored_scan *scan, unsigned char *ret_flags)
