@@ -106,108 +106,136 @@ static inline void backproject_line(const struct plan *plan, const struct line *
  * rows are evenly spaced: two columns of the projection are blended, and every
  * LANES voxels look up theirs in a window of 2 LANES rows.
  */
-struct column_pair {
-	const float *left, *right; /* [rows] */
-	float left_weight, right_weight, cover;
+struct columns {
+	double row[TILE_LINES], step[TILE_LINES]; /* of the first voxel, from one to the next */
+	int left[TILE_LINES], right[TILE_LINES];  /* columns of the detector */
+	float left_weight[TILE_LINES], right_weight[TILE_LINES];
+	float cover[TILE_LINES];                /* of the two together, the weight left out */
+	int begin[TILE_LINES], end[TILE_LINES]; /* groups of LANES voxels that see rows only */
 };
 
-static void column_pair_set(const struct plan *plan, const float *projection, double column, float weight,
-			    struct column_pair *ret)
+/* All lines of a tile together, in vectors; `distance` is the isocentre's depth, or 0 for the weight 1. */
+static void columns_set(const struct plan *plan, const double m[12], const struct tile *tile, double distance,
+			struct columns *ret)
 {
-	const int c = (int)floor(column);
-	const float upper = (float)(column - c);
-	const float left = c >= 0 && c < plan->columns ? 1 - upper : 0;
-	const float right = c >= -1 && c < plan->columns - 1 ? upper : 0;
+	const int groups = (tile->count[2] + LANES - 1) / LANES;
+	const double last_row = plan->rows - 1, row_step = 1 / m[6];
+	double x[TILE_LINES], y[TILE_LINES];
 
-	ret->left = ret->right = NULL;
-	if (projection != NULL) {
-		ret->left = projection + (size_t)(left > 0 ? c : 0) * (size_t)plan->rows;
-		ret->right = projection + (size_t)(right > 0 ? c + 1 : 0) * (size_t)plan->rows;
+	for (int i = 0; i < TILE_LINES; i++) {
+		x[i] = tile->first[0] + i % tile->count[0];
+		y[i] = tile->first[1] + i / tile->count[0];
 	}
-	ret->left_weight = weight * left;
-	ret->right_weight = weight * right;
-	ret->cover = left + right;
+	for (int i = 0; i < TILE_LINES; i++) {
+		const double depth = m[8] * x[i] + m[9] * y[i] + m[11], inverse = 1 / depth;
+		const double column = (m[0] * x[i] + m[1] * y[i] + m[3]) * inverse, whole = floor(column);
+		const float weight = distance > 0 ? (float)(distance * distance * inverse * inverse) : 1;
+		const float upper = (float)(column - whole);
+		const float left = whole >= 0 && whole < plan->columns ? 1 - upper : 0;
+		const float right = whole >= -1 && whole < plan->columns - 1 ? upper : 0;
+		const double step = m[6] * inverse, step_inverse = depth * row_step;
+		const double row = (m[4] * x[i] + m[5] * y[i] + m[7]) * inverse + tile->first[2] * step;
+		/* voxels from .. to are inside, or the other way round: whole groups of them */
+		const double from = -row * step_inverse, to = (last_row - row) * step_inverse;
+		double begin = ceil((from < to ? from : to) * (1. / LANES));
+		double end = floor(((from < to ? to : from) + 1) * (1. / LANES));
+
+		begin = begin < 0 ? 0 : begin > groups ? groups : begin;
+		end = end < begin ? begin : end > groups ? groups : end;
+		ret->row[i] = row;
+		ret->step[i] = step;
+		ret->left[i] = left > 0 ? (int)whole : 0;
+		ret->right[i] = right > 0 ? (int)whole + 1 : 0;
+		ret->left_weight[i] = weight * left;
+		ret->right_weight[i] = weight * right;
+		ret->cover[i] = left + right;
+		ret->begin[i] = (int)begin;
+		ret->end[i] = window_holds(step) ? (int)end : (int)begin;
+	}
 }
 
 /* LANES voxels from the row `first` on, some of them outside or too far apart for a window. */
-static void pair_sample_edge(const struct plan *plan, const struct column_pair *pair, double first, double step,
-			     float *sums, float *cover)
+static void column_edge(const struct plan *plan, const struct columns *columns, int i, int group,
+			const float *projection, float *sums, float *cover)
 {
+	const double first = columns->row[i] + group * LANES * columns->step[i];
 	const int origin = (int)fmin(fmax(first, 0), plan->rows - 1);
-	const vf row = vf_iota() * (float)step + (float)(first - origin);
+	const vf row = vf_iota() * (float)columns->step[i] + (float)(first - origin);
 	const vf weight = cover_of(row, plan->rows, origin);
-	vf upper, l0, l1, r0, r1;
 
 	if (cover != NULL)
-		vf_store(cover, vf_load(cover) + pair->cover * weight);
-	if (sums != NULL) {
+		vf_store(cover + group * LANES, vf_load(cover + group * LANES) + columns->cover[i] * weight);
+	if (projection != NULL) {
+		const float *pixel = projection + origin;
+		vf upper, l0, l1, r0, r1;
 		vi index = neighbours(row, plan->rows, origin, &upper);
 
-		vf_gather_pair(pair->left + origin, index, &l0, &l1);
-		vf_gather_pair(pair->right + origin, index, &r0, &r1);
-		l0 = pair->left_weight * l0 + pair->right_weight * r0;
-		l1 = pair->left_weight * l1 + pair->right_weight * r1;
-		vf_store(sums, vf_load(sums) + weight * (l0 + upper * (l1 - l0)));
+		vf_gather_pair(pixel + (size_t)columns->left[i] * (size_t)plan->rows, index, &l0, &l1);
+		vf_gather_pair(pixel + (size_t)columns->right[i] * (size_t)plan->rows, index, &r0, &r1);
+		l0 = columns->left_weight[i] * l0 + columns->right_weight[i] * r0;
+		l1 = columns->left_weight[i] * l1 + columns->right_weight[i] * r1;
+		sums += group * LANES;
+		vf_store(sums, vf_load(sums) + weight * vf_fma(upper, l1 - l0, l0));
 	}
 }
 
-/* Groups begin .. end - 1 of LANES voxels, all of them inside, the first voxel of all at `row`. */
-static void pair_sample_inside(const struct column_pair *pair, int begin, int end, double row, double step, float *sums)
+/* The groups of a line that see rows of the detector only. */
+static void column_inside(const struct plan *plan, const struct columns *columns, int i, const float *projection,
+			  float *sums)
 {
-	enum { MOST = 64 }; /* groups whose positions are worked out together */
-	const vf left_weight = vf_all(pair->left_weight), right_weight = vf_all(pair->right_weight);
-	const vf along = vf_iota() * (float)step;
+	enum { MOST = 32 }; /* groups whose positions are worked out together */
+	const float *left = projection + (size_t)columns->left[i] * (size_t)plan->rows;
+	const float *right = projection + (size_t)columns->right[i] * (size_t)plan->rows;
+	const vf left_weight = vf_all(columns->left_weight[i]), right_weight = vf_all(columns->right_weight[i]);
+	const double row = columns->row[i], step = columns->step[i];
 	const double lowest = step < 0 ? (LANES - 1) * step : 0; /* of a group, from its first */
+	const vf along = vf_iota() * (float)step;
 	int32_t base[MOST];
 	float offset[MOST];
 
-	for (; begin < end; begin += MOST) {
-		const int count = end - begin < MOST ? end - begin : MOST;
+	for (int begin = columns->begin[i]; begin < columns->end[i]; begin += MOST) {
+		const int left_over = columns->end[i] - begin, count = left_over < MOST ? left_over : MOST;
 
-		for (int g = 0; g < count; g++) {
+		for (int g = 0; g < MOST; g++) {
 			double position = row + (begin + g) * (LANES * step) + lowest;
 
 			base[g] = (int32_t)position;
 			offset[g] = (float)(position - base[g] - lowest);
 		}
 		for (int g = 0; g < count; g++) {
-			const float *left = pair->left + base[g], *right = pair->right + base[g];
+			const float *l = left + base[g], *r = right + base[g];
 			float *sum = sums + (size_t)(begin + g) * LANES;
-			vf low = vf_fma(left_weight, vf_load(left), right_weight * vf_load(right));
-			vf high = vf_fma(left_weight, vf_load(left + LANES), right_weight * vf_load(right + LANES));
+			vf low = vf_fma(left_weight, vf_load(l), right_weight * vf_load(r));
+			vf high = vf_fma(left_weight, vf_load(l + LANES), right_weight * vf_load(r + LANES));
 
 			vf_store(sum, vf_load(sum) + vf_window_sample(low, high, along + offset[g]));
 		}
 	}
 }
 
-static void backproject_column(const struct plan *plan, const double m[12], double x, double y, int z, int count,
-			       double distance, const float *projection, float *sums, float *cover)
+static void backproject_columns(const struct plan *plan, const double m[12], const struct tile *tile, double distance,
+				const float *projection, float *sums, float *cover)
 {
-	const double depth = m[8] * x + m[9] * y + m[11], inverse = 1 / depth;
-	const double step = m[6] * inverse, row = (m[4] * x + m[5] * y + m[7]) * inverse + z * step;
-	const double step_inverse = depth / m[6], from = -row * step_inverse;
-	const double to = (plan->rows - 1 - row) * step_inverse;
-	const int groups = (count + LANES - 1) / LANES;
-	struct column_pair pair;
-	int begin, end;
+	const int lines = tile->count[0] * tile->count[1], groups = (tile->count[2] + LANES - 1) / LANES;
+	struct columns columns;
 
-	column_pair_set(plan, projection, (m[0] * x + m[1] * y + m[3]) * inverse,
-			distance > 0 ? (float)(distance * distance * inverse * inverse) : 1, &pair);
-	if (pair.cover == 0)
-		return;
-	/* voxels ceil(from) .. floor(to) are inside (or the other way round): whole groups of them */
-	begin = (int)ceil(fmin(fmax(fmin(from, to) / LANES, 0), groups));
-	end = (int)floor(fmin(fmax((fmax(from, to) + 1) / LANES, begin), groups));
-	if (!window_holds(step) || cover != NULL)
-		end = begin;
-	if (sums != NULL)
-		pair_sample_inside(&pair, begin, end, row, step, sums);
-	for (int g = 0; g < groups; g++)
-		if (g < begin || g >= end)
-			pair_sample_edge(plan, &pair, row + g * LANES * step, step,
-					 sums != NULL ? sums + (size_t)g * LANES : NULL,
-					 cover != NULL ? cover + (size_t)g * LANES : NULL);
+	columns_set(plan, m, tile, distance, &columns);
+	for (int i = 0; i < lines; i++) {
+		float *line_sums = sums != NULL ? sums + (size_t)i * tile->stride : NULL;
+		float *line_cover = cover != NULL ? cover + (size_t)i * tile->stride : NULL;
+		int begin = columns.begin[i], end = columns.end[i];
+
+		if (columns.cover[i] == 0)
+			continue;
+		if (projection != NULL)
+			column_inside(plan, &columns, i, projection, line_sums);
+		for (int g = 0; g < groups; g++) {
+			if (g < begin || g >= end)
+				column_edge(plan, &columns, i, g, projection, line_sums, line_cover);
+			else if (cover != NULL)
+				vf_store(line_cover + g * LANES, vf_load(line_cover + g * LANES) + columns.cover[i]);
+		}
+	}
 }
 
 /* True when all eight corners fall well inside of the detector: then all voxels do. */
@@ -241,19 +269,17 @@ bool SIMD_NAME(backproject)(const struct plan *plan, int view_index, const struc
 
 	if (inside && projection == NULL)
 		return true;
+	if (plan->untilted) {
+		backproject_columns(plan, view->matrix, tile, weight == BACKPROJECT_FDK ? view->isocentre_depth : 0,
+				    projection, sums, inside ? NULL : cover);
+		return inside;
+	}
 	for (int i = 0; i < lines; i++) {
 		struct line line;
 		size_t at = (size_t)i * tile->stride;
 
-		if (!plan->untilted)
-			line_set(plan, view->matrix, tile, i, &line);
-		if (plan->untilted)
-			backproject_column(plan, view->matrix, tile->first[0] + i % tile->count[0],
-					   tile->first[1] + i / tile->count[0], tile->first[2], count,
-					   weight == BACKPROJECT_FDK ? view->isocentre_depth : 0, projection,
-					   sums != NULL ? sums + at : NULL,
-					   !inside && cover != NULL ? cover + at : NULL);
-		else if (inside)
+		line_set(plan, view->matrix, tile, i, &line);
+		if (inside)
 			backproject_line(plan, &line, count, distance2, true, projection, sums + at, NULL);
 		else
 			backproject_line(plan, &line, count, distance2, false, projection,

@@ -24,8 +24,10 @@
  */
 enum {
 	SLACK = 64,
-	LANES_MOST = 16,               /* of any instruction set */
-	BLOCK_COLUMNS = 16,            /* of a projection that are handed out together */
+	LANES_MOST = 16,    /* of any instruction set */
+	BLOCK_COLUMNS = 16, /* of a projection that are handed out together */
+	TILE_ACROSS = 4,    /* voxels of a tile across its lines */
+	TILE_LINES = TILE_ACROSS * TILE_ACROSS,
 	BLEND_MARGIN = 2 * LANES_MOST, /* floats around a column of voxels in scratch, for windows beyond its ends */
 };
 

@@ -7,10 +7,10 @@
 #include <string.h>
 
 /*
- * Voxels of a tile across its lines, and at most so many along one: its sums
- * and the pixels that it sees in a view fit the first level cache together.
+ * At most so many voxels along a line: with TILE_ACROSS, a tile's sums and the
+ * pixels that it sees in a view are about what the first level cache holds.
  */
-enum { TILE_ACROSS = 4, TILE_ALONG = 512 };
+enum { TILE_ALONG = 512 };
 
 static int parts(int size, int part)
 {
@@ -56,8 +56,7 @@ size_t tile_floats(const struct plan *plan)
 {
 	int size = plan->grid.size[plan->along_z ? 2 : 0];
 
-	return (size_t)TILE_ACROSS * TILE_ACROSS * (size_t)parts(size < TILE_ALONG ? size : TILE_ALONG, LANES_MOST) *
-	       LANES_MOST;
+	return (size_t)TILE_LINES * (size_t)parts(size < TILE_ALONG ? size : TILE_ALONG, LANES_MOST) * LANES_MOST;
 }
 
 int tile_lines(const struct plan *plan, const struct tile *tile)

@@ -97,12 +97,12 @@ static void axis_direction(const struct view *view, double ret_direction[3])
  * weight * cos(gamma) of rows row .. row + ROWS - 1 in one column:
  * cos(gamma) = (ray . direction) / |ray|, the ray a + r v from the source.
  */
-static void column_cosines(const struct view *view, int column, int row, float weight, float ret_weights[ROWS])
+static void column_cosines(const struct view *view, const double direction[3], int column, int row, float weight,
+			   float ret_weights[ROWS])
 {
-	double direction[3], a[3];
 	float along, along_step, square, square_step, square_step2;
+	double a[3];
 
-	axis_direction(view, direction);
 	for (int i = 0; i < 3; i++)
 		a[i] = view->pixel0[i] - view->source[i] + column * view->column_step[i] + row * view->row_step[i];
 	along = (float)vec_dot(a, direction) * weight;
@@ -124,12 +124,14 @@ static void filter_rows(const struct filter_engine *engine, int view, int column
 	const size_t stride = engine->stride;
 	kiss_fft_cpx *in = buffers, *out = buffers + PAIRS * stride;
 	const int pairs = (count + 1) / 2;
+	double direction[3];
 
+	axis_direction(&engine->geometry->views[view], direction);
 	for (int c = 0; c < columns; c++) {
 		float weights[ROWS], values[ROWS] = {0};
 
 		memcpy(values, from + (size_t)c * (size_t)rows + (size_t)row, (size_t)count * sizeof(float));
-		column_cosines(&engine->geometry->views[view], c, row,
+		column_cosines(&engine->geometry->views[view], direction, c, row,
 			       engine->column_weights[(size_t)view * (size_t)columns + (size_t)c], weights);
 		for (int i = 0; i < ROWS; i++)
 			values[i] *= weights[i];

@@ -220,7 +220,10 @@ static void project_general(const struct plan *plan, int view_index, int column,
  * are blended once, and every LANES rows look up theirs in a window of 2 LANES
  * voxels of the blend.
  */
-enum { GROUPS_MOST = 64 }; /* groups of LANES rows whose positions are worked out together */
+enum {
+	GROUPS_MOST = 64, /* groups of LANES rows whose positions are worked out together */
+	PREFETCH = 8,     /* slices that the voxels are asked for ahead of their use */
+};
 
 /* The plane of rays to one column. Slices are counted along a, the axis in which all of them are fastest. */
 struct fan {
@@ -342,17 +345,38 @@ static bool fan_clip(const struct plan *plan, const struct fan *fan, const struc
 	return first <= last;
 }
 
-/* The line along z in which slice i is crossed, its ends held for one voxel more. */
-static void fan_blend(const struct plan *plan, const struct fan *fan, int i, const float *volume, float *ret)
+/* The two columns of voxels beside the line along z in which slice i is crossed; returns the right one's weight. */
+static float fan_cross(const struct plan *plan, const struct fan *fan, int i, const float *volume,
+		       const float **ret_left, const float **ret_right)
 {
 	const size_t strides[2] = {plan->row, plan->plane};
-	const int size = plan->grid.size[fan->b], nz = plan->grid.size[2];
+	const int last = plan->grid.size[fan->b] - 1;
 	const double at = fan->source_b + (i - fan->source_a) * fan->inverse * fan->direction_b;
-	const double held = at < 0 ? 0 : at > size - 1 ? size - 1 : at;
-	const int j = (int)held < size - 1 ? (int)held : size > 1 ? size - 2 : 0;
-	const float *left = volume + (size_t)i * strides[fan->a] + (size_t)j * strides[fan->b];
-	const float *right = left + (size > 1 ? strides[fan->b] : 0);
-	const vf weight = vf_all((float)(held - j));
+	const double held = at < 0 ? 0 : at > last ? last : at;
+	const int j = (int)held < last ? (int)held : last > 0 ? last - 1 : 0;
+
+	*ret_left = volume + (size_t)i * strides[fan->a] + (size_t)j * strides[fan->b];
+	*ret_right = *ret_left + (last > 0 ? strides[fan->b] : 0);
+	return (float)(held - j);
+}
+
+static void fan_prefetch(const struct plan *plan, const struct fan *fan, int i, const float *volume)
+{
+	const float *left, *right;
+
+	fan_cross(plan, fan, i, volume, &left, &right);
+	for (int z = 0; z < plan->grid.size[2]; z += 16) {
+		__builtin_prefetch(left + z);
+		__builtin_prefetch(right + z);
+	}
+}
+
+/* That line, its ends held for one voxel more. */
+static void fan_blend(const struct plan *plan, const struct fan *fan, int i, const float *volume, float *ret)
+{
+	const int nz = plan->grid.size[2];
+	const float *left, *right;
+	const vf weight = vf_all(fan_cross(plan, fan, i, volume, &left, &right));
 
 	for (int z = 0; z < nz; z += LANES) {
 		vf l = vf_load(left + z);
@@ -366,17 +390,27 @@ static void fan_blend(const struct plan *plan, const struct fan *fan, int i, con
 
 /* A group of rows of which some leave or enter, or that lie too far apart for a window. */
 static void fan_sample_edge(const struct plan *plan, const struct fan_rows *rows, int g, int i, double height,
-			    double step, const float *blend)
+			    double step, bool windowed, const float *blend)
 {
 	const vf begin = vf_load(rows->begin + g * LANES), end = vf_load(rows->end + g * LANES);
 	const vf weight = vf_min(vf_all((float)i + .5f), end) - vf_max(vf_all((float)i - .5f), begin);
-	const vf z = vf_fma(vf_iota(), vf_all((float)step), vf_all((float)height));
-	vf fraction, a, b;
-	vi index = vf_split(vf_clamp(z, vf_all(-1), vf_all((float)plan->grid.size[2])) + 1, &fraction);
+	const vf z = vf_clamp(vf_fma(vf_iota(), vf_all((float)step), vf_all((float)height)), vf_all(-1),
+			      vf_all((float)plan->grid.size[2]));
+	float *sum = rows->sum + g * LANES;
+	vf sample;
 
-	vf_gather_pair(blend - 1, index, &a, &b);
-	a = vf_fma(fraction, b - a, a);
-	vf_store(rows->sum + g * LANES, vf_fma(vf_max(weight, vf_all(0)), a, vf_load(rows->sum + g * LANES)));
+	if (windowed) {
+		const int base = (int)(z[step < 0 ? LANES - 1 : 0] + 1) - 1;
+
+		sample = vf_window_sample(vf_load(blend + base), vf_load(blend + base + LANES), z - (float)base);
+	} else {
+		vf fraction, upper;
+		vi index = vf_split(z + 1, &fraction);
+
+		vf_gather_pair(blend - 1, index, &sample, &upper);
+		sample = vf_fma(fraction, upper - sample, sample);
+	}
+	vf_store(sum, vf_fma(vf_max(weight, vf_all(0)), sample, vf_load(sum)));
 }
 
 /* Slice i for all groups: `begin` .. `end` - 1 are those with any part in any slice. */
@@ -409,7 +443,7 @@ static void fan_sample(const struct plan *plan, const struct fan *fan, const str
 
 				vf_store(sum, vf_load(sum) + vf_window_sample(low, high, along + offset[k]));
 			} else if (i >= rows->any_first[g] && i <= rows->any_last[g]) {
-				fan_sample_edge(plan, rows, g, i, height + g * LANES * step, step, blend);
+				fan_sample_edge(plan, rows, g, i, height + g * LANES * step, step, windowed, blend);
 			}
 		}
 	}
@@ -433,6 +467,8 @@ static void project_column(const struct plan *plan, int view, int column, const 
 		/* One slice ahead, so that the blend is in the cache by the time that windows of it are read. */
 		fan_blend(plan, &fan, first, volume, rows.blend[first & 1]);
 		for (int i = first; i <= last; i++) {
+			if (i + PREFETCH <= last)
+				fan_prefetch(plan, &fan, i + PREFETCH, volume);
 			if (i < last)
 				fan_blend(plan, &fan, i + 1, volume, rows.blend[(i + 1) & 1]);
 			fan_sample(plan, &fan, &rows, i, begin, end, rows.blend[i & 1]);
