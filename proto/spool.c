@@ -21,8 +21,8 @@
 _Static_assert(SPOOL_VOLUME_OFFSET == 352, "a NIfTI-1 header and its four extension bytes");
 
 enum {
-	READ_BYTES = 8 << 20, /* projections in one go: small beside the scan, large beside a system call */
-	SLAB_BYTES = 8 << 20  /* voxels in one go, on their way to the disk */
+	READ_BYTES = 2 << 20, /* projections in one go: small beside the scan, large beside a system call */
+	SLAB_BYTES = 1 << 20  /* voxels in one go, on their way to the disk */
 };
 
 /* ---- files ---- */
