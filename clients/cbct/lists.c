@@ -81,7 +81,8 @@ static void print_job(const cJSON *job)
 
 static void print_device(const cJSON *device)
 {
-	printf("%-6s %s\n", member_text(device, "backend", "?"), member_text(device, "name", "?"));
+	printf("%-6s %-8s %s\n", member_text(device, "backend", "?"), member_text(device, "state", "?"),
+	       member_text(device, "device", "?"));
 }
 
 /* The members of array `name` of the document at `path`, one line each. */
@@ -137,6 +138,8 @@ static int rm_run(const void *values, struct error *err)
 	if (code == ERR_NOT_FOUND) {
 		snprintf(path, sizeof(path), "/v1/scans/%.63s", options->id);
 		code = fetch(options, "DELETE", path, &document, err);
+		if (code == ERR_NOT_FOUND)
+			code = error_set(err, code, "there is neither a job nor a scan \"%s\"", options->id);
 	}
 	cJSON_Delete(document);
 	return code;

@@ -82,7 +82,7 @@ void progress_show(struct progress *progress, double fraction, double seconds_le
 	fraction = fmin(fmax(fraction, 0), 1);
 	if (seconds_left < 0 && fraction > 0.01)
 		seconds_left = (time - progress->started) * (1 - fraction) / fraction;
-	time_text(seconds_left, left, sizeof(left));
+	time_text(fraction < 1 ? seconds_left : -1, left, sizeof(left));
 	if (progress->terminal) {
 		/* Ten times a second is enough for eyes. */
 		if (time - progress->shown >= 0.1 || fraction == 1) {
