@@ -89,7 +89,7 @@ test_volumes_come_in_every_format() {
 	for full in v.nii: v.mha:format=mha hu.raw:"format=raw&type=int16"; do
 		req GET "/v1/jobs/$job/volumes/final?${full#*:}" -r 300-1099
 		expect_status 206
-		tail -c +301 "$work/${full%%:*}" | head -c 800 | cmp - "$body" || fail "bytes 300-1099 of ${full%%:*}"
+		dd if="$work/${full%%:*}" iflag=skip_bytes,count_bytes skip=300 count=800 status=none | cmp - "$body" || fail "bytes 300-1099 of ${full%%:*}"
 		[[ $(header content-range) == "bytes 300-1099/$(stat -c %s "$work/${full%%:*}")" ]] || fail "Content-Range"
 		req GET "/v1/jobs/$job/volumes/final?${full#*:}" -r -500
 		expect_status 206
@@ -175,7 +175,7 @@ test_cancel_and_delete() {
 test_higher_priority_goes_first_and_the_lower_one_goes_on() {
 	local long urgent
 	uploaded_scan
-	post_job "$small"'"sart": {"iterations": 400, "subsets": "views"}}'
+	post_job "$small"'"sart": {"iterations": 150, "subsets": "views"}}'
 	long=$job
 	for ((i = 0; i < 200; i++)); do
 		req GET "/v1/jobs/$long"
@@ -189,7 +189,7 @@ test_higher_priority_goes_first_and_the_lower_one_goes_on() {
 	expect_json '.state != "succeeded"'
 	job=$long
 	wait_job succeeded 240
-	expect_json '[.history[].iteration] == [range(1; 401)]'
+	expect_json '[.history[].iteration] == [range(1; 151)]'
 }
 
 test_lists() {
