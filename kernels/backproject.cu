@@ -26,6 +26,8 @@ struct backprojection_job {
 	const float *from; /* row 0, column 0 of the first slot */
 	int pitch;
 	size_t slot;
+	const float2 *pairs; /* untilted: row 0 of the first slot */
+	pairs_shape shape;
 	float columns, rows;
 	int views;
 	int nx, ny, nz;
@@ -123,23 +125,24 @@ static __global__ void __launch_bounds__(ACROSS *ALONG) backproject_general(cons
 }
 
 template <int VOXELS, int WINDOWS, int ACROSS, int ALONG>
-static __global__ void __launch_bounds__(ACROSS *ALONG) backproject_untilted(const backprojection_job job)
+static __global__ void __launch_bounds__(ACROSS *ALONG, 8) backproject_untilted(const backprojection_job job)
 {
 	const int run = VOXELS * WINDOWS;
 	int x = blockIdx.x * ACROSS + threadIdx.x, y = blockIdx.y * ALONG + threadIdx.y, z = blockIdx.z * run;
 	float sum[run], fx = (float)x, fy = (float)y, fz = (float)z;
-	const float *p = job.from;
+	const float2 *p = job.pairs;
 
 #pragma unroll
 	for (int k = 0; k < run; k++)
 		sum[k] = 0;
-	for (int i = 0; i < job.views; i++, p += job.slot) {
+	for (int i = 0; i < job.views; i++, p += job.shape.slot) {
 		const float *m = matrices[i];
 		float a = fmaf(m[0], fx, fmaf(m[1], fy, m[3])), c = fmaf(m[8], fx, fmaf(m[9], fy, m[11]));
 		float b = fmaf(m[4], fx, fmaf(m[5], fy, fmaf(m[6], fz, m[7]))), w = reciprocal(c);
 		float u = fminf(fmaxf(a * w, -1.0f), job.columns), first = b * w, rise = m[6] * w, e = rise - 1.0f;
 		float weight = job.use.fdk ? w * w : 1.0f, across, lowest = fminf(0.0f, (float)(VOXELS - 1) * e);
-		int column = split(u, across);
+		unsigned place = (unsigned)split(u, across) + 1;
+		int within = (int)(place / PANEL * (unsigned)job.shape.panel + place % PANEL);
 		float right = across * weight, left = weight - right;
 
 #pragma unroll
@@ -148,11 +151,11 @@ static __global__ void __launch_bounds__(ACROSS *ALONG) backproject_untilted(con
 			float base = fminf(fmaxf(row + lowest, (float)-STACK_PAD), job.rows);
 			int low = split(base, unused);
 			float t = row - (float)low, q[VOXELS + 2];
-			const float *r = p + (low * job.pitch + column);
+			const float2 *r = p + (low * PANEL + within);
 
 #pragma unroll
 			for (int j = 0; j < VOXELS + 2; j++)
-				q[j] = fmaf(left, r[j * job.pitch], right * r[j * job.pitch + 1]);
+				q[j] = fmaf(left, r[j * PANEL].x, right * r[j * PANEL].y);
 			float below = q[1] - q[0];
 #pragma unroll
 			for (int k = 0; k < VOXELS; k++) {
@@ -203,7 +206,8 @@ static int load_matrices(struct plan *plan, int first, int count, struct error *
 {
 	cudaStream_t stream = plan->device->stream;
 
-	gather<<<divide_up(count * 12, 256), 256, 0, stream>>>(plan->geometry, plan->views + first, count, plan->matrices);
+	gather<<<divide_up(count * 12, 256), 256, 0, stream>>>(plan->geometry, plan->views + first, count,
+							       plan->matrices);
 	LAUNCHED();
 	CUDA_TRY(cudaMemcpyToSymbolAsync(matrices, plan->matrices, (size_t)count * 12 * sizeof(float), 0,
 					 cudaMemcpyDeviceToDevice, stream));
@@ -232,7 +236,8 @@ static void launch_untilted(const backprojection_job &job, cudaStream_t stream)
 	backproject_untilted<VOXELS, WINDOWS, ACROSS, ALONG><<<blocks, dim3(ACROSS, ALONG), 0, stream>>>(job);
 }
 
-template <bool TEXTURE> static void launch_general(const backprojection_job &job, cudaStream_t stream)
+template <bool TEXTURE>
+static void launch_general(const backprojection_job &job, cudaStream_t stream)
 {
 	const int voxels = 8, side = 16;
 	dim3 blocks(divide_up(job.nx, side), divide_up(job.ny, side), divide_up(job.nz, voxels));
@@ -247,6 +252,8 @@ static backprojection_job job_make(const struct plan *plan, float *volume, struc
 	job.texture = plan->projections.texture;
 	job.pitch = plan->stack.pitch;
 	job.slot = plan->stack.slot;
+	job.shape = pairs_shape_make(plan->stack.columns, plan->stack.rows);
+	job.pairs = plan->pairs + job.shape.before;
 	job.columns = (float)plan->stack.columns;
 	job.rows = (float)plan->stack.rows;
 	job.nx = plan->grid.size[0];
@@ -261,6 +268,8 @@ static int launch(struct plan *plan, backprojection_job &job, struct error *err)
 {
 	cudaStream_t stream = plan->device->stream;
 
+	if (plan->shape.back_voxels > 0)
+		TRY(layout_pairs(plan, job.from, job.views, err));
 	switch (plan->shape.back_voxels) {
 	case 3:
 		launch_untilted<3, 4, 16, 8>(job, stream);

@@ -28,17 +28,20 @@ static __device__ __forceinline__ float2 multiply_conjugate(float2 a, float2 b)
 {
 	return {fmaf(a.x, b.x, a.y * b.y), fmaf(a.y, b.x, -a.x * b.y)};
 }
-template <bool INVERSE> static __device__ __forceinline__ float2 turn(float2 a, float2 root)
+template <bool INVERSE>
+static __device__ __forceinline__ float2 turn(float2 a, float2 root)
 {
 	return INVERSE ? multiply_conjugate(a, root) : multiply(a, root);
 }
 /* times -i, or i for the inverse */
-template <bool INVERSE> static __device__ __forceinline__ float2 quarter(float2 a)
+template <bool INVERSE>
+static __device__ __forceinline__ float2 quarter(float2 a)
 {
 	return INVERSE ? make_float2(-a.y, a.x) : make_float2(a.y, -a.x);
 }
 
-template <bool INVERSE> static __device__ __forceinline__ void dft2(float2 &a, float2 &b)
+template <bool INVERSE>
+static __device__ __forceinline__ void dft2(float2 &a, float2 &b)
 {
 	float2 sum = a + b;
 
@@ -46,7 +49,8 @@ template <bool INVERSE> static __device__ __forceinline__ void dft2(float2 &a, f
 	a = sum;
 }
 
-template <bool INVERSE> static __device__ __forceinline__ void dft3(float2 &a, float2 &b, float2 &c)
+template <bool INVERSE>
+static __device__ __forceinline__ void dft3(float2 &a, float2 &b, float2 &c)
 {
 	const float sine = 0.866025404f;
 	float2 sum = b + c, difference = quarter<INVERSE>(sine * (b - c)), middle = a + (-0.5f) * sum;
@@ -56,7 +60,8 @@ template <bool INVERSE> static __device__ __forceinline__ void dft3(float2 &a, f
 	c = middle - difference;
 }
 
-template <bool INVERSE> static __device__ __forceinline__ void dft4(float2 &a, float2 &b, float2 &c, float2 &d)
+template <bool INVERSE>
+static __device__ __forceinline__ void dft4(float2 &a, float2 &b, float2 &c, float2 &d)
 {
 	float2 s = a + c, t = a - c, u = b + d, v = quarter<INVERSE>(b - d);
 
@@ -66,7 +71,8 @@ template <bool INVERSE> static __device__ __forceinline__ void dft4(float2 &a, f
 	d = t - v;
 }
 
-template <bool INVERSE> static __device__ __forceinline__ void dft5(float2 x[5])
+template <bool INVERSE>
+static __device__ __forceinline__ void dft5(float2 x[5])
 {
 	const float c1 = 0.309016994f, c2 = -0.809016994f, s1 = 0.951056516f, s2 = 0.587785252f;
 	float2 a = x[1] + x[4], b = x[1] - x[4], c = x[2] + x[3], d = x[2] - x[3];
@@ -81,9 +87,10 @@ template <bool INVERSE> static __device__ __forceinline__ void dft5(float2 x[5])
 }
 
 /* 6 = 2 x 3: the prime factors need no twiddles between them. */
-template <bool INVERSE> static __device__ __forceinline__ void dft6(float2 x[6])
+template <bool INVERSE>
+static __device__ __forceinline__ void dft6(float2 x[6])
 {
-	float2 a[3] = {x[0] + x[3], x[4] + x[1], x[2] + x[5]}, b[3] = {x[0] - x[3], x[4] - x[1], x[2] - x[5]};
+	float2 a[3] = {x[0] + x[3], x[2] + x[5], x[4] + x[1]}, b[3] = {x[0] - x[3], x[2] - x[5], x[4] - x[1]};
 
 	dft3<INVERSE>(a[0], a[1], a[2]);
 	dft3<INVERSE>(b[0], b[1], b[2]);
@@ -95,7 +102,8 @@ template <bool INVERSE> static __device__ __forceinline__ void dft6(float2 x[6])
 	x[5] = b[2];
 }
 
-template <bool INVERSE> static __device__ __forceinline__ void dft8(float2 x[8])
+template <bool INVERSE>
+static __device__ __forceinline__ void dft8(float2 x[8])
 {
 	const float half = 0.707106781f;
 
@@ -111,12 +119,14 @@ template <bool INVERSE> static __device__ __forceinline__ void dft8(float2 x[8])
 	x[3] = even[3] + c, x[7] = even[3] - c;
 }
 
-template <bool INVERSE> static __device__ __forceinline__ void dft16(float2 x[16])
+template <bool INVERSE>
+static __device__ __forceinline__ void dft16(float2 x[16])
 {
-	const float cosine[10] = {1, 0.923879533f,  0.707106781f,  0.382683432f,  0,
-				  -0.382683432f, -0.707106781f, -0.923879533f, -1, -0.923879533f};
-	const float sine[10] = {0, 0.382683432f, 0.707106781f, 0.923879533f, 1,
-				0.923879533f, 0.707106781f, 0.382683432f, 0, -0.382683432f};
+	const float cosine[10] = {1,  0.923879533f,  0.707106781f,  0.382683432f,
+				  0,  -0.382683432f, -0.707106781f, -0.923879533f,
+				  -1, -0.923879533f};
+	const float sine[10] = {
+	    0, 0.382683432f, 0.707106781f, 0.923879533f, 1, 0.923879533f, 0.707106781f, 0.382683432f, 0, -0.382683432f};
 
 #pragma unroll
 	for (int i = 0; i < 4; i++)
@@ -139,7 +149,8 @@ template <bool INVERSE> static __device__ __forceinline__ void dft16(float2 x[16
 		x[k] = y[4 * (k % 4) + k / 4];
 }
 
-template <int COUNT, bool INVERSE> static __device__ __forceinline__ void dft(float2 x[COUNT])
+template <int COUNT, bool INVERSE>
+static __device__ __forceinline__ void dft(float2 x[COUNT])
 {
 	static_assert(COUNT == 1 || COUNT == 2 || COUNT == 3 || COUNT == 4 || COUNT == 5 || COUNT == 6 || COUNT == 8,
 		      "a transform of this many points is not here");

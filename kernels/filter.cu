@@ -70,47 +70,29 @@ static __device__ __forceinline__ row_weight weight_of(const filter_job &job, in
 	return w;
 }
 
-/* cos(gamma) times the column's weight */
-static __device__ __forceinline__ float weight_at(const filter_job &job, const row_weight &w, int column)
+static __device__ __forceinline__ float cosine_at(const filter_job &job, const row_weight &w, int column)
 {
-	float c = (float)column - 0.5f * (float)(job.columns - 1);
+	float c = (float)column - 0.5f * (float)(job.columns - 1), inverse;
 	float length2 = fmaf(fmaf(w.length2[2], c, w.length2[1]), c, w.length2[0]);
 
-	return w.column_weights[column] * fmaf(w.along[1], c, w.along[0]) * rsqrtf(length2);
-}
-
-/* Where a row of all rows of the call comes from and goes to. */
-static __device__ __forceinline__ void row_place(const filter_job &job, int index, int &view, int &row,
-						 const float *&from, float *&to)
-{
-	int i = index / job.rows;
-
-	row = index - i * job.rows;
-	view = job.views[i];
-	from = job.from + (size_t)job.slots[i] * job.slot + (size_t)row * job.pitch;
-	to = job.to + (size_t)i * job.slot + (size_t)row * job.pitch;
+	asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(inverse) : "f"(length2)); /* never near 0: no care for denormals */
+	return fmaf(w.along[1], c, w.along[0]) * inverse;
 }
 
 /* Shared memory is padded by one value in 16, so that neither order of access meets in a bank. */
 template <int HALF, int PAIRS>
-static __global__ void __launch_bounds__(32 * HALF *PAIRS) filter_fused(const filter_job job)
+static __global__ void __launch_bounds__(32 * HALF * PAIRS) filter_fused(const filter_job job)
 {
 	const int FACTOR = 2 * HALF, THREADS = 16 * FACTOR, BLOCK = 272; /* 256 and the padding */
 	__shared__ float2 shared[PAIRS][FACTOR * BLOCK];
 	float2 *s = shared[threadIdx.y];
-	int t = threadIdx.x, all = job.count * job.rows, first = 2 * ((int)blockIdx.x * PAIRS + (int)threadIdx.y);
-	bool has[2] = {first < all, first + 1 < all};
-	int view[2], row[2];
-	const float *from[2];
-	float *to[2];
-	row_weight weight[2];
+	int t = threadIdx.x, row = 2 * ((int)blockIdx.x * PAIRS + (int)threadIdx.y), view = job.views[blockIdx.y];
+	bool has[2] = {row < job.rows, row + 1 < job.rows};
+	const float *from = job.from + (size_t)job.slots[blockIdx.y] * job.slot + (size_t)row * job.pitch;
+	float *to = job.to + (size_t)blockIdx.y * job.slot + (size_t)row * job.pitch;
+	row_weight weight[2] = {weight_of(job, view, row), weight_of(job, view, row + 1)};
 	const float2 *second = job.twiddles + FACTOR * 256;
 
-#pragma unroll
-	for (int i = 0; i < 2; i++) {
-		row_place(job, has[i] ? first + i : 0, view[i], row[i], from[i], to[i]);
-		weight[i] = weight_of(job, view[i], row[i]);
-	}
 	for (int q = t; q < 256; q += THREADS) {
 		float2 even[HALF], odd[HALF];
 
@@ -120,10 +102,13 @@ static __global__ void __launch_bounds__(32 * HALF *PAIRS) filter_fused(const fi
 
 			even[j] = make_float2(0, 0);
 			if (column < job.columns) {
+				float by_column = weight[0].column_weights[column];
+
 				if (has[0])
-					even[j].x = from[0][column] * weight_at(job, weight[0], column);
+					even[j].x = from[column] * by_column * cosine_at(job, weight[0], column);
 				if (has[1])
-					even[j].y = from[1][column] * weight_at(job, weight[1], column);
+					even[j].y =
+					    from[job.pitch + column] * by_column * cosine_at(job, weight[1], column);
 			}
 			odd[j] = j > 0 ? multiply(even[j], job.roots[j]) : even[j];
 		}
@@ -188,26 +173,42 @@ static __global__ void __launch_bounds__(32 * HALF *PAIRS) filter_fused(const fi
 			if (column >= job.columns)
 				continue;
 			if (has[0])
-				to[0][column] = value.x;
+				to[column] = value.x;
 			if (has[1])
-				to[1][column] = value.y;
+				to[job.pitch + column] = value.y;
 		}
 	}
 }
 
 /* ---- cuFFT ---- */
 
+/* Where a row of all rows of the call comes from and goes to. */
+struct row_place {
+	int view, row;
+	size_t from, to;
+};
+static __device__ __forceinline__ row_place place_of(const filter_job &job, int index)
+{
+	int i = index / job.rows, row = index - i * job.rows;
+	size_t within = (size_t)row * job.pitch;
+
+	return {job.views[i], row, (size_t)job.slots[i] * job.slot + within, (size_t)i * job.slot + within};
+}
+
 static __global__ void fft_fill(const filter_job job, int first, int length, float *to)
 {
-	int column = blockIdx.x * blockDim.x + threadIdx.x, view, row;
-	const float *from;
-	float *unused;
+	int column = blockIdx.x * blockDim.x + threadIdx.x;
+	float value = 0;
 
 	if (column >= length)
 		return;
-	row_place(job, first + (int)blockIdx.y, view, row, from, unused);
-	to[(size_t)blockIdx.y * (length + 2) + column] =
-	    column < job.columns ? from[column] * weight_at(job, weight_of(job, view, row), column) : 0.0f;
+	if (column < job.columns) {
+		row_place at = place_of(job, first + (int)blockIdx.y);
+		row_weight weight = weight_of(job, at.view, at.row);
+
+		value = job.from[at.from + column] * weight.column_weights[column] * cosine_at(job, weight, column);
+	}
+	to[(size_t)blockIdx.y * (length + 2) + column] = value;
 }
 
 static __global__ void fft_multiply(const float *response, int length, float *rows)
@@ -221,14 +222,11 @@ static __global__ void fft_multiply(const float *response, int length, float *ro
 
 static __global__ void fft_take(const filter_job job, int first, int length, const float *rows)
 {
-	int column = blockIdx.x * blockDim.x + threadIdx.x, view, row;
-	const float *unused;
-	float *to;
+	int column = blockIdx.x * blockDim.x + threadIdx.x;
 
-	if (column >= job.columns)
-		return;
-	row_place(job, first + (int)blockIdx.y, view, row, unused, to);
-	to[column] = rows[(size_t)blockIdx.y * (length + 2) + column];
+	if (column < job.columns)
+		job.to[place_of(job, first + (int)blockIdx.y).to + column] =
+		    rows[(size_t)blockIdx.y * (length + 2) + column];
 }
 
 static int filter_fft(struct plan *plan, const filter_job &job, struct error *err)
@@ -360,12 +358,10 @@ static int prepare_fft(struct plan *plan, struct error *err)
 	TRY(upload(plan, response.data(), response.size() * sizeof(float), (void **)&plan->response, err));
 	fft->bytes = (size_t)rows * (size_t)padded * sizeof(float);
 	TRY(device_allocate(plan->device, fft->bytes, (void **)&fft->rows, err));
-	fft->has_forward =
-	    cufftPlanMany(&fft->forward, 1, &length, &padded, 1, padded, &half, 1, half, CUFFT_R2C, rows) ==
-	    CUFFT_SUCCESS;
-	fft->has_inverse =
-	    cufftPlanMany(&fft->inverse, 1, &length, &half, 1, half, &padded, 1, padded, CUFFT_C2R, rows) ==
-	    CUFFT_SUCCESS;
+	fft->has_forward = cufftPlanMany(&fft->forward, 1, &length, &padded, 1, padded, &half, 1, half, CUFFT_R2C,
+					 rows) == CUFFT_SUCCESS;
+	fft->has_inverse = cufftPlanMany(&fft->inverse, 1, &length, &half, 1, half, &padded, 1, padded, CUFFT_C2R,
+					 rows) == CUFFT_SUCCESS;
 	if (!fft->has_forward || !fft->has_inverse ||
 	    cufftSetStream(fft->forward, plan->device->stream) != CUFFT_SUCCESS ||
 	    cufftSetStream(fft->inverse, plan->device->stream) != CUFFT_SUCCESS)
@@ -402,14 +398,15 @@ void filter_release(struct plan *plan)
 	free(fft);
 }
 
-template <int HALF> static void launch_fused(filter_job &job, cudaStream_t stream)
+template <int HALF>
+static void launch_fused(filter_job &job, cudaStream_t stream)
 {
 	const int pairs = HALF >= 4 ? 1 : HALF >= 2 ? 2 : 4;
-	int rows = job.count * job.rows;
 
 	for (int j = 0; j < HALF; j++)
 		job.roots[j] = make_float2((float)cos(M_PI * j / HALF), (float)-sin(M_PI * j / HALF));
-	filter_fused<HALF, pairs><<<divide_up(rows, 2 * pairs), dim3(32 * HALF, pairs), 0, stream>>>(job);
+	filter_fused<HALF, pairs>
+	    <<<dim3(divide_up(job.rows, 2 * pairs), job.count), dim3(32 * HALF, pairs), 0, stream>>>(job);
 }
 
 int cuda_filter(struct plan *plan, const struct stack *from, const int *slots, const int *views, int count,

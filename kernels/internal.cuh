@@ -52,7 +52,7 @@ struct device {
 	cudaStream_t copy;   /* raw projections on their way in */
 	size_t limit;        /* bytes that may be allocated in all */
 	size_t used;
-	double *sums;      /* pinned, [SUMS]: results of reductions, written by the device */
+	double *sums;        /* pinned, [SUMS]: results of reductions, written by the device */
 	double *sums_device; /* the same memory as the device sees it */
 };
 enum { SUMS = 16 };
@@ -81,9 +81,9 @@ struct volume {
 enum { STACK_PAD = 8 };
 struct stack_shape {
 	int columns, rows;
-	int pitch;         /* floats from row to row */
-	size_t slot;       /* floats from slot to slot */
-	size_t floats;     /* in all */
+	int pitch;     /* floats from row to row */
+	size_t slot;   /* floats from slot to slot */
+	size_t floats; /* in all */
 };
 struct stack {
 	struct device *device;
@@ -112,22 +112,40 @@ struct device_view {
 	float central[2];   /* unit vector, horizontal, from the source to the axis */
 };
 
-/* The volume as a stack of slices across one axis, for the forward projection. */
-struct slices {
-	const float *data; /* sample 0 of row 0 of slice 0 */
-	size_t slice;      /* floats from slice to slice */
-	int row;           /* floats from row to row; neighbours along the fast axis are adjacent */
-};
-
-/* Padded copies, [slice][row][fast]: rows of `row` floats, SLICE_PAD rows between the slices, edge values held around. */
-enum { SLICE_PAD = 8, SLICE_HELD = 2 };
+/*
+ * The volume as a stack of slices across one axis, for the forward projection:
+ * [slice][row][fast], SLICE_PAD rows between the slices, edge values held around.
+ *
+ * The untilted kernel reads many rows below each other and wants a distance from
+ * row to row that the compiler knows: there the fast axis is cut into panels,
+ * [slice][panel][row][PANEL], the last value of a panel being the first of the next.
+ */
+enum { SLICE_PAD = 8, SLICE_HELD = 2, PANEL = 64 };
 struct slices_shape {
 	int slices, rows, fast;
-	int row;
-	size_t slice, floats;
+	int row;      /* floats from row to row */
+	int panel;    /* floats from panel to panel; 0: rows are whole */
+	size_t slice; /* floats from slice to slice */
+	size_t floats;
 };
-struct slices_shape slices_shape_make(int slices, int rows, int fast);
-struct slices slices_at(const float *memory, const struct slices_shape *shape);
+struct slices {
+	float *data; /* row 0 of slice 0; where rows are whole, its value 0, else value -1 is first in its panel */
+	size_t slice;
+	int row, panel;
+};
+struct slices_shape slices_shape_make(int slices, int rows, int fast, bool panels);
+struct slices slices_at(float *memory, const struct slices_shape *shape);
+
+/*
+ * A batch of projections for the untilted backprojection, [slot][panel][row][PANEL]
+ * of pairs of neighbours along a row, pair 0 of panel 0 being columns -1 and 0.
+ */
+struct pairs_shape {
+	int panel;     /* pairs from panel to panel */
+	size_t slot;   /* pairs from slot to slot */
+	size_t before; /* pairs in front of row 0 of slot 0 */
+};
+struct pairs_shape pairs_shape_make(int columns, int rows);
 
 /* The volume with z fastest, [x][y][z], columns of `pitch` floats. */
 struct columns_shape {
@@ -143,7 +161,7 @@ struct layered { /* a layered 2D array with its texture: hardware bilinear sampl
 	size_t bytes;
 };
 int layered_new(struct device *device, int width, int height, int layers, cudaTextureAddressMode outside,
-                struct layered *ret_layered, struct error *err);
+		struct layered *ret_layered, struct error *err);
 void layered_free(struct device *device, struct layered *layered);
 
 struct device_grid {
@@ -185,8 +203,8 @@ struct plan {
 
 	int *views_host; /* what `views` holds, so that the same list is not copied again */
 	int views_held;
-	int *views; /* [count], device: the views of the call in hand */
-	int *slots; /* [count], device: their slots, for those that need them */
+	int *views;                   /* [count], device: the views of the call in hand */
+	int *slots;                   /* [count], device: their slots, for those that need them */
 	struct device_view *geometry; /* [count], device */
 
 	/* One block that the stages use in turn: slices of the forward projection, z-fastest copy, TV's copies. */
@@ -194,9 +212,11 @@ struct plan {
 	size_t scratch_bytes;
 	struct layered slices[2];   /* slices across x and y, with textures */
 	struct layered projections; /* a batch of projections, with textures */
-	float *coverage;            /* [z][y][x], sum_S w_ij of subset `coverage_subset`, where not all is covered */
+	float2 *pairs;              /* a batch of projections as pairs, untilted */
+	size_t pairs_bytes;
+	float *coverage; /* [z][y][x], sum_S w_ij of subset `coverage_subset`, where not all is covered */
 	int coverage_subset;
-	float *work;                /* [z][y][x], where an update takes more views than one launch */
+	float *work; /* [z][y][x], where an update takes more views than one launch */
 	struct stack *correction;
 	float2 *partial; /* SART: squares of residuals and projections, one for each block of the forward projection */
 	size_t partial_count;
@@ -227,36 +247,37 @@ struct plan {
 int plan_set_views(struct plan *plan, const int *views, int count, struct error *err);
 int plan_set_slots(struct plan *plan, const int *slots, int count, const struct stack *from, struct error *err);
 int plan_check_views(const struct plan *plan, const int *views, int count, const struct stack *stack, int slots,
-                     struct error *err);
+		     struct error *err);
 
 /* ---- layout.cu ---- */
-int layout_slices(struct plan *plan, const float *volume, struct error *err); /* -> scratch, arrays */
+int layout_slices(struct plan *plan, const float *volume, struct error *err);         /* -> scratch, arrays */
+int layout_pairs(struct plan *plan, const float *from, int count, struct error *err); /* -> pairs */
 int layout_to_columns(struct plan *plan, const float *volume, float *columns, struct error *err);
 int layout_from_columns(struct plan *plan, const float *columns, float *volume, struct error *err);
 
 /* ---- project.cu ---- */
 /* What becomes of a ray's sum. */
 struct ray_use {
-	const float *measured;  /* NULL: the sum itself is wanted; else (p - sum) / row sum, slot = view */
-	float2 *partial;        /* one a block: residual^2, p^2 */
-	float least;            /* mm that a ray must have in the grid to correct it */
+	const float *measured; /* NULL: the sum itself is wanted; else (p - sum) / row sum, slot = view */
+	float2 *partial;       /* one a block: residual^2, p^2 */
+	float least;           /* mm that a ray must have in the grid to correct it */
 };
 /* The slices must be there. Rays of plan->views[first .. first + count - 1] into slots 0 .. count - 1. */
 int project_rays(struct plan *plan, const float *volume, int first, int count, struct ray_use use, float *to,
-                 struct error *err);
+		 struct error *err);
 size_t project_blocks(const struct plan *plan, int count);
 
 /* ---- backproject.cu ---- */
 /* What becomes of a voxel's sum. */
 struct voxel_use {
-	bool update;           /* false: added to the volume */
-	bool fdk;              /* weight (D/depth)^2 */
+	bool update; /* false: added to the volume */
+	bool fdk;    /* weight (D/depth)^2 */
 	bool nonnegative;
 	float scale;           /* update: relaxation, over the number of views where all is covered */
 	const float *coverage; /* update: else divided by this, voxel by voxel */
 };
 int backproject_views(struct plan *plan, const float *from, int first, int count, struct voxel_use use, float *volume,
-                      struct error *err);
+		      struct error *err);
 /* Views that one launch takes. */
 enum { VIEWS_AT_ONCE = 1024 };
 int coverage_sum(struct plan *plan, int first, int count, struct error *err);
@@ -285,20 +306,20 @@ static inline int cancel_check(const struct cancel *cancel, struct error *err)
 
 /* ---- the operations of the table ---- */
 int cuda_linearise(struct plan *plan, const void *samples, int count, const int *slots, struct stack *to,
-                   size_t *defects, struct error *err);
+		   size_t *defects, struct error *err);
 int cuda_filter(struct plan *plan, const struct stack *from, const int *slots, const int *views, int count,
-                struct stack *to, struct error *err);
+		struct stack *to, struct error *err);
 int cuda_backproject(struct plan *plan, const struct stack *from, const int *views, int count,
-                     enum backprojection weight, struct volume *to, struct error *err);
+		     enum backprojection weight, struct volume *to, struct error *err);
 int cuda_project(struct plan *plan, const struct volume *from, const int *views, int count, struct stack *to,
-                 struct error *err);
+		 struct error *err);
 int cuda_sart_iterate(struct plan *plan, const struct stack *projections, struct volume *volume,
-                      const struct cancel *cancel, struct sart_sums *ret_sums, struct error *err);
+		      const struct cancel *cancel, struct sart_sums *ret_sums, struct error *err);
 int cuda_tv(struct plan *plan, struct volume *volume, const struct cancel *cancel, struct error *err);
 int cuda_norms(struct plan *plan, const struct volume *volume, const struct volume *other, double unit,
-               struct volume_norms *ret_norms, struct error *err);
+	       struct volume_norms *ret_norms, struct error *err);
 int cuda_plan_bytes(struct device *device, const struct plan_options *options, struct plan_bytes *ret_bytes,
-                    struct error *err);
+		    struct error *err);
 int cuda_plan_new(struct device *device, const struct plan_options *options, struct plan **ret_plan, struct error *err);
 void cuda_plan_free(struct plan *plan);
 const char *cuda_plan_summary(const struct plan *plan);
@@ -310,7 +331,7 @@ int cuda_volume_download(struct volume *volume, int z_first, int z_count, float 
 int cuda_volume_fill(struct volume *volume, float value, struct error *err);
 int cuda_volume_copy(struct volume *to, const struct volume *from, struct error *err);
 int cuda_stack_new(struct device *device, int columns, int rows, int slots, struct stack **ret_stack,
-                   struct error *err);
+		   struct error *err);
 void cuda_stack_free(struct stack *stack);
 int cuda_stack_download(struct stack *stack, int slot, int count, float *ret_to, struct error *err);
 

@@ -5,23 +5,37 @@
  */
 #include "kernels/internal.cuh"
 
-struct slices_shape slices_shape_make(int slices, int rows, int fast)
+struct slices_shape slices_shape_make(int slices, int rows, int fast, bool panels)
 {
 	struct slices_shape shape;
+	int padded = rows + SLICE_PAD;
 
 	shape.slices = slices;
 	shape.rows = rows;
 	shape.fast = fast;
-	shape.row = round_up(fast + 2, 32);
-	shape.slice = (size_t)shape.row * (size_t)(rows + SLICE_PAD);
+	shape.row = panels ? PANEL : round_up(fast + 2, 32);
+	shape.panel = panels ? PANEL * padded : 0;
+	shape.slice =
+	    panels ? (size_t)shape.panel * (size_t)divide_up(fast + 3, PANEL - 1) : (size_t)shape.row * (size_t)padded;
 	/* Before the first slice and behind the last, SLICE_PAD rows and one value can be read. */
 	shape.floats = shape.slice * (size_t)slices + (size_t)shape.row * (SLICE_PAD + 2);
 	return shape;
 }
 
-struct slices slices_at(const float *memory, const struct slices_shape *shape)
+struct slices slices_at(float *memory, const struct slices_shape *shape)
 {
-	return {memory + (size_t)shape->row * (SLICE_PAD + 1), shape->slice, shape->row};
+	return {memory + (size_t)shape->row * (SLICE_PAD + 1), shape->slice, shape->row, shape->panel};
+}
+
+struct pairs_shape pairs_shape_make(int columns, int rows)
+{
+	struct pairs_shape shape;
+
+	shape.panel = PANEL * (rows + STACK_PAD);
+	/* Pairs are read for columns -1 .. columns. */
+	shape.slot = (size_t)shape.panel * (size_t)divide_up(columns + 2, PANEL);
+	shape.before = (size_t)PANEL * STACK_PAD;
+	return shape;
 }
 
 struct columns_shape columns_shape_make(const int size[3])
@@ -39,25 +53,40 @@ struct columns_shape columns_shape_make(const int size[3])
 
 enum { TILE = 32, TILE_ROWS = 8 };
 
-/* Writes a value and, at the ends of the fast and the row axis, what is held beyond them. */
-static __device__ __forceinline__ void put_held(float *slice, int stride, int row, int rows, int fast, int count,
+/* Writes a value, and where it begins a panel also behind the one before. */
+static __device__ __forceinline__ void put(float *slice, const slices &to, int row, int fast, float value)
+{
+	if (to.panel == 0) {
+		slice[row * to.row + fast] = value;
+		return;
+	}
+	int place = fast + 1, panel = place / (PANEL - 1), within = place - panel * (PANEL - 1);
+	float *at = slice + (panel * to.panel + row * PANEL + within);
+
+	*at = value;
+	if (within == 0 && panel > 0)
+		at[PANEL - 1 - to.panel] = value;
+}
+
+/* The same and, at the ends of the fast and the row axis, what is held beyond them. */
+static __device__ __forceinline__ void put_held(const slices &to, int slice, int row, int rows, int fast, int count,
 						float value)
 {
-	int from = row == 0 ? -SLICE_HELD : row, to = row == rows - 1 ? rows - 1 + SLICE_HELD : row;
+	int from = row == 0 ? -SLICE_HELD : row, until = row == rows - 1 ? rows - 1 + SLICE_HELD : row;
+	float *data = to.data + to.slice * (size_t)slice;
 
-	for (int j = from; j <= to; j++) {
-		slice[j * stride + fast] = value;
+	for (int j = from; j <= until; j++) {
+		put(data, to, j, fast, value);
 		if (fast == 0)
-			slice[j * stride - 1] = value;
+			put(data, to, j, -1, value);
 		if (fast == count - 1)
-			slice[j * stride + count] = value;
+			put(data, to, j, count, value);
 	}
 }
 
 /* One tile of x and y in one plane; across x it is turned over in shared memory. */
 static __global__ void __launch_bounds__(TILE *TILE_ROWS)
-    to_slices(const float *__restrict__ volume, int nx, int ny, int nz, float *across_x, size_t slice_x, int stride_x,
-	      float *across_y, size_t slice_y, int stride_y)
+    to_slices(const float *__restrict__ volume, int nx, int ny, int nz, const slices across_x, const slices across_y)
 {
 	__shared__ float tile[TILE][TILE + 1];
 	int x0 = blockIdx.x * TILE, y0 = blockIdx.y * TILE, z = blockIdx.z;
@@ -69,7 +98,7 @@ static __global__ void __launch_bounds__(TILE *TILE_ROWS)
 			float value = volume[((size_t)z * ny + y) * nx + x];
 
 			tile[j][threadIdx.x] = value;
-			put_held(across_y + slice_y * y, stride_y, z, nz, x, nx, value);
+			put_held(across_y, y, z, nz, x, nx, value);
 		}
 	}
 	__syncthreads();
@@ -77,7 +106,7 @@ static __global__ void __launch_bounds__(TILE *TILE_ROWS)
 		int x = x0 + j, y = y0 + threadIdx.x;
 
 		if (x < nx && y < ny)
-			put_held(across_x + slice_x * x, stride_x, z, nz, y, ny, tile[threadIdx.x][j]);
+			put_held(across_x, x, z, nz, y, ny, tile[threadIdx.x][j]);
 	}
 }
 
@@ -103,8 +132,7 @@ int layout_slices(struct plan *plan, const float *volume, struct error *err)
 	struct slices y = slices_at(plan->scratch + plan->along_x.floats, &plan->along_y);
 	dim3 blocks(divide_up(size[0], TILE), divide_up(size[1], TILE), size[2]), threads(TILE, TILE_ROWS);
 
-	to_slices<<<blocks, threads, 0, stream>>>(volume, size[0], size[1], size[2], (float *)x.data, x.slice, x.row,
-						  (float *)y.data, y.slice, y.row);
+	to_slices<<<blocks, threads, 0, stream>>>(volume, size[0], size[1], size[2], x, y);
 	LAUNCHED();
 	if (plan->slices[0].array != NULL) {
 		TRY(copy_to_array(&plan->slices[0], &plan->along_x, x.data, stream, err));
@@ -125,8 +153,8 @@ static __global__ void __launch_bounds__(TILE *TILE_ROWS)
 		int x = x0 + (FORWARD ? threadIdx.x : j), z = z0 + (FORWARD ? j : threadIdx.x);
 
 		if (x < nx && z < nz)
-			tile[j][threadIdx.x] = FORWARD ? volume[((size_t)z * ny + y) * nx + x]
-						       : columns[((size_t)x * ny + y) * pitch + z];
+			tile[j][threadIdx.x] =
+			    FORWARD ? volume[((size_t)z * ny + y) * nx + x] : columns[((size_t)x * ny + y) * pitch + z];
 	}
 	__syncthreads();
 	for (int j = threadIdx.y; j < TILE; j += TILE_ROWS) {
@@ -159,6 +187,40 @@ int layout_from_columns(struct plan *plan, const float *columns, float *volume, 
 
 	turn_columns<false><<<blocks, threads, 0, plan->device->stream>>>(volume, (float *)columns, shape->nx,
 									  shape->ny, shape->nz, shape->pitch);
+	LAUNCHED();
+	return 0;
+}
+
+/* Zeros outside of the detector included: everything is written. */
+static __global__ void __launch_bounds__(256)
+    to_pairs(const float *__restrict__ from, const stack_shape shape, float2 *to, const pairs_shape pairs)
+{
+	int row = (int)(blockIdx.x * 4 + threadIdx.y) - STACK_PAD, column = (int)(blockIdx.y * PANEL + threadIdx.x) - 1;
+	float2 pair = {0, 0};
+
+	if (row >= shape.rows + STACK_PAD)
+		return;
+	if (row >= 0 && row < shape.rows) {
+		const float *at = from + blockIdx.z * shape.slot + (size_t)row * shape.pitch;
+
+		if (column >= 0 && column < shape.columns)
+			pair.x = at[column];
+		if (column + 1 < shape.columns)
+			pair.y = at[column + 1];
+	}
+	/* The rows of zeros below one panel are those above the next. */
+	if (row < shape.rows || blockIdx.y + 1 == gridDim.y)
+		to[blockIdx.z * pairs.slot + blockIdx.y * (size_t)pairs.panel + (size_t)(row + STACK_PAD) * PANEL +
+		   threadIdx.x] = pair;
+}
+
+int layout_pairs(struct plan *plan, const float *from, int count, struct error *err)
+{
+	const struct stack_shape *shape = &plan->stack;
+	struct pairs_shape pairs = pairs_shape_make(shape->columns, shape->rows);
+	dim3 blocks(divide_up(shape->rows + 2 * STACK_PAD, 4), (unsigned)(pairs.slot / (size_t)pairs.panel), count);
+
+	to_pairs<<<blocks, dim3(PANEL, 4), 0, plan->device->stream>>>(from, *shape, plan->pairs, pairs);
 	LAUNCHED();
 	return 0;
 }

@@ -100,8 +100,7 @@ size_t stack_bytes(int columns, int rows, int slots)
 	return stack_shape_make(columns, rows, slots).floats * sizeof(float);
 }
 
-int cuda_stack_new(struct device *device, int columns, int rows, int slots, struct stack **ret_stack,
-		   struct error *err)
+int cuda_stack_new(struct device *device, int columns, int rows, int slots, struct stack **ret_stack, struct error *err)
 {
 	struct stack *stack = (struct stack *)calloc(1, sizeof(*stack));
 	int code;
@@ -164,9 +163,8 @@ int layered_new(struct device *device, int width, int height, int layers, cudaTe
 	layered.bytes = (size_t)width * (size_t)height * (size_t)layers * sizeof(float);
 	if (layered.bytes > device->limit - device->used)
 		return error_set(err, ERR_NO_MEMORY, "an array of %zu bytes does not fit", layered.bytes);
-	CUDA_TRY(cudaMalloc3DArray(&layered.array, &channel, make_cudaExtent((size_t)width, (size_t)height,
-									      (size_t)layers),
-				   cudaArrayLayered));
+	CUDA_TRY(cudaMalloc3DArray(&layered.array, &channel,
+				   make_cudaExtent((size_t)width, (size_t)height, (size_t)layers), cudaArrayLayered));
 	resource.resType = cudaResourceTypeArray;
 	resource.res.array.array = layered.array;
 	texture.addressMode[0] = texture.addressMode[1] = outside;

@@ -21,7 +21,8 @@ static __device__ __forceinline__ double combine(int what, double a, double b)
 }
 
 /* Thread 0 has the block's result. */
-template <int COUNT> static __device__ __forceinline__ void reduce_block(double value[COUNT])
+template <int COUNT>
+static __device__ __forceinline__ void reduce_block(double value[COUNT])
 {
 	__shared__ double warps[THREADS / 32][COUNT];
 	int thread = threadIdx.x;
@@ -149,10 +150,10 @@ int cuda_norms(struct plan *plan, const struct volume *volume, const struct volu
 	double finite;
 
 	TRY(device_enter(device, err));
-	norms<<<blocks, THREADS, 0, device->stream>>>(
-	    volume->data, other != NULL ? other->data : NULL, grid->size[0], grid->size[1], grid->size[2],
-	    (float)(least / grid->spacing[0]), (float)(least / grid->spacing[1]), (float)(least / grid->spacing[2]),
-	    plan->reduce);
+	norms<<<blocks, THREADS, 0, device->stream>>>(volume->data, other != NULL ? other->data : NULL, grid->size[0],
+						      grid->size[1], grid->size[2], (float)(least / grid->spacing[0]),
+						      (float)(least / grid->spacing[1]),
+						      (float)(least / grid->spacing[2]), plan->reduce);
 	LAUNCHED();
 	add_blocks<NORMS><<<1, THREADS, 0, device->stream>>>(plan->reduce, blocks, device->sums_device);
 	LAUNCHED();

@@ -11,9 +11,9 @@
 
 /* ---- which kernels ---- */
 
-enum { LAYERS_MOST = 2048 };   /* of a layered array, on every card */
-enum { SIDE_MOST = 32768 };    /* its width and height */
-enum { BATCH_MOST = 128 };     /* views that FDK filters and backprojects in one go */
+enum { LAYERS_MOST = 2048 };                      /* of a layered array, on every card */
+enum { SIDE_MOST = 32768 };                       /* its width and height */
+enum { BATCH_MOST = 128 };                        /* views that FDK filters and backprojects in one go */
 static const size_t RAW_BYTES = (size_t)16 << 20; /* of each of the two buffers of raw samples */
 static const size_t FFT_BYTES = (size_t)64 << 20; /* of the rows that cuFFT takes at once */
 
@@ -31,8 +31,7 @@ static int largest_subset(const struct subsets *subsets)
 static void corner_of(const struct grid *grid, int corner, double beyond, double ret[3])
 {
 	for (int i = 0; i < 3; i++)
-		ret[i] = grid->origin[i] +
-			 grid->spacing[i] * (corner >> i & 1 ? grid->size[i] - 1 + beyond : -beyond);
+		ret[i] = grid->origin[i] + grid->spacing[i] * (corner >> i & 1 ? grid->size[i] - 1 + beyond : -beyond);
 }
 
 /* Every view sees the whole grid: all corners fall well inside of the detector, so all voxels do. */
@@ -93,8 +92,8 @@ static void row_spacing(const struct geometry *geometry, const struct grid *grid
 
 	for (int k = 0; k < geometry->count; k++) {
 		const struct view *view = &geometry->views[k];
-		double matrix[12], point[3], column, row, detector = view_project((view_matrix(view, matrix), matrix),
-										  view->pixel0, &column, &row);
+		double matrix[12], point[3], column, row,
+		    detector = view_project((view_matrix(view, matrix), matrix), view->pixel0, &column, &row);
 
 		up += view->row_step[2] > 0 ? 1 : -1;
 		for (int corner = 0; corner < 4; corner++) {
@@ -151,8 +150,8 @@ static struct plan_shape shape_of(const struct plan_options *options)
 		subset = largest_subset(&options->sart->subsets);
 	shape.z_rays = has_z_rays(geometry, grid);
 	choose_untilted(options, &shape);
-	shape.textures = !options->reference_precision && fits && geometry->columns <= SIDE_MOST &&
-			 geometry->rows <= SIDE_MOST;
+	shape.textures =
+	    !options->reference_precision && fits && geometry->columns <= SIDE_MOST && geometry->rows <= SIDE_MOST;
 	shape.batch = geometry->count < BATCH_MOST ? geometry->count : BATCH_MOST;
 	shape.by_view = subset == 1 && columns_shape_make(grid->size).floats < (size_t)1 << 31;
 	shape.by_subset = subset > 0 && !shape.by_view;
@@ -185,8 +184,8 @@ static void plan_describe(struct plan *plan, const struct plan_options *options)
 		plan->grid.size[i] = size[i];
 		plan->grid.spacing[i] = (float)grid->spacing[i];
 	}
-	plan->along_x = slices_shape_make(size[0], size[2], size[1]);
-	plan->along_y = slices_shape_make(size[1], size[2], size[0]);
+	plan->along_x = slices_shape_make(size[0], size[2], size[1], plan->shape.forward_rows > 0);
+	plan->along_y = slices_shape_make(size[1], size[2], size[0], plan->shape.forward_rows > 0);
 	plan->columns = columns_shape_make(size);
 	plan->stack = stack_shape_make(geometry->columns, geometry->rows, 1);
 	plan->scratch_bytes = (plan->along_x.floats + plan->along_y.floats) * sizeof(float);
@@ -199,8 +198,8 @@ static void plan_describe(struct plan *plan, const struct plan_options *options)
 	else if (plan->shape.by_subset)
 		plan->partial_count = project_blocks(plan, geometry->count);
 	plan->raw_views = 1;
-	plan->bytes.raw = (size_t)geometry->columns * (size_t)geometry->rows *
-			  (options->linearise.sample == SAMPLE_UINT16 ? 2 : 4);
+	plan->bytes.raw =
+	    (size_t)geometry->columns * (size_t)geometry->rows * (options->linearise.sample == SAMPLE_UINT16 ? 2 : 4);
 	if (plan->bytes.raw < RAW_BYTES)
 		plan->raw_views = (int)(RAW_BYTES / plan->bytes.raw);
 	if (plan->raw_views > geometry->count)
@@ -215,7 +214,15 @@ static bool needs_arrays_back(const struct plan *plan)
 {
 	return plan->shape.textures && plan->shape.back_voxels == 0;
 }
-static int array_layers(const struct plan *plan)
+static size_t pairs_bytes(const struct plan *plan, int views)
+{
+	struct pairs_shape pairs = pairs_shape_make(plan->stack.columns, plan->stack.rows);
+
+	return (pairs.slot * (size_t)views + 2 * pairs.before) * sizeof(float2);
+}
+
+/* Views of a batch that is laid out anew for the backprojection. */
+static int views_laid_out(const struct plan *plan)
 {
 	int subset = plan->shape.correction, batch = plan->shape.batch;
 	int views = subset > batch ? subset : batch;
@@ -255,7 +262,9 @@ int cuda_plan_bytes(struct device *device, const struct plan_options *options, s
 	if (needs_arrays_forward(&plan))
 		bytes.scratch += 2 * voxels;
 	if (needs_arrays_back(&plan))
-		bytes.scratch += pixels_of(&plan) * (size_t)array_layers(&plan) * sizeof(float);
+		bytes.scratch += pixels_of(&plan) * (size_t)views_laid_out(&plan) * sizeof(float);
+	if (plan.shape.back_voxels > 0)
+		bytes.scratch += pairs_bytes(&plan, views_laid_out(&plan));
 	if (needs_coverage(&plan))
 		bytes.scratch += voxels;
 	if (needs_work(&plan))
@@ -407,8 +416,13 @@ static int prepare_arrays(struct plan *plan, struct error *err)
 		TRY(layered_new(plan->device, size[1], size[2], size[0], cudaAddressModeClamp, &plan->slices[0], err));
 		TRY(layered_new(plan->device, size[0], size[2], size[1], cudaAddressModeClamp, &plan->slices[1], err));
 	}
+	if (plan->shape.back_voxels > 0) {
+		plan->shape.views_at_once = views_laid_out(plan);
+		plan->pairs_bytes = pairs_bytes(plan, plan->shape.views_at_once);
+		TRY(device_allocate(plan->device, plan->pairs_bytes, (void **)&plan->pairs, err));
+	}
 	if (needs_arrays_back(plan)) {
-		plan->shape.views_at_once = array_layers(plan);
+		plan->shape.views_at_once = views_laid_out(plan);
 		TRY(layered_new(plan->device, plan->stack.columns, plan->stack.rows, plan->shape.views_at_once,
 				cudaAddressModeBorder, &plan->projections, err));
 	}
@@ -450,7 +464,9 @@ static void summarise(struct plan *plan)
 		snprintf(back, sizeof(back), "untilted, %d voxels a window", shape->back_voxels);
 	snprintf(plan->summary, sizeof(plan->summary), "forward %s; back %s; %s; %s", forward, back,
 		 shape->textures ? "texture sampling" : "float32 sampling",
-		 shape->filter_length > 0 ? "fused filter" : shape->fft_length > 0 ? "cuFFT" : "no filter");
+		 shape->filter_length > 0 ? "fused filter"
+		 : shape->fft_length > 0  ? "cuFFT"
+					  : "no filter");
 }
 
 int cuda_plan_new(struct device *device, const struct plan_options *options, struct plan **ret_plan, struct error *err)
@@ -508,6 +524,7 @@ void cuda_plan_free(struct plan *plan)
 	if (plan->linearised != NULL)
 		cudaEventDestroy(plan->linearised);
 	layered_free(device, &plan->projections);
+	device_release(device, plan->pairs, plan->pairs_bytes);
 	device_release(device, plan->defects, sizeof(*plan->defects));
 	device_release(device, plan->flat, pixels_of(plan) * sizeof(float));
 	device_release(device, plan->dark, pixels_of(plan) * sizeof(float));

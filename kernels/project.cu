@@ -73,7 +73,7 @@ static __device__ __forceinline__ float2 finish(const projection &p, int slot, i
 enum { GENERAL_ROWS = 8 }; /* of a block, 32 columns wide: a warp a row */
 
 template <bool TEXTURE, bool ALONG_Z>
-static __global__ void __launch_bounds__(32 * GENERAL_ROWS) project_general(const projection p)
+static __global__ void __launch_bounds__(32 * GENERAL_ROWS, 5) project_general(const projection p)
 {
 	place at = place_of(p);
 	int view = p.views[at.slot];
@@ -107,33 +107,39 @@ static __global__ void __launch_bounds__(32 * GENERAL_ROWS) project_general(cons
 		size_t slice = p.across[axis].slice;
 		int stride = p.across[axis].row;
 		cudaTextureObject_t texture = p.texture[axis];
-		auto hard = [&](int i) {
-			return tex2DLayered<float>(texture, fmaf((float)i, s.fast_step, s.fast + 0.5f),
-						   fmaf((float)i, s.row_step, s.row + 0.5f), i);
-		};
-		auto soft = [&](int i) {
-			return sample(data + slice * (size_t)i, stride, 1, fmaf((float)i, s.fast_step, s.fast),
-				      fmaf((float)i, s.row_step, s.row));
-		};
 		float total = 0;
 		auto edge = [&](int from, int to) {
 			for (int i = from; i < to; i++) {
-				float fast = fminf(fmaxf(fmaf((float)i, s.fast_step, s.fast), -1.0f), (float)axes.fast);
-				float up = fminf(fmaxf(fmaf((float)i, s.row_step, s.row), -1.0f), (float)axes.rows);
+				float fast = fmaf((float)i, s.fast_step, s.fast);
+				float up = fmaf((float)i, s.row_step, s.row), value;
 
-				total = fmaf(part_of(i, s.begin, s.end),
-					     sample(data + slice * (size_t)i, stride, 1, fast, up), total);
+				if (TEXTURE)
+					value = tex2DLayered<float>(texture, fast + 0.5f, up + 0.5f, i & 0x7ff);
+				else
+					value = sample(data + slice * (size_t)i, stride, 1,
+						       fminf(fmaxf(fast, -1.0f), (float)axes.fast),
+						       fminf(fmaxf(up, -1.0f), (float)axes.rows));
+				total = fmaf(part_of(i, s.begin, s.end), value, total);
 			}
 		};
 
 		edge(w.first, w.inner_first);
+		const float *at_slice = data + slice * (size_t)w.inner_first;
+		float f = (float)w.inner_first, fast_half = s.fast + 0.5f, row_half = s.row + 0.5f;
 		int i = w.inner_first;
-		if (TEXTURE)
-			for (; i + 2 <= w.inner_end; i += 2)
-				total += hard(i) + soft(i + 1);
-#pragma unroll 4
-		for (; i < w.inner_end; i++)
-			total += soft(i);
+		if (TEXTURE) {
+			at_slice += slice;
+			for (; i + 2 <= w.inner_end; i += 2, f += 2.0f, at_slice += 2 * slice) {
+				/* The mask only says that the layer is small: it saves the compiler's clamp. */
+				total += tex2DLayered<float>(texture, fmaf(f, s.fast_step, fast_half),
+							     fmaf(f, s.row_step, row_half), i & 0x7ff);
+				total += sample(at_slice, stride, 1, fmaf(f + 1.0f, s.fast_step, s.fast),
+						fmaf(f + 1.0f, s.row_step, s.row));
+			}
+			at_slice -= slice;
+		}
+		for (; i < w.inner_end; i++, f += 1.0f, at_slice += slice)
+			total += sample(at_slice, stride, 1, fmaf(f, s.fast_step, s.fast), fmaf(f, s.row_step, s.row));
 		edge(w.inner_end, w.end);
 		if (hits) {
 			sum = total;
@@ -174,43 +180,61 @@ enum { UNTILTED_WARPS = 4 }; /* of a block: 32 columns wide, UNTILTED_WARPS * RO
 /* A column's rays: row k, counted upwards, crosses slice i at row + i row_step + k (1 + spread + i spread_step). */
 struct fan {
 	float fast, fast_step, row, row_step, spread, spread_step;
-	float from, to;        /* where all are inside across z, counted from the middle slice */
+	float from, to;                  /* where all are inside across z, counted from the middle slice */
 	float middle_row, middle_spread; /* row and spread in the middle slice, of centred z */
 };
 
-template <int ROWS, bool GUARD>
-static __device__ __forceinline__ void add_rows(const float *__restrict__ slice, int stride, const fan &f, int i,
-						const slice_axes &axes, const float begin[ROWS],
-						const float end[ROWS], float sum[ROWS])
+/* Which slices count as a whole: all rows alike do not, but by the same part; or each by its own. */
+enum guard { GUARD_NONE, GUARD_ALIKE, GUARD_EACH };
+
+template <int ROWS, int GUARD>
+static __device__ __forceinline__ void add_rows(const float *__restrict__ slice, int panel, const fan &f, int i,
+						const slice_axes &axes, const float begin[ROWS], const float end[ROWS],
+						float sum[ROWS])
 {
 	float fast = fmaf((float)i, f.fast_step, f.fast), row = fmaf((float)i, f.row_step, f.row);
-	float e = fmaf((float)i, f.spread_step, f.spread), right, base = row + fminf(0.0f, (float)(ROWS - 1) * e), unused;
-	float x[ROWS + 2];
+	float e = fmaf((float)i, f.spread_step, f.spread), right, part = 1;
+	float base = row + fminf(0.0f, (float)(ROWS - 1) * e), unused, x[ROWS + 2];
 
-	if (GUARD) {
+	if (GUARD != GUARD_NONE) {
 		fast = fminf(fmaxf(fast, -1.0f), (float)axes.fast);
 		base = fminf(fmaxf(base, (float)-SLICE_PAD), (float)axes.rows);
+		part = part_of(i, begin[0], end[0]);
 	}
-	int column = split(fast, right), low = split(base, unused);
-	const float *q = slice + (low * stride + column);
+	unsigned place = (unsigned)split(fast, right) + 1;
+	int low = split(base, unused), within = (int)(place * 66577u >> 22); /* place / (PANEL - 1) below 89240 */
+	const float *q = slice + (int)(low * PANEL + (int)place + within * (panel - (PANEL - 1)));
 #pragma unroll
 	for (int j = 0; j < ROWS + 2; j++)
-		x[j] = mix(q[j * stride], q[j * stride + 1], right);
+		x[j] = mix(q[j * PANEL], q[j * PANEL + 1], right);
 	float t = row - (float)low, below = x[1] - x[0];
 #pragma unroll
 	for (int k = 0; k < ROWS; k++) {
 		float down = __saturatef(fmaf((float)-k, e, 1.0f - t)), up = __saturatef(fmaf((float)k, e, t - 1.0f));
 		float above = x[k + 2] - x[k + 1];
 
-		if (GUARD) {
-			sum[k] = fmaf(part_of(i, begin[k], end[k]), fmaf(up, above, fmaf(-down, below, x[k + 1])), sum[k]);
-		} else {
+		if (GUARD == GUARD_NONE) {
 			sum[k] += x[k + 1];
 			sum[k] = fmaf(-down, below, sum[k]);
 			sum[k] = fmaf(up, above, sum[k]);
+		} else {
+			if (GUARD == GUARD_EACH)
+				part = part_of(i, begin[k], end[k]);
+			sum[k] = fmaf(part, fmaf(up, above, fmaf(-down, below, x[k + 1])), sum[k]);
 		}
 		below = above;
 	}
+}
+
+template <int ROWS, int GUARD>
+static __device__ __forceinline__ void add_slices(const slices &across, int from, int to, const fan &f,
+						  const slice_axes &axes, const float begin[ROWS],
+						  const float end[ROWS], float sum[ROWS])
+{
+	const float *at = across.data + across.slice * (size_t)from;
+
+	for (int i = from; i < to; i++, at += across.slice)
+		add_rows<ROWS, GUARD>(at, across.panel, f, i, axes, begin, end, sum);
 }
 
 /* Where row k is inside of the box, in slices. */
@@ -225,7 +249,7 @@ static __device__ __forceinline__ void row_range(const fan &f, int k, const slic
 }
 
 template <int ROWS>
-static __global__ void __launch_bounds__(32 * UNTILTED_WARPS) project_untilted(const projection p)
+static __global__ void __launch_bounds__(32 * UNTILTED_WARPS, 8) project_untilted(const projection p)
 {
 	place at = place_of(p);
 	int view = p.views[at.slot];
@@ -252,6 +276,7 @@ static __global__ void __launch_bounds__(32 * UNTILTED_WARPS) project_untilted(c
 		fan f;
 		int any_first = 1 << 28, any_end = -1, all_first = 0, all_end = 1 << 28;
 		float begin[ROWS], end[ROWS], sum[ROWS];
+		bool alike = true;
 
 		f.from = -0.5f * (float)axes.across;
 		f.to = -f.from;
@@ -272,6 +297,7 @@ static __global__ void __launch_bounds__(32 * UNTILTED_WARPS) project_untilted(c
 				continue;
 			row_range(f, k, axes, begin[k], end[k]);
 			bool crosses = end[k] > begin[k];
+			alike = alike && begin[k] == begin[0] && end[k] == end[0];
 			int first = first_slice(begin[k]), last = last_slice(end[k]);
 
 			any_first = min(any_first, crosses ? first : 1 << 28);
@@ -283,17 +309,15 @@ static __global__ void __launch_bounds__(32 * UNTILTED_WARPS) project_untilted(c
 		if (!hits)
 			f = {0.5f * (float)(axes.fast - 1), 0, 0.5f * (float)(axes.rows - 1), 0, 0, 0, 0, 0, 0, 0};
 		walk w = walk_together(hits, any_first, any_end, all_first, all_end);
-		const float *data = p.across[axis].data;
-		size_t slice = p.across[axis].slice;
-		int stride = p.across[axis].row;
-
-		for (int i = w.first; i < w.inner_first; i++)
-			add_rows<ROWS, true>(data + slice * (size_t)i, stride, f, i, axes, begin, end, sum);
-		for (int i = w.inner_end; i < w.end; i++)
-			add_rows<ROWS, true>(data + slice * (size_t)i, stride, f, i, axes, begin, end, sum);
-		const float *at_slice = data + slice * (size_t)w.inner_first;
-		for (int i = w.inner_first; i < w.inner_end; i++, at_slice += slice)
-			add_rows<ROWS, false>(at_slice, stride, f, i, axes, begin, end, sum);
+		const slices &across = p.across[axis];
+		if (__all_sync(~0u, alike || !hits)) {
+			add_slices<ROWS, GUARD_ALIKE>(across, w.first, w.inner_first, f, axes, begin, end, sum);
+			add_slices<ROWS, GUARD_ALIKE>(across, w.inner_end, w.end, f, axes, begin, end, sum);
+		} else {
+			add_slices<ROWS, GUARD_EACH>(across, w.first, w.inner_first, f, axes, begin, end, sum);
+			add_slices<ROWS, GUARD_EACH>(across, w.inner_end, w.end, f, axes, begin, end, sum);
+		}
+		add_slices<ROWS, GUARD_NONE>(across, w.inner_first, w.inner_end, f, axes, begin, end, sum);
 		if (!mine)
 			continue;
 #pragma unroll
@@ -302,14 +326,15 @@ static __global__ void __launch_bounds__(32 * UNTILTED_WARPS) project_untilted(c
 				continue;
 			float fast_mm = cross.fast_step * axes.spacing_fast;
 			float row_mm = fmaf((float)k, g.direction[2][2] * inverse, cross.row_step) * axes.spacing_row;
-			float step = sqrtf(axes.spacing_across * axes.spacing_across + fast_mm * fast_mm +
-					   row_mm * row_mm);
+			float step =
+			    sqrtf(axes.spacing_across * axes.spacing_across + fast_mm * fast_mm + row_mm * row_mm);
 			int row = p.rows_down ? p.rows - 1 - (low + k) : low + k;
 			float from = 0, to = 0;
 
 			if (hits)
 				row_range(f, k, axes, from, to);
-			float2 square = finish(p, at.slot, view, column, row, to > from ? sum[k] : 0.0f, to - from, step);
+			float2 square =
+			    finish(p, at.slot, view, column, row, to > from ? sum[k] : 0.0f, to - from, step);
 			squares.x += square.x;
 			squares.y += square.y;
 		}

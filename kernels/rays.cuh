@@ -67,11 +67,9 @@ struct slice_axes {
 static __device__ __forceinline__ slice_axes axes_of(const device_grid &grid, int axis)
 {
 	if (axis == ACROSS_X)
-		return {grid.size[0],    grid.size[1],	  grid.size[2],
-			grid.spacing[0], grid.spacing[1], grid.spacing[2]};
+		return {grid.size[0], grid.size[1], grid.size[2], grid.spacing[0], grid.spacing[1], grid.spacing[2]};
 	if (axis == ACROSS_Y)
-		return {grid.size[1],    grid.size[0],	  grid.size[2],
-			grid.spacing[1], grid.spacing[0], grid.spacing[2]};
+		return {grid.size[1], grid.size[0], grid.size[2], grid.spacing[1], grid.spacing[0], grid.spacing[2]};
 	return {grid.size[2], grid.size[0], grid.size[1], grid.spacing[2], grid.spacing[0], grid.spacing[1]};
 }
 
@@ -118,15 +116,21 @@ static __device__ __forceinline__ ray ray_idle(const slice_axes &axes)
 
 /*
  * floor(x) and what is above it for |x| < 2^22, without a conversion: adding
- * 1.5 * 2^23 with rounding down leaves the integer in the lowest bits.
+ * 1.5 * 2^23 with rounding down leaves the integer in the lowest bits, SPLIT_BITS
+ * too large.
  */
-static __device__ __forceinline__ int split(float x, float &fraction)
+static const unsigned SPLIT_BITS = 0x4B400000;
+static __device__ __forceinline__ unsigned split_bits(float x, float &fraction)
 {
 	const float shift = 12582912.0f;
 	float shifted = __fadd_rd(x, shift);
 
 	fraction = x - (shifted - shift);
-	return __float_as_int(shifted) - 0x4B400000;
+	return __float_as_uint(shifted);
+}
+static __device__ __forceinline__ int split(float x, float &fraction)
+{
+	return (int)(split_bits(x, fraction) - SPLIT_BITS);
 }
 
 static __device__ __forceinline__ float mix(float a, float b, float part)
@@ -139,8 +143,11 @@ static __device__ __forceinline__ float sample(const float *__restrict__ slice, 
 					       float fast, float row)
 {
 	float across, up;
-	int i = split(fast, across), j = split(row, up);
-	const float *p = slice + (j * row_stride + i * fast_stride), *q = p + row_stride;
+	unsigned i = split_bits(fast, across), j = split_bits(row, up);
+	/* Modulo 2^32 the surplus of both comes off at once. */
+	unsigned surplus = SPLIT_BITS * (unsigned)row_stride + SPLIT_BITS * (unsigned)fast_stride;
+	const float *p = slice + (int)(j * (unsigned)row_stride + i * (unsigned)fast_stride - surplus);
+	const float *q = p + row_stride;
 
 	return mix(mix(p[0], p[fast_stride], across), mix(q[0], q[fast_stride], across), up);
 }

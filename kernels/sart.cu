@@ -35,9 +35,9 @@ struct sweep_view {
 	bool nonnegative;
 };
 
-enum { SWEEP_COLUMNS = 4, SWEEP_PARTS = 4 };
+enum { SWEEP_COLUMNS = 8, SWEEP_PARTS = 2 };
 
-static __global__ void __launch_bounds__(32 * SWEEP_COLUMNS *SWEEP_PARTS) project_view(const sweep_view s)
+static __global__ void __launch_bounds__(32 * SWEEP_COLUMNS * SWEEP_PARTS) project_view(const sweep_view s)
 {
 	__shared__ float sums[SWEEP_PARTS][SWEEP_COLUMNS][32];
 	const device_view &g = *s.geometry;
@@ -67,7 +67,8 @@ static __global__ void __launch_bounds__(32 * SWEEP_COLUMNS *SWEEP_PARTS) projec
 
 			if (full.end > full.begin) {
 				a = full;
-				/* Between the outer centres all four neighbours are there; a thousandth for rounding. */
+				/* Between the outer centres all four neighbours are there; a thousandth for rounding.
+				 */
 				to = 0.5f * (float)(axes.across - 1);
 				from = -to;
 				clip(at.fast, at.fast_step, 0.5f * (float)(axes.fast - 1) - 1e-3f, from, to);
@@ -126,8 +127,11 @@ static __global__ void __launch_bounds__(32 * SWEEP_COLUMNS *SWEEP_PARTS) projec
 
 enum { UPDATE_LINES = 8 }; /* of voxels along z, side by side in a block */
 
-/* The update from one view; a thread has CHUNKS voxels, 32 apart along z. */
-template <int CHUNKS>
+/*
+ * The update from one view; a thread has CHUNKS voxels, 32 apart along z. COVERED:
+ * the view sees the whole grid. UNTILTED: column and depth stay the same along z.
+ */
+template <int CHUNKS, bool COVERED, bool UNTILTED>
 static __global__ void __launch_bounds__(32 * UPDATE_LINES) update_view(const sweep_view s)
 {
 	const float(&m)[3][4] = s.geometry->matrix;
@@ -139,22 +143,30 @@ static __global__ void __launch_bounds__(32 * UPDATE_LINES) update_view(const sw
 	if (y >= s.grid.size[1])
 		return;
 	float *at = s.volume + ((size_t)x * s.grid.size[1] + y) * s.pitch + z;
-	float a = fmaf(m[0][0], fx, fmaf(m[0][1], fy, fmaf(m[0][2], fz, m[0][3])));
-	float b = fmaf(m[1][0], fx, fmaf(m[1][1], fy, fmaf(m[1][2], fz, m[1][3])));
-	float c = fmaf(m[2][0], fx, fmaf(m[2][1], fy, fmaf(m[2][2], fz, m[2][3])));
 #pragma unroll
 	for (int k = 0; k < CHUNKS; k++)
 		value[k] = z + 32 * k < nz ? at[32 * k] : 0.0f;
+	float a = fmaf(m[0][0], fx, fmaf(m[0][1], fy, m[0][3])), b = fmaf(m[1][0], fx, fmaf(m[1][1], fy, m[1][3]));
+	float c = fmaf(m[2][0], fx, fmaf(m[2][1], fy, m[2][3])), w = 1.0f / c, u = a * w;
 #pragma unroll
 	for (int k = 0; k < CHUNKS; k++) {
-		float w = 1.0f / fmaf((float)(32 * k), m[2][2], c);
-		float u = fmaf((float)(32 * k), m[0][2], a) * w, v = fmaf((float)(32 * k), m[1][2], b) * w;
-		float coverage = __saturatef(fminf(u + 1.0f, columns - u)) * __saturatef(fminf(v + 1.0f, rows - v));
-		float sum = sample(s.correction, 1, s.correction_pitch, fminf(fmaxf(u, -1.0f), columns),
-				   fminf(fmaxf(v, -1.0f), rows));
+		float up = fz + (float)(32 * k);
 
+		if (!UNTILTED) {
+			w = __frcp_rn(fmaf(up, m[2][2], c));
+			u = fmaf(up, m[0][2], a) * w;
+		}
+		float v = fmaf(up, m[1][2], b) * w;
+		float sum = sample(s.correction, 1, s.correction_pitch, COVERED ? u : fminf(fmaxf(u, -1.0f), columns),
+				   fminf(fmaxf(v, -1.0f), rows));
+		float coverage = 1.0f;
+
+		if (!COVERED) {
+			coverage = __saturatef(fminf(u + 1.0f, columns - u)) * __saturatef(fminf(v + 1.0f, rows - v));
+			sum /= fmaxf(coverage, 1e-30f);
+		}
 		if (coverage > 0) {
-			value[k] += s.relaxation * sum / coverage;
+			value[k] = fmaf(s.relaxation, sum, value[k]);
 			if (s.nonnegative)
 				value[k] = fmaxf(value[k], 0.0f);
 		}
@@ -184,6 +196,7 @@ static float length_least(const struct plan *plan)
 	return (float)RAY_LENGTH_LEAST * fminf(fminf(spacing[0], spacing[1]), spacing[2]);
 }
 
+template <bool COVERED, bool UNTILTED>
 static void launch_update(const sweep_view &s, cudaStream_t stream)
 {
 	const int *size = s.grid.size;
@@ -191,11 +204,23 @@ static void launch_update(const sweep_view &s, cudaStream_t stream)
 	unsigned lines = (unsigned)divide_up(size[1], UPDATE_LINES), nx = (unsigned)size[0];
 
 	if (size[2] <= 32)
-		update_view<1><<<dim3(lines, 1, nx), threads, 0, stream>>>(s);
+		update_view<1, COVERED, UNTILTED><<<dim3(lines, 1, nx), threads, 0, stream>>>(s);
 	else if (size[2] <= 64)
-		update_view<2><<<dim3(lines, 1, nx), threads, 0, stream>>>(s);
+		update_view<2, COVERED, UNTILTED><<<dim3(lines, 1, nx), threads, 0, stream>>>(s);
 	else
-		update_view<4><<<dim3(lines, divide_up(size[2], 128), nx), threads, 0, stream>>>(s);
+		update_view<4, COVERED, UNTILTED><<<dim3(lines, divide_up(size[2], 128), nx), threads, 0, stream>>>(s);
+}
+
+static void update_by(const struct plan_shape *shape, const sweep_view &s, cudaStream_t stream)
+{
+	if (shape->covered && shape->untilted)
+		launch_update<true, true>(s, stream);
+	else if (shape->covered)
+		launch_update<true, false>(s, stream);
+	else if (shape->untilted)
+		launch_update<false, true>(s, stream);
+	else
+		launch_update<false, false>(s, stream);
 }
 
 static int sweep_views(struct plan *plan, const float *projections, float *volume, const struct cancel *cancel,
@@ -226,7 +251,7 @@ static int sweep_views(struct plan *plan, const float *projections, float *volum
 		s.partial = plan->partial + (size_t)i * blocks.x * blocks.y;
 		project_view<<<blocks, dim3(32, SWEEP_COLUMNS, SWEEP_PARTS), 0, stream>>>(s);
 		LAUNCHED();
-		launch_update(s, stream);
+		update_by(&plan->shape, s, stream);
 		LAUNCHED();
 	}
 	TRY(layout_from_columns(plan, plan->scratch, volume, err));

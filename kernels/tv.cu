@@ -115,9 +115,10 @@ static __global__ void __launch_bounds__(TILE_X *TILE_Y)
 		along_y[half][ty][tx] = p.inside ? q.y : 0.0f;
 		__syncthreads();
 		if (p.writes)
-			to[at] = c.here +
-				 s.flow * divergence(q, along_x[half][ty][tx - 1], along_y[half][ty - 1][tx], before, s) +
-				 s.fidelity * (fidel - c.here);
+			to[at] =
+			    c.here +
+			    s.flow * divergence(q, along_x[half][ty][tx - 1], along_y[half][ty - 1][tx], before, s) +
+			    s.fidelity * (fidel - c.here);
 		before = q.z;
 		c = ahead;
 		fidel = fidel_ahead;
@@ -176,9 +177,9 @@ static __global__ void __launch_bounds__(TILE_X *TILE_Y)
 	float before = 0;
 
 	if (z > 0)
-		before = projected(dual_at<DUAL, FIRST>(dual, at - plane, voxels),
-				   corner_at(u, at - plane, p, s, z - 1), s)
-			     .z;
+		before =
+		    projected(dual_at<DUAL, FIRST>(dual, at - plane, voxels), corner_at(u, at - plane, p, s, z - 1), s)
+			.z;
 	corner c = corner_at(u, at, p, s, z), c_ahead = c;
 	flux old = dual_at<DUAL, FIRST>(dual, at, voxels), old_ahead = old;
 
@@ -275,7 +276,7 @@ static int run_gradient(struct plan *plan, float *volume, const struct cancel *c
 
 	s.flow = (float)(tv->step * tv->unit);
 	s.fidelity = (float)(tv->step * tv->alpha);
-	s.epsilon2 = (float)(epsilon * epsilon);
+	s.epsilon2 = fmaxf((float)(epsilon * epsilon), 1e-30f); /* a single voxel has no differences: 0, not 0/0 */
 	for (int i = 0; i < tv->iterations; i++) {
 		/* The volume is f until the last step writes over it, each voxel behind its own reading. */
 		float *to = i > 0 && i == tv->iterations - 1 ? volume : work[i % 2];

@@ -4,7 +4,9 @@
  * warm-up, data on the device, the host's call and the final wait included.
  * Prints a table with the goals beside the times, writes JSON when given a file.
  *
- *   gpu_bench [--cases ABCDE] [--json FILE]
+ *   gpu_bench [--cases ABCDET] [--what WORDS] [--precision standard|reference] [--json FILE]
+ *
+ * T stands for TV; --what measures only the rows that contain these words.
  */
 #include <math.h>
 #include <stdio.h>
@@ -27,26 +29,93 @@ struct bench_case {
 };
 
 static const struct bench_case cases[] = {
-    {'A', {.columns = 559, .rows = 559, .views = 100, .arc = 2 * M_PI, .pixel = {.529, .529}, .size = {256, 256, 256},
-	   .spacing = {.3725, .3725, .3725}},
-     {2.35, 2.2}, {1.55, 1.25}, {0, 0}, {1.9, 1.5}, {4.2, 3.6}, {5.5, 5}, {10, 8}, 1},
-    {'B', {.columns = 339, .rows = 339, .views = 100, .arc = 2 * M_PI, .pixel = {.713, .713}, .size = {256, 256, 33},
-	   .spacing = {.3725, .3725, .3725}},
-     {0, 0}, {0, 0}, {0, 0}, {0, 0}, {.9, .8}, {0, 0}, {2.5, 2.2}, 1},
-    {'C', {.columns = 43, .rows = 43, .views = 26, .arc = 2 * M_PI, .pixel = {6.88, 6.88}, .size = {32, 32, 32},
-	   .spacing = {2.98, 2.98, 2.98}},
-     {0, 0}, {0, 0}, {0, 0}, {0, 0}, {.6, .6}, {0, 0}, {0, 0}, 20},
-    {'D', {.columns = 1240, .rows = 960, .views = 496, .arc = 200 * DEGREE, .pixel = {.308, .308}, .size = {512, 512, 512},
-	   .spacing = {.1862, .1862, .1862}},
-     {70, 50}, {60, 42}, {3, 3}, {66, 47}, {135, 95}, {0, 0}, {330, 300}, 1},
-    {'E', {.columns = 1024, .rows = 1024, .views = 720, .arc = 2 * M_PI, .pixel = {.2888, .2888}, .size = {1024, 1024, 1024},
-	   .spacing = {.0931, .0931, .0931}},
-     {240, 175}, {700, 500}, {0, 0}, {715, 515}, {0, 0}, {0, 0}, {0, 0}, 1},
+    {'A',
+     {.columns = 559,
+      .rows = 559,
+      .views = 100,
+      .arc = 2 * M_PI,
+      .pixel = {.529, .529},
+      .size = {256, 256, 256},
+      .spacing = {.3725, .3725, .3725}},
+     {2.35, 2.2},
+     {1.55, 1.25},
+     {0, 0},
+     {1.9, 1.5},
+     {4.2, 3.6},
+     {5.5, 5},
+     {10, 8},
+     1},
+    {'B',
+     {.columns = 339,
+      .rows = 339,
+      .views = 100,
+      .arc = 2 * M_PI,
+      .pixel = {.713, .713},
+      .size = {256, 256, 33},
+      .spacing = {.3725, .3725, .3725}},
+     {0, 0},
+     {0, 0},
+     {0, 0},
+     {0, 0},
+     {.9, .8},
+     {0, 0},
+     {2.5, 2.2},
+     1},
+    {'C',
+     {.columns = 43,
+      .rows = 43,
+      .views = 26,
+      .arc = 2 * M_PI,
+      .pixel = {6.88, 6.88},
+      .size = {32, 32, 32},
+      .spacing = {2.98, 2.98, 2.98}},
+     {0, 0},
+     {0, 0},
+     {0, 0},
+     {0, 0},
+     {.6, .6},
+     {0, 0},
+     {0, 0},
+     20},
+    {'D',
+     {.columns = 1240,
+      .rows = 960,
+      .views = 496,
+      .arc = 200 * DEGREE,
+      .pixel = {.308, .308},
+      .size = {512, 512, 512},
+      .spacing = {.1862, .1862, .1862}},
+     {70, 50},
+     {60, 42},
+     {3, 3},
+     {66, 47},
+     {135, 95},
+     {0, 0},
+     {330, 300},
+     1},
+    {'E',
+     {.columns = 1024,
+      .rows = 1024,
+      .views = 720,
+      .arc = 2 * M_PI,
+      .pixel = {.2888, .2888},
+      .size = {1024, 1024, 1024},
+      .spacing = {.0931, .0931, .0931}},
+     {240, 175},
+     {700, 500},
+     {0, 0},
+     {715, 515},
+     {0, 0},
+     {0, 0},
+     {0, 0},
+     1},
 };
 
 static FILE *json;
 static bool json_first = true;
 static struct device *device;
+static const char *what_wanted = "";
+static bool reference; /* precision */
 
 static void report(char letter, const char *kind, const char *what, double milliseconds, double goal)
 {
@@ -56,8 +125,10 @@ static void report(char letter, const char *kind, const char *what, double milli
 	printf("\n");
 	fflush(stdout);
 	if (json != NULL)
-		fprintf(json, "%s\n  {\"case\": \"%c\", \"geometry\": \"%s\", \"what\": \"%s\", \"ms\": %.4f, \"goal_ms\": %g}",
-			json_first ? "" : ",", letter, kind, what, milliseconds, goal);
+		fprintf(
+		    json,
+		    "%s\n  {\"case\": \"%c\", \"geometry\": \"%s\", \"what\": \"%s\", \"ms\": %.4f, \"goal_ms\": %g}",
+		    json_first ? "" : ",", letter, kind, what, milliseconds, goal);
 	json_first = false;
 }
 
@@ -79,7 +150,7 @@ struct bench {
 };
 typedef void operation(struct bench *bench, struct error *err);
 
-static double measure(struct bench *bench, operation *run, double budget)
+static double milliseconds_of(struct bench *bench, operation *run, double budget)
 {
 	enum { MOST = 9 };
 	double times[MOST], begin = seconds();
@@ -100,10 +171,18 @@ static double measure(struct bench *bench, operation *run, double budget)
 	return times[count / 2];
 }
 
+static void measure(struct bench *bench, char letter, const char *kind, const char *what, operation *run, double goal)
+{
+	const double budget = 1.5;
+
+	if (strstr(what, what_wanted) != NULL)
+		report(letter, kind, what, milliseconds_of(bench, run, budget), goal);
+}
+
 static void run_project(struct bench *bench, struct error *err)
 {
-	must(backend_cuda.project(bench->plan, bench->volume, bench->views, bench->scene.geometry.count, bench->projections,
-				  err),
+	must(backend_cuda.project(bench->plan, bench->volume, bench->views, bench->scene.geometry.count,
+				  bench->projections, err),
 	     err, "project");
 }
 
@@ -132,8 +211,8 @@ static void run_fdk(struct bench *bench, struct error *err)
 	for (int done = 0; done < all; done += batch) {
 		int count = all - done < batch ? all - done : batch;
 
-		must(backend_cuda.filter(bench->plan, bench->projections, NULL, bench->views + done, count, bench->filtered,
-					 err),
+		must(backend_cuda.filter(bench->plan, bench->projections, NULL, bench->views + done, count,
+					 bench->filtered, err),
 		     err, "filter");
 		must(backend_cuda.backproject(bench->plan, bench->filtered, bench->views + done, count, BACKPROJECT_FDK,
 					      bench->volume, err),
@@ -173,7 +252,7 @@ static void fill_volume(struct bench *bench)
 
 static void make_plan(struct bench *bench, struct sart_options *sart, int subsets, const struct tv_options *tv)
 {
-	struct plan_options options = scene_plan(&bench->scene, sart, subsets, tv, false);
+	struct plan_options options = scene_plan(&bench->scene, sart, subsets, tv, reference);
 	struct error err = {0};
 
 	must(backend_cuda.plan_new(device, &options, &bench->plan, &err), &err, "plan");
@@ -184,9 +263,11 @@ static void bench_sart(struct bench *bench, const struct bench_case *c, const ch
 {
 	struct sart_options sart = {.relaxation = 1, .nonnegative = true};
 
+	if (strstr(what, what_wanted) == NULL)
+		return;
 	make_plan(bench, &sart, subsets, NULL);
 	bench->repeat = repeat;
-	report(c->letter, kind, what, measure(bench, run_sart, 2), goal);
+	measure(bench, c->letter, kind, what, run_sart, goal);
 	bench->repeat = 1;
 	backend_cuda.plan_free(bench->plan);
 	subsets_clear(&sart.subsets);
@@ -196,7 +277,6 @@ static void bench_geometry(const struct bench_case *c, bool untilted)
 {
 	struct scene_options options = c->options;
 	const char *kind = untilted ? "untilted" : "any";
-	const double budget = 1.5;
 	struct bench bench = {.repeat = 1};
 	struct error err = {0};
 	int count = options.views, big = c->letter == 'E';
@@ -207,19 +287,20 @@ static void bench_geometry(const struct bench_case *c, bool untilted)
 	for (int i = 0; i < count; i++)
 		bench.views[i] = i;
 	must(backend_cuda.volume_new(device, &bench.scene.grid, &bench.volume, &err), &err, "volume");
-	must(backend_cuda.stack_new(device, options.columns, options.rows, count, &bench.projections, &err), &err, "stack");
+	must(backend_cuda.stack_new(device, options.columns, options.rows, count, &bench.projections, &err), &err,
+	     "stack");
 	make_plan(&bench, NULL, 0, NULL);
 	must(backend_cuda.stack_new(device, options.columns, options.rows, backend_cuda.plan_batch(bench.plan),
 				    &bench.filtered, &err),
 	     &err, "stack");
 	printf("%c: %s\n", c->letter, backend_cuda.plan_summary(bench.plan));
 	fill_volume(&bench);
-	report(c->letter, kind, "forward projection", measure(&bench, run_project, budget), c->project[untilted]);
-	report(c->letter, kind, "backprojection", measure(&bench, run_backproject, budget), c->backproject[untilted]);
-	report(c->letter, kind, "weights and filter", measure(&bench, run_filter, budget), c->filter[untilted]);
-	report(c->letter, kind, "FDK", measure(&bench, run_fdk, budget), c->fdk[untilted]);
+	measure(&bench, c->letter, kind, "forward projection", run_project, c->project[untilted]);
+	measure(&bench, c->letter, kind, "backprojection", run_backproject, c->backproject[untilted]);
+	measure(&bench, c->letter, kind, "weights and filter", run_filter, c->filter[untilted]);
+	measure(&bench, c->letter, kind, "FDK", run_fdk, c->fdk[untilted]);
 	if (untilted)
-		report(c->letter, kind, "norms", measure(&bench, run_norms, budget), 0);
+		measure(&bench, c->letter, kind, "norms", run_norms, 0);
 	fill_volume(&bench);
 	run_project(&bench, &err);
 	backend_cuda.plan_free(bench.plan);
@@ -239,8 +320,13 @@ static void bench_geometry(const struct bench_case *c, bool untilted)
 /* One step of TV: ten of them less none, so that the copies around do not count. */
 static void bench_tv(int size, const double goals[TV_METHOD_COUNT])
 {
-	const struct scene_options options = {.columns = 16, .rows = 16, .views = 2, .arc = 3, .pixel = {10, 10},
-					      .size = {size, size, size}, .spacing = {.3, .3, .3}};
+	const struct scene_options options = {.columns = 16,
+					      .rows = 16,
+					      .views = 2,
+					      .arc = 3,
+					      .pixel = {10, 10},
+					      .size = {size, size, size},
+					      .spacing = {.3, .3, .3}};
 	struct bench bench = {.repeat = 1};
 	struct error err = {0};
 
@@ -255,7 +341,7 @@ static void bench_tv(int size, const double goals[TV_METHOD_COUNT])
 			tv.iterations = i == 0 ? 2 : 22;
 			make_plan(&bench, NULL, 0, &tv);
 			fill_volume(&bench);
-			times[i] = measure(&bench, run_tv, 1);
+			times[i] = milliseconds_of(&bench, run_tv, 1);
 			backend_cuda.plan_free(bench.plan);
 		}
 		snprintf(what, sizeof(what), "TV %s step %d", tv_method_names[method], size);
@@ -291,12 +377,12 @@ static void voxelise_ball(const struct grid *grid, double radius, float density,
 						inside += vec_dot(p, p) < radius * radius;
 					}
 				}
-				values[((size_t)z * (size_t)grid->size[1] + (size_t)y) * (size_t)grid->size[0] + (size_t)x] =
-				    density * (float)inside / 512;
+				values[((size_t)z * (size_t)grid->size[1] + (size_t)y) * (size_t)grid->size[0] +
+				       (size_t)x] = density * (float)inside / 512;
 			}
 }
 
-static void check_ball(const struct bench_case *c, bool untilted, bool reference)
+static void check_ball(const struct bench_case *c, bool untilted)
 {
 	struct scene_options options = c->options;
 	struct bench bench = {.repeat = 1};
@@ -304,7 +390,8 @@ static void check_ball(const struct bench_case *c, bool untilted, bool reference
 	struct error err = {0};
 	const float density = .0213f;
 	int count = options.views;
-	size_t pixels = (size_t)options.columns * (size_t)options.rows, slice = (size_t)options.size[0] * (size_t)options.size[1];
+	size_t pixels = (size_t)options.columns * (size_t)options.rows,
+	       slice = (size_t)options.size[0] * (size_t)options.size[1];
 	double radius = .42 * options.size[0], worst = 0, sum = 0, inner = 0, shift[3];
 	size_t rays = 0, voxels = 0, defects = 0;
 	float *exact = malloc(pixels * (size_t)count * sizeof(float)), *got = malloc(pixels * sizeof(float)), *values;
@@ -324,7 +411,8 @@ static void check_ball(const struct bench_case *c, bool untilted, bool reference
 	struct plan_options plan = scene_plan(&bench.scene, NULL, 0, NULL, reference);
 	must(backend_cuda.plan_new(device, &plan, &bench.plan, &err), &err, "plan");
 	must(backend_cuda.volume_new(device, &bench.scene.grid, &bench.volume, &err), &err, "volume");
-	must(backend_cuda.stack_new(device, options.columns, options.rows, count, &bench.projections, &err), &err, "stack");
+	must(backend_cuda.stack_new(device, options.columns, options.rows, count, &bench.projections, &err), &err,
+	     "stack");
 	must(backend_cuda.stack_new(device, options.columns, options.rows, backend_cuda.plan_batch(bench.plan),
 				    &bench.filtered, &err),
 	     &err, "stack");
@@ -353,20 +441,24 @@ static void check_ball(const struct bench_case *c, bool untilted, bool reference
 	for (int z = 0; z < 5; z++)
 		for (int y = -20; y <= 20; y++)
 			for (int x = -20; x <= 20; x++) {
-				int at[3] = {options.size[0] / 2 + 7 + x, options.size[1] / 2 - 5 + y, options.size[2] / 2 + z};
+				int at[3] = {options.size[0] / 2 + 7 + x, options.size[1] / 2 - 5 + y,
+					     options.size[2] / 2 + z};
 
-				inner += values[(size_t)at[2] * slice + (size_t)at[1] * (size_t)options.size[0] + (size_t)at[0]];
+				inner += values[(size_t)at[2] * slice + (size_t)at[1] * (size_t)options.size[0] +
+						(size_t)at[0]];
 				voxels++;
 			}
 	printf("%c %-9s %s ball: forward mean %.4f %% worst %.3f %%; FDK %.5f of it\n", c->letter,
-	       untilted ? "untilted" : "any", reference ? "reference" : "standard", 100 * sum / (double)rays, 100 * worst,
-	       inner / (double)voxels / density);
+	       untilted ? "untilted" : "any", reference ? "reference" : "standard", 100 * sum / (double)rays,
+	       100 * worst, inner / (double)voxels / density);
 	if (json != NULL)
 		fprintf(json,
-			"%s\n  {\"case\": \"%c\", \"geometry\": \"%s\", \"what\": \"ball\", \"precision\": \"%s\", \"forward_mean\": %.3e, "
+			"%s\n  {\"case\": \"%c\", \"geometry\": \"%s\", \"what\": \"ball\", \"precision\": \"%s\", "
+			"\"forward_mean\": %.3e, "
 			"\"forward_worst\": %.3e, \"fdk\": %.6f}",
-			json_first ? "" : ",", c->letter, untilted ? "untilted" : "any", reference ? "reference" : "standard",
-			sum / (double)rays, worst, inner / (double)voxels / density);
+			json_first ? "" : ",", c->letter, untilted ? "untilted" : "any",
+			reference ? "reference" : "standard", sum / (double)rays, worst,
+			inner / (double)voxels / density);
 	json_first = false;
 	backend_cuda.plan_free(bench.plan);
 	backend_cuda.stack_free(bench.filtered);
@@ -389,6 +481,10 @@ int main(int argc, char **argv)
 	for (int i = 1; i + 1 < argc; i += 2) {
 		if (strcmp(argv[i], "--cases") == 0)
 			wanted = argv[i + 1];
+		else if (strcmp(argv[i], "--what") == 0)
+			what_wanted = argv[i + 1];
+		else if (strcmp(argv[i], "--precision") == 0)
+			reference = strcmp(argv[i + 1], "reference") == 0;
 		else if (strcmp(argv[i], "--json") == 0)
 			json = fopen(argv[i + 1], "we");
 	}
@@ -406,9 +502,9 @@ int main(int argc, char **argv)
 			continue;
 		for (int untilted = 0; untilted < 2; untilted++)
 			bench_geometry(&cases[i], untilted);
-		if (cases[i].letter == 'A' || cases[i].letter == 'D') {
-			check_ball(&cases[i], false, false);
-			check_ball(&cases[i], true, false);
+		if ((cases[i].letter == 'A' || cases[i].letter == 'D') && strstr("ball", what_wanted) != NULL) {
+			check_ball(&cases[i], false);
+			check_ball(&cases[i], true);
 		}
 	}
 	if (strchr(wanted, 'T') != NULL) {

@@ -40,7 +40,8 @@ static void bend_view(struct view *view, enum bend bend, int index, int columns,
 	double wobble = 0.02 * sin(1.7 * index), centre[3];
 
 	for (int i = 0; i < 3; i++)
-		centre[i] = view->pixel0[i] + .5 * (columns - 1) * view->column_step[i] + .5 * (rows - 1) * view->row_step[i];
+		centre[i] =
+		    view->pixel0[i] + .5 * (columns - 1) * view->column_step[i] + .5 * (rows - 1) * view->row_step[i];
 	switch (bend) {
 	case BEND_ROWS_DOWN:
 		for (int i = 0; i < 3; i++) {
@@ -80,7 +81,8 @@ static void bend_view(struct view *view, enum bend bend, int index, int columns,
 		return;
 	}
 	for (int i = 0; i < 3; i++)
-		view->pixel0[i] = centre[i] - .5 * (columns - 1) * view->column_step[i] - .5 * (rows - 1) * view->row_step[i];
+		view->pixel0[i] =
+		    centre[i] - .5 * (columns - 1) * view->column_step[i] - .5 * (rows - 1) * view->row_step[i];
 }
 
 void scene_make(struct scene *ret_scene, const char *name, const struct scene_options *options)
@@ -98,7 +100,8 @@ void scene_make(struct scene *ret_scene, const char *name, const struct scene_op
 	snprintf(scene.name, sizeof(scene.name), "%s", name);
 	for (int i = 0; i < options->views; i++)
 		angles[i] = options->arc * i / options->views + 0.002;
-	must(geometry_circular(&scene.geometry, options->columns, options->rows, options->views, &circular, angles, &err),
+	must(geometry_circular(&scene.geometry, options->columns, options->rows, options->views, &circular, angles,
+			       &err),
 	     &err, name);
 	free(angles);
 	for (int i = 0; i < options->views; i++)
