@@ -39,8 +39,8 @@ struct device_options {
 };
 
 struct device_info {
-	char name[96];     /* "Intel Xeon ... (2 threads, AVX-512)", "NVIDIA H200" */
-	char driver[64];   /* "" on the CPU */
+	char name[96];   /* "Intel Xeon ... (2 threads, AVX-512)", "NVIDIA H200" */
+	char driver[64]; /* "" on the CPU */
 	size_t bytes_total, bytes_free;
 };
 
@@ -50,10 +50,10 @@ enum quantity { QUANTITY_LINE_INTEGRAL, QUANTITY_INTENSITY };
 struct linearise {
 	enum sample sample;
 	enum quantity quantity;
-	double air;         /* counts; used when flat is NULL */
-	const float *flat;  /* [row][column] counts, or NULL; host memory that outlives the plan */
-	const float *dark;  /* [row][column] counts, or NULL for none */
-	double saturation;  /* counts at and above this are defects; 0 = 65535 for uint16, none for float32 */
+	double air;        /* counts; used when flat is NULL */
+	const float *flat; /* [row][column] counts, or NULL; host memory that outlives the plan */
+	const float *dark; /* [row][column] counts, or NULL for none */
+	double saturation; /* counts at and above this are defects; 0 = 65535 for uint16, none for float32 */
 };
 
 /*
@@ -87,9 +87,16 @@ struct plan_options {
 	const struct geometry *geometry;
 	const struct grid *grid;
 	struct linearise linearise;
-	/* FDK, or NULL when none runs: orbit_column_weights and filter_response (pitch 1, length filter_length(columns)). */
+	/* FDK, or NULL when none runs: orbit_column_weights and filter_response (pitch 1, length filter_length of the
+	 * padded columns). */
 	const float *column_weights;  /* [count][columns] */
 	const float *filter_response; /* [length/2 + 1] */
+	/*
+	 * Filtered rows reach pad[0] columns before column 0 and pad[1] after the
+	 * last (orbit.pad): `filter` writes and `backproject` with BACKPROJECT_FDK
+	 * reads stacks of pad[0] + columns + pad[1] columns. 0 but for displaced detectors.
+	 */
+	int pad[2];
 	const struct sart_options *sart; /* NULL: no SART */
 	const struct tv_options *tv;     /* NULL: no TV */
 	bool reference_precision;        /* float everywhere; otherwise storage may be packed within the stated bound */
@@ -136,7 +143,8 @@ struct backend {
 	void (*close)(struct device *device); /* NULL is fine */
 	void (*describe)(struct device *device, struct device_info *ret_info);
 
-	int (*volume_new)(struct device *device, const struct grid *grid, struct volume **ret_volume, struct error *err);
+	int (*volume_new)(struct device *device, const struct grid *grid, struct volume **ret_volume,
+			  struct error *err);
 	void (*volume_free)(struct volume *volume); /* NULL is fine */
 	int (*volume_upload)(struct volume *volume, const float *from, struct error *err);
 	/* Slices z_first .. z_first + z_count - 1. */
@@ -145,15 +153,15 @@ struct backend {
 	int (*volume_copy)(struct volume *to, const struct volume *from, struct error *err);
 
 	int (*stack_new)(struct device *device, int columns, int rows, int slots, struct stack **ret_stack,
-	                 struct error *err);
+			 struct error *err);
 	void (*stack_free)(struct stack *stack); /* NULL is fine */
 	int (*stack_download)(struct stack *stack, int slot, int count, float *ret_to, struct error *err);
 
 	/* Touches no device memory, device may be NULL: it is how a job that cannot fit is refused beforehand. */
 	int (*plan_bytes)(struct device *device, const struct plan_options *options, struct plan_bytes *ret_bytes,
-	                  struct error *err);
+			  struct error *err);
 	int (*plan_new)(struct device *device, const struct plan_options *options, struct plan **ret_plan,
-	                struct error *err);
+			struct error *err);
 	void (*plan_free)(struct plan *plan); /* NULL is fine */
 	/* How this plan does its work, e.g. "untilted, 16 x 16 tiles, AVX-512": said in the job's document. */
 	const char *(*plan_summary)(const struct plan *plan);
@@ -166,16 +174,16 @@ struct backend {
 	 * neighbours in the row and column and added to *defects, never reset.
 	 */
 	int (*linearise)(struct plan *plan, const void *samples, int count, const int *slots, struct stack *to,
-	                 size_t *defects, struct error *err);
+			 size_t *defects, struct error *err);
 	/*
 	 * q = ramp of weights and cosine times p: view views[i] from slot slots[i] of `from` into slot i of `to`.
 	 * slots NULL: slot = view. FDK alone keeps no stack of all views, its slots are those of one batch.
 	 */
 	int (*filter)(struct plan *plan, const struct stack *from, const int *slots, const int *views, int count,
-	              struct stack *to, struct error *err);
+		      struct stack *to, struct error *err);
 	/* volume += sum over i of (weight) * slot i, seen from views[i]. Bilinear; outside of the detector is 0. */
 	int (*backproject)(struct plan *plan, const struct stack *from, const int *views, int count,
-	                   enum backprojection weight, struct volume *to, struct error *err);
+			   enum backprojection weight, struct volume *to, struct error *err);
 	/*
 	 * Slot i = line integrals of the volume along the rays of views[i]: Joseph's
 	 * method, one bilinear sample in every slice of the ray's dominant axis
@@ -187,7 +195,7 @@ struct backend {
 	 * exit, so that the weights of a ray add up to its length inside the grid.
 	 */
 	int (*project)(struct plan *plan, const struct volume *from, const int *views, int count, struct stack *to,
-	               struct error *err);
+		       struct error *err);
 	/*
 	 * One iteration over all subsets, in place:
 	 *   v_j += relaxation * (sum_S w_ij (p_i - sum_m w_im v_m) / sum_m w_im) / sum_S w_ij
@@ -198,12 +206,12 @@ struct backend {
 	 * spacing inside, counts as one that misses.
 	 */
 	int (*sart_iterate)(struct plan *plan, const struct stack *projections, struct volume *volume,
-	                    const struct cancel *cancel, struct sart_sums *ret_sums, struct error *err);
+			    const struct cancel *cancel, struct sart_sums *ret_sums, struct error *err);
 	/* The plan's TV, in place. */
 	int (*tv)(struct plan *plan, struct volume *volume, const struct cancel *cancel, struct error *err);
 	/* `other` may be NULL; unit as in tv_options. */
 	int (*norms)(struct plan *plan, const struct volume *volume, const struct volume *other, double unit,
-	             struct volume_norms *ret_norms, struct error *err);
+		     struct volume_norms *ret_norms, struct error *err);
 	int (*sync)(struct device *device, struct error *err);
 };
 

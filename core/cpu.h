@@ -79,7 +79,11 @@ struct plan {
 	unsigned char *defective; /* [column][row] of one view */
 
 	struct filter_engine *filter; /* NULL without FDK */
-	int filter_batch;             /* views that FDK should filter at once */
+	int wide;                     /* columns of a filtered view, plan_options.pad included */
+	/* How FDK's backprojection sees filtered views: this plan, or a copy with `wide` columns and views of its own.
+	 */
+	struct plan *filtered;
+	int filter_batch; /* views that FDK should filter at once */
 
 	struct sart_options sart;
 	int batch;           /* views whose corrections are held at once; 0 without SART */

@@ -91,8 +91,12 @@ static void tile_add(const struct plan *plan, const struct tile *tile, const flo
 int cpu_backproject(struct plan *plan, const struct stack *from, const int *views, int count,
 		    enum backprojection weight, struct volume *to, struct error *err)
 {
+	const struct plan *seen = weight == BACKPROJECT_FDK ? plan->filtered : plan;
 	const int tiles = tile_count(plan);
 
+	if (from->columns != seen->columns)
+		return error_set(err, ERR_INTERNAL, "%d columns to backproject instead of %d", from->columns,
+				 seen->columns);
 	if (count > from->slots)
 		return error_set(err, ERR_INTERNAL, "%d views to backproject from a stack of %d slots", count,
 				 from->slots);
@@ -104,7 +108,7 @@ int cpu_backproject(struct plan *plan, const struct stack *from, const int *view
 		tile_at(plan, t, &tile);
 		memset(sums, 0, tile_floats(plan) * sizeof(float));
 		for (int i = 0; i < count; i++)
-			plan->device->kernels->backproject(plan, views[i], &tile, weight, stack_slot(from, i), sums,
+			plan->device->kernels->backproject(seen, views[i], &tile, weight, stack_slot(from, i), sums,
 							   NULL);
 		tile_add(plan, &tile, sums, to->data);
 	}

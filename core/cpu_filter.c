@@ -18,6 +18,7 @@ struct filter_engine {
 	const struct geometry *geometry; /* borrowed, as are the weights */
 	const float *column_weights;     /* [view][column] */
 	int length;
+	int pad, wide; /* zero columns before column 0; columns of a filtered row */
 	kiss_fft_cfg forward, inverse;
 	float *response;       /* [length], all frequencies, 1 / length included */
 	kiss_fft_cpx *buffers; /* [threads][2][PAIRS][stride] */
@@ -37,7 +38,7 @@ static size_t buffers_count(int length, int threads)
 
 size_t filter_engine_bytes(const struct plan_options *options, int threads)
 {
-	int length = filter_length(options->geometry->columns);
+	int length = filter_length(options->pad[0] + options->geometry->columns + options->pad[1]);
 	size_t transform = 0;
 
 	kiss_fft_alloc(length, 0, NULL, &transform);
@@ -49,13 +50,15 @@ int filter_engine_new(const struct plan_options *options, int threads, struct fi
 		      struct error *err)
 {
 	struct filter_engine *engine = calloc(1, sizeof(*engine));
-	int length = filter_length(options->geometry->columns);
+	int length = filter_length(options->pad[0] + options->geometry->columns + options->pad[1]);
 
 	if (engine == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for the ramp filter");
 	engine->geometry = options->geometry;
 	engine->column_weights = options->column_weights;
 	engine->length = length;
+	engine->pad = options->pad[0];
+	engine->wide = options->pad[0] + options->geometry->columns + options->pad[1];
 	engine->stride = buffer_stride(length);
 	engine->forward = kiss_fft_alloc(length, 0, NULL, NULL);
 	engine->inverse = kiss_fft_alloc(length, 1, NULL, NULL);
@@ -136,12 +139,15 @@ static void filter_rows(const struct filter_engine *engine, int view, int column
 		for (int i = 0; i < ROWS; i++)
 			values[i] *= weights[i];
 		for (int i = 0; i < PAIRS; i++)
-			in[(size_t)i * stride + (size_t)c] = (kiss_fft_cpx){values[2 * i], values[2 * i + 1]};
+			in[(size_t)i * stride + (size_t)(engine->pad + c)] =
+			    (kiss_fft_cpx){values[2 * i], values[2 * i + 1]};
 	}
 	for (int i = 0; i < pairs; i++) {
 		kiss_fft_cpx *row_in = in + (size_t)i * stride, *row_out = out + (size_t)i * stride;
 
-		memset(row_in + columns, 0, (size_t)(engine->length - columns) * sizeof(*row_in));
+		memset(row_in, 0, (size_t)engine->pad * sizeof(*row_in));
+		memset(row_in + engine->pad + columns, 0,
+		       (size_t)(engine->length - engine->pad - columns) * sizeof(*row_in));
 		kiss_fft(engine->forward, row_in, row_out);
 		for (int k = 0; k < engine->length; k++) {
 			row_out[k].r *= engine->response[k];
@@ -149,7 +155,7 @@ static void filter_rows(const struct filter_engine *engine, int view, int column
 		}
 		kiss_fft(engine->inverse, row_out, row_in);
 	}
-	for (int c = 0; c < columns; c++) {
+	for (int c = 0; c < engine->wide; c++) {
 		float values[ROWS];
 
 		for (int i = 0; i < pairs; i++) {
@@ -168,6 +174,8 @@ int cpu_filter(struct plan *plan, const struct stack *from, const int *slots, co
 
 	if (engine == NULL)
 		return error_set(err, ERR_INTERNAL, "the plan was made without FDK");
+	if (to->columns != plan->wide)
+		return error_set(err, ERR_INTERNAL, "%d columns to filter into instead of %d", to->columns, plan->wide);
 	if (count > to->slots)
 		return error_set(err, ERR_INTERNAL, "%d views to filter into a stack of %d slots", count, to->slots);
 #pragma omp parallel for num_threads(plan->device->threads) schedule(dynamic)
@@ -177,7 +185,7 @@ int cpu_filter(struct plan *plan, const struct stack *from, const int *slots, co
 
 		filter_rows(engine, views[i], plan->columns, plan->rows, row, left < ROWS ? left : ROWS,
 			    stack_slot(from, slots != NULL ? slots[i] : views[i]),
-			    to->data + (size_t)i * (size_t)plan->columns * (size_t)plan->rows, buffers);
+			    to->data + (size_t)i * (size_t)plan->wide * (size_t)plan->rows, buffers);
 	}
 	return 0;
 }

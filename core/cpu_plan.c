@@ -76,6 +76,7 @@ static void plan_shape(const struct plan_options *options, struct plan *ret)
 	ret->columns = geometry->columns;
 	ret->rows = geometry->rows;
 	ret->views = geometry->count;
+	ret->wide = options->pad[0] + geometry->columns + options->pad[1];
 	ret->grid = *grid;
 	volume_strides(grid, &ret->row, &ret->plane);
 	ret->spacing_least = fmin(fmin(grid->spacing[0], grid->spacing[1]), grid->spacing[2]);
@@ -129,7 +130,8 @@ int cpu_plan_bytes(struct device *device, const struct plan_options *options, st
 	*ret_bytes = (struct plan_bytes){
 	    .stack = pixels * (size_t)plan.views * sizeof(float),
 	    .volumes = volume * (size_t)(1 + (options->sart != NULL) + needs_work(&plan) + 4 * needs_dual(&plan)),
-	    .scratch = floats * sizeof(float) + pixels + (size_t)plan.views * sizeof(struct cpu_view) +
+	    .scratch = floats * sizeof(float) + pixels +
+		       (size_t)(1 + (plan.wide > plan.columns)) * (size_t)plan.views * sizeof(struct cpu_view) +
 		       (ray_sums_count(&plan) + (size_t)plan.grid.size[1] * REDUCE) * sizeof(double),
 	    .raw = pixels * (options->linearise.sample == SAMPLE_UINT16 ? sizeof(uint16_t) : sizeof(float)),
 	};
@@ -162,6 +164,30 @@ static void view_set(const struct view *view, const struct grid *grid, struct cp
 			to[3] += from[i] * grid->origin[i];
 		}
 	}
+}
+
+/* Columns are counted from the first padded one. Needs plan->view. */
+static int plan_widen(struct plan *plan, const struct plan_options *options, struct error *err)
+{
+	plan->filtered = plan;
+	if (plan->wide == plan->columns)
+		return 0;
+	plan->filtered = malloc(sizeof(*plan));
+	if (plan->filtered != NULL) {
+		*plan->filtered = *plan;
+		plan->filtered->columns = plan->wide;
+		plan->filtered->view = malloc((size_t)plan->views * sizeof(*plan->view));
+	}
+	if (plan->filtered == NULL || plan->filtered->view == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a plan of %d views", plan->views);
+	for (int i = 0; i < plan->views; i++) {
+		struct cpu_view *view = &plan->filtered->view[i];
+
+		*view = plan->view[i];
+		for (int k = 0; k < 4; k++)
+			view->matrix[k] += options->pad[0] * view->matrix[8 + k];
+	}
+	return 0;
 }
 
 static int plan_volume(struct plan *plan, struct volume **ret_volume, struct error *err)
@@ -216,6 +242,11 @@ int cpu_plan_new(struct device *device, const struct plan_options *options, stru
 	}
 	for (int i = 0; i < plan->views; i++)
 		view_set(&options->geometry->views[i], &plan->grid, &plan->view[i]);
+	code = plan_widen(plan, options, err);
+	if (code < 0) {
+		cpu_plan_free(plan);
+		return code;
+	}
 	snprintf(plan->summary, sizeof(plan->summary), "%s, %d thread%s, %s",
 		 plan->untilted ? "untilted" : "any geometry", device->threads, device->threads == 1 ? "" : "s",
 		 device->kernels->name);
@@ -240,6 +271,10 @@ void cpu_plan_free(struct plan *plan)
 	for (int i = 0; i < 3; i++)
 		backend_cpu.volume_free(plan->dual[i]);
 	filter_engine_free(plan->filter);
+	if (plan->filtered != NULL && plan->filtered != plan) {
+		free(plan->filtered->view);
+		free(plan->filtered);
+	}
 	free(plan->view);
 	free(plan->defective);
 	free(plan->reduce);

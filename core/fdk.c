@@ -17,10 +17,11 @@
 int fdk_weights_make(struct fdk_weights *ret_weights, const struct orbit *orbit, const struct geometry *geometry,
 		     enum window window, double cutoff, struct error *err)
 {
-	int length = filter_length(geometry->columns), code = 0;
+	int length = filter_length(orbit->pad[0] + geometry->columns + orbit->pad[1]), code = 0;
 	struct fdk_weights weights = {
 	    .columns = malloc(sizeof(float) * (size_t)geometry->count * (size_t)geometry->columns),
 	    .response = malloc(sizeof(float) * ((size_t)length / 2 + 1)),
+	    .pad = {orbit->pad[0], orbit->pad[1]},
 	};
 
 	if (weights.columns == NULL || weights.response == NULL) {
@@ -55,10 +56,11 @@ int fdk_batch(const struct backend *backend, const struct plan *plan, int views)
 }
 
 int fdk_open(struct fdk *ret_fdk, const struct backend *backend, struct device *device, struct plan *plan,
-	     const struct geometry *geometry, struct error *err)
+	     const struct geometry *geometry, const int pad[2], struct error *err)
 {
 	struct fdk fdk = {.backend = backend, .plan = plan, .batch = fdk_batch(backend, plan, geometry->count)};
-	int code = backend->stack_new(device, geometry->columns, geometry->rows, fdk.batch, &fdk.filtered, err);
+	int code = backend->stack_new(device, pad[0] + geometry->columns + pad[1], geometry->rows, fdk.batch,
+				      &fdk.filtered, err);
 
 	if (code < 0)
 		return code;

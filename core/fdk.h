@@ -9,6 +9,7 @@
 struct fdk_weights {
 	float *columns;  /* [view][column], owned */
 	float *response; /* [length/2 + 1], owned */
+	int pad[2];      /* orbit.pad */
 };
 
 /* Free with fdk_weights_clear. */
@@ -26,7 +27,7 @@ enum { FDK_BATCH_MOST = 32 };
 struct fdk {
 	const struct backend *backend;
 	struct plan *plan;                                /* borrowed */
-	struct stack *filtered;                           /* [batch][row][column], owned */
+	struct stack *filtered;                           /* [batch][row][padded column], owned */
 	int batch;                                        /* views in one go */
 	int pending;                                      /* views that wait for their batch to be full */
 	int views[FDK_BATCH_MOST], slots[FDK_BATCH_MOST]; /* of those, and where they lie */
@@ -35,7 +36,7 @@ struct fdk {
 /* Views in one go for this plan and this many views. */
 int fdk_batch(const struct backend *backend, const struct plan *plan, int views);
 int fdk_open(struct fdk *ret_fdk, const struct backend *backend, struct device *device, struct plan *plan,
-	     const struct geometry *geometry, struct error *err);
+	     const struct geometry *geometry, const int pad[2], struct error *err);
 void fdk_clear(struct fdk *fdk);
 
 /* Takes the view that lies in this slot of `from`; when the batch is full, fdk_flush. */

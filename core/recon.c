@@ -75,6 +75,7 @@ static struct plan_options plan_options(const struct recipe *recipe, const struc
 	    .linearise = *linearise,
 	    .column_weights = recipe->fdk.on ? weights->columns : NULL,
 	    .filter_response = recipe->fdk.on ? weights->response : NULL,
+	    .pad = {recipe->fdk.on ? weights->pad[0] : 0, recipe->fdk.on ? weights->pad[1] : 0},
 	    .sart = recipe->sart.on ? sart : NULL,
 	    .tv = recipe->tv.on ? &recipe->tv.options : NULL,
 	    .reference_precision = recipe->reference_precision,
@@ -99,7 +100,7 @@ static int memory_needed(const struct backend *backend, struct device *device, c
 	struct plan_bytes bytes;
 	struct device_info info;
 	int views = options->geometry->count;
-	size_t slot, batch;
+	size_t slot, batch, columns = (size_t)options->geometry->columns;
 	int code = backend->plan_bytes(device, options, &bytes, err);
 
 	if (code < 0)
@@ -108,7 +109,9 @@ static int memory_needed(const struct backend *backend, struct device *device, c
 	batch = slot * (size_t)(views < FDK_BATCH_MOST ? views : FDK_BATCH_MOST);
 	memory.projections = options->sart != NULL ? bytes.stack : batch;
 	memory.volumes = bytes.volumes;
-	memory.scratch = bytes.scratch + bytes.raw + (options->column_weights != NULL ? batch : 0);
+	memory.scratch = bytes.scratch + bytes.raw;
+	if (options->column_weights != NULL)
+		memory.scratch += batch / columns * (columns + (size_t)(options->pad[0] + options->pad[1]));
 	memory.total = memory.projections + memory.volumes + memory.scratch;
 	if (device != NULL) {
 		backend->describe(device, &info);
@@ -122,7 +125,7 @@ int recon_memory(const struct backend *backend, struct device *device, const str
 		 const struct recipe *recipe, struct recon_memory *ret_memory, struct error *err)
 {
 	float some = 0; /* stands for the weights: only whether there are any is asked here */
-	const struct fdk_weights weights = {.columns = &some, .response = &some};
+	struct fdk_weights weights = {.columns = &some, .response = &some};
 	const struct linearise linearise = {.sample = SAMPLE_FLOAT32};
 	struct recipe resolved = *recipe;
 	struct orbit orbit;
@@ -132,6 +135,7 @@ int recon_memory(const struct backend *backend, struct device *device, const str
 
 	if (code < 0)
 		return code;
+	memcpy(weights.pad, orbit.pad, sizeof(weights.pad));
 	code = recipe_resolve(&resolved, geometry, &orbit, err);
 	if (code == 0 && resolved.sart.on)
 		code = sart_options_make(&sart, &resolved, &orbit, err);
@@ -195,7 +199,7 @@ static int recon_allocate(struct recon *recon, struct error *err)
 	if (code == 0)
 		code = backend->plan_new(recon->device, &options, &recon->plan, err);
 	if (code == 0 && recipe->fdk.on)
-		code = fdk_open(&recon->fdk, backend, recon->device, recon->plan, geometry, err);
+		code = fdk_open(&recon->fdk, backend, recon->device, recon->plan, geometry, recon->weights.pad, err);
 	if (code == 0)
 		code =
 		    backend->stack_new(recon->device, geometry->columns, geometry->rows,
