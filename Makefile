@@ -3,13 +3,18 @@
 
 .DEFAULT_GOAL := all
 BUILD ?= build
-CC ?= gcc
+ifeq ($(origin CC),default)
+CC := gcc
+endif
+# V=1 shows the commands.
+V ?= 0
 NVCC ?= nvcc
 # CUDA=0 leaves the CUDA backend out; otherwise it is built where nvcc is found.
 CUDA ?= $(if $(shell command -v $(NVCC) 2>/dev/null),1,0)
 # Machine code for these cards, and PTX for later ones. CUDA_ARCH=90 for a quick build.
 CUDA_ARCH ?= 75 80 86 89 90 100 120
 SANITIZE ?=
+SANITIZED ?= 0
 WERROR ?= 1
 prefix ?= /usr/local
 
@@ -30,9 +35,11 @@ pkg = $(shell pkg-config $(1) $(2) 2>/dev/null)
 WARN   := -Wall -Wextra -Wpedantic $(if $(filter 1,$(WERROR)),-Werror)
 CFLAGS ?= -O2 -g
 OPENMP ?= -fopenmp
+pkg_cflags := $(call pkg,--cflags,$(all_libs))
 # Errors of the maths library are not read from errno, traps are off: the compiler may vectorise.
-override CFLAGS += -std=c11 -D_GNU_SOURCE -I. $(WARN) $(or $(OPENMP),-Wno-unknown-pragmas) -fno-math-errno -fno-trapping-math -MMD -MP \
-                   $(call pkg,--cflags,$(all_libs)) $(if $(SANITIZE),-fsanitize=$(SANITIZE) -fno-omit-frame-pointer)
+override CFLAGS += -std=c11 -D_GNU_SOURCE -I. $(WARN) $(or $(OPENMP),-Wno-unknown-pragmas) -fno-math-errno \
+                   -fno-trapping-math -MMD -MP $(pkg_cflags) \
+                   $(if $(SANITIZE),-fsanitize=$(SANITIZE) -fno-omit-frame-pointer)
 override LDFLAGS += $(OPENMP) $(if $(SANITIZE),-fsanitize=$(SANITIZE))
 LIBM := -lm -lpthread
 
@@ -50,6 +57,9 @@ daemon_sources := $(filter-out daemon/worker.c,$(wildcard daemon/*.c))
 state_sources  := $(wildcard daemon/store*.c) $(patsubst %,daemon/%.c,job queue document supervise spawn files id log watch)
 cbct_sources   := $(wildcard clients/cbct/*.c)
 unit_sources   := $(wildcard tests/unit/*.c)
+
+# say NAME: a short line for a recipe, its commands with V=1
+say = $(if $(filter 1,$(V)),,@echo '  $(1)' '$(patsubst $(BUILD)/%,%,$@)';)
 
 objects      = $(patsubst %.c,$(BUILD)/%.o,$(1))
 simd_objects := $(foreach isa,$(SIMD_ISAS),$(patsubst %.c,$(BUILD)/%.$(isa).o,$(simd_sources)))
@@ -70,41 +80,41 @@ all: $(programs) ## the programs, in build/
 
 $(BUILD)/%.o: %.c
 	@mkdir -p $(@D)
-	$(CC) $(CFLAGS) -c -o $@ $<
+	$(call say,CC  )$(CC) $(CFLAGS) -c -o $@ $<
 
 define simd_rule
 $(BUILD)/%.$(1).o: %.c
 	@mkdir -p $$(@D)
-	$$(CC) $$(CFLAGS) -O3 $$(flags_$(1)) -DSIMD_ISA=$(1) -DSIMD_$(1)=1 -c -o $$@ $$<
+	$$(call say,CC  )$$(CC) $$(CFLAGS) -O3 $$(flags_$(1)) -DSIMD_ISA=$(1) -DSIMD_$(1)=1 -c -o $$@ $$<
 endef
 $(foreach isa,$(SIMD_ISAS),$(eval $(call simd_rule,$(isa))))
 
 $(BUILD)/kernels/%.o: kernels/%.cu
 	@mkdir -p $(@D)
-	$(NVCC) -std=c++17 -O3 -lineinfo -I. $(cuda_code) -Xcompiler -Wall,-Wextra -MMD -MP -c -o $@ $<
+	$(call say,NVCC)$(NVCC) -std=c++17 -O3 -lineinfo -I. $(cuda_code) -Xcompiler -Wall,-Wextra -MMD -MP -c -o $@ $<
 
 # The daemon and the client use the library's backends by table; only the worker,
 # the client's `recon` and the GPU tests know of CUDA's row (core/backend.c).
 $(library): $(core_objects) $(call objects,$(proto_sources))
 	@rm -f $@
-	$(AR) rcs $@ $^
+	$(call say,AR  )$(AR) rcs $@ $^
 
 $(BUILD)/cbctd: $(call objects,$(daemon_sources)) $(library)
-	$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(daemon_libs) $(proto_libs) $(core_libs)) $(LIBM)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(daemon_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
 $(BUILD)/cbct-worker: $(call objects,daemon/worker.c) $(library) $(cuda_objects)
-	$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(cuda_libs) $(LIBM)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(cuda_libs) $(LIBM)
 
 $(BUILD)/cbct: $(call objects,$(cbct_sources)) $(library)
-	$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(cbct_libs) $(proto_libs) $(core_libs)) $(LIBM)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(cbct_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
 $(BUILD)/unit: $(call objects,$(unit_sources) $(state_sources)) $(library)
-	$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,check sqlite3 $(proto_libs) $(core_libs)) $(LIBM)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,check sqlite3 $(proto_libs) $(core_libs)) $(LIBM)
 
 # The GPU's checks and benchmarks need the mathematics and the kernels only, so that they run on a bare machine.
 gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench
 $(gpu_programs): $(BUILD)/%: $(call objects,tests/bench/%.c tests/bench/gpu_scene.c) $(core_objects) $(cuda_objects)
-	$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(cuda_libs) $(LIBM)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(cuda_libs) $(LIBM)
 
 setup: ## install the Debian packages that are missing
 	@missing=""; \
@@ -124,13 +134,13 @@ demo: setup ## a C-arm scan posted with curl, reconstructed, its volumes coming 
 
 check: setup ## every test; what cannot run here is skipped aloud
 	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/unit
-	@BUILD=$(BUILD) tests/run.sh
+	@BUILD=$(BUILD) SANITIZED=$(SANITIZED) tests/run.sh
 
 FUZZ_SECONDS ?= 10
 fuzzers := $(patsubst tests/fuzz/%.c,$(BUILD)/%,$(wildcard tests/fuzz/fuzz_*.c))
 
 $(BUILD)/fuzz_%: $(BUILD)/tests/fuzz/fuzz_%.o $(BUILD)/daemon/http_text.o $(library)
-	$(CC) $(LDFLAGS) -fsanitize=fuzzer -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(LIBM)
+	$(call say,LINK)$(CC) $(LDFLAGS) -fsanitize=fuzzer -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(LIBM)
 
 fuzzers: $(fuzzers)
 
@@ -154,10 +164,10 @@ bench-gpu: ## times of the CUDA backend beside their goals, results in build/ben
 	@$(BUILD)/gpu_bench --json $(BUILD)/bench/gpu.json
 
 asan: setup ## the tests under the address and undefined-behaviour sanitizers
-	@$(MAKE) --no-print-directory check BUILD=build/asan SANITIZE=address,undefined CUDA=0
+	@$(MAKE) --no-print-directory check SANITIZED=1 BUILD=build/asan SANITIZE=address,undefined CUDA=0
 
 tsan: setup ## the daemon's tests under the thread sanitizer (OpenMP's runtime left out)
-	@$(MAKE) --no-print-directory check BUILD=build/tsan SANITIZE=thread OPENMP= CUDA=0
+	@$(MAKE) --no-print-directory check SANITIZED=1 BUILD=build/tsan SANITIZE=thread OPENMP= CUDA=0
 
 lint: ## who includes whom, and the house's other rules
 	@tests/lint.sh
