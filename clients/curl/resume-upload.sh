@@ -33,7 +33,7 @@ echo "missing: $missing"
 
 # Each missing run is one request, with a digest of its bytes (RFC 9530) that the daemon checks.
 jq -r '.[] | "\(.[0]) \(.[1])"' <<<"$missing" | while read -r first last; do
-	tail -c +$((first * one + 1)) "$work/projections.raw" | head -c $(((last - first + 1) * one)) >"$work/run"
+	head -c $(((last + 1) * one)) "$work/projections.raw" | tail -c $(((last - first + 1) * one)) >"$work/run"
 	digest=$(openssl dgst -sha256 -binary "$work/run" | base64)
 	curl -sS --fail-with-body -o /dev/null -w "projections $first-$last: status %{http_code}\n" \
 		-H "Content-Digest: sha-256=:$digest:" -T "$work/run" "$url/v1/scans/$scan/projections/$first-$last"
