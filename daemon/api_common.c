@@ -40,9 +40,19 @@ int query_choice(struct request *request, const char *name, const char *const *n
 	return 0;
 }
 
+static ssize_t read_nothing(void *context, uint64_t offset, void *to, size_t size)
+{
+	(void)context;
+	(void)offset;
+	(void)to;
+	(void)size;
+	return 0;
+}
+
 static int reply_not_modified(struct request *request, const struct entity *entity, struct error *err)
 {
-	if (request_reply_empty(request, 304, err) != 0)
+	/* Its headers are those of a 200, the length too, but no body is ever sent. */
+	if (request_reply_read(request, 304, entity->size, read_nothing, NULL, NULL, err) != 0)
 		return err->code;
 	request_reply_header(request, "ETag", "%s", entity->etag);
 	request_reply_header(request, "Vary", "Accept-Encoding");

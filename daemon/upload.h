@@ -19,8 +19,10 @@
  * fast client is slowed down to the disk's pace.
  *
  * Each whole projection counts by itself: what came before a break is kept.
- * With a Content-Digest it is all or nothing: projections are written under
- * their claims as they come, but recorded only when the digest was right.
+ * Where the end of a body may show that all of it was wrong (a digest, a
+ * compressed frame, a length not told before), projections are written under
+ * their claims as they come, but recorded only at the end, or at a break; with
+ * a Content-Digest it is all or nothing.
  */
 struct uploads;
 struct upload; /* one request's; belongs to its connection's thread */
