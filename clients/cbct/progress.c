@@ -96,6 +96,15 @@ void progress_show(struct progress *progress, double fraction, double seconds_le
 	}
 }
 
+void progress_clear(struct progress *progress)
+{
+	if (progress == NULL || !progress->drawn)
+		return;
+	fputs("\r\033[K", progress->to);
+	fflush(progress->to);
+	progress->drawn = false;
+}
+
 void progress_free(struct progress *progress)
 {
 	if (progress == NULL)

@@ -15,6 +15,8 @@ struct progress *progress_new(FILE *to, enum progress_style style, const char *l
 /* fraction 0..1; seconds_left < 0: guessed from the time so far. */
 void progress_show(struct progress *progress, double fraction, double seconds_left, const char *format, ...)
     __attribute__((format(printf, 4, 5)));
+/* Takes the bar off the line, so that something else can be printed there. */
+void progress_clear(struct progress *progress);
 /* Leaves the last bar standing. */
 void progress_free(struct progress *progress);
 

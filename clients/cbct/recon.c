@@ -60,16 +60,20 @@ static void on_row(void *context, const struct history_row *row)
 
 static void on_warning(void *context, const char *code, const char *detail)
 {
-	(void)context;
+	struct display *display = context;
+
+	progress_clear(display->progress);
 	fprintf(stderr, "warning: %s: %s\n", code, detail);
 }
 
 static int on_volume(void *context, const struct kept_volume *volume, const struct saved_volume *saved,
 		     struct error *err)
 {
-	(void)context;
+	struct display *display = context;
+
 	(void)volume;
 	(void)err;
+	progress_clear(display->progress);
 	puts(saved->path);
 	fflush(stdout);
 	return 0;
