@@ -5,7 +5,9 @@
  *
  * General: any 3x4 matrix. Of every four voxels three are sampled by the texture
  * unit and one by four plain loads, about the ratio of what the two pipes can do;
- * loads alone for reference precision.
+ * loads alone for reference precision. Where a sum is divided by its coverage, the
+ * texture unit's 8-bit weights would not cancel at the detector's edges: there it
+ * samples with the edges held, and the exact coverage is a factor.
  *
  * Untilted: a voxel column along z has one detector column u, one depth and an
  * even spacing 1 + e of rows in each view. VOXELS of them need VOXELS + 2 rows:
@@ -90,7 +92,15 @@ static __device__ __forceinline__ void put_voxels(const backprojection_job &job,
 	}
 }
 
-template <int VOXELS, int ACROSS, int ALONG, bool TEXTURE>
+enum sampling_by { BY_LOADS, BY_TEXTURE, BY_TEXTURE_HELD };
+
+/* The part of a bilinear sample that lies on the detector, along one direction. */
+static __device__ __forceinline__ float coverage_at(float position, float count)
+{
+	return __saturatef(fminf(position + 1.0f, count - position));
+}
+
+template <int VOXELS, int ACROSS, int ALONG, int SAMPLING>
 static __global__ void __launch_bounds__(ACROSS *ALONG) backproject_general(const backprojection_job job)
 {
 	int x = blockIdx.x * ACROSS + threadIdx.x, y = blockIdx.y * ALONG + threadIdx.y, z = blockIdx.z * VOXELS;
@@ -111,8 +121,10 @@ static __global__ void __launch_bounds__(ACROSS *ALONG) backproject_general(cons
 			float w = reciprocal(fmaf((float)k, m[10], c));
 			float u = fmaf((float)k, m[2], a) * w, v = fmaf((float)k, m[6], b) * w, value;
 
-			if (TEXTURE && k % 4 != 3) {
-				value = tex2DLayered<float>(job.texture, u + 0.5f, v + 0.5f, i);
+			if (SAMPLING != BY_LOADS && k % 4 != 3) {
+				value = tex2DLayered<float>(job.texture, u + 0.5f, v + 0.5f, i & 0x7ff);
+				if (SAMPLING == BY_TEXTURE_HELD)
+					value *= coverage_at(u, job.columns) * coverage_at(v, job.rows);
 			} else {
 				u = fminf(fmaxf(u, -1.0f), job.columns);
 				v = fminf(fmaxf(v, -1.0f), job.rows);
@@ -188,7 +200,7 @@ static __global__ void __launch_bounds__(256) sum_coverage(const backprojection_
 		float w = reciprocal(fmaf(m[8], fx, fmaf(m[9], fy, fmaf(m[10], fz, m[11]))));
 		float u = a * w, v = b * w;
 
-		sum += __saturatef(fminf(u + 1.0f, job.columns - u)) * __saturatef(fminf(v + 1.0f, job.rows - v));
+		sum += coverage_at(u, job.columns) * coverage_at(v, job.rows);
 	}
 	job.volume[((size_t)z * job.ny + y) * job.nx + x] += sum;
 }
@@ -202,16 +214,39 @@ static __global__ void __launch_bounds__(256) update_from(const float *__restric
 		put_voxels<1>(job, x, y, z, sum + ((size_t)z * job.ny + y) * job.nx + x);
 }
 
+/* Whose views are in constant memory, so that they are not brought there again. */
+static struct {
+	const struct plan *plan;
+	unsigned long list;
+	int first, count;
+} loaded;
+
 static int load_matrices(struct plan *plan, int first, int count, struct error *err)
 {
 	cudaStream_t stream = plan->device->stream;
 
+	if (loaded.plan == plan && loaded.list == plan->views_list && loaded.first == first && loaded.count == count)
+		return 0;
 	gather<<<divide_up(count * 12, 256), 256, 0, stream>>>(plan->geometry, plan->views + first, count,
 							       plan->matrices);
 	LAUNCHED();
 	CUDA_TRY(cudaMemcpyToSymbolAsync(matrices, plan->matrices, (size_t)count * 12 * sizeof(float), 0,
 					 cudaMemcpyDeviceToDevice, stream));
+	loaded.plan = plan;
+	loaded.list = plan->views_list;
+	loaded.first = first;
+	loaded.count = count;
 	return 0;
+}
+
+int backproject_prepare(struct plan *plan, int first, int count, struct error *err)
+{
+	return load_matrices(plan, first, count, err);
+}
+
+void backproject_forget(void)
+{
+	loaded.plan = NULL;
 }
 
 static int load_array(struct plan *plan, const float *from, int count, struct error *err)
@@ -236,13 +271,13 @@ static void launch_untilted(const backprojection_job &job, cudaStream_t stream)
 	backproject_untilted<VOXELS, WINDOWS, ACROSS, ALONG><<<blocks, dim3(ACROSS, ALONG), 0, stream>>>(job);
 }
 
-template <bool TEXTURE>
+template <int SAMPLING>
 static void launch_general(const backprojection_job &job, cudaStream_t stream)
 {
 	const int voxels = 8, side = 16;
 	dim3 blocks(divide_up(job.nx, side), divide_up(job.ny, side), divide_up(job.nz, voxels));
 
-	backproject_general<voxels, side, side, TEXTURE><<<blocks, dim3(side, side), 0, stream>>>(job);
+	backproject_general<voxels, side, side, SAMPLING><<<blocks, dim3(side, side), 0, stream>>>(job);
 }
 
 static backprojection_job job_make(const struct plan *plan, float *volume, struct voxel_use use)
@@ -286,9 +321,14 @@ static int launch(struct plan *plan, backprojection_job &job, struct error *err)
 	default:
 		if (plan->shape.textures) {
 			TRY(load_array(plan, job.from, job.views, err));
-			launch_general<true>(job, stream);
+			if (job.use.coverage != NULL) {
+				job.texture = plan->projections.held;
+				launch_general<BY_TEXTURE_HELD>(job, stream);
+			} else {
+				launch_general<BY_TEXTURE>(job, stream);
+			}
 		} else {
-			launch_general<false>(job, stream);
+			launch_general<BY_LOADS>(job, stream);
 		}
 	}
 	LAUNCHED();

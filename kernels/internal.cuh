@@ -157,6 +157,7 @@ struct columns_shape columns_shape_make(const int size[3]);
 struct layered { /* a layered 2D array with its texture: hardware bilinear samples */
 	cudaArray_t array;
 	cudaTextureObject_t texture;
+	cudaTextureObject_t held; /* the same with the edges held, whatever `texture` has beyond them */
 	int width, height, layers;
 	size_t bytes;
 };
@@ -203,6 +204,7 @@ struct plan {
 
 	int *views_host; /* what `views` holds, so that the same list is not copied again */
 	int views_held;
+	unsigned long views_list;     /* changes with the list, over all plans */
 	int *views;                   /* [count], device: the views of the call in hand */
 	int *slots;                   /* [count], device: their slots, for those that need them */
 	struct device_view *geometry; /* [count], device */
@@ -280,6 +282,12 @@ int backproject_views(struct plan *plan, const float *from, int first, int count
 		      struct error *err);
 /* Views that one launch takes. */
 enum { VIEWS_AT_ONCE = 1024 };
+/*
+ * The matrices of the next call stay in constant memory until another list of
+ * views is used: what is recorded finds them there when they are brought before.
+ */
+int backproject_prepare(struct plan *plan, int first, int count, struct error *err);
+void backproject_forget(void);
 int coverage_sum(struct plan *plan, int first, int count, struct error *err);
 
 /* ---- filter.cu ---- */

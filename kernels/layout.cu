@@ -47,40 +47,54 @@ struct columns_shape columns_shape_make(const int size[3])
 	shape.nz = size[2];
 	/* Long columns start on cache lines, short ones on sectors; the next value behind a column can be read. */
 	shape.pitch = round_up(size[2] + 1, size[2] >= 128 ? 32 : 8);
-	shape.floats = (size_t)shape.nx * (size_t)shape.ny * (size_t)shape.pitch + 32;
+	/* One more plane and column: read with weight 0 at the far ends. */
+	shape.floats = ((size_t)shape.nx + 1) * (size_t)shape.ny * (size_t)shape.pitch + (size_t)shape.pitch + 32;
 	return shape;
 }
 
 enum { TILE = 32, TILE_ROWS = 8 };
 
-/* Writes a value, and where it begins a panel also behind the one before. */
-static __device__ __forceinline__ void put(float *slice, const slices &to, int row, int fast, float value)
+/* A value at row z; at the ends of the rows also what is held beyond them. */
+static __device__ __forceinline__ void put_rows(float *at, int row, int z, int nz, float value)
 {
-	if (to.panel == 0) {
-		slice[row * to.row + fast] = value;
-		return;
-	}
-	int place = fast + 1, panel = place / (PANEL - 1), within = place - panel * (PANEL - 1);
-	float *at = slice + (panel * to.panel + row * PANEL + within);
-
-	*at = value;
-	if (within == 0 && panel > 0)
-		at[PANEL - 1 - to.panel] = value;
+	at[z * row] = value;
+	if (z == 0)
+		for (int i = 1; i <= SLICE_HELD; i++)
+			at[-i * row] = value;
+	if (z == nz - 1)
+		for (int i = 1; i <= SLICE_HELD; i++)
+			at[(z + i) * row] = value;
 }
 
-/* The same and, at the ends of the fast and the row axis, what is held beyond them. */
-static __device__ __forceinline__ void put_held(const slices &to, int slice, int row, int rows, int fast, int count,
-						float value)
+/* The values of a thread: TILE / TILE_ROWS slices, one place along the fast axis. */
+static __device__ __forceinline__ void put_slices(const slices &to, int first, int slices_count, int fast, int count,
+						  int z, int nz, const float value[TILE / TILE_ROWS])
 {
-	int from = row == 0 ? -SLICE_HELD : row, until = row == rows - 1 ? rows - 1 + SLICE_HELD : row;
-	float *data = to.data + to.slice * (size_t)slice;
+	if (fast >= count)
+		return;
+	int place = fast + 1, panel = to.panel > 0 ? place / (PANEL - 1) : 0, within = place - panel * (PANEL - 1);
+	int main = to.panel > 0 ? panel * to.panel + within : fast;
+	bool doubled = to.panel > 0 && within == 0 && panel > 0;
 
-	for (int j = from; j <= until; j++) {
-		put(data, to, j, fast, value);
+#pragma unroll
+	for (int k = 0; k < TILE / TILE_ROWS; k++) {
+		int i = first + k * TILE_ROWS;
+
+		if (i >= slices_count)
+			break;
+		float *slice = to.data + to.slice * (size_t)i;
+		put_rows(slice + main, to.row, z, nz, value[k]);
+		if (doubled)
+			put_rows(slice + (main - to.panel + PANEL - 1), to.row, z, nz, value[k]);
 		if (fast == 0)
-			put(data, to, j, -1, value);
-		if (fast == count - 1)
-			put(data, to, j, count, value);
+			put_rows(slice + main - 1, to.row, z, nz, value[k]);
+		if (fast == count - 1) {
+			int next = to.panel > 0 ? (place + 1) / (PANEL - 1) : 0, rest = place + 1 - next * (PANEL - 1);
+
+			put_rows(slice + (to.panel > 0 ? next * to.panel + rest : count), to.row, z, nz, value[k]);
+			if (to.panel > 0 && rest == 0)
+				put_rows(slice + (next - 1) * to.panel + PANEL - 1, to.row, z, nz, value[k]);
+		}
 	}
 }
 
@@ -89,25 +103,24 @@ static __global__ void __launch_bounds__(TILE *TILE_ROWS)
     to_slices(const float *__restrict__ volume, int nx, int ny, int nz, const slices across_x, const slices across_y)
 {
 	__shared__ float tile[TILE][TILE + 1];
-	int x0 = blockIdx.x * TILE, y0 = blockIdx.y * TILE, z = blockIdx.z;
+	int x0 = blockIdx.x * TILE, y0 = blockIdx.y * TILE, z = blockIdx.z, tx = threadIdx.x, ty = threadIdx.y;
+	float value[TILE / TILE_ROWS];
 
-	for (int j = threadIdx.y; j < TILE; j += TILE_ROWS) {
-		int x = x0 + threadIdx.x, y = y0 + j;
+#pragma unroll
+	for (int k = 0; k < TILE / TILE_ROWS; k++) {
+		int x = x0 + tx, y = y0 + ty + k * TILE_ROWS;
 
-		if (x < nx && y < ny) {
-			float value = volume[((size_t)z * ny + y) * nx + x];
-
-			tile[j][threadIdx.x] = value;
-			put_held(across_y, y, z, nz, x, nx, value);
-		}
+		value[k] = x < nx && y < ny ? volume[((size_t)z * ny + y) * nx + x] : 0.0f;
 	}
+#pragma unroll
+	for (int k = 0; k < TILE / TILE_ROWS; k++)
+		tile[ty + k * TILE_ROWS][tx] = value[k];
+	put_slices(across_y, y0 + ty, ny, x0 + tx, nx, z, nz, value);
 	__syncthreads();
-	for (int j = threadIdx.y; j < TILE; j += TILE_ROWS) {
-		int x = x0 + j, y = y0 + threadIdx.x;
-
-		if (x < nx && y < ny)
-			put_held(across_x, x, z, nz, y, ny, tile[threadIdx.x][j]);
-	}
+#pragma unroll
+	for (int k = 0; k < TILE / TILE_ROWS; k++)
+		value[k] = tile[tx][ty + k * TILE_ROWS];
+	put_slices(across_x, x0 + ty, nx, y0 + tx, ny, z, nz, value);
 }
 
 static int copy_to_array(const struct layered *to, const struct slices_shape *shape, const float *data,

@@ -171,6 +171,12 @@ int layered_new(struct device *device, int width, int height, int layers, cudaTe
 	texture.filterMode = cudaFilterModeLinear;
 	texture.readMode = cudaReadModeElementType;
 	cudaError_t status = cudaCreateTextureObject(&layered.texture, &resource, &texture, NULL);
+	if (status == cudaSuccess) {
+		texture.addressMode[0] = texture.addressMode[1] = cudaAddressModeClamp;
+		status = cudaCreateTextureObject(&layered.held, &resource, &texture, NULL);
+		if (status != cudaSuccess)
+			cudaDestroyTextureObject(layered.texture);
+	}
 	if (status != cudaSuccess) {
 		cudaFreeArray(layered.array);
 		return cuda_error(err, status, "cudaCreateTextureObject");
@@ -186,6 +192,7 @@ void layered_free(struct device *device, struct layered *layered)
 		return;
 	cudaSetDevice(device->index);
 	cudaDestroyTextureObject(layered->texture);
+	cudaDestroyTextureObject(layered->held);
 	cudaFreeArray(layered->array);
 	device->used -= layered->bytes;
 	*layered = {};

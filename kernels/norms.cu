@@ -79,6 +79,11 @@ int reduce_pairs(struct plan *plan, const float2 *partial, size_t count, double 
 	cudaStream_t stream = plan->device->stream;
 	int blocks = (int)(count < (size_t)BLOCKS * THREADS ? (count + THREADS - 1) / THREADS : BLOCKS);
 
+	if (count <= 64 * (size_t)THREADS) { /* a second launch would cost more */
+		sum_pairs<<<1, THREADS, 0, stream>>>(partial, count, sums);
+		LAUNCHED();
+		return 0;
+	}
 	sum_pairs<<<blocks, THREADS, 0, stream>>>(partial, count, plan->reduce);
 	LAUNCHED();
 	add_blocks<2><<<1, THREADS, 0, stream>>>(plan->reduce, blocks, sums);

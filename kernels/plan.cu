@@ -14,6 +14,7 @@
 enum { LAYERS_MOST = 2048 };                      /* of a layered array, on every card */
 enum { SIDE_MOST = 32768 };                       /* its width and height */
 enum { BATCH_MOST = 128 };                        /* views that FDK filters and backprojects in one go */
+static const double SMALL = 1 << 24;              /* voxels times views below which launches take longer than samples */
 static const size_t RAW_BYTES = (size_t)16 << 20; /* of each of the two buffers of raw samples */
 static const size_t FFT_BYTES = (size_t)64 << 20; /* of the rows that cuFFT takes at once */
 
@@ -119,12 +120,30 @@ static int window_size(double least, double most)
 	return size >= 3 ? size : 0;
 }
 
+/*
+ * geometry_is_untilted speaks of the rays to the detector; a backprojection's
+ * samples reach one pixel beyond, which is far on a detector of one.
+ */
+static bool is_untilted(const struct geometry *geometry)
+{
+	const double pixels = 1e-3;
+
+	for (int k = 0; k < geometry->count; k++) {
+		const double *u = geometry->views[k].column_step, *v = geometry->views[k].row_step;
+
+		if (fabs(u[2]) * (geometry->columns + 1) > pixels * vec_norm(v) ||
+		    hypot(v[0], v[1]) * (geometry->rows + 1) > pixels * vec_norm(u))
+			return false;
+	}
+	return true;
+}
+
 static void choose_untilted(const struct plan_options *options, struct plan_shape *shape)
 {
 	double least, most;
 	int sign;
 
-	if (!geometry_is_untilted(options->geometry))
+	if (!is_untilted(options->geometry))
 		return;
 	row_spacing(options->geometry, options->grid, &least, &most, &sign);
 	if (sign == 0)
@@ -144,14 +163,17 @@ static struct plan_shape shape_of(const struct plan_options *options)
 	const struct grid *grid = options->grid;
 	struct plan_shape shape = {};
 	int most = grid->size[0] > grid->size[1] ? grid->size[0] : grid->size[1], subset = 0;
-	bool fits = most <= LAYERS_MOST && grid->size[2] <= SIDE_MOST;
+	bool is_small, fits = most <= LAYERS_MOST && grid->size[2] <= SIDE_MOST;
 
 	if (options->sart != NULL)
 		subset = largest_subset(&options->sart->subsets);
 	shape.z_rays = has_z_rays(geometry, grid);
 	choose_untilted(options, &shape);
-	shape.textures =
-	    !options->reference_precision && fits && geometry->columns <= SIDE_MOST && geometry->rows <= SIDE_MOST;
+	is_small = (double)grid_voxels(grid) * geometry->count < SMALL;
+	if (is_small)
+		shape.forward_rows = shape.back_voxels = 0;
+	shape.textures = !is_small && !options->reference_precision && fits && geometry->columns <= SIDE_MOST &&
+			 geometry->rows <= SIDE_MOST;
 	shape.batch = geometry->count < BATCH_MOST ? geometry->count : BATCH_MOST;
 	shape.by_view = subset == 1 && columns_shape_make(grid->size).floats < (size_t)1 << 31;
 	shape.by_subset = subset > 0 && !shape.by_view;
@@ -501,6 +523,7 @@ void cuda_plan_free(struct plan *plan)
 	cudaSetDevice(device->index);
 	cudaStreamSynchronize(device->copy);
 	cudaStreamSynchronize(device->stream);
+	backproject_forget();
 	if (plan->sweep != NULL)
 		cudaGraphExecDestroy(plan->sweep);
 	filter_release(plan);
@@ -566,6 +589,8 @@ int plan_check_views(const struct plan *plan, const int *views, int count, const
 	return 0;
 }
 
+static unsigned long lists; /* made so far, over all plans: one thread has all devices of a process */
+
 int plan_set_views(struct plan *plan, const int *views, int count, struct error *err)
 {
 	size_t bytes = (size_t)count * sizeof(int);
@@ -575,6 +600,7 @@ int plan_set_views(struct plan *plan, const int *views, int count, struct error 
 		return 0;
 	memcpy(plan->views_host, views, bytes);
 	plan->views_held = count;
+	plan->views_list = ++lists;
 	/* From pageable memory: it has been read when the call returns. */
 	CUDA_TRY(cudaMemcpyAsync(plan->views, views, bytes, cudaMemcpyHostToDevice, plan->device->stream));
 	return 0;

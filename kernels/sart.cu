@@ -86,12 +86,18 @@ static __global__ void __launch_bounds__(32 * SWEEP_COLUMNS * SWEEP_PARTS) proje
 		int end = min(begin + each, w.end), inner = min(max(w.inner_first, begin), end);
 		int outer = min(max(w.inner_end, inner), end);
 		auto edge = [&](int i, int until) {
-			for (; i < until; i++)
+			const float fast_end = (float)(axes.fast - 1), row_end = (float)(axes.rows - 1);
+
+			for (; i < until; i++) {
+				float across = fmaf((float)i, a.fast_step, a.fast),
+				      along = fmaf((float)i, a.row_step, a.row);
+
 				total = fmaf(part_of(i, a.begin, a.end),
-					     sample_held(s.volume + (size_t)slice * i, up, fast,
-							 fmaf((float)i, a.fast_step, a.fast),
-							 fmaf((float)i, a.row_step, a.row), axes),
+					     sample(s.volume + (size_t)slice * i, up, fast,
+						    fminf(fmaxf(across, 0.0f), fast_end),
+						    fminf(fmaxf(along, 0.0f), row_end)),
 					     total);
+			}
 		};
 
 		edge(begin, inner);
@@ -349,27 +355,34 @@ int cuda_sart_iterate(struct plan *plan, const struct stack *projections, struct
 {
 	const struct sart_options *sart = plan->options.sart;
 	struct device *device = plan->device;
+	int count = plan->options.geometry->count;
+	bool resident = sart != NULL && sart->subsets.count == 1 && count <= plan->shape.views_at_once;
 
 	if (sart == NULL)
 		return error_set(err, ERR_INTERNAL, "the plan was made without SART");
 	TRY(device_enter(device, err));
-	TRY(plan_check_views(plan, sart->subsets.order, plan->options.geometry->count, projections,
-			     plan->options.geometry->count, err));
-	TRY(plan_set_views(plan, sart->subsets.order, plan->options.geometry->count, err));
+	TRY(plan_check_views(plan, sart->subsets.order, count, projections, count, err));
+	TRY(plan_set_views(plan, sart->subsets.order, count, err));
 	if (!worth_recording(plan)) {
 		TRY(sweep(plan, projections->data, volume->data, cancel, err));
 	} else {
 		TRY(cancel_check(cancel, err));
+		if (resident)
+			TRY(backproject_prepare(plan, 0, count, err));
+		else
+			backproject_forget(); /* what is recorded brings its own */
 		if (plan->sweep == NULL || plan->sweep_volume != volume->data ||
 		    plan->sweep_stack != projections->data) {
 			/* With one subset the column sums are made now and not again and again. */
 			if (plan->coverage != NULL && sart->subsets.count == 1 && plan->coverage_subset != 0) {
-				TRY(coverage_sum(plan, 0, plan->options.geometry->count, err));
+				TRY(coverage_sum(plan, 0, count, err));
 				plan->coverage_subset = 0;
 			}
 			TRY(record(plan, projections->data, volume->data, err));
 		}
 		CUDA_TRY(cudaGraphLaunch(plan->sweep, device->stream));
+		if (!resident)
+			backproject_forget();
 	}
 	TRY(device_wait(device, err));
 	*ret_sums = {device->sums[0], device->sums[1]};

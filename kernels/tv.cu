@@ -17,7 +17,8 @@
 
 #include "kernels/internal.cuh"
 
-enum { TILE_X = 32, TILE_Y = 16, PLANES = 16 };
+/* Explicit steps gain by square tiles, primal-dual ones by whole cache lines of the half-precision dual. */
+enum { TILE_X = 32, TILE_Y = 16, DUAL_X = 64, DUAL_Y = 8, PLANES = 16 };
 
 struct tv_step {
 	int nx, ny, nz;
@@ -31,10 +32,11 @@ struct spot {
 	bool inside, writes, right, down; /* in the volume; has a result; has a neighbour at x + 1, at y + 1 */
 	size_t at;                        /* in plane 0; of the nearest voxel where outside */
 };
+template <int WIDE, int HIGH>
 static __device__ __forceinline__ spot spot_make(const tv_step &s)
 {
-	int x = (int)blockIdx.x * (TILE_X - 1) + (int)threadIdx.x - 1;
-	int y = (int)blockIdx.y * (TILE_Y - 1) + (int)threadIdx.y - 1;
+	int x = (int)blockIdx.x * (WIDE - 1) + (int)threadIdx.x - 1;
+	int y = (int)blockIdx.y * (HIGH - 1) + (int)threadIdx.y - 1;
 	spot p;
 
 	p.inside = x >= 0 && y >= 0 && x < s.nx && y < s.ny;
@@ -89,7 +91,7 @@ static __global__ void __launch_bounds__(TILE_X *TILE_Y)
     gradient_step(const float *__restrict__ u, const float *f, float *to, const tv_step s)
 {
 	__shared__ float along_x[2][TILE_Y][TILE_X], along_y[2][TILE_Y][TILE_X];
-	spot p = spot_make(s);
+	spot p = spot_make<TILE_X, TILE_Y>(s);
 	int tx = threadIdx.x, ty = threadIdx.y, z = blockIdx.z * PLANES, end = min(z + PLANES, s.nz);
 	size_t plane = (size_t)s.nx * s.ny, at = p.at + plane * z;
 	float before = 0;
@@ -165,12 +167,12 @@ static __device__ __forceinline__ flux projected(const flux &old, const corner &
  * only; the last one writes v only, which may then be f.
  */
 template <typename DUAL, bool FIRST, bool LAST>
-static __global__ void __launch_bounds__(TILE_X *TILE_Y)
+static __global__ void __launch_bounds__(DUAL_X *DUAL_Y)
     proximal_step(const float *f, const float *__restrict__ ahead, const DUAL *__restrict__ dual, const float *v,
 		  float *ret_v, float *__restrict__ ret_ahead, DUAL *__restrict__ ret_dual, const tv_step s)
 {
-	__shared__ float along_x[2][TILE_Y][TILE_X], along_y[2][TILE_Y][TILE_X];
-	spot p = spot_make(s);
+	__shared__ float along_x[2][DUAL_Y][DUAL_X], along_y[2][DUAL_Y][DUAL_X];
+	spot p = spot_make<DUAL_X, DUAL_Y>(s);
 	int tx = threadIdx.x, ty = threadIdx.y, z = blockIdx.z * PLANES, end = min(z + PLANES, s.nz);
 	size_t plane = (size_t)s.nx * s.ny, at = p.at + plane * z, voxels = plane * s.nz;
 	const float *u = FIRST ? f : ahead;
@@ -221,9 +223,9 @@ static __global__ void __launch_bounds__(TILE_X *TILE_Y)
 	}
 }
 
-static dim3 tv_blocks(const tv_step &s)
+static dim3 tv_blocks(const tv_step &s, int wide, int high)
 {
-	return dim3(divide_up(s.nx, TILE_X - 1), divide_up(s.ny, TILE_Y - 1), divide_up(s.nz, PLANES));
+	return dim3(divide_up(s.nx, wide - 1), divide_up(s.ny, high - 1), divide_up(s.nz, PLANES));
 }
 
 static tv_step step_make(const struct plan *plan)
@@ -282,7 +284,7 @@ static int run_gradient(struct plan *plan, float *volume, const struct cancel *c
 		float *to = i > 0 && i == tv->iterations - 1 ? volume : work[i % 2];
 
 		TRY(cancel_check(cancel, err));
-		gradient_step<<<tv_blocks(s), dim3(TILE_X, TILE_Y), 0, stream>>>(from, volume, to, s);
+		gradient_step<<<tv_blocks(s, TILE_X, TILE_Y), dim3(TILE_X, TILE_Y), 0, stream>>>(from, volume, to, s);
 		LAUNCHED();
 		from = to;
 	}
@@ -301,7 +303,7 @@ static int run_proximal(struct plan *plan, float *volume, const struct cancel *c
 	float *v = plan->scratch, *ahead[2] = {v + voxels, v + 2 * voxels};
 	DUAL *dual[2] = {(DUAL *)(v + 3 * voxels), (DUAL *)(v + 3 * voxels) + 3 * voxels};
 	double square = fmax(4 * squared_weights(s), 1), tau = 1 / tv->alpha, sigma = 1 / (square * tau);
-	dim3 blocks = tv_blocks(s), threads(TILE_X, TILE_Y);
+	dim3 blocks = tv_blocks(s, DUAL_X, DUAL_Y), threads(DUAL_X, DUAL_Y);
 
 	for (int i = 0; i < tv->iterations; i++) {
 		double theta = 1 / sqrt(1 + 2 * tv->alpha * tau);

@@ -63,7 +63,7 @@ static double difference(const float *a, const float *b, size_t count)
 	for (size_t i = 0; i < count; i++) {
 		double d = (double)a[i] - (double)b[i];
 
-		if (!isfinite(a[i]))
+		if (!isfinite(a[i]) || !isfinite(b[i]))
 			return INFINITY;
 		sum += d * d;
 		norm += (double)b[i] * b[i];
