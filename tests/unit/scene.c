@@ -1,0 +1,275 @@
+/* A scan and its reconstruction for the tests of the pipeline: see scene.h. */
+#include "tests/unit/scene.h"
+
+#include <check.h>
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+static size_t scene_samples(const struct scene *scene)
+{
+	return (size_t)scene->geometry.columns * (size_t)scene->geometry.rows;
+}
+
+void scene_orbit(struct scene *ret_scene, const struct orbit_spec *spec)
+{
+	double *angles = malloc(sizeof(double) * (size_t)spec->views);
+	struct error err;
+
+	ck_assert_ptr_nonnull(angles);
+	for (int i = 0; i < spec->views; i++)
+		angles[i] = (spec->first_deg + i * spec->step_deg) * M_PI / 180;
+	if (geometry_circular(&ret_scene->geometry, spec->columns, spec->rows, spec->views, &spec->circular, angles,
+			      &err) < 0)
+		ck_abort_msg("%s", err.text);
+	free(angles);
+	ret_scene->projections = calloc(scene_samples(ret_scene) * (size_t)spec->views, sizeof(float));
+	ck_assert_ptr_nonnull(ret_scene->projections);
+}
+
+void scene_add(struct scene *scene, const struct phantom *phantom)
+{
+	size_t samples = scene_samples(scene);
+	float *one = malloc(sizeof(float) * samples);
+
+	ck_assert_ptr_nonnull(one);
+	for (int view = 0; view < scene->geometry.count; view++) {
+		float *projection = scene->projections + samples * (size_t)view;
+
+		phantom_project(phantom, &scene->geometry, view, one);
+		for (size_t i = 0; i < samples; i++)
+			projection[i] += one[i];
+	}
+	free(one);
+}
+
+void scene_clear(struct scene *scene)
+{
+	geometry_clear(&scene->geometry);
+	free(scene->projections);
+	*scene = (struct scene){0};
+}
+
+/* ---- hooks ---- */
+
+static void note(struct outcome *outcome, const char *what, const char *end)
+{
+	size_t used = strlen(outcome->log), length = strlen(what) + strlen(end) + 2;
+
+	ck_assert_uint_lt(used + length, sizeof(outcome->log));
+	snprintf(outcome->log + used, sizeof(outcome->log) - used, "%s%s%s", used > 0 ? " " : "", what, end);
+}
+
+static bool on_cancelled(void *context)
+{
+	struct outcome *outcome = context;
+
+	return ++outcome->asked == outcome->cancel_at;
+}
+
+static bool on_yield(void *context)
+{
+	struct outcome *outcome = context;
+
+	return outcome->yield_at > 0 && outcome->rows[outcome->row_count - 1].iteration == outcome->yield_at;
+}
+
+static void on_progress(void *context, enum stage stage, int iteration, double fraction)
+{
+	struct outcome *outcome = context;
+
+	ck_assert_int_ge(iteration, 0);
+	ck_assert_double_ge(fraction, outcome->fraction);
+	ck_assert_double_le(fraction, 1);
+	outcome->fraction = fraction;
+	if (stage != STAGE_SAVE)
+		note(outcome, stage_names[stage], "");
+}
+
+static void on_row(void *context, const struct history_row *row)
+{
+	struct outcome *outcome = context;
+	char text[16];
+
+	ck_assert_int_lt(outcome->row_count, SCENE_ROWS_MOST);
+	outcome->rows[outcome->row_count++] = *row;
+	snprintf(text, sizeof(text), "%d", row->iteration);
+	note(outcome, "row", text);
+}
+
+static int on_keep(void *context, struct recon *recon, const struct kept_volume *volume, struct error *err)
+{
+	struct outcome *outcome = context;
+	int i = outcome->kept_count;
+
+	ck_assert_int_lt(i, SCENE_KEPT_MOST);
+	outcome->kept_count++;
+	snprintf(outcome->kept[i].name, sizeof(outcome->kept[i].name), "%s", volume->name);
+	snprintf(outcome->kept[i].stage, sizeof(outcome->kept[i].stage), "%s", volume->stage);
+	outcome->kept[i].iteration = volume->iteration;
+	outcome->kept[i].norms = volume->norms;
+	outcome->kept[i].voxels = malloc(sizeof(float) * grid_voxels(volume->grid));
+	ck_assert_ptr_nonnull(outcome->kept[i].voxels);
+	note(outcome, volume->name, "!");
+	return recon_read(recon, 0, volume->grid->size[2], outcome->kept[i].voxels, err);
+}
+
+static void on_warning(void *context, const char *code, const char *detail)
+{
+	struct outcome *outcome = context;
+	size_t used = strlen(outcome->warnings);
+
+	snprintf(outcome->warnings + used, sizeof(outcome->warnings) - used, "%s: %s\n", code, detail);
+}
+
+/* ---- the run ---- */
+
+static int push_all(const struct scene *scene, struct outcome *outcome, struct recon *recon)
+{
+	int all = scene->geometry.count, at_once = outcome->at_once > 0 ? outcome->at_once : all, code = 0;
+	size_t sample = outcome->linearise.sample == SAMPLE_UINT16 ? 2 : 4;
+	size_t bytes = sample * scene_samples(scene);
+	const char *samples = outcome->samples != NULL ? outcome->samples : scene->projections;
+	char *block = malloc(bytes * (size_t)at_once);
+	int *views = malloc(sizeof(int) * (size_t)at_once);
+
+	ck_assert(block != NULL && views != NULL);
+	for (int begin = 0; begin < all && code == 0; begin += at_once) {
+		int count = all - begin < at_once ? all - begin : at_once;
+
+		for (int i = 0; i < count; i++) {
+			views[i] = outcome->order != NULL ? outcome->order[begin + i] : begin + i;
+			memcpy(block + bytes * (size_t)i, samples + bytes * (size_t)views[i], bytes);
+		}
+		code = recon_push(recon, block, views, count, &outcome->err);
+	}
+	free(block);
+	free(views);
+	return code;
+}
+
+void scene_run(const struct scene *scene, const struct recipe *recipe, struct outcome *outcome)
+{
+	const struct device_options options = {.threads = outcome->threads};
+	const struct recon_hooks hooks = {
+	    .context = outcome,
+	    .cancelled = on_cancelled,
+	    .yield = on_yield,
+	    .progress = on_progress,
+	    .row = on_row,
+	    .keep = on_keep,
+	    .warning = on_warning,
+	};
+	struct device *device;
+	struct recon *recon = NULL;
+
+	if (backend_cpu.open(0, &options, &device, &outcome->err) < 0)
+		ck_abort_msg("%s", outcome->err.text);
+	outcome->code = recon_open(&backend_cpu, device, &scene->geometry, &outcome->linearise, recipe, &hooks, &recon,
+				   &outcome->err);
+	if (outcome->code < 0)
+		goto out;
+	outcome->grid = *recon_grid(recon);
+	if (outcome->resume != NULL)
+		outcome->code = recon_resume(recon, outcome->resume, outcome->resume_iteration, &outcome->err);
+	if (outcome->code == 0)
+		outcome->code = push_all(scene, outcome, recon);
+	if (outcome->code == 0)
+		outcome->code = recon_run(recon, &outcome->err);
+	outcome->iteration = recon_iteration(recon);
+	outcome->last = malloc(sizeof(float) * grid_voxels(&outcome->grid));
+	ck_assert_ptr_nonnull(outcome->last);
+	ck_assert_int_eq(recon_read(recon, 0, outcome->grid.size[2], outcome->last, &outcome->err), 0);
+out:
+	recon_free(recon);
+	backend_cpu.close(device);
+}
+
+const float *outcome_volume(const struct outcome *outcome, const char *name)
+{
+	if (outcome->code < 0)
+		ck_abort_msg("the run failed: %s", outcome->err.text);
+	for (int i = 0; i < outcome->kept_count; i++)
+		if (strcmp(outcome->kept[i].name, name) == 0)
+			return outcome->kept[i].voxels;
+	ck_abort_msg("no volume %s was kept", name);
+}
+
+void outcome_clear(struct outcome *outcome)
+{
+	for (int i = 0; i < outcome->kept_count; i++)
+		free(outcome->kept[i].voxels);
+	free(outcome->last);
+	*outcome = (struct outcome){0};
+}
+
+struct grid grid_of(int nx, int ny, int nz, double dx, double dy, double dz)
+{
+	struct grid grid = {.size = {nx, ny, nz}, .spacing = {dx, dy, dz}};
+
+	grid_centre(&grid);
+	return grid;
+}
+
+struct recipe recipe_on(const struct grid *grid)
+{
+	struct recipe recipe;
+
+	recipe_defaults(&recipe);
+	recipe.has_grid = recipe.has_origin = true;
+	recipe.grid = *grid;
+	return recipe;
+}
+
+/* ---- measures ---- */
+
+double relative_error(const float *volume, const float *truth, size_t count)
+{
+	double difference2 = 0, norm2 = 0;
+
+	for (size_t i = 0; i < count; i++) {
+		difference2 += ((double)volume[i] - truth[i]) * ((double)volume[i] - truth[i]);
+		norm2 += (double)truth[i] * truth[i];
+	}
+	return sqrt(difference2 / norm2);
+}
+
+double mean_error(const float *volume, const float *truth, size_t count)
+{
+	double sum = 0;
+
+	for (size_t i = 0; i < count; i++)
+		sum += fabs((double)volume[i] - truth[i]);
+	return sum / (double)count;
+}
+
+double psnr_of(const float *volume, const float *truth, size_t count, double range)
+{
+	double sum = 0;
+
+	for (size_t i = 0; i < count; i++)
+		sum += ((double)volume[i] - truth[i]) * ((double)volume[i] - truth[i]);
+	return 20 * log10(range) - 10 * log10(sum / (double)count);
+}
+
+double mean_near(const float *volume, const struct grid *grid, const double point[3], double radius)
+{
+	double sum = 0;
+	size_t count = 0, at = 0;
+
+	for (int k = 0; k < grid->size[2]; k++)
+		for (int j = 0; j < grid->size[1]; j++)
+			for (int i = 0; i < grid->size[0]; i++, at++) {
+				double x = grid->origin[0] + i * grid->spacing[0] - point[0];
+				double y = grid->origin[1] + j * grid->spacing[1] - point[1];
+				double z = grid->origin[2] + k * grid->spacing[2] - point[2];
+
+				if (x * x + y * y + z * z > radius * radius)
+					continue;
+				sum += volume[at];
+				count++;
+			}
+	ck_assert_uint_gt(count, 0);
+	return sum / (double)count;
+}

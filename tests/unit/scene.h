@@ -1,0 +1,73 @@
+#ifndef CBCT_TESTS_SCENE_H
+#define CBCT_TESTS_SCENE_H
+
+#include "core/phantom.h"
+#include "core/recon.h"
+
+/* A scan made from exact line integrals, and all that a reconstruction of it said: for the tests of the pipeline. */
+struct orbit_spec {
+	int columns, rows, views;
+	struct circular circular;
+	double first_deg, step_deg;
+};
+
+struct scene {
+	struct geometry geometry;
+	float *projections; /* [view][row][column], line integrals */
+};
+
+/* These end the test where they fail. */
+void scene_orbit(struct scene *ret_scene, const struct orbit_spec *spec);
+void scene_add(struct scene *scene, const struct phantom *phantom);
+void scene_clear(struct scene *scene);
+
+enum { SCENE_KEPT_MOST = 64, SCENE_ROWS_MOST = 256, SCENE_LOG_MOST = 4096 };
+struct outcome {
+	/* asked for beforehand */
+	struct linearise linearise; /* zero: float32 line integrals */
+	const void *samples;        /* raw samples in place of the scene's projections */
+	const int *order;           /* [views] in which they come; NULL: as they are */
+	int at_once;                /* views in a push; 0: all */
+	int cancel_at;              /* the n-th question is answered with yes, from 1; 0: never */
+	int yield_at;               /* iteration; 0: never */
+	int threads;                /* 0: all */
+	const float *resume;        /* iterate, or NULL */
+	int resume_iteration;
+
+	/* what came of it */
+	int code; /* of the first call that failed */
+	struct error err;
+	struct grid grid;
+	struct {
+		char name[32], stage[8];
+		int iteration;
+		struct volume_norms norms;
+		float *voxels;
+	} kept[SCENE_KEPT_MOST];
+	int kept_count;
+	struct history_row rows[SCENE_ROWS_MOST];
+	int row_count;
+	char log[SCENE_LOG_MOST]; /* each hook in its order: "fdk tv fdk-tv! sart tv row1 ..." */
+	char warnings[1024];      /* "code: detail\n" */
+	double fraction;          /* of the last progress; the test ends where it falls */
+	int asked;
+	float *last; /* the iterate as it was at the end, kept or not */
+	int iteration;
+};
+
+/* Opens the CPU, pushes, runs. */
+void scene_run(const struct scene *scene, const struct recipe *recipe, struct outcome *outcome);
+const float *outcome_volume(const struct outcome *outcome, const char *name); /* ends the test where it is not there */
+void outcome_clear(struct outcome *outcome);
+
+struct grid grid_of(int nx, int ny, int nz, double dx, double dy, double dz);
+/* fdk and sart off, no TV, this grid. */
+struct recipe recipe_on(const struct grid *grid);
+
+/* Over whole volumes. */
+double relative_error(const float *volume, const float *truth, size_t count); /* ||v - t|| / ||t|| */
+double mean_error(const float *volume, const float *truth, size_t count);     /* mean |v - t| */
+double psnr_of(const float *volume, const float *truth, size_t count, double range);
+double mean_near(const float *volume, const struct grid *grid, const double point[3], double radius);
+
+#endif

@@ -1,0 +1,1251 @@
+/*
+ * The pipeline of core/recon.h over the CPU backend: what is reconstructed from
+ * exact line integrals, where it lies, what is told on the way, and what is refused.
+ */
+#include <check.h>
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "core/sart.h"
+#include "tests/unit/scene.h"
+
+Suite *recon_suite(void);
+
+static void add_ball(struct scene *scene, double radius, double density, double x, double y, double z)
+{
+	struct ellipsoid ball = {
+	    .shape = SHAPE_ELLIPSOID, .semi_axes = {radius, radius, radius}, .centre = {x, y, z}, .density = density};
+	struct phantom phantom = {.count = 1, .parts = &ball};
+
+	scene_add(scene, &phantom);
+}
+
+static void run(const struct scene *scene, const struct recipe *recipe, struct outcome *outcome)
+{
+	scene_run(scene, recipe, outcome);
+	if (outcome->code < 0)
+		ck_abort_msg("%s %s", outcome->err.pointer, outcome->err.text);
+}
+
+/* ---- what comes out ---- */
+
+/* Orbits that must all give the same ball: arcs, senses, displacements. */
+static const struct {
+	const char *name;
+	struct orbit_spec spec;
+} orbits[] = {
+    {"full", {96, 96, 180, {600, 1100, {2, 2}, {0, 0}, {0, 0}}, 0, 2}},
+    {"full, reversed", {96, 96, 180, {600, 1100, {2, 2}, {0, 0}, {0, 0}}, 30, -2}},
+    {"short", {96, 96, 120, {600, 1100, {2, 2}, {0, 0}, {0, 0}}, 70, 200.0 / 119}},
+    {"short, reversed", {96, 96, 120, {600, 1100, {2, 2}, {0, 0}, {0, 0}}, 70, -200.0 / 119}},
+    {"short, longer arc", {96, 96, 140, {600, 1100, {2, 2}, {0, 0}, {0, 0}}, 200, 250.0 / 139}},
+    {"unequal pitches", {64, 120, 180, {600, 1100, {3, 1.6}, {0, 0}, {0, 0}}, 0, 2}},
+    {"detector a little off", {96, 96, 180, {600, 1100, {2, 2}, {3.3, -4.1}, {0, 0}}, 0, 2}},
+    {"short, detector a little off", {96, 96, 120, {600, 1100, {2, 2}, {3.3, 2.5}, {0, 0}}, 0, 200.0 / 119}},
+    {"displaced", {96, 96, 240, {600, 1100, {2, 2}, {50, 0}, {0, 0}}, 0, 1.5}},
+    {"displaced the other way, reversed", {96, 96, 240, {600, 1100, {2, 2}, {-50, 0}, {0, 0}}, 0, -1.5}},
+    {"source a little off", {96, 96, 180, {600, 1100, {2, 2}, {0, 0}, {2, -3}}, 0, 2}},
+};
+enum { ORBITS = sizeof(orbits) / sizeof(orbits[0]) };
+
+/*
+ * 0.5 % is the field's own gate for the middle of a uniform object; what is
+ * seen of it here is the sampling of the ball's edge by 2 mm pixels.
+ */
+START_TEST(fdk_of_a_ball_is_its_density)
+{
+	const double density = 0.02, origin[3] = {0, 0, 0};
+	struct grid grid = grid_of(65, 65, 65, 1.2, 1.2, 1.2);
+	struct recipe recipe = recipe_on(&grid);
+	struct scene scene;
+	struct outcome outcome = {0};
+	double middle;
+
+	recipe.fdk.on = true;
+	scene_orbit(&scene, &orbits[_i].spec);
+	add_ball(&scene, 30, density, 0, 0, 0);
+	run(&scene, &recipe, &outcome);
+	middle = mean_near(outcome_volume(&outcome, "final"), &grid, origin, 6);
+	ck_assert_msg(fabs(middle / density - 1) < 0.005, "%s: %.5f", orbits[_i].name, middle);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
+/* A mirrored or swapped axis, a wrong sign of a rotation or an offset puts the balls elsewhere. */
+START_TEST(balls_off_centre_are_where_they_were_put)
+{
+	static const double places[][3] = {{16, -5, 9}, {-7, 14, -12}, {-17, -17, 18}};
+	static const double densities[] = {0.02, 0.03, 0.05};
+	struct grid grid = grid_of(57, 47, 33, 1.0, 1.2, 1.6);
+	bool sart = _i >= ORBITS;
+	struct recipe recipe = recipe_on(&grid);
+	struct scene scene;
+	struct outcome outcome = {0};
+	const float *volume;
+
+	recipe.fdk.on = !sart;
+	recipe.sart.on = sart;
+	recipe.sart.iterations = 4;
+	scene_orbit(&scene, &orbits[_i % ORBITS].spec);
+	for (int b = 0; b < 3; b++)
+		add_ball(&scene, 7, densities[b], places[b][0], places[b][1], places[b][2]);
+	run(&scene, &recipe, &outcome);
+	volume = outcome_volume(&outcome, "final");
+	for (int b = 0; b < 3; b++) {
+		double value = mean_near(volume, &grid, places[b], 3);
+
+		ck_assert_msg(fabs(value / densities[b] - 1) < 0.05, "%s, ball %d: %.5f", orbits[_i % ORBITS].name, b,
+			      value);
+		for (int flip = 1; flip < 8; flip++) {
+			double mirrored[3];
+
+			for (int axis = 0; axis < 3; axis++)
+				mirrored[axis] = flip >> axis & 1 ? -places[b][axis] : places[b][axis];
+			value = mean_near(volume, &grid, mirrored, 3);
+			ck_assert_msg(fabs(value) < 0.3 * densities[b], "%s, ball %d mirrored %d: %.5f",
+				      orbits[_i % ORBITS].name, b, flip, value);
+		}
+	}
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
+START_TEST(one_row_and_one_slice_give_a_disc)
+{
+	const struct orbit_spec spec = {160, 1, 200, {600, 1100, {1.2, 1.2}, {0, 0}, {0, 0}}, 0, 1.8};
+	const double place[3] = {10, -12, 0}, outside[3] = {-20, 20, 0};
+	struct grid grid = grid_of(80, 80, 1, 1, 1, 1);
+	struct recipe recipe = recipe_on(&grid);
+	struct ellipsoid disc = {
+	    .shape = SHAPE_CYLINDER, .semi_axes = {12, 12, 50}, .centre = {10, -12, 0}, .density = 0.02};
+	struct phantom phantom = {.count = 1, .parts = &disc};
+	struct scene scene;
+
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	for (int sart = 0; sart < 2; sart++) {
+		struct outcome outcome = {0};
+
+		recipe.fdk.on = !sart;
+		recipe.sart.on = sart;
+		run(&scene, &recipe, &outcome);
+		/* One ray through a voxel's middle stands for all of it: the rim is what costs 1 %. */
+		ck_assert_double_eq_tol(mean_near(outcome.last, &grid, place, 7), 0.02, 0.0002);
+		ck_assert_double_eq_tol(mean_near(outcome.last, &grid, outside, 7), 0, 0.0003);
+		outcome_clear(&outcome);
+	}
+	scene_clear(&scene);
+}
+END_TEST
+
+START_TEST(a_single_view_is_explained_by_sart_and_harmless_to_fdk)
+{
+	const struct orbit_spec spec = {40, 40, 1, {600, 1100, {3, 3}, {0, 0}, {0, 0}}, 25, 1};
+	struct grid grid = grid_of(32, 32, 32, 2, 2, 2);
+	struct recipe recipe = recipe_on(&grid);
+	struct scene scene;
+	struct outcome outcome = {0};
+
+	recipe.fdk.on = recipe.sart.on = true;
+	recipe.sart.subsets = SUBSETS_VIEWS;
+	scene_orbit(&scene, &spec);
+	add_ball(&scene, 20, 0.02, 0, 0, 0);
+	run(&scene, &recipe, &outcome);
+	ck_assert_int_eq(outcome.row_count, 10);
+	ck_assert_double_lt(outcome.rows[9].residual, 0.05);
+	ck_assert_uint_eq(outcome.kept[0].norms.not_finite, 0);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
+/* The default grid is the field of view: a ball in the middle is in the middle of it. */
+START_TEST(without_a_grid_one_is_chosen)
+{
+	const double origin[3] = {0, 0, 0};
+	struct recipe recipe;
+	struct scene scene;
+	struct outcome outcome = {0};
+
+	recipe_defaults(&recipe);
+	recipe.fdk.on = true;
+	scene_orbit(&scene, &orbits[0].spec);
+	add_ball(&scene, 30, 0.02, 0, 0, 0);
+	run(&scene, &recipe, &outcome);
+	for (int i = 0; i < 3; i++) {
+		ck_assert_double_gt(outcome.grid.size[i] * outcome.grid.spacing[i], 60);
+		ck_assert_double_eq_tol(outcome.grid.spacing[i], 2 * 600 / 1100.0, 0.05);
+	}
+	ck_assert_double_eq_tol(mean_near(outcome.last, &outcome.grid, origin, 6), 0.02, 0.0001);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
+/* ---- SART ---- */
+
+static const struct orbit_spec small_orbit = {44, 44, 36, {600, 1100, {3, 3}, {0, 0}, {0, 0}}, 0, 10};
+
+/* Two overlapping balls and a hole: enough for all that is not about accuracy. */
+static void small_scene(struct scene *ret_scene)
+{
+	scene_orbit(ret_scene, &small_orbit);
+	add_ball(ret_scene, 25, 0.02, 2, -3, 1);
+	add_ball(ret_scene, 8, -0.015, -8, 6, 0);
+	add_ball(ret_scene, 6, 0.02, 10, 4, -7);
+}
+
+static struct recipe small_recipe(void)
+{
+	struct grid grid = grid_of(32, 30, 28, 2, 2.1, 2.2);
+	struct recipe recipe = recipe_on(&grid);
+
+	recipe.sart.on = true;
+	recipe.sart.iterations = 6;
+	recipe.sart.subsets = 6;
+	return recipe;
+}
+
+/* Simultaneous updates are a steepest descent of a weighted residual; the rows' own norm is close enough to it. */
+START_TEST(sirt_lowers_the_residual_in_every_iteration)
+{
+	struct recipe recipe = small_recipe();
+	struct scene scene;
+	struct outcome outcome = {0};
+
+	recipe.sart.subsets = 1;
+	recipe.sart.iterations = 25;
+	recipe.sart.nonnegative = _i;
+	small_scene(&scene);
+	run(&scene, &recipe, &outcome);
+	ck_assert_int_eq(outcome.row_count, 25);
+	/* From zero: nothing of the projections is explained as they are met, and all of the volume is new. */
+	ck_assert_double_eq_tol(outcome.rows[0].residual, 1, 1e-6);
+	ck_assert_double_eq(outcome.rows[0].change, 1);
+	for (int i = 1; i < 25; i++) {
+		ck_assert_double_lt(outcome.rows[i].residual, outcome.rows[i - 1].residual);
+		ck_assert_double_lt(outcome.rows[i].change, outcome.rows[i - 1].change);
+	}
+	ck_assert_double_lt(outcome.rows[24].residual, 0.1);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
+START_TEST(more_subsets_converge_faster)
+{
+	static const int subsets[] = {1, 4, 12, SUBSETS_VIEWS};
+	struct recipe recipe = small_recipe();
+	struct scene scene;
+	double before = INFINITY;
+
+	recipe.sart.iterations = 2;
+	small_scene(&scene);
+	for (size_t s = 0; s < sizeof(subsets) / sizeof(subsets[0]); s++) {
+		struct outcome outcome = {0};
+
+		recipe.sart.subsets = subsets[s];
+		run(&scene, &recipe, &outcome);
+		ck_assert_double_lt(outcome.rows[1].residual, before);
+		before = outcome.rows[1].residual;
+		outcome_clear(&outcome);
+	}
+	scene_clear(&scene);
+}
+END_TEST
+
+START_TEST(nonnegative_is_what_it_says)
+{
+	struct recipe recipe = small_recipe();
+	struct scene scene;
+
+	small_scene(&scene);
+	for (int nonnegative = 0; nonnegative < 2; nonnegative++) {
+		struct outcome outcome = {0};
+
+		recipe.sart.nonnegative = nonnegative;
+		run(&scene, &recipe, &outcome);
+		if (nonnegative)
+			ck_assert_double_ge(outcome.kept[0].norms.minimum, 0);
+		else
+			ck_assert_double_lt(outcome.kept[0].norms.minimum, 0);
+		outcome_clear(&outcome);
+	}
+	scene_clear(&scene);
+}
+END_TEST
+
+/* From zero and over all views at once the update is linear in the relaxation. */
+START_TEST(relaxation_scales_the_update)
+{
+	struct recipe recipe = small_recipe();
+	struct scene scene;
+	struct outcome whole = {0}, half = {0};
+
+	recipe.sart.subsets = 1;
+	recipe.sart.iterations = 1;
+	recipe.sart.nonnegative = false;
+	small_scene(&scene);
+	run(&scene, &recipe, &whole);
+	recipe.sart.relaxation = 0.5;
+	run(&scene, &recipe, &half);
+	for (size_t i = 0; i < grid_voxels(&whole.grid); i++)
+		half.last[i] *= 2;
+	/* a few roundings of float */
+	ck_assert_double_lt(relative_error(half.last, whole.last, grid_voxels(&whole.grid)), 1e-6);
+	outcome_clear(&whole);
+	outcome_clear(&half);
+	scene_clear(&scene);
+}
+END_TEST
+
+START_TEST(the_rows_are_the_norms_of_the_volumes)
+{
+	struct recipe recipe = small_recipe();
+	struct scene scene;
+	struct outcome outcome = {0};
+	size_t count;
+	int emit[] = {3, 4};
+
+	recipe.emit = emit;
+	recipe.emits = 2;
+	recipe.tv.on = true;
+	small_scene(&scene);
+	run(&scene, &recipe, &outcome);
+	count = grid_voxels(&outcome.grid);
+	/* Double sums of float differences, in another order. */
+	ck_assert_double_eq_tol(
+	    outcome.rows[3].change,
+	    relative_error(outcome_volume(&outcome, "iter-4"), outcome_volume(&outcome, "iter-3"), count), 1e-6);
+	ck_assert_double_gt(outcome.rows[3].tv, 0);
+	ck_assert_double_eq(outcome.rows[3].tv, outcome.kept[1].norms.tv);
+	ck_assert_double_ge(outcome.rows[3].seconds, 0);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
+START_TEST(a_scan_of_nothing_is_nothing_with_finite_rows)
+{
+	struct recipe recipe = small_recipe();
+	struct scene scene;
+	struct outcome outcome = {0};
+
+	recipe.fdk.on = recipe.tv.on = true;
+	scene_orbit(&scene, &small_orbit);
+	run(&scene, &recipe, &outcome);
+	ck_assert_int_eq(outcome.row_count, 6);
+	for (int i = 0; i < 6; i++) {
+		ck_assert_double_eq(outcome.rows[i].residual, 0);
+		ck_assert_double_eq(outcome.rows[i].change, 0);
+		ck_assert_double_eq(outcome.rows[i].tv, 0);
+	}
+	ck_assert_double_eq(outcome.kept[0].norms.maximum, 0);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
+/* ---- the pipeline ---- */
+
+/* Stages, rows and kept volumes in the order in which the hooks hear of them. */
+static const struct {
+	bool fdk, sart, tv, after_fdk;
+	int iterations, emit[6], emits;
+	const char *log;
+} pipelines[] = {
+    {true, false, false, true, 0, {0}, 0, "fdk final!"},
+    {true, false, false, true, 0, {EMIT_FDK}, 1, "fdk fdk! final!"},
+    {true, false, true, true, 0, {EMIT_FDK_TV, EMIT_FDK}, 2, "fdk fdk! tv fdk-tv! final!"},
+    {true, false, true, false, 0, {EMIT_FDK}, 1, "fdk fdk! final!"},
+    {false, true, false, true, 2, {0}, 0, "load sart row1 sart row2 final!"},
+    {false, true, false, true, 2, {2, 1, 1}, 3, "load sart row1 iter-1! sart row2 iter-2! final!"},
+    {false, true, true, true, 1, {1}, 1, "load sart tv row1 iter-1! final!"},
+    {true,
+     true,
+     true,
+     true,
+     2,
+     {EMIT_FDK, EMIT_FDK_TV, 1},
+     3,
+     "fdk fdk! tv fdk-tv! sart tv row1 iter-1! sart tv row2 final!"},
+    {true, true, true, false, 1, {EMIT_FDK}, 1, "fdk fdk! sart tv row1 final!"},
+};
+
+START_TEST(stages_rows_and_volumes_come_in_order)
+{
+	struct recipe recipe = small_recipe();
+	int emit[6];
+	struct scene scene;
+	struct outcome outcome = {0};
+	const char *last = pipelines[_i].sart ? "sart" : pipelines[_i].tv && pipelines[_i].after_fdk ? "tv" : "fdk";
+
+	memcpy(emit, pipelines[_i].emit, sizeof(emit));
+	recipe.fdk.on = pipelines[_i].fdk;
+	recipe.sart.on = pipelines[_i].sart;
+	recipe.sart.iterations = pipelines[_i].iterations > 0 ? pipelines[_i].iterations : 1;
+	recipe.tv.on = pipelines[_i].tv;
+	recipe.tv.after_fdk = pipelines[_i].after_fdk;
+	recipe.emit = emit;
+	recipe.emits = pipelines[_i].emits;
+	small_scene(&scene);
+	run(&scene, &recipe, &outcome);
+	ck_assert_str_eq(outcome.log, pipelines[_i].log);
+	ck_assert_str_eq(outcome.kept[outcome.kept_count - 1].stage, last);
+	ck_assert_int_eq(outcome.kept[outcome.kept_count - 1].iteration, pipelines[_i].iterations);
+	ck_assert_double_eq_tol(outcome.fraction, 1, 1e-9);
+	for (int i = 0; i < outcome.kept_count; i++)
+		ck_assert_uint_eq(outcome.kept[i].norms.not_finite, 0);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
+START_TEST(fdk_is_a_start_for_sart_and_tv_smooths_it)
+{
+	struct recipe recipe = small_recipe();
+	int emit[] = {EMIT_FDK, EMIT_FDK_TV};
+	struct scene scene;
+	struct outcome outcome = {0}, zero = {0};
+
+	small_scene(&scene);
+	recipe.sart.iterations = 1;
+	run(&scene, &recipe, &zero);
+	recipe.fdk.on = recipe.tv.on = true;
+	recipe.emit = emit;
+	recipe.emits = 2;
+	run(&scene, &recipe, &outcome);
+	ck_assert_double_lt(outcome.rows[0].residual, zero.rows[0].residual);
+	ck_assert_double_lt(outcome.kept[1].norms.tv, outcome.kept[0].norms.tv);
+	outcome_clear(&outcome);
+	outcome_clear(&zero);
+	scene_clear(&scene);
+}
+END_TEST
+
+static void shuffle(int *order, int count)
+{
+	unsigned state = 12345;
+
+	for (int i = 0; i < count; i++)
+		order[i] = i;
+	for (int i = count - 1; i > 0; i--) {
+		int other, kept = order[i];
+
+		state = state * 1103515245U + 12345U;
+		other = (int)(state >> 16) % (i + 1);
+		order[i] = order[other];
+		order[other] = kept;
+	}
+}
+
+/* SART sees the same stack; the FDK's sum is taken in another order, which is rounding. */
+START_TEST(views_may_come_in_any_order)
+{
+	struct recipe recipe = small_recipe();
+	int order[36];
+	struct scene scene;
+	struct outcome straight = {0}, shuffled = {.order = order, .at_once = 1};
+
+	shuffle(order, 36);
+	small_scene(&scene);
+	run(&scene, &recipe, &straight);
+	run(&scene, &recipe, &shuffled);
+	ck_assert_mem_eq(straight.last, shuffled.last, sizeof(float) * grid_voxels(&straight.grid));
+	outcome_clear(&straight);
+	outcome_clear(&shuffled);
+
+	recipe.fdk.on = true;
+	shuffled = (struct outcome){.order = order, .at_once = 1};
+	run(&scene, &recipe, &straight);
+	run(&scene, &recipe, &shuffled);
+	ck_assert_double_lt(relative_error(shuffled.last, straight.last, grid_voxels(&straight.grid)), 1e-5);
+	outcome_clear(&straight);
+	outcome_clear(&shuffled);
+	scene_clear(&scene);
+}
+END_TEST
+
+/* How many views a call brings, how many threads work, and a repeat: none of it shows. With and without SART. */
+START_TEST(pushes_and_threads_do_not_change_a_bit)
+{
+	static const struct {
+		int at_once, threads;
+	} ways[] = {{1, 0}, {7, 0}, {36, 1}, {36, 2}, {5, 2}};
+	struct recipe recipe = small_recipe();
+	struct scene scene;
+	struct outcome reference = {0};
+
+	recipe.fdk.on = true;
+	recipe.sart.on = _i;
+	recipe.tv.on = true;
+	recipe.sart.iterations = 2;
+	small_scene(&scene);
+	run(&scene, &recipe, &reference);
+	for (size_t i = 0; i < sizeof(ways) / sizeof(ways[0]); i++) {
+		struct outcome outcome = {.at_once = ways[i].at_once, .threads = ways[i].threads};
+
+		run(&scene, &recipe, &outcome);
+		ck_assert_mem_eq(outcome.last, reference.last, sizeof(float) * grid_voxels(&reference.grid));
+		outcome_clear(&outcome);
+	}
+	outcome_clear(&reference);
+	scene_clear(&scene);
+}
+END_TEST
+
+START_TEST(a_run_that_yielded_goes_on_as_if_it_had_not)
+{
+	struct recipe recipe = small_recipe();
+	struct scene scene;
+	struct outcome whole = {0}, first = {.yield_at = 2}, second = {0};
+	int emit[] = {2, 3};
+
+	recipe.fdk.on = recipe.tv.on = true;
+	recipe.tv.options.method = _i == 0 ? TV_GRADIENT : TV_PROXIMAL;
+	recipe.sart.iterations = 4;
+	recipe.emit = emit;
+	recipe.emits = 2;
+	small_scene(&scene);
+	run(&scene, &recipe, &whole);
+
+	scene_run(&scene, &recipe, &first);
+	ck_assert_int_eq(first.code, ERR_BUSY);
+	ck_assert_int_eq(first.iteration, 2);
+	ck_assert_str_eq(first.log, "fdk tv sart tv row1 sart tv row2 iter-2!");
+
+	second.resume = first.last;
+	second.resume_iteration = first.iteration;
+	run(&scene, &recipe, &second);
+	ck_assert_str_eq(second.log, "load sart tv row3 iter-3! sart tv row4 final!");
+	ck_assert_mem_eq(second.last, whole.last, sizeof(float) * grid_voxels(&whole.grid));
+	for (int i = 0; i < 2; i++) {
+		ck_assert_double_eq(second.rows[i].residual, whole.rows[2 + i].residual);
+		ck_assert_double_eq(second.rows[i].change, whole.rows[2 + i].change);
+		ck_assert_double_eq(second.rows[i].tv, whole.rows[2 + i].tv);
+	}
+	outcome_clear(&whole);
+	outcome_clear(&first);
+	outcome_clear(&second);
+	scene_clear(&scene);
+}
+END_TEST
+
+START_TEST(the_last_iteration_does_not_yield_and_can_be_resumed_from)
+{
+	struct recipe recipe = small_recipe();
+	struct scene scene;
+	struct outcome outcome = {.yield_at = 2}, again = {0};
+
+	recipe.sart.iterations = 2;
+	small_scene(&scene);
+	run(&scene, &recipe, &outcome);
+	ck_assert_str_eq(outcome.log, "load sart row1 sart row2 final!");
+	again.resume = outcome.last;
+	again.resume_iteration = 2;
+	run(&scene, &recipe, &again);
+	ck_assert_str_eq(again.log, "load final!");
+	ck_assert_int_eq(again.kept[0].iteration, 2);
+	ck_assert_mem_eq(again.last, outcome.last, sizeof(float) * grid_voxels(&outcome.grid));
+	outcome_clear(&outcome);
+	outcome_clear(&again);
+	scene_clear(&scene);
+}
+END_TEST
+
+START_TEST(a_resume_that_makes_no_sense_is_refused)
+{
+	struct recipe recipe = small_recipe();
+	float *zero = calloc(grid_voxels(&recipe.grid), sizeof(float));
+	struct scene scene;
+	struct outcome outcome = {.resume = zero, .resume_iteration = 7};
+
+	small_scene(&scene);
+	scene_run(&scene, &recipe, &outcome);
+	ck_assert_int_eq(outcome.code, ERR_INVALID);
+	outcome_clear(&outcome);
+	recipe.sart.on = false;
+	recipe.fdk.on = true;
+	outcome = (struct outcome){.resume = zero};
+	scene_run(&scene, &recipe, &outcome);
+	ck_assert_int_eq(outcome.code, ERR_INVALID);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(zero);
+}
+END_TEST
+
+/* Whenever the question is answered with yes, the run ends with it, and nothing is kept after that. */
+START_TEST(a_run_can_be_cancelled_anywhere)
+{
+	struct recipe recipe = small_recipe();
+	struct scene scene;
+	struct outcome whole = {.at_once = 12};
+
+	recipe.fdk.on = recipe.tv.on = true;
+	recipe.sart.iterations = 2;
+	small_scene(&scene);
+	run(&scene, &recipe, &whole);
+	ck_assert_int_gt(whole.asked, 36 + 2);
+	for (int at = 1; at <= whole.asked; at += at < 40 ? 13 : 1) {
+		struct outcome outcome = {.at_once = 12, .cancel_at = at};
+
+		scene_run(&scene, &recipe, &outcome);
+		ck_assert_int_eq(outcome.code, ERR_CANCELLED);
+		ck_assert_int_eq(outcome.asked, at);
+		ck_assert_int_eq(outcome.kept_count, 0);
+		ck_assert_int_eq(strncmp(whole.log, outcome.log, strlen(outcome.log)), 0);
+		outcome_clear(&outcome);
+	}
+	outcome_clear(&whole);
+	scene_clear(&scene);
+}
+END_TEST
+
+START_TEST(stop_rules_end_it_at_the_first_row_that_meets_them)
+{
+	struct recipe recipe = small_recipe();
+	struct scene scene;
+	struct outcome whole = {0}, residual = {0}, change = {0};
+	int emit[] = {4, 6};
+
+	recipe.emit = emit;
+	recipe.emits = 2;
+	small_scene(&scene);
+	run(&scene, &recipe, &whole);
+	ck_assert_int_eq(whole.row_count, 6);
+	ck_assert_double_lt(whole.rows[3].residual, whole.rows[2].residual);
+	ck_assert_double_lt(whole.rows[3].change, whole.rows[2].change);
+
+	recipe.sart.stop_residual = whole.rows[3].residual;
+	run(&scene, &recipe, &residual);
+	ck_assert_int_eq(residual.row_count, 4);
+	ck_assert_int_eq(residual.kept_count, 2);
+	ck_assert_str_eq(residual.kept[0].name, "iter-4");
+	ck_assert_str_eq(residual.kept[1].name, "final");
+	ck_assert_int_eq(residual.kept[1].iteration, 4);
+	ck_assert_mem_eq(residual.last, outcome_volume(&whole, "iter-4"), sizeof(float) * grid_voxels(&whole.grid));
+	ck_assert_double_eq(residual.fraction, 1);
+
+	recipe.sart.stop_residual = 0;
+	recipe.sart.stop_change = whole.rows[1].change;
+	run(&scene, &recipe, &change);
+	ck_assert_int_eq(change.row_count, 2);
+	outcome_clear(&whole);
+	outcome_clear(&residual);
+	outcome_clear(&change);
+	scene_clear(&scene);
+}
+END_TEST
+
+/* Explicit TV steps a million times too large overflow within a few iterations. */
+START_TEST(divergence_is_an_error_with_the_iteration)
+{
+	struct recipe recipe = small_recipe();
+	struct scene scene;
+	struct outcome outcome = {0};
+
+	recipe.sart.nonnegative = false;
+	recipe.tv.on = true;
+	recipe.tv.options.step = 1e6;
+	recipe.tv.options.alpha = 1e6;
+	small_scene(&scene);
+	scene_run(&scene, &recipe, &outcome);
+	ck_assert_int_eq(outcome.code, ERR_IMPOSSIBLE);
+	ck_assert_ptr_nonnull(strstr(outcome.err.text, "iteration 1 has diverged"));
+	ck_assert_int_eq(outcome.kept_count, 0);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
+/* ---- what is told of the input ---- */
+
+START_TEST(defects_are_replaced_counted_and_told)
+{
+	const double air = 60000, origin[3] = {2, -3, 10};
+	struct recipe recipe = small_recipe();
+	struct scene scene;
+	struct outcome outcome = {.linearise = {.sample = SAMPLE_UINT16, .quantity = QUANTITY_INTENSITY, .air = air}};
+	size_t samples = 44 * 44, all = samples * 36;
+	unsigned short *counts = malloc(all * sizeof(*counts));
+
+	recipe.fdk.on = true;
+	small_scene(&scene);
+	for (size_t i = 0; i < all; i++)
+		counts[i] = (unsigned short)lrint(air * exp(-(double)scene.projections[i]));
+	counts[3 * samples + 500] = 0;
+	counts[3 * samples + 777] = 65535;
+	counts[20 * samples + 1000] = 0;
+	outcome.samples = counts;
+	run(&scene, &recipe, &outcome);
+	ck_assert_str_eq(outcome.warnings,
+			 "defects: 3 samples (0.0043 %) in 2 projections were replaced from their neighbours\n");
+	/* rounded to whole counts, and 36 views, 6 iterations */
+	ck_assert_double_eq_tol(mean_near(outcome.last, &outcome.grid, origin, 5), 0.02, 0.0005);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(counts);
+}
+END_TEST
+
+START_TEST(an_arc_that_is_too_short_for_fdk_is_told)
+{
+	const struct orbit_spec spec = {44, 44, 60, {600, 1100, {3, 3}, {0, 0}, {0, 0}}, 0, 170.0 / 59};
+	struct recipe recipe = small_recipe();
+	struct scene scene;
+	struct outcome outcome = {0}, sart = {0};
+
+	scene_orbit(&scene, &spec);
+	add_ball(&scene, 20, 0.02, 0, 0, 0);
+	run(&scene, &recipe, &sart);
+	ck_assert_str_eq(sart.warnings, "");
+	recipe.fdk.on = true;
+	run(&scene, &recipe, &outcome);
+	ck_assert_ptr_nonnull(strstr(outcome.warnings, "short_arc: "));
+	ck_assert_ptr_nonnull(strstr(outcome.warnings, "170.0 degrees"));
+	outcome_clear(&outcome);
+	outcome_clear(&sart);
+	scene_clear(&scene);
+}
+END_TEST
+
+/* ---- refused ---- */
+
+static const struct recon_hooks no_hooks;
+static const struct linearise plain = {.sample = SAMPLE_FLOAT32};
+
+START_TEST(views_must_be_there_once_each)
+{
+	const struct device_options options = {0};
+	struct recipe recipe = small_recipe();
+	struct scene scene;
+	struct device *device;
+	struct recon *recon;
+	struct error err = {0};
+	int views[36];
+
+	for (int i = 0; i < 36; i++)
+		views[i] = i;
+	small_scene(&scene);
+	ck_assert_int_eq(backend_cpu.open(0, &options, &device, &err), 0);
+	ck_assert_int_eq(recon_open(&backend_cpu, device, &scene.geometry, &plain, &recipe, &no_hooks, &recon, &err),
+			 0);
+	ck_assert_int_eq(recon_push(recon, scene.projections, (int[]){36}, 1, &err), ERR_INVALID);
+	ck_assert_int_eq(recon_push(recon, scene.projections, (int[]){-1}, 1, &err), ERR_INVALID);
+	ck_assert_int_eq(recon_push(recon, scene.projections, views, 12, &err), 0);
+	ck_assert_int_eq(recon_push(recon, scene.projections, (int[]){20, 5}, 2, &err), ERR_CONFLICT);
+	ck_assert_int_eq(recon_run(recon, &err), ERR_CONFLICT);
+	ck_assert_str_eq(err.text, "24 of 36 views have not come, the first of them is 12");
+	ck_assert_int_eq(recon_resume(recon, scene.projections, 1, &err), ERR_CONFLICT);
+	ck_assert_int_eq(recon_push(recon, scene.projections + (size_t)12 * 44 * 44, views + 12, 24, &err), 0);
+	ck_assert_int_eq(recon_run(recon, &err), 0);
+	ck_assert_int_eq(recon_iteration(recon), 6);
+	ck_assert_int_eq(recon_run(recon, &err), ERR_CONFLICT);
+	ck_assert_int_eq(recon_push(recon, scene.projections, views, 1, &err), ERR_CONFLICT);
+	recon_free(recon);
+	backend_cpu.close(device);
+	scene_clear(&scene);
+}
+END_TEST
+
+START_TEST(what_does_not_fit_is_refused_before_it_is_allocated)
+{
+	const struct device_options options = {.memory_limit = 3 << 20};
+	struct grid grid = grid_of(512, 512, 512, 0.2, 0.2, 0.2);
+	struct recipe recipe = recipe_on(&grid);
+	struct recon_memory memory;
+	struct scene scene;
+	struct device *device;
+	struct recon *recon = NULL;
+	struct error err = {0};
+	double numbers[5];
+
+	recipe.fdk.on = true;
+	small_scene(&scene);
+	ck_assert_int_eq(backend_cpu.open(0, &options, &device, &err), 0);
+	ck_assert_int_eq(recon_open(&backend_cpu, device, &scene.geometry, &plain, &recipe, &no_hooks, &recon, &err),
+			 ERR_NO_MEMORY);
+	ck_assert_ptr_null(recon);
+	ck_assert_str_eq(err.pointer, "/grid");
+	ck_assert_int_eq(sscanf(err.text,
+				"%lf MiB are needed (projections %lf, volumes %lf, scratch %lf), %lf MiB are free",
+				&numbers[0], &numbers[1], &numbers[2], &numbers[3], &numbers[4]),
+			 5);
+	ck_assert_double_ge(numbers[2], 512);
+	ck_assert_double_gt(numbers[0], numbers[4]);
+	ck_assert_int_eq(recon_memory(&backend_cpu, device, &scene.geometry, &recipe, &memory, &err), 0);
+	ck_assert_uint_le(memory.available, 3 << 20);
+	ck_assert_uint_eq(memory.total, memory.projections + memory.volumes + memory.scratch);
+	backend_cpu.close(device);
+	scene_clear(&scene);
+}
+END_TEST
+
+START_TEST(fdk_alone_does_not_keep_the_projections)
+{
+	const struct orbit_spec spec = {200, 200, 720, {600, 1100, {1, 1}, {0, 0}, {0, 0}}, 0, 0.5};
+	const size_t all = (size_t)200 * 200 * 720 * sizeof(float);
+	struct grid grid = grid_of(64, 64, 64, 1, 1, 1);
+	struct recipe recipe = recipe_on(&grid);
+	struct recon_memory fdk, sart;
+	struct scene scene;
+	struct error err = {0};
+
+	scene_orbit(&scene, &spec);
+	recipe.fdk.on = true;
+	ck_assert_int_eq(recon_memory(&backend_cpu, NULL, &scene.geometry, &recipe, &fdk, &err), 0);
+	recipe.sart.on = true;
+	ck_assert_int_eq(recon_memory(&backend_cpu, NULL, &scene.geometry, &recipe, &sart, &err), 0);
+	ck_assert_uint_ge(sart.projections, all);
+	ck_assert_uint_lt(fdk.projections, all / 10);
+	ck_assert_uint_lt(fdk.volumes, sart.volumes);
+	ck_assert_uint_eq(fdk.available, 0);
+	scene_clear(&scene);
+}
+END_TEST
+
+/* One wrong thing each in a recipe that is fine otherwise. */
+static void two_subsets_too_many(struct recipe *recipe)
+{
+	recipe->sart.subsets = 38;
+}
+static void negative_subsets(struct recipe *recipe)
+{
+	recipe->sart.subsets = -2;
+}
+static void no_stage(struct recipe *recipe)
+{
+	recipe->fdk.on = recipe->sart.on = false;
+}
+static void no_iterations(struct recipe *recipe)
+{
+	recipe->sart.iterations = 0;
+}
+static void relaxation_zero(struct recipe *recipe)
+{
+	recipe->sart.relaxation = 0;
+}
+static void relaxation_nan(struct recipe *recipe)
+{
+	recipe->sart.relaxation = NAN;
+}
+static void relaxation_large(struct recipe *recipe)
+{
+	recipe->sart.relaxation = 2.1;
+}
+static void stop_residual(struct recipe *recipe)
+{
+	recipe->sart.stop_residual = -1;
+}
+static void stop_change(struct recipe *recipe)
+{
+	recipe->sart.stop_change = INFINITY;
+}
+static void cutoff_zero(struct recipe *recipe)
+{
+	recipe->fdk.cutoff = 0;
+}
+static void tv_alpha(struct recipe *recipe)
+{
+	recipe->tv.options.alpha = -1;
+}
+static void tv_alpha_proximal(struct recipe *recipe)
+{
+	recipe->tv.options.method = TV_PROXIMAL;
+	recipe->tv.options.alpha = 0;
+}
+static void tv_step(struct recipe *recipe)
+{
+	recipe->tv.options.step = 0;
+}
+static void tv_iterations(struct recipe *recipe)
+{
+	recipe->tv.options.iterations = 0;
+}
+static void tv_unit(struct recipe *recipe)
+{
+	recipe->tv.options.unit = -1;
+}
+static void mu_water(struct recipe *recipe)
+{
+	recipe->mu_water = 0;
+}
+static void grid_size(struct recipe *recipe)
+{
+	recipe->grid.size[1] = 0;
+}
+static void grid_spacing(struct recipe *recipe)
+{
+	recipe->grid.spacing[2] = -1;
+}
+static void grid_to_the_source(struct recipe *recipe)
+{
+	recipe->grid.spacing[0] = recipe->grid.spacing[1] = 40;
+	recipe->has_origin = false;
+}
+static int second_emit = 7;
+static void emit_iteration(struct recipe *recipe)
+{
+	recipe->emits = 1;
+	recipe->emit = &second_emit;
+}
+static int emit_fdk_only = EMIT_FDK;
+static void emit_fdk(struct recipe *recipe)
+{
+	recipe->fdk.on = false;
+	recipe->emits = 1;
+	recipe->emit = &emit_fdk_only;
+}
+static int emit_fdk_tv_only = EMIT_FDK_TV;
+static void emit_fdk_tv(struct recipe *recipe)
+{
+	recipe->tv.after_fdk = false;
+	recipe->emits = 1;
+	recipe->emit = &emit_fdk_tv_only;
+}
+
+static const struct {
+	void (*spoil)(struct recipe *recipe);
+	const char *pointer;
+} refusals[] = {
+    {two_subsets_too_many, "/sart/subsets"},
+    {negative_subsets, "/sart/subsets"},
+    {no_stage, ""},
+    {no_iterations, "/sart/iterations"},
+    {relaxation_zero, "/sart/relaxation"},
+    {relaxation_nan, "/sart/relaxation"},
+    {relaxation_large, "/sart/relaxation"},
+    {stop_residual, "/sart/stop/residual"},
+    {stop_change, "/sart/stop/change"},
+    {cutoff_zero, "/fdk/cutoff"},
+    {tv_alpha, "/tv/alpha"},
+    {tv_alpha_proximal, "/tv/alpha"},
+    {tv_step, "/tv/step"},
+    {tv_iterations, "/tv/iterations"},
+    {tv_unit, "/tv/unit"},
+    {mu_water, "/mu_water"},
+    {grid_size, "/grid/size/1"},
+    {grid_spacing, "/grid/spacing_mm/2"},
+    {grid_to_the_source, "/grid"},
+    {emit_iteration, "/emit/0"},
+    {emit_fdk, "/emit/0"},
+    {emit_fdk_tv, "/emit/0"},
+};
+
+START_TEST(impossible_recipes_are_refused_by_their_field)
+{
+	const struct device_options options = {0};
+	struct recipe recipe = small_recipe();
+	struct scene scene;
+	struct device *device;
+	struct recon *recon = NULL;
+	struct error err = {0};
+	int code;
+
+	recipe.fdk.on = recipe.tv.on = true;
+	small_scene(&scene);
+	ck_assert_int_eq(recipe_check(&recipe, &scene.geometry, &err), 0);
+	refusals[_i].spoil(&recipe);
+	code = recipe_check(&recipe, &scene.geometry, &err);
+	ck_assert_int_lt(code, 0);
+	ck_assert_int_eq(code, err.code);
+	ck_assert_str_eq(err.pointer, refusals[_i].pointer);
+	ck_assert_int_gt((int)strlen(err.text), 0);
+	ck_assert_int_eq(backend_cpu.open(0, &options, &device, &err), 0);
+	ck_assert_int_eq(recon_open(&backend_cpu, device, &scene.geometry, &plain, &recipe, &no_hooks, &recon, &err),
+			 code);
+	ck_assert_ptr_null(recon);
+	ck_assert_str_eq(err.pointer, refusals[_i].pointer);
+	backend_cpu.close(device);
+	scene_clear(&scene);
+}
+END_TEST
+
+START_TEST(resolving_writes_every_default_and_is_stable)
+{
+	struct recipe recipe, again;
+	struct scene scene;
+	struct orbit orbit;
+	struct error err = {0};
+
+	recipe_defaults(&recipe);
+	recipe.fdk.on = recipe.sart.on = recipe.tv.on = true;
+	small_scene(&scene);
+	ck_assert_int_eq(orbit_analyse(&orbit, &scene.geometry, &err), 0);
+	ck_assert_int_eq(recipe_resolve(&recipe, &scene.geometry, &orbit, &err), 0);
+	ck_assert(recipe.has_grid && recipe.has_origin);
+	ck_assert_double_eq(recipe.tv.options.unit, recipe.mu_water / 1000);
+	again = recipe;
+	ck_assert_int_eq(recipe_resolve(&again, &scene.geometry, &orbit, &err), 0);
+	ck_assert_mem_eq(&again.grid, &recipe.grid, sizeof(recipe.grid));
+	ck_assert_double_eq(again.tv.options.unit, recipe.tv.options.unit);
+
+	/* A size without an origin is centred. */
+	recipe.grid = grid_of(20, 22, 24, 1, 1, 1);
+	memset(recipe.grid.origin, 0, sizeof(recipe.grid.origin));
+	recipe.has_origin = false;
+	ck_assert_int_eq(recipe_resolve(&recipe, &scene.geometry, &orbit, &err), 0);
+	ck_assert_double_eq(recipe.grid.origin[0], -9.5);
+	ck_assert_double_eq(recipe.grid.origin[2], -11.5);
+	orbit_clear(&orbit);
+	scene_clear(&scene);
+}
+END_TEST
+
+/* ---- subsets ---- */
+
+static void orbit_of(struct orbit *ret_orbit, int views, double first_deg, double step_deg)
+{
+	const struct orbit_spec spec = {8, 8, views, {600, 1100, {3, 3}, {0, 0}, {0, 0}}, first_deg, step_deg};
+	struct scene scene;
+	struct error err;
+
+	scene_orbit(&scene, &spec);
+	ck_assert_int_eq(orbit_analyse(ret_orbit, &scene.geometry, &err), 0);
+	scene_clear(&scene);
+}
+
+START_TEST(subsets_hold_every_view_once_and_are_of_one_size)
+{
+	static const int views[] = {1, 2, 3, 10, 26, 97, 100, 549};
+	const int all = views[_i];
+	struct orbit orbit;
+	struct error err;
+
+	orbit_of(&orbit, all, 90, 197.0 / all);
+	for (int count = 1; count <= all; count += count < 30 ? 1 : 37) {
+		struct subsets subsets, again;
+		int *seen = calloc((size_t)all, sizeof(int)), least = all, most = 0;
+
+		ck_assert_int_eq(subsets_make(&subsets, &orbit, count, &err), 0);
+		ck_assert_int_eq(subsets_make(&again, &orbit, count, &err), 0);
+		ck_assert_mem_eq(subsets.order, again.order, sizeof(int) * (size_t)all);
+		ck_assert_int_eq(subsets.count, count);
+		ck_assert_int_eq(subsets.start[0], 0);
+		ck_assert_int_eq(subsets.start[count], all);
+		for (int s = 0; s < count; s++) {
+			int size = subsets.start[s + 1] - subsets.start[s];
+
+			least = size < least ? size : least;
+			most = size > most ? size : most;
+		}
+		ck_assert_int_le(most - least, 1);
+		for (int i = 0; i < all; i++)
+			seen[subsets.order[i]]++;
+		for (int i = 0; i < all; i++)
+			ck_assert_int_eq(seen[i], 1);
+		subsets_clear(&subsets);
+		subsets_clear(&again);
+		free(seen);
+	}
+	orbit_clear(&orbit);
+}
+END_TEST
+
+/* Each subset is the whole arc, thinned out: no two neighbours of a subset are much farther apart than count views. */
+START_TEST(each_subset_is_spread_over_the_arc)
+{
+	struct orbit orbit;
+	struct subsets subsets;
+	struct error err;
+
+	orbit_of(&orbit, 100, 300, 2); /* its middle is at angle zero */
+	ck_assert_int_eq(subsets_make(&subsets, &orbit, 10, &err), 0);
+	for (int s = 0; s < 10; s++)
+		for (int i = subsets.start[s] + 1; i < subsets.start[s + 1]; i++)
+			ck_assert_int_eq(subsets.order[i] - subsets.order[i - 1], 10);
+	subsets_clear(&subsets);
+	orbit_clear(&orbit);
+}
+END_TEST
+
+/* The property of the golden section: after n views, the widest gap is not much more than the mean of n. */
+START_TEST(each_view_is_far_from_those_before_it)
+{
+	enum { VIEWS = 100 };
+	struct orbit orbit;
+	struct subsets subsets;
+	struct error err;
+	bool taken[VIEWS] = {false};
+
+	orbit_of(&orbit, VIEWS, 0, 360.0 / VIEWS);
+	ck_assert_int_eq(subsets_make(&subsets, &orbit, VIEWS, &err), 0);
+	for (int n = 1; n <= VIEWS; n++) {
+		int gap = 0, widest = 0;
+
+		taken[subsets.order[n - 1]] = true;
+		for (int i = 0; i < 2 * VIEWS; i++) {
+			gap = taken[i % VIEWS] ? 0 : gap + 1;
+			widest = gap > widest ? gap : widest;
+		}
+		/* 1/golden ratio^2 + 1 = 2.618 of the mean at worst, and one for whole views */
+		ck_assert_double_le(widest, 2.618 * VIEWS / n + 1);
+	}
+	subsets_clear(&subsets);
+	orbit_clear(&orbit);
+}
+END_TEST
+
+/* ---- RTK's own test set-ups, at RTK's thresholds ---- */
+
+/* What the detector does not see in every view is none of the reconstruction's business. */
+static void zero_outside_the_field_of_view(const struct scene *scene, const struct grid *grid, float *volume)
+{
+	struct orbit orbit;
+	struct error err;
+	size_t at = 0;
+	double(*matrices)[12] = malloc(sizeof(*matrices) * (size_t)scene->geometry.count);
+
+	ck_assert_int_eq(orbit_analyse(&orbit, &scene->geometry, &err), 0);
+	for (int v = 0; v < scene->geometry.count; v++)
+		view_matrix(&scene->geometry.views[v], matrices[v]);
+	for (int k = 0; k < grid->size[2]; k++)
+		for (int j = 0; j < grid->size[1]; j++)
+			for (int i = 0; i < grid->size[0]; i++, at++) {
+				const double point[3] = {grid->origin[0] + i * grid->spacing[0],
+							 grid->origin[1] + j * grid->spacing[1],
+							 grid->origin[2] + k * grid->spacing[2]};
+				bool seen = hypot(point[0], point[1]) <= orbit.field_of_view / 2;
+
+				for (int v = 0; seen && v < scene->geometry.count; v++) {
+					double column, row;
+
+					view_project(matrices[v], point, &column, &row);
+					seen = row >= -0.5 && row <= scene->geometry.rows - 0.5;
+				}
+				if (!seen)
+					volume[at] = 0;
+			}
+	free(matrices);
+	orbit_clear(&orbit);
+}
+
+static const struct {
+	const char *name;
+	struct orbit_spec spec;
+	double error, psnr;
+} rtk_fdk[] = {
+    {"full", {128, 128, 180, {600, 1200, {4, 4}, {0, 0}, {0, 0}}, 0, 2}, 0.03, 26},
+    {"short scan", {128, 128, 110, {600, 1200, {4, 4}, {0, 0}, {0, 0}}, 0, 240.0 / 110}, 0.09, 22},
+    {"displaced", {128, 128, 180, {600, 1200, {4, 4}, {120, 0}, {0, 0}}, 0, 2}, 0.061, 24},
+};
+
+START_TEST(fdk_is_as_good_as_rtk_demands)
+{
+	struct grid grid = grid_of(128, 128, 128, 2, 2, 2);
+	struct recipe recipe = recipe_on(&grid);
+	size_t count = grid_voxels(&grid);
+	float *truth = malloc(sizeof(float) * count);
+	struct phantom phantom;
+	struct scene scene;
+	struct outcome outcome = {0};
+	double error, psnr;
+
+	recipe.fdk.on = true;
+	recipe.fdk.window = WINDOW_RAM_LAK; /* as RTK's tests have it */
+	scene_orbit(&scene, &rtk_fdk[_i].spec);
+	ck_assert_int_eq(phantom_named(&phantom, "shepp-logan", 116, 1, &outcome.err), 0);
+	scene_add(&scene, &phantom);
+	phantom_voxelise(&phantom, &grid, 1, truth);
+	run(&scene, &recipe, &outcome);
+	zero_outside_the_field_of_view(&scene, &grid, outcome.last);
+	error = mean_error(outcome.last, truth, count);
+	psnr = psnr_of(outcome.last, truth, count, 2);
+	ck_assert_msg(error < rtk_fdk[_i].error && psnr > rtk_fdk[_i].psnr, "%s: mean |error| %.4f, PSNR %.2f dB",
+		      rtk_fdk[_i].name, error, psnr);
+	outcome_clear(&outcome);
+	phantom_clear(&phantom);
+	scene_clear(&scene);
+	free(truth);
+}
+END_TEST
+
+START_TEST(sart_is_as_good_as_rtk_demands)
+{
+	const struct orbit_spec spec = {64, 64, 180, {600, 1200, {8, 8}, {0, 0}, {0, 0}}, 0, 2};
+	struct grid grid = grid_of(64, 64, 64, 4, 4, 4);
+	struct recipe recipe = recipe_on(&grid);
+	size_t count = grid_voxels(&grid);
+	float *truth = malloc(sizeof(float) * count);
+	struct ellipsoid ball = {.shape = SHAPE_ELLIPSOID, .semi_axes = {90, 90, 90}, .density = 1};
+	struct phantom phantom = {.count = 1, .parts = &ball};
+	struct scene scene;
+	struct outcome outcome = {0};
+	double error, psnr;
+
+	recipe.sart.on = true;
+	recipe.sart.iterations = 1;
+	recipe.sart.relaxation = 0.5;
+	recipe.sart.subsets = SUBSETS_VIEWS;
+	recipe.sart.nonnegative = false;
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	phantom_voxelise(&phantom, &grid, 1, truth);
+	run(&scene, &recipe, &outcome);
+	error = mean_error(outcome.last, truth, count);
+	psnr = psnr_of(outcome.last, truth, count, 2);
+	ck_assert_msg(error < 0.032 && psnr > 28.6, "mean |error| %.4f, PSNR %.2f dB", error, psnr);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(truth);
+}
+END_TEST
+
+#define COUNT(table) ((int)(sizeof(table) / sizeof((table)[0])))
+
+Suite *recon_suite(void)
+{
+	Suite *suite = suite_create("recon");
+	TCase *images = tcase_create("images"), *pipeline = tcase_create("pipeline"),
+	      *subsets = tcase_create("subsets");
+
+	/* No test here is about time, and a sanitizer's build takes its own. */
+	tcase_set_timeout(images, 0);
+	tcase_set_timeout(pipeline, 0);
+	tcase_set_timeout(subsets, 0);
+
+	tcase_add_loop_test(images, fdk_of_a_ball_is_its_density, 0, ORBITS);
+	tcase_add_loop_test(images, balls_off_centre_are_where_they_were_put, 0, 2 * ORBITS);
+	tcase_add_test(images, one_row_and_one_slice_give_a_disc);
+	tcase_add_test(images, a_single_view_is_explained_by_sart_and_harmless_to_fdk);
+	tcase_add_test(images, without_a_grid_one_is_chosen);
+	tcase_add_loop_test(images, fdk_is_as_good_as_rtk_demands, 0, COUNT(rtk_fdk));
+	tcase_add_test(images, sart_is_as_good_as_rtk_demands);
+	suite_add_tcase(suite, images);
+
+	tcase_add_loop_test(pipeline, sirt_lowers_the_residual_in_every_iteration, 0, 2);
+	tcase_add_test(pipeline, more_subsets_converge_faster);
+	tcase_add_test(pipeline, nonnegative_is_what_it_says);
+	tcase_add_test(pipeline, relaxation_scales_the_update);
+	tcase_add_test(pipeline, the_rows_are_the_norms_of_the_volumes);
+	tcase_add_test(pipeline, a_scan_of_nothing_is_nothing_with_finite_rows);
+	tcase_add_loop_test(pipeline, stages_rows_and_volumes_come_in_order, 0, COUNT(pipelines));
+	tcase_add_test(pipeline, fdk_is_a_start_for_sart_and_tv_smooths_it);
+	tcase_add_test(pipeline, views_may_come_in_any_order);
+	tcase_add_loop_test(pipeline, pushes_and_threads_do_not_change_a_bit, 0, 2);
+	tcase_add_loop_test(pipeline, a_run_that_yielded_goes_on_as_if_it_had_not, 0, 2);
+	tcase_add_test(pipeline, the_last_iteration_does_not_yield_and_can_be_resumed_from);
+	tcase_add_test(pipeline, a_resume_that_makes_no_sense_is_refused);
+	tcase_add_test(pipeline, a_run_can_be_cancelled_anywhere);
+	tcase_add_test(pipeline, stop_rules_end_it_at_the_first_row_that_meets_them);
+	tcase_add_test(pipeline, divergence_is_an_error_with_the_iteration);
+	tcase_add_test(pipeline, defects_are_replaced_counted_and_told);
+	tcase_add_test(pipeline, an_arc_that_is_too_short_for_fdk_is_told);
+	tcase_add_test(pipeline, views_must_be_there_once_each);
+	tcase_add_test(pipeline, what_does_not_fit_is_refused_before_it_is_allocated);
+	tcase_add_test(pipeline, fdk_alone_does_not_keep_the_projections);
+	tcase_add_loop_test(pipeline, impossible_recipes_are_refused_by_their_field, 0, COUNT(refusals));
+	tcase_add_test(pipeline, resolving_writes_every_default_and_is_stable);
+	suite_add_tcase(suite, pipeline);
+
+	tcase_add_loop_test(subsets, subsets_hold_every_view_once_and_are_of_one_size, 0, 8);
+	tcase_add_test(subsets, each_subset_is_spread_over_the_arc);
+	tcase_add_test(subsets, each_view_is_far_from_those_before_it);
+	suite_add_tcase(suite, subsets);
+	return suite;
+}
