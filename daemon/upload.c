@@ -1,8 +1,8 @@
 /*
  * Projections and images from a request's body to the disk: upload.h.
  *
- *   connection  fills and checks a slot ---> queue ---> writer: hash, claim, pwrite
- *                                               ^             |          |
+ *   connection  fills and checks a slot ---> queue ---> writer: claim, pwrite, hash
+ *                                               ^             |           |
  *                                               |          busy: park    v
  *                                               '--- a claim came free   sync, commit, settle
  *
@@ -43,7 +43,6 @@ struct slot {
 	int weight;          /* projections that it stands for */
 	size_t size, filled; /* bytes */
 	unsigned char *data; /* [size] */
-	bool hashed;
 	uint8_t sha256[32];
 	double parked;  /* since when it waits for a claim, 0: it does not */
 	bool committed; /* its claims went back with the commit */
@@ -737,10 +736,19 @@ static int write_slot(const struct slot *slot, struct error *err)
 	return 0;
 }
 
+static int hash_slot(struct slot *slot, struct error *err)
+{
+	if (EVP_Digest(slot->data, slot->size, slot->sha256, NULL, EVP_sha256(), NULL) != 1)
+		return error_set(err, ERR_INTERNAL, "the digest of a projection cannot be made");
+	return 0;
+}
+
 static int compare_with_stored(struct slot *slot, struct error *err)
 {
 	uint8_t stored[32];
 
+	if (hash_slot(slot, err) != 0)
+		return err->code;
 	if (!stored_scan_digest(slot->upload->scan, slot->index, stored))
 		return error_set(err, ERR_NOT_FOUND, "the scan was deleted meanwhile");
 	if (memcmp(stored, slot->sha256, sizeof(stored)) != 0)
@@ -749,41 +757,47 @@ static int compare_with_stored(struct slot *slot, struct error *err)
 	return 0;
 }
 
-/* Hash, claim and write; slot->outcome tells how far it came. */
+/* Another request has the claim: waits for its outcome, though not for ever. */
+static int park(struct slot *slot, struct error *err)
+{
+	double now = http_now();
+
+	if (slot->parked == 0)
+		slot->parked = now;
+	if (now - slot->parked > BUSY_SECONDS)
+		return error_set(err, ERR_BUSY, "another request has been sending projection %d for %d s", slot->index,
+				 BUSY_SECONDS);
+	slot->outcome = SLOT_PARKED;
+	return 0;
+}
+
+/* Under its claim; the disk begins at once, while the bytes are hashed. */
+static int write_claimed(struct slot *slot, struct error *err)
+{
+	const struct upload *upload = slot->upload;
+
+	if (write_slot(slot, err) == 0) {
+		sync_file_range(upload->descriptor, (off_t)slot->index * (off_t)slot->size, (off_t)slot->size,
+				SYNC_FILE_RANGE_WRITE);
+		if (hash_slot(slot, err) == 0) {
+			slot->outcome = upload->holds ? SLOT_HELD : SLOT_WRITTEN;
+			return 0;
+		}
+	}
+	stored_scan_unclaim(upload->scan, slot->index);
+	return err->code;
+}
+
+/* slot->outcome tells how far it came. */
 static int process_projection(struct slot *slot, struct error *err)
 {
 	enum claim claim;
 
-	if (!slot->hashed) {
-		if (EVP_Digest(slot->data, slot->size, slot->sha256, NULL, EVP_sha256(), NULL) != 1)
-			return error_set(err, ERR_INTERNAL, "the digest of a projection cannot be made");
-		slot->hashed = true;
-	}
 	if (stored_scan_claim(slot->upload->scan, slot->index, &claim, err) != 0)
 		return err->code;
 	if (claim == CLAIM_STORED)
 		return compare_with_stored(slot, err);
-	if (claim == CLAIM_BUSY) {
-		double now = http_now();
-
-		if (slot->parked == 0)
-			slot->parked = now;
-		if (now - slot->parked > BUSY_SECONDS)
-			return error_set(err, ERR_BUSY, "another request has been sending projection %d for %d s",
-					 slot->index, BUSY_SECONDS);
-		slot->outcome = SLOT_PARKED;
-		return 0;
-	}
-	if (write_slot(slot, err) != 0) {
-		stored_scan_unclaim(slot->upload->scan, slot->index);
-		return err->code;
-	}
-	/* The sync of what is held comes much later: the disk may begin now. */
-	if (slot->upload->holds)
-		sync_file_range(slot->upload->descriptor, (off_t)slot->index * (off_t)slot->size, (off_t)slot->size,
-				SYNC_FILE_RANGE_WRITE);
-	slot->outcome = slot->upload->holds ? SLOT_HELD : SLOT_WRITTEN;
-	return 0;
+	return claim == CLAIM_BUSY ? park(slot, err) : write_claimed(slot, err);
 }
 
 /* float32 as it came, or the scan's own counts made float32. */
