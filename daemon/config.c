@@ -7,7 +7,6 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "core/backend.h"
 #include "proto/spool.h"
 
 enum kind {
@@ -368,13 +367,8 @@ void config_help(FILE *out)
 		fputc('\n', out);
 	}
 	fputs("  --print-config\n        every setting as it is now, as a config file\n"
-	      "  --help\n        this list\n\nbackends:\n",
+	      "  --help\n        this list\n",
 	      out);
-	/* The daemon itself has no CUDA; the worker has, and its row is weak here. */
-	for (int i = 0; i < BACKEND_COUNT; i++) {
-		if (backends[i] != NULL)
-			fprintf(out, "  %-6s %s\n", backends[i]->name, backends[i]->summary);
-	}
 }
 
 void config_print(const struct config *config, FILE *out)

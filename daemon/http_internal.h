@@ -57,7 +57,8 @@ struct request {
 	} queries[QUERIES_MAX];
 	int query_count;
 
-	bool begun; /* the header was looked at */
+	bool begun;  /* the header was looked at */
+	bool framed; /* the header tells of a body, if only of 0 bytes */
 	bool chunked;
 	bool dropping; /* the answer is known, the rest of the body is not wanted */
 	int64_t content_length;

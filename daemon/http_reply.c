@@ -32,6 +32,7 @@ static const struct problem {
     {ERR_BUSY, 503, "busy", "Not just now"},
     {ERR_INTERNAL, 500, "internal", "The daemon broke a promise of its own"},
     {0, 405, "method-not-allowed", "The resource does not know this method"},
+    {0, 411, "length-required", "The request needs a body"},
     {0, 415, "unsupported-encoding", "The body's encoding is not known"},
     {0, 416, "range-outside", "The range lies outside of the body"},
     {0, 429, "too-many-connections", "Too many connections from this address"},

@@ -213,6 +213,7 @@ static int read_framing(struct request *request, struct error *err)
 				 framing.encoding);
 	request->chunked = framing.encodings == 1;
 	request->content_length = request->chunked ? -1 : 0;
+	request->framed = framing.encodings + framing.lengths > 0;
 	if (framing.lengths == 0)
 		return 0;
 	if (strspn(framing.length, "0123456789") != strlen(framing.length) ||
@@ -227,6 +228,9 @@ static int check_body(struct request *request, struct error *err)
 {
 	const struct route *route = request->route;
 
+	if (route->body != BODY_NONE && !request->framed)
+		return request_reply_problem(request, 411, err,
+					     "neither Content-Length nor Transfer-Encoding tells of a body");
 	if (route->body == BODY_WHOLE && request->content_length > (int64_t)route->body_max)
 		return error_set(err, ERR_TOO_LARGE, "the body has %" PRId64 " bytes, at most %zu are taken",
 				 request->content_length, route->body_max);
