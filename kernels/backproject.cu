@@ -110,6 +110,8 @@ static __global__ void __launch_bounds__(ACROSS *ALONG) backproject_general(cons
 #pragma unroll
 	for (int k = 0; k < VOXELS; k++)
 		sum[k] = 0;
+		/* With few voxels a thread there is nothing else to do while samples come: several views at once. */
+#pragma unroll(VOXELS < 4 ? 4 : 1)
 	for (int i = 0; i < job.views; i++, p += job.slot) {
 		const float *m = matrices[i];
 		float a = fmaf(m[0], fx, fmaf(m[1], fy, fmaf(m[2], fz, m[3])));
@@ -271,13 +273,13 @@ static void launch_untilted(const backprojection_job &job, cudaStream_t stream)
 	backproject_untilted<VOXELS, WINDOWS, ACROSS, ALONG><<<blocks, dim3(ACROSS, ALONG), 0, stream>>>(job);
 }
 
-template <int SAMPLING>
+template <int VOXELS, int SAMPLING>
 static void launch_general(const backprojection_job &job, cudaStream_t stream)
 {
-	const int voxels = 8, side = 16;
-	dim3 blocks(divide_up(job.nx, side), divide_up(job.ny, side), divide_up(job.nz, voxels));
+	const int side = 16;
+	dim3 blocks(divide_up(job.nx, side), divide_up(job.ny, side), divide_up(job.nz, VOXELS));
 
-	backproject_general<voxels, side, side, SAMPLING><<<blocks, dim3(side, side), 0, stream>>>(job);
+	backproject_general<VOXELS, side, side, SAMPLING><<<blocks, dim3(side, side), 0, stream>>>(job);
 }
 
 static backprojection_job job_make(const struct plan *plan, float *volume, struct voxel_use use)
@@ -323,12 +325,14 @@ static int launch(struct plan *plan, backprojection_job &job, struct error *err)
 			TRY(load_array(plan, job.from, job.views, err));
 			if (job.use.coverage != NULL) {
 				job.texture = plan->projections.held;
-				launch_general<BY_TEXTURE_HELD>(job, stream);
+				launch_general<8, BY_TEXTURE_HELD>(job, stream);
 			} else {
-				launch_general<BY_TEXTURE>(job, stream);
+				launch_general<8, BY_TEXTURE>(job, stream);
 			}
+		} else if (plan->shape.is_small) {
+			launch_general<1, BY_LOADS>(job, stream);
 		} else {
-			launch_general<BY_LOADS>(job, stream);
+			launch_general<8, BY_LOADS>(job, stream);
 		}
 	}
 	LAUNCHED();

@@ -163,16 +163,16 @@ static struct plan_shape shape_of(const struct plan_options *options)
 	const struct grid *grid = options->grid;
 	struct plan_shape shape = {};
 	int most = grid->size[0] > grid->size[1] ? grid->size[0] : grid->size[1], subset = 0;
-	bool is_small, fits = most <= LAYERS_MOST && grid->size[2] <= SIDE_MOST;
+	bool fits = most <= LAYERS_MOST && grid->size[2] <= SIDE_MOST;
 
 	if (options->sart != NULL)
 		subset = largest_subset(&options->sart->subsets);
 	shape.z_rays = has_z_rays(geometry, grid);
 	choose_untilted(options, &shape);
-	is_small = (double)grid_voxels(grid) * geometry->count < SMALL;
-	if (is_small)
+	shape.is_small = (double)grid_voxels(grid) * geometry->count < SMALL;
+	if (shape.is_small)
 		shape.forward_rows = shape.back_voxels = 0;
-	shape.textures = !is_small && !options->reference_precision && fits && geometry->columns <= SIDE_MOST &&
+	shape.textures = !shape.is_small && !options->reference_precision && fits && geometry->columns <= SIDE_MOST &&
 			 geometry->rows <= SIDE_MOST;
 	shape.batch = geometry->count < BATCH_MOST ? geometry->count : BATCH_MOST;
 	shape.by_view = subset == 1 && columns_shape_make(grid->size).floats < (size_t)1 << 31;
@@ -217,8 +217,9 @@ static void plan_describe(struct plan *plan, const struct plan_options *options)
 		plan->scratch_bytes = tv_scratch_bytes(options);
 	if (plan->shape.by_view)
 		plan->partial_count = sweep_partials(plan);
-	else if (plan->shape.by_subset)
-		plan->partial_count = project_blocks(plan, geometry->count);
+	for (int i = 0; plan->shape.by_subset && i < options->sart->subsets.count; i++)
+		plan->partial_count +=
+		    project_blocks(plan, options->sart->subsets.start[i + 1] - options->sart->subsets.start[i]);
 	plan->raw_views = 1;
 	plan->bytes.raw =
 	    (size_t)geometry->columns * (size_t)geometry->rows * (options->linearise.sample == SAMPLE_UINT16 ? 2 : 4);

@@ -44,12 +44,16 @@ struct projection {
 struct place {
 	int slot, tile_column, tile_row;
 };
+/* A block has the same tile of VIEWS successive views, which share what they read where the angles are close. */
+template <int VIEWS>
 static __device__ __forceinline__ place place_of(const projection &p)
 {
-	int block = blockIdx.x, whole = GROUP * p.tiles, group = block / whole, rest = block - group * whole;
-	int views = min(GROUP, p.count - group * GROUP), tile = rest / views, row = tile / p.tiles_across;
+	const int group_most = GROUP / VIEWS;
+	int sets = (p.count + VIEWS - 1) / VIEWS, block = blockIdx.x, whole = group_most * p.tiles;
+	int group = block / whole, rest = block - group * whole, here = min(group_most, sets - group * group_most);
+	int tile = rest / here, row = tile / p.tiles_across;
 
-	return {group * GROUP + rest - tile * views, tile - row * p.tiles_across, row};
+	return {(group * group_most + rest - tile * here) * VIEWS + (int)threadIdx.z, tile - row * p.tiles_across, row};
 }
 
 /* Stores a ray's line integral, or what SART makes of it, and gives the squares for the sums. */
@@ -70,16 +74,19 @@ static __device__ __forceinline__ float2 finish(const projection &p, int slot, i
 	return squares;
 }
 
-enum { GENERAL_ROWS = 8 }; /* of a block, 32 columns wide: a warp a row */
+/* Of a block, 32 columns wide, a warp a row: rays far apart share little among rows, but much with the next views. */
+enum { GENERAL_ROWS = 2 };
+static const int GENERAL_VIEWS = 4;
 
 template <bool TEXTURE, bool ALONG_Z>
-static __global__ void __launch_bounds__(32 * GENERAL_ROWS, 5) project_general(const projection p)
+static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS, 5) project_general(const projection p)
 {
-	place at = place_of(p);
-	int view = p.views[at.slot];
+	place at = place_of<GENERAL_VIEWS>(p);
+	bool has_view = at.slot < p.count;
+	int view = p.views[has_view ? at.slot : 0];
 	const device_view &g = p.geometry[view];
 	int column = at.tile_column * 32 + threadIdx.x, row = at.tile_row * GENERAL_ROWS + threadIdx.y;
-	bool valid = column < p.columns && row < p.rows;
+	bool valid = has_view && column < p.columns && row < p.rows;
 	float c = (float)column - 0.5f * (float)(p.columns - 1), r = (float)row - 0.5f * (float)(p.rows - 1);
 	float d[3] = {form(g.direction[0], c, r), form(g.direction[1], c, r), form(g.direction[2], c, r)};
 	float m[3] = {form(g.moment[0], c, r), form(g.moment[1], c, r), form(g.moment[2], c, r)};
@@ -168,7 +175,7 @@ static __global__ void __launch_bounds__(32 * GENERAL_ROWS, 5) project_general(c
 		squares = finish(p, at.slot, view, column, row, sum, slices, step);
 	if (p.use.measured != NULL) {
 		squares = block_sum(squares);
-		if (threadIdx.x == 0 && threadIdx.y == 0)
+		if (threadIdx.x == 0 && threadIdx.y == 0 && threadIdx.z == 0)
 			p.use.partial[blockIdx.x] = squares;
 	}
 }
@@ -176,6 +183,7 @@ static __global__ void __launch_bounds__(32 * GENERAL_ROWS, 5) project_general(c
 /* ---- untilted ---- */
 
 enum { UNTILTED_WARPS = 4 }; /* of a block: 32 columns wide, UNTILTED_WARPS * ROWS rows high */
+static const int UNTILTED_VIEWS = 2;
 
 /* A column's rays: row k, counted upwards, crosses slice i at row + i row_step + k (1 + spread + i spread_step). */
 struct fan {
@@ -249,13 +257,15 @@ static __device__ __forceinline__ void row_range(const fan &f, int k, const slic
 }
 
 template <int ROWS>
-static __global__ void __launch_bounds__(32 * UNTILTED_WARPS, 8) project_untilted(const projection p)
+static __global__ void __launch_bounds__(32 * UNTILTED_WARPS * UNTILTED_VIEWS, 8 / UNTILTED_VIEWS)
+    project_untilted(const projection p)
 {
-	place at = place_of(p);
-	int view = p.views[at.slot];
+	place at = place_of<UNTILTED_VIEWS>(p);
+	bool has_view = at.slot < p.count;
+	int view = p.views[has_view ? at.slot : 0];
 	const device_view &g = p.geometry[view];
 	int column = at.tile_column * 32 + threadIdx.x, low = (at.tile_row * UNTILTED_WARPS + threadIdx.y) * ROWS;
-	bool valid = column < p.columns && low < p.rows;
+	bool valid = has_view && column < p.columns && low < p.rows;
 	float upwards = p.rows_down ? -1.0f : 1.0f;
 	float c = (float)column - 0.5f * (float)(p.columns - 1);
 	float r = upwards * ((float)low - 0.5f * (float)(p.rows - 1));
@@ -341,7 +351,7 @@ static __global__ void __launch_bounds__(32 * UNTILTED_WARPS, 8) project_untilte
 	}
 	if (p.use.measured != NULL) {
 		squares = block_sum(squares);
-		if (threadIdx.x == 0 && threadIdx.y == 0)
+		if (threadIdx.x == 0 && threadIdx.y == 0 && threadIdx.z == 0)
 			p.use.partial[blockIdx.x] = squares;
 	}
 }
@@ -362,7 +372,7 @@ size_t project_blocks(const struct plan *plan, int count)
 	int across, tiles;
 
 	count_tiles(plan, &across, &tiles);
-	return (size_t)tiles * (size_t)count;
+	return (size_t)tiles * (size_t)divide_up(count, plan->shape.forward_rows > 0 ? UNTILTED_VIEWS : GENERAL_VIEWS);
 }
 
 int project_rays(struct plan *plan, const float *volume, int first, int count, struct ray_use use, float *to,
@@ -389,7 +399,7 @@ int project_rays(struct plan *plan, const float *volume, int first, int count, s
 	p.rows_down = plan->shape.rows_down;
 	p.use = use;
 	p.to = to;
-	dim3 untilted(32, UNTILTED_WARPS), general(32, GENERAL_ROWS);
+	dim3 untilted(32, UNTILTED_WARPS, UNTILTED_VIEWS), general(32, GENERAL_ROWS, GENERAL_VIEWS);
 	switch (plan->shape.forward_rows) {
 	case 3:
 		project_untilted<3><<<blocks, untilted, 0, stream>>>(p);

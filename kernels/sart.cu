@@ -35,9 +35,9 @@ struct sweep_view {
 	bool nonnegative;
 };
 
-enum { SWEEP_COLUMNS = 8, SWEEP_PARTS = 2 };
+enum { SWEEP_COLUMNS = 4, SWEEP_PARTS = 4 };
 
-static __global__ void __launch_bounds__(32 * SWEEP_COLUMNS * SWEEP_PARTS) project_view(const sweep_view s)
+static __global__ void __launch_bounds__(32 * SWEEP_COLUMNS * SWEEP_PARTS, 2) project_view(const sweep_view s)
 {
 	__shared__ float sums[SWEEP_PARTS][SWEEP_COLUMNS][32];
 	const device_view &g = *s.geometry;
@@ -102,7 +102,7 @@ static __global__ void __launch_bounds__(32 * SWEEP_COLUMNS * SWEEP_PARTS) proje
 
 		edge(begin, inner);
 		const float *at_slice = s.volume + (size_t)slice * inner;
-#pragma unroll 4
+#pragma unroll 8 /* most of what is read comes from memory: many loads on their way */
 		for (int i = inner; i < outer; i++, at_slice += slice)
 			total += sample(at_slice, up, fast, fmaf((float)i, a.fast_step, a.fast),
 					fmaf((float)i, a.row_step, a.row));

@@ -4,7 +4,7 @@
  * warm-up, data on the device, the host's call and the final wait included.
  * Prints a table with the goals beside the times, writes JSON when given a file.
  *
- *   gpu_bench [--cases ABCDET] [--what WORDS] [--precision standard|reference] [--json FILE]
+ *   gpu_bench [--cases ABCDET] [--what WORDS] [--geometry any|untilted] [--precision standard|reference] [--json FILE]
  *
  * T stands for TV; --what measures only the rows that contain these words.
  */
@@ -115,6 +115,7 @@ static FILE *json;
 static bool json_first = true;
 static struct device *device;
 static const char *what_wanted = "";
+static const char *geometry_wanted = "";
 static bool reference; /* precision */
 
 static void report(char letter, const char *kind, const char *what, double milliseconds, double goal)
@@ -483,6 +484,8 @@ int main(int argc, char **argv)
 			wanted = argv[i + 1];
 		else if (strcmp(argv[i], "--what") == 0)
 			what_wanted = argv[i + 1];
+		else if (strcmp(argv[i], "--geometry") == 0)
+			geometry_wanted = argv[i + 1];
 		else if (strcmp(argv[i], "--precision") == 0)
 			reference = strcmp(argv[i + 1], "reference") == 0;
 		else if (strcmp(argv[i], "--json") == 0)
@@ -501,7 +504,8 @@ int main(int argc, char **argv)
 		if (strchr(wanted, cases[i].letter) == NULL)
 			continue;
 		for (int untilted = 0; untilted < 2; untilted++)
-			bench_geometry(&cases[i], untilted);
+			if (strstr(untilted ? "untilted" : "any", geometry_wanted) != NULL)
+				bench_geometry(&cases[i], untilted);
 		if ((cases[i].letter == 'A' || cases[i].letter == 'D') && strstr("ball", what_wanted) != NULL) {
 			check_ball(&cases[i], false);
 			check_ball(&cases[i], true);

@@ -389,8 +389,64 @@ static const struct kind kinds[] = {
 static const int wide[] = {43,   500,  600,  1000,
 			   1200, 1500, 2000, 2100}; /* columns: each length of the filter, and cuFFT */
 
-int main(void)
+/* What a plan takes is what plan_bytes said beforehand, and all of it comes back. */
+static void check_memory(struct device *device)
 {
+	const double page = 2 << 20; /* what the driver rounds an allocation up to */
+
+	for (size_t k = 0; k < sizeof(kinds) / sizeof(kinds[0]); k++) {
+		struct sart_options sart = {.relaxation = 1};
+		struct tv_options tv = {.method = TV_PROXIMAL, .alpha = 1, .step = .1, .iterations = 2, .unit = 1};
+		struct device_info before, during, after;
+		struct plan_options options;
+		struct plan_bytes bytes;
+		struct plan *plan;
+		struct scene scene;
+		struct error err = {0};
+
+		scene_make(&scene, kinds[k].name, &kinds[k].options);
+		options = scene_plan(&scene, &sart, kinds[k].subsets, &tv, false);
+		must(backend_cuda.plan_bytes(NULL, &options, &bytes, &err), &err, "plan_bytes");
+		backend_cuda.describe(device, &before);
+		must(backend_cuda.plan_new(device, &options, &plan, &err), &err, "plan");
+		backend_cuda.describe(device, &during);
+		backend_cuda.plan_free(plan);
+		backend_cuda.describe(device, &after);
+		expect(&scene, "bytes beyond plan_bytes",
+		       (double)before.bytes_free - (double)during.bytes_free - (double)(bytes.scratch + bytes.raw),
+		       8 * page);
+		expect(&scene, "bytes kept", (double)before.bytes_free - (double)after.bytes_free, page);
+		subsets_clear(&sart.subsets);
+		scene_clear(&scene);
+	}
+}
+
+/* A plan that does not fit is refused with the numbers, and the device goes on. */
+static void check_limit(void)
+{
+	const struct device_options options = {.memory_limit = 1 << 20};
+	struct device *device;
+	struct plan_options plan_options;
+	struct plan *plan;
+	struct scene scene;
+	struct error err = {0};
+	int code;
+
+	scene_make(&scene, "limit", &kinds[0].options);
+	plan_options = scene_plan(&scene, NULL, 0, NULL, false);
+	must(backend_cuda.open(0, &options, &device, &err), &err, "open");
+	code = backend_cuda.plan_new(device, &plan_options, &plan, &err);
+	expect(&scene, "refusal", code != ERR_NO_MEMORY, 0);
+	printf("%-34s %s\n", scene.name, err.text);
+	must(backend_cuda.sync(device, &err), &err, "sync");
+	backend_cuda.close(device);
+	scene_clear(&scene);
+}
+
+/* gpu_check [WORDS]: only the scenes whose names contain these words. */
+int main(int argc, char **argv)
+{
+	const char *wanted = argc > 1 ? argv[1] : "";
 	struct device *devices[2];
 	struct device_info before, after;
 	struct error err = {0};
@@ -411,6 +467,8 @@ int main(void)
 
 			options.bend = (enum bend)bend;
 			snprintf(name, sizeof(name), "%s, %s", kinds[k].name, bend_names[bend]);
+			if (strstr(name, wanted) == NULL)
+				continue;
 			scene_make(&scene, name, &options);
 			check_scene(&scene, devices, kinds[k].subsets, true);
 			check_scene(&scene, devices, kinds[k].subsets, false);
@@ -430,11 +488,15 @@ int main(void)
 		char name[64];
 
 		snprintf(name, sizeof(name), "%d columns", wide[k]);
+		if (strstr(name, wanted) == NULL)
+			continue;
 		scene_make(&scene, name, &options);
 		check_scene(&scene, devices, 1, true);
 		scene_clear(&scene);
 	}
 	check_counts(devices);
+	check_memory(devices[1]);
+	check_limit();
 	backend_cuda.describe(devices[1], &after);
 	if (before.bytes_free - after.bytes_free > (size_t)64 << 20 && after.bytes_free < before.bytes_free) {
 		printf("FAILED  %.1f MiB of device memory did not come back\n",
