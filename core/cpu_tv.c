@@ -203,7 +203,8 @@ static int run_gradient(struct plan *plan, struct pass *pass, const struct cance
 {
 	const struct tv_options *tv = &plan->tv;
 	const double damping = fmax(2 - tv->alpha * tv->step, .1);
-	const double epsilon = 4 * squared_weights(pass->box) * tv->step / damping * tv->unit;
+	/* a single voxel has no differences and needs none: but 0, not 0 / 0 */
+	const double epsilon = fmax(4 * squared_weights(pass->box) * tv->step / damping * tv->unit, 1e-15);
 
 	pass->step = (struct tv_step){
 	    .flow = (float)(tv->step * tv->unit),

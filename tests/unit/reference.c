@@ -1,0 +1,318 @@
+#include "tests/unit/reference.h"
+
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+static size_t voxel_at(const struct grid *grid, int x, int y, int z)
+{
+	return ((size_t)z * (size_t)grid->size[1] + (size_t)y) * (size_t)grid->size[0] + (size_t)x;
+}
+
+/* ---- projection ---- */
+
+/* Bilinear in the slice `i` of the axis `a`, held at the edges; at is in voxels. */
+static double slice_sample(const struct grid *grid, const float *volume, int a, int i, const double at[3])
+{
+	double sum = 0;
+
+	for (int corner = 0; corner < 4; corner++) {
+		double weight = 1;
+		int voxel[3], bit = 0;
+
+		for (int k = 0; k < 3; k++) {
+			double held, upper;
+			int low;
+
+			if (k == a) {
+				voxel[k] = i;
+				continue;
+			}
+			held = fmin(fmax(at[k], 0), grid->size[k] - 1);
+			low = (int)fmin(floor(held), fmax(grid->size[k] - 2, 0));
+			upper = held - low;
+			voxel[k] = low + (corner >> bit & 1);
+			weight *= corner >> bit & 1 ? upper : 1 - upper;
+			bit++;
+		}
+		if (weight > 0)
+			sum += weight * (double)volume[voxel_at(grid, voxel[0], voxel[1], voxel[2])];
+	}
+	return sum;
+}
+
+double reference_ray(const struct geometry *geometry, const struct grid *grid, int view_index, int column, int row,
+		     const float *volume, double *ret_length)
+{
+	const struct view *view = &geometry->views[view_index];
+	double s[3], d[3], enter = -INFINITY, leave = INFINITY, mm = 0, begin, end, sum = 0;
+	int a = 0;
+
+	*ret_length = 0;
+	for (int i = 0; i < 3; i++) {
+		double to = view->pixel0[i] - view->source[i] + column * view->column_step[i] + row * view->row_step[i];
+
+		mm += to * to;
+		s[i] = (view->source[i] - grid->origin[i]) / grid->spacing[i];
+		d[i] = to / grid->spacing[i];
+		if (fabs(d[i]) > fabs(d[a]))
+			a = i;
+	}
+	for (int i = 0; i < 3; i++) {
+		double low = (-.5 - s[i]) / d[i], high = (grid->size[i] - .5 - s[i]) / d[i];
+
+		if (fabs(d[i]) < 1e-12) {
+			if (s[i] < -.5 || s[i] > grid->size[i] - .5)
+				return 0;
+			continue;
+		}
+		enter = fmax(enter, fmin(low, high));
+		leave = fmin(leave, fmax(low, high));
+	}
+	if (enter >= leave)
+		return 0;
+	begin = fmin(s[a] + enter * d[a], s[a] + leave * d[a]);
+	end = fmax(s[a] + enter * d[a], s[a] + leave * d[a]);
+	for (int i = 0; i < grid->size[a]; i++) {
+		double part = fmin(i + .5, end) - fmax(i - .5, begin), at[3];
+
+		if (part <= 0)
+			continue;
+		for (int k = 0; k < 3; k++)
+			at[k] = s[k] + (i - s[a]) / d[a] * d[k];
+		sum += part * slice_sample(grid, volume, a, i, at);
+	}
+	*ret_length = (end - begin) * sqrt(mm) / fabs(d[a]);
+	return sum * sqrt(mm) / fabs(d[a]);
+}
+
+void reference_project(const struct geometry *geometry, const struct grid *grid, int view, const float *volume,
+		       float *ret)
+{
+	double length;
+
+	for (int row = 0; row < geometry->rows; row++)
+		for (int column = 0; column < geometry->columns; column++)
+			ret[(size_t)row * (size_t)geometry->columns + (size_t)column] =
+			    (float)reference_ray(geometry, grid, view, column, row, volume, &length);
+}
+
+/* ---- backprojection ---- */
+
+void reference_backproject(const struct geometry *geometry, const struct grid *grid, int view,
+			   enum backprojection weight, const float *projection, double *sums, double *cover)
+{
+	const double isocentre[3] = {0};
+	double matrix[12], column, row, distance;
+
+	view_matrix(&geometry->views[view], matrix);
+	distance = view_project(matrix, isocentre, &column, &row);
+	for (size_t i = 0; i < grid_voxels(grid); i++) {
+		const int at[3] = {(int)(i % (size_t)grid->size[0]),
+				   (int)(i / (size_t)grid->size[0] % (size_t)grid->size[1]),
+				   (int)(i / (size_t)grid->size[0] / (size_t)grid->size[1])};
+		double point[3], depth, factor;
+		int c, r;
+
+		for (int k = 0; k < 3; k++)
+			point[k] = grid->origin[k] + at[k] * grid->spacing[k];
+		depth = view_project(matrix, point, &column, &row);
+		factor = weight == BACKPROJECT_FDK ? distance / depth * (distance / depth) : 1;
+		c = (int)floor(column);
+		r = (int)floor(row);
+		for (int corner = 0; corner < 4; corner++) {
+			int cc = c + (corner & 1), rr = r + (corner >> 1);
+			double w = (corner & 1 ? column - c : c + 1 - column) * (corner >> 1 ? row - r : r + 1 - row);
+
+			if (cc < 0 || cc >= geometry->columns || rr < 0 || rr >= geometry->rows)
+				continue;
+			sums[i] += factor * w * (double)projection[(size_t)rr * (size_t)geometry->columns + (size_t)cc];
+			if (cover != NULL)
+				cover[i] += w;
+		}
+	}
+}
+
+/* ---- the ramp filter, as the sum that it is ---- */
+
+static double cosine(const struct view *view, int column, int row)
+{
+	double ray[3], towards[3] = {-view->source[0], -view->source[1], 0};
+
+	for (int i = 0; i < 3; i++)
+		ray[i] = view->pixel0[i] - view->source[i] + column * view->column_step[i] + row * view->row_step[i];
+	return vec_dot(ray, towards) / vec_norm(ray) / vec_norm(towards);
+}
+
+void reference_filter(const struct plan_options *options, int view, const float *projection, float *ret)
+{
+	const struct geometry *geometry = options->geometry;
+	const int columns = geometry->columns, wide = options->pad[0] + columns + options->pad[1];
+	const int length = filter_length(wide);
+	double *kernel = calloc((size_t)length, sizeof(double));
+
+	for (int n = 0; n < length; n++) /* the inverse transform of the response: what rows are convolved with */
+		for (int k = 0; k < length; k++)
+			kernel[n] += (double)options->filter_response[k <= length / 2 ? k : length - k] *
+				     cos(2 * M_PI * ((double)k * n / length)) / length;
+	for (int row = 0; row < geometry->rows; row++) {
+		for (int to = 0; to < wide; to++) {
+			double sum = 0;
+
+			for (int c = 0; c < columns; c++)
+				sum += kernel[abs(to - options->pad[0] - c)] * cosine(&geometry->views[view], c, row) *
+				       (double)options->column_weights[(size_t)view * (size_t)columns + (size_t)c] *
+				       (double)projection[(size_t)row * (size_t)columns + (size_t)c];
+			ret[(size_t)row * (size_t)wide + (size_t)to] = (float)sum;
+		}
+	}
+	free(kernel);
+}
+
+/* ---- SART ---- */
+
+/* Corrections of one view; what they are made from is added to sums. */
+static void corrections(const struct geometry *geometry, const struct grid *grid, int view, const float *measured,
+			const float *volume, float *ret, struct sart_sums *sums)
+{
+	const double least = RAY_LENGTH_LEAST * fmin(fmin(grid->spacing[0], grid->spacing[1]), grid->spacing[2]);
+
+	for (int row = 0; row < geometry->rows; row++) {
+		for (int column = 0; column < geometry->columns; column++) {
+			const size_t at = (size_t)row * (size_t)geometry->columns + (size_t)column;
+			double length, integral = reference_ray(geometry, grid, view, column, row, volume, &length);
+			double difference = (double)measured[at] - integral;
+
+			sums->residual2 += difference * difference;
+			sums->projection2 += (double)measured[at] * (double)measured[at];
+			ret[at] = length >= least ? (float)(difference / length) : 0;
+		}
+	}
+}
+
+struct sart_sums reference_sart(const struct geometry *geometry, const struct grid *grid,
+				const struct sart_options *options, const float *projections, float *volume)
+{
+	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows, voxels = grid_voxels(grid);
+	float *correction = malloc(pixels * sizeof(float));
+	double *sums = malloc(voxels * sizeof(double)), *cover = malloc(voxels * sizeof(double));
+	struct sart_sums ret = {0};
+
+	for (int s = 0; s < options->subsets.count; s++) {
+		memset(sums, 0, voxels * sizeof(double));
+		memset(cover, 0, voxels * sizeof(double));
+		for (int i = options->subsets.start[s]; i < options->subsets.start[s + 1]; i++) {
+			int view = options->subsets.order[i];
+
+			corrections(geometry, grid, view, projections + (size_t)view * pixels, volume, correction,
+				    &ret);
+			reference_backproject(geometry, grid, view, BACKPROJECT_PLAIN, correction, sums, cover);
+		}
+		for (size_t i = 0; i < voxels; i++) {
+			if (cover[i] == 0)
+				continue;
+			volume[i] = (float)((double)volume[i] + options->relaxation * sums[i] / cover[i]);
+			if (options->nonnegative && volume[i] < 0)
+				volume[i] = 0;
+		}
+	}
+	free(cover);
+	free(sums);
+	free(correction);
+	return ret;
+}
+
+/* ---- total variation ---- */
+
+static void differences(const struct grid *grid, const double *u, int x, int y, int z, double ret[3])
+{
+	const int at[3] = {x, y, z};
+	const double least = fmin(fmin(grid->spacing[0], grid->spacing[1]), grid->spacing[2]);
+	const double here = u[voxel_at(grid, x, y, z)];
+
+	for (int i = 0; i < 3; i++) {
+		int next[3] = {x, y, z};
+
+		next[i]++;
+		ret[i] = at[i] + 1 < grid->size[i]
+			     ? least / grid->spacing[i] * (u[voxel_at(grid, next[0], next[1], next[2])] - here)
+			     : 0;
+	}
+}
+
+double reference_variation(const struct grid *grid, const double *u)
+{
+	double sum = 0, d[3];
+
+	for (int z = 0; z < grid->size[2]; z++)
+		for (int y = 0; y < grid->size[1]; y++)
+			for (int x = 0; x < grid->size[0]; x++) {
+				differences(grid, u, x, y, z, d);
+				sum += vec_norm(d);
+			}
+	return sum;
+}
+
+void reference_tv_gradient(const struct grid *grid, const struct tv_options *options, double epsilon, float *volume)
+{
+	const double least = fmin(fmin(grid->spacing[0], grid->spacing[1]), grid->spacing[2]);
+	const size_t voxels = grid_voxels(grid);
+	double *u = malloc(voxels * sizeof(double)), *f = malloc(voxels * sizeof(double));
+	double(*p)[3] = malloc(voxels * sizeof(*p));
+
+	for (size_t i = 0; i < voxels; i++)
+		f[i] = u[i] = (double)volume[i] / options->unit;
+	for (int step = 0; step < options->iterations; step++) {
+		for (int z = 0; z < grid->size[2]; z++)
+			for (int y = 0; y < grid->size[1]; y++)
+				for (int x = 0; x < grid->size[0]; x++) {
+					double d[3], norm;
+					size_t i = voxel_at(grid, x, y, z);
+
+					differences(grid, u, x, y, z, d);
+					norm = sqrt(vec_dot(d, d) + epsilon * epsilon);
+					for (int k = 0; k < 3; k++)
+						p[i][k] = norm > 0 ? d[k] / norm : 0;
+				}
+		for (int z = 0; z < grid->size[2]; z++)
+			for (int y = 0; y < grid->size[1]; y++)
+				for (int x = 0; x < grid->size[0]; x++) {
+					const size_t i = voxel_at(grid, x, y, z);
+					double flow = 0;
+
+					for (int k = 0; k < 3; k++) {
+						int before[3] = {x, y, z};
+						double weight = least / grid->spacing[k];
+
+						before[k]--;
+						flow += weight * p[i][k];
+						if (before[k] >= 0)
+							flow -= weight *
+								p[voxel_at(grid, before[0], before[1], before[2])][k];
+					}
+					u[i] += options->step * (flow - options->alpha * (u[i] - f[i]));
+				}
+	}
+	for (size_t i = 0; i < voxels; i++)
+		volume[i] = (float)(u[i] * options->unit);
+	free(p);
+	free(f);
+	free(u);
+}
+
+double reference_objective(const struct grid *grid, const struct tv_options *options, const float *volume,
+			   const float *start)
+{
+	const size_t voxels = grid_voxels(grid);
+	double *u = malloc(voxels * sizeof(double)), fidelity = 0, variation;
+
+	for (size_t i = 0; i < voxels; i++) {
+		double away = ((double)volume[i] - (double)start[i]) / options->unit;
+
+		u[i] = (double)volume[i] / options->unit;
+		fidelity += away * away;
+	}
+	variation = reference_variation(grid, u);
+	free(u);
+	return variation + options->alpha / 2 * fidelity;
+}
