@@ -1106,15 +1106,20 @@ static float *everything(struct rig *rig, const struct machine *machine, const f
 	return ret;
 }
 
+/* Of the set-ups: those that take ways of their own. */
+static const int ways[] = {0, 5, 11, 16, 17};
+enum { WAYS = sizeof(ways) / sizeof(ways[0]) };
+
 START_TEST(bits_do_not_depend_on_threads_or_runs)
 {
+	const struct setup *setup = &setups[ways[_i]];
 	struct machine list[MACHINES_MOST];
 	const int count = machines(list);
 	struct rig rig;
 	float *volume, *projections;
 
 	random_state = 10;
-	rig_make(&setups[_i], &rig);
+	rig_make(setup, &rig);
 	rig.tv.method = _i % 2 ? TV_PROXIMAL : TV_GRADIENT;
 	volume = random_floats(rig.voxels, 0, 1);
 	projections = random_floats(rig.all_pixels, 0, 20);
@@ -1129,7 +1134,7 @@ START_TEST(bits_do_not_depend_on_threads_or_runs)
 			machine.options.threads = threads;
 			again = everything(&rig, &machine, volume, projections, &values);
 			ck_assert_msg(memcmp(first, again, values * sizeof(float)) == 0, "%s, %s: %d threads",
-				      setups[_i].name, list[m].name, threads);
+				      setup->name, list[m].name, threads);
 			free(again);
 		}
 		free(first);
@@ -1522,7 +1527,7 @@ Suite *backend_suite(void)
 	tcase_add_test(known, proximal_tv_of_a_step_is_known);
 	tcase_add_loop_test(known, proximal_tv_is_a_minimum, 0, SETUPS);
 	tcase_add_test(known, gradient_tv_is_stable_and_comes_near_the_minimum);
-	tcase_add_loop_test(rest, bits_do_not_depend_on_threads_or_runs, 0, SETUPS);
+	tcase_add_loop_test(rest, bits_do_not_depend_on_threads_or_runs, 0, WAYS);
 	tcase_add_loop_test(rest, norms_are_those_of_the_volume, 0, SETUPS);
 	tcase_add_test(rest, norms_count_what_is_not_finite);
 	tcase_add_loop_test(rest, volumes_and_stacks_come_back_as_they_went, 0, SETUPS);
