@@ -339,7 +339,7 @@ static int launch(struct plan *plan, backprojection_job &job, struct error *err)
 	return 0;
 }
 
-static int update_volume(struct plan *plan, struct voxel_use use, float *volume, struct error *err)
+int update_volume(struct plan *plan, struct voxel_use use, float *volume, struct error *err)
 {
 	backprojection_job job = job_make(plan, volume, use);
 	dim3 blocks(divide_up(job.nx, 256), job.ny, job.nz);

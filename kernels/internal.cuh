@@ -180,7 +180,9 @@ struct plan_shape {
 	bool textures;     /* 8-bit interpolation weights are allowed */
 	bool z_rays;       /* some ray runs closer to z than to x and y */
 	int batch;         /* views filtered and backprojected in one go */
+	bool lean;         /* little memory: few views at a time, no arrays */
 	int correction;    /* slots of the correction stack, 0 without SART */
+	bool parts;        /* it holds a part of a subset only */
 	int views_at_once; /* that one launch of the backprojection takes; layers of the projection array */
 	bool by_view;      /* SART goes view by view over a z-fastest copy */
 	bool by_subset;    /* SART has updates of several views */
@@ -281,6 +283,8 @@ struct voxel_use {
 };
 int backproject_views(struct plan *plan, const float *from, int first, int count, struct voxel_use use, float *volume,
 		      struct error *err);
+/* The update from plan->work, where sums were made in parts. */
+int update_volume(struct plan *plan, struct voxel_use use, float *volume, struct error *err);
 /* Views that one launch takes. */
 enum { VIEWS_AT_ONCE = 1024 };
 /*
@@ -305,6 +309,7 @@ int reduce_pairs(struct plan *plan, const float2 *partial, size_t count, double 
 /* ---- tv.cu, sart.cu ---- */
 size_t tv_scratch_bytes(const struct plan_options *options);
 size_t sweep_partials(const struct plan *plan);
+size_t subsets_partials(const struct plan *plan);
 
 static inline int cancel_check(const struct cancel *cancel, struct error *err)
 {

@@ -54,48 +54,54 @@ struct columns_shape columns_shape_make(const int size[3])
 
 enum { TILE = 32, TILE_ROWS = 8 };
 
-/* A value at row z; at the ends of the rows also what is held beyond them. */
-static __device__ __forceinline__ void put_rows(float *at, int row, int z, int nz, float value)
+/* Floats from the beginning of row 0 to a place along the fast axis. */
+static __device__ __forceinline__ int place_at(const slices &to, int fast)
 {
-	at[z * row] = value;
-	if (z == 0)
-		for (int i = 1; i <= SLICE_HELD; i++)
-			at[-i * row] = value;
-	if (z == nz - 1)
-		for (int i = 1; i <= SLICE_HELD; i++)
-			at[(z + i) * row] = value;
+	int panel = to.panel > 0 ? (fast + 1) / (PANEL - 1) : 0;
+
+	return to.panel > 0 ? panel * to.panel + fast + 1 - panel * (PANEL - 1) : fast;
+}
+
+/* A value with all that repeats it: the first of a panel behind the one before, and what is held beyond the ends. */
+static __device__ void put_held(const slices &to, float *slice, int row, int rows, int fast, int count, float value)
+{
+	int row_from = row == 0 ? -SLICE_HELD : row, row_to = row == rows - 1 ? rows - 1 + SLICE_HELD : row;
+	int from = fast == 0 ? -1 : fast, until = fast == count - 1 ? count : fast;
+
+	for (int j = row_from; j <= row_to; j++)
+		for (int i = from; i <= until; i++) {
+			float *at = slice + (j * to.row + place_at(to, i));
+
+			*at = value;
+			if (to.panel > 0 && i >= 0 && (i + 1) % (PANEL - 1) == 0)
+				at[PANEL - 1 - to.panel] = value;
+		}
 }
 
 /* The values of a thread: TILE / TILE_ROWS slices, one place along the fast axis. */
 static __device__ __forceinline__ void put_slices(const slices &to, int first, int slices_count, int fast, int count,
-						  int z, int nz, const float value[TILE / TILE_ROWS])
+						  int row, int rows, const float value[TILE / TILE_ROWS])
 {
+	const int each = TILE / TILE_ROWS;
+	float *slice = to.data + to.slice * (size_t)first;
+	size_t step = to.slice * TILE_ROWS;
+	bool is_plain = row > 0 && row < rows - 1 && fast > 0 && fast < count - 1 &&
+			(to.panel == 0 || (fast + 1) % (PANEL - 1) != 0);
+
 	if (fast >= count)
 		return;
-	int place = fast + 1, panel = to.panel > 0 ? place / (PANEL - 1) : 0, within = place - panel * (PANEL - 1);
-	int main = to.panel > 0 ? panel * to.panel + within : fast;
-	bool doubled = to.panel > 0 && within == 0 && panel > 0;
+	if (is_plain && first + (each - 1) * TILE_ROWS < slices_count) {
+		float *at = slice + (row * to.row + place_at(to, fast));
 
 #pragma unroll
-	for (int k = 0; k < TILE / TILE_ROWS; k++) {
-		int i = first + k * TILE_ROWS;
-
-		if (i >= slices_count)
-			break;
-		float *slice = to.data + to.slice * (size_t)i;
-		put_rows(slice + main, to.row, z, nz, value[k]);
-		if (doubled)
-			put_rows(slice + (main - to.panel + PANEL - 1), to.row, z, nz, value[k]);
-		if (fast == 0)
-			put_rows(slice + main - 1, to.row, z, nz, value[k]);
-		if (fast == count - 1) {
-			int next = to.panel > 0 ? (place + 1) / (PANEL - 1) : 0, rest = place + 1 - next * (PANEL - 1);
-
-			put_rows(slice + (to.panel > 0 ? next * to.panel + rest : count), to.row, z, nz, value[k]);
-			if (to.panel > 0 && rest == 0)
-				put_rows(slice + (next - 1) * to.panel + PANEL - 1, to.row, z, nz, value[k]);
-		}
+		for (int k = 0; k < each; k++, at += step)
+			*at = value[k];
+		return;
 	}
+#pragma unroll
+	for (int k = 0; k < each; k++, slice += step)
+		if (first + k * TILE_ROWS < slices_count)
+			put_held(to, slice, row, rows, fast, count, value[k]);
 }
 
 /* One tile of x and y in one plane; across x it is turned over in shared memory. */

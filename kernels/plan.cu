@@ -13,10 +13,15 @@
 
 enum { LAYERS_MOST = 2048 };                      /* of a layered array, on every card */
 enum { SIDE_MOST = 32768 };                       /* its width and height */
-enum { BATCH_MOST = 128 };                        /* views that FDK filters and backprojects in one go */
+enum { BATCH_MOST = 128, BATCH_LEAN = 16 };       /* views that are filtered and backprojected in one go */
 static const double SMALL = 1 << 24;              /* voxels times views below which launches take longer than samples */
 static const size_t RAW_BYTES = (size_t)16 << 20; /* of each of the two buffers of raw samples */
 static const size_t FFT_BYTES = (size_t)64 << 20; /* of the rows that cuFFT takes at once */
+
+static int at_most(int count, int most)
+{
+	return count < most ? count : most;
+}
 
 static int largest_subset(const struct subsets *subsets)
 {
@@ -157,7 +162,7 @@ static void choose_untilted(const struct plan_options *options, struct plan_shap
 		shape->back_voxels = window_size(1 / most, 1 / least);
 }
 
-static struct plan_shape shape_of(const struct plan_options *options)
+static struct plan_shape shape_of(const struct plan_options *options, bool lean)
 {
 	const struct geometry *geometry = options->geometry;
 	const struct grid *grid = options->grid;
@@ -172,14 +177,16 @@ static struct plan_shape shape_of(const struct plan_options *options)
 	shape.is_small = (double)grid_voxels(grid) * geometry->count < SMALL;
 	if (shape.is_small)
 		shape.forward_rows = shape.back_voxels = 0;
-	shape.textures = !shape.is_small && !options->reference_precision && fits && geometry->columns <= SIDE_MOST &&
-			 geometry->rows <= SIDE_MOST;
-	shape.batch = geometry->count < BATCH_MOST ? geometry->count : BATCH_MOST;
+	shape.textures = !lean && !shape.is_small && !options->reference_precision && fits &&
+			 geometry->columns <= SIDE_MOST && geometry->rows <= SIDE_MOST;
+	shape.lean = lean;
+	shape.batch = at_most(geometry->count, lean ? BATCH_LEAN : BATCH_MOST);
 	shape.by_view = subset == 1 && columns_shape_make(grid->size).floats < (size_t)1 << 31;
 	shape.by_subset = subset > 0 && !shape.by_view;
-	shape.correction = shape.by_subset ? subset : 0;
+	shape.correction = shape.by_subset ? (lean ? at_most(subset, BATCH_LEAN) : subset) : 0;
+	shape.parts = shape.correction < (shape.by_subset ? subset : 0);
 	shape.covered = is_covered(geometry, grid);
-	shape.views_at_once = geometry->count < VIEWS_AT_ONCE ? geometry->count : VIEWS_AT_ONCE;
+	shape.views_at_once = at_most(geometry->count, lean ? (int)BATCH_LEAN : (int)VIEWS_AT_ONCE);
 	if (options->column_weights != NULL) {
 		shape.filter_length = filter_choose(geometry->columns);
 		if (shape.filter_length == 0) {
@@ -194,14 +201,14 @@ static struct plan_shape shape_of(const struct plan_options *options)
 
 /* ---- what memory ---- */
 
-static void plan_describe(struct plan *plan, const struct plan_options *options)
+static void plan_describe(struct plan *plan, const struct plan_options *options, bool lean)
 {
 	const struct geometry *geometry = options->geometry;
 	const struct grid *grid = options->grid;
 	const int *size = grid->size;
 
 	plan->options = *options;
-	plan->shape = shape_of(options);
+	plan->shape = shape_of(options, lean);
 	for (int i = 0; i < 3; i++) {
 		plan->grid.size[i] = size[i];
 		plan->grid.spacing[i] = (float)grid->spacing[i];
@@ -217,9 +224,8 @@ static void plan_describe(struct plan *plan, const struct plan_options *options)
 		plan->scratch_bytes = tv_scratch_bytes(options);
 	if (plan->shape.by_view)
 		plan->partial_count = sweep_partials(plan);
-	for (int i = 0; plan->shape.by_subset && i < options->sart->subsets.count; i++)
-		plan->partial_count +=
-		    project_blocks(plan, options->sart->subsets.start[i + 1] - options->sart->subsets.start[i]);
+	else if (plan->shape.by_subset)
+		plan->partial_count = subsets_partials(plan);
 	plan->raw_views = 1;
 	plan->bytes.raw =
 	    (size_t)geometry->columns * (size_t)geometry->rows * (options->linearise.sample == SAMPLE_UINT16 ? 2 : 4);
@@ -258,24 +264,21 @@ static bool needs_coverage(const struct plan *plan)
 }
 static bool needs_work(const struct plan *plan)
 {
-	return plan->shape.correction > plan->shape.views_at_once;
+	return plan->shape.parts || plan->shape.correction > plan->shape.views_at_once;
 }
 static size_t pixels_of(const struct plan *plan)
 {
 	return (size_t)plan->stack.columns * (size_t)plan->stack.rows;
 }
 
-int cuda_plan_bytes(struct device *device, const struct plan_options *options, struct plan_bytes *ret_bytes,
-		    struct error *err)
+static struct plan_bytes bytes_of(const struct plan_options *options, bool lean)
 {
 	struct plan plan = {};
 	struct plan_bytes bytes = {};
 	const struct geometry *geometry = options->geometry;
 	size_t voxels = grid_voxels(options->grid) * sizeof(float), views = (size_t)geometry->count;
 
-	(void)device;
-	(void)err;
-	plan_describe(&plan, options);
+	plan_describe(&plan, options, lean);
 	bytes.stack = stack_bytes(geometry->columns, geometry->rows, geometry->count);
 	bytes.volumes = voxels * (options->sart != NULL ? 2 : 1);
 	bytes.raw = 2 * plan.bytes.raw * (size_t)plan.raw_views;
@@ -303,7 +306,28 @@ int cuda_plan_bytes(struct device *device, const struct plan_options *options, s
 		bytes.scratch += pixels_of(&plan) * sizeof(float);
 	if (options->linearise.dark != NULL)
 		bytes.scratch += pixels_of(&plan) * sizeof(float);
-	*ret_bytes = bytes;
+	return bytes;
+}
+
+/*
+ * Whether the job fits only with a lean plan: float32 loads in place of arrays
+ * with textures, few views at a time, corrections in parts.
+ */
+static bool is_lean(const struct device *device, const struct plan_options *options)
+{
+	struct plan_bytes bytes;
+
+	if (device == NULL)
+		return false;
+	bytes = bytes_of(options, false);
+	return bytes.stack + bytes.volumes + bytes.scratch + bytes.raw > device->limit - device->used;
+}
+
+int cuda_plan_bytes(struct device *device, const struct plan_options *options, struct plan_bytes *ret_bytes,
+		    struct error *err)
+{
+	(void)err;
+	*ret_bytes = bytes_of(options, is_lean(device, options));
 	return 0;
 }
 
@@ -485,8 +509,8 @@ static void summarise(struct plan *plan)
 		snprintf(forward, sizeof(forward), "untilted, %d rows a thread", shape->forward_rows);
 	if (shape->back_voxels > 0)
 		snprintf(back, sizeof(back), "untilted, %d voxels a window", shape->back_voxels);
-	snprintf(plan->summary, sizeof(plan->summary), "forward %s; back %s; %s; %s", forward, back,
-		 shape->textures ? "texture sampling" : "float32 sampling",
+	snprintf(plan->summary, sizeof(plan->summary), "%sforward %s; back %s; %s; %s", shape->lean ? "lean; " : "",
+		 forward, back, shape->textures ? "texture sampling" : "float32 sampling",
 		 shape->filter_length > 0 ? "fused filter"
 		 : shape->fft_length > 0  ? "cuFFT"
 					  : "no filter");
@@ -500,7 +524,7 @@ int cuda_plan_new(struct device *device, const struct plan_options *options, str
 	if (plan == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a plan");
 	plan->device = device;
-	plan_describe(plan, options);
+	plan_describe(plan, options, is_lean(device, options));
 	code = plan_prepare(plan, err);
 	if (code < 0) {
 		cuda_plan_free(plan);

@@ -77,9 +77,15 @@ static __device__ __forceinline__ float2 finish(const projection &p, int slot, i
 /* Of a block, 32 columns wide, a warp a row: rays far apart share little among rows, but much with the next views. */
 enum { GENERAL_ROWS = 2 };
 static const int GENERAL_VIEWS = 4;
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ < 800 /* multiprocessors of 1024 threads */
+static const int GENERAL_BLOCKS = 4;
+#else
+static const int GENERAL_BLOCKS = 5;
+#endif
 
 template <bool TEXTURE, bool ALONG_Z>
-static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS, 5) project_general(const projection p)
+static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS, GENERAL_BLOCKS)
+    project_general(const projection p)
 {
 	place at = place_of<GENERAL_VIEWS>(p);
 	bool has_view = at.slot < p.count;

@@ -279,12 +279,44 @@ static int update_subset(struct plan *plan, int subset, const float *projections
 	voxels.scale = (float)(plan->shape.covered ? sart->relaxation / count : sart->relaxation);
 	voxels.coverage = plan->shape.covered ? NULL : plan->coverage;
 	TRY(layout_slices(plan, volume, err));
-	TRY(project_rays(plan, volume, first, count, rays, plan->correction->data, err));
 	if (!plan->shape.covered && plan->coverage_subset != subset) {
 		TRY(coverage_sum(plan, first, count, err));
 		plan->coverage_subset = sart->subsets.count > 1 ? -1 : subset;
 	}
-	return backproject_views(plan, plan->correction->data, first, count, voxels, volume, err);
+	if (count <= plan->shape.correction) {
+		TRY(project_rays(plan, volume, first, count, rays, plan->correction->data, err));
+		return backproject_views(plan, plan->correction->data, first, count, voxels, volume, err);
+	}
+	/* In parts: the volume stays as it is until all of the subset has been seen. */
+	struct voxel_use sum = voxels;
+	sum.update = false;
+	CUDA_TRY(cudaMemsetAsync(plan->work, 0, grid_voxels(plan->options.grid) * sizeof(float), plan->device->stream));
+	for (int done = 0; done < count; done += plan->shape.correction) {
+		int now = count - done < plan->shape.correction ? count - done : plan->shape.correction;
+
+		TRY(project_rays(plan, volume, first + done, now, rays, plan->correction->data, err));
+		rays.partial += project_blocks(plan, now);
+		TRY(backproject_views(plan, plan->correction->data, first + done, now, sum, plan->work, err));
+	}
+	return update_volume(plan, voxels, volume, err);
+}
+
+/* Of the forward projection of a subset, part by part. */
+static size_t subset_blocks(const struct plan *plan, int count)
+{
+	int most = plan->shape.correction;
+
+	return (size_t)(count / most) * project_blocks(plan, most) + project_blocks(plan, count % most);
+}
+
+size_t subsets_partials(const struct plan *plan)
+{
+	const struct subsets *subsets = &plan->options.sart->subsets;
+	size_t blocks = 0;
+
+	for (int i = 0; i < subsets->count; i++)
+		blocks += subset_blocks(plan, subsets->start[i + 1] - subsets->start[i]);
+	return blocks;
 }
 
 static int sweep_subsets(struct plan *plan, const float *projections, float *volume, const struct cancel *cancel,
@@ -300,7 +332,7 @@ static int sweep_subsets(struct plan *plan, const float *projections, float *vol
 		if (count == 0)
 			continue;
 		TRY(update_subset(plan, i, projections, volume, plan->partial + blocks, err));
-		blocks += project_blocks(plan, count);
+		blocks += subset_blocks(plan, count);
 	}
 	return reduce_pairs(plan, plan->partial, blocks, plan->device->sums_device, err);
 }
@@ -356,7 +388,8 @@ int cuda_sart_iterate(struct plan *plan, const struct stack *projections, struct
 	const struct sart_options *sart = plan->options.sart;
 	struct device *device = plan->device;
 	int count = plan->options.geometry->count;
-	bool resident = sart != NULL && sart->subsets.count == 1 && count <= plan->shape.views_at_once;
+	bool resident =
+	    sart != NULL && sart->subsets.count == 1 && count <= plan->shape.views_at_once && !plan->shape.parts;
 
 	if (sart == NULL)
 		return error_set(err, ERR_INTERNAL, "the plan was made without SART");

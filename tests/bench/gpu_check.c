@@ -15,6 +15,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "core/phantom.h"
 #include "tests/bench/gpu_scene.h"
 
 extern const struct backend backend_cuda;
@@ -421,6 +422,136 @@ static void check_memory(struct device *device)
 	}
 }
 
+/* FDK and ten SART iterations of the head through core/recon.c, on both sides. */
+static void check_recon(struct device *devices[2], bool reference, bool tv, double tolerance)
+{
+	const struct scene_options at = {.columns = 128,
+					 .rows = 110,
+					 .views = 90,
+					 .arc = TURN,
+					 .pixel = {1.2, 1.2},
+					 .size = {96, 96, 80},
+					 .spacing = {.8, .8, .8}};
+	const struct backend *sides[2] = {&backend_cpu, &backend_cuda};
+	const struct linearise linearise = {.sample = SAMPLE_FLOAT32};
+	const struct recon_hooks hooks = {0};
+	struct phantom head;
+	struct recipe recipe;
+	struct scene scene;
+	struct error err = {0};
+	float *raw, *got[2];
+	size_t pixels = (size_t)at.columns * (size_t)at.rows, voxels;
+	int *views;
+	double rms = 0;
+
+	scene_make(&scene, reference ? "head, reference" : tv ? "head with TV" : "head", &at);
+	voxels = grid_voxels(&scene.grid);
+	must(phantom_named(&head, "head", 34, .0192, &err), &err, "head");
+	raw = malloc(pixels * (size_t)at.views * sizeof(float));
+	views = all_views(at.views);
+	for (int i = 0; i < at.views; i++)
+		phantom_project(&head, &scene.geometry, views[i], raw + pixels * (size_t)i);
+	recipe_defaults(&recipe);
+	recipe.has_grid = true;
+	recipe.grid = scene.grid;
+	recipe.fdk.on = recipe.sart.on = true;
+	recipe.tv.on = tv;
+	recipe.sart.iterations = 10;
+	recipe.reference_precision = reference;
+	for (int s = 0; s < 2; s++) {
+		struct recon *recon;
+
+		got[s] = malloc(voxels * sizeof(float));
+		must(recon_open(sides[s], devices[s], &scene.geometry, &linearise, &recipe, &hooks, &recon, &err), &err,
+		     "open");
+		must(recon_push(recon, raw, views, at.views, &err), &err, "push");
+		must(recon_run(recon, &err), &err, "run");
+		must(recon_read(recon, 0, scene.grid.size[2], got[s], &err), &err, "read");
+		recon_free(recon);
+	}
+	for (size_t i = 0; i < voxels; i++)
+		rms += ((double)got[1][i] - got[0][i]) * ((double)got[1][i] - got[0][i]);
+	rms = 1000 * sqrt(rms / (double)voxels) / .0192;
+	printf("%-34s after 10 iterations: %.1e, %.3f HU RMS\n", scene.name, difference(got[1], got[0], voxels), rms);
+	expect(&scene, "SART of the head", difference(got[1], got[0], voxels), tolerance);
+	expect(&scene, "HU RMS", rms, .5);
+	for (int s = 0; s < 2; s++)
+		free(got[s]);
+	free(raw);
+	free(views);
+	recipe_clear(&recipe);
+	phantom_clear(&head);
+	scene_clear(&scene);
+}
+
+/* A plan that is short of memory takes its work in parts and gives the same volume. */
+static void check_lean(void)
+{
+	const struct scene_options at = {.columns = 150,
+					 .rows = 140,
+					 .views = 120,
+					 .arc = TURN,
+					 .pixel = {1.2, 1.2},
+					 .size = {101, 99, 97},
+					 .spacing = {.8, .8, .8}};
+	const struct side empty = {0};
+	float *got[2], *stack;
+	double residual[2];
+	struct scene scene;
+	struct error err = {0};
+	size_t voxels, pixels = (size_t)at.columns * (size_t)at.rows * (size_t)at.views;
+
+	scene_make(&scene, "lean", &at);
+	voxels = grid_voxels(&scene.grid);
+	stack = malloc(pixels * sizeof(float));
+	fill_random(stack, pixels, 9);
+	for (int s = 0; s < 2; s++) {
+		struct sart_options sart = {.relaxation = 1};
+		struct plan_options options = scene_plan(&scene, &sart, 1, NULL, true);
+		struct sart_sums sums = {0};
+		struct device *device;
+		struct plan_bytes bytes;
+		struct side side = empty;
+		size_t defects = 0;
+		int *slots = malloc(sizeof(int) * (size_t)at.views);
+
+		must(backend_cuda.plan_bytes(NULL, &options, &bytes, &err), &err, "bytes");
+		/* just too little for the plan at its ease */
+		must(backend_cuda.open(0,
+				       &(struct device_options){
+					   .memory_limit = s == 0 ? 0 : bytes.stack + bytes.volumes + bytes.scratch},
+				       &device, &err),
+		     &err, "open");
+		side.backend = &backend_cuda;
+		for (int i = 0; i < at.views; i++)
+			slots[i] = i;
+		must(backend_cuda.plan_new(device, &options, &side.plan, &err), &err, "plan");
+		must(backend_cuda.volume_new(device, &scene.grid, &side.volume, &err), &err, "volume");
+		must(backend_cuda.stack_new(device, at.columns, at.rows, at.views, &side.stack, &err), &err, "stack");
+		must(backend_cuda.linearise(side.plan, stack, at.views, slots, side.stack, &defects, &err), &err,
+		     "linearise");
+		for (int i = 0; i < 2; i++)
+			must(backend_cuda.sart_iterate(side.plan, side.stack, side.volume, NULL, &sums, &err), &err,
+			     "sart");
+		got[s] = malloc(voxels * sizeof(float));
+		read_volume(&side, &scene, got[s]);
+		residual[s] = sums.residual2;
+		printf("%-34s %s\n", scene.name, backend_cuda.plan_summary(side.plan));
+		backend_cuda.stack_free(side.stack);
+		backend_cuda.volume_free(side.volume);
+		backend_cuda.plan_free(side.plan);
+		backend_cuda.close(device);
+		subsets_clear(&sart.subsets);
+		free(slots);
+	}
+	expect(&scene, "SART in parts", difference(got[1], got[0], voxels), 1e-5);
+	expect(&scene, "its residual", apart(residual[1], residual[0]), 1e-5);
+	free(got[0]);
+	free(got[1]);
+	free(stack);
+	scene_clear(&scene);
+}
+
 /* A plan that does not fit is refused with the numbers, and the device goes on. */
 static void check_limit(void)
 {
@@ -497,6 +628,10 @@ int main(int argc, char **argv)
 	check_counts(devices);
 	check_memory(devices[1]);
 	check_limit();
+	check_recon(devices, true, false, 1e-4);
+	check_recon(devices, false, false, 2e-3);
+	check_recon(devices, false, true, 2e-3);
+	check_lean();
 	backend_cuda.describe(devices[1], &after);
 	if (before.bytes_free - after.bytes_free > (size_t)64 << 20 && after.bytes_free < before.bytes_free) {
 		printf("FAILED  %.1f MiB of device memory did not come back\n",
