@@ -1,6 +1,7 @@
 #ifndef CBCT_DAEMON_API_H
 #define CBCT_DAEMON_API_H
 
+#include "daemon/feed.h"
 #include "daemon/http.h"
 #include "daemon/job.h"
 #include "daemon/store.h"
@@ -13,6 +14,7 @@ struct api {
 	struct jobs *jobs;
 	struct supervise *supervise;
 	struct uploads *uploads;
+	struct feed *feed;
 	struct http *http;
 	double max_wait; /* s */
 	double started;  /* http_now */
@@ -40,6 +42,9 @@ int job_post(void *context, struct request *request, struct error *err);
 int job_list(void *context, struct request *request, struct error *err);
 int job_get(void *context, struct request *request, struct error *err);
 int job_delete(void *context, struct request *request, struct error *err);
+
+int job_events(void *context, struct request *request, struct error *err);
+int all_events(void *context, struct request *request, struct error *err);
 
 int volume_list(void *context, struct request *request, struct error *err);
 int volume_get(void *context, struct request *request, struct error *err);

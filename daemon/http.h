@@ -122,6 +122,18 @@ int request_reply_file(struct request *request, int status, int descriptor, uint
 int request_reply_read(struct request *request, int status, uint64_t size,
 		       ssize_t (*read)(void *context, uint64_t offset, void *to, size_t size), void *context,
 		       void (*context_free)(void *context), struct error *err);
+/*
+ * A body that goes on for as long as something comes. read, as above, is called
+ * in the request's thread; READ_WAIT calls it again after request_wake, or when
+ * the time of request_wait_until has come. What it works on is request_state.
+ * A client that has gone is noticed before each wait, and without traffic by
+ * keep-alive probes; patience (s, 0: the system's) is how long sent bytes may
+ * stay unacknowledged.
+ */
+enum { READ_WAIT = -2 };
+int request_reply_live(struct request *request, int status,
+		       ssize_t (*read)(struct request *request, void *to, size_t size), double patience,
+		       struct error *err);
 /* After one of the above. */
 void request_reply_header(struct request *request, const char *name, const char *format, ...)
     __attribute__((format(printf, 3, 4)));

@@ -12,6 +12,7 @@
 
 #include "daemon/document.h"
 #include "daemon/log.h"
+#include "proto/json.h"
 #include "proto/spool.h"
 
 /* The one table of transitions: [from][to]. */
@@ -256,7 +257,7 @@ int jobs_list(struct jobs *jobs, const char *after, int limit, struct job **ret_
 /* A NULL document becomes an error, so that callers check once. */
 static int event_make(struct event *ret_event, const char *kind, cJSON *document, struct error *err)
 {
-	char *data = document == NULL ? NULL : cJSON_PrintUnformatted(document);
+	char *data = document == NULL ? NULL : json_print(document, NULL);
 
 	cJSON_Delete(document);
 	if (data == NULL)
@@ -346,8 +347,8 @@ static int save_state(struct jobs *jobs, const struct job_record *record, bool r
 		code = event_make(&end, "end", state_document(record), err);
 	if (code == 0)
 		code = store_job_update(jobs->store, record, &event, ended ? &end : NULL, rewind, err);
-	cJSON_free(event.data);
-	cJSON_free(end.data);
+	free(event.data);
+	free(end.data);
 	return code;
 }
 
@@ -576,11 +577,9 @@ static int fill_record(struct job_record *record, const struct job_request *requ
 		       const struct recon_memory *memory, const char *key, const uint8_t digest[32], struct error *err)
 {
 	cJSON *document = job_request_json(request);
-	char *text = document == NULL ? NULL : cJSON_PrintUnformatted(document);
 
+	record->request = document == NULL ? NULL : json_print(document, NULL);
 	cJSON_Delete(document);
-	record->request = text == NULL ? NULL : strdup(text);
-	cJSON_free(text);
 	record->key = key == NULL ? NULL : strdup(key);
 	if (record->request == NULL || (key != NULL && record->key == NULL))
 		return error_set_errno(err, ENOMEM, "job");
@@ -620,7 +619,7 @@ static int insert_job(struct jobs *jobs, struct job *job, struct stored_scan *sc
 	if (code != 0)
 		return code;
 	code = store_job_insert(jobs->store, record, &event, err);
-	cJSON_free(event.data);
+	free(event.data);
 	if (code != 0)
 		return code;
 	pthread_mutex_lock(&jobs->lock);
@@ -926,12 +925,16 @@ static void note_row(struct job *job, int iteration)
 int job_add_row(struct job *job, const struct history_row *row, struct error *err)
 {
 	struct event event;
+	char once[32];
 	int code = event_make(&event, "progress", history_row_document(row), err);
 
 	if (code != 0)
 		return code;
+	/* A run that was lost is repeated, what was told of it is not. */
+	snprintf(once, sizeof(once), "row %d", row->iteration);
+	event.once = once;
 	code = store_job_add_row(job->jobs->store, job->id, row, &event, err);
-	cJSON_free(event.data);
+	free(event.data);
 	if (code != 0)
 		return code;
 	note_row(job, row->iteration);
@@ -942,12 +945,15 @@ int job_add_row(struct job *job, const struct history_row *row, struct error *er
 int job_add_volume(struct job *job, const struct volume_record *volume, struct error *err)
 {
 	struct event event;
+	char once[48];
 	int code = event_make(&event, "volume", volume_document(job->id, volume), err);
 
 	if (code != 0)
 		return code;
+	snprintf(once, sizeof(once), "volume %s", volume->name);
+	event.once = once;
 	code = store_job_add_volume(job->jobs->store, job->id, volume, &event, err);
-	cJSON_free(event.data);
+	free(event.data);
 	if (code == 0)
 		wake(job);
 	return code;
@@ -969,7 +975,7 @@ int job_add_warning(struct job *job, const char *code_name, const char *detail, 
 	if (code != 0)
 		return code;
 	code = store_job_add_warning(job->jobs->store, job->id, &warning, &event, &new, err);
-	cJSON_free(event.data);
+	free(event.data);
 	if (code == 0 && new)
 		wake(job);
 	return code;

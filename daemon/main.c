@@ -90,6 +90,8 @@ static int start_parts(const struct config *config, struct api *api, struct erro
 	if (code == 0)
 		code = supervise_start(api->jobs, &supervise, &api->supervise, err);
 	if (code == 0)
+		code = feed_new(api->store, &api->feed, err);
+	if (code == 0)
 		code = uploads_new(api->store, &uploads, &api->uploads, err);
 	if (code == 0)
 		code = http_start(api->http, err);
@@ -100,6 +102,7 @@ static void stop_parts(struct api *api)
 {
 	http_free(api->http);
 	uploads_free(api->uploads);
+	feed_free(api->feed);
 	supervise_stop(api->supervise);
 	jobs_close(api->jobs);
 	store_close(api->store);

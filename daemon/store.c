@@ -111,6 +111,9 @@ static const char *const migrations[] = {
     " kind TEXT NOT NULL,"
     " data TEXT NOT NULL);"
     "CREATE INDEX events_of_job ON events (job, number);",
+    /* What a job that starts again does once more is told once: the name of such an event, else NULL. */
+    "ALTER TABLE events ADD COLUMN once TEXT;"
+    "CREATE UNIQUE INDEX events_once ON events (job, once);",
 };
 enum { MIGRATIONS = sizeof(migrations) / sizeof(migrations[0]) };
 
@@ -288,6 +291,9 @@ int store_end(struct store *store, int code, struct error *err)
 	/* A failed COMMIT may have rolled back by itself. */
 	if (code != 0 && !sqlite3_get_autocommit(store->writer.db))
 		run_plain(&store->writer, "ROLLBACK", &ignored);
+	if (code == 0 && store->event_written != 0)
+		atomic_store(&store->last_event, store->event_written);
+	store->event_written = 0;
 	pthread_mutex_unlock(&store->writer.lock);
 	if (code == 0) {
 		atomic_fetch_add(&store->commits, 1);
@@ -461,6 +467,8 @@ static int open_catalogue(struct store *store, struct error *err)
 		code = store_sweep_scans(store, fresh, err);
 	if (code == 0)
 		code = store_sweep_jobs(store, fresh, err);
+	if (code == 0)
+		code = store_load_last_event(store, err);
 	if (code != 0)
 		return code;
 	sqlite3_wal_hook(store->writer.db, on_commit, store);

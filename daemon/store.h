@@ -210,7 +210,8 @@ struct event_record {
 /* Every one of these writes the event (NULL: none) in the same transaction. */
 struct event {
 	const char *kind;
-	char *data; /* JSON text */
+	char *data;       /* JSON text */
+	const char *once; /* NULL, or: of all events of the job with this name, the first is the only one */
 };
 int store_job_insert(struct store *store, const struct job_record *job, const struct event *event, struct error *err);
 /* All columns that can change. `end`, when not NULL, is a second event. With `rewind`, history rows behind the
@@ -244,6 +245,8 @@ int store_job_warnings(struct store *store, const char *id, struct warning_recor
 int store_job_events(struct store *store, const char *id, long long after, int limit, struct event_record **ret_events,
 		     int *ret_count, struct error *err);
 void event_records_free(struct event_record *events, int count);
+/* The number of the latest event of all jobs, 0 when there has never been one. Memory only. */
+long long store_last_event(const struct store *store);
 
 /* STATE/jobs/ID; STATE/jobs/ID/NAME.nii */
 void store_job_directory(const struct store *store, const char *id, char ret_path[1024]);

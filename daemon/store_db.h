@@ -35,6 +35,8 @@ struct store {
 	struct connection writer, reader;
 	_Atomic bool failed; /* a commit did not reach the disk: nothing is acknowledged any more */
 	atomic_flag failure_told;
+	long long event_written; /* by the transaction under way, 0: none; guarded by writer.lock */
+	_Atomic long long last_event;
 
 	/* The checkpointer moves the log into the database, off the path of the commits. */
 	pthread_t checkpointer;
@@ -92,6 +94,7 @@ double time_now(void);
 int store_load_scans(struct store *store, struct error *err);
 int store_sweep_scans(struct store *store, bool fresh, struct error *err);
 int store_sweep_jobs(struct store *store, bool fresh, struct error *err);
+int store_load_last_event(struct store *store, struct error *err);
 void store_free_scans(struct store *store);
 
 #endif

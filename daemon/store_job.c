@@ -46,14 +46,17 @@ static int add_event(struct store *store, const char *id, const struct event *ev
 	if (event == NULL)
 		return 0;
 	query_begin(&query, &store->writer,
-		    "INSERT INTO events (job, created, kind, data)"
-		    " VALUES ((SELECT number FROM jobs WHERE id = ?), ?, ?, ?)",
+		    "INSERT INTO events (job, created, kind, data, once)"
+		    " VALUES ((SELECT number FROM jobs WHERE id = ?), ?, ?, ?, ?) ON CONFLICT (job, once) DO NOTHING",
 		    err);
 	query_text(&query, id);
 	query_real(&query, time_now());
 	query_text(&query, event->kind);
 	query_text(&query, event->data);
-	return query_run(&query);
+	query_text(&query, event->once);
+	if (query_run(&query) == 0 && sqlite3_changes(store->writer.db) > 0)
+		store->event_written = sqlite3_last_insert_rowid(store->writer.db);
+	return query.code;
 }
 
 /* The columns that can change, in the order of both statements below. */
@@ -558,7 +561,23 @@ int store_job_events(struct store *store, const char *id, long long after, int l
 	return 0;
 }
 
+long long store_last_event(const struct store *store)
+{
+	return atomic_load(&store->last_event);
+}
+
 /* ---- at the start ---- */
+
+/* Of jobs that are gone, too: a client may have seen them. */
+int store_load_last_event(struct store *store, struct error *err)
+{
+	struct query query;
+
+	query_begin(&query, &store->reader, "SELECT seq FROM sqlite_sequence WHERE name = 'events'", err);
+	if (query_row(&query))
+		atomic_store(&store->last_event, sqlite3_column_int64(query.statement, 0));
+	return query_end(&query);
+}
 
 struct sweep {
 	struct store *store;

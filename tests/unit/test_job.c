@@ -344,6 +344,8 @@ START_TEST(events_come_in_order_from_where_one_left_off)
 	ck_assert_int_eq(job_add_warning(job, "arc", "too short", &err), 0); /* said once */
 	add_row(job, 1);
 	ck_assert_int_eq(job_add_volume(job, &volume, &err), 0);
+	add_row(job, 1); /* what a lost run had done is done again, and not told again */
+	ck_assert_int_eq(job_add_volume(job, &volume, &err), 0);
 	add_row(job, 2);
 	state_set(job, JOB_SUCCEEDED, NULL);
 	job_release(job);
@@ -356,6 +358,7 @@ START_TEST(events_come_in_order_from_where_one_left_off)
 		if (i > 0)
 			ck_assert_int_gt(events[i].number, events[i - 1].number);
 	}
+	ck_assert_int_eq(store_last_event(state.store), events[7].number);
 	third = events[2].number;
 	event_records_free(events, count);
 	ck_assert_int_eq(store_job_events(state.store, NULL, third, 2, &events, &count, &err), 0);
