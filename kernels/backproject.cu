@@ -15,7 +15,9 @@
  * B = floor of the first row and t = row - B + k e,
  *   q[k+1] - saturate(1 - t) (q[k+1] - q[k]) + saturate(t - 1) (q[k+2] - q[k+1])
  * is the linear interpolation along z without a branch or a dynamic index, exact
- * while (VOXELS - 1) |e| <= 1, which plan.cu sees to.
+ * while (VOXELS - 1) |e| <= 1, which plan.cu sees to. Voxels half as far apart as
+ * rows (HALF) go the same way: voxel k has its rows from k / 2 on and the spacing
+ * 1/2 + e, so that as few rows serve twice as many voxels.
  *
  * Matrices are read from constant memory, one broadcast for a block.
  */
@@ -138,10 +140,10 @@ static __global__ void __launch_bounds__(ACROSS *ALONG) backproject_general(cons
 	put_voxels<VOXELS>(job, x, y, z, sum);
 }
 
-template <int VOXELS, int WINDOWS, int ACROSS, int ALONG>
+template <int VOXELS, int WINDOWS, bool HALF, int ACROSS, int ALONG>
 static __global__ void __launch_bounds__(ACROSS *ALONG, 8) backproject_untilted(const backprojection_job job)
 {
-	const int run = VOXELS * WINDOWS;
+	const int run = VOXELS * WINDOWS, rows = (HALF ? (VOXELS - 1) / 2 : VOXELS - 1) + 3;
 	int x = blockIdx.x * ACROSS + threadIdx.x, y = blockIdx.y * ALONG + threadIdx.y, z = blockIdx.z * run;
 	float sum[run], fx = (float)x, fy = (float)y, fz = (float)z;
 	const float2 *p = job.pairs;
@@ -153,8 +155,9 @@ static __global__ void __launch_bounds__(ACROSS *ALONG, 8) backproject_untilted(
 		const float *m = matrices[i];
 		float a = fmaf(m[0], fx, fmaf(m[1], fy, m[3])), c = fmaf(m[8], fx, fmaf(m[9], fy, m[11]));
 		float b = fmaf(m[4], fx, fmaf(m[5], fy, fmaf(m[6], fz, m[7]))), w = reciprocal(c);
-		float u = fminf(fmaxf(a * w, -1.0f), job.columns), first = b * w, rise = m[6] * w, e = rise - 1.0f;
-		float weight = job.use.fdk ? w * w : 1.0f, across, lowest = fminf(0.0f, (float)(VOXELS - 1) * e);
+		float u = fminf(fmaxf(a * w, -1.0f), job.columns), first = b * w, rise = m[6] * w;
+		float e = rise - (HALF ? 0.5f : 1.0f), lowest = fminf(0.0f, (float)(VOXELS - 1) * e);
+		float weight = job.use.fdk ? w * w : 1.0f, across;
 		unsigned place = (unsigned)split(u, across) + 1;
 		int within = (int)(place / PANEL * (unsigned)job.shape.panel + place % PANEL);
 		float right = across * weight, left = weight - right;
@@ -164,23 +167,23 @@ static __global__ void __launch_bounds__(ACROSS *ALONG, 8) backproject_untilted(
 			float row = fmaf((float)(n * VOXELS), rise, first), unused;
 			float base = fminf(fmaxf(row + lowest, (float)-STACK_PAD), job.rows);
 			int low = split(base, unused);
-			float t = row - (float)low, q[VOXELS + 2];
+			float t = row - (float)low, q[rows];
 			const float2 *r = p + (low * PANEL + within);
 
 #pragma unroll
-			for (int j = 0; j < VOXELS + 2; j++)
+			for (int j = 0; j < rows; j++)
 				q[j] = fmaf(left, r[j * PANEL].x, right * r[j * PANEL].y);
-			float below = q[1] - q[0];
 #pragma unroll
 			for (int k = 0; k < VOXELS; k++) {
-				float down = __saturatef(fmaf((float)-k, e, 1.0f - t));
-				float up = __saturatef(fmaf((float)k, e, t - 1.0f)), above = q[k + 2] - q[k + 1];
+				const int j = HALF ? k / 2 : k;
+				const float beyond = HALF && k % 2 ? 0.5f : 0.0f;
+				float down = __saturatef(fmaf((float)-k, e, 1.0f - beyond - t));
+				float up = __saturatef(fmaf((float)k, e, t - (1.0f - beyond)));
 				float &s = sum[n * VOXELS + k];
 
-				s += q[k + 1];
-				s = fmaf(-down, below, s);
-				s = fmaf(up, above, s);
-				below = above;
+				s += q[j + 1];
+				s = fmaf(-down, q[j + 1] - q[j], s);
+				s = fmaf(up, q[j + 2] - q[j + 1], s);
 			}
 		}
 	}
@@ -265,12 +268,13 @@ static int load_array(struct plan *plan, const float *from, int count, struct er
 	return 0;
 }
 
-template <int VOXELS, int WINDOWS, int ACROSS, int ALONG>
+template <int VOXELS, int WINDOWS, bool HALF>
 static void launch_untilted(const backprojection_job &job, cudaStream_t stream)
 {
-	dim3 blocks(divide_up(job.nx, ACROSS), divide_up(job.ny, ALONG), divide_up(job.nz, VOXELS * WINDOWS));
+	const int wide = 8, high = 16;
+	dim3 blocks(divide_up(job.nx, wide), divide_up(job.ny, high), divide_up(job.nz, VOXELS * WINDOWS));
 
-	backproject_untilted<VOXELS, WINDOWS, ACROSS, ALONG><<<blocks, dim3(ACROSS, ALONG), 0, stream>>>(job);
+	backproject_untilted<VOXELS, WINDOWS, HALF, wide, high><<<blocks, dim3(wide, high), 0, stream>>>(job);
 }
 
 template <int VOXELS, int SAMPLING>
@@ -307,18 +311,24 @@ static int launch(struct plan *plan, backprojection_job &job, struct error *err)
 
 	if (plan->shape.back_voxels > 0)
 		TRY(layout_pairs(plan, job.from, job.views, err));
-	switch (plan->shape.back_voxels) {
+	switch (plan->shape.back_half ? -plan->shape.back_voxels : plan->shape.back_voxels) {
+	case -5:
+		launch_untilted<5, 3, true>(job, stream);
+		break;
+	case -4:
+		launch_untilted<4, 4, true>(job, stream);
+		break;
 	case 3:
-		launch_untilted<3, 4, 16, 8>(job, stream);
+		launch_untilted<3, 4, false>(job, stream);
 		break;
 	case 4:
-		launch_untilted<4, 4, 16, 8>(job, stream);
+		launch_untilted<4, 4, false>(job, stream);
 		break;
 	case 5:
-		launch_untilted<5, 3, 16, 8>(job, stream);
+		launch_untilted<5, 3, false>(job, stream);
 		break;
 	case 6:
-		launch_untilted<6, 2, 16, 8>(job, stream);
+		launch_untilted<6, 2, false>(job, stream);
 		break;
 	default:
 		if (plan->shape.textures) {

@@ -177,6 +177,7 @@ struct plan_shape {
 	int forward_rows;  /* rows of one thread in the untilted forward projection; 0: the general one */
 	int back_voxels;   /* voxels of one window in the untilted backprojection; 0: the general one */
 	bool is_small;     /* launches take longer than samples: the plainest kernels */
+	bool back_half;    /* its voxels lie half as far apart as rows */
 	bool textures;     /* 8-bit interpolation weights are allowed */
 	bool z_rays;       /* some ray runs closer to z than to x and y */
 	int batch;         /* views filtered and backprojected in one go */

@@ -78,30 +78,41 @@ static __device__ void put_held(const slices &to, float *slice, int row, int row
 		}
 }
 
-/* The values of a thread: TILE / TILE_ROWS slices, one place along the fast axis. */
+/*
+ * The values of a thread: TILE / TILE_ROWS slices, one place along the fast axis.
+ * Within a plane a value has at most two places more: where it begins a panel it
+ * ends the one before, at the ends of the axis it is held beyond them.
+ */
 static __device__ __forceinline__ void put_slices(const slices &to, int first, int slices_count, int fast, int count,
 						  int row, int rows, const float value[TILE / TILE_ROWS])
 {
 	const int each = TILE / TILE_ROWS;
 	float *slice = to.data + to.slice * (size_t)first;
 	size_t step = to.slice * TILE_ROWS;
-	bool is_plain = row > 0 && row < rows - 1 && fast > 0 && fast < count - 1 &&
-			(to.panel == 0 || (fast + 1) % (PANEL - 1) != 0);
+	bool is_first = fast == 0, is_last = fast == count - 1;
+	bool begins = to.panel > 0 && (fast + 1) % (PANEL - 1) == 0;
+	bool next_begins = to.panel > 0 && is_last && (count + 1) % (PANEL - 1) == 0;
 
 	if (fast >= count)
 		return;
-	if (is_plain && first + (each - 1) * TILE_ROWS < slices_count) {
-		float *at = slice + (row * to.row + place_at(to, fast));
-
-#pragma unroll
-		for (int k = 0; k < each; k++, at += step)
-			*at = value[k];
+	if (row == 0 || row == rows - 1 || count == 1 || next_begins) {
+		for (int k = 0; k < each; k++, slice += step)
+			if (first + k * TILE_ROWS < slices_count)
+				put_held(to, slice, row, rows, fast, count, value[k]);
 		return;
 	}
+	float *main = slice + (row * to.row + place_at(to, fast));
+	float *held = slice + (row * to.row + place_at(to, is_first ? -1 : count));
 #pragma unroll
-	for (int k = 0; k < each; k++, slice += step)
-		if (first + k * TILE_ROWS < slices_count)
-			put_held(to, slice, row, rows, fast, count, value[k]);
+	for (int k = 0; k < each; k++, main += step, held += step) {
+		if (first + k * TILE_ROWS >= slices_count)
+			return;
+		*main = value[k];
+		if (begins)
+			main[PANEL - 1 - to.panel] = value[k];
+		if (is_first || is_last)
+			*held = value[k];
+	}
 }
 
 /* One tile of x and y in one plane; across x it is turned over in shared memory. */

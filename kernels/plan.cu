@@ -14,7 +14,7 @@
 enum { LAYERS_MOST = 2048 };                      /* of a layered array, on every card */
 enum { SIDE_MOST = 32768 };                       /* its width and height */
 enum { BATCH_MOST = 128, BATCH_LEAN = 16 };       /* views that are filtered and backprojected in one go */
-static const double SMALL = 1 << 24;              /* voxels times views below which launches take longer than samples */
+static const double SMALL = 1 << 20;              /* voxels times views below which launches take longer than samples */
 static const size_t RAW_BYTES = (size_t)16 << 20; /* of each of the two buffers of raw samples */
 static const size_t FFT_BYTES = (size_t)64 << 20; /* of the rows that cuFFT takes at once */
 
@@ -116,13 +116,32 @@ static void row_spacing(const struct geometry *geometry, const struct grid *grid
 	*ret_sign = abs(up) == geometry->count ? (up > 0 ? 1 : -1) : 0;
 }
 
-/* How many neighbours one window of evenly spaced ones may hold: (n - 1) |e| <= 1, 0 when fewer than 3. */
-static int window_size(double least, double most)
+/*
+ * Whether a window may hold `count` neighbours that lie `spacing` samples apart: from
+ * the lowest sample of the window, neighbour k must lie in j .. j + 2, with j = k, or k / 2 of
+ * neighbours half as far apart. The lowest neighbour is up to a sample above that one.
+ */
+static bool window_holds(int count, bool half, double spacing)
 {
-	double e = fmax(fabs(most - 1), fabs(least - 1)) + 1e-4;
-	int size = (int)fmin(1 + 1 / e, 6);
+	const double margin = 1e-4; /* float32 */
+	double e = spacing - (half ? 0.5 : 1.0), lift = e < 0 ? -e * (count - 1) : 0;
 
-	return size >= 3 ? size : 0;
+	for (int k = 0; k < count; k++) {
+		double above = lift + k * spacing - (half ? k / 2 : k);
+
+		if (above < -margin || above + 1 > 2 - margin)
+			return false;
+	}
+	return true;
+}
+
+static int window_size(bool half, double least, double most)
+{
+	int size = half ? 5 : 6, smallest = half ? 4 : 3;
+
+	while (size >= smallest && !(window_holds(size, half, least) && window_holds(size, half, most)))
+		size--;
+	return size >= smallest ? size : 0;
 }
 
 /*
@@ -156,10 +175,14 @@ static void choose_untilted(const struct plan_options *options, struct plan_shap
 	shape->untilted = true;
 	shape->rows_down = sign < 0;
 	if (!shape->z_rays)
-		shape->forward_rows = window_size(least, most);
+		shape->forward_rows = window_size(false, least, most);
 	/* Seen from the detector the same spacing is upside down. */
-	if (!shape->rows_down)
-		shape->back_voxels = window_size(1 / most, 1 / least);
+	if (shape->rows_down)
+		return;
+	shape->back_voxels = window_size(true, 1 / most, 1 / least);
+	shape->back_half = shape->back_voxels > 0;
+	if (!shape->back_half)
+		shape->back_voxels = window_size(false, 1 / most, 1 / least);
 }
 
 static struct plan_shape shape_of(const struct plan_options *options, bool lean)
@@ -508,7 +531,8 @@ static void summarise(struct plan *plan)
 	if (shape->forward_rows > 0)
 		snprintf(forward, sizeof(forward), "untilted, %d rows a thread", shape->forward_rows);
 	if (shape->back_voxels > 0)
-		snprintf(back, sizeof(back), "untilted, %d voxels a window", shape->back_voxels);
+		snprintf(back, sizeof(back), "untilted, %d voxels a window%s", shape->back_voxels,
+			 shape->back_half ? ", two a row" : "");
 	snprintf(plan->summary, sizeof(plan->summary), "%sforward %s; back %s; %s; %s", shape->lean ? "lean; " : "",
 		 forward, back, shape->textures ? "texture sampling" : "float32 sampling",
 		 shape->filter_length > 0 ? "fused filter"
