@@ -78,6 +78,7 @@ struct supervise {
 
 	struct worker workers[WORKERS_MAX]; /* the thread's own */
 	double dispatch_at;                 /* monotonic; the thread's own */
+	double stop_by;                     /* monotonic: the stop's end, NEVER before it; the thread's own */
 
 	pthread_mutex_t lock; /* guards what follows */
 	struct worker_facts facts[WORKERS_MAX];
@@ -191,7 +192,8 @@ static void job_ended(struct supervise *supervise, struct worker *worker, const 
 	job_facts(worker->job, &facts);
 	worker->deadline = NEVER;
 	worker->state = WORKER_IDLE;
-	if (message->code == 0) {
+	/* Done before it heard of it: what could not be kept is lost all the same. */
+	if (message->code == 0 && worker->failure_code == 0) {
 		worker->failures = 0;
 		end_job(supervise, worker, (struct ending){.to = JOB_SUCCEEDED}, "");
 	} else if (message->code == ERR_DEVICE) {
@@ -213,6 +215,10 @@ static void job_ended(struct supervise *supervise, struct worker *worker, const 
 		end_job(supervise, worker,
 			(struct ending){.to = JOB_QUEUED, .checkpoint = message->iteration, .yielded = true},
 			"it made room");
+	} else if (message->code == ERR_NO_SPACE && (worker->yielding || supervise->stop_by < NEVER)) {
+		/* Most likely its checkpoint: who is asked to make room must not fail for that. */
+		end_job(supervise, worker, (struct ending){.to = JOB_QUEUED, .checkpoint = worker->checkpoint},
+			message->text);
 	} else if (message->code == ERR_INVALID && worker->checkpoint > 0) {
 		end_job(supervise, worker, (struct ending){.to = JOB_QUEUED, .crashed = true},
 			"its checkpoint is damaged: from the start");
@@ -563,6 +569,9 @@ static void look_at_clock(struct supervise *supervise, bool stopping)
 			finish(supervise, worker);
 		if (worker->state == WORKER_ABSENT && !stopping && now >= worker->start_at)
 			start_worker(supervise, worker);
+		/* Also when its job has ended since: it was told to quit, and may not heed it. */
+		if (worker->state != WORKER_ENDING && worker->deadline > supervise->stop_by)
+			worker->deadline = supervise->stop_by;
 		if (worker->state != WORKER_ABSENT && now >= worker->deadline) {
 			log_line(LEVEL_WARNING, "worker %d does not %s: killed", worker->index,
 				 worker->state == WORKER_STARTING ? "start"
@@ -661,6 +670,7 @@ static void wait_and_read(struct supervise *supervise, bool stopping)
 
 static void quit_workers(struct supervise *supervise)
 {
+	supervise->stop_by = now_monotonic() + supervise->options.stop_seconds;
 	for (int i = 0; i < supervise->count; i++) {
 		struct worker *worker = &supervise->workers[i];
 
@@ -671,8 +681,6 @@ static void quit_workers(struct supervise *supervise)
 			child_kill(&worker->child);
 		else
 			tell(worker, MESSAGE_QUIT);
-		if (worker->deadline == NEVER)
-			worker->deadline = now_monotonic() + supervise->options.stop_seconds;
 	}
 }
 
@@ -748,6 +756,7 @@ int supervise_start(struct jobs *jobs, const struct supervise_options *options, 
 	if (supervise == NULL)
 		return error_set_errno(err, ENOMEM, "supervisor");
 	supervise->jobs = jobs;
+	supervise->stop_by = NEVER;
 	set_options(supervise, options);
 	for (int i = 0; i < supervise->count; i++) {
 		supervise->workers[i] =

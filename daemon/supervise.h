@@ -29,7 +29,7 @@ struct supervise_options {
 /* The strings are copied. Returns at once; the first worker says hello later. */
 int supervise_start(struct jobs *jobs, const struct supervise_options *options, struct supervise **ret_supervise,
 		    struct error *err);
-/* Running jobs leave a checkpoint and are queued, workers end, within stop_seconds + 1. NULL is fine. */
+/* Running jobs leave a checkpoint and are queued, workers end, within stop_seconds + 2. NULL is fine. */
 void supervise_stop(struct supervise *supervise);
 
 /* At least one worker is there that can take jobs (idle or busy). */

@@ -161,6 +161,63 @@ test_a_full_disk_is_507_and_loses_nothing() {
 	stop_daemon
 }
 
+test_on_a_full_disk_who_makes_room_begins_again() {
+	local low
+	small=$work/small
+	mkdir -p "$small"
+	mount -t tmpfs -o size=6m none "$small" 2>/dev/null || skip "no permission to mount a small tmpfs"
+	trap 'stop_daemon; umount "$small"' EXIT
+	state=$small/state start_daemon
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	# neither its checkpoint nor its volume has room
+	post_job '{"scan": "SCAN", "grid": {"size": [128, 128, 128], "spacing_mm": [1, 1, 1]}, "fdk": null, "sart": {"iterations": 500, "subsets": 1}}'
+	low=$job
+	running_at 1
+	post_job '{"scan": "SCAN", "grid": {"size": [16, 16, 16], "spacing_mm": [5, 5, 5]}, "fdk": {}, "priority": "stat"}'
+	wait_job succeeded
+	job=$low
+	running_at 1
+	expect_json '.state == "running" and .attempts == 2'
+	req DELETE "/v1/jobs/$low"
+	wait_job cancelled
+	stop_daemon
+}
+
+test_a_worker_that_does_not_exit_keeps_nobody() {
+	local pid
+	# one that does its work, and then stays
+	printf '#!/bin/sh\n"%s" "$@"\nexec sleep 300\n' "$BUILD/cbct-worker" >"$work/worker"
+	chmod +x "$work/worker"
+	start_daemon --worker "$work/worker" --stop-timeout 5
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	# nobody may yield in the only iteration: the job ends well after the worker was told to quit
+	post_job '{"scan": "SCAN", "grid": {"size": [192, 192, 192], "spacing_mm": [1, 1, 1]}, "fdk": null, "sart": {"iterations": 1, "subsets": 1}}'
+	pid=$(cat "$work/daemon.pid")
+	while [ "$(json .state)" != running ]; do req GET "/v1/jobs/$job"; done
+	kill "$pid"
+	timeout 60 tail --pid="$pid" -f /dev/null || { kill -9 "$pid"; fail "the end of the daemon"; }
+	stop_daemon
+	start_daemon
+	wait_job succeeded
+	stop_daemon
+}
+
+test_a_volume_that_cannot_be_recorded_is_no_success() {
+	command -v sqlite3 >/dev/null || skip "no sqlite3 to make the catalogue refuse a row"
+	start_daemon
+	sqlite3 "$state/catalogue.sqlite" "CREATE TRIGGER refuse BEFORE INSERT ON volumes WHEN NEW.name = 'final'
+		BEGIN SELECT RAISE(ABORT, 'refused'); END"
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "{\"scan\": \"SCAN\", $grid, \"fdk\": {}}"
+	wait_job failed
+	expect_json '.error.detail | test("refused")'
+	sqlite3 "$state/catalogue.sqlite" "DROP TRIGGER refuse"
+	stop_daemon
+}
+
 test_two_daemons_do_not_share_a_state_directory() {
 	start_daemon
 	if timeout 10 "$BUILD/cbctd" --listen 127.0.0.1:0 --state-dir "$state" --backend cpu >"$work/second.out" 2>&1; then
