@@ -91,7 +91,7 @@ $(foreach isa,$(SIMD_ISAS),$(eval $(call simd_rule,$(isa))))
 
 $(BUILD)/kernels/%.o: kernels/%.cu
 	@mkdir -p $(@D)
-	$(call say,NVCC)$(NVCC) -std=c++17 -O3 -lineinfo -I. $(cuda_code) -Xcompiler -Wall,-Wextra -MMD -MP -c -o $@ $<
+	$(call say,NVCC)$(NVCC) -std=c++17 -O3 -lineinfo -I. $(cuda_code) -Xcompiler -Wall,-Wextra $(addprefix -Xcompiler ,$(OPENMP)) -MMD -MP -c -o $@ $<
 
 # The daemon and the client use the library's backends by table; only the worker,
 # the client's `recon` and the GPU tests know of CUDA's row (core/backend.c).
@@ -110,6 +110,9 @@ $(BUILD)/cbct: $(call objects,$(cbct_sources)) $(library)
 
 $(BUILD)/unit: $(call objects,$(unit_sources) $(state_sources)) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,check sqlite3 $(proto_libs) $(core_libs)) $(LIBM)
+
+$(BUILD)/cpu-bench: $(call objects,tests/bench/bench.c) $(library)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(LIBM)
 
 # The GPU's checks and benchmarks need the mathematics and the kernels only, so that they run on a bare machine.
 gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench
@@ -134,7 +137,7 @@ demo: setup ## a C-arm scan posted with curl, reconstructed, its volumes coming 
 
 check: setup ## every test; what cannot run here is skipped aloud
 	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/unit
-	@BUILD=$(BUILD) SANITIZED=$(SANITIZED) tests/run.sh
+	@BUILD=$(BUILD) SANITIZED=$(SANITIZED) OMP_WAIT_POLICY=passive tests/run.sh
 
 FUZZ_SECONDS ?= 10
 fuzzers := $(patsubst tests/fuzz/%.c,$(BUILD)/%,$(wildcard tests/fuzz/fuzz_*.c))
@@ -151,7 +154,7 @@ fuzz: setup ## each fuzz target for FUZZ_SECONDS=10 (needs clang)
 	@BUILD=$(BUILD)/fuzz FUZZ_SECONDS=$(FUZZ_SECONDS) tests/fuzz/run.sh
 
 bench: setup ## CPU and HTTP benchmarks, results in build/bench/
-	@$(MAKE) --no-print-directory -j$$(nproc) all
+	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/cpu-bench
 	@BUILD=$(BUILD) tests/bench/run.sh
 
 check-gpu: ## the CUDA backend against the CPU's; skipped aloud without a GPU

@@ -6,6 +6,7 @@
 #include <signal.h>
 #include <stdatomic.h>
 #include <stdio.h>
+#include <stdlib.h>
 #include <string.h>
 #include <sys/resource.h>
 #include <unistd.h>
@@ -137,6 +138,11 @@ int main(int argc, char **argv)
 	struct error err = {0};
 	int status = 0;
 
+	/*
+	 * For the workers, whose OpenMP reads it when it is loaded: threads that wait for each other sleep. Spinning
+	 * ones take the processor from the one that they wait for as soon as anything else runs beside them.
+	 */
+	setenv("OMP_WAIT_POLICY", "passive", 0);
 	if (config_load(argc, argv, &config, &action, &err) != 0) {
 		fprintf(stderr, "cbctd: %s\n", err.text);
 		return 2;

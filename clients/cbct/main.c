@@ -8,6 +8,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <unistd.h>
 
 #include "clients/cbct/commands.h"
 
@@ -70,10 +71,23 @@ static int command_run(const struct command *command, int count, char *const *ar
 	return code == 0 ? EXIT_SUCCESS : report(command, &err);
 }
 
+/*
+ * OpenMP's threads shall sleep while they wait: spinning ones take the
+ * processor from the one that they wait for as soon as anything else runs
+ * beside them. The runtime reads this when it is loaded, so the program starts
+ * once more with it; where that fails it is slower, no more.
+ */
+static void start_with_sleeping_threads(char **arguments)
+{
+	if (getenv("OMP_WAIT_POLICY") == NULL && setenv("OMP_WAIT_POLICY", "passive", 1) == 0)
+		execv("/proc/self/exe", arguments);
+}
+
 int main(int count, char **arguments)
 {
 	const struct command *command;
 
+	start_with_sleeping_threads(arguments);
 	if (count < 2)
 		return help_all(stderr);
 	if (strcmp(arguments[1], "help") == 0 || strcmp(arguments[1], "--help") == 0 ||
