@@ -44,19 +44,17 @@ static bool on_piece(void *context, const void *data, size_t length)
 
 static void volume_path(const struct get_options *options, char *ret_path, size_t size)
 {
-	int used = snprintf(ret_path, size, "/v1/jobs/%s/volumes/%s?type=%s", options->job, options->volume,
-			    volume_type_names[options->type]);
+	bool has_format = options->format != NULL;
 
-	if (options->format != NULL)
-		used += snprintf(ret_path + used, size - (size_t)used, "&format=%s", options->format);
-	if (options->scale > 1)
-		snprintf(ret_path + used, size - (size_t)used, "&scale=%ld", options->scale);
+	snprintf(ret_path, size, "/v1/jobs/%.100s/volumes/%.100s?type=%s%s%.100s&scale=%ld", options->job,
+		 options->volume, volume_type_names[options->type], has_format ? "&format=" : "",
+		 has_format ? options->format : "", options->scale);
 }
 
 /* The whole body into `file`; ret_name is what the daemon calls it. */
 static int download(const struct get_options *options, FILE *file, char *ret_name, size_t name_size, struct error *err)
 {
-	char path[700];
+	char path[500];
 	struct http *http = NULL;
 	struct http_reply reply = {0};
 	int code = http_new(&options->http, &http, err);

@@ -20,17 +20,17 @@ static void show(struct progress *progress, const cJSON *job)
 	const cJSON *history = cJSON_GetObjectItemCaseSensitive(job, "history");
 	int rows = cJSON_GetArraySize(history);
 	const char *state = member_text(job, "state", "?"), *stage = member_text(job, "stage", "");
-	int iterations = (int)member_number(job, "iterations", 0);
-	char text[140];
-	int used = snprintf(text, sizeof(text), "%s", state);
+	double iterations = member_number(job, "iterations", 0);
+	char text[140]; /* what the daemon calls things is cut, the numbers fit */
+	int used = snprintf(text, sizeof(text), "%.20s", state);
 
 	if (strcmp(state, "running") == 0 && stage[0] != 0)
-		used = snprintf(text, sizeof(text), "%s", stage);
+		used = snprintf(text, sizeof(text), "%.20s", stage);
 	if (strcmp(state, "queued") == 0 && member_number(job, "queue_position", -1) >= 0)
-		used += snprintf(text + used, sizeof(text) - (size_t)used, ", place %.0f",
+		used += snprintf(text + used, sizeof(text) - (size_t)used, ", place %.10g",
 				 member_number(job, "queue_position", 0));
 	if (iterations > 0)
-		used += snprintf(text + used, sizeof(text) - (size_t)used, "  iteration %.0f of %d",
+		used += snprintf(text + used, sizeof(text) - (size_t)used, "  iteration %.10g of %.10g",
 				 member_number(job, "iteration", 0), iterations);
 	if (rows > 0)
 		snprintf(text + used, sizeof(text) - (size_t)used, "  residual %.4g",

@@ -197,6 +197,7 @@ test_failures_are_told() {
 	expect_exit 1 cbct submit unknown
 	expect_exit 1 cbct watch unknown
 	expect_exit 1 cbct get unknown final -o "$work/never.nii"
+	expect_exit 1 cbct get "$(printf 'x%.0s' {1..700})" final --format raw --scale 2 -o "$work/never.nii"
 	[ ! -e "$work/never.nii" ] || fail "no file of a volume that is not there"
 	job=$(cbct submit "$scan" --grid 32 --spacing 2 --sart 100000 --subsets views)
 	(sleep 1; cbct rm "$job") &
