@@ -119,6 +119,10 @@ gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench
 $(gpu_programs): $(BUILD)/%: $(call objects,tests/bench/%.c tests/bench/gpu_scene.c) $(core_objects) $(cuda_objects)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(cuda_libs) $(LIBM)
 
+$(BUILD)/gpu_ceilings: tests/bench/gpu_ceilings.cu
+	@mkdir -p $(@D)
+	$(call say,NVCC)$(NVCC) -std=c++17 -O3 $(cuda_code) -o $@ $<
+
 setup: ## install the Debian packages that are missing
 	@missing=""; \
 	for pair in $(COMMANDS); do command -v $${pair%%:*} >/dev/null 2>&1 || missing="$$missing $${pair##*:}"; done; \
@@ -162,9 +166,10 @@ check-gpu: ## the CUDA backend against the CPU's; skipped aloud without a GPU
 	@$(BUILD)/gpu_check
 
 bench-gpu: ## times of the CUDA backend beside their goals, results in build/bench/
-	@$(MAKE) --no-print-directory $(BUILD)/gpu_bench
+	@$(MAKE) --no-print-directory $(BUILD)/gpu_bench $(BUILD)/gpu_ceilings
 	@mkdir -p $(BUILD)/bench
 	@$(BUILD)/gpu_bench --json $(BUILD)/bench/gpu.json
+	@$(BUILD)/gpu_ceilings | tee $(BUILD)/bench/gpu_ceilings.json
 
 asan: setup ## the tests under the address and undefined-behaviour sanitizers
 	@$(MAKE) --no-print-directory check SANITIZED=1 BUILD=build/asan SANITIZE=address,undefined CUDA=0

@@ -2,8 +2,9 @@
  * How long the CPU takes: the case that the figures of other programs exist for,
  * 256^3 voxels of 0.3725 mm, 100 views over 360 degrees of 559 x 559 pixels of
  * 0.529 mm, source to isocentre 620 mm, to the detector 1100 mm. Medians of
- * repeats, wall clock. And how much memory whole reconstructions take at most,
- * each in a process of its own.
+ * repeats: wall clock, and the processor time of all threads divided by their
+ * number, which others on the same cores disturb less. And how much memory whole
+ * reconstructions take at most, each in a process of its own.
  *
  *   cpu-bench RESULT.json [REPEATS]
  */
@@ -108,17 +109,36 @@ static const struct {
     [NORMS] = {"norms", "norms", 0, 0},
 };
 
-struct timing {
-	char device[96], plan[96];
-	double median[TIMED];
+struct moment {
+	double wall, processor; /* seconds */
 };
 
-static double now(void)
+struct timing {
+	char device[96], plan[96];
+	struct moment median[TIMED];
+};
+
+static double read_clock(clockid_t clock)
 {
 	struct timespec time;
 
-	clock_gettime(CLOCK_MONOTONIC, &time);
+	clock_gettime(clock, &time);
 	return (double)time.tv_sec + 1e-9 * (double)time.tv_nsec;
+}
+
+static struct moment now(void)
+{
+	return (struct moment){read_clock(CLOCK_MONOTONIC),
+			       read_clock(CLOCK_PROCESS_CPUTIME_ID) / (double)sysconf(_SC_NPROCESSORS_ONLN)};
+}
+
+/* What has passed since, added. */
+static void add_since(struct moment begin, struct moment *sum)
+{
+	const struct moment end = now();
+
+	sum->wall += end.wall - begin.wall;
+	sum->processor += end.processor - begin.processor;
 }
 
 static int ascending(const void *a, const void *b)
@@ -136,60 +156,62 @@ struct bench {
 	int batch, views[VIEWS];
 };
 
-static void time_fdk(struct bench *bench, double *ret_filter, double *ret_backprojection)
+static void time_fdk(struct bench *bench, struct moment ret[TIMED])
 {
-	*ret_filter = *ret_backprojection = 0;
 	must(backend_cpu.volume_fill(bench->volume, 0, &err));
 	for (int first = 0; first < VIEWS; first += bench->batch) {
 		const int left = VIEWS - first, count = left < bench->batch ? left : bench->batch;
-		double begin = now(), middle;
+		struct moment begin = now();
 
 		must(backend_cpu.filter(bench->plan, bench->projections, NULL, bench->views + first, count,
 					bench->filtered, &err));
-		middle = now();
+		add_since(begin, &ret[FILTER]);
+		begin = now();
 		must(backend_cpu.backproject(bench->plan, bench->filtered, bench->views + first, count, BACKPROJECT_FDK,
 					     bench->volume, &err));
-		*ret_filter += middle - begin;
-		*ret_backprojection += now() - middle;
+		add_since(begin, &ret[BACKPROJECTION]);
 	}
-}
-
-static double time_sart(struct bench *bench)
-{
-	struct sart_sums sums;
-	double begin = now();
-
-	must(backend_cpu.sart_iterate(bench->plan, bench->projections, bench->volume, NULL, &sums, &err));
-	return now() - begin;
-}
-
-static double time_tv(struct bench *bench)
-{
-	double begin = now();
-
-	must(backend_cpu.tv(bench->plan, bench->volume, NULL, &err));
-	return now() - begin;
+	ret[FDK].wall = ret[FILTER].wall + ret[BACKPROJECTION].wall;
+	ret[FDK].processor = ret[FILTER].processor + ret[BACKPROJECTION].processor;
 }
 
 /* Once each: what a plan with this recipe is asked to measure. */
-static void run_once(struct bench *bench, const struct plan_options *options, double ret[TIMED])
+static void run_once(struct bench *bench, const struct plan_options *options, struct moment ret[TIMED])
 {
 	const bool first = options->tv->method == TV_GRADIENT;
 	struct volume_norms norms;
-	double begin;
+	struct sart_sums sums;
+	struct moment begin;
 
+	memset(ret, 0, TIMED * sizeof(*ret));
 	if (first) {
-		time_fdk(bench, &ret[FILTER], &ret[BACKPROJECTION]);
-		ret[FDK] = ret[FILTER] + ret[BACKPROJECTION];
+		time_fdk(bench, ret);
 		begin = now();
 		must(backend_cpu.project(bench->plan, bench->volume, bench->views, VIEWS, bench->projected, &err));
-		ret[FORWARD] = now() - begin;
+		add_since(begin, &ret[FORWARD]);
 		begin = now();
 		must(backend_cpu.norms(bench->plan, bench->volume, bench->other, options->tv->unit, &norms, &err));
-		ret[NORMS] = now() - begin;
+		add_since(begin, &ret[NORMS]);
 	}
-	ret[first ? SIRT : SUBSETS] = time_sart(bench);
-	ret[first ? TV_STEPS : TV_MINIMUM] = time_tv(bench);
+	begin = now();
+	must(backend_cpu.sart_iterate(bench->plan, bench->projections, bench->volume, NULL, &sums, &err));
+	add_since(begin, &ret[first ? SIRT : SUBSETS]);
+	begin = now();
+	must(backend_cpu.tv(bench->plan, bench->volume, NULL, &err));
+	add_since(begin, &ret[first ? TV_STEPS : TV_MINIMUM]);
+}
+
+static struct moment median_of(struct moment seconds[][TIMED], int repeats, int what)
+{
+	double wall[REPEATS_MOST], processor[REPEATS_MOST];
+
+	for (int i = 0; i < repeats; i++) {
+		wall[i] = seconds[i][what].wall;
+		processor[i] = seconds[i][what].processor;
+	}
+	qsort(wall, (size_t)repeats, sizeof(double), ascending);
+	qsort(processor, (size_t)repeats, sizeof(double), ascending);
+	return (struct moment){wall[repeats / 2], processor[repeats / 2]};
 }
 
 static void run_plan(const struct plan_options *options, int repeats, struct timing *ret)
@@ -197,7 +219,7 @@ static void run_plan(const struct plan_options *options, int repeats, struct tim
 	const struct device_options device_options = {0};
 	struct bench bench;
 	struct device_info info;
-	double seconds[REPEATS_MOST][TIMED], sorted[REPEATS_MOST];
+	struct moment seconds[REPEATS_MOST][TIMED], median;
 	float *view = room(sizeof(float) * PIXELS * PIXELS);
 	size_t defects = 0;
 
@@ -217,12 +239,9 @@ static void run_plan(const struct plan_options *options, int repeats, struct tim
 	for (int i = -1; i < repeats; i++) /* the first to warm up */
 		run_once(&bench, options, seconds[i < 0 ? 0 : i]);
 	for (int what = 0; what < TIMED; what++) {
-		for (int i = 0; i < repeats; i++)
-			sorted[i] = seconds[i][what];
-		qsort(sorted, (size_t)repeats, sizeof(double), ascending);
-		if (options->tv->method == TV_GRADIENT ? what != SUBSETS && what != TV_MINIMUM
-						       : what == SUBSETS || what == TV_MINIMUM)
-			ret->median[what] = sorted[repeats / 2];
+		median = median_of(seconds, repeats, what);
+		if (median.wall > 0) /* the other plan measures the others */
+			ret->median[what] = median;
 	}
 	backend_cpu.describe(bench.device, &info);
 	snprintf(ret->device, sizeof(ret->device), "%s", info.name);
@@ -322,15 +341,15 @@ static double peak_of(enum tv_method method)
 static void print_timing(const char *title, const struct timing *timing)
 {
 	printf("\n%s: %s, plan: %s\n", title, timing->device, timing->plan);
-	printf("  %-30s %9s %9s %22s\n", "", "seconds", "goal", "plastimatch 1.9.4");
+	printf("  %-30s %9s %9s %9s %22s\n", "", "seconds", "processor", "goal", "plastimatch 1.9.4");
 	for (int i = 0; i < TIMED; i++) {
-		printf("  %-30s %9.3f", rows[i].name, timing->median[i]);
+		printf("  %-30s %9.3f %9.3f", rows[i].name, timing->median[i].wall, timing->median[i].processor);
 		if (rows[i].goal > 0)
 			printf(" %9.1f", rows[i].goal);
 		else
 			printf(" %9s", "");
 		if (rows[i].plastimatch > 0)
-			printf(" %14.1f (x %4.1f)", rows[i].plastimatch, rows[i].plastimatch / timing->median[i]);
+			printf(" %14.1f (x %4.1f)", rows[i].plastimatch, rows[i].plastimatch / timing->median[i].wall);
 		printf("\n");
 	}
 }
@@ -339,8 +358,11 @@ static void write_timing(FILE *file, const char *key, const struct timing *timin
 {
 	fprintf(file, "  \"%s\": { \"plan\": \"%s\"", key, timing->plan);
 	for (int i = 0; i < TIMED; i++)
-		fprintf(file, ", \"%s\": %.4f", rows[i].key, timing->median[i]);
-	fprintf(file, " },\n");
+		fprintf(file, ", \"%s\": %.4f", rows[i].key, timing->median[i].wall);
+	fprintf(file, ", \"processor\": {");
+	for (int i = 0; i < TIMED; i++)
+		fprintf(file, "%s\"%s\": %.4f", i > 0 ? ", " : " ", rows[i].key, timing->median[i].processor);
+	fprintf(file, " } },\n");
 }
 
 int main(int argc, char **argv)

@@ -30,7 +30,7 @@ if command -v plastimatch >/dev/null 2>&1; then
 	work=$(mktemp -d)
 	trap 'rm -rf "$work"' EXIT
 	plastimatch synth --pattern sphere --radius 40 --foreground 100 --background -1000 --dim "256 256 256" \
-		--spacing ".3725 .3725 .3725" --output "$work/ball.mha" >/dev/null
+		--spacing ".3725 .3725 .3725" --origin "-47.49375 -47.49375 -47.49375" --output "$work/ball.mha" >/dev/null
 	forward=$(seconds plastimatch drr --algorithm exact --num-angles 100 --gantry-angle-spacing 3.6 \
 		--dim "559 559" --detector-size "295.711 295.711" --sad 620 --sid 1100 --output-format pfm \
 		--output "$work/view" --input "$work/ball.mha")
