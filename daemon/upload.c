@@ -877,6 +877,17 @@ static int sync_batch(struct uploads *uploads, struct slot *const slots[], int c
 	return 0;
 }
 
+/* Another file's sync failed meanwhile: the disk is no longer trusted with anything. */
+static int check_trust(struct uploads *uploads, struct error *err)
+{
+	bool failed;
+
+	pthread_mutex_lock(&uploads->lock);
+	failed = uploads->failed;
+	pthread_mutex_unlock(&uploads->lock);
+	return failed ? error_set(err, ERR_IO, "a sync has failed before; nothing more is stored") : 0;
+}
+
 static void received_set(struct received_projection *received, const struct upload *upload, int index,
 			 const uint8_t sha256[32])
 {
@@ -918,6 +929,8 @@ static int commit(struct uploads *uploads, struct slot *const slots[], int count
 	int total = 0, at = 0, code;
 
 	code = sync_batch(uploads, slots, count, err);
+	if (code == 0)
+		code = check_trust(uploads, err);
 	if (code == 0)
 		code = gather(slots, count, &batch, &total, err);
 	if (code == 0)
