@@ -1,5 +1,4 @@
 /* /v1/scans/{}/projections, flat, dark */
-#include <errno.h>
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -9,6 +8,7 @@
 #include "daemon/api.h"
 #include "daemon/http_text.h"
 #include "daemon/picture.h"
+#include "proto/spool.h"
 
 /* ---- in ---- */
 
@@ -131,20 +131,6 @@ static int open_projection(struct stored_scan *scan, int index, int *ret_descrip
 	return stored_scan_open(scan, false, ret_descriptor, err);
 }
 
-static int read_whole(int descriptor, off_t offset, void *to, size_t size, struct error *err)
-{
-	for (size_t done = 0; done < size;) {
-		ssize_t got = pread(descriptor, (char *)to + done, size - done, offset + (off_t)done);
-
-		if (got < 0 && errno == EINTR)
-			continue;
-		if (got <= 0)
-			return error_set_errno(err, got < 0 ? errno : EIO, "read a projection");
-		done += (size_t)got;
-	}
-	return 0;
-}
-
 /* Samples as float, the smallest finite one black, the largest white. */
 static int draw(const void *samples, const struct scan *scan, char **ret_png, size_t *ret_length, struct error *err)
 {
@@ -187,7 +173,7 @@ static int reply_picture(struct request *request, const struct scan *scan, int d
 	samples = malloc(size);
 	if (samples == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a picture");
-	code = read_whole(descriptor, (off_t)index * (off_t)size, samples, size, err);
+	code = file_read_at(descriptor, samples, size, (size_t)index * size, "a projection", err);
 	if (code == 0)
 		code = draw(samples, scan, &png, &length, err);
 	if (code == 0)
