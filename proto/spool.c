@@ -516,8 +516,13 @@ static int resume(struct run *run, struct recon *recon, const char *path, int ex
 
 	if (file < 0)
 		return error_set_errno(err, errno, "%s cannot be opened", path);
-	if (fstat(file, &status) == 0 && status.st_size > 0)
+	if (fstat(file, &status) == 0) {
+		if (status.st_size == 0) { /* nothing can be mapped; damaged like any other of a wrong size */
+			code = error_set(err, ERR_INVALID, "%.200s is empty", path);
+			goto out;
+		}
 		bytes = mmap(NULL, (size_t)status.st_size, PROT_READ, MAP_PRIVATE, file, 0);
+	}
 	if (bytes == MAP_FAILED) {
 		code = error_set(err, ERR_IO, "%.200s cannot be mapped", path);
 		goto out;
