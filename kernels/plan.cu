@@ -224,6 +224,31 @@ static struct plan_shape shape_of(const struct plan_options *options, bool lean)
 
 /* ---- what memory ---- */
 
+static bool needs_arrays_forward(const struct plan *plan)
+{
+	return plan->shape.textures && plan->shape.forward_rows == 0;
+}
+static bool needs_arrays_back(const struct plan *plan)
+{
+	return plan->shape.textures && plan->shape.back_voxels == 0;
+}
+static size_t pairs_bytes(const struct plan *plan, int views)
+{
+	struct pairs_shape pairs = pairs_shape_make(plan->stack.columns, plan->stack.rows);
+
+	return (pairs.slot * (size_t)views + 2 * pairs.before) * sizeof(float2);
+}
+
+/* Views of a batch that is laid out anew for the backprojection. */
+static int views_laid_out(const struct plan *plan)
+{
+	int views = plan->shape.batch;
+
+	/* Pairs take twice a stack's room: a batch must do. Arrays take all of a subset, to need no sums aside. */
+	if (plan->shape.back_voxels == 0 && plan->shape.correction > views)
+		views = plan->shape.correction;
+	return at_most(views, plan->shape.views_at_once);
+}
 static void plan_describe(struct plan *plan, const struct plan_options *options, bool lean)
 {
 	const struct geometry *geometry = options->geometry;
@@ -249,6 +274,8 @@ static void plan_describe(struct plan *plan, const struct plan_options *options,
 		plan->partial_count = sweep_partials(plan);
 	else if (plan->shape.by_subset)
 		plan->partial_count = subsets_partials(plan);
+	if (plan->shape.back_voxels > 0 || needs_arrays_back(plan))
+		plan->shape.views_at_once = views_laid_out(plan);
 	plan->raw_views = 1;
 	plan->bytes.raw =
 	    (size_t)geometry->columns * (size_t)geometry->rows * (options->linearise.sample == SAMPLE_UINT16 ? 2 : 4);
@@ -258,29 +285,6 @@ static void plan_describe(struct plan *plan, const struct plan_options *options,
 		plan->raw_views = geometry->count;
 }
 
-static bool needs_arrays_forward(const struct plan *plan)
-{
-	return plan->shape.textures && plan->shape.forward_rows == 0;
-}
-static bool needs_arrays_back(const struct plan *plan)
-{
-	return plan->shape.textures && plan->shape.back_voxels == 0;
-}
-static size_t pairs_bytes(const struct plan *plan, int views)
-{
-	struct pairs_shape pairs = pairs_shape_make(plan->stack.columns, plan->stack.rows);
-
-	return (pairs.slot * (size_t)views + 2 * pairs.before) * sizeof(float2);
-}
-
-/* Views of a batch that is laid out anew for the backprojection. */
-static int views_laid_out(const struct plan *plan)
-{
-	int subset = plan->shape.correction, batch = plan->shape.batch;
-	int views = subset > batch ? subset : batch;
-
-	return views < plan->shape.views_at_once ? views : plan->shape.views_at_once;
-}
 static bool needs_coverage(const struct plan *plan)
 {
 	return plan->shape.by_subset && !plan->shape.covered;
@@ -487,12 +491,10 @@ static int prepare_arrays(struct plan *plan, struct error *err)
 		TRY(layered_new(plan->device, size[0], size[2], size[1], cudaAddressModeClamp, &plan->slices[1], err));
 	}
 	if (plan->shape.back_voxels > 0) {
-		plan->shape.views_at_once = views_laid_out(plan);
 		plan->pairs_bytes = pairs_bytes(plan, plan->shape.views_at_once);
 		TRY(device_allocate(plan->device, plan->pairs_bytes, (void **)&plan->pairs, err));
 	}
 	if (needs_arrays_back(plan)) {
-		plan->shape.views_at_once = views_laid_out(plan);
 		TRY(layered_new(plan->device, plan->stack.columns, plan->stack.rows, plan->shape.views_at_once,
 				cudaAddressModeBorder, &plan->projections, err));
 	}
