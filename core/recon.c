@@ -321,7 +321,7 @@ static void warn_of_the_input(struct recon *recon)
 		snprintf(detail, sizeof(detail),
 			 "FDK of an arc of %.1f degrees; a complete one has 180 degrees and the fan of %.1f degrees",
 			 recon->orbit.arc * degrees, recon->orbit.fan * degrees);
-		recon->hooks->warning(recon->hooks->context, "short_arc", detail);
+		recon->hooks->warning(recon->hooks->context, "arc_too_short", detail);
 	}
 }
 

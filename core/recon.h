@@ -45,7 +45,8 @@ enum { ITERATIONS_MAX = 100000, GRID_DEFAULT_MOST = 512 };
 void recipe_defaults(struct recipe *ret_recipe); /* nothing on; the values that `{}` stages take */
 void recipe_clear(struct recipe *recipe);
 int recipe_copy(struct recipe *ret_recipe, const struct recipe *recipe, struct error *err);
-/* Pointers are those of the job's JSON, "/grid/size/0", "/sart/subsets"; ERR_IMPOSSIBLE for all that is out of range. */
+/* Pointers are those of the job's JSON, "/grid/size/0", "/sart/subsets"; ERR_IMPOSSIBLE for all that is out of range.
+ */
 int recipe_check(const struct recipe *recipe, const struct geometry *geometry, struct error *err);
 /*
  * Writes out what was left open: the grid (orbit_default_grid, at most
@@ -53,15 +54,15 @@ int recipe_check(const struct recipe *recipe, const struct geometry *geometry, s
  * mu_water / 1000; then checks. A resolved recipe stays as it is.
  */
 int recipe_resolve(struct recipe *recipe, const struct geometry *geometry, const struct orbit *orbit,
-                   struct error *err);
+		   struct error *err);
 
 /* Always finite. */
 struct history_row {
 	int iteration;
 	double residual; /* ||p - A v|| / ||p||, each view's as it was met; 0 where all of it is zero */
-	double change;   /* ||v - v_before|| / ||v_before|| over the iteration, TV included; 1 where v_before was zero */
-	double tv;       /* sum |grad u| of the volume in gray levels */
-	double seconds;  /* that the iteration took */
+	double change;  /* ||v - v_before|| / ||v_before|| over the iteration, TV included; 1 where v_before was zero */
+	double tv;      /* sum |grad u| of the volume in gray levels */
+	double seconds; /* that the iteration took */
 };
 
 enum stage { STAGE_LOAD, STAGE_FDK, STAGE_SART, STAGE_TV, STAGE_SAVE, STAGE_COUNT };
@@ -93,7 +94,7 @@ struct recon_hooks {
 	 * comes as "final", and before that under its own name where the recipe asks for that too.
 	 */
 	int (*keep)(void *context, struct recon *recon, const struct kept_volume *volume, struct error *err);
-	/* "defects": samples were replaced; "short_arc": FDK of less than 180 degrees plus the fan. */
+	/* "defects": samples were replaced; "arc_too_short": FDK of less than 180 degrees plus the fan. */
 	void (*warning)(void *context, const char *code, const char *detail);
 }; /* any of them may be NULL */
 
@@ -108,7 +109,7 @@ struct recon_memory {
  * opens none): available is 0.
  */
 int recon_memory(const struct backend *backend, struct device *device, const struct geometry *geometry,
-                 const struct recipe *recipe, struct recon_memory *ret_memory, struct error *err);
+		 const struct recipe *recipe, struct recon_memory *ret_memory, struct error *err);
 
 /*
  * geometry, linearise's images, hooks, backend and device are borrowed until
@@ -116,8 +117,8 @@ int recon_memory(const struct backend *backend, struct device *device, const str
  * ERR_NO_MEMORY what does not fit, then allocates.
  */
 int recon_open(const struct backend *backend, struct device *device, const struct geometry *geometry,
-               const struct linearise *linearise, const struct recipe *recipe, const struct recon_hooks *hooks,
-               struct recon **ret_recon, struct error *err);
+	       const struct linearise *linearise, const struct recipe *recipe, const struct recon_hooks *hooks,
+	       struct recon **ret_recon, struct error *err);
 void recon_free(struct recon *recon);
 
 /*

@@ -706,7 +706,7 @@ START_TEST(an_arc_that_is_too_short_for_fdk_is_told)
 	ck_assert_str_eq(sart.warnings, "");
 	recipe.fdk.on = true;
 	run(&scene, &recipe, &outcome);
-	ck_assert_ptr_nonnull(strstr(outcome.warnings, "short_arc: "));
+	ck_assert_ptr_nonnull(strstr(outcome.warnings, "arc_too_short: "));
 	ck_assert_ptr_nonnull(strstr(outcome.warnings, "170.0 degrees"));
 	outcome_clear(&outcome);
 	outcome_clear(&sart);
