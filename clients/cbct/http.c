@@ -143,6 +143,17 @@ double member_number(const cJSON *object, const char *name, double fallback)
 	return cJSON_IsNumber(member) ? member->valuedouble : fallback;
 }
 
+int document_print(const cJSON *document, struct error *err)
+{
+	char *text = json_print(document, NULL);
+
+	if (text == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a document");
+	puts(text);
+	free(text);
+	return 0;
+}
+
 static int status_error(int status)
 {
 	switch (status) {

@@ -40,8 +40,7 @@ struct http_reply {
 	int status; /* 0: none came */
 	char *body; /* ends with a zero byte beyond its length; "" when `write` took it */
 	size_t length;
-	int retry_after; /* s, 0 without */
-	char name[128];  /* file name of Content-Disposition, "" without */
+	char name[128]; /* file name of Content-Disposition, "" without */
 };
 
 /*
@@ -70,5 +69,7 @@ int http_post(struct http *http, const char *path, const cJSON *document, const 
 /* Members of documents that come from a daemon: absent or of another type gives the fallback. */
 const char *member_text(const cJSON *object, const char *name, const char *fallback);
 double member_number(const cJSON *object, const char *name, double fallback);
+/* A document as one line on standard output. */
+int document_print(const cJSON *document, struct error *err);
 
 #endif

@@ -1,10 +1,6 @@
 /* cbct scans, jobs, status, rm: what the daemon knows, a line each. */
-#include <stdlib.h>
-#include <string.h>
-
 #include "clients/cbct/commands.h"
 #include "clients/cbct/http.h"
-#include "proto/json.h"
 
 struct list_options {
 	const char *id;
@@ -53,17 +49,6 @@ static int fetch(const struct list_options *options, const char *method, const c
 	return code;
 }
 
-static int print_document(const cJSON *document, struct error *err)
-{
-	char *text = json_print(document, NULL);
-
-	if (text == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for a document");
-	puts(text);
-	free(text);
-	return 0;
-}
-
 static void print_scan(const cJSON *scan)
 {
 	const cJSON *projections = cJSON_GetObjectItemCaseSensitive(scan, "projections");
@@ -94,7 +79,7 @@ static int list(const struct list_options *options, const char *path, const char
 	int code = fetch(options, "GET", path, &document, err);
 
 	if (code == 0 && options->json) {
-		code = print_document(document, err);
+		code = document_print(document, err);
 	} else if (code == 0) {
 		cJSON_ArrayForEach(entry, cJSON_GetObjectItemCaseSensitive(document, name)) print(entry);
 	}

@@ -1,13 +1,10 @@
 /* cbct submit: a job, from a document, from options, or from both. */
 #include <stdint.h>
-#include <stdlib.h>
-#include <string.h>
 #include <sys/random.h>
 
 #include "clients/cbct/commands.h"
 #include "clients/cbct/recipe_options.h"
 #include "clients/cbct/watch.h"
-#include "proto/json.h"
 
 struct submit_options {
 	const char *scan, *recipe;
@@ -45,17 +42,6 @@ static int post(struct http *http, const cJSON *document, cJSON **ret_job, struc
 	return code;
 }
 
-static int print_document(const cJSON *document, struct error *err)
-{
-	char *text = json_print(document, NULL);
-
-	if (text == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for a job document");
-	puts(text);
-	free(text);
-	return 0;
-}
-
 static int submit(const struct submit_options *options, const cJSON *document, struct error *err)
 {
 	struct http *http = NULL;
@@ -85,7 +71,7 @@ static int submit_run(const void *values, struct error *err)
 	int code = recipe_document(&options->pipeline, options->recipe, options->scan, &document, err);
 
 	if (code == 0)
-		code = options->print ? print_document(document, err) : submit(options, document, err);
+		code = options->print ? document_print(document, err) : submit(options, document, err);
 	cJSON_Delete(document);
 	return code;
 }
