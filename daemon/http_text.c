@@ -221,11 +221,11 @@ bool index_parse(const char *text, size_t length, long most, long *ret)
 	if (length == 0)
 		return false;
 	for (size_t i = 0; i < length; i++) {
-		if (!isdigit((unsigned char)text[i]))
+		int digit = text[i] - '0';
+
+		if (!isdigit((unsigned char)text[i]) || value > most / 10 || value * 10 > most - digit)
 			return false;
-		value = value * 10 + (text[i] - '0');
-		if (value > most)
-			return false;
+		value = value * 10 + digit;
 	}
 	*ret = value;
 	return true;

@@ -87,7 +87,7 @@ test_positions_that_cannot_be_are_refused() {
 	uploaded_scan
 	post_job "{\"scan\": \"SCAN\", $grid, \"fdk\": {}}"
 	wait_job succeeded
-	for position in 999999 -1 x 1.5 99999999999999999999; do
+	for position in 999999 -1 x 1.5 10000000000000000000 99999999999999999999; do
 		req GET "/v1/jobs/$job/events" -H "Last-Event-ID: $position"
 		expect_problem 400
 		expect_json '.detail | contains("Last-Event-ID")'
