@@ -185,10 +185,13 @@ struct backend {
 	int (*backproject)(struct plan *plan, const struct stack *from, const int *views, int count,
 			   enum backprojection weight, struct volume *to, struct error *err);
 	/*
-	 * Slot i = line integrals of the volume along the rays of views[i]: Joseph's
-	 * method, one bilinear sample in every slice of the ray's dominant axis
-	 * between entry and exit, times the step's length in mm. The object ends half
-	 * a voxel beyond the outer centres in every direction, values there held.
+	 * Slot i = line integrals of the volume's linear interpolation along the rays
+	 * of views[i]: slice by slice of the ray's dominant axis between entry and exit,
+	 * each with its bilinear interpolation averaged over the way between the two
+	 * slices beside it (weight 1 - |s|; exactly so along b, the first of the other
+	 * two axes, and as at the slice itself along the last one, where a C-arm's rays
+	 * hardly rise), times the step's length in mm. The object ends half a voxel
+	 * beyond the outer centres in every direction, values there held.
 	 * Dominant is the axis along which the ray passes the most voxels (x before y
 	 * before z where equal). A slice stands for half a voxel to either side of its
 	 * centres; the first and last count with the part that lies between entry and

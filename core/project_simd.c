@@ -1,10 +1,26 @@
 /*
- * Line integrals by Joseph's method (IEEE Trans. Med. Imaging 1, 1982): along
- * the axis on which the ray advances fastest, counted in voxels, one bilinear
- * sample in every slice. The object ends half a voxel beyond the outer centres,
- * with the outer values held there. The first and last slices count with the
- * part of them that lies between the ray's entry and exit, so that the weights
- * of a ray add up to its length inside the grid.
+ * Line integrals of the voxels' linear interpolation, slice by slice along the
+ * axis a on which the ray advances fastest, counted in voxels.
+ *
+ * Joseph's method (IEEE Trans. Med. Imaging 1, 1982) takes one bilinear sample
+ * in every slice, V(b, c) where the ray crosses it. But between the slices before
+ * and behind, where this one counts with 1 - |s| at s slices from it, the ray
+ * wanders by slope s along b. Linear interpolation differs from a straight line at
+ * the voxels k only, so that what the slice has a part in is
+ *
+ *   int (1 - |s|) V(b + slope s, c) ds
+ *       = V(b, c) + sum_k kink(b - k) (V(k + 1, c) - 2 V(k, c) + V(k - 1, c)),
+ *   kink(y) = |slope|/6 (1 - |y|/|slope|)^3 for |y| < |slope|, else 0.
+ *
+ * |slope| <= 1, so only the two voxels beside the ray have a kink that counts.
+ * Without them a projection of sharp edges is off by 0.3 %, which SART turns into
+ * 5 % of the volume. The same along c, where a C-arm's rays hardly rise, would
+ * change next to nothing.
+ *
+ * The object ends half a voxel beyond the outer centres, with the outer values
+ * held there. The first and last slices count with the part of them that lies
+ * between the ray's entry and exit, so that the weights of a ray add up to its
+ * length inside the grid.
  */
 #include "core/cpu.h"
 #include "core/simd.h"
@@ -20,7 +36,8 @@ struct rays {
 
 static const int others[3][2] = {{1, 2}, {0, 2}, {0, 1}};
 
-/* Clips the ray to the grid: source + t direction, from t = *enter to *leave. */
+/* Clips the ray to the grid: source + t direction, from t = *enter to *leave.
+ */
 static void ray_clip(const struct plan *plan, const double source[3], const double direction[3], double *ret_enter,
 		     double *ret_leave)
 {
@@ -101,14 +118,24 @@ static bool rays_select(const struct rays *rays, int axis, struct rays *ret)
 }
 
 /* Index of the lower of two neighbours and the weight of the upper one, held at the ends of 0 .. size - 1. */
-static inline vi neighbours(vf position, int size, vf *ret_upper)
+static inline vf neighbours(vf position, int size, vf *ret_upper)
 {
 	vf at = vf_clamp(position, vf_all(0), vf_all((float)(size - 1)));
 	vf low = vf_min(vf_floor(at), vf_all((float)(size > 1 ? size - 2 : 0)));
 
 	*ret_upper = at - low;
-	return vi_from(low);
+	return low;
 }
+
+/* kink(y) above, for slope = |b_slope| and its inverse. */
+static inline vf kink(vf y, vf slope, vf inverse)
+{
+	vf part = vf_max(1 - vf_max(y, -y) * inverse, vf_all(0));
+
+	return slope * (1 / 6.f) * part * part * part;
+}
+
+static const float SLOPE_LEAST = 1e-6f; /* below that there is no wandering, and its inverse stays finite */
 
 struct axes {
 	int slices, b_size, c_size;
@@ -116,14 +143,31 @@ struct axes {
 	int c_stride;           /* 1, then pairs are gathered; or any */
 };
 
+/* Bilinear along c only, in the row of voxels that starts at `from`. */
+static inline vf sample_row(const float *from, vi index, vf fc, int c_next, bool pairs)
+{
+	vf lower, upper;
+
+	if (pairs) {
+		vf_gather_pair(from, index, &lower, &upper);
+	} else {
+		lower = vf_gather(from, index);
+		upper = vf_gather(from + c_next, index);
+	}
+	return vf_fma(fc, upper - lower, lower);
+}
+
 /* Sum over the slices of weight * sample; per lane. */
 static inline vf march(const struct rays *rays, const struct axes *axes, const float *volume)
 {
 	const vf begin = vf_load(rays->begin), end = vf_load(rays->end);
 	const vf b0 = vf_load(rays->b), c0 = vf_load(rays->c);
 	const vf b_slope = vf_load(rays->b_slope), c_slope = vf_load(rays->c_slope);
-	const int b_next = axes->b_size > 1 ? (int)axes->b_stride : 0;
+	const vf slope = vf_max(b_slope, -b_slope), inverse = 1 / vf_max(slope, vf_all(SLOPE_LEAST));
+	const vf b_last = vf_all((float)(axes->b_size - 1));
+	const vi b_stride = vi_all((int)axes->b_stride);
 	const int c_next = axes->c_size > 1 ? axes->c_stride : 0;
+	const bool pairs = axes->c_stride == 1;
 	int first = (int)floorf(vf_lowest(begin) + .5f), last = (int)ceilf(vf_highest(end) - .5f);
 	vf sum = vf_all(0);
 
@@ -132,26 +176,24 @@ static inline vf march(const struct rays *rays, const struct axes *axes, const f
 	for (int i = first; i <= last; i++) {
 		const float along = (float)(i - axes->slices / 2);
 		vf weight = vf_min(vf_all((float)i + .5f), end) - vf_max(vf_all((float)i - .5f), begin);
-		vf fb, fc, v00, v01, v10, v11;
-		vi b = neighbours(b0 + along * b_slope, axes->b_size, &fb);
-		vi c = neighbours(c0 + along * c_slope, axes->c_size, &fc);
-		const float *slice = volume + (size_t)i * axes->slice + (size_t)b[0] * axes->b_stride +
-				     (size_t)c[0] * (size_t)axes->c_stride;
-		vi index = (b - b[0]) * (int)axes->b_stride + (c - c[0]) * axes->c_stride;
+		vf position = b0 + along * b_slope, fb, fc;
+		vf b = neighbours(position, axes->b_size, &fb), c = neighbours(c0 + along * c_slope, axes->c_size, &fc);
+		vf kink0 = kink(position - b, slope, inverse), kink1 = kink(position - b - 1, slope, inverse);
+		/* The four voxels across; indices count from the first lane's, so that they stay small. */
+		const int b_first = (int)b[0], c_first = (int)c[0];
+		const float *slice = volume + (size_t)i * axes->slice + (size_t)b_first * axes->b_stride +
+				     (size_t)c_first * (size_t)axes->c_stride;
+		const vi along_c = (vi_from(c) - c_first) * axes->c_stride;
+		const vi at1 = (vi_from(b) - b_first) * b_stride + along_c;
+		const vi at0 = (vi_from(vf_max(b - 1, vf_all(0))) - b_first) * b_stride + along_c;
+		const vi at2 = (vi_from(vf_min(b + 1, b_last)) - b_first) * b_stride + along_c;
+		const vi at3 = (vi_from(vf_min(b + 2, b_last)) - b_first) * b_stride + along_c;
+		vf v0 = sample_row(slice, at0, fc, c_next, pairs), v1 = sample_row(slice, at1, fc, c_next, pairs);
+		vf v2 = sample_row(slice, at2, fc, c_next, pairs), v3 = sample_row(slice, at3, fc, c_next, pairs);
+		vf rise = v2 - v1;
 
-		if (axes->c_stride == 1) {
-			vf_gather_pair(slice, index, &v00, &v01);
-			vf_gather_pair(slice + b_next, index, &v10, &v11);
-		} else {
-			v00 = vf_gather(slice, index);
-			v01 = vf_gather(slice + c_next, index);
-			v10 = vf_gather(slice + b_next, index);
-			v11 = vf_gather(slice + b_next + c_next, index);
-		}
-		v00 += fc * (v01 - v00);
-		v10 += fc * (v11 - v10);
-		v00 += fb * (v10 - v00);
-		sum += vf_max(weight, vf_all(0)) * v00;
+		v1 += fb * rise + kink0 * (rise - (v1 - v0)) + kink1 * ((v3 - v2) - rise);
+		sum += vf_max(weight, vf_all(0)) * v1;
 	}
 	return sum;
 }
@@ -216,9 +258,9 @@ static void project_general(const struct plan *plan, int view_index, int column,
 /*
  * ---- untilted ----
  * All rays to one column of the detector cross a slice in one line along z, at
- * evenly spaced heights. So the two columns of voxels on either side of that line
- * are blended once, and every LANES rows look up theirs in a window of 2 LANES
- * voxels of the blend.
+ * evenly spaced heights. So the four columns of voxels beside that line, b being
+ * across z, are blended once, and every LANES rows look up theirs in a window of
+ * 2 LANES voxels of the blend.
  */
 enum {
 	GROUPS_MOST = 64, /* groups of LANES rows whose positions are worked out together */
@@ -345,43 +387,65 @@ static bool fan_clip(const struct plan *plan, const struct fan *fan, const struc
 	return first <= last;
 }
 
-/* The two columns of voxels beside the line along z in which slice i is crossed; returns the right one's weight. */
-static float fan_cross(const struct plan *plan, const struct fan *fan, int i, const float *volume,
-		       const float **ret_left, const float **ret_right)
+/* The four columns of voxels beside the line along z in which slice i is crossed, and what each counts for. */
+struct crossing {
+	const float *column[4];
+	float part[4];
+};
+
+static void fan_cross(const struct plan *plan, const struct fan *fan, int i, const float *volume, struct crossing *ret)
 {
 	const size_t strides[2] = {plan->row, plan->plane};
 	const int last = plan->grid.size[fan->b] - 1;
-	const double at = fan->source_b + (i - fan->source_a) * fan->inverse * fan->direction_b;
+	const double slope = fan->inverse * fan->direction_b, wander = fabs(slope);
+	const double at = fan->source_b + (i - fan->source_a) * slope;
 	const double held = at < 0 ? 0 : at > last ? last : at;
 	const int j = (int)held < last ? (int)held : last > 0 ? last - 1 : 0;
+	const double right = held - j;
+	double kinks[2];
 
-	*ret_left = volume + (size_t)i * strides[fan->a] + (size_t)j * strides[fan->b];
-	*ret_right = *ret_left + (last > 0 ? strides[fan->b] : 0);
-	return (float)(held - j);
+	for (int k = 0; k < 2; k++) {
+		double inside = 1 - fabs(at - j - k) / fmax(wander, SLOPE_LEAST);
+
+		kinks[k] = inside > 0 ? wander / 6 * inside * inside * inside : 0;
+	}
+	ret->part[0] = (float)kinks[0];
+	ret->part[1] = (float)(1 - right - 2 * kinks[0] + kinks[1]);
+	ret->part[2] = (float)(right + kinks[0] - 2 * kinks[1]);
+	ret->part[3] = (float)kinks[1];
+	for (int k = 0; k < 4; k++) {
+		int to = j - 1 + k;
+
+		to = to < 0 ? 0 : to > last ? last : to;
+		ret->column[k] = volume + (size_t)i * strides[fan->a] + (size_t)to * strides[fan->b];
+	}
 }
 
 static void fan_prefetch(const struct plan *plan, const struct fan *fan, int i, const float *volume)
 {
-	const float *left, *right;
+	struct crossing crossing;
 
-	fan_cross(plan, fan, i, volume, &left, &right);
-	for (int z = 0; z < plan->grid.size[2]; z += 16) {
-		__builtin_prefetch(left + z);
-		__builtin_prefetch(right + z);
-	}
+	fan_cross(plan, fan, i, volume, &crossing);
+	for (int z = 0; z < plan->grid.size[2]; z += 16)
+		for (int k = 0; k < 4; k++)
+			__builtin_prefetch(crossing.column[k] + z);
 }
 
 /* That line, its ends held for one voxel more. */
 static void fan_blend(const struct plan *plan, const struct fan *fan, int i, const float *volume, float *ret)
 {
 	const int nz = plan->grid.size[2];
-	const float *left, *right;
-	const vf weight = vf_all(fan_cross(plan, fan, i, volume, &left, &right));
+	struct crossing at;
+	vf part[4];
 
+	fan_cross(plan, fan, i, volume, &at);
+	for (int k = 0; k < 4; k++)
+		part[k] = vf_all(at.part[k]);
 	for (int z = 0; z < nz; z += LANES) {
-		vf l = vf_load(left + z);
+		vf inner = vf_fma(part[1], vf_load(at.column[1] + z), part[2] * vf_load(at.column[2] + z));
+		vf outer = vf_fma(part[0], vf_load(at.column[0] + z), part[3] * vf_load(at.column[3] + z));
 
-		vf_store(ret + z, vf_fma(weight, vf_load(right + z) - l, l));
+		vf_store(ret + z, inner + outer);
 	}
 	ret[-1] = ret[0];
 	for (int z = nz; z < nz + LANES; z++)

@@ -41,6 +41,39 @@ static double slice_sample(const struct grid *grid, const float *volume, int a, 
 	return sum;
 }
 
+/*
+ * The slice's part in the linear interpolation between slices: s from -1 to 1
+ * slices away it counts with 1 - |s|, and at[b] has moved by slope s. Between
+ * voxels that is a polynomial of the second degree, for which Simpson's rule is exact.
+ */
+static double slab_sample(const struct grid *grid, const float *volume, int a, int i, const double at[3], double slope)
+{
+	const int b = a == 0 ? 1 : 0;
+	double cut[8] = {-1, 0, 1}, sum = 0;
+	int cuts = 3;
+
+	for (double k = ceil(at[b] - fabs(slope)); k <= at[b] + fabs(slope) && slope != 0 && cuts < 8; k++)
+		if (fabs((k - at[b]) / slope) < 1)
+			cut[cuts++] = (k - at[b]) / slope;
+	for (int m = 1; m < cuts; m++)
+		for (int n = m; n > 0 && cut[n] < cut[n - 1]; n--) {
+			double higher = cut[n - 1];
+
+			cut[n - 1] = cut[n];
+			cut[n] = higher;
+		}
+	for (int m = 1; m < cuts; m++)
+		for (int k = 0; k < 3; k++) {
+			double s = cut[m - 1] + 0.5 * k * (cut[m] - cut[m - 1]);
+			double moved[3] = {at[0], at[1], at[2]};
+
+			moved[b] += slope * s;
+			sum += (cut[m] - cut[m - 1]) / 6 * (k == 1 ? 4 : 1) * (1 - fabs(s)) *
+			       slice_sample(grid, volume, a, i, moved);
+		}
+	return sum;
+}
+
 double reference_ray(const struct geometry *geometry, const struct grid *grid, int view_index, int column, int row,
 		     const float *volume, double *ret_length)
 {
@@ -80,7 +113,7 @@ double reference_ray(const struct geometry *geometry, const struct grid *grid, i
 			continue;
 		for (int k = 0; k < 3; k++)
 			at[k] = s[k] + (i - s[a]) / d[a] * d[k];
-		sum += part * slice_sample(grid, volume, a, i, at);
+		sum += part * slab_sample(grid, volume, a, i, at, d[a == 0 ? 1 : 0] / d[a]);
 	}
 	*ret_length = (end - begin) * sqrt(mm) / fabs(d[a]);
 	return sum * sqrt(mm) / fabs(d[a]);

@@ -495,7 +495,7 @@ static void read_volume(struct rig *rig, float *ret)
 /* Single precision: positions of up to a hundred pixels err by 1e-5 of a pixel, and neighbours differ by up to 1. */
 static const double SINGLE = 3e-5;
 
-START_TEST(project_is_josephs_sum)
+START_TEST(project_integrates_linear_interpolation)
 {
 	struct rig rig;
 	float *volume, *want, *have;
@@ -1514,7 +1514,7 @@ Suite *backend_suite(void)
 	tcase_set_timeout(operations, 60);
 	tcase_set_timeout(known, 60);
 	tcase_set_timeout(rest, 60);
-	tcase_add_loop_test(operations, project_is_josephs_sum, 0, SETUPS);
+	tcase_add_loop_test(operations, project_integrates_linear_interpolation, 0, SETUPS);
 	tcase_add_loop_test(operations, backproject_is_the_bilinear_sum, 0, SETUPS);
 	tcase_add_loop_test(operations, filter_is_the_convolution_of_weighted_rows, 0, SETUPS);
 	tcase_add_test(operations, padded_filter_goes_on_beyond_the_detector);
