@@ -40,7 +40,8 @@ pkg_cflags := $(call pkg,--cflags,$(all_libs))
 override CFLAGS += -std=c11 -D_GNU_SOURCE -I. $(WARN) $(or $(OPENMP),-Wno-unknown-pragmas) -fno-math-errno \
                    -fno-trapping-math -MMD -MP $(pkg_cflags) \
                    $(if $(SANITIZE),-fsanitize=$(SANITIZE) -fno-omit-frame-pointer)
-override LDFLAGS += $(OPENMP) $(if $(SANITIZE),-fsanitize=$(SANITIZE))
+bundle_flags := -Wl,--disable-new-dtags,-rpath,'$$ORIGIN/../lib'
+override LDFLAGS += $(if $(BUNDLE),$(bundle_flags)) $(OPENMP) $(if $(SANITIZE),-fsanitize=$(SANITIZE))
 LIBM := -lm -lpthread
 
 # core/*_simd.c are compiled once for each instruction set; core/cpu.c picks one at run time.
@@ -186,6 +187,16 @@ format: ## clang-format over everything
 install: all ## programs, units and example configuration under $(DESTDIR)$(prefix)
 	install -D -m 755 -t $(DESTDIR)$(prefix)/bin $(programs)
 	install -D -m 644 -t $(DESTDIR)$(prefix)/lib/systemd/system systemd/cbctd.service
+
+# A tarball's programs look for libraries beside them (RPATH, which the libraries inherit); glibc is the system's.
+bundle: ## a tarball that runs on a machine with a driver only
+	@$(MAKE) --no-print-directory BUILD=$(BUILD)/bundled BUNDLE=1 all
+	@set -e; to=$(BUILD)/bundle/cbctd; rm -rf $(BUILD)/bundle; mkdir -p $$to/bin $$to/lib; \
+	for p in $(notdir $(programs)); do cp $(BUILD)/bundled/$$p $$to/bin/; strip $$to/bin/$$p; done; \
+	ldd $$to/bin/* | awk '/=> \// { print $$3 }' | sort -u | \
+	grep -vE '/(libc|libm|libdl|libpthread|librt|libresolv|libcuda)\.so|/ld-linux' | xargs cp -L -t $$to/lib; \
+	cp -r systemd README.md $$to/; tar -C $(BUILD)/bundle -cf - cbctd | zstd -q -T0 -f -o $(BUILD)/cbctd.tar.zst; \
+	ls -l $(BUILD)/cbctd.tar.zst
 
 clean: ## removes build/
 	rm -rf $(BUILD)
