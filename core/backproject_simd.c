@@ -58,45 +58,114 @@ static inline vi neighbours(vf position, int size, int origin, vf *ret_upper)
 	return vi_from(low);
 }
 
+/*
+ * Where LANES voxels of a line fall on the detector, for each group of them in a
+ * tile well inside of it: column and row run one way along a line, so its ends
+ * bound both.
+ */
+enum { GROUPS = TILE_ALONG / LANES };
+struct line_groups {
+	int columns[GROUPS];             /* 2 or 3 neighbouring ones hold all samples; 0: they lie too far apart */
+	int column[GROUPS], row[GROUPS]; /* the lowest, counted from the line's origin */
+};
+
+static void line_groups_set(const struct line *line, int count, struct line_groups *ret)
+{
+	const double margin = 1e-3; /* rows, above what single precision may err: a window has no index -1 */
+
+	for (int g = 0; g * LANES < count; g++) {
+		const int first = g * LANES, last = first + LANES < count ? first + LANES - 1 : count - 1;
+		const double inverse0 = 1 / (line->depth + first * line->depth_step);
+		const double inverse1 = 1 / (line->depth + last * line->depth_step);
+		const double c0 = (line->column + first * line->column_step) * inverse0;
+		const double c1 = (line->column + last * line->column_step) * inverse1;
+		const double r0 = (line->row + first * line->row_step) * inverse0;
+		const double r1 = (line->row + last * line->row_step) * inverse1;
+		const double column = floor(c0 < c1 ? c0 : c1), row = floor((r0 < r1 ? r0 : r1) - margin);
+		const double across = (c0 < c1 ? c1 : c0) - column, along = (r0 < r1 ? r1 : r0) - row + margin;
+
+		ret->column[g] = (int)column;
+		ret->row[g] = (int)row;
+		ret->columns[g] = along >= 2 * LANES - 1 || across >= 2 ? 0 : across < 1 ? 2 : 3;
+	}
+}
+
+/* Bilinear samples at `column` and `row` counted from `pixel`, which see 2 or 3 columns and 2 LANES rows. */
+static inline vf window_samples(const float *pixel, int rows, int columns, vf column, vf row)
+{
+	const vf zero = vf_all(0), one = vf_all(1);
+	const vf left = columns == 2 ? one - column : vf_max(one - column, zero);
+	const vf right = columns == 2 ? zero : vf_max(column - one, zero);
+	const vf weights[3] = {left, columns == 2 ? column : one - left - right, right};
+	vf upper, below = zero, above = zero;
+	vi index = vf_split(row, &upper);
+
+	for (int j = 0; j < columns; j++, pixel += rows) {
+		const vf low = vf_load(pixel), high = vf_load(pixel + LANES);
+
+		below = vf_fma(weights[j], vf_window(low, high, index), below);
+		above = vf_fma(weights[j], vf_window(low, high, index + 1), above);
+	}
+	return vf_fma(upper, above - below, below);
+}
+
+static inline vf gathered_samples(const struct plan *plan, const struct line *line, const float *pixel, vf column,
+				  vf row)
+{
+	const int next = plan->columns > 1 ? plan->rows : 0;
+	vf right, upper, p00, p01, p10, p11;
+	vi c = neighbours(column, plan->columns, line->column_origin, &right);
+	vi r = neighbours(row, plan->rows, line->row_origin, &upper);
+	vi index = c * plan->rows + r;
+
+	vf_gather_pair(pixel, index, &p00, &p01);
+	vf_gather_pair(pixel + next, index, &p10, &p11);
+	p00 = vf_fma(upper, p01 - p00, p00);
+	p10 = vf_fma(upper, p11 - p10, p10);
+	return vf_fma(right, p10 - p00, p00);
+}
+
 static inline void backproject_line(const struct plan *plan, const struct line *line, int count, float distance2,
 				    bool inside, const float *projection, float *sums, float *cover)
 {
 	const vf column0 = vf_all((float)line->column), column_step = vf_all((float)line->column_step);
 	const vf row0 = vf_all((float)line->row), row_step = vf_all((float)line->row_step);
 	const vf depth0 = vf_all((float)line->depth), depth_step = vf_all((float)line->depth_step);
-	const float *pixel = projection;
-	const int next = plan->columns > 1 ? plan->rows : 0;
+	const float *origin = projection;
+	struct line_groups groups;
 
 	if (projection != NULL)
-		pixel += (size_t)line->column_origin * (size_t)plan->rows + (size_t)line->row_origin;
-	for (int i = 0; i < count; i += LANES) {
-		const vf lane = vf_iota() + (float)i;
-		const vf inverse = vf_all(1) / (depth0 + lane * depth_step);
-		const vf column = (column0 + lane * column_step) * inverse;
-		const vf row = (row0 + lane * row_step) * inverse;
-		vf weight = vf_all(1);
+		origin += (size_t)line->column_origin * (size_t)plan->rows + (size_t)line->row_origin;
+	if (inside)
+		line_groups_set(line, count, &groups);
+	for (int g = 0; g * LANES < count; g++) {
+		const size_t at = (size_t)g * LANES;
+		const vf lane = vf_iota() + (float)at;
+		const vf inverse = vf_reciprocal(vf_fma(lane, depth_step, depth0));
+		const vf column = vf_fma(lane, column_step, column0) * inverse;
+		const vf row = vf_fma(lane, row_step, row0) * inverse;
+		vf weight = vf_all(1), sample;
 
 		if (!inside) {
 			weight = cover_of(column, plan->columns, line->column_origin) *
 				 cover_of(row, plan->rows, line->row_origin);
 			if (cover != NULL)
-				vf_store(cover + i, vf_load(cover + i) + weight);
+				vf_store(cover + at, vf_load(cover + at) + weight);
+			if (projection == NULL)
+				continue;
 		}
-		if (projection != NULL) {
-			vf fc, fr, p00, p01, p10, p11;
-			vi c = neighbours(column, plan->columns, line->column_origin, &fc);
-			vi r = neighbours(row, plan->rows, line->row_origin, &fr);
-			vi index = c * plan->rows + r;
+		if (inside && groups.columns[g] > 0) {
+			const vf c = column - (float)groups.column[g], r = row - (float)groups.row[g];
+			const float *pixel = origin + (ptrdiff_t)groups.column[g] * plan->rows + groups.row[g];
 
-			vf_gather_pair(pixel, index, &p00, &p01);
-			vf_gather_pair(pixel + next, index, &p10, &p11);
-			p00 += fr * (p01 - p00);
-			p10 += fr * (p11 - p10);
-			p00 += fc * (p10 - p00);
-			if (distance2 > 0)
-				weight *= distance2 * inverse * inverse;
-			vf_store(sums + i, vf_load(sums + i) + weight * p00);
+			sample = groups.columns[g] == 2 ? window_samples(pixel, plan->rows, 2, c, r)
+							: window_samples(pixel, plan->rows, 3, c, r);
+		} else {
+			sample = gathered_samples(plan, line, origin, column, row);
 		}
+		if (distance2 > 0)
+			weight *= distance2 * inverse * inverse;
+		vf_store(sums + at, vf_fma(weight, sample, vf_load(sums + at)));
 	}
 }
 
@@ -241,7 +310,7 @@ static void backproject_columns(const struct plan *plan, const double m[12], con
 /* True when all eight corners fall well inside of the detector: then all voxels do. */
 static bool tile_inside(const struct plan *plan, const double m[12], const struct tile *tile)
 {
-	const double margin = 1e-3; /* pixels, above what single precision may err */
+	const double margin = 2e-3; /* pixels, above what single precision may err */
 
 	for (int corner = 0; corner < 8; corner++) {
 		double at[3], depth, column, row;

@@ -27,6 +27,7 @@ enum {
 	LANES_MOST = 16,    /* of any instruction set */
 	BLOCK_COLUMNS = 16, /* of a projection that are handed out together */
 	TILE_ACROSS = 4,    /* voxels of a tile across its lines */
+	TILE_ALONG = 512,   /* and at most so many along one */
 	TILE_LINES = TILE_ACROSS * TILE_ACROSS,
 	BLEND_MARGIN = 2 * LANES_MOST, /* floats around a column of voxels in scratch, for windows beyond its ends */
 };

@@ -6,12 +6,6 @@
 
 #include <string.h>
 
-/*
- * At most so many voxels along a line: with TILE_ACROSS, a tile's sums and the
- * pixels that it sees in a view are about what the first level cache holds.
- */
-enum { TILE_ALONG = 512 };
-
 static int parts(int size, int part)
 {
 	return (size + part - 1) / part;

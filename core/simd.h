@@ -101,6 +101,17 @@ static inline vf vf_fma(vf a, vf b, vf c)
 #endif
 }
 
+static inline vf vf_reciprocal(vf a)
+{
+#if defined(SIMD_avx512)
+	vf guess = (vf)_mm512_rcp14_ps((__m512)a);
+
+	return guess + guess * vf_fma(-a, guess, vf_all(1)); /* Newton's step: 14 bits become all */
+#else
+	return vf_all(1) / a;
+#endif
+}
+
 /* Whole and fractional part of what is not negative. */
 static inline vi vf_split(vf v, vf *ret_fraction)
 {
@@ -154,7 +165,7 @@ static inline void vf_gather_pair(const float *from, vi index, vf *ret_a, vf *re
 	*ret_b = (vf)_mm512_permutex2var_ps(first, _mm512_add_epi32(even, _mm512_set1_epi32(1)), last);
 }
 
-/* Looks up each lane's index, 0 .. 2 LANES - 1, in two registers. */
+/* Looks up each lane's index, of which only 0 .. 2 LANES - 1 counts, in two registers. */
 static inline vf vf_window(vf low, vf high, vi index)
 {
 	return (vf)_mm512_permutex2var_ps((__m512)low, (__m512i)index, (__m512)high);
@@ -255,7 +266,7 @@ static inline vf vf_window(vf low, vf high, vi index)
 	vf_store(both, low);
 	vf_store(both + LANES, high);
 	for (int l = 0; l < LANES; l++)
-		v[l] = both[index[l]];
+		v[l] = both[index[l] & (2 * LANES - 1)];
 	return v;
 }
 
