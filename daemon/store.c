@@ -154,6 +154,9 @@ static int connection_error(struct connection *connection, int result, const cha
 		return error_set(err, ERR_NO_MEMORY, "catalogue: %s", text);
 	if (result == SQLITE_CONSTRAINT)
 		return error_set(err, ERR_INTERNAL, "catalogue: %s", text);
+	/* Somebody else holds the catalogue, a backup perhaps: nothing is wrong with the disk. */
+	if (result == SQLITE_BUSY)
+		return error_set(err, ERR_BUSY, "the catalogue is held by another program (%s)", text);
 	if (connection == &store->writer)
 		store_fail(store, text);
 	return error_set(err, ERR_IO, "catalogue: %s", text);

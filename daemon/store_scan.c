@@ -45,6 +45,7 @@ struct stored_scan {
 	int references; /* one of them is the array's */
 	struct scan *parsed;
 	bool recent;
+	bool removed; /* from the array: whoever refers to it now may use its parsed form */
 
 	pthread_mutex_t lock;    /* guards what follows */
 	unsigned char *progress; /* [count], enum progress */
@@ -145,7 +146,7 @@ static void array_remove(struct store *store, const struct stored_scan *scan)
 /* Only the array refers to it and it was not used for a while; scans_lock is held. */
 static void forget_parsed(struct stored_scan *scan)
 {
-	if (scan->references > 1 || scan->recent)
+	if (scan->references > 1 || scan->recent || scan->removed)
 		return;
 	scan_free(scan->parsed);
 	scan->parsed = NULL;
@@ -338,7 +339,7 @@ static int make_files(struct store *store, const struct scan *parsed, const char
 
 	if (code != 0)
 		return code;
-	text = cJSON_PrintUnformatted(parsed->document);
+	text = json_print(parsed->document, NULL);
 	if (text == NULL)
 		return error_set_errno(err, ENOMEM, "scan document");
 	store_scan_directory(store, id, directory);
@@ -461,6 +462,7 @@ int store_scan_delete(struct store *store, struct stored_scan *scan, struct erro
 	pthread_mutex_lock(&store->scans_lock);
 	array_remove(store, scan);
 	forget_recent(store, scan);
+	scan->removed = true;
 	scan->references--; /* the array's; the caller holds another */
 	pthread_mutex_unlock(&store->scans_lock);
 	log_line(LEVEL_INFO, "scan %s removed", scan->id);

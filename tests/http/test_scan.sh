@@ -217,6 +217,27 @@ test_delete() {
 	expect_status 204
 }
 
+test_delete_under_an_upload() {
+	local address=${url#http://} line i
+	new_scan
+	exec 3<>"/dev/tcp/${address%:*}/${address##*:}"
+	printf 'PUT /v1/scans/%s/projections HTTP/1.1\r\nHost: x\r\nContent-Length: %d\r\n\r\n' "$scan" $((one * count)) >&3
+	fill 0100 1 >&3
+	for ((i = 0; i < 200; i++)); do # until the upload is under way
+		req GET "/v1/scans/$scan"
+		[ "$(json .received_count)" = 0 ] || break
+		sleep 0.05
+	done
+	req DELETE "/v1/scans/$scan"
+	expect_status 204
+	fill 0100 $((count - 1)) >&3
+	read -r line <&3
+	exec 3>&-
+	[[ $line == 'HTTP/1.1 404 '* ]] || fail "404, got $line"
+	req GET /livez
+	expect_status 200
+}
+
 test_methods_and_paths() {
 	new_scan
 	req PUT /v1/scans
