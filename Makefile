@@ -142,7 +142,7 @@ demo: setup ## a C-arm scan posted with curl, reconstructed, its volumes coming 
 
 check: setup ## every test; what cannot run here is skipped aloud
 	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/unit
-	@BUILD=$(BUILD) SANITIZED=$(SANITIZED) OMP_WAIT_POLICY=passive tests/run.sh
+	@BUILD=$(BUILD) SANITIZED=$(SANITIZED) LEAVE_OUT="$(LEAVE_OUT)" OMP_WAIT_POLICY=passive tests/run.sh
 
 FUZZ_SECONDS ?= 10
 fuzzers := $(patsubst tests/fuzz/%.c,$(BUILD)/%,$(wildcard tests/fuzz/fuzz_*.c))
@@ -173,10 +173,10 @@ bench-gpu: ## times of the CUDA backend beside their goals, results in build/ben
 	@$(BUILD)/gpu_ceilings | tee $(BUILD)/bench/gpu_ceilings.json
 
 asan: setup ## the tests under the address and undefined-behaviour sanitizers
-	@$(MAKE) --no-print-directory check SANITIZED=1 BUILD=build/asan SANITIZE=address,undefined CUDA=0
+	@$(MAKE) --no-print-directory check SANITIZED=1 LEAVE_OUT=-study BUILD=build/asan SANITIZE=address,undefined CUDA=0
 
 tsan: setup ## the daemon's tests under the thread sanitizer (OpenMP's runtime left out)
-	@$(MAKE) --no-print-directory check SANITIZED=1 BUILD=build/tsan SANITIZE=thread OPENMP= CUDA=0
+	@$(MAKE) --no-print-directory check SANITIZED=1 LEAVE_OUT="-study -recon -backend" BUILD=build/tsan SANITIZE=thread OPENMP= CUDA=0
 
 lint: ## who includes whom, and the house's other rules
 	@tests/lint.sh

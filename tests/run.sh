@@ -30,7 +30,13 @@ fi
 if wanted unit "$@"; then
 	part "unit"
 	log=$BUILD/test/unit.log
-	CK_LOG_FILE_NAME=$BUILD/test/unit.check "$BUILD/unit" 2>&1 | tee "$log"
+	# The study's 50 iterations take half an hour under a sanitizer; LEAVE_OUT names suites (-NAME) that are left out aloud.
+	for suite in ${LEAVE_OUT:-}; do
+		echo "SKIP unit suite ${suite#-}: too slow under a sanitizer"
+		echo "skip unit suite ${suite#-}: too slow under a sanitizer" >>"$results"
+	done
+	# shellcheck disable=SC2086
+	CK_LOG_FILE_NAME=$BUILD/test/unit.check "$BUILD/unit" ${LEAVE_OUT:-} 2>&1 | tee "$log"
 	status=${PIPESTATUS[0]}
 	# check's closing line: "100%: Checks: 42, Failures: 0, Errors: 0"
 	counts=$(grep -oE 'Checks: [0-9]+, Failures: [0-9]+, Errors: [0-9]+' "$log" | tail -1)

@@ -1,5 +1,6 @@
 /*
- * Runs the suites of the table below; `unit NAME ...` runs those named only.
+ * Runs the suites of the table below; `unit NAME ...` runs those named only,
+ * `unit -NAME ...` all but those.
  * CK_FORK=no keeps the tests in one process, for debuggers and sanitizers.
  *
  * A new suite is a file tests/unit/test_NAME.c that exports NAME_suite, and a row.
@@ -12,7 +13,7 @@
 
 #define SUITES(row)                                                                                                    \
 	row(error) row(geometry) row(orbit) row(filter) row(phantom) row(recon) row(study) row(backend) row(json)      \
-	    row(scan) row(recipe) row(format) row(spool) row(message) row(queue) row(store) row(job)
+	    row(scan) row(recipe) row(format) row(slice) row(spool) row(message) row(queue) row(store) row(job)
 
 /* Weak: a row may stand here before its file does. What is missing is said aloud. */
 #define DECLARE(name) Suite *name##_suite(void) __attribute__((weak));
@@ -26,16 +27,22 @@ static const struct {
 
 static bool wanted(const char *name, int count, char **names)
 {
-	for (int i = 0; i < count; i++)
+	bool some = false;
+
+	for (int i = 0; i < count; i++) {
+		if (names[i][0] == '-' && strcmp(name, names[i] + 1) == 0)
+			return false;
 		if (strcmp(name, names[i]) == 0)
 			return true;
-	return count == 0;
+		some = some || names[i][0] != '-';
+	}
+	return !some;
 }
 
 int main(int argc, char **argv)
 {
 	SRunner *runner = srunner_create(NULL);
-	int failed, found = 0;
+	int failed, found = 0, named = 0;
 
 	for (size_t i = 0; i < sizeof(suites) / sizeof(*suites); i++) {
 		if (!wanted(suites[i].name, argc - 1, argv + 1))
@@ -46,7 +53,9 @@ int main(int argc, char **argv)
 		else
 			printf("skipped: suite %s is not linked\n", suites[i].name);
 	}
-	if (found < argc - 1) {
+	for (int i = 1; i < argc; i++)
+		named += argv[i][0] != '-';
+	if (found < named) {
 		fprintf(stderr, "unit: a suite of that name does not exist\n");
 		srunner_free(runner);
 		return EXIT_FAILURE;
