@@ -1,7 +1,7 @@
 /*
  * The API: one row for each endpoint. The schema of record is
- * proto/openapi.yaml; /v1/jobs/{}/stream, /slice, /v1/openapi.json and the web
- * page at / get their rows here when they come.
+ * proto/openapi.yaml; /v1/openapi.json and the web page at / get their rows here
+ * when they come.
  */
 #include "daemon/api.h"
 
@@ -32,5 +32,7 @@ const struct route api_routes[] = {
     {"GET", "/v1/events", all_events, BODY_NONE, 0, NULL, NULL},
     {"GET", "/v1/jobs/{}/volumes", volume_list, BODY_NONE, 0, NULL, NULL},
     {"GET", "/v1/jobs/{}/volumes/{}", volume_get, BODY_NONE, 0, NULL, NULL},
+    {"GET", "/v1/jobs/{}/volumes/{}/slice", slice_get, BODY_NONE, 0, NULL, NULL},
+    {"GET", "/v1/jobs/{}/stream", volume_stream, BODY_NONE, 0, NULL, NULL},
     {NULL, NULL, NULL, BODY_NONE, 0, NULL, NULL},
 };

@@ -1,9 +1,12 @@
 #ifndef CBCT_DAEMON_API_H
 #define CBCT_DAEMON_API_H
 
+#include "daemon/content.h"
 #include "daemon/feed.h"
 #include "daemon/http.h"
 #include "daemon/job.h"
+#include "daemon/mapping.h"
+#include "daemon/rendition.h"
 #include "daemon/store.h"
 #include "daemon/supervise.h"
 #include "daemon/upload.h"
@@ -15,6 +18,8 @@ struct api {
 	struct supervise *supervise;
 	struct uploads *uploads;
 	struct feed *feed;
+	struct mappings *mappings;
+	struct renditions *renditions;
 	struct http *http;
 	double max_wait; /* s */
 	double started;  /* http_now */
@@ -48,6 +53,9 @@ int all_events(void *context, struct request *request, struct error *err);
 
 int volume_list(void *context, struct request *request, struct error *err);
 int volume_get(void *context, struct request *request, struct error *err);
+
+int volume_stream(void *context, struct request *request, struct error *err);
+int slice_get(void *context, struct request *request, struct error *err);
 
 int live_get(void *context, struct request *request, struct error *err);
 int ready_get(void *context, struct request *request, struct error *err);
@@ -85,5 +93,19 @@ struct selection {
 int entity_select(struct request *request, const struct entity *entity, struct selection *ret_selection, bool *ret_done,
 		  struct error *err);
 void entity_headers(struct request *request, const struct entity *entity, const struct selection *selection);
+
+/* ---- what several of them need of volumes: api_volume.c ---- */
+enum { VOLUME_FILENAME_MAX = 96 };
+int volume_find(struct api *api, const struct job_facts *job, const char *name, struct volume_record *ret_volume,
+		struct error *err);
+/* Of the request's path: its job and the volume of it. */
+int volume_asked(struct api *api, struct request *request, struct job_facts *ret_facts,
+		 struct volume_record *ret_volume, struct error *err);
+/* ?format=, ?type= and ?scale=; the name is left to the caller. */
+int volume_options(struct request *request, const struct job_facts *job, struct content_options *ret_options,
+		   struct error *err);
+const char *volume_media_type(const struct content_options *options);
+void volume_filename(const char *job, const char *name, const struct content_options *options,
+		     char ret_name[VOLUME_FILENAME_MAX]);
 
 #endif

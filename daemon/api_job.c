@@ -194,12 +194,24 @@ int job_get(void *context, struct request *request, struct error *err)
 	return wait_end(request, 200, err);
 }
 
+/* Its files are gone; what is still open of them would keep their space. */
+static void forget_files(struct api *api, struct job *job)
+{
+	char directory[1024];
+	struct job_facts facts;
+
+	job_facts(job, &facts);
+	store_job_directory(api->store, facts.id, directory);
+	mappings_forget(api->mappings, directory);
+	renditions_forget(api->renditions, facts.id);
+}
+
 int job_delete(void *context, struct request *request, struct error *err)
 {
 	struct api *api = context;
 	struct job *job;
 	double seconds;
-	bool removed;
+	bool removed = false;
 
 	if (request_state(request) != NULL)
 		return wait_end(request, 202, err);
@@ -207,6 +219,8 @@ int job_delete(void *context, struct request *request, struct error *err)
 	    jobs_find(api->jobs, request_argument(request, 0), &job, err) != 0)
 		return err->code;
 	if (jobs_delete(api->jobs, job, &removed, err) != 0 || removed) {
+		if (removed)
+			forget_files(api, job);
 		job_release(job);
 		return removed ? request_reply_empty(request, 204, err) : err->code;
 	}

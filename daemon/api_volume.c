@@ -33,19 +33,13 @@ int volume_list(void *context, struct request *request, struct error *err)
 	return request_reply_json(request, 200, document, err);
 }
 
-static int find_volume(struct api *api, struct request *request, struct job_facts *ret_facts,
-		       struct volume_record *ret_volume, struct error *err)
+int volume_find(struct api *api, const struct job_facts *job, const char *name, struct volume_record *ret_volume,
+		struct error *err)
 {
-	const char *name = request_argument(request, 1);
 	struct volume_record *volumes;
-	struct job *job;
 	int count, found = -1;
 
-	if (jobs_find(api->jobs, request_argument(request, 0), &job, err) != 0)
-		return err->code;
-	job_facts(job, ret_facts);
-	job_release(job);
-	if (store_job_volumes(api->store, ret_facts->id, &volumes, &count, err) != 0)
+	if (store_job_volumes(api->store, job->id, &volumes, &count, err) != 0)
 		return err->code;
 	for (int i = 0; i < count && found < 0; i++) {
 		if (strcmp(volumes[i].name, name) == 0)
@@ -55,35 +49,80 @@ static int find_volume(struct api *api, struct request *request, struct job_fact
 		*ret_volume = volumes[found];
 	free(volumes);
 	if (found < 0)
-		return error_set(err, ERR_NOT_FOUND, "job %s has no volume \"%.40s\"%s", ret_facts->id, name,
-				 ret_facts->ended ? "" : " yet");
+		return error_set(err, ERR_NOT_FOUND, "job %s has no volume \"%.40s\"%s", job->id, name,
+				 job->ended ? "" : " yet");
 	return 0;
 }
 
-static int read_options(struct request *request, const struct job_facts *facts, struct content_options *ret_options,
-			struct error *err)
+int volume_asked(struct api *api, struct request *request, struct job_facts *ret_facts,
+		 struct volume_record *ret_volume, struct error *err)
 {
-	const char *const types[] = {volume_type_names[VOLUME_FLOAT32], volume_type_names[VOLUME_INT16], NULL};
-	const char *scale_text = request_query(request, "scale");
-	const char *formats[16] = {NULL};
-	int format, type;
-	long scale = 1;
+	struct job *job;
 
-	for (int i = 0; volume_formats[i].name != NULL && i < 15; i++)
-		formats[i] = volume_formats[i].name;
+	if (jobs_find(api->jobs, request_argument(request, 0), &job, err) != 0)
+		return err->code;
+	job_facts(job, ret_facts);
+	job_release(job);
+	return volume_find(api, ret_facts, request_argument(request, 1), ret_volume, err);
+}
+
+/* The formats of files, and the one that is for programs only. */
+static const char shuffled_name[] = "shuffled", shuffled_media_type[] = "application/vnd.cbct.shuffled+zstd";
+
+static int read_format(struct request *request, struct content_options *options, struct error *err)
+{
+	const char *types[] = {volume_type_names[VOLUME_FLOAT32], volume_type_names[VOLUME_INT16], NULL};
+	const char *formats[16] = {NULL};
+	int format, type, count = 0;
+
+	for (; volume_formats[count].name != NULL && count < 14; count++)
+		formats[count] = volume_formats[count].name;
+	formats[count] = shuffled_name;
 	if (query_choice(request, "format", formats, &format, err) != 0 ||
 	    query_choice(request, "type", types, &type, err) != 0)
+		return err->code;
+	options->shuffled = format == count;
+	if (!options->shuffled) {
+		options->format = &volume_formats[format];
+		options->type = (enum volume_type)type;
+		return 0;
+	}
+	if (type != VOLUME_INT16 && request_query(request, "type") != NULL)
+		return error_set(err, ERR_INVALID, "type is \"%.40s\", expected int16 with format=%s", types[type],
+				 shuffled_name);
+	options->format = volume_format_find("raw");
+	options->type = VOLUME_INT16;
+	return 0;
+}
+
+int volume_options(struct request *request, const struct job_facts *job, struct content_options *ret_options,
+		   struct error *err)
+{
+	const char *scale_text = request_query(request, "scale");
+	struct content_options options = {.mu_water = job->mu_water, .name = ""};
+	long scale = 1;
+
+	if (read_format(request, &options, err) != 0)
 		return err->code;
 	if (scale_text != NULL &&
 	    (!index_parse(scale_text, strlen(scale_text), CONTENT_SCALE_MAX, &scale) || scale == 0))
 		return error_set(err, ERR_INVALID, "scale is \"%.40s\", expected a whole number from 1 to %d",
 				 scale_text, CONTENT_SCALE_MAX);
-	ret_options->format = &volume_formats[format];
-	ret_options->type = (enum volume_type)type;
-	ret_options->scale = (int)scale;
-	ret_options->mu_water = facts->mu_water;
-	ret_options->name = request_argument(request, 1);
+	options.scale = (int)scale;
+	*ret_options = options;
 	return 0;
+}
+
+const char *volume_media_type(const struct content_options *options)
+{
+	return options->shuffled ? shuffled_media_type : options->format->media_type;
+}
+
+void volume_filename(const char *job, const char *name, const struct content_options *options,
+		     char ret_name[VOLUME_FILENAME_MAX])
+{
+	snprintf(ret_name, VOLUME_FILENAME_MAX, "%s-%s%s", job, name,
+		 options->shuffled ? ".shuffled.zst" : options->format->extension);
 }
 
 /* Tells voxels, format, type, scale and encoding apart. */
@@ -94,8 +133,8 @@ static void make_etag(const struct volume_record *volume, const struct content_o
 
 	for (int i = 0; i < 16; i++)
 		snprintf(digest + 2 * i, sizeof(digest) - 2 * (size_t)i, "%02x", volume->sha256[i]);
-	snprintf(ret_etag, size, "\"%s-%s-%s-%d%s\"", digest, options->format->name, volume_type_names[options->type],
-		 options->scale, zstd ? "-zstd" : "");
+	snprintf(ret_etag, size, "\"%s-%s-%s-%d%s\"", digest, options->shuffled ? shuffled_name : options->format->name,
+		 volume_type_names[options->type], options->scale, zstd ? "-zstd" : "");
 }
 
 /* A part of the content that is made as it is sent. */
@@ -152,15 +191,16 @@ static int reply_plain(struct request *request, struct content *content, const s
 	return request_reply_read(request, selection->status, selection->length, part_read, part, part_free, err);
 }
 
-/* Takes the content. */
-static int reply_zstd(struct request *request, struct content *content, struct error *err)
+/* Takes the content. encoding: zstd is not the media type's own. */
+static int reply_zstd(struct request *request, struct content *content, bool encoding, struct error *err)
 {
 	struct content_stream *stream;
 
 	if (content_stream_new(content, &stream, err) != 0 ||
 	    request_reply_read(request, 200, UNKNOWN_SIZE, stream_read, stream, stream_free, err) != 0)
 		return err->code;
-	request_reply_header(request, "Content-Encoding", "zstd");
+	if (encoding)
+		request_reply_header(request, "Content-Encoding", "zstd");
 	return 0;
 }
 
@@ -173,26 +213,30 @@ int volume_get(void *context, struct request *request, struct error *err)
 	struct content *content;
 	struct job_facts facts;
 	struct entity entity;
-	char etag[96], filename[96], path[1024];
+	char etag[96], filename[VOLUME_FILENAME_MAX], path[1024];
 	/* Ranges are of the plain bytes: a frame of zstd cannot be entered in the middle. */
 	bool zstd = accepts_zstd(request_header(request, "Accept-Encoding")) &&
 		    (request_header(request, "Range") == NULL || request_is_head(request));
 	bool done;
 
-	if (find_volume(api, request, &facts, &volume, err) != 0 || read_options(request, &facts, &options, err) != 0)
+	if (volume_asked(api, request, &facts, &volume, err) != 0 ||
+	    volume_options(request, &facts, &options, err) != 0)
 		return err->code;
+	options.name = volume.name;
 	store_volume_path(api->store, facts.id, volume.name, path);
 	if (content_open(path, &volume.grid, &options, &content, err) != 0)
 		return err->code;
+	zstd = zstd || options.shuffled;
 	make_etag(&volume, &options, zstd, etag, sizeof(etag));
-	snprintf(filename, sizeof(filename), "%s-%s%s", facts.id, volume.name, options.format->extension);
+	volume_filename(facts.id, volume.name, &options, filename);
 	entity =
-	    (struct entity){etag, zstd ? UNKNOWN_SIZE : content_size(content), options.format->media_type, filename};
+	    (struct entity){etag, zstd ? UNKNOWN_SIZE : content_size(content), volume_media_type(&options), filename};
 	if (entity_select(request, &entity, &selection, &done, err) != 0 || done) {
 		content_close(content);
 		return done ? 0 : err->code;
 	}
-	if ((zstd ? reply_zstd(request, content, err) : reply_plain(request, content, &selection, err)) != 0)
+	if ((zstd ? reply_zstd(request, content, !options.shuffled, err)
+		  : reply_plain(request, content, &selection, err)) != 0)
 		return err->code;
 	entity_headers(request, &entity, &selection);
 	return 0;

@@ -28,6 +28,8 @@ struct content {
 	float *rows;          /* [factor[1]][nx], for means */
 	float voxels[CHUNK];  /* a piece of the scaled volume, 1/mm */
 	int16_t units[CHUNK]; /* the same in HU */
+	int16_t *plane;       /* [y][x] of the scaled volume in HU, to be shuffled; NULL: not wanted */
+	int64_t plane_z;      /* -1: none yet */
 };
 
 static void scale_grid(struct content *content, int scale)
@@ -41,10 +43,15 @@ static void scale_grid(struct content *content, int scale)
 		int factor = scale < from->size[axis] ? scale : from->size[axis];
 
 		content->factor[axis] = factor;
-		to->size[axis] = from->size[axis] / factor;
+		to->size[axis] = (from->size[axis] + factor - 1) / factor;
 		to->spacing[axis] = from->spacing[axis] * factor;
 		to->origin[axis] = from->origin[axis] + 0.5 * (factor - 1) * from->spacing[axis];
 	}
+}
+
+static size_t plane_voxels(const struct content *content)
+{
+	return (size_t)content->scaled.size[0] * (size_t)content->scaled.size[1];
 }
 
 static bool is_plain(const struct content *content)
@@ -94,7 +101,10 @@ int content_open(const char *path, const struct grid *grid, const struct content
 	scale_grid(content, options->scale);
 	content->descriptor = open(path, O_RDONLY | O_CLOEXEC);
 	content->rows = malloc((size_t)content->factor[1] * (size_t)grid->size[0] * sizeof(float));
-	if (content->descriptor < 0 || content->rows == NULL) {
+	content->plane_z = -1;
+	if (options->shuffled)
+		content->plane = malloc(plane_voxels(content) * sizeof(*content->plane));
+	if (content->descriptor < 0 || content->rows == NULL || (options->shuffled && content->plane == NULL)) {
 		if (content->descriptor < 0 && errno == ENOENT) /* removed since its row was read */
 			error_set(err, ERR_NOT_FOUND, "the volume is not there any more");
 		else
@@ -117,6 +127,7 @@ void content_close(struct content *content)
 	if (content->descriptor >= 0)
 		close(content->descriptor);
 	free(content->rows);
+	free(content->plane);
 	free(content);
 }
 
@@ -134,32 +145,39 @@ int content_descriptor(const struct content *content, uint64_t *ret_offset)
 	return fcntl(content->descriptor, F_DUPFD_CLOEXEC, 0);
 }
 
+static size_t smaller(size_t a, size_t b)
+{
+	return a < b ? a : b;
+}
+
 /* Part of a row of means: voxels x .. x + count - 1 of row (y, z). */
 static int read_means(struct content *content, size_t x, size_t y, size_t z, size_t count, float *to)
 {
-	const int *factor = content->factor;
-	size_t nx = (size_t)content->grid.size[0], ny = (size_t)content->grid.size[1];
-	size_t wx = (size_t)factor[0], wy = (size_t)factor[1], wz = (size_t)factor[2];
-	float weight = 1.0f / (float)(wx * wy * wz);
+	const int *factor = content->factor, *size = content->grid.size;
+	size_t nx = (size_t)size[0], ny = (size_t)size[1], nz = (size_t)size[2], wx = (size_t)factor[0];
+	size_t first_y = y * (size_t)factor[1], rows = smaller((size_t)factor[1], ny - first_y);
+	size_t first_z = z * (size_t)factor[2], planes = smaller((size_t)factor[2], nz - first_z);
 
 	memset(to, 0, count * sizeof(*to));
-	for (size_t dz = 0; dz < wz; dz++) {
-		uint64_t first = ((z * wz + dz) * ny + y * wy) * nx;
+	for (size_t dz = 0; dz < planes; dz++) {
+		uint64_t first = ((first_z + dz) * ny + first_y) * nx;
 
 		if (read_file(content, SPOOL_VOLUME_OFFSET + first * sizeof(float), content->rows,
-			      wy * nx * sizeof(float)) != 0)
+			      rows * nx * sizeof(float)) != 0)
 			return -1;
-		for (size_t dy = 0; dy < wy; dy++) {
-			const float *row = content->rows + dy * nx + x * wx;
+		for (size_t dy = 0; dy < rows; dy++) {
+			const float *row = content->rows + dy * nx;
 
 			for (size_t i = 0; i < count; i++) {
-				for (size_t dx = 0; dx < wx; dx++)
-					to[i] += row[i * wx + dx];
+				size_t end = smaller((x + i + 1) * wx, nx);
+
+				for (size_t from = (x + i) * wx; from < end; from++)
+					to[i] += row[from];
 			}
 		}
 	}
 	for (size_t i = 0; i < count; i++)
-		to[i] *= weight;
+		to[i] /= (float)(planes * rows * smaller(wx, nx - (x + i) * wx));
 	return 0;
 }
 
@@ -212,6 +230,49 @@ static ssize_t read_converted(struct content *content, uint64_t offset, char *to
 	return (ssize_t)done;
 }
 
+static int load_plane(struct content *content, uint64_t z)
+{
+	size_t count = plane_voxels(content), done = 0, part;
+
+	content->plane_z = -1;
+	for (; done < count; done += part) {
+		part = smaller(CHUNK, count - done);
+		if (read_voxels(content, z * count + done, part, content->voxels) != 0)
+			return -1;
+		volume_to_hu(content->voxels, part, content->options.mu_water, content->plane + done);
+	}
+	content->plane_z = (int64_t)z;
+	return 0;
+}
+
+static ssize_t read_shuffled(struct content *content, uint64_t offset, uint8_t *to, size_t size)
+{
+	size_t count = plane_voxels(content), done = 0;
+
+	while (done < size) {
+		uint64_t z = (offset + done) / (2 * count);
+		size_t at = (size_t)((offset + done) % (2 * count)), first = at % count;
+		size_t part = smaller(count - first, size - done);
+		int shift = at < count ? 0 : 8;
+
+		if (content->plane_z != (int64_t)z && load_plane(content, z) != 0)
+			return -1;
+		for (size_t i = 0; i < part; i++)
+			to[done + i] = (uint8_t)((uint16_t)content->plane[first + i] >> shift);
+		done += part;
+	}
+	return (ssize_t)done;
+}
+
+static ssize_t read_body(struct content *content, uint64_t offset, void *to, size_t size)
+{
+	if (content->options.shuffled)
+		return read_shuffled(content, offset, to, size);
+	if (is_plain(content))
+		return read_file(content, SPOOL_VOLUME_OFFSET + offset, to, size);
+	return read_converted(content, offset, to, size);
+}
+
 ssize_t content_read(struct content *content, uint64_t offset, void *to, size_t size)
 {
 	uint64_t whole = content_size(content);
@@ -227,15 +288,8 @@ ssize_t content_read(struct content *content, uint64_t offset, void *to, size_t 
 			head = size;
 		memcpy(to, content->header + offset, head);
 	}
-	if (size > head) {
-		uint64_t from = offset + head - content->header_size;
-		char *rest = (char *)to + head;
-		bool read = is_plain(content) ? read_file(content, SPOOL_VOLUME_OFFSET + from, rest, size - head) == 0
-					      : read_converted(content, from, rest, size - head) >= 0;
-
-		if (!read)
-			return -1;
-	}
+	if (size > head && read_body(content, offset + head - content->header_size, (char *)to + head, size - head) < 0)
+		return -1;
 	return (ssize_t)size;
 }
 

@@ -15,6 +15,8 @@
 #include "daemon/config.h"
 #include "daemon/log.h"
 
+enum { STREAM_THREADS = 2 }; /* that hash and compress what is streamed: the others are the worker's */
+
 static atomic_bool failed; /* the disk did: nothing more is acknowledged, and the exit status is 1 */
 
 static void on_failure(void *context, const char *what)
@@ -93,6 +95,10 @@ static int start_parts(const struct config *config, struct api *api, struct erro
 	if (code == 0)
 		code = feed_new(api->store, &api->feed, err);
 	if (code == 0)
+		code = mappings_new(&api->mappings, err);
+	if (code == 0)
+		code = renditions_new(api->store, STREAM_THREADS, &api->renditions, err);
+	if (code == 0)
 		code = uploads_new(api->store, &uploads, &api->uploads, err);
 	if (code == 0)
 		code = http_start(api->http, err);
@@ -103,6 +109,8 @@ static void stop_parts(struct api *api)
 {
 	http_free(api->http);
 	uploads_free(api->uploads);
+	renditions_free(api->renditions);
+	mappings_free(api->mappings);
 	feed_free(api->feed);
 	supervise_stop(api->supervise);
 	jobs_close(api->jobs);

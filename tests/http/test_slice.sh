@@ -1,0 +1,115 @@
+#!/usr/bin/env bash
+# Slices of a kept volume as PNG: the right plane the right way up, window and level in HU, refusals that name the parameter.
+. "$(dirname "$0")/lib.sh"
+
+scan_dir=$work/ball
+cbct simulate --phantom ball --scale 30 --density 0.02 --shift 12,-9,10 --views 60 --arc 360 --columns 64 --rows 48 --pixel 4 \
+	--source-to-isocentre 600 --source-to-detector 1000 -o "$scan_dir" >/dev/null || exit 1
+
+# The job that all tests look at; the daemon and its state stay.
+start_daemon || exit 1
+post_scan "$scan_dir"
+post_projections "$scan_dir"
+post_job '{"scan": "SCAN", "grid": {"size": [31, 24, 15], "spacing_mm": [3, 4, 5]}, "fdk": {}}'
+wait_job succeeded
+volume=/v1/jobs/$job/volumes/final
+get_volume final "$work/hu.raw" "format=raw&type=int16"
+
+be32() { od -An -tu1 -j "$1" -N 4 "$body" | awk '{ print (($1 * 256 + $2) * 256 + $3) * 256 + $4 }'; }
+# Width, height, bit depth and colour of the last body.
+picture() { echo "$(be32 16) $(be32 20) $(od -An -tu1 -j 24 -N 2 "$body" | xargs)"; }
+
+test_each_axis_gives_its_plane() {
+	local axis size
+	for axis in x:24:15 y:31:15 z:31:24; do
+		IFS=: read -r axis w h <<<"$axis"
+		req GET "$volume/slice?axis=$axis&index=7"
+		expect_status 200
+		[ "$(header content-type)" = image/png ] || fail "image/png"
+		[ "$(picture)" = "$w $h 8 0" ] || fail "$w x $h, 8 bit gray, got $(picture)"
+	done
+	req GET "$volume/slice"
+	expect_status 200
+	[ "$(picture)" = "31 24 8 0" ] || fail "the middle across z without parameters"
+	cp "$body" "$work/middle"
+	req GET "$volume/slice?axis=z&index=7&window=2000&level=0"
+	cmp "$body" "$work/middle" || fail "the same with the defaults written out"
+}
+
+test_a_contact_sheet_shows_all_planes() {
+	req GET "$volume/slice?axis=z&sheet=1"
+	expect_status 200
+	# 15 planes, six across
+	[ "$(picture)" = "186 72 8 0" ] || fail "6 x 3 tiles of 31 x 24, got $(picture)"
+}
+
+test_tags_save_the_drawing() {
+	local etag
+	req GET "$volume/slice?axis=y&index=3"
+	etag=$(header etag)
+	[[ $etag == '"'*'"' ]] || fail "a strong ETag"
+	req GET "$volume/slice?axis=y&index=3" -H "If-None-Match: $etag"
+	expect_status 304
+	req GET "$volume/slice?axis=y&index=4" -H "If-None-Match: $etag"
+	expect_status 200
+	req GET "$volume/slice?axis=y&index=3&level=1" -H "If-None-Match: $etag"
+	expect_status 200
+}
+
+test_what_cannot_be_is_refused_by_its_name() {
+	local query
+	for query in axis=w index=15 index=-1 index=1.5 index=x "axis=x&index=31" window=0 window=-5 window=nan level=high sheet=2; do
+		req GET "$volume/slice?$query"
+		expect_problem 400
+		expect_json ".detail | contains(\"$(sed 's/.*&//; s/=.*//' <<<"$query")\")"
+	done
+	req GET "/v1/jobs/$job/volumes/iter-7/slice"
+	expect_problem 404
+	req GET /v1/jobs/0000000000000000/volumes/final/slice
+	expect_problem 404
+	req PUT "$volume/slice"
+	expect_problem 405
+}
+
+test_other_formats_and_scales() {
+	local n=$((31 * 24))
+	# shuffled: of each plane the low bytes, then the high ones
+	req GET "$volume?format=shuffled"
+	expect_status 200
+	[ "$(header content-type)" = application/vnd.cbct.shuffled+zstd ] || fail "the media type"
+	[ -z "$(header content-encoding)" ] || fail "no Content-Encoding: the type says it"
+	zstd -q -d -c <"$body" | od -An -v -tu1 -w1 | awk -v n=$n '
+		{ b[NR - 1] = $1 }
+		END { for (z = 0; z < 15; z++) for (i = 0; i < n; i++) { v = b[2 * z * n + i] + 256 * b[2 * z * n + n + i]; print (v > 32767 ? v - 65536 : v) } }' >"$work/unshuffled"
+	od -An -v -td2 -w2 "$work/hu.raw" | awk '{ print $1 }' | cmp - "$work/unshuffled" || fail "the int16 voxels"
+	req GET "$volume?format=shuffled&type=float32"
+	expect_problem 400
+	req GET "$volume?scale=0"
+	expect_problem 400
+	req GET "$volume?scale=17"
+	expect_problem 400
+	# scale=2 of odd sizes: the last ones are means of what is there
+	get_volume final "$work/v.raw" format=raw
+	get_volume final "$work/half.nrrd" "format=nrrd&scale=2"
+	grep -a -q '^sizes: 16 12 8' "$work/half.nrrd" || fail "16 x 12 x 8: $(grep -a '^sizes' "$work/half.nrrd")"
+	grep -a -q '^space directions: (6,0,0) (0,8,0) (0,0,10)' "$work/half.nrrd" || fail "twice the spacing"
+	# voxel 0 was at -45, -46, -35
+	grep -a -q '^space origin: (-43.5,-44,-32.5)' "$work/half.nrrd" || fail "the origin in the middle of the first eight"
+	get_volume final "$work/half.raw" "format=raw&scale=2"
+	paste <(od -An -v -tf4 -w4 "$work/v.raw" | awk '
+		{ v[NR - 1] = $1 }
+		END {
+			for (z = 0; z < 8; z++) for (y = 0; y < 12; y++) for (x = 0; x < 16; x++) {
+				s = n = 0
+				for (k = 2 * z; k < 2 * z + 2 && k < 15; k++) for (j = 2 * y; j < 2 * y + 2; j++) for (i = 2 * x; i < 2 * x + 2 && i < 31; i++) { s += v[(k * 24 + j) * 31 + i]; n++ }
+				print s / n
+			}
+		}') <(od -An -v -tf4 -w4 "$work/half.raw") |
+		# awk prints six digits of numbers of at most 0.03
+		awk '{ d = $1 - $2; n++; if (d > 1e-6 || d < -1e-6) bad++ } END { exit bad > 0 || n != 16 * 12 * 8 }' || fail "the means"
+	get_volume final "$work/half.again" "format=raw&scale=2"
+	cmp "$work/half.raw" "$work/half.again" || fail "the same bytes twice"
+}
+
+run_tests
+stop_daemon
