@@ -293,6 +293,27 @@ static double overlap(const struct orbit *orbit, const struct geometry *geometry
 	return theta;
 }
 
+/*
+ * The view's part of the weight, R d / (pitch D^2), where d and D are taken in the
+ * plane of the fan, which the row and the central ray span: with the central ray c,
+ * horizontal, l mm long from the source to the detector's plane,
+ * D = R sqrt(1 - (c u)^2) and d = l sqrt(1 - (c u)^2). So a turn of the detector
+ * about its row does not change it, as it does not change the middle row's rays.
+ */
+static double view_weight(const struct view *view)
+{
+	double matrix[12], to_detector[3], radius = hypot(view->source[0], view->source[1]);
+	double pitch = vec_norm(view->column_step);
+	double central[3] = {-view->source[0] / radius, -view->source[1] / radius, 0};
+	double along = vec_dot(central, view->column_step) / pitch, length;
+
+	view_matrix(view, matrix);
+	for (int i = 0; i < 3; i++)
+		to_detector[i] = view->pixel0[i] - view->source[i];
+	length = vec_dot(matrix + 8, to_detector) / vec_dot(matrix + 8, central);
+	return length / (pitch * radius * sqrt(1 - along * along));
+}
+
 void orbit_column_weights(const struct orbit *orbit, const struct geometry *geometry, float *ret_weights)
 {
 	double sense = orbit->direction < 0 ? -1 : 1, outside = 2 * M_PI - orbit->arc;
@@ -304,16 +325,11 @@ void orbit_column_weights(const struct orbit *orbit, const struct geometry *geom
 		const struct view *view = &geometry->views[k];
 		float *weights = ret_weights + (size_t)k * (size_t)geometry->columns;
 		double b = wrap(sense * (orbit->angle[k] - orbit->angle[orbit->first]));
-		double matrix[12], to_detector[3], pitch = vec_norm(view->column_step), constant;
+		double constant = 0.5 * orbit->weight[k] * view_weight(view);
 
 		/* A view beside the first one by a rounding error is at the beginning, not a turn later. */
 		if (orbit->short_scan && b > orbit->arc + 0.5 * outside)
 			b = 0;
-		view_matrix(view, matrix);
-		for (int i = 0; i < 3; i++)
-			to_detector[i] = view->pixel0[i] - view->source[i];
-		constant = 0.5 * orbit->weight[k] * hypot(view->source[0], view->source[1]) *
-			   vec_dot(matrix + 8, to_detector) / (pitch * matrix[11] * matrix[11]);
 		for (int column = 0; column < geometry->columns; column++) {
 			double alpha = sense * ray_angle(geometry, view, column), weight = 1;
 

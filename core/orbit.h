@@ -79,9 +79,10 @@ void orbit_clear(struct orbit *orbit);
  *
  *   weight = 1/2 * angular weight * short-scan or displaced weight * R d / (pitch D^2),
  *
- * D = depth of the isocentre, gamma = angle between the ray and the line from
- * the source to the isocentre (a change of variables in the fan-beam formula;
- * for an untilted detector it is the usual SDD / ray length and D^2/depth^2).
+ * D = depth of the isocentre and d of the detector in the plane of row and central
+ * ray, gamma = angle between the ray and the line from the source to the isocentre
+ * (a change of variables in the fan-beam formula; for an untilted detector it is
+ * the usual SDD / ray length and D^2/depth^2).
  * Parker: a ray and its conjugate sum to 2 when both are measured, and a ray that
  * is measured once has 2, however short the arc; 1 everywhere on a full turn.
  * Fan angles are those of the rays in the middle row about the rotation axis,

@@ -607,6 +607,35 @@ static void turn_detector(const struct geometry *geometry, struct view *view, do
 		view->pixel0[i] -= middle * view->column_step[i];
 }
 
+/* Leans a view's detector about its middle row towards the source: the rays of that row stay the same. */
+static void lean_detector(struct view *view, double angle)
+{
+	double radius = hypot(view->source[0], view->source[1]), pitch = view->row_step[2];
+
+	view->row_step[0] = pitch * sin(angle) * view->source[0] / radius;
+	view->row_step[1] = pitch * sin(angle) * view->source[1] / radius;
+	view->row_step[2] = pitch * cos(angle);
+}
+
+START_TEST(leaning_detectors_give_the_density_back)
+{
+	static const struct sweep sweeps[] = {{251, 1, 1.6, 0, 1, 360, {0, 0}, 0},
+					      {251, 1, 1.6, 40, -0.75, 291, {0, 0}, 0}};
+
+	for (int i = 0; i < 4; i++) {
+		struct geometry geometry = geometry_of(&sweeps[i % 2], NULL);
+
+		for (int k = 0; k < geometry.count; k++) {
+			if (i >= 2)
+				turn_detector(&geometry, &geometry.views[k], 0.2);
+			lean_detector(&geometry.views[k], 0.35);
+		}
+		assert_density_comes_back(&geometry, i < 2 ? "leaning" : "turned and leaning", 10, -20);
+		geometry_clear(&geometry);
+	}
+}
+END_TEST
+
 START_TEST(turned_detectors_and_uneven_steps_give_the_density_back)
 {
 	static const struct sweep sweeps[] = {{251, 1, 1.6, 0, 1, 360, {0, 0}, 0},
@@ -730,6 +759,7 @@ Suite *orbit_suite(void)
 	tcase_add_test(weights, conjugate_rays_sum_to_two);
 	tcase_add_test(weights, filtered_backprojection_gives_the_density_back);
 	tcase_add_test(weights, turned_detectors_and_uneven_steps_give_the_density_back);
+	tcase_add_test(weights, leaning_detectors_give_the_density_back);
 	/* Sanitizers are slow. */
 	tcase_set_timeout(weights, 120);
 	tcase_set_timeout(facts, 60);
