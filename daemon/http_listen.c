@@ -3,6 +3,7 @@
  * nothing yet asks a client who it is.
  */
 #include "daemon/http_internal.h"
+#include "daemon/http_text.h"
 
 #include <errno.h>
 #include <netdb.h>
@@ -67,6 +68,7 @@ static int open_tcp(const char *text, struct listener *listener, struct error *e
 	const char *colon = strrchr(text, ':');
 	char host[80];
 	size_t length;
+	double port;
 	int code;
 
 	if (colon == NULL || colon == text || colon[1] == '\0')
@@ -79,6 +81,9 @@ static int open_tcp(const char *text, struct listener *listener, struct error *e
 	snprintf(host, sizeof(host), "%.*s", (int)length, text);
 	if (strcmp(host, "localhost") == 0)
 		snprintf(host, sizeof(host), "127.0.0.1");
+	/* The resolver takes a port modulo 65536. */
+	if (!number_parse(colon + 1, 0, 65535, &port) || port != (int)port)
+		return error_set(err, ERR_INVALID, "listen: the port of \"%s\" is not between 0 and 65535", text);
 	if (getaddrinfo(host, colon + 1, &hints, &found) != 0)
 		return error_set(err, ERR_INVALID, "listen: \"%s\" is no numeric address with a port", text);
 	if (is_loopback(found->ai_addr))

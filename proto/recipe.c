@@ -115,6 +115,10 @@ static int read_sart(struct recipe *recipe, const cJSON *value, struct error *er
 	return code;
 }
 
+/* Explicit steps are a smoothing of their own; the minimiser is one only when it is reached, to about a percent here.
+ */
+static const long PROXIMAL_ITERATIONS = 100;
+
 static int read_tv(struct recipe *recipe, const cJSON *value, struct error *err)
 {
 	struct json_reader reader;
@@ -127,6 +131,8 @@ static int read_tv(struct recipe *recipe, const cJSON *value, struct error *err)
 	/* Nothing keeps explicit steps near f when alpha is 0, but the minimiser without f is a constant. */
 	json_number(&reader, "alpha", false, method == TV_PROXIMAL ? 1e-9 : 0, 1e9, &tv->alpha);
 	json_number(&reader, "step", false, 1e-9, 1e9, &tv->step);
+	if (method == TV_PROXIMAL && !json_has(&reader, "iterations"))
+		iterations = PROXIMAL_ITERATIONS;
 	json_integer(&reader, "iterations", false, 1, ITERATIONS_MAX, &iterations);
 	json_number(&reader, "unit", false, 1e-12, 1e12, &tv->unit);
 	json_choice(&reader, "after", false, after_names, 2, &after);

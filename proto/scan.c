@@ -364,6 +364,8 @@ __attribute__((format(printf, 3, 4))) static void warn(cJSON *list, const char *
 /* What follows from the arc and the detector's place: which weights, and what they cannot mend. */
 static void warn_weights(cJSON *list, const struct orbit *orbit)
 {
+	const double displaced_share = 0.1; /* of half the detector's width; a calibrated offset stays below */
+	const double tilt_least = 2;        /* degrees; less costs FDK below a percent */
 	double arc = orbit->arc / degree, fan = orbit->fan / degree;
 
 	if (orbit->arc_too_short)
@@ -378,6 +380,17 @@ static void warn_weights(cJSON *list, const struct orbit *orbit)
 		warn(list, "displaced_detector",
 		     "the detector is displaced by %.2f mm: displaced-detector weights will apply in FDK",
 		     orbit->displacement);
+	else if (fabs(orbit->displacement) > displaced_share * orbit->source_to_detector * tan(orbit->fan / 2))
+		warn(
+		    list, "displaced_short_scan",
+		    "the detector is displaced by %.2f mm on an arc of %.2f degrees: displaced-detector weights need a "
+		    "full turn, so that FDK is right only where every view sees the object",
+		    orbit->displacement, arc);
+	if (fabs(orbit->tilt) > tilt_least * degree)
+		warn(list, "rotated_detector",
+		     "the detector's rows are %.1f degrees off the plane across the rotation axis; FDK filters along "
+		     "rows and is inexact there, SART is not",
+		     fabs(orbit->tilt) / degree);
 	if (orbit->field_of_view <= 0)
 		warn(list, "no_field_of_view", "no point of the rotation axis is seen by every view");
 }

@@ -238,6 +238,9 @@ test_settings_as_flag_line_and_environment() {
 	if "$BUILD/cbctd" --listen 0.0.0.0:0 --state-dir "$work/other" >"$work/out" 2>&1; then
 		fail "a refusal to listen beyond loopback without tokens and TLS"
 	fi
+	if "$BUILD/cbctd" --listen 127.0.0.1:99999 --state-dir "$work/other" >"$work/out" 2>&1; then
+		fail "a refusal of a port beyond 65535"
+	fi
 	if "$BUILD/cbctd" --no-such-flag >"$work/out" 2>&1; then
 		fail "a refusal of an unknown flag"
 	fi

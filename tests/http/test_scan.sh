@@ -62,6 +62,19 @@ test_every_kind_of_geometry_is_the_same_scan() {
 	diff "$work/derived.circular" "$work/derived.matrices" || fail "the same derived values for matrices"
 }
 
+test_what_fdk_cannot_mend_is_warned_of() {
+	# a detector in portrait: its rows run along the rotation axis
+	new_scan '.geometry = {kind: "views", views: [range(12) | . * 30 * 3.14159265358979312 / 180 | {c: cos, s: sin} |
+	  {source_mm: [600 * .c, 600 * .s, 0], pixel0_mm: [-400 * .c + 9 * .s, -400 * .s - 9 * .c, -23],
+	   column_step_mm: [0, 0, 2], row_step_mm: [-2 * .s, 2 * .c, 0]}]}'
+	expect_json '[.warnings[] | select(.code == "rotated_detector")] | length == 1'
+	# displaced by a third of its width on a short scan
+	new_scan '.geometry.angle_step_deg = 18 | .geometry.detector_offset_mm = [16, 0]'
+	expect_json '[.warnings[] | select(.code == "displaced_short_scan")] | length == 1'
+	new_scan '.geometry.angle_step_deg = 18 | .geometry.detector_offset_mm = [0.3, 0]'
+	expect_json '[.warnings[] | select(.code == "displaced_short_scan")] | length == 0'
+}
+
 test_projections_in_any_order_one_run_all() {
 	new_scan
 	fill 100 1 >"$work/a"
