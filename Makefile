@@ -115,6 +115,9 @@ $(BUILD)/unit: $(call objects,$(unit_sources) $(state_sources)) $(library)
 $(BUILD)/cpu-bench: $(call objects,tests/bench/bench.c) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(LIBM)
 
+$(BUILD)/watchers: $(call objects,tests/bench/watchers.c)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^
+
 # The GPU's checks and benchmarks need the mathematics and the kernels only, so that they run on a bare machine.
 gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench
 $(gpu_programs): $(BUILD)/%: $(call objects,tests/bench/%.c tests/bench/gpu_scene.c) $(core_objects) $(cuda_objects)
