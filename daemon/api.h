@@ -70,6 +70,7 @@ struct page {
 };
 /* ?limit= and ?after=. */
 int page_read(struct request *request, struct page *ret_page, struct error *err);
+int page_read_ids(struct request *request, struct page *ret_page, struct error *err); /* `after` is an id */
 
 /* The value of a query parameter among `names` (which ends with NULL); its index, 0 when it is absent. */
 int query_choice(struct request *request, const char *name, const char *const *names, int *ret_index,

@@ -8,16 +8,26 @@
 
 int page_read(struct request *request, struct page *ret_page, struct error *err)
 {
-	const char *limit = request_query(request, "limit"), *after = request_query(request, "after");
+	const char *limit = request_query(request, "limit");
 	long number = PAGE_DEFAULT;
 
 	if (limit != NULL && (!index_parse(limit, strlen(limit), PAGE_MAX, &number) || number == 0))
 		return error_set(err, ERR_INVALID, "limit is \"%.40s\", expected a whole number from 1 to %d", limit,
 				 PAGE_MAX);
-	if (after != NULL && !id_valid(after))
-		return error_set(err, ERR_INVALID, "after is \"%.40s\", expected an id", after);
 	ret_page->limit = (int)number;
-	ret_page->after = after;
+	ret_page->after = request_query(request, "after");
+	return 0;
+}
+
+int page_read_ids(struct request *request, struct page *ret_page, struct error *err)
+{
+	struct page page;
+
+	if (page_read(request, &page, err) != 0)
+		return err->code;
+	if (page.after != NULL && !id_valid(page.after))
+		return error_set(err, ERR_INVALID, "after is \"%.40s\", expected an id", page.after);
+	*ret_page = page;
 	return 0;
 }
 

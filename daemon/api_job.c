@@ -93,7 +93,7 @@ int job_list(void *context, struct request *request, struct error *err)
 	int count;
 	bool more;
 
-	if (page_read(request, &page, err) != 0 ||
+	if (page_read_ids(request, &page, err) != 0 ||
 	    jobs_list(api->jobs, page.after, page.limit, jobs, &count, &more, err) != 0)
 		return err->code;
 	document = cJSON_CreateObject();

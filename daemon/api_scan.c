@@ -34,7 +34,7 @@ int scan_list(void *context, struct request *request, struct error *err)
 	int count;
 	bool more;
 
-	if (page_read(request, &page, err) != 0 ||
+	if (page_read_ids(request, &page, err) != 0 ||
 	    store_scan_list(api->store, page.after, page.limit, scans, &count, &more, err) != 0)
 		return err->code;
 	document = cJSON_CreateObject();

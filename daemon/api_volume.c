@@ -14,21 +14,32 @@ int volume_list(void *context, struct request *request, struct error *err)
 	struct volume_record *volumes = NULL;
 	struct job_facts facts;
 	cJSON *document, *list;
+	struct page page;
 	struct job *job;
-	int count = 0, code;
+	int count = 0, first, last, code;
 
-	if (jobs_find(api->jobs, request_argument(request, 0), &job, err) != 0)
+	if (page_read(request, &page, err) != 0 || jobs_find(api->jobs, request_argument(request, 0), &job, err) != 0)
 		return err->code;
 	job_facts(job, &facts);
 	job_release(job);
 	code = store_job_volumes(api->store, facts.id, &volumes, &count, err);
 	if (code != 0)
 		return code;
+	/* Newest first, as all lists; a page goes on behind the volume named by `after`. */
+	first = count - 1;
+	for (int i = 0; page.after != NULL && i < count; i++) {
+		if (strcmp(volumes[i].name, page.after) == 0)
+			first = i - 1;
+	}
+	last = first >= page.limit ? first - page.limit + 1 : 0;
 	document = cJSON_CreateObject();
 	list = cJSON_AddArrayToObject(document, "volumes");
-	for (int i = 0; i < count; i++)
+	for (int i = first; i >= last; i--)
 		cJSON_AddItemToArray(list, volume_document(facts.id, &volumes[i]));
-	cJSON_AddNullToObject(document, "next"); /* a job has as many as its recipe names: one page */
+	if (last > 0)
+		cJSON_AddStringToObject(document, "next", volumes[last].name);
+	else
+		cJSON_AddNullToObject(document, "next");
 	free(volumes);
 	return request_reply_json(request, 200, document, err);
 }

@@ -27,10 +27,14 @@ test_pipeline_keeps_the_volumes_asked_for() {
 	expect_json '.history[4].residual < .history[0].residual'
 	req GET "/v1/jobs/$job/volumes"
 	expect_status 200
-	expect_json '[.volumes[].name] == ["fdk", "fdk-tv", "iter-1", "iter-3", "final"]'
+	expect_json '[.volumes[].name] == ["final", "iter-3", "iter-1", "fdk-tv", "fdk"]'
 	expect_json '.volumes | all(.size == [32, 24, 16] and (.href | startswith("/v1/jobs/")) and (.digest | length > 20))'
-	expect_json '[.volumes[].iteration] == [0, 0, 1, 3, 5]'
+	expect_json '[.volumes[].iteration] == [5, 3, 1, 0, 0]'
 	expect_json '.volumes[0].statistics | .minimum < .mean and .mean < .maximum'
+	req GET "/v1/jobs/$job/volumes?limit=2"
+	expect_json '[.volumes[].name] == ["final", "iter-3"] and (.next | length > 0)'
+	req GET "/v1/jobs/$job/volumes?limit=9&after=$(json .next)"
+	expect_json '[.volumes[].name] == ["iter-1", "fdk-tv", "fdk"] and .next == null'
 }
 
 test_every_stage_may_be_left_out() {
@@ -208,17 +212,17 @@ test_the_same_inputs_give_the_same_bits() {
 	post_job "$recipe"
 	wait_job succeeded
 	req GET "/v1/jobs/$job/volumes"
-	first=$(json '.volumes[-1].digest')
+	first=$(json '.volumes[0].digest')
 	post_job "$recipe"
 	wait_job succeeded
 	req GET "/v1/jobs/$job/volumes"
-	[ "$(json '.volumes[-1].digest')" = "$first" ] || fail "the digest of the first run"
+	[ "$(json '.volumes[0].digest')" = "$first" ] || fail "the digest of the first run"
 	stop_daemon
 	start_daemon --threads 1
 	post_job "$recipe"
 	wait_job succeeded
 	req GET "/v1/jobs/$job/volumes"
-	[ "$(json '.volumes[-1].digest')" = "$first" ] || fail "the digest of the first run with another number of threads"
+	[ "$(json '.volumes[0].digest')" = "$first" ] || fail "the digest of the first run with another number of threads"
 }
 
 start_daemon || exit 1

@@ -101,7 +101,7 @@ test_a_running_job_is_queued_again_after_kill_9() {
 	wait_job succeeded 240
 	expect_json '.attempts == 2 and ([.history[].iteration] == [range(1; 301)])'
 	req GET "/v1/jobs/$job/volumes"
-	expect_json '[.volumes[].name] == ["iter-1", "iter-300", "final"]'
+	expect_json '[.volumes[].name] == ["final", "iter-300", "iter-1"]'
 	stop_daemon
 }
 
