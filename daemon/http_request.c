@@ -227,7 +227,11 @@ static int read_framing(struct request *request, struct error *err)
 static int check_body(struct request *request, struct error *err)
 {
 	const struct route *route = request->route;
+	const char *encoding = MHD_lookup_connection_value(request->mhd, MHD_HEADER_KIND, "Content-Encoding");
 
+	if (route->body == BODY_WHOLE && encoding != NULL && strcasecmp(encoding, "identity") != 0)
+		return request_reply_problem(request, 415, err,
+					     "Content-Encoding is \"%.40s\", a document comes as it is", encoding);
 	if (route->body != BODY_NONE && !request->framed)
 		return request_reply_problem(request, 411, err,
 					     "neither Content-Length nor Transfer-Encoding tells of a body");

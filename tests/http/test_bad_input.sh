@@ -62,6 +62,8 @@ test_text_that_is_not_strict_json() {
 		req POST /v1/scans -H 'Content-Type: application/json' --data-binary "$text"
 		expect_problem 400
 	done
+	req POST /v1/scans -H 'Content-Type: application/json' -H 'Content-Encoding: gzip' --data-binary "$base"
+	expect_problem 415
 	req GET /livez
 	expect_status 200
 }
