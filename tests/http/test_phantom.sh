@@ -93,7 +93,7 @@ asymmetric() {
 	get_volume final "$dir/final.nii"
 	cbct compare --json "$dir/fdk.nii" "$dir/truth.nii" >"$dir/fdk.json"
 	cbct compare --json "$dir/final.nii" "$dir/truth.nii" >"$dir/final.json"
-	expect_number "$(jq .correlation "$dir.fdk.json")" ">" 0.99 "correlation of FDK"
+	expect_number "$(jq .correlation "$dir/fdk.json")" ">" 0.99 "correlation of FDK"
 	expect_number "$(jq .correlation "$dir/final.json")" '>' 0.99 "correlation of SART"
 }
 test_asymmetric() { asymmetric plain --views 180 --arc 360; }
