@@ -39,21 +39,20 @@ struct backprojection_job {
 	struct voxel_use use;
 };
 
-/* The matrices of the views in hand, one after the other, for the copy into constant memory. */
-static __global__ void gather(const device_view *geometry, const int *views, int count, float *to)
+/*
+ * The matrices of the views in hand, one after the other, for the copy into
+ * constant memory; columns are counted from `pad` before the detector's first.
+ */
+static __global__ void gather(const device_view *geometry, const int *views, int count, float pad, float *to)
 {
 	int i = blockIdx.x * blockDim.x + threadIdx.x;
 
-	if (i < count * 12)
-		to[i] = geometry[views[i / 12]].matrix[i % 12 / 4][i % 4];
-}
+	if (i >= count * 12)
+		return;
+	const float(&m)[3][4] = geometry[views[i / 12]].matrix;
+	int row = i % 12 / 4, k = i % 4;
 
-static __device__ __forceinline__ float reciprocal(float x)
-{
-	float r;
-
-	asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x));
-	return r;
+	to[i] = row == 0 ? fmaf(pad, m[2][k], m[0][k]) : m[row][k];
 }
 
 /* What the sums of `COUNT` voxels from z on do to the volume. */
@@ -223,16 +222,17 @@ static __global__ void __launch_bounds__(256) update_from(const float *__restric
 static struct {
 	const struct plan *plan;
 	unsigned long list;
-	int first, count;
+	int first, count, pad;
 } loaded;
 
-static int load_matrices(struct plan *plan, int first, int count, struct error *err)
+static int load_matrices(struct plan *plan, int first, int count, int pad, struct error *err)
 {
 	cudaStream_t stream = plan->device->stream;
 
-	if (loaded.plan == plan && loaded.list == plan->views_list && loaded.first == first && loaded.count == count)
+	if (loaded.plan == plan && loaded.list == plan->views_list && loaded.first == first && loaded.count == count &&
+	    loaded.pad == pad)
 		return 0;
-	gather<<<divide_up(count * 12, 256), 256, 0, stream>>>(plan->geometry, plan->views + first, count,
+	gather<<<divide_up(count * 12, 256), 256, 0, stream>>>(plan->geometry, plan->views + first, count, (float)pad,
 							       plan->matrices);
 	LAUNCHED();
 	CUDA_TRY(cudaMemcpyToSymbolAsync(matrices, plan->matrices, (size_t)count * 12 * sizeof(float), 0,
@@ -241,12 +241,13 @@ static int load_matrices(struct plan *plan, int first, int count, struct error *
 	loaded.list = plan->views_list;
 	loaded.first = first;
 	loaded.count = count;
+	loaded.pad = pad;
 	return 0;
 }
 
 int backproject_prepare(struct plan *plan, int first, int count, struct error *err)
 {
-	return load_matrices(plan, first, count, err);
+	return load_matrices(plan, first, count, 0, err);
 }
 
 void backproject_forget(void)
@@ -254,15 +255,25 @@ void backproject_forget(void)
 	loaded.plan = NULL;
 }
 
-static int load_array(struct plan *plan, const float *from, int count, struct error *err)
+/* What a sum samples: padded rows and their array for FDK, the detector's own for SART. */
+static const struct stack_shape *shape_for(const struct plan *plan, const struct voxel_use &use)
 {
-	const struct stack_shape *shape = &plan->stack;
+	return use.fdk ? &plan->filtered : &plan->stack;
+}
+static const struct layered *array_for(const struct plan *plan, const struct voxel_use &use)
+{
+	return use.fdk && plan->filtered.columns > plan->stack.columns ? &plan->filtered_array : &plan->projections;
+}
+
+static int load_array(struct plan *plan, const backprojection_job &job, struct error *err)
+{
+	const struct stack_shape *shape = shape_for(plan, job.use);
 	cudaMemcpy3DParms copy = {};
 
-	copy.srcPtr = make_cudaPitchedPtr((void *)from, (size_t)shape->pitch * sizeof(float), (size_t)shape->columns,
-					  shape->slot / (size_t)shape->pitch);
-	copy.dstArray = plan->projections.array;
-	copy.extent = make_cudaExtent((size_t)shape->columns, (size_t)shape->rows, (size_t)count);
+	copy.srcPtr = make_cudaPitchedPtr((void *)job.from, (size_t)shape->pitch * sizeof(float),
+					  (size_t)shape->columns, shape->slot / (size_t)shape->pitch);
+	copy.dstArray = array_for(plan, job.use)->array;
+	copy.extent = make_cudaExtent((size_t)shape->columns, (size_t)shape->rows, (size_t)job.views);
 	copy.kind = cudaMemcpyDeviceToDevice;
 	CUDA_TRY(cudaMemcpy3DAsync(&copy, plan->device->stream));
 	return 0;
@@ -288,15 +299,16 @@ static void launch_general(const backprojection_job &job, cudaStream_t stream)
 
 static backprojection_job job_make(const struct plan *plan, float *volume, struct voxel_use use)
 {
+	const struct stack_shape *shape = shape_for(plan, use);
 	backprojection_job job = {};
 
-	job.texture = plan->projections.texture;
-	job.pitch = plan->stack.pitch;
-	job.slot = plan->stack.slot;
-	job.shape = pairs_shape_make(plan->stack.columns, plan->stack.rows);
+	job.texture = array_for(plan, use)->texture;
+	job.pitch = shape->pitch;
+	job.slot = shape->slot;
+	job.shape = pairs_shape_make(shape->columns, shape->rows);
 	job.pairs = plan->pairs + job.shape.before;
-	job.columns = (float)plan->stack.columns;
-	job.rows = (float)plan->stack.rows;
+	job.columns = (float)shape->columns;
+	job.rows = (float)shape->rows;
 	job.nx = plan->grid.size[0];
 	job.ny = plan->grid.size[1];
 	job.nz = plan->grid.size[2];
@@ -310,7 +322,7 @@ static int launch(struct plan *plan, backprojection_job &job, struct error *err)
 	cudaStream_t stream = plan->device->stream;
 
 	if (plan->shape.back_voxels > 0)
-		TRY(layout_pairs(plan, job.from, job.views, err));
+		TRY(layout_pairs(plan, shape_for(plan, job.use), job.from, job.views, err));
 	switch (plan->shape.back_half ? -plan->shape.back_voxels : plan->shape.back_voxels) {
 	case -5:
 		launch_untilted<5, 3, true>(job, stream);
@@ -332,7 +344,7 @@ static int launch(struct plan *plan, backprojection_job &job, struct error *err)
 		break;
 	default:
 		if (plan->shape.textures) {
-			TRY(load_array(plan, job.from, job.views, err));
+			TRY(load_array(plan, job, err));
 			if (job.use.coverage != NULL) {
 				job.texture = plan->projections.held;
 				launch_general<8, BY_TEXTURE_HELD>(job, stream);
@@ -362,7 +374,9 @@ int update_volume(struct plan *plan, struct voxel_use use, float *volume, struct
 int backproject_views(struct plan *plan, const float *from, int first, int count, struct voxel_use use, float *volume,
 		      struct error *err)
 {
-	int most = plan->shape.views_at_once;
+	const struct stack_shape *shape = shape_for(plan, use);
+	bool padded = shape->columns > plan->stack.columns;
+	int most = padded ? plan->shape.batch : plan->shape.views_at_once, pad = padded ? plan->options.pad[0] : 0;
 	/* An update takes the whole sum: all parts but the last are summed aside. */
 	bool parts = use.update && count > most;
 	struct voxel_use sum = use;
@@ -375,9 +389,9 @@ int backproject_views(struct plan *plan, const float *from, int first, int count
 	for (int done = 0; done < count; done += most) {
 		backprojection_job job = job_make(plan, parts ? plan->work : volume, sum);
 
-		job.from = from + (size_t)done * plan->stack.slot;
+		job.from = from + (size_t)done * shape->slot;
 		job.views = count - done < most ? count - done : most;
-		TRY(load_matrices(plan, first + done, job.views, err));
+		TRY(load_matrices(plan, first + done, job.views, pad, err));
 		TRY(launch(plan, job, err));
 	}
 	return parts ? update_volume(plan, use, volume, err) : 0;
@@ -393,7 +407,7 @@ int coverage_sum(struct plan *plan, int first, int count, struct error *err)
 		dim3 blocks(divide_up(job.nx, 32), divide_up(job.ny, 8), job.nz);
 
 		job.views = count - done < VIEWS_AT_ONCE ? count - done : VIEWS_AT_ONCE;
-		TRY(load_matrices(plan, first + done, job.views, err));
+		TRY(load_matrices(plan, first + done, job.views, 0, err));
 		sum_coverage<<<blocks, dim3(32, 8), 0, stream>>>(job);
 		LAUNCHED();
 	}
@@ -406,7 +420,7 @@ int cuda_backproject(struct plan *plan, const struct stack *from, const int *vie
 	struct voxel_use use = {};
 
 	use.fdk = weight == BACKPROJECT_FDK;
-	TRY(plan_check_views(plan, views, count, from, count, err));
+	TRY(plan_check_views(plan, views, count, shape_for(plan, use), from, count, err));
 	TRY(plan_set_views(plan, views, count, err));
 	return backproject_views(plan, from->data, 0, count, use, to->data, err);
 }

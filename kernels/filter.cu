@@ -9,6 +9,8 @@
  * back, computes only what is kept. The middle of it stays in the order in which
  * it falls out: the response is stored in that order instead.
  *
+ * A row is placed between the zeros of plan_options.pad, and comes out as wide.
+ *
  * The response that core/filter.h gives belongs to another length. A linear
  * convolution sees only the taps -(columns - 1) .. columns - 1 of the kernel:
  * these are taken out of it and transformed anew, so that both give the same rows.
@@ -39,6 +41,8 @@ struct filter_job {
 	float *to;
 	int columns, rows, pitch;
 	size_t slot;
+	int pad, wide, wide_pitch; /* of the filtered rows */
+	size_t wide_slot;
 	const float *column_weights;
 	const float *response;
 	const float2 *twiddles; /* of the first factor, then [16][16] of the second */
@@ -89,7 +93,7 @@ static __global__ void __launch_bounds__(32 * HALF * PAIRS) filter_fused(const f
 	int t = threadIdx.x, row = 2 * ((int)blockIdx.x * PAIRS + (int)threadIdx.y), view = job.views[blockIdx.y];
 	bool has[2] = {row < job.rows, row + 1 < job.rows};
 	const float *from = job.from + (size_t)job.slots[blockIdx.y] * job.slot + (size_t)row * job.pitch;
-	float *to = job.to + (size_t)blockIdx.y * job.slot + (size_t)row * job.pitch;
+	float *to = job.to + (size_t)blockIdx.y * job.wide_slot + (size_t)row * job.wide_pitch;
 	row_weight weight[2] = {weight_of(job, view, row), weight_of(job, view, row + 1)};
 	const float2 *second = job.twiddles + FACTOR * 256;
 
@@ -98,10 +102,10 @@ static __global__ void __launch_bounds__(32 * HALF * PAIRS) filter_fused(const f
 
 #pragma unroll
 		for (int j = 0; j < HALF; j++) {
-			int column = q + 256 * j;
+			int column = q + 256 * j - job.pad;
 
 			even[j] = make_float2(0, 0);
-			if (column < job.columns) {
+			if ((unsigned)column < (unsigned)job.columns) {
 				float by_column = weight[0].column_weights[column];
 
 				if (has[0])
@@ -170,12 +174,12 @@ static __global__ void __launch_bounds__(32 * HALF * PAIRS) filter_fused(const f
 			float2 value = even[j] + (j > 0 ? multiply_conjugate(odd[j], job.roots[j]) : odd[j]);
 			int column = q + 256 * j;
 
-			if (column >= job.columns)
+			if (column >= job.wide)
 				continue;
 			if (has[0])
 				to[column] = value.x;
 			if (has[1])
-				to[job.pitch + column] = value.y;
+				to[job.wide_pitch + column] = value.y;
 		}
 	}
 }
@@ -190,25 +194,25 @@ struct row_place {
 static __device__ __forceinline__ row_place place_of(const filter_job &job, int index)
 {
 	int i = index / job.rows, row = index - i * job.rows;
-	size_t within = (size_t)row * job.pitch;
 
-	return {job.views[i], row, (size_t)job.slots[i] * job.slot + within, (size_t)i * job.slot + within};
+	return {job.views[i], row, (size_t)job.slots[i] * job.slot + (size_t)row * job.pitch,
+		(size_t)i * job.wide_slot + (size_t)row * job.wide_pitch};
 }
 
 static __global__ void fft_fill(const filter_job job, int first, int length, float *to)
 {
-	int column = blockIdx.x * blockDim.x + threadIdx.x;
+	int to_column = blockIdx.x * blockDim.x + threadIdx.x, column = to_column - job.pad;
 	float value = 0;
 
-	if (column >= length)
+	if (to_column >= length)
 		return;
-	if (column < job.columns) {
+	if ((unsigned)column < (unsigned)job.columns) {
 		row_place at = place_of(job, first + (int)blockIdx.y);
 		row_weight weight = weight_of(job, at.view, at.row);
 
 		value = job.from[at.from + column] * weight.column_weights[column] * cosine_at(job, weight, column);
 	}
-	to[(size_t)blockIdx.y * (length + 2) + column] = value;
+	to[(size_t)blockIdx.y * (length + 2) + to_column] = value;
 }
 
 static __global__ void fft_multiply(const float *response, int length, float *rows)
@@ -224,7 +228,7 @@ static __global__ void fft_take(const filter_job job, int first, int length, con
 {
 	int column = blockIdx.x * blockDim.x + threadIdx.x;
 
-	if (column < job.columns)
+	if (column < job.wide)
 		job.to[place_of(job, first + (int)blockIdx.y).to + column] =
 		    rows[(size_t)blockIdx.y * (length + 2) + column];
 }
@@ -248,7 +252,7 @@ static int filter_fft(struct plan *plan, const filter_job &job, struct error *er
 		LAUNCHED();
 		if (cufftExecC2R(fft->inverse, (cufftComplex *)fft->rows, fft->rows) != CUFFT_SUCCESS)
 			return error_set(err, ERR_DEVICE, "cufftExecC2R of %d rows of %d failed", rows, length);
-		fft_take<<<dim3(divide_up(job.columns, 256), rows), 256, 0, stream>>>(job, first, length, fft->rows);
+		fft_take<<<dim3(divide_up(job.wide, 256), rows), 256, 0, stream>>>(job, first, length, fft->rows);
 		LAUNCHED();
 	}
 	return 0;
@@ -314,7 +318,7 @@ static int upload(struct plan *plan, const void *from, size_t bytes, void **ret_
 
 static int prepare_fused(struct plan *plan, struct error *err)
 {
-	int length = plan->shape.filter_length, factor = length / 256, columns = plan->stack.columns;
+	int length = plan->shape.filter_length, factor = length / 256, columns = plan->filtered.columns;
 	std::vector<double> values =
 	    response_at(plan->options.filter_response, filter_length(columns), columns, length);
 	std::vector<float> response((size_t)length);
@@ -417,7 +421,7 @@ int cuda_filter(struct plan *plan, const struct stack *from, const int *slots, c
 
 	if (plan->column_weights == NULL)
 		return error_set(err, ERR_INTERNAL, "the plan was made without FDK");
-	TRY(plan_check_views(plan, views, count, to, count, err));
+	TRY(plan_check_views(plan, views, count, &plan->filtered, to, count, err));
 	TRY(plan_set_views(plan, views, count, err));
 	TRY(plan_set_slots(plan, slots != NULL ? slots : views, count, from, err));
 	job.geometry = plan->geometry;
@@ -432,6 +436,10 @@ int cuda_filter(struct plan *plan, const struct stack *from, const int *slots, c
 	job.rows = plan->stack.rows;
 	job.pitch = plan->stack.pitch;
 	job.slot = plan->stack.slot;
+	job.pad = plan->options.pad[0];
+	job.wide = plan->filtered.columns;
+	job.wide_pitch = plan->filtered.pitch;
+	job.wide_slot = plan->filtered.slot;
 	job.column_weights = plan->column_weights;
 	job.response = plan->response;
 	job.twiddles = plan->twiddles;

@@ -118,9 +118,10 @@ struct device_view {
  *
  * The untilted kernel reads many rows below each other and wants a distance from
  * row to row that the compiler knows: there the fast axis is cut into panels,
- * [slice][panel][row][PANEL], the last value of a panel being the first of the next.
+ * [slice][panel][row][PANEL], the last SLICE_SHARED values of a panel being the
+ * first of the next, so that the four columns of a sample are always in one.
  */
-enum { SLICE_PAD = 8, SLICE_HELD = 2, PANEL = 64 };
+enum { SLICE_PAD = 8, SLICE_HELD = 2, PANEL = 64, SLICE_SHARED = 3, SLICE_STEP = PANEL - SLICE_SHARED };
 struct slices_shape {
 	int slices, rows, fast;
 	int row;      /* floats from row to row */
@@ -129,7 +130,7 @@ struct slices_shape {
 	size_t floats;
 };
 struct slices {
-	float *data; /* row 0 of slice 0; where rows are whole, its value 0, else value -1 is first in its panel */
+	float *data; /* row 0 of slice 0; where rows are whole, its value 0, else -SLICE_HELD is first in its panel */
 	size_t slice;
 	int row, panel;
 };
@@ -204,6 +205,7 @@ struct plan {
 	struct slices_shape along_x, along_y;
 	struct columns_shape columns;
 	struct stack_shape stack;
+	struct stack_shape filtered; /* with plan_options.pad */
 	char summary[192];
 
 	int *views_host; /* what `views` holds, so that the same list is not copied again */
@@ -216,9 +218,10 @@ struct plan {
 	/* One block that the stages use in turn: slices of the forward projection, z-fastest copy, TV's copies. */
 	float *scratch;
 	size_t scratch_bytes;
-	struct layered slices[2];   /* slices across x and y, with textures */
-	struct layered projections; /* a batch of projections, with textures */
-	float2 *pairs;              /* a batch of projections as pairs, untilted */
+	struct layered slices[2];      /* slices across x and y, with textures */
+	struct layered projections;    /* a batch of projections, with textures */
+	struct layered filtered_array; /* the same of padded rows, where they are longer */
+	float2 *pairs;                 /* a batch of projections as pairs, untilted */
 	size_t pairs_bytes;
 	float *coverage; /* [z][y][x], sum_S w_ij of subset `coverage_subset`, where not all is covered */
 	int coverage_subset;
@@ -252,12 +255,14 @@ struct plan {
 /* The list of views on the device; nothing is copied when it is there already. */
 int plan_set_views(struct plan *plan, const int *views, int count, struct error *err);
 int plan_set_slots(struct plan *plan, const int *slots, int count, const struct stack *from, struct error *err);
-int plan_check_views(const struct plan *plan, const int *views, int count, const struct stack *stack, int slots,
-		     struct error *err);
+/* The views, and a stack of projections of this shape. */
+int plan_check_views(const struct plan *plan, const int *views, int count, const struct stack_shape *shape,
+		     const struct stack *stack, int slots, struct error *err);
 
 /* ---- layout.cu ---- */
-int layout_slices(struct plan *plan, const float *volume, struct error *err);         /* -> scratch, arrays */
-int layout_pairs(struct plan *plan, const float *from, int count, struct error *err); /* -> pairs */
+int layout_slices(struct plan *plan, const float *volume, struct error *err); /* -> scratch, arrays */
+/* -> pairs */
+int layout_pairs(struct plan *plan, const struct stack_shape *shape, const float *from, int count, struct error *err);
 int layout_to_columns(struct plan *plan, const float *volume, float *columns, struct error *err);
 int layout_from_columns(struct plan *plan, const float *columns, float *volume, struct error *err);
 

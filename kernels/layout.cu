@@ -13,10 +13,11 @@ struct slices_shape slices_shape_make(int slices, int rows, int fast, bool panel
 	shape.slices = slices;
 	shape.rows = rows;
 	shape.fast = fast;
-	shape.row = panels ? PANEL : round_up(fast + 2, 32);
+	/* What is held before a row lies behind the row before. A sample on the held edge reads one value more. */
+	shape.row = panels ? PANEL : round_up(fast + 2 * SLICE_HELD, 32);
 	shape.panel = panels ? PANEL * padded : 0;
-	shape.slice =
-	    panels ? (size_t)shape.panel * (size_t)divide_up(fast + 3, PANEL - 1) : (size_t)shape.row * (size_t)padded;
+	shape.slice = panels ? (size_t)shape.panel * (size_t)divide_up(fast + 2 * SLICE_HELD + 1, SLICE_STEP)
+			     : (size_t)shape.row * (size_t)padded;
 	/* Before the first slice and behind the last, SLICE_PAD rows and one value can be read. */
 	shape.floats = shape.slice * (size_t)slices + (size_t)shape.row * (SLICE_PAD + 2);
 	return shape;
@@ -57,61 +58,60 @@ enum { TILE = 32, TILE_ROWS = 8 };
 /* Floats from the beginning of row 0 to a place along the fast axis. */
 static __device__ __forceinline__ int place_at(const slices &to, int fast)
 {
-	int panel = to.panel > 0 ? (fast + 1) / (PANEL - 1) : 0;
+	int place = fast + SLICE_HELD, panel = place / SLICE_STEP;
 
-	return to.panel > 0 ? panel * to.panel + fast + 1 - panel * (PANEL - 1) : fast;
+	return to.panel > 0 ? panel * (to.panel - SLICE_STEP) + place : fast;
 }
 
-/* A value with all that repeats it: the first of a panel behind the one before, and what is held beyond the ends. */
+/* Whether the panel before ends with it too. */
+static __device__ __forceinline__ bool is_shared(const slices &to, int fast)
+{
+	int place = fast + SLICE_HELD;
+
+	return to.panel > 0 && place >= SLICE_STEP && place % SLICE_STEP < SLICE_SHARED;
+}
+
+/* A value with all that repeats it: at the end of a panel, and what is held beyond the ends. */
 static __device__ void put_held(const slices &to, float *slice, int row, int rows, int fast, int count, float value)
 {
 	int row_from = row == 0 ? -SLICE_HELD : row, row_to = row == rows - 1 ? rows - 1 + SLICE_HELD : row;
-	int from = fast == 0 ? -1 : fast, until = fast == count - 1 ? count : fast;
+	int from = fast == 0 ? -SLICE_HELD : fast, to_end = fast == count - 1 ? fast + SLICE_HELD : fast;
 
 	for (int j = row_from; j <= row_to; j++)
-		for (int i = from; i <= until; i++) {
+		for (int i = from; i <= to_end; i++) {
 			float *at = slice + (j * to.row + place_at(to, i));
 
 			*at = value;
-			if (to.panel > 0 && i >= 0 && (i + 1) % (PANEL - 1) == 0)
-				at[PANEL - 1 - to.panel] = value;
+			if (is_shared(to, i))
+				at[SLICE_STEP - to.panel] = value;
 		}
 }
 
-/*
- * The values of a thread: TILE / TILE_ROWS slices, one place along the fast axis.
- * Within a plane a value has at most two places more: where it begins a panel it
- * ends the one before, at the ends of the axis it is held beyond them.
- */
+/* The values of a thread: TILE / TILE_ROWS slices, one place along the fast axis. */
 static __device__ __forceinline__ void put_slices(const slices &to, int first, int slices_count, int fast, int count,
 						  int row, int rows, const float value[TILE / TILE_ROWS])
 {
 	const int each = TILE / TILE_ROWS;
 	float *slice = to.data + to.slice * (size_t)first;
 	size_t step = to.slice * TILE_ROWS;
-	bool is_first = fast == 0, is_last = fast == count - 1;
-	bool begins = to.panel > 0 && (fast + 1) % (PANEL - 1) == 0;
-	bool next_begins = to.panel > 0 && is_last && (count + 1) % (PANEL - 1) == 0;
+	bool shared = is_shared(to, fast);
 
 	if (fast >= count)
 		return;
-	if (row == 0 || row == rows - 1 || count == 1 || next_begins) {
+	if (row == 0 || row == rows - 1 || fast == 0 || fast == count - 1) {
 		for (int k = 0; k < each; k++, slice += step)
 			if (first + k * TILE_ROWS < slices_count)
 				put_held(to, slice, row, rows, fast, count, value[k]);
 		return;
 	}
 	float *main = slice + (row * to.row + place_at(to, fast));
-	float *held = slice + (row * to.row + place_at(to, is_first ? -1 : count));
 #pragma unroll
-	for (int k = 0; k < each; k++, main += step, held += step) {
+	for (int k = 0; k < each; k++, main += step) {
 		if (first + k * TILE_ROWS >= slices_count)
 			return;
 		*main = value[k];
-		if (begins)
-			main[PANEL - 1 - to.panel] = value[k];
-		if (is_first || is_last)
-			*held = value[k];
+		if (shared)
+			main[SLICE_STEP - to.panel] = value[k];
 	}
 }
 
@@ -244,9 +244,8 @@ static __global__ void __launch_bounds__(256)
 		   threadIdx.x] = pair;
 }
 
-int layout_pairs(struct plan *plan, const float *from, int count, struct error *err)
+int layout_pairs(struct plan *plan, const struct stack_shape *shape, const float *from, int count, struct error *err)
 {
-	const struct stack_shape *shape = &plan->stack;
 	struct pairs_shape pairs = pairs_shape_make(shape->columns, shape->rows);
 	dim3 blocks(divide_up(shape->rows + 2 * STACK_PAD, 4), (unsigned)(pairs.slot / (size_t)pairs.panel), count);
 

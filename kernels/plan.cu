@@ -33,6 +33,12 @@ static int largest_subset(const struct subsets *subsets)
 	return most;
 }
 
+/* Columns of a filtered projection. */
+static int wide_columns(const struct plan_options *options)
+{
+	return options->pad[0] + options->geometry->columns + options->pad[1];
+}
+
 /* The corner of the box, half a voxel beyond the outer centres or on them, mm. */
 static void corner_of(const struct grid *grid, int corner, double beyond, double ret[3])
 {
@@ -146,16 +152,17 @@ static int window_size(bool half, double least, double most)
 
 /*
  * geometry_is_untilted speaks of the rays to the detector; a backprojection's
- * samples reach one pixel beyond, which is far on a detector of one.
+ * samples reach one pixel beyond, which is far on a detector of one, and FDK's the padding.
  */
-static bool is_untilted(const struct geometry *geometry)
+static bool is_untilted(const struct plan_options *options)
 {
+	const struct geometry *geometry = options->geometry;
 	const double pixels = 1e-3;
 
 	for (int k = 0; k < geometry->count; k++) {
 		const double *u = geometry->views[k].column_step, *v = geometry->views[k].row_step;
 
-		if (fabs(u[2]) * (geometry->columns + 1) > pixels * vec_norm(v) ||
+		if (fabs(u[2]) * (wide_columns(options) + 1) > pixels * vec_norm(v) ||
 		    hypot(v[0], v[1]) * (geometry->rows + 1) > pixels * vec_norm(u))
 			return false;
 	}
@@ -167,7 +174,7 @@ static void choose_untilted(const struct plan_options *options, struct plan_shap
 	double least, most;
 	int sign;
 
-	if (!is_untilted(options->geometry))
+	if (!is_untilted(options))
 		return;
 	row_spacing(options->geometry, options->grid, &least, &most, &sign);
 	if (sign == 0)
@@ -201,7 +208,7 @@ static struct plan_shape shape_of(const struct plan_options *options, bool lean)
 	if (shape.is_small)
 		shape.forward_rows = shape.back_voxels = 0;
 	shape.textures = !lean && !shape.is_small && !options->reference_precision && fits &&
-			 geometry->columns <= SIDE_MOST && geometry->rows <= SIDE_MOST;
+			 wide_columns(options) <= SIDE_MOST && geometry->rows <= SIDE_MOST;
 	shape.lean = lean;
 	shape.batch = at_most(geometry->count, lean ? BATCH_LEAN : BATCH_MOST);
 	shape.by_view = subset == 1 && columns_shape_make(grid->size).floats < (size_t)1 << 31;
@@ -211,9 +218,9 @@ static struct plan_shape shape_of(const struct plan_options *options, bool lean)
 	shape.covered = is_covered(geometry, grid);
 	shape.views_at_once = at_most(geometry->count, lean ? (int)BATCH_LEAN : (int)VIEWS_AT_ONCE);
 	if (options->column_weights != NULL) {
-		shape.filter_length = filter_choose(geometry->columns);
+		shape.filter_length = filter_choose(wide_columns(options));
 		if (shape.filter_length == 0) {
-			shape.fft_length = filter_length(geometry->columns);
+			shape.fft_length = filter_length(wide_columns(options));
 			shape.fft_rows = (int)(FFT_BYTES / ((size_t)(shape.fft_length + 2) * sizeof(float)));
 			if ((size_t)shape.fft_rows > (size_t)shape.batch * (size_t)geometry->rows)
 				shape.fft_rows = shape.batch * geometry->rows;
@@ -232,9 +239,14 @@ static bool needs_arrays_back(const struct plan *plan)
 {
 	return plan->shape.textures && plan->shape.back_voxels == 0;
 }
+/* Textures hold zeros beyond an array's sides: one cannot serve stacks of two widths. */
+static bool needs_filtered_array(const struct plan *plan)
+{
+	return needs_arrays_back(plan) && plan->filtered.columns > plan->stack.columns;
+}
 static size_t pairs_bytes(const struct plan *plan, int views)
 {
-	struct pairs_shape pairs = pairs_shape_make(plan->stack.columns, plan->stack.rows);
+	struct pairs_shape pairs = pairs_shape_make(plan->filtered.columns, plan->filtered.rows);
 
 	return (pairs.slot * (size_t)views + 2 * pairs.before) * sizeof(float2);
 }
@@ -265,6 +277,7 @@ static void plan_describe(struct plan *plan, const struct plan_options *options,
 	plan->along_y = slices_shape_make(size[1], size[2], size[0], plan->shape.forward_rows > 0);
 	plan->columns = columns_shape_make(size);
 	plan->stack = stack_shape_make(geometry->columns, geometry->rows, 1);
+	plan->filtered = stack_shape_make(wide_columns(options), geometry->rows, 1);
 	plan->scratch_bytes = (plan->along_x.floats + plan->along_y.floats) * sizeof(float);
 	if (plan->shape.by_view && plan->columns.floats * sizeof(float) > plan->scratch_bytes)
 		plan->scratch_bytes = plan->columns.floats * sizeof(float);
@@ -316,6 +329,9 @@ static struct plan_bytes bytes_of(const struct plan_options *options, bool lean)
 		bytes.scratch += 2 * voxels;
 	if (needs_arrays_back(&plan))
 		bytes.scratch += pixels_of(&plan) * (size_t)views_laid_out(&plan) * sizeof(float);
+	if (needs_filtered_array(&plan))
+		bytes.scratch += (size_t)plan.filtered.columns * (size_t)plan.filtered.rows * (size_t)plan.shape.batch *
+				 sizeof(float);
 	if (plan.shape.back_voxels > 0)
 		bytes.scratch += pairs_bytes(&plan, views_laid_out(&plan));
 	if (needs_coverage(&plan))
@@ -498,6 +514,10 @@ static int prepare_arrays(struct plan *plan, struct error *err)
 		TRY(layered_new(plan->device, plan->stack.columns, plan->stack.rows, plan->shape.views_at_once,
 				cudaAddressModeBorder, &plan->projections, err));
 	}
+	if (needs_filtered_array(plan)) {
+		TRY(layered_new(plan->device, plan->filtered.columns, plan->filtered.rows, plan->shape.batch,
+				cudaAddressModeBorder, &plan->filtered_array, err));
+	}
 	return 0;
 }
 
@@ -598,6 +618,7 @@ void cuda_plan_free(struct plan *plan)
 	if (plan->linearised != NULL)
 		cudaEventDestroy(plan->linearised);
 	layered_free(device, &plan->projections);
+	layered_free(device, &plan->filtered_array);
 	device_release(device, plan->pairs, plan->pairs_bytes);
 	device_release(device, plan->defects, sizeof(*plan->defects));
 	device_release(device, plan->flat, pixels_of(plan) * sizeof(float));
@@ -622,18 +643,17 @@ int cuda_plan_batch(const struct plan *plan)
 
 /* ---- lists of views ---- */
 
-int plan_check_views(const struct plan *plan, const int *views, int count, const struct stack *stack, int slots,
-		     struct error *err)
+int plan_check_views(const struct plan *plan, const int *views, int count, const struct stack_shape *shape,
+		     const struct stack *stack, int slots, struct error *err)
 {
 	int all = plan->options.geometry->count;
 
 	if (count < 0 || count > all)
 		return error_set(err, ERR_INTERNAL, "%d views at once, there are %d", count, all);
-	if (stack->shape.columns != plan->stack.columns || stack->shape.rows != plan->stack.rows ||
-	    stack->slots < slots)
+	if (stack->shape.columns != shape->columns || stack->shape.rows != shape->rows || stack->slots < slots)
 		return error_set(err, ERR_INTERNAL, "a stack of %d projections of %d x %d, expected %d of %d x %d",
-				 stack->slots, stack->shape.columns, stack->shape.rows, slots, plan->stack.columns,
-				 plan->stack.rows);
+				 stack->slots, stack->shape.columns, stack->shape.rows, slots, shape->columns,
+				 shape->rows);
 	for (int i = 0; i < count; i++)
 		if (views[i] < 0 || views[i] >= all)
 			return error_set(err, ERR_INTERNAL, "view %d of %d", views[i], all);

@@ -1,11 +1,13 @@
 /*
- * Forward projection: Joseph's method (rays.cuh), all views of a call in one launch.
+ * Forward projection (rays.cuh has the method), all views of a call in one launch.
  *
  * General: a thread has one ray and a warp 32 neighbours in a row, which walk the
  * slices of their axis together. Samples are alternately taken by the texture
- * unit and by four plain loads: either pipe alone is the limit, both together
- * nearly add up. Reference precision has loads only, since the texture unit's
- * weights have 8 bits.
+ * unit and by plain loads: either pipe alone is the limit, both together nearly
+ * add up. The four columns of a sample all count with 0 or more, so the texture
+ * unit takes them two by two: with A = p0 + p1 and B = p2 + p3 = 1 - A, a
+ * bilinear sample at j - 1 + p1/A counts with A and one at j + 1 + p3/B with B.
+ * Reference precision has loads only, since the texture unit's weights have 8 bits.
  *
  * Untilted: the rays of a column share their way across the rows' direction,
  * and in every slice adjacent rows of the detector are evenly spaced along z,
@@ -54,6 +56,21 @@ static __device__ __forceinline__ place place_of(const projection &p)
 	int tile = rest / here, row = tile / p.tiles_across;
 
 	return {(group * group_most + rest - tile * here) * VIEWS + (int)threadIdx.z, tile - row * p.tiles_across, row};
+}
+
+/* A ray's sample of layer i by the texture unit, which holds the edges. */
+static __device__ __forceinline__ float sample_texture(cudaTextureObject_t texture, int i, float fast, float row_half,
+						       const wandering &wander)
+{
+	float right, low = floor_of(fast, right);
+	four_parts part = parts_at(wander, right);
+	float left = part.p[0] + part.p[1], rest = part.p[2] + part.p[3];
+	/* The mask only says that the layer is small: it saves the compiler's clamp. `rest` is 0 where p3 is. */
+	float a = tex2DLayered<float>(texture, fmaf(part.p[1], reciprocal(left), low - 0.5f), row_half, i & 0x7ff);
+	float b = tex2DLayered<float>(texture, fmaf(part.p[3], reciprocal(fmaxf(rest, 1e-20f)), low + 1.5f), row_half,
+				      i & 0x7ff);
+
+	return mix(b, a, left);
 }
 
 /* Stores a ray's line integral, or what SART makes of it, and gives the squares for the sums. */
@@ -120,6 +137,7 @@ static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS, GENE
 		size_t slice = p.across[axis].slice;
 		int stride = p.across[axis].row;
 		cudaTextureObject_t texture = p.texture[axis];
+		wandering wander = wander_of(s.fast_step);
 		float total = 0;
 		auto edge = [&](int from, int to) {
 			for (int i = from; i < to; i++) {
@@ -127,32 +145,32 @@ static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS, GENE
 				float up = fmaf((float)i, s.row_step, s.row), value;
 
 				if (TEXTURE)
-					value = tex2DLayered<float>(texture, fast + 0.5f, up + 0.5f, i & 0x7ff);
+					value = sample_texture(texture, i, fast, up + 0.5f, wander);
 				else
-					value = sample(data + slice * (size_t)i, stride, 1,
-						       fminf(fmaxf(fast, -1.0f), (float)axes.fast),
-						       fminf(fmaxf(up, -1.0f), (float)axes.rows));
+					value = sample_ray(data + slice * (size_t)i, stride, 1,
+							   fminf(fmaxf(fast, -1.0f), (float)axes.fast),
+							   fminf(fmaxf(up, -1.0f), (float)axes.rows), wander);
 				total = fmaf(part_of(i, s.begin, s.end), value, total);
 			}
 		};
 
 		edge(w.first, w.inner_first);
 		const float *at_slice = data + slice * (size_t)w.inner_first;
-		float f = (float)w.inner_first, fast_half = s.fast + 0.5f, row_half = s.row + 0.5f;
+		float f = (float)w.inner_first, row_half = s.row + 0.5f;
 		int i = w.inner_first;
 		if (TEXTURE) {
 			at_slice += slice;
 			for (; i + 2 <= w.inner_end; i += 2, f += 2.0f, at_slice += 2 * slice) {
-				/* The mask only says that the layer is small: it saves the compiler's clamp. */
-				total += tex2DLayered<float>(texture, fmaf(f, s.fast_step, fast_half),
-							     fmaf(f, s.row_step, row_half), i & 0x7ff);
-				total += sample(at_slice, stride, 1, fmaf(f + 1.0f, s.fast_step, s.fast),
-						fmaf(f + 1.0f, s.row_step, s.row));
+				total += sample_texture(texture, i, fmaf(f, s.fast_step, s.fast),
+							fmaf(f, s.row_step, row_half), wander);
+				total += sample_ray(at_slice, stride, 1, fmaf(f + 1.0f, s.fast_step, s.fast),
+						    fmaf(f + 1.0f, s.row_step, s.row), wander);
 			}
 			at_slice -= slice;
 		}
 		for (; i < w.inner_end; i++, f += 1.0f, at_slice += slice)
-			total += sample(at_slice, stride, 1, fmaf(f, s.fast_step, s.fast), fmaf(f, s.row_step, s.row));
+			total += sample_ray(at_slice, stride, 1, fmaf(f, s.fast_step, s.fast),
+					    fmaf(f, s.row_step, s.row), wander);
 		edge(w.inner_end, w.end);
 		if (hits) {
 			sum = total;
@@ -164,13 +182,14 @@ static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS, GENE
 		slice_axes axes = axes_of(p.grid, ACROSS_Z);
 		ray s = ray_make(crossing_of(d, m, ACROSS_Z), axes);
 		size_t slice = (size_t)axes.fast * (size_t)axes.rows;
+		wandering wander = wander_of(s.fast_step);
 
 		if (s.end > s.begin) {
 			for (int i = first_slice(s.begin), last = last_slice(s.end); i <= last; i++)
 				sum = fmaf(part_of(i, s.begin, s.end),
-					   sample_held(p.volume + slice * (size_t)i, axes.fast, 1,
-						       fmaf((float)i, s.fast_step, s.fast),
-						       fmaf((float)i, s.row_step, s.row), axes),
+					   sample_ray_held(p.volume + slice * (size_t)i, axes.fast, 1,
+							   fmaf((float)i, s.fast_step, s.fast),
+							   fmaf((float)i, s.row_step, s.row), wander, axes),
 					   sum);
 			slices = s.end - s.begin;
 		}
@@ -196,6 +215,7 @@ struct fan {
 	float fast, fast_step, row, row_step, spread, spread_step;
 	float from, to;                  /* where all are inside across z, counted from the middle slice */
 	float middle_row, middle_spread; /* row and spread in the middle slice, of centred z */
+	wandering across;
 };
 
 /* Which slices count as a whole: all rows alike do not, but by the same part; or each by its own. */
@@ -215,12 +235,14 @@ static __device__ __forceinline__ void add_rows(const float *__restrict__ slice,
 		base = fminf(fmaxf(base, (float)-SLICE_PAD), (float)axes.rows);
 		part = part_of(i, begin[0], end[0]);
 	}
-	unsigned place = (unsigned)split(fast, right) + 1;
-	int low = split(base, unused), within = (int)(place * 66577u >> 22); /* place / (PANEL - 1) below 89240 */
-	const float *q = slice + (int)(low * PANEL + (int)place + within * (panel - (PANEL - 1)));
+	/* The first of the four columns, counted from the first that is held. */
+	unsigned place = (unsigned)split(fast, right) + (SLICE_HELD - 1);
+	int low = split(base, unused), within = (int)(place * 17190u >> 20); /* place / SLICE_STEP below 74898 */
+	const float *q = slice + (int)(low * PANEL + (int)place + within * (panel - SLICE_STEP));
+	four_parts four = parts_at(f.across, right);
 #pragma unroll
 	for (int j = 0; j < ROWS + 2; j++)
-		x[j] = mix(q[j * PANEL], q[j * PANEL + 1], right);
+		x[j] = across_four(q + j * PANEL, 1, four);
 	float t = row - (float)low, below = x[1] - x[0];
 #pragma unroll
 	for (int k = 0; k < ROWS; k++) {
@@ -302,6 +324,7 @@ static __global__ void __launch_bounds__(32 * UNTILTED_WARPS * UNTILTED_VIEWS, 8
 		f.row_step = cross.row_step;
 		f.spread_step = g.direction[2][2] * inverse;
 		f.fast_step = cross.fast_step;
+		f.across = wander_of(f.fast_step);
 		f.fast = fmaf(-middle, f.fast_step, cross.fast + 0.5f * (float)(axes.fast - 1));
 		f.row = fmaf(-middle, f.row_step, f.middle_row + 0.5f * (float)(axes.rows - 1));
 		f.spread = fmaf(-middle, f.spread_step, f.middle_spread) - 1.0f;
@@ -323,7 +346,7 @@ static __global__ void __launch_bounds__(32 * UNTILTED_WARPS * UNTILTED_VIEWS, 8
 		}
 		bool hits = any_end > any_first;
 		if (!hits)
-			f = {0.5f * (float)(axes.fast - 1), 0, 0.5f * (float)(axes.rows - 1), 0, 0, 0, 0, 0, 0, 0};
+			f = {0.5f * (float)(axes.fast - 1), 0, 0.5f * (float)(axes.rows - 1), 0, 0, 0, 0, 0, 0, 0, {}};
 		walk w = walk_together(hits, any_first, any_end, all_first, all_end);
 		const slices &across = p.across[axis];
 		if (__all_sync(~0u, alike || !hits)) {
@@ -436,7 +459,7 @@ int project_rays(struct plan *plan, const float *volume, int first, int count, s
 int cuda_project(struct plan *plan, const struct volume *from, const int *views, int count, struct stack *to,
 		 struct error *err)
 {
-	TRY(plan_check_views(plan, views, count, to, count, err));
+	TRY(plan_check_views(plan, views, count, &plan->stack, to, count, err));
 	TRY(plan_set_views(plan, views, count, err));
 	TRY(layout_slices(plan, from->data, err));
 	return project_rays(plan, from->data, 0, count, {}, to->data, err);

@@ -3,12 +3,20 @@
 
 /*
  * A ray among the slices across its dominant axis, as Joseph's method walks it
- * (IEEE Trans. Med. Imaging 1, 1982): one bilinear sample where it crosses the
- * middle of each slice, times the distance from one slice to the next along the
- * ray. The box ends half a voxel beyond the outer centres, with the outer values
- * held there; the first and the last slice count with the part of them between
- * the ray's entry and exit. The row sum of a ray, sum_m w_im, is thus its length
- * inside the box.
+ * (IEEE Trans. Med. Imaging 1, 1982): one sample for each slice, times the
+ * distance from one slice to the next along the ray. The box ends half a voxel
+ * beyond the outer centres, with the outer values held there; the first and the
+ * last slice count with the part of them between the ray's entry and exit. The
+ * row sum of a ray, sum_m w_im, is thus its length inside the box.
+ *
+ * Joseph's sample is bilinear where the ray crosses the middle of the slice. Here
+ * it is the linear interpolation along the fast axis, integrated over the way
+ * between the slices beside it with weight 1 - |s| (core/project_simd.c derives
+ * it): with S the change of the fast coordinate per slice and
+ *   kink(y) = S/6 (1 - |y|/S)^3 for |y| < S, else 0,
+ * the columns j - 1 .. j + 2 beside the position j + right count with k0,
+ * 1 - right - 2 k0 + k1, right + k0 - 2 k1 and k1, k0 = kink(right) and
+ * k1 = kink(1 - right). Along the row axis it stays linear at the middle.
  */
 #include "kernels/internal.cuh"
 
@@ -21,6 +29,32 @@ struct ray {
 	float step;       /* mm from slice to slice */
 	float begin, end; /* between entry and exit, in slices; begin >= end: it misses the box */
 };
+
+/* kink(y) = max(root - |y| fall, 0)^3, of a ray's change of the fast coordinate per slice. */
+struct wandering {
+	float root, fall;
+};
+static __device__ __forceinline__ wandering wander_of(float fast_step)
+{
+	const float least = 1e-6f; /* below that there is none, and the inverse stays finite */
+	float slope = fabsf(fast_step), root = cbrtf(slope * (1.0f / 6.0f));
+
+	if (slope < least)
+		return {0, 0};
+	return {root, root / slope};
+}
+
+/* What the columns j - 1 .. j + 2 count for. */
+struct four_parts {
+	float p[4];
+};
+static __device__ __forceinline__ four_parts parts_at(const wandering &w, float right)
+{
+	float a = fmaxf(fmaf(-right, w.fall, w.root), 0.0f), b = fmaxf(fmaf(right, w.fall, w.root - w.fall), 0.0f);
+	float k0 = a * a * a, k1 = b * b * b;
+
+	return {k0, fmaf(-2.0f, k0, k1) + (1.0f - right), fmaf(-2.0f, k1, k0) + right, k1};
+}
 
 static __device__ __forceinline__ float form(const float coefficients[3], float column, float row)
 {
@@ -120,17 +154,32 @@ static __device__ __forceinline__ ray ray_idle(const slice_axes &axes)
  * too large.
  */
 static const unsigned SPLIT_BITS = 0x4B400000;
+static const float SPLIT_SHIFT = 12582912.0f;
 static __device__ __forceinline__ unsigned split_bits(float x, float &fraction)
 {
-	const float shift = 12582912.0f;
-	float shifted = __fadd_rd(x, shift);
+	float shifted = __fadd_rd(x, SPLIT_SHIFT);
 
-	fraction = x - (shifted - shift);
+	fraction = x - (shifted - SPLIT_SHIFT);
 	return __float_as_uint(shifted);
+}
+static __device__ __forceinline__ float floor_of(float x, float &fraction)
+{
+	float low = __fadd_rd(x, SPLIT_SHIFT) - SPLIT_SHIFT;
+
+	fraction = x - low;
+	return low;
 }
 static __device__ __forceinline__ int split(float x, float &fraction)
 {
 	return (int)(split_bits(x, fraction) - SPLIT_BITS);
+}
+
+static __device__ __forceinline__ float reciprocal(float x)
+{
+	float r;
+
+	asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x));
+	return r;
 }
 
 static __device__ __forceinline__ float mix(float a, float b, float part)
@@ -152,16 +201,45 @@ static __device__ __forceinline__ float sample(const float *__restrict__ slice, 
 	return mix(mix(p[0], p[fast_stride], across), mix(q[0], q[fast_stride], across), up);
 }
 
-/* The same with the outer voxels held beyond the edges. */
-static __device__ __forceinline__ float sample_held(const float *__restrict__ slice, int row_stride, int fast_stride,
-						    float fast, float row, const slice_axes &axes)
+/* One row of the four columns from p on. */
+static __device__ __forceinline__ float across_four(const float *__restrict__ p, int fast_stride,
+						    const four_parts &part)
 {
-	float across, up;
-	int i = split(fast, across), j = split(row, up);
-	int i0 = min(max(i, 0), axes.fast - 1) * fast_stride, i1 = min(max(i + 1, 0), axes.fast - 1) * fast_stride;
-	int j0 = min(max(j, 0), axes.rows - 1) * row_stride, j1 = min(max(j + 1, 0), axes.rows - 1) * row_stride;
+	float two = fmaf(part.p[1], p[fast_stride], part.p[0] * p[0]);
 
-	return mix(mix(slice[j0 + i0], slice[j0 + i1], across), mix(slice[j1 + i0], slice[j1 + i1], across), up);
+	return fmaf(part.p[3], p[3 * fast_stride], fmaf(part.p[2], p[2 * fast_stride], two));
+}
+
+/* A ray's sample of a slice; four columns of two rows must be readable. */
+static __device__ __forceinline__ float sample_ray(const float *__restrict__ slice, int row_stride, int fast_stride,
+						   float fast, float row, const wandering &wander)
+{
+	float right, up;
+	unsigned i = split_bits(fast, right), j = split_bits(row, up);
+	unsigned surplus = SPLIT_BITS * (unsigned)row_stride + SPLIT_BITS * (unsigned)fast_stride;
+	const float *p = slice + ((int)(j * (unsigned)row_stride + i * (unsigned)fast_stride - surplus) - fast_stride);
+	four_parts part = parts_at(wander, right);
+
+	return mix(across_four(p, fast_stride, part), across_four(p + row_stride, fast_stride, part), up);
+}
+
+/* The same with the outer voxels held beyond the edges. */
+static __device__ __forceinline__ float sample_ray_held(const float *__restrict__ slice, int row_stride,
+							int fast_stride, float fast, float row, const wandering &wander,
+							const slice_axes &axes)
+{
+	float right, up, sum = 0;
+	int i = split(fast, right), j = split(row, up);
+	int j0 = min(max(j, 0), axes.rows - 1) * row_stride, j1 = min(max(j + 1, 0), axes.rows - 1) * row_stride;
+	four_parts part = parts_at(wander, right);
+
+#pragma unroll
+	for (int k = 0; k < 4; k++) {
+		int at = min(max(i - 1 + k, 0), axes.fast - 1) * fast_stride;
+
+		sum = fmaf(part.p[k], mix(slice[j0 + at], slice[j1 + at], up), sum);
+	}
+	return sum;
 }
 
 static __device__ __forceinline__ int warp_min(int value)

@@ -67,12 +67,16 @@ static __global__ void __launch_bounds__(32 * SWEEP_COLUMNS * SWEEP_PARTS, 2) pr
 
 			if (full.end > full.begin) {
 				a = full;
-				/* Between the outer centres all four neighbours are there; a thousandth for rounding.
+				/*
+				 * A voxel from the outer centres all four columns are there, between the
+				 * outer centres both rows; a thousandth for rounding.
 				 */
 				to = 0.5f * (float)(axes.across - 1);
 				from = -to;
-				clip(at.fast, at.fast_step, 0.5f * (float)(axes.fast - 1) - 1e-3f, from, to);
+				clip(at.fast, at.fast_step, 0.5f * (float)(axes.fast - 3) - 1e-3f, from, to);
 				clip(at.row, at.row_step, 0.5f * (float)(axes.rows - 1) - 1e-3f, from, to);
+				if (axes.fast < 4 || axes.rows < 2)
+					to = -1e6f;
 				from = fminf(from, 1e6f) + 0.5f * (float)(axes.across - 1);
 				to = fmaxf(to, -1e6f) + 0.5f * (float)(axes.across - 1);
 			}
@@ -85,27 +89,22 @@ static __global__ void __launch_bounds__(32 * SWEEP_COLUMNS * SWEEP_PARTS, 2) pr
 		int each = (w.end - w.first + SWEEP_PARTS - 1) / SWEEP_PARTS, begin = w.first + part * each;
 		int end = min(begin + each, w.end), inner = min(max(w.inner_first, begin), end);
 		int outer = min(max(w.inner_end, inner), end);
+		wandering wander = wander_of(a.fast_step);
 		auto edge = [&](int i, int until) {
-			const float fast_end = (float)(axes.fast - 1), row_end = (float)(axes.rows - 1);
-
-			for (; i < until; i++) {
-				float across = fmaf((float)i, a.fast_step, a.fast),
-				      along = fmaf((float)i, a.row_step, a.row);
-
+			for (; i < until; i++)
 				total = fmaf(part_of(i, a.begin, a.end),
-					     sample(s.volume + (size_t)slice * i, up, fast,
-						    fminf(fmaxf(across, 0.0f), fast_end),
-						    fminf(fmaxf(along, 0.0f), row_end)),
+					     sample_ray_held(s.volume + (size_t)slice * i, up, fast,
+							     fmaf((float)i, a.fast_step, a.fast),
+							     fmaf((float)i, a.row_step, a.row), wander, axes),
 					     total);
-			}
 		};
 
 		edge(begin, inner);
 		const float *at_slice = s.volume + (size_t)slice * inner;
-#pragma unroll 8 /* most of what is read comes from memory: many loads on their way */
+#pragma unroll 4 /* most of what is read comes from memory: many loads on their way */
 		for (int i = inner; i < outer; i++, at_slice += slice)
-			total += sample(at_slice, up, fast, fmaf((float)i, a.fast_step, a.fast),
-					fmaf((float)i, a.row_step, a.row));
+			total += sample_ray(at_slice, up, fast, fmaf((float)i, a.fast_step, a.fast),
+					    fmaf((float)i, a.row_step, a.row), wander);
 		edge(outer, end);
 		if (hits) {
 			sum = total;
@@ -394,7 +393,7 @@ int cuda_sart_iterate(struct plan *plan, const struct stack *projections, struct
 	if (sart == NULL)
 		return error_set(err, ERR_INTERNAL, "the plan was made without SART");
 	TRY(device_enter(device, err));
-	TRY(plan_check_views(plan, sart->subsets.order, count, projections, count, err));
+	TRY(plan_check_views(plan, sart->subsets.order, count, &plan->stack, projections, count, err));
 	TRY(plan_set_views(plan, sart->subsets.order, count, err));
 	if (!worth_recording(plan)) {
 		TRY(sweep(plan, projections->data, volume->data, cancel, err));

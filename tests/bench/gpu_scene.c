@@ -138,6 +138,7 @@ struct plan_options scene_plan(const struct scene *scene, struct sart_options *s
 	    .linearise = {.sample = SAMPLE_FLOAT32},
 	    .column_weights = scene->weights.columns,
 	    .filter_response = scene->weights.response,
+	    .pad = {scene->weights.pad[0], scene->weights.pad[1]},
 	    .sart = subsets > 0 ? sart : NULL,
 	    .tv = tv,
 	    .reference_precision = reference,
