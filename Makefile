@@ -22,7 +22,7 @@ prefix ?= /usr/local
 PACKAGES := libmicrohttpd:libmicrohttpd-dev libcjson:libcjson-dev libzstd:libzstd-dev sqlite3:libsqlite3-dev \
             kissfft-float:libkissfft-dev libpng:libpng-dev libcurl:libcurl4-openssl-dev libcrypto:libssl-dev \
             check:check
-COMMANDS := gcc:gcc pkg-config:pkg-config curl:curl jq:jq zstd:zstd
+COMMANDS := gcc:gcc pkg-config:pkg-config curl:curl jq:jq zstd:zstd openssl:openssl pgrep:procps sqlite3:sqlite3
 
 core_libs   := kissfft-float
 proto_libs  := libcjson libzstd libcrypto libpng
