@@ -63,12 +63,12 @@ static __device__ __forceinline__ float sample_texture(cudaTextureObject_t textu
 						       const wandering &wander)
 {
 	float right, low = floor_of(fast, right);
-	four_parts part = parts_at(wander, right);
-	float left = part.p[0] + part.p[1], rest = part.p[2] + part.p[3];
-	/* The mask only says that the layer is small: it saves the compiler's clamp. `rest` is 0 where p3 is. */
-	float a = tex2DLayered<float>(texture, fmaf(part.p[1], reciprocal(left), low - 0.5f), row_half, i & 0x7ff);
-	float b = tex2DLayered<float>(texture, fmaf(part.p[3], reciprocal(fmaxf(rest, 1e-20f)), low + 1.5f), row_half,
-				      i & 0x7ff);
+	kinks k = kinks_at(wander, right);
+	float left = (1.0f - right) + (k.k1 - k.k0), rest = 1.0f - left;
+	/* p1/A = 1 - p0/A. Where B is 0, so is p3. The mask only says that the layer is small: it saves a clamp. */
+	float a = tex2DLayered<float>(texture, fmaf(-k.k0, reciprocal(left), low + 0.5f), row_half, i & 0x7ff);
+	float b =
+	    tex2DLayered<float>(texture, fmaf(k.k1, reciprocal(fmaxf(rest, 1e-20f)), low + 1.5f), row_half, i & 0x7ff);
 
 	return mix(b, a, left);
 }

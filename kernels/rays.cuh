@@ -30,7 +30,7 @@ struct ray {
 	float begin, end; /* between entry and exit, in slices; begin >= end: it misses the box */
 };
 
-/* kink(y) = max(root - |y| fall, 0)^3, of a ray's change of the fast coordinate per slice. */
+/* kink(y) = max(root - |y| fall, 0)^3, of a ray's change of the fast coordinate per slice; root < 1. */
 struct wandering {
 	float root, fall;
 };
@@ -44,16 +44,26 @@ static __device__ __forceinline__ wandering wander_of(float fast_step)
 	return {root, root / slope};
 }
 
+struct kinks {
+	float k0, k1;
+};
+static __device__ __forceinline__ kinks kinks_at(const wandering &w, float right)
+{
+	/* Saturation costs nothing, a maximum does. */
+	float a = __saturatef(fmaf(-right, w.fall, w.root)), b = __saturatef(fmaf(right, w.fall, w.root - w.fall));
+
+	return {a * a * a, b * b * b};
+}
+
 /* What the columns j - 1 .. j + 2 count for. */
 struct four_parts {
 	float p[4];
 };
 static __device__ __forceinline__ four_parts parts_at(const wandering &w, float right)
 {
-	float a = fmaxf(fmaf(-right, w.fall, w.root), 0.0f), b = fmaxf(fmaf(right, w.fall, w.root - w.fall), 0.0f);
-	float k0 = a * a * a, k1 = b * b * b;
+	kinks k = kinks_at(w, right);
 
-	return {k0, fmaf(-2.0f, k0, k1) + (1.0f - right), fmaf(-2.0f, k1, k0) + right, k1};
+	return {k.k0, fmaf(-2.0f, k.k0, k.k1) + (1.0f - right), fmaf(-2.0f, k.k1, k.k0) + right, k.k1};
 }
 
 static __device__ __forceinline__ float form(const float coefficients[3], float column, float row)
