@@ -60,6 +60,15 @@ test_everything_is_known_again_after_kill_9() {
 	stop_daemon
 }
 
+acknowledged_at_least() { # COUNT
+	local i
+	for ((i = 0; i < 200; i++)); do
+		[ "$(wc -l <"$work/acknowledged")" -lt "$1" ] || return 0
+		sleep 0.05
+	done
+	fail "$1 projections acknowledged within 10 s"
+}
+
 test_kill_9_in_the_middle_of_uploads_loses_nothing_that_was_acknowledged() {
 	local round k pids
 	start_daemon
@@ -75,7 +84,9 @@ test_kill_9_in_the_middle_of_uploads_loses_nothing_that_was_acknowledged() {
 				true
 			) &
 			pids+=($!)
-			[ "$k" = $((round * 15 - 6)) ] && stop_daemon KILL
+			# Half of them in peace until some are acknowledged, then the daemon dies over the others.
+			[ "$k" != $((round * 15 - 9)) ] || acknowledged_at_least $((round * 3))
+			[ "$k" != $((round * 15 - 1)) ] || stop_daemon KILL
 		done
 		wait "${pids[@]}" || true
 		start_daemon
