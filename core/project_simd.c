@@ -34,75 +34,88 @@ struct rays {
 	float step[LANES];                    /* mm a slice */
 };
 
-static const int others[3][2] = {{1, 2}, {0, 2}, {0, 1}};
-
-/* Clips the ray to the grid: source + t direction, from t = *enter to *leave.
- */
-static void ray_clip(const struct plan *plan, const double source[3], const double direction[3], double *ret_enter,
-		     double *ret_leave)
+/* Of three values, one for each axis: that of the axis a, and those of the two others b < c. */
+static inline double of_a(int a, double x, double y, double z)
 {
-	double enter = -INFINITY, leave = INFINITY;
-
-	for (int i = 0; i < 3; i++) {
-		double low = -.5 - source[i], high = plan->grid.size[i] - .5 - source[i];
-
-		if (fabs(direction[i]) < 1e-12) {
-			if (low > 0 || high < 0)
-				leave = -INFINITY;
-			continue;
-		}
-		low /= direction[i];
-		high /= direction[i];
-		enter = fmax(enter, fmin(low, high));
-		leave = fmin(leave, fmax(low, high));
-	}
-	*ret_enter = enter;
-	*ret_leave = leave;
+	return a == 0 ? x : a == 1 ? y : z;
 }
 
-static void ray_set(const struct plan *plan, const struct cpu_view *view, int column, int row, int lane,
-		    struct rays *ret)
+static inline double of_b(int a, double x, double y)
 {
-	double d[3], enter, leave, mm2 = 0, middle;
-	int a = 0, b, c;
+	return a == 0 ? y : x;
+}
 
-	for (int i = 0; i < 3; i++) {
-		double mm;
+static inline double of_c(int a, double y, double z)
+{
+	return a == 2 ? y : z;
+}
 
-		d[i] = view->pixel0[i] + column * view->column_step[i] + row * view->row_step[i];
-		mm = d[i] * plan->grid.spacing[i];
-		mm2 += mm * mm;
+/* Rays to the pixels of a line: direction + lane step from the source, in voxels; all lanes at once, in vectors. */
+static void rays_set(const struct plan *plan, const double source[3], const double direction[3], const double step[3],
+		     int lanes, struct rays *ret)
+{
+	const int *size = plan->grid.size;
+	const double *spacing = plan->grid.spacing, *s = source;
+	double d[3][LANES], enter[LANES], leave[LANES];
+
+	for (int l = 0; l < LANES; l++) { /* those behind the last repeat it */
+		enter[l] = -INFINITY;
+		leave[l] = INFINITY;
+		for (int i = 0; i < 3; i++)
+			d[i][l] = direction[i] + (l < lanes ? l : lanes - 1) * step[i];
 	}
-	for (int i = 1; i < 3; i++)
-		if (fabs(d[i]) > fabs(d[a]))
-			a = i;
-	b = others[a][0];
-	c = others[a][1];
-	middle = plan->grid.size[a] / 2;
-	ray_clip(plan, view->source, d, &enter, &leave);
-	ret->axis[lane] = leave > enter ? a : -1;
-	ret->begin[lane] = (float)(view->source[a] + (d[a] > 0 ? enter : leave) * d[a]);
-	ret->end[lane] = (float)(view->source[a] + (d[a] > 0 ? leave : enter) * d[a]);
-	ret->b_slope[lane] = (float)(d[b] / d[a]);
-	ret->c_slope[lane] = (float)(d[c] / d[a]);
-	ret->b[lane] = (float)(view->source[b] + (middle - view->source[a]) * d[b] / d[a]);
-	ret->c[lane] = (float)(view->source[c] + (middle - view->source[a]) * d[c] / d[a]);
-	ret->step[lane] = (float)(sqrt(mm2) / fabs(d[a]));
+	/* source + t d lies in the grid from t = enter to leave */
+	for (int i = 0; i < 3; i++) {
+		for (int l = 0; l < LANES; l++) {
+			const bool across = fabs(d[i][l]) < 1e-12;
+			const double inverse = 1 / d[i][l];
+			const double to_low = (-.5 - s[i]) * inverse, to_high = (size[i] - .5 - s[i]) * inverse;
+			const double first = to_low < to_high ? to_low : to_high;
+			const double last = to_low < to_high ? to_high : to_low;
+			const double never = s[i] < -.5 || s[i] > size[i] - .5 ? -INFINITY : leave[l];
+
+			enter[l] = across || enter[l] > first ? enter[l] : first;
+			leave[l] = across ? never : leave[l] < last ? leave[l] : last;
+		}
+	}
+	for (int l = 0; l < LANES; l++) {
+		const double x = d[0][l], y = d[1][l], z = d[2][l];
+		const int flat = fabs(y) > fabs(x), a = fabs(z) > fabs(flat ? y : x) ? 2 : flat;
+		const double s_a = of_a(a, s[0], s[1], s[2]), d_a = of_a(a, x, y, z), inverse = 1 / d_a;
+		const double b_slope = of_b(a, x, y) * inverse, c_slope = of_c(a, y, z) * inverse;
+		const double to_middle = of_a(a, size[0] / 2, size[1] / 2, size[2] / 2) - s_a;
+		const double at_enter = s_a + enter[l] * d_a, at_leave = s_a + leave[l] * d_a;
+		const double mm2 = x * spacing[0] * (x * spacing[0]) + y * spacing[1] * (y * spacing[1]) +
+				   z * spacing[2] * (z * spacing[2]);
+
+		ret->axis[l] = leave[l] > enter[l] ? a : -1;
+		ret->begin[l] = (float)(d_a > 0 ? at_enter : at_leave);
+		ret->end[l] = (float)(d_a > 0 ? at_leave : at_enter);
+		ret->b_slope[l] = (float)b_slope;
+		ret->c_slope[l] = (float)c_slope;
+		ret->b[l] = (float)(of_b(a, s[0], s[1]) + to_middle * b_slope);
+		ret->c[l] = (float)(of_c(a, s[1], s[2]) + to_middle * c_slope);
+		ret->step[l] = (float)(sqrt(mm2) * fabs(inverse));
+	}
 }
 
 /*
- * The lanes of one axis; the others, and those that miss the grid, follow an
- * active lane with no weight, which keeps all indices close together.
+ * The lanes of one axis, and how many they are; the others, and those that miss
+ * the grid, follow an active lane with no weight, which keeps all indices close
+ * together.
  */
-static bool rays_select(const struct rays *rays, int axis, struct rays *ret)
+static int rays_select(const struct rays *rays, int axis, struct rays *ret)
 {
-	int active = -1;
+	int active = -1, count = 0;
 
-	for (int l = 0; l < LANES; l++)
-		if (rays->axis[l] == axis)
+	for (int l = 0; l < LANES; l++) {
+		if (rays->axis[l] == axis) {
 			active = l;
-	if (active < 0)
-		return false;
+			count++;
+		}
+	}
+	if (count == 0)
+		return 0;
 	for (int l = 0; l < LANES; l++) {
 		bool on = rays->axis[l] == axis;
 		int from = on ? l : active;
@@ -114,7 +127,7 @@ static bool rays_select(const struct rays *rays, int axis, struct rays *ret)
 		ret->b_slope[l] = rays->b_slope[from];
 		ret->c_slope[l] = rays->c_slope[from];
 	}
-	return true;
+	return count;
 }
 
 /* Index of the lower of two neighbours and the weight of the upper one, held at the ends of 0 .. size - 1. */
@@ -135,6 +148,7 @@ static inline vf kink(vf y, vf slope, vf inverse)
 	return slope * (1 / 6.f) * part * part * part;
 }
 
+static const float MARGIN = 1e-3f;      /* voxels, above what single precision may err: a window has no index -1 */
 static const float SLOPE_LEAST = 1e-6f; /* below that there is no wandering, and its inverse stays finite */
 
 struct axes {
@@ -157,8 +171,8 @@ static inline vf sample_row(const float *from, vi index, vf fc, int c_next, bool
 	return vf_fma(fc, upper - lower, lower);
 }
 
-/* Sum over the slices of weight * sample; per lane. */
-static inline vf march(const struct rays *rays, const struct axes *axes, const float *volume)
+/* Slices first .. last, with whatever part of them lies inside; per lane. */
+static inline vf march(const struct rays *rays, const struct axes *axes, const float *volume, int first, int last)
 {
 	const vf begin = vf_load(rays->begin), end = vf_load(rays->end);
 	const vf b0 = vf_load(rays->b), c0 = vf_load(rays->c);
@@ -168,11 +182,8 @@ static inline vf march(const struct rays *rays, const struct axes *axes, const f
 	const vi b_stride = vi_all((int)axes->b_stride);
 	const int c_next = axes->c_size > 1 ? axes->c_stride : 0;
 	const bool pairs = axes->c_stride == 1;
-	int first = (int)floorf(vf_lowest(begin) + .5f), last = (int)ceilf(vf_highest(end) - .5f);
 	vf sum = vf_all(0);
 
-	first = first < 0 ? 0 : first;
-	last = last > axes->slices - 1 ? axes->slices - 1 : last;
 	for (int i = first; i <= last; i++) {
 		const float along = (float)(i - axes->slices / 2);
 		vf weight = vf_min(vf_all((float)i + .5f), end) - vf_max(vf_all((float)i - .5f), begin);
@@ -198,58 +209,236 @@ static inline vf march(const struct rays *rays, const struct axes *axes, const f
 	return sum;
 }
 
-static void project_rays(const struct plan *plan, const struct rays *rays, const float *volume, float *ret,
-			 float *ret_length)
+/*
+ * Pixels that are neighbours along a column of the detector cross a slice almost
+ * along z when the detector is turned but a little: then a few columns of voxels
+ * hold all samples of LANES rays, and each lane looks up its own in windows of
+ * 2 LANES of them. Positions across run one way from lane to lane, so the first
+ * and the last one bound all.
+ */
+enum { SLICES_AT_ONCE = 16 }; /* whose crossings are worked out together */
+struct crossings {
+	int columns[SLICES_AT_ONCE];              /* 2 or 3 lie beside the rays; 0: they are too far apart */
+	int b[SLICES_AT_ONCE], c[SLICES_AT_ONCE]; /* the lowest */
+};
+
+static void crossings_set(const struct rays *rays, int middle, int first, int count, struct crossings *ret)
 {
+	const float b0 = rays->b[0], b1 = rays->b[LANES - 1], c0 = rays->c[0], c1 = rays->c[LANES - 1];
+	const float b_slope0 = rays->b_slope[0], b_slope1 = rays->b_slope[LANES - 1];
+	const float c_slope0 = rays->c_slope[0], c_slope1 = rays->c_slope[LANES - 1];
+
+	for (int k = 0; k < count; k++) {
+		const float along = (float)(first + k - middle);
+		const float first_b = b0 + along * b_slope0, last_b = b1 + along * b_slope1;
+		const float first_c = c0 + along * c_slope0, last_c = c1 + along * c_slope1;
+		const float b = floorf(first_b < last_b ? first_b : last_b);
+		const float c = floorf((first_c < last_c ? first_c : last_c) - MARGIN);
+		const float across = (first_b < last_b ? last_b : first_b) - b;
+		const float length = (first_c < last_c ? last_c : first_c) - c + MARGIN;
+
+		ret->b[k] = (int)b;
+		ret->c[k] = (int)c;
+		ret->columns[k] = length >= 2 * LANES - 1 || across >= 2 ? 0 : across < 1 ? 2 : 3;
+	}
+}
+
+/* Sample at (b, c) counted from `from`, with the kinks; b lies between the first two, or three, columns. */
+static inline vf window_sample(const float *from, size_t stride, int columns, vf b, vf c, vf slope, vf inverse)
+{
+	const vf zero = vf_all(0), one = vf_all(1);
+	const vf kink0 = kink(b, slope, inverse), kink1 = kink(b - one, slope, inverse);
+	const vf kink2 = columns == 2 ? zero : kink(b - 2 * one, slope, inverse);
+	const vf hat0 = columns == 2 ? one - b : vf_max(one - b, zero);
+	const vf hat2 = columns == 2 ? zero : vf_max(b - one, zero);
+	const vf hat1 = columns == 2 ? b : one - hat0 - hat2;
+	const vf parts[5] = {kink0, hat0 - 2 * kink0 + kink1, hat1 + kink0 - 2 * kink1 + kink2,
+			     hat2 + kink1 - 2 * kink2, kink2};
+	vf upper, below = zero, above = zero;
+	vi index = vf_split(c, &upper);
+
+	from -= stride;
+	for (int k = 0; k < columns + 2; k++, from += stride) {
+		const vf low = vf_load(from), high = vf_load(from + LANES);
+
+		below = vf_fma(parts[k], vf_window(low, high, index), below);
+		above = vf_fma(parts[k], vf_window(low, high, index + 1), above);
+	}
+	return vf_fma(upper, above - below, below);
+}
+
+/* At most SLICES_AT_ONCE slices that lie whole between entry and exit and are crossed well inside; c runs along z. */
+static vf march_inside(const struct rays *rays, const struct axes *axes, const float *volume, int first, int last)
+{
+	const vf b0 = vf_load(rays->b), c0 = vf_load(rays->c);
+	const vf b_slope = vf_load(rays->b_slope), c_slope = vf_load(rays->c_slope);
+	const vf slope = vf_max(b_slope, -b_slope), inverse = 1 / vf_max(slope, vf_all(SLOPE_LEAST));
+	const int middle = axes->slices / 2;
+	struct crossings at;
+	vf sum = vf_all(0);
+
+	crossings_set(rays, middle, first, last - first + 1, &at);
+	for (int i = first; i <= last; i++) {
+		const int k = i - first;
+		const vf along = vf_all((float)(i - middle));
+		const vf b = vf_fma(along, b_slope, b0) - (float)at.b[k];
+		const vf c = vf_fma(along, c_slope, c0) - (float)at.c[k];
+		const float *from =
+		    volume + (size_t)i * axes->slice + (size_t)at.b[k] * axes->b_stride + (size_t)at.c[k];
+
+		if (at.columns[k] == 0)
+			sum += march(rays, axes, volume, i, i);
+		else if (at.columns[k] == 2)
+			sum += window_sample(from, axes->b_stride, 2, b, c, slope, inverse);
+		else
+			sum += window_sample(from, axes->b_stride, 3, b, c, slope, inverse);
+	}
+	return sum;
+}
+
+/* Narrows *first .. *last to the slices i where low <= at + slope (i - middle) <= high. */
+static void narrow(double at, double slope, int middle, double low, double high, int *first, int *last)
+{
+	double begin, end;
+
+	if (fabs(slope) < 1e-9) {
+		if (at < low || at > high)
+			*last = *first - 1;
+		return;
+	}
+	begin = ceil((slope > 0 ? low - at : high - at) / slope) + middle;
+	end = floor((slope > 0 ? high - at : low - at) / slope) + middle;
+	if (begin > *first)
+		*first = begin > *last ? *last + 1 : (int)begin;
+	if (end < *last)
+		*last = end < *first ? *first - 1 : (int)end;
+}
+
+/* LANES neighbouring rays on their way through the grid. */
+struct bundle {
+	struct rays rays;
+	float sum[LANES], length[LANES]; /* in slices */
+	int axis;                        /* of march_inside, or -1: all is done */
+	int first, last;                 /* its slices */
+};
+
+/* The slices that lie whole between all entries and exits and are crossed well inside; false: there are none. */
+static bool bundle_inside(const struct axes *axes, struct bundle *bundle)
+{
+	const struct rays *rays = &bundle->rays;
+	const int middle = axes->slices / 2;
+
+	bundle->first = (int)ceilf(vf_highest(vf_load(rays->begin)) + .5f);
+	bundle->last = (int)floorf(vf_lowest(vf_load(rays->end)) - .5f);
+	for (int l = 0; l < LANES; l += LANES - 1) { /* across one column more to either side is read */
+		narrow(rays->b[l], rays->b_slope[l], middle, 1 + MARGIN, axes->b_size - 2 - MARGIN, &bundle->first,
+		       &bundle->last);
+		narrow(rays->c[l], rays->c_slope[l], middle, MARGIN, axes->c_size - 1 - MARGIN, &bundle->first,
+		       &bundle->last);
+	}
+	return bundle->first <= bundle->last;
+}
+
+/*
+ * All that needs masks, edges or gathers; what march_inside can do is left to it.
+ * `column`: the rays are neighbours along a column of pixels.
+ */
+static void bundle_begin(const struct axes axes[3], bool column, const float *volume, struct bundle *bundle)
+{
+	vf sum = vf_all(0), length = vf_all(0);
+
+	bundle->axis = -1;
+	for (int a = 0; a < 3; a++) {
+		struct rays rays;
+		const int count = rays_select(&bundle->rays, a, &rays);
+		const vf begin = vf_load(rays.begin), end = vf_load(rays.end);
+		int first, last;
+
+		if (count == 0)
+			continue;
+		length += vf_max(end - begin, vf_all(0));
+		first = (int)floorf(vf_lowest(begin) + .5f);
+		last = (int)ceilf(vf_highest(end) - .5f);
+		first = first < 0 ? 0 : first;
+		last = last > axes[a].slices - 1 ? axes[a].slices - 1 : last;
+		if (column && a < 2 && count == LANES && bundle_inside(&axes[a], bundle)) {
+			bundle->axis = a;
+			sum += march(&rays, &axes[a], volume, first, bundle->first - 1);
+			first = bundle->last + 1;
+		}
+		sum +=
+		    a < 2 ? march(&rays, &axes[a], volume, first, last) : march(&rays, &axes[2], volume, first, last);
+	}
+	vf_store(bundle->sum, sum);
+	vf_store(bundle->length, length);
+}
+
+/*
+ * The rest, some slices at a time for all bundles: those of neighbouring columns
+ * read mostly the same voxels.
+ */
+static void bundles_end(const struct axes axes[3], const float *volume, struct bundle *bundles, int count)
+{
+	for (int a = 0; a < 2; a++) {
+		for (int begin = 0; begin < axes[a].slices; begin += SLICES_AT_ONCE) {
+			for (int k = 0; k < count; k++) {
+				struct bundle *bundle = &bundles[k];
+				const int end = begin + SLICES_AT_ONCE - 1;
+				const int first = bundle->first > begin ? bundle->first : begin;
+				const int last = bundle->last < end ? bundle->last : end;
+
+				if (bundle->axis == a && first <= last)
+					vf_store(bundle->sum,
+						 vf_load(bundle->sum) +
+						     march_inside(&bundle->rays, &axes[a], volume, first, last));
+			}
+		}
+	}
+}
+
+static void project_general(const struct plan *plan, int view_index, int column, int count, const float *volume,
+			    float *ret, float *ret_length)
+{
+	enum { TOGETHER = 8 }; /* bundles */
+	const struct cpu_view *view = &plan->view[view_index];
 	const int *size = plan->grid.size;
 	const struct axes axes[3] = {
 	    {size[0], size[1], size[2], plan->row, plan->plane, 1},
 	    {size[1], size[0], size[2], plan->plane, plan->row, 1},
 	    {size[2], size[0], size[1], 1, plan->row, (int)plan->plane},
 	};
-	const vf step = vf_load(rays->step);
-	vf sum = vf_all(0), length = vf_all(0);
-
-	for (int a = 0; a < 3; a++) {
-		struct rays selected;
-
-		if (!rays_select(rays, a, &selected))
-			continue;
-		length += vf_max(vf_load(selected.end) - vf_load(selected.begin), vf_all(0));
-		if (a < 2)
-			sum += march(&selected, &axes[a], volume);
-		else
-			sum += march(&selected, &axes[2], volume);
-	}
-	vf_store(ret, sum * step);
-	vf_store(ret_length, length * step);
-}
-
-static void project_general(const struct plan *plan, int view_index, int column, int count, const float *volume,
-			    float *ret, float *ret_length)
-{
-	const struct cpu_view *view = &plan->view[view_index];
 	const int lanes_along = plan->along_rows ? plan->rows : count;
 	const int lines = plan->along_rows ? count : plan->rows;
 	const size_t lane_stride = plan->along_rows ? 1 : (size_t)plan->rows;
 	const size_t line_stride = plan->along_rows ? (size_t)plan->rows : 1;
+	struct bundle bundles[TOGETHER];
 
-	for (int line = 0; line < lines; line++) {
+	for (int line = 0; line < lines; line += TOGETHER) {
+		const int together = lines - line < TOGETHER ? lines - line : TOGETHER;
+
 		for (int first = 0; first < lanes_along; first += LANES) {
-			struct rays rays;
-			float sum[LANES], length[LANES];
-			size_t at = (size_t)line * line_stride + (size_t)first * lane_stride;
+			for (int k = 0; k < together; k++) {
+				const int c = column + (plan->along_rows ? line + k : first);
+				const int r = plan->along_rows ? first : line + k;
+				double direction[3];
 
-			for (int l = 0; l < LANES; l++) {
-				int i = first + l < lanes_along ? first + l : lanes_along - 1;
-
-				ray_set(plan, view, column + (plan->along_rows ? line : i), plan->along_rows ? i : line,
-					l, &rays);
+				for (int i = 0; i < 3; i++)
+					direction[i] =
+					    view->pixel0[i] + c * view->column_step[i] + r * view->row_step[i];
+				rays_set(plan, view->source, direction,
+					 plan->along_rows ? view->row_step : view->column_step, lanes_along - first,
+					 &bundles[k].rays);
+				bundle_begin(axes, plan->along_rows, volume, &bundles[k]);
 			}
-			project_rays(plan, &rays, volume, sum, length);
-			for (int l = 0; l < LANES && first + l < lanes_along; l++) {
-				ret[at + (size_t)l * lane_stride] = sum[l];
-				ret_length[at + (size_t)l * lane_stride] = length[l];
+			bundles_end(axes, volume, bundles, together);
+			for (int k = 0; k < together; k++) {
+				const struct bundle *bundle = &bundles[k];
+				size_t at = (size_t)(line + k) * line_stride + (size_t)first * lane_stride;
+
+				for (int l = 0; l < LANES && first + l < lanes_along; l++, at += lane_stride) {
+					ret[at] = bundle->sum[l] * bundle->rays.step[l];
+					ret_length[at] = bundle->length[l] * bundle->rays.step[l];
+				}
 			}
 		}
 	}
