@@ -5,7 +5,7 @@
  */
 #include "core/cpu.h"
 
-#include <string.h>
+#include <stdlib.h>
 
 /* A sample as a line integral; NAN for a defect. */
 static float linear(const struct linearise *options, float sample, float flat, float dark, float saturation)
@@ -55,57 +55,107 @@ static size_t linearise_rows(struct plan *plan, const void *samples, int row, in
 	return defects;
 }
 
-/* Adds what the nearest good pixel in one direction says: weight 1 / distance. */
-static void look(const struct plan *plan, const float *view, int column, int row, int column_step, int row_step,
-		 float *sum, float *weights)
+/*
+ * Where the nearest good pixels lie, for a walk through the columns in order:
+ * for each row the last good column before this one and the first behind it.
+ * Each is looked for from where the last search ended, so that a walk takes as
+ * many looks as there are pixels, however many are bad.
+ */
+struct nearest {
+	int *before, *behind; /* [rows], columns; -1 and the number of columns: none */
+	int above, below;     /* rows of this column, likewise */
+};
+
+static void nearest_column(const struct plan *plan, int column, struct nearest *nearest)
 {
-	const size_t rows = (size_t)plan->rows;
-	int c = column + column_step, r = row + row_step, distance = 1;
+	const unsigned char *map = plan->defective + (size_t)column * (size_t)plan->rows;
 
-	for (; c >= 0 && c < plan->columns && r >= 0 && r < plan->rows; c += column_step, r += row_step, distance++) {
-		size_t at = (size_t)c * rows + (size_t)r;
-
-		if (plan->defective[at])
-			continue;
-		*sum += view[at] / (float)distance;
-		*weights += 1 / (float)distance;
-		return;
-	}
+	for (int row = 0; column > 0 && row < plan->rows; row++)
+		if (!map[row - plan->rows])
+			nearest->before[row] = column - 1;
+	nearest->above = nearest->below = -1;
 }
 
-/*
- * Replaces what has a good pixel in its row or column; those replaced are good
- * from the next pass on. After the first pass the row and the column of any good
- * pixel are whole, so the second one reaches all the rest.
- */
-static void replace_defects(struct plan *plan, float *view, size_t defects)
+static void nearest_pixel(const struct plan *plan, int column, int row, struct nearest *nearest)
+{
+	const unsigned char *map = plan->defective + (size_t)column * (size_t)plan->rows;
+	int *behind = &nearest->behind[row];
+
+	if (*behind <= column)
+		for (*behind = column + 1; *behind < plan->columns; ++*behind)
+			if (!plan->defective[(size_t)*behind * (size_t)plan->rows + (size_t)row])
+				break;
+	if (nearest->below <= row)
+		for (nearest->below = row + 1; nearest->below < plan->rows; nearest->below++)
+			if (!map[nearest->below])
+				break;
+}
+
+/* The mean of the nearest good pixels in row and column, weighted by 1 / distance; false: there is none. */
+static bool replacement(const struct plan *plan, const float *view, int column, int row, const struct nearest *nearest,
+			float *ret)
+{
+	const int at[4][2] = {{nearest->before[row], row},
+			      {nearest->behind[row], row},
+			      {column, nearest->above},
+			      {column, nearest->below}};
+	float sum = 0, weights = 0;
+
+	for (int i = 0; i < 4; i++) {
+		const int c = at[i][0], r = at[i][1];
+
+		if (c < 0 || c >= plan->columns || r < 0 || r >= plan->rows)
+			continue;
+		const float weight = 1 / (float)(abs(c - column) + abs(r - row));
+
+		sum += weight * view[(size_t)c * (size_t)plan->rows + (size_t)r];
+		weights += weight;
+	}
+	if (weights > 0)
+		*ret = sum / weights;
+	return weights > 0;
+}
+
+/* Replaces the defects that have a good pixel in their row or column; returns how many have none. */
+static size_t replace_once(struct plan *plan, float *view)
 {
 	enum { GOOD, DEFECTIVE, REPLACED };
 	const size_t pixels = (size_t)plan->columns * (size_t)plan->rows;
+	struct nearest nearest = {.before = (int *)plan->scratch, .behind = (int *)plan->scratch + plan->rows};
+	size_t left = 0;
 
-	if (defects == pixels)
-		return; /* nothing to go by: air */
-	for (int pass = 0; pass < 2; pass++) {
-		for (int column = 0; column < plan->columns; column++) {
-			for (int row = 0; row < plan->rows; row++) {
-				const size_t at = (size_t)column * (size_t)plan->rows + (size_t)row;
-				float sum = 0, weights = 0;
+	for (int row = 0; row < plan->rows; row++)
+		nearest.before[row] = nearest.behind[row] = -1;
+	for (int column = 0; column < plan->columns; column++) {
+		nearest_column(plan, column, &nearest);
+		for (int row = 0; row < plan->rows; row++) {
+			const size_t at = (size_t)column * (size_t)plan->rows + (size_t)row;
 
-				if (plan->defective[at] != DEFECTIVE)
-					continue;
-				look(plan, view, column, row, -1, 0, &sum, &weights);
-				look(plan, view, column, row, 1, 0, &sum, &weights);
-				look(plan, view, column, row, 0, -1, &sum, &weights);
-				look(plan, view, column, row, 0, 1, &sum, &weights);
-				if (weights > 0) {
-					view[at] = sum / weights;
-					plan->defective[at] = REPLACED;
-				}
+			if (plan->defective[at] == GOOD) {
+				nearest.above = row;
+				continue;
 			}
+			nearest_pixel(plan, column, row, &nearest);
+			if (replacement(plan, view, column, row, &nearest, &view[at]))
+				plan->defective[at] = REPLACED;
+			else
+				left++;
 		}
-		for (size_t i = 0; i < pixels; i++)
-			plan->defective[i] = plan->defective[i] == DEFECTIVE ? DEFECTIVE : GOOD;
 	}
+	for (size_t i = 0; i < pixels; i++)
+		plan->defective[i] = plan->defective[i] == DEFECTIVE ? DEFECTIVE : GOOD;
+	return left;
+}
+
+/*
+ * What was replaced counts as good from the next pass on. After the first one
+ * the row and the column of any good pixel are whole, so the second reaches all
+ * the rest; without a good pixel all stays 0, air.
+ */
+static void replace_defects(struct plan *plan, float *view)
+{
+	if (replace_once(plan, view) > 0)
+		replace_once(plan, view);
 }
 
 int cpu_linearise(struct plan *plan, const void *samples, int count, const int *slots, struct stack *to,
@@ -128,7 +178,7 @@ int cpu_linearise(struct plan *plan, const void *samples, int count, const int *
 			found +=
 			    linearise_rows(plan, view, row, plan->rows - row < BLOCK ? plan->rows - row : BLOCK, slot);
 		if (found > 0)
-			replace_defects(plan, slot, found);
+			replace_defects(plan, slot);
 		*defects += found;
 	}
 	return 0;

@@ -9,8 +9,11 @@
 #include <stdlib.h>
 #include <string.h>
 
-/* Of projections and three volumes: what a batch of corrections, and one of filtered views, may take. */
-static const double BATCH_SHARE = 0.05;
+/*
+ * Of projections and three volumes: what a batch of corrections, and one of
+ * filtered views, may take; FDK alone holds neither all projections nor two more volumes.
+ */
+static const double BATCH_SHARE = 0.05, BATCH_SHARE_ALONE = 0.25;
 
 /* Pixels of a column below which taking them along a row fills the lanes better. */
 enum { ALONG_LEAST = 8 };
@@ -71,7 +74,8 @@ static void plan_shape(const struct plan_options *options, struct plan *ret)
 	const struct geometry *geometry = options->geometry;
 	const struct grid *grid = options->grid;
 	const double view = (double)geometry->columns * geometry->rows;
-	const double share = BATCH_SHARE * (view * geometry->count + 3 * (double)grid_voxels(grid)) / view;
+	const double share = (options->sart != NULL ? BATCH_SHARE : BATCH_SHARE_ALONE) *
+			     (view * geometry->count + 3 * (double)grid_voxels(grid)) / view;
 
 	ret->columns = geometry->columns;
 	ret->rows = geometry->rows;
@@ -226,6 +230,32 @@ static int plan_allocate(struct plan *plan, const struct plan_options *options, 
 	return code;
 }
 
+/*
+ * Gathers reach from one ray to its neighbours with 32 bit. In a volume of 2^31
+ * voxels and more they could be too far apart, were pixels very coarse: twice
+ * what a register of them covers on the detector is allowed for.
+ */
+static int check_reach(const struct plan *plan, struct error *err)
+{
+	const double strides[3] = {(double)plan->row, (double)plan->plane, 1};
+
+	if ((double)plan->plane * plan->grid.size[1] <= INT32_MAX)
+		return 0;
+	for (int k = 0; k < plan->views; k++) {
+		const struct cpu_view *view = &plan->view[k];
+		double reach = 0;
+
+		for (int i = 0; i < 3; i++)
+			reach += strides[i] *
+				 (4 + 2 * LANES_MOST * fmax(fabs(view->column_step[i]), fabs(view->row_step[i])));
+		if (reach > INT32_MAX)
+			return error_set(err, ERR_IMPOSSIBLE,
+					 "view %d: %d pixels cover more of a grid of %zu voxels than the CPU can reach",
+					 k, LANES_MOST, grid_voxels(&plan->grid));
+	}
+	return 0;
+}
+
 int cpu_plan_new(struct device *device, const struct plan_options *options, struct plan **ret_plan, struct error *err)
 {
 	struct plan *plan = calloc(1, sizeof(*plan));
@@ -242,7 +272,9 @@ int cpu_plan_new(struct device *device, const struct plan_options *options, stru
 	}
 	for (int i = 0; i < plan->views; i++)
 		view_set(&options->geometry->views[i], &plan->grid, &plan->view[i]);
-	code = plan_widen(plan, options, err);
+	code = check_reach(plan, err);
+	if (code == 0)
+		code = plan_widen(plan, options, err);
 	if (code < 0) {
 		cpu_plan_free(plan);
 		return code;
