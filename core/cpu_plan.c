@@ -13,7 +13,7 @@
  * Of projections and three volumes: what a batch of corrections, and one of
  * filtered views, may take; FDK alone holds neither all projections nor two more volumes.
  */
-static const double BATCH_SHARE = 0.05, BATCH_SHARE_ALONE = 0.25;
+static const double BATCH_SHARE = 0.035, BATCH_SHARE_ALONE = 0.25;
 
 /* Pixels of a column below which taking them along a row fills the lanes better. */
 enum { ALONG_LEAST = 8 };

@@ -1459,6 +1459,31 @@ START_TEST(a_limit_of_memory_is_kept)
 }
 END_TEST
 
+START_TEST(what_was_said_to_be_needed_is_enough)
+{
+	struct machine list[MACHINES_MOST];
+	const int count = machines(list);
+	struct rig rig;
+
+	rig_make(&setups[_i], &rig);
+	rig.tv.method = _i % 2 ? TV_PROXIMAL : TV_GRADIENT;
+	for (int m = 0; m < count; m++) {
+		struct machine machine = list[m];
+		struct plan_bytes bytes;
+
+		rig_open(&rig, &machine);
+		ok(rig.backend->plan_bytes(rig.device, &rig.options, &bytes, &err));
+		rig_close(&rig);
+		/* iterate and copy are among the volumes; a second stack, and 64 KiB for what allocations are rounded
+		 * up to */
+		machine.options.memory_limit = bytes.volumes + bytes.scratch + bytes.raw + 2 * bytes.stack + (64 << 10);
+		rig_open(&rig, &machine);
+		rig_close(&rig);
+	}
+	rig_clear(&rig);
+}
+END_TEST
+
 static bool second_time(void *context)
 {
 	return ++*(int *)context >= 2;
@@ -1536,6 +1561,7 @@ Suite *backend_suite(void)
 	tcase_add_test(rest, saturated_words_and_lost_line_integrals_are_defects);
 	tcase_add_test(rest, bytes_are_known_beforehand);
 	tcase_add_test(rest, a_limit_of_memory_is_kept);
+	tcase_add_loop_test(rest, what_was_said_to_be_needed_is_enough, 0, SETUPS);
 	tcase_add_test(rest, cancel_is_asked_between_steps);
 	tcase_add_test(rest, freeing_nothing_is_fine);
 	suite_add_tcase(suite, operations);
