@@ -8,9 +8,19 @@ CC := gcc
 endif
 # V=1 shows the commands.
 V ?= 0
+comma := ,
 NVCC ?= nvcc
-# CUDA=0 leaves the CUDA backend out; otherwise it is built where nvcc is found.
-CUDA ?= $(if $(shell command -v $(NVCC) 2>/dev/null),1,0)
+# CUDA=0 leaves the CUDA backend out; otherwise it is built where nvcc is found and its libraries can be linked.
+# nvcc itself says where they are: the one on the PATH may be a link or a script.
+ifneq ($(CUDA),0)
+cuda_paths := $(shell $(NVCC) --dryrun -x cu -c /dev/null 2>&1 | sed -n 's/^\#\$$ LIBRARIES= *//p' | tr -d '"')
+cuda_libs  := $(cuda_paths) $(patsubst -L%,-Wl$(comma)-rpath$(comma)%,$(filter-out %/stubs,$(cuda_paths))) -lcufft -lcudart -lstdc++
+CUDA := $(shell command -v $(NVCC) >/dev/null && echo 'int main(void) { return 0; }' | \
+          $(CC) -x c - $(cuda_libs) -o /dev/null 2>/dev/null && echo 1 || echo 0)
+ifeq ($(CUDA)$(MAKELEVEL),00)
+$(info building without the CUDA backend: no nvcc with its libraries here)
+endif
+endif
 # Machine code for these cards, and PTX for later ones. CUDA_ARCH=90 for a quick build.
 CUDA_ARCH ?= 75 80 86 89 90 100 120
 SANITIZE ?=
@@ -69,8 +79,6 @@ library      := $(BUILD)/libcbct.a
 
 ifeq ($(CUDA),1)
 cuda_objects := $(patsubst %.cu,$(BUILD)/%.o,$(wildcard kernels/*.cu))
-cuda_home    := $(patsubst %/bin/nvcc,%,$(realpath $(shell command -v $(NVCC))))
-cuda_libs    := -L$(cuda_home)/lib64 -Wl,-rpath,$(cuda_home)/lib64 -lcufft -lcudart -lstdc++
 cuda_code    := $(foreach a,$(CUDA_ARCH),-gencode arch=compute_$(a),code=sm_$(a)) \
                 -gencode arch=compute_$(lastword $(CUDA_ARCH)),code=compute_$(lastword $(CUDA_ARCH))
 endif
@@ -104,7 +112,7 @@ $(BUILD)/cbctd: $(call objects,$(daemon_sources)) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(daemon_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
 $(BUILD)/cbct-worker: $(call objects,daemon/worker.c) $(library) $(cuda_objects)
-	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(cuda_libs) $(LIBM)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(if $(cuda_objects),$(cuda_libs)) $(LIBM)
 
 $(BUILD)/cbct: $(call objects,$(cbct_sources)) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(cbct_libs) $(proto_libs) $(core_libs)) $(LIBM)
@@ -121,7 +129,7 @@ $(BUILD)/watchers: $(call objects,tests/bench/watchers.c)
 # The GPU's checks and benchmarks need the mathematics and the kernels only, so that they run on a bare machine.
 gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench
 $(gpu_programs): $(BUILD)/%: $(call objects,tests/bench/%.c tests/bench/gpu_scene.c) $(core_objects) $(cuda_objects)
-	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(cuda_libs) $(LIBM)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(if $(cuda_objects),$(cuda_libs)) $(LIBM)
 
 $(BUILD)/gpu_ceilings: tests/bench/gpu_ceilings.cu
 	@mkdir -p $(@D)
