@@ -118,7 +118,7 @@ while :; do
 	[ "$line" = "$shown" ] || echo "$line"
 	shown=$line
 	state=$(jq -r .state "$out/job-now.json")
-	for name in $(curl -sS "$url/v1/jobs/$job/volumes" | jq -r '.volumes[].name'); do
+	for name in $(curl -sS "$url/v1/jobs/$job/volumes" | jq -r '.volumes | reverse | .[].name'); do
 		[[ $fetched == *" $name "* ]] && continue
 		run curl -sS --fail-with-body "$url/v1/jobs/$job/volumes/$name" -o "$out/$name.nii"
 		fetched+="$name "
