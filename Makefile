@@ -10,6 +10,8 @@ endif
 V ?= 0
 comma := ,
 NVCC ?= nvcc
+# Debian's own, which sees Debian's modules.
+PYTHON ?= /usr/bin/python3
 # CUDA=0 leaves the CUDA backend out; otherwise it is built where nvcc is found and its libraries can be linked.
 # nvcc itself says where they are: the one on the PATH may be a link or a script.
 ifneq ($(CUDA),0)
@@ -33,6 +35,8 @@ PACKAGES := libmicrohttpd:libmicrohttpd-dev libcjson:libcjson-dev libzstd:libzst
             kissfft-float:libkissfft-dev libpng:libpng-dev libcurl:libcurl4-openssl-dev libcrypto:libssl-dev \
             check:check
 COMMANDS := gcc:gcc pkg-config:pkg-config curl:curl jq:jq zstd:zstd openssl:openssl pgrep:procps sqlite3:sqlite3
+# Of Python: yaml for the build, the others for tests.
+MODULES  := yaml:python3-yaml jsonschema:python3-jsonschema numpy:python3-numpy requests:python3-requests
 
 core_libs   := kissfft-float
 proto_libs  := libcjson libzstd libcrypto libpng
@@ -108,7 +112,14 @@ $(library): $(core_objects) $(call objects,$(proto_sources))
 	@rm -f $@
 	$(call say,AR  )$(AR) rcs $@ $^
 
-$(BUILD)/cbctd: $(call objects,$(daemon_sources)) $(library)
+$(BUILD)/proto/openapi.c: proto/openapi.py proto/openapi.yaml
+	@mkdir -p $(@D)
+	$(call say,YAML)$(PYTHON) $^ >$@.part && mv $@.part $@
+
+$(BUILD)/proto/openapi.o: $(BUILD)/proto/openapi.c
+	$(call say,CC  )$(CC) $(CFLAGS) -c -o $@ $<
+
+$(BUILD)/cbctd: $(call objects,$(daemon_sources)) $(BUILD)/proto/openapi.o $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(daemon_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
 $(BUILD)/cbct-worker: $(call objects,daemon/worker.c) $(library) $(cuda_objects)
@@ -139,6 +150,7 @@ setup: ## install the Debian packages that are missing
 	@missing=""; \
 	for pair in $(COMMANDS); do command -v $${pair%%:*} >/dev/null 2>&1 || missing="$$missing $${pair##*:}"; done; \
 	for pair in $(PACKAGES); do pkg-config --exists $${pair%%:*} 2>/dev/null || missing="$$missing $${pair##*:}"; done; \
+	for pair in $(MODULES); do $(PYTHON) -c "import $${pair%%:*}" 2>/dev/null || missing="$$missing $${pair##*:}"; done; \
 	[ -z "$$missing" ] && exit 0; \
 	echo "installing:$$missing"; \
 	run=""; [ "$$(id -u)" = 0 ] || run="sudo -n"; \

@@ -61,6 +61,7 @@ int live_get(void *context, struct request *request, struct error *err);
 int ready_get(void *context, struct request *request, struct error *err);
 int metrics_get(void *context, struct request *request, struct error *err);
 int device_list(void *context, struct request *request, struct error *err);
+int schema_get(void *context, struct request *request, struct error *err);
 
 /* ---- what several of them need: api_common.c ---- */
 enum { PAGE_DEFAULT = 100, PAGE_MAX = 1000 };
@@ -81,7 +82,7 @@ struct entity {
 	const char *etag; /* quoted, strong */
 	uint64_t size;    /* UNKNOWN_SIZE: no ranges */
 	const char *media_type;
-	const char *filename;
+	const char *filename; /* NULL: none, it is shown where it is asked for */
 };
 /*
  * If-None-Match, Range and If-Range. *ret_done: the reply is set (304, 416);

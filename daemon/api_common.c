@@ -109,7 +109,8 @@ int entity_select(struct request *request, const struct entity *entity, struct s
 void entity_headers(struct request *request, const struct entity *entity, const struct selection *selection)
 {
 	request_reply_header(request, "Content-Type", "%s", entity->media_type);
-	request_reply_header(request, "Content-Disposition", "attachment; filename=\"%s\"", entity->filename);
+	if (entity->filename != NULL)
+		request_reply_header(request, "Content-Disposition", "attachment; filename=\"%s\"", entity->filename);
 	request_reply_header(request, "ETag", "%s", entity->etag);
 	request_reply_header(request, "Vary", "Accept-Encoding");
 	request_reply_header(request, "Cache-Control", "private, no-cache");

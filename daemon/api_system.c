@@ -1,10 +1,11 @@
-/* /livez, /readyz, /metrics, /v1/devices */
+/* /livez, /readyz, /metrics, /v1/devices, /v1/openapi.json */
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
 #include "daemon/api.h"
 #include "daemon/document.h"
+#include "proto/openapi.h"
 
 enum { WORKERS_MAX = 64 };
 
@@ -40,6 +41,22 @@ int device_list(void *context, struct request *request, struct error *err)
 	for (int i = 0; i < count && i < WORKERS_MAX; i++)
 		cJSON_AddItemToArray(list, worker_document(&workers[i]));
 	return request_reply_json(request, 200, document, err);
+}
+
+int schema_get(void *context, struct request *request, struct error *err)
+{
+	const struct entity entity = {
+	    .etag = openapi_json_etag, .size = UNKNOWN_SIZE, .media_type = "application/json"};
+	struct selection selection;
+	bool done;
+
+	(void)context;
+	if (entity_select(request, &entity, &selection, &done, err) != 0 || done)
+		return done ? 0 : err->code;
+	if (request_reply_constant(request, 200, openapi_json, openapi_json_size, err) != 0)
+		return err->code;
+	entity_headers(request, &entity, &selection);
+	return 0;
 }
 
 /* ---- metrics, in Prometheus' text format ---- */

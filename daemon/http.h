@@ -109,6 +109,8 @@ int request_reply_json(struct request *request, int status, cJSON *value, struct
 int request_reply_text(struct request *request, int status, const char *media_type, char *text, size_t length,
 		       struct error *err);
 int request_reply_empty(struct request *request, int status, struct error *err);
+/* Bytes that stay where they are for as long as the program runs. */
+int request_reply_constant(struct request *request, int status, const void *data, size_t length, struct error *err);
 /* Takes the descriptor, on failure too. Sent by the kernel alone. */
 int request_reply_file(struct request *request, int status, int descriptor, uint64_t offset, uint64_t size,
 		       struct error *err);

@@ -110,6 +110,14 @@ int request_reply_empty(struct request *request, int status, struct error *err)
 			    err);
 }
 
+int request_reply_constant(struct request *request, int status, const void *data, size_t length, struct error *err)
+{
+	/* The library never writes to what is persistent. */
+	return set_response(request, status,
+			    MHD_create_response_from_buffer(length, (void *)(uintptr_t)data, MHD_RESPMEM_PERSISTENT),
+			    length, err);
+}
+
 int request_reply_file(struct request *request, int status, int descriptor, uint64_t offset, uint64_t size,
 		       struct error *err)
 {
