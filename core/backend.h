@@ -54,7 +54,37 @@ struct linearise {
 	const float *flat; /* [row][column] counts, or NULL; host memory that outlives the plan */
 	const float *dark; /* [row][column] counts, or NULL for none */
 	double saturation; /* counts at and above this are defects; 0 = 65535 for uint16, none for float32 */
+	/* [row][column], not zero: a defect in every view; NULL for none. Given and found ones alike (core/defects.h).
+	 */
+	const unsigned char *defects;
+	/*
+	 * First column, first row, last column, last row, all included: the mean
+	 * transmission (I - dark) / (flat - dark) there, defects left out, is each view's
+	 * own air, so that p is 0 where the mean is. For QUANTITY_INTENSITY only.
+	 */
+	bool has_air_region;
+	int air_region[4];
+	/* p' = sum over k of hardening[k] p^k, the last step before defects are replaced; count 0 for none. */
+	const double *hardening;
+	int hardening_count;
 };
+enum { HARDENING_MOST = 8 }; /* coefficients */
+
+/* What linearise met, added up and never reset. A pixel counts once, in the first row that fits. */
+struct defect_counts {
+	size_t mapped;     /* pixels of the map */
+	size_t not_finite; /* NaN, infinite, or no flat above the dark to hold it against */
+	size_t saturated;
+	size_t zero; /* nothing above the dark */
+	int blank;   /* views without one good pixel: all of their slot is 0, and says nothing */
+	int no_air;  /* views whose air region has no good pixel: taken against the flat as they are */
+	/* The least and the most of the air regions' means so far; both 0 before the first. */
+	float air_least, air_most;
+};
+static inline size_t defects_total(const struct defect_counts *counts)
+{
+	return counts->mapped + counts->not_finite + counts->saturated + counts->zero;
+}
 
 /*
  * TV in gray levels u = v / unit. Differences are weighted by (smallest spacing
@@ -97,9 +127,20 @@ struct plan_options {
 	 * reads stacks of pad[0] + columns + pad[1] columns. 0 but for displaced detectors.
 	 */
 	int pad[2];
+	/*
+	 * Columns by which `filter` extends truncated rows on either side before the
+	 * ramp, see there; 0: none. filter_response is then that of filter_length(padded columns + extend).
+	 */
+	int extend;
 	const struct sart_options *sart; /* NULL: no SART */
-	const struct tv_options *tv;     /* NULL: no TV */
-	bool reference_precision;        /* float everywhere; otherwise storage may be packed within the stated bound */
+	/*
+	 * SART's forward and backward weights are those of one matrix and its exact
+	 * transpose: `project` and plain `backproject` are matched then. FDK's
+	 * backprojection stays the interpolating one.
+	 */
+	bool matched;
+	const struct tv_options *tv; /* NULL: no TV */
+	bool reference_precision;    /* float everywhere; otherwise storage may be packed within the stated bound */
 };
 
 /* Bytes, known before anything is allocated. */
@@ -170,17 +211,23 @@ struct backend {
 
 	/*
 	 * Raw samples of `count` views -> line integrals in the slots named by `slots`.
-	 * Defects (zero, negative, saturated, not finite) are replaced from their
-	 * neighbours in the row and column and added to *defects, never reset.
+	 * Defects (of the map, zero, negative, saturated, not finite) are replaced from
+	 * their neighbours in the row and column and counted.
 	 */
 	int (*linearise)(struct plan *plan, const void *samples, int count, const int *slots, struct stack *to,
-			 size_t *defects, struct error *err);
+			 struct defect_counts *counts, struct error *err);
 	/*
 	 * q = ramp of weights and cosine times p: view views[i] from slot slots[i] of `from` into slot i of `to`.
 	 * slots NULL: slot = view. FDK alone keeps no stack of all views, its slots are those of one batch.
+	 * With plan_options.extend each row is looked at by itself on either side, see core/extend.h.
 	 */
 	int (*filter)(struct plan *plan, const struct stack *from, const int *slots, const int *views, int count,
 		      struct stack *to, struct error *err);
+	/*
+	 * Rows that `filter` has extended since the plan was made: before column 0 and
+	 * behind the last one. Waits for the device, so that `filter` need not.
+	 */
+	int (*filter_extended)(struct plan *plan, size_t ret_rows[2], struct error *err);
 	/* volume += sum over i of (weight) * slot i, seen from views[i]. Bilinear; outside of the detector is 0. */
 	int (*backproject)(struct plan *plan, const struct stack *from, const int *views, int count,
 			   enum backprojection weight, struct volume *to, struct error *err);

@@ -388,6 +388,7 @@ const struct backend backend_cpu = {
     .plan_batch = cpu_plan_batch,
     .linearise = cpu_linearise,
     .filter = cpu_filter,
+    .filter_extended = cpu_filter_extended,
     .backproject = cpu_backproject,
     .project = cpu_project,
     .sart_iterate = cpu_sart_iterate,

@@ -85,6 +85,7 @@ struct plan {
 	 */
 	struct plan *filtered;
 	int filter_batch; /* views that FDK should filter at once */
+	size_t extended[2]; /* rows that `filter` has extended on either side */
 
 	struct sart_options sart;
 	int batch;           /* views whose corrections are held at once; 0 without SART */
@@ -221,7 +222,7 @@ int cpu_plan_batch(const struct plan *plan);
 
 /* cpu_linearise.c */
 int cpu_linearise(struct plan *plan, const void *samples, int count, const int *slots, struct stack *to,
-		  size_t *defects, struct error *err);
+		  struct defect_counts *counts, struct error *err);
 
 /* cpu_filter.c */
 size_t filter_engine_bytes(const struct plan_options *options, int threads);
@@ -230,6 +231,7 @@ int filter_engine_new(const struct plan_options *options, int threads, struct fi
 void filter_engine_free(struct filter_engine *engine);
 int cpu_filter(struct plan *plan, const struct stack *from, const int *slots, const int *views, int count,
 	       struct stack *to, struct error *err);
+int cpu_filter_extended(struct plan *plan, size_t ret_rows[2], struct error *err);
 
 /* cpu_project.c */
 int cpu_project(struct plan *plan, const struct volume *from, const int *views, int count, struct stack *to,

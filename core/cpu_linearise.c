@@ -1,24 +1,23 @@
 /*
- * Raw samples to line integrals, p = -ln((I - dark) / (flat - dark)), turned to
- * [column][row]; pixels that say nothing are replaced from the nearest good ones
- * in their row and column.
+ * Raw samples to line integrals in one pass, turned to [column][row]:
+ *
+ *   p  = -ln((I - dark) / (a (flat - dark))),  a the view's own air (1 without an air region),
+ *   p' = hardening[0] + hardening[1] p + hardening[2] p^2 + ...
+ *
+ * Pixels that say nothing, and those of the map, are replaced from the nearest
+ * good ones in their row and column.
  */
 #include "core/cpu.h"
 
 #include <stdlib.h>
 
-/* A sample as a line integral; NAN for a defect. */
-static float linear(const struct linearise *options, float sample, float flat, float dark, float saturation)
-{
-	float above, range;
+/* What a pixel is; all but GOOD are defects, struct defect_counts says which. */
+enum kind { GOOD, MAPPED, NOT_FINITE, SATURATED, ZERO, KIND_COUNT };
 
-	if (options->quantity == QUANTITY_LINE_INTEGRAL)
-		return isfinite(sample) ? sample : NAN;
-	above = sample - dark;
-	range = flat - dark;
-	if (!(above > 0) || !(range > 0) || !(sample < saturation) || !isfinite(range))
-		return NAN;
-	return -logf(above / range);
+/* The sample at `at`, [row][column] of one view. */
+static float sample_at(const struct linearise *options, const void *samples, size_t at)
+{
+	return options->sample == SAMPLE_UINT16 ? ((const uint16_t *)samples)[at] : ((const float *)samples)[at];
 }
 
 static float saturation_of(const struct linearise *options)
@@ -28,31 +27,91 @@ static float saturation_of(const struct linearise *options)
 	return options->sample == SAMPLE_UINT16 ? 65535 : INFINITY;
 }
 
-/* Rows row .. row + count - 1 of one view; returns the number of defects. */
-static size_t linearise_rows(struct plan *plan, const void *samples, int row, int count, float *ret_view)
+/* (I - dark) / (flat - dark); anything for a defect. */
+static enum kind transmission(const struct linearise *options, float sample, size_t at, float saturation, float *ret)
+{
+	const float flat = options->flat != NULL ? options->flat[at] : (float)options->air;
+	const float dark = options->dark != NULL ? options->dark[at] : 0;
+	const float above = sample - dark, range = flat - dark;
+
+	*ret = above / range;
+	if (!isfinite(sample) || !isfinite(range) || !(range > 0))
+		return NOT_FINITE;
+	if (!(sample < saturation))
+		return SATURATED;
+	return above > 0 ? GOOD : ZERO;
+}
+
+/* A sample as a line integral; `air` is that of the view. */
+static enum kind linear(const struct linearise *options, float sample, size_t at, float saturation, float air,
+			float *ret)
+{
+	enum kind kind = GOOD;
+	float p = sample, sum = 0;
+
+	if (options->defects != NULL && options->defects[at]) {
+		*ret = 0;
+		return MAPPED;
+	}
+	if (options->quantity == QUANTITY_INTENSITY) {
+		kind = transmission(options, sample, at, saturation, &p);
+		p = -logf(p / air);
+	}
+	if (options->hardening_count > 0) {
+		for (int k = options->hardening_count - 1; k >= 0; k--)
+			sum = sum * p + (float)options->hardening[k];
+		p = sum;
+	}
+	if (kind == GOOD && !isfinite(p))
+		kind = NOT_FINITE;
+	*ret = kind == GOOD ? p : 0;
+	return kind;
+}
+
+/* The view's air: the mean transmission of its air region's good pixels; 0 where it has none. */
+static double air_of(const struct plan *plan, const void *samples)
+{
+	const struct linearise *options = &plan->linearise;
+	const int *region = options->air_region;
+	const float saturation = saturation_of(options);
+	double sum = 0;
+	size_t good = 0;
+
+	for (int row = region[1]; row <= region[3]; row++) {
+		for (int column = region[0]; column <= region[2]; column++) {
+			const size_t at = (size_t)row * (size_t)plan->columns + (size_t)column;
+			float value;
+
+			if (options->defects != NULL && options->defects[at])
+				continue;
+			if (transmission(options, sample_at(options, samples, at), at, saturation, &value) != GOOD)
+				continue;
+			sum += (double)value;
+			good++;
+		}
+	}
+	return good > 0 ? sum / (double)good : 0;
+}
+
+/* Rows row .. row + count - 1 of one view; adds up each kind of pixel. */
+static void linearise_rows(struct plan *plan, const void *samples, int row, int count, float air, float *ret_view,
+			   size_t kinds[KIND_COUNT])
 {
 	const struct linearise *options = &plan->linearise;
 	const float saturation = saturation_of(options);
 	const size_t rows = (size_t)plan->rows;
-	size_t defects = 0;
 
 	for (int column = 0; column < plan->columns; column++) {
 		for (int r = row; r < row + count; r++) {
 			const size_t from = (size_t)r * (size_t)plan->columns + (size_t)column;
 			const size_t to = (size_t)column * rows + (size_t)r;
-			const float sample = options->sample == SAMPLE_UINT16 ? ((const uint16_t *)samples)[from]
-									      : ((const float *)samples)[from];
-			const float flat = options->flat != NULL ? options->flat[from] : (float)options->air;
-			const float dark = options->dark != NULL ? options->dark[from] : 0;
-			const float p = linear(options, sample, flat, dark, saturation);
-			const bool defective = !isfinite(p);
+			const enum kind kind =
+			    linear(options, sample_at(options, samples, from), from, saturation, air, &ret_view[to]);
 
-			ret_view[to] = defective ? 0 : p;
-			plan->defective[to] = defective;
-			defects += defective;
+			plan->defective[to] = kind != GOOD;
+			kinds[kind]++;
 		}
 	}
-	return defects;
 }
 
 /*
@@ -119,7 +178,7 @@ static bool replacement(const struct plan *plan, const float *view, int column, 
 /* Replaces the defects that have a good pixel in their row or column; returns how many have none. */
 static size_t replace_once(struct plan *plan, float *view)
 {
-	enum { GOOD, DEFECTIVE, REPLACED };
+	enum { WHOLE, DEFECTIVE, REPLACED };
 	const size_t pixels = (size_t)plan->columns * (size_t)plan->rows;
 	struct nearest nearest = {.before = (int *)plan->scratch, .behind = (int *)plan->scratch + plan->rows};
 	size_t left = 0;
@@ -131,7 +190,7 @@ static size_t replace_once(struct plan *plan, float *view)
 		for (int row = 0; row < plan->rows; row++) {
 			const size_t at = (size_t)column * (size_t)plan->rows + (size_t)row;
 
-			if (plan->defective[at] == GOOD) {
+			if (plan->defective[at] == WHOLE) {
 				nearest.above = row;
 				continue;
 			}
@@ -143,7 +202,7 @@ static size_t replace_once(struct plan *plan, float *view)
 		}
 	}
 	for (size_t i = 0; i < pixels; i++)
-		plan->defective[i] = plan->defective[i] == DEFECTIVE ? DEFECTIVE : GOOD;
+		plan->defective[i] = plan->defective[i] == DEFECTIVE ? DEFECTIVE : WHOLE;
 	return left;
 }
 
@@ -158,28 +217,54 @@ static void replace_defects(struct plan *plan, float *view)
 		replace_once(plan, view);
 }
 
+static void count_defects(struct defect_counts *counts, const size_t kinds[KIND_COUNT])
+{
+	counts->mapped += kinds[MAPPED];
+	counts->not_finite += kinds[NOT_FINITE];
+	counts->saturated += kinds[SATURATED];
+	counts->zero += kinds[ZERO];
+	counts->blank += kinds[GOOD] == 0;
+}
+
+static void count_air(struct defect_counts *counts, float air)
+{
+	if (!(air > 0)) {
+		counts->no_air++;
+		return;
+	}
+	if (air < counts->air_least || counts->air_least == 0)
+		counts->air_least = air;
+	if (air > counts->air_most)
+		counts->air_most = air;
+}
+
 int cpu_linearise(struct plan *plan, const void *samples, int count, const int *slots, struct stack *to,
-		  size_t *defects, struct error *err)
+		  struct defect_counts *counts, struct error *err)
 {
 	enum { BLOCK = 16 };
 	const size_t pixels = (size_t)plan->columns * (size_t)plan->rows;
 	const size_t sample = plan->linearise.sample == SAMPLE_UINT16 ? sizeof(uint16_t) : sizeof(float);
+	const int rows = plan->rows;
 
 	for (int i = 0; i < count; i++) {
 		const char *view = (const char *)samples + (size_t)i * pixels * sample;
-		size_t found = 0;
-		float *slot;
+		size_t kinds[KIND_COUNT] = {0};
+		float *slot, air = 1;
 
 		if (slots[i] < 0 || slots[i] >= to->slots)
 			return error_set(err, ERR_INTERNAL, "slot %d of a stack of %d", slots[i], to->slots);
 		slot = to->data + (size_t)slots[i] * pixels;
-#pragma omp parallel for num_threads(plan->device->threads) reduction(+ : found)
-		for (int row = 0; row < plan->rows; row += BLOCK)
-			found +=
-			    linearise_rows(plan, view, row, plan->rows - row < BLOCK ? plan->rows - row : BLOCK, slot);
-		if (found > 0)
+		if (plan->linearise.has_air_region) {
+			air = (float)air_of(plan, view);
+			count_air(counts, air);
+			air = air > 0 ? air : 1;
+		}
+#pragma omp parallel for num_threads(plan->device->threads) reduction(+ : kinds[:KIND_COUNT])
+		for (int row = 0; row < rows; row += BLOCK)
+			linearise_rows(plan, view, row, rows - row < BLOCK ? rows - row : BLOCK, air, slot, kinds);
+		if (kinds[GOOD] < pixels)
 			replace_defects(plan, slot);
-		*defects += found;
+		count_defects(counts, kinds);
 	}
 	return 0;
 }

@@ -39,7 +39,7 @@ struct recon {
 
 	unsigned char *pushed; /* [views] */
 	int pushed_count;
-	size_t defects;      /* samples */
+	struct defect_counts defects;
 	int defective_views; /* views with any */
 
 	bool resumed, ran;
@@ -311,10 +311,11 @@ static void warn_of_the_input(struct recon *recon)
 
 	if (recon->hooks->warning == NULL)
 		return;
-	if (recon->defects > 0) {
+	if (defects_total(&recon->defects) > 0) {
 		snprintf(detail, sizeof(detail),
-			 "%zu samples (%.3g %%) in %d projections were replaced from their neighbours", recon->defects,
-			 100.0 * (double)recon->defects / (double)samples, recon->defective_views);
+			 "%zu samples (%.3g %%) in %d projections were replaced from their neighbours",
+			 defects_total(&recon->defects),
+			 100.0 * (double)defects_total(&recon->defects) / (double)samples, recon->defective_views);
 		recon->hooks->warning(recon->hooks->context, "defects", detail);
 	}
 	if (recon->recipe.fdk.on && recon->orbit.arc_too_short) {
@@ -350,19 +351,18 @@ static int check_views(const struct recon *recon, const int *views, int count, s
 static int push_view(struct recon *recon, const void *samples, int view, struct error *err)
 {
 	int slot = recon->recipe.sart.on ? view : recon->fdk.pending, code;
-	size_t defects = 0;
+	size_t before = defects_total(&recon->defects);
 
 	/* Again here: the list of one call may name a view twice. */
 	if (recon->pushed[view])
 		return error_set(err, ERR_CONFLICT, "view %d came a second time", view);
 	/* One by one, so that the projections with defects can be counted. */
-	code = recon->backend->linearise(recon->plan, samples, 1, &slot, recon->projections, &defects, err);
+	code = recon->backend->linearise(recon->plan, samples, 1, &slot, recon->projections, &recon->defects, err);
 	if (code < 0)
 		return code;
 	recon->pushed[view] = 1;
 	recon->pushed_count++;
-	recon->defects += defects;
-	recon->defective_views += defects > 0;
+	recon->defective_views += defects_total(&recon->defects) > before;
 	recon->work_done += WORK_LOAD / recon->geometry->count;
 	if (!fdk_runs(recon))
 		return 0;
@@ -585,7 +585,7 @@ int recon_iteration(const struct recon *recon)
 
 size_t recon_defects(const struct recon *recon)
 {
-	return recon->defects;
+	return defects_total(&recon->defects);
 }
 
 const char *recon_plan(const struct recon *recon)

@@ -166,6 +166,7 @@ const struct backend backend_cuda = {
     .plan_batch = cuda_plan_batch,
     .linearise = cuda_linearise,
     .filter = cuda_filter,
+    .filter_extended = cuda_filter_extended,
     .backproject = cuda_backproject,
     .project = cuda_project,
     .sart_iterate = cuda_sart_iterate,

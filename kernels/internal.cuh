@@ -245,7 +245,7 @@ struct plan {
 	cudaEvent_t asked, linearised;
 	float *flat, *dark;
 	unsigned char *marks[2];     /* defects of one view */
-	unsigned long long *defects; /* device */
+	unsigned long long *defects; /* device, counters of linearise.cu */
 
 	/* A whole SART iteration, recorded at its first run for this volume and this stack. */
 	cudaGraphExec_t sweep;
@@ -326,7 +326,9 @@ static inline int cancel_check(const struct cancel *cancel, struct error *err)
 
 /* ---- the operations of the table ---- */
 int cuda_linearise(struct plan *plan, const void *samples, int count, const int *slots, struct stack *to,
-		   size_t *defects, struct error *err);
+		   struct defect_counts *counts, struct error *err);
+size_t linearise_counters_bytes(void);
+int cuda_filter_extended(struct plan *plan, size_t ret_rows[2], struct error *err);
 int cuda_filter(struct plan *plan, const struct stack *from, const int *slots, const int *views, int count,
 		struct stack *to, struct error *err);
 int cuda_backproject(struct plan *plan, const struct stack *from, const int *views, int count,

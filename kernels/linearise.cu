@@ -20,11 +20,14 @@ struct samples {
 	int columns, rows;
 };
 
+/* Order of plan->defects. */
+enum { NOT_FINITE, SATURATED, ZERO, BLANK, COUNTERS };
+
 /* One view: [row][column] into a slot, and a mark for each defect. */
 static __global__ void __launch_bounds__(256)
     to_integrals(const samples s, float *slot, int pitch, unsigned char *marks, unsigned long long *defects)
 {
-	int column = blockIdx.x * 32 + threadIdx.x, row = blockIdx.y * 8 + threadIdx.y;
+	int column = blockIdx.x * 32 + threadIdx.x, row = blockIdx.y * 8 + threadIdx.y, kind = NOT_FINITE;
 	bool inside = column < s.columns && row < s.rows, good = true;
 
 	if (inside) {
@@ -38,14 +41,15 @@ static __global__ void __launch_bounds__(256)
 
 			value = -logf(above / range);
 			good = above > 0 && range > 0 && sample < s.saturation && isfinite(range);
+			if (isfinite(sample) && range > 0 && isfinite(range))
+				kind = sample >= s.saturation ? SATURATED : ZERO;
 		}
 		good = good && isfinite(value);
 		slot[(size_t)row * pitch + column] = good ? value : 0.0f;
 		marks[at] = !good;
 	}
-	int found = __syncthreads_count(!good);
-	if (threadIdx.x == 0 && threadIdx.y == 0 && found > 0)
-		atomicAdd(defects, (unsigned long long)found);
+	if (!good)
+		atomicAdd(defects + kind, 1ull); /* defects are rare */
 }
 
 /* What the nearest good pixel in one direction says. */
@@ -64,9 +68,13 @@ static __device__ void look(const samples &s, const float *slot, int pitch, cons
 	}
 }
 
-/* Only marked pixels are written and only unmarked ones read. */
+/*
+ * Only marked pixels are written and only unmarked ones read. A pixel that is
+ * marked after the second pass (the one with `defects`) is of a view without a good one.
+ */
 static __global__ void __launch_bounds__(256)
-    replace(const samples s, float *slot, int pitch, const unsigned char *marks, unsigned char *ret_marks)
+    replace(const samples s, float *slot, int pitch, const unsigned char *marks, unsigned char *ret_marks,
+	    unsigned long long *defects)
 {
 	int column = blockIdx.x * 32 + threadIdx.x, row = blockIdx.y * 8 + threadIdx.y;
 	float sum = 0, weights = 0;
@@ -86,6 +94,13 @@ static __global__ void __launch_bounds__(256)
 		}
 	}
 	ret_marks[at] = mark;
+	if (mark && at == 0 && defects != NULL)
+		atomicAdd(defects + BLANK, 1ull);
+}
+
+size_t linearise_counters_bytes(void)
+{
+	return COUNTERS * sizeof(unsigned long long);
 }
 
 static samples samples_make(const struct plan *plan)
@@ -119,9 +134,10 @@ static int linearise_piece(struct plan *plan, const void *raw, int count, const 
 		s.raw = (const char *)raw + (size_t)i * pixels * sample;
 		to_integrals<<<blocks, threads, 0, stream>>>(s, slot, to->shape.pitch, plan->marks[0], plan->defects);
 		LAUNCHED();
-		replace<<<blocks, threads, 0, stream>>>(s, slot, to->shape.pitch, plan->marks[0], plan->marks[1]);
+		replace<<<blocks, threads, 0, stream>>>(s, slot, to->shape.pitch, plan->marks[0], plan->marks[1], NULL);
 		LAUNCHED();
-		replace<<<blocks, threads, 0, stream>>>(s, slot, to->shape.pitch, plan->marks[1], plan->marks[0]);
+		replace<<<blocks, threads, 0, stream>>>(s, slot, to->shape.pitch, plan->marks[1], plan->marks[0],
+							plan->defects);
 		LAUNCHED();
 	}
 	return 0;
@@ -143,11 +159,11 @@ static void copy_to_pinned(char *to, const char *from, size_t bytes)
 }
 
 int cuda_linearise(struct plan *plan, const void *samples, int count, const int *slots, struct stack *to,
-		   size_t *defects, struct error *err)
+		   struct defect_counts *counts, struct error *err)
 {
 	struct device *device = plan->device;
 	size_t view = plan->bytes.raw;
-	unsigned long long found = 0;
+	unsigned long long found[COUNTERS];
 
 	for (int i = 0; i < count; i++)
 		if (slots[i] < 0 || slots[i] >= to->slots)
@@ -155,7 +171,7 @@ int cuda_linearise(struct plan *plan, const void *samples, int count, const int 
 	TRY(device_enter(device, err));
 	/* What was asked for before may still read these slots. */
 	CUDA_TRY(cudaEventRecord(plan->asked, device->stream));
-	CUDA_TRY(cudaMemsetAsync(plan->defects, 0, sizeof(*plan->defects), device->copy));
+	CUDA_TRY(cudaMemsetAsync(plan->defects, 0, linearise_counters_bytes(), device->copy));
 	for (int done = 0; done < count; done += plan->raw_views) {
 		int half = plan->raw_next, now = count - done < plan->raw_views ? count - done : plan->raw_views;
 		size_t bytes = view * (size_t)now;
@@ -170,10 +186,13 @@ int cuda_linearise(struct plan *plan, const void *samples, int count, const int 
 			CUDA_TRY(cudaStreamWaitEvent(device->copy, plan->asked, 0));
 		TRY(linearise_piece(plan, plan->raw[half], now, slots + done, to, err));
 	}
-	CUDA_TRY(cudaMemcpyAsync(&found, plan->defects, sizeof(found), cudaMemcpyDeviceToHost, device->copy));
+	CUDA_TRY(cudaMemcpyAsync(found, plan->defects, sizeof(found), cudaMemcpyDeviceToHost, device->copy));
 	CUDA_TRY(cudaEventRecord(plan->linearised, device->copy));
 	CUDA_TRY(cudaStreamWaitEvent(device->stream, plan->linearised, 0));
 	CUDA_TRY(cudaStreamSynchronize(device->copy));
-	*defects += (size_t)found;
+	counts->not_finite += (size_t)found[NOT_FINITE];
+	counts->saturated += (size_t)found[SATURATED];
+	counts->zero += (size_t)found[ZERO];
+	counts->blank += (int)found[BLANK];
 	return 0;
 }

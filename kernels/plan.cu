@@ -324,7 +324,7 @@ static struct plan_bytes bytes_of(const struct plan_options *options, bool lean)
 	bytes.raw = 2 * plan.bytes.raw * (size_t)plan.raw_views;
 	bytes.scratch = plan.scratch_bytes + views * (sizeof(struct device_view) + 2 * sizeof(int)) +
 			plan.partial_count * sizeof(float2) + reduce_bytes() + VIEWS_AT_ONCE * 12 * sizeof(float) +
-			pixels_of(&plan) * 2 + sizeof(unsigned long long);
+			pixels_of(&plan) * 2 + linearise_counters_bytes();
 	if (needs_arrays_forward(&plan))
 		bytes.scratch += 2 * voxels;
 	if (needs_arrays_back(&plan))
@@ -366,10 +366,26 @@ static bool is_lean(const struct device *device, const struct plan_options *opti
 	return bytes.stack + bytes.volumes + bytes.scratch + bytes.raw > device->limit - device->used;
 }
 
+/* What the CPU does and this backend does not. */
+static int check_supported(const struct plan_options *options, struct error *err)
+{
+	const struct linearise *linearise = &options->linearise;
+	const char *what = linearise->defects != NULL       ? "a defect map"
+			   : linearise->has_air_region      ? "an air region"
+			   : linearise->hardening_count > 0 ? "a beam-hardening correction"
+			   : options->extend > 0            ? "the extension of truncated rows"
+			   : options->matched               ? "the matched projector"
+							    : NULL;
+
+	if (what != NULL)
+		return error_set(err, ERR_IMPOSSIBLE, "the CUDA backend does not know %s, the CPU backend does", what);
+	return 0;
+}
+
 int cuda_plan_bytes(struct device *device, const struct plan_options *options, struct plan_bytes *ret_bytes,
 		    struct error *err)
 {
-	(void)err;
+	TRY(check_supported(options, err));
 	*ret_bytes = bytes_of(options, is_lean(device, options));
 	return 0;
 }
@@ -473,7 +489,7 @@ static int prepare_linearise(struct plan *plan, struct error *err)
 	}
 	CUDA_TRY(cudaEventCreateWithFlags(&plan->asked, cudaEventDisableTiming));
 	CUDA_TRY(cudaEventCreateWithFlags(&plan->linearised, cudaEventDisableTiming));
-	TRY(device_allocate(plan->device, sizeof(*plan->defects), (void **)&plan->defects, err));
+	TRY(device_allocate(plan->device, linearise_counters_bytes(), (void **)&plan->defects, err));
 	TRY(prepare_image(plan, plan->options.linearise.flat, &plan->flat, err));
 	return prepare_image(plan, plan->options.linearise.dark, &plan->dark, err);
 }
@@ -564,9 +580,11 @@ static void summarise(struct plan *plan)
 
 int cuda_plan_new(struct device *device, const struct plan_options *options, struct plan **ret_plan, struct error *err)
 {
-	struct plan *plan = (struct plan *)calloc(1, sizeof(*plan));
+	struct plan *plan;
 	int code;
 
+	TRY(check_supported(options, err));
+	plan = (struct plan *)calloc(1, sizeof(*plan));
 	if (plan == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a plan");
 	plan->device = device;
@@ -620,7 +638,7 @@ void cuda_plan_free(struct plan *plan)
 	layered_free(device, &plan->projections);
 	layered_free(device, &plan->filtered_array);
 	device_release(device, plan->pairs, plan->pairs_bytes);
-	device_release(device, plan->defects, sizeof(*plan->defects));
+	device_release(device, plan->defects, linearise_counters_bytes());
 	device_release(device, plan->flat, pixels_of(plan) * sizeof(float));
 	device_release(device, plan->dark, pixels_of(plan) * sizeof(float));
 	device_release(device, plan->partial, plan->partial_count * sizeof(float2));

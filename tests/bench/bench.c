@@ -221,7 +221,7 @@ static void run_plan(const struct plan_options *options, int repeats, struct tim
 	struct device_info info;
 	struct moment seconds[REPEATS_MOST][TIMED], median;
 	float *view = room(sizeof(float) * PIXELS * PIXELS);
-	size_t defects = 0;
+	struct defect_counts defects = {0};
 
 	must(backend_cpu.open(0, &device_options, &bench.device, &err));
 	must(backend_cpu.plan_new(bench.device, options, &bench.plan, &err));

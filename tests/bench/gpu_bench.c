@@ -394,7 +394,8 @@ static void check_ball(const struct bench_case *c, bool untilted)
 	size_t pixels = (size_t)options.columns * (size_t)options.rows,
 	       slice = (size_t)options.size[0] * (size_t)options.size[1];
 	double radius = .42 * options.size[0], worst = 0, sum = 0, inner = 0, shift[3];
-	size_t rays = 0, voxels = 0, defects = 0;
+	struct defect_counts defects = {0};
+	size_t rays = 0, voxels = 0;
 	float *exact = malloc(pixels * (size_t)count * sizeof(float)), *got = malloc(pixels * sizeof(float)), *values;
 
 	options.bend = untilted ? BEND_NONE : BEND_TURNED;
