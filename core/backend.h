@@ -141,6 +141,8 @@ struct plan_options {
 	bool matched;
 	const struct tv_options *tv; /* NULL: no TV */
 	bool reference_precision;    /* float everywhere; otherwise storage may be packed within the stated bound */
+	bool no_projection;          /* neither project nor sart_iterate will be asked for: no scratch for them */
+	int resident;                /* slots of the stacks that are on the device beside the plan; 0: one for each view */
 };
 
 /* Bytes, known before anything is allocated. */
@@ -149,6 +151,7 @@ struct plan_bytes {
 	size_t volumes; /* the iterate and the copies that the recipe needs */
 	size_t scratch; /* the rest */
 	size_t raw;     /* one projection on its way in */
+	size_t host;    /* beside the device's own memory, in parts.h; 0 elsewhere */
 };
 
 struct sart_sums {
@@ -188,7 +191,9 @@ struct backend {
 			  struct error *err);
 	void (*volume_free)(struct volume *volume); /* NULL is fine */
 	int (*volume_upload)(struct volume *volume, const float *from, struct error *err);
-	/* Slices z_first .. z_first + z_count - 1. */
+	/* Slices z_first .. z_first + z_count - 1; the others stay. */
+	int (*volume_put)(struct volume *volume, int z_first, int z_count, const float *from, struct error *err);
+	/* Waits for what changes the volume, not for what was asked of the device since. */
 	int (*volume_download)(struct volume *volume, int z_first, int z_count, float *ret_to, struct error *err);
 	int (*volume_fill)(struct volume *volume, float value, struct error *err);
 	int (*volume_copy)(struct volume *to, const struct volume *from, struct error *err);
@@ -197,6 +202,8 @@ struct backend {
 			 struct error *err);
 	void (*stack_free)(struct stack *stack); /* NULL is fine */
 	int (*stack_download)(struct stack *stack, int slot, int count, float *ret_to, struct error *err);
+	/* Line integrals [slot][row][column]; `from` has been read when it returns. */
+	int (*stack_upload)(struct stack *stack, int slot, int count, const float *from, struct error *err);
 
 	/* Touches no device memory, device may be NULL: it is how a job that cannot fit is refused beforehand. */
 	int (*plan_bytes)(struct device *device, const struct plan_options *options, struct plan_bytes *ret_bytes,

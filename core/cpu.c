@@ -273,25 +273,40 @@ void transpose(const float *from, size_t from_stride, int from_rows, int from_co
 	}
 }
 
-static int cpu_volume_upload(struct volume *volume, const float *from, struct error *err)
+static int check_slices(const struct volume *volume, int z_first, int z_count, struct error *err)
+{
+	if (z_first < 0 || z_count < 0 || z_first > volume->size[2] - z_count)
+		return error_set(err, ERR_INVALID, "slices %d to %d: there are 0 to %d", z_first, z_first + z_count - 1,
+				 volume->size[2] - 1);
+	return 0;
+}
+
+static int cpu_volume_put(struct volume *volume, int z_first, int z_count, const float *from, struct error *err)
 {
 	const size_t nx = (size_t)volume->size[0], ny = (size_t)volume->size[1];
+	int code = check_slices(volume, z_first, z_count, err);
 
-	(void)err;
+	if (code < 0)
+		return code;
 #pragma omp parallel for num_threads(volume->device->threads) schedule(static)
 	for (int y = 0; y < volume->size[1]; y++)
-		transpose(from + (size_t)y * nx, nx * ny, volume->size[2], volume->size[0],
-			  volume->data + (size_t)y * volume->plane, volume->row);
+		transpose(from + (size_t)y * nx, nx * ny, z_count, volume->size[0],
+			  volume->data + (size_t)y * volume->plane + (size_t)z_first, volume->row);
 	return 0;
+}
+
+static int cpu_volume_upload(struct volume *volume, const float *from, struct error *err)
+{
+	return cpu_volume_put(volume, 0, volume->size[2], from, err);
 }
 
 static int cpu_volume_download(struct volume *volume, int z_first, int z_count, float *ret_to, struct error *err)
 {
 	const size_t nx = (size_t)volume->size[0], ny = (size_t)volume->size[1];
+	int code = check_slices(volume, z_first, z_count, err);
 
-	if (z_first < 0 || z_count < 0 || z_first > volume->size[2] - z_count)
-		return error_set(err, ERR_INVALID, "slices %d to %d: there are 0 to %d", z_first, z_first + z_count - 1,
-				 volume->size[2] - 1);
+	if (code < 0)
+		return code;
 #pragma omp parallel for num_threads(volume->device->threads) schedule(static)
 	for (int y = 0; y < volume->size[1]; y++)
 		transpose(volume->data + (size_t)y * volume->plane + (size_t)z_first, volume->row, volume->size[0],
@@ -346,11 +361,34 @@ static void cpu_stack_free(struct stack *stack)
 	free(stack);
 }
 
-static int cpu_stack_download(struct stack *stack, int slot, int count, float *ret_to, struct error *err)
+static int check_slots(const struct stack *stack, int slot, int count, struct error *err)
 {
 	if (slot < 0 || count < 0 || slot > stack->slots - count)
 		return error_set(err, ERR_INVALID, "slots %d to %d: there are 0 to %d", slot, slot + count - 1,
 				 stack->slots - 1);
+	return 0;
+}
+
+static int cpu_stack_upload(struct stack *stack, int slot, int count, const float *from, struct error *err)
+{
+	const size_t pixels = (size_t)stack->columns * (size_t)stack->rows;
+	int code = check_slots(stack, slot, count, err);
+
+	if (code < 0)
+		return code;
+#pragma omp parallel for num_threads(stack->device->threads) schedule(static)
+	for (int i = 0; i < count; i++)
+		transpose(from + (size_t)i * pixels, (size_t)stack->columns, stack->rows, stack->columns,
+			  stack->data + (size_t)(slot + i) * pixels, (size_t)stack->rows);
+	return 0;
+}
+
+static int cpu_stack_download(struct stack *stack, int slot, int count, float *ret_to, struct error *err)
+{
+	int code = check_slots(stack, slot, count, err);
+
+	if (code < 0)
+		return code;
 #pragma omp parallel for num_threads(stack->device->threads) schedule(static)
 	for (int i = 0; i < count; i++)
 		transpose(stack_slot(stack, slot + i), (size_t)stack->rows, stack->columns, stack->rows,
@@ -375,12 +413,14 @@ const struct backend backend_cpu = {
     .volume_new = cpu_volume_new,
     .volume_free = cpu_volume_free,
     .volume_upload = cpu_volume_upload,
+    .volume_put = cpu_volume_put,
     .volume_download = cpu_volume_download,
     .volume_fill = cpu_volume_fill,
     .volume_copy = cpu_volume_copy,
     .stack_new = cpu_stack_new,
     .stack_free = cpu_stack_free,
     .stack_download = cpu_stack_download,
+    .stack_upload = cpu_stack_upload,
     .plan_bytes = cpu_plan_bytes,
     .plan_new = cpu_plan_new,
     .plan_free = cpu_plan_free,

@@ -349,12 +349,14 @@ int cuda_plan_batch(const struct plan *plan);
 int cuda_volume_new(struct device *device, const struct grid *grid, struct volume **ret_volume, struct error *err);
 void cuda_volume_free(struct volume *volume);
 int cuda_volume_upload(struct volume *volume, const float *from, struct error *err);
+int cuda_volume_put(struct volume *volume, int z_first, int z_count, const float *from, struct error *err);
 int cuda_volume_download(struct volume *volume, int z_first, int z_count, float *ret_to, struct error *err);
 int cuda_volume_fill(struct volume *volume, float value, struct error *err);
 int cuda_volume_copy(struct volume *to, const struct volume *from, struct error *err);
 int cuda_stack_new(struct device *device, int columns, int rows, int slots, struct stack **ret_stack,
 		   struct error *err);
 void cuda_stack_free(struct stack *stack);
+int cuda_stack_upload(struct stack *stack, int slot, int count, const float *from, struct error *err);
 int cuda_stack_download(struct stack *stack, int slot, int count, float *ret_to, struct error *err);
 
 #endif

@@ -43,6 +43,19 @@ int cuda_volume_upload(struct volume *volume, const float *from, struct error *e
 	return device_wait(volume->device, err);
 }
 
+int cuda_volume_put(struct volume *volume, int z_first, int z_count, const float *from, struct error *err)
+{
+	size_t slice = (size_t)volume->size[0] * (size_t)volume->size[1];
+
+	if (z_first < 0 || z_count < 0 || z_first + z_count > volume->size[2])
+		return error_set(err, ERR_INTERNAL, "slices %d to %d of %d", z_first, z_first + z_count - 1,
+				 volume->size[2]);
+	TRY(device_enter(volume->device, err));
+	CUDA_TRY(cudaMemcpyAsync(volume->data + slice * (size_t)z_first, from, slice * (size_t)z_count * sizeof(float),
+				 cudaMemcpyHostToDevice, volume->device->stream));
+	return device_wait(volume->device, err);
+}
+
 int cuda_volume_download(struct volume *volume, int z_first, int z_count, float *ret_to, struct error *err)
 {
 	size_t slice = (size_t)volume->size[0] * (size_t)volume->size[1];
@@ -146,6 +159,22 @@ int cuda_stack_download(struct stack *stack, int slot, int count, float *ret_to,
 					   stack->data + (size_t)(slot + i) * shape->slot,
 					   (size_t)shape->pitch * sizeof(float), width, (size_t)shape->rows,
 					   cudaMemcpyDeviceToHost, stack->device->stream));
+	return device_wait(stack->device, err);
+}
+
+int cuda_stack_upload(struct stack *stack, int slot, int count, const float *from, struct error *err)
+{
+	const struct stack_shape *shape = &stack->shape;
+	size_t width = (size_t)shape->columns * sizeof(float);
+
+	if (slot < 0 || count < 0 || slot + count > stack->slots)
+		return error_set(err, ERR_INTERNAL, "slots %d to %d of %d", slot, slot + count - 1, stack->slots);
+	TRY(device_enter(stack->device, err));
+	for (int i = 0; i < count; i++)
+		CUDA_TRY(cudaMemcpy2DAsync(stack->data + (size_t)(slot + i) * shape->slot,
+					   (size_t)shape->pitch * sizeof(float),
+					   from + (size_t)i * (size_t)shape->columns * (size_t)shape->rows, width,
+					   width, (size_t)shape->rows, cudaMemcpyHostToDevice, stack->device->stream));
 	return device_wait(stack->device, err);
 }
 
