@@ -33,15 +33,17 @@ prefix ?= /usr/local
 # pkg-config name:Debian package, then command:Debian package.
 PACKAGES := libmicrohttpd:libmicrohttpd-dev libcjson:libcjson-dev libzstd:libzstd-dev sqlite3:libsqlite3-dev \
             kissfft-float:libkissfft-dev libpng:libpng-dev libcurl:libcurl4-openssl-dev libcrypto:libssl-dev \
-            check:check
-COMMANDS := gcc:gcc pkg-config:pkg-config curl:curl jq:jq zstd:zstd openssl:openssl pgrep:procps sqlite3:sqlite3
+            expat:libexpat1-dev libtiff-4:libtiff-dev zlib:zlib1g-dev check:check
+COMMANDS := gcc:gcc pkg-config:pkg-config curl:curl jq:jq zstd:zstd openssl:openssl pgrep:procps sqlite3:sqlite3 dcmdump:dcmtk
 # Of Python: yaml for the build, the others for tests.
 MODULES  := yaml:python3-yaml jsonschema:python3-jsonschema numpy:python3-numpy requests:python3-requests
 
 core_libs   := kissfft-float
 proto_libs  := libcjson libzstd libcrypto libpng
 daemon_libs := libmicrohttpd sqlite3
-cbct_libs   := libcurl
+# Other tools' files: the client reads and writes them, the daemon and the worker know none of them.
+files_libs  := expat libtiff-4 zlib
+cbct_libs   := libcurl $(files_libs)
 all_libs    := $(core_libs) $(proto_libs) $(daemon_libs) $(cbct_libs)
 
 pkg = $(shell pkg-config $(1) $(2) 2>/dev/null)
@@ -129,7 +131,7 @@ $(BUILD)/cbct: $(call objects,$(cbct_sources)) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(cbct_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
 $(BUILD)/unit: $(call objects,$(unit_sources) $(state_sources)) $(library)
-	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,check sqlite3 $(proto_libs) $(core_libs)) $(LIBM)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,check sqlite3 $(files_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
 $(BUILD)/cpu-bench: $(call objects,tests/bench/bench.c) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(LIBM)
@@ -171,7 +173,7 @@ FUZZ_SECONDS ?= 10
 fuzzers := $(patsubst tests/fuzz/%.c,$(BUILD)/%,$(wildcard tests/fuzz/fuzz_*.c))
 
 $(BUILD)/fuzz_%: $(BUILD)/tests/fuzz/fuzz_%.o $(BUILD)/daemon/http_text.o $(library)
-	$(call say,LINK)$(CC) $(LDFLAGS) -fsanitize=fuzzer -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(LIBM)
+	$(call say,LINK)$(CC) $(LDFLAGS) -fsanitize=fuzzer -o $@ $^ $(call pkg,--libs,$(files_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
 fuzzers: $(fuzzers)
 
