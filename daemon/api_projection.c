@@ -159,14 +159,32 @@ static int draw(const void *samples, const struct scan *scan, char **ret_png, si
 	return code;
 }
 
-static int reply_picture(struct request *request, const struct scan *scan, int descriptor, int index, struct error *err)
+enum { ETAG_MAX = 48 };
+
+static void make_etag(const uint8_t sha256[32], const char *kind, char ret_etag[ETAG_MAX])
+{
+	char digest[33];
+
+	for (int i = 0; i < 16; i++)
+		snprintf(digest + 2 * i, sizeof(digest) - 2 * (size_t)i, "%02x", sha256[i]);
+	snprintf(ret_etag, ETAG_MAX, "\"%s%s\"", digest, kind);
+}
+
+static int reply_picture(struct request *request, const struct scan *scan, int descriptor, int index,
+			 const uint8_t sha256[32], struct error *err)
 {
 	enum { PICTURE_PIXELS_MAX = 64 << 20 };
 	size_t size = scan_projection_bytes(scan), length;
-	char *png;
+	char *png, etag[ETAG_MAX];
+	const struct entity entity = {.etag = etag, .size = UNKNOWN_SIZE, .media_type = "image/png"};
+	struct selection selection;
 	void *samples;
+	bool done;
 	int code;
 
+	make_etag(sha256, "-png", etag);
+	if (entity_select(request, &entity, &selection, &done, err) != 0 || done)
+		return done ? 0 : err->code;
 	if (size > PICTURE_PIXELS_MAX * sample_bytes(scan->sample))
 		return error_set(err, ERR_IMPOSSIBLE, "a picture has at most %d pixels, the projection %zu",
 				 PICTURE_PIXELS_MAX, size / sample_bytes(scan->sample));
@@ -177,8 +195,10 @@ static int reply_picture(struct request *request, const struct scan *scan, int d
 	if (code == 0)
 		code = draw(samples, scan, &png, &length, err);
 	if (code == 0)
-		code = request_reply_text(request, 200, "image/png", png, length, err);
+		code = request_reply_bytes(request, 200, png, length, err);
 	free(samples);
+	if (code == 0)
+		entity_headers(request, &entity, &selection);
 	return code;
 }
 
@@ -186,7 +206,7 @@ static int reply_picture(struct request *request, const struct scan *scan, int d
 static int reply_samples(struct request *request, const struct scan *scan, int descriptor, int index,
 			 const uint8_t sha256[32], struct error *err)
 {
-	char etag[40] = "\"", filename[96];
+	char etag[ETAG_MAX], filename[96];
 	struct entity entity = {.etag = etag,
 				.size = scan_projection_bytes(scan),
 				.media_type = "application/octet-stream",
@@ -194,9 +214,7 @@ static int reply_samples(struct request *request, const struct scan *scan, int d
 	struct selection selection;
 	bool done;
 
-	for (int i = 0; i < 16; i++)
-		snprintf(etag + 1 + 2 * i, sizeof(etag) - 1 - 2 * (size_t)i, "%02x", sha256[i]);
-	snprintf(etag + 33, sizeof(etag) - 33, "\"");
+	make_etag(sha256, "", etag);
 	snprintf(filename, sizeof(filename), "%.40s-%d.raw", request_argument(request, 0), index);
 	if (entity_select(request, &entity, &selection, &done, err) != 0 || done) {
 		close(descriptor);
@@ -227,7 +245,7 @@ static int reply_projection(struct request *request, struct stored_scan *stored,
 		return err->code;
 	if (format == 0)
 		return reply_samples(request, scan, descriptor, (int)index, sha256, err);
-	code = reply_picture(request, scan, descriptor, (int)index, err);
+	code = reply_picture(request, scan, descriptor, (int)index, sha256, err);
 	close(descriptor);
 	return code;
 }

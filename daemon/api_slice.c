@@ -95,29 +95,6 @@ static int draw(const float *voxels, const struct grid *grid, const struct asked
 	return code;
 }
 
-struct picture {
-	char *png;
-	size_t length;
-};
-
-static ssize_t picture_read(void *context, uint64_t offset, void *to, size_t size)
-{
-	const struct picture *picture = context;
-
-	if (size > picture->length - offset)
-		size = picture->length - offset;
-	memcpy(to, picture->png + offset, size);
-	return (ssize_t)size;
-}
-
-static void picture_free(void *context)
-{
-	struct picture *picture = context;
-
-	free(picture->png);
-	free(picture);
-}
-
 static void make_etag(const struct volume_record *volume, const struct asked *asked, char *ret_etag, size_t size)
 {
 	char digest[33];
@@ -131,22 +108,16 @@ static void make_etag(const struct volume_record *volume, const struct asked *as
 static int reply_drawn(struct api *api, struct request *request, const char *path, const struct grid *grid,
 		       const struct asked *asked, struct error *err)
 {
-	struct picture *picture = calloc(1, sizeof(*picture));
 	struct mapping *mapping;
+	size_t length;
+	char *png;
 	int code;
 
-	if (picture == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for a picture");
-	code = mapping_get(api->mappings, path, grid, &mapping, err);
-	if (code == 0) {
-		code = draw(mapping_voxels(mapping), grid, asked, &picture->png, &picture->length, err);
-		mapping_release(api->mappings, mapping);
-	}
-	if (code != 0) {
-		free(picture);
-		return code;
-	}
-	return request_reply_read(request, 200, picture->length, picture_read, picture, picture_free, err);
+	if (mapping_get(api->mappings, path, grid, &mapping, err) != 0)
+		return err->code;
+	code = draw(mapping_voxels(mapping), grid, asked, &png, &length, err);
+	mapping_release(api->mappings, mapping);
+	return code == 0 ? request_reply_bytes(request, 200, png, length, err) : code;
 }
 
 int slice_get(void *context, struct request *request, struct error *err)

@@ -108,6 +108,8 @@ int request_reply_json(struct request *request, int status, cJSON *value, struct
 /* Takes the text (free). */
 int request_reply_text(struct request *request, int status, const char *media_type, char *text, size_t length,
 		       struct error *err);
+/* Takes the data (free); the headers are the caller's. */
+int request_reply_bytes(struct request *request, int status, void *data, size_t length, struct error *err);
 int request_reply_empty(struct request *request, int status, struct error *err);
 /* Bytes that stay where they are for as long as the program runs. */
 int request_reply_constant(struct request *request, int status, const void *data, size_t length, struct error *err);

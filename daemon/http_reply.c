@@ -73,15 +73,20 @@ static int set_response(struct request *request, int status, struct MHD_Response
 	return 0;
 }
 
+int request_reply_bytes(struct request *request, int status, void *data, size_t length, struct error *err)
+{
+	struct MHD_Response *response =
+	    data != NULL ? MHD_create_response_from_buffer(length, data, MHD_RESPMEM_MUST_FREE) : NULL;
+
+	if (response == NULL)
+		free(data);
+	return set_response(request, status, response, length, err);
+}
+
 int request_reply_text(struct request *request, int status, const char *media_type, char *text, size_t length,
 		       struct error *err)
 {
-	struct MHD_Response *response =
-	    text != NULL ? MHD_create_response_from_buffer(length, text, MHD_RESPMEM_MUST_FREE) : NULL;
-
-	if (response == NULL)
-		free(text);
-	if (set_response(request, status, response, length, err) != 0)
+	if (request_reply_bytes(request, status, text, length, err) != 0)
 		return err->code;
 	request_reply_header(request, "Content-Type", "%s", media_type);
 	request_reply_header(request, "Cache-Control", "no-store");

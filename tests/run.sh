@@ -7,6 +7,7 @@ cd "$(dirname "$0")/.."
 export BUILD=${BUILD:-build}
 mkdir -p "$BUILD/test"
 results=$BUILD/test/results
+rm -rf "$BUILD/test/exchanges"
 : >"$results"
 
 wanted() {
@@ -57,6 +58,20 @@ for file in tests/http/test_*.sh; do
 	part "$file"
 	RESULTS=$results bash "$file" || true
 done
+
+if wanted http "$@"; then
+	part "exchanges and proto/openapi.yaml"
+	python=${PYTHON:-/usr/bin/python3}
+	if ! "$python" -c 'import jsonschema, yaml' 2>/dev/null; then
+		echo "SKIP exchanges: python3-jsonschema and python3-yaml are not here"
+		echo "skip exchanges with the schema: python3-jsonschema and python3-yaml are not here" >>"$results"
+	elif "$python" proto/openapi.py --json proto/openapi.yaml >"$BUILD/test/openapi.json" &&
+		"$python" tests/http/exchanges.py "$BUILD/test/openapi.json" "$BUILD"/test/exchanges/test_*; then
+		echo "pass exchanges with the schema" >>"$results"
+	else
+		echo "fail exchanges with the schema" >>"$results"
+	fi
+fi
 
 passed=$(grep -c '^pass' "$results")
 failed=$(grep -c '^fail' "$results")

@@ -71,12 +71,41 @@ need_data() {
 body=$work/body
 headers=$work/headers
 req() {
-	local method=$1 path=$2
+	local method=$1 path=$2 media whole=1
 	shift 2
 	local how=(-X "$method")
 	[ "$method" = HEAD ] && how=(--head)
 	: >"$headers"
-	status=$(curl -sS "${how[@]}" -o "$body" -D "$headers" -w '%{http_code}' --max-time 120 "$@" "$url$path") || true
+	status=$(curl -sS "${how[@]}" -o "$body" -D "$headers" -w '%{http_code} %{content_type}' --max-time 120 "$@" "$url$path") || whole=0
+	media=${status#* } status=${status%% *}
+	[ $whole = 0 ] && [[ $media != text/event-stream* ]] || record "$method" "$path" "$media" "$@"
+}
+# One line for each exchange, which tests/http/exchanges.py holds against the schema: method, target, status, header
+# fields, JSON sent, JSON or events received.
+exchanges=$BUILD/test/exchanges/$(basename "${BASH_SOURCE[1]}" .sh)
+mkdir -p "${exchanges%/*}"
+rm -f "$exchanges"
+record() { # METHOD TARGET MEDIA-TYPE [CURL OPTION ...]
+	local sent="" line
+	line="$1	$2	$status	$(awk '/^HTTP\// { all = "" } NF > 1 { sub(/\r$/, ""); all = all $0 "\037" } END { printf "%s", all }' "$headers")"
+	local media=$3
+	shift 3
+	while [ $# -gt 1 ]; do
+		[ "$1" != --data-binary ] || sent=$2
+		shift
+	done
+	{
+		printf '%s\t' "$line"
+		case $sent in
+		@*) tr '\n\t' '  ' <"${sent#@}" ;;
+		*) printf '%s' "$sent" | tr '\n\t' '  ' ;;
+		esac
+		printf '\t'
+		case $media in
+		*json* | text/event-stream*) tr '\n' '\036' <"$body" ;;
+		esac
+		printf '\n'
+	} >>"$exchanges"
 }
 header() { # NAME: the value in the last reply
 	awk -v name="$(tr 'A-Z' 'a-z' <<<"$1")" 'BEGIN { FS = ": *" } tolower($1) == name { sub(/^[^:]*: */, ""); sub(/\r$/, ""); print; exit }' "$headers"

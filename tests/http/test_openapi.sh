@@ -39,4 +39,34 @@ test_every_reference_of_the_schema_has_its_target() {
 	done < <(grep -oE '#/components/[A-Za-z]+/[A-Za-z]+' "$top/proto/openapi.yaml" | sed 's,#/components/,,' | sort -u)
 }
 
+test_what_is_served_is_the_schema() {
+	local python=${PYTHON:-/usr/bin/python3}
+	"$python" -c 'import yaml' 2>/dev/null || skip "python3-yaml is not here"
+	start_daemon
+	req GET /v1/openapi.json
+	expect_status 200
+	diff <("$python" "$top/proto/openapi.py" --json "$top/proto/openapi.yaml" | jq -S .) <(jq -S . "$body") ||
+		fail "proto/openapi.yaml (<) as JSON (>)"
+	req GET /v1/openapi.json -H "If-None-Match: $(header etag)"
+	expect_status 304
+	req GET /readyz
+	expect_status 200
+	stop_daemon
+}
+
+# Spectral, as tests/openapi/package-lock.json names it, installed under build/ once for each lockfile.
+test_the_schema_has_no_flaws_that_a_linter_sees() {
+	local from=$top/tests/openapi to=$BUILD/openapi-lint
+	command -v npm >/dev/null || skip "npm is not here"
+	if ! cmp -s "$from/package-lock.json" "$to/installed"; then
+		rm -rf "$to"
+		mkdir -p "$to"
+		cp "$from"/package*.json "$to/"
+		(cd "$to" && npm ci --ignore-scripts --omit=optional --no-audit --no-fund) >"$work/npm.log" 2>&1 ||
+			skip "npm cannot install the linter: $(grep -m 1 -i error "$work/npm.log")"
+		cp "$from/package-lock.json" "$to/installed"
+	fi
+	"$to/node_modules/.bin/spectral" lint --fail-severity warn --ruleset "$from/ruleset.yaml" "$top/proto/openapi.yaml"
+}
+
 run_tests

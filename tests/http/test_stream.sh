@@ -105,6 +105,8 @@ test_after_goes_on_behind_a_volume() {
 	stream "$work/rest" after=final
 	split_parts "$work/rest" "$work/parts"
 	[ "$parts" = 1 ] || fail "the document alone"
+	req GET "/v1/jobs/$job/stream?after=final"
+	expect_status 200
 	req GET "/v1/jobs/$job/stream?after=iter-2"
 	expect_problem 400
 	expect_json '.detail | contains("after")'
