@@ -203,7 +203,7 @@ test_one_that_leaves_in_the_middle_of_a_part_leaves_nothing_open() {
 test_a_slow_reader_holds_up_nobody() {
 	uploaded_scan
 	post_job "$whole"
-	stream "$work/slow" "" --limit-rate 40K &
+	reader "$work/slow" "" --limit-rate 40K &
 	wait_job succeeded
 	stream "$work/fast" ""
 	wait $! || fail "the slow one's end"
