@@ -16,7 +16,9 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
+#include "proto/header.h"
 #include "proto/json.h"
+#include "proto/metaimage.h"
 #include "proto/spool.h"
 
 const char *const volume_type_names[VOLUME_TYPE_COUNT] = {"float32", "int16"};
@@ -235,37 +237,23 @@ const struct volume_format *volume_format_find(const char *name)
 
 /* ---- reading ---- */
 
-enum element {
-	ELEMENT_FLOAT,
-	ELEMENT_DOUBLE,
-	ELEMENT_INT8,
-	ELEMENT_UINT8,
-	ELEMENT_INT16,
-	ELEMENT_UINT16,
-	ELEMENT_INT32
-};
-
+/* What the other formats call the types that they share. */
 static const struct {
-	size_t bytes;
 	int nifti;
-	const char *mha, *nrrd, *nrrd_too;
-} elements[] = {
-    [ELEMENT_FLOAT] = {4, 16, "MET_FLOAT", "float", "float"},
-    [ELEMENT_DOUBLE] = {8, 64, "MET_DOUBLE", "double", "double"},
-    [ELEMENT_INT8] = {1, 256, "MET_CHAR", "signed char", "int8"},
-    [ELEMENT_UINT8] = {1, 2, "MET_UCHAR", "unsigned char", "uint8"},
-    [ELEMENT_INT16] = {2, 4, "MET_SHORT", "short", "int16"},
-    [ELEMENT_UINT16] = {2, 512, "MET_USHORT", "unsigned short", "uint16"},
-    [ELEMENT_INT32] = {4, 8, "MET_INT", "int", "int32"},
+	const char *nrrd, *nrrd_too;
+} type_names[PIXEL_TYPE_COUNT] = {
+    [PIXEL_UINT8] = {2, "unsigned char", "uint8"},      [PIXEL_INT8] = {256, "signed char", "int8"},
+    [PIXEL_UINT16] = {512, "unsigned short", "uint16"}, [PIXEL_INT16] = {4, "short", "int16"},
+    [PIXEL_UINT32] = {768, "unsigned int", "uint32"},   [PIXEL_INT32] = {8, "int", "int32"},
+    [PIXEL_FLOAT32] = {16, "float", "float"},           [PIXEL_FLOAT64] = {64, "double", "double"},
 };
-enum { ELEMENT_COUNT = sizeof(elements) / sizeof(elements[0]) };
 
 /* What a header told. */
 struct layout {
 	int size[3];
 	double direction[3][3]; /* of axis i in LPS mm, spacing included */
 	double origin[3];       /* LPS mm, centre of the first voxel in the file */
-	enum element element;
+	enum pixel_type type;
 	double slope, offset; /* value = slope * stored + offset */
 	size_t start;         /* of the voxels in the file */
 };
@@ -319,8 +307,8 @@ static int read_nifti(const uint8_t *h, struct layout *ret, struct error *err)
 
 	if (get16(h + NIFTI_SIZEOF_HDR) != NIFTI_HEADER)
 		return error_set(err, ERR_INVALID, "NIfTI of the other byte order is not read");
-	for (int i = 0; i < ELEMENT_COUNT; i++) {
-		if (elements[i].nifti == type)
+	for (int i = 0; i < PIXEL_TYPE_COUNT; i++) {
+		if (type_names[i].nifti == type)
 			found = i;
 	}
 	if (found < 0)
@@ -342,7 +330,7 @@ static int read_nifti(const uint8_t *h, struct layout *ret, struct error *err)
 		ret->direction[axis][2] = rows[2][axis];
 		ret->origin[axis] = axis < 2 ? -rows[axis][3] : rows[axis][3];
 	}
-	ret->element = (enum element)found;
+	ret->type = (enum pixel_type)found;
 	ret->start = (size_t)fmin(fmax(get_float(h + NIFTI_VOX_OFFSET), NIFTI_HEADER), 1e9);
 	if (get_float(h + NIFTI_SCL_SLOPE) != 0) {
 		ret->slope = get_float(h + NIFTI_SCL_SLOPE);
@@ -351,33 +339,11 @@ static int read_nifti(const uint8_t *h, struct layout *ret, struct error *err)
 	return 0;
 }
 
-/* Numbers in a text, commas and brackets counting as spaces; how many there were, at most `most`. */
-static int numbers_in(const char *text, int most, double *ret)
-{
-	int count = 0;
-
-	while (*text != '\0' && count < most) {
-		char *end;
-		double number;
-
-		if (strchr(" \t(),", *text) != NULL) {
-			text++;
-			continue;
-		}
-		number = strtod(text, &end);
-		if (end == text)
-			return -1;
-		ret[count++] = number;
-		text = end;
-	}
-	return count;
-}
-
 static int want_numbers(const char *key, const char *text, int count, double *ret, struct error *err)
 {
 	double numbers[16];
 
-	if (numbers_in(text, 16, numbers) != count)
+	if (header_numbers(text, 16, numbers) != count)
 		return error_set(err, ERR_INVALID, "%.60s: %d numbers are expected", key, count);
 	memcpy(ret, numbers, (size_t)count * sizeof(*ret));
 	return 0;
@@ -397,94 +363,33 @@ static int want_size(const char *key, const char *text, int ret_size[3], struct 
 	return code;
 }
 
-static int refuse_value(const char *key, const char *value, struct error *err)
-{
-	return error_set(err, ERR_INVALID, "%.60s: \"%.60s\" is not read", key, value);
-}
-
-/* One line "key = value" of a MetaImage. */
-static int read_mha_line(const char *key, const char *value, struct layout *ret, double spacing[3], struct error *err)
-{
-	double matrix[9];
-	int code = 0;
-
-	if (strcmp(key, "NDims") == 0 && strcmp(value, "3") != 0)
-		return refuse_value(key, value, err);
-	if ((strcmp(key, "CompressedData") == 0 || strcmp(key, "BinaryDataByteOrderMSB") == 0 ||
-	     strcmp(key, "ElementByteOrderMSB") == 0) &&
-	    strcasecmp(value, "False") != 0)
-		return refuse_value(key, value, err);
-	if (strcmp(key, "ElementNumberOfChannels") == 0 && strcmp(value, "1") != 0)
-		return refuse_value(key, value, err);
-	if (strcmp(key, "DimSize") == 0)
-		return want_size(key, value, ret->size, err);
-	if (strcmp(key, "ElementSpacing") == 0 || strcmp(key, "ElementSize") == 0)
-		return want_numbers(key, value, 3, spacing, err);
-	if (strcmp(key, "Offset") == 0 || strcmp(key, "Position") == 0 || strcmp(key, "Origin") == 0)
-		return want_numbers(key, value, 3, ret->origin, err);
-	if (strcmp(key, "TransformMatrix") == 0 || strcmp(key, "Rotation") == 0 || strcmp(key, "Orientation") == 0) {
-		code = want_numbers(key, value, 9, matrix, err);
-		if (code == 0)
-			memcpy(ret->direction, matrix, sizeof(matrix));
-		return code;
-	}
-	if (strcmp(key, "ElementType") == 0) {
-		for (int i = 0; i < ELEMENT_COUNT; i++) {
-			if (strcmp(value, elements[i].mha) == 0) {
-				ret->element = (enum element)i;
-				return 0;
-			}
-		}
-		return refuse_value(key, value, err);
-	}
-	if (strcmp(key, "ElementDataFile") == 0 && strcmp(value, "LOCAL") != 0)
-		return refuse_value(key, value, err);
-	return 0;
-}
-
-/* The next line of a text header, its end taken off; false when there is none. */
-static bool next_line(const char *text, size_t length, size_t *at, char *ret_line, size_t size)
-{
-	const char *end = memchr(text + *at, '\n', length - *at);
-	size_t width;
-
-	if (end == NULL)
-		return false;
-	width = (size_t)(end - (text + *at));
-	snprintf(ret_line, size, "%.*s", (int)(width < size ? width : size - 1), text + *at);
-	width = strlen(ret_line);
-	while (width > 0 && strchr(" \t\r", ret_line[width - 1]) != NULL)
-		ret_line[--width] = '\0';
-	*at += (size_t)(end - (text + *at)) + 1;
-	return true;
-}
-
 static int read_mha(const char *text, size_t length, struct layout *ret, struct error *err)
 {
-	double spacing[3] = {1, 1, 1};
-	char row[512];
+	struct metaimage image;
+	int code = metaimage_parse(text, length, &image, err);
 
-	while (next_line(text, length, &ret->start, row, sizeof(row))) {
-		char *equals = strchr(row, '='), *value, *end;
-		int code;
-
-		if (equals == NULL)
-			return error_set(err, ERR_INVALID, "MetaImage: \"%.60s\" is no line of a header", row);
-		for (end = equals; end > row && end[-1] == ' '; end--)
-			;
-		*end = '\0';
-		for (value = equals + 1; *value == ' '; value++)
-			;
-		code = read_mha_line(row, value, ret, spacing, err);
-		if (code != 0)
-			return code;
-		if (strcmp(row, "ElementDataFile") == 0) {
-			for (int i = 0; i < 9; i++)
-				ret->direction[i / 3][i % 3] *= spacing[i / 3];
-			return 0;
-		}
+	if (code != 0)
+		return code;
+	if (image.dimensions != 3)
+		return error_set(err, ERR_INVALID, "MetaImage: NDims is %d, a volume has 3", image.dimensions);
+	if (image.compressed)
+		return header_refuse("CompressedData", "True", err);
+	if (image.big_endian)
+		return header_refuse("BinaryDataByteOrderMSB", "True", err);
+	if (strcmp(image.data_file, "LOCAL") != 0)
+		return header_refuse("ElementDataFile", image.data_file, err);
+	for (int i = 0; i < 3; i++) {
+		if (image.size[i] > GRID_SIZE_MAX)
+			return error_set(err, ERR_INVALID, "DimSize: %d voxels, 1 to %d are expected", image.size[i],
+					 GRID_SIZE_MAX);
+		ret->size[i] = image.size[i];
+		ret->origin[i] = image.origin[i];
+		for (int j = 0; j < 3; j++)
+			ret->direction[i][j] = image.direction[i][j] * image.spacing[i];
 	}
-	return error_set(err, ERR_INVALID, "MetaImage: the header has no ElementDataFile");
+	ret->type = image.type;
+	ret->start = image.length;
+	return 0;
 }
 
 static int read_nrrd_line(const char *key, const char *value, struct layout *ret, bool *ras, struct error *err)
@@ -493,11 +398,11 @@ static int read_nrrd_line(const char *key, const char *value, struct layout *ret
 	int code;
 
 	if (strcmp(key, "dimension") == 0 && strcmp(value, "3") != 0)
-		return refuse_value(key, value, err);
+		return header_refuse(key, value, err);
 	if ((strcmp(key, "encoding") == 0 && strcmp(value, "raw") != 0) ||
 	    (strcmp(key, "endian") == 0 && strcmp(value, "little") != 0) || strcmp(key, "data file") == 0 ||
 	    strcmp(key, "byte skip") == 0 || strcmp(key, "line skip") == 0)
-		return refuse_value(key, value, err);
+		return header_refuse(key, value, err);
 	if (strcmp(key, "sizes") == 0)
 		return want_size(key, value, ret->size, err);
 	if (strcmp(key, "space directions") == 0)
@@ -513,16 +418,16 @@ static int read_nrrd_line(const char *key, const char *value, struct layout *ret
 	if (strcmp(key, "space") == 0) {
 		*ras = strcmp(value, "right-anterior-superior") == 0 || strcmp(value, "RAS") == 0;
 		if (!*ras && strcmp(value, "left-posterior-superior") != 0 && strcmp(value, "LPS") != 0)
-			return refuse_value(key, value, err);
+			return header_refuse(key, value, err);
 	}
 	if (strcmp(key, "type") == 0) {
-		for (int i = 0; i < ELEMENT_COUNT; i++) {
-			if (strcmp(value, elements[i].nrrd) == 0 || strcmp(value, elements[i].nrrd_too) == 0) {
-				ret->element = (enum element)i;
+		for (int i = 0; i < PIXEL_TYPE_COUNT; i++) {
+			if (strcmp(value, type_names[i].nrrd) == 0 || strcmp(value, type_names[i].nrrd_too) == 0) {
+				ret->type = (enum pixel_type)i;
 				return 0;
 			}
 		}
-		return refuse_value(key, value, err);
+		return header_refuse(key, value, err);
 	}
 	return 0;
 }
@@ -532,8 +437,8 @@ static int read_nrrd(const char *text, size_t length, struct layout *ret, struct
 	char row[512];
 	bool ras = false;
 
-	next_line(text, length, &ret->start, row, sizeof(row)); /* the magic */
-	while (next_line(text, length, &ret->start, row, sizeof(row))) {
+	header_line(text, length, &ret->start, row, sizeof(row)); /* the magic */
+	while (header_line(text, length, &ret->start, row, sizeof(row))) {
 		char *colon = strstr(row, ": ");
 		int code = 0;
 
@@ -559,12 +464,13 @@ static int read_header(const uint8_t *head, size_t length, struct layout *ret, s
 {
 	const char *text = (const char *)head;
 
-	*ret = (struct layout){.direction = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}, .slope = 1, .size = {1, 1, 1}};
+	*ret = (struct layout){
+	    .direction = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}, .type = PIXEL_FLOAT32, .slope = 1, .size = {1, 1, 1}};
 	if (length >= NIFTI_HEADER && memcmp(head + NIFTI_MAGIC, "n+1", 4) == 0)
 		return read_nifti(head, ret, err);
 	if (length >= 5 && memcmp(head, "NRRD0", 5) == 0)
 		return read_nrrd(text, length, ret, err);
-	if (length >= 10 && (memcmp(head, "ObjectType", 10) == 0 || memcmp(head, "NDims", 5) == 0))
+	if (metaimage_recognise(head, length))
 		return read_mha(text, length, ret, err);
 	if (grid->size[0] < 1)
 		return error_set(err, ERR_INVALID, "neither NIfTI, MetaImage nor NRRD, and no grid for a raw volume");
@@ -596,43 +502,18 @@ static int layout_grid(const struct layout *layout, struct grid *ret_grid, bool 
 	return grid_check(ret_grid, err);
 }
 
-static double element_value(const uint8_t *at, enum element element)
-{
-	double number;
-	int32_t whole;
-
-	switch (element) {
-	case ELEMENT_FLOAT:
-		return get_float(at);
-	case ELEMENT_DOUBLE:
-		memcpy(&number, at, sizeof(number));
-		return number;
-	case ELEMENT_INT8:
-		return (int8_t)*at;
-	case ELEMENT_UINT8:
-		return *at;
-	case ELEMENT_INT16:
-		return get16(at);
-	case ELEMENT_UINT16:
-		return (uint16_t)get16(at);
-	case ELEMENT_INT32:
-		memcpy(&whole, at, sizeof(whole));
-		return whole;
-	}
-	return 0;
-}
-
 /* Row after row, each to its place. */
 static int read_voxels(int file, const char *path, const struct layout *layout, const struct grid *grid,
 		       const bool flip[3], float *ret_voxels, struct error *err)
 {
 	size_t nx = (size_t)grid->size[0], ny = (size_t)grid->size[1], nz = (size_t)grid->size[2];
-	size_t bytes = elements[layout->element].bytes, plane = nx * ny * bytes;
+	size_t bytes = pixel_bytes(layout->type), plane = nx * ny * bytes;
 	uint8_t *slice = malloc(plane);
+	float *stored = malloc(nx * sizeof(*stored));
 	int code = 0;
 
-	if (slice == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for a slice of %zu bytes", plane);
+	if (slice == NULL || stored == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for a slice of %zu bytes", plane);
 	for (size_t z = 0; z < nz && code == 0; z++) {
 		size_t to_z = flip[2] ? nz - 1 - z : z;
 
@@ -641,14 +522,14 @@ static int read_voxels(int file, const char *path, const struct layout *layout, 
 			size_t to_y = flip[1] ? ny - 1 - y : y;
 			float *row = ret_voxels + (to_z * ny + to_y) * nx;
 
-			for (size_t x = 0; x < nx; x++) {
-				double stored = element_value(slice + (y * nx + x) * bytes, layout->element);
-
-				row[flip[0] ? nx - 1 - x : x] = (float)(layout->slope * stored + layout->offset);
-			}
+			pixels_to_float(slice + y * nx * bytes, layout->type, false, nx, stored);
+			for (size_t x = 0; x < nx; x++)
+				row[flip[0] ? nx - 1 - x : x] =
+				    (float)(layout->slope * (double)stored[x] + layout->offset);
 		}
 	}
 	free(slice);
+	free(stored);
 	return code;
 }
 
@@ -656,7 +537,7 @@ static int read_voxels(int file, const char *path, const struct layout *layout, 
 static int check_length(const char *path, const struct stat *status, const struct layout *layout,
 			const struct grid *grid, struct error *err)
 {
-	size_t expected = layout->start + grid_voxels(grid) * elements[layout->element].bytes;
+	size_t expected = layout->start + grid_voxels(grid) * pixel_bytes(layout->type);
 
 	if ((size_t)status->st_size < expected)
 		return error_set(err, ERR_INVALID, "%.200s: %zu bytes, at least %zu are expected", path,

@@ -324,8 +324,10 @@ static const struct {
 } unread[] = {
     {"ObjectType = Image\nNDims = 3\nDimSize = 3 2 4\nElementType = MET_FLOAT\nElementDataFile = x.raw\n", "x.raw"},
     {"ObjectType = Image\nNDims = 2\nDimSize = 3 2\nElementType = MET_FLOAT\nElementDataFile = LOCAL\n", "NDims"},
-    {"NDims = 3\nCompressedData = True\nDimSize = 3 2 4\nElementDataFile = LOCAL\n", "CompressedData"},
-    {"NDims = 3\nBinaryDataByteOrderMSB = True\nDimSize = 3 2 4\nElementDataFile = LOCAL\n", "MSB"},
+    {"NDims = 3\nCompressedData = True\nDimSize = 3 2 4\nElementType = MET_FLOAT\nElementDataFile = LOCAL\n",
+     "CompressedData"},
+    {"NDims = 3\nBinaryDataByteOrderMSB = True\nDimSize = 3 2 4\nElementType = MET_FLOAT\nElementDataFile = LOCAL\n",
+     "MSB"},
     {"NDims = 3\nDimSize = 3 2\nElementDataFile = LOCAL\n", "DimSize"},
     {"NDims = 3\nDimSize = 3 2 0\nElementDataFile = LOCAL\n", "DimSize"},
     {"NDims = 3\nDimSize = 3 2 1e30\nElementDataFile = LOCAL\n", "DimSize"},
