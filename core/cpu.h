@@ -27,9 +27,11 @@ enum {
 	LANES_MOST = 16,    /* of any instruction set */
 	BLOCK_COLUMNS = 16, /* of a projection that are handed out together */
 	TILE_ACROSS = 4,    /* voxels of a tile across its lines */
+	MATCHED_ACROSS = 8, /* the same for the matched backprojection, whose rays reach two voxels beyond a tile */
 	TILE_ALONG = 512,   /* and at most so many along one */
 	TILE_LINES = TILE_ACROSS * TILE_ACROSS,
 	BLEND_MARGIN = 2 * LANES_MOST, /* floats around a column of voxels in scratch, for windows beyond its ends */
+	ROWS_MARGIN = 4 * LANES_MOST,  /* the same around a column of pixels */
 };
 
 struct device {
@@ -74,6 +76,8 @@ struct plan {
 	bool fans;            /* untilted, and no ray passes more voxels along z than across */
 	bool along_z;         /* backprojection takes voxels along z together, else along x */
 	bool along_rows;      /* projection takes pixels along a column of the detector together, else along a row */
+	bool matched;         /* plain backprojection is the transpose of the projection */
+	int across[2];        /* voxels of a tile across its lines, by enum backprojection */
 	char summary[96];
 
 	struct linearise linearise;
@@ -153,6 +157,12 @@ struct cpu_kernels {
 	 */
 	bool (*backproject)(const struct plan *plan, int view, const struct tile *tile, enum backprojection weight,
 			    const float *projection, float *sums, float *cover);
+	/*
+	 * Adds the transpose of `project` of one view to the tile's sums, and that of
+	 * ones to `cover`; either may be NULL. scratch: matched_scratch_floats.
+	 */
+	void (*backproject_matched)(const struct plan *plan, int view, const struct tile *tile, const float *projection,
+				    float *sums, float *cover, float *scratch);
 
 	void (*tv_flux)(const struct tv_row *row, const struct tv_weights *weights, float epsilon2,
 			const struct tv_flux *ret);
@@ -203,6 +213,12 @@ static inline size_t project_scratch_floats(const struct plan *plan)
 	return 4 * lanes_padded(plan->rows) + 2 * (lanes_padded(plan->grid.size[2]) + 2 * BLEND_MARGIN);
 }
 
+/* Four floats for each row of a column, and as many rows around them as windows reach. */
+static inline size_t matched_scratch_floats(const struct plan *plan)
+{
+	return plan->matched ? 4 * (lanes_padded(plan->rows) + 2 * ROWS_MARGIN) : 0;
+}
+
 static inline float *plan_scratch(const struct plan *plan)
 {
 	return plan->scratch + (size_t)cpu_thread() * plan->scratch_floats;
@@ -243,8 +259,8 @@ int column_blocks(const struct plan *plan);
 int cpu_backproject(struct plan *plan, const struct stack *from, const int *views, int count,
 		    enum backprojection weight, struct volume *to, struct error *err);
 /* Tiles that the grid is cut into; tile_at gives one of them. */
-int tile_count(const struct plan *plan);
-void tile_at(const struct plan *plan, int index, struct tile *ret_tile);
+int tile_count(const struct plan *plan, enum backprojection weight);
+void tile_at(const struct plan *plan, enum backprojection weight, int index, struct tile *ret_tile);
 size_t tile_floats(const struct plan *plan); /* of the largest tile's sums */
 int tile_lines(const struct plan *plan, const struct tile *tile);
 /* The voxels of one line of a tile: first float in a volume, floats from one to the next, how many. */

@@ -88,6 +88,9 @@ static void plan_shape(const struct plan_options *options, struct plan *ret)
 	ret->along_rows = geometry->rows >= ALONG_LEAST || geometry->rows >= geometry->columns;
 	ret->untilted = ret->along_z && ret->along_rows && geometry_is_untilted(geometry);
 	ret->fans = ret->untilted && rays_lie_flat(geometry, grid);
+	ret->matched = options->matched;
+	ret->across[BACKPROJECT_FDK] = TILE_ACROSS;
+	ret->across[BACKPROJECT_PLAIN] = ret->matched ? MATCHED_ACROSS : TILE_ACROSS;
 	ret->linearise = options->linearise;
 	ret->filter_batch = at_least_one(share, geometry->count);
 	if (options->sart != NULL) {
@@ -100,8 +103,8 @@ static void plan_shape(const struct plan_options *options, struct plan *ret)
 		ret->planes_floats = tv_planes_floats(ret);
 	}
 	ret->scratch_floats = (size_t)BLOCK_COLUMNS * (size_t)ret->rows + project_scratch_floats(ret);
-	if (ret->scratch_floats < 2 * tile_floats(ret))
-		ret->scratch_floats = 2 * tile_floats(ret);
+	if (ret->scratch_floats < 2 * tile_floats(ret) + matched_scratch_floats(ret))
+		ret->scratch_floats = 2 * tile_floats(ret) + matched_scratch_floats(ret);
 }
 
 static bool needs_work(const struct plan *plan)
@@ -279,9 +282,9 @@ int cpu_plan_new(struct device *device, const struct plan_options *options, stru
 		cpu_plan_free(plan);
 		return code;
 	}
-	snprintf(plan->summary, sizeof(plan->summary), "%s, %d thread%s, %s",
-		 plan->untilted ? "untilted" : "any geometry", device->threads, device->threads == 1 ? "" : "s",
-		 device->kernels->name);
+	snprintf(plan->summary, sizeof(plan->summary), "%s%s, %d thread%s, %s",
+		 plan->untilted ? "untilted" : "any geometry", plan->matched ? ", matched projector" : "",
+		 device->threads, device->threads == 1 ? "" : "s", device->kernels->name);
 	*ret_plan = plan;
 	return 0;
 }

@@ -75,23 +75,34 @@ static void update_line(const struct plan *plan, const float *sums, const float 
 	}
 }
 
+/* Sums and cover of one view; true where the cover is 1 all over the tile and was left alone. */
+static bool add_view(const struct plan *plan, int view, const struct tile *tile, const float *corrections, float *sums,
+		     float *cover, float *scratch)
+{
+	const struct cpu_kernels *kernels = plan->device->kernels;
+
+	if (!plan->matched)
+		return kernels->backproject(plan, view, tile, BACKPROJECT_PLAIN, corrections, sums, cover);
+	kernels->backproject_matched(plan, view, tile, corrections, sums, cover, scratch);
+	return false;
+}
+
 static void update_tile(const struct plan *plan, const struct subset *subset, int begin, int count, int index,
 			struct volume *volume)
 {
-	const struct cpu_kernels *kernels = plan->device->kernels;
 	const size_t pixels = (size_t)plan->rows * (size_t)plan->columns, floats = tile_floats(plan);
 	const bool first = begin == 0, last = begin + count == subset->count;
-	float *sums = plan_scratch(plan), *cover = sums + floats;
+	float *sums = plan_scratch(plan), *cover = sums + floats, *scratch = cover + floats;
 	int everywhere = 0;
 	struct tile tile;
 
-	tile_at(plan, index, &tile);
+	tile_at(plan, BACKPROJECT_PLAIN, index, &tile);
 	memset(sums, 0, 2 * floats * sizeof(float));
 	for (int i = 0; i < count; i++)
-		everywhere += kernels->backproject(plan, subset->views[begin + i], &tile, BACKPROJECT_PLAIN,
-						   plan->corrections + (size_t)i * pixels, sums, last ? cover : NULL);
+		everywhere += add_view(plan, subset->views[begin + i], &tile, plan->corrections + (size_t)i * pixels,
+				       sums, last ? cover : NULL, scratch);
 	for (int i = 0; last && i < begin; i++)
-		everywhere += kernels->backproject(plan, subset->views[i], &tile, BACKPROJECT_PLAIN, NULL, NULL, cover);
+		everywhere += add_view(plan, subset->views[i], &tile, NULL, NULL, cover, scratch);
 	for (int line = 0; line < tile_lines(plan, &tile); line++) {
 		float *line_sums = sums + (size_t)line * tile.stride;
 		int length;
@@ -110,7 +121,7 @@ static void update_tile(const struct plan *plan, const struct subset *subset, in
 static int run_subset(struct plan *plan, const struct subset *subset, const struct stack *projections,
 		      struct volume *volume, const struct cancel *cancel, struct sart_sums *sums, struct error *err)
 {
-	const int tiles = tile_count(plan);
+	const int tiles = tile_count(plan, BACKPROJECT_PLAIN);
 
 	for (int begin = 0; begin < subset->count; begin += plan->batch) {
 		int left = subset->count - begin, count = left < plan->batch ? left : plan->batch;

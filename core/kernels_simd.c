@@ -16,6 +16,7 @@ const struct cpu_kernels SIMD_NAME(cpu_kernels) = {
     .name = NAME,
     .project = SIMD_NAME(project),
     .backproject = SIMD_NAME(backproject),
+    .backproject_matched = SIMD_NAME(backproject_matched),
     .tv_flux = SIMD_NAME(tv_flux),
     .tv_dual = SIMD_NAME(tv_dual),
     .tv_update = SIMD_NAME(tv_update),

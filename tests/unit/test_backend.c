@@ -962,6 +962,94 @@ END_TEST
 
 /* ---- proximal TV ---- */
 
+/* <a, b> */
+static double inner(const float *a, const float *b, size_t count)
+{
+	double sum = 0;
+
+	for (size_t i = 0; i < count; i++)
+		sum += (double)a[i] * (double)b[i];
+	return sum;
+}
+
+static void matched_backproject(struct rig *rig, const float *projections, float *ret)
+{
+	load(rig, projections);
+	ok(rig->backend->volume_fill(rig->volume, 0, &err));
+	ok(rig->backend->backproject(rig->plan, rig->stack, all_views, rig->geometry.count, BACKPROJECT_PLAIN,
+				     rig->volume, &err));
+	read_volume(rig, ret);
+}
+
+static void project_all(struct rig *rig, const float *volume, float *ret)
+{
+	ok(rig->backend->volume_upload(rig->volume, volume, &err));
+	ok(rig->backend->project(rig->plan, rig->volume, all_views, rig->geometry.count, rig->stack, &err));
+	unload(rig, rig->stack, ret);
+}
+
+/* Corners, edges, faces and the middle of the grid. */
+static size_t some_voxel(const struct grid *grid, int index)
+{
+	size_t ret = 0;
+
+	for (int i = 2; i >= 0; i--) {
+		static const int digits[3] = {1, 3, 9};
+		const int place = index / digits[i] % 3;
+
+		ret = ret * (size_t)grid->size[i] + (size_t)(place == 0   ? 0
+							     : place == 1 ? grid->size[i] / 2
+									  : grid->size[i] - 1);
+	}
+	return ret;
+}
+
+START_TEST(matched_backprojection_is_the_transpose_of_projection)
+{
+	struct rig rig;
+	float *volume, *projections, *seen, *spread;
+
+	random_state = 20;
+	rig_make(&setups[_i], &rig);
+	rig.options.matched = true;
+	volume = random_floats(rig.voxels, 0, 1);
+	projections = random_floats(rig.all_pixels, 0, 1);
+	seen = floats(rig.all_pixels);
+	spread = floats(rig.voxels);
+	FOR_EACH_MACHINE(&rig)
+	{
+		double forward, backward, most_spread;
+
+		project_all(&rig, volume, seen);
+		matched_backproject(&rig, projections, spread);
+		forward = inner(seen, projections, rig.all_pixels);
+		backward = inner(volume, spread, rig.voxels);
+		/* sums of thousands of roundings in single precision */
+		ck_assert_msg(fabs(forward / backward - 1) < 2e-6, "%s, %s: %g", setups[_i].name, machine->name,
+			      forward / backward - 1);
+		most_spread = most(spread, rig.voxels);
+		/* and each row of the transpose is a column of the matrix */
+		for (int k = 0; k < 27; k++) {
+			const size_t at = some_voxel(&rig.grid, k);
+			float *one = floats(rig.voxels);
+
+			one[at] = 1;
+			project_all(&rig, one, seen);
+			free(one);
+			forward = inner(seen, projections, rig.all_pixels);
+			ck_assert_msg(fabs(forward - (double)spread[at]) < SINGLE * most_spread,
+				      "%s, %s: voxel %d: %g instead of %g", setups[_i].name, machine->name, k,
+				      (double)spread[at], forward);
+		}
+	}
+	free(spread);
+	free(seen);
+	free(projections);
+	free(volume);
+	rig_clear(&rig);
+}
+END_TEST
+
 START_TEST(proximal_tv_of_a_step_is_known)
 {
 	/* Of two levels, each side moves towards the other by 1 / (alpha times its length). */
@@ -1549,6 +1637,7 @@ Suite *backend_suite(void)
 	tcase_add_loop_test(known, integrals_of_a_ball_are_exact_within_its_voxels, 0, 2);
 	tcase_add_test(known, fdk_of_a_ball_has_its_density);
 	tcase_add_loop_test(known, projection_is_linear, 0, SETUPS);
+	tcase_add_loop_test(known, matched_backprojection_is_the_transpose_of_projection, 0, SETUPS);
 	tcase_add_test(known, proximal_tv_of_a_step_is_known);
 	tcase_add_loop_test(known, proximal_tv_is_a_minimum, 0, SETUPS);
 	tcase_add_test(known, gradient_tv_is_stable_and_comes_near_the_minimum);
