@@ -181,13 +181,13 @@ static int finish_place(const struct lines *lines, struct metaimage *image, stru
 
 static int finish(const struct lines *lines, struct metaimage *image, struct error *err)
 {
-	int code = 0;
+	int code;
 
 	if (image->dimensions == 0)
 		return error_set(err, ERR_INVALID, "MetaImage: the header has no NDims");
-	if (!lines->type_seen)
-		return error_set(err, ERR_INVALID, "MetaImage: the header has no ElementType");
 	code = finish_size(lines, image, err);
+	if (code == 0 && !lines->type_seen)
+		code = error_set(err, ERR_INVALID, "MetaImage: the header has no ElementType");
 	if (code == 0)
 		code = finish_spacing(lines, image, err);
 	if (code == 0)

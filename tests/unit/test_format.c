@@ -333,8 +333,11 @@ static const struct {
     {"NDims = 3\nDimSize = 3 2 1e30\nElementDataFile = LOCAL\n", "DimSize"},
     {"NDims = 3\nDimSize = 8000 8000 8000\nElementType = MET_FLOAT\nElementDataFile = LOCAL\n", "2048000000"},
     {"NDims = 3\nDimSize = 3 2 4\nElementType = MET_FLOAT_ARRAY\nElementDataFile = LOCAL\n", "ElementType"},
-    {"NDims = 3\nDimSize = 3 2 4\nTransformMatrix = 0 1 0 1 0 0 0 0 1\nElementDataFile = LOCAL\n", "axes"},
-    {"NDims = 3\nDimSize = 3 2 4\nElementSpacing = 1 0 1\nElementDataFile = LOCAL\n", "spacing"},
+    {"NDims = 3\nDimSize = 3 2 4\nTransformMatrix = 0 1 0 1 0 0 0 0 1\nElementType = MET_FLOAT\nElementDataFile = "
+     "LOCAL\n",
+     "axes"},
+    {"NDims = 3\nDimSize = 3 2 4\nElementSpacing = 1 0 1\nElementType = MET_FLOAT\nElementDataFile = LOCAL\n",
+     "spacing"},
     {"NDims = 3\nno equals sign here\n", "no line"},
     {"NDims = 3\n", "ElementDataFile"},
     {"NRRD0004\ntype: float\ndimension: 3\nsizes: 3 2 4\nencoding: gzip\n\n", "gzip"},
