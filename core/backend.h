@@ -180,6 +180,8 @@ enum backprojection { BACKPROJECT_PLAIN, BACKPROJECT_FDK /* times (D/depth)^2 */
 struct backend {
 	const char *name;    /* "cpu", "cuda" */
 	const char *summary; /* for --help */
+	/* Its devices have memory beside the host's: what does not fit there can go through it in parts (parts.h). */
+	bool own_memory;
 
 	/* Devices that answer now; 0 when there is none. Never fails. */
 	int (*count)(void);

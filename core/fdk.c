@@ -14,6 +14,8 @@
 #include <assert.h>
 #include <stdlib.h>
 
+#include "core/parts.h"
+
 int fdk_weights_make(struct fdk_weights *ret_weights, const struct orbit *orbit, const struct geometry *geometry,
 		     enum window window, double cutoff, struct error *err)
 {
@@ -50,7 +52,7 @@ int fdk_batch(const struct backend *backend, const struct plan *plan, int views)
 {
 	int batch = backend->plan_batch(plan);
 
-	if (batch > FDK_BATCH_MOST)
+	if (batch > FDK_BATCH_MOST && backend != &backend_parts)
 		batch = FDK_BATCH_MOST;
 	return batch < views ? batch : views;
 }
@@ -59,19 +61,28 @@ int fdk_open(struct fdk *ret_fdk, const struct backend *backend, struct device *
 	     const struct geometry *geometry, const int pad[2], struct error *err)
 {
 	struct fdk fdk = {.backend = backend, .plan = plan, .batch = fdk_batch(backend, plan, geometry->count)};
-	int code = backend->stack_new(device, pad[0] + geometry->columns + pad[1], geometry->rows, fdk.batch,
-				      &fdk.filtered, err);
+	int code;
 
+	fdk.views = malloc((size_t)fdk.batch * sizeof(int));
+	fdk.slots = malloc((size_t)fdk.batch * sizeof(int));
+	if (fdk.views == NULL || fdk.slots == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for batches of %d views", fdk.batch);
+	else
+		code = backend->stack_new(device, pad[0] + geometry->columns + pad[1], geometry->rows, fdk.batch,
+					  &fdk.filtered, err);
 	if (code < 0)
-		return code;
-	*ret_fdk = fdk;
-	return 0;
+		fdk_clear(&fdk);
+	else
+		*ret_fdk = fdk;
+	return code;
 }
 
 void fdk_clear(struct fdk *fdk)
 {
 	if (fdk->backend != NULL)
 		fdk->backend->stack_free(fdk->filtered);
+	free(fdk->views);
+	free(fdk->slots);
 	*fdk = (struct fdk){0};
 }
 

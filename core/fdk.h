@@ -20,17 +20,18 @@ void fdk_weights_clear(struct fdk_weights *weights);
 /*
  * Views that are filtered and backprojected in one go, at most: memory is
  * counted with it before any plan can be asked, and by 32 views the pass over
- * the volume that a batch costs is long hidden behind the samples it takes.
+ * the volume that a batch costs is long hidden behind the samples it takes. Not
+ * in parts: there the pass is over the host's memory, and all views go at once.
  */
 enum { FDK_BATCH_MOST = 32 };
 
 struct fdk {
 	const struct backend *backend;
-	struct plan *plan;                                /* borrowed */
-	struct stack *filtered;                           /* [batch][row][padded column], owned */
-	int batch;                                        /* views in one go */
-	int pending;                                      /* views that wait for their batch to be full */
-	int views[FDK_BATCH_MOST], slots[FDK_BATCH_MOST]; /* of those, and where they lie */
+	struct plan *plan;      /* borrowed */
+	struct stack *filtered; /* [batch][row][padded column], owned */
+	int batch;              /* views in one go */
+	int pending;            /* views that wait for their batch to be full */
+	int *views, *slots;     /* [batch], of those, and where they lie; owned */
 };
 
 /* Views in one go for this plan and this many views. */

@@ -12,6 +12,7 @@
 #include <time.h>
 
 #include "core/fdk.h"
+#include "core/parts.h"
 #include "core/sart.h"
 
 const char *const stage_names[STAGE_COUNT] = {"load", "fdk", "sart", "tv", "save"};
@@ -21,6 +22,7 @@ const char *const stage_names[STAGE_COUNT] = {"load", "fdk", "sart", "tv", "save
 struct recon {
 	const struct backend *backend;
 	struct device *device;
+	struct device *parts; /* that one, where the job goes through the device in parts */
 	const struct geometry *geometry;
 	const struct recon_hooks *hooks;
 	struct cancel cancel;
@@ -79,6 +81,10 @@ static struct plan_options plan_options(const struct recipe *recipe, const struc
 	    .sart = recipe->sart.on ? sart : NULL,
 	    .tv = recipe->tv.on ? &recipe->tv.options : NULL,
 	    .reference_precision = recipe->reference_precision,
+	    .no_projection = !recipe->sart.on,
+	    .resident = recipe->sart.on            ? 0
+			: geometry->count < FDK_BATCH_MOST ? geometry->count
+							   : FDK_BATCH_MOST,
 	};
 }
 
@@ -113,12 +119,35 @@ static int memory_needed(const struct backend *backend, struct device *device, c
 	if (options->column_weights != NULL)
 		memory.scratch += batch / columns * (columns + (size_t)(options->pad[0] + options->pad[1]));
 	memory.total = memory.projections + memory.volumes + memory.scratch;
+	memory.host = bytes.host;
 	if (device != NULL) {
 		backend->describe(device, &info);
 		memory.available = info.bytes_free;
 	}
 	*ret_memory = memory;
 	return 0;
+}
+
+/*
+ * What the job takes, and on what: *ret_parts stays NULL where it fits as a
+ * whole, otherwise it is the device in parts and the memory what that takes.
+ */
+static int choose_device(const struct backend *backend, struct device *device, const struct plan_options *options,
+			 struct recon_memory *ret_memory, struct device **ret_parts, struct error *err)
+{
+	struct device *parts = NULL;
+	int code = memory_needed(backend, device, options, ret_memory, err);
+
+	if (code < 0 || device == NULL || !backend->own_memory || ret_memory->total <= ret_memory->available)
+		return code;
+	code = parts_open(backend, device, &parts, err);
+	if (code == 0)
+		code = memory_needed(&backend_parts, parts, options, ret_memory, err);
+	if (code < 0)
+		backend_parts.close(parts);
+	else
+		*ret_parts = parts;
+	return code;
 }
 
 int recon_memory(const struct backend *backend, struct device *device, const struct geometry *geometry,
@@ -130,6 +159,7 @@ int recon_memory(const struct backend *backend, struct device *device, const str
 	struct recipe resolved = *recipe;
 	struct orbit orbit;
 	struct sart_options sart = {0};
+	struct device *parts = NULL;
 	struct plan_options options;
 	int code = orbit_analyse(&orbit, geometry, err);
 
@@ -141,25 +171,43 @@ int recon_memory(const struct backend *backend, struct device *device, const str
 		code = sart_options_make(&sart, &resolved, &orbit, err);
 	if (code == 0) {
 		options = plan_options(&resolved, geometry, &linearise, &weights, &sart);
-		code = memory_needed(backend, device, &options, ret_memory, err);
+		code = choose_device(backend, device, &options, ret_memory, &parts, err);
 	}
+	if (parts != NULL)
+		backend_parts.close(parts);
 	subsets_clear(&sart.subsets);
 	orbit_clear(&orbit);
 	return code;
 }
 
-static int refuse_what_does_not_fit(const struct recon *recon, const struct plan_options *options, struct error *err)
+/* The host's memory is asked for where the job lies in it. */
+static int refuse_what_does_not_fit(struct recon *recon, const struct plan_options *options, struct error *err)
 {
 	const double mib = 1 << 20;
 	struct recon_memory memory;
-	int code = memory_needed(recon->backend, recon->device, options, &memory, err);
+	struct device_info host = {.bytes_free = SIZE_MAX};
+	struct device *processor;
+	int code = choose_device(recon->backend, recon->device, options, &memory, &recon->parts, err);
 
+	if (code == 0 && recon->parts != NULL) {
+		recon->backend = &backend_parts;
+		recon->device = recon->parts;
+		code = backend_cpu.open(0, &(struct device_options){0}, &processor, err);
+		if (code < 0)
+			return code;
+		backend_cpu.describe(processor, &host);
+		backend_cpu.close(processor);
+	}
 	if (code == 0 && memory.total > memory.available)
 		return error_set_at(
 		    err, ERR_NO_MEMORY, "/grid",
 		    "%.1f MiB are needed (projections %.1f, volumes %.1f, scratch %.1f), %.1f MiB are free",
 		    (double)memory.total / mib, (double)memory.projections / mib, (double)memory.volumes / mib,
 		    (double)memory.scratch / mib, (double)memory.available / mib);
+	if (code == 0 && memory.host > host.bytes_free)
+		return error_set_at(err, ERR_NO_MEMORY, "/grid",
+				    "%.1f MiB of the host's memory are needed, %.1f MiB are free",
+				    (double)memory.host / mib, (double)host.bytes_free / mib);
 	return code;
 }
 
@@ -189,12 +237,12 @@ static int recon_prepare(struct recon *recon, const struct recipe *recipe, struc
 
 static int recon_allocate(struct recon *recon, struct error *err)
 {
-	const struct backend *backend = recon->backend;
 	const struct geometry *geometry = recon->geometry;
 	const struct recipe *recipe = &recon->recipe;
 	const struct plan_options options =
 	    plan_options(recipe, geometry, &recon->linearise, &recon->weights, &recon->sart);
 	int code = refuse_what_does_not_fit(recon, &options, err);
+	const struct backend *backend = recon->backend; /* that may have changed it */
 
 	if (code == 0)
 		code = backend->plan_new(recon->device, &options, &recon->plan, err);
@@ -252,6 +300,8 @@ void recon_free(struct recon *recon)
 	fdk_weights_clear(&recon->weights);
 	orbit_clear(&recon->orbit);
 	recipe_clear(&recon->recipe);
+	if (recon->parts != NULL)
+		backend_parts.close(recon->parts);
 	free(recon->pushed);
 	free(recon);
 }

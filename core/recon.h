@@ -101,6 +101,7 @@ struct recon_hooks {
 struct recon_memory {
 	size_t projections, volumes, scratch, total; /* bytes on the device */
 	size_t available;                            /* bytes free there */
+	size_t host; /* 0; or in parts (parts.h): bytes in the host's memory, where projections and volumes lie */
 };
 
 /*

@@ -242,6 +242,7 @@ static void add_memory(cJSON *document, const struct recon_memory *memory)
 	cJSON_AddNumberToObject(object, "volumes", (double)memory->volumes);
 	cJSON_AddNumberToObject(object, "scratch", (double)memory->scratch);
 	cJSON_AddNumberToObject(object, "total", (double)memory->total);
+	cJSON_AddNumberToObject(object, "host", (double)memory->host);
 }
 
 static void add_job_facts(cJSON *document, struct job *job, const struct job_record *record)

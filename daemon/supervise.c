@@ -824,6 +824,14 @@ int supervise_workers(struct supervise *supervise, struct worker_facts *ret_fact
 	return supervise->count;
 }
 
+/* What does not fit on a card goes through it in parts and lies in the host's memory, all of which may come free. */
+static size_t memory_available(const struct worker_facts *facts)
+{
+	size_t host = (size_t)sysconf(_SC_PHYS_PAGES) * (size_t)sysconf(_SC_PAGESIZE);
+
+	return strcmp(facts->backend, "cpu") == 0 || facts->bytes_free > host ? facts->bytes_free : host;
+}
+
 /*
  * The daemon has no CUDA to ask, so for a card it takes what no recipe can do
  * without: the projections as floats, the iterate and its copy.
@@ -857,7 +865,7 @@ int supervise_check_memory(struct supervise *supervise, const struct scan *scan,
 		code = memory_needed(facts[i].backend, scan, recipe, &memory, err);
 		if (code != 0)
 			return code;
-		memory.available = facts[i].bytes_free;
+		memory.available = memory_available(&facts[i]);
 		if (memory.total <= memory.available) {
 			*ret_memory = memory;
 			return 0;

@@ -146,6 +146,7 @@ extern "C" const struct backend backend_cuda;
 const struct backend backend_cuda = {
     .name = "cuda",
     .summary = "NVIDIA GPUs",
+    .own_memory = true,
     .count = cuda_count,
     .open = cuda_open,
     .close = cuda_close,

@@ -59,6 +59,7 @@ static const struct field opened_fields[] = {FIELD("job", FIELD_STRING, job),
 					     FIELD("scratch", FIELD_SIZE, memory.scratch),
 					     FIELD("total", FIELD_SIZE, memory.total),
 					     FIELD("available", FIELD_SIZE, memory.available),
+					     FIELD("host", FIELD_SIZE, memory.host),
 					     FIELD("plan", FIELD_STRING, plan),
 					     {0}};
 static const struct field progress_fields[] = {FIELD("job", FIELD_STRING, job),

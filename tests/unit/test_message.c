@@ -114,11 +114,12 @@ START_TEST(what_a_worker_says_comes_back)
 	ck_assert_uint_eq(back.info.bytes_free, (150ull << 30) + 1);
 
 	message =
-	    (struct message){.kind = MESSAGE_OPENED, .job = "j", .plan = "untilted", .memory = {1, 2, 3, 6, 1000}};
+	    (struct message){.kind = MESSAGE_OPENED, .job = "j", .plan = "untilted", .memory = {1, 2, 3, 6, 1000, 77}};
 	back = through(&message);
 	ck_assert_str_eq(back.plan, "untilted");
 	ck_assert_uint_eq(back.memory.scratch, 3);
 	ck_assert_uint_eq(back.memory.available, 1000);
+	ck_assert_uint_eq(back.memory.host, 77);
 
 	message = (struct message){.kind = MESSAGE_WARNING, .job = "j", .code_name = "defects", .text = "3 pixels"};
 	back = through(&message);

@@ -1,0 +1,278 @@
+/*
+ * Volumes and projections in the host's memory, and the table of what works on
+ * them in parts: parts.h.
+ */
+#include "core/parts_internal.h"
+
+#include <stdlib.h>
+#include <string.h>
+#include <sys/mman.h>
+
+float *parts_floats(size_t count)
+{
+	void *floats = mmap(NULL, count * sizeof(float), PROT_READ | PROT_WRITE,
+			    MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
+
+	if (floats == MAP_FAILED)
+		return NULL;
+	madvise(floats, count * sizeof(float), MADV_HUGEPAGE); /* a hint: fewer faults where it is taken */
+	return floats;
+}
+
+void parts_floats_free(float *floats, size_t count)
+{
+	if (floats != NULL)
+		munmap(floats, count * sizeof(float));
+}
+
+int parts_open(const struct backend *backend, struct device *device, struct device **ret_parts, struct error *err)
+{
+	struct device *parts = calloc(1, sizeof(*parts));
+
+	if (parts == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a device");
+	*parts = (struct device){.backend = backend, .below = device};
+	*ret_parts = parts;
+	return 0;
+}
+
+static void parts_close(struct device *device)
+{
+	free(device);
+}
+
+static void parts_describe(struct device *device, struct device_info *ret_info)
+{
+	device->backend->describe(device->below, ret_info);
+}
+
+static int parts_sync(struct device *device, struct error *err)
+{
+	return device->backend->sync(device->below, err);
+}
+
+/* ---- volumes ---- */
+
+static size_t volume_floats(const struct volume *volume)
+{
+	return volume->slice * (size_t)volume->size[2];
+}
+
+static int parts_volume_new(struct device *device, const struct grid *grid, struct volume **ret_volume,
+			    struct error *err)
+{
+	struct volume *volume = calloc(1, sizeof(*volume));
+
+	if (volume != NULL) {
+		volume->device = device;
+		memcpy(volume->size, grid->size, sizeof(volume->size));
+		volume->slice = (size_t)grid->size[0] * (size_t)grid->size[1];
+		volume->is_zero = true;
+		volume->data = parts_floats(volume_floats(volume));
+	}
+	if (volume == NULL || volume->data == NULL) {
+		free(volume);
+		return error_set(err, ERR_NO_MEMORY, "no memory for %zu voxels", grid_voxels(grid));
+	}
+	*ret_volume = volume;
+	return 0;
+}
+
+static void parts_volume_free(struct volume *volume)
+{
+	if (volume == NULL)
+		return;
+	parts_floats_free(volume->data, volume_floats(volume));
+	free(volume);
+}
+
+static int check_slices(const struct volume *volume, int z_first, int z_count, struct error *err)
+{
+	if (z_first < 0 || z_count < 0 || z_first > volume->size[2] - z_count)
+		return error_set(err, ERR_INTERNAL, "slices %d to %d of %d", z_first, z_first + z_count - 1,
+				 volume->size[2]);
+	return 0;
+}
+
+static void copy_slices(float *to, const float *from, size_t slice, int count)
+{
+#pragma omp parallel for schedule(static)
+	for (int z = 0; z < count; z++)
+		memcpy(to + (size_t)z * slice, from + (size_t)z * slice, slice * sizeof(float));
+}
+
+static int parts_volume_put(struct volume *volume, int z_first, int z_count, const float *from, struct error *err)
+{
+	int code = check_slices(volume, z_first, z_count, err);
+
+	if (code < 0)
+		return code;
+	copy_slices(volume->data + volume->slice * (size_t)z_first, from, volume->slice, z_count);
+	volume->is_zero = false;
+	return 0;
+}
+
+static int parts_volume_upload(struct volume *volume, const float *from, struct error *err)
+{
+	return parts_volume_put(volume, 0, volume->size[2], from, err);
+}
+
+static int parts_volume_download(struct volume *volume, int z_first, int z_count, float *ret_to, struct error *err)
+{
+	int code = check_slices(volume, z_first, z_count, err);
+
+	if (code < 0)
+		return code;
+	copy_slices(ret_to, volume->data + volume->slice * (size_t)z_first, volume->slice, z_count);
+	return 0;
+}
+
+static int parts_volume_fill(struct volume *volume, float value, struct error *err)
+{
+	(void)err;
+	if (value == 0 && volume->is_zero)
+		return 0;
+#pragma omp parallel for schedule(static)
+	for (int z = 0; z < volume->size[2]; z++)
+		for (size_t i = 0; i < volume->slice; i++)
+			volume->data[(size_t)z * volume->slice + i] = value;
+	volume->is_zero = value == 0;
+	return 0;
+}
+
+static int parts_volume_copy(struct volume *to, const struct volume *from, struct error *err)
+{
+	(void)err;
+	copy_slices(to->data, from->data, from->slice, from->size[2]);
+	to->is_zero = from->is_zero;
+	return 0;
+}
+
+/* ---- stacks ---- */
+
+static void parts_stack_free(struct stack *stack)
+{
+	if (stack == NULL)
+		return;
+	parts_floats_free(stack->data, stack->pixels * (size_t)stack->slots);
+	free(stack->from);
+	free(stack->views);
+	free(stack);
+}
+
+static int parts_stack_new(struct device *device, int columns, int rows, int slots, struct stack **ret_stack,
+			   struct error *err)
+{
+	struct stack *stack = calloc(1, sizeof(*stack));
+
+	if (stack != NULL) {
+		*stack = (struct stack){.device = device, .columns = columns, .rows = rows, .slots = slots};
+		stack->pixels = (size_t)columns * (size_t)rows;
+		stack->data = parts_floats(stack->pixels * (size_t)slots);
+		stack->from = calloc((size_t)slots, sizeof(int));
+		stack->views = calloc((size_t)slots, sizeof(int));
+	}
+	if (stack == NULL || stack->data == NULL || stack->from == NULL || stack->views == NULL) {
+		parts_stack_free(stack);
+		return error_set(err, ERR_NO_MEMORY, "no memory for %d projections of %d x %d", slots, columns, rows);
+	}
+	*ret_stack = stack;
+	return 0;
+}
+
+static int parts_stack_upload(struct stack *stack, int slot, int count, const float *from, struct error *err)
+{
+	if (slot < 0 || count < 0 || slot > stack->slots - count)
+		return error_set(err, ERR_INTERNAL, "slots %d to %d of %d", slot, slot + count - 1, stack->slots);
+	copy_slices(stack->data + stack->pixels * (size_t)slot, from, stack->pixels, count);
+	stack->by = NULL;
+	return 0;
+}
+
+/* ---- what works on single projections ---- */
+
+static int parts_linearise(struct plan *plan, const void *samples, int count, const int *slots, struct stack *to,
+			   struct defect_counts *counts, struct error *err)
+{
+	const struct backend *backend = plan->device->backend;
+	const size_t bytes = to->pixels * (plan->options.linearise.sample == SAMPLE_UINT16 ? 2 : 4);
+	int code = 0;
+
+	to->by = NULL;
+	for (int i = 0; code == 0 && i < count; i++) {
+		if (slots[i] < 0 || slots[i] >= to->slots)
+			return error_set(err, ERR_INTERNAL, "slot %d of a stack of %d", slots[i], to->slots);
+		code = backend->linearise(plan->intake, (const char *)samples + (size_t)i * bytes, 1, plan->identity,
+					  plan->taken, counts, err);
+		if (code == 0)
+			code =
+			    backend->stack_download(plan->taken, 0, 1, to->data + to->pixels * (size_t)slots[i], err);
+	}
+	return code;
+}
+
+static int parts_filter(struct plan *plan, const struct stack *from, const int *slots, const int *views, int count,
+			struct stack *to, struct error *err)
+{
+	if (plan->options.column_weights == NULL)
+		return error_set(err, ERR_INTERNAL, "the plan was made without FDK");
+	if (count > to->slots)
+		return error_set(err, ERR_INTERNAL, "%d views into a stack of %d", count, to->slots);
+	to->by = plan;
+	to->source = from;
+	to->filtered = count;
+	for (int i = 0; i < count; i++) {
+		to->from[i] = slots != NULL ? slots[i] : views[i];
+		to->views[i] = views[i];
+	}
+	return 0;
+}
+
+static int parts_filter_extended(struct plan *plan, size_t ret_rows[2], struct error *err)
+{
+	(void)err;
+	memcpy(ret_rows, plan->extended, sizeof(plan->extended));
+	return 0;
+}
+
+static const char *parts_plan_summary(const struct plan *plan)
+{
+	return plan->summary;
+}
+
+static int parts_plan_batch(const struct plan *plan)
+{
+	return plan->options.geometry->count;
+}
+
+const struct backend backend_parts = {
+    .name = "parts",
+    .summary = "another one's device, in parts",
+    .close = parts_close,
+    .describe = parts_describe,
+    .volume_new = parts_volume_new,
+    .volume_free = parts_volume_free,
+    .volume_upload = parts_volume_upload,
+    .volume_put = parts_volume_put,
+    .volume_download = parts_volume_download,
+    .volume_fill = parts_volume_fill,
+    .volume_copy = parts_volume_copy,
+    .stack_new = parts_stack_new,
+    .stack_free = parts_stack_free,
+    .stack_download = parts_stack_download,
+    .stack_upload = parts_stack_upload,
+    .plan_bytes = parts_plan_bytes,
+    .plan_new = parts_plan_new,
+    .plan_free = parts_plan_free,
+    .plan_summary = parts_plan_summary,
+    .plan_batch = parts_plan_batch,
+    .linearise = parts_linearise,
+    .filter = parts_filter,
+    .filter_extended = parts_filter_extended,
+    .backproject = parts_backproject,
+    .project = parts_project,
+    .sart_iterate = parts_sart_iterate,
+    .tv = parts_tv,
+    .norms = parts_norms,
+    .sync = parts_sync,
+};

@@ -1,0 +1,106 @@
+#ifndef CBCT_CORE_PARTS_INTERNAL_H
+#define CBCT_CORE_PARTS_INTERNAL_H
+
+#include "core/parts.h"
+
+/*
+ * What the files parts*.c share. Inside of these four structs, what belongs to
+ * the backend below is reached through device->backend only.
+ */
+struct device {
+	const struct backend *backend; /* the one below */
+	struct device *below;
+};
+
+struct volume {
+	struct device *device;
+	int size[3];
+	size_t slice; /* floats */
+	float *data;  /* [z][y][x], host */
+	bool is_zero; /* nothing but zeros so far */
+};
+
+struct stack {
+	struct device *device;
+	int columns, rows, slots;
+	size_t pixels;
+	float *data; /* [slot][row][column], host; not touched where `by` is set */
+	/* What `filter` noted: slot i is views[i] filtered, from slot from[i] of `source`. */
+	struct plan *by;
+	const struct stack *source;
+	int *from, *views;
+	int filtered;
+};
+
+/* What a slab on the device is for: which plan, and what lies beside it. */
+enum purpose { FOR_FDK, FOR_SUMS, FOR_TV, PURPOSE_COUNT };
+
+enum { PARTS_BATCH = 32 }; /* views on the device at a time: by then launches are long hidden */
+
+struct plan {
+	struct device *device;
+	struct plan_options options;
+	int batch;                 /* views on the device at a time */
+	int slices[PURPOSE_COUNT]; /* of a slab, 0 where the purpose has none */
+	struct plan_bytes bytes;
+	int identity[PARTS_BATCH]; /* 0, 1, 2 ... */
+	char summary[192];
+
+	struct plan *intake; /* linearises, knows no volume but one of a voxel */
+	struct grid one;     /* that one */
+	struct stack *taken; /* one slot */
+	float *sums;         /* [slice of a slab and its neighbours][y][x] */
+	size_t sums_floats;
+	float *partial; /* [batch][row][column] */
+	double *rows;   /* [rows][2] of sums over a view */
+	struct stack *correction;
+	size_t extended[2];
+};
+
+/* Slices first .. first + count - 1 of the grid on the device, `below` and `above` more on either side. */
+struct slab {
+	int first, count, below, above;
+	struct grid grid;
+	struct plan *plan;
+	struct volume *volume;
+};
+
+/* Two stacks of a batch, one being filled while the other is in use, and one of filtered views. */
+struct feed {
+	struct stack *in[2], *filtered;
+};
+
+/* Zeros, not counted before they are touched; NULL: no memory. */
+float *parts_floats(size_t count);
+void parts_floats_free(float *floats, size_t count);
+
+/* ---- parts_plan.c ---- */
+int parts_plan_bytes(struct device *device, const struct plan_options *options, struct plan_bytes *ret_bytes,
+		     struct error *err);
+int parts_plan_new(struct device *device, const struct plan_options *options, struct plan **ret_plan,
+		   struct error *err);
+void parts_plan_free(struct plan *plan);
+/* Slices of the volume, that many beyond a slab for its neighbours' sake. */
+int parts_halo(const struct plan_options *options, enum purpose purpose);
+int slab_open(struct plan *plan, enum purpose purpose, int first, struct slab *ret_slab, struct error *err);
+void slab_close(struct plan *plan, struct slab *slab); /* a closed one is fine */
+int feed_open(struct plan *plan, enum purpose purpose, struct feed *ret_feed, struct error *err);
+void feed_close(struct plan *plan, struct feed *feed);
+
+/* ---- parts_project.c ---- */
+int parts_project(struct plan *plan, const struct volume *from, const int *views, int count, struct stack *to,
+		  struct error *err);
+int parts_backproject(struct plan *plan, const struct stack *from, const int *views, int count,
+		      enum backprojection weight, struct volume *to, struct error *err);
+int parts_stack_download(struct stack *stack, int slot, int count, float *ret_to, struct error *err);
+
+/* ---- parts_sart.c ---- */
+int parts_sart_iterate(struct plan *plan, const struct stack *projections, struct volume *volume,
+		       const struct cancel *cancel, struct sart_sums *ret_sums, struct error *err);
+
+/* ---- parts_tv.c ---- */
+int parts_tv(struct plan *plan, struct volume *volume, const struct cancel *cancel, struct error *err);
+int parts_norms(struct plan *plan, const struct volume *volume, const struct volume *other, double unit,
+		struct volume_norms *ret_norms, struct error *err);
+
+#endif
