@@ -10,12 +10,15 @@
 #include <stdlib.h>
 #include <string.h>
 
+const char *const projector_names[PROJECTOR_COUNT] = {"interpolating", "matched"};
+
 void recipe_defaults(struct recipe *ret_recipe)
 {
 	*ret_recipe = (struct recipe){
 	    .fdk = {.window = WINDOW_HANN, .cutoff = 1},
 	    .sart = {.iterations = 10, .relaxation = 1, .subsets = SUBSETS_DEFAULT, .nonnegative = true},
 	    .tv = {.after_fdk = true, .options = {.method = TV_GRADIENT, .alpha = 0.1, .step = 0.1, .iterations = 10}},
+	    .metal = {.threshold_hu = 2500},
 	    .mu_water = 0.0192,
 	};
 }
@@ -103,6 +106,15 @@ static int check_tv(const struct recipe *recipe, struct error *err)
 	return code;
 }
 
+/* Bone reaches 2000 HU; what lies below the least is soft tissue, whose shadow covers all projections. */
+static int check_metal(const struct recipe *recipe, struct error *err)
+{
+	if (!recipe->fdk.on)
+		return error_set_at(err, ERR_IMPOSSIBLE, "/metal",
+				    "metal is found in the FDK volume, but no FDK is run");
+	return check_range(recipe->metal.threshold_hu, METAL_HU_LEAST, METAL_HU_MOST, true, "/metal/threshold_hu", err);
+}
+
 /* A volume that can never come is refused here, not missed at the end. */
 static int check_emit(const struct recipe *recipe, struct error *err)
 {
@@ -150,6 +162,8 @@ int recipe_check(const struct recipe *recipe, const struct geometry *geometry, s
 		code = check_sart(recipe, geometry->count, err);
 	if (code == 0 && recipe->tv.on)
 		code = check_tv(recipe, err);
+	if (code == 0 && recipe->metal.on)
+		code = check_metal(recipe, err);
 	if (code == 0)
 		code = check_positive(recipe->mu_water, false, "/mu_water", err);
 	if (code == 0)

@@ -79,6 +79,7 @@ static struct plan_options plan_options(const struct recipe *recipe, const struc
 	    .filter_response = recipe->fdk.on ? weights->response : NULL,
 	    .pad = {recipe->fdk.on ? weights->pad[0] : 0, recipe->fdk.on ? weights->pad[1] : 0},
 	    .sart = recipe->sart.on ? sart : NULL,
+	    .matched = recipe->sart.on && recipe->projector == PROJECTOR_MATCHED,
 	    .tv = recipe->tv.on ? &recipe->tv.options : NULL,
 	    .reference_precision = recipe->reference_precision,
 	    .no_projection = !recipe->sart.on,

@@ -11,6 +11,10 @@
  */
 enum { EMIT_FDK = 0, EMIT_FDK_TV = -1 }; /* beside iterations 1, 2, ... */
 
+/* How SART projects backwards: plan_options.matched. */
+enum projector { PROJECTOR_INTERPOLATING, PROJECTOR_MATCHED, PROJECTOR_COUNT };
+extern const char *const projector_names[PROJECTOR_COUNT]; /* "interpolating", "matched" */
+
 struct recipe {
 	bool has_grid; /* otherwise chosen from field of view and resolution */
 	struct grid grid;
@@ -33,6 +37,11 @@ struct recipe {
 		bool after_fdk; /* false with "after": "sart" */
 		struct tv_options options;
 	} tv;
+	enum projector projector;
+	struct {
+		bool on; /* needs fdk.on */
+		double threshold_hu;
+	} metal;         /* core/metal.h */
 	double mu_water; /* 1/mm */
 	int *emit;       /* [emits], owned; iterations, EMIT_FDK, EMIT_FDK_TV */
 	int emits;
@@ -40,7 +49,7 @@ struct recipe {
 };
 enum { SUBSETS_DEFAULT = 0, SUBSETS_VIEWS = -1 };
 
-enum { ITERATIONS_MAX = 100000, GRID_DEFAULT_MOST = 512 };
+enum { ITERATIONS_MAX = 100000, GRID_DEFAULT_MOST = 512, METAL_HU_LEAST = 500, METAL_HU_MOST = 1000000 };
 
 void recipe_defaults(struct recipe *ret_recipe); /* nothing on; the values that `{}` stages take */
 void recipe_clear(struct recipe *recipe);

@@ -143,6 +143,16 @@ static int read_tv(struct recipe *recipe, const cJSON *value, struct error *err)
 	return json_end(&reader);
 }
 
+static int read_metal(struct recipe *recipe, const cJSON *value, struct error *err)
+{
+	struct json_reader reader;
+
+	json_begin(&reader, value, "/metal", err);
+	json_number(&reader, "threshold_hu", false, METAL_HU_LEAST, METAL_HU_MOST, &recipe->metal.threshold_hu);
+	recipe->metal.on = true;
+	return json_end(&reader);
+}
+
 static int read_emitted(struct json_reader *reader, const cJSON *element, int index, int *ret_emit)
 {
 	char place[32];
@@ -194,13 +204,15 @@ static void read_emit(struct json_reader *reader, struct recipe *recipe)
 	recipe->emits = count;
 }
 
-static int read_stages(struct recipe *recipe, const cJSON *const stages[4], struct error *err)
+enum { STAGES = 5 };
+
+static int read_stages(struct recipe *recipe, const cJSON *const stages[STAGES], struct error *err)
 {
-	static int (*const readers[4])(struct recipe *, const cJSON *, struct error *) = {read_grid, read_fdk,
-											  read_sart, read_tv};
+	static int (*const readers[STAGES])(struct recipe *, const cJSON *,
+					    struct error *) = {read_grid, read_fdk, read_sart, read_tv, read_metal};
 	int code = 0;
 
-	for (int i = 0; i < 4 && code == 0; i++) {
+	for (int i = 0; i < STAGES && code == 0; i++) {
 		if (stages[i] != NULL)
 			code = readers[i](recipe, stages[i], err);
 	}
@@ -211,8 +223,8 @@ int job_request_read(const cJSON *value, struct job_request *ret_request, struct
 {
 	struct job_request request = {0};
 	struct json_reader reader;
-	const cJSON *stages[4];
-	int priority = PRIORITY_ROUTINE, precision = 0, code;
+	const cJSON *stages[STAGES];
+	int priority = PRIORITY_ROUTINE, precision = 0, projector = PROJECTOR_INTERPOLATING, code;
 
 	recipe_defaults(&request.recipe);
 	json_begin(&reader, value, "", err);
@@ -221,12 +233,15 @@ int job_request_read(const cJSON *value, struct job_request *ret_request, struct
 	stages[1] = json_member(&reader, "fdk", false);
 	stages[2] = json_member(&reader, "sart", false);
 	stages[3] = json_member(&reader, "tv", false);
+	stages[4] = json_member(&reader, "metal", false);
+	json_choice(&reader, "projector", false, projector_names, PROJECTOR_COUNT, &projector);
 	json_choice(&reader, "priority", false, priority_names, PRIORITY_COUNT, &priority);
 	json_choice(&reader, "precision", false, precision_names, 2, &precision);
 	json_number(&reader, "mu_water", false, 1e-9, 1e3, &request.recipe.mu_water);
 	read_emit(&reader, &request.recipe);
 	request.priority = (enum priority)priority;
 	request.recipe.reference_precision = precision != 0;
+	request.recipe.projector = (enum projector)projector;
 	code = json_end(&reader);
 	if (code == 0)
 		code = read_stages(&request.recipe, stages, err);
@@ -334,6 +349,13 @@ static void add_tv(cJSON *document, const struct recipe *recipe)
 	cJSON_AddStringToObject(tv, "after", after_names[recipe->tv.after_fdk]);
 }
 
+static void add_metal(cJSON *document, const struct recipe *recipe)
+{
+	cJSON *metal = cJSON_AddObjectToObject(document, "metal");
+
+	cJSON_AddNumberToObject(metal, "threshold_hu", recipe->metal.threshold_hu);
+}
+
 static void add_emit(cJSON *document, const struct recipe *recipe)
 {
 	cJSON *emit = cJSON_AddArrayToObject(document, "emit");
@@ -371,6 +393,11 @@ static cJSON *request_document(const struct job_request *request)
 		add_tv(document, recipe);
 	else
 		cJSON_AddNullToObject(document, "tv");
+	if (recipe->metal.on)
+		add_metal(document, recipe);
+	else
+		cJSON_AddNullToObject(document, "metal");
+	cJSON_AddStringToObject(document, "projector", projector_names[recipe->projector]);
 	add_emit(document, recipe);
 	cJSON_AddStringToObject(document, "priority", priority_names[request->priority]);
 	cJSON_AddStringToObject(document, "precision", precision_names[recipe->reference_precision]);
@@ -412,8 +439,10 @@ bool job_request_same(const struct job_request *a, const struct job_request *b)
 	return strcmp(a->scan, b->scan) == 0 && a->priority == b->priority && same_grid(x, y) &&
 	       x->fdk.on == y->fdk.on &&
 	       (!x->fdk.on || (x->fdk.window == y->fdk.window && x->fdk.cutoff == y->fdk.cutoff)) && same_sart(x, y) &&
-	       same_tv(x, y) && x->mu_water == y->mu_water && x->reference_precision == y->reference_precision &&
-	       x->emits == y->emits &&
+	       same_tv(x, y) && x->metal.on == y->metal.on &&
+	       (!x->metal.on || x->metal.threshold_hu == y->metal.threshold_hu) &&
+	       (!x->sart.on || x->projector == y->projector) && x->mu_water == y->mu_water &&
+	       x->reference_precision == y->reference_precision && x->emits == y->emits &&
 	       (x->emits == 0 || memcmp(x->emit, y->emit, (size_t)x->emits * sizeof(*x->emit)) == 0);
 }
 

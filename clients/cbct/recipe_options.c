@@ -35,6 +35,11 @@ const struct option recipe_option_rows[] = {
     ROW("tv-iterations", OPTION_INTEGER, tv_iterations, "N", "steps", 0, 0, 0, NULL),
     ROW("tv-unit", OPTION_NUMBER, unit, "MU", "one gray level, 1/mm", 0, 0, 0, NULL),
     ROW("tv-after-sart", OPTION_FLAG, tv_after_sart, NULL, "leave the FDK volume alone", 0, 0, 0, NULL),
+    ROW("projector", OPTION_CHOICE, projector, "NAME", "how SART projects backwards", 0, 0, PROJECTOR_COUNT,
+	projector_names),
+    ROW("metal", OPTION_NUMBER, metal, "HU",
+	"take what is at least HU for metal, and its shadows out of the projections", METAL_HU_LEAST, METAL_HU_MOST, 0,
+	NULL),
     ROW("emit", OPTION_TEXT, emit, "LIST", "volumes to keep beside the last one, e.g. fdk,fdk-tv,1,5", 0, 0, 0, NULL),
     ROW("priority", OPTION_CHOICE, priority, "PRIORITY", "in the queue", 0, 0, PRIORITY_COUNT, priority_names),
     ROW("mu-water", OPTION_NUMBER, mu_water, "MU", "water, 1/mm", 0, 0, 0, NULL),
@@ -201,6 +206,10 @@ int recipe_document(const struct recipe_options *options, const char *path, cons
 	put_fdk(document, options);
 	put_sart(document, options);
 	put_tv(document, options);
+	if (options->projector != OPTION_UNSET_CHOICE)
+		put(document, "projector", cJSON_CreateString(projector_names[options->projector]));
+	if (!isnan(options->metal))
+		put_number(stage(document, "metal"), "threshold_hu", options->metal);
 	if (options->emit != NULL)
 		put_emit(document, options->emit);
 	if (options->priority != OPTION_UNSET_CHOICE)

@@ -21,6 +21,8 @@ struct recipe_options {
 	long tv_iterations;
 	double unit;
 	bool tv_after_sart;
+	int projector;
+	double metal;
 	const char *emit;
 	int priority;
 	double mu_water;
@@ -34,7 +36,8 @@ extern const struct option recipe_option_rows[];
 		.relaxation = OPTION_UNSET_NUMBER, .stop_residual = OPTION_UNSET_NUMBER,                               \
 		.stop_change = OPTION_UNSET_NUMBER, .method = OPTION_UNSET_CHOICE, .alpha = OPTION_UNSET_NUMBER,       \
 		.step = OPTION_UNSET_NUMBER, .tv_iterations = OPTION_UNSET_INTEGER, .unit = OPTION_UNSET_NUMBER,       \
-		.priority = OPTION_UNSET_CHOICE, .mu_water = OPTION_UNSET_NUMBER                                       \
+		.projector = OPTION_UNSET_CHOICE, .metal = OPTION_UNSET_NUMBER, .priority = OPTION_UNSET_CHOICE,       \
+		.mu_water = OPTION_UNSET_NUMBER                                                                        \
 	}
 
 /* path may be NULL: it starts from an FDK with its defaults. Delete *ret_document. */

@@ -68,6 +68,8 @@ static const char *const requests[] = {
     "\"emit\":[100000,7,3,7]}",
     "{\"scan\":\"a\",\"sart\":{},\"tv\":{\"alpha\":0,\"step\":0.25,\"iterations\":1,\"unit\":3.3e-5,"
     "\"after\":\"fdk+sart\"}}",
+    "{\"scan\":\"a\",\"fdk\":{},\"sart\":{},\"projector\":\"matched\",\"metal\":{}}",
+    "{\"scan\":\"a\",\"fdk\":{},\"projector\":null,\"metal\":{\"threshold_hu\":3071.5}}",
     "{\"scan\":\"a\",\"fdk\":{},\"grid\":{\"size\":[1,8192,7],\"spacing_mm\":[0.1,0.012345678901234567,1],"
     "\"origin_mm\":[-0.1,-50.3,1e-3]}}",
 };
@@ -157,6 +159,9 @@ START_TEST(defaults_are_the_contracts)
 	ck_assert_double_eq(recipe->mu_water, 0.0192);
 	ck_assert_int_eq(recipe->emits, 0);
 	ck_assert(!recipe->reference_precision);
+	ck_assert(!recipe->metal.on);
+	ck_assert_double_eq(recipe->metal.threshold_hu, 2500);
+	ck_assert_int_eq(recipe->projector, PROJECTOR_INTERPOLATING);
 	ck_assert(recipe->has_grid && recipe->has_origin);
 	/* The field of view, 128 mm at half of 1000 mm away, in pixels of 4 * 0.6 mm. */
 	ck_assert_int_gt(recipe->grid.size[0], 40);
@@ -285,6 +290,13 @@ static const struct {
     {"{\"scan\":\"a\",\"sart\":{},\"tv\":{},\"emit\":[\"fdk-tv\"]}", ERR_IMPOSSIBLE, "/emit/0", "FDK"},
     {"{\"scan\":\"a\",\"fdk\":{},\"priority\":\"now\"}", ERR_INVALID, "/priority", "urgent"},
     {"{\"scan\":\"a\",\"fdk\":{},\"precision\":\"half\"}", ERR_INVALID, "/precision", "reference"},
+    {"{\"scan\":\"a\",\"fdk\":{},\"projector\":\"siddon\"}", ERR_INVALID, "/projector", "matched"},
+    {"{\"scan\":\"a\",\"fdk\":{},\"projector\":1}", ERR_INVALID, "/projector", "matched"},
+    {"{\"scan\":\"a\",\"fdk\":{},\"metal\":2500}", ERR_INVALID, "/metal", "an object"},
+    {"{\"scan\":\"a\",\"fdk\":{},\"metal\":{\"threshold\":2500}}", ERR_INVALID, "/metal/threshold", "nobody knows"},
+    {"{\"scan\":\"a\",\"fdk\":{},\"metal\":{\"threshold_hu\":499}}", ERR_IMPOSSIBLE, "/metal/threshold_hu", "500"},
+    {"{\"scan\":\"a\",\"fdk\":{},\"metal\":{\"threshold_hu\":\"2500\"}}", ERR_INVALID, "/metal/threshold_hu", "number"},
+    {"{\"scan\":\"a\",\"sart\":{},\"metal\":{}}", ERR_IMPOSSIBLE, "/metal", "no FDK"},
     {"{\"scan\":\"a\",\"fdk\":{},\"mu_water\":0}", ERR_IMPOSSIBLE, "/mu_water", "0"},
     {"{\"scan\":\"a\",\"fdk\":{},\"mu_water\":1e999}", ERR_INVALID, "/mu_water", "double"},
     {"{\"scan\":\"0123456789012345678901234567890123456789012345678901234567890123\",\"fdk\":{}}", ERR_INVALID, "/scan",
