@@ -65,6 +65,25 @@ static int cuda_count(void)
 	return count;
 }
 
+static int staging_make(struct staging *staging, struct error *err)
+{
+	for (int i = 0; i < 2; i++) {
+		CUDA_TRY(cudaMallocHost((void **)&staging->pinned[i], STAGING_BYTES));
+		CUDA_TRY(cudaEventCreateWithFlags(&staging->done[i], cudaEventDisableTiming));
+	}
+	return 0;
+}
+
+static void staging_free(struct staging *staging)
+{
+	for (int i = 0; i < 2; i++) {
+		if (staging->pinned[i] != NULL)
+			cudaFreeHost(staging->pinned[i]);
+		if (staging->done[i] != NULL)
+			cudaEventDestroy(staging->done[i]);
+	}
+}
+
 static void cuda_close(struct device *device)
 {
 	if (device == NULL)
@@ -72,6 +91,10 @@ static void cuda_close(struct device *device)
 	cudaSetDevice(device->index);
 	if (device->sums != NULL)
 		cudaFreeHost(device->sums);
+	staging_free(&device->in);
+	staging_free(&device->out);
+	if (device->back != NULL)
+		cudaStreamDestroy(device->back);
 	if (device->copy != NULL)
 		cudaStreamDestroy(device->copy);
 	if (device->stream != NULL)
@@ -88,6 +111,9 @@ static int device_prepare(struct device *device, const struct device_options *op
 	CUDA_TRY(cudaDeviceGetAttribute(&device->multiprocessors, cudaDevAttrMultiProcessorCount, device->index));
 	CUDA_TRY(cudaStreamCreateWithFlags(&device->stream, cudaStreamNonBlocking));
 	CUDA_TRY(cudaStreamCreateWithFlags(&device->copy, cudaStreamNonBlocking));
+	CUDA_TRY(cudaStreamCreateWithFlags(&device->back, cudaStreamNonBlocking));
+	TRY(staging_make(&device->in, err));
+	TRY(staging_make(&device->out, err));
 	CUDA_TRY(cudaHostAlloc((void **)&device->sums, SUMS * sizeof(double), cudaHostAllocMapped));
 	CUDA_TRY(cudaHostGetDevicePointer(&mapped, device->sums, 0));
 	device->sums_device = (double *)mapped;
@@ -142,6 +168,50 @@ static int cuda_sync(struct device *device, struct error *err)
 	return device_wait(device, err);
 }
 
+/*
+ * What works on volumes and stacks, with a mark behind it: copies from and to the
+ * host wait for these marks (memory.cu).
+ */
+static int filter(struct plan *plan, const struct stack *from, const int *slots, const int *views, int count,
+		  struct stack *to, struct error *err)
+{
+	TRY(cuda_filter(plan, from, slots, views, count, to, err));
+	TRY(mark_used(plan->device, from->used, err));
+	return mark_used(plan->device, to->used, err);
+}
+
+static int backproject(struct plan *plan, const struct stack *from, const int *views, int count,
+		       enum backprojection weight, struct volume *to, struct error *err)
+{
+	TRY(cuda_backproject(plan, from, views, count, weight, to, err));
+	TRY(mark_used(plan->device, from->used, err));
+	return mark_used(plan->device, to->used, err);
+}
+
+static int project(struct plan *plan, const struct volume *from, const int *views, int count, struct stack *to,
+		   struct error *err)
+{
+	if (plan->options.no_projection)
+		return error_set(err, ERR_INTERNAL, "the plan was made without forward projection");
+	TRY(cuda_project(plan, from, views, count, to, err));
+	TRY(mark_used(plan->device, from->used, err));
+	return mark_used(plan->device, to->used, err);
+}
+
+static int sart_iterate(struct plan *plan, const struct stack *projections, struct volume *volume,
+			const struct cancel *cancel, struct sart_sums *ret_sums, struct error *err)
+{
+	TRY(cuda_sart_iterate(plan, projections, volume, cancel, ret_sums, err));
+	TRY(mark_used(plan->device, projections->used, err));
+	return mark_used(plan->device, volume->used, err);
+}
+
+static int tv(struct plan *plan, struct volume *volume, const struct cancel *cancel, struct error *err)
+{
+	TRY(cuda_tv(plan, volume, cancel, err));
+	return mark_used(plan->device, volume->used, err);
+}
+
 extern "C" const struct backend backend_cuda;
 const struct backend backend_cuda = {
     .name = "cuda",
@@ -168,12 +238,12 @@ const struct backend backend_cuda = {
     .plan_summary = cuda_plan_summary,
     .plan_batch = cuda_plan_batch,
     .linearise = cuda_linearise,
-    .filter = cuda_filter,
+    .filter = filter,
     .filter_extended = cuda_filter_extended,
-    .backproject = cuda_backproject,
-    .project = cuda_project,
-    .sart_iterate = cuda_sart_iterate,
-    .tv = cuda_tv,
+    .backproject = backproject,
+    .project = project,
+    .sart_iterate = sart_iterate,
+    .tv = tv,
     .norms = cuda_norms,
     .sync = cuda_sync,
 };

@@ -5,8 +5,9 @@
  * What the files of the CUDA backend share: the four structs, the layouts of
  * their memory, and how errors and allocations go.
  *
- * All work of a device runs on one stream in the order it was asked for; raw
- * projections come in on a second one beside it. Lengths on the device are in
+ * All work of a device runs on one stream in the order it was asked for; what
+ * comes from the host and goes there has streams beside it, and waits for those
+ * who use that volume or stack only. Lengths on the device are in
  * voxels and pixels, counted from the centre of the grid and of the detector,
  * so that float32 keeps four digits behind the point.
  */
@@ -45,12 +46,22 @@ static inline int round_up(int a, int b)
 	return divide_up(a, b) * b;
 }
 
+/* Pinned memory, used in turn: one half is on the bus while the other is filled or emptied by the host. */
+enum { STAGING_BYTES = 16 << 20 };
+struct staging {
+	char *pinned[2];
+	cudaEvent_t done[2]; /* behind the copy that used it last */
+	int next;
+};
+
 struct device {
 	int index;
 	int multiprocessors;
 	cudaStream_t stream; /* everything that computes */
-	cudaStream_t copy;   /* raw projections on their way in */
-	size_t limit;        /* bytes that may be allocated in all */
+	cudaStream_t copy;   /* what comes in, raw projections made line integrals included */
+	cudaStream_t back;   /* what goes out; idle whenever no operation runs */
+	struct staging in, out;
+	size_t limit; /* bytes that may be allocated in all */
 	size_t used;
 	double *sums;        /* pinned, [SUMS]: results of reductions, written by the device */
 	double *sums_device; /* the same memory as the device sees it */
@@ -63,12 +74,29 @@ int device_allocate(struct device *device, size_t bytes, void **ret_memory, stru
 void device_release(struct device *device, void *memory, size_t bytes);
 int device_wait(struct device *device, struct error *err);
 
+/* ---- memory.cu: copies through pinned memory ---- */
+/*
+ * Rows of `width` bytes into rows `pitch` bytes apart on the device, on the copy
+ * stream. `from` has been read when it returns.
+ */
+int copy_in(struct device *device, void *to, size_t pitch, const void *from, size_t width, size_t rows,
+	    struct error *err);
+/* The other way, on the stream for what goes out; all of it is there when it returns. */
+int copy_out(struct device *device, void *to, const void *from, size_t pitch, size_t width, size_t rows,
+	     struct error *err);
+/* `used` is behind the last that touched a volume or stack: what comes in waits for it, and what is asked next for
+ * that. */
+int begin_arrival(struct device *device, cudaEvent_t used, struct error *err);
+int end_arrival(struct device *device, cudaEvent_t used, struct error *err);
+int mark_used(struct device *device, cudaEvent_t used, struct error *err);
+
 /* [z][y][x], no padding. */
 struct volume {
 	struct device *device;
 	int size[3];
 	size_t bytes;
 	float *data;
+	cudaEvent_t used;
 };
 
 /*
@@ -91,6 +119,7 @@ struct stack {
 	int slots;
 	float *memory; /* allocation */
 	float *data;   /* row 0, column 0 of slot 0 */
+	cudaEvent_t used;
 };
 
 struct stack_shape stack_shape_make(int columns, int rows, int slots);
@@ -237,15 +266,13 @@ struct plan {
 	float2 *twiddles;
 	struct fft *fft;
 
-	/* linearise: raw samples, pinned and on the device, twice, so that copying goes on during the kernels. */
-	int raw_views; /* projections of one buffer */
-	void *raw_pinned[2], *raw[2];
-	cudaEvent_t raw_copied[2];
-	int raw_next;
-	cudaEvent_t asked, linearised;
+	/* linearise: raw samples of some views */
+	int raw_views; /* projections of the buffer */
+	void *raw;
 	float *flat, *dark;
+	unsigned char *map;          /* defects of every view */
 	unsigned char *marks[2];     /* defects of one view */
-	unsigned long long *defects; /* device, counters of linearise.cu */
+	struct linearised *counters; /* linearise.cu */
 
 	/* A whole SART iteration, recorded at its first run for this volume and this stack. */
 	cudaGraphExec_t sweep;

@@ -1,55 +1,139 @@
 /*
- * Raw samples to line integrals, p = -ln((I - dark) / (flat - dark)), with the
- * rules of core/cpu_linearise.c: defects take the values of the nearest good
- * pixels in their row and column, weighted by 1 / distance, in two passes.
+ * Raw samples to line integrals with the rules of core/cpu_linearise.c:
  *
- * Samples are copied into pinned memory and from there to the device in pieces,
- * two in turn, on the stream of their own: while one is on its way the caller's
- * next one is copied, and whatever computes on the device goes on.
+ *   p  = -ln((I - dark) / (a (flat - dark))),  a the view's own air (1 without an air region),
+ *   p' = hardening[0] + hardening[1] p + hardening[2] p^2 + ...
+ *
+ * Defects take the values of the nearest good pixels in their row and column,
+ * weighted by 1 / distance, in two passes.
+ *
+ * All of it runs on the stream for what comes in, beside whatever computes.
  */
 #include <cmath>
-#include <cstring>
 
 #include "kernels/internal.cuh"
 
 struct samples {
 	const void *raw;
-	bool is_uint16, is_intensity;
+	bool is_uint16, is_intensity, has_air_region;
 	float air, saturation;
-	const float *flat, *dark; /* NULL: air, 0 */
+	const float *flat, *dark;     /* NULL: air, 0 */
+	const unsigned char *defects; /* of every view, NULL: none */
 	int columns, rows;
+	int region[4];
+	float hardening[HARDENING_MOST];
+	int hardening_count;
 };
 
-/* Order of plan->defects. */
-enum { NOT_FINITE, SATURATED, ZERO, BLANK, COUNTERS };
+/* What a pixel is; all but GOOD are defects. */
+enum kind { GOOD, MAPPED, NOT_FINITE, SATURATED, ZERO, KIND_COUNT };
+
+/* What a call met, struct defect_counts in numbers that a kernel can add to. */
+struct linearised {
+	unsigned long long kinds[KIND_COUNT]; /* GOOD is not counted */
+	int blank, no_air;
+	float air; /* of the view in hand */
+	float air_least, air_most;
+};
+
+size_t linearise_counters_bytes(void)
+{
+	return sizeof(struct linearised);
+}
+
+static __device__ __forceinline__ float sample_at(const samples &s, size_t at)
+{
+	return s.is_uint16 ? (float)((const unsigned short *)s.raw)[at] : ((const float *)s.raw)[at];
+}
+
+/* (I - dark) / (flat - dark); anything for a defect. */
+static __device__ __forceinline__ kind transmission(const samples &s, size_t at, float &ret)
+{
+	float sample = sample_at(s, at), dark = s.dark != NULL ? s.dark[at] : 0.0f;
+	float above = sample - dark, range = (s.flat != NULL ? s.flat[at] : s.air) - dark;
+
+	ret = above / range;
+	if (!isfinite(sample) || !isfinite(range) || !(range > 0))
+		return NOT_FINITE;
+	if (!(sample < s.saturation))
+		return SATURATED;
+	return above > 0 ? GOOD : ZERO;
+}
+
+/* The mean transmission of the air region's good pixels, in a fixed order; 0 where there is none. */
+static __global__ void __launch_bounds__(256) find_air(const samples s, linearised *found)
+{
+	__shared__ double sums[256];
+	__shared__ int counts[256];
+	int wide = s.region[2] - s.region[0] + 1, pixels = wide * (s.region[3] - s.region[1] + 1), good = 0;
+	double sum = 0;
+
+	for (int i = threadIdx.x; i < pixels; i += 256) {
+		size_t at = (size_t)(s.region[1] + i / wide) * s.columns + (size_t)(s.region[0] + i % wide);
+		float value;
+
+		if ((s.defects != NULL && s.defects[at]) || transmission(s, at, value) != GOOD)
+			continue;
+		sum += (double)value;
+		good++;
+	}
+	sums[threadIdx.x] = sum;
+	counts[threadIdx.x] = good;
+	for (int half = 128; half > 0; half /= 2) {
+		__syncthreads();
+		if (threadIdx.x < half) {
+			sums[threadIdx.x] += sums[threadIdx.x + half];
+			counts[threadIdx.x] += counts[threadIdx.x + half];
+		}
+	}
+	if (threadIdx.x > 0)
+		return;
+	float air = counts[0] > 0 ? (float)(sums[0] / counts[0]) : 0.0f;
+	found->air = air > 0 ? air : 1.0f;
+	if (!(air > 0)) {
+		found->no_air++;
+		return;
+	}
+	if (air < found->air_least || found->air_least == 0)
+		found->air_least = air;
+	if (air > found->air_most)
+		found->air_most = air;
+}
 
 /* One view: [row][column] into a slot, and a mark for each defect. */
 static __global__ void __launch_bounds__(256)
-    to_integrals(const samples s, float *slot, int pitch, unsigned char *marks, unsigned long long *defects)
+    to_integrals(const samples s, float *slot, int pitch, unsigned char *marks, linearised *found)
 {
-	int column = blockIdx.x * 32 + threadIdx.x, row = blockIdx.y * 8 + threadIdx.y, kind = NOT_FINITE;
-	bool inside = column < s.columns && row < s.rows, good = true;
+	int column = blockIdx.x * 32 + threadIdx.x, row = blockIdx.y * 8 + threadIdx.y;
+	size_t at = (size_t)row * s.columns + column;
+	kind what = GOOD;
+	float p;
 
-	if (inside) {
-		size_t at = (size_t)row * s.columns + column;
-		float sample = s.is_uint16 ? (float)((const unsigned short *)s.raw)[at] : ((const float *)s.raw)[at];
-		float value = sample;
-
+	if (column >= s.columns || row >= s.rows)
+		return;
+	if (s.defects != NULL && s.defects[at]) {
+		what = MAPPED;
+		p = 0;
+	} else {
+		p = sample_at(s, at);
 		if (s.is_intensity) {
-			float dark = s.dark != NULL ? s.dark[at] : 0.0f;
-			float above = sample - dark, range = (s.flat != NULL ? s.flat[at] : s.air) - dark;
-
-			value = -logf(above / range);
-			good = above > 0 && range > 0 && sample < s.saturation && isfinite(range);
-			if (isfinite(sample) && range > 0 && isfinite(range))
-				kind = sample >= s.saturation ? SATURATED : ZERO;
+			what = transmission(s, at, p);
+			p = -logf(s.has_air_region ? p / found->air : p);
 		}
-		good = good && isfinite(value);
-		slot[(size_t)row * pitch + column] = good ? value : 0.0f;
-		marks[at] = !good;
+		if (s.hardening_count > 0) {
+			float sum = 0;
+
+			for (int k = s.hardening_count - 1; k >= 0; k--)
+				sum = fmaf(sum, p, s.hardening[k]);
+			p = sum;
+		}
+		if (what == GOOD && !isfinite(p))
+			what = NOT_FINITE;
 	}
-	if (!good)
-		atomicAdd(defects + kind, 1ull); /* defects are rare */
+	slot[(size_t)row * pitch + column] = what == GOOD ? p : 0.0f;
+	marks[at] = what != GOOD;
+	if (what != GOOD)
+		atomicAdd(&found->kinds[what], 1ull); /* defects are rare */
 }
 
 /* What the nearest good pixel in one direction says. */
@@ -70,11 +154,11 @@ static __device__ void look(const samples &s, const float *slot, int pitch, cons
 
 /*
  * Only marked pixels are written and only unmarked ones read. A pixel that is
- * marked after the second pass (the one with `defects`) is of a view without a good one.
+ * marked after the second pass (the one with `found`) is of a view without a good one.
  */
 static __global__ void __launch_bounds__(256)
     replace(const samples s, float *slot, int pitch, const unsigned char *marks, unsigned char *ret_marks,
-	    unsigned long long *defects)
+	    linearised *found)
 {
 	int column = blockIdx.x * 32 + threadIdx.x, row = blockIdx.y * 8 + threadIdx.y;
 	float sum = 0, weights = 0;
@@ -94,13 +178,8 @@ static __global__ void __launch_bounds__(256)
 		}
 	}
 	ret_marks[at] = mark;
-	if (mark && at == 0 && defects != NULL)
-		atomicAdd(defects + BLANK, 1ull);
-}
-
-size_t linearise_counters_bytes(void)
-{
-	return COUNTERS * sizeof(unsigned long long);
+	if (mark && at == 0 && found != NULL)
+		found->blank++;
 }
 
 static samples samples_make(const struct plan *plan)
@@ -108,54 +187,63 @@ static samples samples_make(const struct plan *plan)
 	const struct linearise *options = &plan->options.linearise;
 	samples s = {};
 
+	s.raw = plan->raw;
 	s.is_uint16 = options->sample == SAMPLE_UINT16;
 	s.is_intensity = options->quantity == QUANTITY_INTENSITY;
 	s.air = (float)options->air;
 	s.saturation = options->saturation > 0 ? (float)options->saturation : s.is_uint16 ? 65535.0f : INFINITY;
 	s.flat = plan->flat;
 	s.dark = plan->dark;
+	s.defects = plan->map;
 	s.columns = plan->stack.columns;
 	s.rows = plan->stack.rows;
+	s.has_air_region = s.is_intensity && options->has_air_region;
+	for (int i = 0; i < 4; i++)
+		s.region[i] = options->air_region[i];
+	s.hardening_count = options->hardening_count;
+	for (int k = 0; k < options->hardening_count; k++)
+		s.hardening[k] = (float)options->hardening[k];
 	return s;
 }
 
-/* A piece on the device -> its slots. Every view is looked through for marks: a view without any costs two reads. */
-static int linearise_piece(struct plan *plan, const void *raw, int count, const int *slots, struct stack *to,
-			   struct error *err)
+/* Views on the device -> their slots. Every view is looked through for marks: a view without any costs two reads. */
+static int linearise_piece(struct plan *plan, int count, const int *slots, struct stack *to, struct error *err)
 {
 	cudaStream_t stream = plan->device->copy;
 	samples s = samples_make(plan);
-	size_t pixels = (size_t)s.columns * (size_t)s.rows, sample = s.is_uint16 ? 2 : 4;
 	dim3 blocks(divide_up(s.columns, 32), divide_up(s.rows, 8)), threads(32, 8);
 
 	for (int i = 0; i < count; i++) {
 		float *slot = to->data + (size_t)slots[i] * to->shape.slot;
 
-		s.raw = (const char *)raw + (size_t)i * pixels * sample;
-		to_integrals<<<blocks, threads, 0, stream>>>(s, slot, to->shape.pitch, plan->marks[0], plan->defects);
+		s.raw = (const char *)plan->raw + (size_t)i * plan->bytes.raw;
+		if (s.has_air_region) {
+			find_air<<<1, 256, 0, stream>>>(s, plan->counters);
+			LAUNCHED();
+		}
+		to_integrals<<<blocks, threads, 0, stream>>>(s, slot, to->shape.pitch, plan->marks[0], plan->counters);
 		LAUNCHED();
 		replace<<<blocks, threads, 0, stream>>>(s, slot, to->shape.pitch, plan->marks[0], plan->marks[1], NULL);
 		LAUNCHED();
 		replace<<<blocks, threads, 0, stream>>>(s, slot, to->shape.pitch, plan->marks[1], plan->marks[0],
-							plan->defects);
+							plan->counters);
 		LAUNCHED();
 	}
 	return 0;
 }
 
-/* One core copies a fifth of what the bus takes, and waits for the disk's pages on the way. */
-static void copy_to_pinned(char *to, const char *from, size_t bytes)
+static void add_counts(struct defect_counts *counts, const linearised *found)
 {
-	const int stripes = 8;
-	size_t each = (bytes + (size_t)stripes - 1) / (size_t)stripes;
-
-#pragma omp parallel for num_threads(stripes) if (bytes > (1 << 20))
-	for (int i = 0; i < stripes; i++) {
-		size_t first = each * (size_t)i;
-
-		if (first < bytes)
-			memcpy(to + first, from + first, bytes - first < each ? bytes - first : each);
-	}
+	counts->mapped += (size_t)found->kinds[MAPPED];
+	counts->not_finite += (size_t)found->kinds[NOT_FINITE];
+	counts->saturated += (size_t)found->kinds[SATURATED];
+	counts->zero += (size_t)found->kinds[ZERO];
+	counts->blank += found->blank;
+	counts->no_air += found->no_air;
+	if (found->air_least > 0 && (found->air_least < counts->air_least || counts->air_least == 0))
+		counts->air_least = found->air_least;
+	if (found->air_most > counts->air_most)
+		counts->air_most = found->air_most;
 }
 
 int cuda_linearise(struct plan *plan, const void *samples, int count, const int *slots, struct stack *to,
@@ -163,36 +251,26 @@ int cuda_linearise(struct plan *plan, const void *samples, int count, const int 
 {
 	struct device *device = plan->device;
 	size_t view = plan->bytes.raw;
-	unsigned long long found[COUNTERS];
+	linearised found;
 
 	for (int i = 0; i < count; i++)
 		if (slots[i] < 0 || slots[i] >= to->slots)
 			return error_set(err, ERR_INTERNAL, "slot %d of a stack of %d", slots[i], to->slots);
 	TRY(device_enter(device, err));
-	/* What was asked for before may still read these slots. */
-	CUDA_TRY(cudaEventRecord(plan->asked, device->stream));
-	CUDA_TRY(cudaMemsetAsync(plan->defects, 0, linearise_counters_bytes(), device->copy));
+	CUDA_TRY(cudaMemsetAsync(plan->counters, 0, sizeof(found), device->copy));
 	for (int done = 0; done < count; done += plan->raw_views) {
-		int half = plan->raw_next, now = count - done < plan->raw_views ? count - done : plan->raw_views;
-		size_t bytes = view * (size_t)now;
+		int now = count - done < plan->raw_views ? count - done : plan->raw_views;
 
-		plan->raw_next = 1 - half;
-		CUDA_TRY(cudaEventSynchronize(plan->raw_copied[half]));
-		copy_to_pinned((char *)plan->raw_pinned[half], (const char *)samples + view * (size_t)done, bytes);
-		CUDA_TRY(cudaMemcpyAsync(plan->raw[half], plan->raw_pinned[half], bytes, cudaMemcpyHostToDevice,
-					 device->copy));
-		CUDA_TRY(cudaEventRecord(plan->raw_copied[half], device->copy));
+		TRY(copy_in(device, plan->raw, view, (const char *)samples + view * (size_t)done, view, (size_t)now,
+			    err));
+		/* The raw samples may come while the slots are still in use. */
 		if (done == 0)
-			CUDA_TRY(cudaStreamWaitEvent(device->copy, plan->asked, 0));
-		TRY(linearise_piece(plan, plan->raw[half], now, slots + done, to, err));
+			TRY(begin_arrival(device, to->used, err));
+		TRY(linearise_piece(plan, now, slots + done, to, err));
 	}
-	CUDA_TRY(cudaMemcpyAsync(found, plan->defects, sizeof(found), cudaMemcpyDeviceToHost, device->copy));
-	CUDA_TRY(cudaEventRecord(plan->linearised, device->copy));
-	CUDA_TRY(cudaStreamWaitEvent(device->stream, plan->linearised, 0));
+	TRY(end_arrival(device, to->used, err));
+	CUDA_TRY(cudaMemcpyAsync(&found, plan->counters, sizeof(found), cudaMemcpyDeviceToHost, device->copy));
 	CUDA_TRY(cudaStreamSynchronize(device->copy));
-	counts->not_finite += (size_t)found[NOT_FINITE];
-	counts->saturated += (size_t)found[SATURATED];
-	counts->zero += (size_t)found[ZERO];
-	counts->blank += (int)found[BLANK];
+	add_counts(counts, &found);
 	return 0;
 }

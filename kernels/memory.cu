@@ -1,10 +1,124 @@
 /*
- * Volumes, stacks and layered arrays on the device. Copies to and from the host
- * go in the order of everything else; downloads wait for them.
+ * Volumes, stacks and layered arrays on the device, and the copies between them
+ * and the host. These go through pinned memory in pieces, two in turn, on streams
+ * of their own: the bus has one while the host's cores copy the other, and
+ * whatever computes goes on, as long as it is not about the same memory.
  */
 #include <cstdlib>
+#include <cstring>
 
 #include "kernels/internal.cuh"
+
+/* ---- copies ---- */
+
+/* One core copies a fifth of what the bus takes, and waits for new pages on the way. */
+static void copy_by_cores(char *to, const char *from, size_t bytes)
+{
+	const int stripes = 8;
+	size_t each = (bytes + (size_t)stripes - 1) / (size_t)stripes;
+
+#pragma omp parallel for num_threads(stripes) if (bytes > (1 << 20))
+	for (int i = 0; i < stripes; i++) {
+		size_t first = each * (size_t)i;
+
+		if (first < bytes)
+			memcpy(to + first, from + first, bytes - first < each ? bytes - first : each);
+	}
+}
+
+int begin_arrival(struct device *device, cudaEvent_t used, struct error *err)
+{
+	CUDA_TRY(cudaStreamWaitEvent(device->copy, used, 0));
+	return 0;
+}
+
+int end_arrival(struct device *device, cudaEvent_t used, struct error *err)
+{
+	CUDA_TRY(cudaEventRecord(used, device->copy));
+	CUDA_TRY(cudaStreamWaitEvent(device->stream, used, 0));
+	return 0;
+}
+
+int mark_used(struct device *device, cudaEvent_t used, struct error *err)
+{
+	CUDA_TRY(cudaEventRecord(used, device->stream));
+	return 0;
+}
+
+/* Rows of a piece; where rows follow each other without a gap, anything will do for one. */
+static size_t rows_at_once(size_t *pitch, size_t *width, size_t *rows)
+{
+	if (*pitch == *width) {
+		size_t bytes = *width * *rows;
+
+		*pitch = *width = 1;
+		*rows = bytes;
+	}
+	return (size_t)STAGING_BYTES / *width;
+}
+
+int copy_in(struct device *device, void *to, size_t pitch, const void *from, size_t width, size_t rows,
+	    struct error *err)
+{
+	struct staging *staging = &device->in;
+	size_t most = rows_at_once(&pitch, &width, &rows);
+
+	for (size_t done = 0; done < rows; done += most) {
+		size_t now = rows - done < most ? rows - done : most;
+		int half = staging->next;
+
+		staging->next = 1 - half;
+		CUDA_TRY(cudaEventSynchronize(staging->done[half]));
+		copy_by_cores(staging->pinned[half], (const char *)from + done * width, now * width);
+		if (width == 1)
+			CUDA_TRY(cudaMemcpyAsync((char *)to + done, staging->pinned[half], now, cudaMemcpyHostToDevice,
+						 device->copy));
+		else
+			CUDA_TRY(cudaMemcpy2DAsync((char *)to + done * pitch, pitch, staging->pinned[half], width,
+						   width, now, cudaMemcpyHostToDevice, device->copy));
+		CUDA_TRY(cudaEventRecord(staging->done[half], device->copy));
+	}
+	return 0;
+}
+
+int copy_out(struct device *device, void *to, const void *from, size_t pitch, size_t width, size_t rows,
+	     struct error *err)
+{
+	struct staging *staging = &device->out;
+	size_t most = rows_at_once(&pitch, &width, &rows), before = 0;
+
+	/* A piece is asked for, then the one before it is taken out. */
+	for (size_t done = 0; done < rows || before > 0; done += most) {
+		size_t now = done >= rows ? 0 : rows - done < most ? rows - done : most;
+		int half = staging->next;
+
+		if (now > 0) {
+			if (width == 1)
+				CUDA_TRY(cudaMemcpyAsync(staging->pinned[half], (const char *)from + done, now,
+							 cudaMemcpyDeviceToHost, device->back));
+			else
+				CUDA_TRY(cudaMemcpy2DAsync(staging->pinned[half], width,
+							   (const char *)from + done * pitch, pitch, width, now,
+							   cudaMemcpyDeviceToHost, device->back));
+			CUDA_TRY(cudaEventRecord(staging->done[half], device->back));
+		}
+		if (before > 0) {
+			CUDA_TRY(cudaEventSynchronize(staging->done[1 - half]));
+			copy_by_cores((char *)to + (done - most) * width, staging->pinned[1 - half], before * width);
+		}
+		before = now;
+		staging->next = 1 - half;
+	}
+	return 0;
+}
+
+/* ---- volumes ---- */
+
+static int event_new(cudaEvent_t *ret_event, struct error *err)
+{
+	CUDA_TRY(cudaEventCreateWithFlags(ret_event, cudaEventDisableTiming));
+	return 0;
+}
 
 int cuda_volume_new(struct device *device, const struct grid *grid, struct volume **ret_volume, struct error *err)
 {
@@ -18,6 +132,8 @@ int cuda_volume_new(struct device *device, const struct grid *grid, struct volum
 		volume->size[i] = grid->size[i];
 	volume->bytes = grid_voxels(grid) * sizeof(float);
 	code = device_allocate(device, volume->bytes, (void **)&volume->data, err);
+	if (code == 0)
+		code = event_new(&volume->used, err);
 	if (code == 0)
 		code = cuda_volume_fill(volume, 0, err);
 	if (code < 0) {
@@ -33,41 +149,51 @@ void cuda_volume_free(struct volume *volume)
 	if (volume == NULL)
 		return;
 	device_release(volume->device, volume->data, volume->bytes);
+	if (volume->used != NULL)
+		cudaEventDestroy(volume->used);
 	free(volume);
 }
 
-int cuda_volume_upload(struct volume *volume, const float *from, struct error *err)
+static int check_slices(const struct volume *volume, int z_first, int z_count, struct error *err)
 {
-	TRY(device_enter(volume->device, err));
-	CUDA_TRY(cudaMemcpyAsync(volume->data, from, volume->bytes, cudaMemcpyHostToDevice, volume->device->stream));
-	return device_wait(volume->device, err);
+	if (z_first < 0 || z_count < 0 || z_first > volume->size[2] - z_count)
+		return error_set(err, ERR_INTERNAL, "slices %d to %d of %d", z_first, z_first + z_count - 1,
+				 volume->size[2]);
+	return 0;
+}
+
+static size_t slice_bytes(const struct volume *volume)
+{
+	return (size_t)volume->size[0] * (size_t)volume->size[1] * sizeof(float);
 }
 
 int cuda_volume_put(struct volume *volume, int z_first, int z_count, const float *from, struct error *err)
 {
-	size_t slice = (size_t)volume->size[0] * (size_t)volume->size[1];
+	struct device *device = volume->device;
+	size_t slice = slice_bytes(volume);
 
-	if (z_first < 0 || z_count < 0 || z_first + z_count > volume->size[2])
-		return error_set(err, ERR_INTERNAL, "slices %d to %d of %d", z_first, z_first + z_count - 1,
-				 volume->size[2]);
-	TRY(device_enter(volume->device, err));
-	CUDA_TRY(cudaMemcpyAsync(volume->data + slice * (size_t)z_first, from, slice * (size_t)z_count * sizeof(float),
-				 cudaMemcpyHostToDevice, volume->device->stream));
-	return device_wait(volume->device, err);
+	TRY(check_slices(volume, z_first, z_count, err));
+	TRY(device_enter(device, err));
+	TRY(begin_arrival(device, volume->used, err));
+	TRY(copy_in(device, (char *)volume->data + slice * (size_t)z_first, slice, from, slice, (size_t)z_count, err));
+	return end_arrival(device, volume->used, err);
+}
+
+int cuda_volume_upload(struct volume *volume, const float *from, struct error *err)
+{
+	return cuda_volume_put(volume, 0, volume->size[2], from, err);
 }
 
 int cuda_volume_download(struct volume *volume, int z_first, int z_count, float *ret_to, struct error *err)
 {
-	size_t slice = (size_t)volume->size[0] * (size_t)volume->size[1];
+	struct device *device = volume->device;
+	size_t slice = slice_bytes(volume);
 
-	if (z_first < 0 || z_count < 0 || z_first + z_count > volume->size[2])
-		return error_set(err, ERR_INTERNAL, "slices %d to %d of %d", z_first, z_first + z_count - 1,
-				 volume->size[2]);
-	TRY(device_enter(volume->device, err));
-	CUDA_TRY(cudaMemcpyAsync(ret_to, volume->data + slice * (size_t)z_first,
-				 slice * (size_t)z_count * sizeof(float), cudaMemcpyDeviceToHost,
-				 volume->device->stream));
-	return device_wait(volume->device, err);
+	TRY(check_slices(volume, z_first, z_count, err));
+	TRY(device_enter(device, err));
+	CUDA_TRY(cudaStreamWaitEvent(device->back, volume->used, 0));
+	return copy_out(device, ret_to, (const char *)volume->data + slice * (size_t)z_first, slice, slice,
+			(size_t)z_count, err);
 }
 
 static __global__ void fill(float *data, size_t count, float value)
@@ -86,15 +212,18 @@ int cuda_volume_fill(struct volume *volume, float value, struct error *err)
 	fill<<<device->multiprocessors * 8, 256, 0, device->stream>>>(volume->data, volume->bytes / sizeof(float),
 								      value);
 	LAUNCHED();
-	return 0;
+	return mark_used(device, volume->used, err);
 }
 
 int cuda_volume_copy(struct volume *to, const struct volume *from, struct error *err)
 {
 	TRY(device_enter(to->device, err));
 	CUDA_TRY(cudaMemcpyAsync(to->data, from->data, to->bytes, cudaMemcpyDeviceToDevice, to->device->stream));
-	return 0;
+	TRY(mark_used(to->device, from->used, err));
+	return mark_used(to->device, to->used, err);
 }
+
+/* ---- stacks ---- */
 
 struct stack_shape stack_shape_make(int columns, int rows, int slots)
 {
@@ -131,6 +260,11 @@ int cuda_stack_new(struct device *device, int columns, int rows, int slots, stru
 		code = cuda_error(err, cudaGetLastError(), "clearing a stack");
 		goto failed;
 	}
+	code = event_new(&stack->used, err);
+	if (code == 0)
+		code = mark_used(device, stack->used, err);
+	if (code < 0)
+		goto failed;
 	*ret_stack = stack;
 	return 0;
 failed:
@@ -143,40 +277,50 @@ void cuda_stack_free(struct stack *stack)
 	if (stack == NULL)
 		return;
 	device_release(stack->device, stack->memory, stack->shape.floats * sizeof(float));
+	if (stack->used != NULL)
+		cudaEventDestroy(stack->used);
 	free(stack);
+}
+
+static int check_slots(const struct stack *stack, int slot, int count, struct error *err)
+{
+	if (slot < 0 || count < 0 || slot > stack->slots - count)
+		return error_set(err, ERR_INTERNAL, "slots %d to %d of %d", slot, slot + count - 1, stack->slots);
+	return 0;
 }
 
 int cuda_stack_download(struct stack *stack, int slot, int count, float *ret_to, struct error *err)
 {
 	const struct stack_shape *shape = &stack->shape;
-	size_t width = (size_t)shape->columns * sizeof(float);
+	size_t width = (size_t)shape->columns * sizeof(float), rows = (size_t)shape->rows;
 
-	if (slot < 0 || count < 0 || slot + count > stack->slots)
-		return error_set(err, ERR_INTERNAL, "slots %d to %d of %d", slot, slot + count - 1, stack->slots);
+	TRY(check_slots(stack, slot, count, err));
 	TRY(device_enter(stack->device, err));
+	CUDA_TRY(cudaStreamWaitEvent(stack->device->back, stack->used, 0));
 	for (int i = 0; i < count; i++)
-		CUDA_TRY(cudaMemcpy2DAsync(ret_to + (size_t)i * (size_t)shape->columns * (size_t)shape->rows, width,
-					   stack->data + (size_t)(slot + i) * shape->slot,
-					   (size_t)shape->pitch * sizeof(float), width, (size_t)shape->rows,
-					   cudaMemcpyDeviceToHost, stack->device->stream));
-	return device_wait(stack->device, err);
+		TRY(copy_out(stack->device, (char *)ret_to + (size_t)i * width * rows,
+			     stack->data + (size_t)(slot + i) * shape->slot, (size_t)shape->pitch * sizeof(float),
+			     width, rows, err));
+	return 0;
 }
 
 int cuda_stack_upload(struct stack *stack, int slot, int count, const float *from, struct error *err)
 {
 	const struct stack_shape *shape = &stack->shape;
-	size_t width = (size_t)shape->columns * sizeof(float);
+	struct device *device = stack->device;
+	size_t width = (size_t)shape->columns * sizeof(float), rows = (size_t)shape->rows;
 
-	if (slot < 0 || count < 0 || slot + count > stack->slots)
-		return error_set(err, ERR_INTERNAL, "slots %d to %d of %d", slot, slot + count - 1, stack->slots);
-	TRY(device_enter(stack->device, err));
+	TRY(check_slots(stack, slot, count, err));
+	TRY(device_enter(device, err));
+	TRY(begin_arrival(device, stack->used, err));
 	for (int i = 0; i < count; i++)
-		CUDA_TRY(cudaMemcpy2DAsync(stack->data + (size_t)(slot + i) * shape->slot,
-					   (size_t)shape->pitch * sizeof(float),
-					   from + (size_t)i * (size_t)shape->columns * (size_t)shape->rows, width,
-					   width, (size_t)shape->rows, cudaMemcpyHostToDevice, stack->device->stream));
-	return device_wait(stack->device, err);
+		TRY(copy_in(device, stack->data + (size_t)(slot + i) * shape->slot,
+			    (size_t)shape->pitch * sizeof(float), (const char *)from + (size_t)i * width * rows, width,
+			    rows, err));
+	return end_arrival(device, stack->used, err);
 }
+
+/* ---- arrays ---- */
 
 int layered_new(struct device *device, int width, int height, int layers, cudaTextureAddressMode outside,
 		struct layered *ret_layered, struct error *err)

@@ -15,7 +15,7 @@ enum { LAYERS_MOST = 2048 };                      /* of a layered array, on ever
 enum { SIDE_MOST = 32768 };                       /* its width and height */
 enum { BATCH_MOST = 128, BATCH_LEAN = 16 };       /* views that are filtered and backprojected in one go */
 static const double SMALL = 1 << 20;              /* voxels times views below which launches take longer than samples */
-static const size_t RAW_BYTES = (size_t)16 << 20; /* of each of the two buffers of raw samples */
+static const size_t RAW_BYTES = (size_t)16 << 20; /* of the buffer of raw samples */
 static const size_t FFT_BYTES = (size_t)64 << 20; /* of the rows that cuFFT takes at once */
 
 static int at_most(int count, int most)
@@ -37,6 +37,14 @@ static int largest_subset(const struct subsets *subsets)
 static int wide_columns(const struct plan_options *options)
 {
 	return options->pad[0] + options->geometry->columns + options->pad[1];
+}
+
+/* Projections that are on the device at a time. */
+static int resident_views(const struct plan_options *options)
+{
+	int count = options->geometry->count;
+
+	return options->resident > 0 && options->resident < count ? options->resident : count;
 }
 
 /* The corner of the box, half a voxel beyond the outer centres or on them, mm. */
@@ -210,7 +218,7 @@ static struct plan_shape shape_of(const struct plan_options *options, bool lean)
 	shape.textures = !lean && !shape.is_small && !options->reference_precision && fits &&
 			 wide_columns(options) <= SIDE_MOST && geometry->rows <= SIDE_MOST;
 	shape.lean = lean;
-	shape.batch = at_most(geometry->count, lean ? BATCH_LEAN : BATCH_MOST);
+	shape.batch = at_most(resident_views(options), lean ? BATCH_LEAN : BATCH_MOST);
 	shape.by_view = subset == 1 && columns_shape_make(grid->size).floats < (size_t)1 << 31;
 	shape.by_subset = subset > 0 && !shape.by_view;
 	shape.correction = shape.by_subset ? (lean ? at_most(subset, BATCH_LEAN) : subset) : 0;
@@ -233,7 +241,7 @@ static struct plan_shape shape_of(const struct plan_options *options, bool lean)
 
 static bool needs_arrays_forward(const struct plan *plan)
 {
-	return plan->shape.textures && plan->shape.forward_rows == 0;
+	return plan->shape.textures && plan->shape.forward_rows == 0 && !plan->options.no_projection;
 }
 static bool needs_arrays_back(const struct plan *plan)
 {
@@ -278,7 +286,8 @@ static void plan_describe(struct plan *plan, const struct plan_options *options,
 	plan->columns = columns_shape_make(size);
 	plan->stack = stack_shape_make(geometry->columns, geometry->rows, 1);
 	plan->filtered = stack_shape_make(wide_columns(options), geometry->rows, 1);
-	plan->scratch_bytes = (plan->along_x.floats + plan->along_y.floats) * sizeof(float);
+	if (!options->no_projection)
+		plan->scratch_bytes = (plan->along_x.floats + plan->along_y.floats) * sizeof(float);
 	if (plan->shape.by_view && plan->columns.floats * sizeof(float) > plan->scratch_bytes)
 		plan->scratch_bytes = plan->columns.floats * sizeof(float);
 	if (tv_scratch_bytes(options) > plan->scratch_bytes)
@@ -321,7 +330,7 @@ static struct plan_bytes bytes_of(const struct plan_options *options, bool lean)
 	plan_describe(&plan, options, lean);
 	bytes.stack = stack_bytes(geometry->columns, geometry->rows, geometry->count);
 	bytes.volumes = voxels * (options->sart != NULL ? 2 : 1);
-	bytes.raw = 2 * plan.bytes.raw * (size_t)plan.raw_views;
+	bytes.raw = plan.bytes.raw * (size_t)plan.raw_views;
 	bytes.scratch = plan.scratch_bytes + views * (sizeof(struct device_view) + 2 * sizeof(int)) +
 			plan.partial_count * sizeof(float2) + reduce_bytes() + VIEWS_AT_ONCE * 12 * sizeof(float) +
 			pixels_of(&plan) * 2 + linearise_counters_bytes();
@@ -349,6 +358,8 @@ static struct plan_bytes bytes_of(const struct plan_options *options, bool lean)
 		bytes.scratch += pixels_of(&plan) * sizeof(float);
 	if (options->linearise.dark != NULL)
 		bytes.scratch += pixels_of(&plan) * sizeof(float);
+	if (options->linearise.defects != NULL)
+		bytes.scratch += pixels_of(&plan);
 	return bytes;
 }
 
@@ -363,19 +374,16 @@ static bool is_lean(const struct device *device, const struct plan_options *opti
 	if (device == NULL)
 		return false;
 	bytes = bytes_of(options, false);
+	bytes.stack = stack_bytes(options->geometry->columns, options->geometry->rows, resident_views(options));
 	return bytes.stack + bytes.volumes + bytes.scratch + bytes.raw > device->limit - device->used;
 }
 
 /* What the CPU does and this backend does not. */
 static int check_supported(const struct plan_options *options, struct error *err)
 {
-	const struct linearise *linearise = &options->linearise;
-	const char *what = linearise->defects != NULL       ? "a defect map"
-			   : linearise->has_air_region      ? "an air region"
-			   : linearise->hardening_count > 0 ? "a beam-hardening correction"
-			   : options->extend > 0            ? "the extension of truncated rows"
-			   : options->matched               ? "the matched projector"
-							    : NULL;
+	const char *what = options->extend > 0 ? "the extension of truncated rows"
+			   : options->matched  ? "the matched projector"
+					       : NULL;
 
 	if (what != NULL)
 		return error_set(err, ERR_IMPOSSIBLE, "the CUDA backend does not know %s, the CPU backend does", what);
@@ -466,32 +474,29 @@ static int prepare_geometry(struct plan *plan, struct error *err)
 	return code;
 }
 
-static int prepare_image(struct plan *plan, const float *from, float **ret_to, struct error *err)
+/* Something of each pixel, where it is given. */
+static int prepare_image(struct plan *plan, const void *from, size_t size, void **ret_to, struct error *err)
 {
-	size_t bytes = pixels_of(plan) * sizeof(float);
+	size_t bytes = pixels_of(plan) * size;
 
 	if (from == NULL)
 		return 0;
-	TRY(device_allocate(plan->device, bytes, (void **)ret_to, err));
+	TRY(device_allocate(plan->device, bytes, ret_to, err));
 	CUDA_TRY(cudaMemcpy(*ret_to, from, bytes, cudaMemcpyHostToDevice));
 	return 0;
 }
 
 static int prepare_linearise(struct plan *plan, struct error *err)
 {
-	size_t raw = plan->bytes.raw * (size_t)plan->raw_views;
+	const struct linearise *options = &plan->options.linearise;
 
-	for (int i = 0; i < 2; i++) {
-		TRY(device_allocate(plan->device, raw, &plan->raw[i], err));
+	TRY(device_allocate(plan->device, plan->bytes.raw * (size_t)plan->raw_views, &plan->raw, err));
+	for (int i = 0; i < 2; i++)
 		TRY(device_allocate(plan->device, pixels_of(plan), (void **)&plan->marks[i], err));
-		CUDA_TRY(cudaMallocHost(&plan->raw_pinned[i], raw));
-		CUDA_TRY(cudaEventCreateWithFlags(&plan->raw_copied[i], cudaEventDisableTiming));
-	}
-	CUDA_TRY(cudaEventCreateWithFlags(&plan->asked, cudaEventDisableTiming));
-	CUDA_TRY(cudaEventCreateWithFlags(&plan->linearised, cudaEventDisableTiming));
-	TRY(device_allocate(plan->device, linearise_counters_bytes(), (void **)&plan->defects, err));
-	TRY(prepare_image(plan, plan->options.linearise.flat, &plan->flat, err));
-	return prepare_image(plan, plan->options.linearise.dark, &plan->dark, err);
+	TRY(device_allocate(plan->device, linearise_counters_bytes(), (void **)&plan->counters, err));
+	TRY(prepare_image(plan, options->flat, sizeof(float), (void **)&plan->flat, err));
+	TRY(prepare_image(plan, options->dark, sizeof(float), (void **)&plan->dark, err));
+	return prepare_image(plan, options->defects, 1, (void **)&plan->map, err);
 }
 
 static int prepare_sart(struct plan *plan, struct error *err)
@@ -624,21 +629,14 @@ void cuda_plan_free(struct plan *plan)
 	device_release(device, plan->scratch, plan->scratch_bytes);
 	for (int i = 0; i < 2; i++) {
 		layered_free(device, &plan->slices[i]);
-		device_release(device, plan->raw[i], plan->bytes.raw * (size_t)plan->raw_views);
 		device_release(device, plan->marks[i], pixels_of(plan));
-		if (plan->raw_pinned[i] != NULL)
-			cudaFreeHost(plan->raw_pinned[i]);
-		if (plan->raw_copied[i] != NULL)
-			cudaEventDestroy(plan->raw_copied[i]);
 	}
-	if (plan->asked != NULL)
-		cudaEventDestroy(plan->asked);
-	if (plan->linearised != NULL)
-		cudaEventDestroy(plan->linearised);
+	device_release(device, plan->raw, plan->bytes.raw * (size_t)plan->raw_views);
 	layered_free(device, &plan->projections);
 	layered_free(device, &plan->filtered_array);
 	device_release(device, plan->pairs, plan->pairs_bytes);
-	device_release(device, plan->defects, linearise_counters_bytes());
+	device_release(device, plan->counters, linearise_counters_bytes());
+	device_release(device, plan->map, pixels_of(plan));
 	device_release(device, plan->flat, pixels_of(plan) * sizeof(float));
 	device_release(device, plan->dark, pixels_of(plan) * sizeof(float));
 	device_release(device, plan->partial, plan->partial_count * sizeof(float2));
