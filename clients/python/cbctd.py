@@ -1,0 +1,955 @@
+"""Client of cbctd: cone-beam projections go in as NumPy arrays, volumes come out.
+
+In one call::
+
+    import cbctd
+    geometry = cbctd.Geometry.circular(620, 1100, pixel_mm=(0.8, 0.8), angles_deg=np.arange(0, 360, 3.6))
+    volume = cbctd.recon(projections, geometry, sart={"iterations": 10}, tv={})
+    volume.voxels            # float32 [z][y][x], 1/mm
+
+Or step by step, while the arm still turns::
+
+    with cbctd.Client("http://cart:2228") as client:
+        scan = client.create_scan(geometry, projections.shape)
+        job = client.submit(scan["id"], {"fdk": {}, "sart": {}, "emit": ["fdk", 1, 5]})
+        client.upload(scan["id"], projections)
+        for volume in client.volumes(job["id"]):
+            show(volume.voxels)
+
+Everywhere: projections are ``[view][row][column]``, volumes ``[z][y][x]``; lengths are mm, angles degrees; the world's
+origin is the isocentre, z the rotation axis. Voxels are linear attenuation in 1/mm (float32) or Hounsfield units
+(int16). What the daemon refuses is raised as `Problem`, with its words. Connections that break are taken up again where
+they broke, busy daemons (429, 503) are asked again after the pause that they ask for.
+
+A `Client` may be used from several threads.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import os
+import socket
+import threading
+import time
+import uuid
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, Callable, Dict, Iterator, List, Mapping, NamedTuple, Optional, Sequence, Tuple, Union
+
+import numpy as np
+import numpy.typing as npt
+import requests
+import requests.adapters
+
+__all__ = [
+    "Broken",
+    "Client",
+    "Error",
+    "Event",
+    "Geometry",
+    "JobFailed",
+    "Problem",
+    "Volume",
+    "recon",
+]
+
+Array = npt.NDArray[Any]
+Document = Dict[str, Any]
+Progress = Callable[[int, int], None]
+
+_FLOAT32: np.dtype[Any] = np.dtype("<f4")
+_UINT16: np.dtype[Any] = np.dtype("<u2")
+_INT16: np.dtype[Any] = np.dtype("<i2")
+# What breaks when a connection does.
+_BREAKS = (
+    requests.exceptions.ConnectionError,
+    requests.exceptions.Timeout,
+    requests.exceptions.ChunkedEncodingError,
+    requests.exceptions.ContentDecodingError,
+)
+_HEARTBEAT = 10.0  # s: the longest that a living daemon keeps silent in events
+_RUN_BYTES = 16 << 20  # of one request of an upload: the daemon syncs its disk once for each
+
+
+class Error(Exception):
+    """Anything that goes wrong between here and the daemon."""
+
+
+class Broken(Error):
+    """No answer, or one that broke off, for longer than the client's patience."""
+
+
+class Problem(Error):
+    """The daemon refused (RFC 9457).
+
+    Attributes:
+        status: of HTTP, e.g. 422.
+        type: ``urn:cbctd:problem:...``, stable.
+        title: what kind of problem it is.
+        detail: one sentence with the number that was wrong and the one that was expected.
+        pointer: RFC 6901 pointer to the field of the request, or "".
+        request_id: to be found in the daemon's log.
+    """
+
+    def __init__(self, status: int, document: Mapping[str, Any]) -> None:
+        self.status = status
+        self.type = str(document.get("type", "about:blank"))
+        self.title = str(document.get("title", f"status {status}"))
+        self.detail = str(document.get("detail", ""))
+        self.pointer = str(document.get("pointer", ""))
+        self.request_id = str(document.get("request_id", ""))
+        where = f"{self.pointer}: " if self.pointer else ""
+        super().__init__(f"{where}{self.title}{': ' if self.detail else ''}{self.detail} (status {status})")
+
+
+class JobFailed(Error):
+    """The job ended without success; `job` is its document, `state` is ``failed`` or ``cancelled``."""
+
+    def __init__(self, job: Document) -> None:
+        self.job = job
+        self.state = str(job.get("state"))
+        super().__init__(f"job {job.get('id')} {self.state}: {(job.get('error') or {}).get('detail', '')}".rstrip(": "))
+
+
+class Event(NamedTuple):
+    """Something that happened to a job.
+
+    ``kind`` is ``state``, ``progress``, ``volume``, ``warning``, ``removed`` or ``end``; ``data["job"]`` names the job;
+    ``id`` grows and is never used twice.
+    """
+
+    id: int
+    kind: str
+    data: Document
+
+
+@dataclass(frozen=True)
+class Volume:
+    """A kept volume.
+
+    Attributes:
+        name: ``fdk``, ``fdk-tv``, ``iter-5`` ..., ``final``.
+        voxels: ``[z][y][x]``, float32 in 1/mm or int16 in Hounsfield units.
+        spacing_mm: of voxels along x, y and z.
+        origin_mm: centre of voxel 0,0,0: x, y, z.
+        stage: ``fdk``, ``tv`` or ``sart``.
+        iteration: of SART, 0 before it.
+    """
+
+    name: str
+    voxels: Array
+    spacing_mm: Tuple[float, float, float]
+    origin_mm: Tuple[float, float, float]
+    stage: str
+    iteration: int
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Where source and detector stand in each view.
+
+    Attributes:
+        document: ``geometry`` of a scan, as the API takes it.
+        pixel_mm: pitch of the detector's pixels along columns and rows.
+    """
+
+    document: Document
+    pixel_mm: Tuple[float, float]
+
+    @staticmethod
+    def circular(
+        source_to_isocentre_mm: float,
+        source_to_detector_mm: float,
+        pixel_mm: Sequence[float],
+        *,
+        angles_deg: Optional[npt.ArrayLike] = None,
+        first_angle_deg: float = 0.0,
+        angle_step_deg: Optional[float] = None,
+        detector_offset_mm: Sequence[float] = (0.0, 0.0),
+        source_offset_mm: Sequence[float] = (0.0, 0.0),
+    ) -> Geometry:
+        """A circular orbit about z: at gantry angle b the source stands at ``D (cos b, sin b, 0)``, columns run along
+        ``(-sin b, cos b, 0)``, rows along z. Either a list of angles, or the first and the step."""
+        document: Document = {
+            "kind": "circular",
+            "source_to_isocentre_mm": float(source_to_isocentre_mm),
+            "source_to_detector_mm": float(source_to_detector_mm),
+            "detector_offset_mm": [float(x) for x in detector_offset_mm],
+            "source_offset_mm": [float(x) for x in source_offset_mm],
+        }
+        if angles_deg is not None:
+            document["angles_deg"] = np.asarray(angles_deg, dtype=float).ravel().tolist()
+        else:
+            document["first_angle_deg"] = float(first_angle_deg)
+            if angle_step_deg is not None:
+                document["angle_step_deg"] = float(angle_step_deg)
+        return Geometry(document, _pair(pixel_mm))
+
+    @staticmethod
+    def matrices(matrices: npt.ArrayLike, pixel_mm: Sequence[float]) -> Geometry:
+        """Calibrated projection matrices ``[view][3][4]``, taking (x, y, z, 1) in mm to w (column, row, 1) in pixels,
+        any overall scale and sign."""
+        rows = np.asarray(matrices, dtype=float)
+        return Geometry({"kind": "matrices", "matrices": rows.reshape(len(rows), 12).tolist()}, _pair(pixel_mm))
+
+    @staticmethod
+    def views(
+        source_mm: npt.ArrayLike,
+        pixel0_mm: npt.ArrayLike,
+        column_step_mm: npt.ArrayLike,
+        row_step_mm: npt.ArrayLike,
+        pixel_mm: Sequence[float],
+    ) -> Geometry:
+        """Vectors ``[view][3]``: the source, the centre of column 0 and row 0, from one column to the next, from one
+        row to the next."""
+        arrays = {
+            "source_mm": source_mm,
+            "pixel0_mm": pixel0_mm,
+            "column_step_mm": column_step_mm,
+            "row_step_mm": row_step_mm,
+        }
+        lists = {name: np.asarray(value, dtype=float).reshape(-1, 3).tolist() for name, value in arrays.items()}
+        if len({len(value) for value in lists.values()}) != 1:
+            raise ValueError("source, pixel0, column step and row step have different numbers of views")
+        views = [dict(zip(lists, vectors)) for vectors in zip(*lists.values())]
+        return Geometry({"kind": "views", "views": views}, _pair(pixel_mm))
+
+
+class _Adapter(requests.adapters.HTTPAdapter):
+    """Connections whose peer is probed while they are silent."""
+
+    def init_poolmanager(self, *args: Any, **options: Any) -> None:
+        wanted = [(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1), (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)]
+        for name, value in (("TCP_KEEPIDLE", 10), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 4)):
+            if hasattr(socket, name):
+                wanted.append((socket.IPPROTO_TCP, getattr(socket, name), value))
+        super().init_poolmanager(*args, socket_options=wanted, **options)
+
+
+class Client:
+    """A daemon.
+
+    Args:
+        url: ``http://HOST:PORT``; default ``$CBCT_URL``, else ``http://127.0.0.1:2228``.
+        timeout: s, to wait for a connection and between two bytes of an answer.
+        patience: s, for how long broken connections are taken up again and a busy daemon is asked again before
+            `Broken` or `Problem` is raised. One that was never reached is given up at once.
+    """
+
+    def __init__(self, url: Optional[str] = None, *, timeout: float = 60.0, patience: float = 60.0) -> None:
+        self.url = (url or os.environ.get("CBCT_URL") or "http://127.0.0.1:2228").rstrip("/")
+        self.timeout = timeout
+        self.patience = patience
+        self._reached = False
+        # One for all threads: its pool of connections is made for that, and of its own state nothing changes.
+        self._session = requests.Session()
+        # The daemon is near: no proxies, and no passwords of other services.
+        self._session.trust_env = False
+        self._session.headers["User-Agent"] = "cbctd-python"
+        for scheme in ("http://", "https://"):
+            self._session.mount(scheme, _Adapter(pool_maxsize=32))
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Closes all connections."""
+        self._session.close()
+
+    # ---- scans ----
+
+    def create_scan(
+        self,
+        geometry: Geometry,
+        shape: Sequence[int],
+        *,
+        dtype: npt.DTypeLike = np.float32,
+        name: Optional[str] = None,
+        quantity: str = "line_integral",
+        **projections: Any,
+    ) -> Document:
+        """Announces a scan; returns its document, with ``id``, ``derived`` and ``warnings``.
+
+        Args:
+            geometry: of its views.
+            shape: (views, rows, columns).
+            dtype: of what is going to be uploaded, float32 or uint16.
+            name: for people.
+            quantity: ``line_integral``, or ``intensity`` with ``air=60000`` or with `put_flat` later.
+            projections: more members of ``projections`` in the request, e.g. ``air``, ``saturation``.
+        """
+        views, rows, columns = (int(n) for n in shape)
+        members = {"count": views, "sample": _sample(dtype), "quantity": quantity}
+        members.update((key, value) for key, value in projections.items() if value is not None)
+        request: Document = {
+            "detector": {"columns": columns, "rows": rows, "pixel_mm": list(geometry.pixel_mm)},
+            "projections": members,
+            "geometry": geometry.document,
+        }
+        if name is not None:
+            request["name"] = name
+        # A second one by mistake would stay for ever.
+        return self._json("POST", "/v1/scans", json=request, repeatable=False)
+
+    def scan(self, scan: str) -> Document:
+        """The scan's document; ``missing`` has the runs [first, last] of projections that are not there."""
+        return self._json("GET", f"/v1/scans/{scan}")
+
+    def scans(self) -> Iterator[Document]:
+        """All scans, newest first."""
+        return self._pages("/v1/scans", "scans")
+
+    def delete_scan(self, scan: str) -> None:
+        """Removes a scan with its projections; `Problem` 409 while a job uses it."""
+        self._delete(f"/v1/scans/{scan}")
+
+    def upload(
+        self,
+        scan: str,
+        projections: npt.ArrayLike,
+        *,
+        connections: int = 4,
+        compress: bool = False,
+        progress: Optional[Progress] = None,
+    ) -> None:
+        """Sends what is missing of a scan's projections, in runs over several connections; returns when all of them
+        are on the daemon's disk. To go on after a break, also in another process, call it again.
+
+        Args:
+            scan: its id.
+            projections: ``[view][row][column]``, all of them; a memory-mapped file is read run by run. float32, or
+                uint16 where the scan says so; other types are converted where nothing is lost by it.
+            connections: at the same time.
+            compress: with zstd, where a module for it is installed; worth it for slow networks only.
+            progress: called with the number of projections that are there and the number of all.
+        """
+        document = self.scan(scan)
+        stack = np.asanyarray(projections)
+        dtype = _wire_type(document)
+        shape = (document["projections"]["count"], document["detector"]["rows"], document["detector"]["columns"])
+        if stack.shape != shape:
+            raise ValueError(f"projections of shape {stack.shape}, the scan has {shape}")
+        _check_cast(stack.dtype, dtype)
+        run = max(1, _RUN_BYTES // max(1, int(np.prod(shape[1:])) * dtype.itemsize))
+        give_up = time.monotonic() + self.patience
+        left = _count(document["missing"])
+        while left > 0:
+            if progress is not None:
+                progress(shape[0] - left, shape[0])
+            runs = _split(document["missing"], run)
+            broken = self._send_runs(scan, stack, dtype, runs, connections, compress, progress)
+            document = self.scan(scan)
+            if _count(document["missing"]) < left:
+                give_up = time.monotonic() + self.patience
+            elif broken is None or time.monotonic() > give_up:
+                raise Broken(f"projections are not taken: {broken}") from broken
+            left = _count(document["missing"])
+        if progress is not None:
+            progress(shape[0], shape[0])
+
+    def put_projection(self, scan: str, view: int, image: npt.ArrayLike) -> bool:
+        """Sends one projection ``[row][column]`` as it is acquired. False when the same was there already."""
+        document = self.scan(scan)
+        return self._put_image(document, f"projections/{int(view)}", image, _wire_type(document))
+
+    def put_flat(self, scan: str, image: npt.ArrayLike) -> bool:
+        """Sends the flat image ``[row][column]`` of a scan of intensities, float32. False when it was there."""
+        return self._put_image(self.scan(scan), "flat", image, _FLOAT32)
+
+    def put_dark(self, scan: str, image: npt.ArrayLike) -> bool:
+        """Sends the dark image ``[row][column]`` of a scan of intensities, float32. False when it was there."""
+        return self._put_image(self.scan(scan), "dark", image, _FLOAT32)
+
+    def projection(self, scan: str, view: int) -> Array:
+        """One projection ``[row][column]`` as it was stored."""
+        document = self.scan(scan)
+        detector = document["detector"]
+        body = self._request("GET", f"/v1/scans/{scan}/projections/{int(view)}").content
+        return np.frombuffer(bytearray(body), _wire_type(document)).reshape(detector["rows"], detector["columns"])
+
+    # ---- jobs ----
+
+    def submit(self, scan: str, recipe: Mapping[str, Any], *, idempotency_key: Optional[str] = None) -> Document:
+        """Asks for a reconstruction; returns the job's document, with its ``id``. May come before the projections.
+
+        Args:
+            scan: its id.
+            recipe: ``grid``, ``fdk``, ``sart``, ``tv``, ``emit``, ``priority`` ... as POST /v1/jobs takes them; a
+                stage given as ``{}`` takes its defaults.
+            idempotency_key: a repeat with the same key returns the same job; one is made up if none is given, so that
+                a connection that breaks never makes two jobs.
+        """
+        headers = {"Idempotency-Key": idempotency_key or uuid.uuid4().hex}
+        return self._json("POST", "/v1/jobs", json={**recipe, "scan": scan}, headers=headers)
+
+    def job(self, job: str) -> Document:
+        """The job's document as it is."""
+        return self._json("GET", f"/v1/jobs/{job}")
+
+    def jobs(self) -> Iterator[Document]:
+        """All jobs, newest first."""
+        return self._pages("/v1/jobs", "jobs")
+
+    def wait(self, job: str, timeout: Optional[float] = None) -> Document:
+        """The job's document when it has ended. `JobFailed` unless it succeeded, `TimeoutError` after so many s."""
+        end = None if timeout is None else time.monotonic() + timeout
+        while True:
+            left = self.timeout / 2 if end is None else min(self.timeout / 2, max(0.0, end - time.monotonic()))
+            document = self._json("GET", f"/v1/jobs/{job}", params={"wait": f"{left:.3f}"})
+            if document["state"] in ("succeeded", "failed", "cancelled"):
+                return _judge(document)
+            if end is not None and time.monotonic() >= end:
+                raise TimeoutError(f"job {job} is {document['state']} after {timeout} s")
+
+    def cancel(self, job: str) -> Optional[Document]:
+        """Cancels a job that has not ended and waits for its end; returns its document. One that has ended is removed
+        with its volumes: None."""
+        response = self._request("DELETE", f"/v1/jobs/{job}", params={"wait": f"{self.timeout / 2:.3f}"})
+        return None if response.status_code == 204 else dict(response.json())
+
+    def delete_job(self, job: str) -> None:
+        """Removes a job with its volumes; one that still runs is cancelled before."""
+        while self.cancel(job) is not None:
+            pass
+
+    def events(self, job: Optional[str] = None, *, after: Union[int, str, None] = None) -> Iterator[Event]:
+        """What happens to a job, from the first to its ``end``; or to all jobs, for ever. Nothing is missed and
+        nothing comes twice, over broken connections and restarts of the daemon.
+
+        Args:
+            job: its id, None for all.
+            after: goes on behind the event with this id; ``"latest"``: only what is new.
+        """
+        path = "/v1/events" if job is None else f"/v1/jobs/{job}/events"
+        give_up = time.monotonic() + self.patience
+        while True:
+            params = {} if after is None else {"after": str(after)}
+            try:
+                with self._request("GET", path, params=params, stream=True, timeout=3 * _HEARTBEAT) as response:
+                    if response.status_code == 204:
+                        return
+                    for event in _read_events(response):
+                        give_up = time.monotonic() + self.patience
+                        after = event.id
+                        yield event
+                        if event.kind == "end" and job is not None:
+                            return
+            except _BREAKS as error:
+                if time.monotonic() > give_up:
+                    raise Broken(f"{path}: {error}") from error
+            time.sleep(0.5)
+
+    # ---- volumes ----
+
+    def volumes(
+        self,
+        job: str,
+        *,
+        after: Optional[str] = None,
+        dtype: npt.DTypeLike = np.float32,
+        scale: int = 1,
+        compress: bool = False,
+    ) -> Iterator[Volume]:
+        """Each kept volume: those that are there, then each as it is made, to the job's end (`JobFailed` unless it
+        succeeded). Digests are checked; a connection that breaks is taken up behind the last whole volume.
+
+        Args:
+            job: its id.
+            after: goes on behind the volume of this name.
+            dtype: float32 is 1/mm, int16 Hounsfield units.
+            scale: each voxel the mean of ``scale**3``.
+            compress: zstd on the way, where a module for it is installed.
+        """
+        headers = {"Accept-Encoding": "zstd" if compress and _zstd() is not None else "identity"}
+        give_up = time.monotonic() + self.patience
+        while True:
+            params = {"format": "nrrd", "type": _volume_type(dtype), "scale": str(int(scale))}
+            if after is not None:
+                params["after"] = after
+            try:
+                # It may be long until the next one: whether the peer is still there is left to keep-alive probes.
+                with self._request(
+                    "GET", f"/v1/jobs/{job}/stream", params=params, headers=headers, stream=True, timeout=None
+                ) as response:
+                    for part in _read_parts(response):
+                        give_up = time.monotonic() + self.patience
+                        if part.headers["content-type"] == "application/json":
+                            _judge(json.loads(bytes(part.body)))
+                            return
+                        after = part.headers["cbct-volume"]
+                        yield _volume(part)
+            except _BREAKS as error:
+                if time.monotonic() > give_up:
+                    raise Broken(f"stream of job {job}: {error}") from error
+            time.sleep(0.5)
+
+    def volume_list(self, job: str) -> List[Document]:
+        """The documents of the kept volumes, oldest first: name, size, digest, statistics ..."""
+        return list(self._pages(f"/v1/jobs/{job}/volumes", "volumes"))[::-1]
+
+    def volume(self, job: str, name: str = "final", *, dtype: npt.DTypeLike = np.float32, scale: int = 1) -> Volume:
+        """One kept volume; `dtype` and `scale` as in `volumes`."""
+        params = {"format": "nrrd", "type": _volume_type(dtype), "scale": str(int(scale))}
+        headers = {"Accept-Encoding": "identity"}
+        response = self._request("GET", f"/v1/jobs/{job}/volumes/{name}", params=params, headers=headers)
+        document = next(document for document in self.volume_list(job) if document["name"] == name)
+        told = {"cbct-volume": name, "cbct-stage": document["stage"], "cbct-iteration": str(document["iteration"])}
+        return _volume(_Part(told, bytearray(response.content)))
+
+    def volume_file(self, job: str, name: str = "final", **query: Any) -> bytes:
+        """A kept volume as a file; ``format``: ``nifti`` (default), ``mha``, ``nrrd``, ``raw``; ``type``, ``scale``."""
+        params = {key: str(value) for key, value in query.items()}
+        headers = {"Accept-Encoding": "identity"}
+        return self._bytes(f"/v1/jobs/{job}/volumes/{name}", params, headers)
+
+    def slice(self, job: str, name: str = "final", **query: Any) -> bytes:
+        """One plane as PNG: ``axis="z"``, ``index``, ``window`` and ``level`` in Hounsfield units; ``sheet=1`` gives a
+        contact sheet."""
+        return self._bytes(f"/v1/jobs/{job}/volumes/{name}/slice", {key: str(value) for key, value in query.items()})
+
+    # ---- the daemon ----
+
+    def devices(self) -> List[Document]:
+        """The workers and what they run on."""
+        return list(self._json("GET", "/v1/devices")["devices"])
+
+    def ready(self) -> bool:
+        """Whether a worker can take a job just now."""
+        try:
+            response = self._session.get(f"{self.url}/readyz", timeout=self.timeout)
+        except _BREAKS:
+            return False
+        return bool(response.status_code == 200)
+
+    # ---- everything in one call ----
+
+    def recon(
+        self,
+        projections: npt.ArrayLike,
+        geometry: Geometry,
+        *,
+        grid: Optional[Mapping[str, Any]] = None,
+        fdk: Optional[Mapping[str, Any]] = {},  # noqa: B006  it is never changed
+        sart: Optional[Mapping[str, Any]] = None,
+        tv: Optional[Mapping[str, Any]] = None,
+        emit: Sequence[Union[int, str]] = (),
+        on_volume: Optional[Callable[[Volume], None]] = None,
+        dtype: npt.DTypeLike = np.float32,
+        quantity: str = "line_integral",
+        air: Optional[float] = None,
+        flat: Optional[npt.ArrayLike] = None,
+        dark: Optional[npt.ArrayLike] = None,
+        name: Optional[str] = None,
+        progress: bool = True,
+        keep: bool = False,
+        **recipe: Any,
+    ) -> Volume:
+        """Reconstructs and returns the final volume.
+
+        Args:
+            projections: ``[view][row][column]``, float32 or uint16; line integrals, or intensities.
+            geometry: of the views.
+            grid: ``{"size": [x, y, z], "spacing_mm": [x, y, z], "origin_mm": [x, y, z]}``; None: one is chosen.
+            fdk, sart, tv: the stages' settings; ``{}`` takes their defaults, None leaves them out.
+            emit: after which iterations `on_volume` gets a volume: ``"fdk"``, ``"fdk-tv"``, numbers.
+            on_volume: called with each kept volume as it is made, the final one included.
+            dtype: of the voxels: float32 is 1/mm, int16 Hounsfield units.
+            quantity: ``line_integral``, or ``intensity`` with `air`, or `flat` and `dark` images ``[row][column]``.
+            name: of the scan, for people.
+            progress: bars of tqdm, where it is installed.
+            keep: leaves scan and job with the daemon; otherwise they are removed, also when this is interrupted.
+            recipe: more members of the job's request, e.g. ``priority="urgent"``.
+        """
+        stack = np.asanyarray(projections)
+        if stack.ndim != 3:
+            raise ValueError(f"projections of shape {stack.shape}, expected [view][row][column]")
+        sample = np.uint16 if stack.dtype == np.uint16 else np.float32
+        scan = self.create_scan(geometry, stack.shape, dtype=sample, name=name, quantity=quantity, air=air)["id"]
+        job: Optional[str] = None
+        stages = {"grid": grid, "fdk": fdk, "sart": sart, "tv": tv, "emit": list(emit), **recipe}
+        try:
+            if flat is not None:
+                self.put_flat(scan, flat)
+            if dark is not None:
+                self.put_dark(scan, dark)
+            document = self.submit(scan, {key: value for key, value in stages.items() if value is not None})
+            job = str(document["id"])
+            with _Bar("upload", "view", progress) as bar:
+                self.upload(scan, stack, progress=bar.to)
+            with _Bar("reconstruct", "iteration", progress) as bar:
+                return self._follow(document, bar, on_volume, dtype)
+        finally:
+            if not keep:
+                if job is not None:
+                    self.delete_job(job)
+                self.delete_scan(scan)
+
+    def _follow(
+        self, document: Document, bar: _Bar, on_volume: Optional[Callable[[Volume], None]], dtype: npt.DTypeLike
+    ) -> Volume:
+        job = str(document["id"])
+        total = int((document.get("sart") or {}).get("iterations") or 1)
+        bar.to(0, total)
+        for event in self.events(job):
+            if event.kind == "progress":
+                bar.to(int(event.data["iteration"]), total, residual=f"{event.data['residual']:.4g}")
+            elif event.kind == "volume" and on_volume is not None and event.data["name"] != "final":
+                on_volume(self.volume(job, str(event.data["name"]), dtype=dtype))
+        self.wait(job)
+        bar.to(total, total)
+        final = self.volume(job, dtype=dtype)
+        if on_volume is not None:
+            on_volume(final)
+        return final
+
+    # ---- requests ----
+
+    def _request(
+        self,
+        method: str,
+        path: str,
+        *,
+        repeatable: bool = True,
+        stream: bool = False,
+        timeout: Optional[float] = -1.0,
+        **options: Any,
+    ) -> requests.Response:
+        """Asks again while the connection breaks or the daemon is busy, as long as patience lasts. timeout: of the
+        answer; None is for ever, below 0 the client's own."""
+        give_up = time.monotonic() + self.patience
+        read_timeout = self.timeout if timeout is not None and timeout < 0 else timeout
+        pause = 0.1
+        while True:
+            try:
+                response = self._session.request(
+                    method, self.url + path, stream=stream, timeout=(self.timeout, read_timeout), **options
+                )
+            except _BREAKS as error:
+                if not repeatable or not self._reached or time.monotonic() + pause > give_up:
+                    raise Broken(f"{method} {self.url}{path}: {error}") from error
+            else:
+                self._reached = True
+                if response.status_code < 400:
+                    return response
+                problem = _problem(response)
+                if problem.status not in (429, 503) or time.monotonic() + pause > give_up:
+                    raise problem
+                pause = max(pause, _seconds(response.headers.get("Retry-After")))
+            time.sleep(pause)
+            pause = min(2 * pause, 5.0)
+
+    def _json(self, method: str, path: str, **options: Any) -> Document:
+        return dict(self._request(method, path, **options).json())
+
+    def _bytes(self, path: str, params: Mapping[str, str], headers: Optional[Mapping[str, str]] = None) -> bytes:
+        return bytes(self._request("GET", path, params=params, headers=headers).content)
+
+    def _pages(self, path: str, name: str) -> Iterator[Document]:
+        after: Optional[str] = None
+        while True:
+            page = self._json("GET", path, params={} if after is None else {"after": after})
+            yield from page[name]
+            after = page["next"]
+            if after is None:
+                return
+
+    def _delete(self, path: str) -> None:
+        try:
+            self._request("DELETE", path)
+        except Problem as problem:
+            # Gone already: this may be the second time that it was asked, after an answer that was lost.
+            if problem.status != 404:
+                raise
+
+    def _put_image(self, scan: Document, name: str, image: npt.ArrayLike, dtype: np.dtype[Any]) -> bool:
+        array = np.asanyarray(image)
+        shape = (scan["detector"]["rows"], scan["detector"]["columns"])
+        if array.shape != shape:
+            raise ValueError(f"an image of shape {array.shape}, the detector has {shape}")
+        _check_cast(array.dtype, dtype)
+        body = array.astype(dtype, copy=False).tobytes()
+        response = self._request("PUT", f"/v1/scans/{scan['id']}/{name}", data=body)
+        return bool(response.status_code == 201)
+
+    def _send_runs(
+        self,
+        scan: str,
+        stack: Array,
+        dtype: np.dtype[Any],
+        runs: List[Tuple[int, int]],
+        connections: int,
+        compress: bool,
+        progress: Optional[Progress],
+    ) -> Optional[Exception]:
+        """All runs once; what broke, None for nothing. `Problem` when one is refused."""
+        done = len(stack) - sum(last - first + 1 for first, last in runs)
+        lock = threading.Lock()
+        broken: List[Exception] = []
+        coder = _zstd() if compress else None
+
+        def send(run: Tuple[int, int]) -> None:
+            nonlocal done
+            first, last = run
+            body = stack[first : last + 1].astype(dtype, copy=False).tobytes()
+            headers = {"Content-Type": "application/octet-stream"}
+            if coder is not None:
+                body = coder.compress(body, 1)
+                headers["Content-Encoding"] = "zstd"
+            try:
+                # Not repeated as it is: of a run that broke the first ones are there already.
+                self._request(
+                    "PUT", f"/v1/scans/{scan}/projections/{first}-{last}", data=body, headers=headers, repeatable=False
+                )
+            except Broken as error:
+                broken.append(error)
+                time.sleep(0.2)
+                return
+            with lock:
+                done += last - first + 1
+                if progress is not None:
+                    progress(done, len(stack))
+
+        with ThreadPoolExecutor(max(1, min(connections, len(runs)))) as pool:
+            tasks = [pool.submit(send, run) for run in runs]
+            try:
+                for task in tasks:
+                    task.result()
+            finally:
+                for task in tasks:
+                    task.cancel()
+        return broken[0] if broken else None
+
+
+def recon(projections: npt.ArrayLike, geometry: Geometry, *, url: Optional[str] = None, **options: Any) -> Volume:
+    """`Client.recon` with a client of its own."""
+    with Client(url) as client:
+        return client.recon(projections, geometry, **options)
+
+
+# ---- what the daemon says ----
+
+
+def _problem(response: requests.Response) -> Problem:
+    document: Document = {}
+    try:
+        if "json" in response.headers.get("Content-Type", ""):
+            document = dict(response.json())
+    except ValueError:
+        pass
+    finally:
+        response.close()
+    return Problem(int(response.status_code), document)
+
+
+def _judge(job: Document) -> Document:
+    if job["state"] != "succeeded":
+        raise JobFailed(job)
+    return job
+
+
+def _seconds(text: Optional[str]) -> float:
+    """Of Retry-After; somebody's idea of an hour is not waited for."""
+    try:
+        return min(max(float(text or 0), 0.0), 30.0)
+    except ValueError:
+        return 1.0
+
+
+def _read_events(response: requests.Response) -> Iterator[Event]:
+    """Of text/event-stream; an event that was cut off is left out, it comes again."""
+    fields: Dict[str, str] = {}
+    rest = b""
+    for chunk in response.iter_content(chunk_size=None):
+        *lines, rest = (rest + chunk).split(b"\n")
+        for line in lines:
+            name, _, value = line.decode("utf-8", "replace").partition(": ")
+            if line:
+                fields[name] = value
+                continue
+            if "id" in fields and "data" in fields:
+                yield Event(int(fields["id"]), fields.get("event", "message"), json.loads(fields["data"]))
+            fields = {}
+
+
+class _Part(NamedTuple):
+    headers: Dict[str, str]  # names in lower case
+    body: bytearray
+
+
+class _Body:
+    """A response's bytes, by lines and by lengths."""
+
+    def __init__(self, response: requests.Response) -> None:
+        self.chunks = response.iter_content(chunk_size=None)
+        self.held = memoryview(b"")
+
+    def more(self) -> None:
+        chunk = next(self.chunks, b"")
+        if not chunk:
+            raise requests.exceptions.ConnectionError("the stream broke off")
+        self.held = memoryview(bytes(self.held) + chunk) if len(self.held) else memoryview(chunk)
+
+    def line(self) -> str:
+        while True:
+            text, newline, _ = bytes(self.held[:4096]).partition(b"\r\n")
+            if newline:
+                self.held = self.held[len(text) + 2 :]
+                return text.decode("latin-1")
+            self.more()
+
+    def read(self, length: int) -> bytearray:
+        to = bytearray(length)
+        view, done = memoryview(to), 0
+        while done < length:
+            if not len(self.held):
+                self.more()
+            part = min(len(self.held), length - done)
+            view[done : done + part] = self.held[:part]
+            self.held = self.held[part:]
+            done += part
+        return to
+
+
+def _read_parts(response: requests.Response) -> Iterator[_Part]:
+    """Of multipart/mixed, with digests checked and zstd undone. What ends without the last boundary broke off."""
+    boundary = "--" + response.headers["Content-Type"].partition("boundary=")[2].strip('"')
+    body = _Body(response)
+    while True:
+        line = body.line()
+        if line == boundary + "--":
+            return
+        if line != boundary:
+            raise Error(f"the stream has no boundary, but {line[:60]!r}")
+        headers = {}
+        while (line := body.line()) != "":
+            name, _, value = line.partition(":")
+            headers[name.strip().lower()] = value.strip()
+        content = body.read(int(headers["content-length"]))
+        digest = headers.get("content-digest", "")
+        if digest.startswith("sha-256=:") and base64.b64decode(digest[9:-1]) != hashlib.sha256(content).digest():
+            raise Error("a part of the stream does not fit its digest")
+        coder = _zstd()
+        if headers.get("content-encoding") == "zstd" and coder is not None:
+            content = bytearray(coder.decompress(content))
+        if body.line() != "":
+            raise Error("a part of the stream is longer than it says")
+        yield _Part(headers, content)
+
+
+def _volume(part: _Part) -> Volume:
+    """NRRD says how large it is and where: directions and origin are along x, y and z of the scan."""
+    header, separator, _ = bytes(part.body[:4096]).partition(b"\n\n")
+    fields = dict(line.split(": ", 1) for line in header.decode("ascii").split("\n") if ": " in line)
+    dtype = {"float": _FLOAT32, "short": _INT16}[fields["type"]]
+    sizes = [int(n) for n in fields["sizes"].split()]
+    steps = [_vector(text) for text in fields["space directions"].split()]
+    # The header may end anywhere.
+    voxels = np.require(np.frombuffer(part.body, dtype, offset=len(header) + len(separator)), requirements=["A", "W"])
+    return Volume(
+        name=part.headers["cbct-volume"],
+        voxels=voxels.reshape(sizes[::-1]),
+        spacing_mm=(steps[0][0], steps[1][1], steps[2][2]),
+        origin_mm=_vector(fields["space origin"]),
+        stage=part.headers["cbct-stage"],
+        iteration=int(part.headers["cbct-iteration"]),
+    )
+
+
+# ---- arrays and lists ----
+
+
+def _vector(text: str) -> Tuple[float, float, float]:
+    x, y, z = (float(number) for number in text.strip("()").split(","))
+    return x, y, z
+
+
+def _pair(values: Sequence[float]) -> Tuple[float, float]:
+    first, second = (float(x) for x in values)
+    return first, second
+
+
+def _sample(dtype: npt.DTypeLike) -> str:
+    if np.dtype(dtype) not in (np.dtype(np.float32), np.dtype(np.uint16)):
+        raise ValueError(f"projections of {np.dtype(dtype)}, expected float32 or uint16")
+    return np.dtype(dtype).name
+
+
+def _volume_type(dtype: npt.DTypeLike) -> str:
+    if np.dtype(dtype) not in (np.dtype(np.float32), np.dtype(np.int16)):
+        raise ValueError(f"voxels of {np.dtype(dtype)}, expected float32 (1/mm) or int16 (Hounsfield units)")
+    return np.dtype(dtype).name
+
+
+def _wire_type(scan: Document) -> np.dtype[Any]:
+    return _UINT16 if scan["projections"]["sample"] == "uint16" else _FLOAT32
+
+
+def _check_cast(have: np.dtype[Any], wanted: np.dtype[Any]) -> None:
+    """Of one kind, or from integers that a float32 holds: float64 is rounded, but nothing is cut off."""
+    if not (np.can_cast(have, wanted, "same_kind") and (wanted.kind == "f" or np.can_cast(have, wanted))):
+        raise ValueError(f"an array of {have} cannot become {wanted}")
+
+
+def _count(runs: Sequence[Sequence[int]]) -> int:
+    return sum(last - first + 1 for first, last in runs)
+
+
+def _split(runs: Sequence[Sequence[int]], length: int) -> List[Tuple[int, int]]:
+    return [(at, min(at + length - 1, last)) for first, last in runs for at in range(first, last + 1, length)]
+
+
+class _Zstd(NamedTuple):
+    compress: Callable[[bytes, int], bytes]
+    decompress: Callable[[bytearray], bytes]
+
+
+def _zstd() -> Optional[_Zstd]:
+    """Python's own module (3.14), or zstandard; None where there is neither."""
+    try:
+        from compression import zstd
+
+        return _Zstd(zstd.compress, zstd.decompress)
+    except ImportError:
+        pass
+    try:
+        import zstandard
+    except ImportError:
+        return None
+    return _Zstd(
+        lambda data, level: bytes(zstandard.ZstdCompressor(level=level).compress(data)),
+        lambda data: bytes(zstandard.ZstdDecompressor().decompressobj().decompress(data)),
+    )
+
+
+class _Bar:
+    """tqdm's bar where it is installed and wanted, else nothing."""
+
+    def __init__(self, label: str, unit: str, wanted: bool) -> None:
+        self.bar: Any = None
+        if not wanted:
+            return
+        try:
+            from tqdm.auto import tqdm
+        except ImportError:
+            return
+        self.bar = tqdm(desc=label, unit=unit, total=0)
+
+    def __enter__(self) -> _Bar:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.bar is not None:
+            self.bar.close()
+
+    def to(self, done: int, total: int, **more: str) -> None:
+        if self.bar is None:
+            return
+        self.bar.total = total
+        if more:
+            self.bar.set_postfix(more, refresh=False)
+        self.bar.update(done - self.bar.n)
