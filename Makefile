@@ -34,7 +34,8 @@ prefix ?= /usr/local
 PACKAGES := libmicrohttpd:libmicrohttpd-dev libcjson:libcjson-dev libzstd:libzstd-dev sqlite3:libsqlite3-dev \
             kissfft-float:libkissfft-dev libpng:libpng-dev libcurl:libcurl4-openssl-dev libcrypto:libssl-dev \
             expat:libexpat1-dev libtiff-4:libtiff-dev zlib:zlib1g-dev check:check
-COMMANDS := gcc:gcc pkg-config:pkg-config curl:curl jq:jq zstd:zstd openssl:openssl pgrep:procps sqlite3:sqlite3 dcmdump:dcmtk
+COMMANDS := gcc:gcc pkg-config:pkg-config curl:curl jq:jq zstd:zstd openssl:openssl pgrep:procps sqlite3:sqlite3 \
+            mypy:mypy dcmdump:dcmtk
 # Of Python: yaml for the build, the others for tests.
 MODULES  := yaml:python3-yaml jsonschema:python3-jsonschema numpy:python3-numpy requests:python3-requests
 
