@@ -122,7 +122,14 @@ $(BUILD)/proto/openapi.c: proto/openapi.py proto/openapi.yaml
 $(BUILD)/proto/openapi.o: $(BUILD)/proto/openapi.c
 	$(call say,CC  )$(CC) $(CFLAGS) -c -o $@ $<
 
-$(BUILD)/cbctd: $(call objects,$(daemon_sources)) $(BUILD)/proto/openapi.o $(library)
+# The page for the clinician is part of the daemon; without npm there is a plain one.
+$(BUILD)/web/assets.c: $(shell find clients/web -name node_modules -prune -o -type f -print)
+	$(call say,WEB )clients/web/build.sh $(@D)
+
+$(BUILD)/web/assets.o: $(BUILD)/web/assets.c
+	$(call say,CC  )$(CC) $(CFLAGS) -c -o $@ $<
+
+$(BUILD)/cbctd: $(call objects,$(daemon_sources)) $(BUILD)/proto/openapi.o $(BUILD)/web/assets.o $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(daemon_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
 $(BUILD)/cbct-worker: $(call objects,daemon/worker.c) $(library) $(cuda_objects)

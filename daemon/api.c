@@ -1,6 +1,6 @@
 /*
  * The API: one row for each endpoint. The schema of record is
- * proto/openapi.yaml; the web page at / gets its row here when it comes.
+ * proto/openapi.yaml.
  */
 #include "daemon/api.h"
 
@@ -8,6 +8,12 @@
 
 /* GET is HEAD as well. A body that is streamed has begin and data beside handle. */
 const struct route api_routes[] = {
+    {"GET", "/", page_get, BODY_NONE, 0, NULL, NULL},
+    {"GET", "/assets/{}", asset_get, BODY_NONE, 0, NULL, NULL},
+    {"GET", "/plain", plain_list, BODY_NONE, 0, NULL, NULL},
+    {"GET", "/plain.css", plain_style, BODY_NONE, 0, NULL, NULL},
+    {"GET", "/plain/{}", plain_job, BODY_NONE, 0, NULL, NULL},
+
     {"GET", "/livez", live_get, BODY_NONE, 0, NULL, NULL},
     {"GET", "/readyz", ready_get, BODY_NONE, 0, NULL, NULL},
     {"GET", "/metrics", metrics_get, BODY_NONE, 0, NULL, NULL},

@@ -57,6 +57,12 @@ int volume_get(void *context, struct request *request, struct error *err);
 int volume_stream(void *context, struct request *request, struct error *err);
 int slice_get(void *context, struct request *request, struct error *err);
 
+int page_get(void *context, struct request *request, struct error *err);
+int asset_get(void *context, struct request *request, struct error *err);
+int plain_list(void *context, struct request *request, struct error *err);
+int plain_job(void *context, struct request *request, struct error *err);
+int plain_style(void *context, struct request *request, struct error *err);
+
 int live_get(void *context, struct request *request, struct error *err);
 int ready_get(void *context, struct request *request, struct error *err);
 int metrics_get(void *context, struct request *request, struct error *err);

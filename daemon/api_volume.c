@@ -226,7 +226,7 @@ int volume_get(void *context, struct request *request, struct error *err)
 	struct entity entity;
 	char etag[96], filename[VOLUME_FILENAME_MAX], path[1024];
 	/* Ranges are of the plain bytes: a frame of zstd cannot be entered in the middle. */
-	bool zstd = accepts_zstd(request_header(request, "Accept-Encoding")) &&
+	bool zstd = accepts_coding(request_header(request, "Accept-Encoding"), "zstd") &&
 		    (request_header(request, "Range") == NULL || request_is_head(request));
 	bool done;
 

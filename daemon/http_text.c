@@ -94,7 +94,7 @@ enum range range_parse(const char *header, uint64_t size, uint64_t *ret_first, u
 	return RANGE_ONE;
 }
 
-bool accepts_zstd(const char *header)
+bool accepts_coding(const char *header, const char *coding)
 {
 	if (header == NULL)
 		return false;
@@ -105,7 +105,7 @@ bool accepts_zstd(const char *header)
 		header = header + strspn(header, " \t,");
 		length = strcspn(header, " \t,;");
 		parameter = header + strcspn(header, ",;");
-		if (length == 4 && strncasecmp(header, "zstd", 4) == 0) {
+		if (length == strlen(coding) && strncasecmp(header, coding, length) == 0) {
 			if (*parameter != ';')
 				return true;
 			parameter = skip_blanks(parameter + 1);

@@ -23,8 +23,8 @@ enum range {
 };
 enum range range_parse(const char *header /* or NULL */, uint64_t size, uint64_t *ret_first, uint64_t *ret_length);
 
-/* Whether an Accept-Encoding names zstd with a quality above 0. NULL: no. */
-bool accepts_zstd(const char *header);
+/* Whether an Accept-Encoding names this coding (zstd, gzip) with a quality above 0. NULL: no. */
+bool accepts_coding(const char *header, const char *coding);
 
 /*
  * Whether a list of entity tags, or *, has this one (a strong one, quoted). weak:

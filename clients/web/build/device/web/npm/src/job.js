@@ -1,0 +1,495 @@
+/* A job's page: its volumes as they come, and everything about how they came. */
+import { h, replace, write, throttle, newId, bytes, duration } from './dom.js'
+import { get, request, jobPath, scanPath, volumePath, listVolumes, watch } from './api.js'
+import { View, presets } from './view.js'
+import { Viewer } from './viewer.js'
+import { Plot } from './plot.js'
+import { Film } from './film.js'
+import { Bar, badge, doing, left, ended } from './state.js'
+import { geometryFacts, jobFacts, warningList } from './facts.js'
+import { reconstructAgain, confirmed, openDialog } from './form.js'
+
+const pollTime = 1500 /* ms: progress and time left are not told as events */
+const plainLimits = [-3000, 30000] /* HU: beyond, the numbers are no attenuation of a patient */
+
+const volumeText = volume => volume.stage === 'sart' ? `iteration ${volume.iteration}` : volume.stage === 'tv' ? 'FDK and TV' : 'FDK'
+
+export class JobPage {
+	#job = null
+	#scan = null
+	#volumes = []
+	#selected = null /* name */
+	#other = null /* name, of the comparison */
+	#mode = 'off'
+	#follow = true
+	#view = new View()
+	#abort = new AbortController()
+	#closed = false
+	#first = true
+
+	constructor(jobId, { live, title }) {
+		this.id = jobId
+		this.live = live
+		this.title = title
+		this.#build()
+		this.refresh = throttle(250, () => this.#refresh())
+		this.refreshVolumes = throttle(250, () => this.#refreshVolumes())
+		this.#view.addEventListener('change', ({ detail }) => this.#onView(detail))
+		document.addEventListener('keydown', this.onKey = event => this.#key(event))
+		this.refresh()
+		this.refreshVolumes()
+		this.timer = setInterval(() => this.#job && !ended(this.#job) && !document.hidden && this.refresh(), pollTime)
+	}
+
+	/* ---- layout ---- */
+
+	#build() {
+		this.heading = h('h1', {}, '…')
+		this.badge = h('span', {})
+		this.bar = new Bar('Progress')
+		this.doing = h('span', { class: 'doing' })
+		this.left = h('span', { class: 'left' })
+		this.announce = h('p', { class: 'hidden', 'aria-live': 'polite' })
+		this.actions = h('div', { class: 'actions' })
+		this.trouble = h('div', { class: 'notice bad', role: 'alert', hidden: true })
+		this.stage = h('div', { class: 'stages', 'data-mode': 'off', hidden: true })
+		this.empty = h('p', { class: 'empty' }, 'No volume yet: the first appears here by itself.')
+		this.viewer = new Viewer(this.#view, { label: 'Volume', step: way => this.#step(way), shown: () => this.#onPicture() })
+		this.second = null
+		this.stage.append(this.viewer.element)
+		this.plot = new Plot(iteration => this.#selectIteration(iteration))
+		this.film = new Film()
+		this.controls = h('div', { class: 'controls', hidden: true }, this.#iterationControls(), this.#viewControls(), this.#compareControls())
+		this.warnings = h('div', {})
+		this.about = h('div', {})
+		this.geometry = h('div', {})
+		this.files = h('div', {})
+		this.courseSection = h('section', { class: 'card', hidden: true }, h('h2', {}, 'Convergence'), this.plot.element)
+		this.element = h('div', { class: 'job' },
+			h('header', { class: 'head' }, h('a', { class: 'back', href: '#/' }, '‹ Jobs'), h('div', { class: 'title' }, this.heading, this.badge), this.actions,
+				h('div', { class: 'progress' }, this.bar.element, this.doing, this.left)),
+			this.announce, this.trouble, this.warnings,
+			h('div', { class: 'columns' },
+				h('div', { class: 'pictures' }, this.empty, this.stage, this.controls),
+				h('div', { class: 'aside' }, this.courseSection,
+					h('section', { class: 'card' }, h('h2', {}, 'Downloads'), this.files),
+					h('section', { class: 'card' }, h('h2', {}, 'Projections'), this.film.element),
+					h('section', { class: 'card' }, h('h2', {}, 'Reconstruction'), this.about),
+					h('section', { class: 'card' }, h('h2', {}, 'Geometry'), this.geometry))))
+	}
+
+	#iterationControls() {
+		this.slider = h('input', { type: 'range', id: newId('iteration'), min: '0', step: '1', value: '0', oninput: () => this.#choose(Number(this.slider.value)) })
+		this.sliderText = h('output', { for: this.slider.id, class: 'volume-name' })
+		this.marks = h('div', { class: 'marks', 'aria-hidden': 'true' })
+		this.followBox = h('input', { type: 'checkbox', checked: true, onchange: () => this.#setFollow(this.followBox.checked) })
+		this.back = h('button', { type: 'button', class: 'icon', 'aria-label': 'Previous kept iteration', title: 'Previous (←)', onclick: () => this.#step(-1) }, '‹')
+		this.forth = h('button', { type: 'button', class: 'icon', 'aria-label': 'Next kept iteration', title: 'Next (→)', onclick: () => this.#step(1) }, '›')
+		return h('div', { class: 'group iterations' }, h('label', { for: this.slider.id, class: 'label' }, 'Iteration'), this.back,
+			h('div', { class: 'track' }, this.slider, this.marks), this.forth, this.sliderText, h('label', { class: 'check' }, this.followBox, ' Newest'))
+	}
+
+	#viewControls() {
+		const radio = (name, entries, current, act) => h('div', { class: 'segments', role: 'group', 'aria-label': name }, entries.map(([value, label, hint]) =>
+			h('button', { type: 'button', title: hint ?? null, 'data-value': value, 'aria-pressed': String(value === current), onclick: () => act(value) }, label)))
+		this.presets = h('div', { class: 'segments', role: 'group', 'aria-label': 'Window presets' }, presets.map((preset, i) =>
+			h('button', { type: 'button', 'data-preset': preset.name, title: `W ${preset.window} L ${preset.level} (${i + 1})`, 'aria-pressed': 'false',
+				onclick: () => this.#view.setWindow(preset.window, preset.level) }, preset.name)),
+		h('button', { type: 'button', 'data-preset': 'Full', title: `All values (${presets.length + 1})`, 'aria-pressed': 'false', onclick: () => this.#fullWindow() }, 'Full'))
+		const box = (label, key) => h('input', { type: 'number', 'aria-label': label, step: '10', onchange: event => {
+			const value = Number(event.target.value)
+			this.#view.setWindow(key === 'window' ? value : this.#view.window, key === 'level' ? value : this.#view.level)
+			this.#writeWindow()
+		} })
+		this.windowBox = box('Window width, HU', 'window')
+		this.levelBox = box('Window level, HU', 'level')
+		this.tools = radio('What dragging does', [['window', 'Window', 'Dragging changes window and level; a click moves the cross'], ['cross', 'Cross', 'Dragging moves the cross'],
+			['pan', 'Pan', 'Dragging moves a zoomed plane']], 'window', tool => this.#view.set({ tool }))
+		this.tiles = radio('What is shown', [['all', 'All'], ['z', 'Axial'], ['x', 'Sagittal'], ['y', 'Coronal'], ['3d', '3D']], 'all', tile => this.#view.set({ tile }))
+		this.readout = h('output', { class: 'readout' })
+		return [h('div', { class: 'group' }, h('span', { class: 'label' }, 'Window'), this.presets,
+			h('span', { class: 'numbers' }, h('label', {}, h('span', { 'aria-hidden': 'true' }, 'W'), this.windowBox), h('label', {}, h('span', { 'aria-hidden': 'true' }, 'L'), this.levelBox))),
+		h('div', { class: 'group' }, h('span', { class: 'label' }, 'View'), this.tiles,
+			h('button', { type: 'button', class: 'quiet', title: 'Middle, no zoom (r)', onclick: () => this.#view.reset() }, 'Reset'), this.readout),
+		h('div', { class: 'group' }, h('span', { class: 'label' }, 'Drag'), this.tools, h('button', { type: 'button', class: 'quiet', onclick: () => this.#help() }, 'Keys'))]
+	}
+
+	#compareControls() {
+		this.modes = h('div', { class: 'segments', role: 'group', 'aria-label': 'Comparison' }, [['off', 'Off'], ['side', 'Side by side'], ['swipe', 'Swipe']].map(([value, label]) =>
+			h('button', { type: 'button', 'data-value': value, 'aria-pressed': String(value === 'off'), onclick: () => this.#compare(value) }, label)))
+		this.otherBox = h('select', { 'aria-label': 'Compare with', onchange: () => this.#showOther(this.otherBox.value) })
+		this.swipe = h('input', { type: 'range', class: 'swipe', min: '0', max: '1000', value: '500', 'aria-label': 'Swipe: how much is the other volume',
+			oninput: () => this.#setSwipe(Number(this.swipe.value) / 1000) })
+		this.comparing = h('span', { class: 'comparing', hidden: true }, h('label', {}, 'with ', this.otherBox))
+		return h('div', { class: 'group' }, h('span', { class: 'label' }, 'Compare'), this.modes, this.comparing)
+	}
+
+	/* ---- what the daemon says ---- */
+
+	/* Until it has ended; then nothing comes any more. */
+	#watch() {
+		if (ended(this.#job)) {
+			this.stopWatching?.()
+			this.live(null)
+			return
+		}
+		this.stopWatching ??= watch(`${jobPath(this.id)}/events?after=latest`, kind => {
+			this.refresh()
+			if (kind === 'volume' || kind === 'end')
+				this.refreshVolumes()
+		}, connected => {
+			this.live(connected)
+			if (connected) { /* what happened before it stood */
+				this.refresh()
+				this.refreshVolumes()
+			}
+		})
+	}
+
+	async #refresh() {
+		try {
+			const job = await get(jobPath(this.id), this.#abort.signal)
+			const before = this.#job
+			this.#job = job
+			if (this.#scan === null || (this.#scan.state !== 'complete' && !ended(job)))
+				this.#scan = await get(scanPath(job.scan), this.#abort.signal)
+			this.trouble.hidden = true
+			this.#showJob(before)
+		} catch (error) {
+			this.#showError(error)
+		}
+	}
+
+	#showError(error) {
+		if (this.#closed)
+			return
+		if (error.status === 404) {
+			clearInterval(this.timer)
+			write(this.heading, 'No such job')
+		}
+		replace(this.trouble, error.status ? error.message : 'The daemon cannot be reached; this page goes on by itself once it answers again.')
+		this.trouble.hidden = false
+	}
+
+	#showJob(before) {
+		const job = this.#job, scan = this.#scan
+		write(this.heading, scan.name || `Scan ${scan.id}`)
+		if (before?.state !== job.state) {
+			replace(this.badge, badge(job.state))
+			if (before) {
+				write(this.announce, `The job is ${job.state}`)
+				this.refreshVolumes()
+			}
+			this.#watch()
+		}
+		this.bar.show(job)
+		write(this.doing, job.state === 'waiting' ? `${scan.received_count} of ${scan.projections.count} projections are here` : doing(job))
+		write(this.left, left(job) || (job.ended ? duration(job.timings.total) : ''))
+		this.title(`${ended(job) ? '' : `${Math.round(job.progress * 100)} % · `}${scan.name || scan.id}`)
+		this.#showActions(before)
+		replace(this.warnings, warningList([...scan.warnings, ...job.warnings]), job.error ? h('div', { class: 'notice bad' }, job.error.detail) : null)
+		replace(this.about, jobFacts(job))
+		if (this.#first)
+			replace(this.geometry, geometryFacts(scan))
+		this.#first = false
+		this.film.show(scan)
+		if (ended(job) && this.#volumes.length === 0)
+			write(this.empty, 'This job kept no volume.')
+		this.#showPlot()
+	}
+
+	#showActions(before) {
+		const job = this.#job
+		if (before && ended(before) === ended(job) && before.cancel_requested === job.cancel_requested)
+			return
+		replace(this.actions,
+			h('button', { type: 'button', onclick: () => reconstructAgain(this.#job, 'Reconstruct again with …') }, 'Reconstruct again …'),
+			ended(job)
+				? h('button', { type: 'button', class: 'quiet danger-text', onclick: () => this.#remove() }, 'Remove …')
+				: h('button', { type: 'button', class: 'danger-text', disabled: job.cancel_requested, onclick: () => this.#cancel() }, 'Cancel …'))
+	}
+
+	#cancel() {
+		confirmed('Cancel this job?', 'The volumes that are kept so far stay.', 'Cancel the job', async () => {
+			await request('DELETE', jobPath(this.id))
+			this.refresh()
+		})
+	}
+
+	#remove() {
+		confirmed('Remove this job?', 'Its volumes are removed with it; the scan and its projections stay.', 'Remove', async () => {
+			await request('DELETE', jobPath(this.id))
+			location.hash = '#/'
+		})
+	}
+
+	#showPlot() {
+		const kept = new Map(this.#volumes.filter(volume => volume.stage === 'sart').map(volume => [volume.iteration, volume.name]))
+		const selected = this.#volumes.find(volume => volume.name === this.#selected)
+		this.courseSection.hidden = !(this.#job?.history?.length > 0)
+		this.plot.show(this.#job?.history ?? [], kept, selected?.stage === 'sart' ? selected.iteration : null)
+	}
+
+	/* ---- volumes ---- */
+
+	async #refreshVolumes() {
+		try {
+			const volumes = await listVolumes(this.id, this.#abort.signal)
+			if (this.#closed || JSON.stringify(volumes) === JSON.stringify(this.#volumes))
+				return
+			this.#volumes = volumes
+			this.#showVolumes()
+		} catch (error) {
+			this.#showError(error)
+		}
+	}
+
+	#showVolumes() {
+		const volumes = this.#volumes
+		this.empty.hidden = volumes.length > 0
+		this.stage.hidden = this.controls.hidden = volumes.length === 0
+		this.slider.max = String(Math.max(volumes.length - 1, 0))
+		this.slider.disabled = volumes.length < 2
+		replace(this.marks, volumes.map(volume => h('span', {}, volumes.length <= 14 ? ({ fdk: 'FDK', tv: 'TV' }[volume.stage] ?? String(volume.iteration)) : '')))
+		if (volumes.length === 0)
+			return
+		const first = this.#selected === null
+		if (first)
+			this.#firstWindow(volumes[0])
+		this.#show(this.#follow || first ? volumes.at(-1).name : this.#selected)
+		this.#listOthers()
+		this.#showFiles()
+	}
+
+	#hounsfield(mu) {
+		const water = this.#job?.mu_water ?? 0.0192
+		return 1000 * (mu - water) / water
+	}
+
+	/* Bone, unless the numbers cannot be those of a patient. */
+	#firstWindow(volume) {
+		const { minimum, maximum } = volume.statistics
+		const [low, high] = [this.#hounsfield(minimum ?? 0), this.#hounsfield(maximum ?? 0)]
+		if (low < plainLimits[0] || high > plainLimits[1])
+			this.#fullWindow(volume)
+		this.#writeWindow()
+	}
+
+	#fullWindow(volume = this.#volumes.find(one => one.name === this.#selected)) {
+		const { minimum, maximum } = volume.statistics
+		const low = Math.max(this.#hounsfield(minimum ?? 0), -32768), high = Math.min(this.#hounsfield(maximum ?? 1), 32767)
+		this.#view.setWindow(high - low, (high + low) / 2)
+	}
+
+	#index() {
+		return this.#volumes.findIndex(volume => volume.name === this.#selected)
+	}
+
+	#choose(index) {
+		const volume = this.#volumes[Math.min(Math.max(index, 0), this.#volumes.length - 1)]
+		this.#setFollow(index >= this.#volumes.length - 1)
+		this.#show(volume.name)
+	}
+
+	#step(way) {
+		if (this.#volumes.length > 0)
+			this.#choose(this.#index() + way)
+	}
+
+	#selectIteration(iteration) {
+		const index = this.#volumes.findIndex(volume => volume.stage === 'sart' && volume.iteration === iteration)
+		if (index >= 0)
+			this.#choose(index)
+	}
+
+	#setFollow(follow) {
+		this.#follow = follow
+		this.followBox.checked = follow
+		if (follow && this.#volumes.length > 0)
+			this.#show(this.#volumes.at(-1).name)
+	}
+
+	#show(name) {
+		this.#selected = name
+		const index = this.#index(), volume = this.#volumes[index]
+		this.viewer.show(this.id, volume)
+		this.slider.value = String(index)
+		const text = `${volume.name === 'final' ? 'final' : volume.name}${volume.name === 'final' || volume.stage !== 'sart' ? `, ${volumeText(volume)}` : ''}`
+		this.slider.setAttribute('aria-valuetext', text)
+		write(this.sliderText, text)
+		this.viewer.tag.textContent = volume.name
+		this.back.disabled = index === 0
+		this.forth.disabled = index === this.#volumes.length - 1
+		this.#showPlot()
+		this.#showFiles()
+	}
+
+	#showFiles() {
+		if (!this.#files) {
+			const select = (label, values) => h('select', { 'aria-label': label, onchange: () => this.#writeLinks() }, values.map(([value, text]) => h('option', { value }, text)))
+			this.#files = {
+				format: select('Format', [['nifti', 'NIfTI'], ['mha', 'MetaImage'], ['nrrd', 'NRRD'], ['raw', 'raw']]),
+				type: select('Values', [['int16', 'HU, int16'], ['float32', '1/mm, float32']]),
+				scale: select('Resolution', [['1', 'full'], ['2', 'half'], ['4', 'quarter']]),
+				list: h('ul', { class: 'files' }),
+			}
+			replace(this.files, h('div', { class: 'row' }, this.#files.format, this.#files.type, this.#files.scale), this.#files.list)
+		}
+		this.#writeLinks()
+	}
+	#files = null
+
+	#writeLinks() {
+		const { format, type, scale, list } = this.#files
+		const query = `?format=${format.value}&type=${type.value}${scale.value === '1' ? '' : `&scale=${scale.value}`}`
+		const state = JSON.stringify([query, this.#selected, this.#volumes.map(volume => volume.digest)])
+		if (list.dataset.state === state)
+			return
+		list.dataset.state = state
+		const size = volume => volume.bytes / (type.value === 'int16' ? 2 : 1) / Number(scale.value) ** 3
+		replace(list, [...this.#volumes].reverse().map(volume => h('li', { class: volume.name === this.#selected ? 'current' : '' },
+			h('a', { href: volumePath(this.id, volume.name) + query, download: '' }, volume.name),
+			h('span', {}, volumeText(volume)), h('span', { class: 'amount' }, bytes(size(volume))))))
+	}
+
+	/* ---- comparison ---- */
+
+	#listOthers() {
+		const options = this.#volumes.map(volume => h('option', { value: volume.name }, volume.name))
+		replace(this.otherBox, options)
+		if (!this.#volumes.some(volume => volume.name === this.#other))
+			this.#other = this.#volumes[0].name
+		this.otherBox.value = this.#other
+		for (const button of this.modes.children)
+			button.disabled = button.dataset.value !== 'off' && this.#volumes.length < 2
+		if (this.second)
+			this.#showOther(this.#other)
+	}
+
+	#compare(mode) {
+		this.#mode = mode
+		this.stage.dataset.mode = mode
+		this.comparing.hidden = mode === 'off'
+		for (const button of this.modes.children)
+			button.setAttribute('aria-pressed', String(button.dataset.value === mode))
+		this.second?.close()
+		this.second = null
+		this.swipe.remove()
+		if (mode === 'off')
+			return
+		this.second = new Viewer(this.#view, { label: 'Volume to compare with', step: way => this.#step(way), shown: () => {} })
+		this.second.element.classList.add('second')
+		this.stage.append(this.second.element)
+		if (mode === 'swipe') {
+			this.second.element.setAttribute('inert', '')
+			this.second.element.setAttribute('aria-hidden', 'true')
+			this.stage.append(this.swipe)
+			this.#setSwipe(Number(this.swipe.value) / 1000)
+		}
+		if (this.#other === this.#selected)
+			this.#other = this.#volumes.find(volume => volume.name !== this.#selected)?.name ?? this.#selected
+		this.otherBox.value = this.#other
+		this.#showOther(this.#other)
+	}
+
+	#showOther(name) {
+		this.#other = name
+		this.second.show(this.id, this.#volumes.find(volume => volume.name === name))
+		this.second.tag.textContent = name
+	}
+
+	/* The other volume lies to the right of the line. */
+	#setSwipe(share) {
+		this.stage.style.setProperty('--swipe', String(share))
+	}
+
+	/* ---- view ---- */
+
+	#onView(changed) {
+		if (changed.window || changed.level)
+			this.#writeWindow()
+		if (changed.tile)
+			this.#press(this.tiles, this.#view.tile)
+		if (changed.tool) {
+			this.#press(this.tools, this.#view.tool)
+			this.stage.dataset.tool = this.#view.tool
+		}
+		if (changed.position)
+			this.#read()
+	}
+
+	#press(segments, value) {
+		for (const button of segments.children)
+			button.setAttribute('aria-pressed', String(button.dataset.value === value))
+	}
+
+	#writeWindow() {
+		const { window, level } = this.#view
+		this.windowBox.value = String(window)
+		this.levelBox.value = String(level)
+		for (const button of this.presets.children) {
+			const preset = presets.find(one => one.name === button.dataset.preset)
+			button.setAttribute('aria-pressed', String(preset !== undefined && preset.window === window && preset.level === level))
+		}
+	}
+
+	#onPicture() {
+		if (performance.getEntriesByName('first-picture').length === 0)
+			performance.mark('first-picture')
+		this.#read()
+	}
+
+	#read() {
+		const value = this.viewer.value()
+		const place = this.#view.position.map((mm, i) => `${'xyz'[i]} ${mm.toFixed(1).replace('-', '−')}`).join('  ')
+		write(this.readout, `${place} mm${value === null ? '' : `   ${String(value).replace('-', '−')} HU`}`)
+	}
+
+	/* ---- keys ---- */
+
+	#key(event) {
+		if (event.ctrlKey || event.altKey || event.metaKey || event.defaultPrevented || document.querySelector('dialog[open]') ||
+			event.target.closest?.('input, select, textarea') || this.#volumes.length === 0)
+			return
+		const modes = ['off', 'side', 'swipe']
+		const keys = {
+			n: () => this.#setFollow(!this.#follow),
+			r: () => this.#view.reset(),
+			c: () => this.#volumes.length > 1 && this.#compare(modes[(modes.indexOf(this.#mode) + 1) % 3]),
+			'?': () => this.#help(),
+			Escape: () => this.#view.set({ tile: 'all' }),
+			',': () => this.#step(-1),
+			'.': () => this.#step(1),
+		}
+		presets.forEach((preset, i) => keys[String(i + 1)] = () => this.#view.setWindow(preset.window, preset.level))
+		keys[String(presets.length + 1)] = () => this.#fullWindow()
+		if (!keys[event.key])
+			return
+		event.preventDefault()
+		keys[event.key]()
+	}
+
+	#help() {
+		const rows = [['← →', 'iteration before, iteration after (also , and .)'], ['↑ ↓', 'slice by slice; Page Up, Page Down ten; Home, End'],
+			['Shift + arrows', 'level up and down, window wider and narrower'], ['1 2 3 4', 'bone, soft tissue, lung, full'], ['+ −', 'zoom'],
+			['m', 'this plane only, and back'], ['c', 'compare: off, side by side, swipe'], ['n', 'newest volume: go with it or stay'], ['r', 'middle, no zoom'],
+			['Mouse', 'drag: window and level; click: the cross; wheel: slices; Ctrl + wheel: zoom; right button: window; middle button: pan'],
+			['Touch', 'drag: window and level; tap: the cross; two fingers: zoom and pan']]
+		const dialog = openDialog('Keys and gestures', h('p', {}, 'The arrows act on the plane that has the focus.'),
+			h('dl', { class: 'keys' }, rows.map(([key, what]) => h('div', {}, h('dt', {}, key), h('dd', {}, what)))),
+			h('div', { class: 'row end' }, h('button', { type: 'button', onclick: () => dialog.close() }, 'Close')))
+	}
+
+	close() {
+		this.#closed = true
+		clearInterval(this.timer)
+		this.refresh.cancel()
+		this.refreshVolumes.cancel()
+		this.#abort.abort()
+		this.stopWatching?.()
+		document.removeEventListener('keydown', this.onKey)
+		this.viewer.close()
+		this.second?.close()
+		this.film.close()
+	}
+}

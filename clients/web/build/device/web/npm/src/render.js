@@ -1,0 +1,92 @@
+/*
+ * The rendering in three dimensions, by NiiVue: a chunk of its own, fetched
+ * once the planes are there. The volume goes to it as NIfTI-1, whose matrix
+ * tells it where left and right are.
+ */
+import { Niivue, NVImage, SLICE_TYPE } from '@niivue/niivue'
+
+const headerBytes = 352
+const airMost = -200 /* HU: a window that reaches below would wrap the patient in fog */
+
+function nifti({ size, spacing, origin, voxels }) {
+	const file = new ArrayBuffer(headerBytes + voxels.byteLength)
+	const header = new DataView(file)
+	const int16 = (at, ...values) => values.forEach((value, i) => header.setInt16(at + 2 * i, value, true))
+	const float = (at, ...values) => values.forEach((value, i) => header.setFloat32(at + 4 * i, value, true))
+	header.setInt32(0, 348, true)
+	int16(40, 3, ...size, 1, 1, 1, 1)
+	int16(70, 4, 16) /* int16, bits */
+	float(76, 1, ...spacing)
+	float(108, headerBytes)
+	float(112, 1, 0)
+	int16(252, 0, 1) /* sform only */
+	/* NIfTI's x runs to the right, y to anterior: ours the other way. */
+	float(280, -spacing[0], 0, 0, -origin[0])
+	float(296, 0, -spacing[1], 0, -origin[1])
+	float(312, 0, 0, spacing[2], origin[2])
+	;[0x6e, 0x2b, 0x31, 0].forEach((byte, i) => header.setUint8(344 + i, byte))
+	new Int16Array(file, headerBytes).set(voxels)
+	return file
+}
+
+export class Render {
+	#nv
+	#size = ''
+
+	static async open(canvas) {
+		const render = new Render()
+		const nv = new Niivue({
+			interactive: false, dragAndDropEnabled: false, isResizeCanvas: true, logLevel: 'silent', loadingText: '',
+			backColor: [0, 0, 0, 1], show3Dcrosshair: false, isOrientCube: false, isColorbar: false, gradientAmount: 0,
+		})
+		await nv.attachToCanvas(canvas, true)
+		nv.setSliceType(SLICE_TYPE.RENDER)
+		render.#nv = nv
+		return render
+	}
+
+	/* The limits keep still from one iteration to the next; so does the brightness. */
+	async show(grid, view) {
+		const nv = this.#nv
+		const [low, high] = this.#limits(view)
+		const place = JSON.stringify([grid.size, grid.spacing, grid.origin])
+		if (nv.volumes.length > 0 && this.#size === place) {
+			nv.volumes[0].img.set(grid.voxels)
+			nv.volumes[0].cal_min = low
+			nv.volumes[0].cal_max = high
+			nv.updateGLVolume()
+			return
+		}
+		const image = await NVImage.loadFromUrl({ url: nifti(grid), name: 'volume.nii', colormap: 'gray', cal_min: low, cal_max: high })
+		while (nv.volumes.length > 0)
+			nv.removeVolumeByIndex(0)
+		nv.addVolume(image)
+		this.#size = place
+		nv.setVolumeRenderIllumination(0.7)
+		this.turn(view)
+	}
+
+	#limits(view) {
+		const low = Math.max(view.level - view.window / 2, airMost)
+		return [low, Math.max(view.level + view.window / 2, low + 100)]
+	}
+
+	window(view) {
+		const nv = this.#nv
+		if (nv.volumes.length === 0)
+			return
+		;[nv.volumes[0].cal_min, nv.volumes[0].cal_max] = this.#limits(view)
+		nv.updateGLVolume()
+	}
+
+	turn(view) {
+		const nv = this.#nv
+		nv.scene.volScaleMultiplier = 1.15
+		nv.setRenderAzimuthElevation(view.azimuth, view.elevation)
+	}
+
+	close() {
+		this.#nv.cleanup()
+		this.#nv.gl?.getExtension('WEBGL_lose_context')?.loseContext()
+	}
+}

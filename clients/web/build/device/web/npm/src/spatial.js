@@ -1,0 +1,157 @@
+/* The tile of the rendering. Without WebGL 2 it shows a contact sheet that the daemon draws. */
+import { h, inFrame, throttle } from './dom.js'
+import { volumePath } from './api.js'
+import { fetchVoxels, scaleFor } from './voxels.js'
+
+const settleTime = 150 /* ms: the rendering follows the window once the hand rests; each change costs a whole volume */
+
+/* { software } or null: asked of a canvas of its own, which is given back at once. */
+function probe() {
+	const gl = document.createElement('canvas').getContext('webgl2', { failIfMajorPerformanceCaveat: false })
+	if (!gl)
+		return null
+	const info = gl.getExtension('WEBGL_debug_renderer_info')
+	const name = info ? String(gl.getParameter(info.UNMASKED_RENDERER_WEBGL)) : ''
+	gl.getExtension('WEBGL_lose_context')?.loseContext()
+	return { software: /swiftshader|llvmpipe|software|basic render/i.test(name) }
+}
+
+export const graphics = probe()
+const touch = matchMedia('(pointer: coarse)').matches
+const voxelsMost = graphics?.software ? 96 ** 3 : touch ? 192 ** 3 : 256 ** 3
+
+export class Spatial {
+	#view
+	#render = null
+	#source = null
+	#grid = null
+	#failed = graphics === null
+	#gesture = null
+
+	constructor(view) {
+		this.#view = view
+		this.note = h('p', { class: 'note' })
+		this.canvas = h('canvas', { class: 'render', role: 'img', 'aria-label': 'Rendering in three dimensions' })
+		this.sheet = h('img', { class: 'sheet', alt: '', hidden: true })
+		this.stage = h('div', { class: 'stage' }, this.canvas, this.sheet, h('div', { class: 'grip' }))
+		this.maximise = h('button', { type: 'button', class: 'maximise', title: 'This one only (m)', 'aria-label': 'Show the rendering only',
+			'aria-pressed': 'false', onclick: () => this.#maximise() })
+		this.element = h('section', { class: 'tile spatial', tabindex: '0', 'aria-label': 'Rendering', 'data-plane': '3d' },
+			this.stage, h('div', { class: 'caption' }, h('span', { class: 'name' }, '3D')), this.maximise, this.note)
+		this.turn = inFrame(() => this.#render?.turn(this.#view))
+		this.settle = throttle(settleTime, () => this.#settle())
+		this.#listen()
+	}
+
+	#maximise() {
+		this.#view.set({ tile: this.#view.tile === '3d' ? 'all' : '3d' })
+	}
+
+	show(source) {
+		this.#source = source
+		this.#grid = null
+		this.settle()
+	}
+
+	update(changed) {
+		if (changed.tile)
+			this.maximise.setAttribute('aria-pressed', String(this.#view.tile === '3d'))
+		if (changed.azimuth || changed.elevation)
+			this.turn()
+		if (changed.window || changed.level)
+			this.settle()
+	}
+
+	/* Brings the rendering to the newest volume and window, one step at a time. */
+	async #settle() {
+		const source = this.#source
+		if (source === null || !this.element.isConnected)
+			return
+		if (this.#failed) {
+			this.#showSheet()
+			return
+		}
+		try {
+			if (this.#render === null) {
+				const { Render } = await import('./render.js')
+				this.#render = await Render.open(this.canvas)
+				this.canvas.addEventListener('webglcontextlost', () => this.#fail())
+			}
+			if (this.#grid === null) {
+				const grid = await fetchVoxels(source.job, source.volume, scaleFor(source.volume, voxelsMost))
+				if (source !== this.#source)
+					return
+				await this.#render.show(grid, this.#view)
+				this.#grid = grid
+			} else {
+				this.#render.window(this.#view)
+			}
+			this.element.dataset.shown = source.volume.name
+		} catch (error) {
+			if (error.message !== 'aborted')
+				this.#fail()
+		}
+	}
+
+	#fail() {
+		this.#failed = true
+		this.#showSheet()
+	}
+
+	#showSheet() {
+		const { job, volume } = this.#source
+		const { window, level } = this.#view
+		this.canvas.hidden = true
+		this.sheet.hidden = false
+		this.sheet.src = `${volumePath(job, volume.name)}/slice?sheet=1&axis=z&window=${window}&level=${level}`
+		this.sheet.alt = `Contact sheet of ${volume.name}`
+		this.note.textContent = 'This browser has no WebGL 2: a contact sheet in place of the rendering'
+		this.element.dataset.shown = volume.name
+	}
+
+	#listen() {
+		const stage = this.stage
+		stage.addEventListener('pointerdown', event => {
+			event.preventDefault()
+			this.element.focus({ preventScroll: true })
+			stage.setPointerCapture(event.pointerId)
+			this.#gesture = { x: event.clientX, y: event.clientY, azimuth: this.#view.azimuth, elevation: this.#view.elevation }
+		})
+		stage.addEventListener('pointermove', event => {
+			if (this.#gesture)
+				this.#turnTo(this.#gesture.azimuth - (event.clientX - this.#gesture.x) / 2,
+					this.#gesture.elevation + (event.clientY - this.#gesture.y) / 2)
+		})
+		for (const kind of ['pointerup', 'pointercancel', 'lostpointercapture'])
+			stage.addEventListener(kind, () => this.#gesture = null)
+		stage.addEventListener('contextmenu', event => event.preventDefault())
+		stage.addEventListener('dblclick', () => this.#maximise())
+		this.element.addEventListener('keydown', event => this.#key(event))
+	}
+
+	#turnTo(azimuth, elevation) {
+		this.#view.set({ azimuth: (azimuth % 360 + 360) % 360, elevation: Math.min(Math.max(elevation, -89), 89) })
+	}
+
+	#key(event) {
+		const view = this.#view
+		const keys = {
+			ArrowLeft: () => this.#turnTo(view.azimuth + 5, view.elevation),
+			ArrowRight: () => this.#turnTo(view.azimuth - 5, view.elevation),
+			ArrowUp: () => this.#turnTo(view.azimuth, view.elevation - 5),
+			ArrowDown: () => this.#turnTo(view.azimuth, view.elevation + 5),
+			m: () => this.#maximise(),
+		}
+		if (event.target !== this.element || event.ctrlKey || event.altKey || event.metaKey || !keys[event.key])
+			return
+		event.preventDefault()
+		keys[event.key]()
+	}
+
+	close() {
+		this.settle.cancel()
+		this.#render?.close()
+		this.#render = null
+		this.#source = null
+	}
+}

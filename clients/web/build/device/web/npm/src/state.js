@@ -1,0 +1,48 @@
+/* How the states of jobs look: a word and a sign, not a colour alone. */
+import { h, duration } from './dom.js'
+
+const signs = { waiting: '◌', queued: '◔', running: '◑', succeeded: '●', failed: '✕', cancelled: '⊘' }
+
+export const ended = job => ['succeeded', 'failed', 'cancelled'].includes(job.state)
+
+export function badge(state) {
+	return h('span', { class: `badge ${state}` }, h('span', { 'aria-hidden': 'true' }, signs[state] ?? '○'), ` ${state}`)
+}
+
+/* What it is doing, in words. */
+export function doing(job) {
+	if (job.cancel_requested && !ended(job))
+		return 'being cancelled'
+	if (job.state === 'queued')
+		return job.queue_position > 1 ? `${job.queue_position - 1} before it` : 'next in the queue'
+	if (job.state === 'waiting')
+		return 'waits for projections'
+	if (job.state === 'running') {
+		const step = job.iterations > 0 && job.stage !== 'load' && job.stage !== 'fdk'
+			? `iteration ${Math.min(job.iteration + 1, job.iterations)} of ${job.iterations}`
+			: { load: 'loading', fdk: 'FDK', tv: 'TV', save: 'saving', sart: 'SART' }[job.stage] ?? ''
+		return step
+	}
+	if (job.state === 'failed')
+		return job.error?.detail ?? ''
+	return job.iterations > 0 ? `${job.iteration} of ${job.iterations} iterations` : ''
+}
+
+export function left(job) {
+	return job.state === 'running' && job.eta_s !== null ? `${duration(job.eta_s)} left` : ''
+}
+
+export class Bar {
+	constructor(label) {
+		this.fill = h('div', { class: 'fill' })
+		this.element = h('div', { class: 'bar', role: 'progressbar', 'aria-label': label, 'aria-valuemin': '0', 'aria-valuemax': '100' }, this.fill)
+	}
+
+	show(job) {
+		const percent = Math.round(job.progress * 100)
+		this.element.dataset.state = job.state
+		this.element.setAttribute('aria-valuenow', String(percent))
+		this.element.setAttribute('aria-valuetext', [`${percent} %`, doing(job), left(job)].filter(Boolean).join(', '))
+		this.fill.style.width = `${job.progress * 100}%`
+	}
+}

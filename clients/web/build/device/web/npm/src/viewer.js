@@ -1,0 +1,79 @@
+/* Three planes and a rendering of one volume at a time, in one View. */
+import { h } from './dom.js'
+import { Plane } from './plane.js'
+import { Spatial, graphics } from './spatial.js'
+import { countOf, fetchVoxels, heldVoxels, cancelVoxels, wholeMost } from './voxels.js'
+
+const order = ['z', 'x', 'y']
+
+export class Viewer {
+	#view
+	#source = null
+	#shown
+
+	/* step(direction): another iteration is asked for; shown(): after each picture. */
+	constructor(view, { step, shown, label }) {
+		this.#view = view
+		this.#shown = shown
+		this.planes = order.map(name => new Plane(name, view, { step, shown }))
+		this.spatial = new Spatial(view)
+		this.tag = h('span', { class: 'tag' })
+		this.element = h('div', { class: 'viewer', role: 'group', 'aria-label': label, 'data-tile': view.tile },
+			[...this.planes, this.spatial].map(part => part.element), this.tag)
+		this.follow = ({ detail }) => this.#update(detail)
+		view.addEventListener('change', this.follow)
+	}
+
+	#update(changed) {
+		if (changed.tile)
+			this.element.dataset.tile = this.#view.tile
+		for (const part of [...this.planes, this.spatial])
+			part.update(changed)
+	}
+
+	/* Place and window stay; the picture before stays until the new one is there. */
+	show(job, volume) {
+		const before = this.#source
+		const here = graphics !== null && countOf(volume.size) <= wholeMost
+		if (before && before.job === job && before.volume.name === volume.name && before.volume.digest === volume.digest)
+			return
+		if (before)
+			cancelVoxels(before.job, before.volume, 1)
+		const source = { job, volume }
+		this.#source = source
+		this.#view.setGrid(volume)
+		this.element.dataset.volume = volume.name
+		const held = heldVoxels(job, volume, 1)
+		for (const plane of this.planes) {
+			plane.show(source)
+			if (held && here)
+				plane.setVoxels(held)
+		}
+		this.spatial.show(source)
+		if (!held && here)
+			this.#fetch(source)
+	}
+
+	async #fetch(source) {
+		try {
+			const grid = await fetchVoxels(source.job, source.volume, 1)
+			if (source === this.#source)
+				this.planes.forEach(plane => plane.setVoxels(grid))
+		} catch {
+			/* the daemon goes on drawing the planes */
+		}
+	}
+
+	/* HU at the position, or null. */
+	value() {
+		return this.planes[0].value()
+	}
+
+	close() {
+		this.#view.removeEventListener('change', this.follow)
+		this.planes.forEach(plane => plane.close())
+		this.spatial.close()
+		this.element.remove()
+		this.#source = null
+	}
+}

@@ -1,0 +1,116 @@
+/*
+ * Volumes in the browser's memory: int16 Hounsfield units, fetched once at a
+ * scale, the ones not looked at for longest given up first.
+ */
+import { volumePath } from './api.js'
+
+const touch = matchMedia('(pointer: coarse)').matches
+const memory = navigator.deviceMemory ?? (touch ? 2 : 8) /* GB, at most 8 is told */
+
+/* Voxels of the largest volume that is fetched whole; beyond, planes are drawn by the daemon. */
+export const wholeMost = memory >= 8 && !touch ? 512 ** 3 : memory >= 4 ? 320 ** 3 : 256 ** 3
+const cacheMost = memory >= 8 && !touch ? 1024e6 : 256e6 /* bytes */
+
+let worker = null, lastNumber = 0
+const waiting = new Map()
+const cache = new Map() /* key -> { promise, bytes, number }, in the order of their last use */
+
+function startWorker() {
+	worker = new Worker(DECODE_WORKER)
+	worker.onmessage = ({ data }) => {
+		const { resolve, reject } = waiting.get(data.number)
+		waiting.delete(data.number)
+		if (data.error)
+			reject(new Error(data.error))
+		else
+			resolve(data.voxels)
+	}
+	worker.onerror = event => {
+		for (const { reject } of waiting.values())
+			reject(new Error(event.message || 'the decoder could not be started'))
+		waiting.clear()
+		worker = null
+	}
+}
+
+function decode(number, path, size) {
+	if (worker === null)
+		startWorker()
+	return new Promise((resolve, reject) => {
+		waiting.set(number, { resolve, reject })
+		worker.postMessage({ number, path, size })
+	})
+}
+
+/* Size, spacing and place of a volume whose voxels are means of scale^3 (at the far ends of what is there). */
+export function scaled(volume, scale) {
+	return {
+		size: volume.size.map(count => Math.ceil(count / scale)),
+		spacing: volume.spacing_mm.map(step => step * scale),
+		origin: volume.origin_mm.map((start, i) => start + (scale - 1) / 2 * volume.spacing_mm[i]),
+	}
+}
+
+export const countOf = size => size[0] * size[1] * size[2]
+
+/* The smallest scale that leaves at most so many voxels. */
+export function scaleFor(volume, most) {
+	let scale = 1
+	while (scale < 16 && countOf(scaled(volume, scale).size) > most)
+		scale++
+	return scale
+}
+
+function forget(key) {
+	const entry = cache.get(key)
+	cache.delete(key)
+	if (waiting.has(entry.number))
+		worker?.postMessage({ cancel: entry.number })
+}
+
+function makeRoom(keep) {
+	let total = 0
+	for (const entry of cache.values())
+		total += entry.bytes
+	for (const key of [...cache.keys()]) {
+		if (total <= cacheMost)
+			return
+		if (key === keep)
+			continue
+		total -= cache.get(key).bytes
+		forget(key)
+	}
+}
+
+const keyOf = (job, volume, scale) => `${job} ${volume.name} ${volume.digest} ${scale}`
+
+/* What is here already: { size, spacing, origin, voxels }, or null. */
+export function heldVoxels(job, volume, scale) {
+	return cache.get(keyOf(job, volume, scale))?.held ?? null
+}
+
+/* A promise of the same. */
+export function fetchVoxels(job, volume, scale) {
+	const key = keyOf(job, volume, scale)
+	let entry = cache.get(key)
+	cache.delete(key)
+	if (!entry) {
+		const grid = scaled(volume, scale)
+		const number = ++lastNumber
+		const path = `${volumePath(job, volume.name)}?format=shuffled&scale=${scale}`
+		entry = { number, bytes: 2 * countOf(grid.size), held: null }
+		entry.promise = decode(number, path, grid.size).then(voxels => entry.held = { ...grid, voxels })
+		entry.promise.catch(() => cache.get(key) === entry && cache.delete(key))
+	}
+	cache.set(key, entry)
+	makeRoom(key)
+	return entry.promise
+}
+
+/* What is not here yet and nobody waits for any more need not come. */
+export function cancelVoxels(job, volume, scale) {
+	const key = keyOf(job, volume, scale)
+	const entry = cache.get(key)
+	if (entry && waiting.has(entry.number))
+		forget(key)
+}

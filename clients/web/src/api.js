@@ -1,0 +1,110 @@
+/* The daemon's HTTP interface: documents, problems (RFC 9457) and events. Paths are of this origin, always. */
+
+export class Problem extends Error {
+	constructor(status, document) {
+		super(document.detail || document.title || `status ${status}`)
+		this.status = status
+		this.title = document.title ?? ''
+		this.pointer = document.pointer ?? null
+	}
+}
+
+async function problemOf(response) {
+	let document = {}
+	try {
+		document = await response.json()
+	} catch {
+		/* a proxy's own page */
+	}
+	if (!document.detail)
+		document.detail = `the daemon answered ${response.status} ${response.statusText}`.trim()
+	return new Problem(response.status, document)
+}
+
+export async function request(method, path, { body, headers, signal } = {}) {
+	const response = await fetch(path, {
+		method,
+		headers: { Accept: 'application/json', ...(body ? { 'Content-Type': 'application/json' } : {}), ...headers },
+		body: body ? JSON.stringify(body) : undefined,
+		signal,
+	})
+	if (!response.ok)
+		throw await problemOf(response)
+	return response.status === 204 ? null : response.json()
+}
+
+export const get = (path, signal) => request('GET', path, { signal })
+
+export const id = encodeURIComponent
+export const jobPath = job => `/v1/jobs/${id(job)}`
+export const scanPath = scan => `/v1/scans/${id(scan)}`
+export const volumePath = (job, volume) => `${jobPath(job)}/volumes/${id(volume)}`
+
+/* A key that makes a repeated POST harmless. Without randomUUID, which plain http:// does not have. */
+export function newKey() {
+	return [...crypto.getRandomValues(new Uint8Array(16))].map(byte => byte.toString(16).padStart(2, '0')).join('')
+}
+
+/* All volumes of a job, in the order of their making. */
+export async function listVolumes(job, signal) {
+	const volumes = []
+	let after = null
+	do {
+		const page = await get(`${jobPath(job)}/volumes?limit=1000${after ? `&after=${id(after)}` : ''}`, signal)
+		volumes.push(...page.volumes)
+		after = page.next
+	} while (after)
+	return volumes.reverse()
+}
+
+const kinds = ['state', 'progress', 'volume', 'warning', 'end']
+const retryAfter = 5000 /* ms: the browser itself comes again where the connection broke, not where it was refused */
+const hiddenFor = 30000 /* ms: a browser has six connections to a daemon, for all of its pages together */
+
+/*
+ * Events from `path` on, told to `tell(kind, data)`; `live(bool)` says whether
+ * the connection stands. After each reconnection the browser names the last
+ * event that it has heard, so nothing is missed. A page that nobody looks at
+ * lets its connection go. Returns a function that ends it.
+ */
+export function watch(path, tell, live) {
+	let source = null, timer = null, hidden = null, last = null, over = false
+
+	function open() {
+		timer = null
+		source = new EventSource(last === null ? path : `${path.split('?')[0]}?after=${last}`)
+		source.onopen = () => live(true)
+		source.onerror = () => {
+			live(false)
+			if (source.readyState === EventSource.CLOSED && !over)
+				timer = setTimeout(open, retryAfter)
+		}
+		for (const kind of kinds) {
+			source.addEventListener(kind, event => {
+				last = event.lastEventId
+				if (kind === 'end' && path.startsWith('/v1/jobs/'))
+					close()
+				tell(kind, JSON.parse(event.data))
+			})
+		}
+	}
+	function close() {
+		over = true
+		clearTimeout(timer)
+		clearTimeout(hidden)
+		document.removeEventListener('visibilitychange', onVisibility)
+		source.close()
+	}
+	function onVisibility() {
+		clearTimeout(hidden)
+		if (document.hidden) {
+			hidden = setTimeout(() => source.close(), hiddenFor)
+		} else if (source.readyState === EventSource.CLOSED) {
+			clearTimeout(timer)
+			open()
+		}
+	}
+	document.addEventListener('visibilitychange', onVisibility)
+	open()
+	return close
+}

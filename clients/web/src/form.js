@@ -1,0 +1,239 @@
+/*
+ * "Reconstruct again with ...": a job's request as a form, from one table of
+ * its fields. A problem (RFC 9457) is shown at the field its pointer names.
+ */
+import { h, replace, newId } from './dom.js'
+import { request, newKey, Problem } from './api.js'
+
+const number = (pointer, label, options) => ({ pointer, label, kind: 'number', ...options })
+const choice = (pointer, label, values, options) => ({ pointer, label, kind: 'choice', values, ...options })
+const flag = (pointer, label, options) => ({ pointer, label, kind: 'flag', ...options })
+const text = (pointer, label, options) => ({ pointer, label, kind: 'text', ...options })
+
+/* A stage is left out by its checkbox; what is empty is left to the daemon's defaults. */
+const groups = [
+	{ title: 'Grid', pointer: '/grid', optional: true, off: 'chosen from the field of view', fields: [
+		number('/grid/size/0', 'Voxels along x', { step: 1 }), number('/grid/size/1', 'along y', { step: 1 }), number('/grid/size/2', 'along z', { step: 1 }),
+		number('/grid/spacing_mm/0', 'Spacing x, mm'), number('/grid/spacing_mm/1', 'y, mm'), number('/grid/spacing_mm/2', 'z, mm'),
+	] },
+	{ title: 'FDK', pointer: '/fdk', optional: true, off: 'start from zero', fields: [
+		choice('/fdk/window', 'Window', ['ram-lak', 'shepp-logan', 'cosine', 'hamming', 'hann']),
+		number('/fdk/cutoff', 'Cutoff, of Nyquist'),
+		choice('/fdk/truncation', 'Truncated rows', ['auto', 'off']),
+	] },
+	{ title: 'SART', pointer: '/sart', optional: true, off: 'no iterations', fields: [
+		number('/sart/iterations', 'Iterations', { step: 1 }), number('/sart/relaxation', 'Relaxation'),
+		text('/sart/subsets', 'Subsets', { hint: 'a number, or views', read: value => value === 'views' ? value : Number(value) }),
+		flag('/sart/nonnegative', 'Never below zero'),
+		number('/sart/stop/residual', 'Stop at residual'), number('/sart/stop/change', 'Stop at change'),
+	] },
+	{ title: 'Total variation', pointer: '/tv', optional: true, off: 'no smoothing', fields: [
+		choice('/tv/method', 'Method', ['gradient', 'proximal']), number('/tv/alpha', 'Alpha'), number('/tv/step', 'Step'),
+		number('/tv/iterations', 'Iterations', { step: 1 }), choice('/tv/after', 'After', ['fdk+sart', 'sart']), number('/tv/unit', 'Gray level, 1/mm'),
+	] },
+	{ title: 'Job', pointer: '', fields: [
+		text('/emit', 'Keep volumes', { hint: 'fdk, fdk-tv, iterations', wide: true, read: value => value.split(/[\s,]+/).filter(Boolean).map(name => /^\d+$/.test(name) ? Number(name) : name),
+			write: list => (list ?? []).join(', ') }),
+		choice('/priority', 'Priority', ['routine', 'urgent', 'stat']), choice('/precision', 'Precision', ['standard', 'reference']),
+		choice('/projector', 'Projector', ['interpolating', 'matched']), number('/mu_water', 'Water, 1/mm'),
+	] },
+]
+/* Members of a job's document that are parts of its request, whether they have a field above or not. */
+const members = ['grid', 'fdk', 'sart', 'tv', 'emit', 'priority', 'precision', 'mu_water', 'projector', 'metal']
+
+const path = pointer => pointer.split('/').slice(1)
+const at = (value, pointer) => path(pointer).reduce((part, key) => part?.[key], value)
+
+function put(value, pointer, what) {
+	const keys = path(pointer), last = keys.pop()
+	let part = value
+	keys.forEach((key, i) => {
+		part[key] ??= /^\d+$/.test(keys[i + 1] ?? last) ? [] : {}
+		part = part[key]
+	})
+	part[last] = what
+}
+
+function remove(value, pointer) {
+	const keys = path(pointer), last = keys.pop()
+	const part = keys.reduce((inner, key) => inner?.[key], value)
+	if (part && !Array.isArray(part))
+		delete part[last]
+}
+
+export class JobForm {
+	#initial
+	#fields = new Map() /* pointer -> { field, input, error } */
+	#switches = new Map() /* pointer of a group -> checkbox */
+	#key = newKey()
+
+	/* base: a job's document, or { scan }; done(job) after it was taken. */
+	constructor(base, { done, cancel }) {
+		this.done = done
+		this.#initial = { scan: base.scan }
+		for (const member of members) {
+			if (base[member] !== undefined)
+				this.#initial[member] = structuredCloneOf(base[member])
+		}
+		this.trouble = h('p', { class: 'trouble', role: 'alert', hidden: true })
+		this.submit = h('button', { type: 'submit', class: 'primary' }, 'Reconstruct')
+		this.element = h('form', { class: 'job-form', novalidate: true, onsubmit: event => this.#submit(event) },
+			groups.map(group => this.#group(group)), this.trouble,
+			h('div', { class: 'row end' }, h('button', { type: 'button', onclick: cancel }, 'Close'), this.submit))
+		this.element.addEventListener('input', () => this.#key = newKey())
+	}
+
+	#group(group) {
+		const body = h('div', { class: 'fields' }, group.fields.map(field => this.#field(field)))
+		if (!group.optional)
+			return h('fieldset', {}, h('legend', {}, group.title), body)
+		const value = this.#initial[path(group.pointer)[0]]
+		const fresh = members.every(member => this.#initial[member] === undefined) && group.pointer !== '/grid'
+		const box = h('input', { type: 'checkbox', checked: fresh || (value !== undefined && value !== null) })
+		const off = h('p', { class: 'off' }, group.off)
+		const error = h('p', { class: 'trouble', hidden: true, id: newId('error') })
+		const adapt = () => {
+			body.hidden = !box.checked
+			off.hidden = box.checked
+		}
+		box.addEventListener('change', adapt)
+		adapt()
+		this.#switches.set(group.pointer, box)
+		this.#fields.set(group.pointer, { input: box, error })
+		return h('fieldset', {}, h('legend', {}, h('label', {}, box, ` ${group.title}`)), body, off, error)
+	}
+
+	#field(field) {
+		const value = at(this.#initial, field.pointer)
+		const error = h('p', { class: 'trouble', hidden: true, id: newId('error') })
+		let input
+		if (field.kind === 'choice')
+			input = h('select', {}, [...(field.values.includes(value) || value === undefined || value === null ? [] : [value]), ...field.values]
+				.map(name => h('option', { value: name, selected: name === value }, name)))
+		else if (field.kind === 'flag')
+			input = h('input', { type: 'checkbox', checked: value ?? true })
+		else
+			input = h('input', { type: 'text', inputmode: field.kind === 'number' ? 'decimal' : null, autocomplete: 'off', spellcheck: 'false',
+				value: field.write ? field.write(value) : value === undefined || value === null ? '' : String(value) })
+		if (field.kind === 'choice' && (value === undefined || value === null)) {
+			input.prepend(h('option', { value: '' }, 'default'))
+			input.value = ''
+		}
+		input.setAttribute('name', field.pointer)
+		this.#fields.set(field.pointer, { field, input, error, initial: field.kind === 'flag' ? input.checked : input.value })
+		return h('label', { class: `field ${field.kind}${field.wide ? ' wide' : ''}` },
+			h('span', { class: 'label' }, field.label, field.hint ? h('small', {}, ` ${field.hint}`) : null), input, error)
+	}
+
+	/* The document before with what was changed. Text that is no number goes as it is: the daemon says so best. */
+	#document() {
+		const document = structuredCloneOf(this.#initial)
+		for (const [pointer, box] of this.#switches) {
+			const member = path(pointer)[0]
+			if (!box.checked)
+				delete document[member]
+			else
+				document[member] ??= {}
+		}
+		for (const [pointer, { field, input, initial }] of this.#fields) {
+			if (!field || this.#switches.get(`/${path(pointer)[0]}`)?.checked === false)
+				continue
+			const raw = field.kind === 'flag' ? input.checked : input.value.trim()
+			if (raw === initial)
+				continue
+			if (raw === '')
+				remove(document, pointer)
+			else
+				put(document, pointer, field.kind === 'number' ? (Number.isNaN(Number(raw)) ? raw : Number(raw)) : field.read ? field.read(raw) : raw)
+		}
+		return document
+	}
+
+	async #submit(event) {
+		event.preventDefault()
+		this.#clear()
+		this.submit.disabled = true
+		try {
+			this.done(await request('POST', '/v1/jobs', { body: this.#document(), headers: { 'Idempotency-Key': this.#key } }))
+		} catch (error) {
+			this.#show(error)
+		}
+		this.submit.disabled = false
+	}
+
+	#clear() {
+		this.trouble.hidden = true
+		for (const { input, error } of this.#fields.values()) {
+			error.hidden = true
+			input.removeAttribute('aria-invalid')
+			input.removeAttribute('aria-describedby')
+		}
+	}
+
+	/* At the field, else at its group or one of its parts, else at the end of the form. */
+	#show(error) {
+		const pointer = error instanceof Problem ? error.pointer : null
+		let found = null
+		for (let part = pointer; part && !found; part = part.slice(0, part.lastIndexOf('/')))
+			found = this.#fields.get(part) ?? [...this.#fields].find(([name]) => name.startsWith(`${part}/`))?.[1] ?? null
+		if (!found) {
+			this.trouble.textContent = pointer ? `${pointer}: ${error.message}` : error.message
+			this.trouble.hidden = false
+			return
+		}
+		replace(found.error, error.message)
+		found.error.hidden = false
+		found.input.setAttribute('aria-invalid', 'true')
+		found.input.setAttribute('aria-describedby', found.error.id)
+		found.input.closest('.fields')?.removeAttribute('hidden')
+		found.input.focus()
+	}
+}
+
+/* JSON in, JSON out; structuredClone is younger than some browsers that run the rest. */
+function structuredCloneOf(value) {
+	return JSON.parse(JSON.stringify(value))
+}
+
+/* ---- dialogs ---- */
+
+export function openDialog(title, ...content) {
+	const heading = h('h2', { id: newId('title') }, title)
+	const dialog = h('dialog', { 'aria-labelledby': heading.id }, heading, ...content)
+	dialog.addEventListener('close', () => dialog.remove())
+	document.body.append(dialog)
+	dialog.showModal()
+	return dialog
+}
+
+/* The form in a dialog; a job that was taken is gone to. */
+export function reconstructAgain(base, title) {
+	const form = new JobForm(base, {
+		done: job => {
+			dialog.close()
+			location.hash = `#/jobs/${encodeURIComponent(job.id)}`
+		},
+		cancel: () => dialog.close(),
+	})
+	const dialog = openDialog(title, form.element)
+	dialog.classList.add('wide')
+	return dialog
+}
+
+/* Asks before `act`; a failure is shown in place. */
+export function confirmed(title, question, verb, act) {
+	const trouble = h('p', { class: 'trouble', role: 'alert', hidden: true })
+	const yes = h('button', { type: 'button', class: 'danger', onclick: async () => {
+		yes.disabled = true
+		try {
+			await act()
+			dialog.close()
+		} catch (error) {
+			trouble.textContent = error.message
+			trouble.hidden = false
+			yes.disabled = false
+		}
+	} }, verb)
+	const dialog = openDialog(title, h('p', {}, question), trouble,
+		h('div', { class: 'row end' }, h('button', { type: 'button', onclick: () => dialog.close() }, 'Keep it'), yes))
+}

@@ -1,0 +1,69 @@
+/* The page's frame: which of its pages the address names, and how the daemon is. */
+import { h, replace, write } from './dom.js'
+import { get } from './api.js'
+import { ListPage } from './lists.js'
+import { JobPage } from './job.js'
+import { ScanPage } from './scan.js'
+
+const devicesTime = 10000 /* ms */
+
+const routes = [
+	[/^#?\/?$/, tools => new ListPage(tools)],
+	[/^#\/jobs\/([^/]+)$/, (tools, job) => new JobPage(decodeURIComponent(job), tools)],
+	[/^#\/scans\/([^/]+)$/, (tools, scan) => new ScanPage(decodeURIComponent(scan), tools)],
+]
+
+const main = document.querySelector('main')
+const live = h('span', { class: 'live', role: 'status' })
+const devices = h('span', { class: 'devices' })
+document.querySelector('.status').append(devices, live)
+
+let page = null
+
+const tools = {
+	title: text => document.title = `${text} · cbctd`,
+	/* true: events come; false: the connection is broken; null: nothing is listened to. */
+	live: connected => {
+		live.dataset.state = connected === null ? 'off' : connected ? 'on' : 'broken'
+		write(live, connected === null ? '' : connected ? 'live' : 'reconnecting …')
+	},
+}
+
+function open() {
+	page?.close()
+	page = null
+	for (const [pattern, make] of routes) {
+		const match = pattern.exec(location.hash)
+		if (match) {
+			page = make(tools, ...match.slice(1))
+			break
+		}
+	}
+	replace(main, page ? page.element : h('p', { class: 'empty' }, 'There is nothing here. ', h('a', { href: '#/' }, 'All jobs')))
+	scrollTo(0, 0)
+}
+
+async function showDevices() {
+	if (document.hidden)
+		return
+	try {
+		const { devices: list } = await get('/v1/devices')
+		const able = list.filter(device => ['idle', 'busy'].includes(device.state))
+		write(devices, able.length > 0 ? able.map(device => device.device ?? device.backend).join(', ') : 'no worker can take a job')
+		devices.classList.toggle('bad', able.length === 0)
+	} catch {
+		write(devices, '')
+	}
+}
+
+document.querySelector('.skip').addEventListener('click', event => {
+	event.preventDefault()
+	main.focus()
+})
+addEventListener('hashchange', () => {
+	open()
+	main.focus({ preventScroll: true })
+})
+open()
+showDevices()
+setInterval(showDevices, devicesTime)

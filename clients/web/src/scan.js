@@ -1,0 +1,73 @@
+/* A scan's page: its projections as a film, its geometry, a way to reconstruct it. */
+import { h, replace, throttle, write } from './dom.js'
+import { get, request, scanPath } from './api.js'
+import { Film } from './film.js'
+import { geometryFacts, warningList } from './facts.js'
+import { reconstructAgain, confirmed } from './form.js'
+
+const pollTime = 1500 /* ms, while projections arrive */
+
+export class ScanPage {
+	#scan = null
+	#abort = new AbortController()
+	#closed = false
+
+	constructor(scanId, { live, title }) {
+		this.id = scanId
+		this.title = title
+		live(null)
+		this.heading = h('h1', {}, '…')
+		this.state = h('span', { class: 'doing' })
+		this.warnings = h('div', {})
+		this.geometry = h('div', {})
+		this.trouble = h('div', { class: 'notice bad', role: 'alert', hidden: true })
+		this.film = new Film()
+		this.element = h('div', { class: 'scan' },
+			h('header', { class: 'head' }, h('a', { class: 'back', href: '#/' }, '‹ Jobs'), h('div', { class: 'title' }, this.heading, this.state),
+				h('div', { class: 'actions' },
+					h('button', { type: 'button', class: 'primary', onclick: () => this.#scan && reconstructAgain({ scan: this.#scan.id }, `Reconstruct ${this.#scan.name}`) }, 'Reconstruct …'),
+					h('button', { type: 'button', class: 'quiet danger-text', onclick: () => this.#remove() }, 'Remove …'))),
+			this.trouble, this.warnings,
+			h('div', { class: 'columns' }, h('section', { class: 'card' }, h('h2', {}, 'Projections'), this.film.element),
+				h('div', { class: 'aside' }, h('section', { class: 'card' }, h('h2', {}, 'Geometry'), this.geometry))))
+		this.refresh = throttle(500, () => this.#refresh())
+		this.refresh()
+		this.timer = setInterval(() => !document.hidden && this.#scan?.state !== 'complete' && this.refresh(), pollTime)
+	}
+
+	async #refresh() {
+		try {
+			const scan = await get(scanPath(this.id), this.#abort.signal)
+			this.#scan = scan
+			this.trouble.hidden = true
+			this.title(scan.name || scan.id)
+			write(this.heading, scan.name || `Scan ${scan.id}`)
+			write(this.state, scan.state === 'complete' ? 'complete' : `${scan.received_count} of ${scan.projections.count} projections are here`)
+			replace(this.warnings, warningList(scan.warnings))
+			replace(this.geometry, geometryFacts(scan))
+			this.film.show(scan)
+		} catch (error) {
+			if (this.#closed)
+				return
+			if (error.status === 404)
+				write(this.heading, 'No such scan')
+			replace(this.trouble, error.status ? error.message : 'The daemon cannot be reached.')
+			this.trouble.hidden = false
+		}
+	}
+
+	#remove() {
+		confirmed('Remove this scan?', 'Its projections are removed. A scan that a job uses stays.', 'Remove', async () => {
+			await request('DELETE', scanPath(this.id))
+			location.hash = '#/'
+		})
+	}
+
+	close() {
+		this.#closed = true
+		clearInterval(this.timer)
+		this.refresh.cancel()
+		this.#abort.abort()
+		this.film.close()
+	}
+}
