@@ -129,9 +129,11 @@ struct plan_options {
 	int pad[2];
 	/*
 	 * Columns by which `filter` extends truncated rows on either side before the
-	 * ramp, see there; 0: none. filter_response is then that of filter_length(padded columns + extend).
+	 * ramp (core/extend.h), 0: none; and the response of filter_length(padded columns
+	 * + extend) that these rows need. Other rows are filtered as without.
 	 */
 	int extend;
+	const float *extended_response;  /* [length/2 + 1], or NULL without extend */
 	const struct sart_options *sart; /* NULL: no SART */
 	/*
 	 * SART's forward and backward weights are those of one matrix and its exact
@@ -142,7 +144,7 @@ struct plan_options {
 	const struct tv_options *tv; /* NULL: no TV */
 	bool reference_precision;    /* float everywhere; otherwise storage may be packed within the stated bound */
 	bool no_projection;          /* neither project nor sart_iterate will be asked for: no scratch for them */
-	int resident;                /* slots of the stacks that are on the device beside the plan; 0: one for each view */
+	int resident; /* slots of the stacks that are on the device beside the plan; 0: one for each view */
 };
 
 /* Bytes, known before anything is allocated. */
@@ -180,6 +182,7 @@ enum backprojection { BACKPROJECT_PLAIN, BACKPROJECT_FDK /* times (D/depth)^2 */
 struct backend {
 	const char *name;    /* "cpu", "cuda" */
 	const char *summary; /* for --help */
+	bool extends;        /* plan_options.extend may be more than 0 */
 	/* Its devices have memory beside the host's: what does not fit there can go through it in parts (parts.h). */
 	bool own_memory;
 
@@ -228,7 +231,7 @@ struct backend {
 	/*
 	 * q = ramp of weights and cosine times p: view views[i] from slot slots[i] of `from` into slot i of `to`.
 	 * slots NULL: slot = view. FDK alone keeps no stack of all views, its slots are those of one batch.
-	 * With plan_options.extend each row is looked at by itself on either side, see core/extend.h.
+	 * With plan_options.extend truncated rows are extended, see core/extend.h.
 	 */
 	int (*filter)(struct plan *plan, const struct stack *from, const int *slots, const int *views, int count,
 		      struct stack *to, struct error *err);

@@ -6,6 +6,7 @@
  * as input and output differ and the length has the factors 2, 3 and 5 only.
  */
 #include "core/cpu.h"
+#include "core/extend.h"
 
 #include <kissfft/kiss_fft.h>
 #include <stdlib.h>
@@ -14,62 +15,106 @@
 /* Rows that are neighbours in memory and are filtered together: one cache line of floats. */
 enum { ROWS = 16, PAIRS = ROWS / 2 };
 
+/* Transforms of one length. */
+struct transform {
+	int length;
+	kiss_fft_cfg forward, inverse;
+	float *response; /* [length], all frequencies, 1 / length included */
+};
+
 struct filter_engine {
 	const struct geometry *geometry; /* borrowed, as are the weights */
 	const float *column_weights;     /* [view][column] */
-	int length;
-	int pad, wide; /* zero columns before column 0; columns of a filtered row */
-	kiss_fft_cfg forward, inverse;
-	float *response;       /* [length], all frequencies, 1 / length included */
+	int pad, wide;                   /* zero columns before column 0; columns of a filtered row */
+	int extend;                      /* columns that truncated rows get on either side */
+	bool sides[2];                   /* that may be extended */
+	struct transform plain, extended;
 	kiss_fft_cpx *buffers; /* [threads][2][PAIRS][stride] */
 	size_t stride;
 };
 
-/* Away from multiples of 4 KiB, where all pairs would share the same sets of the cache. */
-static size_t buffer_stride(int length)
+static int wide_columns(const struct plan_options *options)
 {
-	return (size_t)length + 8;
+	return options->pad[0] + options->geometry->columns + options->pad[1];
 }
 
-static size_t buffers_count(int length, int threads)
+/* Of the longest transform; away from multiples of 4 KiB, where all pairs would share the same sets of the cache. */
+static size_t buffer_stride(const struct plan_options *options)
 {
-	return (size_t)threads * 2 * PAIRS * buffer_stride(length);
+	return (size_t)filter_length(wide_columns(options) + options->extend) + 8;
+}
+
+static size_t buffers_count(const struct plan_options *options, int threads)
+{
+	return (size_t)threads * 2 * PAIRS * buffer_stride(options);
+}
+
+static size_t transform_bytes(int length)
+{
+	size_t bytes = 0;
+
+	kiss_fft_alloc(length, 0, NULL, &bytes);
+	return 2 * bytes + (size_t)length * sizeof(float);
 }
 
 size_t filter_engine_bytes(const struct plan_options *options, int threads)
 {
-	int length = filter_length(options->pad[0] + options->geometry->columns + options->pad[1]);
-	size_t transform = 0;
+	const int wide = wide_columns(options);
+	size_t bytes = sizeof(struct filter_engine) + transform_bytes(filter_length(wide));
 
-	kiss_fft_alloc(length, 0, NULL, &transform);
-	return sizeof(struct filter_engine) + 2 * transform + (size_t)length * sizeof(float) +
-	       buffers_count(length, threads) * sizeof(kiss_fft_cpx);
+	if (options->extend > 0)
+		bytes += transform_bytes(filter_length(wide + options->extend));
+	return bytes + buffers_count(options, threads) * sizeof(kiss_fft_cpx);
+}
+
+static int transform_new(int length, const float *response, struct transform *ret, struct error *err)
+{
+	ret->length = length;
+	ret->forward = kiss_fft_alloc(length, 0, NULL, NULL);
+	ret->inverse = kiss_fft_alloc(length, 1, NULL, NULL);
+	ret->response = malloc((size_t)length * sizeof(float));
+	if (ret->forward == NULL || ret->inverse == NULL || ret->response == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for the ramp filter of %d samples", length);
+	for (int i = 0; i < length; i++)
+		ret->response[i] = response[i <= length / 2 ? i : length - i] / (float)length;
+	return 0;
+}
+
+static void transform_clear(struct transform *transform)
+{
+	kiss_fft_free(transform->forward);
+	kiss_fft_free(transform->inverse);
+	free(transform->response);
 }
 
 int filter_engine_new(const struct plan_options *options, int threads, struct filter_engine **ret_engine,
 		      struct error *err)
 {
 	struct filter_engine *engine = calloc(1, sizeof(*engine));
-	int length = filter_length(options->pad[0] + options->geometry->columns + options->pad[1]);
+	const int wide = wide_columns(options);
+	int code;
 
 	if (engine == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for the ramp filter");
 	engine->geometry = options->geometry;
 	engine->column_weights = options->column_weights;
-	engine->length = length;
 	engine->pad = options->pad[0];
-	engine->wide = options->pad[0] + options->geometry->columns + options->pad[1];
-	engine->stride = buffer_stride(length);
-	engine->forward = kiss_fft_alloc(length, 0, NULL, NULL);
-	engine->inverse = kiss_fft_alloc(length, 1, NULL, NULL);
-	engine->response = malloc((size_t)length * sizeof(float));
-	engine->buffers = calloc(buffers_count(length, threads), sizeof(kiss_fft_cpx));
-	if (engine->forward == NULL || engine->inverse == NULL || engine->response == NULL || engine->buffers == NULL) {
+	engine->wide = wide;
+	engine->extend = options->extend;
+	for (int side = 0; side < 2; side++)
+		engine->sides[side] = options->extend > 0 && options->pad[side] == 0;
+	engine->stride = buffer_stride(options);
+	code = transform_new(filter_length(wide), options->filter_response, &engine->plain, err);
+	if (code == 0 && engine->extend > 0)
+		code = transform_new(filter_length(wide + engine->extend), options->extended_response,
+				     &engine->extended, err);
+	engine->buffers = calloc(buffers_count(options, threads), sizeof(kiss_fft_cpx));
+	if (code == 0 && engine->buffers == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for the buffers of the ramp filter");
+	if (code < 0) {
 		filter_engine_free(engine);
-		return error_set(err, ERR_NO_MEMORY, "no memory for the ramp filter of %d samples", length);
+		return code;
 	}
-	for (int i = 0; i < length; i++)
-		engine->response[i] = options->filter_response[i <= length / 2 ? i : length - i] / (float)length;
 	*ret_engine = engine;
 	return 0;
 }
@@ -78,9 +123,8 @@ void filter_engine_free(struct filter_engine *engine)
 {
 	if (engine == NULL)
 		return;
-	kiss_fft_free(engine->forward);
-	kiss_fft_free(engine->inverse);
-	free(engine->response);
+	transform_clear(&engine->plain);
+	transform_clear(&engine->extended);
 	free(engine->buffers);
 	free(engine);
 }
@@ -120,40 +164,167 @@ static void column_cosines(const struct view *view, const double direction[3], i
 	}
 }
 
-/* Rows row .. row + count - 1 of one view. */
-static void filter_rows(const struct filter_engine *engine, int view, int columns, int rows, int row, int count,
-			const float *from, float *to, kiss_fft_cpx *buffers)
+/* ---- extension of truncated rows, see core/extend.h ---- */
+
+/* A view, [column][row], and ROWS rows of it or fewer. */
+struct rows {
+	const float *view;
+	int columns, rows;
+	int first, count;
+};
+
+/* What each row of a group has before column 0 and behind the last one. */
+struct extensions {
+	bool truncated[2][ROWS];
+	struct extension edge[2][ROWS];
+};
+
+/* Column i from an edge, the group's first row. */
+static const float *at_edge(const struct rows *rows, int side, int i)
 {
-	const size_t stride = engine->stride;
-	kiss_fft_cpx *in = buffers, *out = buffers + PAIRS * stride;
-	const int pairs = (count + 1) / 2;
+	const int column = side == 0 ? i : rows->columns - 1 - i;
+
+	return rows->view + (size_t)column * (size_t)rows->rows + (size_t)rows->first;
+}
+
+/* Which rows are not air at an edge; returns whether any is. */
+static bool find_truncated(const struct filter_engine *engine, const struct rows *rows, struct extensions *ret)
+{
+	const int edge = extend_edge(rows->columns);
+	bool any = false;
+
+	memset(ret->truncated, 0, sizeof(ret->truncated));
+	for (int side = 0; side < 2; side++) {
+		float sums[ROWS] = {0};
+
+		if (!engine->sides[side])
+			continue;
+		for (int i = 0; i < edge; i++)
+			for (int r = 0; r < rows->count; r++)
+				sums[r] += at_edge(rows, side, i)[r];
+		for (int r = 0; r < rows->count; r++) {
+			ret->truncated[side][r] = sums[r] >= EXTEND_LEVEL * (float)edge;
+			any = any || ret->truncated[side][r];
+		}
+	}
+	return any;
+}
+
+static void fit_extensions(const struct filter_engine *engine, const struct rows *rows, struct extensions *ret)
+{
+	struct extend_row_sums sums[ROWS] = {{0}};
+
+	for (int c = 0; c < rows->columns; c++) {
+		const float *values = at_edge(rows, 0, c);
+		const double x = extend_x(c, rows->columns);
+
+		for (int r = 0; r < rows->count; r++)
+			if (values[r] >= EXTEND_LEVEL)
+				extend_row_add(&sums[r], x, (double)values[r]);
+	}
+	for (int side = 0; side < 2; side++) {
+		struct extend_edge_sums edges[ROWS] = {{0}};
+
+		for (int i = 0; i < extend_window(rows->columns); i++) {
+			const float *values = at_edge(rows, side, i);
+
+			for (int r = 0; r < rows->count; r++) {
+				const double p = values[r] > 0 ? (double)values[r] : 0;
+
+				edges[r].y += p * p;
+				edges[r].xy -= i * p * p;
+			}
+		}
+		for (int r = 0; r < rows->count; r++)
+			if (ret->truncated[side][r])
+				ret->edge[side][r] = extend_fit(rows->columns, engine->extend, &sums[r], &edges[r]);
+	}
+}
+
+/* Writes the extension of one side into the buffers of all pairs; column -1 is the last of the buffer. */
+static void write_extension(const struct filter_engine *engine, int view, const struct rows *rows, int side,
+			    const struct extensions *extensions, kiss_fft_cpx *in)
+{
+	const int outermost = side == 0 ? 0 : rows->columns - 1;
+	const float weight = engine->column_weights[(size_t)view * (size_t)rows->columns + (size_t)outermost];
 	double direction[3];
 
 	axis_direction(&engine->geometry->views[view], direction);
-	for (int c = 0; c < columns; c++) {
+	for (int x = 1; x <= engine->extend; x++) {
+		const int column = side == 0 ? -x : outermost + x;
+		const int at = engine->pad + column + (column < 0 ? engine->extended.length : 0);
 		float weights[ROWS], values[ROWS] = {0};
 
-		memcpy(values, from + (size_t)c * (size_t)rows + (size_t)row, (size_t)count * sizeof(float));
-		column_cosines(&engine->geometry->views[view], direction, c, row,
-			       engine->column_weights[(size_t)view * (size_t)columns + (size_t)c], weights);
+		column_cosines(&engine->geometry->views[view], direction, column, rows->first, weight, weights);
+		for (int r = 0; r < rows->count; r++)
+			if (extensions->truncated[side][r])
+				values[r] = weights[r] * extend_value(&extensions->edge[side][r], x);
+		for (int i = 0; i < PAIRS; i++)
+			in[(size_t)i * engine->stride + (size_t)at] = (kiss_fft_cpx){values[2 * i], values[2 * i + 1]};
+	}
+}
+
+/* ---- the filter ---- */
+
+/* Rows times their weights into the buffers of their pairs, from `pad` on. */
+static void weight_rows(const struct filter_engine *engine, int view, const struct rows *rows, kiss_fft_cpx *in)
+{
+	const struct view *from = &engine->geometry->views[view];
+	double direction[3];
+
+	axis_direction(from, direction);
+	for (int c = 0; c < rows->columns; c++) {
+		float weights[ROWS], values[ROWS] = {0};
+
+		memcpy(values, at_edge(rows, 0, c), (size_t)rows->count * sizeof(float));
+		column_cosines(from, direction, c, rows->first,
+			       engine->column_weights[(size_t)view * (size_t)rows->columns + (size_t)c], weights);
 		for (int i = 0; i < ROWS; i++)
 			values[i] *= weights[i];
 		for (int i = 0; i < PAIRS; i++)
-			in[(size_t)i * stride + (size_t)(engine->pad + c)] =
+			in[(size_t)i * engine->stride + (size_t)(engine->pad + c)] =
 			    (kiss_fft_cpx){values[2 * i], values[2 * i + 1]};
+	}
+}
+
+/* Rows row .. row + count - 1 of one view; adds the rows that were extended on either side. */
+static void filter_rows(const struct filter_engine *engine, int view, const struct rows *rows, float *to,
+			kiss_fft_cpx *buffers, size_t extended[2])
+{
+	const size_t stride = engine->stride;
+	kiss_fft_cpx *in = buffers, *out = buffers + PAIRS * stride;
+	const int pairs = (rows->count + 1) / 2;
+	const struct transform *transform = &engine->plain;
+	struct extensions extensions;
+
+	weight_rows(engine, view, rows, in);
+	if (find_truncated(engine, rows, &extensions))
+		transform = &engine->extended;
+	for (int i = 0; i < pairs; i++) {
+		kiss_fft_cpx *row = in + (size_t)i * stride;
+
+		memset(row, 0, (size_t)engine->pad * sizeof(*row));
+		memset(row + engine->pad + rows->columns, 0,
+		       (size_t)(transform->length - engine->pad - rows->columns) * sizeof(*row));
+	}
+	if (transform == &engine->extended) {
+		fit_extensions(engine, rows, &extensions);
+		for (int side = 0; side < 2; side++) {
+			if (engine->sides[side])
+				write_extension(engine, view, rows, side, &extensions, in);
+			for (int r = 0; r < rows->count; r++)
+				extended[side] += extensions.truncated[side][r];
+		}
 	}
 	for (int i = 0; i < pairs; i++) {
 		kiss_fft_cpx *row_in = in + (size_t)i * stride, *row_out = out + (size_t)i * stride;
 
-		memset(row_in, 0, (size_t)engine->pad * sizeof(*row_in));
-		memset(row_in + engine->pad + columns, 0,
-		       (size_t)(engine->length - engine->pad - columns) * sizeof(*row_in));
-		kiss_fft(engine->forward, row_in, row_out);
-		for (int k = 0; k < engine->length; k++) {
-			row_out[k].r *= engine->response[k];
-			row_out[k].i *= engine->response[k];
+		kiss_fft(transform->forward, row_in, row_out);
+		for (int k = 0; k < transform->length; k++) {
+			row_out[k].r *= transform->response[k];
+			row_out[k].i *= transform->response[k];
 		}
-		kiss_fft(engine->inverse, row_out, row_in);
+		kiss_fft(transform->inverse, row_out, row_in);
 	}
 	for (int c = 0; c < engine->wide; c++) {
 		float values[ROWS];
@@ -162,7 +333,8 @@ static void filter_rows(const struct filter_engine *engine, int view, int column
 			values[2 * i] = in[(size_t)i * stride + (size_t)c].r;
 			values[2 * i + 1] = in[(size_t)i * stride + (size_t)c].i;
 		}
-		memcpy(to + (size_t)c * (size_t)rows + (size_t)row, values, (size_t)count * sizeof(float));
+		memcpy(to + (size_t)c * (size_t)rows->rows + (size_t)rows->first, values,
+		       (size_t)rows->count * sizeof(float));
 	}
 }
 
@@ -171,6 +343,7 @@ int cpu_filter(struct plan *plan, const struct stack *from, const int *slots, co
 {
 	const struct filter_engine *engine = plan->filter;
 	const int blocks = (plan->rows + ROWS - 1) / ROWS;
+	size_t extended[2] = {0};
 
 	if (engine == NULL)
 		return error_set(err, ERR_INTERNAL, "the plan was made without FDK");
@@ -178,15 +351,22 @@ int cpu_filter(struct plan *plan, const struct stack *from, const int *slots, co
 		return error_set(err, ERR_INTERNAL, "%d columns to filter into instead of %d", to->columns, plan->wide);
 	if (count > to->slots)
 		return error_set(err, ERR_INTERNAL, "%d views to filter into a stack of %d slots", count, to->slots);
-#pragma omp parallel for num_threads(plan->device->threads) schedule(dynamic)
+#pragma omp parallel for num_threads(plan->device->threads) schedule(dynamic) reduction(+ : extended[:2])
 	for (int job = 0; job < count * blocks; job++) {
 		const int i = job / blocks, row = job % blocks * ROWS, left = plan->rows - row;
-		kiss_fft_cpx *buffers = engine->buffers + (size_t)cpu_thread() * 2 * PAIRS * engine->stride;
+		const struct rows rows = {
+		    .view = stack_slot(from, slots != NULL ? slots[i] : views[i]),
+		    .columns = plan->columns,
+		    .rows = plan->rows,
+		    .first = row,
+		    .count = left < ROWS ? left : ROWS,
+		};
 
-		filter_rows(engine, views[i], plan->columns, plan->rows, row, left < ROWS ? left : ROWS,
-			    stack_slot(from, slots != NULL ? slots[i] : views[i]),
-			    to->data + (size_t)i * (size_t)plan->wide * (size_t)plan->rows, buffers);
+		filter_rows(engine, views[i], &rows, to->data + (size_t)i * (size_t)plan->wide * (size_t)plan->rows,
+			    engine->buffers + (size_t)cpu_thread() * 2 * PAIRS * engine->stride, extended);
 	}
+	for (int side = 0; side < 2; side++)
+		plan->extended[side] += extended[side];
 	return 0;
 }
 

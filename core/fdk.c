@@ -17,20 +17,26 @@
 #include "core/parts.h"
 
 int fdk_weights_make(struct fdk_weights *ret_weights, const struct orbit *orbit, const struct geometry *geometry,
-		     enum window window, double cutoff, struct error *err)
+		     enum window window, double cutoff, bool extend, struct error *err)
 {
-	int length = filter_length(orbit->pad[0] + geometry->columns + orbit->pad[1]), code = 0;
+	const int wide = orbit->pad[0] + geometry->columns + orbit->pad[1];
+	const int length = filter_length(wide), longer = filter_length(wide + geometry->columns);
+	int code = 0;
 	struct fdk_weights weights = {
 	    .columns = malloc(sizeof(float) * (size_t)geometry->count * (size_t)geometry->columns),
 	    .response = malloc(sizeof(float) * ((size_t)length / 2 + 1)),
 	    .pad = {orbit->pad[0], orbit->pad[1]},
+	    .extend = extend ? geometry->columns : 0,
+	    .extended = extend ? malloc(sizeof(float) * ((size_t)longer / 2 + 1)) : NULL,
 	};
 
-	if (weights.columns == NULL || weights.response == NULL) {
+	if (weights.columns == NULL || weights.response == NULL || (extend && weights.extended == NULL)) {
 		code = error_set(err, ERR_NO_MEMORY, "no memory for the FDK weights of %d views", geometry->count);
 		goto out;
 	}
 	code = filter_response(window, cutoff, 1, length, weights.response, err);
+	if (code == 0 && extend)
+		code = filter_response(window, cutoff, 1, longer, weights.extended, err);
 	if (code < 0)
 		goto out;
 	orbit_column_weights(orbit, geometry, weights.columns);
@@ -45,6 +51,7 @@ void fdk_weights_clear(struct fdk_weights *weights)
 {
 	free(weights->columns);
 	free(weights->response);
+	free(weights->extended);
 	*weights = (struct fdk_weights){0};
 }
 

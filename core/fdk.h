@@ -10,11 +10,13 @@ struct fdk_weights {
 	float *columns;  /* [view][column], owned */
 	float *response; /* [length/2 + 1], owned */
 	int pad[2];      /* orbit.pad */
+	int extend;      /* plan_options.extend */
+	float *extended; /* its response, owned; NULL without */
 };
 
 /* Free with fdk_weights_clear. */
 int fdk_weights_make(struct fdk_weights *ret_weights, const struct orbit *orbit, const struct geometry *geometry,
-		     enum window window, double cutoff, struct error *err);
+		     enum window window, double cutoff, bool extend, struct error *err);
 void fdk_weights_clear(struct fdk_weights *weights);
 
 /*

@@ -15,7 +15,7 @@ const char *const projector_names[PROJECTOR_COUNT] = {"interpolating", "matched"
 void recipe_defaults(struct recipe *ret_recipe)
 {
 	*ret_recipe = (struct recipe){
-	    .fdk = {.window = WINDOW_HANN, .cutoff = 1},
+	    .fdk = {.window = WINDOW_HANN, .cutoff = 1, .extend = true},
 	    .sart = {.iterations = 10, .relaxation = 1, .subsets = SUBSETS_DEFAULT, .nonnegative = true},
 	    .tv = {.after_fdk = true, .options = {.method = TV_GRADIENT, .alpha = 0.1, .step = 0.1, .iterations = 10}},
 	    .metal = {.threshold_hu = 2500},

@@ -78,15 +78,22 @@ static struct plan_options plan_options(const struct recipe *recipe, const struc
 	    .column_weights = recipe->fdk.on ? weights->columns : NULL,
 	    .filter_response = recipe->fdk.on ? weights->response : NULL,
 	    .pad = {recipe->fdk.on ? weights->pad[0] : 0, recipe->fdk.on ? weights->pad[1] : 0},
+	    .extend = recipe->fdk.on ? weights->extend : 0,
+	    .extended_response = recipe->fdk.on ? weights->extended : NULL,
 	    .sart = recipe->sart.on ? sart : NULL,
 	    .matched = recipe->sart.on && recipe->projector == PROJECTOR_MATCHED,
 	    .tv = recipe->tv.on ? &recipe->tv.options : NULL,
 	    .reference_precision = recipe->reference_precision,
 	    .no_projection = !recipe->sart.on,
-	    .resident = recipe->sart.on            ? 0
+	    .resident = recipe->sart.on                    ? 0
 			: geometry->count < FDK_BATCH_MOST ? geometry->count
 							   : FDK_BATCH_MOST,
 	};
+}
+
+static bool extends(const struct recipe *recipe, const struct backend *backend)
+{
+	return recipe->fdk.on && recipe->fdk.extend && backend->extends;
 }
 
 static int sart_options_make(struct sart_options *ret_sart, const struct recipe *recipe, const struct orbit *orbit,
@@ -155,7 +162,7 @@ int recon_memory(const struct backend *backend, struct device *device, const str
 		 const struct recipe *recipe, struct recon_memory *ret_memory, struct error *err)
 {
 	float some = 0; /* stands for the weights: only whether there are any is asked here */
-	struct fdk_weights weights = {.columns = &some, .response = &some};
+	struct fdk_weights weights = {.columns = &some, .response = &some, .extended = &some};
 	const struct linearise linearise = {.sample = SAMPLE_FLOAT32};
 	struct recipe resolved = *recipe;
 	struct orbit orbit;
@@ -167,6 +174,7 @@ int recon_memory(const struct backend *backend, struct device *device, const str
 	if (code < 0)
 		return code;
 	memcpy(weights.pad, orbit.pad, sizeof(weights.pad));
+	weights.extend = extends(recipe, backend) ? geometry->columns : 0;
 	code = recipe_resolve(&resolved, geometry, &orbit, err);
 	if (code == 0 && resolved.sart.on)
 		code = sart_options_make(&sart, &resolved, &orbit, err);
@@ -224,7 +232,7 @@ static int recon_prepare(struct recon *recon, const struct recipe *recipe, struc
 		code = recipe_resolve(&recon->recipe, geometry, &recon->orbit, err);
 	if (code == 0 && recon->recipe.fdk.on)
 		code = fdk_weights_make(&recon->weights, &recon->orbit, geometry, recon->recipe.fdk.window,
-					recon->recipe.fdk.cutoff, err);
+					recon->recipe.fdk.cutoff, extends(&recon->recipe, recon->backend), err);
 	if (code == 0 && recon->recipe.sart.on)
 		code = sart_options_make(&recon->sart, &recon->recipe, &recon->orbit, err);
 	if (code < 0)
@@ -480,12 +488,33 @@ static int run_tv(struct recon *recon, int iteration, struct error *err)
 	return code;
 }
 
+/* Known once all views are filtered. */
+static int warn_of_truncation(struct recon *recon, struct error *err)
+{
+	const double all = (double)recon->geometry->count * recon->geometry->rows;
+	size_t rows[2];
+	char detail[256];
+	int code = recon->backend->filter_extended(recon->plan, rows, err);
+
+	if (code < 0 || recon->hooks->warning == NULL || rows[0] + rows[1] == 0)
+		return code;
+	snprintf(
+	    detail, sizeof(detail),
+	    "the object reaches beyond the detector: %.3g %% of the rows are cut off at the first column and %.3g %% "
+	    "at the last; FDK extended them by %d columns, values near the rim of the field of view are estimates",
+	    100 * (double)rows[0] / all, 100 * (double)rows[1] / all, recon->weights.extend);
+	recon->hooks->warning(recon->hooks->context, "truncated", detail);
+	return 0;
+}
+
 /* The FDK volume and what is made of it before the first iteration. */
 static int finish_fdk(struct recon *recon, struct error *err)
 {
 	const struct recipe *recipe = &recon->recipe;
 	int code = fdk_flush(&recon->fdk, recon->projections, recon->volume, err);
 
+	if (code == 0)
+		code = warn_of_truncation(recon, err);
 	if (code == 0)
 		code = measure(recon, NULL, err);
 	if (code == 0 && recon->norms.not_finite > 0)

@@ -23,6 +23,7 @@ struct recipe {
 		bool on;
 		enum window window;
 		double cutoff;
+		bool extend; /* rows that the detector cuts off, core/extend.h */
 	} fdk;
 	struct {
 		bool on;

@@ -15,6 +15,7 @@
 const char *const priority_names[PRIORITY_COUNT] = {"routine", "urgent", "stat"};
 
 static const char *const after_names[2] = {"sart", "fdk+sart"};
+static const char *const truncation_names[2] = {"off", "auto"};
 static const char *const precision_names[2] = {"standard", "reference"};
 
 /* ---- reading ---- */
@@ -57,12 +58,14 @@ static int read_grid(struct recipe *recipe, const cJSON *value, struct error *er
 static int read_fdk(struct recipe *recipe, const cJSON *value, struct error *err)
 {
 	struct json_reader reader;
-	int window = recipe->fdk.window;
+	int window = recipe->fdk.window, truncation = recipe->fdk.extend;
 
 	json_begin(&reader, value, "/fdk", err);
 	json_choice(&reader, "window", false, window_names, WINDOW_COUNT, &window);
 	json_number(&reader, "cutoff", false, 1e-3, 1, &recipe->fdk.cutoff);
+	json_choice(&reader, "truncation", false, truncation_names, 2, &truncation);
 	recipe->fdk.window = (enum window)window;
+	recipe->fdk.extend = truncation != 0;
 	recipe->fdk.on = true;
 	return json_end(&reader);
 }
@@ -382,6 +385,7 @@ static cJSON *request_document(const struct job_request *request)
 		fdk = cJSON_AddObjectToObject(document, "fdk");
 		cJSON_AddStringToObject(fdk, "window", window_names[recipe->fdk.window]);
 		cJSON_AddNumberToObject(fdk, "cutoff", recipe->fdk.cutoff);
+		cJSON_AddStringToObject(fdk, "truncation", truncation_names[recipe->fdk.extend]);
 	} else {
 		cJSON_AddNullToObject(document, "fdk");
 	}
@@ -438,8 +442,9 @@ bool job_request_same(const struct job_request *a, const struct job_request *b)
 
 	return strcmp(a->scan, b->scan) == 0 && a->priority == b->priority && same_grid(x, y) &&
 	       x->fdk.on == y->fdk.on &&
-	       (!x->fdk.on || (x->fdk.window == y->fdk.window && x->fdk.cutoff == y->fdk.cutoff)) && same_sart(x, y) &&
-	       same_tv(x, y) && x->metal.on == y->metal.on &&
+	       (!x->fdk.on ||
+		(x->fdk.window == y->fdk.window && x->fdk.cutoff == y->fdk.cutoff && x->fdk.extend == y->fdk.extend)) &&
+	       same_sart(x, y) && same_tv(x, y) && x->metal.on == y->metal.on &&
 	       (!x->metal.on || x->metal.threshold_hu == y->metal.threshold_hu) &&
 	       (!x->sart.on || x->projector == y->projector) && x->mu_water == y->mu_water &&
 	       x->reference_precision == y->reference_precision && x->emits == y->emits &&

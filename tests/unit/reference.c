@@ -177,29 +177,125 @@ static double cosine(const struct view *view, int column, int row)
 	return vec_dot(ray, towards) / vec_norm(ray) / vec_norm(towards);
 }
 
+/* The convolution kernel of a response: its inverse transform. */
+static double *kernel_of(const float *response, int length)
+{
+	double *kernel = calloc((size_t)length, sizeof(double));
+
+	for (int n = 0; n < length; n++)
+		for (int k = 0; k < length; k++)
+			kernel[n] += (double)response[k <= length / 2 ? k : length - k] *
+				     cos(2 * M_PI * ((double)k * n / length)) / length;
+	return kernel;
+}
+
+/* The part of y(x) along x^2 that 1 and x do not hold: the curvature of the parabola nearest to y. */
+static double curvature(const double *x, const double *y, int count)
+{
+	double mean = 0, x2 = 0, x3 = 0, along = 0, norm = 0;
+
+	for (int i = 0; i < count; i++)
+		mean += x[i] / count;
+	for (int i = 0; i < count; i++) {
+		x2 += pow(x[i] - mean, 2);
+		x3 += pow(x[i] - mean, 3);
+	}
+	for (int i = 0; i < count; i++) {
+		double t = x[i] - mean, q = t * t - x2 / count - (x2 > 0 ? t * x3 / x2 : 0);
+
+		along += q * y[i];
+		norm += q * q;
+	}
+	return norm > 1e-6 ? along / norm : 0;
+}
+
+/* One side of a row by the words of core/extend.h; false: it ends in air. */
+static bool extend_row(const float *row, int columns, int extend, bool behind, double *ret)
+{
+	const int edge = columns / 64 > 4 ? columns / 64 : 4, window = columns / 16 > 4 ? columns / 16 : 4;
+	double *x = calloc((size_t)columns, sizeof(double)), *y = calloc((size_t)columns, sizeof(double));
+	double level = 0, mean = 0, mean_x = 0, c, a, b = 0, xx = 0, xy = 0, first = 0;
+	int count = 0;
+
+	for (int i = 0; i < edge; i++)
+		level += (double)row[behind ? columns - 1 - i : i] / edge;
+	for (int i = 0; i < columns; i++) {
+		double p = (double)row[behind ? columns - 1 - i : i];
+
+		if (p >= 0.03) {
+			x[count] = -i;
+			y[count++] = p * p;
+		}
+	}
+	c = curvature(x, y, count);
+	for (int i = 0; i < window; i++)
+		first += pow(fmax(0, (double)row[behind ? columns - 1 - i : i]), 2) / window;
+	c = fmin(c, -first / ((double)extend * extend));
+	for (int i = 0; i < window; i++) {
+		double p = fmax(0, (double)row[behind ? columns - 1 - i : i]);
+
+		x[i] = -i;
+		y[i] = p * p - c * i * i;
+		mean_x += x[i] / window;
+		mean += y[i] / window;
+	}
+	for (int i = 0; i < window; i++) {
+		xx += (x[i] - mean_x) * (x[i] - mean_x);
+		xy += (x[i] - mean_x) * (y[i] - mean);
+	}
+	b = fmin(0, xy / xx);
+	a = fmax(0, mean - b * mean_x);
+	for (int i = 1; i <= extend; i++)
+		ret[i - 1] = sqrt(fmax(0, a + b * i + c * i * i));
+	free(x);
+	free(y);
+	return level >= 0.03;
+}
+
 void reference_filter(const struct plan_options *options, int view, const float *projection, float *ret)
 {
 	const struct geometry *geometry = options->geometry;
 	const int columns = geometry->columns, wide = options->pad[0] + columns + options->pad[1];
-	const int length = filter_length(wide);
-	double *kernel = calloc((size_t)length, sizeof(double));
+	const int extend = options->extend;
+	double *kernels[2] = {kernel_of(options->filter_response, filter_length(wide)), NULL};
+	double *line = calloc((size_t)(columns + 2 * extend), sizeof(double));
+	double *beyond = calloc((size_t)extend + 1, sizeof(double));
 
-	for (int n = 0; n < length; n++) /* the inverse transform of the response: what rows are convolved with */
-		for (int k = 0; k < length; k++)
-			kernel[n] += (double)options->filter_response[k <= length / 2 ? k : length - k] *
-				     cos(2 * M_PI * ((double)k * n / length)) / length;
+	if (extend > 0)
+		kernels[1] = kernel_of(options->extended_response, filter_length(wide + extend));
 	for (int row = 0; row < geometry->rows; row++) {
+		const float *from = projection + (size_t)row * (size_t)columns;
+		bool extended = false;
+
+		for (int c = -extend; c < columns + extend; c++)
+			line[c + extend] = c >= 0 && c < columns ? (double)from[c] : 0;
+		for (int side = 0; side < 2 && extend > 0; side++) {
+			if (options->pad[side] > 0 || !extend_row(from, columns, extend, side == 1, beyond))
+				continue;
+			extended = true;
+			for (int i = 0; i < extend; i++)
+				line[side == 1 ? extend + columns + i : extend - 1 - i] = beyond[i];
+		}
 		for (int to = 0; to < wide; to++) {
 			double sum = 0;
 
-			for (int c = 0; c < columns; c++)
-				sum += kernel[abs(to - options->pad[0] - c)] * cosine(&geometry->views[view], c, row) *
-				       (double)options->column_weights[(size_t)view * (size_t)columns + (size_t)c] *
-				       (double)projection[(size_t)row * (size_t)columns + (size_t)c];
+			for (int c = -extend; c < columns + extend; c++) {
+				int nearest = c < 0 ? 0 : c < columns ? c : columns - 1;
+
+				if (line[c + extend] != 0)
+					sum += kernels[extended][abs(to - options->pad[0] - c)] *
+					       cosine(&geometry->views[view], c, row) *
+					       (double)options
+						   ->column_weights[(size_t)view * (size_t)columns + (size_t)nearest] *
+					       line[c + extend];
+			}
 			ret[(size_t)row * (size_t)wide + (size_t)to] = (float)sum;
 		}
 	}
-	free(kernel);
+	free(beyond);
+	free(line);
+	free(kernels[0]);
+	free(kernels[1]);
 }
 
 /* ---- SART ---- */

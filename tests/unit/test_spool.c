@@ -552,7 +552,9 @@ START_TEST(a_run_that_yields_goes_on_to_the_same_bits)
 	ck_assert_int_eq(second.last_row, 3);
 	ck_assert_int_eq(run(pipeline, out, checkpoint, 3, &third, &err), 0);
 	ck_assert_int_eq(third.rows, 1);
-	ck_assert_str_eq(third.warnings, whole.warnings);
+	/* What FDK warns of is told where FDK runs, once. */
+	ck_assert_str_eq(first.warnings, whole.warnings);
+	ck_assert_str_eq(third.warnings, "");
 	for (int i = 0; i < whole.kept; i++) {
 		char name[64];
 
