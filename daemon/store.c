@@ -114,6 +114,10 @@ static const char *const migrations[] = {
     /* What a job that starts again does once more is told once: the name of such an event, else NULL. */
     "ALTER TABLE events ADD COLUMN once TEXT;"
     "CREATE UNIQUE INDEX events_once ON events (job, once);",
+    /* A removed job's events go with it; that it was removed stays, under a number of theirs. */
+    "CREATE TABLE removals ("
+    " number INTEGER PRIMARY KEY,"
+    " job TEXT NOT NULL);",
 };
 enum { MIGRATIONS = sizeof(migrations) / sizeof(migrations[0]) };
 

@@ -218,7 +218,7 @@ int store_job_insert(struct store *store, const struct job_record *job, const st
  * checkpoint go. */
 int store_job_update(struct store *store, const struct job_record *job, const struct event *event,
 		     const struct event *end, bool rewind, struct error *err);
-/* Removes the rows; then the files may go. */
+/* Removes the rows; then the files may go. Of the events only that it was removed stays, for those who watch all jobs. */
 int store_job_delete(struct store *store, const char *id, struct error *err);
 void store_job_remove_files(const struct store *store, const char *id);
 int store_job_add_row(struct store *store, const char *id, const struct history_row *row, const struct event *event,

@@ -10,6 +10,8 @@
 #include "daemon/log.h"
 #include "daemon/store_db.h"
 
+enum { REMOVALS_KEPT = 1000 /* a page that was away for longer reads its list anew */ };
+
 const char *const job_state_names[JOB_STATE_COUNT] = {"waiting",   "queued", "running",
 						      "succeeded", "failed", "cancelled"};
 
@@ -152,6 +154,27 @@ int store_job_update(struct store *store, const struct job_record *job, const st
 	return store_end(store, code, err);
 }
 
+/* Takes a number from the job's own events, which go with it. */
+static int note_removal(struct store *store, const char *id, struct error *err)
+{
+	struct event event = {.kind = "removed", .data = (char[]){"{}"}};
+	struct query query;
+
+	if (add_event(store, id, &event, err) != 0)
+		return err->code;
+	query_begin(&query, &store->writer, "INSERT INTO removals (number, job) VALUES (?, ?)", err);
+	query_integer(&query, store->event_written);
+	query_text(&query, id);
+	if (query_run(&query) != 0)
+		return query.code;
+	query_begin(&query, &store->writer,
+		    "DELETE FROM removals WHERE number <="
+		    " (SELECT number FROM removals ORDER BY number DESC LIMIT 1 OFFSET ?)",
+		    err);
+	query_integer(&query, REMOVALS_KEPT);
+	return query_run(&query);
+}
+
 int store_job_delete(struct store *store, const char *id, struct error *err)
 {
 	struct query query;
@@ -159,9 +182,13 @@ int store_job_delete(struct store *store, const char *id, struct error *err)
 
 	if (code != 0)
 		return code;
-	query_begin(&query, &store->writer, "DELETE FROM jobs WHERE id = ?", err);
-	query_text(&query, id);
-	return store_end(store, query_run(&query), err);
+	code = note_removal(store, id, err);
+	if (code == 0) {
+		query_begin(&query, &store->writer, "DELETE FROM jobs WHERE id = ?", err);
+		query_text(&query, id);
+		code = query_run(&query);
+	}
+	return store_end(store, code, err);
 }
 
 void store_job_remove_files(const struct store *store, const char *id)
@@ -530,8 +557,11 @@ int store_job_events(struct store *store, const char *id, long long after, int l
 	} else {
 		query_begin(&query, &store->reader,
 			    "SELECT events.number, jobs.id, kind, data FROM events, jobs"
-			    " WHERE events.job = jobs.number AND events.number > ? ORDER BY events.number LIMIT ?",
+			    " WHERE events.job = jobs.number AND events.number > ?"
+			    " UNION ALL SELECT number, job, 'removed', '{}' FROM removals WHERE number > ?"
+			    " ORDER BY 1 LIMIT ?",
 			    err);
+		query_integer(&query, after);
 	}
 	query_integer(&query, after);
 	query_integer(&query, limit);

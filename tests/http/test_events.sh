@@ -35,6 +35,7 @@ wait_for() { # FILE PATTERN
 	fail "$2 in $(tail -c 600 "$1")"
 }
 threads_and_files() { echo "$(ls "/proc/$(cat "$work/daemon.pid")/task" | wc -l) $(ls "/proc/$(cat "$work/daemon.pid")/fd" | wc -l)"; }
+connections() { curl -s "$url/metrics" | awk '/^cbctd_connections /{ print $2 }'; }
 
 test_a_job_is_told_from_its_first_state_to_its_end() {
 	uploaded_scan
@@ -137,8 +138,6 @@ test_all_jobs_are_told_to_one_watcher() {
 	second=$job
 	wait_job succeeded
 	wait_for "$work/all" "^data: {\"job\":\"$second\",\"state\":\"succeeded\""
-	req GET "/v1/events?after=0" --max-time 1
-	expect_status 200
 	sleep 0.3
 	[ "$(awk '/^event: end/{ n++ } END { print n }' "$work/all")" = 2 ] || fail "both ends"
 	[ "$(told "$work/all" | grep -c "\"job\":\"$first\"")" -ge 5 ] || fail "the first job's"
@@ -147,6 +146,22 @@ test_all_jobs_are_told_to_one_watcher() {
 	start_daemon
 	curl -sS -N --max-time 2 -o "$work/again" "$url/v1/events?after=$(($(ids "$work/all" | head -1) - 1))" || true
 	[ "$(told "$work/again")" = "$(told "$work/all")" ] || fail "the same from the catalogue"
+	# what is removed is told, now and later; the rest of its events is gone
+	: >"$work/all"
+	curl -sS -N --max-time 60 -o "$work/all" "$url/v1/events?after=latest" &
+	wait_for "$work/all" '^retry'
+	req DELETE "/v1/jobs/$first"
+	expect_status 204
+	wait_for "$work/all" "^data: {\"job\":\"$first\"}"
+	stop_daemon
+	wait $! || true
+	[ "$(kinds "$work/all")" = removed ] || fail "the removal alone, got $(kinds "$work/all")"
+	start_daemon
+	req GET "/v1/events?after=0" --max-time 1
+	expect_status 200
+	[ "$(told "$body" | grep "\"job\":\"$first\"")" = "removed {\"job\":\"$first\"}" ] || fail "the removal from the catalogue"
+	[ "$(ids "$body")" = "$(ids "$body" | sort -nu)" ] || fail "numbers that grow"
+	[ "$(ids "$body" | tail -1)" = "$(ids "$work/all")" ] || fail "the removal last"
 }
 
 test_a_silent_job_is_kept_alive_and_dead_clients_are_let_go() {
@@ -162,7 +177,8 @@ test_a_silent_job_is_kept_alive_and_dead_clients_are_let_go() {
 		pids+=($!)
 	done
 	wait_for "$work/quiet" '^event: state'
-	[ "$(curl -s "$url/metrics" | awk '/^cbctd_connections /{ print $2 }')" -ge 21 ] || fail "21 watchers"
+	for ((i = 0; i < 200 && $(connections) < 21; i++)); do sleep 0.05; done
+	[ "$(connections)" -ge 21 ] || fail "21 watchers, got $(connections)"
 	kill -9 "${pids[@]}"
 	wait "${pids[@]}" 2>/dev/null || true
 	wait_for "$work/quiet" '^:$'
