@@ -8,7 +8,6 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <limits.h>
-#include <openssl/evp.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -16,13 +15,15 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
+#include "proto/durable.h"
 #include "proto/format.h"
+#include "proto/saver.h"
 
 _Static_assert(SPOOL_VOLUME_OFFSET == 352, "a NIfTI-1 header and its four extension bytes");
 
 enum {
 	READ_BYTES = 2 << 20, /* projections in one go: small beside the scan, large beside a system call */
-	SLAB_BYTES = 1 << 20  /* voxels in one go, on their way to the disk */
+	PIECE_BYTES = 8 << 20 /* voxels in one go, on their way to the disk */
 };
 
 /* ---- files ---- */
@@ -40,20 +41,6 @@ int file_read_at(int file, void *ret_to, size_t size, size_t offset, const char 
 			return error_set(err, ERR_IO, "%.200s ends at byte %zu, %zu are expected", path, offset + done,
 					 offset + size);
 		done += (size_t)got;
-	}
-	return 0;
-}
-
-static int write_all(int file, const void *from, size_t size, const char *path, struct error *err)
-{
-	for (size_t done = 0; done < size;) {
-		ssize_t put = write(file, (const char *)from + done, size - done);
-
-		if (put < 0 && errno == EINTR)
-			continue;
-		if (put < 0)
-			return error_set_errno(err, errno, "%s cannot be written", path);
-		done += (size_t)put;
 	}
 	return 0;
 }
@@ -96,88 +83,6 @@ out:
 	return code;
 }
 
-/* The names in the directory of `path` reach the disk. */
-static int sync_directory_of(const char *path, struct error *err)
-{
-	char directory[PATH_MAX];
-	const char *slash = strrchr(path, '/');
-	int file, code = 0;
-
-	snprintf(directory, sizeof(directory), "%.*s", slash == NULL ? 1 : (int)(slash - path) + 1,
-		 slash == NULL ? "." : path);
-	file = open(directory, O_RDONLY | O_DIRECTORY | O_CLOEXEC);
-	if (file < 0)
-		return error_set_errno(err, errno, "%s cannot be opened", directory);
-	if (fsync(file) != 0)
-		code = error_set_errno(err, errno, "%s cannot be synced", directory);
-	close(file);
-	return code;
-}
-
-/* A file on its way to its name. */
-struct durable {
-	int file; /* descriptor, -1 once closed */
-	const char *path;
-	char beside[PATH_MAX];
-};
-
-/* `size` bytes are set aside at once, so that a full disk is met before the work and not within it. */
-static int durable_open(struct durable *ret, const char *path, size_t size, struct error *err)
-{
-	struct durable d = {.path = path};
-	int code;
-
-	if (snprintf(d.beside, sizeof(d.beside), "%s.tmp", path) >= (int)sizeof(d.beside))
-		return error_set(err, ERR_INVALID, "a path of %zu bytes is too long", strlen(path));
-	d.file = open(d.beside, O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, 0640);
-	if (d.file < 0)
-		return error_set_errno(err, errno, "%s cannot be created", d.beside);
-	/* File systems that cannot set space aside say so; the writes will then tell. */
-	if (size > 0 && fallocate(d.file, 0, 0, (off_t)size) != 0 && errno != EOPNOTSUPP && errno != EINTR) {
-		code = error_set_errno(err, errno, "%zu bytes for %s", size, d.beside);
-		close(d.file);
-		unlink(d.beside);
-		return code;
-	}
-	*ret = d;
-	return 0;
-}
-
-/* Nothing half-written stays behind. */
-static void durable_abandon(struct durable *d)
-{
-	if (d->file >= 0)
-		close(d->file);
-	d->file = -1;
-	unlink(d->beside);
-}
-
-static int durable_rename(struct durable *d, struct error *err)
-{
-	int code = 0;
-
-	if (rename(d->beside, d->path) != 0)
-		code = error_set_errno(err, errno, "%s cannot be renamed", d->beside);
-	return code != 0 ? code : sync_directory_of(d->path, err);
-}
-
-/* Gives the file its name, or abandons it. */
-static int durable_commit(struct durable *d, struct error *err)
-{
-	int code = 0;
-
-	if (fdatasync(d->file) != 0)
-		code = error_set_errno(err, errno, "%s cannot be synced", d->beside);
-	if (close(d->file) != 0 && code == 0)
-		code = error_set_errno(err, errno, "%s cannot be closed", d->beside);
-	d->file = -1;
-	if (code == 0)
-		code = durable_rename(d, err);
-	if (code != 0)
-		durable_abandon(d);
-	return code;
-}
-
 int file_write_durable(const char *path, const void *data, size_t length, struct error *err)
 {
 	struct durable d;
@@ -185,7 +90,7 @@ int file_write_durable(const char *path, const void *data, size_t length, struct
 
 	if (code != 0)
 		return code;
-	code = write_all(d.file, data, length, d.beside, err);
+	code = durable_write(&d, data, length, err);
 	if (code != 0) {
 		durable_abandon(&d);
 		return code;
@@ -305,12 +210,26 @@ struct run {
 	struct saved_volume saved;
 	char saved_stage[16];
 	int saved_iteration;
+	/* The one that is on its way to the disk while the run goes on: settle. */
+	struct saver *saver; /* NULL before the first */
+	struct saved_volume saving;
+	struct kept_volume saving_kept;
+	char saving_name[32];
+	struct error trouble; /* what stopped the run from a question of its */
 };
 
+static int settle(struct run *run, bool wait, struct error *err);
+
+/* Asked so often that a volume is told of soon after it is saved. */
 static bool run_cancelled(void *context)
 {
-	const struct spool_hooks *hooks = ((struct run *)context)->hooks;
+	struct run *run = context;
+	const struct spool_hooks *hooks = run->hooks;
 
+	if (run->trouble.code == 0)
+		settle(run, false, &run->trouble);
+	if (run->trouble.code != 0)
+		return true;
 	return hooks->recon.cancelled != NULL && hooks->recon.cancelled(hooks->recon.context);
 }
 
@@ -345,89 +264,99 @@ static void run_warning(void *context, const char *code, const char *detail)
 		hooks->recon.warning(hooks->recon.context, code, detail);
 }
 
-/* The iterate behind what the file holds already, slab by slab; digest may be NULL. */
-static int write_iterate(struct recon *recon, struct durable *d, EVP_MD_CTX *digest, struct error *err)
+/* ---- kept volumes ---- */
+
+/* Slices of one piece: whole ones, at least one. */
+static int slices_of_a_piece(const struct grid *grid, size_t *ret_slice)
+{
+	size_t slice = (size_t)grid->size[0] * (size_t)grid->size[1] * sizeof(float);
+	int slices = slice < PIECE_BYTES ? (int)(PIECE_BYTES / slice) : 1;
+
+	*ret_slice = slice;
+	return slices < grid->size[2] ? slices : grid->size[2];
+}
+
+/* The iterate as it is now goes to the saver, which writes it while the work goes on. */
+static int hand_over(struct run *run, struct recon *recon, struct error *err)
 {
 	const struct grid *grid = recon_grid(recon);
-	size_t slice = (size_t)grid->size[0] * (size_t)grid->size[1] * sizeof(float);
-	int slab = slice < SLAB_BYTES ? (int)(SLAB_BYTES / slice) : 1, code = 0;
-	float *voxels;
+	size_t slice;
+	int slices = slices_of_a_piece(grid, &slice), code = 0;
 
-	if (slab > grid->size[2])
-		slab = grid->size[2];
-	voxels = malloc((size_t)slab * slice);
-	if (voxels == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for a slab of %zu bytes", (size_t)slab * slice);
-	for (int z = 0; z < grid->size[2] && code == 0; z += slab) {
-		int count = z + slab <= grid->size[2] ? slab : grid->size[2] - z;
-		size_t bytes = (size_t)count * slice;
+	for (int z = 0; z < grid->size[2] && code == 0; z += slices) {
+		int count = z + slices <= grid->size[2] ? slices : grid->size[2] - z;
+		void *piece = saver_piece(run->saver);
 
-		code = recon_read(recon, z, count, voxels, err);
-		if (code == 0 && digest != NULL && EVP_DigestUpdate(digest, voxels, bytes) != 1)
-			code = error_set(err, ERR_INTERNAL, "SHA-256 failed");
-		if (code == 0)
-			code = write_all(d->file, voxels, bytes, d->beside, err);
+		if (piece == NULL) {
+			code = error_set(err, ERR_NO_MEMORY, "no memory for %d slices of %zu bytes", count, slice);
+			break;
+		}
+		code = recon_read(recon, z, count, piece, err);
+		saver_give(run->saver, piece, (size_t)count * slice);
 	}
-	free(voxels);
+	if (code == 0)
+		saver_end(run->saver);
+	else
+		saver_abandon(run->saver);
 	return code;
 }
 
+static int open_saver(struct run *run, const struct grid *grid, struct error *err)
+{
+	size_t slice;
+	int slices = slices_of_a_piece(grid, &slice);
+
+	return run->saver != NULL ? 0 : saver_new((size_t)slices * slice, &run->saver, err);
+}
+
+static int announce(struct run *run, const struct kept_volume *kept, const struct saved_volume *saved,
+		    struct error *err)
+{
+	run->saved = *saved;
+	run->saved_iteration = kept->iteration;
+	snprintf(run->saved_stage, sizeof(run->saved_stage), "%s", kept->stage);
+	if (run->hooks->on_volume == NULL)
+		return 0;
+	return run->hooks->on_volume(run->hooks->recon.context, kept, saved, err);
+}
+
+/* Tells of the volume that was being saved, once it is; waits for that where it must. */
+static int settle(struct run *run, bool wait, struct error *err)
+{
+	bool done;
+	int code;
+
+	if (run->saver == NULL || !saver_busy(run->saver))
+		return 0;
+	code = saver_finish(run->saver, wait, &done, run->saving.sha256, err);
+	if (code != 0 || !done)
+		return code;
+	return announce(run, &run->saving_kept, &run->saving, err);
+}
+
 /* Header and voxels under the volume's own name. */
-static int save_volume(struct recon *recon, const struct kept_volume *kept, struct saved_volume *ret_saved,
-		       struct error *err)
+static int begin_volume(struct run *run, struct recon *recon, const struct kept_volume *kept,
+			const struct saved_volume *saved, struct error *err)
 {
 	uint8_t header[FORMAT_HEADER_MAX];
 	char description[80];
-	struct durable d;
-	EVP_MD_CTX *digest = EVP_MD_CTX_new();
 	size_t length;
-	int code;
+	int code = open_saver(run, kept->grid, err);
 
-	if (digest == NULL || EVP_DigestInit_ex(digest, EVP_sha256(), NULL) != 1) {
-		EVP_MD_CTX_free(digest);
-		return error_set(err, ERR_NO_MEMORY, "no memory for SHA-256");
-	}
-	code = durable_open(&d, ret_saved->path, SPOOL_VOLUME_OFFSET + ret_saved->bytes, err);
 	if (code != 0)
-		goto out;
+		return code;
 	/* Nothing of the name: "final" may be a link to this file. */
 	snprintf(description, sizeof(description), "attenuation in 1/mm, %s, iteration %d", kept->stage,
 		 kept->iteration);
 	length = volume_formats[0].header(kept->grid, VOLUME_FLOAT32, description, header);
-	code = write_all(d.file, header, length, d.beside, err);
-	if (code == 0)
-		code = write_iterate(recon, &d, digest, err);
-	if (code == 0 && EVP_DigestFinal_ex(digest, ret_saved->sha256, NULL) != 1)
-		code = error_set(err, ERR_INTERNAL, "SHA-256 failed");
+	code = saver_begin(run->saver, saved->path, header, length, saved->bytes, err);
 	if (code != 0)
-		durable_abandon(&d);
-	else
-		code = durable_commit(&d, err);
-out:
-	EVP_MD_CTX_free(digest);
-	return code;
-}
-
-/* Another name for a volume that is on the disk; *ret_linked false where the file system knows no links. */
-static int link_volume(const char *from, const char *path, bool *ret_linked, struct error *err)
-{
-	struct durable d = {.file = -1, .path = path};
-	int code;
-
-	if (snprintf(d.beside, sizeof(d.beside), "%s.tmp", path) >= (int)sizeof(d.beside))
-		return error_set(err, ERR_INVALID, "a path of %zu bytes is too long", strlen(path));
-	unlink(d.beside); /* what a crash left */
-	if (link(from, d.beside) != 0) {
-		if (errno == ENOSPC || errno == EDQUOT || errno == EIO)
-			return error_set_errno(err, errno, "%s cannot be linked", d.beside);
-		*ret_linked = false;
-		return 0;
-	}
-	code = durable_rename(&d, err);
-	unlink(d.beside); /* still there when that failed, or did nothing because both were one file already */
-	if (code == 0)
-		*ret_linked = true;
-	return code;
+		return code;
+	run->saving = *saved;
+	run->saving_kept = *kept;
+	snprintf(run->saving_name, sizeof(run->saving_name), "%s", kept->name);
+	run->saving_kept.name = run->saving_name;
+	return hand_over(run, recon, err);
 }
 
 static int run_keep(void *context, struct recon *recon, const struct kept_volume *kept, struct error *err)
@@ -435,23 +364,18 @@ static int run_keep(void *context, struct recon *recon, const struct kept_volume
 	struct run *run = context;
 	struct saved_volume saved = {.bytes = grid_voxels(kept->grid) * sizeof(float)};
 	bool linked = false;
-	int code = join(saved.path, sizeof(saved.path), run->directory, kept->name, ".nii", err);
+	int code = settle(run, true, err);
 
+	if (code == 0)
+		code = join(saved.path, sizeof(saved.path), run->directory, kept->name, ".nii", err);
 	if (code == 0 && run->saved.bytes > 0 && run->saved_iteration == kept->iteration &&
 	    strcmp(run->saved_stage, kept->stage) == 0) {
 		memcpy(saved.sha256, run->saved.sha256, sizeof(saved.sha256));
-		code = link_volume(run->saved.path, saved.path, &linked, err);
+		code = durable_link(run->saved.path, saved.path, &linked, err);
 	}
-	if (code == 0 && !linked)
-		code = save_volume(recon, kept, &saved, err);
 	if (code != 0)
 		return code;
-	run->saved = saved;
-	run->saved_iteration = kept->iteration;
-	snprintf(run->saved_stage, sizeof(run->saved_stage), "%s", kept->stage);
-	if (run->hooks->on_volume != NULL)
-		code = run->hooks->on_volume(run->hooks->recon.context, kept, &saved, err);
-	return code;
+	return linked ? announce(run, kept, &saved, err) : begin_volume(run, recon, kept, &saved, err);
 }
 
 /* ---- checkpoints ---- */
@@ -467,6 +391,27 @@ static void checkpoint_line(char ret_line[SPOOL_CHECKPOINT_OFFSET], int iteratio
 	ret_line[SPOOL_CHECKPOINT_OFFSET - 1] = '\n';
 }
 
+/* The iterate behind what the file holds already, piece by piece. */
+static int write_iterate(struct recon *recon, struct durable *d, struct error *err)
+{
+	const struct grid *grid = recon_grid(recon);
+	size_t slice;
+	int slices = slices_of_a_piece(grid, &slice), code = 0;
+	float *voxels = malloc((size_t)slices * slice);
+
+	if (voxels == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for %d slices of %zu bytes", slices, slice);
+	for (int z = 0; z < grid->size[2] && code == 0; z += slices) {
+		int count = z + slices <= grid->size[2] ? slices : grid->size[2] - z;
+
+		code = recon_read(recon, z, count, voxels, err);
+		if (code == 0)
+			code = durable_write(d, voxels, (size_t)count * slice, err);
+	}
+	free(voxels);
+	return code;
+}
+
 static int save_checkpoint(struct recon *recon, const char *directory, struct error *err)
 {
 	char path[PATH_MAX], header[SPOOL_CHECKPOINT_OFFSET];
@@ -478,9 +423,9 @@ static int save_checkpoint(struct recon *recon, const char *directory, struct er
 	if (code != 0)
 		return code;
 	checkpoint_line(header, recon_iteration(recon), recon_grid(recon));
-	code = write_all(d.file, header, sizeof(header), d.beside, err);
+	code = durable_write(&d, header, sizeof(header), err);
 	if (code == 0)
-		code = write_iterate(recon, &d, NULL, err);
+		code = write_iterate(recon, &d, err);
 	if (code != 0) {
 		durable_abandon(&d);
 		return code;
@@ -586,6 +531,13 @@ static int run_pipeline(struct run *run, struct recon *recon, const struct scan_
 		code = push_views(recon, files, err);
 	if (code == 0)
 		code = recon_run(recon, err);
+	/* What was kept is told of, however the run ends. */
+	if (run->trouble.code == 0)
+		settle(run, true, &run->trouble);
+	if (run->trouble.code != 0 && (code == 0 || code == ERR_BUSY || code == ERR_CANCELLED)) {
+		*err = run->trouble;
+		return run->trouble.code;
+	}
 	if (code == ERR_BUSY && save_checkpoint(recon, run->directory, &trouble) != 0) {
 		*err = trouble;
 		code = trouble.code;
@@ -630,6 +582,7 @@ int spool_run(const struct backend *backend, struct device *device, const char *
 		hooks->on_open(hooks->recon.context, &memory, recon_plan(recon));
 	if (code == 0)
 		code = run_pipeline(&run, recon, &files, checkpoint, iteration, err);
+	saver_free(run.saver);
 	recon_free(recon);
 	scan_files_close(&files);
 	return code;
