@@ -518,28 +518,33 @@ int rtk_geometry_views(const struct rtk_geometry *from, const struct rtk_stack *
 /* ---- views to parameters ---- */
 
 /*
- * The detector's axes in RTK's world: rx along the columns' direction, ry across it
- * on the rows' side, rz towards the source. *ret_sign is -1 where the rows then run
- * against ry.
+ * The detector's axes in RTK's world: rx along the columns' direction, ry along the
+ * rows', rz across both towards the source. *ret_sign is -1 where the rows run
+ * against ry. What columns and rows lack of a right angle, each gives half.
  */
 static void view_axes(const struct view *view, double ret_axes[3][3], double *ret_sign)
 {
-	double u[3], v[3], to_source[3], length = vec_norm(view->column_step), along;
+	double u[3], v[3], to_source[3], skew;
+	double length_u = vec_norm(view->column_step), length_v = vec_norm(view->row_step);
 
 	for (int i = 0; i < 3; i++) {
 		int ours = (i + 1) % 3;
 
-		u[i] = view->column_step[ours] / length;
-		v[i] = view->row_step[ours];
+		u[i] = view->column_step[ours] / length_u;
+		v[i] = view->row_step[ours] / length_v;
 		to_source[i] = view->source[ours] - view->pixel0[ours];
 	}
-	along = vec_dot(u, v);
-	for (int i = 0; i < 3; i++)
-		v[i] -= along * u[i];
-	length = vec_norm(v);
-	memcpy(ret_axes[0], u, sizeof(u));
-	for (int i = 0; i < 3; i++)
-		ret_axes[1][i] = v[i] / length;
+	skew = vec_dot(u, v);
+	for (int i = 0; i < 3; i++) {
+		ret_axes[0][i] = u[i] - 0.5 * skew * v[i];
+		ret_axes[1][i] = v[i] - 0.5 * skew * u[i];
+	}
+	length_u = vec_norm(ret_axes[0]);
+	length_v = vec_norm(ret_axes[1]);
+	for (int i = 0; i < 3; i++) {
+		ret_axes[0][i] /= length_u;
+		ret_axes[1][i] /= length_v;
+	}
 	vec_cross(ret_axes[0], ret_axes[1], ret_axes[2]);
 	*ret_sign = 1;
 	if (vec_dot(ret_axes[2], to_source) < 0) {
@@ -564,25 +569,29 @@ static void axes_angles(double axes[3][3], struct rtk_projection *ret)
 	ret->in_plane_angle = atan2(in_plane_y, in_plane_x) / degree;
 }
 
-static void view_parameters(const struct view *view, const struct rtk_stack *stack, struct rtk_projection *ret)
+/* The stack's origin is its centre, and so is what is held fast of a detector that is not quite rectangular. */
+static void view_parameters(const struct view *view, const struct geometry *geometry, struct rtk_projection *ret)
 {
-	double axes[3][3], sign, source[3], pixel0[3];
+	double axes[3][3], sign, source[3] = {0, 0, 0}, centre[3] = {0, 0, 0};
 
 	view_axes(view, axes, &sign);
 	axes_angles(axes, ret);
-	for (int axis = 0; axis < 3; axis++) {
-		source[axis] = pixel0[axis] = 0;
-		for (int i = 0; i < 3; i++) {
-			source[axis] += axes[axis][i] * view->source[(i + 1) % 3];
-			pixel0[axis] += axes[axis][i] * view->pixel0[(i + 1) % 3];
+	for (int i = 0; i < 3; i++) {
+		int ours = (i + 1) % 3;
+		double at = view->pixel0[ours] + 0.5 * (geometry->columns - 1) * view->column_step[ours] +
+			    0.5 * (geometry->rows - 1) * view->row_step[ours];
+
+		for (int axis = 0; axis < 3; axis++) {
+			source[axis] += axes[axis][i] * view->source[ours];
+			centre[axis] += axes[axis][i] * at;
 		}
 	}
 	for (int i = 0; i < 2; i++) {
 		ret->source_offset[i] = source[i];
-		ret->projection_offset[i] = pixel0[i] - stack->origin[i];
+		ret->projection_offset[i] = centre[i];
 	}
 	ret->source_to_isocentre = source[2];
-	ret->source_to_detector = source[2] - pixel0[2];
+	ret->source_to_detector = source[2] - centre[2];
 }
 
 /* What RTK has one number for in a whole stack: pitch, square corners, handedness. */
@@ -627,12 +636,13 @@ int rtk_geometry_from_views(const struct geometry *from, double tolerance, struc
 			    struct rtk_stack *ret_stack, struct error *err)
 {
 	struct rtk_geometry geometry = {.count = from->count};
+	const struct view *first = &from->views[0];
 	struct rtk_stack stack = {
-	    {0, 0}, {vec_norm(from->views[0].column_step), 0}, {0, vec_norm(from->views[0].row_step)}};
+	    {0, 0}, {neat(vec_norm(first->column_step), 1e-13), 0}, {0, neat(vec_norm(first->row_step), 1e-13)}};
 	double axes[3][3], sign;
 	int code = 0;
 
-	view_axes(&from->views[0], axes, &sign);
+	view_axes(first, axes, &sign);
 	stack.row_step[1] *= sign;
 	stack.origin[0] = -0.5 * (from->columns - 1) * stack.column_step[0];
 	stack.origin[1] = -0.5 * (from->rows - 1) * stack.row_step[1];
@@ -645,7 +655,7 @@ int rtk_geometry_from_views(const struct geometry *from, double tolerance, struc
 		code = check_pixels(from, k, &stack, tolerance, err);
 		if (code != 0)
 			break;
-		view_parameters(&from->views[k], &stack, p);
+		view_parameters(&from->views[k], from, p);
 		for (int i = 0; i < PARAMETERS_WRITTEN; i++)
 			*parameter_of(p, i) = neat(*parameter_of(p, i), parameters[i].equal);
 		parameters_matrix(p, p->matrix);

@@ -13,8 +13,9 @@
 #include "clients/cbct/commands.h"
 
 static const struct command *const commands[] = {
-    &command_simulate, &command_upload, &command_submit, &command_watch, &command_get,    &command_recon,
-    &command_compare,  &command_slice,  &command_scans,  &command_jobs,  &command_status, &command_rm,
+    &command_simulate, &command_import, &command_upload,  &command_submit,          &command_watch,
+    &command_get,      &command_recon,  &command_compare, &command_slice,           &command_scans,
+    &command_jobs,     &command_status, &command_rm,      &command_export_geometry,
 };
 enum { COMMAND_COUNT = sizeof(commands) / sizeof(commands[0]) };
 
@@ -22,7 +23,7 @@ static int help_all(FILE *to)
 {
 	fprintf(to, "usage: cbct COMMAND [arguments]\n\n");
 	for (int i = 0; i < COMMAND_COUNT; i++)
-		fprintf(to, "  %-10s %s\n", commands[i]->name, commands[i]->summary);
+		fprintf(to, "  %-15s %s\n", commands[i]->name, commands[i]->summary);
 	fprintf(to, "\n`cbct COMMAND --help` says more.\n");
 	return to == stdout ? EXIT_SUCCESS : 2;
 }

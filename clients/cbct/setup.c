@@ -11,6 +11,7 @@
 #include <string.h>
 
 #include "clients/cbct/rng.h"
+#include "clients/cbct/view_json.h"
 #include "proto/spool.h"
 
 /* How the geometry is written. */
@@ -124,17 +125,6 @@ static void view_wobble(struct view *view, double turn, double wobble, uint64_t 
 									 vec_norm(view->row_step) /
 									 vec_norm(view->column_step);
 	memcpy(view->column_step, turned, sizeof(turned));
-}
-
-static cJSON *view_json(const struct view *view)
-{
-	cJSON *json = cJSON_CreateObject();
-
-	cJSON_AddItemToObject(json, "source_mm", numbers(view->source, 3));
-	cJSON_AddItemToObject(json, "pixel0_mm", numbers(view->pixel0, 3));
-	cJSON_AddItemToObject(json, "column_step_mm", numbers(view->column_step, 3));
-	cJSON_AddItemToObject(json, "row_step_mm", numbers(view->row_step, 3));
-	return json;
 }
 
 static cJSON *vectors_json(const struct setup_options *options, const struct geometry *geometry)

@@ -1,16 +1,15 @@
 /* cbct simulate: a scan directory (proto/spool.h) made from a phantom or a volume. */
 #include <errno.h>
-#include <fcntl.h>
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
-#include <sys/stat.h>
 #include <unistd.h>
 
 #include "clients/cbct/commands.h"
 #include "clients/cbct/noise.h"
 #include "clients/cbct/object.h"
 #include "clients/cbct/progress.h"
+#include "clients/cbct/scan_output.h"
 #include "clients/cbct/setup.h"
 #include "clients/cbct/volume_output.h"
 #include "proto/spool.h"
@@ -81,58 +80,6 @@ static const struct option_group groups[] = {
     {0},
 };
 
-/* A file of the scan directory, written from its beginning. */
-static int create(const char *directory, const char *name, int *ret_fd, struct error *err)
-{
-	char path[1200];
-	int fd;
-
-	snprintf(path, sizeof(path), "%s/%s", directory, name);
-	fd = open(path, O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, 0666);
-	if (fd < 0)
-		return error_set_errno(err, errno, "%s", path);
-	*ret_fd = fd;
-	return 0;
-}
-
-static int write_all(int fd, const void *data, size_t length, struct error *err)
-{
-	const char *at = data;
-
-	while (length > 0) {
-		ssize_t written = write(fd, at, length);
-
-		if (written < 0 && errno != EINTR)
-			return error_set_errno(err, errno, "the scan directory cannot be written");
-		if (written > 0) {
-			at += written;
-			length -= (size_t)written;
-		}
-	}
-	return 0;
-}
-
-static int write_file(const char *directory, const char *name, const void *data, size_t length, struct error *err)
-{
-	int fd = -1, code = create(directory, name, &fd, err);
-
-	if (code == 0)
-		code = write_all(fd, data, length, err);
-	if (fd >= 0 && close(fd) != 0 && code == 0)
-		code = error_set_errno(err, errno, "%s/%s", directory, name);
-	return code;
-}
-
-static int write_document(const char *directory, const struct scan *scan, struct error *err)
-{
-	char *text = json_print(scan->document, NULL);
-	int code = text != NULL ? write_file(directory, "scan.json", text, strlen(text), err)
-				: error_set(err, ERR_NO_MEMORY, "no memory for a scan document");
-
-	free(text);
-	return code;
-}
-
 /* All views, in order, with what the detector makes of them. */
 static int write_projections(const struct simulate_options *options, const struct noise *noise,
 			     const struct object *object, const struct scan *scan, const float *flat, const float *dark,
@@ -146,11 +93,11 @@ static int write_projections(const struct simulate_options *options, const struc
 
 	code = projection == NULL || samples == NULL
 		   ? error_set(err, ERR_NO_MEMORY, "no memory for a projection of %zu pixels", pixels)
-		   : create(options->output, "projections.raw", &fd, err);
+		   : scan_output_create(options->output, "projections.raw", &fd, err);
 	for (int view = 0; view < scan->count && code == 0; view++) {
 		object_project(object, &scan->geometry, view, projection);
 		noise_apply(noise, view, scan->geometry.columns, scan->geometry.rows, projection, flat, dark, samples);
-		code = write_all(fd, samples, scan_projection_bytes(scan), err);
+		code = scan_output_write(fd, samples, scan_projection_bytes(scan), err);
 		progress_show(progress, (double)(view + 1) / scan->count, -1, "view %d of %d", view + 1, scan->count);
 	}
 	if (fd >= 0 && close(fd) != 0 && code == 0)
@@ -191,28 +138,15 @@ static int write_truth(const struct simulate_options *options, const struct obje
 	return volume_write(options->truth.path, &object->grid, object->voxels, err);
 }
 
-/* What an earlier simulation may have left, and this one may not write again. */
-static void remove_old(const char *directory)
-{
-	static const char *const names[] = {"scan.json", "flat.f32", "dark.f32"};
-	char path[1200];
-
-	for (size_t i = 0; i < sizeof(names) / sizeof(names[0]); i++) {
-		snprintf(path, sizeof(path), "%s/%s", directory, names[i]);
-		unlink(path);
-	}
-}
-
 static int write_scan(const struct simulate_options *options, const struct noise *noise, const struct object *object,
 		      const struct scan *scan, struct error *err)
 {
 	size_t pixels = (size_t)scan->geometry.columns * (size_t)scan->geometry.rows;
 	float *flat = NULL, *dark = NULL;
-	int code = 0;
+	int code = scan_output_begin(options->output, err);
 
-	if (mkdir(options->output, 0777) != 0 && errno != EEXIST)
-		return error_set_errno(err, errno, "%s", options->output);
-	remove_old(options->output);
+	if (code != 0)
+		return code;
 	if (noise->structure) {
 		flat = malloc(pixels * sizeof(*flat));
 		dark = malloc(pixels * sizeof(*dark));
@@ -221,9 +155,9 @@ static int write_scan(const struct simulate_options *options, const struct noise
 			goto out;
 		}
 		noise_images(noise, scan->geometry.columns, scan->geometry.rows, flat, dark);
-		code = write_file(options->output, "flat.f32", flat, pixels * sizeof(*flat), err);
+		code = scan_output_file(options->output, "flat.f32", flat, pixels * sizeof(*flat), err);
 		if (code == 0)
-			code = write_file(options->output, "dark.f32", dark, pixels * sizeof(*dark), err);
+			code = scan_output_file(options->output, "dark.f32", dark, pixels * sizeof(*dark), err);
 	}
 	if (code == 0 && options->truth.path != NULL)
 		code = write_truth(options, object, err);
@@ -231,7 +165,7 @@ static int write_scan(const struct simulate_options *options, const struct noise
 		code = write_projections(options, noise, object, scan, flat, dark, err);
 	/* Last: a directory with a document is whole. */
 	if (code == 0)
-		code = write_document(options->output, scan, err);
+		code = scan_output_document(options->output, scan, err);
 out:
 	free(flat);
 	free(dark);

@@ -17,35 +17,37 @@
 #include <openssl/evp.h>
 
 #include "clients/cbct/commands.h"
-#include "clients/cbct/http.h"
 #include "clients/cbct/progress.h"
+#include "clients/cbct/upload.h"
 #include "proto/spool.h"
 #include "proto/zstream.h"
 
 enum { CONNECTIONS_MAX = 64, RUN_BYTES = 16 << 20 };
 
 struct upload_options {
-	const char *directory, *scan;
-	long connections, run;
-	bool zstd, quiet;
-	struct http_options http;
+	const char *directory;
+	struct upload_settings settings;
 };
 
 #define ROW(name, kind, member, argument, help, least, most)                                                           \
 	{                                                                                                              \
-		name, 0, kind, offsetof(struct upload_options, member), argument, help, least, most, 0, NULL           \
+		name, 0, kind, offsetof(struct upload_settings, member), argument, help, least, most, 0, NULL          \
 	}
-static const struct option rows[] = {
-    ROW("scan", OPTION_TEXT, scan, "ID", "go on with a scan that was begun: only what is missing is sent", 0, 0),
+const struct option upload_rows[] = {
     ROW("connections", OPTION_INTEGER, connections, "N", "at once", 1, CONNECTIONS_MAX),
     ROW("run", OPTION_INTEGER, run, "N", "projections in one request (default: about 16 MB)", 1, VIEWS_MAX),
     ROW("zstd", OPTION_FLAG, zstd, NULL, "compress on the way", 0, 0),
     ROW("quiet", OPTION_FLAG, quiet, NULL, "no progress bar", 0, 0),
     {0},
 };
+static const struct option scan_rows[] = {
+    ROW("scan", OPTION_TEXT, scan, "ID", "go on with a scan that was begun: only what is missing is sent", 0, 0),
+    {0},
+};
 static const struct option_group groups[] = {
-    {"options", rows, 0},
-    {"", http_option_rows, offsetof(struct upload_options, http)},
+    {"options", scan_rows, offsetof(struct upload_options, settings)},
+    {"", upload_rows, offsetof(struct upload_options, settings)},
+    {"", http_option_rows, offsetof(struct upload_options, settings.http)},
     {0},
 };
 
@@ -55,7 +57,7 @@ struct run {
 
 /* Shared by the connections. */
 struct upload {
-	const struct upload_options *options;
+	const struct upload_settings *options;
 	char id[64];
 	size_t one;               /* bytes of a projection */
 	const unsigned char *all; /* projections.raw, mapped */
@@ -336,19 +338,18 @@ static int upload_files(struct upload *upload, const struct scan_files *files, s
 	return code;
 }
 
-static int upload_run(const void *values, struct error *err)
+int upload_directory(const char *directory, const struct upload_settings *settings, struct error *err)
 {
-	const struct upload_options *options = values;
-	struct upload upload = {.options = options};
+	struct upload upload = {.options = settings};
 	struct scan_files files;
-	int code = scan_files_open(options->directory, &files, err);
+	int code = scan_files_open(directory, &files, err);
 
 	if (code != 0)
 		return code;
 	upload.one = scan_projection_bytes(files.scan);
 	code = map_projections(&upload, &files, err);
 	if (code == 0) {
-		if (!options->quiet)
+		if (!settings->quiet)
 			upload.progress = progress_new(stderr, PROGRESS_BAR_ONLY, "uploading");
 		code = upload_files(&upload, &files, err);
 		progress_free(upload.progress);
@@ -359,7 +360,14 @@ static int upload_run(const void *values, struct error *err)
 	return code;
 }
 
-static const struct upload_options defaults = {.connections = 4, .run = OPTION_UNSET_INTEGER};
+static int upload_run(const void *values, struct error *err)
+{
+	const struct upload_options *options = values;
+
+	return upload_directory(options->directory, &options->settings, err);
+}
+
+static const struct upload_options defaults = {.settings = UPLOAD_DEFAULTS};
 static const struct positional positionals[] = {
     {"DIR", "a scan directory: scan.json, projections.raw", offsetof(struct upload_options, directory), true},
     {0},

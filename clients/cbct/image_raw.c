@@ -1,0 +1,147 @@
+/*
+ * Plain numbers [image][row][column] in a file: raw files, of which the command
+ * line must tell size and type, and NumPy arrays, which tell it themselves.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <math.h>
+#include <stdlib.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include "clients/cbct/images.h"
+#include "clients/cbct/npy.h"
+#include "proto/spool.h"
+
+struct plain {
+	int file;
+	size_t start, bytes; /* of the first image in the file, of one image */
+	bool big_endian;
+	unsigned char *image;
+};
+
+static void plain_close(struct image_file *file)
+{
+	struct plain *plain = file->state;
+
+	if (plain == NULL)
+		return;
+	if (plain->file >= 0)
+		close(plain->file);
+	free(plain->image);
+	free(plain);
+}
+
+/* Opens the file; its length is *ret_length. */
+static int plain_new(struct image_file *file, const char *path, size_t *ret_length, struct error *err)
+{
+	struct plain *plain = calloc(1, sizeof(*plain));
+	struct stat status;
+
+	if (plain == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a file");
+	file->state = plain;
+	plain->file = open(path, O_RDONLY | O_CLOEXEC);
+	if (plain->file < 0 || fstat(plain->file, &status) != 0)
+		return error_set_errno(err, errno, "%s cannot be opened", path);
+	*ret_length = (size_t)status.st_size;
+	return 0;
+}
+
+static int plain_room(struct image_file *file, struct error *err)
+{
+	struct plain *plain = file->state;
+
+	plain->bytes = (size_t)file->columns * (size_t)file->rows * pixel_bytes(file->type);
+	plain->image = malloc(plain->bytes);
+	return plain->image != NULL ? 0 : error_set(err, ERR_NO_MEMORY, "no memory for %zu bytes", plain->bytes);
+}
+
+static int plain_read(struct image_file *file, int index, float *ret_pixels, struct error *err)
+{
+	struct plain *plain = file->state;
+	int code = file_read_at(plain->file, plain->image, plain->bytes, plain->start + (size_t)index * plain->bytes,
+				"the file", err);
+
+	if (code == 0)
+		pixels_to_float(plain->image, file->type, plain->big_endian, (size_t)file->columns * (size_t)file->rows,
+				ret_pixels);
+	return code;
+}
+
+static int raw_open(struct image_file *file, const char *path, const struct image_options *options, struct error *err)
+{
+	struct plain *plain;
+	size_t length = 0, pixels;
+	int code;
+
+	if (isnan(options->size[0]) || options->type == OPTION_UNSET_CHOICE)
+		return error_set(err, ERR_USAGE,
+				 "it is no format that tells its size: raw images need --size and --type");
+	if (options->size[0] != rint(options->size[0]) || options->size[1] != rint(options->size[1]))
+		return error_set(err, ERR_USAGE, "--size: whole numbers are expected");
+	code = plain_new(file, path, &length, err);
+	if (code != 0)
+		return code;
+	plain = file->state;
+	file->columns = (int)options->size[0];
+	file->rows = (int)options->size[1];
+	file->type = (enum pixel_type)options->type;
+	plain->start = (size_t)options->header;
+	plain->big_endian = options->big_endian;
+	code = plain_room(file, err);
+	if (code != 0)
+		return code;
+	pixels = length > plain->start ? length - plain->start : 0;
+	if (pixels == 0 || pixels % plain->bytes != 0)
+		return error_set(err, ERR_INVALID,
+				 "%zu bytes behind %zu of header are no whole images of %d x %d %s, %zu bytes each",
+				 pixels, plain->start, file->columns, file->rows, pixel_type_names[file->type],
+				 plain->bytes);
+	if (pixels / plain->bytes > VIEWS_MAX)
+		return error_set(err, ERR_IMPOSSIBLE, "%zu images, at most %d are expected", pixels / plain->bytes,
+				 VIEWS_MAX);
+	file->count = (int)(pixels / plain->bytes);
+	return 0;
+}
+
+static int npy_open(struct image_file *file, const char *path, const struct image_options *options, struct error *err)
+{
+	struct plain *plain;
+	struct npy npy;
+	char head[NPY_HEAD_MAX];
+	size_t length = 0, expected, head_length;
+	int code = plain_new(file, path, &length, err);
+
+	(void)options;
+	if (code != 0)
+		return code;
+	plain = file->state;
+	head_length = length < sizeof(head) ? length : sizeof(head);
+	code = file_read_at(plain->file, head, head_length, 0, path, err);
+	if (code == 0)
+		code = npy_parse(head, head_length, &npy, err);
+	if (code != 0)
+		return code;
+	if (npy.dimensions != 2 && npy.dimensions != 3)
+		return error_set(err, ERR_INVALID, "an array of %d dimensions, [image][row][column] are expected",
+				 npy.dimensions);
+	for (int i = 0; i < npy.dimensions; i++)
+		if (npy.shape[i] > VIEWS_MAX)
+			return error_set(err, ERR_IMPOSSIBLE, "an array with a side of %zu, at most %d are expected",
+					 npy.shape[i], VIEWS_MAX);
+	file->count = npy.dimensions == 3 ? (int)npy.shape[0] : 1;
+	file->rows = (int)npy.shape[npy.dimensions - 2];
+	file->columns = (int)npy.shape[npy.dimensions - 1];
+	file->type = npy.type;
+	plain->start = npy.start;
+	plain->big_endian = npy.big_endian;
+	code = plain_room(file, err);
+	expected = plain->start + (size_t)file->count * plain->bytes;
+	if (code == 0 && length < expected)
+		code = error_set(err, ERR_INVALID, "%zu bytes, %zu are expected", length, expected);
+	return code;
+}
+
+const struct image_format image_raw = {"raw", NULL, raw_open, plain_read, plain_close};
+const struct image_format image_npy = {"NumPy", npy_recognise, npy_open, plain_read, plain_close};

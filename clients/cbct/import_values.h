@@ -1,0 +1,37 @@
+#ifndef CBCT_CLIENTS_IMPORT_VALUES_H
+#define CBCT_CLIENTS_IMPORT_VALUES_H
+
+#include <cjson/cJSON.h>
+
+#include "clients/cbct/images.h"
+#include "proto/scan.h"
+
+/* What the numbers of images mean: what the command line says, or what they look like. */
+struct import_values {
+	int quantity, sample; /* enum quantity, enum sample, or unset */
+	double air;           /* counts; NaN: not given */
+	double saturation;    /* counts; NaN: not given */
+	const char *flat, *dark;
+	double scale, bias; /* a value is scale * stored + bias */
+};
+extern const struct option import_value_rows[];
+#define IMPORT_VALUES_DEFAULTS                                                                                         \
+	{                                                                                                              \
+		.quantity = OPTION_UNSET_CHOICE, .sample = OPTION_UNSET_CHOICE, .air = OPTION_UNSET_NUMBER,            \
+		.saturation = OPTION_UNSET_NUMBER, .scale = 1                                                          \
+	}
+
+/* Member "projections" of a scan's document; the caller's. Looks through all images where it must. */
+int import_values(const struct import_values *options, struct images *images, cJSON **ret_projections,
+		  struct error *err);
+
+/* Image `index` as the scan's samples; `pixels` is scratch of as many floats. ERR_IMPOSSIBLE for counts beyond uint16.
+ */
+int import_samples(const struct import_values *options, struct images *images, int index, enum sample sample,
+		   float *pixels, void *ret_samples, struct error *err);
+
+/* The mean of the images at `path`, which must be as large as the projections; [row][column]. */
+int import_mean(const struct import_values *options, const struct image_options *how, const char *path,
+		const struct images *like, float *ret_mean, struct error *err);
+
+#endif

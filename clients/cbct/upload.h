@@ -1,0 +1,22 @@
+#ifndef CBCT_CLIENTS_UPLOAD_H
+#define CBCT_CLIENTS_UPLOAD_H
+
+#include "clients/cbct/http.h"
+
+/* How a scan directory goes to the daemon. */
+struct upload_settings {
+	const char *scan; /* go on with this one; NULL: a new one */
+	long connections, run;
+	bool zstd, quiet;
+	struct http_options http;
+};
+extern const struct option upload_rows[]; /* connections, run, zstd, quiet */
+#define UPLOAD_DEFAULTS                                                                                                \
+	{                                                                                                              \
+		.connections = 4, .run = OPTION_UNSET_INTEGER                                                          \
+	}
+
+/* Prints the scan's id on standard output as soon as it has one. */
+int upload_directory(const char *directory, const struct upload_settings *settings, struct error *err);
+
+#endif
