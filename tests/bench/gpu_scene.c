@@ -114,7 +114,8 @@ void scene_make(struct scene *ret_scene, const char *name, const struct scene_op
 	must(grid_check(&scene.grid, &err), &err, name);
 	must(grid_check_geometry(&scene.grid, &scene.geometry, &err), &err, name);
 	must(orbit_analyse(&scene.orbit, &scene.geometry, &err), &err, name);
-	must(fdk_weights_make(&scene.weights, &scene.orbit, &scene.geometry, options->window, 1, &err), &err, name);
+	must(fdk_weights_make(&scene.weights, &scene.orbit, &scene.geometry, options->window, 1, options->extend, &err),
+	     &err, name);
 	*ret_scene = scene;
 }
 
@@ -139,6 +140,8 @@ struct plan_options scene_plan(const struct scene *scene, struct sart_options *s
 	    .column_weights = scene->weights.columns,
 	    .filter_response = scene->weights.response,
 	    .pad = {scene->weights.pad[0], scene->weights.pad[1]},
+	    .extend = scene->weights.extend,
+	    .extended_response = scene->weights.extended,
 	    .sart = subsets > 0 ? sart : NULL,
 	    .tv = tv,
 	    .reference_precision = reference,

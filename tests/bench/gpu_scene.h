@@ -29,6 +29,7 @@ struct scene_options {
 	double spacing[3];
 	enum bend bend;
 	enum window window;
+	bool extend; /* truncated rows, where the backend can */
 };
 
 /* Source to isocentre 620 mm, source to detector 1100 mm. Exits on failure: these are test programs. */
