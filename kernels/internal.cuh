@@ -149,6 +149,9 @@ struct device_view {
  * row to row that the compiler knows: there the fast axis is cut into panels,
  * [slice][panel][row][PANEL], the last SLICE_SHARED values of a panel being the
  * first of the next, so that the four columns of a sample are always in one.
+ *
+ * A value is a float or, in standard precision, a __half2 of the voxel and the
+ * next one along the row axis: one load brings both that a sample lies between.
  */
 enum { SLICE_PAD = 8, SLICE_HELD = 2, PANEL = 64, SLICE_SHARED = 3, SLICE_STEP = PANEL - SLICE_SHARED };
 struct slices_shape {
@@ -204,7 +207,8 @@ struct device_grid {
 struct plan_shape {
 	bool untilted;     /* the fast kernels apply */
 	bool rows_down;    /* untilted, and rows count against z */
-	int forward_rows;  /* rows of one thread in the untilted forward projection; 0: the general one */
+	int forward_rows;  /* rows of one thread in the forward projection by rows; 0: the general one */
+	bool halves;       /* the forward projection reads pairs in half precision */
 	int back_voxels;   /* voxels of one window in the untilted backprojection; 0: the general one */
 	bool is_small;     /* launches take longer than samples: the plainest kernels */
 	bool back_half;    /* its voxels lie half as far apart as rows */
@@ -247,7 +251,6 @@ struct plan {
 	/* One block that the stages use in turn: slices of the forward projection, z-fastest copy, TV's copies. */
 	float *scratch;
 	size_t scratch_bytes;
-	struct layered slices[2];      /* slices across x and y, with textures */
 	struct layered projections;    /* a batch of projections, with textures */
 	struct layered filtered_array; /* the same of padded rows, where they are longer */
 	float2 *pairs;                 /* a batch of projections as pairs, untilted */
@@ -287,7 +290,7 @@ int plan_check_views(const struct plan *plan, const int *views, int count, const
 		     const struct stack *stack, int slots, struct error *err);
 
 /* ---- layout.cu ---- */
-int layout_slices(struct plan *plan, const float *volume, struct error *err); /* -> scratch, arrays */
+int layout_slices(struct plan *plan, const float *volume, struct error *err); /* -> scratch */
 /* -> pairs */
 int layout_pairs(struct plan *plan, const struct stack_shape *shape, const float *from, int count, struct error *err);
 int layout_to_columns(struct plan *plan, const float *volume, float *columns, struct error *err);

@@ -3,6 +3,8 @@
  * everybody else sees; here it is copied into slices across x and across y with
  * edge values held around, into texture arrays, or with z fastest.
  */
+#include <cuda_fp16.h>
+
 #include "kernels/internal.cuh"
 
 struct slices_shape slices_shape_make(int slices, int rows, int fast, bool panels)
@@ -71,28 +73,42 @@ static __device__ __forceinline__ bool is_shared(const slices &to, int fast)
 	return to.panel > 0 && place >= SLICE_STEP && place % SLICE_STEP < SLICE_SHARED;
 }
 
+/* What is kept of a voxel: itself, or in half precision with the next one along the rows' axis. */
+static __device__ __forceinline__ void put(float *at, float value, float)
+{
+	*at = value;
+}
+static __device__ __forceinline__ void put(__half2 *at, float value, float next)
+{
+	*at = __floats2half2_rn(value, next);
+}
+
 /* A value with all that repeats it: at the end of a panel, and what is held beyond the ends. */
-static __device__ void put_held(const slices &to, float *slice, int row, int rows, int fast, int count, float value)
+template <typename T>
+static __device__ void put_held(const slices &to, T *slice, int row, int rows, int fast, int count, float value,
+				float next)
 {
 	int row_from = row == 0 ? -SLICE_HELD : row, row_to = row == rows - 1 ? rows - 1 + SLICE_HELD : row;
 	int from = fast == 0 ? -SLICE_HELD : fast, to_end = fast == count - 1 ? fast + SLICE_HELD : fast;
 
 	for (int j = row_from; j <= row_to; j++)
 		for (int i = from; i <= to_end; i++) {
-			float *at = slice + (j * to.row + place_at(to, i));
+			T *at = slice + (j * to.row + place_at(to, i));
 
-			*at = value;
+			put(at, value, j == row ? next : value);
 			if (is_shared(to, i))
-				at[SLICE_STEP - to.panel] = value;
+				put(at + (SLICE_STEP - to.panel), value, j == row ? next : value);
 		}
 }
 
 /* The values of a thread: TILE / TILE_ROWS slices, one place along the fast axis. */
+template <typename T>
 static __device__ __forceinline__ void put_slices(const slices &to, int first, int slices_count, int fast, int count,
-						  int row, int rows, const float value[TILE / TILE_ROWS])
+						  int row, int rows, const float value[TILE / TILE_ROWS],
+						  const float next[TILE / TILE_ROWS])
 {
 	const int each = TILE / TILE_ROWS;
-	float *slice = to.data + to.slice * (size_t)first;
+	T *slice = (T *)to.data + to.slice * (size_t)first;
 	size_t step = to.slice * TILE_ROWS;
 	bool shared = is_shared(to, fast);
 
@@ -101,57 +117,61 @@ static __device__ __forceinline__ void put_slices(const slices &to, int first, i
 	if (row == 0 || row == rows - 1 || fast == 0 || fast == count - 1) {
 		for (int k = 0; k < each; k++, slice += step)
 			if (first + k * TILE_ROWS < slices_count)
-				put_held(to, slice, row, rows, fast, count, value[k]);
+				put_held(to, slice, row, rows, fast, count, value[k], next[k]);
 		return;
 	}
-	float *main = slice + (row * to.row + place_at(to, fast));
+	T *main = slice + (row * to.row + place_at(to, fast));
 #pragma unroll
 	for (int k = 0; k < each; k++, main += step) {
 		if (first + k * TILE_ROWS >= slices_count)
 			return;
-		*main = value[k];
+		put(main, value[k], next[k]);
 		if (shared)
-			main[SLICE_STEP - to.panel] = value[k];
+			put(main + (SLICE_STEP - to.panel), value[k], next[k]);
 	}
 }
 
-/* One tile of x and y in one plane; across x it is turned over in shared memory. */
+enum { PLANES = 8 }; /* of a block, from the top down: the plane above is at hand for the pairs */
+
+/* One tile of x and y; across x it is turned over in shared memory. */
+template <typename T>
 static __global__ void __launch_bounds__(TILE *TILE_ROWS)
     to_slices(const float *__restrict__ volume, int nx, int ny, int nz, const slices across_x, const slices across_y)
 {
-	__shared__ float tile[TILE][TILE + 1];
-	int x0 = blockIdx.x * TILE, y0 = blockIdx.y * TILE, z = blockIdx.z, tx = threadIdx.x, ty = threadIdx.y;
-	float value[TILE / TILE_ROWS];
-
+	const int each = TILE / TILE_ROWS;
+	__shared__ float tile[2][TILE][TILE + 1];
+	int x0 = blockIdx.x * TILE, y0 = blockIdx.y * TILE, tx = threadIdx.x, ty = threadIdx.y;
+	int bottom = blockIdx.z * PLANES, top = min(bottom + PLANES, nz) - 1;
+	int side = 0;
+	float value[each] = {}, turned[each] = {}, above[each], turned_above[each];
+	auto read = [&](int z) {
 #pragma unroll
-	for (int k = 0; k < TILE / TILE_ROWS; k++) {
-		int x = x0 + tx, y = y0 + ty + k * TILE_ROWS;
+		for (int k = 0; k < each; k++) {
+			int x = x0 + tx, y = y0 + ty + k * TILE_ROWS;
 
-		value[k] = x < nx && y < ny ? volume[((size_t)z * ny + y) * nx + x] : 0.0f;
+			value[k] = x < nx && y < ny ? volume[((size_t)z * ny + y) * nx + x] : 0.0f;
+			tile[side][ty + k * TILE_ROWS][tx] = value[k];
+		}
+		/* Two tiles: nobody writes one that others may still read. */
+		__syncthreads();
+#pragma unroll
+		for (int k = 0; k < each; k++)
+			turned[k] = tile[side][tx][ty + k * TILE_ROWS];
+		side ^= 1;
+	};
+
+	if (sizeof(T) == sizeof(__half2))
+		read(min(top + 1, nz - 1));
+	for (int z = top; z >= bottom; z--) {
+#pragma unroll
+		for (int k = 0; k < each; k++) {
+			above[k] = value[k];
+			turned_above[k] = turned[k];
+		}
+		read(z);
+		put_slices<T>(across_y, y0 + ty, ny, x0 + tx, nx, z, nz, value, above);
+		put_slices<T>(across_x, x0 + ty, nx, y0 + tx, ny, z, nz, turned, turned_above);
 	}
-#pragma unroll
-	for (int k = 0; k < TILE / TILE_ROWS; k++)
-		tile[ty + k * TILE_ROWS][tx] = value[k];
-	put_slices(across_y, y0 + ty, ny, x0 + tx, nx, z, nz, value);
-	__syncthreads();
-#pragma unroll
-	for (int k = 0; k < TILE / TILE_ROWS; k++)
-		value[k] = tile[tx][ty + k * TILE_ROWS];
-	put_slices(across_x, x0 + ty, nx, y0 + tx, ny, z, nz, value);
-}
-
-static int copy_to_array(const struct layered *to, const struct slices_shape *shape, const float *data,
-			 cudaStream_t stream, struct error *err)
-{
-	cudaMemcpy3DParms copy = {};
-
-	copy.srcPtr = make_cudaPitchedPtr((void *)data, (size_t)shape->row * sizeof(float), (size_t)shape->fast,
-					  shape->slice / (size_t)shape->row);
-	copy.dstArray = to->array;
-	copy.extent = make_cudaExtent((size_t)shape->fast, (size_t)shape->rows, (size_t)shape->slices);
-	copy.kind = cudaMemcpyDeviceToDevice;
-	CUDA_TRY(cudaMemcpy3DAsync(&copy, stream));
-	return 0;
 }
 
 int layout_slices(struct plan *plan, const float *volume, struct error *err)
@@ -160,14 +180,14 @@ int layout_slices(struct plan *plan, const float *volume, struct error *err)
 	cudaStream_t stream = plan->device->stream;
 	struct slices x = slices_at(plan->scratch, &plan->along_x);
 	struct slices y = slices_at(plan->scratch + plan->along_x.floats, &plan->along_y);
-	dim3 blocks(divide_up(size[0], TILE), divide_up(size[1], TILE), size[2]), threads(TILE, TILE_ROWS);
+	dim3 blocks(divide_up(size[0], TILE), divide_up(size[1], TILE), divide_up(size[2], PLANES));
+	dim3 threads(TILE, TILE_ROWS);
 
-	to_slices<<<blocks, threads, 0, stream>>>(volume, size[0], size[1], size[2], x, y);
+	if (plan->shape.halves)
+		to_slices<__half2><<<blocks, threads, 0, stream>>>(volume, size[0], size[1], size[2], x, y);
+	else
+		to_slices<float><<<blocks, threads, 0, stream>>>(volume, size[0], size[1], size[2], x, y);
 	LAUNCHED();
-	if (plan->slices[0].array != NULL) {
-		TRY(copy_to_array(&plan->slices[0], &plan->along_x, x.data, stream, err));
-		TRY(copy_to_array(&plan->slices[1], &plan->along_y, y.data, stream, err));
-	}
 	return 0;
 }
 

@@ -100,9 +100,17 @@ static bool has_z_rays(const struct geometry *geometry, const struct grid *grid)
 	return false;
 }
 
+/* How far a detector's rows step aside for a step along z, and what that may be for the projection by rows. */
+static double lean_of(const struct view *view)
+{
+	return hypot(view->row_step[0], view->row_step[1]) / fabs(view->row_step[2]);
+}
+static const double LEAN_MOST = 0.04;
+
 /*
  * Smallest and largest distance, in voxels along z, of the rays of neighbouring
- * rows where they cross the grid: the magnification varies with the depth, which is extreme at corners.
+ * rows where they cross the grid: the magnification varies with the depth, which is
+ * extreme at corners, and with the rise of the rays where rows lean.
  */
 static void row_spacing(const struct geometry *geometry, const struct grid *grid, double *ret_least, double *ret_most,
 			int *ret_sign)
@@ -112,17 +120,30 @@ static void row_spacing(const struct geometry *geometry, const struct grid *grid
 
 	for (int k = 0; k < geometry->count; k++) {
 		const struct view *view = &geometry->views[k];
-		double matrix[12], point[3], column, row,
-		    detector = view_project((view_matrix(view, matrix), matrix), view->pixel0, &column, &row);
+		double matrix[12], point[3], column, row, near = INFINITY, far = 0, lean = 0;
 
+		view_matrix(view, matrix);
+		for (int corner = 0; corner < 4; corner++) {
+			double c = corner & 1 ? geometry->columns - 1 : 0, r = corner & 2 ? geometry->rows - 1 : 0, rise;
+			double depth;
+
+			for (int i = 0; i < 3; i++)
+				point[i] = view->pixel0[i] + c * view->column_step[i] + r * view->row_step[i];
+			depth = view_project(matrix, point, &column, &row);
+			near = fmin(near, depth);
+			far = fmax(far, depth);
+			rise = fabs(point[2] - view->source[2]) /
+			       hypot(point[0] - view->source[0], point[1] - view->source[1]);
+			lean = fmax(lean, 1.5 * rise * lean_of(view));
+		}
 		up += view->row_step[2] > 0 ? 1 : -1;
 		for (int corner = 0; corner < 4; corner++) {
-			double depth;
+			double depth, step = fabs(view->row_step[2]) / grid->spacing[2];
 
 			corner_of(grid, corner, 0.5, point);
 			depth = view_project(matrix, point, &column, &row);
-			least = fmin(least, depth / detector * fabs(view->row_step[2]) / grid->spacing[2]);
-			most = fmax(most, depth / detector * fabs(view->row_step[2]) / grid->spacing[2]);
+			least = fmin(least, depth / far * step * (1 - lean));
+			most = fmax(most, depth / near * step * (1 + lean));
 		}
 	}
 	*ret_least = least;
@@ -177,22 +198,27 @@ static bool is_untilted(const struct plan_options *options)
 	return true;
 }
 
-static void choose_untilted(const struct plan_options *options, struct plan_shape *shape)
+static void choose_rows(const struct plan_options *options, struct plan_shape *shape)
 {
-	double least, most;
+	const struct geometry *geometry = options->geometry;
+	const double *spacing = options->grid->spacing;
+	double least, most, lean = 0;
 	int sign;
 
-	if (!is_untilted(options))
+	for (int k = 0; k < geometry->count; k++)
+		lean = fmax(lean, lean_of(&geometry->views[k]) * spacing[2] / fmin(spacing[0], spacing[1]));
+	shape->untilted = is_untilted(options);
+	if (!shape->untilted && !(shape->halves && lean < LEAN_MOST))
 		return;
-	row_spacing(options->geometry, options->grid, &least, &most, &sign);
+	row_spacing(geometry, options->grid, &least, &most, &sign);
+	shape->untilted = shape->untilted && sign != 0;
 	if (sign == 0)
 		return;
-	shape->untilted = true;
 	shape->rows_down = sign < 0;
 	if (!shape->z_rays)
 		shape->forward_rows = window_size(false, least, most);
 	/* Seen from the detector the same spacing is upside down. */
-	if (shape->rows_down)
+	if (shape->rows_down || !shape->untilted)
 		return;
 	shape->back_voxels = window_size(true, 1 / most, 1 / least);
 	shape->back_half = shape->back_voxels > 0;
@@ -211,8 +237,9 @@ static struct plan_shape shape_of(const struct plan_options *options, bool lean)
 	if (options->sart != NULL)
 		subset = largest_subset(&options->sart->subsets);
 	shape.z_rays = has_z_rays(geometry, grid);
-	choose_untilted(options, &shape);
 	shape.is_small = (double)grid_voxels(grid) * geometry->count < SMALL;
+	shape.halves = !options->reference_precision && !shape.is_small;
+	choose_rows(options, &shape);
 	if (shape.is_small)
 		shape.forward_rows = shape.back_voxels = 0;
 	shape.textures = !lean && !shape.is_small && !options->reference_precision && fits &&
@@ -239,10 +266,6 @@ static struct plan_shape shape_of(const struct plan_options *options, bool lean)
 
 /* ---- what memory ---- */
 
-static bool needs_arrays_forward(const struct plan *plan)
-{
-	return plan->shape.textures && plan->shape.forward_rows == 0 && !plan->options.no_projection;
-}
 static bool needs_arrays_back(const struct plan *plan)
 {
 	return plan->shape.textures && plan->shape.back_voxels == 0;
@@ -334,8 +357,6 @@ static struct plan_bytes bytes_of(const struct plan_options *options, bool lean)
 	bytes.scratch = plan.scratch_bytes + views * (sizeof(struct device_view) + 2 * sizeof(int)) +
 			plan.partial_count * sizeof(float2) + reduce_bytes() + VIEWS_AT_ONCE * 12 * sizeof(float) +
 			pixels_of(&plan) * 2 + linearise_counters_bytes();
-	if (needs_arrays_forward(&plan))
-		bytes.scratch += 2 * voxels;
 	if (needs_arrays_back(&plan))
 		bytes.scratch += pixels_of(&plan) * (size_t)views_laid_out(&plan) * sizeof(float);
 	if (needs_filtered_array(&plan))
@@ -521,12 +542,6 @@ static int prepare_sart(struct plan *plan, struct error *err)
 
 static int prepare_arrays(struct plan *plan, struct error *err)
 {
-	const int *size = plan->grid.size;
-
-	if (needs_arrays_forward(plan)) {
-		TRY(layered_new(plan->device, size[1], size[2], size[0], cudaAddressModeClamp, &plan->slices[0], err));
-		TRY(layered_new(plan->device, size[0], size[2], size[1], cudaAddressModeClamp, &plan->slices[1], err));
-	}
 	if (plan->shape.back_voxels > 0) {
 		plan->pairs_bytes = pairs_bytes(plan, plan->shape.views_at_once);
 		TRY(device_allocate(plan->device, plan->pairs_bytes, (void **)&plan->pairs, err));
@@ -572,7 +587,8 @@ static void summarise(struct plan *plan)
 	char forward[64] = "general", back[64] = "general";
 
 	if (shape->forward_rows > 0)
-		snprintf(forward, sizeof(forward), "untilted, %d rows a thread", shape->forward_rows);
+		snprintf(forward, sizeof(forward), "%s, %d rows a thread", shape->untilted ? "untilted" : "near untilted",
+			 shape->forward_rows);
 	if (shape->back_voxels > 0)
 		snprintf(back, sizeof(back), "untilted, %d voxels a window%s", shape->back_voxels,
 			 shape->back_half ? ", two a row" : "");
@@ -628,7 +644,6 @@ void cuda_plan_free(struct plan *plan)
 	device_release(device, plan->matrices, VIEWS_AT_ONCE * 12 * sizeof(float));
 	device_release(device, plan->scratch, plan->scratch_bytes);
 	for (int i = 0; i < 2; i++) {
-		layered_free(device, &plan->slices[i]);
 		device_release(device, plan->marks[i], pixels_of(plan));
 	}
 	device_release(device, plan->raw, plan->bytes.raw * (size_t)plan->raw_views);

@@ -1,27 +1,29 @@
 /*
  * Forward projection (rays.cuh has the method), all views of a call in one launch.
+ * The volume is read as slices (layout.cu), in reference precision as floats, else
+ * as pairs of neighbours along the row axis in half precision: one load brings
+ * two voxels and one instruction works on both. What a ray sums up is in float.
  *
  * General: a thread has one ray and a warp 32 neighbours in a row, which walk the
- * slices of their axis together. Samples are alternately taken by the texture
- * unit and by plain loads: either pipe alone is the limit, both together nearly
- * add up. The four columns of a sample all count with 0 or more, so the texture
- * unit takes them two by two: with A = p0 + p1 and B = p2 + p3 = 1 - A, a
- * bilinear sample at j - 1 + p1/A counts with A and one at j + 1 + p3/B with B.
- * Reference precision has loads only, since the texture unit's weights have 8 bits.
+ * slices of their axis together.
  *
- * Untilted: the rays of a column share their way across the rows' direction,
- * and in every slice adjacent rows of the detector are evenly spaced along z,
- * 1 + e voxels apart. A thread has ROWS of them: it interpolates ROWS + 2 values
- * across once, x[0] at the floor B of the lowest row, and row k lies at
- * t = z - B + k e beyond k, 0 <= t <= 2, where the two pieces of
+ * By rows, where rows run across z: the rays of a column share their way across
+ * the rows' direction, and in every slice adjacent rows of the detector are evenly
+ * spaced along z, 1 + e voxels apart. A thread has ROWS of them: it interpolates
+ * ROWS + 2 values across once, x[0] at the floor B of the lowest row, and row k
+ * lies at t = z - B + k e beyond k, 0 <= t <= 2, where the two pieces of
  *   x[k+1] - saturate(1 - t) (x[k+1] - x[k]) + saturate(t - 1) (x[k+2] - x[k+1])
  * give the linear interpolation without a branch or a dynamic index. This holds
- * while (ROWS - 1) |e| <= 1, which plan.cu sees to.
+ * while (ROWS - 1) |e| <= 1, which plan.cu sees to. Where columns lean by a degree or
+ * two, each pair of values across is taken at its own place, which the thread's
+ * rays share too.
  *
  * Blocks are ordered by groups of views, then by tiles of the detector, then by
  * views: those that run at one time see the same part of the volume from many
  * sides, and the second cache keeps it.
  */
+#include <type_traits>
+
 #include "kernels/rays.cuh"
 
 /* Views of a group: as many as fill the card with blocks of one or two tiles. */
@@ -34,7 +36,6 @@ struct projection {
 	int tiles_across, tiles;
 	device_grid grid;
 	struct slices across[2];
-	cudaTextureObject_t texture[2];
 	const float *volume; /* [z][y][x], for rays along z */
 	int columns, rows, pitch;
 	size_t slot;
@@ -58,20 +59,18 @@ static __device__ __forceinline__ place place_of(const projection &p)
 	return {(group * group_most + rest - tile * here) * VIEWS + (int)threadIdx.z, tile - row * p.tiles_across, row};
 }
 
-/* A ray's sample of layer i by the texture unit, which holds the edges. */
-static __device__ __forceinline__ float sample_texture(cudaTextureObject_t texture, int i, float fast, float row_half,
-						       const wandering &wander)
+/* What a ray needs to know of its wandering, for either kind of values. */
+template <typename T>
+static __device__ __forceinline__ auto wander_for(float fast_step)
 {
-	float right, low = floor_of(fast, right);
-	kinks k = kinks_at(wander, right);
-	float left = (1.0f - right) + (k.k1 - k.k0), rest = 1.0f - left;
-	/* p1/A = 1 - p0/A. Where B is 0, so is p3. The mask only says that the layer is small: it saves a clamp. */
-	float a = tex2DLayered<float>(texture, fmaf(-k.k0, reciprocal(left), low + 0.5f), row_half, i & 0x7ff);
-	float b =
-	    tex2DLayered<float>(texture, fmaf(k.k1, reciprocal(fmaxf(rest, 1e-20f)), low + 1.5f), row_half, i & 0x7ff);
-
-	return mix(b, a, left);
+	if constexpr (std::is_same<T, __half2>::value)
+		return half_of(wander_of(fast_step));
+	else
+		return wander_of(fast_step);
 }
+
+/* Less than the number of values along an axis by this, a clamped place has all its neighbours. */
+static const float HELD_LEAST = 1e-3f;
 
 /* Stores a ray's line integral, or what SART makes of it, and gives the squares for the sums. */
 static __device__ __forceinline__ float2 finish(const projection &p, int slot, int view, int column, int row, float sum,
@@ -100,7 +99,7 @@ static const int GENERAL_BLOCKS = 4;
 static const int GENERAL_BLOCKS = 5;
 #endif
 
-template <bool TEXTURE, bool ALONG_Z>
+template <typename T, bool ALONG_Z>
 static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS, GENERAL_BLOCKS)
     project_general(const projection p)
 {
@@ -133,42 +132,28 @@ static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS, GENE
 		bool hits = s.end > s.begin;
 		int first = first_slice(s.begin), last = last_slice(s.end);
 		walk w = walk_together(hits, first, last + 1, first + 1, last);
-		const float *data = p.across[axis].data;
 		size_t slice = p.across[axis].slice;
+		const T *data = (const T *)p.across[axis].data;
 		int stride = p.across[axis].row;
-		cudaTextureObject_t texture = p.texture[axis];
-		wandering wander = wander_of(s.fast_step);
+		auto wander = wander_for<T>(s.fast_step);
 		float total = 0;
 		auto edge = [&](int from, int to) {
 			for (int i = from; i < to; i++) {
 				float fast = fmaf((float)i, s.fast_step, s.fast);
-				float up = fmaf((float)i, s.row_step, s.row), value;
+				float up = fmaf((float)i, s.row_step, s.row);
 
-				if (TEXTURE)
-					value = sample_texture(texture, i, fast, up + 0.5f, wander);
-				else
-					value = sample_ray(data + slice * (size_t)i, stride, 1,
-							   fminf(fmaxf(fast, -1.0f), (float)axes.fast),
-							   fminf(fmaxf(up, -1.0f), (float)axes.rows), wander);
-				total = fmaf(part_of(i, s.begin, s.end), value, total);
+				total = fmaf(part_of(i, s.begin, s.end),
+					     sample_ray(data + slice * (size_t)i, stride, 1,
+							fminf(fmaxf(fast, -1.0f), (float)axes.fast - HELD_LEAST),
+							fminf(fmaxf(up, -1.0f), (float)axes.rows - HELD_LEAST), wander),
+					     total);
 			}
 		};
 
 		edge(w.first, w.inner_first);
-		const float *at_slice = data + slice * (size_t)w.inner_first;
-		float f = (float)w.inner_first, row_half = s.row + 0.5f;
-		int i = w.inner_first;
-		if (TEXTURE) {
-			at_slice += slice;
-			for (; i + 2 <= w.inner_end; i += 2, f += 2.0f, at_slice += 2 * slice) {
-				total += sample_texture(texture, i, fmaf(f, s.fast_step, s.fast),
-							fmaf(f, s.row_step, row_half), wander);
-				total += sample_ray(at_slice, stride, 1, fmaf(f + 1.0f, s.fast_step, s.fast),
-						    fmaf(f + 1.0f, s.row_step, s.row), wander);
-			}
-			at_slice -= slice;
-		}
-		for (; i < w.inner_end; i++, f += 1.0f, at_slice += slice)
+		const T *at_slice = data + slice * (size_t)w.inner_first;
+		float f = (float)w.inner_first;
+		for (int i = w.inner_first; i < w.inner_end; i++, f += 1.0f, at_slice += slice)
 			total += sample_ray(at_slice, stride, 1, fmaf(f, s.fast_step, s.fast),
 					    fmaf(f, s.row_step, s.row), wander);
 		edge(w.inner_end, w.end);
@@ -205,94 +190,235 @@ static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS, GENE
 	}
 }
 
-/* ---- untilted ---- */
+/* ---- by rows ---- */
 
-enum { UNTILTED_WARPS = 4 }; /* of a block: 32 columns wide, UNTILTED_WARPS * ROWS rows high */
-static const int UNTILTED_VIEWS = 2;
+enum { ROWS_WARPS = 4 }; /* of a block: 32 columns wide, ROWS_WARPS * ROWS rows high */
+static const int ROWS_VIEWS = 2;
 
 /* A column's rays: row k, counted upwards, crosses slice i at row + i row_step + k (1 + spread + i spread_step). */
 struct fan {
 	float fast, fast_step, row, row_step, spread, spread_step;
-	float from, to;                  /* where all are inside across z, counted from the middle slice */
+	float lean, lean_step;           /* and steps aside by k (lean + i lean_step) */
+	float from, to;                  /* where all are inside across the fast axis, counted from the middle slice */
 	float middle_row, middle_spread; /* row and spread in the middle slice, of centred z */
-	wandering across;
+	float middle_fast, middle_lean;
 };
 
 /* Which slices count as a whole: all rows alike do not, but by the same part; or each by its own. */
 enum guard { GUARD_NONE, GUARD_ALIKE, GUARD_EACH };
 
-template <int ROWS, int GUARD>
-static __device__ __forceinline__ void add_rows(const float *__restrict__ slice, int panel, const fan &f, int i,
-						const slice_axes &axes, const float begin[ROWS], const float end[ROWS],
-						float sum[ROWS])
+/* Where the first of the four columns beside a place lies in a slice, in row 0. */
+template <int GUARD>
+static __device__ __forceinline__ int first_column(float fast, int panel, const slice_axes &axes, float &right)
 {
-	float fast = fmaf((float)i, f.fast_step, f.fast), row = fmaf((float)i, f.row_step, f.row);
-	float e = fmaf((float)i, f.spread_step, f.spread), right, part = 1;
-	float base = row + fminf(0.0f, (float)(ROWS - 1) * e), unused, x[ROWS + 2];
-
-	if (GUARD != GUARD_NONE) {
-		fast = fminf(fmaxf(fast, -1.0f), (float)axes.fast);
-		base = fminf(fmaxf(base, (float)-SLICE_PAD), (float)axes.rows);
-		part = part_of(i, begin[0], end[0]);
-	}
-	/* The first of the four columns, counted from the first that is held. */
+	if (GUARD != GUARD_NONE)
+		fast = fminf(fmaxf(fast, -1.0f), (float)axes.fast - HELD_LEAST);
+	/* Counted from the first that is held. */
 	unsigned place = (unsigned)split(fast, right) + (SLICE_HELD - 1);
-	int low = split(base, unused), within = (int)(place * 17190u >> 20); /* place / SLICE_STEP below 74898 */
-	const float *q = slice + (int)(low * PANEL + (int)place + within * (panel - SLICE_STEP));
-	four_parts four = parts_at(f.across, right);
+	int within = (int)(place * 17190u >> 20); /* place / SLICE_STEP below 74898 */
+
+	return (int)place + within * (panel - SLICE_STEP);
+}
+
+/* The lowest of the values that a fan needs in slice i, and the fan's first row counted from there. */
+template <int ROWS, int GUARD>
+static __device__ __forceinline__ int lowest_row(const fan &f, float i, float e, const slice_axes &axes, float &t)
+{
+	float row = fmaf(i, f.row_step, f.row), base = row + fminf(0.0f, (float)(ROWS - 1) * e), unused;
+
+	if (GUARD != GUARD_NONE)
+		base = fminf(fmaxf(base, (float)-SLICE_PAD), (float)axes.rows);
+	int low = split(base, unused);
+
+	t = row - (float)low;
+	return low;
+}
+
+/* The samples of slice i in float. */
+template <int ROWS, int GUARD>
+static __device__ __forceinline__ void sample_rows(const float *__restrict__ slice, int panel, const fan &f,
+						   const wandering &wander, float i, const slice_axes &axes,
+						   float value[ROWS])
+{
+	float e = fmaf(i, f.spread_step, f.spread), right, t, x[ROWS + 2];
+	int low = lowest_row<ROWS, GUARD>(f, i, e, axes, t);
+	const float *q = slice + (low * PANEL + first_column<GUARD>(fmaf(i, f.fast_step, f.fast), panel, axes, right));
+	four_parts four = parts_at(wander, right);
+
 #pragma unroll
 	for (int j = 0; j < ROWS + 2; j++)
 		x[j] = across_four(q + j * PANEL, 1, four);
-	float t = row - (float)low, below = x[1] - x[0];
+	float below = x[1] - x[0];
 #pragma unroll
 	for (int k = 0; k < ROWS; k++) {
 		float down = __saturatef(fmaf((float)-k, e, 1.0f - t)), up = __saturatef(fmaf((float)k, e, t - 1.0f));
 		float above = x[k + 2] - x[k + 1];
 
-		if (GUARD == GUARD_NONE) {
-			sum[k] += x[k + 1];
-			sum[k] = fmaf(-down, below, sum[k]);
-			sum[k] = fmaf(up, above, sum[k]);
-		} else {
-			if (GUARD == GUARD_EACH)
-				part = part_of(i, begin[k], end[k]);
-			sum[k] = fmaf(part, fmaf(up, above, fmaf(-down, below, x[k + 1])), sum[k]);
-		}
+		value[k] = fmaf(up, above, fmaf(-down, below, x[k + 1]));
 		below = above;
 	}
 }
 
-template <int ROWS, int GUARD>
-static __device__ __forceinline__ void add_slices(const slices &across, int from, int to, const fan &f,
-						  const slice_axes &axes, const float begin[ROWS],
-						  const float end[ROWS], float sum[ROWS])
+/*
+ * The samples of slice i in half precision, two rows a register. Where rows LEAN,
+ * each pair of values across has its own place.
+ */
+template <int ROWS, int GUARD, bool LEAN>
+static __device__ __forceinline__ void sample_pairs(const __half2 *__restrict__ slice, int panel, const fan &f,
+						    const half_wandering &wander, float i, const slice_axes &axes,
+						    __half2 value[(ROWS + 1) / 2])
 {
-	const float *at = across.data + across.slice * (size_t)from;
+	const int pairs = (ROWS + 3) / 2;
+	float e = fmaf(i, f.spread_step, f.spread), fast = fmaf(i, f.fast_step, f.fast), right, t, lean = 0;
+	int low = lowest_row<ROWS, GUARD>(f, i, e, axes, t);
+	__half2 x[pairs];
 
-	for (int i = from; i < to; i++, at += across.slice)
-		add_rows<ROWS, GUARD>(at, across.panel, f, i, axes, begin, end, sum);
+	if (LEAN) {
+		lean = fmaf(i, f.lean_step, f.lean) * reciprocal(1.0f + e);
+		fast = fmaf(0.5f - t, lean, fast);
+	}
+	const __half2 *q = slice + (low * PANEL + first_column<GUARD>(fast, panel, axes, right));
+	half_parts part = parts_at(wander, right);
+#pragma unroll
+	for (int j = 0; j < pairs; j++) {
+		if (LEAN && j > 0) {
+			q = slice +
+			    (low * PANEL + first_column<GUARD>(fmaf((float)(2 * j), lean, fast), panel, axes, right));
+			part = parts_at(wander, right);
+		}
+		x[j] = across_four(q + 2 * j * PANEL, 1, part);
+	}
+	__half2 both = __float2half2_rn(e), first = __floats2half2_rn(1.0f - t, 1.0f - t - e);
+#pragma unroll
+	for (int k = 0; k < (ROWS + 1) / 2; k++) {
+		__half2 here = __halves2half2(__high2half(x[k]), __low2half(x[k + 1]));
+		__half2 down = __hfma2_sat(both, __float2half2_rn((float)(-2 * k)), first);
+		__half2 up = __hfma2_sat(both, __float2half2_rn((float)(2 * k)), __hneg2(first));
+
+		value[k] = __hfma2(up, __hsub2(x[k + 1], here), __hfma2(down, __hsub2(x[k], here), here));
+	}
+}
+
+/* Where a slice counts in part, what a row of no part has read may be anything. */
+template <int ROWS, int GUARD>
+static __device__ __forceinline__ void add_values(float i, const float begin[ROWS], const float end[ROWS],
+						  const float value[ROWS], float sum[ROWS])
+{
+	float part = GUARD == GUARD_NONE ? 1.0f : part_of(i, begin[0], end[0]);
+
+#pragma unroll
+	for (int k = 0; k < ROWS; k++) {
+		if (GUARD == GUARD_EACH)
+			part = part_of(i, begin[k], end[k]);
+		if (part > 0)
+			sum[k] = fmaf(part, value[k], sum[k]);
+	}
+}
+
+template <int ROWS, int GUARD, bool LEAN>
+static __device__ __forceinline__ void add_slices(const float *at, const slices &across, int from, int to, const fan &f,
+						  const wandering &wander, const slice_axes &axes,
+						  const float begin[ROWS], const float end[ROWS], float sum[ROWS])
+{
+	float i = (float)from, value[ROWS];
+
+	for (; from < to; from++, i += 1.0f, at += across.slice) {
+		sample_rows<ROWS, GUARD>(at, across.panel, f, wander, i, axes, value);
+		add_values<ROWS, GUARD>(i, begin, end, value, sum);
+	}
+}
+
+/* Two rows a register, into floats. */
+template <int ROWS>
+static __device__ __forceinline__ void spread_out(const __half2 value[(ROWS + 1) / 2], float ret[ROWS])
+{
+#pragma unroll
+	for (int k = 0; k < ROWS; k++)
+		ret[k] = k & 1 ? __high2float(value[k / 2]) : __low2float(value[k / 2]);
+}
+
+template <int ROWS, int GUARD, bool LEAN>
+static __device__ __forceinline__ void add_slices(const __half2 *at, const slices &across, int from, int to,
+						  const fan &f, const half_wandering &wander, const slice_axes &axes,
+						  const float begin[ROWS], const float end[ROWS], float sum[ROWS])
+{
+	const int pairs = (ROWS + 1) / 2;
+	float i = (float)from, flat[ROWS];
+	__half2 one[pairs], two[pairs];
+
+	/* Two samples are added in half precision, all else in float. */
+	for (; GUARD == GUARD_NONE && from + 2 <= to; from += 2, i += 2.0f, at += 2 * across.slice) {
+		sample_pairs<ROWS, GUARD, LEAN>(at, across.panel, f, wander, i, axes, one);
+		sample_pairs<ROWS, GUARD, LEAN>(at + across.slice, across.panel, f, wander, i + 1.0f, axes, two);
+#pragma unroll
+		for (int k = 0; k < pairs; k++)
+			one[k] = __hadd2(one[k], two[k]);
+		spread_out<ROWS>(one, flat);
+		add_values<ROWS, GUARD>(i, begin, end, flat, sum);
+	}
+	for (; from < to; from++, i += 1.0f, at += across.slice) {
+		sample_pairs<ROWS, GUARD, LEAN>(at, across.panel, f, wander, i, axes, one);
+		spread_out<ROWS>(one, flat);
+		add_values<ROWS, GUARD>(i, begin, end, flat, sum);
+	}
 }
 
 /* Where row k is inside of the box, in slices. */
+template <bool LEAN>
 static __device__ __forceinline__ void row_range(const fan &f, int k, const slice_axes &axes, float &begin, float &end)
 {
 	float from = f.from, to = f.to, middle = 0.5f * (float)(axes.across - 1);
 
+	if (LEAN)
+		clip(fmaf((float)k, f.middle_lean, f.middle_fast), fmaf((float)k, f.lean_step, f.fast_step),
+		     0.5f * (float)axes.fast, from, to);
 	clip(fmaf((float)k, f.middle_spread, f.middle_row), fmaf((float)k, f.spread_step, f.row_step),
 	     0.5f * (float)axes.rows, from, to);
 	begin = from + middle;
 	end = to + middle;
 }
 
-template <int ROWS>
-static __global__ void __launch_bounds__(32 * UNTILTED_WARPS * UNTILTED_VIEWS, 8 / UNTILTED_VIEWS)
-    project_untilted(const projection p)
+/*
+ * The fan above a ray. Row k divides by another depth, d + k rise, where rows lean;
+ * over so few rows the straight line from the first to the last is it.
+ */
+template <int ROWS, bool LEAN>
+static __device__ __forceinline__ fan fan_make(const device_view &g, const float d[3], const float m[3], int axis,
+					       float upwards, const slice_axes &axes)
 {
-	place at = place_of<UNTILTED_VIEWS>(p);
+	crossing cross = crossing_of(d, m, axis);
+	bool x = axis == ACROSS_X;
+	float middle = 0.5f * (float)(axes.across - 1), rise = LEAN ? g.direction[x ? 0 : 1][2] : 0.0f;
+	float inverse = upwards / ((x ? d[0] : d[1]) + (float)(ROWS - 1) * upwards * rise);
+	fan f;
+
+	f.from = -0.5f * (float)axes.across;
+	f.to = -f.from;
+	if (!LEAN)
+		clip(cross.fast, cross.fast_step, 0.5f * (float)axes.fast, f.from, f.to);
+	f.middle_row = cross.row;
+	f.middle_spread = ((x ? g.moment[1][2] : -g.moment[0][2]) - cross.row * rise) * inverse;
+	f.row_step = cross.row_step;
+	f.spread_step = (g.direction[2][2] - cross.row_step * rise) * inverse;
+	f.middle_fast = cross.fast;
+	f.middle_lean = LEAN ? ((x ? -g.moment[2][2] : g.moment[2][2]) - cross.fast * rise) * inverse : 0.0f;
+	f.fast_step = cross.fast_step;
+	f.lean_step = LEAN ? (g.direction[x ? 1 : 0][2] - cross.fast_step * rise) * inverse : 0.0f;
+	f.fast = fmaf(-middle, f.fast_step, cross.fast + 0.5f * (float)(axes.fast - 1));
+	f.row = fmaf(-middle, f.row_step, f.middle_row + 0.5f * (float)(axes.rows - 1));
+	f.spread = fmaf(-middle, f.spread_step, f.middle_spread) - 1.0f;
+	f.lean = fmaf(-middle, f.lean_step, f.middle_lean);
+	return f;
+}
+
+template <int ROWS, typename T, bool LEAN>
+static __global__ void __launch_bounds__(32 * ROWS_WARPS * ROWS_VIEWS, 8 / ROWS_VIEWS) project_rows(const projection p)
+{
+	place at = place_of<ROWS_VIEWS>(p);
 	bool has_view = at.slot < p.count;
 	int view = p.views[has_view ? at.slot : 0];
 	const device_view &g = p.geometry[view];
-	int column = at.tile_column * 32 + threadIdx.x, low = (at.tile_row * UNTILTED_WARPS + threadIdx.y) * ROWS;
+	int column = at.tile_column * 32 + threadIdx.x, low = (at.tile_row * ROWS_WARPS + threadIdx.y) * ROWS;
 	bool valid = has_view && column < p.columns && low < p.rows;
 	float upwards = p.rows_down ? -1.0f : 1.0f;
 	float c = (float)column - 0.5f * (float)(p.columns - 1);
@@ -308,33 +434,18 @@ static __global__ void __launch_bounds__(32 * UNTILTED_WARPS * UNTILTED_VIEWS, 8
 		if (!__any_sync(~0u, mine))
 			continue;
 		slice_axes axes = axes_of(p.grid, axis);
-		crossing cross = crossing_of(d, m, axis);
-		float inverse = upwards / (axis == ACROSS_X ? d[0] : d[1]), middle = 0.5f * (float)(axes.across - 1);
-		float moment_rise = axis == ACROSS_X ? g.moment[1][2] : -g.moment[0][2];
-		fan f;
+		fan f = fan_make<ROWS, LEAN>(g, d, m, axis, upwards, axes);
 		int any_first = 1 << 28, any_end = -1, all_first = 0, all_end = 1 << 28;
 		float begin[ROWS], end[ROWS], sum[ROWS];
 		bool alike = true;
 
-		f.from = -0.5f * (float)axes.across;
-		f.to = -f.from;
-		clip(cross.fast, cross.fast_step, 0.5f * (float)axes.fast, f.from, f.to);
-		f.middle_row = cross.row;
-		f.middle_spread = moment_rise * inverse;
-		f.row_step = cross.row_step;
-		f.spread_step = g.direction[2][2] * inverse;
-		f.fast_step = cross.fast_step;
-		f.across = wander_of(f.fast_step);
-		f.fast = fmaf(-middle, f.fast_step, cross.fast + 0.5f * (float)(axes.fast - 1));
-		f.row = fmaf(-middle, f.row_step, f.middle_row + 0.5f * (float)(axes.rows - 1));
-		f.spread = fmaf(-middle, f.spread_step, f.middle_spread) - 1.0f;
 #pragma unroll
 		for (int k = 0; k < ROWS; k++) {
 			sum[k] = 0;
 			begin[k] = end[k] = 0;
 			if (!mine || low + k >= p.rows)
 				continue;
-			row_range(f, k, axes, begin[k], end[k]);
+			row_range<LEAN>(f, k, axes, begin[k], end[k]);
 			bool crosses = end[k] > begin[k];
 			alike = alike && begin[k] == begin[0] && end[k] == end[0];
 			int first = first_slice(begin[k]), last = last_slice(end[k]);
@@ -345,33 +456,41 @@ static __global__ void __launch_bounds__(32 * UNTILTED_WARPS * UNTILTED_VIEWS, 8
 			all_end = min(all_end, crosses ? last : -1);
 		}
 		bool hits = any_end > any_first;
-		if (!hits)
-			f = {0.5f * (float)(axes.fast - 1), 0, 0.5f * (float)(axes.rows - 1), 0, 0, 0, 0, 0, 0, 0, {}};
+		if (!hits) {
+			f = {};
+			f.fast = 0.5f * (float)(axes.fast - 1);
+			f.row = 0.5f * (float)(axes.rows - 1);
+		}
 		walk w = walk_together(hits, any_first, any_end, all_first, all_end);
 		const slices &across = p.across[axis];
-		if (__all_sync(~0u, alike || !hits)) {
-			add_slices<ROWS, GUARD_ALIKE>(across, w.first, w.inner_first, f, axes, begin, end, sum);
-			add_slices<ROWS, GUARD_ALIKE>(across, w.inner_end, w.end, f, axes, begin, end, sum);
+		auto wander = wander_for<T>(f.fast_step);
+		auto add = [&](auto guard, int from, int to) {
+			add_slices<ROWS, decltype(guard)::value, LEAN>(
+			    (const T *)across.data + across.slice * (size_t)from, across, from, to, f, wander, axes,
+			    begin, end, sum);
+		};
+		if (!LEAN && __all_sync(~0u, alike || !hits)) {
+			add(std::integral_constant<int, GUARD_ALIKE>(), w.first, w.inner_first);
+			add(std::integral_constant<int, GUARD_ALIKE>(), w.inner_end, w.end);
 		} else {
-			add_slices<ROWS, GUARD_EACH>(across, w.first, w.inner_first, f, axes, begin, end, sum);
-			add_slices<ROWS, GUARD_EACH>(across, w.inner_end, w.end, f, axes, begin, end, sum);
+			add(std::integral_constant<int, GUARD_EACH>(), w.first, w.inner_first);
+			add(std::integral_constant<int, GUARD_EACH>(), w.inner_end, w.end);
 		}
-		add_slices<ROWS, GUARD_NONE>(across, w.inner_first, w.inner_end, f, axes, begin, end, sum);
+		add(std::integral_constant<int, GUARD_NONE>(), w.inner_first, w.inner_end);
 		if (!mine)
 			continue;
 #pragma unroll
 		for (int k = 0; k < ROWS; k++) {
 			if (low + k >= p.rows)
 				continue;
-			float fast_mm = cross.fast_step * axes.spacing_fast;
-			float row_mm = fmaf((float)k, g.direction[2][2] * inverse, cross.row_step) * axes.spacing_row;
-			float step =
-			    sqrtf(axes.spacing_across * axes.spacing_across + fast_mm * fast_mm + row_mm * row_mm);
+			float aside = fmaf((float)k, f.lean_step, f.fast_step) * axes.spacing_fast;
+			float up = fmaf((float)k, f.spread_step, f.row_step) * axes.spacing_row;
+			float step = sqrtf(axes.spacing_across * axes.spacing_across + aside * aside + up * up);
 			int row = p.rows_down ? p.rows - 1 - (low + k) : low + k;
 			float from = 0, to = 0;
 
 			if (hits)
-				row_range(f, k, axes, from, to);
+				row_range<LEAN>(f, k, axes, from, to);
 			float2 square =
 			    finish(p, at.slot, view, column, row, to > from ? sum[k] : 0.0f, to - from, step);
 			squares.x += square.x;
@@ -387,7 +506,7 @@ static __global__ void __launch_bounds__(32 * UNTILTED_WARPS * UNTILTED_VIEWS, 8
 
 static int rows_of_a_tile(const plan_shape &shape)
 {
-	return shape.forward_rows > 0 ? UNTILTED_WARPS * shape.forward_rows : GENERAL_ROWS;
+	return shape.forward_rows > 0 ? ROWS_WARPS * shape.forward_rows : GENERAL_ROWS;
 }
 
 static void count_tiles(const struct plan *plan, int *ret_across, int *ret_tiles)
@@ -401,7 +520,31 @@ size_t project_blocks(const struct plan *plan, int count)
 	int across, tiles;
 
 	count_tiles(plan, &across, &tiles);
-	return (size_t)tiles * (size_t)divide_up(count, plan->shape.forward_rows > 0 ? UNTILTED_VIEWS : GENERAL_VIEWS);
+	return (size_t)tiles * (size_t)divide_up(count, plan->shape.forward_rows > 0 ? ROWS_VIEWS : GENERAL_VIEWS);
+}
+
+template <int ROWS>
+static void launch_rows(const plan_shape &shape, const projection &p, unsigned blocks, cudaStream_t stream)
+{
+	dim3 threads(32, ROWS_WARPS, ROWS_VIEWS);
+
+	if (!shape.halves)
+		project_rows<ROWS, float, false><<<blocks, threads, 0, stream>>>(p);
+	else if (shape.untilted)
+		project_rows<ROWS, __half2, false><<<blocks, threads, 0, stream>>>(p);
+	else
+		project_rows<ROWS, __half2, true><<<blocks, threads, 0, stream>>>(p);
+}
+
+template <typename T>
+static void launch_general(const plan_shape &shape, const projection &p, unsigned blocks, cudaStream_t stream)
+{
+	dim3 threads(32, GENERAL_ROWS, GENERAL_VIEWS);
+
+	if (shape.z_rays)
+		project_general<T, true><<<blocks, threads, 0, stream>>>(p);
+	else
+		project_general<T, false><<<blocks, threads, 0, stream>>>(p);
 }
 
 int project_rays(struct plan *plan, const float *volume, int first, int count, struct ray_use use, float *to,
@@ -418,8 +561,6 @@ int project_rays(struct plan *plan, const float *volume, int first, int count, s
 	p.grid = plan->grid;
 	p.across[0] = slices_at(plan->scratch, &plan->along_x);
 	p.across[1] = slices_at(plan->scratch + plan->along_x.floats, &plan->along_y);
-	p.texture[0] = plan->slices[0].texture;
-	p.texture[1] = plan->slices[1].texture;
 	p.volume = volume;
 	p.columns = plan->stack.columns;
 	p.rows = plan->stack.rows;
@@ -428,29 +569,24 @@ int project_rays(struct plan *plan, const float *volume, int first, int count, s
 	p.rows_down = plan->shape.rows_down;
 	p.use = use;
 	p.to = to;
-	dim3 untilted(32, UNTILTED_WARPS, UNTILTED_VIEWS), general(32, GENERAL_ROWS, GENERAL_VIEWS);
 	switch (plan->shape.forward_rows) {
 	case 3:
-		project_untilted<3><<<blocks, untilted, 0, stream>>>(p);
+		launch_rows<3>(plan->shape, p, blocks, stream);
 		break;
 	case 4:
-		project_untilted<4><<<blocks, untilted, 0, stream>>>(p);
+		launch_rows<4>(plan->shape, p, blocks, stream);
 		break;
 	case 5:
-		project_untilted<5><<<blocks, untilted, 0, stream>>>(p);
+		launch_rows<5>(plan->shape, p, blocks, stream);
 		break;
 	case 6:
-		project_untilted<6><<<blocks, untilted, 0, stream>>>(p);
+		launch_rows<6>(plan->shape, p, blocks, stream);
 		break;
 	default:
-		if (plan->shape.textures && plan->shape.z_rays)
-			project_general<true, true><<<blocks, general, 0, stream>>>(p);
-		else if (plan->shape.textures)
-			project_general<true, false><<<blocks, general, 0, stream>>>(p);
-		else if (plan->shape.z_rays)
-			project_general<false, true><<<blocks, general, 0, stream>>>(p);
+		if (plan->shape.halves)
+			launch_general<__half2>(plan->shape, p, blocks, stream);
 		else
-			project_general<false, false><<<blocks, general, 0, stream>>>(p);
+			launch_general<float>(plan->shape, p, blocks, stream);
 	}
 	LAUNCHED();
 	return 0;

@@ -18,6 +18,8 @@
  * 1 - right - 2 k0 + k1, right + k0 - 2 k1 and k1, k0 = kink(right) and
  * k1 = kink(1 - right). Along the row axis it stays linear at the middle.
  */
+#include <cuda_fp16.h>
+
 #include "kernels/internal.cuh"
 
 /* Axes of a slice: across (the dominant one), fast (contiguous in the copies) and row. */
@@ -64,6 +66,29 @@ static __device__ __forceinline__ four_parts parts_at(const wandering &w, float 
 	kinks k = kinks_at(w, right);
 
 	return {k.k0, fmaf(-2.0f, k.k0, k.k1) + (1.0f - right), fmaf(-2.0f, k.k1, k.k0) + right, k.k1};
+}
+
+/*
+ * The same for pairs in half precision, two parts a register: the outer columns
+ * and the inner ones. The instructions take either half for both of a pair.
+ */
+struct half_wandering {
+	__half2 root, fall; /* fall negated */
+};
+static __device__ __forceinline__ half_wandering half_of(const wandering &w)
+{
+	return {__float2half2_rn(w.root), __float2half2_rn(-w.fall)};
+}
+
+struct half_parts {
+	__half2 outer, inner;
+};
+static __device__ __forceinline__ half_parts parts_at(const half_wandering &w, float right)
+{
+	__half2 beside = __floats2half2_rn(right, 1.0f - right), hats = __lowhigh2highlow(beside);
+	__half2 inside = __hfma2_sat(w.fall, beside, w.root), kinks = __hmul2(inside, __hmul2(inside, inside));
+
+	return {kinks, __hadd2(__hfma2(kinks, __float2half2_rn(-2.0f), hats), __lowhigh2highlow(kinks))};
 }
 
 static __device__ __forceinline__ float form(const float coefficients[3], float column, float row)
@@ -172,13 +197,6 @@ static __device__ __forceinline__ unsigned split_bits(float x, float &fraction)
 	fraction = x - (shifted - SPLIT_SHIFT);
 	return __float_as_uint(shifted);
 }
-static __device__ __forceinline__ float floor_of(float x, float &fraction)
-{
-	float low = __fadd_rd(x, SPLIT_SHIFT) - SPLIT_SHIFT;
-
-	fraction = x - low;
-	return low;
-}
 static __device__ __forceinline__ int split(float x, float &fraction)
 {
 	return (int)(split_bits(x, fraction) - SPLIT_BITS);
@@ -231,6 +249,30 @@ static __device__ __forceinline__ float sample_ray(const float *__restrict__ sli
 	four_parts part = parts_at(wander, right);
 
 	return mix(across_four(p, fast_stride, part), across_four(p + row_stride, fast_stride, part), up);
+}
+
+/* A row and the next one, of the four columns of pairs from p on. */
+static __device__ __forceinline__ __half2 across_four(const __half2 *__restrict__ p, int fast_stride,
+						      const half_parts &part)
+{
+	__half2 two = __hfma2(__low2half2(part.inner), p[fast_stride], __hmul2(__low2half2(part.outer), p[0]));
+
+	return __hfma2(__high2half2(part.outer), p[3 * fast_stride],
+		       __hfma2(__high2half2(part.inner), p[2 * fast_stride], two));
+}
+
+/* The sample of a slice of pairs; four columns of a row must be readable. */
+static __device__ __forceinline__ float sample_ray(const __half2 *__restrict__ slice, int row_stride, int fast_stride,
+						   float fast, float row, const half_wandering &wander)
+{
+	float right, up;
+	unsigned i = split_bits(fast, right), j = split_bits(row, up);
+	unsigned surplus = SPLIT_BITS * (unsigned)row_stride + SPLIT_BITS * (unsigned)fast_stride;
+	const __half2 *p =
+	    slice + ((int)(j * (unsigned)row_stride + i * (unsigned)fast_stride - surplus) - fast_stride);
+	float2 rows = __half22float2(across_four(p, fast_stride, parts_at(wander, right)));
+
+	return mix(rows.x, rows.y, up);
 }
 
 /* The same with the outer voxels held beyond the edges. */
