@@ -2,10 +2,9 @@
 # The page as $1/assets.c, by npm's esbuild; without npm or its registry an empty table, aloud: the daemon then has its
 # plain page only. Such a table is written as older than any source, so that the next `make` tries again.
 set -uo pipefail
-cd "$(dirname "$0")"
-to=$1
-mkdir -p "$to/npm"
-to=$(realpath "$to")
+mkdir -p "$1/npm"
+to=$(realpath "$1")
+cd "$(dirname "$0")" || exit 1
 
 without() {
 	echo "building without the web page: $*" >&2
