@@ -13,7 +13,7 @@ export function geometryFacts(scan) {
 		['Projections', `${projections.count} of ${detector.columns} × ${detector.rows}`],
 		['Pixel', detector.pixel_mm && `${times(detector.pixel_mm)} mm`],
 		['at the isocentre', derived.pixel_at_isocentre_mm && `${times(derived.pixel_at_isocentre_mm, 3)} mm`],
-		['Arc', derived.arc_deg !== undefined && `${number(derived.arc_deg, 4)}° ${derived.direction === 'none' ? '' : derived.direction}, ${derived.scan}`],
+		['Arc', derived.arc_deg !== undefined && [`${number(derived.arc_deg, 4)}°`, derived.direction === 'none' ? '' : derived.direction, { full: 'a full turn', short: 'a short scan' }[derived.scan] ?? derived.scan].filter(Boolean).join(', ')],
 		['Weights of FDK', derived.weights],
 		['Source to axis', derived.source_radius_mm !== undefined && `${number(derived.source_radius_mm, 4)} mm`],
 		['Source to detector', derived.source_to_detector_mm !== undefined && `${number(derived.source_to_detector_mm, 4)} mm`],

@@ -12,6 +12,17 @@ function angle(scan, k) {
 	return at === undefined || at === null ? '' : `, ${number(at, 4)}°`
 }
 
+/* Whether rows run towards superior, so that the picture must be turned over: then it is as seen from the source. */
+function upward({ geometry }) {
+	if (geometry?.kind === 'views')
+		return geometry.views[0].row_step_mm[2] > 0
+	if (geometry?.kind !== 'matrices')
+		return true
+	/* How the row changes along z at the isocentre. */
+	const [, , , , , , rowZ, row, , , depthZ, depth] = geometry.matrices[0]
+	return (rowZ - row / depth * depthZ) / depth > 0
+}
+
 export class Film {
 	#scan = null
 	#timer = null
@@ -34,6 +45,7 @@ export class Film {
 		this.#scan = scan
 		this.slider.max = String(scan.projections.count - 1)
 		this.screen.style.aspectRatio = `${scan.detector.columns * scan.detector.pixel_mm[0]} / ${scan.detector.rows * scan.detector.pixel_mm[1]}`
+		this.screen.classList.toggle('upward', upward(scan))
 		if (first || grown)
 			this.#show(Number(this.slider.value))
 	}

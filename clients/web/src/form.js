@@ -12,7 +12,7 @@ const text = (pointer, label, options) => ({ pointer, label, kind: 'text', ...op
 
 /* A stage is left out by its checkbox; what is empty is left to the daemon's defaults. */
 const groups = [
-	{ title: 'Grid', pointer: '/grid', optional: true, off: 'chosen from the field of view', fields: [
+	{ title: 'Grid', pointer: '/grid', optional: true, three: true, off: 'chosen from the field of view', fields: [
 		number('/grid/size/0', 'Voxels along x', { step: 1 }), number('/grid/size/1', 'along y', { step: 1 }), number('/grid/size/2', 'along z', { step: 1 }),
 		number('/grid/spacing_mm/0', 'Spacing x, mm'), number('/grid/spacing_mm/1', 'y, mm'), number('/grid/spacing_mm/2', 'z, mm'),
 	] },
@@ -23,7 +23,7 @@ const groups = [
 	] },
 	{ title: 'SART', pointer: '/sart', optional: true, off: 'no iterations', fields: [
 		number('/sart/iterations', 'Iterations', { step: 1 }), number('/sart/relaxation', 'Relaxation'),
-		text('/sart/subsets', 'Subsets', { hint: 'a number, or views', read: value => value === 'views' ? value : Number(value) }),
+		text('/sart/subsets', 'Subsets', { hint: 'or views', read: value => value === 'views' ? value : Number(value) }),
 		flag('/sart/nonnegative', 'Never below zero'),
 		number('/sart/stop/residual', 'Stop at residual'), number('/sart/stop/change', 'Stop at change'),
 	] },
@@ -84,7 +84,7 @@ export class JobForm {
 	}
 
 	#group(group) {
-		const body = h('div', { class: 'fields' }, group.fields.map(field => this.#field(field)))
+		const body = h('div', { class: group.three ? 'fields three' : 'fields' }, group.fields.map(field => this.#field(field)))
 		if (!group.optional)
 			return h('fieldset', {}, h('legend', {}, group.title), body)
 		const value = this.#initial[path(group.pointer)[0]]

@@ -61,6 +61,7 @@ export class JobPage {
 		this.film = new Film()
 		this.controls = h('div', { class: 'controls', hidden: true }, this.#iterationControls(), this.#viewControls(), this.#compareControls())
 		this.warnings = h('div', {})
+		this.failure = h('div', {})
 		this.about = h('div', {})
 		this.geometry = h('div', {})
 		this.files = h('div', {})
@@ -68,10 +69,10 @@ export class JobPage {
 		this.element = h('div', { class: 'job' },
 			h('header', { class: 'head' }, h('a', { class: 'back', href: '#/' }, '‹ Jobs'), h('div', { class: 'title' }, this.heading, this.badge), this.actions,
 				h('div', { class: 'progress' }, this.bar.element, this.doing, this.left)),
-			this.announce, this.trouble, this.warnings,
+			this.announce, this.trouble, this.failure,
 			h('div', { class: 'columns' },
 				h('div', { class: 'pictures' }, this.empty, this.stage, this.controls),
-				h('div', { class: 'aside' }, this.courseSection,
+				h('div', { class: 'aside' }, this.warnings, this.courseSection,
 					h('section', { class: 'card' }, h('h2', {}, 'Downloads'), this.files),
 					h('section', { class: 'card' }, h('h2', {}, 'Projections'), this.film.element),
 					h('section', { class: 'card' }, h('h2', {}, 'Reconstruction'), this.about),
@@ -187,7 +188,10 @@ export class JobPage {
 		write(this.left, left(job) || (job.ended ? duration(job.timings.total) : ''))
 		this.title(`${ended(job) ? '' : `${Math.round(job.progress * 100)} % · `}${scan.name || scan.id}`)
 		this.#showActions(before)
-		replace(this.warnings, warningList([...scan.warnings, ...job.warnings]), job.error ? h('div', { class: 'notice bad' }, job.error.detail) : null)
+		const warnings = [...scan.warnings, ...job.warnings]
+		replace(this.warnings, warningList(warnings))
+		this.warnings.hidden = warnings.length === 0
+		replace(this.failure, job.error ? h('div', { class: 'notice bad' }, `It failed: ${job.error.detail}`) : null)
 		replace(this.about, jobFacts(job))
 		if (this.#first)
 			replace(this.geometry, geometryFacts(scan))
@@ -333,7 +337,7 @@ export class JobPage {
 				scale: select('Resolution', [['1', 'full'], ['2', 'half'], ['4', 'quarter']]),
 				list: h('ul', { class: 'files' }),
 			}
-			replace(this.files, h('div', { class: 'row' }, this.#files.format, this.#files.type, this.#files.scale), this.#files.list)
+			replace(this.files, h('div', { class: 'row choices' }, this.#files.format, this.#files.type, this.#files.scale), this.#files.list)
 		}
 		this.#writeLinks()
 	}

@@ -115,7 +115,7 @@ class Row {
 		this.detail = h('span', { class: 'detail' })
 		this.when = h('span', { class: 'when' })
 		this.bar = new Bar('Progress')
-		this.link = h('a', { class: 'job-row' }, this.thumb, h('span', { class: 'text' }, h('span', { class: 'line' }, this.name, this.badge), h('span', { class: 'line' }, this.detail, this.when), this.bar.element))
+		this.link = h('a', { class: 'job-row' }, this.thumb, h('span', { class: 'words' }, h('span', { class: 'line' }, this.name, this.badge), h('span', { class: 'line' }, this.detail, this.when), this.bar.element))
 		this.element = h('li', {}, this.link)
 	}
 

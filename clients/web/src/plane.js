@@ -8,6 +8,7 @@ import { volumePath } from './api.js'
 import { planes, axes, letters } from './view.js'
 
 const clickMost = 4 /* px: a pointer that moved less has clicked */
+const narrowMost = 280 /* px: below, there is no room for words beside the letters */
 const wheelStep = 40 /* of a wheel's units: one slice */
 
 /* Gray levels of all int16 values, as little-endian RGBA. */
@@ -128,6 +129,7 @@ export class Plane {
 		const height = view.grid.size[rows] * view.grid.spacing[rows]
 		const room = this.stage.getBoundingClientRect()
 		const scale = Math.min(room.width / width, room.height / height)
+		this.element.classList.toggle('narrow', room.width < narrowMost)
 		const [x, y] = view.pan[this.name]
 		const [crossX, crossY] = view.cross(this.name)
 		this.frame.style.width = `${width * scale}px`

@@ -106,6 +106,8 @@ export class Spatial {
 	}
 
 	#fail() {
+		if (this.#source === null) /* closed: the context was given back */
+			return
 		this.#failed = true
 		this.#showSheet()
 	}

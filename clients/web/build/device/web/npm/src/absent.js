@@ -1,2 +1,0 @@
-/* Stands for a package of NiiVue's that the page has no use for: build.mjs. */
-export {}
