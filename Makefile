@@ -195,15 +195,22 @@ bench: setup ## CPU and HTTP benchmarks, results in build/bench/
 	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/cpu-bench
 	@BUILD=$(BUILD) tests/bench/run.sh
 
+# A worker that can be made to fault, for the test of what becomes of that.
+$(BUILD)/tests/gpu/fault.o: tests/gpu/fault.cu
+	@mkdir -p $(@D)
+	$(call say,NVCC)$(NVCC) -std=c++17 $(cuda_code) -c -o $@ $<
+$(BUILD)/cbct-worker-faulty: $(call objects,daemon/worker.c) $(library) $(cuda_objects) $(BUILD)/tests/gpu/fault.o
+	$(call say,LINK)$(CC) $(LDFLAGS) -Wl,--wrap=_Z7cuda_tvP4planP6volumePK6cancelP5error -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(cuda_libs) $(LIBM)
+
 check-gpu: ## the CUDA backend against the CPU's; skipped aloud without a GPU
-	@$(MAKE) --no-print-directory $(BUILD)/gpu_check
+	@$(MAKE) --no-print-directory $(BUILD)/gpu_check all $(if $(cuda_objects),$(BUILD)/cbct-worker-faulty)
 	@$(BUILD)/gpu_check
+	@BUILD=$(BUILD) tests/gpu/end_to_end.sh
+	@BUILD=$(BUILD) tests/gpu/sanitize.sh
 
 bench-gpu: ## times of the CUDA backend beside their goals, results in build/bench/
-	@$(MAKE) --no-print-directory $(BUILD)/gpu_bench $(BUILD)/gpu_ceilings
-	@mkdir -p $(BUILD)/bench
-	@$(BUILD)/gpu_bench --json $(BUILD)/bench/gpu.json
-	@$(BUILD)/gpu_ceilings | tee $(BUILD)/bench/gpu_ceilings.json
+	@$(MAKE) --no-print-directory $(BUILD)/gpu_bench $(BUILD)/gpu_ceilings all
+	@BUILD=$(BUILD) tests/bench/gpu.sh
 
 asan: setup ## the tests under the address and undefined-behaviour sanitizers
 	@$(MAKE) --no-print-directory check SANITIZED=1 LEAVE_OUT=-study BUILD=build/asan SANITIZE=address,undefined CUDA=0

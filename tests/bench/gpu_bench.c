@@ -5,8 +5,12 @@
  * Prints a table with the goals beside the times, writes JSON when given a file.
  *
  *   gpu_bench [--cases ABCDET] [--what WORDS] [--geometry any|untilted] [--precision standard|reference] [--json FILE]
+ *             [--ceilings FILE]
  *
- * T stands for TV; --what measures only the rows that contain these words.
+ * T stands for TV; --what measures only the rows that contain these words. With
+ * the ceilings that gpu_ceilings has measured, rows say what part of them they
+ * reach: samples by the projectors against bilinear samples by the texture unit,
+ * bytes that must be read and written against copying.
  */
 #include <math.h>
 #include <stdio.h>
@@ -26,6 +30,7 @@ struct bench_case {
 	/* ms: any geometry, untilted; 0: none stated */
 	double project[2], backproject[2], filter[2], fdk[2], sirt[2], subsets[2], views[2];
 	int sirt_count; /* iterations in one measurement */
+	double samples; /* 1e9, of the forward projection along dominant axes; 0: not counted */
 };
 
 static const struct bench_case cases[] = {
@@ -44,7 +49,8 @@ static const struct bench_case cases[] = {
      {4.2, 3.6},
      {5.5, 5},
      {10, 8},
-     1},
+     1,
+     2.393},
     {'B',
      {.columns = 339,
       .rows = 339,
@@ -60,7 +66,8 @@ static const struct bench_case cases[] = {
      {.9, .8},
      {0, 0},
      {2.5, 2.2},
-     1},
+     1,
+     0},
     {'C',
      {.columns = 43,
       .rows = 43,
@@ -76,7 +83,8 @@ static const struct bench_case cases[] = {
      {.6, .6},
      {0, 0},
      {0, 0},
-     20},
+     20,
+     0},
     {'D',
      {.columns = 1240,
       .rows = 960,
@@ -92,7 +100,8 @@ static const struct bench_case cases[] = {
      {135, 95},
      {0, 0},
      {330, 300},
-     1},
+     1,
+     70.31},
     {'E',
      {.columns = 1024,
       .rows = 1024,
@@ -108,7 +117,8 @@ static const struct bench_case cases[] = {
      {0, 0},
      {0, 0},
      {0, 0},
-     1},
+     1,
+     229},
 };
 
 static FILE *json;
@@ -116,20 +126,48 @@ static bool json_first = true;
 static struct device *device;
 static const char *what_wanted = "";
 static const char *geometry_wanted = "";
-static bool reference; /* precision */
+static bool reference;                      /* precision */
+static double copy_ceiling, sample_ceiling; /* bytes/s, samples/s; 0: not measured */
 
-static void report(char letter, const char *kind, const char *what, double milliseconds, double goal)
+/* What part of the card's ceiling a time is; 0: not said. */
+static double part_of_ceiling(const struct bench_case *c, const char *what, double milliseconds)
+{
+	const struct scene_options *o = &c->options;
+	double voxels = (double)o->size[0] * o->size[1] * o->size[2], seconds_taken = milliseconds * 1e-3;
+	double pixels = (double)o->columns * o->rows * o->views;
+
+	if (copy_ceiling == 0)
+		return 0;
+	if (strcmp(what, "forward projection") == 0)
+		return c->samples * 1e9 / sample_ceiling / seconds_taken;
+	if (strcmp(what, "backprojection") == 0)
+		return voxels * o->views / sample_ceiling / seconds_taken;
+	if (strcmp(what, "FDK") == 0)
+		return (voxels * o->views / sample_ceiling + 8 * pixels / copy_ceiling) / seconds_taken;
+	if (strcmp(what, "weights and filter") == 0)
+		return 8 * pixels / copy_ceiling / seconds_taken;
+	if (strcmp(what, "norms") == 0)
+		return 4 * voxels / copy_ceiling / seconds_taken;
+	if (strcmp(what, "SIRT iteration") == 0)
+		return (c->samples * 1e9 + voxels * o->views) / sample_ceiling / seconds_taken;
+	return 0;
+}
+
+static void report(char letter, const char *kind, const char *what, double milliseconds, double goal, double part)
 {
 	printf("%c %-9s %-22s %10.3f ms", letter, kind, what, milliseconds);
 	if (goal > 0)
 		printf("   goal %8.2f  %5.2f x%s", goal, milliseconds / goal, milliseconds <= goal ? "" : "  -");
+	if (part > 0)
+		printf("   %3.0f %% of the ceiling", 100 * part);
 	printf("\n");
 	fflush(stdout);
 	if (json != NULL)
 		fprintf(
 		    json,
-		    "%s\n  {\"case\": \"%c\", \"geometry\": \"%s\", \"what\": \"%s\", \"ms\": %.4f, \"goal_ms\": %g}",
-		    json_first ? "" : ",", letter, kind, what, milliseconds, goal);
+		    "%s\n  {\"case\": \"%c\", \"geometry\": \"%s\", \"what\": \"%s\", \"ms\": %.4f, \"goal_ms\": %g, "
+		    "\"of_ceiling\": %.3f}",
+		    json_first ? "" : ",", letter, kind, what, milliseconds, goal, part);
 	json_first = false;
 }
 
@@ -172,12 +210,17 @@ static double milliseconds_of(struct bench *bench, operation *run, double budget
 	return times[count / 2];
 }
 
-static void measure(struct bench *bench, char letter, const char *kind, const char *what, operation *run, double goal)
+static void measure(struct bench *bench, const struct bench_case *c, const char *kind, const char *what, operation *run,
+		    double goal)
 {
 	const double budget = 1.5;
 
-	if (strstr(what, what_wanted) != NULL)
-		report(letter, kind, what, milliseconds_of(bench, run, budget), goal);
+	double milliseconds;
+
+	if (strstr(what, what_wanted) == NULL)
+		return;
+	milliseconds = milliseconds_of(bench, run, budget);
+	report(c->letter, kind, what, milliseconds, goal, part_of_ceiling(c, what, milliseconds));
 }
 
 static void run_project(struct bench *bench, struct error *err)
@@ -268,7 +311,7 @@ static void bench_sart(struct bench *bench, const struct bench_case *c, const ch
 		return;
 	make_plan(bench, &sart, subsets, NULL);
 	bench->repeat = repeat;
-	measure(bench, c->letter, kind, what, run_sart, goal);
+	measure(bench, c, kind, what, run_sart, goal);
 	bench->repeat = 1;
 	backend_cuda.plan_free(bench->plan);
 	subsets_clear(&sart.subsets);
@@ -296,12 +339,12 @@ static void bench_geometry(const struct bench_case *c, bool untilted)
 	     &err, "stack");
 	printf("%c: %s\n", c->letter, backend_cuda.plan_summary(bench.plan));
 	fill_volume(&bench);
-	measure(&bench, c->letter, kind, "forward projection", run_project, c->project[untilted]);
-	measure(&bench, c->letter, kind, "backprojection", run_backproject, c->backproject[untilted]);
-	measure(&bench, c->letter, kind, "weights and filter", run_filter, c->filter[untilted]);
-	measure(&bench, c->letter, kind, "FDK", run_fdk, c->fdk[untilted]);
+	measure(&bench, c, kind, "forward projection", run_project, c->project[untilted]);
+	measure(&bench, c, kind, "backprojection", run_backproject, c->backproject[untilted]);
+	measure(&bench, c, kind, "weights and filter", run_filter, c->filter[untilted]);
+	measure(&bench, c, kind, "FDK", run_fdk, c->fdk[untilted]);
 	if (untilted)
-		measure(&bench, c->letter, kind, "norms", run_norms, 0);
+		measure(&bench, c, kind, "norms", run_norms, 0);
 	fill_volume(&bench);
 	run_project(&bench, &err);
 	backend_cuda.plan_free(bench.plan);
@@ -346,7 +389,7 @@ static void bench_tv(int size, const double goals[TV_METHOD_COUNT])
 			backend_cuda.plan_free(bench.plan);
 		}
 		snprintf(what, sizeof(what), "TV %s step %d", tv_method_names[method], size);
-		report(size == 256 ? 'A' : 'D', "-", what, (times[1] - times[0]) / 20, goals[method]);
+		report(size == 256 ? 'A' : 'D', "-", what, (times[1] - times[0]) / 20, goals[method], 0);
 	}
 	backend_cuda.volume_free(bench.volume);
 	scene_clear(&bench.scene);
@@ -474,6 +517,20 @@ static void check_ball(const struct bench_case *c, bool untilted)
 	free(got);
 }
 
+static void read_ceilings(const char *path)
+{
+	FILE *file = fopen(path, "re");
+	double copy, samples;
+
+	if (file == NULL || fscanf(file, " {\"copy_tb_s\": %lf, \"layered_bilinear_g_s\": %lf", &copy, &samples) != 2) {
+		fprintf(stderr, "%s has no ceilings\n", path);
+		exit(2);
+	}
+	fclose(file);
+	copy_ceiling = copy * 1e12;
+	sample_ceiling = samples * 1e9;
+}
+
 int main(int argc, char **argv)
 {
 	const char *wanted = "ABCDET";
@@ -491,6 +548,8 @@ int main(int argc, char **argv)
 			reference = strcmp(argv[i + 1], "reference") == 0;
 		else if (strcmp(argv[i], "--json") == 0)
 			json = fopen(argv[i + 1], "we");
+		else if (strcmp(argv[i], "--ceilings") == 0)
+			read_ceilings(argv[i + 1]);
 	}
 	if (backend_cuda.count() == 0) {
 		printf("SKIPPED: no CUDA device answers\n");

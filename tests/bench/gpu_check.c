@@ -870,7 +870,35 @@ static void check_limit(void)
 	scene_clear(&scene);
 }
 
-/* gpu_check [WORDS]: only the scenes whose names contain these words; --large: only that (60 GB of host memory). */
+/* For compute-sanitizer, under which everything takes many times as long: each kind of kernel once or twice. */
+static void check_briefly(struct device *devices[2])
+{
+	static const char *const names[] = {"cube", "by view", "cut off", "flat", "one voxel", "one pixel", "thin"};
+	static const enum bend bends[] = {BEND_NONE, BEND_TILTED, BEND_STEEP};
+
+	for (size_t i = 0; i < sizeof(kinds) / sizeof(kinds[0]); i++)
+		for (size_t n = 0; n < sizeof(names) / sizeof(names[0]); n++)
+			for (size_t b = 0; b < sizeof(bends) / sizeof(bends[0]); b++) {
+				struct scene_options options = kinds[i].options;
+				struct scene scene;
+
+				if (strcmp(kinds[i].name, names[n]) != 0)
+					continue;
+				options.bend = bends[b];
+				for (int k = 0; k < 3; k++)
+					options.size[k] = options.size[k] > 33 ? 33 : options.size[k];
+				options.views = options.views > 7 ? 7 : options.views;
+				scene_make(&scene, kinds[i].name, &options);
+				check_scene(&scene, devices, kinds[i].subsets > 7 ? 7 : kinds[i].subsets, b > 0);
+				scene_clear(&scene);
+			}
+	check_counts(devices, true);
+}
+
+/*
+ * gpu_check [WORDS]: only the scenes whose names contain these words. --brief: little of everything;
+ * --large: only that (60 GB of host memory).
+ */
 int main(int argc, char **argv)
 {
 	const char *wanted = argc > 1 ? argv[1] : "";
@@ -888,6 +916,12 @@ int main(int argc, char **argv)
 	}
 	must(backend_cpu.open(0, &(struct device_options){0}, &devices[0], &err), &err, "CPU");
 	must(backend_cuda.open(0, &(struct device_options){0}, &devices[1], &err), &err, "CUDA");
+	if (strcmp(wanted, "--brief") == 0) {
+		check_briefly(devices);
+		backend_cuda.close(devices[1]);
+		backend_cpu.close(devices[0]);
+		return failures > 0;
+	}
 	backend_cuda.describe(devices[1], &before);
 	printf("%s, %s, %.1f GiB free\n", before.name, before.driver, (double)before.bytes_free / (1 << 30));
 	for (size_t k = 0; k < sizeof(kinds) / sizeof(kinds[0]); k++) {

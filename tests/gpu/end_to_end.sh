@@ -1,0 +1,88 @@
+#!/usr/bin/env bash
+# The CUDA backend through the real daemon: volumes beside the CPU's, memory that
+# comes back after 200 jobs, a worker that dies of an illegal access while the
+# daemon goes on. Needs a device, and nothing but cbct; skipped aloud without one.
+set -uo pipefail
+cd "$(dirname "$0")/../.."
+BUILD=$(realpath "${BUILD:-build}")
+PATH=$BUILD:$PATH
+work=$BUILD/test/gpu
+JOBS=${JOBS:-200}
+rm -rf "$work" && mkdir -p "$work"
+failures=0
+
+if ! nvidia-smi -L >/dev/null 2>&1; then
+	echo "SKIPPED: no CUDA device answers"
+	exit 0
+fi
+
+start() { # [OPTION ...]: a daemon on a free port
+	cbctd --listen 127.0.0.1:0 --state-dir "$work/state" --backend cuda --log-level info "$@" >"$work/out" 2>>"$work/err" &
+	daemon=$!
+	for ((i = 0; i < 600; i++)); do
+		CBCT_URL=$(sed -n 's/^listening on //p' "$work/out")
+		[ -n "$CBCT_URL" ] && grep -q "cuda, " "$work/err" && break
+		kill -0 $daemon 2>/dev/null || { tail -5 "$work/err"; exit 1; }
+		sleep 0.05
+	done
+	export CBCT_URL
+}
+stop() { kill $daemon && wait $daemon; }
+trap 'kill $daemon 2>/dev/null' EXIT
+memory() { nvidia-smi --query-gpu=memory.used --format=csv,noheader,nounits | head -1; }
+check() { # WHAT CONDITION ...
+	local what=$1
+	shift
+	if "$@"; then echo "pass $what"; else echo "FAIL $what" && failures=$((failures + 1)); fi
+}
+below() { awk -v a="$1" -v b="$2" 'BEGIN { exit !(a + 0 < b + 0) }'; }
+
+# Counts with noise from a C-arm that wanders; FDK, SART and TV on both backends.
+cbct simulate -o "$work/scan" --phantom head --scale 45 --density 0.0192 --views 120 --arc 200 --columns 260 --rows 220 \
+	--pixel 1.2 --wobble 3 --kind matrices --photons 100000 >"$work/simulate.log" 2>&1 || cat "$work/simulate.log"
+recipe=(--grid 128 --spacing 0.75 --sart 10 --subsets 10 --emit fdk)
+start
+scan=$(cbct upload "$work/scan" --quiet | tail -1)
+job=$(cbct submit "$scan" "${recipe[@]}" --wait 2>>"$work/watch" | tail -1)
+cbct recon "$work/scan" "${recipe[@]}" --backend cpu -o "$work/cpu" --quiet >/dev/null
+for name in fdk final; do
+	cbct get "$job" $name -o "$work/$name.nii" >/dev/null
+	rms=$(cbct compare "$work/$name.nii" "$work/cpu/$name.nii" --hu --json | tr ',{' '\n\n' | sed -n 's/.*"rmse": *//p' | head -1)
+	check "$name is the CPU's within 0.5 HU RMS ($rms)" below "${rms:-nan}" 0.5
+done
+again=$(cbct submit "$scan" "${recipe[@]}" --tv gradient --wait 2>>"$work/watch" | tail -1)
+third=$(cbct submit "$scan" "${recipe[@]}" --tv gradient --wait 2>>"$work/watch" | tail -1)
+cbct get "$again" final -o "$work/a.nii" >/dev/null && cbct get "$third" final -o "$work/b.nii" >/dev/null
+check "the same bits again" cmp -s "$work/a.nii" "$work/b.nii"
+
+# Memory: all kinds of small jobs, one after the other.
+before=$(memory)
+for ((i = 0; i < JOBS; i++)); do
+	case $((i % 4)) in
+	0) last=$(cbct submit "$scan" --grid 64 --spacing 1.5) ;;
+	1) last=$(cbct submit "$scan" --grid 48,50,33 --spacing 1.5 --sart 2 --subsets views) ;;
+	2) last=$(cbct submit "$scan" --grid 64 --spacing 1.5 --sart 2 --tv proximal) ;;
+	3) last=$(cbct submit "$scan" --grid 33 --spacing 2 --sart 3 --subsets 1 --tv gradient --no-fdk) ;;
+	esac
+done
+cbct watch "$last" >/dev/null 2>&1
+after=$(memory)
+check "memory after $JOBS jobs: $before MiB, $after MiB" below "$after" "$((before + 16))"
+stop
+
+# An illegal access: the worker ends, the daemon starts another, the job is done there.
+if [ -x "$BUILD/cbct-worker-faulty" ]; then
+	touch "$work/fault"
+	export CBCT_FAULT=$work/fault
+	: >"$work/err"
+	start --worker "$BUILD/cbct-worker-faulty"
+	job=$(cbct submit "$scan" --grid 64 --spacing 1.5 --tv gradient --wait 2>>"$work/watch" | tail -1)
+	check "the job is done after the fault" cbct watch "$job"
+	check "the fault was met" [ ! -e "$work/fault" ]
+	check "its worker ended and another came" grep -q "ended with exit status 3, the next one starts" "$work/err"
+	check "the daemon goes on" kill -0 $daemon
+	stop
+fi
+
+echo "$failures failures"
+[ $failures = 0 ]
