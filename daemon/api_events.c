@@ -13,7 +13,7 @@
 #include "daemon/http_text.h"
 
 static const double heartbeat_every = 10; /* s */
-static const double patience = 15;        /* s; with one heartbeat more, a dead client is gone within 30 */
+static const double patience = 15;        /* s; with one heartbeat more, a client that vanished is gone within 30 */
 static const char heartbeat_text[] = ":\n\n", greeting[] = "retry: 2000\n\n";
 
 struct watcher {

@@ -20,7 +20,7 @@
 #include "daemon/http_text.h"
 #include "proto/json.h"
 
-static const double look_every = 10; /* s: whether the client is still there */
+static const double patience = 15; /* s */
 enum { BATCH = 64, HEAD_MAX = 1024 };
 
 struct stream {
@@ -248,8 +248,6 @@ static ssize_t stream_read(struct request *request, void *to, size_t size)
 		if (stream->last)
 			return 0;
 		code = go_on(stream, to, size, &sent);
-		if (code == READ_WAIT)
-			request_wait_until(request, http_now() + look_every);
 		if (code != 0 || sent > 0)
 			return code != 0 ? code : sent;
 	}
@@ -310,7 +308,7 @@ int volume_stream(void *context, struct request *request, struct error *err)
 	    volume_options(request, &stream->facts, &stream->options, err) != 0 ||
 	    (after != NULL && skip_to(stream, after, err) != 0))
 		return err->code;
-	if (request_reply_live(request, 200, stream_read, 0, err) != 0)
+	if (request_reply_live(request, 200, stream_read, patience, err) != 0)
 		return err->code;
 	request_reply_header(request, "Content-Type", "multipart/mixed; boundary=\"%s\"", stream->boundary);
 	request_reply_header(request, "Cache-Control", "no-store");

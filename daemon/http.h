@@ -130,9 +130,9 @@ int request_reply_read(struct request *request, int status, uint64_t size,
  * A body that goes on for as long as something comes. read, as above, is called
  * in the request's thread; READ_WAIT calls it again after request_wake, or when
  * the time of request_wait_until has come. What it works on is request_state.
- * A client that has gone is noticed before each wait, and without traffic by
- * keep-alive probes; patience (s, 0: the system's) is how long sent bytes may
- * stay unacknowledged.
+ * A client that has gone is noticed within a second, one that vanished by
+ * keep-alive probes within 20; patience (s) is how long sent bytes may stay
+ * unacknowledged.
  */
 enum { READ_WAIT = -2 };
 int request_reply_live(struct request *request, int status,

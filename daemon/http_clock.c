@@ -1,6 +1,7 @@
 /*
- * Connections and time: each one's pace is judged by the phase it is in, and
- * those that wait are woken when their time has come. One thread looks at all
+ * Connections and time: each one's pace is judged by the phase it is in, those
+ * that wait are woken when their time has come, those without an end in sight
+ * when their peer has gone. One thread looks at all
  * of them; it sleeps until the next deadline it saw, or a second.
  *
  * The library knows idle time only, so that a client which sends a byte every
@@ -33,6 +34,8 @@ void connection_phase(struct connection *connection, enum phase phase, uint64_t 
 	connection->paused = 0;
 	connection->bytes = bytes;
 	connection->woken = false;
+	if (phase == PHASE_IDLE)
+		connection->patience = 0;
 	pthread_mutex_unlock(&connection->lock);
 }
 
@@ -146,9 +149,15 @@ static double look(struct connection *connection, double now)
 	bool cut = false;
 
 	pthread_mutex_lock(&connection->lock);
+	if (connection->patience > 0 && !connection->cut && now >= connection->looked_at + 1) {
+		connection->looked_at = now;
+		connection->cut = live_peer_gone(connection, now);
+		if (connection->cut)
+			shutdown(connection->socket, SHUT_RDWR);
+	}
 	if (connection->suspended) {
 		next = connection->wait_until;
-		if (next <= now) {
+		if (next <= now || connection->cut) {
 			resume(connection);
 			next = INFINITY;
 		}

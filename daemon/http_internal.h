@@ -38,7 +38,12 @@ struct connection {
 	double suspended_at;
 	bool woken;        /* request_wake came while it was not suspended */
 	double wait_until; /* of a suspended one */
-	bool cut;          /* shut down for its pace */
+	bool cut;          /* shut down for its pace, or because its peer has gone */
+
+	/* Of a reply without an end in sight: s that sent bytes may stay unacknowledged; 0: another kind. */
+	double patience;
+	double looked_at, answered_at; /* by the clock; the last time that nothing was outstanding, or some of it came in */
+	uint64_t acknowledged;         /* bytes, then */
 };
 
 struct request {
@@ -122,6 +127,10 @@ enum suspension connection_suspend(struct connection *connection, double until);
 void connections_wake(struct http *http);
 /* None has a request under way. */
 bool connections_idle(struct http *http);
+
+/* ---- http_live.c: replies without an end in sight ---- */
+/* Whether a client has gone, with or without a word; with the connection's lock held. */
+bool live_peer_gone(struct connection *connection, double now);
 
 /* ---- http_request.c: what the request line and headers say ---- */
 struct request *request_new(struct http *http, struct connection *connection, const char *target);

@@ -4,15 +4,15 @@
  * The library asks for bytes whenever the socket takes some; when there are
  * none yet the connection is suspended from within that call, out of the epoll
  * loop, until request_wake. No thread and no timer of its own for any of them.
- * A suspended connection does not see its peer go: so the socket is looked at
- * before each wait, and whoever has nothing to send wakes up now and then.
+ * A suspended connection does not see its peer go: so the clock looks at the
+ * socket every second.
  */
 #include "daemon/http_internal.h"
 
 #include <errno.h>
 #include <math.h>
+#include <linux/tcp.h> /* the C library's has not all of struct tcp_info */
 #include <netinet/in.h>
-#include <netinet/tcp.h>
 #include <stdlib.h>
 
 struct live {
@@ -21,12 +21,33 @@ struct live {
 };
 
 /* Closed or broken; a client that has shut down its side for writing is counted as gone, too. */
-static bool peer_is_gone(const struct connection *connection)
+static bool has_hung_up(const struct connection *connection)
 {
 	char byte;
 	ssize_t got = recv(connection->socket, &byte, 1, MSG_PEEK | MSG_DONTWAIT);
 
 	return got == 0 || (got < 0 && errno != EAGAIN && errno != EWOULDBLOCK && errno != EINTR);
+}
+
+/*
+ * Who vanished answers nothing: neither what was sent nor the probes of an idle
+ * connection, whose end the kernel then makes an error of the socket. Who does
+ * not read answers the probes of his closed window.
+ */
+bool live_peer_gone(struct connection *connection, double now)
+{
+	struct tcp_info info = {0};
+	socklen_t size = sizeof(info);
+
+	if (has_hung_up(connection))
+		return true;
+	if (getsockopt(connection->socket, IPPROTO_TCP, TCP_INFO, &info, &size) != 0)
+		return false; /* a Unix socket: a peer does not vanish */
+	if ((info.tcpi_unacked == 0 && info.tcpi_probes == 0) || info.tcpi_bytes_acked != connection->acknowledged) {
+		connection->acknowledged = info.tcpi_bytes_acked;
+		connection->answered_at = now;
+	}
+	return now - connection->answered_at >= connection->patience;
 }
 
 /*
@@ -56,7 +77,7 @@ static ssize_t live_read(void *context, uint64_t offset, char *to, size_t size)
 			return got;
 		if (got == 0)
 			return MHD_CONTENT_READER_END_OF_STREAM;
-		if (got != READ_WAIT || peer_is_gone(request->connection))
+		if (got != READ_WAIT || has_hung_up(request->connection))
 			return give_up(request->connection, to);
 		switch (connection_suspend(request->connection, request->wait_until)) {
 		case SUSPENDED:
@@ -75,17 +96,21 @@ static void live_free(void *context)
 }
 
 /* Good manners, not conditions: a Unix socket knows nothing of them. */
-static void watch_peer(int socket, double patience)
+static void watch_peer(struct connection *connection, double patience)
 {
-	int on = 1, idle = 5, interval = 5, probes = 3, milliseconds = (int)(patience * 1000);
+	int on = 1, idle = 5, interval = 5, probes = 3;
 
-	setsockopt(socket, SOL_SOCKET, SO_KEEPALIVE, &on, sizeof(on));
-	setsockopt(socket, IPPROTO_TCP, TCP_KEEPIDLE, &idle, sizeof(idle));
-	setsockopt(socket, IPPROTO_TCP, TCP_KEEPINTVL, &interval, sizeof(interval));
-	setsockopt(socket, IPPROTO_TCP, TCP_KEEPCNT, &probes, sizeof(probes));
-	setsockopt(socket, IPPROTO_TCP, TCP_USER_TIMEOUT, &milliseconds, sizeof(milliseconds));
+	setsockopt(connection->socket, SOL_SOCKET, SO_KEEPALIVE, &on, sizeof(on));
+	setsockopt(connection->socket, IPPROTO_TCP, TCP_KEEPIDLE, &idle, sizeof(idle));
+	setsockopt(connection->socket, IPPROTO_TCP, TCP_KEEPINTVL, &interval, sizeof(interval));
+	setsockopt(connection->socket, IPPROTO_TCP, TCP_KEEPCNT, &probes, sizeof(probes));
 	/* Each event is due when it happens. */
-	setsockopt(socket, IPPROTO_TCP, TCP_NODELAY, &on, sizeof(on));
+	setsockopt(connection->socket, IPPROTO_TCP, TCP_NODELAY, &on, sizeof(on));
+	pthread_mutex_lock(&connection->lock);
+	connection->patience = patience;
+	connection->looked_at = connection->answered_at = http_now();
+	connection->acknowledged = 0;
+	pthread_mutex_unlock(&connection->lock);
 }
 
 int request_reply_live(struct request *request, int status,
@@ -104,7 +129,7 @@ int request_reply_live(struct request *request, int status,
 		free(live);
 		return error_set(err, ERR_NO_MEMORY, "no memory for a reply");
 	}
-	watch_peer(request->connection->socket, patience);
+	watch_peer(request->connection, patience);
 	request->response = response;
 	request->status = status;
 	request->response_size = UNKNOWN_SIZE;
