@@ -108,7 +108,7 @@ static double drift(struct rng *stream, double turn)
 static void view_wobble(struct view *view, double turn, double wobble, uint64_t seed)
 {
 	struct rng rng;
-	double turned[3], angle;
+	double turned[3], angle, ratio = vec_norm(view->row_step) / vec_norm(view->column_step);
 
 	rng_seed(&rng, seed, 0);
 	for (int i = 0; i < 3; i++) {
@@ -118,12 +118,9 @@ static void view_wobble(struct view *view, double turn, double wobble, uint64_t 
 	/* A hundredth of a degree for each millimetre. */
 	angle = wobble * 0.01 * M_PI / 180 * drift(&rng, turn);
 	for (int i = 0; i < 3; i++)
-		turned[i] = view->column_step[i] * cos(angle) +
-			    view->row_step[i] * sin(angle) * vec_norm(view->column_step) / vec_norm(view->row_step);
+		turned[i] = view->column_step[i] * cos(angle) + view->row_step[i] * sin(angle) / ratio;
 	for (int i = 0; i < 3; i++)
-		view->row_step[i] = view->row_step[i] * cos(angle) - view->column_step[i] * sin(angle) *
-									 vec_norm(view->row_step) /
-									 vec_norm(view->column_step);
+		view->row_step[i] = view->row_step[i] * cos(angle) - view->column_step[i] * sin(angle) * ratio;
 	memcpy(view->column_step, turned, sizeof(turned));
 }
 

@@ -1,0 +1,232 @@
+#!/usr/bin/python3
+"""Projections of a scan directory in other tools' formats, written without any of the project's code.
+
+Usage: images.py mha|npy|tiff|pages|tiles|dicom|enhanced SCAN OUT [OPTION=VALUE ...]
+"""
+import json
+import os
+import struct
+import sys
+import zlib
+
+import numpy
+
+
+def load(scan):
+    """The document and [view][row][column]."""
+    with open(os.path.join(scan, "scan.json"), encoding="utf-8") as file:
+        document = json.load(file)
+    shape = document["projections"]["count"], document["detector"]["rows"], document["detector"]["columns"]
+    kind = "<f4" if document["projections"]["sample"] == "float32" else "<u2"
+    return document, numpy.fromfile(os.path.join(scan, "projections.raw"), kind).reshape(shape)
+
+
+def to_type(images, options):
+    """As another type, times a factor: type=<i2 factor=100."""
+    kind = numpy.dtype(options.get("type", images.dtype.str))
+    images = images * float(options.get("factor", 1))
+    return (numpy.rint(images) if kind.kind in "iu" else images).astype(kind)
+
+
+def write_mha(document, images, out, options):
+    """type=, data=FILE for pixels beside the header, header=BYTES before them, packed=1."""
+    kinds = {"u1": "UCHAR", "i1": "CHAR", "u2": "USHORT", "i2": "SHORT", "u4": "UINT", "i4": "INT", "f4": "FLOAT", "f8": "DOUBLE"}
+    images = to_type(images, options)
+    packed, beside = "packed" in options, options.get("data")
+    pixels = zlib.compress(images.tobytes()) if packed else images.tobytes()
+    pitch = document["detector"]["pixel_mm"]
+    count, rows, columns = images.shape
+    lines = [
+        "ObjectType = Image",
+        "NDims = 3",
+        "BinaryData = True",
+        f"BinaryDataByteOrderMSB = {images.dtype.str[0] == '>'}",
+        f"CompressedData = {packed}",
+        f"Offset = {-0.5 * (columns - 1) * pitch[0]!r} {-0.5 * (rows - 1) * pitch[1]!r} 0",
+        f"ElementSpacing = {pitch[0]!r} {pitch[1]!r} 1",
+        f"DimSize = {columns} {rows} {count}",
+        f"ElementType = MET_{kinds[images.dtype.str[1:]]}",
+    ]
+    if "header" in options:
+        lines.append(f"HeaderSize = {options['header']}")
+        pixels = bytes(int(options["header"]) if options["header"] != "-1" else 13) + pixels
+    lines.append(f"ElementDataFile = {beside or 'LOCAL'}\n")
+    with open(out, "wb") as file:
+        file.write("\n".join(lines).encode())
+        if beside is None:
+            file.write(pixels)
+    if beside is not None:
+        with open(os.path.join(os.path.dirname(out), beside), "wb") as file:
+            file.write(pixels)
+
+
+def tiff_page(image, offset, last, strips=3, tile=0, packed=False):
+    """One image file directory behind its pixels, all of it to stand at `offset` (TIFF 6.0)."""
+    order = ">" if image.dtype.str[0] == ">" else "<"
+    rows, columns = image.shape
+    if tile:
+        blocks = []
+        for y in range(0, rows, tile):
+            for x in range(0, columns, tile):
+                block = numpy.zeros((tile, tile), image.dtype)
+                part = image[y : y + tile, x : x + tile]
+                block[: part.shape[0], : part.shape[1]] = part
+                blocks.append(block.tobytes())
+    else:
+        each = -(-rows // strips)
+        blocks = [image[y : y + each].tobytes() for y in range(0, rows, each)]
+    if packed:
+        blocks = [zlib.compress(block) for block in blocks]
+    data, places = b"", []
+    for block in blocks:
+        places.append(offset + len(data))
+        data += block + b"\0" * (len(block) % 2)
+    lists = offset + len(data)
+    data += struct.pack(f"{order}{len(blocks)}I", *places) + struct.pack(f"{order}{len(blocks)}I", *map(len, blocks))
+    inline = len(blocks) == 1
+    place = places[0] if inline else lists
+    length = len(blocks[0]) if inline else lists + 4 * len(blocks)
+    tags = [
+        (256, 4, 1, columns),
+        (257, 4, 1, rows),
+        (258, 3, 1, image.dtype.itemsize * 8),
+        (259, 3, 1, 8 if packed else 1),
+        (262, 3, 1, 1),
+        (277, 3, 1, 1),
+        (339, 3, 1, {"u": 1, "i": 2, "f": 3}[image.dtype.kind]),
+    ]
+    if tile:
+        tags += [(322, 4, 1, tile), (323, 4, 1, tile), (324, 4, len(blocks), place), (325, 4, len(blocks), length)]
+    else:
+        tags += [(273, 4, len(blocks), place), (278, 4, 1, each), (279, 4, len(blocks), length)]
+    directory = offset + len(data)
+    data += struct.pack(order + "H", len(tags))
+    for tag, kind, count, value in sorted(tags):
+        data += struct.pack(order + "HHI", tag, kind, count)
+        data += struct.pack(order + ("I" if kind == 4 else "HH"), *((value,) if kind == 4 else (value, 0)))
+    end = directory + 2 + 12 * len(tags) + 4
+    return data + struct.pack(order + "I", 0 if last else end), directory, end
+
+
+def write_tiff(images, out, **how):
+    """All images as pages of one file. A page's directory stands behind its pixels: the chain is mended as it grows."""
+    big = images.dtype.str[0] == ">"
+    order = ">" if big else "<"
+    data = bytearray(struct.pack(order + "2sHI", b"MM" if big else b"II", 42, 0))
+    link = 4
+    for image in images:
+        page, directory, end = tiff_page(image, len(data), True, **how)
+        data += page
+        data[link : link + 4] = struct.pack(order + "I", directory)
+        link = end - 4
+    with open(out, "wb") as file:
+        file.write(data)
+
+
+def write_folder(images, out, **how):
+    """proj_1.tif, proj_2.tif ... proj_10.tif: numbers without zeros before them."""
+    os.makedirs(out, exist_ok=True)
+    for k, image in enumerate(images):
+        write_tiff(image[None], os.path.join(out, f"proj_{k + 1}.tif"), **how)
+
+
+def first_and_step(document):
+    """Gantry angles to DICOM's: the source behind the patient, at +y, is primary angle 0."""
+    geometry = document["geometry"]
+    return geometry["first_angle_deg"] - 90, geometry["angle_step_deg"]
+
+
+DICOM_HEAD = """(0002,0010) UI [{syntax}]
+(0008,0016) UI [{sop_class}]
+(0008,0018) UI [1.2.3.4.5.6]
+(0008,0060) CS [XA]
+(0010,0010) PN [M\udcfcller^Test]
+"""
+DICOM_PIXELS = """(0028,0002) US 1
+(0028,0004) CS [MONOCHROME2]
+(0028,0008) IS [{frames}]
+(0028,0010) US {rows}
+(0028,0011) US {columns}
+(0028,0100) US 16
+(0028,0101) US 16
+(0028,0102) US 15
+(0028,0103) US 0
+(0028,1040) CS [LIN]
+"""
+
+
+def dicom_images(document, images, out):
+    """Shown as one faces the patient: turned by half a turn against the scan's own order."""
+    pixels = os.path.basename(out) + ".pixels"
+    numpy.ascontiguousarray(images[:, ::-1, ::-1]).astype("<u2").tofile(os.path.join(os.path.dirname(out), pixels))
+    geometry, pitch = document["geometry"], document["detector"]["pixel_mm"]
+    return {
+        "frames": images.shape[0],
+        "rows": images.shape[1],
+        "columns": images.shape[2],
+        "pixels": f"(7fe0,0010) OW ={pixels}\n",
+        "distance": f"(0018,1110) DS [{geometry['source_to_detector_mm']}]\n",
+        "spacing": f"(0018,1164) DS [{pitch[1]}\\{pitch[0]}]\n",
+    }
+
+
+def write_dump(text, out):
+    with open(out, "wb") as file:
+        file.write(text.encode("latin-1", "surrogateescape"))
+
+
+def write_dicom(document, images, out, options):
+    """A dump for dump2dcm of an XA object; increments=each writes each frame's offset, else one step."""
+    parts = dicom_images(document, images, out)
+    first, step = first_and_step(document)
+    increments = [f"{step:.12g}"] if options.get("increments") != "each" else [f"{step * k:.12g}" for k in range(parts["frames"])]
+    text = DICOM_HEAD.format(syntax="1.2.840.10008.1.2.1", sop_class="1.2.840.10008.5.1.4.1.1.12.1")
+    text += parts["distance"] + f"(0018,1111) DS [{document['geometry']['source_to_isocentre_mm']}]\n" + parts["spacing"]
+    text += f"(0018,1500) CS [DYNAMIC]\n(0018,1510) DS [{first}]\n(0018,1511) DS [0]\n"
+    text += "(0018,1520) DS [" + "\\".join(increments) + "]\n"
+    text += DICOM_PIXELS.format(**parts) + parts["pixels"]
+    write_dump(text, out)
+
+
+def write_enhanced(document, images, out, options):
+    """A dump of an Enhanced XA object: distances and spacing shared, angles in each frame's functional groups."""
+    parts = dicom_images(document, images, out)
+    first, step = first_and_step(document)
+    text = DICOM_HEAD.format(syntax="1.2.840.10008.1.2.1", sop_class="1.2.840.10008.5.1.4.1.1.12.1.1")
+    text += DICOM_PIXELS.format(**parts)
+    text += "(5200,9229) SQ\n(fffe,e000) na\n(0018,9476) SQ\n(fffe,e000) na\n" + parts["distance"]
+    text += f"(0018,9402) FL {document['geometry']['source_to_isocentre_mm']}\n(fffe,e00d) na\n(fffe,e0dd) na\n"
+    text += "(0028,9443) SQ\n(fffe,e000) na\n" + parts["spacing"] + "(fffe,e00d) na\n(fffe,e0dd) na\n"
+    text += "(fffe,e00d) na\n(fffe,e0dd) na\n(5200,9230) SQ\n"
+    for k in range(parts["frames"]):
+        text += "(fffe,e000) na\n(0018,9405) SQ\n(fffe,e000) na\n"
+        text += f"(0018,1510) DS [{first + step * k:.12g}]\n(0018,1511) DS [{options.get('secondary', 0)}]\n"
+        text += "(fffe,e00d) na\n(fffe,e0dd) na\n(fffe,e00d) na\n"
+    text += "(fffe,e0dd) na\n" + parts["pixels"]
+    write_dump(text, out)
+
+
+def main():
+    """The command line."""
+    kind, scan, out = sys.argv[1:4]
+    options = dict(word.split("=", 1) for word in sys.argv[4:])
+    document, images = load(scan)
+    if kind == "mha":
+        write_mha(document, images, out, options)
+    elif kind == "npy":
+        numpy.save(out, to_type(images, options))
+    elif kind == "tiff":
+        write_folder(to_type(images, options), out)
+    elif kind == "pages":
+        write_tiff(to_type(images, options), out, packed=True)
+    elif kind == "tiles":
+        write_folder(to_type(images, options), out, tile=16)
+    elif kind == "dicom":
+        write_dicom(document, images, out, options)
+    elif kind == "enhanced":
+        write_enhanced(document, images, out, options)
+    else:
+        sys.exit(f"no format {kind}")
+
+
+main()
