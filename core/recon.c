@@ -12,6 +12,7 @@
 #include <time.h>
 
 #include "core/fdk.h"
+#include "core/input.h"
 #include "core/parts.h"
 #include "core/sart.h"
 
@@ -29,7 +30,7 @@ struct recon {
 
 	struct recipe recipe; /* resolved */
 	struct orbit orbit;
-	struct linearise linearise;
+	struct input input;
 	struct fdk_weights weights;
 	struct sart_options sart;
 
@@ -38,11 +39,11 @@ struct recon {
 	struct stack *projections; /* a slot for each view with SART, else for each view of an FDK batch */
 	struct volume *volume;     /* the iterate */
 	struct volume *before;     /* the iterate before the iteration; NULL without SART */
+	struct stack *stand_in;    /* one slot, once a view is blank and SART is on */
+	float *stand_in_host;
 
 	unsigned char *pushed; /* [views] */
 	int pushed_count;
-	struct defect_counts defects;
-	int defective_views; /* views with any */
 
 	bool resumed, ran;
 	int iteration; /* done so far */
@@ -249,7 +250,7 @@ static int recon_allocate(struct recon *recon, struct error *err)
 	const struct geometry *geometry = recon->geometry;
 	const struct recipe *recipe = &recon->recipe;
 	const struct plan_options options =
-	    plan_options(recipe, geometry, &recon->linearise, &recon->weights, &recon->sart);
+	    plan_options(recipe, geometry, &recon->input.linearise, &recon->weights, &recon->sart);
 	int code = refuse_what_does_not_fit(recon, &options, err);
 	const struct backend *backend = recon->backend; /* that may have changed it */
 
@@ -282,10 +283,11 @@ int recon_open(const struct backend *backend, struct device *device, const struc
 	recon->backend = backend;
 	recon->device = device;
 	recon->geometry = geometry;
-	recon->linearise = *linearise;
 	recon->hooks = hooks;
 	recon->cancel = (struct cancel){.asked = hooks->cancelled, .context = hooks->context};
-	code = recon_prepare(recon, recipe, err);
+	code = input_open(&recon->input, linearise, geometry, err);
+	if (code == 0)
+		code = recon_prepare(recon, recipe, err);
 	if (code == 0)
 		code = recon_allocate(recon, err);
 	if (code < 0) {
@@ -302,6 +304,7 @@ void recon_free(struct recon *recon)
 		return;
 	recon->backend->volume_free(recon->before);
 	recon->backend->volume_free(recon->volume);
+	recon->backend->stack_free(recon->stand_in);
 	recon->backend->stack_free(recon->projections);
 	fdk_clear(&recon->fdk);
 	recon->backend->plan_free(recon->plan);
@@ -311,6 +314,8 @@ void recon_free(struct recon *recon)
 	recipe_clear(&recon->recipe);
 	if (recon->parts != NULL)
 		backend_parts.close(recon->parts);
+	input_clear(&recon->input);
+	free(recon->stand_in_host);
 	free(recon->pushed);
 	free(recon);
 }
@@ -364,19 +369,11 @@ static int keep(struct recon *recon, const char *name, const char *stage, struct
 static void warn_of_the_input(struct recon *recon)
 {
 	const double degrees = 57.29577951308232;
-	size_t samples =
-	    (size_t)recon->geometry->count * (size_t)recon->geometry->columns * (size_t)recon->geometry->rows;
 	char detail[256];
 
 	if (recon->hooks->warning == NULL)
 		return;
-	if (defects_total(&recon->defects) > 0) {
-		snprintf(detail, sizeof(detail),
-			 "%zu samples (%.3g %%) in %d projections were replaced from their neighbours",
-			 defects_total(&recon->defects),
-			 100.0 * (double)defects_total(&recon->defects) / (double)samples, recon->defective_views);
-		recon->hooks->warning(recon->hooks->context, "defects", detail);
-	}
+	input_warn(&recon->input, recon->geometry, recon->hooks);
 	if (recon->recipe.fdk.on && recon->orbit.arc_too_short) {
 		snprintf(detail, sizeof(detail),
 			 "FDK of an arc of %.1f degrees; a complete one has 180 degrees and the fan of %.1f degrees",
@@ -410,18 +407,15 @@ static int check_views(const struct recon *recon, const int *views, int count, s
 static int push_view(struct recon *recon, const void *samples, int view, struct error *err)
 {
 	int slot = recon->recipe.sart.on ? view : recon->fdk.pending, code;
-	size_t before = defects_total(&recon->defects);
 
 	/* Again here: the list of one call may name a view twice. */
 	if (recon->pushed[view])
 		return error_set(err, ERR_CONFLICT, "view %d came a second time", view);
-	/* One by one, so that the projections with defects can be counted. */
-	code = recon->backend->linearise(recon->plan, samples, 1, &slot, recon->projections, &recon->defects, err);
+	code = input_take(&recon->input, recon->backend, recon->plan, samples, view, slot, recon->projections, err);
 	if (code < 0)
 		return code;
 	recon->pushed[view] = 1;
 	recon->pushed_count++;
-	recon->defective_views += defects_total(&recon->defects) > before;
 	recon->work_done += WORK_LOAD / recon->geometry->count;
 	if (!fdk_runs(recon))
 		return 0;
@@ -431,7 +425,7 @@ static int push_view(struct recon *recon, const void *samples, int view, struct 
 
 int recon_push(struct recon *recon, const void *samples, const int *views, int count, struct error *err)
 {
-	size_t sample = recon->linearise.sample == SAMPLE_UINT16 ? sizeof(uint16_t) : sizeof(float);
+	size_t sample = recon->input.linearise.sample == SAMPLE_UINT16 ? sizeof(uint16_t) : sizeof(float);
 	size_t view_bytes = sample * (size_t)recon->geometry->columns * (size_t)recon->geometry->rows;
 	int code = check_views(recon, views, count, err);
 
@@ -507,6 +501,56 @@ static int warn_of_truncation(struct recon *recon, struct error *err)
 	return 0;
 }
 
+/* What is missing where views were blank: the others stand in for them in equal shares. */
+static int make_up_for_blank_views(struct recon *recon, struct error *err)
+{
+	const size_t voxels = grid_voxels(&recon->recipe.grid);
+	const float factor = (float)(1 / (1 - input_blank_share(&recon->input, &recon->orbit)));
+	float *host;
+	int code;
+
+	if (recon->input.counts.blank == 0)
+		return 0;
+	host = malloc(voxels * sizeof(*host));
+	if (host == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a volume of %zu voxels", voxels);
+	code = recon->backend->volume_download(recon->volume, 0, recon->recipe.grid.size[2], host, err);
+	for (size_t i = 0; code == 0 && i < voxels; i++)
+		host[i] *= factor;
+	if (code == 0)
+		code = recon->backend->volume_upload(recon->volume, host, err);
+	free(host);
+	return code;
+}
+
+/*
+ * SART knows no view that is not there: a blank one is made to agree with the
+ * iterate as it is before each iteration, and corrects next to nothing.
+ */
+static int stand_in_for_blank_views(struct recon *recon, struct error *err)
+{
+	const struct backend *backend = recon->backend;
+	const struct geometry *geometry = recon->geometry;
+	int code = 0;
+
+	if (recon->input.counts.blank > 0 && recon->stand_in == NULL) {
+		recon->stand_in_host = malloc(sizeof(float) * (size_t)geometry->columns * (size_t)geometry->rows);
+		if (recon->stand_in_host == NULL)
+			return error_set(err, ERR_NO_MEMORY, "no memory for a view");
+		code = backend->stack_new(recon->device, geometry->columns, geometry->rows, 1, &recon->stand_in, err);
+	}
+	for (int i = 0; code == 0 && i < recon->input.counts.blank; i++) {
+		const int view = recon->input.blank[i];
+
+		code = backend->project(recon->plan, recon->volume, &view, 1, recon->stand_in, err);
+		if (code == 0)
+			code = backend->stack_download(recon->stand_in, 0, 1, recon->stand_in_host, err);
+		if (code == 0)
+			code = backend->stack_upload(recon->projections, view, 1, recon->stand_in_host, err);
+	}
+	return code;
+}
+
 /* The FDK volume and what is made of it before the first iteration. */
 static int finish_fdk(struct recon *recon, struct error *err)
 {
@@ -515,6 +559,8 @@ static int finish_fdk(struct recon *recon, struct error *err)
 
 	if (code == 0)
 		code = warn_of_truncation(recon, err);
+	if (code == 0)
+		code = make_up_for_blank_views(recon, err);
 	if (code == 0)
 		code = measure(recon, NULL, err);
 	if (code == 0 && recon->norms.not_finite > 0)
@@ -558,6 +604,8 @@ static int iterate(struct recon *recon, struct history_row *ret_row, struct erro
 
 	tell_progress(recon, STAGE_SART, iteration);
 	code = backend->volume_copy(recon->before, recon->volume, err);
+	if (code == 0)
+		code = stand_in_for_blank_views(recon, err);
 	if (code == 0)
 		code =
 		    backend->sart_iterate(recon->plan, recon->projections, recon->volume, cancel_of(recon), &sums, err);
@@ -634,6 +682,9 @@ int recon_run(struct recon *recon, struct error *err)
 
 	if (code < 0)
 		return code;
+	code = input_check(&recon->input, err);
+	if (code < 0)
+		return code;
 	recon->ran = true;
 	if (!recon->resumed)
 		warn_of_the_input(recon);
@@ -665,7 +716,7 @@ int recon_iteration(const struct recon *recon)
 
 size_t recon_defects(const struct recon *recon)
 {
-	return defects_total(&recon->defects);
+	return defects_total(&recon->input.counts);
 }
 
 const char *recon_plan(const struct recon *recon)

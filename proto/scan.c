@@ -30,6 +30,22 @@ size_t scan_projection_bytes(const struct scan *scan)
 	return (size_t)scan->geometry.columns * (size_t)scan->geometry.rows * sample_bytes(scan->sample);
 }
 
+struct linearise scan_linearise(const struct scan *scan)
+{
+	struct linearise linearise = {
+	    .sample = scan->sample,
+	    .quantity = scan->quantity,
+	    .air = scan->air,
+	    .saturation = scan->saturation,
+	    .has_air_region = scan->has_air_region,
+	    .hardening = scan->hardening,
+	    .hardening_count = scan->hardening_count,
+	};
+
+	memcpy(linearise.air_region, scan->air_region, sizeof(linearise.air_region));
+	return linearise;
+}
+
 /* ---- reading ---- */
 
 static int read_detector(struct scan *scan, const cJSON *detector, struct error *err)
@@ -46,6 +62,49 @@ static int read_detector(struct scan *scan, const cJSON *detector, struct error 
 	return json_end(&reader);
 }
 
+/* [first column, first row, last column, last row], all included. */
+static void read_air_region(struct json_reader *reader, struct scan *scan)
+{
+	const int most[2] = {scan->geometry.columns - 1, scan->geometry.rows - 1};
+	double numbers[4];
+
+	scan->has_air_region = json_has(reader, "air_region");
+	if (!scan->has_air_region)
+		return;
+	json_numbers(reader, "air_region", true, 4, 0, DETECTOR_MAX, numbers);
+	if (reader->code != 0)
+		return;
+	for (int i = 0; i < 4; i++) {
+		scan->air_region[i] = (int)numbers[i];
+		if (numbers[i] != floor(numbers[i]) || numbers[i] > most[i % 2])
+			json_fail(reader, ERR_INVALID, "air_region",
+				  "%.10g is not one of the %ss 0 to %d; first column, first row, last column and last "
+				  "row are expected",
+				  numbers[i], i % 2 ? "row" : "column", most[i % 2]);
+	}
+	for (int i = 0; i < 2; i++)
+		if (numbers[i] > numbers[i + 2])
+			json_fail(reader, ERR_INVALID, "air_region", "the first %s, %.10g, is behind the last, %.10g",
+				  i ? "row" : "column", numbers[i], numbers[i + 2]);
+}
+
+/* Coefficients of 1, p, p^2 ... */
+static void read_hardening(struct json_reader *reader, struct scan *scan)
+{
+	const cJSON *list = json_member(reader, "beam_hardening", false);
+	int count = list != NULL ? cJSON_GetArraySize(list) : 0;
+
+	if (list == NULL)
+		return;
+	if (!cJSON_IsArray(list) || count < 1 || count > HARDENING_MOST) {
+		json_fail(reader, ERR_INVALID, "beam_hardening",
+			  "a list of 1 to %d coefficients is expected, of p^0, p^1 and so on", HARDENING_MOST);
+		return;
+	}
+	json_numbers(reader, "beam_hardening", true, count, -1e6, 1e6, scan->hardening);
+	scan->hardening_count = count;
+}
+
 static int read_projections(struct scan *scan, const cJSON *projections, struct error *err)
 {
 	struct json_reader reader;
@@ -59,6 +118,10 @@ static int read_projections(struct scan *scan, const cJSON *projections, struct 
 	json_choice(&reader, "quantity", true, quantity_names, 2, &quantity);
 	json_number(&reader, "air", false, 1e-6, count_most, &scan->air);
 	json_number(&reader, "saturation", false, 1e-6, count_most, &scan->saturation);
+	read_air_region(&reader, scan);
+	read_hardening(&reader, scan);
+	if (quantity == QUANTITY_LINE_INTEGRAL && scan->has_air_region)
+		json_fail(&reader, ERR_INVALID, "air_region", "line integrals have no air, it belongs to intensity");
 	if (quantity == QUANTITY_LINE_INTEGRAL && scan->air != 0)
 		json_fail(&reader, ERR_INVALID, "air", "line integrals have no air value, it belongs to intensity");
 	if (quantity == QUANTITY_LINE_INTEGRAL && scan->saturation != 0)
@@ -448,6 +511,31 @@ static void warn_angles(cJSON *list, const struct orbit *orbit)
 	free(views);
 }
 
+/* A polynomial that is none of water's is more likely a slip than a beam. */
+static void warn_hardening(cJSON *list, const struct scan *scan)
+{
+	const double offset_most = 0.05, p_most = 6; /* line integrals; thicker patients are rare */
+	double before = -INFINITY;
+
+	if (scan->hardening_count == 0)
+		return;
+	if (fabs(scan->hardening[0]) > offset_most)
+		warn(list, "beam_hardening", "the polynomial makes %.4g of the line integral 0: air would not stay air",
+		     scan->hardening[0]);
+	for (int i = 0; i <= 60; i++) {
+		double p = i * p_most / 60, value = 0;
+
+		for (int k = scan->hardening_count - 1; k >= 0; k--)
+			value = value * p + scan->hardening[k];
+		if (value <= before) {
+			warn(list, "beam_hardening",
+			     "the polynomial falls at the line integral %.3g: more of the object would be less", p);
+			return;
+		}
+		before = value;
+	}
+}
+
 cJSON *scan_warnings(const struct scan *scan)
 {
 	const struct orbit *orbit = &scan->orbit;
@@ -459,6 +547,7 @@ cJSON *scan_warnings(const struct scan *scan)
 	} else {
 		warn(list, "single_view", "one view only: depth cannot be told");
 	}
+	warn_hardening(list, scan);
 	if (scan->air > 0 && scan->saturation > 0 && scan->air >= scan->saturation)
 		warn(list, "air_saturated", "air is %.6g, not below the saturation at %.6g: all of it are defects",
 		     scan->air, scan->saturation);

@@ -14,6 +14,10 @@ struct scan {
 	enum quantity quantity;
 	double air;        /* counts; 0 = not given: a flat image must come */
 	double saturation; /* counts; 0 = the sample type's own */
+	bool has_air_region;
+	int air_region[4]; /* first column, first row, last column, last row */
+	double hardening[HARDENING_MOST];
+	int hardening_count; /* coefficients, 0: none */
 	struct geometry geometry;
 	struct orbit orbit;
 	cJSON *document; /* as posted, checked: members name, detector, projections, geometry */
@@ -28,6 +32,8 @@ void scan_free(struct scan *scan);
 
 size_t sample_bytes(enum sample sample);
 size_t scan_projection_bytes(const struct scan *scan); /* columns * rows * sample */
+/* All of it but the images; borrows from the scan. */
+struct linearise scan_linearise(const struct scan *scan);
 
 /* `derived` and `warnings` of the reply, new cJSON values of the caller's. */
 cJSON *scan_derived(const struct scan *scan);

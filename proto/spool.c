@@ -149,13 +149,13 @@ static int open_projections(const char *directory, const struct scan *scan, int 
 	return code;
 }
 
-/* A flat or dark image, float32; *ret_image stays NULL where there is none. */
-static int read_image(const char *directory, const char *name, const struct scan *scan, float **ret_image,
+/* An image of values of `size` bytes; *ret_image stays NULL where there is none. */
+static int read_image(const char *directory, const char *name, size_t size, const struct scan *scan, void **ret_image,
 		      struct error *err)
 {
-	size_t expected = (size_t)scan->geometry.columns * (size_t)scan->geometry.rows * sizeof(float), length = 0;
+	size_t expected = (size_t)scan->geometry.columns * (size_t)scan->geometry.rows * size, length = 0;
 	char path[PATH_MAX], *bytes = NULL;
-	int code = join(path, sizeof(path), directory, name, ".f32", err);
+	int code = join(path, sizeof(path), directory, name, "", err);
 
 	if (code != 0)
 		return code;
@@ -167,7 +167,21 @@ static int read_image(const char *directory, const char *name, const struct scan
 		return error_set(err, ERR_INVALID, "%.200s: %zu bytes, %zu are expected", path, length, expected);
 	}
 	if (code == 0)
-		*ret_image = (float *)(void *)bytes; /* malloc's alignment suits any type */
+		*ret_image = bytes; /* malloc's alignment suits any type */
+	return code;
+}
+
+static int read_images(const char *directory, struct scan_files *files, struct error *err)
+{
+	static const char *const names[] = {"flat.f32", "dark.f32", "defects.u8"};
+	void *images[3] = {NULL};
+	int code = 0;
+
+	for (int i = 0; i < 3 && code == 0; i++)
+		code = read_image(directory, names[i], i < 2 ? sizeof(float) : 1, files->scan, &images[i], err);
+	files->flat = images[0];
+	files->dark = images[1];
+	files->defects = images[2];
 	return code;
 }
 
@@ -179,9 +193,7 @@ int scan_files_open(const char *directory, struct scan_files *ret_files, struct 
 	if (code == 0)
 		code = open_projections(directory, files.scan, &files.projections, err);
 	if (code == 0)
-		code = read_image(directory, "flat", files.scan, &files.flat, err);
-	if (code == 0)
-		code = read_image(directory, "dark", files.scan, &files.dark, err);
+		code = read_images(directory, &files, err);
 	if (code != 0)
 		scan_files_close(&files);
 	else
@@ -198,6 +210,7 @@ void scan_files_close(struct scan_files *files)
 		close(files->projections);
 	free(files->flat);
 	free(files->dark);
+	free(files->defects);
 	*files = (struct scan_files){.projections = -1};
 }
 
@@ -565,12 +578,10 @@ int spool_run(const struct backend *backend, struct device *device, const char *
 
 	if (code != 0)
 		return code;
-	linearise = (struct linearise){.sample = files.scan->sample,
-				       .quantity = files.scan->quantity,
-				       .air = files.scan->air,
-				       .flat = files.flat,
-				       .dark = files.dark,
-				       .saturation = files.scan->saturation};
+	linearise = scan_linearise(files.scan);
+	linearise.flat = files.flat;
+	linearise.dark = files.dark;
+	linearise.defects = files.defects;
 	if (linearise.quantity == QUANTITY_INTENSITY && linearise.air <= 0 && linearise.flat == NULL)
 		code = error_set(err, ERR_IMPOSSIBLE, "intensities need an air value or a flat image, none is there");
 	if (code == 0)

@@ -15,6 +15,7 @@
  *   scan.json        the document of POST /v1/scans
  *   projections.raw  [view][row][column] of the scan's sample type, preallocated
  *   flat.f32 dark.f32  [row][column] float32, where given
+ *   defects.u8         [row][column] bytes, not zero where a pixel is defective, where given
  *
  * Kept volumes are NAME.nii files: a 352-byte NIfTI header and float32 voxels,
  * so that raw and nifti are both sent straight from the file.
@@ -40,6 +41,7 @@ struct scan_files {
 	struct scan *scan;
 	int projections;    /* descriptor */
 	float *flat, *dark; /* [row][column] or NULL */
+	unsigned char *defects;
 };
 /*
  * Reads scan.json and the images and checks that every file is as long as the

@@ -10,5 +10,7 @@
 
 /* `numbers` float64 in C order, as numpy writes version 1 files. Free with free. */
 double *data_npy(const char *name, size_t numbers);
+/* `numbers` float32 of a .f32.zst file. Free with free. */
+float *data_f32(const char *name, size_t numbers);
 
 #endif

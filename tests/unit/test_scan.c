@@ -130,6 +130,21 @@ static const struct {
     {"\"count\": 100", "\"count\": 100, \"saturation\": 60000", ERR_INVALID, "/projections/saturation", "saturate"},
     {"\"line_integral\"", "\"intensity\", \"air\": 0", ERR_IMPOSSIBLE, "/projections/air", "0"},
     {"\"line_integral\"", "\"intensity\", \"flat\": 0", ERR_INVALID, "/projections/flat", "nobody knows"},
+    {"\"count\": 100", "\"count\": 100, \"air_region\": [0, 0, 9, 9]", ERR_INVALID, "/projections/air_region",
+     "intensity"},
+    {"\"line_integral\"", "\"intensity\", \"air_region\": [0, 0, 9]", ERR_INVALID, "/projections/air_region",
+     "3 numbers, 4"},
+    {"\"line_integral\"", "\"intensity\", \"air_region\": [0, 0, 559, 9]", ERR_INVALID, "/projections/air_region",
+     "559 is not one of the columns 0 to 558"},
+    {"\"line_integral\"", "\"intensity\", \"air_region\": [0, 2.5, 9, 9]", ERR_INVALID, "/projections/air_region",
+     "2.5"},
+    {"\"line_integral\"", "\"intensity\", \"air_region\": [0, 10, 9, 9]", ERR_INVALID, "/projections/air_region",
+     "the first row, 10, is behind the last, 9"},
+    {"\"count\": 100", "\"count\": 100, \"beam_hardening\": []", ERR_INVALID, "/projections/beam_hardening", "1 to 8"},
+    {"\"count\": 100", "\"count\": 100, \"beam_hardening\": [0,1,2,3,4,5,6,7,8]", ERR_INVALID,
+     "/projections/beam_hardening", "1 to 8"},
+    {"\"count\": 100", "\"count\": 100, \"beam_hardening\": [0, \"1\"]", ERR_INVALID, "/projections/beam_hardening/1",
+     "a string"},
     {"\"circular\"", "\"helical\"", ERR_INVALID, "/geometry/kind", "matrices"},
     {"\"kind\": \"circular\", ", "", ERR_INVALID, "/geometry/kind", "missing"},
     {"\"source_to_isocentre_mm\": 620,", "", ERR_INVALID, "/geometry/source_to_isocentre_mm", "missing"},
@@ -392,6 +407,10 @@ static const struct {
     {"\"count\": 100", "\"count\": 1", 0, "none", "single view", "none", "single_view "},
     {"\"line_integral\"", "\"intensity\", \"air\": 60000, \"saturation\": 50000", 360, "counter-clockwise", "full",
      "none", "air_saturated "},
+    {"\"line_integral\"", "\"intensity\", \"air_region\": [0, 0, 558, 3], \"beam_hardening\": [0, 1, 0.05]", 360,
+     "counter-clockwise", "full", "none", ""},
+    {"\"count\": 100", "\"count\": 100, \"beam_hardening\": [0.2, 1, -0.1]", 360, "counter-clockwise", "full", "none",
+     "beam_hardening beam_hardening "}, /* air that is not air; falls from 5 on */
 };
 
 START_TEST(what_was_understood_is_told)

@@ -1,0 +1,164 @@
+/* The samples of a reconstruction on their way in, and what has to be said of them. */
+#include "core/input.h"
+
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
+
+/* Air regions that differ by more than this tell of a tube or a detector that drifts. */
+static const double DRIFT = 0.05;
+
+static int check(const struct linearise *linearise, const struct geometry *geometry, struct error *err)
+{
+	const int *region = linearise->air_region;
+
+	if (linearise->hardening_count < 0 || linearise->hardening_count > HARDENING_MOST)
+		return error_set(err, ERR_INVALID, "a beam-hardening polynomial of %d coefficients, at most %d",
+				 linearise->hardening_count, HARDENING_MOST);
+	if (!linearise->has_air_region)
+		return 0;
+	if (linearise->quantity != QUANTITY_INTENSITY)
+		return error_set(err, ERR_INVALID, "line integrals have no air region, intensities do");
+	if (region[0] < 0 || region[0] > region[2] || region[2] >= geometry->columns || region[1] < 0 ||
+	    region[1] > region[3] || region[3] >= geometry->rows)
+		return error_set(err, ERR_INVALID,
+				 "air region of columns %d to %d and rows %d to %d on a detector of %d x %d", region[0],
+				 region[2], region[1], region[3], geometry->columns, geometry->rows);
+	return 0;
+}
+
+int input_open(struct input *ret_input, const struct linearise *linearise, const struct geometry *geometry,
+	       struct error *err)
+{
+	struct input input = {.linearise = *linearise};
+	int code = check(linearise, geometry, err);
+
+	if (code == 0)
+		code = defect_map_make(&input.map, linearise, geometry->columns, geometry->rows, err);
+	if (code < 0)
+		return code;
+	input.linearise.defects = input.map.map;
+	input.blank = calloc((size_t)geometry->count, sizeof(*input.blank));
+	if (input.blank == NULL) {
+		defect_map_clear(&input.map);
+		return error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", geometry->count);
+	}
+	*ret_input = input;
+	return 0;
+}
+
+void input_clear(struct input *input)
+{
+	defect_map_clear(&input->map);
+	free(input->blank);
+	*input = (struct input){0};
+}
+
+int input_take(struct input *input, const struct backend *backend, struct plan *plan, const void *samples, int view,
+	       int slot, struct stack *to, struct error *err)
+{
+	/* One by one, so that the views with defects are known. */
+	const struct defect_counts before = input->counts;
+	int code = backend->linearise(plan, samples, 1, &slot, to, &input->counts, err);
+
+	if (code < 0)
+		return code;
+	input->views++;
+	/* Those of the map are in every view. */
+	input->defective_views +=
+	    defects_total(&input->counts) - input->counts.mapped > defects_total(&before) - before.mapped;
+	if (input->counts.blank > before.blank)
+		input->blank[before.blank] = view;
+	return 0;
+}
+
+double input_blank_share(const struct input *input, const struct orbit *orbit)
+{
+	double blank = 0, all = 0;
+
+	for (int i = 0; i < input->counts.blank; i++)
+		blank += orbit->weight[input->blank[i]];
+	for (int k = 0; k < orbit->count; k++)
+		all += orbit->weight[k];
+	return all > 0 ? blank / all : 0;
+}
+
+int input_check(const struct input *input, struct error *err)
+{
+	if (input->views == 0 || input->counts.blank < input->views)
+		return 0;
+	return error_set(err, ERR_IMPOSSIBLE,
+			 "none of the %d projections has a good pixel: %zu of their samples are in the defect map, %zu "
+			 "not above the dark, %zu saturated, %zu not finite",
+			 input->views, input->counts.mapped, input->counts.zero, input->counts.saturated,
+			 input->counts.not_finite);
+}
+
+__attribute__((format(printf, 3, 4))) static void tell(const struct recon_hooks *hooks, const char *code,
+						       const char *format, ...)
+{
+	char detail[320];
+	va_list args;
+
+	va_start(args, format);
+	vsnprintf(detail, sizeof(detail), format, args);
+	va_end(args);
+	hooks->warning(hooks->context, code, detail);
+}
+
+static int lowest(const int *views, int count)
+{
+	int least = views[0];
+
+	for (int i = 1; i < count; i++)
+		least = views[i] < least ? views[i] : least;
+	return least;
+}
+
+static void warn_of_air(const struct input *input, const struct recon_hooks *hooks)
+{
+	const double least = (double)input->counts.air_least, most = (double)input->counts.air_most;
+
+	if (input->counts.no_air > 0)
+		tell(hooks, "air_region",
+		     "the air region has no good pixel in %d projections: those are taken against the flat as they are",
+		     input->counts.no_air);
+	if (least > 0 && most > (1 + DRIFT) * least)
+		tell(
+		    hooks, "air_region",
+		    "the air region lies between %.4g and %.4g of the flat; each projection was held against its own%s",
+		    least, most, most > 2 * least ? ". That is more than a tube drifts: is the object in it?" : "");
+}
+
+void input_warn(const struct input *input, const struct geometry *geometry, const struct recon_hooks *hooks)
+{
+	const struct defect_counts *counts = &input->counts;
+	const struct defect_map *map = &input->map;
+	const size_t found = defects_total(counts) - counts->mapped;
+	const double pixels = (double)geometry->columns * geometry->rows;
+
+	if (hooks->warning == NULL)
+		return;
+	if (map->map != NULL) {
+		const size_t all = map->given + map->dead + map->hot + map->noisy;
+
+		tell(hooks, "defect_map",
+		     "%zu pixels (%.3g %%) of every projection were replaced from their neighbours: %zu of the given "
+		     "map, "
+		     "and %zu dead, %zu hot and %zu noisy ones that the flat and dark images show",
+		     all, 100 * (double)all / pixels, map->given, map->dead, map->hot, map->noisy);
+	}
+	if (found > 0)
+		tell(hooks, "defects",
+		     "%zu samples (%.3g %%) in %d projections were replaced from their neighbours: %zu not above the "
+		     "dark, %zu saturated, %zu not finite or without a flat",
+		     found, 100 * (double)found / (pixels * input->views), input->defective_views, counts->zero,
+		     counts->saturated, counts->not_finite);
+	if (counts->blank > 0)
+		tell(hooks, "blank_views",
+		     "%d projections have no good pixel, the first of them is %d: they are left out, the others stand "
+		     "in "
+		     "for them",
+		     counts->blank, lowest(input->blank, counts->blank));
+	warn_of_air(input, hooks);
+}

@@ -1,0 +1,32 @@
+#ifndef CBCT_CORE_INPUT_H
+#define CBCT_CORE_INPUT_H
+
+#include "core/defects.h"
+#include "core/recon.h"
+
+/* What core/recon.c knows of the samples that it was given, and tells of them. Nobody else's. */
+struct input {
+	struct linearise linearise; /* as given, with the whole map */
+	struct defect_map map;
+	struct defect_counts counts;
+	int views, defective_views; /* linearised so far, and those of them with defects */
+	int *blank;                 /* [counts.blank], owned: views without a good pixel, in the order they came */
+};
+
+/* Checks linearise against the detector; looks for defects in its images. Free with input_clear. */
+int input_open(struct input *ret_input, const struct linearise *linearise, const struct geometry *geometry,
+	       struct error *err);
+void input_clear(struct input *input);
+
+/* linearise of one view into a slot. */
+int input_take(struct input *input, const struct backend *backend, struct plan *plan, const void *samples, int view,
+	       int slot, struct stack *to, struct error *err);
+
+/* The share of the angular weights that blank views have, 0 .. 1. */
+double input_blank_share(const struct input *input, const struct orbit *orbit);
+/* ERR_IMPOSSIBLE where no view has a good pixel. */
+int input_check(const struct input *input, struct error *err);
+/* "defects", "defect_map", "blank_views", "air_region". */
+void input_warn(const struct input *input, const struct geometry *geometry, const struct recon_hooks *hooks);
+
+#endif

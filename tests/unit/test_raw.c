@@ -1,0 +1,493 @@
+/*
+ * Raw counts to volumes: simulated from exact line integrals with everything
+ * that a detector does to them, and held against the scan without.
+ */
+#include <check.h>
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "core/defects.h"
+#include "tests/unit/data.h"
+#include "tests/unit/scene.h"
+
+Suite *raw_suite(void);
+
+enum { COLUMNS = 72, ROWS = 56, PIXELS = COLUMNS * ROWS, VIEWS = 90 };
+static const struct orbit_spec orbit = {COLUMNS, ROWS, VIEWS, {600, 1100, {2.6, 2.6}, {0, 0}, {0, 0}}, 0, 4};
+
+/* A value of 0 .. 1 of its own for each index. */
+static double noise(unsigned index)
+{
+	index = (index ^ 61) ^ (index >> 16);
+	index *= 9;
+	index ^= index >> 4;
+	index *= 0x27d4eb2d;
+	index ^= index >> 15;
+	return index / 4294967295.0;
+}
+
+/* Two balls in a ball, away from the detector's corners. */
+static void make_scene(struct scene *ret)
+{
+	struct ellipsoid balls[] = {
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {38, 38, 32}, .centre = {2, -3, 1}, .density = 0.02},
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {8, 8, 8}, .centre = {14, 6, 4}, .density = 0.02},
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {9, 9, 9}, .centre = {-12, -10, -5}, .density = -0.015},
+	};
+	struct phantom phantom = {.count = 3, .parts = balls};
+
+	scene_orbit(ret, &orbit);
+	scene_add(ret, &phantom);
+}
+
+static struct recipe recipe_of(bool sart)
+{
+	struct grid grid = grid_of(48, 48, 40, 1.8, 1.8, 1.8);
+	struct recipe recipe = recipe_on(&grid);
+
+	recipe.fdk.on = true;
+	recipe.sart.on = sart;
+	recipe.sart.iterations = 3;
+	return recipe;
+}
+
+static void run(const struct scene *scene, const struct recipe *recipe, struct outcome *outcome)
+{
+	scene_run(scene, recipe, outcome);
+	if (outcome->code < 0)
+		ck_abort_msg("%s %s", outcome->err.pointer, outcome->err.text);
+}
+
+/* ---- counts ---- */
+
+/* p' = p + 0.06 p^2 - 0.002 p^3 rises over all line integrals of the scene. */
+static const double water[] = {0, 1, 0.06, -0.002};
+
+static double hardened(double wanted)
+{
+	double p = wanted;
+
+	for (int i = 0; i < 20; i++)
+		p -= (p * (1 + p * (0.06 - 0.002 * p)) - wanted) / (1 + p * (0.12 - 0.006 * p));
+	return p;
+}
+
+struct counts {
+	float flat[PIXELS], dark[PIXELS];
+	unsigned char map[PIXELS];
+	float *samples; /* [view][row][column] */
+};
+
+/* Gain and dark of their own for each pixel, a tube that drifts by 25 %, a beam that hardens. */
+static void make_counts(const struct scene *scene, struct counts *ret)
+{
+	for (int i = 0; i < PIXELS; i++) {
+		ret->dark[i] = (float)(200 + 20 * noise((unsigned)i));
+		ret->flat[i] = (float)(ret->dark[i] +
+				       40000 * (0.9 + 0.2 * noise((unsigned)i + PIXELS)) * (1 - 0.003 * (i % COLUMNS)));
+	}
+	ret->samples = malloc(sizeof(float) * PIXELS * VIEWS);
+	ck_assert_ptr_nonnull(ret->samples);
+	for (int i = 0; i < PIXELS * VIEWS; i++) {
+		const int pixel = i % PIXELS, view = i / PIXELS;
+		const double tube = 1 - 0.25 * view / VIEWS + 0.02 * noise((unsigned)view);
+		const double range = (double)ret->flat[pixel] - (double)ret->dark[pixel];
+
+		ret->samples[i] =
+		    (float)((double)ret->dark[pixel] + tube * range * exp(-hardened((double)scene->projections[i])));
+	}
+	memset(ret->map, 0, sizeof(ret->map));
+}
+
+/* What the pixel says has nothing to do with the object. */
+static void spoil(struct counts *counts, int column, int row)
+{
+	const int pixel = row * COLUMNS + column;
+
+	for (int view = 0; view < VIEWS; view++)
+		counts->samples[view * PIXELS + pixel] = (float)(60000 * noise((unsigned)(pixel + view)));
+}
+
+/* Some given by the map, some that only the flat and the dark show; a whole row, a whole column, a cluster. */
+static void add_defects(struct counts *counts)
+{
+	for (int c = 0; c < COLUMNS; c++)
+		spoil(counts, c, 20), counts->map[20 * COLUMNS + c] = 255;
+	for (int r = 0; r < ROWS; r++)
+		spoil(counts, 50, r), counts->flat[r * COLUMNS + 50] = counts->dark[r * COLUMNS + 50] + 30;
+	for (int r = 30; r < 34; r++)
+		for (int c = 30; c < 33; c++)
+			spoil(counts, c, r), counts->dark[r * COLUMNS + c] += 20000;
+	spoil(counts, 12, 40), counts->flat[40 * COLUMNS + 12] = NAN;
+	spoil(counts, 25, 44), counts->dark[44 * COLUMNS + 25] += 4000;
+}
+
+START_TEST(raw_counts_give_the_volume_of_their_line_integrals)
+{
+	struct recipe recipe = recipe_of(false);
+	struct outcome outcome = {0}, ideal = {0};
+	struct scene scene;
+	struct counts *counts = malloc(sizeof(*counts));
+	const char *const expected =
+	    "defect_map: 141 pixels (3.5 %) of every projection were replaced from their neighbours: 72 of the given "
+	    "map, and 55 dead, 12 hot and 2 noisy ones that the flat and dark images show\n"
+	    "defects: 3 samples (0.000827 %) in 2 projections were replaced from their neighbours: 1 not above the "
+	    "dark, "
+	    "1 saturated, 1 not finite or without a flat\n"
+	    "air_region: the air region lies between ";
+
+	make_scene(&scene);
+	run(&scene, &recipe, &ideal);
+	ck_assert_str_eq(ideal.warnings, "");
+	make_counts(&scene, counts);
+	add_defects(counts);
+	counts->samples[7 * PIXELS + 25 * COLUMNS + 40] = 0;
+	counts->samples[7 * PIXELS + 26 * COLUMNS + 41] = 65535;
+	counts->samples[30 * PIXELS + 26 * COLUMNS + 44] = INFINITY;
+	outcome.samples = counts->samples;
+	outcome.linearise = (struct linearise){
+	    .sample = SAMPLE_FLOAT32,
+	    .quantity = QUANTITY_INTENSITY,
+	    .flat = counts->flat,
+	    .dark = counts->dark,
+	    .saturation = 65535,
+	    .defects = counts->map,
+	    .has_air_region = true,
+	    .air_region = {1, 1, 6, 50},
+	    .hardening = water,
+	    .hardening_count = 4,
+	};
+	run(&scene, &recipe, &outcome);
+	ck_assert_msg(strncmp(outcome.warnings, expected, strlen(expected)) == 0, "%s", outcome.warnings);
+	/* What is left are the neighbours in place of 141 pixels: half a percent of the volume. */
+	ck_assert_double_lt(relative_error(outcome.last, ideal.last, grid_voxels(&ideal.grid)), 0.02);
+	ck_assert_double_eq_tol(mean_near(outcome.last, &outcome.grid, (const double[]){2, 12, -8}, 6), 0.02, 1e-4);
+	ck_assert_double_eq_tol(mean_near(outcome.last, &outcome.grid, (const double[]){14, 6, 4}, 4), 0.04, 4e-4);
+	ck_assert_double_eq_tol(mean_near(outcome.last, &outcome.grid, (const double[]){-12, -10, -5}, 5), 0.005, 2e-4);
+	outcome_clear(&outcome);
+	outcome_clear(&ideal);
+	scene_clear(&scene);
+	free(counts->samples);
+	free(counts);
+}
+END_TEST
+
+/* Each step alone is exact: only floats lie between the volume of the counts and that of the line integrals. */
+START_TEST(gain_drift_and_hardening_leave_no_trace)
+{
+	struct recipe recipe = recipe_of(false);
+	struct outcome outcome = {0}, ideal = {0};
+	struct scene scene;
+	struct counts *counts = malloc(sizeof(*counts));
+
+	make_scene(&scene);
+	run(&scene, &recipe, &ideal);
+	make_counts(&scene, counts);
+	outcome.samples = counts->samples;
+	outcome.linearise = (struct linearise){
+	    .sample = SAMPLE_FLOAT32,
+	    .quantity = QUANTITY_INTENSITY,
+	    .flat = counts->flat,
+	    .dark = counts->dark,
+	    .has_air_region = true,
+	    .air_region = {0, 0, COLUMNS - 1, 2},
+	    .hardening = water,
+	    .hardening_count = 4,
+	};
+	run(&scene, &recipe, &outcome);
+	ck_assert_double_lt(relative_error(outcome.last, ideal.last, grid_voxels(&ideal.grid)), 1e-4);
+	outcome_clear(&outcome);
+	outcome_clear(&ideal);
+	scene_clear(&scene);
+	free(counts->samples);
+	free(counts);
+}
+END_TEST
+
+START_TEST(an_air_region_without_a_good_pixel_is_told)
+{
+	struct recipe recipe = recipe_of(false);
+	struct outcome outcome = {0};
+	struct scene scene;
+	struct counts *counts = malloc(sizeof(*counts));
+
+	make_scene(&scene);
+	make_counts(&scene, counts);
+	counts->samples[5 * PIXELS] = NAN;
+	counts->samples[9 * PIXELS] = 0;
+	outcome.samples = counts->samples;
+	outcome.linearise = (struct linearise){.sample = SAMPLE_FLOAT32,
+					       .quantity = QUANTITY_INTENSITY,
+					       .flat = counts->flat,
+					       .dark = counts->dark,
+					       .has_air_region = true};
+	run(&scene, &recipe, &outcome);
+	ck_assert_ptr_nonnull(
+	    strstr(outcome.warnings, "air_region: the air region has no good pixel in 2 projections"));
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(counts->samples);
+	free(counts);
+}
+END_TEST
+
+/* Of 90 views every 30th: as air they would take 3 % away. */
+START_TEST(a_blank_view_is_told_and_is_not_air)
+{
+	const double place[] = {2, 12, -8};
+	struct recipe recipe = recipe_of(_i);
+	struct outcome outcome = {0};
+	struct scene scene;
+	float *samples = malloc(sizeof(float) * PIXELS * VIEWS);
+
+	make_scene(&scene);
+	for (int i = 0; i < PIXELS * VIEWS; i++)
+		samples[i] = i / PIXELS % 30 == 4 ? 0 : (float)(50000 * exp(-(double)scene.projections[i]));
+	outcome.samples = samples;
+	outcome.linearise = (struct linearise){.sample = SAMPLE_FLOAT32, .quantity = QUANTITY_INTENSITY, .air = 50000};
+	run(&scene, &recipe, &outcome);
+	ck_assert_ptr_nonnull(
+	    strstr(outcome.warnings, "blank_views: 3 projections have no good pixel, the first of them is 4: "));
+	ck_assert_double_eq_tol(mean_near(outcome.last, &outcome.grid, place, 6), 0.02, 1.5e-4);
+	outcome_clear(&outcome);
+	memset(samples, 0, sizeof(float) * PIXELS * VIEWS);
+	outcome = (struct outcome){
+	    .samples = samples, .linearise = {.sample = SAMPLE_FLOAT32, .quantity = QUANTITY_INTENSITY, .air = 50000}};
+	scene_run(&scene, &recipe, &outcome);
+	ck_assert_int_eq(outcome.code, ERR_IMPOSSIBLE);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(samples);
+}
+END_TEST
+
+/* ---- defects that the images show ---- */
+
+enum fault { NONE, DEAD, LIVELESS, HOT, SATURATED, LEAKY, LEAKS_A_LITTLE, NOT_A_NUMBER, LESS_GAIN };
+
+static void place(struct counts *counts, int column, int row, enum fault fault)
+{
+	float *flat = &counts->flat[row * COLUMNS + column], *dark = &counts->dark[row * COLUMNS + column];
+
+	if (fault == DEAD)
+		*flat = *dark;
+	else if (fault == LIVELESS)
+		*flat = *dark + 0.4f * (*flat - *dark);
+	else if (fault == HOT)
+		*flat = *dark + 2 * (*flat - *dark);
+	else if (fault == SATURATED)
+		*flat = 65535;
+	else if (fault == LEAKY)
+		*dark += 15000, *flat += 15000;
+	else if (fault == LEAKS_A_LITTLE)
+		*dark += 3500, *flat += 3500;
+	else if (fault == NOT_A_NUMBER)
+		*flat = NAN;
+	else if (fault == LESS_GAIN)
+		*flat = *dark + 0.7f * (*flat - *dark);
+}
+
+START_TEST(defects_are_found_in_flat_and_dark)
+{
+	static const struct {
+		const char *what;
+		enum fault fault;
+		int columns[2], rows[2]; /* first and last */
+		size_t dead, hot, noisy;
+	} rows[] = {
+	    {"nothing", NONE, {0, 0}, {0, 0}, 0, 0, 0},
+	    {"less gain", LESS_GAIN, {20, 23}, {30, 33}, 0, 0, 0},
+	    {"one dead pixel", DEAD, {31, 31}, {20, 20}, 1, 0, 0},
+	    {"one in a corner", DEAD, {0, 0}, {0, 0}, 1, 0, 0},
+	    {"one at the rim", HOT, {COLUMNS - 1, COLUMNS - 1}, {17, 17}, 0, 1, 0},
+	    {"a weak cluster", LIVELESS, {30, 36}, {20, 26}, 49, 0, 0},
+	    {"a dead row", DEAD, {0, COLUMNS - 1}, {12, 12}, COLUMNS, 0, 0},
+	    {"seven dead columns", DEAD, {40, 46}, {0, ROWS - 1}, 7 * ROWS, 0, 0},
+	    {"the outermost column", DEAD, {0, 0}, {0, ROWS - 1}, ROWS, 0, 0},
+	    {"hot pixels", HOT, {10, 12}, {10, 11}, 0, 6, 0},
+	    {"a saturated flat", SATURATED, {10, 10}, {5, 9}, 0, 5, 0},
+	    {"a leak", LEAKY, {60, 61}, {40, 40}, 0, 2, 0},
+	    {"a small leak", LEAKS_A_LITTLE, {60, 61}, {40, 40}, 0, 0, 2},
+	    {"not a number", NOT_A_NUMBER, {3, 4}, {3, 4}, 0, 0, 4},
+	};
+	struct counts *counts = malloc(sizeof(*counts));
+	struct scene scene;
+
+	make_scene(&scene);
+	for (size_t i = 0; i < sizeof(rows) / sizeof(rows[0]); i++) {
+		struct linearise linearise = {.sample = SAMPLE_UINT16, .quantity = QUANTITY_INTENSITY};
+		struct defect_map map;
+		struct error err;
+		size_t marked = 0;
+
+		make_counts(&scene, counts);
+		for (int r = rows[i].rows[0]; r <= rows[i].rows[1]; r++)
+			for (int c = rows[i].columns[0]; c <= rows[i].columns[1]; c++)
+				place(counts, c, r, rows[i].fault);
+		linearise.flat = counts->flat;
+		linearise.dark = counts->dark;
+		ck_assert_int_eq(defect_map_make(&map, &linearise, COLUMNS, ROWS, &err), 0);
+		ck_assert_msg(map.dead == rows[i].dead && map.hot == rows[i].hot && map.noisy == rows[i].noisy,
+			      "%s: %zu dead, %zu hot, %zu noisy", rows[i].what, map.dead, map.hot, map.noisy);
+		ck_assert((map.map == NULL) == (map.dead + map.hot + map.noisy == 0));
+		for (int k = 0; map.map != NULL && k < PIXELS; k++) {
+			const int c = k % COLUMNS, r = k / COLUMNS;
+
+			marked += map.map[k];
+			if (map.map[k])
+				ck_assert(c >= rows[i].columns[0] && c <= rows[i].columns[1] && r >= rows[i].rows[0] &&
+					  r <= rows[i].rows[1]);
+		}
+		ck_assert_uint_eq(marked, map.dead + map.hot + map.noisy);
+		defect_map_clear(&map);
+		free(counts->samples);
+	}
+	scene_clear(&scene);
+	free(counts);
+}
+END_TEST
+
+/* Outside of a collimator there is nothing to see, and nothing wrong with the pixels. */
+START_TEST(the_shadow_of_a_collimator_is_no_defect)
+{
+	struct counts *counts = malloc(sizeof(*counts));
+	struct linearise linearise = {
+	    .sample = SAMPLE_UINT16, .quantity = QUANTITY_INTENSITY, .flat = counts->flat, .dark = counts->dark};
+	struct defect_map map;
+	struct scene scene;
+	struct error err;
+
+	make_scene(&scene);
+	make_counts(&scene, counts);
+	for (int i = 0; i < PIXELS; i++)
+		if (i % COLUMNS < 20)
+			counts->flat[i] = (float)(counts->dark[i] + 20 + 10 * noise((unsigned)i));
+	ck_assert_int_eq(defect_map_make(&map, &linearise, COLUMNS, ROWS, &err), 0);
+	ck_assert_uint_eq(map.dead + map.hot + map.noisy, 0);
+	defect_map_clear(&map);
+	scene_clear(&scene);
+	free(counts->samples);
+	free(counts);
+}
+END_TEST
+
+START_TEST(exchanged_images_are_refused)
+{
+	struct counts *counts = malloc(sizeof(*counts));
+	struct recipe recipe = recipe_of(false);
+	struct outcome outcome = {0};
+	struct scene scene;
+
+	make_scene(&scene);
+	make_counts(&scene, counts);
+	outcome.samples = counts->samples;
+	outcome.linearise = (struct linearise){
+	    .sample = SAMPLE_FLOAT32, .quantity = QUANTITY_INTENSITY, .flat = counts->dark, .dark = counts->flat};
+	scene_run(&scene, &recipe, &outcome);
+	ck_assert_int_eq(outcome.code, ERR_IMPOSSIBLE);
+	ck_assert_ptr_nonnull(
+	    strstr(outcome.err.text, "the flat image is not above the dark image in 100 % of the pixels"));
+	outcome_clear(&outcome);
+	outcome.samples = counts->samples;
+	outcome.linearise = (struct linearise){
+	    .sample = SAMPLE_FLOAT32, .quantity = QUANTITY_INTENSITY, .air = 150, .dark = counts->dark};
+	scene_run(&scene, &recipe, &outcome);
+	ck_assert_int_eq(outcome.code, ERR_IMPOSSIBLE);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(counts->samples);
+	free(counts);
+}
+END_TEST
+
+/* ---- a detector's own counts ---- */
+
+/*
+ * Counts of a steel tetrahedron with three flats and a dark, 21 views. The
+ * published formula, once more in double; and as much steel in every view.
+ */
+START_TEST(measured_counts_are_what_their_publishers_say)
+{
+	enum { SIDE = 150, SHOT = 21, AREA = SIDE * SIDE };
+	float *images = data_f32("ctsimu_tetra_raw.f32.zst", 25ul * AREA), *flat, *have;
+	const struct device_options device_options = {.threads = 2};
+	struct circular circular = {300, 400, {1.3, 1.3}, {0, 0}, {0, 0}};
+	struct grid grid = grid_of(8, 8, 8, 2, 2, 2);
+	struct geometry geometry;
+	struct plan_options options = {.geometry = &geometry, .grid = &grid};
+	struct defect_counts counts = {0};
+	struct defect_map map;
+	struct device *device;
+	struct stack *stack;
+	struct plan *plan;
+	struct error err = {0};
+	double angles[SHOT], least = INFINITY, most = 0;
+	int slots[SHOT];
+
+	if (images == NULL)
+		return;
+	flat = malloc(sizeof(float) * AREA);
+	have = malloc(sizeof(float) * AREA * SHOT);
+	for (int i = 0; i < AREA; i++)
+		flat[i] = (images[AREA + i] + images[2 * AREA + i] + images[3 * AREA + i]) / 3;
+	for (int k = 0; k < SHOT; k++) {
+		angles[k] = k * M_PI / 10;
+		slots[k] = k;
+	}
+	ck_assert_int_eq(geometry_circular(&geometry, SIDE, SIDE, SHOT, &circular, angles, &err), 0);
+	options.linearise =
+	    (struct linearise){.sample = SAMPLE_FLOAT32, .quantity = QUANTITY_INTENSITY, .flat = flat, .dark = images};
+	ck_assert_int_eq(defect_map_make(&map, &options.linearise, SIDE, SIDE, &err), 0);
+	ck_assert_ptr_null(map.map);
+	ck_assert_int_eq(backend_cpu.open(0, &device_options, &device, &err), 0);
+	ck_assert_int_eq(backend_cpu.plan_new(device, &options, &plan, &err), 0);
+	ck_assert_int_eq(backend_cpu.stack_new(device, SIDE, SIDE, SHOT, &stack, &err), 0);
+	ck_assert_int_eq(backend_cpu.linearise(plan, images + 4 * AREA, SHOT, slots, stack, &counts, &err), 0);
+	ck_assert_uint_eq(defects_total(&counts), 0);
+	ck_assert_int_eq(backend_cpu.stack_download(stack, 0, SHOT, have, &err), 0);
+	for (int k = 0; k < SHOT; k++) {
+		double steel = 0;
+
+		for (int i = 0; i < AREA; i++) {
+			const double dark = (double)images[i], count = (double)images[(4 + k) * AREA + i];
+			const double p = -log((count - dark) / ((double)flat[i] - dark));
+
+			ck_assert_double_eq_tol((double)have[k * AREA + i], p, 1e-5);
+			steel += p;
+		}
+		least = fmin(least, steel);
+		most = fmax(most, steel);
+	}
+	/* The cone magnifies what is near to the source: not more than that. */
+	ck_assert_double_lt(most / least, 1.05);
+	backend_cpu.stack_free(stack);
+	backend_cpu.plan_free(plan);
+	backend_cpu.close(device);
+	geometry_clear(&geometry);
+	free(have);
+	free(flat);
+	free(images);
+}
+END_TEST
+
+Suite *raw_suite(void)
+{
+	Suite *suite = suite_create("raw");
+	TCase *volumes = tcase_create("volumes"), *images = tcase_create("images");
+
+	tcase_set_timeout(volumes, 0);
+	tcase_set_timeout(images, 0);
+	tcase_add_test(volumes, raw_counts_give_the_volume_of_their_line_integrals);
+	tcase_add_test(volumes, gain_drift_and_hardening_leave_no_trace);
+	tcase_add_test(volumes, an_air_region_without_a_good_pixel_is_told);
+	tcase_add_loop_test(volumes, a_blank_view_is_told_and_is_not_air, 0, 2);
+	tcase_add_test(volumes, measured_counts_are_what_their_publishers_say);
+	suite_add_tcase(suite, volumes);
+	tcase_add_test(images, defects_are_found_in_flat_and_dark);
+	tcase_add_test(images, the_shadow_of_a_collimator_is_no_defect);
+	tcase_add_test(images, exchanged_images_are_refused);
+	suite_add_tcase(suite, images);
+	return suite;
+}
