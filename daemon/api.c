@@ -26,6 +26,7 @@ const struct route api_routes[] = {
     {"DELETE", "/v1/scans/{}", scan_delete, BODY_NONE, 0, NULL, NULL},
     {"PUT", "/v1/scans/{}/flat", image_put, BODY_STREAM, 0, flat_begin, upload_take},
     {"PUT", "/v1/scans/{}/dark", image_put, BODY_STREAM, 0, dark_begin, upload_take},
+    {"PUT", "/v1/scans/{}/defects", image_put, BODY_STREAM, 0, defects_begin, upload_take},
     {"PUT", "/v1/scans/{}/projections", projections_put, BODY_STREAM, 0, projections_begin, upload_take},
     {"GET", "/v1/scans/{}/projections/{}", projection_get, BODY_NONE, 0, NULL, NULL},
     {"PUT", "/v1/scans/{}/projections/{}", projections_put, BODY_STREAM, 0, projections_begin, upload_take},

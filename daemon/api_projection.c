@@ -1,4 +1,4 @@
-/* /v1/scans/{}/projections, flat, dark */
+/* /v1/scans/{}/projections, flat, dark, defects */
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -74,7 +74,7 @@ static int image_begin(struct api *api, struct request *request, enum image imag
 
 	if (store_scan_find(api->store, request_argument(request, 0), &scan, err) != 0)
 		return err->code;
-	if (stored_scan_parsed(scan)->quantity != QUANTITY_INTENSITY) {
+	if (image != IMAGE_DEFECTS && stored_scan_parsed(scan)->quantity != QUANTITY_INTENSITY) {
 		stored_scan_release(scan);
 		return error_set(err, ERR_IMPOSSIBLE,
 				 "the scan's quantity is line_integral; flat and dark images are for intensity");
@@ -90,6 +90,11 @@ int flat_begin(void *context, struct request *request, struct error *err)
 int dark_begin(void *context, struct request *request, struct error *err)
 {
 	return image_begin(context, request, IMAGE_DARK, err);
+}
+
+int defects_begin(void *context, struct request *request, struct error *err)
+{
+	return image_begin(context, request, IMAGE_DEFECTS, err);
 }
 
 int upload_take(void *context, struct request *request, const void *data, size_t size, size_t *ret_taken,

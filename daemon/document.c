@@ -144,6 +144,7 @@ cJSON *scan_document(struct stored_scan *stored, bool brief)
 		cJSON_AddBoolToObject(document, "flat", facts.flat);
 		cJSON_AddBoolToObject(document, "dark", facts.dark);
 	}
+	cJSON_AddBoolToObject(document, "defects", facts.defects);
 	if (brief || scan == NULL) {
 		add_essence(document, &facts);
 		return document;

@@ -118,6 +118,7 @@ static const char *const migrations[] = {
     "CREATE TABLE removals ("
     " number INTEGER PRIMARY KEY,"
     " job TEXT NOT NULL);",
+    "ALTER TABLE scans ADD COLUMN defects BLOB;", /* SHA-256 of the defect map's bytes */
 };
 enum { MIGRATIONS = sizeof(migrations) / sizeof(migrations[0]) };
 

@@ -14,7 +14,7 @@
  *
  *   STATE/lock              held by the one daemon that uses STATE
  *   STATE/catalogue.sqlite  scans, projections, jobs, volumes, history, warnings, events
- *   STATE/scans/ID/         scan.json projections.raw flat.f32 dark.f32 (proto/spool.h)
+ *   STATE/scans/ID/         scan.json projections.raw flat.f32 dark.f32 defects.u8 (proto/spool.h)
  *   STATE/jobs/ID/          NAME.nii, checkpoint.f32
  *
  * A call that returns 0 has its change on the disk. The order is always: files
@@ -90,7 +90,7 @@ struct scan_facts {
 	enum quantity quantity;
 	double air;      /* counts, 0: not given */
 	int received;    /* projections */
-	bool flat, dark; /* images that are there */
+	bool flat, dark, defects; /* images that are there */
 	bool complete, ready;
 	bool deleted;
 	bool damaged; /* its files were not there at the start */
@@ -147,12 +147,12 @@ struct received_projection {
 int store_put_projections(struct store *store, struct received_projection *batch, int count, struct error *err);
 
 /*
- * The flat or dark image, [row][column] counts. *ret_new false: the same pixels
- * were there. ERR_CONFLICT: other pixels are there. ERR_BUSY: another request is
- * writing it just now.
+ * An image, [row][column]: flat and dark in float32 counts, the defect map in
+ * bytes. *ret_new false: the same pixels were there. ERR_CONFLICT: other pixels
+ * are there. ERR_BUSY: another request is writing it just now.
  */
-enum image { IMAGE_FLAT, IMAGE_DARK, IMAGE_COUNT };
-int store_put_image(struct store *store, struct stored_scan *scan, enum image image, const float *pixels, bool *ret_new,
+enum image { IMAGE_FLAT, IMAGE_DARK, IMAGE_DEFECTS, IMAGE_COUNT };
+int store_put_image(struct store *store, struct stored_scan *scan, enum image image, const void *pixels, bool *ret_new,
 		    struct error *err);
 
 /* ---- rows of jobs: for job.c, which keeps the rules; everybody else uses job.h ---- */

@@ -26,7 +26,7 @@ static const unsigned long long SPACE_FOR_CATALOGUE = 4ull << 20;
 enum { DOCUMENT_BYTES_MAX = 64 << 20 };
 enum progress { MISSING, CLAIMED, STORED };
 
-static const char *const image_files[IMAGE_COUNT] = {"flat.f32", "dark.f32"};
+static const char *const image_files[IMAGE_COUNT] = {"flat.f32", "dark.f32", "defects.u8"};
 
 struct stored_scan {
 	/* Constant. */
@@ -516,6 +516,7 @@ void stored_scan_facts(struct stored_scan *scan, struct scan_facts *ret)
 	ret->received = scan->received;
 	ret->flat = scan->image[IMAGE_FLAT] == STORED;
 	ret->dark = scan->image[IMAGE_DARK] == STORED;
+	ret->defects = scan->image[IMAGE_DEFECTS] == STORED;
 	ret->complete = scan->received == scan->count;
 	ret->ready = is_ready(scan);
 	ret->deleted = scan->deleted;
@@ -677,12 +678,18 @@ int store_put_projections(struct store *store, struct received_projection *batch
 	return 0;
 }
 
-/* ---- flat and dark ---- */
+/* ---- flat, dark, defects ---- */
+
+static size_t image_bytes(const struct stored_scan *scan, enum image image)
+{
+	return (size_t)scan->columns * (size_t)scan->rows * (image == IMAGE_DEFECTS ? 1 : sizeof(float));
+}
 
 /* Nobody else may write this image until claim_image's caller has set its progress again. */
 static int claim_image(struct stored_scan *scan, enum image image, const uint8_t sha256[32], bool *ret_there,
 		       struct error *err)
 {
+	static const char *const names[IMAGE_COUNT] = {"flat image", "dark image", "defect map"};
 	int code = 0;
 
 	*ret_there = false;
@@ -696,24 +703,24 @@ static int claim_image(struct stored_scan *scan, enum image image, const uint8_t
 	else if (memcmp(scan->image_sha256[image], sha256, 32) == 0)
 		*ret_there = true;
 	else
-		code = error_set(err, ERR_CONFLICT, "the scan has another %s image already",
-				 image == IMAGE_FLAT ? "flat" : "dark");
+		code = error_set(err, ERR_CONFLICT, "the scan has another %s already", names[image]);
 	pthread_mutex_unlock(&scan->lock);
 	return code;
 }
 
-static int write_image(struct store *store, struct stored_scan *scan, enum image image, const float *pixels,
+static int write_image(struct store *store, struct stored_scan *scan, enum image image, const void *pixels,
 		       const uint8_t sha256[32], struct error *err)
 {
 	static const char *const statements[IMAGE_COUNT] = {"UPDATE scans SET flat = ? WHERE number = ?",
-							    "UPDATE scans SET dark = ? WHERE number = ?"};
+							    "UPDATE scans SET dark = ? WHERE number = ?",
+							    "UPDATE scans SET defects = ? WHERE number = ?"};
 	char directory[1024], path[1100];
 	struct query query;
 	int code;
 
 	store_scan_directory(store, scan->id, directory);
 	snprintf(path, sizeof(path), "%s/%s", directory, image_files[image]);
-	code = file_write_durable(path, pixels, (size_t)scan->columns * (size_t)scan->rows * sizeof(float), err);
+	code = file_write_durable(path, pixels, image_bytes(scan, image), err);
 	if (code == 0)
 		code = store_begin(store, err);
 	if (code != 0)
@@ -724,15 +731,14 @@ static int write_image(struct store *store, struct stored_scan *scan, enum image
 	return store_end(store, query_run(&query), err);
 }
 
-int store_put_image(struct store *store, struct stored_scan *scan, enum image image, const float *pixels, bool *ret_new,
+int store_put_image(struct store *store, struct stored_scan *scan, enum image image, const void *pixels, bool *ret_new,
 		    struct error *err)
 {
 	uint8_t sha256[32];
 	bool there, ready;
 	int code;
 
-	if (EVP_Digest(pixels, (size_t)scan->columns * (size_t)scan->rows * sizeof(float), sha256, NULL, EVP_sha256(),
-		       NULL) != 1)
+	if (EVP_Digest(pixels, image_bytes(scan, image), sha256, NULL, EVP_sha256(), NULL) != 1)
 		return error_set(err, ERR_INTERNAL, "SHA-256 failed");
 	code = claim_image(scan, image, sha256, &there, err);
 	if (code != 0)
@@ -790,6 +796,7 @@ static int load_scan(struct store *store, struct query *query, struct error *err
 	scan->air = sqlite3_column_double(row, 9);
 	read_image_digest(query, 10, scan, IMAGE_FLAT);
 	read_image_digest(query, 11, scan, IMAGE_DARK);
+	read_image_digest(query, 12, scan, IMAGE_DEFECTS);
 	if (sample < 0 || quantity < 0 || !id_valid(scan->id)) {
 		code = error_set(err, ERR_IO, "catalogue: the row of scan \"%s\" makes no sense", scan->id);
 		scan_free_memory(scan);
@@ -823,7 +830,7 @@ int store_load_scans(struct store *store, struct error *err)
 	int code = 0;
 
 	query_begin(&query, &store->reader,
-		    "SELECT number, id, name, created, columns, rows, count, sample, quantity, air, flat, dark"
+		    "SELECT number, id, name, created, columns, rows, count, sample, quantity, air, flat, dark, defects"
 		    " FROM scans ORDER BY id",
 		    err);
 	while (code == 0 && query_row(&query))

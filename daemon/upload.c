@@ -347,6 +347,12 @@ static size_t image_pixels(const struct scan *scan)
 	return (size_t)scan->geometry.columns * (size_t)scan->geometry.rows;
 }
 
+/* As it is stored. */
+static size_t image_bytes(const struct scan *scan, enum image image)
+{
+	return image_pixels(scan) * (image == IMAGE_DEFECTS ? 1 : sizeof(float));
+}
+
 /* "2 projections of 1249924 bytes (559 x 559 float32)" */
 static void describe_expected(const struct upload *upload, char *ret_text, size_t size)
 {
@@ -358,6 +364,9 @@ static void describe_expected(const struct upload *upload, char *ret_text, size_
 		snprintf(ret_text, size, "%" PRIu64 " bytes: %d projection%s of %d x %d %s", upload->expected, count,
 			 count == 1 ? "" : "s", scan->geometry.columns, scan->geometry.rows,
 			 sample_names[scan->sample]);
+	else if (upload->target.image == IMAGE_DEFECTS)
+		snprintf(ret_text, size, "%zu bytes: %d x %d of one byte each", pixels, scan->geometry.columns,
+			 scan->geometry.rows);
 	else if (scan->sample == SAMPLE_FLOAT32)
 		snprintf(ret_text, size, "%zu bytes: %d x %d float32", pixels * sizeof(float), scan->geometry.columns,
 			 scan->geometry.rows);
@@ -372,8 +381,9 @@ static bool length_is_right(const struct upload *upload, uint64_t length)
 	const struct scan *scan = stored_scan_parsed(upload->scan);
 
 	if (upload->target.kind == UPLOAD_IMAGE)
-		return length == image_pixels(scan) * sizeof(float) ||
-		       length == image_pixels(scan) * sample_bytes(scan->sample);
+		return length == image_bytes(scan, upload->target.image) ||
+		       (upload->target.image != IMAGE_DEFECTS &&
+			length == image_pixels(scan) * sample_bytes(scan->sample));
 	return length == upload->expected;
 }
 
@@ -457,7 +467,7 @@ int upload_new(struct uploads *uploads, struct request *request, struct stored_s
 	upload->descriptor = -1;
 	upload->references = 1;
 	upload->next = target->first;
-	upload->slot_bytes = target->kind == UPLOAD_IMAGE ? image_pixels(stored_scan_parsed(scan)) * sizeof(float)
+	upload->slot_bytes = target->kind == UPLOAD_IMAGE ? image_bytes(stored_scan_parsed(scan), target->image)
 							  : scan_projection_bytes(stored_scan_parsed(scan));
 	upload->expected = (uint64_t)upload->slot_bytes * (uint64_t)(target->last - target->first + 1);
 	code = read_encoding(upload, &known, err);
@@ -800,14 +810,14 @@ static int process_projection(struct slot *slot, struct error *err)
 	return claim == CLAIM_BUSY ? park(slot, err) : write_claimed(slot, err);
 }
 
-/* float32 as it came, or the scan's own counts made float32. */
+/* As it came, or the scan's own counts made float32. */
 static int process_image(struct slot *slot, struct error *err)
 {
 	struct upload *upload = slot->upload;
 	size_t pixels = image_pixels(stored_scan_parsed(upload->scan));
 	bool created;
 
-	if (slot->filled != pixels * sizeof(float)) {
+	if (slot->filled != image_bytes(stored_scan_parsed(upload->scan), upload->target.image)) {
 		for (size_t i = pixels; i-- > 0;) { /* from the end: the float of pixel i covers counts 2i and 2i + 1 */
 			uint16_t sample;
 			float value;
@@ -817,8 +827,7 @@ static int process_image(struct slot *slot, struct error *err)
 			memcpy(slot->data + i * sizeof(value), &value, sizeof(value));
 		}
 	}
-	if (store_put_image(upload->uploads->store, upload->scan, upload->target.image,
-			    (const float *)(const void *)slot->data, &created, err) != 0)
+	if (store_put_image(upload->uploads->store, upload->scan, upload->target.image, slot->data, &created, err) != 0)
 		return err->code;
 	slot->outcome = created ? SLOT_CREATED : SLOT_SAME;
 	return 0;

@@ -177,7 +177,7 @@ static int make_temporary(char *ret_path, size_t size, struct error *err)
 
 static void remove_temporary(const char *directory)
 {
-	static const char *const names[] = {"scan.json", "projections.raw", "flat.f32", "dark.f32"};
+	static const char *const names[] = {"scan.json", "projections.raw", "flat.f32", "dark.f32", "defects.u8"};
 	char path[1200];
 
 	for (size_t i = 0; i < sizeof(names) / sizeof(names[0]); i++) {

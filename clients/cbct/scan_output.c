@@ -62,7 +62,7 @@ int scan_output_document(const char *directory, const struct scan *scan, struct 
 
 int scan_output_begin(const char *directory, struct error *err)
 {
-	static const char *const names[] = {"scan.json", "flat.f32", "dark.f32"};
+	static const char *const names[] = {"scan.json", "flat.f32", "dark.f32", "defects.u8"};
 	char path[1200];
 
 	if (mkdir(directory, 0777) != 0 && errno != EEXIST)

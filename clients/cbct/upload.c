@@ -244,10 +244,10 @@ static int make_runs(struct upload *upload, const cJSON *missing, int count, int
 	return 0;
 }
 
-static int send_image(struct http *http, const struct upload *upload, const char *name, const float *image,
+static int send_image(struct http *http, const struct upload *upload, const char *name, const void *image, size_t size,
 		      const struct scan *scan, struct error *err)
 {
-	size_t length = (size_t)scan->geometry.columns * (size_t)scan->geometry.rows * sizeof(*image);
+	size_t length = (size_t)scan->geometry.columns * (size_t)scan->geometry.rows * size;
 	char path[160];
 
 	if (image == NULL)
@@ -328,9 +328,11 @@ static int upload_files(struct upload *upload, const struct scan_files *files, s
 		code = make_runs(upload, cJSON_GetObjectItemCaseSensitive(document, "missing"), scan->count, most, err);
 	}
 	if (code == 0)
-		code = send_image(http, upload, "flat", files->flat, scan, err);
+		code = send_image(http, upload, "flat", files->flat, sizeof(float), scan, err);
 	if (code == 0)
-		code = send_image(http, upload, "dark", files->dark, scan, err);
+		code = send_image(http, upload, "dark", files->dark, sizeof(float), scan, err);
+	if (code == 0)
+		code = send_image(http, upload, "defects", files->defects, 1, scan, err);
 	if (code == 0)
 		code = send_runs(upload, err);
 	cJSON_Delete(document);

@@ -143,6 +143,10 @@ post_projections() {
 		req PUT "/v1/scans/$scan/$image" --data-binary @"$1/$image.f32"
 		[[ $status == 20[014] ]] || fail "$image stored, got $status"
 	done
+	if [ -e "$1/defects.u8" ]; then
+		req PUT "/v1/scans/$scan/defects" --data-binary @"$1/defects.u8"
+		[[ $status == 20[014] ]] || fail "defects stored, got $status"
+	fi
 	req PUT "/v1/scans/$scan/projections" -T "$1/projections.raw"
 	expect_status 201
 }

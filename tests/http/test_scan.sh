@@ -196,6 +196,25 @@ test_uint16_intensities_with_flat_and_dark() {
 	expect_problem 400
 }
 
+test_a_map_of_defects() {
+	new_scan
+	fill 17 1 | head -c $((one / 4)) >"$work/map"
+	req GET "/v1/scans/$scan"
+	expect_json '.defects == false'
+	req PUT "/v1/scans/$scan/defects" -T "$work/map"
+	expect_status 201
+	req PUT "/v1/scans/$scan/defects" -T "$work/map"
+	expect_status 200
+	req GET "/v1/scans/$scan"
+	expect_json '.defects == true'
+	fill 18 1 | head -c $((one / 4)) >"$work/map"
+	req PUT "/v1/scans/$scan/defects" -T "$work/map"
+	expect_problem 409
+	fill 18 1 >"$work/map"
+	req PUT "/v1/scans/$scan/defects" -T "$work/map" # as long as a float32 image
+	expect_problem 400
+}
+
 test_lists_newest_first_in_pages() {
 	local first second third
 	new_scan && first=$scan
