@@ -143,6 +143,7 @@ struct plan_options {
 	bool matched;
 	const struct tv_options *tv; /* NULL: no TV */
 	bool reference_precision;    /* float everywhere; otherwise storage may be packed within the stated bound */
+	bool no_samples;             /* linearise will not be asked for */
 	bool no_projection;          /* neither project nor sart_iterate will be asked for: no scratch for them */
 	int resident; /* slots of the stacks that are on the device beside the plan; 0: one for each view */
 };

@@ -45,6 +45,7 @@ static struct plan_options options_for(const struct plan *plan, enum purpose pur
 	options.grid = grid;
 	options.linearise = (struct linearise){.sample = SAMPLE_FLOAT32};
 	options.sart = NULL;
+	options.no_samples = true;
 	options.no_projection = purpose != FOR_SUMS;
 	options.resident = plan->batch;
 	if (purpose != FOR_TV)
@@ -83,6 +84,7 @@ static struct plan_options intake_options(const struct plan *plan, const struct 
 
 	options.tv = NULL;
 	options.linearise = plan->options.linearise;
+	options.no_samples = false;
 	options.resident = 1;
 	return options;
 }

@@ -253,6 +253,8 @@ int cuda_linearise(struct plan *plan, const void *samples, int count, const int 
 	size_t view = plan->bytes.raw;
 	linearised found;
 
+	if (plan->raw_views == 0)
+		return error_set(err, ERR_INTERNAL, "the plan was made without raw samples");
 	for (int i = 0; i < count; i++)
 		if (slots[i] < 0 || slots[i] >= to->slots)
 			return error_set(err, ERR_INTERNAL, "slot %d of a stack of %d", slots[i], to->slots);

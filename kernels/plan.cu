@@ -124,7 +124,8 @@ static void row_spacing(const struct geometry *geometry, const struct grid *grid
 
 		view_matrix(view, matrix);
 		for (int corner = 0; corner < 4; corner++) {
-			double c = corner & 1 ? geometry->columns - 1 : 0, r = corner & 2 ? geometry->rows - 1 : 0, rise;
+			double c = corner & 1 ? geometry->columns - 1 : 0, r = corner & 2 ? geometry->rows - 1 : 0,
+			       rise;
 			double depth;
 
 			for (int i = 0; i < 3; i++)
@@ -326,8 +327,7 @@ static void plan_describe(struct plan *plan, const struct plan_options *options,
 	    (size_t)geometry->columns * (size_t)geometry->rows * (options->linearise.sample == SAMPLE_UINT16 ? 2 : 4);
 	if (plan->bytes.raw < RAW_BYTES)
 		plan->raw_views = (int)(RAW_BYTES / plan->bytes.raw);
-	if (plan->raw_views > geometry->count)
-		plan->raw_views = geometry->count;
+	plan->raw_views = options->no_samples ? 0 : at_most(plan->raw_views, resident_views(options));
 }
 
 static bool needs_coverage(const struct plan *plan)
@@ -587,8 +587,8 @@ static void summarise(struct plan *plan)
 	char forward[64] = "general", back[64] = "general";
 
 	if (shape->forward_rows > 0)
-		snprintf(forward, sizeof(forward), "%s, %d rows a thread", shape->untilted ? "untilted" : "near untilted",
-			 shape->forward_rows);
+		snprintf(forward, sizeof(forward), "%s, %d rows a thread",
+			 shape->untilted ? "untilted" : "near untilted", shape->forward_rows);
 	if (shape->back_voxels > 0)
 		snprintf(back, sizeof(back), "untilted, %d voxels a window%s", shape->back_voxels,
 			 shape->back_half ? ", two a row" : "");

@@ -22,7 +22,7 @@
 _Static_assert(SPOOL_VOLUME_OFFSET == 352, "a NIfTI-1 header and its four extension bytes");
 
 enum {
-	READ_BYTES = 2 << 20, /* projections in one go: small beside the scan, large beside a system call */
+	READ_BYTES = 8 << 20, /* projections in one go: small beside the scan, large beside a system call */
 	PIECE_BYTES = 8 << 20 /* voxels in one go, on their way to the disk */
 };
 
@@ -504,6 +504,31 @@ out:
 
 /* ---- views ---- */
 
+/* One core reads a fifth of what the page cache gives. */
+static int read_views(int file, char *ret_to, size_t size, size_t offset, struct error *err)
+{
+	enum { STRIPES = 8, STRIPE_LEAST = 256 << 10 };
+	size_t each = (size + STRIPES - 1) / STRIPES;
+	struct error errors[STRIPES] = {{0}};
+	int count;
+
+	if (each < STRIPE_LEAST)
+		each = STRIPE_LEAST;
+	count = (int)((size + each - 1) / each);
+#pragma omp parallel for num_threads(count) schedule(static)
+	for (int i = 0; i < count; i++) {
+		size_t first = each * (size_t)i, some = size - first < each ? size - first : each;
+
+		file_read_at(file, ret_to + first, some, offset + first, "projections.raw", &errors[i]);
+	}
+	for (int i = 0; i < count; i++)
+		if (errors[i].code != 0) {
+			*err = errors[i];
+			return err->code;
+		}
+	return 0;
+}
+
 static int push_views(struct recon *recon, const struct scan_files *files, struct error *err)
 {
 	size_t bytes = scan_projection_bytes(files->scan);
@@ -522,8 +547,7 @@ static int push_views(struct recon *recon, const struct scan_files *files, struc
 
 		for (int i = 0; i < some; i++)
 			views[i] = first + i;
-		code = file_read_at(files->projections, samples, (size_t)some * bytes, (size_t)first * bytes,
-				    "projections.raw", err);
+		code = read_views(files->projections, samples, (size_t)some * bytes, (size_t)first * bytes, err);
 		if (code == 0)
 			code = recon_push(recon, samples, views, some, err);
 	}

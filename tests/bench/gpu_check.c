@@ -967,7 +967,7 @@ int main(int argc, char **argv)
 	check_recon(devices, BEND_NONE, true, false, 1e-4);
 	check_recon(devices, BEND_TILTED, true, false, 1e-4);
 	for (int bend = 0; bend < BEND_STEEP; bend++)
-		check_recon(devices, (enum bend)bend, false, false, 2e-3);
+		check_recon(devices, (enum bend)bend, false, false, 5e-3);
 	check_recon(devices, BEND_NONE, false, true, 2e-3);
 	check_lean();
 	check_parts(false, true);
