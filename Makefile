@@ -36,6 +36,8 @@ PACKAGES := libmicrohttpd:libmicrohttpd-dev libcjson:libcjson-dev libzstd:libzst
             expat:libexpat1-dev libtiff-4:libtiff-dev zlib:zlib1g-dev check:check
 COMMANDS := gcc:gcc pkg-config:pkg-config curl:curl jq:jq zstd:zstd openssl:openssl pgrep:procps sqlite3:sqlite3 \
             mypy:mypy dcmdump:dcmtk
+# What is done without where it cannot be had: the web page, and its tests in a browser.
+OPTIONAL := node:nodejs npm:npm
 # Of Python: yaml for the build, the others for tests.
 MODULES  := yaml:python3-yaml jsonschema:python3-jsonschema numpy:python3-numpy requests:python3-requests
 
@@ -156,6 +158,10 @@ $(BUILD)/gpu_ceilings: tests/bench/gpu_ceilings.cu
 	@mkdir -p $(@D)
 	$(call say,NVCC)$(NVCC) -std=c++17 -O3 $(cuda_code) -o $@ $<
 
+apt_install = { $$run apt-get install -y -qq --no-install-recommends $(1) >/dev/null 2>&1 || \
+	  { $$run apt-get update -qq && DEBIAN_FRONTEND=noninteractive $$run apt-get install -y -qq --no-install-recommends $(1) >/dev/null; }; }
+
+check: OPTIONAL += chromium:chromium
 setup: ## install the Debian packages that are missing
 	@missing=""; \
 	for pair in $(COMMANDS); do command -v $${pair%%:*} >/dev/null 2>&1 || missing="$$missing $${pair##*:}"; done; \
@@ -166,8 +172,12 @@ setup: ## install the Debian packages that are missing
 	run=""; [ "$$(id -u)" = 0 ] || run="sudo -n"; \
 	if [ "$$(id -u)" != 0 ] && ! sudo -n true 2>/dev/null; then \
 		echo "please type:  sudo apt-get install -y --no-install-recommends$$missing" >&2; exit 1; fi; \
-	{ $$run apt-get install -y -qq --no-install-recommends $$missing >/dev/null 2>&1 || \
-	  { $$run apt-get update -qq && DEBIAN_FRONTEND=noninteractive $$run apt-get install -y -qq --no-install-recommends $$missing >/dev/null; }; }
+	$(call apt_install,$$missing)
+	@wanted=""; for pair in $(OPTIONAL); do command -v $${pair%%:*} >/dev/null 2>&1 || wanted="$$wanted $${pair##*:}"; done; \
+	[ -z "$$wanted" ] && exit 0; \
+	run=""; [ "$$(id -u)" = 0 ] || run="sudo -n"; \
+	echo "installing:$$wanted"; \
+	$(call apt_install,$$wanted) || echo "going on without$$wanted: apt-get cannot install them here" >&2
 
 demo: setup ## a C-arm scan posted with curl, reconstructed, its volumes coming back
 	@$(MAKE) --no-print-directory -j$$(nproc) all

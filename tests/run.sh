@@ -53,7 +53,7 @@ if wanted unit "$@"; then
 	grep -E '^SKIP ' "$log" | sed 's/^SKIP /skip /' >>"$results"
 fi
 
-for file in tests/http/test_*.sh; do
+for file in tests/http/test_*.sh tests/web/test_*.sh; do
 	wanted "$file" "$@" || continue
 	part "$file"
 	RESULTS=$results bash "$file" || true

@@ -1,0 +1,436 @@
+/* The page in a real browser, against a real daemon whose jobs are real: run by test_page.sh. */
+import { readFileSync } from 'node:fs'
+import { createRequire } from 'node:module'
+import {
+	origin, api, post, ended, picture, grayOf, shrink, mirrored, flipped, transposed, correlation, launch, software, withoutGraphics, open,
+	realComplaints, shoot, until, expect, test, runTests,
+} from './lib.mjs'
+
+const { SCAN: scan, FINISHED: finished, NAME: name } = process.env
+const axe = readFileSync(createRequire(import.meta.url).resolve('axe-core/axe.min.js'), 'utf8')
+
+const browser = await launch(software)
+const finishedPath = `/#/jobs/${finished}`
+
+/* ---- what is asked of a page ---- */
+
+const tile = plane => `.viewer:not(.second) [data-plane="${plane}"]`
+
+/* The pixels that a plane is drawn with, once its voxels are there. */
+async function planePixels(page, plane, viewer = '.viewer:not(.second)') {
+	await page.waitForSelector(`${viewer} [data-plane="${plane}"] canvas.slice:not([hidden])`, { state: 'attached' })
+	return page.evaluate(([selector]) => new Promise(resolve => requestAnimationFrame(() => requestAnimationFrame(() => {
+		const canvas = document.querySelector(selector)
+		const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height)
+		resolve({ width: canvas.width, height: canvas.height, pixels: Array.from({ length: data.length / 4 }, (_, i) => data[4 * i]) })
+	}))), [`${viewer} [data-plane="${plane}"] canvas.slice`])
+}
+const windowOf = async page => [await page.inputValue('[aria-label="Window width, HU"]'), await page.inputValue('[aria-label="Window level, HU"]')].map(Number)
+const depthOf = async (page, plane) => Number(await page.inputValue(`${tile(plane)} .depth`))
+const shownVolume = page => page.getAttribute('.viewer:not(.second)', 'data-volume')
+const differ = (a, b) => a.pixels.some((value, i) => value !== b.pixels[i])
+const badge = page => page.textContent('.head .badge')
+
+async function openFinished(options) {
+	const page = await open(browser, finishedPath, options)
+	await planePixels(page, 'z')
+	return page
+}
+
+async function accessible(page, what) {
+	await page.evaluate(axe)
+	const { violations } = await page.evaluate(() => axe.run(document, { resultTypes: ['violations'] }))
+	expect(violations.length === 0, `${what} without barriers: ${JSON.stringify(violations.map(one => [one.id, one.nodes[0].html, one.nodes[0].failureSummary]))}`)
+}
+
+async function fits(page, what) {
+	const [wide, room] = await page.evaluate(() => [document.documentElement.scrollWidth, document.documentElement.clientWidth])
+	expect(wide <= room, `${what} no wider than the screen, ${wide} of ${room}`)
+}
+
+/* ---- live ---- */
+
+test('a job appears in the list, runs and is cancelled, without a reload', async () => {
+	const page = await open(browser, '/')
+	await page.waitForSelector(`.jobs a[href="#/jobs/${finished}"]`)
+	await page.waitForSelector('.live[data-state=on]')
+	const job = await post('/v1/jobs', { scan, grid: { size: [40, 40, 40], spacing_mm: [3, 3, 3] }, fdk: {}, sart: { iterations: 100000, subsets: 'views' },
+		emit: ['fdk', 1, 2, 3, 5, 8, 13, 21] })
+	const row = `.jobs a[href="#/jobs/${job.id}"]`
+	await page.waitForSelector(`${row} .badge.running`)
+	await page.click(row)
+	await page.waitForSelector('.head .badge.running')
+	const before = await until('points of the plot', () => page.locator('.plot .residual .point').count(), count => count >= 2)
+	await until('more of them', () => page.locator('.plot .residual .point').count(), count => count > before)
+	await until('volumes that come by themselves', () => page.getAttribute('.iterations input[type=range]', 'max'), most => Number(most) >= 3)
+	await until('the newest of them shown', async () => {
+		const { volumes } = await api(`/v1/jobs/${job.id}/volumes?limit=1`)
+		return [volumes[0].name, await shownVolume(page)]
+	}, ([newest, shown]) => newest === shown)
+	expect(/iteration \d+ of 100.?000/.test(await page.textContent('.doing')), 'the iteration in words')
+	expect(Number(await page.getAttribute('.head [role=progressbar]', 'aria-valuenow')) >= 0, 'progress')
+	await until('the time left', () => page.textContent('.left'), text => /left/.test(text))
+	await shoot(page, 'running')
+	await page.click('button:has-text("Cancel …")')
+	await shoot(page, 'cancel')
+	await page.click('dialog button:has-text("Cancel the job")')
+	await page.waitForSelector('.head .badge.cancelled')
+	expect((await ended(job.id)).state === 'cancelled', 'the job cancelled')
+	await page.context().close()
+})
+
+/* ---- pictures ---- */
+
+const half = 6 /* voxels off the middle, where the solid has no mirror plane */
+
+test('planes are the daemon\'s slices, pixel by pixel', async () => {
+	const page = await openFinished()
+	const [window, level] = await windowOf(page)
+	for (const plane of ['z', 'y', 'x']) {
+		await page.focus(tile(plane))
+		for (let i = 0; i < half; i++)
+			await page.keyboard.press('ArrowUp')
+		const index = await depthOf(page, plane)
+		const drawn = await planePixels(page, plane)
+		const slice = await picture(`/v1/jobs/${finished}/volumes/final/slice?axis=${plane}&index=${index}&window=${window}&level=${level}`)
+		expect(drawn.width === slice.width && drawn.height === slice.height, `${plane}: ${slice.width} x ${slice.height}, got ${drawn.width} x ${drawn.height}`)
+		/* The page has whole Hounsfield units, half of one off at most: one gray level at such windows. */
+		const worst = drawn.pixels.reduce((most, value, i) => Math.max(most, Math.abs(value - slice.pixels[i])), 0)
+		expect(worst <= 1, `${plane}: the same gray, ${worst} levels off`)
+		const small = shrink(slice), others = [mirrored(small), flipped(small), mirrored(flipped(small)), transposed(small)]
+		expect(others.every(other => correlation(small, other) < 0.9), `${plane}: a slice that a mirror would change`)
+		/* And so on the screen, with all that the style sheet does to it. */
+		const seen = shrink(grayOf(await page.locator(`${tile(plane)} .frame`).screenshot()))
+		const likeness = correlation(small, seen)
+		expect(likeness > 0.85 && others.every(other => correlation(other, seen) < likeness - 0.05), `${plane}: the right way round on the screen (${likeness})`)
+	}
+	await page.context().close()
+})
+
+test('the rendering shows the patient from the front, the left to the right', async () => {
+	const page = await openFinished()
+	await page.waitForSelector(`${tile('3d')}[data-shown=final]`)
+	await page.focus(tile('3d'))
+	for (let i = 0; i < 4; i++)
+		await page.keyboard.press('ArrowLeft')
+	for (let i = 0; i < 2; i++)
+		await page.keyboard.press('ArrowUp')
+	await page.evaluate(() => document.activeElement.blur())
+	await page.$$eval(`${tile('3d')} > :not(.stage)`, labels => labels.forEach(label => label.style.visibility = 'hidden'))
+	/* What lies behind each other along y, as seen with superior on top. */
+	const { size } = (await api(`/v1/jobs/${finished}/volumes`)).volumes[0]
+	const raw = await (await fetch(`${origin}/v1/jobs/${finished}/volumes/final?format=raw&type=int16`)).arrayBuffer()
+	const voxels = new Int16Array(raw), [nx, ny, nz] = size
+	const shadow = { width: nx, height: nz, pixels: new Float64Array(nx * nz) }
+	for (let i = 0; i < voxels.length; i++) {
+		const x = i % nx, z = Math.floor(i / nx / ny)
+		if (voxels[i] > 150)
+			shadow.pixels[(nz - 1 - z) * nx + x] = 1
+	}
+	const seen = await until('the rendering', async () => grayOf(await page.locator(`${tile('3d')} canvas`).screenshot()), one => one.pixels.some(value => value > 60))
+	const [a, b] = [cropped(shadow, 0.5), cropped(seen, 40, 12)].map(one => shrink(one))
+	const likeness = correlation(a, b)
+	expect(likeness > 0.6 && [mirrored(b), flipped(b), mirrored(flipped(b))].every(other => correlation(a, other) < likeness - 0.2),
+		`the solid, not its mirror image: ${likeness}, mirrored ${correlation(a, mirrored(b))}, upside down ${correlation(a, flipped(b))}`)
+	await page.context().close()
+})
+
+/* What is brighter than `least`, and no more around it; the margin, where the viewer's edge is, does not count. */
+function cropped({ width, height, pixels }, least, margin = 0) {
+	let x0 = width, x1 = 0, y0 = height, y1 = 0
+	pixels.forEach((value, i) => {
+		const x = i % width, y = Math.floor(i / width)
+		if (value <= least || Math.min(x, width - 1 - x, y, height - 1 - y) < margin)
+			return
+		;[x0, x1, y0, y1] = [Math.min(x0, x), Math.max(x1, x), Math.min(y0, y), Math.max(y1, y)]
+	})
+	const part = { width: x1 - x0 + 1, height: y1 - y0 + 1, pixels: [] }
+	for (let y = y0; y <= y1; y++) {
+		for (let x = x0; x <= x1; x++)
+			part.pixels.push(pixels[y * width + x] > least ? 1 : 0)
+	}
+	return part
+}
+
+test('another iteration changes the pixels, and neither window nor place', async () => {
+	const page = await openFinished()
+	await page.click('[data-preset="Soft tissue"]')
+	await page.mouse.click(...await spot(page, 'z', 0.4, 0.6))
+	const place = await page.textContent('.readout'), before = await planePixels(page, 'z'), rendering = await page.locator(`${tile('3d')} canvas`).screenshot()
+	await page.focus('.iterations input[type=range]')
+	await page.keyboard.press('Home')
+	await until('the first volume', () => shownVolume(page), shown => shown === 'fdk')
+	await until('other pixels', async () => differ(before, await planePixels(page, 'z')))
+	await page.waitForSelector(`${tile('3d')}[data-shown=fdk]`)
+	expect(!rendering.equals(await page.locator(`${tile('3d')} canvas`).screenshot()), 'another rendering')
+	expect(String(await windowOf(page)) === '400,40', 'the window kept')
+	expect((await page.textContent('.readout')).split('mm')[0] === place.split('mm')[0], 'the place kept')
+	expect(!await page.isChecked('.iterations input[type=checkbox]'), 'the newest no longer followed')
+	await page.keyboard.press('End')
+	await until('the same pixels again', async () => !differ(before, await planePixels(page, 'z')))
+	await page.context().close()
+})
+
+/* A point of a plane on the screen, in fractions of its width and height. */
+async function spot(page, plane, x, y) {
+	const box = await page.locator(`${tile(plane)} .frame`).boundingBox()
+	return [box.x + x * box.width, box.y + y * box.height]
+}
+
+test('window and level by dragging and by presets; a click moves the cross, the wheel the slice', async () => {
+	const page = await openFinished()
+	const before = await planePixels(page, 'z'), [window, level] = await windowOf(page)
+	const [x, y] = await spot(page, 'z', 0.5, 0.5)
+	await page.mouse.move(x, y)
+	await page.mouse.down()
+	await page.mouse.move(x + 60, y - 40, { steps: 4 })
+	await page.mouse.up()
+	const [wider, lower] = await windowOf(page)
+	expect(wider > window && lower < level, `a wider window and a lower level, ${window} ${level} became ${wider} ${lower}`)
+	expect(differ(before, await planePixels(page, 'z')), 'other pixels')
+	for (const [preset, expected] of [['Bone', '2000,300'], ['Soft tissue', '400,40'], ['Lung', '1500,-600']]) {
+		await page.click(`[data-preset="${preset}"]`)
+		expect(String(await windowOf(page)) === expected, `${preset}: ${expected}`)
+		expect(await page.getAttribute(`[data-preset="${preset}"]`, 'aria-pressed') === 'true', `${preset} pressed`)
+	}
+	const [sagittal, axial] = [await depthOf(page, 'x'), await depthOf(page, 'z')]
+	await page.mouse.click(...await spot(page, 'z', 0.25, 0.5))
+	expect(await depthOf(page, 'x') < sagittal, 'the sagittal plane further to the right of the patient')
+	await page.mouse.wheel(0, -120)
+	await until('slices further up', () => depthOf(page, 'z'), index => index > axial)
+	await page.context().close()
+})
+
+/* ---- numbers ---- */
+
+test('the plot has the points of the history on a logarithmic axis', async () => {
+	const page = await openFinished()
+	const { history } = await api(`/v1/jobs/${finished}`)
+	for (const key of ['residual', 'change', 'tv']) {
+		const points = await page.$$eval(`.plot .${key} .point`, circles => circles.map(circle => [circle.dataset.iteration, circle.getAttribute('cx'), circle.getAttribute('cy')].map(Number)))
+		expect(String(points.map(point => point[0])) === String(history.map(row => row.iteration)), `${key}: a point for each iteration, got ${points.map(point => point[0])}`)
+		expect(points.every((point, i) => i === 0 || point[1] > points[i - 1][1]), `${key}: from left to right`)
+		const logs = history.map(row => Math.log10(row[key]))
+		/* Positions are rounded to a tenth of a unit of some fifty. */
+		expect(correlation(logs, points.map(point => -point[2])) > 0.999, `${key}: heights as the logarithms`)
+	}
+	expect(await page.locator('.plot .residual .kept').count() >= 4, 'kept iterations marked')
+	await page.click('.course summary')
+	expect(await page.locator('.course tbody tr').count() === history.length, 'the same as a table')
+	await page.click('.plot .residual .kept >> nth=1')
+	const wanted = Number(await page.getAttribute('.plot .residual .kept >> nth=1', 'data-iteration'))
+	await until('the volume of the point that was clicked', () => shownVolume(page), shown => shown === `iter-${wanted}`)
+	await page.context().close()
+})
+
+test('warnings, geometry, projections and downloads', async () => {
+	const page = await openFinished()
+	expect(await page.textContent('h1') === name, 'the scan\'s name as a text')
+	expect(await page.locator('h1 *').count() === 0, 'no markup out of a name')
+	expect(/parker/.test(await page.textContent('.warnings')), 'the warning of a short scan')
+	expect(/short scan/.test(await page.textContent('.job')) && /620 mm/.test(await page.textContent('.job')), 'weights and source distance')
+	const film = page.locator('.film input[type=range]')
+	await film.focus()
+	for (let i = 0; i < 3; i++)
+		await page.keyboard.press('ArrowRight')
+	await page.waitForSelector('.film img[data-projection="3"]')
+	await page.click('.film .play')
+	await until('the film runs', () => film.inputValue(), value => Number(value) > 4)
+	await page.click('.film .play')
+	await page.selectOption('[aria-label=Format]', 'mha')
+	const [download] = await Promise.all([page.waitForEvent('download'), page.click('.files a >> nth=0')])
+	expect(download.suggestedFilename() === `${finished}-final.mha`, `a file named by its job, got ${download.suggestedFilename()}`)
+	await page.context().close()
+})
+
+/* ---- two volumes ---- */
+
+test('two iterations side by side and under a swipe', async () => {
+	const page = await openFinished()
+	const alone = await page.locator(`${tile('z')} .frame`).screenshot()
+	await page.click('button:has-text("Side by side")')
+	const first = await planePixels(page, 'z'), second = await planePixels(page, 'z', '.viewer.second')
+	expect(differ(first, second), 'two volumes')
+	await page.mouse.click(...await spot(page, 'z', 0.3, 0.3))
+	const depth = selector => page.inputValue(`${selector} [data-plane=x] .depth`)
+	expect(await depth('.viewer:not(.second)') === await depth('.viewer.second'), 'the same place')
+	await page.selectOption('[aria-label="Compare with"]', 'iter-2')
+	await until('the other one', () => page.getAttribute('.viewer.second', 'data-volume'), shown => shown === 'iter-2')
+	await page.waitForSelector('.viewer.second [data-plane="3d"][data-shown=iter-2]')
+	await shoot(page, 'side-by-side')
+	await page.click('button:has-text("Swipe")')
+	await planePixels(page, 'z', '.viewer.second')
+	await page.focus('input.swipe')
+	await page.keyboard.press('End')
+	await until('all of the first', async () => Number(await page.evaluate(() => getComputedStyle(document.querySelector('.stages')).getPropertyValue('--swipe'))), share => share === 1)
+	await page.keyboard.press('Home')
+	await page.evaluate(() => new Promise(resolve => requestAnimationFrame(() => requestAnimationFrame(resolve))))
+	const other = await page.locator(`${tile('z')} .frame`).screenshot()
+	expect(!alone.equals(other), 'the other volume')
+	await page.locator('input.swipe').fill('500')
+	await page.waitForSelector('.viewer.second [data-plane="3d"][data-shown=iter-2]')
+	await shoot(page, 'swipe')
+	await page.click('[aria-label=Comparison] button:has-text("Off")')
+	expect(await page.locator('.viewer').count() === 1, 'one viewer again')
+	await page.context().close()
+})
+
+/* ---- hands ---- */
+
+test('everything by keyboard, the focus visible', async () => {
+	const page = await openFinished()
+	const reached = new Set()
+	for (let i = 0; i < 70; i++) {
+		await page.keyboard.press('Tab')
+		const [what, seen] = await page.evaluate(() => {
+			const element = document.activeElement, style = getComputedStyle(element)
+			return [element === document.body ? '' : element.getAttribute('aria-label') || element.textContent.trim() || element.tagName, style.outlineStyle !== 'none' && parseFloat(style.outlineWidth) > 0]
+		})
+		if (what !== '')
+			expect(seen, `the focus to be seen at "${what}"`)
+		reached.add(what)
+	}
+	for (const what of ['Reconstruct again …', 'Axial plane', 'Rendering', 'Soft tissue', 'Swipe', 'Projection', 'final'])
+		expect(reached.has(what), `Tab to reach "${what}", it came to ${[...reached].join(', ')}`)
+	await page.focus(tile('z'))
+	const index = await depthOf(page, 'z')
+	await page.keyboard.press('ArrowUp')
+	expect(await depthOf(page, 'z') === index + 1, 'one slice up')
+	await page.keyboard.press('ArrowLeft')
+	await until('the iteration before', () => shownVolume(page), shown => shown !== 'final')
+	await page.keyboard.press('2')
+	expect(String(await windowOf(page)) === '400,40', 'soft tissue')
+	await page.keyboard.press('Shift+ArrowRight')
+	expect((await windowOf(page))[0] === 420, 'a wider window')
+	await page.keyboard.press('m')
+	expect(await page.getAttribute('.viewer', 'data-tile') === 'z', 'the axial plane alone')
+	await page.keyboard.press('Escape')
+	expect(await page.getAttribute('.viewer', 'data-tile') === 'all', 'all again')
+	await page.keyboard.press('c')
+	await page.waitForSelector('.viewer.second')
+	await page.keyboard.press('?')
+	await page.waitForSelector('dialog[open]')
+	await page.keyboard.press('Escape')
+	await page.waitForSelector('dialog', { state: 'detached' })
+	await page.context().close()
+})
+
+test('"reconstruct again" shows what is wrong at its field, then posts a job', async () => {
+	const page = await openFinished()
+	const field = pointer => `dialog [name="${pointer}"]`
+	await page.click('button:has-text("Reconstruct again")')
+	await page.fill(field('/sart/iterations'), '0')
+	await page.click('dialog button[type=submit]')
+	await page.waitForSelector(`${field('/sart/iterations')}[aria-invalid=true]`)
+	const described = await page.getAttribute(field('/sart/iterations'), 'aria-describedby')
+	expect(/expected/.test(await page.textContent(`#${described}`)), 'what was expected')
+	expect(await page.evaluate(() => document.activeElement.name) === '/sart/iterations', 'the focus at the field')
+	await shoot(page, 'reconstruct-again')
+	await page.fill(field('/sart/iterations'), '2')
+	await page.fill(field('/grid/spacing_mm/1'), 'wide')
+	await page.click('dialog button[type=submit]')
+	await page.waitForSelector(`${field('/grid/spacing_mm/1')}[aria-invalid=true]`)
+	await page.fill(field('/grid/spacing_mm/1'), '5')
+	await page.fill(field('/emit'), 'fdk 1')
+	await page.selectOption(field('/fdk/window'), 'ram-lak')
+	await page.locator('dialog fieldset:has-text("Total variation") legend input').uncheck()
+	await page.click('dialog button[type=submit]')
+	await page.waitForSelector('dialog', { state: 'detached' })
+	const id = new URL(page.url()).hash.split('/').pop()
+	expect(id !== finished, 'the page of the new job')
+	await page.waitForSelector('.head .badge.succeeded')
+	const [before, job] = [await api(`/v1/jobs/${finished}`), await ended(id)]
+	expect(job.sart.iterations === 2 && job.fdk.window === 'ram-lak' && job.tv === null && String(job.emit) === 'fdk,1', `what was changed: ${JSON.stringify(job)}`)
+	expect(String(job.grid.size) === String(before.grid.size) && job.grid.spacing_mm[1] === 5 && job.scan === before.scan, 'the rest as before')
+	await page.context().close()
+})
+
+/* ---- looks ---- */
+
+test('a phone: one column, nothing beside the screen', async () => {
+	const page = await openFinished({ viewport: { width: 390, height: 844 }, deviceScaleFactor: 2, isMobile: true, hasTouch: true })
+	await page.waitForSelector(`${tile('3d')}[data-shown=final]`)
+	await fits(page, 'the job')
+	await shoot(page, 'phone', { fullPage: true })
+	const box = await page.locator(`${tile('z')} .frame`).boundingBox(), sagittal = await depthOf(page, 'x')
+	await page.touchscreen.tap(box.x + 0.2 * box.width, box.y + 0.5 * box.height)
+	await until('a tap moves the cross', () => depthOf(page, 'x'), index => index < sagittal)
+	await page.click('button:has-text("Side by side")')
+	await fits(page, 'the comparison')
+	await page.click('button:has-text("Reconstruct again")')
+	await fits(page, 'the form')
+	await page.keyboard.press('Escape')
+	await page.goto(`${origin}/#/`)
+	await page.waitForSelector('.jobs a')
+	await fits(page, 'the list')
+	await shoot(page, 'phone-list')
+	await page.goto(`${origin}/#/scans/${scan}`)
+	await page.waitForSelector('.film img[data-projection="0"]')
+	await fits(page, 'the scan')
+	await page.context().close()
+})
+
+for (const scheme of ['light', 'dark']) {
+	test(`${scheme}: colours of the system, no barriers`, async () => {
+		const page = await openFinished({ colorScheme: scheme })
+		await page.waitForSelector(`${tile('3d')}[data-shown=final]`)
+		const ground = await page.evaluate(() => getComputedStyle(document.documentElement).backgroundColor.match(/\d+/g).map(Number))
+		expect(scheme === 'dark' ? Math.max(...ground) < 60 : Math.min(...ground) > 200, `a ${scheme} ground, got ${ground}`)
+		await shoot(page, `job-${scheme}`)
+		await accessible(page, 'the job')
+		await page.click('button:has-text("Reconstruct again")')
+		await accessible(page, 'the form')
+		await page.keyboard.press('Escape')
+		await page.goto(`${origin}/#/`)
+		await page.waitForSelector('.jobs .thumb img')
+		await shoot(page, `list-${scheme}`)
+		await accessible(page, 'the list')
+		await page.goto(`${origin}/#/scans/${scan}`)
+		await page.waitForSelector('.film img[data-projection="0"]')
+		await shoot(page, `scan-${scheme}`)
+		await accessible(page, 'the scan')
+		await page.context().close()
+	})
+}
+
+/* ---- other browsers ---- */
+
+test('without WebGL 2 the daemon draws: slices and a contact sheet as PNG', async () => {
+	const plain = await launch(withoutGraphics)
+	const page = await open(plain, finishedPath)
+	const source = plane => page.getAttribute(`${tile(plane)} img.slice:not([hidden])`, 'src')
+	await page.waitForSelector(`${tile('3d')} img.sheet:not([hidden])`)
+	for (const plane of ['x', 'y', 'z'])
+		expect((await source(plane)).includes(`/volumes/final/slice?axis=${plane}`), `a slice across ${plane}`)
+	const before = await source('z')
+	await page.click('[data-preset=Lung]')
+	await until('another window', () => source('z'), src => src !== before && src.includes('window=1500&level=-600'))
+	await page.focus('.iterations input[type=range]')
+	await page.keyboard.press('Home')
+	await until('another volume', () => source('z'), src => src.includes('/volumes/fdk/'))
+	expect(!page.requests.some(url => url.includes('format=shuffled')), 'no volume fetched')
+	await shoot(page, 'without-webgl')
+	await plain.close()
+})
+
+test('without JavaScript a text, and pages that need none', async () => {
+	const page = await open(browser, '/', { javaScriptEnabled: false })
+	expect(/too old/.test(await page.textContent('main')), 'what is the matter')
+	await page.click('main a')
+	await page.click(`a[href="/plain/${finished}"]`)
+	expect(await page.textContent('h1') === name, 'the scan\'s name as a text')
+	expect(await page.locator('img').count() === 3, 'three planes')
+	await page.click('text=soft tissue')
+	expect((await page.getAttribute('img >> nth=0', 'src')).includes('window=400'), 'another window')
+	await page.click('nav >> text=iter-1')
+	expect((await page.getAttribute('img >> nth=0', 'src')).includes('/iter-1/'), 'another volume')
+	await shoot(page, 'plain')
+	await page.context().close()
+})
+
+test('no errors, nothing against the policy, nobody else asked', async () => {
+	expect(realComplaints().length === 0, `a silent console: ${realComplaints().slice(0, 5).join('\n')}`)
+})
+
+await runTests()
+await browser.close()

@@ -1,0 +1,134 @@
+#!/usr/bin/env bash
+# The page: how it is served, and how it does its work in a real browser (Chromium by playwright-core). Screenshots stay in $BUILD/test/test_page.
+. "$(dirname "$0")/../http/lib.sh"
+
+here=$top/tests/web
+tools=$BUILD/web-tests
+name='knee <b>3</b> & "co"'
+
+# A daemon, a scan of the solid over 220 degrees, and a job of it that has ended.
+prepare() {
+	node "$here/solid.mjs" "$work/solid.f32"
+	cbct simulate --volume "$work/solid.f32" --size 24,24,24 --spacing 4 --centre --name "$name" --views 56 --arc 220 --columns 64 --rows 64 \
+		--pixel 3.2 --source-to-isocentre 620 --source-to-detector 1100 -o "$work/scan" >/dev/null
+	start_daemon --threads 1
+	post_scan "$work/scan"
+	post_projections "$work/scan"
+	post_job '{"scan": "SCAN", "grid": {"size": [36, 32, 40], "spacing_mm": [3, 3.4, 2.8]}, "fdk": {}, "sart": {"iterations": 7}, "tv": {}, "emit": ["fdk", 1, 2, 4, 6]}'
+	wait_job succeeded
+}
+
+need_page() {
+	command -v node >/dev/null || skip "node is not here"
+	[ -e "$BUILD/web/files/index.html" ] || skip "the daemon was built without the page"
+}
+
+test_files_are_compressed_and_kept() {
+	local file etag
+	need_page
+	start_daemon
+	req GET / -H 'Accept-Encoding: gzip'
+	expect_status 200
+	[ "$(header content-encoding)" = gzip ] || fail "gzip"
+	[ "$(header cache-control)" = no-cache ] || fail "asked for each time"
+	[[ $(header content-security-policy) == "default-src 'none'; script-src 'self';"* ]] || fail "a strict policy"
+	[[ $(header content-security-policy) != *unsafe* ]] || fail "nothing unsafe in it"
+	gzip -dc <"$body" >"$work/index.html"
+	req GET /
+	cmp "$body" "$work/index.html" || fail "the same page without gzip"
+	etag=$(header etag)
+	req GET / -H "If-None-Match: $etag"
+	expect_status 304
+	req GET / -H "If-None-Match: $etag" -H 'Accept-Encoding: gzip'
+	expect_status 200
+	for file in $(grep -oE '"/assets/[^"]+"' "$work/index.html" | tr -d '"'); do
+		req GET "$file" -H 'Accept-Encoding: gzip'
+		expect_status 200
+		[[ $(header cache-control) == *immutable* ]] || fail "$file kept for ever"
+		[ "$(header x-content-type-options)" = nosniff ] || fail "nosniff"
+	done
+	req GET /assets/nothing.js
+	expect_problem 404
+	req GET "/assets/%3Cscript%3E"
+	expect_problem 404
+	stop_daemon
+}
+
+test_every_bundled_package_is_named_with_its_licence() {
+	local package
+	need_page
+	for package in @niivue/niivue fzstd gl-matrix; do
+		grep -q "^$package [0-9.]*: " "$BUILD"/web/files/licences-*.txt || fail "the licence of $package"
+	done
+}
+
+# What stands for the whole page where npm is not.
+test_the_plain_page_shows_jobs_and_escapes_names() {
+	start_daemon
+	req POST /v1/scans --data-binary '{"name": "<script>\"&", "detector": {"columns": 4, "rows": 4, "pixel_mm": [1, 1]},
+		"projections": {"count": 3, "sample": "float32", "quantity": "line_integral"},
+		"geometry": {"kind": "circular", "source_to_isocentre_mm": 600, "source_to_detector_mm": 1000, "angle_step_deg": 120}}'
+	expect_status 201
+	scan=$(json .id)
+	post_job '{"scan": "SCAN", "fdk": {}}'
+	for path in /plain "/plain/$job"; do
+		req GET "$path"
+		expect_status 200
+		[[ $(header content-type) == text/html* ]] || fail "HTML"
+		grep -q '&lt;script&gt;&quot;&amp;' "$body" || fail "the name, escaped"
+		! grep -q '<script' "$body" || fail "no markup out of a name"
+	done
+	req GET /plain/nothing
+	expect_problem 404
+	req GET "/plain/$job?volume=%3Cscript%3E&window=9"
+	expect_status 200
+	! grep -q '<script' "$body" || fail "nothing of the query in the page"
+	stop_daemon
+}
+
+# One result for each test that the browser reports.
+browser_tests() {
+	local line status
+	CHROMIUM=$(command -v chromium || command -v chromium-browser || true)
+	if [ -z "$CHROMIUM" ]; then why="chromium is not here"
+	elif ! command -v node >/dev/null || ! command -v npm >/dev/null; then why="node or npm is not here"
+	elif [ ! -e "$BUILD/web/files/index.html" ]; then why="the daemon was built without the page"
+	elif ! install_tools; then why="npm cannot install playwright-core: $(grep -m 1 -i err "$work/npm.log")"
+	else why=; fi
+	if [ -n "$why" ]; then
+		echo "SKIP the page in a browser: $why"
+		echo "skip $(basename "$0") the page in a browser: $why" >>"$RESULTS"
+		return
+	fi
+	if ! (set -eEuo pipefail; trap - EXIT; prepare; echo "$url $scan $job" >"$work/prepared") >"$work/prepare.log" 2>&1; then
+		echo "FAIL the page in a browser: no job to look at"
+		tail -5 "$work/prepare.log"
+		echo "fail $(basename "$0") the page in a browser" >>"$RESULTS"
+		return
+	fi
+	read -r url scan job <"$work/prepared"
+	cp "$here"/*.mjs "$tools/"
+	URL=$url OUT=$work SCAN=$scan FINISHED=$job NAME=$name CHROMIUM=$CHROMIUM HOME=$work timeout 600 node "$tools/page.mjs" 2>&1 | tee "$work/browser.log"
+	status=${PIPESTATUS[0]}
+	while read -r line; do
+		case $line in
+		pass\ * | FAIL\ *) echo "$(tr 'A-Z' 'a-z' <<<"${line%% *}") $(basename "$0") ${line#* }" | sed 's/ ([0-9.]* s)$//' >>"$RESULTS" ;;
+		esac
+	done <"$work/browser.log"
+	if [ "$status" != 0 ] && ! grep -q '^FAIL' "$work/browser.log"; then
+		echo "FAIL the page in a browser: ended with status $status"
+		echo "fail $(basename "$0") the page in a browser: status $status" >>"$RESULTS"
+	fi
+}
+
+install_tools() {
+	cmp -s "$here/package-lock.json" "$tools/installed" && return 0
+	mkdir -p "$tools"
+	cp "$here"/package*.json "$tools/"
+	(cd "$tools" && npm ci --ignore-scripts --no-audit --no-fund --fetch-retries=1 --fetch-timeout=30000) >"$work/npm.log" 2>&1 || return 1
+	cp "$here/package-lock.json" "$tools/installed"
+}
+
+run_tests
+browser_tests
+stop_daemon
