@@ -180,6 +180,24 @@ static int list_angles(const struct import_geometry *options, const struct image
 	return code;
 }
 
+/* RTK's stacks say where the detector is, others begin at 0: with angles nothing but the command line counts. */
+static void note_centre(const struct images *images)
+{
+	const struct rtk_stack *stack = &images->stack;
+	double centre[2], pixels = 0;
+
+	for (int i = 0; i < 2; i++) {
+		centre[i] = stack->origin[i] + 0.5 * (images->columns - 1) * stack->column_step[i] +
+			    0.5 * (images->rows - 1) * stack->row_step[i];
+		pixels = fmax(pixels, fabs(centre[i]) / images->pixel[i]);
+	}
+	if (pixels > RTK_AGREEMENT && (stack->origin[0] != 0 || stack->origin[1] != 0))
+		fprintf(stderr,
+			"note: the stack's Offset would put the detector's centre to (%.6g, %.6g) mm; with angles only "
+			"--detector-offset moves it\n",
+			centre[0], centre[1]);
+}
+
 static int from_angles(const struct import_geometry *options, const struct images *images, cJSON **ret_geometry,
 		       struct error *err)
 {
@@ -187,6 +205,8 @@ static int from_angles(const struct import_geometry *options, const struct image
 	cJSON *json;
 	int code;
 
+	if (images->has_stack)
+		note_centre(images);
 	if (isnan(options->source_to_isocentre) || isnan(options->source_to_detector))
 		return error_set(err, ERR_USAGE, "angles need --source-to-isocentre and --source-to-detector");
 	degrees = malloc((size_t)images->count * sizeof(*degrees));

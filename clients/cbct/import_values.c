@@ -21,6 +21,10 @@ const struct option import_value_rows[] = {
     ROW("sample", OPTION_CHOICE, sample, "TYPE", "of the scan (default: uint16 for counts that fit)", 0, 0, 2,
 	sample_names),
     ROW("air", OPTION_NUMBER, air, "COUNTS", "of the open beam", 1e-6, 1e12, 0, NULL),
+    ROW("air-region", OPTION_NUMBERS, air_region, "C0,R0,C1,R1",
+	"pixels that see air in every view, from column C0 and row R0 to C1 and R1: their mean is each view's own air",
+	0, DETECTOR_MAX, 4, NULL),
+    ROW("beam-hardening", OPTION_TEXT, hardening, "C0,C1,...", "p becomes C0 + C1 p + C2 p^2 and so on", 0, 0, 0, NULL),
     ROW("saturation", OPTION_NUMBER, saturation, "COUNTS", "from which on a pixel says nothing", 1e-6, 1e12, 0, NULL),
     ROW("flat", OPTION_TEXT, flat, "IMAGES", "of the open beam in place of --air; several are averaged", 0, 0, 0, NULL),
     ROW("dark", OPTION_TEXT, dark, "IMAGES", "without beam; several are averaged", 0, 0, 0, NULL),
@@ -107,7 +111,8 @@ static bool plainly_counts(const struct import_values *options, const struct ima
 
 static bool tells_intensity(const struct import_values *options)
 {
-	return !isnan(options->air) || options->flat != NULL || options->dark != NULL || !isnan(options->saturation);
+	return !isnan(options->air) || !isnan(options->air_region[0]) || options->flat != NULL ||
+	       options->dark != NULL || !isnan(options->saturation);
 }
 
 static int choose_quantity(const struct import_values *options, const struct images *images,
@@ -141,22 +146,48 @@ static enum sample choose_sample(const struct import_values *options, const stru
 		   : SAMPLE_FLOAT32;
 }
 
-/* Intensities mean something against the open beam only. */
-static int need_air(const struct import_values *options, struct images *images, const struct survey *survey,
-		    struct error *err)
+/*
+ * Intensities mean something against the open beam only. With a region of air each
+ * view finds its own, and any number does to begin with.
+ */
+static int find_air(const struct import_values *options, struct images *images, const struct survey *survey,
+		    double *ret_air, struct error *err)
 {
 	struct survey now = *survey;
 	int code = 0;
 
+	*ret_air = options->air;
 	if (!isnan(options->air) || options->flat != NULL)
 		return 0;
 	if (!isfinite(now.most))
 		code = look_through(options, images, &now, err);
 	if (code != 0)
 		return code;
+	if (!isnan(options->air_region[0]) && now.most > 0) {
+		*ret_air = now.most;
+		return 0;
+	}
 	return error_set(err, ERR_USAGE,
-			 "intensities need --air or --flat; the brightest pixel is %.6g, the edges' mean %.6g",
+			 "intensities need --air, --flat or --air-region; the brightest pixel is %.6g, the edges' mean "
+			 "%.6g",
 			 now.most, now.edge);
+}
+
+static int add_hardening(const char *text, cJSON *json, struct error *err)
+{
+	cJSON *list = cJSON_AddArrayToObject(json, "beam_hardening");
+	const char *at = text;
+	char *end;
+
+	do {
+		double number = strtod(at, &end);
+
+		if (end == at || !isfinite(number) || (*end != '\0' && *end != ','))
+			return error_set(err, ERR_USAGE, "--beam-hardening: '%.60s' is no list of numbers", text);
+		cJSON_AddItemToArray(list, cJSON_CreateNumber(number));
+		at = end + 1;
+	} while (*end == ',');
+	return 0;
 }
 
 static int check_values(const struct import_values *options, enum quantity quantity, struct error *err)
@@ -166,8 +197,9 @@ static int check_values(const struct import_values *options, enum quantity quant
 	if (!isnan(options->air) && options->flat != NULL)
 		return error_set(err, ERR_USAGE, "--flat stands in place of --air");
 	if (quantity == QUANTITY_LINE_INTEGRAL && tells_intensity(options))
-		return error_set(err, ERR_USAGE,
-				 "line integrals have no air, flat, dark or saturation: they belong to intensities");
+		return error_set(
+		    err, ERR_USAGE,
+		    "line integrals have no air, air region, flat, dark or saturation: they belong to intensities");
 	return 0;
 }
 
@@ -178,6 +210,7 @@ int import_values(const struct import_values *options, struct images *images, cJ
 	struct survey survey = {.least = 0, .most = INFINITY, .whole = true};
 	enum quantity quantity = QUANTITY_INTENSITY;
 	enum sample sample = SAMPLE_UINT16;
+	double air = NAN;
 	cJSON *json;
 	int code = check_values(options, QUANTITY_INTENSITY, err);
 
@@ -200,19 +233,26 @@ int import_values(const struct import_values *options, struct images *images, cJ
 	if (code == 0)
 		code = check_values(options, quantity, err);
 	if (code == 0 && quantity == QUANTITY_INTENSITY)
-		code = need_air(options, images, &survey, err);
+		code = find_air(options, images, &survey, &air, err);
 	if (code != 0)
 		return code;
 	json = cJSON_CreateObject();
 	cJSON_AddNumberToObject(json, "count", images->count);
 	cJSON_AddStringToObject(json, "sample", sample_names[sample]);
 	cJSON_AddStringToObject(json, "quantity", quantity_names[quantity]);
-	if (!isnan(options->air))
-		cJSON_AddNumberToObject(json, "air", options->air);
+	if (!isnan(air))
+		cJSON_AddNumberToObject(json, "air", air);
+	if (!isnan(options->air_region[0]))
+		cJSON_AddItemToObject(json, "air_region", cJSON_CreateDoubleArray(options->air_region, 4));
 	if (!isnan(options->saturation))
 		cJSON_AddNumberToObject(json, "saturation", options->saturation);
-	*ret_projections = json;
-	return 0;
+	if (options->hardening != NULL)
+		code = add_hardening(options->hardening, json, err);
+	if (code != 0)
+		cJSON_Delete(json);
+	else
+		*ret_projections = json;
+	return code;
 }
 
 /* ---- samples ---- */

@@ -11,14 +11,16 @@ struct import_values {
 	int quantity, sample; /* enum quantity, enum sample, or unset */
 	double air;           /* counts; NaN: not given */
 	double saturation;    /* counts; NaN: not given */
+	double air_region[4]; /* first column and row, last column and row; NaN: none */
 	const char *flat, *dark;
-	double scale, bias; /* a value is scale * stored + bias */
+	const char *hardening; /* "C0,C1,C2": p' = C0 + C1 p + C2 p^2 ..., NULL: none */
+	double scale, bias;    /* a value is scale * stored + bias */
 };
 extern const struct option import_value_rows[];
 #define IMPORT_VALUES_DEFAULTS                                                                                         \
 	{                                                                                                              \
 		.quantity = OPTION_UNSET_CHOICE, .sample = OPTION_UNSET_CHOICE, .air = OPTION_UNSET_NUMBER,            \
-		.saturation = OPTION_UNSET_NUMBER, .scale = 1                                                          \
+		.saturation = OPTION_UNSET_NUMBER, .air_region = {OPTION_UNSET_NUMBER}, .scale = 1                     \
 	}
 
 /* Member "projections" of a scan's document; the caller's. Looks through all images where it must. */

@@ -29,7 +29,7 @@ enum option_kind {
 	{                                                                                                              \
 		OPTION_UNSET_NUMBER, OPTION_UNSET_NUMBER, OPTION_UNSET_NUMBER                                          \
 	}
-enum { OPTION_UNSET_CHOICE = -1, OPTION_NUMBERS_MAX = 3 };
+enum { OPTION_UNSET_CHOICE = -1, OPTION_NUMBERS_MAX = 4 };
 
 struct option {
 	const char *name; /* "views", written --views; a table ends with a NULL name */

@@ -211,8 +211,19 @@ test_flat_and_dark_are_means() {
 	# Fractions that fall towards the middle are no line integrals.
 	cbct import "$work/uneven/projections.raw" --size 48,32 --type uint16 --scale 1e-4 --air 5 --pixel 4,3 "${circle[@]}" -o "$work/back" 2>"$work/said"
 	[ "$(jq -c .projections.quantity "$work/back/scan.json")" = '"intensity"' ] || fail "intensities by --air"
-	refused 2 "intensities need --air or --flat; the brightest pixel is" \
+	refused 2 "intensities need --air, --flat or --air-region; the brightest pixel is" \
 		cbct import "$work/uneven/projections.raw" --size 48,32 --type uint16 --scale 1e-4 --pixel 4,3 "${circle[@]}" -o "$work/never"
+}
+
+# Each view's air is the mean of the first columns, which the ball does not reach: whatever the tube gave.
+test_a_region_of_air_stands_in_for_its_number() {
+	local here=(--size 48,32 --type uint16 --pixel 4,3 "${circle[@]}")
+	make_scans
+	cbct import "$counts/projections.raw" "${here[@]}" --air-region 0,0,3,31 --beam-hardening 0,1,0.01 -o "$work/region" 2>"$work/said"
+	jq -e '.projections | .air_region == [0, 0, 3, 31] and .beam_hardening == [0, 1, 0.01] and .air == 50000 and .sample == "uint16"' \
+		"$work/region/scan.json" >/dev/null || fail "region and polynomial in $(cat "$work/region/scan.json")"
+	refused 1 "air_region" cbct import "$counts/projections.raw" "${here[@]}" --air-region 0,0,3,32 -o "$work/never"
+	refused 2 "--beam-hardening: '1,,2'" cbct import "$counts/projections.raw" "${here[@]}" --air 5 --beam-hardening 1,,2 -o "$work/never"
 }
 
 # Read as DICOM shows them, the frames are the scan's turned by half a turn, and so is their detector.
