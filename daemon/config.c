@@ -13,6 +13,7 @@ enum kind {
 	KIND_TEXT,
 	KIND_LIST, /* text; a flag given again adds to it */
 	KIND_CHOICE,
+	KIND_INDICES, /* text: numbers from 0 with commas between them, or nothing */
 	KIND_INTEGER,
 	KIND_BYTES,
 	KIND_SECONDS
@@ -42,7 +43,9 @@ static const struct setting {
      "a file of lines NAME = VALUE; # begins a comment"},
     {"worker", "PATH", KIND_TEXT, FIELD(worker), "", 0, 0, NULL,
      "the worker program; empty: cbct-worker beside cbctd, else from PATH"},
-    {"workers", "N", KIND_INTEGER, FIELD(workers), "1", 1, 64, NULL, "worker processes, one for each device"},
+    {"workers", "N", KIND_INTEGER, FIELD(workers), "1", 1, 64, NULL, "worker processes, one for each device from 0 on"},
+    {"devices", "LIST", KIND_INDICES, FIELD(devices), "", 0, 0, NULL,
+     "a worker for each of these devices, as 0,2; empty: as many as --workers says"},
     {"threads", "N", KIND_INTEGER, FIELD(threads), "0", 0, 4096, NULL,
      "threads of a CPU worker; 0: all that the process may use"},
     {"device-memory", "BYTES", KIND_BYTES, FIELD(device_memory), "0", 0, 1e15, NULL,
@@ -79,7 +82,8 @@ static void *field(const struct setting *setting, struct config *config)
 
 static bool is_text(const struct setting *setting)
 {
-	return setting->kind == KIND_TEXT || setting->kind == KIND_LIST || setting->kind == KIND_CHOICE;
+	return setting->kind == KIND_TEXT || setting->kind == KIND_LIST || setting->kind == KIND_CHOICE ||
+	       setting->kind == KIND_INDICES;
 }
 
 static const struct setting *setting_find(const char *name, size_t length)
@@ -136,6 +140,26 @@ static double parse_amount(const char *value, bool units)
 	return *end == '\0' ? number : NAN;
 }
 
+int config_indices(const char *text, int *ret_indices, int most)
+{
+	const long largest = 4095;
+	int count = 0;
+
+	while (*text != '\0') {
+		char *end;
+		long index = strtol(text, &end, 10);
+
+		if (!isdigit((unsigned char)text[0]) || index > largest || count == most ||
+		    (*end != '\0' && (*end != ',' || end[1] == '\0')))
+			return -1;
+		if (ret_indices != NULL)
+			ret_indices[count] = (int)index;
+		count++;
+		text = *end == ',' ? end + 1 : end;
+	}
+	return count;
+}
+
 /* `source` is how the user wrote it, "--threads" or "cbctd.conf:7: threads". */
 static int setting_set(const struct setting *setting, struct config *config, const char *value, bool add,
 		       const char *source, struct error *err)
@@ -151,6 +175,9 @@ static int setting_set(const struct setting *setting, struct config *config, con
 			return error_set(err, ERR_INVALID, "%s: \"%s\" is none of its values: %s", source, value,
 					 setting->help);
 	}
+	if (setting->kind == KIND_INDICES && config_indices(value, NULL, INDICES_MOST) < 0)
+		return error_set(err, ERR_INVALID, "%s: \"%s\" is not a list of at most %d numbers, as 0,2", source,
+				 value, INDICES_MOST);
 	if (is_text(setting))
 		return set_text(field(setting, config), value, add, err);
 

@@ -20,6 +20,7 @@ struct config {
 	char *config_file; /* "" for none */
 	char *worker;      /* path of cbct-worker, "" for the one beside this program */
 	long workers;
+	char *devices; /* of the workers, "0,2"; "" for 0 .. workers - 1 */
 	long threads;
 	size_t device_memory; /* bytes, 0 = what is free */
 	char *log_level;
@@ -38,6 +39,10 @@ enum config_action { CONFIG_RUN, CONFIG_HELP, CONFIG_PRINT };
  * source. */
 int config_load(int argc, char **argv, struct config *ret_config, enum config_action *ret_action, struct error *err);
 void config_clear(struct config *config);
+
+/* The numbers of a list as in `devices`; -1 where it is none, or of more than `most`. ret_indices may be NULL. */
+enum { INDICES_MOST = 64 };
+int config_indices(const char *text, int *ret_indices, int most);
 
 void config_help(FILE *out);
 /* Every setting as it is now, as a config file. */

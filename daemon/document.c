@@ -375,6 +375,7 @@ cJSON *worker_document(const struct worker_facts *facts)
 	cJSON_AddStringToObject(document, "state", worker_state_names[facts->state]);
 	add_text_or_null(document, "backend", facts->backend);
 	add_text_or_null(document, "device", facts->device);
+	cJSON_AddNumberToObject(document, "device_index", facts->device_index);
 	add_text_or_null(document, "driver", facts->driver);
 	memory = cJSON_AddObjectToObject(document, "memory");
 	cJSON_AddNumberToObject(memory, "total", (double)facts->bytes_total);

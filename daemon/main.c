@@ -76,9 +76,11 @@ static int start_parts(const struct config *config, struct api *api, struct erro
 {
 	const struct store_hooks hooks = {.failed = on_failure};
 	const struct uploads_options uploads = {.buffer = config->upload_buffer, .failed = on_failure};
+	int devices[INDICES_MOST], given = config_indices(config->devices, devices, INDICES_MOST);
 	const struct supervise_options supervise = {.worker = config->worker[0] != '\0' ? config->worker : NULL,
 						    .backend = config->backend,
-						    .workers = (int)config->workers,
+						    .workers = given > 0 ? given : (int)config->workers,
+						    .devices = given > 0 ? devices : NULL,
 						    .threads = (int)config->threads,
 						    .device_memory = config->device_memory,
 						    .stop_seconds = config->stop_timeout};

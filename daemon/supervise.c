@@ -72,6 +72,7 @@ struct supervise {
 	char worker[1024], backend[16];
 	struct supervise_options options;
 	int count;
+	int devices[WORKERS_MAX];
 	int wake; /* eventfd */
 	struct watch jobs_watch, ready_watch;
 	pthread_t thread;
@@ -106,7 +107,10 @@ static void wake_up(void *context)
 /* What others see of a worker. */
 static void publish(struct supervise *supervise, const struct worker *worker)
 {
-	struct worker_facts facts = {.index = worker->index, .state = worker->state, .pid = worker->child.pid};
+	struct worker_facts facts = {.index = worker->index,
+				     .device_index = supervise->devices[worker->index],
+				     .state = worker->state,
+				     .pid = worker->child.pid};
 	struct job_facts job;
 
 	snprintf(facts.backend, sizeof(facts.backend), "%s", worker->backend);
@@ -355,7 +359,7 @@ static void start_worker(struct supervise *supervise, struct worker *worker)
 {
 	const struct spawn_options options = {.worker = supervise->worker,
 					      .backend = supervise->backend,
-					      .device = worker->index,
+					      .device = supervise->devices[worker->index],
 					      .threads = supervise->options.threads,
 					      .device_memory = supervise->options.device_memory};
 	struct error err;
@@ -745,6 +749,8 @@ static void set_options(struct supervise *supervise, const struct supervise_opti
 	if (options->stop_seconds <= 0)
 		supervise->options.stop_seconds = 20;
 	supervise->count = options->workers < 1 ? 1 : options->workers > WORKERS_MAX ? WORKERS_MAX : options->workers;
+	for (int i = 0; i < supervise->count; i++)
+		supervise->devices[i] = options->devices != NULL ? options->devices[i] : i;
 }
 
 int supervise_start(struct jobs *jobs, const struct supervise_options *options, struct supervise **ret_supervise,

@@ -18,7 +18,8 @@ struct supervise;
 struct supervise_options {
 	const char *worker;    /* path of cbct-worker; NULL: beside this program, else from PATH */
 	const char *backend;   /* "auto", "cuda", "cpu" */
-	int workers;           /* one for each device 0 .. workers - 1; 0 = 1 */
+	int workers;           /* 0 = 1 */
+	const int *devices;    /* [workers], the device of each; NULL: 0 .. workers - 1 */
 	int threads;           /* of the CPU backend; 0 = all */
 	size_t device_memory;  /* bytes a worker may use; 0 = what is free */
 	double hello_seconds;  /* until a new worker must have spoken; 0 = 30 */
@@ -47,7 +48,7 @@ int supervise_check_memory(struct supervise *supervise, const struct scan *scan,
 enum worker_state { WORKER_ABSENT, WORKER_STARTING, WORKER_IDLE, WORKER_BUSY, WORKER_ENDING, WORKER_STATE_COUNT };
 extern const char *const worker_state_names[WORKER_STATE_COUNT];
 struct worker_facts {
-	int index;
+	int index, device_index; /* the second counts devices of its backend */
 	enum worker_state state;
 	long pid; /* 0: none */
 	char backend[16], device[96], driver[64];

@@ -280,7 +280,9 @@ static int open_device(struct worker *worker, const struct arguments *arguments,
 	worker->backend = backend_find(arguments->backend);
 	if (worker->backend == NULL)
 		return error_set(err, ERR_NOT_FOUND, "there is no backend \"%s\" here", arguments->backend);
-	code = worker->backend->open(arguments->device, &arguments->options, &worker->device, err);
+	/* All workers without devices of their own share the processor. */
+	code = worker->backend->open(worker->backend->own_memory ? arguments->device : 0, &arguments->options,
+				     &worker->device, err);
 	if (code != 0)
 		return code;
 	worker->backend->describe(worker->device, &hello.info);
