@@ -7,32 +7,22 @@
 
 #include "clients/cbct/commands.h"
 #include "clients/cbct/http.h"
-#include "proto/format.h"
+#include "clients/cbct/volume_query.h"
 
 struct get_options {
-	const char *job, *volume, *output, *format;
-	int type;
-	long scale;
-	bool zstd;
+	const char *job, *volume, *output;
+	struct volume_query query;
 	struct http_options http;
 };
 
-#define ROW(name, letter, kind, member, argument, help, least, most, count, names)                                     \
-	{                                                                                                              \
-		name, letter, kind, offsetof(struct get_options, member), argument, help, least, most, count, names    \
-	}
 static const struct option rows[] = {
-    ROW("output", 'o', OPTION_TEXT, output, "FILE", "- is standard output (default: the name that the daemon gives)", 0,
-	0, 0, NULL),
-    ROW("format", 0, OPTION_TEXT, format, "FORMAT", "nifti, mha, nrrd or raw (default nifti)", 0, 0, 0, NULL),
-    ROW("type", 0, OPTION_CHOICE, type, "TYPE", "float32 is 1/mm, int16 Hounsfield units", 0, 0, VOLUME_TYPE_COUNT,
-	volume_type_names),
-    ROW("scale", 0, OPTION_INTEGER, scale, "N", "each voxel the mean of N x N x N", 1, 64, 0, NULL),
-    ROW("zstd", 0, OPTION_FLAG, zstd, NULL, "compressed on the way", 0, 0, 0, NULL),
+    {"output", 'o', OPTION_TEXT, offsetof(struct get_options, output), "FILE",
+     "- is standard output (default: the name that the daemon gives)", 0, 0, 0, NULL},
     {0},
 };
 static const struct option_group groups[] = {
     {"options", rows, 0},
+    {"", volume_query_rows, offsetof(struct get_options, query)},
     {"", http_option_rows, offsetof(struct get_options, http)},
     {0},
 };
@@ -44,11 +34,10 @@ static bool on_piece(void *context, const void *data, size_t length)
 
 static void volume_path(const struct get_options *options, char *ret_path, size_t size)
 {
-	bool has_format = options->format != NULL;
+	char query[VOLUME_QUERY_MAX];
 
-	snprintf(ret_path, size, "/v1/jobs/%.100s/volumes/%.100s?type=%s%s%.100s&scale=%ld", options->job,
-		 options->volume, volume_type_names[options->type], has_format ? "&format=" : "",
-		 has_format ? options->format : "", options->scale);
+	volume_query_text(&options->query, query);
+	snprintf(ret_path, size, "/v1/jobs/%.100s/volumes/%.100s?%s", options->job, options->volume, query);
 }
 
 /* The whole body into `file`; ret_name is what the daemon calls it. */
@@ -65,7 +54,7 @@ static int download(const struct get_options *options, FILE *file, char *ret_nam
 	code = http_send(
 	    http,
 	    &(struct http_request){
-		.method = "GET", .path = path, .decompress = options->zstd, .write = on_piece, .context = file},
+		.method = "GET", .path = path, .decompress = options->query.zstd, .write = on_piece, .context = file},
 	    &reply, err);
 	snprintf(ret_name, name_size, "%s", reply.name);
 	http_reply_clear(&reply);
@@ -110,7 +99,7 @@ static int get_run(const void *values, struct error *err)
 	return download(options, stdout, name, sizeof(name), err);
 }
 
-static const struct get_options defaults = {.type = VOLUME_FLOAT32, .scale = 1};
+static const struct get_options defaults = {.query = VOLUME_QUERY_DEFAULTS};
 
 static const struct positional positionals[] = {
     {"JOB", "its id", offsetof(struct get_options, job), true},

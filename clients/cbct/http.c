@@ -58,6 +58,10 @@ int http_new(const struct http_options *options, struct http **ret_http, struct 
 	curl_easy_setopt(http->easy, CURLOPT_ERRORBUFFER, http->message);
 	curl_easy_setopt(http->easy, CURLOPT_NOSIGNAL, 1L);
 	curl_easy_setopt(http->easy, CURLOPT_CONNECTTIMEOUT, 10L);
+	/* Between two volumes of a stream nothing may come for hours: whether the daemon is still there is asked. */
+	curl_easy_setopt(http->easy, CURLOPT_TCP_KEEPALIVE, 1L);
+	curl_easy_setopt(http->easy, CURLOPT_TCP_KEEPIDLE, 15L);
+	curl_easy_setopt(http->easy, CURLOPT_TCP_KEEPINTVL, 5L);
 	curl_easy_setopt(http->easy, CURLOPT_BUFFERSIZE, 512L * 1024);
 	curl_easy_setopt(http->easy, CURLOPT_UPLOAD_BUFFERSIZE, 2L * 1024 * 1024);
 	curl_easy_setopt(http->easy, CURLOPT_USERAGENT, "cbct");
@@ -115,18 +119,18 @@ static const char *reply_header(struct http *http, const char *name)
 	return curl_easy_header(http->easy, name, 0, CURLH_HEADER, -1, &header) == CURLHE_OK ? header->value : NULL;
 }
 
-/* attachment; filename="name" -> name, with nothing in it that leaves the current directory. */
-static void reply_name(const char *disposition, struct http_reply *reply)
+void disposition_name(const char *disposition, char ret_name[HTTP_NAME_MAX])
 {
 	const char *at = disposition != NULL ? strstr(disposition, "filename=\"") : NULL;
 	size_t length;
 
+	ret_name[0] = 0;
 	if (at == NULL)
 		return;
 	at += strlen("filename=\"");
 	length = strcspn(at, "\"");
-	if (length < sizeof(reply->name) && memchr(at, '/', length) == NULL && at[0] != '.')
-		memcpy(reply->name, at, length);
+	if (length < HTTP_NAME_MAX && memchr(at, '/', length) == NULL && at[0] != '.')
+		snprintf(ret_name, HTTP_NAME_MAX, "%.*s", (int)length, at);
 }
 
 const char *member_text(const cJSON *object, const char *name, const char *fallback)
@@ -233,7 +237,7 @@ int http_send(struct http *http, const struct http_request *request, struct http
 	reply.status = (int)status;
 	http->retry_after = retry_after != NULL ? strtod(retry_after, NULL) : 0;
 	http->unreachable = result == CURLE_COULDNT_CONNECT || result == CURLE_COULDNT_RESOLVE_HOST;
-	reply_name(reply_header(http, "Content-Disposition"), &reply);
+	disposition_name(reply_header(http, "Content-Disposition"), reply.name);
 	*ret_reply = reply;
 	/* A refusal that came before the whole body was sent counts, though the sending broke. */
 	if (status >= 400)

@@ -23,7 +23,7 @@ extern const struct option http_option_rows[];
 int http_new(const struct http_options *options, struct http **ret_http, struct error *err);
 void http_free(struct http *http); /* NULL is fine */
 
-enum { HTTP_HEADERS_MAX = 4 };
+enum { HTTP_HEADERS_MAX = 4, HTTP_NAME_MAX = 128 };
 
 struct http_request {
 	const char *method, *path; /* "PUT", "/v1/scans/ID/flat" */
@@ -40,7 +40,7 @@ struct http_reply {
 	int status; /* 0: none came */
 	char *body; /* ends with a zero byte beyond its length; "" when `write` took it */
 	size_t length;
-	char name[128]; /* file name of Content-Disposition, "" without */
+	char name[HTTP_NAME_MAX]; /* file name of Content-Disposition, "" without */
 };
 
 /*
@@ -65,6 +65,9 @@ int http_json(struct http *http, const char *method, const char *path, cJSON **r
 /* POST of a JSON document; idempotency_key may be NULL. */
 int http_post(struct http *http, const char *path, const cJSON *document, const char *idempotency_key,
 	      cJSON **ret_document, struct error *err);
+
+/* attachment; filename="name" -> name, "" without one or when it would leave the directory. disposition may be NULL. */
+void disposition_name(const char *disposition, char ret_name[HTTP_NAME_MAX]);
 
 /* Members of documents that come from a daemon: absent or of another type gives the fallback. */
 const char *member_text(const cJSON *object, const char *name, const char *fallback);

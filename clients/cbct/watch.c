@@ -1,21 +1,44 @@
-/* cbct watch: a job's progress to its end, by asking again with ?wait=. */
+/*
+ * cbct watch: a job's progress to its end, by asking again with ?wait=. With
+ * --save, volumes come in over a connection of their own meanwhile.
+ */
 #include "clients/cbct/watch.h"
 
+#include <errno.h>
+#include <pthread.h>
+#include <stdatomic.h>
 #include <string.h>
+#include <sys/stat.h>
 
 #include "clients/cbct/commands.h"
 #include "clients/cbct/progress.h"
+#include "clients/cbct/stream.h"
 
 struct watch_options {
-	const char *job;
+	const char *job, *directory;
+	struct volume_query query;
 	struct http_options http;
 };
+static const struct option rows[] = {
+    {"save", 0, OPTION_TEXT, offsetof(struct watch_options, directory), "DIR",
+     "each volume into DIR the moment it is kept; prints the names, and progress on standard error", 0, 0, 0, NULL},
+    {0},
+};
 static const struct option_group groups[] = {
-    {"options", http_option_rows, offsetof(struct watch_options, http)},
+    {"options", rows, 0},
+    {"", http_option_rows, offsetof(struct watch_options, http)},
+    {"volumes that are saved", volume_query_rows, offsetof(struct watch_options, query)},
     {0},
 };
 
-static void show(struct progress *progress, const cJSON *job)
+/* What is on the terminal, and who has failed beside the one that draws it. */
+struct view {
+	pthread_mutex_t lock; /* guards progress */
+	struct progress *progress;
+	atomic_bool failed;
+};
+
+static void show(struct view *view, const cJSON *job)
 {
 	const cJSON *history = cJSON_GetObjectItemCaseSensitive(job, "history");
 	int rows = cJSON_GetArraySize(history);
@@ -35,7 +58,9 @@ static void show(struct progress *progress, const cJSON *job)
 	if (rows > 0)
 		snprintf(text + used, sizeof(text) - (size_t)used, "  residual %.4g",
 			 member_number(cJSON_GetArrayItem(history, rows - 1), "residual", 0));
-	progress_show(progress, member_number(job, "progress", 0), member_number(job, "eta_s", -1), "%s", text);
+	pthread_mutex_lock(&view->lock);
+	progress_show(view->progress, member_number(job, "progress", 0), member_number(job, "eta_s", -1), "%s", text);
+	pthread_mutex_unlock(&view->lock);
 }
 
 static bool ended(const char *state)
@@ -70,21 +95,20 @@ static int ask(struct http *http, const char *path, bool first, cJSON **ret_job,
 	return code;
 }
 
-int watch_job(struct http *http, const char *job, FILE *to, struct error *err)
+static int follow(struct http *http, const char *job, struct view *view, struct error *err)
 {
-	struct progress *progress = progress_new(to, PROGRESS_OR_LINES, job);
-	char path[200];
 	bool first = true, end = false;
+	char path[200];
 	int code = 0;
 
 	snprintf(path, sizeof(path), "/v1/jobs/%.100s", job);
-	while (code == 0 && !end) {
+	while (code == 0 && !end && !atomic_load(&view->failed)) {
 		cJSON *document = NULL;
 
 		code = ask(http, path, first, &document, err);
 		if (code != 0)
 			break;
-		show(progress, document);
+		show(view, document);
 		end = ended(member_text(document, "state", "?"));
 		if (end)
 			code = judge(document, err);
@@ -93,7 +117,76 @@ int watch_job(struct http *http, const char *job, FILE *to, struct error *err)
 		snprintf(path, sizeof(path), "/v1/jobs/%.100s?wait=1", job);
 		first = false;
 	}
-	progress_free(progress);
+	return code;
+}
+
+int watch_job(struct http *http, const char *job, FILE *to, struct error *err)
+{
+	struct view view = {.lock = PTHREAD_MUTEX_INITIALIZER, .progress = progress_new(to, PROGRESS_OR_LINES, job)};
+	int code = follow(http, job, &view, err);
+
+	progress_free(view.progress);
+	return code;
+}
+
+/* ---- with volumes ---- */
+
+struct saver {
+	struct stream_options stream;
+	struct view *view;
+	struct error err;
+	int code;
+};
+
+static void on_saved(void *context, const char *path)
+{
+	struct saver *saver = context;
+
+	pthread_mutex_lock(&saver->view->lock);
+	progress_clear(saver->view->progress);
+	puts(path);
+	fflush(stdout);
+	pthread_mutex_unlock(&saver->view->lock);
+}
+
+static void *run_saver(void *context)
+{
+	struct saver *saver = context;
+
+	saver->code = stream_save(&saver->stream, &saver->err);
+	if (saver->code != 0)
+		atomic_store(&saver->view->failed, true);
+	return NULL;
+}
+
+static int watch_and_save(struct http *http, const struct watch_options *options, struct error *err)
+{
+	struct view view = {.lock = PTHREAD_MUTEX_INITIALIZER,
+			    .progress = progress_new(stderr, PROGRESS_OR_LINES, options->job)};
+	struct saver saver = {.view = &view,
+			      .stream = {.job = options->job,
+					 .directory = options->directory,
+					 .query = &options->query,
+					 .http = &options->http,
+					 .saved = on_saved,
+					 .context = &saver}};
+	pthread_t thread;
+	int code;
+
+	if (mkdir(options->directory, 0777) != 0 && errno != EEXIST)
+		code = error_set_errno(err, errno, "%s", options->directory);
+	else if ((code = pthread_create(&thread, NULL, run_saver, &saver)) != 0)
+		code = error_set_errno(err, code, "a thread for volumes");
+	else {
+		code = follow(http, options->job, &view, err);
+		/* Behind the job's last volume its stream ends. */
+		pthread_join(thread, NULL);
+		if (code == 0 && saver.code != 0) {
+			*err = saver.err;
+			code = saver.code;
+		}
+	}
+	progress_free(view.progress);
 	return code;
 }
 
@@ -104,12 +197,13 @@ static int watch_run(const void *values, struct error *err)
 	int code = http_new(&options->http, &http, err);
 
 	if (code == 0)
-		code = watch_job(http, options->job, stdout, err);
+		code = options->directory != NULL ? watch_and_save(http, options, err)
+						  : watch_job(http, options->job, stdout, err);
 	http_free(http);
 	return code;
 }
 
-static const struct watch_options defaults = {0};
+static const struct watch_options defaults = {.query = VOLUME_QUERY_DEFAULTS};
 static const struct positional positionals[] = {
     {"JOB", "its id", offsetof(struct watch_options, job), true},
     {0},

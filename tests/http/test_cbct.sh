@@ -171,6 +171,51 @@ url_get_missing() { # SCAN MISSING
 	expect_json ".missing == $2"
 }
 
+test_watch_saves_each_volume_as_it_is_kept() {
+	local id job_id name
+	cbct simulate -o "$work/scan" "${ball[@]}" "${small[@]}"
+	id=$(cbct upload "$work/scan")
+	job_id=$(cbct submit "$id" --grid 32,28,24 --spacing 2.5 --sart 4 --emit fdk,1,3)
+	[ "$(cbct watch "$job_id" --save "$work/saved" 2>"$work/said")" = "$(printf "$work/saved/$job_id-%s.nii\n" fdk iter-1 iter-3 final)" ] ||
+		fail "the names of the files in order"
+	grep -q succeeded "$work/said" || fail "progress beside them"
+	for name in fdk iter-1 iter-3 final; do
+		get_volume_of "$job_id" $name ""
+		cmp "$body" "$work/saved/$job_id-$name.nii" || fail "$name as it is downloaded"
+	done
+	cbct watch "$job_id" --save "$work/packed" --format mha --type int16 --zstd >/dev/null 2>&1
+	get_volume_of "$job_id" iter-3 "?format=mha&type=int16"
+	cmp "$body" "$work/packed/$job_id-iter-3.mha" || fail "another format, compressed on the way"
+	[ "$(ls "$work/packed" | wc -l)" = 4 ] || fail "four files and nothing beside them: $(ls "$work/packed")"
+	expect_exit 1 cbct watch "$job_id" --save "$work/scan/scan.json"
+	expect_exit 1 cbct watch "$job_id" --save "$work/never" --format jpeg
+}
+get_volume_of() { # JOB NAME QUERY
+	req GET "/v1/jobs/$1/volumes/$2$3"
+	expect_status 200
+}
+
+test_saving_goes_on_after_a_restart_of_the_daemon() {
+	local id job_id watcher
+	cbct simulate -o "$work/scan" "${ball[@]}" "${small[@]}"
+	id=$(cbct upload "$work/scan")
+	local port=${url##*:} # the address stays
+	job_id=$(cbct submit "$id" --grid 32,28,24 --spacing 2.5 --sart 100000 --subsets views --emit fdk,5,200)
+	: >"$work/names"
+	cbct watch "$job_id" --save "$work/resumed" >"$work/names" 2>"$work/said" &
+	watcher=$!
+	until grep -q iter-5 "$work/names"; do sleep 0.05; done
+	stop_daemon KILL
+	start_daemon
+	until grep -q iter-200 "$work/names"; do sleep 0.05; done
+	cbct rm "$job_id"
+	! wait $watcher || fail "a status that tells of the cancelled job"
+	[ "$(sed 's/.*-\(fdk\|iter-[0-9]*\|final\).nii/\1/' "$work/names" | head -3 | xargs)" = "fdk iter-5 iter-200" ] ||
+		fail "each volume once, got $(cat "$work/names")"
+	get_volume_of "$job_id" iter-200 ""
+	cmp "$body" "$work/resumed/$job_id-iter-200.nii" || fail "iter-200 as it is downloaded"
+}
+
 test_an_interrupted_upload_goes_on() {
 	local one=$((48 * 32 * 4)) k
 	cbct simulate -o "$work/broken" "${ball[@]}" "${small[@]}" --photons 1000

@@ -1,0 +1,23 @@
+#ifndef CBCT_CLIENTS_VOLUME_QUERY_H
+#define CBCT_CLIENTS_VOLUME_QUERY_H
+
+#include "clients/cbct/options.h"
+
+/* How volumes are wanted: the options of every subcommand that fetches some. */
+struct volume_query {
+	const char *format; /* NULL: the daemon's default, nifti */
+	int type;           /* enum volume_type */
+	long scale;
+	bool zstd; /* on the way */
+};
+extern const struct option volume_query_rows[];
+#define VOLUME_QUERY_DEFAULTS                                                                                          \
+	{                                                                                                              \
+		.type = 0, .scale = 1                                                                                  \
+	}
+
+/* "type=float32&scale=1&format=mha" */
+enum { VOLUME_QUERY_MAX = 200 };
+void volume_query_text(const struct volume_query *query, char ret_text[VOLUME_QUERY_MAX]);
+
+#endif
