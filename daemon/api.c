@@ -24,6 +24,7 @@ const struct route api_routes[] = {
     {"POST", "/v1/scans", scan_post, BODY_WHOLE, JSON_BYTES_MAX, NULL, NULL},
     {"GET", "/v1/scans/{}", scan_get, BODY_NONE, 0, NULL, NULL},
     {"DELETE", "/v1/scans/{}", scan_delete, BODY_NONE, 0, NULL, NULL},
+    {"POST", "/v1/scans/{}/complete", scan_complete, BODY_NONE, 0, NULL, NULL},
     {"PUT", "/v1/scans/{}/flat", image_put, BODY_STREAM, 0, flat_begin, upload_take},
     {"PUT", "/v1/scans/{}/dark", image_put, BODY_STREAM, 0, dark_begin, upload_take},
     {"PUT", "/v1/scans/{}/defects", image_put, BODY_STREAM, 0, defects_begin, upload_take},

@@ -32,6 +32,7 @@ extern const struct route api_routes[];
 int scan_post(void *context, struct request *request, struct error *err);
 int scan_list(void *context, struct request *request, struct error *err);
 int scan_get(void *context, struct request *request, struct error *err);
+int scan_complete(void *context, struct request *request, struct error *err);
 int scan_delete(void *context, struct request *request, struct error *err);
 
 int projection_get(void *context, struct request *request, struct error *err);

@@ -29,8 +29,8 @@ static int post_resolved(struct api *api, struct job_request *wanted, struct sto
 	struct recon_memory memory;
 	bool fresh;
 
-	if (job_request_resolve(wanted, stored_scan_parsed(scan), err) != 0 ||
-	    supervise_check_memory(api->supervise, stored_scan_parsed(scan), &wanted->recipe, &memory, err) != 0)
+	if (job_request_resolve(wanted, stored_scan_measured(scan), err) != 0 ||
+	    supervise_check_memory(api->supervise, stored_scan_measured(scan), &wanted->recipe, &memory, err) != 0)
 		return err->code;
 	return jobs_post(api->jobs, wanted, scan, &memory, key, digest, ret_job, &fresh, err);
 }

@@ -63,6 +63,21 @@ int scan_get(void *context, struct request *request, struct error *err)
 	return code;
 }
 
+int scan_complete(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	struct stored_scan *scan;
+	int code;
+
+	if (store_scan_find(api->store, request_argument(request, 0), &scan, err) != 0)
+		return err->code;
+	code = store_scan_close(api->store, scan, err);
+	if (code == 0)
+		code = request_reply_json(request, 200, scan_document(scan, false), err);
+	stored_scan_release(scan);
+	return code;
+}
+
 int scan_delete(void *context, struct request *request, struct error *err)
 {
 	struct api *api = context;

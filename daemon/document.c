@@ -110,16 +110,34 @@ static bool add_received(cJSON *document, struct stored_scan *scan, int count)
 	return true;
 }
 
+void incomplete_detail(const struct scan_facts *facts, char ret_text[200])
+{
+	snprintf(ret_text, 200,
+		 "the scan was completed with %d of %d projections: arc, weights and subsets are those of the views "
+		 "that are there",
+		 facts->received, facts->count);
+}
+
+static void add_warning(cJSON *list, const char *code, const char *detail)
+{
+	cJSON *warning = cJSON_CreateObject();
+
+	cJSON_AddStringToObject(warning, "code", code);
+	cJSON_AddStringToObject(warning, "detail", detail);
+	cJSON_AddItemToArray(list, warning);
+}
+
 static void add_scan_warnings(cJSON *document, const struct scan *scan, const struct scan_facts *facts)
 {
-	cJSON *warnings = scan_warnings(scan), *damaged;
+	cJSON *warnings = scan_warnings(scan);
+	char detail[200];
 
-	if (facts->damaged) {
-		damaged = cJSON_CreateObject();
-		cJSON_AddStringToObject(damaged, "code", "files-missing");
-		cJSON_AddStringToObject(damaged, "detail", "the file of the projections is not there at its full size");
-		cJSON_AddItemToArray(warnings, damaged);
+	if (facts->closed) {
+		incomplete_detail(facts, detail);
+		add_warning(warnings, "incomplete", detail);
 	}
+	if (facts->damaged)
+		add_warning(warnings, "files-missing", "the file of the projections is not there at its full size");
 	cJSON_AddItemToObject(document, "warnings", warnings);
 }
 
@@ -154,6 +172,7 @@ cJSON *scan_document(struct stored_scan *stored, bool brief)
 		cJSON_Delete(document);
 		return NULL;
 	}
+	scan = stored_scan_measured(stored);
 	cJSON_AddItemToObject(document, "derived", scan_derived(scan));
 	add_scan_warnings(document, scan, &facts);
 	return document;
@@ -246,8 +265,28 @@ static void add_memory(cJSON *document, const struct recon_memory *memory)
 	cJSON_AddNumberToObject(object, "host", (double)memory->host);
 }
 
+/* How many are there, and how many of them the reconstruction has; null when the scan has gone. */
+static void add_views(cJSON *document, struct store *store, const struct job_record *record)
+{
+	struct scan_facts facts;
+	struct error err;
+	cJSON *views;
+	int all;
+
+	if (store_scan_look(store, record->scan, &facts, &err) != 0) {
+		cJSON_AddNullToObject(document, "views");
+		return;
+	}
+	all = facts.closed ? facts.received : facts.count;
+	views = cJSON_AddObjectToObject(document, "views");
+	cJSON_AddNumberToObject(views, "received", facts.received);
+	cJSON_AddNumberToObject(views, "reconstructed", record->state == JOB_SUCCEEDED ? all : record->taken);
+	cJSON_AddNumberToObject(views, "of", all);
+}
+
 static void add_job_facts(cJSON *document, struct job *job, const struct job_record *record)
 {
+	bool works = record->state == JOB_RUNNING || record->attended;
 	int position = job_queue_position(job);
 	char href[64];
 
@@ -255,10 +294,11 @@ static void add_job_facts(cJSON *document, struct job *job, const struct job_rec
 	cJSON_AddStringToObject(document, "id", record->id);
 	cJSON_AddStringToObject(document, "href", href);
 	cJSON_AddStringToObject(document, "state", job_state_names[record->state]);
-	add_text_or_null(document, "stage", record->state == JOB_RUNNING ? stage_names[record->stage] : "");
+	add_text_or_null(document, "stage", works ? stage_names[record->stage] : "");
 	cJSON_AddNumberToObject(document, "iteration", record->iteration);
 	cJSON_AddNumberToObject(document, "iterations", record->iterations);
 	cJSON_AddNumberToObject(document, "progress", record->fraction);
+	add_views(document, jobs_store(job_jobs(job)), record);
 	add_number_or_null(document, "eta_s", job_eta(job));
 	add_number_or_null(document, "queue_position", position > 0 ? position : -1);
 	add_text_or_null(document, "backend", record->backend);
@@ -294,17 +334,13 @@ static int add_warnings(cJSON *document, struct store *store, const char *id, st
 {
 	struct warning_record *warnings;
 	int count, code = store_job_warnings(store, id, &warnings, &count, err);
-	cJSON *list, *warning;
+	cJSON *list;
 
 	if (code != 0)
 		return code;
 	list = cJSON_AddArrayToObject(document, "warnings");
-	for (int i = 0; i < count; i++) {
-		warning = cJSON_CreateObject();
-		cJSON_AddStringToObject(warning, "code", warnings[i].code);
-		cJSON_AddStringToObject(warning, "detail", warnings[i].detail);
-		cJSON_AddItemToArray(list, warning);
-	}
+	for (int i = 0; i < count; i++)
+		add_warning(list, warnings[i].code, warnings[i].detail);
 	free(warnings);
 	return 0;
 }

@@ -17,7 +17,8 @@
 
 /* The one table of transitions: [from][to]. */
 static const bool transitions[JOB_STATE_COUNT][JOB_STATE_COUNT] = {
-    [JOB_WAITING] = {[JOB_QUEUED] = true, [JOB_FAILED] = true, [JOB_CANCELLED] = true},
+    [JOB_WAITING] =
+	{[JOB_WAITING] = true, [JOB_QUEUED] = true, [JOB_RUNNING] = true, [JOB_FAILED] = true, [JOB_CANCELLED] = true},
     [JOB_QUEUED] = {[JOB_RUNNING] = true, [JOB_FAILED] = true, [JOB_CANCELLED] = true},
     [JOB_RUNNING] = {[JOB_QUEUED] = true, [JOB_SUCCEEDED] = true, [JOB_FAILED] = true, [JOB_CANCELLED] = true},
 };
@@ -26,6 +27,7 @@ struct job {
 	/* Constant. */
 	struct jobs *jobs;
 	char id[ID_SIZE], scan[ID_SIZE];
+	bool fdk; /* it has FDK; known of waiting jobs */
 
 	struct watch_list watchers;
 
@@ -308,14 +310,31 @@ static void enter_queue(struct job_record *record, const struct job_change *chan
 		record->fraction = 0;
 }
 
-static void enter_running(struct job_record *record, const struct job_change *change)
+/* A worker was lost over it: it waits, and what it had reconstructed is gone. */
+static void enter_waiting(struct job_record *record)
+{
+	record->attempts = (record->attempts == 0 ? 1 : record->attempts) + 1;
+	record->stage = STAGE_LOAD;
+	record->fraction = 0;
+	record->taken = 0;
+}
+
+static void enter_running(struct job_record *record, enum job_state from, const struct job_change *change,
+			  struct jobs *jobs)
 {
 	if (record->attempts == 0)
 		record->attempts = 1;
+	if (record->ticket == 0) {
+		record->ticket = jobs->next_ticket++;
+		record->queued = time_of_day();
+	}
 	if (record->started == 0)
 		record->started = time_of_day();
-	record->stage = STAGE_LOAD;
 	record->iteration = record->checkpoint;
+	if (from != JOB_WAITING) {
+		record->stage = STAGE_LOAD;
+		record->taken = 0;
+	}
 	if (change->backend != NULL)
 		snprintf(record->backend, sizeof(record->backend), "%s", change->backend);
 	if (change->device != NULL)
@@ -355,16 +374,22 @@ static int save_state(struct jobs *jobs, const struct job_record *record, bool r
 /* The record as it will be; jobs->change is held. */
 static void next_record(struct job *job, enum job_state to, const struct job_change *change, struct job_record *ret)
 {
+	enum job_state from;
+
 	pthread_mutex_lock(&job->jobs->lock);
 	account_stage(job);
 	*ret = job->record;
 	pthread_mutex_unlock(&job->jobs->lock);
+	from = ret->state;
 	ret->state = to;
+	ret->attended = false;
 	ret->crashes += change->crashed;
-	if (to == JOB_QUEUED)
+	if (to == JOB_WAITING)
+		enter_waiting(ret);
+	else if (to == JOB_QUEUED)
 		enter_queue(ret, change, job->jobs);
 	else if (to == JOB_RUNNING)
-		enter_running(ret, change);
+		enter_running(ret, from, change, job->jobs);
 	else
 		enter_end(ret, change);
 }
@@ -459,6 +484,22 @@ static int checkpoint_there(const struct jobs *jobs, const struct job_record *re
 	return record->checkpoint > 0 && access(path, R_OK) == 0 ? record->checkpoint : 0;
 }
 
+static int recover_waiting(struct job *job, struct error *err)
+{
+	static const struct job_change asked = {.reason = "as asked"};
+	struct job_request request;
+	struct error why;
+
+	if (job->record.cancel_asked)
+		return change_state(job, JOB_CANCELLED, &asked, err);
+	/* One that cannot be read fails when it is to be run, with the reason. */
+	if (job_request_parse(job->record.request, strlen(job->record.request), &request, &why) == 0) {
+		job->fdk = request.recipe.fdk.on;
+		recipe_clear(&request.recipe);
+	}
+	return 0;
+}
+
 static int recover(struct job *job, struct error *err)
 {
 	struct job_change change = {.reason = "the daemon was started again"};
@@ -476,6 +517,8 @@ static int recover(struct job *job, struct error *err)
 		job->entry.ticket = job->record.ticket;
 		queue_add(&job->jobs->queue, &job->entry);
 		return 0;
+	case JOB_WAITING:
+		return recover_waiting(job, err);
 	default:
 		return 0;
 	}
@@ -647,6 +690,8 @@ int jobs_post(struct jobs *jobs, const struct job_request *request, struct store
 		job = job_new(jobs, &record);
 		if (job == NULL)
 			code = error_set_errno(err, ENOMEM, "job");
+		else
+			job->fdk = request->recipe.fdk.on;
 	}
 	job_record_clear(&record);
 	if (code != 0)
@@ -723,7 +768,7 @@ int jobs_delete(struct jobs *jobs, struct job *job, bool *ret_removed, struct er
 		code = error_set(err, ERR_NOT_FOUND, "there is no job \"%s\" any more", facts.id);
 	else if (facts.ended)
 		code = remove_job(jobs, job, err);
-	else if (facts.state == JOB_RUNNING)
+	else if (facts.state == JOB_RUNNING || facts.attended)
 		code = ask_cancel(job, err);
 	else
 		code = change_state(job, JOB_CANCELLED, &asked, err);
@@ -769,6 +814,8 @@ void job_facts(struct job *job, struct job_facts *ret)
 	ret->ended = job_state_ended(job->record.state);
 	ret->removed = job->removed;
 	ret->cancel_asked = job->record.cancel_asked;
+	ret->attended = job->record.attended;
+	ret->priority = job->record.priority;
 	ret->mu_water = job->record.mu_water;
 	pthread_mutex_unlock(&job->jobs->lock);
 }
@@ -837,10 +884,11 @@ static int promote(struct jobs *jobs, struct job *job, struct error *err)
 	return facts.ready ? job_set_state(job, JOB_QUEUED, &change, err) : 0;
 }
 
-int jobs_promote(struct jobs *jobs, struct error *err)
+/* References to all that wait and are not attended, oldest first; free the array. NULL when there are none. */
+static struct job **list_waiting(struct jobs *jobs, int *ret_count)
 {
 	struct job **waiting = NULL;
-	int count = 0, code = 0, result;
+	int count = 0;
 
 	pthread_mutex_lock(&jobs->lock);
 	for (int i = 0; i < jobs->count; i++)
@@ -849,12 +897,23 @@ int jobs_promote(struct jobs *jobs, struct error *err)
 		waiting = calloc((size_t)count, sizeof(struct job *));
 	count = 0;
 	for (int i = 0; i < jobs->count && waiting != NULL; i++) {
-		if (jobs->all[i]->record.state != JOB_WAITING)
+		const struct job_record *record = &jobs->all[i]->record;
+
+		if (record->state != JOB_WAITING || record->attended)
 			continue;
 		waiting[count++] = jobs->all[i];
 		jobs->all[i]->references++;
 	}
 	pthread_mutex_unlock(&jobs->lock);
+	*ret_count = count;
+	return waiting;
+}
+
+int jobs_promote(struct jobs *jobs, struct error *err)
+{
+	int count, code = 0, result;
+	struct job **waiting = list_waiting(jobs, &count);
+
 	for (int i = 0; i < count; i++) {
 		result = code == 0 ? promote(jobs, waiting[i], err) : 0;
 		/* Cancelled meanwhile: somebody else's business. */
@@ -864,6 +923,98 @@ int jobs_promote(struct jobs *jobs, struct error *err)
 	}
 	free(waiting);
 	return code;
+}
+
+struct candidate {
+	struct job *job;
+	enum priority priority;
+	double arrived;
+	bool arriving;
+};
+
+static bool goes_first(const struct candidate *a, const struct candidate *b)
+{
+	if (a->arriving != b->arriving)
+		return a->arriving;
+	/* A pause may end: most likely that of the scan that has just had one. */
+	if (!a->arriving && a->arrived != b->arrived)
+		return a->arrived > b->arrived;
+	return a->priority > b->priority;
+}
+
+struct job *jobs_arriving(struct jobs *jobs, double since, bool *ret_arriving)
+{
+	struct candidate best = {.job = NULL};
+	int count;
+	struct job **waiting = list_waiting(jobs, &count);
+
+	for (int i = 0; i < count; i++) {
+		struct candidate one = {.job = waiting[i], .priority = waiting[i]->record.priority};
+		struct scan_facts facts;
+		struct error err;
+
+		if (!one.job->fdk || store_scan_look(jobs->store, one.job->scan, &facts, &err) != 0 ||
+		    !facts.convertible)
+			continue;
+		one.arrived = facts.arrived;
+		one.arriving = facts.arrived > since;
+		if (best.job == NULL || goes_first(&one, &best))
+			best = one;
+	}
+	for (int i = 0; i < count; i++) {
+		if (waiting[i] != best.job)
+			job_release(waiting[i]);
+	}
+	free(waiting);
+	*ret_arriving = best.arriving;
+	return best.job;
+}
+
+int job_attend(struct job *job, const char *backend, const char *device, struct error *err)
+{
+	struct job_record *record = &job->record;
+	int code = 0;
+
+	/* A DELETE looks under the same lock: it finds it waiting alone, or attended. */
+	pthread_mutex_lock(&job->jobs->change);
+	pthread_mutex_lock(&job->jobs->lock);
+	if (record->state != JOB_WAITING || record->cancel_asked) {
+		code = error_set(err, ERR_CONFLICT, "job %s does not wait any more", job->id);
+	} else {
+		record->attended = true;
+		record->stage = STAGE_FDK;
+		snprintf(record->backend, sizeof(record->backend), "%s", backend);
+		snprintf(record->device, sizeof(record->device), "%s", device);
+	}
+	pthread_mutex_unlock(&job->jobs->lock);
+	pthread_mutex_unlock(&job->jobs->change);
+	if (code == 0)
+		wake(job);
+	return code;
+}
+
+void job_leave(struct job *job)
+{
+	struct job_record *record = &job->record;
+
+	pthread_mutex_lock(&job->jobs->change);
+	pthread_mutex_lock(&job->jobs->lock);
+	record->attended = false;
+	if (record->state == JOB_WAITING) {
+		record->stage = STAGE_LOAD;
+		record->fraction = 0;
+		record->taken = 0;
+	}
+	pthread_mutex_unlock(&job->jobs->lock);
+	pthread_mutex_unlock(&job->jobs->change);
+	wake(job);
+}
+
+void job_taken(struct job *job, int count)
+{
+	pthread_mutex_lock(&job->jobs->lock);
+	job->record.taken = count;
+	pthread_mutex_unlock(&job->jobs->lock);
 }
 
 struct job *jobs_next(struct jobs *jobs)
@@ -879,12 +1030,13 @@ struct job *jobs_next(struct jobs *jobs)
 	return job;
 }
 
-int jobs_victim(struct jobs *jobs, const struct queue_running *running, int count, int idle)
+int jobs_victim(struct jobs *jobs, const enum priority *arriving, const struct queue_running *running, int count,
+		int idle)
 {
 	int victim;
 
 	pthread_mutex_lock(&jobs->lock);
-	victim = queue_victim(&jobs->queue, running, count, idle);
+	victim = queue_victim(&jobs->queue, arriving, running, count, idle);
 	pthread_mutex_unlock(&jobs->lock);
 	return victim;
 }

@@ -11,6 +11,10 @@
  *   waiting -> queued -> running -> succeeded | failed | cancelled
  *                 ^---------'  a yield, a dead worker, a restart
  *
+ * A waiting job may be attended: a worker reconstructs its projections as they
+ * arrive. With the last of them it is running, without having been queued; when
+ * the worker is taken from it or dies, it waits as before.
+ *
  * Whoever changes a state goes through job_set_state: it checks the one table
  * of transitions, commits the row with its event, then shows the change in
  * memory, logs it and wakes the watchers, in this order. So whatever a reader
@@ -65,7 +69,7 @@ int jobs_list(struct jobs *jobs, const char *after, int limit, struct job **ret_
 
 /*
  * DELETE. A job that has not ended is asked to: waiting and queued ones are
- * cancelled on return, a running one soon after (watch it). An ended job is
+ * cancelled on return, a running or attended one soon after (watch it). An ended job is
  * removed with its rows and files. *ret_removed tells which it was.
  */
 int jobs_delete(struct jobs *jobs, struct job *job, bool *ret_removed, struct error *err);
@@ -83,7 +87,8 @@ struct job_facts {
 	char id[ID_SIZE], scan[ID_SIZE];
 	enum job_state state;
 	bool ended, removed;
-	bool cancel_asked;
+	bool cancel_asked, attended;
+	enum priority priority;
 	double mu_water; /* 1/mm */
 };
 void job_facts(struct job *job, struct job_facts *ret);
@@ -106,7 +111,7 @@ struct job_change {
 	int error_code; /* with JOB_FAILED */
 	const char *error_pointer, *error_text;
 	int checkpoint;               /* to JOB_QUEUED: the iteration that checkpoint.f32 holds, 0: none */
-	bool crashed;                 /* to JOB_QUEUED or JOB_FAILED: the worker died with it */
+	bool crashed;                 /* to JOB_QUEUED, JOB_WAITING or JOB_FAILED: the worker died with it */
 	bool yielded;                 /* to JOB_QUEUED: it goes on later, which is no new attempt */
 	const char *backend, *device; /* to JOB_RUNNING */
 	const char *reason;           /* for the log */
@@ -114,12 +119,26 @@ struct job_change {
 /* ERR_CONFLICT when the table does not allow it; the caller's picture was old. change may be NULL. */
 int job_set_state(struct job *job, enum job_state to, const struct job_change *change, struct error *err);
 
-/* Waiting jobs whose scan has become ready go to the queue. */
+/* Waiting jobs whose scan has become ready go to the queue, but for those that are attended. */
 int jobs_promote(struct jobs *jobs, struct error *err);
+/*
+ * The waiting job that an idle worker should attend, or NULL: it has FDK, and its
+ * projections can be converted. Those whose projections came after `since`
+ * (CLOCK_MONOTONIC) go first, the higher priority before the lower; then those
+ * that came later. *ret_arriving: it is one of the former.
+ */
+struct job *jobs_arriving(struct jobs *jobs, double since, bool *ret_arriving);
+/* ERR_CONFLICT when it does not wait any more, or was cancelled. */
+int job_attend(struct job *job, const char *backend, const char *device, struct error *err);
+/* The worker goes; a job that still waits is where it was before. */
+void job_leave(struct job *job);
+/* Projections reconstructed so far. */
+void job_taken(struct job *job, int count);
 /* The queued job that is due, or NULL; it stays queued until job_set_state. */
 struct job *jobs_next(struct jobs *jobs);
 /* queue_victim over the jobs' queue. */
-int jobs_victim(struct jobs *jobs, const struct queue_running *running, int count, int idle);
+int jobs_victim(struct jobs *jobs, const enum priority *arriving, const struct queue_running *running, int count,
+		int idle);
 
 void job_set_plan(struct job *job, const struct recon_memory *memory, const char *plan);
 /* Memory only, until the next change of state. */

@@ -54,32 +54,48 @@ int queue_position(const struct queue_entry *entry)
 	return position;
 }
 
-/* The lowest priority below `priority`, and of those the latest ticket. */
+static bool yields_before(const struct queue_running *a, const struct queue_running *b)
+{
+	if (a->gives_way != b->gives_way)
+		return a->gives_way;
+	return a->priority != b->priority ? a->priority < b->priority : a->ticket > b->ticket;
+}
+
+/* Who gives way, or the lowest priority below `priority` and of those the latest ticket. */
 static int least_of(const struct queue_running *running, int count, enum priority priority)
 {
 	int least = -1;
 
 	for (int i = 0; i < count; i++) {
-		if (running[i].leaving || running[i].priority >= priority)
+		if (running[i].leaving || (running[i].priority >= priority && !running[i].gives_way))
 			continue;
-		if (least < 0 || running[i].priority < running[least].priority ||
-		    (running[i].priority == running[least].priority && running[i].ticket > running[least].ticket))
+		if (least < 0 || yields_before(&running[i], &running[least]))
 			least = i;
 	}
 	return least;
 }
 
-int queue_victim(const struct queue *queue, const struct queue_running *running, int count, int idle)
+int queue_victim(const struct queue *queue, const enum priority *arriving, const struct queue_running *running,
+		 int count, int idle)
 {
+	const struct queue_entry *entry = queue->first;
 	int coming = idle;
 
 	for (int i = 0; i < count; i++)
 		coming += running[i].leaving;
 	/* The first `coming` jobs get workers that are free already; the next one may push somebody out. */
-	for (const struct queue_entry *entry = queue->first; entry != NULL; entry = entry->next) {
-		if (coming-- > 0)
-			continue;
-		return least_of(running, count, entry->priority);
+	while (entry != NULL || arriving != NULL) {
+		enum priority next;
+
+		if (arriving != NULL && (entry == NULL || *arriving > entry->priority)) {
+			next = *arriving;
+			arriving = NULL;
+		} else {
+			next = entry->priority;
+			entry = entry->next;
+		}
+		if (coming-- <= 0)
+			return least_of(running, count, next);
 	}
 	return -1;
 }

@@ -31,14 +31,18 @@ int queue_position(const struct queue_entry *entry);               /* 1 = next; 
 struct queue_running {
 	enum priority priority;
 	long long ticket;
-	bool leaving; /* told to yield or to cancel: its worker is as good as free */
+	bool leaving;   /* told to yield or to cancel: its worker is as good as free */
+	bool gives_way; /* to any other: it has nothing to do just now */
 };
 
 /*
  * Which of running[count] should yield so that a queued job of higher priority
- * gets a worker, when `idle` workers are free: the lowest priority, and of those
- * the one that came last. -1 when none should.
+ * gets a worker, when `idle` workers are free: one that gives way, else the lowest
+ * priority, and of those the one that came last. -1 when none should. `arriving`:
+ * the priority of one more job that is not queued, but wants a worker like those
+ * that are, behind all of its priority; NULL: there is none.
  */
-int queue_victim(const struct queue *queue, const struct queue_running *running, int count, int idle);
+int queue_victim(const struct queue *queue, const enum priority *arriving, const struct queue_running *running,
+		 int count, int idle);
 
 #endif

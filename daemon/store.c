@@ -112,13 +112,14 @@ static const char *const migrations[] = {
     " data TEXT NOT NULL);"
     "CREATE INDEX events_of_job ON events (job, number);",
     /* What a job that starts again does once more is told once: the name of such an event, else NULL. */
-    "ALTER TABLE events ADD COLUMN once TEXT;"
-    "CREATE UNIQUE INDEX events_once ON events (job, once);",
+    ("ALTER TABLE events ADD COLUMN once TEXT;"
+     "CREATE UNIQUE INDEX events_once ON events (job, once);"),
     /* A removed job's events go with it; that it was removed stays, under a number of theirs. */
-    "CREATE TABLE removals ("
-    " number INTEGER PRIMARY KEY,"
-    " job TEXT NOT NULL);",
-    "ALTER TABLE scans ADD COLUMN defects BLOB;", /* SHA-256 of the defect map's bytes */
+    ("CREATE TABLE removals ("
+     " number INTEGER PRIMARY KEY,"
+     " job TEXT NOT NULL);"),
+    "ALTER TABLE scans ADD COLUMN defects BLOB;",                      /* SHA-256 of the defect map's bytes */
+    "ALTER TABLE scans ADD COLUMN closed INTEGER NOT NULL DEFAULT 0;", /* 1: its projections are those that are there */
 };
 enum { MIGRATIONS = sizeof(migrations) / sizeof(migrations[0]) };
 
@@ -508,7 +509,7 @@ int store_open(const char *directory, const struct store_hooks *hooks, struct st
 	pthread_mutex_init(&store->scans_lock, NULL);
 	pthread_mutex_init(&store->checkpoint_lock, NULL);
 	pthread_cond_init(&store->checkpoint_due, NULL);
-	watch_list_init(&store->ready);
+	watch_list_init(&store->arrivals);
 	code = open_catalogue(store, err);
 	if (code != 0) {
 		store_close(store);
@@ -532,7 +533,7 @@ void store_close(struct store *store)
 	store_free_scans(store);
 	connection_close(&store->reader);
 	connection_close(&store->writer);
-	watch_list_destroy(&store->ready);
+	watch_list_destroy(&store->arrivals);
 	pthread_cond_destroy(&store->checkpoint_due);
 	pthread_mutex_destroy(&store->checkpoint_lock);
 	pthread_mutex_destroy(&store->scans_lock);

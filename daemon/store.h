@@ -77,21 +77,29 @@ void store_scan_remove_files(const struct store *store, const char *id);
 
 /* Constant while the reference lives; references from store_scan_list may have none (NULL). */
 const struct scan *stored_scan_parsed(struct stored_scan *scan);
+/* What is reconstructed: the same, or once it was closed with projections missing, those views that are there. */
+const struct scan *stored_scan_measured(struct stored_scan *scan);
 const char *stored_scan_id(const struct stored_scan *scan);
 /* STATE/scans/ID */
 void store_scan_directory(const struct store *store, const char *id, char ret_path[1024]);
 
-/* Memory only. Complete: every projection is there. Ready: and whatever else makes line integrals of them. */
+/*
+ * Memory only. Complete: every projection is there, or it was closed with those that are. Convertible: so is whatever
+ * else makes line integrals of them. Ready: both.
+ */
 struct scan_facts {
 	char name[256];
 	double created; /* seconds since 1970 */
 	int columns, rows, count;
 	enum sample sample;
 	enum quantity quantity;
-	double air;      /* counts, 0: not given */
-	int received;    /* projections */
+	double air;               /* counts, 0: not given */
+	int received;             /* projections */
 	bool flat, dark, defects; /* images that are there */
-	bool complete, ready;
+	bool closed;              /* by store_scan_close, with projections missing */
+	bool complete, convertible, ready;
+	double arrived; /* when the last projection came, seconds of CLOCK_MONOTONIC; 0: none since the start */
+	unsigned basis; /* another number: an image came or it was closed, what was made of its projections is void */
 	bool deleted;
 	bool damaged; /* its files were not there at the start */
 };
@@ -100,15 +108,30 @@ void stored_scan_facts(struct stored_scan *scan, struct scan_facts *ret);
 int store_scan_look(struct store *store, const char *id, struct scan_facts *ret, struct error *err);
 /* flags[count]: 1 where the projection is stored. */
 void stored_scan_received(struct stored_scan *scan, unsigned char *ret_flags);
+/*
+ * The projections in the order in which they came (those from before the start
+ * by their numbers): numbers `from`, from + 1, ... of that order, at most `most`.
+ * Returns how many.
+ */
+int stored_scan_arrivals(struct stored_scan *scan, int from, int *ret_projections, int most);
 /* False when it is not stored. */
 bool stored_scan_digest(struct stored_scan *scan, int index, uint8_t ret_sha256[32]);
 
 /* Woken when a projection is stored, a claim given back, an image set, the scan deleted. */
 void stored_scan_watch(struct stored_scan *scan, struct watch *watch);
 void stored_scan_unwatch(struct stored_scan *scan, struct watch *watch);
-/* Woken when any scan becomes ready. */
-void store_watch_ready(struct store *store, struct watch *watch);
-void store_unwatch_ready(struct store *store, struct watch *watch);
+/* Woken when a projection or an image of any scan is stored, and when one is closed. */
+void store_watch_arrivals(struct store *store, struct watch *watch);
+void store_unwatch_arrivals(struct store *store, struct watch *watch);
+
+/*
+ * Nothing more will come: the scan is those projections that are there. Others
+ * are refused from now on (ERR_CONFLICT), also those on their way. A scan that
+ * is complete stays as it is. ERR_CONFLICT when fewer are there than VIEWS_LEAST
+ * of them, or than the scan has in all.
+ */
+enum { VIEWS_LEAST = 2 }; /* an arc has two ends */
+int store_scan_close(struct store *store, struct stored_scan *scan, struct error *err);
 
 /* ---- projections on their way in ---- */
 /*
@@ -124,7 +147,7 @@ void store_unwatch_ready(struct store *store, struct watch *watch);
  * Never write without a claim: a stored projection is never touched again.
  */
 enum claim { CLAIM_GRANTED, CLAIM_STORED, CLAIM_BUSY };
-/* ERR_NOT_FOUND when the scan was deleted meanwhile. Memory only. */
+/* ERR_NOT_FOUND when the scan was deleted meanwhile, ERR_CONFLICT when it is closed without this one. Memory only. */
 int stored_scan_claim(struct stored_scan *scan, int index, enum claim *ret_claim, struct error *err);
 void stored_scan_unclaim(struct stored_scan *scan, int index);
 
@@ -135,8 +158,8 @@ int stored_scan_open(struct stored_scan *scan, bool writing, int *ret_descriptor
  * Group commit: many claimed projections, of one scan or several, in one
  * transaction, after the caller's fdatasync of their bytes. On success every
  * claim is given back, and `stored` says for each whether it is there now
- * (false: the scan was deleted meanwhile). On failure none is stored and the
- * claims are still the caller's.
+ * (false: the scan was deleted or closed meanwhile). On failure none is stored
+ * and the claims are still the caller's.
  */
 struct received_projection {
 	struct stored_scan *scan;
@@ -183,6 +206,9 @@ struct job_record {
 	enum stage stage;
 	int iteration;
 	double fraction;
+	/* Memory only. */
+	bool attended; /* it waits, and a worker reconstructs what arrives */
+	int taken;     /* projections reconstructed */
 };
 
 struct volume_record {
@@ -218,7 +244,8 @@ int store_job_insert(struct store *store, const struct job_record *job, const st
  * checkpoint go. */
 int store_job_update(struct store *store, const struct job_record *job, const struct event *event,
 		     const struct event *end, bool rewind, struct error *err);
-/* Removes the rows; then the files may go. Of the events only that it was removed stays, for those who watch all jobs. */
+/* Removes the rows; then the files may go. Of the events only that it was removed stays, for those who watch all jobs.
+ */
 int store_job_delete(struct store *store, const char *id, struct error *err);
 void store_job_remove_files(const struct store *store, const char *id);
 int store_job_add_row(struct store *store, const char *id, const struct history_row *row, const struct event *event,

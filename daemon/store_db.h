@@ -51,7 +51,7 @@ struct store {
 	int scan_count, scan_space;
 	struct stored_scan *recent[RECENT_SCANS]; /* whose parsed form is kept though nobody uses it */
 	int recent_next;
-	struct watch_list ready;
+	struct watch_list arrivals;
 
 	_Atomic unsigned long long projections_stored, commits, commit_microseconds;
 };

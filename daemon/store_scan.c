@@ -13,6 +13,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/stat.h>
+#include <time.h>
 #include <unistd.h>
 
 #include "daemon/files.h"
@@ -44,16 +45,22 @@ struct stored_scan {
 	/* Guarded by store->scans_lock. */
 	int references; /* one of them is the array's */
 	struct scan *parsed;
+	struct scan *measured; /* of a closed one: what of it is there; NULL: all of it, or not parsed */
 	bool recent;
 	bool removed; /* from the array: whoever refers to it now may use its parsed form */
 
 	pthread_mutex_t lock;    /* guards what follows */
 	unsigned char *progress; /* [count], enum progress */
 	uint8_t (*sha256)[32];   /* [count], of those that are stored */
+	int *order;              /* [received]: the projections that are stored, as they came */
 	int received;
+	double arrived; /* monotonic: the last of them, 0: before the start */
+	unsigned basis; /* grows when they are to be understood otherwise */
 	enum progress image[IMAGE_COUNT];
 	uint8_t image_sha256[IMAGE_COUNT][32];
-	bool deleted; /* written with writer.lock held too */
+	bool deleted; /* written with writer.lock held too, as the next */
+	bool closing; /* takes no new projections */
+	bool closed;  /* and that is on the disk */
 
 	struct watch_list watchers;
 };
@@ -63,6 +70,8 @@ static struct stored_scan *scan_free_memory(struct stored_scan *scan)
 	if (scan == NULL)
 		return NULL;
 	scan_free(scan->parsed);
+	scan_free(scan->measured);
+	free(scan->order);
 	free(scan->progress);
 	free(scan->sha256);
 	watch_list_destroy(&scan->watchers);
@@ -84,7 +93,8 @@ static struct stored_scan *scan_new(struct store *store, int count)
 	scan->references = 1;
 	scan->progress = calloc((size_t)count, 1);
 	scan->sha256 = calloc((size_t)count, sizeof(scan->sha256[0]));
-	return scan->progress == NULL || scan->sha256 == NULL ? scan_free_memory(scan) : scan;
+	scan->order = calloc((size_t)count, sizeof(scan->order[0]));
+	return scan->progress == NULL || scan->sha256 == NULL || scan->order == NULL ? scan_free_memory(scan) : scan;
 }
 
 /* ---- the array ---- */
@@ -149,7 +159,8 @@ static void forget_parsed(struct stored_scan *scan)
 	if (scan->references > 1 || scan->recent || scan->removed)
 		return;
 	scan_free(scan->parsed);
-	scan->parsed = NULL;
+	scan_free(scan->measured);
+	scan->parsed = scan->measured = NULL;
 }
 
 static void forget_recent(struct store *store, struct stored_scan *scan)
@@ -193,6 +204,16 @@ void stored_scan_release(struct stored_scan *scan)
 		scan_free_memory(scan);
 }
 
+static bool was_deleted(struct stored_scan *scan)
+{
+	bool deleted;
+
+	pthread_mutex_lock(&scan->lock);
+	deleted = scan->deleted;
+	pthread_mutex_unlock(&scan->lock);
+	return deleted;
+}
+
 static int read_document(struct stored_scan *scan, struct scan **ret_parsed, struct error *err)
 {
 	char directory[1024], path[1100];
@@ -203,6 +224,8 @@ static int read_document(struct stored_scan *scan, struct scan **ret_parsed, str
 	store_scan_directory(scan->store, scan->id, directory);
 	snprintf(path, sizeof(path), "%s/scan.json", directory);
 	code = file_read(path, DOCUMENT_BYTES_MAX, &text, &length, err);
+	if (code != 0 && was_deleted(scan)) /* between the finding and the reading */
+		return error_set(err, ERR_NOT_FOUND, "there is no scan \"%.64s\" any more", scan->id);
 	if (code != 0)
 		/* The row is there, so its file must be: this is our disk's fault, not the client's. */
 		return error_set(err, ERR_IO, "scan %s: its document cannot be read from %s", scan->id, path);
@@ -215,11 +238,67 @@ static int read_document(struct stored_scan *scan, struct scan **ret_parsed, str
 	return code;
 }
 
+/* Flags of what is there, once nothing more may come; *ret_flags NULL before. */
+static int closed_flags(struct stored_scan *scan, unsigned char **ret_flags, struct error *err)
+{
+	unsigned char *flags = NULL;
+	bool closed;
+
+	pthread_mutex_lock(&scan->lock);
+	closed = scan->closed;
+	pthread_mutex_unlock(&scan->lock);
+	if (closed) {
+		flags = malloc((size_t)scan->count);
+		if (flags == NULL)
+			return error_set_errno(err, ENOMEM, "list of %d projections", scan->count);
+		stored_scan_received(scan, flags);
+	}
+	*ret_flags = flags;
+	return 0;
+}
+
+/* The scan as it was measured, read anew: what others hold of the parsed one stays as it is. */
+static int read_measured(struct stored_scan *scan, const unsigned char *present, struct scan **ret_measured,
+			 struct error *err)
+{
+	struct scan *measured;
+	int code = read_document(scan, &measured, err);
+
+	if (code != 0)
+		return code;
+	code = scan_reduce(measured, present, err);
+	if (code != 0)
+		scan_free(measured);
+	else
+		*ret_measured = measured;
+	return code;
+}
+
+static int read_both(struct stored_scan *scan, struct scan **ret_parsed, struct scan **ret_measured, struct error *err)
+{
+	unsigned char *present = NULL;
+	struct scan *parsed = NULL, *measured = NULL;
+	int code = closed_flags(scan, &present, err);
+
+	if (code == 0)
+		code = read_document(scan, &parsed, err);
+	if (code == 0 && present != NULL)
+		code = read_measured(scan, present, &measured, err);
+	free(present);
+	if (code != 0) {
+		scan_free(parsed);
+	} else {
+		*ret_parsed = parsed;
+		*ret_measured = measured;
+	}
+	return code;
+}
+
 /* The caller holds a reference, so a parsed document that is there stays. */
 static int load_parsed(struct stored_scan *scan, struct error *err)
 {
 	struct store *store = scan->store;
-	struct scan *parsed = NULL;
+	struct scan *parsed = NULL, *measured = NULL;
 	bool there;
 	int code;
 
@@ -228,16 +307,18 @@ static int load_parsed(struct stored_scan *scan, struct error *err)
 	pthread_mutex_unlock(&store->scans_lock);
 	if (there)
 		return 0;
-	code = read_document(scan, &parsed, err);
+	code = read_both(scan, &parsed, &measured, err);
 	if (code != 0)
 		return code;
 	pthread_mutex_lock(&store->scans_lock);
 	if (scan->parsed == NULL) {
 		scan->parsed = parsed;
-		parsed = NULL;
+		scan->measured = measured;
+		parsed = measured = NULL;
 	}
 	pthread_mutex_unlock(&store->scans_lock);
 	scan_free(parsed); /* somebody else was faster */
+	scan_free(measured);
 	return 0;
 }
 
@@ -482,6 +563,16 @@ const struct scan *stored_scan_parsed(struct stored_scan *scan)
 	return parsed;
 }
 
+const struct scan *stored_scan_measured(struct stored_scan *scan)
+{
+	const struct scan *measured;
+
+	pthread_mutex_lock(&scan->store->scans_lock);
+	measured = scan->measured != NULL ? scan->measured : scan->parsed;
+	pthread_mutex_unlock(&scan->store->scans_lock);
+	return measured;
+}
+
 const char *stored_scan_id(const struct stored_scan *scan)
 {
 	return scan->id;
@@ -492,11 +583,22 @@ void store_scan_directory(const struct store *store, const char *id, char ret_pa
 	snprintf(ret_path, 1024, "%s/scans/%s", store->directory, id);
 }
 
-/* The scan's lock is held. */
-static bool is_ready(const struct stored_scan *scan)
+/* These and the next: the scan's lock is held. */
+static bool is_complete(const struct stored_scan *scan)
 {
-	return scan->received == scan->count &&
-	       (scan->quantity == QUANTITY_LINE_INTEGRAL || scan->air > 0 || scan->image[IMAGE_FLAT] == STORED);
+	return scan->received == scan->count || scan->closed;
+}
+
+static bool is_convertible(const struct stored_scan *scan)
+{
+	return scan->quantity == QUANTITY_LINE_INTEGRAL || scan->air > 0 || scan->image[IMAGE_FLAT] == STORED;
+}
+
+static void add_received(struct stored_scan *scan, int index, const uint8_t sha256[32])
+{
+	memcpy(scan->sha256[index], sha256, 32);
+	scan->progress[index] = STORED;
+	scan->order[scan->received++] = index;
 }
 
 void stored_scan_facts(struct stored_scan *scan, struct scan_facts *ret)
@@ -517,8 +619,12 @@ void stored_scan_facts(struct stored_scan *scan, struct scan_facts *ret)
 	ret->flat = scan->image[IMAGE_FLAT] == STORED;
 	ret->dark = scan->image[IMAGE_DARK] == STORED;
 	ret->defects = scan->image[IMAGE_DEFECTS] == STORED;
-	ret->complete = scan->received == scan->count;
-	ret->ready = is_ready(scan);
+	ret->closed = scan->closed;
+	ret->complete = is_complete(scan);
+	ret->convertible = is_convertible(scan);
+	ret->ready = ret->complete && ret->convertible;
+	ret->arrived = scan->arrived;
+	ret->basis = scan->basis;
 	ret->deleted = scan->deleted;
 	pthread_mutex_unlock(&scan->lock);
 }
@@ -540,6 +646,19 @@ void stored_scan_received(struct stored_scan *scan, unsigned char *ret_flags)
 	for (int i = 0; i < scan->count; i++)
 		ret_flags[i] = scan->progress[i] == STORED;
 	pthread_mutex_unlock(&scan->lock);
+}
+
+int stored_scan_arrivals(struct stored_scan *scan, int from, int *ret_projections, int most)
+{
+	int count;
+
+	pthread_mutex_lock(&scan->lock);
+	count = scan->received - from;
+	count = count < 0 ? 0 : count < most ? count : most;
+	if (count > 0)
+		memcpy(ret_projections, scan->order + from, (size_t)count * sizeof(*ret_projections));
+	pthread_mutex_unlock(&scan->lock);
+	return count;
 }
 
 bool stored_scan_digest(struct stored_scan *scan, int index, uint8_t ret_sha256[32])
@@ -564,14 +683,122 @@ void stored_scan_unwatch(struct stored_scan *scan, struct watch *watch)
 	watch_remove(&scan->watchers, watch);
 }
 
-void store_watch_ready(struct store *store, struct watch *watch)
+void store_watch_arrivals(struct store *store, struct watch *watch)
 {
-	watch_add(&store->ready, watch);
+	watch_add(&store->arrivals, watch);
 }
 
-void store_unwatch_ready(struct store *store, struct watch *watch)
+void store_unwatch_arrivals(struct store *store, struct watch *watch)
 {
-	watch_remove(&store->ready, watch);
+	watch_remove(&store->arrivals, watch);
+}
+
+/* ---- closing ---- */
+
+/* *ret_done: there is nothing to do. The scan's lock is held. */
+static int check_closing(const struct stored_scan *scan, bool *ret_done, struct error *err)
+{
+	*ret_done = false;
+	if (scan->deleted)
+		return error_set(err, ERR_NOT_FOUND, "there is no scan \"%s\" any more", scan->id);
+	if (is_complete(scan))
+		*ret_done = true;
+	else if (scan->closing)
+		return error_set(err, ERR_BUSY, "another request is completing this scan");
+	else if (scan->received < VIEWS_LEAST)
+		return error_set(err, ERR_CONFLICT, "%d of %d projections are there, at least %d are needed",
+				 scan->received, scan->count, VIEWS_LEAST);
+	return 0;
+}
+
+/* Which are there, and how many. */
+static int look_before_closing(struct stored_scan *scan, unsigned char *ret_present, int *ret_received, bool *ret_done,
+			       struct error *err)
+{
+	int code;
+
+	pthread_mutex_lock(&scan->lock);
+	code = check_closing(scan, ret_done, err);
+	*ret_received = scan->received;
+	for (int i = 0; i < scan->count; i++)
+		ret_present[i] = scan->progress[i] == STORED;
+	pthread_mutex_unlock(&scan->lock);
+	return code;
+}
+
+static int close_row(struct store *store, struct stored_scan *scan, int received, bool *ret_done, struct error *err)
+{
+	struct query query;
+	int code = store_begin(store, err);
+
+	if (code != 0)
+		return code;
+	pthread_mutex_lock(&scan->lock);
+	code = check_closing(scan, ret_done, err);
+	/* More have come since: they are part of it. */
+	if (code == 0 && !*ret_done && scan->received != received)
+		code = error_set(err, ERR_BUSY, "projections come while the scan is completed");
+	if (code == 0 && !*ret_done)
+		scan->closing = true;
+	pthread_mutex_unlock(&scan->lock);
+	if (code != 0 || *ret_done)
+		return store_end(store, code, err);
+	query_begin(&query, &store->writer, "UPDATE scans SET closed = 1 WHERE number = ?", err);
+	query_integer(&query, scan->number);
+	code = store_end(store, query_run(&query), err);
+	if (code != 0) {
+		pthread_mutex_lock(&scan->lock);
+		scan->closing = false;
+		pthread_mutex_unlock(&scan->lock);
+	}
+	return code;
+}
+
+/* What it will be is made before the lock of the catalogue is taken. */
+static int close_once(struct store *store, struct stored_scan *scan, unsigned char *present, bool *ret_done,
+		      struct error *err)
+{
+	struct scan *measured;
+	int received, code = look_before_closing(scan, present, &received, ret_done, err);
+
+	if (code != 0 || *ret_done)
+		return code;
+	code = read_measured(scan, present, &measured, err);
+	if (code != 0)
+		return code;
+	code = close_row(store, scan, received, ret_done, err);
+	if (code != 0 || *ret_done) {
+		scan_free(measured);
+		return code;
+	}
+	pthread_mutex_lock(&store->scans_lock);
+	scan->measured = measured;
+	pthread_mutex_unlock(&store->scans_lock);
+	pthread_mutex_lock(&scan->lock);
+	scan->closed = true;
+	scan->basis++;
+	pthread_mutex_unlock(&scan->lock);
+	log_line(LEVEL_INFO, "scan %s is complete with %d of %d projections", scan->id, received, scan->count);
+	return 0;
+}
+
+int store_scan_close(struct store *store, struct stored_scan *scan, struct error *err)
+{
+	enum { TRIES = 20 };
+	unsigned char *present = malloc((size_t)scan->count);
+	bool done;
+	int code = ERR_BUSY;
+
+	if (present == NULL)
+		return error_set_errno(err, ENOMEM, "list of %d projections", scan->count);
+	for (int i = 0; i < TRIES && code == ERR_BUSY; i++)
+		code = close_once(store, scan, present, &done, err);
+	free(present);
+	if (code == 0) {
+		watch_wake(&scan->watchers);
+		watch_wake(&store->arrivals);
+	}
+	return code;
 }
 
 /* ---- projections on their way in ---- */
@@ -586,6 +813,8 @@ int stored_scan_claim(struct stored_scan *scan, int index, enum claim *ret_claim
 	pthread_mutex_lock(&scan->lock);
 	if (scan->deleted) {
 		code = error_set(err, ERR_NOT_FOUND, "scan %s was deleted meanwhile", scan->id);
+	} else if (scan->progress[index] == MISSING && scan->closing) {
+		code = error_set(err, ERR_CONFLICT, "the scan was completed without projection %d", index);
 	} else if (scan->progress[index] == MISSING) {
 		scan->progress[index] = CLAIMED;
 		*ret_claim = CLAIM_GRANTED;
@@ -613,6 +842,8 @@ int stored_scan_open(struct stored_scan *scan, bool writing, int *ret_descriptor
 	store_scan_directory(scan->store, scan->id, directory);
 	snprintf(path, sizeof(path), "%s/projections.raw", directory);
 	file = open(path, (writing ? O_RDWR : O_RDONLY) | O_CLOEXEC);
+	if (file < 0 && was_deleted(scan))
+		return error_set(err, ERR_NOT_FOUND, "there is no scan \"%s\" any more", scan->id);
 	if (file < 0)
 		return error_set_errno(err, errno, "open %s", path);
 	*ret_descriptor = file;
@@ -625,7 +856,8 @@ static int insert_projections(struct store *store, struct received_projection *b
 	int code = 0;
 
 	for (int i = 0; i < count && code == 0; i++) {
-		batch[i].stored = !batch[i].scan->deleted; /* cannot change: writer.lock is held */
+		/* Cannot change: writer.lock is held. */
+		batch[i].stored = !batch[i].scan->deleted && !batch[i].scan->closing;
 		if (!batch[i].stored)
 			continue;
 		query_begin(&query, &store->writer, "INSERT INTO projections (scan, view, sha256) VALUES (?, ?, ?)",
@@ -638,43 +870,41 @@ static int insert_projections(struct store *store, struct received_projection *b
 	return code;
 }
 
-/* Shows in memory what is on the disk now; true when that made the scan ready. */
-static bool show_projection(const struct received_projection *projection)
+/* Shows in memory what is on the disk now. */
+static void show_projection(const struct received_projection *projection, double now)
 {
 	struct stored_scan *scan = projection->scan;
-	bool ready = false;
 
 	pthread_mutex_lock(&scan->lock);
 	assert(scan->progress[projection->index] == CLAIMED);
-	scan->progress[projection->index] = projection->stored ? STORED : MISSING;
+	scan->progress[projection->index] = MISSING;
 	if (projection->stored) {
-		memcpy(scan->sha256[projection->index], projection->sha256, 32);
-		scan->received++;
-		ready = is_ready(scan);
+		add_received(scan, projection->index, projection->sha256);
+		scan->arrived = now;
 	}
 	pthread_mutex_unlock(&scan->lock);
-	return ready;
 }
 
 int store_put_projections(struct store *store, struct received_projection *batch, int count, struct error *err)
 {
 	unsigned stored = 0;
-	bool ready = false;
+	struct timespec now;
 	int code = store_begin(store, err);
 
 	if (code == 0)
 		code = store_end(store, insert_projections(store, batch, count, err), err);
 	if (code != 0)
 		return code;
+	clock_gettime(CLOCK_MONOTONIC, &now);
 	for (int i = 0; i < count; i++) {
-		ready |= show_projection(&batch[i]);
+		show_projection(&batch[i], (double)now.tv_sec + (double)now.tv_nsec * 1e-9);
 		stored += batch[i].stored;
 		if (i + 1 == count || batch[i + 1].scan != batch[i].scan)
 			watch_wake(&batch[i].scan->watchers);
 	}
 	atomic_fetch_add(&store->projections_stored, stored);
-	if (ready)
-		watch_wake(&store->ready);
+	if (stored > 0)
+		watch_wake(&store->arrivals);
 	return 0;
 }
 
@@ -735,7 +965,7 @@ int store_put_image(struct store *store, struct stored_scan *scan, enum image im
 		    struct error *err)
 {
 	uint8_t sha256[32];
-	bool there, ready;
+	bool there;
 	int code;
 
 	if (EVP_Digest(pixels, image_bytes(scan, image), sha256, NULL, EVP_sha256(), NULL) != 1)
@@ -751,11 +981,11 @@ int store_put_image(struct store *store, struct stored_scan *scan, enum image im
 	pthread_mutex_lock(&scan->lock);
 	scan->image[image] = code == 0 ? STORED : MISSING;
 	memcpy(scan->image_sha256[image], sha256, 32);
-	ready = code == 0 && is_ready(scan);
+	scan->basis += code == 0;
 	pthread_mutex_unlock(&scan->lock);
 	watch_wake(&scan->watchers);
-	if (ready)
-		watch_wake(&store->ready);
+	if (code == 0)
+		watch_wake(&store->arrivals);
 	if (code == 0)
 		*ret_new = true;
 	return code;
@@ -797,6 +1027,7 @@ static int load_scan(struct store *store, struct query *query, struct error *err
 	read_image_digest(query, 10, scan, IMAGE_FLAT);
 	read_image_digest(query, 11, scan, IMAGE_DARK);
 	read_image_digest(query, 12, scan, IMAGE_DEFECTS);
+	scan->closed = scan->closing = sqlite3_column_int(row, 13) != 0;
 	if (sample < 0 || quantity < 0 || !id_valid(scan->id)) {
 		code = error_set(err, ERR_IO, "catalogue: the row of scan \"%s\" makes no sense", scan->id);
 		scan_free_memory(scan);
@@ -817,9 +1048,7 @@ static void load_projection(struct stored_scan *scan, sqlite3_stmt *row)
 		log_line(LEVEL_ERROR, "scan %s: the row of projection %d makes no sense", scan->id, view);
 		return;
 	}
-	memcpy(scan->sha256[view], sqlite3_column_blob(row, 2), 32);
-	scan->progress[view] = STORED;
-	scan->received++;
+	add_received(scan, view, sqlite3_column_blob(row, 2));
 }
 
 /* Called while nobody else has the store: no locks. */
@@ -829,17 +1058,19 @@ int store_load_scans(struct store *store, struct error *err)
 	struct query query;
 	int code = 0;
 
-	query_begin(&query, &store->reader,
-		    "SELECT number, id, name, created, columns, rows, count, sample, quantity, air, flat, dark, defects"
-		    " FROM scans ORDER BY id",
-		    err);
+	query_begin(
+	    &query, &store->reader,
+	    "SELECT number, id, name, created, columns, rows, count, sample, quantity, air, flat, dark, defects,"
+	    " closed FROM scans ORDER BY id",
+	    err);
 	while (code == 0 && query_row(&query))
 		code = load_scan(store, &query, err);
 	if (query_end(&query) != 0)
 		code = query.code;
 	for (int i = 0; i < store->scan_count && code == 0; i++) {
 		scan = store->scans[i];
-		query_begin(&query, &store->reader, "SELECT scan, view, sha256 FROM projections WHERE scan = ?", err);
+		query_begin(&query, &store->reader,
+			    "SELECT scan, view, sha256 FROM projections WHERE scan = ? ORDER BY view", err);
 		query_integer(&query, scan->number);
 		while (query_row(&query))
 			load_projection(scan, query.statement);

@@ -10,6 +10,7 @@
 #include "daemon/supervise.h"
 
 #include <errno.h>
+#include <limits.h>
 #include <poll.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -18,6 +19,7 @@
 #include <time.h>
 #include <unistd.h>
 
+#include "daemon/document.h"
 #include "daemon/files.h"
 #include "daemon/log.h"
 #include "daemon/spawn.h"
@@ -31,6 +33,11 @@ static const double RESTART_FIRST = 0.1, RESTART_LAST = 30; /* s between a death
 static const double STEADY = 60;                            /* s of life after which earlier deaths are forgotten */
 static const double RETRY = 1;                              /* s until a change that the disk refused is tried again */
 static const double EXIT = 2;                               /* s that a worker has to exit by itself */
+/*
+ * s without a projection after which a worker that waits for some is anybody's: an arm that turns sends several a
+ * second, and who has stopped has nothing to lose but what it has reconstructed.
+ */
+static const double PATIENCE = 2;
 static const double NEVER = 1e300;
 
 const char *const worker_state_names[WORKER_STATE_COUNT] = {"absent", "starting", "idle", "busy", "ending"};
@@ -62,7 +69,12 @@ struct worker {
 	struct queue_running running;
 	int checkpoint; /* that it began from */
 	bool cancelling, yielding;
-	int failure_code; /* why we told it to stop, 0: we did not */
+	/* While its job waits for the rest of its projections: the scan, a reference; NULL otherwise. */
+	struct stored_scan *arriving;
+	unsigned basis;         /* of the scan when it began */
+	int told, taken;        /* projections that it was told of, that it has reconstructed */
+	double attended, again; /* monotonic: since when; not before, after the catalogue refused */
+	int failure_code;       /* why we told it to stop, 0: we did not */
 	char failure_text[320];
 	struct ending ending;
 };
@@ -74,7 +86,7 @@ struct supervise {
 	int count;
 	int devices[WORKERS_MAX];
 	int wake; /* eventfd */
-	struct watch jobs_watch, ready_watch;
+	struct watch jobs_watch, arrivals_watch;
 	pthread_t thread;
 
 	struct worker workers[WORKERS_MAX]; /* the thread's own */
@@ -131,28 +143,74 @@ static void publish(struct supervise *supervise, const struct worker *worker)
 
 /* ---- the end of a job ---- */
 
+/* It does not wait for projections any more, or not with this worker. */
+static void stop_attending(struct worker *worker)
+{
+	stored_scan_release(worker->arriving);
+	worker->arriving = NULL;
+}
+
+/* Its last projection was told: from now on it is a job as any other. A code when the catalogue refused. */
+static int record_running(struct worker *worker, struct error *err)
+{
+	const struct job_change change = {
+	    .backend = worker->backend, .device = worker->info.name, .reason = "its last projection is there"};
+	struct job_record record;
+	int code = job_set_state(worker->job, JOB_RUNNING, &change, err);
+
+	if (code != 0)
+		return code;
+	job_record(worker->job, &record);
+	worker->running.ticket = record.ticket;
+	stop_attending(worker);
+	return 0;
+}
+
+static int record_ending(struct worker *worker, struct error *err)
+{
+	const struct ending *ending = &worker->ending;
+	const struct job_change change = {
+	    .error_code = ending->error_code,
+	    .error_text = ending->error_text,
+	    .checkpoint = ending->checkpoint,
+	    .crashed = ending->crashed,
+	    .yielded = ending->yielded,
+	    .reason = ending->to == JOB_QUEUED || ending->to == JOB_WAITING ? ending->error_text : NULL};
+	int code = 0;
+
+	/* It was faster than the catalogue. */
+	if (worker->arriving != NULL && ending->to == JOB_SUCCEEDED)
+		code = record_running(worker, err);
+	/* One that waits as before has no news. */
+	if (code == 0 && (ending->to != JOB_WAITING || ending->crashed))
+		code = job_set_state(worker->job, ending->to, &change, err);
+	return code;
+}
+
 /* The job's new state reaches the catalogue now, or is tried again: a full disk must not lose how it ended. */
 static void finish(struct supervise *supervise, struct worker *worker)
 {
-	struct ending *ending = &worker->ending;
-	struct job_change change = {.error_code = ending->error_code,
-				    .error_text = ending->error_text,
-				    .checkpoint = ending->checkpoint,
-				    .crashed = ending->crashed,
-				    .yielded = ending->yielded,
-				    .reason = ending->to == JOB_QUEUED ? ending->error_text : NULL};
 	struct error err;
-	int code = job_set_state(worker->job, ending->to, &change, &err);
+	int code = record_ending(worker, &err);
 
 	if (code != 0 && code != ERR_CONFLICT) {
-		ending->again = now_monotonic() + RETRY;
+		worker->ending.again = now_monotonic() + RETRY;
 		log_line(LEVEL_ERROR, "the end of a job cannot be recorded yet: %s", err.text);
 		return;
 	}
+	if (worker->arriving != NULL)
+		job_leave(worker->job);
+	stop_attending(worker);
 	job_release(worker->job);
 	worker->job = NULL;
-	*ending = (struct ending){0};
+	worker->ending = (struct ending){0};
 	publish(supervise, worker);
+}
+
+/* Where a job goes that its worker could not bring to an end. */
+static enum job_state back_to(const struct worker *worker)
+{
+	return worker->arriving != NULL ? JOB_WAITING : JOB_QUEUED;
 }
 
 static void end_job(struct supervise *supervise, struct worker *worker, struct ending ending, const char *text)
@@ -180,11 +238,12 @@ static void lose_job(struct supervise *supervise, struct worker *worker, int err
 		end_job(supervise, worker, (struct ending){.to = JOB_FAILED, .error_code = error_code, .crashed = true},
 			text);
 	} else {
-		end_job(
-		    supervise, worker,
-		    (struct ending){
-			.to = JOB_QUEUED, .error_code = error_code, .checkpoint = record.checkpoint, .crashed = true},
-		    how);
+		end_job(supervise, worker,
+			(struct ending){.to = back_to(worker),
+					.error_code = error_code,
+					.checkpoint = record.checkpoint,
+					.crashed = true},
+			how);
 	}
 }
 
@@ -217,15 +276,15 @@ static void job_ended(struct supervise *supervise, struct worker *worker, const 
 			worker->deadline = now_monotonic() + EXIT;
 		}
 		end_job(supervise, worker,
-			(struct ending){.to = JOB_QUEUED, .checkpoint = message->iteration, .yielded = true},
+			(struct ending){.to = back_to(worker), .checkpoint = message->iteration, .yielded = true},
 			"it made room");
 	} else if (message->code == ERR_NO_SPACE && (worker->yielding || supervise->stop_by < NEVER)) {
 		/* Most likely its checkpoint: who is asked to make room must not fail for that. */
-		end_job(supervise, worker, (struct ending){.to = JOB_QUEUED, .checkpoint = worker->checkpoint},
+		end_job(supervise, worker, (struct ending){.to = back_to(worker), .checkpoint = worker->checkpoint},
 			message->text);
 	} else if (message->code == ERR_INVALID && worker->checkpoint > 0) {
 		end_job(supervise, worker, (struct ending){.to = JOB_QUEUED, .crashed = true},
-			"its checkpoint is damaged: from the start");
+			"its checkpoint is damaged or gone: from the start");
 	} else {
 		end_job(supervise, worker, (struct ending){.to = JOB_FAILED, .error_code = message->code},
 			message->text);
@@ -248,6 +307,57 @@ static void tell(struct worker *worker, enum message_kind kind)
 	/* Gone already: its pidfd tells. */
 	if (message_send(worker->child.socket, &message, &err) != 0)
 		log_line(LEVEL_DEBUG, "worker %d: %s", worker->index, err.text);
+}
+
+/* What has arrived since it was told, so that one message at a time is under way, however far behind the worker is. */
+static void tell_arrivals(struct worker *worker)
+{
+	enum { MOST = 4 * MESSAGE_RUNS_MAX };
+	struct message message = {.kind = MESSAGE_VIEWS};
+	struct job_facts facts;
+	struct error err;
+	int projections[MOST], count, added = 0;
+
+	count = stored_scan_arrivals(worker->arriving, worker->told, projections, MOST);
+	while (added < count && projection_runs_add(&message.runs, projections[added]))
+		added++;
+	if (added == 0)
+		return;
+	job_facts(worker->job, &facts);
+	snprintf(message.job, sizeof(message.job), "%s", facts.id);
+	worker->told += added;
+	/* Gone already: its pidfd tells. */
+	if (message_send(worker->child.socket, &message, &err) != 0)
+		log_line(LEVEL_DEBUG, "worker %d: %s", worker->index, err.text);
+}
+
+/* Projections that came go to the worker that waits for them; with the last one its job runs. */
+static void feed(struct worker *worker)
+{
+	struct scan_facts facts;
+	struct error err;
+	int code;
+
+	if (worker->arriving == NULL || worker->state != WORKER_BUSY || worker->ending.due || worker->cancelling ||
+	    worker->yielding)
+		return;
+	stored_scan_facts(worker->arriving, &facts);
+	if (facts.basis != worker->basis) {
+		log_line(LEVEL_INFO, "worker %d: its scan is to be understood otherwise now, it begins again",
+			 worker->index);
+		tell(worker, MESSAGE_YIELD);
+		worker->yielding = true;
+		return;
+	}
+	if (worker->told == worker->taken)
+		tell_arrivals(worker);
+	if (worker->told < facts.count || now_monotonic() < worker->again)
+		return;
+	code = record_running(worker, &err);
+	if (code != 0) {
+		worker->again = now_monotonic() + RETRY;
+		log_line(LEVEL_ERROR, "a job cannot be running yet: %s", err.text);
+	}
 }
 
 /* Something of the job could not be kept: then it must not seem to have succeeded. */
@@ -309,6 +419,11 @@ static void on_message(struct supervise *supervise, struct worker *worker, const
 	switch (message->kind) {
 	case MESSAGE_OPENED:
 		job_set_plan(worker->job, &message->memory, message->plan);
+		break;
+	case MESSAGE_TAKEN:
+		worker->taken = message->count;
+		job_taken(worker->job, message->count);
+		feed(worker);
 		break;
 	case MESSAGE_PROGRESS:
 		job_progress(worker->job, message->stage, message->iteration, message->fraction);
@@ -402,7 +517,8 @@ static void worker_died(struct supervise *supervise, struct worker *worker, bool
 	worker->deadline = NEVER;
 	if (worker->job != NULL && !worker->ending.due) {
 		if (stopping)
-			end_job(supervise, worker, (struct ending){.to = JOB_QUEUED, .checkpoint = worker->checkpoint},
+			end_job(supervise, worker,
+				(struct ending){.to = back_to(worker), .checkpoint = worker->checkpoint},
 				"the daemon stops");
 		else
 			lose_job(supervise, worker, ERR_INTERNAL, text);
@@ -419,10 +535,32 @@ static void worker_died(struct supervise *supervise, struct worker *worker, bool
 
 /* ---- giving work ---- */
 
+/* Of a scan that was closed with projections missing: those that are there. */
+static int add_present(struct message *message, struct stored_scan *scan, const struct scan_facts *facts,
+		       struct error *err)
+{
+	unsigned char *flags = malloc((size_t)facts->count);
+	struct recipe *recipe = &message->request.recipe;
+
+	if (flags == NULL)
+		return error_set_errno(err, ENOMEM, "list of %d projections", facts->count);
+	stored_scan_received(scan, flags);
+	message->reduced = true;
+	for (int i = 0; i < facts->count; i++)
+		message->present[i / 8] |= (uint8_t)(flags[i] << i % 8);
+	free(flags);
+	/* Asked for with all projections in mind. */
+	if (recipe->sart.on && recipe->sart.subsets > facts->received)
+		recipe->sart.subsets = facts->received;
+	return 0;
+}
+
+/* The reference to the scan is the caller's. */
 static int make_start(struct supervise *supervise, const struct job_record *record, struct message *message,
-		      struct error *err)
+		      struct stored_scan **ret_scan, struct error *err)
 {
 	struct store *store = jobs_store(supervise->jobs);
+	struct scan_facts facts;
 	struct stored_scan *scan;
 	int code = store_scan_find(store, record->scan, &scan, err);
 
@@ -432,14 +570,20 @@ static int make_start(struct supervise *supervise, const struct job_record *reco
 	snprintf(message->job, sizeof(message->job), "%s", record->id);
 	store_scan_directory(store, record->scan, message->scan_directory);
 	store_job_directory(store, record->id, message->job_directory);
+	stored_scan_facts(scan, &facts);
 	code = job_request_parse(record->request, strlen(record->request), &message->request, err);
+	if (code == 0 && facts.closed)
+		code = add_present(message, scan, &facts, err);
 	if (code == 0)
-		code = job_request_resolve(&message->request, stored_scan_parsed(scan), err);
+		code = job_request_resolve(&message->request, stored_scan_measured(scan), err);
 	if (code == 0)
 		code = directory_make(message->job_directory, err);
-	if (code != 0)
+	if (code != 0) {
 		message_clear(message);
-	stored_scan_release(scan);
+		stored_scan_release(scan);
+	} else {
+		*ret_scan = scan;
+	}
 	return code;
 }
 
@@ -453,6 +597,9 @@ static void begin(struct supervise *supervise, struct worker *worker, struct job
 	worker->checkpoint = record->checkpoint;
 	worker->cancelling = worker->yielding = false;
 	worker->failure_code = 0;
+	worker->told = worker->taken = 0;
+	worker->again = 0;
+	worker->attended = now_monotonic();
 	worker->state = WORKER_BUSY;
 	worker->deadline = NEVER;
 	if (message_send(worker->child.socket, message, &err) != 0) {
@@ -464,32 +611,98 @@ static void begin(struct supervise *supervise, struct worker *worker, struct job
 	publish(supervise, worker);
 }
 
-/* The queue's first job to this idle worker; a code when no more can be given just now. */
-static int give_job(struct supervise *supervise, struct worker *worker, struct job *job, struct error *err)
+/* What a radiographer must know of a volume that was made of a part of the scan. */
+static void warn_incomplete(struct supervise *supervise, struct worker *worker, struct stored_scan *scan)
 {
-	struct job_change change = {.backend = worker->backend, .device = worker->info.name};
+	struct scan_facts facts;
+	struct error err;
+	char detail[200];
+
+	stored_scan_facts(scan, &facts);
+	if (!facts.closed)
+		return;
+	incomplete_detail(&facts, detail);
+	if (job_add_warning(worker->job, "incomplete", detail, &err) != 0)
+		stop_job(supervise, worker, &err);
+}
+
+/* To running with all that is there, or, `arriving`, to attend it while the rest comes. */
+static int begin_job(struct supervise *supervise, struct worker *worker, struct job *job,
+		     const struct job_record *record, struct message *message, struct stored_scan *scan, bool arriving,
+		     struct error *err)
+{
+	const struct job_change change = {.backend = worker->backend, .device = worker->info.name};
+	struct scan_facts facts;
+	int code;
+
+	message->arriving = arriving;
+	if (arriving)
+		code = job_attend(job, worker->backend, worker->info.name, err);
+	else
+		code = job_set_state(job, JOB_RUNNING, &change, err);
+	if (code != 0) {
+		stored_scan_release(scan);
+		return code;
+	}
+	begin(supervise, worker, job, record, message);
+	warn_incomplete(supervise, worker, scan);
+	if (!arriving) {
+		stored_scan_release(scan);
+		return 0;
+	}
+	stored_scan_facts(scan, &facts);
+	worker->running.ticket = LLONG_MAX; /* it has none before it runs, and makes room first */
+	worker->arriving = scan;
+	worker->basis = facts.basis;
+	feed(worker);
+	return 0;
+}
+
+/* A job to this idle worker; a code when no more can be given just now. */
+static int give_job(struct supervise *supervise, struct worker *worker, struct job *job, bool arriving,
+		    struct error *err)
+{
 	struct message *message = calloc(1, sizeof(*message));
+	struct stored_scan *scan;
 	struct job_record record;
+	struct job_change change;
 	struct error why;
 	int code;
 
 	if (message == NULL)
 		return error_set_errno(err, ENOMEM, "message");
 	job_record(job, &record);
-	code = make_start(supervise, &record, message, &why);
+	code = make_start(supervise, &record, message, &scan, &why);
 	if (code == ERR_NO_SPACE || code == ERR_NO_MEMORY) {
 		*err = why;
 	} else if (code != 0) {
 		change = (struct job_change){.error_code = code, .error_pointer = why.pointer, .error_text = why.text};
 		code = job_set_state(job, JOB_FAILED, &change, err);
 	} else {
-		code = job_set_state(job, JOB_RUNNING, &change, err);
-		if (code == 0)
-			begin(supervise, worker, job, &record, message);
+		code = begin_job(supervise, worker, job, &record, message, scan, arriving, err);
 		message_clear(message);
 	}
 	free(message);
 	return code == ERR_CONFLICT ? 0 : code; /* cancelled in this very moment */
+}
+
+/* The queue's first, or a waiting job: before it when its projections come just now and it has the higher priority. */
+static struct job *choose_job(struct supervise *supervise, bool *ret_arriving)
+{
+	struct job *queued = jobs_next(supervise->jobs), *waiting, *chosen;
+	struct job_facts a, b;
+	bool now;
+
+	waiting = jobs_arriving(supervise->jobs, now_monotonic() - PATIENCE, &now);
+	chosen = queued != NULL ? queued : waiting;
+	if (queued != NULL && waiting != NULL && now) {
+		job_facts(queued, &a);
+		job_facts(waiting, &b);
+		chosen = b.priority > a.priority ? waiting : queued;
+	}
+	*ret_arriving = chosen == waiting;
+	job_release(chosen == waiting ? queued : waiting);
+	return chosen;
 }
 
 static void dispatch(struct supervise *supervise)
@@ -500,14 +713,15 @@ static void dispatch(struct supervise *supervise)
 	for (int i = 0; i < supervise->count && code == 0;) {
 		struct worker *worker = &supervise->workers[i];
 		struct job *job = NULL;
+		bool arriving = false;
 
 		if (worker->state == WORKER_IDLE && worker->job == NULL)
-			job = jobs_next(supervise->jobs);
+			job = choose_job(supervise, &arriving);
 		if (job == NULL) {
 			i++;
 			continue;
 		}
-		code = give_job(supervise, worker, job, &err);
+		code = give_job(supervise, worker, job, arriving, &err);
 		job_release(job);
 	}
 	if (code != 0) {
@@ -534,12 +748,48 @@ static void carry_out_cancels(struct supervise *supervise)
 	}
 }
 
-/* Who runs with a lower priority than somebody who waits makes room. */
+/* When the patience with a worker that waits for projections ends; NEVER for any other. */
+static double patience_ends(const struct worker *worker)
+{
+	struct scan_facts facts;
+
+	if (worker->arriving == NULL || worker->ending.due || worker->yielding)
+		return NEVER;
+	stored_scan_facts(worker->arriving, &facts);
+	/* It has everything: what it does takes as long as it takes. */
+	if (worker->told == facts.count)
+		return NEVER;
+	return (facts.arrived > worker->attended ? facts.arrived : worker->attended) + PATIENCE;
+}
+
+/* Projections that came later than this are worth a worker: just now, or after the last of somebody who gives way. */
+static double arrivals_since(const struct supervise *supervise, double now)
+{
+	double since = now - PATIENCE;
+	struct scan_facts facts;
+
+	for (int i = 0; i < supervise->count; i++) {
+		if (patience_ends(&supervise->workers[i]) > now)
+			continue;
+		stored_scan_facts(supervise->workers[i].arriving, &facts);
+		since = facts.arrived < since ? facts.arrived : since;
+	}
+	return since;
+}
+
+/* Who runs with a lower priority than somebody who waits for a worker makes room. */
 static void preempt(struct supervise *supervise)
 {
 	struct queue_running running[WORKERS_MAX];
 	int of[WORKERS_MAX], busy, idle, victim;
+	double now = now_monotonic();
+	bool arriving;
+	struct job *waiting = jobs_arriving(supervise->jobs, arrivals_since(supervise, now), &arriving);
+	struct job_facts facts = {.priority = PRIORITY_ROUTINE};
 
+	if (waiting != NULL)
+		job_facts(waiting, &facts);
+	job_release(waiting);
 	do {
 		busy = idle = 0;
 		for (int i = 0; i < supervise->count; i++) {
@@ -550,9 +800,11 @@ static void preempt(struct supervise *supervise)
 				continue;
 			running[busy] = worker->running;
 			running[busy].leaving = worker->cancelling || worker->yielding;
+			running[busy].gives_way = patience_ends(worker) <= now;
 			of[busy++] = i;
 		}
-		victim = jobs_victim(supervise->jobs, running, busy, idle);
+		victim = jobs_victim(supervise->jobs, waiting != NULL && arriving ? &facts.priority : NULL, running,
+				     busy, idle);
 		if (victim >= 0) {
 			tell(&supervise->workers[of[victim]], MESSAGE_YIELD);
 			supervise->workers[of[victim]].yielding = true;
@@ -590,13 +842,19 @@ static void look_at_clock(struct supervise *supervise, bool stopping)
 
 static int poll_timeout(const struct supervise *supervise, bool stopping)
 {
-	double next = NEVER, left;
+	double next = NEVER, now = now_monotonic(), left;
 
 	for (int i = 0; i < supervise->count; i++) {
 		const struct worker *worker = &supervise->workers[i];
 
+		double patience = patience_ends(worker);
+
 		if (worker->ending.due && worker->ending.again < next)
 			next = worker->ending.again;
+		if (worker->arriving != NULL && !worker->ending.due && worker->again > now && worker->again < next)
+			next = worker->again;
+		if (patience > now && patience < next)
+			next = patience;
 		if (worker->state == WORKER_ABSENT && !stopping && worker->start_at < next)
 			next = worker->start_at;
 		if (worker->state != WORKER_ABSENT && worker->deadline < next)
@@ -606,7 +864,7 @@ static int poll_timeout(const struct supervise *supervise, bool stopping)
 		next = supervise->dispatch_at;
 	if (next == NEVER)
 		return -1;
-	left = (next - now_monotonic()) * 1000;
+	left = (next - now) * 1000;
 	return left <= 0 ? 0 : left > 60000 ? 60000 : (int)left + 1;
 }
 
@@ -624,6 +882,12 @@ static void move_jobs(struct supervise *supervise)
 	}
 	dispatch(supervise);
 	preempt(supervise);
+}
+
+static void feed_all(struct supervise *supervise)
+{
+	for (int i = 0; i < supervise->count; i++)
+		feed(&supervise->workers[i]);
 }
 
 static void read_workers(struct supervise *supervise, const struct pollfd *fds, bool stopping)
@@ -714,6 +978,7 @@ static void *supervise_loop(void *context)
 	while (!stop_asked(supervise)) {
 		look_at_clock(supervise, false);
 		carry_out_cancels(supervise);
+		feed_all(supervise);
 		move_jobs(supervise);
 		wait_and_read(supervise, false);
 	}
@@ -724,6 +989,7 @@ static void *supervise_loop(void *context)
 	}
 	/* What the catalogue would not take stays `running` there; the next start queues it again. */
 	for (int i = 0; i < supervise->count; i++) {
+		stop_attending(&supervise->workers[i]);
 		job_release(supervise->workers[i].job);
 		supervise->workers[i].job = NULL;
 	}
@@ -776,15 +1042,15 @@ int supervise_start(struct jobs *jobs, const struct supervise_options *options, 
 		goto out;
 	}
 	supervise->jobs_watch = (struct watch){.wake = wake_up, .context = supervise};
-	supervise->ready_watch = supervise->jobs_watch;
+	supervise->arrivals_watch = supervise->jobs_watch;
 	jobs_watch(jobs, &supervise->jobs_watch);
-	store_watch_ready(jobs_store(jobs), &supervise->ready_watch);
+	store_watch_arrivals(jobs_store(jobs), &supervise->arrivals_watch);
 	result = pthread_create(&supervise->thread, NULL, supervise_loop, supervise);
 	if (result == 0) {
 		*ret_supervise = supervise;
 		return 0;
 	}
-	store_unwatch_ready(jobs_store(jobs), &supervise->ready_watch);
+	store_unwatch_arrivals(jobs_store(jobs), &supervise->arrivals_watch);
 	jobs_unwatch(jobs, &supervise->jobs_watch);
 	close(supervise->wake);
 out:
@@ -802,7 +1068,7 @@ void supervise_stop(struct supervise *supervise)
 	pthread_mutex_unlock(&supervise->lock);
 	wake_up(supervise);
 	pthread_join(supervise->thread, NULL);
-	store_unwatch_ready(jobs_store(supervise->jobs), &supervise->ready_watch);
+	store_unwatch_arrivals(jobs_store(supervise->jobs), &supervise->arrivals_watch);
 	jobs_unwatch(supervise->jobs, &supervise->jobs_watch);
 	close(supervise->wake);
 	pthread_mutex_destroy(&supervise->lock);

@@ -108,6 +108,13 @@ struct uploads {
 	bool stop, failed;
 	struct slot_list queue, parked;
 	unsigned long long releases; /* times that claims came free */
+	/*
+	 * Batches taken, and those whose commit is over. They are committed in the order in which they were taken, so
+	 * that the projections of a body are stored in the body's order: what is reconstructed as it arrives has the
+	 * same bits each time.
+	 */
+	unsigned long long taken, over;
+	pthread_cond_t turn; /* `over` has grown */
 	struct upload *starved_first, **starved_end;
 	size_t used;         /* bytes of slots and grants */
 	struct slot *spares; /* all of one size */
@@ -931,8 +938,27 @@ static int gather(struct slot *const slots[], int count, struct received_project
 	return 0;
 }
 
+static int why_not_stored(const struct received_projection *projection, struct error *err)
+{
+	struct scan_facts facts;
+
+	stored_scan_facts(projection->scan, &facts);
+	if (facts.deleted)
+		return error_set(err, ERR_NOT_FOUND, "the scan was deleted meanwhile");
+	return error_set(err, ERR_CONFLICT, "the scan was completed without projection %d", projection->index);
+}
+
+static void await_turn(struct uploads *uploads, unsigned long long batch)
+{
+	pthread_mutex_lock(&uploads->lock);
+	while (uploads->over != batch)
+		pthread_cond_wait(&uploads->turn, &uploads->lock);
+	pthread_mutex_unlock(&uploads->lock);
+}
+
 /* The bytes, then the rows. */
-static int commit(struct uploads *uploads, struct slot *const slots[], int count, struct error *err)
+static int commit(struct uploads *uploads, unsigned long long number, struct slot *const slots[], int count,
+		  struct error *err)
 {
 	struct received_projection *batch = NULL;
 	int total = 0, at = 0, code;
@@ -942,6 +968,7 @@ static int commit(struct uploads *uploads, struct slot *const slots[], int count
 		code = check_trust(uploads, err);
 	if (code == 0)
 		code = gather(slots, count, &batch, &total, err);
+	await_turn(uploads, number);
 	if (code == 0)
 		code = store_put_projections(uploads->store, batch, total, err);
 	for (int i = 0; i < count && code == 0; i++) {
@@ -951,18 +978,20 @@ static int commit(struct uploads *uploads, struct slot *const slots[], int count
 			if (batch[at].stored)
 				continue;
 			slots[i]->outcome = SLOT_FAILED;
-			slots[i]->code = error_set(&slots[i]->error, ERR_NOT_FOUND, "the scan was deleted meanwhile");
+			slots[i]->code = why_not_stored(&batch[at], &slots[i]->error);
 		}
 	}
 	free(batch);
 	return code;
 }
 
-static void commit_written(struct uploads *uploads, struct slot *const slots[], int count)
+static void commit_written(struct uploads *uploads, unsigned long long number, struct slot *const slots[], int count)
 {
 	struct error err = {0};
 
-	if (count == 0 || commit(uploads, slots, count, &err) == 0)
+	if (count == 0)
+		await_turn(uploads, number);
+	if (count == 0 || commit(uploads, number, slots, count, &err) == 0)
 		return;
 	for (int i = 0; i < count; i++) {
 		if (slots[i]->data != NULL) /* held ones are given back with their upload */
@@ -1063,7 +1092,7 @@ static void *run_writer(void *context)
 	pthread_mutex_lock(&uploads->lock);
 	while (wait_for_work(uploads)) {
 		int count = take_batch(uploads, slots), written_count = 0;
-		unsigned long long releases = uploads->releases;
+		unsigned long long releases = uploads->releases, number = uploads->taken++;
 		bool claims_given_back = false;
 
 		pthread_mutex_unlock(&uploads->lock);
@@ -1073,8 +1102,10 @@ static void *run_writer(void *context)
 				written[written_count++] = slots[i];
 			claims_given_back |= slots[i]->outcome == SLOT_FAILED;
 		}
-		commit_written(uploads, written, written_count);
+		commit_written(uploads, number, written, written_count);
 		pthread_mutex_lock(&uploads->lock);
+		uploads->over++;
+		pthread_cond_broadcast(&uploads->turn);
 		settle_all(uploads, slots, count, releases);
 		if (written_count > 0 || claims_given_back)
 			requeue_parked(uploads);
@@ -1102,6 +1133,7 @@ int uploads_new(struct store *store, const struct uploads_options *options, stru
 	pthread_condattr_init(&monotonic);
 	pthread_condattr_setclock(&monotonic, CLOCK_MONOTONIC);
 	pthread_cond_init(&uploads->work, &monotonic);
+	pthread_cond_init(&uploads->turn, NULL);
 	pthread_condattr_destroy(&monotonic);
 	for (int i = 0; i < WRITERS; i++) {
 		int code = pthread_create(&uploads->writers[i], NULL, run_writer, uploads);
@@ -1129,6 +1161,7 @@ void uploads_free(struct uploads *uploads)
 		pthread_join(uploads->writers[i], NULL);
 	assert(uploads->used == 0);
 	free_spares(uploads);
+	pthread_cond_destroy(&uploads->turn);
 	pthread_cond_destroy(&uploads->work);
 	pthread_mutex_destroy(&uploads->lock);
 	free(uploads);

@@ -4,7 +4,9 @@
  * It says hello, then takes one job at a time from the socket and runs it in
  * its only thread (the backends bring their own). While a job runs, the socket
  * is looked at whenever the pipeline asks whether to go on, which it does
- * between steps; so cancel and yield need no second thread. It dies with the
+ * between steps; so cancel and yield need no second thread. A job that begins
+ * before its projections are complete gets their numbers over the same socket,
+ * and reads them from the file, which the daemon has just written. It dies with the
  * daemon, and it may die alone: everything that it has finished is on the disk.
  */
 #include <errno.h>
@@ -26,6 +28,7 @@ enum { EXIT_START = 1, EXIT_USAGE = 2, EXIT_DEVICE = 3 };
 enum { NICENESS = 5, OOM_SCORE = 500 };
 
 static const double PROGRESS_LEAST = 0.1; /* s between two reports of mere progress */
+enum { LOOK_MS = 250 };                   /* between two looks for SIGTERM while nothing arrives */
 static const double CHANGE_LEAST = 0.005; /* s between two reports of a new stage or iteration */
 
 struct arguments {
@@ -41,10 +44,12 @@ struct worker {
 
 	char job[64]; /* that runs */
 	bool cancel, yield, quit;
+	int *told; /* [told_count], room for VIEWS_MAX: projections that are there, as the daemon named them */
+	int told_count;
 	int iteration; /* done */
 	double reported;
-	enum stage stage;
-	int stage_iteration;
+	struct message progress; /* the last that was reported, or, `behind`, that came too soon after it */
+	bool behind;
 };
 
 /* SIGTERM: as MESSAGE_QUIT while a job runs, the end at once otherwise. */
@@ -86,6 +91,14 @@ static int report(struct worker *worker, struct message *message)
 	return code;
 }
 
+static void note_arrivals(struct worker *worker, const struct projection_runs *runs)
+{
+	for (int i = 0; i < runs->count; i++) {
+		for (int k = runs->first[i]; k <= runs->last[i] && worker->told_count < VIEWS_MAX; k++)
+			worker->told[worker->told_count++] = k;
+	}
+}
+
 static void obey(struct worker *worker, const struct message *message)
 {
 	bool mine = strcmp(message->job, worker->job) == 0;
@@ -93,24 +106,37 @@ static void obey(struct worker *worker, const struct message *message)
 	worker->cancel |= message->kind == MESSAGE_CANCEL && mine;
 	worker->yield |= message->kind == MESSAGE_YIELD && mine;
 	worker->quit |= message->kind == MESSAGE_QUIT;
+	if (message->kind == MESSAGE_VIEWS && mine)
+		note_arrivals(worker, &message->runs);
+}
+
+/* One message, waiting for it at most that long; false when there was none. */
+static bool obey_next(struct worker *worker, int timeout_ms)
+{
+	struct message message;
+	struct error err;
+	bool got = false;
+
+	if (message_receive(worker->socket, timeout_ms, &message, &got, &err) != 0) {
+		worker->cancel = worker->quit = true;
+		return false;
+	}
+	if (got) {
+		obey(worker, &message);
+		message_clear(&message);
+	}
+	return got;
 }
 
 static void look_at_socket(struct worker *worker)
 {
-	struct message message;
-	struct error err;
-	bool got = true;
+	while (!worker->cancel && obey_next(worker, 0))
+		;
+}
 
-	while (got && !worker->cancel) {
-		if (message_receive(worker->socket, 0, &message, &got, &err) != 0) {
-			worker->cancel = worker->quit = true;
-			return;
-		}
-		if (got) {
-			obey(worker, &message);
-			message_clear(&message);
-		}
-	}
+static bool must_leave(const struct worker *worker)
+{
+	return worker->yield || worker->quit || terminated;
 }
 
 /* ---- what the pipeline asks and tells ---- */
@@ -128,23 +154,29 @@ static bool on_yield(void *context)
 	struct worker *worker = context;
 
 	look_at_socket(worker);
-	return worker->yield || worker->quit || terminated;
+	return must_leave(worker);
+}
+
+static void report_progress(struct worker *worker)
+{
+	worker->reported = now_monotonic();
+	worker->behind = false;
+	report(worker, &worker->progress);
 }
 
 static void on_progress(void *context, enum stage stage, int iteration, double fraction)
 {
 	struct worker *worker = context;
-	struct message message = {
-	    .kind = MESSAGE_PROGRESS, .stage = stage, .iteration = iteration, .fraction = fraction};
-	bool changed = stage != worker->stage || iteration != worker->stage_iteration;
-	double now = now_monotonic();
+	struct message *last = &worker->progress;
+	bool changed = stage != last->stage || iteration != last->iteration;
 
-	if (now - worker->reported < (changed ? CHANGE_LEAST : PROGRESS_LEAST))
-		return;
-	worker->reported = now;
-	worker->stage = stage;
-	worker->stage_iteration = iteration;
-	report(worker, &message);
+	last->kind = MESSAGE_PROGRESS;
+	last->stage = stage;
+	last->iteration = iteration;
+	last->fraction = fraction;
+	worker->behind = true;
+	if (now_monotonic() - worker->reported >= (changed ? CHANGE_LEAST : PROGRESS_LEAST))
+		report_progress(worker);
 }
 
 static void on_row(void *context, const struct history_row *row)
@@ -190,6 +222,62 @@ static int on_volume(void *context, const struct kept_volume *volume, const stru
 
 /* ---- jobs ---- */
 
+static void report_taken(struct worker *worker, const struct spool *spool)
+{
+	struct message message = {.kind = MESSAGE_TAKEN, .count = spool_pushed(spool)};
+
+	report(worker, &message);
+}
+
+/*
+ * Projections as they arrive, until all are there. Who is to make room leaves at
+ * once: there is nothing yet that could be gone on from.
+ */
+static int push_arrivals(struct worker *worker, struct spool *spool, struct error *err)
+{
+	enum { MOST = 8 }; /* projections between two looks at the socket */
+	int code = 0;
+
+	while (code == 0 && spool_pushed(spool) < spool_wanted(spool)) {
+		int pushed = spool_pushed(spool), count = worker->told_count - pushed;
+
+		if (count > 0) {
+			code = spool_push(spool, worker->told + pushed, count < MOST ? count : MOST, err);
+			if (code == 0)
+				report_taken(worker, spool);
+			look_at_socket(worker);
+		} else {
+			if (worker->behind)
+				report_progress(worker);
+			obey_next(worker, LOOK_MS);
+		}
+		if (code != 0 || spool_pushed(spool) == spool_wanted(spool))
+			break;
+		if (worker->cancel)
+			return error_set(err, ERR_CANCELLED, "cancelled");
+		if (must_leave(worker))
+			return error_set(err, ERR_BUSY, "left with %d of %d projections", pushed, spool_wanted(spool));
+	}
+	return code;
+}
+
+static int run_spool(struct worker *worker, const struct spool_options *options, bool arriving, struct error *err)
+{
+	struct spool *spool = NULL;
+	int code = spool_open(worker->backend, worker->device, options, &spool, err);
+
+	if (code == 0 && arriving) {
+		code = push_arrivals(worker, spool, err);
+	} else if (code == 0) {
+		code = spool_push_rest(spool, err);
+		report_taken(worker, spool);
+	}
+	if (code == 0)
+		code = spool_finish(spool, err);
+	spool_close(spool);
+	return code;
+}
+
 static int run_job(struct worker *worker, const struct message *start, struct error *err)
 {
 	const struct spool_hooks hooks = {.recon = {.context = worker,
@@ -200,11 +288,29 @@ static int run_job(struct worker *worker, const struct message *start, struct er
 						    .warning = on_warning},
 					  .on_volume = on_volume,
 					  .on_open = on_open};
+	struct spool_options options = {.scan_directory = start->scan_directory,
+					.out_directory = start->job_directory,
+					.recipe = &start->request.recipe,
+					.iteration = start->iteration,
+					.hooks = &hooks};
+	unsigned char *present = NULL;
 	char checkpoint[1100];
+	int code;
 
 	snprintf(checkpoint, sizeof(checkpoint), "%s/%s", start->job_directory, SPOOL_CHECKPOINT);
-	return spool_run(worker->backend, worker->device, start->scan_directory, &start->request.recipe,
-			 start->job_directory, start->iteration > 0 ? checkpoint : NULL, start->iteration, &hooks, err);
+	if (start->iteration > 0)
+		options.checkpoint = checkpoint;
+	if (start->reduced) {
+		present = malloc(VIEWS_MAX);
+		if (present == NULL)
+			return error_set(err, ERR_NO_MEMORY, "no memory for a list of projections");
+		for (int i = 0; i < VIEWS_MAX; i++)
+			present[i] = start->present[i / 8] >> i % 8 & 1;
+		options.present = present;
+	}
+	code = run_spool(worker, &options, start->arriving, err);
+	free(present);
+	return code;
 }
 
 /* Returns the exit status, or negative to go on. */
@@ -215,6 +321,7 @@ static int serve_job(struct worker *worker, const struct message *start)
 
 	snprintf(worker->job, sizeof(worker->job), "%s", start->job);
 	worker->cancel = worker->yield = false;
+	worker->told_count = 0;
 	worker->iteration = start->iteration;
 	worker->reported = 0;
 	working = 1;
@@ -354,7 +461,11 @@ int main(int argc, char **argv)
 	sigaction(SIGTERM, &terminate, NULL);
 	lower_priority();
 	worker.socket = arguments.socket;
-	if (open_device(&worker, &arguments, &err) != 0) {
+	worker.told = malloc(VIEWS_MAX * sizeof(*worker.told));
+	if (worker.told == NULL) {
+		perror("cbct-worker");
+		status = EXIT_START;
+	} else if (open_device(&worker, &arguments, &err) != 0) {
 		say(&err);
 		status = EXIT_START;
 	} else {
@@ -362,5 +473,6 @@ int main(int argc, char **argv)
 	}
 	if (worker.device != NULL)
 		worker.backend->close(worker.device);
+	free(worker.told);
 	return status;
 }

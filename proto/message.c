@@ -24,8 +24,11 @@ enum field_type {
 	FIELD_INT,
 	FIELD_NUMBER,
 	FIELD_SIZE,
+	FIELD_BOOL,
 	FIELD_STAGE,
 	FIELD_DIGEST,
+	FIELD_BITS,
+	FIELD_RUNS,
 	FIELD_GRID,
 	FIELD_REQUEST
 };
@@ -46,7 +49,11 @@ static const struct field start_fields[] = {FIELD("job", FIELD_STRING, job),
 					    FIELD("job_directory", FIELD_STRING, job_directory),
 					    FIELD("request", FIELD_REQUEST, request),
 					    FIELD("iteration", FIELD_INT, iteration),
+					    FIELD("arriving", FIELD_BOOL, arriving),
+					    FIELD("reduced", FIELD_BOOL, reduced),
+					    FIELD("present", FIELD_BITS, present),
 					    {0}};
+static const struct field views_fields[] = {FIELD("job", FIELD_STRING, job), FIELD("runs", FIELD_RUNS, runs), {0}};
 static const struct field job_fields[] = {FIELD("job", FIELD_STRING, job), {0}};
 static const struct field no_fields[] = {{0}};
 static const struct field hello_fields[] = {
@@ -62,6 +69,7 @@ static const struct field opened_fields[] = {FIELD("job", FIELD_STRING, job),
 					     FIELD("host", FIELD_SIZE, memory.host),
 					     FIELD("plan", FIELD_STRING, plan),
 					     {0}};
+static const struct field taken_fields[] = {FIELD("job", FIELD_STRING, job), FIELD("count", FIELD_INT, count), {0}};
 static const struct field progress_fields[] = {FIELD("job", FIELD_STRING, job),
 					       FIELD("stage", FIELD_STAGE, stage),
 					       FIELD("iteration", FIELD_INT, iteration),
@@ -102,11 +110,13 @@ static const struct {
 	const struct field *fields;
 } kinds[MESSAGE_KIND_COUNT] = {
     [MESSAGE_START] = {"start", start_fields},
+    [MESSAGE_VIEWS] = {"views", views_fields},
     [MESSAGE_CANCEL] = {"cancel", job_fields},
     [MESSAGE_YIELD] = {"yield", job_fields},
     [MESSAGE_QUIT] = {"quit", no_fields},
     [MESSAGE_HELLO] = {"hello", hello_fields},
     [MESSAGE_OPENED] = {"opened", opened_fields},
+    [MESSAGE_TAKEN] = {"taken", taken_fields},
     [MESSAGE_PROGRESS] = {"progress", progress_fields},
     [MESSAGE_ROW] = {"row", row_fields},
     [MESSAGE_VOLUME] = {"volume", volume_fields},
@@ -114,15 +124,57 @@ static const struct {
     [MESSAGE_ENDED] = {"ended", ended_fields},
 };
 
+/* ---- runs ---- */
+
+bool projection_runs_add(struct projection_runs *runs, int projection)
+{
+	int at = runs->count - 1;
+
+	if (at >= 0 && runs->last[at] + 1 == projection) {
+		runs->last[at]++;
+		return true;
+	}
+	if (runs->count == MESSAGE_RUNS_MAX)
+		return false;
+	runs->first[runs->count] = runs->last[runs->count] = projection;
+	runs->count++;
+	return true;
+}
+
 /* ---- writing ---- */
 
-static cJSON *digest_json(const uint8_t digest[32])
+/* Two digits a byte; zero bytes at the end are left out down to `least`. */
+static cJSON *bytes_json(const uint8_t *bytes, size_t count, size_t least)
 {
-	char text[65];
+	static const char digits[] = "0123456789abcdef";
+	cJSON *json;
+	char *text;
 
-	for (int i = 0; i < 32; i++)
-		snprintf(text + 2 * i, 3, "%02x", digest[i]);
-	return cJSON_CreateString(text);
+	while (count > least && bytes[count - 1] == 0)
+		count--;
+	text = malloc(2 * count + 1);
+	if (text == NULL)
+		return NULL;
+	for (size_t i = 0; i < count; i++) {
+		text[2 * i] = digits[bytes[i] >> 4];
+		text[2 * i + 1] = digits[bytes[i] & 15];
+	}
+	text[2 * count] = '\0';
+	json = cJSON_CreateString(text);
+	free(text);
+	return json;
+}
+
+/* first, last, first, last ... */
+static cJSON *runs_json(const struct projection_runs *runs)
+{
+	int numbers[2 * MESSAGE_RUNS_MAX];
+
+	for (int i = 0; i < runs->count; i++) {
+		numbers[2 * i] = runs->first[i];
+		numbers[2 * i + 1] = runs->last[i];
+	}
+	return cJSON_CreateIntArray(numbers, 2 * runs->count);
 }
 
 /* size, spacing, origin: nine numbers in a row. */
@@ -151,10 +203,16 @@ static cJSON *field_json(const struct field *field, const struct message *messag
 		return cJSON_CreateNumber(*(const double *)at);
 	case FIELD_SIZE:
 		return cJSON_CreateNumber((double)*(const size_t *)at);
+	case FIELD_BOOL:
+		return cJSON_CreateBool(*(const bool *)at);
 	case FIELD_STAGE:
 		return cJSON_CreateString(stage_names[*(const enum stage *)at]);
 	case FIELD_DIGEST:
-		return digest_json(at);
+		return bytes_json(at, field->size, field->size);
+	case FIELD_BITS:
+		return bytes_json(at, field->size, 0);
+	case FIELD_RUNS:
+		return runs_json(at);
 	case FIELD_GRID:
 		return grid_json(at);
 	case FIELD_REQUEST:
@@ -231,18 +289,52 @@ static int hex_digit(char c)
 	return c >= 'a' && c <= 'f' ? c - 'a' + 10 : -1;
 }
 
-static void read_digest(struct json_reader *reader, const char *name, uint8_t ret_digest[32])
+/* least .. size bytes, two digits each; those that are not there are zero. */
+static void read_bytes(struct json_reader *reader, const char *name, size_t least, size_t size, uint8_t *ret)
 {
-	char text[65] = "";
+	const cJSON *member = json_member(reader, name, true);
+	size_t length = cJSON_IsString(member) ? strlen(member->valuestring) : 0;
 
-	json_string(reader, name, true, text, sizeof(text));
-	for (int i = 0; i < 32 && reader->code == 0; i++) {
-		int high = hex_digit(text[2 * i]), low = high < 0 ? -1 : hex_digit(text[2 * i + 1]);
+	if (member == NULL)
+		return;
+	if (!cJSON_IsString(member) || length % 2 != 0 || length < 2 * least || length > 2 * size) {
+		json_fail(reader, ERR_INVALID, name, "%zu to %zu hexadecimal digits are expected", 2 * least, 2 * size);
+		return;
+	}
+	memset(ret, 0, size);
+	for (size_t i = 0; i < length / 2; i++) {
+		const char *text = member->valuestring + 2 * i;
+		int high = hex_digit(text[0]), low = hex_digit(text[1]);
 
-		if (low < 0)
-			json_fail(reader, ERR_INVALID, name, "64 hexadecimal digits are expected");
-		else
-			ret_digest[i] = (uint8_t)(high << 4 | low);
+		if (high < 0 || low < 0) {
+			json_fail(reader, ERR_INVALID, name, "hexadecimal digits are expected");
+			return;
+		}
+		ret[i] = (uint8_t)(high << 4 | low);
+	}
+}
+
+static void read_runs(struct json_reader *reader, const char *name, struct projection_runs *ret_runs)
+{
+	const cJSON *member = json_member(reader, name, true), *first, *last;
+	int length = cJSON_IsArray(member) ? cJSON_GetArraySize(member) : -1;
+
+	if (member == NULL)
+		return;
+	if (length < 0 || length % 2 != 0 || length > 2 * MESSAGE_RUNS_MAX) {
+		json_fail(reader, ERR_INVALID, name, "at most %d pairs are expected", MESSAGE_RUNS_MAX);
+		return;
+	}
+	ret_runs->count = 0;
+	for (first = member->child; first != NULL; first = last->next) {
+		last = first->next;
+		if (!cJSON_IsNumber(first) || !cJSON_IsNumber(last) || first->valueint < 0 ||
+		    last->valueint < first->valueint || last->valueint >= VIEWS_MAX) {
+			json_fail(reader, ERR_INVALID, name, "a run from 0 to %d is expected", VIEWS_MAX - 1);
+			return;
+		}
+		ret_runs->first[ret_runs->count] = first->valueint;
+		ret_runs->last[ret_runs->count++] = last->valueint;
 	}
 }
 
@@ -319,8 +411,17 @@ static void read_field(struct json_reader *reader, const struct field *field, st
 		json_choice(reader, field->name, true, stage_names, STAGE_COUNT, &choice);
 		*(enum stage *)at = (enum stage)choice;
 		break;
+	case FIELD_BOOL:
+		json_bool(reader, field->name, true, at);
+		break;
 	case FIELD_DIGEST:
-		read_digest(reader, field->name, at);
+		read_bytes(reader, field->name, field->size, field->size, at);
+		break;
+	case FIELD_BITS:
+		read_bytes(reader, field->name, 0, field->size, at);
+		break;
+	case FIELD_RUNS:
+		read_runs(reader, field->name, at);
 		break;
 	case FIELD_GRID:
 		read_grid(reader, field->name, at);

@@ -12,13 +12,21 @@
  */
 enum message_kind {
 	/* daemon -> worker */
-	MESSAGE_START,  /* job, scan_directory, job_directory, recipe, iteration (0, or resume from the checkpoint) */
+	/*
+	 * job, scan_directory, job_directory, recipe, iteration (0, or resume from the checkpoint), reduced and
+	 * present, arriving: the projections come by MESSAGE_VIEWS; otherwise all that are present are there
+	 */
+	MESSAGE_START,
+	/* job, runs: these projections are there, to be reconstructed in this order. Not before the last were taken. */
+	MESSAGE_VIEWS,
 	MESSAGE_CANCEL, /* job */
-	MESSAGE_YIELD,  /* job: leave it at the next iteration's end */
-	MESSAGE_QUIT,   /* finish or yield what runs, then exit 0 */
+	/* job: leave it at the next iteration's end; one that still waits for projections is left at once */
+	MESSAGE_YIELD,
+	MESSAGE_QUIT, /* finish or yield what runs, then exit 0 */
 	/* worker -> daemon */
 	MESSAGE_HELLO,    /* backend, device, driver, bytes_total, bytes_free */
 	MESSAGE_OPENED,   /* job, memory, plan */
+	MESSAGE_TAKEN,    /* job, count: projections reconstructed so far, all that it was told of */
 	MESSAGE_PROGRESS, /* job, stage, iteration, fraction */
 	MESSAGE_ROW,      /* job, row */
 	MESSAGE_VOLUME,   /* job, name, stage, iteration, bytes, sha256, norms: the file is on the disk */
@@ -27,11 +35,25 @@ enum message_kind {
 	MESSAGE_KIND_COUNT
 };
 
+enum { MESSAGE_RUNS_MAX = 512 };
+
+/* Projections in an order: first .. last of each run after those of the one before. */
+struct projection_runs {
+	int count;
+	int first[MESSAGE_RUNS_MAX], last[MESSAGE_RUNS_MAX];
+};
+/* Adds one behind the last; false when there is no room. */
+bool projection_runs_add(struct projection_runs *runs, int projection);
+
 struct message {
 	enum message_kind kind;
 	char job[64];
 	char scan_directory[1024], job_directory[1024];
 	struct job_request request; /* START; recipe owned by the message: message_clear */
+	bool arriving, reduced;
+	uint8_t present[(VIEWS_MAX + 7) / 8]; /* START with `reduced`: bit k % 8 of byte k / 8 for projection k */
+	struct projection_runs runs;
+	int count;
 	struct device_info info;
 	char backend[16], plan[160];
 	struct recon_memory memory;

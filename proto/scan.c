@@ -352,10 +352,47 @@ int scan_parse(const char *text, size_t length, struct scan **ret_scan, struct e
 	return 0;
 }
 
+int scan_reduce(struct scan *scan, const unsigned char *present, struct error *err)
+{
+	struct geometry reduced = {.columns = scan->geometry.columns, .rows = scan->geometry.rows};
+	struct orbit orbit;
+	int *projection = malloc((size_t)scan->count * sizeof(*projection)), code;
+
+	reduced.views = malloc((size_t)scan->count * sizeof(*reduced.views));
+	if (projection == NULL || reduced.views == NULL) {
+		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views", scan->count);
+		goto out;
+	}
+	for (int i = 0; i < scan->count; i++) {
+		if (!present[i])
+			continue;
+		projection[reduced.count] = i;
+		reduced.views[reduced.count++] = scan->geometry.views[i];
+	}
+	if (reduced.count == 0)
+		code = error_set(err, ERR_INVALID, "none of the %d projections is present", scan->count);
+	else
+		code = orbit_analyse(&orbit, &reduced, err);
+	if (code != 0)
+		goto out;
+	orbit_clear(&scan->orbit);
+	geometry_clear(&scan->geometry);
+	scan->geometry = reduced;
+	scan->orbit = orbit;
+	scan->count = reduced.count;
+	scan->projection = projection;
+	return 0;
+out:
+	free(projection);
+	free(reduced.views);
+	return code;
+}
+
 void scan_free(struct scan *scan)
 {
 	if (scan == NULL)
 		return;
+	free(scan->projection);
 	orbit_clear(&scan->orbit);
 	geometry_clear(&scan->geometry);
 	cJSON_Delete(scan->document);

@@ -20,6 +20,7 @@ struct scan {
 	int hardening_count; /* coefficients, 0: none */
 	struct geometry geometry;
 	struct orbit orbit;
+	int *projection; /* [count], owned, after scan_reduce: the number of each view's projection; NULL: its own */
 	cJSON *document; /* as posted, checked: members name, detector, projections, geometry */
 };
 
@@ -29,6 +30,14 @@ extern const char *const quantity_names[2]; /* "line_integral", "intensity" */
 /* Reads and checks the document of POST /v1/scans. Free with scan_free. */
 int scan_parse(const char *text, size_t length, struct scan **ret_scan, struct error *err);
 void scan_free(struct scan *scan);
+
+/*
+ * Leaves the views whose projection is present, flags [count], in their order:
+ * count, geometry and orbit are then theirs, so that arc, weights and subsets
+ * are those of what was measured. For a scan that has not been reduced before;
+ * unchanged on failure. ERR_INVALID when none is present.
+ */
+int scan_reduce(struct scan *scan, const unsigned char *present, struct error *err);
 
 size_t sample_bytes(enum sample sample);
 size_t scan_projection_bytes(const struct scan *scan); /* columns * rows * sample */

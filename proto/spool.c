@@ -472,6 +472,8 @@ static int resume(struct run *run, struct recon *recon, const char *path, int ex
 	struct stat status;
 	char *bytes = MAP_FAILED;
 
+	if (file < 0 && errno == ENOENT)
+		return error_set(err, ERR_INVALID, "%.200s does not exist", path);
 	if (file < 0)
 		return error_set_errno(err, errno, "%s cannot be opened", path);
 	if (fstat(file, &status) == 0) {
@@ -502,7 +504,132 @@ out:
 	return code;
 }
 
-/* ---- views ---- */
+/* ---- the three steps ---- */
+
+struct spool {
+	struct run run;
+	struct recon_hooks hooks;
+	struct scan_files files;
+	int projections;       /* of scan.json */
+	int *view_of;          /* [projections]: the view of the scan that it is, -1 where it is not present */
+	unsigned char *pushed; /* [projections] */
+	int pushed_count;
+	int batch;     /* projections that are read at once */
+	int *views;    /* [batch] */
+	char *samples; /* [batch][row][column] */
+	struct recon *recon;
+};
+
+static int reduce(struct spool *spool, const unsigned char *present, struct error *err)
+{
+	struct scan *scan = spool->files.scan;
+	int code = present == NULL ? 0 : scan_reduce(scan, present, err);
+
+	if (code != 0)
+		return code;
+	for (int i = 0; i < spool->projections; i++)
+		spool->view_of[i] = -1;
+	for (int i = 0; i < scan->count; i++)
+		spool->view_of[scan->projection == NULL ? i : scan->projection[i]] = i;
+	return 0;
+}
+
+static int allocate(struct spool *spool, struct error *err)
+{
+	size_t bytes = scan_projection_bytes(spool->files.scan), count = (size_t)spool->files.scan->count;
+
+	spool->projections = (int)count;
+	spool->batch = bytes < READ_BYTES ? (int)(READ_BYTES / bytes) : 1;
+	if (spool->batch > spool->projections)
+		spool->batch = spool->projections;
+	spool->view_of = malloc(count * sizeof(*spool->view_of));
+	spool->pushed = calloc(count, 1);
+	spool->views = malloc((size_t)spool->batch * sizeof(*spool->views));
+	spool->samples = malloc((size_t)spool->batch * bytes);
+	if (spool->view_of == NULL || spool->pushed == NULL || spool->views == NULL || spool->samples == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for %d projections of %zu bytes", spool->batch, bytes);
+	return 0;
+}
+
+static int open_recon(struct spool *spool, const struct backend *backend, struct device *device,
+		      const struct recipe *recipe, struct error *err)
+{
+	const struct spool_hooks *hooks = spool->run.hooks;
+	const struct scan_files *files = &spool->files;
+	struct linearise linearise = scan_linearise(files->scan);
+	struct recon_memory memory;
+	int code = 0;
+
+	linearise.flat = files->flat;
+	linearise.dark = files->dark;
+	linearise.defects = files->defects;
+	if (linearise.quantity == QUANTITY_INTENSITY && linearise.air <= 0 && linearise.flat == NULL)
+		return error_set(err, ERR_IMPOSSIBLE, "intensities need an air value or a flat image, none is there");
+	code = recon_memory(backend, device, &files->scan->geometry, recipe, &memory, err);
+	if (code == 0)
+		code = recon_open(backend, device, &files->scan->geometry, &linearise, recipe, &spool->hooks,
+				  &spool->recon, err);
+	if (code == 0 && hooks->on_open != NULL)
+		hooks->on_open(hooks->recon.context, &memory, recon_plan(spool->recon));
+	return code;
+}
+
+int spool_open(const struct backend *backend, struct device *device, const struct spool_options *options,
+	       struct spool **ret_spool, struct error *err)
+{
+	struct spool *spool = calloc(1, sizeof(*spool));
+	int code;
+
+	if (spool == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a reconstruction");
+	spool->run = (struct run){.hooks = options->hooks, .directory = options->out_directory};
+	spool->hooks = (struct recon_hooks){.context = &spool->run,
+					    .cancelled = run_cancelled,
+					    .yield = run_yield,
+					    .progress = run_progress,
+					    .row = run_row,
+					    .keep = run_keep,
+					    .warning = run_warning};
+	spool->files.projections = -1;
+	code = scan_files_open(options->scan_directory, &spool->files, err);
+	if (code == 0)
+		code = allocate(spool, err);
+	if (code == 0)
+		code = reduce(spool, options->present, err);
+	if (code == 0)
+		code = open_recon(spool, backend, device, options->recipe, err);
+	if (code == 0 && options->checkpoint != NULL)
+		code = resume(&spool->run, spool->recon, options->checkpoint, options->iteration, err);
+	if (code != 0)
+		spool_close(spool);
+	else
+		*ret_spool = spool;
+	return code;
+}
+
+void spool_close(struct spool *spool)
+{
+	if (spool == NULL)
+		return;
+	saver_free(spool->run.saver);
+	recon_free(spool->recon);
+	scan_files_close(&spool->files);
+	free(spool->view_of);
+	free(spool->pushed);
+	free(spool->views);
+	free(spool->samples);
+	free(spool);
+}
+
+int spool_pushed(const struct spool *spool)
+{
+	return spool->pushed_count;
+}
+
+int spool_wanted(const struct spool *spool)
+{
+	return spool->files.scan->count;
+}
 
 /* One core reads a fifth of what the page cache gives. */
 static int read_views(int file, char *ret_to, size_t size, size_t offset, struct error *err)
@@ -529,45 +656,74 @@ static int read_views(int file, char *ret_to, size_t size, size_t offset, struct
 	return 0;
 }
 
-static int push_views(struct recon *recon, const struct scan_files *files, struct error *err)
+/* Into samples, neighbours in the file in one go. */
+static int read_projections(struct spool *spool, const int *projections, int count, struct error *err)
 {
-	size_t bytes = scan_projection_bytes(files->scan);
-	int count = files->scan->count, most = bytes < READ_BYTES ? (int)(READ_BYTES / bytes) : 1, code = 0;
-	int *views;
-	char *samples;
+	size_t bytes = scan_projection_bytes(spool->files.scan);
+	int code = 0;
 
-	if (most > count)
-		most = count;
-	views = malloc((size_t)most * sizeof(*views));
-	samples = malloc((size_t)most * bytes);
-	if (views == NULL || samples == NULL)
-		code = error_set(err, ERR_NO_MEMORY, "no memory for %d projections of %zu bytes", most, bytes);
-	for (int first = 0; first < count && code == 0; first += most) {
-		int some = first + most <= count ? most : count - first;
-
-		for (int i = 0; i < some; i++)
-			views[i] = first + i;
-		code = read_views(files->projections, samples, (size_t)some * bytes, (size_t)first * bytes, err);
-		if (code == 0)
-			code = recon_push(recon, samples, views, some, err);
+	for (int first = 0, next; first < count && code == 0; first = next) {
+		for (next = first + 1; next < count && projections[next] == projections[next - 1] + 1;)
+			next++;
+		code = read_views(spool->files.projections, spool->samples + (size_t)first * bytes,
+				  (size_t)(next - first) * bytes, (size_t)projections[first] * bytes, err);
 	}
-	free(samples);
-	free(views);
 	return code;
 }
 
-static int run_pipeline(struct run *run, struct recon *recon, const struct scan_files *files, const char *checkpoint,
-			int iteration, struct error *err)
+/* At most a batch. */
+static int push_some(struct spool *spool, const int *projections, int count, struct error *err)
 {
-	struct error trouble;
+	int code;
+
+	for (int i = 0; i < count; i++) {
+		int projection = projections[i];
+
+		if (projection < 0 || projection >= spool->projections || spool->view_of[projection] < 0)
+			return error_set(err, ERR_INVALID, "projection %d is none of the scan's %d", projection,
+					 spool_wanted(spool));
+		spool->views[i] = spool->view_of[projection];
+	}
+	code = read_projections(spool, projections, count, err);
+	if (code == 0)
+		code = recon_push(spool->recon, spool->samples, spool->views, count, err);
+	for (int i = 0; i < count && code == 0; i++)
+		spool->pushed[projections[i]] = 1;
+	spool->pushed_count += code == 0 ? count : 0;
+	return code;
+}
+
+int spool_push(struct spool *spool, const int *projections, int count, struct error *err)
+{
 	int code = 0;
 
-	if (checkpoint != NULL)
-		code = resume(run, recon, checkpoint, iteration, err);
-	if (code == 0)
-		code = push_views(recon, files, err);
-	if (code == 0)
-		code = recon_run(recon, err);
+	for (int first = 0; first < count && code == 0; first += spool->batch)
+		code = push_some(spool, projections + first,
+				 count - first < spool->batch ? count - first : spool->batch, err);
+	return code;
+}
+
+int spool_push_rest(struct spool *spool, struct error *err)
+{
+	int *rest = malloc((size_t)spool_wanted(spool) * sizeof(*rest)), count = 0, code;
+
+	if (rest == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a list of %d projections", spool_wanted(spool));
+	for (int i = 0; i < spool->projections; i++) {
+		if (spool->view_of[i] >= 0 && !spool->pushed[i])
+			rest[count++] = i;
+	}
+	code = spool_push(spool, rest, count, err);
+	free(rest);
+	return code;
+}
+
+int spool_finish(struct spool *spool, struct error *err)
+{
+	struct run *run = &spool->run;
+	struct error trouble;
+	int code = recon_run(spool->recon, err);
+
 	/* What was kept is told of, however the run ends. */
 	if (run->trouble.code == 0)
 		settle(run, true, &run->trouble);
@@ -575,50 +731,23 @@ static int run_pipeline(struct run *run, struct recon *recon, const struct scan_
 		*err = run->trouble;
 		return run->trouble.code;
 	}
-	if (code == ERR_BUSY && save_checkpoint(recon, run->directory, &trouble) != 0) {
+	if (code == ERR_BUSY && save_checkpoint(spool->recon, run->directory, &trouble) != 0) {
 		*err = trouble;
 		code = trouble.code;
 	}
 	return code;
 }
 
-int spool_run(const struct backend *backend, struct device *device, const char *scan_directory,
-	      const struct recipe *recipe, const char *out_directory, const char *checkpoint, int iteration,
-	      const struct spool_hooks *hooks, struct error *err)
+int spool_run(const struct backend *backend, struct device *device, const struct spool_options *options,
+	      struct error *err)
 {
-	struct run run = {.hooks = hooks, .directory = out_directory};
-	const struct recon_hooks recon_hooks = {.context = &run,
-						.cancelled = run_cancelled,
-						.yield = run_yield,
-						.progress = run_progress,
-						.row = run_row,
-						.keep = run_keep,
-						.warning = run_warning};
-	struct scan_files files;
-	struct linearise linearise;
-	struct recon_memory memory;
-	struct recon *recon = NULL;
-	int code = scan_files_open(scan_directory, &files, err);
+	struct spool *spool = NULL;
+	int code = spool_open(backend, device, options, &spool, err);
 
-	if (code != 0)
-		return code;
-	linearise = scan_linearise(files.scan);
-	linearise.flat = files.flat;
-	linearise.dark = files.dark;
-	linearise.defects = files.defects;
-	if (linearise.quantity == QUANTITY_INTENSITY && linearise.air <= 0 && linearise.flat == NULL)
-		code = error_set(err, ERR_IMPOSSIBLE, "intensities need an air value or a flat image, none is there");
 	if (code == 0)
-		code = recon_memory(backend, device, &files.scan->geometry, recipe, &memory, err);
+		code = spool_push_rest(spool, err);
 	if (code == 0)
-		code =
-		    recon_open(backend, device, &files.scan->geometry, &linearise, recipe, &recon_hooks, &recon, err);
-	if (code == 0 && hooks->on_open != NULL)
-		hooks->on_open(hooks->recon.context, &memory, recon_plan(recon));
-	if (code == 0)
-		code = run_pipeline(&run, recon, &files, checkpoint, iteration, err);
-	saver_free(run.saver);
-	recon_free(recon);
-	scan_files_close(&files);
+		code = spool_finish(spool, err);
+	spool_close(spool);
 	return code;
 }

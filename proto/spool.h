@@ -59,28 +59,62 @@ struct saved_volume {
 };
 
 /*
- * The pipeline over a directory: opens the recon, pushes all views a few at a
- * time, runs, and writes each kept volume durably into out_directory before it
- * calls on_volume. Where "final" is the same iterate as the volume before it,
- * it is another link to that file. Used by the worker and by `cbct recon`, so
- * that both do the same thing.
- *
- * A run that hooks->recon.yield ended returns ERR_BUSY and has left its iterate
- * as OUT/checkpoint.f32, durably. `checkpoint` is the path of one to resume from,
- * or NULL; `iteration` the one it holds as far as the caller knows. The file
- * itself knows better (a crash may lie between its writing and the caller's
- * note): where they differ, the file counts and a warning "checkpoint" says so.
+ * The pipeline over a directory, in three steps: opened, given its projections in
+ * any order and as they arrive, and finished. Each kept volume is written durably
+ * into out_directory before on_volume is called for it. Where "final" is the same
+ * iterate as the volume before it, it is another link to that file. The worker
+ * and `cbct recon` both do it this way. One thread at a time.
  */
 struct spool_hooks {
-	struct recon_hooks recon; /* any may be NULL, its context goes to all of these; keep is spool_run's own and must
+	struct recon_hooks recon; /* any may be NULL, its context goes to all of these; keep is the spool's own and must
 				     be NULL here */
 	int (*on_volume)(void *context, const struct kept_volume *volume, const struct saved_volume *saved,
 			 struct error *err);
 	void (*on_open)(void *context, const struct recon_memory *memory, const char *plan);
 };
-int spool_run(const struct backend *backend, struct device *device, const char *scan_directory,
-	      const struct recipe *recipe, const char *out_directory, const char *checkpoint, int iteration,
-	      const struct spool_hooks *hooks, struct error *err);
+
+/* What is to be reconstructed; all of it is borrowed until spool_close, the recipe is copied. */
+struct spool_options {
+	const char *scan_directory, *out_directory;
+	/* A flag for each projection of scan.json: those that make up the scan, the others never come. NULL: all. */
+	const unsigned char *present;
+	const struct recipe *recipe;
+	/*
+	 * Of a run that yielded, or NULL; `iteration` is the one it holds as far as the
+	 * caller knows. The file itself knows better (a crash may lie between its writing
+	 * and the caller's note): where they differ, the file counts and a warning
+	 * "checkpoint" says so. One that is missing or damaged is ERR_INVALID.
+	 */
+	const char *checkpoint;
+	int iteration;
+	const struct spool_hooks *hooks;
+};
+
+struct spool;
+int spool_open(const struct backend *backend, struct device *device, const struct spool_options *options,
+	       struct spool **ret_spool, struct error *err);
+void spool_close(struct spool *spool); /* NULL is fine */
+
+/* Projections that the reconstruction has, and that it wants in all. */
+int spool_pushed(const struct spool *spool);
+int spool_wanted(const struct spool *spool);
+/*
+ * Reads these projections and reconstructs as far as they go, in this order: the
+ * same order gives the same bits, however many a call brings. Each once
+ * (ERR_CONFLICT), and only those that are present (ERR_INVALID).
+ */
+int spool_push(struct spool *spool, const int *projections, int count, struct error *err);
+/* All that have not been pushed, by their numbers. */
+int spool_push_rest(struct spool *spool, struct error *err);
+/*
+ * Once, when all are there: the rest of the pipeline. A run that hooks->recon.yield ended returns ERR_BUSY and has
+ * left its iterate as OUT/checkpoint.f32, durably.
+ */
+int spool_finish(struct spool *spool, struct error *err);
+
+/* The three in a row. */
+int spool_run(const struct backend *backend, struct device *device, const struct spool_options *options,
+	      struct error *err);
 
 /* A line of text padded to SPOOL_CHECKPOINT_OFFSET bytes with iteration and size, then float32 voxels [z][y][x]. */
 #define SPOOL_CHECKPOINT "checkpoint.f32"

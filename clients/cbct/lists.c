@@ -1,4 +1,4 @@
-/* cbct scans, jobs, status, rm: what the daemon knows, a line each. */
+/* cbct scans, jobs, status, complete, rm: what the daemon knows, a line each. */
 #include "clients/cbct/commands.h"
 #include "clients/cbct/http.h"
 
@@ -130,6 +130,32 @@ static int rm_run(const void *values, struct error *err)
 	return code;
 }
 
+/* So that who ends a scan too early sees it. */
+static void print_completed(const cJSON *scan)
+{
+	const cJSON *projections = cJSON_GetObjectItemCaseSensitive(scan, "projections");
+
+	printf("%-20s %.0f of %.0f projections\n", member_text(scan, "id", "?"),
+	       member_number(scan, "received_count", 0), member_number(projections, "count", 0));
+}
+
+static int complete_run(const void *values, struct error *err)
+{
+	const struct list_options *options = values;
+	cJSON *document = NULL;
+	char path[100];
+	int code;
+
+	snprintf(path, sizeof(path), "/v1/scans/%.63s/complete", options->id);
+	code = fetch(options, "POST", path, &document, err);
+	if (code == 0 && options->json)
+		code = document_print(document, err);
+	else if (code == 0)
+		print_completed(document);
+	cJSON_Delete(document);
+	return code;
+}
+
 static const struct list_options defaults = {.limit = 20};
 static const struct positional none[] = {{0}};
 static const struct positional rm_positionals[] = {
@@ -137,6 +163,18 @@ static const struct positional rm_positionals[] = {
     {0},
 };
 
+static const struct positional complete_positionals[] = {
+    {"SCAN", "its id", offsetof(struct list_options, id), true},
+    {0},
+};
+
+const struct command command_complete = {"complete",
+					 "ends a scan that was broken off, with the projections that are there",
+					 complete_positionals,
+					 status_groups,
+					 &defaults,
+					 sizeof(defaults),
+					 complete_run};
 const struct command command_scans = {"scans",   "the newest scans", none,     list_groups,
 				      &defaults, sizeof(defaults),   scans_run};
 const struct command command_jobs = {"jobs",    "the newest jobs", none,    list_groups,

@@ -113,6 +113,8 @@ static int pipeline_run(const struct recon_options *options, const struct recipe
 	    .recon = {.context = &display, .progress = on_progress, .row = on_row, .warning = on_warning},
 	    .on_volume = on_volume,
 	};
+	const struct spool_options run = {
+	    .scan_directory = options->directory, .out_directory = output, .recipe = recipe, .hooks = &hooks};
 	struct device *device = NULL;
 	int code;
 
@@ -125,7 +127,7 @@ static int pipeline_run(const struct recon_options *options, const struct recipe
 		return code;
 	if (!options->quiet)
 		display.progress = progress_new(stderr, PROGRESS_BAR_ONLY, backend->name);
-	code = spool_run(backend, device, options->directory, recipe, output, NULL, 0, &hooks, err);
+	code = spool_run(backend, device, &run, err);
 	progress_free(display.progress);
 	backend->close(device);
 	return code;

@@ -171,6 +171,7 @@ test_a_silent_job_is_kept_alive_and_dead_clients_are_let_go() {
 	start_daemon
 	post_scan "$scan_dir"
 	post_job "{\"scan\": \"SCAN\", $grid, \"fdk\": {}}"
+	until [ "$(json '.stage // ""')" = fdk ]; do req GET "/v1/jobs/$job"; done # a worker has been given to it
 	before=$(threads_and_files)
 	: >"$work/quiet"
 	curl -sS -N --max-time 13 -o "$work/quiet" "$url/v1/jobs/$job/events" &

@@ -72,7 +72,7 @@ static int rows_of(const char *id)
 START_TEST(the_table_of_transitions_is_the_contracts)
 {
 	/* rows: from, columns: to; waiting, queued, running, succeeded, failed, cancelled */
-	static const char *const expected[JOB_STATE_COUNT] = {".q..fc", "..r.fc", ".q.sfc",
+	static const char *const expected[JOB_STATE_COUNT] = {"wqr.fc", "..r.fc", ".q.sfc",
 							      "......", "......", "......"};
 
 	for (int from = 0; from < JOB_STATE_COUNT; from++)
@@ -110,6 +110,117 @@ START_TEST(a_job_waits_for_its_last_projection)
 	ck_assert_int_eq(state_of(job), JOB_QUEUED);
 	job_release(job);
 	stored_scan_release(growing);
+}
+END_TEST
+
+START_TEST(a_waiting_job_is_attended_and_runs_with_its_last_projection)
+{
+	struct stored_scan *growing = state_scan(&state, 3, false);
+	struct job *job = state_post(&state, growing, "routine"), *found;
+	const struct job_change died = {.crashed = true};
+	struct job_record record;
+	struct error err = {0};
+	bool arriving;
+
+	found = jobs_arriving(state.jobs, 0, &arriving);
+	ck_assert_ptr_eq(found, job); /* also before anything has come */
+	ck_assert(!arriving);
+	job_release(found);
+	ck_assert_int_eq(job_attend(job, "cpu", "some", &err), 0);
+	ck_assert_ptr_null(jobs_arriving(state.jobs, 0, &arriving));
+	job_taken(job, 2);
+	/* its scan is ready, but it is in a worker's hands */
+	state_put(&state, growing, 0, 2, 1);
+	ck_assert_int_eq(jobs_promote(state.jobs, &err), 0);
+	ck_assert_int_eq(state_of(job), JOB_WAITING);
+	job_record(job, &record);
+	ck_assert(record.attended && record.taken == 2 && record.attempts == 0);
+	/* a worker that dies with it is an attempt, one that leaves is none */
+	state_set(job, JOB_WAITING, &died);
+	job_record(job, &record);
+	ck_assert(!record.attended && record.taken == 0 && record.attempts == 2 && record.crashes == 1);
+	ck_assert_int_eq(job_attend(job, "cpu", "some", &err), 0);
+	job_leave(job);
+	ck_assert_int_eq(job_attend(job, "cpu", "some", &err), 0);
+	state_set(job, JOB_RUNNING, NULL);
+	job_record(job, &record);
+	ck_assert(!record.attended && record.attempts == 2 && record.ticket > 0 && record.queued > 0);
+	ck_assert_int_eq(job_attend(job, "cpu", "some", &err), ERR_CONFLICT);
+	job_release(job);
+	stored_scan_release(growing);
+}
+END_TEST
+
+START_TEST(who_arrives_goes_before_who_does_not_then_the_higher_priority)
+{
+	struct stored_scan *a = state_scan(&state, 3, false), *b = state_scan(&state, 3, false);
+	struct job *stat = state_post(&state, a, "stat"), *routine = state_post(&state, b, "routine"), *found;
+	bool arriving;
+
+	found = jobs_arriving(state.jobs, 0, &arriving);
+	ck_assert_ptr_eq(found, stat);
+	ck_assert(!arriving);
+	job_release(found);
+	state_put(&state, b, 0, 0, 1);
+	found = jobs_arriving(state.jobs, 1, &arriving);
+	ck_assert_ptr_eq(found, routine);
+	ck_assert(arriving);
+	job_release(found);
+	found = jobs_arriving(state.jobs, 1e300, &arriving); /* that was long ago, but the other has had none yet */
+	ck_assert_ptr_eq(found, routine);
+	ck_assert(!arriving);
+	job_release(found);
+	state_put(&state, a, 0, 0, 1);
+	state_put(&state, b, 1, 1, 1);
+	found = jobs_arriving(state.jobs, 1, &arriving); /* both at once */
+	ck_assert_ptr_eq(found, stat);
+	job_release(found);
+	job_release(stat);
+	job_release(routine);
+	stored_scan_release(a);
+	stored_scan_release(b);
+}
+END_TEST
+
+START_TEST(a_cancel_of_an_attended_job_waits_for_its_worker_and_survives_a_restart)
+{
+	struct stored_scan *growing = state_scan(&state, 3, false);
+	struct job *job = state_post(&state, growing, "routine");
+	struct error err = {0};
+	char id[ID_SIZE];
+	bool removed;
+
+	keep_id(job, id);
+	stored_scan_release(growing);
+	ck_assert_int_eq(job_attend(job, "cpu", "some", &err), 0);
+	ck_assert_int_eq(jobs_delete(state.jobs, job, &removed, &err), 0);
+	ck_assert(!removed);
+	ck_assert_int_eq(state_of(job), JOB_WAITING);
+	job_leave(job);
+	ck_assert_int_eq(job_attend(job, "cpu", "some", &err), ERR_CONFLICT);
+	job_release(job);
+	restart();
+	job = find(id);
+	ck_assert_int_eq(state_of(job), JOB_CANCELLED);
+	job_release(job);
+}
+END_TEST
+
+START_TEST(a_waiting_job_is_found_again_after_a_restart)
+{
+	struct stored_scan *growing = state_scan(&state, 3, false);
+	struct job *job = state_post(&state, growing, "routine"), *found;
+	bool arriving;
+
+	state_put(&state, growing, 1, 1, 1);
+	stored_scan_release(growing);
+	job_release(job);
+	restart();
+	found = jobs_arriving(state.jobs, 1, &arriving);
+	ck_assert_ptr_nonnull(found);
+	ck_assert(!arriving); /* in this life */
+	ck_assert_int_eq(state_of(found), JOB_WAITING);
+	job_release(found);
 }
 END_TEST
 
@@ -439,6 +550,10 @@ Suite *job_suite(void)
 	tcase_add_test(tests, the_table_of_transitions_is_the_contracts);
 	tcase_add_test(tests, what_the_table_forbids_changes_nothing);
 	tcase_add_test(tests, a_job_waits_for_its_last_projection);
+	tcase_add_test(tests, a_waiting_job_is_attended_and_runs_with_its_last_projection);
+	tcase_add_test(tests, who_arrives_goes_before_who_does_not_then_the_higher_priority);
+	tcase_add_test(tests, a_cancel_of_an_attended_job_waits_for_its_worker_and_survives_a_restart);
+	tcase_add_test(tests, a_waiting_job_is_found_again_after_a_restart);
 	tcase_add_test(tests, one_that_yielded_stands_in_front_of_its_class);
 	tcase_add_test(tests, only_a_run_from_the_start_is_an_attempt);
 	tcase_add_test(tests, a_running_job_is_queued_again_after_a_restart);

@@ -79,8 +79,53 @@ START_TEST(the_longest_list_of_volumes_fits)
 	ck_assert_ptr_nonnull(start.request.recipe.emit);
 	for (int i = 0; i < EMITS_MAX; i++)
 		start.request.recipe.emit[i] = ITERATIONS_MAX - i;
+	start.arriving = start.reduced = true;
+	memset(start.present, 0xff, sizeof(start.present));
 	back = through(&start);
 	ck_assert(job_request_same(&back.request, &start.request));
+	ck_assert(back.arriving && back.reduced);
+	ck_assert_mem_eq(back.present, start.present, sizeof(start.present));
+	message_clear(&start);
+	message_clear(&back);
+}
+END_TEST
+
+START_TEST(projections_come_in_their_order)
+{
+	static const int order[] = {7, 8, 9, 3, 2, 1, 19999, 0, 10, 11};
+	struct message views = {.kind = MESSAGE_VIEWS, .job = "abc"}, back;
+	int count = 0;
+
+	for (size_t i = 0; i < sizeof(order) / sizeof(order[0]); i++)
+		ck_assert(projection_runs_add(&views.runs, order[i]));
+	ck_assert_int_eq(views.runs.count, 7); /* 7-9, 3, 2, 1, 19999, 0, 10-11 */
+	back = through(&views);
+	ck_assert_str_eq(back.job, "abc");
+	for (int i = 0; i < back.runs.count; i++) {
+		for (int k = back.runs.first[i]; k <= back.runs.last[i]; k++)
+			ck_assert_int_eq(k, order[count++]);
+	}
+	ck_assert_int_eq(count, 10);
+	/* As many runs as there is room for, and one more projection that only lengthens the last. */
+	views.runs.count = 0;
+	for (int i = 0; i < MESSAGE_RUNS_MAX; i++)
+		ck_assert(projection_runs_add(&views.runs, 2 * i));
+	ck_assert(!projection_runs_add(&views.runs, 5000));
+	ck_assert(projection_runs_add(&views.runs, 2 * MESSAGE_RUNS_MAX - 1));
+	back = through(&views);
+	ck_assert_int_eq(back.runs.count, MESSAGE_RUNS_MAX);
+	ck_assert_int_eq(back.runs.last[MESSAGE_RUNS_MAX - 1], 2 * MESSAGE_RUNS_MAX - 1);
+}
+END_TEST
+
+START_TEST(a_start_says_which_projections_are_there)
+{
+	struct message start = {.kind = MESSAGE_START, .reduced = true, .present = {[0] = 0x81, [17] = 0x10}}, back;
+
+	request_of("{\"scan\":\"s\",\"fdk\":{}}", &start.request);
+	back = through(&start);
+	ck_assert(back.reduced && !back.arriving);
+	ck_assert_mem_eq(back.present, start.present, sizeof(start.present));
 	message_clear(&start);
 	message_clear(&back);
 }
@@ -120,6 +165,9 @@ START_TEST(what_a_worker_says_comes_back)
 	ck_assert_uint_eq(back.memory.scratch, 3);
 	ck_assert_uint_eq(back.memory.available, 1000);
 	ck_assert_uint_eq(back.memory.host, 77);
+
+	message = (struct message){.kind = MESSAGE_TAKEN, .job = "j", .count = 118};
+	ck_assert_int_eq(through(&message).count, 118);
 
 	message = (struct message){.kind = MESSAGE_WARNING, .job = "j", .code_name = "defects", .text = "3 pixels"};
 	back = through(&message);
@@ -233,6 +281,10 @@ START_TEST(a_message_that_makes_no_sense_is_refused_and_the_next_is_read)
 	    "{\"kind\":\"cancel\",\"job\":7}",
 	    "{\"kind\":\"quit\",\"job\":\"j\"}",
 	    "{\"kind\":\"row\",\"job\":\"j\",\"iteration\":1.5}",
+	    "{\"kind\":\"views\",\"job\":\"j\",\"runs\":[1]}",
+	    "{\"kind\":\"views\",\"job\":\"j\",\"runs\":[5,4]}",
+	    "{\"kind\":\"views\",\"job\":\"j\",\"runs\":[0,20000]}",
+	    "{\"kind\":\"views\",\"job\":\"j\",\"runs\":[-1,2]}",
 	    "{\"kind\":\"start\",\"job\":\"j\",\"scan_directory\":\"\",\"job_directory\":\"\",\"iteration\":0,"
 	    "\"request\":{\"scan\":\"s\",\"emit\":[1,2,0.5]}}",
 	    "{\"kind\":\"volume\",\"job\":\"j\",\"name\":\"final\",\"stage\":\"fdk\",\"iteration\":0,"
@@ -325,6 +377,8 @@ Suite *message_suite(void)
 	tcase_add_checked_fixture(tests, open_pair, close_pair);
 	tcase_add_test(tests, a_start_carries_the_whole_recipe);
 	tcase_add_test(tests, the_longest_list_of_volumes_fits);
+	tcase_add_test(tests, projections_come_in_their_order);
+	tcase_add_test(tests, a_start_says_which_projections_are_there);
 	tcase_add_test(tests, short_messages_carry_their_job);
 	tcase_add_test(tests, what_a_worker_says_comes_back);
 	tcase_add_test(tests, numbers_come_back_the_same_and_nan_as_nan);

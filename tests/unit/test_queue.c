@@ -51,47 +51,97 @@ START_TEST(the_lowest_and_latest_makes_room_for_the_higher)
 		struct queue_running running[3];
 		int running_count, idle, victim;
 		const char *why;
+		int arriving; /* priority + 1 of one that is not queued, 0: none */
 	} cases[] = {
-	    {{PRIORITY_STAT}, 0, {{PRIORITY_ROUTINE, 1, false}}, 1, 0, -1, "an empty queue"},
-	    {{PRIORITY_ROUTINE}, 1, {{PRIORITY_ROUTINE, 1, false}}, 1, 0, -1, "an equal waits"},
-	    {{PRIORITY_URGENT}, 1, {{PRIORITY_STAT, 1, false}}, 1, 0, -1, "a lower one waits"},
-	    {{PRIORITY_URGENT}, 1, {{PRIORITY_ROUTINE, 1, false}}, 1, 0, 0, "a higher one pushes"},
-	    {{PRIORITY_STAT}, 1, {{PRIORITY_ROUTINE, 1, false}}, 1, 1, -1, "a worker is idle"},
-	    {{PRIORITY_STAT}, 1, {{PRIORITY_ROUTINE, 1, true}}, 1, 0, -1, "room is being made"},
+	    {{PRIORITY_STAT}, 0, {{PRIORITY_ROUTINE, 1, false, false}}, 1, 0, -1, "an empty queue", 0},
+	    {{PRIORITY_ROUTINE}, 1, {{PRIORITY_ROUTINE, 1, false, false}}, 1, 0, -1, "an equal waits", 0},
+	    {{PRIORITY_URGENT}, 1, {{PRIORITY_STAT, 1, false, false}}, 1, 0, -1, "a lower one waits", 0},
+	    {{PRIORITY_URGENT}, 1, {{PRIORITY_ROUTINE, 1, false, false}}, 1, 0, 0, "a higher one pushes", 0},
+	    {{PRIORITY_STAT}, 1, {{PRIORITY_ROUTINE, 1, false, false}}, 1, 1, -1, "a worker is idle", 0},
+	    {{PRIORITY_STAT}, 1, {{PRIORITY_ROUTINE, 1, true, false}}, 1, 0, -1, "room is being made", 0},
 	    {{PRIORITY_STAT, PRIORITY_STAT},
 	     2,
-	     {{PRIORITY_ROUTINE, 1, true}, {PRIORITY_URGENT, 2, false}},
+	     {{PRIORITY_ROUTINE, 1, true, false}, {PRIORITY_URGENT, 2, false, false}},
 	     2,
 	     0,
 	     1,
-	     "room for two"},
+	     "room for two",
+	     0},
 	    {{PRIORITY_STAT},
 	     1,
-	     {{PRIORITY_URGENT, 1, false}, {PRIORITY_ROUTINE, 2, false}, {PRIORITY_ROUTINE, 3, false}},
+	     {{PRIORITY_URGENT, 1, false, false},
+	      {PRIORITY_ROUTINE, 2, false, false},
+	      {PRIORITY_ROUTINE, 3, false, false}},
 	     3,
 	     0,
 	     2,
-	     "the latest of the lowest"},
+	     "the latest of the lowest",
+	     0},
 	    {{PRIORITY_STAT, PRIORITY_URGENT},
 	     2,
-	     {{PRIORITY_URGENT, 1, true}, {PRIORITY_URGENT, 2, false}},
+	     {{PRIORITY_URGENT, 1, true, false}, {PRIORITY_URGENT, 2, false, false}},
 	     2,
 	     0,
 	     -1,
-	     "the second pushes no equal"},
+	     "the second pushes no equal",
+	     0},
+	    {{PRIORITY_ROUTINE},
+	     1,
+	     {{PRIORITY_STAT, 1, false, true}},
+	     1,
+	     0,
+	     0,
+	     "who has nothing to do goes for any",
+	     0},
+	    {{PRIORITY_STAT},
+	     1,
+	     {{PRIORITY_ROUTINE, 1, false, false}, {PRIORITY_STAT, 2, false, true}},
+	     2,
+	     0,
+	     1,
+	     "and before all",
+	     0},
+	    {{PRIORITY_STAT}, 0, {{PRIORITY_STAT, 1, false, true}}, 1, 0, -1, "but not for nobody", 0},
+	    {{PRIORITY_STAT},
+	     0,
+	     {{PRIORITY_ROUTINE, 1, false, false}},
+	     1,
+	     0,
+	     0,
+	     "one that arrives pushes a lower one",
+	     1 + PRIORITY_URGENT},
+	    {{PRIORITY_STAT}, 0, {{PRIORITY_URGENT, 1, false, false}}, 1, 0, -1, "and no equal", 1 + PRIORITY_URGENT},
+	    {{PRIORITY_URGENT},
+	     1,
+	     {{PRIORITY_ROUTINE, 1, false, false}},
+	     1,
+	     1,
+	     0,
+	     "both get a worker",
+	     1 + PRIORITY_URGENT},
+	    {{PRIORITY_ROUTINE},
+	     1,
+	     {{PRIORITY_ROUTINE, 1, false, false}},
+	     1,
+	     1,
+	     -1,
+	     "the idle one is for who arrives",
+	     1 + PRIORITY_URGENT},
 	};
 
 	for (size_t i = 0; i < sizeof(cases) / sizeof(cases[0]); i++) {
 		struct queue queue = {0};
 		struct queue_entry entries[3] = {0};
+		enum priority arriving;
 
 		for (int k = 0; k < cases[i].queued_count; k++) {
 			entries[k].priority = (enum priority)cases[i].queued[k];
 			entries[k].ticket = 100 + k;
 			queue_add(&queue, &entries[k]);
 		}
-		ck_assert_msg(queue_victim(&queue, cases[i].running, cases[i].running_count, cases[i].idle) ==
-				  cases[i].victim,
+		arriving = (enum priority)(cases[i].arriving - 1);
+		ck_assert_msg(queue_victim(&queue, cases[i].arriving > 0 ? &arriving : NULL, cases[i].running,
+					   cases[i].running_count, cases[i].idle) == cases[i].victim,
 			      "%s", cases[i].why);
 	}
 }

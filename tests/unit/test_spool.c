@@ -418,13 +418,19 @@ static int run(const char *request_text, const char *where, const char *checkpoi
 					  .on_volume = watched_volume,
 					  .on_open = watched_open};
 	const struct device_options options = {.threads = 2};
+	struct spool_options spool = {.scan_directory = directory,
+				      .out_directory = where,
+				      .checkpoint = checkpoint,
+				      .iteration = iteration,
+				      .hooks = &hooks};
 	struct job_request request;
 	struct device *device = NULL;
 	int code;
 
 	ck_assert_msg(job_request_parse(request_text, strlen(request_text), &request, err) == 0, "%s", err->text);
 	ck_assert_msg(backend_cpu.open(0, &options, &device, err) == 0, "%s", err->text);
-	code = spool_run(&backend_cpu, device, directory, &request.recipe, where, checkpoint, iteration, &hooks, err);
+	spool.recipe = &request.recipe;
+	code = spool_run(&backend_cpu, device, &spool, err);
 	backend_cpu.close(device);
 	recipe_clear(&request.recipe);
 	return code;
@@ -533,6 +539,124 @@ START_TEST(the_same_iterate_is_one_file_with_two_names)
 }
 END_TEST
 
+/* The projections of `order` as they come, `piece` at a time; flags of those that there are, or NULL. */
+static int run_arriving(const int *order, int count, int piece, const unsigned char *present, struct watched *watched,
+			struct error *err)
+{
+	const struct spool_hooks hooks = {.recon = {.context = watched}, .on_volume = watched_volume};
+	const struct device_options options = {.threads = 2};
+	struct spool_options spool_options = {
+	    .scan_directory = directory, .out_directory = out, .present = present, .hooks = &hooks};
+	struct job_request request;
+	struct spool *spool = NULL;
+	struct device *device = NULL;
+	int code;
+
+	ck_assert_int_eq(job_request_parse(pipeline, strlen(pipeline), &request, err), 0);
+	spool_options.recipe = &request.recipe;
+	ck_assert_msg(backend_cpu.open(0, &options, &device, err) == 0, "%s", err->text);
+	code = spool_open(&backend_cpu, device, &spool_options, &spool, err);
+	for (int first = 0; first < count && code == 0; first += piece) {
+		ck_assert_int_eq(spool_pushed(spool), first);
+		code = spool_push(spool, order + first, count - first < piece ? count - first : piece, err);
+	}
+	if (code == 0)
+		code = spool_finish(spool, err);
+	spool_close(spool);
+	backend_cpu.close(device);
+	recipe_clear(&request.recipe);
+	return code;
+}
+
+START_TEST(projections_may_arrive_in_any_order_and_in_pieces)
+{
+	int order[VIEWS], straight[VIEWS];
+	struct watched whole = {0}, pieces = {0}, same = {0}, shuffled = {0}, again = {0};
+	struct error err = {0};
+	char *a, *b;
+	size_t length;
+
+	put_scan();
+	for (int i = 0; i < VIEWS; i++) {
+		straight[i] = i;
+		order[i] = (i * 7 + 3) % VIEWS;
+	}
+	ck_assert_int_eq(run(pipeline, out, NULL, 0, &whole, &err), 0);
+	load(out, "final.nii", &a, &length);
+	/* The same order is the same bits, whatever the pieces. */
+	ck_assert_msg(run_arriving(straight, VIEWS, 5, NULL, &pieces, &err) == 0, "%s", err.text);
+	ck_assert_mem_eq(pieces.saved[4].sha256, whole.saved[4].sha256, 32);
+	ck_assert_int_eq(run_arriving(order, VIEWS, 1, NULL, &shuffled, &err), 0);
+	ck_assert_int_eq(run_arriving(order, VIEWS, 4, NULL, &same, &err), 0);
+	ck_assert_mem_eq(shuffled.saved[0].sha256, same.saved[0].sha256, 32);
+	ck_assert_mem_eq(shuffled.saved[4].sha256, same.saved[4].sha256, 32);
+	/* Another one differs by the rounding of a sum of VIEWS floats. */
+	load(out, "fdk.nii", &b, &length);
+	free(a);
+	ck_assert_int_eq(run(pipeline, out, NULL, 0, &again, &err), 0);
+	load(out, "fdk.nii", &a, &length);
+	for (size_t i = SPOOL_VOLUME_OFFSET; i < length; i += sizeof(float)) {
+		float x, y;
+
+		memcpy(&x, a + i, sizeof(x));
+		memcpy(&y, b + i, sizeof(y));
+		ck_assert_float_eq_tol(x, y, 0.02F * 1e-6F);
+	}
+	free(a);
+	free(b);
+}
+END_TEST
+
+START_TEST(projections_that_make_no_sense_are_refused)
+{
+	const unsigned char present[VIEWS] = {[2] = 1, [5] = 1, [9] = 1, [13] = 1, [16] = 1}, none[VIEWS] = {0};
+	struct watched watched = {0};
+	struct error err = {0};
+
+	put_scan();
+	ck_assert_int_eq(run_arriving((int[]){VIEWS}, 1, 1, NULL, &watched, &err), ERR_INVALID);
+	ck_assert_int_eq(run_arriving((int[]){-1}, 1, 1, NULL, &watched, &err), ERR_INVALID);
+	ck_assert_int_eq(run_arriving((int[]){3, 4, 3}, 3, 1, NULL, &watched, &err), ERR_CONFLICT);
+	ck_assert_int_eq(run_arriving((int[]){3, 4}, 2, 1, NULL, &watched, &err),
+			 ERR_CONFLICT); /* the rest is missing */
+	ck_assert_int_eq(run_arriving((int[]){2, 3}, 2, 1, present, &watched, &err), ERR_INVALID);
+	ck_assert_int_eq(run_arriving(NULL, 0, 1, none, &watched, &err), ERR_INVALID);
+	ck_assert_int_eq(watched.kept, 0);
+}
+END_TEST
+
+/* Two directories: the whole scan with half of it present, and that half as a scan of its own. */
+START_TEST(a_scan_of_what_is_there_is_as_if_no_more_had_been_planned)
+{
+	unsigned char present[VIEWS] = {0};
+	int order[VIEWS], count = 0;
+	struct watched partial = {0}, half = {0};
+	struct error err = {0};
+	char *all, text[600];
+	size_t length;
+
+	put_scan();
+	for (int i = 3; i < 15; i++) {
+		present[i] = 1;
+		order[count++] = i;
+	}
+	ck_assert_msg(run_arriving(order, count, 5, present, &partial, &err) == 0, "%s", err.text);
+	load(directory, "projections.raw", &all, &length);
+	snprintf(text, sizeof(text),
+		 "{\"detector\":{\"columns\":%d,\"rows\":%d,\"pixel_mm\":[6,6]},\"projections\":{\"count\":%d,"
+		 "\"sample\":\"float32\",\"quantity\":\"line_integral\"},"
+		 "\"geometry\":{\"kind\":\"circular\",\"source_to_isocentre_mm\":600,\"source_to_detector_mm\":1000,"
+		 "\"first_angle_deg\":60,\"angle_step_deg\":20}}",
+		 COLUMNS, ROWS, count);
+	put("scan.json", text, strlen(text));
+	put("projections.raw", all + 3 * PIXELS * sizeof(float), (size_t)count * PIXELS * sizeof(float));
+	free(all);
+	ck_assert_msg(run(pipeline, out, NULL, 0, &half, &err) == 0, "%s", err.text);
+	for (int i = 0; i < 5; i++)
+		ck_assert_mem_eq(partial.saved[i].sha256, half.saved[i].sha256, 32);
+}
+END_TEST
+
 START_TEST(a_run_that_yields_goes_on_to_the_same_bits)
 {
 	struct watched whole = {0}, first = {.yield_at = 1}, second = {.yield_at = 3}, third = {0};
@@ -591,7 +715,7 @@ START_TEST(a_checkpoint_of_something_else_is_refused)
 
 	put_scan();
 	snprintf(checkpoint, sizeof(checkpoint), "%s/%s", out, SPOOL_CHECKPOINT);
-	ck_assert_int_lt(run(pipeline, out, checkpoint, 2, &second, &err), 0); /* none there */
+	ck_assert_int_eq(run(pipeline, out, checkpoint, 2, &second, &err), ERR_INVALID); /* none there */
 	ck_assert_int_eq(run(pipeline, out, NULL, 0, &first, &err), ERR_BUSY);
 	ck_assert_int_eq(run(other, out, checkpoint, 2, &second, &err), ERR_INVALID);
 	load(out, SPOOL_CHECKPOINT, &bytes, &length);
@@ -691,6 +815,9 @@ Suite *spool_suite(void)
 	tcase_add_checked_fixture(pipelines, make_directory, remove_directory);
 	tcase_add_test(pipelines, kept_volumes_are_files_that_say_what_they_are);
 	tcase_add_test(pipelines, the_same_iterate_is_one_file_with_two_names);
+	tcase_add_test(pipelines, projections_may_arrive_in_any_order_and_in_pieces);
+	tcase_add_test(pipelines, projections_that_make_no_sense_are_refused);
+	tcase_add_test(pipelines, a_scan_of_what_is_there_is_as_if_no_more_had_been_planned);
 	tcase_add_test(pipelines, a_run_that_yields_goes_on_to_the_same_bits);
 	tcase_add_test(pipelines, a_checkpoint_knows_its_own_iteration);
 	tcase_add_test(pipelines, a_checkpoint_of_something_else_is_refused);

@@ -313,23 +313,120 @@ static void count_wake(void *context)
 	++*(int *)context;
 }
 
-START_TEST(watchers_hear_of_projections_and_of_the_last_one)
+START_TEST(arrivals_are_told_in_their_order)
 {
-	struct stored_scan *scan = state_scan(&state, 4, false);
-	int wakes = 0, ready = 0;
+	struct stored_scan *scan = state_scan(&state, 8, false);
+	char id[ID_SIZE];
+	int order[8];
+
+	memcpy(id, stored_scan_id(scan), sizeof(id));
+	ck_assert_int_eq(stored_scan_arrivals(scan, 0, order, 8), 0);
+	ck_assert(facts_of(scan).arrived == 0);
+	state_put(&state, scan, 5, 6, 1);
+	state_put(&state, scan, 0, 1, 1);
+	state_put(&state, scan, 7, 7, 1);
+	ck_assert(facts_of(scan).arrived > 0);
+	ck_assert_int_eq(stored_scan_arrivals(scan, 0, order, 8), 5);
+	ck_assert_mem_eq(order, ((int[]){5, 6, 0, 1, 7}), 5 * sizeof(int));
+	ck_assert_int_eq(stored_scan_arrivals(scan, 3, order, 1), 1);
+	ck_assert_int_eq(order[0], 1);
+	ck_assert_int_eq(stored_scan_arrivals(scan, 5, order, 8), 0);
+	stored_scan_release(scan);
+	state_reopen(&state);
+	scan = find(id);
+	ck_assert_int_eq(stored_scan_arrivals(scan, 0, order, 8), 5);
+	ck_assert_mem_eq(order, ((int[]){0, 1, 5, 6, 7}), 5 * sizeof(int)); /* by their numbers, those of before */
+	stored_scan_release(scan);
+}
+END_TEST
+
+START_TEST(a_scan_that_is_closed_is_what_is_there)
+{
+	struct stored_scan *scan = state_scan(&state, 12, false);
+	struct received_projection late = {.scan = scan, .index = 3};
+	struct error err = {0};
+	enum claim claim;
+	char id[ID_SIZE];
+	unsigned basis;
+
+	memcpy(id, stored_scan_id(scan), sizeof(id));
+	ck_assert_int_eq(store_scan_close(state.store, scan, &err), ERR_CONFLICT); /* nothing is there */
+	state_put(&state, scan, 4, 4, 1);
+	ck_assert_int_eq(store_scan_close(state.store, scan, &err), ERR_CONFLICT);
+	state_put(&state, scan, 1, 2, 1);
+	ck_assert_int_eq(stored_scan_claim(scan, 3, &claim, &err), 0); /* on its way */
+	basis = facts_of(scan).basis;
+	ck_assert_ptr_eq(stored_scan_measured(scan), stored_scan_parsed(scan));
+	ck_assert_msg(store_scan_close(state.store, scan, &err) == 0, "%s", err.text);
+	ck_assert_int_eq(store_scan_close(state.store, scan, &err), 0);
+	ck_assert_uint_ne(facts_of(scan).basis, basis);
+	/* what was on its way counts no more, what is there stays */
+	ck_assert_int_eq(store_put_projections(state.store, &late, 1, &err), 0);
+	ck_assert(!late.stored);
+	ck_assert_int_eq(stored_scan_claim(scan, 3, &claim, &err), ERR_CONFLICT);
+	ck_assert_int_eq(stored_scan_claim(scan, 4, &claim, &err), 0);
+	ck_assert_int_eq(claim, CLAIM_STORED);
+	for (int again = 0; again < 2; again++) {
+		const struct scan *measured = stored_scan_measured(scan), *parsed = stored_scan_parsed(scan);
+
+		ck_assert(facts_of(scan).closed && facts_of(scan).complete && facts_of(scan).ready);
+		ck_assert_int_eq(facts_of(scan).received, 3);
+		ck_assert_int_eq(parsed->count, 12);
+		ck_assert_int_eq(measured->count, 3);
+		ck_assert_int_eq(measured->geometry.count, 3);
+		ck_assert_mem_eq(measured->projection, ((int[]){1, 2, 4}), 3 * sizeof(int));
+		ck_assert_mem_eq(&measured->geometry.views[2], &parsed->geometry.views[4], sizeof(struct view));
+		/* 30, 60 and 120 degrees */
+		ck_assert_double_eq_tol(measured->orbit.arc, 1.57079633, 1e-6);
+		ck_assert_int_eq(stored_scan_claim(scan, 0, &claim, &err), ERR_CONFLICT);
+		stored_scan_release(scan);
+		if (again == 0)
+			state_reopen(&state);
+		scan = find(id);
+	}
+	stored_scan_release(scan);
+}
+END_TEST
+
+START_TEST(a_scan_that_is_complete_need_not_be_closed)
+{
+	struct stored_scan *scan = state_scan(&state, 3, false), *single = state_scan(&state, 1, false);
+	struct error err = {0};
+
+	state_put(&state, scan, 0, 2, 1);
+	ck_assert_int_eq(store_scan_close(state.store, scan, &err), 0);
+	ck_assert(!facts_of(scan).closed);
+	ck_assert_int_eq(store_scan_close(state.store, single, &err), ERR_CONFLICT);
+	state_put(&state, single, 0, 0, 1);
+	ck_assert_int_eq(store_scan_close(state.store, single, &err), 0);
+	ck_assert_int_eq(store_scan_delete(state.store, scan, &err), 0);
+	ck_assert_int_eq(store_scan_close(state.store, scan, &err), ERR_NOT_FOUND);
+	stored_scan_release(scan);
+	stored_scan_release(single);
+}
+END_TEST
+
+START_TEST(watchers_hear_of_projections_and_of_the_end)
+{
+	struct stored_scan *scan = state_scan(&state, 8, false);
+	int wakes = 0, arrivals = 0;
 	struct watch watch = {.wake = count_wake, .context = &wakes};
-	struct watch ready_watch = {.wake = count_wake, .context = &ready};
+	struct watch arrivals_watch = {.wake = count_wake, .context = &arrivals};
+	struct error err = {0};
 
 	stored_scan_watch(scan, &watch);
-	store_watch_ready(state.store, &ready_watch);
+	store_watch_arrivals(state.store, &arrivals_watch);
 	state_put(&state, scan, 0, 2, 1);
 	ck_assert_int_eq(wakes, 1); /* a batch is one piece of news */
-	ck_assert_int_eq(ready, 0);
-	state_put(&state, scan, 3, 3, 1);
+	ck_assert_int_eq(arrivals, 1);
+	state_put(&state, scan, 5, 5, 1);
 	ck_assert_int_eq(wakes, 2);
-	ck_assert_int_eq(ready, 1);
+	ck_assert_int_eq(arrivals, 2);
+	ck_assert_int_eq(store_scan_close(state.store, scan, &err), 0);
+	ck_assert_int_eq(wakes, 3);
+	ck_assert_int_eq(arrivals, 3);
 	stored_scan_unwatch(scan, &watch);
-	store_unwatch_ready(state.store, &ready_watch);
+	store_unwatch_arrivals(state.store, &arrivals_watch);
 	stored_scan_release(scan);
 }
 END_TEST
@@ -352,7 +449,10 @@ Suite *store_suite(void)
 	tcase_add_test(tests, a_scan_whose_files_are_gone_says_so);
 	tcase_add_test(tests, a_state_directory_has_one_daemon);
 	tcase_add_test(tests, a_failed_commit_is_final_and_nothing_is_acknowledged);
-	tcase_add_test(tests, watchers_hear_of_projections_and_of_the_last_one);
+	tcase_add_test(tests, arrivals_are_told_in_their_order);
+	tcase_add_test(tests, a_scan_that_is_closed_is_what_is_there);
+	tcase_add_test(tests, a_scan_that_is_complete_need_not_be_closed);
+	tcase_add_test(tests, watchers_hear_of_projections_and_of_the_end);
 	suite_add_tcase(suite, tests);
 	return suite;
 }

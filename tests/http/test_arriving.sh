@@ -1,0 +1,375 @@
+#!/usr/bin/env bash
+# FDK while the projections arrive: in any order, interrupted in every way; and scans that are broken off.
+. "$(dirname "$0")/lib.sh"
+
+scan_dir=$work/ball raw_dir=$work/raw
+views=60 one=$((64 * 48 * 4))
+ball=(--phantom ball --scale 30 --density 0.02 --shift 5,-8,6 --views $views --arc 300 --columns 64 --rows 48 --pixel 4
+	--source-to-isocentre 600 --source-to-detector 1000)
+cbct simulate "${ball[@]}" -o "$scan_dir" >/dev/null || exit 1
+cbct simulate "${ball[@]}" --raw flat --sample float32 -o "$raw_dir" >/dev/null || exit 1
+grid='"grid": {"size": [48, 48, 24], "spacing_mm": [2, 2, 3]}'
+fdk="{\"scan\": \"SCAN\", $grid, \"fdk\": {}}"
+long="{\"scan\": \"SCAN\", $grid, \"sart\": {\"iterations\": 100000, \"subsets\": \"views\"}}"
+
+# A test that failed leaves nothing that the next one would wait for.
+fresh_daemon() {
+	rm -rf "$state"
+	start_daemon
+}
+# send DIR FIRST LAST [STATUS]: that run in one body
+send() {
+	dd if="$1/projections.raw" bs=$one skip="$2" count=$(($3 - $2 + 1)) status=none >"$work/run"
+	req PUT "/v1/scans/$scan/projections/$2-$3" -T "$work/run"
+	expect_status "${4:-201}"
+}
+# reconstructed COUNT [SECONDS]: waits until the job, still waiting, has taken in so many
+reconstructed() {
+	local end=$((SECONDS + ${2:-60}))
+	while :; do
+		req GET "/v1/jobs/$job"
+		expect_json '.state == "waiting"'
+		[ "$(json .views.reconstructed)" = "$1" ] && return 0
+		[ $SECONDS -lt $end ] || fail "$1 projections reconstructed: $(json '{state, stage, views}')"
+		sleep 0.02
+	done
+}
+state_becomes() { # STATE [SECONDS]
+	local end=$((SECONDS + ${2:-60}))
+	until req GET "/v1/jobs/$job" && [ "$(json .state)" = "$1" ]; do
+		[ $SECONDS -lt $end ] || fail "job $job $1: $(json '{state, stage, views}')"
+		sleep 0.02
+	done
+}
+digest() { # NAME: of a volume of $job
+	req GET "/v1/jobs/$job/volumes"
+	expect_status 200
+	json ".volumes[] | select(.name == \"$1\") | .digest"
+}
+# What the same recipe gives of the whole scan posted afterwards.
+expect_same_as_afterwards() { # RECIPE [NAME]
+	local arrived
+	arrived=$(digest "${2:-final}")
+	post_job "$1"
+	wait_job succeeded
+	[ "$(digest "${2:-final}")" = "$arrived" ] || fail "the bits of the job that was posted afterwards"
+}
+# kill_worker ATTEMPT: until the daemon has seen that the job's worker died and calls it so often tried
+kill_worker() {
+	local end=$((SECONDS + 60))
+	kill -9 "$(worker_of)"
+	until req GET "/v1/jobs/$job" && [ "$(json .attempts)" = "$1" ]; do
+		[ $SECONDS -lt $end ] || fail "attempt $1 of job $job: $(json '{state, attempts}')"
+		sleep 0.02
+	done
+}
+worker_of() { pgrep -P "$(cat "$work/daemon.pid")" | head -1; }
+
+test_fdk_goes_along_and_the_rest_of_the_pipeline_follows() {
+	fresh_daemon
+	local recipe="{\"scan\": \"SCAN\", $grid, \"fdk\": {}, \"sart\": {\"iterations\": 2, \"subsets\": 5}, \"tv\": {}, \"emit\": [\"fdk\", 1]}"
+	post_scan "$scan_dir"
+	post_job "$recipe"
+	expect_json '.state == "waiting" and .views == {received: 0, reconstructed: 0, of: 60}'
+	send "$scan_dir" 0 19
+	reconstructed 20
+	expect_json '.stage == "fdk" and .views == {received: 20, reconstructed: 20, of: 60} and .progress > 0 and .progress < 1'
+	expect_json '.backend == "cpu" and (.plan | length > 0) and .attempts == 0 and .started == null and .eta_s == null'
+	req GET /v1/devices
+	expect_json ".devices[0] | .state == \"busy\" and .job == \"$job\""
+	send "$scan_dir" 20 58
+	reconstructed 59
+	send "$scan_dir" 59 59
+	wait_job succeeded
+	expect_json '.attempts == 1 and .views == {received: 60, reconstructed: 60, of: 60} and .progress == 1'
+	expect_json '[.history[].iteration] == [1, 2] and .volumes == 3'
+	# in the order of their numbers: the same bits
+	expect_same_as_afterwards "$recipe"
+}
+
+test_any_order_with_gaps_and_repeats() {
+	fresh_daemon
+	local k order first
+	post_scan "$scan_dir"
+	post_job "$fdk"
+	order=$(for ((k = 0; k < views; k++)); do echo $((k * 37 % views)); done)
+	for k in $order; do
+		send "$scan_dir" "$k" "$k"
+		[ $((k % 7)) != 0 ] || send "$scan_dir" "$k" "$k" 200
+		[ "$k" != 0 ] || reconstructed 1
+	done
+	wait_job succeeded
+	get_volume final "$work/shuffled.nii"
+	first=$(digest final)
+	post_job "$fdk"
+	wait_job succeeded
+	get_volume final "$work/straight.nii"
+	[ "$(digest final)" != "$first" ] || fail "other bits: it was reconstructed in the order of its arrival"
+	# rounding of a sum of 60 floats
+	expect_number "$(cbct compare "$work/shuffled.nii" "$work/straight.nii" --json | jq .relative_error)" '<=' 1e-6 "relative difference"
+	# and the same order is the same bits, whenever the worker hears of it
+	post_scan "$scan_dir"
+	for k in $(head -20 <<<"$order"); do send "$scan_dir" "$k" "$k"; done
+	post_job "$fdk"
+	reconstructed 20
+	for k in $(tail -n +21 <<<"$order"); do send "$scan_dir" "$k" "$k"; done
+	wait_job succeeded
+	[ "$(digest final)" = "$first" ] || fail "the bits of the same order"
+}
+
+test_from_several_connections_at_once() {
+	fresh_daemon
+	local i k pids=()
+	post_scan "$scan_dir"
+	post_job "$fdk"
+	for i in 0 1 2 3; do
+		(
+			for ((k = i; k < views; k += 4)); do
+				dd if="$scan_dir/projections.raw" bs=$one skip="$k" count=1 status=none |
+					curl -sf -o /dev/null -X PUT --data-binary @- "$url/v1/scans/$scan/projections/$k" || exit 1
+			done
+		) &
+		pids+=($!)
+	done
+	for i in "${pids[@]}"; do wait "$i" || fail "each projection stored"; done
+	wait_job succeeded
+	expect_json '.attempts == 1'
+	get_volume final "$work/parallel.nii"
+	post_job "$fdk"
+	wait_job succeeded
+	get_volume final "$work/straight.nii"
+	expect_number "$(cbct compare "$work/parallel.nii" "$work/straight.nii" --json | jq .relative_error)" '<=' 1e-6 "relative difference"
+}
+
+test_who_only_waits_blocks_nobody() {
+	fresh_daemon
+	local waiting
+	post_scan "$scan_dir"
+	post_job "$fdk"
+	waiting=$job
+	send "$scan_dir" 0 9
+	reconstructed 10
+	local growing=$scan
+	# ready jobs of its own priority, after a moment of patience, and of a higher one at once
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "$fdk"
+	wait_job succeeded 60
+	post_job "${fdk%\}}, \"priority\": \"stat\"}"
+	wait_job succeeded 60
+	# nothing was lost
+	job=$waiting
+	scan=$growing
+	reconstructed 10
+	expect_json '.attempts == 0'
+	send "$scan_dir" 10 59
+	wait_job succeeded
+	expect_json '.attempts == 1'
+	expect_same_as_afterwards "$fdk"
+}
+
+test_an_urgent_scan_that_comes_in_takes_the_worker() {
+	fresh_daemon
+	local running urgent other
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "$long"
+	running=$job
+	state_becomes running
+	post_scan "$scan_dir"
+	post_job "${fdk%\}}, \"priority\": \"urgent\"}"
+	urgent=$job
+	# before the first projection there is nothing to make room for
+	send "$scan_dir" 0 9
+	reconstructed 10
+	job=$running
+	state_becomes queued
+	job=$urgent
+	send "$scan_dir" 10 59
+	wait_job succeeded
+	# of two that wait, the one that gets projections has the worker
+	job=$running
+	req DELETE "/v1/jobs/$job?wait=30"
+	expect_json '.state == "cancelled"'
+	post_scan "$scan_dir"
+	post_job "$fdk"
+	other=$job
+	post_scan "$scan_dir"
+	post_job "$fdk"
+	send "$scan_dir" 0 1
+	reconstructed 2 || fail "the worker for the job whose projections come"
+	send "$scan_dir" 2 59
+	wait_job succeeded
+	job=$other
+	req DELETE "/v1/jobs/$job?wait=30"
+	expect_json '.state == "cancelled"'
+}
+
+test_cancel_and_delete_while_it_waits() {
+	fresh_daemon
+	local worker
+	post_scan "$scan_dir"
+	post_job "$fdk"
+	send "$scan_dir" 0 9
+	reconstructed 10
+	req DELETE "/v1/scans/$scan"
+	expect_problem 409
+	worker=$(worker_of)
+	req DELETE "/v1/jobs/$job?wait=30"
+	expect_status 202
+	expect_json '.state == "cancelled"'
+	[ "$(worker_of)" = "$worker" ] || fail "the worker alive"
+	req DELETE "/v1/jobs/$job"
+	expect_status 204
+	send "$scan_dir" 10 59
+	req DELETE "/v1/scans/$scan"
+	expect_status 204
+	# it is free again
+	post_scan "$scan_dir"
+	post_job "$fdk"
+	send "$scan_dir" 0 59
+	wait_job succeeded
+	req DELETE "/v1/scans/$scan"
+	expect_status 204
+	req GET "/v1/jobs/$job"
+	expect_json '.views == null'
+}
+
+test_a_worker_that_dies_in_the_middle() {
+	fresh_daemon
+	post_scan "$scan_dir"
+	post_job "$fdk"
+	send "$scan_dir" 0 29
+	reconstructed 30
+	kill_worker 2
+	send "$scan_dir" 30 39
+	reconstructed 40
+	kill_worker 3
+	send "$scan_dir" 40 59
+	wait_job succeeded
+	expect_json '.attempts == 3'
+	expect_same_as_afterwards "$fdk"
+	# three times is enough
+	post_scan "$scan_dir"
+	post_job "$fdk"
+	send "$scan_dir" 0 9
+	reconstructed 10
+	kill_worker 2
+	reconstructed 10
+	kill_worker 3
+	reconstructed 10
+	kill -9 "$(worker_of)"
+	wait_job failed
+	expect_json '.error.detail | test("3 times")'
+}
+
+test_a_daemon_that_dies_or_stops_in_the_middle() {
+	fresh_daemon
+	local signal
+	post_scan "$scan_dir"
+	post_job "$fdk"
+	send "$scan_dir" 20 39
+	reconstructed 20
+	for signal in KILL TERM; do
+		stop_daemon $signal
+		[ $signal != TERM ] || [ "$stop_status" = 0 ] || fail "exit status 0"
+		start_daemon
+		reconstructed 20
+	done
+	send "$scan_dir" 40 59
+	send "$scan_dir" 0 19
+	wait_job succeeded
+	get_volume final "$work/restarted.nii"
+	post_job "$fdk"
+	wait_job succeeded
+	get_volume final "$work/straight.nii"
+	expect_number "$(cbct compare "$work/restarted.nii" "$work/straight.nii" --json | jq .relative_error)" '<=' 1e-6 "relative difference"
+}
+
+test_images_that_come_late() {
+	fresh_daemon
+	post_scan "$raw_dir"
+	post_job "$fdk"
+	send "$raw_dir" 0 9
+	# nothing can be made of counts alone
+	req GET "/v1/jobs/$job"
+	expect_json '.state == "waiting" and .stage == null and .views.reconstructed == 0'
+	req PUT "/v1/scans/$scan/flat" -T "$raw_dir/flat.f32"
+	expect_status 201
+	reconstructed 10
+	# what was reconstructed without the dark is void
+	req PUT "/v1/scans/$scan/dark" -T "$raw_dir/dark.f32"
+	expect_status 201
+	send "$raw_dir" 10 19
+	reconstructed 20
+	send "$raw_dir" 20 59
+	wait_job succeeded
+	expect_json '.attempts == 1'
+	expect_same_as_afterwards "$fdk"
+}
+
+test_a_scan_that_is_broken_off_is_completed_with_what_is_there() {
+	fresh_daemon
+	local recipe="{\"scan\": \"SCAN\", $grid, \"fdk\": {}, \"sart\": {\"iterations\": 1, \"subsets\": 50}}" arrived short=$work/short
+	post_scan "$scan_dir"
+	req POST "/v1/scans/$scan/complete"
+	expect_problem 409
+	send "$scan_dir" 3 3
+	req POST "/v1/scans/$scan/complete"
+	expect_problem 409
+	expect_json '.detail | test("1 of 60")'
+	post_job "$recipe"
+	send "$scan_dir" 4 47
+	reconstructed 45
+	req POST "/v1/scans/$scan/complete"
+	expect_status 200
+	expect_json '.state == "complete" and .received == [[3, 47]] and .missing == [[0, 2], [48, 59]] and .received_count == 45'
+	expect_json '.derived.arc_deg > 223 and .derived.arc_deg < 224 and .derived.short_scan and .projections.count == 60'
+	expect_json '[.warnings[] | select(.code == "incomplete") | .detail | test("45 of 60")] == [true]'
+	cp "$body" "$work/completed"
+	wait_job succeeded
+	expect_json '.views == {received: 45, reconstructed: 45, of: 45} and .attempts == 1'
+	expect_json '[.warnings[] | select(.code == "incomplete") | .detail | test("45 of 60")] == [true]'
+	arrived=$(digest final)
+	# closed is closed
+	req POST "/v1/scans/$scan/complete"
+	expect_status 200
+	diff "$body" "$work/completed" || fail "the same document"
+	send "$scan_dir" 0 0 409
+	send "$scan_dir" 47 48 409
+	send "$scan_dir" 3 47 200
+	stop_daemon KILL
+	start_daemon
+	req GET "/v1/scans/$scan"
+	diff "$body" "$work/completed" || fail "the same document after a restart"
+	send "$scan_dir" 0 0 409
+	post_job "$fdk"
+	wait_job succeeded
+	expect_json '.warnings | any(.code == "incomplete")'
+	# as if no more had been planned
+	mkdir -p "$short"
+	dd if="$scan_dir/projections.raw" bs=$one skip=3 count=45 of="$short/projections.raw" status=none
+	jq '.projections.count = 45 | .geometry.first_angle_deg += 3 * .geometry.angle_step_deg' "$scan_dir/scan.json" >"$short/scan.json"
+	post_scan "$short"
+	post_projections "$short"
+	post_job "${recipe/50/45}"
+	wait_job succeeded
+	[ "$(digest final)" = "$arrived" ] || fail "the bits of a scan of those 45 views"
+	# nothing is missing: nothing changes
+	req POST "/v1/scans/$scan/complete"
+	expect_status 200
+	expect_json '.missing == [] and (.warnings | all(.code != "incomplete"))'
+	req POST "/v1/scans/1m00000000000000/complete"
+	expect_problem 404
+}
+
+test_cbct_completes_a_scan() {
+	fresh_daemon
+	post_scan "$scan_dir"
+	if cbct complete "$scan" 2>"$work/error"; then fail "a refusal"; fi
+	grep -q '0 of 60' "$work/error" || fail "the numbers: $(cat "$work/error")"
+	send "$scan_dir" 0 49
+	[[ $(cbct complete "$scan") == "$scan"*"50 of 60 projections" ]] || fail "50 of 60 projections"
+}
+
+stop_after_each=1 run_tests
