@@ -41,9 +41,11 @@ struct backprojection_job {
 
 /*
  * The matrices of the views in hand, one after the other, for the copy into
- * constant memory; columns are counted from `pad` before the detector's first.
+ * constant memory; columns are counted from `pad` before the detector's first,
+ * rows from the last one, `flip`, where that is not negative.
  */
-static __global__ void gather(const device_view *geometry, const int *views, int count, float pad, float *to)
+static __global__ void gather(const device_view *geometry, const int *views, int count, float pad, float flip,
+			      float *to)
 {
 	int i = blockIdx.x * blockDim.x + threadIdx.x;
 
@@ -53,6 +55,8 @@ static __global__ void gather(const device_view *geometry, const int *views, int
 	int row = i % 12 / 4, k = i % 4;
 
 	to[i] = row == 0 ? fmaf(pad, m[2][k], m[0][k]) : m[row][k];
+	if (row == 1 && flip >= 0)
+		to[i] = fmaf(flip, m[2][k], -m[1][k]);
 }
 
 /* What the sums of `COUNT` voxels from z on do to the volume. */
@@ -228,12 +232,13 @@ static struct {
 static int load_matrices(struct plan *plan, int first, int count, int pad, struct error *err)
 {
 	cudaStream_t stream = plan->device->stream;
+	float flip = pairs_flipped(plan) ? (float)(plan->stack.rows - 1) : -1.0f;
 
 	if (loaded.plan == plan && loaded.list == plan->views_list && loaded.first == first && loaded.count == count &&
 	    loaded.pad == pad)
 		return 0;
 	gather<<<divide_up(count * 12, 256), 256, 0, stream>>>(plan->geometry, plan->views + first, count, (float)pad,
-							       plan->matrices);
+							       flip, plan->matrices);
 	LAUNCHED();
 	CUDA_TRY(cudaMemcpyToSymbolAsync(matrices, plan->matrices, (size_t)count * 12 * sizeof(float), 0,
 					 cudaMemcpyDeviceToDevice, stream));

@@ -291,6 +291,11 @@ int plan_check_views(const struct plan *plan, const int *views, int count, const
 
 /* ---- layout.cu ---- */
 int layout_slices(struct plan *plan, const float *volume, struct error *err); /* -> scratch */
+/* Pairs stand upside down where rows run down: their kernel wants rows that count with z. */
+static inline bool pairs_flipped(const struct plan *plan)
+{
+	return plan->shape.back_voxels > 0 && plan->shape.rows_down;
+}
 /* -> pairs */
 int layout_pairs(struct plan *plan, const struct stack_shape *shape, const float *from, int count, struct error *err);
 int layout_to_columns(struct plan *plan, const float *volume, float *columns, struct error *err);

@@ -243,7 +243,7 @@ int layout_from_columns(struct plan *plan, const float *columns, float *volume, 
 
 /* Zeros outside of the detector included: everything is written. */
 static __global__ void __launch_bounds__(256)
-    to_pairs(const float *__restrict__ from, const stack_shape shape, float2 *to, const pairs_shape pairs)
+    to_pairs(const float *__restrict__ from, const stack_shape shape, float2 *to, const pairs_shape pairs, bool flipped)
 {
 	int row = (int)(blockIdx.x * 4 + threadIdx.y) - STACK_PAD, column = (int)(blockIdx.y * PANEL + threadIdx.x) - 1;
 	float2 pair = {0, 0};
@@ -251,7 +251,8 @@ static __global__ void __launch_bounds__(256)
 	if (row >= shape.rows + STACK_PAD)
 		return;
 	if (row >= 0 && row < shape.rows) {
-		const float *at = from + blockIdx.z * shape.slot + (size_t)row * shape.pitch;
+		int from_row = flipped ? shape.rows - 1 - row : row;
+		const float *at = from + blockIdx.z * shape.slot + (size_t)from_row * shape.pitch;
 
 		if (column >= 0 && column < shape.columns)
 			pair.x = at[column];
@@ -269,7 +270,8 @@ int layout_pairs(struct plan *plan, const struct stack_shape *shape, const float
 	struct pairs_shape pairs = pairs_shape_make(shape->columns, shape->rows);
 	dim3 blocks(divide_up(shape->rows + 2 * STACK_PAD, 4), (unsigned)(pairs.slot / (size_t)pairs.panel), count);
 
-	to_pairs<<<blocks, dim3(PANEL, 4), 0, plan->device->stream>>>(from, *shape, plan->pairs, pairs);
+	to_pairs<<<blocks, dim3(PANEL, 4), 0, plan->device->stream>>>(from, *shape, plan->pairs, pairs,
+								      pairs_flipped(plan));
 	LAUNCHED();
 	return 0;
 }

@@ -219,7 +219,7 @@ static void choose_rows(const struct plan_options *options, struct plan_shape *s
 	if (!shape->z_rays)
 		shape->forward_rows = window_size(false, least, most);
 	/* Seen from the detector the same spacing is upside down. */
-	if (shape->rows_down || !shape->untilted)
+	if (!shape->untilted)
 		return;
 	shape->back_voxels = window_size(true, 1 / most, 1 / least);
 	shape->back_half = shape->back_voxels > 0;
