@@ -92,7 +92,7 @@ cuda_code    := $(foreach a,$(CUDA_ARCH),-gencode arch=compute_$(a),code=sm_$(a)
                 -gencode arch=compute_$(lastword $(CUDA_ARCH)),code=compute_$(lastword $(CUDA_ARCH))
 endif
 
-programs := $(BUILD)/cbctd $(BUILD)/cbct-worker $(BUILD)/cbct
+programs := $(BUILD)/cbctd $(BUILD)/cbct-worker $(BUILD)/cbct $(if $(cuda_objects),$(BUILD)/cbct-cuda)
 
 all: $(programs) ## the programs, in build/
 
@@ -139,6 +139,10 @@ $(BUILD)/cbct-worker: $(call objects,daemon/worker.c) $(library) $(cuda_objects)
 
 $(BUILD)/cbct: $(call objects,$(cbct_sources)) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(cbct_libs) $(proto_libs) $(core_libs)) $(LIBM)
+
+# What `cbct recon` becomes where a card is wanted.
+$(BUILD)/cbct-cuda: $(call objects,$(cbct_sources)) $(library) $(cuda_objects)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(cbct_libs) $(proto_libs) $(core_libs)) $(cuda_libs) $(LIBM)
 
 $(BUILD)/unit: $(call objects,$(unit_sources) $(state_sources)) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,check sqlite3 $(files_libs) $(proto_libs) $(core_libs)) $(LIBM)

@@ -1,7 +1,11 @@
 /* cbct recon: the pipeline over a scan directory with no daemon, as a worker runs it. */
 #include <errno.h>
+#include <limits.h>
+#include <stdio.h>
+#include <stdlib.h>
 #include <string.h>
 #include <sys/stat.h>
+#include <unistd.h>
 
 #include "clients/cbct/commands.h"
 #include "clients/cbct/progress.h"
@@ -103,6 +107,54 @@ static int request_make(const struct recon_options *options, struct job_request 
 	return code;
 }
 
+/* The command line, each argument with its zero. Free with free. */
+static int own_arguments(char **ret_text, size_t *ret_length, struct error *err)
+{
+	FILE *file = fopen("/proc/self/cmdline", "re");
+	char *text = NULL;
+	size_t room = 0;
+	ssize_t length;
+
+	if (file == NULL)
+		return error_set_errno(err, errno, "/proc/self/cmdline");
+	length = getdelim(&text, &room, EOF, file);
+	fclose(file);
+	if (length <= 0) {
+		free(text);
+		return error_set(err, ERR_IO, "/proc/self/cmdline is empty");
+	}
+	*ret_text = text;
+	*ret_length = (size_t)length;
+	return 0;
+}
+
+/*
+ * cbct itself is without the kernels and the libraries that come with them, to
+ * start at once: cbct-cuda beside it is the same program with both. Returns
+ * where there is none.
+ */
+static void become_cuda(void)
+{
+	enum { ARGUMENTS_MOST = 256 };
+	char path[PATH_MAX], *text = NULL, *arguments[ARGUMENTS_MOST + 1], *end;
+	struct error ignored;
+	ssize_t length = readlink("/proc/self/exe", path, sizeof(path) - sizeof("-cuda"));
+	size_t bytes = 0;
+	int count = 0;
+
+	if (length <= 0)
+		return;
+	strcpy(path + length, "-cuda");
+	if (access(path, X_OK) != 0 || own_arguments(&text, &bytes, &ignored) != 0)
+		return;
+	end = text + bytes;
+	for (char *at = text; at < end && count < ARGUMENTS_MOST; at += strlen(at) + 1)
+		arguments[count++] = at;
+	arguments[count] = NULL;
+	execv(path, arguments);
+	free(text);
+}
+
 static int pipeline_run(const struct recon_options *options, const struct recipe *recipe, struct error *err)
 {
 	const struct backend *backend = backend_find(options->backend);
@@ -118,6 +170,8 @@ static int pipeline_run(const struct recon_options *options, const struct recipe
 	struct device *device = NULL;
 	int code;
 
+	if (backends[0] == NULL && strcmp(options->backend, "cpu") != 0)
+		become_cuda();
 	if (backend == NULL)
 		return error_set(err, ERR_USAGE, "--backend: '%s' is none that this program has", options->backend);
 	if (mkdir(output, 0777) != 0 && errno != EEXIST)
