@@ -44,7 +44,7 @@ enum rtk_trust {
 	RTK_TRUST_COUNT
 };
 extern const char *const rtk_trust_names[RTK_TRUST_COUNT]; /* "both", "parameters", "matrices" */
-#define RTK_AGREEMENT 0.01 /* pixels: more than rounded numbers make, less than a picture shows */
+#define RTK_AGREEMENT 0.05 /* pixels: more than rounded numbers make, less than a picture shows */
 
 enum { RTK_BYTES_MAX = 64 << 20 };
 

@@ -7,6 +7,7 @@
  * step for all frames or each frame's offset from the first (C.8.7.5.1.3). Enhanced
  * XA: the same attributes in the functional groups, shared or of each frame.
  */
+#include <dirent.h>
 #include <errno.h>
 #include <fcntl.h>
 #include <limits.h>
@@ -420,17 +421,17 @@ static bool dicom_recognise(const unsigned char *head, size_t length)
 	return length >= 132 && memcmp(head + 128, "DICM", 4) == 0;
 }
 
+/* All of them: dcmdump writes a file for each piece that it finds. */
 static void remove_files(struct dicom *dicom)
 {
-	static const char *const names[] = {"plain.dcm", "in.dcm", "plain.dcm.0.raw", "in.dcm.0.raw"};
-	char path[128];
+	DIR *directory = dicom->directory[0] != '\0' ? opendir(dicom->directory) : NULL;
+	const struct dirent *entry;
 
-	if (dicom->directory[0] == '\0')
+	while (directory != NULL && (entry = readdir(directory)) != NULL)
+		unlinkat(dirfd(directory), entry->d_name, 0);
+	if (directory == NULL)
 		return;
-	for (size_t i = 0; i < sizeof(names) / sizeof(names[0]); i++) {
-		snprintf(path, sizeof(path), "%s/%s", dicom->directory, names[i]);
-		unlink(path);
-	}
+	closedir(directory);
 	rmdir(dicom->directory);
 	dicom->directory[0] = '\0';
 }
