@@ -125,7 +125,7 @@ $(BUILD)/proto/openapi.o: $(BUILD)/proto/openapi.c
 	$(call say,CC  )$(CC) $(CFLAGS) -c -o $@ $<
 
 # The page for the clinician is part of the daemon; without npm there is a plain one.
-$(BUILD)/web/assets.c: $(shell find clients/web -name node_modules -prune -o -type f -print)
+$(BUILD)/web/assets.c: $(shell find clients/web -name node_modules -prune -o -type f -print) $(if $(wildcard $(BUILD)/web/without),again)
 	$(call say,WEB )clients/web/build.sh $(@D)
 
 $(BUILD)/web/assets.o: $(BUILD)/web/assets.c
@@ -259,6 +259,6 @@ clean: ## removes build/
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-.PHONY: all setup demo check fuzz fuzzers bench check-gpu bench-gpu asan tsan lint format install clean help
+.PHONY: all again setup demo check fuzz fuzzers bench check-gpu bench-gpu asan tsan lint format install clean help
 .SECONDARY:
 -include $(shell find $(BUILD) -name '*.d' 2>/dev/null)

@@ -50,7 +50,7 @@ jq --arg date "$date" --arg commit "$commit" --argjson plastimatch "$plastimatch
 rm -f "$out/measured.json"
 echo "written: $out/cpu.json"
 
-if [ -x tests/bench/http.sh ]; then
+for more in tests/bench/http.sh tests/bench/page.sh; do
 	echo
-	BUILD=$BUILD tests/bench/http.sh
-fi
+	BUILD=$BUILD $more
+done

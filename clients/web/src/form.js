@@ -31,6 +31,7 @@ const groups = [
 		choice('/tv/method', 'Method', ['gradient', 'proximal']), number('/tv/alpha', 'Alpha'), number('/tv/step', 'Step'),
 		number('/tv/iterations', 'Iterations', { step: 1 }), choice('/tv/after', 'After', ['fdk+sart', 'sart']), number('/tv/unit', 'Gray level, 1/mm'),
 	] },
+	{ title: 'Metal', pointer: '/metal', optional: true, rare: true, off: 'not corrected', fields: [number('/metal/threshold_hu', 'From, HU')] },
 	{ title: 'Job', pointer: '', fields: [
 		text('/emit', 'Keep volumes', { hint: 'fdk, fdk-tv, iterations', wide: true, read: value => value.split(/[\s,]+/).filter(Boolean).map(name => /^\d+$/.test(name) ? Number(name) : name),
 			write: list => (list ?? []).join(', ') }),
@@ -88,7 +89,8 @@ export class JobForm {
 		if (!group.optional)
 			return h('fieldset', {}, h('legend', {}, group.title), body)
 		const value = this.#initial[path(group.pointer)[0]]
-		const fresh = members.every(member => this.#initial[member] === undefined) && group.pointer !== '/grid'
+		/* A job from nothing has all stages; which grid, the daemon knows best. */
+		const fresh = members.every(member => this.#initial[member] === undefined) && group.pointer !== '/grid' && !group.rare
 		const box = h('input', { type: 'checkbox', checked: fresh || (value !== undefined && value !== null) })
 		const off = h('p', { class: 'off' }, group.off)
 		const error = h('p', { class: 'trouble', hidden: true, id: newId('error') })
