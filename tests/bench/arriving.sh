@@ -58,8 +58,8 @@ done
 
 jq -s --arg backend "$backend" --argjson grid "$grid" --arg size "$columns x $rows" --arg sample "$sample" --argjson goal "$goal" \
 	--slurpfile job "$work/job" '{backend: $backend, device: $job[0].device, detector: $size, sample: $sample, grid: $grid,
-	goal_ms: $goal, runs: .}' "$work/results" >"$BUILD/bench/arriving.json"
+	goal_ms: $goal, last_timings: $job[0].timings, runs: .}' "$work/results" >"$BUILD/bench/arriving.json"
 jq -r '"FDK while it arrives, \(.backend), \(.runs[0].views) views of \(.detector) \(.sample) at \(.runs[0].rate)/s, \(.grid)^3:",
 	(.runs[] | "  kept \(.fdk_kept_ms) ms after the last 2xx; PUT median \(.put_ms.median), 99 % \(.put_ms.p99), most \(.put_ms.most) ms; sent at most \(.late_ms.most) ms late"),
-	"  goal \(.goal_ms) ms"' "$BUILD/bench/arriving.json"
+	"  goal \(.goal_ms) ms; after the last projection, of the last run: FDK \(.last_timings.fdk) s, save \(.last_timings.save) s"' "$BUILD/bench/arriving.json"
 echo "written: $BUILD/bench/arriving.json"
