@@ -548,6 +548,80 @@ static void warn_angles(cJSON *list, const struct orbit *orbit)
 	free(views);
 }
 
+/*
+ * How a view's detector lies, seen from the source with z up: +1 where columns run
+ * to the right, as u does; and +1 where turning them towards the rows turns to the
+ * left, as from u to v.
+ */
+static void view_turns(const struct view *view, int *ret_columns, int *ret_handedness)
+{
+	const double *s = view->source, *u = view->column_step;
+	double normal[3], along = u[1] * s[0] - u[0] * s[1];
+
+	vec_cross(u, view->row_step, normal);
+	*ret_columns = along < 0 ? -1 : 1;
+	*ret_handedness = vec_dot(normal, s) < vec_dot(normal, view->pixel0) ? -1 : 1;
+}
+
+/* Detectors that are seen from behind, and sets of which some are mirrored and others not. */
+static void warn_mirrored(cJSON *list, const struct geometry *geometry)
+{
+	int against = 0, odd = 0, first_odd = 0, first = 0;
+
+	for (int k = 0; k < geometry->count; k++) {
+		int columns, handedness;
+
+		view_turns(&geometry->views[k], &columns, &handedness);
+		first = k == 0 ? handedness : first;
+		against += columns < 0;
+		if (handedness != first && odd++ == 0)
+			first_odd = k;
+	}
+	if (odd > 0)
+		warn(list, "mirrored_views", "%d of %d views, such as view %d, are mirrored against view 0", odd,
+		     geometry->count, first_odd);
+	if (against > geometry->count / 2)
+		warn(list, "mirrored_columns",
+		     "seen from the source with z up, columns run to the left: right for images that are shown as one "
+		     "faces "
+		     "the patient, otherwise they are mirrored");
+}
+
+/* Lengths in another unit, matrices that were made for another detector: possible, and hardly meant. */
+static void warn_implausible(cJSON *list, const struct scan *scan)
+{
+	const double fan_most = 120;           /* degrees; scanners stay below 60 */
+	const double magnification_most = 300; /* micro-CT stays below; sources in metres make it a thousand and more */
+	const double nearest = 5;              /* mm from source to detector */
+	const struct orbit *orbit = &scan->orbit;
+	const struct geometry *geometry = &scan->geometry;
+	double fan = orbit->fan / degree, pitch = 0, magnification = orbit->source_to_detector / orbit->source_radius;
+	int outside = 0;
+
+	for (int k = 0; k < geometry->count; k++) {
+		const double isocentre[3] = {0, 0, 0};
+		double matrix[12], column, row;
+
+		view_matrix(&geometry->views[k], matrix);
+		view_project(matrix, isocentre, &column, &row);
+		outside += !(column > -1 && column < geometry->columns && row > -1 && row < geometry->rows);
+		pitch += vec_norm(geometry->views[k].column_step) / geometry->count;
+	}
+	if (fan > fan_most || orbit->source_to_detector < nearest || magnification > magnification_most)
+		warn(list, "implausible_lengths",
+		     "the sources stand %.4g mm from the axis and %.4g mm from the detector, which they see under %.4g "
+		     "degrees: are all lengths in mm?",
+		     orbit->source_radius, orbit->source_to_detector, fan);
+	if (fabs(pitch / scan->pixel_mm[0] - 1) > 0.01)
+		warn(list, "other_pitch", "the views' columns are %.6g mm apart, detector.pixel_mm says %.6g", pitch,
+		     scan->pixel_mm[0]);
+	if (outside > geometry->count / 2)
+		warn(list, "isocentre_outside",
+		     "the isocentre falls outside the detector in %d of %d views: is the geometry that of another "
+		     "detector?",
+		     outside, geometry->count);
+}
+
 /* A polynomial that is none of water's is more likely a slip than a beam. */
 static void warn_hardening(cJSON *list, const struct scan *scan)
 {
@@ -584,6 +658,8 @@ cJSON *scan_warnings(const struct scan *scan)
 	} else {
 		warn(list, "single_view", "one view only: depth cannot be told");
 	}
+	warn_implausible(list, scan);
+	warn_mirrored(list, &scan->geometry);
 	warn_hardening(list, scan);
 	if (scan->air > 0 && scan->saturation > 0 && scan->air >= scan->saturation)
 		warn(list, "air_saturated", "air is %.6g, not below the saturation at %.6g: all of it are defects",

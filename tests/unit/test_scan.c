@@ -444,6 +444,116 @@ START_TEST(what_was_understood_is_told)
 }
 END_TEST
 
+/* ---- what is hardly meant ---- */
+
+static void in_metres(struct view *view, int k)
+{
+	(void)k;
+	for (int i = 0; i < 3; i++) {
+		view->source[i] *= 1e-3;
+		view->pixel0[i] *= 1e-3;
+	}
+}
+static void all_in_metres(struct view *view, int k)
+{
+	in_metres(view, k);
+	for (int i = 0; i < 3; i++) {
+		view->column_step[i] *= 1e-3;
+		view->row_step[i] *= 1e-3;
+	}
+}
+static void coarser(struct view *view, int k)
+{
+	(void)k;
+	for (int i = 0; i < 3; i++) {
+		view->column_step[i] *= 1.5;
+		view->row_step[i] *= 1.5;
+	}
+}
+static void other_detector(struct view *view, int k)
+{
+	(void)k;
+	for (int i = 0; i < 3; i++)
+		view->pixel0[i] += 24 * view->column_step[i];
+}
+static void columns_back(struct view *view, int k)
+{
+	(void)k;
+	for (int i = 0; i < 3; i++) {
+		view->pixel0[i] += 39 * view->column_step[i];
+		view->column_step[i] = -view->column_step[i];
+	}
+}
+static void one_back(struct view *view, int k)
+{
+	if (k == 2)
+		columns_back(view, k);
+}
+static void rows_down(struct view *view, int k)
+{
+	(void)k;
+	for (int i = 0; i < 3; i++) {
+		view->pixel0[i] += 29 * view->row_step[i];
+		view->row_step[i] = -view->row_step[i];
+	}
+}
+
+static const struct {
+	void (*change)(struct view *view, int k);
+	const char *warning; /* NULL: none of these */
+} slips[] = {
+    {in_metres, "implausible_lengths"},
+    {all_in_metres, "implausible_lengths"},
+    {coarser, "other_pitch"},
+    {other_detector, "isocentre_outside"},
+    {columns_back, "mirrored_columns"},
+    {one_back, "mirrored_views"},
+    {rows_down, NULL}, /* as most images are stored */
+};
+
+START_TEST(what_is_hardly_meant_is_told)
+{
+	static const char *const codes[] = {"implausible_lengths", "other_pitch", "isocentre_outside",
+					    "mirrored_columns", "mirrored_views"};
+	cJSON *geometry = cJSON_CreateObject(), *list, *warnings, *warning;
+	struct geometry views;
+	struct scan *scan;
+	bool found = false;
+	char *text;
+
+	cJSON_AddStringToObject(geometry, "kind", "views");
+	list = cJSON_AddArrayToObject(geometry, "views");
+	orbit_geometry(&views);
+	for (int k = 0; k < VIEWS; k++) {
+		cJSON *one = cJSON_CreateObject();
+
+		slips[_i].change(&views.views[k], k);
+		cJSON_AddItemToObject(one, "source_mm", cJSON_CreateDoubleArray(views.views[k].source, 3));
+		cJSON_AddItemToObject(one, "pixel0_mm", cJSON_CreateDoubleArray(views.views[k].pixel0, 3));
+		cJSON_AddItemToObject(one, "column_step_mm", cJSON_CreateDoubleArray(views.views[k].column_step, 3));
+		cJSON_AddItemToObject(one, "row_step_mm", cJSON_CreateDoubleArray(views.views[k].row_step, 3));
+		cJSON_AddItemToArray(list, one);
+	}
+	text = kind_text(geometry);
+	scan = read_scan(text);
+	warnings = scan_warnings(scan);
+	cJSON_ArrayForEach(warning, warnings)
+	{
+		const char *code = cJSON_GetObjectItem(warning, "code")->valuestring;
+
+		if (slips[_i].warning != NULL && strcmp(code, slips[_i].warning) == 0)
+			found = true;
+		for (size_t i = 0; slips[_i].warning == NULL && i < sizeof(codes) / sizeof(codes[0]); i++)
+			ck_assert_str_ne(code, codes[i]);
+	}
+	ck_assert_msg(found == (slips[_i].warning != NULL), "%s", slips[_i].warning);
+	cJSON_Delete(warnings);
+	scan_free(scan);
+	free(text);
+	geometry_clear(&views);
+}
+END_TEST
+
 START_TEST(derived_numbers_are_those_of_the_orbit)
 {
 	struct scan *scan = read_scan(contract);
@@ -510,6 +620,7 @@ Suite *scan_suite(void)
 	suite_add_tcase(suite, reading);
 	tcase_add_test(telling, what_was_understood_is_told);
 	tcase_add_test(telling, derived_numbers_are_those_of_the_orbit);
+	tcase_add_loop_test(telling, what_is_hardly_meant_is_told, 0, (int)(sizeof(slips) / sizeof(slips[0])));
 	tcase_add_test(telling, a_hole_in_the_arc_is_told);
 	suite_add_tcase(suite, telling);
 	return suite;
