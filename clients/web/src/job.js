@@ -66,17 +66,19 @@ export class JobPage {
 		this.geometry = h('div', {})
 		this.files = h('div', {})
 		this.courseSection = h('section', { class: 'card', hidden: true }, h('h2', {}, 'Convergence'), this.plot.element)
+		this.fileSection = h('section', { class: 'card', hidden: true }, h('h2', {}, 'Downloads'), this.files)
+		this.progress = h('div', { class: 'progress' }, this.bar.element, this.doing, this.left)
+		this.columns = h('div', { class: 'columns' },
+			h('div', { class: 'pictures' }, this.empty, this.stage, this.controls),
+			h('div', { class: 'aside' }, this.warnings, this.courseSection, this.fileSection,
+				h('section', { class: 'card' }, h('h2', {}, 'Projections'), this.film.element),
+				h('section', { class: 'card' }, h('h2', {}, 'Reconstruction'), this.about),
+				h('section', { class: 'card' }, h('h2', {}, 'Geometry'), this.geometry)))
 		this.element = h('div', { class: 'job' },
 			h('header', { class: 'head' }, h('a', { class: 'back', href: '#/' }, '‹ Jobs'), h('div', { class: 'title' }, this.heading, this.badge), this.actions,
-				h('div', { class: 'progress' }, this.bar.element, this.doing, this.left)),
+				this.progress),
 			this.announce, this.trouble, this.failure,
-			h('div', { class: 'columns' },
-				h('div', { class: 'pictures' }, this.empty, this.stage, this.controls),
-				h('div', { class: 'aside' }, this.warnings, this.courseSection,
-					h('section', { class: 'card' }, h('h2', {}, 'Downloads'), this.files),
-					h('section', { class: 'card' }, h('h2', {}, 'Projections'), this.film.element),
-					h('section', { class: 'card' }, h('h2', {}, 'Reconstruction'), this.about),
-					h('section', { class: 'card' }, h('h2', {}, 'Geometry'), this.geometry))))
+			this.columns)
 	}
 
 	#iterationControls() {
@@ -167,6 +169,7 @@ export class JobPage {
 		if (error.status === 404) {
 			clearInterval(this.timer)
 			write(this.heading, 'No such job')
+			this.progress.hidden = this.columns.hidden = true
 		}
 		replace(this.trouble, error.status ? error.message : 'The daemon cannot be reached; this page goes on by itself once it answers again.')
 		this.trouble.hidden = false
@@ -251,7 +254,7 @@ export class JobPage {
 	#showVolumes() {
 		const volumes = this.#volumes
 		this.empty.hidden = volumes.length > 0
-		this.stage.hidden = this.controls.hidden = volumes.length === 0
+		this.stage.hidden = this.controls.hidden = this.fileSection.hidden = volumes.length === 0
 		this.slider.max = String(Math.max(volumes.length - 1, 0))
 		this.slider.disabled = volumes.length < 2
 		replace(this.marks, volumes.map(volume => h('span', {}, volumes.length <= 14 ? ({ fdk: 'FDK', tv: 'TV' }[volume.stage] ?? String(volume.iteration)) : '')))

@@ -134,6 +134,7 @@ export class Plane {
 		const [crossX, crossY] = view.cross(this.name)
 		this.frame.style.width = `${width * scale}px`
 		this.frame.style.height = `${height * scale}px`
+		this.frame.classList.toggle('zoomed', view.zoom > 1)
 		this.picture.style.transform = `translate(${x * 100}%, ${y * 100}%) scale(${view.zoom})`
 		this.crossX.style.left = `${crossX * 100}%`
 		this.crossY.style.top = `${crossY * 100}%`

@@ -25,7 +25,7 @@ export function doing(job) {
 	}
 	if (job.state === 'failed')
 		return job.error?.detail ?? ''
-	return job.iterations > 0 ? `${job.iteration} of ${job.iterations} iterations` : ''
+	return [job.iterations > 0 ? `${job.iteration} of ${job.iterations} iterations` : 'FDK', job.grid?.size?.join(' × ')].filter(Boolean).join(' · ')
 }
 
 export function left(job) {
