@@ -138,6 +138,24 @@ static int write_mean(const struct import_options *options, const struct images 
 	return code;
 }
 
+static int write_defects(const struct import_options *options, const struct images *images, const char *directory,
+			 struct error *err)
+{
+	size_t pixels = (size_t)images->columns * (size_t)images->rows;
+	unsigned char *defects;
+	int code;
+
+	if (options->values.defects == NULL)
+		return 0;
+	defects = malloc(pixels);
+	code = defects != NULL ? import_defects(&options->image, options->values.defects, images, defects, err)
+			       : error_set(err, ERR_NO_MEMORY, "no memory for an image");
+	if (code == 0)
+		code = scan_output_file(directory, "defects.u8", defects, pixels, err);
+	free(defects);
+	return code;
+}
+
 static int write_directory(const struct import_options *options, struct images *images, const struct scan *scan,
 			   const char *directory, struct error *err)
 {
@@ -147,6 +165,8 @@ static int write_directory(const struct import_options *options, struct images *
 		code = write_mean(options, images, options->values.flat, directory, "flat.f32", err);
 	if (code == 0)
 		code = write_mean(options, images, options->values.dark, directory, "dark.f32", err);
+	if (code == 0)
+		code = write_defects(options, images, directory, err);
 	if (code == 0)
 		code = write_projections(options, images, scan, directory, err);
 	if (code == 0)

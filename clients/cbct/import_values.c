@@ -28,6 +28,7 @@ const struct option import_value_rows[] = {
     ROW("saturation", OPTION_NUMBER, saturation, "COUNTS", "from which on a pixel says nothing", 1e-6, 1e12, 0, NULL),
     ROW("flat", OPTION_TEXT, flat, "IMAGES", "of the open beam in place of --air; several are averaged", 0, 0, 0, NULL),
     ROW("dark", OPTION_TEXT, dark, "IMAGES", "without beam; several are averaged", 0, 0, 0, NULL),
+    ROW("defects", OPTION_TEXT, defects, "IMAGE", "not zero where a pixel is defective in every view", 0, 0, 0, NULL),
     ROW("scale", OPTION_NUMBER, scale, "F", "each number times F", 0, 0, 0, NULL),
     ROW("bias", OPTION_NUMBER, bias, "B", "and B added to it", 0, 0, 0, NULL),
     {0},
@@ -283,6 +284,22 @@ int import_samples(const struct import_values *options, struct images *images, i
 	return code;
 }
 
+static int open_alike(const char *path, const struct image_options *how, const struct images *like,
+		      struct images **ret_images, struct error *err)
+{
+	struct images *images = NULL;
+	int code = images_open(path, how, &images, err);
+
+	if (code == 0 && (images->columns != like->columns || images->rows != like->rows)) {
+		code = error_set(err, ERR_INVALID, "%.160s: images of %d x %d pixels, the projections have %d x %d",
+				 path, images->columns, images->rows, like->columns, like->rows);
+		images_free(images);
+	}
+	if (code == 0)
+		*ret_images = images;
+	return code;
+}
+
 int import_mean(const struct import_values *options, const struct image_options *how, const char *path,
 		const struct images *like, float *ret_mean, struct error *err)
 {
@@ -294,11 +311,8 @@ int import_mean(const struct import_values *options, const struct image_options 
 
 	/* A pattern chooses projections. */
 	every.pattern = NULL;
-	code = sums != NULL ? images_open(path, &every, &images, err)
+	code = sums != NULL ? open_alike(path, &every, like, &images, err)
 			    : error_set(err, ERR_NO_MEMORY, "no memory for %zu pixels", pixels);
-	if (code == 0 && (images->columns != like->columns || images->rows != like->rows))
-		code = error_set(err, ERR_INVALID, "%.160s: images of %d x %d pixels, the projections have %d x %d",
-				 path, images->columns, images->rows, like->columns, like->rows);
 	for (int k = 0; code == 0 && k < images->count; k++) {
 		code = read_scaled(options, images, k, ret_mean, err);
 		for (size_t i = 0; i < pixels && code == 0; i++)
@@ -308,5 +322,27 @@ int import_mean(const struct import_values *options, const struct image_options 
 		ret_mean[i] = (float)(sums[i] / images->count);
 	images_free(images);
 	free(sums);
+	return code;
+}
+
+int import_defects(const struct image_options *how, const char *path, const struct images *like,
+		   unsigned char *ret_defects, struct error *err)
+{
+	struct image_options bytes = *how;
+	float *pixels = malloc(pixels_of(like) * sizeof(*pixels));
+	struct images *images = NULL;
+	int code;
+
+	bytes.type = PIXEL_UINT8;
+	bytes.pattern = NULL;
+	bytes.header = 0;
+	code = pixels != NULL ? open_alike(path, &bytes, like, &images, err)
+			      : error_set(err, ERR_NO_MEMORY, "no memory for an image");
+	if (code == 0)
+		code = images_read(images, 0, pixels, err);
+	for (size_t i = 0; i < pixels_of(like) && code == 0; i++)
+		ret_defects[i] = pixels[i] != 0;
+	images_free(images);
+	free(pixels);
 	return code;
 }

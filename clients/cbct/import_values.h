@@ -12,7 +12,7 @@ struct import_values {
 	double air;           /* counts; NaN: not given */
 	double saturation;    /* counts; NaN: not given */
 	double air_region[4]; /* first column and row, last column and row; NaN: none */
-	const char *flat, *dark;
+	const char *flat, *dark, *defects;
 	const char *hardening; /* "C0,C1,C2": p' = C0 + C1 p + C2 p^2 ..., NULL: none */
 	double scale, bias;    /* a value is scale * stored + bias */
 };
@@ -35,5 +35,9 @@ int import_samples(const struct import_values *options, struct images *images, i
 /* The mean of the images at `path`, which must be as large as the projections; [row][column]. */
 int import_mean(const struct import_values *options, const struct image_options *how, const char *path,
 		const struct images *like, float *ret_mean, struct error *err);
+
+/* Where the image at `path` is not zero; raw ones are bytes. [row][column], 0 or 1. */
+int import_defects(const struct image_options *how, const char *path, const struct images *like,
+		   unsigned char *ret_defects, struct error *err);
 
 #endif

@@ -207,6 +207,7 @@ test_flat_and_dark_are_means() {
 		--flat "$work/flats.raw" --dark "$work/uneven/dark.f32" -o "$work/back" 2>/dev/null
 	cmp "$work/back/flat.f32" "$work/uneven/flat.f32" || fail "the mean of two that are the same"
 	cmp "$work/back/dark.f32" "$work/uneven/dark.f32" || fail "the dark"
+	[ ! -e "$work/back/defects.u8" ] || fail "no map of defects that nobody gave"
 	[ "$(jq -c '[.projections.quantity, .projections.air]' "$work/back/scan.json")" = '["intensity",null]' ] || fail "intensities with a flat"
 	# Fractions that fall towards the middle are no line integrals.
 	cbct import "$work/uneven/projections.raw" --size 48,32 --type uint16 --scale 1e-4 --air 5 --pixel 4,3 "${circle[@]}" -o "$work/back" 2>"$work/said"
@@ -216,12 +217,17 @@ test_flat_and_dark_are_means() {
 }
 
 # Each view's air is the mean of the first columns, which the ball does not reach: whatever the tube gave.
-test_a_region_of_air_stands_in_for_its_number() {
+test_regions_of_air_and_maps_of_defects() {
 	local here=(--size 48,32 --type uint16 --pixel 4,3 "${circle[@]}")
 	make_scans
 	cbct import "$counts/projections.raw" "${here[@]}" --air-region 0,0,3,31 --beam-hardening 0,1,0.01 -o "$work/region" 2>"$work/said"
 	jq -e '.projections | .air_region == [0, 0, 3, 31] and .beam_hardening == [0, 1, 0.01] and .air == 50000 and .sample == "uint16"' \
 		"$work/region/scan.json" >/dev/null || fail "region and polynomial in $(cat "$work/region/scan.json")"
+	# A map of defects is mirrored with the images.
+	{ printf '\0\7'; head -c $((48 * 32 - 2)) /dev/zero; } >"$work/map.raw"
+	cbct import "$counts/projections.raw" "${here[@]}" --air 50000 --defects "$work/map.raw" --flip-columns -o "$work/region" 2>"$work/said"
+	{ head -c 46 /dev/zero; printf '\1\0'; head -c $((48 * 31)) /dev/zero; } | cmp - "$work/region/defects.u8" || fail "the mirrored map"
+	refused 1 "no whole images" cbct import "$counts/projections.raw" "${here[@]}" --air 5 --defects "$counts/scan.json" -o "$work/never"
 	refused 1 "air_region" cbct import "$counts/projections.raw" "${here[@]}" --air-region 0,0,3,32 -o "$work/never"
 	refused 2 "--beam-hardening: '1,,2'" cbct import "$counts/projections.raw" "${here[@]}" --air 5 --beam-hardening 1,,2 -o "$work/never"
 }
