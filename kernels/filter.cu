@@ -15,21 +15,42 @@
  * convolution sees only the taps -(columns - 1) .. columns - 1 of the kernel:
  * these are taken out of it and transformed anew, so that both give the same rows.
  *
- * Rows too long for that go through cuFFT in batches.
+ * Rows too long for that go through cuFFT in batches, and so do those that the
+ * detector cuts off (core/extend.h): rows are looked at before they are filtered,
+ * on the stream for what comes in, so that nobody waits for the card to come to
+ * it. All are filtered as they are, those few then once more with their extension.
  */
 #include <cmath>
 #include <cstdlib>
 #include <cufft.h>
 #include <vector>
 
+#include "core/extend.h"
 #include "kernels/fft.cuh"
 #include "kernels/internal.cuh"
 
+static const size_t FFT_BYTES = (size_t)64 << 20; /* of the rows that cuFFT takes at once */
+
+/* cuFFT's part: transforms of one length, so many rows at once. */
 struct fft {
+	int length, at_once;
 	cufftHandle forward, inverse;
-	float *rows; /* [fft_rows][fft_length + 2] */
+	float *response; /* [length / 2 + 1], 1 / length included */
+	float *rows;     /* [at_once][length + 2] */
 	size_t bytes;
 	bool has_forward, has_inverse;
+};
+
+/* What is found at the edges of a batch's rows: [slot of the batch][row]. */
+struct edges {
+	unsigned char *sides; /* bit 0: cut off before column 0, bit 1: behind the last one */
+	struct extension (*fit)[2];
+	int *list; /* rows with any */
+	unsigned char *sides_host;
+	int *list_host;
+	int rows; /* that there is room for */
+	cudaEvent_t used;
+	size_t extended[2];
 };
 
 struct filter_job {
@@ -47,6 +68,11 @@ struct filter_job {
 	const float *response;
 	const float2 *twiddles; /* of the first factor, then [16][16] of the second */
 	float2 roots[8];        /* exp(-2 pi i j / (2 HALF)) */
+	/* cuFFT's rows are these in place of all, and have extensions; NULL: all as they are. */
+	const int *list;
+	const unsigned char *sides;
+	const struct extension (*fit)[2];
+	int extend;
 };
 
 /* A row's squared length of rays and their part along the central line, as polynomials of the centred column. */
@@ -184,19 +210,107 @@ static __global__ void __launch_bounds__(32 * HALF * PAIRS) filter_fused(const f
 	}
 }
 
+/* ---- edges ---- */
+
+enum { EDGE_THREADS = 64 };
+struct batch_slots {
+	int slot[BATCH_MOST];
+};
+
+/* The block's sum, the same bits on every run; thread 0 has it. */
+static __device__ double sum_block(double value, double *shared)
+{
+	shared[threadIdx.x] = value;
+	for (int half = EDGE_THREADS / 2; half > 0; half /= 2) {
+		__syncthreads();
+		if (threadIdx.x < half)
+			shared[threadIdx.x] += shared[threadIdx.x + half];
+	}
+	__syncthreads();
+	double sum = shared[0];
+	__syncthreads();
+	return sum;
+}
+
+/* A block has one row; most rows end in air at both sides and cost no more than a look there. */
+static __global__ void __launch_bounds__(EDGE_THREADS)
+    find_edges(const filter_job job, const batch_slots slots, bool before, bool behind, edges found)
+{
+	__shared__ double shared[EDGE_THREADS];
+	int row = blockIdx.x, columns = job.columns, edge = extend_edge(columns), window = extend_window(columns);
+	const float *p = job.from + (size_t)slots.slot[blockIdx.y] * job.slot + (size_t)row * job.pitch;
+	size_t at = (size_t)blockIdx.y * job.rows + row;
+	int sides = 0;
+
+	for (int side = 0; side < 2; side++) {
+		double sum = 0;
+
+		for (int i = threadIdx.x; i < edge; i += EDGE_THREADS)
+			sum += (double)p[side == 0 ? i : columns - 1 - i];
+		sum = sum_block(sum, shared);
+		if ((side == 0 ? before : behind) && sum >= (double)(EXTEND_LEVEL * (float)edge))
+			sides |= 1 << side;
+	}
+	if (threadIdx.x == 0)
+		found.sides[at] = (unsigned char)sides;
+	if (sides == 0)
+		return;
+	struct extend_row_sums own = {}, row_sums;
+	for (int c = threadIdx.x; c < columns; c += EDGE_THREADS)
+		if (p[c] >= EXTEND_LEVEL)
+			extend_row_add(&own, extend_x(c, columns), (double)p[c]);
+	row_sums.n = sum_block(own.n, shared);
+	row_sums.x = sum_block(own.x, shared);
+	row_sums.x2 = sum_block(own.x2, shared);
+	row_sums.x3 = sum_block(own.x3, shared);
+	row_sums.x4 = sum_block(own.x4, shared);
+	row_sums.y = sum_block(own.y, shared);
+	row_sums.xy = sum_block(own.xy, shared);
+	row_sums.x2y = sum_block(own.x2y, shared);
+	for (int side = 0; side < 2; side++) {
+		struct extend_edge_sums edge_sums;
+		double y = 0, xy = 0;
+
+		for (int i = threadIdx.x; i < window; i += EDGE_THREADS) {
+			double value = fmax((double)p[side == 0 ? i : columns - 1 - i], 0.0);
+
+			y += value * value;
+			xy -= i * value * value;
+		}
+		edge_sums.y = sum_block(y, shared);
+		edge_sums.xy = sum_block(xy, shared);
+		if (threadIdx.x == 0 && (sides >> side & 1))
+			found.fit[at][side] = extend_fit(columns, job.extend, &row_sums, &edge_sums);
+	}
+}
+
 /* ---- cuFFT ---- */
 
 /* Where a row of all rows of the call comes from and goes to. */
 struct row_place {
 	int view, row;
-	size_t from, to;
+	size_t from, to, index;
 };
 static __device__ __forceinline__ row_place place_of(const filter_job &job, int index)
 {
+	if (job.list != NULL)
+		index = job.list[index];
 	int i = index / job.rows, row = index - i * job.rows;
 
 	return {job.views[i], row, (size_t)job.slots[i] * job.slot + (size_t)row * job.pitch,
-		(size_t)i * job.wide_slot + (size_t)row * job.wide_pitch};
+		(size_t)i * job.wide_slot + (size_t)row * job.wide_pitch, (size_t)index};
+}
+
+/* The row beyond its ends: where it goes on `x` columns past the outermost one. */
+static __device__ __forceinline__ float extended_at(const filter_job &job, const row_place &at,
+						    const row_weight &weight, int side, int x)
+{
+	int outermost = side == 0 ? 0 : job.columns - 1, column = side == 0 ? -x : outermost + x;
+
+	if (!(job.sides[at.index] >> side & 1) || x > job.extend)
+		return 0;
+	return extend_value(&job.fit[at.index][side], x) * weight.column_weights[outermost] *
+	       cosine_at(job, weight, column);
 }
 
 static __global__ void fft_fill(const filter_job job, int first, int length, float *to)
@@ -206,12 +320,14 @@ static __global__ void fft_fill(const filter_job job, int first, int length, flo
 
 	if (to_column >= length)
 		return;
-	if ((unsigned)column < (unsigned)job.columns) {
-		row_place at = place_of(job, first + (int)blockIdx.y);
-		row_weight weight = weight_of(job, at.view, at.row);
-
+	row_place at = place_of(job, first + (int)blockIdx.y);
+	row_weight weight = weight_of(job, at.view, at.row);
+	if ((unsigned)column < (unsigned)job.columns)
 		value = job.from[at.from + column] * weight.column_weights[column] * cosine_at(job, weight, column);
-	}
+	else if (job.list != NULL && column >= job.columns && column < job.columns + job.extend)
+		value = extended_at(job, at, weight, 1, column - (job.columns - 1));
+	else if (job.list != NULL && column >= length - job.extend)
+		value = extended_at(job, at, weight, 0, length - column);
 	to[(size_t)blockIdx.y * (length + 2) + to_column] = value;
 }
 
@@ -233,21 +349,20 @@ static __global__ void fft_take(const filter_job job, int first, int length, con
 		    rows[(size_t)blockIdx.y * (length + 2) + column];
 }
 
-static int filter_fft(struct plan *plan, const filter_job &job, struct error *err)
+/* The first `all` rows of the job's list, or of all. */
+static int filter_fft(const struct fft *fft, const filter_job &job, int all, cudaStream_t stream, struct error *err)
 {
-	struct fft *fft = plan->fft;
-	int length = plan->shape.fft_length, all = job.count * job.rows, most = plan->shape.fft_rows;
-	cudaStream_t stream = plan->device->stream;
+	int length = fft->length;
 
-	for (int first = 0; first < all; first += most) {
-		int rows = all - first < most ? all - first : most;
+	for (int first = 0; first < all; first += fft->at_once) {
+		int rows = all - first < fft->at_once ? all - first : fft->at_once;
 
 		fft_fill<<<dim3(divide_up(length, 256), rows), 256, 0, stream>>>(job, first, length, fft->rows);
 		LAUNCHED();
 		/* Rows left over from the batch before are transformed once more and not read. */
 		if (cufftExecR2C(fft->forward, fft->rows, (cufftComplex *)fft->rows) != CUFFT_SUCCESS)
 			return error_set(err, ERR_DEVICE, "cufftExecR2C of %d rows of %d failed", rows, length);
-		fft_multiply<<<dim3(divide_up(length / 2 + 1, 256), rows), 256, 0, stream>>>(plan->response, length,
+		fft_multiply<<<dim3(divide_up(length / 2 + 1, 256), rows), 256, 0, stream>>>(fft->response, length,
 											     fft->rows);
 		LAUNCHED();
 		if (cufftExecC2R(fft->inverse, (cufftComplex *)fft->rows, fft->rows) != CUFFT_SUCCESS)
@@ -270,16 +385,34 @@ int filter_choose(int columns)
 	return 0;
 }
 
-size_t filter_bytes(const struct plan_shape *shape, int columns)
+/* Rows that cuFFT takes at once: as much as a batch has, within a bound. */
+static int fft_at_once(int length, int rows)
 {
-	size_t length = (size_t)shape->filter_length;
+	int most = (int)(FFT_BYTES / ((size_t)(length + 2) * sizeof(float)));
 
-	(void)columns;
-	if (length > 0)
-		return length * (sizeof(float) + sizeof(float2)) + 256 * sizeof(float2);
-	length = (size_t)shape->fft_length;
+	return rows < most ? rows : most;
+}
+
+static size_t fft_bytes(int length, int rows)
+{
 	/* cuFFT's own workspace is about as large as its data. */
-	return (length / 2 + 1) * sizeof(float) + 2 * (size_t)shape->fft_rows * (length + 2) * sizeof(float);
+	return ((size_t)length / 2 + 1) * sizeof(float) +
+	       2 * (size_t)fft_at_once(length, rows) * (size_t)(length + 2) * sizeof(float);
+}
+
+size_t filter_bytes(const struct plan_shape *shape, int rows)
+{
+	size_t length = (size_t)shape->filter_length, bytes;
+	size_t all = (size_t)shape->batch * (size_t)rows;
+
+	if (length > 0)
+		bytes = length * (sizeof(float) + sizeof(float2)) + 256 * sizeof(float2);
+	else
+		bytes = fft_bytes(shape->fft_length, (int)all);
+	if (shape->extended_length > 0)
+		bytes += fft_bytes(shape->extended_length, (int)all) +
+			 all * (1 + 2 * sizeof(struct extension) + sizeof(int));
+	return bytes;
 }
 
 /* The response at another length that convolves `columns` values alike. */
@@ -289,6 +422,7 @@ static std::vector<double> response_at(const float *response, int from, int colu
 
 	for (int i = 0; i < from; i++)
 		cosine[(size_t)i] = cos(2 * M_PI * i / from);
+#pragma omp parallel for
 	for (int n = 0; n < columns; n++) {
 		double sum = response[0] + (n % 2 ? -1.0 : 1.0) * response[from / 2];
 
@@ -299,6 +433,7 @@ static std::vector<double> response_at(const float *response, int from, int colu
 	cosine.resize((size_t)length);
 	for (int i = 0; i < length; i++)
 		cosine[(size_t)i] = cos(2 * M_PI * i / length);
+#pragma omp parallel for
 	for (int k = 0; k <= length / 2; k++) {
 		double sum = taps[0];
 
@@ -348,18 +483,21 @@ static int prepare_fused(struct plan *plan, struct error *err)
 	return upload(plan, twiddles.data(), twiddles.size() * sizeof(float2), (void **)&plan->twiddles, err);
 }
 
-static int prepare_fft(struct plan *plan, struct error *err)
+static int fft_new(struct plan *plan, int length, const float *from, struct fft **ret_fft, struct error *err)
 {
-	int length = plan->shape.fft_length, rows = plan->shape.fft_rows, half = length / 2 + 1, padded = length + 2;
+	int rows = fft_at_once(length, plan->shape.batch * plan->stack.rows), half = length / 2 + 1,
+	    padded = length + 2;
 	std::vector<float> response((size_t)half);
 	struct fft *fft = (struct fft *)calloc(1, sizeof(*fft));
 
 	if (fft == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for the filter");
-	plan->fft = fft;
+	*ret_fft = fft; /* the plan's, which releases it however far this comes */
+	fft->length = length;
+	fft->at_once = rows;
 	for (int k = 0; k < half; k++)
-		response[(size_t)k] = plan->options.filter_response[k] / (float)length;
-	TRY(upload(plan, response.data(), response.size() * sizeof(float), (void **)&plan->response, err));
+		response[(size_t)k] = from[k] / (float)length;
+	TRY(upload(plan, response.data(), response.size() * sizeof(float), (void **)&fft->response, err));
 	fft->bytes = (size_t)rows * (size_t)padded * sizeof(float);
 	TRY(device_allocate(plan->device, fft->bytes, (void **)&fft->rows, err));
 	fft->has_forward = cufftPlanMany(&fft->forward, 1, &length, &padded, 1, padded, &half, 1, half, CUFFT_R2C,
@@ -374,32 +512,79 @@ static int prepare_fft(struct plan *plan, struct error *err)
 	return 0;
 }
 
-int filter_prepare(struct plan *plan, struct error *err)
+static void fft_free(struct device *device, struct fft *fft)
 {
-	size_t bytes = (size_t)plan->options.geometry->count * (size_t)plan->stack.columns * sizeof(float);
-
-	TRY(upload(plan, plan->options.column_weights, bytes, (void **)&plan->column_weights, err));
-	return plan->shape.filter_length > 0 ? prepare_fused(plan, err) : prepare_fft(plan, err);
-}
-
-void filter_release(struct plan *plan)
-{
-	struct fft *fft = plan->fft;
-	size_t length = (size_t)plan->shape.filter_length;
-
-	device_release(plan->device, plan->column_weights,
-		       (size_t)plan->options.geometry->count * (size_t)plan->stack.columns * sizeof(float));
-	device_release(plan->device, plan->response,
-		       (length > 0 ? length : (size_t)plan->shape.fft_length / 2 + 1) * sizeof(float));
-	device_release(plan->device, plan->twiddles, (length + 256) * sizeof(float2));
 	if (fft == NULL)
 		return;
 	if (fft->has_forward)
 		cufftDestroy(fft->forward);
 	if (fft->has_inverse)
 		cufftDestroy(fft->inverse);
-	device_release(plan->device, fft->rows, fft->bytes);
+	device_release(device, fft->rows, fft->bytes);
+	device_release(device, fft->response, ((size_t)fft->length / 2 + 1) * sizeof(float));
 	free(fft);
+}
+
+static int prepare_edges(struct plan *plan, struct error *err)
+{
+	struct edges *edges = (struct edges *)calloc(1, sizeof(*edges));
+	size_t rows = (size_t)plan->shape.batch * (size_t)plan->stack.rows;
+
+	if (edges == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for the edges of rows");
+	plan->edges = edges;
+	edges->rows = (int)rows;
+	edges->sides_host = (unsigned char *)malloc(rows);
+	edges->list_host = (int *)malloc(rows * sizeof(int));
+	if (edges->sides_host == NULL || edges->list_host == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for the edges of %zu rows", rows);
+	CUDA_TRY(cudaEventCreateWithFlags(&edges->used, cudaEventDisableTiming));
+	TRY(device_allocate(plan->device, rows, (void **)&edges->sides, err));
+	TRY(device_allocate(plan->device, rows * sizeof(*edges->fit), (void **)&edges->fit, err));
+	return device_allocate(plan->device, rows * sizeof(int), (void **)&edges->list, err);
+}
+
+static void edges_free(struct device *device, struct edges *edges)
+{
+	if (edges == NULL)
+		return;
+	device_release(device, edges->sides, (size_t)edges->rows);
+	device_release(device, edges->fit, (size_t)edges->rows * sizeof(*edges->fit));
+	device_release(device, edges->list, (size_t)edges->rows * sizeof(int));
+	if (edges->used != NULL)
+		cudaEventDestroy(edges->used);
+	free(edges->sides_host);
+	free(edges->list_host);
+	free(edges);
+}
+
+int filter_prepare(struct plan *plan, struct error *err)
+{
+	const struct plan_options *options = &plan->options;
+	size_t bytes = (size_t)options->geometry->count * (size_t)plan->stack.columns * sizeof(float);
+
+	TRY(upload(plan, options->column_weights, bytes, (void **)&plan->column_weights, err));
+	if (plan->shape.filter_length > 0)
+		TRY(prepare_fused(plan, err));
+	else
+		TRY(fft_new(plan, plan->shape.fft_length, options->filter_response, &plan->fft, err));
+	if (plan->shape.extended_length == 0)
+		return 0;
+	TRY(prepare_edges(plan, err));
+	return fft_new(plan, plan->shape.extended_length, options->extended_response, &plan->extended, err);
+}
+
+void filter_release(struct plan *plan)
+{
+	size_t length = (size_t)plan->shape.filter_length;
+
+	device_release(plan->device, plan->column_weights,
+		       (size_t)plan->options.geometry->count * (size_t)plan->stack.columns * sizeof(float));
+	device_release(plan->device, plan->response, length * sizeof(float));
+	device_release(plan->device, plan->twiddles, (length + 256) * sizeof(float2));
+	fft_free(plan->device, plan->fft);
+	fft_free(plan->device, plan->extended);
+	edges_free(plan->device, plan->edges);
 }
 
 template <int HALF>
@@ -413,21 +598,11 @@ static void launch_fused(filter_job &job, cudaStream_t stream)
 	    <<<dim3(divide_up(job.rows, 2 * pairs), job.count), dim3(32 * HALF, pairs), 0, stream>>>(job);
 }
 
-int cuda_filter(struct plan *plan, const struct stack *from, const int *slots, const int *views, int count,
-		struct stack *to, struct error *err)
+static filter_job job_make(const struct plan *plan, const struct stack *from, const struct stack *to)
 {
-	cudaStream_t stream = plan->device->stream;
 	filter_job job = {};
 
-	if (plan->column_weights == NULL)
-		return error_set(err, ERR_INTERNAL, "the plan was made without FDK");
-	TRY(plan_check_views(plan, views, count, &plan->filtered, to, count, err));
-	TRY(plan_set_views(plan, views, count, err));
-	TRY(plan_set_slots(plan, slots != NULL ? slots : views, count, from, err));
 	job.geometry = plan->geometry;
-	job.views = plan->views;
-	job.slots = plan->slots;
-	job.count = count;
 	for (int i = 0; i < 3; i++)
 		job.spacing[i] = plan->grid.spacing[i];
 	job.from = from->data;
@@ -443,6 +618,17 @@ int cuda_filter(struct plan *plan, const struct stack *from, const int *slots, c
 	job.column_weights = plan->column_weights;
 	job.response = plan->response;
 	job.twiddles = plan->twiddles;
+	job.views = plan->views;
+	job.slots = plan->slots;
+	job.extend = plan->options.extend;
+	return job;
+}
+
+/* All rows as they are. */
+static int filter_plain(struct plan *plan, filter_job job, struct error *err)
+{
+	cudaStream_t stream = plan->device->stream;
+
 	switch (plan->shape.filter_length / 512) {
 	case 1:
 		launch_fused<1>(job, stream);
@@ -466,17 +652,91 @@ int cuda_filter(struct plan *plan, const struct stack *from, const int *slots, c
 		launch_fused<8>(job, stream);
 		break;
 	default:
-		return filter_fft(plan, job, err);
+		return filter_fft(plan->fft, job, job.count * job.rows, stream, err);
 	}
 	LAUNCHED();
 	return 0;
 }
 
-/* No plan with plan_options.extend is made yet: plan.cu refuses it. */
+/* Looks at the rows of a batch as soon as they are there; *ret_count of them are to be extended. */
+static int look_at_edges(struct plan *plan, const filter_job &job, const int *slots, cudaEvent_t there, int *ret_count,
+			 struct error *err)
+{
+	const int *pad = plan->options.pad;
+	cudaStream_t stream = plan->device->copy;
+	struct edges *edges = plan->edges;
+	int rows = job.count * job.rows, count = 0;
+	batch_slots batch = {};
+
+	for (int i = 0; i < job.count; i++)
+		batch.slot[i] = slots[i];
+	TRY(begin_arrival(plan->device, there, err));
+	TRY(begin_arrival(plan->device, edges->used, err));
+	find_edges<<<dim3(job.rows, job.count), EDGE_THREADS, 0, stream>>>(job, batch, pad[0] == 0, pad[1] == 0,
+									   *edges);
+	LAUNCHED();
+	CUDA_TRY(cudaMemcpyAsync(edges->sides_host, edges->sides, (size_t)rows, cudaMemcpyDeviceToHost, stream));
+	CUDA_TRY(cudaStreamSynchronize(stream));
+	for (int i = 0; i < rows; i++) {
+		int sides = edges->sides_host[i];
+
+		if (sides != 0)
+			edges->list_host[count++] = i;
+		edges->extended[0] += sides & 1;
+		edges->extended[1] += sides >> 1;
+	}
+	*ret_count = count;
+	return 0;
+}
+
+static int filter_extended_rows(struct plan *plan, filter_job job, int count, struct error *err)
+{
+	struct edges *edges = plan->edges;
+	cudaStream_t stream = plan->device->stream;
+
+	CUDA_TRY(cudaMemcpyAsync(edges->list, edges->list_host, (size_t)count * sizeof(int), cudaMemcpyHostToDevice,
+				 stream));
+	job.list = edges->list;
+	job.sides = edges->sides;
+	job.fit = edges->fit;
+	TRY(filter_fft(plan->extended, job, count, stream, err));
+	return mark_used(plan->device, edges->used, err); /* what was found is free for the next batch */
+}
+
+int cuda_filter(struct plan *plan, const struct stack *from, const int *slots, const int *views, int count,
+		struct stack *to, struct error *err)
+{
+	filter_job job;
+
+	if (plan->column_weights == NULL)
+		return error_set(err, ERR_INTERNAL, "the plan was made without FDK");
+	slots = slots != NULL ? slots : views;
+	TRY(plan_check_views(plan, views, count, &plan->filtered, to, count, err));
+	TRY(plan_set_views(plan, views, count, err));
+	TRY(plan_set_slots(plan, slots, count, from, err));
+	job = job_make(plan, from, to);
+	job.count = count;
+	if (plan->edges == NULL)
+		return filter_plain(plan, job, err);
+	for (int done = 0; done < count; done += plan->shape.batch) {
+		int extended = 0;
+
+		job.count = count - done < plan->shape.batch ? count - done : plan->shape.batch;
+		job.views = plan->views + done;
+		job.slots = plan->slots + done;
+		job.to = to->data + (size_t)done * plan->filtered.slot;
+		TRY(look_at_edges(plan, job, slots + done, from->used, &extended, err));
+		TRY(filter_plain(plan, job, err));
+		if (extended > 0)
+			TRY(filter_extended_rows(plan, job, extended, err));
+	}
+	return 0;
+}
+
 int cuda_filter_extended(struct plan *plan, size_t ret_rows[2], struct error *err)
 {
-	(void)plan;
 	(void)err;
-	ret_rows[0] = ret_rows[1] = 0;
+	for (int i = 0; i < 2; i++)
+		ret_rows[i] = plan->edges != NULL ? plan->edges->extended[i] : 0;
 	return 0;
 }

@@ -203,31 +203,34 @@ struct device_grid {
 	float spacing[3];
 };
 
+enum { BATCH_MOST = 128 }; /* views that are filtered and backprojected in one go */
+
 /* How a plan does its work; chosen once from geometry and options. */
 struct plan_shape {
-	bool untilted;     /* the fast kernels apply */
-	bool rows_down;    /* untilted, and rows count against z */
-	int forward_rows;  /* rows of one thread in the forward projection by rows; 0: the general one */
-	bool halves;       /* the forward projection reads pairs in half precision */
-	int back_voxels;   /* voxels of one window in the untilted backprojection; 0: the general one */
-	bool is_small;     /* launches take longer than samples: the plainest kernels */
-	bool back_half;    /* its voxels lie half as far apart as rows */
-	bool textures;     /* 8-bit interpolation weights are allowed */
-	bool z_rays;       /* some ray runs closer to z than to x and y */
-	int batch;         /* views filtered and backprojected in one go */
-	bool lean;         /* little memory: few views at a time, no arrays */
-	int correction;    /* slots of the correction stack, 0 without SART */
-	bool parts;        /* it holds a part of a subset only */
-	int views_at_once; /* that one launch of the backprojection takes; layers of the projection array */
-	bool by_view;      /* SART goes view by view over a z-fastest copy */
-	bool by_subset;    /* SART has updates of several views */
-	bool covered;      /* every view sees the whole grid: sum_S w_ij = views of S */
-	int filter_length; /* of the fused filter, 0 for cuFFT */
-	int fft_length;    /* of cuFFT */
-	int fft_rows;      /* rows that cuFFT takes at once */
+	bool untilted;       /* the fast kernels apply */
+	bool rows_down;      /* untilted, and rows count against z */
+	int forward_rows;    /* rows of one thread in the forward projection by rows; 0: the general one */
+	bool halves;         /* the forward projection reads pairs in half precision */
+	int back_voxels;     /* voxels of one window in the untilted backprojection; 0: the general one */
+	bool is_small;       /* launches take longer than samples: the plainest kernels */
+	bool back_half;      /* its voxels lie half as far apart as rows */
+	bool textures;       /* 8-bit interpolation weights are allowed */
+	bool z_rays;         /* some ray runs closer to z than to x and y */
+	int batch;           /* views filtered and backprojected in one go */
+	bool lean;           /* little memory: few views at a time, no arrays */
+	int correction;      /* slots of the correction stack, 0 without SART */
+	bool parts;          /* it holds a part of a subset only */
+	int views_at_once;   /* that one launch of the backprojection takes; layers of the projection array */
+	bool by_view;        /* SART goes view by view over a z-fastest copy */
+	bool by_subset;      /* SART has updates of several views */
+	bool covered;        /* every view sees the whole grid: sum_S w_ij = views of S */
+	int filter_length;   /* of the fused filter, 0 for cuFFT */
+	int fft_length;      /* of cuFFT for all rows */
+	int extended_length; /* of cuFFT for rows that are extended, 0: none are */
 };
 
-struct fft; /* filter.cu: cuFFT's plans */
+struct fft;   /* filter.cu: cuFFT's plans */
+struct edges; /* what it finds at the edges of rows */
 
 struct plan {
 	struct device *device;
@@ -267,7 +270,8 @@ struct plan {
 	float *column_weights; /* [count][columns] */
 	float *response;       /* the filter's, in the order of the kernel */
 	float2 *twiddles;
-	struct fft *fft;
+	struct fft *fft, *extended;
+	struct edges *edges; /* with plan_options.extend */
 
 	/* linearise: raw samples of some views */
 	int raw_views; /* projections of the buffer */
@@ -340,7 +344,7 @@ int coverage_sum(struct plan *plan, int first, int count, struct error *err);
 int filter_choose(int columns);
 int filter_prepare(struct plan *plan, struct error *err);
 void filter_release(struct plan *plan);
-size_t filter_bytes(const struct plan_shape *shape, int columns);
+size_t filter_bytes(const struct plan_shape *shape, int rows);
 
 /* ---- norms.cu ---- */
 size_t reduce_bytes(void);

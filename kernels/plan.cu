@@ -13,10 +13,9 @@
 
 enum { LAYERS_MOST = 2048 };                      /* of a layered array, on every card */
 enum { SIDE_MOST = 32768 };                       /* its width and height */
-enum { BATCH_MOST = 128, BATCH_LEAN = 16 };       /* views that are filtered and backprojected in one go */
+enum { BATCH_LEAN = 16 };                         /* of BATCH_MOST, with little memory */
 static const double SMALL = 1 << 20;              /* voxels times views below which launches take longer than samples */
 static const size_t RAW_BYTES = (size_t)16 << 20; /* of the buffer of raw samples */
-static const size_t FFT_BYTES = (size_t)64 << 20; /* of the rows that cuFFT takes at once */
 
 static int at_most(int count, int most)
 {
@@ -246,7 +245,7 @@ static struct plan_shape shape_of(const struct plan_options *options, bool lean)
 	shape.textures = !lean && !shape.is_small && !options->reference_precision && fits &&
 			 wide_columns(options) <= SIDE_MOST && geometry->rows <= SIDE_MOST;
 	shape.lean = lean;
-	shape.batch = at_most(resident_views(options), lean ? BATCH_LEAN : BATCH_MOST);
+	shape.batch = at_most(resident_views(options), lean ? (int)BATCH_LEAN : (int)BATCH_MOST);
 	shape.by_view = subset == 1 && columns_shape_make(grid->size).floats < (size_t)1 << 31;
 	shape.by_subset = subset > 0 && !shape.by_view;
 	shape.correction = shape.by_subset ? (lean ? at_most(subset, BATCH_LEAN) : subset) : 0;
@@ -257,10 +256,9 @@ static struct plan_shape shape_of(const struct plan_options *options, bool lean)
 		shape.filter_length = filter_choose(wide_columns(options));
 		if (shape.filter_length == 0) {
 			shape.fft_length = filter_length(wide_columns(options));
-			shape.fft_rows = (int)(FFT_BYTES / ((size_t)(shape.fft_length + 2) * sizeof(float)));
-			if ((size_t)shape.fft_rows > (size_t)shape.batch * (size_t)geometry->rows)
-				shape.fft_rows = shape.batch * geometry->rows;
 		}
+		if (options->extend > 0)
+			shape.extended_length = filter_length(wide_columns(options) + options->extend);
 	}
 	return shape;
 }
@@ -374,7 +372,7 @@ static struct plan_bytes bytes_of(const struct plan_options *options, bool lean)
 		bytes.scratch += stack_bytes(geometry->columns, geometry->rows, plan.shape.correction);
 	if (options->column_weights != NULL)
 		bytes.scratch +=
-		    views * (size_t)geometry->columns * sizeof(float) + filter_bytes(&plan.shape, geometry->columns);
+		    views * (size_t)geometry->columns * sizeof(float) + filter_bytes(&plan.shape, geometry->rows);
 	if (options->linearise.flat != NULL)
 		bytes.scratch += pixels_of(&plan) * sizeof(float);
 	if (options->linearise.dark != NULL)
@@ -402,12 +400,9 @@ static bool is_lean(const struct device *device, const struct plan_options *opti
 /* What the CPU does and this backend does not. */
 static int check_supported(const struct plan_options *options, struct error *err)
 {
-	const char *what = options->extend > 0 ? "the extension of truncated rows"
-			   : options->matched  ? "the matched projector"
-					       : NULL;
-
-	if (what != NULL)
-		return error_set(err, ERR_IMPOSSIBLE, "the CUDA backend does not know %s, the CPU backend does", what);
+	if (options->matched)
+		return error_set(err, ERR_IMPOSSIBLE,
+				 "the CUDA backend does not know the matched projector, the CPU backend does");
 	return 0;
 }
 
