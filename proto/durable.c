@@ -66,18 +66,12 @@ static int durable_rename(struct durable *d, struct error *err)
 	return code != 0 ? code : sync_directory_of(d->path, err);
 }
 
-int durable_sync(struct durable *d, struct error *err)
-{
-	if (fdatasync(d->file) != 0)
-		return error_set_errno(err, errno, "%s cannot be synced", d->beside);
-	d->synced = true;
-	return 0;
-}
-
 int durable_commit(struct durable *d, struct error *err)
 {
-	int code = d->synced ? 0 : durable_sync(d, err);
+	int code = 0;
 
+	if (fdatasync(d->file) != 0)
+		code = error_set_errno(err, errno, "%s cannot be synced", d->beside);
 	if (close(d->file) != 0 && code == 0)
 		code = error_set_errno(err, errno, "%s cannot be closed", d->beside);
 	d->file = -1;
@@ -90,7 +84,6 @@ int durable_commit(struct durable *d, struct error *err)
 
 int durable_write(struct durable *d, const void *from, size_t size, struct error *err)
 {
-	d->synced = false;
 	for (size_t done = 0; done < size;) {
 		ssize_t put = write(d->file, (const char *)from + done, size - done);
 

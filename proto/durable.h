@@ -13,7 +13,6 @@
  */
 struct durable {
 	int file; /* descriptor, -1 once closed */
-	bool synced;
 	const char *path;
 	char beside[PATH_MAX];
 };
@@ -21,8 +20,6 @@ struct durable {
 /* `size` bytes are set aside at once, so that a full disk is met before the work and not within it. */
 int durable_open(struct durable *ret, const char *path, size_t size, struct error *err);
 int durable_write(struct durable *d, const void *from, size_t size, struct error *err);
-/* Its data is on the disk; durable_commit does it where it was not done. */
-int durable_sync(struct durable *d, struct error *err);
 /* Gives the file its name, or abandons it. */
 int durable_commit(struct durable *d, struct error *err);
 /* Nothing half-written stays behind. */

@@ -122,28 +122,25 @@ static int write_piece(struct saver *saver, const struct piece *piece)
 	return code;
 }
 
-/* Called with the lock, at the end of the file: its data first, its name when its digest is known. */
+/*
+ * Called with the lock, at the end of the file. It gets its name while the
+ * digest is still being made: nobody hears of the file before both are there.
+ */
 static void finish_file(struct saver *saver)
 {
 	bool failed = saver->failed;
-	int code = 0;
 
 	pthread_mutex_unlock(&saver->lock);
-	if (!failed)
-		code = durable_sync(&saver->file, &saver->error);
+	if (failed)
+		durable_abandon(&saver->file);
+	else
+		failed = durable_commit(&saver->file, &saver->error) != 0;
 	pthread_mutex_lock(&saver->lock);
 	while (!saver->hashed)
 		pthread_cond_wait(&saver->changed, &saver->lock);
 	if (saver->failed && saver->error.code == 0)
 		error_set(&saver->error, ERR_INTERNAL, "SHA-256 failed");
-	failed = saver->failed || code != 0;
-	pthread_mutex_unlock(&saver->lock);
-	if (failed)
-		durable_abandon(&saver->file);
-	else
-		code = durable_commit(&saver->file, &saver->error);
-	pthread_mutex_lock(&saver->lock);
-	saver->failed = failed || code != 0;
+	saver->failed |= failed;
 	saver->done = true;
 	pthread_cond_broadcast(&saver->changed);
 }
