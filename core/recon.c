@@ -12,6 +12,7 @@
 #include <time.h>
 
 #include "core/fdk.h"
+#include "core/metal.h"
 #include "core/input.h"
 #include "core/parts.h"
 #include "core/sart.h"
@@ -38,8 +39,10 @@ struct recon {
 	struct fdk fdk;            /* where FDK is on */
 	struct stack *projections; /* a slot for each view with SART, else for each view of an FDK batch */
 	struct volume *volume;     /* the iterate */
-	struct volume *before;     /* the iterate before the iteration; NULL without SART */
-	struct stack *stand_in;    /* one slot, once a view is blank and SART is on */
+	struct volume *before;     /* the iterate before the iteration, and for metal to work in; NULL without both */
+	struct stack *batch;       /* for metal to work in; NULL without */
+	struct metal metal;
+	struct stack *stand_in; /* one slot, once a view is blank and SART is on */
 	float *stand_in_host;
 
 	unsigned char *pushed; /* [views] */
@@ -55,7 +58,7 @@ struct recon {
  * What the stages cost beside an FDK of the whole scan, roughly, as measured on
  * CPU and GPU alike: only the progress bar lives on it.
  */
-static const double WORK_LOAD = 0.2, WORK_FDK = 1, WORK_SART = 4, WORK_TV = 0.2;
+static const double WORK_LOAD = 0.2, WORK_FDK = 1, WORK_SART = 4, WORK_TV = 0.2, WORK_METAL = 6;
 
 static double recipe_work(const struct recipe *recipe)
 {
@@ -63,9 +66,17 @@ static double recipe_work(const struct recipe *recipe)
 
 	if (recipe->fdk.on)
 		work += WORK_FDK + (recipe->tv.on && recipe->tv.after_fdk ? WORK_TV : 0);
+	if (recipe->metal.on)
+		work += WORK_METAL;
 	if (recipe->sart.on)
 		work += recipe->sart.iterations * (WORK_SART + (recipe->tv.on ? WORK_TV : 0));
 	return work;
+}
+
+/* SART goes over all projections again and again, metal is taken out of them when the last one has come. */
+static bool keeps_projections(const struct recipe *recipe)
+{
+	return recipe->sart.on || recipe->metal.on;
 }
 
 static struct plan_options plan_options(const struct recipe *recipe, const struct geometry *geometry,
@@ -85,8 +96,8 @@ static struct plan_options plan_options(const struct recipe *recipe, const struc
 	    .matched = recipe->sart.on && recipe->projector == PROJECTOR_MATCHED,
 	    .tv = recipe->tv.on ? &recipe->tv.options : NULL,
 	    .reference_precision = recipe->reference_precision,
-	    .no_projection = !recipe->sart.on,
-	    .resident = recipe->sart.on                    ? 0
+	    .no_projection = !keeps_projections(recipe),
+	    .resident = keeps_projections(recipe)          ? 0
 			: geometry->count < FDK_BATCH_MOST ? geometry->count
 							   : FDK_BATCH_MOST,
 	};
@@ -108,8 +119,28 @@ static int sart_options_make(struct sart_options *ret_sart, const struct recipe 
 	return code;
 }
 
+/* A batch that is projected and a volume to work in, which is SART's copy of the iterate where there is one. */
+static int add_metal(const struct backend *backend, struct device *device, const struct plan_options *options,
+		     size_t batch, struct recon_memory *memory, struct error *err)
+{
+	struct plan_options bare = *options;
+	struct plan_bytes bytes;
+	int code;
+
+	bare.tv = NULL;
+	code = backend->plan_bytes(device, &bare, &bytes, err);
+	if (code < 0)
+		return code;
+	memory->scratch += batch;
+	if (options->sart == NULL)
+		memory->volumes += bytes.volumes;
+	if (memory->host > 0)
+		memory->host += batch + (options->sart == NULL ? bytes.volumes : 0);
+	return 0;
+}
+
 static int memory_needed(const struct backend *backend, struct device *device, const struct plan_options *options,
-			 struct recon_memory *ret_memory, struct error *err)
+			 const struct recipe *recipe, struct recon_memory *ret_memory, struct error *err)
 {
 	struct recon_memory memory = {0};
 	struct plan_bytes bytes;
@@ -122,13 +153,18 @@ static int memory_needed(const struct backend *backend, struct device *device, c
 		return code;
 	slot = (bytes.stack + (size_t)views - 1) / (size_t)views;
 	batch = slot * (size_t)(views < FDK_BATCH_MOST ? views : FDK_BATCH_MOST);
-	memory.projections = options->sart != NULL ? bytes.stack : batch;
+	memory.projections = options->resident == 0 ? bytes.stack : batch;
 	memory.volumes = bytes.volumes;
 	memory.scratch = bytes.scratch + bytes.raw;
 	if (options->column_weights != NULL)
 		memory.scratch += batch / columns * (columns + (size_t)(options->pad[0] + options->pad[1]));
-	memory.total = memory.projections + memory.volumes + memory.scratch;
 	memory.host = bytes.host;
+	if (recipe->metal.on) {
+		code = add_metal(backend, device, options, batch, &memory, err);
+		if (code < 0)
+			return code;
+	}
+	memory.total = memory.projections + memory.volumes + memory.scratch;
 	if (device != NULL) {
 		backend->describe(device, &info);
 		memory.available = info.bytes_free;
@@ -142,16 +178,17 @@ static int memory_needed(const struct backend *backend, struct device *device, c
  * whole, otherwise it is the device in parts and the memory what that takes.
  */
 static int choose_device(const struct backend *backend, struct device *device, const struct plan_options *options,
-			 struct recon_memory *ret_memory, struct device **ret_parts, struct error *err)
+			 const struct recipe *recipe, struct recon_memory *ret_memory, struct device **ret_parts,
+			 struct error *err)
 {
 	struct device *parts = NULL;
-	int code = memory_needed(backend, device, options, ret_memory, err);
+	int code = memory_needed(backend, device, options, recipe, ret_memory, err);
 
 	if (code < 0 || device == NULL || !backend->own_memory || ret_memory->total <= ret_memory->available)
 		return code;
 	code = parts_open(backend, device, &parts, err);
 	if (code == 0)
-		code = memory_needed(&backend_parts, parts, options, ret_memory, err);
+		code = memory_needed(&backend_parts, parts, options, recipe, ret_memory, err);
 	if (code < 0)
 		backend_parts.close(parts);
 	else
@@ -181,7 +218,7 @@ int recon_memory(const struct backend *backend, struct device *device, const str
 		code = sart_options_make(&sart, &resolved, &orbit, err);
 	if (code == 0) {
 		options = plan_options(&resolved, geometry, &linearise, &weights, &sart);
-		code = choose_device(backend, device, &options, ret_memory, &parts, err);
+		code = choose_device(backend, device, &options, &resolved, ret_memory, &parts, err);
 	}
 	if (parts != NULL)
 		backend_parts.close(parts);
@@ -197,7 +234,7 @@ static int refuse_what_does_not_fit(struct recon *recon, const struct plan_optio
 	struct recon_memory memory;
 	struct device_info host = {.bytes_free = SIZE_MAX};
 	struct device *processor;
-	int code = choose_device(recon->backend, recon->device, options, &memory, &recon->parts, err);
+	int code = choose_device(recon->backend, recon->device, options, &recon->recipe, &memory, &recon->parts, err);
 
 	if (code == 0 && recon->parts != NULL) {
 		recon->backend = &backend_parts;
@@ -259,15 +296,18 @@ static int recon_allocate(struct recon *recon, struct error *err)
 	if (code == 0 && recipe->fdk.on)
 		code = fdk_open(&recon->fdk, backend, recon->device, recon->plan, geometry, recon->weights.pad, err);
 	if (code == 0)
-		code =
-		    backend->stack_new(recon->device, geometry->columns, geometry->rows,
-				       recipe->sart.on ? geometry->count : recon->fdk.batch, &recon->projections, err);
+		code = backend->stack_new(recon->device, geometry->columns, geometry->rows,
+					  keeps_projections(recipe) ? geometry->count : recon->fdk.batch,
+					  &recon->projections, err);
 	if (code == 0)
 		code = backend->volume_new(recon->device, &recipe->grid, &recon->volume, err);
 	if (code == 0)
 		code = backend->volume_fill(recon->volume, 0, err);
-	if (code == 0 && recipe->sart.on)
+	if (code == 0 && keeps_projections(recipe))
 		code = backend->volume_new(recon->device, &recipe->grid, &recon->before, err);
+	if (code == 0 && recipe->metal.on)
+		code = backend->stack_new(recon->device, geometry->columns, geometry->rows, metal_slots(geometry),
+					  &recon->batch, err);
 	return code;
 }
 
@@ -306,6 +346,8 @@ void recon_free(struct recon *recon)
 	recon->backend->volume_free(recon->volume);
 	recon->backend->stack_free(recon->stand_in);
 	recon->backend->stack_free(recon->projections);
+	recon->backend->stack_free(recon->batch);
+	metal_clear(&recon->metal);
 	fdk_clear(&recon->fdk);
 	recon->backend->plan_free(recon->plan);
 	subsets_clear(&recon->sart.subsets);
@@ -350,9 +392,34 @@ static bool is_wanted(const struct recipe *recipe, int emit)
 	return false;
 }
 
+static int measure(struct recon *recon, const struct volume *other, struct volume_norms *ret_norms, struct error *err)
+{
+	return recon->backend->norms(recon->plan, recon->volume, other, recon->recipe.tv.options.unit, ret_norms, err);
+}
+
+static struct metal_tools metal_tools(struct recon *recon)
+{
+	return (struct metal_tools){
+	    .backend = recon->backend,
+	    .plan = recon->plan,
+	    .fdk = &recon->fdk,
+	    .projections = recon->projections,
+	    .batch = recon->batch,
+	    .slots = metal_slots(recon->geometry),
+	    .volume = recon->before,
+	    .geometry = recon->geometry,
+	    .grid = &recon->recipe.grid,
+	    .mu_water = recon->recipe.mu_water,
+	    .cancel = cancel_of(recon),
+	};
+}
+
+/* What is kept shows the metal; what is worked on does not. */
 static int keep(struct recon *recon, const char *name, const char *stage, struct error *err)
 {
-	const struct kept_volume kept = {
+	const struct metal_tools tools = metal_tools(recon);
+	int code;
+	struct kept_volume kept = {
 	    .name = name,
 	    .stage = stage,
 	    .iteration = recon->iteration,
@@ -363,7 +430,16 @@ static int keep(struct recon *recon, const char *name, const char *stage, struct
 	if (recon->hooks->keep == NULL)
 		return 0;
 	tell_progress(recon, STAGE_SAVE, recon->iteration);
-	return recon->hooks->keep(recon->hooks->context, recon, &kept, err);
+	if (recon->metal.voxels_count == 0)
+		return recon->hooks->keep(recon->hooks->context, recon, &kept, err);
+	code = metal_exchange(&recon->metal, &tools, recon->volume, err);
+	if (code == 0)
+		code = measure(recon, NULL, &kept.norms, err);
+	if (code == 0)
+		code = recon->hooks->keep(recon->hooks->context, recon, &kept, err);
+	if (code < 0)
+		return code;
+	return metal_exchange(&recon->metal, &tools, recon->volume, err);
 }
 
 static void warn_of_the_input(struct recon *recon)
@@ -406,7 +482,7 @@ static int check_views(const struct recon *recon, const int *views, int count, s
 
 static int push_view(struct recon *recon, const void *samples, int view, struct error *err)
 {
-	int slot = recon->recipe.sart.on ? view : recon->fdk.pending, code;
+	int slot = keeps_projections(&recon->recipe) ? view : recon->fdk.pending, code;
 
 	/* Again here: the list of one call may name a view twice. */
 	if (recon->pushed[view])
@@ -464,13 +540,20 @@ int recon_resume(struct recon *recon, const float *volume, int iteration, struct
 	return 0;
 }
 
-/* ---- the run ---- */
-
-static int measure(struct recon *recon, const struct volume *other, struct error *err)
+int recon_resume_metal(struct recon *recon, const void *list, size_t bytes, struct error *err)
 {
-	return recon->backend->norms(recon->plan, recon->volume, other, recon->recipe.tv.options.unit, &recon->norms,
-				     err);
+	if (!recon->resumed || !recon->recipe.metal.on)
+		return error_set(err, ERR_INVALID, "a list of metal for a run that has none");
+	return metal_put(&recon->metal, &recon->recipe.grid, list, bytes, err);
 }
+
+const void *recon_metal(const struct recon *recon, size_t *ret_bytes)
+{
+	*ret_bytes = recon->metal.voxels_count * sizeof(*recon->metal.voxels);
+	return recon->metal.voxels;
+}
+
+/* ---- the run ---- */
 
 static int run_tv(struct recon *recon, int iteration, struct error *err)
 {
@@ -551,6 +634,50 @@ static int stand_in_for_blank_views(struct recon *recon, struct error *err)
 	return code;
 }
 
+static void warn_of_metal(const struct recon *recon)
+{
+	const struct metal *metal = &recon->metal;
+	const double samples =
+	    (double)recon->geometry->count * (double)recon->geometry->columns * (double)recon->geometry->rows;
+	char detail[256];
+
+	if (recon->hooks->warning == NULL)
+		return;
+	if (metal->voxels_count == 0) {
+		snprintf(detail, sizeof(detail), "nothing in the FDK volume has %g HU or more: no metal was taken out",
+			 recon->recipe.metal.threshold_hu);
+		recon->hooks->warning(recon->hooks->context, "no_metal", detail);
+		return;
+	}
+	snprintf(
+	    detail, sizeof(detail),
+	    "%zu voxels (%.3g %%) of %g HU or more are metal; %zu samples (%.3g %%) in %d projections were replaced "
+	    "from what lies beside them",
+	    metal->voxels_count, 100 * (double)metal->voxels_count / (double)grid_voxels(&recon->recipe.grid),
+	    recon->recipe.metal.threshold_hu, metal->replaced, 100 * (double)metal->replaced / samples, metal->views);
+	recon->hooks->warning(recon->hooks->context, "metal", detail);
+}
+
+/* The metal of the FDK volume out of the projections, and the FDK of those. */
+static int take_metal_out(struct recon *recon, struct error *err)
+{
+	const struct metal_tools tools = metal_tools(recon);
+	const double threshold = recon->recipe.mu_water * (1 + recon->recipe.metal.threshold_hu / 1000);
+	int code = metal_find(&recon->metal, &tools, recon->volume, threshold, err);
+
+	if (code == 0 && recon->metal.voxels_count > 0)
+		code = metal_replace(&recon->metal, &tools, err);
+	if (code == 0 && recon->metal.voxels_count > 0)
+		code = metal_fdk(&tools, recon->volume, err);
+	if (code == 0 && recon->metal.voxels_count > 0)
+		code = measure(recon, NULL, &recon->norms, err);
+	if (code < 0)
+		return code;
+	recon->work_done += WORK_METAL;
+	warn_of_metal(recon);
+	return 0;
+}
+
 /* The FDK volume and what is made of it before the first iteration. */
 static int finish_fdk(struct recon *recon, struct error *err)
 {
@@ -562,11 +689,13 @@ static int finish_fdk(struct recon *recon, struct error *err)
 	if (code == 0)
 		code = make_up_for_blank_views(recon, err);
 	if (code == 0)
-		code = measure(recon, NULL, err);
+		code = measure(recon, NULL, &recon->norms, err);
 	if (code == 0 && recon->norms.not_finite > 0)
 		code = error_set(err, ERR_IMPOSSIBLE,
 				 "%zu voxels of the FDK volume are not finite: the projections' values are too large",
 				 recon->norms.not_finite);
+	if (code == 0 && recipe->metal.on)
+		code = take_metal_out(recon, err);
 	if (code == 0 && is_wanted(recipe, EMIT_FDK))
 		code = keep(recon, "fdk", "fdk", err);
 	if (code < 0 || !recipe->tv.on || !recipe->tv.after_fdk)
@@ -575,7 +704,7 @@ static int finish_fdk(struct recon *recon, struct error *err)
 	if (code == 0)
 		code = run_tv(recon, 0, err);
 	if (code == 0)
-		code = measure(recon, NULL, err);
+		code = measure(recon, NULL, &recon->norms, err);
 	if (code == 0 && recon->norms.not_finite > 0)
 		code = error_set(err, ERR_IMPOSSIBLE,
 				 "TV has diverged: %zu voxels are not finite; a smaller step is needed",
@@ -583,6 +712,17 @@ static int finish_fdk(struct recon *recon, struct error *err)
 	if (code == 0 && is_wanted(recipe, EMIT_FDK_TV))
 		code = keep(recon, "fdk-tv", "tv", err);
 	return code;
+}
+
+/* Where a run goes on, what its projections were before. */
+static int take_metal_out_again(struct recon *recon, struct error *err)
+{
+	const struct metal_tools tools = metal_tools(recon);
+
+	if (recon->metal.voxels_count == 0)
+		return 0;
+	tell_progress(recon, STAGE_LOAD, recon->iteration);
+	return metal_replace(&recon->metal, &tools, err);
 }
 
 static double now(void)
@@ -615,7 +755,7 @@ static int iterate(struct recon *recon, struct history_row *ret_row, struct erro
 	if (recon->recipe.tv.on)
 		code = run_tv(recon, iteration, err);
 	if (code == 0)
-		code = measure(recon, recon->before, err);
+		code = measure(recon, recon->before, &recon->norms, err);
 	if (code == 0)
 		code = sart_row(iteration, &sums, &recon->norms, norm2_before, ret_row, err);
 	if (code < 0)
@@ -689,8 +829,10 @@ int recon_run(struct recon *recon, struct error *err)
 	if (!recon->resumed)
 		warn_of_the_input(recon);
 	code = check_cancelled(recon, err);
+	if (code == 0 && recon->resumed)
+		code = take_metal_out_again(recon, err);
 	if (code == 0)
-		code = fdk_runs(recon) ? finish_fdk(recon, err) : measure(recon, NULL, err);
+		code = fdk_runs(recon) ? finish_fdk(recon, err) : measure(recon, NULL, &recon->norms, err);
 	if (code == 0 && recipe->sart.on)
 		code = run_sart(recon, err);
 	if (code < 0)

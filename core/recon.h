@@ -104,7 +104,8 @@ struct recon_hooks {
 	 * comes as "final", and before that under its own name where the recipe asks for that too.
 	 */
 	int (*keep)(void *context, struct recon *recon, const struct kept_volume *volume, struct error *err);
-	/* "defects": samples were replaced; "arc_too_short": FDK of less than 180 degrees plus the fan. */
+	/* "metal", "no_metal": what became of it. "defects": samples were replaced; "arc_too_short": FDK of less than
+	 * 180 degrees plus the fan. */
 	void (*warning)(void *context, const char *code, const char *detail);
 }; /* any of them may be NULL */
 
@@ -148,7 +149,15 @@ int recon_run(struct recon *recon, struct error *err);
  */
 int recon_resume(struct recon *recon, const float *volume, int iteration, struct error *err);
 
-/* Slices of the current iterate, 1/mm. */
+/*
+ * The metal that was found, as bytes that belong to the recon; 0 of them where
+ * there is none. A run that goes on wants them back, behind recon_resume: its
+ * projections are then what they were.
+ */
+const void *recon_metal(const struct recon *recon, size_t *ret_bytes);
+int recon_resume_metal(struct recon *recon, const void *list, size_t bytes, struct error *err);
+
+/* Slices of the current iterate, 1/mm; while a volume is kept, with the metal in it. */
 int recon_read(struct recon *recon, int z_first, int z_count, float *ret_slices, struct error *err);
 
 const struct grid *recon_grid(const struct recon *recon);
