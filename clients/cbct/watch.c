@@ -41,6 +41,7 @@ struct view {
 static void show(struct view *view, const cJSON *job)
 {
 	const cJSON *history = cJSON_GetObjectItemCaseSensitive(job, "history");
+	const cJSON *views = cJSON_GetObjectItemCaseSensitive(job, "views");
 	int rows = cJSON_GetArraySize(history);
 	const char *state = member_text(job, "state", "?"), *stage = member_text(job, "stage", "");
 	double iterations = member_number(job, "iterations", 0);
@@ -52,6 +53,9 @@ static void show(struct view *view, const cJSON *job)
 	if (strcmp(state, "queued") == 0 && member_number(job, "queue_position", -1) >= 0)
 		used += snprintf(text + used, sizeof(text) - (size_t)used, ", place %.10g",
 				 member_number(job, "queue_position", 0));
+	if (strcmp(state, "waiting") == 0 && cJSON_IsObject(views))
+		used += snprintf(text + used, sizeof(text) - (size_t)used, ", %.10g of %.10g projections",
+				 member_number(views, "received", 0), member_number(views, "of", 0));
 	if (iterations > 0)
 		used += snprintf(text + used, sizeof(text) - (size_t)used, "  iteration %.10g of %.10g",
 				 member_number(job, "iteration", 0), iterations);

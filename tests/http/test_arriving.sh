@@ -368,8 +368,18 @@ test_cbct_completes_a_scan() {
 	post_scan "$scan_dir"
 	if cbct complete "$scan" 2>"$work/error"; then fail "a refusal"; fi
 	grep -q '0 of 60' "$work/error" || fail "the numbers: $(cat "$work/error")"
+	local watcher
+	post_job "$fdk"
 	send "$scan_dir" 0 49
+	cbct watch "$job" >"$work/said" 2>&1 &
+	watcher=$!
+	for ((i = 0; i < 200; i++)); do
+		grep -q 'waiting, 50 of 60 projections' "$work/said" && break
+		sleep 0.05
+	done
+	[ $i -lt 200 ] || fail "the watcher's line: $(cat "$work/said")"
 	[[ $(cbct complete "$scan") == "$scan"*"50 of 60 projections" ]] || fail "50 of 60 projections"
+	wait $watcher || fail "the watcher to see it succeed: $(cat "$work/said")"
 }
 
 stop_after_each=1 run_tests
