@@ -217,15 +217,20 @@ $(BUILD)/tests/gpu/fault.o: tests/gpu/fault.cu
 $(BUILD)/cbct-worker-faulty: $(call objects,daemon/worker.c) $(library) $(cuda_objects) $(BUILD)/tests/gpu/fault.o
 	$(call say,LINK)$(CC) $(LDFLAGS) -Wl,--wrap=_Z7cuda_tvP4planP6volumePK6cancelP5error -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(cuda_libs) $(LIBM)
 
-check-gpu: ## the CUDA backend against the CPU's; skipped aloud without a GPU
-	@$(MAKE) --no-print-directory $(BUILD)/gpu_check all $(if $(cuda_objects),$(BUILD)/cbct-worker-faulty)
+ifdef cuda_objects
+check-gpu: ## the CUDA backend against the CPU's, and through the daemon; skipped aloud without a GPU
+	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/gpu_check $(BUILD)/cbct-worker-faulty
 	@$(BUILD)/gpu_check
 	@BUILD=$(BUILD) tests/gpu/end_to_end.sh
 	@BUILD=$(BUILD) tests/gpu/sanitize.sh
 
-bench-gpu: ## times of the CUDA backend beside their goals, results in build/bench/
-	@$(MAKE) --no-print-directory $(BUILD)/gpu_bench $(BUILD)/gpu_ceilings all
+bench-gpu: ## times of the CUDA backend beside their goals and the card's ceilings, results in build/bench/
+	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/gpu_bench $(BUILD)/gpu_ceilings
 	@BUILD=$(BUILD) tests/bench/gpu.sh
+else
+check-gpu bench-gpu:
+	@echo "SKIPPED: $@ needs the CUDA backend, which is left out or cannot be built here (no nvcc with its libraries)"
+endif
 
 asan: setup ## the tests under the address and undefined-behaviour sanitizers
 	@$(MAKE) --no-print-directory check SANITIZED=1 LEAVE_OUT=-study BUILD=build/asan SANITIZE=address,undefined CUDA=0
