@@ -40,8 +40,8 @@ static const struct option_group groups[] = {
     {"", http_option_rows, offsetof(struct import_options, upload.http)},
     {"images: MetaImage (.mha, .mhd), TIFF, NumPy (.npy), DICOM XA and Enhanced XA (through DCMTK's programs), raw",
      image_option_rows, offsetof(struct import_options, image)},
-    {"geometry: one of --rtk, --matrices, --angles, --angle-step; DICOM files have their own", import_geometry_rows,
-     offsetof(struct import_options, geometry)},
+    {"geometry: one of --rtk, --matrices, --astra, --angles, --angle-step; DICOM files have their own",
+     import_geometry_rows, offsetof(struct import_options, geometry)},
     {"numbers", import_value_rows, offsetof(struct import_options, values)},
     {0},
 };

@@ -32,6 +32,9 @@ const struct option import_geometry_rows[] = {
 	0, 0, 0, NULL),
     ROW("first-pixel", OPTION_NUMBER, first_pixel, "N",
 	"what the matrices call the centre of the first column and row: 0, 0.5 or 1", -10, 10, 0, NULL),
+    ROW("astra", OPTION_TEXT, astra, "FILE",
+	"ASTRA's cone_vec in mm: 12 numbers for each image, source, detector's centre, u and v; text or .npy", 0, 0, 0,
+	NULL),
     ROW("angles", OPTION_TEXT, angles, "FILE", "gantry angles in degrees, one for each image: text or .npy", 0, 0, 0,
 	NULL),
     ROW("first-angle", OPTION_NUMBER, first_angle, "DEG", "of the first image, where there is no list", -36000, 36000,
@@ -153,6 +156,50 @@ static int from_matrices(const struct import_geometry *options, const struct ima
 	return 0;
 }
 
+/* ---- ASTRA ---- */
+
+/* The vectors tell the pixels' pitch as well, where nobody else does. */
+static int from_astra(const struct import_geometry *options, const struct images *images, double pixel[2],
+		      cJSON **ret_geometry, struct error *err)
+{
+	double *vectors = NULL;
+	int count = 0, code = matrices_read(options->astra, &vectors, &count, err);
+	struct view *views;
+	struct geometry geometry;
+
+	if (code == 0 && count != images->count)
+		code = count_differs("vectors", (size_t)count, images, err);
+	if (code != 0) {
+		free(vectors);
+		return code;
+	}
+	views = calloc((size_t)images->count, sizeof(*views));
+	for (int k = 0; k < images->count && views != NULL; k++) {
+		const double *v = vectors + 12 * (size_t)k;
+
+		for (int i = 0; i < 3; i++) {
+			views[k].source[i] = v[i];
+			views[k].column_step[i] = v[6 + i];
+			views[k].row_step[i] = v[9 + i];
+			views[k].pixel0[i] =
+			    v[3 + i] - 0.5 * (images->columns - 1) * v[6 + i] - 0.5 * (images->rows - 1) * v[9 + i];
+		}
+	}
+	code = views != NULL ? geometry_views(&geometry, images->columns, images->rows, images->count, views, err)
+			     : error_set(err, ERR_NO_MEMORY, "no memory for %d views", images->count);
+	if (code == 0 && isnan(pixel[0])) {
+		pixel[0] = vec_norm(views[0].column_step);
+		pixel[1] = vec_norm(views[0].row_step);
+	}
+	free(views);
+	free(vectors);
+	if (code == 0) {
+		*ret_geometry = views_json(&geometry);
+		geometry_clear(&geometry);
+	}
+	return code;
+}
+
 /* ---- angles ---- */
 
 static int list_angles(const struct import_geometry *options, const struct images *images, double *ret_degrees,
@@ -165,8 +212,9 @@ static int list_angles(const struct import_geometry *options, const struct image
 	if (options->angles != NULL)
 		code = numbers_read(options->angles, &numbers, &count, err);
 	else if (isnan(options->angle_step) && images->count > 1)
-		code = error_set(err, ERR_USAGE,
-				 "nothing tells the geometry: --rtk, --matrices, --angles or --angle-step is needed");
+		code = error_set(
+		    err, ERR_USAGE,
+		    "nothing tells the geometry: --rtk, --matrices, --astra, --angles or --angle-step is needed");
 	if (code == 0 && options->angles != NULL && count != (size_t)images->count)
 		code = count_differs("angles", count, images, err);
 	for (int k = 0; k < images->count && code == 0; k++) {
@@ -300,17 +348,18 @@ static int check_options(const struct import_geometry *options, struct error *er
 	bool offsets = options->detector_offset[0] != 0 || options->detector_offset[1] != 0 ||
 		       options->source_offset[0] != 0 || options->source_offset[1] != 0;
 	bool angles = options->angles != NULL || !isnan(options->angle_step);
-	int given = (options->rtk != NULL) + (options->matrices != NULL) + angles;
+	int given = (options->rtk != NULL) + (options->matrices != NULL) + (options->astra != NULL) + angles;
 
 	if (given > 1 || (options->angles != NULL && !isnan(options->angle_step)))
-		return error_set(err, ERR_USAGE, "one of --rtk, --matrices, --angles and --angle-step at a time");
+		return error_set(err, ERR_USAGE,
+				 "one of --rtk, --matrices, --astra, --angles and --angle-step at a time");
 	if (options->radians && options->angles == NULL)
 		return error_set(err, ERR_USAGE, "--radians goes with --angles");
 	if (options->clockwise && !angles)
 		return error_set(err, ERR_USAGE, "--clockwise goes with --angles or --angle-step");
 	if (options->first_pixel != 0 && options->matrices == NULL)
 		return error_set(err, ERR_USAGE, "--first-pixel goes with --matrices");
-	if ((options->rtk != NULL || options->matrices != NULL) && offsets)
+	if ((options->rtk != NULL || options->matrices != NULL || options->astra != NULL) && offsets)
 		return error_set(err, ERR_USAGE, "--detector-offset and --source-offset go with angles");
 	return 0;
 }
@@ -329,12 +378,13 @@ int import_geometry(const struct import_geometry *options, const struct images *
 		    cJSON **ret_geometry, struct error *err)
 {
 	bool given = !isnan(options->pixel[0]);
-	const double *pixel = given ? options->pixel : images->pixel;
+	double pixel[2];
 	int code = check_options(options, err);
 
+	memcpy(pixel, given ? options->pixel : images->pixel, sizeof(pixel));
 	if (code == 0 && given && options->rtk != NULL && images->has_stack)
 		code = error_set(err, ERR_USAGE, "the stack tells its pixels to RTK's geometry, --pixel does not");
-	if (code == 0)
+	if (code == 0 && options->astra == NULL)
 		code = need_pixel(pixel, err);
 	if (code != 0)
 		return code;
@@ -342,6 +392,8 @@ int import_geometry(const struct import_geometry *options, const struct images *
 		code = from_rtk(options, images, pixel, ret_geometry, err);
 	else if (options->matrices != NULL)
 		code = from_matrices(options, images, ret_geometry, err);
+	else if (options->astra != NULL)
+		code = from_astra(options, images, pixel, ret_geometry, err);
 	else if (images->positions != NULL && options->angles == NULL && isnan(options->angle_step))
 		code = from_positions(options, images, pixel, ret_geometry, err);
 	else

@@ -7,9 +7,9 @@
 
 /* Where source and detector stood for images of other tools: what the command line says, or the images themselves. */
 struct import_geometry {
-	const char *rtk, *matrices, *angles; /* files, at most one of them */
-	int trust;                           /* enum rtk_trust */
-	double first_angle, angle_step;      /* degrees; step NaN: not given */
+	const char *rtk, *matrices, *astra, *angles; /* files, at most one of them */
+	int trust;                                   /* enum rtk_trust */
+	double first_angle, angle_step;              /* degrees; step NaN: not given */
 	bool clockwise, radians;
 	double first_pixel; /* what the matrices call the centre of the first column and row */
 	double pixel[2];    /* mm; NaN: from the images */

@@ -192,6 +192,10 @@ test_lists_of_angles_and_matrices() {
 	cbct export-geometry "$floats" --format matrices -o "$work/matrices.txt"
 	imports "$floats" "$floats/projections.raw" "${plain[@]}" --matrices "$work/matrices.txt"
 	same_views "$floats" "$work/back" 1e-10 "matrices in lines of 12"
+	cbct export-geometry "$floats" --format astra -o "$work/vectors.txt"
+	imports "$floats" "$floats/projections.raw" --size 48,32 --type float32 --astra "$work/vectors.txt"
+	same_views "$floats" "$work/back" 1e-10 "ASTRA's vectors"
+	jq -e '.detector.pixel_mm | (.[0] - 4 | fabs) < 1e-12 and (.[1] - 3 | fabs) < 1e-12' "$work/back/scan.json" >/dev/null || fail "the vectors' pitch"
 	# Three lines each, brackets, another scale and sign, pixels that begin at 1.
 	awk '!/^#/ { print "% view " NR; for (r = 0; r < 3; r++) { printf "["; for (c = 1; c <= 4; c++)
 		printf("%s%.17g", (c > 1 ? "; " : ""), -0.01 * ($(4 * r + c) + (r < 2 ? $(8 + c) : 0))); print "]" } }' "$work/matrices.txt" >"$work/three.txt"
