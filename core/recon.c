@@ -11,6 +11,7 @@
 #include <string.h>
 #include <time.h>
 
+#include "core/exterior.h"
 #include "core/fdk.h"
 #include "core/metal.h"
 #include "core/input.h"
@@ -158,6 +159,9 @@ static int memory_needed(const struct backend *backend, struct device *device, c
 	memory.scratch = bytes.scratch + bytes.raw;
 	if (options->column_weights != NULL)
 		memory.scratch += batch / columns * (columns + (size_t)(options->pad[0] + options->pad[1]));
+	/* Of exterior_subtract. */
+	if (options->sart != NULL && options->extend > 0)
+		memory.scratch += slot;
 	memory.host = bytes.host;
 	if (recipe->metal.on) {
 		code = add_metal(backend, device, options, batch, &memory, err);
@@ -765,6 +769,65 @@ static int iterate(struct recon *recon, struct history_row *ret_row, struct erro
 	return 0;
 }
 
+/* Whether FDK extends any row of the scan; a run that goes on from an iterate has not filtered yet. */
+static int find_truncation(struct recon *recon, bool *ret_truncated, struct error *err)
+{
+	const int all = recon->geometry->count;
+	const int batch = recon->fdk.batch < FDK_BATCH_MOST ? recon->fdk.batch : FDK_BATCH_MOST;
+	size_t rows[2];
+	int code = 0;
+
+	for (int view = 0; view < all && recon->resumed && code == 0; view += batch) {
+		const int count = all - view < batch ? all - view : batch;
+		int views[FDK_BATCH_MOST];
+
+		for (int i = 0; i < count; i++)
+			views[i] = view + i;
+		code = recon->backend->filter(recon->plan, recon->projections, NULL, views, count, recon->fdk.filtered,
+					      err);
+	}
+	if (code == 0)
+		code = recon->backend->filter_extended(recon->plan, rows, err);
+	if (code == 0)
+		*ret_truncated = rows[0] + rows[1] > 0;
+	return code;
+}
+
+/*
+ * Where FDK extends rows, what lies outside of the grid is taken out of the
+ * projections before SART sees them. FDK runs once more for it, over the stack
+ * and in the order of the views, so that a run that goes on from an iterate
+ * gives the same bits. The iterate waits in `before`, which the first iteration
+ * writes anyway.
+ */
+static int leave_out_the_exterior(struct recon *recon, struct error *err)
+{
+	const struct backend *backend = recon->backend;
+	bool truncated = false;
+	int code = recon->weights.extend > 0 ? find_truncation(recon, &truncated, err) : 0;
+
+	if (code < 0 || !truncated)
+		return code;
+	code = backend->volume_copy(recon->before, recon->volume, err);
+	if (code == 0)
+		code = backend->volume_fill(recon->volume, 0, err);
+	for (int view = 0; view < recon->geometry->count && code == 0; view++) {
+		code = check_cancelled(recon, err);
+		if (code == 0)
+			code = fdk_add(&recon->fdk, view, view, recon->projections, recon->volume, err);
+	}
+	if (code == 0)
+		code = fdk_flush(&recon->fdk, recon->projections, recon->volume, err);
+	if (code == 0)
+		code = make_up_for_blank_views(recon, err);
+	if (code == 0)
+		code = exterior_subtract(backend, recon->device, recon->plan, recon->geometry, recon->weights.pad,
+					 recon->volume, recon->projections, err);
+	if (code == 0)
+		code = backend->volume_copy(recon->volume, recon->before, err);
+	return code;
+}
+
 static bool is_last(const struct recipe *recipe, const struct history_row *row)
 {
 	return row->iteration >= recipe->sart.iterations ||
@@ -776,6 +839,10 @@ static int run_sart(struct recon *recon, struct error *err)
 {
 	const struct recon_hooks *hooks = recon->hooks;
 	bool last = recon->iteration >= recon->recipe.sart.iterations;
+	int failed = last ? 0 : leave_out_the_exterior(recon, err);
+
+	if (failed < 0)
+		return failed;
 
 	while (!last) {
 		struct history_row row;

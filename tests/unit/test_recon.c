@@ -1173,6 +1173,58 @@ START_TEST(fdk_is_as_good_as_rtk_demands)
 }
 END_TEST
 
+/*
+ * An ellipse and two balls, cut off on both sides, on a grid as wide as the field
+ * of view and on one that holds all of it: no rim, no cup. Without FDK's
+ * extension the values are half as large again.
+ */
+START_TEST(truncation_leaves_no_rim_in_fdk_or_sart)
+{
+	const struct orbit_spec spec = {60, 40, 120, {600, 1100, {3, 3}, {0, 0}, {0, 0}}, 0, _i % 2 ? -3 : 3};
+	struct ellipsoid parts[] = {
+	    {.shape = SHAPE_CYLINDER, .semi_axes = {95, 75, 60}, .density = 0.02},
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {12, 12, 12}, .centre = {20, 10, 0}, .density = 0.01},
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {10, 10, 10}, .centre = {-15, -20, 5}, .density = -0.01},
+	};
+	struct phantom phantom = {.count = 3, .parts = parts};
+	const double places[][3] = {{0, 0, 0}, {38, -15, 0}, {-38, 15, 5}, {0, -42, 0}, {20, 10, 0}, {-15, -20, 5}};
+	const double expected[] = {0.02, 0.02, 0.02, 0.02, 0.03, 0.01};
+	struct grid grid = grid_of(_i / 2 ? 100 : 48, _i / 2 ? 80 : 48, 20, 2, 2, 2);
+	struct recipe recipe = recipe_on(&grid);
+	struct scene scene;
+
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	recipe.fdk.on = true;
+	for (int sart = 0; sart < 2; sart++) {
+		struct outcome outcome = {0};
+
+		recipe.sart.on = sart;
+		recipe.sart.iterations = 5;
+		run(&scene, &recipe, &outcome);
+		ck_assert_ptr_nonnull(strstr(outcome.warnings, "truncated: "));
+		for (int i = 0; i < 6; i++) {
+			double value = mean_near(outcome.last, &grid, places[i], 5);
+
+			/* 2 %, 20 HU, as far out as 43 of 48 mm */
+			ck_assert_msg(fabs(value - expected[i]) < 0.0004, "%s, place %d: %.5f", sart ? "sart" : "fdk",
+				      i, value);
+		}
+		outcome_clear(&outcome);
+	}
+	recipe.sart.on = recipe.fdk.extend = false;
+	{
+		struct outcome outcome = {0};
+
+		run(&scene, &recipe, &outcome);
+		ck_assert_ptr_null(strstr(outcome.warnings, "truncated: "));
+		ck_assert_double_gt(mean_near(outcome.last, &grid, places[1], 5), 0.025);
+		outcome_clear(&outcome);
+	}
+	scene_clear(&scene);
+}
+END_TEST
+
 START_TEST(sart_is_as_good_as_rtk_demands)
 {
 	const struct orbit_spec spec = {64, 64, 180, {600, 1200, {8, 8}, {0, 0}, {0, 0}}, 0, 2};
@@ -1223,6 +1275,7 @@ Suite *recon_suite(void)
 	tcase_add_test(images, a_single_view_is_explained_by_sart_and_harmless_to_fdk);
 	tcase_add_test(images, without_a_grid_one_is_chosen);
 	tcase_add_loop_test(images, fdk_is_as_good_as_rtk_demands, 0, COUNT(rtk_fdk));
+	tcase_add_loop_test(images, truncation_leaves_no_rim_in_fdk_or_sart, 0, 4);
 	tcase_add_test(images, sart_is_as_good_as_rtk_demands);
 	suite_add_tcase(suite, images);
 

@@ -1,0 +1,120 @@
+/* What lies outside of the grid is taken out of truncated rows: see exterior.h. */
+#include "core/exterior.h"
+
+#include <stdlib.h>
+
+#include "core/extend.h"
+
+/* One view on the host: line integrals as measured and through the volume. */
+struct pair {
+	int columns, rows;
+	const int *pad;
+	float *measured, *explained; /* [row][column], owned */
+	double *smooth;              /* [row][column], owned */
+};
+
+static bool is_truncated(const struct pair *pair, const float *row)
+{
+	const int edge = extend_edge(pair->columns);
+	float sums[2] = {0};
+
+	for (int i = 0; i < edge; i++) {
+		sums[0] += row[i];
+		sums[1] += row[pair->columns - 1 - i];
+	}
+	return (pair->pad[0] == 0 && sums[0] >= EXTEND_LEVEL * (float)edge) ||
+	       (pair->pad[1] == 0 && sums[1] >= EXTEND_LEVEL * (float)edge);
+}
+
+/* Sums of e and column e over the columns first .. last. */
+struct stretch {
+	int first, last;
+	double sum, moment;
+};
+
+static void stretch_add(struct stretch *stretch, int column, double e)
+{
+	stretch->sum += e;
+	stretch->moment += column * e;
+}
+
+/* The straight line nearest to e in the window, at a column. */
+static double line_at(const struct stretch *stretch, int column)
+{
+	const double n = stretch->last - stretch->first + 1, middle = 0.5 * (stretch->first + stretch->last);
+	const double spread = n * (n * n - 1) / 12;
+	const double slope = spread > 0 ? (stretch->moment - middle * stretch->sum) / spread : 0;
+
+	return stretch->sum / n + slope * (column - middle);
+}
+
+static void subtract_row(float *measured, const float *explained, double *smooth, int columns)
+{
+	const int reach = columns / EXTERIOR_PART > 2 ? columns / EXTERIOR_PART : 2;
+	struct stretch stretch = {.first = 0, .last = -1};
+
+	for (int c = 0; c < columns; c++) {
+		for (; stretch.last < columns - 1 && stretch.last < c + reach; stretch.last++)
+			stretch_add(&stretch, stretch.last + 1,
+				    (double)measured[stretch.last + 1] - (double)explained[stretch.last + 1]);
+		for (; stretch.first < c - reach; stretch.first++)
+			stretch_add(&stretch, stretch.first,
+				    (double)explained[stretch.first] - (double)measured[stretch.first]);
+		smooth[c] = line_at(&stretch, c);
+	}
+	for (int c = 0; c < columns; c++)
+		measured[c] = (float)((double)measured[c] - smooth[c]);
+}
+
+/* Returns whether any row was truncated. */
+static bool subtract_view(const struct pair *pair)
+{
+	int truncated = 0;
+
+#pragma omp parallel for schedule(static) reduction(+ : truncated)
+	for (int r = 0; r < pair->rows; r++) {
+		const size_t at = (size_t)r * (size_t)pair->columns;
+
+		if (!is_truncated(pair, pair->measured + at))
+			continue;
+		subtract_row(pair->measured + at, pair->explained + at, pair->smooth + at, pair->columns);
+		truncated++;
+	}
+	return truncated > 0;
+}
+
+int exterior_subtract(const struct backend *backend, struct device *device, struct plan *plan,
+		      const struct geometry *geometry, const int pad[2], const struct volume *volume,
+		      struct stack *projections, struct error *err)
+{
+	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
+	struct pair pair = {
+	    .columns = geometry->columns,
+	    .rows = geometry->rows,
+	    .pad = pad,
+	    .measured = malloc(pixels * sizeof(float)),
+	    .explained = malloc(pixels * sizeof(float)),
+	    .smooth = malloc(pixels * sizeof(double)),
+	};
+	struct stack *slot = NULL;
+	int code = 0;
+
+	if (pair.measured == NULL || pair.explained == NULL || pair.smooth == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for a view of %d x %d pixels", pair.columns, pair.rows);
+	if (code == 0)
+		code = backend->stack_new(device, pair.columns, pair.rows, 1, &slot, err);
+	for (int view = 0; view < geometry->count && code == 0; view++) {
+		code = backend->project(plan, volume, &view, 1, slot, err);
+		if (code == 0)
+			code = backend->stack_download(slot, 0, 1, pair.explained, err);
+		if (code == 0)
+			code = backend->stack_download(projections, view, 1, pair.measured, err);
+		if (code == 0 && subtract_view(&pair))
+			code = backend->stack_upload(projections, view, 1, pair.measured, err);
+	}
+	backend->stack_free(slot);
+	free(pair.measured);
+	free(pair.explained);
+	free(pair.smooth);
+	return code;
+}
