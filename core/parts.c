@@ -8,6 +8,8 @@
 #include <string.h>
 #include <sys/mman.h>
 
+#include "core/extend.h"
+
 float *parts_floats(size_t count)
 {
 	void *floats = mmap(NULL, count * sizeof(float), PROT_READ | PROT_WRITE,
@@ -211,6 +213,29 @@ static int parts_linearise(struct plan *plan, const void *samples, int count, co
 	return code;
 }
 
+/* Rows of a projection that the filter will extend, by the rule of extend.h. */
+static void count_extended(const struct plan *plan, const float *projection, size_t counts[2])
+{
+	const struct plan_options *options = &plan->options;
+	const int columns = options->geometry->columns, edge = extend_edge(columns);
+	size_t before = 0, behind = 0;
+
+#pragma omp parallel for schedule(static) reduction(+ : before, behind)
+	for (int row = 0; row < options->geometry->rows; row++) {
+		const float *p = projection + (size_t)row * (size_t)columns;
+		float sums[2] = {0};
+
+		for (int i = 0; i < edge; i++) {
+			sums[0] += p[i];
+			sums[1] += p[columns - 1 - i];
+		}
+		before += options->pad[0] == 0 && sums[0] >= EXTEND_LEVEL * (float)edge;
+		behind += options->pad[1] == 0 && sums[1] >= EXTEND_LEVEL * (float)edge;
+	}
+	counts[0] += before;
+	counts[1] += behind;
+}
+
 static int parts_filter(struct plan *plan, const struct stack *from, const int *slots, const int *views, int count,
 			struct stack *to, struct error *err)
 {
@@ -224,6 +249,8 @@ static int parts_filter(struct plan *plan, const struct stack *from, const int *
 	for (int i = 0; i < count; i++) {
 		to->from[i] = slots != NULL ? slots[i] : views[i];
 		to->views[i] = views[i];
+		if (plan->options.extend > 0)
+			count_extended(plan, from->data + from->pixels * (size_t)to->from[i], plan->extended);
 	}
 	return 0;
 }

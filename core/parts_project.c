@@ -94,21 +94,6 @@ static int fill_slab(struct plan *plan, struct slab *slab, struct feed *feed, co
 	return code;
 }
 
-/* Rows that were extended, from the first slab: the others see the same rows again. */
-static int note_extended(struct plan *plan, const struct slab *slab, struct error *err)
-{
-	size_t rows[2];
-	int code;
-
-	if (slab->first > 0 || plan->options.extend == 0)
-		return 0;
-	code = plan->device->backend->filter_extended(slab->plan, rows, err);
-	if (code == 0)
-		for (int i = 0; i < 2; i++)
-			plan->extended[i] += rows[i];
-	return code;
-}
-
 int parts_backproject(struct plan *plan, const struct stack *from, const int *views, int count,
 		      enum backprojection weight, struct volume *to, struct error *err)
 {
@@ -130,8 +115,6 @@ int parts_backproject(struct plan *plan, const struct stack *from, const int *vi
 		code = fill_slab(plan, &slab, &feed, from, views, count, weight, &drain, to, err);
 		if (code == 0)
 			code = drain_all(plan, &drain, to, err);
-		if (code == 0 && from->by != NULL)
-			code = note_extended(plan, &slab, err);
 		backend->plan_free(slab.plan);
 		slab.plan = NULL;
 		if (code < 0)

@@ -34,12 +34,14 @@ static void make_scene(struct scene *scene, const struct orbit_spec *spec)
 static const struct orbit_spec full = {71, 67, 47, {600, 1100, {1.9, 1.7}, {0, 0}, {0, 0}}, 3, 360. / 47};
 static const struct orbit_spec displaced = {71, 67, 60, {600, 1100, {1.9, 1.7}, {40, 0}, {0, 0}}, 0, 6};
 
+static const struct orbit_spec narrow = {37, 67, 47, {600, 1100, {1.9, 1.7}, {0, 0}, {0, 0}}, 3, 360. / 47};
+
 struct result {
 	float *volume, *fdk;
 	struct history_row rows[8];
 	int count;
 	struct recon_memory memory;
-	char plan[256];
+	char plan[256], warnings[512];
 	size_t defects;
 };
 
@@ -59,13 +61,21 @@ static int on_keep(void *context, struct recon *recon, const struct kept_volume 
 	return recon_read(recon, 0, volume->grid->size[2], *to, ret_err);
 }
 
+static void on_warning(void *context, const char *code, const char *detail)
+{
+	struct result *result = context;
+	size_t used = strlen(result->warnings);
+
+	snprintf(result->warnings + used, sizeof(result->warnings) - used, "%s: %s\n", code, detail);
+}
+
 /* limit 0: the whole; otherwise a device with so many bytes that are not the host's. */
 static struct result reconstruct(const struct scene *scene, const struct recipe *recipe,
 				 const struct linearise *linearise, const void *samples, size_t limit)
 {
 	const struct device_options options = {.threads = 2, .memory_limit = limit};
 	struct result result = {0};
-	const struct recon_hooks hooks = {.context = &result, .row = on_row, .keep = on_keep};
+	const struct recon_hooks hooks = {.context = &result, .row = on_row, .keep = on_keep, .warning = on_warning};
 	struct backend backend = backend_cpu;
 	int *views = malloc(sizeof(int) * (size_t)scene->geometry.count);
 	struct device *device;
@@ -129,6 +139,8 @@ static const struct {
 	double tolerance;
 } cases[] = {
     {"FDK", &full, true, false, 0, -1, 1e-6},
+    {"FDK, cut off", &narrow, true, false, 0, -1, 1e-6},
+    {"OS-SART, cut off", &narrow, true, true, 4, -1, 1e-4},
     {"FDK, displaced", &displaced, true, false, 0, -1, 1e-6},
     {"SIRT", &full, false, true, 1, -1, 1e-5},
     {"OS-SART", &full, true, true, 4, -1, 1e-5},
@@ -173,6 +185,7 @@ START_TEST(parts_give_what_the_whole_gives)
 		ck_assert_double_lt(apart(parts.fdk, whole.fdk, voxels), 1e-6);
 	ck_assert_msg(memcmp(parts.volume, again.volume, voxels * sizeof(float)) == 0, "%s: other bits on a repeat",
 		      cases[_i].name);
+	ck_assert_str_eq(parts.warnings, whole.warnings);
 	ck_assert_int_eq(parts.count, whole.count);
 	for (int i = 0; i < whole.count; i++) {
 		ck_assert_double_eq_tol(parts.rows[i].residual / whole.rows[i].residual, 1, 1e-3);
