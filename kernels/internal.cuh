@@ -187,6 +187,18 @@ struct columns_shape {
 };
 struct columns_shape columns_shape_make(const int size[3]);
 
+/*
+ * Its copy in half precision, [x][y][z] with edge values held for SLICE_HELD voxels
+ * around. Columns of voxels begin with a pair; before and behind all, SWEEP_MARGIN
+ * values can be read.
+ */
+enum { SWEEP_MARGIN = 32 };
+struct half_columns_shape {
+	int pitch;     /* values from column to column, even */
+	size_t floats; /* in all */
+};
+struct half_columns_shape half_columns_shape_make(const int size[3]);
+
 struct layered { /* a layered 2D array with its texture: hardware bilinear samples */
 	cudaArray_t array;
 	cudaTextureObject_t texture;
@@ -204,12 +216,14 @@ struct device_grid {
 };
 
 enum { BATCH_MOST = 128 }; /* views that are filtered and backprojected in one go */
+enum { ROWS_APART = 4 };   /* rows of a thread that share columns, but no values */
 
 /* How a plan does its work; chosen once from geometry and options. */
 struct plan_shape {
 	bool untilted;       /* the fast kernels apply */
 	bool rows_down;      /* untilted, and rows count against z */
 	int forward_rows;    /* rows of one thread in the forward projection by rows; 0: the general one */
+	bool rows_apart;     /* they share columns, but no values */
 	bool halves;         /* the forward projection reads pairs in half precision */
 	int back_voxels;     /* voxels of one window in the untilted backprojection; 0: the general one */
 	bool is_small;       /* launches take longer than samples: the plainest kernels */
@@ -222,6 +236,7 @@ struct plan_shape {
 	bool parts;          /* it holds a part of a subset only */
 	int views_at_once;   /* that one launch of the backprojection takes; layers of the projection array */
 	bool by_view;        /* SART goes view by view over a z-fastest copy */
+	bool by_rows;        /* its projection by rows, over another one in half precision */
 	bool by_subset;      /* SART has updates of several views */
 	bool covered;        /* every view sees the whole grid: sum_S w_ij = views of S */
 	int filter_length;   /* of the fused filter, 0 for cuFFT */
@@ -240,6 +255,7 @@ struct plan {
 	struct device_grid grid;
 	struct slices_shape along_x, along_y;
 	struct columns_shape columns;
+	struct half_columns_shape half_columns;
 	struct stack_shape stack;
 	struct stack_shape filtered; /* with plan_options.pad */
 	char summary[192];
@@ -354,6 +370,7 @@ int reduce_pairs(struct plan *plan, const float2 *partial, size_t count, double 
 /* ---- tv.cu, sart.cu ---- */
 size_t tv_scratch_bytes(const struct plan_options *options);
 size_t sweep_partials(const struct plan *plan);
+size_t sweep_scratch_bytes(const struct plan *plan);
 size_t subsets_partials(const struct plan *plan);
 
 static inline int cancel_check(const struct cancel *cancel, struct error *err)

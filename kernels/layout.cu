@@ -55,6 +55,17 @@ struct columns_shape columns_shape_make(const int size[3])
 	return shape;
 }
 
+struct half_columns_shape half_columns_shape_make(const int size[3])
+{
+	struct half_columns_shape shape;
+	size_t columns = ((size_t)size[0] + 2 * SLICE_HELD) * ((size_t)size[1] + 2 * SLICE_HELD);
+
+	/* Columns start on sectors. */
+	shape.pitch = round_up(size[2] + 2 * SLICE_HELD, 16);
+	shape.floats = (columns * (size_t)shape.pitch + 2 * SWEEP_MARGIN) / 2;
+	return shape;
+}
+
 enum { TILE = 32, TILE_ROWS = 8 };
 
 /* Floats from the beginning of row 0 to a place along the fast axis. */
@@ -131,17 +142,19 @@ static __device__ __forceinline__ void put_slices(const slices &to, int first, i
 	}
 }
 
-enum { PLANES = 8 }; /* of a block, from the top down: the plane above is at hand for the pairs */
-
-/* One tile of x and y; across x it is turned over in shared memory. */
+/*
+ * One tile of x and y in `planes` planes, from the top down: the plane above is at
+ * hand for the pairs. Across x it is turned over in shared memory.
+ */
 template <typename T>
 static __global__ void __launch_bounds__(TILE *TILE_ROWS)
-    to_slices(const float *__restrict__ volume, int nx, int ny, int nz, const slices across_x, const slices across_y)
+    to_slices(const float *__restrict__ volume, int nx, int ny, int nz, int planes, const slices across_x,
+	      const slices across_y)
 {
 	const int each = TILE / TILE_ROWS;
 	__shared__ float tile[2][TILE][TILE + 1];
 	int x0 = blockIdx.x * TILE, y0 = blockIdx.y * TILE, tx = threadIdx.x, ty = threadIdx.y;
-	int bottom = blockIdx.z * PLANES, top = min(bottom + PLANES, nz) - 1;
+	int bottom = blockIdx.z * planes, top = min(bottom + planes, nz) - 1;
 	int side = 0;
 	float value[each] = {}, turned[each] = {}, above[each], turned_above[each];
 	auto read = [&](int z) {
@@ -174,19 +187,25 @@ static __global__ void __launch_bounds__(TILE *TILE_ROWS)
 	}
 }
 
+enum { PLANES_MOST = 8 };
+
 int layout_slices(struct plan *plan, const float *volume, struct error *err)
 {
 	const int *size = plan->grid.size;
 	cudaStream_t stream = plan->device->stream;
 	struct slices x = slices_at(plan->scratch, &plan->along_x);
 	struct slices y = slices_at(plan->scratch + plan->along_x.floats, &plan->along_y);
-	dim3 blocks(divide_up(size[0], TILE), divide_up(size[1], TILE), divide_up(size[2], PLANES));
-	dim3 threads(TILE, TILE_ROWS);
+	int tiles = divide_up(size[0], TILE) * divide_up(size[1], TILE);
+	/* As few planes read twice as the device is filled for all that. */
+	int planes = tiles * size[2] / (16 * plan->device->multiprocessors);
 
+	planes = planes < 1 ? 1 : planes > PLANES_MOST ? PLANES_MOST : planes;
+	dim3 blocks(divide_up(size[0], TILE), divide_up(size[1], TILE), divide_up(size[2], planes));
+	dim3 threads(TILE, TILE_ROWS);
 	if (plan->shape.halves)
-		to_slices<__half2><<<blocks, threads, 0, stream>>>(volume, size[0], size[1], size[2], x, y);
+		to_slices<__half2><<<blocks, threads, 0, stream>>>(volume, size[0], size[1], size[2], planes, x, y);
 	else
-		to_slices<float><<<blocks, threads, 0, stream>>>(volume, size[0], size[1], size[2], x, y);
+		to_slices<float><<<blocks, threads, 0, stream>>>(volume, size[0], size[1], size[2], planes, x, y);
 	LAUNCHED();
 	return 0;
 }

@@ -104,7 +104,7 @@ static double lean_of(const struct view *view)
 {
 	return hypot(view->row_step[0], view->row_step[1]) / fabs(view->row_step[2]);
 }
-static const double LEAN_MOST = 0.04;
+static const double LEAN_MOST = 0.02;
 
 /*
  * Smallest and largest distance, in voxels along z, of the rays of neighbouring
@@ -215,8 +215,12 @@ static void choose_rows(const struct plan_options *options, struct plan_shape *s
 	if (sign == 0)
 		return;
 	shape->rows_down = sign < 0;
-	if (!shape->z_rays)
+	if (!shape->z_rays) {
 		shape->forward_rows = window_size(false, least, most);
+		shape->rows_apart = shape->forward_rows == 0 && shape->halves;
+		if (shape->rows_apart)
+			shape->forward_rows = ROWS_APART;
+	}
 	/* Seen from the detector the same spacing is upside down. */
 	if (!shape->untilted)
 		return;
@@ -247,6 +251,7 @@ static struct plan_shape shape_of(const struct plan_options *options, bool lean)
 	shape.lean = lean;
 	shape.batch = at_most(resident_views(options), lean ? (int)BATCH_LEAN : (int)BATCH_MOST);
 	shape.by_view = subset == 1 && columns_shape_make(grid->size).floats < (size_t)1 << 31;
+	shape.by_rows = shape.by_view && shape.halves && shape.forward_rows > 0 && !shape.rows_apart;
 	shape.by_subset = subset > 0 && !shape.by_view;
 	shape.correction = shape.by_subset ? (lean ? at_most(subset, BATCH_LEAN) : subset) : 0;
 	shape.parts = shape.correction < (shape.by_subset ? subset : 0);
@@ -306,12 +311,13 @@ static void plan_describe(struct plan *plan, const struct plan_options *options,
 	plan->along_x = slices_shape_make(size[0], size[2], size[1], plan->shape.forward_rows > 0);
 	plan->along_y = slices_shape_make(size[1], size[2], size[0], plan->shape.forward_rows > 0);
 	plan->columns = columns_shape_make(size);
+	plan->half_columns = half_columns_shape_make(size);
 	plan->stack = stack_shape_make(geometry->columns, geometry->rows, 1);
 	plan->filtered = stack_shape_make(wide_columns(options), geometry->rows, 1);
 	if (!options->no_projection)
 		plan->scratch_bytes = (plan->along_x.floats + plan->along_y.floats) * sizeof(float);
-	if (plan->shape.by_view && plan->columns.floats * sizeof(float) > plan->scratch_bytes)
-		plan->scratch_bytes = plan->columns.floats * sizeof(float);
+	if (plan->shape.by_view && sweep_scratch_bytes(plan) > plan->scratch_bytes)
+		plan->scratch_bytes = sweep_scratch_bytes(plan);
 	if (tv_scratch_bytes(options) > plan->scratch_bytes)
 		plan->scratch_bytes = tv_scratch_bytes(options);
 	if (plan->shape.by_view)
@@ -582,8 +588,9 @@ static void summarise(struct plan *plan)
 	char forward[64] = "general", back[64] = "general";
 
 	if (shape->forward_rows > 0)
-		snprintf(forward, sizeof(forward), "%s, %d rows a thread",
-			 shape->untilted ? "untilted" : "near untilted", shape->forward_rows);
+		snprintf(forward, sizeof(forward), "%s, %d rows a thread%s",
+			 shape->untilted ? "untilted" : "near untilted", shape->forward_rows,
+			 shape->rows_apart ? " apart" : "");
 	if (shape->back_voxels > 0)
 		snprintf(back, sizeof(back), "untilted, %d voxels a window%s", shape->back_voxels,
 			 shape->back_half ? ", two a row" : "");

@@ -7,16 +7,7 @@
  * General: a thread has one ray and a warp 32 neighbours in a row, which walk the
  * slices of their axis together.
  *
- * By rows, where rows run across z: the rays of a column share their way across
- * the rows' direction, and in every slice adjacent rows of the detector are evenly
- * spaced along z, 1 + e voxels apart. A thread has ROWS of them: it interpolates
- * ROWS + 2 values across once, x[0] at the floor B of the lowest row, and row k
- * lies at t = z - B + k e beyond k, 0 <= t <= 2, where the two pieces of
- *   x[k+1] - saturate(1 - t) (x[k+1] - x[k]) + saturate(t - 1) (x[k+2] - x[k+1])
- * give the linear interpolation without a branch or a dynamic index. This holds
- * while (ROWS - 1) |e| <= 1, which plan.cu sees to. Where columns lean by a degree or
- * two, each pair of values across is taken at its own place, which the thread's
- * rays share too.
+ * By rows: a thread has ROWS rays of a column (rows.cuh), a warp 32 columns.
  *
  * Blocks are ordered by groups of views, then by tiles of the detector, then by
  * views: those that run at one time see the same part of the volume from many
@@ -24,7 +15,7 @@
  */
 #include <type_traits>
 
-#include "kernels/rays.cuh"
+#include "kernels/rows.cuh"
 
 /* Views of a group: as many as fill the card with blocks of one or two tiles. */
 static const int GROUP = 128;
@@ -68,9 +59,6 @@ static __device__ __forceinline__ auto wander_for(float fast_step)
 	else
 		return wander_of(fast_step);
 }
-
-/* Less than the number of values along an axis by this, a clamped place has all its neighbours. */
-static const float HELD_LEAST = 1e-3f;
 
 /* Stores a ray's line integral, or what SART makes of it, and gives the squares for the sums. */
 static __device__ __forceinline__ float2 finish(const projection &p, int slot, int view, int column, int row, float sum,
@@ -195,43 +183,14 @@ static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS, GENE
 enum { ROWS_WARPS = 4 }; /* of a block: 32 columns wide, ROWS_WARPS * ROWS rows high */
 static const int ROWS_VIEWS = 2;
 
-/* A column's rays: row k, counted upwards, crosses slice i at row + i row_step + k (1 + spread + i spread_step). */
-struct fan {
-	float fast, fast_step, row, row_step, spread, spread_step;
-	float lean, lean_step;           /* and steps aside by k (lean + i lean_step) */
-	float from, to;                  /* where all are inside across the fast axis, counted from the middle slice */
-	float middle_row, middle_spread; /* row and spread in the middle slice, of centred z */
-	float middle_fast, middle_lean;
-};
-
-/* Which slices count as a whole: all rows alike do not, but by the same part; or each by its own. */
-enum guard { GUARD_NONE, GUARD_ALIKE, GUARD_EACH };
-
 /* Where the first of the four columns beside a place lies in a slice, in row 0. */
-template <int GUARD>
-static __device__ __forceinline__ int first_column(float fast, int panel, const slice_axes &axes, float &right)
+static __device__ __forceinline__ int first_column(float fast, int panel, float &right)
 {
-	if (GUARD != GUARD_NONE)
-		fast = fminf(fmaxf(fast, -1.0f), (float)axes.fast - HELD_LEAST);
 	/* Counted from the first that is held. */
 	unsigned place = (unsigned)split(fast, right) + (SLICE_HELD - 1);
 	int within = (int)(place * 17190u >> 20); /* place / SLICE_STEP below 74898 */
 
 	return (int)place + within * (panel - SLICE_STEP);
-}
-
-/* The lowest of the values that a fan needs in slice i, and the fan's first row counted from there. */
-template <int ROWS, int GUARD>
-static __device__ __forceinline__ int lowest_row(const fan &f, float i, float e, const slice_axes &axes, float &t)
-{
-	float row = fmaf(i, f.row_step, f.row), base = row + fminf(0.0f, (float)(ROWS - 1) * e), unused;
-
-	if (GUARD != GUARD_NONE)
-		base = fminf(fmaxf(base, (float)-SLICE_PAD), (float)axes.rows);
-	int low = split(base, unused);
-
-	t = row - (float)low;
-	return low;
 }
 
 /* The samples of slice i in float. */
@@ -242,7 +201,8 @@ static __device__ __forceinline__ void sample_rows(const float *__restrict__ sli
 {
 	float e = fmaf(i, f.spread_step, f.spread), right, t, x[ROWS + 2];
 	int low = lowest_row<ROWS, GUARD>(f, i, e, axes, t);
-	const float *q = slice + (low * PANEL + first_column<GUARD>(fmaf(i, f.fast_step, f.fast), panel, axes, right));
+	const float *q =
+	    slice + (low * PANEL + first_column(held<GUARD>(fmaf(i, f.fast_step, f.fast), axes), panel, right));
 	four_parts four = parts_at(wander, right);
 
 #pragma unroll
@@ -259,62 +219,6 @@ static __device__ __forceinline__ void sample_rows(const float *__restrict__ sli
 	}
 }
 
-/*
- * The samples of slice i in half precision, two rows a register. Where rows LEAN,
- * each pair of values across has its own place.
- */
-template <int ROWS, int GUARD, bool LEAN>
-static __device__ __forceinline__ void sample_pairs(const __half2 *__restrict__ slice, int panel, const fan &f,
-						    const half_wandering &wander, float i, const slice_axes &axes,
-						    __half2 value[(ROWS + 1) / 2])
-{
-	const int pairs = (ROWS + 3) / 2;
-	float e = fmaf(i, f.spread_step, f.spread), fast = fmaf(i, f.fast_step, f.fast), right, t, lean = 0;
-	int low = lowest_row<ROWS, GUARD>(f, i, e, axes, t);
-	__half2 x[pairs];
-
-	if (LEAN) {
-		lean = fmaf(i, f.lean_step, f.lean) * reciprocal(1.0f + e);
-		fast = fmaf(0.5f - t, lean, fast);
-	}
-	const __half2 *q = slice + (low * PANEL + first_column<GUARD>(fast, panel, axes, right));
-	half_parts part = parts_at(wander, right);
-#pragma unroll
-	for (int j = 0; j < pairs; j++) {
-		if (LEAN && j > 0) {
-			q = slice +
-			    (low * PANEL + first_column<GUARD>(fmaf((float)(2 * j), lean, fast), panel, axes, right));
-			part = parts_at(wander, right);
-		}
-		x[j] = across_four(q + 2 * j * PANEL, 1, part);
-	}
-	__half2 both = __float2half2_rn(e), first = __floats2half2_rn(1.0f - t, 1.0f - t - e);
-#pragma unroll
-	for (int k = 0; k < (ROWS + 1) / 2; k++) {
-		__half2 here = __halves2half2(__high2half(x[k]), __low2half(x[k + 1]));
-		__half2 down = __hfma2_sat(both, __float2half2_rn((float)(-2 * k)), first);
-		__half2 up = __hfma2_sat(both, __float2half2_rn((float)(2 * k)), __hneg2(first));
-
-		value[k] = __hfma2(up, __hsub2(x[k + 1], here), __hfma2(down, __hsub2(x[k], here), here));
-	}
-}
-
-/* Where a slice counts in part, what a row of no part has read may be anything. */
-template <int ROWS, int GUARD>
-static __device__ __forceinline__ void add_values(float i, const float begin[ROWS], const float end[ROWS],
-						  const float value[ROWS], float sum[ROWS])
-{
-	float part = GUARD == GUARD_NONE ? 1.0f : part_of(i, begin[0], end[0]);
-
-#pragma unroll
-	for (int k = 0; k < ROWS; k++) {
-		if (GUARD == GUARD_EACH)
-			part = part_of(i, begin[k], end[k]);
-		if (part > 0)
-			sum[k] = fmaf(part, value[k], sum[k]);
-	}
-}
-
 template <int ROWS, int GUARD, bool LEAN>
 static __device__ __forceinline__ void add_slices(const float *at, const slices &across, int from, int to, const fan &f,
 						  const wandering &wander, const slice_axes &axes,
@@ -328,90 +232,64 @@ static __device__ __forceinline__ void add_slices(const float *at, const slices 
 	}
 }
 
-/* Two rows a register, into floats. */
-template <int ROWS>
-static __device__ __forceinline__ void spread_out(const __half2 value[(ROWS + 1) / 2], float ret[ROWS])
-{
-#pragma unroll
-	for (int k = 0; k < ROWS; k++)
-		ret[k] = k & 1 ? __high2float(value[k / 2]) : __low2float(value[k / 2]);
-}
-
+/* The same in half precision. */
 template <int ROWS, int GUARD, bool LEAN>
 static __device__ __forceinline__ void add_slices(const __half2 *at, const slices &across, int from, int to,
 						  const fan &f, const half_wandering &wander, const slice_axes &axes,
 						  const float begin[ROWS], const float end[ROWS], float sum[ROWS])
 {
-	const int pairs = (ROWS + 1) / 2;
-	float i = (float)from, flat[ROWS];
-	__half2 one[pairs], two[pairs];
+	add_pairs<ROWS, GUARD>(
+	    at, across.slice, from, to, begin, end, sum, [&](const __half2 *slice, float i, __half2 *value) {
+		    const int pairs = (ROWS + 3) / 2;
+		    float e = fmaf(i, f.spread_step, f.spread), fast = fmaf(i, f.fast_step, f.fast), right, t;
+		    int low = lowest_row<ROWS, GUARD>(f, i, e, axes, t);
+		    float lean = LEAN ? lean_at(f, i, e) : 0.0f;
+		    __half2 x[pairs];
 
-	/* Two samples are added in half precision, all else in float. */
-	for (; GUARD == GUARD_NONE && from + 2 <= to; from += 2, i += 2.0f, at += 2 * across.slice) {
-		sample_pairs<ROWS, GUARD, LEAN>(at, across.panel, f, wander, i, axes, one);
-		sample_pairs<ROWS, GUARD, LEAN>(at + across.slice, across.panel, f, wander, i + 1.0f, axes, two);
-#pragma unroll
-		for (int k = 0; k < pairs; k++)
-			one[k] = __hadd2(one[k], two[k]);
-		spread_out<ROWS>(one, flat);
-		add_values<ROWS, GUARD>(i, begin, end, flat, sum);
-	}
-	for (; from < to; from++, i += 1.0f, at += across.slice) {
-		sample_pairs<ROWS, GUARD, LEAN>(at, across.panel, f, wander, i, axes, one);
-		spread_out<ROWS>(one, flat);
-		add_values<ROWS, GUARD>(i, begin, end, flat, sum);
-	}
-}
-
-/* Where row k is inside of the box, in slices. */
-template <bool LEAN>
-static __device__ __forceinline__ void row_range(const fan &f, int k, const slice_axes &axes, float &begin, float &end)
-{
-	float from = f.from, to = f.to, middle = 0.5f * (float)(axes.across - 1);
-
-	if (LEAN)
-		clip(fmaf((float)k, f.middle_lean, f.middle_fast), fmaf((float)k, f.lean_step, f.fast_step),
-		     0.5f * (float)axes.fast, from, to);
-	clip(fmaf((float)k, f.middle_spread, f.middle_row), fmaf((float)k, f.spread_step, f.row_step),
-	     0.5f * (float)axes.rows, from, to);
-	begin = from + middle;
-	end = to + middle;
+		    if (LEAN)
+			    fast = fmaf((float)pairs - 0.5f - t, lean, fast);
+		    int column = first_column(held<GUARD>(fast, axes), across.panel, right);
+		    across_pairs<pairs, LEAN>(slice + (low * PANEL + column), 2 * PANEL, 1, wander, right, lean, x);
+		    blend_rows<ROWS>(x, e, t, value);
+	    });
 }
 
 /*
- * The fan above a ray. Row k divides by another depth, d + k rise, where rows lean;
- * over so few rows the straight line from the first to the last is it.
+ * Rows too far apart, or too close, to share values across: they share the columns
+ * and what these count for, or the changes of it, and each has its own two rows.
  */
-template <int ROWS, bool LEAN>
-static __device__ __forceinline__ fan fan_make(const device_view &g, const float d[3], const float m[3], int axis,
-					       float upwards, const slice_axes &axes)
+template <int ROWS, int GUARD, bool LEAN>
+static __device__ __forceinline__ void add_apart(const __half2 *at, const slices &across, int from, int to,
+						 const fan &f, const half_wandering &wander, const slice_axes &axes,
+						 const float begin[ROWS], const float end[ROWS], float sum[ROWS])
 {
-	crossing cross = crossing_of(d, m, axis);
-	bool x = axis == ACROSS_X;
-	float middle = 0.5f * (float)(axes.across - 1), rise = LEAN ? g.direction[x ? 0 : 1][2] : 0.0f;
-	float inverse = upwards / ((x ? d[0] : d[1]) + (float)(ROWS - 1) * upwards * rise);
-	fan f;
+	float i = (float)from, value[ROWS];
 
-	f.from = -0.5f * (float)axes.across;
-	f.to = -f.from;
-	if (!LEAN)
-		clip(cross.fast, cross.fast_step, 0.5f * (float)axes.fast, f.from, f.to);
-	f.middle_row = cross.row;
-	f.middle_spread = ((x ? g.moment[1][2] : -g.moment[0][2]) - cross.row * rise) * inverse;
-	f.row_step = cross.row_step;
-	f.spread_step = (g.direction[2][2] - cross.row_step * rise) * inverse;
-	f.middle_fast = cross.fast;
-	f.middle_lean = LEAN ? ((x ? -g.moment[2][2] : g.moment[2][2]) - cross.fast * rise) * inverse : 0.0f;
-	f.fast_step = cross.fast_step;
-	f.lean_step = LEAN ? (g.direction[x ? 1 : 0][2] - cross.fast_step * rise) * inverse : 0.0f;
-	f.fast = fmaf(-middle, f.fast_step, cross.fast + 0.5f * (float)(axes.fast - 1));
-	f.row = fmaf(-middle, f.row_step, f.middle_row + 0.5f * (float)(axes.rows - 1));
-	f.spread = fmaf(-middle, f.spread_step, f.middle_spread) - 1.0f;
-	f.lean = fmaf(-middle, f.lean_step, f.middle_lean);
-	return f;
+	for (; from < to; from++, i += 1.0f, at += across.slice) {
+		float row = fmaf(i, f.row_step, f.row), apart = 1.0f + fmaf(i, f.spread_step, f.spread), right, up;
+		float fast = fmaf(i, f.fast_step, f.fast), lean = LEAN ? fmaf(i, f.lean_step, f.lean) : 0.0f;
+		int column = first_column(held<GUARD>(fmaf(0.5f * (ROWS - 1), lean, fast), axes), across.panel, right);
+		half_parts part = parts_at(wander, right), change;
+
+		if (LEAN)
+			change = changes_at(wander, right, lean);
+#pragma unroll
+		for (int k = 0; k < ROWS; k++) {
+			float z = fmaf((float)k, apart, row);
+
+			if (GUARD != GUARD_NONE)
+				z = fminf(fmaxf(z, -1.0f), (float)axes.rows - HELD_LEAST);
+			const __half2 *q = at + (split(z, up) * PANEL + column);
+			float2 two = __half22float2(
+			    LEAN ? across_four(q, 1, part, change, __float2half2_rn((float)k - 0.5f * (ROWS - 1)))
+				 : across_four(q, 1, part));
+			value[k] = mix(two.x, two.y, up);
+		}
+		add_values<ROWS, GUARD>(i, begin, end, value, sum);
+	}
 }
 
-template <int ROWS, typename T, bool LEAN>
+template <int ROWS, typename T, bool LEAN, bool APART>
 static __global__ void __launch_bounds__(32 * ROWS_WARPS * ROWS_VIEWS, 8 / ROWS_VIEWS) project_rows(const projection p)
 {
 	place at = place_of<ROWS_VIEWS>(p);
@@ -435,41 +313,25 @@ static __global__ void __launch_bounds__(32 * ROWS_WARPS * ROWS_VIEWS, 8 / ROWS_
 			continue;
 		slice_axes axes = axes_of(p.grid, axis);
 		fan f = fan_make<ROWS, LEAN>(g, d, m, axis, upwards, axes);
-		int any_first = 1 << 28, any_end = -1, all_first = 0, all_end = 1 << 28;
-		float begin[ROWS], end[ROWS], sum[ROWS];
-		bool alike = true;
+		float begin[ROWS], end[ROWS], sum[ROWS] = {};
+		reach r = reach_of<ROWS, LEAN>(f, mine, low, p.rows, axes, begin, end);
+		bool hits = r.any_end > r.any_first;
 
-#pragma unroll
-		for (int k = 0; k < ROWS; k++) {
-			sum[k] = 0;
-			begin[k] = end[k] = 0;
-			if (!mine || low + k >= p.rows)
-				continue;
-			row_range<LEAN>(f, k, axes, begin[k], end[k]);
-			bool crosses = end[k] > begin[k];
-			alike = alike && begin[k] == begin[0] && end[k] == end[0];
-			int first = first_slice(begin[k]), last = last_slice(end[k]);
-
-			any_first = min(any_first, crosses ? first : 1 << 28);
-			any_end = max(any_end, crosses ? last + 1 : -1);
-			all_first = max(all_first, crosses ? first + 1 : 1 << 28);
-			all_end = min(all_end, crosses ? last : -1);
-		}
-		bool hits = any_end > any_first;
-		if (!hits) {
-			f = {};
-			f.fast = 0.5f * (float)(axes.fast - 1);
-			f.row = 0.5f * (float)(axes.rows - 1);
-		}
-		walk w = walk_together(hits, any_first, any_end, all_first, all_end);
+		if (!hits)
+			f = fan_idle(axes);
+		walk w = walk_together(hits, r.any_first, r.any_end, r.all_first, r.all_end);
 		const slices &across = p.across[axis];
 		auto wander = wander_for<T>(f.fast_step);
 		auto add = [&](auto guard, int from, int to) {
-			add_slices<ROWS, decltype(guard)::value, LEAN>(
-			    (const T *)across.data + across.slice * (size_t)from, across, from, to, f, wander, axes,
-			    begin, end, sum);
+			constexpr int GUARD = decltype(guard)::value;
+			const T *at = (const T *)across.data + across.slice * (size_t)from;
+
+			if constexpr (APART)
+				add_apart<ROWS, GUARD, LEAN>(at, across, from, to, f, wander, axes, begin, end, sum);
+			else
+				add_slices<ROWS, GUARD, LEAN>(at, across, from, to, f, wander, axes, begin, end, sum);
 		};
-		if (!LEAN && __all_sync(~0u, alike || !hits)) {
+		if (!LEAN && __all_sync(~0u, r.alike || !hits)) {
 			add(std::integral_constant<int, GUARD_ALIKE>(), w.first, w.inner_first);
 			add(std::integral_constant<int, GUARD_ALIKE>(), w.inner_end, w.end);
 		} else {
@@ -529,11 +391,21 @@ static void launch_rows(const plan_shape &shape, const projection &p, unsigned b
 	dim3 threads(32, ROWS_WARPS, ROWS_VIEWS);
 
 	if (!shape.halves)
-		project_rows<ROWS, float, false><<<blocks, threads, 0, stream>>>(p);
+		project_rows<ROWS, float, false, false><<<blocks, threads, 0, stream>>>(p);
 	else if (shape.untilted)
-		project_rows<ROWS, __half2, false><<<blocks, threads, 0, stream>>>(p);
+		project_rows<ROWS, __half2, false, false><<<blocks, threads, 0, stream>>>(p);
 	else
-		project_rows<ROWS, __half2, true><<<blocks, threads, 0, stream>>>(p);
+		project_rows<ROWS, __half2, true, false><<<blocks, threads, 0, stream>>>(p);
+}
+
+static void launch_apart(const plan_shape &shape, const projection &p, unsigned blocks, cudaStream_t stream)
+{
+	dim3 threads(32, ROWS_WARPS, ROWS_VIEWS);
+
+	if (shape.untilted)
+		project_rows<ROWS_APART, __half2, false, true><<<blocks, threads, 0, stream>>>(p);
+	else
+		project_rows<ROWS_APART, __half2, true, true><<<blocks, threads, 0, stream>>>(p);
 }
 
 template <typename T>
@@ -569,7 +441,7 @@ int project_rays(struct plan *plan, const float *volume, int first, int count, s
 	p.rows_down = plan->shape.rows_down;
 	p.use = use;
 	p.to = to;
-	switch (plan->shape.forward_rows) {
+	switch (plan->shape.rows_apart ? 0 : plan->shape.forward_rows) {
 	case 3:
 		launch_rows<3>(plan->shape, p, blocks, stream);
 		break;
@@ -583,7 +455,9 @@ int project_rays(struct plan *plan, const float *volume, int first, int count, s
 		launch_rows<6>(plan->shape, p, blocks, stream);
 		break;
 	default:
-		if (plan->shape.halves)
+		if (plan->shape.rows_apart)
+			launch_apart(plan->shape, p, blocks, stream);
+		else if (plan->shape.halves)
 			launch_general<__half2>(plan->shape, p, blocks, stream);
 		else
 			launch_general<float>(plan->shape, p, blocks, stream);

@@ -73,11 +73,11 @@ static __device__ __forceinline__ four_parts parts_at(const wandering &w, float 
  * and the inner ones. The instructions take either half for both of a pair.
  */
 struct half_wandering {
-	__half2 root, fall; /* fall negated */
+	__half2 root, fall;
 };
 static __device__ __forceinline__ half_wandering half_of(const wandering &w)
 {
-	return {__float2half2_rn(w.root), __float2half2_rn(-w.fall)};
+	return {__float2half2_rn(w.root), __float2half2_rn(w.fall)};
 }
 
 struct half_parts {
@@ -86,9 +86,21 @@ struct half_parts {
 static __device__ __forceinline__ half_parts parts_at(const half_wandering &w, float right)
 {
 	__half2 beside = __floats2half2_rn(right, 1.0f - right), hats = __lowhigh2highlow(beside);
-	__half2 inside = __hfma2_sat(w.fall, beside, w.root), kinks = __hmul2(inside, __hmul2(inside, inside));
+	__half2 inside = __hfma2_sat(__hneg2(w.fall), beside, w.root);
+	__half2 kinks = __hmul2(inside, __hmul2(inside, inside));
 
 	return {kinks, __hadd2(__hfma2(kinks, __float2half2_rn(-2.0f), hats), __lowhigh2highlow(kinks))};
+}
+
+/* What `lean` more of `right` adds to the parts. */
+static __device__ __forceinline__ half_parts changes_at(const half_wandering &w, float right, float lean)
+{
+	__half2 beside = __floats2half2_rn(right, 1.0f - right), by = __float2half2_rn(lean);
+	__half2 inside = __hfma2_sat(__hneg2(w.fall), beside, w.root);
+	__half2 steep = __hmul2(__hmul2(w.fall, __floats2half2_rn(-3.0f, 3.0f)), __hmul2(inside, inside));
+	__half2 inner = __hfma2(steep, __float2half2_rn(-2.0f), __floats2half2_rn(-1.0f, 1.0f));
+
+	return {__hmul2(steep, by), __hmul2(__hadd2(inner, __lowhigh2highlow(steep)), by)};
 }
 
 static __device__ __forceinline__ float form(const float coefficients[3], float column, float row)
@@ -259,6 +271,19 @@ static __device__ __forceinline__ __half2 across_four(const __half2 *__restrict_
 
 	return __hfma2(__high2half2(part.outer), p[3 * fast_stride],
 		       __hfma2(__high2half2(part.inner), p[2 * fast_stride], two));
+}
+
+/* The same where the parts change from row to row: `places` of the two, in units of the change. */
+static __device__ __forceinline__ __half2 across_four(const __half2 *__restrict__ p, int fast_stride,
+						      const half_parts &part, const half_parts &change, __half2 places)
+{
+	__half2 p0 = __hfma2(__low2half2(change.outer), places, __low2half2(part.outer));
+	__half2 p1 = __hfma2(__low2half2(change.inner), places, __low2half2(part.inner));
+	__half2 p2 = __hfma2(__high2half2(change.inner), places, __high2half2(part.inner));
+	__half2 p3 = __hfma2(__high2half2(change.outer), places, __high2half2(part.outer));
+	__half2 two = __hfma2(p1, p[fast_stride], __hmul2(p0, p[0]));
+
+	return __hfma2(p3, p[3 * fast_stride], __hfma2(p2, p[2 * fast_stride], two));
 }
 
 /* The sample of a slice of pairs; four columns of a row must be readable. */

@@ -1,0 +1,244 @@
+#ifndef CBCT_KERNELS_ROWS_CUH
+#define CBCT_KERNELS_ROWS_CUH
+
+/*
+ * The rays of ROWS neighbouring rows in one column of the detector, where rows run
+ * across z. They share their way across the rows' direction, and in every slice
+ * they are evenly spaced along z, 1 + e voxels apart. ROWS + 2 values are
+ * interpolated across once, x[0] at the floor B of the lowest row; row k lies at
+ * t = z - B + k e beyond k, 0 <= t <= 2, where the two pieces of
+ *   x[k+1] - saturate(1 - t) (x[k+1] - x[k]) + saturate(t - 1) (x[k+2] - x[k+1])
+ * give the linear interpolation without a branch or a dynamic index. This holds
+ * while (ROWS - 1) |e| <= 1, which plan.cu sees to.
+ *
+ * In half precision, two neighbours along z a register. Where the rows LEAN, by a
+ * degree or so, each pair across counts with its own weights, on the tangent of
+ * those in the middle of all.
+ */
+#include "kernels/rays.cuh"
+
+/* A column's rays: row k, counted upwards, crosses slice i at row + i row_step + k (1 + spread + i spread_step). */
+struct fan {
+	float fast, fast_step, row, row_step, spread, spread_step;
+	float lean, lean_step;           /* and steps aside by k (lean + i lean_step) */
+	float from, to;                  /* where all are inside across the fast axis, counted from the middle slice */
+	float middle_row, middle_spread; /* row and spread in the middle slice, of centred z */
+	float middle_fast, middle_lean;
+};
+
+/* Which slices count as a whole: all rows alike do not, but by the same part; or each by its own. */
+enum guard { GUARD_NONE, GUARD_ALIKE, GUARD_EACH };
+
+/* Less than the number of values along an axis by this, a clamped place has all its neighbours. */
+static const float HELD_LEAST = 1e-3f;
+
+template <int GUARD>
+static __device__ __forceinline__ float held(float fast, const slice_axes &axes)
+{
+	return GUARD == GUARD_NONE ? fast : fminf(fmaxf(fast, -1.0f), (float)axes.fast - HELD_LEAST);
+}
+
+/* The lowest of the values that a fan needs in slice i, and the fan's first row counted from there. */
+template <int ROWS, int GUARD>
+static __device__ __forceinline__ int lowest_row(const fan &f, float i, float e, const slice_axes &axes, float &t)
+{
+	float row = fmaf(i, f.row_step, f.row), base = row + fminf(0.0f, (float)(ROWS - 1) * e), above;
+
+	if (GUARD != GUARD_NONE)
+		base = fminf(fmaxf(base, (float)-SLICE_PAD), (float)axes.rows);
+	int low = split(base, above);
+
+	t = row - (base - above);
+	return low;
+}
+
+/* How the fast coordinate changes along z in slice i. */
+static __device__ __forceinline__ float lean_at(const fan &f, float i, float e)
+{
+	return fmaf(i, f.lean_step, f.lean) * reciprocal(1.0f + e);
+}
+
+/*
+ * COUNT pairs of values across, row_stride apart; `right` is that in their middle
+ * along z. Four columns must be readable.
+ */
+template <int COUNT, bool LEAN>
+static __device__ __forceinline__ void across_pairs(const __half2 *__restrict__ q, int row_stride, int fast_stride,
+						    const half_wandering &wander, float right, float lean,
+						    __half2 x[COUNT])
+{
+	half_parts part = parts_at(wander, right), change;
+
+	if (LEAN)
+		change = changes_at(wander, right, lean);
+#pragma unroll
+	for (int j = 0; j < COUNT; j++) {
+		if (LEAN)
+			x[j] = across_four(q + j * row_stride, fast_stride, part, change,
+					   __floats2half2_rn(2 * j + 0.5f - COUNT, 2 * j + 1.5f - COUNT));
+		else
+			x[j] = across_four(q + j * row_stride, fast_stride, part);
+	}
+}
+
+/* The rows' samples from pairs of values across, the first row t above the first value. */
+template <int ROWS>
+static __device__ __forceinline__ void blend_rows(const __half2 x[(ROWS + 3) / 2], float e, float t,
+						  __half2 value[(ROWS + 1) / 2])
+{
+	__half2 both = __float2half2_rn(e), first = __floats2half2_rn(1.0f - t, 1.0f - t - e);
+
+#pragma unroll
+	for (int k = 0; k < (ROWS + 1) / 2; k++) {
+		__half2 here = __halves2half2(__high2half(x[k]), __low2half(x[k + 1]));
+		__half2 down = __hfma2_sat(both, __float2half2_rn((float)(-2 * k)), first);
+		__half2 up = __hfma2_sat(both, __float2half2_rn((float)(2 * k)), __hneg2(first));
+
+		value[k] = __hfma2(up, __hsub2(x[k + 1], here), __hfma2(down, __hsub2(x[k], here), here));
+	}
+}
+
+/* Where a slice counts in part, what a row of no part has read may be anything. */
+template <int ROWS, int GUARD>
+static __device__ __forceinline__ void add_values(float i, const float begin[ROWS], const float end[ROWS],
+						  const float value[ROWS], float sum[ROWS])
+{
+	float part = GUARD == GUARD_NONE ? 1.0f : part_of(i, begin[0], end[0]);
+
+#pragma unroll
+	for (int k = 0; k < ROWS; k++) {
+		if (GUARD == GUARD_EACH)
+			part = part_of(i, begin[k], end[k]);
+		if (part > 0)
+			sum[k] = fmaf(part, value[k], sum[k]);
+	}
+}
+
+/* Two rows a register, into floats. */
+template <int ROWS>
+static __device__ __forceinline__ void spread_out(const __half2 value[(ROWS + 1) / 2], float ret[ROWS])
+{
+#pragma unroll
+	for (int k = 0; k < ROWS; k++)
+		ret[k] = k & 1 ? __high2float(value[k / 2]) : __low2float(value[k / 2]);
+}
+
+/* Adds slices from .. to - 1; sample(slice, i, value) gives those of slice i. */
+template <int ROWS, int GUARD, typename Sample>
+static __device__ __forceinline__ void add_pairs(const __half2 *at, size_t slice, int from, int to,
+						 const float begin[ROWS], const float end[ROWS], float sum[ROWS],
+						 Sample sample)
+{
+	const int pairs = (ROWS + 1) / 2;
+	float i = (float)from, flat[ROWS];
+	__half2 one[pairs], two[pairs];
+
+	/* Two samples are added in half precision, all else in float. */
+	for (; GUARD == GUARD_NONE && from + 2 <= to; from += 2, i += 2.0f, at += 2 * slice) {
+		sample(at, i, one);
+		sample(at + slice, i + 1.0f, two);
+#pragma unroll
+		for (int k = 0; k < pairs; k++)
+			one[k] = __hadd2(one[k], two[k]);
+		spread_out<ROWS>(one, flat);
+		add_values<ROWS, GUARD>(i, begin, end, flat, sum);
+	}
+	for (; from < to; from++, i += 1.0f, at += slice) {
+		sample(at, i, one);
+		spread_out<ROWS>(one, flat);
+		add_values<ROWS, GUARD>(i, begin, end, flat, sum);
+	}
+}
+
+/* Where row k is inside of the box, in slices. */
+template <bool LEAN>
+static __device__ __forceinline__ void row_range(const fan &f, int k, const slice_axes &axes, float &begin, float &end)
+{
+	float from = f.from, to = f.to, middle = 0.5f * (float)(axes.across - 1);
+
+	if (LEAN)
+		clip(fmaf((float)k, f.middle_lean, f.middle_fast), fmaf((float)k, f.lean_step, f.fast_step),
+		     0.5f * (float)axes.fast, from, to);
+	clip(fmaf((float)k, f.middle_spread, f.middle_row), fmaf((float)k, f.spread_step, f.row_step),
+	     0.5f * (float)axes.rows, from, to);
+	begin = from + middle;
+	end = to + middle;
+}
+
+/*
+ * The fan above a ray. Row k divides by another depth, d + k rise, where rows lean;
+ * over so few rows the straight line from the first to the last is it.
+ */
+template <int ROWS, bool LEAN>
+static __device__ __forceinline__ fan fan_make(const device_view &g, const float d[3], const float m[3], int axis,
+					       float upwards, const slice_axes &axes)
+{
+	crossing cross = crossing_of(d, m, axis);
+	bool x = axis == ACROSS_X;
+	float middle = 0.5f * (float)(axes.across - 1), rise = LEAN ? g.direction[x ? 0 : 1][2] : 0.0f;
+	float inverse = upwards / ((x ? d[0] : d[1]) + (float)(ROWS - 1) * upwards * rise);
+	fan f;
+
+	f.from = -0.5f * (float)axes.across;
+	f.to = -f.from;
+	if (!LEAN)
+		clip(cross.fast, cross.fast_step, 0.5f * (float)axes.fast, f.from, f.to);
+	f.middle_row = cross.row;
+	f.middle_spread = ((x ? g.moment[1][2] : -g.moment[0][2]) - cross.row * rise) * inverse;
+	f.row_step = cross.row_step;
+	f.spread_step = (g.direction[2][2] - cross.row_step * rise) * inverse;
+	f.middle_fast = cross.fast;
+	f.middle_lean = LEAN ? ((x ? -g.moment[2][2] : g.moment[2][2]) - cross.fast * rise) * inverse : 0.0f;
+	f.fast_step = cross.fast_step;
+	f.lean_step = LEAN ? (g.direction[x ? 1 : 0][2] - cross.fast_step * rise) * inverse : 0.0f;
+	f.fast = fmaf(-middle, f.fast_step, cross.fast + 0.5f * (float)(axes.fast - 1));
+	f.row = fmaf(-middle, f.row_step, f.middle_row + 0.5f * (float)(axes.rows - 1));
+	f.spread = fmaf(-middle, f.spread_step, f.middle_spread) - 1.0f;
+	f.lean = fmaf(-middle, f.lean_step, f.middle_lean);
+	return f;
+}
+
+/*
+ * Where ROWS rays are inside of the box, rows beyond `rows` and those that miss it
+ * nowhere, and where all that a lane has are inside together.
+ */
+struct reach {
+	int any_first, any_end, all_first, all_end;
+	bool alike; /* all begin and end at the same place */
+};
+template <int ROWS, bool LEAN>
+static __device__ __forceinline__ reach reach_of(const fan &f, bool mine, int low, int rows, const slice_axes &axes,
+						 float begin[ROWS], float end[ROWS])
+{
+	const int far = 1 << 28;
+	reach r = {far, -1, 0, far, true};
+
+#pragma unroll
+	for (int k = 0; k < ROWS; k++) {
+		begin[k] = end[k] = 0;
+		if (!mine || low + k >= rows)
+			continue;
+		row_range<LEAN>(f, k, axes, begin[k], end[k]);
+		bool crosses = end[k] > begin[k];
+		r.alike = r.alike && begin[k] == begin[0] && end[k] == end[0];
+		int first = first_slice(begin[k]), last = last_slice(end[k]);
+
+		r.any_first = min(r.any_first, crosses ? first : far);
+		r.any_end = max(r.any_end, crosses ? last + 1 : -1);
+		r.all_first = max(r.all_first, crosses ? first + 1 : far);
+		r.all_end = min(r.all_end, crosses ? last : -1);
+	}
+	return r;
+}
+
+/* What a lane without rays follows. */
+static __device__ __forceinline__ fan fan_idle(const slice_axes &axes)
+{
+	fan f = {};
+
+	f.fast = 0.5f * (float)(axes.fast - 1);
+	f.row = 0.5f * (float)(axes.rows - 1);
+	return f;
+}
+
+#endif
