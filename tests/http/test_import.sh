@@ -311,6 +311,11 @@ test_hostile_files_are_refused_with_a_reason() {
 	refused 1 "1000 bytes of pixels, the header tells of" cbct import "$work/short.mha" --rtk "$work/geometry.xml" "${to[@]}"
 	sed 's/CompressedData.*/CompressedData = True/' "$work/short.mha" >"$work/packed.mha"
 	refused 1 "the compressed pixels are damaged" cbct import "$work/packed.mha" --rtk "$work/geometry.xml" "${to[@]}"
+	if /usr/bin/python3 -c 'import numpy' 2>/dev/null; then
+		images mha "$floats" "$work/whole.mha" packed=1
+		head -c 15000 "$work/whole.mha" >"$work/packed.mha"
+		refused 1 "the compressed pixels end within image" cbct import "$work/packed.mha" --rtk "$work/geometry.xml" "${to[@]}"
+	fi
 	sed 's/DimSize.*/DimSize = 1000000 1000000 1000000/' "$work/stack.mhd" >"$work/huge.mhd"
 	refused 1 "huge.mhd" cbct import "$work/huge.mhd" --rtk "$work/geometry.xml" "${to[@]}"
 	head -c 100 "$work/stack.mhd" >"$work/cut.mhd"

@@ -111,6 +111,45 @@ START_TEST(a_plain_circle_is_ours)
 }
 END_TEST
 
+/*
+ * Worked by hand from RTK's text. In plane: the detector's columns go from x towards y of RTK, our y towards z.
+ * Out of plane, counter-clockwise seen from +x: the source goes from z down to -y of RTK, our x down to -z.
+ */
+START_TEST(angles_turn_as_documented)
+{
+	const double s = sqrt(0.5);
+	const struct {
+		const char *name;
+		int degrees;
+		double source[3], column[3], row[3];
+	} turns[] = {
+	    {"GantryAngle", 45, {600 * s, 600 * s, 0}, {-s, s, 0}, {0, 0, 1}},
+	    {"InPlaneAngle", 90, {600, 0, 0}, {0, 0, 1}, {0, -1, 0}},
+	    {"OutOfPlaneAngle", 45, {600 * s, 0, -600 * s}, {0, 1, 0}, {s, 0, s}},
+	};
+
+	for (size_t i = 0; i < sizeof(turns) / sizeof(turns[0]); i++) {
+		char text[400];
+		struct rtk_geometry rtk;
+		struct geometry views;
+		struct error err = {0};
+
+		snprintf(
+		    text, sizeof(text),
+		    "<SourceToIsocenterDistance>600</SourceToIsocenterDistance>"
+		    "<SourceToDetectorDistance>1200</SourceToDetectorDistance><Projection><%s>%d</%s></Projection>",
+		    turns[i].name, turns[i].degrees, turns[i].name);
+		parse(file_of(text), &rtk);
+		ck_assert_int_eq(rtk_geometry_views(&rtk, &unit_stack, COLUMNS, ROWS, RTK_BOTH, &views, &err), 0);
+		assert_vector(views.views[0].source, turns[i].source, EXACT, turns[i].name, 0);
+		assert_vector(views.views[0].column_step, turns[i].column, EXACT, turns[i].name, 0);
+		assert_vector(views.views[0].row_step, turns[i].row, EXACT, turns[i].name, 0);
+		geometry_clear(&views);
+		rtk_geometry_clear(&rtk);
+	}
+}
+END_TEST
+
 START_TEST(values_hold_until_they_change)
 {
 	struct rtk_geometry rtk;
@@ -505,6 +544,7 @@ Suite *rtk_geometry_suite(void)
 
 	tcase_add_test(tests, the_documented_matrix_and_parameters_agree);
 	tcase_add_test(tests, a_plain_circle_is_ours);
+	tcase_add_test(tests, angles_turn_as_documented);
 	tcase_add_test(tests, values_hold_until_they_change);
 	tcase_add_loop_test(tests, views_come_back_from_the_file, 0, ORBIT_COUNT);
 	tcase_add_test(tests, what_is_the_same_stands_once_and_short);
