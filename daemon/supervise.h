@@ -11,6 +11,14 @@
  * nothing with it: its job is queued again (three times at most, then it has
  * failed), and a new worker is started, later and later while they keep dying.
  *
+ * A free worker attends a waiting job with FDK: it is told which projections are
+ * stored, in the order of their arrival, and reconstructs them. A job of higher
+ * priority takes the worker from it, and any other that has something to do
+ * after two seconds in which nothing arrived; it then begins again later. So it
+ * does, at once, when an image comes late or the scan is closed, since what was
+ * reconstructed is void then. Uploads never wait for any of this: they wake the
+ * thread, and one message at a time is under way.
+ *
  * Threads: any for everything below; supervise_start and supervise_stop once each.
  */
 struct supervise;

@@ -26,7 +26,7 @@ enum message_kind {
 	/* worker -> daemon */
 	MESSAGE_HELLO,    /* backend, device, driver, bytes_total, bytes_free */
 	MESSAGE_OPENED,   /* job, memory, plan */
-	MESSAGE_TAKEN,    /* job, count: projections reconstructed so far, all that it was told of */
+	MESSAGE_TAKEN,    /* job, count: projections reconstructed so far */
 	MESSAGE_PROGRESS, /* job, stage, iteration, fraction */
 	MESSAGE_ROW,      /* job, row */
 	MESSAGE_VOLUME,   /* job, name, stage, iteration, bytes, sha256, norms: the file is on the disk */

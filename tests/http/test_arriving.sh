@@ -286,6 +286,23 @@ test_a_daemon_that_dies_or_stops_in_the_middle() {
 	expect_number "$(cbct compare "$work/restarted.nii" "$work/straight.nii" --json | jq .relative_error)" '<=' 1e-6 "relative difference"
 }
 
+test_a_run_that_cannot_be_recorded_yet_is_recorded_later() {
+	command -v sqlite3 >/dev/null || skip "no sqlite3 to make the catalogue refuse a row"
+	fresh_daemon
+	post_scan "$scan_dir"
+	post_job "$fdk"
+	send "$scan_dir" 0 9
+	reconstructed 10
+	sqlite3 "$state/catalogue.sqlite" "CREATE TRIGGER refuse BEFORE UPDATE ON jobs WHEN NEW.state = 'running'
+		BEGIN SELECT RAISE(ABORT, 'refused'); END"
+	send "$scan_dir" 10 59
+	until [ "$(json '.volumes // 0')" -ge 1 ]; do req GET "/v1/jobs/$job"; done # it is done with it meanwhile
+	expect_json '.state == "waiting" and .views.reconstructed == 60'
+	sqlite3 "$state/catalogue.sqlite" "DROP TRIGGER refuse"
+	wait_job succeeded
+	expect_json '.attempts == 1'
+}
+
 test_images_that_come_late() {
 	fresh_daemon
 	post_scan "$raw_dir"
