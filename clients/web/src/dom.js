@@ -108,10 +108,14 @@ export function timeElement(text) {
 
 /* ---- how often ---- */
 
-/* f at most once in `milliseconds`, and once more when it was asked for meanwhile. f may be asynchronous. */
+/*
+ * f at most once in `milliseconds`, and once more when it was asked for meanwhile.
+ * f may be asynchronous; the longer it takes, the longer it then rests.
+ */
 export function throttle(milliseconds, f) {
 	let timer = null, running = false, again = false
 	const run = async () => {
+		const start = performance.now()
 		timer = null
 		running = true
 		again = false
@@ -120,7 +124,7 @@ export function throttle(milliseconds, f) {
 		} finally {
 			running = false
 			if (again)
-				timer = setTimeout(run, milliseconds)
+				timer = setTimeout(run, Math.max(milliseconds, 4 * (performance.now() - start)))
 		}
 	}
 	const ask = () => {

@@ -10,6 +10,7 @@ import { geometryFacts, jobFacts, warningList } from './facts.js'
 import { reconstructAgain, confirmed, openDialog } from './form.js'
 
 const pollTime = 1500 /* ms: progress and time left are not told as events */
+const swipeReach = 12 /* px to either side of the line */
 const plainLimits = [-3000, 30000] /* HU: beyond, the numbers are no attenuation of a patient */
 
 const volumeText = volume => volume.stage === 'sart' ? `iteration ${volume.iteration}` : volume.stage === 'tv' ? 'FDK and TV' : 'FDK'
@@ -57,6 +58,7 @@ export class JobPage {
 		this.viewer = new Viewer(this.#view, { label: 'Volume', step: way => this.#step(way), shown: () => this.#onPicture() })
 		this.second = null
 		this.stage.append(this.viewer.element)
+		this.stage.addEventListener('pointerdown', event => this.#grabSwipe(event), { capture: true })
 		this.plot = new Plot(iteration => this.#selectIteration(iteration))
 		this.film = new Film()
 		this.controls = h('div', { class: 'controls', hidden: true }, this.#iterationControls(), this.#viewControls(), this.#compareControls())
@@ -244,6 +246,8 @@ export class JobPage {
 			const volumes = await listVolumes(this.id, this.#abort.signal)
 			if (this.#closed || JSON.stringify(volumes) === JSON.stringify(this.#volumes))
 				return
+			if (this.#volumes.length > 0 && volumes.length > this.#volumes.length)
+				write(this.announce, `New volume: ${volumes.at(-1).name}`)
 			this.#volumes = volumes
 			this.#showVolumes()
 		} catch (error) {
@@ -403,6 +407,26 @@ export class JobPage {
 		this.#other = name
 		this.second.show(this.id, this.#volumes.find(volume => volume.name === name))
 		this.second.tag.textContent = name
+	}
+
+	/* The line can be taken hold of in any tile. */
+	#grabSwipe(event) {
+		const tile = event.target.closest('.tile')
+		if (this.#mode !== 'swipe' || !tile || event.button !== 0)
+			return
+		const box = tile.getBoundingClientRect()
+		if (Math.abs(event.clientX - box.left - box.width * Number(this.swipe.value) / 1000) > swipeReach)
+			return
+		event.preventDefault()
+		event.stopPropagation()
+		tile.setPointerCapture(event.pointerId)
+		const held = new AbortController()
+		tile.addEventListener('pointermove', ({ clientX }) => {
+			this.swipe.value = String(Math.round(Math.min(Math.max((clientX - box.left) / box.width, 0), 1) * 1000))
+			this.#setSwipe(Number(this.swipe.value) / 1000)
+		}, { signal: held.signal })
+		for (const end of ['pointerup', 'pointercancel', 'lostpointercapture'])
+			tile.addEventListener(end, () => held.abort(), { signal: held.signal })
 	}
 
 	/* The other volume lies to the right of the line. */

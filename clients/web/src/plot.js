@@ -66,8 +66,9 @@ export class Plot {
 		this.picture = svg('svg', { class: 'plot', role: 'img' })
 		this.reading = h('p', { class: 'reading' })
 		this.table = h('table', {})
-		this.element = h('div', { class: 'course' }, this.picture, this.reading,
-			h('details', {}, h('summary', {}, 'As a table'), h('div', { class: 'scroll', tabindex: '0', role: 'region', 'aria-label': 'History as a table' }, this.table)))
+		this.details = h('details', { ontoggle: () => this.#fill() }, h('summary', {}, 'As a table'), 
+			h('div', { class: 'scroll', tabindex: '0', role: 'region', 'aria-label': 'History as a table' }, this.table))
+		this.element = h('div', { class: 'course' }, this.picture, this.reading, this.details)
 		this.picture.addEventListener('pointermove', event => this.#point(event))
 		this.picture.addEventListener('pointerleave', () => this.#read(this.#selectedRow()))
 		this.picture.addEventListener('click', event => this.#choose(event))
@@ -178,6 +179,8 @@ export class Plot {
 	}
 
 	#fill() {
+		if (!this.details.open)
+			return
 		const head = ['Iteration', 'Residual', 'Change', 'TV', 'Time'].map(name => h('th', { scope: 'col' }, name))
 		replace(this.table, h('caption', { class: 'hidden' }, 'History'), h('thead', {}, h('tr', {}, head)),
 			h('tbody', {}, this.#rows.slice(-1000).map(row => h('tr', {}, h('th', { scope: 'row' }, String(row.iteration)),
