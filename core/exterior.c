@@ -4,6 +4,7 @@
 #include <stdlib.h>
 
 #include "core/extend.h"
+#include "core/fdk.h"
 
 /* One view on the host: line integrals as measured and through the volume. */
 struct pair {
@@ -96,23 +97,30 @@ int exterior_subtract(const struct backend *backend, struct device *device, stru
 	    .explained = malloc(pixels * sizeof(float)),
 	    .smooth = malloc(pixels * sizeof(double)),
 	};
-	struct stack *slot = NULL;
+	struct stack *batch = NULL;
+	int views[FDK_BATCH_MOST], slots = geometry->count < FDK_BATCH_MOST ? geometry->count : FDK_BATCH_MOST;
 	int code = 0;
 
 	if (pair.measured == NULL || pair.explained == NULL || pair.smooth == NULL)
 		code = error_set(err, ERR_NO_MEMORY, "no memory for a view of %d x %d pixels", pair.columns, pair.rows);
 	if (code == 0)
-		code = backend->stack_new(device, pair.columns, pair.rows, 1, &slot, err);
+		code = backend->stack_new(device, pair.columns, pair.rows, slots, &batch, err);
+	/* Several at a time: a pass over the volume costs as much as some views do. */
 	for (int view = 0; view < geometry->count && code == 0; view++) {
-		code = backend->project(plan, volume, &view, 1, slot, err);
+		const int slot = view % slots, left = geometry->count - view;
+
+		for (int i = 0; i < slots && slot == 0; i++)
+			views[i] = view + i;
+		if (slot == 0)
+			code = backend->project(plan, volume, views, left < slots ? left : slots, batch, err);
 		if (code == 0)
-			code = backend->stack_download(slot, 0, 1, pair.explained, err);
+			code = backend->stack_download(batch, slot, 1, pair.explained, err);
 		if (code == 0)
 			code = backend->stack_download(projections, view, 1, pair.measured, err);
 		if (code == 0 && subtract_view(&pair))
 			code = backend->stack_upload(projections, view, 1, pair.measured, err);
 	}
-	backend->stack_free(slot);
+	backend->stack_free(batch);
 	free(pair.measured);
 	free(pair.explained);
 	free(pair.smooth);

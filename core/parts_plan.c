@@ -280,7 +280,7 @@ static int allocate(struct plan *plan, struct error *err)
 static int summarise(struct plan *plan, struct error *err)
 {
 	enum purpose purpose = plan->slices[FOR_SUMS] > 0 ? FOR_SUMS : plan->slices[FOR_FDK] > 0 ? FOR_FDK : FOR_TV;
-	int slices = plan->slices[purpose], code;
+	int slices = plan->slices[purpose], slabs, code;
 	struct slab slab = {0};
 
 	if (slices == 0)
@@ -288,9 +288,9 @@ static int summarise(struct plan *plan, struct error *err)
 	code = slab_open(plan, purpose, 0, &slab, err);
 	if (code < 0)
 		return code;
-	snprintf(plan->summary, sizeof(plan->summary), "in parts: %d slabs of %d slices, %d views at a time; %.100s",
-		 (plan->options.grid->size[2] + slices - 1) / slices, slices, plan->batch,
-		 plan->device->backend->plan_summary(slab.plan));
+	slabs = (plan->options.grid->size[2] + slices - 1) / slices;
+	snprintf(plan->summary, sizeof(plan->summary), "in parts: %d slab%s of %d slices, %d views at a time; %.100s",
+		 slabs, slabs > 1 ? "s" : "", slices, plan->batch, plan->device->backend->plan_summary(slab.plan));
 	slab_close(plan, &slab);
 	return 0;
 }

@@ -161,7 +161,7 @@ static int memory_needed(const struct backend *backend, struct device *device, c
 		memory.scratch += batch / columns * (columns + (size_t)(options->pad[0] + options->pad[1]));
 	/* Of exterior_subtract. */
 	if (options->sart != NULL && options->extend > 0)
-		memory.scratch += slot;
+		memory.scratch += batch;
 	memory.host = bytes.host;
 	if (recipe->metal.on) {
 		code = add_metal(backend, device, options, batch, &memory, err);

@@ -125,7 +125,7 @@ static void expect_parts(const struct result *result, int slabs_least)
 {
 	int slabs = 0;
 
-	ck_assert_msg(sscanf(result->plan, "in parts: %d slabs", &slabs) == 1, "%s", result->plan);
+	ck_assert_msg(sscanf(result->plan, "in parts: %d slab", &slabs) == 1, "%s", result->plan);
 	ck_assert_int_ge(slabs, slabs_least);
 	ck_assert_uint_gt(result->memory.host, 0);
 	ck_assert_uint_le(result->memory.total, result->memory.available);
