@@ -393,13 +393,15 @@ static int run_keep(void *context, struct recon *recon, const struct kept_volume
 
 /* ---- checkpoints ---- */
 
-static void checkpoint_line(char ret_line[SPOOL_CHECKPOINT_OFFSET], int iteration, const struct grid *grid)
+/* Behind the line lies the iterate, behind that the list of the metal that was taken out. */
+static void checkpoint_line(char ret_line[SPOOL_CHECKPOINT_OFFSET], int iteration, const struct grid *grid,
+			    size_t metal_bytes)
 {
 	char text[SPOOL_CHECKPOINT_OFFSET];
 
 	memset(ret_line, ' ', SPOOL_CHECKPOINT_OFFSET);
-	snprintf(text, sizeof(text), "cbctd checkpoint %d of %d %d %d", iteration, grid->size[0], grid->size[1],
-		 grid->size[2]);
+	snprintf(text, sizeof(text), "cbctd checkpoint %d of %d %d %d, metal %zu", iteration, grid->size[0],
+		 grid->size[1], grid->size[2], metal_bytes);
 	memcpy(ret_line, text, strlen(text));
 	ret_line[SPOOL_CHECKPOINT_OFFSET - 1] = '\n';
 }
@@ -429,16 +431,21 @@ static int save_checkpoint(struct recon *recon, const char *directory, struct er
 {
 	char path[PATH_MAX], header[SPOOL_CHECKPOINT_OFFSET];
 	struct durable d;
+	size_t metal_bytes;
+	const void *metal = recon_metal(recon, &metal_bytes);
 	int code = join(path, sizeof(path), directory, SPOOL_CHECKPOINT, "", err);
 
 	if (code == 0)
-		code = durable_open(&d, path, sizeof(header) + grid_voxels(recon_grid(recon)) * sizeof(float), err);
+		code = durable_open(&d, path,
+				    sizeof(header) + grid_voxels(recon_grid(recon)) * sizeof(float) + metal_bytes, err);
 	if (code != 0)
 		return code;
-	checkpoint_line(header, recon_iteration(recon), recon_grid(recon));
+	checkpoint_line(header, recon_iteration(recon), recon_grid(recon), metal_bytes);
 	code = durable_write(&d, header, sizeof(header), err);
 	if (code == 0)
 		code = write_iterate(recon, &d, err);
+	if (code == 0 && metal_bytes > 0)
+		code = durable_write(&d, metal, metal_bytes, err);
 	if (code != 0) {
 		durable_abandon(&d);
 		return code;
@@ -453,12 +460,12 @@ static int check_checkpoint(const char *path, const char *bytes, size_t size, co
 	char text[SPOOL_CHECKPOINT_OFFSET + 1] = "", line[SPOOL_CHECKPOINT_OFFSET];
 	int iteration;
 
-	if (size != expected)
+	if (size < expected)
 		return error_set(err, ERR_INVALID, "%.200s: %zu bytes, %zu are expected", path, size, expected);
 	memcpy(text, bytes, SPOOL_CHECKPOINT_OFFSET);
 	if (sscanf(text, "cbctd checkpoint %d of", &iteration) != 1)
 		return error_set(err, ERR_INVALID, "%.200s is no checkpoint", path);
-	checkpoint_line(line, iteration, grid);
+	checkpoint_line(line, iteration, grid, size - expected);
 	if (memcmp(line, bytes, sizeof(line)) != 0)
 		return error_set(err, ERR_INVALID, "%.200s is of another grid", path);
 	*ret_iteration = iteration;
@@ -470,6 +477,7 @@ static int resume(struct run *run, struct recon *recon, const char *path, int ex
 {
 	int file = open(path, O_RDONLY | O_CLOEXEC), code, iteration = 0;
 	struct stat status;
+	size_t metal;
 	char *bytes = MAP_FAILED;
 
 	if (file < 0 && errno == ENOENT)
@@ -491,6 +499,9 @@ static int resume(struct run *run, struct recon *recon, const char *path, int ex
 	if (code == 0)
 		code =
 		    recon_resume(recon, (const float *)(const void *)(bytes + SPOOL_CHECKPOINT_OFFSET), iteration, err);
+	metal = SPOOL_CHECKPOINT_OFFSET + grid_voxels(recon_grid(recon)) * sizeof(float);
+	if (code == 0 && (size_t)status.st_size > metal)
+		code = recon_resume_metal(recon, bytes + metal, (size_t)status.st_size - metal, err);
 	if (code == 0 && iteration != expected) {
 		char detail[128];
 

@@ -12,7 +12,7 @@
 #include <string.h>
 
 #define SUITES(row)                                                                                                    \
-	row(error) row(geometry) row(orbit) row(filter) row(phantom) row(raw) row(recon) row(parts) row(study) row(backend) row(json)      \
+	row(error) row(geometry) row(orbit) row(filter) row(phantom) row(raw) row(recon) row(metal) row(parts) row(study) row(backend) row(json)      \
 	    row(scan) row(recipe) row(format) row(metaimage) row(rtk_geometry) row(slice) row(spool) row(message)      \
 		row(queue) row(store) row(job)
 

@@ -163,6 +163,7 @@ void scene_run(const struct scene *scene, const struct recipe *recipe, struct ou
 	};
 	struct device *device;
 	struct recon *recon = NULL;
+	const void *metal;
 
 	if (backend_cpu.open(0, &options, &device, &outcome->err) < 0)
 		ck_abort_msg("%s", outcome->err.text);
@@ -173,11 +174,19 @@ void scene_run(const struct scene *scene, const struct recipe *recipe, struct ou
 	outcome->grid = *recon_grid(recon);
 	if (outcome->resume != NULL)
 		outcome->code = recon_resume(recon, outcome->resume, outcome->resume_iteration, &outcome->err);
+	if (outcome->code == 0 && outcome->resume_metal_bytes > 0)
+		outcome->code =
+		    recon_resume_metal(recon, outcome->resume_metal, outcome->resume_metal_bytes, &outcome->err);
 	if (outcome->code == 0)
 		outcome->code = push_all(scene, outcome, recon);
 	if (outcome->code == 0)
 		outcome->code = recon_run(recon, &outcome->err);
 	outcome->iteration = recon_iteration(recon);
+	metal = recon_metal(recon, &outcome->metal_bytes);
+	outcome->metal = malloc(outcome->metal_bytes + 1);
+	ck_assert_ptr_nonnull(outcome->metal);
+	if (outcome->metal_bytes > 0)
+		memcpy(outcome->metal, metal, outcome->metal_bytes);
 	outcome->last = malloc(sizeof(float) * grid_voxels(&outcome->grid));
 	ck_assert_ptr_nonnull(outcome->last);
 	ck_assert_int_eq(recon_read(recon, 0, outcome->grid.size[2], outcome->last, &outcome->err), 0);
@@ -201,6 +210,7 @@ void outcome_clear(struct outcome *outcome)
 	for (int i = 0; i < outcome->kept_count; i++)
 		free(outcome->kept[i].voxels);
 	free(outcome->last);
+	free(outcome->metal);
 	*outcome = (struct outcome){0};
 }
 

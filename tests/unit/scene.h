@@ -33,6 +33,8 @@ struct outcome {
 	int threads;                /* 0: all */
 	const float *resume;        /* iterate, or NULL */
 	int resume_iteration;
+	const void *resume_metal; /* of resume_metal_bytes */
+	size_t resume_metal_bytes;
 
 	/* what came of it */
 	int code; /* of the first call that failed */
@@ -52,6 +54,8 @@ struct outcome {
 	double fraction;          /* of the last progress; the test ends where it falls */
 	int asked;
 	float *last; /* the iterate as it was at the end, kept or not */
+	void *metal; /* what recon_metal gave then */
+	size_t metal_bytes;
 	int iteration;
 };
 
