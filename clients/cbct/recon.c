@@ -144,7 +144,7 @@ static void become_cuda(void)
 
 	if (length <= 0)
 		return;
-	strcpy(path + length, "-cuda");
+	memcpy(path + length, "-cuda", sizeof("-cuda"));
 	if (access(path, X_OK) != 0 || own_arguments(&text, &bytes, &ignored) != 0)
 		return;
 	end = text + bytes;
