@@ -54,7 +54,6 @@ static int reply_asset(struct request *request, const struct asset *asset, const
 	request_reply_header(request, "Content-Security-Policy", "%s", policy);
 	request_reply_header(request, "X-Content-Type-Options", "nosniff");
 	request_reply_header(request, "Referrer-Policy", "no-referrer");
-	request_reply_header(request, "Cross-Origin-Opener-Policy", "same-origin");
 	return 0;
 }
 

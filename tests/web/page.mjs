@@ -70,6 +70,7 @@ test('a job appears in the list, runs and is cancelled, without a reload', async
 	expect(/iteration \d+ of 100.?000/.test(await page.textContent('.doing')), 'the iteration in words')
 	expect(Number(await page.getAttribute('.head [role=progressbar]', 'aria-valuenow')) >= 0, 'progress')
 	await until('the time left', () => page.textContent('.left'), text => /left/.test(text))
+	await page.waitForSelector(`${tile('3d')}[data-shown]`)
 	await shoot(page, 'running')
 	await page.click('button:has-text("Cancel …")')
 	await shoot(page, 'cancel')

@@ -18,10 +18,10 @@ export function doing(job) {
 	if (job.state === 'waiting')
 		return 'waits for projections'
 	if (job.state === 'running') {
-		const step = job.iterations > 0 && job.stage !== 'load' && job.stage !== 'fdk'
-			? `iteration ${Math.min(job.iteration + 1, job.iterations)} of ${job.iterations}`
-			: { load: 'loading', fdk: 'FDK', tv: 'TV', save: 'saving', sart: 'SART' }[job.stage] ?? ''
-		return step
+		/* The one under way, from 1 on; 0 is before the first. */
+		if (job.iterations > 0 && job.iteration > 0)
+			return `iteration ${job.iteration} of ${job.iterations}`
+		return { load: 'loading', fdk: 'FDK', tv: 'TV', save: 'saving', sart: 'SART' }[job.stage] ?? ''
 	}
 	if (job.state === 'failed')
 		return job.error?.detail ?? ''
