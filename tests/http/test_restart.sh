@@ -150,6 +150,27 @@ test_a_dead_worker_takes_nothing_with_it() {
 	stop_daemon
 }
 
+test_a_checkpoint_that_is_gone_begins_the_job_again() {
+	local yielded
+	start_daemon
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "{\"scan\": \"SCAN\", $grid, \"sart\": {\"iterations\": $long, \"subsets\": \"views\"}}"
+	yielded=$job
+	running_at 2
+	post_job "{\"scan\": \"SCAN\", $grid, \"sart\": {\"iterations\": 100000, \"subsets\": \"views\"}, \"priority\": \"stat\"}"
+	running_at 1
+	req GET "/v1/jobs/$yielded"
+	expect_json '.state == "queued" and .iteration >= 2 and .attempts == 1'
+	rm "$state/jobs/$yielded/checkpoint.f32"
+	req DELETE "/v1/jobs/$job?wait=30"
+	expect_json '.state == "cancelled"'
+	job=$yielded
+	wait_job succeeded 240
+	expect_json ".attempts == 2 and ([.history[].iteration] == [range(1; $long + 1)])"
+	stop_daemon
+}
+
 test_a_full_disk_is_507_and_loses_nothing() {
 	small=$work/small # not local: the trap runs after the function
 	mkdir -p "$small"
