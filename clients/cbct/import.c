@@ -4,7 +4,8 @@
  * import_values.c, where they were taken import_geometry.c.
  */
 #include <errno.h>
-#include <math.h>
+#include <fcntl.h>
+#include <signal.h>
 #include <stdlib.h>
 #include <string.h>
 #include <unistd.h>
@@ -186,39 +187,61 @@ static void print_warnings(const struct scan *scan)
 
 /* ---- posting ---- */
 
-static int make_temporary(char *ret_path, size_t size, struct error *err)
-{
-	const char *base = getenv("TMPDIR");
+/* The one temporary directory: who breaks an upload off shall not find gigabytes of it a month later. */
+static char temporary[1000];
+static int temporary_fd = -1;
 
-	if (snprintf(ret_path, size, "%s/cbct-import-XXXXXX", base != NULL ? base : "/tmp") >= (int)size)
-		return error_set(err, ERR_INVALID, "TMPDIR is too long");
-	return mkdtemp(ret_path) != NULL ? 0 : error_set_errno(err, errno, "no temporary directory %s", ret_path);
-}
-
-static void remove_temporary(const char *directory)
+/* Nothing but what a signal's handler may call. */
+static void remove_temporary(void)
 {
 	static const char *const names[] = {"scan.json", "projections.raw", "flat.f32", "dark.f32", "defects.u8"};
-	char path[1200];
 
-	for (size_t i = 0; i < sizeof(names) / sizeof(names[0]); i++) {
-		snprintf(path, sizeof(path), "%s/%s", directory, names[i]);
-		unlink(path);
+	for (size_t i = 0; i < sizeof(names) / sizeof(names[0]); i++)
+		unlinkat(temporary_fd, names[i], 0);
+	rmdir(temporary);
+}
+
+static void end_by_signal(int number)
+{
+	remove_temporary();
+	_exit(128 + number);
+}
+
+static int make_temporary(struct error *err)
+{
+	const char *base = getenv("TMPDIR");
+	struct sigaction action = {.sa_handler = end_by_signal};
+
+	if (snprintf(temporary, sizeof(temporary), "%s/cbct-import-XXXXXX", base != NULL ? base : "/tmp") >=
+	    (int)sizeof(temporary))
+		return error_set(err, ERR_INVALID, "TMPDIR is too long");
+	if (mkdtemp(temporary) == NULL)
+		return error_set_errno(err, errno, "no temporary directory %s", temporary);
+	temporary_fd = open(temporary, O_RDONLY | O_DIRECTORY | O_CLOEXEC);
+	if (temporary_fd < 0) {
+		int code = error_set_errno(err, errno, "%s", temporary);
+
+		rmdir(temporary);
+		return code;
 	}
-	rmdir(directory);
+	sigaction(SIGINT, &action, NULL);
+	sigaction(SIGTERM, &action, NULL);
+	sigaction(SIGHUP, &action, NULL);
+	return 0;
 }
 
 /* By way of a directory: runs of projections go over several connections, again where one broke. */
 static int post(const struct import_options *options, struct images *images, const struct scan *scan, struct error *err)
 {
-	char directory[1000];
-	int code = make_temporary(directory, sizeof(directory), err);
+	int code = make_temporary(err);
 
 	if (code != 0)
 		return code;
-	code = write_directory(options, images, scan, directory, err);
+	code = write_directory(options, images, scan, temporary, err);
 	if (code == 0)
-		code = upload_directory(directory, &options->upload, err);
-	remove_temporary(directory);
+		code = upload_directory(temporary, &options->upload, err);
+	remove_temporary();
+	close(temporary_fd);
 	return code;
 }
 

@@ -284,7 +284,37 @@ test_an_imported_scan_reconstructs_like_the_posted_one() {
 	cbct get "$job_id" final -o "$work/posted.nii"
 	# Views that differ by 1e-11 mm.
 	expect_number "$(cbct compare --json "$work/imported.nii" "$work/posted.nii" | jq .relative_error)" '<' 1e-5 "imported against posted"
-	[ -z "$(ls -d "${TMPDIR:-/tmp}"/cbct-import-* 2>/dev/null)" ] || fail "no temporary directory left"
+}
+
+test_nothing_temporary_is_left() {
+	local here=$work/temporary i pid server
+	make_scans
+	rm -rf "$here"
+	mkdir -p "$here"
+	TMPDIR=$here cbct import "$counts/projections.raw" --size 48,32 --type uint16 --pixel 4,3 "${circle[@]}" --air 50000 >/dev/null 2>&1
+	[ -z "$(ls "$here")" ] || fail "nothing after an upload"
+	# One that is broken off while it waits for somebody who listens and never answers.
+	/usr/bin/python3 -c 'import socket, time
+server = socket.create_server(("127.0.0.1", 0))
+print(server.getsockname()[1], flush=True)
+time.sleep(60)' >"$work/port" &
+	server=$!
+	for ((i = 0; i < 1000; i++)); do
+		[ -s "$work/port" ] && break
+		sleep 0.02
+	done
+	TMPDIR=$here CBCT_URL=http://127.0.0.1:$(cat "$work/port") cbct import "$counts/projections.raw" --size 48,32 --type uint16 \
+		--pixel 4,3 "${circle[@]}" --air 50000 >/dev/null 2>&1 &
+	pid=$!
+	for ((i = 0; i < 1000; i++)); do
+		[ -e "$(echo "$here"/*/scan.json)" ] && break
+		sleep 0.02
+	done
+	[ -e "$(echo "$here"/*/scan.json)" ] || fail "a temporary directory while it waits"
+	kill -TERM $pid
+	wait $pid || true
+	kill $server
+	[ -z "$(ls "$here")" ] || fail "nothing after an end by a signal, found $(ls "$here")"
 }
 
 test_what_cannot_be_exported_is_said() {
