@@ -207,7 +207,7 @@ static int reply_zstd(struct request *request, struct content *content, bool enc
 {
 	struct content_stream *stream;
 
-	if (content_stream_new(content, &stream, err) != 0 ||
+	if (content_stream_new(content, 0, &stream, err) != 0 ||
 	    request_reply_read(request, 200, UNKNOWN_SIZE, stream_read, stream, stream_free, err) != 0)
 		return err->code;
 	if (encoding)

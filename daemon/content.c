@@ -304,7 +304,7 @@ struct content_stream {
 	char block[STREAM_BLOCK];
 };
 
-int content_stream_new(struct content *content, struct content_stream **ret_stream, struct error *err)
+int content_stream_new(struct content *content, int workers, struct content_stream **ret_stream, struct error *err)
 {
 	struct content_stream *stream = malloc(sizeof(*stream));
 
@@ -313,7 +313,7 @@ int content_stream_new(struct content *content, struct content_stream **ret_stre
 		return error_set(err, ERR_NO_MEMORY, "no memory to compress a volume");
 	}
 	*stream = (struct content_stream){.content = content};
-	if (zencoder_new(STREAM_LEVEL, &stream->encoder, err) != 0) {
+	if (zencoder_new(STREAM_LEVEL, workers, &stream->encoder, err) != 0) {
 		content_stream_free(stream);
 		return err->code;
 	}

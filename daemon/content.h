@@ -34,9 +34,12 @@ ssize_t content_read(struct content *content, uint64_t offset, void *to, size_t 
 /* Where the content stands as it is in a file: a descriptor of the caller's own and its offset; -1 when it does not. */
 int content_descriptor(const struct content *content, uint64_t *ret_offset);
 
-/* The content as one zstd frame, in order; as content_read otherwise. Takes the content, on failure too. */
+/*
+ * The content as one zstd frame, in order; as content_read otherwise. Takes the content, on failure too.
+ * workers: as of zencoder_new.
+ */
 struct content_stream;
-int content_stream_new(struct content *content, struct content_stream **ret_stream, struct error *err);
+int content_stream_new(struct content *content, int workers, struct content_stream **ret_stream, struct error *err);
 void content_stream_free(struct content_stream *stream);
 ssize_t content_stream_read(struct content_stream *stream, void *to, size_t size);
 

@@ -15,6 +15,7 @@
 
 enum {
 	THREADS_MAX = 8,
+	WORKERS = 2,      /* that compress, while the maker's thread reads, converts, hashes and writes */
 	BLOCK = 256 << 10 /* bytes: stays in the second-level cache between making, hashing and writing */
 };
 static const int idle_max = 8;
@@ -115,7 +116,7 @@ static int make_zstd(struct maker *maker, struct content *content, struct error 
 {
 	struct content_stream *stream;
 	ssize_t got = 1;
-	int code = content_stream_new(content, &stream, err);
+	int code = content_stream_new(content, WORKERS, &stream, err);
 
 	if (code != 0)
 		return code;

@@ -38,10 +38,9 @@ static inline int16_t hounsfield(float mu, double scale)
 	return (int16_t)((int)(hu + (0.5 - low)) + (int)low);
 }
 
-void volume_to_hu(const float *mu, size_t count, double mu_water, int16_t *ret_hu)
+static inline __attribute__((always_inline)) void to_hu(const float *mu, size_t count, double scale, int16_t *ret_hu)
 {
 	enum { BLOCK = 256 }; /* a constant number of turns is what lets gcc vectorise at -O2 */
-	const double scale = 1000 / mu_water;
 	size_t done = 0;
 
 	for (; done + BLOCK <= count; done += BLOCK) {
@@ -50,6 +49,30 @@ void volume_to_hu(const float *mu, size_t count, double mu_water, int16_t *ret_h
 	}
 	for (; done < count; done++)
 		ret_hu[done] = hounsfield(mu[done], scale);
+}
+
+static void to_hu_base(const float *mu, size_t count, double scale, int16_t *ret_hu)
+{
+	to_hu(mu, count, scale, ret_hu);
+}
+
+#ifdef __x86_64__
+/* Four at a time in place of two; without contracted products, so that the bits are the same. */
+static __attribute__((target("avx2"))) void to_hu_avx2(const float *mu, size_t count, double scale, int16_t *ret_hu)
+{
+	to_hu(mu, count, scale, ret_hu);
+}
+#endif
+
+void volume_to_hu(const float *mu, size_t count, double mu_water, int16_t *ret_hu)
+{
+#ifdef __x86_64__
+	if (__builtin_cpu_supports("avx2")) {
+		to_hu_avx2(mu, count, 1000 / mu_water, ret_hu);
+		return;
+	}
+#endif
+	to_hu_base(mu, count, 1000 / mu_water, ret_hu);
 }
 
 /* ---- NIfTI ---- */

@@ -62,6 +62,7 @@ void slice_make(const float *voxels, const struct grid *grid, const struct slice
 				to[i] = gray(from[i * nx], black, scale);
 			}
 		} else {
+#pragma omp simd
 			for (size_t i = 0; i < of(size[0]); i++)
 				to[i] = gray(from[i], black, scale);
 		}

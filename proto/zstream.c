@@ -61,7 +61,7 @@ int zdecoder_step(struct zdecoder *decoder, const void *in, size_t in_size, size
 	return 0;
 }
 
-int zencoder_new(int level, struct zencoder **ret_encoder, struct error *err)
+int zencoder_new(int level, int workers, struct zencoder **ret_encoder, struct error *err)
 {
 	struct zencoder *encoder = calloc(1, sizeof(*encoder));
 
@@ -74,6 +74,9 @@ int zencoder_new(int level, struct zencoder **ret_encoder, struct error *err)
 		zencoder_free(encoder);
 		return error_set(err, ERR_NO_MEMORY, "no memory for a zstd encoder");
 	}
+	/* A library that was built without threads refuses, and does it all in ours. */
+	if (workers > 0)
+		ZSTD_CCtx_setParameter(encoder->context, ZSTD_c_nbWorkers, workers);
 	*ret_encoder = encoder;
 	return 0;
 }

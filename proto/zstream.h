@@ -19,7 +19,11 @@ int zdecoder_step(struct zdecoder *decoder, const void *in, size_t in_size, size
 		  size_t out_size, size_t *ret_produced, bool *ret_ended, struct error *err);
 
 struct zencoder;
-int zencoder_new(int level, struct zencoder **ret_encoder, struct error *err);
+/*
+ * workers: threads of its own that compress while more is given, 0 none. The
+ * frame depends on there being any, not on how many.
+ */
+int zencoder_new(int level, int workers, struct zencoder **ret_encoder, struct error *err);
 void zencoder_free(struct zencoder *encoder);
 /* last: no input after this; call until *ret_ended. */
 int zencoder_step(struct zencoder *encoder, const void *in, size_t in_size, size_t *ret_consumed, bool last, void *out,

@@ -97,7 +97,7 @@ static int compress(const unsigned char *data, size_t length, unsigned char **re
 	struct zencoder *encoder = NULL;
 	bool ended = false;
 	int code =
-	    body != NULL ? zencoder_new(1, &encoder, err) : error_set(err, ERR_NO_MEMORY, "no memory to compress");
+	    body != NULL ? zencoder_new(1, 0, &encoder, err) : error_set(err, ERR_NO_MEMORY, "no memory to compress");
 
 	while (code == 0 && !ended) {
 		size_t consumed = 0, produced = 0;

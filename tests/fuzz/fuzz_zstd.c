@@ -42,7 +42,7 @@ static size_t encode(const uint8_t *data, size_t size, size_t piece, uint8_t *re
 	size_t at = 0, made = 0;
 	bool ended = false;
 
-	PROMISE(zencoder_new(1, &encoder, &err) == 0);
+	PROMISE(zencoder_new(1, 0, &encoder, &err) == 0);
 	while (!ended) {
 		size_t give = size - at < piece ? size - at : piece, consumed = 0, produced = 0;
 
