@@ -413,7 +413,10 @@ void http_statistics(struct http *http, struct http_statistics *ret)
 		ret->requests[i] = atomic_load(&http->requests[i]);
 	ret->bytes_in = atomic_load(&http->bytes_in);
 	ret->bytes_out = atomic_load(&http->bytes_out);
-	pthread_mutex_lock(&http->lock);
-	ret->connections = http->connection_count;
-	pthread_mutex_unlock(&http->lock);
+	ret->connections = http_connections(http);
+}
+
+long http_connections(const struct http *http)
+{
+	return atomic_load(&http->connection_count);
 }

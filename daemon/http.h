@@ -74,6 +74,8 @@ struct http_statistics {
 	long connections;               /* now */
 };
 void http_statistics(struct http *http, struct http_statistics *ret);
+/* Those that are open now; takes no lock. */
+long http_connections(const struct http *http);
 
 /* ---- what was asked ---- */
 const char *request_id(const struct request *request);
@@ -101,6 +103,8 @@ void request_wait_until(struct request *request, double time);
 bool request_stopping(const struct request *request);
 /* Any thread, while the request lives; as often as you like; takes no lock of ours but its own. */
 void request_wake(struct request *request);
+/* The same, at that time (http_now) if not before. Not from within a call of the server's own. */
+void request_wake_by(struct request *request, double time);
 
 /* ---- replies: exactly one for each request ---- */
 /* Takes the value, NULL included (then ERR_NO_MEMORY). Cache-Control: no-store. */

@@ -53,7 +53,7 @@ enum suspension connection_suspend(struct connection *connection, double until)
 	double now = http_now();
 
 	pthread_mutex_lock(&connection->lock);
-	if (atomic_load(&http->closing)) {
+	if (atomic_load(&http->closing) || connection->cut) {
 		outcome = REFUSED;
 	} else if (connection->woken || until <= now) {
 		connection->woken = false;
@@ -92,6 +92,23 @@ void request_wake(struct request *request)
 	else
 		connection->woken = true;
 	pthread_mutex_unlock(&connection->lock);
+}
+
+void request_wake_by(struct request *request, double time)
+{
+	struct connection *connection = request->connection;
+	struct http *http = connection->http;
+
+	pthread_mutex_lock(&connection->lock);
+	if (!connection->suspended)
+		connection->woken = true;
+	else if (time < connection->wait_until)
+		connection->wait_until = time;
+	pthread_mutex_unlock(&connection->lock);
+	pthread_mutex_lock(&http->lock);
+	if (time < http->clock_next)
+		pthread_cond_signal(&http->clock_kick);
+	pthread_mutex_unlock(&http->lock);
 }
 
 void connections_wake(struct http *http)

@@ -95,7 +95,7 @@ struct http {
 
 	pthread_mutex_t lock; /* guards the list, the clock's fields; taken before a connection's lock */
 	struct connection *connections;
-	long connection_count;
+	atomic_long connection_count; /* changed under the lock */
 	pthread_t clock;
 	bool clock_runs, clock_stop;
 	pthread_cond_t clock_kick;
@@ -120,7 +120,7 @@ void connection_progress(struct connection *connection, uint64_t bytes);
 enum suspension {
 	SUSPENDED,
 	WOKEN,  /* not suspended: something has happened already, look again */
-	REFUSED /* the daemon closes: give the connection up */
+	REFUSED /* the daemon closes, or the peer has gone: give the connection up */
 };
 enum suspension connection_suspend(struct connection *connection, double until);
 /* All that are suspended. */

@@ -77,7 +77,7 @@ static ssize_t live_read(void *context, uint64_t offset, char *to, size_t size)
 			return got;
 		if (got == 0)
 			return MHD_CONTENT_READER_END_OF_STREAM;
-		if (got != READ_WAIT || has_hung_up(request->connection))
+		if (got != READ_WAIT)
 			return give_up(request->connection, to);
 		switch (connection_suspend(request->connection, request->wait_until)) {
 		case SUSPENDED:
