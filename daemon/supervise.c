@@ -555,9 +555,13 @@ static int add_present(struct message *message, struct stored_scan *scan, const 
 	return 0;
 }
 
-/* The reference to the scan is the caller's. */
+/*
+ * The reference to the scan is the caller's. The facts are from before anything
+ * of the scan is read, here or by the worker: what changes from now on changes
+ * their basis.
+ */
 static int make_start(struct supervise *supervise, const struct job_record *record, struct message *message,
-		      struct stored_scan **ret_scan, struct error *err)
+		      struct stored_scan **ret_scan, struct scan_facts *ret_facts, struct error *err)
 {
 	struct store *store = jobs_store(supervise->jobs);
 	struct scan_facts facts;
@@ -583,6 +587,7 @@ static int make_start(struct supervise *supervise, const struct job_record *reco
 		stored_scan_release(scan);
 	} else {
 		*ret_scan = scan;
+		*ret_facts = facts;
 	}
 	return code;
 }
@@ -612,27 +617,24 @@ static void begin(struct supervise *supervise, struct worker *worker, struct job
 }
 
 /* What a radiographer must know of a volume that was made of a part of the scan. */
-static void warn_incomplete(struct supervise *supervise, struct worker *worker, struct stored_scan *scan)
+static void warn_incomplete(struct supervise *supervise, struct worker *worker, const struct scan_facts *facts)
 {
-	struct scan_facts facts;
 	struct error err;
 	char detail[200];
 
-	stored_scan_facts(scan, &facts);
-	if (!facts.closed)
+	if (!facts->closed)
 		return;
-	incomplete_detail(&facts, detail);
+	incomplete_detail(facts, detail);
 	if (job_add_warning(worker->job, "incomplete", detail, &err) != 0)
 		stop_job(supervise, worker, &err);
 }
 
 /* To running with all that is there, or, `arriving`, to attend it while the rest comes. */
 static int begin_job(struct supervise *supervise, struct worker *worker, struct job *job,
-		     const struct job_record *record, struct message *message, struct stored_scan *scan, bool arriving,
-		     struct error *err)
+		     const struct job_record *record, struct message *message, struct stored_scan *scan,
+		     const struct scan_facts *facts, bool arriving, struct error *err)
 {
 	const struct job_change change = {.backend = worker->backend, .device = worker->info.name};
-	struct scan_facts facts;
 	int code;
 
 	message->arriving = arriving;
@@ -645,15 +647,14 @@ static int begin_job(struct supervise *supervise, struct worker *worker, struct 
 		return code;
 	}
 	begin(supervise, worker, job, record, message);
-	warn_incomplete(supervise, worker, scan);
+	warn_incomplete(supervise, worker, facts);
 	if (!arriving) {
 		stored_scan_release(scan);
 		return 0;
 	}
-	stored_scan_facts(scan, &facts);
 	worker->running.ticket = LLONG_MAX; /* it has none before it runs, and makes room first */
 	worker->arriving = scan;
-	worker->basis = facts.basis;
+	worker->basis = facts->basis;
 	feed(worker);
 	return 0;
 }
@@ -664,6 +665,7 @@ static int give_job(struct supervise *supervise, struct worker *worker, struct j
 {
 	struct message *message = calloc(1, sizeof(*message));
 	struct stored_scan *scan;
+	struct scan_facts facts;
 	struct job_record record;
 	struct job_change change;
 	struct error why;
@@ -672,14 +674,14 @@ static int give_job(struct supervise *supervise, struct worker *worker, struct j
 	if (message == NULL)
 		return error_set_errno(err, ENOMEM, "message");
 	job_record(job, &record);
-	code = make_start(supervise, &record, message, &scan, &why);
+	code = make_start(supervise, &record, message, &scan, &facts, &why);
 	if (code == ERR_NO_SPACE || code == ERR_NO_MEMORY) {
 		*err = why;
 	} else if (code != 0) {
 		change = (struct job_change){.error_code = code, .error_pointer = why.pointer, .error_text = why.text};
 		code = job_set_state(job, JOB_FAILED, &change, err);
 	} else {
-		code = begin_job(supervise, worker, job, &record, message, scan, arriving, err);
+		code = begin_job(supervise, worker, job, &record, message, scan, &facts, arriving, err);
 		message_clear(message);
 	}
 	free(message);
