@@ -34,6 +34,7 @@ const badge = page => page.textContent('.head .badge')
 async function openFinished(options) {
 	const page = await open(browser, finishedPath, options)
 	await planePixels(page, 'z')
+	await page.waitForSelector('.head .badge.succeeded') /* the job's document is there as well */
 	return page
 }
 
@@ -217,7 +218,7 @@ test('the plot has the points of the history on a logarithmic axis', async () =>
 	}
 	expect(await page.locator('.plot .residual .kept').count() >= 4, 'kept iterations marked')
 	await page.click('.course summary')
-	expect(await page.locator('.course tbody tr').count() === history.length, 'the same as a table')
+	await until('the same as a table', () => page.locator('.course tbody tr').count(), count => count === history.length)
 	await page.click('.plot .residual .kept >> nth=1')
 	const wanted = Number(await page.getAttribute('.plot .residual .kept >> nth=1', 'data-iteration'))
 	await until('the volume of the point that was clicked', () => shownVolume(page), shown => shown === `iter-${wanted}`)
@@ -349,6 +350,20 @@ test('"reconstruct again" shows what is wrong at its field, then posts a job', a
 	const [before, job] = [await api(`/v1/jobs/${finished}`), await ended(id)]
 	expect(job.sart.iterations === 2 && job.fdk.window === 'ram-lak' && job.tv === null && String(job.emit) === 'fdk,1', `what was changed: ${JSON.stringify(job)}`)
 	expect(String(job.grid.size) === String(before.grid.size) && job.grid.spacing_mm[1] === 5 && job.scan === before.scan, 'the rest as before')
+	await page.context().close()
+})
+
+test('a grid that is asked for again with other voxels stays about its middle', async () => {
+	const job = await post('/v1/jobs', { scan, grid: { size: [20, 20, 20], spacing_mm: [4, 4, 4], origin_mm: [-30, -38, -38] }, fdk: {} })
+	await ended(job.id)
+	const page = await open(browser, `/#/jobs/${job.id}`)
+	await page.click('button:has-text("Reconstruct again")')
+	await page.fill('dialog [name="/grid/size/0"]', '40')
+	await page.fill('dialog [name="/grid/spacing_mm/0"]', '2')
+	await page.click('dialog button[type=submit]')
+	await page.waitForSelector('dialog', { state: 'detached' })
+	const { grid } = await ended(new URL(page.url()).hash.split('/').pop())
+	expect(String(grid.origin_mm) === '-31,-38,-38', `the corner at -31, -38, -38, got ${grid.origin_mm}`)
 	await page.context().close()
 })
 

@@ -33,7 +33,7 @@ const groups = [
 	] },
 	{ title: 'Metal', pointer: '/metal', optional: true, rare: true, off: 'not corrected', fields: [number('/metal/threshold_hu', 'From, HU')] },
 	{ title: 'Job', pointer: '', fields: [
-		text('/emit', 'Keep volumes', { hint: 'fdk, fdk-tv, iterations', wide: true, read: value => value.split(/[\s,]+/).filter(Boolean).map(name => /^\d+$/.test(name) ? Number(name) : name),
+		text('/emit', 'Keep volumes', { hint: 'fdk, fdk-tv, iterations', empty: 'the last one only', wide: true, read: value => value.split(/[\s,]+/).filter(Boolean).map(name => /^\d+$/.test(name) ? Number(name) : name),
 			write: list => (list ?? []).join(', ') }),
 		choice('/priority', 'Priority', ['routine', 'urgent', 'stat']), choice('/precision', 'Precision', ['standard', 'reference']),
 		choice('/projector', 'Projector', ['interpolating', 'matched']), number('/mu_water', 'Water, 1/mm'),
@@ -115,7 +115,7 @@ export class JobForm {
 		else if (field.kind === 'flag')
 			input = h('input', { type: 'checkbox', checked: value ?? true })
 		else
-			input = h('input', { type: 'text', inputmode: field.kind === 'number' ? 'decimal' : null, autocomplete: 'off', spellcheck: 'false',
+			input = h('input', { type: 'text', inputmode: field.kind === 'number' ? 'decimal' : null, autocomplete: 'off', spellcheck: 'false', placeholder: field.empty ?? 'default',
 				value: field.write ? field.write(value) : value === undefined || value === null ? '' : String(value) })
 		if (field.kind === 'choice' && (value === undefined || value === null)) {
 			input.prepend(h('option', { value: '' }, 'default'))
@@ -148,7 +148,19 @@ export class JobForm {
 			else
 				put(document, pointer, field.kind === 'number' ? (Number.isNaN(Number(raw)) ? raw : Number(raw)) : field.read ? field.read(raw) : raw)
 		}
+		this.#keepMiddle(document.grid)
 		return document
+	}
+
+	/* A grid whose corner is given stays where it is when its size or spacing changes: about its middle. */
+	#keepMiddle(grid) {
+		const before = this.#initial.grid
+		if (!grid?.origin_mm || !before?.origin_mm || JSON.stringify([grid.size, grid.spacing_mm]) === JSON.stringify([before.size, before.spacing_mm]))
+			return
+		const half = ({ size, spacing_mm }, i) => (size[i] - 1) / 2 * spacing_mm[i]
+		grid.origin_mm = before.origin_mm.map((start, i) => start + half(before, i) - half(grid, i))
+		if (!grid.origin_mm.every(Number.isFinite)) /* a size or spacing that is no number: the daemon says so */
+			delete grid.origin_mm
 	}
 
 	async #submit(event) {
