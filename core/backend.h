@@ -183,7 +183,6 @@ enum backprojection { BACKPROJECT_PLAIN, BACKPROJECT_FDK /* times (D/depth)^2 */
 struct backend {
 	const char *name;    /* "cpu", "cuda" */
 	const char *summary; /* for --help */
-	bool extends;        /* plan_options.extend may be more than 0 */
 	/* Its devices have memory beside the host's: what does not fit there can go through it in parts (parts.h). */
 	bool own_memory;
 

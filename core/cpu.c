@@ -405,7 +405,6 @@ static int cpu_sync(struct device *device, struct error *err)
 
 const struct backend backend_cpu = {
     .name = "cpu",
-    .extends = true,
     .summary = "the processor's cores",
     .count = cpu_count,
     .open = cpu_open,

@@ -104,11 +104,6 @@ static struct plan_options plan_options(const struct recipe *recipe, const struc
 	};
 }
 
-static bool extends(const struct recipe *recipe, const struct backend *backend)
-{
-	return recipe->fdk.on && recipe->fdk.extend && backend->extends;
-}
-
 static int sart_options_make(struct sart_options *ret_sart, const struct recipe *recipe, const struct orbit *orbit,
 			     struct error *err)
 {
@@ -216,7 +211,7 @@ int recon_memory(const struct backend *backend, struct device *device, const str
 	if (code < 0)
 		return code;
 	memcpy(weights.pad, orbit.pad, sizeof(weights.pad));
-	weights.extend = extends(recipe, backend) ? geometry->columns : 0;
+	weights.extend = recipe->fdk.on && recipe->fdk.extend ? geometry->columns : 0;
 	code = recipe_resolve(&resolved, geometry, &orbit, err);
 	if (code == 0 && resolved.sart.on)
 		code = sart_options_make(&sart, &resolved, &orbit, err);
@@ -274,7 +269,7 @@ static int recon_prepare(struct recon *recon, const struct recipe *recipe, struc
 		code = recipe_resolve(&recon->recipe, geometry, &recon->orbit, err);
 	if (code == 0 && recon->recipe.fdk.on)
 		code = fdk_weights_make(&recon->weights, &recon->orbit, geometry, recon->recipe.fdk.window,
-					recon->recipe.fdk.cutoff, extends(&recon->recipe, recon->backend), err);
+					recon->recipe.fdk.cutoff, recon->recipe.fdk.extend, err);
 	if (code == 0 && recon->recipe.sart.on)
 		code = sart_options_make(&recon->sart, &recon->recipe, &recon->orbit, err);
 	if (code < 0)

@@ -216,7 +216,6 @@ extern "C" const struct backend backend_cuda;
 const struct backend backend_cuda = {
     .name = "cuda",
     .summary = "NVIDIA GPUs",
-    .extends = true,
     .own_memory = true,
     .count = cuda_count,
     .open = cuda_open,
