@@ -24,11 +24,11 @@
  */
 enum {
 	SLACK = 64,
-	LANES_MOST = 16,    /* of any instruction set */
-	BLOCK_COLUMNS = 16, /* of a projection that are handed out together */
-	TILE_ACROSS = 4,    /* voxels of a tile across its lines */
-	MATCHED_ACROSS = 8, /* the same for the matched backprojection, whose rays reach two voxels beyond a tile */
-	TILE_ALONG = 512,   /* and at most so many along one */
+	LANES_MOST = 16,     /* of any instruction set */
+	BLOCK_COLUMNS = 16,  /* of a projection that are handed out together */
+	TILE_ACROSS = 4,     /* voxels of a tile across its lines */
+	MATCHED_ACROSS = 16, /* the same for the matched backprojection, whose rays reach two voxels beyond a tile */
+	TILE_ALONG = 512,    /* and at most so many along one */
 	TILE_LINES = TILE_ACROSS * TILE_ACROSS,
 	BLEND_MARGIN = 2 * LANES_MOST, /* floats around a column of voxels in scratch, for windows beyond its ends */
 	ROWS_MARGIN = 4 * LANES_MOST,  /* the same around a column of pixels */
@@ -88,7 +88,7 @@ struct plan {
 	/* How FDK's backprojection sees filtered views: this plan, or a copy with `wide` columns and views of its own.
 	 */
 	struct plan *filtered;
-	int filter_batch; /* views that FDK should filter at once */
+	int filter_batch;   /* views that FDK should filter at once */
 	size_t extended[2]; /* rows that `filter` has extended on either side */
 
 	struct sart_options sart;
@@ -213,10 +213,11 @@ static inline size_t project_scratch_floats(const struct plan *plan)
 	return 4 * lanes_padded(plan->rows) + 2 * (lanes_padded(plan->grid.size[2]) + 2 * BLEND_MARGIN);
 }
 
-/* Four floats for each row of a column, and as many rows around them as windows reach. */
+/* For each row of a column its height, its ray, and two floats for each voxel across a tile; rows around, for windows.
+ */
 static inline size_t matched_scratch_floats(const struct plan *plan)
 {
-	return plan->matched ? 4 * (lanes_padded(plan->rows) + 2 * ROWS_MARGIN) : 0;
+	return plan->matched ? (10 + 2 * MATCHED_ACROSS) * (lanes_padded(plan->rows) + 2 * ROWS_MARGIN) : 0;
 }
 
 static inline float *plan_scratch(const struct plan *plan)
