@@ -150,7 +150,7 @@ $(BUILD)/unit: $(call objects,$(unit_sources) $(state_sources)) $(library)
 $(BUILD)/cpu-bench: $(call objects,tests/bench/bench.c) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(LIBM)
 
-$(BUILD)/watchers $(BUILD)/acquire: $(BUILD)/%: $(BUILD)/tests/bench/%.o
+$(BUILD)/watchers $(BUILD)/slices $(BUILD)/acquire: $(BUILD)/%: $(BUILD)/tests/bench/%.o
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ -lpthread
 
 # The GPU's checks and benchmarks need the mathematics and the kernels only, so that they run on a bare machine.
@@ -206,9 +206,10 @@ fuzz: setup ## each fuzz target for FUZZ_SECONDS=10 (needs clang)
 	@BUILD=$(BUILD)/fuzz FUZZ_SECONDS=$(FUZZ_SECONDS) tests/fuzz/run.sh
 
 bench: setup ## CPU and HTTP benchmarks, results in build/bench/
-	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/cpu-bench $(BUILD)/acquire
+	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/cpu-bench $(BUILD)/acquire $(BUILD)/watchers $(BUILD)/slices
 	@BUILD=$(BUILD) tests/bench/run.sh
 	@BUILD=$(BUILD) tests/bench/arriving.sh
+	@BUILD=$(BUILD) tests/bench/live.sh
 
 # A worker that can be made to fault, for the test of what becomes of that.
 $(BUILD)/tests/gpu/fault.o: tests/gpu/fault.cu
