@@ -51,7 +51,8 @@ size_t tile_floats(const struct plan *plan)
 	const int size = plan->grid.size[plan->along_z ? 2 : 0];
 	const int across = plan->across[plan->across[0] < plan->across[1]];
 
-	return (size_t)across * (size_t)across * (size_t)parts(size < TILE_ALONG ? size : TILE_ALONG, LANES_MOST) * LANES_MOST;
+	return (size_t)across * (size_t)across * (size_t)parts(size < TILE_ALONG ? size : TILE_ALONG, LANES_MOST) *
+	       LANES_MOST;
 }
 
 int tile_lines(const struct plan *plan, const struct tile *tile)

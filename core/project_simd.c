@@ -56,7 +56,7 @@ static int rays_select(const struct rays *rays, int axis, struct rays *ret)
 	return count;
 }
 
-static const float MARGIN = 1e-3f;      /* voxels, above what single precision may err: a window has no index -1 */
+static const float MARGIN = 1e-3f; /* voxels, above what single precision may err: a window has no index -1 */
 
 struct axes {
 	int slices, b_size, c_size;

@@ -320,8 +320,8 @@ void SIMD_NAME(project)(const struct plan *plan, int view, int column, int count
 			float *ret_length, float *scratch);
 bool SIMD_NAME(backproject)(const struct plan *plan, int view, const struct tile *tile, enum backprojection weight,
 			    const float *projection, float *sums, float *cover);
-void SIMD_NAME(backproject_matched)(const struct plan *plan, int view, const struct tile *tile,
-				    const float *projection, float *sums, float *cover, float *scratch);
+void SIMD_NAME(backproject_matched)(const struct plan *plan, int view, const struct tile *tile, const float *projection,
+				    float *sums, float *cover, float *scratch);
 
 void SIMD_NAME(tv_flux)(const struct tv_row *row, const struct tv_weights *weights, float epsilon2,
 			const struct tv_flux *ret);

@@ -42,8 +42,9 @@ struct connection {
 
 	/* Of a reply without an end in sight: s that sent bytes may stay unacknowledged; 0: another kind. */
 	double patience;
-	double looked_at, answered_at; /* by the clock; the last time that nothing was outstanding, or some of it came in */
-	uint64_t acknowledged;         /* bytes, then */
+	double looked_at;      /* by the clock */
+	double answered_at;    /* the last time that nothing was outstanding, or some of it came in */
+	uint64_t acknowledged; /* bytes, then */
 };
 
 struct request {
