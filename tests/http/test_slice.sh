@@ -84,6 +84,8 @@ test_other_formats_and_scales() {
 	od -An -v -td2 -w2 "$work/hu.raw" | awk '{ print $1 }' | cmp - "$work/unshuffled" || fail "the int16 voxels"
 	req GET "$volume?format=shuffled&type=float32"
 	expect_problem 400
+	req GET "$volume?type=float64"
+	expect_problem 400
 	req GET "$volume?scale=0"
 	expect_problem 400
 	req GET "$volume?scale=17"
