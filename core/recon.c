@@ -441,6 +441,49 @@ static int keep(struct recon *recon, const char *name, const char *stage, struct
 	return metal_exchange(&recon->metal, &tools, recon->volume, err);
 }
 
+/* Whether a view's detector has the shadow of any of 9 x 9 x 9 places that span the grid. */
+static bool is_seen(const struct grid *grid, const struct geometry *geometry)
+{
+	enum { ALONG = 9 };
+
+	for (int k = 0; k < geometry->count; k++) {
+		double matrix[12];
+
+		view_matrix(&geometry->views[k], matrix);
+		for (int i = 0; i < ALONG * ALONG * ALONG; i++) {
+			const int steps[3] = {i % ALONG, i / ALONG % ALONG, i / ALONG / ALONG};
+			double place[3], column, row;
+
+			for (int a = 0; a < 3; a++)
+				place[a] =
+				    grid->origin[a] + grid->spacing[a] * (grid->size[a] - 1) * steps[a] / (ALONG - 1);
+			if (view_project(matrix, place, &column, &row) > 0 && column >= 0 && row >= 0 &&
+			    column <= geometry->columns - 1 && row <= geometry->rows - 1)
+				return true;
+		}
+	}
+	return false;
+}
+
+static void warn_of_the_recipe(struct recon *recon)
+{
+	const struct recipe *recipe = &recon->recipe;
+	const struct grid *grid = &recipe->grid;
+	char detail[256];
+
+	if (!is_seen(grid, recon->geometry)) {
+		snprintf(detail, sizeof(detail),
+			 "no view sees any of the grid, which begins at (%g, %g, %g) mm and is %g x %g x %g mm in size",
+			 grid->origin[0], grid->origin[1], grid->origin[2], grid->size[0] * grid->spacing[0],
+			 grid->size[1] * grid->spacing[1], grid->size[2] * grid->spacing[2]);
+		recon->hooks->warning(recon->hooks->context, "grid_unseen", detail);
+	}
+	if (recipe->tv.on && !recipe->tv.after_fdk && !recipe->sart.on)
+		recon->hooks->warning(
+		    recon->hooks->context, "tv_without_sart",
+		    "TV was wanted after SART iterations, and there are none: the FDK volume is left alone");
+}
+
 static void warn_of_the_input(struct recon *recon)
 {
 	const double degrees = 57.29577951308232;
@@ -448,6 +491,7 @@ static void warn_of_the_input(struct recon *recon)
 
 	if (recon->hooks->warning == NULL)
 		return;
+	warn_of_the_recipe(recon);
 	input_warn(&recon->input, recon->geometry, recon->hooks);
 	if (recon->recipe.fdk.on && recon->orbit.arc_too_short) {
 		snprintf(detail, sizeof(detail),

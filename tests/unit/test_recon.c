@@ -863,6 +863,50 @@ START_TEST(an_arc_that_is_too_short_for_fdk_is_told)
 }
 END_TEST
 
+START_TEST(a_grid_beside_every_view_is_told)
+{
+	struct recipe recipe = small_recipe();
+	struct scene scene;
+	struct outcome outcome = {0}, touched = {0};
+
+	small_scene(&scene);
+	recipe.grid.origin[2] += 500;
+	run(&scene, &recipe, &outcome);
+	ck_assert_ptr_nonnull(strstr(outcome.warnings, "grid_unseen: no view sees any of the grid"));
+	/* a corner of it comes in */
+	recipe.grid = small_recipe().grid;
+	for (int i = 0; i < 3; i++)
+		recipe.grid.origin[i] = 0;
+	run(&scene, &recipe, &touched);
+	ck_assert_str_eq(touched.warnings, "");
+	outcome_clear(&outcome);
+	outcome_clear(&touched);
+	scene_clear(&scene);
+}
+END_TEST
+
+START_TEST(tv_after_a_sart_that_is_not_there_is_told)
+{
+	struct recipe recipe = small_recipe();
+	struct scene scene;
+	struct outcome plain = {0}, outcome = {0};
+	size_t voxels = grid_voxels(&recipe.grid);
+
+	small_scene(&scene);
+	recipe.fdk.on = true;
+	recipe.sart.on = false;
+	run(&scene, &recipe, &plain);
+	recipe.tv.on = true;
+	recipe.tv.after_fdk = false;
+	run(&scene, &recipe, &outcome);
+	ck_assert_ptr_nonnull(strstr(outcome.warnings, "tv_without_sart: "));
+	ck_assert_mem_eq(outcome.last, plain.last, voxels * sizeof(float));
+	outcome_clear(&plain);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
 /* ---- refused ---- */
 
 static const struct recon_hooks no_hooks;
@@ -1530,6 +1574,8 @@ Suite *recon_suite(void)
 	tcase_add_test(pipeline, divergence_is_an_error_with_the_iteration);
 	tcase_add_test(pipeline, defects_are_replaced_counted_and_told);
 	tcase_add_test(pipeline, an_arc_that_is_too_short_for_fdk_is_told);
+	tcase_add_test(pipeline, a_grid_beside_every_view_is_told);
+	tcase_add_test(pipeline, tv_after_a_sart_that_is_not_there_is_told);
 	tcase_add_test(pipeline, views_must_be_there_once_each);
 	tcase_add_test(pipeline, what_does_not_fit_is_refused_before_it_is_allocated);
 	tcase_add_test(pipeline, fdk_alone_does_not_keep_the_projections);
