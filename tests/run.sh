@@ -7,7 +7,7 @@ cd "$(dirname "$0")/.."
 export BUILD=${BUILD:-build}
 mkdir -p "$BUILD/test"
 results=$BUILD/test/results
-rm -rf "$BUILD/test/exchanges"
+rm -rf "$BUILD"/test/{exchanges,reported.*}
 : >"$results"
 
 wanted() {
@@ -21,6 +21,28 @@ wanted() {
 
 part() {
 	printf '\n== %s\n' "$1"
+}
+
+# What a sanitizer has to say of any process, the daemon and its workers too, comes into files of its own; only the
+# one for undefined behaviour, beside another, writes to standard error whatever it is told, and ends the process.
+# A part that leaves a report has failed.
+reports=$(realpath "$BUILD/test")/sanitizer
+rm -f "$reports".*
+for tool in ASAN LSAN UBSAN TSAN; do
+	options=${tool}_OPTIONS
+	export "$options=${!options:+${!options}:}log_path=$reports"
+done
+export UBSAN_OPTIONS=$UBSAN_OPTIONS:halt_on_error=1:print_stacktrace=1
+sanitized() { # PART FILE-OR-FOLDER: its output
+	grep -rIhs -A 12 'runtime error: ' "$2" >"$reports.undefined" || rm "$reports.undefined"
+	local report
+	for report in "$reports".*; do
+		[ -e "$report" ] || continue
+		echo "FAIL $1: a sanitizer's report"
+		head -60 "$report" | sed 's/^/    /'
+		echo "fail $1 sanitizer" >>"$results"
+		mv "$report" "$BUILD/test/reported.$(basename "$1" .sh).${report##*.}"
+	done
 }
 
 if wanted lint "$@"; then
@@ -51,12 +73,14 @@ if wanted unit "$@"; then
 	fi
 	# A unit test that finds no data says "SKIP name: why" and passes nothing.
 	grep -E '^SKIP ' "$log" | sed 's/^SKIP /skip /' >>"$results"
+	sanitized unit "$log"
 fi
 
 for file in tests/http/test_*.sh tests/web/test_*.sh; do
 	wanted "$file" "$@" || continue
 	part "$file"
 	RESULTS=$results bash "$file" || true
+	sanitized "$(basename "$file")" "$BUILD/test/$(basename "$file" .sh)"
 done
 
 if wanted http "$@"; then
