@@ -136,7 +136,13 @@ static int examine(const struct linearise *linearise, int columns, int rows, str
 {
 	const size_t pixels = (size_t)columns * (size_t)rows;
 	float *floats = malloc(5 * pixels * sizeof(*floats));
-	struct images images = {
+	struct images images;
+	size_t without;
+	int code = 0;
+
+	if (floats == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory to look for defects in %d x %d pixels", columns, rows);
+	images = (struct images){
 	    .linearise = linearise,
 	    .columns = columns,
 	    .rows = rows,
@@ -149,11 +155,6 @@ static int examine(const struct linearise *linearise, int columns, int rows, str
 	    .dark_median = floats + 3 * pixels,
 	    .scratch = floats + 4 * pixels,
 	};
-	size_t without;
-	int code = 0;
-
-	if (floats == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory to look for defects in %d x %d pixels", columns, rows);
 	without = read_images(&images);
 	if (2 * without > pixels)
 		code = error_set(err, ERR_IMPOSSIBLE,

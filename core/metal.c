@@ -494,11 +494,13 @@ static int make_prior(const struct metal_tools *tools, struct error *err)
 	const struct grid *grid = tools->grid;
 	const size_t slice = slice_voxels(grid);
 	const int nz = grid->size[2];
-	float *ring = malloc(5 * slice * sizeof(float)), *raw = ring + 3 * slice, *scratch = ring + 4 * slice;
+	float *ring = malloc(5 * slice * sizeof(float)), *raw, *scratch;
 	int code = 0;
 
 	if (ring == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for five slices of %zu voxels", slice);
+	raw = ring + 3 * slice;
+	scratch = ring + 4 * slice;
 	for (int z = -1; z < nz && code == 0; z++) { /* z is made when z + 1 has been read and smoothed */
 		if (z + 1 < nz)
 			code = tools->backend->volume_download(tools->volume, z + 1, 1, raw, err);
