@@ -1098,12 +1098,15 @@ int supervise_workers(struct supervise *supervise, struct worker_facts *ret_fact
 	return supervise->count;
 }
 
-/* What does not fit on a card goes through it in parts and lies in the host's memory, all of which may come free. */
+/*
+ * All that may come free until the job's turn; the worker looks again when it begins. What does not fit on a card goes
+ * through it in parts and lies in the host's memory.
+ */
 static size_t memory_available(const struct worker_facts *facts)
 {
 	size_t host = (size_t)sysconf(_SC_PHYS_PAGES) * (size_t)sysconf(_SC_PAGESIZE);
 
-	return strcmp(facts->backend, "cpu") == 0 || facts->bytes_free > host ? facts->bytes_free : host;
+	return strcmp(facts->backend, "cpu") == 0 || facts->bytes_total > host ? facts->bytes_total : host;
 }
 
 /*
