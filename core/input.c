@@ -1,9 +1,9 @@
 /* The samples of a reconstruction on their way in, and what has to be said of them. */
 #include "core/input.h"
 
-#include <stdarg.h>
-#include <stdio.h>
 #include <stdlib.h>
+
+#include "core/warn.h"
 
 /* Air regions that differ by more than this tell of a tube or a detector that drifts. */
 static const double DRIFT = 0.05;
@@ -94,18 +94,6 @@ int input_check(const struct input *input, struct error *err)
 			 input->counts.not_finite);
 }
 
-__attribute__((format(printf, 3, 4))) static void tell(const struct recon_hooks *hooks, const char *code,
-						       const char *format, ...)
-{
-	char detail[320];
-	va_list args;
-
-	va_start(args, format);
-	vsnprintf(detail, sizeof(detail), format, args);
-	va_end(args);
-	hooks->warning(hooks->context, code, detail);
-}
-
 static int lowest(const int *views, int count)
 {
 	int least = views[0];
@@ -120,11 +108,12 @@ static void warn_of_air(const struct input *input, const struct recon_hooks *hoo
 	const double least = (double)input->counts.air_least, most = (double)input->counts.air_most;
 
 	if (input->counts.no_air > 0)
-		tell(hooks, "air_region",
-		     "the air region has no good pixel in %d projections: those are taken against the flat as they are",
-		     input->counts.no_air);
+		recon_warn(
+		    hooks, "air_region",
+		    "the air region has no good pixel in %d projections: those are taken against the flat as they are",
+		    input->counts.no_air);
 	if (least > 0 && most > (1 + DRIFT) * least)
-		tell(
+		recon_warn(
 		    hooks, "air_region",
 		    "the air region lies between %.4g and %.4g of the flat; each projection was held against its own%s",
 		    least, most, most > 2 * least ? ". That is more than a tube drifts: is the object in it?" : "");
@@ -137,28 +126,27 @@ void input_warn(const struct input *input, const struct geometry *geometry, cons
 	const size_t found = defects_total(counts) - counts->mapped;
 	const double pixels = (double)geometry->columns * geometry->rows;
 
-	if (hooks->warning == NULL)
-		return;
 	if (map->map != NULL) {
 		const size_t all = map->given + map->dead + map->hot + map->noisy;
 
-		tell(hooks, "defect_map",
-		     "%zu pixels (%.3g %%) of every projection were replaced from their neighbours: %zu of the given "
-		     "map, "
-		     "and %zu dead, %zu hot and %zu noisy ones that the flat and dark images show",
-		     all, 100 * (double)all / pixels, map->given, map->dead, map->hot, map->noisy);
+		recon_warn(
+		    hooks, "defect_map",
+		    "%zu pixels (%.3g %%) of every projection were replaced from their neighbours: %zu of the given "
+		    "map, and %zu dead, %zu hot and %zu noisy ones that the flat and dark images show",
+		    all, 100 * (double)all / pixels, map->given, map->dead, map->hot, map->noisy);
 	}
 	if (found > 0)
-		tell(hooks, "defects",
-		     "%zu samples (%.3g %%) in %d projections were replaced from their neighbours: %zu not above the "
-		     "dark, %zu saturated, %zu not finite or without a flat",
-		     found, 100 * (double)found / (pixels * input->views), input->defective_views, counts->zero,
-		     counts->saturated, counts->not_finite);
+		recon_warn(
+		    hooks, "defects",
+		    "%zu samples (%.3g %%) in %d projections were replaced from their neighbours: %zu not above the "
+		    "dark, %zu saturated, %zu not finite or without a flat",
+		    found, 100 * (double)found / (pixels * input->views), input->defective_views, counts->zero,
+		    counts->saturated, counts->not_finite);
 	if (counts->blank > 0)
-		tell(hooks, "blank_views",
-		     "%d projections have no good pixel, the first of them is %d: they are left out, the others stand "
-		     "in "
-		     "for them",
-		     counts->blank, lowest(input->blank, counts->blank));
+		recon_warn(
+		    hooks, "blank_views",
+		    "%d projections have no good pixel, the first of them is %d: they are left out, the others stand "
+		    "in for them",
+		    counts->blank, lowest(input->blank, counts->blank));
 	warn_of_air(input, hooks);
 }

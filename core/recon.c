@@ -17,6 +17,7 @@
 #include "core/input.h"
 #include "core/parts.h"
 #include "core/sart.h"
+#include "core/warn.h"
 
 const char *const stage_names[STAGE_COUNT] = {"load", "fdk", "sart", "tv", "save"};
 
@@ -441,66 +442,6 @@ static int keep(struct recon *recon, const char *name, const char *stage, struct
 	return metal_exchange(&recon->metal, &tools, recon->volume, err);
 }
 
-/* Whether a view's detector has the shadow of any of 9 x 9 x 9 places that span the grid. */
-static bool is_seen(const struct grid *grid, const struct geometry *geometry)
-{
-	enum { ALONG = 9 };
-
-	for (int k = 0; k < geometry->count; k++) {
-		double matrix[12];
-
-		view_matrix(&geometry->views[k], matrix);
-		for (int i = 0; i < ALONG * ALONG * ALONG; i++) {
-			const int steps[3] = {i % ALONG, i / ALONG % ALONG, i / ALONG / ALONG};
-			double place[3], column, row;
-
-			for (int a = 0; a < 3; a++)
-				place[a] =
-				    grid->origin[a] + grid->spacing[a] * (grid->size[a] - 1) * steps[a] / (ALONG - 1);
-			if (view_project(matrix, place, &column, &row) > 0 && column >= 0 && row >= 0 &&
-			    column <= geometry->columns - 1 && row <= geometry->rows - 1)
-				return true;
-		}
-	}
-	return false;
-}
-
-static void warn_of_the_recipe(struct recon *recon)
-{
-	const struct recipe *recipe = &recon->recipe;
-	const struct grid *grid = &recipe->grid;
-	char detail[256];
-
-	if (!is_seen(grid, recon->geometry)) {
-		snprintf(detail, sizeof(detail),
-			 "no view sees any of the grid, which begins at (%g, %g, %g) mm and is %g x %g x %g mm in size",
-			 grid->origin[0], grid->origin[1], grid->origin[2], grid->size[0] * grid->spacing[0],
-			 grid->size[1] * grid->spacing[1], grid->size[2] * grid->spacing[2]);
-		recon->hooks->warning(recon->hooks->context, "grid_unseen", detail);
-	}
-	if (recipe->tv.on && !recipe->tv.after_fdk && !recipe->sart.on)
-		recon->hooks->warning(
-		    recon->hooks->context, "tv_without_sart",
-		    "TV was wanted after SART iterations, and there are none: the FDK volume is left alone");
-}
-
-static void warn_of_the_input(struct recon *recon)
-{
-	const double degrees = 57.29577951308232;
-	char detail[256];
-
-	if (recon->hooks->warning == NULL)
-		return;
-	warn_of_the_recipe(recon);
-	input_warn(&recon->input, recon->geometry, recon->hooks);
-	if (recon->recipe.fdk.on && recon->orbit.arc_too_short) {
-		snprintf(detail, sizeof(detail),
-			 "FDK of an arc of %.1f degrees; a complete one has 180 degrees and the fan of %.1f degrees",
-			 recon->orbit.arc * degrees, recon->orbit.fan * degrees);
-		recon->hooks->warning(recon->hooks->context, "arc_too_short", detail);
-	}
-}
-
 /* ---- views in ---- */
 
 static bool fdk_runs(const struct recon *recon)
@@ -611,20 +552,12 @@ static int run_tv(struct recon *recon, int iteration, struct error *err)
 /* Known once all views are filtered. */
 static int warn_of_truncation(struct recon *recon, struct error *err)
 {
-	const double all = (double)recon->geometry->count * recon->geometry->rows;
 	size_t rows[2];
-	char detail[256];
 	int code = recon->backend->filter_extended(recon->plan, rows, err);
 
-	if (code < 0 || recon->hooks->warning == NULL || rows[0] + rows[1] == 0)
-		return code;
-	snprintf(
-	    detail, sizeof(detail),
-	    "the object reaches beyond the detector: %.3g %% of the rows are cut off at the first column and %.3g %% "
-	    "at the last; FDK extended them by %d columns, values near the rim of the field of view are estimates",
-	    100 * (double)rows[0] / all, 100 * (double)rows[1] / all, recon->weights.extend);
-	recon->hooks->warning(recon->hooks->context, "truncated", detail);
-	return 0;
+	if (code == 0)
+		warn_truncated(recon->hooks, recon->geometry, rows, recon->weights.extend);
+	return code;
 }
 
 /* What is missing where views were blank: the others stand in for them in equal shares. */
@@ -677,30 +610,6 @@ static int stand_in_for_blank_views(struct recon *recon, struct error *err)
 	return code;
 }
 
-static void warn_of_metal(const struct recon *recon)
-{
-	const struct metal *metal = &recon->metal;
-	const double samples =
-	    (double)recon->geometry->count * (double)recon->geometry->columns * (double)recon->geometry->rows;
-	char detail[256];
-
-	if (recon->hooks->warning == NULL)
-		return;
-	if (metal->voxels_count == 0) {
-		snprintf(detail, sizeof(detail), "nothing in the FDK volume has %g HU or more: no metal was taken out",
-			 recon->recipe.metal.threshold_hu);
-		recon->hooks->warning(recon->hooks->context, "no_metal", detail);
-		return;
-	}
-	snprintf(
-	    detail, sizeof(detail),
-	    "%zu voxels (%.3g %%) of %g HU or more are metal; %zu samples (%.3g %%) in %d projections were replaced "
-	    "from what lies beside them",
-	    metal->voxels_count, 100 * (double)metal->voxels_count / (double)grid_voxels(&recon->recipe.grid),
-	    recon->recipe.metal.threshold_hu, metal->replaced, 100 * (double)metal->replaced / samples, metal->views);
-	recon->hooks->warning(recon->hooks->context, "metal", detail);
-}
-
 /* The metal of the FDK volume out of the projections, and the FDK of those. */
 static int take_metal_out(struct recon *recon, struct error *err)
 {
@@ -717,7 +626,7 @@ static int take_metal_out(struct recon *recon, struct error *err)
 	if (code < 0)
 		return code;
 	recon->work_done += WORK_METAL;
-	warn_of_metal(recon);
+	warn_metal(recon->hooks, recon->geometry, &recon->recipe, &recon->metal);
 	return 0;
 }
 
@@ -932,8 +841,10 @@ int recon_run(struct recon *recon, struct error *err)
 	if (code < 0)
 		return code;
 	recon->ran = true;
-	if (!recon->resumed)
-		warn_of_the_input(recon);
+	if (!recon->resumed) {
+		warn_recipe(recon->hooks, recon->geometry, recipe, &recon->orbit);
+		input_warn(&recon->input, recon->geometry, recon->hooks);
+	}
 	code = check_cancelled(recon, err);
 	if (code == 0 && recon->resumed)
 		code = take_metal_out_again(recon, err);

@@ -1,0 +1,95 @@
+/* What a reconstruction warns of, in words. */
+#include "core/warn.h"
+
+#include <stdarg.h>
+#include <stdio.h>
+
+static const double DEGREES = 57.29577951308232;
+
+void recon_warn(const struct recon_hooks *hooks, const char *code, const char *format, ...)
+{
+	char detail[320];
+	va_list args;
+
+	if (hooks->warning == NULL)
+		return;
+	va_start(args, format);
+	vsnprintf(detail, sizeof(detail), format, args);
+	va_end(args);
+	hooks->warning(hooks->context, code, detail);
+}
+
+/* Whether a view's detector has the shadow of any of 9 x 9 x 9 places that span the grid. */
+static bool is_seen(const struct grid *grid, const struct geometry *geometry)
+{
+	enum { ALONG = 9 };
+
+	for (int k = 0; k < geometry->count; k++) {
+		double matrix[12];
+
+		view_matrix(&geometry->views[k], matrix);
+		for (int i = 0; i < ALONG * ALONG * ALONG; i++) {
+			const int steps[3] = {i % ALONG, i / ALONG % ALONG, i / ALONG / ALONG};
+			double place[3], column, row;
+
+			for (int a = 0; a < 3; a++)
+				place[a] =
+				    grid->origin[a] + grid->spacing[a] * (grid->size[a] - 1) * steps[a] / (ALONG - 1);
+			if (view_project(matrix, place, &column, &row) > 0 && column >= 0 && row >= 0 &&
+			    column <= geometry->columns - 1 && row <= geometry->rows - 1)
+				return true;
+		}
+	}
+	return false;
+}
+
+void warn_recipe(const struct recon_hooks *hooks, const struct geometry *geometry, const struct recipe *recipe,
+		 const struct orbit *orbit)
+{
+	const struct grid *grid = &recipe->grid;
+
+	if (!is_seen(grid, geometry))
+		recon_warn(
+		    hooks, "grid_unseen",
+		    "no view sees any of the grid, which begins at (%g, %g, %g) mm and is %g x %g x %g mm in size",
+		    grid->origin[0], grid->origin[1], grid->origin[2], grid->size[0] * grid->spacing[0],
+		    grid->size[1] * grid->spacing[1], grid->size[2] * grid->spacing[2]);
+	if (recipe->tv.on && !recipe->tv.after_fdk && !recipe->sart.on)
+		recon_warn(hooks, "tv_without_sart",
+			   "TV was wanted after SART iterations, and there are none: the FDK volume is left alone");
+	if (recipe->fdk.on && orbit->arc_too_short)
+		recon_warn(hooks, "arc_too_short",
+			   "FDK of an arc of %.1f degrees; a complete one has 180 degrees and the fan of %.1f degrees",
+			   orbit->arc * DEGREES, orbit->fan * DEGREES);
+}
+
+void warn_truncated(const struct recon_hooks *hooks, const struct geometry *geometry, const size_t rows[2], int extend)
+{
+	const double all = (double)geometry->count * geometry->rows;
+
+	if (rows[0] + rows[1] == 0)
+		return;
+	recon_warn(
+	    hooks, "truncated",
+	    "the object reaches beyond the detector: %.3g %% of the rows are cut off at the first column and %.3g %% "
+	    "at the last; FDK extended them by %d columns, values near the rim of the field of view are estimates",
+	    100 * (double)rows[0] / all, 100 * (double)rows[1] / all, extend);
+}
+
+void warn_metal(const struct recon_hooks *hooks, const struct geometry *geometry, const struct recipe *recipe,
+		const struct metal *metal)
+{
+	const double samples = (double)geometry->count * (double)geometry->columns * (double)geometry->rows;
+
+	if (metal->voxels_count == 0) {
+		recon_warn(hooks, "no_metal", "nothing in the FDK volume has %g HU or more: no metal was taken out",
+			   recipe->metal.threshold_hu);
+		return;
+	}
+	recon_warn(
+	    hooks, "metal",
+	    "%zu voxels (%.3g %%) of %g HU or more are metal; %zu samples (%.3g %%) in %d projections were replaced "
+	    "from what lies beside them",
+	    metal->voxels_count, 100 * (double)metal->voxels_count / (double)grid_voxels(&recipe->grid),
+	    recipe->metal.threshold_hu, metal->replaced, 100 * (double)metal->replaced / samples, metal->views);
+}

@@ -1,0 +1,24 @@
+#ifndef CBCT_CORE_WARN_H
+#define CBCT_CORE_WARN_H
+
+#include "core/metal.h"
+#include "core/orbit.h"
+#include "core/recon.h"
+
+/* What a reconstruction warns of, in words; those of its samples are in input.h. For core/ only. */
+
+/* A warning of this code by the hook, if there is one; the text is cut off at 319 characters. */
+__attribute__((format(printf, 3, 4))) void recon_warn(const struct recon_hooks *hooks, const char *code,
+						      const char *format, ...);
+
+/* "grid_unseen", "tv_without_sart", "arc_too_short". */
+void warn_recipe(const struct recon_hooks *hooks, const struct geometry *geometry, const struct recipe *recipe,
+		 const struct orbit *orbit);
+/* "truncated": rows[0] rows of all views were cut off at the first column, rows[1] at the last; none: nothing is told.
+ */
+void warn_truncated(const struct recon_hooks *hooks, const struct geometry *geometry, const size_t rows[2], int extend);
+/* "metal", or "no_metal" where it has no voxels. */
+void warn_metal(const struct recon_hooks *hooks, const struct geometry *geometry, const struct recipe *recipe,
+		const struct metal *metal);
+
+#endif
