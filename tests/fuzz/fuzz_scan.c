@@ -13,6 +13,24 @@ static void print_and_free(cJSON *value)
 	cJSON_Delete(value);
 }
 
+/* The odd projections are not there. */
+static void reduce(struct scan *scan)
+{
+	const int count = scan->count;
+	unsigned char *present = malloc((size_t)count);
+	struct error err = {0};
+
+	PROMISE(present != NULL);
+	for (int k = 0; k < count; k++)
+		present[k] = k % 2 == 0;
+	PROMISE(scan_reduce(scan, present, &err) == 0);
+	PROMISE(scan->count == (count + 1) / 2 && scan->geometry.count == scan->count);
+	for (int k = 0; k < scan->count && count > 1; k++)
+		PROMISE(scan->projection[k] == 2 * k);
+	print_and_free(scan_derived(scan));
+	free(present);
+}
+
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 {
 	struct scan *scan = NULL, *again = NULL;
@@ -29,6 +47,9 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 	text = json_print(scan->document, NULL);
 	PROMISE(text != NULL && scan_parse(text, strlen(text), &again, &err) == 0);
 	PROMISE(memcmp(scan->geometry.views, again->geometry.views, sizeof(struct view) * (size_t)scan->count) == 0);
+	PROMISE(memcmp(scan->air_region, again->air_region, sizeof(scan->air_region)) == 0);
+	PROMISE(memcmp(scan->hardening, again->hardening, sizeof(scan->hardening)) == 0);
+	reduce(again);
 	free(text);
 	scan_free(scan);
 	scan_free(again);
