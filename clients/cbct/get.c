@@ -66,7 +66,7 @@ static int download(const struct get_options *options, FILE *file, char *ret_nam
 static int get_file(const struct get_options *options, struct error *err)
 {
 	const char *beside = options->output != NULL ? options->output : "cbct-volume";
-	char partial[1100], name[128], fallback[200];
+	char partial[1100], name[128] = "", fallback[200];
 	FILE *file;
 	int code;
 

@@ -164,6 +164,8 @@ static void read_top(struct reader *reader)
 			continue;
 		if (multiple(reader->text, 1, &value) != 1 || value < 0 || value > 1e6 || value != rint(value))
 			fail(reader, ERR_INVALID, "a whole number is expected");
+		else if (dicom->frame != NULL)
+			fail(reader, ERR_INVALID, "it stands behind the functional groups");
 		else
 			*(long *)((char *)dicom + counts[i].offset) = (long)value;
 	}
