@@ -7,7 +7,7 @@
 
 #include "daemon/api.h"
 #include "daemon/http_text.h"
-#include "daemon/picture.h"
+#include "proto/slice.h"
 #include "proto/spool.h"
 
 /* ---- in ---- */
@@ -136,31 +136,50 @@ static int open_projection(struct stored_scan *scan, int index, int *ret_descrip
 	return stored_scan_open(scan, false, ret_descriptor, err);
 }
 
-/* Samples as float, the smallest finite one black, the largest white. */
-static int draw(const void *samples, const struct scan *scan, char **ret_png, size_t *ret_length, struct error *err)
+/* As float; the smallest finite sample and the largest. */
+static void read_samples(const void *samples, const struct scan *scan, size_t count, float *ret_values,
+			 struct slice *ret_range)
 {
-	int width = scan->geometry.columns, height = scan->geometry.rows, code;
-	size_t count = (size_t)width * (size_t)height;
-	float *values = malloc(count * sizeof(*values)), black = INFINITY, white = -INFINITY;
+	float black = INFINITY, white = -INFINITY;
 
-	if (values == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for a picture");
 	for (size_t i = 0; i < count; i++) {
 		uint16_t counts;
 
 		if (scan->sample == SAMPLE_UINT16) {
 			memcpy(&counts, (const char *)samples + i * sizeof(counts), sizeof(counts));
-			values[i] = counts;
+			ret_values[i] = counts;
 		} else {
-			memcpy(&values[i], (const char *)samples + i * sizeof(float), sizeof(float));
+			memcpy(&ret_values[i], (const char *)samples + i * sizeof(float), sizeof(float));
 		}
-		if (isfinite(values[i])) {
-			black = fminf(black, values[i]);
-			white = fmaxf(white, values[i]);
+		if (isfinite(ret_values[i])) {
+			black = fminf(black, ret_values[i]);
+			white = fmaxf(white, ret_values[i]);
 		}
 	}
-	code = picture_make(values, width, height, black, white, ret_png, ret_length, err);
+	ret_range->black = (double)black;
+	ret_range->white = (double)white;
+}
+
+/* The smallest finite sample black, the largest white. */
+static int draw(const void *samples, const struct scan *scan, char **ret_png, size_t *ret_length, struct error *err)
+{
+	const struct grid grid = {.size = {scan->geometry.columns, scan->geometry.rows, 1}, .spacing = {1, 1, 1}};
+	const size_t count = grid_voxels(&grid);
+	struct slice slice = {.axis = 2};
+	float *values = malloc(count * sizeof(*values));
+	unsigned char *pixels = malloc(count);
+	int code = 0;
+
+	if (values == NULL || pixels == NULL) {
+		code = error_set(err, ERR_NO_MEMORY, "no memory for a picture of %zu pixels", count);
+		goto out;
+	}
+	read_samples(samples, scan, count, values, &slice);
+	slice_make(values, &grid, &slice, 0, pixels);
+	code = gray_png(pixels, grid.size[0], grid.size[1], NULL, ret_png, ret_length, err);
+out:
 	free(values);
+	free(pixels);
 	return code;
 }
 

@@ -7,14 +7,16 @@
  *   axis y   x to the right, z up:   seen from the front
  *   axis x   y to the right, z up:   seen from the patient's left
  */
+#include <errno.h>
 #include <math.h>
+#include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 
 #include "clients/cbct/commands.h"
-#include "clients/cbct/picture.h"
 #include "clients/cbct/volume_input.h"
+#include "proto/slice.h"
 
-enum axis { AXIS_X, AXIS_Y, AXIS_Z };
 static const char *const axis_names[] = {"x", "y", "z", NULL};
 
 struct slice_options {
@@ -49,71 +51,82 @@ static const struct option_group groups[] = {
     {0},
 };
 
-/* One slice as it is shown: values [height][width], the first row on top. */
-struct plane {
-	int width, height;
-	float *values;
-};
-
-static int plane_cut(const struct grid *grid, const float *voxels, enum axis axis, int index, struct plane *ret_plane,
-		     struct error *err)
-{
-	static const struct {
-		int right, down;
-		bool up;
-	} views[] = {[AXIS_X] = {1, 2, true}, [AXIS_Y] = {0, 2, true}, [AXIS_Z] = {0, 1, false}};
-	struct plane plane = {grid->size[views[axis].right], grid->size[views[axis].down], NULL};
-
-	plane.values = malloc((size_t)plane.width * (size_t)plane.height * sizeof(*plane.values));
-	if (plane.values == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for a slice of %d x %d", plane.width, plane.height);
-	for (int row = 0; row < plane.height; row++)
-		for (int column = 0; column < plane.width; column++) {
-			size_t at[3] = {(size_t)index, (size_t)index, (size_t)index};
-
-			at[views[axis].right] = (size_t)column;
-			at[views[axis].down] = (size_t)(views[axis].up ? plane.height - 1 - row : row);
-			plane.values[(size_t)row * (size_t)plane.width + (size_t)column] =
-			    voxels[(at[2] * (size_t)grid->size[1] + at[1]) * (size_t)grid->size[0] + at[0]];
-		}
-	*ret_plane = plane;
-	return 0;
-}
-
 /* What is not given of window and level: from the slice's range. */
-static void plane_range(const struct plane *plane, double *window, double *level)
+static void find_window(const float *voxels, const struct grid *grid, int axis, long index, double *window,
+			double *level)
 {
+	const size_t strides[3] = {1, (size_t)grid->size[0], (size_t)grid->size[0] * (size_t)grid->size[1]};
+	const int across = axis == 0 ? 1 : 0, down = axis == 2 ? 1 : 2;
+	const float *slice = voxels + (size_t)index * strides[axis];
 	double least = INFINITY, most = -INFINITY;
 
-	for (size_t i = 0; i < (size_t)plane->width * (size_t)plane->height; i++) {
-		least = fmin(least, (double)plane->values[i]);
-		most = fmax(most, (double)plane->values[i]);
-	}
+	for (int j = 0; j < grid->size[down]; j++)
+		for (int i = 0; i < grid->size[across]; i++) {
+			double value = (double)slice[(size_t)j * strides[down] + (size_t)i * strides[across]];
+
+			least = fmin(least, value);
+			most = fmax(most, value);
+		}
 	if (isnan(*level))
 		*level = (least + most) / 2;
 	if (isnan(*window))
 		*window = fmax(2 * fmax(most - *level, *level - least), 1e-12);
 }
 
-static int plane_write(const struct plane *plane, double window, double level, int scale, const char *path,
-		       struct error *err)
+/* Each pixel `scale` times across and down; the caller frees what comes back, NULL without memory. */
+static unsigned char *enlarge(const unsigned char *pixels, const int size[2], int scale)
 {
-	int width = plane->width * scale, height = plane->height * scale, code;
-	unsigned char *pixels = malloc((size_t)width * (size_t)height);
+	const size_t width = (size_t)size[0] * (size_t)scale, height = (size_t)size[1] * (size_t)scale;
+	unsigned char *large = malloc(width * height);
 
-	if (pixels == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for a picture of %d x %d", width, height);
-	for (int row = 0; row < height; row++)
-		for (int column = 0; column < width; column++) {
-			double value =
-			    (double)
-				plane->values[(size_t)(row / scale) * (size_t)plane->width + (size_t)(column / scale)];
-			double gray = 255 * ((value - level) / window + 0.5);
+	for (size_t row = 0; large != NULL && row < height; row++)
+		for (size_t column = 0; column < width; column++)
+			large[row * width + column] =
+			    pixels[row / (size_t)scale * (size_t)size[0] + column / (size_t)scale];
+	return large;
+}
 
-			pixels[(size_t)row * (size_t)width + (size_t)column] =
-			    (unsigned char)rint(fmin(fmax(gray, 0), 255));
-		}
-	code = picture_write(path, pixels, width, height, err);
+static int write_file(const char *path, const char *data, size_t length, struct error *err)
+{
+	FILE *file = strcmp(path, "-") == 0 ? stdout : fopen(path, "wbe");
+	bool failed;
+
+	if (file == NULL)
+		return error_set_errno(err, errno, "%s", path);
+	failed = fwrite(data, 1, length, file) != length;
+	/* Both matter: a full disk may show only when the last buffer goes out. */
+	if ((file == stdout ? fflush(file) : fclose(file)) != 0 || failed)
+		return error_set_errno(err, errno, "%s", path);
+	return 0;
+}
+
+static int write_picture(const float *voxels, const struct grid *grid, const struct slice *slice, long index, int scale,
+			 const char *path, struct error *err)
+{
+	unsigned char *pixels, *large = NULL;
+	double pixel_mm[2];
+	char *png = NULL;
+	size_t length;
+	int size[2], code = 0;
+
+	slice_size(grid, slice->axis, size, pixel_mm);
+	pixels = malloc((size_t)size[0] * (size_t)size[1]);
+	if (pixels != NULL) {
+		slice_make(voxels, grid, slice, (int)index, pixels);
+		large = enlarge(pixels, size, scale);
+	}
+	for (int i = 0; i < 2; i++) {
+		size[i] *= scale;
+		pixel_mm[i] /= scale;
+	}
+	if (large == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for a picture of %d x %d", size[0], size[1]);
+	if (code == 0)
+		code = gray_png(large, size[0], size[1], pixel_mm, &png, &length, err);
+	if (code == 0)
+		code = write_file(path, png, length, err);
+	free(png);
+	free(large);
 	free(pixels);
 	return code;
 }
@@ -122,7 +135,7 @@ static int slice_run(const void *values, struct error *err)
 {
 	const struct slice_options *options = values;
 	double window = options->window, level = options->level;
-	struct plane plane = {0};
+	struct slice slice = {.axis = options->axis};
 	struct grid grid;
 	float *voxels = NULL;
 	long index = options->index;
@@ -133,22 +146,23 @@ static int slice_run(const void *values, struct error *err)
 	if (code == 0 && index >= grid.size[options->axis])
 		code = error_set(err, ERR_USAGE, "--index: %ld, but the volume has %d slices along %s", index,
 				 grid.size[options->axis], axis_names[options->axis]);
-	if (code == 0)
-		code = plane_cut(&grid, voxels, (enum axis)options->axis, (int)index, &plane, err);
 	if (code == 0) {
-		for (size_t i = 0; options->file.hu && i < (size_t)plane.width * (size_t)plane.height; i++)
-			plane.values[i] = (float)(1000 * ((double)plane.values[i] / options->file.mu_water - 1));
-		plane_range(&plane, &window, &level);
-		code = plane_write(&plane, window, level, (int)options->scale, options->output, err);
+		if (options->file.hu) {
+			level = options->file.mu_water * (1 + level / 1000);
+			window = options->file.mu_water * window / 1000;
+		}
+		find_window(voxels, &grid, options->axis, index, &window, &level);
+		slice.black = level - window / 2;
+		slice.white = level + window / 2;
+		code = write_picture(voxels, &grid, &slice, index, (int)options->scale, options->output, err);
 	}
-	free(plane.values);
 	free(voxels);
 	return code;
 }
 
 static const struct slice_options defaults = {.output = "slice.png",
 					      .file = VOLUME_OPTIONS_DEFAULTS,
-					      .axis = AXIS_Z,
+					      .axis = 2,
 					      .index = OPTION_UNSET_INTEGER,
 					      .scale = 1,
 					      .window = OPTION_UNSET_NUMBER,
