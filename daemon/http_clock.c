@@ -33,6 +33,7 @@ void connection_phase(struct connection *connection, enum phase phase, uint64_t 
 	connection->since = http_now();
 	connection->paused = 0;
 	connection->bytes = bytes;
+	connection->bytes_then = UNKNOWN_SIZE;
 	connection->woken = false;
 	if (phase == PHASE_IDLE)
 		connection->patience = 0;
@@ -157,6 +158,20 @@ static double deadline(const struct connection *connection)
 	       (double)connection->bytes / (double)options->minimum_rate;
 }
 
+/*
+ * A body that has stopped because its client is gone. The library waits for an
+ * edge of epoll; when the end of the connection came together with the last
+ * bytes there is none any more, and what had come would lie unsaved, its
+ * projections claimed, until the body's time is over. With the lock held.
+ */
+static bool body_is_broken(struct connection *connection)
+{
+	bool stopped = connection->bytes == connection->bytes_then;
+
+	connection->bytes_then = connection->bytes;
+	return stopped && live_hung_up(connection);
+}
+
 /* Looks at one connection; returns when to look again. With http->lock held: the socket is not closed meanwhile. */
 static double look(struct connection *connection, double now)
 {
@@ -166,9 +181,12 @@ static double look(struct connection *connection, double now)
 	bool cut = false;
 
 	pthread_mutex_lock(&connection->lock);
-	if (connection->patience > 0 && !connection->cut && now >= connection->looked_at + 1) {
+	if (!connection->cut && now >= connection->looked_at + 1) {
 		connection->looked_at = now;
-		connection->cut = live_peer_gone(connection, now);
+		if (connection->patience > 0)
+			connection->cut = live_peer_gone(connection, now);
+		else if (connection->phase == PHASE_BODY && !connection->suspended)
+			connection->cut = body_is_broken(connection);
 		if (connection->cut)
 			shutdown(connection->socket, SHUT_RDWR);
 	}

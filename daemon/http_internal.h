@@ -36,13 +36,14 @@ struct connection {
 	uint64_t bytes; /* of this phase's body so far, or in all when sending */
 	bool suspended; /* out of the library's hands until resumed */
 	double suspended_at;
-	bool woken;        /* request_wake came while it was not suspended */
-	double wait_until; /* of a suspended one */
-	bool cut;          /* shut down for its pace, or because its peer has gone */
+	bool woken;          /* request_wake came while it was not suspended */
+	double wait_until;   /* of a suspended one */
+	bool cut;            /* shut down for its pace, or because its peer has gone */
+	double looked_at;    /* by the clock, whether the peer is there */
+	uint64_t bytes_then; /* of a body, when that was */
 
 	/* Of a reply without an end in sight: s that sent bytes may stay unacknowledged; 0: another kind. */
 	double patience;
-	double looked_at;      /* by the clock */
 	double answered_at;    /* the last time that nothing was outstanding, or some of it came in */
 	uint64_t acknowledged; /* bytes, then */
 };
@@ -130,6 +131,8 @@ void connections_wake(struct http *http);
 bool connections_idle(struct http *http);
 
 /* ---- http_live.c: replies without an end in sight ---- */
+/* Closed or broken, and nothing of it is unread; who has shut down its side for writing counts, too. */
+bool live_hung_up(const struct connection *connection);
 /* Whether a client has gone, with or without a word; with the connection's lock held. */
 bool live_peer_gone(struct connection *connection, double now);
 

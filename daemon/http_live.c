@@ -20,8 +20,7 @@ struct live {
 	ssize_t (*read)(struct request *request, void *to, size_t size);
 };
 
-/* Closed or broken; a client that has shut down its side for writing is counted as gone, too. */
-static bool has_hung_up(const struct connection *connection)
+bool live_hung_up(const struct connection *connection)
 {
 	char byte;
 	ssize_t got = recv(connection->socket, &byte, 1, MSG_PEEK | MSG_DONTWAIT);
@@ -39,7 +38,7 @@ bool live_peer_gone(struct connection *connection, double now)
 	struct tcp_info info = {0};
 	socklen_t size = sizeof(info);
 
-	if (has_hung_up(connection))
+	if (live_hung_up(connection))
 		return true;
 	if (getsockopt(connection->socket, IPPROTO_TCP, TCP_INFO, &info, &size) != 0)
 		return false; /* a Unix socket: a peer does not vanish */

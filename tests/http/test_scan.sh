@@ -163,6 +163,27 @@ test_a_broken_connection_keeps_the_whole_projections_before_it() {
 	expect_json '.received == [[0, 1]] and .missing == [[2, 11]]'
 	put /2-11 --data-binary @<(fill 100 10)
 	expect_status 201
+	# chunked, and so fast that the end of the connection comes together with the last bytes
+	new_scan
+	{
+		printf 'PUT /v1/scans/%s/projections HTTP/1.1\r\nHost: t\r\nTransfer-Encoding: chunked\r\n\r\n' "$scan"
+		for i in 0 1 2 3 4; do
+			printf '%x\r\n' $((one / 2))
+			head -c $((one / 2)) "$work/all"
+			printf '\r\n'
+		done
+	} >"$work/chunks"
+	for ((i = 0; i < 4; i++)); do
+		timeout 5 bash -c 'exec 3<>"/dev/tcp/127.0.0.1/$0"; cat "$1" >&3; exec 3>&-' "${url##*:}" "$work/chunks" || true
+	done
+	for ((i = 0; i < 200; i++)); do
+		req GET "/v1/scans/$scan"
+		[ "$(jq -c .received "$body")" = '[[0,1]]' ] && break
+		sleep 0.05
+	done
+	expect_json '.received == [[0, 1]]'
+	put /0-11 -T "$work/all"
+	expect_status 201
 }
 
 test_several_connections_at_once_with_repeats() {
