@@ -164,25 +164,19 @@ test_a_broken_connection_keeps_the_whole_projections_before_it() {
 	put /2-11 --data-binary @<(fill 100 10)
 	expect_status 201
 	# chunked, and so fast that the end of the connection comes together with the last bytes
-	new_scan
-	{
-		printf 'PUT /v1/scans/%s/projections HTTP/1.1\r\nHost: t\r\nTransfer-Encoding: chunked\r\n\r\n' "$scan"
-		for i in 0 1 2 3 4; do
-			printf '%x\r\n' $((one / 2))
-			head -c $((one / 2)) "$work/all"
-			printf '\r\n'
-		done
-	} >"$work/chunks"
-	for ((i = 0; i < 4; i++)); do
-		timeout 5 bash -c 'exec 3<>"/dev/tcp/127.0.0.1/$0"; cat "$1" >&3; exec 3>&-' "${url##*:}" "$work/chunks" || true
-	done
+	new_scan '.detector.columns = 96 | .detector.rows = 84'
+	timeout 5 bash -c 'exec 3<>"/dev/tcp/127.0.0.1/$0"
+		printf "PUT /v1/scans/%s/projections HTTP/1.1\r\nHost: t\r\nTransfer-Encoding: chunked\r\n\r\n" "$1" >&3
+		printf -v chunk "1000\r\n%04096d\r\n" 0
+		for ((i = 0; i < 40; i++)); do printf %s "$chunk" >&3; done
+		exec 3>&-' "${url##*:}" "$scan"
 	for ((i = 0; i < 200; i++)); do
 		req GET "/v1/scans/$scan"
-		[ "$(jq -c .received "$body")" = '[[0,1]]' ] && break
+		[ "$(jq -c .received "$body")" = '[[0,4]]' ] && break
 		sleep 0.05
 	done
-	expect_json '.received == [[0, 1]]'
-	put /0-11 -T "$work/all"
+	expect_json '.received == [[0, 4]]'
+	put '' --data-binary @<(head -c $((96 * 84 * 4 * count)) /dev/zero | tr '\0' 0)
 	expect_status 201
 }
 
