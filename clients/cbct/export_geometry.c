@@ -12,6 +12,7 @@
 
 #include "clients/cbct/commands.h"
 #include "clients/cbct/http.h"
+#include "clients/cbct/output.h"
 #include "proto/rtk_geometry.h"
 #include "proto/scan.h"
 #include "proto/spool.h"
@@ -198,15 +199,6 @@ static void print_stack(const struct rtk_stack *stack, const struct scan *scan, 
 		scan->geometry.rows, scan->count, scan->sample == SAMPLE_UINT16 ? "MET_USHORT" : "MET_FLOAT", data);
 }
 
-static int close_file(FILE *file, const char *path, struct error *err)
-{
-	bool failed = ferror(file) != 0;
-
-	if ((file == stdout ? fflush(file) : fclose(file)) != 0 || failed)
-		return error_set(err, ERR_IO, "%.200s cannot be written", path);
-	return 0;
-}
-
 static int write_stack(const struct export_options *options, const struct scan *scan, struct error *err)
 {
 	char path[PATH_MAX], whole[PATH_MAX];
@@ -221,22 +213,22 @@ static int write_stack(const struct export_options *options, const struct scan *
 	snprintf(path, sizeof(path), "%s/projections.raw", options->scan);
 	if (realpath(path, whole) == NULL)
 		return error_set_errno(err, errno, "%s", path);
-	to = fopen(options->stack, "we");
-	if (to == NULL)
-		return error_set_errno(err, errno, "%s", options->stack);
+	code = output_open(options->stack, &to, err);
+	if (code != 0)
+		return code;
 	print_stack(&stack, scan, whole, to);
-	return close_file(to, options->stack, err);
+	return output_close(to, options->stack, err);
 }
 
 static int write_geometry(const struct export_options *options, const struct scan *scan, struct error *err)
 {
-	FILE *to = strcmp(options->output, "-") == 0 ? stdout : fopen(options->output, "we");
-	int code, closed;
+	FILE *to;
+	int code = output_open(options->output, &to, err), closed;
 
-	if (to == NULL)
-		return error_set_errno(err, errno, "%s", options->output);
+	if (code != 0)
+		return code;
 	code = writers[options->format](options, &scan->geometry, to, err);
-	closed = close_file(to, options->output, err);
+	closed = output_close(to, options->output, code == 0 ? err : &(struct error){0});
 	return code != 0 ? code : closed;
 }
 

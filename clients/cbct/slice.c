@@ -7,13 +7,11 @@
  *   axis y   x to the right, z up:   seen from the front
  *   axis x   y to the right, z up:   seen from the patient's left
  */
-#include <errno.h>
 #include <math.h>
-#include <stdio.h>
 #include <stdlib.h>
-#include <string.h>
 
 #include "clients/cbct/commands.h"
+#include "clients/cbct/output.h"
 #include "clients/cbct/volume_input.h"
 #include "proto/slice.h"
 
@@ -86,20 +84,6 @@ static unsigned char *enlarge(const unsigned char *pixels, const int size[2], in
 	return large;
 }
 
-static int write_file(const char *path, const char *data, size_t length, struct error *err)
-{
-	FILE *file = strcmp(path, "-") == 0 ? stdout : fopen(path, "wbe");
-	bool failed;
-
-	if (file == NULL)
-		return error_set_errno(err, errno, "%s", path);
-	failed = fwrite(data, 1, length, file) != length;
-	/* Both matter: a full disk may show only when the last buffer goes out. */
-	if ((file == stdout ? fflush(file) : fclose(file)) != 0 || failed)
-		return error_set_errno(err, errno, "%s", path);
-	return 0;
-}
-
 static int write_picture(const float *voxels, const struct grid *grid, const struct slice *slice, long index, int scale,
 			 const char *path, struct error *err)
 {
@@ -107,6 +91,7 @@ static int write_picture(const float *voxels, const struct grid *grid, const str
 	double pixel_mm[2];
 	char *png = NULL;
 	size_t length;
+	FILE *file;
 	int size[2], code = 0;
 
 	slice_size(grid, slice->axis, size, pixel_mm);
@@ -124,7 +109,11 @@ static int write_picture(const float *voxels, const struct grid *grid, const str
 	if (code == 0)
 		code = gray_png(large, size[0], size[1], pixel_mm, &png, &length, err);
 	if (code == 0)
-		code = write_file(path, png, length, err);
+		code = output_open(path, &file, err);
+	if (code == 0) {
+		fwrite(png, 1, length, file);
+		code = output_close(file, path, err);
+	}
 	free(png);
 	free(large);
 	free(pixels);

@@ -1,9 +1,9 @@
 /* Volume files: see volume_output.h. */
 #include "clients/cbct/volume_output.h"
 
-#include <errno.h>
-#include <stdio.h>
 #include <string.h>
+
+#include "clients/cbct/output.h"
 
 static const struct volume_format *format_of(const char *path)
 {
@@ -22,14 +22,12 @@ int volume_write(const char *path, const struct grid *grid, const float *voxels,
 {
 	uint8_t header[FORMAT_HEADER_MAX];
 	size_t length = format_of(path)->header(grid, VOLUME_FLOAT32, "cbct", header), count = grid_voxels(grid);
-	FILE *file = fopen(path, "wbe");
-	int failed;
+	FILE *file;
+	int code = output_open(path, &file, err);
 
-	if (file == NULL)
-		return error_set_errno(err, errno, "%s", path);
-	failed = fwrite(header, 1, length, file) != length || fwrite(voxels, sizeof(*voxels), count, file) != count;
-	/* Both matter: a full disk may show only when the last buffer goes out. */
-	if (fclose(file) != 0 || failed)
-		return error_set_errno(err, errno, "%s", path);
-	return 0;
+	if (code != 0)
+		return code;
+	fwrite(header, 1, length, file);
+	fwrite(voxels, sizeof(*voxels), count, file);
+	return output_close(file, path, err);
 }
