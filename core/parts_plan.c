@@ -211,9 +211,6 @@ static int plan_describe(struct plan *plan, struct device *device, const struct 
 	plan->options = *options;
 	for (int i = 0; i < PARTS_BATCH; i++)
 		plan->identity[i] = i;
-	if (options->sart != NULL && options->matched)
-		return error_set_at(err, ERR_NO_MEMORY, "/sart/projector",
-				    "the matched projector needs all of the volume on the device");
 	device->backend->describe(device->below, &info);
 	code = intake_bytes(plan, &intake, err);
 	if (code < 0)

@@ -386,6 +386,8 @@ int backproject_views(struct plan *plan, const float *from, int first, int count
 	bool parts = use.update && count > most;
 	struct voxel_use sum = use;
 
+	if (plan->options.matched && !use.fdk)
+		return matched_views(plan, from, first, count, use, volume, NULL, err);
 	if (parts) {
 		sum.update = false;
 		CUDA_TRY(cudaMemsetAsync(plan->work, 0, grid_voxels(plan->options.grid) * sizeof(float),

@@ -139,6 +139,7 @@ struct device_view {
 	float moment[3][3];
 	float matrix[3][4]; /* of voxel indices: column * w, row * w, w = depth / depth of the isocentre */
 	float central[2];   /* unit vector, horizontal, from the source to the axis */
+	float source[3];    /* roughly: how steep rays can be at a voxel */
 };
 
 /*
@@ -355,6 +356,14 @@ enum { VIEWS_AT_ONCE = 1024 };
 int backproject_prepare(struct plan *plan, int first, int count, struct error *err);
 void backproject_forget(void);
 int coverage_sum(struct plan *plan, int first, int count, struct error *err);
+
+/* ---- matched.cu ---- */
+/*
+ * The transpose of project_rays, any number of views in one launch. An update has its
+ * column sums by itself; a mere sum adds them to `cover`, unless that is NULL.
+ */
+int matched_views(struct plan *plan, const float *from, int first, int count, struct voxel_use use, float *volume,
+		  float *cover, struct error *err);
 
 /* ---- filter.cu ---- */
 int filter_choose(int columns);

@@ -242,20 +242,23 @@ static struct plan_shape shape_of(const struct plan_options *options, bool lean)
 		subset = largest_subset(&options->sart->subsets);
 	shape.z_rays = has_z_rays(geometry, grid);
 	shape.is_small = (double)grid_voxels(grid) * geometry->count < SMALL;
-	shape.halves = !options->reference_precision && !shape.is_small;
+	/* The transpose is that of the general projection in float, whose weights are its own to the last bits. */
+	shape.halves = !options->reference_precision && !shape.is_small && !options->matched;
 	choose_rows(options, &shape);
 	if (shape.is_small)
-		shape.forward_rows = shape.back_voxels = 0;
+		shape.back_voxels = 0;
+	if (shape.is_small || options->matched)
+		shape.forward_rows = 0;
 	shape.textures = !lean && !shape.is_small && !options->reference_precision && fits &&
 			 wide_columns(options) <= SIDE_MOST && geometry->rows <= SIDE_MOST;
 	shape.lean = lean;
 	shape.batch = at_most(resident_views(options), lean ? (int)BATCH_LEAN : (int)BATCH_MOST);
-	shape.by_view = subset == 1 && columns_shape_make(grid->size).floats < (size_t)1 << 31;
+	shape.by_view = subset == 1 && !options->matched && columns_shape_make(grid->size).floats < (size_t)1 << 31;
 	shape.by_rows = shape.by_view && shape.halves && shape.forward_rows > 0 && !shape.rows_apart;
 	shape.by_subset = subset > 0 && !shape.by_view;
 	shape.correction = shape.by_subset ? (lean ? at_most(subset, BATCH_LEAN) : subset) : 0;
 	shape.parts = shape.correction < (shape.by_subset ? subset : 0);
-	shape.covered = is_covered(geometry, grid);
+	shape.covered = !options->matched && is_covered(geometry, grid);
 	shape.views_at_once = at_most(geometry->count, lean ? (int)BATCH_LEAN : (int)VIEWS_AT_ONCE);
 	if (options->column_weights != NULL) {
 		shape.filter_length = filter_choose(wide_columns(options));
@@ -291,8 +294,11 @@ static int views_laid_out(const struct plan *plan)
 {
 	int views = plan->shape.batch;
 
-	/* Pairs take twice a stack's room: a batch must do. Arrays take all of a subset, to need no sums aside. */
-	if (plan->shape.back_voxels == 0 && plan->shape.correction > views)
+	/*
+	 * Pairs take twice a stack's room: a batch must do. Arrays take all of a subset, to need no sums aside;
+	 * the matched projector's corrections are not laid out.
+	 */
+	if (plan->shape.back_voxels == 0 && plan->shape.correction > views && !plan->options.matched)
 		views = plan->shape.correction;
 	return at_most(views, plan->shape.views_at_once);
 }
@@ -334,13 +340,14 @@ static void plan_describe(struct plan *plan, const struct plan_options *options,
 	plan->raw_views = options->no_samples ? 0 : at_most(plan->raw_views, resident_views(options));
 }
 
-static bool needs_coverage(const struct plan *plan)
-{
-	return plan->shape.by_subset && !plan->shape.covered;
-}
 static bool needs_work(const struct plan *plan)
 {
-	return plan->shape.parts || plan->shape.correction > plan->shape.views_at_once;
+	return plan->shape.parts || (plan->shape.correction > plan->shape.views_at_once && !plan->options.matched);
+}
+/* The matched projector has column sums by itself where a subset goes in one launch. */
+static bool needs_coverage(const struct plan *plan)
+{
+	return plan->shape.by_subset && !plan->shape.covered && (!plan->options.matched || needs_work(plan));
 }
 static size_t pixels_of(const struct plan *plan)
 {
@@ -403,19 +410,10 @@ static bool is_lean(const struct device *device, const struct plan_options *opti
 	return bytes.stack + bytes.volumes + bytes.scratch + bytes.raw > device->limit - device->used;
 }
 
-/* What the CPU does and this backend does not. */
-static int check_supported(const struct plan_options *options, struct error *err)
-{
-	if (options->matched)
-		return error_set(err, ERR_IMPOSSIBLE,
-				 "the CUDA backend does not know the matched projector, the CPU backend does");
-	return 0;
-}
-
 int cuda_plan_bytes(struct device *device, const struct plan_options *options, struct plan_bytes *ret_bytes,
 		    struct error *err)
 {
-	TRY(check_supported(options, err));
+	(void)err;
 	*ret_bytes = bytes_of(options, is_lean(device, options));
 	return 0;
 }
@@ -440,6 +438,8 @@ static struct device_view view_make(const struct geometry *geometry, const struc
 	struct device_view result = {};
 
 	to_voxels(grid, view->source, true, source);
+	for (int i = 0; i < 3; i++)
+		result.source[i] = (float)source[i];
 	for (int i = 0; i < 3; i++)
 		ray[i] = view->pixel0[i] + 0.5 * (geometry->columns - 1) * view->column_step[i] +
 			 0.5 * (geometry->rows - 1) * view->row_step[i] - view->source[i];
@@ -591,7 +591,9 @@ static void summarise(struct plan *plan)
 		snprintf(forward, sizeof(forward), "%s, %d rows a thread%s",
 			 shape->untilted ? "untilted" : "near untilted", shape->forward_rows,
 			 shape->rows_apart ? " apart" : "");
-	if (shape->back_voxels > 0)
+	if (plan->options.matched)
+		snprintf(back, sizeof(back), "matched");
+	else if (shape->back_voxels > 0)
 		snprintf(back, sizeof(back), "untilted, %d voxels a window%s", shape->back_voxels,
 			 shape->back_half ? ", two a row" : "");
 	snprintf(plan->summary, sizeof(plan->summary), "%sforward %s; back %s; %s; %s", shape->lean ? "lean; " : "",
@@ -606,7 +608,6 @@ int cuda_plan_new(struct device *device, const struct plan_options *options, str
 	struct plan *plan;
 	int code;
 
-	TRY(check_supported(options, err));
 	plan = (struct plan *)calloc(1, sizeof(*plan));
 	if (plan == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a plan");

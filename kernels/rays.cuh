@@ -170,15 +170,12 @@ static __device__ __forceinline__ crossing crossing_of(const float d[3], const f
 	return {-m[1] * inverse, m[0] * inverse, d[0] * inverse, d[1] * inverse};
 }
 
-static __device__ __forceinline__ ray ray_make(const crossing &at, const slice_axes &axes)
+/* All of a ray but where it begins and ends. */
+static __device__ __forceinline__ ray ray_line(const crossing &at, const slice_axes &axes)
 {
-	float middle = 0.5f * (float)(axes.across - 1), to = 0.5f * (float)axes.across, from = -to;
-	ray r;
+	float middle = 0.5f * (float)(axes.across - 1);
+	ray r = {};
 
-	clip(at.fast, at.fast_step, 0.5f * (float)axes.fast, from, to);
-	clip(at.row, at.row_step, 0.5f * (float)axes.rows, from, to);
-	r.begin = from + middle;
-	r.end = to + middle;
 	r.fast_step = at.fast_step;
 	r.row_step = at.row_step;
 	r.fast = fmaf(-middle, at.fast_step, at.fast + 0.5f * (float)(axes.fast - 1));
@@ -186,6 +183,18 @@ static __device__ __forceinline__ ray ray_make(const crossing &at, const slice_a
 	r.step = sqrtf(axes.spacing_across * axes.spacing_across +
 		       at.fast_step * axes.spacing_fast * at.fast_step * axes.spacing_fast +
 		       at.row_step * axes.spacing_row * at.row_step * axes.spacing_row);
+	return r;
+}
+
+static __device__ __forceinline__ ray ray_make(const crossing &at, const slice_axes &axes)
+{
+	float middle = 0.5f * (float)(axes.across - 1), to = 0.5f * (float)axes.across, from = -to;
+	ray r = ray_line(at, axes);
+
+	clip(at.fast, at.fast_step, 0.5f * (float)axes.fast, from, to);
+	clip(at.row, at.row_step, 0.5f * (float)axes.rows, from, to);
+	r.begin = from + middle;
+	r.end = to + middle;
 	return r;
 }
 

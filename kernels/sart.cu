@@ -1,7 +1,8 @@
 /*
  * SART, OS-SART and SIRT (core/sart.c has the formula). Row sums are lengths
  * (rays.cuh), column sums are numbers of views where the whole grid is seen, so
- * neither needs memory.
+ * neither needs memory. The matched projector has its own column sums, which
+ * come along with its backprojection (matched.cuh).
  *
  * Updates of several views: forward projection with the correction
  * (p - A v) / L as its result, then backprojection that ends in the update.
@@ -483,13 +484,14 @@ static int update_subset(struct plan *plan, int subset, const float *projections
 	int first = sart->subsets.start[subset], count = sart->subsets.start[subset + 1] - first;
 	struct ray_use rays = {projections, partial, length_least(plan)};
 	struct voxel_use voxels = {};
+	size_t bytes = grid_voxels(plan->options.grid) * sizeof(float);
 
 	voxels.update = true;
 	voxels.nonnegative = sart->nonnegative;
 	voxels.scale = (float)(plan->shape.covered ? sart->relaxation / count : sart->relaxation);
 	voxels.coverage = plan->shape.covered ? NULL : plan->coverage;
 	TRY(layout_slices(plan, volume, err));
-	if (!plan->shape.covered && plan->coverage_subset != subset) {
+	if (!plan->shape.covered && !plan->options.matched && plan->coverage_subset != subset) {
 		TRY(coverage_sum(plan, first, count, err));
 		plan->coverage_subset = sart->subsets.count > 1 ? -1 : subset;
 	}
@@ -500,13 +502,19 @@ static int update_subset(struct plan *plan, int subset, const float *projections
 	/* In parts: the volume stays as it is until all of the subset has been seen. */
 	struct voxel_use sum = voxels;
 	sum.update = false;
-	CUDA_TRY(cudaMemsetAsync(plan->work, 0, grid_voxels(plan->options.grid) * sizeof(float), plan->device->stream));
+	CUDA_TRY(cudaMemsetAsync(plan->work, 0, bytes, plan->device->stream));
+	if (plan->options.matched)
+		CUDA_TRY(cudaMemsetAsync(plan->coverage, 0, bytes, plan->device->stream));
 	for (int done = 0; done < count; done += plan->shape.correction) {
 		int now = count - done < plan->shape.correction ? count - done : plan->shape.correction;
 
 		TRY(project_rays(plan, volume, first + done, now, rays, plan->correction->data, err));
 		rays.partial += project_blocks(plan, now);
-		TRY(backproject_views(plan, plan->correction->data, first + done, now, sum, plan->work, err));
+		if (plan->options.matched)
+			TRY(matched_views(plan, plan->correction->data, first + done, now, sum, plan->work,
+					  plan->coverage, err));
+		else
+			TRY(backproject_views(plan, plan->correction->data, first + done, now, sum, plan->work, err));
 	}
 	return update_volume(plan, voxels, volume, err);
 }
@@ -598,8 +606,8 @@ int cuda_sart_iterate(struct plan *plan, const struct stack *projections, struct
 	const struct sart_options *sart = plan->options.sart;
 	struct device *device = plan->device;
 	int count = plan->options.geometry->count;
-	bool resident =
-	    sart != NULL && sart->subsets.count == 1 && count <= plan->shape.views_at_once && !plan->shape.parts;
+	bool matched = plan->options.matched, one = sart != NULL && sart->subsets.count == 1;
+	bool resident = one && !matched && count <= plan->shape.views_at_once && !plan->shape.parts;
 
 	if (sart == NULL)
 		return error_set(err, ERR_INTERNAL, "the plan was made without SART");
@@ -617,7 +625,7 @@ int cuda_sart_iterate(struct plan *plan, const struct stack *projections, struct
 		if (plan->sweep == NULL || plan->sweep_volume != volume->data ||
 		    plan->sweep_stack != projections->data) {
 			/* With one subset the column sums are made now and not again and again. */
-			if (plan->coverage != NULL && sart->subsets.count == 1 && plan->coverage_subset != 0) {
+			if (plan->coverage != NULL && one && !matched && plan->coverage_subset != 0) {
 				TRY(coverage_sum(plan, 0, count, err));
 				plan->coverage_subset = 0;
 			}

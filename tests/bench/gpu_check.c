@@ -294,6 +294,151 @@ static void check_scene(const struct scene *scene, struct device *devices[2], in
 	free(slots);
 }
 
+/* <a, b> */
+static double inner(const float *a, const float *b, size_t count)
+{
+	double sum = 0;
+
+	for (size_t i = 0; i < count; i++)
+		sum += (double)a[i] * (double)b[i];
+	return sum;
+}
+
+/* Corners, edges, faces and the middle of the grid, by 0 .. 26. */
+static size_t some_voxel(const struct grid *grid, int index)
+{
+	static const int digits[3] = {1, 3, 9};
+	size_t voxel = 0;
+
+	for (int i = 2; i >= 0; i--) {
+		const int place = index / digits[i] % 3, last = grid->size[i] - 1;
+
+		voxel = voxel * (size_t)grid->size[i] + (size_t)(place == 0 ? 0 : place == 1 ? (last + 1) / 2 : last);
+	}
+	return voxel;
+}
+
+/* A^T y to `ret`. */
+static void backproject_matched(struct side *side, const struct scene *scene, const float *y, const int *views,
+				float *ret)
+{
+	struct error err = {0};
+
+	must(side->backend->stack_upload(side->stack, 0, scene->geometry.count, y, &err), &err, "upload");
+	must(side->backend->volume_fill(side->volume, 0, &err), &err, "fill");
+	must(side->backend->backproject(side->plan, side->stack, views, scene->geometry.count, BACKPROJECT_PLAIN,
+					side->volume, &err),
+	     &err, "backproject");
+	read_volume(side, scene, ret);
+}
+
+/* A x to `ret`. */
+static void project_matched(struct side *side, const struct scene *scene, const float *x, const int *views, float *ret)
+{
+	struct error err = {0};
+
+	must(side->backend->volume_upload(side->volume, x, &err), &err, "upload");
+	must(side->backend->project(side->plan, side->volume, views, scene->geometry.count, side->result, &err), &err,
+	     "project");
+	read_stack(side, scene, ret);
+}
+
+static void iterate_matched(struct side *side, const struct scene *scene, float *ret)
+{
+	struct sart_sums sums;
+	struct error err = {0};
+
+	must(side->backend->volume_fill(side->volume, 0, &err), &err, "fill");
+	for (int i = 0; i < 2; i++)
+		must(side->backend->sart_iterate(side->plan, side->stack, side->volume, NULL, &sums, &err), &err,
+		     "sart");
+	read_volume(side, scene, ret);
+}
+
+/*
+ * The matched pair: <A x, y> = <x, A^T y> for noise, and row by row of the transpose
+ * for some voxels; the transpose is the CPU's, and so is SART by it; the same bits
+ * again. Both precisions are float here.
+ */
+static void check_matched(const struct scene *scene, struct device *devices[2], int subsets, bool reference)
+{
+	const struct backend *backends_here[2] = {&backend_cpu, &backend_cuda};
+	const struct geometry *geometry = &scene->geometry;
+	const size_t voxels = grid_voxels(&scene->grid);
+	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows * (size_t)geometry->count;
+	struct sart_options sart = {.relaxation = 0.9, .nonnegative = true};
+	struct plan_options options = scene_plan(scene, &sart, subsets, NULL, reference);
+	float *x = malloc(voxels * sizeof(float)), *y = malloc(pixels * sizeof(float)), *seen[2], *spread[2], *again;
+	int *views = all_views(geometry->count), *slots = all_views(geometry->count);
+	double forward, backward, adjoint, rows = 0, most = 0, transpose, iterated;
+	struct side sides[2];
+
+	options.matched = true;
+	fill_random(x, voxels, 21);
+	fill_random(y, pixels, 22);
+	for (int s = 0; s < 2; s++) {
+		seen[s] = malloc(pixels * sizeof(float));
+		spread[s] = malloc(voxels * sizeof(float));
+		side_open(&sides[s], backends_here[s], devices[s], &options);
+		project_matched(&sides[s], scene, x, views, seen[s]);
+		backproject_matched(&sides[s], scene, y, views, spread[s]);
+	}
+	forward = inner(seen[1], y, pixels);
+	backward = inner(x, spread[1], voxels);
+	adjoint = apart(forward, backward);
+	expect(scene, "adjoint", adjoint, 1e-5);
+	expect(scene, "matched project", difference(seen[1], seen[0], pixels), REFERENCE);
+	transpose = difference(spread[1], spread[0], voxels);
+	expect(scene, "matched backproject", transpose, REFERENCE);
+	again = malloc(voxels * sizeof(float));
+	backproject_matched(&sides[1], scene, y, views, again);
+	expect(scene, "its bits", memcmp(again, spread[1], voxels * sizeof(float)) != 0, 0);
+	for (size_t i = 0; i < voxels; i++)
+		most = fmax(most, fabs((double)spread[1][i]));
+	for (int k = 0; k < 27; k += 2) {
+		const size_t at = some_voxel(&scene->grid, k);
+
+		memset(again, 0, voxels * sizeof(float));
+		again[at] = 1;
+		project_matched(&sides[1], scene, again, views, seen[1]);
+		forward = inner(seen[1], y, pixels);
+		rows = fmax(rows, fabs(forward - (double)spread[1][at]) / fmax(most, 1e-30));
+	}
+	expect(scene, "rows of the transpose", rows, REFERENCE);
+
+	/* From zero against a projection, so that it does not just fit noise. */
+	for (int i = 0; i < geometry->count; i++)
+		slots[i] = i;
+	project_matched(&sides[0], scene, x, slots, seen[0]);
+	for (int s = 0; s < 2; s++) {
+		struct error err = {0};
+
+		must(sides[s].backend->stack_upload(sides[s].stack, 0, geometry->count, seen[0], &err), &err, "upload");
+		iterate_matched(&sides[s], scene, spread[s]);
+	}
+	iterated = difference(spread[1], spread[0], voxels);
+	/* A single ray goes through centres of voxels: whether its neighbours have 1e-8 of it or nothing is rounding.
+	 */
+	if (geometry->columns * geometry->rows > 1)
+		expect(scene, "matched SART", iterated, 2 * REFERENCE);
+	iterate_matched(&sides[1], scene, again);
+	expect(scene, "matched SART's bits", memcmp(again, spread[1], voxels * sizeof(float)) != 0, 0);
+	printf("%-34s matched, %3d subsets: adjoint %.1e, rows %.1e, back %.1e, SART %.1e  [%s]\n", scene->name,
+	       subsets, adjoint, rows, transpose, iterated, backend_cuda.plan_summary(sides[1].plan));
+	fflush(stdout);
+	for (int s = 0; s < 2; s++) {
+		side_close(&sides[s]);
+		free(seen[s]);
+		free(spread[s]);
+	}
+	subsets_clear(&sart.subsets);
+	free(again);
+	free(x);
+	free(y);
+	free(views);
+	free(slots);
+}
+
 static bool same_counts(const struct defect_counts *a, const struct defect_counts *b)
 {
 	return a->mapped == b->mapped && a->not_finite == b->not_finite && a->saturated == b->saturated &&
@@ -584,7 +729,8 @@ static void check_memory(struct device *device)
 {
 	const double page = 2 << 20; /* what the driver rounds an allocation up to */
 
-	for (size_t k = 0; k < sizeof(kinds) / sizeof(kinds[0]); k++) {
+	for (size_t i = 0; i < 2 * sizeof(kinds) / sizeof(kinds[0]); i++) {
+		const size_t k = i / 2;
 		struct sart_options sart = {.relaxation = 1};
 		struct tv_options tv = {.method = TV_PROXIMAL, .alpha = 1, .step = .1, .iterations = 2, .unit = 1};
 		struct device_info before, during, after;
@@ -596,6 +742,7 @@ static void check_memory(struct device *device)
 
 		scene_make(&scene, kinds[k].name, &kinds[k].options);
 		options = scene_plan(&scene, &sart, kinds[k].subsets, &tv, false);
+		options.matched = i % 2 == 1;
 		must(backend_cuda.plan_bytes(NULL, &options, &bytes, &err), &err, "plan_bytes");
 		/* The first one may load a library's code, which stays. */
 		must(backend_cuda.plan_new(device, &options, &plan, &err), &err, "plan");
@@ -614,8 +761,36 @@ static void check_memory(struct device *device)
 	}
 }
 
+/* Grids that the orbit's axis or the detector miss: many rays or voxels have nobody, in `above` all. */
+static void check_matched_beside(struct device *devices[2])
+{
+	static const struct {
+		const char *name;
+		double x, z;
+	} places[] = {{"aside", 300, 0}, {"half above", 0, 70}, {"above", 0, 400}};
+
+	for (size_t k = 0; k < sizeof(places) / sizeof(places[0]); k++) {
+		const struct scene_options at = {.columns = 61,
+						 .rows = 43,
+						 .views = 17,
+						 .arc = TURN,
+						 .pixel = {3, 3},
+						 .size = {33, 31, 29},
+						 .spacing = {1.1, .9, 1.3},
+						 .bend = BEND_TILTED};
+		struct scene scene;
+
+		scene_make(&scene, places[k].name, &at);
+		scene.grid.origin[0] += places[k].x;
+		scene.grid.origin[2] += places[k].z;
+		check_matched(&scene, devices, 3, true);
+		scene_clear(&scene);
+	}
+}
+
 /* FDK and ten SART iterations of the head through core/recon.c, on both sides. */
-static void check_recon(struct device *devices[2], enum bend bend, bool reference, bool tv, double tolerance)
+static void check_recon(struct device *devices[2], enum bend bend, bool reference, bool tv, bool matched,
+			double tolerance)
 {
 	const struct scene_options at = {.columns = 128,
 					 .rows = 110,
@@ -638,8 +813,8 @@ static void check_recon(struct device *devices[2], enum bend bend, bool referenc
 	double rms = 0;
 	char name[64];
 
-	snprintf(name, sizeof(name), "head, %s%s%s", bend_names[bend], reference ? ", reference" : "",
-		 tv ? ", TV" : "");
+	snprintf(name, sizeof(name), "head, %s%s%s%s", bend_names[bend], reference ? ", reference" : "",
+		 tv ? ", TV" : "", matched ? ", matched" : "");
 	scene_make(&scene, name, &at);
 	voxels = grid_voxels(&scene.grid);
 	must(phantom_named(&head, "head", 34, .0192, &err), &err, "head");
@@ -654,6 +829,7 @@ static void check_recon(struct device *devices[2], enum bend bend, bool referenc
 	recipe.tv.on = tv;
 	recipe.sart.iterations = 10;
 	recipe.reference_precision = reference;
+	recipe.projector = matched ? PROJECTOR_MATCHED : PROJECTOR_INTERPOLATING;
 	for (int s = 0; s < 2; s++) {
 		struct recon *recon;
 
@@ -681,7 +857,7 @@ static void check_recon(struct device *devices[2], enum bend bend, bool referenc
 }
 
 /* A device that is too small for the job has it in parts: what the whole gives, and the same bits again. */
-static void check_parts(bool tv, bool untilted)
+static void check_parts(bool tv, bool untilted, bool matched)
 {
 	const struct scene_options at = {.columns = 257,
 					 .rows = 193,
@@ -702,7 +878,7 @@ static void check_parts(bool tv, bool untilted)
 	float *raw = malloc(pixels * (size_t)at.views * sizeof(float)), *got[3];
 	int *views = all_views(at.views);
 
-	scene_make(&scene, tv ? "in parts, TV" : "in parts", &at);
+	scene_make(&scene, matched ? "in parts, matched" : tv ? "in parts, TV" : "in parts", &at);
 	voxels = grid_voxels(&scene.grid);
 	must(phantom_named(&head, "head", 42, .0192, &err), &err, "head");
 	for (int i = 0; i < at.views; i++)
@@ -711,14 +887,16 @@ static void check_parts(bool tv, bool untilted)
 	recipe.has_grid = recipe.has_origin = true;
 	recipe.grid = scene.grid;
 	recipe.fdk.on = true;
-	recipe.sart.on = tv;
+	recipe.sart.on = tv || matched;
+	recipe.projector = matched ? PROJECTOR_MATCHED : PROJECTOR_INTERPOLATING;
 	recipe.sart.iterations = 2;
 	recipe.sart.subsets = 4;
 	recipe.tv.on = tv;
 	recipe.reference_precision = true;
 	must(recon_memory(&backend_cuda, NULL, &scene.geometry, &recipe, &memory, &err), &err, "memory");
 	for (int s = 0; s < 3; s++) {
-		const struct device_options limit = {.memory_limit = s == 0 ? 0 : memory.total / (tv ? 4 : 2)};
+		const struct device_options limit = {.memory_limit =
+							 s == 0 ? 0 : memory.total / (tv || matched ? 4 : 2)};
 		struct device *device;
 		struct recon *recon;
 
@@ -738,7 +916,7 @@ static void check_parts(bool tv, bool untilted)
 		backend_cuda.close(device);
 	}
 	printf("%-34s difference %.1e\n", scene.name, difference(got[1], got[0], voxels));
-	expect(&scene, "parts", difference(got[1], got[0], voxels), tv ? 1e-4 : 1e-5);
+	expect(&scene, "parts", difference(got[1], got[0], voxels), tv || matched ? 1e-4 : 1e-5);
 	expect(&scene, "the same bits", memcmp(got[1], got[2], voxels * sizeof(float)) != 0, 0);
 	for (int s = 0; s < 3; s++)
 		free(got[s]);
@@ -833,7 +1011,7 @@ static void check_large(void)
 }
 
 /* A plan that is short of memory takes its work in parts and gives the same volume. */
-static void check_lean(void)
+static void check_lean(bool matched)
 {
 	const struct scene_options at = {.columns = 150,
 					 .rows = 140,
@@ -849,7 +1027,7 @@ static void check_lean(void)
 	struct error err = {0};
 	size_t voxels, pixels = (size_t)at.columns * (size_t)at.rows * (size_t)at.views;
 
-	scene_make(&scene, "lean", &at);
+	scene_make(&scene, matched ? "lean, matched" : "lean", &at);
 	voxels = grid_voxels(&scene.grid);
 	stack = malloc(pixels * sizeof(float));
 	fill_random(stack, pixels, 9);
@@ -863,6 +1041,7 @@ static void check_lean(void)
 		struct defect_counts defects = {0};
 		int *slots = malloc(sizeof(int) * (size_t)at.views);
 
+		options.matched = matched;
 		must(backend_cuda.plan_bytes(NULL, &options, &bytes, &err), &err, "bytes");
 		/* just too little for the plan at its ease */
 		must(backend_cuda.open(0,
@@ -942,6 +1121,7 @@ static void check_briefly(struct device *devices[2])
 				options.views = options.views > 7 ? 7 : options.views;
 				scene_make(&scene, kinds[i].name, &options);
 				check_scene(&scene, devices, kinds[i].subsets > 7 ? 7 : kinds[i].subsets, b > 0);
+				check_matched(&scene, devices, kinds[i].subsets > 7 ? 7 : kinds[i].subsets, b > 0);
 				scene_clear(&scene);
 			}
 	check_counts(devices, true);
@@ -990,6 +1170,8 @@ int main(int argc, char **argv)
 			scene_make(&scene, name, &options);
 			check_scene(&scene, devices, kinds[k].subsets, true);
 			check_scene(&scene, devices, kinds[k].subsets, false);
+			check_matched(&scene, devices, kinds[k].subsets, true);
+			check_matched(&scene, devices, kinds[k].subsets, false);
 			scene_clear(&scene);
 		}
 	}
@@ -1019,15 +1201,21 @@ int main(int argc, char **argv)
 	check_transfers(devices[1]);
 	check_memory(devices[1]);
 	check_limit();
-	check_recon(devices, BEND_NONE, true, false, 1e-4);
-	check_recon(devices, BEND_TILTED, true, false, 1e-4);
+	check_recon(devices, BEND_NONE, true, false, false, 1e-4);
+	check_recon(devices, BEND_TILTED, true, false, false, 1e-4);
 	for (int bend = 0; bend < BEND_STEEP; bend++)
-		check_recon(devices, (enum bend)bend, false, false, 5e-3);
-	check_recon(devices, BEND_NONE, false, true, 2e-3);
-	check_lean();
-	check_parts(false, true);
-	check_parts(false, false);
-	check_parts(true, false);
+		check_recon(devices, (enum bend)bend, false, false, false, 5e-3);
+	check_recon(devices, BEND_NONE, false, true, false, 2e-3);
+	for (int bend = 0; bend < BEND_COUNT; bend++)
+		check_recon(devices, (enum bend)bend, true, false, true, 1e-4);
+	check_recon(devices, BEND_TILTED, false, false, true, 5e-3);
+	check_matched_beside(devices);
+	check_lean(false);
+	check_lean(true);
+	check_parts(false, true, false);
+	check_parts(false, false, false);
+	check_parts(true, false, false);
+	check_parts(false, false, true);
 	backend_cuda.describe(devices[1], &after);
 	if (before.bytes_free - after.bytes_free > (size_t)64 << 20 && after.bytes_free < before.bytes_free) {
 		printf("FAILED  %.1f MiB of device memory did not come back\n",

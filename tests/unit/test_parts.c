@@ -137,17 +137,21 @@ static const struct {
 	bool fdk, sart;
 	int subsets, tv; /* TV: -1 none, else the method */
 	double tolerance;
+	bool matched;
 } cases[] = {
-    {"FDK", &full, true, false, 0, -1, 1e-6},
-    {"FDK, cut off", &narrow, true, false, 0, -1, 1e-6},
-    {"OS-SART, cut off", &narrow, true, true, 4, -1, 1e-4},
-    {"FDK, displaced", &displaced, true, false, 0, -1, 1e-6},
-    {"SIRT", &full, false, true, 1, -1, 1e-5},
-    {"OS-SART", &full, true, true, 4, -1, 1e-5},
-    {"by view", &full, false, true, SUBSETS_VIEWS, -1, 1e-5},
-    {"seen in part", &displaced, false, true, 3, -1, 1e-5},
-    {"TV by steps", &full, true, true, 4, TV_GRADIENT, 1e-4},
-    {"proximal TV", &full, true, true, 4, TV_PROXIMAL, 1e-4},
+    {"FDK", &full, true, false, 0, -1, 1e-6, false},
+    {"FDK, cut off", &narrow, true, false, 0, -1, 1e-6, false},
+    {"OS-SART, cut off", &narrow, true, true, 4, -1, 1e-4, false},
+    {"FDK, displaced", &displaced, true, false, 0, -1, 1e-6, false},
+    {"SIRT", &full, false, true, 1, -1, 1e-5, false},
+    {"OS-SART", &full, true, true, 4, -1, 1e-5, false},
+    {"by view", &full, false, true, SUBSETS_VIEWS, -1, 1e-5, false},
+    {"matched", &full, true, true, 4, -1, 1e-5, true},
+    {"matched, by view", &full, false, true, SUBSETS_VIEWS, -1, 1e-5, true},
+    {"matched, seen in part", &displaced, false, true, 3, -1, 1e-5, true},
+    {"seen in part", &displaced, false, true, 3, -1, 1e-5, false},
+    {"TV by steps", &full, true, true, 4, TV_GRADIENT, 1e-4, false},
+    {"proximal TV", &full, true, true, 4, TV_PROXIMAL, 1e-4, false},
 };
 
 START_TEST(parts_give_what_the_whole_gives)
@@ -164,6 +168,7 @@ START_TEST(parts_give_what_the_whole_gives)
 	recipe.fdk.on = cases[_i].fdk;
 	recipe.sart.on = cases[_i].sart;
 	recipe.sart.subsets = cases[_i].subsets;
+	recipe.projector = cases[_i].matched ? PROJECTOR_MATCHED : PROJECTOR_INTERPOLATING;
 	recipe.sart.iterations = 2;
 	recipe.emit = emit;
 	recipe.emits = cases[_i].fdk ? 1 : 0;
