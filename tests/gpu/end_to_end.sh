@@ -50,6 +50,14 @@ for name in fdk final; do
 	rms=$(cbct compare "$work/$name.nii" "$work/cpu/$name.nii" --hu --json | tr ',{' '\n\n' | sed -n 's/.*"rmse": *//p' | head -1)
 	check "$name is the CPU's within 0.5 HU RMS ($rms)" below "${rms:-nan}" 0.5
 done
+# The matched pair: the volume beside the CPU's, and the plan that the job's document names.
+matched=(--grid 128 --spacing 0.75 --sart 10 --subsets 10 --projector matched)
+job=$(cbct submit "$scan" "${matched[@]}" --wait 2>>"$work/watch" | tail -1)
+cbct recon "$work/scan" "${matched[@]}" --backend cpu -o "$work/cpu-matched" --quiet >/dev/null
+cbct get "$job" final -o "$work/matched.nii" >/dev/null
+rms=$(cbct compare "$work/matched.nii" "$work/cpu-matched/final.nii" --hu --json | tr ',{' '\n\n' | sed -n 's/.*"rmse": *//p' | head -1)
+check "the matched pair's volume is the CPU's within 0.5 HU RMS ($rms)" below "${rms:-nan}" 0.5
+check "the job was done by the matched pair" grep -q "back matched" <(cbct jobs --limit 1 --json)
 again=$(cbct submit "$scan" "${recipe[@]}" --tv gradient --wait 2>>"$work/watch" | tail -1)
 third=$(cbct submit "$scan" "${recipe[@]}" --tv gradient --wait 2>>"$work/watch" | tail -1)
 cbct get "$again" final -o "$work/a.nii" >/dev/null && cbct get "$third" final -o "$work/b.nii" >/dev/null
