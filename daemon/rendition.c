@@ -9,14 +9,12 @@
 #include <string.h>
 #include <unistd.h>
 
-#include <openssl/evp.h>
-
 #include "daemon/log.h"
+#include "daemon/sink.h"
 
 enum {
 	THREADS_MAX = 8,
-	WORKERS = 2,      /* that compress, while the maker's thread reads, converts, hashes and writes */
-	BLOCK = 256 << 10 /* bytes: stays in the second-level cache between making, hashing and writing */
+	WORKERS = 2 /* that compress, while the maker's thread reads and converts, and its sink hashes and writes */
 };
 static const int idle_max = 8;
 static const uint64_t idle_bytes_max = 1ull << 30;
@@ -58,14 +56,6 @@ static void rendition_free(struct rendition *rendition)
 
 /* ---- making one ---- */
 
-struct maker {
-	struct rendition *rendition;
-	EVP_MD_CTX *hash;
-	int file; /* -1: the kept file is sent as it is, only its digest is wanted */
-	uint64_t size;
-	char block[BLOCK];
-};
-
 /* Nobody waits for it any more, or the daemon stops. */
 static bool is_unwanted(struct rendition *rendition)
 {
@@ -78,58 +68,41 @@ static bool is_unwanted(struct rendition *rendition)
 	return unwanted;
 }
 
-static int put(struct maker *maker, size_t size, struct error *err)
-{
-	if (EVP_DigestUpdate(maker->hash, maker->block, size) != 1)
-		return error_set(err, ERR_INTERNAL, "a digest cannot be made");
-	for (size_t done = 0; maker->file >= 0 && done < size;) {
-		ssize_t put = pwrite(maker->file, maker->block + done, size - done, (off_t)(maker->size + done));
-
-		if (put < 0 && errno != EINTR)
-			return error_set_errno(err, errno, "write a volume to be streamed");
-		done += put > 0 ? (size_t)put : 0;
-	}
-	maker->size += size;
-	return 0;
-}
-
-/* Takes the content. */
-static int make_plain(struct maker *maker, struct content *content, struct error *err)
-{
-	ssize_t got = 1;
-	int code = 0;
-
-	while (code == 0 && got > 0) {
-		if (is_unwanted(maker->rendition))
-			code = error_set(err, ERR_CANCELLED, "nobody waits for it");
-		else if ((got = content_read(content, maker->size, maker->block, BLOCK)) < 0)
-			code = error_set(err, ERR_IO, "the volume's file cannot be read");
-		else
-			code = put(maker, (size_t)got, err);
-	}
-	content_close(content);
-	return code;
-}
-
-/* Takes the content. */
-static int make_zstd(struct maker *maker, struct content *content, struct error *err)
-{
+/* Reads on where it stands: of the content, or of what it is compressed to. */
+struct source {
+	struct content *content; /* NULL: the stream has it */
 	struct content_stream *stream;
-	ssize_t got = 1;
-	int code = content_stream_new(content, WORKERS, &stream, err);
+	uint64_t offset;
+};
 
-	if (code != 0)
-		return code;
-	while (code == 0 && got > 0) {
-		if (is_unwanted(maker->rendition))
-			code = error_set(err, ERR_CANCELLED, "nobody waits for it");
-		else if ((got = content_stream_read(stream, maker->block, BLOCK)) < 0)
-			code = error_set(err, ERR_IO, "the volume cannot be compressed");
-		else
-			code = put(maker, (size_t)got, err);
+static ssize_t source_read(struct source *source, void *to, size_t size)
+{
+	ssize_t got = source->stream != NULL ? content_stream_read(source->stream, to, size)
+					     : content_read(source->content, source->offset, to, size);
+
+	source->offset += got > 0 ? (uint64_t)got : 0;
+	return got;
+}
+
+/* All of it. */
+static int pour(struct rendition *rendition, struct source *source, struct sink *sink, struct error *err)
+{
+	ssize_t got = 1;
+
+	while (got > 0) {
+		char *room = sink_room(sink);
+
+		if (room == NULL)
+			return 0; /* the sink tells why */
+		if (is_unwanted(rendition))
+			return error_set(err, ERR_CANCELLED, "nobody waits for it");
+		got = source_read(source, room, SINK_BLOCK);
+		if (got < 0)
+			return error_set(err, ERR_IO, "the volume cannot be read or compressed");
+		if (got > 0)
+			sink_put(sink, (size_t)got);
 	}
-	content_stream_free(stream);
-	return code;
+	return 0;
 }
 
 static int open_spool(struct rendition *rendition, int *ret_file, struct error *err)
@@ -147,53 +120,48 @@ static int open_spool(struct rendition *rendition, int *ret_file, struct error *
 	return 0;
 }
 
-static int make(struct maker *maker, struct rendition_facts *ret, struct error *err)
+/* Its descriptor is the caller's to close, also after a failure. */
+static int make(struct rendition *rendition, struct rendition_facts *ret, struct error *err)
 {
-	struct rendition *rendition = maker->rendition;
-	struct content *content;
+	struct source source = {0};
+	struct sink *sink = NULL;
 	char path[1024];
-	int code, own = -1;
+	bool as_it_is;
+	int code;
 
 	store_volume_path(rendition->owner->store, rendition->job, rendition->volume.name, path);
-	code = content_open(path, &rendition->volume.grid, &rendition->options, &content, err);
+	code = content_open(path, &rendition->volume.grid, &rendition->options, &source.content, err);
 	if (code != 0)
 		return code;
 	if (!rendition->zstd)
-		own = content_descriptor(content, &ret->offset);
-	if (own < 0 && (code = open_spool(rendition, &maker->file, err)) != 0) {
-		content_close(content);
-		return code;
+		ret->descriptor = content_descriptor(source.content, &ret->offset);
+	as_it_is = ret->descriptor >= 0; /* only its digest is wanted */
+	if (!as_it_is)
+		code = open_spool(rendition, &ret->descriptor, err);
+	if (code == 0 && rendition->zstd) {
+		code = content_stream_new(source.content, WORKERS, &source.stream, err);
+		source.content = NULL;
 	}
-	code = rendition->zstd ? make_zstd(maker, content, err) : make_plain(maker, content, err);
-	if (code == 0 && EVP_DigestFinal_ex(maker->hash, ret->sha256, NULL) != 1)
-		code = error_set(err, ERR_INTERNAL, "a digest cannot be made");
-	ret->descriptor = own >= 0 ? own : maker->file;
-	ret->size = maker->size;
+	if (code == 0)
+		code = sink_new(as_it_is ? -1 : ret->descriptor, &sink, err);
+	if (code == 0)
+		code = pour(rendition, &source, sink, err);
+	if (code == 0)
+		code = sink_end(sink, &ret->size, ret->sha256, err);
+	sink_free(sink);
+	content_stream_free(source.stream);
+	content_close(source.content);
 	return code;
 }
 
 static void make_one(struct rendition *rendition)
 {
 	struct rendition_facts facts = {.descriptor = -1};
-	struct maker *maker = malloc(sizeof(*maker));
 	struct error err = {0};
-	int code;
+	int code = make(rendition, &facts, &err);
 
-	if (maker != NULL) {
-		maker->rendition = rendition;
-		maker->hash = EVP_MD_CTX_new();
-		maker->file = -1;
-		maker->size = 0;
-	}
-	if (maker == NULL || maker->hash == NULL || EVP_DigestInit_ex(maker->hash, EVP_sha256(), NULL) != 1)
-		code = error_set(&err, ERR_NO_MEMORY, "no memory for a volume to be streamed");
-	else
-		code = make(maker, &facts, &err);
 	if (code != 0 && code != ERR_CANCELLED)
 		log_line(LEVEL_WARNING, "job %s, volume %s: %s", rendition->job, rendition->volume.name, err.text);
-	if (maker != NULL)
-		EVP_MD_CTX_free(maker->hash);
-	free(maker);
 	if (code != 0 && facts.descriptor >= 0)
 		close(facts.descriptor);
 	if (code != 0)
