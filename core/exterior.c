@@ -5,11 +5,13 @@
 
 #include "core/extend.h"
 #include "core/fdk.h"
+#include "core/outside.h"
 
 /* One view on the host: line integrals as measured and through the volume. */
 struct pair {
 	int columns, rows;
 	const int *pad;
+	const struct faces *faces;   /* NULL: nobody knows */
 	float *measured, *explained; /* [row][column], owned */
 	double *smooth;              /* [row][column], owned */
 };
@@ -67,26 +69,53 @@ static void subtract_row(float *measured, const float *explained, double *smooth
 		measured[c] = (float)((double)measured[c] - smooth[c]);
 }
 
-/* Returns whether any row was truncated. */
-static bool subtract_view(const struct pair *pair)
+/* Returns whether any row was changed; adds those that were not truncated. */
+static bool subtract_view(const struct pair *pair, const struct view *view, size_t *outside)
 {
-	int truncated = 0;
+	size_t truncated = 0, counting = 0;
 
-#pragma omp parallel for schedule(static) reduction(+ : truncated)
+#pragma omp parallel for schedule(static) reduction(+ : truncated, counting)
 	for (int r = 0; r < pair->rows; r++) {
 		const size_t at = (size_t)r * (size_t)pair->columns;
 
-		if (!is_truncated(pair, pair->measured + at))
+		if (is_truncated(pair, pair->measured + at))
+			truncated++;
+		else if (pair->faces != NULL &&
+			 faces_row_counts_outside(pair->faces, view, pair->columns, r, pair->measured + at))
+			counting++;
+		else
 			continue;
 		subtract_row(pair->measured + at, pair->explained + at, pair->smooth + at, pair->columns);
-		truncated++;
 	}
-	return truncated > 0;
+	*outside += counting;
+	return truncated + counting > 0;
+}
+
+int exterior_is_possible(const struct geometry *geometry, const struct grid *grid, const struct backend *backend,
+			 struct stack *projections, bool *ret_possible, struct error *err)
+{
+	float *measured = malloc((size_t)geometry->columns * (size_t)geometry->rows * sizeof(float));
+	bool possible = false;
+	int code = 0;
+
+	if (measured == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a view of %d x %d pixels", geometry->columns,
+				 geometry->rows);
+	for (int view = 0; view < geometry->count && !possible && code == 0; view++) {
+		code = backend->stack_download(projections, view, 1, measured, err);
+		if (code == 0)
+			possible = outside_is_possible(grid, &geometry->views[view], geometry->columns, geometry->rows,
+						       measured);
+	}
+	free(measured);
+	if (code == 0)
+		*ret_possible = possible;
+	return code;
 }
 
 int exterior_subtract(const struct backend *backend, struct device *device, struct plan *plan,
-		      const struct geometry *geometry, const int pad[2], const struct volume *volume,
-		      struct stack *projections, struct error *err)
+		      const struct geometry *geometry, const int pad[2], const struct grid *grid, struct volume *volume,
+		      struct stack *projections, size_t *ret_outside, struct error *err)
 {
 	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
 	struct pair pair = {
@@ -97,12 +126,18 @@ int exterior_subtract(const struct backend *backend, struct device *device, stru
 	    .explained = malloc(pixels * sizeof(float)),
 	    .smooth = malloc(pixels * sizeof(double)),
 	};
+	struct faces faces = {0};
 	struct stack *batch = NULL;
+	size_t outside = 0;
 	int views[FDK_BATCH_MOST], slots = geometry->count < FDK_BATCH_MOST ? geometry->count : FDK_BATCH_MOST;
 	int code = 0;
 
 	if (pair.measured == NULL || pair.explained == NULL || pair.smooth == NULL)
 		code = error_set(err, ERR_NO_MEMORY, "no memory for a view of %d x %d pixels", pair.columns, pair.rows);
+	if (code == 0 && grid != NULL) {
+		code = faces_make(&faces, backend, volume, grid, err);
+		pair.faces = &faces;
+	}
 	if (code == 0)
 		code = backend->stack_new(device, pair.columns, pair.rows, slots, &batch, err);
 	/* Several at a time: a pass over the volume costs as much as some views do. */
@@ -117,10 +152,13 @@ int exterior_subtract(const struct backend *backend, struct device *device, stru
 			code = backend->stack_download(batch, slot, 1, pair.explained, err);
 		if (code == 0)
 			code = backend->stack_download(projections, view, 1, pair.measured, err);
-		if (code == 0 && subtract_view(&pair))
+		if (code == 0 && subtract_view(&pair, &geometry->views[view], &outside))
 			code = backend->stack_upload(projections, view, 1, pair.measured, err);
 	}
+	if (code == 0)
+		*ret_outside = outside;
 	backend->stack_free(batch);
+	faces_clear(&faces);
 	free(pair.measured);
 	free(pair.explained);
 	free(pair.smooth);

@@ -741,24 +741,11 @@ static int find_truncation(struct recon *recon, bool *ret_truncated, struct erro
 	return code;
 }
 
-/*
- * Where FDK extends rows, what lies outside of the grid is taken out of the
- * projections before SART sees them. FDK runs once more for it, over the stack
- * and in the order of the views, so that a run that goes on from an iterate
- * gives the same bits. The iterate waits in `before`, which the first iteration
- * writes anyway.
- */
-static int leave_out_the_exterior(struct recon *recon, struct error *err)
+/* FDK once more, over the stack and in the order of the views. */
+static int run_fdk_again(struct recon *recon, struct error *err)
 {
-	const struct backend *backend = recon->backend;
-	bool truncated = false;
-	int code = recon->weights.extend > 0 ? find_truncation(recon, &truncated, err) : 0;
+	int code = recon->backend->volume_fill(recon->volume, 0, err);
 
-	if (code < 0 || !truncated)
-		return code;
-	code = backend->volume_copy(recon->before, recon->volume, err);
-	if (code == 0)
-		code = backend->volume_fill(recon->volume, 0, err);
 	for (int view = 0; view < recon->geometry->count && code == 0; view++) {
 		code = check_cancelled(recon, err);
 		if (code == 0)
@@ -768,9 +755,38 @@ static int leave_out_the_exterior(struct recon *recon, struct error *err)
 		code = fdk_flush(&recon->fdk, recon->projections, recon->volume, err);
 	if (code == 0)
 		code = make_up_for_blank_views(recon, err);
+	return code;
+}
+
+/*
+ * Where FDK extends rows, or the object goes on outside of the grid, that is
+ * taken out of the projections before SART sees them. FDK runs again for it
+ * also when its volume is still there, so that a run that goes on from an
+ * iterate gives the same bits. The iterate waits in `before`, which the first
+ * iteration writes anyway.
+ */
+static int leave_out_the_exterior(struct recon *recon, struct error *err)
+{
+	const struct backend *backend = recon->backend;
+	/* An FDK volume that is too low in many places looks as if something were missing from it. */
+	const bool sound = !recon->orbit.arc_too_short && recon->orbit.tilt < 0.1;
+	const struct grid *grid = sound ? &recon->recipe.grid : NULL;
+	bool wanted = false;
+	size_t outside;
+	int code = recon->weights.extend > 0 ? find_truncation(recon, &wanted, err) : 0;
+
+	if (code == 0 && recon->weights.extend > 0 && !wanted && grid != NULL)
+		code = exterior_is_possible(recon->geometry, grid, backend, recon->projections, &wanted, err);
+	if (code < 0 || !wanted)
+		return code;
+	code = backend->volume_copy(recon->before, recon->volume, err);
 	if (code == 0)
-		code = exterior_subtract(backend, recon->device, recon->plan, recon->geometry, recon->weights.pad,
-					 recon->volume, recon->projections, err);
+		code = run_fdk_again(recon, err);
+	if (code == 0)
+		code = exterior_subtract(backend, recon->device, recon->plan, recon->geometry, recon->weights.pad, grid,
+					 recon->volume, recon->projections, &outside, err);
+	if (code == 0)
+		warn_outside(recon->hooks, recon->geometry, outside);
 	if (code == 0)
 		code = backend->volume_copy(recon->volume, recon->before, err);
 	return code;

@@ -76,6 +76,17 @@ void warn_truncated(const struct recon_hooks *hooks, const struct geometry *geom
 	    100 * (double)rows[0] / all, 100 * (double)rows[1] / all, extend);
 }
 
+void warn_outside(const struct recon_hooks *hooks, const struct geometry *geometry, size_t rows)
+{
+	if (rows == 0)
+		return;
+	recon_warn(
+	    hooks, "outside_grid",
+	    "the object goes on outside of the grid: what FDK does not explain of %.3g %% of the rows was taken out "
+	    "of them for SART, which keeps FDK's means there",
+	    100 * (double)rows / ((double)geometry->count * geometry->rows));
+}
+
 void warn_metal(const struct recon_hooks *hooks, const struct geometry *geometry, const struct recipe *recipe,
 		const struct metal *metal)
 {

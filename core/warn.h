@@ -17,6 +17,8 @@ void warn_recipe(const struct recon_hooks *hooks, const struct geometry *geometr
 /* "truncated": rows[0] rows of all views were cut off at the first column, rows[1] at the last; none: nothing is told.
  */
 void warn_truncated(const struct recon_hooks *hooks, const struct geometry *geometry, const size_t rows[2], int extend);
+/* "outside_grid": so many rows count something that lies outside of the grid; none: nothing is told. */
+void warn_outside(const struct recon_hooks *hooks, const struct geometry *geometry, size_t rows);
 /* "metal", or "no_metal" where it has no voxels. */
 void warn_metal(const struct recon_hooks *hooks, const struct geometry *geometry, const struct recipe *recipe,
 		const struct metal *metal);

@@ -1,0 +1,45 @@
+#ifndef CBCT_CORE_OUTSIDE_H
+#define CBCT_CORE_OUTSIDE_H
+
+#include <stdbool.h>
+
+#include "core/backend.h"
+
+/*
+ * Which rows of the projections count something that lies outside of the grid,
+ * though neither end of the row is cut off: a patient is longer than any
+ * detector, and a grid may be a part of the body.
+ *
+ * A ray counts it when it misses the grid and is not air, or when it crosses a
+ * face of the grid where the object goes on: where the FDK volume, averaged
+ * over FACE_REACH voxels to all sides in the outermost layer, has at least a
+ * quarter of the object's density. The object's density is sum v^2 / sum |v|,
+ * so that the scale of the projections has no part in it.
+ */
+enum { FACE_REACH = 2 };
+
+struct faces {
+	const struct grid *grid;
+	/* Across x, y and z, at the low side, then the high one: whether the object goes on, [z][y], [z][x], [y][x];
+	 * owned. */
+	bool *open[6];
+};
+
+/* Of the FDK volume, which waits for it. Free with faces_clear. */
+int faces_make(struct faces *ret_faces, const struct backend *backend, struct volume *volume, const struct grid *grid,
+	       struct error *err);
+void faces_clear(struct faces *faces);
+
+/* One row of a view, line integrals [columns]; about 64 of its rays are looked at. */
+bool faces_row_counts_outside(const struct faces *faces, const struct view *view, int columns, int row,
+			      const float *measured);
+
+/*
+ * The same without a volume, to save the trouble: a row may count it when the
+ * mean of those of its rays that miss the grid, or pass its lowest or highest
+ * face, is not air. `measured` is [rows][columns].
+ */
+bool outside_is_possible(const struct grid *grid, const struct view *view, int columns, int rows,
+			 const float *measured);
+
+#endif
