@@ -388,8 +388,10 @@ int filter_choose(int columns)
 /* Rows that cuFFT takes at once: as much as a batch has, within a bound. */
 static int fft_at_once(int length, int rows)
 {
+	const int launch_most = 65535; /* of blocks below each other */
 	int most = (int)(FFT_BYTES / ((size_t)(length + 2) * sizeof(float)));
 
+	most = most < launch_most ? most : launch_most;
 	return rows < most ? rows : most;
 }
 
@@ -508,7 +510,7 @@ static int fft_new(struct plan *plan, int length, const float *from, struct fft 
 	    cufftSetStream(fft->forward, plan->device->stream) != CUFFT_SUCCESS ||
 	    cufftSetStream(fft->inverse, plan->device->stream) != CUFFT_SUCCESS)
 		return error_set(err, ERR_NO_MEMORY, "cuFFT has no plan for %d rows of %d", rows, length);
-	CUDA_TRY(cudaMemset(fft->rows, 0, fft->bytes));
+	CUDA_TRY(cudaMemsetAsync(fft->rows, 0, fft->bytes, plan->device->stream));
 	return 0;
 }
 

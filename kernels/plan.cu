@@ -579,6 +579,8 @@ static int plan_prepare(struct plan *plan, struct error *err)
 	TRY(prepare_sart(plan, err));
 	if (plan->options.column_weights != NULL)
 		TRY(filter_prepare(plan, err));
+	/* What was uploaded at once may still be on its way, on a stream that the others do not wait for. */
+	CUDA_TRY(cudaStreamSynchronize(cudaStreamLegacy));
 	return device_wait(plan->device, err);
 }
 

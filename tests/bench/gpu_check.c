@@ -521,13 +521,13 @@ static void check_counts(struct device *devices[2], bool corrected)
 }
 
 /* A ball that the detector cuts off: the same rows are extended, alike, on both sides; pieces of a batch as well. */
-static void check_extension(struct device *devices[2])
+static void check_extension(struct device *devices[2], int columns, int rows_each, double high)
 {
-	const struct scene_options at = {.columns = 211,
-					 .rows = 97,
+	const struct scene_options at = {.columns = columns,
+					 .rows = rows_each,
 					 .views = 150,
 					 .arc = 6.28,
-					 .pixel = {.6, 1.2},
+					 .pixel = {126. / columns, high / rows_each},
 					 .size = {16, 16, 16},
 					 .spacing = {1, 1, 1},
 					 .extend = true};
@@ -767,7 +767,7 @@ static void check_matched_beside(struct device *devices[2])
 	static const struct {
 		const char *name;
 		double x, z;
-	} places[] = {{"aside", 300, 0}, {"half above", 0, 70}, {"above", 0, 400}};
+	} places[] = {{"aside", 300, 0}, {"half above", 0, 40}, {"above", 0, 400}};
 
 	for (size_t k = 0; k < sizeof(places) / sizeof(places[0]); k++) {
 		const struct scene_options at = {.columns = 61,
@@ -1125,7 +1125,7 @@ static void check_briefly(struct device *devices[2])
 				scene_clear(&scene);
 			}
 	check_counts(devices, true);
-	check_extension(devices);
+	check_extension(devices, 211, 97, 116);
 }
 
 /*
@@ -1197,7 +1197,8 @@ int main(int argc, char **argv)
 	}
 	check_counts(devices, false);
 	check_counts(devices, true);
-	check_extension(devices);
+	check_extension(devices, 211, 97, 116);
+	check_extension(devices, 64, 601, 40); /* more rows than a launch has blocks below each other */
 	check_transfers(devices[1]);
 	check_memory(devices[1]);
 	check_limit();
