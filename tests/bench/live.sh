@@ -76,15 +76,21 @@ if [[ $wanted == *watchers* ]]; then
 		local id pid=
 		id=$(cbct submit "$scan" --grid 96 --spacing 2 --sart 200 --subsets 2)
 		if [ "$1" != 0 ]; then
+			rm -f "$work/created"
+			mkfifo "$work/created"
 			# niced: what the clients take is not the daemon's
-			nice -n 19 "$BUILD/watchers" "$port" "$id" "$1" 600 >"$work/watched" &
+			nice -n 19 "$BUILD/watchers" "$port" "$id" "$1" "$work/created" >"$work/watched" &
 			pid=$!
 			sleep 3
 			awk '/RssAnon/ { print $2 / 1000 }' /proc/$daemon/status >"$work/memory"
 		fi
 		until curl -s "$url/v1/jobs/$id?wait=60" | jq -e '.state == "succeeded"' >/dev/null; do :; done
 		curl -s "$url/v1/jobs/$id" | jq .timings.sart
-		[ -z "$pid" ] || wait $pid
+		[ -n "$pid" ] || return 0
+		kill -0 $pid # it reads what comes now
+		sqlite3 -separator ' ' "file:$work/state/catalogue.sqlite?mode=ro" "SELECT e.number, printf('%.6f', e.created)
+			FROM events e JOIN jobs j ON j.number = e.job WHERE j.id = '$id'" >"$work/created"
+		wait $pid
 	}
 	for turn in 1 2 3; do
 		alone=$(job_seconds 0)

@@ -1,12 +1,14 @@
 /*
- * Many watchers of one job on loopback: when does each of them get each event?
+ * Many watchers of one job on loopback: does each of them get each event, and when?
  *
- * Usage: watchers PORT JOB COUNT SECONDS. One thread and one epoll; an
- * event's time counts from the moment in which the first watcher has it. Only
- * events that came after all were connected count.
+ * Usage: watchers PORT JOB COUNT CREATED. One thread and one epoll. An event
+ * has come when the kernel had it for the watcher: how soon a crowd in one
+ * process on the same machine gets round to reading is not the daemon's doing.
+ * CREATED is read when all watchers were let go (a FIFO will do): a line "NUMBER
+ * SECONDS" for each event of the job, since 1970, as the catalogue has them.
+ * Those that were created after the last watcher was answered must reach all.
  */
 #include <arpa/inet.h>
-#include <errno.h>
 #include <netinet/in.h>
 #include <stdbool.h>
 #include <stdio.h>
@@ -18,56 +20,69 @@
 #include <time.h>
 #include <unistd.h>
 
-enum { EVENTS_MAX = 4096, DELAYS_MAX = 8 << 20 };
+enum { EVENTS_MAX = 4096, PATIENCE = 600 /* s */ };
+/* Sleeps between two looks, so that the daemon's sending does not pay for waking a crowd that lives elsewhere. */
+static const struct timespec nap = {0, 20 * 1000 * 1000};
 
 struct watcher {
 	int socket;
 	char line[64]; /* the beginning of the line that is coming in */
 	int length;
-	long last;
+	bool answered;
+	long last; /* event */
+};
+
+struct arrival {
+	long number;
+	double time;
 };
 
 struct event {
 	long number;
-	double first;
+	double created;
 	int seen;
 };
 
+static struct arrival *arrivals;
+static size_t arrival_count, arrival_room;
 static struct event events[EVENTS_MAX];
-static int event_count;
-static float *delays;
-static long delay_count, repeats;
+static int event_count, answered_count;
+static double answered_last;
+static long repeats;
+
+static double seconds(const struct timespec *time)
+{
+	return (double)time->tv_sec + 1e-9 * (double)time->tv_nsec;
+}
 
 static double now(void)
 {
 	struct timespec time;
 
-	clock_gettime(CLOCK_MONOTONIC, &time);
-	return (double)time.tv_sec + 1e-9 * (double)time.tv_nsec;
+	clock_gettime(CLOCK_REALTIME, &time);
+	return seconds(&time);
 }
 
-static void note(struct watcher *watcher, long number, double time, bool counts)
+static void note(struct watcher *watcher, long number, double time)
 {
-	int i = event_count - 1;
-
 	repeats += number <= watcher->last;
 	watcher->last = number;
-	if (!counts)
-		return;
-	while (i >= 0 && events[i].number != number)
-		i--;
-	if (i < 0 && event_count < EVENTS_MAX) {
-		i = event_count++;
-		events[i] = (struct event){.number = number, .first = time};
+	if (arrival_count == arrival_room) {
+		arrival_room = arrival_room > 0 ? 2 * arrival_room : 1 << 16;
+		arrivals = realloc(arrivals, arrival_room * sizeof(*arrivals));
+		if (arrivals == NULL)
+			exit(1);
 	}
-	if (i < 0 || delay_count == DELAYS_MAX)
-		return;
-	events[i].seen++;
-	delays[delay_count++] = (float)(time - events[i].first);
+	arrivals[arrival_count++] = (struct arrival){number, time};
 }
 
-static void take(struct watcher *watcher, const char *data, ssize_t size, double time, bool counts)
+static void take(struct watcher *watcher, const char *data, ssize_t size, double time)
 {
+	if (!watcher->answered) {
+		watcher->answered = true;
+		answered_count++;
+		answered_last = time;
+	}
 	for (ssize_t i = 0; i < size; i++) {
 		if (data[i] != '\n') {
 			if (watcher->length < (int)sizeof(watcher->line) - 1)
@@ -76,9 +91,31 @@ static void take(struct watcher *watcher, const char *data, ssize_t size, double
 		}
 		watcher->line[watcher->length] = '\0';
 		if (strncmp(watcher->line, "id: ", 4) == 0)
-			note(watcher, atol(watcher->line + 4), time, counts);
+			note(watcher, atol(watcher->line + 4), time);
 		watcher->length = 0;
 	}
+}
+
+/* What there is, and when the last of it came in; 0 or less at the end. */
+static ssize_t receive(int socket, char *data, size_t size, double *ret_time)
+{
+	union {
+		struct cmsghdr align;
+		char room[CMSG_SPACE(sizeof(struct timespec))];
+	} control;
+	struct iovec into = {data, size};
+	struct msghdr message = {
+	    .msg_iov = &into, .msg_iovlen = 1, .msg_control = &control, .msg_controllen = sizeof(control)};
+	ssize_t got = recvmsg(socket, &message, 0);
+	struct cmsghdr *stamp = got > 0 ? CMSG_FIRSTHDR(&message) : NULL;
+	struct timespec time;
+
+	*ret_time = now();
+	if (stamp != NULL && stamp->cmsg_level == SOL_SOCKET && stamp->cmsg_type == SCM_TIMESTAMPNS) {
+		memcpy(&time, CMSG_DATA(stamp), sizeof(time));
+		*ret_time = seconds(&time);
+	}
+	return got;
 }
 
 static bool open_watcher(struct watcher *watcher, int port, const char *job, int epoll)
@@ -86,37 +123,78 @@ static bool open_watcher(struct watcher *watcher, int port, const char *job, int
 	struct sockaddr_in address = {.sin_family = AF_INET, .sin_port = htons((unsigned short)port)};
 	struct epoll_event wanted = {.events = EPOLLIN, .data.ptr = watcher};
 	char request[256];
-	int length = snprintf(request, sizeof(request),
-			      "GET /v1/jobs/%s/events?after=latest HTTP/1.1\r\nHost: localhost\r\n\r\n", job);
+	int on = 1, length = snprintf(request, sizeof(request),
+				      "GET /v1/jobs/%s/events?after=latest HTTP/1.1\r\nHost: localhost\r\n\r\n", job);
 
 	address.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
 	watcher->socket = socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0);
-	return watcher->socket >= 0 && connect(watcher->socket, (struct sockaddr *)&address, sizeof(address)) == 0 &&
+	return watcher->socket >= 0 && setsockopt(watcher->socket, SOL_SOCKET, SO_TIMESTAMPNS, &on, sizeof(on)) == 0 &&
+	       connect(watcher->socket, (struct sockaddr *)&address, sizeof(address)) == 0 &&
 	       send(watcher->socket, request, (size_t)length, 0) == length &&
 	       epoll_ctl(epoll, EPOLL_CTL_ADD, watcher->socket, &wanted) == 0;
 }
 
-static int compare(const void *a, const void *b)
+static bool read_created(const char *path)
+{
+	FILE *file = fopen(path, "re");
+	struct event event = {0};
+
+	if (file == NULL)
+		return false;
+	while (event_count < EVENTS_MAX && fscanf(file, "%ld %lf", &event.number, &event.created) == 2) {
+		if (event.created > answered_last)
+			events[event_count++] = event;
+	}
+	fclose(file);
+	return true;
+}
+
+static int by_size(const void *a, const void *b)
 {
 	float x = *(const float *)a, y = *(const float *)b;
 
 	return (x > y) - (x < y);
 }
 
-static void report(int count, int closed)
+static int by_number(const void *a, const void *b)
 {
+	const struct event *x = a, *y = b;
+
+	return (x->number > y->number) - (x->number < y->number);
+}
+
+static void report(int count)
+{
+	float *delays = malloc((arrival_count + 1) * sizeof(*delays));
+	struct rusage used;
+	size_t told = 0;
 	long missed = 0;
 
-	/* The last ones may still be on their way. */
+	if (delays == NULL)
+		exit(1);
+	qsort(events, (size_t)event_count, sizeof(*events), by_number);
+	for (size_t i = 0; i < arrival_count; i++) {
+		struct event key = {.number = arrivals[i].number};
+		struct event *event = bsearch(&key, events, (size_t)event_count, sizeof(*events), by_number);
+
+		if (event == NULL)
+			continue;
+		event->seen++;
+		delays[told++] = (float)(arrivals[i].time - event->created);
+	}
 	for (int i = 0; i < event_count; i++)
 		missed += count - events[i].seen;
-	qsort(delays, (size_t)delay_count, sizeof(*delays), compare);
-	printf("%d watchers, %d events, %ld told, %ld missed, %ld repeated, %d closed\n", count, event_count,
-	       delay_count, missed, repeats, closed);
-	if (delay_count > 0)
-		printf("ms behind the first: median %.2f, 99 %% %.2f, most %.2f\n",
-		       1e3 * (double)delays[delay_count / 2], 1e3 * (double)delays[delay_count * 99 / 100],
-		       1e3 * (double)delays[delay_count - 1]);
+	getrusage(RUSAGE_SELF, &used);
+	printf("%d watchers, %d events, %zu told, %ld missed, %ld repeated; the watchers took %.2f s of a processor\n",
+	       count, event_count, told, missed, repeats,
+	       (double)(used.ru_utime.tv_sec + used.ru_stime.tv_sec) +
+		   1e-6 * (double)(used.ru_utime.tv_usec + used.ru_stime.tv_usec));
+	qsort(delays, told, sizeof(*delays), by_size);
+	if (told > 0)
+		printf("ms from an event's time in the catalogue to a watcher: median %.1f, 99 %% %.1f, most %.1f\n",
+		       1e3 * (double)delays[told / 2], 1e3 * (double)delays[told * 99 / 100],
+		       1e3 * (double)delays[told - 1]);
+	free(delays);
 }
 
 int main(int argc, char **argv)
@@ -125,13 +203,12 @@ int main(int argc, char **argv)
 	int epoll = epoll_create1(EPOLL_CLOEXEC);
 	struct watcher *watchers = calloc((size_t)count + 1, sizeof(*watchers));
 	struct rlimit limit;
-	double end, counting;
+	double end = now() + PATIENCE;
 
 	if (count < 1 || epoll < 0 || watchers == NULL) {
-		fprintf(stderr, "usage: watchers PORT JOB COUNT SECONDS\n");
+		fprintf(stderr, "usage: watchers PORT JOB COUNT CREATED\n");
 		return 2;
 	}
-	delays = malloc(DELAYS_MAX * sizeof(*delays));
 	if (getrlimit(RLIMIT_NOFILE, &limit) == 0) {
 		limit.rlim_cur = limit.rlim_max;
 		setrlimit(RLIMIT_NOFILE, &limit);
@@ -142,25 +219,32 @@ int main(int argc, char **argv)
 			return 1;
 		}
 	}
-	counting = now() + 1;
-	end = counting + atof(argv[4]);
 	while (now() < end && closed < count) {
 		struct epoll_event ready[256];
-		int many = epoll_wait(epoll, ready, 256, 100);
+		int many = epoll_wait(epoll, ready, 256, 0);
 
+		if (many <= 0)
+			nanosleep(&nap, NULL);
 		for (int i = 0; i < many; i++) {
 			struct watcher *watcher = ready[i].data.ptr;
 			char data[16384];
-			ssize_t got = recv(watcher->socket, data, sizeof(data), 0);
+			double time;
+			ssize_t got = receive(watcher->socket, data, sizeof(data), &time);
 
 			if (got > 0) {
-				take(watcher, data, got, now(), now() > counting);
+				take(watcher, data, got, time);
 			} else {
 				close(watcher->socket);
 				closed++;
 			}
 		}
 	}
-	report(count, closed);
+	if (closed < count || answered_count < count || !read_created(argv[4])) {
+		fprintf(stderr, "watchers: %d of %d were answered, %d were let go\n", answered_count, count, closed);
+		return 1;
+	}
+	report(count);
+	free(arrivals);
+	free(watchers);
 	return 0;
 }
