@@ -284,8 +284,8 @@ class Events(Case):
     def test_events_are_told_once_over_connections_that_break(self) -> None:
         job = self.finished(fdk={}, sart={"iterations": 3}, emit=["fdk"])
         whole = list(self.client.events(job))
-        # a volume is told of when it is on the disk, and the iterations do not wait for that
-        kinds = [event.kind for event in whole]
+        # a volume is told of when it is on the disk, and the iterations do not wait for that; the ball is taller than the grid
+        kinds = [event.kind for event in whole if event.kind != "warning"]
         self.assertEqual(kinds[:2] + kinds[-3:], "state state volume state end".split())
         self.assertEqual(sorted(kinds[2:-3]), "progress progress progress volume".split())
         self.assertTrue(all(event.data["job"] == job for event in whole))
