@@ -25,6 +25,7 @@ struct transform {
 struct filter_engine {
 	const struct geometry *geometry; /* borrowed, as are the weights */
 	const float *column_weights;     /* [view][column] */
+	double axis[3];                  /* plan_options.axis */
 	int pad, wide;                   /* zero columns before column 0; columns of a filtered row */
 	int extend;                      /* columns that truncated rows get on either side */
 	bool sides[2];                   /* that may be extended */
@@ -98,6 +99,7 @@ int filter_engine_new(const struct plan_options *options, int threads, struct fi
 		return error_set(err, ERR_NO_MEMORY, "no memory for the ramp filter");
 	engine->geometry = options->geometry;
 	engine->column_weights = options->column_weights;
+	memcpy(engine->axis, options->axis, sizeof(engine->axis));
 	engine->pad = options->pad[0];
 	engine->wide = wide;
 	engine->extend = options->extend;
@@ -127,17 +129,6 @@ void filter_engine_free(struct filter_engine *engine)
 	transform_clear(&engine->extended);
 	free(engine->buffers);
 	free(engine);
-}
-
-/* Unit vector from the source to the rotation axis, the source's own z kept; to the isocentre from on the axis. */
-static void axis_direction(const struct view *view, double ret_direction[3])
-{
-	const double *s = view->source;
-	double across = hypot(s[0], s[1]), length = across > 0 ? across : fabs(s[2]);
-
-	ret_direction[0] = length > 0 ? -s[0] / length : 0;
-	ret_direction[1] = length > 0 ? -s[1] / length : 0;
-	ret_direction[2] = across > 0 || length == 0 ? 0 : -s[2] / length;
 }
 
 /*
@@ -249,7 +240,7 @@ static void write_extension(const struct filter_engine *engine, int view, const 
 	const float weight = engine->column_weights[(size_t)view * (size_t)rows->columns + (size_t)outermost];
 	double direction[3];
 
-	axis_direction(&engine->geometry->views[view], direction);
+	axis_direction(engine->geometry->views[view].source, engine->axis, direction);
 	for (int x = 1; x <= engine->extend; x++) {
 		const int column = side == 0 ? -x : outermost + x;
 		const int at = engine->pad + column + (column < 0 ? engine->extended.length : 0);
@@ -272,7 +263,7 @@ static void weight_rows(const struct filter_engine *engine, int view, const stru
 	const struct view *from = &engine->geometry->views[view];
 	double direction[3];
 
-	axis_direction(from, direction);
+	axis_direction(from->source, engine->axis, direction);
 	for (int c = 0; c < rows->columns; c++) {
 		float weights[ROWS], values[ROWS] = {0};
 

@@ -13,6 +13,7 @@
 
 #include <assert.h>
 #include <stdlib.h>
+#include <string.h>
 
 #include "core/parts.h"
 
@@ -30,6 +31,8 @@ int fdk_weights_make(struct fdk_weights *ret_weights, const struct orbit *orbit,
 	    .extended = extend ? malloc(sizeof(float) * ((size_t)longer / 2 + 1)) : NULL,
 	};
 
+	if (orbit->lean > 0)
+		memcpy(weights.axis, orbit->frame[2], sizeof(weights.axis));
 	if (weights.columns == NULL || weights.response == NULL || (extend && weights.extended == NULL)) {
 		code = error_set(err, ERR_NO_MEMORY, "no memory for the FDK weights of %d views", geometry->count);
 		goto out;

@@ -10,6 +10,7 @@ struct fdk_weights {
 	float *columns;  /* [view][column], owned */
 	float *response; /* [length/2 + 1], owned */
 	int pad[2];      /* orbit.pad */
+	double axis[3];  /* plan_options.axis */
 	int extend;      /* plan_options.extend */
 	float *extended; /* its response, owned; NULL without */
 };

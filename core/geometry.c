@@ -318,6 +318,24 @@ double view_project(const double matrix[12], const double point[3], double *ret_
 	return depth;
 }
 
+void axis_direction(const double source[3], const double axis[3], double ret_direction[3])
+{
+	static const double z[3] = {0, 0, 1};
+	const double *way = vec_dot(axis, axis) > 0 ? axis : z;
+	double length;
+
+	for (int i = 0; i < 3; i++)
+		ret_direction[i] = vec_dot(source, way) * way[i] - source[i];
+	length = vec_norm(ret_direction);
+	if (!(length > 0)) {
+		length = vec_norm(source);
+		for (int i = 0; i < 3; i++)
+			ret_direction[i] = -source[i];
+	}
+	for (int i = 0; i < 3; i++)
+		ret_direction[i] = length > 0 ? ret_direction[i] / length : 0;
+}
+
 int geometry_is_untilted(const struct geometry *geometry)
 {
 	const double pixels = 1e-3;

@@ -68,6 +68,13 @@ void view_matrix(const struct view *view, double ret_matrix[12]);
 double view_project(const double matrix[12], const double point[3], double *ret_column, double *ret_row);
 
 /*
+ * Unit vector from a source straight across to the rotation axis, which goes
+ * through the isocentre along the unit vector `axis`, z where that is all 0; from
+ * on the axis to the isocentre, from the isocentre 0.
+ */
+void axis_direction(const double source[3], const double axis[3], double ret_direction[3]);
+
+/*
  * True when every detector row is across z and every column along z, the
  * source's rays to one column thus share their x and y: the fast kernels'
  * case. Tolerance: the error over the whole detector is below 1e-3 pixel.

@@ -14,8 +14,111 @@
 #include <string.h>
 
 static const double FULL_GAP = 5 * M_PI / 180, FULL_GAP_DISPLACED = 20 * M_PI / 180, FULL_GAP_RATIO = 2.25;
-static const double SAME_ANGLE = 1e-6; /* radians, a micrometre on a C-arm's orbit */
+static const double LEAN_LEAST = 2 * M_PI / 180; /* FDK about z is within some HU up to there */
+static const double SAME_ANGLE = 1e-6;           /* radians, a micrometre on a C-arm's orbit */
 static const double DISPLACED_PIXELS = 4, DISPLACED_WIDTH = 0.02;
+
+/* A view in the orbit's frame. */
+static struct view view_in(const struct orbit *orbit, const struct view *view)
+{
+	const double *const from[] = {view->source, view->pixel0, view->column_step, view->row_step};
+	struct view turned;
+	double *const to[] = {turned.source, turned.pixel0, turned.column_step, turned.row_step};
+
+	if (orbit->lean == 0)
+		return *view;
+	for (int k = 0; k < 4; k++)
+		for (int i = 0; i < 3; i++)
+			to[k][i] = vec_dot(orbit->frame[i], from[k]);
+	return turned;
+}
+
+/* Sums of products of the sources' coordinates about their mean. */
+static void find_scatter(const struct geometry *geometry, double ret[3][3])
+{
+	double mean[3] = {0};
+
+	memset(ret, 0, 9 * sizeof(double));
+	for (int k = 0; k < geometry->count; k++)
+		for (int i = 0; i < 3; i++)
+			mean[i] += geometry->views[k].source[i] / geometry->count;
+	for (int k = 0; k < geometry->count; k++)
+		for (int i = 0; i < 3; i++)
+			for (int j = 0; j < 3; j++)
+				ret[i][j] +=
+				    (geometry->views[k].source[i] - mean[i]) * (geometry->views[k].source[j] - mean[j]);
+}
+
+/* The direction in which the scatter is least, a unit vector, by powers of trace - scatter; and that least part. */
+static double find_normal(double scatter[3][3], double ret[3])
+{
+	const double trace = scatter[0][0] + scatter[1][1] + scatter[2][2];
+	double least = 0;
+
+	ret[0] = 0.01;
+	ret[1] = 0.02;
+	ret[2] = 1;
+	for (int step = 0; step < 1000; step++) {
+		double next[3], norm;
+
+		for (int i = 0; i < 3; i++)
+			next[i] = trace * ret[i] - vec_dot(scatter[i], ret);
+		norm = vec_norm(next);
+		for (int i = 0; i < 3 && norm > 0; i++)
+			ret[i] = next[i] / norm;
+	}
+	for (int i = 0; i < 3; i++)
+		least += ret[i] * vec_dot(scatter[i], ret);
+	return trace > 0 ? least / trace : 1;
+}
+
+/*
+ * The orbit's frame. A plane is one where the sources leave it by less than 3 %
+ * of their spread, and are spread over it to both sides: an arc of about 60
+ * degrees and more.
+ */
+static void find_frame(struct orbit *orbit, const struct geometry *geometry)
+{
+	const double flat = 0.03, round = 0.1;
+	double scatter[3][3], normal[3], axis[3], cosine, least, trace, square = 0;
+
+	for (int i = 0; i < 3; i++)
+		orbit->frame[i][i] = 1;
+	find_scatter(geometry, scatter);
+	least = find_normal(scatter, normal);
+	trace = scatter[0][0] + scatter[1][1] + scatter[2][2];
+	for (int i = 0; i < 3; i++)
+		for (int j = 0; j < 3; j++)
+			square += scatter[i][j] * scatter[i][j];
+	/* With l the least and a, b the others: a b / (a + b)^2 from (a + b)^2 - a^2 - b^2. */
+	if (!(least < flat * flat) || (trace * trace - square) / (2 * trace * trace) < round * round)
+		return;
+	/* On z's side; an axis across z to that of the world's nearest. */
+	for (int i = 2; i >= 0; i--)
+		if (fabs(normal[i]) > 1e-6) {
+			for (int j = 0; j < 3 && normal[i] < 0; j++)
+				normal[j] = -normal[j];
+			break;
+		}
+	for (int j = 0; j < 3; j++)
+		normal[j] = normal[j] == 0 ? 0 : normal[j];
+	cosine = fmin(1, normal[2]);
+	if (acos(cosine) < LEAN_LEAST)
+		return;
+	orbit->lean = acos(cosine);
+	/* The turn about z x normal that takes z to the normal. */
+	axis[0] = -normal[1] / sin(orbit->lean);
+	axis[1] = normal[0] / sin(orbit->lean);
+	axis[2] = 0;
+	for (int i = 0; i < 3; i++) {
+		double unit[3] = {i == 0, i == 1, i == 2}, across[3], along = axis[i];
+
+		vec_cross(axis, unit, across);
+		for (int j = 0; j < 3; j++)
+			orbit->frame[i][j] =
+			    cosine * unit[j] + sin(orbit->lean) * across[j] + (1 - cosine) * along * axis[j];
+	}
+}
 
 struct placed {
 	double angle;
@@ -74,7 +177,7 @@ static void take_means(struct orbit *orbit, const struct geometry *geometry)
 	double share = 1.0 / geometry->count;
 
 	for (int k = 0; k < geometry->count; k++) {
-		const struct view *view = &geometry->views[k];
+		const struct view turned = view_in(orbit, &geometry->views[k]), *view = &turned;
 		double matrix[12], to_detector[3], depth, magnification;
 
 		view_matrix(view, matrix);
@@ -171,7 +274,7 @@ static void find_fan(struct orbit *orbit, const struct geometry *geometry)
 	double sense = orbit->direction < 0 ? -1 : 1, low_side = INFINITY, high_side = INFINITY;
 
 	for (int k = 0; k < geometry->count; k++) {
-		const struct view *view = &geometry->views[k];
+		const struct view turned = view_in(orbit, &geometry->views[k]), *view = &turned;
 		double radius = hypot(view->source[0], view->source[1]);
 		double edge0 = sense * ray_angle(geometry, view, -0.5);
 		double edge1 = sense * ray_angle(geometry, view, geometry->columns - 0.5);
@@ -192,11 +295,11 @@ static int find_padding(const struct orbit *orbit, const struct geometry *geomet
 	double sign = orbit->displacement > 0 ? 1 : -1, most = 0;
 
 	for (int k = 0; k < geometry->count; k++) {
+		const struct view view = view_in(orbit, &geometry->views[k]);
 		double matrix[12];
 
-		view_matrix(&geometry->views[k], matrix);
-		most = fmax(most, 2 * sign * view_displacement(geometry, &geometry->views[k], matrix) /
-				      vec_norm(geometry->views[k].column_step));
+		view_matrix(&view, matrix);
+		most = fmax(most, 2 * sign * view_displacement(geometry, &view, matrix) / vec_norm(view.column_step));
 	}
 	/* A view as far off as that is not a displaced detector any more. */
 	return (int)fmin(ceil(most - 1e-6), 2 * geometry->columns);
@@ -218,8 +321,9 @@ int orbit_analyse(struct orbit *ret_orbit, const struct geometry *geometry, stru
 		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views", geometry->count);
 		goto out;
 	}
+	find_frame(&orbit, geometry);
 	for (int k = 0; k < geometry->count; k++) {
-		const struct view *view = &geometry->views[k];
+		const struct view turned = view_in(&orbit, &geometry->views[k]), *view = &turned;
 
 		orbit.angle[k] = wrap(atan2(view->source[1], view->source[0]));
 		placed[k] = (struct placed){.angle = orbit.angle[k], .view = k};
@@ -285,8 +389,9 @@ static double overlap(const struct orbit *orbit, const struct geometry *geometry
 	double theta = INFINITY;
 
 	for (int k = 0; k < geometry->count; k++) {
-		double edge0 = sense * ray_angle(geometry, &geometry->views[k], -0.5);
-		double edge1 = sense * ray_angle(geometry, &geometry->views[k], geometry->columns - 0.5);
+		const struct view view = view_in(orbit, &geometry->views[k]);
+		double edge0 = sense * ray_angle(geometry, &view, -0.5);
+		double edge1 = sense * ray_angle(geometry, &view, geometry->columns - 0.5);
 
 		theta = fmin(theta, wide_high ? -fmin(edge0, edge1) : fmax(edge0, edge1));
 	}
@@ -322,7 +427,7 @@ void orbit_column_weights(const struct orbit *orbit, const struct geometry *geom
 
 #pragma omp parallel for schedule(static)
 	for (int k = 0; k < geometry->count; k++) {
-		const struct view *view = &geometry->views[k];
+		const struct view turned = view_in(orbit, &geometry->views[k]), *view = &turned;
 		float *weights = ret_weights + (size_t)k * (size_t)geometry->columns;
 		double b = wrap(sense * (orbit->angle[k] - orbit->angle[orbit->first]));
 		double constant = 0.5 * orbit->weight[k] * view_weight(view);
@@ -343,12 +448,12 @@ void orbit_column_weights(const struct orbit *orbit, const struct geometry *geom
 }
 
 /* Half of the height on the axis that the detector's middle column covers, mm, to the farther side of the isocentre. */
-static double half_height(const struct geometry *geometry)
+static double half_height(const struct orbit *orbit, const struct geometry *geometry)
 {
 	double farthest = 0;
 
 	for (int k = 0; k < geometry->count; k++) {
-		const struct view *view = &geometry->views[k];
+		const struct view turned = view_in(orbit, &geometry->views[k]), *view = &turned;
 		double radius = hypot(view->source[0], view->source[1]);
 
 		for (int end = 0; end < 2; end++) {
@@ -367,11 +472,14 @@ static double half_height(const struct geometry *geometry)
 
 void orbit_default_grid(const struct orbit *orbit, const struct geometry *geometry, int most, struct grid *ret_grid)
 {
-	double width = orbit->field_of_view, height = 2 * half_height(geometry), nearest = INFINITY;
+	double width = orbit->field_of_view, height = 2 * half_height(orbit, geometry), nearest = INFINITY;
 	double spacing = orbit->pixel_at_isocentre[0];
 
-	for (int k = 0; k < geometry->count; k++)
-		nearest = fmin(nearest, hypot(geometry->views[k].source[0], geometry->views[k].source[1]));
+	for (int k = 0; k < geometry->count; k++) {
+		const struct view view = view_in(orbit, &geometry->views[k]);
+
+		nearest = fmin(nearest, hypot(view.source[0], view.source[1]));
+	}
 	/* Where the views have no common cylinder: as wide as the detector. */
 	if (!(width > spacing))
 		width = spacing * geometry->columns;

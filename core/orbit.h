@@ -12,9 +12,16 @@
  * the actual sources, so it holds for calibrated C-arms as well; and the FDK
  * weights that follow from it. Nothing here changes silently: what was decided
  * stands in these fields, which the scan's `derived` shows.
+ *
+ * All of it is told in the orbit's own frame: its axis is z, unless the sources
+ * lie in a plane that leans against z's by more than LEAN_LEAST (an arm swung out,
+ * a sweep about another axis of the patient). Then it is that plane's normal
+ * through the isocentre, on z's side.
  */
 struct orbit {
 	int count;
+	double frame[3][3]; /* its x, y and z, unit vectors in the world: turns the world's axes as little as it can */
+	double lean;        /* radians, of its z against the world's; 0 below LEAN_LEAST */
 	/* [count], radians, gantry angle of each view's source, 0 <= angle < 2 pi */
 	double *angle;
 	/*
@@ -24,7 +31,8 @@ struct orbit {
 	 */
 	double *weight;
 	double arc;      /* radians, from the first source to the last, 2 pi for a full turn */
-	int direction;   /* +1 counter-clockwise seen from +z, -1 clockwise, 0 when all views stand at one angle */
+	int direction;   /* +1 counter-clockwise seen from the axis' end, -1 clockwise, 0 when all views stand at one
+			    angle */
 	int first;       /* the view at which the arc begins, in the sense of `direction` */
 	bool short_scan; /* the arc has a gap: Parker weights apply */
 	/*
@@ -33,7 +41,7 @@ struct orbit {
 	 * fan is their difference, the full fan angle that the detector sees.
 	 */
 	double fan, half_fan_min, half_fan_max;
-	double source_radius;      /* mm, mean distance of the sources from the z axis */
+	double source_radius;      /* mm, mean distance of the sources from the axis */
 	double source_to_detector; /* mm, mean, along the normal */
 	double field_of_view;      /* mm, diameter of the cylinder that all views see, or one half when displaced */
 	double displacement;       /* mm at the detector, along +u, of its centre from the ray through the axis, mean */
@@ -49,7 +57,7 @@ struct orbit {
 	bool arc_too_short;           /* arc < pi + fan: a warning, not an error */
 	double pixel_at_isocentre[2]; /* mm, mean */
 	/*
-	 * Radians, mean angle between the detector's rows and the plane across z. FDK
+	 * Radians, mean angle between the detector's rows and the plane across the axis. FDK
 	 * filters along the rows: near pi/2, a detector on its side, that is the wrong
 	 * direction.
 	 */

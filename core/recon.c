@@ -85,7 +85,7 @@ static struct plan_options plan_options(const struct recipe *recipe, const struc
 					const struct linearise *linearise, const struct fdk_weights *weights,
 					const struct sart_options *sart)
 {
-	return (struct plan_options){
+	struct plan_options options = {
 	    .geometry = geometry,
 	    .grid = &recipe->grid,
 	    .linearise = *linearise,
@@ -103,6 +103,9 @@ static struct plan_options plan_options(const struct recipe *recipe, const struc
 			: geometry->count < FDK_BATCH_MOST ? geometry->count
 							   : FDK_BATCH_MOST,
 	};
+
+	memcpy(options.axis, weights->axis, sizeof(options.axis));
+	return options;
 }
 
 static int sart_options_make(struct sart_options *ret_sart, const struct recipe *recipe, const struct orbit *orbit,

@@ -94,8 +94,8 @@ static __device__ __forceinline__ row_weight weight_of(const filter_job &job, in
 	w.length2[0] = at[0] * at[0] + at[1] * at[1] + at[2] * at[2];
 	w.length2[1] = 2.0f * (at[0] * step[0] + at[1] * step[1] + at[2] * step[2]);
 	w.length2[2] = step[0] * step[0] + step[1] * step[1] + step[2] * step[2];
-	w.along[0] = at[0] * g.central[0] + at[1] * g.central[1];
-	w.along[1] = step[0] * g.central[0] + step[1] * g.central[1];
+	w.along[0] = at[0] * g.central[0] + at[1] * g.central[1] + at[2] * g.central[2];
+	w.along[1] = step[0] * g.central[0] + step[1] * g.central[1] + step[2] * g.central[2];
 	w.column_weights = job.column_weights + (size_t)view * job.columns;
 	return w;
 }

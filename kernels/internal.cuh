@@ -138,7 +138,7 @@ struct device_view {
 	float direction[3][3];
 	float moment[3][3];
 	float matrix[3][4]; /* of voxel indices: column * w, row * w, w = depth / depth of the isocentre */
-	float central[2];   /* unit vector, horizontal, from the source to the axis */
+	float central[3];   /* unit vector from the source across to the axis */
 	float source[3];    /* roughly: how steep rays can be at a voxel */
 };
 

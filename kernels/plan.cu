@@ -430,11 +430,13 @@ static void to_voxels(const struct grid *grid, const double point[3], bool is_pl
 	}
 }
 
-static struct device_view view_make(const struct geometry *geometry, const struct grid *grid, int index)
+static struct device_view view_make(const struct plan_options *options, int index)
 {
+	const struct geometry *geometry = options->geometry;
+	const struct grid *grid = options->grid;
 	const struct view *view = &geometry->views[index];
 	const double isocentre[3] = {0, 0, 0};
-	double source[3], ray[3], forms[3][3], matrix[12], depth, column, row, horizontal;
+	double source[3], ray[3], forms[3][3], matrix[12], depth, column, row, central[3];
 	struct device_view result = {};
 
 	to_voxels(grid, view->source, true, source);
@@ -468,9 +470,9 @@ static struct device_view view_make(const struct geometry *geometry, const struc
 		}
 		result.matrix[r][3] = (float)(offset / depth);
 	}
-	horizontal = hypot(view->source[0], view->source[1]);
-	for (int i = 0; i < 2; i++)
-		result.central[i] = horizontal > 0 ? (float)(-view->source[i] / horizontal) : 0.0f;
+	axis_direction(view->source, options->axis, central);
+	for (int i = 0; i < 3; i++)
+		result.central[i] = (float)central[i];
 	return result;
 }
 
@@ -485,7 +487,7 @@ static int prepare_geometry(struct plan *plan, struct error *err)
 	if (views == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for %d views", geometry->count);
 	for (int i = 0; i < geometry->count; i++)
-		views[i] = view_make(geometry, plan->options.grid, i);
+		views[i] = view_make(&plan->options, i);
 	code = device_allocate(plan->device, bytes, (void **)&plan->geometry, err);
 	if (code == 0) {
 		status = cudaMemcpy(plan->geometry, views, bytes, cudaMemcpyHostToDevice);

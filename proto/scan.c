@@ -486,6 +486,11 @@ static void warn_weights(cJSON *list, const struct orbit *orbit)
 		    "the detector is displaced by %.2f mm on an arc of %.2f degrees: displaced-detector weights need a "
 		    "full turn, so that FDK is right only where every view sees the object",
 		    orbit->displacement, arc);
+	if (orbit->lean > 0)
+		warn(list, "tilted_orbit",
+		     "the sources turn about an axis that leans by %.1f degrees against z, along (%.4f, %.4f, %.4f): "
+		     "arc, direction, field of view and FDK's weights are those about that axis",
+		     orbit->lean / degree, orbit->frame[2][0], orbit->frame[2][1], orbit->frame[2][2]);
 	if (fabs(orbit->tilt) > tilt_least * degree)
 		warn(list, "rotated_detector",
 		     "the detector's rows are %.1f degrees off the plane across the rotation axis; FDK filters along "

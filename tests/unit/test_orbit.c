@@ -741,6 +741,59 @@ START_TEST(a_default_grid_exists_for_any_orbit)
 }
 END_TEST
 
+static void lean_over(double *vector, double angle)
+{
+	const double y = vector[1], z = vector[2];
+
+	vector[1] = cos(angle) * y - sin(angle) * z;
+	vector[2] = sin(angle) * y + cos(angle) * z;
+}
+
+START_TEST(an_orbit_that_leans_over_is_told_about_its_own_axis)
+{
+	const struct sweep sweep = {60, 40, 4, 20, 2, 105, {3, -2}, 0};
+	const double leans[] = {1, 5, 25, 60, 90, 120};
+	struct geometry upright = geometry_of(&sweep, NULL);
+	struct orbit expected = orbit_of(&upright);
+
+	for (size_t i = 0; i < sizeof(leans) / sizeof(*leans); i++) {
+		struct geometry geometry = geometry_of(&sweep, NULL);
+		struct orbit orbit;
+
+		for (int k = 0; k < geometry.count; k++) {
+			lean_over(geometry.views[k].source, leans[i] * DEGREE);
+			lean_over(geometry.views[k].pixel0, leans[i] * DEGREE);
+			lean_over(geometry.views[k].column_step, leans[i] * DEGREE);
+			lean_over(geometry.views[k].row_step, leans[i] * DEGREE);
+		}
+		orbit = orbit_of(&geometry);
+		/* Below 2 degrees it counts as upright: then the numbers are z's. */
+		if (leans[i] < 2) {
+			ck_assert_double_eq(orbit.lean, 0);
+		} else {
+			/* Beyond a right angle the axis' other end is on z's side. */
+			const bool over = leans[i] >= 90;
+
+			ck_assert_double_eq_tol(orbit.lean, (leans[i] > 90 ? 180 - leans[i] : leans[i]) * DEGREE, 1e-9);
+			ck_assert_double_eq_tol(fabs(orbit.frame[2][2]), fabs(cos(leans[i] * DEGREE)), 1e-9);
+			ck_assert_double_eq_tol(orbit.arc, expected.arc, 1e-9);
+			ck_assert_int_eq(orbit.direction, over ? -expected.direction : expected.direction);
+			ck_assert_int_eq(orbit.first, expected.first);
+			ck_assert(orbit.short_scan && !orbit.arc_too_short && !orbit.displaced);
+			ck_assert_double_eq_tol(orbit.fan, expected.fan, 1e-9);
+			ck_assert_double_eq_tol(orbit.source_radius, expected.source_radius, 1e-9);
+			ck_assert_double_eq_tol(orbit.field_of_view, expected.field_of_view, 1e-9);
+			ck_assert_double_eq_tol(orbit.displacement, expected.displacement, 1e-9);
+			ck_assert_double_eq_tol(orbit.tilt, 0, 1e-9);
+		}
+		orbit_clear(&orbit);
+		geometry_clear(&geometry);
+	}
+	orbit_clear(&expected);
+	geometry_clear(&upright);
+}
+END_TEST
+
 Suite *orbit_suite(void);
 Suite *orbit_suite(void)
 {
@@ -755,6 +808,7 @@ Suite *orbit_suite(void)
 	tcase_add_test(facts, the_field_of_view_is_what_all_views_see);
 	tcase_add_test(facts, a_displaced_detector_widens_the_field_of_view);
 	tcase_add_test(facts, a_real_c_arm_s_orbit_is_a_short_scan);
+	tcase_add_test(facts, an_orbit_that_leans_over_is_told_about_its_own_axis);
 	suite_add_tcase(suite, facts);
 	tcase_add_test(weights, conjugate_rays_sum_to_two);
 	tcase_add_test(weights, filtered_backprojection_gives_the_density_back);

@@ -154,6 +154,7 @@ enum strange {
 	DETECTOR_WANDERS,
 	DETECTOR_BREATHES,
 	ORBIT_TILTED,
+	ORBIT_ON_ITS_SIDE,
 	ORBIT_SHIFTED,
 	TURNED_A_LITTLE,
 	VIEWS_TWICE,
@@ -162,8 +163,9 @@ enum strange {
 	STRANGE_COUNT
 };
 static const char *const strange_names[] = {
-    "columns mirrored", "rows mirrored", "upside down",     "source breathes", "detector wanders", "detector breathes",
-    "orbit tilted",     "orbit shifted", "turned a little", "views twice",     "views shuffled",   "steps uneven"};
+    "columns mirrored",  "rows mirrored",  "upside down",       "source breathes", "detector wanders",
+    "detector breathes", "orbit tilted",   "orbit on its side", "orbit shifted",   "turned a little",
+    "views twice",       "views shuffled", "steps uneven"};
 
 static void make_strange(enum strange strange, const struct orbit_spec *spec, struct geometry *geometry)
 {
@@ -198,11 +200,13 @@ static void make_strange(enum strange strange, const struct orbit_spec *spec, st
 		if (strange == DETECTOR_BREATHES)
 			for (int i = 0; i < 2; i++)
 				view->pixel0[i] -= 0.02 * slow * old.source[i];
-		if (strange == ORBIT_TILTED) {
-			turn(view->source, 0.035);
-			turn(view->pixel0, 0.035);
-			turn(view->column_step, 0.035);
-			turn(view->row_step, 0.035);
+		if (strange == ORBIT_TILTED || strange == ORBIT_ON_ITS_SIDE) {
+			const double lean = strange == ORBIT_TILTED ? 0.035 : 0.5 * M_PI;
+
+			turn(view->source, lean);
+			turn(view->pixel0, lean);
+			turn(view->column_step, lean);
+			turn(view->row_step, lean);
 		}
 		if (strange == ORBIT_SHIFTED) {
 			move(view->source, shift, 1);
