@@ -592,6 +592,32 @@ static void warn_mirrored(cJSON *list, const struct geometry *geometry)
 		     "the patient, otherwise they are mirrored");
 }
 
+/* A view of which no arm is capable: of another calibration, or in another unit than the rest. */
+static void warn_uneven_distances(cJSON *list, const struct geometry *geometry)
+{
+	const double most = 2; /* times; arms breathe by some mm */
+	const double first = vec_norm(geometry->views[0].source);
+	double such = 0;
+	int odd = 0, first_odd = 0;
+
+	for (int k = 1; k < geometry->count; k++) {
+		const double distance = vec_norm(geometry->views[k].source);
+
+		if (distance <= most * first && first <= most * distance)
+			continue;
+		if (odd++ == 0) {
+			first_odd = k;
+			such = distance;
+		}
+	}
+	if (odd > 0)
+		warn(
+		    list, "implausible_lengths",
+		    "the source of view 0 stands %.4g mm from the isocentre, those of %d of %d views less than half or "
+		    "more than twice as far, such as view %d, %.4g mm: are all lengths in mm?",
+		    first, odd, geometry->count, first_odd, such);
+}
+
 /* Lengths in another unit, matrices that were made for another detector: possible, and hardly meant. */
 static void warn_implausible(cJSON *list, const struct scan *scan)
 {
@@ -612,7 +638,9 @@ static void warn_implausible(cJSON *list, const struct scan *scan)
 		outside += !(column > -1 && column < geometry->columns && row > -1 && row < geometry->rows);
 		pitch += vec_norm(geometry->views[k].column_step) / geometry->count;
 	}
-	if (fan > fan_most || orbit->source_to_detector < nearest || magnification > magnification_most)
+	/* Below 1 the detector stands before the axis. */
+	if (fan > fan_most || orbit->source_to_detector < nearest || magnification > magnification_most ||
+	    magnification < 1)
 		warn(list, "implausible_lengths",
 		     "the sources stand %.4g mm from the axis and %.4g mm from the detector, which they see under %.4g "
 		     "degrees: are all lengths in mm?",
@@ -664,6 +692,7 @@ cJSON *scan_warnings(const struct scan *scan)
 		warn(list, "single_view", "one view only: depth cannot be told");
 	}
 	warn_implausible(list, scan);
+	warn_uneven_distances(list, &scan->geometry);
 	warn_mirrored(list, &scan->geometry);
 	warn_hardening(list, scan);
 	if (scan->air > 0 && scan->saturation > 0 && scan->air >= scan->saturation)

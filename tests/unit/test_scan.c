@@ -462,6 +462,17 @@ static void all_in_metres(struct view *view, int k)
 		view->row_step[i] *= 1e-3;
 	}
 }
+static void one_in_metres(struct view *view, int k)
+{
+	if (k == 2)
+		in_metres(view, k);
+}
+static void detector_before_the_axis(struct view *view, int k)
+{
+	(void)k;
+	for (int i = 0; i < 3; i++)
+		view->pixel0[i] += 0.9 * view->source[i];
+}
 static void coarser(struct view *view, int k)
 {
 	(void)k;
@@ -504,6 +515,8 @@ static const struct {
 } slips[] = {
     {in_metres, "implausible_lengths"},
     {all_in_metres, "implausible_lengths"},
+    {one_in_metres, "implausible_lengths"},
+    {detector_before_the_axis, "implausible_lengths"},
     {coarser, "other_pitch"},
     {other_detector, "isocentre_outside"},
     {columns_back, "mirrored_columns"},
