@@ -58,7 +58,7 @@ test_grid_is_chosen_when_none_is_given() {
 }
 
 test_volumes_come_in_every_format() {
-	local voxels=$((32 * 24 * 16)) etag full
+	local voxels=$((32 * 24 * 16)) etag full first range
 	uploaded_scan
 	post_job "$small"'"fdk": {}}'
 	wait_job succeeded
