@@ -14,7 +14,7 @@
 #include <string.h>
 
 static const double FULL_GAP = 5 * M_PI / 180, FULL_GAP_DISPLACED = 20 * M_PI / 180, FULL_GAP_RATIO = 2.25;
-static const double LEAN_LEAST = 2 * M_PI / 180; /* FDK about z is within some HU up to there */
+static const double LEAN_LEAST = 4 * M_PI / 180; /* FDK about z is within 4 HU up to there; real arms lean by less */
 static const double SAME_ANGLE = 1e-6;           /* radians, a micrometre on a C-arm's orbit */
 static const double DISPLACED_PIXELS = 4, DISPLACED_WIDTH = 0.02;
 

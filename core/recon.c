@@ -6,6 +6,7 @@
 #include "core/recon.h"
 
 #include <stdint.h>
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -771,8 +772,13 @@ static int run_fdk_again(struct recon *recon, struct error *err)
 static int leave_out_the_exterior(struct recon *recon, struct error *err)
 {
 	const struct backend *backend = recon->backend;
-	/* An FDK volume that is too low in many places looks as if something were missing from it. */
-	const bool sound = !recon->orbit.arc_too_short && recon->orbit.tilt < 0.1;
+	/*
+	 * An FDK volume that is too low in many places looks as if something were
+	 * missing from it; real sweeps are some degrees short, and that is at the rim.
+	 */
+	const double little = 0.1;
+	const bool sound = (!recon->orbit.arc_too_short || recon->orbit.arc > M_PI + recon->orbit.fan - little) &&
+			   recon->orbit.tilt < little;
 	const struct grid *grid = sound ? &recon->recipe.grid : NULL;
 	bool wanted = false;
 	size_t outside;
