@@ -3,7 +3,7 @@
 
 enum { SIDE = 16 }; /* of a block across z */
 
-static __global__ void __launch_bounds__(SIDE *SIDE) backproject_matched(const matched_job job)
+static __global__ void __launch_bounds__(SIDE *SIDE, 3) backproject_matched(const matched_job job)
 {
 	matched_thread(job, blockIdx.x * SIDE + threadIdx.x, blockIdx.y * SIDE + threadIdx.y, blockIdx.z * MATCHED_RUN);
 }
