@@ -5,8 +5,8 @@
  */
 #include "core/recon.h"
 
-#include <stdint.h>
 #include <math.h>
+#include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -776,7 +776,7 @@ static int leave_out_the_exterior(struct recon *recon, struct error *err)
 	 * An FDK volume that is too low in many places looks as if something were
 	 * missing from it; real sweeps are some degrees short, and that is at the rim.
 	 */
-	const double little = 0.1;
+	const double little = 0.2;
 	const bool sound = (!recon->orbit.arc_too_short || recon->orbit.arc > M_PI + recon->orbit.fan - little) &&
 			   recon->orbit.tilt < little;
 	const struct grid *grid = sound ? &recon->recipe.grid : NULL;
