@@ -80,8 +80,8 @@ static bool subtract_view(const struct pair *pair, const struct view *view, size
 
 		if (is_truncated(pair, pair->measured + at))
 			truncated++;
-		else if (pair->faces != NULL &&
-			 faces_row_counts_outside(pair->faces, view, pair->columns, r, pair->measured + at))
+		else if (pair->faces != NULL && faces_row_counts_outside(pair->faces, view, pair->columns, r,
+									 pair->measured + at, pair->explained + at))
 			counting++;
 		else
 			continue;

@@ -8,7 +8,7 @@
 
 enum { LOOKED_AT = 64 /* rays of a row */, SHARE = 32 /* one ray in so many makes the row one that counts it */ };
 
-static const double OPEN_DENSITY = 0.25;
+static const double OPEN_DENSITY = 0.25, OPEN_EXCESS = 0.02;
 
 /* Where a line meets the grid's box, half a voxel beyond the outer centres. */
 struct passage {
@@ -87,10 +87,10 @@ static bool is_open(const struct faces *faces, const struct passage *passage, in
 }
 
 bool faces_row_counts_outside(const struct faces *faces, const struct view *view, int columns, int row,
-			      const float *measured)
+			      const float *measured, const float *explained)
 {
 	int looked_at = 0, missed = 0, open = 0;
-	double beside = 0;
+	double beside = 0, all = 0, excess = 0;
 
 	for (int column = 0; column < columns; column += stride_of(columns)) {
 		const struct passage passage = pass_of_ray(faces->grid, view, column, row);
@@ -101,9 +101,13 @@ bool faces_row_counts_outside(const struct faces *faces, const struct view *view
 			beside += (double)measured[column];
 		} else if (is_open(faces, &passage, 0) || is_open(faces, &passage, 1)) {
 			open++;
+			all += (double)measured[column];
+			excess += (double)measured[column] - (double)explained[column];
 		}
 	}
-	return open * SHARE > looked_at || (missed * SHARE > looked_at && beside >= (double)EXTEND_LEVEL * missed);
+	if (open * SHARE > looked_at && excess >= (double)EXTEND_LEVEL * open && excess >= OPEN_EXCESS * all)
+		return true;
+	return missed * SHARE > looked_at && beside >= (double)EXTEND_LEVEL * missed;
 }
 
 bool outside_is_possible(const struct grid *grid, const struct view *view, int columns, int rows, const float *measured)

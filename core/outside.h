@@ -14,7 +14,9 @@
  * face of the grid where the object goes on: where the FDK volume, averaged
  * over FACE_REACH voxels to all sides in the outermost layer, has at least a
  * quarter of the object's density. The object's density is sum v^2 / sum |v|,
- * so that the scale of the projections has no part in it.
+ * so that the scale of the projections has no part in it. An object may also end
+ * there: the rays of the row that cross such faces must count 2 % more, and 0.03,
+ * than that volume explains.
  */
 enum { FACE_REACH = 2 };
 
@@ -30,9 +32,9 @@ int faces_make(struct faces *ret_faces, const struct backend *backend, struct vo
 	       struct error *err);
 void faces_clear(struct faces *faces);
 
-/* One row of a view, line integrals [columns]; about 64 of its rays are looked at. */
+/* One row of a view, line integrals [columns], and those through the volume; about 64 of its rays are looked at. */
 bool faces_row_counts_outside(const struct faces *faces, const struct view *view, int columns, int row,
-			      const float *measured);
+			      const float *measured, const float *explained);
 
 /*
  * The same without a volume, to save the trouble: a row may count it when the
