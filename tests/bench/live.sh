@@ -72,9 +72,9 @@ fi
 
 if [[ $wanted == *watchers* ]]; then
 	scan=$(scan_of 64 60)
-	job_seconds() { # WATCHERS: of a job with 200 iterations
+	job_seconds() { # WATCHERS GRID ITERATIONS
 		local id pid=
-		id=$(cbct submit "$scan" --grid 96 --spacing 2 --sart 200 --subsets 2)
+		id=$(cbct submit "$scan" --grid "$2" --spacing "$(per "192 / $2")" --sart "$3" --subsets 2)
 		if [ "$1" != 0 ]; then
 			rm -f "$work/created"
 			mkfifo "$work/created"
@@ -92,13 +92,16 @@ if [[ $wanted == *watchers* ]]; then
 			FROM events e JOIN jobs j ON j.number = e.job WHERE j.id = '$id'" >"$work/created"
 		wait $pid
 	}
-	for turn in 1 2 3; do
-		alone=$(job_seconds 0)
+	# 30 iterations a second, then as many as a small scan has
+	for job in "96 200" "96 200" "96 200" "192 50" "192 50" "192 50"; do
+		# shellcheck disable=SC2086
+		alone=$(job_seconds 0 $job)
 		before=$(cpu)
-		watched=$(job_seconds 1000)
+		# shellcheck disable=SC2086
+		watched=$(job_seconds 1000 $job)
 		used=$(per "$(cpu) - $before")
 		{
-			echo "1,000 watchers: job of 200 iterations $alone s alone, $watched s watched ($(per "100 * ($watched / $alone - 1)") % slower);" \
+			echo "1,000 watchers: job of ${job#* } iterations of ${job% *}^3 $alone s alone, $watched s watched ($(per "100 * ($watched / $alone - 1)") % slower);" \
 				"daemon $used s of a processor, $(cat "$work/memory") MB of memory of its own"
 			cat "$work/watched"
 		} | say
