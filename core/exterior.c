@@ -7,6 +7,9 @@
 #include "core/fdk.h"
 #include "core/outside.h"
 
+/* Spread over the orbit: what goes on outside of the grid shows in many views. */
+enum { VIEWS_LOOKED_AT = 32 };
+
 /* One view on the host: line integrals as measured and through the volume. */
 struct pair {
 	int columns, rows;
@@ -94,6 +97,7 @@ static bool subtract_view(const struct pair *pair, const struct view *view, size
 int exterior_is_possible(const struct geometry *geometry, const struct grid *grid, const struct backend *backend,
 			 struct stack *projections, bool *ret_possible, struct error *err)
 {
+	const int looked_at = geometry->count < VIEWS_LOOKED_AT ? geometry->count : VIEWS_LOOKED_AT;
 	float *measured = malloc((size_t)geometry->columns * (size_t)geometry->rows * sizeof(float));
 	bool possible = false;
 	int code = 0;
@@ -101,7 +105,9 @@ int exterior_is_possible(const struct geometry *geometry, const struct grid *gri
 	if (measured == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a view of %d x %d pixels", geometry->columns,
 				 geometry->rows);
-	for (int view = 0; view < geometry->count && !possible && code == 0; view++) {
+	for (int i = 0; i < looked_at && !possible && code == 0; i++) {
+		const int view = (int)((long long)i * geometry->count / looked_at);
+
 		code = backend->stack_download(projections, view, 1, measured, err);
 		if (code == 0)
 			possible = outside_is_possible(grid, &geometry->views[view], geometry->columns, geometry->rows,

@@ -37,8 +37,8 @@ int exterior_subtract(const struct backend *backend, struct device *device, stru
 		      const struct geometry *geometry, const int pad[2], const struct grid *grid, struct volume *volume,
 		      struct stack *projections, size_t *ret_outside, struct error *err);
 /*
- * Whether a row that is not truncated may have to be changed, from the
- * projections and where the grid lies: sparing FDK when nothing will be.
+ * Whether a row that is not truncated may have to be changed, from some of
+ * the projections and where the grid lies: sparing FDK when nothing will be.
  */
 int exterior_is_possible(const struct geometry *geometry, const struct grid *grid, const struct backend *backend,
 			 struct stack *projections, bool *ret_possible, struct error *err);
