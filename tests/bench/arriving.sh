@@ -9,21 +9,12 @@
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 BUILD=$(realpath "${BUILD:-build}")
+. tests/bench/lib.sh
 backend=${1:-cpu} columns=${2:-308} rows=${3:-240} views=${4:-200} rate=${5:-30} grid=${6:-128} sample=${7:-float32} goal=${8:-500}
 repeats=${REPEATS:-3} connections=2
 work=$BUILD/bench/arriving
-rm -rf "$work"
-mkdir -p "$work"
-: >"$work/out"
 
-"$BUILD/cbctd" --listen 127.0.0.1:0 --state-dir "$work/state" --backend "$backend" >"$work/out" 2>"$work/err" &
-daemon=$!
-trap 'kill $daemon 2>/dev/null; wait $daemon 2>/dev/null; rm -rf "$work"' EXIT
-until url=$(sed -n 's/^listening on //p' "$work/out") && [ -n "$url" ]; do
-	kill -0 $daemon || { cat "$work/err" >&2; exit 1; }
-	sleep 0.05
-done
-until curl -sf -o /dev/null "$url/readyz"; do sleep 0.05; done
+start_daemon "$work" --backend "$backend"
 
 # 0x40404040 is a float of 3.004, 0x4040 are 16448 counts: as good as any other
 one=$((columns * rows * 4)) projections="{\"count\": $views, \"sample\": \"float32\", \"quantity\": \"line_integral\"}"

@@ -5,20 +5,11 @@
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 BUILD=$(realpath "${BUILD:-build}")
+. tests/bench/lib.sh
 work=$BUILD/bench/http
 count=100 one=$((559 * 559 * 4)) repeats=3
-rm -rf "$work"
-mkdir -p "$work/views"
-: >"$work/out"
-
-"$BUILD/cbctd" --listen 127.0.0.1:0 --state-dir "$work/state" --backend cpu >"$work/out" 2>"$work/err" &
-daemon=$!
-trap 'kill $daemon 2>/dev/null; wait $daemon 2>/dev/null; rm -rf "$work"' EXIT
-until url=$(sed -n 's/^listening on //p' "$work/out") && [ -n "$url" ]; do
-	kill -0 $daemon || { cat "$work/err" >&2; exit 1; }
-	sleep 0.05
-done
-until curl -sf -o /dev/null "$url/readyz"; do sleep 0.05; done
+start_daemon "$work" --backend cpu
+mkdir "$work/views"
 
 # 0x40404040 is a float of 3.004: finite, and as good as any other where nothing is compressed
 head -c $((one * count)) /dev/zero | tr '\0' '\100' >"$work/all"

@@ -5,22 +5,13 @@
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 BUILD=$(realpath "${BUILD:-build}")
+. tests/bench/lib.sh
 work=$BUILD/bench/live
 wanted=${*:-slices stream watchers}
-rm -rf "$work"
-mkdir -p "$work"
-: >"$work/out"
 ulimit -n "$(ulimit -Hn)"
 export PATH=$BUILD:$PATH
 
-"$BUILD/cbctd" --listen 127.0.0.1:0 --state-dir "$work/state" --backend cpu >"$work/out" 2>"$work/err" &
-daemon=$!
-trap 'kill $daemon 2>/dev/null; wait $daemon 2>/dev/null; rm -rf "$work"' EXIT
-until url=$(sed -n 's/^listening on //p' "$work/out") && [ -n "$url" ]; do
-	kill -0 $daemon || { cat "$work/err" >&2; exit 1; }
-	sleep 0.05
-done
-until curl -sf -o /dev/null "$url/readyz"; do sleep 0.05; done
+start_daemon "$work" --backend cpu
 export CBCT_URL=$url
 port=${url##*:}
 

@@ -4,22 +4,14 @@
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 BUILD=$(realpath "${BUILD:-build}")
+. tests/bench/lib.sh
 work=$BUILD/bench/page tools=$BUILD/web-tests
 CHROMIUM=$(command -v chromium || true)
 if [ -z "$CHROMIUM" ] || [ ! -d "$tools/node_modules" ] || [ ! -e "$BUILD/web/files/index.html" ]; then
 	echo "the page is not measured: that needs chromium, the page and what 'make check' installs for its tests"
 	exit 0
 fi
-rm -rf "$work"
-mkdir -p "$work"
-"$BUILD/cbctd" --listen 127.0.0.1:0 --state-dir "$work/state" --backend cpu >"$work/out" 2>"$work/err" &
-daemon=$!
-trap 'kill $daemon 2>/dev/null; wait $daemon 2>/dev/null; rm -rf "$work"' EXIT
-until url=$(sed -n 's/^listening on //p' "$work/out") && [ -n "$url" ]; do
-	kill -0 $daemon || { cat "$work/err" >&2; exit 1; }
-	sleep 0.05
-done
-until curl -sf -o /dev/null "$url/readyz"; do sleep 0.05; done
+start_daemon "$work" --backend cpu
 
 export CBCT_URL=$url
 "$BUILD/cbct" simulate --phantom head --scale 88 --density 0.02 --views 60 --columns 160 --rows 160 --pixel 2 --photons 100000 -o "$work/scan" >/dev/null
