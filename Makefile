@@ -208,8 +208,6 @@ fuzz: setup ## each fuzz target for FUZZ_SECONDS=10 (needs clang)
 bench: setup ## CPU and HTTP benchmarks, results in build/bench/
 	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/cpu-bench $(BUILD)/acquire $(BUILD)/watchers $(BUILD)/slices
 	@BUILD=$(BUILD) tests/bench/run.sh
-	@BUILD=$(BUILD) tests/bench/arriving.sh
-	@BUILD=$(BUILD) tests/bench/live.sh
 
 # A worker that can be made to fault, for the test of what becomes of that.
 $(BUILD)/tests/gpu/fault.o: tests/gpu/fault.cu

@@ -104,8 +104,7 @@ struct recon_hooks {
 	 * comes as "final", and before that under its own name where the recipe asks for that too.
 	 */
 	int (*keep)(void *context, struct recon *recon, const struct kept_volume *volume, struct error *err);
-	/* "metal", "no_metal": what became of it. "defects": samples were replaced; "arc_too_short": FDK of less than
-	 * 180 degrees plus the fan. */
+	/* The codes are in warn.h and input.h. */
 	void (*warning)(void *context, const char *code, const char *detail);
 }; /* any of them may be NULL */
 

@@ -50,7 +50,7 @@ jq --arg date "$date" --arg commit "$commit" --argjson plastimatch "$plastimatch
 rm -f "$out/measured.json"
 echo "written: $out/cpu.json"
 
-for more in tests/bench/http.sh tests/bench/page.sh; do
+for more in http page arriving live; do
 	echo
-	BUILD=$BUILD $more
+	BUILD=$BUILD tests/bench/$more.sh
 done
