@@ -104,6 +104,16 @@ int entity_select(struct request *request, const struct entity *entity, struct s
 		  struct error *err);
 void entity_headers(struct request *request, const struct entity *entity, const struct selection *selection);
 
+/* ---- what several of them need to wait for what becomes of a job: api_job.c ---- */
+/* ?wait=SECONDS, or Prefer: wait=N; `initial` when neither is there, and never more than api->max_wait. */
+int wait_read(struct api *api, struct request *request, double initial, double *ret_seconds, struct error *err);
+/* Takes the reference to the job. From now on the request is woken at each change of it: look once more after this. */
+int job_wait_begin(struct request *request, struct job *job, double seconds, struct error *err);
+/* The request's reference; NULL before it waits. */
+struct job *job_waited_for(struct request *request);
+/* True: answer HTTP_WAIT. False: the time is over. */
+bool job_wait_goes_on(struct request *request);
+
 /* ---- what several of them need of volumes: api_volume.c ---- */
 enum { VOLUME_FILENAME_MAX = 96 };
 int volume_find(struct api *api, const struct job_facts *job, const char *name, struct volume_record *ret_volume,
@@ -114,6 +124,9 @@ int volume_asked(struct api *api, struct request *request, struct job_facts *ret
 /* ?format=, ?type= and ?scale=; the name is left to the caller. */
 int volume_options(struct request *request, const struct job_facts *job, struct content_options *ret_options,
 		   struct error *err);
+/* Another one for each volume, also of the same name when it is made again: for ETags. */
+enum { VOLUME_TAG_MAX = 80 };
+void volume_tag(const char *job, const struct volume_record *volume, char ret_tag[VOLUME_TAG_MAX]);
 const char *volume_media_type(const struct content_options *options);
 void volume_filename(const char *job, const char *name, const struct content_options *options,
 		     char ret_name[VOLUME_FILENAME_MAX]);

@@ -110,7 +110,7 @@ int job_list(void *context, struct request *request, struct error *err)
 	return request_reply_json(request, 200, document, err);
 }
 
-/* ---- one, and waiting for its end ---- */
+/* ---- waiting for what becomes of one ---- */
 
 struct waiter {
 	struct job *job;
@@ -132,11 +132,10 @@ static void waiter_free(void *state)
 	free(waiter);
 }
 
-/* ?wait=SECONDS, or Prefer: wait=N; 0 when neither is there. */
-static int wait_read(struct api *api, struct request *request, double *ret_seconds, struct error *err)
+int wait_read(struct api *api, struct request *request, double initial, double *ret_seconds, struct error *err)
 {
 	const char *wait = request_query(request, "wait");
-	double seconds = 0;
+	double seconds = initial;
 
 	if (wait == NULL)
 		prefer_wait(request_header(request, "Prefer"), &seconds);
@@ -146,8 +145,7 @@ static int wait_read(struct api *api, struct request *request, double *ret_secon
 	return 0;
 }
 
-/* Takes the reference to the job. From now on the request is woken at each change of it. */
-static int wait_begin(struct request *request, struct job *job, double seconds, struct error *err)
+int job_wait_begin(struct request *request, struct job *job, double seconds, struct error *err)
 {
 	struct waiter *waiter = calloc(1, sizeof(*waiter));
 
@@ -164,19 +162,37 @@ static int wait_begin(struct request *request, struct job *job, double seconds, 
 	return 0;
 }
 
+struct job *job_waited_for(struct request *request)
+{
+	struct waiter *waiter = request_state(request);
+
+	return waiter != NULL ? waiter->job : NULL;
+}
+
+bool job_wait_goes_on(struct request *request)
+{
+	struct waiter *waiter = request_state(request);
+
+	if (http_now() >= waiter->until || request_stopping(request))
+		return false;
+	request_wait_until(request, waiter->until);
+	return true;
+}
+
+/* ---- one, and waiting for its end ---- */
+
 /* The job's document, once it has ended or the time is over. */
 static int wait_end(struct request *request, int status, struct error *err)
 {
-	struct waiter *waiter = request_state(request);
+	struct job *job = job_waited_for(request);
 	struct job_facts facts;
 
-	job_facts(waiter->job, &facts);
+	job_facts(job, &facts);
 	if (facts.removed)
 		return error_set(err, ERR_NOT_FOUND, "job %s was removed", facts.id);
-	if (facts.ended || http_now() >= waiter->until || request_stopping(request))
-		return request_reply_json(request, status, job_document(waiter->job, false), err);
-	request_wait_until(request, waiter->until);
-	return HTTP_WAIT;
+	if (!facts.ended && job_wait_goes_on(request))
+		return HTTP_WAIT;
+	return request_reply_json(request, status, job_document(job, false), err);
 }
 
 int job_get(void *context, struct request *request, struct error *err)
@@ -187,9 +203,9 @@ int job_get(void *context, struct request *request, struct error *err)
 
 	if (request_state(request) != NULL)
 		return wait_end(request, 200, err);
-	if (wait_read(api, request, &seconds, err) != 0 ||
+	if (wait_read(api, request, 0, &seconds, err) != 0 ||
 	    jobs_find(api->jobs, request_argument(request, 0), &job, err) != 0 ||
-	    wait_begin(request, job, seconds, err) != 0)
+	    job_wait_begin(request, job, seconds, err) != 0)
 		return err->code;
 	return wait_end(request, 200, err);
 }
@@ -215,7 +231,7 @@ int job_delete(void *context, struct request *request, struct error *err)
 
 	if (request_state(request) != NULL)
 		return wait_end(request, 202, err);
-	if (wait_read(api, request, &seconds, err) != 0 ||
+	if (wait_read(api, request, 0, &seconds, err) != 0 ||
 	    jobs_find(api->jobs, request_argument(request, 0), &job, err) != 0)
 		return err->code;
 	if (jobs_delete(api->jobs, job, &removed, err) != 0 || removed) {
@@ -224,7 +240,7 @@ int job_delete(void *context, struct request *request, struct error *err)
 		job_release(job);
 		return removed ? request_reply_empty(request, 204, err) : err->code;
 	}
-	if (wait_begin(request, job, seconds, err) != 0)
+	if (job_wait_begin(request, job, seconds, err) != 0)
 		return err->code;
 	return wait_end(request, 202, err);
 }

@@ -95,13 +95,13 @@ static int draw(const float *voxels, const struct grid *grid, const struct asked
 	return code;
 }
 
-static void make_etag(const struct volume_record *volume, const struct asked *asked, char *ret_etag, size_t size)
+static void make_etag(const char *job, const struct volume_record *volume, const struct asked *asked, char *ret_etag,
+		      size_t size)
 {
-	char digest[33];
+	char tag[VOLUME_TAG_MAX];
 
-	for (int i = 0; i < 16; i++)
-		snprintf(digest + 2 * i, sizeof(digest) - 2 * (size_t)i, "%02x", volume->sha256[i]);
-	snprintf(ret_etag, size, "\"%s-%s-%d-%g-%g\"", digest, asked->sheet ? "sheet" : axis_names[asked->slice.axis],
+	volume_tag(job, volume, tag);
+	snprintf(ret_etag, size, "\"%s-%s-%d-%g-%g\"", tag, asked->sheet ? "sheet" : axis_names[asked->slice.axis],
 		 asked->sheet ? asked->slice.axis : asked->index, asked->window, asked->level);
 }
 
@@ -126,7 +126,7 @@ int slice_get(void *context, struct request *request, struct error *err)
 	struct volume_record volume;
 	struct job_facts facts;
 	struct asked asked;
-	char etag[128], path[1024];
+	char etag[160], path[1024];
 	struct entity entity = {.etag = etag, .size = UNKNOWN_SIZE};
 	struct selection selection;
 	bool done;
@@ -134,7 +134,7 @@ int slice_get(void *context, struct request *request, struct error *err)
 	if (volume_asked(api, request, &facts, &volume, err) != 0 ||
 	    read_asked(request, &volume.grid, facts.mu_water, &asked, err) != 0)
 		return err->code;
-	make_etag(&volume, &asked, etag, sizeof(etag));
+	make_etag(facts.id, &volume, &asked, etag, sizeof(etag));
 	if (entity_select(request, &entity, &selection, &done, err) != 0 || done)
 		return done ? 0 : err->code;
 	store_volume_path(api->store, facts.id, volume.name, path);

@@ -174,14 +174,19 @@ static ssize_t next_part(struct stream *stream)
 	struct job_facts facts;
 	struct error err;
 	char name[sizeof(volume.name)];
+	long long before = stream->after;
+	int code;
 
 	job_facts(stream->job, &facts); /* asked first: what comes before the end is told by then */
 	if (facts.removed || next_volume(stream, name, sizeof(name)) != 0)
 		return -1;
 	if (name[0] != '\0') {
-		if (volume_find(stream->api, &stream->facts, name, &volume, &err) != 0)
-			return -1;
-		return begin_part(stream, &volume);
+		code = volume_find(stream->api, &stream->facts, name, &volume, &err);
+		if (code == 0)
+			return begin_part(stream, &volume);
+		/* Told of before a crash that took it: the job makes it again. */
+		stream->after = before;
+		return code == ERR_NOT_FOUND && !facts.ended && !request_stopping(stream->request) ? READ_WAIT : -1;
 	}
 	if (facts.ended)
 		return last_part(stream);

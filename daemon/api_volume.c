@@ -8,40 +8,69 @@
 #include "daemon/document.h"
 #include "daemon/http_text.h"
 
-int volume_list(void *context, struct request *request, struct error *err)
-{
-	struct api *api = context;
-	struct volume_record *volumes = NULL;
-	struct job_facts facts;
-	cJSON *document, *list;
-	struct page page;
-	struct job *job;
-	int count = 0, first, last, code;
+/* s that a list waits for digests: longer than a disk takes for a volume, or something is wrong with it. */
+static const double patience = 30;
 
-	if (page_read(request, &page, err) != 0 || jobs_find(api->jobs, request_argument(request, 0), &job, err) != 0)
-		return err->code;
-	job_facts(job, &facts);
-	job_release(job);
-	code = store_job_volumes(api->store, facts.id, &volumes, &count, err);
-	if (code != 0)
-		return code;
-	/* Newest first, as all lists; a page goes on behind the volume named by `after`. */
-	first = count - 1;
-	for (int i = 0; page.after != NULL && i < count; i++) {
-		if (strcmp(volumes[i].name, page.after) == 0)
+/* Newest first, as all lists; a page goes on behind the volume named by `after`. */
+static int reply_page(struct request *request, const char *job, const struct page *page,
+		      const struct volume_record *volumes, int count, struct error *err)
+{
+	cJSON *document = cJSON_CreateObject(), *list = cJSON_AddArrayToObject(document, "volumes");
+	int first = count - 1, last;
+
+	for (int i = 0; page->after != NULL && i < count; i++) {
+		if (strcmp(volumes[i].name, page->after) == 0)
 			first = i - 1;
 	}
-	last = first >= page.limit ? first - page.limit + 1 : 0;
-	document = cJSON_CreateObject();
-	list = cJSON_AddArrayToObject(document, "volumes");
+	last = first >= page->limit ? first - page->limit + 1 : 0;
 	for (int i = first; i >= last; i--)
-		cJSON_AddItemToArray(list, volume_document(facts.id, &volumes[i]));
+		cJSON_AddItemToArray(list, volume_document(job, &volumes[i]));
 	if (last > 0)
 		cJSON_AddStringToObject(document, "next", volumes[last].name);
 	else
 		cJSON_AddNullToObject(document, "next");
-	free(volumes);
 	return request_reply_json(request, 200, document, err);
+}
+
+/* HTTP_WAIT while there is hope for the digests that are missing. */
+static int list_volumes(struct api *api, struct request *request, const struct page *page, struct job *job,
+			struct error *err)
+{
+	struct volume_record *volumes;
+	struct job_facts facts;
+	bool settled = true;
+	int count, code;
+
+	job_facts(job, &facts);
+	if (facts.removed)
+		return error_set(err, ERR_NOT_FOUND, "job %s was removed", facts.id);
+	code = store_job_volumes(api->store, facts.id, &volumes, &count, err);
+	if (code != 0)
+		return code;
+	for (int i = 0; i < count; i++)
+		settled = settled && volumes[i].settled;
+	if (!settled && job_wait_goes_on(request))
+		code = HTTP_WAIT;
+	else
+		code = reply_page(request, facts.id, page, volumes, count, err);
+	free(volumes);
+	return code;
+}
+
+int volume_list(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	struct page page;
+	struct job *job;
+	double seconds;
+
+	if (page_read(request, &page, err) != 0)
+		return err->code;
+	if (job_waited_for(request) == NULL && (wait_read(api, request, patience, &seconds, err) != 0 ||
+						jobs_find(api->jobs, request_argument(request, 0), &job, err) != 0 ||
+						job_wait_begin(request, job, seconds, err) != 0))
+		return err->code;
+	return list_volumes(api, request, &page, job_waited_for(request), err);
 }
 
 int volume_find(struct api *api, const struct job_facts *job, const char *name, struct volume_record *ret_volume,
@@ -136,15 +165,20 @@ void volume_filename(const char *job, const char *name, const struct content_opt
 		 options->shuffled ? ".shuffled.zst" : options->format->extension);
 }
 
-/* Tells voxels, format, type, scale and encoding apart. */
-static void make_etag(const struct volume_record *volume, const struct content_options *options, bool zstd,
-		      char *ret_etag, size_t size)
+/* The digest would do as well, but comes later than the volume. */
+void volume_tag(const char *job, const struct volume_record *volume, char ret_tag[VOLUME_TAG_MAX])
 {
-	char digest[33];
+	snprintf(ret_tag, VOLUME_TAG_MAX, "%s-%s-%llx", job, volume->name, (unsigned long long)(volume->created * 1e6));
+}
 
-	for (int i = 0; i < 16; i++)
-		snprintf(digest + 2 * i, sizeof(digest) - 2 * (size_t)i, "%02x", volume->sha256[i]);
-	snprintf(ret_etag, size, "\"%s-%s-%s-%d%s\"", digest, options->shuffled ? shuffled_name : options->format->name,
+/* Tells voxels, format, type, scale and encoding apart. */
+static void make_etag(const char *job, const struct volume_record *volume, const struct content_options *options,
+		      bool zstd, char *ret_etag, size_t size)
+{
+	char tag[VOLUME_TAG_MAX];
+
+	volume_tag(job, volume, tag);
+	snprintf(ret_etag, size, "\"%s-%s-%s-%d%s\"", tag, options->shuffled ? shuffled_name : options->format->name,
 		 volume_type_names[options->type], options->scale, zstd ? "-zstd" : "");
 }
 
@@ -224,7 +258,7 @@ int volume_get(void *context, struct request *request, struct error *err)
 	struct content *content;
 	struct job_facts facts;
 	struct entity entity;
-	char etag[96], filename[VOLUME_FILENAME_MAX], path[1024];
+	char etag[160], filename[VOLUME_FILENAME_MAX], path[1024];
 	/* Ranges are of the plain bytes: a frame of zstd cannot be entered in the middle. */
 	bool zstd = accepts_coding(request_header(request, "Accept-Encoding"), "zstd") &&
 		    (request_header(request, "Range") == NULL || request_is_head(request));
@@ -238,7 +272,7 @@ int volume_get(void *context, struct request *request, struct error *err)
 	if (content_open(path, &volume.grid, &options, &content, err) != 0)
 		return err->code;
 	zstd = zstd || options.shuffled;
-	make_etag(&volume, &options, zstd, etag, sizeof(etag));
+	make_etag(facts.id, &volume, &options, zstd, etag, sizeof(etag));
 	volume_filename(facts.id, volume.name, &options, filename);
 	entity =
 	    (struct entity){etag, zstd ? UNKNOWN_SIZE : content_size(content), volume_media_type(&options), filename};

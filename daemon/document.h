@@ -20,7 +20,7 @@ void time_text(double seconds, char ret_text[TIME_TEXT_SIZE]);
 cJSON *scan_document(struct stored_scan *scan, bool brief);
 /* The job with its request; brief: without history and warnings. */
 cJSON *job_document(struct job *job, bool brief);
-/* name, stage, iteration, size, spacing_mm, origin_mm, bytes, digest, statistics, created, href. */
+/* name, stage, iteration, size, spacing_mm, origin_mm, bytes, digest (once it is known), statistics, created, href. */
 cJSON *volume_document(const char *job, const struct volume_record *volume);
 cJSON *history_row_document(const struct history_row *row);
 /* type (urn:cbctd:problem:NAME), detail, pointer where there is one: how a job says what went wrong. */

@@ -13,6 +13,7 @@
 #include "daemon/document.h"
 #include "daemon/log.h"
 #include "proto/json.h"
+#include "proto/saver.h"
 #include "proto/spool.h"
 
 /* The one table of transitions: [from][to]. */
@@ -422,16 +423,6 @@ static void show_state(struct job *job, const struct job_record *record, const s
 		 record->state == JOB_FAILED ? record->error_text : "");
 }
 
-static void remove_checkpoint(const struct jobs *jobs, const char *id)
-{
-	char directory[1024], path[1100];
-
-	store_job_directory(jobs->store, id, directory);
-	snprintf(path, sizeof(path), "%s/%s", directory, SPOOL_CHECKPOINT);
-	if (unlink(path) < 0 && errno != ENOENT && errno != ENOTDIR)
-		log_line(LEVEL_WARNING, "job %s: %s stays: %s", id, path, strerror(errno));
-}
-
 /* jobs->change is held; the caller wakes the watchers after it. */
 static int change_state(struct job *job, enum job_state to, const struct job_change *change, struct error *err)
 {
@@ -456,7 +447,7 @@ static int change_state(struct job *job, enum job_state to, const struct job_cha
 		return code;
 	show_state(job, &record, change);
 	if (job_state_ended(to))
-		remove_checkpoint(job->jobs, record.id);
+		store_job_remove_checkpoint(job->jobs->store, record.id);
 	return 0;
 }
 
@@ -507,7 +498,7 @@ static int recover(struct job *job, struct error *err)
 	change.checkpoint = checkpoint_there(job->jobs, &job->record);
 	if (change.checkpoint == 0) {
 		job->record.checkpoint = 0;
-		remove_checkpoint(job->jobs, job->id);
+		store_job_remove_checkpoint(job->jobs->store, job->id);
 	}
 	switch (job->record.state) {
 	case JOB_RUNNING:
@@ -1108,6 +1099,63 @@ int job_add_volume(struct job *job, const struct volume_record *volume, struct e
 	free(event.data);
 	if (code == 0)
 		wake(job);
+	return code;
+}
+
+int job_settle_volume(struct job *job, const char *name, const uint8_t sha256[32], struct error *err)
+{
+	int code = store_job_settle_volume(job->jobs->store, job->id, name, sha256, err);
+
+	if (code == 0)
+		wake(job);
+	return code;
+}
+
+int job_unsettled(struct job *job, bool *ret_unsettled, struct error *err)
+{
+	struct volume_record *volumes;
+	bool unsettled = false;
+	int count, code = store_job_volumes(job->jobs->store, job->id, &volumes, &count, err);
+
+	if (code != 0)
+		return code;
+	for (int i = 0; i < count; i++)
+		unsettled |= !volumes[i].settled;
+	free(volumes);
+	*ret_unsettled = unsettled;
+	return 0;
+}
+
+static int settle_one(struct job *job, const struct volume_record *volume, struct error *err)
+{
+	struct store *store = job->jobs->store;
+	uint8_t sha256[32];
+	struct error why;
+	char path[1024];
+	int code;
+
+	store_volume_path(store, job->id, volume->name, path);
+	if (saver_settle(path, SPOOL_VOLUME_OFFSET, sha256, &why) == 0)
+		return job_settle_volume(job, volume->name, sha256, err);
+	log_line(LEVEL_ERROR, "job %s: its volume %s is lost: %s", job->id, volume->name, why.text);
+	code = store_job_remove_volume(store, job->id, volume->name, err);
+	if (code == 0)
+		unlink(path);
+	return code;
+}
+
+int job_settle(struct job *job, struct error *err)
+{
+	struct volume_record *volumes;
+	int count, code = store_job_volumes(job->jobs->store, job->id, &volumes, &count, err);
+
+	if (code != 0)
+		return code;
+	for (int i = 0; i < count && code == 0; i++) {
+		if (!volumes[i].settled)
+			code = settle_one(job, &volumes[i], err);
+	}
+	free(volumes);
 	return code;
 }
 

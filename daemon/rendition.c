@@ -209,7 +209,7 @@ static bool is_same(const struct rendition *rendition, const char *job, const st
 	const struct content_options *own = &rendition->options;
 
 	return strcmp(rendition->job, job) == 0 && strcmp(rendition->volume.name, volume->name) == 0 &&
-	       memcmp(rendition->volume.sha256, volume->sha256, sizeof(volume->sha256)) == 0 &&
+	       rendition->volume.created == volume->created && /* another one when it was made again */
 	       own->format == options->format && own->type == options->type && own->shuffled == options->shuffled &&
 	       own->scale == options->scale && rendition->zstd == zstd && !rendition->facts.failed;
 }

@@ -20,6 +20,7 @@
  * A call that returns 0 has its change on the disk. The order is always: files
  * first, synced, then the row; and on the way out: the row, then the files. So
  * a crash leaves at most files that no row knows, and store_open removes them.
+ * A volume's row comes before its file is synced, and says so (settled).
  *
  * Threads: every function may be called from any thread. Writing calls wait for
  * one commit at a time (about 0.3 ms each); reading calls never wait for them.
@@ -216,9 +217,10 @@ struct volume_record {
 	int iteration;
 	struct grid grid;
 	size_t bytes;       /* of the voxels */
+	bool settled;       /* its file is on the disk, and this is known: */
 	uint8_t sha256[32]; /* of the voxels */
 	struct volume_norms norms;
-	double created; /* seconds since 1970 */
+	double created; /* seconds since 1970; another one when it is made again */
 };
 
 struct warning_record {
@@ -248,10 +250,21 @@ int store_job_update(struct store *store, const struct job_record *job, const st
  */
 int store_job_delete(struct store *store, const char *id, struct error *err);
 void store_job_remove_files(const struct store *store, const char *id);
+void store_job_remove_checkpoint(const struct store *store, const char *id);
 int store_job_add_row(struct store *store, const char *id, const struct history_row *row, const struct event *event,
 		      struct error *err);
+/*
+ * A volume whose file everybody can read, but which a power cut may still take: a
+ * row without a digest. The job must not end before it is settled; what is not
+ * at the start is removed, and its job, which has not ended, makes it again.
+ */
 int store_job_add_volume(struct store *store, const char *id, const struct volume_record *volume,
 			 const struct event *event, struct error *err);
+/* Its file is on the disk. */
+int store_job_settle_volume(struct store *store, const char *id, const char *name, const uint8_t sha256[32],
+			    struct error *err);
+/* The row; then the file may go. */
+int store_job_remove_volume(struct store *store, const char *id, const char *name, struct error *err);
 /* *ret_new false, and no event, when this very warning is there already. */
 int store_job_add_warning(struct store *store, const char *id, const struct warning_record *warning,
 			  const struct event *event, bool *ret_new, struct error *err);

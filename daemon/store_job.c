@@ -9,6 +9,7 @@
 #include "daemon/files.h"
 #include "daemon/log.h"
 #include "daemon/store_db.h"
+#include "proto/spool.h"
 
 enum { REMOVALS_KEPT = 1000 /* a page that was away for longer reads its list anew */ };
 
@@ -201,6 +202,16 @@ void store_job_remove_files(const struct store *store, const char *id)
 		log_line(LEVEL_WARNING, "job %s: files stay until the next start: %s", id, err.text);
 }
 
+void store_job_remove_checkpoint(const struct store *store, const char *id)
+{
+	char directory[1024], path[1100];
+
+	store_job_directory(store, id, directory);
+	snprintf(path, sizeof(path), "%s/%s", directory, SPOOL_CHECKPOINT);
+	if (unlink(path) < 0 && errno != ENOENT && errno != ENOTDIR)
+		log_line(LEVEL_WARNING, "job %s: %s stays: %s", id, path, strerror(errno));
+}
+
 int store_job_add_row(struct store *store, const char *id, const struct history_row *row, const struct event *event,
 		      struct error *err)
 {
@@ -252,7 +263,7 @@ int store_job_add_volume(struct store *store, const char *id, const struct volum
 	for (int i = 0; i < 3; i++)
 		query_real(&query, volume->grid.origin[i]);
 	query_integer(&query, (long long)volume->bytes);
-	query_blob(&query, volume->sha256, sizeof(volume->sha256));
+	query_blob(&query, volume->sha256, volume->settled ? (int)sizeof(volume->sha256) : 0);
 	query_real(&query, volume->norms.norm2);
 	query_real(&query, volume->norms.difference2);
 	query_real(&query, volume->norms.tv);
@@ -265,6 +276,37 @@ int store_job_add_volume(struct store *store, const char *id, const struct volum
 	if (code == 0)
 		code = add_event(store, id, event, err);
 	return store_end(store, code, err);
+}
+
+int store_job_settle_volume(struct store *store, const char *id, const char *name, const uint8_t sha256[32],
+			    struct error *err)
+{
+	struct query query;
+	int code = store_begin(store, err);
+
+	if (code != 0)
+		return code;
+	query_begin(&query, &store->writer,
+		    "UPDATE volumes SET sha256 = ? WHERE job = (SELECT number FROM jobs WHERE id = ?) AND name = ?",
+		    err);
+	query_blob(&query, sha256, 32);
+	query_text(&query, id);
+	query_text(&query, name);
+	return store_end(store, query_run(&query), err);
+}
+
+int store_job_remove_volume(struct store *store, const char *id, const char *name, struct error *err)
+{
+	struct query query;
+	int code = store_begin(store, err);
+
+	if (code != 0)
+		return code;
+	query_begin(&query, &store->writer,
+		    "DELETE FROM volumes WHERE job = (SELECT number FROM jobs WHERE id = ?) AND name = ?", err);
+	query_text(&query, id);
+	query_text(&query, name);
+	return store_end(store, query_run(&query), err);
 }
 
 int store_job_add_warning(struct store *store, const char *id, const struct warning_record *warning,
@@ -437,6 +479,7 @@ static void read_volume(struct query *query, void *element)
 		volume->grid.origin[i] = sqlite3_column_double(row, 9 + i);
 	}
 	volume->bytes = (size_t)sqlite3_column_int64(row, 12);
+	volume->settled = sqlite3_column_bytes(row, 13) == (int)sizeof(volume->sha256);
 	column_bytes(query, 13, volume->sha256, sizeof(volume->sha256));
 	volume->norms.norm2 = column_real(query, 14);
 	volume->norms.difference2 = column_real(query, 15);
@@ -609,6 +652,31 @@ int store_load_last_event(struct store *store, struct error *err)
 	return query_end(&query);
 }
 
+/*
+ * Volumes that were told of and may not be whole on the disk. A checkpoint may be
+ * of a later iteration than the catalogue knows: a run that went on from there
+ * would not make them again.
+ */
+static int remove_unsettled(struct store *store, const char *id, struct volume_record *volumes, int *count,
+			    struct error *err)
+{
+	int kept = 0, code = 0;
+
+	for (int i = 0; i < *count && code == 0; i++) {
+		if (volumes[i].settled) {
+			volumes[kept++] = volumes[i];
+			continue;
+		}
+		log_line(LEVEL_INFO, "job %s: its volume %s had not reached the disk, it is made again", id,
+			 volumes[i].name);
+		code = store_job_remove_volume(store, id, volumes[i].name, err);
+	}
+	if (code == 0 && kept < *count)
+		store_job_remove_checkpoint(store, id);
+	*count = kept;
+	return code;
+}
+
 struct sweep {
 	struct store *store;
 	const char *id;
@@ -686,8 +754,11 @@ static int sweep_directory(void *context, const char *name, struct error *err)
 	code = store_job_volumes(sweep.store, name, &sweep.volumes, &sweep.count, err);
 	if (code != 0)
 		return code;
-	check_volumes(&sweep);
-	code = directory_visit(path, sweep_file, &sweep, err);
+	code = remove_unsettled(sweep.store, name, sweep.volumes, &sweep.count, err);
+	if (code == 0) {
+		check_volumes(&sweep);
+		code = directory_visit(path, sweep_file, &sweep, err);
+	}
 	free(sweep.volumes);
 	return code;
 }

@@ -12,6 +12,7 @@
 #include <errno.h>
 #include <limits.h>
 #include <poll.h>
+#include <stdatomic.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -53,6 +54,20 @@ struct ending {
 	double again; /* monotonic: not before */
 };
 
+/*
+ * A worker died between telling of a volume and settling it: that is done for it,
+ * in a thread, since it waits for the disk and other workers wait for nobody.
+ */
+struct settler {
+	struct supervise *supervise;
+	struct job *job; /* the worker's */
+	pthread_t thread;
+	bool running; /* the supervisor's own */
+	_Atomic bool done;
+	int code; /* with the next: the thread's until it is done */
+	struct error err;
+};
+
 struct worker {
 	int index;
 	enum worker_state state;
@@ -77,6 +92,7 @@ struct worker {
 	int failure_code;       /* why we told it to stop, 0: we did not */
 	char failure_text[320];
 	struct ending ending;
+	struct settler settler;
 };
 
 struct supervise {
@@ -187,12 +203,54 @@ static int record_ending(struct worker *worker, struct error *err)
 	return code;
 }
 
+static void *run_settler(void *context)
+{
+	struct settler *settler = context;
+
+	settler->code = job_settle(settler->job, &settler->err);
+	atomic_store(&settler->done, true);
+	wake_up(settler->supervise);
+	return NULL;
+}
+
+/* What the job's volumes need before it may end. *ret_wait: a thread is at it, which wakes this one. */
+static int settle(struct supervise *supervise, struct worker *worker, bool *ret_wait, struct error *err)
+{
+	struct settler *settler = &worker->settler;
+	bool unsettled = false;
+	int code;
+
+	*ret_wait = false;
+	if (settler->running) {
+		pthread_join(settler->thread, NULL);
+		settler->running = false;
+		*err = settler->err;
+		return settler->code;
+	}
+	code = job_unsettled(worker->job, &unsettled, err);
+	if (code != 0 || !unsettled)
+		return code;
+	*settler = (struct settler){.supervise = supervise, .job = worker->job};
+	code = pthread_create(&settler->thread, NULL, run_settler, settler);
+	if (code != 0)
+		return error_set_errno(err, code, "thread that settles volumes");
+	*ret_wait = settler->running = true;
+	return 0;
+}
+
 /* The job's new state reaches the catalogue now, or is tried again: a full disk must not lose how it ended. */
 static void finish(struct supervise *supervise, struct worker *worker)
 {
 	struct error err;
-	int code = record_ending(worker, &err);
+	bool wait;
+	int code = settle(supervise, worker, &wait, &err);
 
+	if (wait) {
+		worker->ending.again = NEVER;
+		return;
+	}
+	if (code == 0)
+		code = record_ending(worker, &err);
 	if (code != 0 && code != ERR_CONFLICT) {
 		worker->ending.again = now_monotonic() + RETRY;
 		log_line(LEVEL_ERROR, "the end of a job cannot be recorded yet: %s", err.text);
@@ -395,7 +453,6 @@ static int add_volume(struct worker *worker, const struct message *message, stru
 
 	snprintf(volume.name, sizeof(volume.name), "%s", message->name);
 	snprintf(volume.stage, sizeof(volume.stage), "%s", message->volume_stage);
-	memcpy(volume.sha256, message->sha256, sizeof(volume.sha256));
 	clock_gettime(CLOCK_REALTIME, &now);
 	volume.created = (double)now.tv_sec + (double)now.tv_nsec * 1e-9;
 	return job_add_volume(worker->job, &volume, err);
@@ -433,6 +490,9 @@ static void on_message(struct supervise *supervise, struct worker *worker, const
 		break;
 	case MESSAGE_VOLUME:
 		code = add_volume(worker, message, &err);
+		break;
+	case MESSAGE_SETTLED:
+		code = job_settle_volume(worker->job, message->name, message->sha256, &err);
 		break;
 	case MESSAGE_WARNING:
 		code = job_add_warning(worker->job, message->code_name, message->text, &err);
@@ -823,7 +883,8 @@ static void look_at_clock(struct supervise *supervise, bool stopping)
 	for (int i = 0; i < supervise->count; i++) {
 		struct worker *worker = &supervise->workers[i];
 
-		if (worker->ending.due && now >= worker->ending.again)
+		if (worker->ending.due &&
+		    (now >= worker->ending.again || (worker->settler.running && atomic_load(&worker->settler.done))))
 			finish(supervise, worker);
 		if (worker->state == WORKER_ABSENT && !stopping && now >= worker->start_at)
 			start_worker(supervise, worker);
@@ -991,6 +1052,8 @@ static void *supervise_loop(void *context)
 	}
 	/* What the catalogue would not take stays `running` there; the next start queues it again. */
 	for (int i = 0; i < supervise->count; i++) {
+		if (supervise->workers[i].settler.running)
+			finish(supervise, &supervise->workers[i]);
 		stop_attending(&supervise->workers[i]);
 		job_release(supervise->workers[i].job);
 		supervise->workers[i].job = NULL;

@@ -7,7 +7,7 @@
  * between steps; so cancel and yield need no second thread. A job that begins
  * before its projections are complete gets their numbers over the same socket,
  * and reads them from the file, which the daemon has just written. It dies with the
- * daemon, and it may die alone: everything that it has finished is on the disk.
+ * daemon, and it may die alone: what it has told of stays.
  */
 #include <errno.h>
 #include <getopt.h>
@@ -216,7 +216,15 @@ static int on_volume(void *context, const struct kept_volume *volume, const stru
 
 	snprintf(message.name, sizeof(message.name), "%s", volume->name);
 	snprintf(message.volume_stage, sizeof(message.volume_stage), "%s", volume->stage);
-	memcpy(message.sha256, saved->sha256, sizeof(message.sha256));
+	return report(context, &message) == 0 ? 0 : error_set(err, ERR_CANCELLED, "the daemon is gone");
+}
+
+static int on_settled(void *context, const char *name, const uint8_t sha256[32], struct error *err)
+{
+	struct message message = {.kind = MESSAGE_SETTLED};
+
+	snprintf(message.name, sizeof(message.name), "%s", name);
+	memcpy(message.sha256, sha256, sizeof(message.sha256));
 	return report(context, &message) == 0 ? 0 : error_set(err, ERR_CANCELLED, "the daemon is gone");
 }
 
@@ -287,6 +295,7 @@ static int run_job(struct worker *worker, const struct message *start, struct er
 						    .row = on_row,
 						    .warning = on_warning},
 					  .on_volume = on_volume,
+					  .on_settled = on_settled,
 					  .on_open = on_open};
 	struct spool_options options = {.scan_directory = start->scan_directory,
 					.out_directory = start->job_directory,

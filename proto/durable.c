@@ -8,10 +8,10 @@
 #include <fcntl.h>
 #include <stdio.h>
 #include <string.h>
+#include <sys/mman.h>
 #include <unistd.h>
 
-/* The names in the directory of `path` reach the disk. */
-static int sync_directory_of(const char *path, struct error *err)
+int durable_sync_names(const char *path, struct error *err)
 {
 	char directory[PATH_MAX];
 	const char *slash = strrchr(path, '/');
@@ -35,7 +35,7 @@ int durable_open(struct durable *ret, const char *path, size_t size, struct erro
 
 	if (snprintf(d.beside, sizeof(d.beside), "%s.tmp", path) >= (int)sizeof(d.beside))
 		return error_set(err, ERR_INVALID, "a path of %zu bytes is too long", strlen(path));
-	d.file = open(d.beside, O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, 0640);
+	d.file = open(d.beside, O_RDWR | O_CREAT | O_TRUNC | O_CLOEXEC, 0640);
 	if (d.file < 0)
 		return error_set_errno(err, errno, "%s cannot be created", d.beside);
 	/* File systems that cannot set space aside say so; the writes will then tell. */
@@ -57,29 +57,51 @@ void durable_abandon(struct durable *d)
 	unlink(d->beside);
 }
 
-static int durable_rename(struct durable *d, struct error *err)
+static int give_name(const struct durable *d, struct error *err)
 {
-	int code = 0;
+	return rename(d->beside, d->path) == 0 ? 0 : error_set_errno(err, errno, "%s cannot be renamed", d->beside);
+}
 
-	if (rename(d->beside, d->path) != 0)
-		code = error_set_errno(err, errno, "%s cannot be renamed", d->beside);
-	return code != 0 ? code : sync_directory_of(d->path, err);
+static int sync_data(const struct durable *d, struct error *err)
+{
+	return fdatasync(d->file) == 0 ? 0 : error_set_errno(err, errno, "%s cannot be synced", d->path);
+}
+
+static int sync_and_close(struct durable *d, struct error *err)
+{
+	int code = sync_data(d, err);
+
+	if (close(d->file) != 0 && code == 0)
+		code = error_set_errno(err, errno, "%s cannot be closed", d->path);
+	d->file = -1;
+	return code;
 }
 
 int durable_commit(struct durable *d, struct error *err)
 {
-	int code = 0;
+	int code = sync_and_close(d, err);
 
-	if (fdatasync(d->file) != 0)
-		code = error_set_errno(err, errno, "%s cannot be synced", d->beside);
-	if (close(d->file) != 0 && code == 0)
-		code = error_set_errno(err, errno, "%s cannot be closed", d->beside);
-	d->file = -1;
 	if (code == 0)
-		code = durable_rename(d, err);
+		code = give_name(d, err);
+	if (code == 0)
+		code = durable_sync_names(d->path, err);
 	if (code != 0)
 		durable_abandon(d);
 	return code;
+}
+
+int durable_name(struct durable *d, struct error *err)
+{
+	int code = access(d->path, F_OK) == 0 ? sync_data(d, err) : 0;
+
+	return code != 0 ? code : give_name(d, err);
+}
+
+int durable_settle(struct durable *d, struct error *err)
+{
+	int code = sync_and_close(d, err);
+
+	return code != 0 ? code : durable_sync_names(d->path, err);
 }
 
 int durable_write(struct durable *d, const void *from, size_t size, struct error *err)
@@ -93,6 +115,21 @@ int durable_write(struct durable *d, const void *from, size_t size, struct error
 			return error_set_errno(err, errno, "%s cannot be written", d->beside);
 		done += (size_t)put;
 	}
+	return 0;
+}
+
+int durable_map(struct durable *d, size_t size, char **ret_bytes, struct error *err)
+{
+	/* What it does by itself where there is no such call takes long; elsewhere nothing is left to do. */
+	int result = posix_fallocate(d->file, 0, (off_t)size);
+	void *bytes;
+
+	if (result != 0)
+		return error_set_errno(err, result, "%zu bytes for %s", size, d->beside);
+	bytes = mmap(NULL, size, PROT_READ | PROT_WRITE, MAP_SHARED, d->file, 0);
+	if (bytes == MAP_FAILED)
+		return error_set_errno(err, errno, "%s cannot be mapped", d->beside);
+	*ret_bytes = bytes;
 	return 0;
 }
 
@@ -110,7 +147,7 @@ int durable_link(const char *from, const char *path, bool *ret_linked, struct er
 		*ret_linked = false;
 		return 0;
 	}
-	code = durable_rename(&d, err);
+	code = give_name(&d, err);
 	unlink(d.beside); /* still there when that failed, or did nothing because both were one file already */
 	if (code == 0)
 		*ret_linked = true;

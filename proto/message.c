@@ -88,7 +88,6 @@ static const struct field volume_fields[] = {FIELD("job", FIELD_STRING, job),
 					     FIELD("iteration", FIELD_INT, iteration),
 					     FIELD("grid", FIELD_GRID, grid),
 					     FIELD("bytes", FIELD_SIZE, bytes),
-					     FIELD("sha256", FIELD_DIGEST, sha256),
 					     FIELD("norm2", FIELD_NUMBER, norms.norm2),
 					     FIELD("difference2", FIELD_NUMBER, norms.difference2),
 					     FIELD("tv", FIELD_NUMBER, norms.tv),
@@ -97,6 +96,8 @@ static const struct field volume_fields[] = {FIELD("job", FIELD_STRING, job),
 					     FIELD("mean", FIELD_NUMBER, norms.mean),
 					     FIELD("not_finite", FIELD_SIZE, norms.not_finite),
 					     {0}};
+static const struct field settled_fields[] = {
+    FIELD("job", FIELD_STRING, job), FIELD("name", FIELD_STRING, name), FIELD("sha256", FIELD_DIGEST, sha256), {0}};
 static const struct field warning_fields[] = {
     FIELD("job", FIELD_STRING, job), FIELD("code", FIELD_STRING, code_name), FIELD("detail", FIELD_STRING, text), {0}};
 static const struct field ended_fields[] = {FIELD("job", FIELD_STRING, job),
@@ -120,6 +121,7 @@ static const struct {
     [MESSAGE_PROGRESS] = {"progress", progress_fields},
     [MESSAGE_ROW] = {"row", row_fields},
     [MESSAGE_VOLUME] = {"volume", volume_fields},
+    [MESSAGE_SETTLED] = {"settled", settled_fields},
     [MESSAGE_WARNING] = {"warning", warning_fields},
     [MESSAGE_ENDED] = {"ended", ended_fields},
 };

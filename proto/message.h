@@ -29,7 +29,8 @@ enum message_kind {
 	MESSAGE_TAKEN,    /* job, count: projections reconstructed so far */
 	MESSAGE_PROGRESS, /* job, stage, iteration, fraction */
 	MESSAGE_ROW,      /* job, row */
-	MESSAGE_VOLUME,   /* job, name, stage, iteration, bytes, sha256, norms: the file is on the disk */
+	MESSAGE_VOLUME,   /* job, name, stage, iteration, bytes, norms: the file is there, whole, for everybody */
+	MESSAGE_SETTLED,  /* job, name, sha256: that file is on the disk; before the job ends, but for what failed */
 	MESSAGE_WARNING,  /* job, code, detail */
 	MESSAGE_ENDED,    /* job, code (0, ERR_CANCELLED, ERR_BUSY = yielded at `iteration`, or what failed), text */
 	MESSAGE_KIND_COUNT

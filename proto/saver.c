@@ -1,10 +1,11 @@
 /*
- * Files written and hashed beside other work: saver.h.
+ * Files whose bytes are there at once, and on the disk soon after: saver.h.
  *
- * Pieces stand in one list in their order; both threads walk it at their own
- * pace, and who leaves a piece last returns its memory. The latest memory is
- * used again first, since the caches still have it. The writer starts the
- * writeback of each piece at once, so that little is left for the final sync.
+ * write() into the page cache is done by one thread whatever one does, since the
+ * file systems lock the file; a mapping is filled by as many as there are. Its
+ * pages are got in pieces (MADV_POPULATE_WRITE) and not by touching them: a disk
+ * that has none is an error then and no SIGBUS. The hasher lets go of the pages
+ * behind it, so that the file does not count as this process's memory for long.
  */
 #include "proto/saver.h"
 
@@ -16,197 +17,241 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/mman.h>
+#include <sys/stat.h>
+#include <unistd.h>
 
 #include "proto/durable.h"
 
-struct piece {
-	struct piece *next;
-	size_t bytes;
-	int users; /* threads that have it before them still */
-	_Alignas(64) char data[];
+enum {
+	PIECE_BYTES = 8 << 20, /* populated or hashed in one go */
+	PREPARERS = 4          /* the kernel's own work on pages does not get faster with more */
 };
 
-enum { WRITES, HASHES, USERS };
+struct mapped {
+	struct durable file;
+	char *bytes; /* NULL: there is none */
+	size_t size, populated;
+};
 
 struct saver {
-	size_t piece_bytes; /* constant, as the next */
-	int most;
-
 	pthread_mutex_t lock; /* guards what follows */
 	pthread_cond_t changed;
-	struct piece *spare;        /* stack */
-	struct piece *first, *last; /* the list; gone when nobody needs them any more */
-	struct piece *at[USERS];    /* the next of each thread; NULL: all done so far */
-	int pieces;                 /* in all */
-	bool ended, failed;         /* no more pieces come; the file is lost */
-	bool hashed, done;
-	bool quit;
+	size_t given; /* bytes of the file, its header included */
+	bool ended, abandoned;
+	bool hashed, synced;
+	struct error hash_error, sync_error;
+	size_t taken; /* bytes of `blank` that the preparers have populated, or are about to */
+	bool enough;  /* they shall stop */
+	bool refused; /* the disk had no pages for all of it */
 
-	bool busy; /* the caller's own */
-	pthread_t threads[USERS];
-	int started;
-
-	/* Between saver_begin and the writer's `done`: the writer's, `digest` the hasher's until `hashed`. */
-	struct durable file;
+	/* The caller's own; while a file is under way its threads read them. */
+	bool busy;
 	char path[PATH_MAX];
+	struct mapped file;
+	size_t header;
 	EVP_MD_CTX *digest;
 	uint8_t sha256[32];
-	struct error error;
+	pthread_t hasher, syncer;
+
+	struct mapped blank;
+	char blank_path[PATH_MAX];
+	pthread_t preparers[PREPARERS];
+	int preparing;
 };
 
-/* Called with the lock: the piece before this thread, or NULL at the end of the file or of the saver. */
-static struct piece *next_piece(struct saver *saver, int user)
+static size_t smaller(size_t a, size_t b)
 {
-	while (!saver->quit && saver->at[user] == NULL &&
-	       !(saver->busy && saver->ended && !saver->done && !(user == HASHES && saver->hashed)))
-		pthread_cond_wait(&saver->changed, &saver->lock);
-	return saver->at[user];
+	return a < b ? a : b;
 }
 
-/* Called with the lock. */
-static void leave_piece(struct saver *saver, int user, struct piece *piece)
+static size_t page_of(size_t offset)
 {
-	saver->at[user] = piece->next;
-	if (--piece->users > 0)
-		return;
-	/* It is the first: whoever is last has all before it behind them. */
-	saver->first = piece->next;
-	if (saver->first == NULL)
-		saver->last = NULL;
-	piece->next = saver->spare;
-	saver->spare = piece;
-	pthread_cond_broadcast(&saver->changed);
+	return offset & ~((size_t)sysconf(_SC_PAGESIZE) - 1);
 }
 
-/* ---- the hashing thread ---- */
+/* Pages for these bytes. */
+static int populate(const struct mapped *mapped, size_t first, size_t bytes, struct error *err)
+{
+	size_t from = page_of(first);
 
-static void *hash_loop(void *context)
+	/* Where the kernel cannot, they come one by one as they are touched. */
+	if (madvise(mapped->bytes + from, first + bytes - from, MADV_POPULATE_WRITE) == 0 || errno != EFAULT)
+		return 0;
+	return error_set(err, ERR_IO, "%s cannot be written: the disk is full or fails", mapped->file.beside);
+}
+
+static int map_new(struct mapped *ret, const char *path, size_t size, struct error *err)
+{
+	struct mapped mapped = {.size = size};
+	int code = durable_open(&mapped.file, path, size, err);
+
+	if (code != 0)
+		return code;
+	code = durable_map(&mapped.file, size, &mapped.bytes, err);
+	if (code != 0)
+		durable_abandon(&mapped.file);
+	else
+		*ret = mapped;
+	return code;
+}
+
+static void unmap(struct mapped *mapped)
+{
+	munmap(mapped->bytes, mapped->size);
+	mapped->bytes = NULL;
+}
+
+/* ---- the next file ---- */
+
+static void *prepare_loop(void *context)
 {
 	struct saver *saver = context;
+	struct error ignored;
 
 	pthread_mutex_lock(&saver->lock);
-	while (!saver->quit) {
-		struct piece *piece = next_piece(saver, HASHES);
-		bool ok;
+	while (!saver->enough && !saver->refused && saver->taken < saver->blank.size) {
+		size_t first = saver->taken, bytes = smaller(PIECE_BYTES, saver->blank.size - first);
+		int code;
 
-		if (saver->quit)
-			break;
+		saver->taken += bytes;
 		pthread_mutex_unlock(&saver->lock);
-		if (piece != NULL)
-			ok = EVP_DigestUpdate(saver->digest, piece->data, piece->bytes) == 1;
-		else
-			ok = EVP_DigestFinal_ex(saver->digest, saver->sha256, NULL) == 1;
+		code = populate(&saver->blank, first, bytes, &ignored);
 		pthread_mutex_lock(&saver->lock);
-		if (!ok)
-			saver->failed = true;
-		if (piece != NULL) {
-			leave_piece(saver, HASHES, piece);
-			continue;
-		}
-		saver->hashed = true;
-		pthread_cond_broadcast(&saver->changed);
+		saver->refused |= code != 0;
 	}
 	pthread_mutex_unlock(&saver->lock);
 	return NULL;
 }
 
-/* ---- the writing thread ---- */
-
-static int write_piece(struct saver *saver, const struct piece *piece)
+static void stop_preparing(struct saver *saver)
 {
-	int code = durable_write(&saver->file, piece->data, piece->bytes, &saver->error);
-
-	/* A hint: file systems without it write all of it at the end. */
-	if (code == 0)
-		sync_file_range(saver->file.file, 0, 0, SYNC_FILE_RANGE_WRITE);
-	return code;
-}
-
-/*
- * Called with the lock, at the end of the file. It gets its name while the
- * digest is still being made: nobody hears of the file before both are there.
- */
-static void finish_file(struct saver *saver)
-{
-	bool failed = saver->failed;
-
-	pthread_mutex_unlock(&saver->lock);
-	if (failed)
-		durable_abandon(&saver->file);
-	else
-		failed = durable_commit(&saver->file, &saver->error) != 0;
 	pthread_mutex_lock(&saver->lock);
-	while (!saver->hashed)
-		pthread_cond_wait(&saver->changed, &saver->lock);
-	if (saver->failed && saver->error.code == 0)
-		error_set(&saver->error, ERR_INTERNAL, "SHA-256 failed");
-	saver->failed |= failed;
-	saver->done = true;
-	pthread_cond_broadcast(&saver->changed);
+	saver->enough = true;
+	pthread_mutex_unlock(&saver->lock);
+	while (saver->preparing > 0)
+		pthread_join(saver->preparers[--saver->preparing], NULL);
+	saver->blank.populated = saver->refused ? 0 : saver->taken;
 }
 
-static void *write_loop(void *context)
+static void drop_blank(struct saver *saver)
+{
+	if (saver->blank.bytes == NULL)
+		return;
+	stop_preparing(saver);
+	unmap(&saver->blank);
+	durable_abandon(&saver->blank.file);
+}
+
+void saver_prepare(struct saver *saver, const char *path, size_t bytes)
+{
+	struct error ignored;
+
+	if (saver->blank.bytes != NULL && saver->blank.size != bytes)
+		drop_blank(saver);
+	if (saver->blank.bytes == NULL) {
+		snprintf(saver->blank_path, sizeof(saver->blank_path), "%s", path);
+		if (map_new(&saver->blank, saver->blank_path, bytes, &ignored) != 0)
+			return;
+	}
+	/* Once more over all of it: pages that were written back meanwhile cost as much as new ones. */
+	stop_preparing(saver);
+	saver->taken = 0;
+	saver->enough = saver->refused = false;
+	while (saver->preparing < PREPARERS &&
+	       pthread_create(&saver->preparers[saver->preparing], NULL, prepare_loop, saver) == 0)
+		saver->preparing++;
+}
+
+/* ---- the two threads of a file ---- */
+
+static void let_go(const struct mapped *mapped, size_t first, size_t end)
+{
+	first = page_of(first);
+	end = page_of(end);
+	if (end > first)
+		madvise(mapped->bytes + first, end - first, MADV_DONTNEED); /* a hint; the file has the bytes */
+}
+
+/* Called with the lock, which is not held over the work. False when there is nothing more. */
+static bool hash_some(struct saver *saver, size_t *at)
+{
+	size_t bytes;
+	bool ok;
+
+	while (*at == saver->given && !saver->ended && !saver->abandoned)
+		pthread_cond_wait(&saver->changed, &saver->lock);
+	bytes = smaller(PIECE_BYTES, saver->given - *at);
+	if (saver->abandoned || bytes == 0)
+		return false;
+	pthread_mutex_unlock(&saver->lock);
+	ok = EVP_DigestUpdate(saver->digest, saver->file.bytes + *at, bytes) == 1;
+	let_go(&saver->file, *at, *at + bytes);
+	pthread_mutex_lock(&saver->lock);
+	*at += bytes;
+	if (!ok)
+		error_set(&saver->hash_error, ERR_INTERNAL, "SHA-256 failed");
+	return true;
+}
+
+static void *hash_loop(void *context)
 {
 	struct saver *saver = context;
+	size_t at = saver->header;
 
 	pthread_mutex_lock(&saver->lock);
-	while (!saver->quit) {
-		struct piece *piece = next_piece(saver, WRITES);
-		bool failed = saver->failed;
+	while (hash_some(saver, &at))
+		;
+	if (EVP_DigestFinal_ex(saver->digest, saver->sha256, NULL) != 1)
+		error_set(&saver->hash_error, ERR_INTERNAL, "SHA-256 failed");
+	saver->hashed = true;
+	pthread_cond_broadcast(&saver->changed);
+	pthread_mutex_unlock(&saver->lock);
+	return NULL;
+}
 
-		if (saver->quit)
-			break;
-		if (piece == NULL) {
-			finish_file(saver);
-			continue;
-		}
-		pthread_mutex_unlock(&saver->lock);
-		if (!failed)
-			failed = write_piece(saver, piece) != 0;
-		pthread_mutex_lock(&saver->lock);
-		saver->failed |= failed;
-		leave_piece(saver, WRITES, piece);
-	}
+static void *sync_file(void *context)
+{
+	struct saver *saver = context;
+	struct error err = {0};
+
+	durable_settle(&saver->file.file, &err);
+	pthread_mutex_lock(&saver->lock);
+	saver->sync_error = err;
+	saver->synced = true;
+	pthread_cond_broadcast(&saver->changed);
 	pthread_mutex_unlock(&saver->lock);
 	return NULL;
 }
 
 /* ---- the caller ---- */
 
-int saver_new(size_t piece_bytes, struct saver **ret_saver, struct error *err)
+int saver_new(struct saver **ret_saver, struct error *err)
 {
-	static void *(*const loops[USERS])(void *) = {write_loop, hash_loop};
 	struct saver *saver = calloc(1, sizeof(*saver));
-	int result;
 
-	if (saver == NULL)
+	if (saver != NULL)
+		saver->digest = EVP_MD_CTX_new();
+	if (saver == NULL || saver->digest == NULL) {
+		free(saver);
 		return error_set(err, ERR_NO_MEMORY, "no memory for a saver");
-	saver->piece_bytes = piece_bytes;
-	saver->most = piece_bytes * 2 < SAVER_BYTES ? (int)(SAVER_BYTES / piece_bytes) : 2;
-	saver->file.file = -1;
+	}
 	pthread_mutex_init(&saver->lock, NULL);
 	pthread_cond_init(&saver->changed, NULL);
-	saver->digest = EVP_MD_CTX_new();
-	for (int i = 0; i < USERS; i++) {
-		result = saver->digest == NULL ? ENOMEM : pthread_create(&saver->threads[i], NULL, loops[i], saver);
-		if (result != 0) {
-			saver_free(saver);
-			return error_set_errno(err, result, "threads that save volumes");
-		}
-		saver->started++;
-	}
 	*ret_saver = saver;
 	return 0;
 }
 
-static void free_list(struct piece *piece)
+/* The hasher is told, and gone on return. */
+static void drop_file(struct saver *saver)
 {
-	while (piece != NULL) {
-		struct piece *next = piece->next;
-
-		free(piece);
-		piece = next;
-	}
+	pthread_mutex_lock(&saver->lock);
+	saver->abandoned = true;
+	pthread_cond_broadcast(&saver->changed);
+	pthread_mutex_unlock(&saver->lock);
+	pthread_join(saver->hasher, NULL);
+	unmap(&saver->file);
+	durable_abandon(&saver->file.file);
+	saver->busy = false;
 }
 
 void saver_abandon(struct saver *saver)
@@ -215,13 +260,10 @@ void saver_abandon(struct saver *saver)
 	struct error err;
 	bool done;
 
-	if (!saver->busy)
-		return;
-	pthread_mutex_lock(&saver->lock);
-	saver->failed |= !saver->ended;
-	pthread_mutex_unlock(&saver->lock);
-	saver_end(saver);
-	saver_finish(saver, true, &done, ignored, &err);
+	if (saver->busy && saver->ended)
+		saver_finish(saver, true, &done, ignored, &err);
+	else if (saver->busy)
+		drop_file(saver);
 }
 
 void saver_free(struct saver *saver)
@@ -229,13 +271,7 @@ void saver_free(struct saver *saver)
 	if (saver == NULL)
 		return;
 	saver_abandon(saver);
-	pthread_mutex_lock(&saver->lock);
-	saver->quit = true;
-	pthread_cond_broadcast(&saver->changed);
-	pthread_mutex_unlock(&saver->lock);
-	for (int i = 0; i < saver->started; i++)
-		pthread_join(saver->threads[i], NULL);
-	free_list(saver->spare);
+	drop_blank(saver);
 	EVP_MD_CTX_free(saver->digest);
 	pthread_cond_destroy(&saver->changed);
 	pthread_mutex_destroy(&saver->lock);
@@ -247,106 +283,160 @@ bool saver_busy(const struct saver *saver)
 	return saver->busy;
 }
 
+static int take_file(struct saver *saver, size_t size, struct error *err)
+{
+	if (saver->blank.bytes == NULL || saver->blank.size != size) {
+		drop_blank(saver); /* of no use, and its space may be needed */
+		return map_new(&saver->file, saver->path, size, err);
+	}
+	stop_preparing(saver);
+	saver->file = saver->blank;
+	saver->file.file.path = saver->path;
+	saver->blank.bytes = NULL;
+	return 0;
+}
+
 int saver_begin(struct saver *saver, const char *path, const void *header, size_t length, size_t bytes,
 		struct error *err)
 {
-	int code;
+	int code, result;
+	void *place;
 
 	snprintf(saver->path, sizeof(saver->path), "%s", path);
 	if (EVP_DigestInit_ex(saver->digest, EVP_sha256(), NULL) != 1)
 		return error_set(err, ERR_NO_MEMORY, "no memory for SHA-256");
-	code = durable_open(&saver->file, saver->path, length + bytes, err);
+	code = take_file(saver, length + bytes, err);
 	if (code != 0)
 		return code;
-	code = durable_write(&saver->file, header, length, err);
+	saver->given = 0;
+	saver->header = length;
+	code = saver_piece(saver, length, &place, err);
+	if (code == 0) {
+		memcpy(place, header, length);
+		saver->given = length;
+		saver->hash_error = saver->sync_error = (struct error){0};
+		saver->ended = saver->abandoned = saver->hashed = saver->synced = false;
+		result = pthread_create(&saver->hasher, NULL, hash_loop, saver);
+		if (result != 0)
+			code = error_set_errno(err, result, "thread that hashes volumes");
+	}
 	if (code != 0) {
-		durable_abandon(&saver->file);
+		unmap(&saver->file);
+		durable_abandon(&saver->file.file);
 		return code;
 	}
-	pthread_mutex_lock(&saver->lock);
-	saver->error = (struct error){0};
-	saver->ended = saver->failed = saver->hashed = saver->done = false;
 	saver->busy = true;
-	pthread_mutex_unlock(&saver->lock);
 	return 0;
 }
 
-static struct piece *piece_new(size_t bytes)
+int saver_piece(struct saver *saver, size_t bytes, void **ret_place, struct error *err)
 {
-	const size_t large = 2 << 20, size = (sizeof(struct piece) + bytes + large - 1) / large * large;
-	struct piece *piece = aligned_alloc(large, size);
+	struct mapped *file = &saver->file;
+	size_t first = saver->given; /* no other thread changes it */
+	int code = first + bytes <= file->populated ? 0 : populate(file, first, bytes, err);
 
-	if (piece != NULL)
-		madvise(piece, size, MADV_HUGEPAGE); /* a hint: far fewer faults at its first use */
-	return piece;
+	if (code == 0)
+		*ret_place = file->bytes + first;
+	return code;
 }
 
-void *saver_piece(struct saver *saver)
+void saver_give(struct saver *saver, size_t bytes)
 {
-	struct piece *piece = NULL;
-
 	pthread_mutex_lock(&saver->lock);
-	while (piece == NULL) {
-		if (saver->spare != NULL) {
-			piece = saver->spare;
-			saver->spare = piece->next;
-		} else if (saver->pieces < saver->most) {
-			piece = piece_new(saver->piece_bytes);
-			saver->pieces += piece != NULL;
-			if (piece == NULL && saver->pieces == 0)
-				break; /* none will come back */
-		}
-		if (piece == NULL)
-			pthread_cond_wait(&saver->changed, &saver->lock);
-	}
-	pthread_mutex_unlock(&saver->lock);
-	return piece != NULL ? piece->data : NULL;
-}
-
-void saver_give(struct saver *saver, void *data, size_t bytes)
-{
-	struct piece *piece = (struct piece *)(void *)((char *)data - offsetof(struct piece, data));
-
-	piece->bytes = bytes;
-	piece->next = NULL;
-	piece->users = USERS;
-	pthread_mutex_lock(&saver->lock);
-	if (saver->last != NULL)
-		saver->last->next = piece;
-	else
-		saver->first = piece;
-	saver->last = piece;
-	for (int i = 0; i < USERS; i++)
-		if (saver->at[i] == NULL)
-			saver->at[i] = piece;
+	saver->given += bytes;
 	pthread_cond_broadcast(&saver->changed);
 	pthread_mutex_unlock(&saver->lock);
 }
 
-void saver_end(struct saver *saver)
+int saver_end(struct saver *saver, struct error *err)
 {
+	int code = durable_name(&saver->file.file, err), result;
+
+	if (code != 0) {
+		drop_file(saver);
+		return code;
+	}
 	pthread_mutex_lock(&saver->lock);
 	saver->ended = true;
 	pthread_cond_broadcast(&saver->changed);
 	pthread_mutex_unlock(&saver->lock);
+	result = pthread_create(&saver->syncer, NULL, sync_file, saver);
+	if (result != 0) {
+		drop_file(saver);
+		unlink(saver->path);
+		return error_set_errno(err, result, "thread that syncs volumes");
+	}
+	return 0;
 }
 
 int saver_finish(struct saver *saver, bool wait, bool *ret_done, uint8_t ret_sha256[32], struct error *err)
 {
-	int code = 0;
+	const struct error *why = NULL;
 
 	pthread_mutex_lock(&saver->lock);
-	while (wait && !saver->done)
+	while (wait && !(saver->hashed && saver->synced))
 		pthread_cond_wait(&saver->changed, &saver->lock);
-	*ret_done = saver->done;
-	if (saver->done) {
-		saver->busy = saver->ended = saver->done = saver->hashed = false;
-		memcpy(ret_sha256, saver->sha256, sizeof(saver->sha256));
-		if (saver->failed) {
-			*err = saver->error;
-			code = saver->error.code;
-		}
-	}
+	*ret_done = saver->hashed && saver->synced;
 	pthread_mutex_unlock(&saver->lock);
+	if (!*ret_done)
+		return 0;
+	pthread_join(saver->hasher, NULL);
+	pthread_join(saver->syncer, NULL);
+	unmap(&saver->file);
+	saver->busy = false;
+	if (saver->hash_error.code != 0 || saver->sync_error.code != 0)
+		why = saver->sync_error.code != 0 ? &saver->sync_error : &saver->hash_error;
+	if (why != NULL) {
+		unlink(saver->path);
+		*err = *why;
+		return why->code;
+	}
+	memcpy(ret_sha256, saver->sha256, sizeof(saver->sha256));
+	return 0;
+}
+
+/* ---- files of others ---- */
+
+static int hash_file(int file, const char *path, size_t length, uint8_t ret_sha256[32], struct error *err)
+{
+	enum { BLOCK = 1 << 20 };
+	EVP_MD_CTX *digest = EVP_MD_CTX_new();
+	char *block = malloc(BLOCK);
+	ssize_t got = 1;
+	int code = 0;
+
+	if (digest == NULL || block == NULL || EVP_DigestInit_ex(digest, EVP_sha256(), NULL) != 1)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for SHA-256");
+	while (code == 0 && got != 0) {
+		got = pread(file, block, BLOCK, (off_t)length);
+		if (got < 0 && errno != EINTR)
+			code = error_set_errno(err, errno, "%s cannot be read", path);
+		if (got > 0 && EVP_DigestUpdate(digest, block, (size_t)got) != 1)
+			code = error_set(err, ERR_INTERNAL, "SHA-256 failed");
+		length += got > 0 ? (size_t)got : 0;
+	}
+	if (code == 0 && EVP_DigestFinal_ex(digest, ret_sha256, NULL) != 1)
+		code = error_set(err, ERR_INTERNAL, "SHA-256 failed");
+	EVP_MD_CTX_free(digest);
+	free(block);
+	return code;
+}
+
+int saver_settle(const char *path, size_t length, uint8_t ret_sha256[32], struct error *err)
+{
+	struct durable d = {.file = open(path, O_RDONLY | O_CLOEXEC), .path = path};
+	uint8_t sha256[32];
+	int code;
+
+	if (d.file < 0)
+		return error_set_errno(err, errno, "%s cannot be opened", path);
+	code = hash_file(d.file, path, length, sha256, err);
+	if (code != 0) {
+		close(d.file);
+		return code;
+	}
+	code = durable_settle(&d, err);
+	if (code == 0)
+		memcpy(ret_sha256, sha256, sizeof(sha256));
 	return code;
 }

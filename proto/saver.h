@@ -8,37 +8,51 @@
 #include "core/error.h"
 
 /*
- * Files on their way to the disk beside the work that goes on: the caller hands
- * over pieces, one thread writes and another hashes them, and the file gets its
- * name when both are done and it is synced (durable.h). One file at a time.
- *
- * What has been handed over and not yet gone waits in memory, at most
- * SAVER_BYTES or two pieces; saver_piece waits for room. All calls by one thread.
+ * Files that are there for everybody as soon as their bytes are, and on the disk
+ * soon after, beside the work that goes on. The caller stores the bytes where
+ * they belong, in the mapped file; a thread hashes behind it. With the last of
+ * them the file gets its name (saver_end), and another thread syncs it. When
+ * both threads are done it is settled (saver_finish): on the disk, and its
+ * SHA-256 known. One file at a time. All calls by one thread.
  */
-enum { SAVER_BYTES = 512 << 20 };
-
 struct saver;
 
-int saver_new(size_t piece_bytes, struct saver **ret_saver, struct error *err);
-/* Waits for what is under way; a file that was not ended leaves nothing behind. */
+int saver_new(struct saver **ret_saver, struct error *err);
+/* What has its name is waited for, what has none yet leaves nothing behind. */
 void saver_abandon(struct saver *saver);
-/* The same first. NULL is fine. */
+/* The same first; what was prepared goes too. NULL is fine. */
 void saver_free(struct saver *saver);
 
-/* A file that begins with `header`, which is not hashed, then `bytes` in pieces. None may be under way. */
+/*
+ * A file of `bytes` bytes for the saver_begin to come, PATH.tmp until then: set
+ * aside, mapped, and its pages got ready by threads of their own, since a page's
+ * first use costs more than filling it. To be called when it is known that
+ * another file comes soon, again when that took long. A hint: what fails here is
+ * met again by saver_begin.
+ */
+void saver_prepare(struct saver *saver, const char *path, size_t bytes);
+
+/*
+ * A file that begins with `header`, which is not hashed, and has `bytes` more. None may be under way. What is prepared
+ * is used when it has that size.
+ */
 int saver_begin(struct saver *saver, const char *path, const void *header, size_t length, size_t bytes,
 		struct error *err);
-/* Memory for the next piece. What failed meanwhile is said by saver_finish. */
-void *saver_piece(struct saver *saver);
-void saver_give(struct saver *saver, void *piece, size_t bytes);
+/* Where the next `bytes` bytes go; saver_give when they are there. ERR_IO when the disk has no pages for them. */
+int saver_piece(struct saver *saver, size_t bytes, void **ret_place, struct error *err);
+void saver_give(struct saver *saver, size_t bytes);
+/* All were given: the file gets its name, or is abandoned. */
+int saver_end(struct saver *saver, struct error *err);
 
 /* Whether a file is under way, from saver_begin to a saver_finish that has said how it ended. */
 bool saver_busy(const struct saver *saver);
-/* The pieces that were given are all: to be called before saver_finish. */
-void saver_end(struct saver *saver);
 /*
- * How the file ended: 0 with its SHA-256, or what failed. *ret_done false: not yet (never so with `wait`).
+ * How the file ended: 0 with its SHA-256, or what failed, and then it is removed.
+ * *ret_done false: not yet (never so with `wait`).
  */
 int saver_finish(struct saver *saver, bool wait, bool *ret_done, uint8_t ret_sha256[32], struct error *err);
+
+/* A named file whose process ended before it was settled; `length` bytes of header. Waits for the disk. Any thread. */
+int saver_settle(const char *path, size_t length, uint8_t ret_sha256[32], struct error *err);
 
 #endif

@@ -219,21 +219,25 @@ void scan_files_close(struct scan_files *files)
 struct run {
 	const struct spool_hooks *hooks;
 	const char *directory;
-	/* The volume that was written last: "final" may be the same iterate. */
-	struct saved_volume saved;
-	char saved_stage[16];
-	int saved_iteration;
-	/* The one that is on its way to the disk while the run goes on: settle. */
+	const struct recipe *recipe;
+	const struct recon *recon; /* NULL before it is opened */
+	bool ahead;                /* the next volume's file is prepared while the device computes */
+	bool prepared;
 	struct saver *saver; /* NULL before the first */
-	struct saved_volume saving;
-	struct kept_volume saving_kept;
-	char saving_name[32];
+	/* The volume that was written last: "final" may be the same iterate. Told of, and settled while the run goes
+	 * on. */
+	struct saved_volume saved; /* no bytes: there is none */
+	char saved_name[32], saved_stage[16];
+	int saved_iteration;
+	uint8_t sha256[32];       /* once the saver is not busy any more */
+	struct saved_volume link; /* another name of it, told of and not settled; no bytes: there is none */
+	char link_name[32];
 	struct error trouble; /* what stopped the run from a question of its */
 };
 
 static int settle(struct run *run, bool wait, struct error *err);
 
-/* Asked so often that a volume is told of soon after it is saved. */
+/* Asked so often that a volume is told to be settled soon after it is. */
 static bool run_cancelled(void *context)
 {
 	struct run *run = context;
@@ -253,10 +257,14 @@ static bool run_yield(void *context)
 	return hooks->recon.yield != NULL && hooks->recon.yield(hooks->recon.context);
 }
 
+static void prepare(struct run *run, enum stage stage, int iteration);
+
 static void run_progress(void *context, enum stage stage, int iteration, double fraction)
 {
 	const struct spool_hooks *hooks = ((struct run *)context)->hooks;
 
+	if (stage != STAGE_FDK) /* which is told of with every projection: push_some */
+		prepare(context, stage, iteration);
 	if (hooks->recon.progress != NULL)
 		hooks->recon.progress(hooks->recon.context, stage, iteration, fraction);
 }
@@ -289,8 +297,85 @@ static int slices_of_a_piece(const struct grid *grid, size_t *ret_slice)
 	return slices < grid->size[2] ? slices : grid->size[2];
 }
 
-/* The iterate as it is now goes to the saver, which writes it while the work goes on. */
-static int hand_over(struct run *run, struct recon *recon, struct error *err)
+static bool emits(const struct recipe *recipe, int what)
+{
+	for (int i = 0; i < recipe->emits; i++) {
+		if (recipe->emit[i] == what)
+			return true;
+	}
+	return false;
+}
+
+/* Whether a volume is kept at the end of what begins. That a stop rule ends the iterations cannot be known. */
+static bool ends_with_volume(const struct recipe *recipe, enum stage stage, int iteration)
+{
+	bool tv = recipe->tv.on && recipe->tv.after_fdk;
+
+	if (stage == STAGE_FDK)
+		return recipe->fdk.on && (emits(recipe, EMIT_FDK) || (!recipe->sart.on && !tv));
+	if (stage == STAGE_TV && iteration == 0)
+		return emits(recipe, EMIT_FDK_TV) || !recipe->sart.on;
+	return stage == STAGE_SART && (iteration == recipe->sart.iterations || emits(recipe, iteration));
+}
+
+static int open_saver(struct run *run, struct error *err)
+{
+	return run->saver != NULL ? 0 : saver_new(&run->saver, err);
+}
+
+/* Soon after the beginning of a stage: the file that it ends with, where the processor has nothing better to do. */
+static void prepare(struct run *run, enum stage stage, int iteration)
+{
+	struct error ignored;
+	char path[PATH_MAX];
+
+	if (!run->ahead || run->prepared || run->recon == NULL || !ends_with_volume(run->recipe, stage, iteration) ||
+	    join(path, sizeof(path), run->directory, "blank", "", &ignored) != 0 || open_saver(run, &ignored) != 0)
+		return;
+	run->prepared = true;
+	saver_prepare(run->saver, path, SPOOL_VOLUME_OFFSET + grid_voxels(recon_grid(run->recon)) * sizeof(float));
+}
+
+static int tell_settled(struct run *run, const char *name, struct error *err)
+{
+	if (run->hooks->on_settled == NULL)
+		return 0;
+	return run->hooks->on_settled(run->hooks->recon.context, name, run->sha256, err);
+}
+
+static int settle_link(struct run *run, struct error *err)
+{
+	int code = durable_sync_names(run->link.path, err);
+
+	if (code != 0)
+		unlink(run->link.path);
+	run->link.bytes = 0;
+	return code != 0 ? code : tell_settled(run, run->link_name, err);
+}
+
+/* Tells when the volume that was saved last is settled; waits for that where it must. */
+static int settle(struct run *run, bool wait, struct error *err)
+{
+	bool done = true;
+	int code = 0;
+
+	if (run->saver != NULL && saver_busy(run->saver)) {
+		code = saver_finish(run->saver, wait, &done, run->sha256, err);
+		if (code != 0) {
+			if (run->link.bytes > 0)
+				unlink(run->link.path);
+			run->saved.bytes = run->link.bytes = 0;
+		}
+		if (code == 0 && done)
+			code = tell_settled(run, run->saved_name, err);
+	}
+	if (code == 0 && done && run->link.bytes > 0)
+		code = settle_link(run, err);
+	return code;
+}
+
+/* The iterate as it is now, straight into its file. */
+static int write_voxels(struct run *run, struct recon *recon, struct error *err)
 {
 	const struct grid *grid = recon_grid(recon);
 	size_t slice;
@@ -298,63 +383,29 @@ static int hand_over(struct run *run, struct recon *recon, struct error *err)
 
 	for (int z = 0; z < grid->size[2] && code == 0; z += slices) {
 		int count = z + slices <= grid->size[2] ? slices : grid->size[2] - z;
-		void *piece = saver_piece(run->saver);
+		void *place;
 
-		if (piece == NULL) {
-			code = error_set(err, ERR_NO_MEMORY, "no memory for %d slices of %zu bytes", count, slice);
-			break;
-		}
-		code = recon_read(recon, z, count, piece, err);
-		saver_give(run->saver, piece, (size_t)count * slice);
+		code = saver_piece(run->saver, (size_t)count * slice, &place, err);
+		if (code == 0)
+			code = recon_read(recon, z, count, place, err);
+		if (code == 0)
+			saver_give(run->saver, (size_t)count * slice);
 	}
-	if (code == 0)
-		saver_end(run->saver);
-	else
+	if (code != 0) {
 		saver_abandon(run->saver);
-	return code;
-}
-
-static int open_saver(struct run *run, const struct grid *grid, struct error *err)
-{
-	size_t slice;
-	int slices = slices_of_a_piece(grid, &slice);
-
-	return run->saver != NULL ? 0 : saver_new((size_t)slices * slice, &run->saver, err);
-}
-
-static int announce(struct run *run, const struct kept_volume *kept, const struct saved_volume *saved,
-		    struct error *err)
-{
-	run->saved = *saved;
-	run->saved_iteration = kept->iteration;
-	snprintf(run->saved_stage, sizeof(run->saved_stage), "%s", kept->stage);
-	if (run->hooks->on_volume == NULL)
-		return 0;
-	return run->hooks->on_volume(run->hooks->recon.context, kept, saved, err);
-}
-
-/* Tells of the volume that was being saved, once it is; waits for that where it must. */
-static int settle(struct run *run, bool wait, struct error *err)
-{
-	bool done;
-	int code;
-
-	if (run->saver == NULL || !saver_busy(run->saver))
-		return 0;
-	code = saver_finish(run->saver, wait, &done, run->saving.sha256, err);
-	if (code != 0 || !done)
 		return code;
-	return announce(run, &run->saving_kept, &run->saving, err);
+	}
+	return saver_end(run->saver, err);
 }
 
 /* Header and voxels under the volume's own name. */
-static int begin_volume(struct run *run, struct recon *recon, const struct kept_volume *kept,
+static int write_volume(struct run *run, struct recon *recon, const struct kept_volume *kept,
 			const struct saved_volume *saved, struct error *err)
 {
 	uint8_t header[FORMAT_HEADER_MAX];
 	char description[80];
 	size_t length;
-	int code = open_saver(run, kept->grid, err);
+	int code = open_saver(run, err);
 
 	if (code != 0)
 		return code;
@@ -362,14 +413,35 @@ static int begin_volume(struct run *run, struct recon *recon, const struct kept_
 	snprintf(description, sizeof(description), "attenuation in 1/mm, %s, iteration %d", kept->stage,
 		 kept->iteration);
 	length = volume_formats[0].header(kept->grid, VOLUME_FLOAT32, description, header);
+	run->prepared = false;
 	code = saver_begin(run->saver, saved->path, header, length, saved->bytes, err);
+	if (code == 0)
+		code = write_voxels(run, recon, err);
 	if (code != 0)
 		return code;
-	run->saving = *saved;
-	run->saving_kept = *kept;
-	snprintf(run->saving_name, sizeof(run->saving_name), "%s", kept->name);
-	run->saving_kept.name = run->saving_name;
-	return hand_over(run, recon, err);
+	run->saved = *saved;
+	run->saved_iteration = kept->iteration;
+	snprintf(run->saved_name, sizeof(run->saved_name), "%s", kept->name);
+	snprintf(run->saved_stage, sizeof(run->saved_stage), "%s", kept->stage);
+	return 0;
+}
+
+/* As another name of the volume that was written last, where it is the same and the file system can do that. */
+static int link_volume(struct run *run, const struct kept_volume *kept, const struct saved_volume *saved,
+		       bool *ret_linked, struct error *err)
+{
+	bool same = run->saved.bytes > 0 && run->saved_iteration == kept->iteration &&
+		    strcmp(run->saved_stage, kept->stage) == 0;
+	/* A file that had the name before is lost for one that will not be. */
+	int code = same && access(saved->path, F_OK) == 0 ? settle(run, true, err) : 0;
+
+	if (code == 0 && same)
+		code = durable_link(run->saved.path, saved->path, ret_linked, err);
+	if (code == 0 && *ret_linked) {
+		run->link = *saved;
+		snprintf(run->link_name, sizeof(run->link_name), "%s", kept->name);
+	}
+	return code;
 }
 
 static int run_keep(void *context, struct recon *recon, const struct kept_volume *kept, struct error *err)
@@ -377,18 +449,17 @@ static int run_keep(void *context, struct recon *recon, const struct kept_volume
 	struct run *run = context;
 	struct saved_volume saved = {.bytes = grid_voxels(kept->grid) * sizeof(float)};
 	bool linked = false;
-	int code = settle(run, true, err);
+	int code = join(saved.path, sizeof(saved.path), run->directory, kept->name, ".nii", err);
 
 	if (code == 0)
-		code = join(saved.path, sizeof(saved.path), run->directory, kept->name, ".nii", err);
-	if (code == 0 && run->saved.bytes > 0 && run->saved_iteration == kept->iteration &&
-	    strcmp(run->saved_stage, kept->stage) == 0) {
-		memcpy(saved.sha256, run->saved.sha256, sizeof(saved.sha256));
-		code = durable_link(run->saved.path, saved.path, &linked, err);
-	}
-	if (code != 0)
-		return code;
-	return linked ? announce(run, kept, &saved, err) : begin_volume(run, recon, kept, &saved, err);
+		code = link_volume(run, kept, &saved, &linked, err);
+	if (code == 0 && !linked)
+		code = settle(run, true, err);
+	if (code == 0 && !linked)
+		code = write_volume(run, recon, kept, &saved, err);
+	if (code == 0 && run->hooks->on_volume != NULL)
+		code = run->hooks->on_volume(run->hooks->recon.context, kept, &saved, err);
+	return code != 0 ? code : settle(run, false, err);
 }
 
 /* ---- checkpoints ---- */
@@ -529,6 +600,7 @@ struct spool {
 	int *views;    /* [batch] */
 	char *samples; /* [batch][row][column] */
 	struct recon *recon;
+	bool resumed;
 };
 
 static int reduce(struct spool *spool, const unsigned char *present, struct error *err)
@@ -580,6 +652,7 @@ static int open_recon(struct spool *spool, const struct backend *backend, struct
 	if (code == 0)
 		code = recon_open(backend, device, &files->scan->geometry, &linearise, recipe, &spool->hooks,
 				  &spool->recon, err);
+	spool->run.recon = spool->recon;
 	if (code == 0 && hooks->on_open != NULL)
 		hooks->on_open(hooks->recon.context, &memory, recon_plan(spool->recon));
 	return code;
@@ -593,7 +666,10 @@ int spool_open(const struct backend *backend, struct device *device, const struc
 
 	if (spool == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a reconstruction");
-	spool->run = (struct run){.hooks = options->hooks, .directory = options->out_directory};
+	spool->run = (struct run){.hooks = options->hooks,
+				  .directory = options->out_directory,
+				  .recipe = options->recipe,
+				  .ahead = backend->own_memory};
 	spool->hooks = (struct recon_hooks){.context = &spool->run,
 					    .cancelled = run_cancelled,
 					    .yield = run_yield,
@@ -609,7 +685,8 @@ int spool_open(const struct backend *backend, struct device *device, const struc
 		code = reduce(spool, options->present, err);
 	if (code == 0)
 		code = open_recon(spool, backend, device, options->recipe, err);
-	if (code == 0 && options->checkpoint != NULL)
+	spool->resumed = options->checkpoint != NULL;
+	if (code == 0 && spool->resumed)
 		code = resume(&spool->run, spool->recon, options->checkpoint, options->iteration, err);
 	if (code != 0)
 		spool_close(spool);
@@ -701,6 +778,9 @@ static int push_some(struct spool *spool, const int *projections, int count, str
 	for (int i = 0; i < count && code == 0; i++)
 		spool->pushed[projections[i]] = 1;
 	spool->pushed_count += code == 0 ? count : 0;
+	/* Not at the beginning: an arm may stand still for minutes, and the disk takes what is old. */
+	if (code == 0 && !spool->resumed && 2 * spool->pushed_count >= spool_wanted(spool))
+		prepare(&spool->run, STAGE_FDK, 0);
 	return code;
 }
 
@@ -735,7 +815,7 @@ int spool_finish(struct spool *spool, struct error *err)
 	struct error trouble;
 	int code = recon_run(spool->recon, err);
 
-	/* What was kept is told of, however the run ends. */
+	/* What was told of is settled, however the run ends. */
 	if (run->trouble.code == 0)
 		settle(run, true, &run->trouble);
 	if (run->trouble.code != 0 && (code == 0 || code == ERR_BUSY || code == ERR_CANCELLED)) {

@@ -51,29 +51,32 @@ struct scan_files {
 int scan_files_open(const char *directory, struct scan_files *ret_files, struct error *err);
 void scan_files_close(struct scan_files *files); /* NULL and a closed one are fine */
 
-/* One kept volume on its way to disk. */
+/* The file of one kept volume. */
 struct saved_volume {
 	char path[1024];
-	size_t bytes;       /* of voxels, the header not counted */
-	uint8_t sha256[32]; /* of the voxels */
+	size_t bytes; /* of voxels, the header not counted */
 };
 
 /*
  * The pipeline over a directory, in three steps: opened, given its projections in
- * any order and as they arrive, and finished. Each kept volume is written durably
- * into out_directory before on_volume is called for it. Where "final" is the same
- * iterate as the volume before it, it is another link to that file. The worker
- * and `cbct recon` both do it this way. One thread at a time.
+ * any order and as they arrive, and finished. Each kept volume becomes a file of
+ * out_directory and is told of twice: by on_volume as soon as everybody can read
+ * it there, whole, and by on_settled when it is on the disk, with the SHA-256 of
+ * its voxels. However a run ends, what was told of is settled first, unless that
+ * is what failed: then its file is removed. Where "final" is the same iterate as
+ * the volume before it, it is another link to that file. The worker and `cbct
+ * recon` both do it this way. One thread at a time.
  */
 struct spool_hooks {
 	struct recon_hooks recon; /* any may be NULL, its context goes to all of these; keep is the spool's own and must
 				     be NULL here */
 	int (*on_volume)(void *context, const struct kept_volume *volume, const struct saved_volume *saved,
 			 struct error *err);
+	int (*on_settled)(void *context, const char *name, const uint8_t sha256[32], struct error *err);
 	void (*on_open)(void *context, const struct recon_memory *memory, const char *plan);
 };
 
-/* What is to be reconstructed; all of it is borrowed until spool_close, the recipe is copied. */
+/* What is to be reconstructed; all of it is borrowed until spool_close. */
 struct spool_options {
 	const char *scan_directory, *out_directory;
 	/* A flag for each projection of scan.json: those that make up the scan, the others never come. NULL: all. */

@@ -497,7 +497,8 @@ class Client:
         params = {"format": "nrrd", "type": _volume_type(dtype), "scale": str(int(scale))}
         headers = {"Accept-Encoding": "identity"}
         response = self._request("GET", f"/v1/jobs/{job}/volumes/{name}", params=params, headers=headers)
-        document = next(document for document in self.volume_list(job) if document["name"] == name)
+        documents = self._pages(f"/v1/jobs/{job}/volumes?wait=0", "volumes")
+        document = next(document for document in documents if document["name"] == name)
         told = {"cbct-volume": name, "cbct-stage": document["stage"], "cbct-iteration": str(document["iteration"])}
         return _volume(_Part(told, bytearray(response.content)))
 

@@ -1,11 +1,13 @@
 /* The life of a job: its states, its place in the queue, what a restart makes of it. */
 #include <check.h>
+#include <openssl/evp.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
 #include "daemon/document.h"
 #include "daemon/files.h"
+#include "proto/spool.h"
 #include "tests/unit/state.h"
 
 static struct state state;
@@ -482,7 +484,7 @@ END_TEST
 
 START_TEST(a_volume_whose_row_is_missing_is_made_again)
 {
-	const struct volume_record volume = {.name = "fdk", .stage = "fdk", .bytes = 256};
+	const struct volume_record volume = {.name = "fdk", .stage = "fdk", .bytes = 256, .settled = true};
 	struct job *job = state_post(&state, scan, "routine");
 	struct error err = {0};
 	char id[ID_SIZE];
@@ -493,12 +495,109 @@ START_TEST(a_volume_whose_row_is_missing_is_made_again)
 	path_fill(state_path(&state, "jobs/%s/fdk.nii", id));
 	path_fill(state_path(&state, "jobs/%s/iter-1.nii", id));
 	path_fill(state_path(&state, "jobs/%s/iter-2.nii.tmp", id));
+	path_fill(state_path(&state, "jobs/%s/blank.tmp", id));
 	ck_assert_int_eq(job_add_volume(job, &volume, &err), 0);
 	job_release(job);
 	restart();
+	ck_assert(!path_exists(state_path(&state, "jobs/%s/blank.tmp", id)));
 	ck_assert(path_exists(state_path(&state, "jobs/%s/fdk.nii", id)));
 	ck_assert(!path_exists(state_path(&state, "jobs/%s/iter-1.nii", id)));
 	ck_assert(!path_exists(state_path(&state, "jobs/%s/iter-2.nii.tmp", id)));
+}
+END_TEST
+
+/* Without a name where there is none. */
+static struct volume_record volume_of(const char *id, const char *name)
+{
+	struct volume_record *volumes, found = {.name = ""};
+	struct error err = {0};
+	int count;
+
+	ck_assert_int_eq(store_job_volumes(state.store, id, &volumes, &count, &err), 0);
+	for (int i = 0; i < count; i++)
+		if (strcmp(volumes[i].name, name) == 0)
+			found = volumes[i];
+	free(volumes);
+	return found;
+}
+
+START_TEST(a_volume_that_had_not_reached_the_disk_is_made_again)
+{
+	const struct volume_record fdk = {.name = "fdk", .stage = "fdk", .bytes = 256};
+	const struct volume_record second = {.name = "iter-2", .stage = "sart", .iteration = 2, .bytes = 256};
+	const struct job_change yielded = {.checkpoint = 1, .yielded = true};
+	struct job *job = state_post(&state, scan, "routine");
+	struct error err = {0};
+	struct job_record record;
+	struct event_record *events;
+	const uint8_t sha256[32] = {1, 2, 3};
+	char id[ID_SIZE];
+	int count, told = 0;
+
+	keep_id(job, id);
+	state_set(job, JOB_RUNNING, NULL);
+	ck_assert_int_eq(directory_make(state_path(&state, "jobs/%s", id), &err), 0);
+	path_fill(state_path(&state, "jobs/%s/fdk.nii", id));
+	path_fill(state_path(&state, "jobs/%s/iter-2.nii", id));
+	path_fill(state_path(&state, "jobs/%s/checkpoint.f32", id));
+	ck_assert_int_eq(job_add_volume(job, &fdk, &err), 0);
+	ck_assert(!volume_of(id, "fdk").settled);
+	ck_assert_int_eq(job_settle_volume(job, "fdk", sha256, &err), 0);
+	ck_assert(volume_of(id, "fdk").settled);
+	ck_assert_mem_eq(volume_of(id, "fdk").sha256, sha256, 32);
+	state_set(job, JOB_QUEUED, &yielded);
+	state_set(job, JOB_RUNNING, NULL);
+	ck_assert_int_eq(job_add_volume(job, &second, &err), 0);
+	job_release(job);
+	restart();
+	ck_assert_str_eq(volume_of(id, "fdk").name, "fdk");
+	ck_assert_str_eq(volume_of(id, "iter-2").name, "");
+	ck_assert(path_exists(state_path(&state, "jobs/%s/fdk.nii", id)));
+	ck_assert(!path_exists(state_path(&state, "jobs/%s/iter-2.nii", id)));
+	/* The checkpoint may be of what came after it. */
+	ck_assert(!path_exists(state_path(&state, "jobs/%s/checkpoint.f32", id)));
+	job = find(id);
+	job_record(job, &record);
+	ck_assert_int_eq(record.state, JOB_QUEUED);
+	ck_assert_int_eq(record.checkpoint, 0);
+	state_set(job, JOB_RUNNING, NULL);
+	ck_assert_int_eq(job_add_volume(job, &second, &err), 0);
+	ck_assert_int_eq(job_settle_volume(job, "iter-2", sha256, &err), 0);
+	ck_assert(volume_of(id, "iter-2").settled);
+	ck_assert_int_eq(store_job_events(state.store, id, 0, 100, &events, &count, &err), 0);
+	for (int i = 0; i < count; i++)
+		told += strcmp(events[i].kind, "volume") == 0;
+	event_records_free(events, count);
+	ck_assert_int_eq(told, 2); /* each of them once */
+	job_release(job);
+}
+END_TEST
+
+START_TEST(what_a_dead_worker_told_of_is_settled_for_it)
+{
+	const struct volume_record fdk = {.name = "fdk", .stage = "fdk", .bytes = 4}, lost = {.name = "iter-1"};
+	struct job *job = state_post(&state, scan, "routine");
+	struct error err = {0};
+	bool unsettled = false;
+	char id[ID_SIZE], bytes[SPOOL_VOLUME_OFFSET + 4] = "";
+	uint8_t sha256[32];
+
+	keep_id(job, id);
+	state_set(job, JOB_RUNNING, NULL);
+	ck_assert_int_eq(directory_make(state_path(&state, "jobs/%s", id), &err), 0);
+	memcpy(bytes + SPOOL_VOLUME_OFFSET, "abcd", 4);
+	ck_assert_int_eq(file_write_durable(state_path(&state, "jobs/%s/fdk.nii", id), bytes, sizeof(bytes), &err), 0);
+	ck_assert_int_eq(job_add_volume(job, &fdk, &err), 0);
+	ck_assert_int_eq(job_add_volume(job, &lost, &err), 0); /* whose file is not there */
+	ck_assert_int_eq(job_unsettled(job, &unsettled, &err), 0);
+	ck_assert(unsettled);
+	ck_assert_int_eq(job_settle(job, &err), 0);
+	ck_assert_int_eq(job_unsettled(job, &unsettled, &err), 0);
+	ck_assert(!unsettled);
+	EVP_Digest("abcd", 4, sha256, NULL, EVP_sha256(), NULL);
+	ck_assert_mem_eq(volume_of(id, "fdk").sha256, sha256, 32);
+	ck_assert_str_eq(volume_of(id, "iter-1").name, "");
+	job_release(job);
 }
 END_TEST
 
@@ -564,6 +663,8 @@ Suite *job_suite(void)
 	tcase_add_test(tests, a_key_makes_one_job_also_over_a_restart);
 	tcase_add_test(tests, events_come_in_order_from_where_one_left_off);
 	tcase_add_test(tests, a_volume_whose_row_is_missing_is_made_again);
+	tcase_add_test(tests, a_volume_that_had_not_reached_the_disk_is_made_again);
+	tcase_add_test(tests, what_a_dead_worker_told_of_is_settled_for_it);
 	tcase_add_test(tests, the_document_has_what_the_contract_names);
 	tcase_add_test(tests, times_are_written_as_iso_8601);
 	suite_add_tcase(suite, tests);

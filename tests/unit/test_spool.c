@@ -349,7 +349,9 @@ struct watched {
 	int fail_at;             /* the n-th volume is refused */
 	int rows, last_row, kept, opened;
 	struct saved_volume saved[KEPT_MOST];
+	uint8_t sha256[KEPT_MOST][32]; /* once it is settled */
 	char names[KEPT_MOST][32];
+	int settled;
 	char warnings[256];
 };
 
@@ -398,6 +400,17 @@ static int watched_volume(void *context, const struct kept_volume *volume, const
 	return 0;
 }
 
+static int watched_settled(void *context, const char *name, const uint8_t sha256[32], struct error *err)
+{
+	struct watched *watched = context;
+
+	(void)err;
+	ck_assert_int_lt(watched->settled, watched->kept); /* after it was told of, in the same order, once */
+	ck_assert_str_eq(watched->names[watched->settled], name);
+	memcpy(watched->sha256[watched->settled++], sha256, 32);
+	return 0;
+}
+
 static void watched_open(void *context, const struct recon_memory *memory, const char *plan)
 {
 	struct watched *watched = context;
@@ -416,6 +429,7 @@ static int run(const char *request_text, const char *where, const char *checkpoi
 						    .row = watched_row,
 						    .warning = watched_warning},
 					  .on_volume = watched_volume,
+					  .on_settled = watched_settled,
 					  .on_open = watched_open};
 	const struct device_options options = {.threads = 2};
 	struct spool_options spool = {.scan_directory = directory,
@@ -489,7 +503,7 @@ START_TEST(kept_volumes_are_files_that_say_what_they_are)
 		load(out, strrchr(expected, '/') + 1, &content, &length);
 		ck_assert_uint_eq(length, SPOOL_VOLUME_OFFSET + bytes);
 		EVP_Digest(content + SPOOL_VOLUME_OFFSET, bytes, (unsigned char *)digest, NULL, EVP_sha256(), NULL);
-		ck_assert_mem_eq(digest, watched.saved[i].sha256, 32);
+		ck_assert_mem_eq(digest, watched.sha256[i], 32);
 		ck_assert_int_eq(volume_read(expected, &grid, &voxels, &err), 0);
 		ck_assert_int_eq(grid.size[1], 16);
 		ck_assert_double_eq_tol(grid.spacing[2], 6, 1e-6); /* single precision in the header */
@@ -499,8 +513,8 @@ START_TEST(kept_volumes_are_files_that_say_what_they_are)
 		free(voxels);
 		free(content);
 	}
-	ck_assert_mem_eq(watched.saved[3].sha256, watched.saved[4].sha256, 32);
-	ck_assert_mem_ne(watched.saved[2].sha256, watched.saved[3].sha256, 32);
+	ck_assert_mem_eq(watched.sha256[3], watched.sha256[4], 32);
+	ck_assert_mem_ne(watched.sha256[2], watched.sha256[3], 32);
 }
 END_TEST
 
@@ -528,11 +542,11 @@ START_TEST(the_same_iterate_is_one_file_with_two_names)
 	ck_assert_int_eq(
 	    run("{\"scan\":\"s\"," GRID ",\"fdk\":{},\"tv\":{},\"emit\":[\"fdk\"]}", out, NULL, 0, &watched, &err), 0);
 	ck_assert_int_eq(watched.kept, 2);
-	ck_assert_mem_ne(watched.saved[0].sha256, watched.saved[1].sha256, 32);
+	ck_assert_mem_ne(watched.sha256[0], watched.sha256[1], 32);
 	memset(&watched, 0, sizeof(watched));
 	ck_assert_int_eq(run("{\"scan\":\"s\"," GRID ",\"fdk\":{},\"emit\":[\"fdk\"]}", out, NULL, 0, &watched, &err),
 			 0);
-	ck_assert_mem_eq(watched.saved[0].sha256, watched.saved[1].sha256, 32);
+	ck_assert_mem_eq(watched.sha256[0], watched.sha256[1], 32);
 	ck_assert_int_eq(stat(watched.saved[0].path, &last), 0);
 	ck_assert_int_eq(stat(watched.saved[1].path, &final), 0);
 	ck_assert_uint_eq(last.st_ino, final.st_ino);
@@ -543,7 +557,8 @@ END_TEST
 static int run_arriving(const int *order, int count, int piece, const unsigned char *present, struct watched *watched,
 			struct error *err)
 {
-	const struct spool_hooks hooks = {.recon = {.context = watched}, .on_volume = watched_volume};
+	const struct spool_hooks hooks = {
+	    .recon = {.context = watched}, .on_volume = watched_volume, .on_settled = watched_settled};
 	const struct device_options options = {.threads = 2};
 	struct spool_options spool_options = {
 	    .scan_directory = directory, .out_directory = out, .present = present, .hooks = &hooks};
@@ -585,11 +600,11 @@ START_TEST(projections_may_arrive_in_any_order_and_in_pieces)
 	load(out, "final.nii", &a, &length);
 	/* The same order is the same bits, whatever the pieces. */
 	ck_assert_msg(run_arriving(straight, VIEWS, 5, NULL, &pieces, &err) == 0, "%s", err.text);
-	ck_assert_mem_eq(pieces.saved[4].sha256, whole.saved[4].sha256, 32);
+	ck_assert_mem_eq(pieces.sha256[4], whole.sha256[4], 32);
 	ck_assert_int_eq(run_arriving(order, VIEWS, 1, NULL, &shuffled, &err), 0);
 	ck_assert_int_eq(run_arriving(order, VIEWS, 4, NULL, &same, &err), 0);
-	ck_assert_mem_eq(shuffled.saved[0].sha256, same.saved[0].sha256, 32);
-	ck_assert_mem_eq(shuffled.saved[4].sha256, same.saved[4].sha256, 32);
+	ck_assert_mem_eq(shuffled.sha256[0], same.sha256[0], 32);
+	ck_assert_mem_eq(shuffled.sha256[4], same.sha256[4], 32);
 	/* Another one differs by the rounding of a sum of VIEWS floats. */
 	load(out, "fdk.nii", &b, &length);
 	free(a);
@@ -653,7 +668,7 @@ START_TEST(a_scan_of_what_is_there_is_as_if_no_more_had_been_planned)
 	free(all);
 	ck_assert_msg(run(pipeline, out, NULL, 0, &half, &err) == 0, "%s", err.text);
 	for (int i = 0; i < 5; i++)
-		ck_assert_mem_eq(partial.saved[i].sha256, half.saved[i].sha256, 32);
+		ck_assert_mem_eq(partial.sha256[i], half.sha256[i], 32);
 }
 END_TEST
 

@@ -45,12 +45,12 @@ export function newKey() {
 	return [...crypto.getRandomValues(new Uint8Array(16))].map(byte => byte.toString(16).padStart(2, '0')).join('')
 }
 
-/* All volumes of a job, in the order of their making. */
+/* All volumes of a job, in the order of their making; their digests are not waited for. */
 export async function listVolumes(job, signal) {
 	const volumes = []
 	let after = null
 	do {
-		const page = await get(`${jobPath(job)}/volumes?limit=1000${after ? `&after=${id(after)}` : ''}`, signal)
+		const page = await get(`${jobPath(job)}/volumes?limit=1000&wait=0${after ? `&after=${id(after)}` : ''}`, signal)
 		volumes.push(...page.volumes)
 		after = page.next
 	} while (after)

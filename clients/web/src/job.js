@@ -353,7 +353,7 @@ export class JobPage {
 	#writeLinks() {
 		const { format, type, scale, list } = this.#files
 		const query = `?format=${format.value}&type=${type.value}${scale.value === '1' ? '' : `&scale=${scale.value}`}`
-		const state = JSON.stringify([query, this.#selected, this.#volumes.map(volume => volume.digest)])
+		const state = JSON.stringify([query, this.#selected, this.#volumes.map(volume => volume.created)])
 		if (list.dataset.state === state)
 			return
 		list.dataset.state = state

@@ -36,7 +36,7 @@ export class Viewer {
 	/* Place and window stay; the picture before stays until the new one is there. */
 	show(job, volume) {
 		const before = this.#source
-		if (before && before.job === job && before.volume.name === volume.name && before.volume.digest === volume.digest)
+		if (before && before.job === job && before.volume.name === volume.name && before.volume.created === volume.created)
 			return
 		if (before)
 			cancelVoxels(before.job, before.volume, 1)

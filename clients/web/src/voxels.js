@@ -82,7 +82,7 @@ function makeRoom(keep) {
 	}
 }
 
-const keyOf = (job, volume, scale) => `${job} ${volume.name} ${volume.digest} ${scale}`
+const keyOf = (job, volume, scale) => `${job} ${volume.name} ${volume.created} ${scale}`
 
 /* What is here already: { size, spacing, origin, voxels }, or null. */
 export function heldVoxels(job, volume, scale) {
