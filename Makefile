@@ -140,6 +140,10 @@ $(BUILD)/cbct-worker: $(call objects,daemon/worker.c) $(library) $(cuda_objects)
 $(BUILD)/cbct: $(call objects,$(cbct_sources)) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(cbct_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
+# A worker whose syncs can be held up, for the tests of what becomes of a volume meanwhile.
+$(BUILD)/cbct-worker-held: $(call objects,daemon/worker.c tests/http/held.c) $(library) $(cuda_objects)
+	$(call say,LINK)$(CC) $(LDFLAGS) -Wl,--wrap=fdatasync -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(if $(cuda_objects),$(cuda_libs)) $(LIBM)
+
 # What `cbct recon` becomes where a card is wanted.
 $(BUILD)/cbct-cuda: $(call objects,$(cbct_sources)) $(library) $(cuda_objects)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(cbct_libs) $(proto_libs) $(core_libs)) $(cuda_libs) $(LIBM)
@@ -188,7 +192,7 @@ demo: setup ## a C-arm scan posted with curl, reconstructed, its volumes coming 
 	@BUILD=$(BUILD) clients/curl/demo.sh
 
 check: setup ## every test; what cannot run here is skipped aloud
-	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/unit
+	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/unit $(BUILD)/cbct-worker-held
 	@BUILD=$(BUILD) SANITIZED=$(SANITIZED) LEAVE_OUT="$(LEAVE_OUT)" OMP_WAIT_POLICY=passive tests/run.sh
 
 FUZZ_SECONDS ?= 10

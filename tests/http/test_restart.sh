@@ -150,6 +150,104 @@ test_a_dead_worker_takes_nothing_with_it() {
 	stop_daemon
 }
 
+# A job whose FDK volume is told of and stays unsettled for as long as $hold is there.
+hold=$work/hold
+told_and_held() {
+	local i
+	: >"$hold"
+	CBCT_TEST_HOLD=$hold start_daemon --worker "$BUILD/cbct-worker-held"
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "{\"scan\": \"SCAN\", $grid, \"fdk\": {}, \"sart\": {\"iterations\": 3}, \"emit\": [\"fdk\"]}"
+	for ((i = 0; i < 400; i++)); do
+		req GET "/v1/jobs/$job/volumes?wait=0"
+		expect_status 200
+		[ "$(json '.volumes | length')" = 0 ] || break
+		sleep 0.05
+	done
+	expect_json '[.volumes[].name] == ["fdk"] and (.volumes[0] | has("digest") | not)'
+	get_volume fdk "$work/told" format=raw
+	etag=$(header etag)
+}
+digest_of() { echo "sha-256=:$(openssl dgst -sha256 -binary "$1" | base64 -w 0):"; }
+worker_of() { pgrep -P "$(cat "$work/daemon.pid")" | head -1; }
+events_of() { curl -sS -N --max-time 60 "$url/v1/jobs/$job/events" | awk '/^event: /{ printf "%s%s", sep, $2; sep = " " }'; }
+
+test_a_volume_is_told_of_before_it_is_on_the_disk_and_the_job_ends_after() {
+	local list
+	told_and_held
+	req GET "/v1/jobs/$job/volumes?wait=0.2"
+	expect_json '.volumes[0] | has("digest") | not'
+	curl -sS --max-time 60 "$url/v1/jobs/$job/volumes" >"$work/list" &
+	list=$!
+	req GET "/v1/jobs/$job?wait=1"
+	expect_json '.state == "running"'
+	[ ! -s "$work/list" ] || fail "a list that waits for the digest"
+	rm "$hold"
+	wait $list
+	[ "$(jq -r '.volumes[] | select(.name == "fdk") | .digest' "$work/list")" = "$(digest_of "$work/told")" ] ||
+		fail "the digest of what was told of: $(cat "$work/list")"
+	wait_job succeeded
+	req GET "/v1/jobs/$job/volumes"
+	expect_json '[.volumes[].name] == ["final", "fdk"] and (.volumes | all(.digest | startswith("sha-256=:")))'
+	get_volume fdk "$work/settled" format=raw
+	[ "$(header etag)" = "$etag" ] || fail "the ETag $etag still, got $(header etag)"
+	cmp "$work/told" "$work/settled" || fail "the same voxels"
+	get_volume final "$work/final" format=raw
+	[ "$(jq -r '.volumes[0].digest' <(curl -sS "$url/v1/jobs/$job/volumes"))" = "$(digest_of "$work/final")" ] || fail "the digest of the final volume"
+	[ "$(header etag)" != "$etag" ] || fail "another ETag for another volume"
+	stop_daemon
+}
+
+test_a_volume_that_was_told_of_outlives_its_worker() {
+	told_and_held
+	kill -9 "$(worker_of)"
+	# not done by the next worker, whose syncs are held up too
+	req GET "/v1/jobs/$job/volumes?wait=20"
+	expect_json ".volumes | any(.name == \"fdk\" and .digest == \"$(digest_of "$work/told")\")"
+	rm "$hold"
+	wait_job succeeded
+	expect_json '.attempts == 2'
+	get_volume fdk "$work/again" format=raw
+	cmp "$work/told" "$work/again" || fail "the same bits from the second attempt"
+	[ "$(header etag)" != "$etag" ] || fail "another ETag for a volume that was made again"
+	[ "$(events_of | tr ' ' '\n' | grep -c volume)" = 2 ] || fail "each volume told of once, got $(events_of)"
+	stop_daemon
+}
+
+test_a_volume_that_was_told_of_outlives_a_job_that_is_cancelled_and_its_worker() {
+	told_and_held
+	req DELETE "/v1/jobs/$job"
+	expect_status 202
+	kill -9 "$(worker_of)"
+	wait_job cancelled
+	req GET "/v1/jobs/$job/volumes?wait=0"
+	expect_json "[.volumes[] | {name, digest}] == [{name: \"fdk\", digest: \"$(digest_of "$work/told")\"}]"
+	rm "$hold"
+	stop_daemon
+	start_daemon
+	get_volume fdk "$work/again" format=raw
+	cmp "$work/told" "$work/again" || fail "the volume after a restart"
+	stop_daemon
+}
+
+test_a_volume_that_was_told_of_is_made_again_when_the_daemon_dies_too_soon() {
+	told_and_held
+	stop_daemon KILL
+	rm "$hold"
+	start_daemon
+	grep -q "volume fdk had not reached the disk" "$work/cbctd.err" || fail "what becomes of it in the log"
+	# a stream that asks for it meanwhile waits until it is there again
+	curl -sS --max-time 120 "$url/v1/jobs/$job/stream?format=raw" >"$work/stream"
+	wait_job succeeded
+	expect_json '.attempts == 2'
+	grep -qa '^CBCT-Volume: fdk' "$work/stream" && grep -qa '^CBCT-Volume: final' "$work/stream" || fail "both volumes in the stream"
+	get_volume fdk "$work/again" format=raw
+	cmp "$work/told" "$work/again" || fail "the same bits once more"
+	[ "$(events_of | tr ' ' '\n' | grep -c volume)" = 2 ] || fail "each volume told of once, got $(events_of)"
+	stop_daemon
+}
+
 test_a_checkpoint_that_is_gone_begins_the_job_again() {
 	local yielded
 	start_daemon
