@@ -37,6 +37,7 @@ struct saver {
 	pthread_mutex_t lock; /* guards what follows */
 	pthread_cond_t changed;
 	size_t given; /* bytes of the file, its header included */
+	size_t hashed_to;
 	bool ended, abandoned;
 	bool hashed, synced;
 	struct error hash_error, sync_error;
@@ -188,6 +189,8 @@ static bool hash_some(struct saver *saver, size_t *at)
 	let_go(&saver->file, *at, *at + bytes);
 	pthread_mutex_lock(&saver->lock);
 	*at += bytes;
+	saver->hashed_to = *at;
+	pthread_cond_broadcast(&saver->changed);
 	if (!ok)
 		error_set(&saver->hash_error, ERR_INTERNAL, "SHA-256 failed");
 	return true;
@@ -209,11 +212,38 @@ static void *hash_loop(void *context)
 	return NULL;
 }
 
+/*
+ * Behind the hasher, which keeps the disk busy without filling its queue at once:
+ * what others sync meanwhile, that this file is there to begin with, must not
+ * wait for all of it.
+ */
+static void write_back(struct saver *saver)
+{
+	size_t at = 0;
+
+	pthread_mutex_lock(&saver->lock);
+	while (!saver->hashed) {
+		size_t to = saver->hashed_to;
+
+		if (to == at) {
+			pthread_cond_wait(&saver->changed, &saver->lock);
+			continue;
+		}
+		pthread_mutex_unlock(&saver->lock);
+		/* A hint: file systems without it write all of it at the end. */
+		sync_file_range(saver->file.file.file, (off_t)at, (off_t)(to - at), SYNC_FILE_RANGE_WRITE);
+		at = to;
+		pthread_mutex_lock(&saver->lock);
+	}
+	pthread_mutex_unlock(&saver->lock);
+}
+
 static void *sync_file(void *context)
 {
 	struct saver *saver = context;
 	struct error err = {0};
 
+	write_back(saver);
 	durable_settle(&saver->file.file, &err);
 	pthread_mutex_lock(&saver->lock);
 	saver->sync_error = err;
@@ -308,7 +338,7 @@ int saver_begin(struct saver *saver, const char *path, const void *header, size_
 	code = take_file(saver, length + bytes, err);
 	if (code != 0)
 		return code;
-	saver->given = 0;
+	saver->given = saver->hashed_to = 0;
 	saver->header = length;
 	code = saver_piece(saver, length, &place, err);
 	if (code == 0) {

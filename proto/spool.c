@@ -22,8 +22,9 @@
 _Static_assert(SPOOL_VOLUME_OFFSET == 352, "a NIfTI-1 header and its four extension bytes");
 
 enum {
-	READ_BYTES = 8 << 20, /* projections in one go: small beside the scan, large beside a system call */
-	PIECE_BYTES = 8 << 20 /* voxels in one go, on their way to the disk */
+	READ_BYTES = 8 << 20,  /* projections in one go: small beside the scan, large beside a system call */
+	PIECE_BYTES = 8 << 20, /* voxels in one go through memory of their own, on their way to the disk */
+	PLACE_BYTES = 64 << 20 /* straight into a file: long enough for a device to overlap its own pieces */
 };
 
 /* ---- files ---- */
@@ -288,10 +289,10 @@ static void run_warning(void *context, const char *code, const char *detail)
 /* ---- kept volumes ---- */
 
 /* Slices of one piece: whole ones, at least one. */
-static int slices_of_a_piece(const struct grid *grid, size_t *ret_slice)
+static int slices_of_a_piece(const struct grid *grid, size_t bytes, size_t *ret_slice)
 {
 	size_t slice = (size_t)grid->size[0] * (size_t)grid->size[1] * sizeof(float);
-	int slices = slice < PIECE_BYTES ? (int)(PIECE_BYTES / slice) : 1;
+	int slices = slice < bytes ? (int)(bytes / slice) : 1;
 
 	*ret_slice = slice;
 	return slices < grid->size[2] ? slices : grid->size[2];
@@ -379,7 +380,7 @@ static int write_voxels(struct run *run, struct recon *recon, struct error *err)
 {
 	const struct grid *grid = recon_grid(recon);
 	size_t slice;
-	int slices = slices_of_a_piece(grid, &slice), code = 0;
+	int slices = slices_of_a_piece(grid, PLACE_BYTES, &slice), code = 0;
 
 	for (int z = 0; z < grid->size[2] && code == 0; z += slices) {
 		int count = z + slices <= grid->size[2] ? slices : grid->size[2] - z;
@@ -482,7 +483,7 @@ static int write_iterate(struct recon *recon, struct durable *d, struct error *e
 {
 	const struct grid *grid = recon_grid(recon);
 	size_t slice;
-	int slices = slices_of_a_piece(grid, &slice), code = 0;
+	int slices = slices_of_a_piece(grid, PIECE_BYTES, &slice), code = 0;
 	float *voxels = malloc((size_t)slices * slice);
 
 	if (voxels == NULL)

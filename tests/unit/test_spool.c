@@ -1,4 +1,4 @@
-/* The spool: durable files, scan directories, and the pipeline over one: volumes, links, checkpoints. */
+/* The spool: durable files, savers, scan directories, and the pipeline over one: volumes, links, checkpoints. */
 #include <check.h>
 #include <dirent.h>
 #include <errno.h>
@@ -21,9 +21,11 @@
 
 #include "core/phantom.h"
 #include "proto/format.h"
+#include "proto/saver.h"
 #include "proto/spool.h"
 
 static char directory[64], path[128], out[128];
+static struct backend backend; /* that pipelines run on */
 
 static void remove_all(const char *name)
 {
@@ -51,6 +53,7 @@ static void make_directory(void)
 	snprintf(path, sizeof(path), "%s/file", directory);
 	snprintf(out, sizeof(out), "%s/out", directory);
 	ck_assert_int_eq(mkdir(out, 0700), 0);
+	backend = backend_cpu;
 }
 
 static void remove_directory(void)
@@ -247,6 +250,213 @@ START_TEST(a_file_that_cannot_be_read_says_why)
 }
 END_TEST
 
+/* ---- savers ---- */
+
+enum { VOXELS = 3 << 20, HEADER = 352 }; /* bytes; pieces that are no whole pages */
+
+static char header[HEADER], voxels_saved[VOXELS], blank[160], blank_beside[200];
+
+static struct saver *new_saver(void)
+{
+	struct saver *saver = NULL;
+	struct error err = {0};
+
+	memset(header, 'h', sizeof(header));
+	for (size_t i = 0; i < sizeof(voxels_saved); i++)
+		voxels_saved[i] = (char)(i * 7 + i / 1000);
+	snprintf(blank, sizeof(blank), "%s/blank", directory);
+	snprintf(blank_beside, sizeof(blank_beside), "%s.tmp", blank);
+	ck_assert_int_eq(saver_new(&saver, &err), 0);
+	return saver;
+}
+
+static ino_t inode_of(const char *name)
+{
+	struct stat status;
+
+	return stat(name, &status) == 0 ? status.st_ino : 0;
+}
+
+/* Up to the moment when it has its name. */
+static int save(struct saver *saver, struct error *err)
+{
+	enum { PIECE = 1000003 };
+	int code = saver_begin(saver, path, header, HEADER, VOXELS, err);
+
+	for (size_t done = 0; done < VOXELS && code == 0; done += PIECE) {
+		size_t bytes = VOXELS - done < PIECE ? VOXELS - done : PIECE;
+		void *place;
+
+		code = saver_piece(saver, bytes, &place, err);
+		if (code == 0) {
+			memcpy(place, voxels_saved + done, bytes);
+			saver_give(saver, bytes);
+		}
+	}
+	return code == 0 ? saver_end(saver, err) : code;
+}
+
+static void assert_saved(void)
+{
+	char *bytes = NULL;
+	size_t length = 0;
+	struct error err = {0};
+
+	ck_assert_int_eq(file_read(path, 1 << 23, &bytes, &length, &err), 0);
+	ck_assert_uint_eq(length, HEADER + VOXELS);
+	ck_assert_int_eq(memcmp(bytes, header, HEADER), 0);
+	ck_assert_int_eq(memcmp(bytes + HEADER, voxels_saved, VOXELS), 0);
+	free(bytes);
+}
+
+static void settle(struct saver *saver)
+{
+	uint8_t sha256[32], expected[32], alone[32];
+	struct error err = {0};
+	bool done;
+
+	ck_assert_msg(saver_finish(saver, true, &done, sha256, &err) == 0, "%s", err.text);
+	ck_assert(done && !saver_busy(saver));
+	EVP_Digest(voxels_saved, VOXELS, expected, NULL, EVP_sha256(), NULL);
+	ck_assert_mem_eq(sha256, expected, 32);
+	ck_assert_int_eq(saver_settle(path, HEADER, alone, &err), 0);
+	ck_assert_mem_eq(alone, expected, 32);
+}
+
+START_TEST(a_saved_file_is_whole_once_it_has_its_name)
+{
+	struct saver *saver = new_saver();
+	struct error err = {0};
+
+	for (int again = 0; again < 2; again++) { /* the second time in the place of the first */
+		ck_assert_msg(save(saver, &err) == 0, "%s", err.text);
+		ck_assert(saver_busy(saver));
+		assert_saved();
+		ck_assert_int_eq(count_files(directory), 2);
+		settle(saver);
+		assert_saved();
+	}
+	saver_free(saver);
+	saver_free(NULL);
+}
+END_TEST
+
+START_TEST(what_has_its_name_stays_when_its_saver_goes_and_what_has_none_does_not)
+{
+	struct saver *saver = new_saver();
+	struct error err = {0};
+	void *place;
+
+	ck_assert_int_eq(saver_begin(saver, path, header, HEADER, VOXELS, &err), 0);
+	ck_assert_int_eq(saver_piece(saver, 5, &place, &err), 0);
+	saver_give(saver, 5);
+	ck_assert_int_eq(count_files(directory), 2);
+	saver_abandon(saver);
+	ck_assert_int_eq(count_files(directory), 1);
+	ck_assert_int_eq(save(saver, &err), 0);
+	saver_free(saver);
+	assert_saved();
+	ck_assert_int_eq(count_files(directory), 2);
+}
+END_TEST
+
+START_TEST(a_prepared_file_becomes_the_next_one_of_its_size)
+{
+	struct saver *saver = new_saver();
+	struct error err = {0};
+	ino_t inode;
+
+	saver_prepare(saver, blank, HEADER + VOXELS);
+	saver_prepare(saver, blank, HEADER + VOXELS); /* once more, and while it is at it */
+	inode = inode_of(blank_beside);
+	ck_assert_uint_ne(inode, 0);
+	ck_assert_int_eq(save(saver, &err), 0);
+	ck_assert_uint_eq(inode_of(path), inode);
+	saver_prepare(saver, blank, HEADER + VOXELS); /* for the next one, beside what is being settled */
+	settle(saver);
+	assert_saved();
+	ck_assert_int_eq(save(saver, &err), 0);
+	assert_saved();
+	settle(saver);
+	/* One of another size is of no use, one that nobody uses goes. */
+	saver_prepare(saver, blank, VOXELS);
+	ck_assert_int_eq(save(saver, &err), 0);
+	settle(saver);
+	assert_saved();
+	ck_assert_int_eq(count_files(directory), 2);
+	saver_prepare(saver, blank, VOXELS);
+	ck_assert_int_eq(count_files(directory), 3);
+	saver_free(saver);
+	ck_assert_int_eq(count_files(directory), 2);
+}
+END_TEST
+
+static const struct {
+	const char *name;
+	int call, error;
+	int code;      /* expected of save, or of saver_finish where that comes so far */
+	bool finishes; /* it gets its name */
+} saver_faults[] = {
+    {"fallocate", SYS_fallocate, ENOSPC, ERR_NO_SPACE, false},
+    {"fallocate", SYS_fallocate, EOPNOTSUPP, 0, true}, /* a file system that cannot: the same in another way */
+    {"mmap", SYS_mmap, ENODEV, ERR_IO, false},
+    {"madvise", SYS_madvise, EINVAL, 0, true}, /* a kernel that cannot */
+    {"madvise", SYS_madvise, EFAULT, ERR_IO, false},
+#ifdef SYS_rename
+    {"rename", SYS_rename, EIO, ERR_IO, false},
+#endif
+    {"fdatasync", SYS_fdatasync, EIO, ERR_IO, true},
+    {"fdatasync", SYS_fdatasync, ENOSPC, ERR_NO_SPACE, true},
+    {"fsync of the directory", SYS_fsync, EIO, ERR_IO, true},
+};
+
+/* In a process of its own, as write_with_fault. Nothing stays of what could not be settled. */
+static int save_with_fault(size_t i, bool prepared)
+{
+	struct saver *saver = new_saver();
+	struct error err = {0};
+	uint8_t sha256[32];
+	bool done;
+	int code;
+
+	if (!fail_call(saver_faults[i].call, saver_faults[i].error, 0))
+		return FAULT_UNABLE;
+	if (prepared)
+		saver_prepare(saver, blank, HEADER + VOXELS);
+	code = save(saver, &err);
+	if ((code == 0) != saver_faults[i].finishes)
+		return FAULT_WRONG;
+	if (code == 0)
+		code = saver_finish(saver, true, &done, sha256, &err);
+	if (code != saver_faults[i].code || (code != 0 && err.text[0] == '\0'))
+		return FAULT_WRONG;
+	saver_free(saver);
+	return count_files(directory) == (code == 0 ? 2 : 1) ? FAULT_RIGHT : FAULT_WRONG;
+}
+
+START_TEST(a_saver_notices_each_call_that_fails)
+{
+	for (size_t i = 0; i < 2 * sizeof(saver_faults) / sizeof(saver_faults[0]); i++) {
+		pid_t child = fork();
+		int status = 0;
+
+		ck_assert_int_ge(child, 0);
+		if (child == 0)
+			_exit(save_with_fault(i / 2, i % 2 == 1));
+		ck_assert_int_eq(waitpid(child, &status, 0), child);
+		ck_assert_msg(WIFEXITED(status), "%s: signal %d", saver_faults[i / 2].name, WTERMSIG(status));
+		if (WEXITSTATUS(status) == FAULT_UNABLE) {
+			printf("SKIP spool a_saver_notices_each_call_that_fails: system calls cannot be filtered "
+			       "here\n");
+			return;
+		}
+		ck_assert_msg(WEXITSTATUS(status) == FAULT_RIGHT, "%s fails with %s", saver_faults[i / 2].name,
+			      strerror(saver_faults[i / 2].error));
+		unlink(path);
+	}
+}
+END_TEST
+
 /* ---- scan directories ---- */
 
 enum { COLUMNS = 24, ROWS = 20, VIEWS = 18, PIXELS = COLUMNS * ROWS };
@@ -352,6 +562,7 @@ struct watched {
 	uint8_t sha256[KEPT_MOST][32]; /* once it is settled */
 	char names[KEPT_MOST][32];
 	int settled;
+	char prepared[256]; /* the stages at whose beginning the next volume's file was there */
 	char warnings[256];
 };
 
@@ -411,6 +622,17 @@ static int watched_settled(void *context, const char *name, const uint8_t sha256
 	return 0;
 }
 
+static void watched_progress(void *context, enum stage stage, int iteration, double fraction)
+{
+	struct watched *watched = context;
+	size_t length = strlen(watched->prepared);
+
+	(void)fraction;
+	if (is_there(out, "blank.tmp"))
+		snprintf(watched->prepared + length, sizeof(watched->prepared) - length, "%s %d ", stage_names[stage],
+			 iteration);
+}
+
 static void watched_open(void *context, const struct recon_memory *memory, const char *plan)
 {
 	struct watched *watched = context;
@@ -426,6 +648,7 @@ static int run(const char *request_text, const char *where, const char *checkpoi
 	const struct spool_hooks hooks = {.recon = {.context = watched,
 						    .cancelled = watched_cancelled,
 						    .yield = watched_yield,
+						    .progress = watched_progress,
 						    .row = watched_row,
 						    .warning = watched_warning},
 					  .on_volume = watched_volume,
@@ -444,7 +667,7 @@ static int run(const char *request_text, const char *where, const char *checkpoi
 	ck_assert_msg(job_request_parse(request_text, strlen(request_text), &request, err) == 0, "%s", err->text);
 	ck_assert_msg(backend_cpu.open(0, &options, &device, err) == 0, "%s", err->text);
 	spool.recipe = &request.recipe;
-	code = spool_run(&backend_cpu, device, &spool, err);
+	code = spool_run(&backend, device, &spool, err);
 	backend_cpu.close(device);
 	recipe_clear(&request.recipe);
 	return code;
@@ -518,6 +741,32 @@ START_TEST(kept_volumes_are_files_that_say_what_they_are)
 }
 END_TEST
 
+/* The same bits, and nothing that stays behind. */
+START_TEST(a_device_with_memory_of_its_own_has_the_next_file_prepared)
+{
+	struct watched plain = {0}, ahead = {0};
+	struct error err = {0};
+	char straight[160];
+
+	put_scan();
+	snprintf(straight, sizeof(straight), "%s/straight", directory);
+	ck_assert_int_eq(mkdir(straight, 0700), 0);
+	ck_assert_int_eq(run(pipeline, straight, NULL, 0, &plain, &err), 0);
+	ck_assert_str_eq(plain.prepared, "");
+	backend.own_memory = true;
+	ck_assert_int_eq(run(pipeline, out, NULL, 0, &ahead, &err), 0);
+	/* FDK's from its second half on; from the beginning of whatever ends with a volume to its saving. */
+	ck_assert_str_eq(ahead.prepared, "save 0 tv 0 save 0 sart 2 tv 2 save 2 sart 4 tv 4 save 4 ");
+	ck_assert_int_eq(count_files(out), 5);
+	for (int i = 0; i < ahead.kept; i++) {
+		char name[64];
+
+		snprintf(name, sizeof(name), "%s.nii", ahead.names[i]);
+		assert_same_file(straight, out, name);
+	}
+}
+END_TEST
+
 START_TEST(the_same_iterate_is_one_file_with_two_names)
 {
 	struct watched watched = {0};
@@ -557,8 +806,9 @@ END_TEST
 static int run_arriving(const int *order, int count, int piece, const unsigned char *present, struct watched *watched,
 			struct error *err)
 {
-	const struct spool_hooks hooks = {
-	    .recon = {.context = watched}, .on_volume = watched_volume, .on_settled = watched_settled};
+	const struct spool_hooks hooks = {.recon = {.context = watched, .progress = watched_progress},
+					  .on_volume = watched_volume,
+					  .on_settled = watched_settled};
 	const struct device_options options = {.threads = 2};
 	struct spool_options spool_options = {
 	    .scan_directory = directory, .out_directory = out, .present = present, .hooks = &hooks};
@@ -570,7 +820,7 @@ static int run_arriving(const int *order, int count, int piece, const unsigned c
 	ck_assert_int_eq(job_request_parse(pipeline, strlen(pipeline), &request, err), 0);
 	spool_options.recipe = &request.recipe;
 	ck_assert_msg(backend_cpu.open(0, &options, &device, err) == 0, "%s", err->text);
-	code = spool_open(&backend_cpu, device, &spool_options, &spool, err);
+	code = spool_open(&backend, device, &spool_options, &spool, err);
 	for (int first = 0; first < count && code == 0; first += piece) {
 		ck_assert_int_eq(spool_pushed(spool), first);
 		code = spool_push(spool, order + first, count - first < piece ? count - first : piece, err);
@@ -637,6 +887,22 @@ START_TEST(projections_that_make_no_sense_are_refused)
 	ck_assert_int_eq(run_arriving((int[]){2, 3}, 2, 1, present, &watched, &err), ERR_INVALID);
 	ck_assert_int_eq(run_arriving(NULL, 0, 1, none, &watched, &err), ERR_INVALID);
 	ck_assert_int_eq(watched.kept, 0);
+}
+END_TEST
+
+START_TEST(a_prepared_file_goes_with_a_run_that_breaks_off)
+{
+	struct watched watched = {0};
+	struct error err = {0};
+	int order[VIEWS];
+
+	put_scan();
+	for (int i = 0; i < VIEWS; i++)
+		order[i] = i;
+	backend.own_memory = true;
+	ck_assert_int_eq(run_arriving(order, VIEWS / 2 + 3, 3, NULL, &watched, &err), ERR_CONFLICT);
+	ck_assert_str_eq(watched.prepared, "fdk 0 "); /* once half of the views are there */
+	ck_assert_int_eq(count_files(out), 0);
 }
 END_TEST
 
@@ -815,7 +1081,7 @@ END_TEST
 Suite *spool_suite(void)
 {
 	Suite *suite = suite_create("spool");
-	TCase *files = tcase_create("files"), *pipelines = tcase_create("pipeline");
+	TCase *files = tcase_create("files"), *savers = tcase_create("savers"), *pipelines = tcase_create("pipeline");
 
 	tcase_add_checked_fixture(files, make_directory, remove_directory);
 	tcase_add_test(files, a_durable_file_is_there_whole_and_alone);
@@ -826,11 +1092,20 @@ Suite *spool_suite(void)
 	tcase_add_test(files, a_scan_directory_is_read);
 	tcase_add_test(files, a_scan_directory_with_a_fault_is_refused);
 	suite_add_tcase(suite, files);
+	tcase_set_timeout(savers, 60);
+	tcase_add_checked_fixture(savers, make_directory, remove_directory);
+	tcase_add_test(savers, a_saved_file_is_whole_once_it_has_its_name);
+	tcase_add_test(savers, what_has_its_name_stays_when_its_saver_goes_and_what_has_none_does_not);
+	tcase_add_test(savers, a_prepared_file_becomes_the_next_one_of_its_size);
+	tcase_add_test(savers, a_saver_notices_each_call_that_fails);
+	suite_add_tcase(suite, savers);
 	tcase_set_timeout(pipelines, 120); /* sanitizers on a loaded machine */
 	tcase_add_checked_fixture(pipelines, make_directory, remove_directory);
 	tcase_add_test(pipelines, kept_volumes_are_files_that_say_what_they_are);
+	tcase_add_test(pipelines, a_device_with_memory_of_its_own_has_the_next_file_prepared);
 	tcase_add_test(pipelines, the_same_iterate_is_one_file_with_two_names);
 	tcase_add_test(pipelines, projections_may_arrive_in_any_order_and_in_pieces);
+	tcase_add_test(pipelines, a_prepared_file_goes_with_a_run_that_breaks_off);
 	tcase_add_test(pipelines, projections_that_make_no_sense_are_refused);
 	tcase_add_test(pipelines, a_scan_of_what_is_there_is_as_if_no_more_had_been_planned);
 	tcase_add_test(pipelines, a_run_that_yields_goes_on_to_the_same_bits);
