@@ -399,8 +399,7 @@ static const struct {
 } saver_faults[] = {
     {"fallocate", SYS_fallocate, ENOSPC, ERR_NO_SPACE, false},
     {"fallocate", SYS_fallocate, EOPNOTSUPP, 0, true}, /* a file system that cannot: the same in another way */
-    {"mmap", SYS_mmap, ENODEV, ERR_IO, false},
-    {"madvise", SYS_madvise, EINVAL, 0, true}, /* a kernel that cannot */
+    {"madvise", SYS_madvise, EINVAL, 0, true},         /* a kernel that cannot */
     {"madvise", SYS_madvise, EFAULT, ERR_IO, false},
 #ifdef SYS_rename
     {"rename", SYS_rename, EIO, ERR_IO, false},
