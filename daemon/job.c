@@ -447,7 +447,7 @@ static int change_state(struct job *job, enum job_state to, const struct job_cha
 		return code;
 	show_state(job, &record, change);
 	if (job_state_ended(to))
-		store_job_remove_checkpoint(job->jobs->store, record.id);
+		store_job_tidy(job->jobs->store, record.id);
 	return 0;
 }
 

@@ -251,6 +251,8 @@ int store_job_update(struct store *store, const struct job_record *job, const st
 int store_job_delete(struct store *store, const char *id, struct error *err);
 void store_job_remove_files(const struct store *store, const char *id);
 void store_job_remove_checkpoint(const struct store *store, const char *id);
+/* That, and what a worker that died left half-written or prepared: an ended job has no use for it. */
+void store_job_tidy(const struct store *store, const char *id);
 int store_job_add_row(struct store *store, const char *id, const struct history_row *row, const struct event *event,
 		      struct error *err);
 /*

@@ -212,6 +212,27 @@ void store_job_remove_checkpoint(const struct store *store, const char *id)
 		log_line(LEVEL_WARNING, "job %s: %s stays: %s", id, path, strerror(errno));
 }
 
+static int remove_temporary(void *context, const char *name, struct error *err)
+{
+	char path[1400];
+
+	snprintf(path, sizeof(path), "%s/%s", (const char *)context, name);
+	if (name_is_temporary(name) && unlink(path) < 0 && errno != ENOENT)
+		return error_set_errno(err, errno, "unlink %s", path);
+	return 0;
+}
+
+void store_job_tidy(const struct store *store, const char *id)
+{
+	char directory[1024];
+	struct error err;
+
+	store_job_remove_checkpoint(store, id);
+	store_job_directory(store, id, directory);
+	if (directory_visit(directory, remove_temporary, directory, &err) != 0)
+		log_line(LEVEL_WARNING, "job %s: half-written files stay until the next start: %s", id, err.text);
+}
+
 int store_job_add_row(struct store *store, const char *id, const struct history_row *row, const struct event *event,
 		      struct error *err)
 {

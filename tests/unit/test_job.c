@@ -597,6 +597,13 @@ START_TEST(what_a_dead_worker_told_of_is_settled_for_it)
 	EVP_Digest("abcd", 4, sha256, NULL, EVP_sha256(), NULL);
 	ck_assert_mem_eq(volume_of(id, "fdk").sha256, sha256, 32);
 	ck_assert_str_eq(volume_of(id, "iter-1").name, "");
+	/* What it was at goes when the job has ended. */
+	path_fill(state_path(&state, "jobs/%s/blank.tmp", id));
+	path_fill(state_path(&state, "jobs/%s/iter-1.nii.tmp", id));
+	state_set(job, JOB_CANCELLED, NULL);
+	ck_assert(!path_exists(state_path(&state, "jobs/%s/blank.tmp", id)));
+	ck_assert(!path_exists(state_path(&state, "jobs/%s/iter-1.nii.tmp", id)));
+	ck_assert(path_exists(state_path(&state, "jobs/%s/fdk.nii", id)));
 	job_release(job);
 }
 END_TEST
