@@ -80,15 +80,18 @@ static __device__ __forceinline__ void put_voxels(const backprojection_job &job,
 		float value = sum[k];
 
 		if (job.use.update) {
+			bool sure = true;
+
 			if (job.use.coverage != NULL) {
 				float coverage = job.use.coverage[at + k * plane];
 
 				if (!(coverage > 0))
 					continue; /* no ray sees it */
-				value /= coverage;
+				value /= fmaxf(coverage, job.use.least);
+				sure = coverage > job.use.least;
 			}
 			value = fmaf(job.use.scale, value, held[k]);
-			if (job.use.nonnegative)
+			if (job.use.nonnegative && sure)
 				value = fmaxf(value, 0.0f);
 		} else {
 			value += held[k];
@@ -115,8 +118,6 @@ static __global__ void __launch_bounds__(ACROSS *ALONG) backproject_general(cons
 #pragma unroll
 	for (int k = 0; k < VOXELS; k++)
 		sum[k] = 0;
-		/* With few voxels a thread there is nothing else to do while samples come: several views at once. */
-#pragma unroll(VOXELS < 4 ? 4 : 1)
 	for (int i = 0; i < job.views; i++, p += job.slot) {
 		const float *m = matrices[i];
 		float a = fmaf(m[0], fx, fmaf(m[1], fy, fmaf(m[2], fz, m[3])));
@@ -141,6 +142,37 @@ static __global__ void __launch_bounds__(ACROSS *ALONG) backproject_general(cons
 		}
 	}
 	put_voxels<VOXELS>(job, x, y, z, sum);
+}
+
+/* Of a block: voxels along x and y, and parts into which the views are cut; what takes time is to wait for samples. */
+enum { SMALL_SIDE = 8, SMALL_PARTS = 4 };
+
+static __global__ void __launch_bounds__(SMALL_SIDE *SMALL_SIDE *SMALL_PARTS)
+    backproject_small(const backprojection_job job)
+{
+	__shared__ float sums[SMALL_PARTS][SMALL_SIDE][SMALL_SIDE];
+	int x = blockIdx.x * SMALL_SIDE + threadIdx.x, y = blockIdx.y * SMALL_SIDE + threadIdx.y, z = blockIdx.z;
+	int part = threadIdx.z;
+	float fx = (float)x, fy = (float)y, fz = (float)z, sum = 0;
+
+#pragma unroll 4
+	for (int i = part; i < job.views; i += SMALL_PARTS) {
+		const float *m = matrices[i];
+		float w = reciprocal(fmaf(m[8], fx, fmaf(m[9], fy, fmaf(m[10], fz, m[11]))));
+		float u = fmaf(m[0], fx, fmaf(m[1], fy, fmaf(m[2], fz, m[3]))) * w;
+		float v = fmaf(m[4], fx, fmaf(m[5], fy, fmaf(m[6], fz, m[7]))) * w;
+		float value = sample(job.from + job.slot * (size_t)i, job.pitch, 1, fminf(fmaxf(u, -1.0f), job.columns),
+				     fminf(fmaxf(v, -1.0f), job.rows));
+
+		sum = job.use.fdk ? fmaf(value, w * w, sum) : sum + value;
+	}
+	sums[part][threadIdx.y][threadIdx.x] = sum;
+	__syncthreads();
+	if (part > 0)
+		return;
+	for (int k = 1; k < SMALL_PARTS; k++)
+		sum += sums[k][threadIdx.y][threadIdx.x];
+	put_voxels<1>(job, x, y, z, &sum);
 }
 
 template <int VOXELS, int WINDOWS, bool HALF, int ACROSS, int ALONG>
@@ -302,6 +334,13 @@ static void launch_general(const backprojection_job &job, cudaStream_t stream)
 	backproject_general<VOXELS, side, side, SAMPLING><<<blocks, dim3(side, side), 0, stream>>>(job);
 }
 
+static void launch_small(const backprojection_job &job, cudaStream_t stream)
+{
+	dim3 blocks(divide_up(job.nx, SMALL_SIDE), divide_up(job.ny, SMALL_SIDE), job.nz);
+
+	backproject_small<<<blocks, dim3(SMALL_SIDE, SMALL_SIDE, SMALL_PARTS), 0, stream>>>(job);
+}
+
 static backprojection_job job_make(const struct plan *plan, float *volume, struct voxel_use use)
 {
 	const struct stack_shape *shape = shape_for(plan, use);
@@ -357,7 +396,7 @@ static int launch(struct plan *plan, backprojection_job &job, struct error *err)
 				launch_general<8, BY_TEXTURE>(job, stream);
 			}
 		} else if (plan->shape.is_small) {
-			launch_general<1, BY_LOADS>(job, stream);
+			launch_small(job, stream);
 		} else {
 			launch_general<8, BY_LOADS>(job, stream);
 		}

@@ -188,18 +188,6 @@ struct columns_shape {
 };
 struct columns_shape columns_shape_make(const int size[3]);
 
-/*
- * Its copy in half precision, [x][y][z] with edge values held for SLICE_HELD voxels
- * around. Columns of voxels begin with a pair; before and behind all, SWEEP_MARGIN
- * values can be read.
- */
-enum { SWEEP_MARGIN = 32 };
-struct half_columns_shape {
-	int pitch;     /* values from column to column, even */
-	size_t floats; /* in all */
-};
-struct half_columns_shape half_columns_shape_make(const int size[3]);
-
 struct layered { /* a layered 2D array with its texture: hardware bilinear samples */
 	cudaArray_t array;
 	cudaTextureObject_t texture;
@@ -236,8 +224,8 @@ struct plan_shape {
 	int correction;      /* slots of the correction stack, 0 without SART */
 	bool parts;          /* it holds a part of a subset only */
 	int views_at_once;   /* that one launch of the backprojection takes; layers of the projection array */
-	bool by_view;        /* SART goes view by view over a z-fastest copy */
-	bool by_rows;        /* its projection by rows, over another one in half precision */
+	bool by_view;        /* SART goes view by view: over a z-fastest copy, */
+	bool by_rows;        /* or by rows over copies in half precision */
 	bool by_subset;      /* SART has updates of several views */
 	bool covered;        /* every view sees the whole grid: sum_S w_ij = views of S */
 	int filter_length;   /* of the fused filter, 0 for cuFFT */
@@ -256,7 +244,6 @@ struct plan {
 	struct device_grid grid;
 	struct slices_shape along_x, along_y;
 	struct columns_shape columns;
-	struct half_columns_shape half_columns;
 	struct stack_shape stack;
 	struct stack_shape filtered; /* with plan_options.pad */
 	char summary[192];
@@ -279,6 +266,8 @@ struct plan {
 	int coverage_subset;
 	float *work; /* [z][y][x], where an update takes more views than one launch */
 	struct stack *correction;
+	float *sampled_from;         /* the correction where SART goes view by view and by rows, */
+	cudaTextureObject_t sampled; /* and its texture */
 	float2 *partial; /* SART: squares of residuals and projections, one for each block of the forward projection */
 	size_t partial_count;
 	double *reduce;  /* partial sums of reductions */
@@ -329,7 +318,9 @@ struct ray_use {
 	float2 *partial;       /* one a block: residual^2, p^2 */
 	float least;           /* mm that a ray must have in the grid to correct it */
 };
-/* The slices must be there. Rays of plan->views[first .. first + count - 1] into slots 0 .. count - 1. */
+/* Before project_rays: the volume as it reads it. */
+int project_prepare(struct plan *plan, const float *volume, struct error *err);
+/* Rays of plan->views[first .. first + count - 1] into slots 0 .. count - 1. */
 int project_rays(struct plan *plan, const float *volume, int first, int count, struct ray_use use, float *to,
 		 struct error *err);
 size_t project_blocks(const struct plan *plan, int count);
@@ -342,6 +333,7 @@ struct voxel_use {
 	bool nonnegative;
 	float scale;           /* update: relaxation, over the number of views where all is covered */
 	const float *coverage; /* update: else divided by this, voxel by voxel */
+	float least;           /* what a voxel has of it at least, if any */
 };
 int backproject_views(struct plan *plan, const float *from, int first, int count, struct voxel_use use, float *volume,
 		      struct error *err);
@@ -375,6 +367,15 @@ size_t filter_bytes(const struct plan_shape *shape, int rows);
 size_t reduce_bytes(void);
 /* partial[0 .. count - 1] -> sums[0], sums[1] += in a fixed order. */
 int reduce_pairs(struct plan *plan, const float2 *partial, size_t count, double *sums, struct error *err);
+
+/* ---- sweep.cu: an iteration view by view, by rows; partial sums of each view are left in plan->partial ---- */
+size_t sweep_rows_bytes(const struct plan *plan);
+size_t sweep_rows_partials(const struct plan *plan); /* of a view */
+size_t sweep_correction_bytes(const struct plan *plan);
+int sweep_rows_prepare(struct plan *plan, struct error *err);
+void sweep_rows_release(struct plan *plan);
+int sweep_rows(struct plan *plan, const float *projections, float *volume, float least, const struct cancel *cancel,
+	       struct error *err);
 
 /* ---- tv.cu, sart.cu ---- */
 size_t tv_scratch_bytes(const struct plan_options *options);

@@ -55,139 +55,116 @@ struct columns_shape columns_shape_make(const int size[3])
 	return shape;
 }
 
-struct half_columns_shape half_columns_shape_make(const int size[3])
-{
-	struct half_columns_shape shape;
-	size_t columns = ((size_t)size[0] + 2 * SLICE_HELD) * ((size_t)size[1] + 2 * SLICE_HELD);
-
-	/* Columns start on sectors. */
-	shape.pitch = round_up(size[2] + 2 * SLICE_HELD, 16);
-	shape.floats = (columns * (size_t)shape.pitch + 2 * SWEEP_MARGIN) / 2;
-	return shape;
-}
-
-enum { TILE = 32, TILE_ROWS = 8 };
-
-/* Floats from the beginning of row 0 to a place along the fast axis. */
-static __device__ __forceinline__ int place_at(const slices &to, int fast)
-{
-	int place = fast + SLICE_HELD, panel = place / SLICE_STEP;
-
-	return to.panel > 0 ? panel * (to.panel - SLICE_STEP) + place : fast;
-}
-
-/* Whether the panel before ends with it too. */
-static __device__ __forceinline__ bool is_shared(const slices &to, int fast)
-{
-	int place = fast + SLICE_HELD;
-
-	return to.panel > 0 && place >= SLICE_STEP && place % SLICE_STEP < SLICE_SHARED;
-}
-
 /* What is kept of a voxel: itself, or in half precision with the next one along the rows' axis. */
-static __device__ __forceinline__ void put(float *at, float value, float)
+static __device__ __forceinline__ void make(float &ret, float value, float)
 {
-	*at = value;
+	ret = value;
 }
-static __device__ __forceinline__ void put(__half2 *at, float value, float next)
+static __device__ __forceinline__ void make(__half2 &ret, float value, float next)
 {
-	*at = __floats2half2_rn(value, next);
+	ret = __floats2half2_rn(value, next);
 }
-
-/* A value with all that repeats it: at the end of a panel, and what is held beyond the ends. */
-template <typename T>
-static __device__ void put_held(const slices &to, T *slice, int row, int rows, int fast, int count, float value,
-				float next)
+static __device__ __forceinline__ float both_lower(float value)
 {
-	int row_from = row == 0 ? -SLICE_HELD : row, row_to = row == rows - 1 ? rows - 1 + SLICE_HELD : row;
-	int from = fast == 0 ? -SLICE_HELD : fast, to_end = fast == count - 1 ? fast + SLICE_HELD : fast;
-
-	for (int j = row_from; j <= row_to; j++)
-		for (int i = from; i <= to_end; i++) {
-			T *at = slice + (j * to.row + place_at(to, i));
-
-			put(at, value, j == row ? next : value);
-			if (is_shared(to, i))
-				put(at + (SLICE_STEP - to.panel), value, j == row ? next : value);
-		}
+	return value;
+}
+static __device__ __forceinline__ __half2 both_lower(__half2 value)
+{
+	return __low2half2(value);
 }
 
-/* The values of a thread: TILE / TILE_ROWS slices, one place along the fast axis. */
-template <typename T>
-static __device__ __forceinline__ void put_slices(const slices &to, int first, int slices_count, int fast, int count,
-						  int row, int rows, const float value[TILE / TILE_ROWS],
-						  const float next[TILE / TILE_ROWS])
-{
-	const int each = TILE / TILE_ROWS;
-	T *slice = (T *)to.data + to.slice * (size_t)first;
-	size_t step = to.slice * TILE_ROWS;
-	bool shared = is_shared(to, fast);
-
-	if (fast >= count)
-		return;
-	if (row == 0 || row == rows - 1 || fast == 0 || fast == count - 1) {
-		for (int k = 0; k < each; k++, slice += step)
-			if (first + k * TILE_ROWS < slices_count)
-				put_held(to, slice, row, rows, fast, count, value[k], next[k]);
-		return;
-	}
-	T *main = slice + (row * to.row + place_at(to, fast));
-#pragma unroll
-	for (int k = 0; k < each; k++, main += step) {
-		if (first + k * TILE_ROWS >= slices_count)
-			return;
-		put(main, value[k], next[k]);
-		if (shared)
-			put(main + (SLICE_STEP - to.panel), value[k], next[k]);
-	}
-}
+enum { RUN = 8, WIDE = 32, HIGH = 16 };
 
 /*
- * One tile of x and y in `planes` planes, from the top down: the plane above is at
- * hand for the pairs. Across x it is turned over in shared memory.
+ * A place of a slice, in all its rows; beside it at the fast axis' ends stands what
+ * is held there. The first places of a panel are also the last ones of that before.
  */
 template <typename T>
-static __global__ void __launch_bounds__(TILE *TILE_ROWS)
-    to_slices(const float *__restrict__ volume, int nx, int ny, int nz, int planes, const slices across_x,
-	      const slices across_y)
-{
-	const int each = TILE / TILE_ROWS;
-	__shared__ float tile[2][TILE][TILE + 1];
-	int x0 = blockIdx.x * TILE, y0 = blockIdx.y * TILE, tx = threadIdx.x, ty = threadIdx.y;
-	int bottom = blockIdx.z * planes, top = min(bottom + planes, nz) - 1;
-	int side = 0;
-	float value[each] = {}, turned[each] = {}, above[each], turned_above[each];
-	auto read = [&](int z) {
-#pragma unroll
-		for (int k = 0; k < each; k++) {
-			int x = x0 + tx, y = y0 + ty + k * TILE_ROWS;
+struct column {
+	T *at; /* in row 0 */
+	int row, before;
+	int shared; /* places from here on that the panel before has too */
+	bool first, last;
 
-			value[k] = x < nx && y < ny ? volume[((size_t)z * ny + y) * nx + x] : 0.0f;
-			tile[side][ty + k * TILE_ROWS][tx] = value[k];
-		}
-		/* Two tiles: nobody writes one that others may still read. */
-		__syncthreads();
-#pragma unroll
-		for (int k = 0; k < each; k++)
-			turned[k] = tile[side][tx][ty + k * TILE_ROWS];
-		side ^= 1;
-	};
+	__device__ __forceinline__ column(const slices &to, int slice, int fast, int count)
+	{
+		int place = fast + SLICE_HELD, panel = to.panel > 0 ? place / SLICE_STEP : 0;
 
-	if (sizeof(T) == sizeof(__half2))
-		read(min(top + 1, nz - 1));
-	for (int z = top; z >= bottom; z--) {
-#pragma unroll
-		for (int k = 0; k < each; k++) {
-			above[k] = value[k];
-			turned_above[k] = turned[k];
-		}
-		read(z);
-		put_slices<T>(across_y, y0 + ty, ny, x0 + tx, nx, z, nz, value, above);
-		put_slices<T>(across_x, x0 + ty, nx, y0 + tx, ny, z, nz, turned, turned_above);
+		at = (T *)to.data + to.slice * (size_t)slice +
+		     (to.panel > 0 ? panel * (to.panel - SLICE_STEP) + place : fast);
+		row = to.row;
+		before = SLICE_STEP - to.panel;
+		shared = panel > 0 ? SLICE_SHARED - (place - panel * SLICE_STEP) : 0;
+		first = fast == 0;
+		last = fast == count - 1;
 	}
-}
 
-enum { PLANES_MOST = 8 };
+	__device__ __forceinline__ void put(int at_row, T value) const
+	{
+		T *here = at + at_row * row;
+
+		here[0] = value;
+		if (shared > 0)
+			here[before] = value;
+		if (first)
+			here[-1] = here[-2] = value;
+		if (last) {
+			here[1] = here[2] = value;
+			if (shared > 1)
+				here[before + 1] = value;
+			if (shared > 2)
+				here[before + 2] = value;
+		}
+	}
+
+	/* RUN rows from `from` on, and what is held below the first and above the last. */
+	__device__ __forceinline__ void put_run(int from, int rows, const T value[RUN]) const
+	{
+#pragma unroll
+		for (int k = 0; k < RUN; k++) {
+			if (from + k >= rows)
+				return;
+			put(from + k, value[k]);
+			for (int j = 1; from + k == 0 && j <= SLICE_HELD; j++)
+				put(-j, both_lower(value[k]));
+			for (int j = 1; from + k == rows - 1 && j <= SLICE_HELD; j++)
+				put(rows - 1 + j, value[k]);
+		}
+	}
+};
+
+/* RUN planes of a tile in x and y; for the slices across x it is turned over in shared memory. */
+template <typename T>
+static __global__ void __launch_bounds__(WIDE *HIGH)
+    to_slices(const float *__restrict__ volume, int nx, int ny, int nz, const slices across_x, const slices across_y)
+{
+	__shared__ T turned[RUN][WIDE][HIGH + 1];
+	int x0 = blockIdx.x * WIDE, y0 = blockIdx.y * HIGH, z = blockIdx.z * RUN;
+	int x = x0 + threadIdx.x, y = y0 + threadIdx.y;
+	bool inside = x < nx && y < ny;
+	const float *from = volume + ((size_t)min(y, ny - 1) * nx + min(x, nx - 1));
+	float value[RUN + 1];
+	T kept[RUN];
+
+#pragma unroll
+	for (int k = 0; k <= RUN; k++)
+		value[k] = from[(size_t)min(z + k, nz - 1) * ny * nx];
+#pragma unroll
+	for (int k = 0; k < RUN; k++) {
+		make(kept[k], value[k], value[k + 1]);
+		turned[k][threadIdx.x][threadIdx.y] = kept[k];
+	}
+	__syncthreads();
+	if (inside)
+		column<T>(across_y, y, x, nx).put_run(z, nz, kept);
+	int thread = threadIdx.y * WIDE + threadIdx.x, tx = thread / HIGH, ty = thread % HIGH;
+	if (x0 + tx >= nx || y0 + ty >= ny)
+		return;
+#pragma unroll
+	for (int k = 0; k < RUN; k++)
+		kept[k] = turned[k][tx][ty];
+	column<T>(across_x, x0 + tx, y0 + ty, ny).put_run(z, nz, kept);
+}
 
 int layout_slices(struct plan *plan, const float *volume, struct error *err)
 {
@@ -195,20 +172,17 @@ int layout_slices(struct plan *plan, const float *volume, struct error *err)
 	cudaStream_t stream = plan->device->stream;
 	struct slices x = slices_at(plan->scratch, &plan->along_x);
 	struct slices y = slices_at(plan->scratch + plan->along_x.floats, &plan->along_y);
-	int tiles = divide_up(size[0], TILE) * divide_up(size[1], TILE);
-	/* As few planes read twice as the device is filled for all that. */
-	int planes = tiles * size[2] / (16 * plan->device->multiprocessors);
+	dim3 blocks(divide_up(size[0], WIDE), divide_up(size[1], HIGH), divide_up(size[2], RUN)), threads(WIDE, HIGH);
 
-	planes = planes < 1 ? 1 : planes > PLANES_MOST ? PLANES_MOST : planes;
-	dim3 blocks(divide_up(size[0], TILE), divide_up(size[1], TILE), divide_up(size[2], planes));
-	dim3 threads(TILE, TILE_ROWS);
 	if (plan->shape.halves)
-		to_slices<__half2><<<blocks, threads, 0, stream>>>(volume, size[0], size[1], size[2], planes, x, y);
+		to_slices<__half2><<<blocks, threads, 0, stream>>>(volume, size[0], size[1], size[2], x, y);
 	else
-		to_slices<float><<<blocks, threads, 0, stream>>>(volume, size[0], size[1], size[2], planes, x, y);
+		to_slices<float><<<blocks, threads, 0, stream>>>(volume, size[0], size[1], size[2], x, y);
 	LAUNCHED();
 	return 0;
 }
+
+enum { TILE = 32, TILE_ROWS = 8 };
 
 /* Planes of one y, turned over between x and z; FORWARD from [z][y][x] to [x][y][z]. */
 template <bool FORWARD>

@@ -254,7 +254,8 @@ static struct plan_shape shape_of(const struct plan_options *options, bool lean)
 	shape.lean = lean;
 	shape.batch = at_most(resident_views(options), lean ? (int)BATCH_LEAN : (int)BATCH_MOST);
 	shape.by_view = subset == 1 && !options->matched && columns_shape_make(grid->size).floats < (size_t)1 << 31;
-	shape.by_rows = shape.by_view && shape.halves && shape.forward_rows > 0 && !shape.rows_apart;
+	shape.by_rows = shape.by_view && shape.halves && shape.forward_rows > 0 && !shape.rows_apart &&
+			geometry->columns <= SIDE_MOST && geometry->rows <= SIDE_MOST;
 	shape.by_subset = subset > 0 && !shape.by_view;
 	shape.correction = shape.by_subset ? (lean ? at_most(subset, BATCH_LEAN) : subset) : 0;
 	shape.parts = shape.correction < (shape.by_subset ? subset : 0);
@@ -317,10 +318,9 @@ static void plan_describe(struct plan *plan, const struct plan_options *options,
 	plan->along_x = slices_shape_make(size[0], size[2], size[1], plan->shape.forward_rows > 0);
 	plan->along_y = slices_shape_make(size[1], size[2], size[0], plan->shape.forward_rows > 0);
 	plan->columns = columns_shape_make(size);
-	plan->half_columns = half_columns_shape_make(size);
 	plan->stack = stack_shape_make(geometry->columns, geometry->rows, 1);
 	plan->filtered = stack_shape_make(wide_columns(options), geometry->rows, 1);
-	if (!options->no_projection)
+	if (!options->no_projection && !plan->shape.is_small)
 		plan->scratch_bytes = (plan->along_x.floats + plan->along_y.floats) * sizeof(float);
 	if (plan->shape.by_view && sweep_scratch_bytes(plan) > plan->scratch_bytes)
 		plan->scratch_bytes = sweep_scratch_bytes(plan);
@@ -379,7 +379,9 @@ static struct plan_bytes bytes_of(const struct plan_options *options, bool lean)
 		bytes.scratch += voxels;
 	if (needs_work(&plan))
 		bytes.scratch += voxels;
-	if (plan.shape.by_view)
+	if (plan.shape.by_rows)
+		bytes.scratch += sweep_correction_bytes(&plan);
+	else if (plan.shape.by_view)
 		bytes.scratch += stack_bytes(geometry->rows, geometry->columns, 1);
 	if (plan.shape.by_subset)
 		bytes.scratch += stack_bytes(geometry->columns, geometry->rows, plan.shape.correction);
@@ -535,6 +537,8 @@ static int prepare_sart(struct plan *plan, struct error *err)
 		TRY(device_allocate(plan->device, voxels, (void **)&plan->coverage, err));
 	if (needs_work(plan))
 		TRY(device_allocate(plan->device, voxels, (void **)&plan->work, err));
+	if (plan->shape.by_rows)
+		return sweep_rows_prepare(plan, err);
 	if (plan->shape.by_view) /* turned: [column][row] */
 		return cuda_stack_new(plan->device, geometry->rows, geometry->columns, 1, &plan->correction, err);
 	if (plan->shape.by_subset)
@@ -664,6 +668,8 @@ void cuda_plan_free(struct plan *plan)
 	device_release(device, plan->partial, plan->partial_count * sizeof(float2));
 	device_release(device, plan->coverage, voxels);
 	device_release(device, plan->work, voxels);
+	if (plan->shape.by_rows)
+		sweep_rows_release(plan);
 	cuda_stack_free(plan->correction);
 	free(plan->views_host);
 	free(plan);

@@ -9,6 +9,8 @@
  *
  * By rows: a thread has ROWS rays of a column (rows.cuh), a warp 32 columns.
  *
+ * Small problems: from the volume as it is, a ray cut into parts for several warps.
+ *
  * Blocks are ordered by groups of views, then by tiles of the detector, then by
  * views: those that run at one time see the same part of the volume from many
  * sides, and the second cache keeps it.
@@ -130,21 +132,24 @@ static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS, GENE
 				float fast = fmaf((float)i, s.fast_step, s.fast);
 				float up = fmaf((float)i, s.row_step, s.row);
 
+				fast = fminf(fmaxf(fast, -1.0f), (float)axes.fast - HELD_LEAST);
+				up = fminf(fmaxf(up, -1.0f), (float)axes.rows - HELD_LEAST);
 				total = fmaf(part_of(i, s.begin, s.end),
-					     sample_ray(data + slice * (size_t)i, stride, 1,
-							fminf(fmaxf(fast, -1.0f), (float)axes.fast - HELD_LEAST),
-							fminf(fmaxf(up, -1.0f), (float)axes.rows - HELD_LEAST), wander),
-					     total);
+					     sample_ray(data + slice * (size_t)i, stride, fast, up, wander), total);
 			}
 		};
 
 		edge(w.first, w.inner_first);
 		const T *at_slice = data + slice * (size_t)w.inner_first;
 		float f = (float)w.inner_first;
-		for (int i = w.inner_first; i < w.inner_end; i++, f += 1.0f, at_slice += slice)
-			total += sample_ray(at_slice, stride, 1, fmaf(f, s.fast_step, s.fast),
-					    fmaf(f, s.row_step, s.row), wander);
-		edge(w.inner_end, w.end);
+		int i = w.inner_first;
+		for (; i + 2 <= w.inner_end; i += 2, f += 2.0f, at_slice += 2 * slice) {
+			float fast[2] = {fmaf(f, s.fast_step, s.fast), fmaf(f + 1.0f, s.fast_step, s.fast)};
+			float row[2] = {fmaf(f, s.row_step, s.row), fmaf(f + 1.0f, s.row_step, s.row)};
+
+			total += sample_two(at_slice, slice, stride, fast, row, wander);
+		}
+		edge(i, w.end);
 		if (hits) {
 			sum = total;
 			slices = s.end - s.begin;
@@ -178,9 +183,44 @@ static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS, GENE
 	}
 }
 
+/* ---- small problems ---- */
+
+/* Of a block, 32 columns wide: rows, and parts into which rays are cut; what takes time is to wait for samples. */
+enum { SMALL_ROWS = 2, SMALL_PARTS = 4 };
+
+/* From the volume as it is, which the caches hold. */
+static __global__ void __launch_bounds__(32 * SMALL_ROWS * SMALL_PARTS) project_small(const projection p)
+{
+	__shared__ float sums[SMALL_PARTS][SMALL_ROWS][32];
+	int slot = blockIdx.x / p.tiles, tile = blockIdx.x % p.tiles, view = p.views[slot], part = threadIdx.z;
+	int column = tile % p.tiles_across * 32 + threadIdx.x;
+	int row = tile / p.tiles_across * SMALL_ROWS + threadIdx.y;
+	const device_view &g = p.geometry[view];
+	bool valid = column < p.columns && row < p.rows;
+	float c = (float)column - 0.5f * (float)(p.columns - 1), r = (float)row - 0.5f * (float)(p.rows - 1);
+	float d[3] = {form(g.direction[0], c, r), form(g.direction[1], c, r), form(g.direction[2], c, r)};
+	float m[3] = {form(g.moment[0], c, r), form(g.moment[1], c, r), form(g.moment[2], c, r)};
+	strided volume = {p.volume, 1, p.grid.size[0], p.grid.size[0] * p.grid.size[1]};
+	ray_part way = walk_part<false>(volume, p.grid, d, m, valid, part, SMALL_PARTS);
+	float2 squares = {0, 0};
+
+	sums[part][threadIdx.y][threadIdx.x] = way.sum;
+	__syncthreads();
+	if (part == 0 && valid) {
+		for (int k = 1; k < SMALL_PARTS; k++)
+			way.sum += sums[k][threadIdx.y][threadIdx.x];
+		squares = finish(p, slot, view, column, row, way.sum, way.slices, way.step);
+	}
+	if (p.use.measured != NULL) {
+		squares = block_sum(squares);
+		if (threadIdx.x == 0 && threadIdx.y == 0 && threadIdx.z == 0)
+			p.use.partial[blockIdx.x] = squares;
+	}
+}
+
 /* ---- by rows ---- */
 
-enum { ROWS_WARPS = 4 }; /* of a block: 32 columns wide, ROWS_WARPS * ROWS rows high */
+enum { ROWS_WARPS = 2 }; /* of a block: 32 columns wide, ROWS_WARPS * ROWS rows high */
 static const int ROWS_VIEWS = 2;
 
 /* Where the first of the four columns beside a place lies in a slice, in row 0. */
@@ -219,78 +259,128 @@ static __device__ __forceinline__ void sample_rows(const float *__restrict__ sli
 	}
 }
 
-template <int ROWS, int GUARD, bool LEAN>
+template <int ROWS, int GUARD, bool LEAN, typename Ends>
 static __device__ __forceinline__ void add_slices(const float *at, const slices &across, int from, int to, const fan &f,
-						  const wandering &wander, const slice_axes &axes,
-						  const float begin[ROWS], const float end[ROWS], float sum[ROWS])
+						  const wandering &wander, const slice_axes &axes, Ends &ends,
+						  float sum[ROWS])
 {
 	float i = (float)from, value[ROWS];
 
 	for (; from < to; from++, i += 1.0f, at += across.slice) {
 		sample_rows<ROWS, GUARD>(at, across.panel, f, wander, i, axes, value);
-		add_values<ROWS, GUARD>(i, begin, end, value, sum);
+		add_values<ROWS, GUARD>(i, ends, value, sum);
 	}
 }
 
 /* The same in half precision. */
-template <int ROWS, int GUARD, bool LEAN>
+template <int ROWS, int GUARD, bool LEAN, typename Ends>
 static __device__ __forceinline__ void add_slices(const __half2 *at, const slices &across, int from, int to,
 						  const fan &f, const half_wandering &wander, const slice_axes &axes,
-						  const float begin[ROWS], const float end[ROWS], float sum[ROWS])
+						  Ends &ends, float sum[ROWS])
 {
-	add_pairs<ROWS, GUARD>(
-	    at, across.slice, from, to, begin, end, sum, [&](const __half2 *slice, float i, __half2 *value) {
-		    const int pairs = (ROWS + 3) / 2;
-		    float e = fmaf(i, f.spread_step, f.spread), fast = fmaf(i, f.fast_step, f.fast), right, t;
-		    int low = lowest_row<ROWS, GUARD>(f, i, e, axes, t);
-		    float lean = LEAN ? lean_at(f, i, e) : 0.0f;
-		    __half2 x[pairs];
+	const int pairs = (ROWS + 3) / 2;
+	auto place = [&](float i) {
+		spread s;
 
-		    if (LEAN)
-			    fast = fmaf((float)pairs - 0.5f - t, lean, fast);
-		    int column = first_column(held<GUARD>(fast, axes), across.panel, right);
-		    across_pairs<pairs, LEAN>(slice + (low * PANEL + column), 2 * PANEL, 1, wander, right, lean, x);
-		    blend_rows<ROWS>(x, e, t, value);
-	    });
+		s.e = fmaf(i, f.spread_step, f.spread);
+		int low = lowest_row<ROWS, GUARD>(f, i, s.e, axes, s.t);
+		float fast = fmaf(i, f.fast_step, f.fast);
+		if (LEAN) {
+			s.lean = lean_at(f, i, s.e);
+			fast = fmaf((float)pairs - 0.5f - s.t, s.lean, fast);
+		}
+		s.at = low * PANEL + first_column(held<GUARD>(fast, axes), across.panel, s.right);
+		return s;
+	};
+	auto sample = [&](const __half2 *slice, const spread &s, const half_parts &part, const half_parts &change,
+			  auto other, __half2 *value) {
+		__half2 x[pairs];
+
+		across_pairs<pairs, LEAN, decltype(other)::value>(slice + s.at, 2 * PANEL, 1, part, change, x);
+		blend_rows<ROWS>(x, s.e, s.t, value);
+	};
+
+	add_pairs<ROWS, GUARD, LEAN>(at, across.slice, from, to, wander, ends, sum, place, sample);
 }
 
 /*
  * Rows too far apart, or too close, to share values across: they share the columns
  * and what these count for, or the changes of it, and each has its own two rows.
  */
+struct apart {
+	float row, step; /* where the first row crosses the slice, and from one to the next */
+	int column;
+	float right, lean; /* in the middle of all rows, and its change from one to the next */
+};
+
 template <int ROWS, int GUARD, bool LEAN>
+static __device__ __forceinline__ apart apart_at(float i, const slices &across, const fan &f, const slice_axes &axes)
+{
+	float fast = fmaf(i, f.fast_step, f.fast);
+	apart a;
+
+	a.row = fmaf(i, f.row_step, f.row);
+	a.step = 1.0f + fmaf(i, f.spread_step, f.spread);
+	a.lean = LEAN ? fmaf(i, f.lean_step, f.lean) : 0.0f;
+	a.column = first_column(held<GUARD>(fmaf(0.5f * (ROWS - 1), a.lean, fast), axes), across.panel, a.right);
+	return a;
+}
+
+template <int ROWS, int GUARD, bool LEAN, bool OTHER>
+static __device__ __forceinline__ void sample_apart(const __half2 *at, const apart &a, const half_parts &part,
+						    const half_parts &change, const slice_axes &axes, float value[ROWS])
+{
+#pragma unroll
+	for (int k = 0; k < ROWS; k++) {
+		float z = fmaf((float)k, a.step, a.row), up;
+
+		if (GUARD != GUARD_NONE)
+			z = fminf(fmaxf(z, -1.0f), (float)axes.rows - HELD_LEAST);
+		const __half2 *q = at + (split(z, up) * PANEL + a.column);
+		__half2 steps = __float2half2_rn((float)k - 0.5f * (ROWS - 1));
+		float2 two = __half22float2(LEAN ? across_four<OTHER>(q, 1, part, change, steps)
+						 : across_four<OTHER>(q, 1, part));
+
+		value[k] = mix(two.x, two.y, up);
+	}
+}
+
+template <int ROWS, int GUARD, bool LEAN, typename Ends>
 static __device__ __forceinline__ void add_apart(const __half2 *at, const slices &across, int from, int to,
 						 const fan &f, const half_wandering &wander, const slice_axes &axes,
-						 const float begin[ROWS], const float end[ROWS], float sum[ROWS])
+						 Ends &ends, float sum[ROWS])
 {
 	float i = (float)from, value[ROWS];
+	half_parts part, change;
 
-	for (; from < to; from++, i += 1.0f, at += across.slice) {
-		float row = fmaf(i, f.row_step, f.row), apart = 1.0f + fmaf(i, f.spread_step, f.spread), right, up;
-		float fast = fmaf(i, f.fast_step, f.fast), lean = LEAN ? fmaf(i, f.lean_step, f.lean) : 0.0f;
-		int column = first_column(held<GUARD>(fmaf(0.5f * (ROWS - 1), lean, fast), axes), across.panel, right);
-		half_parts part = parts_at(wander, right), change;
+	for (; GUARD == GUARD_NONE && from + 2 <= to; from += 2, i += 2.0f, at += 2 * across.slice) {
+		apart a = apart_at<ROWS, GUARD, LEAN>(i, across, f, axes);
+		apart b = apart_at<ROWS, GUARD, LEAN>(i + 1.0f, across, f, axes);
+		__half2 right = __floats2half2_rn(a.right, b.right);
 
+		part = parts_at(wander, right);
 		if (LEAN)
-			change = changes_at(wander, right, lean);
-#pragma unroll
-		for (int k = 0; k < ROWS; k++) {
-			float z = fmaf((float)k, apart, row);
+			change = changes_at(wander, right, __floats2half2_rn(a.lean, b.lean));
+		sample_apart<ROWS, GUARD, LEAN, false>(at, a, part, change, axes, value);
+		add_values<ROWS, GUARD>(i, ends, value, sum);
+		sample_apart<ROWS, GUARD, LEAN, true>(at + across.slice, b, part, change, axes, value);
+		add_values<ROWS, GUARD>(i, ends, value, sum);
+	}
+	for (; from < to; from++, i += 1.0f, at += across.slice) {
+		apart a = apart_at<ROWS, GUARD, LEAN>(i, across, f, axes);
+		__half2 right = __float2half2_rn(a.right);
 
-			if (GUARD != GUARD_NONE)
-				z = fminf(fmaxf(z, -1.0f), (float)axes.rows - HELD_LEAST);
-			const __half2 *q = at + (split(z, up) * PANEL + column);
-			float2 two = __half22float2(
-			    LEAN ? across_four(q, 1, part, change, __float2half2_rn((float)k - 0.5f * (ROWS - 1)))
-				 : across_four(q, 1, part));
-			value[k] = mix(two.x, two.y, up);
-		}
-		add_values<ROWS, GUARD>(i, begin, end, value, sum);
+		part = parts_at(wander, right);
+		if (LEAN)
+			change = changes_at(wander, right, __float2half2_rn(a.lean));
+		sample_apart<ROWS, GUARD, LEAN, false>(at, a, part, change, axes, value);
+		add_values<ROWS, GUARD>(i, ends, value, sum);
 	}
 }
 
 template <int ROWS, typename T, bool LEAN, bool APART>
-static __global__ void __launch_bounds__(32 * ROWS_WARPS * ROWS_VIEWS, 8 / ROWS_VIEWS) project_rows(const projection p)
+static __global__ void __launch_bounds__(32 * ROWS_WARPS * ROWS_VIEWS, 32 / (ROWS_WARPS * ROWS_VIEWS))
+    project_rows(const projection p)
 {
 	place at = place_of<ROWS_VIEWS>(p);
 	bool has_view = at.slot < p.count;
@@ -313,8 +403,9 @@ static __global__ void __launch_bounds__(32 * ROWS_WARPS * ROWS_VIEWS, 8 / ROWS_
 			continue;
 		slice_axes axes = axes_of(p.grid, axis);
 		fan f = fan_make<ROWS, LEAN>(g, d, m, axis, upwards, axes);
-		float begin[ROWS], end[ROWS], sum[ROWS] = {};
-		reach r = reach_of<ROWS, LEAN>(f, mine, low, p.rows, axes, begin, end);
+		row_ends<ROWS> ends;
+		float sum[ROWS] = {};
+		reach r = reach_of<ROWS, LEAN>(f, mine, low, p.rows, axes, ends);
 		bool hits = r.any_end > r.any_first;
 
 		if (!hits)
@@ -327,9 +418,9 @@ static __global__ void __launch_bounds__(32 * ROWS_WARPS * ROWS_VIEWS, 8 / ROWS_
 			const T *at = (const T *)across.data + across.slice * (size_t)from;
 
 			if constexpr (APART)
-				add_apart<ROWS, GUARD, LEAN>(at, across, from, to, f, wander, axes, begin, end, sum);
+				add_apart<ROWS, GUARD, LEAN>(at, across, from, to, f, wander, axes, ends, sum);
 			else
-				add_slices<ROWS, GUARD, LEAN>(at, across, from, to, f, wander, axes, begin, end, sum);
+				add_slices<ROWS, GUARD, LEAN>(at, across, from, to, f, wander, axes, ends, sum);
 		};
 		if (!LEAN && __all_sync(~0u, r.alike || !hits)) {
 			add(std::integral_constant<int, GUARD_ALIKE>(), w.first, w.inner_first);
@@ -368,6 +459,8 @@ static __global__ void __launch_bounds__(32 * ROWS_WARPS * ROWS_VIEWS, 8 / ROWS_
 
 static int rows_of_a_tile(const plan_shape &shape)
 {
+	if (shape.is_small)
+		return SMALL_ROWS;
 	return shape.forward_rows > 0 ? ROWS_WARPS * shape.forward_rows : GENERAL_ROWS;
 }
 
@@ -382,6 +475,8 @@ size_t project_blocks(const struct plan *plan, int count)
 	int across, tiles;
 
 	count_tiles(plan, &across, &tiles);
+	if (plan->shape.is_small)
+		return (size_t)tiles * (size_t)count;
 	return (size_t)tiles * (size_t)divide_up(count, plan->shape.forward_rows > 0 ? ROWS_VIEWS : GENERAL_VIEWS);
 }
 
@@ -455,7 +550,9 @@ int project_rays(struct plan *plan, const float *volume, int first, int count, s
 		launch_rows<6>(plan->shape, p, blocks, stream);
 		break;
 	default:
-		if (plan->shape.rows_apart)
+		if (plan->shape.is_small)
+			project_small<<<blocks, dim3(32, SMALL_ROWS, SMALL_PARTS), 0, stream>>>(p);
+		else if (plan->shape.rows_apart)
 			launch_apart(plan->shape, p, blocks, stream);
 		else if (plan->shape.halves)
 			launch_general<__half2>(plan->shape, p, blocks, stream);
@@ -466,11 +563,16 @@ int project_rays(struct plan *plan, const float *volume, int first, int count, s
 	return 0;
 }
 
+int project_prepare(struct plan *plan, const float *volume, struct error *err)
+{
+	return plan->shape.is_small ? 0 : layout_slices(plan, volume, err);
+}
+
 int cuda_project(struct plan *plan, const struct volume *from, const int *views, int count, struct stack *to,
 		 struct error *err)
 {
 	TRY(plan_check_views(plan, views, count, &plan->stack, to, count, err));
 	TRY(plan_set_views(plan, views, count, err));
-	TRY(layout_slices(plan, from->data, err));
+	TRY(project_prepare(plan, from->data, err));
 	return project_rays(plan, from->data, 0, count, {}, to->data, err);
 }

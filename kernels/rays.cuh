@@ -69,8 +69,8 @@ static __device__ __forceinline__ four_parts parts_at(const wandering &w, float 
 }
 
 /*
- * The same for pairs in half precision, two parts a register: the outer columns
- * and the inner ones. The instructions take either half for both of a pair.
+ * The same in half precision, for two slices at a time: the low halves are parts in
+ * the one, the high halves in the other. The instructions take either half for both.
  */
 struct half_wandering {
 	__half2 root, fall;
@@ -81,26 +81,37 @@ static __device__ __forceinline__ half_wandering half_of(const wandering &w)
 }
 
 struct half_parts {
-	__half2 outer, inner;
+	__half2 p[4];
 };
-static __device__ __forceinline__ half_parts parts_at(const half_wandering &w, float right)
-{
-	__half2 beside = __floats2half2_rn(right, 1.0f - right), hats = __lowhigh2highlow(beside);
-	__half2 inside = __hfma2_sat(__hneg2(w.fall), beside, w.root);
-	__half2 kinks = __hmul2(inside, __hmul2(inside, inside));
 
-	return {kinks, __hadd2(__hfma2(kinks, __float2half2_rn(-2.0f), hats), __lowhigh2highlow(kinks))};
+/* `right`: of the two slices. */
+static __device__ __forceinline__ half_parts parts_at(const half_wandering &w, __half2 right)
+{
+	const __half2 one = __float2half2_rn(1.0f), minus_two = __float2half2_rn(-2.0f);
+	__half2 left = __hsub2(one, right), fall = __hneg2(w.fall);
+	__half2 a = __hfma2_sat(fall, right, w.root), b = __hfma2_sat(fall, left, w.root);
+	__half2 k0 = __hmul2(a, __hmul2(a, a)), k1 = __hmul2(b, __hmul2(b, b));
+
+	return {{k0, __hadd2(__hfma2(k0, minus_two, left), k1), __hadd2(__hfma2(k1, minus_two, right), k0), k1}};
 }
 
-/* What `lean` more of `right` adds to the parts. */
-static __device__ __forceinline__ half_parts changes_at(const half_wandering &w, float right, float lean)
+/* What `by` more of `right` adds to the parts. */
+static __device__ __forceinline__ half_parts changes_at(const half_wandering &w, __half2 right, __half2 by)
 {
-	__half2 beside = __floats2half2_rn(right, 1.0f - right), by = __float2half2_rn(lean);
-	__half2 inside = __hfma2_sat(__hneg2(w.fall), beside, w.root);
-	__half2 steep = __hmul2(__hmul2(w.fall, __floats2half2_rn(-3.0f, 3.0f)), __hmul2(inside, inside));
-	__half2 inner = __hfma2(steep, __float2half2_rn(-2.0f), __floats2half2_rn(-1.0f, 1.0f));
+	const __half2 one = __float2half2_rn(1.0f), minus_two = __float2half2_rn(-2.0f);
+	__half2 left = __hsub2(one, right), fall = __hneg2(w.fall);
+	__half2 a = __hfma2_sat(fall, right, w.root), b = __hfma2_sat(fall, left, w.root);
+	__half2 steep = __hmul2(__hmul2(w.fall, __float2half2_rn(3.0f)), by);
+	__half2 k0 = __hneg2(__hmul2(steep, __hmul2(a, a))), k1 = __hmul2(steep, __hmul2(b, b));
 
-	return {__hmul2(steep, by), __hmul2(__hadd2(inner, __lowhigh2highlow(steep)), by)};
+	return {{k0, __hadd2(__hfma2(k0, minus_two, k1), __hneg2(by)), __hadd2(__hfma2(k1, minus_two, k0), by), k1}};
+}
+
+/* A part in the one or the other slice, for both of a pair. */
+template <bool OTHER>
+static __device__ __forceinline__ __half2 part_in(__half2 part)
+{
+	return OTHER ? __high2half2(part) : __low2half2(part);
 }
 
 static __device__ __forceinline__ float form(const float coefficients[3], float column, float row)
@@ -273,40 +284,80 @@ static __device__ __forceinline__ float sample_ray(const float *__restrict__ sli
 }
 
 /* A row and the next one, of the four columns of pairs from p on. */
+template <bool OTHER>
 static __device__ __forceinline__ __half2 across_four(const __half2 *__restrict__ p, int fast_stride,
 						      const half_parts &part)
 {
-	__half2 two = __hfma2(__low2half2(part.inner), p[fast_stride], __hmul2(__low2half2(part.outer), p[0]));
+	__half2 sum = __hmul2(part_in<OTHER>(part.p[0]), p[0]);
 
-	return __hfma2(__high2half2(part.outer), p[3 * fast_stride],
-		       __hfma2(__high2half2(part.inner), p[2 * fast_stride], two));
+#pragma unroll
+	for (int k = 1; k < 4; k++)
+		sum = __hfma2(part_in<OTHER>(part.p[k]), p[k * fast_stride], sum);
+	return sum;
 }
 
 /* The same where the parts change from row to row: `places` of the two, in units of the change. */
+template <bool OTHER>
 static __device__ __forceinline__ __half2 across_four(const __half2 *__restrict__ p, int fast_stride,
 						      const half_parts &part, const half_parts &change, __half2 places)
 {
-	__half2 p0 = __hfma2(__low2half2(change.outer), places, __low2half2(part.outer));
-	__half2 p1 = __hfma2(__low2half2(change.inner), places, __low2half2(part.inner));
-	__half2 p2 = __hfma2(__high2half2(change.inner), places, __high2half2(part.inner));
-	__half2 p3 = __hfma2(__high2half2(change.outer), places, __high2half2(part.outer));
-	__half2 two = __hfma2(p1, p[fast_stride], __hmul2(p0, p[0]));
+	__half2 sum = __float2half2_rn(0.0f);
 
-	return __hfma2(p3, p[3 * fast_stride], __hfma2(p2, p[2 * fast_stride], two));
+#pragma unroll
+	for (int k = 0; k < 4; k++) {
+		__half2 here = __hfma2(part_in<OTHER>(change.p[k]), places, part_in<OTHER>(part.p[k]));
+
+		sum = k == 0 ? __hmul2(here, p[0]) : __hfma2(here, p[k * fast_stride], sum);
+	}
+	return sum;
 }
 
-/* The sample of a slice of pairs; four columns of a row must be readable. */
-static __device__ __forceinline__ float sample_ray(const __half2 *__restrict__ slice, int row_stride, int fast_stride,
-						   float fast, float row, const half_wandering &wander)
+/* The first of a sample's four columns in a slice of pairs, and the sample's place between them. */
+static __device__ __forceinline__ const __half2 *first_of(const __half2 *__restrict__ slice, int row_stride, float fast,
+							  float row, float &right, float &up)
+{
+	unsigned i = split_bits(fast, right), j = split_bits(row, up);
+
+	return slice + ((int)(j * (unsigned)row_stride + i - SPLIT_BITS * (unsigned)row_stride - SPLIT_BITS) - 1);
+}
+
+/* The sum of the samples of two slices of pairs; four columns of a row must be readable. */
+static __device__ __forceinline__ float sample_two(const __half2 *__restrict__ slice, size_t next, int row_stride,
+						   const float fast[2], const float row[2],
+						   const half_wandering &wander)
+{
+	float right[2], up[2];
+	const __half2 *p = first_of(slice, row_stride, fast[0], row[0], right[0], up[0]);
+	const __half2 *q = first_of(slice + next, row_stride, fast[1], row[1], right[1], up[1]);
+	half_parts part = parts_at(wander, __floats2half2_rn(right[0], right[1]));
+	float2 one = __half22float2(across_four<false>(p, 1, part)),
+	       two = __half22float2(across_four<true>(q, 1, part));
+
+	return mix(one.x, one.y, up[0]) + mix(two.x, two.y, up[1]);
+}
+
+/* The sample of one slice of pairs. */
+static __device__ __forceinline__ float sample_ray(const __half2 *__restrict__ slice, int row_stride, float fast,
+						   float row, const half_wandering &wander)
 {
 	float right, up;
-	unsigned i = split_bits(fast, right), j = split_bits(row, up);
-	unsigned surplus = SPLIT_BITS * (unsigned)row_stride + SPLIT_BITS * (unsigned)fast_stride;
-	const __half2 *p =
-	    slice + ((int)(j * (unsigned)row_stride + i * (unsigned)fast_stride - surplus) - fast_stride);
-	float2 rows = __half22float2(across_four(p, fast_stride, parts_at(wander, right)));
+	const __half2 *p = first_of(slice, row_stride, fast, row, right, up);
+	float2 one = __half22float2(across_four<false>(p, 1, parts_at(wander, __float2half2_rn(right))));
 
-	return mix(rows.x, rows.y, up);
+	return mix(one.x, one.y, up);
+}
+
+/* The same of floats. */
+static __device__ __forceinline__ float sample_ray(const float *__restrict__ slice, int row_stride, float fast,
+						   float row, const wandering &wander)
+{
+	return sample_ray(slice, row_stride, 1, fast, row, wander);
+}
+static __device__ __forceinline__ float sample_two(const float *__restrict__ slice, size_t next, int row_stride,
+						   const float fast[2], const float row[2], const wandering &wander)
+{
+	return sample_ray(slice, row_stride, fast[0], row[0], wander) +
+	       sample_ray(slice + next, row_stride, fast[1], row[1], wander);
 }
 
 /* The same with the outer voxels held beyond the edges. */
@@ -366,6 +417,95 @@ static __device__ __forceinline__ walk walk_together(bool hits, int first, int e
 	else if (w.inner_first >= w.inner_end)
 		w.inner_first = w.inner_end = w.end;
 	return w;
+}
+
+/* A volume of floats as it is, with the steps from voxel to voxel along x, y and z. */
+struct strided {
+	const float *data;
+	int x, y, z;
+};
+
+/* What a ray has added up, times `step` mm; and how many slices it crosses in all. */
+struct ray_part {
+	float sum, slices, step;
+};
+
+/*
+ * One of `parts` equal parts of the way of a ray along d with moment m, where
+ * `valid`. TOGETHER: of the way of all rays of the warp, whose lanes then read
+ * neighbours in each slice; else each lane goes its own.
+ */
+template <bool TOGETHER>
+static __device__ __forceinline__ ray_part walk_part(const strided &volume, const device_grid &grid, const float d[3],
+						     const float m[3], bool valid, int part, int parts)
+{
+	int own = dominant_axis(d[0], d[1], d[2]);
+	ray_part result = {0, 0, 0};
+
+	for (int axis = ACROSS_X; axis <= ACROSS_Z; axis++) {
+		bool mine = valid && own == axis;
+
+		if (!__any_sync(~0u, mine))
+			continue;
+		slice_axes axes = axes_of(grid, axis);
+		int slice = axis == ACROSS_X ? volume.x : axis == ACROSS_Y ? volume.y : volume.z;
+		int fast = axis == ACROSS_X ? volume.y : volume.x, up = axis == ACROSS_Z ? volume.y : volume.z;
+		ray a = ray_idle(axes);
+		float from = 0, to = 0, total = 0;
+		if (mine) {
+			crossing at = crossing_of(d, m, axis);
+			ray full = ray_make(at, axes);
+
+			result.step = full.step;
+			if (full.end > full.begin) {
+				a = full;
+				/*
+				 * A voxel from the outer centres all four columns are there, between the
+				 * outer centres both rows; a thousandth for rounding.
+				 */
+				to = 0.5f * (float)(axes.across - 1);
+				from = -to;
+				clip(at.fast, at.fast_step, 0.5f * (float)(axes.fast - 3) - 1e-3f, from, to);
+				clip(at.row, at.row_step, 0.5f * (float)(axes.rows - 1) - 1e-3f, from, to);
+				if (axes.fast < 4 || axes.rows < 2)
+					to = -1e6f;
+				from = fminf(from, 1e6f) + 0.5f * (float)(axes.across - 1);
+				to = fmaxf(to, -1e6f) + 0.5f * (float)(axes.across - 1);
+			}
+		}
+		bool hits = a.end > a.begin;
+		int first = first_slice(a.begin), last = last_slice(a.end);
+		int inner_first = max(first + 1, (int)ceilf(from)), inner_end = min(last, (int)floorf(to) + 1);
+		walk w = {first, inner_first, max(inner_first, inner_end), hits ? last + 1 : first};
+
+		if (TOGETHER)
+			w = walk_together(hits, first, last + 1, inner_first, inner_end);
+		int each = (w.end - w.first + parts - 1) / parts, begin = w.first + part * each;
+		int end = min(begin + each, w.end), inner = min(max(w.inner_first, begin), end);
+		int outer = min(max(w.inner_end, inner), end);
+		wandering wander = wander_of(a.fast_step);
+		auto edge = [&](int i, int until) {
+			for (; i < until; i++)
+				total = fmaf(part_of(i, a.begin, a.end),
+					     sample_ray_held(volume.data + (size_t)slice * i, up, fast,
+							     fmaf((float)i, a.fast_step, a.fast),
+							     fmaf((float)i, a.row_step, a.row), wander, axes),
+					     total);
+		};
+
+		edge(begin, inner);
+		const float *at_slice = volume.data + (size_t)slice * inner;
+#pragma unroll 4 /* most of what is read comes from far: many loads on their way */
+		for (int i = inner; i < outer; i++, at_slice += slice)
+			total += sample_ray(at_slice, up, fast, fmaf((float)i, a.fast_step, a.fast),
+					    fmaf((float)i, a.row_step, a.row), wander);
+		edge(outer, end);
+		if (hits) {
+			result.sum = total;
+			result.slices = a.end - a.begin;
+		}
+	}
+	return result;
 }
 
 /* Sums over the block in a fixed order; thread 0 has the result. Every thread must come here. */

@@ -15,6 +15,8 @@
  * degree or so, each pair across counts with its own weights, on the tangent of
  * those in the middle of all.
  */
+#include <type_traits>
+
 #include "kernels/rays.cuh"
 
 /* A column's rays: row k, counted upwards, crosses slice i at row + i row_step + k (1 + spread + i spread_step). */
@@ -58,26 +60,27 @@ static __device__ __forceinline__ float lean_at(const fan &f, float i, float e)
 	return fmaf(i, f.lean_step, f.lean) * reciprocal(1.0f + e);
 }
 
-/*
- * COUNT pairs of values across, row_stride apart; `right` is that in their middle
- * along z. Four columns must be readable.
- */
-template <int COUNT, bool LEAN>
-static __device__ __forceinline__ void across_pairs(const __half2 *__restrict__ q, int row_stride, int fast_stride,
-						    const half_wandering &wander, float right, float lean,
-						    __half2 x[COUNT])
-{
-	half_parts part = parts_at(wander, right), change;
+/* Where a fan crosses a slice. */
+struct spread {
+	int at;      /* the first of the four columns, in its lowest row */
+	float right; /* in the middle of all rows, */
+	float lean;  /* and its change along z */
+	float e, t;
+	bool odd; /* pairs begin a row lower */
+};
 
-	if (LEAN)
-		change = changes_at(wander, right, lean);
+/* COUNT pairs of values across, row_stride apart; four columns must be readable. */
+template <int COUNT, bool LEAN, bool OTHER>
+static __device__ __forceinline__ void across_pairs(const __half2 *__restrict__ q, int row_stride, int fast_stride,
+						    const half_parts &part, const half_parts &change, __half2 x[COUNT])
+{
 #pragma unroll
 	for (int j = 0; j < COUNT; j++) {
 		if (LEAN)
-			x[j] = across_four(q + j * row_stride, fast_stride, part, change,
-					   __floats2half2_rn(2 * j + 0.5f - COUNT, 2 * j + 1.5f - COUNT));
+			x[j] = across_four<OTHER>(q + j * row_stride, fast_stride, part, change,
+						  __floats2half2_rn(2 * j + 0.5f - COUNT, 2 * j + 1.5f - COUNT));
 		else
-			x[j] = across_four(q + j * row_stride, fast_stride, part);
+			x[j] = across_four<OTHER>(q + j * row_stride, fast_stride, part);
 	}
 }
 
@@ -98,17 +101,53 @@ static __device__ __forceinline__ void blend_rows(const __half2 x[(ROWS + 3) / 2
 	}
 }
 
+/* Where a thread's rows begin and end, in slices: in registers, */
+template <int ROWS>
+struct row_ends {
+	float begins[ROWS], ends[ROWS];
+
+	__device__ __forceinline__ float &begin(int k)
+	{
+		return begins[k];
+	}
+	__device__ __forceinline__ float &end(int k)
+	{
+		return ends[k];
+	}
+};
+/*
+ * or in shared memory, those of a block's THREADS side by side. They are looked at on
+ * the edges only: where samples come from far, registers do more for those on their way.
+ */
+template <int ROWS, int THREADS>
+struct shared_ends {
+	float begins[ROWS][THREADS], ends[ROWS][THREADS];
+};
+template <int ROWS, int THREADS>
+struct shared_row_ends {
+	shared_ends<ROWS, THREADS> &all;
+	int thread;
+
+	__device__ __forceinline__ float &begin(int k)
+	{
+		return all.begins[k][thread];
+	}
+	__device__ __forceinline__ float &end(int k)
+	{
+		return all.ends[k][thread];
+	}
+};
+
 /* Where a slice counts in part, what a row of no part has read may be anything. */
-template <int ROWS, int GUARD>
-static __device__ __forceinline__ void add_values(float i, const float begin[ROWS], const float end[ROWS],
-						  const float value[ROWS], float sum[ROWS])
+template <int ROWS, int GUARD, typename Ends>
+static __device__ __forceinline__ void add_values(float i, Ends &ends, const float value[ROWS], float sum[ROWS])
 {
-	float part = GUARD == GUARD_NONE ? 1.0f : part_of(i, begin[0], end[0]);
+	float part = GUARD == GUARD_NONE ? 1.0f : part_of(i, ends.begin(0), ends.end(0));
 
 #pragma unroll
 	for (int k = 0; k < ROWS; k++) {
 		if (GUARD == GUARD_EACH)
-			part = part_of(i, begin[k], end[k]);
+			part = part_of(i, ends.begin(k), ends.end(k));
 		if (part > 0)
 			sum[k] = fmaf(part, value[k], sum[k]);
 	}
@@ -123,30 +162,45 @@ static __device__ __forceinline__ void spread_out(const __half2 value[(ROWS + 1)
 		ret[k] = k & 1 ? __high2float(value[k / 2]) : __low2float(value[k / 2]);
 }
 
-/* Adds slices from .. to - 1; sample(slice, i, value) gives those of slice i. */
-template <int ROWS, int GUARD, typename Sample>
+/*
+ * Adds slices from .. to - 1. place(i) says where the fan crosses slice i;
+ * sample(slice, place, parts, changes, other, value) has its samples.
+ */
+template <int ROWS, int GUARD, bool LEAN, typename Ends, typename Place, typename Sample>
 static __device__ __forceinline__ void add_pairs(const __half2 *at, size_t slice, int from, int to,
-						 const float begin[ROWS], const float end[ROWS], float sum[ROWS],
+						 const half_wandering &wander, Ends &ends, float sum[ROWS], Place place,
 						 Sample sample)
 {
 	const int pairs = (ROWS + 1) / 2;
 	float i = (float)from, flat[ROWS];
+	half_parts part, change;
 	__half2 one[pairs], two[pairs];
 
 	/* Two samples are added in half precision, all else in float. */
 	for (; GUARD == GUARD_NONE && from + 2 <= to; from += 2, i += 2.0f, at += 2 * slice) {
-		sample(at, i, one);
-		sample(at + slice, i + 1.0f, two);
+		spread a = place(i), b = place(i + 1.0f);
+		__half2 right = __floats2half2_rn(a.right, b.right);
+
+		part = parts_at(wander, right);
+		if (LEAN)
+			change = changes_at(wander, right, __floats2half2_rn(a.lean, b.lean));
+		sample(at, a, part, change, std::false_type(), one);
+		sample(at + slice, b, part, change, std::true_type(), two);
 #pragma unroll
 		for (int k = 0; k < pairs; k++)
 			one[k] = __hadd2(one[k], two[k]);
 		spread_out<ROWS>(one, flat);
-		add_values<ROWS, GUARD>(i, begin, end, flat, sum);
+		add_values<ROWS, GUARD>(i, ends, flat, sum);
 	}
 	for (; from < to; from++, i += 1.0f, at += slice) {
-		sample(at, i, one);
+		spread a = place(i);
+
+		part = parts_at(wander, __float2half2_rn(a.right));
+		if (LEAN)
+			change = changes_at(wander, __float2half2_rn(a.right), __float2half2_rn(a.lean));
+		sample(at, a, part, change, std::false_type(), one);
 		spread_out<ROWS>(one, flat);
-		add_values<ROWS, GUARD>(i, begin, end, flat, sum);
+		add_values<ROWS, GUARD>(i, ends, flat, sum);
 	}
 }
 
@@ -206,27 +260,35 @@ struct reach {
 	int any_first, any_end, all_first, all_end;
 	bool alike; /* all begin and end at the same place */
 };
-template <int ROWS, bool LEAN>
+template <int ROWS, bool LEAN, typename Ends>
 static __device__ __forceinline__ reach reach_of(const fan &f, bool mine, int low, int rows, const slice_axes &axes,
-						 float begin[ROWS], float end[ROWS])
+						 Ends &ends)
 {
 	const int far = 1 << 28;
 	reach r = {far, -1, 0, far, true};
+	float begin_0 = 0, end_0 = 0;
 
 #pragma unroll
 	for (int k = 0; k < ROWS; k++) {
-		begin[k] = end[k] = 0;
-		if (!mine || low + k >= rows)
-			continue;
-		row_range<LEAN>(f, k, axes, begin[k], end[k]);
-		bool crosses = end[k] > begin[k];
-		r.alike = r.alike && begin[k] == begin[0] && end[k] == end[0];
-		int first = first_slice(begin[k]), last = last_slice(end[k]);
+		float begin = 0, end = 0;
 
-		r.any_first = min(r.any_first, crosses ? first : far);
-		r.any_end = max(r.any_end, crosses ? last + 1 : -1);
-		r.all_first = max(r.all_first, crosses ? first + 1 : far);
-		r.all_end = min(r.all_end, crosses ? last : -1);
+		if (mine && low + k < rows) {
+			row_range<LEAN>(f, k, axes, begin, end);
+			if (k == 0) {
+				begin_0 = begin;
+				end_0 = end;
+			}
+			bool crosses = end > begin;
+			r.alike = r.alike && begin == begin_0 && end == end_0;
+			int first = first_slice(begin), last = last_slice(end);
+
+			r.any_first = min(r.any_first, crosses ? first : far);
+			r.any_end = max(r.any_end, crosses ? last + 1 : -1);
+			r.all_first = max(r.all_first, crosses ? first + 1 : far);
+			r.all_end = min(r.all_end, crosses ? last : -1);
+		}
+		ends.begin(k) = begin;
+		ends.end(k) = end;
 	}
 	return r;
 }

@@ -7,18 +7,17 @@
  * Updates of several views: forward projection with the correction
  * (p - A v) / L as its result, then backprojection that ends in the update.
  *
- * An update after each view: one view cannot fill the card, and turning the
- * volume into the forward projection's layouts would cost more than the rest.
- * So the sweep runs on one copy with z fastest, in which both directions of the
- * slices are alike: lanes are neighbours along z, rows forward and voxels back,
- * and a ray is cut into parts that several warps walk.
+ * An update after each view, for any geometry and in float (sweep.cu does it where
+ * the projection goes by rows): one view cannot fill the card, and turning the
+ * volume into the forward projection's layouts would cost more than the rest. So it
+ * runs on one copy with z fastest, in which both directions of the slices are
+ * alike: lanes are neighbours along z, rows forward and voxels back, and a ray is
+ * cut into parts that several warps walk.
  *
  * The launches of an iteration are recorded once and replayed, so that small
  * problems do not wait for the host.
  */
-#include <type_traits>
-
-#include "kernels/rows.cuh"
+#include "kernels/rays.cuh"
 
 /* ---- view by view ---- */
 
@@ -27,9 +26,6 @@ struct sweep_view {
 	device_grid grid;
 	float *volume; /* [x][y][z] */
 	int pitch;
-	__half *halves; /* voxel 0 of its copy in half precision; NULL: there is none */
-	int half_pitch;
-	bool rows_down;
 	int columns, rows;
 	const float *measured; /* [row][column] */
 	int measured_pitch;
@@ -63,229 +59,20 @@ static __global__ void __launch_bounds__(32 * SWEEP_COLUMNS * SWEEP_PARTS, 2) pr
 	float c = (float)column - 0.5f * (float)(s.columns - 1), r = (float)row - 0.5f * (float)(s.rows - 1);
 	float d[3] = {form(g.direction[0], c, r), form(g.direction[1], c, r), form(g.direction[2], c, r)};
 	float m[3] = {form(g.moment[0], c, r), form(g.moment[1], c, r), form(g.moment[2], c, r)};
-	int own = dominant_axis(d[0], d[1], d[2]);
-	int x_stride = s.grid.size[1] * s.pitch, y_stride = s.pitch;
-	float sum = 0, length = 0, step = 0;
+	strided volume = {s.volume, s.grid.size[1] * s.pitch, s.pitch, 1};
+	ray_part way = walk_part<true>(volume, s.grid, d, m, valid, part, SWEEP_PARTS);
 
-	for (int axis = ACROSS_X; axis <= ACROSS_Z; axis++) {
-		bool mine = valid && own == axis;
-
-		if (!__any_sync(~0u, mine))
-			continue;
-		slice_axes axes = axes_of(s.grid, axis);
-		int slice = axis == ACROSS_X ? x_stride : axis == ACROSS_Y ? y_stride : 1;
-		int fast = axis == ACROSS_X ? y_stride : x_stride, up = axis == ACROSS_Z ? y_stride : 1;
-		ray a = ray_idle(axes);
-		float from = 0, to = 0, total = 0;
-		if (mine) {
-			crossing at = crossing_of(d, m, axis);
-			ray full = ray_make(at, axes);
-
-			if (full.end > full.begin) {
-				a = full;
-				/*
-				 * A voxel from the outer centres all four columns are there, between the
-				 * outer centres both rows; a thousandth for rounding.
-				 */
-				to = 0.5f * (float)(axes.across - 1);
-				from = -to;
-				clip(at.fast, at.fast_step, 0.5f * (float)(axes.fast - 3) - 1e-3f, from, to);
-				clip(at.row, at.row_step, 0.5f * (float)(axes.rows - 1) - 1e-3f, from, to);
-				if (axes.fast < 4 || axes.rows < 2)
-					to = -1e6f;
-				from = fminf(from, 1e6f) + 0.5f * (float)(axes.across - 1);
-				to = fmaxf(to, -1e6f) + 0.5f * (float)(axes.across - 1);
-			}
-		}
-		bool hits = a.end > a.begin;
-		int first = first_slice(a.begin), last = last_slice(a.end);
-		walk w = walk_together(hits, first, last + 1, max(first + 1, (int)ceilf(from)),
-				       min(last, (int)floorf(to) + 1));
-		/* This warp's part of the way. */
-		int each = (w.end - w.first + SWEEP_PARTS - 1) / SWEEP_PARTS, begin = w.first + part * each;
-		int end = min(begin + each, w.end), inner = min(max(w.inner_first, begin), end);
-		int outer = min(max(w.inner_end, inner), end);
-		wandering wander = wander_of(a.fast_step);
-		auto edge = [&](int i, int until) {
-			for (; i < until; i++)
-				total = fmaf(part_of(i, a.begin, a.end),
-					     sample_ray_held(s.volume + (size_t)slice * i, up, fast,
-							     fmaf((float)i, a.fast_step, a.fast),
-							     fmaf((float)i, a.row_step, a.row), wander, axes),
-					     total);
-		};
-
-		edge(begin, inner);
-		const float *at_slice = s.volume + (size_t)slice * inner;
-#pragma unroll 4 /* most of what is read comes from memory: many loads on their way */
-		for (int i = inner; i < outer; i++, at_slice += slice)
-			total += sample_ray(at_slice, up, fast, fmaf((float)i, a.fast_step, a.fast),
-					    fmaf((float)i, a.row_step, a.row), wander);
-		edge(outer, end);
-		if (hits) {
-			sum = total;
-			length = (a.end - a.begin) * a.step;
-			step = a.step;
-		}
-	}
-	sums[part][threadIdx.y][threadIdx.x] = sum;
+	sums[part][threadIdx.y][threadIdx.x] = way.sum;
 	__syncthreads();
 	float2 squares = {0, 0};
 	if (part == 0 && valid) {
 		for (int k = 1; k < SWEEP_PARTS; k++)
-			sum += sums[k][threadIdx.y][threadIdx.x];
-		squares = correct(s, column, row, sum * step, length);
+			way.sum += sums[k][threadIdx.y][threadIdx.x];
+		squares = correct(s, column, row, way.sum * way.step, way.slices * way.step);
 	}
 	squares = block_sum(squares);
 	if (part == 0 && threadIdx.x == 0 && threadIdx.y == 0)
 		s.partial[blockIdx.y * gridDim.x + blockIdx.x] = squares;
-}
-
-enum { ROWS_COLUMNS = 2, ROWS_PARTS = 8 };
-
-/*
- * By rows, from the copy in half precision: a lane has ROWS rays of a column
- * (rows.cuh), a warp neighbours along it. Pairs there begin at even z: where the
- * window begins at an odd one, they are put together anew after they were
- * interpolated across.
- */
-template <int ROWS, bool LEAN>
-static __global__ void __launch_bounds__(32 * ROWS_COLUMNS * ROWS_PARTS, 2) project_view_rows(const sweep_view s)
-{
-	__shared__ float sums[ROWS_PARTS][ROWS_COLUMNS][ROWS][32];
-	const device_view &g = *s.geometry;
-	int low = (blockIdx.y * 32 + threadIdx.x) * ROWS, column = blockIdx.x * ROWS_COLUMNS + threadIdx.y;
-	int part = threadIdx.z;
-	bool valid = column < s.columns && low < s.rows;
-	float upwards = s.rows_down ? -1.0f : 1.0f, c = (float)column - 0.5f * (float)(s.columns - 1);
-	float r = upwards * ((float)low - 0.5f * (float)(s.rows - 1));
-	float d[3] = {form(g.direction[0], c, r), form(g.direction[1], c, r), form(g.direction[2], c, r)};
-	float m[3] = {form(g.moment[0], c, r), form(g.moment[1], c, r), form(g.moment[2], c, r)};
-	int own = fabsf(d[0]) >= fabsf(d[1]) ? ACROSS_X : ACROSS_Y;
-	int y_stride = s.half_pitch / 2, x_stride = (s.grid.size[1] + 2 * SLICE_HELD) * y_stride;
-
-#pragma unroll
-	for (int k = 0; k < ROWS; k++)
-		sums[part][threadIdx.y][k][threadIdx.x] = 0;
-	for (int axis = ACROSS_X; axis <= ACROSS_Y; axis++) {
-		bool mine = valid && own == axis;
-
-		if (!__any_sync(~0u, mine))
-			continue;
-		slice_axes axes = axes_of(s.grid, axis);
-		fan f = fan_make<ROWS, LEAN>(g, d, m, axis, upwards, axes);
-		float begin[ROWS], end[ROWS], sum[ROWS] = {};
-		reach reaches = reach_of<ROWS, LEAN>(f, mine, low, s.rows, axes, begin, end);
-		bool hits = reaches.any_end > reaches.any_first;
-
-		if (!hits)
-			f = fan_idle(axes);
-		walk w = walk_together(hits, reaches.any_first, reaches.any_end, reaches.all_first, reaches.all_end);
-		/* This warp's part of the way. */
-		int each = (w.end - w.first + ROWS_PARTS - 1) / ROWS_PARTS, from = w.first + part * each;
-		int to = min(from + each, w.end), inner = min(max(w.inner_first, from), max(to, from));
-		int outer = min(max(w.inner_end, inner), max(to, inner));
-		int slice = axis == ACROSS_X ? x_stride : y_stride,
-		    fast_stride = axis == ACROSS_X ? y_stride : x_stride;
-		half_wandering wander = half_of(wander_of(f.fast_step));
-		auto add = [&](auto guard, int first, int last) {
-			constexpr int GUARD = decltype(guard)::value;
-
-			add_pairs<ROWS, GUARD>(
-			    (const __half2 *)s.halves + (ptrdiff_t)slice * first, (size_t)slice, first, last, begin,
-			    end, sum, [&](const __half2 *at, float i, __half2 *value) {
-				    const int pairs = (ROWS + 3) / 2;
-				    float e = fmaf(i, f.spread_step, f.spread), fast = fmaf(i, f.fast_step, f.fast);
-				    float right, t;
-				    int base = lowest_row<ROWS, GUARD>(f, i, e, axes, t), odd = base & 1;
-				    float lean = LEAN ? lean_at(f, i, e) : 0.0f;
-				    __half2 x[pairs + 1];
-
-				    if (LEAN)
-					    fast = fmaf((float)(pairs - odd) + 0.5f - t, lean, fast);
-				    int at_fast = split(held<GUARD>(fast, axes), right) - 1;
-				    across_pairs<pairs + 1, LEAN>(at + (at_fast * fast_stride + (base >> 1)), 1,
-								  fast_stride, wander, right, lean, x);
-#pragma unroll
-				    for (int j = 0; j < pairs; j++) {
-					    __half2 shifted = __halves2half2(__high2half(x[j]), __low2half(x[j + 1]));
-
-					    x[j] = odd ? shifted : x[j];
-				    }
-				    blend_rows<ROWS>(x, e, t, value);
-			    });
-		};
-
-		add(std::integral_constant<int, GUARD_EACH>(), from, inner);
-		add(std::integral_constant<int, GUARD_NONE>(), inner, outer);
-		add(std::integral_constant<int, GUARD_EACH>(), outer, to);
-#pragma unroll
-		for (int k = 0; k < ROWS; k++)
-			if (mine && hits && end[k] > begin[k])
-				sums[part][threadIdx.y][k][threadIdx.x] = sum[k];
-	}
-	__syncthreads();
-	float2 squares = {0, 0};
-	for (int k = part; k < ROWS; k += ROWS_PARTS) {
-		if (!valid || low + k >= s.rows)
-			continue;
-		float up = upwards * ((float)(low + k) - 0.5f * (float)(s.rows - 1)), sum = 0;
-		float dk[3] = {form(g.direction[0], c, up), form(g.direction[1], c, up), form(g.direction[2], c, up)};
-		float mk[3] = {form(g.moment[0], c, up), form(g.moment[1], c, up), form(g.moment[2], c, up)};
-		ray full = ray_make(crossing_of(dk, mk, own), axes_of(s.grid, own));
-		float length = fmaxf(full.end - full.begin, 0.0f) * full.step;
-		int row = s.rows_down ? s.rows - 1 - (low + k) : low + k;
-
-		for (int j = 0; j < ROWS_PARTS; j++)
-			sum += sums[j][threadIdx.y][k][threadIdx.x];
-		float2 square = correct(s, column, row, sum * full.step, length);
-		squares.x += square.x;
-		squares.y += square.y;
-	}
-	squares = block_sum(squares);
-	if (threadIdx.x == 0 && threadIdx.y == 0 && threadIdx.z == 0)
-		s.partial[blockIdx.y * gridDim.x + blockIdx.x] = squares;
-}
-
-static __device__ __forceinline__ __half *half_at(const sweep_view &s, int x, int y, int z)
-{
-	return s.halves + (((ptrdiff_t)x * (s.grid.size[1] + 2 * SLICE_HELD) + y) * s.half_pitch + z);
-}
-
-static __device__ __forceinline__ bool is_edge(const sweep_view &s, int x, int y)
-{
-	return x == 0 || y == 0 || x == s.grid.size[0] - 1 || y == s.grid.size[1] - 1;
-}
-
-/* All that repeats a voxel at the edges of the copy in half precision. */
-static __device__ __noinline__ void hold_half(__half *at, int x, int y, int z, int3 size, int pitch, __half value)
-{
-	int x_stride = (size.y + 2 * SLICE_HELD) * pitch;
-
-	for (int i = x == 0 ? -SLICE_HELD : 0; i <= (x == size.x - 1 ? SLICE_HELD : 0); i++)
-		for (int j = y == 0 ? -SLICE_HELD : 0; j <= (y == size.y - 1 ? SLICE_HELD : 0); j++)
-			for (int k = z == 0 ? -SLICE_HELD : 0; k <= (z == size.z - 1 ? SLICE_HELD : 0); k++)
-				at[i * x_stride + j * pitch + k] = value;
-}
-
-/* A voxel of the copy in half precision; `edge`: it is one along x or y. */
-static __device__ __forceinline__ void put_half(const sweep_view &s, __half *at, bool edge, int x, int y, int z,
-						float value)
-{
-	__half half = __float2half_rn(value);
-
-	*at = half;
-	if (edge || z == 0 || z == s.grid.size[2] - 1)
-		hold_half(at, x, y, z, make_int3(s.grid.size[0], s.grid.size[1], s.grid.size[2]), s.half_pitch, half);
-}
-
-static __global__ void __launch_bounds__(256) to_halves(const sweep_view s)
-{
-	int z = blockIdx.x * 32 + threadIdx.x, y = blockIdx.y * 8 + threadIdx.y, x = blockIdx.z;
-
-	if (z < s.grid.size[2] && y < s.grid.size[1])
-		put_half(s, half_at(s, x, y, z), is_edge(s, x, y), x, y, z,
-			 s.volume[((size_t)x * s.grid.size[1] + y) * s.pitch + z]);
 }
 
 enum { UPDATE_LINES = 8 }; /* of voxels along z, side by side in a block */
@@ -334,44 +121,40 @@ static __global__ void __launch_bounds__(32 * UPDATE_LINES) update_view(const sw
 				value[k] = fmaxf(value[k], 0.0f);
 		}
 	}
-	__half *halves = half_at(s, x, y, z);
-	bool edge = is_edge(s, x, y);
 #pragma unroll
 	for (int k = 0; k < CHUNKS; k++)
-		if (z + 32 * k < nz) {
+		if (z + 32 * k < nz)
 			at[32 * k] = value[k];
-			if (s.halves != NULL)
-				put_half(s, halves + 32 * k, edge, x, y, z + 32 * k, value[k]);
-		}
 }
 
 static dim3 sweep_blocks(const struct plan *plan)
 {
-	if (plan->shape.by_rows)
-		return dim3(divide_up(plan->stack.columns, ROWS_COLUMNS),
-			    divide_up(plan->stack.rows, 32 * plan->shape.forward_rows));
 	return dim3(divide_up(plan->stack.columns, SWEEP_COLUMNS), divide_up(plan->stack.rows, 32));
 }
 
 size_t sweep_scratch_bytes(const struct plan *plan)
 {
-	size_t floats = plan->columns.floats + (plan->shape.by_rows ? plan->half_columns.floats : 0);
-
-	return floats * sizeof(float);
+	return plan->shape.by_rows ? sweep_rows_bytes(plan) : plan->columns.floats * sizeof(float);
 }
 
 size_t sweep_partials(const struct plan *plan)
 {
 	dim3 blocks = sweep_blocks(plan);
+	size_t each = plan->shape.by_rows ? sweep_rows_partials(plan) : (size_t)blocks.x * blocks.y;
 
-	return (size_t)blocks.x * blocks.y * (size_t)plan->options.geometry->count;
+	return each * (size_t)plan->options.geometry->count;
+}
+
+static float spacing_least(const struct plan *plan)
+{
+	const float *spacing = plan->grid.spacing;
+
+	return fminf(fminf(spacing[0], spacing[1]), spacing[2]);
 }
 
 static float length_least(const struct plan *plan)
 {
-	const float *spacing = plan->grid.spacing;
-
-	return (float)RAY_LENGTH_LEAST * fminf(fminf(spacing[0], spacing[1]), spacing[2]);
+	return (float)RAY_LENGTH_LEAST * spacing_least(plan);
 }
 
 template <bool COVERED, bool UNTILTED>
@@ -401,35 +184,6 @@ static void update_by(const struct plan_shape *shape, const sweep_view &s, cudaS
 		launch_update<false, false>(s, stream);
 }
 
-template <int ROWS>
-static void launch_rows(const struct plan_shape *shape, const sweep_view &s, dim3 blocks, cudaStream_t stream)
-{
-	dim3 threads(32, ROWS_COLUMNS, ROWS_PARTS);
-
-	if (shape->untilted)
-		project_view_rows<ROWS, false><<<blocks, threads, 0, stream>>>(s);
-	else
-		project_view_rows<ROWS, true><<<blocks, threads, 0, stream>>>(s);
-}
-
-static void project_by(const struct plan *plan, const sweep_view &s, cudaStream_t stream)
-{
-	dim3 blocks = sweep_blocks(plan);
-
-	switch (plan->shape.by_rows ? plan->shape.forward_rows : 0) {
-	case 3:
-		return launch_rows<3>(&plan->shape, s, blocks, stream);
-	case 4:
-		return launch_rows<4>(&plan->shape, s, blocks, stream);
-	case 5:
-		return launch_rows<5>(&plan->shape, s, blocks, stream);
-	case 6:
-		return launch_rows<6>(&plan->shape, s, blocks, stream);
-	default:
-		project_view<<<blocks, dim3(32, SWEEP_COLUMNS, SWEEP_PARTS), 0, stream>>>(s);
-	}
-}
-
 static int sweep_views(struct plan *plan, const float *projections, float *volume, const struct cancel *cancel,
 		       struct error *err)
 {
@@ -443,7 +197,6 @@ static int sweep_views(struct plan *plan, const float *projections, float *volum
 	s.grid = plan->grid;
 	s.volume = plan->scratch;
 	s.pitch = plan->columns.pitch;
-	s.rows_down = plan->shape.rows_down;
 	s.columns = plan->stack.columns;
 	s.rows = plan->stack.rows;
 	s.measured_pitch = plan->stack.pitch;
@@ -452,27 +205,17 @@ static int sweep_views(struct plan *plan, const float *projections, float *volum
 	s.least = length_least(plan);
 	s.relaxation = (float)plan->options.sart->relaxation;
 	s.nonnegative = plan->options.sart->nonnegative;
-	if (plan->shape.by_rows) {
-		const int *size = s.grid.size;
-
-		s.half_pitch = plan->half_columns.pitch;
-		s.halves = (__half *)(plan->scratch + plan->columns.floats) + SWEEP_MARGIN + SLICE_HELD +
-			   (size_t)SLICE_HELD * (size_t)s.half_pitch * (size_t)(size[1] + 2 * SLICE_HELD + 1);
-		to_halves<<<dim3(divide_up(size[2], 32), divide_up(size[1], 8), size[0]), dim3(32, 8), 0, stream>>>(s);
-		LAUNCHED();
-	}
 	for (int i = 0; i < plan->options.geometry->count; i++) {
 		TRY(cancel_check(cancel, err));
 		s.geometry = plan->geometry + order[i];
 		s.measured = projections + (size_t)order[i] * plan->stack.slot;
 		s.partial = plan->partial + (size_t)i * blocks.x * blocks.y;
-		project_by(plan, s, stream);
+		project_view<<<blocks, dim3(32, SWEEP_COLUMNS, SWEEP_PARTS), 0, stream>>>(s);
 		LAUNCHED();
 		update_by(&plan->shape, s, stream);
 		LAUNCHED();
 	}
-	TRY(layout_from_columns(plan, plan->scratch, volume, err));
-	return reduce_pairs(plan, plan->partial, sweep_partials(plan), plan->device->sums_device, err);
+	return layout_from_columns(plan, plan->scratch, volume, err);
 }
 
 /* ---- several views an update ---- */
@@ -490,7 +233,8 @@ static int update_subset(struct plan *plan, int subset, const float *projections
 	voxels.nonnegative = sart->nonnegative;
 	voxels.scale = (float)(plan->shape.covered ? sart->relaxation / count : sart->relaxation);
 	voxels.coverage = plan->shape.covered ? NULL : plan->coverage;
-	TRY(layout_slices(plan, volume, err));
+	voxels.least = plan->options.matched ? (float)COLUMN_SUM_LEAST * spacing_least(plan) : 0.0f;
+	TRY(project_prepare(plan, volume, err));
 	if (!plan->shape.covered && !plan->options.matched && plan->coverage_subset != subset) {
 		TRY(coverage_sum(plan, first, count, err));
 		plan->coverage_subset = sart->subsets.count > 1 ? -1 : subset;
@@ -558,8 +302,13 @@ static int sweep_subsets(struct plan *plan, const float *projections, float *vol
 static int sweep(struct plan *plan, const float *projections, float *volume, const struct cancel *cancel,
 		 struct error *err)
 {
-	return plan->shape.by_view ? sweep_views(plan, projections, volume, cancel, err)
-				   : sweep_subsets(plan, projections, volume, cancel, err);
+	if (!plan->shape.by_view)
+		return sweep_subsets(plan, projections, volume, cancel, err);
+	if (plan->shape.by_rows)
+		TRY(sweep_rows(plan, projections, volume, length_least(plan), cancel, err));
+	else
+		TRY(sweep_views(plan, projections, volume, cancel, err));
+	return reduce_pairs(plan, plan->partial, sweep_partials(plan), plan->device->sums_device, err);
 }
 
 /* ---- recording ---- */

@@ -185,7 +185,8 @@ struct bench {
 	struct volume *volume;
 	struct stack *projections, *filtered;
 	int *views;
-	int repeat; /* calls in one measurement */
+	int repeat;   /* calls in one measurement */
+	bool matched; /* plans are made for the matched projector */
 };
 typedef void operation(struct bench *bench, struct error *err);
 
@@ -299,6 +300,7 @@ static void make_plan(struct bench *bench, struct sart_options *sart, int subset
 	struct plan_options options = scene_plan(&bench->scene, sart, subsets, tv, reference);
 	struct error err = {0};
 
+	options.matched = bench->matched;
 	must(backend_cuda.plan_new(device, &options, &bench->plan, &err), &err, "plan");
 }
 
@@ -350,6 +352,11 @@ static void bench_geometry(const struct bench_case *c, bool untilted)
 	backend_cuda.plan_free(bench.plan);
 	bench_sart(&bench, c, kind, 1, c->sirt_count == 1 ? "SIRT iteration" : "20 SIRT iterations", c->sirt[untilted],
 		   c->sirt_count);
+	if (c->letter == 'A' || c->letter == 'D') {
+		bench.matched = true;
+		bench_sart(&bench, c, kind, 1, "matched SIRT iteration", 0, 1);
+		bench.matched = false;
+	}
 	if (!big) {
 		bench_sart(&bench, c, kind, 10, "OS-SART iteration, 10", c->subsets[untilted], 1);
 		bench_sart(&bench, c, kind, count, "SART iteration by view", c->views[untilted], 1);

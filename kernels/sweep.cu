@@ -1,0 +1,456 @@
+/*
+ * SART view by view where the projection goes by rows (rows.cuh). The iterate
+ * stays as it is, [z][y][x]; beside it are two copies in half precision, one as
+ * slices across x and one as slices across y, whose rows are pairs of planes:
+ * [z / 2][slice][fast], a register holds the voxels 2 k and 2 k + 1 along z.
+ *
+ * Forward, a warp has 32 columns of the detector and a thread ROWS rays of one,
+ * whose way is cut into parts for several warps, since one view cannot fill the
+ * card. Pairs begin at even z: where the window of a thread begins at an odd one,
+ * they are put together anew after they were interpolated across.
+ *
+ * Back, a thread has a run of voxels along z and reads the correction through a
+ * texture over plain memory. What it writes anew is the iterate and those
+ * copies that the next view reads, one for most: a view whose rays run closer to
+ * x than to y needs the slices across x only.
+ */
+#include <cmath>
+#include <cstdlib>
+#include <type_traits>
+
+#include "kernels/rows.cuh"
+
+struct rows_view {
+	const device_view *geometry; /* of this view */
+	device_grid grid;
+	float *volume;         /* [z][y][x] */
+	__half2 *across[2];    /* pair 0, slice 0, voxel 0 of the copies across x and y */
+	int slice[2], pair[2]; /* from slice to slice, from pair to pair */
+	bool wanted[2];        /* copies that the next view reads */
+	bool rows_down;
+	int columns, rows;
+	const float *measured; /* [row][column], as the correction */
+	float *correction;
+	int measured_pitch, correction_pitch;
+	cudaTextureObject_t sampled; /* the correction, edges held */
+	float2 *partial;
+	float least; /* mm that a ray must have in the grid */
+	float relaxation;
+	bool nonnegative;
+};
+
+/* ---- forward ---- */
+
+enum { PARTS = 8 };
+
+template <int ROWS, bool LEAN>
+static __global__ void __launch_bounds__(32 * PARTS, ROWS > 4 || LEAN ? 3 : 4) project_view_rows(const rows_view s)
+{
+	__shared__ float sums[PARTS][ROWS][32];
+	__shared__ shared_ends<ROWS, 32 * PARTS> all_ends;
+	const device_view &g = *s.geometry;
+	int column = blockIdx.x * 32 + threadIdx.x, low = blockIdx.y * ROWS, part = threadIdx.y;
+	bool valid = column < s.columns;
+	float upwards = s.rows_down ? -1.0f : 1.0f, c = (float)column - 0.5f * (float)(s.columns - 1);
+	float r = upwards * ((float)low - 0.5f * (float)(s.rows - 1));
+	float d[3] = {form(g.direction[0], c, r), form(g.direction[1], c, r), form(g.direction[2], c, r)};
+	float m[3] = {form(g.moment[0], c, r), form(g.moment[1], c, r), form(g.moment[2], c, r)};
+	int own = fabsf(d[0]) >= fabsf(d[1]) ? ACROSS_X : ACROSS_Y;
+
+#pragma unroll
+	for (int k = 0; k < ROWS; k++)
+		sums[part][k][threadIdx.x] = 0;
+	for (int axis = ACROSS_X; axis <= ACROSS_Y; axis++) {
+		bool mine = valid && own == axis;
+
+		if (!__any_sync(~0u, mine))
+			continue;
+		slice_axes axes = axes_of(s.grid, axis);
+		fan f = fan_make<ROWS, LEAN>(g, d, m, axis, upwards, axes);
+		shared_row_ends<ROWS, 32 *PARTS> ends = {all_ends, part * 32 + (int)threadIdx.x};
+		float sum[ROWS] = {};
+		reach reaches = reach_of<ROWS, LEAN>(f, mine, low, s.rows, axes, ends);
+		bool hits = reaches.any_end > reaches.any_first;
+
+		if (!hits)
+			f = fan_idle(axes);
+		walk w = walk_together(hits, reaches.any_first, reaches.any_end, reaches.all_first, reaches.all_end);
+		/* This warp's part of the way. */
+		int each = (w.end - w.first + PARTS - 1) / PARTS, from = w.first + part * each;
+		int to = min(from + each, w.end), inner = min(max(w.inner_first, from), max(to, from));
+		int outer = min(max(w.inner_end, inner), max(to, inner));
+		int slice = s.slice[axis], pair = s.pair[axis];
+		half_wandering wander = half_of(wander_of(f.fast_step));
+		auto add = [&](auto guard, int first, int last) {
+			constexpr int GUARD = decltype(guard)::value, pairs = (ROWS + 3) / 2;
+			auto place = [&](float i) {
+				spread p;
+
+				p.e = fmaf(i, f.spread_step, f.spread);
+				int base = lowest_row<ROWS, GUARD>(f, i, p.e, axes, p.t);
+				float fast = fmaf(i, f.fast_step, f.fast);
+				p.odd = base & 1;
+				if (LEAN) {
+					p.lean = lean_at(f, i, p.e);
+					fast = fmaf((float)(pairs - p.odd) + 0.5f - p.t, p.lean, fast);
+				}
+				p.at = split(held<GUARD>(fast, axes), p.right) - 1 + (base >> 1) * pair;
+				return p;
+			};
+			auto sample = [&](const __half2 *at, const spread &p, const half_parts &parts,
+					  const half_parts &changes, auto other, __half2 *value) {
+				__half2 x[pairs + 1];
+
+				across_pairs<pairs + 1, LEAN, decltype(other)::value>(at + p.at, pair, 1, parts,
+										      changes, x);
+#pragma unroll
+				for (int j = 0; j < pairs; j++) {
+					__half2 shifted = __halves2half2(__high2half(x[j]), __low2half(x[j + 1]));
+
+					x[j] = p.odd ? shifted : x[j];
+				}
+				blend_rows<ROWS>(x, p.e, p.t, value);
+			};
+
+			add_pairs<ROWS, GUARD, LEAN>(s.across[axis] + (ptrdiff_t)slice * first, (size_t)slice, first,
+						     last, wander, ends, sum, place, sample);
+		};
+
+		add(std::integral_constant<int, GUARD_EACH>(), from, inner);
+		add(std::integral_constant<int, GUARD_NONE>(), inner, outer);
+		add(std::integral_constant<int, GUARD_EACH>(), outer, to);
+#pragma unroll
+		for (int k = 0; k < ROWS; k++)
+			if (mine && hits && ends.end(k) > ends.begin(k))
+				sums[part][k][threadIdx.x] = sum[k];
+	}
+	__syncthreads();
+	float2 squares = {0, 0};
+	for (int k = part; k < ROWS; k += PARTS) {
+		if (!valid || low + k >= s.rows)
+			continue;
+		float up = upwards * ((float)(low + k) - 0.5f * (float)(s.rows - 1)), sum = 0;
+		float dk[3] = {form(g.direction[0], c, up), form(g.direction[1], c, up), form(g.direction[2], c, up)};
+		float mk[3] = {form(g.moment[0], c, up), form(g.moment[1], c, up), form(g.moment[2], c, up)};
+		ray full = ray_make(crossing_of(dk, mk, own), axes_of(s.grid, own));
+		float length = fmaxf(full.end - full.begin, 0.0f) * full.step;
+		int row = s.rows_down ? s.rows - 1 - (low + k) : low + k;
+		float measured = s.measured[(size_t)row * s.measured_pitch + column], residual;
+
+		for (int j = 0; j < PARTS; j++)
+			sum += sums[j][k][threadIdx.x];
+		residual = measured - sum * full.step;
+		s.correction[(size_t)row * s.correction_pitch + column] =
+		    length >= s.least && length > 0 ? residual / length : 0.0f;
+		squares.x += residual * residual;
+		squares.y += measured * measured;
+	}
+	squares = block_sum(squares);
+	if (threadIdx.x == 0 && threadIdx.y == 0)
+		s.partial[blockIdx.y * gridDim.x + blockIdx.x] = squares;
+}
+
+/* ---- back ---- */
+
+enum { RUN = 4, WIDE = 32, HIGH = 8 };
+
+/* A pair of voxels at `fast` of a row of one copy, and all that repeats it. */
+static __device__ __forceinline__ void put_row(__half2 *at, int fast, int count, __half2 value)
+{
+	at[0] = value;
+	if (fast == 0)
+		at[-1] = at[-2] = value;
+	if (fast == count - 1)
+		at[1] = at[2] = value;
+}
+
+/* The pairs of a thread, from pair k on, at one place of a copy. */
+static __device__ __forceinline__ void put_pairs(__half2 *copy, int slice, int step, int k, int planes, int fast,
+						 int count, bool amid, const __half2 pair[RUN / 2])
+{
+	__half2 *at = copy + (slice + k * step + fast);
+
+#pragma unroll
+	for (int j = 0; j < RUN / 2; j++, at += step) {
+		if (amid) {
+			*at = pair[j];
+			continue;
+		}
+		if (2 * (k + j) >= planes)
+			return;
+		put_row(at, fast, count, pair[j]);
+		if (k + j == 0)
+			put_row(at - step, fast, count, __low2half2(pair[j]));
+		if (2 * (k + j) + 2 >= planes)
+			put_row(at + step, fast, count, __high2half2(pair[j]));
+	}
+}
+
+enum sweep_update { UPDATE_NOT, UPDATE_COVERED, UPDATE_SEEN };
+
+/*
+ * The update of RUN voxels from one view, and the copies. UPDATE_NOT: only these;
+ * UPDATE_COVERED: the view sees the whole grid; UPDATE_SEEN: what it does not see
+ * stays. UNTILTED: column and depth stay the same along z.
+ */
+template <int UPDATE, bool UNTILTED>
+static __global__ void __launch_bounds__(WIDE *HIGH) update_view_rows(const rows_view s)
+{
+	__shared__ __half2 turned[RUN / 2][WIDE][HIGH + 1];
+	int nx = s.grid.size[0], ny = s.grid.size[1], nz = s.grid.size[2];
+	int x0 = blockIdx.x * WIDE, y0 = blockIdx.y * HIGH, z = blockIdx.z * RUN;
+	int x = x0 + threadIdx.x, y = y0 + threadIdx.y;
+	/* Most blocks have nothing to ask. */
+	bool amid = x0 > 0 && y0 > 0 && z > 0 && x0 + WIDE < nx && y0 + HIGH < ny && z + RUN < nz;
+	bool inside = amid || (x < nx && y < ny);
+	size_t plane = (size_t)nx * ny;
+	float *at = s.volume + ((size_t)z * plane + (size_t)y * nx + x), value[RUN];
+	__half2 pair[RUN / 2];
+
+#pragma unroll
+	for (int k = 0; k < RUN; k++)
+		value[k] = amid || (inside && z + k < nz) ? at[k * plane] : 0.0f;
+	if (UPDATE != UPDATE_NOT) {
+		const float(&m)[3][4] = s.geometry->matrix;
+		float fx = (float)x, fy = (float)y, fz = (float)z;
+		float a = fmaf(m[0][0], fx, fmaf(m[0][1], fy, fmaf(m[0][2], fz, m[0][3])));
+		float b = fmaf(m[1][0], fx, fmaf(m[1][1], fy, fmaf(m[1][2], fz, m[1][3])));
+		float c = fmaf(m[2][0], fx, fmaf(m[2][1], fy, fmaf(m[2][2], fz, m[2][3])));
+		float w = reciprocal(c), u = a * w;
+
+#pragma unroll
+		for (int k = 0; k < RUN; k++) {
+			if (!UNTILTED && k > 0) {
+				w = reciprocal(fmaf((float)k, m[2][2], c));
+				u = fmaf((float)k, m[0][2], a) * w;
+			}
+			float v = fmaf((float)k, m[1][2], b) * w;
+			float next = fmaf(s.relaxation, tex2D<float>(s.sampled, u + 0.5f, v + 0.5f), value[k]);
+			bool seen = UPDATE == UPDATE_COVERED ||
+				    (u > -1.0f && v > -1.0f && u < (float)s.columns && v < (float)s.rows);
+
+			if (s.nonnegative)
+				next = fmaxf(next, 0.0f);
+			value[k] = seen ? next : value[k];
+		}
+#pragma unroll
+		for (int k = 0; k < RUN; k++)
+			if (amid || (inside && z + k < nz))
+				at[k * plane] = value[k];
+	}
+#pragma unroll
+	for (int j = 0; j < RUN / 2; j++)
+		pair[j] = __floats2half2_rn(value[2 * j], amid || z + 2 * j + 1 < nz ? value[2 * j + 1] : value[2 * j]);
+	if (s.wanted[ACROSS_Y] && inside)
+		put_pairs(s.across[ACROSS_Y], y * s.slice[ACROSS_Y], s.pair[ACROSS_Y], z / 2, nz, x, nx, amid, pair);
+	if (!s.wanted[ACROSS_X])
+		return;
+#pragma unroll
+	for (int j = 0; j < RUN / 2; j++)
+		turned[j][threadIdx.x][threadIdx.y] = pair[j];
+	__syncthreads();
+	int thread = threadIdx.y * WIDE + threadIdx.x, tx = thread / HIGH, ty = thread % HIGH;
+	if (x0 + tx >= nx || y0 + ty >= ny)
+		return;
+#pragma unroll
+	for (int j = 0; j < RUN / 2; j++)
+		pair[j] = turned[j][tx][ty];
+	put_pairs(s.across[ACROSS_X], (x0 + tx) * s.slice[ACROSS_X], s.pair[ACROSS_X], z / 2, nz, y0 + ty, ny, amid,
+		  pair);
+}
+
+/* ---- the sweep ---- */
+
+/* A copy: [pair][slice][fast], SLICE_HELD values held around a row, SLICE_PAD planes that can be read below and above.
+ */
+struct copy_shape {
+	int slice, pair;
+	size_t before, pairs; /* registers in front of pair 0, slice 0, voxel 0; in all */
+};
+static copy_shape copy_shape_make(const int size[3], int axis)
+{
+	int fast = axis == ACROSS_X ? size[1] : size[0];
+	copy_shape shape;
+
+	shape.slice = round_up(fast + 2 * SLICE_HELD, 8); /* rows begin on sectors */
+	shape.pair = shape.slice * size[axis];
+	shape.before = (size_t)shape.pair * (SLICE_PAD / 2) + 8;
+	shape.pairs = (size_t)shape.pair * (size_t)(size[2] / 2 + SLICE_PAD + 1) + 16;
+	return shape;
+}
+
+size_t sweep_rows_bytes(const struct plan *plan)
+{
+	return (copy_shape_make(plan->grid.size, ACROSS_X).pairs + copy_shape_make(plan->grid.size, ACROSS_Y).pairs) *
+	       sizeof(__half2);
+}
+
+/* Rows of a thread: fewer where a view would not fill the card. */
+static int rows_of(const struct plan *plan)
+{
+	const int blocks_least = 1000;
+	int rows = plan->shape.forward_rows;
+
+	return divide_up(plan->stack.columns, 32) * divide_up(plan->stack.rows, rows) < blocks_least ? 3 : rows;
+}
+
+static dim3 blocks_of(const struct plan *plan)
+{
+	return dim3(divide_up(plan->stack.columns, 32), divide_up(plan->stack.rows, rows_of(plan)));
+}
+
+size_t sweep_rows_partials(const struct plan *plan)
+{
+	dim3 blocks = blocks_of(plan);
+
+	return (size_t)blocks.x * blocks.y;
+}
+
+/*
+ * Which copies a view reads. Where the directions to all four corners of the
+ * detector are longest along the same axis and point the same way, so are all
+ * between them; the margin is above what float32 errs.
+ */
+static void wanted_by(const struct plan *plan, int index, bool ret_wanted[2])
+{
+	const struct geometry *geometry = plan->options.geometry;
+	const double *spacing = plan->options.grid->spacing, margin = 1e-3;
+	const struct view *view = &geometry->views[index];
+	int along[2] = {0, 0};
+
+	for (int corner = 0; corner < 4; corner++) {
+		double c = corner & 1 ? geometry->columns - 1 : 0, r = corner & 2 ? geometry->rows - 1 : 0, d[2];
+
+		for (int i = 0; i < 2; i++)
+			d[i] = (view->pixel0[i] + c * view->column_step[i] + r * view->row_step[i] - view->source[i]) /
+			       spacing[i];
+		for (int i = 0; i < 2; i++)
+			if (fabs(d[i]) * (1 - margin) > fabs(d[1 - i]))
+				along[i] += d[i] > 0 ? 1 : -1;
+	}
+	ret_wanted[ACROSS_X] = abs(along[ACROSS_Y]) != 4;
+	ret_wanted[ACROSS_Y] = abs(along[ACROSS_X]) != 4;
+}
+
+template <int ROWS>
+static void launch_rows(const struct plan *plan, const rows_view &s, cudaStream_t stream)
+{
+	if (plan->shape.untilted)
+		project_view_rows<ROWS, false><<<blocks_of(plan), dim3(32, PARTS), 0, stream>>>(s);
+	else
+		project_view_rows<ROWS, true><<<blocks_of(plan), dim3(32, PARTS), 0, stream>>>(s);
+}
+
+static void project_by(const struct plan *plan, const rows_view &s, cudaStream_t stream)
+{
+	switch (rows_of(plan)) {
+	case 3:
+		return launch_rows<3>(plan, s, stream);
+	case 4:
+		return launch_rows<4>(plan, s, stream);
+	case 5:
+		return launch_rows<5>(plan, s, stream);
+	default:
+		return launch_rows<6>(plan, s, stream);
+	}
+}
+
+template <int UPDATE>
+static void launch_update(const struct plan *plan, const rows_view &s, cudaStream_t stream)
+{
+	const int *size = plan->grid.size;
+	dim3 blocks(divide_up(size[0], WIDE), divide_up(size[1], HIGH), divide_up(size[2], RUN)), threads(WIDE, HIGH);
+
+	if (plan->shape.untilted)
+		update_view_rows<UPDATE, true><<<blocks, threads, 0, stream>>>(s);
+	else
+		update_view_rows<UPDATE, false><<<blocks, threads, 0, stream>>>(s);
+}
+
+static int correction_pitch(const struct plan *plan)
+{
+	return round_up(plan->stack.columns, 32);
+}
+
+size_t sweep_correction_bytes(const struct plan *plan)
+{
+	return (size_t)correction_pitch(plan) * (size_t)plan->stack.rows * sizeof(float);
+}
+
+int sweep_rows_prepare(struct plan *plan, struct error *err)
+{
+	cudaResourceDesc resource = {};
+	cudaTextureDesc sampling = {};
+
+	TRY(device_allocate(plan->device, sweep_correction_bytes(plan), (void **)&plan->sampled_from, err));
+	resource.resType = cudaResourceTypePitch2D;
+	resource.res.pitch2D.devPtr = plan->sampled_from;
+	resource.res.pitch2D.desc = cudaCreateChannelDesc<float>();
+	resource.res.pitch2D.width = (size_t)plan->stack.columns;
+	resource.res.pitch2D.height = (size_t)plan->stack.rows;
+	resource.res.pitch2D.pitchInBytes = (size_t)correction_pitch(plan) * sizeof(float);
+	sampling.addressMode[0] = sampling.addressMode[1] = cudaAddressModeClamp;
+	sampling.filterMode = cudaFilterModeLinear;
+	sampling.readMode = cudaReadModeElementType;
+	CUDA_TRY(cudaCreateTextureObject(&plan->sampled, &resource, &sampling, NULL));
+	return 0;
+}
+
+void sweep_rows_release(struct plan *plan)
+{
+	if (plan->sampled != 0)
+		cudaDestroyTextureObject(plan->sampled);
+	device_release(plan->device, plan->sampled_from, sweep_correction_bytes(plan));
+}
+
+int sweep_rows(struct plan *plan, const float *projections, float *volume, float least, const struct cancel *cancel,
+	       struct error *err)
+{
+	const int *order = plan->options.sart->subsets.order;
+	cudaStream_t stream = plan->device->stream;
+	__half2 *memory = (__half2 *)plan->scratch;
+	int count = plan->options.geometry->count;
+	rows_view s = {};
+
+	s.grid = plan->grid;
+	s.volume = volume;
+	for (int axis = ACROSS_X; axis <= ACROSS_Y; axis++) {
+		copy_shape shape = copy_shape_make(plan->grid.size, axis);
+
+		s.across[axis] = memory + shape.before;
+		s.slice[axis] = shape.slice;
+		s.pair[axis] = shape.pair;
+		memory += shape.pairs;
+	}
+	s.rows_down = plan->shape.rows_down;
+	s.columns = plan->stack.columns;
+	s.rows = plan->stack.rows;
+	s.measured_pitch = plan->stack.pitch;
+	s.correction = plan->sampled_from;
+	s.correction_pitch = correction_pitch(plan);
+	s.sampled = plan->sampled;
+	s.least = least;
+	s.relaxation = (float)plan->options.sart->relaxation;
+	s.nonnegative = plan->options.sart->nonnegative;
+	s.geometry = plan->geometry;
+	wanted_by(plan, order[0], s.wanted);
+	launch_update<UPDATE_NOT>(plan, s, stream);
+	LAUNCHED();
+	for (int i = 0; i < count; i++) {
+		TRY(cancel_check(cancel, err));
+		s.geometry = plan->geometry + order[i];
+		s.measured = projections + (size_t)order[i] * plan->stack.slot;
+		s.partial = plan->partial + (size_t)i * sweep_rows_partials(plan);
+		project_by(plan, s, stream);
+		LAUNCHED();
+		s.wanted[ACROSS_X] = s.wanted[ACROSS_Y] = false;
+		if (i + 1 < count)
+			wanted_by(plan, order[i + 1], s.wanted);
+		if (plan->shape.covered)
+			launch_update<UPDATE_COVERED>(plan, s, stream);
+		else
+			launch_update<UPDATE_SEEN>(plan, s, stream);
+		LAUNCHED();
+	}
+	return 0;
+}
