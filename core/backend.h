@@ -178,6 +178,12 @@ struct cancel {
 
 /* Of the smallest voxel spacing: what a ray must have inside the grid to correct it, see sart_iterate. */
 #define RAY_LENGTH_LEAST 0.5
+/*
+ * Likewise: what the sum of weights of a voxel counts for at least in the matched
+ * pair. Symmetric scans have rays that pass at exactly the distance where their
+ * weight ends: a voxel that rounding alone lets them touch must hardly move.
+ */
+#define COLUMN_SUM_LEAST 0.01
 
 enum backprojection { BACKPROJECT_PLAIN, BACKPROJECT_FDK /* times (D/depth)^2 */ };
 
@@ -266,7 +272,8 @@ struct backend {
 	 * `backproject`; row and column sums come from the same operators. Rays that
 	 * miss the grid and voxels that no ray of the subset sees stay as they are;
 	 * a ray that only grazes it, with less than RAY_LENGTH_LEAST of the smallest
-	 * spacing inside, counts as one that misses.
+	 * spacing inside, counts as one that misses, and the matched pair divides by
+	 * COLUMN_SUM_LEAST of that spacing at least.
 	 */
 	int (*sart_iterate)(struct plan *plan, const struct stack *projections, struct volume *volume,
 			    const struct cancel *cancel, struct sart_sums *ret_sums, struct error *err);

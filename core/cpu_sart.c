@@ -64,13 +64,14 @@ static void update_line(const struct plan *plan, const float *sums, const float 
 			size_t stride, float *voxels)
 {
 	const float relaxation = (float)plan->sart.relaxation;
+	const float least = plan->matched ? (float)(COLUMN_SUM_LEAST * plan->spacing_least) : 0;
 
 	for (int i = 0; i < count; i++) {
 		float weight = everywhere + cover[i], *voxel = &voxels[(size_t)i * stride];
 
 		if (weight > 0)
-			*voxel += relaxation * sums[i] / weight;
-		if (plan->sart.nonnegative && weight > 0 && *voxel < 0)
+			*voxel += relaxation * sums[i] / fmaxf(weight, least);
+		if (plan->sart.nonnegative && weight > least && *voxel < 0)
 			*voxel = 0;
 	}
 }

@@ -177,6 +177,9 @@ static void update_covered(const struct plan *plan, float *volume, const float *
 {
 	const bool nonnegative = plan->options.sart->nonnegative;
 	const float relaxation = (float)plan->options.sart->relaxation;
+	const double *spacing = plan->options.grid->spacing;
+	const float least =
+	    plan->options.matched ? (float)(COLUMN_SUM_LEAST * fmin(fmin(spacing[0], spacing[1]), spacing[2])) : 0;
 
 #pragma omp parallel for schedule(static)
 	for (int z = 0; z < slices; z++)
@@ -185,8 +188,8 @@ static void update_covered(const struct plan *plan, float *volume, const float *
 
 			if (!(coverage[i] > 0))
 				continue; /* no ray sees it */
-			value = volume[i] + relaxation * (sums[i] / coverage[i]);
-			volume[i] = nonnegative && value < 0 ? 0 : value;
+			value = volume[i] + relaxation * (sums[i] / fmaxf(coverage[i], least));
+			volume[i] = nonnegative && coverage[i] > least && value < 0 ? 0 : value;
 		}
 }
 
