@@ -42,11 +42,11 @@ OPTIONAL := node:nodejs npm:npm
 MODULES  := yaml:python3-yaml jsonschema:python3-jsonschema numpy:python3-numpy requests:python3-requests
 
 core_libs   := kissfft-float
-proto_libs  := libcjson libzstd libcrypto libpng
-daemon_libs := libmicrohttpd sqlite3
+proto_libs  := libcjson libzstd libpng
+daemon_libs := libmicrohttpd sqlite3 libcrypto
 # Other tools' files: the client reads and writes them, the daemon and the worker know none of them.
 files_libs  := expat libtiff-4 zlib
-cbct_libs   := libcurl $(files_libs)
+cbct_libs   := libcurl libcrypto $(files_libs)
 all_libs    := $(core_libs) $(proto_libs) $(daemon_libs) $(cbct_libs)
 
 pkg = $(shell pkg-config $(1) $(2) 2>/dev/null)
@@ -74,7 +74,7 @@ core_sources   := $(filter-out $(simd_sources),$(wildcard core/*.c))
 proto_sources  := $(wildcard proto/*.c)
 daemon_sources := $(filter-out daemon/worker.c,$(wildcard daemon/*.c))
 # What the unit tests know of the daemon: its state, without HTTP.
-state_sources  := $(wildcard daemon/store*.c) $(patsubst %,daemon/%.c,job queue document supervise spawn files id log watch)
+state_sources  := $(wildcard daemon/store*.c) $(patsubst %,daemon/%.c,job digest queue document supervise spawn files id log watch)
 cbct_sources   := $(wildcard clients/cbct/*.c)
 unit_sources   := $(wildcard tests/unit/*.c)
 
@@ -140,16 +140,19 @@ $(BUILD)/cbct-worker: $(call objects,daemon/worker.c) $(library) $(cuda_objects)
 $(BUILD)/cbct: $(call objects,$(cbct_sources)) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(cbct_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
-# A worker whose syncs can be held up, for the tests of what becomes of a volume meanwhile.
+# A worker whose syncs can be held up, and a daemon whose digests, for the tests of what becomes of a volume meanwhile.
 $(BUILD)/cbct-worker-held: $(call objects,daemon/worker.c tests/http/held.c) $(library) $(cuda_objects)
 	$(call say,LINK)$(CC) $(LDFLAGS) -Wl,--wrap=fdatasync -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(if $(cuda_objects),$(cuda_libs)) $(LIBM)
+
+$(BUILD)/cbctd-held: $(call objects,$(daemon_sources) tests/http/held.c) $(BUILD)/proto/openapi.o $(BUILD)/web/assets.o $(library)
+	$(call say,LINK)$(CC) $(LDFLAGS) -Wl,--wrap=job_digest_volume -o $@ $^ $(call pkg,--libs,$(daemon_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
 # What `cbct recon` becomes where a card is wanted.
 $(BUILD)/cbct-cuda: $(call objects,$(cbct_sources)) $(library) $(cuda_objects)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(cbct_libs) $(proto_libs) $(core_libs)) $(cuda_libs) $(LIBM)
 
 $(BUILD)/unit: $(call objects,$(unit_sources) $(state_sources)) $(library)
-	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,check sqlite3 $(files_libs) $(proto_libs) $(core_libs)) $(LIBM)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,check sqlite3 libcrypto $(files_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
 $(BUILD)/cpu-bench: $(call objects,tests/bench/bench.c) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(LIBM)
@@ -192,14 +195,14 @@ demo: setup ## a C-arm scan posted with curl, reconstructed, its volumes coming 
 	@BUILD=$(BUILD) clients/curl/demo.sh
 
 check: setup ## every test; what cannot run here is skipped aloud
-	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/unit $(BUILD)/cbct-worker-held
+	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/unit $(BUILD)/cbct-worker-held $(BUILD)/cbctd-held
 	@BUILD=$(BUILD) SANITIZED=$(SANITIZED) LEAVE_OUT="$(LEAVE_OUT)" OMP_WAIT_POLICY=passive tests/run.sh
 
 FUZZ_SECONDS ?= 10
 fuzzers := $(patsubst tests/fuzz/%.c,$(BUILD)/%,$(wildcard tests/fuzz/fuzz_*.c))
 
 $(BUILD)/fuzz_%: $(BUILD)/tests/fuzz/fuzz_%.o $(call objects,daemon/http_text.c clients/cbct/numbers.c clients/cbct/npy.c) $(library)
-	$(call say,LINK)$(CC) $(LDFLAGS) -fsanitize=fuzzer -o $@ $^ $(call pkg,--libs,$(files_libs) $(proto_libs) $(core_libs)) $(LIBM)
+	$(call say,LINK)$(CC) $(LDFLAGS) -fsanitize=fuzzer -o $@ $^ $(call pkg,--libs,libcrypto $(files_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
 fuzzers: $(fuzzers)
 

@@ -38,7 +38,7 @@ static int list_volumes(struct api *api, struct request *request, const struct p
 {
 	struct volume_record *volumes;
 	struct job_facts facts;
-	bool settled = true;
+	bool hashed = true;
 	int count, code;
 
 	job_facts(job, &facts);
@@ -48,8 +48,8 @@ static int list_volumes(struct api *api, struct request *request, const struct p
 	if (code != 0)
 		return code;
 	for (int i = 0; i < count; i++)
-		settled = settled && volumes[i].settled;
-	if (!settled && job_wait_goes_on(request))
+		hashed = hashed && volumes[i].hashed;
+	if (!hashed && job_wait_goes_on(request))
 		code = HTTP_WAIT;
 	else
 		code = reply_page(request, facts.id, page, volumes, count, err);

@@ -217,7 +217,7 @@ cJSON *volume_document(const char *job, const struct volume_record *volume)
 	cJSON_AddItemToObject(document, "spacing_mm", cJSON_CreateDoubleArray(volume->grid.spacing, 3));
 	cJSON_AddItemToObject(document, "origin_mm", cJSON_CreateDoubleArray(volume->grid.origin, 3));
 	cJSON_AddNumberToObject(document, "bytes", (double)volume->bytes);
-	if (volume->settled)
+	if (volume->hashed)
 		add_digest(document, volume->sha256);
 	statistics = cJSON_AddObjectToObject(document, "statistics");
 	cJSON_AddNumberToObject(statistics, "minimum", volume->norms.minimum);

@@ -12,8 +12,8 @@
 
 #include "daemon/document.h"
 #include "daemon/log.h"
+#include "proto/durable.h"
 #include "proto/json.h"
-#include "proto/saver.h"
 #include "proto/spool.h"
 
 /* The one table of transitions: [from][to]. */
@@ -1102,43 +1102,27 @@ int job_add_volume(struct job *job, const struct volume_record *volume, struct e
 	return code;
 }
 
-int job_settle_volume(struct job *job, const char *name, const uint8_t sha256[32], struct error *err)
+int job_digest_volume(struct job *job, const struct volume_record *volume, struct error *err)
 {
-	int code = store_job_settle_volume(job->jobs->store, job->id, name, sha256, err);
+	int code = store_job_digest_volume(job->jobs->store, job->id, volume, err);
 
 	if (code == 0)
 		wake(job);
 	return code;
 }
 
-int job_unsettled(struct job *job, bool *ret_unsettled, struct error *err)
-{
-	struct volume_record *volumes;
-	bool unsettled = false;
-	int count, code = store_job_volumes(job->jobs->store, job->id, &volumes, &count, err);
-
-	if (code != 0)
-		return code;
-	for (int i = 0; i < count; i++)
-		unsettled |= !volumes[i].settled;
-	free(volumes);
-	*ret_unsettled = unsettled;
-	return 0;
-}
-
-static int settle_one(struct job *job, const struct volume_record *volume, struct error *err)
+static int settle_one(struct job *job, const char *name, struct error *err)
 {
 	struct store *store = job->jobs->store;
-	uint8_t sha256[32];
 	struct error why;
 	char path[1024];
 	int code;
 
-	store_volume_path(store, job->id, volume->name, path);
-	if (saver_settle(path, SPOOL_VOLUME_OFFSET, sha256, &why) == 0)
-		return job_settle_volume(job, volume->name, sha256, err);
-	log_line(LEVEL_ERROR, "job %s: its volume %s is lost: %s", job->id, volume->name, why.text);
-	code = store_job_remove_volume(store, job->id, volume->name, err);
+	store_volume_path(store, job->id, name, path);
+	if (durable_settle_named(path, &why) == 0)
+		return 0;
+	log_line(LEVEL_ERROR, "job %s: its volume %s is lost: %s", job->id, name, why.text);
+	code = store_job_remove_volume(store, job->id, name, err);
 	if (code == 0)
 		unlink(path);
 	return code;
@@ -1152,8 +1136,8 @@ int job_settle(struct job *job, struct error *err)
 	if (code != 0)
 		return code;
 	for (int i = 0; i < count && code == 0; i++) {
-		if (!volumes[i].settled)
-			code = settle_one(job, &volumes[i], err);
+		if (!volumes[i].hashed)
+			code = settle_one(job, volumes[i].name, err);
 	}
 	free(volumes);
 	return code;

@@ -144,13 +144,15 @@ void job_set_plan(struct job *job, const struct recon_memory *memory, const char
 /* Memory only, until the next change of state. */
 void job_progress(struct job *job, enum stage stage, int iteration, double fraction);
 int job_add_row(struct job *job, const struct history_row *row, struct error *err);
-/* A volume whose file is there; then that it is on the disk, which must come before the job's end. */
+/* A volume whose file is there; before its job ends, or is queued again, it must be on the disk. */
 int job_add_volume(struct job *job, const struct volume_record *volume, struct error *err);
-int job_settle_volume(struct job *job, const char *name, const uint8_t sha256[32], struct error *err);
-/* Whether some are not settled: their worker did not live to do it. */
-int job_unsettled(struct job *job, bool *ret_unsettled, struct error *err);
-/* Does it in its place; a file that cannot be is removed. Any thread; waits for the disk, with no lock held. */
+/*
+ * For a worker that did not live to do it: what has no digest reaches the disk; a file that cannot is removed. Any
+ * thread; waits for the disk, with no lock held.
+ */
 int job_settle(struct job *job, struct error *err);
+/* See store_job_digest_volume. */
+int job_digest_volume(struct job *job, const struct volume_record *volume, struct error *err);
 int job_add_warning(struct job *job, const char *code, const char *detail, struct error *err);
 
 #endif

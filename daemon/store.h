@@ -20,7 +20,8 @@
  * A call that returns 0 has its change on the disk. The order is always: files
  * first, synced, then the row; and on the way out: the row, then the files. So
  * a crash leaves at most files that no row knows, and store_open removes them.
- * A volume's row comes before its file is synced, and says so (settled).
+ * A volume's row comes before its file is synced, which its job waits for before
+ * it ends or is queued again, and before its digest, which nobody waits for.
  *
  * Threads: every function may be called from any thread. Writing calls wait for
  * one commit at a time (about 0.3 ms each); reading calls never wait for them.
@@ -217,7 +218,7 @@ struct volume_record {
 	int iteration;
 	struct grid grid;
 	size_t bytes;       /* of the voxels */
-	bool settled;       /* its file is on the disk, and this is known: */
+	bool hashed;        /* this is known, and its file is on the disk: */
 	uint8_t sha256[32]; /* of the voxels */
 	struct volume_norms norms;
 	double created; /* seconds since 1970; another one when it is made again */
@@ -257,14 +258,16 @@ int store_job_add_row(struct store *store, const char *id, const struct history_
 		      struct error *err);
 /*
  * A volume whose file everybody can read, but which a power cut may still take: a
- * row without a digest. The job must not end before it is settled; what is not
- * at the start is removed, and its job, which has not ended, makes it again.
+ * row without a digest. The job must not end, nor be queued again, before it is on
+ * the disk: at the start, of a job that runs or waits, it is removed, and made again.
  */
 int store_job_add_volume(struct store *store, const char *id, const struct volume_record *volume,
 			 const struct event *event, struct error *err);
-/* Its file is on the disk. */
-int store_job_settle_volume(struct store *store, const char *id, const char *name, const uint8_t sha256[32],
-			    struct error *err);
+/* Its digest; nothing when it was made again since, or is gone. Its file is on the disk. */
+int store_job_digest_volume(struct store *store, const char *id, const struct volume_record *volume, struct error *err);
+/* The jobs that have volumes without a digest. */
+int store_jobs_undigested(struct store *store, void (*visit)(void *context, const char *id), void *context,
+			  struct error *err);
 /* The row; then the file may go. */
 int store_job_remove_volume(struct store *store, const char *id, const char *name, struct error *err);
 /* *ret_new false, and no event, when this very warning is there already. */

@@ -284,7 +284,7 @@ int store_job_add_volume(struct store *store, const char *id, const struct volum
 	for (int i = 0; i < 3; i++)
 		query_real(&query, volume->grid.origin[i]);
 	query_integer(&query, (long long)volume->bytes);
-	query_blob(&query, volume->sha256, volume->settled ? (int)sizeof(volume->sha256) : 0);
+	query_blob(&query, volume->sha256, volume->hashed ? (int)sizeof(volume->sha256) : 0);
 	query_real(&query, volume->norms.norm2);
 	query_real(&query, volume->norms.difference2);
 	query_real(&query, volume->norms.tv);
@@ -299,8 +299,7 @@ int store_job_add_volume(struct store *store, const char *id, const struct volum
 	return store_end(store, code, err);
 }
 
-int store_job_settle_volume(struct store *store, const char *id, const char *name, const uint8_t sha256[32],
-			    struct error *err)
+int store_job_digest_volume(struct store *store, const char *id, const struct volume_record *volume, struct error *err)
 {
 	struct query query;
 	int code = store_begin(store, err);
@@ -308,11 +307,13 @@ int store_job_settle_volume(struct store *store, const char *id, const char *nam
 	if (code != 0)
 		return code;
 	query_begin(&query, &store->writer,
-		    "UPDATE volumes SET sha256 = ? WHERE job = (SELECT number FROM jobs WHERE id = ?) AND name = ?",
+		    "UPDATE volumes SET sha256 = ? WHERE job = (SELECT number FROM jobs WHERE id = ?) AND name = ?"
+		    " AND created = ?",
 		    err);
-	query_blob(&query, sha256, 32);
+	query_blob(&query, volume->sha256, sizeof(volume->sha256));
 	query_text(&query, id);
-	query_text(&query, name);
+	query_text(&query, volume->name);
+	query_real(&query, volume->created);
 	return store_end(store, query_run(&query), err);
 }
 
@@ -500,7 +501,7 @@ static void read_volume(struct query *query, void *element)
 		volume->grid.origin[i] = sqlite3_column_double(row, 9 + i);
 	}
 	volume->bytes = (size_t)sqlite3_column_int64(row, 12);
-	volume->settled = sqlite3_column_bytes(row, 13) == (int)sizeof(volume->sha256);
+	volume->hashed = sqlite3_column_bytes(row, 13) == (int)sizeof(volume->sha256);
 	column_bytes(query, 13, volume->sha256, sizeof(volume->sha256));
 	volume->norms.norm2 = column_real(query, 14);
 	volume->norms.difference2 = column_real(query, 15);
@@ -596,6 +597,26 @@ int store_job_warnings(struct store *store, const char *id, struct warning_recor
 	return code;
 }
 
+int store_jobs_undigested(struct store *store, void (*visit)(void *context, const char *id), void *context,
+			  struct error *err)
+{
+	struct query query;
+	char id[ID_SIZE];
+
+	pthread_mutex_lock(&store->reader.lock);
+	query_begin(&query, &store->reader,
+		    "SELECT id FROM jobs WHERE number IN (SELECT job FROM volumes WHERE length(sha256) = 0)"
+		    " ORDER BY number",
+		    err);
+	while (query_row(&query)) {
+		column_text(&query, 0, id, sizeof(id));
+		visit(context, id);
+	}
+	query_end(&query);
+	pthread_mutex_unlock(&store->reader.lock);
+	return query.code;
+}
+
 void event_records_free(struct event_record *events, int count)
 {
 	for (int i = 0; i < count; i++)
@@ -674,9 +695,9 @@ int store_load_last_event(struct store *store, struct error *err)
 }
 
 /*
- * Volumes that were told of and may not be whole on the disk. A checkpoint may be
- * of a later iteration than the catalogue knows: a run that went on from there
- * would not make them again.
+ * Volumes that were told of and may not be whole on the disk: their job was not
+ * through with them. A checkpoint may be of a later iteration than the catalogue
+ * knows: a run that went on from there would not make them again.
  */
 static int remove_unsettled(struct store *store, const char *id, struct volume_record *volumes, int *count,
 			    struct error *err)
@@ -684,7 +705,7 @@ static int remove_unsettled(struct store *store, const char *id, struct volume_r
 	int kept = 0, code = 0;
 
 	for (int i = 0; i < *count && code == 0; i++) {
-		if (volumes[i].settled) {
+		if (volumes[i].hashed) {
 			volumes[kept++] = volumes[i];
 			continue;
 		}
@@ -742,16 +763,20 @@ static void check_volumes(const struct sweep *sweep)
 	}
 }
 
-static int job_is_known(struct store *store, const char *id, bool *ret_known, struct error *err)
+/* *ret_at_work: it is, or was, with a worker. */
+static int job_is_known(struct store *store, const char *id, bool *ret_known, bool *ret_at_work, struct error *err)
 {
 	struct query query;
-	bool known;
+	bool known, at_work;
 
-	query_begin(&query, &store->reader, "SELECT 1 FROM jobs WHERE id = ?", err);
+	query_begin(&query, &store->reader, "SELECT state IN ('waiting', 'running') FROM jobs WHERE id = ?", err);
 	query_text(&query, id);
 	known = query_row(&query);
-	if (query_end(&query) == 0)
+	at_work = known && sqlite3_column_int(query.statement, 0) != 0;
+	if (query_end(&query) == 0) {
 		*ret_known = known;
+		*ret_at_work = at_work;
+	}
 	return query.code;
 }
 
@@ -759,13 +784,13 @@ static int sweep_directory(void *context, const char *name, struct error *err)
 {
 	struct sweep sweep = {.store = context, .id = name};
 	char path[1024];
-	bool known = false;
+	bool known = false, at_work = false;
 	int code;
 
 	if (!id_valid(name))
 		return 0; /* not ours */
 	store_job_directory(sweep.store, name, path);
-	code = job_is_known(sweep.store, name, &known, err);
+	code = job_is_known(sweep.store, name, &known, &at_work, err);
 	if (code != 0)
 		return code;
 	if (!known) {
@@ -775,7 +800,8 @@ static int sweep_directory(void *context, const char *name, struct error *err)
 	code = store_job_volumes(sweep.store, name, &sweep.volumes, &sweep.count, err);
 	if (code != 0)
 		return code;
-	code = remove_unsettled(sweep.store, name, sweep.volumes, &sweep.count, err);
+	if (at_work)
+		code = remove_unsettled(sweep.store, name, sweep.volumes, &sweep.count, err);
 	if (code == 0) {
 		check_volumes(&sweep);
 		code = directory_visit(path, sweep_file, &sweep, err);

@@ -20,6 +20,7 @@
 #include <time.h>
 #include <unistd.h>
 
+#include "daemon/digest.h"
 #include "daemon/document.h"
 #include "daemon/files.h"
 #include "daemon/log.h"
@@ -83,6 +84,7 @@ struct worker {
 	struct job *job; /* reference; NULL: none */
 	struct queue_running running;
 	int checkpoint; /* that it began from */
+	int unsettled;  /* volumes that it has told of and that are not on the disk, as far as it said */
 	bool cancelling, yielding;
 	/* While its job waits for the rest of its projections: the scan, a reference; NULL otherwise. */
 	struct stored_scan *arriving;
@@ -96,7 +98,8 @@ struct worker {
 };
 
 struct supervise {
-	struct jobs *jobs; /* constant, as the next four */
+	struct jobs *jobs; /* constant, as the next five */
+	struct digester *digester;
 	char worker[1024], backend[16];
 	struct supervise_options options;
 	int count;
@@ -217,19 +220,23 @@ static void *run_settler(void *context)
 static int settle(struct supervise *supervise, struct worker *worker, bool *ret_wait, struct error *err)
 {
 	struct settler *settler = &worker->settler;
-	bool unsettled = false;
+	struct job_facts facts;
 	int code;
 
 	*ret_wait = false;
 	if (settler->running) {
 		pthread_join(settler->thread, NULL);
 		settler->running = false;
-		*err = settler->err;
-		return settler->code;
+		if (settler->code != 0) {
+			*err = settler->err;
+			return settler->code;
+		}
+		worker->unsettled = 0;
+		job_facts(worker->job, &facts);
+		digester_add(supervise->digester, facts.id, NULL);
 	}
-	code = job_unsettled(worker->job, &unsettled, err);
-	if (code != 0 || !unsettled)
-		return code;
+	if (worker->unsettled == 0)
+		return 0;
 	*settler = (struct settler){.supervise = supervise, .job = worker->job};
 	code = pthread_create(&settler->thread, NULL, run_settler, settler);
 	if (code != 0)
@@ -489,10 +496,12 @@ static void on_message(struct supervise *supervise, struct worker *worker, const
 		code = job_add_row(worker->job, &message->row, &err);
 		break;
 	case MESSAGE_VOLUME:
+		worker->unsettled++;
 		code = add_volume(worker, message, &err);
 		break;
 	case MESSAGE_SETTLED:
-		code = job_settle_volume(worker->job, message->name, message->sha256, &err);
+		worker->unsettled--;
+		digester_add(supervise->digester, message->job, message->name);
 		break;
 	case MESSAGE_WARNING:
 		code = job_add_warning(worker->job, message->code_name, message->text, &err);
@@ -660,6 +669,7 @@ static void begin(struct supervise *supervise, struct worker *worker, struct job
 	worker->job = job_reference(job);
 	worker->running = (struct queue_running){.priority = record->priority, .ticket = record->ticket};
 	worker->checkpoint = record->checkpoint;
+	worker->unsettled = 0;
 	worker->cancelling = worker->yielding = false;
 	worker->failure_code = 0;
 	worker->told = worker->taken = 0;
@@ -1095,6 +1105,11 @@ int supervise_start(struct jobs *jobs, const struct supervise_options *options, 
 	supervise->jobs = jobs;
 	supervise->stop_by = NEVER;
 	set_options(supervise, options);
+	/* A worker makes them hardly faster than a processor hashes them. */
+	if (digester_start(jobs, supervise->count, &supervise->digester, err) != 0) {
+		free(supervise);
+		return err->code;
+	}
 	for (int i = 0; i < supervise->count; i++) {
 		supervise->workers[i] =
 		    (struct worker){.index = i, .child = {.pidfd = -1, .socket = -1}, .deadline = NEVER};
@@ -1120,6 +1135,7 @@ int supervise_start(struct jobs *jobs, const struct supervise_options *options, 
 	close(supervise->wake);
 out:
 	pthread_mutex_destroy(&supervise->lock);
+	digester_stop(supervise->digester);
 	free(supervise);
 	return error_set_errno(err, result, "supervisor");
 }
@@ -1137,6 +1153,7 @@ void supervise_stop(struct supervise *supervise)
 	jobs_unwatch(supervise->jobs, &supervise->jobs_watch);
 	close(supervise->wake);
 	pthread_mutex_destroy(&supervise->lock);
+	digester_stop(supervise->digester);
 	free(supervise);
 }
 

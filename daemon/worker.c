@@ -219,12 +219,11 @@ static int on_volume(void *context, const struct kept_volume *volume, const stru
 	return report(context, &message) == 0 ? 0 : error_set(err, ERR_CANCELLED, "the daemon is gone");
 }
 
-static int on_settled(void *context, const char *name, const uint8_t sha256[32], struct error *err)
+static int on_settled(void *context, const char *name, struct error *err)
 {
 	struct message message = {.kind = MESSAGE_SETTLED};
 
 	snprintf(message.name, sizeof(message.name), "%s", name);
-	memcpy(message.sha256, sha256, sizeof(message.sha256));
 	return report(context, &message) == 0 ? 0 : error_set(err, ERR_CANCELLED, "the daemon is gone");
 }
 

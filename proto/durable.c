@@ -104,6 +104,15 @@ int durable_settle(struct durable *d, struct error *err)
 	return code != 0 ? code : durable_sync_names(d->path, err);
 }
 
+int durable_settle_named(const char *path, struct error *err)
+{
+	struct durable d = {.file = open(path, O_RDONLY | O_CLOEXEC), .path = path};
+
+	if (d.file < 0)
+		return error_set_errno(err, errno, "%s cannot be opened", path);
+	return durable_settle(&d, err);
+}
+
 int durable_write(struct durable *d, const void *from, size_t size, struct error *err)
 {
 	for (size_t done = 0; done < size;) {

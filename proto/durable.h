@@ -39,6 +39,8 @@ void durable_abandon(struct durable *d);
  */
 int durable_name(struct durable *d, struct error *err);
 int durable_settle(struct durable *d, struct error *err);
+/* A named file whose process ended before it was settled. */
+int durable_settle_named(const char *path, struct error *err);
 
 /* Another name for a file; *ret_linked false where the file system knows no links. */
 int durable_link(const char *from, const char *path, bool *ret_linked, struct error *err);

@@ -26,7 +26,6 @@ enum field_type {
 	FIELD_SIZE,
 	FIELD_BOOL,
 	FIELD_STAGE,
-	FIELD_DIGEST,
 	FIELD_BITS,
 	FIELD_RUNS,
 	FIELD_GRID,
@@ -96,8 +95,7 @@ static const struct field volume_fields[] = {FIELD("job", FIELD_STRING, job),
 					     FIELD("mean", FIELD_NUMBER, norms.mean),
 					     FIELD("not_finite", FIELD_SIZE, norms.not_finite),
 					     {0}};
-static const struct field settled_fields[] = {
-    FIELD("job", FIELD_STRING, job), FIELD("name", FIELD_STRING, name), FIELD("sha256", FIELD_DIGEST, sha256), {0}};
+static const struct field settled_fields[] = {FIELD("job", FIELD_STRING, job), FIELD("name", FIELD_STRING, name), {0}};
 static const struct field warning_fields[] = {
     FIELD("job", FIELD_STRING, job), FIELD("code", FIELD_STRING, code_name), FIELD("detail", FIELD_STRING, text), {0}};
 static const struct field ended_fields[] = {FIELD("job", FIELD_STRING, job),
@@ -145,14 +143,14 @@ bool projection_runs_add(struct projection_runs *runs, int projection)
 
 /* ---- writing ---- */
 
-/* Two digits a byte; zero bytes at the end are left out down to `least`. */
-static cJSON *bytes_json(const uint8_t *bytes, size_t count, size_t least)
+/* Two digits a byte; zero bytes at the end are left out. */
+static cJSON *bytes_json(const uint8_t *bytes, size_t count)
 {
 	static const char digits[] = "0123456789abcdef";
 	cJSON *json;
 	char *text;
 
-	while (count > least && bytes[count - 1] == 0)
+	while (count > 0 && bytes[count - 1] == 0)
 		count--;
 	text = malloc(2 * count + 1);
 	if (text == NULL)
@@ -209,10 +207,8 @@ static cJSON *field_json(const struct field *field, const struct message *messag
 		return cJSON_CreateBool(*(const bool *)at);
 	case FIELD_STAGE:
 		return cJSON_CreateString(stage_names[*(const enum stage *)at]);
-	case FIELD_DIGEST:
-		return bytes_json(at, field->size, field->size);
 	case FIELD_BITS:
-		return bytes_json(at, field->size, 0);
+		return bytes_json(at, field->size);
 	case FIELD_RUNS:
 		return runs_json(at);
 	case FIELD_GRID:
@@ -291,16 +287,17 @@ static int hex_digit(char c)
 	return c >= 'a' && c <= 'f' ? c - 'a' + 10 : -1;
 }
 
-/* least .. size bytes, two digits each; those that are not there are zero. */
-static void read_bytes(struct json_reader *reader, const char *name, size_t least, size_t size, uint8_t *ret)
+/* Two digits each; those that are not there are zero. */
+static void read_bytes(struct json_reader *reader, const char *name, size_t size, uint8_t *ret)
 {
 	const cJSON *member = json_member(reader, name, true);
 	size_t length = cJSON_IsString(member) ? strlen(member->valuestring) : 0;
 
 	if (member == NULL)
 		return;
-	if (!cJSON_IsString(member) || length % 2 != 0 || length < 2 * least || length > 2 * size) {
-		json_fail(reader, ERR_INVALID, name, "%zu to %zu hexadecimal digits are expected", 2 * least, 2 * size);
+	if (!cJSON_IsString(member) || length % 2 != 0 || length > 2 * size) {
+		json_fail(reader, ERR_INVALID, name, "at most %zu hexadecimal digits are expected, two for each byte",
+			  2 * size);
 		return;
 	}
 	memset(ret, 0, size);
@@ -416,11 +413,8 @@ static void read_field(struct json_reader *reader, const struct field *field, st
 	case FIELD_BOOL:
 		json_bool(reader, field->name, true, at);
 		break;
-	case FIELD_DIGEST:
-		read_bytes(reader, field->name, field->size, field->size, at);
-		break;
 	case FIELD_BITS:
-		read_bytes(reader, field->name, 0, field->size, at);
+		read_bytes(reader, field->name, field->size, at);
 		break;
 	case FIELD_RUNS:
 		read_runs(reader, field->name, at);

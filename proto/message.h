@@ -30,7 +30,7 @@ enum message_kind {
 	MESSAGE_PROGRESS, /* job, stage, iteration, fraction */
 	MESSAGE_ROW,      /* job, row */
 	MESSAGE_VOLUME,   /* job, name, stage, iteration, bytes, norms: the file is there, whole, for everybody */
-	MESSAGE_SETTLED,  /* job, name, sha256: that file is on the disk; before the job ends, but for what failed */
+	MESSAGE_SETTLED,  /* job, name: that file is on the disk; before the job ends, but for what failed */
 	MESSAGE_WARNING,  /* job, code, detail */
 	MESSAGE_ENDED,    /* job, code (0, ERR_CANCELLED, ERR_BUSY = yielded at `iteration`, or what failed), text */
 	MESSAGE_KIND_COUNT
@@ -66,7 +66,6 @@ struct message {
 	struct grid grid;
 	struct volume_norms norms;
 	size_t bytes;
-	uint8_t sha256[32];
 	char code_name[64], text[512]; /* WARNING: code and detail; ENDED: text */
 	int code;
 };

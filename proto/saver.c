@@ -11,7 +11,6 @@
 
 #include <errno.h>
 #include <fcntl.h>
-#include <openssl/evp.h>
 #include <pthread.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -23,7 +22,7 @@
 #include "proto/durable.h"
 
 enum {
-	PIECE_BYTES = 8 << 20, /* populated or hashed in one go */
+	PIECE_BYTES = 8 << 20, /* populated or written back in one go */
 	PREPARERS = 4          /* the kernel's own work on pages does not get faster with more */
 };
 
@@ -37,22 +36,17 @@ struct saver {
 	pthread_mutex_t lock; /* guards what follows */
 	pthread_cond_t changed;
 	size_t given; /* bytes of the file, its header included */
-	size_t hashed_to;
-	bool ended, abandoned;
-	bool hashed, synced;
-	struct error hash_error, sync_error;
+	bool ended, abandoned, synced;
+	struct error trouble;
 	size_t taken; /* bytes of `blank` that the preparers have populated, or are about to */
 	bool enough;  /* they shall stop */
 	bool refused; /* the disk had no pages for all of it */
 
-	/* The caller's own; while a file is under way its threads read them. */
+	/* The caller's own; while a file is under way its thread reads them. */
 	bool busy;
 	char path[PATH_MAX];
 	struct mapped file;
-	size_t header;
-	EVP_MD_CTX *digest;
-	uint8_t sha256[32];
-	pthread_t hasher, syncer;
+	pthread_t syncer;
 
 	struct mapped blank;
 	char blank_path[PATH_MAX];
@@ -163,7 +157,7 @@ void saver_prepare(struct saver *saver, const char *path, size_t bytes)
 		saver->preparing++;
 }
 
-/* ---- the two threads of a file ---- */
+/* ---- the thread of a file ---- */
 
 static void let_go(const struct mapped *mapped, size_t first, size_t end)
 {
@@ -173,80 +167,62 @@ static void let_go(const struct mapped *mapped, size_t first, size_t end)
 		madvise(mapped->bytes + first, end - first, MADV_DONTNEED); /* a hint; the file has the bytes */
 }
 
-/* Called with the lock, which is not held over the work. False when there is nothing more. */
-static bool hash_some(struct saver *saver, size_t *at)
+/*
+ * Waits for bytes behind `at`: whole pages, until the last have come, since a page that goes to the disk may not be
+ * filled meanwhile. False when nothing more comes. Called with the lock.
+ */
+static bool await_bytes(struct saver *saver, size_t at, size_t *ret_end)
 {
-	size_t bytes;
-	bool ok;
-
-	while (*at == saver->given && !saver->ended && !saver->abandoned)
+	while (page_of(saver->given) == at && !saver->ended && !saver->abandoned)
 		pthread_cond_wait(&saver->changed, &saver->lock);
-	bytes = smaller(PIECE_BYTES, saver->given - *at);
-	if (saver->abandoned || bytes == 0)
-		return false;
-	pthread_mutex_unlock(&saver->lock);
-	ok = EVP_DigestUpdate(saver->digest, saver->file.bytes + *at, bytes) == 1;
-	let_go(&saver->file, *at, *at + bytes);
-	pthread_mutex_lock(&saver->lock);
-	*at += bytes;
-	saver->hashed_to = *at;
-	pthread_cond_broadcast(&saver->changed);
-	if (!ok)
-		error_set(&saver->hash_error, ERR_INTERNAL, "SHA-256 failed");
-	return true;
-}
-
-static void *hash_loop(void *context)
-{
-	struct saver *saver = context;
-	size_t at = saver->header;
-
-	pthread_mutex_lock(&saver->lock);
-	while (hash_some(saver, &at))
-		;
-	if (EVP_DigestFinal_ex(saver->digest, saver->sha256, NULL) != 1)
-		error_set(&saver->hash_error, ERR_INTERNAL, "SHA-256 failed");
-	saver->hashed = true;
-	pthread_cond_broadcast(&saver->changed);
-	pthread_mutex_unlock(&saver->lock);
-	return NULL;
+	*ret_end = saver->ended ? saver->given : page_of(saver->given);
+	return !saver->abandoned && *ret_end > at;
 }
 
 /*
- * Behind the hasher, which keeps the disk busy without filling its queue at once:
- * what others sync meanwhile, that this file is there to begin with, must not
- * wait for all of it.
+ * Begins with the bytes from `at` on and waits for those from `before` to there:
+ * two pieces keep the disk busy, and what others sync meanwhile, that this file
+ * is there to begin with, does not wait for all of it.
  */
-static void write_back(struct saver *saver)
+static int write_back(const struct durable *file, size_t before, size_t at, size_t end, struct error *err)
 {
-	size_t at = 0;
-
-	pthread_mutex_lock(&saver->lock);
-	while (!saver->hashed) {
-		size_t to = saver->hashed_to;
-
-		if (to == at) {
-			pthread_cond_wait(&saver->changed, &saver->lock);
-			continue;
-		}
-		pthread_mutex_unlock(&saver->lock);
-		/* A hint: file systems without it write all of it at the end. */
-		sync_file_range(saver->file.file.file, (off_t)at, (off_t)(to - at), SYNC_FILE_RANGE_WRITE);
-		at = to;
-		pthread_mutex_lock(&saver->lock);
-	}
-	pthread_mutex_unlock(&saver->lock);
+	/* A hint: what is not begun here, the sync at the end does. */
+	sync_file_range(file->file, (off_t)at, (off_t)(end - at), SYNC_FILE_RANGE_WRITE);
+	/* An error that is told here is not told again. */
+	if (at > before &&
+	    sync_file_range(file->file, (off_t)before, (off_t)(at - before), SYNC_FILE_RANGE_WAIT_AFTER) != 0 &&
+	    errno != ENOSYS)
+		return error_set_errno(err, errno, "%s cannot be synced", file->path);
+	return 0;
 }
 
-static void *sync_file(void *context)
+static void *sync_loop(void *context)
 {
 	struct saver *saver = context;
-	struct error err = {0};
+	struct error err = {0}, ignored;
+	size_t before = 0, at = 0, gone = 0, given;
+	bool abandoned;
 
-	write_back(saver);
-	durable_settle(&saver->file.file, &err);
 	pthread_mutex_lock(&saver->lock);
-	saver->sync_error = err;
+	while (await_bytes(saver, at, &given)) {
+		size_t end = smaller(at + PIECE_BYTES, given);
+
+		pthread_mutex_unlock(&saver->lock);
+		let_go(&saver->file, gone, given);
+		gone = given;
+		if (err.code == 0)
+			write_back(&saver->file.file, before, at, end, &err);
+		before = at;
+		at = end;
+		pthread_mutex_lock(&saver->lock);
+	}
+	abandoned = saver->abandoned;
+	pthread_mutex_unlock(&saver->lock);
+	if (abandoned)
+		return NULL;
+	durable_settle(&saver->file.file, err.code == 0 ? &err : &ignored);
+	pthread_mutex_lock(&saver->lock);
+	saver->trouble = err;
 	saver->synced = true;
 	pthread_cond_broadcast(&saver->changed);
 	pthread_mutex_unlock(&saver->lock);
@@ -259,26 +235,22 @@ int saver_new(struct saver **ret_saver, struct error *err)
 {
 	struct saver *saver = calloc(1, sizeof(*saver));
 
-	if (saver != NULL)
-		saver->digest = EVP_MD_CTX_new();
-	if (saver == NULL || saver->digest == NULL) {
-		free(saver);
+	if (saver == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a saver");
-	}
 	pthread_mutex_init(&saver->lock, NULL);
 	pthread_cond_init(&saver->changed, NULL);
 	*ret_saver = saver;
 	return 0;
 }
 
-/* The hasher is told, and gone on return. */
+/* Its thread is told, and gone on return. */
 static void drop_file(struct saver *saver)
 {
 	pthread_mutex_lock(&saver->lock);
 	saver->abandoned = true;
 	pthread_cond_broadcast(&saver->changed);
 	pthread_mutex_unlock(&saver->lock);
-	pthread_join(saver->hasher, NULL);
+	pthread_join(saver->syncer, NULL);
 	unmap(&saver->file);
 	durable_abandon(&saver->file.file);
 	saver->busy = false;
@@ -286,12 +258,11 @@ static void drop_file(struct saver *saver)
 
 void saver_abandon(struct saver *saver)
 {
-	uint8_t ignored[32];
-	struct error err;
+	struct error ignored;
 	bool done;
 
 	if (saver->busy && saver->ended)
-		saver_finish(saver, true, &done, ignored, &err);
+		saver_finish(saver, true, &done, &ignored);
 	else if (saver->busy)
 		drop_file(saver);
 }
@@ -302,7 +273,6 @@ void saver_free(struct saver *saver)
 		return;
 	saver_abandon(saver);
 	drop_blank(saver);
-	EVP_MD_CTX_free(saver->digest);
 	pthread_cond_destroy(&saver->changed);
 	pthread_mutex_destroy(&saver->lock);
 	free(saver);
@@ -333,22 +303,19 @@ int saver_begin(struct saver *saver, const char *path, const void *header, size_
 	void *place;
 
 	snprintf(saver->path, sizeof(saver->path), "%s", path);
-	if (EVP_DigestInit_ex(saver->digest, EVP_sha256(), NULL) != 1)
-		return error_set(err, ERR_NO_MEMORY, "no memory for SHA-256");
 	code = take_file(saver, length + bytes, err);
 	if (code != 0)
 		return code;
-	saver->given = saver->hashed_to = 0;
-	saver->header = length;
+	saver->given = 0;
 	code = saver_piece(saver, length, &place, err);
 	if (code == 0) {
 		memcpy(place, header, length);
 		saver->given = length;
-		saver->hash_error = saver->sync_error = (struct error){0};
-		saver->ended = saver->abandoned = saver->hashed = saver->synced = false;
-		result = pthread_create(&saver->hasher, NULL, hash_loop, saver);
+		saver->trouble = (struct error){0};
+		saver->ended = saver->abandoned = saver->synced = false;
+		result = pthread_create(&saver->syncer, NULL, sync_loop, saver);
 		if (result != 0)
-			code = error_set_errno(err, result, "thread that hashes volumes");
+			code = error_set_errno(err, result, "thread that syncs volumes");
 	}
 	if (code != 0) {
 		unmap(&saver->file);
@@ -380,7 +347,7 @@ void saver_give(struct saver *saver, size_t bytes)
 
 int saver_end(struct saver *saver, struct error *err)
 {
-	int code = durable_name(&saver->file.file, err), result;
+	int code = durable_name(&saver->file.file, err);
 
 	if (code != 0) {
 		drop_file(saver);
@@ -390,83 +357,24 @@ int saver_end(struct saver *saver, struct error *err)
 	saver->ended = true;
 	pthread_cond_broadcast(&saver->changed);
 	pthread_mutex_unlock(&saver->lock);
-	result = pthread_create(&saver->syncer, NULL, sync_file, saver);
-	if (result != 0) {
-		drop_file(saver);
-		unlink(saver->path);
-		return error_set_errno(err, result, "thread that syncs volumes");
-	}
 	return 0;
 }
 
-int saver_finish(struct saver *saver, bool wait, bool *ret_done, uint8_t ret_sha256[32], struct error *err)
+int saver_finish(struct saver *saver, bool wait, bool *ret_done, struct error *err)
 {
-	const struct error *why = NULL;
-
 	pthread_mutex_lock(&saver->lock);
-	while (wait && !(saver->hashed && saver->synced))
+	while (wait && !saver->synced)
 		pthread_cond_wait(&saver->changed, &saver->lock);
-	*ret_done = saver->hashed && saver->synced;
+	*ret_done = saver->synced;
 	pthread_mutex_unlock(&saver->lock);
 	if (!*ret_done)
 		return 0;
-	pthread_join(saver->hasher, NULL);
 	pthread_join(saver->syncer, NULL);
 	unmap(&saver->file);
 	saver->busy = false;
-	if (saver->hash_error.code != 0 || saver->sync_error.code != 0)
-		why = saver->sync_error.code != 0 ? &saver->sync_error : &saver->hash_error;
-	if (why != NULL) {
+	if (saver->trouble.code != 0) {
 		unlink(saver->path);
-		*err = *why;
-		return why->code;
+		*err = saver->trouble;
 	}
-	memcpy(ret_sha256, saver->sha256, sizeof(saver->sha256));
-	return 0;
-}
-
-/* ---- files of others ---- */
-
-static int hash_file(int file, const char *path, size_t length, uint8_t ret_sha256[32], struct error *err)
-{
-	enum { BLOCK = 1 << 20 };
-	EVP_MD_CTX *digest = EVP_MD_CTX_new();
-	char *block = malloc(BLOCK);
-	ssize_t got = 1;
-	int code = 0;
-
-	if (digest == NULL || block == NULL || EVP_DigestInit_ex(digest, EVP_sha256(), NULL) != 1)
-		code = error_set(err, ERR_NO_MEMORY, "no memory for SHA-256");
-	while (code == 0 && got != 0) {
-		got = pread(file, block, BLOCK, (off_t)length);
-		if (got < 0 && errno != EINTR)
-			code = error_set_errno(err, errno, "%s cannot be read", path);
-		if (got > 0 && EVP_DigestUpdate(digest, block, (size_t)got) != 1)
-			code = error_set(err, ERR_INTERNAL, "SHA-256 failed");
-		length += got > 0 ? (size_t)got : 0;
-	}
-	if (code == 0 && EVP_DigestFinal_ex(digest, ret_sha256, NULL) != 1)
-		code = error_set(err, ERR_INTERNAL, "SHA-256 failed");
-	EVP_MD_CTX_free(digest);
-	free(block);
-	return code;
-}
-
-int saver_settle(const char *path, size_t length, uint8_t ret_sha256[32], struct error *err)
-{
-	struct durable d = {.file = open(path, O_RDONLY | O_CLOEXEC), .path = path};
-	uint8_t sha256[32];
-	int code;
-
-	if (d.file < 0)
-		return error_set_errno(err, errno, "%s cannot be opened", path);
-	code = hash_file(d.file, path, length, sha256, err);
-	if (code != 0) {
-		close(d.file);
-		return code;
-	}
-	code = durable_settle(&d, err);
-	if (code == 0)
-		memcpy(ret_sha256, sha256, sizeof(sha256));
-	return code;
+	return saver->trouble.code;
 }

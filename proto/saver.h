@@ -3,17 +3,15 @@
 
 #include <stdbool.h>
 #include <stddef.h>
-#include <stdint.h>
 
 #include "core/error.h"
 
 /*
  * Files that are there for everybody as soon as their bytes are, and on the disk
  * soon after, beside the work that goes on. The caller stores the bytes where
- * they belong, in the mapped file; a thread hashes behind it. With the last of
- * them the file gets its name (saver_end), and another thread syncs it. When
- * both threads are done it is settled (saver_finish): on the disk, and its
- * SHA-256 known. One file at a time. All calls by one thread.
+ * they belong, in the mapped file; a thread sends them to the disk behind it.
+ * With the last of them the file gets its name (saver_end); synced, it is settled
+ * (saver_finish). One file at a time. All calls by one thread.
  */
 struct saver;
 
@@ -32,9 +30,7 @@ void saver_free(struct saver *saver);
  */
 void saver_prepare(struct saver *saver, const char *path, size_t bytes);
 
-/*
- * A file that begins with `header`, which is not hashed, and has `bytes` more. None may be under way. What is prepared
- * is used when it has that size.
+/* A file that begins with `header` and has `bytes` more. None may be under way. What is prepared is used when it fits.
  */
 int saver_begin(struct saver *saver, const char *path, const void *header, size_t length, size_t bytes,
 		struct error *err);
@@ -46,13 +42,7 @@ int saver_end(struct saver *saver, struct error *err);
 
 /* Whether a file is under way, from saver_begin to a saver_finish that has said how it ended. */
 bool saver_busy(const struct saver *saver);
-/*
- * How the file ended: 0 with its SHA-256, or what failed, and then it is removed.
- * *ret_done false: not yet (never so with `wait`).
- */
-int saver_finish(struct saver *saver, bool wait, bool *ret_done, uint8_t ret_sha256[32], struct error *err);
-
-/* A named file whose process ended before it was settled; `length` bytes of header. Waits for the disk. Any thread. */
-int saver_settle(const char *path, size_t length, uint8_t ret_sha256[32], struct error *err);
+/* How the file ended: what failed, and then it is removed. *ret_done false: not yet (never so with `wait`). */
+int saver_finish(struct saver *saver, bool wait, bool *ret_done, struct error *err);
 
 #endif

@@ -230,7 +230,6 @@ struct run {
 	struct saved_volume saved; /* no bytes: there is none */
 	char saved_name[32], saved_stage[16];
 	int saved_iteration;
-	uint8_t sha256[32];       /* once the saver is not busy any more */
 	struct saved_volume link; /* another name of it, told of and not settled; no bytes: there is none */
 	char link_name[32];
 	struct error trouble; /* what stopped the run from a question of its */
@@ -341,7 +340,7 @@ static int tell_settled(struct run *run, const char *name, struct error *err)
 {
 	if (run->hooks->on_settled == NULL)
 		return 0;
-	return run->hooks->on_settled(run->hooks->recon.context, name, run->sha256, err);
+	return run->hooks->on_settled(run->hooks->recon.context, name, err);
 }
 
 static int settle_link(struct run *run, struct error *err)
@@ -361,7 +360,7 @@ static int settle(struct run *run, bool wait, struct error *err)
 	int code = 0;
 
 	if (run->saver != NULL && saver_busy(run->saver)) {
-		code = saver_finish(run->saver, wait, &done, run->sha256, err);
+		code = saver_finish(run->saver, wait, &done, err);
 		if (code != 0) {
 			if (run->link.bytes > 0)
 				unlink(run->link.path);

@@ -61,9 +61,9 @@ struct saved_volume {
  * The pipeline over a directory, in three steps: opened, given its projections in
  * any order and as they arrive, and finished. Each kept volume becomes a file of
  * out_directory and is told of twice: by on_volume as soon as everybody can read
- * it there, whole, and by on_settled when it is on the disk, with the SHA-256 of
- * its voxels. However a run ends, what was told of is settled first, unless that
- * is what failed: then its file is removed. Where "final" is the same iterate as
+ * it there, whole, and by on_settled when it is on the disk. However a run ends,
+ * what was told of is settled first, unless that is what failed: then its file is
+ * removed. Where "final" is the same iterate as
  * the volume before it, it is another link to that file. The worker and `cbct
  * recon` both do it this way. One thread at a time.
  */
@@ -72,7 +72,7 @@ struct spool_hooks {
 				     be NULL here */
 	int (*on_volume)(void *context, const struct kept_volume *volume, const struct saved_volume *saved,
 			 struct error *err);
-	int (*on_settled)(void *context, const char *name, const uint8_t sha256[32], struct error *err);
+	int (*on_settled)(void *context, const char *name, struct error *err);
 	void (*on_open)(void *context, const struct recon_memory *memory, const char *plan);
 };
 

@@ -13,12 +13,13 @@ RESULTS=${RESULTS:-/dev/null}
 rm -rf "$work"
 mkdir -p "$work"
 
-# start_daemon [OPTION ...]: sets $url; the state directory is $state (kept over restarts), the port a free one or $port.
+# start_daemon [OPTION ...]: sets $url; the state directory is $state (kept over restarts), the port a free one or $port,
+# the program cbctd or $program.
 state=$work/state
 start_daemon() {
 	local out=$work/cbctd.out i daemon_pid
 	: >"$out"
-	"$BUILD/cbctd" --listen "127.0.0.1:${port:-0}" --state-dir "$state" --backend cpu "$@" >"$out" 2>>"$work/cbctd.err" &
+	"$BUILD/${program:-cbctd}" --listen "127.0.0.1:${port:-0}" --state-dir "$state" --backend cpu "$@" >"$out" 2>>"$work/cbctd.err" &
 	daemon_pid=$!
 	echo "$daemon_pid" >"$work/daemon.pid"
 	for ((i = 0; i < 300; i++)); do

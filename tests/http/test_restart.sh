@@ -221,7 +221,7 @@ test_a_volume_that_was_told_of_outlives_a_job_that_is_cancelled_and_its_worker()
 	expect_status 202
 	kill -9 "$(worker_of)"
 	wait_job cancelled
-	req GET "/v1/jobs/$job/volumes?wait=0"
+	req GET "/v1/jobs/$job/volumes"
 	expect_json "[.volumes[] | {name, digest}] == [{name: \"fdk\", digest: \"$(digest_of "$work/told")\"}]"
 	rm "$hold"
 	stop_daemon
@@ -245,6 +245,64 @@ test_a_volume_that_was_told_of_is_made_again_when_the_daemon_dies_too_soon() {
 	get_volume fdk "$work/again" format=raw
 	cmp "$work/told" "$work/again" || fail "the same bits once more"
 	[ "$(events_of | tr ' ' '\n' | grep -c volume)" = 2 ] || fail "each volume told of once, got $(events_of)"
+	stop_daemon
+}
+
+# A job that has ended and whose digests do not come for as long as $hold is there.
+ended_and_held() {
+	: >"$hold"
+	program=cbctd-held CBCT_TEST_HOLD_DIGEST=$hold start_daemon
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "{\"scan\": \"SCAN\", $grid, \"fdk\": {}, \"emit\": [\"fdk\"]}"
+	wait_job succeeded
+	req GET "/v1/jobs/$job/volumes?wait=0"
+	expect_json '[.volumes[] | [.name, has("digest")]] == [["final", false], ["fdk", false]]'
+	get_volume fdk "$work/ended" format=raw
+	etag=$(header etag)
+}
+expect_digests() {
+	expect_json "[.volumes[] | {name, digest}] == ([\"final\", \"fdk\"] | map({name: ., digest: \"$(digest_of "$work/ended")\"}))"
+}
+
+test_a_job_ends_before_its_digests_are_known() {
+	local list first deleted
+	ended_and_held
+	first=$job
+	curl -sS --max-time 60 "$url/v1/jobs/$first/volumes" >"$work/list" &
+	list=$!
+	# others are served meanwhile, by the next worker too
+	kill -9 "$(worker_of)"
+	post_job "{\"scan\": \"SCAN\", $grid, \"fdk\": {}}"
+	wait_job succeeded
+	deleted=$job
+	req DELETE "/v1/jobs/$deleted"
+	expect_status 204
+	[ ! -s "$work/list" ] || fail "a list that waits for the digests"
+	rm "$hold"
+	wait $list
+	job=$first
+	req GET "/v1/jobs/$job/volumes"
+	expect_digests
+	jq -e --slurpfile now <(curl -sS "$url/v1/jobs/$job/volumes") '. == $now[0]' "$work/list" >/dev/null || fail "the list that waited: $(cat "$work/list")"
+	get_volume fdk "$work/hashed" format=raw
+	[ "$(header etag)" = "$etag" ] || fail "the ETag $etag still, got $(header etag)"
+	stop_daemon
+	! grep -q "job $deleted.*digest" "$work/cbctd.err" || fail "no word of a job that was deleted"
+}
+
+test_digests_that_a_daemon_did_not_live_to_make_come_from_the_next() {
+	ended_and_held
+	stop_daemon KILL
+	rm "$hold"
+	start_daemon
+	req GET "/v1/jobs/$job/volumes"
+	expect_digests
+	req GET "/v1/jobs/$job"
+	expect_json '.state == "succeeded" and .attempts == 1'
+	get_volume fdk "$work/again" format=raw
+	cmp "$work/ended" "$work/again" || fail "the volume after a restart"
+	[ "$(header etag)" = "$etag" ] || fail "the ETag $etag still, got $(header etag)"
 	stop_daemon
 }
 

@@ -4,9 +4,12 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <time.h>
 
+#include "daemon/digest.h"
 #include "daemon/document.h"
 #include "daemon/files.h"
+#include "proto/durable.h"
 #include "proto/spool.h"
 #include "tests/unit/state.h"
 
@@ -484,7 +487,7 @@ END_TEST
 
 START_TEST(a_volume_whose_row_is_missing_is_made_again)
 {
-	const struct volume_record volume = {.name = "fdk", .stage = "fdk", .bytes = 256, .settled = true};
+	const struct volume_record volume = {.name = "fdk", .stage = "fdk", .bytes = 256, .hashed = true};
 	struct job *job = state_post(&state, scan, "routine");
 	struct error err = {0};
 	char id[ID_SIZE];
@@ -521,40 +524,61 @@ static struct volume_record volume_of(const char *id, const char *name)
 	return found;
 }
 
-START_TEST(a_volume_that_had_not_reached_the_disk_is_made_again)
+/* The volume's file: `text` as voxels. */
+static void put_voxels(const char *id, const char *name, const char *text)
 {
-	const struct volume_record fdk = {.name = "fdk", .stage = "fdk", .bytes = 256};
+	char bytes[SPOOL_VOLUME_OFFSET + 64] = "";
+	struct error err = {0};
+
+	ck_assert_int_eq(directory_make(state_path(&state, "jobs/%s", id), &err), 0);
+	memcpy(bytes + SPOOL_VOLUME_OFFSET, text, strlen(text));
+	ck_assert_int_eq(file_write_durable(state_path(&state, "jobs/%s/%s.nii", id, name), bytes,
+					    SPOOL_VOLUME_OFFSET + strlen(text), &err),
+			 0);
+}
+
+/* Within half a minute; the digest is what a volume of these voxels has. */
+static void await_digest(const char *id, const char *name, const char *text)
+{
+	const struct timespec moment = {.tv_nsec = 2000000};
+	uint8_t expected[32];
+
+	for (int i = 0; i < 15000 && !volume_of(id, name).hashed; i++)
+		nanosleep(&moment, NULL);
+	ck_assert(volume_of(id, name).hashed);
+	EVP_Digest(text, strlen(text), expected, NULL, EVP_sha256(), NULL);
+	ck_assert_mem_eq(volume_of(id, name).sha256, expected, 32);
+}
+
+/* Of a job at work; its checkpoint may be of what came after the volume. */
+START_TEST(a_volume_that_may_not_have_reached_the_disk_is_made_again)
+{
+	const struct volume_record fdk = {.name = "fdk", .stage = "fdk", .bytes = 256, .hashed = true};
 	const struct volume_record second = {.name = "iter-2", .stage = "sart", .iteration = 2, .bytes = 256};
 	const struct job_change yielded = {.checkpoint = 1, .yielded = true};
 	struct job *job = state_post(&state, scan, "routine");
 	struct error err = {0};
 	struct job_record record;
 	struct event_record *events;
-	const uint8_t sha256[32] = {1, 2, 3};
 	char id[ID_SIZE];
 	int count, told = 0;
 
 	keep_id(job, id);
 	state_set(job, JOB_RUNNING, NULL);
-	ck_assert_int_eq(directory_make(state_path(&state, "jobs/%s", id), &err), 0);
-	path_fill(state_path(&state, "jobs/%s/fdk.nii", id));
-	path_fill(state_path(&state, "jobs/%s/iter-2.nii", id));
+	put_voxels(id, "fdk", "a");
+	put_voxels(id, "iter-2", "b");
 	path_fill(state_path(&state, "jobs/%s/checkpoint.f32", id));
 	ck_assert_int_eq(job_add_volume(job, &fdk, &err), 0);
-	ck_assert(!volume_of(id, "fdk").settled);
-	ck_assert_int_eq(job_settle_volume(job, "fdk", sha256, &err), 0);
-	ck_assert(volume_of(id, "fdk").settled);
-	ck_assert_mem_eq(volume_of(id, "fdk").sha256, sha256, 32);
 	state_set(job, JOB_QUEUED, &yielded);
 	state_set(job, JOB_RUNNING, NULL);
 	ck_assert_int_eq(job_add_volume(job, &second, &err), 0);
+	ck_assert(!volume_of(id, "iter-2").hashed);
 	job_release(job);
 	restart();
 	ck_assert_str_eq(volume_of(id, "fdk").name, "fdk");
 	ck_assert_str_eq(volume_of(id, "iter-2").name, "");
 	ck_assert(path_exists(state_path(&state, "jobs/%s/fdk.nii", id)));
 	ck_assert(!path_exists(state_path(&state, "jobs/%s/iter-2.nii", id)));
-	/* The checkpoint may be of what came after it. */
 	ck_assert(!path_exists(state_path(&state, "jobs/%s/checkpoint.f32", id)));
 	job = find(id);
 	job_record(job, &record);
@@ -562,8 +586,6 @@ START_TEST(a_volume_that_had_not_reached_the_disk_is_made_again)
 	ck_assert_int_eq(record.checkpoint, 0);
 	state_set(job, JOB_RUNNING, NULL);
 	ck_assert_int_eq(job_add_volume(job, &second, &err), 0);
-	ck_assert_int_eq(job_settle_volume(job, "iter-2", sha256, &err), 0);
-	ck_assert(volume_of(id, "iter-2").settled);
 	ck_assert_int_eq(store_job_events(state.store, id, 0, 100, &events, &count, &err), 0);
 	for (int i = 0; i < count; i++)
 		told += strcmp(events[i].kind, "volume") == 0;
@@ -573,29 +595,112 @@ START_TEST(a_volume_that_had_not_reached_the_disk_is_made_again)
 }
 END_TEST
 
+START_TEST(a_volume_of_a_job_that_waits_is_made_again_too)
+{
+	const struct volume_record fdk = {.name = "fdk", .stage = "fdk", .bytes = 1};
+	struct stored_scan *arriving = state_scan(&state, 5, false);
+	struct job *job = state_post(&state, arriving, "routine");
+	struct error err = {0};
+	char id[ID_SIZE];
+
+	keep_id(job, id);
+	ck_assert_int_eq(state_of(job), JOB_WAITING);
+	put_voxels(id, "fdk", "a");
+	ck_assert_int_eq(job_add_volume(job, &fdk, &err), 0);
+	job_release(job);
+	stored_scan_release(arriving);
+	restart();
+	ck_assert_str_eq(volume_of(id, "fdk").name, "");
+	ck_assert(!path_exists(state_path(&state, "jobs/%s/fdk.nii", id)));
+}
+END_TEST
+
+START_TEST(a_digest_that_was_not_made_before_a_restart_is_made_after_it)
+{
+	static const enum job_state states[] = {JOB_SUCCEEDED, JOB_CANCELLED, JOB_QUEUED};
+	const struct volume_record fdk = {.name = "fdk", .stage = "fdk", .bytes = 1};
+	struct digester *digester = NULL;
+	struct error err = {0};
+	char ids[3][ID_SIZE];
+
+	for (int i = 0; i < 3; i++) {
+		struct job *job = state_post(&state, scan, "routine");
+
+		keep_id(job, ids[i]);
+		state_set(job, JOB_RUNNING, NULL);
+		put_voxels(ids[i], "fdk", "abc");
+		ck_assert_int_eq(job_add_volume(job, &fdk, &err), 0);
+		state_set(job, states[i], NULL);
+		job_release(job);
+	}
+	restart();
+	ck_assert_int_eq(digester_start(state.jobs, 2, &digester, &err), 0);
+	for (int i = 0; i < 3; i++)
+		await_digest(ids[i], "fdk", "abc");
+	digester_stop(digester);
+	digester_stop(NULL);
+}
+END_TEST
+
+START_TEST(digests_come_for_what_is_told_to_be_on_the_disk)
+{
+	struct volume_record fdk = {.name = "fdk", .stage = "fdk", .bytes = 1, .created = 1};
+	const struct volume_record final = {.name = "final", .stage = "fdk", .bytes = 1, .created = 2};
+	struct job *job = state_post(&state, scan, "routine"), *gone = state_post(&state, scan, "routine");
+	struct digester *digester = NULL;
+	struct error err = {0};
+	char id[ID_SIZE], deleted[ID_SIZE], from[512];
+	bool removed, linked = false;
+
+	keep_id(job, id);
+	keep_id(gone, deleted);
+	ck_assert_int_eq(digester_start(state.jobs, 1, &digester, &err), 0);
+	state_set(job, JOB_RUNNING, NULL);
+	put_voxels(id, "fdk", "old");
+	snprintf(from, sizeof(from), "%s", state_path(&state, "jobs/%s/fdk.nii", id));
+	ck_assert_int_eq(durable_link(from, state_path(&state, "jobs/%s/final.nii", id), &linked, &err), 0);
+	ck_assert_int_eq(job_add_volume(job, &fdk, &err), 0);
+	ck_assert_int_eq(job_add_volume(job, &final, &err), 0);
+	/* Jobs that are not there, or not any more, are none of its trouble. */
+	digester_add(digester, "none", NULL);
+	state_set(gone, JOB_CANCELLED, NULL);
+	ck_assert_int_eq(jobs_delete(state.jobs, gone, &removed, &err), 0);
+	ck_assert(removed);
+	digester_add(digester, deleted, "fdk");
+	digester_add(digester, id, "fdk");
+	await_digest(id, "fdk", "old");
+	ck_assert(!volume_of(id, "final").hashed); /* nobody said so */
+	digester_add(digester, id, NULL);
+	await_digest(id, "final", "old");
+	/* Made again: what the old one's digest was is nothing to the new one. */
+	fdk = volume_of(id, "fdk");
+	put_voxels(id, "fdk", "new");
+	ck_assert_int_eq(
+	    job_add_volume(job, &(struct volume_record){.name = "fdk", .stage = "fdk", .created = 3}, &err), 0);
+	ck_assert_int_eq(job_digest_volume(job, &fdk, &err), 0);
+	ck_assert(!volume_of(id, "fdk").hashed);
+	digester_add(digester, id, "fdk");
+	await_digest(id, "fdk", "new");
+	digester_stop(digester);
+	job_release(job);
+	job_release(gone);
+}
+END_TEST
+
 START_TEST(what_a_dead_worker_told_of_is_settled_for_it)
 {
 	const struct volume_record fdk = {.name = "fdk", .stage = "fdk", .bytes = 4}, lost = {.name = "iter-1"};
 	struct job *job = state_post(&state, scan, "routine");
 	struct error err = {0};
-	bool unsettled = false;
-	char id[ID_SIZE], bytes[SPOOL_VOLUME_OFFSET + 4] = "";
-	uint8_t sha256[32];
+	char id[ID_SIZE];
 
 	keep_id(job, id);
 	state_set(job, JOB_RUNNING, NULL);
-	ck_assert_int_eq(directory_make(state_path(&state, "jobs/%s", id), &err), 0);
-	memcpy(bytes + SPOOL_VOLUME_OFFSET, "abcd", 4);
-	ck_assert_int_eq(file_write_durable(state_path(&state, "jobs/%s/fdk.nii", id), bytes, sizeof(bytes), &err), 0);
+	put_voxels(id, "fdk", "abcd");
 	ck_assert_int_eq(job_add_volume(job, &fdk, &err), 0);
 	ck_assert_int_eq(job_add_volume(job, &lost, &err), 0); /* whose file is not there */
-	ck_assert_int_eq(job_unsettled(job, &unsettled, &err), 0);
-	ck_assert(unsettled);
 	ck_assert_int_eq(job_settle(job, &err), 0);
-	ck_assert_int_eq(job_unsettled(job, &unsettled, &err), 0);
-	ck_assert(!unsettled);
-	EVP_Digest("abcd", 4, sha256, NULL, EVP_sha256(), NULL);
-	ck_assert_mem_eq(volume_of(id, "fdk").sha256, sha256, 32);
+	ck_assert_str_eq(volume_of(id, "fdk").name, "fdk");
 	ck_assert_str_eq(volume_of(id, "iter-1").name, "");
 	/* What it was at goes when the job has ended. */
 	path_fill(state_path(&state, "jobs/%s/blank.tmp", id));
@@ -670,10 +775,14 @@ Suite *job_suite(void)
 	tcase_add_test(tests, a_key_makes_one_job_also_over_a_restart);
 	tcase_add_test(tests, events_come_in_order_from_where_one_left_off);
 	tcase_add_test(tests, a_volume_whose_row_is_missing_is_made_again);
-	tcase_add_test(tests, a_volume_that_had_not_reached_the_disk_is_made_again);
+	tcase_add_test(tests, a_volume_that_may_not_have_reached_the_disk_is_made_again);
+	tcase_add_test(tests, a_volume_of_a_job_that_waits_is_made_again_too);
+	tcase_add_test(tests, a_digest_that_was_not_made_before_a_restart_is_made_after_it);
+	tcase_add_test(tests, digests_come_for_what_is_told_to_be_on_the_disk);
 	tcase_add_test(tests, what_a_dead_worker_told_of_is_settled_for_it);
 	tcase_add_test(tests, the_document_has_what_the_contract_names);
 	tcase_add_test(tests, times_are_written_as_iso_8601);
+	tcase_set_timeout(tests, 60);
 	suite_add_tcase(suite, tests);
 	return suite;
 }

@@ -1,0 +1,250 @@
+/* The SHA-256 of kept volumes: digest.h. */
+#include "daemon/digest.h"
+
+#include <errno.h>
+#include <fcntl.h>
+#include <openssl/evp.h>
+#include <pthread.h>
+#include <stdatomic.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/resource.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include "daemon/log.h"
+#include "proto/durable.h"
+#include "proto/spool.h"
+
+enum { NICENESS = 10 /* behind the workers, too */ };
+
+/* Volumes of a job that have no digest yet. */
+struct task {
+	struct task *next;
+	char job[ID_SIZE];
+	char name[32]; /* "": all of them */
+};
+
+struct digester {
+	struct jobs *jobs; /* constant, as the next */
+	int count;
+	_Atomic bool stop;
+	pthread_mutex_t lock; /* guards what follows */
+	pthread_cond_t changed;
+	struct task *first, **last;
+	pthread_t threads[];
+};
+
+/* ---- one volume ---- */
+
+static int hash_voxels(int file, const char *path, const _Atomic bool *stop, EVP_MD_CTX *digest, struct error *err)
+{
+	enum { BLOCK = 1 << 20 };
+	char *block = malloc(BLOCK);
+	off_t at = SPOOL_VOLUME_OFFSET;
+	ssize_t got = 1;
+	int code = block == NULL ? error_set_errno(err, ENOMEM, "digest") : 0;
+
+	while (code == 0 && got != 0) {
+		got = pread(file, block, BLOCK, at);
+		if (got < 0 && errno != EINTR)
+			code = error_set_errno(err, errno, "%s cannot be read", path);
+		if (got > 0 && EVP_DigestUpdate(digest, block, (size_t)got) != 1)
+			code = error_set(err, ERR_INTERNAL, "SHA-256 failed");
+		if (atomic_load(stop))
+			code = error_set(err, ERR_CANCELLED, "the daemon stops");
+		at += got > 0 ? got : 0;
+	}
+	free(block);
+	return code;
+}
+
+static int hash_volume(const char *path, const _Atomic bool *stop, uint8_t ret_sha256[32], struct error *err)
+{
+	int file = open(path, O_RDONLY | O_CLOEXEC), code;
+	EVP_MD_CTX *digest;
+	uint8_t sha256[32];
+
+	if (file < 0)
+		return error_set_errno(err, errno, "%s cannot be opened", path);
+	digest = EVP_MD_CTX_new();
+	if (digest == NULL || EVP_DigestInit_ex(digest, EVP_sha256(), NULL) != 1)
+		code = error_set_errno(err, ENOMEM, "digest");
+	else
+		code = hash_voxels(file, path, stop, digest, err);
+	if (code == 0 && EVP_DigestFinal_ex(digest, sha256, NULL) != 1)
+		code = error_set(err, ERR_INTERNAL, "SHA-256 failed");
+	EVP_MD_CTX_free(digest);
+	close(file);
+	if (code == 0)
+		memcpy(ret_sha256, sha256, sizeof(sha256));
+	return code;
+}
+
+static bool same_file(const char *a, const char *b)
+{
+	struct stat of_a, of_b;
+
+	return stat(a, &of_a) == 0 && stat(b, &of_b) == 0 && of_a.st_dev == of_b.st_dev && of_a.st_ino == of_b.st_ino;
+}
+
+/* "final" may be another name of the file of a volume that has its digest. */
+static bool copy_digest(struct store *store, const char *job, const struct volume_record *volumes, int count,
+			struct volume_record *volume)
+{
+	char path[1024], other[1024];
+
+	store_volume_path(store, job, volume->name, path);
+	for (int i = 0; i < count; i++) {
+		store_volume_path(store, job, volumes[i].name, other);
+		if (volumes[i].hashed && same_file(path, other)) {
+			memcpy(volume->sha256, volumes[i].sha256, sizeof(volume->sha256));
+			return true;
+		}
+	}
+	return false;
+}
+
+static int make_digest(struct digester *digester, struct job *job, const struct volume_record *volumes, int count,
+		       struct volume_record *volume, struct error *err)
+{
+	struct store *store = jobs_store(digester->jobs);
+	struct job_facts facts;
+	char path[1024];
+	int code = 0;
+
+	job_facts(job, &facts);
+	store_volume_path(store, facts.id, volume->name, path);
+	if (!copy_digest(store, facts.id, volumes, count, volume))
+		code = hash_volume(path, &digester->stop, volume->sha256, err);
+	/* What it was told of is; but it may have been made again since. */
+	if (code == 0)
+		code = durable_settle_named(path, err);
+	if (code == 0)
+		code = job_digest_volume(job, volume, err);
+	volume->hashed = code == 0;
+	return code;
+}
+
+/* ---- the threads ---- */
+
+static void carry_out(struct digester *digester, const struct task *task)
+{
+	struct volume_record *volumes = NULL;
+	struct job_facts facts;
+	struct job *job;
+	struct error err;
+	int count = 0, code;
+
+	if (jobs_find(digester->jobs, task->job, &job, &err) != 0)
+		return;
+	code = store_job_volumes(jobs_store(digester->jobs), task->job, &volumes, &count, &err);
+	for (int i = 0; i < count && code == 0; i++) {
+		if (!volumes[i].hashed && (task->name[0] == '\0' || strcmp(task->name, volumes[i].name) == 0))
+			code = make_digest(digester, job, volumes, count, &volumes[i], &err);
+	}
+	free(volumes);
+	job_facts(job, &facts);
+	job_release(job);
+	if (code != 0 && code != ERR_CANCELLED && !facts.removed)
+		log_line(LEVEL_ERROR, "job %s: no digest of its volumes before the next start: %s", task->job,
+			 err.text);
+}
+
+static void *digest_loop(void *context)
+{
+	struct digester *digester = context;
+	struct task *task;
+
+	/* Of this thread alone. Good manners, no condition. */
+	setpriority(PRIO_PROCESS, (id_t)gettid(), NICENESS);
+	pthread_mutex_lock(&digester->lock);
+	while (!atomic_load(&digester->stop)) {
+		task = digester->first;
+		if (task == NULL) {
+			pthread_cond_wait(&digester->changed, &digester->lock);
+			continue;
+		}
+		digester->first = task->next;
+		if (digester->first == NULL)
+			digester->last = &digester->first;
+		pthread_mutex_unlock(&digester->lock);
+		carry_out(digester, task);
+		free(task);
+		pthread_mutex_lock(&digester->lock);
+	}
+	pthread_mutex_unlock(&digester->lock);
+	return NULL;
+}
+
+void digester_add(struct digester *digester, const char *job, const char *name)
+{
+	struct task *task = calloc(1, sizeof(*task));
+
+	if (task == NULL) {
+		log_line(LEVEL_ERROR, "job %s: no memory for the digest of a volume", job);
+		return;
+	}
+	snprintf(task->job, sizeof(task->job), "%s", job);
+	snprintf(task->name, sizeof(task->name), "%s", name == NULL ? "" : name);
+	pthread_mutex_lock(&digester->lock);
+	*digester->last = task;
+	digester->last = &task->next;
+	pthread_cond_signal(&digester->changed);
+	pthread_mutex_unlock(&digester->lock);
+}
+
+/* ---- start and stop ---- */
+
+static void add_from_catalogue(void *context, const char *job)
+{
+	digester_add(context, job, NULL);
+}
+
+int digester_start(struct jobs *jobs, int threads, struct digester **ret_digester, struct error *err)
+{
+	struct digester *digester = calloc(1, sizeof(*digester) + (size_t)threads * sizeof(digester->threads[0]));
+	int code;
+
+	if (digester == NULL)
+		return error_set_errno(err, ENOMEM, "digests");
+	digester->jobs = jobs;
+	digester->last = &digester->first;
+	pthread_mutex_init(&digester->lock, NULL);
+	pthread_cond_init(&digester->changed, NULL);
+	code = store_jobs_undigested(jobs_store(jobs), add_from_catalogue, digester, err);
+	while (code == 0 && digester->count < threads) {
+		code = pthread_create(&digester->threads[digester->count], NULL, digest_loop, digester);
+		if (code == 0)
+			digester->count++;
+		else
+			code = error_set_errno(err, code, "thread that makes digests");
+	}
+	if (code != 0)
+		digester_stop(digester);
+	else
+		*ret_digester = digester;
+	return code;
+}
+
+void digester_stop(struct digester *digester)
+{
+	struct task *task;
+
+	if (digester == NULL)
+		return;
+	pthread_mutex_lock(&digester->lock);
+	atomic_store(&digester->stop, true);
+	pthread_cond_broadcast(&digester->changed);
+	pthread_mutex_unlock(&digester->lock);
+	for (int i = 0; i < digester->count; i++)
+		pthread_join(digester->threads[i], NULL);
+	while ((task = digester->first) != NULL) {
+		digester->first = task->next;
+		free(task);
+	}
+	pthread_cond_destroy(&digester->changed);
+	pthread_mutex_destroy(&digester->lock);
+	free(digester);
+}
