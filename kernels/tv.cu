@@ -4,252 +4,364 @@
  * Pock 2011, algorithm 2).
  *
  * Both need, at a voxel, the new flux of itself and of its three predecessors.
- * A block marches along z over a tile in x and y whose first column and row are
- * those predecessors; fluxes along x and y meet in shared memory, the one along z
- * stays in a register, and the next plane is loaded before this one is waited
- * for. So each step reads and writes every volume once, but for the rims.
+ * A block marches along z over a tile of ROWS rows. A warp has a row, a lane as many
+ * neighbours along x as one load brings; one more warp has the row above, of which
+ * only the flux is wanted, and one what else is needed around the tile, so that all
+ * rows begin at whole sectors. Neighbours and their fluxes meet in shuffles along x,
+ * in shared memory along y, in registers along z, and the next plane is loaded
+ * before this one is waited for. So each step reads and writes every volume once,
+ * but for the rims: 12 bytes a voxel in an explicit step.
  *
- * The dual variable lies in -1 .. 1 and is stored in half precision, which moves
- * u by less than 0.01 gray levels; in float32 for reference precision.
+ * The primal-dual steps take the gradient of u^ = v + theta (v - past). That is not
+ * stored, but made from the last two v, of which three take turns. The dual variable
+ * lies in -1 .. 1 and is stored in half precision, which moves u by less than 0.01
+ * gray levels; in float32 for reference precision. So a step reads f, v, past and the
+ * dual variable, and writes v and the dual variable: 28 bytes a voxel.
  */
+#include <climits>
 #include <cmath>
 #include <cuda_fp16.h>
 
 #include "kernels/internal.cuh"
 
-/* Explicit steps gain by square tiles, primal-dual ones by whole cache lines of the half-precision dual. */
-enum { TILE_X = 32, TILE_Y = 16, DUAL_X = 64, DUAL_Y = 8, PLANES = 16 };
+enum { ROWS = 6, WARPS = ROWS + 2, PLANES_MOST = 128 };
+
+/* The first primal-dual step starts from v = past = f and p = 0, the last one writes v only. */
+enum tv_kind { STEP_EXPLICIT, STEP_FIRST, STEP_MIDDLE, STEP_LAST };
+
+template <tv_kind KIND>
+static constexpr bool READS_DUAL = KIND == STEP_MIDDLE || KIND == STEP_LAST;
+template <tv_kind KIND>
+static constexpr bool WRITES_DUAL = KIND == STEP_FIRST || KIND == STEP_MIDDLE;
+/* Blocks on a multiprocessor: as many as registers allow without spilling. */
+template <tv_kind KIND>
+static constexpr int RESIDENT = KIND == STEP_EXPLICIT ? 4 : 3;
 
 struct tv_step {
-	int nx, ny, nz;
-	float weight[3];      /* smallest spacing / spacing */
-	float flow, fidelity; /* v += flow div p + fidelity (f - v) */
-	float epsilon2, sigma, theta;
+	int nx, ny, nz, planes; /* planes: of a block */
+	float slope[3];         /* of a difference in the flux */
+	float flow[3];          /* of a difference of fluxes in v */
+	float fidelity;         /* v += flow div p + fidelity (f - v) */
+	float epsilon2, theta;
 };
 
-/* Where a thread stands in the tile: the first column and row only give their flux. */
-struct spot {
-	bool inside, writes, right, down; /* in the volume; has a result; has a neighbour at x + 1, at y + 1 */
-	size_t at;                        /* in plane 0; of the nearest voxel where outside */
-};
-template <int WIDE, int HIGH>
-static __device__ __forceinline__ spot spot_make(const tv_step &s)
-{
-	int x = (int)blockIdx.x * (WIDE - 1) + (int)threadIdx.x - 1;
-	int y = (int)blockIdx.y * (HIGH - 1) + (int)threadIdx.y - 1;
-	spot p;
-
-	p.inside = x >= 0 && y >= 0 && x < s.nx && y < s.ny;
-	p.writes = p.inside && threadIdx.x > 0 && threadIdx.y > 0;
-	p.right = p.inside && x < s.nx - 1;
-	p.down = p.inside && y < s.ny - 1;
-	p.at = (size_t)min(max(y, 0), s.ny - 1) * s.nx + min(max(x, 0), s.nx - 1);
-	return p;
-}
-
-struct flux {
-	float x, y, z;
+template <typename DUAL>
+struct tv_volumes {
+	const float *f, *v, *past;
+	float *ret_v;        /* may be f in the last step: a thread uses f only where it writes */
+	const DUAL *dual[3]; /* along x, y and z */
+	DUAL *ret_dual[3];
 };
 
-/* A voxel of u with its three successors. */
-struct corner {
-	float here, right, down, next;
+/* V neighbours along x, loaded and stored at once. */
+template <typename T, int V>
+struct alignas(V * sizeof(T)) group {
+	T at[V];
 };
-static __device__ __forceinline__ corner corner_at(const float *__restrict__ u, size_t at, const spot &p,
-						   const tv_step &s, int z)
+template <int V, typename T>
+static __device__ __forceinline__ group<T, V> load(const T *from)
 {
-	corner c;
+	return *reinterpret_cast<const group<T, V> *>(from);
+}
+template <int V, typename T>
+static __device__ __forceinline__ void store(T *to, const group<float, V> &x)
+{
+	group<T, V> out;
 
-	c.here = u[at];
-	c.right = p.right ? u[at + 1] : c.here;
-	c.down = p.down ? u[at + s.nx] : c.here;
-	c.next = z < s.nz - 1 ? u[at + (size_t)s.nx * s.ny] : c.here;
-	return c;
+#pragma unroll
+	for (int i = 0; i < V; i++)
+		out.at[i] = x.at[i];
+	*reinterpret_cast<group<T, V> *>(to) = out;
 }
 
-static __device__ __forceinline__ flux gradient(const corner &c, const tv_step &s)
+template <tv_kind KIND, int V>
+struct iterate {
+	group<float, V> v, past;
+
+	__device__ __forceinline__ void get(const float *from, const float *from_past, size_t at)
+	{
+		v = load<V>(from + at);
+		if constexpr (READS_DUAL<KIND>)
+			past = load<V>(from_past + at);
+	}
+	/* What the gradient is taken of. */
+	__device__ __forceinline__ group<float, V> ahead(float theta) const
+	{
+		group<float, V> u = v;
+
+		if constexpr (READS_DUAL<KIND>)
+#pragma unroll
+			for (int i = 0; i < V; i++)
+				u.at[i] = fmaf(theta, v.at[i] - past.at[i], v.at[i]);
+		return u;
+	}
+};
+
+/* What is loaded a plane early. */
+template <tv_kind KIND, typename DUAL, int V>
+struct arrival {
+	group<DUAL, V> dual[3];
+	group<float, V> f;
+	iterate<KIND, V> next; /* of the plane behind, for the flux along z */
+
+	__device__ __forceinline__ void get(const tv_volumes<DUAL> &a, size_t at, size_t at_next, bool flux,
+					    bool result)
+	{
+		if constexpr (READS_DUAL<KIND>)
+			if (flux)
+				for (int k = 0; k < 3; k++)
+					dual[k] = load<V>(a.dual[k] + at);
+		if (result)
+			f = load<V>(a.f + at);
+		next.get(a.v, a.past, at_next);
+	}
+};
+
+/* New flux along x, y and z at u, from the old one. */
+template <tv_kind KIND, typename DUAL, int V>
+static __device__ __forceinline__ void flux_of(const tv_step &s, const group<float, V> &u, float right,
+					       const group<float, V> &down, const group<float, V> &next,
+					       const group<DUAL, V> old[3], group<float, V> ret_flux[3])
 {
-	return {s.weight[0] * (c.right - c.here), s.weight[1] * (c.down - c.here), s.weight[2] * (c.next - c.here)};
-}
+#pragma unroll
+	for (int i = 0; i < V; i++) {
+		float x = s.slope[0] * ((i + 1 < V ? u.at[(i + 1) % V] : right) - u.at[i]);
+		float y = s.slope[1] * (down.at[i] - u.at[i]), z = s.slope[2] * (next.at[i] - u.at[i]);
 
-static __device__ __forceinline__ flux smoothed(const corner &c, const tv_step &s)
-{
-	flux g = gradient(c, s);
-	float inverse = rsqrtf(fmaf(g.x, g.x, fmaf(g.y, g.y, fmaf(g.z, g.z, s.epsilon2))));
-
-	return {g.x * inverse, g.y * inverse, g.z * inverse};
-}
-
-static __device__ __forceinline__ float divergence(const flux &here, float left, float up, float before,
-						   const tv_step &s)
-{
-	return s.weight[0] * (here.x - left) + s.weight[1] * (here.y - up) + s.weight[2] * (here.z - before);
-}
-
-/* One explicit step from u to `to`, which may be f. */
-static __global__ void __launch_bounds__(TILE_X *TILE_Y)
-    gradient_step(const float *__restrict__ u, const float *f, float *to, const tv_step s)
-{
-	__shared__ float along_x[2][TILE_Y][TILE_X], along_y[2][TILE_Y][TILE_X];
-	spot p = spot_make<TILE_X, TILE_Y>(s);
-	int tx = threadIdx.x, ty = threadIdx.y, z = blockIdx.z * PLANES, end = min(z + PLANES, s.nz);
-	size_t plane = (size_t)s.nx * s.ny, at = p.at + plane * z;
-	float before = 0;
-
-	if (z > 0)
-		before = smoothed(corner_at(u, at - plane, p, s, z - 1), s).z;
-	corner c = corner_at(u, at, p, s, z), ahead = c;
-	float fidel = p.writes ? f[at] : 0.0f, fidel_ahead = 0;
-
-	for (; z < end; z++, at += plane) {
-		int half = z & 1;
-
-		if (z + 1 < end) {
-			/* c.next is the next plane's own value */
-			ahead.here = c.next;
-			ahead.right = p.right ? u[at + plane + 1] : c.next;
-			ahead.down = p.down ? u[at + plane + s.nx] : c.next;
-			ahead.next = z + 1 < s.nz - 1 ? u[at + 2 * plane] : c.next;
-			fidel_ahead = p.writes ? f[at + plane] : 0.0f;
+		if constexpr (READS_DUAL<KIND>) {
+			x += (float)old[0].at[i];
+			y += (float)old[1].at[i];
+			z += (float)old[2].at[i];
 		}
-		flux q = smoothed(c, s);
-		along_x[half][ty][tx] = p.inside ? q.x : 0.0f;
-		along_y[half][ty][tx] = p.inside ? q.y : 0.0f;
-		__syncthreads();
-		if (p.writes)
-			to[at] =
-			    c.here +
-			    s.flow * divergence(q, along_x[half][ty][tx - 1], along_y[half][ty - 1][tx], before, s) +
-			    s.fidelity * (fidel - c.here);
-		before = q.z;
-		c = ahead;
-		fidel = fidel_ahead;
+		float square = fmaf(x, x, fmaf(y, y, z * z));
+		float inverse = rsqrtf(KIND == STEP_EXPLICIT ? square + s.epsilon2 : fmaxf(square, 1.0f));
+
+		ret_flux[0].at[i] = x * inverse;
+		ret_flux[1].at[i] = y * inverse;
+		ret_flux[2].at[i] = z * inverse;
 	}
 }
 
-static __device__ __forceinline__ float as_float(float x)
-{
-	return x;
-}
-static __device__ __forceinline__ float as_float(__half x)
-{
-	return __half2float(x);
-}
-static __device__ __forceinline__ void store(float *to, float x)
-{
-	*to = x;
-}
-static __device__ __forceinline__ void store(__half *to, float x)
-{
-	*to = __float2half_rn(x);
-}
+/* What the warps of a block have for each other, two planes in turn. */
+template <int V>
+struct tile {
+	enum { WIDE = 32 * V, PITCH = WIDE + 4 };
+	alignas(16) float u[2][ROWS + 2][PITCH]; /* from the row above to the row below, one column more to the right */
+	alignas(16) float along_y[2][ROWS + 1][WIDE];
+	float left[2][ROWS]; /* flux along x of the column to the left */
+};
 
-/* The dual variable's three parts, one volume after the other. */
-template <typename DUAL, bool FIRST>
-static __device__ __forceinline__ flux dual_at(const DUAL *__restrict__ dual, size_t at, size_t voxels)
+/*
+ * A row of the tile, or the one above it (row 0). What would lie outside of the volume
+ * stands at its border: a difference to it is 0, and it is not written.
+ */
+template <tv_kind KIND, typename DUAL, int V>
+static __device__ __forceinline__ void march_row(const tv_volumes<DUAL> &a, const tv_step &s, tile<V> &t)
 {
-	if (FIRST)
-		return {0, 0, 0};
-	return {as_float(dual[at]), as_float(dual[at + voxels]), as_float(dual[at + 2 * voxels])};
-}
+	int lane = threadIdx.x, row = threadIdx.y, column = lane * V;
+	int x = (int)blockIdx.x * tile<V>::WIDE + column, y = (int)blockIdx.y * ROWS + row - 1;
+	bool result = row > 0, writes = result && x < s.nx && y < s.ny, border = x + V >= s.nx;
+	int start = (int)blockIdx.z * s.planes, end = min(start + s.planes, s.nz), z = max(start - 1, 0);
+	size_t plane = (size_t)s.nx * s.ny;
+	size_t at = plane * z + (size_t)min(max(y, 0), s.ny - 1) * s.nx + min(x, s.nx - V);
+	iterate<KIND, V> here;
+	arrival<KIND, DUAL, V> now = {};
+	group<float, V> before_z = {};
 
-static __device__ __forceinline__ flux projected(const flux &old, const corner &c, const tv_step &s)
-{
-	flux g = gradient(c, s);
-	flux q = {fmaf(s.sigma, g.x, old.x), fmaf(s.sigma, g.y, old.y), fmaf(s.sigma, g.z, old.z)};
-	float inverse = rsqrtf(fmaxf(fmaf(q.x, q.x, fmaf(q.y, q.y, q.z * q.z)), 1.0f));
+	here.get(a.v, a.past, at);
+	group<float, V> v = here.v, u = here.ahead(s.theta);
+	store<V>(&t.u[z & 1][row][column], u);
+	now.get(a, at, z + 1 < s.nz ? at + plane : at, true, result);
+	__syncthreads();
+	for (; z < end; z++, at += plane) {
+		int half = z & 1;
+		arrival<KIND, DUAL, V> later = now;
 
-	return {q.x * inverse, q.y * inverse, q.z * inverse};
+		if (z + 1 < end)
+			later.get(a, at + plane, z + 2 < s.nz ? at + 2 * plane : at + plane, true, result);
+		group<float, V> down = load<V>(&t.u[half][row + 1][column]), u_next = now.next.ahead(s.theta), q[3];
+		float right = __shfl_down_sync(~0u, u.at[0], 1);
+
+		if (lane == 31)
+			right = t.u[half][row][tile<V>::WIDE];
+		if (border)
+			right = u.at[V - 1];
+		store<V>(&t.u[half ^ 1][row][column], u_next);
+		flux_of<KIND>(s, u, right, down, u_next, now.dual, q);
+		store<V>(&t.along_y[half][row][column], y < 0 ? group<float, V>{} : q[1]);
+		__syncthreads();
+		if (result && z >= start) {
+			group<float, V> up = load<V>(&t.along_y[half][row - 1][column]), to;
+			float left = __shfl_up_sync(~0u, q[0].at[V - 1], 1);
+
+			if (lane == 0)
+				left = t.left[half][row - 1];
+#pragma unroll
+			for (int i = 0; i < V; i++) {
+				float before_x = i > 0 ? q[0].at[(i + V - 1) % V] : left;
+				float change = s.fidelity * (now.f.at[i] - v.at[i]);
+
+				change = fmaf(s.flow[0], q[0].at[i] - before_x, change);
+				change = fmaf(s.flow[1], q[1].at[i] - up.at[i], change);
+				to.at[i] = v.at[i] + fmaf(s.flow[2], q[2].at[i] - before_z.at[i], change);
+			}
+			if (writes) {
+				store<V>(a.ret_v + at, to);
+				if constexpr (WRITES_DUAL<KIND>)
+					for (int k = 0; k < 3; k++)
+						store<V>(a.ret_dual[k] + at, q[k]);
+			}
+		}
+		before_z = q[2];
+		v = now.next.v;
+		u = u_next;
+		now = later;
+	}
 }
 
 /*
- * One primal-dual step. The first one starts from v = u^ = f and p = 0 and reads f
- * only; the last one writes v only, which may then be f.
+ * The warp that has what lies around the tile: a group of the row below each, and
+ * one voxel, of the column to the left (lower half of the warp) or to the right (upper
+ * half, from the row above on). Neighbours in a column are neighbours in the warp.
  */
-template <typename DUAL, bool FIRST, bool LAST>
-static __global__ void __launch_bounds__(DUAL_X *DUAL_Y)
-    proximal_step(const float *f, const float *__restrict__ ahead, const DUAL *__restrict__ dual, const float *v,
-		  float *ret_v, float *__restrict__ ret_ahead, DUAL *__restrict__ ret_dual, const tv_step s)
+template <tv_kind KIND, typename DUAL, int V>
+static __device__ __forceinline__ void march_rim(const tv_volumes<DUAL> &a, const tv_step &s, tile<V> &t)
 {
-	__shared__ float along_x[2][DUAL_Y][DUAL_X], along_y[2][DUAL_Y][DUAL_X];
-	spot p = spot_make<DUAL_X, DUAL_Y>(s);
-	int tx = threadIdx.x, ty = threadIdx.y, z = blockIdx.z * PLANES, end = min(z + PLANES, s.nz);
-	size_t plane = (size_t)s.nx * s.ny, at = p.at + plane * z, voxels = plane * s.nz;
-	const float *u = FIRST ? f : ahead;
-	float before = 0;
+	int lane = threadIdx.x, row = min(lane & 15, (int)ROWS), column = lane * V;
+	int x0 = (int)blockIdx.x * tile<V>::WIDE, y0 = (int)blockIdx.y * ROWS;
+	bool right_side = lane >= 16, left_side = lane < ROWS;
+	int x = right_side ? min(x0 + tile<V>::WIDE, s.nx - 1) : max(x0 - 1, 0), y = y0 + row - (right_side ? 1 : 0);
+	int start = (int)blockIdx.z * s.planes, end = min(start + s.planes, s.nz), z = max(start - 1, 0);
+	size_t plane = (size_t)s.nx * s.ny;
+	size_t at = plane * z + (size_t)min(max(y, 0), s.ny - 1) * s.nx + x;
+	size_t at_below = plane * z + (size_t)min(y0 + ROWS, s.ny - 1) * s.nx + min(x0 + column, s.nx - V);
+	iterate<KIND, 1> here;
+	iterate<KIND, V> below;
+	arrival<KIND, DUAL, 1> now = {};
 
-	if (z > 0)
-		before =
-		    projected(dual_at<DUAL, FIRST>(dual, at - plane, voxels), corner_at(u, at - plane, p, s, z - 1), s)
-			.z;
-	corner c = corner_at(u, at, p, s, z), c_ahead = c;
-	flux old = dual_at<DUAL, FIRST>(dual, at, voxels), old_ahead = old;
-
-	for (; z < end; z++, at += plane) {
+	here.get(a.v, a.past, at);
+	below.get(a.v, a.past, at_below);
+	group<float, 1> u = here.ahead(s.theta);
+	if (right_side)
+		t.u[z & 1][row][tile<V>::WIDE] = u.at[0];
+	store<V>(&t.u[z & 1][ROWS + 1][column], below.ahead(s.theta));
+	now.get(a, at, z + 1 < s.nz ? at + plane : at, left_side, false);
+	below.get(a.v, a.past, z + 1 < s.nz ? at_below + plane : at_below);
+	__syncthreads();
+	for (; z < end; z++, at += plane, at_below += plane) {
 		int half = z & 1;
-		float value = 0, wanted = 0;
+		arrival<KIND, DUAL, 1> later = now;
+		iterate<KIND, V> below_later = below;
 
-		if (p.writes) {
-			wanted = f[at];
-			value = FIRST ? wanted : v[at];
-		}
 		if (z + 1 < end) {
-			c_ahead.here = c.next;
-			c_ahead.right = p.right ? u[at + plane + 1] : c.next;
-			c_ahead.down = p.down ? u[at + plane + s.nx] : c.next;
-			c_ahead.next = z + 1 < s.nz - 1 ? u[at + 2 * plane] : c.next;
-			old_ahead = dual_at<DUAL, FIRST>(dual, at + plane, voxels);
-		}
-		flux q = projected(old, c, s);
-		along_x[half][ty][tx] = p.inside ? q.x : 0.0f;
-		along_y[half][ty][tx] = p.inside ? q.y : 0.0f;
-		__syncthreads();
-		if (p.writes) {
-			float change =
-			    s.flow * divergence(q, along_x[half][ty][tx - 1], along_y[half][ty - 1][tx], before, s) +
-			    s.fidelity * (wanted - value);
+			size_t step = z + 2 < s.nz ? 2 * plane : plane;
 
-			ret_v[at] = value + change;
-			if (!LAST) {
-				ret_ahead[at] = value + change + s.theta * change;
-				store(ret_dual + at, q.x);
-				store(ret_dual + at + voxels, q.y);
-				store(ret_dual + at + 2 * voxels, q.z);
-			}
+			later.get(a, at + plane, at + step, left_side, false);
+			below_later.get(a.v, a.past, at_below + step);
 		}
-		before = q.z;
-		c = c_ahead;
-		old = old_ahead;
+		group<float, 1> down = {__shfl_down_sync(~0u, u.at[0], 1)}, u_next = now.next.ahead(s.theta), q[3];
+		float right = t.u[half][row + 1][0];
+
+		if (right_side)
+			t.u[half ^ 1][row][tile<V>::WIDE] = u_next.at[0];
+		store<V>(&t.u[half ^ 1][ROWS + 1][column], below.ahead(s.theta));
+		flux_of<KIND>(s, u, right, down, u_next, now.dual, q);
+		if (left_side)
+			t.left[half][row] = x0 > 0 ? q[0].at[0] : 0.0f;
+		__syncthreads();
+		u = u_next;
+		now = later;
+		below = below_later;
 	}
 }
 
-static dim3 tv_blocks(const tv_step &s, int wide, int high)
+/* All warps of a block go through as many barriers, if in two loops. */
+template <tv_kind KIND, typename DUAL, int V>
+static __global__ void __launch_bounds__(32 * WARPS, RESIDENT<KIND>)
+    march(const tv_volumes<DUAL> volumes, const tv_step step)
 {
-	return dim3(divide_up(s.nx, wide - 1), divide_up(s.ny, high - 1), divide_up(s.nz, PLANES));
+	__shared__ tile<V> shared;
+
+	if (threadIdx.y <= ROWS)
+		march_row<KIND, DUAL, V>(volumes, step, shared);
+	else
+		march_rim<KIND, DUAL, V>(volumes, step, shared);
 }
 
-static tv_step step_make(const struct plan *plan)
+/*
+ * Planes of a block so that whole waves of blocks fill the card; a block's beginning
+ * takes as long as about three of them. Blocks as long as a large volume would leave
+ * the card idle behind the first that end.
+ */
+static int planes_for(int nz, int tiles, int slots)
+{
+	long long least = LLONG_MAX;
+	int best = nz;
+
+	for (int parts = divide_up(nz, PLANES_MOST); parts <= nz; parts++) {
+		int planes = divide_up(nz, parts);
+		long long cost = (long long)divide_up(tiles * divide_up(nz, planes), slots) * (planes + 3);
+
+		if (cost < least) {
+			least = cost;
+			best = planes;
+		}
+	}
+	return best;
+}
+
+template <tv_kind KIND, typename DUAL, int V>
+static void launch_groups(const struct device *device, const tv_volumes<DUAL> &volumes, tv_step step)
+{
+	dim3 blocks(divide_up(step.nx, tile<V>::WIDE), divide_up(step.ny, ROWS));
+
+	step.planes = planes_for(step.nz, (int)(blocks.x * blocks.y), device->multiprocessors * RESIDENT<KIND>);
+	blocks.z = divide_up(step.nz, step.planes);
+	march<KIND, DUAL, V><<<blocks, dim3(32, WARPS), 0, device->stream>>>(volumes, step);
+}
+/* In groups as long as keep rows aligned. */
+template <tv_kind KIND, typename DUAL>
+static void launch(const struct device *device, const tv_volumes<DUAL> &volumes, const tv_step &step)
+{
+	if (step.nx % 4 == 0)
+		launch_groups<KIND, DUAL, 4>(device, volumes, step);
+	else if (step.nx % 2 == 0)
+		launch_groups<KIND, DUAL, 2>(device, volumes, step);
+	else
+		launch_groups<KIND, DUAL, 1>(device, volumes, step);
+}
+
+/* Smallest spacing / spacing. */
+static double weight_of(const struct plan *plan, int axis)
 {
 	const double *spacing = plan->options.grid->spacing;
-	double least = fmin(fmin(spacing[0], spacing[1]), spacing[2]);
+
+	return fmin(fmin(spacing[0], spacing[1]), spacing[2]) / spacing[axis];
+}
+
+/* With flux and v in proportion to these; u = v / unit. */
+static tv_step step_make(const struct plan *plan, double slope, double flow, double fidelity)
+{
 	tv_step s = {};
 
 	s.nx = plan->grid.size[0];
 	s.ny = plan->grid.size[1];
 	s.nz = plan->grid.size[2];
-	for (int i = 0; i < 3; i++)
-		s.weight[i] = (float)(least / spacing[i]);
+	for (int i = 0; i < 3; i++) {
+		s.slope[i] = (float)(slope * weight_of(plan, i));
+		s.flow[i] = (float)(flow * weight_of(plan, i));
+	}
+	s.fidelity = (float)fidelity;
 	return s;
 }
 
 /* Sum of the squared weights of the axes that have differences; |grad|^2 <= 4 times that. */
-static double squared_weights(const tv_step &s)
+static double squared_weights(const struct plan *plan)
 {
 	double sum = 0;
-	const int size[3] = {s.nx, s.ny, s.nz};
 
 	for (int i = 0; i < 3; i++)
-		sum += size[i] > 1 ? (double)s.weight[i] * s.weight[i] : 0;
+		sum += plan->grid.size[i] > 1 ? weight_of(plan, i) * weight_of(plan, i) : 0;
 	return sum;
 }
 
@@ -261,7 +373,7 @@ size_t tv_scratch_bytes(const struct plan_options *options)
 		return 0;
 	if (options->tv->method == TV_GRADIENT)
 		return 2 * volume;
-	/* twice u^ and p, once v */
+	/* three v, twice p */
 	return options->reference_precision ? 9 * volume : 6 * volume;
 }
 
@@ -270,26 +382,24 @@ static int run_gradient(struct plan *plan, float *volume, const struct cancel *c
 {
 	const struct tv_options *tv = plan->options.tv;
 	size_t voxels = grid_voxels(plan->options.grid);
-	cudaStream_t stream = plan->device->stream;
-	tv_step s = step_make(plan);
+	tv_step s = step_make(plan, 1, tv->step * tv->unit, tv->step * tv->alpha);
 	double damping = fmax(2 - tv->alpha * tv->step, .1);
-	double epsilon = 4 * squared_weights(s) * tv->step / damping * tv->unit;
+	double epsilon = 4 * squared_weights(plan) * tv->step / damping * tv->unit;
 	float *from = volume, *work[2] = {plan->scratch, plan->scratch + voxels};
 
-	s.flow = (float)(tv->step * tv->unit);
-	s.fidelity = (float)(tv->step * tv->alpha);
 	s.epsilon2 = fmaxf((float)(epsilon * epsilon), 1e-30f); /* a single voxel has no differences: 0, not 0/0 */
 	for (int i = 0; i < tv->iterations; i++) {
 		/* The volume is f until the last step writes over it, each voxel behind its own reading. */
 		float *to = i > 0 && i == tv->iterations - 1 ? volume : work[i % 2];
 
 		TRY(cancel_check(cancel, err));
-		gradient_step<<<tv_blocks(s, TILE_X, TILE_Y), dim3(TILE_X, TILE_Y), 0, stream>>>(from, volume, to, s);
+		launch<STEP_EXPLICIT, float>(plan->device, {volume, from, from, to, {}, {}}, s);
 		LAUNCHED();
 		from = to;
 	}
 	if (from != volume)
-		CUDA_TRY(cudaMemcpyAsync(volume, from, voxels * sizeof(float), cudaMemcpyDeviceToDevice, stream));
+		CUDA_TRY(cudaMemcpyAsync(volume, from, voxels * sizeof(float), cudaMemcpyDeviceToDevice,
+					 plan->device->stream));
 	return 0;
 }
 
@@ -298,38 +408,42 @@ static int run_proximal(struct plan *plan, float *volume, const struct cancel *c
 {
 	const struct tv_options *tv = plan->options.tv;
 	size_t voxels = grid_voxels(plan->options.grid);
-	cudaStream_t stream = plan->device->stream;
-	tv_step s = step_make(plan);
-	float *v = plan->scratch, *ahead[2] = {v + voxels, v + 2 * voxels};
-	DUAL *dual[2] = {(DUAL *)(v + 3 * voxels), (DUAL *)(v + 3 * voxels) + 3 * voxels};
-	double square = fmax(4 * squared_weights(s), 1), tau = 1 / tv->alpha, sigma = 1 / (square * tau);
-	dim3 blocks = tv_blocks(s, DUAL_X, DUAL_Y), threads(DUAL_X, DUAL_Y);
+	float *from = volume, *past = volume;
+	float *work[3] = {plan->scratch, plan->scratch + voxels, plan->scratch + 2 * voxels};
+	DUAL *dual[2] = {(DUAL *)(plan->scratch + 3 * voxels), (DUAL *)(plan->scratch + 3 * voxels) + 3 * voxels};
+	double square = fmax(4 * squared_weights(plan), 1), tau = 1 / tv->alpha, sigma = 1 / (square * tau), theta = 0;
 
 	for (int i = 0; i < tv->iterations; i++) {
-		double theta = 1 / sqrt(1 + 2 * tv->alpha * tau);
+		double damping = 1 + tau * tv->alpha;
+		tv_step s = step_make(plan, sigma / tv->unit, tau * tv->unit / damping, tau * tv->alpha / damping);
 		bool last = i == tv->iterations - 1;
-		int from = i % 2, to = 1 - from;
+		/* The volume is f, and up to the second step v or past. */
+		float *to = last && i > 1 ? volume : work[i % 3];
+		tv_volumes<DUAL> volumes = {volume, from, past, to, {}, {}};
+
+		for (int k = 0; k < 3; k++) {
+			volumes.dual[k] = dual[i % 2] + k * voxels;
+			volumes.ret_dual[k] = dual[1 - i % 2] + k * voxels;
+		}
 
 		TRY(cancel_check(cancel, err));
-		s.flow = (float)(tau * tv->unit / (1 + tau * tv->alpha));
-		s.fidelity = (float)(tau * tv->alpha / (1 + tau * tv->alpha));
-		s.sigma = (float)(sigma / tv->unit);
 		s.theta = (float)theta;
 		if (i == 0)
-			proximal_step<DUAL, true, false><<<blocks, threads, 0, stream>>>(
-			    volume, ahead[from], dual[from], v, v, ahead[to], dual[to], s);
+			launch<STEP_FIRST>(plan->device, volumes, s);
 		else if (last)
-			proximal_step<DUAL, false, true><<<blocks, threads, 0, stream>>>(
-			    volume, ahead[from], dual[from], v, volume, ahead[to], dual[to], s);
+			launch<STEP_LAST>(plan->device, volumes, s);
 		else
-			proximal_step<DUAL, false, false><<<blocks, threads, 0, stream>>>(
-			    volume, ahead[from], dual[from], v, v, ahead[to], dual[to], s);
+			launch<STEP_MIDDLE>(plan->device, volumes, s);
 		LAUNCHED();
+		past = from;
+		from = to;
+		theta = 1 / sqrt(1 + 2 * tv->alpha * tau);
 		tau *= theta;
 		sigma /= theta;
 	}
-	if (tv->iterations == 1)
-		CUDA_TRY(cudaMemcpyAsync(volume, v, voxels * sizeof(float), cudaMemcpyDeviceToDevice, stream));
+	if (from != volume)
+		CUDA_TRY(cudaMemcpyAsync(volume, from, voxels * sizeof(float), cudaMemcpyDeviceToDevice,
+					 plan->device->stream));
 	return 0;
 }
 
