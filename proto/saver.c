@@ -22,7 +22,7 @@
 #include "proto/durable.h"
 
 enum {
-	PIECE_BYTES = 8 << 20, /* populated or written back in one go */
+	PIECE_BYTES = 4 << 20, /* populated or written back in one go */
 	PREPARERS = 4          /* the kernel's own work on pages does not get faster with more */
 };
 
@@ -181,8 +181,8 @@ static bool await_bytes(struct saver *saver, size_t at, size_t *ret_end)
 
 /*
  * Begins with the bytes from `at` on and waits for those from `before` to there:
- * two pieces keep the disk busy, and what others sync meanwhile, that this file
- * is there to begin with, does not wait for all of it.
+ * two pieces keep the disk as busy as all of them at once would, and what others
+ * sync meanwhile, that this file is there to begin with, gets in between.
  */
 static int write_back(const struct durable *file, size_t before, size_t at, size_t end, struct error *err)
 {

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # FDK while the arm turns: a job is posted first, then its projections are sent at the rate of a detector. How long after
-# the last 2xx the FDK volume is kept (reconstructed, on the disk, and told of), and what each PUT took meanwhile.
+# the last 2xx the FDK volume is kept (reconstructed, whole in its file, and told of), and what each PUT took meanwhile.
 #
 #   arriving.sh [BACKEND COLUMNS ROWS VIEWS RATE GRID SAMPLE GOAL_MS]    one case; without arguments the CPU's
 #   arriving.sh cuda 1240 960 496 60 512 uint16 100
