@@ -302,17 +302,33 @@ static const struct layered *array_for(const struct plan *plan, const struct vox
 	return use.fdk && plan->filtered.columns > plan->stack.columns ? &plan->filtered_array : &plan->projections;
 }
 
+/* Projections into an array, four pixels a thread: twice as fast as a copy by the driver. */
+enum { ARRAY_WIDE = 64, ARRAY_HIGH = 4 };
+static __global__ void __launch_bounds__(ARRAY_WIDE *ARRAY_HIGH)
+    to_array(const float *__restrict__ from, const stack_shape shape, cudaSurfaceObject_t array)
+{
+	int column = (blockIdx.x * ARRAY_WIDE + threadIdx.x) * 4, row = blockIdx.y * ARRAY_HIGH + threadIdx.y;
+	int slot = blockIdx.z;
+
+	if (column >= shape.columns || row >= shape.rows)
+		return;
+	const float *at = from + slot * shape.slot + (size_t)row * shape.pitch + column;
+	if (column + 4 <= shape.columns) {
+		surf2DLayeredwrite(*(const float4 *)at, array, column * (int)sizeof(float), row, slot);
+		return;
+	}
+	for (int i = 0; column + i < shape.columns; i++)
+		surf2DLayeredwrite(at[i], array, (column + i) * (int)sizeof(float), row, slot);
+}
+
 static int load_array(struct plan *plan, const backprojection_job &job, struct error *err)
 {
 	const struct stack_shape *shape = shape_for(plan, job.use);
-	cudaMemcpy3DParms copy = {};
+	dim3 blocks(divide_up(shape->columns, 4 * ARRAY_WIDE), divide_up(shape->rows, ARRAY_HIGH), job.views);
 
-	copy.srcPtr = make_cudaPitchedPtr((void *)job.from, (size_t)shape->pitch * sizeof(float),
-					  (size_t)shape->columns, shape->slot / (size_t)shape->pitch);
-	copy.dstArray = array_for(plan, job.use)->array;
-	copy.extent = make_cudaExtent((size_t)shape->columns, (size_t)shape->rows, (size_t)job.views);
-	copy.kind = cudaMemcpyDeviceToDevice;
-	CUDA_TRY(cudaMemcpy3DAsync(&copy, plan->device->stream));
+	to_array<<<blocks, dim3(ARRAY_WIDE, ARRAY_HIGH), 0, plan->device->stream>>>(job.from, *shape,
+										    array_for(plan, job.use)->surface);
+	LAUNCHED();
 	return 0;
 }
 
@@ -388,7 +404,8 @@ static int launch(struct plan *plan, backprojection_job &job, struct error *err)
 		break;
 	default:
 		if (plan->shape.textures) {
-			TRY(load_array(plan, job, err));
+			if (!job.use.laid_out)
+				TRY(load_array(plan, job, err));
 			if (job.use.coverage != NULL) {
 				job.texture = plan->projections.held;
 				launch_general<8, BY_TEXTURE_HELD>(job, stream);

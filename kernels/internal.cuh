@@ -191,7 +191,8 @@ struct columns_shape columns_shape_make(const int size[3]);
 struct layered { /* a layered 2D array with its texture: hardware bilinear samples */
 	cudaArray_t array;
 	cudaTextureObject_t texture;
-	cudaTextureObject_t held; /* the same with the edges held, whatever `texture` has beyond them */
+	cudaTextureObject_t held;    /* the same with the edges held, whatever `texture` has beyond them */
+	cudaSurfaceObject_t surface; /* to write it */
 	int width, height, layers;
 	size_t bytes;
 };
@@ -270,8 +271,9 @@ struct plan {
 	cudaTextureObject_t sampled; /* and its texture */
 	float2 *partial; /* SART: squares of residuals and projections, one for each block of the forward projection */
 	size_t partial_count;
-	double *reduce;  /* partial sums of reductions */
-	float *matrices; /* of the views in hand, on their way into constant memory */
+	cudaEvent_t projected, summed; /* the last of them is there; all are summed up */
+	double *reduce;                /* partial sums of reductions */
+	float *matrices;               /* of the views in hand, on their way into constant memory */
 
 	float *column_weights; /* [count][columns] */
 	float *response;       /* the filter's, in the order of the kernel */
@@ -314,9 +316,10 @@ int layout_from_columns(struct plan *plan, const float *columns, float *volume, 
 /* ---- project.cu ---- */
 /* What becomes of a ray's sum. */
 struct ray_use {
-	const float *measured; /* NULL: the sum itself is wanted; else (p - sum) / row sum, slot = view */
-	float2 *partial;       /* one a block: residual^2, p^2 */
-	float least;           /* mm that a ray must have in the grid to correct it */
+	const float *measured;     /* NULL: the sum itself is wanted; else (p - sum) / row sum, slot = view */
+	float2 *partial;           /* one a block: residual^2, p^2 */
+	float least;               /* mm that a ray must have in the grid to correct it */
+	cudaSurfaceObject_t array; /* not 0: into this array, too, layer = slot */
 };
 /* Before project_rays: the volume as it reads it. */
 int project_prepare(struct plan *plan, const float *volume, struct error *err);
@@ -334,6 +337,7 @@ struct voxel_use {
 	float scale;           /* update: relaxation, over the number of views where all is covered */
 	const float *coverage; /* update: else divided by this, voxel by voxel */
 	float least;           /* what a voxel has of it at least, if any */
+	bool laid_out;         /* the array has the projections already */
 };
 int backproject_views(struct plan *plan, const float *from, int first, int count, struct voxel_use use, float *volume,
 		      struct error *err);
@@ -366,7 +370,8 @@ size_t filter_bytes(const struct plan_shape *shape, int rows);
 /* ---- norms.cu ---- */
 size_t reduce_bytes(void);
 /* partial[0 .. count - 1] -> sums[0], sums[1] += in a fixed order. */
-int reduce_pairs(struct plan *plan, const float2 *partial, size_t count, double *sums, struct error *err);
+int reduce_pairs(struct plan *plan, const float2 *partial, size_t count, double *sums, cudaStream_t stream,
+		 struct error *err);
 
 /* ---- sweep.cu: an iteration view by view, by rows; partial sums of each view are left in plan->partial ---- */
 size_t sweep_rows_bytes(const struct plan *plan);

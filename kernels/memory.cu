@@ -337,7 +337,8 @@ int layered_new(struct device *device, int width, int height, int layers, cudaTe
 	if (layered.bytes > device->limit - device->used)
 		return error_set(err, ERR_NO_MEMORY, "an array of %zu bytes does not fit", layered.bytes);
 	CUDA_TRY(cudaMalloc3DArray(&layered.array, &channel,
-				   make_cudaExtent((size_t)width, (size_t)height, (size_t)layers), cudaArrayLayered));
+				   make_cudaExtent((size_t)width, (size_t)height, (size_t)layers),
+				   cudaArrayLayered | cudaArraySurfaceLoadStore));
 	resource.resType = cudaResourceTypeArray;
 	resource.res.array.array = layered.array;
 	texture.addressMode[0] = texture.addressMode[1] = outside;
@@ -347,12 +348,14 @@ int layered_new(struct device *device, int width, int height, int layers, cudaTe
 	if (status == cudaSuccess) {
 		texture.addressMode[0] = texture.addressMode[1] = cudaAddressModeClamp;
 		status = cudaCreateTextureObject(&layered.held, &resource, &texture, NULL);
-		if (status != cudaSuccess)
-			cudaDestroyTextureObject(layered.texture);
 	}
+	if (status == cudaSuccess)
+		status = cudaCreateSurfaceObject(&layered.surface, &resource);
 	if (status != cudaSuccess) {
+		cudaDestroyTextureObject(layered.texture);
+		cudaDestroyTextureObject(layered.held);
 		cudaFreeArray(layered.array);
-		return cuda_error(err, status, "cudaCreateTextureObject");
+		return cuda_error(err, status, "a texture or surface");
 	}
 	device->used += layered.bytes;
 	*ret_layered = layered;
@@ -366,6 +369,7 @@ void layered_free(struct device *device, struct layered *layered)
 	cudaSetDevice(device->index);
 	cudaDestroyTextureObject(layered->texture);
 	cudaDestroyTextureObject(layered->held);
+	cudaDestroySurfaceObject(layered->surface);
 	cudaFreeArray(layered->array);
 	device->used -= layered->bytes;
 	*layered = {};

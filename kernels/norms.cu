@@ -74,9 +74,9 @@ static __global__ void __launch_bounds__(THREADS) add_blocks(const double *block
 			ret[k] = value[k];
 }
 
-int reduce_pairs(struct plan *plan, const float2 *partial, size_t count, double *sums, struct error *err)
+int reduce_pairs(struct plan *plan, const float2 *partial, size_t count, double *sums, cudaStream_t stream,
+		 struct error *err)
 {
-	cudaStream_t stream = plan->device->stream;
 	int blocks = (int)(count < (size_t)BLOCKS * THREADS ? (count + THREADS - 1) / THREADS : BLOCKS);
 
 	if (count <= 64 * (size_t)THREADS) { /* a second launch would cost more */

@@ -530,8 +530,11 @@ static int prepare_sart(struct plan *plan, struct error *err)
 	const struct geometry *geometry = plan->options.geometry;
 	size_t voxels = grid_voxels(plan->options.grid) * sizeof(float);
 
-	if (plan->partial_count > 0)
+	if (plan->partial_count > 0) {
 		TRY(device_allocate(plan->device, plan->partial_count * sizeof(float2), (void **)&plan->partial, err));
+		CUDA_TRY(cudaEventCreateWithFlags(&plan->projected, cudaEventDisableTiming));
+		CUDA_TRY(cudaEventCreateWithFlags(&plan->summed, cudaEventDisableTiming));
+	}
 	plan->coverage_subset = -1;
 	if (needs_coverage(plan))
 		TRY(device_allocate(plan->device, voxels, (void **)&plan->coverage, err));
@@ -647,6 +650,10 @@ void cuda_plan_free(struct plan *plan)
 	backproject_forget();
 	if (plan->sweep != NULL)
 		cudaGraphExecDestroy(plan->sweep);
+	if (plan->projected != NULL)
+		cudaEventDestroy(plan->projected);
+	if (plan->summed != NULL)
+		cudaEventDestroy(plan->summed);
 	filter_release(plan);
 	device_release(device, plan->geometry, count * sizeof(struct device_view));
 	device_release(device, plan->views, count * sizeof(int));

@@ -77,6 +77,8 @@ static __device__ __forceinline__ float2 finish(const projection &p, int slot, i
 		squares = {residual * residual, measured * measured};
 	}
 	p.to[(size_t)slot * p.slot + pixel] = value;
+	if (p.use.array != 0)
+		surf2DLayeredwrite(value, p.use.array, column * (int)sizeof(float), row, slot);
 	return squares;
 }
 
@@ -185,18 +187,17 @@ static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS, GENE
 
 /* ---- small problems ---- */
 
-/* Of a block, 32 columns wide: rows, and parts into which rays are cut; what takes time is to wait for samples. */
-enum { SMALL_ROWS = 2, SMALL_PARTS = 4 };
+/* Of a block: warps of pixels one after the other, and parts into which rays are cut; what takes time is to wait. */
+enum { SMALL_WARPS = 2, SMALL_PARTS = 4, SMALL_PIXELS = 32 * SMALL_WARPS };
 
 /* From the volume as it is, which the caches hold. */
-static __global__ void __launch_bounds__(32 * SMALL_ROWS * SMALL_PARTS) project_small(const projection p)
+static __global__ void __launch_bounds__(SMALL_PIXELS *SMALL_PARTS, 4) project_small(const projection p)
 {
-	__shared__ float sums[SMALL_PARTS][SMALL_ROWS][32];
-	int slot = blockIdx.x / p.tiles, tile = blockIdx.x % p.tiles, view = p.views[slot], part = threadIdx.z;
-	int column = tile % p.tiles_across * 32 + threadIdx.x;
-	int row = tile / p.tiles_across * SMALL_ROWS + threadIdx.y;
+	__shared__ float sums[SMALL_PARTS][SMALL_PIXELS];
+	int slot = blockIdx.x / p.tiles, pixel = blockIdx.x % p.tiles * SMALL_PIXELS + threadIdx.x;
+	int view = p.views[slot], row = pixel / p.columns, column = pixel - row * p.columns, part = threadIdx.y;
 	const device_view &g = p.geometry[view];
-	bool valid = column < p.columns && row < p.rows;
+	bool valid = row < p.rows;
 	float c = (float)column - 0.5f * (float)(p.columns - 1), r = (float)row - 0.5f * (float)(p.rows - 1);
 	float d[3] = {form(g.direction[0], c, r), form(g.direction[1], c, r), form(g.direction[2], c, r)};
 	float m[3] = {form(g.moment[0], c, r), form(g.moment[1], c, r), form(g.moment[2], c, r)};
@@ -204,16 +205,16 @@ static __global__ void __launch_bounds__(32 * SMALL_ROWS * SMALL_PARTS) project_
 	ray_part way = walk_part<false>(volume, p.grid, d, m, valid, part, SMALL_PARTS);
 	float2 squares = {0, 0};
 
-	sums[part][threadIdx.y][threadIdx.x] = way.sum;
+	sums[part][threadIdx.x] = way.sum;
 	__syncthreads();
 	if (part == 0 && valid) {
 		for (int k = 1; k < SMALL_PARTS; k++)
-			way.sum += sums[k][threadIdx.y][threadIdx.x];
+			way.sum += sums[k][threadIdx.x];
 		squares = finish(p, slot, view, column, row, way.sum, way.slices, way.step);
 	}
 	if (p.use.measured != NULL) {
 		squares = block_sum(squares);
-		if (threadIdx.x == 0 && threadIdx.y == 0 && threadIdx.z == 0)
+		if (threadIdx.x == 0 && threadIdx.y == 0)
 			p.use.partial[blockIdx.x] = squares;
 	}
 }
@@ -459,13 +460,16 @@ static __global__ void __launch_bounds__(32 * ROWS_WARPS * ROWS_VIEWS, 32 / (ROW
 
 static int rows_of_a_tile(const plan_shape &shape)
 {
-	if (shape.is_small)
-		return SMALL_ROWS;
 	return shape.forward_rows > 0 ? ROWS_WARPS * shape.forward_rows : GENERAL_ROWS;
 }
 
 static void count_tiles(const struct plan *plan, int *ret_across, int *ret_tiles)
 {
+	if (plan->shape.is_small) {
+		*ret_across = 0;
+		*ret_tiles = divide_up(plan->stack.columns * plan->stack.rows, SMALL_PIXELS);
+		return;
+	}
 	*ret_across = divide_up(plan->stack.columns, 32);
 	*ret_tiles = *ret_across * divide_up(plan->stack.rows, rows_of_a_tile(plan->shape));
 }
@@ -551,7 +555,7 @@ int project_rays(struct plan *plan, const float *volume, int first, int count, s
 		break;
 	default:
 		if (plan->shape.is_small)
-			project_small<<<blocks, dim3(32, SMALL_ROWS, SMALL_PARTS), 0, stream>>>(p);
+			project_small<<<blocks, dim3(SMALL_PIXELS, SMALL_PARTS), 0, stream>>>(p);
 		else if (plan->shape.rows_apart)
 			launch_apart(plan->shape, p, blocks, stream);
 		else if (plan->shape.halves)

@@ -220,12 +220,25 @@ static int sweep_views(struct plan *plan, const float *projections, float *volum
 
 /* ---- several views an update ---- */
 
+/* The squares of all rays are added up beside the last backprojection, which small problems would wait for. */
+static int begin_sums(struct plan *plan, struct error *err)
+{
+	struct device *device = plan->device;
+
+	CUDA_TRY(cudaEventRecord(plan->projected, device->stream));
+	CUDA_TRY(cudaStreamWaitEvent(device->back, plan->projected, 0));
+	TRY(reduce_pairs(plan, plan->partial, plan->partial_count, device->sums_device, device->back, err));
+	CUDA_TRY(cudaEventRecord(plan->summed, device->back));
+	return 0;
+}
+
+/* `last`: all partial sums are there behind its projection. */
 static int update_subset(struct plan *plan, int subset, const float *projections, float *volume, float2 *partial,
-			 struct error *err)
+			 bool last, struct error *err)
 {
 	const struct sart_options *sart = plan->options.sart;
 	int first = sart->subsets.start[subset], count = sart->subsets.start[subset + 1] - first;
-	struct ray_use rays = {projections, partial, length_least(plan)};
+	struct ray_use rays = {projections, partial, length_least(plan), 0};
 	struct voxel_use voxels = {};
 	size_t bytes = grid_voxels(plan->options.grid) * sizeof(float);
 
@@ -240,7 +253,13 @@ static int update_subset(struct plan *plan, int subset, const float *projections
 		plan->coverage_subset = sart->subsets.count > 1 ? -1 : subset;
 	}
 	if (count <= plan->shape.correction) {
+		if (plan->projections.array != NULL && !plan->options.matched && count <= plan->shape.views_at_once) {
+			rays.array = plan->projections.surface;
+			voxels.laid_out = true;
+		}
 		TRY(project_rays(plan, volume, first, count, rays, plan->correction->data, err));
+		if (last)
+			TRY(begin_sums(plan, err));
 		return backproject_views(plan, plan->correction->data, first, count, voxels, volume, err);
 	}
 	/* In parts: the volume stays as it is until all of the subset has been seen. */
@@ -260,6 +279,8 @@ static int update_subset(struct plan *plan, int subset, const float *projections
 		else
 			TRY(backproject_views(plan, plan->correction->data, first + done, now, sum, plan->work, err));
 	}
+	if (last)
+		TRY(begin_sums(plan, err));
 	return update_volume(plan, voxels, volume, err);
 }
 
@@ -293,10 +314,13 @@ static int sweep_subsets(struct plan *plan, const float *projections, float *vol
 		TRY(cancel_check(cancel, err));
 		if (count == 0)
 			continue;
-		TRY(update_subset(plan, i, projections, volume, plan->partial + blocks, err));
+		size_t here = blocks;
 		blocks += subset_blocks(plan, count);
+		TRY(update_subset(plan, i, projections, volume, plan->partial + here, blocks == plan->partial_count,
+				  err));
 	}
-	return reduce_pairs(plan, plan->partial, blocks, plan->device->sums_device, err);
+	CUDA_TRY(cudaStreamWaitEvent(plan->device->stream, plan->summed, 0));
+	return 0;
 }
 
 static int sweep(struct plan *plan, const float *projections, float *volume, const struct cancel *cancel,
@@ -308,7 +332,8 @@ static int sweep(struct plan *plan, const float *projections, float *volume, con
 		TRY(sweep_rows(plan, projections, volume, length_least(plan), cancel, err));
 	else
 		TRY(sweep_views(plan, projections, volume, cancel, err));
-	return reduce_pairs(plan, plan->partial, sweep_partials(plan), plan->device->sums_device, err);
+	return reduce_pairs(plan, plan->partial, plan->partial_count, plan->device->sums_device, plan->device->stream,
+			    err);
 }
 
 /* ---- recording ---- */
