@@ -129,27 +129,34 @@ static int make_digest(struct digester *digester, struct job *job, const struct 
 
 /* ---- the threads ---- */
 
+static void complain(struct job *job, const struct error *err)
+{
+	struct job_facts facts;
+
+	job_facts(job, &facts);
+	if (err->code != ERR_CANCELLED && !facts.removed)
+		log_line(LEVEL_ERROR, "job %s: a volume has no digest before the next start: %s", facts.id, err->text);
+}
+
 static void carry_out(struct digester *digester, const struct task *task)
 {
 	struct volume_record *volumes = NULL;
-	struct job_facts facts;
 	struct job *job;
 	struct error err;
-	int count = 0, code;
+	int count = 0;
 
 	if (jobs_find(digester->jobs, task->job, &job, &err) != 0)
 		return;
-	code = store_job_volumes(jobs_store(digester->jobs), task->job, &volumes, &count, &err);
-	for (int i = 0; i < count && code == 0; i++) {
-		if (!volumes[i].hashed && (task->name[0] == '\0' || strcmp(task->name, volumes[i].name) == 0))
-			code = make_digest(digester, job, volumes, count, &volumes[i], &err);
+	if (store_job_volumes(jobs_store(digester->jobs), task->job, &volumes, &count, &err) != 0)
+		complain(job, &err);
+	for (int i = 0; i < count; i++) {
+		if (volumes[i].hashed || (task->name[0] != '\0' && strcmp(task->name, volumes[i].name) != 0))
+			continue;
+		if (make_digest(digester, job, volumes, count, &volumes[i], &err) != 0)
+			complain(job, &err);
 	}
 	free(volumes);
-	job_facts(job, &facts);
 	job_release(job);
-	if (code != 0 && code != ERR_CANCELLED && !facts.removed)
-		log_line(LEVEL_ERROR, "job %s: no digest of its volumes before the next start: %s", task->job,
-			 err.text);
 }
 
 static void *digest_loop(void *context)

@@ -618,7 +618,7 @@ END_TEST
 START_TEST(a_digest_that_was_not_made_before_a_restart_is_made_after_it)
 {
 	static const enum job_state states[] = {JOB_SUCCEEDED, JOB_CANCELLED, JOB_QUEUED};
-	const struct volume_record fdk = {.name = "fdk", .stage = "fdk", .bytes = 1};
+	const struct volume_record fdk = {.name = "fdk", .stage = "fdk", .bytes = 1}, lost = {.name = "iter-1"};
 	struct digester *digester = NULL;
 	struct error err = {0};
 	char ids[3][ID_SIZE];
@@ -629,6 +629,7 @@ START_TEST(a_digest_that_was_not_made_before_a_restart_is_made_after_it)
 		keep_id(job, ids[i]);
 		state_set(job, JOB_RUNNING, NULL);
 		put_voxels(ids[i], "fdk", "abc");
+		ck_assert_int_eq(job_add_volume(job, &lost, &err), 0); /* whose file is not there */
 		ck_assert_int_eq(job_add_volume(job, &fdk, &err), 0);
 		state_set(job, states[i], NULL);
 		job_release(job);
