@@ -1138,6 +1138,55 @@ START_TEST(matched_backprojection_is_the_transpose_of_projection)
 }
 END_TEST
 
+/*
+ * Rays of a coarse detector in a symmetric scan pass voxels at exactly the distance where their weight ends: a
+ * millionth of a voxel decides whether they touch them, and must not decide whether these are corrected in full.
+ */
+START_TEST(matched_sart_hardly_moves_what_rounding_touches)
+{
+	static const struct setup coarse = {
+	    "coarse", 33, 31, 16, {620, 1100, {5, 6}, {0, 0}, {0, 0}}, 0, 22.5, PLAIN, {{65, 66, 67}, {1, 1, 1}, {0}},
+	    true};
+	float *projections, *moved[2];
+	struct sart_sums sums;
+	struct rig rig;
+
+	random_state = 21;
+	rig_make(&coarse, &rig);
+	rig.options.matched = true;
+	rig.sart.relaxation = 1;
+	projections = random_floats(rig.all_pixels, 10, 20);
+	for (int i = 0; i < 2; i++)
+		moved[i] = floats(rig.voxels);
+	const double origin = rig.grid.origin[0];
+	FOR_EACH_MACHINE(&rig)
+	{
+		load(&rig, projections);
+		ok(rig.backend->volume_fill(rig.volume, 0, &err));
+		ok(rig.backend->sart_iterate(rig.plan, rig.stack, rig.volume, NULL, &sums, &err));
+		read_volume(&rig, moved[0]);
+		rig_close(&rig);
+		rig.grid.origin[0] = origin + 1e-6;
+		rig_open(&rig, machine);
+		load(&rig, projections);
+		ok(rig.backend->volume_fill(rig.volume, 0, &err));
+		ok(rig.backend->sart_iterate(rig.plan, rig.stack, rig.volume, NULL, &sums, &err));
+		read_volume(&rig, moved[1]);
+		rig.grid.origin[0] = origin;
+		double apart = 0;
+		for (size_t k = 0; k < rig.voxels; k++)
+			apart = fmax(apart, fabs((double)moved[0][k] - (double)moved[1][k]));
+		/* 1e-6 of a voxel, and float32, over the hundredth that a sum counts for at least */
+		ck_assert_msg(apart < 2e-3 * most(moved[0], rig.voxels), "%s: %g of %g", machine->name, apart,
+			      most(moved[0], rig.voxels));
+	}
+	for (int i = 0; i < 2; i++)
+		free(moved[i]);
+	free(projections);
+	rig_clear(&rig);
+}
+END_TEST
+
 START_TEST(proximal_tv_of_a_step_is_known)
 {
 	/* Of two levels, each side moves towards the other by 1 / (alpha times its length). */
@@ -1728,6 +1777,7 @@ Suite *backend_suite(void)
 	tcase_add_test(known, fdk_of_a_ball_has_its_density);
 	tcase_add_loop_test(known, projection_is_linear, 0, SETUPS);
 	tcase_add_loop_test(known, matched_backprojection_is_the_transpose_of_projection, 0, SETUPS);
+	tcase_add_test(known, matched_sart_hardly_moves_what_rounding_touches);
 	tcase_add_test(known, proximal_tv_of_a_step_is_known);
 	tcase_add_loop_test(known, proximal_tv_is_a_minimum, 0, SETUPS);
 	tcase_add_test(known, gradient_tv_is_stable_and_comes_near_the_minimum);
