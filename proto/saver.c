@@ -4,7 +4,7 @@
  * write() into the page cache is done by one thread whatever one does, since the
  * file systems lock the file; a mapping is filled by as many as there are. Its
  * pages are got in pieces (MADV_POPULATE_WRITE) and not by touching them: a disk
- * that has none is an error then and no SIGBUS. The hasher lets go of the pages
+ * that has none is an error then and no SIGBUS. The syncer lets go of the pages
  * behind it, so that the file does not count as this process's memory for long.
  */
 #include "proto/saver.h"
