@@ -19,6 +19,8 @@
  * rows (HALF) go the same way: voxel k has its rows from k / 2 on and the spacing
  * 1/2 + e, so that as few rows serve twice as many voxels.
  *
+ * Small problems: a voxel a thread, its views cut into parts for several warps.
+ *
  * Matrices are read from constant memory, one broadcast for a block.
  */
 #include "kernels/rays.cuh"

@@ -102,8 +102,8 @@ static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS, GENE
 	int column = at.tile_column * 32 + threadIdx.x, row = at.tile_row * GENERAL_ROWS + threadIdx.y;
 	bool valid = has_view && column < p.columns && row < p.rows;
 	float c = (float)column - 0.5f * (float)(p.columns - 1), r = (float)row - 0.5f * (float)(p.rows - 1);
-	float d[3] = {form(g.direction[0], c, r), form(g.direction[1], c, r), form(g.direction[2], c, r)};
-	float m[3] = {form(g.moment[0], c, r), form(g.moment[1], c, r), form(g.moment[2], c, r)};
+	float d[3], m[3];
+	line_to(g, c, r, d, m);
 	int own = dominant_axis(d[0], d[1], d[2]);
 	float sum = 0, slices = 0, step = 0;
 
@@ -199,8 +199,8 @@ static __global__ void __launch_bounds__(SMALL_PIXELS *SMALL_PARTS, 4) project_s
 	const device_view &g = p.geometry[view];
 	bool valid = row < p.rows;
 	float c = (float)column - 0.5f * (float)(p.columns - 1), r = (float)row - 0.5f * (float)(p.rows - 1);
-	float d[3] = {form(g.direction[0], c, r), form(g.direction[1], c, r), form(g.direction[2], c, r)};
-	float m[3] = {form(g.moment[0], c, r), form(g.moment[1], c, r), form(g.moment[2], c, r)};
+	float d[3], m[3];
+	line_to(g, c, r, d, m);
 	strided volume = {p.volume, 1, p.grid.size[0], p.grid.size[0] * p.grid.size[1]};
 	ray_part way = walk_part<false>(volume, p.grid, d, m, valid, part, SMALL_PARTS);
 	float2 squares = {0, 0};
@@ -392,8 +392,8 @@ static __global__ void __launch_bounds__(32 * ROWS_WARPS * ROWS_VIEWS, 32 / (ROW
 	float upwards = p.rows_down ? -1.0f : 1.0f;
 	float c = (float)column - 0.5f * (float)(p.columns - 1);
 	float r = upwards * ((float)low - 0.5f * (float)(p.rows - 1));
-	float d[3] = {form(g.direction[0], c, r), form(g.direction[1], c, r), form(g.direction[2], c, r)};
-	float m[3] = {form(g.moment[0], c, r), form(g.moment[1], c, r), form(g.moment[2], c, r)};
+	float d[3], m[3];
+	line_to(g, c, r, d, m);
 	int own = fabsf(d[0]) >= fabsf(d[1]) ? ACROSS_X : ACROSS_Y;
 	float2 squares = {0, 0};
 

@@ -119,6 +119,18 @@ static __device__ __forceinline__ float form(const float coefficients[3], float 
 	return fmaf(coefficients[2], row, fmaf(coefficients[1], column, coefficients[0]));
 }
 
+/* The ray to a place on the detector, counted from its middle: direction and moment. */
+static __device__ __forceinline__ void line_to(const device_view &g, float column, float row, float ret_direction[3],
+					       float ret_moment[3])
+{
+	ret_direction[0] = form(g.direction[0], column, row);
+	ret_direction[1] = form(g.direction[1], column, row);
+	ret_direction[2] = form(g.direction[2], column, row);
+	ret_moment[0] = form(g.moment[0], column, row);
+	ret_moment[1] = form(g.moment[1], column, row);
+	ret_moment[2] = form(g.moment[2], column, row);
+}
+
 /* The axis along which a direction, in voxels, is longest; the first of equal ones. */
 static __device__ __forceinline__ int dominant_axis(float x, float y, float z)
 {

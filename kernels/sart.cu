@@ -57,8 +57,8 @@ static __global__ void __launch_bounds__(32 * SWEEP_COLUMNS * SWEEP_PARTS, 2) pr
 	int part = threadIdx.z;
 	bool valid = column < s.columns && row < s.rows;
 	float c = (float)column - 0.5f * (float)(s.columns - 1), r = (float)row - 0.5f * (float)(s.rows - 1);
-	float d[3] = {form(g.direction[0], c, r), form(g.direction[1], c, r), form(g.direction[2], c, r)};
-	float m[3] = {form(g.moment[0], c, r), form(g.moment[1], c, r), form(g.moment[2], c, r)};
+	float d[3], m[3];
+	line_to(g, c, r, d, m);
 	strided volume = {s.volume, s.grid.size[1] * s.pitch, s.pitch, 1};
 	ray_part way = walk_part<true>(volume, s.grid, d, m, valid, part, SWEEP_PARTS);
 

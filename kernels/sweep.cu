@@ -53,8 +53,8 @@ static __global__ void __launch_bounds__(32 * PARTS, ROWS > 4 || LEAN ? 3 : 4) p
 	bool valid = column < s.columns;
 	float upwards = s.rows_down ? -1.0f : 1.0f, c = (float)column - 0.5f * (float)(s.columns - 1);
 	float r = upwards * ((float)low - 0.5f * (float)(s.rows - 1));
-	float d[3] = {form(g.direction[0], c, r), form(g.direction[1], c, r), form(g.direction[2], c, r)};
-	float m[3] = {form(g.moment[0], c, r), form(g.moment[1], c, r), form(g.moment[2], c, r)};
+	float d[3], m[3];
+	line_to(g, c, r, d, m);
 	int own = fabsf(d[0]) >= fabsf(d[1]) ? ACROSS_X : ACROSS_Y;
 
 #pragma unroll
@@ -130,8 +130,8 @@ static __global__ void __launch_bounds__(32 * PARTS, ROWS > 4 || LEAN ? 3 : 4) p
 		if (!valid || low + k >= s.rows)
 			continue;
 		float up = upwards * ((float)(low + k) - 0.5f * (float)(s.rows - 1)), sum = 0;
-		float dk[3] = {form(g.direction[0], c, up), form(g.direction[1], c, up), form(g.direction[2], c, up)};
-		float mk[3] = {form(g.moment[0], c, up), form(g.moment[1], c, up), form(g.moment[2], c, up)};
+		float dk[3], mk[3];
+		line_to(g, c, up, dk, mk);
 		ray full = ray_make(crossing_of(dk, mk, own), axes_of(s.grid, own));
 		float length = fmaxf(full.end - full.begin, 0.0f) * full.step;
 		int row = s.rows_down ? s.rows - 1 - (low + k) : low + k;
