@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # The CUDA backend through the real daemon: volumes beside the CPU's, memory that
 # comes back after 200 jobs, a worker that dies of an illegal access while the
-# daemon goes on. Needs a device, and nothing but cbct; skipped aloud without one.
+# daemon goes on. Needs a device, and for its last part curl and jq; skipped aloud without them.
 set -uo pipefail
 cd "$(dirname "$0")/../.."
 BUILD=$(realpath "${BUILD:-build}")
@@ -90,6 +90,13 @@ if [ -x "$BUILD/cbct-worker-faulty" ]; then
 	check "its worker ended and another came" grep -q "ended with exit status 3, the next one starts" "$work/err"
 	check "the daemon goes on" kill -0 $daemon
 	stop
+fi
+
+# What arrives while the arm turns, in any order, and what phantoms become: the daemon's own tests, on this backend.
+if command -v curl >/dev/null && command -v jq >/dev/null; then
+	check "the daemon's tests of arriving scans and phantoms" env BACKEND=cuda BUILD="$BUILD" tests/run.sh arriving phantom
+else
+	echo "SKIPPED: the daemon's tests of arriving scans and phantoms need curl and jq"
 fi
 
 echo "$failures failures"

@@ -10,6 +10,7 @@ DATA=${CBCT_TEST_DATA:-$top/../shared/data}
 PATH=$BUILD:$PATH
 work=$BUILD/test/$(basename "${BASH_SOURCE[1]}" .sh)
 RESULTS=${RESULTS:-/dev/null}
+BACKEND=${BACKEND:-cpu} # of what can be asked of either: check-gpu
 rm -rf "$work"
 mkdir -p "$work"
 
@@ -19,7 +20,7 @@ state=$work/state
 start_daemon() {
 	local out=$work/cbctd.out i daemon_pid
 	: >"$out"
-	"$BUILD/${program:-cbctd}" --listen "127.0.0.1:${port:-0}" --state-dir "$state" --backend cpu "$@" >"$out" 2>>"$work/cbctd.err" &
+	"$BUILD/${program:-cbctd}" --listen "127.0.0.1:${port:-0}" --state-dir "$state" --backend "$BACKEND" "$@" >"$out" 2>>"$work/cbctd.err" &
 	daemon_pid=$!
 	echo "$daemon_pid" >"$work/daemon.pid"
 	for ((i = 0; i < 300; i++)); do

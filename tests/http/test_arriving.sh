@@ -74,7 +74,7 @@ test_fdk_goes_along_and_the_rest_of_the_pipeline_follows() {
 	send "$scan_dir" 0 19
 	reconstructed 20
 	expect_json '.stage == "fdk" and .views == {received: 20, reconstructed: 20, of: 60} and .progress > 0 and .progress < 1'
-	expect_json '.backend == "cpu" and (.plan | length > 0) and .attempts == 0 and .started == null and .eta_s == null'
+	expect_json '.backend == "'"$BACKEND"'" and (.plan | length > 0) and .attempts == 0 and .started == null and .eta_s == null'
 	req GET /v1/devices
 	expect_json ".devices[0] | .state == \"busy\" and .job == \"$job\""
 	send "$scan_dir" 20 58
