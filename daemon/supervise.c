@@ -41,6 +41,7 @@ static const double EXIT = 2;                               /* s that a worker h
  */
 static const double PATIENCE = 2;
 static const double NEVER = 1e300;
+static const double TURN = 0.01; /* s of reading what one worker says, before the others and the queue have theirs */
 
 const char *const worker_state_names[WORKER_STATE_COUNT] = {"absent", "starting", "idle", "busy", "ending"};
 
@@ -516,15 +517,19 @@ static void on_message(struct supervise *supervise, struct worker *worker, const
 		stop_job(supervise, worker, &err);
 }
 
-/* All that is there to read; *ret_gone at the end of the stream or when it makes no sense. */
-static void read_messages(struct supervise *supervise, struct worker *worker, bool *ret_gone)
+/*
+ * All that is there to read of who died, else for one turn: iterations of a small job end faster than
+ * their rows are taken in. *ret_gone at the end of the stream or when it makes no sense.
+ */
+static void read_messages(struct supervise *supervise, struct worker *worker, bool died, bool *ret_gone)
 {
 	struct message *message = malloc(sizeof(*message));
+	double end = died ? NEVER : now_monotonic() + TURN;
 	struct error err;
 	bool got = true;
 	int code = message == NULL ? error_set_errno(&err, ENOMEM, "message") : 0;
 
-	while (code == 0 && got) {
+	while (code == 0 && got && now_monotonic() < end) {
 		code = message_receive(worker->child.socket, 0, message, &got, &err);
 		if (code == 0 && got) {
 			on_message(supervise, worker, message);
@@ -579,7 +584,7 @@ static void worker_died(struct supervise *supervise, struct worker *worker, bool
 	bool gone;
 
 	/* Its last words first: they may say that the job is done. */
-	read_messages(supervise, worker, &gone);
+	read_messages(supervise, worker, true, &gone);
 	child_reap(&worker->child, how, sizeof(how));
 	snprintf(text, sizeof(text), "its worker ended with %s", how);
 	worker->state = WORKER_ABSENT;
@@ -972,7 +977,7 @@ static void read_workers(struct supervise *supervise, const struct pollfd *fds, 
 		if (worker->state == WORKER_ABSENT)
 			continue;
 		if (fds[2 * i].revents != 0)
-			read_messages(supervise, worker, &gone);
+			read_messages(supervise, worker, false, &gone);
 		if (fds[2 * i + 1].revents != 0) {
 			worker_died(supervise, worker, stopping);
 		} else if (gone && worker->state != WORKER_ENDING) {

@@ -131,6 +131,15 @@ expect_number() { # VALUE OP LIMIT NAME, OP one of <= >= < > ==
 	echo "  $4 = $1 ($2 $3)"
 }
 
+# state_becomes STATE [SECONDS]: of $job, that it may leave again
+state_becomes() {
+	local end=$((SECONDS + ${2:-60}))
+	until req GET "/v1/jobs/$job" && [ "$(json .state)" = "$1" ]; do
+		[ $SECONDS -lt $end ] || fail "job $job $1: $(json '{state, stage, views}')"
+		sleep 0.02
+	done
+}
+
 # A scan of DIR (scan.json, projections.raw) posted with curl alone; sets $scan.
 post_scan() {
 	req POST /v1/scans -H 'Content-Type: application/json' --data-binary @"$1/scan.json"

@@ -34,13 +34,6 @@ reconstructed() {
 		sleep 0.02
 	done
 }
-state_becomes() { # STATE [SECONDS]
-	local end=$((SECONDS + ${2:-60}))
-	until req GET "/v1/jobs/$job" && [ "$(json .state)" = "$1" ]; do
-		[ $SECONDS -lt $end ] || fail "job $job $1: $(json '{state, stage, views}')"
-		sleep 0.02
-	done
-}
 digest() { # NAME: of a volume of $job
 	req GET "/v1/jobs/$job/volumes"
 	expect_status 200

@@ -187,6 +187,18 @@ test_cancel_and_delete() {
 	[ ! -e "$state/jobs/$job" ] || fail "the job's directory gone"
 }
 
+# Iterations of so small a job end faster than their rows can be taken in.
+test_cancel_among_many_short_iterations() {
+	cbct simulate --phantom ball --scale 3 --views 2 --columns 4 --rows 4 --pixel 4 -o "$work/tiny" >/dev/null
+	post_scan "$work/tiny"
+	post_projections "$work/tiny"
+	post_job '{"scan": "SCAN", "grid": {"size": [4, 4, 2], "spacing_mm": [2, 2, 2]}, "sart": {"iterations": 100000, "subsets": 1}}'
+	state_becomes running
+	sleep 0.1
+	req DELETE "/v1/jobs/$job?wait=10"
+	expect_json '.state == "cancelled" and (.history | length > 100)'
+}
+
 test_higher_priority_goes_first_and_the_lower_one_goes_on() {
 	local long urgent
 	uploaded_scan
