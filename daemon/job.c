@@ -1052,12 +1052,12 @@ void job_progress(struct job *job, enum stage stage, int iteration, double fract
 	pthread_mutex_unlock(&job->jobs->lock);
 }
 
-static void note_row(struct job *job, int iteration)
+static void note_rows(struct job *job, int count, int iteration)
 {
 	double now = time_monotonic(), seconds;
 
 	pthread_mutex_lock(&job->jobs->lock);
-	seconds = now - job->row_at;
+	seconds = (now - job->row_at) / count;
 	/* The first row's time holds the loading too, the later ones count more. */
 	job->row_seconds = job->row_seconds == 0 ? seconds : 0.5 * (job->row_seconds + seconds);
 	job->row_at = now;
@@ -1065,22 +1065,26 @@ static void note_row(struct job *job, int iteration)
 	pthread_mutex_unlock(&job->jobs->lock);
 }
 
-int job_add_row(struct job *job, const struct history_row *row, struct error *err)
+int job_add_rows(struct job *job, const struct history_row *rows, int count, struct error *err)
 {
-	struct event event;
-	char once[32];
-	int code = event_make(&event, "progress", history_row_document(row), err);
+	struct event events[JOB_ROWS_MAX] = {0};
+	char once[JOB_ROWS_MAX][32];
+	int code = 0;
 
+	assert(count > 0 && count <= JOB_ROWS_MAX);
+	for (int i = 0; i < count && code == 0; i++) {
+		code = event_make(&events[i], "progress", history_row_document(&rows[i]), err);
+		/* A run that was lost is repeated, what was told of it is not. */
+		snprintf(once[i], sizeof(once[i]), "row %d", rows[i].iteration);
+		events[i].once = once[i];
+	}
+	if (code == 0)
+		code = store_job_add_rows(job->jobs->store, job->id, rows, events, count, err);
+	for (int i = 0; i < count; i++)
+		free(events[i].data);
 	if (code != 0)
 		return code;
-	/* A run that was lost is repeated, what was told of it is not. */
-	snprintf(once, sizeof(once), "row %d", row->iteration);
-	event.once = once;
-	code = store_job_add_row(job->jobs->store, job->id, row, &event, err);
-	free(event.data);
-	if (code != 0)
-		return code;
-	note_row(job, row->iteration);
+	note_rows(job, count, rows[count - 1].iteration);
 	wake(job);
 	return 0;
 }

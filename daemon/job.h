@@ -143,7 +143,9 @@ int jobs_victim(struct jobs *jobs, const enum priority *arriving, const struct q
 void job_set_plan(struct job *job, const struct recon_memory *memory, const char *plan);
 /* Memory only, until the next change of state. */
 void job_progress(struct job *job, enum stage stage, int iteration, double fraction);
-int job_add_row(struct job *job, const struct history_row *row, struct error *err);
+enum { JOB_ROWS_MAX = 64 };
+/* In one commit, all or none: 1 to JOB_ROWS_MAX rows, each with its event. */
+int job_add_rows(struct job *job, const struct history_row *rows, int count, struct error *err);
 /* A volume whose file is there; before its job ends, or is queued again, it must be on the disk. */
 int job_add_volume(struct job *job, const struct volume_record *volume, struct error *err);
 /*

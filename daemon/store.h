@@ -254,8 +254,9 @@ void store_job_remove_files(const struct store *store, const char *id);
 void store_job_remove_checkpoint(const struct store *store, const char *id);
 /* That, and what a worker that died left half-written or prepared: an ended job has no use for it. */
 void store_job_tidy(const struct store *store, const char *id);
-int store_job_add_row(struct store *store, const char *id, const struct history_row *row, const struct event *event,
-		      struct error *err);
+/* All of them or none, each with its event. */
+int store_job_add_rows(struct store *store, const char *id, const struct history_row *rows, const struct event *events,
+		       int count, struct error *err);
 /*
  * A volume whose file everybody can read, but which a power cut may still take: a
  * row without a digest. The job must not end, nor be queued again, before it is on

@@ -233,14 +233,10 @@ void store_job_tidy(const struct store *store, const char *id)
 		log_line(LEVEL_WARNING, "job %s: half-written files stay until the next start: %s", id, err.text);
 }
 
-int store_job_add_row(struct store *store, const char *id, const struct history_row *row, const struct event *event,
-		      struct error *err)
+static int add_row(struct store *store, const char *id, const struct history_row *row, struct error *err)
 {
 	struct query query;
-	int code = store_begin(store, err);
 
-	if (code != 0)
-		return code;
 	query_begin(&query, &store->writer,
 		    "INSERT OR REPLACE INTO history (job, iteration, residual, change, tv, seconds)"
 		    " VALUES ((SELECT number FROM jobs WHERE id = ?), ?, ?, ?, ?, ?)",
@@ -251,9 +247,21 @@ int store_job_add_row(struct store *store, const char *id, const struct history_
 	query_real(&query, row->change);
 	query_real(&query, row->tv);
 	query_real(&query, row->seconds);
-	code = query_run(&query);
-	if (code == 0)
-		code = add_event(store, id, event, err);
+	return query_run(&query);
+}
+
+int store_job_add_rows(struct store *store, const char *id, const struct history_row *rows, const struct event *events,
+		       int count, struct error *err)
+{
+	int code = store_begin(store, err);
+
+	if (code != 0)
+		return code;
+	for (int i = 0; i < count && code == 0; i++) {
+		code = add_row(store, id, &rows[i], err);
+		if (code == 0)
+			code = add_event(store, id, &events[i], err);
+	}
 	return store_end(store, code, err);
 }
 

@@ -86,6 +86,9 @@ struct worker {
 	struct queue_running running;
 	int checkpoint; /* that it began from */
 	int unsettled;  /* volumes that it has told of and that are not on the disk, as far as it said */
+	/* What it told of last and the catalogue has yet to take; none between two turns. */
+	struct history_row rows[JOB_ROWS_MAX];
+	int row_count;
 	bool cancelling, yielding;
 	/* While its job waits for the rest of its projections: the scan, a reference; NULL otherwise. */
 	struct stored_scan *arriving;
@@ -466,6 +469,17 @@ static int add_volume(struct worker *worker, const struct message *message, stru
 	return job_add_volume(worker->job, &volume, err);
 }
 
+/* A commit each takes longer than the iterations of a small job: those that are there to read share one. */
+static void add_rows(struct supervise *supervise, struct worker *worker)
+{
+	int count = worker->row_count;
+	struct error err;
+
+	worker->row_count = 0;
+	if (count > 0 && job_add_rows(worker->job, worker->rows, count, &err) != 0)
+		stop_job(supervise, worker, &err);
+}
+
 static void on_message(struct supervise *supervise, struct worker *worker, const struct message *message)
 {
 	struct job_facts facts = {0};
@@ -481,6 +495,9 @@ static void on_message(struct supervise *supervise, struct worker *worker, const
 		job_facts(worker->job, &facts);
 	if (worker->job == NULL || worker->ending.due || strcmp(facts.id, message->job) != 0)
 		return;
+	/* All else after them, as it was told. */
+	if (message->kind != MESSAGE_ROW || worker->row_count == JOB_ROWS_MAX)
+		add_rows(supervise, worker);
 	switch (message->kind) {
 	case MESSAGE_OPENED:
 		job_set_plan(worker->job, &message->memory, message->plan);
@@ -494,7 +511,7 @@ static void on_message(struct supervise *supervise, struct worker *worker, const
 		job_progress(worker->job, message->stage, message->iteration, message->fraction);
 		break;
 	case MESSAGE_ROW:
-		code = job_add_row(worker->job, &message->row, &err);
+		worker->rows[worker->row_count++] = message->row;
 		break;
 	case MESSAGE_VOLUME:
 		worker->unsettled++;
@@ -536,6 +553,7 @@ static void read_messages(struct supervise *supervise, struct worker *worker, bo
 			message_clear(message);
 		}
 	}
+	add_rows(supervise, worker);
 	free(message);
 	*ret_gone = code != 0;
 	if (code != 0 && code != ERR_IO)

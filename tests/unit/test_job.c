@@ -60,7 +60,7 @@ static void add_row(struct job *job, int iteration)
 	    .iteration = iteration, .residual = 0.5 / iteration, .change = 0.1, .tv = 3, .seconds = 2};
 	struct error err = {0};
 
-	ck_assert_msg(job_add_row(job, &row, &err) == 0, "%s", err.text);
+	ck_assert_msg(job_add_rows(job, &row, 1, &err) == 0, "%s", err.text);
 }
 
 static int rows_of(const char *id)
@@ -485,6 +485,38 @@ START_TEST(events_come_in_order_from_where_one_left_off)
 }
 END_TEST
 
+START_TEST(rows_of_one_commit_are_told_one_by_one)
+{
+	struct job *job = state_post(&state, scan, "routine");
+	struct history_row rows[JOB_ROWS_MAX];
+	struct store_statistics before, after;
+	struct event_record *events;
+	struct error err = {0};
+	char id[ID_SIZE], start[32];
+	int count;
+
+	keep_id(job, id);
+	state_set(job, JOB_RUNNING, NULL);
+	add_row(job, 1);
+	for (int i = 0; i < JOB_ROWS_MAX; i++)
+		rows[i] = (struct history_row){.iteration = i + 1};
+	store_statistics(state.store, &before);
+	ck_assert_int_eq(job_add_rows(job, rows, JOB_ROWS_MAX, &err), 0);
+	store_statistics(state.store, &after);
+	ck_assert_int_eq((int)(after.commits - before.commits), 1);
+	job_release(job);
+	ck_assert_int_eq(rows_of(id), JOB_ROWS_MAX);
+	ck_assert_int_eq(store_job_events(state.store, id, 0, 100, &events, &count, &err), 0);
+	ck_assert_int_eq(count, 2 + JOB_ROWS_MAX); /* the first row was told before */
+	for (int i = 0; i < JOB_ROWS_MAX; i++) {
+		snprintf(start, sizeof(start), "{\"iteration\":%d,", i + 1);
+		ck_assert_str_eq(events[2 + i].kind, "progress");
+		ck_assert_msg(strncmp(events[2 + i].data, start, strlen(start)) == 0, "%s", events[2 + i].data);
+	}
+	event_records_free(events, count);
+}
+END_TEST
+
 START_TEST(a_volume_whose_row_is_missing_is_made_again)
 {
 	const struct volume_record volume = {.name = "fdk", .stage = "fdk", .bytes = 256, .hashed = true};
@@ -775,6 +807,7 @@ Suite *job_suite(void)
 	tcase_add_test(tests, a_scan_stays_while_a_job_needs_it);
 	tcase_add_test(tests, a_key_makes_one_job_also_over_a_restart);
 	tcase_add_test(tests, events_come_in_order_from_where_one_left_off);
+	tcase_add_test(tests, rows_of_one_commit_are_told_one_by_one);
 	tcase_add_test(tests, a_volume_whose_row_is_missing_is_made_again);
 	tcase_add_test(tests, a_volume_that_may_not_have_reached_the_disk_is_made_again);
 	tcase_add_test(tests, a_volume_of_a_job_that_waits_is_made_again_too);
