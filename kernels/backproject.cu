@@ -9,15 +9,10 @@
  * texture unit's 8-bit weights would not cancel at the detector's edges: there it
  * samples with the edges held, and the exact coverage is a factor.
  *
- * Untilted: a voxel column along z has one detector column u, one depth and an
- * even spacing 1 + e of rows in each view. VOXELS of them need VOXELS + 2 rows:
- * these are interpolated across once, scaled by the weight, and then, with
- * B = floor of the first row and t = row - B + k e,
- *   q[k+1] - saturate(1 - t) (q[k+1] - q[k]) + saturate(t - 1) (q[k+2] - q[k+1])
- * is the linear interpolation along z without a branch or a dynamic index, exact
- * while (VOXELS - 1) |e| <= 1, which plan.cu sees to. Voxels half as far apart as
- * rows (HALF) go the same way: voxel k has its rows from k / 2 on and the spacing
- * 1/2 + e, so that as few rows serve twice as many voxels.
+ * By rows, untilted: a voxel column along z has one detector column u, one depth and
+ * an even spacing of rows in each view. Its voxels are the neighbours of combs (comb.cuh): the
+ * few rows that a comb takes are interpolated across once. In standard precision this goes in half
+ * precision, and for rows that lean a little as well.
  *
  * Small problems: a voxel a thread, its views cut into parts for several warps.
  *
@@ -32,8 +27,10 @@ struct backprojection_job {
 	const float *from; /* row 0, column 0 of the first slot */
 	int pitch;
 	size_t slot;
-	const float2 *pairs; /* untilted: row 0 of the first slot */
+	const void *pairs; /* by rows: row 0 of the first slot */
 	pairs_shape shape;
+	const unsigned *most;
+	float most_weight; /* what brings FDK's weights to 1 at most */
 	float columns, rows;
 	int views;
 	int nx, ny, nz;
@@ -177,13 +174,21 @@ static __global__ void __launch_bounds__(SMALL_SIDE *SMALL_SIDE *SMALL_PARTS)
 	put_voxels<1>(job, x, y, z, &sum);
 }
 
-template <int VOXELS, int WINDOWS, bool HALF, int ACROSS, int ALONG>
+/* Where column `column` of a projection as pairs is looked up, in row 0. */
+static __device__ __forceinline__ int place_of(int column, const pairs_shape &shape)
+{
+	unsigned place = (unsigned)(column + PAIRS_BEFORE - 1), panel = place / PAIRS_STEP;
+
+	return (int)(panel * (unsigned)(shape.panel - PAIRS_STEP) + place) + 1;
+}
+
+template <int VOXELS, int WINDOWS, comb KIND, int ACROSS, int ALONG>
 static __global__ void __launch_bounds__(ACROSS *ALONG, 8) backproject_untilted(const backprojection_job job)
 {
-	const int run = VOXELS * WINDOWS, rows = (HALF ? (VOXELS - 1) / 2 : VOXELS - 1) + 3;
+	const int run = VOXELS * WINDOWS, rows = comb_values(KIND, VOXELS);
 	int x = blockIdx.x * ACROSS + threadIdx.x, y = blockIdx.y * ALONG + threadIdx.y, z = blockIdx.z * run;
 	float sum[run], fx = (float)x, fy = (float)y, fz = (float)z;
-	const float2 *p = job.pairs;
+	const float2 *p = (const float2 *)job.pairs;
 
 #pragma unroll
 	for (int k = 0; k < run; k++)
@@ -193,18 +198,16 @@ static __global__ void __launch_bounds__(ACROSS *ALONG, 8) backproject_untilted(
 		float a = fmaf(m[0], fx, fmaf(m[1], fy, m[3])), c = fmaf(m[8], fx, fmaf(m[9], fy, m[11]));
 		float b = fmaf(m[4], fx, fmaf(m[5], fy, fmaf(m[6], fz, m[7]))), w = reciprocal(c);
 		float u = fminf(fmaxf(a * w, -1.0f), job.columns), first = b * w, rise = m[6] * w;
-		float e = rise - (HALF ? 0.5f : 1.0f), lowest = fminf(0.0f, (float)(VOXELS - 1) * e);
+		float e = rise - comb_spacing(KIND), lowest = comb_lowest(KIND, VOXELS, e);
 		float weight = job.use.fdk ? w * w : 1.0f, across;
-		unsigned place = (unsigned)split(u, across) + 1;
-		int within = (int)(place / PANEL * (unsigned)job.shape.panel + place % PANEL);
+		int within = place_of(split(u, across), job.shape);
 		float right = across * weight, left = weight - right;
 
 #pragma unroll
 		for (int n = 0; n < WINDOWS; n++) {
-			float row = fmaf((float)(n * VOXELS), rise, first), unused;
-			float base = fminf(fmaxf(row + lowest, (float)-STACK_PAD), job.rows);
-			int low = split(base, unused);
-			float t = row - (float)low, q[rows];
+			float row = fmaf((float)(n * VOXELS), rise, first), q[rows], unused;
+			int low = split(fminf(fmaxf(row + lowest, (float)-STACK_PAD), job.rows), unused);
+			float t = row - (float)low - 1.0f;
 			const float2 *r = p + (low * PANEL + within);
 
 #pragma unroll
@@ -212,22 +215,125 @@ static __global__ void __launch_bounds__(ACROSS *ALONG, 8) backproject_untilted(
 				q[j] = fmaf(left, r[j * PANEL].x, right * r[j * PANEL].y);
 #pragma unroll
 			for (int k = 0; k < VOXELS; k++) {
-				const int j = HALF ? k / 2 : k;
-				const float beyond = HALF && k % 2 ? 0.5f : 0.0f;
-				float down = __saturatef(fmaf((float)-k, e, 1.0f - beyond - t));
-				float up = __saturatef(fmaf((float)k, e, t - (1.0f - beyond)));
+				const int j = comb_begin(KIND, k);
+				float above = fmaf((float)k, e, t + comb_offset(KIND, k));
 				float &s = sum[n * VOXELS + k];
 
 				s += q[j + 1];
-				s = fmaf(-down, q[j + 1] - q[j], s);
-				s = fmaf(up, q[j + 2] - q[j + 1], s);
+				s = fmaf(-__saturatef(-above), q[j + 1] - q[j], s);
+				s = fmaf(__saturatef(above), q[j + 2] - q[j + 1], s);
 			}
 		}
 	}
 	put_voxels<run>(job, x, y, z, sum);
 }
 
-/* sum_S w_ij: how much of the four pixels around its projection each view has. */
+/*
+ * The same in half precision, two voxels and two rows a register; a few views are summed in it, all else in
+ * float. Also for rows that lean by a degree or so: then a thread's voxels are seen on a line that steps
+ * aside from row to row, and what it meets of each row is interpolated across. Over a window it meets
+ * three columns at most, of which the same two pieces as along z give the value.
+ */
+enum { HALF_VIEWS = 8 };
+
+template <int VOXELS, int WINDOWS, comb KIND, bool LEAN, int ACROSS, int ALONG>
+static __global__ void __launch_bounds__(ACROSS *ALONG, 5) backproject_pairs(const backprojection_job job)
+{
+	const int run = VOXELS * WINDOWS, twos = (VOXELS + 1) / 2;
+	const int pairs = (comb_values(KIND, VOXELS) + 1) / 2;
+	int x = blockIdx.x * ACROSS + threadIdx.x, y = blockIdx.y * ALONG + threadIdx.y, z = blockIdx.z * run;
+	float sum[run], fx = (float)x, fy = (float)y, fz = (float)z + (LEAN ? 0.5f * (float)(run - 1) : 0.0f);
+	/* Bits of a split count from SPLIT_BITS on: so do rows and columns here. */
+	uintptr_t p = (uintptr_t)job.pairs - (uintptr_t)SPLIT_BITS * (PANEL + (LEAN ? 1 : 0)) * sizeof(__half2);
+
+#pragma unroll
+	for (int k = 0; k < run; k++)
+		sum[k] = 0;
+	for (int start = 0; start < job.views; start += HALF_VIEWS) {
+		__half2 few[WINDOWS][twos];
+
+#pragma unroll
+		for (int n = 0; n < WINDOWS; n++)
+#pragma unroll
+			for (int k = 0; k < twos; k++)
+				few[n][k] = __float2half2_rn(0.0f);
+#pragma unroll 1
+		for (int i = start; i < min(start + HALF_VIEWS, job.views);
+		     i++, p += job.shape.slot * sizeof(__half2)) {
+			const float *m = matrices[i];
+			float a = fmaf(m[0], fx, fmaf(m[1], fy, LEAN ? fmaf(m[2], fz, m[3]) : m[3]));
+			float b = fmaf(m[4], fx, fmaf(m[5], fy, fmaf(m[6], fz, m[7])));
+			float c = fmaf(m[8], fx, fmaf(m[9], fy, LEAN ? fmaf(m[10], fz, m[11]) : m[11]));
+			float w = reciprocal(c), middle = b * w, up = LEAN ? fmaf(-middle, m[10], m[6]) : m[6];
+			float u = fminf(fmaxf(a * w, -2.0f), job.columns + 1.0f), rise = up * w;
+			float aside = LEAN ? fmaf(-u, m[10], m[2]) * reciprocal(up) : 0.0f;
+			float e = rise - comb_spacing(KIND), weight = job.use.fdk ? w * w * job.most_weight : 1.0f;
+			float first = LEAN ? fmaf(-0.5f * (float)(run - 1), rise, middle) : middle, across;
+			float lowest = comb_lowest(KIND, VOXELS, e);
+			float slip = LEAN && job.use.fdk ? -2.0f * w * m[10] * weight : 0.0f;
+			int column = split(u, across);
+			const __half2 *there = (const __half2 *)p + (place_of(column, job.shape) - (LEAN ? column : 0));
+			__half2 right = __float2half2_rn(across);
+			__half2 heavy = __float2half2_rn(weight), step = __float2half2_rn(aside);
+			float leftmost =
+			    LEAN ? fmaf(-middle, aside, u) + fminf(0.0f, (float)(2 * pairs - 1) * aside) : 0.0f;
+
+#pragma unroll
+			for (int n = 0; n < WINDOWS; n++) {
+				float row = fmaf((float)(n * VOXELS), rise, first);
+				float base = fminf(fmaxf(row + lowest, (float)-STACK_PAD), job.rows);
+				float shifted = __fadd_rd(base, SPLIT_SHIFT), low = shifted - SPLIT_SHIFT;
+				/* Of the first voxel above the second row. */
+				float t = row - (shifted - (SPLIT_SHIFT - 1.0f));
+				const __half2 *r = there + (size_t)__float_as_uint(shifted) * PANEL;
+				__half2 q[pairs], value[twos];
+				__half2 second = right, beyond = right;
+
+				if (LEAN) {
+					float left = fmaf(low, aside, leftmost), position;
+
+					r += split_bits(left, position);
+					/* Columns are counted from the lowest one, the line may go either way. */
+					position += fmaxf(0.0f, (float)(1 - 2 * pairs) * aside);
+					second = __floats2half2_rn(position, position + aside);
+					beyond = __hadd2(second, __float2half2_rn(-1.0f));
+					heavy = __float2half2_rn(
+					    fmaf((float)(n * VOXELS) + 0.5f * (float)(VOXELS - run), slip, weight));
+				}
+#pragma unroll
+				for (int j = 0; j < pairs; j++) {
+					const __half2 *v = r + 2 * j * PANEL, count = __float2half2_rn((float)(2 * j));
+
+					if (LEAN)
+						right = __hfma2_sat(step, count, second);
+					q[j] = __hfma2(right, __hsub2(v[1], v[0]), v[0]);
+					if (LEAN)
+						q[j] = __hfma2(__hfma2_sat(step, count, beyond), __hsub2(v[2], v[1]),
+							       q[j]);
+				}
+				blend<KIND, VOXELS>(q, e, t, value);
+#pragma unroll
+				for (int k = 0; k < twos; k++)
+					few[n][k] = __hfma2(heavy, value[k], few[n][k]);
+			}
+		}
+#pragma unroll
+		for (int n = 0; n < WINDOWS; n++)
+#pragma unroll
+			for (int k = 0; k < VOXELS; k++)
+				sum[n * VOXELS + k] += k % 2 ? __high2float(few[n][k / 2]) : __low2float(few[n][k / 2]);
+	}
+	float unscale = 1.0f / (pairs_scale(*job.most) * (job.use.fdk ? job.most_weight : 1.0f));
+#pragma unroll
+	for (int k = 0; k < run; k++)
+		sum[k] *= unscale;
+	put_voxels<run>(job, x, y, z, sum);
+}
+
+/*
+ * sum_S w_ij: how much of the four pixels around its projection each view has. Pairs in half precision have it from
+ * a projection of ones, so that their weights, however small at the detector's edges, cancel.
+ */
 static __global__ void __launch_bounds__(256) sum_coverage(const backprojection_job job)
 {
 	int x = blockIdx.x * 32 + threadIdx.x, y = blockIdx.y * 8 + threadIdx.y, z = blockIdx.z;
@@ -334,13 +440,20 @@ static int load_array(struct plan *plan, const backprojection_job &job, struct e
 	return 0;
 }
 
-template <int VOXELS, int WINDOWS, bool HALF>
-static void launch_untilted(const backprojection_job &job, cudaStream_t stream)
+/* In float runs are shorter: a thread needs twice the registers. */
+template <comb KIND, int VOXELS, int WINDOWS, int FLOAT_WINDOWS>
+static void launch_rows(const struct plan_shape *shape, const backprojection_job &job, cudaStream_t stream)
 {
-	const int wide = 8, high = 16;
-	dim3 blocks(divide_up(job.nx, wide), divide_up(job.ny, high), divide_up(job.nz, VOXELS * WINDOWS));
+	const int wide = 8, high = 16, windows = shape->back_pairs ? WINDOWS : FLOAT_WINDOWS;
+	dim3 blocks(divide_up(job.nx, wide), divide_up(job.ny, high), divide_up(job.nz, VOXELS * windows));
+	dim3 threads(wide, high);
 
-	backproject_untilted<VOXELS, WINDOWS, HALF, wide, high><<<blocks, dim3(wide, high), 0, stream>>>(job);
+	if (!shape->back_pairs)
+		backproject_untilted<VOXELS, FLOAT_WINDOWS, KIND, wide, high><<<blocks, threads, 0, stream>>>(job);
+	else if (shape->untilted)
+		backproject_pairs<VOXELS, WINDOWS, KIND, false, wide, high><<<blocks, threads, 0, stream>>>(job);
+	else
+		backproject_pairs<VOXELS, WINDOWS, KIND, true, wide, high><<<blocks, threads, 0, stream>>>(job);
 }
 
 template <int VOXELS, int SAMPLING>
@@ -368,7 +481,10 @@ static backprojection_job job_make(const struct plan *plan, float *volume, struc
 	job.pitch = shape->pitch;
 	job.slot = shape->slot;
 	job.shape = pairs_shape_make(shape->columns, shape->rows);
-	job.pairs = plan->pairs + job.shape.before;
+	job.pairs =
+	    (const char *)plan->pairs + job.shape.before * (plan->shape.back_pairs ? sizeof(__half2) : sizeof(float2));
+	job.most = plan->most;
+	job.most_weight = plan->shape.back_nearest * plan->shape.back_nearest;
 	job.columns = (float)shape->columns;
 	job.rows = (float)shape->rows;
 	job.nx = plan->grid.size[0];
@@ -379,46 +495,56 @@ static backprojection_job job_make(const struct plan *plan, float *volume, struc
 	return job;
 }
 
+/* By rows, of pairs that are laid out. */
+static void launch_pairs(const struct plan_shape *shape, const backprojection_job &job, cudaStream_t stream)
+{
+	switch (shape->back_comb * 8 + shape->back_voxels) {
+	case COMB_TWOS * 8 + 5:
+		launch_rows<COMB_TWOS, 5, 4, 3>(shape, job, stream);
+		break;
+	case COMB_WIDE * 8 + 5:
+		launch_rows<COMB_WIDE, 5, 4, 3>(shape, job, stream);
+		break;
+	case COMB_WIDE * 8 + 4:
+		launch_rows<COMB_WIDE, 4, 5, 4>(shape, job, stream);
+		break;
+	case COMB_NARROW * 8 + 5:
+		launch_rows<COMB_NARROW, 5, 4, 3>(shape, job, stream);
+		break;
+	case COMB_EVEN * 8 + 3:
+		launch_rows<COMB_EVEN, 3, 6, 4>(shape, job, stream);
+		break;
+	case COMB_EVEN * 8 + 4:
+		launch_rows<COMB_EVEN, 4, 5, 4>(shape, job, stream);
+		break;
+	case COMB_EVEN * 8 + 5:
+		launch_rows<COMB_EVEN, 5, 4, 3>(shape, job, stream);
+		break;
+	default:
+		launch_rows<COMB_EVEN, 6, 3, 2>(shape, job, stream);
+	}
+}
+
 static int launch(struct plan *plan, backprojection_job &job, struct error *err)
 {
 	cudaStream_t stream = plan->device->stream;
 
-	if (plan->shape.back_voxels > 0)
+	if (plan->shape.back_voxels > 0) {
 		TRY(layout_pairs(plan, shape_for(plan, job.use), job.from, job.views, err));
-	switch (plan->shape.back_half ? -plan->shape.back_voxels : plan->shape.back_voxels) {
-	case -5:
-		launch_untilted<5, 3, true>(job, stream);
-		break;
-	case -4:
-		launch_untilted<4, 4, true>(job, stream);
-		break;
-	case 3:
-		launch_untilted<3, 4, false>(job, stream);
-		break;
-	case 4:
-		launch_untilted<4, 4, false>(job, stream);
-		break;
-	case 5:
-		launch_untilted<5, 3, false>(job, stream);
-		break;
-	case 6:
-		launch_untilted<6, 2, false>(job, stream);
-		break;
-	default:
-		if (plan->shape.textures) {
-			if (!job.use.laid_out)
-				TRY(load_array(plan, job, err));
-			if (job.use.coverage != NULL) {
-				job.texture = plan->projections.held;
-				launch_general<8, BY_TEXTURE_HELD>(job, stream);
-			} else {
-				launch_general<8, BY_TEXTURE>(job, stream);
-			}
-		} else if (plan->shape.is_small) {
-			launch_small(job, stream);
+		launch_pairs(&plan->shape, job, stream);
+	} else if (plan->shape.textures) {
+		if (!job.use.laid_out)
+			TRY(load_array(plan, job, err));
+		if (job.use.coverage != NULL) {
+			job.texture = plan->projections.held;
+			launch_general<8, BY_TEXTURE_HELD>(job, stream);
 		} else {
-			launch_general<8, BY_LOADS>(job, stream);
+			launch_general<8, BY_TEXTURE>(job, stream);
 		}
+	} else if (plan->shape.is_small) {
+		launch_small(job, stream);
+	} else {
+		launch_general<8, BY_LOADS>(job, stream);
 	}
 	LAUNCHED();
 	return 0;
@@ -473,7 +599,15 @@ int coverage_sum(struct plan *plan, int first, int count, struct error *err)
 
 		job.views = count - done < VIEWS_AT_ONCE ? count - done : VIEWS_AT_ONCE;
 		TRY(load_matrices(plan, first + done, job.views, 0, err));
-		sum_coverage<<<blocks, dim3(32, 8), 0, stream>>>(job);
+		if (plan->ones != NULL) {
+			job.shape = pairs_shape_make(plan->stack.columns, plan->stack.rows);
+			job.pairs = (const __half2 *)plan->ones + job.shape.before;
+			job.shape.slot = 0;
+			job.most = plan->most + 1;
+			launch_pairs(&plan->shape, job, stream);
+		} else {
+			sum_coverage<<<blocks, dim3(32, 8), 0, stream>>>(job);
+		}
 		LAUNCHED();
 	}
 	return 0;

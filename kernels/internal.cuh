@@ -18,6 +18,7 @@
 extern "C" {
 #include "core/backend.h"
 }
+#include "kernels/comb.cuh"
 
 /* Returns from the calling function, which has `err`, when a CUDA call fails. */
 #define CUDA_TRY(call)                                                                                                 \
@@ -171,13 +172,16 @@ struct slices_shape slices_shape_make(int slices, int rows, int fast, bool panel
 struct slices slices_at(float *memory, const struct slices_shape *shape);
 
 /*
- * A batch of projections for the untilted backprojection, [slot][panel][row][PANEL]
- * of pairs of neighbours along a row, pair 0 of panel 0 being columns -1 and 0.
+ * A batch of projections for the backprojection by rows, [slot][panel][row][PANEL]. In float
+ * an element is a pixel and the next one along the row; in half precision a pixel and the one
+ * below it, all scaled by a power of two (layout.cu). A panel begins PAIRS_BEFORE columns before
+ * the first that is looked up in it, and its last PAIRS_SHARED columns are the first of the next.
  */
+enum { PAIRS_BEFORE = 3, PAIRS_SHARED = 4, PAIRS_STEP = PANEL - PAIRS_SHARED };
 struct pairs_shape {
-	int panel;     /* pairs from panel to panel */
-	size_t slot;   /* pairs from slot to slot */
-	size_t before; /* pairs in front of row 0 of slot 0 */
+	int panel;     /* elements from panel to panel */
+	size_t slot;   /* elements from slot to slot */
+	size_t before; /* elements in front of row 0 of slot 0 */
 };
 struct pairs_shape pairs_shape_make(int columns, int rows);
 
@@ -210,14 +214,17 @@ enum { ROWS_APART = 4 };   /* rows of a thread that share columns, but no values
 
 /* How a plan does its work; chosen once from geometry and options. */
 struct plan_shape {
-	bool untilted;       /* the fast kernels apply */
-	bool rows_down;      /* untilted, and rows count against z */
-	int forward_rows;    /* rows of one thread in the forward projection by rows; 0: the general one */
-	bool rows_apart;     /* they share columns, but no values */
-	bool halves;         /* the forward projection reads pairs in half precision */
-	int back_voxels;     /* voxels of one window in the untilted backprojection; 0: the general one */
-	bool is_small;       /* launches take longer than samples: the plainest kernels */
-	bool back_half;      /* its voxels lie half as far apart as rows */
+	bool untilted;    /* the fast kernels apply */
+	bool rows_down;   /* untilted, and rows count against z */
+	int forward_rows; /* rows of one thread in the forward projection by rows; 0: the general one */
+	enum comb forward_comb;
+	bool rows_apart; /* they share columns, but no values */
+	bool halves;     /* the forward projection reads pairs in half precision */
+	int back_voxels; /* voxels of one window in the untilted backprojection; 0: the general one */
+	bool is_small;   /* launches take longer than samples: the plainest kernels */
+	enum comb back_comb;
+	bool back_pairs;     /* it reads pairs in half precision */
+	float back_nearest;  /* least depth of a voxel, of the isocentre's */
 	bool textures;       /* 8-bit interpolation weights are allowed */
 	bool z_rays;         /* some ray runs closer to z than to x and y */
 	int batch;           /* views filtered and backprojected in one go */
@@ -261,8 +268,10 @@ struct plan {
 	size_t scratch_bytes;
 	struct layered projections;    /* a batch of projections, with textures */
 	struct layered filtered_array; /* the same of padded rows, where they are longer */
-	float2 *pairs;                 /* a batch of projections as pairs, untilted */
+	void *pairs;                   /* a batch of projections as pairs of float or half, for the rows */
 	size_t pairs_bytes;
+	void *ones;      /* a projection of ones, where column sums are made of it */
+	unsigned *most;  /* the largest of them, as bits: their scale; behind it that of the ones */
 	float *coverage; /* [z][y][x], sum_S w_ij of subset `coverage_subset`, where not all is covered */
 	int coverage_subset;
 	float *work; /* [z][y][x], where an update takes more views than one launch */
@@ -308,8 +317,24 @@ static inline bool pairs_flipped(const struct plan *plan)
 {
 	return plan->shape.back_voxels > 0 && plan->shape.rows_down;
 }
-/* -> pairs */
+/*
+ * What pairs in half precision are multiplied by, by the largest magnitude of all, as bits. Nearly always it is
+ * the same, which leaves the largest between 2^-10 and 2^13: then the least step is 2^-15 of it, sums of a few
+ * stay finite, and nobody has to wait for it. What is not a number stays none.
+ */
+static const float PAIRS_SCALE = 64.0f;
+static __device__ __forceinline__ float pairs_scale(unsigned most)
+{
+	int exponent = (int)(most >> 23) - 127;
+
+	if ((exponent >= -16 && exponent < 7) || exponent < -100 || exponent > 100)
+		return PAIRS_SCALE;
+	return __uint_as_float((unsigned)(12 - exponent + 127) << 23);
+}
+/* -> pairs; where they are in half precision, also most */
 int layout_pairs(struct plan *plan, const struct stack_shape *shape, const float *from, int count, struct error *err);
+/* -> ones */
+int layout_ones(struct plan *plan, struct error *err);
 int layout_to_columns(struct plan *plan, const float *volume, float *columns, struct error *err);
 int layout_from_columns(struct plan *plan, const float *columns, float *volume, struct error *err);
 

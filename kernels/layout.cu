@@ -4,6 +4,7 @@
  * edge values held around, into texture arrays, or with z fastest.
  */
 #include <cuda_fp16.h>
+#include <type_traits>
 
 #include "kernels/internal.cuh"
 
@@ -35,8 +36,8 @@ struct pairs_shape pairs_shape_make(int columns, int rows)
 	struct pairs_shape shape;
 
 	shape.panel = PANEL * (rows + STACK_PAD);
-	/* Pairs are read for columns -1 .. columns. */
-	shape.slot = (size_t)shape.panel * (size_t)divide_up(columns + 2, PANEL);
+	/* Looked up are columns -2 .. columns + 1. */
+	shape.slot = (size_t)shape.panel * (size_t)divide_up(columns + 4, PAIRS_STEP);
 	shape.before = (size_t)PANEL * STACK_PAD;
 	return shape;
 }
@@ -234,37 +235,114 @@ int layout_from_columns(struct plan *plan, const float *columns, float *volume, 
 	return 0;
 }
 
-/* Zeros outside of the detector included: everything is written. */
-static __global__ void __launch_bounds__(256)
-    to_pairs(const float *__restrict__ from, const stack_shape shape, float2 *to, const pairs_shape pairs, bool flipped)
-{
-	int row = (int)(blockIdx.x * 4 + threadIdx.y) - STACK_PAD, column = (int)(blockIdx.y * PANEL + threadIdx.x) - 1;
-	float2 pair = {0, 0};
+/* ---- projections as pairs ---- */
 
-	if (row >= shape.rows + STACK_PAD)
-		return;
-	if (row >= 0 && row < shape.rows) {
-		int from_row = flipped ? shape.rows - 1 - row : row;
-		const float *at = from + blockIdx.z * shape.slot + (size_t)from_row * shape.pitch;
+/* Pixels of a column, zeros outside of the detector. Without a pitch all of them are one. */
+struct pixels {
+	const float *at;
+	int pitch, columns, rows, column;
+	bool flipped;
 
-		if (column >= 0 && column < shape.columns)
-			pair.x = at[column];
-		if (column + 1 < shape.columns)
-			pair.y = at[column + 1];
+	__device__ __forceinline__ float operator()(int row, int beside) const
+	{
+		int c = column + beside;
+
+		if (row < 0 || row >= rows || c < 0 || c >= columns)
+			return 0;
+		return at[pitch > 0 ? (size_t)(flipped ? rows - 1 - row : row) * pitch + c : 0];
 	}
-	/* The rows of zeros below one panel are those above the next. */
-	if (row < shape.rows || blockIdx.y + 1 == gridDim.y)
-		to[blockIdx.z * pairs.slot + blockIdx.y * (size_t)pairs.panel + (size_t)(row + STACK_PAD) * PANEL +
-		   threadIdx.x] = pair;
+};
+
+enum { PAIRS_ROWS = 8, PAIRS_HIGH = 4 }; /* of a thread; threads below each other */
+
+/* The largest magnitude of all goes to `most` as bits, which are in the order of the numbers. */
+static __device__ __forceinline__ void note_most(unsigned *most, float own)
+{
+	for (int step = 16; step > 0; step /= 2)
+		own = fmaxf(own, __shfl_xor_sync(~0u, own, step));
+	/* Few have to queue for it. */
+	if (threadIdx.x % 32 == 0 && __float_as_uint(own) > *(volatile unsigned *)most)
+		atomicMax(most, __float_as_uint(own));
+}
+
+/*
+ * Everything is written, the zeros outside of the detector included. In half precision it is
+ * done once more (AGAIN) where what was found shows that the scale does not fit.
+ */
+template <typename T, bool AGAIN>
+static __global__ void __launch_bounds__(PANEL *PAIRS_HIGH)
+    to_pairs(const float *__restrict__ from, const stack_shape shape, T *to, const pairs_shape pairs, bool flipped,
+	     unsigned *most)
+{
+	int row = (int)(blockIdx.x * PAIRS_HIGH + threadIdx.y) * PAIRS_ROWS - STACK_PAD;
+	pixels pixel = {from + blockIdx.z * shape.slot,
+			shape.pitch,
+			shape.columns,
+			shape.rows,
+			(int)(blockIdx.y * PAIRS_STEP + threadIdx.x) - PAIRS_BEFORE,
+			flipped};
+	/* The rows below one panel are those above the next. */
+	bool last = blockIdx.y + 1 == gridDim.y && blockIdx.z + 1 == gridDim.z;
+	int end = shape.rows + (last ? STACK_PAD : 0);
+	float scale = AGAIN ? pairs_scale(*most) : PAIRS_SCALE, value[PAIRS_ROWS + 1], own = 0;
+
+	if (AGAIN && scale == PAIRS_SCALE)
+		return;
+	to += blockIdx.z * pairs.slot + blockIdx.y * (size_t)pairs.panel + (size_t)(row + STACK_PAD) * PANEL +
+	      threadIdx.x;
+#pragma unroll
+	for (int k = 0; k <= PAIRS_ROWS; k++)
+		value[k] = pixel(row + k, 0);
+#pragma unroll
+	for (int k = 0; k < PAIRS_ROWS; k++) {
+		own = fmaxf(own, fabsf(value[k]));
+		if (row + k >= end)
+			continue;
+		if constexpr (std::is_same<T, float2>::value)
+			to[k * PANEL] = make_float2(value[k], pixel(row + k, 1));
+		else
+			to[k * PANEL] = __floats2half2_rn(scale * value[k], scale * value[k + 1]);
+	}
+	if (!AGAIN && most != NULL)
+		note_most(most, own);
+}
+
+static int launch_pairs(struct plan *plan, const struct stack_shape *shape, const float *from, int count, void *to,
+			unsigned *most, struct error *err)
+{
+	struct pairs_shape pairs = pairs_shape_make(shape->columns, shape->rows);
+	dim3 blocks(divide_up(shape->rows + 2 * STACK_PAD, PAIRS_ROWS * PAIRS_HIGH),
+		    (unsigned)(pairs.slot / (size_t)pairs.panel), count),
+	    threads(PANEL, PAIRS_HIGH);
+	cudaStream_t stream = plan->device->stream;
+	bool flipped = pairs_flipped(plan);
+
+	if (!plan->shape.back_pairs) {
+		to_pairs<float2, false>
+		    <<<blocks, threads, 0, stream>>>(from, *shape, (float2 *)to, pairs, flipped, NULL);
+	} else {
+		CUDA_TRY(cudaMemsetAsync(most, 0, sizeof(*most), stream));
+		to_pairs<__half2, false>
+		    <<<blocks, threads, 0, stream>>>(from, *shape, (__half2 *)to, pairs, flipped, most);
+		LAUNCHED();
+		to_pairs<__half2, true>
+		    <<<blocks, threads, 0, stream>>>(from, *shape, (__half2 *)to, pairs, flipped, most);
+	}
+	LAUNCHED();
+	return 0;
 }
 
 int layout_pairs(struct plan *plan, const struct stack_shape *shape, const float *from, int count, struct error *err)
 {
-	struct pairs_shape pairs = pairs_shape_make(shape->columns, shape->rows);
-	dim3 blocks(divide_up(shape->rows + 2 * STACK_PAD, 4), (unsigned)(pairs.slot / (size_t)pairs.panel), count);
+	return launch_pairs(plan, shape, from, count, plan->pairs, plan->most, err);
+}
 
-	to_pairs<<<blocks, dim3(PANEL, 4), 0, plan->device->stream>>>(from, *shape, plan->pairs, pairs,
-								      pairs_flipped(plan));
-	LAUNCHED();
-	return 0;
+int layout_ones(struct plan *plan, struct error *err)
+{
+	const float one = 1;
+	struct stack_shape shape = plan->stack;
+
+	CUDA_TRY(cudaMemcpyAsync(plan->matrices, &one, sizeof(one), cudaMemcpyHostToDevice, plan->device->stream));
+	shape.pitch = 0;
+	return launch_pairs(plan, &shape, plan->matrices, 1, plan->ones, plan->most + 1, err);
 }

@@ -106,6 +106,23 @@ static double lean_of(const struct view *view)
 }
 static const double LEAN_MOST = 0.02;
 
+/* Columns that neighbours along z are aside of each other on the detector, for each row that they are apart; about. */
+static double columns_aside(const struct geometry *geometry)
+{
+	double most = 0;
+
+	for (int k = 0; k < geometry->count; k++) {
+		const struct view *view = &geometry->views[k];
+
+		most = fmax(most, 1.5 * lean_of(view) * vec_norm(view->row_step) / vec_norm(view->column_step));
+	}
+	return most;
+}
+/* Closer to the source than that, a part of the isocentre's depth, weights need more than half precision. */
+static const double NEAREST = 0.1;
+/* Rows that a thread of the backprojection by rows reaches from its middle, at most. */
+enum { BACK_ROWS_MOST = 24 };
+
 /*
  * Smallest and largest distance, in voxels along z, of the rays of neighbouring
  * rows where they cross the grid: the magnification varies with the depth, which is
@@ -151,32 +168,41 @@ static void row_spacing(const struct geometry *geometry, const struct grid *grid
 	*ret_sign = abs(up) == geometry->count ? (up > 0 ? 1 : -1) : 0;
 }
 
+/* Combs in the order of preference: the more neighbours for a value, the better. */
+struct comb_choice {
+	enum comb kind;
+	int count;
+};
+static const comb_choice forward_combs[] = {{COMB_EVEN, 6}, {COMB_EVEN, 5}, {COMB_NARROW, 6},
+					    {COMB_EVEN, 4}, {COMB_EVEN, 3}, {COMB_EVEN, 0}};
+static const comb_choice back_combs[] = {{COMB_TWOS, 5},   {COMB_EVEN, 6}, {COMB_EVEN, 5},
+					 {COMB_NARROW, 5}, {COMB_WIDE, 5}, {COMB_EVEN, 4},
+					 {COMB_WIDE, 4},   {COMB_EVEN, 3}, {COMB_EVEN, 0}};
+
 /*
- * Whether a window may hold `count` neighbours that lie `spacing` samples apart: from
- * the lowest sample of the window, neighbour k must lie in j .. j + 2, with j = k, or k / 2 of
- * neighbours half as far apart. The lowest neighbour is up to a sample above that one.
+ * Whether all neighbours of a comb find their values at this spacing: as the kernels place it, each lies
+ * 0 .. 1 above the first of its own, and the lowest is up to one value above that.
  */
-static bool window_holds(int count, bool half, double spacing)
+static bool comb_holds(comb_choice comb, double spacing)
 {
 	const double margin = 1e-4; /* float32 */
-	double e = spacing - (half ? 0.5 : 1.0), lift = e < 0 ? -e * (count - 1) : 0;
+	double e = spacing - comb_spacing(comb.kind), lowest = comb_lowest(comb.kind, comb.count, (float)e);
 
-	for (int k = 0; k < count; k++) {
-		double above = lift + k * spacing - (half ? k / 2 : k);
+	for (int k = 0; k < comb.count; k++) {
+		double above = k * e + comb_offset(comb.kind, k) - lowest;
 
-		if (above < -margin || above + 1 > 2 - margin)
+		if (above < -margin || above > 1 - margin)
 			return false;
 	}
 	return true;
 }
 
-static int window_size(bool half, double least, double most)
+/* The spread of a comb's places is a convex function of the spacing: what holds at both ends, holds between. */
+static comb_choice choose_comb(const comb_choice *combs, double least, double most)
 {
-	int size = half ? 5 : 6, smallest = half ? 4 : 3;
-
-	while (size >= smallest && !(window_holds(size, half, least) && window_holds(size, half, most)))
-		size--;
-	return size >= smallest ? size : 0;
+	while (combs->count > 0 && !(comb_holds(*combs, least) && comb_holds(*combs, most)))
+		combs++;
+	return *combs;
 }
 
 /*
@@ -198,11 +224,33 @@ static bool is_untilted(const struct plan_options *options)
 	return true;
 }
 
+/* The least depth of a corner, as a part of the isocentre's; at most 1, 0 where that is behind a source. */
+static double nearest_voxel(const struct geometry *geometry, const struct grid *grid)
+{
+	const double isocentre[3] = {0, 0, 0};
+	double nearest = 1;
+
+	for (int k = 0; k < geometry->count; k++) {
+		double matrix[12], point[3], column, row, depth;
+
+		view_matrix(&geometry->views[k], matrix);
+		depth = view_project(matrix, isocentre, &column, &row);
+		if (!(depth > 0))
+			return 0;
+		for (int corner = 0; corner < 8; corner++) {
+			corner_of(grid, corner, 0.5, point);
+			nearest = fmin(nearest, view_project(matrix, point, &column, &row) / depth);
+		}
+	}
+	return nearest;
+}
+
 static void choose_rows(const struct plan_options *options, struct plan_shape *shape)
 {
 	const struct geometry *geometry = options->geometry;
 	const double *spacing = options->grid->spacing;
 	double least, most, lean = 0;
+	comb_choice comb;
 	int sign;
 
 	for (int k = 0; k < geometry->count; k++)
@@ -216,18 +264,23 @@ static void choose_rows(const struct plan_options *options, struct plan_shape *s
 		return;
 	shape->rows_down = sign < 0;
 	if (!shape->z_rays) {
-		shape->forward_rows = window_size(false, least, most);
+		comb = choose_comb(forward_combs, least, most);
+		shape->forward_comb = comb.kind;
+		shape->forward_rows = comb.count;
 		shape->rows_apart = shape->forward_rows == 0 && shape->halves;
 		if (shape->rows_apart)
 			shape->forward_rows = ROWS_APART;
 	}
 	/* Seen from the detector the same spacing is upside down. */
-	if (!shape->untilted)
+	if (!shape->untilted && !(columns_aside(geometry) * BACK_ROWS_MOST < 1))
 		return;
-	shape->back_voxels = window_size(true, 1 / most, 1 / least);
-	shape->back_half = shape->back_voxels > 0;
-	if (!shape->back_half)
-		shape->back_voxels = window_size(false, 1 / most, 1 / least);
+	shape->back_nearest = (float)nearest_voxel(geometry, options->grid);
+	shape->back_pairs = shape->halves && shape->back_nearest > NEAREST;
+	if (!shape->untilted && !shape->back_pairs)
+		return;
+	comb = choose_comb(back_combs, 1 / most, 1 / least);
+	shape->back_comb = comb.kind;
+	shape->back_voxels = comb.count;
 }
 
 static struct plan_shape shape_of(const struct plan_options *options, bool lean)
@@ -287,7 +340,17 @@ static size_t pairs_bytes(const struct plan *plan, int views)
 {
 	struct pairs_shape pairs = pairs_shape_make(plan->filtered.columns, plan->filtered.rows);
 
-	return (pairs.slot * (size_t)views + 2 * pairs.before) * sizeof(float2);
+	return (pairs.slot * (size_t)views + 2 * pairs.before) *
+	       (plan->shape.back_pairs ? sizeof(float) : sizeof(float2));
+}
+
+static size_t ones_bytes(const struct plan *plan)
+{
+	struct pairs_shape pairs = pairs_shape_make(plan->stack.columns, plan->stack.rows);
+
+	if (plan->shape.back_voxels == 0 || !plan->shape.back_pairs || plan->options.matched)
+		return 0;
+	return (pairs.slot + 2 * pairs.before) * sizeof(float);
 }
 
 /* Views of a batch that is laid out anew for the backprojection. */
@@ -296,10 +359,11 @@ static int views_laid_out(const struct plan *plan)
 	int views = plan->shape.batch;
 
 	/*
-	 * Pairs take twice a stack's room: a batch must do. Arrays take all of a subset, to need no sums aside;
-	 * the matched projector's corrections are not laid out.
+	 * Pairs of float take twice a stack's room: a batch must do. Else all of a subset is taken, to need no sums
+	 * aside; the matched projector's corrections are not laid out.
 	 */
-	if (plan->shape.back_voxels == 0 && plan->shape.correction > views && !plan->options.matched)
+	if ((plan->shape.back_voxels == 0 || plan->shape.back_pairs) && plan->shape.correction > views &&
+	    !plan->options.matched)
 		views = plan->shape.correction;
 	return at_most(views, plan->shape.views_at_once);
 }
@@ -374,9 +438,9 @@ static struct plan_bytes bytes_of(const struct plan_options *options, bool lean)
 		bytes.scratch += (size_t)plan.filtered.columns * (size_t)plan.filtered.rows * (size_t)plan.shape.batch *
 				 sizeof(float);
 	if (plan.shape.back_voxels > 0)
-		bytes.scratch += pairs_bytes(&plan, views_laid_out(&plan));
+		bytes.scratch += pairs_bytes(&plan, views_laid_out(&plan)) + 2 * sizeof(*plan.most);
 	if (needs_coverage(&plan))
-		bytes.scratch += voxels;
+		bytes.scratch += voxels + ones_bytes(&plan);
 	if (needs_work(&plan))
 		bytes.scratch += voxels;
 	if (plan.shape.by_rows)
@@ -536,8 +600,13 @@ static int prepare_sart(struct plan *plan, struct error *err)
 		CUDA_TRY(cudaEventCreateWithFlags(&plan->summed, cudaEventDisableTiming));
 	}
 	plan->coverage_subset = -1;
-	if (needs_coverage(plan))
+	if (needs_coverage(plan)) {
 		TRY(device_allocate(plan->device, voxels, (void **)&plan->coverage, err));
+		if (ones_bytes(plan) > 0) {
+			TRY(device_allocate(plan->device, ones_bytes(plan), &plan->ones, err));
+			TRY(layout_ones(plan, err));
+		}
+	}
 	if (needs_work(plan))
 		TRY(device_allocate(plan->device, voxels, (void **)&plan->work, err));
 	if (plan->shape.by_rows)
@@ -554,7 +623,8 @@ static int prepare_arrays(struct plan *plan, struct error *err)
 {
 	if (plan->shape.back_voxels > 0) {
 		plan->pairs_bytes = pairs_bytes(plan, plan->shape.views_at_once);
-		TRY(device_allocate(plan->device, plan->pairs_bytes, (void **)&plan->pairs, err));
+		TRY(device_allocate(plan->device, plan->pairs_bytes, &plan->pairs, err));
+		TRY(device_allocate(plan->device, 2 * sizeof(*plan->most), (void **)&plan->most, err));
 	}
 	if (needs_arrays_back(plan)) {
 		TRY(layered_new(plan->device, plan->stack.columns, plan->stack.rows, plan->shape.views_at_once,
@@ -593,6 +663,8 @@ static int plan_prepare(struct plan *plan, struct error *err)
 	return device_wait(plan->device, err);
 }
 
+static const char *const comb_names[] = {"", ", two a row", ", wide", ", narrow"};
+
 static void summarise(struct plan *plan)
 {
 	const struct plan_shape *shape = &plan->shape;
@@ -605,8 +677,8 @@ static void summarise(struct plan *plan)
 	if (plan->options.matched)
 		snprintf(back, sizeof(back), "matched");
 	else if (shape->back_voxels > 0)
-		snprintf(back, sizeof(back), "untilted, %d voxels a window%s", shape->back_voxels,
-			 shape->back_half ? ", two a row" : "");
+		snprintf(back, sizeof(back), "%s, %d voxels a window%s", shape->untilted ? "untilted" : "near untilted",
+			 shape->back_voxels, comb_names[shape->back_comb]);
 	snprintf(plan->summary, sizeof(plan->summary), "%sforward %s; back %s; %s; %s", shape->lean ? "lean; " : "",
 		 forward, back, shape->textures ? "texture sampling" : "float32 sampling",
 		 shape->filter_length > 0 ? "fused filter"
@@ -668,6 +740,8 @@ void cuda_plan_free(struct plan *plan)
 	layered_free(device, &plan->projections);
 	layered_free(device, &plan->filtered_array);
 	device_release(device, plan->pairs, plan->pairs_bytes);
+	device_release(device, plan->ones, ones_bytes(plan));
+	device_release(device, plan->most, 2 * sizeof(*plan->most));
 	device_release(device, plan->counters, linearise_counters_bytes());
 	device_release(device, plan->map, pixels_of(plan));
 	device_release(device, plan->flat, pixels_of(plan) * sizeof(float));

@@ -235,32 +235,32 @@ static __device__ __forceinline__ int first_column(float fast, int panel, float 
 }
 
 /* The samples of slice i in float. */
-template <int ROWS, int GUARD>
+template <comb KIND, int ROWS, int GUARD>
 static __device__ __forceinline__ void sample_rows(const float *__restrict__ slice, int panel, const fan &f,
 						   const wandering &wander, float i, const slice_axes &axes,
 						   float value[ROWS])
 {
-	float e = fmaf(i, f.spread_step, f.spread), right, t, x[ROWS + 2];
-	int low = lowest_row<ROWS, GUARD>(f, i, e, axes, t);
+	const int values = comb_values(KIND, ROWS);
+	float e = fmaf(i, f.spread_step, f.spread), right, t, x[values];
+	int low = lowest_row<KIND, ROWS, GUARD>(f, i, e, axes, t);
 	const float *q =
 	    slice + (low * PANEL + first_column(held<GUARD>(fmaf(i, f.fast_step, f.fast), axes), panel, right));
 	four_parts four = parts_at(wander, right);
 
 #pragma unroll
-	for (int j = 0; j < ROWS + 2; j++)
+	for (int j = 0; j < values; j++)
 		x[j] = across_four(q + j * PANEL, 1, four);
-	float below = x[1] - x[0];
 #pragma unroll
 	for (int k = 0; k < ROWS; k++) {
-		float down = __saturatef(fmaf((float)-k, e, 1.0f - t)), up = __saturatef(fmaf((float)k, e, t - 1.0f));
-		float above = x[k + 2] - x[k + 1];
+		const int j = comb_begin(KIND, k);
+		float above = fmaf((float)k, e, t + comb_offset(KIND, k));
 
-		value[k] = fmaf(up, above, fmaf(-down, below, x[k + 1]));
-		below = above;
+		value[k] = fmaf(__saturatef(above), x[j + 2] - x[j + 1],
+				fmaf(-__saturatef(-above), x[j + 1] - x[j], x[j + 1]));
 	}
 }
 
-template <int ROWS, int GUARD, bool LEAN, typename Ends>
+template <comb KIND, int ROWS, int GUARD, bool LEAN, typename Ends>
 static __device__ __forceinline__ void add_slices(const float *at, const slices &across, int from, int to, const fan &f,
 						  const wandering &wander, const slice_axes &axes, Ends &ends,
 						  float sum[ROWS])
@@ -268,27 +268,27 @@ static __device__ __forceinline__ void add_slices(const float *at, const slices 
 	float i = (float)from, value[ROWS];
 
 	for (; from < to; from++, i += 1.0f, at += across.slice) {
-		sample_rows<ROWS, GUARD>(at, across.panel, f, wander, i, axes, value);
+		sample_rows<KIND, ROWS, GUARD>(at, across.panel, f, wander, i, axes, value);
 		add_values<ROWS, GUARD>(i, ends, value, sum);
 	}
 }
 
 /* The same in half precision. */
-template <int ROWS, int GUARD, bool LEAN, typename Ends>
+template <comb KIND, int ROWS, int GUARD, bool LEAN, typename Ends>
 static __device__ __forceinline__ void add_slices(const __half2 *at, const slices &across, int from, int to,
 						  const fan &f, const half_wandering &wander, const slice_axes &axes,
 						  Ends &ends, float sum[ROWS])
 {
-	const int pairs = (ROWS + 3) / 2;
+	const int pairs = (comb_values(KIND, ROWS) + 1) / 2;
 	auto place = [&](float i) {
 		spread s;
 
 		s.e = fmaf(i, f.spread_step, f.spread);
-		int low = lowest_row<ROWS, GUARD>(f, i, s.e, axes, s.t);
+		int low = lowest_row<KIND, ROWS, GUARD>(f, i, s.e, axes, s.t);
 		float fast = fmaf(i, f.fast_step, f.fast);
 		if (LEAN) {
 			s.lean = lean_at(f, i, s.e);
-			fast = fmaf((float)pairs - 0.5f - s.t, s.lean, fast);
+			fast = fmaf((float)pairs - 1.5f - s.t, s.lean, fast);
 		}
 		s.at = low * PANEL + first_column(held<GUARD>(fast, axes), across.panel, s.right);
 		return s;
@@ -298,7 +298,7 @@ static __device__ __forceinline__ void add_slices(const __half2 *at, const slice
 		__half2 x[pairs];
 
 		across_pairs<pairs, LEAN, decltype(other)::value>(slice + s.at, 2 * PANEL, 1, part, change, x);
-		blend_rows<ROWS>(x, s.e, s.t, value);
+		blend<KIND, ROWS>(x, s.e, s.t, value);
 	};
 
 	add_pairs<ROWS, GUARD, LEAN>(at, across.slice, from, to, wander, ends, sum, place, sample);
@@ -379,7 +379,7 @@ static __device__ __forceinline__ void add_apart(const __half2 *at, const slices
 	}
 }
 
-template <int ROWS, typename T, bool LEAN, bool APART>
+template <comb KIND, int ROWS, typename T, bool LEAN, bool APART>
 static __global__ void __launch_bounds__(32 * ROWS_WARPS * ROWS_VIEWS, 32 / (ROWS_WARPS * ROWS_VIEWS))
     project_rows(const projection p)
 {
@@ -421,7 +421,7 @@ static __global__ void __launch_bounds__(32 * ROWS_WARPS * ROWS_VIEWS, 32 / (ROW
 			if constexpr (APART)
 				add_apart<ROWS, GUARD, LEAN>(at, across, from, to, f, wander, axes, ends, sum);
 			else
-				add_slices<ROWS, GUARD, LEAN>(at, across, from, to, f, wander, axes, ends, sum);
+				add_slices<KIND, ROWS, GUARD, LEAN>(at, across, from, to, f, wander, axes, ends, sum);
 		};
 		if (!LEAN && __all_sync(~0u, r.alike || !hits)) {
 			add(std::integral_constant<int, GUARD_ALIKE>(), w.first, w.inner_first);
@@ -484,17 +484,17 @@ size_t project_blocks(const struct plan *plan, int count)
 	return (size_t)tiles * (size_t)divide_up(count, plan->shape.forward_rows > 0 ? ROWS_VIEWS : GENERAL_VIEWS);
 }
 
-template <int ROWS>
+template <comb KIND, int ROWS>
 static void launch_rows(const plan_shape &shape, const projection &p, unsigned blocks, cudaStream_t stream)
 {
 	dim3 threads(32, ROWS_WARPS, ROWS_VIEWS);
 
 	if (!shape.halves)
-		project_rows<ROWS, float, false, false><<<blocks, threads, 0, stream>>>(p);
+		project_rows<KIND, ROWS, float, false, false><<<blocks, threads, 0, stream>>>(p);
 	else if (shape.untilted)
-		project_rows<ROWS, __half2, false, false><<<blocks, threads, 0, stream>>>(p);
+		project_rows<KIND, ROWS, __half2, false, false><<<blocks, threads, 0, stream>>>(p);
 	else
-		project_rows<ROWS, __half2, true, false><<<blocks, threads, 0, stream>>>(p);
+		project_rows<KIND, ROWS, __half2, true, false><<<blocks, threads, 0, stream>>>(p);
 }
 
 static void launch_apart(const plan_shape &shape, const projection &p, unsigned blocks, cudaStream_t stream)
@@ -502,9 +502,9 @@ static void launch_apart(const plan_shape &shape, const projection &p, unsigned 
 	dim3 threads(32, ROWS_WARPS, ROWS_VIEWS);
 
 	if (shape.untilted)
-		project_rows<ROWS_APART, __half2, false, true><<<blocks, threads, 0, stream>>>(p);
+		project_rows<COMB_EVEN, ROWS_APART, __half2, false, true><<<blocks, threads, 0, stream>>>(p);
 	else
-		project_rows<ROWS_APART, __half2, true, true><<<blocks, threads, 0, stream>>>(p);
+		project_rows<COMB_EVEN, ROWS_APART, __half2, true, true><<<blocks, threads, 0, stream>>>(p);
 }
 
 template <typename T>
@@ -540,18 +540,21 @@ int project_rays(struct plan *plan, const float *volume, int first, int count, s
 	p.rows_down = plan->shape.rows_down;
 	p.use = use;
 	p.to = to;
-	switch (plan->shape.rows_apart ? 0 : plan->shape.forward_rows) {
-	case 3:
-		launch_rows<3>(plan->shape, p, blocks, stream);
+	switch (plan->shape.rows_apart ? 0 : plan->shape.forward_comb * 8 + plan->shape.forward_rows) {
+	case COMB_EVEN * 8 + 3:
+		launch_rows<COMB_EVEN, 3>(plan->shape, p, blocks, stream);
 		break;
-	case 4:
-		launch_rows<4>(plan->shape, p, blocks, stream);
+	case COMB_EVEN * 8 + 4:
+		launch_rows<COMB_EVEN, 4>(plan->shape, p, blocks, stream);
 		break;
-	case 5:
-		launch_rows<5>(plan->shape, p, blocks, stream);
+	case COMB_EVEN * 8 + 5:
+		launch_rows<COMB_EVEN, 5>(plan->shape, p, blocks, stream);
 		break;
-	case 6:
-		launch_rows<6>(plan->shape, p, blocks, stream);
+	case COMB_EVEN * 8 + 6:
+		launch_rows<COMB_EVEN, 6>(plan->shape, p, blocks, stream);
+		break;
+	case COMB_NARROW * 8 + 6:
+		launch_rows<COMB_NARROW, 6>(plan->shape, p, blocks, stream);
 		break;
 	default:
 		if (plan->shape.is_small)

@@ -4,12 +4,8 @@
 /*
  * The rays of ROWS neighbouring rows in one column of the detector, where rows run
  * across z. They share their way across the rows' direction, and in every slice
- * they are evenly spaced along z, 1 + e voxels apart. ROWS + 2 values are
- * interpolated across once, x[0] at the floor B of the lowest row; row k lies at
- * t = z - B + k e beyond k, 0 <= t <= 2, where the two pieces of
- *   x[k+1] - saturate(1 - t) (x[k+1] - x[k]) + saturate(t - 1) (x[k+2] - x[k+1])
- * give the linear interpolation without a branch or a dynamic index. This holds
- * while (ROWS - 1) |e| <= 1, which plan.cu sees to.
+ * they are evenly spaced along z, 1 + e voxels apart: the neighbours of a comb
+ * (comb.cuh), whose few values are interpolated across once.
  *
  * In half precision, two neighbours along z a register. Where the rows LEAN, by a
  * degree or so, each pair across counts with its own weights, on the tangent of
@@ -40,18 +36,18 @@ static __device__ __forceinline__ float held(float fast, const slice_axes &axes)
 	return GUARD == GUARD_NONE ? fast : fminf(fmaxf(fast, -1.0f), (float)axes.fast - HELD_LEAST);
 }
 
-/* The lowest of the values that a fan needs in slice i, and the fan's first row counted from there. */
-template <int ROWS, int GUARD>
+/* The lowest of the values that a fan needs in slice i, and the fan's first row counted from the one above it. */
+template <comb KIND, int ROWS, int GUARD>
 static __device__ __forceinline__ int lowest_row(const fan &f, float i, float e, const slice_axes &axes, float &t)
 {
-	float row = fmaf(i, f.row_step, f.row), base = row + fminf(0.0f, (float)(ROWS - 1) * e), above;
+	float row = fmaf(i, f.row_step, f.row), base = row + comb_lowest(KIND, ROWS, e);
 
 	if (GUARD != GUARD_NONE)
 		base = fminf(fmaxf(base, (float)-SLICE_PAD), (float)axes.rows);
-	int low = split(base, above);
+	float shifted = __fadd_rd(base, SPLIT_SHIFT);
 
-	t = row - (base - above);
-	return low;
+	t = row - (shifted - (SPLIT_SHIFT - 1.0f));
+	return (int)(__float_as_uint(shifted) - SPLIT_BITS);
 }
 
 /* How the fast coordinate changes along z in slice i. */
@@ -81,23 +77,6 @@ static __device__ __forceinline__ void across_pairs(const __half2 *__restrict__ 
 						  __floats2half2_rn(2 * j + 0.5f - COUNT, 2 * j + 1.5f - COUNT));
 		else
 			x[j] = across_four<OTHER>(q + j * row_stride, fast_stride, part);
-	}
-}
-
-/* The rows' samples from pairs of values across, the first row t above the first value. */
-template <int ROWS>
-static __device__ __forceinline__ void blend_rows(const __half2 x[(ROWS + 3) / 2], float e, float t,
-						  __half2 value[(ROWS + 1) / 2])
-{
-	__half2 both = __float2half2_rn(e), first = __floats2half2_rn(1.0f - t, 1.0f - t - e);
-
-#pragma unroll
-	for (int k = 0; k < (ROWS + 1) / 2; k++) {
-		__half2 here = __halves2half2(__high2half(x[k]), __low2half(x[k + 1]));
-		__half2 down = __hfma2_sat(both, __float2half2_rn((float)(-2 * k)), first);
-		__half2 up = __hfma2_sat(both, __float2half2_rn((float)(2 * k)), __hneg2(first));
-
-		value[k] = __hfma2(up, __hsub2(x[k + 1], here), __hfma2(down, __hsub2(x[k], here), here));
 	}
 }
 

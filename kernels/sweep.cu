@@ -43,7 +43,7 @@ struct rows_view {
 
 enum { PARTS = 8 };
 
-template <int ROWS, bool LEAN>
+template <comb KIND, int ROWS, bool LEAN>
 static __global__ void __launch_bounds__(32 * PARTS, ROWS > 4 || LEAN ? 3 : 4) project_view_rows(const rows_view s)
 {
 	__shared__ float sums[PARTS][ROWS][32];
@@ -82,17 +82,17 @@ static __global__ void __launch_bounds__(32 * PARTS, ROWS > 4 || LEAN ? 3 : 4) p
 		int slice = s.slice[axis], pair = s.pair[axis];
 		half_wandering wander = half_of(wander_of(f.fast_step));
 		auto add = [&](auto guard, int first, int last) {
-			constexpr int GUARD = decltype(guard)::value, pairs = (ROWS + 3) / 2;
+			constexpr int GUARD = decltype(guard)::value, pairs = (comb_values(KIND, ROWS) + 1) / 2;
 			auto place = [&](float i) {
 				spread p;
 
 				p.e = fmaf(i, f.spread_step, f.spread);
-				int base = lowest_row<ROWS, GUARD>(f, i, p.e, axes, p.t);
+				int base = lowest_row<KIND, ROWS, GUARD>(f, i, p.e, axes, p.t);
 				float fast = fmaf(i, f.fast_step, f.fast);
 				p.odd = base & 1;
 				if (LEAN) {
 					p.lean = lean_at(f, i, p.e);
-					fast = fmaf((float)(pairs - p.odd) + 0.5f - p.t, p.lean, fast);
+					fast = fmaf((float)(pairs - p.odd) - 0.5f - p.t, p.lean, fast);
 				}
 				p.at = split(held<GUARD>(fast, axes), p.right) - 1 + (base >> 1) * pair;
 				return p;
@@ -109,7 +109,7 @@ static __global__ void __launch_bounds__(32 * PARTS, ROWS > 4 || LEAN ? 3 : 4) p
 
 					x[j] = p.odd ? shifted : x[j];
 				}
-				blend_rows<ROWS>(x, p.e, p.t, value);
+				blend<KIND, ROWS>(x, p.e, p.t, value);
 			};
 
 			add_pairs<ROWS, GUARD, LEAN>(s.across[axis] + (ptrdiff_t)slice * first, (size_t)slice, first,
@@ -285,13 +285,15 @@ size_t sweep_rows_bytes(const struct plan *plan)
 	       sizeof(__half2);
 }
 
+enum { ROWS_FEW = 3 };
+
 /* Rows of a thread: fewer where a view would not fill the card. */
 static int rows_of(const struct plan *plan)
 {
 	const int blocks_least = 1000;
 	int rows = plan->shape.forward_rows;
 
-	return divide_up(plan->stack.columns, 32) * divide_up(plan->stack.rows, rows) < blocks_least ? 3 : rows;
+	return divide_up(plan->stack.columns, 32) * divide_up(plan->stack.rows, rows) < blocks_least ? ROWS_FEW : rows;
 }
 
 static dim3 blocks_of(const struct plan *plan)
@@ -332,26 +334,31 @@ static void wanted_by(const struct plan *plan, int index, bool ret_wanted[2])
 	ret_wanted[ACROSS_Y] = abs(along[ACROSS_X]) != 4;
 }
 
-template <int ROWS>
+template <comb KIND, int ROWS>
 static void launch_rows(const struct plan *plan, const rows_view &s, cudaStream_t stream)
 {
 	if (plan->shape.untilted)
-		project_view_rows<ROWS, false><<<blocks_of(plan), dim3(32, PARTS), 0, stream>>>(s);
+		project_view_rows<KIND, ROWS, false><<<blocks_of(plan), dim3(32, PARTS), 0, stream>>>(s);
 	else
-		project_view_rows<ROWS, true><<<blocks_of(plan), dim3(32, PARTS), 0, stream>>>(s);
+		project_view_rows<KIND, ROWS, true><<<blocks_of(plan), dim3(32, PARTS), 0, stream>>>(s);
 }
 
 static void project_by(const struct plan *plan, const rows_view &s, cudaStream_t stream)
 {
-	switch (rows_of(plan)) {
-	case 3:
-		return launch_rows<3>(plan, s, stream);
-	case 4:
-		return launch_rows<4>(plan, s, stream);
-	case 5:
-		return launch_rows<5>(plan, s, stream);
+	const int rows = rows_of(plan);
+
+	/* So few rows find their values in any comb. */
+	switch ((rows == ROWS_FEW ? COMB_EVEN : plan->shape.forward_comb) * 8 + rows) {
+	case COMB_EVEN * 8 + ROWS_FEW:
+		return launch_rows<COMB_EVEN, ROWS_FEW>(plan, s, stream);
+	case COMB_EVEN * 8 + 4:
+		return launch_rows<COMB_EVEN, 4>(plan, s, stream);
+	case COMB_EVEN * 8 + 5:
+		return launch_rows<COMB_EVEN, 5>(plan, s, stream);
+	case COMB_NARROW * 8 + 6:
+		return launch_rows<COMB_NARROW, 6>(plan, s, stream);
 	default:
-		return launch_rows<6>(plan, s, stream);
+		return launch_rows<COMB_EVEN, 6>(plan, s, stream);
 	}
 }
 

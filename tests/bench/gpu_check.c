@@ -720,6 +720,61 @@ static const struct kind kinds[] = {
       .size = {43, 41, 37},
       .spacing = {1.5, 1.5, 1.5}},
      11},
+    /* Rows and voxels along z in all the ratios that comb.cuh knows. */
+    {"rows a little closer",
+     {.columns = 61,
+      .rows = 57,
+      .views = 20,
+      .arc = TURN,
+      .pixel = {1.6, 1.42},
+      .size = {41, 43, 39},
+      .spacing = {1, 1, 1}},
+     1},
+    {"rows a little closer by view",
+     {.columns = 61,
+      .rows = 57,
+      .views = 20,
+      .arc = TURN,
+      .pixel = {1.6, 1.42},
+      .size = {41, 43, 39},
+      .spacing = {1, 1, 1}},
+     20},
+    {"rows closer",
+     {.columns = 61,
+      .rows = 71,
+      .views = 20,
+      .arc = TURN,
+      .pixel = {1.6, 1.19},
+      .size = {41, 43, 45},
+      .spacing = {1, 1, 1}},
+     3},
+    {"rows a little farther",
+     {.columns = 61,
+      .rows = 37,
+      .views = 20,
+      .arc = TURN,
+      .pixel = {1.6, 2.53},
+      .size = {41, 43, 45},
+      .spacing = {1, 1, 1}},
+     20},
+    {"wide cone",
+     {.columns = 97,
+      .rows = 83,
+      .views = 12,
+      .arc = TURN,
+      .pixel = {7.3, 7.1},
+      .size = {61, 61, 43},
+      .spacing = {4, 4, 4}},
+     2},
+    {"wider cone",
+     {.columns = 97,
+      .rows = 83,
+      .views = 12,
+      .arc = TURN,
+      .pixel = {10, 10.3},
+      .size = {61, 61, 41},
+      .spacing = {5.8, 5.8, 5.8}},
+     2},
 };
 static const int wide[] = {43,   500,  600,  1000,
 			   1200, 1500, 2000, 2100}; /* columns: each length of the filter, and cuFFT */
@@ -856,6 +911,65 @@ static void head_recipe(struct recipe *ret, const struct scene *scene, bool refe
 	ret->fdk.on = ret->sart.on = true;
 	ret->sart.iterations = 10;
 	ret->reference_precision = reference;
+}
+
+/* Projections in any unit: in half precision they are scaled, the sum is not. */
+static void check_scales(struct device *devices[2], enum bend bend)
+{
+	const struct scene_options at = {.columns = 97,
+					 .rows = 83,
+					 .views = 30,
+					 .arc = TURN,
+					 .pixel = {2, 2},
+					 .size = {61, 61, 61},
+					 .spacing = {1, 1, 1},
+					 .bend = bend};
+	const float scales[] = {1e-30F, 1e-9F, 1e-4F, 1, 1e3F, 1e9F, 1e30F};
+	const struct backend *backends_here[2] = {&backend_cpu, &backend_cuda};
+	struct scene scene;
+	struct plan_options options;
+	struct side sides[2];
+	struct error err = {0};
+	float *values, *got[2];
+	size_t pixels, voxels;
+	int *views;
+
+	scene_make(&scene, "scales", &at);
+	options = scene_plan(&scene, NULL, 0, NULL, false);
+	voxels = grid_voxels(&scene.grid);
+	pixels = (size_t)at.columns * (size_t)at.rows * (size_t)at.views;
+	values = malloc(pixels * sizeof(float));
+	views = all_views(at.views);
+	for (int s = 0; s < 2; s++) {
+		got[s] = malloc(voxels * sizeof(float));
+		side_open(&sides[s], backends_here[s], devices[s], &options);
+	}
+	for (size_t k = 0; k < sizeof(scales) / sizeof(scales[0]); k++) {
+		char what[64];
+
+		fill_random(values, pixels, 3);
+		for (size_t i = 0; i < pixels; i++)
+			values[i] *= scales[k];
+		for (int s = 0; s < 2; s++) {
+			must(sides[s].backend->stack_upload(sides[s].stack, 0, at.views, values, &err), &err, "upload");
+			must(sides[s].backend->volume_fill(sides[s].volume, 0, &err), &err, "fill");
+			must(sides[s].backend->backproject(sides[s].plan, sides[s].stack, views, at.views,
+							   BACKPROJECT_PLAIN, sides[s].volume, &err),
+			     &err, "backproject");
+			read_volume(&sides[s], &scene, got[s]);
+			for (size_t i = 0; i < voxels; i++)
+				got[s][i] /= scales[k];
+		}
+		snprintf(what, sizeof(what), "backprojection of 1e%.0f", log10((double)scales[k]));
+		expect(&scene, what, difference(got[1], got[0], voxels), STANDARD);
+	}
+	for (int s = 0; s < 2; s++) {
+		side_close(&sides[s]);
+		free(got[s]);
+	}
+	free(values);
+	free(views);
+	scene_clear(&scene);
 }
 
 /* FDK and ten SART iterations of the head through core/recon.c, on both sides. */
@@ -1312,6 +1426,8 @@ int main(int argc, char **argv)
 	check_transfers(devices[1]);
 	check_memory(devices[1]);
 	check_limit();
+	check_scales(devices, BEND_NONE);
+	check_scales(devices, BEND_TURNED);
 	check_recon(devices, BEND_NONE, true, false, false, 1e-4);
 	check_recon(devices, BEND_TILTED, true, false, false, 1e-4);
 	for (int bend = 0; bend < BEND_STEEP; bend++)
@@ -1322,7 +1438,7 @@ int main(int argc, char **argv)
 	check_recon(devices, BEND_TILTED, false, false, true, 5e-3);
 	check_matched_beside(devices);
 	check_metal(devices, BEND_NONE, true, 1e-4);
-	check_metal(devices, BEND_TURNED, false, 5e-3);
+	check_metal(devices, BEND_TURNED, false, 1e-2); /* edges ten times as high as the skull's */
 	check_metal(devices, BEND_STEEP, true, 1e-4);
 	check_lean(false);
 	check_lean(true);

@@ -92,11 +92,18 @@ if [ -x "$BUILD/cbct-worker-faulty" ]; then
 	stop
 fi
 
-# What arrives while the arm turns, in any order, and what phantoms become: the daemon's own tests, on this backend.
-if command -v curl >/dev/null && command -v jq >/dev/null; then
-	check "the daemon's tests of arriving scans and phantoms" env BACKEND=cuda BUILD="$BUILD" tests/run.sh arriving phantom
+# What arrives while the arm turns, in any order, what phantoms become, and jobs on two cards: the daemon's own tests.
+suites="arriving phantom"
+if [ "$(nvidia-smi -L | wc -l)" -gt 1 ]; then
+	suites+=" devices"
 else
-	echo "SKIPPED: the daemon's tests of arriving scans and phantoms need curl and jq"
+	echo "SKIPPED: jobs on two devices need two"
+fi
+if command -v curl >/dev/null && command -v jq >/dev/null; then
+	# shellcheck disable=SC2086
+	check "the daemon's tests of $suites" env BACKEND=cuda BUILD="$BUILD" tests/run.sh $suites
+else
+	echo "SKIPPED: the daemon's tests of $suites need curl and jq"
 fi
 
 echo "$failures failures"
