@@ -243,8 +243,7 @@ static __global__ void __launch_bounds__(ACROSS *ALONG, 5) backproject_pairs(con
 	const int pairs = (comb_values(KIND, VOXELS) + 1) / 2;
 	int x = blockIdx.x * ACROSS + threadIdx.x, y = blockIdx.y * ALONG + threadIdx.y, z = blockIdx.z * run;
 	float sum[run], fx = (float)x, fy = (float)y, fz = (float)z + (LEAN ? 0.5f * (float)(run - 1) : 0.0f);
-	/* Bits of a split count from SPLIT_BITS on: so do rows and columns here. */
-	uintptr_t p = (uintptr_t)job.pairs - (uintptr_t)SPLIT_BITS * (PANEL + (LEAN ? 1 : 0)) * sizeof(__half2);
+	const __half2 *p = (const __half2 *)job.pairs;
 
 #pragma unroll
 	for (int k = 0; k < run; k++)
@@ -258,8 +257,7 @@ static __global__ void __launch_bounds__(ACROSS *ALONG, 5) backproject_pairs(con
 			for (int k = 0; k < twos; k++)
 				few[n][k] = __float2half2_rn(0.0f);
 #pragma unroll 1
-		for (int i = start; i < min(start + HALF_VIEWS, job.views);
-		     i++, p += job.shape.slot * sizeof(__half2)) {
+		for (int i = start; i < min(start + HALF_VIEWS, job.views); i++, p += job.shape.slot) {
 			const float *m = matrices[i];
 			float a = fmaf(m[0], fx, fmaf(m[1], fy, LEAN ? fmaf(m[2], fz, m[3]) : m[3]));
 			float b = fmaf(m[4], fx, fmaf(m[5], fy, fmaf(m[6], fz, m[7])));
@@ -272,7 +270,7 @@ static __global__ void __launch_bounds__(ACROSS *ALONG, 5) backproject_pairs(con
 			float lowest = comb_lowest(KIND, VOXELS, e);
 			float slip = LEAN && job.use.fdk ? -2.0f * w * m[10] * weight : 0.0f;
 			int column = split(u, across);
-			const __half2 *there = (const __half2 *)p + (place_of(column, job.shape) - (LEAN ? column : 0));
+			const __half2 *there = p + (place_of(column, job.shape) - (LEAN ? column : 0));
 			__half2 right = __float2half2_rn(across);
 			__half2 heavy = __float2half2_rn(weight), step = __float2half2_rn(aside);
 			float leftmost =
@@ -285,14 +283,14 @@ static __global__ void __launch_bounds__(ACROSS *ALONG, 5) backproject_pairs(con
 				float shifted = __fadd_rd(base, SPLIT_SHIFT), low = shifted - SPLIT_SHIFT;
 				/* Of the first voxel above the second row. */
 				float t = row - (shifted - (SPLIT_SHIFT - 1.0f));
-				const __half2 *r = there + (size_t)__float_as_uint(shifted) * PANEL;
+				const __half2 *r = there + (int)(__float_as_uint(shifted) - SPLIT_BITS) * PANEL;
 				__half2 q[pairs], value[twos];
 				__half2 second = right, beyond = right;
 
 				if (LEAN) {
 					float left = fmaf(low, aside, leftmost), position;
 
-					r += split_bits(left, position);
+					r += split(left, position);
 					/* Columns are counted from the lowest one, the line may go either way. */
 					position += fmaxf(0.0f, (float)(1 - 2 * pairs) * aside);
 					second = __floats2half2_rn(position, position + aside);
