@@ -126,6 +126,11 @@ struct stack {
 struct stack_shape stack_shape_make(int columns, int rows, int slots);
 size_t stack_bytes(int columns, int rows, int slots);
 
+/* The pixels whose rays may meet the grid, and some around them. */
+struct shadow {
+	int first_column, end_column, first_row, end_row;
+};
+
 /*
  * One view as the kernels need it, in centred voxels g = index - (size - 1) / 2
  * and centred pixels c' = column - (columns - 1) / 2, r' likewise.
@@ -141,6 +146,7 @@ struct device_view {
 	float matrix[3][4]; /* of voxel indices: column * w, row * w, w = depth / depth of the isocentre */
 	float central[3];   /* unit vector from the source across to the axis */
 	float source[3];    /* roughly: how steep rays can be at a voxel */
+	struct shadow shadow;
 };
 
 /*
@@ -218,6 +224,7 @@ struct plan_shape {
 	bool rows_down;   /* untilted, and rows count against z */
 	int forward_rows; /* rows of one thread in the forward projection by rows; 0: the general one */
 	enum comb forward_comb;
+	int view_rows;   /* the same, where SART goes view by view */
 	bool rows_apart; /* they share columns, but no values */
 	bool halves;     /* the forward projection reads pairs in half precision */
 	int back_voxels; /* voxels of one window in the untilted backprojection; 0: the general one */
@@ -310,6 +317,8 @@ int plan_set_slots(struct plan *plan, const int *slots, int count, const struct 
 int plan_check_views(const struct plan *plan, const int *views, int count, const struct stack_shape *shape,
 		     const struct stack *stack, int slots, struct error *err);
 
+struct shadow shadow_of(const struct geometry *geometry, const struct grid *grid, int index);
+
 /* ---- layout.cu ---- */
 int layout_slices(struct plan *plan, const float *volume, struct error *err); /* -> scratch */
 /* Pairs stand upside down where rows run down: their kernel wants rows that count with z. */
@@ -400,6 +409,7 @@ int reduce_pairs(struct plan *plan, const float2 *partial, size_t count, double 
 
 /* ---- sweep.cu: an iteration view by view, by rows; partial sums of each view are left in plan->partial ---- */
 size_t sweep_rows_bytes(const struct plan *plan);
+int sweep_view_rows(const struct plan *plan);        /* what view_rows is to be */
 size_t sweep_rows_partials(const struct plan *plan); /* of a view */
 size_t sweep_correction_bytes(const struct plan *plan);
 int sweep_rows_prepare(struct plan *plan, struct error *err);

@@ -386,6 +386,8 @@ static void plan_describe(struct plan *plan, const struct plan_options *options,
 	plan->filtered = stack_shape_make(wide_columns(options), geometry->rows, 1);
 	if (!options->no_projection && !plan->shape.is_small)
 		plan->scratch_bytes = (plan->along_x.floats + plan->along_y.floats) * sizeof(float);
+	if (plan->shape.by_rows)
+		plan->shape.view_rows = sweep_view_rows(plan);
 	if (plan->shape.by_view && sweep_scratch_bytes(plan) > plan->scratch_bytes)
 		plan->scratch_bytes = sweep_scratch_bytes(plan);
 	if (tv_scratch_bytes(options) > plan->scratch_bytes)
@@ -496,6 +498,33 @@ static void to_voxels(const struct grid *grid, const double point[3], bool is_pl
 	}
 }
 
+struct shadow shadow_of(const struct geometry *geometry, const struct grid *grid, int index)
+{
+	const struct shadow all = {0, geometry->columns, 0, geometry->rows};
+	const double margin = 2; /* pixels, far above what float32 may err */
+	double matrix[12], low[2] = {INFINITY, INFINITY}, high[2] = {-INFINITY, -INFINITY};
+	const int most[2] = {geometry->columns, geometry->rows};
+	int first[2], end[2];
+
+	view_matrix(&geometry->views[index], matrix);
+	for (int corner = 0; corner < 8; corner++) {
+		double point[3], at[2];
+
+		corner_of(grid, corner, 0.5, point);
+		if (!(view_project(matrix, point, &at[0], &at[1]) > 0))
+			return all; /* the grid is around the source */
+		for (int i = 0; i < 2; i++) {
+			low[i] = fmin(low[i], at[i]);
+			high[i] = fmax(high[i], at[i]);
+		}
+	}
+	for (int i = 0; i < 2; i++) {
+		first[i] = (int)fmin(fmax(floor(low[i] - margin), 0), most[i]);
+		end[i] = (int)fmin(fmax(ceil(high[i] + margin) + 1, 0), most[i]);
+	}
+	return {first[0], end[0], first[1], end[1]};
+}
+
 static struct device_view view_make(const struct plan_options *options, int index)
 {
 	const struct geometry *geometry = options->geometry;
@@ -536,6 +565,7 @@ static struct device_view view_make(const struct plan_options *options, int inde
 		}
 		result.matrix[r][3] = (float)(offset / depth);
 	}
+	result.shadow = shadow_of(geometry, grid, index);
 	axis_direction(view->source, options->axis, central);
 	for (int i = 0; i < 3; i++)
 		result.central[i] = (float)central[i];

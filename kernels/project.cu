@@ -105,11 +105,12 @@ static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS, GENE
 	float d[3], m[3];
 	line_to(g, c, r, d, m);
 	int own = dominant_axis(d[0], d[1], d[2]);
+	bool meets = valid && meets_grid(g, column, 1, row, 1);
 	float sum = 0, slices = 0, step = 0;
 
 	/* Warps near the diagonals hold rays of both axes: they walk twice. */
 	for (int axis = ACROSS_X; axis <= ACROSS_Y; axis++) {
-		bool mine = valid && own == axis;
+		bool mine = meets && own == axis;
 
 		if (!__any_sync(~0u, mine))
 			continue;
@@ -158,7 +159,7 @@ static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS, GENE
 			step = s.step;
 		}
 	}
-	if (ALONG_Z && valid && own == ACROSS_Z) {
+	if (ALONG_Z && meets && own == ACROSS_Z) {
 		slice_axes axes = axes_of(p.grid, ACROSS_Z);
 		ray s = ray_make(crossing_of(d, m, ACROSS_Z), axes);
 		size_t slice = (size_t)axes.fast * (size_t)axes.rows;
@@ -395,10 +396,11 @@ static __global__ void __launch_bounds__(32 * ROWS_WARPS * ROWS_VIEWS, 32 / (ROW
 	float d[3], m[3];
 	line_to(g, c, r, d, m);
 	int own = fabsf(d[0]) >= fabsf(d[1]) ? ACROSS_X : ACROSS_Y;
+	bool meets = meets_grid(g, at.tile_column * 32, 32, p.rows_down ? p.rows - low - ROWS : low, ROWS);
 	float2 squares = {0, 0};
 
 	for (int axis = ACROSS_X; axis <= ACROSS_Y; axis++) {
-		bool mine = valid && own == axis;
+		bool mine = valid && meets && own == axis;
 
 		if (!__any_sync(~0u, mine))
 			continue;
@@ -450,6 +452,15 @@ static __global__ void __launch_bounds__(32 * ROWS_WARPS * ROWS_VIEWS, 32 / (ROW
 			squares.x += square.x;
 			squares.y += square.y;
 		}
+	}
+	for (int k = 0; k < ROWS; k++) {
+		if (meets || !valid || low + k >= p.rows)
+			break;
+		int row = p.rows_down ? p.rows - 1 - (low + k) : low + k;
+		float2 square = finish(p, at.slot, view, column, row, 0, 0, 0);
+
+		squares.x += square.x;
+		squares.y += square.y;
 	}
 	if (p.use.measured != NULL) {
 		squares = block_sum(squares);

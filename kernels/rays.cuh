@@ -131,6 +131,13 @@ static __device__ __forceinline__ void line_to(const device_view &g, float colum
 	ret_moment[2] = form(g.moment[2], column, row);
 }
 
+/* Whether a ray of these pixels may meet the grid. */
+static __device__ __forceinline__ bool meets_grid(const device_view &g, int column, int columns, int row, int rows)
+{
+	return column < g.shadow.end_column && column + columns > g.shadow.first_column && row < g.shadow.end_row &&
+	       row + rows > g.shadow.first_row;
+}
+
 /* The axis along which a direction, in voxels, is longest; the first of equal ones. */
 static __device__ __forceinline__ int dominant_axis(float x, float y, float z)
 {

@@ -29,6 +29,7 @@ struct rows_view {
 	bool wanted[2];        /* copies that the next view reads */
 	bool rows_down;
 	int columns, rows;
+	int first_block;       /* of rows, in a launch */
 	const float *measured; /* [row][column], as the correction */
 	float *correction;
 	int measured_pitch, correction_pitch;
@@ -49,19 +50,21 @@ static __global__ void __launch_bounds__(32 * PARTS, ROWS > 4 || LEAN ? 3 : 4) p
 	__shared__ float sums[PARTS][ROWS][32];
 	__shared__ shared_ends<ROWS, 32 * PARTS> all_ends;
 	const device_view &g = *s.geometry;
-	int column = blockIdx.x * 32 + threadIdx.x, low = blockIdx.y * ROWS, part = threadIdx.y;
+	int block = s.first_block + blockIdx.y, column = blockIdx.x * 32 + threadIdx.x, low = block * ROWS;
+	int part = threadIdx.y;
 	bool valid = column < s.columns;
 	float upwards = s.rows_down ? -1.0f : 1.0f, c = (float)column - 0.5f * (float)(s.columns - 1);
 	float r = upwards * ((float)low - 0.5f * (float)(s.rows - 1));
 	float d[3], m[3];
 	line_to(g, c, r, d, m);
 	int own = fabsf(d[0]) >= fabsf(d[1]) ? ACROSS_X : ACROSS_Y;
+	bool meets = meets_grid(g, blockIdx.x * 32, 32, s.rows_down ? s.rows - low - ROWS : low, ROWS);
 
 #pragma unroll
 	for (int k = 0; k < ROWS; k++)
 		sums[part][k][threadIdx.x] = 0;
 	for (int axis = ACROSS_X; axis <= ACROSS_Y; axis++) {
-		bool mine = valid && own == axis;
+		bool mine = valid && meets && own == axis;
 
 		if (!__any_sync(~0u, mine))
 			continue;
@@ -130,16 +133,19 @@ static __global__ void __launch_bounds__(32 * PARTS, ROWS > 4 || LEAN ? 3 : 4) p
 		if (!valid || low + k >= s.rows)
 			continue;
 		float up = upwards * ((float)(low + k) - 0.5f * (float)(s.rows - 1)), sum = 0;
-		float dk[3], mk[3];
-		line_to(g, c, up, dk, mk);
-		ray full = ray_make(crossing_of(dk, mk, own), axes_of(s.grid, own));
-		float length = fmaxf(full.end - full.begin, 0.0f) * full.step;
+		float dk[3], mk[3], length = 0, step = 0;
+		if (meets) {
+			line_to(g, c, up, dk, mk);
+			ray full = ray_make(crossing_of(dk, mk, own), axes_of(s.grid, own));
+			length = fmaxf(full.end - full.begin, 0.0f) * full.step;
+			step = full.step;
+		}
 		int row = s.rows_down ? s.rows - 1 - (low + k) : low + k;
 		float measured = s.measured[(size_t)row * s.measured_pitch + column], residual;
 
 		for (int j = 0; j < PARTS; j++)
 			sum += sums[j][k][threadIdx.x];
-		residual = measured - sum * full.step;
+		residual = measured - sum * step;
 		s.correction[(size_t)row * s.correction_pitch + column] =
 		    length >= s.least && length > 0 ? residual / length : 0.0f;
 		squares.x += residual * residual;
@@ -147,7 +153,55 @@ static __global__ void __launch_bounds__(32 * PARTS, ROWS > 4 || LEAN ? 3 : 4) p
 	}
 	squares = block_sum(squares);
 	if (threadIdx.x == 0 && threadIdx.y == 0)
-		s.partial[blockIdx.y * gridDim.x + blockIdx.x] = squares;
+		s.partial[block * gridDim.x + blockIdx.x] = squares;
+}
+
+/* The blocks of `each` rows, counted upwards, that may meet the grid. */
+struct block_range {
+	int first, end;
+};
+static __host__ __device__ block_range blocks_that_meet(const shadow &shadow, bool rows_down, int rows, int each)
+{
+	int low = rows_down ? rows - shadow.end_row : shadow.first_row;
+	int high = rows_down ? rows - shadow.first_row : shadow.end_row;
+
+	return {low / each, high > low ? (high + each - 1) / each : low / each};
+}
+
+/* The squares of all rows that no block has: they are residuals as well. A block has one view. */
+enum { MISSED_THREADS = 512 };
+static __global__ void __launch_bounds__(MISSED_THREADS)
+    sum_missed(const rows_view s, const int *order, size_t slot, int each, int across, int blocks)
+{
+	int view = order[blockIdx.x], missed = 0;
+	block_range range = blocks_that_meet(s.geometry[view].shadow, s.rows_down, s.rows, each);
+	int first = range.first * each, skipped = (range.end - range.first) * each;
+	int rows = max(s.rows - skipped, first);
+	const float *measured = s.measured + slot * view;
+	float2 *partial = s.partial + (size_t)blockIdx.x * across * blocks, squares = {0, 0};
+
+	if (range.first == 0 && range.end >= blocks)
+		return;
+	for (int i = threadIdx.x; i < rows * s.columns; i += MISSED_THREADS) {
+		int low = i / s.columns, column = i - low * s.columns;
+
+		low += low >= first ? skipped : 0;
+		if (low >= s.rows)
+			break;
+		float value = measured[(size_t)(s.rows_down ? s.rows - 1 - low : low) * s.measured_pitch + column];
+
+		squares.x += value * value;
+	}
+	squares.y = squares.x;
+	squares = block_sum(squares);
+	for (int block = 0; block < blocks; block++) {
+		if (block >= range.first && block < range.end)
+			continue;
+		if (threadIdx.x < across)
+			partial[block * across + threadIdx.x] =
+			    missed == 0 && threadIdx.x == 0 ? squares : make_float2(0, 0);
+		missed++;
+	}
 }
 
 /* ---- back ---- */
@@ -285,20 +339,26 @@ size_t sweep_rows_bytes(const struct plan *plan)
 	       sizeof(__half2);
 }
 
-enum { ROWS_FEW = 3 };
-
-/* Rows of a thread: fewer where a view would not fill the card. */
-static int rows_of(const struct plan *plan)
+/* Rows of a thread: few where what a view sees of the grid would not fill the card. */
+int sweep_view_rows(const struct plan *plan)
 {
-	const int blocks_least = 1000;
-	int rows = plan->shape.forward_rows;
+	const int blocks_least = 500, few = plan->shape.untilted ? 2 : 3; /* those that lean share more */
+	const struct geometry *geometry = plan->options.geometry;
+	int rows = plan->shape.forward_rows, most = 0;
 
-	return divide_up(plan->stack.columns, 32) * divide_up(plan->stack.rows, rows) < blocks_least ? ROWS_FEW : rows;
+	for (int k = 0; k < geometry->count; k++) {
+		struct shadow shadow = shadow_of(geometry, plan->options.grid, k);
+		int blocks = divide_up(shadow.end_column - shadow.first_column, 32) *
+			     divide_up(shadow.end_row - shadow.first_row, rows);
+
+		most = blocks > most ? blocks : most;
+	}
+	return most < blocks_least && rows > few ? few : rows;
 }
 
 static dim3 blocks_of(const struct plan *plan)
 {
-	return dim3(divide_up(plan->stack.columns, 32), divide_up(plan->stack.rows, rows_of(plan)));
+	return dim3(divide_up(plan->stack.columns, 32), divide_up(plan->stack.rows, plan->shape.view_rows));
 }
 
 size_t sweep_rows_partials(const struct plan *plan)
@@ -335,30 +395,35 @@ static void wanted_by(const struct plan *plan, int index, bool ret_wanted[2])
 }
 
 template <comb KIND, int ROWS>
-static void launch_rows(const struct plan *plan, const rows_view &s, cudaStream_t stream)
+static void launch_rows(const struct plan *plan, const rows_view &s, int count, cudaStream_t stream)
 {
+	dim3 blocks(blocks_of(plan).x, count), threads(32, PARTS);
+
 	if (plan->shape.untilted)
-		project_view_rows<KIND, ROWS, false><<<blocks_of(plan), dim3(32, PARTS), 0, stream>>>(s);
+		project_view_rows<KIND, ROWS, false><<<blocks, threads, 0, stream>>>(s);
 	else
-		project_view_rows<KIND, ROWS, true><<<blocks_of(plan), dim3(32, PARTS), 0, stream>>>(s);
+		project_view_rows<KIND, ROWS, true><<<blocks, threads, 0, stream>>>(s);
 }
 
-static void project_by(const struct plan *plan, const rows_view &s, cudaStream_t stream)
+/* `count` blocks of rows from s.first_block on. */
+static void project_by(const struct plan *plan, const rows_view &s, int count, cudaStream_t stream)
 {
-	const int rows = rows_of(plan);
+	const int rows = plan->shape.view_rows;
 
 	/* So few rows find their values in any comb. */
-	switch ((rows == ROWS_FEW ? COMB_EVEN : plan->shape.forward_comb) * 8 + rows) {
-	case COMB_EVEN * 8 + ROWS_FEW:
-		return launch_rows<COMB_EVEN, ROWS_FEW>(plan, s, stream);
+	switch ((rows <= 3 ? COMB_EVEN : plan->shape.forward_comb) * 8 + rows) {
+	case COMB_EVEN * 8 + 2:
+		return launch_rows<COMB_EVEN, 2>(plan, s, count, stream);
+	case COMB_EVEN * 8 + 3:
+		return launch_rows<COMB_EVEN, 3>(plan, s, count, stream);
 	case COMB_EVEN * 8 + 4:
-		return launch_rows<COMB_EVEN, 4>(plan, s, stream);
+		return launch_rows<COMB_EVEN, 4>(plan, s, count, stream);
 	case COMB_EVEN * 8 + 5:
-		return launch_rows<COMB_EVEN, 5>(plan, s, stream);
+		return launch_rows<COMB_EVEN, 5>(plan, s, count, stream);
 	case COMB_NARROW * 8 + 6:
-		return launch_rows<COMB_NARROW, 6>(plan, s, stream);
+		return launch_rows<COMB_NARROW, 6>(plan, s, count, stream);
 	default:
-		return launch_rows<COMB_EVEN, 6>(plan, s, stream);
+		return launch_rows<COMB_EVEN, 6>(plan, s, count, stream);
 	}
 }
 
@@ -443,12 +508,22 @@ int sweep_rows(struct plan *plan, const float *projections, float *volume, float
 	wanted_by(plan, order[0], s.wanted);
 	launch_update<UPDATE_NOT>(plan, s, stream);
 	LAUNCHED();
+	s.measured = projections;
+	s.partial = plan->partial;
+	sum_missed<<<count, MISSED_THREADS, 0, stream>>>(s, plan->views, plan->stack.slot, plan->shape.view_rows,
+							 (int)blocks_of(plan).x, (int)blocks_of(plan).y);
+	LAUNCHED();
 	for (int i = 0; i < count; i++) {
+		block_range range = blocks_that_meet(shadow_of(plan->options.geometry, plan->options.grid, order[i]),
+						     s.rows_down, s.rows, plan->shape.view_rows);
+
 		TRY(cancel_check(cancel, err));
 		s.geometry = plan->geometry + order[i];
 		s.measured = projections + (size_t)order[i] * plan->stack.slot;
 		s.partial = plan->partial + (size_t)i * sweep_rows_partials(plan);
-		project_by(plan, s, stream);
+		s.first_block = range.first;
+		if (range.end > range.first)
+			project_by(plan, s, range.end - range.first, stream);
 		LAUNCHED();
 		s.wanted[ACROSS_X] = s.wanted[ACROSS_Y] = false;
 		if (i + 1 < count)
