@@ -30,7 +30,6 @@ struct backprojection_job {
 	const void *pairs; /* by rows: row 0 of the first slot */
 	pairs_shape shape;
 	const unsigned *most;
-	float most_weight; /* what brings FDK's weights to 1 at most */
 	float columns, rows;
 	int views;
 	int nx, ny, nz;
@@ -182,11 +181,13 @@ static __device__ __forceinline__ int place_of(int column, const pairs_shape &sh
 	return (int)(panel * (unsigned)(shape.panel - PAIRS_STEP) + place) + 1;
 }
 
-template <int VOXELS, int WINDOWS, comb KIND, int ACROSS, int ALONG>
-static __global__ void __launch_bounds__(ACROSS *ALONG, 8) backproject_untilted(const backprojection_job job)
+enum { ROWS_WIDE = 8, ROWS_HIGH = 16 }; /* of a block, by rows */
+
+template <int VOXELS, int WINDOWS, comb KIND>
+static __global__ void __launch_bounds__(ROWS_WIDE *ROWS_HIGH, 8) backproject_untilted(const backprojection_job job)
 {
 	const int run = VOXELS * WINDOWS, rows = comb_values(KIND, VOXELS);
-	int x = blockIdx.x * ACROSS + threadIdx.x, y = blockIdx.y * ALONG + threadIdx.y, z = blockIdx.z * run;
+	int x = blockIdx.x * ROWS_WIDE + threadIdx.x, y = blockIdx.y * ROWS_HIGH + threadIdx.y, z = blockIdx.z * run;
 	float sum[run], fx = (float)x, fy = (float)y, fz = (float)z;
 	const float2 *p = (const float2 *)job.pairs;
 
@@ -228,20 +229,28 @@ static __global__ void __launch_bounds__(ACROSS *ALONG, 8) backproject_untilted(
 	put_voxels<run>(job, x, y, z, sum);
 }
 
+/* Value k of pairs of them. */
+static __device__ __forceinline__ float single(const __half2 *pairs, int k)
+{
+	return k % 2 ? __high2float(pairs[k / 2]) : __low2float(pairs[k / 2]);
+}
+
 /*
- * The same in half precision, two voxels and two rows a register; a few views are summed in it, all else in
- * float. Also for rows that lean by a degree or so: then a thread's voxels are seen on a line that steps
+ * The same in half precision, two voxels and two rows a register. SART's views come in the same order always:
+ * a few of them are summed in it, too. FDK's come as the arm turns, which must not show.
+ *
+ * Also for rows that lean by a degree or so: then a thread's voxels are seen on a line that steps
  * aside from row to row, and what it meets of each row is interpolated across. Over a window it meets
  * three columns at most, of which the same two pieces as along z give the value.
  */
 enum { HALF_VIEWS = 8 };
 
-template <int VOXELS, int WINDOWS, comb KIND, bool LEAN, int ACROSS, int ALONG>
-static __global__ void __launch_bounds__(ACROSS *ALONG, 5) backproject_pairs(const backprojection_job job)
+template <int VOXELS, int WINDOWS, comb KIND, bool LEAN, bool FDK>
+static __global__ void __launch_bounds__(ROWS_WIDE *ROWS_HIGH, 5) backproject_pairs(const backprojection_job job)
 {
 	const int run = VOXELS * WINDOWS, twos = (VOXELS + 1) / 2;
 	const int pairs = (comb_values(KIND, VOXELS) + 1) / 2;
-	int x = blockIdx.x * ACROSS + threadIdx.x, y = blockIdx.y * ALONG + threadIdx.y, z = blockIdx.z * run;
+	int x = blockIdx.x * ROWS_WIDE + threadIdx.x, y = blockIdx.y * ROWS_HIGH + threadIdx.y, z = blockIdx.z * run;
 	float sum[run], fx = (float)x, fy = (float)y, fz = (float)z + (LEAN ? 0.5f * (float)(run - 1) : 0.0f);
 	const __half2 *p = (const __half2 *)job.pairs;
 
@@ -265,14 +274,14 @@ static __global__ void __launch_bounds__(ACROSS *ALONG, 5) backproject_pairs(con
 			float w = reciprocal(c), middle = b * w, up = LEAN ? fmaf(-middle, m[10], m[6]) : m[6];
 			float u = fminf(fmaxf(a * w, -2.0f), job.columns + 1.0f), rise = up * w;
 			float aside = LEAN ? fmaf(-u, m[10], m[2]) * reciprocal(up) : 0.0f;
-			float e = rise - comb_spacing(KIND), weight = job.use.fdk ? w * w * job.most_weight : 1.0f;
+			float e = rise - comb_spacing(KIND), weight = w * w;
 			float first = LEAN ? fmaf(-0.5f * (float)(run - 1), rise, middle) : middle, across;
 			float lowest = comb_lowest(KIND, VOXELS, e);
-			float slip = LEAN && job.use.fdk ? -2.0f * w * m[10] * weight : 0.0f;
+			float slip = LEAN ? -2.0f * w * m[10] * weight : 0.0f;
 			int column = split(u, across);
 			const __half2 *there = p + (place_of(column, job.shape) - (LEAN ? column : 0));
 			__half2 right = __float2half2_rn(across);
-			__half2 heavy = __float2half2_rn(weight), step = __float2half2_rn(aside);
+			__half2 step = __float2half2_rn(aside);
 			float leftmost =
 			    LEAN ? fmaf(-middle, aside, u) + fminf(0.0f, (float)(2 * pairs - 1) * aside) : 0.0f;
 
@@ -295,8 +304,6 @@ static __global__ void __launch_bounds__(ACROSS *ALONG, 5) backproject_pairs(con
 					position += fmaxf(0.0f, (float)(1 - 2 * pairs) * aside);
 					second = __floats2half2_rn(position, position + aside);
 					beyond = __hadd2(second, __float2half2_rn(-1.0f));
-					heavy = __float2half2_rn(
-					    fmaf((float)(n * VOXELS) + 0.5f * (float)(VOXELS - run), slip, weight));
 				}
 #pragma unroll
 				for (int j = 0; j < pairs; j++) {
@@ -310,18 +317,28 @@ static __global__ void __launch_bounds__(ACROSS *ALONG, 5) backproject_pairs(con
 							       q[j]);
 				}
 				blend<KIND, VOXELS>(q, e, t, value);
+				/* Depth changes hardly along a window. */
+				float here =
+				    LEAN ? fmaf((float)(n * VOXELS) + 0.5f * (float)(VOXELS - run), slip, weight)
+					 : weight;
 #pragma unroll
-				for (int k = 0; k < twos; k++)
-					few[n][k] = __hfma2(heavy, value[k], few[n][k]);
+				for (int k = 0; k < VOXELS; k++) {
+					float &s = sum[n * VOXELS + k];
+
+					if (FDK)
+						s = fmaf(here, single(value, k), s);
+					else if (k % 2 == 0)
+						few[n][k / 2] = __hadd2(few[n][k / 2], value[k / 2]);
+				}
 			}
 		}
 #pragma unroll
 		for (int n = 0; n < WINDOWS; n++)
 #pragma unroll
-			for (int k = 0; k < VOXELS; k++)
-				sum[n * VOXELS + k] += k % 2 ? __high2float(few[n][k / 2]) : __low2float(few[n][k / 2]);
+			for (int k = 0; !FDK && k < VOXELS; k++)
+				sum[n * VOXELS + k] += single(few[n], k);
 	}
-	float unscale = 1.0f / (pairs_scale(*job.most) * (job.use.fdk ? job.most_weight : 1.0f));
+	float unscale = 1.0f / pairs_scale(*job.most);
 #pragma unroll
 	for (int k = 0; k < run; k++)
 		sum[k] *= unscale;
@@ -438,20 +455,31 @@ static int load_array(struct plan *plan, const backprojection_job &job, struct e
 	return 0;
 }
 
+template <comb KIND, int VOXELS, int WINDOWS, bool LEAN>
+static void launch_halves(const backprojection_job &job, dim3 blocks, cudaStream_t stream)
+{
+	dim3 threads(ROWS_WIDE, ROWS_HIGH);
+
+	if (job.use.fdk)
+		backproject_pairs<VOXELS, WINDOWS, KIND, LEAN, true><<<blocks, threads, 0, stream>>>(job);
+	else
+		backproject_pairs<VOXELS, WINDOWS, KIND, LEAN, false><<<blocks, threads, 0, stream>>>(job);
+}
+
 /* In float runs are shorter: a thread needs twice the registers. */
 template <comb KIND, int VOXELS, int WINDOWS, int FLOAT_WINDOWS>
 static void launch_rows(const struct plan_shape *shape, const backprojection_job &job, cudaStream_t stream)
 {
-	const int wide = 8, high = 16, windows = shape->back_pairs ? WINDOWS : FLOAT_WINDOWS;
-	dim3 blocks(divide_up(job.nx, wide), divide_up(job.ny, high), divide_up(job.nz, VOXELS * windows));
-	dim3 threads(wide, high);
+	const int run = VOXELS * (shape->back_pairs ? WINDOWS : FLOAT_WINDOWS);
+	dim3 blocks(divide_up(job.nx, ROWS_WIDE), divide_up(job.ny, ROWS_HIGH), divide_up(job.nz, run));
+	dim3 threads(ROWS_WIDE, ROWS_HIGH);
 
 	if (!shape->back_pairs)
-		backproject_untilted<VOXELS, FLOAT_WINDOWS, KIND, wide, high><<<blocks, threads, 0, stream>>>(job);
+		backproject_untilted<VOXELS, FLOAT_WINDOWS, KIND><<<blocks, threads, 0, stream>>>(job);
 	else if (shape->untilted)
-		backproject_pairs<VOXELS, WINDOWS, KIND, false, wide, high><<<blocks, threads, 0, stream>>>(job);
+		launch_halves<KIND, VOXELS, WINDOWS, false>(job, blocks, stream);
 	else
-		backproject_pairs<VOXELS, WINDOWS, KIND, true, wide, high><<<blocks, threads, 0, stream>>>(job);
+		launch_halves<KIND, VOXELS, WINDOWS, true>(job, blocks, stream);
 }
 
 template <int VOXELS, int SAMPLING>
@@ -482,7 +510,6 @@ static backprojection_job job_make(const struct plan *plan, float *volume, struc
 	job.pairs =
 	    (const char *)plan->pairs + job.shape.before * (plan->shape.back_pairs ? sizeof(__half2) : sizeof(float2));
 	job.most = plan->most;
-	job.most_weight = plan->shape.back_nearest * plan->shape.back_nearest;
 	job.columns = (float)shape->columns;
 	job.rows = (float)shape->rows;
 	job.nx = plan->grid.size[0];

@@ -231,7 +231,6 @@ struct plan_shape {
 	bool is_small;   /* launches take longer than samples: the plainest kernels */
 	enum comb back_comb;
 	bool back_pairs;     /* it reads pairs in half precision */
-	float back_nearest;  /* least depth of a voxel, of the isocentre's */
 	bool textures;       /* 8-bit interpolation weights are allowed */
 	bool z_rays;         /* some ray runs closer to z than to x and y */
 	int batch;           /* views filtered and backprojected in one go */
@@ -328,7 +327,7 @@ static inline bool pairs_flipped(const struct plan *plan)
 }
 /*
  * What pairs in half precision are multiplied by, by the largest magnitude of all, as bits. Nearly always it is
- * the same, which leaves the largest between 2^-10 and 2^13: then the least step is 2^-15 of it, sums of a few
+ * the same, which leaves the largest between 2^-10 and 2^12: then the least step is 2^-15 of it, sums of eight
  * stay finite, and nobody has to wait for it. What is not a number stays none.
  */
 static const float PAIRS_SCALE = 64.0f;
@@ -336,9 +335,9 @@ static __device__ __forceinline__ float pairs_scale(unsigned most)
 {
 	int exponent = (int)(most >> 23) - 127;
 
-	if ((exponent >= -16 && exponent < 7) || exponent < -100 || exponent > 100)
+	if ((exponent >= -16 && exponent < 6) || exponent < -100 || exponent > 100)
 		return PAIRS_SCALE;
-	return __uint_as_float((unsigned)(12 - exponent + 127) << 23);
+	return __uint_as_float((unsigned)(11 - exponent + 127) << 23);
 }
 /* -> pairs; where they are in half precision, also most */
 int layout_pairs(struct plan *plan, const struct stack_shape *shape, const float *from, int count, struct error *err);

@@ -74,7 +74,7 @@ static __device__ __forceinline__ __half2 both_lower(__half2 value)
 	return __low2half2(value);
 }
 
-enum { RUN = 8, WIDE = 32, HIGH = 16 };
+enum { RUN = 8, WIDE = 32, HIGH = 32 };
 
 /*
  * A place of a slice, in all its rows; beside it at the fast axis' ends stands what

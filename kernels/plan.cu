@@ -118,8 +118,6 @@ static double columns_aside(const struct geometry *geometry)
 	}
 	return most;
 }
-/* Closer to the source than that, a part of the isocentre's depth, weights need more than half precision. */
-static const double NEAREST = 0.1;
 /* Rows that a thread of the backprojection by rows reaches from its middle, at most. */
 enum { BACK_ROWS_MOST = 24 };
 
@@ -224,27 +222,6 @@ static bool is_untilted(const struct plan_options *options)
 	return true;
 }
 
-/* The least depth of a corner, as a part of the isocentre's; at most 1, 0 where that is behind a source. */
-static double nearest_voxel(const struct geometry *geometry, const struct grid *grid)
-{
-	const double isocentre[3] = {0, 0, 0};
-	double nearest = 1;
-
-	for (int k = 0; k < geometry->count; k++) {
-		double matrix[12], point[3], column, row, depth;
-
-		view_matrix(&geometry->views[k], matrix);
-		depth = view_project(matrix, isocentre, &column, &row);
-		if (!(depth > 0))
-			return 0;
-		for (int corner = 0; corner < 8; corner++) {
-			corner_of(grid, corner, 0.5, point);
-			nearest = fmin(nearest, view_project(matrix, point, &column, &row) / depth);
-		}
-	}
-	return nearest;
-}
-
 static void choose_rows(const struct plan_options *options, struct plan_shape *shape)
 {
 	const struct geometry *geometry = options->geometry;
@@ -274,10 +251,7 @@ static void choose_rows(const struct plan_options *options, struct plan_shape *s
 	/* Seen from the detector the same spacing is upside down. */
 	if (!shape->untilted && !(columns_aside(geometry) * BACK_ROWS_MOST < 1))
 		return;
-	shape->back_nearest = (float)nearest_voxel(geometry, options->grid);
-	shape->back_pairs = shape->halves && shape->back_nearest > NEAREST;
-	if (!shape->untilted && !shape->back_pairs)
-		return;
+	shape->back_pairs = shape->halves;
 	comb = choose_comb(back_combs, 1 / most, 1 / least);
 	shape->back_comb = comb.kind;
 	shape->back_voxels = comb.count;
