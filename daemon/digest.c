@@ -3,6 +3,7 @@
 
 #include <errno.h>
 #include <fcntl.h>
+#include <math.h>
 #include <openssl/evp.h>
 #include <pthread.h>
 #include <stdatomic.h>
@@ -11,6 +12,7 @@
 #include <string.h>
 #include <sys/resource.h>
 #include <sys/stat.h>
+#include <time.h>
 #include <unistd.h>
 
 #include "daemon/log.h"
@@ -18,12 +20,16 @@
 #include "proto/spool.h"
 
 enum { NICENESS = 10 /* behind the workers, too */ };
+/* s until what failed is tried again; each time twice as long. */
+static const double RETRY_FIRST = 1, RETRY_LAST = 300;
 
 /* Volumes of a job that have no digest yet. */
 struct task {
 	struct task *next;
 	char job[ID_SIZE];
 	char name[32]; /* "": all of them */
+	double due;    /* of now(): not before */
+	double retry;  /* s to the next time, should it fail */
 };
 
 struct digester {
@@ -129,34 +135,84 @@ static int make_digest(struct digester *digester, struct job *job, const struct 
 
 /* ---- the threads ---- */
 
-static void complain(struct job *job, const struct error *err)
+static double now(void)
+{
+	struct timespec at;
+
+	clock_gettime(CLOCK_MONOTONIC, &at);
+	return (double)at.tv_sec + 1e-9 * (double)at.tv_nsec;
+}
+
+/* Whether what failed is worth another try. */
+static bool complain(struct job *job, const struct task *task, const struct error *err)
 {
 	struct job_facts facts;
 
 	job_facts(job, &facts);
-	if (err->code != ERR_CANCELLED && !facts.removed)
-		log_line(LEVEL_ERROR, "job %s: a volume has no digest before the next start: %s", facts.id, err->text);
+	if (err->code == ERR_CANCELLED || facts.removed)
+		return false;
+	log_line(LEVEL_ERROR, "job %s: a volume has no digest, tried again in %g s: %s", facts.id, task->retry,
+		 err->text);
+	return true;
 }
 
-static void carry_out(struct digester *digester, const struct task *task)
+/* False: to be done again. */
+static bool carry_out(struct digester *digester, const struct task *task)
 {
 	struct volume_record *volumes = NULL;
 	struct job *job;
 	struct error err;
 	int count = 0;
+	bool again = false;
 
 	if (jobs_find(digester->jobs, task->job, &job, &err) != 0)
-		return;
+		return true;
 	if (store_job_volumes(jobs_store(digester->jobs), task->job, &volumes, &count, &err) != 0)
-		complain(job, &err);
+		again = complain(job, task, &err);
 	for (int i = 0; i < count; i++) {
 		if (volumes[i].hashed || (task->name[0] != '\0' && strcmp(task->name, volumes[i].name) != 0))
 			continue;
 		if (make_digest(digester, job, volumes, count, &volumes[i], &err) != 0)
-			complain(job, &err);
+			again |= complain(job, task, &err);
 	}
 	free(volumes);
 	job_release(job);
+	return !again;
+}
+
+static void append(struct digester *digester, struct task *task)
+{
+	task->next = NULL;
+	*digester->last = task;
+	digester->last = &task->next;
+	pthread_cond_signal(&digester->changed);
+}
+
+/* The first task that is due, or NULL after a sleep until one may be; holding the lock. */
+static struct task *next_task(struct digester *digester)
+{
+	double at = now(), until = INFINITY;
+	struct timespec end;
+
+	for (struct task **place = &digester->first; *place != NULL; place = &(*place)->next) {
+		struct task *task = *place;
+
+		if (task->due <= at) {
+			*place = task->next;
+			if (task->next == NULL)
+				digester->last = place;
+			return task;
+		}
+		until = fmin(until, task->due);
+	}
+	if (until == INFINITY) {
+		pthread_cond_wait(&digester->changed, &digester->lock);
+	} else {
+		end.tv_sec = (time_t)until;
+		end.tv_nsec = (long)(1e9 * (until - (double)end.tv_sec));
+		pthread_cond_timedwait(&digester->changed, &digester->lock, &end);
+	}
+	return NULL;
 }
 
 static void *digest_loop(void *context)
@@ -168,18 +224,21 @@ static void *digest_loop(void *context)
 	setpriority(PRIO_PROCESS, (id_t)gettid(), NICENESS);
 	pthread_mutex_lock(&digester->lock);
 	while (!atomic_load(&digester->stop)) {
-		task = digester->first;
-		if (task == NULL) {
-			pthread_cond_wait(&digester->changed, &digester->lock);
+		bool done;
+
+		task = next_task(digester);
+		if (task == NULL)
+			continue;
+		pthread_mutex_unlock(&digester->lock);
+		done = carry_out(digester, task);
+		pthread_mutex_lock(&digester->lock);
+		if (done) {
+			free(task);
 			continue;
 		}
-		digester->first = task->next;
-		if (digester->first == NULL)
-			digester->last = &digester->first;
-		pthread_mutex_unlock(&digester->lock);
-		carry_out(digester, task);
-		free(task);
-		pthread_mutex_lock(&digester->lock);
+		task->due = now() + task->retry;
+		task->retry = fmin(2 * task->retry, RETRY_LAST);
+		append(digester, task);
 	}
 	pthread_mutex_unlock(&digester->lock);
 	return NULL;
@@ -195,10 +254,9 @@ void digester_add(struct digester *digester, const char *job, const char *name)
 	}
 	snprintf(task->job, sizeof(task->job), "%s", job);
 	snprintf(task->name, sizeof(task->name), "%s", name == NULL ? "" : name);
+	task->retry = RETRY_FIRST;
 	pthread_mutex_lock(&digester->lock);
-	*digester->last = task;
-	digester->last = &task->next;
-	pthread_cond_signal(&digester->changed);
+	append(digester, task);
 	pthread_mutex_unlock(&digester->lock);
 }
 
@@ -212,6 +270,7 @@ static void add_from_catalogue(void *context, const char *job)
 int digester_start(struct jobs *jobs, int threads, struct digester **ret_digester, struct error *err)
 {
 	struct digester *digester = calloc(1, sizeof(*digester) + (size_t)threads * sizeof(digester->threads[0]));
+	pthread_condattr_t monotonic;
 	int code;
 
 	if (digester == NULL)
@@ -219,7 +278,10 @@ int digester_start(struct jobs *jobs, int threads, struct digester **ret_digeste
 	digester->jobs = jobs;
 	digester->last = &digester->first;
 	pthread_mutex_init(&digester->lock, NULL);
-	pthread_cond_init(&digester->changed, NULL);
+	pthread_condattr_init(&monotonic);
+	pthread_condattr_setclock(&monotonic, CLOCK_MONOTONIC);
+	pthread_cond_init(&digester->changed, &monotonic);
+	pthread_condattr_destroy(&monotonic);
 	code = store_jobs_undigested(jobs_store(jobs), add_from_catalogue, digester, err);
 	while (code == 0 && digester->count < threads) {
 		code = pthread_create(&digester->threads[digester->count], NULL, digest_loop, digester);

@@ -8,7 +8,8 @@
  * and its job ends without it. Threads that give way to all others read each
  * file once it is on the disk, most often from the page cache.
  *
- * What is not done at the stop, or fails, is done after the next start.
+ * What fails is tried again, at longer and longer intervals; what is not done at the
+ * stop is done after the next start.
  */
 struct digester;
 

@@ -296,6 +296,22 @@ test_a_run_that_cannot_be_recorded_yet_is_recorded_later() {
 	expect_json '.attempts == 1'
 }
 
+test_a_digest_that_cannot_be_recorded_yet_is_recorded_later() {
+	command -v sqlite3 >/dev/null || skip "no sqlite3 to make the catalogue refuse a row"
+	fresh_daemon
+	sqlite3 "$state/catalogue.sqlite" "CREATE TRIGGER refuse BEFORE UPDATE ON volumes
+		BEGIN SELECT RAISE(ABORT, 'refused'); END"
+	post_scan "$scan_dir"
+	send "$scan_dir" 0 59
+	post_job "$fdk"
+	wait_job succeeded
+	req GET "/v1/jobs/$job/volumes?wait=1"
+	expect_json '[.volumes[].digest] == [null]'
+	sqlite3 "$state/catalogue.sqlite" "DROP TRIGGER refuse"
+	req GET "/v1/jobs/$job/volumes?wait=20"
+	expect_json '.volumes[0].digest | length > 40'
+}
+
 test_images_that_come_late() {
 	fresh_daemon
 	post_scan "$raw_dir"
