@@ -274,10 +274,11 @@ static void column_inside(const struct plan *plan, const struct columns *columns
 		for (int g = 0; g < count; g++) {
 			const float *l = left + base[g], *r = right + base[g];
 			float *sum = sums + (size_t)(begin + g) * LANES;
+			/* Where the lowest lies on a row exactly, rounding may leave it below. */
 			vf low = vf_fma(left_weight, vf_load(l), right_weight * vf_load(r));
 			vf high = vf_fma(left_weight, vf_load(l + LANES), right_weight * vf_load(r + LANES));
 
-			vf_store(sum, vf_load(sum) + vf_window_sample(low, high, along + offset[g]));
+			vf_store(sum, vf_load(sum) + vf_window_sample(low, high, vf_max(along + offset[g], vf_all(0))));
 		}
 	}
 }

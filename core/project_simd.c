@@ -526,9 +526,11 @@ static void fan_sample(const struct plan *plan, const struct fan *fan, const str
 			float *sum = rows->sum + g * LANES;
 
 			if (windowed && i >= rows->full_first[g] && i <= rows->full_last[g]) {
+				/* Where the lowest lies on a voxel exactly, rounding may leave it below. */
 				vf low = vf_load(blend + base[k]), high = vf_load(blend + base[k] + LANES);
 
-				vf_store(sum, vf_load(sum) + vf_window_sample(low, high, along + offset[k]));
+				vf_store(sum, vf_load(sum) +
+						  vf_window_sample(low, high, vf_max(along + offset[k], vf_all(0))));
 			} else if (i >= rows->any_first[g] && i <= rows->any_last[g]) {
 				fan_sample_edge(plan, rows, g, i, height + g * LANES * step, step, windowed, blend);
 			}
