@@ -239,7 +239,7 @@ static __device__ __forceinline__ float single(const __half2 *pairs, int k)
  * The same in half precision, two voxels and two rows a register. SART's views come in the same order always:
  * a few of them are summed in it, too. FDK's come as the arm turns, which must not show.
  *
- * Also for rows that lean by a degree or so: then a thread's voxels are seen on a line that steps
+ * FDK's also for rows that lean by a degree or so: then a thread's voxels are seen on a line that steps
  * aside from row to row, and what it meets of each row is interpolated across. Over a window it meets
  * three columns at most, of which the same two pieces as along z give the value.
  */
@@ -382,15 +382,18 @@ static struct {
 	const struct plan *plan;
 	unsigned long list;
 	int first, count, pad;
+	float flip;
 } loaded;
 
-static int load_matrices(struct plan *plan, int first, int count, int pad, struct error *err)
+static int load_matrices(struct plan *plan, int first, int count, int pad, bool fdk, struct error *err)
 {
 	cudaStream_t stream = plan->device->stream;
-	float flip = pairs_flipped(plan) ? (float)(plan->stack.rows - 1) : -1.0f;
+	/* Pairs stand upside down where rows run down. */
+	bool flipped = back_by_pairs(plan, fdk) && plan->shape.rows_down;
+	float flip = flipped ? (float)(plan->stack.rows - 1) : -1.0f;
 
 	if (loaded.plan == plan && loaded.list == plan->views_list && loaded.first == first && loaded.count == count &&
-	    loaded.pad == pad)
+	    loaded.pad == pad && loaded.flip == flip)
 		return 0;
 	gather<<<divide_up(count * 12, 256), 256, 0, stream>>>(plan->geometry, plan->views + first, count, (float)pad,
 							       flip, plan->matrices);
@@ -402,12 +405,13 @@ static int load_matrices(struct plan *plan, int first, int count, int pad, struc
 	loaded.first = first;
 	loaded.count = count;
 	loaded.pad = pad;
+	loaded.flip = flip;
 	return 0;
 }
 
 int backproject_prepare(struct plan *plan, int first, int count, struct error *err)
 {
-	return load_matrices(plan, first, count, 0, err);
+	return load_matrices(plan, first, count, 0, false, err);
 }
 
 void backproject_forget(void)
@@ -455,17 +459,6 @@ static int load_array(struct plan *plan, const backprojection_job &job, struct e
 	return 0;
 }
 
-template <comb KIND, int VOXELS, int WINDOWS, bool LEAN>
-static void launch_halves(const backprojection_job &job, dim3 blocks, cudaStream_t stream)
-{
-	dim3 threads(ROWS_WIDE, ROWS_HIGH);
-
-	if (job.use.fdk)
-		backproject_pairs<VOXELS, WINDOWS, KIND, LEAN, true><<<blocks, threads, 0, stream>>>(job);
-	else
-		backproject_pairs<VOXELS, WINDOWS, KIND, LEAN, false><<<blocks, threads, 0, stream>>>(job);
-}
-
 /* In float runs are shorter: a thread needs twice the registers. */
 template <comb KIND, int VOXELS, int WINDOWS, int FLOAT_WINDOWS>
 static void launch_rows(const struct plan_shape *shape, const backprojection_job &job, cudaStream_t stream)
@@ -476,10 +469,12 @@ static void launch_rows(const struct plan_shape *shape, const backprojection_job
 
 	if (!shape->back_pairs)
 		backproject_untilted<VOXELS, FLOAT_WINDOWS, KIND><<<blocks, threads, 0, stream>>>(job);
-	else if (shape->untilted)
-		launch_halves<KIND, VOXELS, WINDOWS, false>(job, blocks, stream);
+	else if (!shape->untilted)
+		backproject_pairs<VOXELS, WINDOWS, KIND, true, true><<<blocks, threads, 0, stream>>>(job);
+	else if (job.use.fdk)
+		backproject_pairs<VOXELS, WINDOWS, KIND, false, true><<<blocks, threads, 0, stream>>>(job);
 	else
-		launch_halves<KIND, VOXELS, WINDOWS, true>(job, blocks, stream);
+		backproject_pairs<VOXELS, WINDOWS, KIND, false, false><<<blocks, threads, 0, stream>>>(job);
 }
 
 template <int VOXELS, int SAMPLING>
@@ -554,10 +549,10 @@ static int launch(struct plan *plan, backprojection_job &job, struct error *err)
 {
 	cudaStream_t stream = plan->device->stream;
 
-	if (plan->shape.back_voxels > 0) {
+	if (back_by_pairs(plan, job.use.fdk)) {
 		TRY(layout_pairs(plan, shape_for(plan, job.use), job.from, job.views, err));
 		launch_pairs(&plan->shape, job, stream);
-	} else if (plan->shape.textures) {
+	} else if (array_for(plan, job.use)->array != NULL) {
 		if (!job.use.laid_out)
 			TRY(load_array(plan, job, err));
 		if (job.use.coverage != NULL) {
@@ -590,7 +585,10 @@ int backproject_views(struct plan *plan, const float *from, int first, int count
 {
 	const struct stack_shape *shape = shape_for(plan, use);
 	bool padded = shape->columns > plan->stack.columns;
-	int most = padded ? plan->shape.batch : plan->shape.views_at_once, pad = padded ? plan->options.pad[0] : 0;
+	int most = padded                         ? plan->shape.batch
+		   : back_by_pairs(plan, use.fdk) ? plan->shape.pairs_at_once
+						  : plan->shape.views_at_once;
+	int pad = padded ? plan->options.pad[0] : 0;
 	/* An update takes the whole sum: all parts but the last are summed aside. */
 	bool parts = use.update && count > most;
 	struct voxel_use sum = use;
@@ -607,7 +605,7 @@ int backproject_views(struct plan *plan, const float *from, int first, int count
 
 		job.from = from + (size_t)done * shape->slot;
 		job.views = count - done < most ? count - done : most;
-		TRY(load_matrices(plan, first + done, job.views, pad, err));
+		TRY(load_matrices(plan, first + done, job.views, pad, use.fdk, err));
 		TRY(launch(plan, job, err));
 	}
 	return parts ? update_volume(plan, use, volume, err) : 0;
@@ -623,7 +621,7 @@ int coverage_sum(struct plan *plan, int first, int count, struct error *err)
 		dim3 blocks(divide_up(job.nx, 32), divide_up(job.ny, 8), job.nz);
 
 		job.views = count - done < VIEWS_AT_ONCE ? count - done : VIEWS_AT_ONCE;
-		TRY(load_matrices(plan, first + done, job.views, 0, err));
+		TRY(load_matrices(plan, first + done, job.views, 0, false, err));
 		if (plan->ones != NULL) {
 			job.shape = pairs_shape_make(plan->stack.columns, plan->stack.rows);
 			job.pairs = (const __half2 *)plan->ones + job.shape.before;

@@ -238,6 +238,7 @@ struct plan_shape {
 	int correction;      /* slots of the correction stack, 0 without SART */
 	bool parts;          /* it holds a part of a subset only */
 	int views_at_once;   /* that one launch of the backprojection takes; layers of the projection array */
+	int pairs_at_once;   /* that there is room for as pairs */
 	bool by_view;        /* SART goes view by view: over a z-fastest copy, */
 	bool by_rows;        /* or by rows over copies in half precision */
 	bool by_subset;      /* SART has updates of several views */
@@ -320,10 +321,13 @@ struct shadow shadow_of(const struct geometry *geometry, const struct grid *grid
 
 /* ---- layout.cu ---- */
 int layout_slices(struct plan *plan, const float *volume, struct error *err); /* -> scratch */
-/* Pairs stand upside down where rows run down: their kernel wants rows that count with z. */
-static inline bool pairs_flipped(const struct plan *plan)
+/*
+ * Rows that lean are backprojected by rows for FDK only: at the detector's edges a voxel's line meets other pixels than
+ * the voxel does, which SART's division by column sums would show.
+ */
+static inline bool back_by_pairs(const struct plan *plan, bool fdk)
 {
-	return plan->shape.back_voxels > 0 && plan->shape.rows_down;
+	return plan->shape.back_voxels > 0 && (fdk || plan->shape.untilted);
 }
 /*
  * What pairs in half precision are multiplied by, by the largest magnitude of all, as bits. Nearly always it is

@@ -315,7 +315,7 @@ static int launch_pairs(struct plan *plan, const struct stack_shape *shape, cons
 		    (unsigned)(pairs.slot / (size_t)pairs.panel), count),
 	    threads(PANEL, PAIRS_HIGH);
 	cudaStream_t stream = plan->device->stream;
-	bool flipped = pairs_flipped(plan);
+	bool flipped = plan->shape.rows_down; /* the kernel wants rows that count with z */
 
 	if (!plan->shape.back_pairs) {
 		to_pairs<float2, false>

@@ -303,12 +303,16 @@ static struct plan_shape shape_of(const struct plan_options *options, bool lean)
 
 static bool needs_arrays_back(const struct plan *plan)
 {
-	return plan->shape.textures && plan->shape.back_voxels == 0;
+	const struct plan_options *options = &plan->options;
+	/* Of rows that lean FDK needs none. */
+	bool sums = plan->shape.correction > 0 || (options->sart == NULL && options->column_weights == NULL);
+
+	return plan->shape.textures && !back_by_pairs(plan, false) && (plan->shape.back_voxels == 0 || sums);
 }
 /* Textures hold zeros beyond an array's sides: one cannot serve stacks of two widths. */
 static bool needs_filtered_array(const struct plan *plan)
 {
-	return needs_arrays_back(plan) && plan->filtered.columns > plan->stack.columns;
+	return needs_arrays_back(plan) && plan->shape.back_voxels == 0 && plan->filtered.columns > plan->stack.columns;
 }
 static size_t pairs_bytes(const struct plan *plan, int views)
 {
@@ -322,7 +326,7 @@ static size_t ones_bytes(const struct plan *plan)
 {
 	struct pairs_shape pairs = pairs_shape_make(plan->stack.columns, plan->stack.rows);
 
-	if (plan->shape.back_voxels == 0 || !plan->shape.back_pairs || plan->options.matched)
+	if (!back_by_pairs(plan, false) || !plan->shape.back_pairs || plan->options.matched)
 		return 0;
 	return (pairs.slot + 2 * pairs.before) * sizeof(float);
 }
@@ -372,6 +376,8 @@ static void plan_describe(struct plan *plan, const struct plan_options *options,
 		plan->partial_count = subsets_partials(plan);
 	if (plan->shape.back_voxels > 0 || needs_arrays_back(plan))
 		plan->shape.views_at_once = views_laid_out(plan);
+	plan->shape.pairs_at_once = back_by_pairs(plan, false) ? plan->shape.views_at_once
+							       : at_most(plan->shape.batch, plan->shape.views_at_once);
 	plan->raw_views = 1;
 	plan->bytes.raw =
 	    (size_t)geometry->columns * (size_t)geometry->rows * (options->linearise.sample == SAMPLE_UINT16 ? 2 : 4);
@@ -414,7 +420,7 @@ static struct plan_bytes bytes_of(const struct plan_options *options, bool lean)
 		bytes.scratch += (size_t)plan.filtered.columns * (size_t)plan.filtered.rows * (size_t)plan.shape.batch *
 				 sizeof(float);
 	if (plan.shape.back_voxels > 0)
-		bytes.scratch += pairs_bytes(&plan, views_laid_out(&plan)) + 2 * sizeof(*plan.most);
+		bytes.scratch += pairs_bytes(&plan, plan.shape.pairs_at_once) + 2 * sizeof(*plan.most);
 	if (needs_coverage(&plan))
 		bytes.scratch += voxels + ones_bytes(&plan);
 	if (needs_work(&plan))
@@ -626,7 +632,7 @@ static int prepare_sart(struct plan *plan, struct error *err)
 static int prepare_arrays(struct plan *plan, struct error *err)
 {
 	if (plan->shape.back_voxels > 0) {
-		plan->pairs_bytes = pairs_bytes(plan, plan->shape.views_at_once);
+		plan->pairs_bytes = pairs_bytes(plan, plan->shape.pairs_at_once);
 		TRY(device_allocate(plan->device, plan->pairs_bytes, &plan->pairs, err));
 		TRY(device_allocate(plan->device, 2 * sizeof(*plan->most), (void **)&plan->most, err));
 	}
@@ -672,7 +678,7 @@ static const char *const comb_names[] = {"", ", two a row", ", wide", ", narrow"
 static void summarise(struct plan *plan)
 {
 	const struct plan_shape *shape = &plan->shape;
-	char forward[64] = "general", back[64] = "general";
+	char forward[64] = "general", back[80] = "general";
 
 	if (shape->forward_rows > 0)
 		snprintf(forward, sizeof(forward), "%s, %d rows a thread%s",
@@ -681,8 +687,9 @@ static void summarise(struct plan *plan)
 	if (plan->options.matched)
 		snprintf(back, sizeof(back), "matched");
 	else if (shape->back_voxels > 0)
-		snprintf(back, sizeof(back), "%s, %d voxels a window%s", shape->untilted ? "untilted" : "near untilted",
-			 shape->back_voxels, comb_names[shape->back_comb]);
+		snprintf(back, sizeof(back), "%s, %d voxels a window%s",
+			 shape->untilted ? "untilted" : "general, FDK's near untilted", shape->back_voxels,
+			 comb_names[shape->back_comb]);
 	snprintf(plan->summary, sizeof(plan->summary), "%sforward %s; back %s; %s; %s", shape->lean ? "lean; " : "",
 		 forward, back, shape->textures ? "texture sampling" : "float32 sampling",
 		 shape->filter_length > 0 ? "fused filter"
