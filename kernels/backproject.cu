@@ -12,7 +12,7 @@
  * By rows, untilted: a voxel column along z has one detector column u, one depth and
  * an even spacing of rows in each view. Its voxels are the neighbours of combs (comb.cuh): the
  * few rows that a comb takes are interpolated across once. In standard precision this goes in half
- * precision, and for rows that lean a little as well.
+ * precision, and FDK's for rows that lean a little as well.
  *
  * Small problems: a voxel a thread, its views cut into parts for several warps.
  *

@@ -224,7 +224,7 @@ struct plan_shape {
 	bool rows_down;   /* untilted, and rows count against z */
 	int forward_rows; /* rows of one thread in the forward projection by rows; 0: the general one */
 	enum comb forward_comb;
-	int view_rows;   /* the same, where SART goes view by view */
+	int view_rows;   /* forward_rows where SART goes view by view: fewer where it sees little of the grid */
 	bool rows_apart; /* they share columns, but no values */
 	bool halves;     /* the forward projection reads pairs in half precision */
 	int back_voxels; /* voxels of one window in the untilted backprojection; 0: the general one */
