@@ -642,20 +642,24 @@ const cJSON *json_member(struct json_reader *reader, const char *name, bool requ
 	const cJSON *member;
 	int index = 0;
 
-	if (reader->code != 0)
+	if (reader->code != 0 && reader->needed == NULL)
 		return NULL;
 	cJSON_ArrayForEach(member, reader->object)
 	{
 		if (strcmp(member->string, name) == 0) {
 			reader->seen |= 1ull << index;
-			if (!cJSON_IsNull(member))
-				return member;
 			break;
 		}
 		index++;
 	}
-	if (required)
+	if (reader->code != 0)
+		return NULL;
+	if (member != NULL && !cJSON_IsNull(member))
+		return member;
+	if (required) {
 		json_fail(reader, ERR_INVALID, name, member == NULL ? "missing" : "null, but a value is needed");
+		reader->needed = name;
+	}
 	return NULL;
 }
 
@@ -809,7 +813,7 @@ int json_end(struct json_reader *reader)
 	const cJSON *member;
 	int index = 0;
 
-	if (reader->code != 0)
+	if (reader->code != 0 && reader->needed == NULL)
 		return reader->code;
 	cJSON_ArrayForEach(member, reader->object)
 	{
@@ -819,12 +823,17 @@ int json_end(struct json_reader *reader)
 			memset(pointer, 0, sizeof(pointer));
 			memcpy(pointer, reader->base, sizeof(reader->base));
 			pointer_append(pointer, member->string, strlen(member->string));
-			reader->code = error_set_at(reader->err, ERR_INVALID, pointer, "a member that nobody knows");
-			return reader->code;
+			if (reader->needed != NULL)
+				error_set_at(reader->err, ERR_INVALID, pointer,
+					     "a member that nobody knows, while %s is needed", reader->needed);
+			else
+				error_set_at(reader->err, ERR_INVALID, pointer, "a member that nobody knows");
+			reader->code = ERR_INVALID;
+			break;
 		}
 		index++;
 	}
-	return 0;
+	return reader->code;
 }
 
 cJSON *json_runs(const unsigned char *flags, int count, bool value)

@@ -45,13 +45,18 @@ void number_print(double number, char ret_text[NUMBER_TEXT_MAX]);
  * output as it is (ERR_INVALID when required). A wrong type, an unknown name or
  * choice is ERR_INVALID, a number out of its range ERR_IMPOSSIBLE. Each error
  * carries base + "/" + name as its pointer.
+ *
+ * A required member that is not there may stand under a misspelt name: then
+ * json_end refuses that one. So all members must be asked for, whatever is
+ * missing.
  */
 struct json_reader {
 	const cJSON *object;
 	char base[160];
 	unsigned long long seen; /* bit i: the i-th member was asked for (objects of at most 64 members) */
 	struct error *err;
-	int code; /* first error; every later call does nothing, so that one check at the end is enough */
+	const char *needed; /* the member whose absence was the first error; NULL */
+	int code; /* first error; later calls only note what they ask for, so that one check at the end is enough */
 };
 
 void json_begin(struct json_reader *reader, const cJSON *value, const char *base, struct error *err);
@@ -71,7 +76,8 @@ void json_numbers(struct json_reader *reader, const char *name, bool required, i
 /* The same for an array that is no member of an object, e.g. one of a list; `pointer` is its own. */
 int json_array(const cJSON *array, const char *pointer, int count, double least, double most, double *ret,
 	       struct error *err);
-int json_end(struct json_reader *reader); /* refuses members that nobody asked for; returns the first error's code */
+/* Refuses members that nobody asked for, even where a required one is missing; returns the error's code. */
+int json_end(struct json_reader *reader);
 
 /*
  * Fails the reader at member `name` ("" for the object itself, "size/0" for a

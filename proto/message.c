@@ -438,8 +438,10 @@ static int message_read(const cJSON *value, struct message *ret_message, struct 
 		names[i] = kinds[i].name;
 	json_begin(&reader, value, "", err);
 	json_choice(&reader, "kind", true, names, MESSAGE_KIND_COUNT, &kind);
+	if (reader.code != 0)
+		return reader.code; /* which other members there may be is not known */
 	ret_message->kind = (enum message_kind)kind;
-	for (const struct field *field = kinds[kind].fields; field->name != NULL && reader.code == 0; field++)
+	for (const struct field *field = kinds[kind].fields; field->name != NULL; field++)
 		read_field(&reader, field, ret_message);
 	return json_end(&reader);
 }

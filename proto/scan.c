@@ -291,7 +291,18 @@ static int read_geometry(struct scan *scan, const cJSON *geometry, struct error 
 		names[i] = kinds[i].name;
 	json_begin(&reader, geometry, "/geometry", err);
 	json_choice(&reader, "kind", true, names, KIND_COUNT, &kind);
-	return reader.code != 0 ? reader.code : kinds[kind].read(scan, &reader);
+	if (reader.code == 0)
+		return kinds[kind].read(scan, &reader);
+	/* Without its kind, what any kind asks for is known. */
+	for (int i = 0; i < KIND_COUNT; i++) {
+		struct json_reader any = reader;
+		struct error ignored;
+
+		any.err = &ignored;
+		kinds[i].read(scan, &any);
+		reader.seen |= any.seen;
+	}
+	return json_end(&reader);
 }
 
 /* A member that is null says no more than one that is absent. */

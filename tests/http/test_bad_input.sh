@@ -29,6 +29,11 @@ test_scans() {
 	done <<'TABLE'
 400|/detector|del(.detector)
 400|/geometry|del(.geometry)
+400|/geometri|.geometri = .geometry | del(.geometry)
+400|/detector/colums|.detector.colums = .detector.columns | del(.detector.columns)
+400|/projections/samples|.projections.samples = .projections.sample | del(.projections.sample)
+400|/geometry/type|.geometry.type = .geometry.kind | del(.geometry.kind)
+400|/geometry/angle_step|.geometry.angle_step = .geometry.angle_step_deg | del(.geometry.angle_step_deg)
 400|/projections/count|.projections.count = "six"
 422|/projections/count|.projections.count = 0
 422|/projections/count|.projections.count = -3
@@ -50,6 +55,8 @@ test_scans() {
 400|/geometry/matrices|.geometry = {kind: "matrices", matrices: [[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]]}
 422|/geometry/matrices/2|.geometry = {kind: "matrices", matrices: [range(6) | if . == 2 then [1, 2, 3, 4, 2, 4, 6, 8, 0, 0, 1, 5] else [-8, 250, 0, 4800, -6, 0, 250, 3600, -1, 0, 0, 600] end]}
 400|/geometry/matrices/1|.geometry = {kind: "matrices", matrices: [range(6) | if . == 1 then [1, 2, 3] else [-8, 250, 0, 4800, -6, 0, 250, 3600, -1, 0, 0, 600] end]}
+400|/geometry/matrix|.geometry = {kind: "matrices", matrix: []}
+400|/geometry/views/0/source|.geometry = {kind: "views", views: [range(6) | {source: [600, 0, 0]}]}
 422|/geometry/views/4|.geometry = {kind: "views", views: [range(6) | {source_mm: [600, 0, 0], pixel0_mm: [-400, -30, -22], column_step_mm: [0, 4, 0], row_step_mm: (if . == 4 then [0, 8, 0] else [0, 0, 4] end)}]}
 TABLE
 }
@@ -135,6 +142,8 @@ test_jobs() {
 		refused_job "$status" "$pointer" "$(jq -c "$filter" <<<"$good_job")"
 	done <<'TABLE'
 400|/scan|del(.scan)
+400|/scans|.scans = .scan | del(.scan)
+400|/grid/spacing|.grid.spacing = .grid.spacing_mm | del(.grid.spacing_mm)
 404|/scan|.scan = "nowhere"
 400|/colour|.colour = 1
 400|/fdk/colour|.fdk.colour = 1

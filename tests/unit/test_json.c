@@ -371,7 +371,13 @@ static const struct {
     {"7", ERR_INVALID, "/base", "a number"},
     {"{}", ERR_INVALID, "/base/number", "missing"},
     {"{\"number\":null}", ERR_INVALID, "/base/number", "null"},
-    {"{\"Number\":0}", ERR_INVALID, "/base/number", "missing"}, /* names differ by case */
+    /* what may be the required one misspelt */
+    {"{\"nunber\":0}", ERR_INVALID, "/base/nunber", "a member that nobody knows, while number is needed"},
+    {"{\"Number\":0}", ERR_INVALID, "/base/Number", "number is needed"}, /* names differ by case */
+    {"{\"number\":null,\"colour\":1}", ERR_INVALID, "/base/colour", "number is needed"},
+    {"{\"pair\":1,\"choice\":2,\"colour\":1}", ERR_INVALID, "/base/colour", "number is needed"},
+    {"{\"pair\":1,\"choice\":2}", ERR_INVALID, "/base/number", "missing"},
+    {"{\"number\":\"0\",\"colour\":1}", ERR_INVALID, "/base/number", "a string"},
     {"{\"number\":\"0\"}", ERR_INVALID, "/base/number", "a string, a number is expected"},
     {"{\"number\":1.5}", ERR_IMPOSSIBLE, "/base/number", "1.5, a number from -1 to 1"},
     {"{\"number\":0,\"pair\":1}", ERR_INVALID, "/base/pair", "array of 2"},

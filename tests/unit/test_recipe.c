@@ -216,6 +216,7 @@ static const struct {
 } refused[] = {
     {"[]", ERR_INVALID, "", "an object is expected"},
     {"{}", ERR_INVALID, "/scan", "missing"},
+    {"{\"scna\":\"a\",\"fdk\":{}}", ERR_INVALID, "/scna", "scan is needed"},
     {"{\"scan\":5,\"fdk\":{}}", ERR_INVALID, "/scan", "a string"},
     {"{\"scan\":\"a\"}", ERR_IMPOSSIBLE, "", "nothing to run"},
     {"{\"scan\":\"a\",\"tv\":{}}", ERR_IMPOSSIBLE, "", "nothing to run"},
@@ -231,6 +232,8 @@ static const struct {
     {"{\"scan\":\"a\",\"fdk\":{\"Window\":\"hann\"}}", ERR_INVALID, "/fdk/Window", "nobody knows"},
     {"{\"scan\":\"a\",\"fdk\":{},\"grid\":{}}", ERR_INVALID, "/grid/size", "missing"},
     {"{\"scan\":\"a\",\"fdk\":{},\"grid\":{\"size\":[8,8,8]}}", ERR_INVALID, "/grid/spacing_mm", "missing"},
+    {"{\"scan\":\"a\",\"fdk\":{},\"grid\":{\"size\":[8,8,8],\"spacing\":[1,1,1],\"origin_mm\":[0,0,0]}}", ERR_INVALID,
+     "/grid/spacing", "spacing_mm is needed"},
     {"{\"scan\":\"a\",\"fdk\":{},\"grid\":{\"size\":8,\"spacing_mm\":[1,1,1]}}", ERR_INVALID, "/grid/size", "array"},
     {"{\"scan\":\"a\",\"fdk\":{},\"grid\":{\"size\":[8,8],\"spacing_mm\":[1,1,1]}}", ERR_INVALID, "/grid/size",
      "2 numbers, 3"},
