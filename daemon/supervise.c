@@ -90,6 +90,7 @@ struct worker {
 	struct history_row rows[JOB_ROWS_MAX];
 	int row_count;
 	bool cancelling, yielding;
+	double room_since; /* monotonic: it was told to make room for projections that came later; NEVER */
 	/* While its job waits for the rest of its projections: the scan, a reference; NULL otherwise. */
 	struct stored_scan *arriving;
 	unsigned basis;         /* of the scan when it began */
@@ -694,6 +695,7 @@ static void begin(struct supervise *supervise, struct worker *worker, struct job
 	worker->checkpoint = record->checkpoint;
 	worker->unsettled = 0;
 	worker->cancelling = worker->yielding = false;
+	worker->room_since = NEVER;
 	worker->failure_code = 0;
 	worker->told = worker->taken = 0;
 	worker->again = 0;
@@ -781,14 +783,19 @@ static int give_job(struct supervise *supervise, struct worker *worker, struct j
 	return code == ERR_CONFLICT ? 0 : code; /* cancelled in this very moment */
 }
 
-/* The queue's first, or a waiting job: before it when its projections come just now and it has the higher priority. */
-static struct job *choose_job(struct supervise *supervise, bool *ret_arriving)
+/*
+ * The queue's first, or a waiting job: before it when it has the higher priority and its projections come just now, or
+ * came when the worker was told to make room for them: an iteration and a checkpoint may take longer than patience.
+ */
+static struct job *choose_job(struct supervise *supervise, const struct worker *worker, bool *ret_arriving)
 {
+	double since = now_monotonic() - PATIENCE;
 	struct job *queued = jobs_next(supervise->jobs), *waiting, *chosen;
 	struct job_facts a, b;
 	bool now;
 
-	waiting = jobs_arriving(supervise->jobs, now_monotonic() - PATIENCE, &now);
+	since = worker->room_since < since ? worker->room_since : since;
+	waiting = jobs_arriving(supervise->jobs, since, &now);
 	chosen = queued != NULL ? queued : waiting;
 	if (queued != NULL && waiting != NULL && now) {
 		job_facts(queued, &a);
@@ -811,7 +818,7 @@ static void dispatch(struct supervise *supervise)
 		bool arriving = false;
 
 		if (worker->state == WORKER_IDLE && worker->job == NULL)
-			job = choose_job(supervise, &arriving);
+			job = choose_job(supervise, worker, &arriving);
 		if (job == NULL) {
 			i++;
 			continue;
@@ -877,9 +884,9 @@ static void preempt(struct supervise *supervise)
 {
 	struct queue_running running[WORKERS_MAX];
 	int of[WORKERS_MAX], busy, idle, victim;
-	double now = now_monotonic();
+	double now = now_monotonic(), since = arrivals_since(supervise, now);
 	bool arriving;
-	struct job *waiting = jobs_arriving(supervise->jobs, arrivals_since(supervise, now), &arriving);
+	struct job *waiting = jobs_arriving(supervise->jobs, since, &arriving);
 	struct job_facts facts = {.priority = PRIORITY_ROUTINE};
 
 	if (waiting != NULL)
@@ -903,6 +910,7 @@ static void preempt(struct supervise *supervise)
 		if (victim >= 0) {
 			tell(&supervise->workers[of[victim]], MESSAGE_YIELD);
 			supervise->workers[of[victim]].yielding = true;
+			supervise->workers[of[victim]].room_since = arriving ? since : NEVER;
 		}
 	} while (victim >= 0);
 }
@@ -1134,8 +1142,8 @@ int supervise_start(struct jobs *jobs, const struct supervise_options *options, 
 		return err->code;
 	}
 	for (int i = 0; i < supervise->count; i++) {
-		supervise->workers[i] =
-		    (struct worker){.index = i, .child = {.pidfd = -1, .socket = -1}, .deadline = NEVER};
+		supervise->workers[i] = (struct worker){
+		    .index = i, .child = {.pidfd = -1, .socket = -1}, .deadline = NEVER, .room_since = NEVER};
 		supervise->facts[i].index = i;
 	}
 	pthread_mutex_init(&supervise->lock, NULL);

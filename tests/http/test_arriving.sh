@@ -198,6 +198,30 @@ test_an_urgent_scan_that_comes_in_takes_the_worker() {
 	expect_json '.state == "cancelled"'
 }
 
+test_an_urgent_scan_has_the_worker_that_was_long_in_making_room() {
+	rm -rf "$state"
+	local hold=$work/hold running
+	CBCT_TEST_HOLD=$hold start_daemon --worker "$BUILD/cbct-worker-held"
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "$long"
+	running=$job
+	state_becomes running
+	post_scan "$scan_dir"
+	post_job "${fdk%\}}, \"priority\": \"urgent\"}"
+	# its checkpoint takes longer than anybody is patient with a scan that sends nothing
+	: >"$hold"
+	send "$scan_dir" 0 9
+	sleep 3
+	rm "$hold"
+	reconstructed 10 20
+	send "$scan_dir" 10 59
+	wait_job succeeded
+	job=$running
+	req DELETE "/v1/jobs/$job?wait=30"
+	expect_json '.state == "cancelled"'
+}
+
 test_cancel_and_delete_while_it_waits() {
 	fresh_daemon
 	local worker
