@@ -504,7 +504,7 @@ static backprojection_job job_make(const struct plan *plan, float *volume, struc
 	job.shape = pairs_shape_make(shape->columns, shape->rows);
 	job.pairs =
 	    (const char *)plan->pairs + job.shape.before * (plan->shape.back_pairs ? sizeof(__half2) : sizeof(float2));
-	job.most = plan->most;
+	job.most = plan->most + MOST_PAIRS;
 	job.columns = (float)shape->columns;
 	job.rows = (float)shape->rows;
 	job.nx = plan->grid.size[0];
@@ -626,7 +626,7 @@ int coverage_sum(struct plan *plan, int first, int count, struct error *err)
 			job.shape = pairs_shape_make(plan->stack.columns, plan->stack.rows);
 			job.pairs = (const __half2 *)plan->ones + job.shape.before;
 			job.shape.slot = 0;
-			job.most = plan->most + 1;
+			job.most = plan->most + MOST_ONES;
 			launch_pairs(&plan->shape, job, stream);
 		} else {
 			sum_coverage<<<blocks, dim3(32, 8), 0, stream>>>(job);

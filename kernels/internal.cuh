@@ -248,6 +248,9 @@ struct plan_shape {
 	int extended_length; /* of cuFFT for rows that are extended, 0: none are */
 };
 
+/* What has a scale in half precision: projections as pairs, those of ones, the volume. */
+enum { MOST_PAIRS, MOST_ONES, MOST_VOLUME, MOST_COUNT };
+
 struct fft;   /* filter.cu: cuFFT's plans */
 struct edges; /* what it finds at the edges of rows */
 
@@ -278,7 +281,7 @@ struct plan {
 	void *pairs;                   /* a batch of projections as pairs of float or half, for the rows */
 	size_t pairs_bytes;
 	void *ones;      /* a projection of ones, where column sums are made of it */
-	unsigned *most;  /* the largest of them, as bits: their scale; behind it that of the ones */
+	unsigned *most;  /* [MOST_COUNT]: the largest magnitudes, as bits, of what is kept in half precision */
 	float *coverage; /* [z][y][x], sum_S w_ij of subset `coverage_subset`, where not all is covered */
 	int coverage_subset;
 	float *work; /* [z][y][x], where an update takes more views than one launch */
@@ -320,7 +323,10 @@ int plan_check_views(const struct plan *plan, const int *views, int count, const
 struct shadow shadow_of(const struct geometry *geometry, const struct grid *grid, int index);
 
 /* ---- layout.cu ---- */
-int layout_slices(struct plan *plan, const float *volume, struct error *err); /* -> scratch */
+/* The scale of the volume in half precision; `projections`: it is going to be what these are of, or NULL. */
+int layout_scale(struct plan *plan, const float *volume, const float *projections, struct error *err);
+/* -> scratch; in half precision by the scale found last */
+int layout_slices(struct plan *plan, const float *volume, struct error *err);
 /*
  * Rows that lean are backprojected by rows for FDK only: at the detector's edges a voxel's line meets other pixels than
  * the voxel does, which SART's division by column sums would show.
@@ -330,18 +336,28 @@ static inline bool back_by_pairs(const struct plan *plan, bool fdk)
 	return plan->shape.back_voxels > 0 && (fdk || plan->shape.untilted);
 }
 /*
- * What pairs in half precision are multiplied by, by the largest magnitude of all, as bits. Nearly always it is
- * the same, which leaves the largest between 2^-10 and 2^12: then the least step is 2^-15 of it, sums of eight
- * stay finite, and nobody has to wait for it. What is not a number stays none.
+ * What is multiplied by this before it is kept in half precision, a power of two, by the largest magnitude of all, as
+ * bits. Nearly always, from 2^least to 2^most, it is the same; else the largest becomes 2^target at least and half of
+ * what comes after at most. What is not a number stays none.
  */
-static const float PAIRS_SCALE = 64.0f;
+static const float HALF_SCALE = 64.0f;
+static __device__ __forceinline__ float half_scale(unsigned magnitude, int least, int most, int target)
+{
+	int exponent = (int)(magnitude >> 23) - 127;
+
+	if ((exponent >= least && exponent < most) || exponent < -110 || exponent > 127)
+		return HALF_SCALE;
+	return __uint_as_float((unsigned)(target - exponent + 127) << 23);
+}
+/* Of projections: the largest is 2^-10 to 2^12, the least step 2^-15 of it; sums of eight stay finite. */
 static __device__ __forceinline__ float pairs_scale(unsigned most)
 {
-	int exponent = (int)(most >> 23) - 127;
-
-	if ((exponent >= -16 && exponent < 6) || exponent < -100 || exponent > 100)
-		return PAIRS_SCALE;
-	return __uint_as_float((unsigned)(11 - exponent + 127) << 23);
+	return half_scale(most, -16, 6, 11);
+}
+/* Of a volume: 2^-6 to 2^9, so that what it is before SART's first update leaves room for what it becomes. */
+static __device__ __forceinline__ float volume_scale(unsigned most)
+{
+	return half_scale(most, -12, 3, 3);
 }
 /* -> pairs; where they are in half precision, also most */
 int layout_pairs(struct plan *plan, const struct stack_shape *shape, const float *from, int count, struct error *err);

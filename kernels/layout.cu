@@ -56,14 +56,70 @@ struct columns_shape columns_shape_make(const int size[3])
 	return shape;
 }
 
+/* The largest magnitude of all goes to `most` as bits, which are in the order of the numbers. */
+static __device__ __forceinline__ void note_most(unsigned *most, float own)
+{
+	for (int step = 16; step > 0; step /= 2)
+		own = fmaxf(own, __shfl_xor_sync(~0u, own, step));
+	/* Few have to queue for it. */
+	if (threadIdx.x % 32 == 0 && __float_as_uint(own) > *(volatile unsigned *)most)
+		atomicMax(most, __float_as_uint(own));
+}
+
+enum { MOST_THREADS = 256, MOST_BLOCKS = 1024 };
+
+/* Of `rows` rows of `width` values, `pitch` apart; magnitudes count `factor` times. */
+static __global__ void __launch_bounds__(MOST_THREADS)
+    find_most(const float *__restrict__ from, size_t width, size_t pitch, int rows, float factor, unsigned *most)
+{
+	float own = 0;
+
+	for (int row = blockIdx.y; row < rows; row += gridDim.y)
+#pragma unroll 4
+		for (size_t i = (size_t)blockIdx.x * MOST_THREADS + threadIdx.x; i < width;
+		     i += (size_t)gridDim.x * MOST_THREADS)
+			own = fmaxf(own, fabsf(from[(size_t)row * pitch + i]));
+	note_most(most, factor * own);
+}
+
+int layout_scale(struct plan *plan, const float *volume, const float *projections, struct error *err)
+{
+	const size_t few = (size_t)1 << 22; /* values of which all are looked at */
+	const struct stack_shape *stack = &plan->stack;
+	const int *size = plan->grid.size;
+	cudaStream_t stream = plan->device->stream;
+	unsigned *most = plan->most + MOST_VOLUME;
+	int period = (int)(stack->slot / (size_t)stack->pitch), rows = plan->options.geometry->count * period;
+	int step = (size_t)rows * (size_t)stack->pitch > few ? 17 : 1;
+	float diagonal = 0;
+
+	if (!plan->shape.halves)
+		return 0;
+	CUDA_TRY(cudaMemsetAsync(most, 0, sizeof(*most), stream));
+	find_most<<<MOST_BLOCKS, MOST_THREADS, 0, stream>>>(volume, grid_voxels(plan->options.grid), 0, 1, 1.0f, most);
+	LAUNCHED();
+	if (projections == NULL)
+		return 0;
+	/* What they are on the average of the grid is near enough: some rows will do, other ones in each view. */
+	while (step > 1 && period % step == 0)
+		step += 2;
+	for (int i = 0; i < 3; i++)
+		diagonal = hypotf(diagonal, (float)size[i] * plan->grid.spacing[i]);
+	find_most<<<dim3(1, MOST_BLOCKS), MOST_THREADS, 0, stream>>>(projections, (size_t)stack->columns,
+								     (size_t)stack->pitch * (size_t)step,
+								     divide_up(rows, step), 1.0f / diagonal, most);
+	LAUNCHED();
+	return 0;
+}
+
 /* What is kept of a voxel: itself, or in half precision with the next one along the rows' axis. */
-static __device__ __forceinline__ void make(float &ret, float value, float)
+static __device__ __forceinline__ void make(float &ret, float value, float, float)
 {
 	ret = value;
 }
-static __device__ __forceinline__ void make(__half2 &ret, float value, float next)
+static __device__ __forceinline__ void make(__half2 &ret, float value, float next, float scale)
 {
-	ret = __floats2half2_rn(value, next);
+	ret = __floats2half2_rn(scale * value, scale * next);
 }
 static __device__ __forceinline__ float both_lower(float value)
 {
@@ -137,8 +193,10 @@ struct column {
 /* RUN planes of a tile in x and y; for the slices across x it is turned over in shared memory. */
 template <typename T>
 static __global__ void __launch_bounds__(WIDE *HIGH)
-    to_slices(const float *__restrict__ volume, int nx, int ny, int nz, const slices across_x, const slices across_y)
+    to_slices(const float *__restrict__ volume, int nx, int ny, int nz, const slices across_x, const slices across_y,
+	      const unsigned *most)
 {
+	const float scale = std::is_same<T, __half2>::value ? volume_scale(*most) : 1.0f;
 	__shared__ T turned[RUN][WIDE][HIGH + 1];
 	int x0 = blockIdx.x * WIDE, y0 = blockIdx.y * HIGH, z = blockIdx.z * RUN;
 	int x = x0 + threadIdx.x, y = y0 + threadIdx.y;
@@ -152,7 +210,7 @@ static __global__ void __launch_bounds__(WIDE *HIGH)
 		value[k] = from[(size_t)min(z + k, nz - 1) * ny * nx];
 #pragma unroll
 	for (int k = 0; k < RUN; k++) {
-		make(kept[k], value[k], value[k + 1]);
+		make(kept[k], value[k], value[k + 1], scale);
 		turned[k][threadIdx.x][threadIdx.y] = kept[k];
 	}
 	__syncthreads();
@@ -173,12 +231,13 @@ int layout_slices(struct plan *plan, const float *volume, struct error *err)
 	cudaStream_t stream = plan->device->stream;
 	struct slices x = slices_at(plan->scratch, &plan->along_x);
 	struct slices y = slices_at(plan->scratch + plan->along_x.floats, &plan->along_y);
+	const unsigned *most = plan->most + MOST_VOLUME;
 	dim3 blocks(divide_up(size[0], WIDE), divide_up(size[1], HIGH), divide_up(size[2], RUN)), threads(WIDE, HIGH);
 
 	if (plan->shape.halves)
-		to_slices<__half2><<<blocks, threads, 0, stream>>>(volume, size[0], size[1], size[2], x, y);
+		to_slices<__half2><<<blocks, threads, 0, stream>>>(volume, size[0], size[1], size[2], x, y, most);
 	else
-		to_slices<float><<<blocks, threads, 0, stream>>>(volume, size[0], size[1], size[2], x, y);
+		to_slices<float><<<blocks, threads, 0, stream>>>(volume, size[0], size[1], size[2], x, y, most);
 	LAUNCHED();
 	return 0;
 }
@@ -255,16 +314,6 @@ struct pixels {
 
 enum { PAIRS_ROWS = 8, PAIRS_HIGH = 4 }; /* of a thread; threads below each other */
 
-/* The largest magnitude of all goes to `most` as bits, which are in the order of the numbers. */
-static __device__ __forceinline__ void note_most(unsigned *most, float own)
-{
-	for (int step = 16; step > 0; step /= 2)
-		own = fmaxf(own, __shfl_xor_sync(~0u, own, step));
-	/* Few have to queue for it. */
-	if (threadIdx.x % 32 == 0 && __float_as_uint(own) > *(volatile unsigned *)most)
-		atomicMax(most, __float_as_uint(own));
-}
-
 /*
  * Everything is written, the zeros outside of the detector included. In half precision it is
  * done once more (AGAIN) where what was found shows that the scale does not fit.
@@ -284,9 +333,9 @@ static __global__ void __launch_bounds__(PANEL *PAIRS_HIGH)
 	/* The rows below one panel are those above the next. */
 	bool last = blockIdx.y + 1 == gridDim.y && blockIdx.z + 1 == gridDim.z;
 	int end = shape.rows + (last ? STACK_PAD : 0);
-	float scale = AGAIN ? pairs_scale(*most) : PAIRS_SCALE, value[PAIRS_ROWS + 1], own = 0;
+	float scale = AGAIN ? pairs_scale(*most) : HALF_SCALE, value[PAIRS_ROWS + 1], own = 0;
 
-	if (AGAIN && scale == PAIRS_SCALE)
+	if (AGAIN && scale == HALF_SCALE)
 		return;
 	to += blockIdx.z * pairs.slot + blockIdx.y * (size_t)pairs.panel + (size_t)(row + STACK_PAD) * PANEL +
 	      threadIdx.x;
@@ -334,7 +383,7 @@ static int launch_pairs(struct plan *plan, const struct stack_shape *shape, cons
 
 int layout_pairs(struct plan *plan, const struct stack_shape *shape, const float *from, int count, struct error *err)
 {
-	return launch_pairs(plan, shape, from, count, plan->pairs, plan->most, err);
+	return launch_pairs(plan, shape, from, count, plan->pairs, plan->most + MOST_PAIRS, err);
 }
 
 int layout_ones(struct plan *plan, struct error *err)
@@ -344,5 +393,5 @@ int layout_ones(struct plan *plan, struct error *err)
 
 	CUDA_TRY(cudaMemcpyAsync(plan->matrices, &one, sizeof(one), cudaMemcpyHostToDevice, plan->device->stream));
 	shape.pitch = 0;
-	return launch_pairs(plan, &shape, plan->matrices, 1, plan->ones, plan->most + 1, err);
+	return launch_pairs(plan, &shape, plan->matrices, 1, plan->ones, plan->most + MOST_ONES, err);
 }

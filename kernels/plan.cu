@@ -413,14 +413,14 @@ static struct plan_bytes bytes_of(const struct plan_options *options, bool lean)
 	bytes.raw = plan.bytes.raw * (size_t)plan.raw_views;
 	bytes.scratch = plan.scratch_bytes + views * (sizeof(struct device_view) + 2 * sizeof(int)) +
 			plan.partial_count * sizeof(float2) + reduce_bytes() + VIEWS_AT_ONCE * 12 * sizeof(float) +
-			pixels_of(&plan) * 2 + linearise_counters_bytes();
+			pixels_of(&plan) * 2 + linearise_counters_bytes() + MOST_COUNT * sizeof(*plan.most);
 	if (needs_arrays_back(&plan))
 		bytes.scratch += pixels_of(&plan) * (size_t)views_laid_out(&plan) * sizeof(float);
 	if (needs_filtered_array(&plan))
 		bytes.scratch += (size_t)plan.filtered.columns * (size_t)plan.filtered.rows * (size_t)plan.shape.batch *
 				 sizeof(float);
 	if (plan.shape.back_voxels > 0)
-		bytes.scratch += pairs_bytes(&plan, plan.shape.pairs_at_once) + 2 * sizeof(*plan.most);
+		bytes.scratch += pairs_bytes(&plan, plan.shape.pairs_at_once);
 	if (needs_coverage(&plan))
 		bytes.scratch += voxels + ones_bytes(&plan);
 	if (needs_work(&plan))
@@ -634,7 +634,6 @@ static int prepare_arrays(struct plan *plan, struct error *err)
 	if (plan->shape.back_voxels > 0) {
 		plan->pairs_bytes = pairs_bytes(plan, plan->shape.pairs_at_once);
 		TRY(device_allocate(plan->device, plan->pairs_bytes, &plan->pairs, err));
-		TRY(device_allocate(plan->device, 2 * sizeof(*plan->most), (void **)&plan->most, err));
 	}
 	if (needs_arrays_back(plan)) {
 		TRY(layered_new(plan->device, plan->stack.columns, plan->stack.rows, plan->shape.views_at_once,
@@ -659,6 +658,7 @@ static int plan_prepare(struct plan *plan, struct error *err)
 	TRY(device_allocate(plan->device, count * sizeof(int), (void **)&plan->views, err));
 	TRY(device_allocate(plan->device, count * sizeof(int), (void **)&plan->slots, err));
 	TRY(device_allocate(plan->device, reduce_bytes(), (void **)&plan->reduce, err));
+	TRY(device_allocate(plan->device, MOST_COUNT * sizeof(*plan->most), (void **)&plan->most, err));
 	TRY(device_allocate(plan->device, VIEWS_AT_ONCE * 12 * sizeof(float), (void **)&plan->matrices, err));
 	TRY(device_allocate(plan->device, plan->scratch_bytes, (void **)&plan->scratch, err));
 	/* Samples with weight 0 are read from what no copy has written: it must be a number. */
@@ -752,7 +752,7 @@ void cuda_plan_free(struct plan *plan)
 	layered_free(device, &plan->filtered_array);
 	device_release(device, plan->pairs, plan->pairs_bytes);
 	device_release(device, plan->ones, ones_bytes(plan));
-	device_release(device, plan->most, 2 * sizeof(*plan->most));
+	device_release(device, plan->most, MOST_COUNT * sizeof(*plan->most));
 	device_release(device, plan->counters, linearise_counters_bytes());
 	device_release(device, plan->map, pixels_of(plan));
 	device_release(device, plan->flat, pixels_of(plan) * sizeof(float));

@@ -33,9 +33,17 @@ struct projection {
 	int columns, rows, pitch;
 	size_t slot;
 	bool rows_down;
+	const unsigned *most; /* the volume's, in half precision */
 	struct ray_use use;
 	float *to;
 };
+
+/* What a sum over slices of T is to be multiplied by. */
+template <typename T>
+static __device__ __forceinline__ float unscale(const projection &p)
+{
+	return std::is_same<T, __half2>::value ? 1.0f / volume_scale(*p.most) : 1.0f;
+}
 
 struct place {
 	int slot, tile_column, tile_row;
@@ -154,7 +162,7 @@ static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS, GENE
 		}
 		edge(i, w.end);
 		if (hits) {
-			sum = total;
+			sum = total * unscale<T>(p);
 			slices = s.end - s.begin;
 			step = s.step;
 		}
@@ -447,8 +455,8 @@ static __global__ void __launch_bounds__(32 * ROWS_WARPS * ROWS_VIEWS, 32 / (ROW
 
 			if (hits)
 				row_range<LEAN>(f, k, axes, from, to);
-			float2 square =
-			    finish(p, at.slot, view, column, row, to > from ? sum[k] : 0.0f, to - from, step);
+			float2 square = finish(p, at.slot, view, column, row, to > from ? sum[k] * unscale<T>(p) : 0.0f,
+					       to - from, step);
 			squares.x += square.x;
 			squares.y += square.y;
 		}
@@ -549,6 +557,7 @@ int project_rays(struct plan *plan, const float *volume, int first, int count, s
 	p.pitch = plan->stack.pitch;
 	p.slot = plan->stack.slot;
 	p.rows_down = plan->shape.rows_down;
+	p.most = plan->most + MOST_VOLUME;
 	p.use = use;
 	p.to = to;
 	switch (plan->shape.rows_apart ? 0 : plan->shape.forward_comb * 8 + plan->shape.forward_rows) {
@@ -591,6 +600,7 @@ int cuda_project(struct plan *plan, const struct volume *from, const int *views,
 {
 	TRY(plan_check_views(plan, views, count, &plan->stack, to, count, err));
 	TRY(plan_set_views(plan, views, count, err));
+	TRY(layout_scale(plan, from->data, NULL, err));
 	TRY(project_prepare(plan, from->data, err));
 	return project_rays(plan, from->data, 0, count, {}, to->data, err);
 }

@@ -308,6 +308,7 @@ static int sweep_subsets(struct plan *plan, const float *projections, float *vol
 	const struct subsets *subsets = &plan->options.sart->subsets;
 	size_t blocks = 0;
 
+	TRY(layout_scale(plan, volume, projections, err));
 	for (int i = 0; i < subsets->count; i++) {
 		int count = subsets->start[i + 1] - subsets->start[i];
 

@@ -27,6 +27,7 @@ struct rows_view {
 	__half2 *across[2];    /* pair 0, slice 0, voxel 0 of the copies across x and y */
 	int slice[2], pair[2]; /* from slice to slice, from pair to pair */
 	bool wanted[2];        /* copies that the next view reads */
+	const unsigned *most;  /* the volume's: the copies' scale */
 	bool rows_down;
 	int columns, rows;
 	int first_block;       /* of rows, in a launch */
@@ -145,7 +146,7 @@ static __global__ void __launch_bounds__(32 * PARTS, ROWS > 4 || LEAN ? 3 : 4) p
 
 		for (int j = 0; j < PARTS; j++)
 			sum += sums[j][k][threadIdx.x];
-		residual = measured - sum * step;
+		residual = measured - sum / volume_scale(*s.most) * step;
 		s.correction[(size_t)row * s.correction_pitch + column] =
 		    length >= s.least && length > 0 ? residual / length : 0.0f;
 		squares.x += residual * residual;
@@ -258,7 +259,7 @@ static __global__ void __launch_bounds__(WIDE *HIGH) update_view_rows(const rows
 	bool amid = x0 > 0 && y0 > 0 && z > 0 && x0 + WIDE < nx && y0 + HIGH < ny && z + RUN < nz;
 	bool inside = amid || (x < nx && y < ny);
 	size_t plane = (size_t)nx * ny;
-	float *at = s.volume + ((size_t)z * plane + (size_t)y * nx + x), value[RUN];
+	float *at = s.volume + ((size_t)z * plane + (size_t)y * nx + x), scale = volume_scale(*s.most), value[RUN];
 	__half2 pair[RUN / 2];
 
 #pragma unroll
@@ -294,7 +295,8 @@ static __global__ void __launch_bounds__(WIDE *HIGH) update_view_rows(const rows
 	}
 #pragma unroll
 	for (int j = 0; j < RUN / 2; j++)
-		pair[j] = __floats2half2_rn(value[2 * j], amid || z + 2 * j + 1 < nz ? value[2 * j + 1] : value[2 * j]);
+		pair[j] = __floats2half2_rn(scale * value[2 * j],
+					    scale * (amid || z + 2 * j + 1 < nz ? value[2 * j + 1] : value[2 * j]));
 	if (s.wanted[ACROSS_Y] && inside)
 		put_pairs(s.across[ACROSS_Y], y * s.slice[ACROSS_Y], s.pair[ACROSS_Y], z / 2, nz, x, nx, amid, pair);
 	if (!s.wanted[ACROSS_X])
@@ -494,6 +496,7 @@ int sweep_rows(struct plan *plan, const float *projections, float *volume, float
 		s.pair[axis] = shape.pair;
 		memory += shape.pairs;
 	}
+	s.most = plan->most + MOST_VOLUME;
 	s.rows_down = plan->shape.rows_down;
 	s.columns = plan->stack.columns;
 	s.rows = plan->stack.rows;
@@ -506,6 +509,7 @@ int sweep_rows(struct plan *plan, const float *projections, float *volume, float
 	s.nonnegative = plan->options.sart->nonnegative;
 	s.geometry = plan->geometry;
 	wanted_by(plan, order[0], s.wanted);
+	TRY(layout_scale(plan, volume, projections, err));
 	launch_update<UPDATE_NOT>(plan, s, stream);
 	LAUNCHED();
 	s.measured = projections;

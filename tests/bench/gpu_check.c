@@ -319,8 +319,8 @@ static size_t some_voxel(const struct grid *grid, int index)
 }
 
 /* A^T y to `ret`. */
-static void backproject_matched(struct side *side, const struct scene *scene, const float *y, const int *views,
-				float *ret)
+static void backproject_values(struct side *side, const struct scene *scene, const float *y, const int *views,
+			       float *ret)
 {
 	struct error err = {0};
 
@@ -333,7 +333,7 @@ static void backproject_matched(struct side *side, const struct scene *scene, co
 }
 
 /* A x to `ret`. */
-static void project_matched(struct side *side, const struct scene *scene, const float *x, const int *views, float *ret)
+static void project_values(struct side *side, const struct scene *scene, const float *x, const int *views, float *ret)
 {
 	struct error err = {0};
 
@@ -343,7 +343,7 @@ static void project_matched(struct side *side, const struct scene *scene, const 
 	read_stack(side, scene, ret);
 }
 
-static void iterate_matched(struct side *side, const struct scene *scene, float *ret)
+static void iterate_from_zero(struct side *side, const struct scene *scene, float *ret)
 {
 	struct sart_sums sums;
 	struct error err = {0};
@@ -380,8 +380,8 @@ static void check_matched(const struct scene *scene, struct device *devices[2], 
 		seen[s] = malloc(pixels * sizeof(float));
 		spread[s] = malloc(voxels * sizeof(float));
 		side_open(&sides[s], backends_here[s], devices[s], &options);
-		project_matched(&sides[s], scene, x, views, seen[s]);
-		backproject_matched(&sides[s], scene, y, views, spread[s]);
+		project_values(&sides[s], scene, x, views, seen[s]);
+		backproject_values(&sides[s], scene, y, views, spread[s]);
 	}
 	forward = inner(seen[1], y, pixels);
 	backward = inner(x, spread[1], voxels);
@@ -391,7 +391,7 @@ static void check_matched(const struct scene *scene, struct device *devices[2], 
 	transpose = difference(spread[1], spread[0], voxels);
 	expect(scene, "matched backproject", transpose, REFERENCE);
 	again = malloc(voxels * sizeof(float));
-	backproject_matched(&sides[1], scene, y, views, again);
+	backproject_values(&sides[1], scene, y, views, again);
 	expect(scene, "its bits", memcmp(again, spread[1], voxels * sizeof(float)) != 0, 0);
 	for (size_t i = 0; i < voxels; i++)
 		most = fmax(most, fabs((double)spread[1][i]));
@@ -400,7 +400,7 @@ static void check_matched(const struct scene *scene, struct device *devices[2], 
 
 		memset(again, 0, voxels * sizeof(float));
 		again[at] = 1;
-		project_matched(&sides[1], scene, again, views, seen[1]);
+		project_values(&sides[1], scene, again, views, seen[1]);
 		forward = inner(seen[1], y, pixels);
 		rows = fmax(rows, fabs(forward - (double)spread[1][at]) / fmax(most, 1e-30));
 	}
@@ -409,19 +409,19 @@ static void check_matched(const struct scene *scene, struct device *devices[2], 
 	/* From zero against a projection, so that it does not just fit noise. */
 	for (int i = 0; i < geometry->count; i++)
 		slots[i] = i;
-	project_matched(&sides[0], scene, x, slots, seen[0]);
+	project_values(&sides[0], scene, x, slots, seen[0]);
 	for (int s = 0; s < 2; s++) {
 		struct error err = {0};
 
 		must(sides[s].backend->stack_upload(sides[s].stack, 0, geometry->count, seen[0], &err), &err, "upload");
-		iterate_matched(&sides[s], scene, spread[s]);
+		iterate_from_zero(&sides[s], scene, spread[s]);
 	}
 	iterated = difference(spread[1], spread[0], voxels);
 	/* A single ray goes through centres of voxels: whether its neighbours have 1e-8 of it or nothing is rounding.
 	 */
 	if (geometry->columns * geometry->rows > 1)
 		expect(scene, "matched SART", iterated, 2 * REFERENCE);
-	iterate_matched(&sides[1], scene, again);
+	iterate_from_zero(&sides[1], scene, again);
 	expect(scene, "matched SART's bits", memcmp(again, spread[1], voxels * sizeof(float)) != 0, 0);
 	printf("%-34s matched, %3d subsets: adjoint %.1e, rows %.1e, back %.1e, SART %.1e  [%s]\n", scene->name,
 	       subsets, adjoint, rows, transpose, iterated, backend_cuda.plan_summary(sides[1].plan));
@@ -913,8 +913,8 @@ static void head_recipe(struct recipe *ret, const struct scene *scene, bool refe
 	ret->reference_precision = reference;
 }
 
-/* Projections in any unit: in half precision they are scaled, the sum is not. */
-static void check_scales(struct device *devices[2], enum bend bend)
+/* Values in any unit: in half precision they are scaled, what becomes of them is not. */
+static void check_scales(struct device *devices[2], enum bend bend, int subsets)
 {
 	const struct scene_options at = {.columns = 97,
 					 .rows = 83,
@@ -924,51 +924,60 @@ static void check_scales(struct device *devices[2], enum bend bend)
 					 .size = {61, 61, 61},
 					 .spacing = {1, 1, 1},
 					 .bend = bend};
-	const float scales[] = {1e-30F, 1e-9F, 1e-4F, 1, 1e3F, 1e9F, 1e30F};
+	const float scales[] = {1e-27F, 1e-9F, 1e-4F, 1, 1e3F, 1e9F, 1e30F};
+	const char *const steps[] = {"projection", "backprojection", "SART"};
 	const struct backend *backends_here[2] = {&backend_cpu, &backend_cuda};
+	const size_t pixels = (size_t)at.columns * (size_t)at.rows * (size_t)at.views;
+	struct sart_options sart = {.relaxation = 0.9};
 	struct scene scene;
 	struct plan_options options;
 	struct side sides[2];
-	struct error err = {0};
-	float *values, *got[2];
-	size_t pixels, voxels;
-	int *views;
+	float *projections, *volume, *got[2];
+	size_t voxels, most;
+	int views[30];
 
 	scene_make(&scene, "scales", &at);
-	options = scene_plan(&scene, NULL, 0, NULL, false);
+	options = scene_plan(&scene, &sart, subsets, NULL, false);
 	voxels = grid_voxels(&scene.grid);
-	pixels = (size_t)at.columns * (size_t)at.rows * (size_t)at.views;
-	values = malloc(pixels * sizeof(float));
-	views = all_views(at.views);
+	most = voxels > pixels ? voxels : pixels;
+	projections = malloc(pixels * sizeof(float));
+	volume = malloc(voxels * sizeof(float));
+	for (int i = 0; i < at.views; i++)
+		views[i] = i;
 	for (int s = 0; s < 2; s++) {
-		got[s] = malloc(voxels * sizeof(float));
+		got[s] = malloc(most * sizeof(float));
 		side_open(&sides[s], backends_here[s], devices[s], &options);
 	}
 	for (size_t k = 0; k < sizeof(scales) / sizeof(scales[0]); k++) {
-		char what[64];
+		fill_random(volume, voxels, 1);
+		for (size_t i = 0; i < voxels; i++)
+			volume[i] *= scales[k];
+		project_values(&sides[0], &scene, volume, views, projections);
+		for (int step = 0; step < 3; step++) {
+			const size_t count = step == 0 ? pixels : voxels;
+			char what[64];
 
-		fill_random(values, pixels, 3);
-		for (size_t i = 0; i < pixels; i++)
-			values[i] *= scales[k];
-		for (int s = 0; s < 2; s++) {
-			must(sides[s].backend->stack_upload(sides[s].stack, 0, at.views, values, &err), &err, "upload");
-			must(sides[s].backend->volume_fill(sides[s].volume, 0, &err), &err, "fill");
-			must(sides[s].backend->backproject(sides[s].plan, sides[s].stack, views, at.views,
-							   BACKPROJECT_PLAIN, sides[s].volume, &err),
-			     &err, "backproject");
-			read_volume(&sides[s], &scene, got[s]);
-			for (size_t i = 0; i < voxels; i++)
-				got[s][i] /= scales[k];
+			for (int s = 0; s < 2; s++) {
+				if (step == 0)
+					project_values(&sides[s], &scene, volume, views, got[s]);
+				else if (step == 1)
+					backproject_values(&sides[s], &scene, projections, views, got[s]);
+				else
+					iterate_from_zero(&sides[s], &scene, got[s]); /* the stack holds them still */
+				for (size_t i = 0; i < count; i++)
+					got[s][i] /= scales[k];
+			}
+			snprintf(what, sizeof(what), "%s of 1e%.0f", steps[step], log10((double)scales[k]));
+			expect(&scene, what, difference(got[1], got[0], count), (step == 2 ? 2 : 1) * STANDARD);
 		}
-		snprintf(what, sizeof(what), "backprojection of 1e%.0f", log10((double)scales[k]));
-		expect(&scene, what, difference(got[1], got[0], voxels), STANDARD);
 	}
 	for (int s = 0; s < 2; s++) {
 		side_close(&sides[s]);
 		free(got[s]);
 	}
-	free(values);
-	free(views);
+	subsets_clear(&sart.subsets);
+	free(projections);
+	free(volume);
 	scene_clear(&scene);
 }
 
@@ -1426,8 +1435,10 @@ int main(int argc, char **argv)
 	check_transfers(devices[1]);
 	check_memory(devices[1]);
 	check_limit();
-	check_scales(devices, BEND_NONE);
-	check_scales(devices, BEND_TURNED);
+	for (int subsets = 1; subsets <= 30; subsets += subsets == 1 ? 4 : 25) {
+		check_scales(devices, BEND_NONE, subsets);
+		check_scales(devices, BEND_TURNED, subsets);
+	}
 	check_recon(devices, BEND_NONE, true, false, false, 1e-4);
 	check_recon(devices, BEND_TILTED, true, false, false, 1e-4);
 	for (int bend = 0; bend < BEND_STEEP; bend++)
