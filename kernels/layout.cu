@@ -68,17 +68,26 @@ static __device__ __forceinline__ void note_most(unsigned *most, float own)
 
 enum { MOST_THREADS = 256, MOST_BLOCKS = 1024 };
 
-/* Of `rows` rows of `width` values, `pitch` apart; magnitudes count `factor` times. */
+/* Of `rows` rows of `width` values, `pitch` apart, aligned to four; magnitudes count `factor` times. */
 static __global__ void __launch_bounds__(MOST_THREADS)
     find_most(const float *__restrict__ from, size_t width, size_t pitch, int rows, float factor, unsigned *most)
 {
+	size_t first = (size_t)blockIdx.x * MOST_THREADS + threadIdx.x, step = (size_t)gridDim.x * MOST_THREADS;
 	float own = 0;
 
-	for (int row = blockIdx.y; row < rows; row += gridDim.y)
+	for (int row = blockIdx.y; row < rows; row += gridDim.y) {
+		const float *at = from + (size_t)row * pitch;
+
 #pragma unroll 4
-		for (size_t i = (size_t)blockIdx.x * MOST_THREADS + threadIdx.x; i < width;
-		     i += (size_t)gridDim.x * MOST_THREADS)
-			own = fmaxf(own, fabsf(from[(size_t)row * pitch + i]));
+		for (size_t i = first; i < width / 4; i += step) {
+			float4 four = ((const float4 *)at)[i];
+
+			own =
+			    fmaxf(fmaxf(own, fmaxf(fabsf(four.x), fabsf(four.y))), fmaxf(fabsf(four.z), fabsf(four.w)));
+		}
+		for (size_t i = width / 4 * 4 + first; i < width; i += step)
+			own = fmaxf(own, fabsf(at[i]));
+	}
 	note_most(most, factor * own);
 }
 
@@ -320,37 +329,40 @@ enum { PAIRS_ROWS = 8, PAIRS_HIGH = 4 }; /* of a thread; threads below each othe
  */
 template <typename T, bool AGAIN>
 static __global__ void __launch_bounds__(PANEL *PAIRS_HIGH)
-    to_pairs(const float *__restrict__ from, const stack_shape shape, T *to, const pairs_shape pairs, bool flipped,
-	     unsigned *most)
+    to_pairs(const float *__restrict__ from, const stack_shape shape, int count, T *to, const pairs_shape pairs,
+	     bool flipped, unsigned *most)
 {
 	int row = (int)(blockIdx.x * PAIRS_HIGH + threadIdx.y) * PAIRS_ROWS - STACK_PAD;
-	pixels pixel = {from + blockIdx.z * shape.slot,
-			shape.pitch,
-			shape.columns,
-			shape.rows,
-			(int)(blockIdx.y * PAIRS_STEP + threadIdx.x) - PAIRS_BEFORE,
-			flipped};
-	/* The rows below one panel are those above the next. */
-	bool last = blockIdx.y + 1 == gridDim.y && blockIdx.z + 1 == gridDim.z;
-	int end = shape.rows + (last ? STACK_PAD : 0);
 	float scale = AGAIN ? pairs_scale(*most) : HALF_SCALE, value[PAIRS_ROWS + 1], own = 0;
 
 	if (AGAIN && scale == HALF_SCALE)
 		return;
-	to += blockIdx.z * pairs.slot + blockIdx.y * (size_t)pairs.panel + (size_t)(row + STACK_PAD) * PANEL +
-	      threadIdx.x;
+	to += blockIdx.y * (size_t)pairs.panel + (size_t)(row + STACK_PAD) * PANEL + threadIdx.x;
+	for (int slot = blockIdx.z; slot < count; slot += gridDim.z) {
+		pixels pixel = {from + slot * shape.slot,
+				shape.pitch,
+				shape.columns,
+				shape.rows,
+				(int)(blockIdx.y * PAIRS_STEP + threadIdx.x) - PAIRS_BEFORE,
+				flipped};
+		/* The rows below one panel are those above the next. */
+		bool last = blockIdx.y + 1 == gridDim.y && slot + 1 == count;
+		int end = shape.rows + (last ? STACK_PAD : 0);
+		T *here = to + slot * pairs.slot;
+
 #pragma unroll
-	for (int k = 0; k <= PAIRS_ROWS; k++)
-		value[k] = pixel(row + k, 0);
+		for (int k = 0; k <= PAIRS_ROWS; k++)
+			value[k] = pixel(row + k, 0);
 #pragma unroll
-	for (int k = 0; k < PAIRS_ROWS; k++) {
-		own = fmaxf(own, fabsf(value[k]));
-		if (row + k >= end)
-			continue;
-		if constexpr (std::is_same<T, float2>::value)
-			to[k * PANEL] = make_float2(value[k], pixel(row + k, 1));
-		else
-			to[k * PANEL] = __floats2half2_rn(scale * value[k], scale * value[k + 1]);
+		for (int k = 0; k < PAIRS_ROWS; k++) {
+			own = fmaxf(own, fabsf(value[k]));
+			if (row + k >= end)
+				continue;
+			if constexpr (std::is_same<T, float2>::value)
+				here[k * PANEL] = make_float2(value[k], pixel(row + k, 1));
+			else
+				here[k * PANEL] = __floats2half2_rn(scale * value[k], scale * value[k + 1]);
+		}
 	}
 	if (!AGAIN && most != NULL)
 		note_most(most, own);
@@ -362,20 +374,21 @@ static int launch_pairs(struct plan *plan, const struct stack_shape *shape, cons
 	struct pairs_shape pairs = pairs_shape_make(shape->columns, shape->rows);
 	dim3 blocks(divide_up(shape->rows + 2 * STACK_PAD, PAIRS_ROWS * PAIRS_HIGH),
 		    (unsigned)(pairs.slot / (size_t)pairs.panel), count),
-	    threads(PANEL, PAIRS_HIGH);
+	    few = blocks, threads(PANEL, PAIRS_HIGH);
 	cudaStream_t stream = plan->device->stream;
 	bool flipped = plan->shape.rows_down; /* the kernel wants rows that count with z */
 
 	if (!plan->shape.back_pairs) {
 		to_pairs<float2, false>
-		    <<<blocks, threads, 0, stream>>>(from, *shape, (float2 *)to, pairs, flipped, NULL);
+		    <<<blocks, threads, 0, stream>>>(from, *shape, count, (float2 *)to, pairs, flipped, NULL);
 	} else {
 		CUDA_TRY(cudaMemsetAsync(most, 0, sizeof(*most), stream));
 		to_pairs<__half2, false>
-		    <<<blocks, threads, 0, stream>>>(from, *shape, (__half2 *)to, pairs, flipped, most);
+		    <<<blocks, threads, 0, stream>>>(from, *shape, count, (__half2 *)to, pairs, flipped, most);
 		LAUNCHED();
+		few.z = count < 4 ? count : 4; /* for mostly there is nothing to do */
 		to_pairs<__half2, true>
-		    <<<blocks, threads, 0, stream>>>(from, *shape, (__half2 *)to, pairs, flipped, most);
+		    <<<few, threads, 0, stream>>>(from, *shape, count, (__half2 *)to, pairs, flipped, most);
 	}
 	LAUNCHED();
 	return 0;
