@@ -338,10 +338,10 @@ static __global__ void __launch_bounds__(ROWS_WIDE *ROWS_HIGH, 5) backproject_pa
 			for (int k = 0; !FDK && k < VOXELS; k++)
 				sum[n * VOXELS + k] += single(few[n], k);
 	}
-	float unscale = 1.0f / pairs_scale(*job.most);
+	float factor = unscale(pairs_scale(*job.most));
 #pragma unroll
 	for (int k = 0; k < run; k++)
-		sum[k] *= unscale;
+		sum[k] *= factor;
 	put_voxels<run>(job, x, y, z, sum);
 }
 

@@ -224,7 +224,8 @@ struct plan_shape {
 	bool rows_down;   /* untilted, and rows count against z */
 	int forward_rows; /* rows of one thread in the forward projection by rows; 0: the general one */
 	enum comb forward_comb;
-	int view_rows;   /* forward_rows where SART goes view by view: fewer where it sees little of the grid */
+	int view_warps;  /* of forward_rows by 32 rays that meet the grid: of the view with most */
+	int view_rows;   /* forward_rows where SART goes by copies: fewer where a single view sees little of the grid */
 	bool rows_apart; /* they share columns, but no values */
 	bool halves;     /* the forward projection reads pairs in half precision */
 	int back_voxels; /* voxels of one window in the untilted backprojection; 0: the general one */
@@ -239,9 +240,9 @@ struct plan_shape {
 	bool parts;          /* it holds a part of a subset only */
 	int views_at_once;   /* that one launch of the backprojection takes; layers of the projection array */
 	int pairs_at_once;   /* that there is room for as pairs */
-	bool by_view;        /* SART goes view by view: over a z-fastest copy, */
-	bool by_rows;        /* or by rows over copies in half precision */
+	bool by_view;        /* SART goes view by view */
 	bool by_subset;      /* SART has updates of several views */
+	bool by_copies;      /* it projects from copies in half precision, not from slices or one with z fastest */
 	bool covered;        /* every view sees the whole grid: sum_S w_ij = views of S */
 	int filter_length;   /* of the fused filter, 0 for cuFFT */
 	int fft_length;      /* of cuFFT for all rows */
@@ -272,6 +273,7 @@ struct plan {
 	int *views;                   /* [count], device: the views of the call in hand */
 	int *slots;                   /* [count], device: their slots, for those that need them */
 	struct device_view *geometry; /* [count], device */
+	struct device_view *in_order; /* the same in the order of SART, NULL without */
 
 	/* One block that the stages use in turn: slices of the forward projection, z-fastest copy, TV's copies. */
 	float *scratch;
@@ -348,6 +350,10 @@ static __device__ __forceinline__ float half_scale(unsigned magnitude, int least
 	if ((exponent >= least && exponent < most) || exponent < -110 || exponent > 127)
 		return HALF_SCALE;
 	return __uint_as_float((unsigned)(target - exponent + 127) << 23);
+}
+static __device__ __forceinline__ float unscale(float scale)
+{
+	return __uint_as_float((254u << 23) - __float_as_uint(scale)); /* 1 / scale, a power of two */
 }
 /* Of projections: the largest is 2^-10 to 2^12, the least step 2^-15 of it; sums of eight stay finite. */
 static __device__ __forceinline__ float pairs_scale(unsigned most)
@@ -426,13 +432,17 @@ size_t reduce_bytes(void);
 int reduce_pairs(struct plan *plan, const float2 *partial, size_t count, double *sums, cudaStream_t stream,
 		 struct error *err);
 
-/* ---- sweep.cu: an iteration view by view, by rows; partial sums of each view are left in plan->partial ---- */
-size_t sweep_rows_bytes(const struct plan *plan);
-int sweep_view_rows(const struct plan *plan);        /* what view_rows is to be */
-size_t sweep_rows_partials(const struct plan *plan); /* of a view */
+/* ---- sweep.cu: one or few views an update, by rows, from copies in half precision in scratch ---- */
+size_t copies_bytes(const struct plan *plan);
+size_t copies_partials(const struct plan *plan); /* of a view */
+int copies_lay_out(struct plan *plan, const float *volume, struct error *err);
+/* What project_rays does, with `use.measured`. */
+int copies_project(struct plan *plan, int first, int count, struct ray_use use, float *to, struct error *err);
+int sweep_view_rows(const struct plan *plan); /* what view_rows is to be */
 size_t sweep_correction_bytes(const struct plan *plan);
 int sweep_rows_prepare(struct plan *plan, struct error *err);
 void sweep_rows_release(struct plan *plan);
+/* An iteration view by view; partial sums of each view are left in plan->partial. */
 int sweep_rows(struct plan *plan, const float *projections, float *volume, float least, const struct cancel *cancel,
 	       struct error *err);
 

@@ -16,6 +16,7 @@ enum { SIDE_MOST = 32768 };                       /* its width and height */
 enum { BATCH_LEAN = 16 };                         /* of BATCH_MOST, with little memory */
 static const double SMALL = 1 << 20;              /* voxels times views below which launches take longer than samples */
 static const size_t RAW_BYTES = (size_t)16 << 20; /* of the buffer of raw samples */
+static const int WARPS_ENOUGH = 16384;            /* of rays through the grid, to fill the card without cutting them */
 
 static int at_most(int count, int most)
 {
@@ -257,13 +258,29 @@ static void choose_rows(const struct plan_options *options, struct plan_shape *s
 	shape->back_voxels = comb.count;
 }
 
+/* Of `rows` by 32 rays that meet the grid: of the view with most. */
+static int view_warps(const struct geometry *geometry, const struct grid *grid, int rows)
+{
+	int most = 0;
+
+	for (int k = 0; rows > 0 && k < geometry->count; k++) {
+		struct shadow shadow = shadow_of(geometry, grid, k);
+		int warps = divide_up(shadow.end_column - shadow.first_column, 32) *
+			    divide_up(shadow.end_row - shadow.first_row, rows);
+
+		most = warps > most ? warps : most;
+	}
+	return most;
+}
+
 static struct plan_shape shape_of(const struct plan_options *options, bool lean)
 {
 	const struct geometry *geometry = options->geometry;
 	const struct grid *grid = options->grid;
 	struct plan_shape shape = {};
 	int most = grid->size[0] > grid->size[1] ? grid->size[0] : grid->size[1], subset = 0;
-	bool fits = most <= LAYERS_MOST && grid->size[2] <= SIDE_MOST;
+	bool fits = most <= LAYERS_MOST && grid->size[2] <= SIDE_MOST, few;
+	bool indexed = columns_shape_make(grid->size).floats < (size_t)1 << 31; /* by an int */
 
 	if (options->sart != NULL)
 		subset = largest_subset(&options->sart->subsets);
@@ -276,14 +293,17 @@ static struct plan_shape shape_of(const struct plan_options *options, bool lean)
 		shape.back_voxels = 0;
 	if (shape.is_small || options->matched)
 		shape.forward_rows = 0;
+	shape.view_warps = view_warps(geometry, grid, shape.forward_rows);
 	shape.textures = !lean && !shape.is_small && !options->reference_precision && fits &&
 			 wide_columns(options) <= SIDE_MOST && geometry->rows <= SIDE_MOST;
 	shape.lean = lean;
 	shape.batch = at_most(resident_views(options), lean ? (int)BATCH_LEAN : (int)BATCH_MOST);
-	shape.by_view = subset == 1 && !options->matched && columns_shape_make(grid->size).floats < (size_t)1 << 31;
-	shape.by_rows = shape.by_view && shape.halves && shape.forward_rows > 0 && !shape.rows_apart &&
-			geometry->columns <= SIDE_MOST && geometry->rows <= SIDE_MOST;
+	shape.by_view = subset == 1 && !options->matched && indexed;
 	shape.by_subset = subset > 0 && !shape.by_view;
+	/* Slices that are laid out once an iteration cost little, and their rays less. */
+	few = subset > 0 && options->sart->subsets.count > 1 && (long)shape.view_warps * subset < WARPS_ENOUGH;
+	shape.by_copies = (shape.by_view || few) && indexed && shape.halves && shape.forward_rows > 0 &&
+			  !shape.rows_apart && geometry->columns <= SIDE_MOST && geometry->rows <= SIDE_MOST;
 	shape.correction = shape.by_subset ? (lean ? at_most(subset, BATCH_LEAN) : subset) : 0;
 	shape.parts = shape.correction < (shape.by_subset ? subset : 0);
 	shape.covered = !options->matched && is_covered(geometry, grid);
@@ -364,9 +384,8 @@ static void plan_describe(struct plan *plan, const struct plan_options *options,
 	plan->filtered = stack_shape_make(wide_columns(options), geometry->rows, 1);
 	if (!options->no_projection && !plan->shape.is_small)
 		plan->scratch_bytes = (plan->along_x.floats + plan->along_y.floats) * sizeof(float);
-	if (plan->shape.by_rows)
-		plan->shape.view_rows = sweep_view_rows(plan);
-	if (plan->shape.by_view && sweep_scratch_bytes(plan) > plan->scratch_bytes)
+	plan->shape.view_rows = sweep_view_rows(plan);
+	if ((plan->shape.by_view || plan->shape.by_copies) && sweep_scratch_bytes(plan) > plan->scratch_bytes)
 		plan->scratch_bytes = sweep_scratch_bytes(plan);
 	if (tv_scratch_bytes(options) > plan->scratch_bytes)
 		plan->scratch_bytes = tv_scratch_bytes(options);
@@ -411,7 +430,8 @@ static struct plan_bytes bytes_of(const struct plan_options *options, bool lean)
 	bytes.stack = stack_bytes(geometry->columns, geometry->rows, geometry->count);
 	bytes.volumes = voxels * (options->sart != NULL ? 2 : 1);
 	bytes.raw = plan.bytes.raw * (size_t)plan.raw_views;
-	bytes.scratch = plan.scratch_bytes + views * (sizeof(struct device_view) + 2 * sizeof(int)) +
+	bytes.scratch = plan.scratch_bytes +
+			views * ((options->sart != NULL ? 2 : 1) * sizeof(struct device_view) + 2 * sizeof(int)) +
 			plan.partial_count * sizeof(float2) + reduce_bytes() + VIEWS_AT_ONCE * 12 * sizeof(float) +
 			pixels_of(&plan) * 2 + linearise_counters_bytes() + MOST_COUNT * sizeof(*plan.most);
 	if (needs_arrays_back(&plan))
@@ -425,7 +445,7 @@ static struct plan_bytes bytes_of(const struct plan_options *options, bool lean)
 		bytes.scratch += voxels + ones_bytes(&plan);
 	if (needs_work(&plan))
 		bytes.scratch += voxels;
-	if (plan.shape.by_rows)
+	if (plan.shape.by_view && plan.shape.by_copies)
 		bytes.scratch += sweep_correction_bytes(&plan);
 	else if (plan.shape.by_view)
 		bytes.scratch += stack_bytes(geometry->rows, geometry->columns, 1);
@@ -552,21 +572,22 @@ static struct device_view view_make(const struct plan_options *options, int inde
 	return result;
 }
 
-static int prepare_geometry(struct plan *plan, struct error *err)
+/* In an order of their own, NULL: as they are. */
+static int upload_views(struct plan *plan, const int *order, struct device_view **ret_views, struct error *err)
 {
-	const struct geometry *geometry = plan->options.geometry;
-	size_t bytes = (size_t)geometry->count * sizeof(struct device_view);
+	int count = plan->options.geometry->count;
+	size_t bytes = (size_t)count * sizeof(struct device_view);
 	struct device_view *views = (struct device_view *)malloc(bytes);
 	cudaError_t status;
 	int code;
 
 	if (views == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for %d views", geometry->count);
-	for (int i = 0; i < geometry->count; i++)
-		views[i] = view_make(&plan->options, i);
-	code = device_allocate(plan->device, bytes, (void **)&plan->geometry, err);
+		return error_set(err, ERR_NO_MEMORY, "no memory for %d views", count);
+	for (int i = 0; i < count; i++)
+		views[i] = view_make(&plan->options, order != NULL ? order[i] : i);
+	code = device_allocate(plan->device, bytes, (void **)ret_views, err);
 	if (code == 0) {
-		status = cudaMemcpy(plan->geometry, views, bytes, cudaMemcpyHostToDevice);
+		status = cudaMemcpy(*ret_views, views, bytes, cudaMemcpyHostToDevice);
 		if (status != cudaSuccess)
 			code = cuda_error(err, status, "uploading the geometry");
 	}
@@ -619,7 +640,7 @@ static int prepare_sart(struct plan *plan, struct error *err)
 	}
 	if (needs_work(plan))
 		TRY(device_allocate(plan->device, voxels, (void **)&plan->work, err));
-	if (plan->shape.by_rows)
+	if (plan->shape.by_view && plan->shape.by_copies)
 		return sweep_rows_prepare(plan, err);
 	if (plan->shape.by_view) /* turned: [column][row] */
 		return cuda_stack_new(plan->device, geometry->rows, geometry->columns, 1, &plan->correction, err);
@@ -651,7 +672,9 @@ static int plan_prepare(struct plan *plan, struct error *err)
 	size_t count = (size_t)plan->options.geometry->count;
 
 	TRY(device_enter(plan->device, err));
-	TRY(prepare_geometry(plan, err));
+	TRY(upload_views(plan, NULL, &plan->geometry, err));
+	if (plan->options.sart != NULL)
+		TRY(upload_views(plan, plan->options.sart->subsets.order, &plan->in_order, err));
 	plan->views_host = (int *)malloc(count * sizeof(int));
 	if (plan->views_host == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a plan of %zu views", count);
@@ -739,6 +762,7 @@ void cuda_plan_free(struct plan *plan)
 		cudaEventDestroy(plan->summed);
 	filter_release(plan);
 	device_release(device, plan->geometry, count * sizeof(struct device_view));
+	device_release(device, plan->in_order, count * sizeof(struct device_view));
 	device_release(device, plan->views, count * sizeof(int));
 	device_release(device, plan->slots, count * sizeof(int));
 	device_release(device, plan->reduce, reduce_bytes());
@@ -760,7 +784,7 @@ void cuda_plan_free(struct plan *plan)
 	device_release(device, plan->partial, plan->partial_count * sizeof(float2));
 	device_release(device, plan->coverage, voxels);
 	device_release(device, plan->work, voxels);
-	if (plan->shape.by_rows)
+	if (plan->shape.by_view && plan->shape.by_copies)
 		sweep_rows_release(plan);
 	cuda_stack_free(plan->correction);
 	free(plan->views_host);

@@ -40,9 +40,9 @@ struct projection {
 
 /* What a sum over slices of T is to be multiplied by. */
 template <typename T>
-static __device__ __forceinline__ float unscale(const projection &p)
+static __device__ __forceinline__ float unscale_for(const projection &p)
 {
-	return std::is_same<T, __half2>::value ? 1.0f / volume_scale(*p.most) : 1.0f;
+	return std::is_same<T, __half2>::value ? unscale(volume_scale(*p.most)) : 1.0f;
 }
 
 struct place {
@@ -162,7 +162,7 @@ static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS, GENE
 		}
 		edge(i, w.end);
 		if (hits) {
-			sum = total * unscale<T>(p);
+			sum = total * unscale_for<T>(p);
 			slices = s.end - s.begin;
 			step = s.step;
 		}
@@ -455,8 +455,8 @@ static __global__ void __launch_bounds__(32 * ROWS_WARPS * ROWS_VIEWS, 32 / (ROW
 
 			if (hits)
 				row_range<LEAN>(f, k, axes, from, to);
-			float2 square = finish(p, at.slot, view, column, row, to > from ? sum[k] * unscale<T>(p) : 0.0f,
-					       to - from, step);
+			float2 square = finish(p, at.slot, view, column, row,
+					       to > from ? sum[k] * unscale_for<T>(p) : 0.0f, to - from, step);
 			squares.x += square.x;
 			squares.y += square.y;
 		}

@@ -95,25 +95,20 @@ struct row_ends {
 	}
 };
 /*
- * or in shared memory, those of a block's THREADS side by side. They are looked at on
- * the edges only: where samples come from far, registers do more for those on their way.
+ * or in shared memory, 32 apart. They are looked at on the edges only: where samples
+ * come from far, registers do more for those on their way.
  */
-template <int ROWS, int THREADS>
-struct shared_ends {
-	float begins[ROWS][THREADS], ends[ROWS][THREADS];
-};
-template <int ROWS, int THREADS>
+template <int ROWS>
 struct shared_row_ends {
-	shared_ends<ROWS, THREADS> &all;
-	int thread;
+	float *own; /* of this thread */
 
 	__device__ __forceinline__ float &begin(int k)
 	{
-		return all.begins[k][thread];
+		return own[k * 32];
 	}
 	__device__ __forceinline__ float &end(int k)
 	{
-		return all.ends[k][thread];
+		return own[(ROWS + k) * 32];
 	}
 };
 

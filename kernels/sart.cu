@@ -134,13 +134,13 @@ static dim3 sweep_blocks(const struct plan *plan)
 
 size_t sweep_scratch_bytes(const struct plan *plan)
 {
-	return plan->shape.by_rows ? sweep_rows_bytes(plan) : plan->columns.floats * sizeof(float);
+	return plan->shape.by_copies ? copies_bytes(plan) : plan->columns.floats * sizeof(float);
 }
 
 size_t sweep_partials(const struct plan *plan)
 {
 	dim3 blocks = sweep_blocks(plan);
-	size_t each = plan->shape.by_rows ? sweep_rows_partials(plan) : (size_t)blocks.x * blocks.y;
+	size_t each = plan->shape.by_copies ? copies_partials(plan) : (size_t)blocks.x * blocks.y;
 
 	return each * (size_t)plan->options.geometry->count;
 }
@@ -232,6 +232,24 @@ static int begin_sums(struct plan *plan, struct error *err)
 	return 0;
 }
 
+/* What few views are projected from cannot fill the card by whole rays. */
+static int prepare_subset(struct plan *plan, const float *volume, struct error *err)
+{
+	return plan->shape.by_copies ? copies_lay_out(plan, volume, err) : project_prepare(plan, volume, err);
+}
+static int project_subset(struct plan *plan, const float *volume, int first, int count, struct ray_use use,
+			  struct error *err)
+{
+	if (plan->shape.by_copies)
+		return copies_project(plan, first, count, use, plan->correction->data, err);
+	return project_rays(plan, volume, first, count, use, plan->correction->data, err);
+}
+/* Partial sums that it leaves. */
+static size_t project_partials(const struct plan *plan, int count)
+{
+	return plan->shape.by_copies ? copies_partials(plan) * (size_t)count : project_blocks(plan, count);
+}
+
 /* `last`: all partial sums are there behind its projection. */
 static int update_subset(struct plan *plan, int subset, const float *projections, float *volume, float2 *partial,
 			 bool last, struct error *err)
@@ -247,7 +265,7 @@ static int update_subset(struct plan *plan, int subset, const float *projections
 	voxels.scale = (float)(plan->shape.covered ? sart->relaxation / count : sart->relaxation);
 	voxels.coverage = plan->shape.covered ? NULL : plan->coverage;
 	voxels.least = plan->options.matched ? (float)COLUMN_SUM_LEAST * spacing_least(plan) : 0.0f;
-	TRY(project_prepare(plan, volume, err));
+	TRY(prepare_subset(plan, volume, err));
 	if (!plan->shape.covered && !plan->options.matched && plan->coverage_subset != subset) {
 		TRY(coverage_sum(plan, first, count, err));
 		plan->coverage_subset = sart->subsets.count > 1 ? -1 : subset;
@@ -257,7 +275,7 @@ static int update_subset(struct plan *plan, int subset, const float *projections
 			rays.array = plan->projections.surface;
 			voxels.laid_out = true;
 		}
-		TRY(project_rays(plan, volume, first, count, rays, plan->correction->data, err));
+		TRY(project_subset(plan, volume, first, count, rays, err));
 		if (last)
 			TRY(begin_sums(plan, err));
 		return backproject_views(plan, plan->correction->data, first, count, voxels, volume, err);
@@ -271,8 +289,8 @@ static int update_subset(struct plan *plan, int subset, const float *projections
 	for (int done = 0; done < count; done += plan->shape.correction) {
 		int now = count - done < plan->shape.correction ? count - done : plan->shape.correction;
 
-		TRY(project_rays(plan, volume, first + done, now, rays, plan->correction->data, err));
-		rays.partial += project_blocks(plan, now);
+		TRY(project_subset(plan, volume, first + done, now, rays, err));
+		rays.partial += project_partials(plan, now);
 		if (plan->options.matched)
 			TRY(matched_views(plan, plan->correction->data, first + done, now, sum, plan->work,
 					  plan->coverage, err));
@@ -289,7 +307,7 @@ static size_t subset_blocks(const struct plan *plan, int count)
 {
 	int most = plan->shape.correction;
 
-	return (size_t)(count / most) * project_blocks(plan, most) + project_blocks(plan, count % most);
+	return (size_t)(count / most) * project_partials(plan, most) + project_partials(plan, count % most);
 }
 
 size_t subsets_partials(const struct plan *plan)
@@ -329,7 +347,7 @@ static int sweep(struct plan *plan, const float *projections, float *volume, con
 {
 	if (!plan->shape.by_view)
 		return sweep_subsets(plan, projections, volume, cancel, err);
-	if (plan->shape.by_rows)
+	if (plan->shape.by_copies)
 		TRY(sweep_rows(plan, projections, volume, length_least(plan), cancel, err));
 	else
 		TRY(sweep_views(plan, projections, volume, cancel, err));

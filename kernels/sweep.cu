@@ -1,15 +1,15 @@
 /*
- * SART view by view where the projection goes by rows (rows.cuh). The iterate
+ * SART of one or few views an update where the projection goes by rows (rows.cuh). The iterate
  * stays as it is, [z][y][x]; beside it are two copies in half precision, one as
  * slices across x and one as slices across y, whose rows are pairs of planes:
  * [z / 2][slice][fast], a register holds the voxels 2 k and 2 k + 1 along z.
  *
  * Forward, a warp has 32 columns of the detector and a thread ROWS rays of one,
- * whose way is cut into parts for several warps, since one view cannot fill the
+ * whose way is cut into parts for several warps, since few views cannot fill the
  * card. Pairs begin at even z: where the window of a thread begins at an odd one,
  * they are put together anew after they were interpolated across.
  *
- * Back, a thread has a run of voxels along z and reads the correction through a
+ * Back from one view, a thread has a run of voxels along z and reads the correction through a
  * texture over plain memory. What it writes anew is the iterate and those
  * copies that the next view reads, one for most: a view whose rays run closer to
  * x than to y needs the slices across x only.
@@ -21,7 +21,8 @@
 #include "kernels/rows.cuh"
 
 struct rows_view {
-	const device_view *geometry; /* of this view */
+	const device_view *geometry; /* of the views of a launch */
+	const int *views;            /* their numbers; NULL: there is one, `measured` is its own */
 	device_grid grid;
 	float *volume;         /* [z][y][x] */
 	__half2 *across[2];    /* pair 0, slice 0, voxel 0 of the copies across x and y */
@@ -34,7 +35,9 @@ struct rows_view {
 	const float *measured; /* [row][column], as the correction */
 	float *correction;
 	int measured_pitch, correction_pitch;
-	cudaTextureObject_t sampled; /* the correction, edges held */
+	size_t measured_slot, correction_slot; /* by the view and by its place in the launch */
+	cudaSurfaceObject_t array;             /* not 0: the correction goes there, too */
+	cudaTextureObject_t sampled;           /* the correction, edges held */
 	float2 *partial;
 	float least; /* mm that a ray must have in the grid */
 	float relaxation;
@@ -43,16 +46,18 @@ struct rows_view {
 
 /* ---- forward ---- */
 
-enum { PARTS = 8 };
+/* Into how many parts rays are cut, at most; a warp each. */
+enum { PARTS_MOST = 8, PARTS_OF_FEW = 4 };
 
 template <comb KIND, int ROWS, bool LEAN>
-static __global__ void __launch_bounds__(32 * PARTS, ROWS > 4 || LEAN ? 3 : 4) project_view_rows(const rows_view s)
+static __global__ void __launch_bounds__(32 * PARTS_MOST, ROWS > 4 || LEAN ? 3 : 4) project_view_rows(const rows_view s)
 {
-	__shared__ float sums[PARTS][ROWS][32];
-	__shared__ shared_ends<ROWS, 32 * PARTS> all_ends;
-	const device_view &g = *s.geometry;
+	extern __shared__ float shared[]; /* [part][3 ROWS][32]: sums, and where rows begin and end */
+	int slot = blockIdx.z;
+	const device_view &g = s.geometry[slot];
 	int block = s.first_block + blockIdx.y, column = blockIdx.x * 32 + threadIdx.x, low = block * ROWS;
-	int part = threadIdx.y;
+	int part = threadIdx.y, parts = blockDim.y;
+	float *own_sums = shared + part * (3 * ROWS * 32) + threadIdx.x;
 	bool valid = column < s.columns;
 	float upwards = s.rows_down ? -1.0f : 1.0f, c = (float)column - 0.5f * (float)(s.columns - 1);
 	float r = upwards * ((float)low - 0.5f * (float)(s.rows - 1));
@@ -63,7 +68,7 @@ static __global__ void __launch_bounds__(32 * PARTS, ROWS > 4 || LEAN ? 3 : 4) p
 
 #pragma unroll
 	for (int k = 0; k < ROWS; k++)
-		sums[part][k][threadIdx.x] = 0;
+		own_sums[k * 32] = 0;
 	for (int axis = ACROSS_X; axis <= ACROSS_Y; axis++) {
 		bool mine = valid && meets && own == axis;
 
@@ -71,7 +76,7 @@ static __global__ void __launch_bounds__(32 * PARTS, ROWS > 4 || LEAN ? 3 : 4) p
 			continue;
 		slice_axes axes = axes_of(s.grid, axis);
 		fan f = fan_make<ROWS, LEAN>(g, d, m, axis, upwards, axes);
-		shared_row_ends<ROWS, 32 *PARTS> ends = {all_ends, part * 32 + (int)threadIdx.x};
+		shared_row_ends<ROWS> ends = {own_sums + ROWS * 32};
 		float sum[ROWS] = {};
 		reach reaches = reach_of<ROWS, LEAN>(f, mine, low, s.rows, axes, ends);
 		bool hits = reaches.any_end > reaches.any_first;
@@ -80,7 +85,7 @@ static __global__ void __launch_bounds__(32 * PARTS, ROWS > 4 || LEAN ? 3 : 4) p
 			f = fan_idle(axes);
 		walk w = walk_together(hits, reaches.any_first, reaches.any_end, reaches.all_first, reaches.all_end);
 		/* This warp's part of the way. */
-		int each = (w.end - w.first + PARTS - 1) / PARTS, from = w.first + part * each;
+		int each = (w.end - w.first + parts - 1) / parts, from = w.first + part * each;
 		int to = min(from + each, w.end), inner = min(max(w.inner_first, from), max(to, from));
 		int outer = min(max(w.inner_end, inner), max(to, inner));
 		int slice = s.slice[axis], pair = s.pair[axis];
@@ -126,11 +131,13 @@ static __global__ void __launch_bounds__(32 * PARTS, ROWS > 4 || LEAN ? 3 : 4) p
 #pragma unroll
 		for (int k = 0; k < ROWS; k++)
 			if (mine && hits && ends.end(k) > ends.begin(k))
-				sums[part][k][threadIdx.x] = sum[k];
+				own_sums[k * 32] = sum[k];
 	}
-	__syncthreads();
+	const float *all_measured = s.measured + (s.views != NULL ? s.views[slot] * s.measured_slot : 0);
+	float factor = unscale(volume_scale(*s.most));
 	float2 squares = {0, 0};
-	for (int k = part; k < ROWS; k += PARTS) {
+	__syncthreads();
+	for (int k = part; k < ROWS; k += parts) {
 		if (!valid || low + k >= s.rows)
 			continue;
 		float up = upwards * ((float)(low + k) - 0.5f * (float)(s.rows - 1)), sum = 0;
@@ -142,19 +149,22 @@ static __global__ void __launch_bounds__(32 * PARTS, ROWS > 4 || LEAN ? 3 : 4) p
 			step = full.step;
 		}
 		int row = s.rows_down ? s.rows - 1 - (low + k) : low + k;
-		float measured = s.measured[(size_t)row * s.measured_pitch + column], residual;
+		float measured = all_measured[(size_t)row * s.measured_pitch + column];
 
-		for (int j = 0; j < PARTS; j++)
-			sum += sums[j][k][threadIdx.x];
-		residual = measured - sum / volume_scale(*s.most) * step;
-		s.correction[(size_t)row * s.correction_pitch + column] =
-		    length >= s.least && length > 0 ? residual / length : 0.0f;
+#pragma unroll
+		for (int j = 0; j < PARTS_MOST; j++)
+			sum += j < parts ? shared[(j * 3 * ROWS + k) * 32 + threadIdx.x] : 0.0f;
+		float residual = measured - sum * factor * step;
+		float correction = length >= s.least && length > 0 ? residual / length : 0.0f;
+		s.correction[slot * s.correction_slot + (size_t)row * s.correction_pitch + column] = correction;
+		if (s.array != 0)
+			surf2DLayeredwrite(correction, s.array, column * (int)sizeof(float), row, slot);
 		squares.x += residual * residual;
 		squares.y += measured * measured;
 	}
 	squares = block_sum(squares);
 	if (threadIdx.x == 0 && threadIdx.y == 0)
-		s.partial[block * gridDim.x + blockIdx.x] = squares;
+		s.partial[(slot * gridDim.y + block) * gridDim.x + blockIdx.x] = squares;
 }
 
 /* The blocks of `each` rows, counted upwards, that may meet the grid. */
@@ -335,7 +345,7 @@ static copy_shape copy_shape_make(const int size[3], int axis)
 	return shape;
 }
 
-size_t sweep_rows_bytes(const struct plan *plan)
+size_t copies_bytes(const struct plan *plan)
 {
 	return (copy_shape_make(plan->grid.size, ACROSS_X).pairs + copy_shape_make(plan->grid.size, ACROSS_Y).pairs) *
 	       sizeof(__half2);
@@ -344,18 +354,10 @@ size_t sweep_rows_bytes(const struct plan *plan)
 /* Rows of a thread: few where what a view sees of the grid would not fill the card. */
 int sweep_view_rows(const struct plan *plan)
 {
-	const int blocks_least = 500, few = plan->shape.untilted ? 2 : 3; /* those that lean share more */
-	const struct geometry *geometry = plan->options.geometry;
-	int rows = plan->shape.forward_rows, most = 0;
+	const int warps_least = 500, few = plan->shape.untilted ? 2 : 3; /* those that lean share more */
+	int rows = plan->shape.forward_rows;
 
-	for (int k = 0; k < geometry->count; k++) {
-		struct shadow shadow = shadow_of(geometry, plan->options.grid, k);
-		int blocks = divide_up(shadow.end_column - shadow.first_column, 32) *
-			     divide_up(shadow.end_row - shadow.first_row, rows);
-
-		most = blocks > most ? blocks : most;
-	}
-	return most < blocks_least && rows > few ? few : rows;
+	return plan->shape.by_view && plan->shape.view_warps < warps_least && rows > few ? few : rows;
 }
 
 static dim3 blocks_of(const struct plan *plan)
@@ -363,7 +365,7 @@ static dim3 blocks_of(const struct plan *plan)
 	return dim3(divide_up(plan->stack.columns, 32), divide_up(plan->stack.rows, plan->shape.view_rows));
 }
 
-size_t sweep_rows_partials(const struct plan *plan)
+size_t copies_partials(const struct plan *plan)
 {
 	dim3 blocks = blocks_of(plan);
 
@@ -397,35 +399,37 @@ static void wanted_by(const struct plan *plan, int index, bool ret_wanted[2])
 }
 
 template <comb KIND, int ROWS>
-static void launch_rows(const struct plan *plan, const rows_view &s, int count, cudaStream_t stream)
+static void launch_rows(const struct plan *plan, const rows_view &s, int count, int views, cudaStream_t stream)
 {
-	dim3 blocks(blocks_of(plan).x, count), threads(32, PARTS);
+	int parts = plan->shape.by_view ? PARTS_MOST : PARTS_OF_FEW;
+	dim3 blocks(blocks_of(plan).x, count, views), threads(32, parts);
+	size_t shared = (size_t)parts * 3 * ROWS * 32 * sizeof(float);
 
 	if (plan->shape.untilted)
-		project_view_rows<KIND, ROWS, false><<<blocks, threads, 0, stream>>>(s);
+		project_view_rows<KIND, ROWS, false><<<blocks, threads, shared, stream>>>(s);
 	else
-		project_view_rows<KIND, ROWS, true><<<blocks, threads, 0, stream>>>(s);
+		project_view_rows<KIND, ROWS, true><<<blocks, threads, shared, stream>>>(s);
 }
 
 /* `count` blocks of rows from s.first_block on. */
-static void project_by(const struct plan *plan, const rows_view &s, int count, cudaStream_t stream)
+static void project_by(const struct plan *plan, const rows_view &s, int count, int views, cudaStream_t stream)
 {
 	const int rows = plan->shape.view_rows;
 
 	/* So few rows find their values in any comb. */
 	switch ((rows <= 3 ? COMB_EVEN : plan->shape.forward_comb) * 8 + rows) {
 	case COMB_EVEN * 8 + 2:
-		return launch_rows<COMB_EVEN, 2>(plan, s, count, stream);
+		return launch_rows<COMB_EVEN, 2>(plan, s, count, views, stream);
 	case COMB_EVEN * 8 + 3:
-		return launch_rows<COMB_EVEN, 3>(plan, s, count, stream);
+		return launch_rows<COMB_EVEN, 3>(plan, s, count, views, stream);
 	case COMB_EVEN * 8 + 4:
-		return launch_rows<COMB_EVEN, 4>(plan, s, count, stream);
+		return launch_rows<COMB_EVEN, 4>(plan, s, count, views, stream);
 	case COMB_EVEN * 8 + 5:
-		return launch_rows<COMB_EVEN, 5>(plan, s, count, stream);
+		return launch_rows<COMB_EVEN, 5>(plan, s, count, views, stream);
 	case COMB_NARROW * 8 + 6:
-		return launch_rows<COMB_NARROW, 6>(plan, s, count, stream);
+		return launch_rows<COMB_NARROW, 6>(plan, s, count, views, stream);
 	default:
-		return launch_rows<COMB_EVEN, 6>(plan, s, count, stream);
+		return launch_rows<COMB_EVEN, 6>(plan, s, count, views, stream);
 	}
 }
 
@@ -477,13 +481,10 @@ void sweep_rows_release(struct plan *plan)
 	device_release(plan->device, plan->sampled_from, sweep_correction_bytes(plan));
 }
 
-int sweep_rows(struct plan *plan, const float *projections, float *volume, float least, const struct cancel *cancel,
-	       struct error *err)
+/* All but the views and what they give. */
+static rows_view rows_view_make(const struct plan *plan, float *volume, float least)
 {
-	const int *order = plan->options.sart->subsets.order;
-	cudaStream_t stream = plan->device->stream;
 	__half2 *memory = (__half2 *)plan->scratch;
-	int count = plan->options.geometry->count;
 	rows_view s = {};
 
 	s.grid = plan->grid;
@@ -501,13 +502,52 @@ int sweep_rows(struct plan *plan, const float *projections, float *volume, float
 	s.columns = plan->stack.columns;
 	s.rows = plan->stack.rows;
 	s.measured_pitch = plan->stack.pitch;
+	s.measured_slot = plan->stack.slot;
+	s.least = least;
+	s.geometry = plan->geometry;
+	return s;
+}
+
+int copies_lay_out(struct plan *plan, const float *volume, struct error *err)
+{
+	rows_view s = rows_view_make(plan, (float *)volume, 0);
+
+	s.wanted[ACROSS_X] = s.wanted[ACROSS_Y] = true;
+	launch_update<UPDATE_NOT>(plan, s, plan->device->stream);
+	LAUNCHED();
+	return 0;
+}
+
+int copies_project(struct plan *plan, int first, int count, struct ray_use use, float *to, struct error *err)
+{
+	rows_view s = rows_view_make(plan, NULL, use.least);
+
+	s.geometry = plan->in_order + first;
+	s.views = plan->views + first;
+	s.measured = use.measured;
+	s.correction = to;
+	s.correction_pitch = plan->stack.pitch;
+	s.correction_slot = plan->stack.slot;
+	s.array = use.array;
+	s.partial = use.partial;
+	project_by(plan, s, (int)blocks_of(plan).y, count, plan->device->stream);
+	LAUNCHED();
+	return 0;
+}
+
+int sweep_rows(struct plan *plan, const float *projections, float *volume, float least, const struct cancel *cancel,
+	       struct error *err)
+{
+	const int *order = plan->options.sart->subsets.order;
+	cudaStream_t stream = plan->device->stream;
+	int count = plan->options.geometry->count;
+	rows_view s = rows_view_make(plan, volume, least);
+
 	s.correction = plan->sampled_from;
 	s.correction_pitch = correction_pitch(plan);
 	s.sampled = plan->sampled;
-	s.least = least;
 	s.relaxation = (float)plan->options.sart->relaxation;
 	s.nonnegative = plan->options.sart->nonnegative;
-	s.geometry = plan->geometry;
 	wanted_by(plan, order[0], s.wanted);
 	TRY(layout_scale(plan, volume, projections, err));
 	launch_update<UPDATE_NOT>(plan, s, stream);
@@ -522,12 +562,12 @@ int sweep_rows(struct plan *plan, const float *projections, float *volume, float
 						     s.rows_down, s.rows, plan->shape.view_rows);
 
 		TRY(cancel_check(cancel, err));
-		s.geometry = plan->geometry + order[i];
+		s.geometry = plan->in_order + i;
 		s.measured = projections + (size_t)order[i] * plan->stack.slot;
-		s.partial = plan->partial + (size_t)i * sweep_rows_partials(plan);
+		s.partial = plan->partial + (size_t)i * copies_partials(plan);
 		s.first_block = range.first;
 		if (range.end > range.first)
-			project_by(plan, s, range.end - range.first, stream);
+			project_by(plan, s, range.end - range.first, 1, stream);
 		LAUNCHED();
 		s.wanted[ACROSS_X] = s.wanted[ACROSS_Y] = false;
 		if (i + 1 < count)
