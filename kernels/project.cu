@@ -196,7 +196,8 @@ static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS, GENE
 
 /* ---- small problems ---- */
 
-/* Of a block: warps of pixels one after the other, and parts into which rays are cut; what takes time is to wait. */
+/* Of a block: warps of pixels one after the other, and parts into which rays are cut at most; what takes time is to
+ * wait. */
 enum { SMALL_WARPS = 2, SMALL_PARTS = 4, SMALL_PIXELS = 32 * SMALL_WARPS };
 
 /* From the volume as it is, which the caches hold. */
@@ -211,13 +212,13 @@ static __global__ void __launch_bounds__(SMALL_PIXELS *SMALL_PARTS, 4) project_s
 	float d[3], m[3];
 	line_to(g, c, r, d, m);
 	strided volume = {p.volume, 1, p.grid.size[0], p.grid.size[0] * p.grid.size[1]};
-	ray_part way = walk_part<false>(volume, p.grid, d, m, valid, part, SMALL_PARTS);
+	ray_part way = walk_part<false>(volume, p.grid, d, m, valid, part, blockDim.y);
 	float2 squares = {0, 0};
 
 	sums[part][threadIdx.x] = way.sum;
 	__syncthreads();
 	if (part == 0 && valid) {
-		for (int k = 1; k < SMALL_PARTS; k++)
+		for (int k = 1; k < (int)blockDim.y; k++)
 			way.sum += sums[k][threadIdx.x];
 		squares = finish(p, slot, view, column, row, way.sum, way.slices, way.step);
 	}
@@ -526,6 +527,14 @@ static void launch_apart(const plan_shape &shape, const projection &p, unsigned 
 		project_rows<COMB_EVEN, ROWS_APART, __half2, true, true><<<blocks, threads, 0, stream>>>(p);
 }
 
+/* Cut once only where all of it would not run at one time. */
+static void launch_small(const struct device *device, const projection &p, unsigned blocks, cudaStream_t stream)
+{
+	bool many = blocks * SMALL_WARPS * SMALL_PARTS > 32u * (unsigned)device->multiprocessors;
+
+	project_small<<<blocks, dim3(SMALL_PIXELS, many ? SMALL_PARTS / 2 : SMALL_PARTS), 0, stream>>>(p);
+}
+
 template <typename T>
 static void launch_general(const plan_shape &shape, const projection &p, unsigned blocks, cudaStream_t stream)
 {
@@ -578,7 +587,7 @@ int project_rays(struct plan *plan, const float *volume, int first, int count, s
 		break;
 	default:
 		if (plan->shape.is_small)
-			project_small<<<blocks, dim3(SMALL_PIXELS, SMALL_PARTS), 0, stream>>>(p);
+			launch_small(plan->device, p, blocks, stream);
 		else if (plan->shape.rows_apart)
 			launch_apart(plan->shape, p, blocks, stream);
 		else if (plan->shape.halves)
