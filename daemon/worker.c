@@ -332,6 +332,8 @@ static int serve_job(struct worker *worker, const struct message *start)
 	worker->told_count = 0;
 	worker->iteration = start->iteration;
 	worker->reported = 0;
+	worker->progress = (struct message){0};
+	worker->behind = false;
 	working = 1;
 	ended.code = run_job(worker, start, &err);
 	ended.iteration = worker->iteration;

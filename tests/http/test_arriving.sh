@@ -80,6 +80,26 @@ test_fdk_goes_along_and_the_rest_of_the_pipeline_follows() {
 	expect_same_as_afterwards "$recipe"
 }
 
+test_the_progress_of_the_job_before_is_not_that_of_the_next() {
+	fresh_daemon
+	local stages
+	# whether the last progress of a job was told depends on the time since the one before: several kinds
+	for stages in '"fdk": {}' '"fdk": {}, "tv": {}'; do
+		post_scan "$scan_dir"
+		post_projections "$scan_dir"
+		post_job "{\"scan\": \"SCAN\", $grid, $stages}"
+		wait_job succeeded
+		post_scan "$scan_dir"
+		post_job "$fdk"
+		sleep 0.1 # attended, with nothing to reconstruct yet
+		send "$scan_dir" 0 2
+		reconstructed 3
+		expect_json '.stage == "fdk" and .iteration == 0 and .progress < 0.1'
+		req DELETE "/v1/jobs/$job?wait=30"
+		expect_json '.state == "cancelled"'
+	done
+}
+
 test_any_order_with_gaps_and_repeats() {
 	fresh_daemon
 	local k order first
