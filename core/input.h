@@ -26,7 +26,7 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 double input_blank_share(const struct input *input, const struct orbit *orbit);
 /* ERR_IMPOSSIBLE where no view has a good pixel. */
 int input_check(const struct input *input, struct error *err);
-/* "defects", "defect_map", "blank_views", "air_region". */
+/* "no_dark", "defects", "defect_map", "blank_views", "air_region". */
 void input_warn(const struct input *input, const struct geometry *geometry, const struct recon_hooks *hooks);
 
 #endif

@@ -307,8 +307,10 @@ static void enter_queue(struct job_record *record, const struct job_change *chan
 	record->checkpoint = change->checkpoint;
 	record->iteration = change->checkpoint;
 	record->stage = STAGE_LOAD;
-	if (change->checkpoint == 0)
+	if (change->checkpoint == 0) {
 		record->fraction = 0;
+		record->taken = 0;
+	}
 }
 
 /* A worker was lost over it: it waits, and what it had reconstructed is gone. */
@@ -331,6 +333,12 @@ static void enter_running(struct job_record *record, enum job_state from, const 
 	}
 	if (record->started == 0)
 		record->started = time_of_day();
+	/* A checkpoint of what is understood otherwise now is of no use. */
+	if (from == JOB_QUEUED && record->basis != change->basis) {
+		record->checkpoint = 0;
+		record->fraction = 0;
+	}
+	record->basis = change->basis;
 	record->iteration = record->checkpoint;
 	if (from != JOB_WAITING) {
 		record->stage = STAGE_LOAD;
@@ -357,7 +365,7 @@ static void enter_end(struct job_record *record, const struct job_change *change
 		 change->error_text == NULL ? "" : change->error_text);
 }
 
-static int save_state(struct jobs *jobs, const struct job_record *record, bool rewind, struct error *err)
+static int save_state(struct jobs *jobs, const struct job_record *record, enum job_past past, struct error *err)
 {
 	struct event event = {0}, end = {0};
 	bool ended = job_state_ended(record->state);
@@ -366,7 +374,7 @@ static int save_state(struct jobs *jobs, const struct job_record *record, bool r
 	if (code == 0 && ended)
 		code = event_make(&end, "end", state_document(record), err);
 	if (code == 0)
-		code = store_job_update(jobs->store, record, &event, ended ? &end : NULL, rewind, err);
+		code = store_job_update(jobs->store, record, &event, ended ? &end : NULL, past, err);
 	free(event.data);
 	free(end.data);
 	return code;
@@ -430,6 +438,8 @@ static int change_state(struct job *job, enum job_state to, const struct job_cha
 	struct job_record record;
 	bool removed;
 	enum job_state from;
+	enum job_past past = PAST_STAYS;
+	unsigned basis;
 	int code;
 
 	if (change == NULL)
@@ -437,15 +447,22 @@ static int change_state(struct job *job, enum job_state to, const struct job_cha
 	pthread_mutex_lock(&job->jobs->lock);
 	from = job->record.state;
 	removed = job->removed;
+	basis = job->record.basis;
 	pthread_mutex_unlock(&job->jobs->lock);
 	if (removed || !job_state_may_follow(from, to))
 		return error_set(err, ERR_CONFLICT, "job %s is %s and cannot become %s", job->id,
 				 removed ? "removed" : job_state_names[from], job_state_names[to]);
 	next_record(job, to, change, &record);
-	code = save_state(job->jobs, &record, from == JOB_RUNNING && to == JOB_QUEUED, err);
+	if (from == JOB_RUNNING && to == JOB_QUEUED)
+		past = PAST_REWINDS;
+	else if (from == JOB_QUEUED && to == JOB_RUNNING && basis != change->basis)
+		past = PAST_GOES;
+	code = save_state(job->jobs, &record, past, err);
 	if (code != 0)
 		return code;
 	show_state(job, &record, change);
+	if (past == PAST_GOES)
+		store_job_remove_volumes(job->jobs->store, record.id);
 	if (job_state_ended(to))
 		store_job_tidy(job->jobs->store, record.id);
 	return 0;
@@ -722,7 +739,7 @@ static int ask_cancel(struct job *job, struct error *err)
 	if (record.cancel_asked)
 		return 0;
 	record.cancel_asked = true;
-	code = store_job_update(job->jobs->store, &record, NULL, NULL, false, err);
+	code = store_job_update(job->jobs->store, &record, NULL, NULL, PAST_STAYS, err);
 	if (code != 0)
 		return code;
 	pthread_mutex_lock(&job->jobs->lock);

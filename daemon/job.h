@@ -113,6 +113,7 @@ struct job_change {
 	int checkpoint;               /* to JOB_QUEUED: the iteration that checkpoint.f32 holds, 0: none */
 	bool crashed;                 /* to JOB_QUEUED, JOB_WAITING or JOB_FAILED: the worker died with it */
 	bool yielded;                 /* to JOB_QUEUED: it goes on later, which is no new attempt */
+	unsigned basis;               /* to JOB_RUNNING: of its scan; after another one it begins anew, its past goes */
 	const char *backend, *device; /* to JOB_RUNNING */
 	const char *reason;           /* for the log */
 };

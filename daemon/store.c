@@ -120,6 +120,7 @@ static const char *const migrations[] = {
      " job TEXT NOT NULL);"),
     "ALTER TABLE scans ADD COLUMN defects BLOB;",                      /* SHA-256 of the defect map's bytes */
     "ALTER TABLE scans ADD COLUMN closed INTEGER NOT NULL DEFAULT 0;", /* 1: its projections are those that are there */
+    "ALTER TABLE jobs ADD COLUMN basis INTEGER NOT NULL DEFAULT 0;",   /* of its scan, when it ran last */
 };
 enum { MIGRATIONS = sizeof(migrations) / sizeof(migrations[0]) };
 

@@ -199,6 +199,7 @@ struct job_record {
 	int attempts; /* 1 with the first run, one more each time that a run was lost; going on after a yield is none */
 	int crashes;  /* workers that died with it */
 	int checkpoint; /* iteration that checkpoint.f32 holds, 0: none */
+	unsigned basis; /* of its scan, when it ran last */
 	char backend[16], device[96], plan[160];
 	struct recon_memory memory;
 	int error_code; /* 0: none */
@@ -243,16 +244,22 @@ struct event {
 	const char *once; /* NULL, or: of all events of the job with this name, the first is the only one */
 };
 int store_job_insert(struct store *store, const struct job_record *job, const struct event *event, struct error *err);
-/* All columns that can change. `end`, when not NULL, is a second event. With `rewind`, history rows behind the
- * checkpoint go. */
+/*
+ * What becomes of the rows that tell of a job's runs: with PAST_REWINDS the history behind the checkpoint goes, with
+ * PAST_GOES all history, volumes, warnings and events, but for its states.
+ */
+enum job_past { PAST_STAYS, PAST_REWINDS, PAST_GOES };
+/* All columns that can change. `end`, when not NULL, is a second event. */
 int store_job_update(struct store *store, const struct job_record *job, const struct event *event,
-		     const struct event *end, bool rewind, struct error *err);
+		     const struct event *end, enum job_past past, struct error *err);
 /* Removes the rows; then the files may go. Of the events only that it was removed stays, for those who watch all jobs.
  */
 int store_job_delete(struct store *store, const char *id, struct error *err);
 void store_job_remove_files(const struct store *store, const char *id);
 void store_job_remove_checkpoint(const struct store *store, const char *id);
-/* That, and what a worker that died left half-written or prepared: an ended job has no use for it. */
+/* The files of all its volumes, whose rows have gone. */
+void store_job_remove_volumes(const struct store *store, const char *id);
+/* The checkpoint, and what a worker that died left half-written or prepared: an ended job has no use for it. */
 void store_job_tidy(const struct store *store, const char *id);
 /* All of them or none, each with its event. */
 int store_job_add_rows(struct store *store, const char *id, const struct history_row *rows, const struct event *events,

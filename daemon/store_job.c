@@ -85,6 +85,7 @@ static void bind_changing(struct query *query, const struct job_record *job)
 	query_text(query, stage_names[job->stage]);
 	query_integer(query, job->iteration);
 	query_real(query, job->fraction);
+	query_integer(query, job->basis);
 	query_text(query, job->id);
 }
 
@@ -99,9 +100,9 @@ int store_job_insert(struct store *store, const struct job_record *job, const st
 	    &query, &store->writer,
 	    "INSERT INTO jobs (state, ticket, cancel_asked, attempts, crashes, checkpoint, backend, device, plan,"
 	    " memory, error_code, error_pointer, error_text, queued, started, ended, seconds, stage, iteration,"
-	    " fraction, id, scan, priority, request, mu_water, iterations, idempotency_key, request_sha256,"
+	    " fraction, basis, id, scan, priority, request, mu_water, iterations, idempotency_key, request_sha256,"
 	    " created) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?,"
-	    " ?)",
+	    " ?, ?)",
 	    err);
 	bind_changing(&query, job);
 	query_text(&query, job->scan);
@@ -129,8 +130,28 @@ static int rewind_history(struct store *store, const struct job_record *job, str
 	return query_run(&query);
 }
 
+/* Events too: what is told once is told once more. */
+static int remove_past(struct store *store, const char *id, struct error *err)
+{
+	static const char *const statements[] = {
+	    "DELETE FROM history WHERE job = (SELECT number FROM jobs WHERE id = ?)",
+	    "DELETE FROM volumes WHERE job = (SELECT number FROM jobs WHERE id = ?)",
+	    "DELETE FROM warnings WHERE job = (SELECT number FROM jobs WHERE id = ?)",
+	    "DELETE FROM events WHERE job = (SELECT number FROM jobs WHERE id = ?) AND kind <> 'state'",
+	};
+	struct query query;
+	int code = 0;
+
+	for (size_t i = 0; i < sizeof(statements) / sizeof(statements[0]) && code == 0; i++) {
+		query_begin(&query, &store->writer, statements[i], err);
+		query_text(&query, id);
+		code = query_run(&query);
+	}
+	return code;
+}
+
 int store_job_update(struct store *store, const struct job_record *job, const struct event *event,
-		     const struct event *end, bool rewind, struct error *err)
+		     const struct event *end, enum job_past past, struct error *err)
 {
 	struct query query;
 	int code = store_begin(store, err);
@@ -141,13 +162,15 @@ int store_job_update(struct store *store, const struct job_record *job, const st
 	    &query, &store->writer,
 	    "UPDATE jobs SET state = ?, ticket = ?, cancel_asked = ?, attempts = ?, crashes = ?, checkpoint = ?,"
 	    " backend = ?, device = ?, plan = ?, memory = ?, error_code = ?, error_pointer = ?, error_text = ?,"
-	    " queued = ?, started = ?, ended = ?, seconds = ?, stage = ?, iteration = ?, fraction = ?"
+	    " queued = ?, started = ?, ended = ?, seconds = ?, stage = ?, iteration = ?, fraction = ?, basis = ?"
 	    " WHERE id = ?",
 	    err);
 	bind_changing(&query, job);
 	code = query_run(&query);
-	if (code == 0 && rewind)
+	if (code == 0 && past == PAST_REWINDS)
 		code = rewind_history(store, job, err);
+	else if (code == 0 && past == PAST_GOES)
+		code = remove_past(store, job->id, err);
 	if (code == 0)
 		code = add_event(store, job->id, event, err);
 	if (code == 0)
@@ -210,6 +233,27 @@ void store_job_remove_checkpoint(const struct store *store, const char *id)
 	snprintf(path, sizeof(path), "%s/%s", directory, SPOOL_CHECKPOINT);
 	if (unlink(path) < 0 && errno != ENOENT && errno != ENOTDIR)
 		log_line(LEVEL_WARNING, "job %s: %s stays: %s", id, path, strerror(errno));
+}
+
+static int remove_volume(void *context, const char *name, struct error *err)
+{
+	const char *extension = strrchr(name, '.');
+	char path[1400];
+
+	snprintf(path, sizeof(path), "%s/%s", (const char *)context, name);
+	if (extension != NULL && strcmp(extension, ".nii") == 0 && unlink(path) < 0 && errno != ENOENT)
+		return error_set_errno(err, errno, "unlink %s", path);
+	return 0;
+}
+
+void store_job_remove_volumes(const struct store *store, const char *id)
+{
+	char directory[1024];
+	struct error err;
+
+	store_job_directory(store, id, directory);
+	if (directory_visit(directory, remove_volume, directory, &err) != 0)
+		log_line(LEVEL_WARNING, "job %s: volumes that are void are still there: %s", id, err.text);
 }
 
 static int remove_temporary(void *context, const char *name, struct error *err)
@@ -430,6 +474,7 @@ static int read_job(struct query *query, struct job_record *job, struct error *e
 	stage = column_name(query, 26, stage_names, STAGE_COUNT);
 	job->iteration = sqlite3_column_int(row, 27);
 	job->fraction = sqlite3_column_double(row, 28);
+	job->basis = (unsigned)sqlite3_column_int64(row, 29);
 	if (state < 0 || priority < 0 || stage < 0 || !id_valid(job->id))
 		return error_set(err, ERR_IO, "catalogue: the row of job \"%s\" makes no sense", job->id);
 	job->state = (enum job_state)state;
@@ -452,7 +497,7 @@ int store_job_load(struct store *store, struct job_record **ret_jobs, int *ret_c
 	    "SELECT id, scan, state, priority, ticket, request, mu_water, iterations, idempotency_key,"
 	    " request_sha256, cancel_asked, attempts, crashes, checkpoint, backend, device, plan, memory,"
 	    " error_code, error_pointer, error_text, created, queued, started, ended, seconds, stage, iteration,"
-	    " fraction FROM jobs ORDER BY id",
+	    " fraction, basis FROM jobs ORDER BY id",
 	    err);
 	while (code == 0 && query_row(&query)) {
 		more = grow(jobs, count, sizeof(*jobs));

@@ -55,7 +55,6 @@ struct stored_scan {
 	int *order;              /* [received]: the projections that are stored, as they came */
 	int received;
 	double arrived; /* monotonic: the last of them, 0: before the start */
-	unsigned basis; /* grows when they are to be understood otherwise */
 	enum progress image[IMAGE_COUNT];
 	uint8_t image_sha256[IMAGE_COUNT][32];
 	bool deleted; /* written with writer.lock held too, as the next */
@@ -594,6 +593,16 @@ static bool is_convertible(const struct stored_scan *scan)
 	return scan->quantity == QUANTITY_LINE_INTEGRAL || scan->air > 0 || scan->image[IMAGE_FLAT] == STORED;
 }
 
+/* Images and the end of a scan come and never go: what is there tells all that its projections are understood by. */
+static unsigned basis_of(const struct stored_scan *scan)
+{
+	unsigned basis = scan->closed;
+
+	for (int i = 0; i < IMAGE_COUNT; i++)
+		basis = basis << 1 | (scan->image[i] == STORED);
+	return basis;
+}
+
 static void add_received(struct stored_scan *scan, int index, const uint8_t sha256[32])
 {
 	memcpy(scan->sha256[index], sha256, 32);
@@ -624,7 +633,7 @@ void stored_scan_facts(struct stored_scan *scan, struct scan_facts *ret)
 	ret->convertible = is_convertible(scan);
 	ret->ready = ret->complete && ret->convertible;
 	ret->arrived = scan->arrived;
-	ret->basis = scan->basis;
+	ret->basis = basis_of(scan);
 	ret->deleted = scan->deleted;
 	pthread_mutex_unlock(&scan->lock);
 }
@@ -776,7 +785,6 @@ static int close_once(struct store *store, struct stored_scan *scan, unsigned ch
 	pthread_mutex_unlock(&store->scans_lock);
 	pthread_mutex_lock(&scan->lock);
 	scan->closed = true;
-	scan->basis++;
 	pthread_mutex_unlock(&scan->lock);
 	log_line(LEVEL_INFO, "scan %s is complete with %d of %d projections", scan->id, received, scan->count);
 	return 0;
@@ -981,7 +989,6 @@ int store_put_image(struct store *store, struct stored_scan *scan, enum image im
 	pthread_mutex_lock(&scan->lock);
 	scan->image[image] = code == 0 ? STORED : MISSING;
 	memcpy(scan->image_sha256[image], sha256, 32);
-	scan->basis += code == 0;
 	pthread_mutex_unlock(&scan->lock);
 	watch_wake(&scan->watchers);
 	if (code == 0)

@@ -177,8 +177,10 @@ static void stop_attending(struct worker *worker)
 /* Its last projection was told: from now on it is a job as any other. A code when the catalogue refused. */
 static int record_running(struct worker *worker, struct error *err)
 {
-	const struct job_change change = {
-	    .backend = worker->backend, .device = worker->info.name, .reason = "its last projection is there"};
+	const struct job_change change = {.backend = worker->backend,
+					  .device = worker->info.name,
+					  .basis = worker->basis,
+					  .reason = "its last projection is there"};
 	struct job_record record;
 	int code = job_set_state(worker->job, JOB_RUNNING, &change, err);
 
@@ -317,6 +319,18 @@ static void lose_job(struct supervise *supervise, struct worker *worker, int err
 	}
 }
 
+/* An image came since it began, or its scan was closed: whoever was told that it is stored may rely on it. */
+static bool is_void(const struct worker *worker)
+{
+	struct job_facts facts;
+	struct scan_facts scan;
+	struct error err;
+
+	job_facts(worker->job, &facts);
+	return store_scan_look(jobs_store(job_jobs(worker->job)), facts.scan, &scan, &err) == 0 &&
+	       scan.basis != worker->basis;
+}
+
 /* The worker said how its job ended. */
 static void job_ended(struct supervise *supervise, struct worker *worker, const struct message *message)
 {
@@ -325,8 +339,8 @@ static void job_ended(struct supervise *supervise, struct worker *worker, const 
 	job_facts(worker->job, &facts);
 	worker->deadline = NEVER;
 	worker->state = WORKER_IDLE;
-	/* Done before it heard of it: what could not be kept is lost all the same. */
-	if (message->code == 0 && worker->failure_code == 0) {
+	/* Done before it heard of it: what could not be kept is lost all the same, and what is void stays so. */
+	if (message->code == 0 && worker->failure_code == 0 && !is_void(worker)) {
 		worker->failures = 0;
 		end_job(supervise, worker, (struct ending){.to = JOB_SUCCEEDED}, "");
 	} else if (message->code == ERR_DEVICE) {
@@ -348,6 +362,9 @@ static void job_ended(struct supervise *supervise, struct worker *worker, const 
 		end_job(supervise, worker,
 			(struct ending){.to = back_to(worker), .checkpoint = message->iteration, .yielded = true},
 			"it made room");
+	} else if (is_void(worker)) {
+		end_job(supervise, worker, (struct ending){.to = back_to(worker)},
+			"its scan is understood otherwise now");
 	} else if (message->code == ERR_NO_SPACE && (worker->yielding || supervise->stop_by < NEVER)) {
 		/* Most likely its checkpoint: who is asked to make room must not fail for that. */
 		end_job(supervise, worker, (struct ending){.to = back_to(worker), .checkpoint = worker->checkpoint},
@@ -401,24 +418,36 @@ static void tell_arrivals(struct worker *worker)
 		log_line(LEVEL_DEBUG, "worker %d: %s", worker->index, err.text);
 }
 
-/* Projections that came go to the worker that waits for them; with the last one its job runs. */
-static void feed(struct worker *worker)
+/* To end its job soon; it is killed if it does not. */
+static void stop_worker(struct supervise *supervise, struct worker *worker)
+{
+	tell(worker, MESSAGE_CANCEL);
+	worker->cancelling = true;
+	worker->deadline = now_monotonic() + supervise->options.cancel_seconds;
+}
+
+/*
+ * Projections that came go to the worker that waits for them; with the last one its job runs. What is void is left,
+ * running or not, and the job begins again.
+ */
+static void feed(struct supervise *supervise, struct worker *worker)
 {
 	struct scan_facts facts;
 	struct error err;
 	int code;
 
-	if (worker->arriving == NULL || worker->state != WORKER_BUSY || worker->ending.due || worker->cancelling ||
+	if (worker->job == NULL || worker->state != WORKER_BUSY || worker->ending.due || worker->cancelling ||
 	    worker->yielding)
 		return;
-	stored_scan_facts(worker->arriving, &facts);
-	if (facts.basis != worker->basis) {
+	if (is_void(worker)) {
 		log_line(LEVEL_INFO, "worker %d: its scan is to be understood otherwise now, it begins again",
 			 worker->index);
-		tell(worker, MESSAGE_YIELD);
-		worker->yielding = true;
+		stop_worker(supervise, worker);
 		return;
 	}
+	if (worker->arriving == NULL)
+		return;
+	stored_scan_facts(worker->arriving, &facts);
 	if (worker->told == worker->taken)
 		tell_arrivals(worker);
 	if (worker->told < facts.count || now_monotonic() < worker->again)
@@ -438,11 +467,8 @@ static void stop_job(struct supervise *supervise, struct worker *worker, const s
 	log_line(LEVEL_ERROR, "worker %d: its job is stopped: %s", worker->index, why->text);
 	worker->failure_code = why->code;
 	snprintf(worker->failure_text, sizeof(worker->failure_text), "%s", why->text);
-	if (!worker->cancelling) {
-		tell(worker, MESSAGE_CANCEL);
-		worker->cancelling = true;
-		worker->deadline = now_monotonic() + supervise->options.cancel_seconds;
-	}
+	if (!worker->cancelling)
+		stop_worker(supervise, worker);
 }
 
 static void hello(struct supervise *supervise, struct worker *worker, const struct message *message)
@@ -506,7 +532,7 @@ static void on_message(struct supervise *supervise, struct worker *worker, const
 	case MESSAGE_TAKEN:
 		worker->taken = message->count;
 		job_taken(worker->job, message->count);
-		feed(worker);
+		feed(supervise, worker);
 		break;
 	case MESSAGE_PROGRESS:
 		job_progress(worker->job, message->stage, message->iteration, message->fraction);
@@ -663,11 +689,12 @@ static int make_start(struct supervise *supervise, const struct job_record *reco
 
 	if (code != 0)
 		return code;
-	*message = (struct message){.kind = MESSAGE_START, .iteration = record->checkpoint};
+	stored_scan_facts(scan, &facts);
+	*message =
+	    (struct message){.kind = MESSAGE_START, .iteration = record->basis == facts.basis ? record->checkpoint : 0};
 	snprintf(message->job, sizeof(message->job), "%s", record->id);
 	store_scan_directory(store, record->scan, message->scan_directory);
 	store_job_directory(store, record->id, message->job_directory);
-	stored_scan_facts(scan, &facts);
 	code = job_request_parse(record->request, strlen(record->request), &message->request, err);
 	if (code == 0 && facts.closed)
 		code = add_present(message, scan, &facts, err);
@@ -692,7 +719,7 @@ static void begin(struct supervise *supervise, struct worker *worker, struct job
 
 	worker->job = job_reference(job);
 	worker->running = (struct queue_running){.priority = record->priority, .ticket = record->ticket};
-	worker->checkpoint = record->checkpoint;
+	worker->checkpoint = message->iteration;
 	worker->unsettled = 0;
 	worker->cancelling = worker->yielding = false;
 	worker->room_since = NEVER;
@@ -729,7 +756,8 @@ static int begin_job(struct supervise *supervise, struct worker *worker, struct 
 		     const struct job_record *record, struct message *message, struct stored_scan *scan,
 		     const struct scan_facts *facts, bool arriving, struct error *err)
 {
-	const struct job_change change = {.backend = worker->backend, .device = worker->info.name};
+	const struct job_change change = {
+	    .backend = worker->backend, .device = worker->info.name, .basis = facts->basis};
 	int code;
 
 	message->arriving = arriving;
@@ -741,6 +769,7 @@ static int begin_job(struct supervise *supervise, struct worker *worker, struct 
 		stored_scan_release(scan);
 		return code;
 	}
+	worker->basis = facts->basis;
 	begin(supervise, worker, job, record, message);
 	warn_incomplete(supervise, worker, facts);
 	if (!arriving) {
@@ -749,8 +778,7 @@ static int begin_job(struct supervise *supervise, struct worker *worker, struct 
 	}
 	worker->running.ticket = LLONG_MAX; /* it has none before it runs, and makes room first */
 	worker->arriving = scan;
-	worker->basis = facts->basis;
-	feed(worker);
+	feed(supervise, worker);
 	return 0;
 }
 
@@ -842,11 +870,8 @@ static void carry_out_cancels(struct supervise *supervise)
 		if (worker->state != WORKER_BUSY || worker->job == NULL || worker->cancelling)
 			continue;
 		job_facts(worker->job, &facts);
-		if (!facts.cancel_asked)
-			continue;
-		tell(worker, MESSAGE_CANCEL);
-		worker->cancelling = true;
-		worker->deadline = now_monotonic() + supervise->options.cancel_seconds;
+		if (facts.cancel_asked)
+			stop_worker(supervise, worker);
 	}
 }
 
@@ -991,7 +1016,7 @@ static void move_jobs(struct supervise *supervise)
 static void feed_all(struct supervise *supervise)
 {
 	for (int i = 0; i < supervise->count; i++)
-		feed(&supervise->workers[i]);
+		feed(supervise, &supervise->workers[i]);
 }
 
 static void read_workers(struct supervise *supervise, const struct pollfd *fds, bool stopping)

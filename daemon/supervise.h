@@ -16,8 +16,9 @@
  * priority takes the worker from it, and any other that has something to do
  * after two seconds in which nothing arrived; it then begins again later. So it
  * does, at once, when an image comes late or the scan is closed, since what was
- * reconstructed is void then. Uploads never wait for any of this: they wake the
- * thread, and one message at a time is under way.
+ * reconstructed is void then; a job that runs already is queued again for that.
+ * Uploads never wait for any of this: they wake the thread, and one message at a
+ * time is under way.
  *
  * Threads: any for everything below; supervise_start and supervise_stop once each.
  */

@@ -378,6 +378,40 @@ test_images_that_come_late() {
 	expect_same_as_afterwards "$fdk"
 }
 
+# A dark that is taken after the run: the job has all projections, its first volumes are there.
+test_an_image_that_comes_while_the_job_runs() {
+	fresh_daemon
+	local stages='"fdk": {}, "sart": {"subsets": "views", "iterations"' end=$((SECONDS + 60)) events fdk_digest one_digest
+	post_scan "$raw_dir"
+	req PUT "/v1/scans/$scan/flat" -T "$raw_dir/flat.f32"
+	expect_status 201
+	send "$raw_dir" 0 59
+	post_job "{\"scan\": \"SCAN\", $grid, $stages: 100000}, \"emit\": [\"fdk\", 1]}"
+	until req GET "/v1/jobs/$job" && [ "$(json '.volumes')" = 2 ]; do [ $SECONDS -lt $end ] || fail "two volumes"; done
+	expect_json '.state == "running" and .attempts == 1 and [.warnings[].code] == ["no_dark"]'
+	req PUT "/v1/scans/$scan/dark" -T "$raw_dir/dark.f32"
+	expect_status 201
+	until req GET "/v1/jobs/$job" && [ "$(json '.attempts')" = 2 ] && [ "$(json '.volumes')" = 2 ]; do
+		[ $SECONDS -lt $end ] || fail "two volumes once more"
+	done
+	expect_json '.state == "running" and (.warnings | all(.code != "no_dark")) and .history[0].iteration == 1'
+	req DELETE "/v1/jobs/$job?wait=30"
+	expect_json '.state == "cancelled"'
+	until fdk_digest=$(digest fdk) && one_digest=$(digest iter-1) && [[ $fdk_digest == sha* && $one_digest == sha* ]]; do
+		[ $SECONDS -lt $end ] || fail "the digests"
+	done
+	# what was told of the run without the dark has gone
+	req GET "/v1/jobs/$job/events"
+	events=$(grep -c '^event: volume' "$body")
+	[ "$events" = 2 ] || fail "two volumes told, got $events"
+	if grep -q no_dark "$body"; then fail "no warning of the run without the dark"; fi
+	# as if it had been there before
+	post_job "{\"scan\": \"SCAN\", $grid, $stages: 1}, \"emit\": [\"fdk\"]}"
+	wait_job succeeded
+	[ "$(digest fdk)" = "$fdk_digest" ] || fail "the bits of the FDK volume of the job that was posted afterwards"
+	[ "$(digest final)" = "$one_digest" ] || fail "the bits of the iteration of the job that was posted afterwards"
+}
+
 test_a_scan_that_is_broken_off_is_completed_with_what_is_there() {
 	fresh_daemon
 	local recipe="{\"scan\": \"SCAN\", $grid, \"fdk\": {}, \"sart\": {\"iterations\": 1, \"subsets\": 50}}" arrived short=$work/short

@@ -647,6 +647,76 @@ START_TEST(a_volume_of_a_job_that_waits_is_made_again_too)
 }
 END_TEST
 
+static int volumes_of(const char *id)
+{
+	struct volume_record *volumes;
+	struct error err = {0};
+	int count;
+
+	ck_assert_msg(store_job_volumes(state.store, id, &volumes, &count, &err) == 0, "%s", err.text);
+	free(volumes);
+	return count;
+}
+
+static int warnings_of(const char *id)
+{
+	struct warning_record *warnings;
+	struct error err = {0};
+	int count;
+
+	ck_assert_msg(store_job_warnings(state.store, id, &warnings, &count, &err) == 0, "%s", err.text);
+	free(warnings);
+	return count;
+}
+
+START_TEST(a_job_whose_scan_is_understood_otherwise_begins_anew)
+{
+	const struct volume_record fdk = {.name = "fdk", .stage = "fdk", .bytes = 1};
+	const struct job_change before = {.basis = 1}, later = {.basis = 3};
+	const struct job_change yielded = {.checkpoint = 1, .yielded = true};
+	struct job *job = state_post(&state, scan, "routine");
+	struct event_record *events;
+	struct job_record record;
+	struct error err = {0};
+	char id[ID_SIZE];
+	int count;
+
+	keep_id(job, id);
+	state_set(job, JOB_RUNNING, &before);
+	put_voxels(id, "fdk", "a");
+	path_fill(state_path(&state, "jobs/%s/checkpoint.f32", id));
+	ck_assert_int_eq(job_add_volume(job, &fdk, &err), 0);
+	ck_assert_int_eq(job_digest_volume(job, &fdk, &err), 0);
+	ck_assert_int_eq(job_add_warning(job, "no_dark", "none", &err), 0);
+	add_row(job, 1);
+	job_progress(job, STAGE_SART, 1, 0.5);
+	state_set(job, JOB_QUEUED, &yielded);
+	state_set(job, JOB_RUNNING, &before); /* nothing has changed */
+	job_record(job, &record);
+	ck_assert_int_eq(record.iteration, 1);
+	ck_assert_double_gt(record.fraction, 0);
+	ck_assert_int_eq(rows_of(id) + volumes_of(id) + warnings_of(id), 3);
+	state_set(job, JOB_QUEUED, &yielded);
+	job_release(job);
+	restart(); /* what it ran with is known over it */
+	job = find(id);
+	ck_assert_int_eq(rows_of(id) + volumes_of(id) + warnings_of(id), 3);
+	state_set(job, JOB_RUNNING, &later);
+	job_record(job, &record);
+	ck_assert_int_eq(record.iteration, 0);
+	ck_assert_int_eq(record.checkpoint, 0);
+	ck_assert_double_eq(record.fraction, 0);
+	ck_assert_int_eq(rows_of(id) + volumes_of(id) + warnings_of(id), 0);
+	ck_assert(!path_exists(state_path(&state, "jobs/%s/fdk.nii", id)));
+	add_row(job, 1); /* this one was never told */
+	ck_assert_int_eq(store_job_events(state.store, id, 0, 100, &events, &count, &err), 0);
+	for (int i = 0; i < count; i++)
+		ck_assert_str_eq(events[i].kind, i + 1 < count ? "state" : "progress");
+	event_records_free(events, count);
+	job_release(job);
+}
+END_TEST
+
 START_TEST(a_digest_that_was_not_made_before_a_restart_is_made_after_it)
 {
 	static const enum job_state states[] = {JOB_SUCCEEDED, JOB_CANCELLED, JOB_QUEUED};
@@ -811,6 +881,7 @@ Suite *job_suite(void)
 	tcase_add_test(tests, a_volume_whose_row_is_missing_is_made_again);
 	tcase_add_test(tests, a_volume_that_may_not_have_reached_the_disk_is_made_again);
 	tcase_add_test(tests, a_volume_of_a_job_that_waits_is_made_again_too);
+	tcase_add_test(tests, a_job_whose_scan_is_understood_otherwise_begins_anew);
 	tcase_add_test(tests, a_digest_that_was_not_made_before_a_restart_is_made_after_it);
 	tcase_add_test(tests, digests_come_for_what_is_told_to_be_on_the_disk);
 	tcase_add_test(tests, what_a_dead_worker_told_of_is_settled_for_it);
