@@ -118,6 +118,9 @@ void incomplete_detail(const struct scan_facts *facts, char ret_text[200])
 		 facts->received, facts->count);
 }
 
+const char no_flat_detail[] = "all projections are there, but no flat image, and the scan has no air value: its jobs "
+			      "wait for PUT /v1/scans/{scan}/flat";
+
 static void add_warning(cJSON *list, const char *code, const char *detail)
 {
 	cJSON *warning = cJSON_CreateObject();
@@ -136,6 +139,8 @@ static void add_scan_warnings(cJSON *document, const struct scan *scan, const st
 		incomplete_detail(facts, detail);
 		add_warning(warnings, "incomplete", detail);
 	}
+	if (facts->complete && !facts->convertible)
+		add_warning(warnings, "no_flat", no_flat_detail);
 	if (facts->damaged)
 		add_warning(warnings, "files-missing", "the file of the projections is not there at its full size");
 	cJSON_AddItemToObject(document, "warnings", warnings);

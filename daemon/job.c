@@ -30,6 +30,8 @@ struct job {
 	char id[ID_SIZE], scan[ID_SIZE];
 	bool fdk; /* it has FDK; known of waiting jobs */
 
+	bool warned; /* it was told that it waits for a flat image; the supervisor's own */
+
 	struct watch_list watchers;
 
 	/* Guarded by jobs->lock; all but the running job's progress is changed with jobs->change held too. */
@@ -455,7 +457,8 @@ static int change_state(struct job *job, enum job_state to, const struct job_cha
 	next_record(job, to, change, &record);
 	if (from == JOB_RUNNING && to == JOB_QUEUED)
 		past = PAST_REWINDS;
-	else if (from == JOB_QUEUED && to == JOB_RUNNING && basis != change->basis)
+	else if ((from == JOB_WAITING && to == JOB_QUEUED) ||
+		 (from == JOB_QUEUED && to == JOB_RUNNING && basis != change->basis))
 		past = PAST_GOES;
 	code = save_state(job->jobs, &record, past, err);
 	if (code != 0)
@@ -889,7 +892,12 @@ static int promote(struct jobs *jobs, struct job *job, struct error *err)
 		change = (struct job_change){.error_code = code, .error_text = why.text};
 		return job_set_state(job, JOB_FAILED, &change, err);
 	}
-	return facts.ready ? job_set_state(job, JOB_QUEUED, &change, err) : 0;
+	if (facts.ready)
+		return job_set_state(job, JOB_QUEUED, &change, err);
+	/* A full disk that has no room for it is no reason to queue no other job. */
+	if (facts.complete && !job->warned)
+		job->warned = job_add_warning(job, "no_flat", no_flat_detail, &why) == 0;
+	return 0;
 }
 
 /* References to all that wait and are not attended, oldest first; free the array. NULL when there are none. */
@@ -962,7 +970,7 @@ struct job *jobs_arriving(struct jobs *jobs, double since, bool *ret_arriving)
 		struct error err;
 
 		if (!one.job->fdk || store_scan_look(jobs->store, one.job->scan, &facts, &err) != 0 ||
-		    !facts.convertible)
+		    !facts.convertible || facts.complete)
 			continue;
 		one.arrived = facts.arrived;
 		one.arriving = facts.arrived > since;

@@ -120,11 +120,14 @@ struct job_change {
 /* ERR_CONFLICT when the table does not allow it; the caller's picture was old. change may be NULL. */
 int job_set_state(struct job *job, enum job_state to, const struct job_change *change, struct error *err);
 
-/* Waiting jobs whose scan has become ready go to the queue, but for those that are attended. */
+/*
+ * Waiting jobs whose scan has become ready go to the queue, but for those that are attended. Those that wait for
+ * nothing but a flat image warn of it ("no_flat") until then.
+ */
 int jobs_promote(struct jobs *jobs, struct error *err);
 /*
  * The waiting job that an idle worker should attend, or NULL: it has FDK, and its
- * projections can be converted. Those whose projections came after `since`
+ * projections can be converted and are not all there. Those whose projections came after `since`
  * (CLOCK_MONOTONIC) go first, the higher priority before the lower; then those
  * that came later. *ret_arriving: it is one of the former.
  */

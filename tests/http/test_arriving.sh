@@ -412,6 +412,36 @@ test_an_image_that_comes_while_the_job_runs() {
 	[ "$(digest final)" = "$one_digest" ] || fail "the bits of the iteration of the job that was posted afterwards"
 }
 
+test_counts_that_only_wait_for_a_flat_say_so() {
+	fresh_daemon
+	local end=$((SECONDS + 30))
+	post_scan "$raw_dir"
+	post_job "$fdk"
+	send "$raw_dir" 0 58
+	req GET "/v1/scans/$scan"
+	expect_json '.warnings | all(.code != "no_flat")'
+	send "$raw_dir" 59 59
+	req GET "/v1/scans/$scan"
+	expect_json '.state == "complete" and (.warnings | any(.code == "no_flat" and (.detail | test("flat"))))'
+	until req GET "/v1/jobs/$job" && [ "$(json '.warnings | length')" = 1 ]; do
+		[ $SECONDS -lt $end ] || fail "a warning of the job"
+	done
+	expect_json '.state == "waiting" and .warnings[0].code == "no_flat"'
+	# one that is posted now, and after a restart: once
+	post_job "$fdk"
+	stop_daemon
+	start_daemon
+	until req GET "/v1/jobs/$job" && [ "$(json '.warnings | length')" = 1 ]; do
+		[ $SECONDS -lt $end ] || fail "a warning of the job"
+	done
+	req PUT "/v1/scans/$scan/flat" -T "$raw_dir/flat.f32"
+	expect_status 201
+	wait_job succeeded
+	expect_json '[.warnings[].code] == ["no_dark"]'
+	req GET "/v1/scans/$scan"
+	expect_json '.warnings | all(.code != "no_flat")'
+}
+
 test_a_scan_that_is_broken_off_is_completed_with_what_is_there() {
 	fresh_daemon
 	local recipe="{\"scan\": \"SCAN\", $grid, \"fdk\": {}, \"sart\": {\"iterations\": 1, \"subsets\": 50}}" arrived short=$work/short
