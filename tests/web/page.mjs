@@ -81,6 +81,27 @@ test('a job appears in the list, runs and is cancelled, without a reload', async
 	await page.context().close()
 })
 
+test('of a job that begins anew another volume is shown until the chosen one is made again', async () => {
+	/* A scan of its own: its map of defects is there for good. */
+	const { detector, projections, geometry } = await api(`/v1/scans/${scan}`)
+	const own = await post('/v1/scans', { detector, projections, geometry })
+	for (let k = 0; k < projections.count; k++) {
+		const samples = await (await fetch(`${origin}/v1/scans/${scan}/projections/${k}`)).arrayBuffer()
+		await api(`/v1/scans/${own.id}/projections/${k}`, { method: 'PUT', body: samples })
+	}
+	const job = await post('/v1/jobs', { scan: own.id, grid: { size: [40, 40, 40], spacing_mm: [3, 3, 3] }, fdk: {}, sart: { iterations: 100000, subsets: 'views' },
+		emit: ['fdk', 60] })
+	const page = await open(browser, `/#/jobs/${job.id}`)
+	await until('the iteration', () => shownVolume(page), shown => shown === 'iter-60')
+	await page.uncheck('.iterations input[type=checkbox]')
+	await api(`/v1/scans/${own.id}/defects`, { method: 'PUT', body: new Uint8Array(detector.columns * detector.rows) })
+	await until('the FDK volume in its place', () => shownVolume(page), shown => shown === 'fdk')
+	expect(await page.locator('.notice.bad:visible').count() === 0, 'no trouble')
+	await api(`/v1/jobs/${job.id}`, { method: 'DELETE' })
+	await ended(job.id)
+	await page.context().close()
+})
+
 /* ---- pictures ---- */
 
 const half = 6 /* voxels off the middle, where the solid has no mirror plane */

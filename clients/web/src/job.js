@@ -156,7 +156,8 @@ export class JobPage {
 			const job = await get(jobPath(this.id), this.#abort.signal)
 			const before = this.#job
 			this.#job = job
-			if (this.#scan === null || (this.#scan.state !== 'complete' && !ended(job)))
+			/* Of a complete one the warnings still change with the image that a job waits for. */
+			if (this.#scan === null || ((this.#scan.state !== 'complete' || before?.state === 'waiting') && !ended(job)))
 				this.#scan = await get(scanPath(job.scan), this.#abort.signal)
 			this.trouble.hidden = true
 			this.#showJob(before)
@@ -267,7 +268,8 @@ export class JobPage {
 		const first = this.#selected === null
 		if (first)
 			this.#firstWindow(volumes[0])
-		this.#show(this.#follow || first ? volumes.at(-1).name : this.#selected)
+		/* A job that begins anew has not made the selected one again yet. */
+		this.#show(this.#follow || this.#index() < 0 ? volumes.at(-1).name : this.#selected)
 		this.#listOthers()
 		this.#showFiles()
 	}
