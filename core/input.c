@@ -7,6 +7,8 @@
 
 /* Air regions that differ by more than this tell of a tube or a detector that drifts. */
 static const double DRIFT = 0.05;
+/* Of the flat: below it something stands before the air region, in all views alike where they do not differ. */
+static const double FAINT = 0.7;
 
 static int check(const struct linearise *linearise, const struct geometry *geometry, struct error *err)
 {
@@ -112,11 +114,12 @@ static void warn_of_air(const struct input *input, const struct recon_hooks *hoo
 		    hooks, "air_region",
 		    "the air region has no good pixel in %d projections: those are taken against the flat as they are",
 		    input->counts.no_air);
-	if (least > 0 && most > (1 + DRIFT) * least)
+	if (least > 0 && (most > (1 + DRIFT) * least || least < FAINT))
 		recon_warn(
 		    hooks, "air_region",
 		    "the air region lies between %.4g and %.4g of the flat; each projection was held against its own%s",
-		    least, most, most > 2 * least ? ". That is more than a tube drifts: is the object in it?" : "");
+		    least, most,
+		    most > 2 * least || least < FAINT ? ". That is more than a tube drifts: is the object in it?" : "");
 }
 
 void input_warn(const struct input *input, const struct geometry *geometry, const struct recon_hooks *hooks)

@@ -233,6 +233,44 @@ START_TEST(an_air_region_without_a_good_pixel_is_told)
 }
 END_TEST
 
+/*
+ * A cylinder about the axis is the same in all views: in its shadow nothing
+ * drifts, and all of the volume is too low. A tube at 80 % is none of that.
+ */
+START_TEST(an_object_in_the_air_region_is_told)
+{
+	struct ellipsoid cylinder = {.shape = SHAPE_CYLINDER, .semi_axes = {36, 36, 200}, .density = 0.02};
+	struct phantom phantom = {.count = 1, .parts = &cylinder};
+	struct recipe recipe = recipe_of(false);
+	const bool inside = _i == 0;
+	struct outcome outcome = {0};
+	struct scene scene;
+	float *samples = malloc(sizeof(float) * PIXELS * VIEWS);
+
+	scene_orbit(&scene, &orbit);
+	scene_add(&scene, &phantom);
+	for (int i = 0; i < PIXELS * VIEWS; i++)
+		samples[i] = (float)((inside ? 50000 : 40000) * exp(-(double)scene.projections[i]));
+	outcome.samples = samples;
+	outcome.linearise =
+	    (struct linearise){.sample = SAMPLE_FLOAT32,
+			       .quantity = QUANTITY_INTENSITY,
+			       .air = 50000,
+			       .has_air_region = true,
+			       .air_region = {inside ? COLUMNS / 2 - 5 : 0, 0, inside ? COLUMNS / 2 + 4 : 3, ROWS - 1}};
+	run(&scene, &recipe, &outcome);
+	if (inside)
+		ck_assert_msg(strstr(outcome.warnings, "air_region: the air region lies between 0.") != NULL &&
+				  strstr(outcome.warnings, "is the object in it?") != NULL,
+			      "%s", outcome.warnings);
+	else
+		ck_assert_str_eq(outcome.warnings, "");
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(samples);
+}
+END_TEST
+
 /* Of 90 views every 30th: as air they would take 3 % away. */
 START_TEST(a_blank_view_is_told_and_is_not_air)
 {
@@ -482,6 +520,7 @@ Suite *raw_suite(void)
 	tcase_add_test(volumes, raw_counts_give_the_volume_of_their_line_integrals);
 	tcase_add_test(volumes, gain_drift_and_hardening_leave_no_trace);
 	tcase_add_test(volumes, an_air_region_without_a_good_pixel_is_told);
+	tcase_add_loop_test(volumes, an_object_in_the_air_region_is_told, 0, 2);
 	tcase_add_loop_test(volumes, a_blank_view_is_told_and_is_not_air, 0, 2);
 	tcase_add_test(volumes, measured_counts_are_what_their_publishers_say);
 	suite_add_tcase(suite, volumes);
