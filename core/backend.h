@@ -1,6 +1,7 @@
 #ifndef CBCT_CORE_BACKEND_H
 #define CBCT_CORE_BACKEND_H
 
+#include <math.h>
 #include <stdbool.h>
 #include <stddef.h>
 #include "core/error.h"
@@ -69,6 +70,13 @@ struct linearise {
 	int hardening_count;
 };
 enum { HARDENING_MOST = 8 }; /* coefficients */
+/* From which on a sample says nothing. */
+static inline float linearise_saturation(const struct linearise *linearise)
+{
+	if (linearise->saturation > 0)
+		return (float)linearise->saturation;
+	return linearise->sample == SAMPLE_UINT16 ? 65535.0f : INFINITY;
+}
 
 /* What linearise met, added up and never reset. A pixel counts once, in the first row that fits. */
 struct defect_counts {

@@ -20,13 +20,6 @@ static float sample_at(const struct linearise *options, const void *samples, siz
 	return options->sample == SAMPLE_UINT16 ? ((const uint16_t *)samples)[at] : ((const float *)samples)[at];
 }
 
-static float saturation_of(const struct linearise *options)
-{
-	if (options->saturation > 0)
-		return (float)options->saturation;
-	return options->sample == SAMPLE_UINT16 ? 65535 : INFINITY;
-}
-
 /* (I - dark) / (flat - dark); anything for a defect. */
 static enum kind transmission(const struct linearise *options, float sample, size_t at, float saturation, float *ret)
 {
@@ -73,7 +66,7 @@ static double air_of(const struct plan *plan, const void *samples)
 {
 	const struct linearise *options = &plan->linearise;
 	const int *region = options->air_region;
-	const float saturation = saturation_of(options);
+	const float saturation = linearise_saturation(options);
 	double sum = 0;
 	size_t good = 0;
 
@@ -98,7 +91,7 @@ static void linearise_rows(struct plan *plan, const void *samples, int row, int 
 			   size_t kinds[KIND_COUNT])
 {
 	const struct linearise *options = &plan->linearise;
-	const float saturation = saturation_of(options);
+	const float saturation = linearise_saturation(options);
 	const size_t rows = (size_t)plan->rows;
 
 	for (int column = 0; column < plan->columns; column++) {

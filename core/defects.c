@@ -146,9 +146,7 @@ static int examine(const struct linearise *linearise, int columns, int rows, str
 	    .linearise = linearise,
 	    .columns = columns,
 	    .rows = rows,
-	    .saturation = linearise->saturation > 0            ? (float)linearise->saturation
-			  : linearise->sample == SAMPLE_UINT16 ? 65535
-							       : INFINITY,
+	    .saturation = linearise_saturation(linearise),
 	    .range = floats,
 	    .dark = floats + pixels,
 	    .range_median = floats + 2 * pixels,

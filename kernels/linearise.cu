@@ -191,7 +191,7 @@ static samples samples_make(const struct plan *plan)
 	s.is_uint16 = options->sample == SAMPLE_UINT16;
 	s.is_intensity = options->quantity == QUANTITY_INTENSITY;
 	s.air = (float)options->air;
-	s.saturation = options->saturation > 0 ? (float)options->saturation : s.is_uint16 ? 65535.0f : INFINITY;
+	s.saturation = linearise_saturation(options);
 	s.flat = plan->flat;
 	s.dark = plan->dark;
 	s.defects = plan->map;

@@ -691,6 +691,16 @@ static void warn_hardening(cJSON *list, const struct scan *scan)
 	}
 }
 
+static void warn_air(cJSON *list, const struct scan *scan)
+{
+	const struct linearise linearise = scan_linearise(scan);
+	const double saturation = (double)linearise_saturation(&linearise);
+
+	if (scan->air > 0 && scan->air >= saturation)
+		warn(list, "air_saturated", "air is %.6g, not below the saturation at %.6g: all of it are defects",
+		     scan->air, saturation);
+}
+
 cJSON *scan_warnings(const struct scan *scan)
 {
 	const struct orbit *orbit = &scan->orbit;
@@ -706,8 +716,6 @@ cJSON *scan_warnings(const struct scan *scan)
 	warn_uneven_distances(list, &scan->geometry);
 	warn_mirrored(list, &scan->geometry);
 	warn_hardening(list, scan);
-	if (scan->air > 0 && scan->saturation > 0 && scan->air >= scan->saturation)
-		warn(list, "air_saturated", "air is %.6g, not below the saturation at %.6g: all of it are defects",
-		     scan->air, scan->saturation);
+	warn_air(list, scan);
 	return list;
 }
