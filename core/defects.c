@@ -169,6 +169,7 @@ int defect_map_make(struct defect_map *ret_map, const struct linearise *linearis
 		    struct error *err)
 {
 	const size_t pixels = (size_t)columns * (size_t)rows;
+	size_t all;
 	const bool images =
 	    linearise->quantity == QUANTITY_INTENSITY && (linearise->flat != NULL || linearise->dark != NULL);
 	struct defect_map map = {0};
@@ -187,7 +188,13 @@ int defect_map_make(struct defect_map *ret_map, const struct linearise *linearis
 	}
 	if (images)
 		code = examine(linearise, columns, rows, &map, err);
-	if (code < 0 || map.given + map.dead + map.hot + map.noisy == 0)
+	all = map.given + map.dead + map.hot + map.noisy;
+	if (code == 0 && 2 * all > pixels)
+		code = error_set(err, ERR_IMPOSSIBLE,
+				 "%.3g %% of the pixels are defects, half of them can be at most: %zu of the given "
+				 "map, and %zu dead, %zu hot and %zu noisy ones that the flat and dark images show",
+				 100 * (double)all / (double)pixels, map.given, map.dead, map.hot, map.noisy);
+	if (code < 0 || all == 0)
 		defect_map_clear(&map);
 	if (code == 0)
 		*ret_map = map;

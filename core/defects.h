@@ -17,8 +17,8 @@
  *   dead   the range below half of its neighbourhood's
  *
  * A pixel counts once, in the first row that fits of: noisy by value, hot, dead,
- * noisy. Gain alone makes no defect: that is what the flat is for. Where the
- * neighbourhood's range is below 2 % of the widest one (outside of a collimator)
+ * noisy. Gain between those bounds makes no defect: that is what the flat is for.
+ * Where the neighbourhood's range is below 2 % of the widest one (outside of a collimator)
  * nothing is found, and linearise takes each sample for what it is.
  */
 struct defect_map {
@@ -28,7 +28,8 @@ struct defect_map {
 
 /*
  * From linearise's flat, dark, air, saturation and defects. ERR_IMPOSSIBLE where the flat is not above the dark in
- * most of the pixels. Line integrals have no flat: only the given map counts then. Free with defect_map_clear.
+ * most of the pixels, or most are defects: what is made up then is no projection. Line integrals have no flat: only the
+ * given map counts then. Free with defect_map_clear.
  */
 int defect_map_make(struct defect_map *ret_map, const struct linearise *linearise, int columns, int rows,
 		    struct error *err);

@@ -440,6 +440,39 @@ START_TEST(exchanged_images_are_refused)
 }
 END_TEST
 
+/* Columns of unlike gain that no median has in common, or a map of nearly all: made up, not measured. */
+START_TEST(a_detector_of_defects_is_refused)
+{
+	struct counts *counts = malloc(sizeof(*counts));
+	struct recipe recipe = recipe_of(false);
+	struct outcome outcome = {0};
+	struct scene scene;
+
+	make_scene(&scene);
+	make_counts(&scene, counts);
+	for (int i = 0; i < PIXELS; i++) {
+		const float gain = _i == 0 && i % 2 ? 0.43f : 1;
+
+		counts->flat[i] = counts->dark[i] + gain * (counts->flat[i] - counts->dark[i]);
+		counts->map[i] = _i == 1 && i % COLUMNS % 36 != 0;
+	}
+	outcome.samples = counts->samples;
+	outcome.linearise = (struct linearise){.sample = SAMPLE_FLOAT32,
+					       .quantity = QUANTITY_INTENSITY,
+					       .flat = counts->flat,
+					       .dark = counts->dark,
+					       .defects = counts->map};
+	scene_run(&scene, &recipe, &outcome);
+	ck_assert_int_eq(outcome.code, ERR_IMPOSSIBLE);
+	ck_assert_msg(strstr(outcome.err.text, "% of the pixels are defects, half of them can be at most: ") != NULL,
+		      "%s", outcome.err.text);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(counts->samples);
+	free(counts);
+}
+END_TEST
+
 /* ---- a detector's own counts ---- */
 
 /*
@@ -527,6 +560,7 @@ Suite *raw_suite(void)
 	tcase_add_test(images, defects_are_found_in_flat_and_dark);
 	tcase_add_test(images, the_shadow_of_a_collimator_is_no_defect);
 	tcase_add_test(images, exchanged_images_are_refused);
+	tcase_add_loop_test(images, a_detector_of_defects_is_refused, 0, 2);
 	suite_add_tcase(suite, images);
 	return suite;
 }
