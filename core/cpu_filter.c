@@ -29,6 +29,7 @@ struct filter_engine {
 	int pad, wide;                   /* zero columns before column 0; columns of a filtered row */
 	int extend;                      /* columns that truncated rows get on either side */
 	bool sides[2];                   /* that may be extended */
+	float *levels;                   /* [view] extend_level, or NULL without extend */
 	struct transform plain, extended;
 	kiss_fft_cpx *buffers; /* [threads][2][PAIRS][stride] */
 	size_t stride;
@@ -64,7 +65,8 @@ size_t filter_engine_bytes(const struct plan_options *options, int threads)
 	size_t bytes = sizeof(struct filter_engine) + transform_bytes(filter_length(wide));
 
 	if (options->extend > 0)
-		bytes += transform_bytes(filter_length(wide + options->extend));
+		bytes += transform_bytes(filter_length(wide + options->extend)) +
+			 (size_t)options->geometry->count * sizeof(float);
 	return bytes + buffers_count(options, threads) * sizeof(kiss_fft_cpx);
 }
 
@@ -111,7 +113,9 @@ int filter_engine_new(const struct plan_options *options, int threads, struct fi
 		code = transform_new(filter_length(wide + engine->extend), options->extended_response,
 				     &engine->extended, err);
 	engine->buffers = calloc(buffers_count(options, threads), sizeof(kiss_fft_cpx));
-	if (code == 0 && engine->buffers == NULL)
+	if (engine->extend > 0)
+		engine->levels = malloc((size_t)options->geometry->count * sizeof(float));
+	if (code == 0 && (engine->buffers == NULL || (engine->extend > 0 && engine->levels == NULL)))
 		code = error_set(err, ERR_NO_MEMORY, "no memory for the buffers of the ramp filter");
 	if (code < 0) {
 		filter_engine_free(engine);
@@ -128,6 +132,7 @@ void filter_engine_free(struct filter_engine *engine)
 	transform_clear(&engine->plain);
 	transform_clear(&engine->extended);
 	free(engine->buffers);
+	free(engine->levels);
 	free(engine);
 }
 
@@ -162,6 +167,7 @@ struct rows {
 	const float *view;
 	int columns, rows;
 	int first, count;
+	float level; /* of the view */
 };
 
 /* What each row of a group has before column 0 and behind the last one. */
@@ -178,26 +184,19 @@ static const float *at_edge(const struct rows *rows, int side, int i)
 	return rows->view + (size_t)column * (size_t)rows->rows + (size_t)rows->first;
 }
 
-/* Which rows are not air at an edge; returns whether any is. */
+/* Which rows are cut off at an edge; returns whether any is. */
 static bool find_truncated(const struct filter_engine *engine, const struct rows *rows, struct extensions *ret)
 {
-	const int edge = extend_edge(rows->columns);
 	bool any = false;
 
 	memset(ret->truncated, 0, sizeof(ret->truncated));
-	for (int side = 0; side < 2; side++) {
-		float sums[ROWS] = {0};
-
-		if (!engine->sides[side])
-			continue;
-		for (int i = 0; i < edge; i++)
-			for (int r = 0; r < rows->count; r++)
-				sums[r] += at_edge(rows, side, i)[r];
-		for (int r = 0; r < rows->count; r++) {
-			ret->truncated[side][r] = sums[r] >= EXTEND_LEVEL * (float)edge;
+	for (int side = 0; side < 2; side++)
+		for (int r = 0; r < rows->count && engine->sides[side]; r++) {
+			ret->truncated[side][r] =
+			    extend_is_cut(at_edge(rows, side, 0) + r, side == 0 ? rows->rows : -rows->rows,
+					  rows->columns, rows->level);
 			any = any || ret->truncated[side][r];
 		}
-	}
 	return any;
 }
 
@@ -210,7 +209,7 @@ static void fit_extensions(const struct filter_engine *engine, const struct rows
 		const double x = extend_x(c, rows->columns);
 
 		for (int r = 0; r < rows->count; r++)
-			if (values[r] >= EXTEND_LEVEL)
+			if (values[r] >= rows->level)
 				extend_row_add(&sums[r], x, (double)values[r]);
 	}
 	for (int side = 0; side < 2; side++) {
@@ -329,6 +328,18 @@ static void filter_rows(const struct filter_engine *engine, int view, const stru
 	}
 }
 
+static void find_levels(struct plan *plan, const struct stack *from, const int *slots, const int *views, int count)
+{
+	const size_t rows = (size_t)plan->rows;
+
+#pragma omp parallel for num_threads(plan->device->threads)
+	for (int i = 0; i < count; i++) {
+		const float *view = stack_slot(from, slots != NULL ? slots[i] : views[i]);
+
+		plan->filter->levels[views[i]] = extend_level(extend_largest(view, plan->columns, plan->rows, rows, 1));
+	}
+}
+
 int cpu_filter(struct plan *plan, const struct stack *from, const int *slots, const int *views, int count,
 	       struct stack *to, struct error *err)
 {
@@ -342,6 +353,8 @@ int cpu_filter(struct plan *plan, const struct stack *from, const int *slots, co
 		return error_set(err, ERR_INTERNAL, "%d columns to filter into instead of %d", to->columns, plan->wide);
 	if (count > to->slots)
 		return error_set(err, ERR_INTERNAL, "%d views to filter into a stack of %d slots", count, to->slots);
+	if (engine->extend > 0)
+		find_levels(plan, from, slots, views, count);
 #pragma omp parallel for num_threads(plan->device->threads) schedule(dynamic) reduction(+ : extended[:2])
 	for (int job = 0; job < count * blocks; job++) {
 		const int i = job / blocks, row = job % blocks * ROWS, left = plan->rows - row;
@@ -351,6 +364,7 @@ int cpu_filter(struct plan *plan, const struct stack *from, const int *slots, co
 		    .rows = plan->rows,
 		    .first = row,
 		    .count = left < ROWS ? left : ROWS,
+		    .level = engine->extend > 0 ? engine->levels[views[i]] : 0,
 		};
 
 		filter_rows(engine, views[i], &rows, to->data + (size_t)i * (size_t)plan->wide * (size_t)plan->rows,

@@ -20,15 +20,26 @@
  * mirrored rows of Ohnesorge et al. 2000 over half of the row's width, 15 with
  * water's curvature and 3 with this; of an object two thirds larger: 709, 67, 7 and 13.
  *
- * A row is looked at by itself, at either side, before any weight: the same on
- * every backend and for views in any order. A side where FDK pads the detector
- * (plan_options.pad, displaced) is never extended: its weights end in 0. The
- * extension gets the weight of the outermost column and its own cosine.
+ * A side is cut off where the mean of its outermost columns is
+ *
+ *   not air     EXTEND_SHARE, 5 %, of the photons, above the drift of a tube, or of
+ *               the largest p of the view where that is below 1: the rows of a body
+ *               that is cut off have more than a tenth of it there;
+ *   not chance  three times the deviation that noise gives to that mean, noise as
+ *               the second differences of the columns beside the edge tell it.
+ *
+ * So an object of any p is extended alike: an abdomen whose largest p is 4, or
+ * 0.0004, is right by 6 HU, by 169 without. Nothing but the view has a part in it,
+ * before any weight: the same on every backend and for views in any order. A side
+ * where FDK pads the detector (plan_options.pad, displaced) is never extended: its
+ * weights end in 0. The extension gets the weight of the outermost column and its
+ * own cosine.
  *
  * Also read by nvcc: no libc but sqrt.
  */
 #include <math.h>
 #include <stdbool.h>
+#include <stddef.h>
 
 #ifdef __CUDACC__
 #define EXTEND_INLINE static __host__ __device__ inline
@@ -36,15 +47,19 @@
 #define EXTEND_INLINE static inline
 #endif
 
-/* Mean line integral at an edge from which on it is not air: 3 % of the photons, above the drift of a tube. */
+/* Mean line integral of rays that are not air, 3 % of the photons: for those who have no view at hand. */
 #define EXTEND_LEVEL 0.03f
 
-/* Columns at an edge whose mean decides, and those that a and b are fitted to. */
+#define EXTEND_SHARE 0.05f
+
+/* Columns at an edge whose mean decides, an eighth of all at most, and those that a and b are fitted to. */
 EXTEND_INLINE int extend_edge(int columns)
 {
-	int edge = columns / 64 > 4 ? columns / 64 : 4;
+	int edge = columns < 32 ? columns / 8 : 4;
 
-	return edge < columns ? edge : columns;
+	if (edge < 1)
+		edge = 1;
+	return columns / 64 > edge ? columns / 64 : edge;
 }
 EXTEND_INLINE int extend_window(int columns)
 {
@@ -53,13 +68,57 @@ EXTEND_INLINE int extend_window(int columns)
 	return window < columns ? window : columns;
 }
 
+/* The view's largest p is that of about 64 x 64 of its rays: of every so many columns and rows. */
+EXTEND_INLINE int extend_stride(int count)
+{
+	return count > 64 ? count / 64 : 1;
+}
+EXTEND_INLINE float extend_largest(const float *view, int columns, int rows, size_t column_step, size_t row_step)
+{
+	float largest = 0;
+
+	for (int r = 0; r < rows; r += extend_stride(rows))
+		for (int c = 0; c < columns; c += extend_stride(columns))
+			largest = fmaxf(largest, view[(size_t)c * column_step + (size_t)r * row_step]);
+	return largest;
+}
+/* What is not air in a view. */
+EXTEND_INLINE float extend_level(float largest)
+{
+	return EXTEND_SHARE * (largest < 1 ? largest : 1);
+}
+/* From the sum over the edge and that of squared second differences, six times the noise's variance each. */
+EXTEND_INLINE bool extend_is_chance(int columns, double sum, double bends)
+{
+	const int window = extend_window(columns);
+
+	return window > 2 && 6 * (window - 2) * sum * sum < 9 * extend_edge(columns) * bends;
+}
+/* A side of a row by its outermost column and the way from one to the next. */
+EXTEND_INLINE bool extend_is_cut(const float *p, ptrdiff_t step, int columns, float level)
+{
+	const int edge = extend_edge(columns), window = extend_window(columns);
+	double sum = 0, bends = 0;
+
+	for (int i = 0; i < edge; i++)
+		sum += (double)p[i * step];
+	if (!(sum > 0) || sum < (double)level * edge)
+		return false;
+	for (int i = 1; i < window - 1; i++) {
+		const double bend = (double)p[(i - 1) * step] - 2 * (double)p[i * step] + (double)p[(i + 1) * step];
+
+		bends += bend * bend;
+	}
+	return !extend_is_chance(columns, sum, bends);
+}
+
 /* x of a column in the fit of c, -1/2 .. 1/2. */
 EXTEND_INLINE double extend_x(int column, int columns)
 {
 	return ((double)column - 0.5 * (columns - 1)) / columns;
 }
 
-/* Over the columns of a row with p >= EXTEND_LEVEL, y = p^2. */
+/* Over the columns of a row with p >= extend_level, y = p^2. */
 struct extend_row_sums {
 	double n, x, x2, x3, x4, y, xy, x2y;
 };

@@ -217,20 +217,16 @@ static int parts_linearise(struct plan *plan, const void *samples, int count, co
 static void count_extended(const struct plan *plan, const float *projection, size_t counts[2])
 {
 	const struct plan_options *options = &plan->options;
-	const int columns = options->geometry->columns, edge = extend_edge(columns);
+	const int columns = options->geometry->columns, rows = options->geometry->rows;
+	const float level = extend_level(extend_largest(projection, columns, rows, 1, (size_t)columns));
 	size_t before = 0, behind = 0;
 
 #pragma omp parallel for schedule(static) reduction(+ : before, behind)
-	for (int row = 0; row < options->geometry->rows; row++) {
+	for (int row = 0; row < rows; row++) {
 		const float *p = projection + (size_t)row * (size_t)columns;
-		float sums[2] = {0};
 
-		for (int i = 0; i < edge; i++) {
-			sums[0] += p[i];
-			sums[1] += p[columns - 1 - i];
-		}
-		before += options->pad[0] == 0 && sums[0] >= EXTEND_LEVEL * (float)edge;
-		behind += options->pad[1] == 0 && sums[1] >= EXTEND_LEVEL * (float)edge;
+		before += options->pad[0] == 0 && extend_is_cut(p, 1, columns, level);
+		behind += options->pad[1] == 0 && extend_is_cut(p + columns - 1, -1, columns, level);
 	}
 	counts[0] += before;
 	counts[1] += behind;

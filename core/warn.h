@@ -14,8 +14,8 @@ __attribute__((format(printf, 3, 4))) void recon_warn(const struct recon_hooks *
 /* "grid_unseen", "tv_without_sart", "arc_too_short". */
 void warn_recipe(const struct recon_hooks *hooks, const struct geometry *geometry, const struct recipe *recipe,
 		 const struct orbit *orbit);
-/* "truncated": rows[0] rows of all views were cut off at the first column, rows[1] at the last; none: nothing is told.
- */
+/* "truncated": rows[0] rows of all views were cut off at the first column, rows[1] at the last; of a few nothing is
+ * told. */
 void warn_truncated(const struct recon_hooks *hooks, const struct geometry *geometry, const size_t rows[2], int extend);
 /* "outside_grid": so many rows count something that lies outside of the grid; none: nothing is told. */
 void warn_outside(const struct recon_hooks *hooks, const struct geometry *geometry, size_t rows);

@@ -43,6 +43,7 @@ struct fft {
 
 /* What is found at the edges of a batch's rows: [slot of the batch][row]. */
 struct edges {
+	float *levels;        /* [slot of the batch] what is not air */
 	unsigned char *sides; /* bit 0: cut off before column 0, bit 1: behind the last one */
 	struct extension (*fit)[2];
 	int *list; /* rows with any */
@@ -212,7 +213,7 @@ static __global__ void __launch_bounds__(32 * HALF * PAIRS) filter_fused(const f
 
 /* ---- edges ---- */
 
-enum { EDGE_THREADS = 64 };
+enum { EDGE_THREADS = 64, LEVEL_THREADS = 256 };
 struct batch_slots {
 	int slot[BATCH_MOST];
 };
@@ -232,6 +233,31 @@ static __device__ double sum_block(double value, double *shared)
 	return sum;
 }
 
+/* A block has one view. */
+static __global__ void __launch_bounds__(LEVEL_THREADS)
+    find_levels(const filter_job job, const batch_slots slots, float *levels)
+{
+	__shared__ float shared[LEVEL_THREADS];
+	const float *p = job.from + (size_t)slots.slot[blockIdx.x] * job.slot;
+	int column_stride = extend_stride(job.columns), row_stride = extend_stride(job.rows);
+	int columns = (job.columns - 1) / column_stride + 1, rows = (job.rows - 1) / row_stride + 1;
+	float largest = 0;
+
+	for (int i = threadIdx.x; i < columns * rows; i += LEVEL_THREADS) {
+		int row = i / columns * row_stride, column = i % columns * column_stride;
+
+		largest = fmaxf(largest, p[(size_t)row * job.pitch + column]);
+	}
+	shared[threadIdx.x] = largest;
+	for (int half = LEVEL_THREADS / 2; half > 0; half /= 2) {
+		__syncthreads();
+		if (threadIdx.x < half)
+			shared[threadIdx.x] = fmaxf(shared[threadIdx.x], shared[threadIdx.x + half]);
+	}
+	if (threadIdx.x == 0)
+		levels[blockIdx.x] = extend_level(shared[0]);
+}
+
 /* A block has one row; most rows end in air at both sides and cost no more than a look there. */
 static __global__ void __launch_bounds__(EDGE_THREADS)
     find_edges(const filter_job job, const batch_slots slots, bool before, bool behind, edges found)
@@ -240,15 +266,24 @@ static __global__ void __launch_bounds__(EDGE_THREADS)
 	int row = blockIdx.x, columns = job.columns, edge = extend_edge(columns), window = extend_window(columns);
 	const float *p = job.from + (size_t)slots.slot[blockIdx.y] * job.slot + (size_t)row * job.pitch;
 	size_t at = (size_t)blockIdx.y * job.rows + row;
+	const float level = found.levels[blockIdx.y];
 	int sides = 0;
 
 	for (int side = 0; side < 2; side++) {
-		double sum = 0;
+		double sum = 0, bends = 0;
 
 		for (int i = threadIdx.x; i < edge; i += EDGE_THREADS)
 			sum += (double)p[side == 0 ? i : columns - 1 - i];
 		sum = sum_block(sum, shared);
-		if ((side == 0 ? before : behind) && sum >= (double)(EXTEND_LEVEL * (float)edge))
+		if (!(side == 0 ? before : behind) || !(sum > 0) || sum < (double)level * edge)
+			continue;
+		for (int i = threadIdx.x + 1; i < window - 1; i += EDGE_THREADS) {
+			const float *middle = p + (side == 0 ? i : columns - 1 - i);
+			double bend = (double)middle[-1] - 2 * (double)middle[0] + (double)middle[1];
+
+			bends += bend * bend;
+		}
+		if (!extend_is_chance(columns, sum, sum_block(bends, shared)))
 			sides |= 1 << side;
 	}
 	if (threadIdx.x == 0)
@@ -257,7 +292,7 @@ static __global__ void __launch_bounds__(EDGE_THREADS)
 		return;
 	struct extend_row_sums own = {}, row_sums;
 	for (int c = threadIdx.x; c < columns; c += EDGE_THREADS)
-		if (p[c] >= EXTEND_LEVEL)
+		if (p[c] >= level)
 			extend_row_add(&own, extend_x(c, columns), (double)p[c]);
 	row_sums.n = sum_block(own.n, shared);
 	row_sums.x = sum_block(own.x, shared);
@@ -413,7 +448,7 @@ size_t filter_bytes(const struct plan_shape *shape, int rows)
 		bytes = fft_bytes(shape->fft_length, (int)all);
 	if (shape->extended_length > 0)
 		bytes += fft_bytes(shape->extended_length, (int)all) +
-			 all * (1 + 2 * sizeof(struct extension) + sizeof(int));
+			 all * (1 + 2 * sizeof(struct extension) + sizeof(int)) + (size_t)shape->batch * sizeof(float);
 	return bytes;
 }
 
@@ -541,15 +576,17 @@ static int prepare_edges(struct plan *plan, struct error *err)
 	if (edges->sides_host == NULL || edges->list_host == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for the edges of %zu rows", rows);
 	CUDA_TRY(cudaEventCreateWithFlags(&edges->used, cudaEventDisableTiming));
+	TRY(device_allocate(plan->device, (size_t)plan->shape.batch * sizeof(float), (void **)&edges->levels, err));
 	TRY(device_allocate(plan->device, rows, (void **)&edges->sides, err));
 	TRY(device_allocate(plan->device, rows * sizeof(*edges->fit), (void **)&edges->fit, err));
 	return device_allocate(plan->device, rows * sizeof(int), (void **)&edges->list, err);
 }
 
-static void edges_free(struct device *device, struct edges *edges)
+static void edges_free(struct device *device, struct edges *edges, int batch)
 {
 	if (edges == NULL)
 		return;
+	device_release(device, edges->levels, (size_t)batch * sizeof(float));
 	device_release(device, edges->sides, (size_t)edges->rows);
 	device_release(device, edges->fit, (size_t)edges->rows * sizeof(*edges->fit));
 	device_release(device, edges->list, (size_t)edges->rows * sizeof(int));
@@ -586,7 +623,7 @@ void filter_release(struct plan *plan)
 	device_release(plan->device, plan->twiddles, (length + 256) * sizeof(float2));
 	fft_free(plan->device, plan->fft);
 	fft_free(plan->device, plan->extended);
-	edges_free(plan->device, plan->edges);
+	edges_free(plan->device, plan->edges, plan->shape.batch);
 }
 
 template <int HALF>
@@ -674,6 +711,8 @@ static int look_at_edges(struct plan *plan, const filter_job &job, const int *sl
 		batch.slot[i] = slots[i];
 	TRY(begin_arrival(plan->device, there, err));
 	TRY(begin_arrival(plan->device, edges->used, err));
+	find_levels<<<job.count, LEVEL_THREADS, 0, stream>>>(job, batch, edges->levels);
+	LAUNCHED();
 	find_edges<<<dim3(job.rows, job.count), EDGE_THREADS, 0, stream>>>(job, batch, pad[0] == 0, pad[1] == 0,
 									   *edges);
 	LAUNCHED();

@@ -209,20 +209,42 @@ static double curvature(const double *x, const double *y, int count)
 	return norm > 1e-6 ? along / norm : 0;
 }
 
-/* One side of a row by the words of core/extend.h; false: it ends in air. */
-static bool extend_row(const float *row, int columns, int extend, bool behind, double *ret)
+double reference_not_air(const float *view, size_t pixels)
+{
+	double largest = 0;
+
+	for (size_t i = 0; i < pixels; i++)
+		largest = fmax(largest, (double)view[i]);
+	return 0.05 * fmin(largest, 1);
+}
+
+bool reference_is_cut(const float *row, int columns, bool behind, double not_air)
 {
 	const int edge = columns / 64 > 4 ? columns / 64 : 4, window = columns / 16 > 4 ? columns / 16 : 4;
-	double *x = calloc((size_t)columns, sizeof(double)), *y = calloc((size_t)columns, sizeof(double));
-	double level = 0, mean = 0, mean_x = 0, c, a, b = 0, xx = 0, xy = 0, first = 0;
-	int count = 0;
+	double mean = 0, square = 0;
 
 	for (int i = 0; i < edge; i++)
-		level += (double)row[behind ? columns - 1 - i : i] / edge;
+		mean += (double)row[behind ? columns - 1 - i : i] / edge;
+	for (int i = 0; i < window - 2; i++) {
+		const float *at = row + (behind ? columns - 3 - i : i);
+
+		square += pow((double)at[0] - 2 * (double)at[1] + (double)at[2], 2) / (window - 2);
+	}
+	return mean > 0 && mean >= not_air && mean >= 3 * sqrt(square / 6 / edge);
+}
+
+/* One side of a row by the words of core/extend.h; false: it ends in air. */
+static bool extend_row(const float *row, int columns, int extend, bool behind, double not_air, double *ret)
+{
+	const int window = columns / 16 > 4 ? columns / 16 : 4;
+	double *x = calloc((size_t)columns, sizeof(double)), *y = calloc((size_t)columns, sizeof(double));
+	double mean = 0, mean_x = 0, c, a, b = 0, xx = 0, xy = 0, first = 0;
+	int count = 0;
+
 	for (int i = 0; i < columns; i++) {
 		double p = (double)row[behind ? columns - 1 - i : i];
 
-		if (p >= 0.03) {
+		if (p >= not_air) {
 			x[count] = -i;
 			y[count++] = p * p;
 		}
@@ -249,7 +271,7 @@ static bool extend_row(const float *row, int columns, int extend, bool behind, d
 		ret[i - 1] = sqrt(fmax(0, a + b * i + c * i * i));
 	free(x);
 	free(y);
-	return level >= 0.03;
+	return reference_is_cut(row, columns, behind, not_air);
 }
 
 void reference_filter(const struct plan_options *options, int view, const float *projection, float *ret)
@@ -260,6 +282,7 @@ void reference_filter(const struct plan_options *options, int view, const float 
 	double *kernels[2] = {kernel_of(options->filter_response, filter_length(wide)), NULL};
 	double *line = calloc((size_t)(columns + 2 * extend), sizeof(double));
 	double *beyond = calloc((size_t)extend + 1, sizeof(double));
+	const double not_air = reference_not_air(projection, (size_t)columns * (size_t)geometry->rows);
 
 	if (extend > 0)
 		kernels[1] = kernel_of(options->extended_response, filter_length(wide + extend));
@@ -270,7 +293,7 @@ void reference_filter(const struct plan_options *options, int view, const float 
 		for (int c = -extend; c < columns + extend; c++)
 			line[c + extend] = c >= 0 && c < columns ? (double)from[c] : 0;
 		for (int side = 0; side < 2 && extend > 0; side++) {
-			if (options->pad[side] > 0 || !extend_row(from, columns, extend, side == 1, beyond))
+			if (options->pad[side] > 0 || !extend_row(from, columns, extend, side == 1, not_air, beyond))
 				continue;
 			extended = true;
 			for (int i = 0; i < extend; i++)

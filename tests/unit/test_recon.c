@@ -1423,6 +1423,77 @@ START_TEST(truncation_leaves_no_rim_in_fdk_or_sart)
 }
 END_TEST
 
+/* Line integrals have no scale of their own for FDK: what is cut off is told and extended also where little is
+ * absorbed. */
+START_TEST(a_thin_object_that_is_cut_off_keeps_its_values)
+{
+	const double scale = 1e-3;
+	const struct orbit_spec spec = {60, 16, 120, {600, 1100, {3, 3}, {0, 0}, {0, 0}}, 0, 3};
+	struct ellipsoid body = {.shape = SHAPE_CYLINDER, .semi_axes = {95, 75, 60}, .density = 0.02};
+	struct phantom phantom = {.count = 1, .parts = &body};
+	const double places[][3] = {{0, 0, 0}, {38, -15, 0}, {-38, 15, 2}, {0, -42, 0}};
+	struct grid grid = grid_of(48, 48, 8, 2, 2, 2);
+	struct recipe recipe = recipe_on(&grid);
+	struct outcome outcome = {0};
+	struct scene scene;
+
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	for (int i = 0; i < spec.columns * spec.rows * spec.views; i++)
+		scene.projections[i] *= (float)scale;
+	recipe.fdk.on = true;
+	run(&scene, &recipe, &outcome);
+	ck_assert_ptr_nonnull(strstr(outcome.warnings, "truncated: "));
+	for (int i = 0; i < 4; i++)
+		ck_assert_double_eq_tol(mean_near(outcome.last, &grid, places[i], 5) / scale, 0.02, 0.0004);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
+static const struct {
+	const char *what;
+	int columns;
+	double tube, drift; /* of the flat; more and less of it */
+	double photons;     /* in air, 0: endless */
+} whole[] = {
+    {"a tube at 97 %", 96, 0.97, 0, 0}, {"a tube that drifts by 3 %", 96, 1, 0.03, 20000},
+    {"1000 photons", 96, 1, 0, 1000},   {"300 photons", 96, 1, 0, 300},
+    {"8 columns", 8, 1, 0, 0},          {"12 columns", 12, 1, 0, 0},
+    {"16 columns", 16, 1, 0, 0},
+};
+
+/* A ball with air on all sides, as badly measured as that. */
+START_TEST(a_body_that_is_wholly_seen_is_not_called_cut_off)
+{
+	const int columns = whole[_i].columns;
+	const struct orbit_spec spec = {columns, 32, 60, {600, 1100, {256.0 / columns, 6}, {0, 0}, {0, 0}}, 0, 6};
+	struct ellipsoid ball = {.shape = SHAPE_ELLIPSOID, .semi_axes = {50, 50, 40}, .density = 0.02};
+	struct phantom phantom = {.count = 1, .parts = &ball};
+	struct grid grid = grid_of(16, 16, 4, 4, 4, 4);
+	struct recipe recipe = recipe_on(&grid);
+	struct outcome outcome = {0};
+	struct scene scene;
+	unsigned short seed[3] = {7, 0, 0};
+
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	for (int i = 0; i < columns * spec.rows * spec.views; i++) {
+		const double tube = whole[_i].tube + whole[_i].drift * sin(i / (columns * spec.rows));
+		const double photons = whole[_i].photons > 0 ? whole[_i].photons : INFINITY;
+		const double seen = tube * exp(-(double)scene.projections[i]);
+		const double gauss = sqrt(-2 * log(1 - erand48(seed))) * cos(2 * M_PI * erand48(seed));
+
+		scene.projections[i] = (float)-log(fmax(seen + sqrt(seen / photons) * gauss, 0.5 / photons));
+	}
+	recipe.fdk.on = true;
+	run(&scene, &recipe, &outcome);
+	ck_assert_msg(strstr(outcome.warnings, "truncated: ") == NULL, "%s: %s", whole[_i].what, outcome.warnings);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
 /*
  * A body longer than the detector is high, and grids that are a part of it: SART
  * keeps its values as far as the grid's last slice but one, also where the grid
@@ -1602,6 +1673,8 @@ Suite *recon_suite(void)
 	tcase_add_test(images, without_a_grid_one_is_chosen);
 	tcase_add_loop_test(images, fdk_is_as_good_as_rtk_demands, 0, COUNT(rtk_fdk));
 	tcase_add_loop_test(images, truncation_leaves_no_rim_in_fdk_or_sart, 0, 4);
+	tcase_add_test(images, a_thin_object_that_is_cut_off_keeps_its_values);
+	tcase_add_loop_test(images, a_body_that_is_wholly_seen_is_not_called_cut_off, 0, COUNT(whole));
 	tcase_add_loop_test(images, a_body_that_goes_on_outside_of_the_grid_is_not_piled_up_at_its_faces, 0, 4);
 	tcase_add_test(images, a_truncated_abdomen_keeps_its_values);
 	tcase_add_test(images, sart_is_as_good_as_rtk_demands);
