@@ -1,6 +1,8 @@
 /* The samples of a reconstruction on their way in, and what has to be said of them. */
 #include "core/input.h"
 
+#include <math.h>
+#include <stdint.h>
 #include <stdlib.h>
 
 #include "core/warn.h"
@@ -9,6 +11,10 @@
 static const double DRIFT = 0.05;
 /* Of the flat: below it something stands before the air region, in all views alike where they do not differ. */
 static const double FAINT = 0.7;
+
+/* Means of line integrals that no object has: no photon passes the one, and no flat is a tenth too dark for the other.
+ */
+static const double COUNTS = 1000, NEGATIVE = -0.1;
 
 static int check(const struct linearise *linearise, const struct geometry *geometry, struct error *err)
 {
@@ -40,6 +46,7 @@ int input_open(struct input *ret_input, const struct linearise *linearise, const
 	if (code < 0)
 		return code;
 	input.linearise.defects = input.map.map;
+	input.pixels = (size_t)geometry->columns * (size_t)geometry->rows;
 	input.blank = calloc((size_t)geometry->count, sizeof(*input.blank));
 	if (input.blank == NULL) {
 		defect_map_clear(&input.map);
@@ -56,6 +63,19 @@ void input_clear(struct input *input)
 	*input = (struct input){0};
 }
 
+static void look_at_line_integrals(struct input *input, const void *samples)
+{
+	for (size_t i = 0; i < input->pixels; i += input->pixels / 4096 + 1) {
+		const float p = input->linearise.sample == SAMPLE_UINT16 ? ((const uint16_t *)samples)[i]
+									 : ((const float *)samples)[i];
+
+		if (!isfinite(p) || (input->map.map != NULL && input->map.map[i]))
+			continue;
+		input->sum += (double)p;
+		input->looked_at++;
+	}
+}
+
 int input_take(struct input *input, const struct backend *backend, struct plan *plan, const void *samples, int view,
 	       int slot, struct stack *to, struct error *err)
 {
@@ -65,6 +85,8 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 
 	if (code < 0)
 		return code;
+	if (input->linearise.quantity == QUANTITY_LINE_INTEGRAL)
+		look_at_line_integrals(input, samples);
 	input->views++;
 	/* Those of the map are in every view. */
 	input->defective_views +=
@@ -122,6 +144,21 @@ static void warn_of_air(const struct input *input, const struct recon_hooks *hoo
 		    most > 2 * least || least < FAINT ? ". That is more than a tube drifts: is the object in it?" : "");
 }
 
+static void warn_of_line_integrals(const struct input *input, const struct recon_hooks *hooks)
+{
+	const double mean = input->looked_at > 0 ? input->sum / (double)input->looked_at : 0;
+
+	if (mean > COUNTS)
+		recon_warn(hooks, "line_integrals",
+			   "the line integrals are %.4g in the mean: are they counts, which would be intensities?",
+			   mean);
+	if (mean < NEGATIVE)
+		recon_warn(
+		    hooks, "line_integrals",
+		    "the line integrals are %.4g in the mean, where air is 0 and all else more: is their sign turned?",
+		    mean);
+}
+
 void input_warn(const struct input *input, const struct geometry *geometry, const struct recon_hooks *hooks)
 {
 	const struct defect_counts *counts = &input->counts;
@@ -156,4 +193,5 @@ void input_warn(const struct input *input, const struct geometry *geometry, cons
 		    "in for them",
 		    counts->blank, lowest(input->blank, counts->blank));
 	warn_of_air(input, hooks);
+	warn_of_line_integrals(input, hooks);
 }

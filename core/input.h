@@ -11,6 +11,10 @@ struct input {
 	struct defect_counts counts;
 	int views, defective_views; /* linearised so far, and those of them with defects */
 	int *blank;                 /* [counts.blank], owned: views without a good pixel, in the order they came */
+	size_t pixels;              /* of a view */
+	/* Of line integrals: about 4096 of each view. */
+	double sum;
+	size_t looked_at;
 };
 
 /* Checks linearise against the detector; looks for defects in its images. Free with input_clear. */
@@ -26,7 +30,7 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 double input_blank_share(const struct input *input, const struct orbit *orbit);
 /* ERR_IMPOSSIBLE where no view has a good pixel. */
 int input_check(const struct input *input, struct error *err);
-/* "no_dark", "defects", "defect_map", "blank_views", "air_region". */
+/* "no_dark", "defects", "defect_map", "blank_views", "air_region", "line_integrals". */
 void input_warn(const struct input *input, const struct geometry *geometry, const struct recon_hooks *hooks);
 
 #endif
