@@ -76,6 +76,21 @@ static void look_at_line_integrals(struct input *input, const void *samples)
 	}
 }
 
+static int exchanged(uint16_t sample)
+{
+	return sample >> 8 | (sample & 255) << 8;
+}
+
+static void look_at_bytes(struct input *input, const uint16_t *samples)
+{
+	for (size_t i = 1; i < input->pixels; i += input->pixels / 4096 + 1) {
+		input->rough[0] += abs(samples[i] - samples[i - 1]);
+		input->rough[1] += abs(exchanged(samples[i]) - exchanged(samples[i - 1]));
+		if (exchanged(samples[i]) > input->largest)
+			input->largest = exchanged(samples[i]);
+	}
+}
+
 int input_take(struct input *input, const struct backend *backend, struct plan *plan, const void *samples, int view,
 	       int slot, struct stack *to, struct error *err)
 {
@@ -87,6 +102,8 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 		return code;
 	if (input->linearise.quantity == QUANTITY_LINE_INTEGRAL)
 		look_at_line_integrals(input, samples);
+	if (input->linearise.sample == SAMPLE_UINT16)
+		look_at_bytes(input, samples);
 	input->views++;
 	/* Those of the map are in every view. */
 	input->defective_views +=
@@ -159,6 +176,19 @@ static void warn_of_line_integrals(const struct input *input, const struct recon
 		    mean);
 }
 
+/* What has its bytes exchanged is noise. So are 8 bits in the upper byte, but for being below 256 the other way. */
+static void warn_of_bytes(const struct input *input, const struct recon_hooks *hooks)
+{
+	const double smoother = 8;
+
+	if (input->largest > 255 && input->rough[0] > smoother * input->rough[1])
+		recon_warn(
+		    hooks, "byte_order",
+		    "pixels differ from their neighbours by %.3g times as much as with their bytes exchanged: are they "
+		    "big-endian?",
+		    input->rough[0] / fmax(input->rough[1], 1));
+}
+
 void input_warn(const struct input *input, const struct geometry *geometry, const struct recon_hooks *hooks)
 {
 	const struct defect_counts *counts = &input->counts;
@@ -194,4 +224,5 @@ void input_warn(const struct input *input, const struct geometry *geometry, cons
 		    counts->blank, lowest(input->blank, counts->blank));
 	warn_of_air(input, hooks);
 	warn_of_line_integrals(input, hooks);
+	warn_of_bytes(input, hooks);
 }

@@ -12,9 +12,12 @@ struct input {
 	int views, defective_views; /* linearised so far, and those of them with defects */
 	int *blank;                 /* [counts.blank], owned: views without a good pixel, in the order they came */
 	size_t pixels;              /* of a view */
-	/* Of line integrals: about 4096 of each view. */
-	double sum;
+	/* Of about 4096 pixels of each view. */
+	double sum; /* of line integrals */
 	size_t looked_at;
+	/* Of uint16, as it is and with its bytes exchanged: how far neighbours are apart; the largest then. */
+	double rough[2];
+	int largest;
 };
 
 /* Checks linearise against the detector; looks for defects in its images. Free with input_clear. */
@@ -30,7 +33,8 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 double input_blank_share(const struct input *input, const struct orbit *orbit);
 /* ERR_IMPOSSIBLE where no view has a good pixel. */
 int input_check(const struct input *input, struct error *err);
-/* "no_dark", "defects", "defect_map", "blank_views", "air_region", "line_integrals". */
+/* "no_dark", "defects", "defect_map", "blank_views", "air_region", "line_integrals",
+ * "byte_order". */
 void input_warn(const struct input *input, const struct geometry *geometry, const struct recon_hooks *hooks);
 
 #endif

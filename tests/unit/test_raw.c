@@ -4,6 +4,7 @@
  */
 #include <check.h>
 #include <math.h>
+#include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -290,6 +291,34 @@ START_TEST(counts_and_turned_signs_among_line_integrals_are_told)
 }
 END_TEST
 
+/* Little-endian counts, big-endian ones, and those of a detector that has 8 bits and puts them first. */
+START_TEST(big_endian_counts_are_told)
+{
+	struct recipe recipe = recipe_of(false);
+	struct outcome outcome = {0};
+	struct scene scene;
+	uint16_t *samples = malloc(sizeof(*samples) * PIXELS * VIEWS);
+
+	make_scene(&scene);
+	for (int i = 0; i < PIXELS * VIEWS; i++) {
+		const double level = exp(-(double)scene.projections[i]) * (1 + 0.01 * noise((unsigned)i));
+		const unsigned count = (unsigned)(20000 * level);
+
+		samples[i] = (uint16_t)(_i == 0   ? count
+					: _i == 1 ? count >> 8 | count << 8
+						  : (unsigned)(200 * level) << 8);
+	}
+	outcome.samples = samples;
+	outcome.linearise = (struct linearise){
+	    .sample = SAMPLE_UINT16, .quantity = QUANTITY_INTENSITY, .air = _i == 2 ? 201 * 256 : 20100};
+	run(&scene, &recipe, &outcome);
+	ck_assert_msg((strstr(outcome.warnings, "byte_order: ") != NULL) == (_i == 1), "%s", outcome.warnings);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(samples);
+}
+END_TEST
+
 /* Of 90 views every 30th: as air they would take 3 % away. */
 START_TEST(a_blank_view_is_told_and_is_not_air)
 {
@@ -573,6 +602,7 @@ Suite *raw_suite(void)
 	tcase_add_test(volumes, gain_drift_and_hardening_leave_no_trace);
 	tcase_add_test(volumes, an_air_region_without_a_good_pixel_is_told);
 	tcase_add_loop_test(volumes, counts_and_turned_signs_among_line_integrals_are_told, 0, 2);
+	tcase_add_loop_test(volumes, big_endian_counts_are_told, 0, 3);
 	tcase_add_loop_test(volumes, an_object_in_the_air_region_is_told, 0, 2);
 	tcase_add_loop_test(volumes, a_blank_view_is_told_and_is_not_air, 0, 2);
 	tcase_add_test(volumes, measured_counts_are_what_their_publishers_say);
