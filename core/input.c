@@ -118,10 +118,11 @@ double input_blank_share(const struct input *input, const struct orbit *orbit)
 	double blank = 0, all = 0;
 
 	for (int i = 0; i < input->counts.blank; i++)
-		blank += orbit->weight[input->blank[i]];
+		blank += orbit_axis_weight(orbit, input->blank[i]);
 	for (int k = 0; k < orbit->count; k++)
-		all += orbit->weight[k];
-	return all > 0 ? blank / all : 0;
+		all += orbit_axis_weight(orbit, k);
+	/* Where the others are next to nothing on the axis, as an arc's two ends, they cannot stand in. */
+	return blank < (1 - 1e-6) * all ? blank / all : 0;
 }
 
 int input_check(const struct input *input, struct error *err)

@@ -29,7 +29,7 @@ void input_clear(struct input *input);
 int input_take(struct input *input, const struct backend *backend, struct plan *plan, const void *samples, int view,
 	       int slot, struct stack *to, struct error *err);
 
-/* The share of the angular weights that blank views have, 0 .. 1. */
+/* The share that blank views have in FDK's density on the axis, 0 .. 1. */
 double input_blank_share(const struct input *input, const struct orbit *orbit);
 /* ERR_IMPOSSIBLE where no view has a good pixel. */
 int input_check(const struct input *input, struct error *err);

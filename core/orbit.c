@@ -419,9 +419,28 @@ static double view_weight(const struct view *view)
 	return length / (pitch * radius * sqrt(1 - along * along));
 }
 
-void orbit_column_weights(const struct orbit *orbit, const struct geometry *geometry, float *ret_weights)
+/* The view's b, 0 .. arc on a short scan. */
+static double place_in_arc(const struct orbit *orbit, int view)
 {
 	double sense = orbit->direction < 0 ? -1 : 1, outside = 2 * M_PI - orbit->arc;
+	double b = wrap(sense * (orbit->angle[view] - orbit->angle[orbit->first]));
+
+	if (!orbit->short_scan)
+		return b;
+	/* A view beside the first one by a rounding error is at the beginning, not a turn later. */
+	return b > orbit->arc + 0.5 * outside ? 0 : fmin(b, orbit->arc);
+}
+
+double orbit_axis_weight(const struct orbit *orbit, int view)
+{
+	if (!orbit->short_scan)
+		return orbit->weight[view];
+	return orbit->weight[view] * parker(place_in_arc(orbit, view), 0, orbit->parker_delta);
+}
+
+void orbit_column_weights(const struct orbit *orbit, const struct geometry *geometry, float *ret_weights)
+{
+	double sense = orbit->direction < 0 ? -1 : 1;
 	double wide = orbit->half_fan_max > -orbit->half_fan_min ? 1 : -1;
 	double theta = orbit->displaced ? overlap(orbit, geometry, sense) : 0;
 
@@ -429,17 +448,13 @@ void orbit_column_weights(const struct orbit *orbit, const struct geometry *geom
 	for (int k = 0; k < geometry->count; k++) {
 		const struct view turned = view_in(orbit, &geometry->views[k]), *view = &turned;
 		float *weights = ret_weights + (size_t)k * (size_t)geometry->columns;
-		double b = wrap(sense * (orbit->angle[k] - orbit->angle[orbit->first]));
-		double constant = 0.5 * orbit->weight[k] * view_weight(view);
+		double b = place_in_arc(orbit, k), constant = 0.5 * orbit->weight[k] * view_weight(view);
 
-		/* A view beside the first one by a rounding error is at the beginning, not a turn later. */
-		if (orbit->short_scan && b > orbit->arc + 0.5 * outside)
-			b = 0;
 		for (int column = 0; column < geometry->columns; column++) {
 			double alpha = sense * ray_angle(geometry, view, column), weight = 1;
 
 			if (orbit->short_scan)
-				weight = parker(fmin(b, orbit->arc), alpha, orbit->parker_delta);
+				weight = parker(b, alpha, orbit->parker_delta);
 			else if (orbit->displaced)
 				weight = half_fan(wide * alpha, theta);
 			weights[column] = (float)(constant * weight);

@@ -99,6 +99,12 @@ void orbit_clear(struct orbit *orbit);
 void orbit_column_weights(const struct orbit *orbit, const struct geometry *geometry, float *ret_weights);
 
 /*
+ * What the view counts for in FDK's density on the axis: its angular weight times
+ * the short-scan or displaced weight of its ray through the axis.
+ */
+double orbit_axis_weight(const struct orbit *orbit, int view);
+
+/*
  * A grid for who gives none: centred on the isocentre, cubic voxels, the field of
  * view across and what the cone covers on the axis along z (one slice for a
  * detector of one row), at the resolution of the detector at the isocentre,

@@ -349,6 +349,43 @@ START_TEST(a_blank_view_is_told_and_is_not_air)
 }
 END_TEST
 
+/*
+ * Where a short scan begins and ends, a view counts for little, and in its middle for
+ * more than the mean: what stands in for blank views follows that, to 3 HU.
+ */
+START_TEST(blank_views_of_a_short_scan_leave_the_level)
+{
+	static const struct orbit_spec sweep = {COLUMNS, ROWS, 108, {600, 1100, {2.6, 2.6}, {0, 0}, {0, 0}}, 0, 2};
+	static const struct {
+		int first, count;
+	} blank[] = {{0, 0}, {0, 2}, {0, 6}, {102, 6}, {52, 3}};
+	struct recipe recipe = recipe_of(false);
+	struct ellipsoid ball = {.shape = SHAPE_ELLIPSOID, .semi_axes = {38, 38, 32}, .density = 0.02};
+	struct phantom phantom = {.count = 1, .parts = &ball};
+	struct scene scene;
+	float *samples = malloc(sizeof(float) * PIXELS * 108);
+
+	scene_orbit(&scene, &sweep);
+	scene_add(&scene, &phantom);
+	for (size_t i = 0; i < sizeof(blank) / sizeof(*blank); i++) {
+		struct outcome outcome = {
+		    .samples = samples,
+		    .linearise = {.sample = SAMPLE_FLOAT32, .quantity = QUANTITY_INTENSITY, .air = 50000}};
+
+		for (int k = 0; k < PIXELS * 108; k++)
+			samples[k] = (float)(50000 * exp(-(double)scene.projections[k]));
+		for (int k = 0; k < PIXELS * blank[i].count; k++)
+			samples[PIXELS * blank[i].first + k] = 0;
+		run(&scene, &recipe, &outcome);
+		ck_assert_double_eq_tol(mean_near(outcome.last, &outcome.grid, (const double[]){0, 0, 0}, 25), 0.02,
+					6e-5);
+		outcome_clear(&outcome);
+	}
+	scene_clear(&scene);
+	free(samples);
+}
+END_TEST
+
 /* ---- defects that the images show ---- */
 
 enum fault { NONE, DEAD, LIVELESS, HOT, SATURATED, LEAKY, LEAKS_A_LITTLE, NOT_A_NUMBER, LESS_GAIN };
@@ -605,6 +642,7 @@ Suite *raw_suite(void)
 	tcase_add_loop_test(volumes, big_endian_counts_are_told, 0, 3);
 	tcase_add_loop_test(volumes, an_object_in_the_air_region_is_told, 0, 2);
 	tcase_add_loop_test(volumes, a_blank_view_is_told_and_is_not_air, 0, 2);
+	tcase_add_test(volumes, blank_views_of_a_short_scan_leave_the_level);
 	tcase_add_test(volumes, measured_counts_are_what_their_publishers_say);
 	suite_add_tcase(suite, volumes);
 	tcase_add_test(images, defects_are_found_in_flat_and_dark);
