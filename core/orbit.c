@@ -14,6 +14,9 @@
 #include <string.h>
 
 static const double FULL_GAP = 5 * M_PI / 180, FULL_GAP_DISPLACED = 20 * M_PI / 180, FULL_GAP_RATIO = 2.25;
+static const double SWEEP_GAP = 40 * M_PI / 180, HOLE = 20 * M_PI / 180;
+/* Neighbours at the golden angle are apart by up to 2.62 times the least gap, those of a lost view by twice. */
+static const double ODD_GAP_RATIO = 3;
 static const double LEAN_LEAST = 4 * M_PI / 180; /* FDK about z is within 4 HU up to there; real arms lean by less */
 static const double SAME_ANGLE = 1e-6;           /* radians, a micrometre on a C-arm's orbit */
 static const double DISPLACED_PIXELS = 4, DISPLACED_WIDTH = 0.02;
@@ -119,6 +122,9 @@ static void find_frame(struct orbit *orbit, const struct geometry *geometry)
 			    cosine * unit[j] + sin(orbit->lean) * across[j] + (1 - cosine) * along * axis[j];
 	}
 }
+
+/* As many as may be odd, and the first that is not: what the arc leaves out and two holes. */
+enum { GAPS = 4 };
 
 struct placed {
 	double angle;
@@ -230,18 +236,29 @@ static int find_direction(const double *angle, int count)
 static void follow(struct orbit *orbit, const struct placed *placed, const struct station *station, int stations,
 		   bool displaced)
 {
-	double second = 0, largest;
+	double gaps[GAPS] = {0}; /* the largest, in falling order */
+	double largest, odd;
 	int widest = 0;
 
-	for (int s = 1; s < stations; s++)
-		if (station[s].gap > station[widest].gap)
-			widest = s;
-	for (int s = 0; s < stations; s++)
-		if (s != widest)
-			second = fmax(second, station[s].gap);
-	largest = station[widest].gap;
+	for (int s = 0; s < stations; s++) {
+		double gap = station[s].gap;
 
-	orbit->short_scan = largest > FULL_GAP_RATIO * second && largest > (displaced ? FULL_GAP_DISPLACED : FULL_GAP);
+		if (gap > station[widest].gap)
+			widest = s;
+		for (int i = 0; i < GAPS; i++)
+			if (gap > gaps[i]) {
+				double less = gaps[i];
+
+				gaps[i] = gap;
+				gap = less;
+			}
+	}
+	largest = gaps[0];
+	odd = ODD_GAP_RATIO * gaps[stations < GAPS ? stations - 1 : GAPS - 1];
+
+	orbit->short_scan =
+	    (largest > FULL_GAP_RATIO * gaps[1] && largest > (displaced ? FULL_GAP_DISPLACED : FULL_GAP)) ||
+	    (largest > SWEEP_GAP && largest > odd);
 	orbit->direction = stations > 1 ? find_direction(orbit->angle, orbit->count) : 0;
 	orbit->arc = orbit->short_scan ? 2 * M_PI - largest : 2 * M_PI;
 	orbit->first = 0;
@@ -258,6 +275,8 @@ static void follow(struct orbit *orbit, const struct placed *placed, const struc
 
 		if (!orbit->short_scan || s != widest)
 			sum += 0.5 * station[s].gap;
+		if (orbit->short_scan && s != widest && station[s].gap > HOLE && station[s].gap > odd)
+			orbit->holes += station[s].gap;
 		if (!orbit->short_scan || before != widest)
 			sum += 0.5 * station[before].gap;
 		/* One direction stands for all of them. */
@@ -339,7 +358,7 @@ int orbit_analyse(struct orbit *ret_orbit, const struct geometry *geometry, stru
 	if (orbit.displaced)
 		orbit.pad[orbit.displacement > 0 ? 0 : 1] = find_padding(&orbit, geometry);
 	orbit.parker_delta = 0.5 * (orbit.arc - M_PI);
-	orbit.arc_too_short = orbit.short_scan && orbit.arc < M_PI + orbit.fan - SAME_ANGLE;
+	orbit.arc_too_short = orbit.short_scan && orbit.arc - orbit.holes < M_PI + orbit.fan - SAME_ANGLE;
 	*ret_orbit = orbit;
 out:
 	free(placed);

@@ -31,6 +31,7 @@ struct orbit {
 	 */
 	double *weight;
 	double arc;      /* radians, from the first source to the last, 2 pi for a full turn */
+	double holes;    /* radians that the views of a short scan leave out inside of the arc, see below */
 	int direction;   /* +1 counter-clockwise seen from the axis' end, -1 clockwise, 0 when all views stand at one
 			    angle */
 	int first;       /* the view at which the arc begins, in the sense of `direction` */
@@ -54,7 +55,7 @@ struct orbit {
 	 */
 	int pad[2];
 	double parker_delta;          /* radians, (arc - pi) / 2 */
-	bool arc_too_short;           /* arc < pi + fan: a warning, not an error */
+	bool arc_too_short;           /* arc - holes < pi + fan: a warning, not an error */
 	double pixel_at_isocentre[2]; /* mm, mean */
 	/*
 	 * Radians, mean angle between the detector's rows and the plane across the axis. FDK
@@ -70,6 +71,11 @@ struct orbit {
  * degrees, 4 views a quarter turn apart, a lost view and uneven steps are full
  * turns. With a displaced detector, whose views have no conjugates to spare, up
  * to 20 degrees. Otherwise the largest gap is what the arc leaves out.
+ *
+ * A gap of more than 40 degrees and three times the fourth largest is never part of
+ * a full turn, whatever the second is: that is a sweep with one or two holes, or
+ * a view apart from it. Gaps inside of the arc that are three times the fourth largest
+ * and wider than 20 degrees are holes.
  */
 
 /* Allocates the arrays; free with orbit_clear. Fails for no memory only: any checked geometry has an orbit. */

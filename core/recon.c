@@ -777,8 +777,9 @@ static int leave_out_the_exterior(struct recon *recon, struct error *err)
 	 * missing from it; real sweeps are some degrees short, and that is at the rim.
 	 */
 	const double little = 0.2;
-	const bool sound = (!recon->orbit.arc_too_short || recon->orbit.arc > M_PI + recon->orbit.fan - little) &&
-			   recon->orbit.tilt < little;
+	const double covered = recon->orbit.arc - recon->orbit.holes;
+	const bool sound =
+	    (!recon->orbit.arc_too_short || covered > M_PI + recon->orbit.fan - little) && recon->orbit.tilt < little;
 	const struct grid *grid = sound ? &recon->recipe.grid : NULL;
 	bool wanted = false;
 	size_t outside;

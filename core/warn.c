@@ -60,7 +60,7 @@ void warn_recipe(const struct recon_hooks *hooks, const struct geometry *geometr
 	if (recipe->fdk.on && orbit->arc_too_short)
 		recon_warn(hooks, "arc_too_short",
 			   "FDK of an arc of %.1f degrees; a complete one has 180 degrees and the fan of %.1f degrees",
-			   orbit->arc * DEGREES, orbit->fan * DEGREES);
+			   (orbit->arc - orbit->holes) * DEGREES, orbit->fan * DEGREES);
 }
 
 void warn_truncated(const struct recon_hooks *hooks, const struct geometry *geometry, const size_t rows[2], int extend)

@@ -484,7 +484,7 @@ static void warn_weights(cJSON *list, const struct orbit *orbit)
 		     "the sources cover %.2f degrees; FDK needs 180 and the fan angle of %.2f, %.2f degrees: expect "
 		     "streaks "
 		     "and shading from FDK",
-		     arc, fan, 180 + fan);
+		     (orbit->arc - orbit->holes) / degree, fan, 180 + fan);
 	if (orbit->short_scan)
 		warn(list, "parker_weights", "a short scan of %.2f degrees: Parker weights will apply in FDK", arc);
 	if (orbit->displaced)

@@ -138,8 +138,8 @@ END_TEST
 
 START_TEST(angular_weights_are_half_the_gaps_to_both_neighbours)
 {
-	static const double degrees[] = {10, 12, 15, 16, 16, 120, 160, 200};
-	static const double expected[] = {1, 2.5, 2, 26.25, 26.25, 72, 40, 20};
+	static const double degrees[] = {10, 12, 15, 16, 16, 100, 190, 280};
+	static const double expected[] = {46, 2.5, 2, 21.25, 21.25, 87, 90, 90};
 	struct circular circular = {.source_to_isocentre = 500, .source_to_detector = 900, .pixel = {1, 1}};
 	struct geometry geometry;
 	struct error err = {0};
@@ -150,10 +150,9 @@ START_TEST(angular_weights_are_half_the_gaps_to_both_neighbours)
 		angles[i] = degrees[i] * DEGREE;
 	ck_assert_int_eq(geometry_circular(&geometry, 8, 1, 8, &circular, angles, &err), 0);
 	orbit = orbit_of(&geometry);
-	/* The widest gap, 170 degrees, is not wider than 2.25 times the next: a full turn with large gaps. */
+	/* The widest gap, 90 degrees, is not wider than the next: a full turn with large gaps. */
 	ck_assert(!orbit.short_scan);
-	ck_assert_double_eq_tol(orbit.weight[0], 86 * DEGREE, 1e-9);
-	for (int i = 1; i < 7; i++)
+	for (int i = 0; i < 8; i++)
 		ck_assert_double_eq_tol(orbit.weight[i], expected[i] * DEGREE, 1e-9);
 	orbit_clear(&orbit);
 	geometry_clear(&geometry);
@@ -169,6 +168,100 @@ START_TEST(angular_weights_are_half_the_gaps_to_both_neighbours)
 	ck_assert_double_eq_tol(orbit.weight[7], 1 * DEGREE, 1e-9);
 	orbit_clear(&orbit);
 	geometry_clear(&geometry);
+}
+END_TEST
+
+/* Whole degrees 0, step, 2 step ... that `keep` lets pass. */
+static struct orbit orbit_of_degrees(int count, double step, bool (*keep)(int degree))
+{
+	struct circular circular = {.source_to_isocentre = 620, .source_to_detector = 1100, .pixel = {1.6, 1.6}};
+	struct geometry geometry;
+	struct orbit orbit;
+	struct error err = {0};
+	double angles[1000];
+	int views = 0;
+
+	for (int i = 0; i < count; i++)
+		if (keep == NULL || keep((int)(i * step)))
+			angles[views++] = i * step * DEGREE;
+	ck_assert_int_eq(geometry_circular(&geometry, 160, 3, views, &circular, angles, &err), 0);
+	orbit = orbit_of(&geometry);
+	geometry_clear(&geometry);
+	return orbit;
+}
+
+static bool large_hole(int degree)
+{
+	return degree <= 50 || degree >= 128;
+}
+static bool small_hole(int degree)
+{
+	return degree <= 60 || degree >= 75;
+}
+static bool two_holes(int degree)
+{
+	return degree <= 40 || (degree >= 90 && degree <= 110) || degree >= 170;
+}
+static bool one_apart(int degree)
+{
+	return degree <= 214 || degree == 290;
+}
+static bool every_twelfth(int degree)
+{
+	return degree % 12 == 0;
+}
+static bool six_phases(int degree)
+{
+	return degree % 60 < 10;
+}
+static bool a_sector_lost(int degree)
+{
+	return degree < 100 || degree >= 160;
+}
+
+START_TEST(a_sweep_with_a_hole_is_no_full_turn)
+{
+	static const struct {
+		const char *what;
+		int count;
+		double step;
+		bool (*keep)(int degree);
+		double arc, holes; /* 360: a full turn */
+		bool too_short;
+	} rows[] = {
+	    {"a hole of 78 degrees", 201, 1, large_hole, 200, 78, true},
+	    {"forth and back", 401, 0.5, large_hole, 200, 77.5, true},
+	    {"a hole of 15 degrees", 201, 1, small_hole, 200, 0, false},
+	    {"two holes", 201, 1, two_holes, 200, 110, true},
+	    {"one view apart", 291, 1, one_apart, 284, 70, false},
+	    {"an overscan with a hole", 321, 1, large_hole, 360 - 78, 40, false},
+	    {"a full turn without a sector", 360, 1, a_sector_lost, 299, 0, false},
+	    {"6 phases of a motion", 360, 1, six_phases, 360, 0, false},
+	    {"30 views", 360, 1, every_twelfth, 360, 0, false},
+	    {"7 views, 2 turns", 14, 360.0 / 7, NULL, 360, 0, false},
+	    {"12 views, the last lost", 11, 30, NULL, 360, 0, false},
+	    {"7 views, the last lost", 6, 360.0 / 7, NULL, 360, 0, false},
+	    {"a turn in 3", 3, 120, NULL, 360, 0, false},
+	    {"2 views", 2, 180, NULL, 360, 0, false},
+	};
+
+	for (size_t i = 0; i < sizeof(rows) / sizeof(*rows); i++) {
+		struct orbit orbit = orbit_of_degrees(rows[i].count, rows[i].step, rows[i].keep);
+
+		ck_assert_msg(fabs(orbit.arc - rows[i].arc * DEGREE) < 1e-9, "%s: arc %g", rows[i].what,
+			      orbit.arc / DEGREE);
+		ck_assert_msg(orbit.short_scan == (rows[i].arc < 360), "%s: short scan", rows[i].what);
+		ck_assert_msg(fabs(orbit.holes - rows[i].holes * DEGREE) < 1e-9, "%s: holes %g", rows[i].what,
+			      orbit.holes / DEGREE);
+		ck_assert_msg(orbit.arc_too_short == rows[i].too_short, "%s: too short", rows[i].what);
+		orbit_clear(&orbit);
+	}
+	for (int count = 3; count < 100; count++) {
+		struct orbit orbit = orbit_of_degrees(count, 180 * (3 - sqrt(5)), NULL);
+
+		ck_assert_msg(!orbit.short_scan, "%d views at the golden angle", count);
+		orbit_clear(&orbit);
+	}
 }
 END_TEST
 
@@ -802,6 +895,7 @@ Suite *orbit_suite(void)
 
 	tcase_add_test(facts, arcs_are_read_off_the_sources);
 	tcase_add_test(facts, angular_weights_are_half_the_gaps_to_both_neighbours);
+	tcase_add_test(facts, a_sweep_with_a_hole_is_no_full_turn);
 	tcase_add_test(facts, the_order_of_the_views_does_not_matter);
 	tcase_add_test(facts, a_circular_orbit_has_its_textbook_numbers);
 	tcase_add_test(facts, only_a_clear_displacement_on_a_full_turn_counts);
