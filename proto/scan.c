@@ -637,7 +637,8 @@ static void warn_implausible(cJSON *list, const struct scan *scan)
 	const double nearest = 5;              /* mm from source to detector */
 	const struct orbit *orbit = &scan->orbit;
 	const struct geometry *geometry = &scan->geometry;
-	double fan = orbit->fan / degree, pitch = 0, magnification = orbit->source_to_detector / orbit->source_radius;
+	double fan = orbit->fan / degree, pitch[2] = {0},
+	       magnification = orbit->source_to_detector / orbit->source_radius;
 	int outside = 0;
 
 	for (int k = 0; k < geometry->count; k++) {
@@ -647,7 +648,8 @@ static void warn_implausible(cJSON *list, const struct scan *scan)
 		view_matrix(&geometry->views[k], matrix);
 		view_project(matrix, isocentre, &column, &row);
 		outside += !(column > -1 && column < geometry->columns && row > -1 && row < geometry->rows);
-		pitch += vec_norm(geometry->views[k].column_step) / geometry->count;
+		pitch[0] += vec_norm(geometry->views[k].column_step) / geometry->count;
+		pitch[1] += vec_norm(geometry->views[k].row_step) / geometry->count;
 	}
 	/* Below 1 the detector stands before the axis. */
 	if (fan > fan_most || orbit->source_to_detector < nearest || magnification > magnification_most ||
@@ -656,9 +658,10 @@ static void warn_implausible(cJSON *list, const struct scan *scan)
 		     "the sources stand %.4g mm from the axis and %.4g mm from the detector, which they see under %.4g "
 		     "degrees: are all lengths in mm?",
 		     orbit->source_radius, orbit->source_to_detector, fan);
-	if (fabs(pitch / scan->pixel_mm[0] - 1) > 0.01)
-		warn(list, "other_pitch", "the views' columns are %.6g mm apart, detector.pixel_mm says %.6g", pitch,
-		     scan->pixel_mm[0]);
+	for (int i = 0; i < (geometry->rows > 1 ? 2 : 1); i++)
+		if (fabs(pitch[i] / scan->pixel_mm[i] - 1) > 0.01)
+			warn(list, "other_pitch", "the views' %s are %.6g mm apart, detector.pixel_mm says %.6g",
+			     i == 0 ? "columns" : "rows", pitch[i], scan->pixel_mm[i]);
 	if (outside > geometry->count / 2)
 		warn(list, "isocentre_outside",
 		     "the isocentre falls outside the detector in %d of %d views: is the geometry that of another "

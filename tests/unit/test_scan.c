@@ -494,6 +494,12 @@ static void coarser(struct view *view, int k)
 		view->row_step[i] *= 1.5;
 	}
 }
+static void rows_coarser(struct view *view, int k)
+{
+	(void)k;
+	for (int i = 0; i < 3; i++)
+		view->row_step[i] *= 2;
+}
 static void other_detector(struct view *view, int k)
 {
 	(void)k;
@@ -531,6 +537,7 @@ static const struct {
     {one_in_metres, "implausible_lengths"},
     {detector_before_the_axis, "implausible_lengths"},
     {coarser, "other_pitch"},
+    {rows_coarser, "other_pitch"},
     {other_detector, "isocentre_outside"},
     {columns_back, "mirrored_columns"},
     {one_back, "mirrored_views"},
