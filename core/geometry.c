@@ -291,6 +291,29 @@ int geometry_copy(struct geometry *ret_geometry, const struct geometry *geometry
 	return 0;
 }
 
+void view_exchange(struct view *view)
+{
+	for (int i = 0; i < 3; i++) {
+		const double step = view->column_step[i];
+
+		view->column_step[i] = view->row_step[i];
+		view->row_step[i] = step;
+	}
+}
+
+int geometry_exchange(struct geometry *ret_geometry, const struct geometry *geometry, struct error *err)
+{
+	int code = geometry_copy(ret_geometry, geometry, err);
+
+	if (code < 0)
+		return code;
+	ret_geometry->columns = geometry->rows;
+	ret_geometry->rows = geometry->columns;
+	for (int k = 0; k < geometry->count; k++)
+		view_exchange(&ret_geometry->views[k]);
+	return 0;
+}
+
 void view_matrix(const struct view *view, double ret_matrix[12])
 {
 	double w[3], a[3][3], length, scale;

@@ -54,7 +54,12 @@ int geometry_matrices(struct geometry *ret_geometry, int columns, int rows, int 
 int geometry_views(struct geometry *ret_geometry, int columns, int rows, int count, const struct view *views,
 		   struct error *err);
 int geometry_copy(struct geometry *ret_geometry, const struct geometry *geometry, struct error *err);
+/* The same detector read out the other way: its columns are rows, and its rows columns. */
+int geometry_exchange(struct geometry *ret_geometry, const struct geometry *geometry, struct error *err);
 void geometry_clear(struct geometry *geometry);
+
+/* Column step for row step. */
+void view_exchange(struct view *view);
 
 /*
  * The 3x4 matrix of a view, row by row, scaled so that w is the depth in mm:

@@ -4,6 +4,7 @@
 #include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
+#include <string.h>
 
 #include "core/warn.h"
 
@@ -35,29 +36,86 @@ static int check(const struct linearise *linearise, const struct geometry *geome
 	return 0;
 }
 
-int input_open(struct input *ret_input, const struct linearise *linearise, const struct geometry *geometry,
+static size_t sample_bytes(const struct input *input)
+{
+	return input->linearise.sample == SAMPLE_UINT16 ? sizeof(uint16_t) : sizeof(float);
+}
+
+/* [row][column] to [column][row], pixels of 1, 2 or 4 bytes. */
+static void exchange(const struct input *input, const void *from, size_t bytes, void *to)
+{
+	const char *source = from;
+	char *target = to;
+
+#pragma omp parallel for schedule(static)
+	for (int column = 0; column < input->columns; column++)
+		for (int row = 0; row < input->rows; row++)
+			memcpy(target + ((size_t)column * (size_t)input->rows + (size_t)row) * bytes,
+			       source + ((size_t)row * (size_t)input->columns + (size_t)column) * bytes, bytes);
+}
+
+/* linearise's images and region as the turned detector has them, and room for a projection. */
+static int turn(struct input *input, struct error *err)
+{
+	struct linearise *linearise = &input->linearise;
+	const void *const images[] = {linearise->flat, linearise->dark, linearise->defects};
+	const size_t bytes[] = {sizeof(float), sizeof(float), 1, sample_bytes(input)};
+	const int region[] = {linearise->air_region[1], linearise->air_region[0], linearise->air_region[3],
+			      linearise->air_region[2]};
+
+	for (int i = 0; i < 4; i++) {
+		if (i < 3 && images[i] == NULL)
+			continue;
+		input->exchanged[i] = malloc((size_t)input->columns * (size_t)input->rows * bytes[i]);
+		if (input->exchanged[i] == NULL)
+			return error_set(err, ERR_NO_MEMORY, "no memory for images of %d x %d pixels", input->columns,
+					 input->rows);
+		if (i < 3)
+			exchange(input, images[i], bytes[i], input->exchanged[i]);
+	}
+	linearise->flat = input->exchanged[0];
+	linearise->dark = input->exchanged[1];
+	linearise->defects = input->exchanged[2];
+	memcpy(linearise->air_region, region, sizeof(region));
+	return 0;
+}
+
+int input_open(struct input *ret_input, const struct linearise *linearise, const struct geometry *geometry, bool turned,
 	       struct error *err)
 {
-	struct input input = {.linearise = *linearise};
-	int code = check(linearise, geometry, err);
+	struct input input = {.linearise = *linearise,
+			      .turned = turned,
+			      .columns = turned ? geometry->rows : geometry->columns,
+			      .rows = turned ? geometry->columns : geometry->rows};
+	int code = turned ? turn(&input, err) : 0;
 
 	if (code == 0)
-		code = defect_map_make(&input.map, linearise, geometry->columns, geometry->rows, err);
-	if (code < 0)
-		return code;
-	input.linearise.defects = input.map.map;
-	input.pixels = (size_t)geometry->columns * (size_t)geometry->rows;
-	input.blank = calloc((size_t)geometry->count, sizeof(*input.blank));
-	if (input.blank == NULL) {
-		defect_map_clear(&input.map);
-		return error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", geometry->count);
+		code = check(&input.linearise, geometry, err);
+	if (code == 0)
+		code = defect_map_make(&input.map, &input.linearise, geometry->columns, geometry->rows, err);
+	if (code == 0) {
+		input.linearise.defects = input.map.map;
+		input.pixels = (size_t)geometry->columns * (size_t)geometry->rows;
+		input.blank = calloc((size_t)geometry->count, sizeof(*input.blank));
+		if (input.blank == NULL)
+			code = error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", geometry->count);
 	}
-	*ret_input = input;
-	return 0;
+	if (code < 0)
+		input_clear(&input);
+	else
+		*ret_input = input;
+	return code;
+}
+
+size_t input_view_bytes(const struct input *input)
+{
+	return sample_bytes(input) * (size_t)input->columns * (size_t)input->rows;
 }
 
 void input_clear(struct input *input)
 {
+	for (int i = 0; i < 4; i++)
+		free(input->exchanged[i]);
 	defect_map_clear(&input->map);
 	free(input->blank);
 	*input = (struct input){0};
@@ -96,8 +154,13 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 {
 	/* One by one, so that the views with defects are known. */
 	const struct defect_counts before = input->counts;
-	int code = backend->linearise(plan, samples, 1, &slot, to, &input->counts, err);
+	int code;
 
+	if (input->turned) {
+		exchange(input, samples, sample_bytes(input), input->exchanged[3]);
+		samples = input->exchanged[3];
+	}
+	code = backend->linearise(plan, samples, 1, &slot, to, &input->counts, err);
 	if (code < 0)
 		return code;
 	if (input->linearise.quantity == QUANTITY_LINE_INTEGRAL)

@@ -6,7 +6,10 @@
 
 /* What core/recon.c knows of the samples that it was given, and tells of them. Nobody else's. */
 struct input {
-	struct linearise linearise; /* as given, with the whole map */
+	struct linearise linearise; /* as given, with the whole map; exchanged where `turned` */
+	bool turned;                /* rows and columns of all images are exchanged on their way in */
+	int columns, rows;          /* as they come */
+	void *exchanged[4];         /* owned, NULL where not turned: flat, dark and given defects, a projection */
 	struct defect_map map;
 	struct defect_counts counts;
 	int views, defective_views; /* linearised so far, and those of them with defects */
@@ -20,10 +23,15 @@ struct input {
 	int largest;
 };
 
-/* Checks linearise against the detector; looks for defects in its images. Free with input_clear. */
-int input_open(struct input *ret_input, const struct linearise *linearise, const struct geometry *geometry,
+/*
+ * Checks linearise against the detector; looks for defects in its images. turned: the geometry is that of
+ * geometry_exchange, linearise and all samples are as before that. Free with input_clear.
+ */
+int input_open(struct input *ret_input, const struct linearise *linearise, const struct geometry *geometry, bool turned,
 	       struct error *err);
 void input_clear(struct input *input);
+
+size_t input_view_bytes(const struct input *input);
 
 /* linearise of one view into a slot. */
 int input_take(struct input *input, const struct backend *backend, struct plan *plan, const void *samples, int view,

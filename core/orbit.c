@@ -9,6 +9,7 @@
  */
 #include "core/orbit.h"
 
+#include <assert.h>
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
@@ -21,19 +22,45 @@ static const double LEAN_LEAST = 4 * M_PI / 180; /* FDK about z is within 4 HU u
 static const double SAME_ANGLE = 1e-6;           /* radians, a micrometre on a C-arm's orbit */
 static const double DISPLACED_PIXELS = 4, DISPLACED_WIDTH = 0.02;
 
-/* A view in the orbit's frame. */
+/* A view in the orbit's frame, rows and columns exchanged where the detector is on its side. */
 static struct view view_in(const struct orbit *orbit, const struct view *view)
 {
 	const double *const from[] = {view->source, view->pixel0, view->column_step, view->row_step};
-	struct view turned;
-	double *const to[] = {turned.source, turned.pixel0, turned.column_step, turned.row_step};
+	struct view ret = *view;
+	double *const to[] = {ret.source, ret.pixel0, ret.column_step, ret.row_step};
 
-	if (orbit->lean == 0)
-		return *view;
-	for (int k = 0; k < 4; k++)
-		for (int i = 0; i < 3; i++)
-			to[k][i] = vec_dot(orbit->frame[i], from[k]);
-	return turned;
+	if (orbit->lean > 0)
+		for (int k = 0; k < 4; k++)
+			for (int i = 0; i < 3; i++)
+				to[k][i] = vec_dot(orbit->frame[i], from[k]);
+	if (orbit->turned)
+		view_exchange(&ret);
+	return ret;
+}
+
+/* The detector's sides as view_in has them; the views are borrowed. */
+static struct geometry sides_in(const struct orbit *orbit, const struct geometry *geometry)
+{
+	struct geometry sides = *geometry;
+
+	if (orbit->turned) {
+		sides.columns = geometry->rows;
+		sides.rows = geometry->columns;
+	}
+	return sides;
+}
+
+/* Mean angles of rows and of columns against the plane across the axis. */
+static void find_tilts(const struct orbit *orbit, const struct geometry *geometry, double ret[2])
+{
+	ret[0] = ret[1] = 0;
+	for (int k = 0; k < geometry->count; k++) {
+		const struct view view = view_in(orbit, &geometry->views[k]);
+		const double *const step[] = {view.column_step, view.row_step};
+
+		for (int i = 0; i < 2; i++)
+			ret[i] += asin(fmin(1, fabs(step[i][2]) / vec_norm(step[i]))) / geometry->count;
+	}
 }
 
 /* Sums of products of the sources' coordinates about their mean. */
@@ -196,7 +223,6 @@ static void take_means(struct orbit *orbit, const struct geometry *geometry)
 		orbit->displacement += share * view_displacement(geometry, view, matrix);
 		orbit->pixel_at_isocentre[0] += share * vec_norm(view->column_step) / magnification;
 		orbit->pixel_at_isocentre[1] += share * vec_norm(view->row_step) / magnification;
-		orbit->tilt += share * asin(fmin(1, fabs(view->column_step[2]) / vec_norm(view->column_step)));
 	}
 }
 
@@ -324,13 +350,15 @@ static int find_padding(const struct orbit *orbit, const struct geometry *geomet
 	return (int)fmin(ceil(most - 1e-6), 2 * geometry->columns);
 }
 
-int orbit_analyse(struct orbit *ret_orbit, const struct geometry *geometry, struct error *err)
+int orbit_analyse(struct orbit *ret_orbit, const struct geometry *given, struct error *err)
 {
-	size_t count = (size_t)geometry->count;
-	struct orbit orbit = {.count = geometry->count};
+	size_t count = (size_t)given->count;
+	struct orbit orbit = {.count = given->count};
+	struct geometry sides = *given;
+	const struct geometry *geometry = &sides;
 	struct placed *placed = malloc(count * sizeof(*placed));
 	struct station *station = calloc(count, sizeof(*station));
-	double width = 0;
+	double width = 0, tilts[2];
 	bool aside;
 	int code = 0;
 
@@ -341,6 +369,10 @@ int orbit_analyse(struct orbit *ret_orbit, const struct geometry *geometry, stru
 		goto out;
 	}
 	find_frame(&orbit, geometry);
+	find_tilts(&orbit, geometry, tilts);
+	orbit.turned = tilts[0] > 0.25 * M_PI && tilts[0] > tilts[1];
+	orbit.tilt = tilts[orbit.turned];
+	sides = sides_in(&orbit, given);
 	for (int k = 0; k < geometry->count; k++) {
 		const struct view turned = view_in(&orbit, &geometry->views[k]), *view = &turned;
 
@@ -463,6 +495,7 @@ void orbit_column_weights(const struct orbit *orbit, const struct geometry *geom
 	double wide = orbit->half_fan_max > -orbit->half_fan_min ? 1 : -1;
 	double theta = orbit->displaced ? overlap(orbit, geometry, sense) : 0;
 
+	assert(!orbit->turned);
 #pragma omp parallel for schedule(static)
 	for (int k = 0; k < geometry->count; k++) {
 		const struct view turned = view_in(orbit, &geometry->views[k]), *view = &turned;
@@ -504,8 +537,9 @@ static double half_height(const struct orbit *orbit, const struct geometry *geom
 	return farthest;
 }
 
-void orbit_default_grid(const struct orbit *orbit, const struct geometry *geometry, int most, struct grid *ret_grid)
+void orbit_default_grid(const struct orbit *orbit, const struct geometry *given, int most, struct grid *ret_grid)
 {
+	const struct geometry sides = sides_in(orbit, given), *geometry = &sides;
 	double width = orbit->field_of_view, height = 2 * half_height(orbit, geometry), nearest = INFINITY;
 	double spacing = orbit->pixel_at_isocentre[0];
 

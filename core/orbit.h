@@ -22,6 +22,12 @@ struct orbit {
 	int count;
 	double frame[3][3]; /* its x, y and z, unit vectors in the world: turns the world's axes as little as it can */
 	double lean;        /* radians, of its z against the world's; 0 below LEAN_LEAST */
+	/*
+	 * The detector lies on its side: its rows are nearer to the orbit's axis than to
+	 * the plane across it, and than its columns. Rows and columns below are then those after they were
+	 * exchanged, by which FDK goes, too.
+	 */
+	bool turned;
 	/* [count], radians, gantry angle of each view's source, 0 <= angle < 2 pi */
 	double *angle;
 	/*
@@ -57,11 +63,7 @@ struct orbit {
 	double parker_delta;          /* radians, (arc - pi) / 2 */
 	bool arc_too_short;           /* arc - holes < pi + fan: a warning, not an error */
 	double pixel_at_isocentre[2]; /* mm, mean */
-	/*
-	 * Radians, mean angle between the detector's rows and the plane across the axis. FDK
-	 * filters along the rows: near pi/2, a detector on its side, that is the wrong
-	 * direction.
-	 */
+	/* Radians, mean angle between the detector's rows, along which FDK filters, and the plane across the axis. */
 	double tilt;
 };
 
@@ -100,7 +102,8 @@ void orbit_clear(struct orbit *orbit);
  * Parker: a ray and its conjugate sum to 2 when both are measured, and a ray that
  * is measured once has 2, however short the arc; 1 everywhere on a full turn.
  * Fan angles are those of the rays in the middle row about the rotation axis,
- * signed by the direction of the rotation. ret is [count][columns].
+ * signed by the direction of the rotation. ret is [count][columns]. The orbit is not
+ * turned: geometry_exchange goes first.
  */
 void orbit_column_weights(const struct orbit *orbit, const struct geometry *geometry, float *ret_weights);
 

@@ -27,8 +27,9 @@ const char *const stage_names[STAGE_COUNT] = {"load", "fdk", "sart", "tv", "save
 struct recon {
 	const struct backend *backend;
 	struct device *device;
-	struct device *parts; /* that one, where the job goes through the device in parts */
-	const struct geometry *geometry;
+	struct device *parts;            /* that one, where the job goes through the device in parts */
+	const struct geometry *geometry; /* that which was given, or `upright` */
+	struct geometry upright;         /* owned, empty where the given one was that */
 	const struct recon_hooks *hooks;
 	struct cancel cancel;
 
@@ -200,6 +201,26 @@ static int choose_device(const struct backend *backend, struct device *device, c
 	return code;
 }
 
+/*
+ * The orbit, and the geometry that all goes by: FDK filters along the rows, so that
+ * a detector that lies on its side has its rows and columns exchanged, in
+ * *ret_upright. That stays as it is for any other.
+ */
+static int stand_up(const struct geometry **geometry, struct geometry *ret_upright, struct orbit *ret_orbit,
+		    struct error *err)
+{
+	int code = orbit_analyse(ret_orbit, *geometry, err);
+
+	if (code < 0 || !ret_orbit->turned)
+		return code;
+	orbit_clear(ret_orbit);
+	code = geometry_exchange(ret_upright, *geometry, err);
+	if (code < 0)
+		return code;
+	*geometry = ret_upright;
+	return orbit_analyse(ret_orbit, *geometry, err);
+}
+
 int recon_memory(const struct backend *backend, struct device *device, const struct geometry *geometry,
 		 const struct recipe *recipe, struct recon_memory *ret_memory, struct error *err)
 {
@@ -207,17 +228,17 @@ int recon_memory(const struct backend *backend, struct device *device, const str
 	struct fdk_weights weights = {.columns = &some, .response = &some, .extended = &some};
 	const struct linearise linearise = {.sample = SAMPLE_FLOAT32};
 	struct recipe resolved = *recipe;
-	struct orbit orbit;
+	struct geometry upright = {0};
+	struct orbit orbit = {0};
 	struct sart_options sart = {0};
 	struct device *parts = NULL;
 	struct plan_options options;
-	int code = orbit_analyse(&orbit, geometry, err);
+	int code = stand_up(&geometry, &upright, &orbit, err);
 
-	if (code < 0)
-		return code;
 	memcpy(weights.pad, orbit.pad, sizeof(weights.pad));
 	weights.extend = recipe->fdk.on && recipe->fdk.extend ? geometry->columns : 0;
-	code = recipe_resolve(&resolved, geometry, &orbit, err);
+	if (code == 0)
+		code = recipe_resolve(&resolved, geometry, &orbit, err);
 	if (code == 0 && resolved.sart.on)
 		code = sart_options_make(&sart, &resolved, &orbit, err);
 	if (code == 0) {
@@ -228,6 +249,7 @@ int recon_memory(const struct backend *backend, struct device *device, const str
 		backend_parts.close(parts);
 	subsets_clear(&sart.subsets);
 	orbit_clear(&orbit);
+	geometry_clear(&upright);
 	return code;
 }
 
@@ -268,8 +290,6 @@ static int recon_prepare(struct recon *recon, const struct recipe *recipe, struc
 	const struct geometry *geometry = recon->geometry;
 	int code = recipe_copy(&recon->recipe, recipe, err);
 
-	if (code == 0)
-		code = orbit_analyse(&recon->orbit, geometry, err);
 	if (code == 0)
 		code = recipe_resolve(&recon->recipe, geometry, &recon->orbit, err);
 	if (code == 0 && recon->recipe.fdk.on)
@@ -329,7 +349,9 @@ int recon_open(const struct backend *backend, struct device *device, const struc
 	recon->geometry = geometry;
 	recon->hooks = hooks;
 	recon->cancel = (struct cancel){.asked = hooks->cancelled, .context = hooks->context};
-	code = input_open(&recon->input, linearise, geometry, err);
+	code = stand_up(&recon->geometry, &recon->upright, &recon->orbit, err);
+	if (code == 0)
+		code = input_open(&recon->input, linearise, recon->geometry, recon->geometry != geometry, err);
 	if (code == 0)
 		code = recon_prepare(recon, recipe, err);
 	if (code == 0)
@@ -361,6 +383,7 @@ void recon_free(struct recon *recon)
 	if (recon->parts != NULL)
 		backend_parts.close(recon->parts);
 	input_clear(&recon->input);
+	geometry_clear(&recon->upright);
 	free(recon->stand_in_host);
 	free(recon->pushed);
 	free(recon);
@@ -489,8 +512,7 @@ static int push_view(struct recon *recon, const void *samples, int view, struct 
 
 int recon_push(struct recon *recon, const void *samples, const int *views, int count, struct error *err)
 {
-	size_t sample = recon->input.linearise.sample == SAMPLE_UINT16 ? sizeof(uint16_t) : sizeof(float);
-	size_t view_bytes = sample * (size_t)recon->geometry->columns * (size_t)recon->geometry->rows;
+	const size_t view_bytes = input_view_bytes(&recon->input);
 	int code = check_views(recon, views, count, err);
 
 	if (code < 0)
@@ -560,7 +582,7 @@ static int warn_of_truncation(struct recon *recon, struct error *err)
 	int code = recon->backend->filter_extended(recon->plan, rows, err);
 
 	if (code == 0)
-		warn_truncated(recon->hooks, recon->geometry, rows, recon->weights.extend);
+		warn_truncated(recon->hooks, recon->geometry, recon->input.turned, rows, recon->weights.extend);
 	return code;
 }
 
@@ -796,7 +818,7 @@ static int leave_out_the_exterior(struct recon *recon, struct error *err)
 		code = exterior_subtract(backend, recon->device, recon->plan, recon->geometry, recon->weights.pad, grid,
 					 recon->volume, recon->projections, &outside, err);
 	if (code == 0)
-		warn_outside(recon->hooks, recon->geometry, outside);
+		warn_outside(recon->hooks, recon->geometry, recon->input.turned, outside);
 	if (code == 0)
 		code = backend->volume_copy(recon->volume, recon->before, err);
 	return code;

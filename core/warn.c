@@ -63,30 +63,37 @@ void warn_recipe(const struct recon_hooks *hooks, const struct geometry *geometr
 			   (orbit->arc - orbit->holes) * DEGREES, orbit->fan * DEGREES);
 }
 
-void warn_truncated(const struct recon_hooks *hooks, const struct geometry *geometry, const size_t rows[2], int extend)
+/* What FDK calls rows, and the sides of a detector, are named as they came. */
+static const char *row_of(bool turned)
+{
+	return turned ? "column" : "row";
+}
+
+void warn_truncated(const struct recon_hooks *hooks, const struct geometry *geometry, bool turned, const size_t rows[2],
+		    int extend)
 {
 	/* What noise does by chance: 1.7 % with 100 photons in air. */
 	const double few = 0.02;
+	const char *const row = row_of(turned), *const column = row_of(!turned);
 	const double all = (double)geometry->count * geometry->rows;
 
 	if ((double)rows[0] < few * all && (double)rows[1] < few * all)
 		return;
-	recon_warn(
-	    hooks, "truncated",
-	    "the object reaches beyond the detector: %.3g %% of the rows are cut off at the first column and %.3g %% "
-	    "at the last; FDK extended them by %d columns, values near the rim of the field of view are estimates",
-	    100 * (double)rows[0] / all, 100 * (double)rows[1] / all, extend);
+	recon_warn(hooks, "truncated",
+		   "the object reaches beyond the detector: %.3g %% of the %ss are cut off at the first %s and %.3g %% "
+		   "at the last; FDK extended them by %d %ss, values near the rim of the field of view are estimates",
+		   100 * (double)rows[0] / all, row, column, 100 * (double)rows[1] / all, extend, column);
 }
 
-void warn_outside(const struct recon_hooks *hooks, const struct geometry *geometry, size_t rows)
+void warn_outside(const struct recon_hooks *hooks, const struct geometry *geometry, bool turned, size_t rows)
 {
 	if (rows == 0)
 		return;
 	recon_warn(
 	    hooks, "outside_grid",
-	    "the object goes on outside of the grid: what FDK does not explain of %.3g %% of the rows was taken out "
+	    "the object goes on outside of the grid: what FDK does not explain of %.3g %% of the %ss was taken out "
 	    "of them for SART, which keeps FDK's means there",
-	    100 * (double)rows / ((double)geometry->count * geometry->rows));
+	    100 * (double)rows / ((double)geometry->count * geometry->rows), row_of(turned));
 }
 
 void warn_metal(const struct recon_hooks *hooks, const struct geometry *geometry, const struct recipe *recipe,

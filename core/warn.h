@@ -14,11 +14,14 @@ __attribute__((format(printf, 3, 4))) void recon_warn(const struct recon_hooks *
 /* "grid_unseen", "tv_without_sart", "arc_too_short". */
 void warn_recipe(const struct recon_hooks *hooks, const struct geometry *geometry, const struct recipe *recipe,
 		 const struct orbit *orbit);
-/* "truncated": rows[0] rows of all views were cut off at the first column, rows[1] at the last; of a few nothing is
- * told. */
-void warn_truncated(const struct recon_hooks *hooks, const struct geometry *geometry, const size_t rows[2], int extend);
+/*
+ * "truncated": rows[0] rows of all views were cut off at the first column, rows[1] at the last; of a few nothing is
+ * told. turned: what is a row here came as a column.
+ */
+void warn_truncated(const struct recon_hooks *hooks, const struct geometry *geometry, bool turned, const size_t rows[2],
+		    int extend);
 /* "outside_grid": so many rows count something that lies outside of the grid; none: nothing is told. */
-void warn_outside(const struct recon_hooks *hooks, const struct geometry *geometry, size_t rows);
+void warn_outside(const struct recon_hooks *hooks, const struct geometry *geometry, bool turned, size_t rows);
 /* "metal", or "no_metal" where it has no voxels. */
 void warn_metal(const struct recon_hooks *hooks, const struct geometry *geometry, const struct recipe *recipe,
 		const struct metal *metal);

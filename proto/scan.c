@@ -453,7 +453,8 @@ cJSON *scan_derived(const struct scan *scan)
 	cJSON_AddBoolToObject(derived, "untilted", geometry_is_untilted(&scan->geometry));
 	pixel = cJSON_AddArrayToObject(derived, "pixel_at_isocentre_mm");
 	for (int i = 0; i < 2; i++)
-		cJSON_AddItemToArray(pixel, cJSON_CreateNumber(shown(orbit->pixel_at_isocentre[i])));
+		cJSON_AddItemToArray(pixel,
+				     cJSON_CreateNumber(shown(orbit->pixel_at_isocentre[orbit->turned ? 1 - i : i])));
 	cJSON_AddNumberToObject(derived, "projection_bytes", (double)scan_projection_bytes(scan));
 	return derived;
 }
@@ -502,11 +503,15 @@ static void warn_weights(cJSON *list, const struct orbit *orbit)
 		     "the sources turn about an axis that leans by %.1f degrees against z, along (%.4f, %.4f, %.4f): "
 		     "arc, direction, field of view and FDK's weights are those about that axis",
 		     orbit->lean / degree, orbit->frame[2][0], orbit->frame[2][1], orbit->frame[2][2]);
+	if (orbit->turned)
+		warn(list, "rotated_detector",
+		     "the detector's rows run along the rotation axis: rows and columns are exchanged before FDK, fan "
+		     "angle, field of view and displacement are those across the axis");
 	if (fabs(orbit->tilt) > tilt_least * degree)
 		warn(list, "rotated_detector",
-		     "the detector's rows are %.1f degrees off the plane across the rotation axis; FDK filters along "
-		     "rows and is inexact there, SART is not",
-		     fabs(orbit->tilt) / degree);
+		     "the detector's %s are %.1f degrees off the plane across the rotation axis; FDK filters along "
+		     "them and is inexact there, SART is not",
+		     orbit->turned ? "columns" : "rows", fabs(orbit->tilt) / degree);
 	if (orbit->field_of_view <= 0)
 		warn(list, "no_field_of_view", "no point of the rotation axis is seen by every view");
 }
@@ -580,7 +585,7 @@ static void view_turns(const struct view *view, int *ret_columns, int *ret_hande
 }
 
 /* Detectors that are seen from behind, and sets of which some are mirrored and others not. */
-static void warn_mirrored(cJSON *list, const struct geometry *geometry)
+static void warn_mirrored(cJSON *list, const struct geometry *geometry, bool turned)
 {
 	int against = 0, odd = 0, first_odd = 0, first = 0;
 
@@ -589,7 +594,8 @@ static void warn_mirrored(cJSON *list, const struct geometry *geometry)
 
 		view_turns(&geometry->views[k], &columns, &handedness);
 		first = k == 0 ? handedness : first;
-		against += columns < 0;
+		/* Of one on its side, columns run up or down. */
+		against += columns < 0 && !turned;
 		if (handedness != first && odd++ == 0)
 			first_odd = k;
 	}
@@ -717,7 +723,7 @@ cJSON *scan_warnings(const struct scan *scan)
 	}
 	warn_implausible(list, scan);
 	warn_uneven_distances(list, &scan->geometry);
-	warn_mirrored(list, &scan->geometry);
+	warn_mirrored(list, &scan->geometry, orbit->turned);
 	warn_hardening(list, scan);
 	warn_air(list, scan);
 	return list;

@@ -63,11 +63,13 @@ test_every_kind_of_geometry_is_the_same_scan() {
 }
 
 test_what_fdk_cannot_mend_is_warned_of() {
-	# a detector in portrait: its rows run along the rotation axis
+	# a detector on its side: its rows run along the rotation axis, rows and columns are exchanged for FDK
 	new_scan '.geometry = {kind: "views", views: [range(12) | . * 30 * 3.14159265358979312 / 180 | {c: cos, s: sin} |
 	  {source_mm: [600 * .c, 600 * .s, 0], pixel0_mm: [-400 * .c + 9 * .s, -400 * .s - 9 * .c, -23],
 	   column_step_mm: [0, 0, 2], row_step_mm: [-2 * .s, 2 * .c, 0]}]}'
-	expect_json '[.warnings[] | select(.code == "rotated_detector")] | length == 1'
+	expect_json '[.warnings[].code] == ["rotated_detector"]'
+	# 10 rows of 2 mm across the axis, at 1000 mm
+	expect_json '(.derived.fan_angle_deg - 1.146 | fabs) < 0.01 and (.derived.field_of_view_mm - 12 | fabs) < 0.01'
 	# displaced by a third of its width on a short scan
 	new_scan '.geometry.angle_step_deg = 18 | .geometry.detector_offset_mm = [16, 0]'
 	expect_json '[.warnings[] | select(.code == "displaced_short_scan")] | length == 1'

@@ -401,6 +401,57 @@ START_TEST(a_displaced_detector_widens_the_field_of_view)
 }
 END_TEST
 
+/* Turned by a quarter to either side, mirrored or not, a detector sees what it saw. */
+START_TEST(a_detector_on_its_side_has_the_same_orbit)
+{
+	static const struct sweep sweeps[] = {
+	    {101, 61, 4, 0, 1, 360, {120, 9}, 0},
+	    {101, 61, 4, 30, -1, 215, {-3, 0}, 0},
+	};
+
+	for (int i = 0; i < 8; i++) {
+		const bool right = i & 1, mirrored = i & 2;
+		struct geometry upright = geometry_of(&sweeps[i / 4], NULL), side;
+		struct orbit orbit = orbit_of(&upright), other;
+		struct grid grid, same;
+		struct error err;
+
+		ck_assert_int_eq(geometry_exchange(&side, &upright, &err), 0);
+		for (int k = 0; k < side.count; k++) {
+			struct view *view = &side.views[k];
+
+			/* From the other end of its rows, its columns, or both. */
+			for (int a = 0; a < 3; a++) {
+				const double rows = (side.rows - 1) * view->row_step[a];
+				const double columns = (side.columns - 1) * view->column_step[a];
+
+				view->pixel0[a] += (right ? rows : 0) + (right == mirrored ? columns : 0);
+				view->row_step[a] *= right ? -1 : 1;
+				view->column_step[a] *= right == mirrored ? -1 : 1;
+			}
+		}
+		other = orbit_of(&side);
+		ck_assert(other.turned && !orbit.turned);
+		ck_assert(other.displaced == orbit.displaced && other.short_scan == orbit.short_scan);
+		ck_assert_double_eq_tol(other.fan, orbit.fan, 1e-12);
+		ck_assert_double_eq_tol(other.field_of_view, orbit.field_of_view, 1e-9);
+		ck_assert_double_eq_tol(fabs(other.displacement), fabs(orbit.displacement), 1e-9);
+		ck_assert_int_eq(other.pad[0] + other.pad[1], orbit.pad[0] + orbit.pad[1]);
+		ck_assert_double_eq_tol(other.tilt, 0, 1e-9);
+		orbit_default_grid(&orbit, &upright, 512, &grid);
+		orbit_default_grid(&other, &side, 512, &same);
+		for (int a = 0; a < 3; a++) {
+			ck_assert_int_eq(same.size[a], grid.size[a]);
+			ck_assert_double_eq_tol(same.spacing[a], grid.spacing[a], 1e-9);
+		}
+		orbit_clear(&orbit);
+		orbit_clear(&other);
+		geometry_clear(&upright);
+		geometry_clear(&side);
+	}
+}
+END_TEST
+
 START_TEST(a_real_c_arm_s_orbit_is_a_short_scan)
 {
 	double *matrices = data_npy("carm_kct_248.npy", 248 * 12), pitch[2] = {0.616, 0.616};
@@ -901,6 +952,7 @@ Suite *orbit_suite(void)
 	tcase_add_test(facts, only_a_clear_displacement_on_a_full_turn_counts);
 	tcase_add_test(facts, the_field_of_view_is_what_all_views_see);
 	tcase_add_test(facts, a_displaced_detector_widens_the_field_of_view);
+	tcase_add_test(facts, a_detector_on_its_side_has_the_same_orbit);
 	tcase_add_test(facts, a_real_c_arm_s_orbit_is_a_short_scan);
 	tcase_add_test(facts, an_orbit_that_leans_over_is_told_about_its_own_axis);
 	suite_add_tcase(suite, facts);

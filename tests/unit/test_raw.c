@@ -386,6 +386,71 @@ START_TEST(blank_views_of_a_short_scan_leave_the_level)
 }
 END_TEST
 
+static void exchange(const void *from, size_t bytes, void *to)
+{
+	for (int r = 0; r < ROWS; r++)
+		for (int c = 0; c < COLUMNS; c++)
+			memcpy((char *)to + (size_t)(c * ROWS + r) * bytes,
+			       (const char *)from + (size_t)(r * COLUMNS + c) * bytes, bytes);
+}
+
+/* The detector on its side, its images as they then come: nothing else changes, not even the bits. */
+START_TEST(a_detector_on_its_side_gives_the_same_volume)
+{
+	struct recipe recipe = recipe_of(_i);
+	struct outcome outcome = {0}, upright = {0};
+	struct scene scene, side;
+	struct counts *counts = malloc(sizeof(*counts)), *turned = malloc(sizeof(*turned));
+	struct error err;
+
+	make_scene(&scene);
+	make_counts(&scene, counts);
+	add_defects(counts);
+	memset(&counts->samples[11 * PIXELS], 0, sizeof(float) * PIXELS);
+	upright.samples = counts->samples;
+	upright.linearise = (struct linearise){
+	    .sample = SAMPLE_FLOAT32,
+	    .quantity = QUANTITY_INTENSITY,
+	    .flat = counts->flat,
+	    .dark = counts->dark,
+	    .saturation = 65535,
+	    .defects = counts->map,
+	    .has_air_region = true,
+	    .air_region = {1, 1, 6, 50},
+	    .hardening = water,
+	    .hardening_count = 4,
+	};
+	run(&scene, &recipe, &upright);
+	ck_assert_double_eq_tol(mean_near(upright.last, &upright.grid, (const double[]){2, 12, -8}, 6), 0.02, 2e-4);
+	side = scene;
+	ck_assert_int_eq(geometry_exchange(&side.geometry, &scene.geometry, &err), 0);
+	ck_assert_int_eq(side.geometry.columns, ROWS);
+	exchange(counts->flat, sizeof(float), turned->flat);
+	exchange(counts->dark, sizeof(float), turned->dark);
+	exchange(counts->map, 1, turned->map);
+	turned->samples = malloc(sizeof(float) * PIXELS * VIEWS);
+	for (int k = 0; k < VIEWS; k++)
+		exchange(&counts->samples[k * PIXELS], sizeof(float), &turned->samples[k * PIXELS]);
+	outcome.samples = turned->samples;
+	outcome.linearise = upright.linearise;
+	outcome.linearise.flat = turned->flat;
+	outcome.linearise.dark = turned->dark;
+	outcome.linearise.defects = turned->map;
+	memcpy(outcome.linearise.air_region, (const int[]){1, 1, 50, 6}, sizeof(outcome.linearise.air_region));
+	run(&side, &recipe, &outcome);
+	ck_assert_str_eq(outcome.warnings, upright.warnings);
+	ck_assert_mem_eq(outcome.last, upright.last, sizeof(float) * grid_voxels(&upright.grid));
+	outcome_clear(&outcome);
+	outcome_clear(&upright);
+	geometry_clear(&side.geometry);
+	scene_clear(&scene);
+	free(counts->samples);
+	free(turned->samples);
+	free(counts);
+	free(turned);
+}
+END_TEST
+
 /* ---- defects that the images show ---- */
 
 enum fault { NONE, DEAD, LIVELESS, HOT, SATURATED, LEAKY, LEAKS_A_LITTLE, NOT_A_NUMBER, LESS_GAIN };
@@ -642,6 +707,7 @@ Suite *raw_suite(void)
 	tcase_add_loop_test(volumes, big_endian_counts_are_told, 0, 3);
 	tcase_add_loop_test(volumes, an_object_in_the_air_region_is_told, 0, 2);
 	tcase_add_loop_test(volumes, a_blank_view_is_told_and_is_not_air, 0, 2);
+	tcase_add_loop_test(volumes, a_detector_on_its_side_gives_the_same_volume, 0, 2);
 	tcase_add_test(volumes, blank_views_of_a_short_scan_leave_the_level);
 	tcase_add_test(volumes, measured_counts_are_what_their_publishers_say);
 	suite_add_tcase(suite, volumes);
