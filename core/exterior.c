@@ -1,35 +1,38 @@
-/* What lies outside of the grid is taken out of truncated rows: see exterior.h. */
+/* What lies outside of the grid is taken out of the projections: see exterior.h. */
 #include "core/exterior.h"
 
+#include <math.h>
 #include <stdlib.h>
 
 #include "core/extend.h"
-#include "core/fdk.h"
 #include "core/outside.h"
 
 /* Spread over the orbit: what goes on outside of the grid shows in many views. */
 enum { VIEWS_LOOKED_AT = 32 };
 
-/* One view on the host: line integrals as measured and through the volume. */
-struct pair {
+/* One view on the host, [row][column]: line integrals as measured, through w and through w on the recipe's grid. */
+struct projection {
+	const struct view *view;
 	int columns, rows;
 	const int *pad;
-	const struct faces *faces;   /* NULL: nobody knows */
-	float *measured, *explained; /* [row][column], owned */
-	double *smooth;              /* [row][column], owned */
+	const struct faces *faces; /* of w; NULL: FDK is too poor for that */
+	float *measured;
+	const float *explained, *inside; /* inside NULL: nothing lies outside of the grid */
+	double *smooth;                  /* to work in */
 };
 
-static bool is_truncated(const struct pair *pair, const float *row)
+/* A side that FDK pads is none of a truncated row. */
+static bool is_truncated(const int pad[2], const float *row, int columns)
 {
-	const int edge = extend_edge(pair->columns);
+	const int edge = extend_edge(columns);
 	float sums[2] = {0};
 
 	for (int i = 0; i < edge; i++) {
 		sums[0] += row[i];
-		sums[1] += row[pair->columns - 1 - i];
+		sums[1] += row[columns - 1 - i];
 	}
-	return (pair->pad[0] == 0 && sums[0] >= EXTEND_LEVEL * (float)edge) ||
-	       (pair->pad[1] == 0 && sums[1] >= EXTEND_LEVEL * (float)edge);
+	return (pad[0] == 0 && sums[0] >= EXTEND_LEVEL * (float)edge) ||
+	       (pad[1] == 0 && sums[1] >= EXTEND_LEVEL * (float)edge);
 }
 
 /* Sums of e and column e over the columns first .. last. */
@@ -54,7 +57,8 @@ static double line_at(const struct stretch *stretch, int column)
 	return stretch->sum / n + slope * (column - middle);
 }
 
-static void subtract_row(float *measured, const float *explained, double *smooth, int columns)
+/* What changes slowly along the row of what w does not explain. */
+static void smooth_row(const float *measured, const float *explained, double *ret, int columns)
 {
 	const int reach = columns / EXTERIOR_PART > 2 ? columns / EXTERIOR_PART : 2;
 	struct stretch stretch = {.first = 0, .last = -1};
@@ -66,107 +70,152 @@ static void subtract_row(float *measured, const float *explained, double *smooth
 		for (; stretch.first < c - reach; stretch.first++)
 			stretch_add(&stretch, stretch.first,
 				    (double)explained[stretch.first] - (double)measured[stretch.first]);
-		smooth[c] = line_at(&stretch, c);
+		ret[c] = line_at(&stretch, c);
 	}
-	for (int c = 0; c < columns; c++)
-		measured[c] = (float)((double)measured[c] - smooth[c]);
 }
 
-/* Returns whether any row was changed; adds those that were not truncated. */
-static bool subtract_view(const struct pair *pair, const struct view *view, size_t *outside)
+static struct exterior_rows subtract_row(const struct projection *of, int row)
 {
-	size_t truncated = 0, counting = 0;
+	const size_t at = (size_t)row * (size_t)of->columns;
+	const float *explained = of->explained + at, *inside = of->inside != NULL ? of->inside + at : NULL;
+	float *measured = of->measured + at;
+	double *smooth = of->smooth + at, outside = 0;
+	struct exterior_rows found = {.truncated = is_truncated(of->pad, measured, of->columns)};
 
-#pragma omp parallel for schedule(static) reduction(+ : truncated, counting)
-	for (int r = 0; r < pair->rows; r++) {
-		const size_t at = (size_t)r * (size_t)pair->columns;
-
-		if (is_truncated(pair, pair->measured + at))
-			truncated++;
-		else if (pair->faces != NULL && faces_row_counts_outside(pair->faces, view, pair->columns, r,
-									 pair->measured + at, pair->explained + at))
-			counting++;
-		else
-			continue;
-		subtract_row(pair->measured + at, pair->explained + at, pair->smooth + at, pair->columns);
+	if (found.truncated == 0 && of->faces != NULL &&
+	    faces_row_counts_outside(of->faces, of->view, of->columns, row, measured, explained))
+		found.outside = 1;
+	if (found.truncated + found.outside > 0) {
+		smooth_row(measured, explained, smooth, of->columns);
+		for (int c = 0; c < of->columns; c++)
+			measured[c] = (float)((double)measured[c] - smooth[c]);
 	}
-	*outside += counting;
-	return truncated + counting > 0;
+	for (int c = 0; c < of->columns && inside != NULL; c++) {
+		outside += fabs((double)explained[c] - (double)inside[c]);
+		measured[c] -= explained[c] - inside[c];
+	}
+	if (outside >= (double)EXTEND_LEVEL * of->columns)
+		found.outside = 1;
+	return found;
 }
 
-int exterior_is_possible(const struct geometry *geometry, const struct grid *grid, const struct backend *backend,
-			 struct stack *projections, bool *ret_possible, struct error *err)
+static void subtract_view(const struct projection *of, struct exterior_rows *rows)
 {
+	size_t truncated = 0, outside = 0;
+
+#pragma omp parallel for schedule(static) reduction(+ : truncated, outside)
+	for (int r = 0; r < of->rows; r++) {
+		const struct exterior_rows found = subtract_row(of, r);
+
+		truncated += found.truncated;
+		outside += found.outside;
+	}
+	rows->truncated += truncated;
+	rows->outside += outside;
+}
+
+int exterior_look(const struct surroundings_options *options, struct exterior_rows *ret_rows, struct error *err)
+{
+	const struct geometry *geometry = options->geometry;
+	const int columns = geometry->columns, rows = geometry->rows;
 	const int looked_at = geometry->count < VIEWS_LOOKED_AT ? geometry->count : VIEWS_LOOKED_AT;
-	float *measured = malloc((size_t)geometry->columns * (size_t)geometry->rows * sizeof(float));
-	bool possible = false;
+	float *measured = malloc((size_t)columns * (size_t)rows * sizeof(float));
+	struct exterior_rows found = {0};
 	int code = 0;
 
 	if (measured == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for a view of %d x %d pixels", geometry->columns,
-				 geometry->rows);
-	for (int i = 0; i < looked_at && !possible && code == 0; i++) {
+		return error_set(err, ERR_NO_MEMORY, "no memory for a view of %d x %d pixels", columns, rows);
+	for (int i = 0; i < looked_at && code == 0; i++) {
 		const int view = (int)((long long)i * geometry->count / looked_at);
 
-		code = backend->stack_download(projections, view, 1, measured, err);
+		code = options->backend->stack_download(options->projections, view, 1, measured, err);
+		for (int r = 0; r < rows && code == 0; r++)
+			found.truncated +=
+			    is_truncated(options->orbit->pad, measured + (size_t)r * (size_t)columns, columns);
 		if (code == 0)
-			possible = outside_is_possible(grid, &geometry->views[view], geometry->columns, geometry->rows,
-						       measured);
+			found.outside += outside_rows(options->grid, &geometry->views[view], columns, rows, measured);
 	}
 	free(measured);
 	if (code == 0)
-		*ret_possible = possible;
+		*ret_rows = found;
 	return code;
 }
 
-int exterior_subtract(const struct backend *backend, struct device *device, struct plan *plan,
-		      const struct geometry *geometry, const int pad[2], const struct grid *grid, struct volume *volume,
-		      struct stack *projections, size_t *ret_outside, struct error *err)
+/* Views first .. first + count - 1 through the volume, to the host. */
+static int project(const struct surroundings_options *options, struct plan *plan, const struct volume *volume,
+		   int first, int count, struct stack *batch, float *ret, struct error *err)
 {
-	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
-	struct pair pair = {
-	    .columns = geometry->columns,
-	    .rows = geometry->rows,
-	    .pad = pad,
-	    .measured = malloc(pixels * sizeof(float)),
-	    .explained = malloc(pixels * sizeof(float)),
-	    .smooth = malloc(pixels * sizeof(double)),
-	};
+	int views[FDK_BATCH_MOST], code;
+
+	for (int i = 0; i < count; i++)
+		views[i] = first + i;
+	code = options->backend->project(plan, volume, views, count, batch, err);
+	return code < 0 ? code : options->backend->stack_download(batch, 0, count, ret, err);
+}
+
+int exterior_subtract(const struct surroundings *surroundings, const struct surroundings_options *options,
+		      struct plan *plan, struct volume *work, struct exterior_rows *ret_rows, struct error *err)
+{
+	const struct backend *backend = options->backend;
+	const struct geometry *geometry = options->geometry;
+	const int all = geometry->count, slots = all < FDK_BATCH_MOST ? all : FDK_BATCH_MOST;
+	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows, most = (size_t)slots * pixels;
+	float *measured = malloc(most * sizeof(float)), *explained = malloc(most * sizeof(float)), *inside = NULL;
+	double *smooth = malloc(pixels * sizeof(double));
+	struct exterior_rows found = {0};
 	struct faces faces = {0};
 	struct stack *batch = NULL;
-	size_t outside = 0;
-	int views[FDK_BATCH_MOST], slots = geometry->count < FDK_BATCH_MOST ? geometry->count : FDK_BATCH_MOST;
+	bool enough = measured != NULL && explained != NULL && smooth != NULL;
 	int code = 0;
 
-	if (pair.measured == NULL || pair.explained == NULL || pair.smooth == NULL)
-		code = error_set(err, ERR_NO_MEMORY, "no memory for a view of %d x %d pixels", pair.columns, pair.rows);
-	if (code == 0 && grid != NULL) {
-		code = faces_make(&faces, backend, volume, grid, err);
-		pair.faces = &faces;
+	if (surroundings->goes_on) {
+		inside = malloc(most * sizeof(float));
+		enough = enough && inside != NULL;
 	}
+	if (!enough)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views of %d x %d pixels", slots,
+				 geometry->columns, geometry->rows);
 	if (code == 0)
-		code = backend->stack_new(device, pair.columns, pair.rows, slots, &batch, err);
+		code = faces_make(&faces, backend, surroundings->volume, &surroundings->grid, err);
+	if (code == 0 && inside != NULL)
+		code = surroundings_sample(surroundings, options->grid, work, err);
+	if (code == 0)
+		code = backend->stack_new(options->device, geometry->columns, geometry->rows, slots, &batch, err);
 	/* Several at a time: a pass over the volume costs as much as some views do. */
-	for (int view = 0; view < geometry->count && code == 0; view++) {
-		const int slot = view % slots, left = geometry->count - view;
+	for (int first = 0; first < all && code == 0; first += slots) {
+		const int count = all - first < slots ? all - first : slots;
 
-		for (int i = 0; i < slots && slot == 0; i++)
-			views[i] = view + i;
-		if (slot == 0)
-			code = backend->project(plan, volume, views, left < slots ? left : slots, batch, err);
+		code = project(options, surroundings->plan, surroundings->volume, first, count, batch, explained, err);
+		if (code == 0 && inside != NULL)
+			code = project(options, plan, work, first, count, batch, inside, err);
 		if (code == 0)
-			code = backend->stack_download(batch, slot, 1, pair.explained, err);
+			code = backend->stack_download(options->projections, first, count, measured, err);
+		for (int i = 0; i < count && code == 0; i++) {
+			const size_t at = (size_t)i * pixels;
+			const struct projection projection = {
+			    .view = &geometry->views[first + i],
+			    .columns = geometry->columns,
+			    .rows = geometry->rows,
+			    .pad = options->orbit->pad,
+			    .faces = options->inside_only ? NULL : &faces,
+			    .measured = measured + at,
+			    .explained = explained + at,
+			    .inside = inside != NULL ? inside + at : NULL,
+			    .smooth = smooth,
+			};
+
+			subtract_view(&projection, &found);
+		}
 		if (code == 0)
-			code = backend->stack_download(projections, view, 1, pair.measured, err);
-		if (code == 0 && subtract_view(&pair, &geometry->views[view], &outside))
-			code = backend->stack_upload(projections, view, 1, pair.measured, err);
+			code = backend->stack_upload(options->projections, first, count, measured, err);
 	}
 	if (code == 0)
-		*ret_outside = outside;
+		*ret_rows = found;
 	backend->stack_free(batch);
 	faces_clear(&faces);
-	free(pair.measured);
-	free(pair.explained);
-	free(pair.smooth);
+	free(measured);
+	free(explained);
+	free(inside);
+	free(smooth);
 	return code;
 }

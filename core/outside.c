@@ -113,28 +113,29 @@ bool faces_row_counts_outside(const struct faces *faces, const struct view *view
 	return missed * SHARE > looked_at && beside >= (double)EXTEND_LEVEL * missed;
 }
 
-bool outside_is_possible(const struct grid *grid, const struct view *view, int columns, int rows, const float *measured)
+size_t outside_rows(const struct grid *grid, const struct view *view, int columns, int rows, const float *measured)
 {
 	const int looked_at = rows < LOOKED_AT ? rows : LOOKED_AT;
-	int possible = 0;
+	size_t found = 0;
 
-#pragma omp parallel for schedule(static) reduction(+ : possible)
+#pragma omp parallel for schedule(static) reduction(+ : found)
 	for (int i = 0; i < looked_at; i++) {
 		const int row = looked_at > 1 ? (int)((long long)i * (rows - 1) / (looked_at - 1)) : 0;
+		const bool outermost = row == 0 || row == rows - 1;
 		int count = 0;
 		double sum = 0;
 
 		for (int column = 0; column < columns; column += stride_of(columns)) {
 			const struct passage passage = pass_of_ray(grid, view, column, row);
 
-			if (passage.missed || passage.axis[0] == 2 || passage.axis[1] == 2) {
+			if (passage.missed || (outermost && (passage.axis[0] == 2 || passage.axis[1] == 2))) {
 				count++;
 				sum += (double)measured[(size_t)row * (size_t)columns + (size_t)column];
 			}
 		}
-		possible += count > 0 && sum >= (double)EXTEND_LEVEL * count;
+		found += count > 0 && sum >= (double)EXTEND_LEVEL * count;
 	}
-	return possible > 0;
+	return found;
 }
 
 /* The outermost layers, and the density of what is in the volume. */

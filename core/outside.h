@@ -37,11 +37,12 @@ bool faces_row_counts_outside(const struct faces *faces, const struct view *view
 			      const float *measured, const float *explained);
 
 /*
- * The same without a volume, to save the trouble: a row may count it when the
- * mean of those of its rays that miss the grid, or pass its lowest or highest
- * face, is not air; about 64 rows are looked at. `measured` is [rows][columns].
+ * The same without a volume, of about 64 rows of a view; `measured` is [rows][columns].
+ * A row counts it when the mean of those of its rays that miss the grid is not
+ * air; in the outermost rows, beyond which nobody sees, of those that pass its
+ * lowest or highest face too. An object that ends beside the grid, where every
+ * ray through it passes the grid as well, is within some mm of it.
  */
-bool outside_is_possible(const struct grid *grid, const struct view *view, int columns, int rows,
-			 const float *measured);
+size_t outside_rows(const struct grid *grid, const struct view *view, int columns, int rows, const float *measured);
 
 #endif

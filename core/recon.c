@@ -83,6 +83,12 @@ static bool keeps_projections(const struct recipe *recipe)
 	return recipe->sart.on || recipe->metal.on;
 }
 
+/* Unless it was told to take truncated rows as they are. */
+static bool leaves_out_the_exterior(const struct recipe *recipe)
+{
+	return recipe->sart.on && recipe->fdk.extend;
+}
+
 static struct plan_options plan_options(const struct recipe *recipe, const struct geometry *geometry,
 					const struct linearise *linearise, const struct fdk_weights *weights,
 					const struct sart_options *sart)
@@ -141,8 +147,25 @@ static int add_metal(const struct backend *backend, struct device *device, const
 	return 0;
 }
 
+/* In parts the device holds slabs of one volume at a time. */
+static int add_surroundings(const struct surroundings_options *options, struct recon_memory *memory, struct error *err)
+{
+	size_t device, host;
+	int code = surroundings_bytes(options, &device, &host, err);
+
+	if (code < 0)
+		return code;
+	if (memory->host == 0)
+		memory->scratch += device;
+	else if (device > memory->volumes + memory->scratch)
+		memory->scratch = device - memory->volumes;
+	memory->host += host;
+	return 0;
+}
+
 static int memory_needed(const struct backend *backend, struct device *device, const struct plan_options *options,
-			 const struct recipe *recipe, struct recon_memory *ret_memory, struct error *err)
+			 const struct recipe *recipe, const struct orbit *orbit, struct recon_memory *ret_memory,
+			 struct error *err)
 {
 	struct recon_memory memory = {0};
 	struct plan_bytes bytes;
@@ -160,10 +183,18 @@ static int memory_needed(const struct backend *backend, struct device *device, c
 	memory.scratch = bytes.scratch + bytes.raw;
 	if (options->column_weights != NULL)
 		memory.scratch += batch / columns * (columns + (size_t)(options->pad[0] + options->pad[1]));
-	/* Of exterior_subtract. */
-	if (options->sart != NULL && options->extend > 0)
-		memory.scratch += batch;
 	memory.host = bytes.host;
+	if (leaves_out_the_exterior(recipe)) {
+		const struct surroundings_options surroundings = {.backend = backend,
+								  .device = device,
+								  .geometry = options->geometry,
+								  .orbit = orbit,
+								  .grid = &recipe->grid};
+
+		code = add_surroundings(&surroundings, &memory, err);
+		if (code < 0)
+			return code;
+	}
 	if (recipe->metal.on) {
 		code = add_metal(backend, device, options, batch, &memory, err);
 		if (code < 0)
@@ -183,17 +214,17 @@ static int memory_needed(const struct backend *backend, struct device *device, c
  * whole, otherwise it is the device in parts and the memory what that takes.
  */
 static int choose_device(const struct backend *backend, struct device *device, const struct plan_options *options,
-			 const struct recipe *recipe, struct recon_memory *ret_memory, struct device **ret_parts,
-			 struct error *err)
+			 const struct recipe *recipe, const struct orbit *orbit, struct recon_memory *ret_memory,
+			 struct device **ret_parts, struct error *err)
 {
 	struct device *parts = NULL;
-	int code = memory_needed(backend, device, options, recipe, ret_memory, err);
+	int code = memory_needed(backend, device, options, recipe, orbit, ret_memory, err);
 
 	if (code < 0 || device == NULL || !backend->own_memory || ret_memory->total <= ret_memory->available)
 		return code;
 	code = parts_open(backend, device, &parts, err);
 	if (code == 0)
-		code = memory_needed(&backend_parts, parts, options, recipe, ret_memory, err);
+		code = memory_needed(&backend_parts, parts, options, recipe, orbit, ret_memory, err);
 	if (code < 0)
 		backend_parts.close(parts);
 	else
@@ -243,7 +274,7 @@ int recon_memory(const struct backend *backend, struct device *device, const str
 		code = sart_options_make(&sart, &resolved, &orbit, err);
 	if (code == 0) {
 		options = plan_options(&resolved, geometry, &linearise, &weights, &sart);
-		code = choose_device(backend, device, &options, &resolved, ret_memory, &parts, err);
+		code = choose_device(backend, device, &options, &resolved, &orbit, ret_memory, &parts, err);
 	}
 	if (parts != NULL)
 		backend_parts.close(parts);
@@ -260,7 +291,8 @@ static int refuse_what_does_not_fit(struct recon *recon, const struct plan_optio
 	struct recon_memory memory;
 	struct device_info host = {.bytes_free = SIZE_MAX};
 	struct device *processor;
-	int code = choose_device(recon->backend, recon->device, options, &recon->recipe, &memory, &recon->parts, err);
+	int code = choose_device(recon->backend, recon->device, options, &recon->recipe, &recon->orbit, &memory,
+				 &recon->parts, err);
 
 	if (code == 0 && recon->parts != NULL) {
 		recon->backend = &backend_parts;
@@ -586,11 +618,17 @@ static int warn_of_truncation(struct recon *recon, struct error *err)
 	return code;
 }
 
-/* What is missing where views were blank: the others stand in for them in equal shares. */
+/* The others stand in for blank views in equal shares. */
+static double blank_factor(const struct recon *recon)
+{
+	return 1 / (1 - input_blank_share(&recon->input, &recon->orbit));
+}
+
+/* What is missing where views were blank. */
 static int make_up_for_blank_views(struct recon *recon, struct error *err)
 {
 	const size_t voxels = grid_voxels(&recon->recipe.grid);
-	const float factor = (float)(1 / (1 - input_blank_share(&recon->input, &recon->orbit)));
+	const float factor = (float)blank_factor(recon);
 	float *host;
 	int code;
 
@@ -743,84 +781,49 @@ static int iterate(struct recon *recon, struct history_row *ret_row, struct erro
 	return 0;
 }
 
-/* Whether FDK extends any row of the scan; a run that goes on from an iterate has not filtered yet. */
-static int find_truncation(struct recon *recon, bool *ret_truncated, struct error *err)
-{
-	const int all = recon->geometry->count;
-	const int batch = recon->fdk.batch < FDK_BATCH_MOST ? recon->fdk.batch : FDK_BATCH_MOST;
-	size_t rows[2];
-	int code = 0;
-
-	for (int view = 0; view < all && recon->resumed && code == 0; view += batch) {
-		const int count = all - view < batch ? all - view : batch;
-		int views[FDK_BATCH_MOST];
-
-		for (int i = 0; i < count; i++)
-			views[i] = view + i;
-		code = recon->backend->filter(recon->plan, recon->projections, NULL, views, count, recon->fdk.filtered,
-					      err);
-	}
-	if (code == 0)
-		code = recon->backend->filter_extended(recon->plan, rows, err);
-	if (code == 0)
-		*ret_truncated = rows[0] + rows[1] > 0;
-	return code;
-}
-
-/* FDK once more, over the stack and in the order of the views. */
-static int run_fdk_again(struct recon *recon, struct error *err)
-{
-	int code = recon->backend->volume_fill(recon->volume, 0, err);
-
-	for (int view = 0; view < recon->geometry->count && code == 0; view++) {
-		code = check_cancelled(recon, err);
-		if (code == 0)
-			code = fdk_add(&recon->fdk, view, view, recon->projections, recon->volume, err);
-	}
-	if (code == 0)
-		code = fdk_flush(&recon->fdk, recon->projections, recon->volume, err);
-	if (code == 0)
-		code = make_up_for_blank_views(recon, err);
-	return code;
-}
-
 /*
- * Where FDK extends rows, or the object goes on outside of the grid, that is
- * taken out of the projections before SART sees them. FDK runs again for it
- * also when its volume is still there, so that a run that goes on from an
- * iterate gives the same bits. The iterate waits in `before`, which the first
- * iteration writes anyway.
+ * What lies outside of the grid is taken out of the projections before SART sees
+ * them. It is found from them alone, so that a run that goes on from an iterate
+ * gives the same bits; `before` is worked in, which the first iteration writes
+ * anyway.
  */
 static int leave_out_the_exterior(struct recon *recon, struct error *err)
 {
-	const struct backend *backend = recon->backend;
-	/*
-	 * An FDK volume that is too low in many places looks as if something were
-	 * missing from it; real sweeps are some degrees short, and that is at the rim.
-	 */
+	/* FDK of a short arc is too low in many places; real sweeps lack some degrees, and that is at the rim. */
 	const double little = 0.2;
 	const double covered = recon->orbit.arc - recon->orbit.holes;
 	const bool sound =
 	    (!recon->orbit.arc_too_short || covered > M_PI + recon->orbit.fan - little) && recon->orbit.tilt < little;
-	const struct grid *grid = sound ? &recon->recipe.grid : NULL;
-	bool wanted = false;
-	size_t outside;
-	int code = recon->weights.extend > 0 ? find_truncation(recon, &wanted, err) : 0;
+	const struct surroundings_options options = {
+	    .backend = recon->backend,
+	    .device = recon->device,
+	    .geometry = recon->geometry,
+	    .orbit = &recon->orbit,
+	    .grid = &recon->recipe.grid,
+	    .projections = recon->projections,
+	    .factor = blank_factor(recon),
+	    .inside_only = !sound,
+	    .cancel = cancel_of(recon),
+	};
+	struct surroundings surroundings = {0};
+	struct exterior_rows seen, rows = {0};
+	int code = exterior_look(&options, &seen, err);
 
-	if (code == 0 && recon->weights.extend > 0 && !wanted && grid != NULL)
-		code = exterior_is_possible(recon->geometry, grid, backend, recon->projections, &wanted, err);
-	if (code < 0 || !wanted)
+	if (code < 0 || seen.truncated + seen.outside == 0)
 		return code;
-	code = backend->volume_copy(recon->before, recon->volume, err);
+	if (!sound && (seen.outside > 0 || !recon->recipe.fdk.on))
+		warn_exterior_stays(recon->hooks, &seen);
+	if (!sound && (seen.truncated == 0 || !recon->recipe.fdk.on))
+		return 0;
+	code = surroundings_make(&surroundings, &options, err);
 	if (code == 0)
-		code = run_fdk_again(recon, err);
+		code = exterior_subtract(&surroundings, &options, recon->plan, recon->before, &rows, err);
+	if (code == 0 && !recon->recipe.fdk.on)
+		warn_truncated(recon->hooks, recon->geometry, recon->input.turned, surroundings.truncated,
+			       recon->geometry->columns);
 	if (code == 0)
-		code = exterior_subtract(backend, recon->device, recon->plan, recon->geometry, recon->weights.pad, grid,
-					 recon->volume, recon->projections, &outside, err);
-	if (code == 0)
-		warn_outside(recon->hooks, recon->geometry, recon->input.turned, outside);
-	if (code == 0)
-		code = backend->volume_copy(recon->volume, recon->before, err);
+		warn_outside(recon->hooks, recon->geometry, recon->input.turned, rows.outside);
+	surroundings_clear(&surroundings);
 	return code;
 }
 
@@ -835,7 +838,7 @@ static int run_sart(struct recon *recon, struct error *err)
 {
 	const struct recon_hooks *hooks = recon->hooks;
 	bool last = recon->iteration >= recon->recipe.sart.iterations;
-	int failed = last ? 0 : leave_out_the_exterior(recon, err);
+	int failed = last || !leaves_out_the_exterior(&recon->recipe) ? 0 : leave_out_the_exterior(recon, err);
 
 	if (failed < 0)
 		return failed;

@@ -91,9 +91,20 @@ void warn_outside(const struct recon_hooks *hooks, const struct geometry *geomet
 		return;
 	recon_warn(
 	    hooks, "outside_grid",
-	    "the object goes on outside of the grid: what FDK does not explain of %.3g %% of the %ss was taken out "
-	    "of them for SART, which keeps FDK's means there",
+	    "the object goes on outside of the grid: what FDK shows of that was taken out of %.3g %% of the %ss for "
+	    "SART",
 	    100 * (double)rows / ((double)geometry->count * geometry->rows), row_of(turned));
+}
+
+void warn_exterior_stays(const struct recon_hooks *hooks, const struct exterior_rows *rows)
+{
+	const bool outside = rows->outside > 0;
+
+	recon_warn(
+	    hooks, outside ? "outside_grid" : "truncated",
+	    "the object %s, and FDK of this orbit is too poor to take that out of the projections: SART piles it "
+	    "up in the grid",
+	    outside ? "goes on outside of the grid" : "reaches beyond the detector");
 }
 
 void warn_metal(const struct recon_hooks *hooks, const struct geometry *geometry, const struct recipe *recipe,

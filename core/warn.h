@@ -1,6 +1,7 @@
 #ifndef CBCT_CORE_WARN_H
 #define CBCT_CORE_WARN_H
 
+#include "core/exterior.h"
 #include "core/metal.h"
 #include "core/orbit.h"
 #include "core/recon.h"
@@ -22,6 +23,8 @@ void warn_truncated(const struct recon_hooks *hooks, const struct geometry *geom
 		    int extend);
 /* "outside_grid": so many rows count something that lies outside of the grid; none: nothing is told. */
 void warn_outside(const struct recon_hooks *hooks, const struct geometry *geometry, bool turned, size_t rows);
+/* "outside_grid" or "truncated": FDK of the orbit is too poor to take out what these rows count. */
+void warn_exterior_stays(const struct recon_hooks *hooks, const struct exterior_rows *rows);
 /* "metal", or "no_metal" where it has no voxels. */
 void warn_metal(const struct recon_hooks *hooks, const struct geometry *geometry, const struct recipe *recipe,
 		const struct metal *metal);

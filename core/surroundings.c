@@ -1,0 +1,338 @@
+/* The object in and around the recipe's grid, coarsely: see surroundings.h. */
+#include "core/surroundings.h"
+
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "core/extend.h"
+
+/* Spread over the orbit: what is empty shows in many views. */
+enum { VIEWS_LOOKED_AT = 32 };
+
+static size_t voxel_at(const struct grid *grid, int x, int y, int z)
+{
+	return ((size_t)z * (size_t)grid->size[1] + (size_t)y) * (size_t)grid->size[0] + (size_t)x;
+}
+
+/* The box around the field of view and the recipe's grid; that alone where the sources leave no room for more. */
+static void choose_grid(const struct surroundings_options *options, struct grid *ret)
+{
+	struct grid wide, inner = *options->grid;
+	struct error err;
+
+	orbit_default_grid(options->orbit, options->geometry, SURROUNDINGS_MOST, &wide);
+	for (int narrow = options->inside_only; narrow < 2; narrow++) {
+		double low[3], side[3], spacing = narrow ? 0 : wide.spacing[0];
+
+		for (int i = 0; i < 3; i++) {
+			double high = inner.origin[i] + (inner.size[i] - 0.5) * inner.spacing[i];
+
+			low[i] = inner.origin[i] - 0.5 * inner.spacing[i];
+			if (!narrow) {
+				low[i] = fmin(low[i], wide.origin[i] - 0.5 * wide.spacing[i]);
+				high = fmax(high, wide.origin[i] + (wide.size[i] - 0.5) * wide.spacing[i]);
+			}
+			side[i] = high - low[i];
+			spacing = fmax(spacing, side[i] / SURROUNDINGS_MOST);
+		}
+		for (int i = 0; i < 3; i++) {
+			/* A part of a millionth is rounding, not another voxel. */
+			ret->size[i] = (int)fmax(1, ceil(side[i] / spacing - 1e-6));
+			ret->spacing[i] = side[i] / ret->size[i];
+			ret->origin[i] = low[i] + 0.5 * ret->spacing[i];
+		}
+		if (grid_check_geometry(ret, options->geometry, &err) == 0)
+			return;
+	}
+}
+
+static struct plan_options plan_options_of(const struct surroundings_options *options, const struct grid *grid,
+					   const struct fdk_weights *weights)
+{
+	struct plan_options plan = {
+	    .geometry = options->geometry,
+	    .grid = grid,
+	    .linearise = {.sample = SAMPLE_FLOAT32},
+	    .column_weights = weights->columns,
+	    .filter_response = weights->response,
+	    .pad = {options->orbit->pad[0], options->orbit->pad[1]},
+	    .extend = weights->extend,
+	    .extended_response = weights->extended,
+	    .no_samples = true,
+	};
+
+	memcpy(plan.axis, weights->axis, sizeof(plan.axis));
+	return plan;
+}
+
+int surroundings_bytes(const struct surroundings_options *options, size_t *ret_device, size_t *ret_host,
+		       struct error *err)
+{
+	const struct geometry *geometry = options->geometry;
+	const int *pad = options->orbit->pad, all = geometry->count;
+	const size_t columns = (size_t)geometry->columns, wide = columns + (size_t)(pad[0] + pad[1]);
+	float some = 0; /* stands for the weights: only whether there are any is asked here */
+	const struct fdk_weights weights = {
+	    .columns = &some, .response = &some, .extended = &some, .extend = geometry->columns};
+	struct grid grid;
+	struct plan_options plan;
+	struct plan_bytes bytes;
+	size_t batch;
+	int code;
+
+	choose_grid(options, &grid);
+	plan = plan_options_of(options, &grid, &weights);
+	code = options->backend->plan_bytes(options->device, &plan, &bytes, err);
+	if (code < 0)
+		return code;
+	/* Filtered views and, when those are gone, projected ones. */
+	batch = (bytes.stack + (size_t)all - 1) / (size_t)all * (size_t)(all < FDK_BATCH_MOST ? all : FDK_BATCH_MOST);
+	*ret_device = bytes.volumes + bytes.scratch + bytes.raw + batch / columns * wide;
+	*ret_host = bytes.host > 0 ? grid_voxels(&grid) * sizeof(float) + batch : 0;
+	return 0;
+}
+
+/* ---- what no view can know ---- */
+
+/* Sums over the pixels up to `reach` away along both axes, in place; `line` has room for the longer side. */
+static void box_sums(float *image, int columns, int rows, int reach, float *line)
+{
+	for (int pass = 0; pass < 2; pass++) {
+		const int count = pass == 0 ? columns : rows, lines = pass == 0 ? rows : columns;
+		const size_t step = pass == 0 ? 1 : (size_t)columns, next = pass == 0 ? (size_t)columns : 1;
+
+		for (int j = 0; j < lines; j++) {
+			float *first = image + (size_t)j * next;
+			double sum = 0;
+
+			for (int i = 0; i < count; i++)
+				line[i] = first[(size_t)i * step];
+			for (int i = -reach; i < count; i++) {
+				if (i + reach < count)
+					sum += (double)line[i + reach];
+				if (i - reach - 1 >= 0)
+					sum -= (double)line[i - reach - 1];
+				if (i >= 0)
+					first[(size_t)i * step] = (float)sum;
+			}
+		}
+	}
+}
+
+/* Voxels whose shadow, and what lies up to a voxel and a half around it, is air in this view. `line` as above. */
+static void find_empty(const struct surroundings *s, const struct geometry *geometry, const struct orbit *orbit,
+		       int index, float *measured, float *line, bool *empty)
+{
+	const struct grid *grid = &s->grid;
+	const int columns = geometry->columns, rows = geometry->rows;
+	const size_t pixels = (size_t)columns * (size_t)rows;
+	const double size = fmax(fmax(grid->spacing[0], grid->spacing[1]), grid->spacing[2]);
+	const double pixel = fmin(orbit->pixel_at_isocentre[0], orbit->pixel_at_isocentre[1]);
+	const int reach = (int)fmin(ceil(1.5 * size / pixel), columns > rows ? columns : rows);
+	double matrix[12];
+
+	view_matrix(&geometry->views[index], matrix);
+	/* Means of nine pixels against noise. */
+	box_sums(measured, columns, rows, 1, line);
+	for (size_t i = 0; i < pixels; i++)
+		measured[i] = measured[i] >= 9 * EXTEND_LEVEL;
+	box_sums(measured, columns, rows, reach, line);
+#pragma omp parallel for schedule(static)
+	for (int z = 0; z < grid->size[2]; z++)
+		for (int y = 0; y < grid->size[1]; y++)
+			for (int x = 0; x < grid->size[0]; x++) {
+				const double place[3] = {grid->origin[0] + x * grid->spacing[0],
+							 grid->origin[1] + y * grid->spacing[1],
+							 grid->origin[2] + z * grid->spacing[2]};
+				double column, row;
+
+				view_project(matrix, place, &column, &row);
+				if (column >= 1 && row >= 1 && column <= columns - 2 && row <= rows - 2 &&
+				    measured[(size_t)lround(row) * (size_t)columns + (size_t)lround(column)] < 0.5f)
+					empty[voxel_at(grid, x, y, z)] = true;
+			}
+}
+
+static bool is_blank(const float *measured, size_t pixels)
+{
+	for (size_t i = 0; i < pixels; i++)
+		if (measured[i] != 0)
+			return false;
+	return true;
+}
+
+static bool is_inside(const struct grid *grid, const double place[3])
+{
+	for (int i = 0; i < 3; i++)
+		if (fabs((place[i] - grid->origin[i]) / grid->spacing[i] - 0.5 * (grid->size[i] - 1)) >
+		    0.5 * grid->size[i])
+			return false;
+	return true;
+}
+
+static bool is_in_view(const struct orbit *orbit, const double place[3])
+{
+	return hypot(vec_dot(orbit->frame[0], place), vec_dot(orbit->frame[1], place)) <= orbit->field_of_view / 2;
+}
+
+/* What stays of the FDK volume on the host, blank views made up for. */
+static int keep_what_is_known(struct surroundings *s, const struct surroundings_options *options, struct error *err)
+{
+	const struct geometry *geometry = options->geometry;
+	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
+	const int looked_at = geometry->count < VIEWS_LOOKED_AT ? geometry->count : VIEWS_LOOKED_AT;
+	const int longer = geometry->columns > geometry->rows ? geometry->columns : geometry->rows;
+	float *measured = malloc(pixels * sizeof(float)), *line = malloc((size_t)longer * sizeof(float));
+	bool *empty = calloc(grid_voxels(&s->grid), sizeof(bool));
+	size_t kept = 0;
+	int code = 0;
+
+	if (measured == NULL || line == NULL || empty == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for a view of %d x %d pixels", geometry->columns,
+				 geometry->rows);
+	for (int i = 0; i < looked_at && code == 0; i++) {
+		const int view = (int)((long long)i * geometry->count / looked_at);
+
+		code = options->backend->stack_download(options->projections, view, 1, measured, err);
+		if (code == 0 && !is_blank(measured, pixels))
+			find_empty(s, geometry, options->orbit, view, measured, line, empty);
+	}
+#pragma omp parallel for schedule(static) reduction(+ : kept)
+	for (int z = 0; z < (code == 0 ? s->grid.size[2] : 0); z++)
+		for (int y = 0; y < s->grid.size[1]; y++)
+			for (int x = 0; x < s->grid.size[0]; x++) {
+				const size_t at = voxel_at(&s->grid, x, y, z);
+				const double place[3] = {s->grid.origin[0] + x * s->grid.spacing[0],
+							 s->grid.origin[1] + y * s->grid.spacing[1],
+							 s->grid.origin[2] + z * s->grid.spacing[2]};
+				const bool inside = is_inside(options->grid, place);
+
+				if (!inside && (empty[at] || !is_in_view(options->orbit, place)))
+					s->voxels[at] = 0;
+				s->voxels[at] *= (float)options->factor;
+				kept += !inside && s->voxels[at] != 0;
+			}
+	s->goes_on = kept > 0;
+	free(measured);
+	free(line);
+	free(empty);
+	return code;
+}
+
+/* ---- making ---- */
+
+static int run_fdk(struct surroundings *s, const struct surroundings_options *options, struct error *err)
+{
+	const struct cancel *cancel = options->cancel;
+	struct fdk fdk = {0};
+	int code = fdk_open(&fdk, s->backend, options->device, s->plan, options->geometry, s->weights.pad, err);
+
+	for (int view = 0; view < options->geometry->count && code == 0; view++) {
+		if (cancel != NULL && cancel->asked(cancel->context))
+			code = error_set(err, ERR_CANCELLED, "cancelled");
+		else
+			code = fdk_add(&fdk, view, view, options->projections, s->volume, err);
+	}
+	if (code == 0)
+		code = fdk_flush(&fdk, options->projections, s->volume, err);
+	fdk_clear(&fdk);
+	return code;
+}
+
+int surroundings_make(struct surroundings *s, const struct surroundings_options *options, struct error *err)
+{
+	const struct backend *backend = options->backend;
+	const struct orbit *orbit = options->orbit;
+	struct plan_options plan;
+	int code;
+
+	*s = (struct surroundings){.backend = backend};
+	choose_grid(options, &s->grid);
+	/* As sharp as the voxels can hold: what is smeared over the grid's faces would be missed inside. */
+	code = fdk_weights_make(&s->weights, orbit, options->geometry, WINDOW_RAM_LAK,
+				fmin(1, orbit->pixel_at_isocentre[0] / fmax(s->grid.spacing[0], s->grid.spacing[1])),
+				true, err);
+	if (code < 0)
+		return code;
+	s->voxels = malloc(grid_voxels(&s->grid) * sizeof(float));
+	if (s->voxels == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for a volume of %zu voxels", grid_voxels(&s->grid));
+	plan = plan_options_of(options, &s->grid, &s->weights);
+	if (code == 0)
+		code = backend->plan_new(options->device, &plan, &s->plan, err);
+	if (code == 0)
+		code = backend->volume_new(options->device, &s->grid, &s->volume, err);
+	if (code == 0)
+		code = backend->volume_fill(s->volume, 0, err);
+	if (code == 0)
+		code = run_fdk(s, options, err);
+	if (code == 0)
+		code = backend->filter_extended(s->plan, s->truncated, err);
+	if (code == 0)
+		code = backend->volume_download(s->volume, 0, s->grid.size[2], s->voxels, err);
+	if (code == 0)
+		code = keep_what_is_known(s, options, err);
+	if (code == 0)
+		code = backend->volume_upload(s->volume, s->voxels, err);
+	if (code < 0)
+		surroundings_clear(s);
+	return code;
+}
+
+void surroundings_clear(struct surroundings *s)
+{
+	if (s->backend == NULL)
+		return;
+	s->backend->volume_free(s->volume);
+	s->backend->plan_free(s->plan);
+	fdk_weights_clear(&s->weights);
+	free(s->voxels);
+	*s = (struct surroundings){0};
+}
+
+/* ---- on the recipe's grid ---- */
+
+/* Between which two places of an axis a position lies, held beyond the outer ones, and how near to the second. */
+static float between(const struct grid *from, const struct grid *to, int axis, int index, int ret[2])
+{
+	const double place = to->origin[axis] + index * to->spacing[axis];
+	const double at = fmin(fmax((place - from->origin[axis]) / from->spacing[axis], 0), from->size[axis] - 1);
+
+	ret[0] = (int)at;
+	ret[1] = ret[0] + 1 < from->size[axis] ? ret[0] + 1 : ret[0];
+	return (float)(at - ret[0]);
+}
+
+int surroundings_sample(const struct surroundings *s, const struct grid *grid, struct volume *to, struct error *err)
+{
+	const size_t nx = (size_t)grid->size[0];
+	float *slice = malloc(nx * (size_t)grid->size[1] * sizeof(float));
+	int code = 0;
+
+	if (slice == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a slice");
+	for (int z = 0; z < grid->size[2] && code == 0; z++) {
+#pragma omp parallel for schedule(static)
+		for (int y = 0; y < grid->size[1]; y++)
+			for (int x = 0; x < grid->size[0]; x++) {
+				int at[3][2];
+				const float part[3] = {between(&s->grid, grid, 0, x, at[0]),
+						       between(&s->grid, grid, 1, y, at[1]),
+						       between(&s->grid, grid, 2, z, at[2])};
+				float sum = 0;
+
+				for (int i = 0; i < 8; i++) {
+					const int a = i & 1, b = i >> 1 & 1, c = i >> 2;
+
+					sum += (a ? part[0] : 1 - part[0]) * (b ? part[1] : 1 - part[1]) *
+					       (c ? part[2] : 1 - part[2]) *
+					       s->voxels[voxel_at(&s->grid, at[0][a], at[1][b], at[2][c])];
+				}
+				slice[(size_t)y * nx + (size_t)x] = sum;
+			}
+		code = s->backend->volume_put(to, z, 1, slice, err);
+	}
+	free(slice);
+	return code;
+}
