@@ -60,6 +60,16 @@ static struct passage pass_of_ray(const struct grid *grid, const struct view *vi
 	return pass(grid, view->source, pixel);
 }
 
+double ray_within(const struct grid *grid, const struct view *view, int column, int row)
+{
+	const struct passage passage = pass_of_ray(grid, view, column, row);
+	double way[3];
+
+	for (int i = 0; i < 3; i++)
+		way[i] = passage.point[1][i] - passage.point[0][i];
+	return passage.missed ? 0 : vec_norm(way);
+}
+
 static int stride_of(int columns)
 {
 	return columns > LOOKED_AT ? columns / LOOKED_AT : 1;

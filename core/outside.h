@@ -45,4 +45,7 @@ bool faces_row_counts_outside(const struct faces *faces, const struct view *view
  */
 size_t outside_rows(const struct grid *grid, const struct view *view, int columns, int rows, const float *measured);
 
+/* mm of the ray through a pixel that lie inside of the grid. */
+double ray_within(const struct grid *grid, const struct view *view, int column, int row);
+
 #endif

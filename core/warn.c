@@ -1,8 +1,11 @@
 /* What a reconstruction warns of, in words. */
 #include "core/warn.h"
 
+#include <math.h>
 #include <stdarg.h>
 #include <stdio.h>
+
+#include "core/outside.h"
 
 static const double DEGREES = 57.29577951308232;
 
@@ -43,6 +46,39 @@ static bool is_seen(const struct grid *grid, const struct geometry *geometry)
 	return false;
 }
 
+/* Whether a view has a ray that SART corrects the grid by; of its pixels those around the grid's shadow are tried. */
+static bool is_crossed(const struct grid *grid, const struct view *view, int columns, int rows)
+{
+	const double *mm = grid->spacing, least = RAY_LENGTH_LEAST * fmin(fmin(mm[0], mm[1]), mm[2]);
+	double matrix[12], low[2] = {INFINITY, INFINITY}, high[2] = {-INFINITY, -INFINITY};
+
+	view_matrix(view, matrix);
+	for (int corner = 0; corner < 8; corner++) {
+		double place[3], pixel[2];
+
+		for (int a = 0; a < 3; a++)
+			place[a] = grid->origin[a] + mm[a] * (corner >> a & 1 ? grid->size[a] - 0.5 : -0.5);
+		view_project(matrix, place, &pixel[0], &pixel[1]);
+		for (int a = 0; a < 2; a++) {
+			low[a] = fmin(low[a], pixel[a]);
+			high[a] = fmax(high[a], pixel[a]);
+		}
+	}
+	for (double row = fmax(0, ceil(low[1])); row <= fmin(rows - 1, high[1]); row++)
+		for (double column = fmax(0, ceil(low[0])); column <= fmin(columns - 1, high[0]); column++)
+			if (ray_within(grid, view, (int)column, (int)row) >= least)
+				return true;
+	return false;
+}
+
+static bool is_crossed_in_any(const struct grid *grid, const struct geometry *geometry)
+{
+	for (int k = 0; k < geometry->count; k++)
+		if (is_crossed(grid, &geometry->views[k], geometry->columns, geometry->rows))
+			return true;
+	return false;
+}
+
 void warn_recipe(const struct recon_hooks *hooks, const struct geometry *geometry, const struct recipe *recipe,
 		 const struct orbit *orbit)
 {
@@ -54,6 +90,12 @@ void warn_recipe(const struct recon_hooks *hooks, const struct geometry *geometr
 		    "no view sees any of the grid, which begins at (%g, %g, %g) mm and is %g x %g x %g mm in size",
 		    grid->origin[0], grid->origin[1], grid->origin[2], grid->size[0] * grid->spacing[0],
 		    grid->size[1] * grid->spacing[1], grid->size[2] * grid->spacing[2]);
+	else if (recipe->sart.on && !is_crossed_in_any(grid, geometry))
+		recon_warn(hooks, "grid_unseen",
+			   "every ray of every view passes beside the grid, which is %g x %g x %g mm in size, between "
+			   "the pixels: SART leaves it as it was",
+			   grid->size[0] * grid->spacing[0], grid->size[1] * grid->spacing[1],
+			   grid->size[2] * grid->spacing[2]);
 	if (recipe->tv.on && !recipe->tv.after_fdk && !recipe->sart.on)
 		recon_warn(hooks, "tv_without_sart",
 			   "TV was wanted after SART iterations, and there are none: the FDK volume is left alone");
