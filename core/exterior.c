@@ -132,8 +132,13 @@ int exterior_look(const struct surroundings_options *options, struct exterior_ro
 		for (int r = 0; r < rows && code == 0; r++)
 			found.truncated +=
 			    is_truncated(options->orbit->pad, measured + (size_t)r * (size_t)columns, columns);
-		if (code == 0)
-			found.outside += outside_rows(options->grid, &geometry->views[view], columns, rows, measured);
+		if (code == 0) {
+			const struct outside_rows outside =
+			    outside_rows(options->grid, &geometry->views[view], columns, rows, measured);
+
+			found.beside += outside.beside;
+			found.outside += outside.beside + outside.ends;
+		}
 	}
 	free(measured);
 	if (code == 0)
@@ -197,7 +202,7 @@ int exterior_subtract(const struct surroundings *surroundings, const struct surr
 			    .columns = geometry->columns,
 			    .rows = geometry->rows,
 			    .pad = options->orbit->pad,
-			    .faces = options->inside_only ? NULL : &faces,
+			    .faces = options->poor ? NULL : &faces,
 			    .measured = measured + at,
 			    .explained = explained + at,
 			    .inside = inside != NULL ? inside + at : NULL,

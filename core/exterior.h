@@ -27,6 +27,7 @@ enum { EXTERIOR_PART = 32 };
 /* How many rows of the projections are concerned. */
 struct exterior_rows {
 	size_t truncated, outside;
+	size_t beside; /* of `outside`, those with rays that miss the grid and are not air; exterior_look only */
 };
 
 /* From some of the projections and where the grid lies, sparing the rest when nothing has to be taken out. */

@@ -123,29 +123,34 @@ bool faces_row_counts_outside(const struct faces *faces, const struct view *view
 	return missed * SHARE > looked_at && beside >= (double)EXTEND_LEVEL * missed;
 }
 
-size_t outside_rows(const struct grid *grid, const struct view *view, int columns, int rows, const float *measured)
+struct outside_rows outside_rows(const struct grid *grid, const struct view *view, int columns, int rows,
+				 const float *measured)
 {
 	const int looked_at = rows < LOOKED_AT ? rows : LOOKED_AT;
-	size_t found = 0;
+	size_t beside = 0, ends = 0;
 
-#pragma omp parallel for schedule(static) reduction(+ : found)
+#pragma omp parallel for schedule(static) reduction(+ : beside, ends)
 	for (int i = 0; i < looked_at; i++) {
 		const int row = looked_at > 1 ? (int)((long long)i * (rows - 1) / (looked_at - 1)) : 0;
-		const bool outermost = row == 0 || row == rows - 1;
-		int count = 0;
-		double sum = 0;
+		int missed = 0, passed = 0;
+		double missed_sum = 0, passed_sum = 0;
 
 		for (int column = 0; column < columns; column += stride_of(columns)) {
 			const struct passage passage = pass_of_ray(grid, view, column, row);
+			const double p = (double)measured[(size_t)row * (size_t)columns + (size_t)column];
 
-			if (passage.missed || (outermost && (passage.axis[0] == 2 || passage.axis[1] == 2))) {
-				count++;
-				sum += (double)measured[(size_t)row * (size_t)columns + (size_t)column];
+			if (passage.missed) {
+				missed++;
+				missed_sum += p;
+			} else if (passage.axis[0] == 2 || passage.axis[1] == 2) {
+				passed++;
+				passed_sum += p;
 			}
 		}
-		found += count > 0 && sum >= (double)EXTEND_LEVEL * count;
+		beside += missed > 0 && missed_sum >= (double)EXTEND_LEVEL * missed;
+		ends += (row == 0 || row == rows - 1) && passed > 0 && passed_sum >= (double)EXTEND_LEVEL * passed;
 	}
-	return found;
+	return (struct outside_rows){beside, ends};
 }
 
 /* The outermost layers, and the density of what is in the volume. */

@@ -38,12 +38,17 @@ bool faces_row_counts_outside(const struct faces *faces, const struct view *view
 
 /*
  * The same without a volume, of about 64 rows of a view; `measured` is [rows][columns].
- * A row counts it when the mean of those of its rays that miss the grid is not
- * air; in the outermost rows, beyond which nobody sees, of those that pass its
- * lowest or highest face too. An object that ends beside the grid, where every
+ * A row counts what lies beside the grid when the mean of those of its rays that
+ * miss the grid is not air; the outermost rows, beyond which nobody sees, may
+ * count what lies beyond its ends when the mean of those that pass its lowest or
+ * highest face is not. An object that ends beside the grid, where every
  * ray through it passes the grid as well, is within some mm of it.
  */
-size_t outside_rows(const struct grid *grid, const struct view *view, int columns, int rows, const float *measured);
+struct outside_rows {
+	size_t beside, ends;
+};
+struct outside_rows outside_rows(const struct grid *grid, const struct view *view, int columns, int rows,
+				 const float *measured);
 
 /* mm of the ray through a pixel that lie inside of the grid. */
 double ray_within(const struct grid *grid, const struct view *view, int column, int row);

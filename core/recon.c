@@ -794,7 +794,7 @@ static int leave_out_the_exterior(struct recon *recon, struct error *err)
 	const double covered = recon->orbit.arc - recon->orbit.holes;
 	const bool sound =
 	    (!recon->orbit.arc_too_short || covered > M_PI + recon->orbit.fan - little) && recon->orbit.tilt < little;
-	const struct surroundings_options options = {
+	struct surroundings_options options = {
 	    .backend = recon->backend,
 	    .device = recon->device,
 	    .geometry = recon->geometry,
@@ -802,7 +802,7 @@ static int leave_out_the_exterior(struct recon *recon, struct error *err)
 	    .grid = &recon->recipe.grid,
 	    .projections = recon->projections,
 	    .factor = blank_factor(recon),
-	    .inside_only = !sound,
+	    .poor = !sound,
 	    .cancel = cancel_of(recon),
 	};
 	struct surroundings surroundings = {0};
@@ -815,6 +815,8 @@ static int leave_out_the_exterior(struct recon *recon, struct error *err)
 		warn_exterior_stays(recon->hooks, &seen);
 	if (!sound && (seen.truncated == 0 || !recon->recipe.fdk.on))
 		return 0;
+	/* An object may end with the grid: FDK's blur beyond its faces is none of the object. */
+	options.inside_only = !sound || seen.beside == 0;
 	code = surroundings_make(&surroundings, &options, err);
 	if (code == 0)
 		code = exterior_subtract(&surroundings, &options, recon->plan, recon->before, &rows, err);

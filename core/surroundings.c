@@ -23,7 +23,7 @@ static void choose_grid(const struct surroundings_options *options, struct grid 
 
 	orbit_default_grid(options->orbit, options->geometry, SURROUNDINGS_MOST, &wide);
 	for (int narrow = options->inside_only; narrow < 2; narrow++) {
-		double low[3], side[3], spacing = narrow ? 0 : wide.spacing[0];
+		double low[3], side[3], spacing = wide.spacing[0];
 
 		for (int i = 0; i < 3; i++) {
 			double high = inner.origin[i] + (inner.size[i] - 0.5) * inner.spacing[i];
@@ -120,7 +120,7 @@ static void box_sums(float *image, int columns, int rows, int reach, float *line
 	}
 }
 
-/* Voxels whose shadow, and what lies up to a voxel and a half around it, is air in this view. `line` as above. */
+/* Voxels whose shadow misses the rows, or is air with what lies up to a voxel and a half around it. `line` as above. */
 static void find_empty(const struct surroundings *s, const struct geometry *geometry, const struct orbit *orbit,
 		       int index, float *measured, float *line, bool *empty)
 {
@@ -148,8 +148,9 @@ static void find_empty(const struct surroundings *s, const struct geometry *geom
 				double column, row;
 
 				view_project(matrix, place, &column, &row);
-				if (column >= 1 && row >= 1 && column <= columns - 2 && row <= rows - 2 &&
-				    measured[(size_t)lround(row) * (size_t)columns + (size_t)lround(column)] < 0.5f)
+				if (row < -0.5 || row > rows - 0.5 ||
+				    (column >= 1 && row >= 1 && column <= columns - 2 && row <= rows - 2 &&
+				     measured[(size_t)lround(row) * (size_t)columns + (size_t)lround(column)] < 0.5f))
 					empty[voxel_at(grid, x, y, z)] = true;
 			}
 }

@@ -21,7 +21,8 @@ struct surroundings_options {
 	const struct grid *grid;   /* the recipe's */
 	struct stack *projections; /* a slot for each view */
 	double factor;             /* that makes up for blank views, 1 without */
-	bool inside_only;          /* FDK is too poor to be believed outside of the recipe's grid */
+	bool poor;                 /* FDK is, and not to be believed outside of the recipe's grid */
+	bool inside_only;          /* leaves what lies outside of the recipe's grid away */
 	const struct cancel *cancel;
 };
 
