@@ -47,9 +47,6 @@
 #define EXTEND_INLINE static inline
 #endif
 
-/* Mean line integral of rays that are not air, 3 % of the photons: for those who have no view at hand. */
-#define EXTEND_LEVEL 0.03f
-
 #define EXTEND_SHARE 0.05f
 
 /* Columns at an edge whose mean decides, an eighth of all at most, and those that a and b are fitted to. */
@@ -86,6 +83,11 @@ EXTEND_INLINE float extend_largest(const float *view, int columns, int rows, siz
 EXTEND_INLINE float extend_level(float largest)
 {
 	return EXTEND_SHARE * (largest < 1 ? largest : 1);
+}
+/* The same for the mean of many rays, in which there is less noise. */
+EXTEND_INLINE float extend_level_of_many(float largest)
+{
+	return 0.6f * extend_level(largest);
 }
 /* From the sum over the edge and that of squared second differences, six times the noise's variance each. */
 EXTEND_INLINE bool extend_is_chance(int columns, double sum, double bends)

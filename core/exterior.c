@@ -17,22 +17,18 @@ struct projection {
 	const int *pad;
 	const struct faces *faces; /* of w; NULL: FDK is too poor for that */
 	float *measured;
+	float largest;                   /* extend_largest of it */
 	const float *explained, *inside; /* inside NULL: nothing lies outside of the grid */
 	double *smooth;                  /* to work in */
 };
 
 /* A side that FDK pads is none of a truncated row. */
-static bool is_truncated(const int pad[2], const float *row, int columns)
+static bool is_truncated(const int pad[2], const float *row, int columns, float largest)
 {
-	const int edge = extend_edge(columns);
-	float sums[2] = {0};
+	const float level = extend_level(largest);
 
-	for (int i = 0; i < edge; i++) {
-		sums[0] += row[i];
-		sums[1] += row[columns - 1 - i];
-	}
-	return (pad[0] == 0 && sums[0] >= EXTEND_LEVEL * (float)edge) ||
-	       (pad[1] == 0 && sums[1] >= EXTEND_LEVEL * (float)edge);
+	return (pad[0] == 0 && extend_is_cut(row, 1, columns, level)) ||
+	       (pad[1] == 0 && extend_is_cut(row + columns - 1, -1, columns, level));
 }
 
 /* Sums of e and column e over the columns first .. last. */
@@ -80,10 +76,10 @@ static struct exterior_rows subtract_row(const struct projection *of, int row)
 	const float *explained = of->explained + at, *inside = of->inside != NULL ? of->inside + at : NULL;
 	float *measured = of->measured + at;
 	double *smooth = of->smooth + at, outside = 0;
-	struct exterior_rows found = {.truncated = is_truncated(of->pad, measured, of->columns)};
+	struct exterior_rows found = {.truncated = is_truncated(of->pad, measured, of->columns, of->largest)};
 
 	if (found.truncated == 0 && of->faces != NULL &&
-	    faces_row_counts_outside(of->faces, of->view, of->columns, row, measured, explained))
+	    faces_row_counts_outside(of->faces, of->view, of->columns, row, measured, explained, of->largest))
 		found.outside = 1;
 	if (found.truncated + found.outside > 0) {
 		smooth_row(measured, explained, smooth, of->columns);
@@ -94,7 +90,7 @@ static struct exterior_rows subtract_row(const struct projection *of, int row)
 		outside += fabs((double)explained[c] - (double)inside[c]);
 		measured[c] -= explained[c] - inside[c];
 	}
-	if (outside >= (double)EXTEND_LEVEL * of->columns)
+	if (outside > 0 && outside >= (double)extend_level_of_many(of->largest) * of->columns)
 		found.outside = 1;
 	return found;
 }
@@ -121,6 +117,7 @@ int exterior_look(const struct surroundings_options *options, struct exterior_ro
 	const int looked_at = geometry->count < VIEWS_LOOKED_AT ? geometry->count : VIEWS_LOOKED_AT;
 	float *measured = malloc((size_t)columns * (size_t)rows * sizeof(float));
 	struct exterior_rows found = {0};
+	float largest = 0;
 	int code = 0;
 
 	if (measured == NULL)
@@ -129,9 +126,11 @@ int exterior_look(const struct surroundings_options *options, struct exterior_ro
 		const int view = (int)((long long)i * geometry->count / looked_at);
 
 		code = options->backend->stack_download(options->projections, view, 1, measured, err);
+		if (code == 0)
+			largest = extend_largest(measured, columns, rows, 1, (size_t)columns);
 		for (int r = 0; r < rows && code == 0; r++)
 			found.truncated +=
-			    is_truncated(options->orbit->pad, measured + (size_t)r * (size_t)columns, columns);
+			    is_truncated(options->orbit->pad, measured + (size_t)r * (size_t)columns, columns, largest);
 		if (code == 0) {
 			const struct outside_rows outside =
 			    outside_rows(options->grid, &geometry->views[view], columns, rows, measured);
@@ -204,6 +203,8 @@ int exterior_subtract(const struct surroundings *surroundings, const struct surr
 			    .pad = options->orbit->pad,
 			    .faces = options->poor ? NULL : &faces,
 			    .measured = measured + at,
+			    .largest = extend_largest(measured + at, geometry->columns, geometry->rows, 1,
+						      (size_t)geometry->columns),
 			    .explained = explained + at,
 			    .inside = inside != NULL ? inside + at : NULL,
 			    .smooth = smooth,

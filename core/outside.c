@@ -100,8 +100,9 @@ static bool is_open(const struct faces *faces, const struct passage *passage, in
 }
 
 bool faces_row_counts_outside(const struct faces *faces, const struct view *view, int columns, int row,
-			      const float *measured, const float *explained)
+			      const float *measured, const float *explained, float largest)
 {
+	const double level = (double)extend_level_of_many(largest);
 	int looked_at = 0, missed = 0, open = 0;
 	double beside = 0, all = 0, excess = 0;
 
@@ -118,15 +119,16 @@ bool faces_row_counts_outside(const struct faces *faces, const struct view *view
 			excess += (double)measured[column] - (double)explained[column];
 		}
 	}
-	if (open * SHARE > looked_at && excess >= (double)EXTEND_LEVEL * open && excess >= OPEN_EXCESS * all)
+	if (open * SHARE > looked_at && excess > 0 && excess >= level * open && excess >= OPEN_EXCESS * all)
 		return true;
-	return missed * SHARE > looked_at && beside >= (double)EXTEND_LEVEL * missed;
+	return missed * SHARE > looked_at && beside > 0 && beside >= level * missed;
 }
 
 struct outside_rows outside_rows(const struct grid *grid, const struct view *view, int columns, int rows,
 				 const float *measured)
 {
 	const int looked_at = rows < LOOKED_AT ? rows : LOOKED_AT;
+	const double level = (double)extend_level_of_many(extend_largest(measured, columns, rows, 1, (size_t)columns));
 	size_t beside = 0, ends = 0;
 
 #pragma omp parallel for schedule(static) reduction(+ : beside, ends)
@@ -147,8 +149,8 @@ struct outside_rows outside_rows(const struct grid *grid, const struct view *vie
 				passed_sum += p;
 			}
 		}
-		beside += missed > 0 && missed_sum >= (double)EXTEND_LEVEL * missed;
-		ends += (row == 0 || row == rows - 1) && passed > 0 && passed_sum >= (double)EXTEND_LEVEL * passed;
+		beside += missed_sum > 0 && missed_sum >= level * missed;
+		ends += (row == 0 || row == rows - 1) && passed_sum > 0 && passed_sum >= level * passed;
 	}
 	return (struct outside_rows){beside, ends};
 }

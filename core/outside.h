@@ -32,9 +32,12 @@ int faces_make(struct faces *ret_faces, const struct backend *backend, struct vo
 	       struct error *err);
 void faces_clear(struct faces *faces);
 
-/* One row of a view, line integrals [columns], and those through the volume; about 64 of its rays are looked at. */
+/*
+ * One row of a view, line integrals [columns], and those through the volume; about 64 of its rays are looked at.
+ * largest: extend_largest of the view.
+ */
 bool faces_row_counts_outside(const struct faces *faces, const struct view *view, int columns, int row,
-			      const float *measured, const float *explained);
+			      const float *measured, const float *explained, float largest);
 
 /*
  * The same without a volume, of about 64 rows of a view; `measured` is [rows][columns].

@@ -130,13 +130,14 @@ static void find_empty(const struct surroundings *s, const struct geometry *geom
 	const double size = fmax(fmax(grid->spacing[0], grid->spacing[1]), grid->spacing[2]);
 	const double pixel = fmin(orbit->pixel_at_isocentre[0], orbit->pixel_at_isocentre[1]);
 	const int reach = (int)fmin(ceil(1.5 * size / pixel), columns > rows ? columns : rows);
+	const float level = extend_level_of_many(extend_largest(measured, columns, rows, 1, (size_t)columns));
 	double matrix[12];
 
 	view_matrix(&geometry->views[index], matrix);
 	/* Means of nine pixels against noise. */
 	box_sums(measured, columns, rows, 1, line);
 	for (size_t i = 0; i < pixels; i++)
-		measured[i] = measured[i] >= 9 * EXTEND_LEVEL;
+		measured[i] = measured[i] > 0 && measured[i] >= 9 * level;
 	box_sums(measured, columns, rows, reach, line);
 #pragma omp parallel for schedule(static)
 	for (int z = 0; z < grid->size[2]; z++)
