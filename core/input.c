@@ -260,10 +260,12 @@ void input_warn(const struct input *input, const struct geometry *geometry, cons
 	const size_t found = defects_total(counts) - counts->mapped;
 	const double pixels = (double)geometry->columns * geometry->rows;
 
-	if (input->linearise.quantity == QUANTITY_INTENSITY && input->linearise.dark == NULL)
+	/* Who gives air as a number may have taken the offset away; a flat is what the detector gave. */
+	if (input->linearise.quantity == QUANTITY_INTENSITY && input->linearise.flat != NULL &&
+	    input->linearise.dark == NULL)
 		recon_warn(hooks, "no_dark",
-			   "no dark image is there: an offset that the detector adds to its counts makes all that is "
-			   "measured too thin");
+			   "a flat image is there, but no dark one: an offset that the detector adds to its counts "
+			   "makes all that is measured too thin");
 	if (map->map != NULL) {
 		const size_t all = map->given + map->dead + map->hot + map->noisy;
 
