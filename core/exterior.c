@@ -149,7 +149,7 @@ int exterior_look(const struct surroundings_options *options, struct exterior_ro
 static int project(const struct surroundings_options *options, struct plan *plan, const struct volume *volume,
 		   int first, int count, struct stack *batch, float *ret, struct error *err)
 {
-	int views[FDK_BATCH_MOST], code;
+	int views[SURROUNDINGS_VIEWS], code;
 
 	for (int i = 0; i < count; i++)
 		views[i] = first + i;
@@ -162,7 +162,7 @@ int exterior_subtract(const struct surroundings *surroundings, const struct surr
 {
 	const struct backend *backend = options->backend;
 	const struct geometry *geometry = options->geometry;
-	const int all = geometry->count, slots = all < FDK_BATCH_MOST ? all : FDK_BATCH_MOST;
+	const int all = geometry->count, slots = all < SURROUNDINGS_VIEWS ? all : SURROUNDINGS_VIEWS;
 	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows, most = (size_t)slots * pixels;
 	float *measured = malloc(most * sizeof(float)), *explained = malloc(most * sizeof(float)), *inside = NULL;
 	double *smooth = malloc(pixels * sizeof(double));

@@ -35,7 +35,7 @@ int exterior_look(const struct surroundings_options *options, struct exterior_ro
 
 /*
  * Changes the projections. plan is that of the recipe's grid, `work` a volume on
- * it to work in. Takes FDK_BATCH_MOST more slots on the device meanwhile.
+ * it to work in. Takes SURROUNDINGS_VIEWS more slots on the device meanwhile.
  */
 int exterior_subtract(const struct surroundings *surroundings, const struct surroundings_options *options,
 		      struct plan *plan, struct volume *work, struct exterior_rows *ret_rows, struct error *err);

@@ -59,6 +59,7 @@ static struct plan_options plan_options_of(const struct surroundings_options *op
 	    .pad = {options->orbit->pad[0], options->orbit->pad[1]},
 	    .extend = weights->extend,
 	    .extended_response = weights->extended,
+	    .resident = 1, /* what is filtered in one go takes the most room, and the volume is small */
 	    .no_samples = true,
 	};
 
@@ -87,7 +88,8 @@ int surroundings_bytes(const struct surroundings_options *options, size_t *ret_d
 	if (code < 0)
 		return code;
 	/* Filtered views and, when those are gone, projected ones. */
-	batch = (bytes.stack + (size_t)all - 1) / (size_t)all * (size_t)(all < FDK_BATCH_MOST ? all : FDK_BATCH_MOST);
+	batch = (bytes.stack + (size_t)all - 1) / (size_t)all *
+		(size_t)(all < SURROUNDINGS_VIEWS ? all : SURROUNDINGS_VIEWS);
 	*ret_device = bytes.volumes + bytes.scratch + bytes.raw + batch / columns * wide;
 	*ret_host = bytes.host > 0 ? grid_voxels(&grid) * sizeof(float) + batch : 0;
 	return 0;

@@ -10,7 +10,8 @@
  * field of view, where FDK's sums lack views, and a place that some view sees
  * through air, whatever a wide cone or a short arc made of it.
  */
-enum { SURROUNDINGS_MOST = 128 }; /* voxels a side: 8 MiB at most, which no job notices */
+/* Voxels a side, 8 MiB at most, and views that are projected in one go: little beside a job's own memory. */
+enum { SURROUNDINGS_MOST = 128, SURROUNDINGS_VIEWS = 4 };
 
 /* What it is made from, all of it borrowed. */
 struct surroundings_options {
