@@ -125,6 +125,23 @@ static void add_defects(struct counts *counts)
 	spoil(counts, 25, 44), counts->dark[44 * COLUMNS + 25] += 4000;
 }
 
+/* With all that there is to say of them. */
+static struct linearise as_they_come(const struct counts *counts)
+{
+	return (struct linearise){
+	    .sample = SAMPLE_FLOAT32,
+	    .quantity = QUANTITY_INTENSITY,
+	    .flat = counts->flat,
+	    .dark = counts->dark,
+	    .saturation = 65535,
+	    .defects = counts->map,
+	    .has_air_region = true,
+	    .air_region = {1, 1, 6, 50},
+	    .hardening = water,
+	    .hardening_count = 4,
+	};
+}
+
 START_TEST(raw_counts_give_the_volume_of_their_line_integrals)
 {
 	struct recipe recipe = recipe_of(false);
@@ -148,18 +165,7 @@ START_TEST(raw_counts_give_the_volume_of_their_line_integrals)
 	counts->samples[7 * PIXELS + 26 * COLUMNS + 41] = 65535;
 	counts->samples[30 * PIXELS + 26 * COLUMNS + 44] = INFINITY;
 	outcome.samples = counts->samples;
-	outcome.linearise = (struct linearise){
-	    .sample = SAMPLE_FLOAT32,
-	    .quantity = QUANTITY_INTENSITY,
-	    .flat = counts->flat,
-	    .dark = counts->dark,
-	    .saturation = 65535,
-	    .defects = counts->map,
-	    .has_air_region = true,
-	    .air_region = {1, 1, 6, 50},
-	    .hardening = water,
-	    .hardening_count = 4,
-	};
+	outcome.linearise = as_they_come(counts);
 	run(&scene, &recipe, &outcome);
 	ck_assert_msg(strncmp(outcome.warnings, expected, strlen(expected)) == 0, "%s", outcome.warnings);
 	/* What is left are the neighbours in place of 141 pixels: half a percent of the volume. */
@@ -408,18 +414,7 @@ START_TEST(a_detector_on_its_side_gives_the_same_volume)
 	add_defects(counts);
 	memset(&counts->samples[11 * PIXELS], 0, sizeof(float) * PIXELS);
 	upright.samples = counts->samples;
-	upright.linearise = (struct linearise){
-	    .sample = SAMPLE_FLOAT32,
-	    .quantity = QUANTITY_INTENSITY,
-	    .flat = counts->flat,
-	    .dark = counts->dark,
-	    .saturation = 65535,
-	    .defects = counts->map,
-	    .has_air_region = true,
-	    .air_region = {1, 1, 6, 50},
-	    .hardening = water,
-	    .hardening_count = 4,
-	};
+	upright.linearise = as_they_come(counts);
 	run(&scene, &recipe, &upright);
 	ck_assert_double_eq_tol(mean_near(upright.last, &upright.grid, (const double[]){2, 12, -8}, 6), 0.02, 2e-4);
 	side = scene;
