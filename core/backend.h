@@ -152,16 +152,28 @@ struct plan_options {
 	bool matched;
 	const struct tv_options *tv; /* NULL: no TV */
 	bool reference_precision;    /* float everywhere; otherwise storage may be packed within the stated bound */
-	bool no_samples;             /* linearise will not be asked for */
-	bool no_projection;          /* neither project nor sart_iterate will be asked for: no scratch for them */
-	int resident; /* slots of the stacks that are on the device beside the plan; 0: one for each view */
+	/*
+	 * Bytes that the job takes on the device beside this plan, its projections and
+	 * its volumes, so that the plan sees what is left.
+	 */
+	size_t beside;
+	/*
+	 * Another plan of this device whose plan_bytes.block it works in, NULL: none; and the
+	 * bytes that this plan has of that at least, for another one. Calls to the two take turns, and
+	 * the borrower is freed first.
+	 */
+	struct plan *lender;
+	size_t lends;
+	bool no_samples;    /* linearise will not be asked for */
+	bool no_projection; /* neither project nor sart_iterate will be asked for: no scratch for them */
+	int resident;       /* slots of the stacks that are on the device beside the plan; 0: one for each view */
 };
 
 /* Bytes, known before anything is allocated. */
 struct plan_bytes {
-	size_t stack;   /* all projections as line integrals */
 	size_t volumes; /* the iterate and the copies that the recipe needs */
-	size_t scratch; /* the rest */
+	size_t scratch; /* the rest, */
+	size_t block;   /* and of it what another plan can lend */
 	size_t raw;     /* one projection on its way in */
 	size_t host;    /* beside the device's own memory, in parts.h; 0 elsewhere */
 };
@@ -221,6 +233,8 @@ struct backend {
 	int (*stack_new)(struct device *device, int columns, int rows, int slots, struct stack **ret_stack,
 			 struct error *err);
 	void (*stack_free)(struct stack *stack); /* NULL is fine */
+	/* What stack_new takes of the device's memory. */
+	size_t (*stack_bytes)(int columns, int rows, int slots);
 	int (*stack_download)(struct stack *stack, int slot, int count, float *ret_to, struct error *err);
 	/* Line integrals [slot][row][column]; `from` has been read when it returns. */
 	int (*stack_upload)(struct stack *stack, int slot, int count, const float *from, struct error *err);

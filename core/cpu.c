@@ -336,6 +336,11 @@ static int cpu_volume_copy(struct volume *to, const struct volume *from, struct 
 
 /* ---- stacks ---- */
 
+static size_t cpu_stack_bytes(int columns, int rows, int slots)
+{
+	return (size_t)columns * (size_t)rows * (size_t)slots * sizeof(float);
+}
+
 static int cpu_stack_new(struct device *device, int columns, int rows, int slots, struct stack **ret_stack,
 			 struct error *err)
 {
@@ -419,6 +424,7 @@ const struct backend backend_cpu = {
     .volume_copy = cpu_volume_copy,
     .stack_new = cpu_stack_new,
     .stack_free = cpu_stack_free,
+    .stack_bytes = cpu_stack_bytes,
     .stack_download = cpu_stack_download,
     .stack_upload = cpu_stack_upload,
     .plan_bytes = cpu_plan_bytes,

@@ -135,7 +135,6 @@ int cpu_plan_bytes(struct device *device, const struct plan_options *options, st
 	volume = plan.plane * (size_t)plan.grid.size[1] * sizeof(float);
 	floats = (size_t)threads * (plan.scratch_floats + plan.planes_floats) + (size_t)plan.batch * pixels;
 	*ret_bytes = (struct plan_bytes){
-	    .stack = pixels * (size_t)plan.views * sizeof(float),
 	    .volumes = volume * (size_t)(1 + (options->sart != NULL) + needs_work(&plan) + 4 * needs_dual(&plan)),
 	    .scratch = floats * sizeof(float) + pixels +
 		       (size_t)(1 + (plan.wide > plan.columns)) * (size_t)plan.views * sizeof(struct cpu_view) +

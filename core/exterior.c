@@ -158,7 +158,7 @@ static int project(const struct surroundings_options *options, struct plan *plan
 }
 
 int exterior_subtract(const struct surroundings *surroundings, const struct surroundings_options *options,
-		      struct plan *plan, struct volume *work, struct exterior_rows *ret_rows, struct error *err)
+		      struct volume *work, struct exterior_rows *ret_rows, struct error *err)
 {
 	const struct backend *backend = options->backend;
 	const struct geometry *geometry = options->geometry;
@@ -191,7 +191,7 @@ int exterior_subtract(const struct surroundings *surroundings, const struct surr
 
 		code = project(options, surroundings->plan, surroundings->volume, first, count, batch, explained, err);
 		if (code == 0 && inside != NULL)
-			code = project(options, plan, work, first, count, batch, inside, err);
+			code = project(options, options->plan, work, first, count, batch, inside, err);
 		if (code == 0)
 			code = backend->stack_download(options->projections, first, count, measured, err);
 		for (int i = 0; i < count && code == 0; i++) {

@@ -34,10 +34,10 @@ struct exterior_rows {
 int exterior_look(const struct surroundings_options *options, struct exterior_rows *ret_rows, struct error *err);
 
 /*
- * Changes the projections. plan is that of the recipe's grid, `work` a volume on
- * it to work in. Takes SURROUNDINGS_VIEWS more slots on the device meanwhile.
+ * Changes the projections; `work` is a volume on the recipe's grid to work in. Takes
+ * SURROUNDINGS_VIEWS more slots on the device meanwhile.
  */
 int exterior_subtract(const struct surroundings *surroundings, const struct surroundings_options *options,
-		      struct plan *plan, struct volume *work, struct exterior_rows *ret_rows, struct error *err);
+		      struct volume *work, struct exterior_rows *ret_rows, struct error *err);
 
 #endif

@@ -60,11 +60,9 @@ void fdk_weights_clear(struct fdk_weights *weights)
 
 int fdk_batch(const struct backend *backend, const struct plan *plan, int views)
 {
-	int batch = backend->plan_batch(plan);
+	const int batch = backend->plan_batch(plan), most = backend == &backend_parts ? views : fdk_batch_most(views);
 
-	if (batch > FDK_BATCH_MOST && backend != &backend_parts)
-		batch = FDK_BATCH_MOST;
-	return batch < views ? batch : views;
+	return batch < most ? batch : most;
 }
 
 int fdk_open(struct fdk *ret_fdk, const struct backend *backend, struct device *device, struct plan *plan,

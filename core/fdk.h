@@ -21,12 +21,19 @@ int fdk_weights_make(struct fdk_weights *ret_weights, const struct orbit *orbit,
 void fdk_weights_clear(struct fdk_weights *weights);
 
 /*
- * Views that are filtered and backprojected in one go, at most: memory is
- * counted with it before any plan can be asked, and by 32 views the pass over
- * the volume that a batch costs is long hidden behind the samples it takes. Not
- * in parts: there the pass is over the host's memory, and all views go at once.
+ * Of so many views those that are filtered and backprojected in one go, at most:
+ * memory is counted with it before any plan can be asked. By 32 views the pass over
+ * the volume that a batch costs is long hidden behind the samples it takes; of few
+ * views a batch is no more than a quarter, which is a quarter of a stack. Not in parts:
+ * there the pass is over the host's memory, and all views go at once.
  */
-enum { FDK_BATCH_MOST = 32 };
+static inline int fdk_batch_most(int views)
+{
+	const int most = 32, least = 8, quarter = (views + 3) / 4;
+	const int batch = quarter < least ? least : quarter < most ? quarter : most;
+
+	return batch < views ? batch : views;
+}
 
 struct fdk {
 	const struct backend *backend;

@@ -43,10 +43,10 @@ struct metal_tools {
 	const struct cancel *cancel;
 };
 
-/* Views that are projected in one go: see FDK_BATCH_MOST. */
+/* Views that are projected in one go. */
 static inline int metal_slots(const struct geometry *geometry)
 {
-	return geometry->count < FDK_BATCH_MOST ? geometry->count : FDK_BATCH_MOST;
+	return fdk_batch_most(geometry->count);
 }
 
 /* The voxels of `from` that have at least the threshold (1/mm) beside another one that has. */

@@ -162,6 +162,14 @@ static void parts_stack_free(struct stack *stack)
 	free(stack);
 }
 
+static size_t parts_stack_bytes(int columns, int rows, int slots)
+{
+	(void)columns;
+	(void)rows;
+	(void)slots;
+	return 0; /* it lies in the host's memory */
+}
+
 static int parts_stack_new(struct device *device, int columns, int rows, int slots, struct stack **ret_stack,
 			   struct error *err)
 {
@@ -282,6 +290,7 @@ const struct backend backend_parts = {
     .volume_copy = parts_volume_copy,
     .stack_new = parts_stack_new,
     .stack_free = parts_stack_free,
+    .stack_bytes = parts_stack_bytes,
     .stack_download = parts_stack_download,
     .stack_upload = parts_stack_upload,
     .plan_bytes = parts_plan_bytes,

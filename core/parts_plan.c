@@ -45,6 +45,8 @@ static struct plan_options options_for(const struct plan *plan, enum purpose pur
 	options.grid = grid;
 	options.linearise = (struct linearise){.sample = SAMPLE_FLOAT32};
 	options.sart = NULL;
+	options.beside = options.lends = 0;
+	options.lender = NULL;
 	options.no_samples = true;
 	options.no_projection = purpose != FOR_SUMS;
 	options.resident = plan->batch;
@@ -89,12 +91,10 @@ static struct plan_options intake_options(const struct plan *plan, const struct 
 	return options;
 }
 
-static size_t slot_bytes(const struct plan *plan, const struct plan_bytes *bytes, enum purpose purpose)
+static size_t stack_bytes(const struct plan *plan, enum purpose purpose, int slots)
 {
-	size_t views = (size_t)plan->options.geometry->count, columns = (size_t)plan->options.geometry->columns;
-
-	/* Rows may be longer on the device than their columns, a wide one in the same measure and a little more. */
-	return (bytes->stack / views + 1) / columns * ((size_t)columns_of(&plan->options, purpose) + 64);
+	return plan->device->backend->stack_bytes(columns_of(&plan->options, purpose), plan->options.geometry->rows,
+						  slots);
 }
 
 /* What slabs of so many slices take on the device for a purpose, the volumes to *ret_volumes. */
@@ -107,14 +107,13 @@ static int slab_bytes(const struct plan *plan, enum purpose purpose, int slices,
 	struct plan_options options = options_for(plan, purpose, &grid);
 	struct plan_bytes bytes;
 	int code = plan->device->backend->plan_bytes(plan->device->below, &options, &bytes, err);
-	size_t slots = (size_t)plan->batch;
 
 	if (code < 0)
 		return code;
 	*ret_volumes = bytes.volumes * (purpose == FOR_FDK ? 2 : 1);
 	*ret_total = *ret_volumes + bytes.scratch + bytes.raw +
-		     (size_t)stacks * slots * slot_bytes(plan, &bytes, FOR_SUMS) +
-		     (purpose == FOR_FDK ? slots * slot_bytes(plan, &bytes, FOR_FDK) : 0);
+		     (size_t)stacks * stack_bytes(plan, FOR_SUMS, plan->batch) +
+		     (purpose == FOR_FDK ? stack_bytes(plan, FOR_FDK, plan->batch) : 0);
 	return 0;
 }
 
@@ -126,7 +125,7 @@ static int intake_bytes(const struct plan *plan, size_t *ret_bytes, struct error
 	int code = plan->device->backend->plan_bytes(plan->device->below, &options, &bytes, err);
 
 	if (code == 0)
-		*ret_bytes = bytes.volumes + bytes.scratch + bytes.raw + slot_bytes(plan, &bytes, FOR_SUMS);
+		*ret_bytes = bytes.volumes + bytes.scratch + bytes.raw + stack_bytes(plan, FOR_SUMS, 1);
 	return code;
 }
 

@@ -107,9 +107,7 @@ static struct plan_options plan_options(const struct recipe *recipe, const struc
 	    .tv = recipe->tv.on ? &recipe->tv.options : NULL,
 	    .reference_precision = recipe->reference_precision,
 	    .no_projection = !keeps_projections(recipe),
-	    .resident = keeps_projections(recipe)          ? 0
-			: geometry->count < FDK_BATCH_MOST ? geometry->count
-							   : FDK_BATCH_MOST,
+	    .resident = keeps_projections(recipe) ? 0 : fdk_batch_most(geometry->count),
 	};
 
 	memcpy(options.axis, weights->axis, sizeof(options.axis));
@@ -127,78 +125,56 @@ static int sart_options_make(struct sart_options *ret_sart, const struct recipe 
 	return code;
 }
 
-/* A batch that is projected and a volume to work in, which is SART's copy of the iterate where there is one. */
-static int add_metal(const struct backend *backend, struct device *device, const struct plan_options *options,
-		     size_t batch, struct recon_memory *memory, struct error *err)
-{
-	struct plan_options bare = *options;
-	struct plan_bytes bytes;
-	int code;
-
-	bare.tv = NULL;
-	code = backend->plan_bytes(device, &bare, &bytes, err);
-	if (code < 0)
-		return code;
-	memory->scratch += batch;
-	if (options->sart == NULL)
-		memory->volumes += bytes.volumes;
-	if (memory->host > 0)
-		memory->host += batch + (options->sart == NULL ? bytes.volumes : 0);
-	return 0;
-}
-
-/* In parts the device holds slabs of one volume at a time. */
-static int add_surroundings(const struct surroundings_options *options, struct recon_memory *memory, struct error *err)
-{
-	size_t device, host;
-	int code = surroundings_bytes(options, &device, &host, err);
-
-	if (code < 0)
-		return code;
-	if (memory->host == 0)
-		memory->scratch += device;
-	else if (device > memory->volumes + memory->scratch)
-		memory->scratch = device - memory->volumes;
-	memory->host += host;
-	return 0;
-}
-
-static int memory_needed(const struct backend *backend, struct device *device, const struct plan_options *options,
+/*
+ * What the plan takes, and what the job does beside it: FDK's filtered batch, its
+ * surroundings, and for metal a batch that is projected and a volume to work in, which is
+ * SART's copy of the iterate where there is one. The plan is told of these.
+ */
+static int memory_needed(const struct backend *backend, struct device *device, struct plan_options *options,
 			 const struct recipe *recipe, const struct orbit *orbit, struct recon_memory *ret_memory,
 			 struct error *err)
 {
+	const struct surroundings_options around = {
+	    .backend = backend, .device = device, .geometry = options->geometry, .orbit = orbit, .grid = &recipe->grid};
+	const struct geometry *geometry = options->geometry;
+	const int *pad = options->pad, batch = fdk_batch_most(geometry->count);
+	size_t filtered = 0, projected = 0, work = 0;
+	struct surroundings_bytes needs = {0};
 	struct recon_memory memory = {0};
 	struct plan_bytes bytes;
 	struct device_info info;
-	int views = options->geometry->count;
-	size_t slot, batch, columns = (size_t)options->geometry->columns;
-	int code = backend->plan_bytes(device, options, &bytes, err);
+	int code;
 
+	options->beside = options->lends = 0;
+	code = backend->plan_bytes(device, options, &bytes, err);
+	if (code == 0 && leaves_out_the_exterior(recipe))
+		code = surroundings_bytes(&around, &needs, err);
 	if (code < 0)
 		return code;
-	slot = (bytes.stack + (size_t)views - 1) / (size_t)views;
-	batch = slot * (size_t)(views < FDK_BATCH_MOST ? views : FDK_BATCH_MOST);
-	memory.projections = options->resident == 0 ? bytes.stack : batch;
-	memory.volumes = bytes.volumes;
-	memory.scratch = bytes.scratch + bytes.raw;
 	if (options->column_weights != NULL)
-		memory.scratch += batch / columns * (columns + (size_t)(options->pad[0] + options->pad[1]));
-	memory.host = bytes.host;
-	if (leaves_out_the_exterior(recipe)) {
-		const struct surroundings_options surroundings = {.backend = backend,
-								  .device = device,
-								  .geometry = options->geometry,
-								  .orbit = orbit,
-								  .grid = &recipe->grid};
-
-		code = add_surroundings(&surroundings, &memory, err);
+		filtered = backend->stack_bytes(pad[0] + geometry->columns + pad[1], geometry->rows, batch);
+	if (recipe->metal.on) {
+		projected = backend->stack_bytes(geometry->columns, geometry->rows, metal_slots(geometry));
+		work = options->sart == NULL ? bytes.volumes : 0;
+	}
+	if (bytes.host == 0) {
+		options->beside = filtered + needs.device + projected + work;
+		options->lends = needs.borrowed;
+		code = backend->plan_bytes(device, options, &bytes, err);
 		if (code < 0)
 			return code;
 	}
-	if (recipe->metal.on) {
-		code = add_metal(backend, device, options, batch, &memory, err);
-		if (code < 0)
-			return code;
+	memory.projections = backend->stack_bytes(geometry->columns, geometry->rows,
+						  options->resident > 0 ? options->resident : geometry->count);
+	memory.volumes = bytes.volumes + work;
+	memory.scratch = bytes.scratch + bytes.raw + filtered + projected;
+	if (bytes.host == 0) {
+		memory.scratch += needs.device;
+	} else {
+		/* In parts the device holds slabs of one volume at a time. */
+		if (needs.device > memory.volumes + memory.scratch)
+			memory.scratch = needs.device - memory.volumes;
+		memory.host = bytes.host + needs.host + projected + work;
 	}
 	memory.total = memory.projections + memory.volumes + memory.scratch;
 	if (device != NULL) {
@@ -213,7 +189,7 @@ static int memory_needed(const struct backend *backend, struct device *device, c
  * What the job takes, and on what: *ret_parts stays NULL where it fits as a
  * whole, otherwise it is the device in parts and the memory what that takes.
  */
-static int choose_device(const struct backend *backend, struct device *device, const struct plan_options *options,
+static int choose_device(const struct backend *backend, struct device *device, struct plan_options *options,
 			 const struct recipe *recipe, const struct orbit *orbit, struct recon_memory *ret_memory,
 			 struct device **ret_parts, struct error *err)
 {
@@ -285,7 +261,7 @@ int recon_memory(const struct backend *backend, struct device *device, const str
 }
 
 /* The host's memory is asked for where the job lies in it. */
-static int refuse_what_does_not_fit(struct recon *recon, const struct plan_options *options, struct error *err)
+static int refuse_what_does_not_fit(struct recon *recon, struct plan_options *options, struct error *err)
 {
 	const double mib = 1 << 20;
 	struct recon_memory memory;
@@ -342,7 +318,7 @@ static int recon_allocate(struct recon *recon, struct error *err)
 {
 	const struct geometry *geometry = recon->geometry;
 	const struct recipe *recipe = &recon->recipe;
-	const struct plan_options options =
+	struct plan_options options =
 	    plan_options(recipe, geometry, &recon->input.linearise, &recon->weights, &recon->sart);
 	int code = refuse_what_does_not_fit(recon, &options, err);
 	const struct backend *backend = recon->backend; /* that may have changed it */
@@ -800,6 +776,7 @@ static int leave_out_the_exterior(struct recon *recon, struct error *err)
 	    .geometry = recon->geometry,
 	    .orbit = &recon->orbit,
 	    .grid = &recon->recipe.grid,
+	    .plan = recon->plan,
 	    .projections = recon->projections,
 	    .factor = blank_factor(recon),
 	    .poor = !sound,
@@ -819,7 +796,7 @@ static int leave_out_the_exterior(struct recon *recon, struct error *err)
 	options.inside_only = !sound || seen.beside == 0;
 	code = surroundings_make(&surroundings, &options, err);
 	if (code == 0)
-		code = exterior_subtract(&surroundings, &options, recon->plan, recon->before, &rows, err);
+		code = exterior_subtract(&surroundings, &options, recon->before, &rows, err);
 	if (code == 0 && !recon->recipe.fdk.on)
 		warn_truncated(recon->hooks, recon->geometry, recon->input.turned, surroundings.truncated,
 			       recon->geometry->columns);

@@ -15,13 +15,23 @@ static size_t voxel_at(const struct grid *grid, int x, int y, int z)
 	return ((size_t)z * (size_t)grid->size[1] + (size_t)y) * (size_t)grid->size[0] + (size_t)x;
 }
 
+static int voxels_a_side(const struct surroundings_options *options)
+{
+	const struct geometry *geometry = options->geometry;
+	const double pixels = (double)geometry->columns * geometry->rows * geometry->count;
+	const double most = cbrt(fmax((double)grid_voxels(options->grid), pixels / 4));
+
+	return (int)fmin(fmax(most, SURROUNDINGS_LEAST), SURROUNDINGS_MOST);
+}
+
 /* The box around the field of view and the recipe's grid; that alone where the sources leave no room for more. */
 static void choose_grid(const struct surroundings_options *options, struct grid *ret)
 {
+	const int most = voxels_a_side(options);
 	struct grid wide, inner = *options->grid;
 	struct error err;
 
-	orbit_default_grid(options->orbit, options->geometry, SURROUNDINGS_MOST, &wide);
+	orbit_default_grid(options->orbit, options->geometry, most, &wide);
 	for (int narrow = options->inside_only; narrow < 2; narrow++) {
 		double low[3], side[3], spacing = wide.spacing[0];
 
@@ -34,7 +44,7 @@ static void choose_grid(const struct surroundings_options *options, struct grid 
 				high = fmax(high, wide.origin[i] + (wide.size[i] - 0.5) * wide.spacing[i]);
 			}
 			side[i] = high - low[i];
-			spacing = fmax(spacing, side[i] / SURROUNDINGS_MOST);
+			spacing = fmax(spacing, side[i] / most);
 		}
 		for (int i = 0; i < 3; i++) {
 			/* A part of a millionth is rounding, not another voxel. */
@@ -60,6 +70,7 @@ static struct plan_options plan_options_of(const struct surroundings_options *op
 	    .extend = weights->extend,
 	    .extended_response = weights->extended,
 	    .resident = 1, /* what is filtered in one go takes the most room, and the volume is small */
+	    .lender = options->plan,
 	    .no_samples = true,
 	};
 
@@ -67,31 +78,33 @@ static struct plan_options plan_options_of(const struct surroundings_options *op
 	return plan;
 }
 
-int surroundings_bytes(const struct surroundings_options *options, size_t *ret_device, size_t *ret_host,
+int surroundings_bytes(const struct surroundings_options *options, struct surroundings_bytes *ret_bytes,
 		       struct error *err)
 {
+	const struct backend *backend = options->backend;
 	const struct geometry *geometry = options->geometry;
-	const int *pad = options->orbit->pad, all = geometry->count;
-	const size_t columns = (size_t)geometry->columns, wide = columns + (size_t)(pad[0] + pad[1]);
+	const int *pad = options->orbit->pad, wide = pad[0] + geometry->columns + pad[1];
+	const int slots = geometry->count < SURROUNDINGS_VIEWS ? geometry->count : SURROUNDINGS_VIEWS;
 	float some = 0; /* stands for the weights: only whether there are any is asked here */
 	const struct fdk_weights weights = {
 	    .columns = &some, .response = &some, .extended = &some, .extend = geometry->columns};
 	struct grid grid;
 	struct plan_options plan;
 	struct plan_bytes bytes;
-	size_t batch;
 	int code;
 
 	choose_grid(options, &grid);
 	plan = plan_options_of(options, &grid, &weights);
-	code = options->backend->plan_bytes(options->device, &plan, &bytes, err);
+	code = backend->plan_bytes(options->device, &plan, &bytes, err);
 	if (code < 0)
 		return code;
-	/* Filtered views and, when those are gone, projected ones. */
-	batch = (bytes.stack + (size_t)all - 1) / (size_t)all *
-		(size_t)(all < SURROUNDINGS_VIEWS ? all : SURROUNDINGS_VIEWS);
-	*ret_device = bytes.volumes + bytes.scratch + bytes.raw + batch / columns * wide;
-	*ret_host = bytes.host > 0 ? grid_voxels(&grid) * sizeof(float) + batch : 0;
+	*ret_bytes = (struct surroundings_bytes){
+	    /* Filtered views and, when those are gone, projected ones. */
+	    .device = bytes.volumes + bytes.scratch - bytes.block + bytes.raw +
+		      backend->stack_bytes(wide, geometry->rows, slots),
+	    .borrowed = bytes.block,
+	    .host = bytes.host > 0 ? grid_voxels(&grid) * sizeof(float) : 0,
+	};
 	return 0;
 }
 

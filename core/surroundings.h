@@ -10,8 +10,12 @@
  * field of view, where FDK's sums lack views, and a place that some view sees
  * through air, whatever a wide cone or a short arc made of it.
  */
-/* Voxels a side, 8 MiB at most, and views that are projected in one go: little beside a job's own memory. */
-enum { SURROUNDINGS_MOST = 128, SURROUNDINGS_VIEWS = 4 };
+/*
+ * Voxels a side, and views that are projected in one go: little beside a job's own
+ * memory. That of a small job has room for as many voxels only as its grid or a quarter
+ * of its pixels, but not for fewer than SURROUNDINGS_LEAST a side.
+ */
+enum { SURROUNDINGS_LEAST = 64, SURROUNDINGS_MOST = 128, SURROUNDINGS_VIEWS = 4 };
 
 /* What it is made from, all of it borrowed. */
 struct surroundings_options {
@@ -20,6 +24,7 @@ struct surroundings_options {
 	const struct geometry *geometry;
 	const struct orbit *orbit;
 	const struct grid *grid;   /* the recipe's */
+	struct plan *plan;         /* of that, in whose memory it works */
 	struct stack *projections; /* a slot for each view */
 	double factor;             /* that makes up for blank views, 1 without */
 	bool poor;                 /* FDK is, and not to be believed outside of the recipe's grid */
@@ -38,8 +43,14 @@ struct surroundings {
 	bool goes_on;        /* something is left outside of the recipe's grid */
 };
 
-/* Bytes on the device and on the host (parts.h); of the options it needs backend, device, geometry, orbit and grid. */
-int surroundings_bytes(const struct surroundings_options *options, size_t *ret_device, size_t *ret_host,
+struct surroundings_bytes {
+	size_t device;   /* beside the job's own, */
+	size_t borrowed; /* and of its plan's block (plan_options.lends) */
+	size_t host;     /* as of parts.h */
+};
+
+/* Known beforehand; of the options it needs backend, device, geometry, orbit and grid. */
+int surroundings_bytes(const struct surroundings_options *options, struct surroundings_bytes *ret_bytes,
 		       struct error *err);
 
 /* In place, for the plan points into it: not to be copied. Free with surroundings_clear. */

@@ -585,9 +585,9 @@ int backproject_views(struct plan *plan, const float *from, int first, int count
 {
 	const struct stack_shape *shape = shape_for(plan, use);
 	bool padded = shape->columns > plan->stack.columns;
-	int most = padded                         ? plan->shape.batch
-		   : back_by_pairs(plan, use.fdk) ? plan->shape.pairs_at_once
-						  : plan->shape.views_at_once;
+	int most = back_by_pairs(plan, use.fdk) ? plan->shape.pairs_at_once
+		   : padded                     ? plan->shape.batch
+						: plan->shape.views_at_once;
 	int pad = padded ? plan->options.pad[0] : 0;
 	/* An update takes the whole sum: all parts but the last are summed aside. */
 	bool parts = use.update && count > most;

@@ -230,6 +230,7 @@ const struct backend backend_cuda = {
     .volume_copy = cuda_volume_copy,
     .stack_new = cuda_stack_new,
     .stack_free = cuda_stack_free,
+    .stack_bytes = cuda_stack_bytes,
     .stack_download = cuda_stack_download,
     .stack_upload = cuda_stack_upload,
     .plan_bytes = cuda_plan_bytes,

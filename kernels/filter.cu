@@ -20,6 +20,7 @@
  * on the stream for what comes in, so that nobody waits for the card to come to
  * it. All are filtered as they are, those few then once more with their extension.
  */
+#include <algorithm>
 #include <cmath>
 #include <cstdlib>
 #include <cufft.h>
@@ -29,15 +30,16 @@
 #include "kernels/fft.cuh"
 #include "kernels/internal.cuh"
 
-static const size_t FFT_BYTES = (size_t)64 << 20; /* of the rows that cuFFT takes at once */
+static const size_t FFT_BYTES = (size_t)16
+				<< 20; /* of the rows that cuFFT takes at once: the second cache holds them */
+enum { FFT_ROWS = 8 };                 /* that it has room for at least */
+enum { FFT_ALIGNED = 256 };            /* bytes: where its workspace begins */
 
-/* cuFFT's part: transforms of one length, so many rows at once. */
+/* cuFFT's part: transforms of one length, so many rows at once, in the plan's scratch with the workspace behind. */
 struct fft {
 	int length, at_once;
 	cufftHandle forward, inverse;
 	float *response; /* [length / 2 + 1], 1 / length included */
-	float *rows;     /* [at_once][length + 2] */
-	size_t bytes;
 	bool has_forward, has_inverse;
 };
 
@@ -385,24 +387,27 @@ static __global__ void fft_take(const filter_job job, int first, int length, con
 }
 
 /* The first `all` rows of the job's list, or of all. */
-static int filter_fft(const struct fft *fft, const filter_job &job, int all, cudaStream_t stream, struct error *err)
+static int filter_fft(struct plan *plan, const struct fft *fft, const filter_job &job, int all, struct error *err)
 {
+	cudaStream_t stream = plan->device->stream;
+	float *fft_rows = plan->scratch; /* [at_once][length + 2] */
 	int length = fft->length;
 
+	plan_end_slices(plan);
 	for (int first = 0; first < all; first += fft->at_once) {
 		int rows = all - first < fft->at_once ? all - first : fft->at_once;
 
-		fft_fill<<<dim3(divide_up(length, 256), rows), 256, 0, stream>>>(job, first, length, fft->rows);
+		fft_fill<<<dim3(divide_up(length, 256), rows), 256, 0, stream>>>(job, first, length, fft_rows);
 		LAUNCHED();
 		/* Rows left over from the batch before are transformed once more and not read. */
-		if (cufftExecR2C(fft->forward, fft->rows, (cufftComplex *)fft->rows) != CUFFT_SUCCESS)
+		if (cufftExecR2C(fft->forward, fft_rows, (cufftComplex *)fft_rows) != CUFFT_SUCCESS)
 			return error_set(err, ERR_DEVICE, "cufftExecR2C of %d rows of %d failed", rows, length);
 		fft_multiply<<<dim3(divide_up(length / 2 + 1, 256), rows), 256, 0, stream>>>(fft->response, length,
-											     fft->rows);
+											     fft_rows);
 		LAUNCHED();
-		if (cufftExecC2R(fft->inverse, (cufftComplex *)fft->rows, fft->rows) != CUFFT_SUCCESS)
+		if (cufftExecC2R(fft->inverse, (cufftComplex *)fft_rows, fft_rows) != CUFFT_SUCCESS)
 			return error_set(err, ERR_DEVICE, "cufftExecC2R of %d rows of %d failed", rows, length);
-		fft_take<<<dim3(divide_up(job.wide, 256), rows), 256, 0, stream>>>(job, first, length, fft->rows);
+		fft_take<<<dim3(divide_up(job.wide, 256), rows), 256, 0, stream>>>(job, first, length, fft_rows);
 		LAUNCHED();
 	}
 	return 0;
@@ -420,21 +425,40 @@ int filter_choose(int columns)
 	return 0;
 }
 
-/* Rows that cuFFT takes at once: as much as a batch has, within a bound. */
-static int fft_at_once(int length, int rows)
+static size_t fft_row_bytes(int length)
 {
-	const int launch_most = 65535; /* of blocks below each other */
-	int most = (int)(FFT_BYTES / ((size_t)(length + 2) * sizeof(float)));
-
-	most = most < launch_most ? most : launch_most;
-	return rows < most ? rows : most;
+	return (size_t)(length + 2) * sizeof(float);
 }
 
-static size_t fft_bytes(int length, int rows)
+/*
+ * What cuFFT has of the scratch: room for as many rows as the cache holds and a
+ * workspace as large; for a small job no more than a stack, or what others need anyway.
+ */
+size_t filter_scratch_bytes(const struct plan *plan, size_t others)
 {
-	/* cuFFT's own workspace is about as large as its data. */
-	return ((size_t)length / 2 + 1) * sizeof(float) +
-	       2 * (size_t)fft_at_once(length, rows) * (size_t)(length + 2) * sizeof(float);
+	const struct plan_shape *shape = &plan->shape;
+	const struct geometry *geometry = plan->options.geometry;
+	int longest = std::max(shape->fft_length, shape->extended_length);
+	size_t row = fft_row_bytes(longest), view = sizeof(float) * (size_t)geometry->columns * (size_t)geometry->rows;
+	size_t share = std::max(others, view * (size_t)geometry->count) / 2;
+	size_t rows = std::min(std::min((size_t)shape->batch * (size_t)geometry->rows * row, FFT_BYTES), share);
+
+	return longest > 0 ? 2 * std::max(rows, FFT_ROWS * row) + FFT_ALIGNED : 0;
+}
+
+/* Rows at once for which there is room, with a workspace as large. */
+static int fft_at_once(const struct plan *plan, int length)
+{
+	const size_t launch_most = 65535; /* of blocks below each other */
+	size_t room = std::min((plan->scratch_bytes - FFT_ALIGNED) / 2, FFT_BYTES);
+	size_t all = (size_t)plan->shape.batch * (size_t)plan->stack.rows;
+
+	return (int)std::min(std::min(room / fft_row_bytes(length), all), launch_most);
+}
+
+static size_t response_bytes(int length)
+{
+	return ((size_t)length / 2 + 1) * sizeof(float);
 }
 
 size_t filter_bytes(const struct plan_shape *shape, int rows)
@@ -445,9 +469,9 @@ size_t filter_bytes(const struct plan_shape *shape, int rows)
 	if (length > 0)
 		bytes = length * (sizeof(float) + sizeof(float2)) + 256 * sizeof(float2);
 	else
-		bytes = fft_bytes(shape->fft_length, (int)all);
+		bytes = response_bytes(shape->fft_length);
 	if (shape->extended_length > 0)
-		bytes += fft_bytes(shape->extended_length, (int)all) +
+		bytes += response_bytes(shape->extended_length) +
 			 all * (1 + 2 * sizeof(struct extension) + sizeof(int)) + (size_t)shape->batch * sizeof(float);
 	return bytes;
 }
@@ -520,10 +544,41 @@ static int prepare_fused(struct plan *plan, struct error *err)
 	return upload(plan, twiddles.data(), twiddles.size() * sizeof(float2), (void **)&plan->twiddles, err);
 }
 
+/* Both transforms of so many rows with one workspace of *ret_bytes; false: cuFFT will not. */
+static bool fft_make(struct fft *fft, int length, int rows, cudaStream_t stream, void *workspace, size_t *ret_bytes)
+{
+	int half = length / 2 + 1, padded = length + 2;
+	size_t forward = 0, inverse = 0;
+
+	fft->has_forward = cufftCreate(&fft->forward) == CUFFT_SUCCESS;
+	fft->has_inverse = cufftCreate(&fft->inverse) == CUFFT_SUCCESS;
+	if (!fft->has_forward || !fft->has_inverse || cufftSetAutoAllocation(fft->forward, 0) != CUFFT_SUCCESS ||
+	    cufftSetAutoAllocation(fft->inverse, 0) != CUFFT_SUCCESS ||
+	    cufftMakePlanMany(fft->forward, 1, &length, &padded, 1, padded, &half, 1, half, CUFFT_R2C, rows,
+			      &forward) != CUFFT_SUCCESS ||
+	    cufftMakePlanMany(fft->inverse, 1, &length, &half, 1, half, &padded, 1, padded, CUFFT_C2R, rows,
+			      &inverse) != CUFFT_SUCCESS ||
+	    cufftSetStream(fft->forward, stream) != CUFFT_SUCCESS ||
+	    cufftSetStream(fft->inverse, stream) != CUFFT_SUCCESS ||
+	    cufftSetWorkArea(fft->forward, workspace) != CUFFT_SUCCESS ||
+	    cufftSetWorkArea(fft->inverse, workspace) != CUFFT_SUCCESS)
+		return false;
+	*ret_bytes = std::max(forward, inverse);
+	return true;
+}
+
+static void fft_unmake(struct fft *fft)
+{
+	if (fft->has_forward)
+		cufftDestroy(fft->forward);
+	if (fft->has_inverse)
+		cufftDestroy(fft->inverse);
+	fft->has_forward = fft->has_inverse = false;
+}
+
 static int fft_new(struct plan *plan, int length, const float *from, struct fft **ret_fft, struct error *err)
 {
-	int rows = fft_at_once(length, plan->shape.batch * plan->stack.rows), half = length / 2 + 1,
-	    padded = length + 2;
+	int half = length / 2 + 1;
 	std::vector<float> response((size_t)half);
 	struct fft *fft = (struct fft *)calloc(1, sizeof(*fft));
 
@@ -531,34 +586,32 @@ static int fft_new(struct plan *plan, int length, const float *from, struct fft 
 		return error_set(err, ERR_NO_MEMORY, "no memory for the filter");
 	*ret_fft = fft; /* the plan's, which releases it however far this comes */
 	fft->length = length;
-	fft->at_once = rows;
 	for (int k = 0; k < half; k++)
 		response[(size_t)k] = from[k] / (float)length;
 	TRY(upload(plan, response.data(), response.size() * sizeof(float), (void **)&fft->response, err));
-	fft->bytes = (size_t)rows * (size_t)padded * sizeof(float);
-	TRY(device_allocate(plan->device, fft->bytes, (void **)&fft->rows, err));
-	fft->has_forward = cufftPlanMany(&fft->forward, 1, &length, &padded, 1, padded, &half, 1, half, CUFFT_R2C,
-					 rows) == CUFFT_SUCCESS;
-	fft->has_inverse = cufftPlanMany(&fft->inverse, 1, &length, &half, 1, half, &padded, 1, padded, CUFFT_C2R,
-					 rows) == CUFFT_SUCCESS;
-	if (!fft->has_forward || !fft->has_inverse ||
-	    cufftSetStream(fft->forward, plan->device->stream) != CUFFT_SUCCESS ||
-	    cufftSetStream(fft->inverse, plan->device->stream) != CUFFT_SUCCESS)
-		return error_set(err, ERR_NO_MEMORY, "cuFFT has no plan for %d rows of %d", rows, length);
-	CUDA_TRY(cudaMemsetAsync(fft->rows, 0, fft->bytes, plan->device->stream));
-	return 0;
+	/* A workspace may be larger than the rows: fewer then. */
+	for (int rows = fft_at_once(plan, length); rows > 0; rows /= 2) {
+		size_t data = ((size_t)rows * fft_row_bytes(length) + FFT_ALIGNED - 1) / FFT_ALIGNED * FFT_ALIGNED;
+		size_t needed = 0;
+
+		if (!fft_make(fft, length, rows, plan->device->stream, (char *)plan->scratch + data, &needed))
+			break;
+		if (data + needed <= plan->scratch_bytes) {
+			fft->at_once = rows;
+			return 0;
+		}
+		fft_unmake(fft);
+	}
+	return error_set(err, ERR_NO_MEMORY, "cuFFT has no plan for rows of %d within %zu bytes", length,
+			 plan->scratch_bytes);
 }
 
 static void fft_free(struct device *device, struct fft *fft)
 {
 	if (fft == NULL)
 		return;
-	if (fft->has_forward)
-		cufftDestroy(fft->forward);
-	if (fft->has_inverse)
-		cufftDestroy(fft->inverse);
-	device_release(device, fft->rows, fft->bytes);
-	device_release(device, fft->response, ((size_t)fft->length / 2 + 1) * sizeof(float));
+	fft_unmake(fft);
+	device_release(device, fft->response, response_bytes(fft->length));
 	free(fft);
 }
 
@@ -691,7 +744,7 @@ static int filter_plain(struct plan *plan, filter_job job, struct error *err)
 		launch_fused<8>(job, stream);
 		break;
 	default:
-		return filter_fft(plan->fft, job, job.count * job.rows, stream, err);
+		return filter_fft(plan, plan->fft, job, job.count * job.rows, err);
 	}
 	LAUNCHED();
 	return 0;
@@ -740,7 +793,7 @@ static int filter_extended_rows(struct plan *plan, filter_job job, int count, st
 	job.list = edges->list;
 	job.sides = edges->sides;
 	job.fit = edges->fit;
-	TRY(filter_fft(plan->extended, job, count, stream, err));
+	TRY(filter_fft(plan, plan->extended, job, count, err));
 	return mark_used(plan->device, edges->used, err); /* what was found is free for the next batch */
 }
 

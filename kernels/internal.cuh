@@ -17,6 +17,7 @@
 
 extern "C" {
 #include "core/backend.h"
+#include "core/fdk.h"
 }
 #include "kernels/comb.cuh"
 
@@ -124,7 +125,7 @@ struct stack {
 };
 
 struct stack_shape stack_shape_make(int columns, int rows, int slots);
-size_t stack_bytes(int columns, int rows, int slots);
+size_t cuda_stack_bytes(int columns, int rows, int slots);
 
 /* The pixels whose rays may meet the grid, and some around them. */
 struct shadow {
@@ -218,6 +219,13 @@ struct device_grid {
 enum { BATCH_MOST = 128 }; /* views that are filtered and backprojected in one go */
 enum { ROWS_APART = 4 };   /* rows of a thread that share columns, but no values */
 
+/*
+ * How a plan saves memory, if at all: the corrections of a subset are laid out in
+ * halves; are made and laid out in two, three or four parts; or few at a time and
+ * without arrays. Each takes more time than the one before.
+ */
+enum thrift { THRIFT_NONE, THRIFT_HALVES, THRIFT_2_PARTS, THRIFT_3_PARTS, THRIFT_4_PARTS, THRIFT_LEAN };
+
 /* How a plan does its work; chosen once from geometry and options. */
 struct plan_shape {
 	bool untilted;    /* the fast kernels apply */
@@ -231,11 +239,11 @@ struct plan_shape {
 	int back_voxels; /* voxels of one window in the untilted backprojection; 0: the general one */
 	bool is_small;   /* launches take longer than samples: the plainest kernels */
 	enum comb back_comb;
-	bool back_pairs;     /* it reads pairs in half precision */
-	bool textures;       /* 8-bit interpolation weights are allowed */
-	bool z_rays;         /* some ray runs closer to z than to x and y */
-	int batch;           /* views filtered and backprojected in one go */
-	bool lean;           /* little memory: few views at a time, no arrays */
+	bool back_pairs; /* it reads pairs in half precision */
+	bool textures;   /* 8-bit interpolation weights are allowed */
+	bool z_rays;     /* some ray runs closer to z than to x and y */
+	int batch;       /* views filtered and backprojected in one go */
+	enum thrift thrift;
 	int correction;      /* slots of the correction stack, 0 without SART */
 	bool parts;          /* it holds a part of a subset only */
 	int views_at_once;   /* that one launch of the backprojection takes; layers of the projection array */
@@ -275,9 +283,17 @@ struct plan {
 	struct device_view *geometry; /* [count], device */
 	struct device_view *in_order; /* the same in the order of SART, NULL without */
 
-	/* One block that the stages use in turn: slices of the forward projection, z-fastest copy, TV's copies. */
+	/*
+	 * One block that the stages use in turn, and another plan that borrows it: slices of
+	 * the forward projection or copies of SART (the first `slices_bytes`), TV's copies,
+	 * cuFFT's rows. Samples of weight 0 are read from slices where nothing was put, so that
+	 * numbers must stand there.
+	 */
 	float *scratch;
-	size_t scratch_bytes;
+	size_t scratch_bytes, slices_bytes;
+	struct plan *lender; /* whose scratch it is, NULL: its own */
+	const struct plan
+	    *slices_of; /* of its own scratch: the plan whose slices are there, and nothing else was since */
 	struct layered projections;    /* a batch of projections, with textures */
 	struct layered filtered_array; /* the same of padded rows, where they are longer */
 	void *pairs;                   /* a batch of projections as pairs of float or half, for the rows */
@@ -318,6 +334,10 @@ struct plan {
 /* The list of views on the device; nothing is copied when it is there already. */
 int plan_set_views(struct plan *plan, const int *views, int count, struct error *err);
 int plan_set_slots(struct plan *plan, const int *slots, int count, const struct stack *from, struct error *err);
+/* The scratch is to hold slices: zeros where anything else has been. */
+int plan_begin_slices(struct plan *plan, struct error *err);
+/* It is to hold something else. */
+void plan_end_slices(struct plan *plan);
 /* The views, and a stack of projections of this shape. */
 int plan_check_views(const struct plan *plan, const int *views, int count, const struct stack_shape *shape,
 		     const struct stack *stack, int slots, struct error *err);
@@ -424,7 +444,9 @@ int matched_views(struct plan *plan, const float *from, int first, int count, st
 int filter_choose(int columns);
 int filter_prepare(struct plan *plan, struct error *err);
 void filter_release(struct plan *plan);
+/* Of its own, and in plan->scratch, which has `others` for other stages anyway. */
 size_t filter_bytes(const struct plan_shape *shape, int rows);
+size_t filter_scratch_bytes(const struct plan *plan, size_t others);
 
 /* ---- norms.cu ---- */
 size_t reduce_bytes(void);

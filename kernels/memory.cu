@@ -231,13 +231,14 @@ struct stack_shape stack_shape_make(int columns, int rows, int slots)
 
 	shape.columns = columns;
 	shape.rows = rows;
-	shape.pitch = round_up(columns + 2, 32); /* rows on cache lines, two zeros or more behind each */
+	/* Long rows start on cache lines, short ones on sectors; two zeros or more behind each. */
+	shape.pitch = round_up(columns + 2, columns >= 256 ? 32 : 8);
 	shape.slot = (size_t)shape.pitch * (size_t)(rows + STACK_PAD);
 	shape.floats = shape.slot * (size_t)slots + (size_t)shape.pitch * (STACK_PAD + 2);
 	return shape;
 }
 
-size_t stack_bytes(int columns, int rows, int slots)
+size_t cuda_stack_bytes(int columns, int rows, int slots)
 {
 	return stack_shape_make(columns, rows, slots).floats * sizeof(float);
 }

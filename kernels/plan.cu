@@ -15,12 +15,18 @@ enum { LAYERS_MOST = 2048 };                      /* of a layered array, on ever
 enum { SIDE_MOST = 32768 };                       /* its width and height */
 enum { BATCH_LEAN = 16 };                         /* of BATCH_MOST, with little memory */
 static const double SMALL = 1 << 20;              /* voxels times views below which launches take longer than samples */
-static const size_t RAW_BYTES = (size_t)16 << 20; /* of the buffer of raw samples */
+static const size_t RAW_BYTES = (size_t)16 << 20; /* of the buffer of raw samples, */
+enum { RAW_PART = 16 };                           /* and of all views at most the 16th part */
 static const int WARPS_ENOUGH = 16384;            /* of rays through the grid, to fill the card without cutting them */
 
 static int at_most(int count, int most)
 {
 	return count < most ? count : most;
+}
+
+static size_t at_least(size_t bytes, size_t least)
+{
+	return bytes > least ? bytes : least;
 }
 
 static int largest_subset(const struct subsets *subsets)
@@ -273,7 +279,20 @@ static int view_warps(const struct geometry *geometry, const struct grid *grid, 
 	return most;
 }
 
-static struct plan_shape shape_of(const struct plan_options *options, bool lean)
+static int lean_or(enum thrift thrift, int most)
+{
+	return thrift == THRIFT_LEAN ? at_most(most, BATCH_LEAN) : most;
+}
+
+/* Of a subset, whose corrections are made in one go. */
+static int corrected_at_once(enum thrift thrift, int subset)
+{
+	int parts = thrift < THRIFT_2_PARTS ? 1 : thrift - THRIFT_2_PARTS + 2;
+
+	return lean_or(thrift, divide_up(subset, parts));
+}
+
+static struct plan_shape shape_of(const struct plan_options *options, enum thrift thrift)
 {
 	const struct geometry *geometry = options->geometry;
 	const struct grid *grid = options->grid;
@@ -294,20 +313,22 @@ static struct plan_shape shape_of(const struct plan_options *options, bool lean)
 	if (shape.is_small || options->matched)
 		shape.forward_rows = 0;
 	shape.view_warps = view_warps(geometry, grid, shape.forward_rows);
-	shape.textures = !lean && !shape.is_small && !options->reference_precision && fits &&
+	shape.textures = thrift != THRIFT_LEAN && !shape.is_small && !options->reference_precision && fits &&
 			 wide_columns(options) <= SIDE_MOST && geometry->rows <= SIDE_MOST;
-	shape.lean = lean;
-	shape.batch = at_most(resident_views(options), lean ? (int)BATCH_LEAN : (int)BATCH_MOST);
+	shape.thrift = thrift;
+	/* Beside what SART takes FDK has no more than it will ask for. */
+	shape.batch = at_most(resident_views(options),
+			      lean_or(thrift, subset > 0 ? fdk_batch_most(geometry->count) : BATCH_MOST));
 	shape.by_view = subset == 1 && !options->matched && indexed;
 	shape.by_subset = subset > 0 && !shape.by_view;
 	/* Slices that are laid out once an iteration cost little, and their rays less. */
 	few = subset > 0 && options->sart->subsets.count > 1 && (long)shape.view_warps * subset < WARPS_ENOUGH;
 	shape.by_copies = (shape.by_view || few) && indexed && shape.halves && shape.forward_rows > 0 &&
 			  !shape.rows_apart && geometry->columns <= SIDE_MOST && geometry->rows <= SIDE_MOST;
-	shape.correction = shape.by_subset ? (lean ? at_most(subset, BATCH_LEAN) : subset) : 0;
+	shape.correction = shape.by_subset ? corrected_at_once(thrift, subset) : 0;
 	shape.parts = shape.correction < (shape.by_subset ? subset : 0);
 	shape.covered = !options->matched && is_covered(geometry, grid);
-	shape.views_at_once = at_most(geometry->count, lean ? (int)BATCH_LEAN : (int)VIEWS_AT_ONCE);
+	shape.views_at_once = at_most(geometry->count, lean_or(thrift, VIEWS_AT_ONCE));
 	if (options->column_weights != NULL) {
 		shape.filter_length = filter_choose(wide_columns(options));
 		if (shape.filter_length == 0) {
@@ -363,16 +384,18 @@ static int views_laid_out(const struct plan *plan)
 	if ((plan->shape.back_voxels == 0 || plan->shape.back_pairs) && plan->shape.correction > views &&
 	    !plan->options.matched)
 		views = plan->shape.correction;
+	if (plan->shape.thrift == THRIFT_HALVES)
+		views = divide_up(views, 2);
 	return at_most(views, plan->shape.views_at_once);
 }
-static void plan_describe(struct plan *plan, const struct plan_options *options, bool lean)
+static void plan_describe(struct plan *plan, const struct plan_options *options, enum thrift thrift)
 {
 	const struct geometry *geometry = options->geometry;
 	const struct grid *grid = options->grid;
 	const int *size = grid->size;
 
 	plan->options = *options;
-	plan->shape = shape_of(options, lean);
+	plan->shape = shape_of(options, thrift);
 	for (int i = 0; i < 3; i++) {
 		plan->grid.size[i] = size[i];
 		plan->grid.spacing[i] = (float)grid->spacing[i];
@@ -383,12 +406,13 @@ static void plan_describe(struct plan *plan, const struct plan_options *options,
 	plan->stack = stack_shape_make(geometry->columns, geometry->rows, 1);
 	plan->filtered = stack_shape_make(wide_columns(options), geometry->rows, 1);
 	if (!options->no_projection && !plan->shape.is_small)
-		plan->scratch_bytes = (plan->along_x.floats + plan->along_y.floats) * sizeof(float);
+		plan->slices_bytes = (plan->along_x.floats + plan->along_y.floats) * sizeof(float);
 	plan->shape.view_rows = sweep_view_rows(plan);
-	if ((plan->shape.by_view || plan->shape.by_copies) && sweep_scratch_bytes(plan) > plan->scratch_bytes)
-		plan->scratch_bytes = sweep_scratch_bytes(plan);
-	if (tv_scratch_bytes(options) > plan->scratch_bytes)
-		plan->scratch_bytes = tv_scratch_bytes(options);
+	if ((plan->shape.by_view || plan->shape.by_copies) && sweep_scratch_bytes(plan) > plan->slices_bytes)
+		plan->slices_bytes = sweep_scratch_bytes(plan);
+	plan->scratch_bytes = at_least(plan->slices_bytes, tv_scratch_bytes(options));
+	plan->scratch_bytes = at_least(plan->scratch_bytes, filter_scratch_bytes(plan, plan->scratch_bytes));
+	plan->scratch_bytes = at_least(plan->scratch_bytes, options->lends);
 	if (plan->shape.by_view)
 		plan->partial_count = sweep_partials(plan);
 	else if (plan->shape.by_subset)
@@ -402,7 +426,8 @@ static void plan_describe(struct plan *plan, const struct plan_options *options,
 	    (size_t)geometry->columns * (size_t)geometry->rows * (options->linearise.sample == SAMPLE_UINT16 ? 2 : 4);
 	if (plan->bytes.raw < RAW_BYTES)
 		plan->raw_views = (int)(RAW_BYTES / plan->bytes.raw);
-	plan->raw_views = options->no_samples ? 0 : at_most(plan->raw_views, resident_views(options));
+	plan->raw_views =
+	    options->no_samples ? 0 : at_most(plan->raw_views, divide_up(resident_views(options), RAW_PART));
 }
 
 static bool needs_work(const struct plan *plan)
@@ -419,17 +444,17 @@ static size_t pixels_of(const struct plan *plan)
 	return (size_t)plan->stack.columns * (size_t)plan->stack.rows;
 }
 
-static struct plan_bytes bytes_of(const struct plan_options *options, bool lean)
+static struct plan_bytes bytes_of(const struct plan_options *options, enum thrift thrift)
 {
 	struct plan plan = {};
 	struct plan_bytes bytes = {};
 	const struct geometry *geometry = options->geometry;
 	size_t voxels = grid_voxels(options->grid) * sizeof(float), views = (size_t)geometry->count;
 
-	plan_describe(&plan, options, lean);
-	bytes.stack = stack_bytes(geometry->columns, geometry->rows, geometry->count);
+	plan_describe(&plan, options, thrift);
 	bytes.volumes = voxels * (options->sart != NULL ? 2 : 1);
 	bytes.raw = plan.bytes.raw * (size_t)plan.raw_views;
+	bytes.block = plan.scratch_bytes;
 	bytes.scratch = plan.scratch_bytes +
 			views * ((options->sart != NULL ? 2 : 1) * sizeof(struct device_view) + 2 * sizeof(int)) +
 			plan.partial_count * sizeof(float2) + reduce_bytes() + VIEWS_AT_ONCE * 12 * sizeof(float) +
@@ -448,9 +473,9 @@ static struct plan_bytes bytes_of(const struct plan_options *options, bool lean)
 	if (plan.shape.by_view && plan.shape.by_copies)
 		bytes.scratch += sweep_correction_bytes(&plan);
 	else if (plan.shape.by_view)
-		bytes.scratch += stack_bytes(geometry->rows, geometry->columns, 1);
+		bytes.scratch += cuda_stack_bytes(geometry->rows, geometry->columns, 1);
 	if (plan.shape.by_subset)
-		bytes.scratch += stack_bytes(geometry->columns, geometry->rows, plan.shape.correction);
+		bytes.scratch += cuda_stack_bytes(geometry->columns, geometry->rows, plan.shape.correction);
 	if (options->column_weights != NULL)
 		bytes.scratch +=
 		    views * (size_t)geometry->columns * sizeof(float) + filter_bytes(&plan.shape, geometry->rows);
@@ -463,26 +488,55 @@ static struct plan_bytes bytes_of(const struct plan_options *options, bool lean)
 	return bytes;
 }
 
-/*
- * Whether the job fits only with a lean plan: float32 loads in place of arrays
- * with textures, few views at a time, corrections in parts.
- */
-static bool is_lean(const struct device *device, const struct plan_options *options)
+/* A job's bound: seven volumes, ten with the proximal method's, and three stacks. */
+static size_t most_bytes(const struct plan_options *options)
 {
-	struct plan_bytes bytes;
+	const struct geometry *geometry = options->geometry;
+	bool proximal = options->tv != NULL && options->tv->method == TV_PROXIMAL;
 
-	if (device == NULL)
-		return false;
-	bytes = bytes_of(options, false);
-	bytes.stack = stack_bytes(options->geometry->columns, options->geometry->rows, resident_views(options));
-	return bytes.stack + bytes.volumes + bytes.scratch + bytes.raw > device->limit - device->used;
+	return sizeof(float) * ((proximal ? 10 : 7) * grid_voxels(options->grid) +
+				3 * (size_t)geometry->columns * (size_t)geometry->rows * (size_t)geometry->count);
+}
+
+static bool is_borrowed(const struct plan_options *options, size_t block)
+{
+	return options->lender != NULL && options->lender->scratch_bytes >= block;
+}
+
+/*
+ * The least thrift with which the job fits the device and its bound. Where nothing fits that, for
+ * the tables of a small job alone take more, as much as is worth it.
+ */
+static enum thrift choose_thrift(const struct device *device, const struct plan_options *options)
+{
+	size_t most = most_bytes(options), room = device != NULL ? device->limit - device->used : SIZE_MAX, least = 0;
+	enum thrift best = THRIFT_LEAN;
+
+	for (int thrift = THRIFT_NONE; thrift <= THRIFT_LEAN; thrift++) {
+		struct plan_bytes bytes = bytes_of(options, (enum thrift)thrift);
+		size_t all =
+		    options->beside + bytes.volumes + bytes.scratch + bytes.raw +
+		    cuda_stack_bytes(options->geometry->columns, options->geometry->rows, resident_views(options));
+
+		if (is_borrowed(options, bytes.block))
+			all -= bytes.block;
+		if (all > room)
+			continue;
+		if (all <= most)
+			return (enum thrift)thrift;
+		if (least == 0 || all < least / 16 * 15) {
+			least = all;
+			best = (enum thrift)thrift;
+		}
+	}
+	return best;
 }
 
 int cuda_plan_bytes(struct device *device, const struct plan_options *options, struct plan_bytes *ret_bytes,
 		    struct error *err)
 {
 	(void)err;
-	*ret_bytes = bytes_of(options, is_lean(device, options));
+	*ret_bytes = bytes_of(options, choose_thrift(device, options));
 	return 0;
 }
 
@@ -667,6 +721,20 @@ static int prepare_arrays(struct plan *plan, struct error *err)
 	return 0;
 }
 
+static int prepare_scratch(struct plan *plan, struct error *err)
+{
+	struct plan *lender = plan->options.lender;
+
+	if (is_borrowed(&plan->options, plan->scratch_bytes)) {
+		plan->lender = lender;
+		plan->scratch = lender->scratch;
+		return 0;
+	}
+	TRY(device_allocate(plan->device, plan->scratch_bytes, (void **)&plan->scratch, err));
+	CUDA_TRY(cudaMemsetAsync(plan->scratch, 0, plan->scratch_bytes, plan->device->stream));
+	return 0;
+}
+
 static int plan_prepare(struct plan *plan, struct error *err)
 {
 	size_t count = (size_t)plan->options.geometry->count;
@@ -683,9 +751,7 @@ static int plan_prepare(struct plan *plan, struct error *err)
 	TRY(device_allocate(plan->device, reduce_bytes(), (void **)&plan->reduce, err));
 	TRY(device_allocate(plan->device, MOST_COUNT * sizeof(*plan->most), (void **)&plan->most, err));
 	TRY(device_allocate(plan->device, VIEWS_AT_ONCE * 12 * sizeof(float), (void **)&plan->matrices, err));
-	TRY(device_allocate(plan->device, plan->scratch_bytes, (void **)&plan->scratch, err));
-	/* Samples with weight 0 are read from what no copy has written: it must be a number. */
-	CUDA_TRY(cudaMemsetAsync(plan->scratch, 0, plan->scratch_bytes, plan->device->stream));
+	TRY(prepare_scratch(plan, err));
 	TRY(prepare_arrays(plan, err));
 	TRY(prepare_linearise(plan, err));
 	TRY(prepare_sart(plan, err));
@@ -696,12 +762,32 @@ static int plan_prepare(struct plan *plan, struct error *err)
 	return device_wait(plan->device, err);
 }
 
+static struct plan *owner_of_scratch(struct plan *plan)
+{
+	return plan->lender != NULL ? plan->lender : plan;
+}
+
+int plan_begin_slices(struct plan *plan, struct error *err)
+{
+	struct plan *owner = owner_of_scratch(plan);
+
+	if (owner->slices_of != plan)
+		CUDA_TRY(cudaMemsetAsync(plan->scratch, 0, plan->slices_bytes, plan->device->stream));
+	owner->slices_of = plan;
+	return 0;
+}
+
+void plan_end_slices(struct plan *plan)
+{
+	owner_of_scratch(plan)->slices_of = NULL;
+}
+
 static const char *const comb_names[] = {"", ", two a row", ", wide", ", narrow"};
 
 static void summarise(struct plan *plan)
 {
 	const struct plan_shape *shape = &plan->shape;
-	char forward[64] = "general", back[80] = "general";
+	char forward[64] = "general", back[80] = "general", saves[32] = "";
 
 	if (shape->forward_rows > 0)
 		snprintf(forward, sizeof(forward), "%s, %d rows a thread%s",
@@ -713,8 +799,11 @@ static void summarise(struct plan *plan)
 		snprintf(back, sizeof(back), "%s, %d voxels a window%s",
 			 shape->untilted ? "untilted" : "general, FDK's near untilted", shape->back_voxels,
 			 comb_names[shape->back_comb]);
-	snprintf(plan->summary, sizeof(plan->summary), "%sforward %s; back %s; %s; %s", shape->lean ? "lean; " : "",
-		 forward, back, shape->textures ? "texture sampling" : "float32 sampling",
+	if (shape->thrift != THRIFT_NONE)
+		snprintf(saves, sizeof(saves), "%s%d views at a time; ", shape->thrift == THRIFT_LEAN ? "lean, " : "",
+			 at_most(shape->views_at_once, shape->by_subset ? shape->correction : shape->views_at_once));
+	snprintf(plan->summary, sizeof(plan->summary), "%sforward %s; back %s; %s; %s", saves, forward, back,
+		 shape->textures ? "texture sampling" : "float32 sampling",
 		 shape->filter_length > 0 ? "fused filter"
 		 : shape->fft_length > 0  ? "cuFFT"
 					  : "no filter");
@@ -729,7 +818,7 @@ int cuda_plan_new(struct device *device, const struct plan_options *options, str
 	if (plan == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a plan");
 	plan->device = device;
-	plan_describe(plan, options, is_lean(device, options));
+	plan_describe(plan, options, choose_thrift(device, options));
 	code = plan_prepare(plan, err);
 	if (code < 0) {
 		cuda_plan_free(plan);
@@ -767,7 +856,10 @@ void cuda_plan_free(struct plan *plan)
 	device_release(device, plan->slots, count * sizeof(int));
 	device_release(device, plan->reduce, reduce_bytes());
 	device_release(device, plan->matrices, VIEWS_AT_ONCE * 12 * sizeof(float));
-	device_release(device, plan->scratch, plan->scratch_bytes);
+	if (plan->lender != NULL)
+		plan_end_slices(plan);
+	else
+		device_release(device, plan->scratch, plan->scratch_bytes);
 	for (int i = 0; i < 2; i++) {
 		device_release(device, plan->marks[i], pixels_of(plan));
 	}

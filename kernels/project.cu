@@ -609,6 +609,7 @@ int cuda_project(struct plan *plan, const struct volume *from, const int *views,
 {
 	TRY(plan_check_views(plan, views, count, &plan->stack, to, count, err));
 	TRY(plan_set_views(plan, views, count, err));
+	TRY(plan_begin_slices(plan, err));
 	TRY(layout_scale(plan, from->data, NULL, err));
 	TRY(project_prepare(plan, from->data, err));
 	return project_rays(plan, from->data, 0, count, {}, to->data, err);

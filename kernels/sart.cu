@@ -407,6 +407,7 @@ int cuda_sart_iterate(struct plan *plan, const struct stack *projections, struct
 	TRY(device_enter(device, err));
 	TRY(plan_check_views(plan, sart->subsets.order, count, &plan->stack, projections, count, err));
 	TRY(plan_set_views(plan, sart->subsets.order, count, err));
+	TRY(plan_begin_slices(plan, err));
 	if (!worth_recording(plan)) {
 		TRY(sweep(plan, projections->data, volume->data, cancel, err));
 	} else {

@@ -15,8 +15,9 @@
  * The primal-dual steps take the gradient of u^ = v + theta (v - past). That is not
  * stored, but made from the last two v, of which three take turns. The dual variable
  * lies in -1 .. 1 and is stored in half precision, which moves u by less than 0.01
- * gray levels; in float32 for reference precision. So a step reads f, v, past and the
- * dual variable, and writes v and the dual variable: 28 bytes a voxel.
+ * gray levels. So a step reads f, v, past and the dual variable, and writes v and the
+ * dual variable: 28 bytes a voxel. In float, for reference precision, that would take
+ * nine volumes of memory; there a step is two plain kernels that take five.
  */
 #include <climits>
 #include <cmath>
@@ -45,12 +46,11 @@ struct tv_step {
 	float epsilon2, theta;
 };
 
-template <typename DUAL>
 struct tv_volumes {
 	const float *f, *v, *past;
-	float *ret_v;        /* may be f in the last step: a thread uses f only where it writes */
-	const DUAL *dual[3]; /* along x, y and z */
-	DUAL *ret_dual[3];
+	float *ret_v;          /* may be f in the last step: a thread uses f only where it writes */
+	const __half *dual[3]; /* along x, y and z */
+	__half *ret_dual[3];
 };
 
 /* V neighbours along x, loaded and stored at once. */
@@ -98,14 +98,13 @@ struct iterate {
 };
 
 /* What is loaded a plane early. */
-template <tv_kind KIND, typename DUAL, int V>
+template <tv_kind KIND, int V>
 struct arrival {
-	group<DUAL, V> dual[3];
+	group<__half, V> dual[3];
 	group<float, V> f;
 	iterate<KIND, V> next; /* of the plane behind, for the flux along z */
 
-	__device__ __forceinline__ void get(const tv_volumes<DUAL> &a, size_t at, size_t at_next, bool flux,
-					    bool result)
+	__device__ __forceinline__ void get(const tv_volumes &a, size_t at, size_t at_next, bool flux, bool result)
 	{
 		if constexpr (READS_DUAL<KIND>)
 			if (flux)
@@ -118,10 +117,10 @@ struct arrival {
 };
 
 /* New flux along x, y and z at u, from the old one. */
-template <tv_kind KIND, typename DUAL, int V>
+template <tv_kind KIND, int V>
 static __device__ __forceinline__ void flux_of(const tv_step &s, const group<float, V> &u, float right,
 					       const group<float, V> &down, const group<float, V> &next,
-					       const group<DUAL, V> old[3], group<float, V> ret_flux[3])
+					       const group<__half, V> old[3], group<float, V> ret_flux[3])
 {
 #pragma unroll
 	for (int i = 0; i < V; i++) {
@@ -164,8 +163,8 @@ struct tile {
  * A row of the tile, or the one above it (row 0). What would lie outside of the volume
  * stands at its border: a difference to it is 0, and it is not written.
  */
-template <tv_kind KIND, typename DUAL, int V>
-static __device__ __forceinline__ void march_row(const tv_volumes<DUAL> &a, const tv_step &s, tile<V> &t)
+template <tv_kind KIND, int V>
+static __device__ __forceinline__ void march_row(const tv_volumes &a, const tv_step &s, tile<V> &t)
 {
 	int lane = threadIdx.x, row = threadIdx.y, column = lane * V;
 	int x = (int)blockIdx.x * tile<V>::WIDE + column, y = (int)blockIdx.y * ROWS + row - 1;
@@ -174,7 +173,7 @@ static __device__ __forceinline__ void march_row(const tv_volumes<DUAL> &a, cons
 	size_t plane = (size_t)s.nx * s.ny;
 	size_t at = plane * z + (size_t)min(max(y, 0), s.ny - 1) * s.nx + min(x, s.nx - V);
 	iterate<KIND, V> here;
-	arrival<KIND, DUAL, V> now = {};
+	arrival<KIND, V> now = {};
 	group<float, V> before_z = {};
 
 	here.get(a.v, a.past, at);
@@ -184,7 +183,7 @@ static __device__ __forceinline__ void march_row(const tv_volumes<DUAL> &a, cons
 	meet();
 	for (; z < end; z++, at += plane) {
 		int half = z & 1;
-		arrival<KIND, DUAL, V> later = now;
+		arrival<KIND, V> later = now;
 
 		if (z + 1 < end)
 			later.get(a, at + plane, z + 2 < s.nz ? at + 2 * plane : at + plane, true, result);
@@ -233,8 +232,8 @@ static __device__ __forceinline__ void march_row(const tv_volumes<DUAL> &a, cons
  * one voxel, of the column to the left (lower half of the warp) or to the right (upper
  * half, from the row above on). Neighbours in a column are neighbours in the warp.
  */
-template <tv_kind KIND, typename DUAL, int V>
-static __device__ __forceinline__ void march_rim(const tv_volumes<DUAL> &a, const tv_step &s, tile<V> &t)
+template <tv_kind KIND, int V>
+static __device__ __forceinline__ void march_rim(const tv_volumes &a, const tv_step &s, tile<V> &t)
 {
 	int lane = threadIdx.x, row = min(lane & 15, (int)ROWS), column = lane * V;
 	int x0 = (int)blockIdx.x * tile<V>::WIDE, y0 = (int)blockIdx.y * ROWS;
@@ -246,7 +245,7 @@ static __device__ __forceinline__ void march_rim(const tv_volumes<DUAL> &a, cons
 	size_t at_below = plane * z + (size_t)min(y0 + ROWS, s.ny - 1) * s.nx + min(x0 + column, s.nx - V);
 	iterate<KIND, 1> here;
 	iterate<KIND, V> below;
-	arrival<KIND, DUAL, 1> now = {};
+	arrival<KIND, 1> now = {};
 
 	here.get(a.v, a.past, at);
 	below.get(a.v, a.past, at_below);
@@ -259,7 +258,7 @@ static __device__ __forceinline__ void march_rim(const tv_volumes<DUAL> &a, cons
 	meet();
 	for (; z < end; z++, at += plane, at_below += plane) {
 		int half = z & 1;
-		arrival<KIND, DUAL, 1> later = now;
+		arrival<KIND, 1> later = now;
 		iterate<KIND, V> below_later = below;
 
 		if (z + 1 < end) {
@@ -285,16 +284,15 @@ static __device__ __forceinline__ void march_rim(const tv_volumes<DUAL> &a, cons
 }
 
 /* All warps of a block go through as many barriers, if in two loops. */
-template <tv_kind KIND, typename DUAL, int V>
-static __global__ void __launch_bounds__(32 * WARPS, RESIDENT<KIND>)
-    march(const tv_volumes<DUAL> volumes, const tv_step step)
+template <tv_kind KIND, int V>
+static __global__ void __launch_bounds__(32 * WARPS, RESIDENT<KIND>) march(const tv_volumes volumes, const tv_step step)
 {
 	__shared__ tile<V> shared;
 
 	if (threadIdx.y <= ROWS)
-		march_row<KIND, DUAL, V>(volumes, step, shared);
+		march_row<KIND, V>(volumes, step, shared);
 	else
-		march_rim<KIND, DUAL, V>(volumes, step, shared);
+		march_rim<KIND, V>(volumes, step, shared);
 }
 
 /*
@@ -319,25 +317,25 @@ static int planes_for(int nz, int tiles, int slots)
 	return best;
 }
 
-template <tv_kind KIND, typename DUAL, int V>
-static void launch_groups(const struct device *device, const tv_volumes<DUAL> &volumes, tv_step step)
+template <tv_kind KIND, int V>
+static void launch_groups(const struct device *device, const tv_volumes &volumes, tv_step step)
 {
 	dim3 blocks(divide_up(step.nx, tile<V>::WIDE), divide_up(step.ny, ROWS));
 
 	step.planes = planes_for(step.nz, (int)(blocks.x * blocks.y), device->multiprocessors * RESIDENT<KIND>);
 	blocks.z = divide_up(step.nz, step.planes);
-	march<KIND, DUAL, V><<<blocks, dim3(32, WARPS), 0, device->stream>>>(volumes, step);
+	march<KIND, V><<<blocks, dim3(32, WARPS), 0, device->stream>>>(volumes, step);
 }
 /* In groups as long as keep rows aligned. */
-template <tv_kind KIND, typename DUAL>
-static void launch(const struct device *device, const tv_volumes<DUAL> &volumes, const tv_step &step)
+template <tv_kind KIND>
+static void launch(const struct device *device, const tv_volumes &volumes, const tv_step &step)
 {
 	if (step.nx % 4 == 0)
-		launch_groups<KIND, DUAL, 4>(device, volumes, step);
+		launch_groups<KIND, 4>(device, volumes, step);
 	else if (step.nx % 2 == 0)
-		launch_groups<KIND, DUAL, 2>(device, volumes, step);
+		launch_groups<KIND, 2>(device, volumes, step);
 	else
-		launch_groups<KIND, DUAL, 1>(device, volumes, step);
+		launch_groups<KIND, 1>(device, volumes, step);
 }
 
 /* Smallest spacing / spacing. */
@@ -382,8 +380,8 @@ size_t tv_scratch_bytes(const struct plan_options *options)
 		return 0;
 	if (options->tv->method == TV_GRADIENT)
 		return 2 * volume;
-	/* three v, twice p */
-	return options->reference_precision ? 9 * volume : 6 * volume;
+	/* v, u and p in float; else three v, twice p in half precision */
+	return options->reference_precision ? 5 * volume : 6 * volume;
 }
 
 /* The smallest epsilon with which the steps are stable: see core/cpu_tv.c. */
@@ -402,7 +400,7 @@ static int run_gradient(struct plan *plan, float *volume, const struct cancel *c
 		float *to = i > 0 && i == tv->iterations - 1 ? volume : work[i % 2];
 
 		TRY(cancel_check(cancel, err));
-		launch<STEP_EXPLICIT, float>(plan->device, {volume, from, from, to, {}, {}}, s);
+		launch<STEP_EXPLICIT>(plan->device, {volume, from, from, to, {}, {}}, s);
 		LAUNCHED();
 		from = to;
 	}
@@ -412,31 +410,53 @@ static int run_gradient(struct plan *plan, float *volume, const struct cancel *c
 	return 0;
 }
 
-template <typename DUAL>
-static int run_proximal(struct plan *plan, float *volume, const struct cancel *cancel, struct error *err)
+/* Of step i: p, then v, go by these; theta is that of the step before. */
+struct pace {
+	double tau, sigma, theta;
+};
+static pace pace_first(const struct plan *plan)
+{
+	double square = fmax(4 * squared_weights(plan), 1), tau = 1 / plan->options.tv->alpha;
+
+	return {tau, 1 / (square * tau), 0};
+}
+static pace pace_next(const struct plan *plan, pace p)
+{
+	double theta = 1 / sqrt(1 + 2 * plan->options.tv->alpha * p.tau);
+
+	return {p.tau * theta, p.sigma / theta, theta};
+}
+static tv_step step_at(const struct plan *plan, pace p)
 {
 	const struct tv_options *tv = plan->options.tv;
+	double damping = 1 + p.tau * tv->alpha;
+	tv_step s = step_make(plan, p.sigma / tv->unit, p.tau * tv->unit / damping, p.tau * tv->alpha / damping);
+
+	s.theta = (float)p.theta;
+	return s;
+}
+
+static int run_proximal(struct plan *plan, float *volume, const struct cancel *cancel, struct error *err)
+{
 	size_t voxels = grid_voxels(plan->options.grid);
+	int iterations = plan->options.tv->iterations;
 	float *from = volume, *past = volume;
 	float *work[3] = {plan->scratch, plan->scratch + voxels, plan->scratch + 2 * voxels};
-	DUAL *dual[2] = {(DUAL *)(plan->scratch + 3 * voxels), (DUAL *)(plan->scratch + 3 * voxels) + 3 * voxels};
-	double square = fmax(4 * squared_weights(plan), 1), tau = 1 / tv->alpha, sigma = 1 / (square * tau), theta = 0;
+	__half *dual[2] = {(__half *)(plan->scratch + 3 * voxels), (__half *)(plan->scratch + 3 * voxels) + 3 * voxels};
+	pace pace = pace_first(plan);
 
-	for (int i = 0; i < tv->iterations; i++) {
-		double damping = 1 + tau * tv->alpha;
-		tv_step s = step_make(plan, sigma / tv->unit, tau * tv->unit / damping, tau * tv->alpha / damping);
-		bool last = i == tv->iterations - 1;
+	for (int i = 0; i < iterations; i++, pace = pace_next(plan, pace)) {
+		bool last = i == iterations - 1;
 		/* The volume is f, and up to the second step v or past. */
 		float *to = last && i > 1 ? volume : work[i % 3];
-		tv_volumes<DUAL> volumes = {volume, from, past, to, {}, {}};
+		tv_volumes volumes = {volume, from, past, to, {}, {}};
+		tv_step s = step_at(plan, pace);
 
 		for (int k = 0; k < 3; k++) {
 			volumes.dual[k] = dual[i % 2] + k * voxels;
 			volumes.ret_dual[k] = dual[1 - i % 2] + k * voxels;
 		}
-
 		TRY(cancel_check(cancel, err));
-		s.theta = (float)theta;
 		if (i == 0)
 			launch<STEP_FIRST>(plan->device, volumes, s);
 		else if (last)
@@ -446,13 +466,80 @@ static int run_proximal(struct plan *plan, float *volume, const struct cancel *c
 		LAUNCHED();
 		past = from;
 		from = to;
-		theta = 1 / sqrt(1 + 2 * tv->alpha * tau);
-		tau *= theta;
-		sigma /= theta;
 	}
 	if (from != volume)
 		CUDA_TRY(cudaMemcpyAsync(volume, from, voxels * sizeof(float), cudaMemcpyDeviceToDevice,
 					 plan->device->stream));
+	return 0;
+}
+
+/* ---- the primal-dual steps in float ---- */
+
+/* p += slope grad u, drawn back to length 1; `first`: p was 0. */
+static __global__ void step_dual(const tv_step s, const float *u, float3 *p, bool first)
+{
+	int x = blockIdx.x * blockDim.x + threadIdx.x, y = blockIdx.y * blockDim.y + threadIdx.y, z = blockIdx.z;
+
+	if (x >= s.nx || y >= s.ny)
+		return;
+	size_t row = (size_t)s.nx, plane = row * s.ny, at = plane * z + row * y + x;
+	float here = u[at];
+	float3 q = first ? float3{0, 0, 0} : p[at];
+
+	if (x + 1 < s.nx)
+		q.x += s.slope[0] * (u[at + 1] - here);
+	if (y + 1 < s.ny)
+		q.y += s.slope[1] * (u[at + row] - here);
+	if (z + 1 < s.nz)
+		q.z += s.slope[2] * (u[at + plane] - here);
+	float inverse = rsqrtf(fmaxf(fmaf(q.x, q.x, fmaf(q.y, q.y, q.z * q.z)), 1.0f));
+	p[at] = {q.x * inverse, q.y * inverse, q.z * inverse};
+}
+
+/* ret_v = v + flow div p + fidelity (f - v) and u = what the next step takes the gradient of; may be v and f. */
+static __global__ void step_primal(const tv_step s, const float *f, const float *v, const float3 *p, float theta,
+				   float *ret_v, float *ret_u)
+{
+	int x = blockIdx.x * blockDim.x + threadIdx.x, y = blockIdx.y * blockDim.y + threadIdx.y, z = blockIdx.z;
+
+	if (x >= s.nx || y >= s.ny)
+		return;
+	size_t row = (size_t)s.nx, plane = row * s.ny, at = plane * z + row * y + x;
+	float3 q = p[at];
+	float old = v[at], value = fmaf(s.fidelity, f[at] - old, old);
+
+	value = fmaf(s.flow[0], q.x - (x > 0 ? p[at - 1].x : 0.0f), value);
+	value = fmaf(s.flow[1], q.y - (y > 0 ? p[at - row].y : 0.0f), value);
+	value = fmaf(s.flow[2], q.z - (z > 0 ? p[at - plane].z : 0.0f), value);
+	ret_v[at] = value;
+	ret_u[at] = fmaf(theta, value - old, value);
+}
+
+/* Two kernels a step, each in place: half the memory, and 56 bytes a voxel. */
+static int run_proximal_in_float(struct plan *plan, float *volume, const struct cancel *cancel, struct error *err)
+{
+	size_t voxels = grid_voxels(plan->options.grid);
+	const int *size = plan->grid.size;
+	int iterations = plan->options.tv->iterations;
+	float *work = plan->scratch, *u = plan->scratch + voxels;
+	float3 *p = (float3 *)(plan->scratch + 2 * voxels);
+	dim3 threads(32, 8), blocks(divide_up(size[0], 32), divide_up(size[1], 8), size[2]);
+	cudaStream_t stream = plan->device->stream;
+	pace pace = pace_first(plan);
+
+	for (int i = 0; i < iterations; i++) {
+		tv_step s = step_at(plan, pace);
+		bool first = i == 0, last = i == iterations - 1;
+
+		pace = pace_next(plan, pace);
+		TRY(cancel_check(cancel, err));
+		step_dual<<<blocks, threads, 0, stream>>>(s, first ? volume : u, p, first);
+		LAUNCHED();
+		/* The volume is f until the last step writes over it, each voxel behind its own reading. */
+		step_primal<<<blocks, threads, 0, stream>>>(s, volume, first ? volume : work, p, (float)pace.theta,
+							    last ? volume : work, u);
+		LAUNCHED();
+	}
 	return 0;
 }
 
@@ -461,8 +548,9 @@ int cuda_tv(struct plan *plan, struct volume *volume, const struct cancel *cance
 	if (plan->options.tv == NULL)
 		return error_set(err, ERR_INTERNAL, "the plan was made without TV");
 	TRY(device_enter(plan->device, err));
+	plan_end_slices(plan);
 	if (plan->options.tv->method == TV_GRADIENT)
 		return run_gradient(plan, volume->data, cancel, err);
-	return plan->options.reference_precision ? run_proximal<float>(plan, volume->data, cancel, err)
-						 : run_proximal<__half>(plan, volume->data, cancel, err);
+	return plan->options.reference_precision ? run_proximal_in_float(plan, volume->data, cancel, err)
+						 : run_proximal(plan, volume->data, cancel, err);
 }

@@ -1657,7 +1657,8 @@ START_TEST(bytes_are_known_beforehand)
 		options.sart = NULL;
 		options.tv = NULL;
 		ok(backend->plan_bytes(NULL, &options, &plain, &err));
-		ck_assert_uint_ge(gradient.stack, rig.all_pixels * sizeof(float));
+		ck_assert_uint_ge(backend->stack_bytes(rig.geometry.columns, rig.geometry.rows, rig.geometry.count),
+				  rig.all_pixels * sizeof(float));
 		ck_assert_uint_eq(gradient.raw, rig.pixels * sizeof(float));
 		ck_assert_uint_ge(plain.volumes, volume);
 		/* iterate, its copy and one to work in; 15 % allow for padding */
@@ -1715,7 +1716,8 @@ START_TEST(what_was_said_to_be_needed_is_enough)
 		rig_close(&rig);
 		/* iterate and copy are among the volumes; a second stack, and 64 KiB for what allocations are rounded
 		 * up to */
-		machine.options.memory_limit = bytes.volumes + bytes.scratch + bytes.raw + 2 * bytes.stack + (64 << 10);
+		machine.options.memory_limit =
+		    bytes.volumes + bytes.scratch + bytes.raw + 2 * rig.all_pixels * sizeof(float) + (64 << 10);
 		rig_open(&rig, &machine);
 		rig_close(&rig);
 	}
