@@ -368,6 +368,45 @@ static void bench_geometry(const struct bench_case *c, bool untilted)
 	scene_clear(&bench.scene);
 }
 
+/* Filtering where the detector cuts off all rows on both sides (core/extend.h). */
+static void bench_cut_off(const struct bench_case *c)
+{
+	struct scene_options options = c->options;
+	struct bench bench = {.repeat = 1};
+	struct error err = {0};
+	const size_t pixels = (size_t)options.columns * (size_t)options.rows;
+	float *view = malloc(pixels * sizeof(float));
+	size_t cut[2];
+
+	options.extend = true;
+	scene_make(&bench.scene, "cut off", &options);
+	bench.views = malloc(sizeof(int) * (size_t)options.views);
+	must(backend_cuda.stack_new(device, options.columns, options.rows, options.views, &bench.projections, &err),
+	     &err, "stack");
+	make_plan(&bench, NULL, 0, NULL);
+	must(backend_cuda.stack_new(device, options.columns, options.rows, backend_cuda.plan_batch(bench.plan),
+				    &bench.filtered, &err),
+	     &err, "stack");
+	for (size_t i = 0; i < pixels; i++)
+		view[i] = 2;
+	for (int i = 0; i < options.views; i++) {
+		bench.views[i] = i;
+		must(backend_cuda.stack_upload(bench.projections, i, 1, view, &err), &err, "upload");
+	}
+	measure(&bench, c, "untilted", "filter, rows cut off", run_filter, 0);
+	must(backend_cuda.filter_extended(bench.plan, cut, &err), &err, "filter");
+	if (cut[0] != cut[1] || cut[0] % ((size_t)options.rows * (size_t)options.views) != 0) {
+		fprintf(stderr, "%zu and %zu rows were extended\n", cut[0], cut[1]);
+		exit(1);
+	}
+	backend_cuda.plan_free(bench.plan);
+	backend_cuda.stack_free(bench.filtered);
+	backend_cuda.stack_free(bench.projections);
+	free(bench.views);
+	free(view);
+	scene_clear(&bench.scene);
+}
+
 /* One step of TV: ten of them less none, so that the copies around do not count. */
 static void bench_tv(int size, const double goals[TV_METHOD_COUNT])
 {
@@ -577,6 +616,9 @@ int main(int argc, char **argv)
 			check_ball(&cases[i], false);
 			check_ball(&cases[i], true);
 		}
+		if ((cases[i].letter == 'A' || cases[i].letter == 'D') &&
+		    strstr("filter, rows cut off", what_wanted) != NULL)
+			bench_cut_off(&cases[i]);
 	}
 	if (strchr(wanted, 'T') != NULL) {
 		bench_tv(256, (const double[]){.07, .14});

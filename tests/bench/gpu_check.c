@@ -258,7 +258,9 @@ static void check_scene(const struct scene *scene, struct device *devices[2], in
 	expect(scene, "SART's residual", fabs(worst[5] / worst[4] - 1), 50 * tolerance);
 	worst[4] = difference(got[1], got[0], voxels);
 	expect(scene, "SART", worst[4], 2 * tolerance);
-	/* the same bits again */
+	/* the same bits again, whatever TV has left in the memory that stages share */
+	must(backend_cuda.volume_upload(sides[1].other, volume, &err), &err, "upload");
+	must(backend_cuda.tv(sides[1].plan, sides[1].other, NULL, &err), &err, "tv");
 	must(backend_cuda.volume_fill(sides[1].volume, 0, &err), &err, "fill");
 	for (int i = 0; i < 2; i++) {
 		struct sart_sums sums = {0};
@@ -1253,73 +1255,229 @@ static void check_large(void)
 	scene_clear(&scene);
 }
 
-/* A plan that is short of memory takes its work in parts and gives the same volume. */
-static void check_lean(bool matched)
+/*
+ * Two iterations of SIRT on a device of `limit` bytes, 0: all; what its plan takes to *ret_bytes. NULL where it has
+ * no plan that small. The caller frees it.
+ */
+static float *sart_within(size_t limit, const struct scene *scene, bool matched, bool reference,
+			  const float *projections, size_t *ret_bytes, double *ret_residual)
 {
-	const struct scene_options at = {.columns = 150,
-					 .rows = 140,
-					 .views = 120,
-					 .arc = TURN,
-					 .pixel = {1.2, 1.2},
-					 .size = {101, 99, 97},
-					 .spacing = {.8, .8, .8}};
-	const struct side empty = {0};
-	float *got[2], *stack;
-	double residual[2];
-	struct scene scene;
+	const struct geometry *geometry = &scene->geometry;
+	const struct device_options open = {.memory_limit = limit};
+	struct sart_options sart = {.relaxation = 1};
+	struct plan_options options = scene_plan(scene, &sart, 1, NULL, reference);
+	struct side side = {.backend = &backend_cuda};
+	struct sart_sums sums = {0};
+	struct defect_counts defects = {0};
+	struct device *device;
+	struct plan_bytes bytes;
 	struct error err = {0};
-	size_t voxels, pixels = (size_t)at.columns * (size_t)at.rows * (size_t)at.views;
+	float *got = NULL;
+	int *slots = all_views(geometry->count);
 
-	scene_make(&scene, matched ? "lean, matched" : "lean", &at);
-	voxels = grid_voxels(&scene.grid);
-	stack = malloc(pixels * sizeof(float));
-	fill_random(stack, pixels, 9);
-	for (int s = 0; s < 2; s++) {
-		struct sart_options sart = {.relaxation = 1};
-		struct plan_options options = scene_plan(&scene, &sart, 1, NULL, true);
-		struct sart_sums sums = {0};
-		struct device *device;
-		struct plan_bytes bytes;
-		struct side side = empty;
-		struct defect_counts defects = {0};
-		int *slots = malloc(sizeof(int) * (size_t)at.views);
-
-		options.matched = matched;
-		must(backend_cuda.plan_bytes(NULL, &options, &bytes, &err), &err, "bytes");
-		/* just too little for the plan at its ease */
-		must(backend_cuda.open(0,
-				       &(struct device_options){
-					   .memory_limit = s == 0 ? 0 : bytes.stack + bytes.volumes + bytes.scratch},
-				       &device, &err),
-		     &err, "open");
-		side.backend = &backend_cuda;
-		for (int i = 0; i < at.views; i++)
-			slots[i] = i;
+	options.matched = matched;
+	must(backend_cuda.open(0, &open, &device, &err), &err, "open");
+	must(backend_cuda.plan_bytes(device, &options, &bytes, &err), &err, "bytes");
+	*ret_bytes = backend_cuda.stack_bytes(geometry->columns, geometry->rows, geometry->count) + bytes.volumes +
+		     bytes.scratch + bytes.raw;
+	if (limit == 0 || *ret_bytes <= limit) {
 		must(backend_cuda.plan_new(device, &options, &side.plan, &err), &err, "plan");
-		must(backend_cuda.volume_new(device, &scene.grid, &side.volume, &err), &err, "volume");
-		must(backend_cuda.stack_new(device, at.columns, at.rows, at.views, &side.stack, &err), &err, "stack");
-		must(backend_cuda.linearise(side.plan, stack, at.views, slots, side.stack, &defects, &err), &err,
-		     "linearise");
+		must(backend_cuda.volume_new(device, &scene->grid, &side.volume, &err), &err, "volume");
+		must(backend_cuda.stack_new(device, geometry->columns, geometry->rows, geometry->count, &side.stack,
+					    &err),
+		     &err, "stack");
+		must(backend_cuda.linearise(side.plan, projections, geometry->count, slots, side.stack, &defects, &err),
+		     &err, "linearise");
 		for (int i = 0; i < 2; i++)
 			must(backend_cuda.sart_iterate(side.plan, side.stack, side.volume, NULL, &sums, &err), &err,
 			     "sart");
-		got[s] = malloc(voxels * sizeof(float));
-		read_volume(&side, &scene, got[s]);
-		residual[s] = sums.residual2;
-		printf("%-34s %s\n", scene.name, backend_cuda.plan_summary(side.plan));
+		got = malloc(grid_voxels(&scene->grid) * sizeof(float));
+		read_volume(&side, scene, got);
+		*ret_residual = sums.residual2;
+		printf("%-34s %.1f MB: %s\n", scene->name, (double)*ret_bytes / 1e6,
+		       backend_cuda.plan_summary(side.plan));
 		backend_cuda.stack_free(side.stack);
 		backend_cuda.volume_free(side.volume);
 		backend_cuda.plan_free(side.plan);
-		backend_cuda.close(device);
-		subsets_clear(&sart.subsets);
-		free(slots);
 	}
-	expect(&scene, "SART in parts", difference(got[1], got[0], voxels), 1e-5);
-	expect(&scene, "its residual", apart(residual[1], residual[0]), 1e-5);
-	free(got[0]);
-	free(got[1]);
+	backend_cuda.close(device);
+	subsets_clear(&sart.subsets);
+	free(slots);
+	return got;
+}
+
+/* On ever smaller devices a plan takes its work in ever smaller parts, and gives the same volume. */
+static void check_thrift(bool matched, bool reference, int plans)
+{
+	const struct scene_options at = {.columns = 300,
+					 .rows = 280,
+					 .views = 120,
+					 .arc = TURN,
+					 .pixel = {.6, .6},
+					 .size = {161, 157, 149},
+					 .spacing = {.55, .55, .55}};
+	float *first, *got, *stack;
+	double residual[2] = {0};
+	struct scene scene;
+	size_t voxels, pixels = (size_t)at.columns * (size_t)at.rows * (size_t)at.views, bytes;
+	int found = 1;
+
+	scene_make(&scene, matched ? "thrift, matched" : "thrift", &at);
+	voxels = grid_voxels(&scene.grid);
+	stack = malloc(pixels * sizeof(float));
+	fill_random(stack, pixels, 9);
+	first = sart_within(0, &scene, matched, reference, stack, &bytes, &residual[0]);
+	while ((got = sart_within(bytes - 1, &scene, matched, reference, stack, &bytes, &residual[1])) != NULL) {
+		expect(&scene, "SART in parts", difference(got, first, voxels), reference ? 1e-5 : STANDARD);
+		expect(&scene, "its residual", apart(residual[1], residual[0]), reference ? 1e-5 : STANDARD);
+		free(got);
+		found++;
+	}
+	expect(&scene, "plans that are missing", plans - found, 0);
+	free(first);
 	free(stack);
 	scene_clear(&scene);
+}
+
+struct bound_recipe {
+	const char *name;
+	int subsets; /* 0: no SART; or SUBSETS_VIEWS */
+	bool fdk, tv, metal, matched, reference;
+	enum tv_method method;
+};
+static const struct bound_recipe bound_recipes[] = {
+    {"FDK", .fdk = true},
+    {"FDK, metal", .fdk = true, .metal = true},
+    {"by view", SUBSETS_VIEWS, .fdk = true},
+    {"10 subsets", 10, .fdk = true},
+    {"10 subsets, reference", 10, .fdk = true, .reference = true},
+    {"SIRT", 1, .fdk = true},
+    {"SIRT alone", 1},
+    {"SIRT, reference", 1, .fdk = true, .reference = true},
+    {"SIRT, matched", 1, .fdk = true, .matched = true},
+    {"SIRT, metal", 1, .fdk = true, .metal = true},
+    {"SIRT, TV gradient", 1, .fdk = true, .tv = true, .method = TV_GRADIENT},
+    {"SIRT, TV proximal", 1, .fdk = true, .tv = true, .method = TV_PROXIMAL},
+    {"SIRT, TV proximal, reference", 1, .fdk = true, .tv = true, .reference = true, .method = TV_PROXIMAL},
+};
+enum { BOUND_RECIPES = sizeof(bound_recipes) / sizeof(bound_recipes[0]) };
+
+static void bound_recipe_make(struct recipe *ret, const struct bound_recipe *from, const struct grid *grid)
+{
+	recipe_defaults(ret);
+	ret->has_grid = ret->has_origin = true;
+	ret->grid = *grid;
+	ret->fdk.on = from->fdk;
+	ret->sart.on = from->subsets != 0;
+	ret->sart.iterations = 3;
+	ret->sart.subsets = from->subsets;
+	ret->tv.on = from->tv;
+	ret->tv.options.method = from->method;
+	ret->metal.on = from->metal;
+	ret->projector = from->matched ? PROJECTOR_MATCHED : PROJECTOR_INTERPOLATING;
+	ret->reference_precision = from->reference;
+}
+
+/*
+ * What a job says that it takes: at most seven volumes, ten with the proximal method, and three
+ * stacks, whatever is asked for. The smallest are let have 2 MB more, for tables.
+ */
+static void check_bound(void)
+{
+	static const struct kind jobs[] = {
+	    {"A", {559, 559, 100, TURN, {.529, .529}, .size = {256, 256, 256}, .spacing = {.3725, .3725, .3725}}, 0},
+	    {"B", {339, 339, 100, TURN, {.713, .713}, .size = {256, 256, 33}, .spacing = {.3725, .3725, .3725}}, 0},
+	    {"C", {43, 43, 26, TURN, {6.88, 6.88}, .size = {32, 32, 32}, .spacing = {2.98, 2.98, 2.98}}, 1},
+	    {"D", {1240, 960, 496, 3.49, {.308, .308}, .size = {512, 512, 512}, .spacing = {.1862, .1862, .1862}}, 0},
+	    {"E", {1024, 1024, 720, TURN, {.289, .289}, .size = {1024, 1024, 1024}, .spacing = {.093, .093, .093}}, 0},
+	    {"half of A",
+	     {339, 339, 100, TURN, {.872, .872}, .size = {128, 128, 128}, .spacing = {.745, .745, .745}},
+	     0},
+	    {"a quarter", {128, 128, 60, TURN, {2.31, 2.31}, .size = {64, 64, 64}, .spacing = {1.49, 1.49, 1.49}}, 1},
+	    {"many views", {976, 976, 248, 3.49, {.304, .304}, .size = {256, 256, 256}, .spacing = {.5, .5, .5}}, 0},
+	    {"small grid", {1024, 1024, 400, TURN, {.289, .289}, .size = {64, 64, 64}, .spacing = {.5, .5, .5}}, 0},
+	    {"large grid",
+	     {256, 256, 60, TURN, {1.16, 1.16}, .size = {512, 512, 512}, .spacing = {.186, .186, .186}},
+	     0},
+	    {"displaced",
+	     {512, 400, 360, TURN, {.6, .6}, .offset = {100, 0}, .size = {400, 400, 300}, .spacing = {.5, .5, .5}},
+	     0},
+	};
+	static const enum bend bends[] = {BEND_NONE, BEND_TURNED, BEND_TILTED};
+
+	for (size_t k = 0; k < sizeof(jobs) / sizeof(jobs[0]); k++) {
+		const struct scene_options *job = &jobs[k].options;
+		const double voxels = (double)job->size[0] * job->size[1] * job->size[2];
+		const double stack = 4. * job->columns * job->rows * job->views;
+		const char *worst_name = "";
+		double worst = 0;
+
+		for (size_t b = 0; b < sizeof(bends) / sizeof(bends[0]); b++) {
+			struct scene_options options = *job;
+			struct scene scene;
+
+			options.bend = bends[b];
+			scene_make(&scene, jobs[k].name, &options);
+			for (int i = 0; i < BOUND_RECIPES; i++) {
+				const struct bound_recipe *of = &bound_recipes[i];
+				const double volumes = of->tv && of->method == TV_PROXIMAL ? 10 : 7;
+				const double bound = volumes * 4 * voxels + 3 * stack;
+				struct recon_memory memory;
+				struct recipe recipe;
+				struct error err = {0};
+
+				bound_recipe_make(&recipe, of, &scene.grid);
+				must(recon_memory(&backend_cuda, NULL, &scene.geometry, &recipe, &memory, &err), &err,
+				     of->name);
+				expect(&scene, of->name, (double)memory.total, bound + (jobs[k].subsets > 0 ? 2e6 : 0));
+				if ((double)memory.total / bound > worst) {
+					worst = (double)memory.total / bound;
+					worst_name = of->name;
+				}
+				recipe_clear(&recipe);
+			}
+			scene_clear(&scene);
+		}
+		printf("%-34s takes at most %.3f of seven (ten) volumes and three stacks: %s\n", jobs[k].name, worst,
+		       worst_name);
+	}
+}
+
+/* On a device with just what a job says that it takes, it runs as a whole and to the same bits. */
+static void check_said(struct device *device)
+{
+	for (int i = 0; i < BOUND_RECIPES; i++) {
+		struct device_options limit = {0};
+		struct recon_memory memory;
+		struct recipe recipe;
+		struct scene scene;
+		struct device *small;
+		struct error err = {0};
+		float *projections, *got[2];
+
+		head_make(&scene, bound_recipes[i].name, i % 2 ? BEND_TILTED : BEND_NONE);
+		/* Inside of the head, so that its surroundings are asked for. */
+		for (int k = 0; k < 3; k++) {
+			scene.grid.origin[k] += scene.grid.spacing[k] * (scene.grid.size[k] - 48) / 2;
+			scene.grid.size[k] = 48;
+		}
+		projections = project_head(&scene);
+		bound_recipe_make(&recipe, &bound_recipes[i], &scene.grid);
+		must(recon_memory(&backend_cuda, NULL, &scene.geometry, &recipe, &memory, &err), &err, "memory");
+		limit.memory_limit = memory.total;
+		must(backend_cuda.open(0, &limit, &small, &err), &err, "open");
+		got[0] = reconstruct(&backend_cuda, device, &scene, &recipe, projections);
+		got[1] = reconstruct(&backend_cuda, small, &scene, &recipe, projections);
+		expect(&scene, "the same bits", memcmp(got[0], got[1], grid_voxels(&scene.grid) * sizeof(float)) != 0,
+		       0);
+		backend_cuda.close(small);
+		free(got[0]);
+		free(got[1]);
+		free(projections);
+		recipe_clear(&recipe);
+		scene_clear(&scene);
+	}
+	printf("%-34s %d recipes run in what they say that they take\n", "memory", BOUND_RECIPES);
 }
 
 /* A plan that does not fit is refused with the numbers, and the device goes on. */
@@ -1461,8 +1619,11 @@ int main(int argc, char **argv)
 	check_metal(devices, BEND_NONE, true, 1e-4);
 	check_metal(devices, BEND_TURNED, false, 5e-3);
 	check_metal(devices, BEND_STEEP, true, 1e-4);
-	check_lean(false);
-	check_lean(true);
+	check_thrift(false, false, 6);
+	check_thrift(false, true, 5);
+	check_thrift(true, true, 3);
+	check_bound();
+	check_said(devices[1]);
 	check_parts(false, true, false);
 	check_parts(false, false, false);
 	check_parts(true, false, false);
