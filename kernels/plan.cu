@@ -427,7 +427,9 @@ static void plan_describe(struct plan *plan, const struct plan_options *options,
 	if (plan->bytes.raw < RAW_BYTES)
 		plan->raw_views = (int)(RAW_BYTES / plan->bytes.raw);
 	plan->raw_views =
-	    options->no_samples ? 0 : at_most(plan->raw_views, divide_up(resident_views(options), RAW_PART));
+	    at_most(plan->raw_views, at_most(divide_up(geometry->count, RAW_PART), resident_views(options)));
+	if (options->no_samples)
+		plan->raw_views = 0;
 }
 
 static bool needs_work(const struct plan *plan)

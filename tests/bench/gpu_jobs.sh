@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Whole jobs through HTTP on the CUDA backend: seconds from the last projection's acknowledgement to the end of the job and
-# to the end of the last volume's download. The job is posted before the projections, which come as fast as they can.
+# of the last volume's download behind it; and, for a client that listens to the events, to the end of that download as soon
+# as the volume is kept. The job is posted before the projections, which come as fast as they can.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 BUILD=$(realpath "${BUILD:-build}")
@@ -29,24 +30,42 @@ simulate() { # NAME ...: a scan directory
 	[ -d "$SCRATCH/scan-$name" ] || cbct simulate -o "$SCRATCH/scan-$name" --phantom head --scale 45 --density 0.0192 "$@" >/dev/null 2>&1
 }
 
-measure() { # WHAT SCAN JOB: the median of REPEATS
-	local what=$1 directory=$SCRATCH/scan-$2 scan job sent ended got rows=()
-	for ((i = 0; i < ${REPEATS:-3}; i++)); do
+fetch() { # JOB: its last volume, and when that was there
+	curl -sS "$url/v1/jobs/$1/volumes/final?format=raw" -o /dev/null
+	now
+}
+
+median() { sort -n | awk '{ line[NR] = $0 } END { print line[int((NR + 1) / 2)] }'; }
+
+measure() { # WHAT SCAN JOB: medians of REPEATS
+	local what=$1 directory=$SCRATCH/scan-$2 scan job sent ended listens line
+	rm -f "$work"/rows-*
+	for ((i = 0; i < 2 * ${REPEATS:-3}; i++)); do
+		listens=$((i % 2))
 		scan=$(curl "${json[@]}" --data-binary @"$directory/scan.json" "$url/v1/scans" | jq -r .id)
 		job=$(curl "${json[@]}" --data-binary "$(jq -c --arg scan "$scan" '. + {scan: $scan}' <<<"$3")" "$url/v1/jobs" | jq -r .id)
+		if ((listens)); then
+			(
+				grep -q -m 1 '/volumes/final"' < <(curl -sN "$url/v1/jobs/$job/events")
+				fetch "$job" >"$work/fetched"
+			) &
+		fi
 		cbct upload "$directory" --scan "$scan" --quiet >/dev/null
 		sent=$(now)
+		if ((listens)); then
+			wait $!
+			echo "$(seconds "$sent" "$(cat "$work/fetched")")" >>"$work/rows-1"
+		fi
 		curl -sS "$url/v1/jobs/$job?wait=100" -o "$work/job.json"
 		ended=$(now)
-		curl -sS "$url/v1/jobs/$job/volumes/final?format=raw" -o /dev/null
-		got=$(now)
-		rows+=("$(seconds "$sent" "$ended") $(seconds "$sent" "$got") $(jq -c '[.state, .timings, .plan]' "$work/job.json")")
+		((listens)) ||
+			echo "$(seconds "$sent" "$ended") $(seconds "$sent" "$(fetch "$job")") $(jq -c '[.state, .timings, .plan]' "$work/job.json")" >>"$work/rows-0"
 		curl -sS -X DELETE "$url/v1/jobs/$job" -o /dev/null
 		curl -sS -X DELETE "$url/v1/scans/$scan" -o /dev/null
 	done
-	printf '%s\n' "${rows[@]}" | sort -n | awk -v what="$what" '
-		{ line[NR] = $0 }
-		END { split(line[int((NR + 1) / 2)], f, " "); printf "%-34s ended %.3f s, downloaded %.3f s  %s\n", what, f[1], f[2], f[3] }'
+	read -r ended line < <(median <"$work/rows-0")
+	printf '%-34s ended %s s, downloaded %s s; as soon as kept %s s  %s\n' "$what" "$ended" "${line%% *}" \
+		"$(median <"$work/rows-1")" "${line#* }"
 }
 
 simulate A --views 100 --columns 559 --rows 559 --pixel 0.529
