@@ -291,9 +291,8 @@ struct plan {
 	 */
 	float *scratch;
 	size_t scratch_bytes, slices_bytes;
-	struct plan *lender; /* whose scratch it is, NULL: its own */
-	const struct plan
-	    *slices_of; /* of its own scratch: the plan whose slices are there, and nothing else was since */
+	struct plan *lender;           /* whose scratch it is, NULL: its own */
+	const struct plan *slices_of;  /* of its own scratch: whose slices alone are there */
 	struct layered projections;    /* a batch of projections, with textures */
 	struct layered filtered_array; /* the same of padded rows, where they are longer */
 	void *pairs;                   /* a batch of projections as pairs of float or half, for the rows */

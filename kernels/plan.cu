@@ -287,9 +287,9 @@ static int lean_or(enum thrift thrift, int most)
 /* Of a subset, whose corrections are made in one go. */
 static int corrected_at_once(enum thrift thrift, int subset)
 {
-	int parts = thrift < THRIFT_2_PARTS ? 1 : thrift - THRIFT_2_PARTS + 2;
+	bool in_parts = thrift >= THRIFT_2_PARTS && thrift < THRIFT_LEAN;
 
-	return lean_or(thrift, divide_up(subset, parts));
+	return lean_or(thrift, in_parts ? divide_up(subset, thrift - THRIFT_2_PARTS + 2) : subset);
 }
 
 static struct plan_shape shape_of(const struct plan_options *options, enum thrift thrift)
@@ -393,6 +393,7 @@ static void plan_describe(struct plan *plan, const struct plan_options *options,
 	const struct geometry *geometry = options->geometry;
 	const struct grid *grid = options->grid;
 	const int *size = grid->size;
+	int part;
 
 	plan->options = *options;
 	plan->shape = shape_of(options, thrift);
@@ -426,10 +427,8 @@ static void plan_describe(struct plan *plan, const struct plan_options *options,
 	    (size_t)geometry->columns * (size_t)geometry->rows * (options->linearise.sample == SAMPLE_UINT16 ? 2 : 4);
 	if (plan->bytes.raw < RAW_BYTES)
 		plan->raw_views = (int)(RAW_BYTES / plan->bytes.raw);
-	plan->raw_views =
-	    at_most(plan->raw_views, at_most(divide_up(geometry->count, RAW_PART), resident_views(options)));
-	if (options->no_samples)
-		plan->raw_views = 0;
+	part = at_most(divide_up(geometry->count, RAW_PART), resident_views(options));
+	plan->raw_views = options->no_samples ? 0 : at_most(plan->raw_views, part);
 }
 
 static bool needs_work(const struct plan *plan)

@@ -1256,16 +1256,16 @@ static void check_large(void)
 }
 
 /*
- * Two iterations of SIRT on a device of `limit` bytes, 0: all; what its plan takes to *ret_bytes. NULL where it has
+ * Two iterations of SART on a device of `limit` bytes, 0: all; what its plan takes to *ret_bytes. NULL where it has
  * no plan that small. The caller frees it.
  */
-static float *sart_within(size_t limit, const struct scene *scene, bool matched, bool reference,
+static float *sart_within(size_t limit, const struct scene *scene, int subsets, bool matched, bool reference,
 			  const float *projections, size_t *ret_bytes, double *ret_residual)
 {
 	const struct geometry *geometry = &scene->geometry;
 	const struct device_options open = {.memory_limit = limit};
 	struct sart_options sart = {.relaxation = 1};
-	struct plan_options options = scene_plan(scene, &sart, 1, NULL, reference);
+	struct plan_options options = scene_plan(scene, &sart, subsets, NULL, reference);
 	struct side side = {.backend = &backend_cuda};
 	struct sart_sums sums = {0};
 	struct defect_counts defects = {0};
@@ -1307,27 +1307,36 @@ static float *sart_within(size_t limit, const struct scene *scene, bool matched,
 }
 
 /* On ever smaller devices a plan takes its work in ever smaller parts, and gives the same volume. */
-static void check_thrift(bool matched, bool reference, int plans)
+static void check_thrift(int subsets, bool matched, bool reference, int plans)
 {
-	const struct scene_options at = {.columns = 300,
-					 .rows = 280,
-					 .views = 120,
-					 .arc = TURN,
-					 .pixel = {.6, .6},
-					 .size = {161, 157, 149},
-					 .spacing = {.55, .55, .55}};
+	const struct scene_options large = {.columns = 300,
+					    .rows = 280,
+					    .views = 120,
+					    .arc = TURN,
+					    .pixel = {.6, .6},
+					    .size = {161, 157, 149},
+					    .spacing = {.55, .55, .55}};
+	const struct scene_options small = {.columns = 97,
+					    .rows = 83,
+					    .views = 60,
+					    .arc = TURN,
+					    .pixel = {2, 2},
+					    .size = {41, 39, 37},
+					    .spacing = {1, 1, 1}};
+	const struct scene_options at = subsets > 1 ? small : large;
 	float *first, *got, *stack;
 	double residual[2] = {0};
 	struct scene scene;
 	size_t voxels, pixels = (size_t)at.columns * (size_t)at.rows * (size_t)at.views, bytes;
 	int found = 1;
 
-	scene_make(&scene, matched ? "thrift, matched" : "thrift", &at);
+	scene_make(&scene, matched ? "thrift, matched" : subsets > 1 ? "thrift, subsets" : "thrift", &at);
 	voxels = grid_voxels(&scene.grid);
 	stack = malloc(pixels * sizeof(float));
 	fill_random(stack, pixels, 9);
-	first = sart_within(0, &scene, matched, reference, stack, &bytes, &residual[0]);
-	while ((got = sart_within(bytes - 1, &scene, matched, reference, stack, &bytes, &residual[1])) != NULL) {
+	first = sart_within(0, &scene, subsets, matched, reference, stack, &bytes, &residual[0]);
+	while ((got = sart_within(bytes - 1, &scene, subsets, matched, reference, stack, &bytes, &residual[1])) !=
+	       NULL) {
 		expect(&scene, "SART in parts", difference(got, first, voxels), reference ? 1e-5 : STANDARD);
 		expect(&scene, "its residual", apart(residual[1], residual[0]), reference ? 1e-5 : STANDARD);
 		free(got);
@@ -1619,9 +1628,10 @@ int main(int argc, char **argv)
 	check_metal(devices, BEND_NONE, true, 1e-4);
 	check_metal(devices, BEND_TURNED, false, 5e-3);
 	check_metal(devices, BEND_STEEP, true, 1e-4);
-	check_thrift(false, false, 6);
-	check_thrift(false, true, 5);
-	check_thrift(true, true, 3);
+	check_thrift(1, false, false, 6);
+	check_thrift(1, false, true, 5);
+	check_thrift(1, true, true, 3);
+	check_thrift(4, false, false, 4);
 	check_bound();
 	check_said(devices[1]);
 	check_parts(false, true, false);
