@@ -125,22 +125,86 @@ static int sart_options_make(struct sart_options *ret_sart, const struct recipe 
 	return code;
 }
 
+/* One more volume to work in, as this backend holds one. */
+static int volume_bytes(const struct backend *backend, struct device *device, const struct plan_options *options,
+			size_t *ret_bytes, struct error *err)
+{
+	struct plan_options bare = *options;
+	struct plan_bytes bytes;
+	int code;
+
+	bare.sart = NULL;
+	bare.tv = NULL;
+	code = backend->plan_bytes(device, &bare, &bytes, err);
+	if (code == 0)
+		*ret_bytes = bytes.volumes;
+	return code;
+}
+
 /*
- * What the plan takes, and what the job does beside it: FDK's filtered batch, its
- * surroundings, and for metal a batch that is projected and a volume to work in, which is
- * SART's copy of the iterate where there is one. The plan is told of these.
+ * What the job takes beside its plan, whole on the device: FDK's filtered batch, its surroundings, and for metal a
+ * batch that is projected and a volume to work in, which is SART's copy of the iterate where there is one. The
+ * plan is told of these.
  */
+static int memory_whole(const struct backend *backend, struct device *device, struct plan_options *options,
+			bool has_metal, const struct surroundings_bytes *around, struct recon_memory *ret_memory,
+			struct error *err)
+{
+	const struct geometry *geometry = options->geometry;
+	const int columns = geometry->columns, rows = geometry->rows, *pad = options->pad;
+	size_t filtered = 0, projected = 0, work = 0;
+	struct plan_bytes bytes;
+	int code = 0;
+
+	if (options->column_weights != NULL)
+		filtered = backend->stack_bytes(pad[0] + columns + pad[1], rows, fdk_batch_most(geometry->count));
+	if (has_metal)
+		projected = backend->stack_bytes(columns, rows, metal_slots(geometry));
+	if (has_metal && options->sart == NULL)
+		code = volume_bytes(backend, device, options, &work, err);
+	options->beside = filtered + around->device + projected + work;
+	options->lends = around->borrowed;
+	if (code == 0)
+		code = backend->plan_bytes(device, options, &bytes, err);
+	if (code < 0)
+		return code;
+	*ret_memory = (struct recon_memory){
+	    .projections =
+		backend->stack_bytes(columns, rows, options->resident > 0 ? options->resident : geometry->count),
+	    .volumes = bytes.volumes + work,
+	    .scratch = bytes.scratch + bytes.raw + filtered + around->device + projected,
+	};
+	return 0;
+}
+
+/* The same in parts: the device holds slabs of one volume at a time, the host all the rest. */
+static struct recon_memory memory_in_parts(const struct plan_options *options, const struct plan_bytes *bytes,
+					   bool has_metal, const struct surroundings_bytes *around)
+{
+	const struct geometry *geometry = options->geometry;
+	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
+	struct recon_memory memory = {
+	    .volumes = bytes->volumes,
+	    .scratch = bytes->scratch + bytes->raw,
+	    .host = bytes->host + around->host,
+	};
+
+	if (around->device > memory.volumes + memory.scratch)
+		memory.scratch = around->device - memory.volumes;
+	if (has_metal)
+		memory.host += sizeof(float) * ((size_t)metal_slots(geometry) * pixels +
+						(options->sart == NULL ? grid_voxels(options->grid) : 0));
+	return memory;
+}
+
 static int memory_needed(const struct backend *backend, struct device *device, struct plan_options *options,
 			 const struct recipe *recipe, const struct orbit *orbit, struct recon_memory *ret_memory,
 			 struct error *err)
 {
-	const struct surroundings_options around = {
+	const struct surroundings_options surroundings = {
 	    .backend = backend, .device = device, .geometry = options->geometry, .orbit = orbit, .grid = &recipe->grid};
-	const struct geometry *geometry = options->geometry;
-	const int *pad = options->pad, batch = fdk_batch_most(geometry->count);
-	size_t filtered = 0, projected = 0, work = 0;
-	struct surroundings_bytes needs = {0};
-	struct recon_memory memory = {0};
+	struct surroundings_bytes around = {0};
+	struct recon_memory memory;
 	struct plan_bytes bytes;
 	struct device_info info;
 	int code;
@@ -148,34 +212,13 @@ static int memory_needed(const struct backend *backend, struct device *device, s
 	options->beside = options->lends = 0;
 	code = backend->plan_bytes(device, options, &bytes, err);
 	if (code == 0 && leaves_out_the_exterior(recipe))
-		code = surroundings_bytes(&around, &needs, err);
+		code = surroundings_bytes(&surroundings, &around, err);
+	if (code == 0 && bytes.host == 0)
+		code = memory_whole(backend, device, options, recipe->metal.on, &around, &memory, err);
 	if (code < 0)
 		return code;
-	if (options->column_weights != NULL)
-		filtered = backend->stack_bytes(pad[0] + geometry->columns + pad[1], geometry->rows, batch);
-	if (recipe->metal.on) {
-		projected = backend->stack_bytes(geometry->columns, geometry->rows, metal_slots(geometry));
-		work = options->sart == NULL ? bytes.volumes : 0;
-	}
-	if (bytes.host == 0) {
-		options->beside = filtered + needs.device + projected + work;
-		options->lends = needs.borrowed;
-		code = backend->plan_bytes(device, options, &bytes, err);
-		if (code < 0)
-			return code;
-	}
-	memory.projections = backend->stack_bytes(geometry->columns, geometry->rows,
-						  options->resident > 0 ? options->resident : geometry->count);
-	memory.volumes = bytes.volumes + work;
-	memory.scratch = bytes.scratch + bytes.raw + filtered + projected;
-	if (bytes.host == 0) {
-		memory.scratch += needs.device;
-	} else {
-		/* In parts the device holds slabs of one volume at a time. */
-		if (needs.device > memory.volumes + memory.scratch)
-			memory.scratch = needs.device - memory.volumes;
-		memory.host = bytes.host + needs.host + projected + work;
-	}
+	if (bytes.host > 0)
+		memory = memory_in_parts(options, &bytes, recipe->metal.on, &around);
 	memory.total = memory.projections + memory.volumes + memory.scratch;
 	if (device != NULL) {
 		backend->describe(device, &info);

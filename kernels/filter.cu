@@ -30,10 +30,10 @@
 #include "kernels/fft.cuh"
 #include "kernels/internal.cuh"
 
-static const size_t FFT_BYTES = (size_t)16
-				<< 20; /* of the rows that cuFFT takes at once: the second cache holds them */
-enum { FFT_ROWS = 8 };                 /* that it has room for at least */
-enum { FFT_ALIGNED = 256 };            /* bytes: where its workspace begins */
+/* Of the rows that cuFFT takes at once: the second cache holds them. */
+static const size_t FFT_BYTES = (size_t)16 << 20;
+/* Rows that it has room for at least; bytes that its workspace is aligned to. */
+enum { FFT_ROWS = 8, FFT_ALIGNED = 256 };
 
 /* cuFFT's part: transforms of one length, so many rows at once, in the plan's scratch with the workspace behind. */
 struct fft {

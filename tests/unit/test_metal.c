@@ -282,27 +282,32 @@ START_TEST(cancel_ends_the_stage_wherever_it_is)
 }
 END_TEST
 
-/* _i: FDK alone, SART after it. */
+/* _i: FDK alone, SART after it, TV after it. */
 START_TEST(memory_is_known_beforehand)
 {
 	struct recipe without = recipe_make(false), with = recipe_make(true);
 	const struct recon_hooks hooks = {0};
 	const struct linearise linearise = {0};
 	struct device_options options = {.threads = 1};
-	struct recon_memory plain, memory;
+	struct recon_memory alone, plain, memory;
 	struct device *device;
 	struct recon *recon = NULL;
 	struct scene scene;
 	struct error err;
 
 	scene_make(&scene, true);
+	ck_assert_int_eq(recon_memory(&backend_cpu, NULL, &scene.geometry, &without, &alone, &err), 0);
 	without.sart.on = with.sart.on = _i == 1;
+	without.tv.on = with.tv.on = _i == 2;
+	without.tv.after_fdk = with.tv.after_fdk = true;
 	ck_assert_int_eq(recon_memory(&backend_cpu, NULL, &scene.geometry, &without, &plain, &err), 0);
 	ck_assert_int_eq(backend_cpu.open(0, &options, &device, &err), 0);
 	ck_assert_int_eq(recon_memory(&backend_cpu, device, &scene.geometry, &with, &memory, &err), 0);
 	backend_cpu.close(device);
 	ck_assert_uint_ge(memory.projections, sizeof(float) * COLUMNS * ROWS * VIEWS);
 	ck_assert_uint_gt(memory.total, plain.total);
+	/* a volume to work in, which SART's copy of the iterate is */
+	ck_assert_uint_eq(memory.volumes, plain.volumes + (_i == 1 ? 0 : alone.volumes));
 	options.memory_limit = memory.total + (64 << 10); /* for what allocations are rounded up to */
 	ck_assert_int_eq(backend_cpu.open(0, &options, &device, &err), 0);
 	ck_assert_msg(recon_open(&backend_cpu, device, &scene.geometry, &linearise, &with, &hooks, &recon, &err) == 0,
@@ -355,7 +360,7 @@ Suite *metal_suite(void)
 	tcase_add_loop_test(stage, without_metal_nothing_changes, 0, 2);
 	tcase_add_test(stage, a_run_with_metal_goes_on_with_the_same_bits);
 	tcase_add_test(stage, cancel_ends_the_stage_wherever_it_is);
-	tcase_add_loop_test(stage, memory_is_known_beforehand, 0, 2);
+	tcase_add_loop_test(stage, memory_is_known_beforehand, 0, 3);
 	tcase_add_test(rows, a_row_is_filled_with_lines);
 	suite_add_tcase(suite, stage);
 	suite_add_tcase(suite, rows);

@@ -250,6 +250,34 @@ START_TEST(any_limit_gives_the_same_volume)
 }
 END_TEST
 
+/* In parts metal's volume to work in and its batch lie on the host. */
+START_TEST(what_metal_takes_of_the_host_is_said)
+{
+	struct grid grid = grid_of(53, 47, 61, 1, 1.1, .9);
+	const struct device_options options = {.threads = 2, .memory_limit = 1 << 20};
+	const size_t volume = grid_voxels(&grid) * sizeof(float);
+	struct backend backend = backend_cpu;
+	struct recipe recipe = recipe_on(&grid);
+	struct recon_memory memory[2];
+	struct device *device;
+	struct scene scene;
+
+	backend.own_memory = true;
+	make_scene(&scene, &full);
+	recipe.fdk.on = true;
+	for (int i = 0; i < 2; i++) {
+		recipe.metal.on = i == 1;
+		ok(backend.open(0, &options, &device, &err));
+		ok(recon_memory(&backend, device, &scene.geometry, &recipe, &memory[i], &err));
+		backend.close(device);
+		ck_assert_uint_le(memory[i].total, memory[i].available);
+		ck_assert_uint_gt(memory[i].host, volume);
+	}
+	ck_assert_uint_gt(memory[1].host, memory[0].host + volume);
+	scene_clear(&scene);
+}
+END_TEST
+
 START_TEST(defects_are_counted_once)
 {
 	struct grid grid = grid_of(53, 47, 61, 1, 1.1, .9);
@@ -287,6 +315,7 @@ Suite *parts_suite(void)
 	tcase_set_timeout(tests, 300);
 	tcase_add_loop_test(tests, parts_give_what_the_whole_gives, 0, (int)(sizeof(cases) / sizeof(cases[0])));
 	tcase_add_test(tests, any_limit_gives_the_same_volume);
+	tcase_add_test(tests, what_metal_takes_of_the_host_is_said);
 	tcase_add_test(tests, defects_are_counted_once);
 	suite_add_tcase(suite, tests);
 	return suite;
