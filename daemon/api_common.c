@@ -66,6 +66,7 @@ static int reply_not_modified(struct request *request, const struct entity *enti
 		return err->code;
 	request_reply_header(request, "ETag", "%s", entity->etag);
 	request_reply_header(request, "Vary", "Accept-Encoding");
+	request_reply_header(request, "Cache-Control", "private, no-cache");
 	return 0;
 }
 

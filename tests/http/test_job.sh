@@ -83,6 +83,7 @@ test_volumes_come_in_every_format() {
 	[[ $etag == '"'*'"' ]] || fail "a strong ETag, got $etag"
 	req GET "/v1/jobs/$job/volumes/final" -H "If-None-Match: $etag"
 	expect_status 304
+	[ "$(header cache-control)" = 'private, no-cache' ] || fail "the Cache-Control of a 200, got $(header cache-control)"
 	req GET "/v1/jobs/$job/volumes/final" -H 'If-None-Match: "other"'
 	expect_status 200
 	req HEAD "/v1/jobs/$job/volumes/final"
