@@ -293,6 +293,18 @@ static void end_job(struct supervise *supervise, struct worker *worker, struct e
 	finish(supervise, worker);
 }
 
+/* An image came since it began, or its scan was closed: whoever was told that it is stored may rely on it. */
+static bool is_void(const struct worker *worker)
+{
+	struct job_facts facts;
+	struct scan_facts scan;
+	struct error err;
+
+	job_facts(worker->job, &facts);
+	return store_scan_look(jobs_store(job_jobs(worker->job)), facts.scan, &scan, &err) == 0 &&
+	       scan.basis != worker->basis;
+}
+
 /* The worker is lost, and its job with it unless it may try again. */
 static void lose_job(struct supervise *supervise, struct worker *worker, int error_code, const char *how)
 {
@@ -305,6 +317,9 @@ static void lose_job(struct supervise *supervise, struct worker *worker, int err
 	} else if (worker->failure_code != 0) {
 		end_job(supervise, worker, (struct ending){.to = JOB_FAILED, .error_code = worker->failure_code},
 			worker->failure_text);
+	} else if (is_void(worker)) {
+		/* Told to leave it, it took too long: that is no fault of the job's. */
+		end_job(supervise, worker, (struct ending){.to = back_to(worker)}, how);
 	} else if (record.crashes + 1 >= CRASHES_MAX) {
 		snprintf(text, sizeof(text), "the worker died with it %d times, last: %.250s", record.crashes + 1, how);
 		end_job(supervise, worker, (struct ending){.to = JOB_FAILED, .error_code = error_code, .crashed = true},
@@ -317,18 +332,6 @@ static void lose_job(struct supervise *supervise, struct worker *worker, int err
 					.crashed = true},
 			how);
 	}
-}
-
-/* An image came since it began, or its scan was closed: whoever was told that it is stored may rely on it. */
-static bool is_void(const struct worker *worker)
-{
-	struct job_facts facts;
-	struct scan_facts scan;
-	struct error err;
-
-	job_facts(worker->job, &facts);
-	return store_scan_look(jobs_store(job_jobs(worker->job)), facts.scan, &scan, &err) == 0 &&
-	       scan.basis != worker->basis;
 }
 
 /* The worker said how its job ended. */
