@@ -391,7 +391,7 @@ test_an_image_that_comes_while_the_job_runs() {
 	expect_json '.state == "running" and .attempts == 1 and [.warnings[].code] == ["no_dark"]'
 	req PUT "/v1/scans/$scan/dark" -T "$raw_dir/dark.f32"
 	expect_status 201
-	until req GET "/v1/jobs/$job" && [ "$(json '.attempts')" = 2 ] && [ "$(json '.volumes')" = 2 ]; do
+	until req GET "/v1/jobs/$job" && [ "$(json '.attempts')" = 2 ] && [ "$(json '.state')" = running ] && [ "$(json '.volumes')" = 2 ]; do
 		[ $SECONDS -lt $end ] || fail "two volumes once more"
 	done
 	expect_json '.state == "running" and (.warnings | all(.code != "no_dark")) and .history[0].iteration == 1'

@@ -1427,34 +1427,6 @@ START_TEST(truncation_leaves_no_rim_in_fdk_or_sart)
 }
 END_TEST
 
-/* Line integrals have no scale of their own for FDK: what is cut off is told and extended also where little is
- * absorbed. */
-START_TEST(a_thin_object_that_is_cut_off_keeps_its_values)
-{
-	const double scale = 1e-3;
-	const struct orbit_spec spec = {60, 16, 120, {600, 1100, {3, 3}, {0, 0}, {0, 0}}, 0, 3};
-	struct ellipsoid body = {.shape = SHAPE_CYLINDER, .semi_axes = {95, 75, 60}, .density = 0.02};
-	struct phantom phantom = {.count = 1, .parts = &body};
-	const double places[][3] = {{0, 0, 0}, {38, -15, 0}, {-38, 15, 2}, {0, -42, 0}};
-	struct grid grid = grid_of(48, 48, 8, 2, 2, 2);
-	struct recipe recipe = recipe_on(&grid);
-	struct outcome outcome = {0};
-	struct scene scene;
-
-	scene_orbit(&scene, &spec);
-	scene_add(&scene, &phantom);
-	for (int i = 0; i < spec.columns * spec.rows * spec.views; i++)
-		scene.projections[i] *= (float)scale;
-	recipe.fdk.on = true;
-	run(&scene, &recipe, &outcome);
-	ck_assert_ptr_nonnull(strstr(outcome.warnings, "truncated: "));
-	for (int i = 0; i < 4; i++)
-		ck_assert_double_eq_tol(mean_near(outcome.last, &grid, places[i], 5) / scale, 0.02, 0.0004);
-	outcome_clear(&outcome);
-	scene_clear(&scene);
-}
-END_TEST
-
 static const struct {
 	const char *what;
 	int columns;
@@ -1797,7 +1769,6 @@ Suite *recon_suite(void)
 	tcase_add_test(images, without_a_grid_one_is_chosen);
 	tcase_add_loop_test(images, fdk_is_as_good_as_rtk_demands, 0, COUNT(rtk_fdk));
 	tcase_add_loop_test(images, truncation_leaves_no_rim_in_fdk_or_sart, 0, 5);
-	tcase_add_test(images, a_thin_object_that_is_cut_off_keeps_its_values);
 	tcase_add_loop_test(images, a_body_that_is_wholly_seen_is_not_called_cut_off, 0, COUNT(whole));
 	tcase_add_loop_test(images, a_body_that_goes_on_outside_of_the_grid_is_not_piled_up_at_its_faces, 0, 4);
 	tcase_add_loop_test(images, a_grid_inside_of_the_body_shows_what_is_there, 0, 4);

@@ -81,7 +81,7 @@ test('a job appears in the list, runs and is cancelled, without a reload', async
 	await page.context().close()
 })
 
-test('of a job that begins anew another volume is shown until the chosen one is made again', async () => {
+test('of a job that begins anew a volume that is there is shown in place of the chosen one', async () => {
 	/* A scan of its own: its map of defects is there for good. */
 	const { detector, projections, geometry } = await api(`/v1/scans/${scan}`)
 	const own = await post('/v1/scans', { detector, projections, geometry })

@@ -194,7 +194,9 @@ export class JobPage {
 		write(this.left, left(job) || (job.ended ? duration(job.timings.total) : ''))
 		this.title(`${ended(job) ? '' : `${Math.round(job.progress * 100)} % · `}${scan.name || scan.id}`)
 		this.#showActions(before)
-		const warnings = [...scan.warnings, ...job.warnings]
+		/* A job that waits repeats some of what its scan says. */
+		const told = new Set(scan.warnings.map(({ code, detail }) => `${code} ${detail}`))
+		const warnings = [...scan.warnings, ...job.warnings.filter(({ code, detail }) => !told.has(`${code} ${detail}`))]
 		replace(this.warnings, warningList(warnings))
 		this.warnings.hidden = warnings.length === 0
 		replace(this.failure, job.error ? h('div', { class: 'notice bad' }, `It failed: ${job.error.detail}`) : null)
@@ -268,7 +270,7 @@ export class JobPage {
 		const first = this.#selected === null
 		if (first)
 			this.#firstWindow(volumes[0])
-		/* A job that begins anew has not made the selected one again yet. */
+		/* Of a job that begins anew the selected one may be gone: the last that is there takes its place. */
 		this.#show(this.#follow || this.#index() < 0 ? volumes.at(-1).name : this.#selected)
 		this.#listOthers()
 		this.#showFiles()
