@@ -198,6 +198,10 @@ check: setup ## every test; what cannot run here is skipped aloud
 	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/unit $(BUILD)/cbct-worker-held $(BUILD)/cbctd-held
 	@BUILD=$(BUILD) SANITIZED=$(SANITIZED) LEAVE_OUT="$(LEAVE_OUT)" OMP_WAIT_POLICY=passive tests/run.sh
 
+soak: setup ## the long tests: faults by the thousand, sweeps over anatomy and noise (an hour and more)
+	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/unit $(BUILD)/cbct-worker-held $(BUILD)/cbctd-held
+	@BUILD=$(BUILD) OMP_WAIT_POLICY=passive tests/run.sh --soak
+
 FUZZ_SECONDS ?= 10
 fuzzers := $(patsubst tests/fuzz/%.c,$(BUILD)/%,$(wildcard tests/fuzz/fuzz_*.c))
 
@@ -270,6 +274,6 @@ clean: ## removes build/
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-.PHONY: all again setup demo check fuzz fuzzers bench check-gpu bench-gpu asan tsan lint format install clean help
+.PHONY: all again setup demo check soak fuzz fuzzers bench check-gpu bench-gpu asan tsan lint format install clean help
 .SECONDARY:
 -include $(shell find $(BUILD) -name '*.d' 2>/dev/null)

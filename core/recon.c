@@ -915,7 +915,7 @@ int recon_run(struct recon *recon, struct error *err)
 		return code;
 	recon->ran = true;
 	if (!recon->resumed) {
-		warn_recipe(recon->hooks, recon->geometry, recipe, &recon->orbit);
+		warn_recipe(recon->hooks, recon->geometry, recipe);
 		input_warn(&recon->input, recon->geometry, recon->hooks);
 	}
 	code = check_cancelled(recon, err);

@@ -1,19 +1,20 @@
 /* What a reconstruction warns of, in words. */
 #include "core/warn.h"
 
+#include <assert.h>
 #include <math.h>
 #include <stdarg.h>
 #include <stdio.h>
 
 #include "core/outside.h"
-
-static const double DEGREES = 57.29577951308232;
+#include "core/warning.h"
 
 void recon_warn(const struct recon_hooks *hooks, const char *code, const char *format, ...)
 {
 	char detail[320];
 	va_list args;
 
+	assert(warning_is_known(code));
 	if (hooks->warning == NULL)
 		return;
 	va_start(args, format);
@@ -79,8 +80,7 @@ static bool is_crossed_in_any(const struct grid *grid, const struct geometry *ge
 	return false;
 }
 
-void warn_recipe(const struct recon_hooks *hooks, const struct geometry *geometry, const struct recipe *recipe,
-		 const struct orbit *orbit)
+void warn_recipe(const struct recon_hooks *hooks, const struct geometry *geometry, const struct recipe *recipe)
 {
 	const struct grid *grid = &recipe->grid;
 
@@ -99,10 +99,6 @@ void warn_recipe(const struct recon_hooks *hooks, const struct geometry *geometr
 	if (recipe->tv.on && !recipe->tv.after_fdk && !recipe->sart.on)
 		recon_warn(hooks, "tv_without_sart",
 			   "TV was wanted after SART iterations, and there are none: the FDK volume is left alone");
-	if (recipe->fdk.on && orbit->arc_too_short)
-		recon_warn(hooks, "arc_too_short",
-			   "FDK of an arc of %.1f degrees; a complete one has 180 degrees and the fan of %.1f degrees",
-			   (orbit->arc - orbit->holes) * DEGREES, orbit->fan * DEGREES);
 }
 
 /* What FDK calls rows, and the sides of a detector, are named as they came. */

@@ -12,9 +12,8 @@
 __attribute__((format(printf, 3, 4))) void recon_warn(const struct recon_hooks *hooks, const char *code,
 						      const char *format, ...);
 
-/* "grid_unseen", "tv_without_sart", "arc_too_short". */
-void warn_recipe(const struct recon_hooks *hooks, const struct geometry *geometry, const struct recipe *recipe,
-		 const struct orbit *orbit);
+/* "grid_unseen", "tv_without_sart". What the orbit lacks is told with the scan (proto/scan.h). */
+void warn_recipe(const struct recon_hooks *hooks, const struct geometry *geometry, const struct recipe *recipe);
 /*
  * "truncated": rows[0] rows of all views were cut off at the first column, rows[1] at the last; of a few nothing is
  * told. turned: what is a row here came as a column.

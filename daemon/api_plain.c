@@ -254,9 +254,13 @@ static void put_messages(FILE *out, const cJSON *job)
 	}
 	cJSON_ArrayForEach(warning, cJSON_GetObjectItemCaseSensitive(job, "warnings"))
 	{
-		fputs("<p>Warning: ", out);
+		fputs("<p><strong>", out);
+		put_text(out, text_of(warning, "severity"));
+		fputs("</strong>: ", out);
+		put_text(out, text_of(warning, "summary"));
+		fputs(" <small>", out);
 		put_text(out, text_of(warning, "detail"));
-		fputs("</p>\n", out);
+		fputs("</small></p>\n", out);
 	}
 }
 

@@ -110,24 +110,9 @@ static bool add_received(cJSON *document, struct stored_scan *scan, int count)
 	return true;
 }
 
-void incomplete_detail(const struct scan_facts *facts, char ret_text[200])
-{
-	snprintf(ret_text, 200,
-		 "the scan was completed with %d of %d projections: arc, weights and subsets are those of the views "
-		 "that are there",
-		 facts->received, facts->count);
-}
-
-const char no_flat_detail[] = "all projections are there, but no flat image, and the scan has no air value: its jobs "
-			      "wait for PUT /v1/scans/{scan}/flat";
-
 static void add_warning(cJSON *list, const char *code, const char *detail)
 {
-	cJSON *warning = cJSON_CreateObject();
-
-	cJSON_AddStringToObject(warning, "code", code);
-	cJSON_AddStringToObject(warning, "detail", detail);
-	cJSON_AddItemToArray(list, warning);
+	cJSON_AddItemToArray(list, json_warning(code, detail));
 }
 
 static void add_scan_warnings(cJSON *document, const struct scan *scan, const struct scan_facts *facts)
@@ -136,13 +121,20 @@ static void add_scan_warnings(cJSON *document, const struct scan *scan, const st
 	char detail[200];
 
 	if (facts->closed) {
-		incomplete_detail(facts, detail);
+		snprintf(
+		    detail, sizeof(detail),
+		    "the scan was completed with %d of %d projections: arc, weights and subsets are those of the views "
+		    "that are there",
+		    facts->received, facts->count);
 		add_warning(warnings, "incomplete", detail);
 	}
 	if (facts->complete && !facts->convertible)
-		add_warning(warnings, "no_flat", no_flat_detail);
+		add_warning(
+		    warnings, "no_flat",
+		    "all projections are there, but no flat image, and the scan has no air value: its jobs wait "
+		    "for PUT /v1/scans/{scan}/flat");
 	if (facts->damaged)
-		add_warning(warnings, "files-missing", "the file of the projections is not there at its full size");
+		add_warning(warnings, "files_missing", "the file of the projections is not there at its full size");
 	cJSON_AddItemToObject(document, "warnings", warnings);
 }
 
@@ -272,30 +264,47 @@ static void add_memory(cJSON *document, const struct recon_memory *memory)
 }
 
 /* How many are there, and how many of them the reconstruction has; null when the scan has gone. */
-static void add_views(cJSON *document, struct store *store, const struct job_record *record)
+static void add_views(cJSON *document, const struct scan_facts *scan, const struct job_record *record)
 {
-	struct scan_facts facts;
-	struct error err;
 	cJSON *views;
 	int all;
 
-	if (store_scan_look(store, record->scan, &facts, &err) != 0) {
+	if (scan == NULL) {
 		cJSON_AddNullToObject(document, "views");
 		return;
 	}
-	all = facts.closed ? facts.received : facts.count;
+	all = scan->closed ? scan->received : scan->count;
 	views = cJSON_AddObjectToObject(document, "views");
-	cJSON_AddNumberToObject(views, "received", facts.received);
+	cJSON_AddNumberToObject(views, "received", scan->received);
 	cJSON_AddNumberToObject(views, "reconstructed", record->state == JOB_SUCCEEDED ? all : record->taken);
 	cJSON_AddNumberToObject(views, "of", all);
+}
+
+/* What a job that has not begun waits for, by name; an empty list for any other. */
+static void add_waiting_for(cJSON *document, const struct scan_facts *scan, const struct job_record *record)
+{
+	cJSON *list = cJSON_AddArrayToObject(document, "waiting_for");
+
+	if (record->state == JOB_WAITING && scan != NULL) {
+		if (!scan->convertible)
+			cJSON_AddItemToArray(list, cJSON_CreateString("flat"));
+		if (!scan->complete)
+			cJSON_AddItemToArray(list, cJSON_CreateString("projections"));
+	}
+	if (record->state == JOB_QUEUED)
+		cJSON_AddItemToArray(list, cJSON_CreateString("worker"));
 }
 
 static void add_job_facts(cJSON *document, struct job *job, const struct job_record *record)
 {
 	bool works = record->state == JOB_RUNNING || record->attended;
+	struct scan_facts facts, *scan = NULL;
+	struct error err;
 	int position = job_queue_position(job);
 	char href[64];
 
+	if (store_scan_look(jobs_store(job_jobs(job)), record->scan, &facts, &err) == 0)
+		scan = &facts;
 	snprintf(href, sizeof(href), "/v1/jobs/%s", record->id);
 	cJSON_AddStringToObject(document, "id", record->id);
 	cJSON_AddStringToObject(document, "href", href);
@@ -304,7 +313,8 @@ static void add_job_facts(cJSON *document, struct job *job, const struct job_rec
 	cJSON_AddNumberToObject(document, "iteration", record->iteration);
 	cJSON_AddNumberToObject(document, "iterations", record->iterations);
 	cJSON_AddNumberToObject(document, "progress", record->fraction);
-	add_views(document, jobs_store(job_jobs(job)), record);
+	add_waiting_for(document, scan, record);
+	add_views(document, scan, record);
 	add_number_or_null(document, "eta_s", job_eta(job));
 	add_number_or_null(document, "queue_position", position > 0 ? position : -1);
 	add_text_or_null(document, "backend", record->backend);

@@ -25,10 +25,6 @@ cJSON *volume_document(const char *job, const struct volume_record *volume);
 cJSON *history_row_document(const struct history_row *row);
 /* type (urn:cbctd:problem:NAME), detail, pointer where there is one: how a job says what went wrong. */
 cJSON *error_document(int code, const char *pointer, const char *text);
-/* What the warning "incomplete" says of a scan that was closed with projections missing. */
-void incomplete_detail(const struct scan_facts *facts, char ret_text[200]);
-/* What the warning "no_flat" says of a scan of counts that has all its projections, and of its jobs, which wait. */
-extern const char no_flat_detail[];
 /* index, state, backend, device, driver, memory, job, restarts. */
 cJSON *worker_document(const struct worker_facts *facts);
 

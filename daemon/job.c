@@ -30,8 +30,6 @@ struct job {
 	char id[ID_SIZE], scan[ID_SIZE];
 	bool fdk; /* it has FDK; known of waiting jobs */
 
-	bool warned; /* it was told that it waits for a flat image; the supervisor's own */
-
 	struct watch_list watchers;
 
 	/* Guarded by jobs->lock; all but the running job's progress is changed with jobs->change held too. */
@@ -894,9 +892,6 @@ static int promote(struct jobs *jobs, struct job *job, struct error *err)
 	}
 	if (facts.ready)
 		return job_set_state(job, JOB_QUEUED, &change, err);
-	/* A full disk that has no room for it is no reason to queue no other job. */
-	if (facts.complete && !job->warned)
-		job->warned = job_add_warning(job, "no_flat", no_flat_detail, &why) == 0;
 	return 0;
 }
 
@@ -1176,15 +1171,12 @@ int job_add_warning(struct job *job, const char *code_name, const char *detail, 
 {
 	struct warning_record warning;
 	struct event event;
-	cJSON *document = cJSON_CreateObject();
 	bool new;
 	int code;
 
 	snprintf(warning.code, sizeof(warning.code), "%s", code_name);
 	snprintf(warning.detail, sizeof(warning.detail), "%s", detail);
-	cJSON_AddStringToObject(document, "code", warning.code);
-	cJSON_AddStringToObject(document, "detail", warning.detail);
-	code = event_make(&event, "warning", document, err);
+	code = event_make(&event, "warning", json_warning(warning.code, warning.detail), err);
 	if (code != 0)
 		return code;
 	code = store_job_add_warning(job->jobs->store, job->id, &warning, &event, &new, err);

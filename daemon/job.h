@@ -120,10 +120,7 @@ struct job_change {
 /* ERR_CONFLICT when the table does not allow it; the caller's picture was old. change may be NULL. */
 int job_set_state(struct job *job, enum job_state to, const struct job_change *change, struct error *err);
 
-/*
- * Waiting jobs whose scan has become ready go to the queue, but for those that are attended. Those that wait for
- * nothing but a flat image warn of it ("no_flat") until then.
- */
+/* Waiting jobs whose scan has become ready go to the queue, but for those that are attended. */
 int jobs_promote(struct jobs *jobs, struct error *err);
 /*
  * The waiting job that an idle worker should attend, or NULL: it has FDK, and its

@@ -741,19 +741,6 @@ static void begin(struct supervise *supervise, struct worker *worker, struct job
 	publish(supervise, worker);
 }
 
-/* What a radiographer must know of a volume that was made of a part of the scan. */
-static void warn_incomplete(struct supervise *supervise, struct worker *worker, const struct scan_facts *facts)
-{
-	struct error err;
-	char detail[200];
-
-	if (!facts->closed)
-		return;
-	incomplete_detail(facts, detail);
-	if (job_add_warning(worker->job, "incomplete", detail, &err) != 0)
-		stop_job(supervise, worker, &err);
-}
-
 /* To running with all that is there, or, `arriving`, to attend it while the rest comes. */
 static int begin_job(struct supervise *supervise, struct worker *worker, struct job *job,
 		     const struct job_record *record, struct message *message, struct stored_scan *scan,
@@ -774,7 +761,6 @@ static int begin_job(struct supervise *supervise, struct worker *worker, struct 
 	}
 	worker->basis = facts->basis;
 	begin(supervise, worker, job, record, message);
-	warn_incomplete(supervise, worker, facts);
 	if (!arriving) {
 		stored_scan_release(scan);
 		return 0;

@@ -15,6 +15,8 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "core/warning.h"
+
 /* ---- pointers and UTF-8 ---- */
 
 enum { POINTER_MAX = sizeof(((struct error *)0)->pointer) };
@@ -856,4 +858,16 @@ cJSON *json_runs(const unsigned char *flags, int count, bool value)
 		}
 	}
 	return runs;
+}
+
+cJSON *json_warning(const char *code, const char *detail)
+{
+	const struct warning_kind *kind = warning_kind(code);
+	cJSON *warning = cJSON_CreateObject();
+
+	cJSON_AddStringToObject(warning, "code", code);
+	cJSON_AddStringToObject(warning, "severity", severity_names[kind->severity]);
+	cJSON_AddStringToObject(warning, "summary", kind->summary);
+	cJSON_AddStringToObject(warning, "detail", detail);
+	return warning;
 }

@@ -86,6 +86,12 @@ int json_end(struct json_reader *reader);
 int json_fail(struct json_reader *reader, int code, const char *name, const char *format, ...)
     __attribute__((format(printf, 4, 5)));
 
+/*
+ * A warning as the API shows it: code, severity, summary (both of core/warning.h)
+ * and the technical detail. The caller's to delete.
+ */
+cJSON *json_warning(const char *code, const char *detail);
+
 /* Adds [first, last] pairs of the runs of `value` in flags[count], as `received` and `missing` are written. */
 cJSON *json_runs(const unsigned char *flags, int count, bool value);
 

@@ -5,12 +5,15 @@
  */
 #include "proto/scan.h"
 
+#include <assert.h>
 #include <math.h>
 #include <stdarg.h>
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+
+#include "core/warning.h"
 
 const char *const sample_names[2] = {"float32", "uint16"};
 const char *const quantity_names[2] = {"line_integral", "intensity"};
@@ -461,16 +464,14 @@ cJSON *scan_derived(const struct scan *scan)
 
 __attribute__((format(printf, 3, 4))) static void warn(cJSON *list, const char *code, const char *format, ...)
 {
-	cJSON *warning = cJSON_CreateObject();
 	char detail[320];
 	va_list args;
 
 	va_start(args, format);
 	vsnprintf(detail, sizeof(detail), format, args);
 	va_end(args);
-	cJSON_AddStringToObject(warning, "code", code);
-	cJSON_AddStringToObject(warning, "detail", detail);
-	cJSON_AddItemToArray(list, warning);
+	assert(warning_is_known(code));
+	cJSON_AddItemToArray(list, json_warning(code, detail));
 }
 
 /* What follows from the arc and the detector's place: which weights, and what they cannot mend. */

@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # Every test: the house's rules, the unit tests, then the black-box tests over HTTP.
 # What cannot run here is skipped aloud. Closes with `N passed, N failed, N skipped`.
-# Usage: tests/run.sh [FILTER ...]   only the parts whose path has one of the words in it
+# Usage: tests/run.sh [--soak] [FILTER ...]   only the parts whose path has one of the words in it; --soak: the long
+# tests of tests/soak in place of all others
 set -uo pipefail
 cd "$(dirname "$0")/.."
 export BUILD=${BUILD:-build}
@@ -10,9 +11,17 @@ results=$BUILD/test/results
 rm -rf "$BUILD"/test/{exchanges,reported.*}
 : >"$results"
 
+parts=(tests/http/test_*.sh tests/web/test_*.sh)
+if [ "${1:-}" = --soak ]; then
+	shift
+	parts=(tests/soak/test_*.sh)
+	soak=1
+fi
+
 wanted() {
 	local path=$1
 	shift
+	[[ -n ${soak:-} && $path != tests/soak/* ]] && return 1
 	[ $# = 0 ] && return 0
 	local word
 	for word; do [[ $path == *$word* ]] && return 0; done
@@ -76,7 +85,8 @@ if wanted unit "$@"; then
 	sanitized unit "$log"
 fi
 
-for file in tests/http/test_*.sh tests/web/test_*.sh; do
+for file in "${parts[@]}"; do
+	[ -e "$file" ] || continue
 	wanted "$file" "$@" || continue
 	part "$file"
 	RESULTS=$results bash "$file" || true

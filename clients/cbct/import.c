@@ -16,6 +16,7 @@
 #include "clients/cbct/progress.h"
 #include "clients/cbct/scan_output.h"
 #include "clients/cbct/upload.h"
+#include "clients/cbct/warning.h"
 
 struct import_options {
 	const char *images, *output, *name;
@@ -175,16 +176,6 @@ static int write_directory(const struct import_options *options, struct images *
 	return code;
 }
 
-static void print_warnings(const struct scan *scan)
-{
-	cJSON *list = scan_warnings(scan);
-	const cJSON *warning;
-
-	cJSON_ArrayForEach(warning, list)
-	    fprintf(stderr, "warning: %s: %s\n", member_text(warning, "code", "?"), member_text(warning, "detail", ""));
-	cJSON_Delete(list);
-}
-
 /* ---- posting ---- */
 
 /* The one temporary directory: who breaks an upload off shall not find gigabytes of it a month later. */
@@ -257,7 +248,7 @@ static int import_run(const void *values, struct error *err)
 	if (code == 0 && options->output != NULL) {
 		code = write_directory(options, images, scan, options->output, err);
 		if (code == 0)
-			print_warnings(scan);
+			warnings_print_scan(scan);
 	} else if (code == 0) {
 		code = post(options, images, scan, err);
 	}

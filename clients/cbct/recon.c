@@ -10,6 +10,7 @@
 #include "clients/cbct/commands.h"
 #include "clients/cbct/progress.h"
 #include "clients/cbct/recipe_options.h"
+#include "clients/cbct/warning.h"
 #include "proto/spool.h"
 
 struct recon_options {
@@ -67,7 +68,7 @@ static void on_warning(void *context, const char *code, const char *detail)
 	struct display *display = context;
 
 	progress_clear(display->progress);
-	fprintf(stderr, "warning: %s: %s\n", code, detail);
+	warning_print(code, detail);
 }
 
 static int on_volume(void *context, const struct kept_volume *volume, const struct saved_volume *saved,
@@ -97,6 +98,7 @@ static int request_make(const struct recon_options *options, struct job_request 
 		return code;
 	code = scan_files_open(options->directory, &files, err);
 	if (code == 0) {
+		warnings_print_scan(files.scan); /* a job does not repeat them */
 		code = job_request_resolve(&request, files.scan, err);
 		scan_files_close(&files);
 	}

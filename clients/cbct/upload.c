@@ -19,6 +19,7 @@
 #include "clients/cbct/commands.h"
 #include "clients/cbct/progress.h"
 #include "clients/cbct/upload.h"
+#include "clients/cbct/warning.h"
 #include "proto/spool.h"
 #include "proto/zstream.h"
 
@@ -282,14 +283,6 @@ static int begin(struct http *http, struct upload *upload, const struct scan *sc
 	return 0;
 }
 
-static void print_warnings(const cJSON *document)
-{
-	const cJSON *warning;
-
-	cJSON_ArrayForEach(warning, cJSON_GetObjectItemCaseSensitive(document, "warnings"))
-	    fprintf(stderr, "warning: %s: %s\n", member_text(warning, "code", "?"), member_text(warning, "detail", ""));
-}
-
 static int map_projections(struct upload *upload, const struct scan_files *files, struct error *err)
 {
 	size_t length = upload->one * (size_t)files->scan->count;
@@ -321,7 +314,7 @@ static int upload_files(struct upload *upload, const struct scan_files *files, s
 	if (code == 0)
 		code = begin(http, upload, scan, &document, err);
 	if (code == 0) {
-		print_warnings(document);
+		warnings_print(cJSON_GetObjectItemCaseSensitive(document, "warnings"));
 		/* First of all: who interrupts this can go on with it. */
 		puts(upload->id);
 		fflush(stdout);

@@ -1,9 +1,11 @@
 /* struct error: what it holds, how pointers nest, and that nothing overflows. */
 #include <check.h>
 #include <errno.h>
+#include <stdio.h>
 #include <string.h>
 
 #include "core/error.h"
+#include "core/warning.h"
 
 START_TEST(an_error_has_code_pointer_and_text)
 {
@@ -65,6 +67,31 @@ START_TEST(errno_values_keep_their_meaning)
 }
 END_TEST
 
+/* The table of warnings is complete and the schema of record names each of its codes. */
+START_TEST(every_warning_has_a_sentence_and_is_in_the_schema)
+{
+	static char schema[1 << 20];
+	FILE *file = fopen("proto/openapi.yaml", "re");
+	size_t length;
+
+	ck_assert_msg(file != NULL, "proto/openapi.yaml is read from the project's root");
+	length = fread(schema, 1, sizeof(schema) - 1, file);
+	ck_assert_uint_lt(length, sizeof(schema) - 1);
+	fclose(file);
+	for (const struct warning_kind *kind = warning_kinds; kind->code != NULL; kind++) {
+		const size_t end = strlen(kind->summary);
+		char quoted[80];
+
+		ck_assert_ptr_eq(warning_kind(kind->code), kind);
+		ck_assert_msg(end > 20 && kind->summary[end - 1] == '.', "%s: one sentence", kind->code);
+		snprintf(quoted, sizeof(quoted), "`%s`", kind->code);
+		ck_assert_msg(strstr(schema, quoted) != NULL, "%s is not in proto/openapi.yaml", quoted);
+	}
+	ck_assert(!warning_is_known("none_of_ours"));
+	ck_assert_int_eq(warning_kind("none_of_ours")->severity, SEVERITY_CAUTION);
+}
+END_TEST
+
 Suite *error_suite(void);
 Suite *error_suite(void)
 {
@@ -75,6 +102,7 @@ Suite *error_suite(void)
 	tcase_add_test(cases, pointers_nest_from_the_inside_out);
 	tcase_add_test(cases, long_texts_are_cut);
 	tcase_add_test(cases, errno_values_keep_their_meaning);
+	tcase_add_test(cases, every_warning_has_a_sentence_and_is_in_the_schema);
 	suite_add_tcase(suite, cases);
 	return suite;
 }

@@ -846,27 +846,6 @@ START_TEST(defects_are_replaced_counted_and_told)
 }
 END_TEST
 
-START_TEST(an_arc_that_is_too_short_for_fdk_is_told)
-{
-	const struct orbit_spec spec = {44, 44, 60, {600, 1100, {3, 3}, {0, 0}, {0, 0}}, 0, 170.0 / 59};
-	struct recipe recipe = small_recipe();
-	struct scene scene;
-	struct outcome outcome = {0}, sart = {0};
-
-	scene_orbit(&scene, &spec);
-	add_ball(&scene, 20, 0.02, 0, 0, 0);
-	run(&scene, &recipe, &sart);
-	ck_assert_str_eq(sart.warnings, "");
-	recipe.fdk.on = true;
-	run(&scene, &recipe, &outcome);
-	ck_assert_ptr_nonnull(strstr(outcome.warnings, "arc_too_short: "));
-	ck_assert_ptr_nonnull(strstr(outcome.warnings, "170.0 degrees"));
-	outcome_clear(&outcome);
-	outcome_clear(&sart);
-	scene_clear(&scene);
-}
-END_TEST
-
 START_TEST(a_grid_beside_every_view_is_told)
 {
 	struct recipe recipe = small_recipe();
@@ -1795,7 +1774,6 @@ Suite *recon_suite(void)
 	tcase_add_test(pipeline, stop_rules_end_it_at_the_first_row_that_meets_them);
 	tcase_add_test(pipeline, divergence_is_an_error_with_the_iteration);
 	tcase_add_test(pipeline, defects_are_replaced_counted_and_told);
-	tcase_add_test(pipeline, an_arc_that_is_too_short_for_fdk_is_told);
 	tcase_add_test(pipeline, a_grid_beside_every_view_is_told);
 	tcase_add_test(pipeline, tv_after_a_sart_that_is_not_there_is_told);
 	tcase_add_test(pipeline, views_must_be_there_once_each);

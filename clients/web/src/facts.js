@@ -45,8 +45,13 @@ export function jobFacts(job) {
 	])
 }
 
-/* [{ code, detail }] or nothing at all. */
+const severities = ['serious', 'caution', 'info']
+
+/* The API's warnings, the most serious first; null where there are none. */
 export function warningList(warnings) {
 	return warnings.length === 0 ? null : h('ul', { class: 'warnings' },
-		warnings.map(({ code, detail }) => h('li', {}, h('strong', {}, code.replaceAll(/[_-]/g, ' ')), ` ${detail}`)))
+		[...warnings].sort((a, b) => severities.indexOf(a.severity) - severities.indexOf(b.severity)).map(
+			({ code, severity, summary, detail }) => h('li', { class: severity },
+				h('strong', {}, severity), ` ${summary} `,
+				h('details', {}, h('summary', {}, code.replaceAll(/[_-]/g, ' ')), detail))))
 }

@@ -195,8 +195,7 @@ export class JobPage {
 		this.title(`${ended(job) ? '' : `${Math.round(job.progress * 100)} % · `}${scan.name || scan.id}`)
 		this.#showActions(before)
 		/* A job that waits repeats some of what its scan says. */
-		const told = new Set(scan.warnings.map(({ code, detail }) => `${code} ${detail}`))
-		const warnings = [...scan.warnings, ...job.warnings.filter(({ code, detail }) => !told.has(`${code} ${detail}`))]
+		const warnings = [...scan.warnings, ...job.warnings]
 		replace(this.warnings, warningList(warnings))
 		this.warnings.hidden = warnings.length === 0
 		replace(this.failure, job.error ? h('div', { class: 'notice bad' }, `It failed: ${job.error.detail}`) : null)

@@ -1,0 +1,72 @@
+/* The table of warnings: code, severity and the sentence for a clinician. */
+#include "core/warning.h"
+
+#include <stddef.h>
+#include <string.h>
+
+const char *const severity_names[SEVERITY_COUNT] = {"info", "caution", "serious"};
+
+const struct warning_kind warning_kinds[] = {
+    /* ---- of the orbit and the detector ---- */
+    {"arc_too_short", SEVERITY_CAUTION,
+     "The arm turned less than half a circle and the fan: expect streaks and shading along some directions."},
+    {"parker_weights", SEVERITY_INFO, "The scan covers a part of the circle, and is weighted as such."},
+    {"displaced_detector", SEVERITY_INFO,
+     "The detector was shifted to the side for a wider field of view, and the scan is weighted as such."},
+    {"displaced_short_scan", SEVERITY_CAUTION,
+     "The detector is shifted to the side, but the arm did not make a full turn: the image is reliable only near the "
+     "centre."},
+    {"tilted_orbit", SEVERITY_INFO, "The arm turned about an axis that is not the z axis; the image allows for it."},
+    {"rotated_detector", SEVERITY_INFO, "The detector is turned about its own centre; the image allows for it."},
+    {"no_field_of_view", SEVERITY_SERIOUS, "No place on the rotation axis is seen by all projections."},
+    {"duplicate_angles", SEVERITY_CAUTION, "Some projections were taken at the same angle as another."},
+    {"uneven_angles", SEVERITY_CAUTION, "There is a gap between the projections: expect streaks."},
+    {"single_view", SEVERITY_SERIOUS, "There is only one projection: depth cannot be told from it."},
+    {"implausible_lengths", SEVERITY_SERIOUS,
+     "The distances of the scan are unlike those of any arm: sizes in the image may be wrong."},
+    {"other_pitch", SEVERITY_CAUTION,
+     "The size of the detector's pixels is given in two ways that differ: sizes in the image may be wrong."},
+    {"isocentre_outside", SEVERITY_SERIOUS,
+     "The centre of rotation falls outside of the detector: the calibration may be that of another detector."},
+    {"mirrored_views", SEVERITY_SERIOUS, "Some projections are mirrored against the others: the image is wrong."},
+    {"mirrored_columns", SEVERITY_SERIOUS, "The projections may be mirrored: left and right may be exchanged."},
+    /* ---- of the samples ---- */
+    {"beam_hardening", SEVERITY_CAUTION, "The correction for beam hardening looks wrong: gray values may be off."},
+    {"air_saturated", SEVERITY_SERIOUS, "The value given for air is one at which the detector is saturated."},
+    {"incomplete", SEVERITY_CAUTION, "The scan was broken off: the image is made of the projections that arrived."},
+    {"no_flat", SEVERITY_SERIOUS, "The scan lacks its flat image: nothing can be reconstructed before it arrives."},
+    {"no_dark", SEVERITY_CAUTION, "The scan has a flat but no dark image: gray values may be too low."},
+    {"files_missing", SEVERITY_SERIOUS, "The file of the projections is gone: the scan must be sent again."},
+    {"defect_map", SEVERITY_INFO, "Bad pixels of the detector were replaced from their neighbours."},
+    {"defects", SEVERITY_CAUTION, "Some samples could not be used and were replaced from their neighbours."},
+    {"blank_views", SEVERITY_CAUTION, "Some projections are empty and were left out."},
+    {"air_region", SEVERITY_CAUTION, "The brightness of air changed during the scan, and was corrected."},
+    {"line_integrals", SEVERITY_SERIOUS, "The projections' values are unlike line integrals: the image may be wrong."},
+    {"byte_order", SEVERITY_SERIOUS, "The projections look like noise: their bytes may be in the wrong order."},
+    /* ---- of the reconstruction ---- */
+    {"truncated", SEVERITY_CAUTION,
+     "The patient is wider than the detector: gray values near the rim of the image are estimates."},
+    {"outside_grid", SEVERITY_INFO, "The patient goes on outside of the image, and the image allows for it."},
+    {"grid_unseen", SEVERITY_SERIOUS, "The image lies where no projection sees it: it shows nothing."},
+    {"tv_without_sart", SEVERITY_INFO, "Noise reduction was asked for after iterations, and there were none."},
+    {"metal", SEVERITY_CAUTION, "There is metal: what is shown within 10 mm of it is an estimate."},
+    {"no_metal", SEVERITY_INFO, "No metal was found in the image."},
+    {"checkpoint", SEVERITY_INFO, "The job went on from an earlier iteration than expected; the result is the same."},
+    {0},
+};
+
+const struct warning_kind *warning_kind(const char *code)
+{
+	static const struct warning_kind other = {"", SEVERITY_CAUTION,
+						  "There is a fact to look at; its detail says which."};
+	const struct warning_kind *kind = warning_kinds;
+
+	while (kind->code != NULL && strcmp(kind->code, code) != 0)
+		kind++;
+	return kind->code != NULL ? kind : &other;
+}
+
+bool warning_is_known(const char *code)
+{
+	return warning_kind(code)->code[0] != 0;
+}
