@@ -85,6 +85,9 @@ int page_read_ids(struct request *request, struct page *ret_page, struct error *
 int query_choice(struct request *request, const char *name, const char *const *names, int *ret_index,
 		 struct error *err);
 
+/* The request's Idempotency-Key, and the SHA-256 of its body; text is NULL where it has none. */
+int idempotency_read(struct request *request, struct store_key *ret_key, struct error *err);
+
 /* Bytes that do not change while they bear this tag. */
 struct entity {
 	const char *etag; /* quoted, strong */

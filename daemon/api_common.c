@@ -3,8 +3,26 @@
 #include <stdio.h>
 #include <string.h>
 
+#include <openssl/evp.h>
+
 #include "daemon/api.h"
 #include "daemon/http_text.h"
+
+int idempotency_read(struct request *request, struct store_key *ret_key, struct error *err)
+{
+	enum { KEY_MAX = 255 };
+	struct store_key key = {.text = request_header(request, "Idempotency-Key")};
+	size_t length;
+	const char *body = request_body(request, &length);
+
+	if (key.text != NULL && (key.text[0] == '\0' || strlen(key.text) > KEY_MAX))
+		return error_set(err, ERR_INVALID, "Idempotency-Key has %zu bytes, expected 1 to %d", strlen(key.text),
+				 KEY_MAX);
+	if (EVP_Digest(body, length, key.digest, NULL, EVP_sha256(), NULL) != 1)
+		return error_set(err, ERR_INTERNAL, "the digest of a request cannot be made");
+	*ret_key = key;
+	return 0;
+}
 
 int page_read(struct request *request, struct page *ret_page, struct error *err)
 {

@@ -3,8 +3,6 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include <openssl/evp.h>
-
 #include "daemon/api.h"
 #include "daemon/document.h"
 #include "daemon/http_text.h"
@@ -57,24 +55,18 @@ static int post(struct api *api, const char *text, size_t length, const char *ke
 
 int job_post(void *context, struct request *request, struct error *err)
 {
-	enum { KEY_MAX = 255 };
 	struct api *api = context;
-	const char *key = request_header(request, "Idempotency-Key");
 	struct job *job = NULL;
-	uint8_t digest[32];
+	struct store_key key;
 	size_t length;
 	const char *text = request_body(request, &length);
-	int code = 0;
+	int code;
 
-	if (key != NULL && (key[0] == '\0' || strlen(key) > KEY_MAX))
-		return error_set(err, ERR_INVALID, "Idempotency-Key has %zu bytes, expected 1 to %d", strlen(key),
-				 KEY_MAX);
-	if (EVP_Digest(text, length, digest, NULL, EVP_sha256(), NULL) != 1)
-		return error_set(err, ERR_INTERNAL, "the digest of a request cannot be made");
-	if (key != NULL)
-		code = jobs_repeat(api->jobs, key, digest, &job, err);
+	code = idempotency_read(request, &key, err);
+	if (code == 0 && key.text != NULL)
+		code = jobs_repeat(api->jobs, key.text, key.digest, &job, err);
 	if (code == 0 && job == NULL)
-		code = post(api, text, length, key, digest, &job, err);
+		code = post(api, text, length, key.text, key.digest, &job, err);
 	if (code == 0)
 		code = reply_accepted(request, job, err);
 	job_release(job);

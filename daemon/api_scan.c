@@ -2,10 +2,10 @@
 #include "daemon/api.h"
 #include "daemon/document.h"
 
-int scan_post(void *context, struct request *request, struct error *err)
+/* A new scan, or the one that another request with the same key has made at the same time. */
+static int post(struct api *api, struct request *request, const struct store_key *key, struct stored_scan **ret_scan,
+		struct error *err)
 {
-	struct api *api = context;
-	struct stored_scan *stored = NULL;
 	struct scan *scan = NULL;
 	size_t length;
 	const char *text = request_body(request, &length);
@@ -13,11 +13,25 @@ int scan_post(void *context, struct request *request, struct error *err)
 
 	if (scan_parse(text, length, &scan, err) != 0)
 		return err->code;
-	code = store_scan_create(api->store, scan, &stored, err);
-	if (code != 0) {
+	code = store_scan_create(api->store, scan, key->text != NULL ? key : NULL, ret_scan, err);
+	if (code != 0)
 		scan_free(scan);
+	return code == ERR_CONFLICT ? store_scan_repeat(api->store, key, ret_scan, err) : code;
+}
+
+int scan_post(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	struct stored_scan *stored = NULL;
+	struct store_key key;
+	int code = idempotency_read(request, &key, err);
+
+	if (code == 0 && key.text != NULL)
+		code = store_scan_repeat(api->store, &key, &stored, err);
+	if (code == 0 && stored == NULL)
+		code = post(api, request, &key, &stored, err);
+	if (code != 0)
 		return code;
-	}
 	code = request_reply_json(request, 201, scan_document(stored, false), err);
 	if (code == 0)
 		request_reply_header(request, "Location", "/v1/scans/%s", stored_scan_id(stored));

@@ -121,6 +121,12 @@ static const char *const migrations[] = {
     "ALTER TABLE scans ADD COLUMN defects BLOB;",                      /* SHA-256 of the defect map's bytes */
     "ALTER TABLE scans ADD COLUMN closed INTEGER NOT NULL DEFAULT 0;", /* 1: its projections are those that are there */
     "ALTER TABLE jobs ADD COLUMN basis INTEGER NOT NULL DEFAULT 0;",   /* of its scan, when it ran last */
+    /* Idempotency-Key of POST /v1/scans; the SHA-256 is that of the request's body. */
+    ("CREATE TABLE scan_keys ("
+     " key TEXT PRIMARY KEY,"
+     " request_sha256 BLOB NOT NULL,"
+     " scan INTEGER NOT NULL REFERENCES scans(number) ON DELETE CASCADE) WITHOUT ROWID;"
+     "CREATE INDEX scan_keys_of_scan ON scan_keys (scan);"),
 };
 enum { MIGRATIONS = sizeof(migrations) / sizeof(migrations[0]) };
 

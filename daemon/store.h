@@ -55,12 +55,26 @@ void store_statistics(struct store *store, struct store_statistics *ret);
 
 /* ---- scans ---- */
 
+/* An Idempotency-Key and the SHA-256 of the body of the request that it came with; borrowed. */
+struct store_key {
+	const char *text;
+	uint8_t digest[32];
+};
+
 /*
  * Takes the parsed scan over (on success only), makes its directory with
  * scan.json and projections.raw at full size. ERR_NO_SPACE when the disk cannot
- * hold all of it. The reference is the caller's.
+ * hold all of it. key may be NULL; ERR_CONFLICT when another request has used it
+ * meanwhile: store_scan_repeat tells which scan it made. The reference is the caller's.
  */
-int store_scan_create(struct store *store, struct scan *scan, struct stored_scan **ret_scan, struct error *err);
+int store_scan_create(struct store *store, struct scan *scan, const struct store_key *key,
+		      struct stored_scan **ret_scan, struct error *err);
+/*
+ * The scan that this key made before: *ret_scan stays NULL where there is none (and 0 is returned). ERR_CONFLICT: the
+ * key came with another request.
+ */
+int store_scan_repeat(struct store *store, const struct store_key *key, struct stored_scan **ret_scan,
+		      struct error *err);
 /* ERR_NOT_FOUND. Reads scan.json when the scan has not been used for a while; otherwise memory only. */
 int store_scan_find(struct store *store, const char *id, struct stored_scan **ret_scan, struct error *err);
 void stored_scan_release(struct stored_scan *scan); /* NULL is fine */

@@ -435,7 +435,53 @@ static int make_files(struct store *store, const struct scan *parsed, const char
 	return code;
 }
 
-static int insert_row(struct store *store, struct stored_scan *scan, struct error *err)
+/* In the transaction that inserts the scan, so that a key and its scan are both there or neither is. */
+static int insert_key(struct store *store, const struct stored_scan *scan, const struct store_key *key,
+		      struct error *err)
+{
+	struct query query;
+	int code;
+
+	query_begin(&query, &store->writer,
+		    "INSERT OR IGNORE INTO scan_keys (key, request_sha256, scan) VALUES (?, ?, ?)", err);
+	query_text(&query, key->text);
+	query_blob(&query, key->digest, sizeof(key->digest));
+	query_integer(&query, scan->number);
+	code = query_run(&query);
+	if (code == 0 && sqlite3_changes(store->writer.db) == 0)
+		return error_set(err, ERR_CONFLICT, "this Idempotency-Key was used meanwhile");
+	return code;
+}
+
+int store_scan_repeat(struct store *store, const struct store_key *key, struct stored_scan **ret_scan,
+		      struct error *err)
+{
+	struct query query;
+	char id[ID_SIZE] = "";
+	bool same = false;
+	int code;
+
+	pthread_mutex_lock(&store->reader.lock);
+	query_begin(&query, &store->reader,
+		    "SELECT scans.id, request_sha256 = ? FROM scan_keys JOIN scans ON scans.number = scan_keys.scan"
+		    " WHERE key = ?",
+		    err);
+	query_blob(&query, key->digest, sizeof(key->digest));
+	query_text(&query, key->text);
+	if (query_row(&query)) {
+		column_text(&query, 0, id, sizeof(id));
+		same = sqlite3_column_int(query.statement, 1) != 0;
+	}
+	code = query_end(&query);
+	pthread_mutex_unlock(&store->reader.lock);
+	if (code != 0 || id[0] == '\0')
+		return code;
+	if (!same)
+		return error_set(err, ERR_CONFLICT, "this Idempotency-Key came with another request before");
+	return store_scan_find(store, id, ret_scan, err);
+}
+
+static int insert_row(struct store *store, struct stored_scan *scan, const struct store_key *key, struct error *err)
 {
 	struct query query;
 	int code = store_begin(store, err);
@@ -457,6 +503,8 @@ static int insert_row(struct store *store, struct stored_scan *scan, struct erro
 	query_real(&query, scan->air);
 	code = query_run(&query);
 	scan->number = sqlite3_last_insert_rowid(store->writer.db);
+	if (code == 0 && key != NULL)
+		code = insert_key(store, scan, key, err);
 	return store_end(store, code, err);
 }
 
@@ -470,7 +518,8 @@ void store_scan_remove_files(const struct store *store, const char *id)
 		log_line(LEVEL_WARNING, "scan %s: files stay until the next start: %s", id, err.text);
 }
 
-int store_scan_create(struct store *store, struct scan *parsed, struct stored_scan **ret_scan, struct error *err)
+int store_scan_create(struct store *store, struct scan *parsed, const struct store_key *key,
+		      struct stored_scan **ret_scan, struct error *err)
 {
 	struct stored_scan *scan = scan_new(store, parsed->count);
 	int code;
@@ -494,7 +543,7 @@ int store_scan_create(struct store *store, struct scan *parsed, struct stored_sc
 		pthread_mutex_unlock(&store->scans_lock);
 	}
 	if (code == 0)
-		code = insert_row(store, scan, err);
+		code = insert_row(store, scan, key, err);
 	if (code != 0) {
 		store_scan_remove_files(store, scan->id);
 		goto out;

@@ -222,6 +222,20 @@ static int read_stages(struct recipe *recipe, const cJSON *const stages[STAGES],
 	return code;
 }
 
+/*
+ * A request that names no stage at all, not even with null, is a whole job: every stage with its defaults. What a
+ * request printed with every default written out says stays as it is, for that has null for a stage that is off.
+ */
+static bool names_no_stage(const cJSON *value)
+{
+	static const char *const names[] = {"fdk", "sart", "tv"};
+
+	for (size_t i = 0; i < sizeof(names) / sizeof(names[0]); i++)
+		if (cJSON_GetObjectItemCaseSensitive(value, names[i]) != NULL)
+			return false;
+	return true;
+}
+
 int job_request_read(const cJSON *value, struct job_request *ret_request, struct error *err)
 {
 	struct job_request request = {0};
@@ -248,6 +262,8 @@ int job_request_read(const cJSON *value, struct job_request *ret_request, struct
 	code = json_end(&reader);
 	if (code == 0)
 		code = read_stages(&request.recipe, stages, err);
+	if (code == 0 && names_no_stage(value))
+		request.recipe.fdk.on = request.recipe.sart.on = request.recipe.tv.on = true;
 	if (code != 0) {
 		recipe_clear(&request.recipe);
 		return code;

@@ -17,10 +17,9 @@ void warnings_print(const cJSON *list)
 {
 	const cJSON *warning;
 
-	cJSON_ArrayForEach(warning, list)
-	    fprintf(stderr, "%s: %s: %s (%s)\n", member_text(warning, "severity", "caution"),
-		    member_text(warning, "code", "?"), member_text(warning, "summary", ""),
-		    member_text(warning, "detail", ""));
+	cJSON_ArrayForEach(warning, list) fprintf(
+	    stderr, "%s: %s: %s (%s)\n", member_text(warning, "severity", "caution"), member_text(warning, "code", "?"),
+	    member_text(warning, "summary", ""), member_text(warning, "detail", ""));
 }
 
 void warnings_print_scan(const struct scan *scan)

@@ -165,6 +165,22 @@ test_idempotency_key() {
 	[[ $status == 409 || $status == 422 ]] || fail "409 or 422 for the key with another request, got $status"
 }
 
+# {"scan": ID} alone: every stage with its defaults
+test_a_scan_alone_is_a_whole_job() {
+	uploaded_scan
+	post_job '{"scan": "SCAN"}'
+	expect_json '.fdk.window == "hann" and .sart.iterations == 10 and .tv.method and .grid.size and .metal == null'
+	expect_json '.emit == [] and .priority == "routine"'
+	wait_job succeeded
+	expect_json '(.history | length) == 10 and .volumes == 1'
+	# naming a stage, even as null, is choosing
+	post_job '{"scan": "SCAN", "fdk": {}}'
+	expect_json '.sart == null and .tv == null'
+	wait_job succeeded
+	req POST /v1/jobs -H 'Content-Type: application/json' -d "{\"scan\": \"$scan\", \"sart\": null}"
+	expect_problem 422
+}
+
 test_stop_rules() {
 	uploaded_scan
 	post_job "$small"'"sart": {"iterations": 500, "stop": {"residual": 0.2}}}'

@@ -25,10 +25,13 @@ running_at() { # ITERATION: waits until the job is there
 }
 
 test_everything_is_known_again_after_kill_9() {
-	local k finished
+	local k finished keyed_scan
 	start_daemon
 	post_scan "$scan_dir"
 	finished=$scan
+	keyed() { req POST /v1/scans -H 'Content-Type: application/json' -H 'Idempotency-Key: k' --data-binary "@$scan_dir/scan.json"; }
+	keyed
+	keyed_scan=$(json .id)
 	post_projections "$scan_dir"
 	post_job "{\"scan\": \"SCAN\", $grid, \"fdk\": {}, \"sart\": {\"iterations\": 2}}"
 	wait_job succeeded
@@ -56,7 +59,9 @@ test_everything_is_known_again_after_kill_9() {
 	get_volume final "$work/final.after"
 	cmp "$work/final.before" "$work/final.after" || fail "the volume as it was"
 	req GET /v1/scans
-	expect_json "[.scans[].id] == [\"$scan\", \"$finished\"]"
+	expect_json "[.scans[].id] == [\"$scan\", \"$keyed_scan\", \"$finished\"]"
+	keyed
+	[ "$(json .id)" = "$keyed_scan" ] || fail "the scan that its Idempotency-Key made"
 	stop_daemon
 }
 

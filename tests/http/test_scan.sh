@@ -38,6 +38,38 @@ test_document_says_what_was_understood() {
 	expect_json '[.warnings[] | select(.code | test("arc"))] | length == 1'
 }
 
+test_idempotency_key_of_a_scan() {
+	local first n pids=()
+	scan_json >"$work/scan.json"
+	keyed() { req POST /v1/scans -H 'Content-Type: application/json' -H "Idempotency-Key: $1" --data-binary "@$2"; }
+	keyed key-1 "$work/scan.json"
+	expect_status 201
+	first=$(json .id)
+	keyed key-1 "$work/scan.json"
+	expect_status 201
+	[ "$(json .id)" = "$first" ] && header Location | grep -q "$first" || fail "the same scan"
+	scan_json '.name = "other"' >"$work/other.json"
+	keyed key-1 "$work/other.json"
+	expect_problem 409
+	keyed key-2 "$work/scan.json"
+	[ "$(json .id)" != "$first" ] || fail "another scan for another key"
+	keyed "$(printf 'k%.0s' {1..256})" "$work/scan.json"
+	expect_problem 400
+	# eight at once with a new key make one scan
+	for n in 1 2 3 4 5 6 7 8; do
+		curl -s -o "$work/keyed.$n" -H 'Content-Type: application/json' -H 'Idempotency-Key: at-once' \
+			--data-binary "@$work/scan.json" "$url/v1/scans" &
+		pids+=($!)
+	done
+	wait "${pids[@]}"
+	[ "$(jq -r .id "$work"/keyed.? | sort -u | wc -l)" = 1 ] || fail "one scan: $(jq -c '[.id, .detail]' "$work"/keyed.?)"
+	# its key goes with a scan
+	req DELETE "/v1/scans/$first"
+	expect_status 204
+	keyed key-1 "$work/other.json"
+	expect_status 201
+}
+
 test_every_kind_of_geometry_is_the_same_scan() {
 	local kinds=0
 	new_scan

@@ -107,7 +107,7 @@ struct stored_scan *state_scan(struct state *state, int count, bool intensity)
 		 " \"source_to_detector_mm\": 1100, \"first_angle_deg\": 0, \"angle_step_deg\": %.17g}}",
 		 count, intensity ? "intensity" : "line_integral", 360.0 / count);
 	ck_assert_msg(scan_parse(text, strlen(text), &scan, &err) == 0, "%s", err.text);
-	ck_assert_msg(store_scan_create(state->store, scan, &stored, &err) == 0, "%s", err.text);
+	ck_assert_msg(store_scan_create(state->store, scan, NULL, &stored, &err) == 0, "%s", err.text);
 	return stored;
 }
 

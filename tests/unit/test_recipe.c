@@ -218,7 +218,7 @@ static const struct {
     {"{}", ERR_INVALID, "/scan", "missing"},
     {"{\"scna\":\"a\",\"fdk\":{}}", ERR_INVALID, "/scna", "scan is needed"},
     {"{\"scan\":5,\"fdk\":{}}", ERR_INVALID, "/scan", "a string"},
-    {"{\"scan\":\"a\"}", ERR_IMPOSSIBLE, "", "nothing to run"},
+    {"{\"scan\":\"a\",\"sart\":null}", ERR_IMPOSSIBLE, "", "nothing to run"},
     {"{\"scan\":\"a\",\"tv\":{}}", ERR_IMPOSSIBLE, "", "nothing to run"},
     {"{\"scan\":\"a\",\"fdk\":null,\"sart\":null}", ERR_IMPOSSIBLE, "", "nothing to run"},
     {"{\"scan\":\"a\",\"fdk\":[]}", ERR_INVALID, "/fdk", "an array"},

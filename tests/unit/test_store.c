@@ -117,7 +117,7 @@ START_TEST(a_scan_beyond_the_disk_is_refused_before_anything_is_made)
 	if (available > scan_projection_bytes(scan) * 20000ull) {
 		printf("skipped: a disk of more than a terabyte cannot be too small\n");
 	} else {
-		ck_assert_int_eq(store_scan_create(state.store, scan, &stored, &err), ERR_NO_SPACE);
+		ck_assert_int_eq(store_scan_create(state.store, scan, NULL, &stored, &err), ERR_NO_SPACE);
 		ck_assert_str_eq(err.pointer, "/projections/count");
 		ck_assert_ptr_null(stored);
 		ck_assert_int_eq(rmdir(state_path(&state, "scans")), 0); /* nothing is in it */
