@@ -42,10 +42,10 @@ OPTIONAL := node:nodejs npm:npm
 MODULES  := yaml:python3-yaml jsonschema:python3-jsonschema numpy:python3-numpy requests:python3-requests
 
 core_libs   := kissfft-float
-proto_libs  := libcjson libzstd libpng
+proto_libs  := libcjson libzstd libpng zlib
 daemon_libs := libmicrohttpd sqlite3 libcrypto
 # Other tools' files: the client reads and writes them, the daemon and the worker know none of them.
-files_libs  := expat libtiff-4 zlib
+files_libs  := expat libtiff-4
 cbct_libs   := libcurl libcrypto $(files_libs)
 all_libs    := $(core_libs) $(proto_libs) $(daemon_libs) $(cbct_libs)
 

@@ -131,8 +131,11 @@ int image_put(void *context, struct request *request, struct error *err)
 static int open_projection(struct stored_scan *scan, int index, int *ret_descriptor, uint8_t ret_sha256[32],
 			   struct error *err)
 {
-	if (!stored_scan_digest(scan, index, ret_sha256))
+	struct sum sum;
+
+	if (!stored_scan_sum(scan, index, &sum))
 		return error_set(err, ERR_NOT_FOUND, "projection %d has not been stored yet", index);
+	memcpy(ret_sha256, sum.sha256, 32);
 	return stored_scan_open(scan, false, ret_descriptor, err);
 }
 

@@ -8,6 +8,7 @@
 #include "daemon/id.h"
 #include "daemon/watch.h"
 #include "proto/recipe.h"
+#include "proto/sums.h"
 
 /*
  * Everything that outlives the process: the catalogue (SQLite) and the files.
@@ -15,6 +16,7 @@
  *   STATE/lock              held by the one daemon that uses STATE
  *   STATE/catalogue.sqlite  scans, projections, jobs, volumes, history, warnings, events
  *   STATE/scans/ID/         scan.json projections.raw flat.f32 dark.f32 defects.u8 (proto/spool.h)
+ *                           projections.sums (proto/sums.h)
  *   STATE/jobs/ID/          NAME.nii, checkpoint.f32
  *
  * A call that returns 0 has its change on the disk. The order is always: files
@@ -125,13 +127,12 @@ int store_scan_look(struct store *store, const char *id, struct scan_facts *ret,
 /* flags[count]: 1 where the projection is stored. */
 void stored_scan_received(struct stored_scan *scan, unsigned char *ret_flags);
 /*
- * The projections in the order in which they came (those from before the start
- * by their numbers): numbers `from`, from + 1, ... of that order, at most `most`.
+ * The projections in the order in which they came: numbers `from`, from + 1, ... of that order, at most `most`.
  * Returns how many.
  */
 int stored_scan_arrivals(struct stored_scan *scan, int from, int *ret_projections, int most);
-/* False when it is not stored. */
-bool stored_scan_digest(struct stored_scan *scan, int index, uint8_t ret_sha256[32]);
+/* False when it is not stored. ret_sum->bytes 0: only its SHA-256 is known yet. */
+bool stored_scan_sum(struct stored_scan *scan, int index, struct sum *ret_sum);
 
 /* Woken when a projection is stored, a claim given back, an image set, the scan deleted. */
 void stored_scan_watch(struct stored_scan *scan, struct watch *watch);
@@ -153,10 +154,10 @@ int store_scan_close(struct store *store, struct stored_scan *scan, struct error
 /*
  * Who wants to write projection k into projections.raw claims it first:
  *
- *   CLAIM_GRANTED  it is yours: pwrite at k * scan_projection_bytes(), fdatasync,
- *                  then store_put_projections; or stored_scan_unclaim, and what was
- *                  written counts for nothing
- *   CLAIM_STORED   it is there already: hash the body and compare with stored_scan_digest
+ *   CLAIM_GRANTED  it is yours: pwrite at k * scan_projection_bytes(), then its record
+ *                  (stored_scan_put_sum), fdatasync of both, then store_put_projections;
+ *                  or stored_scan_unclaim, and what was written counts for nothing
+ *   CLAIM_STORED   it is there already: hash the body and compare with stored_scan_sum
  *                  (200 or 409), write nothing
  *   CLAIM_BUSY     another request is writing it: watch the scan and ask again
  *
@@ -169,6 +170,8 @@ void stored_scan_unclaim(struct stored_scan *scan, int index);
 
 /* A descriptor of projections.raw, the caller's to close; close-on-exec. */
 int stored_scan_open(struct stored_scan *scan, bool writing, int *ret_descriptor, struct error *err);
+/* The same of projections.sums, for writing. */
+int stored_scan_open_sums(struct stored_scan *scan, int *ret_descriptor, struct error *err);
 
 /*
  * Group commit: many claimed projections, of one scan or several, in one
@@ -180,9 +183,14 @@ int stored_scan_open(struct stored_scan *scan, bool writing, int *ret_descriptor
 struct received_projection {
 	struct stored_scan *scan;
 	int index;
-	uint8_t sha256[32]; /* of the raw samples */
-	bool stored;        /* out */
+	struct sum sum; /* of the raw samples; its order is set by stored_scan_put_sum */
+	bool stored;    /* out */
 };
+/*
+ * Writes the projection's record into this file of projections.sums, not synced. turn: of projections that are stored
+ * one after the other the first has the lower one; counted since the start.
+ */
+int stored_scan_put_sum(struct received_projection *projection, int sums, uint64_t turn, struct error *err);
 int store_put_projections(struct store *store, struct received_projection *batch, int count, struct error *err);
 
 /*

@@ -18,51 +18,15 @@
 
 #include "daemon/files.h"
 #include "daemon/log.h"
-#include "daemon/store_db.h"
+#include "daemon/store_scan.h"
 #include "proto/spool.h"
 
 /* Left on the disk for the catalogue when room for projections is set aside. */
 static const unsigned long long SPACE_FOR_CATALOGUE = 4ull << 20;
 
 enum { DOCUMENT_BYTES_MAX = 64 << 20 };
-enum progress { MISSING, CLAIMED, STORED };
-
 static const char *const image_files[IMAGE_COUNT] = {"flat.f32", "dark.f32", "defects.u8"};
-
-struct stored_scan {
-	/* Constant. */
-	struct store *store;
-	char id[ID_SIZE];
-	long long number; /* in the catalogue */
-	char name[256];
-	double created;
-	int columns, rows, count;
-	enum sample sample;
-	enum quantity quantity;
-	double air;
-	bool damaged;
-
-	/* Guarded by store->scans_lock. */
-	int references; /* one of them is the array's */
-	struct scan *parsed;
-	struct scan *measured; /* of a closed one: what of it is there; NULL: all of it, or not parsed */
-	bool recent;
-	bool removed; /* from the array: whoever refers to it now may use its parsed form */
-
-	pthread_mutex_t lock;    /* guards what follows */
-	unsigned char *progress; /* [count], enum progress */
-	uint8_t (*sha256)[32];   /* [count], of those that are stored */
-	int *order;              /* [received]: the projections that are stored, as they came */
-	int received;
-	double arrived; /* monotonic: the last of them, 0: before the start */
-	enum progress image[IMAGE_COUNT];
-	uint8_t image_sha256[IMAGE_COUNT][32];
-	bool deleted; /* written with writer.lock held too, as the next */
-	bool closing; /* takes no new projections */
-	bool closed;  /* and that is on the disk */
-
-	struct watch_list watchers;
-};
+static const enum sums_part image_parts[IMAGE_COUNT] = {SUMS_FLAT, SUMS_DARK, SUMS_DEFECTS};
 
 static struct stored_scan *scan_free_memory(struct stored_scan *scan)
 {
@@ -72,7 +36,7 @@ static struct stored_scan *scan_free_memory(struct stored_scan *scan)
 	scan_free(scan->measured);
 	free(scan->order);
 	free(scan->progress);
-	free(scan->sha256);
+	free(scan->sums);
 	watch_list_destroy(&scan->watchers);
 	pthread_mutex_destroy(&scan->lock);
 	free(scan);
@@ -91,9 +55,9 @@ static struct stored_scan *scan_new(struct store *store, int count)
 	scan->count = count;
 	scan->references = 1;
 	scan->progress = calloc((size_t)count, 1);
-	scan->sha256 = calloc((size_t)count, sizeof(scan->sha256[0]));
+	scan->sums = calloc((size_t)count, sizeof(scan->sums[0]));
 	scan->order = calloc((size_t)count, sizeof(scan->order[0]));
-	return scan->progress == NULL || scan->sha256 == NULL || scan->order == NULL ? scan_free_memory(scan) : scan;
+	return scan->progress == NULL || scan->sums == NULL || scan->order == NULL ? scan_free_memory(scan) : scan;
 }
 
 /* ---- the array ---- */
@@ -409,7 +373,7 @@ static int make_projections(const char *directory, unsigned long long bytes, str
 	return code;
 }
 
-static int make_files(struct store *store, const struct scan *parsed, const char *id, struct error *err)
+static int make_files(struct store *store, const struct scan *parsed, const struct stored_scan *scan, struct error *err)
 {
 	unsigned long long bytes =
 	    (unsigned long long)scan_projection_bytes(parsed) * (unsigned long long)parsed->count;
@@ -422,13 +386,17 @@ static int make_files(struct store *store, const struct scan *parsed, const char
 	text = json_print(parsed->document, NULL);
 	if (text == NULL)
 		return error_set_errno(err, ENOMEM, "scan document");
-	store_scan_directory(store, id, directory);
+	store_scan_directory(store, scan->id, directory);
 	snprintf(path, sizeof(path), "%s/scan.json", directory);
 	code = directory_make(directory, err);
 	if (code == 0)
 		code = make_projections(directory, bytes, err);
 	if (code == 0)
+		code = sums_create(directory, parsed->count, scan_projection_bytes(parsed), err);
+	if (code == 0)
 		code = file_write_durable(path, text, strlen(text), err);
+	if (code == 0)
+		code = store_put_part_sum(scan, SUMS_SCAN, text, strlen(text), err);
 	if (code == 0)
 		code = directory_sync(directory, err);
 	cJSON_free(text);
@@ -536,7 +504,7 @@ int store_scan_create(struct store *store, struct scan *parsed, const struct sto
 	code = id_make(scan->id, err);
 	if (code != 0)
 		goto out;
-	code = make_files(store, parsed, scan->id, err);
+	code = make_files(store, parsed, scan, err);
 	if (code == 0) {
 		pthread_mutex_lock(&store->scans_lock);
 		code = array_reserve(store, err);
@@ -652,9 +620,10 @@ static unsigned basis_of(const struct stored_scan *scan)
 	return basis;
 }
 
-static void add_received(struct stored_scan *scan, int index, const uint8_t sha256[32])
+void stored_scan_add(struct stored_scan *scan, int index, const struct sum *sum)
 {
-	memcpy(scan->sha256[index], sha256, 32);
+	scan->sums[index] = *sum;
+	scan->unchecked += sum->bytes == 0;
 	scan->progress[index] = STORED;
 	scan->order[scan->received++] = index;
 }
@@ -719,14 +688,14 @@ int stored_scan_arrivals(struct stored_scan *scan, int from, int *ret_projection
 	return count;
 }
 
-bool stored_scan_digest(struct stored_scan *scan, int index, uint8_t ret_sha256[32])
+bool stored_scan_sum(struct stored_scan *scan, int index, struct sum *ret_sum)
 {
 	bool stored;
 
 	pthread_mutex_lock(&scan->lock);
 	stored = scan->progress[index] == STORED;
 	if (stored)
-		memcpy(ret_sha256, scan->sha256[index], 32);
+		*ret_sum = scan->sums[index];
 	pthread_mutex_unlock(&scan->lock);
 	return stored;
 }
@@ -801,9 +770,13 @@ static int close_row(struct store *store, struct stored_scan *scan, int received
 	pthread_mutex_unlock(&scan->lock);
 	if (code != 0 || *ret_done)
 		return store_end(store, code, err);
-	query_begin(&query, &store->writer, "UPDATE scans SET closed = 1 WHERE number = ?", err);
-	query_integer(&query, scan->number);
-	code = store_end(store, query_run(&query), err);
+	code = store_put_part_sum(scan, SUMS_CLOSED, "", 0, err);
+	if (code == 0) {
+		query_begin(&query, &store->writer, "UPDATE scans SET closed = 1 WHERE number = ?", err);
+		query_integer(&query, scan->number);
+		code = query_run(&query);
+	}
+	code = store_end(store, code, err);
 	if (code != 0) {
 		pthread_mutex_lock(&scan->lock);
 		scan->closing = false;
@@ -921,7 +894,7 @@ static int insert_projections(struct store *store, struct received_projection *b
 			    err);
 		query_integer(&query, batch[i].scan->number);
 		query_integer(&query, batch[i].index);
-		query_blob(&query, batch[i].sha256, sizeof(batch[i].sha256));
+		query_blob(&query, batch[i].sum.sha256, sizeof(batch[i].sum.sha256));
 		code = query_run(&query);
 	}
 	return code;
@@ -936,7 +909,7 @@ static void show_projection(const struct received_projection *projection, double
 	assert(scan->progress[projection->index] == CLAIMED);
 	scan->progress[projection->index] = MISSING;
 	if (projection->stored) {
-		add_received(scan, projection->index, projection->sha256);
+		stored_scan_add(scan, projection->index, &projection->sum);
 		scan->arrived = now;
 	}
 	pthread_mutex_unlock(&scan->lock);
@@ -1008,6 +981,8 @@ static int write_image(struct store *store, struct stored_scan *scan, enum image
 	store_scan_directory(store, scan->id, directory);
 	snprintf(path, sizeof(path), "%s/%s", directory, image_files[image]);
 	code = file_write_durable(path, pixels, image_bytes(scan, image), err);
+	if (code == 0)
+		code = store_put_part_sum(scan, image_parts[image], pixels, image_bytes(scan, image), err);
 	if (code == 0)
 		code = store_begin(store, err);
 	if (code != 0)
@@ -1099,12 +1074,14 @@ static int load_scan(struct store *store, struct query *query, struct error *err
 static void load_projection(struct stored_scan *scan, sqlite3_stmt *row)
 {
 	int view = sqlite3_column_int(row, 1);
+	struct sum sum = {0};
 
 	if (view < 0 || view >= scan->count || sqlite3_column_bytes(row, 2) != 32) {
 		log_line(LEVEL_ERROR, "scan %s: the row of projection %d makes no sense", scan->id, view);
 		return;
 	}
-	add_received(scan, view, sqlite3_column_blob(row, 2));
+	memcpy(sum.sha256, sqlite3_column_blob(row, 2), 32);
+	stored_scan_add(scan, view, &sum);
 }
 
 /* Called while nobody else has the store: no locks. */
@@ -1131,6 +1108,8 @@ int store_load_scans(struct store *store, struct error *err)
 		while (query_row(&query))
 			load_projection(scan, query.statement);
 		code = query_end(&query);
+		if (code == 0)
+			code = store_load_sums(store, scan, err);
 	}
 	return code;
 }

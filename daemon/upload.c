@@ -56,6 +56,8 @@ void upload_unreference_and_unlock(struct upload *upload)
 		return;
 	if (upload->descriptor >= 0)
 		close(upload->descriptor);
+	if (upload->sums >= 0)
+		close(upload->sums);
 	zdecoder_free(upload->decoder);
 	EVP_MD_CTX_free(upload->digest);
 	stored_scan_release(upload->scan);
@@ -226,7 +228,7 @@ int upload_new(struct uploads *uploads, struct request *request, struct stored_s
 	upload->request = request;
 	upload->scan = scan;
 	upload->target = *target;
-	upload->descriptor = -1;
+	upload->descriptor = upload->sums = -1;
 	upload->references = 1;
 	upload->next = target->first;
 	upload->slot_bytes = target->kind == UPLOAD_IMAGE ? upload_image_bytes(stored_scan_parsed(scan), target->image)
@@ -239,6 +241,8 @@ int upload_new(struct uploads *uploads, struct request *request, struct stored_s
 		code = prepare_holding(upload, err);
 	if (code == 0 && known && target->kind == UPLOAD_PROJECTIONS)
 		code = stored_scan_open(scan, true, &upload->descriptor, err);
+	if (code == 0 && known && target->kind == UPLOAD_PROJECTIONS)
+		code = stored_scan_open_sums(scan, &upload->sums, err);
 	if (code != 0 || !known) {
 		upload_release(upload);
 		upload = NULL;

@@ -26,7 +26,7 @@ struct slot {
 	int weight;          /* projections that it stands for */
 	size_t size, filled; /* bytes */
 	unsigned char *data; /* [size] */
-	uint8_t sha256[32];
+	struct sum sum;
 	double parked;  /* since when it waits for a claim, 0: it does not */
 	bool committed; /* its claims went back with the commit */
 	int code;       /* what became of it, while it is in a writer's hands */
@@ -41,14 +41,14 @@ struct slot_list {
 /* A projection that is written, but must not count yet. */
 struct held {
 	int index;
-	uint8_t sha256[32];
+	struct sum sum;
 };
 
 struct upload {
 	struct uploads *uploads;
 	struct stored_scan *scan;
 	struct upload_target target;
-	int descriptor; /* of projections.raw, -1 for images */
+	int descriptor, sums; /* of projections.raw and .sums, -1 for images */
 	size_t slot_bytes;
 	uint64_t expected; /* bytes, decoded; for an image at most */
 

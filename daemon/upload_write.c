@@ -41,20 +41,22 @@ static int write_slot(const struct slot *slot, struct error *err)
 
 static int hash_slot(struct slot *slot, struct error *err)
 {
-	if (EVP_Digest(slot->data, slot->size, slot->sha256, NULL, EVP_sha256(), NULL) != 1)
+	if (EVP_Digest(slot->data, slot->size, slot->sum.sha256, NULL, EVP_sha256(), NULL) != 1)
 		return error_set(err, ERR_INTERNAL, "the digest of a projection cannot be made");
+	slot->sum.crc = checksum(0, slot->data, slot->size);
+	slot->sum.bytes = slot->size;
 	return 0;
 }
 
 static int compare_with_stored(struct slot *slot, struct error *err)
 {
-	uint8_t stored[32];
+	struct sum stored;
 
 	if (hash_slot(slot, err) != 0)
 		return err->code;
-	if (!stored_scan_digest(slot->upload->scan, slot->index, stored))
+	if (!stored_scan_sum(slot->upload->scan, slot->index, &stored))
 		return error_set(err, ERR_NOT_FOUND, "the scan was deleted meanwhile");
-	if (memcmp(stored, slot->sha256, sizeof(stored)) != 0)
+	if (memcmp(stored.sha256, slot->sum.sha256, sizeof(stored.sha256)) != 0)
 		return error_set(err, ERR_CONFLICT, "projection %d is stored already, with other bytes", slot->index);
 	slot->outcome = SLOT_SAME;
 	return 0;
@@ -164,7 +166,7 @@ static int sync_batch(struct uploads *uploads, struct slot *const slots[], int c
 			done = slots[j]->upload->scan == slots[i]->upload->scan;
 		if (done)
 			continue;
-		if (fdatasync(slots[i]->upload->descriptor) != 0) {
+		if (fdatasync(slots[i]->upload->descriptor) != 0 || fdatasync(slots[i]->upload->sums) != 0) {
 			error_set_errno(err, errno, "sync projections of scan %s",
 					stored_scan_id(slots[i]->upload->scan));
 			if (err->code != ERR_NO_SPACE)
@@ -191,11 +193,11 @@ static int check_trust(struct uploads *uploads, struct error *err)
 }
 
 static void received_set(struct received_projection *received, const struct upload *upload, int index,
-			 const uint8_t sha256[32])
+			 const struct sum *sum)
 {
 	received->scan = upload->scan;
 	received->index = index;
-	memcpy(received->sha256, sha256, 32);
+	received->sum = *sum;
 	received->stored = false;
 }
 
@@ -215,13 +217,47 @@ static int gather(struct slot *const slots[], int count, struct received_project
 		const struct upload *upload = slots[i]->upload;
 
 		if (slots[i]->data != NULL)
-			received_set(&batch[total++], upload, slots[i]->index, slots[i]->sha256);
+			received_set(&batch[total++], upload, slots[i]->index, &slots[i]->sum);
 		for (int j = 0; slots[i]->data == NULL && j < slots[i]->weight; j++)
-			received_set(&batch[total++], upload, upload->held[j].index, upload->held[j].sha256);
+			received_set(&batch[total++], upload, upload->held[j].index, &upload->held[j].sum);
 	}
 	*ret_batch = batch;
 	*ret_total = total;
 	return 0;
+}
+
+/*
+ * The records of a batch into projections.sums, in the order in which it will be stored; they are synced with the
+ * samples. `number` is the batch's.
+ */
+static int write_sums(unsigned long long number, struct slot *const slots[], int count,
+		      struct received_projection *batch, struct error *err)
+{
+	enum { MOST = 1 << 24 }; /* projections in a batch: BATCH_SLOTS times VIEWS_MAX */
+	int at = 0;
+
+	for (int i = 0; i < count; i++) {
+		for (int j = 0; j < slots[i]->weight; j++, at++) {
+			if (stored_scan_put_sum(&batch[at], slots[i]->upload->sums, number * MOST + (unsigned)at,
+						err) != 0)
+				return err->code;
+		}
+	}
+	return 0;
+}
+
+/* What was not stored has no record; unsynced, since what it would say is true. */
+static void take_back_sums(struct slot *const slots[], int count, const struct received_projection *batch, bool all)
+{
+	struct error ignored;
+	int at = 0;
+
+	for (int i = 0; i < count; i++) {
+		for (int j = 0; j < slots[i]->weight; j++, at++) {
+			if (all || !batch[at].stored)
+				sums_put(slots[i]->upload->sums, batch[at].index, NULL, &ignored);
+		}
+	}
 }
 
 static int why_not_stored(const struct received_projection *projection, struct error *err)
@@ -242,21 +278,25 @@ static void await_turn(struct uploads *uploads, unsigned long long batch)
 	pthread_mutex_unlock(&uploads->lock);
 }
 
-/* The bytes, then the rows. */
+/* The bytes and their records, then the rows. */
 static int commit(struct uploads *uploads, unsigned long long number, struct slot *const slots[], int count,
 		  struct error *err)
 {
 	struct received_projection *batch = NULL;
 	int total = 0, at = 0, code;
 
-	code = sync_batch(uploads, slots, count, err);
+	code = gather(slots, count, &batch, &total, err);
+	if (code == 0)
+		code = write_sums(number, slots, count, batch, err);
+	if (code == 0)
+		code = sync_batch(uploads, slots, count, err);
 	if (code == 0)
 		code = check_trust(uploads, err);
-	if (code == 0)
-		code = gather(slots, count, &batch, &total, err);
 	await_turn(uploads, number);
 	if (code == 0)
 		code = store_put_projections(uploads->store, batch, total, err);
+	if (batch != NULL)
+		take_back_sums(slots, count, batch, code != 0);
 	for (int i = 0; i < count && code == 0; i++) {
 		slots[i]->outcome = SLOT_CREATED;
 		slots[i]->committed = true;
@@ -306,7 +346,7 @@ static void settle(struct uploads *uploads, struct slot *slot)
 		break;
 	case SLOT_HELD:
 		upload->held[upload->held_count].index = slot->index;
-		memcpy(upload->held[upload->held_count++].sha256, slot->sha256, sizeof(slot->sha256));
+		upload->held[upload->held_count++].sum = slot->sum;
 		break;
 	default:
 		if (upload->error.code == 0)

@@ -14,6 +14,7 @@
  *
  *   scan.json        the document of POST /v1/scans
  *   projections.raw  [view][row][column] of the scan's sample type, preallocated
+ *   projections.sums checksums of all these files (proto/sums.h); the daemon always has them
  *   flat.f32 dark.f32  [row][column] float32, where given
  *   defects.u8         [row][column] bytes, not zero where a pixel is defective, where given
  *

@@ -117,20 +117,26 @@ void state_put(struct state *state, struct stored_scan *scan, int first, int las
 	struct error err = {0};
 	float pixels[12] = {1};
 	enum claim claim;
-	int file, count = last - first + 1;
+	int file, sums, count = last - first + 1;
 
 	ck_assert_int_le(count, 64);
 	ck_assert_int_eq(stored_scan_open(scan, true, &file, &err), 0);
+	ck_assert_int_eq(stored_scan_open_sums(scan, &sums, &err), 0);
 	for (int i = 0; i < count; i++) {
 		ck_assert_int_eq(stored_scan_claim(scan, first + i, &claim, &err), 0);
 		ck_assert_int_eq(claim, CLAIM_GRANTED);
 		ck_assert_int_eq(pwrite(file, pixels, sizeof(pixels), (off_t)sizeof(pixels) * (first + i)),
 				 (ssize_t)sizeof(pixels));
 		batch[i] = (struct received_projection){.scan = scan, .index = first + i};
-		memset(batch[i].sha256, mark, sizeof(batch[i].sha256));
+		batch[i].sum.crc = checksum(0, pixels, sizeof(pixels));
+		batch[i].sum.bytes = sizeof(pixels);
+		memset(batch[i].sum.sha256, mark, sizeof(batch[i].sum.sha256));
+		ck_assert_int_eq(stored_scan_put_sum(&batch[i], sums, (uint64_t)++state->turns, &err), 0);
 	}
 	ck_assert_int_eq(fdatasync(file), 0);
+	ck_assert_int_eq(fdatasync(sums), 0);
 	close(file);
+	close(sums);
 	ck_assert_msg(store_put_projections(state->store, batch, count, &err) == 0, "%s", err.text);
 	for (int i = 0; i < count; i++)
 		ck_assert(batch[i].stored);

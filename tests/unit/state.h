@@ -10,6 +10,7 @@ struct state {
 	struct store *store;
 	struct jobs *jobs;
 	int failures; /* calls of the store's failed hook */
+	int turns;    /* projections that state_put has stored */
 };
 
 void state_open(struct state *state);   /* a new directory */
@@ -24,7 +25,7 @@ void path_fill(const char *path); /* a file of a few bytes */
 
 /* A scan of `count` projections of 4 x 3 pixels; intensity: without air. */
 struct stored_scan *state_scan(struct state *state, int count, bool intensity);
-/* Claims, writes, syncs and records projections first .. last, digest bytes all `mark`. */
+/* Claims, writes, syncs and records projections first .. last with their checksums, digest bytes all `mark`. */
 void state_put(struct state *state, struct stored_scan *scan, int first, int last, int mark);
 /* FDK and two SART iterations. */
 struct job *state_post(struct state *state, struct stored_scan *scan, const char *priority);

@@ -2,6 +2,7 @@
 #include <check.h>
 #include <errno.h>
 #include <signal.h>
+#include <sqlite3.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -45,7 +46,7 @@ START_TEST(projections_are_known_again_after_a_restart)
 {
 	struct stored_scan *scan = state_scan(&state, 10, false);
 	unsigned char flags[10];
-	uint8_t digest[32];
+	struct sum sum;
 	char id[ID_SIZE];
 
 	memcpy(id, stored_scan_id(scan), sizeof(id));
@@ -56,10 +57,10 @@ START_TEST(projections_are_known_again_after_a_restart)
 	scan = find(id);
 	stored_scan_received(scan, flags);
 	ck_assert_mem_eq(flags, ((unsigned char[]){1, 0, 0, 0, 0, 0, 0, 1, 1, 0}), 10);
-	ck_assert(stored_scan_digest(scan, 8, digest));
+	ck_assert(stored_scan_sum(scan, 8, &sum));
 	for (int i = 0; i < 32; i++)
-		ck_assert_uint_eq(digest[i], 0xab);
-	ck_assert(!stored_scan_digest(scan, 9, digest));
+		ck_assert_uint_eq(sum.sha256[i], 0xab);
+	ck_assert(!stored_scan_sum(scan, 9, &sum));
 	ck_assert_int_eq(facts_of(scan).received, 3);
 	ck_assert(!facts_of(scan).complete);
 	ck_assert_str_eq(stored_scan_parsed(scan)->name, "a scan");
@@ -335,7 +336,92 @@ START_TEST(arrivals_are_told_in_their_order)
 	state_reopen(&state);
 	scan = find(id);
 	ck_assert_int_eq(stored_scan_arrivals(scan, 0, order, 8), 5);
-	ck_assert_mem_eq(order, ((int[]){0, 1, 5, 6, 7}), 5 * sizeof(int)); /* by their numbers, those of before */
+	ck_assert_mem_eq(order, ((int[]){5, 6, 0, 1, 7}), 5 * sizeof(int)); /* the same bits after a restart, too */
+	state_put(&state, scan, 2, 2, 1);
+	stored_scan_release(scan);
+	state_reopen(&state);
+	scan = find(id);
+	ck_assert_int_eq(stored_scan_arrivals(scan, 0, order, 8), 6);
+	ck_assert_mem_eq(order, ((int[]){5, 6, 0, 1, 7, 2}), 6 * sizeof(int));
+	stored_scan_release(scan);
+}
+END_TEST
+
+/* The catalogue forgets; no daemon runs. */
+static void change_catalogue(const char *statement)
+{
+	sqlite3 *db;
+
+	state_close(&state);
+	ck_assert_int_eq(sqlite3_open(state_path(&state, "catalogue.sqlite"), &db), SQLITE_OK);
+	ck_assert_int_eq(sqlite3_exec(db, statement, NULL, NULL, NULL), SQLITE_OK);
+	sqlite3_close(db);
+	state_reopen(&state);
+}
+
+START_TEST(what_was_acknowledged_is_found_again_beside_its_data)
+{
+	struct stored_scan *scan = state_scan(&state, 10, true);
+	float pixels[12] = {3};
+	struct error err = {0};
+	unsigned char flags[10];
+	struct sum sum;
+	char id[ID_SIZE];
+	int order[10];
+	bool new;
+
+	memcpy(id, stored_scan_id(scan), sizeof(id));
+	state_put(&state, scan, 7, 8, 0xab);
+	state_put(&state, scan, 0, 1, 0xcd);
+	ck_assert_int_eq(store_put_image(state.store, scan, IMAGE_FLAT, pixels, &new, &err), 0);
+	ck_assert_int_eq(store_scan_close(state.store, scan, &err), 0);
+	stored_scan_release(scan);
+	change_catalogue("DELETE FROM projections WHERE view <> 0; UPDATE projections SET sha256 = zeroblob(32);"
+			 "UPDATE scans SET flat = NULL, closed = 0;");
+	for (int starts = 0; starts < 2; starts++) { /* and are in the catalogue again */
+		scan = find(id);
+		stored_scan_received(scan, flags);
+		ck_assert_mem_eq(flags, ((unsigned char[]){1, 1, 0, 0, 0, 0, 0, 1, 1, 0}), 10);
+		ck_assert(stored_scan_sum(scan, 0, &sum));
+		ck_assert_uint_eq(sum.sha256[31], 0xcd);
+		ck_assert_uint_eq(sum.bytes, sizeof(pixels));
+		ck_assert_int_eq(stored_scan_arrivals(scan, 0, order, 10), 4);
+		ck_assert_mem_eq(order, ((int[]){7, 8, 0, 1}), 4 * sizeof(int));
+		ck_assert(facts_of(scan).flat && facts_of(scan).closed && facts_of(scan).ready);
+		stored_scan_release(scan);
+		state_reopen(&state);
+	}
+	ck_assert(path_exists(state_path(&state, "scans/%s/flat.f32", id)));
+}
+END_TEST
+
+START_TEST(a_file_of_checksums_that_is_lost_is_made_again)
+{
+	struct stored_scan *scan = state_scan(&state, 4, false);
+	struct error err = {0};
+	struct sum sum;
+	char id[ID_SIZE];
+	int file;
+
+	memcpy(id, stored_scan_id(scan), sizeof(id));
+	state_put(&state, scan, 0, 2, 1);
+	stored_scan_release(scan);
+	state_close(&state);
+	ck_assert_int_eq(unlink(state_path(&state, "scans/%s/projections.sums", id)), 0);
+	state_reopen(&state);
+	scan = find(id);
+	ck_assert_int_eq(facts_of(scan).received, 3);
+	ck_assert(stored_scan_sum(scan, 1, &sum));
+	ck_assert_uint_eq(sum.sha256[0], 1); /* from the catalogue */
+	ck_assert_uint_eq(sum.bytes, 0);
+	ck_assert_int_eq(stored_scan_open_sums(scan, &file, &err), 0);
+	close(file);
+	state_put(&state, scan, 3, 3, 2);
+	stored_scan_release(scan);
+	state_reopen(&state);
+	scan = find(id);
+	ck_assert(stored_scan_sum(scan, 3, &sum));
+	ck_assert_uint_eq(sum.bytes, 48);
 	stored_scan_release(scan);
 }
 END_TEST
@@ -450,6 +536,8 @@ Suite *store_suite(void)
 	tcase_add_test(tests, a_state_directory_has_one_daemon);
 	tcase_add_test(tests, a_failed_commit_is_final_and_nothing_is_acknowledged);
 	tcase_add_test(tests, arrivals_are_told_in_their_order);
+	tcase_add_test(tests, what_was_acknowledged_is_found_again_beside_its_data);
+	tcase_add_test(tests, a_file_of_checksums_that_is_lost_is_made_again);
 	tcase_add_test(tests, a_scan_that_is_closed_is_what_is_there);
 	tcase_add_test(tests, a_scan_that_is_complete_need_not_be_closed);
 	tcase_add_test(tests, watchers_hear_of_projections_and_of_the_end);
