@@ -2,7 +2,8 @@
  * The catalogue: one SQLite database in WAL mode.
  *
  * Every commit is synced (synchronous = FULL): one append to the log and one
- * fdatasync. The log is moved into the database by a thread of its own, so that
+ * fdatasync; but for projections, whose records beside the samples are synced
+ * (store_sums.c). The log is moved into the database by a thread of its own, so that
  * no commit waits for that. One connection writes, another reads and never
  * waits for the writer.
  */
@@ -283,11 +284,21 @@ static int run_plain(struct connection *connection, const char *sql, struct erro
 	return query_run(&query);
 }
 
-int store_begin(struct store *store, struct error *err)
+/* How commits reach the disk; not within a transaction. writer.lock is held. */
+static void set_unsynced(struct store *store, bool unsynced)
+{
+	if (store->unsynced != unsynced)
+		sqlite3_exec(store->writer.db, unsynced ? "PRAGMA synchronous = NORMAL" : "PRAGMA synchronous = FULL",
+			     NULL, NULL, NULL);
+	store->unsynced = unsynced;
+}
+
+static int begin(struct store *store, bool unsynced, struct error *err)
 {
 	int code;
 
 	pthread_mutex_lock(&store->writer.lock);
+	set_unsynced(store, unsynced);
 	if (atomic_load(&store->failed))
 		code = error_set(err, ERR_IO, "the catalogue has failed before; nothing more is stored");
 	else
@@ -295,6 +306,16 @@ int store_begin(struct store *store, struct error *err)
 	if (code != 0)
 		pthread_mutex_unlock(&store->writer.lock);
 	return code;
+}
+
+int store_begin(struct store *store, struct error *err)
+{
+	return begin(store, false, err);
+}
+
+int store_begin_unsynced(struct store *store, struct error *err)
+{
+	return begin(store, true, err);
 }
 
 int store_end(struct store *store, int code, struct error *err)

@@ -19,7 +19,9 @@
  *                           projections.sums (proto/sums.h)
  *   STATE/jobs/ID/          NAME.nii, checkpoint.f32
  *
- * A call that returns 0 has its change on the disk. The order is always: files
+ * A call that returns 0 has its change on the disk: in the catalogue, or for
+ * projections in their records (projections.sums), which their rows follow at
+ * the next start. The order is always: files
  * first, synced, then the row; and on the way out: the row, then the files. So
  * a crash leaves at most files that no row knows, and store_open removes them.
  * A volume's row comes before its file is synced, which its job waits for before

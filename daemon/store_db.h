@@ -33,6 +33,7 @@ struct store {
 	struct store_hooks hooks;
 	int lock_file;
 	struct connection writer, reader;
+	bool unsynced;       /* of the writer's commits; guarded by writer.lock */
 	_Atomic bool failed; /* a commit did not reach the disk: nothing is acknowledged any more */
 	atomic_flag failure_told;
 	long long event_written; /* by the transaction under way, 0: none; guarded by writer.lock */
@@ -84,6 +85,11 @@ int name_index(const char *name, const char *const *names, int count);
 
 /* Locks the writer and begins; on failure nothing is locked. */
 int store_begin(struct store *store, struct error *err);
+/*
+ * The same of a commit that a power cut may take until a later one is synced: for rows that the next start finds again
+ * beside their data.
+ */
+int store_begin_unsynced(struct store *store, struct error *err);
 /* Commits when code is 0, else rolls back; unlocks. Returns code, or why the commit failed. */
 int store_end(struct store *store, int code, struct error *err);
 

@@ -919,7 +919,7 @@ int store_put_projections(struct store *store, struct received_projection *batch
 {
 	unsigned stored = 0;
 	struct timespec now;
-	int code = store_begin(store, err);
+	int code = store_begin_unsynced(store, err);
 
 	if (code == 0)
 		code = store_end(store, insert_projections(store, batch, count, err), err);
