@@ -90,7 +90,7 @@ static int reply_not_modified(struct request *request, const struct entity *enti
 
 static int reply_range_outside(struct request *request, const struct entity *entity, struct error *err)
 {
-	if (request_reply_problem(request, 416, err, "Range is \"%.60s\", the body has %" PRIu64 " bytes",
+	if (request_reply_problem(request, "range-outside", err, "Range is \"%.60s\", the body has %" PRIu64 " bytes",
 				  request_header(request, "Range"), entity->size) != 0)
 		return err->code;
 	request_reply_header(request, "Content-Range", "bytes */%" PRIu64, entity->size);

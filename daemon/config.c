@@ -35,6 +35,8 @@ static const struct setting {
 #define FIELD(member) offsetof(struct config, member)
     {"listen", "ADDR:PORT|unix:PATH", KIND_LIST, FIELD(listen), "127.0.0.1:2228", 0, 0, NULL,
      "where to accept requests; loopback or Unix sockets; may be given again; port 0: the kernel chooses"},
+    {"server-name", "NAME", KIND_LIST, FIELD(server_names), "", 0, 0, NULL,
+     "a name that requests may give as Host, beside localhost and the listening addresses; may be given again"},
     {"state-dir", "DIR", KIND_TEXT, FIELD(state_dir), NULL, 0, 0, NULL,
      "where scans, volumes and the catalogue are kept; $STATE_DIRECTORY, else $XDG_STATE_HOME/cbctd"},
     {"backend", "NAME", KIND_CHOICE, FIELD(backend), "auto", 0, 0, backend_choices,

@@ -14,7 +14,9 @@
  * default.
  */
 struct config {
-	char *listen;      /* ADDR:PORT and unix:PATH, separated by commas */
+	char *listen; /* ADDR:PORT and unix:PATH, separated by commas */
+	char
+	    *server_names; /* that Host may have beside localhost and the addresses, separated by commas; "" for none */
 	char *state_dir;   /* where everything is kept */
 	char *backend;     /* "auto", "cuda", "cpu" */
 	char *config_file; /* "" for none */

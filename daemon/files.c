@@ -109,3 +109,27 @@ int space_free(const char *path, unsigned long long *ret_bytes, struct error *er
 	*ret_bytes = (unsigned long long)space.f_bavail * space.f_frsize;
 	return 0;
 }
+
+void path_hide(char *text, const char *directory)
+{
+	size_t length = strlen(directory);
+	char *found;
+
+	while (length > 0 && directory[length - 1] == '/')
+		length--;
+	if (length == 0)
+		return;
+	for (char *from = text; (found = strchr(from, directory[0])) != NULL; from = found) {
+		char *end, *name;
+
+		if (strncmp(found, directory, length) != 0 || found[length] != '/') {
+			found++;
+			continue;
+		}
+		end = found + length + strcspn(found + length, " \t\"',:;");
+		for (name = end; name[-1] != '/'; name--)
+			;
+		memmove(found, name, strlen(name) + 1);
+		found += end - name;
+	}
+}

@@ -28,4 +28,10 @@ bool name_is_temporary(const char *name);
 /* Bytes that an unprivileged process may still write where `path` is. */
 int space_free(const char *path, unsigned long long *ret_bytes, struct error *err);
 
+/*
+ * For texts that leave the machine: each path in `text` that begins with
+ * `directory` becomes its last component.
+ */
+void path_hide(char *text, const char *directory);
+
 #endif

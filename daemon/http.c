@@ -331,7 +331,8 @@ int http_new(const struct http_options *options, struct http **ret_http, struct 
 	pthread_condattr_setclock(&monotonic, CLOCK_MONOTONIC);
 	pthread_cond_init(&http->clock_kick, &monotonic);
 	pthread_condattr_destroy(&monotonic);
-	if (listeners_open(options->listen, http->listeners, &http->listener_count, err) != 0) {
+	if (server_names_check(options->server_names, err) != 0 ||
+	    listeners_open(options->listen, http->listeners, &http->listener_count, err) != 0) {
 		http_free(http);
 		return err->code;
 	}

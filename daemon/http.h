@@ -48,6 +48,8 @@ struct route {
 
 struct http_options {
 	const char *listen;         /* as config.listen */
+	const char *server_names;   /* as config.server_names */
+	const char *state_dir;      /* paths in it are not told to clients */
 	const struct route *routes; /* ends with method == NULL */
 	void *context;              /* the handlers' */
 	int threads;
@@ -147,10 +149,11 @@ void request_reply_header(struct request *request, const char *name, const char 
     __attribute__((format(printf, 3, 4)));
 
 /*
- * A problem document of a status that no error code stands for (405, 415, 416 ...).
- * Counts as a reply.
+ * A problem document by the name that ends its type ("range-outside", a row of
+ * problems[] in http_reply.c), for those that no error code stands for. Counts
+ * as a reply.
  */
-int request_reply_problem(struct request *request, int status, struct error *err, const char *format, ...)
+int request_reply_problem(struct request *request, const char *name, struct error *err, const char *format, ...)
     __attribute__((format(printf, 4, 5)));
 
 #endif

@@ -84,7 +84,8 @@ struct request {
 };
 
 struct listener {
-	int socket;          /* -1 once closed */
+	int socket; /* -1 once closed */
+	struct sockaddr_storage address;
 	char name[160];      /* "http://127.0.0.1:2228", "unix:/run/x" */
 	char unix_path[108]; /* to be removed at the end; "" for TCP */
 	struct MHD_Daemon *daemon;
@@ -141,6 +142,12 @@ struct request *request_new(struct http *http, struct connection *connection, co
 void request_free(struct request *request); /* NULL is fine */
 /* Method, framing, route; 0, or the reply is set (code < 0 when it is not). */
 int request_read_header(struct request *request, const char *method, struct error *err);
+
+/* ---- http_origin.c: who is addressed, and by whose page ---- */
+/* ERR_INVALID for a list of server names in which one is none. */
+int server_names_check(const char *names, struct error *err);
+/* Host, Origin, Sec-Fetch-Site; 0, or 0 with a reply that refuses, or an error. */
+int request_check_origin(struct request *request, struct error *err);
 
 /* ---- http_reply.c ---- */
 int reply_problem_of(struct request *request, const struct error *err);

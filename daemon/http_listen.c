@@ -29,21 +29,22 @@ static bool is_loopback(const struct sockaddr *address)
 	return false;
 }
 
-/* "http://127.0.0.1:2228" with the port that the kernel chose. */
-static int name_socket(int socket, char *ret_name, size_t size, struct error *err)
+/* Address and name, "http://127.0.0.1:2228", with the port that the kernel chose. */
+static int name_socket(struct listener *listener, struct error *err)
 {
-	struct sockaddr_storage bound;
-	socklen_t length = sizeof(bound);
+	struct sockaddr_storage *bound = &listener->address;
+	socklen_t length = sizeof(*bound);
 	char host[NI_MAXHOST], port[NI_MAXSERV];
 	bool six;
 
-	if (getsockname(socket, (struct sockaddr *)&bound, &length) != 0)
+	if (getsockname(listener->socket, (struct sockaddr *)bound, &length) != 0)
 		return error_set_errno(err, errno, "address of the listening socket");
-	if (getnameinfo((struct sockaddr *)&bound, length, host, sizeof(host), port, sizeof(port),
+	if (getnameinfo((struct sockaddr *)bound, length, host, sizeof(host), port, sizeof(port),
 			NI_NUMERICHOST | NI_NUMERICSERV) != 0)
 		return error_set(err, ERR_IO, "the listening socket's address has no name");
-	six = bound.ss_family == AF_INET6;
-	snprintf(ret_name, size, "http://%s%.64s%s:%.8s", six ? "[" : "", host, six ? "]" : "", port);
+	six = bound->ss_family == AF_INET6;
+	snprintf(listener->name, sizeof(listener->name), "http://%s%.64s%s:%.8s", six ? "[" : "", host, six ? "]" : "",
+		 port);
 	return 0;
 }
 
@@ -57,7 +58,7 @@ static int bind_tcp(const struct addrinfo *address, const char *text, struct lis
 	setsockopt(listener->socket, SOL_SOCKET, SO_REUSEADDR, &one, sizeof(one));
 	if (bind(listener->socket, address->ai_addr, address->ai_addrlen) != 0)
 		return error_set_errno(err, errno, "listen on %s", text);
-	return name_socket(listener->socket, listener->name, sizeof(listener->name), err);
+	return name_socket(listener, err);
 }
 
 /* ADDR:PORT with a numeric address, [ADDR]:PORT for IPv6, or localhost:PORT. */

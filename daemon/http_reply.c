@@ -11,6 +11,8 @@
 #include <string.h>
 #include <unistd.h>
 
+#include "daemon/files.h"
+#include "daemon/log.h"
 #include "proto/json.h"
 
 /* `name` ends the type, urn:cbctd:problem:NAME: it is stable, clients switch on it. The first of a code is its own. */
@@ -31,12 +33,14 @@ static const struct problem {
     {ERR_CANCELLED, 503, "cancelled", "The request was given up"},
     {ERR_BUSY, 503, "busy", "Not just now"},
     {ERR_INTERNAL, 500, "internal", "The daemon broke a promise of its own"},
+    {0, 403, "foreign-origin", "A page of another site may not do this"},
     {0, 405, "method-not-allowed", "The resource does not know this method"},
     {0, 411, "length-required", "The request needs a body"},
     {0, 415, "unsupported-encoding", "The body's encoding is not known"},
+    {0, 415, "unsupported-media-type", "The body is of another type"},
     {0, 416, "range-outside", "The range lies outside of the body"},
+    {0, 421, "misdirected", "The request is for another server"},
     {0, 429, "too-many-connections", "Too many connections from this address"},
-    {0, 503, "busy", "Not just now"},
 };
 enum { PROBLEM_COUNT = sizeof(problems) / sizeof(problems[0]) };
 
@@ -49,12 +53,13 @@ static const struct problem *problem_of_code(int code)
 	return problem_of_code(ERR_INTERNAL);
 }
 
-static const struct problem *problem_of_status(int status)
+static const struct problem *problem_named(const char *name)
 {
 	for (int i = 0; i < PROBLEM_COUNT; i++) {
-		if (problems[i].code == 0 && problems[i].status == status)
+		if (strcmp(problems[i].name, name) == 0)
 			return &problems[i];
 	}
+	assert(!"a row of problems[]");
 	return problem_of_code(ERR_INTERNAL);
 }
 
@@ -217,16 +222,23 @@ static int reply_problem(struct request *request, const struct problem *problem,
 int reply_problem_of(struct request *request, const struct error *err)
 {
 	const struct problem *problem = problem_of_code(err->code);
+	char detail[sizeof(err->text)];
 	struct error unable;
+
+	/* What the daemon is to blame for is for its operator: clients do not see paths. */
+	if (problem->status >= 500 && problem->status != 503)
+		log_line(LEVEL_WARNING, "request id=%s: %s", request->id, err->text);
+	snprintf(detail, sizeof(detail), "%s", err->text);
+	path_hide(detail, request->http->options.state_dir);
 
 	if (request->response != NULL) { /* it failed after it had begun to answer */
 		MHD_destroy_response(request->response);
 		request->response = NULL;
 	}
-	return reply_problem(request, problem, err->text, err->pointer, &unable);
+	return reply_problem(request, problem, detail, err->pointer, &unable);
 }
 
-int request_reply_problem(struct request *request, int status, struct error *err, const char *format, ...)
+int request_reply_problem(struct request *request, const char *name, struct error *err, const char *format, ...)
 {
 	char detail[sizeof(err->text)];
 	va_list args;
@@ -234,7 +246,7 @@ int request_reply_problem(struct request *request, int status, struct error *err
 	va_start(args, format);
 	vsnprintf(detail, sizeof(detail), format, args);
 	va_end(args);
-	return reply_problem(request, problem_of_status(status), detail, "", err);
+	return reply_problem(request, problem_named(name), detail, "", err);
 }
 
 bool reply_send(struct request *request)

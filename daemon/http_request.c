@@ -148,8 +148,8 @@ static int find_route(struct request *request, char *const segments[], int count
 	}
 	if (allow[0] == '\0')
 		return error_set(err, ERR_NOT_FOUND, "there is nothing at %.200s", request->target);
-	if (request_reply_problem(request, 405, err, "%s is not for this resource; allowed: %s", request->method,
-				  allow) != 0)
+	if (request_reply_problem(request, "method-not-allowed", err, "%s is not for this resource; allowed: %s",
+				  request->method, allow) != 0)
 		return err->code;
 	request_reply_header(request, "Allow", "%s", allow);
 	return 0;
@@ -224,16 +224,39 @@ static int read_framing(struct request *request, struct error *err)
 	return 0;
 }
 
+/*
+ * A page of another site may send plain text and forms without being asked
+ * first; JSON it may not. So what changes something comes as JSON or without a
+ * body, but for streams of samples: those need PUT, which is asked for as well.
+ */
+static bool must_be_json(const struct request *request)
+{
+	bool has_body = request->chunked || request->content_length > 0;
+
+	if (request->route->body == BODY_NONE)
+		return has_body && strcmp(request->route->method, "GET") != 0;
+	return request->route->body == BODY_WHOLE && request->framed;
+}
+
 static int check_body(struct request *request, struct error *err)
 {
 	const struct route *route = request->route;
-	const char *encoding = MHD_lookup_connection_value(request->mhd, MHD_HEADER_KIND, "Content-Encoding");
+	const char *encoding = request_header(request, "Content-Encoding"),
+		   *type = request_header(request, "Content-Type");
 
+	if (strcmp(request->method, "PUT") == 0 && request_header(request, "Content-Range") != NULL)
+		return error_set(err, ERR_INVALID,
+				 "Content-Range is \"%.60s\", but a PUT sends the whole (RFC 9110, 14.5)",
+				 request_header(request, "Content-Range"));
+	if (must_be_json(request) && !media_type_is_json(type))
+		return request_reply_problem(
+		    request, "unsupported-media-type", err, "Content-Type is %s%.60s%s, expected application/json",
+		    type != NULL ? "\"" : "", type != NULL ? type : "not given", type != NULL ? "\"" : "");
 	if (route->body == BODY_WHOLE && encoding != NULL && strcasecmp(encoding, "identity") != 0)
-		return request_reply_problem(request, 415, err,
+		return request_reply_problem(request, "unsupported-encoding", err,
 					     "Content-Encoding is \"%.40s\", a document comes as it is", encoding);
 	if (route->body != BODY_NONE && !request->framed)
-		return request_reply_problem(request, 411, err,
+		return request_reply_problem(request, "length-required", err,
 					     "neither Content-Length nor Transfer-Encoding tells of a body");
 	if (route->body == BODY_WHOLE && request->content_length > (int64_t)route->body_max)
 		return error_set(err, ERR_TOO_LARGE, "the body has %" PRId64 " bytes, at most %zu are taken",
@@ -246,7 +269,8 @@ static int refuse_connection(struct request *request, struct error *err)
 	int status = request->connection->refused;
 
 	request->close = true;
-	if (request_reply_problem(request, status, err, "%ld connections%s are open already",
+	if (request_reply_problem(request, status == 429 ? "too-many-connections" : "busy", err,
+				  "%ld connections%s are open already",
 				  status == 429 ? request->http->options.max_connections_per_address
 						: request->http->options.max_connections,
 				  status == 429 ? " of this address" : "") != 0)
@@ -275,6 +299,8 @@ int request_read_header(struct request *request, const char *method, struct erro
 	else if (atomic_load(&request->http->stopping))
 		code = error_set(err, ERR_BUSY, "the daemon is stopping");
 	else
+		code = request_check_origin(request, err);
+	if (code == 0 && request->response == NULL)
 		code = read_target(request, err);
 	if (code == 0 && request->response == NULL)
 		code = check_body(request, err);

@@ -199,6 +199,66 @@ bool prefer_wait(const char *header, double *ret_seconds)
 	return false;
 }
 
+bool authority_parse(const char *text, size_t length, char ret_host[HOST_MAX], long *ret_port)
+{
+	static const char name[] = "abcdefghijklmnopqrstuvwxyz0123456789.-_", literal[] = "abcdef0123456789:.";
+	bool bracketed = length > 0 && text[0] == '[';
+	size_t i = bracketed ? 1 : 0;
+	long port = -1;
+
+	while (i < length && i < HOST_MAX - 2 &&
+	       strchr(bracketed ? literal : name, tolower((unsigned char)text[i])) != NULL && text[i] != '\0')
+		i++;
+	if (bracketed && (i == length || text[i++] != ']'))
+		return false;
+	if (i == 0 || i > HOST_MAX - 1 || (i < length && text[i] != ':'))
+		return false;
+	if (i + 1 < length && !index_parse(text + i + 1, length - i - 1, 65535, &port))
+		return false;
+	for (size_t k = 0; k < i; k++)
+		ret_host[k] = (char)tolower((unsigned char)text[k]);
+	ret_host[i] = '\0';
+	*ret_port = port;
+	return true;
+}
+
+bool origin_parse(const char *text, char ret_host[HOST_MAX], long *ret_port)
+{
+	static const struct {
+		const char *prefix;
+		long port;
+	} schemes[] = {{"http://", 80}, {"https://", 443}};
+	long port;
+
+	for (size_t i = 0; i < sizeof(schemes) / sizeof(*schemes); i++) {
+		size_t length = strlen(schemes[i].prefix);
+
+		if (strncasecmp(text, schemes[i].prefix, length) != 0)
+			continue;
+		if (!authority_parse(text + length, strlen(text + length), ret_host, &port))
+			return false;
+		*ret_port = port >= 0 ? port : schemes[i].port;
+		return true;
+	}
+	return false;
+}
+
+bool media_type_is_json(const char *header)
+{
+	static const char json[] = "application/json", suffix[] = "+json";
+	size_t length;
+
+	if (header == NULL)
+		return false;
+	length = strcspn(header, " \t;,");
+	if (header[length + strspn(header + length, " \t")] != ';' &&
+	    header[length + strspn(header + length, " \t")] != '\0')
+		return false;
+	return (length == sizeof(json) - 1 && strncasecmp(header, json, length) == 0) ||
+	       (length > sizeof(suffix) &&
+		strncasecmp(header + length - (sizeof(suffix) - 1), suffix, sizeof(suffix) - 1) == 0);
+}
+
 bool number_parse(const char *text, double least, double most, double *ret)
 {
 	double value;

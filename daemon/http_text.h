@@ -41,6 +41,22 @@ int content_digest_parse(const char *header /* or NULL */, bool *ret_given, uint
 /* The N of "wait=N" in a Prefer header (RFC 7240); false when there is none. */
 bool prefer_wait(const char *header /* or NULL */, double *ret_seconds);
 
+/*
+ * An authority without user information (RFC 3986, 3.2): uri-host [":" port],
+ * as in Host. *ret_host is a copy of the host in lower case, brackets included;
+ * *ret_port is -1 where none is given. False when it is malformed or longer
+ * than HOST_MAX - 1.
+ */
+enum { HOST_MAX = 256 };
+bool authority_parse(const char *text, size_t length, char ret_host[HOST_MAX], long *ret_port);
+/*
+ * A serialised origin (RFC 6454, 6.2) of http or https; the port is the
+ * scheme's where none is given. False for all others, "null" included.
+ */
+bool origin_parse(const char *text, char ret_host[HOST_MAX], long *ret_port);
+/* application/json or another type with the suffix +json, whatever its parameters. NULL: no. */
+bool media_type_is_json(const char *header);
+
 /* A plain decimal number from `least` to `most`, nothing around it. */
 bool number_parse(const char *text, double least, double most, double *ret);
 /* Digits only; false when it is none or above `most`. */

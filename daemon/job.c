@@ -11,6 +11,7 @@
 #include <unistd.h>
 
 #include "daemon/document.h"
+#include "daemon/files.h"
 #include "daemon/log.h"
 #include "proto/durable.h"
 #include "proto/json.h"
@@ -350,7 +351,8 @@ static void enter_running(struct job_record *record, enum job_state from, const 
 		snprintf(record->device, sizeof(record->device), "%s", change->device);
 }
 
-static void enter_end(struct job_record *record, const struct job_change *change)
+/* directory: of the store; what lies in it is named without it. */
+static void enter_end(struct job_record *record, const struct job_change *change, const char *directory)
 {
 	record->ended = time_of_day();
 	record->checkpoint = 0;
@@ -363,6 +365,7 @@ static void enter_end(struct job_record *record, const struct job_change *change
 		 change->error_pointer == NULL ? "" : change->error_pointer);
 	snprintf(record->error_text, sizeof(record->error_text), "%s",
 		 change->error_text == NULL ? "" : change->error_text);
+	path_hide(record->error_text, directory);
 }
 
 static int save_state(struct jobs *jobs, const struct job_record *record, enum job_past past, struct error *err)
@@ -400,7 +403,7 @@ static void next_record(struct job *job, enum job_state to, const struct job_cha
 	else if (to == JOB_RUNNING)
 		enter_running(ret, from, change, job->jobs);
 	else
-		enter_end(ret, change);
+		enter_end(ret, change, store_directory(job->jobs->store));
 }
 
 static void show_state(struct job *job, const struct job_record *record, const struct job_change *change)
@@ -428,7 +431,7 @@ static void show_state(struct job *job, const struct job_record *record, const s
 	log_line(record->state == JOB_FAILED ? LEVEL_WARNING : LEVEL_INFO, "job %s: %s -> %s%s%s%s%s", record->id,
 		 job_state_names[from], job_state_names[record->state], change->reason != NULL ? ", " : "",
 		 change->reason != NULL ? change->reason : "", record->state == JOB_FAILED ? ": " : "",
-		 record->state == JOB_FAILED ? record->error_text : "");
+		 record->state == JOB_FAILED && change->error_text != NULL ? change->error_text : "");
 }
 
 /* jobs->change is held; the caller wakes the watchers after it. */

@@ -60,6 +60,8 @@ static void block_signals(sigset_t *ret_stops)
 static int start_http(const struct config *config, struct api *api, struct error *err)
 {
 	const struct http_options options = {.listen = config->listen,
+					     .server_names = config->server_names,
+					     .state_dir = config->state_dir,
 					     .routes = api_routes,
 					     .context = api,
 					     .threads = (int)config->http_threads,

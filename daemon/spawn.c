@@ -108,7 +108,7 @@ int child_spawn(const struct spawn_options *options, struct child *ret_child, st
 	close(pair[1]);
 	if (result != 0) {
 		close(pair[0]);
-		return error_set_errno(err, result, "start of %s", options->worker);
+		return error_set_errno(err, result, "start of %s", basename(options->worker));
 	}
 	pidfd = pidfd_open(pid, 0);
 	if (pidfd < 0) {

@@ -547,6 +547,11 @@ int store_open(const char *directory, const struct store_hooks *hooks, struct st
 	return 0;
 }
 
+const char *store_directory(const struct store *store)
+{
+	return store->directory;
+}
+
 void store_close(struct store *store)
 {
 	if (store == NULL)

@@ -48,6 +48,8 @@ struct store_hooks {
 /* Makes STATE where it is missing. ERR_CONFLICT: another process has it. hooks may be NULL, else are copied. */
 int store_open(const char *directory, const struct store_hooks *hooks, struct store **ret_store, struct error *err);
 void store_close(struct store *store); /* NULL is fine; all references must be back */
+/* As it was given to store_open; lives as long as the store. */
+const char *store_directory(const struct store *store);
 
 struct store_statistics {
 	long scans;

@@ -522,8 +522,7 @@ int store_scan_create(struct store *store, struct scan *parsed, const struct sto
 	scan->references++;
 	make_recent(store, scan);
 	pthread_mutex_unlock(&store->scans_lock);
-	log_line(LEVEL_INFO, "scan %s \"%s\": %d projections of %d x %d", scan->id, scan->name, scan->count,
-		 scan->columns, scan->rows);
+	log_line(LEVEL_INFO, "scan %s: %d projections of %d x %d", scan->id, scan->count, scan->columns, scan->rows);
 	*ret_scan = scan;
 	return 0;
 out:

@@ -174,8 +174,8 @@ static int read_encoding(struct upload *upload, bool *ret_known, struct error *e
 	if (strcasecmp(encoding, "zstd") == 0)
 		return zdecoder_new(&upload->decoder, err);
 	*ret_known = false;
-	if (request_reply_problem(upload->request, 415, err, "Content-Encoding is \"%.60s\", expected zstd or none",
-				  encoding) != 0)
+	if (request_reply_problem(upload->request, "unsupported-encoding", err,
+				  "Content-Encoding is \"%.60s\", expected zstd or none", encoding) != 0)
 		return err->code;
 	request_reply_header(upload->request, "Accept-Encoding", "zstd");
 	return 0;

@@ -37,8 +37,8 @@ job_document() {
 
 : >"$work/results"
 for ((i = 0; i < repeats; i++)); do
-	scan=$(scan_document | curl -sf "$url/v1/scans" --data-binary @- | jq -r .id)
-	job=$(job_document | curl -sf "$url/v1/jobs" --data-binary @- | jq -r .id)
+	scan=$(scan_document | curl -sf "$url/v1/scans" -H 'Content-Type: application/json' --data-binary @- | jq -r .id)
+	job=$(job_document | curl -sf "$url/v1/jobs" -H 'Content-Type: application/json' --data-binary @- | jq -r .id)
 	sync
 	until curl -sf "$url/v1/jobs/$job" | jq -e '.plan != null' >/dev/null; do sleep 0.1; done # it is opened
 	"$BUILD/acquire" "${url##*:}" "$scan" "$job" "$work/all" "$views" "$one" "$rate" $connections >>"$work/results"

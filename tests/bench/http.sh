@@ -16,7 +16,7 @@ head -c $((one * count)) /dev/zero | tr '\0' '\100' >"$work/all"
 split -b $one -d -a 3 "$work/all" "$work/views/"
 
 new_scan() { # COLUMNS ROWS COUNT
-	curl -sf "$url/v1/scans" -d "{\"name\": \"bench\", \"detector\": {\"columns\": $1, \"rows\": $2, \"pixel_mm\": [0.8, 0.8]},
+	curl -sf "$url/v1/scans" -H 'Content-Type: application/json' -d "{\"name\": \"bench\", \"detector\": {\"columns\": $1, \"rows\": $2, \"pixel_mm\": [0.8, 0.8]},
 	  \"projections\": {\"count\": $3, \"sample\": \"float32\", \"quantity\": \"line_integral\"},
 	  \"geometry\": {\"kind\": \"circular\", \"source_to_isocentre_mm\": 620, \"source_to_detector_mm\": 1100,
 	  \"first_angle_deg\": 0, \"angle_step_deg\": $((360 / $3))}}" | jq -r .id
@@ -75,7 +75,7 @@ bench_put "upload, one body" send_whole 1
 # A small scan makes a large volume quickly.
 scan=$(new_scan 16 16 4)
 head -c $((16 * 16 * 4 * 4)) "$work/all" | curl -sf -o /dev/null -T - "$url/v1/scans/$scan/projections"
-job=$(curl -sf "$url/v1/jobs" -d "{\"scan\": \"$scan\", \"grid\": {\"size\": [512, 512, 512], \"spacing_mm\": [0.1, 0.1, 0.1]}, \"fdk\": {}}" | jq -r .id)
+job=$(curl -sf "$url/v1/jobs" -H 'Content-Type: application/json' -d "{\"scan\": \"$scan\", \"grid\": {\"size\": [512, 512, 512], \"spacing_mm\": [0.1, 0.1, 0.1]}, \"fdk\": {}}" | jq -r .id)
 until curl -sf "$url/v1/jobs/$job?wait=60" | jq -e '.state == "succeeded"' >/dev/null; do :; done
 
 get() { curl -sf -o /dev/null "$@"; }

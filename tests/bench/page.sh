@@ -16,7 +16,7 @@ start_daemon "$work" --backend cpu
 export CBCT_URL=$url
 "$BUILD/cbct" simulate --phantom head --scale 88 --density 0.02 --views 60 --columns 160 --rows 160 --pixel 2 --photons 100000 -o "$work/scan" >/dev/null
 scan=$("$BUILD/cbct" upload "$work/scan" 2>/dev/null)
-job=$(curl -sf "$url/v1/jobs" -d "{\"scan\": \"$scan\", \"grid\": {\"size\": [256, 256, 256], \"spacing_mm\": [0.8, 0.8, 0.8]}, \"fdk\": {}}" | jq -r .id)
+job=$(curl -sf "$url/v1/jobs" -H 'Content-Type: application/json' -d "{\"scan\": \"$scan\", \"grid\": {\"size\": [256, 256, 256], \"spacing_mm\": [0.8, 0.8, 0.8]}, \"fdk\": {}}" | jq -r .id)
 until curl -sf "$url/v1/jobs/$job?wait=60" | jq -e '.state == "succeeded"' >/dev/null; do :; done
 
 cp tests/bench/page.mjs "$tools/bench.mjs"

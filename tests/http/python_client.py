@@ -362,7 +362,7 @@ class Busy(Case):
         host, port = self.client.url.rpartition("//")[2].split(":")
         for _ in range(8):
             held.append(socket.create_connection((host, int(port))))
-            held[-1].sendall(b"GET /livez HTTP/1.1\r\nHost: t\r\n\r\n")
+            held[-1].sendall(b"GET /livez HTTP/1.1\r\nHost: localhost\r\n\r\n")
             held[-1].recv(1000)
         with cbctd.Client(patience=0) as hasty:
             with self.assertRaises(cbctd.Problem) as caught:

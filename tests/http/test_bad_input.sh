@@ -190,9 +190,9 @@ test_requests_that_are_no_requests() {
 		printf "$1" >"$work/request"
 		timeout 5 bash -c 'exec 3<>"/dev/tcp/127.0.0.1/$0"; cat "$1" >&3; read -r line <&3; echo "$line"' "$port" "$work/request" || true
 	}
-	reply=$(send 'POST /v1/scans HTTP/1.1\r\nHost: t\r\nContent-Length: 2\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n')
+	reply=$(send 'POST /v1/scans HTTP/1.1\r\nHost: localhost\r\nContent-Length: 2\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n')
 	[[ $reply == "HTTP/1.1 400"* ]] || fail "400 for a length beside chunks, got $reply"
-	reply=$(send 'POST /v1/scans HTTP/1.1\r\nHost: t\r\nContent-Length: 2\r\nContent-Length: 3\r\n\r\n{}x')
+	reply=$(send 'POST /v1/scans HTTP/1.1\r\nHost: localhost\r\nContent-Length: 2\r\nContent-Length: 3\r\n\r\n{}x')
 	[[ $reply == "HTTP/1.1 400"* ]] || fail "400 for two lengths, got $reply"
 	send 'GARBAGE\r\n\r\n' >/dev/null
 	send '\0\0\0\0' >/dev/null

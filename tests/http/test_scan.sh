@@ -186,7 +186,7 @@ test_a_broken_connection_keeps_the_whole_projections_before_it() {
 	fill 100 12 >"$work/all"
 	# two projections and a half, then the connection closes
 	{
-		printf 'PUT /v1/scans/%s/projections HTTP/1.1\r\nHost: t\r\nContent-Length: %d\r\n\r\n' "$scan" $((one * 12))
+		printf 'PUT /v1/scans/%s/projections HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n' "$scan" $((one * 12))
 		head -c $((one * 5 / 2)) "$work/all"
 	} | timeout 5 bash -c 'exec 3<>"/dev/tcp/127.0.0.1/$0"; cat >&3; exec 3>&-' "${url##*:}" || true
 	for ((i = 0; i < 100; i++)); do
@@ -200,7 +200,7 @@ test_a_broken_connection_keeps_the_whole_projections_before_it() {
 	# chunked, and so fast that the end of the connection comes together with the last bytes
 	new_scan '.detector.columns = 96 | .detector.rows = 84'
 	timeout 5 bash -c 'exec 3<>"/dev/tcp/127.0.0.1/$0"
-		printf "PUT /v1/scans/%s/projections HTTP/1.1\r\nHost: t\r\nTransfer-Encoding: chunked\r\n\r\n" "$1" >&3
+		printf "PUT /v1/scans/%s/projections HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n" "$1" >&3
 		printf -v chunk "1000\r\n%04096d\r\n" 0
 		for ((i = 0; i < 40; i++)); do printf %s "$chunk" >&3; done
 		exec 3>&-' "${url##*:}" "$scan"
@@ -302,7 +302,7 @@ test_delete_under_an_upload() {
 	local address=${url#http://} line i
 	new_scan
 	exec 3<>"/dev/tcp/${address%:*}/${address##*:}"
-	printf 'PUT /v1/scans/%s/projections HTTP/1.1\r\nHost: x\r\nContent-Length: %d\r\n\r\n' "$scan" $((one * count)) >&3
+	printf 'PUT /v1/scans/%s/projections HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n' "$scan" $((one * count)) >&3
 	fill 0100 1 >&3
 	for ((i = 0; i < 200; i++)); do # until the upload is under way
 		req GET "/v1/scans/$scan"

@@ -19,7 +19,8 @@ export async function api(path, options) {
 	return response.json()
 }
 
-export const post = (path, body) => api(path, { method: 'POST', body: JSON.stringify(body) })
+export const post = (path, body) =>
+	api(path, { method: 'POST', headers: { 'Content-Type': 'application/json' }, body: JSON.stringify(body) })
 
 export async function ended(job) {
 	for (;;) {
