@@ -147,6 +147,10 @@ $(BUILD)/cbct-worker-held: $(call objects,daemon/worker.c tests/http/held.c) $(l
 $(BUILD)/cbctd-held: $(call objects,$(daemon_sources) tests/http/held.c) $(BUILD)/proto/openapi.o $(BUILD)/web/assets.o $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -Wl,--wrap=job_digest_volume -o $@ $^ $(call pkg,--libs,$(daemon_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
+# Faults of the disk, loaded into the programs by tests.
+$(BUILD)/faults.so: tests/http/faults.c
+	$(call say,CC  )$(CC) -std=c11 -O1 -Wall -Wextra -fPIC -shared -o $@ $< -ldl
+
 # What `cbct recon` becomes where a card is wanted.
 $(BUILD)/cbct-cuda: $(call objects,$(cbct_sources)) $(library) $(cuda_objects)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(cbct_libs) $(proto_libs) $(core_libs)) $(cuda_libs) $(LIBM)
@@ -195,11 +199,11 @@ demo: setup ## a C-arm scan posted with curl, reconstructed, its volumes coming 
 	@BUILD=$(BUILD) clients/curl/demo.sh
 
 check: setup ## every test; what cannot run here is skipped aloud
-	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/unit $(BUILD)/cbct-worker-held $(BUILD)/cbctd-held
+	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/unit $(BUILD)/cbct-worker-held $(BUILD)/cbctd-held $(BUILD)/faults.so
 	@BUILD=$(BUILD) SANITIZED=$(SANITIZED) LEAVE_OUT="$(LEAVE_OUT)" OMP_WAIT_POLICY=passive tests/run.sh
 
 soak: setup ## the long tests: faults by the thousand, sweeps over anatomy and noise (an hour and more)
-	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/unit $(BUILD)/cbct-worker-held $(BUILD)/cbctd-held
+	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/unit $(BUILD)/cbct-worker-held $(BUILD)/cbctd-held $(BUILD)/faults.so
 	@BUILD=$(BUILD) OMP_WAIT_POLICY=passive tests/run.sh --soak
 
 FUZZ_SECONDS ?= 10

@@ -42,18 +42,39 @@ void error_nest(struct error *err, const char *prefix)
 		memcpy(err->pointer, pointer, sizeof(pointer));
 }
 
+static int code_of_errno(int errno_value)
+{
+	if (errno_value == ENOSPC || errno_value == EDQUOT)
+		return ERR_NO_SPACE;
+	return errno_value == ENOMEM ? ERR_NO_MEMORY : ERR_IO;
+}
+
+static int error_fill_errno(struct error *err, int code, int errno_value, const char *format, va_list args)
+{
+	char what[sizeof(err->text)];
+
+	vsnprintf(what, sizeof(what), format, args);
+	return error_set(err, code, "%.200s: %s", what, strerror(errno_value));
+}
+
 int error_set_errno(struct error *err, int errno_value, const char *format, ...)
 {
-	int code = ERR_IO;
-	char what[sizeof(err->text)];
+	int code = code_of_errno(errno_value);
 	va_list args;
 
-	if (errno_value == ENOSPC || errno_value == EDQUOT)
-		code = ERR_NO_SPACE;
-	else if (errno_value == ENOMEM)
-		code = ERR_NO_MEMORY;
 	va_start(args, format);
-	vsnprintf(what, sizeof(what), format, args);
+	error_fill_errno(err, code, errno_value, format, args);
 	va_end(args);
-	return error_set(err, code, "%.200s: %s", what, strerror(errno_value));
+	return code;
+}
+
+int error_set_sync(struct error *err, int errno_value, const char *format, ...)
+{
+	int code = code_of_errno(errno_value) == ERR_NO_SPACE ? ERR_NO_SPACE : ERR_SYNC;
+	va_list args;
+
+	va_start(args, format);
+	error_fill_errno(err, code, errno_value, format, args);
+	va_end(args);
+	return code;
 }

@@ -22,7 +22,12 @@ enum error_code {
 	ERR_DEVICE = -9,     /* the accelerator failed; the process must end (500) */
 	ERR_CANCELLED = -10, /* somebody asked for it */
 	ERR_BUSY = -11,      /* later, perhaps (503) */
-	ERR_INTERNAL = -12   /* a promise of our own was broken (500) */
+	ERR_INTERNAL = -12,  /* a promise of our own was broken (500) */
+	/*
+	 * A sync failed: the kernel may have dropped what it held, and a second sync would succeed without it. Final:
+	 * nothing that depends on these bytes may be believed or acknowledged any more (500).
+	 */
+	ERR_SYNC = -13
 };
 
 struct error {
@@ -43,5 +48,11 @@ void error_nest(struct error *err, const char *prefix);
 
 /* ERR_NO_SPACE for ENOSPC and EDQUOT, ERR_NO_MEMORY for ENOMEM, else ERR_IO; text "what: strerror". */
 int error_set_errno(struct error *err, int errno_value, const char *format, ...) __attribute__((format(printf, 3, 4)));
+
+/*
+ * The same of a sync that failed: ERR_SYNC, but ERR_NO_SPACE where the disk was full: then the caller writes all of
+ * it anew and never syncs the same bytes again.
+ */
+int error_set_sync(struct error *err, int errno_value, const char *format, ...) __attribute__((format(printf, 3, 4)));
 
 #endif

@@ -220,17 +220,21 @@ int job_delete(void *context, struct request *request, struct error *err)
 	struct job *job;
 	double seconds;
 	bool removed = false;
+	int code;
 
 	if (request_state(request) != NULL)
 		return wait_end(request, 202, err);
 	if (wait_read(api, request, 0, &seconds, err) != 0 ||
 	    jobs_find(api->jobs, request_argument(request, 0), &job, err) != 0)
 		return err->code;
-	if (jobs_delete(api->jobs, job, &removed, err) != 0 || removed) {
+	code = jobs_delete(api->jobs, job, &removed, err);
+	if (code == ERR_NO_SPACE && store_reserve_spend(api->store))
+		code = jobs_delete(api->jobs, job, &removed, err);
+	if (code != 0 || removed) {
 		if (removed)
 			forget_files(api, job);
 		job_release(job);
-		return removed ? request_reply_empty(request, 204, err) : err->code;
+		return removed ? request_reply_empty(request, 204, err) : code;
 	}
 	if (job_wait_begin(request, job, seconds, err) != 0)
 		return err->code;

@@ -101,6 +101,8 @@ int scan_delete(void *context, struct request *request, struct error *err)
 	if (store_scan_find(api->store, request_argument(request, 0), &scan, err) != 0)
 		return err->code;
 	code = jobs_delete_scan(api->jobs, scan, err);
+	if (code == ERR_NO_SPACE && store_reserve_spend(api->store))
+		code = jobs_delete_scan(api->jobs, scan, err);
 	stored_scan_release(scan);
 	return code != 0 ? code : request_reply_empty(request, 204, err);
 }

@@ -151,6 +151,11 @@ static bool complain(struct job *job, const struct task *task, const struct erro
 	job_facts(job, &facts);
 	if (err->code == ERR_CANCELLED || facts.removed)
 		return false;
+	if (err->code == ERR_SYNC) {
+		/* A second sync would succeed, and mean nothing: the volume is made again after the next start. */
+		store_distrust(jobs_store(job_jobs(job)), err);
+		return false;
+	}
 	log_line(LEVEL_ERROR, "job %s: a volume has no digest, tried again in %g s: %s", facts.id, task->retry,
 		 err->text);
 	return true;

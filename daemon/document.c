@@ -281,7 +281,8 @@ static void add_views(cJSON *document, const struct scan_facts *scan, const stru
 }
 
 /* What a job that has not begun waits for, by name; an empty list for any other. */
-static void add_waiting_for(cJSON *document, const struct scan_facts *scan, const struct job_record *record)
+static void add_waiting_for(cJSON *document, const struct scan_facts *scan, const struct job_record *record,
+			    enum job_obstacle obstacle)
 {
 	cJSON *list = cJSON_AddArrayToObject(document, "waiting_for");
 
@@ -291,7 +292,9 @@ static void add_waiting_for(cJSON *document, const struct scan_facts *scan, cons
 		if (!scan->complete)
 			cJSON_AddItemToArray(list, cJSON_CreateString("projections"));
 	}
-	if (record->state == JOB_QUEUED)
+	if (obstacle != JOB_UNHINDERED)
+		cJSON_AddItemToArray(list, cJSON_CreateString(job_obstacle_names[obstacle]));
+	else if (record->state == JOB_QUEUED)
 		cJSON_AddItemToArray(list, cJSON_CreateString("worker"));
 }
 
@@ -313,7 +316,7 @@ static void add_job_facts(cJSON *document, struct job *job, const struct job_rec
 	cJSON_AddNumberToObject(document, "iteration", record->iteration);
 	cJSON_AddNumberToObject(document, "iterations", record->iterations);
 	cJSON_AddNumberToObject(document, "progress", record->fraction);
-	add_waiting_for(document, scan, record);
+	add_waiting_for(document, scan, record, job_obstacle(job));
 	add_views(document, scan, record);
 	add_number_or_null(document, "eta_s", job_eta(job));
 	add_number_or_null(document, "queue_position", position > 0 ? position : -1);

@@ -17,7 +17,7 @@ int directory_sync(const char *path, struct error *err)
 	if (directory < 0)
 		return error_set_errno(err, errno, "open %s", path);
 	if (fsync(directory) < 0)
-		code = error_set_errno(err, errno, "fsync %s", path);
+		code = error_set_sync(err, errno, "fsync %s", path);
 	close(directory);
 	return code;
 }

@@ -29,6 +29,7 @@ static const struct problem {
     {ERR_NO_MEMORY, 503, "no-memory", "Memory ran out"},
     {ERR_NO_SPACE, 507, "no-space", "The disk is full"},
     {ERR_IO, 500, "io", "Reading or writing failed"},
+    {ERR_SYNC, 500, "sync", "The disk failed"},
     {ERR_DEVICE, 500, "device", "The accelerator failed"},
     {ERR_CANCELLED, 503, "cancelled", "The request was given up"},
     {ERR_BUSY, 503, "busy", "Not just now"},
@@ -216,6 +217,8 @@ static int reply_problem(struct request *request, const struct problem *problem,
 		return err->code;
 	if (problem->status == 503)
 		request_reply_header(request, "Retry-After", "1");
+	if (problem->status == 507) /* somebody has to make room first */
+		request_reply_header(request, "Retry-After", "30");
 	return 0;
 }
 

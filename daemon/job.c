@@ -25,6 +25,15 @@ static const bool transitions[JOB_STATE_COUNT][JOB_STATE_COUNT] = {
     [JOB_RUNNING] = {[JOB_QUEUED] = true, [JOB_SUCCEEDED] = true, [JOB_FAILED] = true, [JOB_CANCELLED] = true},
 };
 
+/* Why a job that could run is not given to a worker just now. In memory only: after a restart it is tried at once. */
+struct hold {
+	enum job_obstacle obstacle;
+	double until;             /* monotonic seconds */
+	unsigned long long space; /* bytes that must be free on the disk */
+	int times;                /* in a row, without a run between them that got further */
+};
+const char *const job_obstacle_names[JOB_OBSTACLE_COUNT] = {"", "space", "disk"};
+
 struct job {
 	/* Constant. */
 	struct jobs *jobs;
@@ -36,6 +45,7 @@ struct job {
 	/* Guarded by jobs->lock; all but the running job's progress is changed with jobs->change held too. */
 	struct job_record record;
 	struct queue_entry entry;
+	struct hold hold;
 	int references; /* one of them is the array's */
 	bool removed;
 	double stage_since;  /* monotonic seconds, while running; 0 before this process saw it run */
@@ -967,8 +977,9 @@ struct job *jobs_arriving(struct jobs *jobs, double since, bool *ret_arriving)
 		struct scan_facts facts;
 		struct error err;
 
-		if (!one.job->fdk || store_scan_look(jobs->store, one.job->scan, &facts, &err) != 0 ||
-		    !facts.convertible || facts.complete)
+		if (job_obstacle(one.job) != JOB_UNHINDERED || !one.job->fdk ||
+		    store_scan_look(jobs->store, one.job->scan, &facts, &err) != 0 || !facts.convertible ||
+		    facts.complete)
 			continue;
 		one.arrived = facts.arrived;
 		one.arriving = facts.arrived > since;
@@ -1031,13 +1042,56 @@ void job_taken(struct job *job, int count)
 	pthread_mutex_unlock(&job->jobs->lock);
 }
 
+int job_hold(struct job *job, enum job_obstacle obstacle, double until, unsigned long long space)
+{
+	struct hold *hold = &job->hold;
+	int times;
+
+	pthread_mutex_lock(&job->jobs->lock);
+	times = hold->obstacle == obstacle ? hold->times + 1 : 1;
+	*hold = (struct hold){.obstacle = obstacle, .until = until, .space = space, .times = times};
+	job->entry.held = true;
+	pthread_mutex_unlock(&job->jobs->lock);
+	wake(job);
+	return times;
+}
+
+bool jobs_review_holds(struct jobs *jobs, double now, unsigned long long space)
+{
+	bool some = false;
+
+	pthread_mutex_lock(&jobs->lock);
+	for (int i = 0; i < jobs->count; i++) {
+		struct job *job = jobs->all[i];
+
+		if (!job->entry.held)
+			continue;
+		job->entry.held = now < job->hold.until || space < job->hold.space;
+		some |= job->entry.held;
+	}
+	pthread_mutex_unlock(&jobs->lock);
+	return some;
+}
+
+enum job_obstacle job_obstacle(struct job *job)
+{
+	enum job_obstacle obstacle;
+
+	pthread_mutex_lock(&job->jobs->lock);
+	obstacle = job->entry.held ? job->hold.obstacle : JOB_UNHINDERED;
+	pthread_mutex_unlock(&job->jobs->lock);
+	return obstacle;
+}
+
 struct job *jobs_next(struct jobs *jobs)
 {
+	struct queue_entry *entry;
 	struct job *job = NULL;
 
 	pthread_mutex_lock(&jobs->lock);
-	if (jobs->queue.first != NULL) {
-		job = (struct job *)((char *)jobs->queue.first - offsetof(struct job, entry));
+	entry = queue_next(&jobs->queue);
+	if (entry != NULL) {
+		job = (struct job *)((char *)entry - offsetof(struct job, entry));
 		job->references++;
 	}
 	pthread_mutex_unlock(&jobs->lock);

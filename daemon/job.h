@@ -135,7 +135,18 @@ int job_attend(struct job *job, const char *backend, const char *device, struct 
 void job_leave(struct job *job);
 /* Projections reconstructed so far. */
 void job_taken(struct job *job, int count);
-/* The queued job that is due, or NULL; it stays queued until job_set_state. */
+/*
+ * What keeps a job from a worker though everything of its scan is there. It is not given to one before `until` (of
+ * CLOCK_MONOTONIC) and before the disk has `space` bytes free; it keeps its place in the queue, and others go before
+ * it. Returns how often in a row it was held for this reason.
+ */
+enum job_obstacle { JOB_UNHINDERED, JOB_NO_SPACE, JOB_DISK_TROUBLE, JOB_OBSTACLE_COUNT };
+extern const char *const job_obstacle_names[JOB_OBSTACLE_COUNT]; /* as `waiting_for` tells: "space", "disk" */
+int job_hold(struct job *job, enum job_obstacle obstacle, double until, unsigned long long space);
+/* Lets go whose time has come and who has room now; true while others are still held. */
+bool jobs_review_holds(struct jobs *jobs, double now, unsigned long long space);
+enum job_obstacle job_obstacle(struct job *job); /* any thread */
+/* The queued job that is due and not held, or NULL; it stays queued until job_set_state. */
 struct job *jobs_next(struct jobs *jobs);
 /* queue_victim over the jobs' queue. */
 int jobs_victim(struct jobs *jobs, const enum priority *arriving, const struct queue_running *running, int count,

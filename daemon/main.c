@@ -53,6 +53,7 @@ static void block_signals(sigset_t *ret_stops)
 	sigemptyset(ret_stops);
 	sigaddset(ret_stops, SIGTERM);
 	sigaddset(ret_stops, SIGINT);
+	sigaddset(ret_stops, SIGHUP);
 	pthread_sigmask(SIG_BLOCK, ret_stops, NULL);
 	signal(SIGPIPE, SIG_IGN);
 }
@@ -121,6 +122,19 @@ static void stop_parts(struct api *api)
 	store_close(api->store);
 }
 
+/* A terminal that is closed, or a reload that is asked for, ends nothing: settings are read at the start alone. */
+static int wait_for_stop(const sigset_t *stops)
+{
+	int signal_number = 0;
+
+	for (;;) {
+		sigwait(stops, &signal_number);
+		if (signal_number != SIGHUP)
+			return signal_number;
+		log_line(LEVEL_INFO, "SIGHUP: settings are read at the start only, nothing changes");
+	}
+}
+
 static int run(const struct config *config)
 {
 	struct api api = {.max_wait = config->max_wait, .started = http_now()};
@@ -135,7 +149,7 @@ static int run(const struct config *config)
 	if (code != 0)
 		log_line(LEVEL_ERROR, "cbctd cannot start: %s", err.text);
 	else
-		sigwait(&stops, &signal_number);
+		signal_number = wait_for_stop(&stops);
 	if (signal_number != 0)
 		log_line(LEVEL_INFO, "stopping: %s",
 			 atomic_load(&failed) ? "the disk failed" : strsignal(signal_number));

@@ -54,6 +54,18 @@ int queue_position(const struct queue_entry *entry)
 	return position;
 }
 
+static struct queue_entry *not_held(struct queue_entry *entry)
+{
+	while (entry != NULL && entry->held)
+		entry = entry->next;
+	return entry;
+}
+
+struct queue_entry *queue_next(const struct queue *queue)
+{
+	return not_held(queue->first);
+}
+
 static bool yields_before(const struct queue_running *a, const struct queue_running *b)
 {
 	if (a->gives_way != b->gives_way)
@@ -78,7 +90,7 @@ static int least_of(const struct queue_running *running, int count, enum priorit
 int queue_victim(const struct queue *queue, const enum priority *arriving, const struct queue_running *running,
 		 int count, int idle)
 {
-	const struct queue_entry *entry = queue->first;
+	const struct queue_entry *entry = queue_next(queue);
 	int coming = idle;
 
 	for (int i = 0; i < count; i++)
@@ -92,7 +104,7 @@ int queue_victim(const struct queue *queue, const enum priority *arriving, const
 			arriving = NULL;
 		} else {
 			next = entry->priority;
-			entry = entry->next;
+			entry = not_held(entry->next);
 		}
 		if (coming-- <= 0)
 			return least_of(running, count, next);

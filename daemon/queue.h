@@ -16,6 +16,7 @@ struct queue_entry {
 	enum priority priority;
 	long long ticket;
 	bool queued;
+	bool held;                           /* its time has not come: it keeps its place, others go before it */
 	struct queue_entry *previous, *next; /* the queue's */
 };
 
@@ -26,6 +27,8 @@ struct queue {
 void queue_add(struct queue *queue, struct queue_entry *entry);
 void queue_remove(struct queue *queue, struct queue_entry *entry); /* not queued is fine */
 int queue_position(const struct queue_entry *entry);               /* 1 = next; 0: not queued */
+/* The first that is not held, or NULL. */
+struct queue_entry *queue_next(const struct queue *queue);
 
 /* What the workers are busy with. */
 struct queue_running {

@@ -16,6 +16,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/file.h>
+#include <sys/stat.h>
 #include <time.h>
 #include <unistd.h>
 
@@ -543,6 +544,7 @@ int store_open(const char *directory, const struct store_hooks *hooks, struct st
 		store_close(store);
 		return code;
 	}
+	store_reserve_save(store);
 	*ret_store = store;
 	return 0;
 }
@@ -550,6 +552,58 @@ int store_open(const char *directory, const struct store_hooks *hooks, struct st
 const char *store_directory(const struct store *store)
 {
 	return store->directory;
+}
+
+/* ---- the disk ---- */
+
+void store_distrust(struct store *store, const struct error *err)
+{
+	if (err->code == ERR_SYNC)
+		store_fail(store, err->text);
+}
+
+static void reserve_path(const struct store *store, char ret_path[1024])
+{
+	snprintf(ret_path, 1024, "%s/reserve", store->directory);
+}
+
+int store_space(const struct store *store, unsigned long long *ret_bytes, struct error *err)
+{
+	return space_free(store->directory, ret_bytes, err);
+}
+
+bool store_reserve_spend(const struct store *store)
+{
+	char path[1024];
+
+	reserve_path(store, path);
+	if (unlink(path) != 0)
+		return false;
+	log_line(LEVEL_WARNING, "the disk is full: the room set aside for removals is used now");
+	return true;
+}
+
+/* A small disk, or one that is nearly full, keeps most of itself; the reserve grows when there is more. */
+void store_reserve_save(const struct store *store)
+{
+	const unsigned long long most = 8ull << 20, part = 16;
+	unsigned long long available, bytes;
+	struct stat status;
+	char path[1024];
+	struct error err;
+	int file;
+
+	if (store_space(store, &available, &err) != 0)
+		return;
+	bytes = available / part < most ? available / part : most;
+	reserve_path(store, path);
+	file = open(path, O_WRONLY | O_CREAT | O_CLOEXEC, 0600);
+	if (file < 0)
+		return;
+	if (fstat(file, &status) == 0 && (unsigned long long)status.st_size < bytes &&
+	    posix_fallocate(file, 0, (off_t)bytes) != 0)
+		unlink(path);
+	close(file);
 }
 
 void store_close(struct store *store)

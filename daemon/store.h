@@ -14,6 +14,7 @@
  * Everything that outlives the process: the catalogue (SQLite) and the files.
  *
  *   STATE/lock              held by the one daemon that uses STATE
+ *   STATE/reserve           room for the commits that empty a full disk
  *   STATE/catalogue.sqlite  scans, projections, jobs, volumes, history, warnings, events
  *   STATE/scans/ID/         scan.json projections.raw flat.f32 dark.f32 defects.u8 (proto/spool.h)
  *                           projections.sums (proto/sums.h)
@@ -50,6 +51,20 @@ int store_open(const char *directory, const struct store_hooks *hooks, struct st
 void store_close(struct store *store); /* NULL is fine; all references must be back */
 /* As it was given to store_open; lives as long as the store. */
 const char *store_directory(const struct store *store);
+
+/* Of any thread: nothing happens unless err is of a sync that failed (ERR_SYNC); then the store has failed, see above.
+ */
+void store_distrust(struct store *store, const struct error *err);
+
+/*
+ * A full disk can be emptied: a few MiB are set aside in STATE/reserve for the commits that a removal needs. Spending
+ * gives them back to the file system; false when they are spent already. store_reserve_save makes it anew as soon as
+ * there is room for it again.
+ */
+bool store_reserve_spend(const struct store *store);
+void store_reserve_save(const struct store *store);
+/* Bytes that the file system of STATE has free. */
+int store_space(const struct store *store, unsigned long long *ret_bytes, struct error *err);
 
 struct store_statistics {
 	long scans;

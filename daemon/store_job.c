@@ -223,6 +223,7 @@ void store_job_remove_files(const struct store *store, const char *id)
 	store_job_directory(store, id, directory);
 	if (directory_remove(directory, &err) != 0)
 		log_line(LEVEL_WARNING, "job %s: files stay until the next start: %s", id, err.text);
+	store_reserve_save(store);
 }
 
 void store_job_remove_checkpoint(const struct store *store, const char *id)

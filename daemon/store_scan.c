@@ -368,7 +368,7 @@ static int make_projections(const char *directory, unsigned long long bytes, str
 	if (result != 0)
 		code = error_set_errno(err, result, "room for %llu bytes of projections", bytes);
 	else if (fsync(file) < 0)
-		code = error_set_errno(err, errno, "fsync %s", path);
+		code = error_set_sync(err, errno, "fsync %s", path);
 	close(file);
 	return code;
 }
@@ -484,6 +484,7 @@ void store_scan_remove_files(const struct store *store, const char *id)
 	store_scan_directory(store, id, directory);
 	if (directory_remove(directory, &err) != 0)
 		log_line(LEVEL_WARNING, "scan %s: files stay until the next start: %s", id, err.text);
+	store_reserve_save(store);
 }
 
 int store_scan_create(struct store *store, struct scan *parsed, const struct store_key *key,
@@ -513,6 +514,7 @@ int store_scan_create(struct store *store, struct scan *parsed, const struct sto
 	if (code == 0)
 		code = insert_row(store, scan, key, err);
 	if (code != 0) {
+		store_distrust(store, err);
 		store_scan_remove_files(store, scan->id);
 		goto out;
 	}
@@ -980,6 +982,8 @@ static int write_image(struct store *store, struct stored_scan *scan, enum image
 	store_scan_directory(store, scan->id, directory);
 	snprintf(path, sizeof(path), "%s/%s", directory, image_files[image]);
 	code = file_write_durable(path, pixels, image_bytes(scan, image), err);
+	if (code != 0)
+		store_distrust(store, err);
 	if (code == 0)
 		code = store_put_part_sum(scan, image_parts[image], pixels, image_bytes(scan, image), err);
 	if (code == 0)

@@ -29,12 +29,14 @@
 
 enum {
 	WORKERS_MAX = 64,
-	CRASHES_MAX = 3, /* workers that may die with one job */
+	CRASHES_MAX = 3,    /* workers that may die with one job, or fail to read or write for it */
+	BEGINNINGS_MAX = 5, /* tries to begin a job whose files cannot be read */
 };
 static const double RESTART_FIRST = 0.1, RESTART_LAST = 30; /* s between a death and the next start */
 static const double STEADY = 60;                            /* s of life after which earlier deaths are forgotten */
 static const double RETRY = 1;                              /* s until a change that the disk refused is tried again */
-static const double EXIT = 2;                               /* s that a worker has to exit by itself */
+static const double LOOK = 1; /* s between two looks whether a job that is held may go on */
+static const double EXIT = 2; /* s that a worker has to exit by itself */
 /*
  * s without a projection after which a worker that waits for some is anybody's: an arm that turns sends several a
  * second, and who has stopped has nothing to lose but what it has reconstructed.
@@ -84,8 +86,9 @@ struct worker {
 
 	struct job *job; /* reference; NULL: none */
 	struct queue_running running;
-	int checkpoint; /* that it began from */
-	int unsettled;  /* volumes that it has told of and that are not on the disk, as far as it said */
+	int checkpoint;      /* that it began from */
+	size_t volume_bytes; /* of one volume of its job */
+	int unsettled;       /* volumes that it has told of and that are not on the disk, as far as it said */
 	/* What it told of last and the catalogue has yet to take; none between two turns. */
 	struct history_row rows[JOB_ROWS_MAX];
 	int row_count;
@@ -115,6 +118,7 @@ struct supervise {
 
 	struct worker workers[WORKERS_MAX]; /* the thread's own */
 	double dispatch_at;                 /* monotonic; the thread's own */
+	double review_at;                   /* monotonic: when jobs that are held are looked at, 0: none; its own */
 	double stop_by;                     /* monotonic: the stop's end, NEVER before it; the thread's own */
 
 	pthread_mutex_t lock; /* guards what follows */
@@ -266,6 +270,9 @@ static void finish(struct supervise *supervise, struct worker *worker)
 	if (code == 0)
 		code = record_ending(worker, &err);
 	if (code != 0 && code != ERR_CONFLICT) {
+		store_distrust(jobs_store(supervise->jobs), &err);
+		if (code == ERR_NO_SPACE)
+			store_reserve_spend(jobs_store(supervise->jobs));
 		worker->ending.again = now_monotonic() + RETRY;
 		log_line(LEVEL_ERROR, "the end of a job cannot be recorded yet: %s", err.text);
 		return;
@@ -305,6 +312,27 @@ static bool is_void(const struct worker *worker)
 	       scan.basis != worker->basis;
 }
 
+/* The disk is full: the job goes on from where it began, once there is room for one more volume than now. */
+static void wait_for_space(struct supervise *supervise, struct worker *worker, const char *how)
+{
+	unsigned long long available = 0;
+	struct error ignored;
+
+	store_space(jobs_store(supervise->jobs), &available, &ignored);
+	job_hold(worker->job, JOB_NO_SPACE, 0, available + worker->volume_bytes);
+	end_job(supervise, worker, (struct ending){.to = back_to(worker), .checkpoint = worker->checkpoint}, how);
+}
+
+/* What this daemon could not record of a job that it stopped for that. */
+static void fail_unrecorded(struct supervise *supervise, struct worker *worker)
+{
+	if (worker->failure_code == ERR_NO_SPACE)
+		wait_for_space(supervise, worker, worker->failure_text);
+	else
+		end_job(supervise, worker, (struct ending){.to = JOB_FAILED, .error_code = worker->failure_code},
+			worker->failure_text);
+}
+
 /* The worker is lost, and its job with it unless it may try again. */
 static void lose_job(struct supervise *supervise, struct worker *worker, int error_code, const char *how)
 {
@@ -315,13 +343,12 @@ static void lose_job(struct supervise *supervise, struct worker *worker, int err
 	if (record.cancel_asked) {
 		end_job(supervise, worker, (struct ending){.to = JOB_CANCELLED}, "");
 	} else if (worker->failure_code != 0) {
-		end_job(supervise, worker, (struct ending){.to = JOB_FAILED, .error_code = worker->failure_code},
-			worker->failure_text);
+		fail_unrecorded(supervise, worker);
 	} else if (is_void(worker)) {
 		/* Told to leave it, it took too long: that is no fault of the job's. */
 		end_job(supervise, worker, (struct ending){.to = back_to(worker)}, how);
 	} else if (record.crashes + 1 >= CRASHES_MAX) {
-		snprintf(text, sizeof(text), "the worker died with it %d times, last: %.250s", record.crashes + 1, how);
+		snprintf(text, sizeof(text), "it was broken off %d times, last: %.260s", record.crashes + 1, how);
 		end_job(supervise, worker, (struct ending){.to = JOB_FAILED, .error_code = error_code, .crashed = true},
 			text);
 	} else {
@@ -337,11 +364,21 @@ static void lose_job(struct supervise *supervise, struct worker *worker, int err
 /* The worker said how its job ended. */
 static void job_ended(struct supervise *supervise, struct worker *worker, const struct message *message)
 {
+	struct error failed = {.code = message->code};
+	struct job_record record;
 	struct job_facts facts;
 
 	job_facts(worker->job, &facts);
 	worker->deadline = NEVER;
 	worker->state = WORKER_IDLE;
+	if (message->code == ERR_SYNC) {
+		/* The disk is no longer trusted, by anybody: the daemon ends, and the job begins again after its start.
+		 */
+		snprintf(failed.text, sizeof(failed.text), "%.319s", message->text);
+		store_distrust(jobs_store(supervise->jobs), &failed);
+		end_job(supervise, worker, (struct ending){.to = back_to(worker)}, message->text);
+		return;
+	}
 	/* Done before it heard of it: what could not be kept is lost all the same, and what is void stays so. */
 	if (message->code == 0 && worker->failure_code == 0 && !is_void(worker)) {
 		worker->failures = 0;
@@ -354,8 +391,7 @@ static void job_ended(struct supervise *supervise, struct worker *worker, const 
 	} else if (facts.cancel_asked) {
 		end_job(supervise, worker, (struct ending){.to = JOB_CANCELLED}, "");
 	} else if (worker->failure_code != 0) {
-		end_job(supervise, worker, (struct ending){.to = JOB_FAILED, .error_code = worker->failure_code},
-			worker->failure_text);
+		fail_unrecorded(supervise, worker);
 	} else if (message->code == ERR_BUSY) {
 		/* Unasked: somebody told the process itself to end, it takes no more jobs. */
 		if (!worker->yielding) {
@@ -368,10 +404,14 @@ static void job_ended(struct supervise *supervise, struct worker *worker, const 
 	} else if (is_void(worker)) {
 		end_job(supervise, worker, (struct ending){.to = back_to(worker)},
 			"its scan is understood otherwise now");
-	} else if (message->code == ERR_NO_SPACE && (worker->yielding || supervise->stop_by < NEVER)) {
-		/* Most likely its checkpoint: who is asked to make room must not fail for that. */
-		end_job(supervise, worker, (struct ending){.to = back_to(worker), .checkpoint = worker->checkpoint},
-			message->text);
+	} else if (message->code == ERR_NO_SPACE) {
+		wait_for_space(supervise, worker, message->text);
+	} else if (message->code == ERR_IO) {
+		/* It may pass: no descriptor was free, or a disk was slow to answer. */
+		job_record(worker->job, &record);
+		job_hold(worker->job, JOB_DISK_TROUBLE, now_monotonic() + RETRY * (1 << record.crashes % CRASHES_MAX),
+			 0);
+		lose_job(supervise, worker, ERR_IO, message->text);
 	} else if (message->code == ERR_INVALID && worker->checkpoint > 0) {
 		end_job(supervise, worker, (struct ending){.to = JOB_QUEUED, .crashed = true},
 			"its checkpoint is damaged or gone: from the start");
@@ -723,6 +763,7 @@ static void begin(struct supervise *supervise, struct worker *worker, struct job
 	worker->job = job_reference(job);
 	worker->running = (struct queue_running){.priority = record->priority, .ticket = record->ticket};
 	worker->checkpoint = message->iteration;
+	worker->volume_bytes = grid_voxels(&message->request.recipe.grid) * sizeof(float);
 	worker->unsettled = 0;
 	worker->cancelling = worker->yielding = false;
 	worker->room_since = NEVER;
@@ -787,8 +828,13 @@ static int give_job(struct supervise *supervise, struct worker *worker, struct j
 		return error_set_errno(err, ENOMEM, "message");
 	job_record(job, &record);
 	code = make_start(supervise, &record, message, &scan, &facts, &why);
-	if (code == ERR_NO_SPACE || code == ERR_NO_MEMORY) {
+	if (code != 0)
+		store_distrust(jobs_store(supervise->jobs), &why);
+	if (code == ERR_NO_SPACE || code == ERR_NO_MEMORY || code == ERR_SYNC) {
 		*err = why;
+	} else if (code == ERR_IO && job_hold(job, JOB_DISK_TROUBLE, now_monotonic() + RETRY, 0) < BEGINNINGS_MAX) {
+		log_line(LEVEL_WARNING, "job %s cannot begin yet: %s", record.id, why.text);
+		code = 0;
 	} else if (code != 0) {
 		change = (struct job_change){.error_code = code, .error_pointer = why.pointer, .error_text = why.text};
 		code = job_set_state(job, JOB_FAILED, &change, err);
@@ -980,16 +1026,34 @@ static int poll_timeout(const struct supervise *supervise, bool stopping)
 	}
 	if (!stopping && supervise->dispatch_at > 0 && supervise->dispatch_at < next)
 		next = supervise->dispatch_at;
+	if (!stopping && supervise->review_at > 0 && supervise->review_at < next)
+		next = supervise->review_at;
 	if (next == NEVER)
 		return -1;
 	left = (next - now) * 1000;
 	return left <= 0 ? 0 : left > 60000 ? 60000 : (int)left + 1;
 }
 
+/* Jobs that wait for room on the disk, or for it to answer. */
+static void review_holds(struct supervise *supervise)
+{
+	unsigned long long available = 0;
+	double now = now_monotonic();
+	struct error ignored;
+
+	if (supervise->review_at > now)
+		return;
+	store_space(jobs_store(supervise->jobs), &available, &ignored);
+	supervise->review_at = jobs_review_holds(supervise->jobs, now, available) ? now + LOOK : 0;
+	if (supervise->review_at > 0)
+		store_reserve_save(jobs_store(supervise->jobs));
+}
+
 static void move_jobs(struct supervise *supervise)
 {
 	struct error err;
 
+	review_holds(supervise);
 	if (supervise->dispatch_at > now_monotonic())
 		return;
 	supervise->dispatch_at = 0;

@@ -167,8 +167,8 @@ static int sync_batch(struct uploads *uploads, struct slot *const slots[], int c
 		if (done)
 			continue;
 		if (fdatasync(slots[i]->upload->descriptor) != 0 || fdatasync(slots[i]->upload->sums) != 0) {
-			error_set_errno(err, errno, "sync projections of scan %s",
-					stored_scan_id(slots[i]->upload->scan));
+			error_set_sync(err, errno, "sync projections of scan %s",
+				       stored_scan_id(slots[i]->upload->scan));
 			if (err->code != ERR_NO_SPACE)
 				report_failure(uploads, err->text);
 			return err->code;

@@ -44,6 +44,7 @@ struct worker {
 
 	char job[64]; /* that runs */
 	bool cancel, yield, quit;
+	struct error trouble; /* why the job was given up here though nobody had asked for it; code 0: it was not */
 	int *told; /* [told_count], room for VIEWS_MAX: projections that are there, as the daemon named them */
 	int told_count;
 	int iteration; /* done */
@@ -84,10 +85,26 @@ static int report(struct worker *worker, struct message *message)
 
 	snprintf(message->job, sizeof(message->job), "%s", worker->job);
 	code = message_send(worker->socket, message, &err);
-	if (code != 0) {
+	if (code == ERR_NO_MEMORY) {
+		/* The daemon is there, and must not take a job for whole that lacks what could not be told. */
+		worker->cancel = true;
+		worker->trouble = err;
+	} else if (code != 0) {
 		say(&err);
 		worker->cancel = worker->quit = true;
 	}
+	return code;
+}
+
+/* The same where the caller can fail. */
+static int report_or_fail(struct worker *worker, struct message *message, struct error *err)
+{
+	int code = report(worker, message);
+
+	if (code == ERR_NO_MEMORY)
+		*err = worker->trouble;
+	else if (code != 0)
+		code = error_set(err, ERR_CANCELLED, "the daemon is gone");
 	return code;
 }
 
@@ -118,6 +135,8 @@ static bool obey_next(struct worker *worker, int timeout_ms)
 	bool got = false;
 
 	if (message_receive(worker->socket, timeout_ms, &message, &got, &err) != 0) {
+		if (err.code == ERR_NO_MEMORY)
+			worker->trouble = err;
 		worker->cancel = worker->quit = true;
 		return false;
 	}
@@ -216,7 +235,7 @@ static int on_volume(void *context, const struct kept_volume *volume, const stru
 
 	snprintf(message.name, sizeof(message.name), "%s", volume->name);
 	snprintf(message.volume_stage, sizeof(message.volume_stage), "%s", volume->stage);
-	return report(context, &message) == 0 ? 0 : error_set(err, ERR_CANCELLED, "the daemon is gone");
+	return report_or_fail(context, &message, err);
 }
 
 static int on_settled(void *context, const char *name, struct error *err)
@@ -224,7 +243,7 @@ static int on_settled(void *context, const char *name, struct error *err)
 	struct message message = {.kind = MESSAGE_SETTLED};
 
 	snprintf(message.name, sizeof(message.name), "%s", name);
-	return report(context, &message) == 0 ? 0 : error_set(err, ERR_CANCELLED, "the daemon is gone");
+	return report_or_fail(context, &message, err);
 }
 
 /* ---- jobs ---- */
@@ -335,11 +354,17 @@ static int serve_job(struct worker *worker, const struct message *start)
 	worker->progress = (struct message){0};
 	worker->behind = false;
 	working = 1;
+	worker->trouble = (struct error){0};
 	ended.code = run_job(worker, start, &err);
+	if (worker->trouble.code != 0) {
+		err = worker->trouble;
+		ended.code = err.code;
+	}
 	ended.iteration = worker->iteration;
 	if (ended.code != 0)
 		snprintf(ended.text, sizeof(ended.text), "%s", err.text);
-	report(worker, &ended);
+	if (report(worker, &ended) == ERR_NO_MEMORY)
+		worker->quit = true; /* the daemon learns it from the end of the process */
 	worker->job[0] = '\0';
 	working = 0;
 	if (ended.code == ERR_DEVICE) {

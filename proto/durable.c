@@ -23,7 +23,7 @@ int durable_sync_names(const char *path, struct error *err)
 	if (file < 0)
 		return error_set_errno(err, errno, "%s cannot be opened", directory);
 	if (fsync(file) != 0)
-		code = error_set_errno(err, errno, "%s cannot be synced", directory);
+		code = error_set_sync(err, errno, "%s cannot be synced", directory);
 	close(file);
 	return code;
 }
@@ -64,7 +64,7 @@ static int give_name(const struct durable *d, struct error *err)
 
 static int sync_data(const struct durable *d, struct error *err)
 {
-	return fdatasync(d->file) == 0 ? 0 : error_set_errno(err, errno, "%s cannot be synced", d->path);
+	return fdatasync(d->file) == 0 ? 0 : error_set_sync(err, errno, "%s cannot be synced", d->path);
 }
 
 static int sync_and_close(struct durable *d, struct error *err)
@@ -107,10 +107,15 @@ int durable_settle(struct durable *d, struct error *err)
 int durable_settle_named(const char *path, struct error *err)
 {
 	struct durable d = {.file = open(path, O_RDONLY | O_CLOEXEC), .path = path};
+	int code;
 
 	if (d.file < 0)
 		return error_set_errno(err, errno, "%s cannot be opened", path);
-	return durable_settle(&d, err);
+	code = durable_settle(&d, err);
+	/* The bytes were written by somebody else: they cannot be written anew here, whatever the reason was. */
+	if (code == ERR_NO_SPACE)
+		code = err->code = ERR_SYNC;
+	return code;
 }
 
 int durable_write(struct durable *d, const void *from, size_t size, struct error *err)

@@ -192,7 +192,7 @@ static int write_back(const struct durable *file, size_t before, size_t at, size
 	if (at > before &&
 	    sync_file_range(file->file, (off_t)before, (off_t)(at - before), SYNC_FILE_RANGE_WAIT_AFTER) != 0 &&
 	    errno != ENOSYS)
-		return error_set_errno(err, errno, "%s cannot be synced", file->path);
+		return error_set_sync(err, errno, "%s cannot be synced", file->path);
 	return 0;
 }
 

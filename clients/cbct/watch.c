@@ -42,6 +42,7 @@ static void show(struct view *view, const cJSON *job)
 {
 	const cJSON *history = cJSON_GetObjectItemCaseSensitive(job, "history");
 	const cJSON *views = cJSON_GetObjectItemCaseSensitive(job, "views");
+	const cJSON *obstacle;
 	int rows = cJSON_GetArraySize(history);
 	const char *state = member_text(job, "state", "?"), *stage = member_text(job, "stage", "");
 	double iterations = member_number(job, "iterations", 0);
@@ -53,6 +54,13 @@ static void show(struct view *view, const cJSON *job)
 	if (strcmp(state, "queued") == 0 && member_number(job, "queue_position", -1) >= 0)
 		used += snprintf(text + used, sizeof(text) - (size_t)used, ", place %.10g",
 				 member_number(job, "queue_position", 0));
+	cJSON_ArrayForEach(obstacle, cJSON_GetObjectItemCaseSensitive(job, "waiting_for"))
+	{
+		const char *what = cJSON_GetStringValue(obstacle);
+
+		if (used < 60 && what != NULL && strcmp(what, "projections") != 0 && strcmp(what, "worker") != 0)
+			used += snprintf(text + used, sizeof(text) - (size_t)used, ", for %.10s", what);
+	}
 	if (strcmp(state, "waiting") == 0 && cJSON_IsObject(views))
 		used += snprintf(text + used, sizeof(text) - (size_t)used, ", %.10g of %.10g projections",
 				 member_number(views, "received", 0), member_number(views, "of", 0));

@@ -190,7 +190,7 @@ export class JobPage {
 			this.#watch()
 		}
 		this.bar.show(job)
-		write(this.doing, job.state === 'waiting' ? `${scan.received_count} of ${scan.projections.count} projections are here` : doing(job))
+		write(this.doing, job.state === 'waiting' && job.waiting_for.includes('projections') ? `${scan.received_count} of ${scan.projections.count} projections are here` : doing(job))
 		write(this.left, left(job) || (job.ended ? duration(job.timings.total) : ''))
 		this.title(`${ended(job) ? '' : `${Math.round(job.progress * 100)} % · `}${scan.name || scan.id}`)
 		this.#showActions(before)

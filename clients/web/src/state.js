@@ -9,10 +9,16 @@ export function badge(state) {
 	return h('span', { class: `badge ${state}` }, h('span', { 'aria-hidden': 'true' }, signs[state] ?? '○'), ` ${state}`)
 }
 
+/* What a job may wait for beside projections and its turn, in words. */
+const obstacles = { flat: 'the flat image', space: 'room on the disk', disk: 'the disk, which failed to read or write' }
+
 /* What it is doing, in words. */
 export function doing(job) {
 	if (job.cancel_requested && !ended(job))
 		return 'being cancelled'
+	const held = job.waiting_for.map(what => obstacles[what]).filter(Boolean)
+	if (held.length > 0)
+		return `waits for ${held.join(' and ')}`
 	if (job.state === 'queued')
 		return job.queue_position > 1 ? `${job.queue_position - 1} before it` : 'next in the queue'
 	if (job.state === 'waiting')

@@ -1,0 +1,159 @@
+#!/usr/bin/env bash
+# Full disks, disks that fail for a moment, syncs that fail: what waits, what is tried again, and what is final.
+. "$(dirname "$0")/lib.sh"
+
+scan_dir=$work/ball
+cbct simulate --phantom ball --scale 30 --density 0.02 --views 60 --arc 360 --columns 64 --rows 48 --pixel 4 \
+	--source-to-isocentre 600 --source-to-detector 1000 -o "$scan_dir" >/dev/null || exit 1
+small='"grid": {"size": [16, 16, 16], "spacing_mm": [5, 5, 5]}'
+large='"grid": {"size": [128, 128, 128], "spacing_mm": [1, 1, 1]}' # 8 MiB a volume
+library=$(realpath "$BUILD")/faults.so
+
+# faulty_daemon [OPTION ...]: fault CALL ERRNO PART TIMES decides what fails
+faulty_daemon() {
+	[ "${SANITIZED:-0}" = 0 ] || skip "a sanitizer must be the first library of a process"
+	export CBCT_TEST_FAULTS=$work/faults
+	rm -f "$work/faults" "$work/faults.count"
+	LD_PRELOAD=$library start_daemon "$@"
+}
+fault() { # CALL ERRNO PART TIMES [PASS]: see faults.c
+	rm -f "$work/faults.count"
+	echo "$1 $2 $3 $4 ${5:-0}" >"$work/faults.new"
+	mv "$work/faults.new" "$work/faults"
+}
+no_fault() { rm -f "$work/faults"; }
+daemon_ends() { # with status 1, and says why
+	local pid
+	pid=$(cat "$work/daemon.pid")
+	timeout 30 tail --pid="$pid" -f /dev/null || fail "the end of a daemon whose disk failed"
+	grep -q 'the disk failed, stopping: .*Input/output error' "$work/cbctd.err" || fail "a word of why it ended"
+	rm "$work/cbctd.err"
+}
+waits_for() { # WHAT
+	local end=$((SECONDS + 60))
+	until req GET "/v1/jobs/$job" && [ "$(json '.state + " " + (.waiting_for | join(" "))')" = "queued $1" ]; do
+		[ $SECONDS -lt $end ] || fail "a job that waits for $1: $(json '{state, waiting_for, error}')"
+		sleep 0.05
+	done
+}
+
+small_disk() { # SIZE
+	disk=$work/small # not local: the trap runs after the function
+	mkdir -p "$disk"
+	mount -t tmpfs -o size="$1" none "$disk" 2>/dev/null || skip "no permission to mount a small tmpfs"
+	trap 'stop_daemon; umount "$disk"' EXIT
+	state=$disk/state start_daemon
+}
+
+test_a_job_that_meets_a_full_disk_waits_for_room() {
+	local first
+	small_disk 6m
+	req POST /v1/scans -H 'Content-Type: application/json' --data-binary @<(jq '.projections.count = 600 | .geometry = {kind: "circular",
+	    source_to_isocentre_mm: 600, source_to_detector_mm: 1000, first_angle_deg: 0, angle_step_deg: 0.6}' "$scan_dir/scan.json")
+	expect_problem 507
+	header Retry-After | grep -qE '^[0-9]+$' || fail "Retry-After of a full disk"
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "{\"scan\": \"SCAN\", $large, \"fdk\": {}}"
+	first=$job
+	waits_for space
+	expect_json '.error == null'
+	# it is in nobody's way
+	post_job "{\"scan\": \"SCAN\", $small, \"fdk\": {}}"
+	wait_job succeeded
+	mount -o remount,size=60m "$disk"
+	job=$first
+	wait_job succeeded
+	expect_json '.volumes == 1'
+	stop_daemon
+}
+
+test_a_full_disk_can_be_emptied() {
+	local done_job filled=0
+	small_disk 24m
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "{\"scan\": \"SCAN\", $small, \"fdk\": {}, \"sart\": {\"iterations\": 40, \"subsets\": 1}}"
+	wait_job succeeded
+	done_job=$job
+	# to the last byte
+	while head -c 65536 /dev/zero >"$disk/fill.$filled" 2>/dev/null; do filled=$((filled + 1)); done
+	head -c 4096 /dev/zero >>"$disk/fill.last" 2>/dev/null || true
+	req POST /v1/scans -H 'Content-Type: application/json' --data-binary "@$scan_dir/scan.json"
+	expect_problem 507
+	req DELETE "/v1/jobs/$done_job"
+	expect_status 204
+	req DELETE "/v1/scans/$scan"
+	expect_status 204
+	rm -f "$disk"/fill.*
+	req GET /v1/scans
+	expect_json '.scans == []'
+	stop_daemon KILL
+	state=$disk/state start_daemon
+	req GET /v1/jobs
+	expect_json '.jobs == []'
+	stop_daemon
+}
+
+test_a_moment_without_descriptors_or_with_a_slow_disk_ends_no_job() {
+	faulty_daemon
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	fault open 24 projections.raw 1 # EMFILE
+	post_job "{\"scan\": \"SCAN\", $small, \"fdk\": {}}"
+	wait_job succeeded
+	expect_json '.attempts == 2'
+	fault open 5 scan.json 1 # EIO
+	post_job "{\"scan\": \"SCAN\", $small, \"fdk\": {}}"
+	wait_job succeeded
+	# one that stays is no moment
+	fault open 5 projections.raw 1000000
+	post_job "{\"scan\": \"SCAN\", $small, \"fdk\": {}}"
+	wait_job failed 60
+	expect_json '.error.detail | test("3 times")'
+	no_fault
+	stop_daemon
+}
+
+test_a_sync_that_failed_is_final() {
+	local what
+	# of a worker's volume, of the digest thread, of a scan's directory: whoever asks a second time is told that all is well
+	for what in "fdatasync 5 /jobs/ 1" "fdatasync 5 /jobs/ 1 1" "fsync 5 /jobs/ 1" "fsync 5 /scans/ 1"; do
+		faulty_daemon
+		post_scan "$scan_dir"
+		post_projections "$scan_dir"
+		# shellcheck disable=SC2086
+		fault $what
+		if [[ $what == *scans* ]]; then
+			req POST /v1/scans -H 'Content-Type: application/json' --data-binary "@$scan_dir/scan.json"
+			expect_problem 500
+		else
+			post_job "{\"scan\": \"SCAN\", $small, \"fdk\": {}}"
+		fi
+		daemon_ends
+		stop_daemon
+		no_fault
+		start_daemon
+		if [[ $what == *jobs* ]]; then
+			wait_job succeeded
+			get_volume final "$work/final"
+		fi
+		req GET "/v1/scans/$scan"
+		expect_json '.missing == []'
+		stop_daemon
+	done
+}
+
+test_sighup_ends_nothing() {
+	local pid
+	start_daemon
+	pid=$(cat "$work/daemon.pid")
+	kill -HUP "$pid"
+	kill -HUP "$pid"
+	sleep 0.2
+	req GET /livez
+	expect_status 200
+	stop_daemon
+}
+
+stop_after_each=1 run_tests
