@@ -44,6 +44,8 @@ struct route {
 	/* BODY_STREAM: takes what it can; less than size only with HTTP_WAIT. After a failure the rest is dropped. */
 	int (*data)(void *context, struct request *request, const void *data, size_t size, size_t *ret_taken,
 		    struct error *err);
+	const char
+	    *queries; /* the names of its query parameters, with blanks between; others are refused. NULL: none */
 };
 
 struct http_options {

@@ -175,6 +175,39 @@ static int read_target(struct request *request, struct error *err)
 	return find_route(request, segments, count, err);
 }
 
+static bool is_listed(const char *names, const char *name)
+{
+	const size_t length = strlen(name);
+
+	while (names != NULL && *names != '\0') {
+		const size_t one = strcspn(names, " ");
+
+		if (one == length && memcmp(names, name, one) == 0)
+			return true;
+		names += one + strspn(names + one, " ");
+	}
+	return false;
+}
+
+/* A misspelt parameter must not be taken for its default in silence: whoever asks for ?typ=int16 wants no float32. */
+static int check_queries(const struct request *request, struct error *err)
+{
+	const char *known = request->route->queries;
+
+	for (int i = 0; i < request->query_count; i++) {
+		const char *name = request->queries[i].name;
+
+		if (!is_listed(known, name))
+			return error_set(err, ERR_INVALID,
+					 "\"%.60s\" is no query parameter of this resource; known: %s", name,
+					 known != NULL ? known : "none");
+		for (int j = 0; j < i; j++)
+			if (strcmp(request->queries[j].name, name) == 0)
+				return error_set(err, ERR_INVALID, "the query parameter %.60s is given twice", name);
+	}
+	return 0;
+}
+
 /* ---- framing ---- */
 
 struct framing {
@@ -302,6 +335,8 @@ int request_read_header(struct request *request, const char *method, struct erro
 		code = request_check_origin(request, err);
 	if (code == 0 && request->response == NULL)
 		code = read_target(request, err);
+	if (code == 0 && request->response == NULL)
+		code = check_queries(request, err);
 	if (code == 0 && request->response == NULL)
 		code = check_body(request, err);
 	if (code != 0)

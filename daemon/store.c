@@ -533,6 +533,7 @@ int store_open(const char *directory, const struct store_hooks *hooks, struct st
 		store->hooks = *hooks;
 	store->lock_file = -1;
 	atomic_flag_clear(&store->failure_told);
+	pthread_mutex_init(&store->insertion_lock, NULL);
 	pthread_mutex_init(&store->writer.lock, NULL);
 	pthread_mutex_init(&store->reader.lock, NULL);
 	pthread_mutex_init(&store->scans_lock, NULL);
@@ -624,6 +625,7 @@ void store_close(struct store *store)
 	pthread_cond_destroy(&store->checkpoint_due);
 	pthread_mutex_destroy(&store->checkpoint_lock);
 	pthread_mutex_destroy(&store->scans_lock);
+	pthread_mutex_destroy(&store->insertion_lock);
 	if (store->lock_file >= 0)
 		close(store->lock_file);
 	free(store);

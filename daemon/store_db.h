@@ -10,7 +10,7 @@
 /*
  * Inside of the store, for store*.c only: connections, queries, transactions.
  *
- * Locks, in the order in which they may be taken: writer.lock (held over a
+ * Locks, in the order in which they may be taken: insertion_lock, writer.lock (held over a
  * commit; makes one transaction at a time) or reader.lock (held over a SELECT),
  * then scans_lock, then a scan's own lock, then checkpoint_lock or a watch list's.
  */
@@ -32,6 +32,9 @@ struct store {
 	char directory[900]; /* constant, as hooks */
 	struct store_hooks hooks;
 	int lock_file;
+	/* Held from the commit of a scan's row to its place in the array: who finds its key finds the scan. First of
+	 * all. */
+	pthread_mutex_t insertion_lock;
 	struct connection writer, reader;
 	bool unsynced;       /* of the writer's commits; guarded by writer.lock */
 	_Atomic bool failed; /* a commit did not reach the disk: nothing is acknowledged any more */

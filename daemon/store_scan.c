@@ -421,8 +421,8 @@ static int insert_key(struct store *store, const struct stored_scan *scan, const
 	return code;
 }
 
-int store_scan_repeat(struct store *store, const struct store_key *key, struct stored_scan **ret_scan,
-		      struct error *err)
+static int find_by_key(struct store *store, const struct store_key *key, struct stored_scan **ret_scan,
+		       struct error *err)
 {
 	struct query query;
 	char id[ID_SIZE] = "";
@@ -447,6 +447,17 @@ int store_scan_repeat(struct store *store, const struct store_key *key, struct s
 	if (!same)
 		return error_set(err, ERR_CONFLICT, "this Idempotency-Key came with another request before");
 	return store_scan_find(store, id, ret_scan, err);
+}
+
+int store_scan_repeat(struct store *store, const struct store_key *key, struct stored_scan **ret_scan,
+		      struct error *err)
+{
+	int code;
+
+	pthread_mutex_lock(&store->insertion_lock);
+	code = find_by_key(store, key, ret_scan, err);
+	pthread_mutex_unlock(&store->insertion_lock);
+	return code;
 }
 
 static int insert_row(struct store *store, struct stored_scan *scan, const struct store_key *key, struct error *err)
@@ -487,6 +498,31 @@ void store_scan_remove_files(const struct store *store, const char *id)
 	store_reserve_save(store);
 }
 
+/* Row and place in the array; the array owns a reference then, and the scan its parsed form. */
+static int insert_scan(struct store *store, struct stored_scan *scan, struct scan *parsed, const struct store_key *key,
+		       struct error *err)
+{
+	int code;
+
+	/* One at a time, so that the room in the array is still there after the commit. */
+	pthread_mutex_lock(&store->insertion_lock);
+	pthread_mutex_lock(&store->scans_lock);
+	code = array_reserve(store, err);
+	pthread_mutex_unlock(&store->scans_lock);
+	if (code == 0)
+		code = insert_row(store, scan, key, err);
+	if (code == 0) {
+		pthread_mutex_lock(&store->scans_lock);
+		array_insert(store, scan);
+		scan->parsed = parsed;
+		scan->references++;
+		make_recent(store, scan);
+		pthread_mutex_unlock(&store->scans_lock);
+	}
+	pthread_mutex_unlock(&store->insertion_lock);
+	return code;
+}
+
 int store_scan_create(struct store *store, struct scan *parsed, const struct store_key *key,
 		      struct stored_scan **ret_scan, struct error *err)
 {
@@ -506,24 +542,13 @@ int store_scan_create(struct store *store, struct scan *parsed, const struct sto
 	if (code != 0)
 		goto out;
 	code = make_files(store, parsed, scan, err);
-	if (code == 0) {
-		pthread_mutex_lock(&store->scans_lock);
-		code = array_reserve(store, err);
-		pthread_mutex_unlock(&store->scans_lock);
-	}
 	if (code == 0)
-		code = insert_row(store, scan, key, err);
+		code = insert_scan(store, scan, parsed, key, err);
 	if (code != 0) {
 		store_distrust(store, err);
 		store_scan_remove_files(store, scan->id);
 		goto out;
 	}
-	pthread_mutex_lock(&store->scans_lock);
-	array_insert(store, scan);
-	scan->parsed = parsed;
-	scan->references++;
-	make_recent(store, scan);
-	pthread_mutex_unlock(&store->scans_lock);
 	log_line(LEVEL_INFO, "scan %s: %d projections of %d x %d", scan->id, scan->count, scan->columns, scan->rows);
 	*ret_scan = scan;
 	return 0;

@@ -54,6 +54,32 @@ test_what_is_served_is_the_schema() {
 	stop_daemon
 }
 
+# A parameter that nobody knows is refused, and the refusal names those of the schema.
+test_query_parameters_are_those_of_the_schema() {
+	local method path names count=0
+	start_daemon
+	req GET /v1/openapi.json
+	jq -r '. as $all | .paths | to_entries[] | .key as $path | (.value.parameters // []) as $shared | .value | to_entries[] |
+		select(.key | IN("get", "put", "post", "delete")) | [(.key | ascii_upcase), ($path | gsub("\\{[a-z]+\\}"; "x")),
+		([$shared[], (.value.parameters // [])[]] | map(if .["$ref"] then $all.components.parameters[.["$ref"] | split("/")[-1]] else . end |
+		select(.in == "query") | .name) | sort | join(" "))] | @tsv' "$body" >"$work/operations"
+	while IFS=$'\t' read -r method path names; do
+		case $method in
+		PUT | POST) req "$method" "$path?nobody_knows=1" -H 'Content-Type: application/json' -d '{}' ;;
+		*) req "$method" "$path?nobody_knows=1" ;;
+		esac
+		expect_problem 400
+		json .detail | grep -q '"nobody_knows"' || fail "the name of the parameter: $(json .detail)"
+		[ "$(json .detail | sed 's/.*known: //; s/^none$//' | tr ' ' '\n' | sort | paste -sd' ')" = "$names" ] ||
+			fail "$method $path with the parameters $names: $(json .detail)"
+		count=$((count + 1))
+	done <"$work/operations"
+	[ "$count" -gt 25 ] || fail "the operations of the schema, found $count"
+	req GET "/v1/scans?limit=1&limit=2"
+	expect_problem 400
+	stop_daemon
+}
+
 # Spectral, as tests/openapi/package-lock.json names it, installed under build/ once for each lockfile.
 test_the_schema_has_no_flaws_that_a_linter_sees() {
 	local from=$top/tests/openapi to=$BUILD/openapi-lint
@@ -69,4 +95,4 @@ test_the_schema_has_no_flaws_that_a_linter_sees() {
 	"$to/node_modules/.bin/spectral" lint --fail-severity warn --ruleset "$from/ruleset.yaml" "$top/proto/openapi.yaml"
 }
 
-run_tests
+stop_after_each=1 run_tests
