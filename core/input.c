@@ -6,6 +6,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "core/extend.h"
 #include "core/warn.h"
 
 /* Air regions that differ by more than this tell of a tube or a detector that drifts. */
@@ -96,6 +97,7 @@ int input_open(struct input *ret_input, const struct linearise *linearise, const
 	if (code == 0) {
 		input.linearise.defects = input.map.map;
 		input.pixels = (size_t)geometry->columns * (size_t)geometry->rows;
+		input.look_every = geometry->count / 32 + 1;
 		input.blank = calloc((size_t)geometry->count, sizeof(*input.blank));
 		if (input.blank == NULL)
 			code = error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", geometry->count);
@@ -149,6 +151,59 @@ static void look_at_bytes(struct input *input, const uint16_t *samples)
 	}
 }
 
+/* The line integral of a pixel as it comes, NAN for a defect; without the air region and hardening. */
+static float line_integral(const struct input *input, const void *samples, size_t at)
+{
+	const struct linearise *linearise = &input->linearise;
+	const float sample =
+	    linearise->sample == SAMPLE_UINT16 ? ((const uint16_t *)samples)[at] : ((const float *)samples)[at];
+	const float dark = linearise->dark != NULL ? linearise->dark[at] : 0;
+	const float flat = linearise->flat != NULL ? linearise->flat[at] : (float)linearise->air;
+
+	if ((input->map.map != NULL && input->map.map[at]) || !isfinite(sample))
+		return NAN;
+	if (linearise->quantity == QUANTITY_LINE_INTEGRAL)
+		return sample;
+	return sample < linearise_saturation(linearise) && sample > dark && flat > dark
+		   ? -logf((sample - dark) / (flat - dark))
+		   : NAN;
+}
+
+/* Whether the mean of a piece of the row, 1/32 of it or 8 pixels, reaches the level. */
+static bool row_reaches(const struct input *input, const void *samples, size_t first, int columns, float level)
+{
+	const int piece = columns > 256 ? columns / 32 : 8;
+
+	for (int from = 0; from < columns; from += piece) {
+		float sum = 0;
+		int good = 0;
+
+		for (int c = from; c < columns && c < from + piece; c++) {
+			const float p = line_integral(input, samples, first + (size_t)c);
+
+			sum += isnan(p) ? 0 : p;
+			good += !isnan(p);
+		}
+		if (good >= piece / 2 && good > 0 && sum > 0 && sum >= level * (float)good)
+			return true;
+	}
+	return false;
+}
+
+/* Whether the object goes on beyond the first and the last row. */
+static void look_at_ends(struct input *input, const void *samples, int columns, int rows)
+{
+	float largest = 0, level;
+
+	for (size_t i = 0; i < input->pixels; i += input->pixels / 4096 + 1)
+		largest = fmaxf(largest, line_integral(input, samples, i)); /* NAN is never the larger */
+	level = extend_level(largest);
+	for (int end = 0; end < 2; end++)
+		input->ends[end] +=
+		    row_reaches(input, samples, end ? (size_t)(rows - 1) * (size_t)columns : 0, columns, level);
+	input->views_looked_at++;
+}
+
 int input_take(struct input *input, const struct backend *backend, struct plan *plan, const void *samples, int view,
 	       int slot, struct stack *to, struct error *err)
 {
@@ -167,6 +222,9 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 		look_at_line_integrals(input, samples);
 	if (input->linearise.sample == SAMPLE_UINT16)
 		look_at_bytes(input, samples);
+	if (view % input->look_every == 0)
+		look_at_ends(input, samples, input->turned ? input->rows : input->columns,
+			     input->turned ? input->columns : input->rows);
 	input->views++;
 	/* Those of the map are in every view. */
 	input->defective_views +=
@@ -174,6 +232,12 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 	if (input->counts.blank > before.blank)
 		input->blank[before.blank] = view;
 	return 0;
+}
+
+void input_goes_on(const struct input *input, bool ret_ends[2])
+{
+	for (int end = 0; end < 2; end++)
+		ret_ends[end] = 4 * input->ends[end] > input->views_looked_at;
 }
 
 double input_blank_share(const struct input *input, const struct orbit *orbit)

@@ -18,6 +18,9 @@ struct input {
 	/* Of about 4096 pixels of each view. */
 	double sum; /* of line integrals */
 	size_t looked_at;
+	/* Of about 32 views: how many were looked at, and how many had something that is not air on the first row and
+	 * on the last one. */
+	int look_every, views_looked_at, ends[2];
 	/* Of uint16, as it is and with its bytes exchanged: how far neighbours are apart; the largest then. */
 	double rough[2];
 	int largest;
@@ -36,6 +39,12 @@ size_t input_view_bytes(const struct input *input);
 /* linearise of one view into a slot. */
 int input_take(struct input *input, const struct backend *backend, struct plan *plan, const void *samples, int view,
 	       int slot, struct stack *to, struct error *err);
+
+/*
+ * Whether the object goes on beyond the first row, [0], and the last one, [1]: more than a quarter of the views looked
+ * at have it there.
+ */
+void input_goes_on(const struct input *input, bool ret_ends[2]);
 
 /* The share that blank views have in FDK's density on the axis, 0 .. 1. */
 double input_blank_share(const struct input *input, const struct orbit *orbit);

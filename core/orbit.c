@@ -22,8 +22,7 @@ static const double LEAN_LEAST = 4 * M_PI / 180; /* FDK about z is within 4 HU u
 static const double SAME_ANGLE = 1e-6;           /* radians, a micrometre on a C-arm's orbit */
 static const double DISPLACED_PIXELS = 4, DISPLACED_WIDTH = 0.02;
 
-/* A view in the orbit's frame, rows and columns exchanged where the detector is on its side. */
-static struct view view_in(const struct orbit *orbit, const struct view *view)
+struct view orbit_view(const struct orbit *orbit, const struct view *view)
 {
 	const double *const from[] = {view->source, view->pixel0, view->column_step, view->row_step};
 	struct view ret = *view;
@@ -38,8 +37,7 @@ static struct view view_in(const struct orbit *orbit, const struct view *view)
 	return ret;
 }
 
-/* The detector's sides as view_in has them; the views are borrowed. */
-static struct geometry sides_in(const struct orbit *orbit, const struct geometry *geometry)
+struct geometry orbit_sides(const struct orbit *orbit, const struct geometry *geometry)
 {
 	struct geometry sides = *geometry;
 
@@ -55,7 +53,7 @@ static void find_tilts(const struct orbit *orbit, const struct geometry *geometr
 {
 	ret[0] = ret[1] = 0;
 	for (int k = 0; k < geometry->count; k++) {
-		const struct view view = view_in(orbit, &geometry->views[k]);
+		const struct view view = orbit_view(orbit, &geometry->views[k]);
 		const double *const step[] = {view.column_step, view.row_step};
 
 		for (int i = 0; i < 2; i++)
@@ -210,7 +208,7 @@ static void take_means(struct orbit *orbit, const struct geometry *geometry)
 	double share = 1.0 / geometry->count;
 
 	for (int k = 0; k < geometry->count; k++) {
-		const struct view turned = view_in(orbit, &geometry->views[k]), *view = &turned;
+		const struct view turned = orbit_view(orbit, &geometry->views[k]), *view = &turned;
 		double matrix[12], to_detector[3], depth, magnification;
 
 		view_matrix(view, matrix);
@@ -319,7 +317,7 @@ static void find_fan(struct orbit *orbit, const struct geometry *geometry)
 	double sense = orbit->direction < 0 ? -1 : 1, low_side = INFINITY, high_side = INFINITY;
 
 	for (int k = 0; k < geometry->count; k++) {
-		const struct view turned = view_in(orbit, &geometry->views[k]), *view = &turned;
+		const struct view turned = orbit_view(orbit, &geometry->views[k]), *view = &turned;
 		double radius = hypot(view->source[0], view->source[1]);
 		double edge0 = sense * ray_angle(geometry, view, -0.5);
 		double edge1 = sense * ray_angle(geometry, view, geometry->columns - 0.5);
@@ -340,7 +338,7 @@ static int find_padding(const struct orbit *orbit, const struct geometry *geomet
 	double sign = orbit->displacement > 0 ? 1 : -1, most = 0;
 
 	for (int k = 0; k < geometry->count; k++) {
-		const struct view view = view_in(orbit, &geometry->views[k]);
+		const struct view view = orbit_view(orbit, &geometry->views[k]);
 		double matrix[12];
 
 		view_matrix(&view, matrix);
@@ -372,9 +370,9 @@ int orbit_analyse(struct orbit *ret_orbit, const struct geometry *given, struct 
 	find_tilts(&orbit, geometry, tilts);
 	orbit.turned = tilts[0] > 0.25 * M_PI && tilts[0] > tilts[1];
 	orbit.tilt = tilts[orbit.turned];
-	sides = sides_in(&orbit, given);
+	sides = orbit_sides(&orbit, given);
 	for (int k = 0; k < geometry->count; k++) {
-		const struct view turned = view_in(&orbit, &geometry->views[k]), *view = &turned;
+		const struct view turned = orbit_view(&orbit, &geometry->views[k]), *view = &turned;
 
 		orbit.angle[k] = wrap(atan2(view->source[1], view->source[0]));
 		placed[k] = (struct placed){.angle = orbit.angle[k], .view = k};
@@ -440,7 +438,7 @@ static double overlap(const struct orbit *orbit, const struct geometry *geometry
 	double theta = INFINITY;
 
 	for (int k = 0; k < geometry->count; k++) {
-		const struct view view = view_in(orbit, &geometry->views[k]);
+		const struct view view = orbit_view(orbit, &geometry->views[k]);
 		double edge0 = sense * ray_angle(geometry, &view, -0.5);
 		double edge1 = sense * ray_angle(geometry, &view, geometry->columns - 0.5);
 
@@ -489,6 +487,23 @@ double orbit_axis_weight(const struct orbit *orbit, int view)
 	return orbit->weight[view] * parker(place_in_arc(orbit, view), 0, orbit->parker_delta);
 }
 
+int orbit_directions(const struct orbit *orbit)
+{
+	enum { DEGREES = 180 };
+	bool taken[DEGREES] = {false};
+	int count = 0;
+
+	for (int k = 0; k < orbit->count; k++) {
+		const int degree = (int)lround(orbit->angle[k] * 180 / M_PI) % DEGREES;
+
+		if (taken[degree] || taken[(degree + DEGREES - 1) % DEGREES] || taken[(degree + 1) % DEGREES])
+			continue;
+		taken[degree] = true;
+		count++;
+	}
+	return count;
+}
+
 void orbit_column_weights(const struct orbit *orbit, const struct geometry *geometry, float *ret_weights)
 {
 	double sense = orbit->direction < 0 ? -1 : 1;
@@ -498,7 +513,7 @@ void orbit_column_weights(const struct orbit *orbit, const struct geometry *geom
 	assert(!orbit->turned);
 #pragma omp parallel for schedule(static)
 	for (int k = 0; k < geometry->count; k++) {
-		const struct view turned = view_in(orbit, &geometry->views[k]), *view = &turned;
+		const struct view turned = orbit_view(orbit, &geometry->views[k]), *view = &turned;
 		float *weights = ret_weights + (size_t)k * (size_t)geometry->columns;
 		double b = place_in_arc(orbit, k), constant = 0.5 * orbit->weight[k] * view_weight(view);
 
@@ -512,60 +527,4 @@ void orbit_column_weights(const struct orbit *orbit, const struct geometry *geom
 			weights[column] = (float)(constant * weight);
 		}
 	}
-}
-
-/* Half of the height on the axis that the detector's middle column covers, mm, to the farther side of the isocentre. */
-static double half_height(const struct orbit *orbit, const struct geometry *geometry)
-{
-	double farthest = 0;
-
-	for (int k = 0; k < geometry->count; k++) {
-		const struct view turned = view_in(orbit, &geometry->views[k]), *view = &turned;
-		double radius = hypot(view->source[0], view->source[1]);
-
-		for (int end = 0; end < 2; end++) {
-			double row = end ? geometry->rows - 0.5 : -0.5, ray[3];
-
-			for (int i = 0; i < 3; i++)
-				ray[i] = view->pixel0[i] + 0.5 * (geometry->columns - 1) * view->column_step[i] +
-					 row * view->row_step[i] - view->source[i];
-			if (hypot(ray[0], ray[1]) > 0)
-				farthest =
-				    fmax(farthest, fabs(view->source[2] + ray[2] * radius / hypot(ray[0], ray[1])));
-		}
-	}
-	return farthest;
-}
-
-void orbit_default_grid(const struct orbit *orbit, const struct geometry *given, int most, struct grid *ret_grid)
-{
-	const struct geometry sides = sides_in(orbit, given), *geometry = &sides;
-	double width = orbit->field_of_view, height = 2 * half_height(orbit, geometry), nearest = INFINITY;
-	double spacing = orbit->pixel_at_isocentre[0];
-
-	for (int k = 0; k < geometry->count; k++) {
-		const struct view view = view_in(orbit, &geometry->views[k]);
-
-		nearest = fmin(nearest, hypot(view.source[0], view.source[1]));
-	}
-	/* Where the views have no common cylinder: as wide as the detector. */
-	if (!(width > spacing))
-		width = spacing * geometry->columns;
-	/* The square's corners stay in front of the sources, however wide the fan: 1.4 of the radius is the limit. */
-	width = fmin(width, 1.3 * nearest);
-	if (geometry->rows > 1)
-		spacing = fmin(spacing, orbit->pixel_at_isocentre[1]);
-	spacing = fmax(spacing, width / most);
-	if (geometry->rows > 1)
-		spacing = fmax(spacing, height / most);
-	for (int i = 0; i < 3; i++) {
-		double side = i < 2 ? width : height;
-
-		/* A part of a millionth is rounding, not another voxel. */
-		ret_grid->size[i] = (int)fmin(most, fmax(1, ceil(side / spacing - 1e-6)));
-		ret_grid->spacing[i] = spacing;
-	}
-	if (geometry->rows == 1)
-		ret_grid->size[2] = 1;
-	grid_centre(ret_grid);
 }

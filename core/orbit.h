@@ -107,6 +107,9 @@ void orbit_clear(struct orbit *orbit);
  */
 void orbit_column_weights(const struct orbit *orbit, const struct geometry *geometry, float *ret_weights);
 
+/* How many directions the views look along; those within a degree of another or of its opposite are one with it. */
+int orbit_directions(const struct orbit *orbit);
+
 /*
  * What the view counts for in FDK's density on the axis: its angular weight times
  * the short-scan or displaced weight of its ray through the axis.
@@ -114,11 +117,31 @@ void orbit_column_weights(const struct orbit *orbit, const struct geometry *geom
 double orbit_axis_weight(const struct orbit *orbit, int view);
 
 /*
- * A grid for who gives none: centred on the isocentre, cubic voxels, the field of
- * view across and what the cone covers on the axis along z (one slice for a
- * detector of one row), at the resolution of the detector at the isocentre,
- * coarsened so that no side has more than `most` voxels.
+ * A view in the orbit's frame, rows and columns exchanged where the detector is on its side, and the geometry with the
+ * sides of that detector, its views those given and borrowed. For core/orbit*.c only.
+ */
+struct view orbit_view(const struct orbit *orbit, const struct view *view);
+struct geometry orbit_sides(const struct orbit *orbit, const struct geometry *geometry);
+
+/*
+ * A grid where none is given: cubic voxels at the resolution of the detector at the isocentre, coarsened so that no
+ * side has more than `most` voxels; across, the field of view, and along z all slices in which every view has the
+ * whole field of view on its rows, not centred where the detector is not. One slice, where its plane meets the axis,
+ * for a detector of one row. An orbit that leans so far that this leaves less than half of the height gets the box
+ * around what all views see, and one whose views have next to no height in common the grid of orbit_covering_grid:
+ * orbit_unseen_slices then tells.
  */
 void orbit_default_grid(const struct orbit *orbit, const struct geometry *geometry, int most, struct grid *ret_grid);
+/*
+ * The same centred on the isocentre and with all that the cone covers on the axis along z: the slices at its ends
+ * are not seen by all views.
+ */
+void orbit_covering_grid(const struct orbit *orbit, const struct geometry *geometry, int most, struct grid *ret_grid);
+/*
+ * How many slices of a grid, from its first and from its last one on, have a place of the field of view that is not on
+ * the rows of every view: FDK is too low there.
+ */
+int orbit_unseen_slices(const struct orbit *orbit, const struct geometry *geometry, const struct grid *grid,
+			int ret_slices[2], struct error *err);
 
 #endif

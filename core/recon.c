@@ -849,6 +849,25 @@ static int leave_out_the_exterior(struct recon *recon, struct error *err)
 	return code;
 }
 
+/* Slices of the grid's ends that lack views, where the object is there. */
+static int warn_of_unseen_slices(const struct recon *recon, struct error *err)
+{
+	const struct geometry *geometry = recon->geometry;
+	const bool downwards = vec_dot(geometry->views[0].row_step, recon->orbit.frame[2]) < 0;
+	bool ends[2];
+	int slices[2] = {0}, code = 0;
+
+	input_goes_on(&recon->input, ends);
+	if (geometry->rows > 1 && (ends[0] || ends[1]))
+		code = orbit_unseen_slices(&recon->orbit, geometry, &recon->recipe.grid, slices, err);
+	for (int end = 0; end < 2; end++)
+		if (!ends[downwards ? 1 - end : end])
+			slices[end] = 0;
+	if (code == 0)
+		warn_unseen_slices(recon->hooks, &recon->recipe.grid, slices);
+	return code;
+}
+
 static bool is_last(const struct recipe *recipe, const struct history_row *row)
 {
 	return row->iteration >= recipe->sart.iterations ||
@@ -877,6 +896,8 @@ static int run_sart(struct recon *recon, struct error *err)
 		last = is_last(&recon->recipe, &row);
 		if (hooks->row != NULL)
 			hooks->row(hooks->context, &row);
+		if (last)
+			warn_residual(hooks, &row);
 		snprintf(name, sizeof(name), "iter-%d", row.iteration);
 		if (is_wanted(&recon->recipe, row.iteration))
 			code = keep(recon, name, "sart", err);
@@ -917,8 +938,10 @@ int recon_run(struct recon *recon, struct error *err)
 	if (!recon->resumed) {
 		warn_recipe(recon->hooks, recon->geometry, recipe);
 		input_warn(&recon->input, recon->geometry, recon->hooks);
+		code = warn_of_unseen_slices(recon, err);
 	}
-	code = check_cancelled(recon, err);
+	if (code == 0)
+		code = check_cancelled(recon, err);
 	if (code == 0 && recon->resumed)
 		code = take_metal_out_again(recon, err);
 	if (code == 0)

@@ -31,7 +31,7 @@ static void choose_grid(const struct surroundings_options *options, struct grid 
 	struct grid wide, inner = *options->grid;
 	struct error err;
 
-	orbit_default_grid(options->orbit, options->geometry, most, &wide);
+	orbit_covering_grid(options->orbit, options->geometry, most, &wide);
 	for (int narrow = options->inside_only; narrow < 2; narrow++) {
 		double low[3], side[3], spacing = wide.spacing[0];
 

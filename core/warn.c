@@ -80,6 +80,18 @@ static bool is_crossed_in_any(const struct grid *grid, const struct geometry *ge
 	return false;
 }
 
+static void warn_of_small_grid(const struct recon_hooks *hooks, const struct grid *grid)
+{
+	const int single = (grid->size[0] == 1) + (grid->size[1] == 1) + (grid->size[2] == 1);
+
+	if (single >= 2)
+		recon_warn(hooks, "grid_too_small",
+			   "the grid has %d x %d x %d voxels of %g x %g x %g mm: it shows no cross-section of the "
+			   "object",
+			   grid->size[0], grid->size[1], grid->size[2], grid->spacing[0], grid->spacing[1],
+			   grid->spacing[2]);
+}
+
 void warn_recipe(const struct recon_hooks *hooks, const struct geometry *geometry, const struct recipe *recipe)
 {
 	const struct grid *grid = &recipe->grid;
@@ -96,9 +108,35 @@ void warn_recipe(const struct recon_hooks *hooks, const struct geometry *geometr
 			   "the pixels: SART leaves it as it was",
 			   grid->size[0] * grid->spacing[0], grid->size[1] * grid->spacing[1],
 			   grid->size[2] * grid->spacing[2]);
+	warn_of_small_grid(hooks, grid);
 	if (recipe->tv.on && !recipe->tv.after_fdk && !recipe->sart.on)
 		recon_warn(hooks, "tv_without_sart",
 			   "TV was wanted after SART iterations, and there are none: the FDK volume is left alone");
+}
+
+void warn_unseen_slices(const struct recon_hooks *hooks, const struct grid *grid, const int slices[2])
+{
+	if (slices[0] + slices[1] == 0)
+		return;
+	recon_warn(
+	    hooks, "slices_unseen",
+	    "the object goes on beyond the detector's rows, and the first %d and the last %d of %d slices are not "
+	    "seen by all views: their values are too low",
+	    slices[0], slices[1], grid->size[2]);
+}
+
+void warn_residual(const struct recon_hooks *hooks, const struct history_row *row)
+{
+	const double implausible = 0.5;
+
+	/* The first iteration meets the projections before it has explained any of them. */
+	if (row->iteration < 2 || !(row->residual > implausible))
+		return;
+	recon_warn(
+	    hooks, "residual_high",
+	    "after %d iterations the volume still leaves %.3g of the projections unexplained (residual): geometry, "
+	    "grid or projections do not fit each other, or far more iterations are needed",
+	    row->iteration, row->residual);
 }
 
 /* What FDK calls rows, and the sides of a detector, are named as they came. */

@@ -12,8 +12,15 @@
 __attribute__((format(printf, 3, 4))) void recon_warn(const struct recon_hooks *hooks, const char *code,
 						      const char *format, ...);
 
-/* "grid_unseen", "tv_without_sart". What the orbit lacks is told with the scan (proto/scan.h). */
+/* "grid_unseen", "grid_too_small", "tv_without_sart". What the orbit lacks is told with the scan (proto/scan.h). */
 void warn_recipe(const struct recon_hooks *hooks, const struct geometry *geometry, const struct recipe *recipe);
+/*
+ * "slices_unseen": slices[0] slices at the low end of the grid and slices[1] at the high one are not seen by all views
+ * (orbit_unseen_slices), and the object goes on there; none: nothing is told.
+ */
+void warn_unseen_slices(const struct recon_hooks *hooks, const struct grid *grid, const int slices[2]);
+/* "residual_high": SART has ended, and the volume explains less than half of the projections. */
+void warn_residual(const struct recon_hooks *hooks, const struct history_row *row);
 /*
  * "truncated": rows[0] rows of all views were cut off at the first column, rows[1] at the last; of a few nothing is
  * told. turned: what is a row here came as a column.

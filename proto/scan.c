@@ -529,6 +529,19 @@ static int compare_angles(const void *a, const void *b)
 	return (x->angle > y->angle) - (x->angle < y->angle);
 }
 
+static void warn_few_views(cJSON *list, const struct orbit *orbit)
+{
+	/* Below it every contour of the object is seen from two or three sides only: a polygon, not a shape. */
+	const int few = 5, directions = orbit_directions(orbit);
+
+	if (directions < few)
+		warn(list, "few_views",
+		     "the %d projections look along %d directions, opposite ones counted once: neither shapes nor "
+		     "values "
+		     "can be told from fewer than some dozens",
+		     orbit->count, directions);
+}
+
 /* Views at the same angle as another, and holes in the arc. */
 static void warn_angles(cJSON *list, const struct orbit *orbit)
 {
@@ -719,6 +732,7 @@ cJSON *scan_warnings(const struct scan *scan)
 	if (orbit->count > 1) {
 		warn_weights(list, orbit);
 		warn_angles(list, orbit);
+		warn_few_views(list, orbit);
 	} else {
 		warn(list, "single_view", "one view only: depth cannot be told");
 	}

@@ -823,17 +823,25 @@ START_TEST(a_default_grid_covers_what_is_seen_and_no_more)
 		struct sweep sweep;
 		int most;
 		int size[3];
-		double spacing;
+		double spacing, middle; /* mm, of the slices */
 	} rows[] = {
-	    /* 2 * 620 * sin(atan(223.6 / 1100)) = 247.0 mm across, 252.0 mm high, pixels of 0.451 mm */
-	    {{559, 559, 0.8, 0, 3.6, 100, {0, 0}, 0}, 1024, {548, 548, 559}, 0.8 * 620 / 1100},
-	    {{559, 559, 0.8, 0, 3.6, 100, {0, 0}, 0}, 256, {251, 251, 256}, 559 * 0.8 * 620 / 1100 / 256},
-	    {{559, 101, 0.8, 0, 3.6, 100, {0, 0}, 0}, 1024, {548, 548, 101}, 0.8 * 620 / 1100},
-	    {{559, 1, 0.8, 0, 3.6, 100, {0, 0}, 0}, 1024, {548, 548, 1}, 0.8 * 620 / 1100},
-	    {{559, 1, 0.8, 0, 3.6, 100, {0, 0}, 0}, 128, {128, 128, 1}, 247.007 / 128},
-	    {{1, 1, 0.8, 0, 3.6, 100, {0, 0}, 0}, 128, {1, 1, 1}, 0.8 * 620 / 1100},
-	    /* The rows are 80 mm up: as far down as up is covered. */
-	    {{559, 101, 0.8, 0, 3.6, 100, {0, 80}, 0}, 1024, {548, 548, 301}, 0.8 * 620 / 1100},
+	    /*
+	     * 2 * 620 * sin(atan(223.6 / 1100)) = 247.0 mm across, pixels of 0.451 mm. The rows' centres are 223.2 mm
+	     * from the middle one, and 223.2 * (620 - 123.5) / 1100 = 100.7 mm at the field of view's near side: 446.8
+	     * voxels between the outermost centres.
+	     */
+	    {{559, 559, 0.8, 0, 3.6, 100, {0, 0}, 0}, 1024, {548, 548, 447}, 0.8 * 620 / 1100, 0},
+	    {{559, 559, 0.8, 0, 3.6, 100, {0, 0}, 0}, 256, {256, 256, 209}, 247.007 / 256, 0},
+	    {{559, 101, 0.8, 0, 3.6, 100, {0, 0}, 0}, 1024, {548, 548, 81}, 0.8 * 620 / 1100, 0},
+	    {{559, 1, 0.8, 0, 3.6, 100, {0, 0}, 0}, 1024, {548, 548, 1}, 0.8 * 620 / 1100, 0},
+	    {{559, 1, 0.8, 0, 3.6, 100, {0, 0}, 0}, 128, {128, 128, 1}, 247.007 / 128, 0},
+	    {{1, 1, 0.8, 0, 3.6, 100, {0, 0}, 0}, 128, {1, 1, 1}, 0.8 * 620 / 1100, 0},
+	    /* 60 mm up: from 20 * (620 + 123.5) / 1100 = 13.5 mm at the far side to 100 * (620 - 123.5) / 1100 = 45.1.
+	     */
+	    {{559, 101, 0.8, 0, 3.6, 100, {0, 60}, 0}, 1024, {548, 548, 71}, 0.8 * 620 / 1100, 29.33},
+	    /* Nearly two fields of view up no slice is seen by all views as a whole: as much as is covered on the axis.
+	     */
+	    {{559, 101, 0.8, 0, 3.6, 100, {0, 200}, 0}, 1024, {548, 548, 601}, 0.8 * 620 / 1100, 0},
 	};
 
 	for (size_t i = 0; i < sizeof(rows) / sizeof(*rows); i++) {
@@ -844,17 +852,91 @@ START_TEST(a_default_grid_covers_what_is_seen_and_no_more)
 
 		orbit_default_grid(&orbit, &geometry, rows[i].most, &grid);
 		for (int axis = 0; axis < 3; axis++) {
+			const double middle = axis == 2 ? rows[i].middle : 0;
+
 			ck_assert_msg(grid.size[axis] == rows[i].size[axis], "row %zu: axis %d has %d voxels", i, axis,
 				      grid.size[axis]);
 			ck_assert_double_eq_tol(grid.spacing[axis], rows[i].spacing, 1e-5);
-			ck_assert_double_eq_tol(grid.origin[axis], -0.5 * (grid.size[axis] - 1) * grid.spacing[axis],
-						1e-9);
+			ck_assert_double_eq_tol(grid.origin[axis],
+						middle - 0.5 * (grid.size[axis] - 1) * grid.spacing[axis],
+						axis == 2 && middle != 0 ? 0.1 : 1e-9);
 		}
 		ck_assert_int_eq(grid_check(&grid, &err), 0);
 		ck_assert_int_eq(grid_check_geometry(&grid, &geometry, &err), 0);
 		orbit_clear(&orbit);
 		geometry_clear(&geometry);
 	}
+}
+END_TEST
+
+/* mm that the field of view of a slice leaves the rows by in the worst view, by the matrices alone; below 0: it does
+ * not. */
+static double leaves_rows_by(const struct geometry *geometry, const double radius, double z)
+{
+	double worst = -INFINITY;
+
+	for (int k = 0; k < geometry->count; k++) {
+		double matrix[12];
+
+		view_matrix(&geometry->views[k], matrix);
+		for (int i = 0; i < 90; i++) {
+			const double point[3] = {radius * cos(4 * i * DEGREE), radius * sin(4 * i * DEGREE), z};
+			double column, row;
+
+			view_project(matrix, point, &column, &row);
+			if (column >= 0 && column <= geometry->columns - 1)
+				worst = fmax(worst, fmax(-row, row - (geometry->rows - 1)));
+		}
+	}
+	return worst;
+}
+
+/* Full turns and short scans, displaced, moved up, with a source beside the axis, and a real arm's calibrated sweep. */
+START_TEST(every_slice_of_a_default_grid_is_seen_by_all_views)
+{
+	static const struct sweep sweeps[] = {
+	    {160, 120, 2, 0, 3.6, 100, {0, 0}, 0},  {160, 120, 2, 40, -1.8, 115, {0, 0}, 0},
+	    {160, 120, 2, 0, 1.5, 240, {90, 0}, 0}, {160, 120, 2, 0, 1.5, 240, {-90, 25}, 0},
+	    {160, 120, 2, 0, 3.6, 100, {0, 25}, 4},
+	};
+	enum { SWEEPS = sizeof(sweeps) / sizeof(*sweeps) };
+	struct geometry geometry;
+	struct error err = {0};
+	struct orbit orbit;
+	struct grid grid;
+	int unseen[2];
+
+	if (_i < SWEEPS) {
+		geometry = geometry_of(&sweeps[_i], NULL);
+	} else {
+		double *matrices = data_npy("carm_kct_248.npy", 248 * 12), pitch[2] = {0.616, 0.616};
+
+		if (matrices == NULL)
+			return;
+		ck_assert_int_eq(geometry_matrices(&geometry, 616, 480, 248, matrices, pitch, &err), 0);
+		free(matrices);
+	}
+	orbit = orbit_of(&geometry);
+	orbit_default_grid(&orbit, &geometry, 256, &grid);
+	for (int end = 0; end < 2; end++) {
+		const double z = grid.origin[2] + (end ? grid.size[2] - 1 : 0) * grid.spacing[2];
+		const double beyond = z + (end ? 1.5 : -1.5) * grid.spacing[2], radius = orbit.field_of_view / 2;
+
+		/* 48 directions round the circle stand for all: a thousandth of its radius, a twentieth of a row. */
+		ck_assert_msg(leaves_rows_by(&geometry, radius, z) < 0.05, "%d: by %g rows at %g mm", _i,
+			      leaves_rows_by(&geometry, radius, z), z);
+		ck_assert_msg(leaves_rows_by(&geometry, radius, beyond) > 0, "%d: not at %g mm", _i, beyond);
+	}
+	ck_assert_int_eq(orbit_unseen_slices(&orbit, &geometry, &grid, unseen, &err), 0);
+	ck_assert_int_eq(unseen[0] + unseen[1], 0);
+	/* With three slices more at the low end and five at the high one. */
+	grid.origin[2] -= 3 * grid.spacing[2];
+	grid.size[2] += 8;
+	ck_assert_int_eq(orbit_unseen_slices(&orbit, &geometry, &grid, unseen, &err), 0);
+	ck_assert_int_le(abs(unseen[0] - 3), 1);
+	ck_assert_int_le(abs(unseen[1] - 5), 1);
+	orbit_clear(&orbit);
+	geometry_clear(&geometry);
 }
 END_TEST
 
@@ -879,6 +961,26 @@ START_TEST(a_default_grid_exists_for_any_orbit)
 			      "sweep %zu: %s", i, err.text);
 		for (int axis = 0; axis < 3; axis++)
 			ck_assert_int_le(grid.size[axis], 256);
+		orbit_clear(&orbit);
+		geometry_clear(&geometry);
+	}
+}
+END_TEST
+
+/* Opposite views look along one direction, however many they are; so do those beside each other. */
+START_TEST(directions_are_counted_without_their_opposites)
+{
+	static const struct {
+		double step;
+		int views, directions;
+	} rows[] = {{180, 2, 1}, {180, 40, 1}, {120, 3, 3}, {90, 4, 2}, {3.6, 100, 50}, {0.1, 20, 2}, {1, 99, 50}};
+
+	for (size_t i = 0; i < sizeof(rows) / sizeof(*rows); i++) {
+		const struct sweep sweep = {64, 64, 0.8, 10, rows[i].step, rows[i].views, {0, 0}, 0};
+		struct geometry geometry = geometry_of(&sweep, NULL);
+		struct orbit orbit = orbit_of(&geometry);
+
+		ck_assert_int_eq(orbit_directions(&orbit), rows[i].directions);
 		orbit_clear(&orbit);
 		geometry_clear(&geometry);
 	}
@@ -954,6 +1056,7 @@ Suite *orbit_suite(void)
 	tcase_add_test(facts, a_displaced_detector_widens_the_field_of_view);
 	tcase_add_test(facts, a_detector_on_its_side_has_the_same_orbit);
 	tcase_add_test(facts, a_real_c_arm_s_orbit_is_a_short_scan);
+	tcase_add_test(facts, directions_are_counted_without_their_opposites);
 	tcase_add_test(facts, an_orbit_that_leans_over_is_told_about_its_own_axis);
 	suite_add_tcase(suite, facts);
 	tcase_add_test(weights, conjugate_rays_sum_to_two);
@@ -965,6 +1068,7 @@ Suite *orbit_suite(void)
 	tcase_set_timeout(facts, 60);
 	suite_add_tcase(suite, weights);
 	tcase_add_test(grids, a_default_grid_covers_what_is_seen_and_no_more);
+	tcase_add_loop_test(grids, every_slice_of_a_default_grid_is_seen_by_all_views, 0, 6);
 	tcase_add_test(grids, a_default_grid_exists_for_any_orbit);
 	suite_add_tcase(suite, grids);
 	return suite;

@@ -361,6 +361,121 @@ static struct recipe small_recipe(void)
 	return recipe;
 }
 
+/* A trunk longer than the panel, on the grid that is chosen for it: FDK's mean in each slice, to its first and last. */
+START_TEST(the_automatic_grid_has_no_slice_that_lacks_views)
+{
+	const struct orbit_spec specs[] = {
+	    {88, 48, 90, {620, 1100, {4, 4}, {0, 0}, {0, 0}}, 0, 4},
+	    {88, 48, 90, {620, 1100, {4, 4}, {0, 30}, {0, 0}}, 20, -2.4},
+	};
+	struct ellipsoid trunk = {.shape = SHAPE_CYLINDER, .semi_axes = {80, 60, 400}, .density = 0.0192};
+	struct phantom phantom = {.count = 1, .parts = &trunk};
+	struct outcome outcome = {0};
+	struct recipe recipe;
+	struct scene scene;
+
+	recipe_defaults(&recipe);
+	recipe.fdk.on = true;
+	scene_orbit(&scene, &specs[_i]);
+	scene_add(&scene, &phantom);
+	run(&scene, &recipe, &outcome);
+	ck_assert_int_gt(outcome.grid.size[2], 25);
+	for (int k = 0; k < outcome.grid.size[2]; k++) {
+		const double middle[3] = {0, 0, outcome.grid.origin[2] + k * outcome.grid.spacing[2]};
+		const size_t slice = (size_t)outcome.grid.size[0] * (size_t)outcome.grid.size[1];
+		double sum = 0;
+		int count = 0;
+
+		for (int j = 0; j < outcome.grid.size[1]; j++)
+			for (int i = 0; i < outcome.grid.size[0]; i++) {
+				const double x = outcome.grid.origin[0] + i * outcome.grid.spacing[0];
+				const double y = outcome.grid.origin[1] + j * outcome.grid.spacing[1];
+
+				if (hypot(x / 72, y / 52) > 1)
+					continue;
+				sum +=
+				    (double)outcome
+					.last[(size_t)k * slice + (size_t)j * (size_t)outcome.grid.size[0] + (size_t)i];
+				count++;
+			}
+		/* With all that is covered on the axis as the grid, the first and last slice are 400 HU too low. */
+		ck_assert_msg(fabs(sum / count / 0.0192 - 1) < 0.02, "slice %d at %.1f mm: %.1f HU", k, middle[2],
+			      1000 * (sum / count / 0.0192 - 1));
+	}
+	ck_assert_ptr_null(strstr(outcome.warnings, "slices_unseen: "));
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
+/* The object, or its rest, decides whether slices that not all views see are worth a word. */
+START_TEST(slices_that_lack_views_are_told_where_the_object_is_there)
+{
+	const struct orbit_spec spec = {88, 48, 45, {620, 1100, {4, 4}, {0, 0}, {0, 0}}, 0, 8};
+	const double half[] = {400, 400, 60, 30};
+	const double middle[] = {0, 200, 0, 0}; /* of the trunk: from -200 on, so that the high end alone goes on */
+	struct ellipsoid trunk = {.shape = SHAPE_CYLINDER, .semi_axes = {80, 60, 0}, .density = 0.0192};
+	struct phantom phantom = {.count = 1, .parts = &trunk};
+	struct grid grid = grid_of(60, 60, 40, 3.2, 3.2, 3.2); /* 128 mm, 84 of it seen by all views */
+	struct recipe recipe = recipe_on(&grid);
+	struct outcome outcome = {0};
+	struct scene scene;
+
+	trunk.semi_axes[2] = _i == 1 ? 230 : half[_i];
+	trunk.centre[2] = middle[_i];
+	recipe.fdk.on = true;
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	run(&scene, &recipe, &outcome);
+	if (_i == 3)
+		ck_assert_ptr_null(strstr(outcome.warnings, "slices_unseen: "));
+	else
+		ck_assert_msg(strstr(outcome.warnings, _i == 1 ? "the first 0 and the last 6 of 40 slices"
+							       : "the first 6 and the last 6 of 40 slices") != NULL,
+			      "%s", outcome.warnings);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
+START_TEST(a_grid_without_a_cross_section_is_told)
+{
+	struct grid grid = _i == 0   ? grid_of(1, 1, 1, 5, 5, 5)
+			   : _i == 1 ? grid_of(1, 20, 1, 2, 2, 2)
+				     : grid_of(20, 20, 1, 2, 2, 2);
+	struct recipe recipe = recipe_on(&grid);
+	struct outcome outcome = {0};
+	struct scene scene;
+
+	recipe.fdk.on = true;
+	small_scene(&scene);
+	run(&scene, &recipe, &outcome);
+	ck_assert_int_eq(strstr(outcome.warnings, "grid_too_small: ") != NULL, _i < 2);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
+/* Projections of the wrong sign cannot be explained by a volume that is nowhere negative. */
+START_TEST(a_residual_that_stays_high_is_told_at_the_end)
+{
+	struct recipe recipe = small_recipe();
+	struct outcome outcome = {0};
+	struct scene scene;
+
+	small_scene(&scene);
+	if (_i == 0)
+		for (size_t i = 0; i < (size_t)scene.geometry.count * 44 * 44; i++)
+			scene.projections[i] = -scene.projections[i];
+	recipe.sart.subsets = 1;
+	recipe.sart.iterations = _i == 1 ? 1 : 6; /* the first row is 1 by what it is */
+	run(&scene, &recipe, &outcome);
+	ck_assert_msg((strstr(outcome.warnings, "residual_high: ") != NULL) == (_i == 0), "%s", outcome.warnings);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
 /* Simultaneous updates are a steepest descent of a weighted residual; the rows' own norm is close enough to it. */
 START_TEST(sirt_lowers_the_residual_in_every_iteration)
 {
@@ -1744,6 +1859,10 @@ Suite *recon_suite(void)
 	tcase_add_loop_test(images, balls_off_centre_are_where_they_were_put, 0, 2 * ORBITS);
 	tcase_add_loop_test(images, strange_orbits_give_the_density_back, 0, 2 * STRANGE_COUNT);
 	tcase_add_test(images, one_row_and_one_slice_give_a_disc);
+	tcase_add_loop_test(images, the_automatic_grid_has_no_slice_that_lacks_views, 0, 2);
+	tcase_add_loop_test(images, slices_that_lack_views_are_told_where_the_object_is_there, 0, 4);
+	tcase_add_loop_test(images, a_grid_without_a_cross_section_is_told, 0, 3);
+	tcase_add_loop_test(images, a_residual_that_stays_high_is_told_at_the_end, 0, 3);
 	tcase_add_test(images, a_single_view_is_explained_by_sart_and_harmless_to_fdk);
 	tcase_add_test(images, without_a_grid_one_is_chosen);
 	tcase_add_loop_test(images, fdk_is_as_good_as_rtk_demands, 0, COUNT(rtk_fdk));

@@ -412,6 +412,8 @@ static const struct {
     {"3.6", "4", 360, "counter-clockwise", "full", "none", "duplicate_angles "}, /* 400 degrees in all */
     {"\"detector_offset_mm\": [0", "\"detector_offset_mm\": [150", 360, "counter-clockwise", "full", "displaced",
      "displaced_detector "},
+    {"\"count\": 100", "\"count\": 2", 3.6, "counter-clockwise", "short", "parker",
+     "arc_too_short parker_weights few_views "},
     {"\"count\": 100", "\"count\": 1", 0, "none", "single view", "none", "single_view "},
     {"\"line_integral\"", "\"intensity\", \"air\": 60000, \"saturation\": 50000", 360, "counter-clockwise", "full",
      "none", "air_saturated "},
