@@ -177,6 +177,7 @@ apt_install = { $$run apt-get install -y -qq --no-install-recommends $(1) >/dev/
 	  { $$run apt-get update -qq && DEBIAN_FRONTEND=noninteractive $$run apt-get install -y -qq --no-install-recommends $(1) >/dev/null; }; }
 
 check: OPTIONAL += chromium:chromium
+check: MODULES += nibabel:python3-nibabel
 setup: ## install the Debian packages that are missing
 	@missing=""; \
 	for pair in $(COMMANDS); do command -v $${pair%%:*} >/dev/null 2>&1 || missing="$$missing $${pair##*:}"; done; \

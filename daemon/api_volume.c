@@ -139,7 +139,7 @@ int volume_options(struct request *request, const struct job_facts *job, struct 
 		   struct error *err)
 {
 	const char *scale_text = request_query(request, "scale");
-	struct content_options options = {.mu_water = job->mu_water, .name = ""};
+	struct content_options options = {.mu_water = job->mu_water};
 	long scale = 1;
 
 	if (read_format(request, &options, err) != 0)
@@ -178,8 +178,8 @@ static void make_etag(const char *job, const struct volume_record *volume, const
 	char tag[VOLUME_TAG_MAX];
 
 	volume_tag(job, volume, tag);
-	snprintf(ret_etag, size, "\"%s-%s-%s-%d%s\"", tag, options->shuffled ? shuffled_name : options->format->name,
-		 volume_type_names[options->type], options->scale, zstd ? "-zstd" : "");
+	snprintf(ret_etag, size, "\"%s-%s-%s-%d-%d%s\"", tag, options->shuffled ? shuffled_name : options->format->name,
+		 volume_type_names[options->type], options->scale, FORMAT_REVISION, zstd ? "-zstd" : "");
 }
 
 /* A part of the content that is made as it is sent. */
@@ -267,7 +267,6 @@ int volume_get(void *context, struct request *request, struct error *err)
 	if (volume_asked(api, request, &facts, &volume, err) != 0 ||
 	    volume_options(request, &facts, &options, err) != 0)
 		return err->code;
-	options.name = volume.name;
 	store_volume_path(api->store, facts.id, volume.name, path);
 	if (content_open(path, &volume.grid, &options, &content, err) != 0)
 		return err->code;

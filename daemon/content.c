@@ -24,6 +24,8 @@ struct content {
 	struct content_options options;
 	uint8_t header[FORMAT_HEADER_MAX];
 	size_t header_size;
+	size_t start;   /* of the voxels in the file */
+	bool as_stored; /* the header is that of the file */
 	size_t voxel_bytes;
 	float *rows;          /* [factor[1]][nx], for means */
 	float voxels[CHUNK];  /* a piece of the scaled volume, 1/mm */
@@ -75,17 +77,25 @@ static int read_file(const struct content *content, uint64_t offset, void *to, s
 	return 0;
 }
 
-/* Of the file itself where it is sent as it is: the same bytes, whichever way they go. */
-static int make_header(struct content *content, struct error *err)
+/* From what the file itself says of its origin: the scan may be gone. */
+static int make_header(struct content *content, const char *path, struct error *err)
 {
 	const struct content_options *options = &content->options;
+	struct provenance provenance;
+	uint8_t stored[SPOOL_VOLUME_OFFSET];
+	int code = volume_own_head(content->descriptor, path, &content->grid, &content->start, &provenance, err);
 
-	content->header_size = options->format->header(&content->scaled, options->type, options->name, content->header);
-	if (!is_plain(content) || options->format != volume_formats)
-		return 0;
-	if (read_file(content, 0, content->header, content->header_size) != 0)
-		return error_set(err, ERR_IO, "the volume's file cannot be read");
-	return 0;
+	if (code != 0)
+		return code;
+	code = options->format->header(&content->scaled, options->type, &provenance, content->header,
+				       &content->header_size, err);
+	provenance_clear(&provenance);
+	/* One from before there were extensions is sent with a header of today. */
+	content->as_stored = code == 0 && is_plain(content) && options->format == volume_formats &&
+			     content->start == content->header_size && content->header_size == sizeof(stored) &&
+			     read_file(content, 0, stored, sizeof(stored)) == 0 &&
+			     memcmp(stored, content->header, sizeof(stored)) == 0;
+	return code;
 }
 
 int content_open(const char *path, const struct grid *grid, const struct content_options *options,
@@ -112,7 +122,7 @@ int content_open(const char *path, const struct grid *grid, const struct content
 		content_close(content);
 		return err->code;
 	}
-	if (make_header(content, err) != 0) {
+	if (make_header(content, path, err) != 0) {
 		content_close(content);
 		return err->code;
 	}
@@ -139,9 +149,9 @@ uint64_t content_size(const struct content *content)
 int content_descriptor(const struct content *content, uint64_t *ret_offset)
 {
 	/* The file is a NIfTI; without its header it is raw. */
-	if (!is_plain(content) || (content->options.format != volume_formats && content->header_size != 0))
+	if (!is_plain(content) || (!content->as_stored && content->header_size != 0))
 		return -1;
-	*ret_offset = content->header_size != 0 ? 0 : SPOOL_VOLUME_OFFSET;
+	*ret_offset = content->header_size != 0 ? 0 : content->start;
 	return fcntl(content->descriptor, F_DUPFD_CLOEXEC, 0);
 }
 
@@ -162,7 +172,7 @@ static int read_means(struct content *content, size_t x, size_t y, size_t z, siz
 	for (size_t dz = 0; dz < planes; dz++) {
 		uint64_t first = ((first_z + dz) * ny + first_y) * nx;
 
-		if (read_file(content, SPOOL_VOLUME_OFFSET + first * sizeof(float), content->rows,
+		if (read_file(content, content->start + first * sizeof(float), content->rows,
 			      rows * nx * sizeof(float)) != 0)
 			return -1;
 		for (size_t dy = 0; dy < rows; dy++) {
@@ -187,7 +197,7 @@ static int read_voxels(struct content *content, uint64_t first, size_t count, fl
 	size_t nx = (size_t)content->scaled.size[0], ny = (size_t)content->scaled.size[1];
 
 	if (content->options.scale == 1)
-		return read_file(content, SPOOL_VOLUME_OFFSET + first * sizeof(float), to, count * sizeof(float));
+		return read_file(content, content->start + first * sizeof(float), to, count * sizeof(float));
 	while (count > 0) {
 		size_t x = first % nx, y = first / nx % ny, z = first / nx / ny;
 		size_t part = nx - x < count ? nx - x : count;
@@ -283,7 +293,7 @@ static ssize_t read_body(struct content *content, uint64_t offset, void *to, siz
 	if (content->options.shuffled)
 		return read_shuffled(content, offset, to, size);
 	if (is_plain(content))
-		return read_file(content, SPOOL_VOLUME_OFFSET + offset, to, size);
+		return read_file(content, content->start + offset, to, size);
 	return read_converted(content, offset, to, size);
 }
 

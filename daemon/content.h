@@ -16,10 +16,9 @@ struct content;
 struct content_options {
 	const struct volume_format *format;
 	enum volume_type type;
-	bool shuffled;    /* raw int16 with bytes sorted: of each plane z the low bytes [y][x], then the high ones */
-	int scale;        /* 1: as it is; s: each voxel the mean of s x s x s, at the far ends of what is there */
-	double mu_water;  /* 1/mm, for Hounsfield units */
-	const char *name; /* for the file's description */
+	bool shuffled;   /* raw int16 with bytes sorted: of each plane z the low bytes [y][x], then the high ones */
+	int scale;       /* 1: as it is; s: each voxel the mean of s x s x s, at the far ends of what is there */
+	double mu_water; /* 1/mm, for Hounsfield units */
 };
 enum { CONTENT_SCALE_MAX = 16 };
 

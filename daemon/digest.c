@@ -17,7 +17,7 @@
 
 #include "daemon/log.h"
 #include "proto/durable.h"
-#include "proto/spool.h"
+#include "proto/format.h"
 
 enum { NICENESS = 10 /* behind the workers, too */ };
 /* s until what failed is tried again; each time twice as long. */
@@ -44,11 +44,11 @@ struct digester {
 
 /* ---- one volume ---- */
 
-static int hash_voxels(int file, const char *path, const _Atomic bool *stop, EVP_MD_CTX *digest, struct error *err)
+static int hash_voxels(int file, const char *path, off_t at, const _Atomic bool *stop, EVP_MD_CTX *digest,
+		       struct error *err)
 {
 	enum { BLOCK = 1 << 20 };
 	char *block = malloc(BLOCK);
-	off_t at = SPOOL_VOLUME_OFFSET;
 	ssize_t got = 1;
 	int code = block == NULL ? error_set_errno(err, ENOMEM, "digest") : 0;
 
@@ -66,9 +66,11 @@ static int hash_voxels(int file, const char *path, const _Atomic bool *stop, EVP
 	return code;
 }
 
-static int hash_volume(const char *path, const _Atomic bool *stop, uint8_t ret_sha256[32], struct error *err)
+static int hash_volume(const char *path, const struct grid *grid, const _Atomic bool *stop, uint8_t ret_sha256[32],
+		       struct error *err)
 {
 	int file = open(path, O_RDONLY | O_CLOEXEC), code;
+	size_t start = 0;
 	EVP_MD_CTX *digest;
 	uint8_t sha256[32];
 
@@ -78,7 +80,9 @@ static int hash_volume(const char *path, const _Atomic bool *stop, uint8_t ret_s
 	if (digest == NULL || EVP_DigestInit_ex(digest, EVP_sha256(), NULL) != 1)
 		code = error_set_errno(err, ENOMEM, "digest");
 	else
-		code = hash_voxels(file, path, stop, digest, err);
+		code = volume_own_start(file, path, grid, &start, err);
+	if (code == 0)
+		code = hash_voxels(file, path, (off_t)start, stop, digest, err);
 	if (code == 0 && EVP_DigestFinal_ex(digest, sha256, NULL) != 1)
 		code = error_set(err, ERR_INTERNAL, "SHA-256 failed");
 	EVP_MD_CTX_free(digest);
@@ -123,7 +127,7 @@ static int make_digest(struct digester *digester, struct job *job, const struct 
 	job_facts(job, &facts);
 	store_volume_path(store, facts.id, volume->name, path);
 	if (!copy_digest(store, facts.id, volumes, count, volume))
-		code = hash_volume(path, &digester->stop, volume->sha256, err);
+		code = hash_volume(path, &volume->grid, &digester->stop, volume->sha256, err);
 	/* What it was told of is; but it may have been made again since. */
 	if (code == 0)
 		code = durable_settle_named(path, err);

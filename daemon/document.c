@@ -165,6 +165,9 @@ cJSON *scan_document(struct stored_scan *stored, bool brief)
 		return document;
 	}
 	add_posted(document, scan);
+	if (!scan->patient.known)
+		cJSON_AddNullToObject(document, "patient");
+	cJSON_AddItemToObject(document, "axes", patient_axes_json(&scan->patient));
 	if (!add_received(document, stored, facts.count)) {
 		cJSON_Delete(document);
 		return NULL;
@@ -338,9 +341,24 @@ static void add_job_facts(cJSON *document, struct job *job, const struct job_rec
 		cJSON_AddNullToObject(document, "error");
 }
 
+/* Where the world's axes point to in the patient; jobs from before there was such a member do not know. */
+static void add_axes(cJSON *document, const cJSON *patient_member)
+{
+	struct patient patient;
+	struct error ignored;
+
+	if (patient_read(patient_member, "/patient", &patient, &ignored) != 0)
+		patient = patient_unknown;
+	if (patient_member == NULL)
+		cJSON_AddNullToObject(document, "patient");
+	cJSON_AddItemToObject(document, "axes", patient_axes_json(&patient));
+}
+
 static void add_request(cJSON *document, const struct job_record *record)
 {
 	cJSON *request = cJSON_Parse(record->request), *member;
+
+	add_axes(document, cJSON_GetObjectItemCaseSensitive(request, "patient"));
 
 	while (request != NULL && (member = request->child) != NULL) {
 		cJSON_DetachItemViaPointer(request, member);

@@ -13,7 +13,7 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
-#include "proto/spool.h"
+#include "proto/format.h"
 
 enum { IDLE_MAX = 8 };
 
@@ -23,7 +23,8 @@ struct mapping {
 	dev_t device;
 	ino_t inode;
 	void *start;
-	size_t size;
+	size_t size;   /* bytes mapped */
+	size_t voxels; /* where they begin in it */
 	int references;
 };
 
@@ -65,7 +66,7 @@ void mappings_free(struct mappings *mappings)
 	free(mappings);
 }
 
-static int map_file(const char *path, size_t size, struct mapping **ret_mapping, struct error *err)
+static int map_file(const char *path, const struct grid *grid, struct mapping **ret_mapping, struct error *err)
 {
 	struct mapping *mapping = calloc(1, sizeof(*mapping));
 	int file = open(path, O_RDONLY | O_CLOEXEC);
@@ -77,11 +78,15 @@ static int map_file(const char *path, size_t size, struct mapping **ret_mapping,
 						   : error_set_errno(err, errno, "open a volume");
 		goto out;
 	}
-	if (fstat(file, &status) != 0 || (size_t)status.st_size < size) {
-		code = error_set(err, ERR_IO, "the volume's file is shorter than its grid");
+	if (fstat(file, &status) != 0) {
+		code = error_set_errno(err, errno, "the volume's file cannot be read");
 		goto out;
 	}
-	mapping->start = mmap(NULL, size, PROT_READ, MAP_SHARED, file, 0);
+	code = volume_own_start(file, path, grid, &mapping->voxels, err);
+	if (code != 0)
+		goto out;
+	mapping->size = mapping->voxels + grid_voxels(grid) * sizeof(float);
+	mapping->start = mmap(NULL, mapping->size, PROT_READ, MAP_SHARED, file, 0);
 	if (mapping->start == MAP_FAILED) {
 		mapping->start = NULL;
 		code = error_set_errno(err, errno, "map a volume");
@@ -90,7 +95,6 @@ static int map_file(const char *path, size_t size, struct mapping **ret_mapping,
 	snprintf(mapping->path, sizeof(mapping->path), "%s", path);
 	mapping->device = status.st_dev;
 	mapping->inode = status.st_ino;
-	mapping->size = size;
 	mapping->references = 1;
 	*ret_mapping = mapping;
 	mapping = NULL;
@@ -103,12 +107,13 @@ out:
 }
 
 /* With the lock held; it comes to the front. */
-static struct mapping *find(struct mappings *mappings, const struct stat *status, size_t size)
+static struct mapping *find(struct mappings *mappings, const struct stat *status, size_t bytes)
 {
 	for (struct mapping **at = &mappings->first; *at != NULL; at = &(*at)->next) {
 		struct mapping *mapping = *at;
 
-		if (mapping->inode != status->st_ino || mapping->device != status->st_dev || mapping->size != size)
+		if (mapping->inode != status->st_ino || mapping->device != status->st_dev ||
+		    mapping->size - mapping->voxels != bytes)
 			continue;
 		*at = mapping->next;
 		mapping->next = mappings->first;
@@ -142,18 +147,18 @@ static void drop_idle(struct mappings *mappings, int stay, const char *directory
 int mapping_get(struct mappings *mappings, const char *path, const struct grid *grid, struct mapping **ret_mapping,
 		struct error *err)
 {
-	size_t size = SPOOL_VOLUME_OFFSET + grid_voxels(grid) * sizeof(float);
+	size_t bytes = grid_voxels(grid) * sizeof(float);
 	struct mapping *mapping = NULL, *fresh = NULL;
 	struct stat status;
 	int code = 0;
 
 	if (stat(path, &status) == 0) {
 		pthread_mutex_lock(&mappings->lock);
-		mapping = find(mappings, &status, size);
+		mapping = find(mappings, &status, bytes);
 		pthread_mutex_unlock(&mappings->lock);
 	}
 	if (mapping == NULL) {
-		code = map_file(path, size, &fresh, err);
+		code = map_file(path, grid, &fresh, err);
 		if (code != 0)
 			return code;
 		pthread_mutex_lock(&mappings->lock);
@@ -177,7 +182,7 @@ void mapping_release(struct mappings *mappings, struct mapping *mapping)
 
 const float *mapping_voxels(const struct mapping *mapping)
 {
-	return (const float *)(const void *)((const char *)mapping->start + SPOOL_VOLUME_OFFSET);
+	return (const float *)(const void *)((const char *)mapping->start + mapping->voxels);
 }
 
 void mappings_forget(struct mappings *mappings, const char *directory)

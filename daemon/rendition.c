@@ -309,7 +309,6 @@ static struct rendition *rendition_new(struct renditions *renditions, const char
 	snprintf(rendition->job, sizeof(rendition->job), "%s", job);
 	rendition->volume = *volume;
 	rendition->options = *options;
-	rendition->options.name = rendition->volume.name;
 	rendition->zstd = zstd;
 	rendition->facts.descriptor = -1;
 	rendition->queued = true;

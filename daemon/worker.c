@@ -21,6 +21,7 @@
 #include <unistd.h>
 
 #include "proto/message.h"
+#include "proto/provenance.h"
 
 enum { EXIT_START = 1, EXIT_USAGE = 2, EXIT_DEVICE = 3 };
 
@@ -318,6 +319,10 @@ static int run_job(struct worker *worker, const struct message *start, struct er
 	struct spool_options options = {.scan_directory = start->scan_directory,
 					.out_directory = start->job_directory,
 					.recipe = &start->request.recipe,
+					.program = CBCTD_PROGRAM,
+					.job = start->job,
+					.scan = start->request.scan,
+					.patient = &start->request.patient,
 					.iteration = start->iteration,
 					.hooks = &hooks};
 	unsigned char *present = NULL;

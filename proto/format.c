@@ -5,21 +5,14 @@
  */
 #include "proto/format.h"
 
-#include <errno.h>
-#include <fcntl.h>
 #include <math.h>
 #include <stdarg.h>
 #include <stdbool.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <sys/stat.h>
-#include <unistd.h>
 
-#include "proto/header.h"
-#include "proto/json.h"
-#include "proto/metaimage.h"
-#include "proto/spool.h"
+#include "proto/nifti.h"
 
 const char *const volume_type_names[VOLUME_TYPE_COUNT] = {"float32", "int16"};
 
@@ -75,29 +68,15 @@ void volume_to_hu(const float *mu, size_t count, double mu_water, int16_t *ret_h
 	to_hu_base(mu, count, 1000 / mu_water, ret_hu);
 }
 
+/* Files of a patient of whom nothing is known have the axes of one who lies HFS, and say that it is not known. */
+static const struct patient *placed(const struct provenance *provenance)
+{
+	return provenance->patient.known ? &provenance->patient : &patient_unknown;
+}
+
 /* ---- NIfTI ---- */
 
-/* Offsets in the 348 bytes of nifti1.h's struct nifti_1_header. */
-enum {
-	NIFTI_SIZEOF_HDR = 0,
-	NIFTI_DIM = 40,
-	NIFTI_DATATYPE = 70,
-	NIFTI_BITPIX = 72,
-	NIFTI_PIXDIM = 76,
-	NIFTI_VOX_OFFSET = 108,
-	NIFTI_SCL_SLOPE = 112,
-	NIFTI_SCL_INTER = 116,
-	NIFTI_XYZT_UNITS = 123,
-	NIFTI_DESCRIP = 148,
-	NIFTI_QFORM_CODE = 252,
-	NIFTI_SFORM_CODE = 254,
-	NIFTI_QUATERN = 256,
-	NIFTI_QOFFSET = 268,
-	NIFTI_SROW = 280,
-	NIFTI_MAGIC = 344,
-	NIFTI_HEADER = 348,
-	NIFTI_VOXELS = 352 /* four bytes say that no extension follows */
-};
+static const char *const unit_names[VOLUME_TYPE_COUNT] = {"1/mm", "HU"};
 
 static void put16(uint8_t *at, int value)
 {
@@ -120,11 +99,87 @@ static void put_float(uint8_t *at, double value)
 	put32(at, bits);
 }
 
-static size_t nifti_header(const struct grid *grid, enum volume_type type, const char *description,
-			   uint8_t ret_header[FORMAT_HEADER_MAX])
+/*
+ * The quaternion (a, b, c, d), a >= 0, of a rotation: its largest component from the
+ * diagonal, the others from differences and sums across it (Shepperd 1978).
+ */
+static void quaternion_of(double m[3][3], double ret[4])
+{
+	double square[4] = {1 + m[0][0] + m[1][1] + m[2][2], 1 + m[0][0] - m[1][1] - m[2][2],
+			    1 - m[0][0] + m[1][1] - m[2][2], 1 - m[0][0] - m[1][1] + m[2][2]};
+	/* 4 times the product of each two components. */
+	double product[4][4] = {{0, m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]},
+				{0, 0, m[0][1] + m[1][0], m[0][2] + m[2][0]},
+				{0, 0, 0, m[1][2] + m[2][1]}};
+	int largest = 0;
+	double sign;
+
+	for (int i = 1; i < 4; i++)
+		if (square[i] > square[largest])
+			largest = i;
+	for (int i = 0; i < 4; i++) {
+		int low = i < largest ? i : largest, high = i < largest ? largest : i;
+
+		ret[i] = i == largest ? sqrt(square[i]) / 2 : product[low][high] / (2 * sqrt(square[largest]));
+	}
+	sign = ret[0] < 0 ? -1 : 1;
+	for (int i = 0; i < 4; i++)
+		ret[i] = sign * ret[i] + 0.0; /* no negative zeros */
+}
+
+/* Voxels to mm, twice: as a matrix (sform), and as a quaternion (qform). */
+static void put_place(uint8_t *h, const struct grid *grid, const struct patient *patient)
 {
 	/* NIfTI's world is RAS: x and y are DICOM's turned round, half a turn about z. */
 	static const double turn[3] = {-1, -1, 1};
+	double rotation[3][3], quaternion[4], origin[3];
+
+	for (int i = 0; i < 3; i++)
+		for (int j = 0; j < 3; j++)
+			rotation[i][j] = turn[i] * patient->rotation[i][j] + 0.0;
+	quaternion_of(rotation, quaternion);
+	patient_point(patient, grid->origin, origin);
+	put_float(h + NIFTI_PIXDIM, 1); /* qfac: the turn is no mirror */
+	put16(h + NIFTI_QFORM_CODE, 1); /* scanner coordinates */
+	put16(h + NIFTI_SFORM_CODE, 1);
+	for (int i = 0; i < 3; i++) {
+		put_float(h + NIFTI_PIXDIM + 4 * (i + 1), grid->spacing[i]);
+		put_float(h + NIFTI_QUATERN + 4 * i, quaternion[i + 1]);
+		put_float(h + NIFTI_QOFFSET + 4 * i, turn[i] * origin[i] + 0.0);
+		for (int j = 0; j < 3; j++)
+			put_float(h + NIFTI_SROW + 16 * i + 4 * j, rotation[i][j] * grid->spacing[j]);
+		put_float(h + NIFTI_SROW + 16 * i + 12, turn[i] * origin[i] + 0.0);
+	}
+}
+
+/* Without the recipe where there is no room for it: half a text is no JSON. */
+static int put_extension(uint8_t *h, const struct provenance *provenance, const char *unit, struct error *err)
+{
+	const size_t room = NIFTI_VOXELS - NIFTI_EXTENSION_TEXT;
+	cJSON *json = provenance_json(provenance, unit);
+	char *text = provenance_text(json);
+	int code = 0;
+
+	if (text != NULL && strlen(text) > room) {
+		free(text);
+		cJSON_DeleteItemFromObjectCaseSensitive(json, "recipe");
+		text = provenance_text(json);
+	}
+	h[NIFTI_EXTENDER] = 1;
+	put32(h + NIFTI_EXTENSION, NIFTI_VOXELS - NIFTI_EXTENSION);
+	put32(h + NIFTI_EXTENSION + 4, NIFTI_ECODE_COMMENT);
+	if (text == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for a header");
+	else
+		memcpy(h + NIFTI_EXTENSION_TEXT, text, strlen(text));
+	free(text);
+	cJSON_Delete(json);
+	return code;
+}
+
+static int nifti_header(const struct grid *grid, enum volume_type type, const struct provenance *provenance,
+			uint8_t ret_header[FORMAT_HEADER_MAX], size_t *ret_length, struct error *err)
+{
 	uint8_t *h = ret_header;
 
 	memset(h, 0, NIFTI_VOXELS);
@@ -134,22 +189,14 @@ static size_t nifti_header(const struct grid *grid, enum volume_type type, const
 		put16(h + NIFTI_DIM + 2 * (i + 1), i < 3 ? grid->size[i] : 1);
 	put16(h + NIFTI_DATATYPE, type == VOLUME_INT16 ? 4 : 16);
 	put16(h + NIFTI_BITPIX, 8 * (int)volume_type_bytes(type));
-	put_float(h + NIFTI_PIXDIM, 1); /* qfac: the turn is no mirror */
 	put_float(h + NIFTI_VOX_OFFSET, NIFTI_VOXELS);
 	put_float(h + NIFTI_SCL_SLOPE, 1);
 	h[NIFTI_XYZT_UNITS] = 2; /* mm */
-	snprintf((char *)h + NIFTI_DESCRIP, 80, "%s", description);
-	put16(h + NIFTI_QFORM_CODE, 1); /* scanner coordinates */
-	put16(h + NIFTI_SFORM_CODE, 1);
-	put_float(h + NIFTI_QUATERN + 8, 1); /* (a, b, c, d) = (0, 0, 0, 1): half a turn about z */
-	for (int i = 0; i < 3; i++) {
-		put_float(h + NIFTI_PIXDIM + 4 * (i + 1), grid->spacing[i]);
-		put_float(h + NIFTI_QOFFSET + 4 * i, turn[i] * grid->origin[i]);
-		put_float(h + NIFTI_SROW + 16 * i + 4 * i, turn[i] * grid->spacing[i]);
-		put_float(h + NIFTI_SROW + 16 * i + 12, turn[i] * grid->origin[i]);
-	}
+	provenance_sentence(provenance, unit_names[type], (char *)h + NIFTI_DESCRIP, 80);
+	put_place(h, grid, placed(provenance));
 	memcpy(h + NIFTI_MAGIC, "n+1", 4);
-	return NIFTI_VOXELS;
+	*ret_length = NIFTI_VOXELS;
+	return put_extension(h, provenance, unit_names[type], err);
 }
 
 /* ---- text headers ---- */
@@ -171,17 +218,12 @@ __attribute__((format(printf, 2, 3))) static void line(struct header_text *h, co
 		h->length += (size_t)length;
 }
 
-/* A description may not end the line that it stands in. */
-static void comment(struct header_text *h, const char *before, const char *description)
+static void comment(struct header_text *h, const char *before, const struct provenance *provenance, const char *unit)
 {
-	char clean[200];
-	size_t length = 0;
+	char sentence[200]; /* MetaIO has room for 255 */
 
-	for (; description[length] != '\0' && length < sizeof(clean) - 1; length++)
-		clean[length] = (unsigned char)description[length] < 0x20 ? ' ' : description[length];
-	clean[length] = '\0';
-	if (length > 0)
-		line(h, "%s%s\n", before, clean);
+	provenance_sentence(provenance, unit, sentence, sizeof(sentence));
+	line(h, "%s%s\n", before, sentence);
 }
 
 static void three(struct header_text *h, const char *before, const double numbers[3], const char *between,
@@ -194,50 +236,128 @@ static void three(struct header_text *h, const char *before, const double number
 	line(h, "%s%s%s%s%s%s%s", before, text[0], between, text[1], between, text[2], after);
 }
 
-static size_t mha_header(const struct grid *grid, enum volume_type type, const char *description,
-			 uint8_t ret_header[FORMAT_HEADER_MAX])
+/*
+ * One key a line: a text as JSON writes it, without its quotes, anything else as
+ * JSON. MetaIO reads 500 bytes of a line and loses what lies behind a longer one,
+ * so that a longer value is left out; none is but what nobody would write by hand.
+ */
+static int key_line(struct header_text *h, const char *prefix, const cJSON *value, bool nrrd, struct error *err)
+{
+	const size_t most = 400, reserve = 1024; /* for the fields behind */
+	char *text = provenance_text(value);
+	size_t length = text != NULL ? strlen(text) : 0, quote = cJSON_IsString(value) ? 1 : 0;
+
+	if (text == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a header");
+	if (length > 2 * quote && length <= most && h->length + 2 * most + reserve < FORMAT_HEADER_MAX) {
+		line(h, "%s%s%s", prefix, value->string, nrrd ? ":=" : " = ");
+		/* A backslash begins an escape of NRRD's own. */
+		for (size_t i = quote; i < length - quote; i++)
+			line(h, nrrd && text[i] == '\\' ? "\\%c" : "%c", text[i]);
+		line(h, "\n");
+	}
+	free(text);
+	return 0;
+}
+
+/* All of the provenance as keys: cbct_job, cbct_recipe_fdk ... */
+static int keys(struct header_text *h, const struct provenance *provenance, const char *unit, bool nrrd,
+		struct error *err)
+{
+	cJSON *json = provenance_json(provenance, unit);
+	const cJSON *member;
+	int code = json == NULL ? error_set(err, ERR_NO_MEMORY, "no memory for a header") : 0;
+
+	cJSON_ArrayForEach(member, json)
+	{
+		bool recipe = strcmp(member->string, "recipe") == 0;
+
+		for (const cJSON *part = recipe ? member->child : member; part != NULL && code == 0;
+		     part = recipe ? part->next : NULL)
+			code = key_line(h, recipe ? "cbct_recipe_" : "cbct_", part, nrrd, err);
+	}
+	cJSON_Delete(json);
+	return code;
+}
+
+/* The directions of the voxels' axes in the patient's mm, LPS, and the centre of the first voxel. */
+static void directions(const struct grid *grid, const struct patient *patient, double ret_axes[3][3],
+		       double ret_origin[3])
+{
+	for (int i = 0; i < 3; i++)
+		for (int j = 0; j < 3; j++)
+			ret_axes[i][j] = patient->rotation[j][i];
+	patient_point(patient, grid->origin, ret_origin);
+}
+
+/* MetaImage names where the axes come from: right, anterior and inferior are DICOM's left, posterior, superior. */
+static void anatomical_orientation(struct header_text *h, double axes[3][3])
+{
+	static const char from[3][2] = {{'R', 'L'}, {'A', 'P'}, {'I', 'S'}};
+	int nearest[3];
+
+	axes_nearest(axes, nearest);
+	line(h, "AnatomicalOrientation = ");
+	for (int i = 0; i < 3; i++)
+		line(h, "%c", from[nearest[i]][axes[i][nearest[i]] < 0]);
+	line(h, "\n");
+}
+
+static int mha_header(const struct grid *grid, enum volume_type type, const struct provenance *provenance,
+		      uint8_t ret_header[FORMAT_HEADER_MAX], size_t *ret_length, struct error *err)
 {
 	struct header_text h = {.text = (char *)ret_header};
+	double axes[3][3], origin[3];
+	int code;
 
+	directions(grid, placed(provenance), axes, origin);
 	line(&h, "ObjectType = Image\nNDims = 3\n");
-	comment(&h, "Comment = ", description);
-	line(&h, "BinaryData = True\nBinaryDataByteOrderMSB = False\nCompressedData = False\n");
-	line(&h, "TransformMatrix = 1 0 0 0 1 0 0 0 1\n");
-	three(&h, "Offset = ", grid->origin, " ", "\n");
-	/* MetaImage names where the axes come from: right, anterior and inferior are DICOM's left, posterior, superior.
-	 */
-	line(&h, "CenterOfRotation = 0 0 0\nAnatomicalOrientation = RAI\n");
+	comment(&h, "Comment = ", provenance, unit_names[type]);
+	code = keys(&h, provenance, unit_names[type], false, err);
+	line(&h, "BinaryData = True\nBinaryDataByteOrderMSB = False\nCompressedData = False\nTransformMatrix =");
+	for (int i = 0; i < 3; i++)
+		three(&h, " ", axes[i], " ", i < 2 ? "" : "\n");
+	three(&h, "Offset = ", origin, " ", "\n");
+	line(&h, "CenterOfRotation = 0 0 0\n");
+	anatomical_orientation(&h, axes);
 	three(&h, "ElementSpacing = ", grid->spacing, " ", "\n");
 	line(&h, "DimSize = %d %d %d\n", grid->size[0], grid->size[1], grid->size[2]);
 	line(&h, "ElementType = %s\nElementDataFile = LOCAL\n", type == VOLUME_INT16 ? "MET_SHORT" : "MET_FLOAT");
-	return h.length;
+	*ret_length = h.length;
+	return code;
 }
 
-static size_t nrrd_header(const struct grid *grid, enum volume_type type, const char *description,
-			  uint8_t ret_header[FORMAT_HEADER_MAX])
+static int nrrd_header(const struct grid *grid, enum volume_type type, const struct provenance *provenance,
+		       uint8_t ret_header[FORMAT_HEADER_MAX], size_t *ret_length, struct error *err)
 {
 	struct header_text h = {.text = (char *)ret_header};
+	double axes[3][3], origin[3];
+	int code;
 
+	directions(grid, placed(provenance), axes, origin);
 	line(&h, "NRRD0004\n");
-	comment(&h, "# ", description);
+	comment(&h, "# ", provenance, unit_names[type]);
 	line(&h, "type: %s\ndimension: 3\nspace: left-posterior-superior\n", type == VOLUME_INT16 ? "short" : "float");
 	line(&h, "sizes: %d %d %d\nspace directions:", grid->size[0], grid->size[1], grid->size[2]);
 	for (int i = 0; i < 3; i++) {
-		double direction[3] = {0, 0, 0};
-
-		direction[i] = grid->spacing[i];
-		three(&h, " (", direction, ",", ")");
+		for (int j = 0; j < 3; j++)
+			axes[i][j] *= grid->spacing[i];
+		three(&h, " (", axes[i], ",", ")");
 	}
 	line(&h, "\nkinds: domain domain domain\nendian: little\nencoding: raw\n");
-	three(&h, "space origin: (", grid->origin, ",", ")\n");
-	line(&h, "space units: \"mm\" \"mm\" \"mm\"\n\n");
-	return h.length;
+	three(&h, "space origin: (", origin, ",", ")\n");
+	line(&h, "space units: \"mm\" \"mm\" \"mm\"\n");
+	code = keys(&h, provenance, unit_names[type], true, err);
+	line(&h, "\n");
+	*ret_length = h.length;
+	return code;
 }
 
-static size_t raw_header(const struct grid *grid, enum volume_type type, const char *description,
-			 uint8_t ret_header[FORMAT_HEADER_MAX])
+static int raw_header(const struct grid *grid, enum volume_type type, const struct provenance *provenance,
+		      uint8_t ret_header[FORMAT_HEADER_MAX], size_t *ret_length, struct error *err)
 {
-	(void)grid, (void)type, (void)description, (void)ret_header;
+	(void)grid, (void)type, (void)provenance, (void)ret_header, (void)err;
+	*ret_length = 0;
 	return 0;
 }
 
@@ -256,356 +376,4 @@ const struct volume_format *volume_format_find(const char *name)
 			return format;
 	}
 	return NULL;
-}
-
-/* ---- reading ---- */
-
-/* What the other formats call the types that they share. */
-static const struct {
-	int nifti;
-	const char *nrrd, *nrrd_too;
-} type_names[PIXEL_TYPE_COUNT] = {
-    [PIXEL_UINT8] = {2, "unsigned char", "uint8"},      [PIXEL_INT8] = {256, "signed char", "int8"},
-    [PIXEL_UINT16] = {512, "unsigned short", "uint16"}, [PIXEL_INT16] = {4, "short", "int16"},
-    [PIXEL_UINT32] = {768, "unsigned int", "uint32"},   [PIXEL_INT32] = {8, "int", "int32"},
-    [PIXEL_FLOAT32] = {16, "float", "float"},           [PIXEL_FLOAT64] = {64, "double", "double"},
-};
-
-/* What a header told. */
-struct layout {
-	int size[3];
-	double direction[3][3]; /* of axis i in LPS mm, spacing included */
-	double origin[3];       /* LPS mm, centre of the first voxel in the file */
-	enum pixel_type type;
-	double slope, offset; /* value = slope * stored + offset */
-	size_t start;         /* of the voxels in the file */
-};
-
-static int get16(const uint8_t *at)
-{
-	return (int16_t)(at[0] | at[1] << 8);
-}
-
-static double get_float(const uint8_t *at)
-{
-	uint32_t bits = at[0] | (uint32_t)at[1] << 8 | (uint32_t)at[2] << 16 | (uint32_t)at[3] << 24;
-	float number;
-
-	memcpy(&number, &bits, sizeof(number));
-	return number;
-}
-
-/* Rows of the RAS matrix: from sform, else from qform's quaternion, else the plain spacing (the standard's methods). */
-static void nifti_matrix(const uint8_t *h, double ret_rows[3][4])
-{
-	double b = get_float(h + NIFTI_QUATERN), c = get_float(h + NIFTI_QUATERN + 4);
-	double d = get_float(h + NIFTI_QUATERN + 8), a = sqrt(fmax(0, 1 - b * b - c * c - d * d));
-	double turn[3][3] = {{a * a + b * b - c * c - d * d, 2 * (b * c - a * d), 2 * (b * d + a * c)},
-			     {2 * (b * c + a * d), a * a + c * c - b * b - d * d, 2 * (c * d - a * b)},
-			     {2 * (b * d - a * c), 2 * (c * d + a * b), a * a + d * d - b * b - c * c}};
-	bool sform = get16(h + NIFTI_SFORM_CODE) > 0, qform = get16(h + NIFTI_QFORM_CODE) > 0;
-	double mirror = get_float(h + NIFTI_PIXDIM) < 0 ? -1 : 1;
-
-	for (int i = 0; i < 3; i++) {
-		for (int j = 0; j < 3; j++) {
-			double spacing = get_float(h + NIFTI_PIXDIM + 4 * (j + 1)) * (j == 2 ? mirror : 1);
-
-			if (sform)
-				ret_rows[i][j] = get_float(h + NIFTI_SROW + 16 * i + 4 * j);
-			else
-				ret_rows[i][j] = qform ? turn[i][j] * spacing : (i == j) * fabs(spacing);
-		}
-		ret_rows[i][3] = 0;
-		if (sform)
-			ret_rows[i][3] = get_float(h + NIFTI_SROW + 16 * i + 12);
-		else if (qform)
-			ret_rows[i][3] = get_float(h + NIFTI_QOFFSET + 4 * i);
-	}
-}
-
-static int read_nifti(const uint8_t *h, struct layout *ret, struct error *err)
-{
-	double rows[3][4];
-	int type = get16(h + NIFTI_DATATYPE), dimensions = get16(h + NIFTI_DIM), found = -1;
-
-	if (get16(h + NIFTI_SIZEOF_HDR) != NIFTI_HEADER)
-		return error_set(err, ERR_INVALID, "NIfTI of the other byte order is not read");
-	for (int i = 0; i < PIXEL_TYPE_COUNT; i++) {
-		if (type_names[i].nifti == type)
-			found = i;
-	}
-	if (found < 0)
-		return error_set(err, ERR_INVALID, "NIfTI datatype %d is not read", type);
-	if (dimensions < 1 || dimensions > 7)
-		return error_set(err, ERR_INVALID, "NIfTI with %d dimensions", dimensions);
-	for (int i = 0; i < dimensions; i++) {
-		int size = get16(h + NIFTI_DIM + 2 * (i + 1));
-
-		if (i < 3)
-			ret->size[i] = size;
-		else if (size > 1)
-			return error_set(err, ERR_INVALID, "NIfTI with more than three dimensions");
-	}
-	nifti_matrix(h, rows);
-	for (int axis = 0; axis < 3; axis++) {
-		ret->direction[axis][0] = -rows[0][axis];
-		ret->direction[axis][1] = -rows[1][axis];
-		ret->direction[axis][2] = rows[2][axis];
-		ret->origin[axis] = axis < 2 ? -rows[axis][3] : rows[axis][3];
-	}
-	ret->type = (enum pixel_type)found;
-	ret->start = (size_t)fmin(fmax(get_float(h + NIFTI_VOX_OFFSET), NIFTI_HEADER), 1e9);
-	if (get_float(h + NIFTI_SCL_SLOPE) != 0) {
-		ret->slope = get_float(h + NIFTI_SCL_SLOPE);
-		ret->offset = get_float(h + NIFTI_SCL_INTER);
-	}
-	return 0;
-}
-
-static int want_numbers(const char *key, const char *text, int count, double *ret, struct error *err)
-{
-	double numbers[16];
-
-	if (header_numbers(text, 16, numbers) != count)
-		return error_set(err, ERR_INVALID, "%.60s: %d numbers are expected", key, count);
-	memcpy(ret, numbers, (size_t)count * sizeof(*ret));
-	return 0;
-}
-
-static int want_size(const char *key, const char *text, int ret_size[3], struct error *err)
-{
-	double numbers[3];
-	int code = want_numbers(key, text, 3, numbers, err);
-
-	for (int i = 0; i < 3 && code == 0; i++) {
-		if (!(numbers[i] >= 1 && numbers[i] <= GRID_SIZE_MAX))
-			return error_set(err, ERR_INVALID, "%.60s: %g voxels, 1 to %d are expected", key, numbers[i],
-					 GRID_SIZE_MAX);
-		ret_size[i] = (int)numbers[i];
-	}
-	return code;
-}
-
-static int read_mha(const char *text, size_t length, struct layout *ret, struct error *err)
-{
-	struct metaimage image;
-	int code = metaimage_parse(text, length, &image, err);
-
-	if (code != 0)
-		return code;
-	if (image.dimensions != 3)
-		return error_set(err, ERR_INVALID, "MetaImage: NDims is %d, a volume has 3", image.dimensions);
-	if (image.compressed)
-		return header_refuse("CompressedData", "True", err);
-	if (image.big_endian)
-		return header_refuse("BinaryDataByteOrderMSB", "True", err);
-	if (strcmp(image.data_file, "LOCAL") != 0)
-		return header_refuse("ElementDataFile", image.data_file, err);
-	for (int i = 0; i < 3; i++) {
-		if (image.size[i] > GRID_SIZE_MAX)
-			return error_set(err, ERR_INVALID, "DimSize: %d voxels, 1 to %d are expected", image.size[i],
-					 GRID_SIZE_MAX);
-		ret->size[i] = image.size[i];
-		ret->origin[i] = image.origin[i];
-		for (int j = 0; j < 3; j++)
-			ret->direction[i][j] = image.direction[i][j] * image.spacing[i];
-	}
-	ret->type = image.type;
-	ret->start = image.length;
-	return 0;
-}
-
-static int read_nrrd_line(const char *key, const char *value, struct layout *ret, bool *ras, struct error *err)
-{
-	double spacing[3];
-	int code;
-
-	if (strcmp(key, "dimension") == 0 && strcmp(value, "3") != 0)
-		return header_refuse(key, value, err);
-	if ((strcmp(key, "encoding") == 0 && strcmp(value, "raw") != 0) ||
-	    (strcmp(key, "endian") == 0 && strcmp(value, "little") != 0) || strcmp(key, "data file") == 0 ||
-	    strcmp(key, "byte skip") == 0 || strcmp(key, "line skip") == 0)
-		return header_refuse(key, value, err);
-	if (strcmp(key, "sizes") == 0)
-		return want_size(key, value, ret->size, err);
-	if (strcmp(key, "space directions") == 0)
-		return want_numbers(key, value, 9, ret->direction[0], err);
-	if (strcmp(key, "space origin") == 0)
-		return want_numbers(key, value, 3, ret->origin, err);
-	if (strcmp(key, "spacings") == 0) {
-		code = want_numbers(key, value, 3, spacing, err);
-		for (int i = 0; i < 3 && code == 0; i++)
-			ret->direction[i][i] = spacing[i];
-		return code;
-	}
-	if (strcmp(key, "space") == 0) {
-		*ras = strcmp(value, "right-anterior-superior") == 0 || strcmp(value, "RAS") == 0;
-		if (!*ras && strcmp(value, "left-posterior-superior") != 0 && strcmp(value, "LPS") != 0)
-			return header_refuse(key, value, err);
-	}
-	if (strcmp(key, "type") == 0) {
-		for (int i = 0; i < PIXEL_TYPE_COUNT; i++) {
-			if (strcmp(value, type_names[i].nrrd) == 0 || strcmp(value, type_names[i].nrrd_too) == 0) {
-				ret->type = (enum pixel_type)i;
-				return 0;
-			}
-		}
-		return header_refuse(key, value, err);
-	}
-	return 0;
-}
-
-static int read_nrrd(const char *text, size_t length, struct layout *ret, struct error *err)
-{
-	char row[512];
-	bool ras = false;
-
-	header_line(text, length, &ret->start, row, sizeof(row)); /* the magic */
-	while (header_line(text, length, &ret->start, row, sizeof(row))) {
-		char *colon = strstr(row, ": ");
-		int code = 0;
-
-		if (row[0] == '\0') {
-			for (int i = 0; i < 2 && ras; i++) {
-				ret->origin[i] *= -1;
-				for (int axis = 0; axis < 3; axis++)
-					ret->direction[axis][i] *= -1;
-			}
-			return 0;
-		}
-		if (row[0] != '#' && colon != NULL) {
-			*colon = '\0';
-			code = read_nrrd_line(row, colon + 2, ret, &ras, err);
-		}
-		if (code != 0)
-			return code;
-	}
-	return error_set(err, ERR_INVALID, "NRRD: the header does not end");
-}
-
-static int read_header(const uint8_t *head, size_t length, struct layout *ret, struct grid *grid, struct error *err)
-{
-	const char *text = (const char *)head;
-
-	*ret = (struct layout){
-	    .direction = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}, .type = PIXEL_FLOAT32, .slope = 1, .size = {1, 1, 1}};
-	if (length >= NIFTI_HEADER && memcmp(head + NIFTI_MAGIC, "n+1", 4) == 0)
-		return read_nifti(head, ret, err);
-	if (length >= 5 && memcmp(head, "NRRD0", 5) == 0)
-		return read_nrrd(text, length, ret, err);
-	if (metaimage_recognise(head, length))
-		return read_mha(text, length, ret, err);
-	if (grid->size[0] < 1)
-		return error_set(err, ERR_INVALID, "neither NIfTI, MetaImage nor NRRD, and no grid for a raw volume");
-	for (int i = 0; i < 3; i++) {
-		ret->size[i] = grid->size[i];
-		ret->direction[i][i] = grid->spacing[i];
-		ret->origin[i] = grid->origin[i];
-	}
-	return 0;
-}
-
-/* The grid of the volume once its axes run along +x, +y and +z, and which of them must be turned round for that. */
-static int layout_grid(const struct layout *layout, struct grid *ret_grid, bool ret_flip[3], struct error *err)
-{
-	const double skew = 1e-4; /* of the spacing: what single precision and a rounded quaternion leave */
-
-	for (int i = 0; i < 3; i++) {
-		double along = layout->direction[i][i];
-
-		for (int j = 0; j < 3; j++) {
-			if (j != i && !(fabs(layout->direction[i][j]) <= skew * fabs(along)))
-				return error_set(err, ERR_INVALID, "the volume's axes do not lie along x, y and z");
-		}
-		ret_flip[i] = along < 0;
-		ret_grid->size[i] = layout->size[i];
-		ret_grid->spacing[i] = fabs(along);
-		ret_grid->origin[i] = layout->origin[i] + (along < 0 ? along * (layout->size[i] - 1) : 0);
-	}
-	return grid_check(ret_grid, err);
-}
-
-/* Row after row, each to its place. */
-static int read_voxels(int file, const char *path, const struct layout *layout, const struct grid *grid,
-		       const bool flip[3], float *ret_voxels, struct error *err)
-{
-	size_t nx = (size_t)grid->size[0], ny = (size_t)grid->size[1], nz = (size_t)grid->size[2];
-	size_t bytes = pixel_bytes(layout->type), plane = nx * ny * bytes;
-	uint8_t *slice = malloc(plane);
-	float *stored = malloc(nx * sizeof(*stored));
-	int code = 0;
-
-	if (slice == NULL || stored == NULL)
-		code = error_set(err, ERR_NO_MEMORY, "no memory for a slice of %zu bytes", plane);
-	for (size_t z = 0; z < nz && code == 0; z++) {
-		size_t to_z = flip[2] ? nz - 1 - z : z;
-
-		code = file_read_at(file, slice, plane, layout->start + z * plane, path, err);
-		for (size_t y = 0; y < ny && code == 0; y++) {
-			size_t to_y = flip[1] ? ny - 1 - y : y;
-			float *row = ret_voxels + (to_z * ny + to_y) * nx;
-
-			pixels_to_float(slice + y * nx * bytes, layout->type, false, nx, stored);
-			for (size_t x = 0; x < nx; x++)
-				row[flip[0] ? nx - 1 - x : x] =
-				    (float)(layout->slope * (double)stored[x] + layout->offset);
-		}
-	}
-	free(slice);
-	free(stored);
-	return code;
-}
-
-/* The size is compared before anything is allocated: a header can promise anything. */
-static int check_length(const char *path, const struct stat *status, const struct layout *layout,
-			const struct grid *grid, struct error *err)
-{
-	size_t expected = layout->start + grid_voxels(grid) * pixel_bytes(layout->type);
-
-	if ((size_t)status->st_size < expected)
-		return error_set(err, ERR_INVALID, "%.200s: %zu bytes, at least %zu are expected", path,
-				 (size_t)status->st_size, expected);
-	return 0;
-}
-
-int volume_read(const char *path, struct grid *grid, float **ret_voxels, struct error *err)
-{
-	int file = open(path, O_RDONLY | O_CLOEXEC), code;
-	uint8_t head[4096];
-	struct layout layout;
-	struct grid found;
-	struct stat status;
-	bool flip[3];
-	float *voxels = NULL;
-
-	if (file < 0)
-		return error_set_errno(err, errno, "%s cannot be opened", path);
-	if (fstat(file, &status) != 0) {
-		code = error_set_errno(err, errno, "%s cannot be read", path);
-		goto out;
-	}
-	if ((size_t)status.st_size < sizeof(head))
-		memset(head, 0, sizeof(head));
-	code = file_read_at(file, head, (size_t)status.st_size < sizeof(head) ? (size_t)status.st_size : sizeof(head),
-			    0, path, err);
-	if (code == 0)
-		code = read_header(head, sizeof(head), &layout, grid, err);
-	if (code == 0)
-		code = layout_grid(&layout, &found, flip, err);
-	if (code == 0)
-		code = check_length(path, &status, &layout, &found, err);
-	if (code != 0)
-		goto out;
-	voxels = malloc(grid_voxels(&found) * sizeof(*voxels));
-	code = voxels == NULL ? error_set(err, ERR_NO_MEMORY, "no memory for %zu voxels", grid_voxels(&found))
-			      : read_voxels(file, path, &layout, &found, flip, voxels, err);
-	if (code == 0) {
-		*grid = found;
-		*ret_voxels = voxels;
-		voxels = NULL;
-	}
-out:
-	free(voxels);
-	close(file);
-	return code;
 }

@@ -240,7 +240,7 @@ int job_request_read(const cJSON *value, struct job_request *ret_request, struct
 {
 	struct job_request request = {0};
 	struct json_reader reader;
-	const cJSON *stages[STAGES];
+	const cJSON *stages[STAGES], *patient;
 	int priority = PRIORITY_ROUTINE, precision = 0, projector = PROJECTOR_INTERPOLATING, code;
 
 	recipe_defaults(&request.recipe);
@@ -251,6 +251,7 @@ int job_request_read(const cJSON *value, struct job_request *ret_request, struct
 	stages[2] = json_member(&reader, "sart", false);
 	stages[3] = json_member(&reader, "tv", false);
 	stages[4] = json_member(&reader, "metal", false);
+	patient = json_member(&reader, "patient", false);
 	json_choice(&reader, "projector", false, projector_names, PROJECTOR_COUNT, &projector);
 	json_choice(&reader, "priority", false, priority_names, PRIORITY_COUNT, &priority);
 	json_choice(&reader, "precision", false, precision_names, 2, &precision);
@@ -260,6 +261,8 @@ int job_request_read(const cJSON *value, struct job_request *ret_request, struct
 	request.recipe.reference_precision = precision != 0;
 	request.recipe.projector = (enum projector)projector;
 	code = json_end(&reader);
+	if (code == 0)
+		code = patient_read(patient, "/patient", &request.patient, err);
 	if (code == 0)
 		code = read_stages(&request.recipe, stages, err);
 	if (code == 0 && names_no_stage(value))
@@ -310,6 +313,8 @@ int job_request_resolve(struct job_request *request, const struct scan *scan, st
 		return code;
 	if (recipe->sart.subsets == SUBSETS_DEFAULT)
 		recipe->sart.subsets = subsets_count(SUBSETS_DEFAULT, scan->geometry.count);
+	if (!request->patient.known)
+		request->patient = scan->patient;
 	/* Not before: until here the pointers of errors are places in the list as it was posted. */
 	if (recipe->emits > 0)
 		qsort(recipe->emit, (size_t)recipe->emits, sizeof(*recipe->emit), compare_emits);
@@ -389,12 +394,10 @@ static void add_emit(cJSON *document, const struct recipe *recipe)
 	}
 }
 
-static cJSON *request_document(const struct job_request *request)
+cJSON *recipe_json(const struct recipe *recipe)
 {
-	const struct recipe *recipe = &request->recipe;
 	cJSON *document = cJSON_CreateObject(), *fdk;
 
-	cJSON_AddStringToObject(document, "scan", request->scan);
 	if (recipe->has_grid)
 		add_grid(document, recipe);
 	if (recipe->fdk.on) {
@@ -418,10 +421,19 @@ static cJSON *request_document(const struct job_request *request)
 	else
 		cJSON_AddNullToObject(document, "metal");
 	cJSON_AddStringToObject(document, "projector", projector_names[recipe->projector]);
-	add_emit(document, recipe);
-	cJSON_AddStringToObject(document, "priority", priority_names[request->priority]);
 	cJSON_AddStringToObject(document, "precision", precision_names[recipe->reference_precision]);
 	cJSON_AddNumberToObject(document, "mu_water", recipe->mu_water);
+	return document;
+}
+
+static cJSON *request_document(const struct job_request *request)
+{
+	cJSON *document = recipe_json(&request->recipe);
+
+	cJSON_AddStringToObject(document, "scan", request->scan);
+	cJSON_AddItemToObject(document, "patient", patient_json(&request->patient));
+	add_emit(document, &request->recipe);
+	cJSON_AddStringToObject(document, "priority", priority_names[request->priority]);
 	return document;
 }
 
@@ -456,8 +468,8 @@ bool job_request_same(const struct job_request *a, const struct job_request *b)
 {
 	const struct recipe *x = &a->recipe, *y = &b->recipe;
 
-	return strcmp(a->scan, b->scan) == 0 && a->priority == b->priority && same_grid(x, y) &&
-	       x->fdk.on == y->fdk.on &&
+	return strcmp(a->scan, b->scan) == 0 && a->priority == b->priority && patient_same(&a->patient, &b->patient) &&
+	       same_grid(x, y) && x->fdk.on == y->fdk.on &&
 	       (!x->fdk.on ||
 		(x->fdk.window == y->fdk.window && x->fdk.cutoff == y->fdk.cutoff && x->fdk.extend == y->fdk.extend)) &&
 	       same_sart(x, y) && same_tv(x, y) && x->metal.on == y->metal.on &&

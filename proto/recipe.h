@@ -11,7 +11,8 @@ extern const char *const priority_names[PRIORITY_COUNT];
 struct job_request {
 	char scan[64];
 	enum priority priority;
-	struct recipe recipe; /* owned: recipe_clear */
+	struct patient patient; /* of the scan, once resolved, unless the job says otherwise */
+	struct recipe recipe;   /* owned: recipe_clear */
 };
 
 enum { EMITS_MAX = 10000 }; /* each is a volume on the disk, and all of them fit into one message to the worker */
@@ -32,6 +33,9 @@ int job_request_resolve(struct job_request *request, const struct scan *scan, st
  * (print it with json_print: cJSON's own printer drops digits). NULL for no memory.
  */
 cJSON *job_request_json(const struct job_request *request);
+/* Of these members those that say what is computed: stages, grid, projector ... but not what is kept. NULL for no
+ * memory. */
+cJSON *recipe_json(const struct recipe *recipe);
 /* What a stage that is off would have done does not count. */
 bool job_request_same(const struct job_request *a, const struct job_request *b);
 

@@ -327,7 +327,7 @@ static void drop_nulls(cJSON *object)
 static int read_document(struct scan *scan, struct error *err)
 {
 	struct json_reader reader;
-	const cJSON *detector, *projections, *geometry;
+	const cJSON *detector, *projections, *geometry, *patient;
 	int code;
 
 	json_begin(&reader, scan->document, "", err);
@@ -335,7 +335,10 @@ static int read_document(struct scan *scan, struct error *err)
 	detector = json_member(&reader, "detector", true);
 	projections = json_member(&reader, "projections", true);
 	geometry = json_member(&reader, "geometry", true);
+	patient = json_member(&reader, "patient", false);
 	code = json_end(&reader);
+	if (code == 0)
+		code = patient_read(patient, "/patient", &scan->patient, err);
 	if (code == 0)
 		code = read_detector(scan, detector, err);
 	if (code == 0)

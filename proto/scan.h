@@ -4,6 +4,7 @@
 #include "core/backend.h"
 #include "core/orbit.h"
 #include "proto/json.h"
+#include "proto/patient.h"
 
 /* A scan as it is posted: what the detector and the orbit are, not the samples themselves. */
 struct scan {
@@ -18,10 +19,11 @@ struct scan {
 	int air_region[4]; /* first column, first row, last column, last row */
 	double hardening[HARDENING_MOST];
 	int hardening_count; /* coefficients, 0: none */
+	struct patient patient;
 	struct geometry geometry;
 	struct orbit orbit;
 	int *projection; /* [count], owned, after scan_reduce: the number of each view's projection; NULL: its own */
-	cJSON *document; /* as posted, checked: members name, detector, projections, geometry */
+	cJSON *document; /* as posted, checked: members name, patient, detector, projections, geometry */
 };
 
 extern const char *const sample_names[2];   /* "float32", "uint16" */

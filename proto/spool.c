@@ -17,9 +17,10 @@
 
 #include "proto/durable.h"
 #include "proto/format.h"
+#include "proto/nifti.h"
 #include "proto/saver.h"
 
-_Static_assert(SPOOL_VOLUME_OFFSET == 352, "a NIfTI-1 header and its four extension bytes");
+_Static_assert((int)SPOOL_VOLUME_OFFSET == (int)NIFTI_VOXELS, "a NIfTI-1 header and its extension");
 
 enum {
 	READ_BYTES = 8 << 20,  /* projections in one go: small beside the scan, large beside a system call */
@@ -222,7 +223,8 @@ struct run {
 	const char *directory;
 	const struct recipe *recipe;
 	const struct recon *recon; /* NULL before it is opened */
-	bool ahead;                /* the next volume's file is prepared while the device computes */
+	struct provenance provenance;
+	bool ahead; /* the next volume's file is prepared while the device computes */
 	bool prepared;
 	struct saver *saver; /* NULL before the first */
 	/* The volume that was written last: "final" may be the same iterate. Told of, and settled while the run goes
@@ -403,16 +405,17 @@ static int write_volume(struct run *run, struct recon *recon, const struct kept_
 			const struct saved_volume *saved, struct error *err)
 {
 	uint8_t header[FORMAT_HEADER_MAX];
-	char description[80];
 	size_t length;
 	int code = open_saver(run, err);
 
 	if (code != 0)
 		return code;
 	/* Nothing of the name: "final" may be a link to this file. */
-	snprintf(description, sizeof(description), "attenuation in 1/mm, %s, iteration %d", kept->stage,
-		 kept->iteration);
-	length = volume_formats[0].header(kept->grid, VOLUME_FLOAT32, description, header);
+	snprintf(run->provenance.stage, sizeof(run->provenance.stage), "%s", kept->stage);
+	run->provenance.iteration = kept->iteration;
+	code = volume_formats[0].header(kept->grid, VOLUME_FLOAT32, &run->provenance, header, &length, err);
+	if (code != 0)
+		return code;
 	run->prepared = false;
 	code = saver_begin(run->saver, saved->path, header, length, saved->bytes, err);
 	if (code == 0)
@@ -658,6 +661,26 @@ static int open_recon(struct spool *spool, const struct backend *backend, struct
 	return code;
 }
 
+static void set_text(char *ret, size_t size, const char *text)
+{
+	snprintf(ret, size, "%s", text != NULL ? text : "");
+}
+
+/* What the volumes' files will say, but for stage and iteration. */
+static int set_provenance(struct spool *spool, const struct spool_options *options, struct error *err)
+{
+	struct provenance *provenance = &spool->run.provenance;
+	const struct scan *scan = spool->files.scan;
+
+	provenance->patient = options->patient != NULL ? *options->patient : scan->patient;
+	set_text(provenance->program, sizeof(provenance->program), options->program);
+	set_text(provenance->job, sizeof(provenance->job), options->job);
+	set_text(provenance->scan, sizeof(provenance->scan), options->scan);
+	set_text(provenance->scan_name, sizeof(provenance->scan_name), scan->name);
+	provenance->recipe = recipe_json(options->recipe);
+	return provenance->recipe != NULL ? 0 : error_set(err, ERR_NO_MEMORY, "no memory for a recipe");
+}
+
 int spool_open(const struct backend *backend, struct device *device, const struct spool_options *options,
 	       struct spool **ret_spool, struct error *err)
 {
@@ -680,6 +703,8 @@ int spool_open(const struct backend *backend, struct device *device, const struc
 	spool->files.projections = -1;
 	code = scan_files_open(options->scan_directory, &spool->files, err);
 	if (code == 0)
+		code = set_provenance(spool, options, err);
+	if (code == 0)
 		code = allocate(spool, err);
 	if (code == 0)
 		code = reduce(spool, options->present, err);
@@ -700,6 +725,7 @@ void spool_close(struct spool *spool)
 	if (spool == NULL)
 		return;
 	saver_free(spool->run.saver);
+	provenance_clear(&spool->run.provenance);
 	recon_free(spool->recon);
 	scan_files_close(&spool->files);
 	free(spool->view_of);

@@ -18,10 +18,12 @@
  *   flat.f32 dark.f32  [row][column] float32, where given
  *   defects.u8         [row][column] bytes, not zero where a pixel is defective, where given
  *
- * Kept volumes are NAME.nii files: a 352-byte NIfTI header and float32 voxels,
- * so that raw and nifti are both sent straight from the file.
+ * Kept volumes are NAME.nii files: a NIfTI header with an extension that says where
+ * they come from, SPOOL_VOLUME_OFFSET bytes in all, and float32 voxels, so that raw
+ * and nifti are both sent straight from the file. Files from before there was an
+ * extension begin their voxels earlier: volume_own_head of proto/format.h tells.
  */
-enum { SPOOL_VOLUME_OFFSET = 352 };
+enum { SPOOL_VOLUME_OFFSET = 4096 };
 
 /*
  * Whole small file; *ret_text ends with a zero byte beyond its length. Free with
@@ -83,6 +85,9 @@ struct spool_options {
 	/* A flag for each projection of scan.json: those that make up the scan, the others never come. NULL: all. */
 	const unsigned char *present;
 	const struct recipe *recipe;
+	/* For the files' descriptions: the program, job and scan by their names ("" or NULL: none). */
+	const char *program, *job, *scan;
+	const struct patient *patient; /* NULL: as scan.json says */
 	/*
 	 * Of a run that yielded, or NULL; `iteration` is the one it holds as far as the
 	 * caller knows. The file itself knows better (a crash may lie between its writing

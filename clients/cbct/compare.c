@@ -91,23 +91,40 @@ static bool is_raw(const char *path)
 
 struct pair {
 	struct grid grid;
+	double axes[3][3]; /* directions of the grid's, LPS */
 	float *a, *truth;
 	unsigned char *mask; /* [z][y][x], 0 = left out */
 };
 
+/* Oblique volumes count their grids along their own axes: those must be the same, or the grids tell nothing. */
+static int axes_agree(double a[3][3], double b[3][3], struct error *err)
+{
+	const double tolerance = 1e-4; /* of a unit vector: what single precision and printed digits leave */
+
+	for (int i = 0; i < 3; i++)
+		for (int j = 0; j < 3; j++)
+			if (!(fabs(a[i][j] - b[i][j]) <= tolerance))
+				return error_set(err, ERR_INVALID, "its axes are turned against those of the truth");
+	return 0;
+}
+
 static int pair_load_both(const struct compare_options *options, struct pair *pair, struct error *err)
 {
 	struct grid a, truth;
+	double axes[3][3] = {{0}};
 	bool truth_first = is_raw(options->volume) && !is_raw(options->truth);
 	int code = 0;
 
 	for (int turn = 0; turn < 2 && code == 0; turn++)
 		if ((turn == 0) == truth_first)
-			code = volume_load(options->truth, &options->file, truth_first ? NULL : &a, &truth,
+			code = volume_load(options->truth, &options->file, truth_first ? NULL : &a, &truth, pair->axes,
 					   &pair->truth, err);
 		else
-			code = volume_load(options->volume, &options->file, truth_first ? &truth : NULL, &a, &pair->a,
-					   err);
+			code = volume_load(options->volume, &options->file, truth_first ? &truth : NULL, &a, axes,
+					   &pair->a, err);
+	/* Raw voxels lie along whatever the other file's do. */
+	if (code == 0 && !is_raw(options->volume) && !is_raw(options->truth))
+		code = axes_agree(axes, pair->axes, err);
 	if (code == 0)
 		code = grids_agree(&a, &truth, err);
 	if (code == 0)
@@ -124,7 +141,7 @@ static int pair_load(const struct compare_options *options, struct pair *pair, s
 		return error_set(err, ERR_USAGE, "either TRUTH or --value is expected");
 	if (options->truth != NULL)
 		return pair_load_both(options, pair, err);
-	code = volume_load(options->volume, &options->file, NULL, &pair->grid, &pair->a, err);
+	code = volume_load(options->volume, &options->file, NULL, &pair->grid, pair->axes, &pair->a, err);
 	if (code != 0)
 		return code;
 	count = grid_voxels(&pair->grid);
@@ -149,9 +166,12 @@ static int keep_mask(const struct compare_options *options, struct pair *pair, s
 {
 	size_t count = grid_voxels(&pair->grid);
 	struct grid grid;
+	double axes[3][3];
 	float *mask = NULL;
-	int code = volume_load(options->mask, &options->file, &pair->grid, &grid, &mask, err);
+	int code = volume_load(options->mask, &options->file, &pair->grid, &grid, axes, &mask, err);
 
+	if (code == 0 && !is_raw(options->mask))
+		code = axes_agree(axes, pair->axes, err);
 	if (code == 0)
 		code = grids_agree(&grid, &pair->grid, err);
 	for (size_t i = 0; i < count && code == 0; i++)

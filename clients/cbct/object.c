@@ -29,7 +29,7 @@ const struct option object_volume_rows[] = {
 static int volume_open(const struct object_options *options, struct object *object, struct error *err)
 {
 	const struct volume_options *file = &options->file;
-	int code = volume_load(options->volume, file, NULL, &object->grid, &object->voxels, err);
+	int code = volume_load(options->volume, file, NULL, &object->grid, NULL, &object->voxels, err);
 
 	if (code != 0)
 		return code;

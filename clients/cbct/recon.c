@@ -11,6 +11,7 @@
 #include "clients/cbct/progress.h"
 #include "clients/cbct/recipe_options.h"
 #include "clients/cbct/warning.h"
+#include "proto/provenance.h"
 #include "proto/spool.h"
 
 struct recon_options {
@@ -157,8 +158,9 @@ static void become_cuda(void)
 	free(text);
 }
 
-static int pipeline_run(const struct recon_options *options, const struct recipe *recipe, struct error *err)
+static int pipeline_run(const struct recon_options *options, const struct job_request *request, struct error *err)
 {
+	const struct recipe *recipe = &request->recipe;
 	const struct backend *backend = backend_find(options->backend);
 	const char *output = options->output != NULL ? options->output : options->directory;
 	const struct device_options device_options = {.threads = (int)options->threads};
@@ -167,8 +169,12 @@ static int pipeline_run(const struct recon_options *options, const struct recipe
 	    .recon = {.context = &display, .progress = on_progress, .row = on_row, .warning = on_warning},
 	    .on_volume = on_volume,
 	};
-	const struct spool_options run = {
-	    .scan_directory = options->directory, .out_directory = output, .recipe = recipe, .hooks = &hooks};
+	const struct spool_options run = {.scan_directory = options->directory,
+					  .out_directory = output,
+					  .recipe = recipe,
+					  .program = CBCT_PROGRAM,
+					  .patient = &request->patient,
+					  .hooks = &hooks};
 	struct device *device = NULL;
 	int code;
 
@@ -197,7 +203,7 @@ static int recon_run_command(const void *values, struct error *err)
 
 	if (code != 0)
 		return code;
-	code = pipeline_run(options, &request.recipe, err);
+	code = pipeline_run(options, &request, err);
 	recipe_clear(&request.recipe);
 	return code;
 }

@@ -108,7 +108,8 @@ static int write_projections(const struct simulate_options *options, const struc
 	return code;
 }
 
-static int write_phantom(const struct simulate_options *options, const struct object *object, struct error *err)
+static int write_phantom(const struct simulate_options *options, const struct object *object,
+			 const struct patient *patient, struct error *err)
 {
 	const struct volume_options *voxels_of = &options->object.file;
 	struct grid grid;
@@ -124,18 +125,19 @@ static int write_phantom(const struct simulate_options *options, const struct ob
 	if (voxels == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for %zu voxels", grid_voxels(&grid));
 	phantom_voxelise(&object->phantom, &grid, (int)options->truth.samples, voxels);
-	code = volume_write(options->truth.path, &grid, voxels, err);
+	code = volume_write(options->truth.path, &grid, patient, voxels, err);
 	free(voxels);
 	return code;
 }
 
-static int write_truth(const struct simulate_options *options, const struct object *object, struct error *err)
+static int write_truth(const struct simulate_options *options, const struct object *object,
+		       const struct patient *patient, struct error *err)
 {
 	if (object->voxels == NULL)
-		return write_phantom(options, object, err);
+		return write_phantom(options, object, patient, err);
 	if (!isnan(options->truth.size[0]))
 		return error_set(err, ERR_USAGE, "--grid is for phantoms: the truth of a volume is the volume itself");
-	return volume_write(options->truth.path, &object->grid, object->voxels, err);
+	return volume_write(options->truth.path, &object->grid, patient, object->voxels, err);
 }
 
 static int write_scan(const struct simulate_options *options, const struct noise *noise, const struct object *object,
@@ -160,7 +162,7 @@ static int write_scan(const struct simulate_options *options, const struct noise
 			code = scan_output_file(options->output, "dark.f32", dark, pixels * sizeof(*dark), err);
 	}
 	if (code == 0 && options->truth.path != NULL)
-		code = write_truth(options, object, err);
+		code = write_truth(options, object, &scan->patient, err);
 	if (code == 0)
 		code = write_projections(options, noise, object, scan, flat, dark, err);
 	/* Last: a directory with a document is whole. */

@@ -126,9 +126,10 @@ static int slice_run(const void *values, struct error *err)
 	double window = options->window, level = options->level;
 	struct slice slice = {.axis = options->axis};
 	struct grid grid;
+	double axes[3][3];
 	float *voxels = NULL;
 	long index = options->index;
-	int code = volume_load(options->volume, &options->file, NULL, &grid, &voxels, err);
+	int code = volume_load(options->volume, &options->file, NULL, &grid, axes, &voxels, err);
 
 	if (code == 0 && index == OPTION_UNSET_INTEGER)
 		index = grid.size[options->axis] / 2;

@@ -45,7 +45,7 @@ int grid_from_numbers(const double size[3], const double spacing[3], const doubl
 }
 
 int volume_load(const char *path, const struct volume_options *options, const struct grid *like, struct grid *ret_grid,
-		float **ret_voxels, struct error *err)
+		double ret_axes[3][3], float **ret_voxels, struct error *err)
 {
 	static const double one[3] = {1, 1, 1};
 	bool has_spacing = !isnan(options->spacing[0]);
@@ -58,7 +58,7 @@ int volume_load(const char *path, const struct volume_options *options, const st
 	else if (like != NULL)
 		grid = *like;
 	if (code == 0)
-		code = volume_read(path, &grid, ret_voxels, err);
+		code = volume_read(path, &grid, ret_axes, ret_voxels, err);
 	if (code != 0)
 		return code;
 	if (has_spacing)

@@ -28,10 +28,11 @@ int grid_from_numbers(const double size[3], const double spacing[3], const doubl
 /*
  * Reads a volume. `like` is the grid of a raw file of which the options say
  * nothing, or NULL. A spacing given for a file that has its own replaces it, and
- * centres the volume. hu is not applied here. Free *ret_voxels.
+ * centres the volume. hu is not applied here. ret_axes: as of volume_read, NULL
+ * refuses oblique volumes. Free *ret_voxels.
  */
 int volume_load(const char *path, const struct volume_options *options, const struct grid *like, struct grid *ret_grid,
-		float **ret_voxels, struct error *err);
+		double ret_axes[3][3], float **ret_voxels, struct error *err);
 /* HU to 1/mm in place. */
 void volume_from_hu(float *voxels, size_t count, double mu_water);
 

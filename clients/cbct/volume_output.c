@@ -18,13 +18,17 @@ static const struct volume_format *format_of(const char *path)
 	return volume_formats;
 }
 
-int volume_write(const char *path, const struct grid *grid, const float *voxels, struct error *err)
+int volume_write(const char *path, const struct grid *grid, const struct patient *patient, const float *voxels,
+		 struct error *err)
 {
+	const struct provenance provenance = {.patient = *patient, .program = CBCT_PROGRAM};
 	uint8_t header[FORMAT_HEADER_MAX];
-	size_t length = format_of(path)->header(grid, VOLUME_FLOAT32, "cbct", header), count = grid_voxels(grid);
+	size_t length, count = grid_voxels(grid);
 	FILE *file;
-	int code = output_open(path, &file, err);
+	int code = format_of(path)->header(grid, VOLUME_FLOAT32, &provenance, header, &length, err);
 
+	if (code == 0)
+		code = output_open(path, &file, err);
 	if (code != 0)
 		return code;
 	fwrite(header, 1, length, file);

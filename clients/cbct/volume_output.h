@@ -3,7 +3,8 @@
 
 #include "proto/format.h"
 
-/* float32 voxels [z][y][x] as a file of the format that its extension names, otherwise NIfTI. */
-int volume_write(const char *path, const struct grid *grid, const float *voxels, struct error *err);
+/* float32 voxels [z][y][x] of the world as a file of the format that its extension names, otherwise NIfTI. */
+int volume_write(const char *path, const struct grid *grid, const struct patient *patient, const float *voxels,
+		 struct error *err);
 
 #endif

@@ -27,7 +27,7 @@ curl -sS --fail-with-body --compressed -o "$work/hu.nii" -w 'status %{http_code}
 etag=$(curl -sS --fail-with-body -I "$volume" | tr -d '\r' | sed -n 's/^[Ee][Tt]ag: //p')
 curl -sS --fail-with-body -o /dev/null -H "If-None-Match: $etag" -w "asked again with $etag: status %{http_code}\n" "$volume"
 
-# Part of a file: the 352 bytes of the NIfTI header.
+# Part of a file: the first 352 bytes, NIfTI's own header.
 curl -sS --fail-with-body -r 0-351 -o "$work/header" -w 'the header alone: status %{http_code}, %{size_download} bytes\n' "$volume"
 cmp -n 352 "$work/header" "$work/hu.nii"
 

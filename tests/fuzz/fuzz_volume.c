@@ -18,7 +18,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 		file = memfd_create("volume", MFD_CLOEXEC);
 	PROMISE(file >= 0 && ftruncate(file, 0) == 0 && pwrite(file, data, size, 0) == (ssize_t)size);
 	snprintf(path, sizeof(path), "/proc/self/fd/%d", file);
-	if (volume_read(path, &grid, &voxels, &err) != 0) {
+	if (volume_read(path, &grid, NULL, &voxels, &err) != 0) {
 		PROMISE(voxels == NULL && err.code < 0 && err.text[0] != '\0');
 		return 0;
 	}

@@ -10,6 +10,7 @@
 #include "daemon/document.h"
 #include "daemon/files.h"
 #include "proto/durable.h"
+#include "proto/format.h"
 #include "proto/spool.h"
 #include "tests/unit/state.h"
 
@@ -559,9 +560,14 @@ static struct volume_record volume_of(const char *id, const char *name)
 /* The volume's file: `text` as voxels. */
 static void put_voxels(const char *id, const char *name, const char *text)
 {
-	char bytes[SPOOL_VOLUME_OFFSET + 64] = "";
+	const struct provenance provenance = {.patient = patient_unknown};
+	const struct grid grid = {.size = {0}}; /* the tests' records have none */
+	uint8_t bytes[FORMAT_HEADER_MAX];
 	struct error err = {0};
+	size_t length;
 
+	ck_assert_int_eq(volume_formats[0].header(&grid, VOLUME_FLOAT32, &provenance, bytes, &length, &err), 0);
+	ck_assert_uint_eq(length, SPOOL_VOLUME_OFFSET);
 	ck_assert_int_eq(directory_make(state_path(&state, "jobs/%s", id), &err), 0);
 	memcpy(bytes + SPOOL_VOLUME_OFFSET, text, strlen(text));
 	ck_assert_int_eq(file_write_durable(state_path(&state, "jobs/%s/%s.nii", id, name), bytes,

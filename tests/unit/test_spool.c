@@ -732,7 +732,7 @@ START_TEST(kept_volumes_are_files_that_say_what_they_are)
 		ck_assert_uint_eq(length, SPOOL_VOLUME_OFFSET + bytes);
 		EVP_Digest(content + SPOOL_VOLUME_OFFSET, bytes, (unsigned char *)digest, NULL, EVP_sha256(), NULL);
 		ck_assert_mem_eq(digest, watched.sha256[i], 32);
-		ck_assert_int_eq(volume_read(expected, &grid, &voxels, &err), 0);
+		ck_assert_int_eq(volume_read(expected, &grid, NULL, &voxels, &err), 0);
 		ck_assert_int_eq(grid.size[1], 16);
 		ck_assert_double_eq_tol(grid.spacing[2], 6, 1e-6); /* single precision in the header */
 		ck_assert_mem_eq(voxels, content + SPOOL_VOLUME_OFFSET, bytes);
@@ -1067,14 +1067,14 @@ START_TEST(intensities_need_air_or_a_flat_image)
 	ck_assert_int_eq(watched.opened, 0);
 	put("flat.f32", flat, sizeof(flat));
 	ck_assert_msg(run(fdk, out, NULL, 0, &watched, &err) == 0, "%s", err.text);
-	ck_assert_int_eq(volume_read(watched.saved[0].path, &grid, &voxels, &err), 0);
+	ck_assert_int_eq(volume_read(watched.saved[0].path, &grid, NULL, &voxels, &err), 0);
 	/* One number says the same as an even image. */
 	snprintf(path, sizeof(path), "%s/flat.f32", directory);
 	ck_assert_int_eq(unlink(path), 0);
 	put_document("\"sample\":\"uint16\",\"quantity\":\"intensity\",\"air\":40000");
 	memset(&watched, 0, sizeof(watched));
 	ck_assert_int_eq(run(fdk, out, NULL, 0, &watched, &err), 0);
-	ck_assert_int_eq(volume_read(watched.saved[0].path, &grid, &twice, &err), 0);
+	ck_assert_int_eq(volume_read(watched.saved[0].path, &grid, NULL, &twice, &err), 0);
 	for (size_t i = 0; i < grid_voxels(&grid); i++)
 		/* Single precision of values of a thousandth, before and after the logarithm. */
 		ck_assert_float_eq_tol(voxels[i], twice[i], 1e-7f);

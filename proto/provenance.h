@@ -1,0 +1,37 @@
+#ifndef CBCT_PROTO_PROVENANCE_H
+#define CBCT_PROTO_PROVENANCE_H
+
+#include "proto/patient.h"
+#include "proto/version.h"
+
+/* Where a volume comes from: what its file says beside the voxels. Texts that are "" are not told. */
+struct provenance {
+	struct patient patient;
+	char program[40]; /* "cbctd 1.0.0", that made the voxels */
+	char stage[16];   /* of the job that made it: "fdk", "sart" ... */
+	int iteration;    /* told with a stage only */
+	char job[64], scan[64];
+	char scan_name[256];
+	cJSON *recipe; /* owned, or NULL */
+};
+#define CBCTD_PROGRAM "cbctd " CBCT_VERSION
+#define CBCT_PROGRAM "cbct " CBCT_VERSION
+
+void provenance_clear(struct provenance *provenance);
+
+/*
+ * The members of a file's description: program, unit, stage, iteration, job, scan,
+ * scan_name, left_right ("known", "not known"), patient, world_to_patient, recipe.
+ * NULL for no memory. `unit` is of the voxels: "1/mm", "HU".
+ */
+cJSON *provenance_json(const struct provenance *provenance, const char *unit);
+/* The other way round, strict in what says where left is; a member that is missing is not told. */
+int provenance_read(const cJSON *json, struct provenance *ret_provenance, struct error *err);
+
+/* "1/mm, left and right are not known, sart iteration 5, job ...": as many of these as there is room for. */
+void provenance_sentence(const struct provenance *provenance, const char *unit, char *ret_text, size_t size);
+
+/* JSON text with everything beyond ASCII as \uXXXX, for headers that know no other characters; free. */
+char *provenance_text(const cJSON *json);
+
+#endif

@@ -1,0 +1,156 @@
+#!/usr/bin/env bash
+# Where the patient's left is: an object with a mark on each side, in each of DICOM's positions, through every format.
+. "$(dirname "$0")/lib.sh"
+
+python=${PYTHON:-/usr/bin/python3}
+sides() { "$python" "$top/tests/http/sides.py" "$@"; }
+need_nibabel() {
+	"$python" -c 'import nibabel, numpy' 2>/dev/null || skip "python3-nibabel is not here"
+	[ -e "$work/scan/scan.json" ] || { mkdir -p "$work/scan" && sides make "$work/scan"; }
+}
+stop_after_each=1
+positions="HFS HFP FFS FFP HFDL HFDR FFDL FFDR"
+tilted='{"world_to_patient": [0.766044443, -0.642787610, 0, 12, 0.620885352, 0.739941976, -0.258819045, -7, 0.166365675, 0.198266889, 0.965925826, 150, 0, 0, 0, 1]}'
+recipe='"grid": {"size": [41, 42, 43], "spacing_mm": [2, 2, 2], "origin_mm": [-40, -42, -41]}, "fdk": {}'
+
+member() { # POSITION: the value of "patient"
+	case $1 in
+	unknown) echo null ;;
+	tilted) echo "$tilted" ;;
+	*) echo "{\"position\": \"$1\"}" ;;
+	esac
+}
+scan_of() { # POSITION DIR: the object, with that patient
+	mkdir -p "$2"
+	ln -sf "$work/scan/projections.raw" "$2/projections.raw"
+	jq -c --argjson patient "$(member "$1")" '.patient = $patient' "$work/scan/scan.json" >"$2/scan.json"
+}
+job_of() { # POSITION: a scan of it and a job that has ended
+	scan_of "$1" "$work/$1"
+	reconstruct "$work/$1" "{\"scan\": \"SCAN\", $recipe}"
+}
+
+test_every_position_puts_each_mark_on_its_side_in_every_format() {
+	local position format query unit at
+	need_nibabel
+	start_daemon
+	for position in $positions tilted unknown; do
+		job_of "$position"
+		for format in nifti mha nrrd; do
+			for query in "" "&type=int16" "&type=int16&scale=2"; do
+				unit=1/mm
+				[[ $query != *int16* ]] || unit=HU
+				get_volume final "$work/volume.${format/nifti/nii}" "format=$format$query"
+				sides check "$position" $format $unit "$work/volume.${format/nifti/nii}" "$job" "$scan" ||
+					fail "$position as $format$query"
+			done
+		done
+		# The default is the kept file itself, and what is made of parts of it is the same.
+		get_volume final "$work/whole.nii"
+		cmp "$work/whole.nii" "$state/jobs/$job/final.nii" || fail "the file as it is kept"
+		at=$(($(stat -c %s "$work/whole.nii") - 4000))
+		req GET "/v1/jobs/$job/volumes/final" -H "Range: bytes=300-$at"
+		expect_status 206
+		cmp "$body" <(tail -c +301 "$work/whole.nii" | head -c $((at - 299))) || fail "a part of it"
+		get_volume final "$work/raw" format=raw
+		cmp "$work/raw" <(tail -c +4097 "$work/whole.nii") || fail "raw voxels behind the header"
+	done
+}
+
+test_the_files_know_the_sides_when_the_scan_is_gone() {
+	need_nibabel
+	start_daemon
+	job_of FFDR
+	req DELETE "/v1/scans/$scan"
+	expect_status 204
+	get_volume final "$work/file" "format=mha&type=int16"
+	sides check FFDR mha HU "$work/file" "$job" "$scan"
+	req GET "/v1/jobs/$job"
+	expect_json '.patient == {position: "FFDR"} and .axes == {x: "A", y: "R", z: "I"}'
+}
+
+test_documents_tell_the_patient_and_the_axes() {
+	local position
+	need_nibabel
+	start_daemon
+	for position in HFDL tilted unknown; do
+		scan_of "$position" "$work/$position"
+		post_scan "$work/$position"
+		[ $position != HFDL ] || expect_json '.patient == {position: "HFDL"} and .axes == {x: "A", y: "L", z: "S"}'
+		[ $position != tilted ] || expect_json '.axes == {x: "LP", y: "PR", z: "SA"} and (.patient.world_to_patient | length == 16)'
+		[ $position != unknown ] || expect_json '.patient == null and .axes == null'
+		post_job "{\"scan\": \"SCAN\", $recipe}"
+		[ $position != HFDL ] || expect_json '.patient == {position: "HFDL"} and .axes == {x: "A", y: "L", z: "S"}'
+		[ $position != unknown ] || expect_json '.patient == null and .axes == null'
+		# What is posted again is the same job.
+		req POST /v1/jobs -H 'Content-Type: application/json' --data-binary "$(jq '{scan, grid, fdk, patient}' "$body")"
+		expect_status 202
+		[ $position != tilted ] || expect_json '.axes == {x: "LP", y: "PR", z: "SA"}'
+	done
+	# A job may know what the scan does not.
+	post_job "{\"scan\": \"SCAN\", $recipe, \"patient\": {\"position\": \"HFP\"}}"
+	expect_json '.patient == {position: "HFP"} and .axes == {x: "R", y: "A", z: "S"}'
+	req GET /v1/jobs
+	expect_json '.jobs[0].axes == {x: "R", y: "A", z: "S"}'
+}
+
+refused() { # STATUS POINTER PATIENT
+	req POST /v1/scans -H 'Content-Type: application/json' --data-binary "$(jq -c --argjson patient "$3" '.patient = $patient' "$work/scan/scan.json")"
+	expect_problem "$1" "$2"
+}
+test_what_is_no_position_and_no_rigid_transform_is_refused() {
+	need_nibabel
+	start_daemon
+	refused 400 /patient/position '{"position": "supine"}'
+	refused 400 /patient/position '{}'
+	refused 400 /patient/world_to_patient '{"position": "HFS", "world_to_patient": [1,0,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1]}'
+	refused 400 /patient/world_to_patient '{"world_to_patient": [1,0,0, 0,1,0, 0,0,1]}'
+	refused 422 /patient/world_to_patient '{"world_to_patient": [-1,0,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1]}'
+	expect_json '.detail | contains("mirror")'
+	refused 422 /patient/world_to_patient '{"world_to_patient": [1,0.1,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1]}'
+	refused 422 /patient/world_to_patient '{"world_to_patient": [1,0,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,2]}'
+}
+
+test_recon_without_a_daemon_and_the_tools_know_the_sides() {
+	local position
+	need_nibabel
+	echo "{$recipe}" >"$work/recipe.json"
+	for position in HFDR tilted unknown; do
+		scan_of "$position" "$work/$position"
+		cbct recon "$work/$position" "$work/recipe.json" -o "$work/out" --quiet >/dev/null
+		sides check "$position" nifti 1/mm "$work/out/final.nii"
+		[ $position = unknown ] || mv "$work/out/final.nii" "$work/$position.nii"
+	done
+	# The same voxels in two positions are two volumes, and one as its own file is itself.
+	cbct compare "$work/HFDR.nii" "$work/HFDR.nii" | grep -q . || fail "an exchange of axes that is read"
+	cbct compare "$work/tilted.nii" "$work/tilted.nii" | grep -q . || fail "an oblique volume that is read"
+	! cbct compare "$work/tilted.nii" "$work/out/final.nii" 2>"$work/why" || fail "oblique against straight refused"
+	grep -q "turned against" "$work/why" || fail "the reason, got $(cat "$work/why")"
+	cbct slice "$work/tilted.nii" -o "$work/tilted.png"
+}
+
+# Files of state directories from before there was an extension begin their voxels earlier.
+test_volumes_from_before_there_was_an_extension_are_served_right() {
+	local slice raw
+	need_nibabel
+	start_daemon
+	job_of unknown
+	get_volume final "$work/before.raw" format=raw
+	req GET "/v1/jobs/$job/volumes/final/slice?axis=y"
+	cp "$body" "$work/before.png"
+	stop_daemon
+	sides old "$state/jobs/$job/final.nii"
+	start_daemon
+	get_volume final "$work/after.raw" format=raw
+	cmp "$work/before.raw" "$work/after.raw" || fail "the same voxels"
+	req GET "/v1/jobs/$job/volumes/final/slice?axis=y"
+	cmp "$body" "$work/before.png" || fail "the same picture"
+	get_volume final "$work/after.nii"
+	cmp <(tail -c +4097 "$work/after.nii") "$work/after.raw" || fail "the same voxels as NIfTI"
+	"$python" -c 'import nibabel, sys
+image = nibabel.load(sys.argv[1])
+assert nibabel.aff2axcodes(image.affine) == ("L", "P", "S"), image.affine
+assert b"left and right are not known" in image.header["descrip"].item()' "$work/after.nii" || fail "a header that says what is not known"
+}
+
+run_tests
