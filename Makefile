@@ -27,7 +27,8 @@ endif
 CUDA_ARCH ?= 75 80 86 89 90 100 120
 SANITIZE ?=
 SANITIZED ?= 0
-WERROR ?= 1
+# 1 in CI and for developers; a newer compiler's new warning breaks nobody else's build.
+WERROR ?= 0
 prefix ?= /usr/local
 
 # pkg-config name:Debian package, then command:Debian package.
@@ -147,6 +148,10 @@ $(BUILD)/cbct-worker-held: $(call objects,daemon/worker.c tests/http/held.c) $(l
 $(BUILD)/cbctd-held: $(call objects,$(daemon_sources) tests/http/held.c) $(BUILD)/proto/openapi.o $(BUILD)/web/assets.o $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -Wl,--wrap=job_digest_volume -o $@ $^ $(call pkg,--libs,$(daemon_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
+# Every program that a test or a benchmark runs, so that none stops compiling unseen.
+test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held faults.so cpu-bench watchers slices acquire) \
+               $(if $(cuda_objects),$(gpu_programs) $(BUILD)/gpu_ceilings $(BUILD)/cbct-worker-faulty,$(call objects,$(wildcard tests/bench/gpu_*.c)))
+
 # Faults of the disk, loaded into the programs by tests.
 $(BUILD)/faults.so: tests/http/faults.c
 	$(call say,CC  )$(CC) -std=c11 -O1 -Wall -Wextra -fPIC -shared -o $@ $< -ldl
@@ -200,11 +205,11 @@ demo: setup ## a C-arm scan posted with curl, reconstructed, its volumes coming 
 	@BUILD=$(BUILD) clients/curl/demo.sh
 
 check: setup ## every test; what cannot run here is skipped aloud
-	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/unit $(BUILD)/cbct-worker-held $(BUILD)/cbctd-held $(BUILD)/faults.so
+	@$(MAKE) --no-print-directory -j$$(nproc) all test-programs
 	@BUILD=$(BUILD) SANITIZED=$(SANITIZED) LEAVE_OUT="$(LEAVE_OUT)" OMP_WAIT_POLICY=passive tests/run.sh
 
 soak: setup ## the long tests: faults by the thousand, sweeps over anatomy and noise (an hour and more)
-	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/unit $(BUILD)/cbct-worker-held $(BUILD)/cbctd-held $(BUILD)/faults.so
+	@$(MAKE) --no-print-directory -j$$(nproc) all test-programs
 	@BUILD=$(BUILD) OMP_WAIT_POLICY=passive tests/run.sh --soak
 
 FUZZ_SECONDS ?= 10
@@ -261,16 +266,19 @@ format: ## clang-format over everything
 
 install: all ## programs, units and example configuration under $(DESTDIR)$(prefix)
 	install -D -m 755 -t $(DESTDIR)$(prefix)/bin $(programs)
-	install -D -m 644 -t $(DESTDIR)$(prefix)/lib/systemd/system systemd/cbctd.service
+	install -d $(DESTDIR)$(prefix)/lib/systemd/system
+	sed 's,@prefix@,$(prefix),g' systemd/cbctd.service.in >$(DESTDIR)$(prefix)/lib/systemd/system/cbctd.service
+	install -D -m 644 README.md $(DESTDIR)$(prefix)/share/doc/cbctd/README.md
+	STATE_DIRECTORY=/var/lib/cbctd $(BUILD)/cbctd --print-config | sed 's/^[^#]/#&/' >$(DESTDIR)$(prefix)/share/doc/cbctd/cbctd.conf
 
 # A tarball's programs look for libraries beside them (RPATH, which the libraries inherit); glibc is the system's.
-bundle: ## a tarball that runs on a machine with a driver only
+bundle: ## a tarball that runs on a machine with a driver only, unpacked as /opt/cbctd
 	@$(MAKE) --no-print-directory BUILD=$(BUILD)/bundled BUNDLE=1 all
 	@set -e; to=$(BUILD)/bundle/cbctd; rm -rf $(BUILD)/bundle; mkdir -p $$to/bin $$to/lib; \
 	for p in $(notdir $(programs)); do cp $(BUILD)/bundled/$$p $$to/bin/; strip $$to/bin/$$p; done; \
 	ldd $$to/bin/* | awk '/=> \// { print $$3 }' | sort -u | \
 	grep -vE '/(libc|libm|libdl|libpthread|librt|libresolv|libcuda)\.so|/ld-linux' | xargs cp -L -t $$to/lib; \
-	cp -r systemd README.md $$to/; tar -C $(BUILD)/bundle -cf - cbctd | zstd -q -T0 -f -o $(BUILD)/cbctd.tar.zst; \
+	cp README.md $$to/; sed 's,@prefix@,/opt/cbctd,g' systemd/cbctd.service.in >$$to/cbctd.service; tar -C $(BUILD)/bundle -cf - cbctd | zstd -q -T0 -f -o $(BUILD)/cbctd.tar.zst; \
 	ls -l $(BUILD)/cbctd.tar.zst
 
 clean: ## removes build/
@@ -279,6 +287,6 @@ clean: ## removes build/
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-.PHONY: all again setup demo check soak fuzz fuzzers bench check-gpu bench-gpu asan tsan lint format install clean help
+.PHONY: all test-programs again setup demo check soak fuzz fuzzers bench check-gpu bench-gpu asan tsan lint format install clean help
 .SECONDARY:
 -include $(shell find $(BUILD) -name '*.d' 2>/dev/null)

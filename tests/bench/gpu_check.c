@@ -1361,7 +1361,7 @@ static const struct bound_recipe bound_recipes[] = {
     {"10 subsets", 10, .fdk = true},
     {"10 subsets, reference", 10, .fdk = true, .reference = true},
     {"SIRT", 1, .fdk = true},
-    {"SIRT alone", 1},
+    {"SIRT alone", .subsets = 1},
     {"SIRT, reference", 1, .fdk = true, .reference = true},
     {"SIRT, matched", 1, .fdk = true, .matched = true},
     {"SIRT, metal", 1, .fdk = true, .metal = true},

@@ -2,6 +2,7 @@
 #include "tests/unit/data.h"
 
 #include <check.h>
+#include <stdbool.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <zstd.h>
@@ -9,13 +10,16 @@
 static FILE *data_open(const char *name)
 {
 	const char *data = getenv("CBCT_TEST_DATA");
+	static bool told;
 	char path[1024];
 	FILE *file;
 
 	snprintf(path, sizeof(path), "%s/%s", data ? data : "../shared/data", name);
 	file = fopen(path, "rbe");
-	if (file == NULL)
-		printf("skipped: %s is not there\n", path);
+	/* Each test is a process of its own, and one skip. */
+	if (file == NULL && !told)
+		printf("SKIP unit %s is not there\n", path);
+	told = told || file == NULL;
 	return file;
 }
 

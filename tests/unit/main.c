@@ -52,7 +52,7 @@ int main(int argc, char **argv)
 		if (suites[i].make != NULL)
 			srunner_add_suite(runner, suites[i].make());
 		else
-			printf("skipped: suite %s is not linked\n", suites[i].name);
+			printf("SKIP unit suite %s is not linked\n", suites[i].name);
 	}
 	for (int i = 1; i < argc; i++)
 		named += argv[i][0] != '-';

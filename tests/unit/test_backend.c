@@ -48,7 +48,7 @@ static int machines(struct machine ret[MACHINES_MOST])
 
 			if (backend_cpu.open(0, &options, &device, &err) < 0) {
 				if (!told)
-					printf("skipped: %s\n", err.text);
+					printf("SKIP unit %s\n", err.text);
 				continue;
 			}
 			backend_cpu.close(device);

@@ -116,7 +116,7 @@ START_TEST(a_scan_beyond_the_disk_is_refused_before_anything_is_made)
 	ck_assert_msg(scan_parse(text, strlen(text), &scan, &err) == 0, "%s", err.text);
 	ck_assert_int_eq(space_free(state.directory, &available, &err), 0);
 	if (available > scan_projection_bytes(scan) * 20000ull) {
-		printf("skipped: a disk of more than a terabyte cannot be too small\n");
+		printf("SKIP unit a disk of more than a terabyte cannot be too small\n");
 	} else {
 		ck_assert_int_eq(store_scan_create(state.store, scan, NULL, &stored, &err), ERR_NO_SPACE);
 		ck_assert_str_eq(err.pointer, "/projections/count");
