@@ -141,12 +141,14 @@ $(BUILD)/cbct-worker: $(call objects,daemon/worker.c) $(library) $(cuda_objects)
 $(BUILD)/cbct: $(call objects,$(cbct_sources)) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(cbct_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
-# A worker whose syncs can be held up, and a daemon whose digests, for the tests of what becomes of a volume meanwhile.
+# A worker whose syncs can be held up, and a daemon whose digests, for the tests of what becomes of a volume meanwhile;
+# and whose catalogue can be made to refuse.
 $(BUILD)/cbct-worker-held: $(call objects,daemon/worker.c tests/http/held.c) $(library) $(cuda_objects)
 	$(call say,LINK)$(CC) $(LDFLAGS) -Wl,--wrap=fdatasync -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(if $(cuda_objects),$(cuda_libs)) $(LIBM)
 
+held_calls := job_digest_volume store_job_update store_job_add_volume store_job_digest_volume
 $(BUILD)/cbctd-held: $(call objects,$(daemon_sources) tests/http/held.c) $(BUILD)/proto/openapi.o $(BUILD)/web/assets.o $(library)
-	$(call say,LINK)$(CC) $(LDFLAGS) -Wl,--wrap=job_digest_volume -o $@ $^ $(call pkg,--libs,$(daemon_libs) $(proto_libs) $(core_libs)) $(LIBM)
+	$(call say,LINK)$(CC) $(LDFLAGS) $(held_calls:%=-Wl,--wrap=%) -o $@ $^ $(call pkg,--libs,$(daemon_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
 # Every program that a test or a benchmark runs, so that none stops compiling unseen.
 test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held faults.so cpu-bench watchers slices acquire) \

@@ -40,7 +40,7 @@ int directory_make(const char *path, struct error *err)
 	int code;
 
 	parent_of(path, parent, sizeof(parent));
-	if (mkdir(path, 0750) == 0)
+	if (mkdir(path, 0700) == 0)
 		return directory_sync(parent, err);
 	if (errno == EEXIST)
 		return 0;
@@ -49,7 +49,7 @@ int directory_make(const char *path, struct error *err)
 	code = directory_make(parent, err);
 	if (code != 0)
 		return code;
-	if (mkdir(path, 0750) < 0 && errno != EEXIST)
+	if (mkdir(path, 0700) < 0 && errno != EEXIST)
 		return error_set_errno(err, errno, "mkdir %s", path);
 	return directory_sync(parent, err);
 }

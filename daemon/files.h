@@ -8,7 +8,7 @@
 
 /* Directories of the state: made durably, swept, removed. Any thread. */
 
-/* Made with mode 0750, its parents too, each synced; one that is there already is fine. */
+/* Made with mode 0700, its parents too, each synced; one that is there already is fine. */
 int directory_make(const char *path, struct error *err);
 /* Whatever was renamed, made or removed in it is on the disk. */
 int directory_sync(const char *path, struct error *err);

@@ -4,8 +4,12 @@
  * Every commit is synced (synchronous = FULL): one append to the log and one
  * fdatasync; but for projections, whose records beside the samples are synced
  * (store_sums.c). The log is moved into the database by a thread of its own, so that
- * no commit waits for that. One connection writes, another reads and never
- * waits for the writer.
+ * no commit waits for most of that. One connection writes, another reads and never
+ * waits for the writer. Every page is checked as it is read (store_pages.h).
+ *
+ * The catalogue is this process's own: the index of its log (-shm) is mapped memory
+ * that nothing checks, so its file loses its name as soon as it is open. Another
+ * program must not write into the catalogue of a running daemon.
  */
 #include "daemon/store_db.h"
 
@@ -22,6 +26,9 @@
 
 #include "daemon/files.h"
 #include "daemon/log.h"
+#include "daemon/store_deleted.h"
+#include "daemon/store_pages.h"
+#include "daemon/store_quarantine.h"
 
 /* Pages in the log (4 KiB each) before they are moved: enough to make it rare, few enough to keep reading fast. */
 enum { CHECKPOINT_PAGES = 1000 };
@@ -129,6 +136,9 @@ static const char *const migrations[] = {
      " request_sha256 BLOB NOT NULL,"
      " scan INTEGER NOT NULL REFERENCES scans(number) ON DELETE CASCADE) WITHOUT ROWID;"
      "CREATE INDEX scan_keys_of_scan ON scan_keys (scan);"),
+    /* Of the record in the directory, store_record.h. */
+    ("ALTER TABLE scans ADD COLUMN stamp INTEGER NOT NULL DEFAULT 0;"
+     "ALTER TABLE jobs ADD COLUMN stamp INTEGER NOT NULL DEFAULT 0;"),
 };
 enum { MIGRATIONS = sizeof(migrations) / sizeof(migrations[0]) };
 
@@ -142,15 +152,24 @@ double time_now(void)
 
 /* ---- queries ---- */
 
-/* The disk can no longer be trusted with what is acknowledged. */
+/* The disk can no longer be trusted with what is acknowledged. At the start store_open fails instead. */
 static void store_fail(struct store *store, const char *what)
 {
+	if (!store->opened)
+		return;
 	atomic_store(&store->failed, true);
 	if (!atomic_flag_test_and_set(&store->failure_told)) {
 		log_line(LEVEL_ERROR, "the catalogue has failed, nothing more is accepted: %s", what);
 		if (store->hooks.failed != NULL)
 			store->hooks.failed(store->hooks.context, what);
 	}
+}
+
+static bool is_damage(sqlite3 *db, int result)
+{
+	return result == SQLITE_CORRUPT || result == SQLITE_NOTADB ||
+	       sqlite3_extended_errcode(db) == SQLITE_IOERR_DATA ||
+	       sqlite3_extended_errcode(db) == SQLITE_IOERR_SHORT_READ;
 }
 
 static int connection_error(struct connection *connection, int result, const char *what, struct error *err)
@@ -163,6 +182,12 @@ static int connection_error(struct connection *connection, int result, const cha
 	char text[200];
 
 	snprintf(text, sizeof(text), "%.60s: %.120s", what, sqlite3_errmsg(connection->db));
+	/* Whoever reads it: the process ends, and the next one makes the catalogue again. */
+	if (is_damage(connection->db, result)) {
+		atomic_store(&store->damaged, true);
+		store_fail(store, text);
+		return error_set(err, ERR_IO, "the catalogue is damaged: %s", text);
+	}
 	if (full)
 		return error_set(err, ERR_NO_SPACE, "the disk of the catalogue is full (%s)", text);
 	if (result == SQLITE_NOMEM)
@@ -340,6 +365,22 @@ int store_end(struct store *store, int code, struct error *err)
 	return code;
 }
 
+int store_note_deletion(struct store *store, int kind, const char *id, struct error *err)
+{
+	int code = deleted_add(store->deleted, (enum deleted_kind)kind, id, err);
+
+	if (code != 0)
+		store_distrust(store, err);
+	return code;
+}
+
+int store_savepoint(struct store *store, const char *sql, struct error *err)
+{
+	int result = sqlite3_exec(store->writer.db, sql, NULL, NULL, NULL);
+
+	return result == SQLITE_OK ? 0 : connection_error(&store->writer, result & 0xff, sql, err);
+}
+
 /* ---- the log and the database ---- */
 
 static int on_commit(void *context, sqlite3 *db, const char *name, int pages)
@@ -364,9 +405,10 @@ static void *checkpoint_loop(void *context)
 	int result;
 
 	snprintf(path, sizeof(path), "%s/catalogue.sqlite", store->directory);
-	result = sqlite3_open_v2(path, &db, SQLITE_OPEN_READWRITE | SQLITE_OPEN_NOMUTEX, NULL);
+	result = sqlite3_open_v2(path, &db, SQLITE_OPEN_READWRITE | SQLITE_OPEN_NOMUTEX, pages_vfs(store->pages));
 	if (result == SQLITE_OK) {
 		sqlite3_extended_result_codes(db, 1);
+		sqlite3_busy_timeout(db, 1000);
 		result = sqlite3_exec(db, "PRAGMA synchronous = FULL", NULL, NULL, NULL);
 	}
 	if (result != SQLITE_OK)
@@ -379,9 +421,14 @@ static void *checkpoint_loop(void *context)
 		}
 		store->log_pages = 0;
 		pthread_mutex_unlock(&store->checkpoint_lock);
-		/* Passive: takes what no reader still needs, makes nobody wait. A full disk passes; the log only grows.
+		/*
+		 * Passive: takes what no reader still needs, makes nobody wait. A full disk passes; the log only
+		 * grows. Then the little that came meanwhile, and the log is emptied: one that were damaged after it
+		 * was moved would put old pages between new ones when it is recovered.
 		 */
 		result = sqlite3_wal_checkpoint_v2(db, NULL, SQLITE_CHECKPOINT_PASSIVE, NULL, NULL);
+		if (result == SQLITE_OK)
+			result = sqlite3_wal_checkpoint_v2(db, NULL, SQLITE_CHECKPOINT_TRUNCATE, NULL, NULL);
 		if ((result & 0xff) == SQLITE_IOERR && sqlite3_system_errno(db) != ENOSPC)
 			store_fail(store, sqlite3_errmsg(db));
 		else if (result != SQLITE_OK && (result & 0xff) != SQLITE_BUSY)
@@ -397,19 +444,23 @@ static void *checkpoint_loop(void *context)
 
 static int connection_open(struct store *store, struct connection *connection, struct error *err)
 {
+	int result, reserve = PAGES_RESERVE;
 	char path[1024];
-	int result;
 
-	connection->store = store;
 	snprintf(path, sizeof(path), "%s/catalogue.sqlite", store->directory);
-	result = sqlite3_open_v2(path, &connection->db,
-				 SQLITE_OPEN_READWRITE | SQLITE_OPEN_CREATE | SQLITE_OPEN_NOMUTEX, NULL);
+	result =
+	    sqlite3_open_v2(path, &connection->db, SQLITE_OPEN_READWRITE | SQLITE_OPEN_CREATE | SQLITE_OPEN_NOMUTEX,
+			    pages_vfs(store->pages));
 	if (result == SQLITE_OK) {
 		sqlite3_busy_timeout(connection->db, 10000);
+		sqlite3_file_control(connection->db, "main", SQLITE_FCNTL_RESERVE_BYTES, &reserve);
 		result = sqlite3_exec(connection->db,
-				      "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; PRAGMA foreign_keys = ON;",
+				      "PRAGMA page_size = 4096; PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL;"
+				      " PRAGMA foreign_keys = ON;",
 				      NULL, NULL, NULL);
 	}
+	if (result != SQLITE_OK && is_damage(connection->db, result & 0xff))
+		atomic_store(&store->damaged, true);
 	if (result != SQLITE_OK)
 		return error_set(err, ERR_IO, "open %s: %s", path, sqlite3_errmsg(connection->db));
 	return 0;
@@ -420,7 +471,8 @@ static void connection_close(struct connection *connection)
 	for (int i = 0; i < connection->cached; i++)
 		sqlite3_finalize(connection->cache[i].statement);
 	sqlite3_close(connection->db);
-	pthread_mutex_destroy(&connection->lock);
+	connection->cached = 0;
+	connection->db = NULL;
 }
 
 static int catalogue_version(struct store *store, int *ret_version, struct error *err)
@@ -477,7 +529,7 @@ static int take_directory(struct store *store, struct error *err)
 			return code;
 	}
 	snprintf(path, sizeof(path), "%s/lock", store->directory);
-	store->lock_file = open(path, O_RDWR | O_CREAT | O_CLOEXEC, 0640);
+	store->lock_file = open(path, O_RDWR | O_CREAT | O_CLOEXEC, 0600);
 	if (store->lock_file < 0)
 		return error_set_errno(err, errno, "open %s", path);
 	if (flock(store->lock_file, LOCK_EX | LOCK_NB) < 0) {
@@ -485,30 +537,212 @@ static int take_directory(struct store *store, struct error *err)
 			return error_set(err, ERR_CONFLICT, "%s is in use by another cbctd", store->directory);
 		return error_set_errno(err, errno, "lock %s", path);
 	}
-	return 0;
+	return deleted_open(store->directory, &store->deleted, err);
 }
 
-static int open_catalogue(struct store *store, struct error *err)
+static void catalogue_path(const struct store *store, const char *suffix, char ret_path[1024])
 {
-	bool fresh = false;
-	int code = take_directory(store, err);
+	snprintf(ret_path, 1024, "%s/catalogue.sqlite%s", store->directory, suffix);
+}
+
+/* A catalogue of an earlier cbctd gets pages that check themselves: a copy, which then takes its name. */
+static int convert(const struct store *store, struct error *err)
+{
+	int result, reserve = PAGES_RESERVE, code = 0;
+	char path[1024], copy[1024], sql[1200];
+	sqlite3 *db = NULL;
+
+	catalogue_path(store, "", path);
+	catalogue_path(store, ".tmp", copy);
+	unlink(copy);
+	snprintf(sql, sizeof(sql), "VACUUM INTO '%s'", copy);
+	result = sqlite3_open_v2(path, &db, SQLITE_OPEN_READWRITE | SQLITE_OPEN_NOMUTEX, NULL);
+	if (result == SQLITE_OK)
+		result = sqlite3_file_control(db, "main", SQLITE_FCNTL_RESERVE_BYTES, &reserve);
+	if (result == SQLITE_OK)
+		result = sqlite3_exec(db, sql, NULL, NULL, NULL);
+	if (result != SQLITE_OK)
+		code = error_set(err, ERR_IO, "the catalogue cannot be converted: %s", sqlite3_errmsg(db));
+	sqlite3_close(db);
+	if (code == 0)
+		code = pages_seal(copy, err);
+	if (code != 0)
+		return code;
+	if (rename(copy, path) != 0)
+		return error_set_errno(err, errno, "rename %s", copy);
+	/* All of it is in the copy; it must not be applied to that. */
+	catalogue_path(store, "-wal", path);
+	unlink(path);
+	log_line(LEVEL_INFO, "the catalogue has checksums now");
+	return directory_sync(store->directory, err);
+}
+
+/* Before SQLite sees them: the database's first page, and the log that a crash left. */
+static int check_files(struct store *store, struct error *err)
+{
+	enum pages_kind kind = PAGES_NONE;
+	struct log_facts log = {0};
+	char path[1024], log_path[1024];
+	int code;
+
+	catalogue_path(store, "", path);
+	catalogue_path(store, "-wal", log_path);
+	code = pages_look(path, &kind, err);
+	if (code == 0 && kind != PAGES_NONE)
+		code = log_check(log_path, &log, err);
+	if (code == 0 && log.damaged)
+		code = error_set(err, ERR_IO,
+				 "its log is damaged: %ld transactions are lost behind the %ld frames that are good",
+				 log.commits_lost, log.frames);
+	if (code != 0) {
+		atomic_store(&store->damaged, true);
+		return code;
+	}
+	store->log_left = log.frames > 0 || log.commits_lost > 0;
+	if (kind == PAGES_PLAIN)
+		code = convert(store, err);
+	if (code != 0)
+		atomic_store(&store->damaged, true);
+	return code;
+}
+
+/* Nobody but us may read who was scanned. */
+static int make_private(const struct store *store, struct error *err)
+{
+	char path[1024];
+	int file, code = 0;
+
+	catalogue_path(store, "", path);
+	file = open(path, O_RDWR | O_CREAT | O_CLOEXEC, 0600);
+	if (file < 0 || fchmod(file, 0600) != 0)
+		code = error_set_errno(err, errno, "open %s", path);
+	if (file >= 0)
+		close(file);
+	return code;
+}
+
+/* All of the log into the database, so that every page of it can be checked. */
+static int empty_log(struct store *store, struct error *err)
+{
+	char path[1024];
+	int result = sqlite3_wal_checkpoint_v2(store->writer.db, NULL, SQLITE_CHECKPOINT_TRUNCATE, NULL, NULL), code;
+
+	if (result != SQLITE_OK)
+		return connection_error(&store->writer, result & 0xff, "checkpoint", err);
+	catalogue_path(store, "", path);
+	code = pages_check(path, err);
+	if (code != 0)
+		atomic_store(&store->damaged, true);
+	return code;
+}
+
+/* Pages may be whole and yet not fit together: a write that never reached the disk. */
+static int check_structure(struct store *store, struct error *err)
+{
+	struct query query;
+	char text[200] = "";
+
+	query_begin(&query, &store->writer, "PRAGMA quick_check(1)", err);
+	if (query_row(&query))
+		column_text(&query, 0, text, sizeof(text));
+	if (query_end(&query) != 0)
+		return query.code;
+	if (strcmp(text, "ok") == 0)
+		return 0;
+	atomic_store(&store->damaged, true);
+	return error_set(err, ERR_IO, "it does not fit together: %s", text);
+}
+
+static int open_connections(struct store *store, struct error *err)
+{
+	char path[1024];
+	int code = make_private(store, err);
 
 	if (code == 0)
 		code = connection_open(store, &store->writer, err);
 	if (code == 0)
+		code = empty_log(store, err);
+	if (code == 0)
+		code = check_structure(store, err);
+	if (code == 0)
 		code = connection_open(store, &store->reader, err);
+	/* Connections of this process find it by the catalogue's inode. */
+	catalogue_path(store, "-shm", path);
+	unlink(path);
+	return code;
+}
+
+static int load(struct store *store, struct error *err)
+{
+	bool fresh = false;
+	int code = check_files(store, err);
+
+	if (code == 0)
+		code = open_connections(store, err);
 	if (code == 0)
 		code = migrate(store, &fresh, err);
 	if (code == 0)
+		code = store_reconcile(store, fresh, err);
+	if (code == 0)
 		code = store_load_scans(store, err);
 	if (code == 0)
-		code = store_sweep_scans(store, fresh, err);
+		code = store_sweep_scans(store, err);
 	if (code == 0)
-		code = store_sweep_jobs(store, fresh, err);
+		code = store_sweep_jobs(store, err);
 	if (code == 0)
 		code = store_load_last_event(store, err);
+	return code;
+}
+
+static void unload(struct store *store)
+{
+	store_free_scans(store);
+	connection_close(&store->reader);
+	connection_close(&store->writer);
+}
+
+/* Catalogue and log to quarantine/; what SQLite keeps beside them goes. */
+static int set_catalogue_aside(struct store *store, const char *why, struct error *err)
+{
+	static const char *const names[] = {"catalogue.sqlite", "catalogue.sqlite-wal"};
+	char path[1024];
+	int code = 0;
+
+	for (size_t i = 0; i < sizeof(names) / sizeof(names[0]) && code == 0; i++) {
+		snprintf(path, sizeof(path), "%s/%s", store->directory, names[i]);
+		if (access(path, F_OK) == 0)
+			code = quarantine_move(store->directory, names[i], why, err);
+	}
+	catalogue_path(store, "-shm", path);
+	unlink(path);
+	store->repairs = (struct store_repairs){.remade = true};
+	atomic_store(&store->damaged, false);
+	return code;
+}
+
+static int open_catalogue(struct store *store, bool rebuild, struct error *err)
+{
+	char why[QUARANTINE_WHY_MAX];
+	int code = take_directory(store, err);
+
+	if (code == 0 && rebuild)
+		code = set_catalogue_aside(store, "it is made again as asked", err);
+	if (code == 0 && rebuild)
+		code = store_take_back(store, err);
 	if (code != 0)
 		return code;
+	code = load(store, err);
+	if (code != 0 && atomic_load(&store->damaged) && !rebuild) {
+		snprintf(why, sizeof(why), "the catalogue is damaged and made again from the directories: %.300s",
+			 err->text);
+		unload(store);
+		code = set_catalogue_aside(store, why, err);
+		if (code == 0)
+			code = load(store, err);
+	}
+	if (code != 0)
+		return code;
+	store->opened = true;
 	sqlite3_wal_hook(store->writer.db, on_commit, store);
 	code = pthread_create(&store->checkpointer, NULL, checkpoint_loop, store);
 	if (code != 0)
@@ -517,7 +751,8 @@ static int open_catalogue(struct store *store, struct error *err)
 	return 0;
 }
 
-int store_open(const char *directory, const struct store_hooks *hooks, struct store **ret_store, struct error *err)
+static int open_store(const char *directory, const struct store_hooks *hooks, bool rebuild, struct store **ret_store,
+		      struct error *err)
 {
 	struct store *store = calloc(1, sizeof(*store));
 	int code;
@@ -534,13 +769,16 @@ int store_open(const char *directory, const struct store_hooks *hooks, struct st
 	store->lock_file = -1;
 	atomic_flag_clear(&store->failure_told);
 	pthread_mutex_init(&store->insertion_lock, NULL);
+	store->writer.store = store->reader.store = store;
 	pthread_mutex_init(&store->writer.lock, NULL);
 	pthread_mutex_init(&store->reader.lock, NULL);
 	pthread_mutex_init(&store->scans_lock, NULL);
 	pthread_mutex_init(&store->checkpoint_lock, NULL);
 	pthread_cond_init(&store->checkpoint_due, NULL);
 	watch_list_init(&store->arrivals);
-	code = open_catalogue(store, err);
+	code = pages_new(&store->pages, err);
+	if (code == 0)
+		code = open_catalogue(store, rebuild, err);
 	if (code != 0) {
 		store_close(store);
 		return code;
@@ -548,6 +786,27 @@ int store_open(const char *directory, const struct store_hooks *hooks, struct st
 	store_reserve_save(store);
 	*ret_store = store;
 	return 0;
+}
+
+int store_open(const char *directory, const struct store_hooks *hooks, struct store **ret_store, struct error *err)
+{
+	return open_store(directory, hooks, false, ret_store, err);
+}
+
+int store_rebuild(const char *directory, struct store_repairs *ret, struct error *err)
+{
+	struct store *store = NULL;
+	int code = open_store(directory, NULL, true, &store, err);
+
+	if (code == 0)
+		*ret = store->repairs;
+	store_close(store);
+	return code;
+}
+
+void store_repairs(const struct store *store, struct store_repairs *ret)
+{
+	*ret = store->repairs;
 }
 
 const char *store_directory(const struct store *store)
@@ -618,9 +877,11 @@ void store_close(struct store *store)
 		pthread_mutex_unlock(&store->checkpoint_lock);
 		pthread_join(store->checkpointer, NULL);
 	}
-	store_free_scans(store);
-	connection_close(&store->reader);
-	connection_close(&store->writer);
+	unload(store);
+	pages_free(store->pages);
+	deleted_free(store->deleted);
+	pthread_mutex_destroy(&store->reader.lock);
+	pthread_mutex_destroy(&store->writer.lock);
 	watch_list_destroy(&store->arrivals);
 	pthread_cond_destroy(&store->checkpoint_due);
 	pthread_mutex_destroy(&store->checkpoint_lock);

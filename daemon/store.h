@@ -15,16 +15,22 @@
  *
  *   STATE/lock              held by the one daemon that uses STATE
  *   STATE/reserve           room for the commits that empty a full disk
+ *   STATE/deleted           what clients have deleted (store_deleted.h)
+ *   STATE/quarantine/       what was found and belongs nowhere (store_quarantine.h)
  *   STATE/catalogue.sqlite  scans, projections, jobs, volumes, history, warnings, events
  *   STATE/scans/ID/         scan.json projections.raw flat.f32 dark.f32 defects.u8 (proto/spool.h)
  *                           projections.sums (proto/sums.h)
  *   STATE/jobs/ID/          NAME.nii, checkpoint.f32
+ *   STATE/{scans,jobs}/ID/record.json  its rows of the catalogue (store_record.h)
+ *
+ * The directories are the truth, the catalogue is their index: what it lacks is found again in them
+ * (store_reconcile.c), and nothing is deleted because the catalogue does not know it.
  *
  * A call that returns 0 has its change on the disk: in the catalogue, or for
  * projections in their records (projections.sums), which their rows follow at
  * the next start. The order is always: files
- * first, synced, then the row; and on the way out: the row, then the files. So
- * a crash leaves at most files that no row knows, and store_open removes them.
+ * first, synced, then the row; and on the way out: a record of the deletion, the
+ * row, then the files.
  * A volume's row comes before its file is synced, which its job waits for before
  * it ends or is queued again, and before its digest, which nobody waits for.
  *
@@ -65,6 +71,19 @@ bool store_reserve_spend(const struct store *store);
 void store_reserve_save(const struct store *store);
 /* Bytes that the file system of STATE has free. */
 int store_space(const struct store *store, unsigned long long *ret_bytes, struct error *err);
+
+/* What store_open had to mend. */
+struct store_repairs {
+	int found[2];  /* scans, jobs that the catalogue did not know, or knew less of than their directories */
+	int set_aside; /* directories moved to quarantine/ */
+	bool remade;   /* the catalogue was damaged: it was moved to quarantine/ and made again */
+};
+void store_repairs(const struct store *store, struct store_repairs *ret);
+/*
+ * Moves the catalogue of a state directory that no daemon uses to quarantine/ and makes it again, with what is whole in
+ * quarantine/ put back to its place.
+ */
+int store_rebuild(const char *directory, struct store_repairs *ret, struct error *err);
 
 struct store_statistics {
 	long scans;

@@ -14,7 +14,10 @@
  * commit; makes one transaction at a time) or reader.lock (held over a SELECT),
  * then scans_lock, then a scan's own lock, then checkpoint_lock or a watch list's.
  */
-enum { STATEMENTS_MAX = 48, RECENT_SCANS = 16 };
+enum { STATEMENTS_MAX = 96, RECENT_SCANS = 16 };
+
+/* In the directory of a scan from its making to the end of that. */
+#define STORE_UNFINISHED "unfinished.tmp"
 
 /* One connection and its prepared statements, found by the address of their text; all guarded by lock. */
 struct connection {
@@ -35,9 +38,16 @@ struct store {
 	/* Held from the commit of a scan's row to its place in the array: who finds its key finds the scan. First of
 	 * all. */
 	pthread_mutex_t insertion_lock;
+	struct deleted *deleted; /* guarded by writer.lock, as the next two; store_deleted.h */
+	long long stamp;         /* of the latest record that was written; store_record.h */
+	struct pages *pages;
 	struct connection writer, reader;
-	bool unsynced;       /* of the writer's commits; guarded by writer.lock */
-	_Atomic bool failed; /* a commit did not reach the disk: nothing is acknowledged any more */
+	bool unsynced;                /* of the writer's commits; guarded by writer.lock */
+	struct store_repairs repairs; /* constant after the start, as the next two */
+	bool opened;
+	bool log_left;        /* by a process that did not end as it should */
+	_Atomic bool damaged; /* the catalogue is: SQLite or its pages say so */
+	_Atomic bool failed;  /* a commit did not reach the disk: nothing is acknowledged any more */
 	atomic_flag failure_told;
 	long long event_written; /* by the transaction under way, 0: none; guarded by writer.lock */
 	_Atomic long long last_event;
@@ -96,13 +106,23 @@ int store_begin_unsynced(struct store *store, struct error *err);
 /* Commits when code is 0, else rolls back; unlocks. Returns code, or why the commit failed. */
 int store_end(struct store *store, int code, struct error *err);
 
+/* Within a transaction: SAVEPOINT, ROLLBACK TO, RELEASE. */
+int store_savepoint(struct store *store, const char *sql, struct error *err);
+/* With writer.lock held, before the row goes: the deletion is on the disk, and what it names does not come back. */
+int store_note_deletion(struct store *store, int kind, const char *id, struct error *err);
+
 /* Seconds since 1970. */
 double time_now(void);
 
-/* store_scan.c, store_job.c: what store_open loads and tidies up. `fresh`: the catalogue was made just now. */
+/* store_reconcile.c. Called while nobody else has the store. */
+int store_reconcile(struct store *store, bool fresh, struct error *err);
+/* What is in quarantine/ and belongs back, before the catalogue is made again. */
+int store_take_back(struct store *store, struct error *err);
+
+/* store_scan.c, store_job.c: what store_open loads and tidies up. */
 int store_load_scans(struct store *store, struct error *err);
-int store_sweep_scans(struct store *store, bool fresh, struct error *err);
-int store_sweep_jobs(struct store *store, bool fresh, struct error *err);
+int store_sweep_scans(struct store *store, struct error *err);
+int store_sweep_jobs(struct store *store, struct error *err);
 int store_load_last_event(struct store *store, struct error *err);
 void store_free_scans(struct store *store);
 

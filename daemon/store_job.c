@@ -9,6 +9,9 @@
 #include "daemon/files.h"
 #include "daemon/log.h"
 #include "daemon/store_db.h"
+#include "daemon/store_deleted.h"
+#include "daemon/store_quarantine.h"
+#include "daemon/store_record.h"
 #include "proto/spool.h"
 
 enum { REMOVALS_KEPT = 1000 /* a page that was away for longer reads its list anew */ };
@@ -89,11 +92,32 @@ static void bind_changing(struct query *query, const struct job_record *job)
 	query_text(query, job->id);
 }
 
+/* Ends a transaction that changed what the job's record tells: that goes first. */
+static int end_with_record(struct store *store, const char *id, int code, struct error *err)
+{
+	bool written = code == 0;
+
+	if (code == 0)
+		code = record_write(store, RECORD_JOB, id, true, err);
+	code = store_end(store, code, err);
+	if (code != 0 && written) {
+		pthread_mutex_lock(&store->writer.lock);
+		record_undo(store, RECORD_JOB, id);
+		pthread_mutex_unlock(&store->writer.lock);
+	}
+	return code;
+}
+
 int store_job_insert(struct store *store, const struct job_record *job, const struct event *event, struct error *err)
 {
+	char directory[1024];
 	struct query query;
-	int code = store_begin(store, err);
+	int code;
 
+	store_job_directory(store, job->id, directory);
+	code = directory_make(directory, err);
+	if (code == 0)
+		code = store_begin(store, err);
 	if (code != 0)
 		return code;
 	query_begin(
@@ -116,7 +140,11 @@ int store_job_insert(struct store *store, const struct job_record *job, const st
 	code = query_run(&query);
 	if (code == 0)
 		code = add_event(store, job->id, event, err);
-	return store_end(store, code, err);
+	code = end_with_record(store, job->id, code, err);
+	if (code != 0)
+		rmdir(directory); /* empty but for a record that could not be taken back: then the next start sees to it
+				   */
+	return code;
 }
 
 static int rewind_history(struct store *store, const struct job_record *job, struct error *err)
@@ -175,7 +203,7 @@ int store_job_update(struct store *store, const struct job_record *job, const st
 		code = add_event(store, job->id, event, err);
 	if (code == 0)
 		code = add_event(store, job->id, end, err);
-	return store_end(store, code, err);
+	return end_with_record(store, job->id, code, err);
 }
 
 /* Takes a number from the job's own events, which go with it. */
@@ -206,13 +234,18 @@ int store_job_delete(struct store *store, const char *id, struct error *err)
 
 	if (code != 0)
 		return code;
+	code = store_note_deletion(store, DELETED_JOB, id, err);
+	if (code != 0)
+		return store_end(store, code, err);
 	code = note_removal(store, id, err);
 	if (code == 0) {
 		query_begin(&query, &store->writer, "DELETE FROM jobs WHERE id = ?", err);
 		query_text(&query, id);
 		code = query_run(&query);
 	}
-	return store_end(store, code, err);
+	code = store_end(store, code, err);
+	/* From its note on it is deleted: on a full disk the row goes at the next start. */
+	return code == ERR_NO_SPACE ? 0 : code;
 }
 
 void store_job_remove_files(const struct store *store, const char *id)
@@ -261,8 +294,11 @@ static int remove_temporary(void *context, const char *name, struct error *err)
 {
 	char path[1400];
 
+	/* A record is written whenever a digest is known. */
+	if (!name_is_temporary(name) || strncmp(name, RECORD_FILE, strlen(RECORD_FILE)) == 0)
+		return 0;
 	snprintf(path, sizeof(path), "%s/%s", (const char *)context, name);
-	if (name_is_temporary(name) && unlink(path) < 0 && errno != ENOENT)
+	if (unlink(path) < 0 && errno != ENOENT)
 		return error_set_errno(err, errno, "unlink %s", path);
 	return 0;
 }
@@ -367,7 +403,7 @@ int store_job_digest_volume(struct store *store, const char *id, const struct vo
 	query_text(&query, id);
 	query_text(&query, volume->name);
 	query_real(&query, volume->created);
-	return store_end(store, query_run(&query), err);
+	return end_with_record(store, id, query_run(&query), err);
 }
 
 int store_job_remove_volume(struct store *store, const char *id, const char *name, struct error *err)
@@ -381,7 +417,7 @@ int store_job_remove_volume(struct store *store, const char *id, const char *nam
 		    "DELETE FROM volumes WHERE job = (SELECT number FROM jobs WHERE id = ?) AND name = ?", err);
 	query_text(&query, id);
 	query_text(&query, name);
-	return store_end(store, query_run(&query), err);
+	return end_with_record(store, id, query_run(&query), err);
 }
 
 int store_job_add_warning(struct store *store, const char *id, const struct warning_record *warning,
@@ -404,7 +440,7 @@ int store_job_add_warning(struct store *store, const char *id, const struct warn
 	new = code == 0 && sqlite3_changes(store->writer.db) > 0;
 	if (new)
 		code = add_event(store, id, event, err);
-	code = store_end(store, code, err);
+	code = new ? end_with_record(store, id, code, err) : store_end(store, code, err);
 	if (code == 0)
 		*ret_new = new;
 	return code;
@@ -757,6 +793,7 @@ static int remove_unsettled(struct store *store, const char *id, struct volume_r
 			    struct error *err)
 {
 	int kept = 0, code = 0;
+	char path[1024];
 
 	for (int i = 0; i < *count && code == 0; i++) {
 		if (volumes[i].hashed) {
@@ -766,6 +803,9 @@ static int remove_unsettled(struct store *store, const char *id, struct volume_r
 		log_line(LEVEL_INFO, "job %s: its volume %s had not reached the disk, it is made again", id,
 			 volumes[i].name);
 		code = store_job_remove_volume(store, id, volumes[i].name, err);
+		store_volume_path(store, id, volumes[i].name, path);
+		if (code == 0)
+			unlink(path);
 	}
 	if (code == 0 && kept < *count)
 		store_job_remove_checkpoint(store, id);
@@ -778,26 +818,32 @@ struct sweep {
 	const char *id;
 	struct volume_record *volumes;
 	int count;
+	bool ended; /* else it makes the volumes that have no row again */
 };
 
-/* Half-written files, and volumes whose row was never written: the job makes them again. */
+static bool has_row(const struct sweep *sweep, const char *name, size_t length)
+{
+	for (int i = 0; i < sweep->count; i++) {
+		if (strlen(sweep->volumes[i].name) == length && strncmp(sweep->volumes[i].name, name, length) == 0)
+			return true;
+	}
+	return false;
+}
+
+/* Half-written files go. A volume that no row tells of is set aside, unless the job makes it again over it. */
 static int sweep_file(void *context, const char *name, struct error *err)
 {
 	const struct sweep *sweep = context;
 	const char *extension = strrchr(name, '.');
 	char directory[1024], path[1400];
-	bool stray = name_is_temporary(name);
 
-	if (!stray && extension != NULL && strcmp(extension, ".nii") == 0) {
-		stray = true;
-		for (int i = 0; i < sweep->count; i++) {
-			if (strlen(sweep->volumes[i].name) == (size_t)(extension - name) &&
-			    strncmp(sweep->volumes[i].name, name, (size_t)(extension - name)) == 0)
-				stray = false;
-		}
+	if (!name_is_temporary(name)) {
+		if (extension == NULL || strcmp(extension, ".nii") != 0 || !sweep->ended ||
+		    has_row(sweep, name, (size_t)(extension - name)))
+			return 0;
+		snprintf(path, sizeof(path), "jobs/%s/%s", sweep->id, name);
+		return quarantine_move(sweep->store->directory, path, "the catalogue does not know this volume", err);
 	}
-	if (!stray)
-		return 0;
 	store_job_directory(sweep->store, sweep->id, directory);
 	snprintf(path, sizeof(path), "%s/%s", directory, name);
 	if (unlink(path) < 0)
@@ -817,21 +863,21 @@ static void check_volumes(const struct sweep *sweep)
 	}
 }
 
-/* *ret_at_work: it is, or was, with a worker. */
-static int job_is_known(struct store *store, const char *id, bool *ret_known, bool *ret_at_work, struct error *err)
+/* False where there is no such job; *ret_at_work: it is, or was, with a worker. */
+static int job_is_known(struct store *store, const char *id, bool *ret_known, bool *ret_at_work, bool *ret_ended,
+			struct error *err)
 {
 	struct query query;
-	bool known, at_work;
 
-	query_begin(&query, &store->reader, "SELECT state IN ('waiting', 'running') FROM jobs WHERE id = ?", err);
+	query_begin(&query, &store->reader,
+		    "SELECT state IN ('waiting', 'running'), state IN ('succeeded', 'failed', 'cancelled')"
+		    " FROM jobs WHERE id = ?",
+		    err);
 	query_text(&query, id);
-	known = query_row(&query);
-	at_work = known && sqlite3_column_int(query.statement, 0) != 0;
-	if (query_end(&query) == 0) {
-		*ret_known = known;
-		*ret_at_work = at_work;
-	}
-	return query.code;
+	*ret_known = query_row(&query);
+	*ret_at_work = *ret_known && sqlite3_column_int(query.statement, 0) != 0;
+	*ret_ended = *ret_known && sqlite3_column_int(query.statement, 1) != 0;
+	return query_end(&query);
 }
 
 static int sweep_directory(void *context, const char *name, struct error *err)
@@ -844,13 +890,9 @@ static int sweep_directory(void *context, const char *name, struct error *err)
 	if (!id_valid(name))
 		return 0; /* not ours */
 	store_job_directory(sweep.store, name, path);
-	code = job_is_known(sweep.store, name, &known, &at_work, err);
-	if (code != 0)
+	code = job_is_known(sweep.store, name, &known, &at_work, &sweep.ended, err);
+	if (code != 0 || !known)
 		return code;
-	if (!known) {
-		log_line(LEVEL_INFO, "job %s is deleted: its files are removed", name);
-		return directory_remove(path, err);
-	}
 	code = store_job_volumes(sweep.store, name, &sweep.volumes, &sweep.count, err);
 	if (code != 0)
 		return code;
@@ -864,13 +906,10 @@ static int sweep_directory(void *context, const char *name, struct error *err)
 	return code;
 }
 
-int store_sweep_jobs(struct store *store, bool fresh, struct error *err)
+int store_sweep_jobs(struct store *store, struct error *err)
 {
 	char path[1024];
 
-	/* A catalogue that was lost must not take the volumes with it. */
-	if (fresh)
-		return 0;
 	snprintf(path, sizeof(path), "%s/jobs", store->directory);
 	return directory_visit(path, sweep_directory, store, err);
 }

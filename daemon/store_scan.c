@@ -18,6 +18,9 @@
 
 #include "daemon/files.h"
 #include "daemon/log.h"
+#include "daemon/store_deleted.h"
+#include "daemon/store_quarantine.h"
+#include "daemon/store_record.h"
 #include "daemon/store_scan.h"
 #include "proto/spool.h"
 
@@ -373,6 +376,29 @@ static int make_projections(const char *directory, unsigned long long bytes, str
 	return code;
 }
 
+/* Until it has its record, so that what a crash leaves of it is known for what it is. */
+static int mark_unfinished(const char *directory, struct error *err)
+{
+	char path[1100];
+	int file;
+
+	snprintf(path, sizeof(path), "%s/" STORE_UNFINISHED, directory);
+	file = open(path, O_WRONLY | O_CREAT | O_CLOEXEC, 0600);
+	if (file < 0)
+		return error_set_errno(err, errno, "make %s", path);
+	close(file);
+	return 0;
+}
+
+static void mark_finished(const struct store *store, const char *id)
+{
+	char directory[1024], path[1100];
+
+	store_scan_directory(store, id, directory);
+	snprintf(path, sizeof(path), "%s/" STORE_UNFINISHED, directory);
+	unlink(path); /* else at the next start: beside a record it says nothing */
+}
+
 static int make_files(struct store *store, const struct scan *parsed, const struct stored_scan *scan, struct error *err)
 {
 	unsigned long long bytes =
@@ -389,6 +415,8 @@ static int make_files(struct store *store, const struct scan *parsed, const stru
 	store_scan_directory(store, scan->id, directory);
 	snprintf(path, sizeof(path), "%s/scan.json", directory);
 	code = directory_make(directory, err);
+	if (code == 0)
+		code = mark_unfinished(directory, err);
 	if (code == 0)
 		code = make_projections(directory, bytes, err);
 	if (code == 0)
@@ -484,6 +512,8 @@ static int insert_row(struct store *store, struct stored_scan *scan, const struc
 	scan->number = sqlite3_last_insert_rowid(store->writer.db);
 	if (code == 0 && key != NULL)
 		code = insert_key(store, scan, key, err);
+	if (code == 0)
+		code = record_write(store, RECORD_SCAN, scan->id, true, err);
 	return store_end(store, code, err);
 }
 
@@ -549,6 +579,7 @@ int store_scan_create(struct store *store, struct scan *parsed, const struct sto
 		store_scan_remove_files(store, scan->id);
 		goto out;
 	}
+	mark_finished(store, scan->id);
 	log_line(LEVEL_INFO, "scan %s: %d projections of %d x %d", scan->id, scan->count, scan->columns, scan->rows);
 	*ret_scan = scan;
 	return 0;
@@ -573,15 +604,19 @@ int store_scan_delete(struct store *store, struct stored_scan *scan, struct erro
 	if (gone)
 		return store_end(store, error_set(err, ERR_NOT_FOUND, "there is no scan \"%s\" any more", scan->id),
 				 err);
-	query_begin(&query, &store->writer, "DELETE FROM scans WHERE number = ?", err);
-	query_integer(&query, scan->number);
-	code = store_end(store, query_run(&query), err);
+	code = store_note_deletion(store, DELETED_SCAN, scan->id, err);
 	if (code != 0) {
 		pthread_mutex_lock(&scan->lock);
 		scan->deleted = false;
 		pthread_mutex_unlock(&scan->lock);
-		return code;
+		return store_end(store, code, err);
 	}
+	query_begin(&query, &store->writer, "DELETE FROM scans WHERE number = ?", err);
+	query_integer(&query, scan->number);
+	code = store_end(store, query_run(&query), err);
+	/* From its note on it is deleted: on a full disk the row goes at the next start. */
+	if (code != 0 && code != ERR_NO_SPACE)
+		return code;
 	pthread_mutex_lock(&store->scans_lock);
 	array_remove(store, scan);
 	forget_recent(store, scan);
@@ -1149,39 +1184,30 @@ void store_free_scans(struct store *store)
 		scan_free_memory(store->scans[i]);
 	}
 	free(store->scans);
+	store->scans = NULL;
+	store->scan_count = store->scan_space = 0;
 }
 
-/* Files that were on their way when the process died, and images whose row was never written. */
+/* Files that were on their way when the process died go; an image that nobody knows is set aside. */
 static int sweep_file(void *context, const char *name, struct error *err)
 {
 	struct stored_scan *scan = context;
 	char directory[1024], path[1400];
-	bool stray = name_is_temporary(name);
+	bool stray = false;
 
 	for (int i = 0; i < IMAGE_COUNT; i++)
 		stray |= strcmp(name, image_files[i]) == 0 && scan->image[i] != STORED;
-	if (!stray)
+	if (stray) {
+		snprintf(path, sizeof(path), "scans/%s/%s", scan->id, name);
+		return quarantine_move(scan->store->directory, path, "it was never acknowledged", err);
+	}
+	if (!name_is_temporary(name))
 		return 0;
 	store_scan_directory(scan->store, scan->id, directory);
 	snprintf(path, sizeof(path), "%s/%s", directory, name);
 	if (unlink(path) < 0)
 		return error_set_errno(err, errno, "unlink %s", path);
 	return 0;
-}
-
-static int sweep_directory(void *context, const char *name, struct error *err)
-{
-	struct store *store = context;
-	int place = place_of(store, name);
-	char path[1024];
-
-	if (!id_valid(name))
-		return 0; /* not ours */
-	store_scan_directory(store, name, path);
-	if (place < store->scan_count && strcmp(store->scans[place]->id, name) == 0)
-		return directory_visit(path, sweep_file, store->scans[place], err);
-	log_line(LEVEL_INFO, "scan %s was never finished or is deleted: its files are removed", name);
-	return directory_remove(path, err);
 }
 
 static void check_files(struct stored_scan *scan)
@@ -1200,15 +1226,15 @@ static void check_files(struct stored_scan *scan)
 		 wanted);
 }
 
-int store_sweep_scans(struct store *store, bool fresh, struct error *err)
+int store_sweep_scans(struct store *store, struct error *err)
 {
 	char path[1024];
+	int code = 0;
 
-	for (int i = 0; i < store->scan_count; i++)
+	for (int i = 0; i < store->scan_count && code == 0; i++) {
 		check_files(store->scans[i]);
-	/* A catalogue that was lost must not take the scans with it. */
-	if (fresh)
-		return 0;
-	snprintf(path, sizeof(path), "%s/scans", store->directory);
-	return directory_visit(path, sweep_directory, store, err);
+		store_scan_directory(store, store->scans[i]->id, path);
+		code = directory_visit(path, sweep_file, store->scans[i], err);
+	}
+	return code;
 }

@@ -324,34 +324,30 @@ test_a_daemon_that_dies_or_stops_in_the_middle() {
 }
 
 test_a_run_that_cannot_be_recorded_yet_is_recorded_later() {
-	command -v sqlite3 >/dev/null || skip "no sqlite3 to make the catalogue refuse a row"
-	fresh_daemon
+	program=cbctd-held CBCT_TEST_REFUSE=$work/refuse fresh_daemon
 	post_scan "$scan_dir"
 	post_job "$fdk"
 	send "$scan_dir" 0 9
 	reconstructed 10
-	sqlite3 "$state/catalogue.sqlite" "CREATE TRIGGER refuse BEFORE UPDATE ON jobs WHEN NEW.state = 'running'
-		BEGIN SELECT RAISE(ABORT, 'refused'); END"
+	echo running >"$work/refuse"
 	send "$scan_dir" 10 59
 	until [ "$(json '.volumes // 0')" -ge 1 ]; do req GET "/v1/jobs/$job"; done # it is done with it meanwhile
 	expect_json '.state == "waiting" and .views.reconstructed == 60'
-	sqlite3 "$state/catalogue.sqlite" "DROP TRIGGER refuse"
+	rm "$work/refuse"
 	wait_job succeeded
 	expect_json '.attempts == 1'
 }
 
 test_a_digest_that_cannot_be_recorded_yet_is_recorded_later() {
-	command -v sqlite3 >/dev/null || skip "no sqlite3 to make the catalogue refuse a row"
-	fresh_daemon
-	sqlite3 "$state/catalogue.sqlite" "CREATE TRIGGER refuse BEFORE UPDATE ON volumes
-		BEGIN SELECT RAISE(ABORT, 'refused'); END"
+	program=cbctd-held CBCT_TEST_REFUSE=$work/refuse fresh_daemon
+	echo digest >"$work/refuse"
 	post_scan "$scan_dir"
 	send "$scan_dir" 0 59
 	post_job "$fdk"
 	wait_job succeeded
 	req GET "/v1/jobs/$job/volumes?wait=1"
 	expect_json '[.volumes[].digest] == [null]'
-	sqlite3 "$state/catalogue.sqlite" "DROP TRIGGER refuse"
+	rm "$work/refuse"
 	req GET "/v1/jobs/$job/volumes?wait=20"
 	expect_json '.volumes[0].digest | length > 40'
 }

@@ -377,16 +377,14 @@ test_a_worker_that_does_not_exit_keeps_nobody() {
 }
 
 test_a_volume_that_cannot_be_recorded_is_no_success() {
-	command -v sqlite3 >/dev/null || skip "no sqlite3 to make the catalogue refuse a row"
-	start_daemon
-	sqlite3 "$state/catalogue.sqlite" "CREATE TRIGGER refuse BEFORE INSERT ON volumes WHEN NEW.name = 'final'
-		BEGIN SELECT RAISE(ABORT, 'refused'); END"
+	program=cbctd-held CBCT_TEST_REFUSE=$work/refuse start_daemon
+	echo "volume final" >"$work/refuse"
 	post_scan "$scan_dir"
 	post_projections "$scan_dir"
 	post_job "{\"scan\": \"SCAN\", $grid, \"fdk\": {}}"
 	wait_job failed
 	expect_json '.error.detail | test("refused")'
-	sqlite3 "$state/catalogue.sqlite" "DROP TRIGGER refuse"
+	rm "$work/refuse"
 	stop_daemon
 }
 

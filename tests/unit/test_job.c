@@ -537,7 +537,7 @@ START_TEST(a_volume_whose_row_is_missing_is_made_again)
 	restart();
 	ck_assert(!path_exists(state_path(&state, "jobs/%s/blank.tmp", id)));
 	ck_assert(path_exists(state_path(&state, "jobs/%s/fdk.nii", id)));
-	ck_assert(!path_exists(state_path(&state, "jobs/%s/iter-1.nii", id)));
+	ck_assert(path_exists(state_path(&state, "jobs/%s/iter-1.nii", id))); /* until the job writes over it */
 	ck_assert(!path_exists(state_path(&state, "jobs/%s/iter-2.nii.tmp", id)));
 }
 END_TEST

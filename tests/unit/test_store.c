@@ -11,6 +11,7 @@
 #include <unistd.h>
 
 #include "daemon/files.h"
+#include "daemon/store_pages.h"
 #include "tests/unit/state.h"
 
 static struct state state;
@@ -350,12 +351,18 @@ END_TEST
 /* The catalogue forgets; no daemon runs. */
 static void change_catalogue(const char *statement)
 {
+	struct pages *pages;
+	struct error err = {0};
 	sqlite3 *db;
 
 	state_close(&state);
-	ck_assert_int_eq(sqlite3_open(state_path(&state, "catalogue.sqlite"), &db), SQLITE_OK);
+	ck_assert_int_eq(pages_new(&pages, &err), 0);
+	ck_assert_int_eq(
+	    sqlite3_open_v2(state_path(&state, "catalogue.sqlite"), &db, SQLITE_OPEN_READWRITE, pages_vfs(pages)),
+	    SQLITE_OK);
 	ck_assert_int_eq(sqlite3_exec(db, statement, NULL, NULL, NULL), SQLITE_OK);
 	sqlite3_close(db);
+	pages_free(pages);
 	state_reopen(&state);
 }
 
