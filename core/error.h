@@ -27,7 +27,8 @@ enum error_code {
 	 * A sync failed: the kernel may have dropped what it held, and a second sync would succeed without it. Final:
 	 * nothing that depends on these bytes may be believed or acknowledged any more (500).
 	 */
-	ERR_SYNC = -13
+	ERR_SYNC = -13,
+	ERR_DAMAGED = -14 /* what the disk holds is not what was written (500) */
 };
 
 struct error {

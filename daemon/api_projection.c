@@ -8,7 +8,6 @@
 #include "daemon/api.h"
 #include "daemon/http_text.h"
 #include "proto/slice.h"
-#include "proto/spool.h"
 
 /* ---- in ---- */
 
@@ -127,16 +126,30 @@ int image_put(void *context, struct request *request, struct error *err)
 
 /* ---- out ---- */
 
-/* The file's descriptor when the projection is stored. */
-static int open_projection(struct stored_scan *scan, int index, int *ret_descriptor, uint8_t ret_sha256[32],
+/* Its samples, held against their checksum; free them. */
+static int read_projection(struct stored_scan *scan, int index, void **ret_samples, uint8_t ret_sha256[32],
 			   struct error *err)
 {
+	size_t size = scan_projection_bytes(stored_scan_parsed(scan));
+	void *samples = malloc(size);
 	struct sum sum;
+	int file = -1, code = 0;
 
-	if (!stored_scan_sum(scan, index, &sum))
-		return error_set(err, ERR_NOT_FOUND, "projection %d has not been stored yet", index);
+	if (samples == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for a projection of %zu bytes", size);
+	if (code == 0)
+		code = stored_scan_open(scan, false, &file, err);
+	if (code == 0)
+		code = stored_scan_read(scan, file, index, samples, &sum, err);
+	if (file >= 0)
+		close(file);
+	if (code != 0) {
+		free(samples);
+		return code;
+	}
 	memcpy(ret_sha256, sum.sha256, 32);
-	return stored_scan_open(scan, false, ret_descriptor, err);
+	*ret_samples = samples;
+	return 0;
 }
 
 /* As float; the smallest finite sample and the largest. */
@@ -197,7 +210,7 @@ static void make_etag(const uint8_t sha256[32], const char *kind, char ret_etag[
 	snprintf(ret_etag, ETAG_MAX, "\"%s%s\"", digest, kind);
 }
 
-static int reply_picture(struct request *request, const struct scan *scan, int descriptor, int index,
+static int reply_picture(struct request *request, const struct scan *scan, const void *samples,
 			 const uint8_t sha256[32], struct error *err)
 {
 	enum { PICTURE_PIXELS_MAX = 64 << 20 };
@@ -205,7 +218,6 @@ static int reply_picture(struct request *request, const struct scan *scan, int d
 	char *png, etag[ETAG_MAX];
 	const struct entity entity = {.etag = etag, .size = UNKNOWN_SIZE, .media_type = "image/png"};
 	struct selection selection;
-	void *samples;
 	bool done;
 	int code;
 
@@ -215,22 +227,16 @@ static int reply_picture(struct request *request, const struct scan *scan, int d
 	if (size > PICTURE_PIXELS_MAX * sample_bytes(scan->sample))
 		return error_set(err, ERR_IMPOSSIBLE, "a picture has at most %d pixels, the projection %zu",
 				 PICTURE_PIXELS_MAX, size / sample_bytes(scan->sample));
-	samples = malloc(size);
-	if (samples == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for a picture");
-	code = file_read_at(descriptor, samples, size, (size_t)index * size, "a projection", err);
-	if (code == 0)
-		code = draw(samples, scan, &png, &length, err);
+	code = draw(samples, scan, &png, &length, err);
 	if (code == 0)
 		code = request_reply_bytes(request, 200, png, length, err);
-	free(samples);
 	if (code == 0)
 		entity_headers(request, &entity, &selection);
 	return code;
 }
 
-/* Takes the descriptor. */
-static int reply_samples(struct request *request, const struct scan *scan, int descriptor, int index,
+/* Takes the samples. */
+static int reply_samples(struct request *request, const struct scan *scan, char *samples, int index,
 			 const uint8_t sha256[32], struct error *err)
 {
 	char etag[ETAG_MAX], filename[96];
@@ -244,11 +250,12 @@ static int reply_samples(struct request *request, const struct scan *scan, int d
 	make_etag(sha256, "", etag);
 	snprintf(filename, sizeof(filename), "%.40s-%d.raw", request_argument(request, 0), index);
 	if (entity_select(request, &entity, &selection, &done, err) != 0 || done) {
-		close(descriptor);
+		free(samples);
 		return done ? 0 : err->code;
 	}
-	if (request_reply_file(request, selection.status, descriptor, (uint64_t)index * entity.size + selection.first,
-			       selection.length, err) != 0)
+	if (selection.first > 0)
+		memmove(samples, samples + selection.first, selection.length);
+	if (request_reply_bytes(request, selection.status, samples, selection.length, err) != 0)
 		return err->code;
 	entity_headers(request, &entity, &selection);
 	return 0;
@@ -259,7 +266,8 @@ static int reply_projection(struct request *request, struct stored_scan *stored,
 	static const char *const formats[] = {"raw", "png", NULL};
 	const struct scan *scan = stored_scan_parsed(stored);
 	const char *text = request_argument(request, 1);
-	int format, descriptor, code;
+	int format, code;
+	void *samples;
 	uint8_t sha256[32];
 	long index;
 
@@ -268,12 +276,12 @@ static int reply_projection(struct request *request, struct stored_scan *stored,
 	if (!index_parse(text, strlen(text), scan->count - 1, &index))
 		return error_set(err, ERR_NOT_FOUND, "projection \"%.40s\" is asked for, the scan has 0 to %d", text,
 				 scan->count - 1);
-	if (open_projection(stored, (int)index, &descriptor, sha256, err) != 0)
+	if (read_projection(stored, (int)index, &samples, sha256, err) != 0)
 		return err->code;
 	if (format == 0)
-		return reply_samples(request, scan, descriptor, (int)index, sha256, err);
-	code = reply_picture(request, scan, descriptor, (int)index, sha256, err);
-	close(descriptor);
+		return reply_samples(request, scan, samples, (int)index, sha256, err);
+	code = reply_picture(request, scan, samples, sha256, err);
+	free(samples);
 	return code;
 }
 

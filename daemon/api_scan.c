@@ -98,7 +98,7 @@ int scan_delete(void *context, struct request *request, struct error *err)
 	struct stored_scan *scan;
 	int code;
 
-	if (store_scan_find(api->store, request_argument(request, 0), &scan, err) != 0)
+	if (store_scan_refer(api->store, request_argument(request, 0), &scan, err) != 0)
 		return err->code;
 	code = jobs_delete_scan(api->jobs, scan, err);
 	if (code == ERR_NO_SPACE && store_reserve_spend(api->store))

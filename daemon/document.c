@@ -115,6 +115,12 @@ static void add_warning(cJSON *list, const char *code, const char *detail)
 	cJSON_AddItemToArray(list, json_warning(code, detail));
 }
 
+static bool lacks_flat(const struct scan_facts *facts)
+{
+	return facts->quantity == QUANTITY_INTENSITY && facts->air <= 0 && !facts->flat &&
+	       !facts->lost_image[IMAGE_FLAT];
+}
+
 static void add_scan_warnings(cJSON *document, const struct scan *scan, const struct scan_facts *facts)
 {
 	cJSON *warnings = scan_warnings(scan);
@@ -128,13 +134,28 @@ static void add_scan_warnings(cJSON *document, const struct scan *scan, const st
 		    facts->received, facts->count);
 		add_warning(warnings, "incomplete", detail);
 	}
-	if (facts->complete && !facts->convertible)
+	if (facts->complete && lacks_flat(facts))
 		add_warning(
 		    warnings, "no_flat",
 		    "all projections are there, but no flat image, and the scan has no air value: its jobs wait "
 		    "for PUT /v1/scans/{scan}/flat");
 	if (facts->damaged)
 		add_warning(warnings, "files_missing", "the file of the projections is not there at its full size");
+	if (facts->lost > 0) {
+		snprintf(detail, sizeof(detail),
+			 "the disk has damaged %d projections that were stored: they are missing again, and the scan's "
+			 "jobs wait until they are sent again",
+			 facts->lost);
+		add_warning(warnings, "damaged_projections", detail);
+	}
+	for (int i = 0; i < IMAGE_COUNT; i++) {
+		if (!facts->lost_image[i])
+			continue;
+		snprintf(detail, sizeof(detail),
+			 "the disk has damaged the image %s: the scan's jobs wait until it is sent again",
+			 image_names[i]);
+		add_warning(warnings, "damaged_image", detail);
+	}
 	cJSON_AddItemToObject(document, "warnings", warnings);
 }
 
@@ -290,10 +311,16 @@ static void add_waiting_for(cJSON *document, const struct scan_facts *scan, cons
 	cJSON *list = cJSON_AddArrayToObject(document, "waiting_for");
 
 	if (record->state == JOB_WAITING && scan != NULL) {
-		if (!scan->convertible)
+		if (lacks_flat(scan))
 			cJSON_AddItemToArray(list, cJSON_CreateString("flat"));
+		for (int i = 0; i < IMAGE_COUNT; i++) {
+			if (scan->lost_image[i])
+				cJSON_AddItemToArray(list, cJSON_CreateString(image_names[i]));
+		}
 		if (!scan->complete)
 			cJSON_AddItemToArray(list, cJSON_CreateString("projections"));
+		if (!scan->checked)
+			cJSON_AddItemToArray(list, cJSON_CreateString("check"));
 	}
 	if (obstacle != JOB_UNHINDERED)
 		cJSON_AddItemToArray(list, cJSON_CreateString(job_obstacle_names[obstacle]));

@@ -34,6 +34,7 @@ static const struct problem {
     {ERR_CANCELLED, 503, "cancelled", "The request was given up"},
     {ERR_BUSY, 503, "busy", "Not just now"},
     {ERR_INTERNAL, 500, "internal", "The daemon broke a promise of its own"},
+    {ERR_DAMAGED, 500, "damaged", "The disk has damaged what was stored"},
     {0, 403, "foreign-origin", "A page of another site may not do this"},
     {0, 405, "method-not-allowed", "The resource does not know this method"},
     {0, 411, "length-required", "The request needs a body"},

@@ -21,8 +21,12 @@
 static const bool transitions[JOB_STATE_COUNT][JOB_STATE_COUNT] = {
     [JOB_WAITING] =
 	{[JOB_WAITING] = true, [JOB_QUEUED] = true, [JOB_RUNNING] = true, [JOB_FAILED] = true, [JOB_CANCELLED] = true},
-    [JOB_QUEUED] = {[JOB_RUNNING] = true, [JOB_FAILED] = true, [JOB_CANCELLED] = true},
-    [JOB_RUNNING] = {[JOB_QUEUED] = true, [JOB_SUCCEEDED] = true, [JOB_FAILED] = true, [JOB_CANCELLED] = true},
+    [JOB_QUEUED] = {[JOB_WAITING] = true, [JOB_RUNNING] = true, [JOB_FAILED] = true, [JOB_CANCELLED] = true},
+    [JOB_RUNNING] = {[JOB_WAITING] = true,
+		     [JOB_QUEUED] = true,
+		     [JOB_SUCCEEDED] = true,
+		     [JOB_FAILED] = true,
+		     [JOB_CANCELLED] = true},
 };
 
 /* Why a job that could run is not given to a worker just now. In memory only: after a restart it is tried at once. */
@@ -39,6 +43,9 @@ struct job {
 	struct jobs *jobs;
 	char id[ID_SIZE], scan[ID_SIZE];
 	bool fdk; /* it has FDK; known of waiting jobs */
+
+	int doubts; /* job_doubt, with the next; the supervisor's own */
+	unsigned doubted_at;
 
 	struct watch_list watchers;
 
@@ -307,14 +314,16 @@ static void account_stage(struct job *job)
 	job->stage_since = now;
 }
 
-static void enter_queue(struct job_record *record, const struct job_change *change, struct jobs *jobs)
+static void enter_queue(struct job_record *record, enum job_state from, const struct job_change *change,
+			struct jobs *jobs)
 {
 	if (record->ticket == 0) {
 		record->ticket = jobs->next_ticket++;
 		record->queued = time_of_day();
 		return;
 	}
-	record->attempts += !change->yielded;
+	/* What its scan lost was sent again: no run of its was lost. */
+	record->attempts += !change->yielded && from != JOB_WAITING;
 	record->checkpoint = change->checkpoint;
 	record->iteration = change->checkpoint;
 	record->stage = STAGE_LOAD;
@@ -324,10 +333,13 @@ static void enter_queue(struct job_record *record, const struct job_change *chan
 	}
 }
 
-/* A worker was lost over it: it waits, and what it had reconstructed is gone. */
-static void enter_waiting(struct job_record *record)
+/* A worker was lost over it, or its scan has lost something: it waits, and what it had reconstructed is gone. */
+static void enter_waiting(struct job_record *record, enum job_state from)
 {
-	record->attempts = (record->attempts == 0 ? 1 : record->attempts) + 1;
+	if (from == JOB_WAITING)
+		record->attempts = (record->attempts == 0 ? 1 : record->attempts) + 1;
+	record->checkpoint = 0;
+	record->iteration = 0;
 	record->stage = STAGE_LOAD;
 	record->fraction = 0;
 	record->taken = 0;
@@ -407,9 +419,9 @@ static void next_record(struct job *job, enum job_state to, const struct job_cha
 	ret->attended = false;
 	ret->crashes += change->crashed;
 	if (to == JOB_WAITING)
-		enter_waiting(ret);
+		enter_waiting(ret, from);
 	else if (to == JOB_QUEUED)
-		enter_queue(ret, change, job->jobs);
+		enter_queue(ret, from, change, job->jobs);
 	else if (to == JOB_RUNNING)
 		enter_running(ret, from, change, job->jobs);
 	else
@@ -468,7 +480,7 @@ static int change_state(struct job *job, enum job_state to, const struct job_cha
 	next_record(job, to, change, &record);
 	if (from == JOB_RUNNING && to == JOB_QUEUED)
 		past = PAST_REWINDS;
-	else if ((from == JOB_WAITING && to == JOB_QUEUED) ||
+	else if ((from == JOB_WAITING && to == JOB_QUEUED) || (from != JOB_WAITING && to == JOB_WAITING) ||
 		 (from == JOB_QUEUED && to == JOB_RUNNING && basis != change->basis))
 		past = PAST_GOES;
 	code = save_state(job->jobs, &record, past, err);
@@ -979,7 +991,7 @@ struct job *jobs_arriving(struct jobs *jobs, double since, bool *ret_arriving)
 
 		if (job_obstacle(one.job) != JOB_UNHINDERED || !one.job->fdk ||
 		    store_scan_look(jobs->store, one.job->scan, &facts, &err) != 0 || !facts.convertible ||
-		    facts.complete)
+		    facts.complete || !facts.checked)
 			continue;
 		one.arrived = facts.arrived;
 		one.arriving = facts.arrived > since;
@@ -1033,6 +1045,13 @@ void job_leave(struct job *job)
 	pthread_mutex_unlock(&job->jobs->lock);
 	pthread_mutex_unlock(&job->jobs->change);
 	wake(job);
+}
+
+int job_doubt(struct job *job, unsigned losses)
+{
+	job->doubts = job->doubted_at == losses ? job->doubts + 1 : 1;
+	job->doubted_at = losses;
+	return job->doubts;
 }
 
 void job_taken(struct job *job, int count)

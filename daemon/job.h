@@ -11,6 +11,9 @@
  *   waiting -> queued -> running -> succeeded | failed | cancelled
  *                 ^---------'  a yield, a dead worker, a restart
  *
+ * A job whose scan loses projections or an image to the disk waits again (queued
+ * or running -> waiting) until they are sent again, and begins anew then.
+ *
  * A waiting job may be attended: a worker reconstructs its projections as they
  * arrive. With the last of them it is running, without having been queued; when
  * the worker is taken from it or dies, it waits as before.
@@ -133,6 +136,11 @@ struct job *jobs_arriving(struct jobs *jobs, double since, bool *ret_arriving);
 int job_attend(struct job *job, const char *backend, const char *device, struct error *err);
 /* The worker goes; a job that still waits is where it was before. */
 void job_leave(struct job *job);
+/*
+ * A worker found its scan damaged, when the scan had lost that much: how many times in a row that has been without
+ * another loss since. The supervisor's thread only.
+ */
+int job_doubt(struct job *job, unsigned losses);
 /* Projections reconstructed so far. */
 void job_taken(struct job *job, int count);
 /*

@@ -70,7 +70,7 @@ const char *error_name(int code)
 {
 	static const char *const names[] = {"none",      "invalid",   "impossible", "not-found", "conflict",
 					    "too-large", "no-memory", "no-space",   "io",        "device",
-					    "cancelled", "busy",      "internal",   "sync"};
+					    "cancelled", "busy",      "internal",   "sync",      "damaged"};
 	unsigned index = code <= 0 ? (unsigned)-code : 0;
 
 	return index < sizeof(names) / sizeof(names[0]) ? names[index] : "internal";

@@ -11,7 +11,7 @@
  * that nothing checks, so its file loses its name as soon as it is open. Another
  * program must not write into the catalogue of a running daemon.
  */
-#include "daemon/store_db.h"
+#include "daemon/store_scan.h"
 
 #include <assert.h>
 #include <errno.h>
@@ -748,7 +748,7 @@ static int open_catalogue(struct store *store, bool rebuild, struct error *err)
 	if (code != 0)
 		return error_set_errno(err, code, "thread for checkpoints");
 	store->has_checkpointer = true;
-	return 0;
+	return store_start_checker(store, err);
 }
 
 static int open_store(const char *directory, const struct store_hooks *hooks, bool rebuild, struct store **ret_store,
@@ -775,6 +775,8 @@ static int open_store(const char *directory, const struct store_hooks *hooks, bo
 	pthread_mutex_init(&store->scans_lock, NULL);
 	pthread_mutex_init(&store->checkpoint_lock, NULL);
 	pthread_cond_init(&store->checkpoint_due, NULL);
+	pthread_mutex_init(&store->check_lock, NULL);
+	pthread_cond_init(&store->check_due, NULL);
 	watch_list_init(&store->arrivals);
 	code = pages_new(&store->pages, err);
 	if (code == 0)
@@ -870,6 +872,7 @@ void store_close(struct store *store)
 {
 	if (store == NULL)
 		return;
+	store_stop_checker(store);
 	if (store->has_checkpointer) {
 		pthread_mutex_lock(&store->checkpoint_lock);
 		store->closing = true;
@@ -884,6 +887,8 @@ void store_close(struct store *store)
 	pthread_mutex_destroy(&store->writer.lock);
 	watch_list_destroy(&store->arrivals);
 	pthread_cond_destroy(&store->checkpoint_due);
+	pthread_cond_destroy(&store->check_due);
+	pthread_mutex_destroy(&store->check_lock);
 	pthread_mutex_destroy(&store->checkpoint_lock);
 	pthread_mutex_destroy(&store->scans_lock);
 	pthread_mutex_destroy(&store->insertion_lock);

@@ -117,6 +117,8 @@ int store_scan_repeat(struct store *store, const struct store_key *key, struct s
 		      struct error *err);
 /* ERR_NOT_FOUND. Reads scan.json when the scan has not been used for a while; otherwise memory only. */
 int store_scan_find(struct store *store, const char *id, struct stored_scan **ret_scan, struct error *err);
+/* The same whatever state its files are in: for its removal. It may have no parsed form. */
+int store_scan_refer(struct store *store, const char *id, struct stored_scan **ret_scan, struct error *err);
 void stored_scan_release(struct stored_scan *scan); /* NULL is fine */
 
 /*
@@ -140,8 +142,8 @@ const char *stored_scan_id(const struct stored_scan *scan);
 void store_scan_directory(const struct store *store, const char *id, char ret_path[1024]);
 
 /*
- * Memory only. Complete: every projection is there, or it was closed with those that are. Convertible: so is whatever
- * else makes line integrals of them. Ready: both.
+ * Memory only. Complete: every projection is there, or it was closed with those that are, and none of them was lost.
+ * Convertible: so is whatever else makes line integrals of them. Ready: both, and nothing of it is being checked.
  */
 struct scan_facts {
 	char name[256];
@@ -152,6 +154,11 @@ struct scan_facts {
 	double air;               /* counts, 0: not given */
 	int received;             /* projections */
 	bool flat, dark, defects; /* images that are there */
+	bool lost_image[3];       /* of enum image: it was found damaged and is to be sent again */
+	int lost;                 /* projections that were found damaged: missing until they are sent again */
+	unsigned losses;          /* grows with each of them */
+	bool document_damaged;    /* scan.json: the scan cannot be used any more */
+	bool checked;             /* its files are not being held against their checksums just now */
 	bool closed;              /* by store_scan_close, with projections missing */
 	bool complete, convertible, ready;
 	double arrived; /* when the last projection came, seconds of CLOCK_MONOTONIC; 0: none since the start */
@@ -172,7 +179,32 @@ int stored_scan_arrivals(struct stored_scan *scan, int from, int *ret_projection
 /* False when it is not stored. ret_sum->bytes 0: only its SHA-256 is known yet. */
 bool stored_scan_sum(struct stored_scan *scan, int index, struct sum *ret_sum);
 
-/* Woken when a projection is stored, a claim given back, an image set, the scan deleted. */
+/* The projections that were found damaged: flags[count]. */
+void stored_scan_lost(struct stored_scan *scan, unsigned char *ret_flags);
+
+/*
+ * ---- damage ----
+ *
+ * What is read of a scan directory is held against projections.sums. A projection that does not fit is lost: missing as
+ * if it had never come, though it may be sent again also to a scan that was closed with it. An image that does not fit
+ * keeps its scan from being used until it is sent again. A document that does not fit cannot be had again: who finds
+ * the scan gets ERR_DAMAGED.
+ */
+/*
+ * Reads the samples of a stored projection from this descriptor of projections.raw into ret_samples[bytes].
+ * ERR_DAMAGED: they do not fit, and it is lost now. ERR_NOT_FOUND: it is not stored.
+ */
+int stored_scan_read(struct stored_scan *scan, int descriptor, int index, void *ret_samples, struct sum *ret_sum,
+		     struct error *err);
+/* The projection was found not to fit `seen`: it is lost, unless it was sent again since. */
+void stored_scan_lose(struct stored_scan *scan, int index, const struct sum *seen);
+/*
+ * Somebody else, a worker, found something of the scan damaged: all of its files are checked by a thread of the store;
+ * until then it is not ready.
+ */
+void store_scan_suspect(struct store *store, const char *id);
+
+/* Woken when a projection is stored or lost, a check is over, a claim given back, an image set, the scan deleted. */
 void stored_scan_watch(struct stored_scan *scan, struct watch *watch);
 void stored_scan_unwatch(struct stored_scan *scan, struct watch *watch);
 /* Woken when a projection or an image of any scan is stored, and when one is closed. */
@@ -237,6 +269,7 @@ int store_put_projections(struct store *store, struct received_projection *batch
  * are there. ERR_BUSY: another request is writing it just now.
  */
 enum image { IMAGE_FLAT, IMAGE_DARK, IMAGE_DEFECTS, IMAGE_COUNT };
+extern const char *const image_names[IMAGE_COUNT]; /* as in the paths of the API */
 int store_put_image(struct store *store, struct stored_scan *scan, enum image image, const void *pixels, bool *ret_new,
 		    struct error *err);
 

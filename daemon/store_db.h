@@ -12,7 +12,7 @@
  *
  * Locks, in the order in which they may be taken: insertion_lock, writer.lock (held over a
  * commit; makes one transaction at a time) or reader.lock (held over a SELECT),
- * then scans_lock, then a scan's own lock, then checkpoint_lock or a watch list's.
+ * then scans_lock, then a scan's own lock, then checkpoint_lock, check_lock or a watch list's.
  */
 enum { STATEMENTS_MAX = 96, RECENT_SCANS = 16 };
 
@@ -59,6 +59,13 @@ struct store {
 	pthread_cond_t checkpoint_due;
 	int log_pages;
 	bool closing;
+
+	/* Checks scans whose files may be damaged (store_sums.c). */
+	pthread_t checker;
+	bool has_checker;
+	pthread_mutex_t check_lock; /* guards the next two */
+	pthread_cond_t check_due;
+	bool checks_due, checks_end;
 
 	pthread_mutex_t scans_lock; /* guards the array, and of each scan: references, parsed, recent */
 	struct stored_scan **scans; /* [scan_count], by id */

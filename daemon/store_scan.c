@@ -39,6 +39,7 @@ static struct stored_scan *scan_free_memory(struct stored_scan *scan)
 	scan_free(scan->measured);
 	free(scan->order);
 	free(scan->progress);
+	free(scan->lost);
 	free(scan->sums);
 	watch_list_destroy(&scan->watchers);
 	pthread_mutex_destroy(&scan->lock);
@@ -60,7 +61,10 @@ static struct stored_scan *scan_new(struct store *store, int count)
 	scan->progress = calloc((size_t)count, 1);
 	scan->sums = calloc((size_t)count, sizeof(scan->sums[0]));
 	scan->order = calloc((size_t)count, sizeof(scan->order[0]));
-	return scan->progress == NULL || scan->sums == NULL || scan->order == NULL ? scan_free_memory(scan) : scan;
+	scan->lost = calloc((size_t)count, 1);
+	return scan->progress == NULL || scan->sums == NULL || scan->order == NULL || scan->lost == NULL
+		   ? scan_free_memory(scan)
+		   : scan;
 }
 
 /* ---- the array ---- */
@@ -195,10 +199,12 @@ static int read_document(struct stored_scan *scan, struct scan **ret_parsed, str
 	if (code != 0)
 		/* The row is there, so its file must be: this is our disk's fault, not the client's. */
 		return error_set(err, ERR_IO, "scan %s: its document cannot be read from %s", scan->id, path);
-	code = scan_parse(text, length, ret_parsed, err);
-	if (code != 0) {
+	code = store_check_part(scan, SUMS_SCAN, text, length, err);
+	if (code == 0 && scan_parse(text, length, ret_parsed, err) != 0)
+		code = ERR_DAMAGED;
+	if (code == ERR_DAMAGED) {
 		log_line(LEVEL_ERROR, "scan %s: %s is damaged: %s", scan->id, path, err->text);
-		code = error_set(err, ERR_IO, "scan %s: its document on the disk is damaged", scan->id);
+		error_set(err, code, "scan %s: its document (scan.json) is damaged", scan->id);
 	}
 	free(text);
 	return code;
@@ -217,7 +223,10 @@ static int closed_flags(struct stored_scan *scan, unsigned char **ret_flags, str
 		flags = malloc((size_t)scan->count);
 		if (flags == NULL)
 			return error_set_errno(err, ENOMEM, "list of %d projections", scan->count);
-		stored_scan_received(scan, flags);
+		pthread_mutex_lock(&scan->lock);
+		for (int i = 0; i < scan->count; i++) /* what was lost is to come again */
+			flags[i] = scan->progress[i] == STORED || scan->lost[i];
+		pthread_mutex_unlock(&scan->lock);
 	}
 	*ret_flags = flags;
 	return 0;
@@ -265,9 +274,14 @@ static int load_parsed(struct stored_scan *scan, struct error *err)
 {
 	struct store *store = scan->store;
 	struct scan *parsed = NULL, *measured = NULL;
-	bool there;
+	bool there, damaged;
 	int code;
 
+	pthread_mutex_lock(&scan->lock);
+	damaged = scan->document_damaged;
+	pthread_mutex_unlock(&scan->lock);
+	if (damaged)
+		return error_set(err, ERR_DAMAGED, "scan %s: its document (scan.json) is damaged", scan->id);
 	pthread_mutex_lock(&store->scans_lock);
 	there = scan->parsed != NULL;
 	pthread_mutex_unlock(&store->scans_lock);
@@ -318,6 +332,16 @@ int store_scan_find(struct store *store, const char *id, struct stored_scan **re
 		stored_scan_release(scan);
 		return code;
 	}
+	*ret_scan = scan;
+	return 0;
+}
+
+int store_scan_refer(struct store *store, const char *id, struct stored_scan **ret_scan, struct error *err)
+{
+	struct stored_scan *scan = array_find(store, id, false);
+
+	if (scan == NULL)
+		return error_set(err, ERR_NOT_FOUND, "there is no scan \"%.64s\"", id);
 	*ret_scan = scan;
 	return 0;
 }
@@ -663,21 +687,35 @@ void store_scan_directory(const struct store *store, const char *id, char ret_pa
 /* These and the next: the scan's lock is held. */
 static bool is_complete(const struct stored_scan *scan)
 {
-	return scan->received == scan->count || scan->closed;
+	return scan->received == scan->count || (scan->closed && scan->lost_count == 0);
 }
 
 static bool is_convertible(const struct stored_scan *scan)
 {
+	for (int i = 0; i < IMAGE_COUNT; i++) {
+		if (scan->image_lost[i])
+			return false;
+	}
 	return scan->quantity == QUANTITY_LINE_INTEGRAL || scan->air > 0 || scan->image[IMAGE_FLAT] == STORED;
 }
 
-/* Images and the end of a scan come and never go: what is there tells all that its projections are understood by. */
+/*
+ * Images and the end of a scan come and never go, though an image that was lost may come again as another: what is
+ * there, and which images, tells all that its projections are understood by.
+ */
 static unsigned basis_of(const struct stored_scan *scan)
 {
 	unsigned basis = scan->closed;
 
-	for (int i = 0; i < IMAGE_COUNT; i++)
-		basis = basis << 1 | (scan->image[i] == STORED);
+	for (int i = 0; i < IMAGE_COUNT; i++) {
+		bool known = scan->image[i] == STORED || scan->image_lost[i];
+
+		basis = basis << 1 | known;
+	}
+	for (int i = 0; i < IMAGE_COUNT; i++) {
+		if (scan->image[i] == STORED || scan->image_lost[i])
+			basis ^= (unsigned)(scan->image_sha256[i][0] << 8 | scan->image_sha256[i][1] << 16) << i;
+	}
 	return basis;
 }
 
@@ -685,6 +723,8 @@ void stored_scan_add(struct stored_scan *scan, int index, const struct sum *sum)
 {
 	scan->sums[index] = *sum;
 	scan->unchecked += sum->bytes == 0;
+	scan->lost_count -= scan->lost[index];
+	scan->lost[index] = 0;
 	scan->progress[index] = STORED;
 	scan->order[scan->received++] = index;
 }
@@ -710,7 +750,13 @@ void stored_scan_facts(struct stored_scan *scan, struct scan_facts *ret)
 	ret->closed = scan->closed;
 	ret->complete = is_complete(scan);
 	ret->convertible = is_convertible(scan);
-	ret->ready = ret->complete && ret->convertible;
+	ret->checked = !scan->suspect;
+	ret->ready = ret->complete && ret->convertible && ret->checked;
+	for (int i = 0; i < IMAGE_COUNT; i++)
+		ret->lost_image[i] = scan->image_lost[i];
+	ret->lost = scan->lost_count;
+	ret->losses = scan->losses;
+	ret->document_damaged = scan->document_damaged;
 	ret->arrived = scan->arrived;
 	ret->basis = basis_of(scan);
 	ret->deleted = scan->deleted;
@@ -733,6 +779,13 @@ void stored_scan_received(struct stored_scan *scan, unsigned char *ret_flags)
 	pthread_mutex_lock(&scan->lock);
 	for (int i = 0; i < scan->count; i++)
 		ret_flags[i] = scan->progress[i] == STORED;
+	pthread_mutex_unlock(&scan->lock);
+}
+
+void stored_scan_lost(struct stored_scan *scan, unsigned char *ret_flags)
+{
+	pthread_mutex_lock(&scan->lock);
+	memcpy(ret_flags, scan->lost, (size_t)scan->count);
 	pthread_mutex_unlock(&scan->lock);
 }
 
@@ -791,6 +844,11 @@ static int check_closing(const struct stored_scan *scan, bool *ret_done, struct 
 		return error_set(err, ERR_NOT_FOUND, "there is no scan \"%s\" any more", scan->id);
 	if (is_complete(scan))
 		*ret_done = true;
+	else if (scan->closed)
+		return error_set(
+		    err, ERR_CONFLICT,
+		    "the scan is complete but for %d projections that the disk has damaged: send them again",
+		    scan->lost_count);
 	else if (scan->closing)
 		return error_set(err, ERR_BUSY, "another request is completing this scan");
 	else if (scan->received < VIEWS_LEAST)
@@ -831,7 +889,9 @@ static int close_row(struct store *store, struct stored_scan *scan, int received
 	pthread_mutex_unlock(&scan->lock);
 	if (code != 0 || *ret_done)
 		return store_end(store, code, err);
-	code = store_put_part_sum(scan, SUMS_CLOSED, "", 0, err);
+	code = store_forget_lost(scan, err);
+	if (code == 0)
+		code = store_put_part_sum(scan, SUMS_CLOSED, "", 0, err);
 	if (code == 0) {
 		query_begin(&query, &store->writer, "UPDATE scans SET closed = 1 WHERE number = ?", err);
 		query_integer(&query, scan->number);
@@ -904,7 +964,7 @@ int stored_scan_claim(struct stored_scan *scan, int index, enum claim *ret_claim
 	pthread_mutex_lock(&scan->lock);
 	if (scan->deleted) {
 		code = error_set(err, ERR_NOT_FOUND, "scan %s was deleted meanwhile", scan->id);
-	} else if (scan->progress[index] == MISSING && scan->closing) {
+	} else if (scan->progress[index] == MISSING && scan->closing && !scan->lost[index]) {
 		code = error_set(err, ERR_CONFLICT, "the scan was completed without projection %d", index);
 	} else if (scan->progress[index] == MISSING) {
 		scan->progress[index] = CLAIMED;
@@ -948,11 +1008,12 @@ static int insert_projections(struct store *store, struct received_projection *b
 
 	for (int i = 0; i < count && code == 0; i++) {
 		/* Cannot change: writer.lock is held. */
-		batch[i].stored = !batch[i].scan->deleted && !batch[i].scan->closing;
+		batch[i].stored =
+		    !batch[i].scan->deleted && (!batch[i].scan->closing || batch[i].scan->lost[batch[i].index]);
 		if (!batch[i].stored)
 			continue;
-		query_begin(&query, &store->writer, "INSERT INTO projections (scan, view, sha256) VALUES (?, ?, ?)",
-			    err);
+		query_begin(&query, &store->writer,
+			    "INSERT OR REPLACE INTO projections (scan, view, sha256) VALUES (?, ?, ?)", err);
 		query_integer(&query, batch[i].scan->number);
 		query_integer(&query, batch[i].index);
 		query_blob(&query, batch[i].sum.sha256, sizeof(batch[i].sum.sha256));
@@ -1068,14 +1129,24 @@ int store_put_image(struct store *store, struct stored_scan *scan, enum image im
 	code = claim_image(scan, image, sha256, &there, err);
 	if (code != 0)
 		return code;
-	if (there) {
+	if (there && store_check_image(scan, image, err) == 0) {
 		*ret_new = false;
 		return 0;
+	}
+	if (there) { /* not any more */
+		code = claim_image(scan, image, sha256, &there, err);
+		if (code == 0 && there)
+			code = error_set(err, ERR_BUSY, "another request is writing this image");
+		if (code != 0)
+			return code;
 	}
 	code = write_image(store, scan, image, pixels, sha256, err);
 	pthread_mutex_lock(&scan->lock);
 	scan->image[image] = code == 0 ? STORED : MISSING;
-	memcpy(scan->image_sha256[image], sha256, 32);
+	if (code == 0) {
+		scan->image_lost[image] = false;
+		memcpy(scan->image_sha256[image], sha256, 32);
+	}
 	pthread_mutex_unlock(&scan->lock);
 	watch_wake(&scan->watchers);
 	if (code == 0)
@@ -1196,7 +1267,7 @@ static int sweep_file(void *context, const char *name, struct error *err)
 	bool stray = false;
 
 	for (int i = 0; i < IMAGE_COUNT; i++)
-		stray |= strcmp(name, image_files[i]) == 0 && scan->image[i] != STORED;
+		stray |= strcmp(name, image_files[i]) == 0 && scan->image[i] != STORED && !scan->image_lost[i];
 	if (stray) {
 		snprintf(path, sizeof(path), "scans/%s/%s", scan->id, name);
 		return quarantine_move(scan->store->directory, path, "it was never acknowledged", err);
@@ -1210,20 +1281,28 @@ static int sweep_file(void *context, const char *name, struct error *err)
 	return 0;
 }
 
+/* A file of projections that is gone or cut off gets its size again: then what it lacks is found to be damaged. */
 static void check_files(struct stored_scan *scan)
 {
 	unsigned long long wanted = (unsigned long long)scan->columns * (unsigned long long)scan->rows *
 				    sample_bytes(scan->sample) * (unsigned long long)scan->count;
 	char directory[1024], path[1100];
 	struct stat status;
+	struct error err;
+	int file;
 
 	store_scan_directory(scan->store, scan->id, directory);
 	snprintf(path, sizeof(path), "%s/projections.raw", directory);
 	if (stat(path, &status) == 0 && (unsigned long long)status.st_size == wanted)
 		return;
-	scan->damaged = true;
 	log_line(LEVEL_ERROR, "scan %s is in the catalogue, but %s is not there with its %llu bytes", scan->id, path,
 		 wanted);
+	file = open(path, O_RDWR | O_CREAT | O_CLOEXEC, 0640);
+	scan->damaged = file < 0 || ftruncate(file, (off_t)wanted) != 0 ||
+			posix_fallocate(file, 0, (off_t)wanted) != 0 || directory_sync(directory, &err) != 0;
+	scan->suspect = true;
+	if (file >= 0)
+		close(file);
 }
 
 int store_sweep_scans(struct store *store, struct error *err)

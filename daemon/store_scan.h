@@ -19,7 +19,7 @@ struct stored_scan {
 	enum quantity quantity;
 	double air;
 	bool damaged;
-	uint64_t order_floor; /* of arrival: what comes from now on is above it */
+	uint64_t order_floor; /* of arrival: what comes from now on is above it; after the start guarded by lock */
 
 	/* Guarded by store->scans_lock. */
 	int references; /* one of them is the array's */
@@ -35,15 +35,21 @@ struct stored_scan {
 	 * projections.sums is missing or damaged, and made again once the samples were found to fit (store_sums.c).
 	 */
 	struct sum *sums;
-	int unchecked; /* those with `bytes` 0 */
-	int *order;    /* [received]: the projections that are stored, as they came */
+	int unchecked;       /* those with `bytes` 0 */
+	unsigned char *lost; /* [count]: was stored, was found damaged, and is missing until it is sent again */
+	int lost_count;
+	unsigned losses; /* since the start: what was counted in `order` has another place after one */
+	int *order;      /* [received]: the projections that are stored, as they came */
 	int received;
 	double arrived; /* monotonic: the last of them, 0: before the start */
 	enum progress image[IMAGE_COUNT];
 	uint8_t image_sha256[IMAGE_COUNT][32];
-	bool deleted; /* written with writer.lock held too, as the next */
-	bool closing; /* takes no new projections */
-	bool closed;  /* and that is on the disk */
+	bool image_lost[IMAGE_COUNT]; /* as of projections */
+	bool document_damaged;        /* scan.json */
+	bool suspect;                 /* all of its files are to be checked before it is used (store_sums.c) */
+	bool deleted;                 /* written with writer.lock held too, as the next */
+	bool closing;                 /* takes no new projections */
+	bool closed;                  /* and that is on the disk */
 
 	struct watch_list watchers;
 };
@@ -58,8 +64,19 @@ void stored_scan_add(struct stored_scan *scan, int index, const struct sum *sum)
  */
 int store_load_sums(struct store *store, struct stored_scan *scan, struct error *err);
 
+/* The scan goes on without what was lost, within the transaction that closes it. */
+int store_forget_lost(struct stored_scan *scan, struct error *err);
+
+/* A thread that checks the files of scans that are suspect. */
+int store_start_checker(struct store *store, struct error *err);
+void store_stop_checker(struct store *store);
+
 /* The record of a part of the scan directory, synced: behind its file and before its row. */
-int store_put_part_sum(const struct stored_scan *scan, enum sums_part part, const void *bytes, size_t size,
-		       struct error *err);
+int store_put_part_sum(const struct stored_scan *scan, int part, const void *bytes, size_t size, struct error *err);
+/* ERR_DAMAGED: these bytes do not fit the part's record. One without a record is taken as it is. */
+int store_check_part(const struct stored_scan *scan, enum sums_part part, const void *bytes, size_t size,
+		     struct error *err);
+/* A stored image is read; ERR_DAMAGED: it does not fit its SHA-256, and is lost now. */
+int store_check_image(struct stored_scan *scan, enum image image, struct error *err);
 
 #endif

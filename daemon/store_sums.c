@@ -12,10 +12,12 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/resource.h>
 #include <unistd.h>
 
 #include "daemon/log.h"
 #include "daemon/store_scan.h"
+#include "proto/spool.h"
 
 static size_t projection_bytes(const struct stored_scan *scan)
 {
@@ -45,17 +47,16 @@ int stored_scan_put_sum(struct received_projection *projection, int sums, uint64
 	return sums_put(sums, projection->index, &projection->sum, err);
 }
 
-static int put_part(int file, enum sums_part part, const struct sum *sum, struct error *err)
+static int put_part(int file, int part, const struct sum *sum, struct error *err)
 {
 	int code = sums_put(file, part, sum, err);
 
 	if (code == 0 && fdatasync(file) != 0)
-		code = error_set_errno(err, errno, "sync checksums");
+		code = error_set_sync(err, errno, "sync checksums");
 	return code;
 }
 
-int store_put_part_sum(const struct stored_scan *scan, enum sums_part part, const void *bytes, size_t size,
-		       struct error *err)
+int store_put_part_sum(const struct stored_scan *scan, int part, const void *bytes, size_t size, struct error *err)
 {
 	struct sum sum = {.crc = checksum(0, bytes, size), .bytes = size};
 	bool whole;
@@ -68,7 +69,413 @@ int store_put_part_sum(const struct stored_scan *scan, enum sums_part part, cons
 		return code;
 	code = put_part(file, part, &sum, err);
 	close(file);
+	if (code != 0)
+		store_distrust(scan->store, err);
 	return code;
+}
+
+/* ---- what does not fit ---- */
+
+/* From the list of those that are stored; the scan's lock is held. */
+static void remove_received(struct stored_scan *scan, int index)
+{
+	int at = 0;
+
+	while (scan->order[at] != index)
+		at++;
+	scan->received--;
+	memmove(scan->order + at, scan->order + at + 1, (size_t)(scan->received - at) * sizeof(scan->order[0]));
+	scan->unchecked -= scan->sums[index].bytes == 0;
+	scan->lost[index] = 1;
+	scan->lost_count++;
+	scan->losses++;
+}
+
+/* On the disk, as far as that can be: what cannot be noted there is found again by the next who reads it. */
+static void note_lost(const struct stored_scan *scan, int slot, struct sum sum)
+{
+	struct error err;
+	bool whole;
+	int file, code = open_sums(scan, &whole, &file, &err);
+
+	sum.lost = true;
+	if (code == 0) {
+		code = put_part(file, slot, &sum, &err);
+		close(file);
+	}
+	if (code == 0)
+		return;
+	log_line(LEVEL_WARNING, "scan %s: damage cannot be noted: %s", scan->id, err.text);
+	store_distrust(scan->store, &err);
+}
+
+void stored_scan_lose(struct stored_scan *scan, int index, const struct sum *seen)
+{
+	struct sum sum = *seen;
+	bool lost;
+
+	pthread_mutex_lock(&scan->lock);
+	lost = scan->progress[index] == STORED && scan->sums[index].order == seen->order;
+	if (lost) {
+		remove_received(scan, index);
+		scan->progress[index] = CLAIMED; /* until that is noted nobody writes another record */
+	}
+	pthread_mutex_unlock(&scan->lock);
+	if (!lost)
+		return;
+	sum.bytes = projection_bytes(scan);
+	note_lost(scan, index, sum);
+	log_line(LEVEL_ERROR, "scan %s: projection %d is damaged on the disk: it is missing until it is sent again",
+		 scan->id, index);
+	stored_scan_unclaim(scan, index);
+	watch_wake(&scan->store->arrivals);
+}
+
+const char *const image_names[IMAGE_COUNT] = {"flat", "dark", "defects"};
+static const char *const image_files[IMAGE_COUNT] = {"flat.f32", "dark.f32", "defects.u8"};
+
+static void lose_image(struct stored_scan *scan, enum image image)
+{
+	struct sum sum = {.bytes = 0};
+	bool lost;
+
+	pthread_mutex_lock(&scan->lock);
+	lost = scan->image[image] == STORED;
+	if (lost) {
+		scan->image[image] = CLAIMED;
+		scan->image_lost[image] = true;
+		scan->losses++;
+		memcpy(sum.sha256, scan->image_sha256[image], sizeof(sum.sha256));
+	}
+	pthread_mutex_unlock(&scan->lock);
+	if (!lost)
+		return;
+	note_lost(scan, SUMS_FLAT + (int)image, sum);
+	log_line(LEVEL_ERROR, "scan %s: its image %s is damaged on the disk: its jobs wait until it is sent again",
+		 scan->id, image_names[image]);
+	pthread_mutex_lock(&scan->lock);
+	scan->image[image] = MISSING;
+	pthread_mutex_unlock(&scan->lock);
+	watch_wake(&scan->watchers);
+	watch_wake(&scan->store->arrivals);
+}
+
+int store_forget_lost(struct stored_scan *scan, struct error *err)
+{
+	struct query query;
+	bool whole, lost;
+	int file, code = open_sums(scan, &whole, &file, err);
+
+	if (code != 0)
+		return code;
+	for (int i = 0; i < scan->count && code == 0; i++) {
+		pthread_mutex_lock(&scan->lock);
+		lost = scan->lost[i] && scan->progress[i] == MISSING;
+		if (lost) {
+			scan->lost[i] = 0;
+			scan->lost_count--;
+		}
+		pthread_mutex_unlock(&scan->lock);
+		if (!lost)
+			continue;
+		code = sums_put(file, i, NULL, err);
+		if (code == 0) {
+			query_begin(&query, &scan->store->writer, "DELETE FROM projections WHERE scan = ? AND view = ?",
+				    err);
+			query_integer(&query, scan->number);
+			query_integer(&query, i);
+			code = query_run(&query);
+		}
+	}
+	close(file);
+	return code;
+}
+
+/* ---- reading ---- */
+
+static bool fits_sha256(const void *bytes, size_t size, const uint8_t sha256[32])
+{
+	uint8_t found[32];
+
+	return EVP_Digest(bytes, size, found, NULL, EVP_sha256(), NULL) == 1 && memcmp(found, sha256, 32) == 0;
+}
+
+/* The samples fit the SHA-256 of the catalogue: they get a record. */
+static void note_checked(struct stored_scan *scan, int index, const struct sum *seen, uint32_t crc)
+{
+	struct sum sum = *seen;
+	struct error err;
+	bool whole, mine;
+	int file;
+
+	sum.crc = crc;
+	sum.bytes = projection_bytes(scan);
+	pthread_mutex_lock(&scan->lock);
+	mine = scan->progress[index] == STORED && scan->sums[index].bytes == 0;
+	if (mine) {
+		sum.order = scan->order_floor++;
+		scan->sums[index] = sum;
+		scan->unchecked--;
+	}
+	pthread_mutex_unlock(&scan->lock);
+	if (!mine || open_sums(scan, &whole, &file, &err) != 0)
+		return;
+	/* Not synced: it would be made again. */
+	if (sums_put(file, index, &sum, &err) != 0)
+		log_line(LEVEL_WARNING, "scan %s: %s", scan->id, err.text);
+	close(file);
+}
+
+int stored_scan_read(struct stored_scan *scan, int descriptor, int index, void *ret_samples, struct sum *ret_sum,
+		     struct error *err)
+{
+	size_t bytes = projection_bytes(scan);
+	struct sum sum;
+	uint32_t crc = 0;
+	bool fits;
+	int code;
+
+	if (!stored_scan_sum(scan, index, &sum))
+		return error_set(err, ERR_NOT_FOUND, "projection %d has not been stored yet", index);
+	code = file_read_at(descriptor, ret_samples, bytes, (size_t)index * bytes, "projections.raw", err);
+	if (code == 0)
+		crc = checksum(0, ret_samples, bytes);
+	fits = code == 0 && (sum.bytes != 0 ? crc == sum.crc : fits_sha256(ret_samples, bytes, sum.sha256));
+	if (fits && sum.bytes == 0)
+		note_checked(scan, index, &sum, crc);
+	if (fits) {
+		*ret_sum = sum;
+		return 0;
+	}
+	stored_scan_lose(scan, index, &sum);
+	return error_set(err, ERR_DAMAGED,
+			 "projection %d is damaged on the disk: it counts as missing and can be sent again", index);
+}
+
+static int get_part(const struct stored_scan *scan, enum sums_part part, struct sum *ret_sum, bool *ret_known,
+		    struct error *err)
+{
+	unsigned char state = SUM_NONE;
+	bool whole;
+	int file, code = open_sums(scan, &whole, &file, err);
+
+	if (code != 0)
+		return code;
+	code = sums_get(file, part, 1, 0, ret_sum, &state, err);
+	close(file);
+	*ret_known = state == SUM_GOOD && !ret_sum->lost;
+	return code;
+}
+
+int store_check_part(const struct stored_scan *scan, enum sums_part part, const void *bytes, size_t size,
+		     struct error *err)
+{
+	struct sum sum;
+	bool known;
+	int code = get_part(scan, part, &sum, &known, err);
+
+	if (code == ERR_NOT_FOUND)
+		return 0; /* its directory is about to go, or the file was lost since the start */
+	if (code == 0 && known && (sum.bytes != size || sum.crc != checksum(0, bytes, size)))
+		code = error_set(err, ERR_DAMAGED, "its bytes do not have the checksum %08x", sum.crc);
+	return code;
+}
+
+int store_check_image(struct stored_scan *scan, enum image image, struct error *err)
+{
+	char directory[1024], path[1100], *bytes = NULL;
+	size_t expected = (size_t)scan->columns * (size_t)scan->rows * (image == IMAGE_DEFECTS ? 1 : sizeof(float)),
+	       size = 0;
+	uint8_t sha256[32];
+	bool fits;
+	int code;
+
+	store_scan_directory(scan->store, scan->id, directory);
+	snprintf(path, sizeof(path), "%s/%s", directory, image_files[image]);
+	code = file_read(path, expected, &bytes, &size, err);
+	if (code == ERR_NO_MEMORY)
+		return code;
+	pthread_mutex_lock(&scan->lock);
+	memcpy(sha256, scan->image_sha256[image], sizeof(sha256));
+	pthread_mutex_unlock(&scan->lock);
+	fits = code == 0 && size == expected && fits_sha256(bytes, size, sha256);
+	if (fits)
+		code = store_put_part_sum(scan, SUMS_FLAT + (int)image, bytes, size, err);
+	free(bytes);
+	if (fits)
+		return code;
+	lose_image(scan, image);
+	return error_set(err, ERR_DAMAGED, "the image %s is damaged on the disk: it is to be sent again",
+			 image_names[image]);
+}
+
+/* ---- checking all of a scan ---- */
+
+static bool must_end(struct store *store)
+{
+	bool end;
+
+	pthread_mutex_lock(&store->check_lock);
+	end = store->checks_end;
+	pthread_mutex_unlock(&store->check_lock);
+	return end;
+}
+
+/* The document, which gets a record where it has none. */
+static void check_document(struct stored_scan *scan)
+{
+	char directory[1024], path[1100], *text = NULL;
+	struct scan *parsed = NULL;
+	struct error err;
+	size_t length;
+	struct sum sum;
+	bool known = false;
+	int code;
+
+	store_scan_directory(scan->store, scan->id, directory);
+	snprintf(path, sizeof(path), "%s/scan.json", directory);
+	code = file_read(path, 64 << 20, &text, &length, &err);
+	if (code == 0)
+		code = store_check_part(scan, SUMS_SCAN, text, length, &err);
+	if (code == 0)
+		code = scan_parse(text, length, &parsed, &err);
+	if (code == 0 && get_part(scan, SUMS_SCAN, &sum, &known, &err) == 0 && !known)
+		store_put_part_sum(scan, SUMS_SCAN, text, length, &err);
+	scan_free(parsed);
+	free(text);
+	if (code == 0 || code == ERR_NO_MEMORY)
+		return;
+	log_line(LEVEL_ERROR, "scan %s: its document (scan.json) is damaged: %s", scan->id, err.text);
+	pthread_mutex_lock(&scan->lock);
+	scan->document_damaged = true;
+	pthread_mutex_unlock(&scan->lock);
+}
+
+static void check_projections(struct stored_scan *scan)
+{
+	char *samples = malloc(projection_bytes(scan));
+	struct error err;
+	struct sum sum;
+	int file;
+
+	if (samples == NULL || stored_scan_open(scan, false, &file, &err) != 0) {
+		free(samples);
+		return;
+	}
+	for (int i = 0; i < scan->count && !must_end(scan->store); i++)
+		stored_scan_read(scan, file, i, samples, &sum, &err); /* tells of what it finds itself */
+	close(file);
+	free(samples);
+}
+
+static void check_scan(struct stored_scan *scan)
+{
+	struct error err;
+	struct scan_facts facts;
+
+	log_line(LEVEL_INFO, "scan %s: its files are checked", scan->id);
+	check_document(scan);
+	stored_scan_facts(scan, &facts);
+	for (int i = 0; i < IMAGE_COUNT; i++) {
+		if (i == IMAGE_FLAT ? facts.flat : i == IMAGE_DARK ? facts.dark : facts.defects)
+			store_check_image(scan, i, &err);
+	}
+	check_projections(scan);
+	if (must_end(scan->store)) /* the next start goes on */
+		return;
+	pthread_mutex_lock(&scan->lock);
+	scan->suspect = false;
+	pthread_mutex_unlock(&scan->lock);
+	watch_wake(&scan->watchers);
+	watch_wake(&scan->store->arrivals);
+}
+
+/* A reference to the newest scan that is suspect, or NULL. */
+static struct stored_scan *find_suspect(struct store *store)
+{
+	struct stored_scan *found = NULL;
+
+	pthread_mutex_lock(&store->scans_lock);
+	for (int i = store->scan_count; i-- > 0 && found == NULL;) {
+		pthread_mutex_lock(&store->scans[i]->lock);
+		if (store->scans[i]->suspect)
+			found = store->scans[i];
+		pthread_mutex_unlock(&store->scans[i]->lock);
+	}
+	if (found != NULL)
+		found->references++;
+	pthread_mutex_unlock(&store->scans_lock);
+	return found;
+}
+
+static void *check_loop(void *context)
+{
+	enum { NICENESS = 10 }; /* behind the workers */
+	struct store *store = context;
+	struct stored_scan *scan;
+
+	/* Of this thread alone. Good manners, no condition. */
+	setpriority(PRIO_PROCESS, (id_t)gettid(), NICENESS);
+	pthread_mutex_lock(&store->check_lock);
+	while (!store->checks_end) {
+		if (!store->checks_due) {
+			pthread_cond_wait(&store->check_due, &store->check_lock);
+			continue;
+		}
+		store->checks_due = false;
+		pthread_mutex_unlock(&store->check_lock);
+		while (!must_end(store) && (scan = find_suspect(store)) != NULL) {
+			check_scan(scan);
+			stored_scan_release(scan);
+		}
+		pthread_mutex_lock(&store->check_lock);
+	}
+	pthread_mutex_unlock(&store->check_lock);
+	return NULL;
+}
+
+static void ask_for_checks(struct store *store)
+{
+	pthread_mutex_lock(&store->check_lock);
+	store->checks_due = true;
+	pthread_cond_signal(&store->check_due);
+	pthread_mutex_unlock(&store->check_lock);
+}
+
+void store_scan_suspect(struct store *store, const char *id)
+{
+	struct stored_scan *scan;
+	struct error err;
+
+	if (store_scan_refer(store, id, &scan, &err) != 0)
+		return;
+	pthread_mutex_lock(&scan->lock);
+	scan->suspect = true;
+	pthread_mutex_unlock(&scan->lock);
+	stored_scan_release(scan);
+	ask_for_checks(store);
+}
+
+int store_start_checker(struct store *store, struct error *err)
+{
+	int code = pthread_create(&store->checker, NULL, check_loop, store);
+
+	if (code != 0)
+		return error_set_errno(err, code, "thread for checks");
+	store->has_checker = true;
+	ask_for_checks(store);
+	return 0;
+}
+
+void store_stop_checker(struct store *store)
+{
+	if (!store->has_checker)
+		return;
+	pthread_mutex_lock(&store->check_lock);
+	store->checks_end = true;
+	pthread_cond_signal(&store->check_due);
+	pthread_mutex_unlock(&store->check_lock);
+	pthread_join(store->checker, NULL);
 }
 
 /* ---- at the start ---- */
@@ -129,7 +536,7 @@ static int write_records(const struct stored_scan *scan, const struct records *r
 			code = sums_put(file, i, &records->projections[i], err);
 	}
 	if (code == 0 && fdatasync(file) != 0)
-		code = error_set_errno(err, errno, "sync checksums of scan %s", scan->id);
+		code = error_set_sync(err, errno, "sync checksums of scan %s", scan->id);
 	close(file);
 	return code;
 }
@@ -210,6 +617,12 @@ static int follow_parts(struct store *store, struct stored_scan *scan, const str
 		memcpy(scan->image_sha256[i], sum->sha256, 32);
 		scan->image[i] = STORED;
 	}
+	for (int i = 0; i < IMAGE_COUNT; i++) {
+		scan->image_lost[i] = records->part_states[SUMS_FLAT + i - SUMS_SCAN] == SUM_GOOD &&
+				      records->parts[SUMS_FLAT + i - SUMS_SCAN].lost;
+		if (scan->image_lost[i])
+			scan->image[i] = MISSING;
+	}
 	if (code != 0 || scan->closed || records->part_states[SUMS_CLOSED - SUMS_SCAN] != SUM_GOOD)
 		return code;
 	scan->closed = scan->closing = true;
@@ -260,7 +673,15 @@ static void show_projections(struct stored_scan *scan, const struct records *rec
 		} else {
 			stored_scan_add(scan, i, &records->projections[i]);
 		}
+		if (records->projections[i].lost) {
+			remove_received(scan, i);
+			scan->progress[i] = MISSING;
+		}
 	}
+	scan->suspect = scan->unchecked > 0 || records->part_states[0] != SUM_GOOD;
+	for (int i = 0; i < IMAGE_COUNT; i++)
+		scan->suspect |=
+		    scan->image[i] == STORED && records->part_states[SUMS_FLAT + i - SUMS_SCAN] != SUM_GOOD;
 }
 
 int store_load_sums(struct store *store, struct stored_scan *scan, struct error *err)

@@ -96,7 +96,7 @@ struct worker {
 	double room_since; /* monotonic: it was told to make room for projections that came later; NEVER */
 	/* While its job waits for the rest of its projections: the scan, a reference; NULL otherwise. */
 	struct stored_scan *arriving;
-	unsigned basis;         /* of the scan when it began */
+	unsigned basis, losses; /* of the scan when it began */
 	int told, taken;        /* projections that it was told of, that it has reconstructed */
 	double attended, again; /* monotonic: since when; not before, after the catalogue refused */
 	int failure_code;       /* why we told it to stop, 0: we did not */
@@ -212,7 +212,7 @@ static int record_ending(struct worker *worker, struct error *err)
 	if (worker->arriving != NULL && ending->to == JOB_SUCCEEDED)
 		code = record_running(worker, err);
 	/* One that waits as before has no news. */
-	if (code == 0 && (ending->to != JOB_WAITING || ending->crashed))
+	if (code == 0 && (ending->to != JOB_WAITING || ending->crashed || worker->arriving == NULL))
 		code = job_set_state(worker->job, ending->to, &change, err);
 	return code;
 }
@@ -308,8 +308,10 @@ static bool is_void(const struct worker *worker)
 	struct error err;
 
 	job_facts(worker->job, &facts);
-	return store_scan_look(jobs_store(job_jobs(worker->job)), facts.scan, &scan, &err) == 0 &&
-	       scan.basis != worker->basis;
+	if (store_scan_look(jobs_store(job_jobs(worker->job)), facts.scan, &scan, &err) != 0)
+		return false;
+	/* While projections arrive they are told by their places in an order that a loss changes. */
+	return scan.basis != worker->basis || (worker->arriving != NULL && scan.losses != worker->losses);
 }
 
 /* The disk is full: the job goes on from where it began, once there is room for one more volume than now. */
@@ -359,6 +361,27 @@ static void lose_job(struct supervise *supervise, struct worker *worker, int err
 					.crashed = true},
 			how);
 	}
+}
+
+/*
+ * The worker found that the disk has damaged something of the scan. The store looks at all of it, and the job waits for
+ * that and for what is to be sent again. Where time and again the store finds nothing, this worker's memory or its
+ * machine's is at fault: that is a crash like any other.
+ */
+static void lose_input(struct supervise *supervise, struct worker *worker, const char *text)
+{
+	struct job_facts facts;
+	struct scan_facts scan = {0};
+	struct error err;
+
+	job_facts(worker->job, &facts);
+	store_scan_look(jobs_store(supervise->jobs), facts.scan, &scan, &err);
+	if (job_doubt(worker->job, scan.losses) >= CRASHES_MAX) {
+		end_job(supervise, worker, (struct ending){.to = JOB_FAILED, .error_code = ERR_DAMAGED}, text);
+		return;
+	}
+	store_scan_suspect(jobs_store(supervise->jobs), facts.scan);
+	end_job(supervise, worker, (struct ending){.to = JOB_WAITING}, text);
 }
 
 /* The worker said how its job ended. */
@@ -412,8 +435,11 @@ static void job_ended(struct supervise *supervise, struct worker *worker, const 
 		job_hold(worker->job, JOB_DISK_TROUBLE, now_monotonic() + RETRY * (1 << record.crashes % CRASHES_MAX),
 			 0);
 		lose_job(supervise, worker, ERR_IO, message->text);
+	} else if (message->code == ERR_DAMAGED) {
+		lose_input(supervise, worker, message->text);
 	} else if (message->code == ERR_INVALID && worker->checkpoint > 0) {
-		end_job(supervise, worker, (struct ending){.to = JOB_QUEUED, .crashed = true},
+		job_add_warning(worker->job, "damaged_checkpoint", message->text, &failed);
+		end_job(supervise, worker, (struct ending){.to = JOB_QUEUED},
 			"its checkpoint is damaged or gone: from the start");
 	} else {
 		end_job(supervise, worker, (struct ending){.to = JOB_FAILED, .error_code = message->code},
@@ -801,6 +827,7 @@ static int begin_job(struct supervise *supervise, struct worker *worker, struct 
 		return code;
 	}
 	worker->basis = facts->basis;
+	worker->losses = facts->losses;
 	begin(supervise, worker, job, record, message);
 	if (!arriving) {
 		stored_scan_release(scan);
@@ -828,6 +855,15 @@ static int give_job(struct supervise *supervise, struct worker *worker, struct j
 		return error_set_errno(err, ENOMEM, "message");
 	job_record(job, &record);
 	code = make_start(supervise, &record, message, &scan, &facts, &why);
+	/* It has lost something since the job was queued. */
+	if (code == 0 && !arriving && !facts.ready) {
+		message_clear(message);
+		free(message);
+		stored_scan_release(scan);
+		change = (struct job_change){.reason = "its scan has lost something to the disk"};
+		code = job_set_state(job, JOB_WAITING, &change, err);
+		return code == ERR_CONFLICT ? 0 : code;
+	}
 	if (code != 0)
 		store_distrust(jobs_store(supervise->jobs), &why);
 	if (code == ERR_NO_SPACE || code == ERR_NO_MEMORY || code == ERR_SYNC) {

@@ -48,18 +48,25 @@ static int hash_slot(struct slot *slot, struct error *err)
 	return 0;
 }
 
-static int compare_with_stored(struct slot *slot, struct error *err)
+/*
+ * Against what the disk holds, not only what it is said to hold. *ret_lost: that is damaged, so that the projection can
+ * be claimed after all.
+ */
+static int compare_with_stored(struct slot *slot, bool *ret_lost, struct error *err)
 {
-	struct sum stored;
+	struct stored_scan *scan = slot->upload->scan;
+	unsigned char *stored = malloc(slot->size);
+	struct sum sum;
+	int code = stored == NULL ? error_set(err, ERR_NO_MEMORY, "no memory for a projection of %zu bytes", slot->size)
+				  : stored_scan_read(scan, slot->upload->descriptor, slot->index, stored, &sum, err);
 
-	if (hash_slot(slot, err) != 0)
-		return err->code;
-	if (!stored_scan_sum(slot->upload->scan, slot->index, &stored))
-		return error_set(err, ERR_NOT_FOUND, "the scan was deleted meanwhile");
-	if (memcmp(stored.sha256, slot->sum.sha256, sizeof(stored.sha256)) != 0)
-		return error_set(err, ERR_CONFLICT, "projection %d is stored already, with other bytes", slot->index);
-	slot->outcome = SLOT_SAME;
-	return 0;
+	*ret_lost = code == ERR_DAMAGED || code == ERR_NOT_FOUND;
+	if (code == 0 && memcmp(stored, slot->data, slot->size) != 0)
+		code = error_set(err, ERR_CONFLICT, "projection %d is stored already, with other bytes", slot->index);
+	if (code == 0)
+		slot->outcome = SLOT_SAME;
+	free(stored);
+	return *ret_lost ? 0 : code;
 }
 
 /* Another request has the claim: waits for its outcome, though not for ever. */
@@ -97,11 +104,16 @@ static int write_claimed(struct slot *slot, struct error *err)
 static int process_projection(struct slot *slot, struct error *err)
 {
 	enum claim claim;
+	bool lost = true;
 
-	if (stored_scan_claim(slot->upload->scan, slot->index, &claim, err) != 0)
-		return err->code;
+	do {
+		if (stored_scan_claim(slot->upload->scan, slot->index, &claim, err) != 0)
+			return err->code;
+		if (claim == CLAIM_STORED && compare_with_stored(slot, &lost, err) != 0)
+			return err->code;
+	} while (claim == CLAIM_STORED && lost);
 	if (claim == CLAIM_STORED)
-		return compare_with_stored(slot, err);
+		return 0;
 	return claim == CLAIM_BUSY ? park(slot, err) : write_claimed(slot, err);
 }
 

@@ -317,6 +317,7 @@ static int run_job(struct worker *worker, const struct message *start, struct er
 					  .on_settled = on_settled,
 					  .on_open = on_open};
 	struct spool_options options = {.scan_directory = start->scan_directory,
+					.checked = true,
 					.out_directory = start->job_directory,
 					.recipe = &start->request.recipe,
 					.program = CBCTD_PROGRAM,

@@ -19,6 +19,7 @@
 #include "proto/format.h"
 #include "proto/nifti.h"
 #include "proto/saver.h"
+#include "proto/sums.h"
 
 _Static_assert((int)SPOOL_VOLUME_OFFSET == (int)NIFTI_VOXELS, "a NIfTI-1 header and its extension");
 
@@ -110,7 +111,39 @@ static int join(char *ret_path, size_t size, const char *directory, const char *
 	return 0;
 }
 
-static int read_scan(const char *directory, struct scan **ret_scan, struct error *err)
+/* *ret_sums -1: there is none. */
+static int open_sums(const char *directory, int *ret_sums, struct error *err)
+{
+	struct error why;
+	bool whole;
+	int code = sums_open(directory, false, 0, 0, ret_sums, &whole, &why);
+
+	if (code == ERR_NOT_FOUND) {
+		*ret_sums = -1;
+		return 0;
+	}
+	if (code != 0)
+		*err = why;
+	return code;
+}
+
+/* A whole file against its record; bytes NULL: there is no such file. */
+static int check_part(int sums, enum sums_part part, const char *name, const void *bytes, size_t size,
+		      struct error *err)
+{
+	unsigned char state = SUM_NONE;
+	struct sum sum;
+	int code = sums < 0 ? 0 : sums_get(sums, part, 1, 0, &sum, &state, err);
+
+	if (sums < 0 || code != 0 || (state == SUM_NONE && bytes == NULL))
+		return code;
+	if (state == SUM_GOOD && !sum.lost && bytes != NULL && sum.bytes == size && sum.crc == checksum(0, bytes, size))
+		return 0;
+	return error_set(err, ERR_DAMAGED, "%s of the scan is damaged: it does not fit its record in %s", name,
+			 SUMS_FILE);
+}
+
+static int read_scan(const char *directory, int sums, struct scan **ret_scan, struct error *err)
 {
 	char path[PATH_MAX], *text = NULL;
 	size_t length = 0;
@@ -118,6 +151,8 @@ static int read_scan(const char *directory, struct scan **ret_scan, struct error
 
 	if (code == 0)
 		code = file_read(path, JSON_BYTES_MAX, &text, &length, err);
+	if (code == 0)
+		code = check_part(sums, SUMS_SCAN, "scan.json", text, length, err);
 	if (code == 0)
 		code = scan_parse(text, length, ret_scan, err);
 	free(text);
@@ -176,11 +211,17 @@ static int read_image(const char *directory, const char *name, size_t size, cons
 static int read_images(const char *directory, struct scan_files *files, struct error *err)
 {
 	static const char *const names[] = {"flat.f32", "dark.f32", "defects.u8"};
+	size_t pixels = (size_t)files->scan->geometry.columns * (size_t)files->scan->geometry.rows;
 	void *images[3] = {NULL};
 	int code = 0;
 
-	for (int i = 0; i < 3 && code == 0; i++)
-		code = read_image(directory, names[i], i < 2 ? sizeof(float) : 1, files->scan, &images[i], err);
+	for (int i = 0; i < 3 && code == 0; i++) {
+		size_t size = i < 2 ? sizeof(float) : 1;
+
+		code = read_image(directory, names[i], size, files->scan, &images[i], err);
+		if (code == 0)
+			code = check_part(files->sums, SUMS_FLAT + i, names[i], images[i], pixels * size, err);
+	}
 	files->flat = images[0];
 	files->dark = images[1];
 	files->defects = images[2];
@@ -189,9 +230,11 @@ static int read_images(const char *directory, struct scan_files *files, struct e
 
 int scan_files_open(const char *directory, struct scan_files *ret_files, struct error *err)
 {
-	struct scan_files files = {.projections = -1};
-	int code = read_scan(directory, &files.scan, err);
+	struct scan_files files = {.projections = -1, .sums = -1};
+	int code = open_sums(directory, &files.sums, err);
 
+	if (code == 0)
+		code = read_scan(directory, files.sums, &files.scan, err);
 	if (code == 0)
 		code = open_projections(directory, files.scan, &files.projections, err);
 	if (code == 0)
@@ -210,10 +253,12 @@ void scan_files_close(struct scan_files *files)
 	scan_free(files->scan);
 	if (files->projections >= 0)
 		close(files->projections);
+	if (files->sums >= 0)
+		close(files->sums);
 	free(files->flat);
 	free(files->dark);
 	free(files->defects);
-	*files = (struct scan_files){.projections = -1};
+	*files = (struct scan_files){.projections = -1, .sums = -1};
 }
 
 /* ---- the pipeline ---- */
@@ -700,8 +745,10 @@ int spool_open(const struct backend *backend, struct device *device, const struc
 					    .row = run_row,
 					    .keep = run_keep,
 					    .warning = run_warning};
-	spool->files.projections = -1;
+	spool->files.projections = spool->files.sums = -1;
 	code = scan_files_open(options->scan_directory, &spool->files, err);
+	if (code == 0 && options->checked && spool->files.sums < 0)
+		code = error_set(err, ERR_DAMAGED, "the scan has no %s", SUMS_FILE);
 	if (code == 0)
 		code = set_provenance(spool, options, err);
 	if (code == 0)
@@ -745,29 +792,91 @@ int spool_wanted(const struct spool *spool)
 	return spool->files.scan->count;
 }
 
-/* One core reads a fifth of what the page cache gives. */
-static int read_views(int file, char *ret_to, size_t size, size_t offset, struct error *err)
+/* A part of one projection, read and summed by one core while it is in that core's cache. */
+struct piece {
+	size_t first, size; /* bytes within the run */
+	uint32_t crc;
+	struct error error; /* code 0: it is there */
+};
+
+/* One core reads a fifth of what the page cache gives, and sums half as fast as it reads. */
+static void read_pieces(int file, char *ret_to, size_t offset, struct piece *pieces, int count)
 {
-	enum { STRIPES = 8, STRIPE_LEAST = 256 << 10 };
-	size_t each = (size + STRIPES - 1) / STRIPES;
-	struct error errors[STRIPES] = {{0}};
-	int count;
+	enum { THREADS = 16 };
 
-	if (each < STRIPE_LEAST)
-		each = STRIPE_LEAST;
-	count = (int)((size + each - 1) / each);
-#pragma omp parallel for num_threads(count) schedule(static)
+#pragma omp parallel for num_threads(count < THREADS ? count : THREADS) schedule(dynamic)
 	for (int i = 0; i < count; i++) {
-		size_t first = each * (size_t)i, some = size - first < each ? size - first : each;
+		struct piece *piece = &pieces[i];
 
-		file_read_at(file, ret_to + first, some, offset + first, "projections.raw", &errors[i]);
+		if (file_read_at(file, ret_to + piece->first, piece->size, offset + piece->first, "projections.raw",
+				 &piece->error) == 0)
+			piece->crc = checksum(0, ret_to + piece->first, piece->size);
 	}
-	for (int i = 0; i < count; i++)
-		if (errors[i].code != 0) {
-			*err = errors[i];
+}
+
+static int join_pieces(const struct piece *pieces, int count, uint32_t *ret_crc, struct error *err)
+{
+	uint32_t crc = 0;
+
+	for (int i = 0; i < count; i++) {
+		if (pieces[i].error.code != 0) {
+			*err = pieces[i].error;
 			return err->code;
 		}
+		crc = checksum_join(crc, pieces[i].crc, pieces[i].size);
+	}
+	*ret_crc = crc;
 	return 0;
+}
+
+static int check_projection(const struct sum *sum, enum sum_state state, int projection, uint32_t crc,
+			    struct error *err)
+{
+	if (state != SUM_GOOD || sum->lost)
+		return error_set(err, ERR_DAMAGED,
+				 "projection %d has no record in %s: it was never received, or the record is damaged",
+				 projection, SUMS_FILE);
+	if (sum->crc != crc)
+		return error_set(err, ERR_DAMAGED, "projection %d is damaged: its samples do not fit their checksum",
+				 projection);
+	return 0;
+}
+
+/* `count` neighbours from `first` on, at most a batch. */
+static int read_run(struct spool *spool, int first, int count, char *ret_to, struct error *err)
+{
+	enum { PIECE = 512 << 10 };
+	size_t bytes = scan_projection_bytes(spool->files.scan);
+	int each = (int)((bytes + PIECE - 1) / PIECE), code = 0;
+	struct piece *pieces = calloc((size_t)count * (size_t)each, sizeof(*pieces));
+	struct sum *sums = calloc((size_t)count, sizeof(*sums));
+	unsigned char *states = calloc((size_t)count, 1);
+
+	if (pieces == NULL || sums == NULL || states == NULL) {
+		code = error_set(err, ERR_NO_MEMORY, "no memory for checksums");
+		goto out;
+	}
+	for (int i = 0; i < count * each; i++) {
+		size_t at = (size_t)(i % each) * PIECE;
+
+		pieces[i].first = (size_t)(i / each) * bytes + at;
+		pieces[i].size = bytes - at < PIECE ? bytes - at : PIECE;
+	}
+	read_pieces(spool->files.projections, ret_to, (size_t)first * bytes, pieces, count * each);
+	if (spool->files.sums >= 0)
+		code = sums_get(spool->files.sums, first, count, bytes, sums, states, err);
+	for (int i = 0; i < count && code == 0; i++) {
+		uint32_t crc = 0;
+
+		code = join_pieces(pieces + i * each, each, &crc, err);
+		if (code == 0 && spool->files.sums >= 0)
+			code = check_projection(&sums[i], states[i], first + i, crc, err);
+	}
+out:
+	free(pieces);
+	free(sums);
+	free(states);
+	return code;
 }
 
 /* Into samples, neighbours in the file in one go. */
@@ -779,8 +888,7 @@ static int read_projections(struct spool *spool, const int *projections, int cou
 	for (int first = 0, next; first < count && code == 0; first = next) {
 		for (next = first + 1; next < count && projections[next] == projections[next - 1] + 1;)
 			next++;
-		code = read_views(spool->files.projections, spool->samples + (size_t)first * bytes,
-				  (size_t)(next - first) * bytes, (size_t)projections[first] * bytes, err);
+		code = read_run(spool, projections[first], next - first, spool->samples + (size_t)first * bytes, err);
 	}
 	return code;
 }

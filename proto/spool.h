@@ -43,13 +43,15 @@ int file_write_durable(const char *path, const void *data, size_t length, struct
 struct scan_files {
 	struct scan *scan;
 	int projections;    /* descriptor */
+	int sums;           /* descriptor of projections.sums, -1: there is none, and nothing is checked */
 	float *flat, *dark; /* [row][column] or NULL */
 	unsigned char *defects;
 };
 /*
  * Reads scan.json and the images and checks that every file is as long as the
- * scan says; whether all projections have arrived only the owner of the
- * directory knows. ERR_NOT_FOUND where a file is missing.
+ * scan says, and that it fits its record where there is projections.sums;
+ * whether all projections have arrived only the owner of the directory knows.
+ * ERR_NOT_FOUND where a file is missing, ERR_DAMAGED where one does not fit.
  */
 int scan_files_open(const char *directory, struct scan_files *ret_files, struct error *err);
 void scan_files_close(struct scan_files *files); /* NULL and a closed one are fine */
@@ -82,6 +84,7 @@ struct spool_hooks {
 /* What is to be reconstructed; all of it is borrowed until spool_close. */
 struct spool_options {
 	const char *scan_directory, *out_directory;
+	bool checked; /* the scan directory must have projections.sums: ERR_DAMAGED without */
 	/* A flag for each projection of scan.json: those that make up the scan, the others never come. NULL: all. */
 	const unsigned char *present;
 	const struct recipe *recipe;
@@ -110,7 +113,8 @@ int spool_wanted(const struct spool *spool);
 /*
  * Reads these projections and reconstructs as far as they go, in this order: the
  * same order gives the same bits, however many a call brings. Each once
- * (ERR_CONFLICT), and only those that are present (ERR_INVALID).
+ * (ERR_CONFLICT), and only those that are present (ERR_INVALID). ERR_DAMAGED:
+ * one does not fit its checksum, and none of it was used.
  */
 int spool_push(struct spool *spool, const int *projections, int count, struct error *err);
 /* All that have not been pushed, by their numbers. */

@@ -16,9 +16,9 @@
  *   byte 512 + 64 k   the record of projection k
  *
  * A record has 64 bytes, little-endian: SHA-256 of the bytes [32], their CRC-32 [4], its slot [4], how many bytes they
- * are [8], order of arrival [8], zeros [4], CRC-32 of the 60 bytes before [4]. All zeros: there is none. Any other
- * record whose check, slot or number of bytes is wrong is torn or damaged and stands for nothing. Records lie within
- * one sector, so a power cut leaves the old one or the new one.
+ * are [8], order of arrival [8], 1 where they were found damaged [4], CRC-32 of the 60 bytes before [4]. All zeros:
+ * there is none. Any other record whose check, slot or number of bytes is wrong is torn or damaged and stands for
+ * nothing. Records lie within one sector, so a power cut leaves the old one or the new one.
  *
  * A record is written and synced together with the bytes that it describes, before either is acknowledged. So a record
  * that is good says what was acknowledged, and the bytes are checked against it whenever they are read: CRC-32 (zlib's)
@@ -44,6 +44,7 @@ struct sum {
 	uint32_t crc;
 	uint64_t bytes;
 	uint64_t order; /* of arrival: grows within a scan, gaps are fine */
+	bool lost;      /* the bytes were found damaged: they are to be sent again */
 };
 
 enum sum_state { SUM_NONE, SUM_GOOD, SUM_DAMAGED };
@@ -51,11 +52,15 @@ enum sum_state { SUM_NONE, SUM_GOOD, SUM_DAMAGED };
 /* CRC-32 of `before` and these bytes behind it; 0 is that of nothing. */
 uint32_t checksum(uint32_t before, const void *data, size_t bytes);
 
+/* Of `bytes` bytes with the checksum `after` behind others with `before`. */
+uint32_t checksum_join(uint32_t before, uint32_t after, size_t bytes);
+
 /* The file with all records blank, durably; one that was there is replaced. */
 int sums_create(const char *directory, int count, size_t projection_bytes, struct error *err);
 /*
  * A descriptor, the caller's to close. ERR_NOT_FOUND where there is no file, ERR_INVALID where it is another scan's. A
  * line that is damaged is passed over (*ret_whole false, as when the file is too short): the records check themselves.
+ * count 0: not known yet, any line will do.
  */
 int sums_open(const char *directory, bool writing, int count, size_t projection_bytes, int *ret_file, bool *ret_whole,
 	      struct error *err);

@@ -4,6 +4,7 @@
 #include <check.h>
 #include <fcntl.h>
 #include <ftw.h>
+#include <openssl/evp.h>
 #include <stdarg.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -111,11 +112,18 @@ struct stored_scan *state_scan(struct state *state, int count, bool intensity)
 	return stored;
 }
 
+void state_digest(int mark, uint8_t ret_sha256[32])
+{
+	float pixels[12] = {(float)mark};
+
+	EVP_Digest(pixels, sizeof(pixels), ret_sha256, NULL, EVP_sha256(), NULL);
+}
+
 void state_put(struct state *state, struct stored_scan *scan, int first, int last, int mark)
 {
 	struct received_projection batch[64];
 	struct error err = {0};
-	float pixels[12] = {1};
+	float pixels[12] = {(float)mark};
 	enum claim claim;
 	int file, sums, count = last - first + 1;
 
@@ -130,7 +138,7 @@ void state_put(struct state *state, struct stored_scan *scan, int first, int las
 		batch[i] = (struct received_projection){.scan = scan, .index = first + i};
 		batch[i].sum.crc = checksum(0, pixels, sizeof(pixels));
 		batch[i].sum.bytes = sizeof(pixels);
-		memset(batch[i].sum.sha256, mark, sizeof(batch[i].sum.sha256));
+		state_digest(mark, batch[i].sum.sha256);
 		ck_assert_int_eq(stored_scan_put_sum(&batch[i], sums, (uint64_t)++state->turns, &err), 0);
 	}
 	ck_assert_int_eq(fdatasync(file), 0);

@@ -25,7 +25,8 @@ void path_fill(const char *path); /* a file of a few bytes */
 
 /* A scan of `count` projections of 4 x 3 pixels; intensity: without air. */
 struct stored_scan *state_scan(struct state *state, int count, bool intensity);
-/* Claims, writes, syncs and records projections first .. last with their checksums, digest bytes all `mark`. */
+/* Claims, writes, syncs and records projections first .. last, whose first pixel is `mark`, with their checksums. */
+void state_digest(int mark, uint8_t ret_sha256[32]); /* of one of them */
 void state_put(struct state *state, struct stored_scan *scan, int first, int last, int mark);
 /* FDK and two SART iterations. */
 struct job *state_post(struct state *state, struct stored_scan *scan, const char *priority);

@@ -78,7 +78,7 @@ static int rows_of(const char *id)
 START_TEST(the_table_of_transitions_is_the_contracts)
 {
 	/* rows: from, columns: to; waiting, queued, running, succeeded, failed, cancelled */
-	static const char *const expected[JOB_STATE_COUNT] = {"wqr.fc", "..r.fc", ".q.sfc",
+	static const char *const expected[JOB_STATE_COUNT] = {"wqr.fc", "w.r.fc", "wq.sfc",
 							      "......", "......", "......"};
 
 	for (int from = 0; from < JOB_STATE_COUNT; from++)

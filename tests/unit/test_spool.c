@@ -180,12 +180,12 @@ static const struct {
     {"write", SYS_write, EIO, PART, ERR_IO, false},
     {"fallocate", SYS_fallocate, ENOSPC, 0, ERR_NO_SPACE, false},
     {"fallocate", SYS_fallocate, EOPNOTSUPP, 0, 0, true}, /* a file system that cannot is none the worse */
-    {"fdatasync", SYS_fdatasync, EIO, 0, ERR_IO, false},
+    {"fdatasync", SYS_fdatasync, EIO, 0, ERR_SYNC, false},
     {"fdatasync", SYS_fdatasync, ENOSPC, 0, ERR_NO_SPACE, false},
 #ifdef SYS_rename
     {"rename", SYS_rename, EIO, 0, ERR_IO, false},
 #endif
-    {"fsync of the directory", SYS_fsync, EIO, 0, ERR_IO, true}, /* there, but nobody may rely on it */
+    {"fsync of the directory", SYS_fsync, EIO, 0, ERR_SYNC, true}, /* there, but nobody may rely on it */
 };
 
 enum { FAULT_RIGHT, FAULT_WRONG, FAULT_UNABLE };
@@ -402,10 +402,10 @@ static const struct {
 #ifdef SYS_rename
     {"rename", SYS_rename, EIO, ERR_IO, false},
 #endif
-    {"fdatasync", SYS_fdatasync, EIO, ERR_IO, true},
+    {"fdatasync", SYS_fdatasync, EIO, ERR_SYNC, true},
     {"fdatasync", SYS_fdatasync, ENOSPC, ERR_NO_SPACE, true},
-    {"fsync of the directory", SYS_fsync, EIO, ERR_IO, true},
-    {"sync_file_range", SYS_sync_file_range, EIO, ERR_IO, true},
+    {"fsync of the directory", SYS_fsync, EIO, ERR_SYNC, true},
+    {"sync_file_range", SYS_sync_file_range, EIO, ERR_SYNC, true},
     {"sync_file_range", SYS_sync_file_range, ENOSYS, 0, true}, /* a kernel that cannot */
 };
 

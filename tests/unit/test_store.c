@@ -1,6 +1,7 @@
 /* What was acknowledged is there after a restart, and nothing else is. */
 #include <check.h>
 #include <errno.h>
+#include <fcntl.h>
 #include <signal.h>
 #include <sqlite3.h>
 #include <stdio.h>
@@ -12,6 +13,7 @@
 
 #include "daemon/files.h"
 #include "daemon/store_pages.h"
+#include "proto/spool.h"
 #include "tests/unit/state.h"
 
 static struct state state;
@@ -48,6 +50,7 @@ START_TEST(projections_are_known_again_after_a_restart)
 	struct stored_scan *scan = state_scan(&state, 10, false);
 	unsigned char flags[10];
 	struct sum sum;
+	uint8_t digest[32];
 	char id[ID_SIZE];
 
 	memcpy(id, stored_scan_id(scan), sizeof(id));
@@ -59,8 +62,8 @@ START_TEST(projections_are_known_again_after_a_restart)
 	stored_scan_received(scan, flags);
 	ck_assert_mem_eq(flags, ((unsigned char[]){1, 0, 0, 0, 0, 0, 0, 1, 1, 0}), 10);
 	ck_assert(stored_scan_sum(scan, 8, &sum));
-	for (int i = 0; i < 32; i++)
-		ck_assert_uint_eq(sum.sha256[i], 0xab);
+	state_digest(0xab, digest);
+	ck_assert_mem_eq(sum.sha256, digest, 32);
 	ck_assert(!stored_scan_sum(scan, 9, &sum));
 	ck_assert_int_eq(facts_of(scan).received, 3);
 	ck_assert(!facts_of(scan).complete);
@@ -246,17 +249,270 @@ START_TEST(a_lost_catalogue_does_not_take_the_scans_with_it)
 }
 END_TEST
 
-START_TEST(a_scan_whose_files_are_gone_says_so)
+/* The catalogue forgets; no daemon runs. */
+static void change_catalogue(const char *statement)
 {
-	struct stored_scan *scan = state_scan(&state, 2, false);
+	struct pages *pages;
+	struct error err = {0};
+	sqlite3 *db;
+
+	state_close(&state);
+	ck_assert_int_eq(pages_new(&pages, &err), 0);
+	ck_assert_int_eq(
+	    sqlite3_open_v2(state_path(&state, "catalogue.sqlite"), &db, SQLITE_OPEN_READWRITE, pages_vfs(pages)),
+	    SQLITE_OK);
+	ck_assert_int_eq(sqlite3_exec(db, statement, NULL, NULL, NULL), SQLITE_OK);
+	sqlite3_close(db);
+	pages_free(pages);
+	state_reopen(&state);
+}
+
+/* Until the store's thread has held the scan's files against their checksums. */
+static void await_check(struct stored_scan *scan)
+{
+	for (int i = 0; i < 1000 && !facts_of(scan).checked; i++)
+		usleep(10000);
+	ck_assert(facts_of(scan).checked);
+}
+
+static void flip_bit(const char *path, off_t bit)
+{
+	int file = open(path, O_RDWR | O_CLOEXEC);
+	unsigned char byte;
+
+	ck_assert_int_ge(file, 0);
+	ck_assert_int_eq(pread(file, &byte, 1, bit / 8), 1);
+	byte ^= (unsigned char)(1 << bit % 8);
+	ck_assert_int_eq(pwrite(file, &byte, 1, bit / 8), 1);
+	close(file);
+}
+
+static int read_projection(struct stored_scan *scan, int index)
+{
+	float pixels[12];
+	struct error err = {0};
+	struct sum sum;
+	int file, code;
+
+	ck_assert_int_eq(stored_scan_open(scan, false, &file, &err), 0);
+	code = stored_scan_read(scan, file, index, pixels, &sum, &err);
+	close(file);
+	return code;
+}
+
+START_TEST(projections_whose_file_is_cut_off_are_missing)
+{
+	struct stored_scan *scan = state_scan(&state, 4, false);
+	unsigned char flags[4];
+	struct stat status;
 	char id[ID_SIZE];
 
 	memcpy(id, stored_scan_id(scan), sizeof(id));
+	state_put(&state, scan, 0, 2, 1);
 	stored_scan_release(scan);
-	ck_assert_int_eq(truncate(state_path(&state, "scans/%s/projections.raw", id), 5), 0);
+	state_close(&state);
+	ck_assert_int_eq(truncate(state_path(&state, "scans/%s/projections.raw", id), 1 * 48 + 2), 0);
 	state_reopen(&state);
 	scan = find(id);
-	ck_assert(facts_of(scan).damaged);
+	await_check(scan);
+	stored_scan_received(scan, flags);
+	ck_assert_mem_eq(flags, ((unsigned char[]){1, 0, 0, 0}), 4);
+	ck_assert_int_eq(facts_of(scan).lost, 2);
+	ck_assert_int_eq(stat(state_path(&state, "scans/%s/projections.raw", id), &status), 0);
+	ck_assert_int_eq(status.st_size, 4 * 48);
+	state_put(&state, scan, 1, 3, 1);
+	ck_assert(facts_of(scan).ready);
+	stored_scan_release(scan);
+}
+END_TEST
+
+START_TEST(a_damaged_projection_is_missing_until_it_is_sent_again)
+{
+	struct stored_scan *scan = state_scan(&state, 4, false);
+	unsigned char flags[4];
+	struct error err = {0};
+	char id[ID_SIZE];
+	int order[4];
+
+	memcpy(id, stored_scan_id(scan), sizeof(id));
+	state_put(&state, scan, 3, 3, 1);
+	state_put(&state, scan, 0, 2, 2);
+	ck_assert_int_eq(read_projection(scan, 0), 0);
+	flip_bit(state_path(&state, "scans/%s/projections.raw", id), 8 * 48 * 1 + 77);
+	ck_assert_int_eq(read_projection(scan, 0), 0);
+	ck_assert_int_eq(read_projection(scan, 1), ERR_DAMAGED);
+	ck_assert_int_eq(read_projection(scan, 1), ERR_NOT_FOUND);
+	for (int starts = 0; starts < 2; starts++) {
+		stored_scan_received(scan, flags);
+		ck_assert_mem_eq(flags, ((unsigned char[]){1, 0, 1, 1}), 4);
+		ck_assert(!facts_of(scan).complete && !facts_of(scan).ready);
+		ck_assert_int_eq(facts_of(scan).lost, 1);
+		ck_assert_int_eq(stored_scan_arrivals(scan, 0, order, 4), 3);
+		ck_assert_mem_eq(order, ((int[]){3, 0, 2}), 3 * sizeof(int));
+		stored_scan_release(scan);
+		state_reopen(&state);
+		scan = find(id);
+	}
+	state_put(&state, scan, 1, 1, 2);
+	ck_assert(facts_of(scan).ready);
+	ck_assert_int_eq(facts_of(scan).lost, 0);
+	ck_assert_int_eq(read_projection(scan, 1), 0);
+	ck_assert_int_eq(store_scan_close(state.store, scan, &err), 0); /* nothing to do */
+	ck_assert(!facts_of(scan).closed);
+	stored_scan_release(scan);
+}
+END_TEST
+
+START_TEST(a_closed_scan_waits_for_what_was_damaged_and_takes_nothing_else)
+{
+	struct stored_scan *scan = state_scan(&state, 6, false);
+	struct error err = {0};
+	enum claim claim;
+	char id[ID_SIZE];
+
+	memcpy(id, stored_scan_id(scan), sizeof(id));
+	state_put(&state, scan, 0, 3, 1);
+	ck_assert_int_eq(store_scan_close(state.store, scan, &err), 0);
+	ck_assert(facts_of(scan).ready);
+	flip_bit(state_path(&state, "scans/%s/projections.raw", id), 8 * 48 * 2);
+	ck_assert_int_eq(read_projection(scan, 2), ERR_DAMAGED);
+	for (int starts = 0; starts < 2; starts++) {
+		ck_assert(facts_of(scan).closed && !facts_of(scan).complete);
+		ck_assert_int_eq(stored_scan_measured(scan)->count, 4); /* of which one is to come again */
+		ck_assert_int_eq(stored_scan_claim(scan, 5, &claim, &err), ERR_CONFLICT);
+		ck_assert_int_eq(store_scan_close(state.store, scan, &err), ERR_CONFLICT);
+		stored_scan_release(scan);
+		state_reopen(&state);
+		scan = find(id);
+	}
+	state_put(&state, scan, 2, 2, 1);
+	ck_assert(facts_of(scan).ready);
+	stored_scan_release(scan);
+}
+END_TEST
+
+START_TEST(a_scan_may_be_completed_without_what_was_damaged)
+{
+	struct stored_scan *scan = state_scan(&state, 6, false);
+	struct error err = {0};
+	enum claim claim;
+	char id[ID_SIZE];
+
+	memcpy(id, stored_scan_id(scan), sizeof(id));
+	state_put(&state, scan, 0, 3, 1);
+	flip_bit(state_path(&state, "scans/%s/projections.raw", id), 8 * 48 * 2);
+	ck_assert_int_eq(read_projection(scan, 2), ERR_DAMAGED);
+	ck_assert_int_eq(store_scan_close(state.store, scan, &err), 0);
+	for (int starts = 0; starts < 2; starts++) {
+		ck_assert(facts_of(scan).ready);
+		ck_assert_int_eq(facts_of(scan).received, 3);
+		ck_assert_int_eq(stored_scan_measured(scan)->count, 3);
+		ck_assert_int_eq(stored_scan_claim(scan, 2, &claim, &err), ERR_CONFLICT);
+		stored_scan_release(scan);
+		state_reopen(&state);
+		scan = find(id);
+	}
+	stored_scan_release(scan);
+}
+END_TEST
+
+START_TEST(a_damaged_image_is_to_be_sent_again)
+{
+	static const char *const files[IMAGE_COUNT] = {"flat.f32", "dark.f32", "defects.u8"};
+	struct stored_scan *scan = state_scan(&state, 2, true);
+	unsigned char map[12] = {0, 1};
+	float pixels[12] = {3};
+	struct error err = {0};
+	char id[ID_SIZE];
+	bool new;
+
+	memcpy(id, stored_scan_id(scan), sizeof(id));
+	state_put(&state, scan, 0, 1, 1);
+	for (int i = 0; i < IMAGE_COUNT; i++)
+		ck_assert_int_eq(
+		    store_put_image(state.store, scan, i, i == IMAGE_DEFECTS ? (void *)map : pixels, &new, &err), 0);
+	for (int i = 0; i < IMAGE_COUNT; i++) {
+		const void *image = i == IMAGE_DEFECTS ? (void *)map : pixels;
+		unsigned basis = facts_of(scan).basis;
+
+		ck_assert(facts_of(scan).ready);
+		ck_assert_int_eq(store_put_image(state.store, scan, i, image, &new, &err), 0);
+		ck_assert(!new);
+		flip_bit(state_path(&state, "scans/%s/%s", id, files[i]), 20);
+		store_scan_suspect(state.store, id);
+		await_check(scan);
+		for (int starts = 0; starts < 2; starts++) {
+			ck_assert(facts_of(scan).lost_image[i]);
+			ck_assert(facts_of(scan).complete && !facts_of(scan).convertible && !facts_of(scan).ready);
+			ck_assert_uint_eq(facts_of(scan).basis, basis);
+			stored_scan_release(scan);
+			state_reopen(&state);
+			scan = find(id);
+			await_check(scan);
+		}
+		ck_assert_int_eq(store_put_image(state.store, scan, i, image, &new, &err), 0);
+		ck_assert(new &&facts_of(scan).ready);
+		ck_assert_uint_eq(facts_of(scan).basis, basis);
+		flip_bit(state_path(&state, "scans/%s/%s", id, files[i]), 40); /* a PUT looks at the disk */
+		ck_assert_int_eq(store_put_image(state.store, scan, i, image, &new, &err), 0);
+		ck_assert(new &&facts_of(scan).ready);
+	}
+	stored_scan_release(scan);
+}
+END_TEST
+
+START_TEST(a_damaged_document_is_told_and_never_used)
+{
+	struct stored_scan *scan = state_scan(&state, 2, false), *found = NULL;
+	struct error err = {0};
+	char id[ID_SIZE], *text;
+	size_t length;
+
+	memcpy(id, stored_scan_id(scan), sizeof(id));
+	stored_scan_release(scan);
+	ck_assert_int_eq(file_read(state_path(&state, "scans/%s/scan.json", id), 100000, &text, &length, &err), 0);
+	state_close(&state);
+	/* Another number, and JSON all the same. */
+	flip_bit(state_path(&state, "scans/%s/scan.json", id), 8 * (strstr(text, "\"count\":2") + 8 - text));
+	state_reopen(&state);
+	ck_assert_int_eq(store_scan_find(state.store, id, &found, &err), ERR_DAMAGED);
+	ck_assert_ptr_nonnull(strstr(err.text, "scan.json"));
+	ck_assert_int_eq(store_scan_refer(state.store, id, &found, &err), 0);
+	ck_assert_int_eq(store_scan_delete(state.store, found, &err), 0);
+	stored_scan_release(found);
+	free(text);
+}
+END_TEST
+
+START_TEST(what_an_earlier_version_stored_is_checked_against_the_catalogue)
+{
+	struct stored_scan *scan = state_scan(&state, 4, true);
+	float pixels[12] = {3};
+	struct error err = {0};
+	unsigned char flags[4];
+	struct sum sum;
+	char id[ID_SIZE];
+	bool new;
+
+	memcpy(id, stored_scan_id(scan), sizeof(id));
+	state_put(&state, scan, 0, 3, 5);
+	ck_assert_int_eq(store_put_image(state.store, scan, IMAGE_FLAT, pixels, &new, &err), 0);
+	stored_scan_release(scan);
+	state_close(&state);
+	ck_assert_int_eq(unlink(state_path(&state, "scans/%s/projections.sums", id)), 0);
+	flip_bit(state_path(&state, "scans/%s/projections.raw", id), 8 * 48 * 2 + 3);
+	state_reopen(&state);
+	scan = find(id);
+	await_check(scan);
+	stored_scan_received(scan, flags);
+	ck_assert_mem_eq(flags, ((unsigned char[]){1, 1, 0, 1}), 4);
+	ck_assert(stored_scan_sum(scan, 1, &sum));
+	ck_assert_uint_eq(sum.bytes, 48);
+	stored_scan_release(scan);
+	change_catalogue("DELETE FROM projections; UPDATE scans SET flat = NULL"); /* it has records now */
+	scan = find(id);
+	ck_assert_int_eq(facts_of(scan).received, 3);
+	ck_assert(facts_of(scan).flat);
 	stored_scan_release(scan);
 }
 END_TEST
@@ -348,30 +604,13 @@ START_TEST(arrivals_are_told_in_their_order)
 }
 END_TEST
 
-/* The catalogue forgets; no daemon runs. */
-static void change_catalogue(const char *statement)
-{
-	struct pages *pages;
-	struct error err = {0};
-	sqlite3 *db;
-
-	state_close(&state);
-	ck_assert_int_eq(pages_new(&pages, &err), 0);
-	ck_assert_int_eq(
-	    sqlite3_open_v2(state_path(&state, "catalogue.sqlite"), &db, SQLITE_OPEN_READWRITE, pages_vfs(pages)),
-	    SQLITE_OK);
-	ck_assert_int_eq(sqlite3_exec(db, statement, NULL, NULL, NULL), SQLITE_OK);
-	sqlite3_close(db);
-	pages_free(pages);
-	state_reopen(&state);
-}
-
 START_TEST(what_was_acknowledged_is_found_again_beside_its_data)
 {
 	struct stored_scan *scan = state_scan(&state, 10, true);
 	float pixels[12] = {3};
 	struct error err = {0};
 	unsigned char flags[10];
+	uint8_t digest[32];
 	struct sum sum;
 	char id[ID_SIZE];
 	int order[10];
@@ -390,7 +629,8 @@ START_TEST(what_was_acknowledged_is_found_again_beside_its_data)
 		stored_scan_received(scan, flags);
 		ck_assert_mem_eq(flags, ((unsigned char[]){1, 1, 0, 0, 0, 0, 0, 1, 1, 0}), 10);
 		ck_assert(stored_scan_sum(scan, 0, &sum));
-		ck_assert_uint_eq(sum.sha256[31], 0xcd);
+		state_digest(0xcd, digest);
+		ck_assert_mem_eq(sum.sha256, digest, 32);
 		ck_assert_uint_eq(sum.bytes, sizeof(pixels));
 		ck_assert_int_eq(stored_scan_arrivals(scan, 0, order, 10), 4);
 		ck_assert_mem_eq(order, ((int[]){7, 8, 0, 1}), 4 * sizeof(int));
@@ -399,37 +639,6 @@ START_TEST(what_was_acknowledged_is_found_again_beside_its_data)
 		state_reopen(&state);
 	}
 	ck_assert(path_exists(state_path(&state, "scans/%s/flat.f32", id)));
-}
-END_TEST
-
-START_TEST(a_file_of_checksums_that_is_lost_is_made_again)
-{
-	struct stored_scan *scan = state_scan(&state, 4, false);
-	struct error err = {0};
-	struct sum sum;
-	char id[ID_SIZE];
-	int file;
-
-	memcpy(id, stored_scan_id(scan), sizeof(id));
-	state_put(&state, scan, 0, 2, 1);
-	stored_scan_release(scan);
-	state_close(&state);
-	ck_assert_int_eq(unlink(state_path(&state, "scans/%s/projections.sums", id)), 0);
-	state_reopen(&state);
-	scan = find(id);
-	ck_assert_int_eq(facts_of(scan).received, 3);
-	ck_assert(stored_scan_sum(scan, 1, &sum));
-	ck_assert_uint_eq(sum.sha256[0], 1); /* from the catalogue */
-	ck_assert_uint_eq(sum.bytes, 0);
-	ck_assert_int_eq(stored_scan_open_sums(scan, &file, &err), 0);
-	close(file);
-	state_put(&state, scan, 3, 3, 2);
-	stored_scan_release(scan);
-	state_reopen(&state);
-	scan = find(id);
-	ck_assert(stored_scan_sum(scan, 3, &sum));
-	ck_assert_uint_eq(sum.bytes, 48);
-	stored_scan_release(scan);
 }
 END_TEST
 
@@ -539,12 +748,17 @@ Suite *store_suite(void)
 	tcase_add_test(tests, intensities_are_ready_with_their_flat_image);
 	tcase_add_test(tests, what_a_crash_left_is_tidied_up);
 	tcase_add_test(tests, a_lost_catalogue_does_not_take_the_scans_with_it);
-	tcase_add_test(tests, a_scan_whose_files_are_gone_says_so);
+	tcase_add_test(tests, projections_whose_file_is_cut_off_are_missing);
+	tcase_add_test(tests, a_damaged_projection_is_missing_until_it_is_sent_again);
+	tcase_add_test(tests, a_closed_scan_waits_for_what_was_damaged_and_takes_nothing_else);
+	tcase_add_test(tests, a_scan_may_be_completed_without_what_was_damaged);
+	tcase_add_test(tests, a_damaged_image_is_to_be_sent_again);
+	tcase_add_test(tests, a_damaged_document_is_told_and_never_used);
+	tcase_add_test(tests, what_an_earlier_version_stored_is_checked_against_the_catalogue);
 	tcase_add_test(tests, a_state_directory_has_one_daemon);
 	tcase_add_test(tests, a_failed_commit_is_final_and_nothing_is_acknowledged);
 	tcase_add_test(tests, arrivals_are_told_in_their_order);
 	tcase_add_test(tests, what_was_acknowledged_is_found_again_beside_its_data);
-	tcase_add_test(tests, a_file_of_checksums_that_is_lost_is_made_again);
 	tcase_add_test(tests, a_scan_that_is_closed_is_what_is_there);
 	tcase_add_test(tests, a_scan_that_is_complete_need_not_be_closed);
 	tcase_add_test(tests, watchers_hear_of_projections_and_of_the_end);

@@ -50,7 +50,8 @@ static struct sum sum_of(int slot)
 {
 	struct sum sum = {.crc = 0x01020304u * (unsigned)(slot + 9),
 			  .bytes = BYTES,
-			  .order = (uint64_t)1 << 40 | (unsigned)(slot + 9)};
+			  .order = (uint64_t)1 << 40 | (unsigned)(slot + 9),
+			  .lost = slot % 2 == 0};
 
 	memset(sum.sha256, slot + 9, sizeof(sum.sha256));
 	return sum;
@@ -64,6 +65,7 @@ static void check_sum(const struct sum *found, int slot)
 	ck_assert_uint_eq(found->crc, expected.crc);
 	ck_assert_uint_eq(found->bytes, expected.bytes);
 	ck_assert_uint_eq(found->order, expected.order);
+	ck_assert_int_eq(found->lost, expected.lost);
 }
 
 /* The check value of CRC-32 (ITU-T V.42), and of two pieces as of the whole. */

@@ -1,0 +1,289 @@
+#!/usr/bin/env bash
+# Bits that the disk has turned round, in every kind of file: found by whoever reads them, told by name, never used.
+. "$(dirname "$0")/lib.sh"
+stop_after_each=1
+
+scan_dir=$work/head
+cbct simulate --phantom shepp-logan --scale 60 --views 24 --arc 360 --columns 64 --rows 48 --pixel 4 \
+	--source-to-isocentre 600 --source-to-detector 1000 -o "$scan_dir" >/dev/null || exit 1
+one=$((64 * 48 * 4))
+grid='"grid": {"size": [24, 24, 24], "spacing_mm": [4, 4, 4]}'
+small="{\"scan\": \"SCAN\", $grid, \"fdk\": {}, \"sart\": {\"iterations\": 2, \"subsets\": 4}}"
+
+# flip FILE BYTE [BIT]: its time of change tells that something wrote to it, but not what
+flip() {
+	python3 - "$@" <<'PY'
+import sys
+name, at, bit = sys.argv[1], int(sys.argv[2]), int((sys.argv + ["3"])[3])
+with open(name, "r+b") as file:
+    file.seek(at)
+    byte = file.read(1)[0]
+    file.seek(at)
+    file.write(bytes([byte ^ 1 << bit]))
+PY
+}
+spool() { echo "$state/scans/$scan"; }
+view() { dd if="$scan_dir/projections.raw" bs=$one skip="$1" count=1 status=none; }
+expect_damaged() {
+	expect_problem 500
+	expect_json '.type == "urn:cbctd:problem:damaged"'
+}
+put_view() { req PUT "/v1/scans/$scan/projections/$1" --data-binary @<(view "$1"); }
+missing_is() { # JSON
+	req GET "/v1/scans/$scan"
+	expect_status 200
+	expect_json ".missing == $1"
+}
+undisturbed() { # sets $right: what the job's final volume must be
+	req GET "/v1/jobs/$job/volumes/final?format=raw"
+	expect_status 200
+	right=$(sha256sum <"$body")
+	cp "$body" "$work/right"
+}
+# What came again came last: a job that takes projections as they arrive adds the same numbers up in another order.
+is_right() {
+	req GET "/v1/jobs/$job/volumes/final?format=raw"
+	expect_status 200
+	/usr/bin/python3 - "$body" "$work/right" <<'PY' || fail "the volume of an undisturbed job"
+import sys
+import numpy
+a, b = (numpy.fromfile(name, "<f4").astype(float) for name in sys.argv[1:])
+assert abs(a - b).max() <= 1e-5 * abs(b).max(), abs(a - b).max()
+PY
+}
+is_undisturbed() {
+	req GET "/v1/jobs/$job/volumes/final?format=raw"
+	expect_status 200
+	[ "$(sha256sum <"$body")" = "$right" ] || fail "the bits of an undisturbed job"
+}
+
+test_a_damaged_projection_is_missing_and_can_be_sent_again() {
+	start_daemon
+	reconstruct "$scan_dir" "$small"
+	undisturbed
+	for format in raw png; do
+		req GET "/v1/scans/$scan/projections/7?format=$format"
+		expect_status 200
+		flip "$(spool)/projections.raw" $((7 * one + 4321))
+		req GET "/v1/scans/$scan/projections/7?format=$format"
+		expect_damaged
+		expect_json '.detail | test("projection 7 ")'
+		req GET "/v1/scans/$scan/projections/7?format=$format"
+		expect_problem 404
+		missing_is '[[7, 7]]'
+		expect_json '.received == [[0, 6], [8, 23]] and .state == "receiving" and
+			([.warnings[] | select(.code == "damaged_projections" and .severity == "serious")] | length == 1)'
+		put_view 7
+		expect_status 201
+		missing_is '[]'
+		expect_json '[.warnings[] | select(.code | startswith("damaged"))] == []'
+	done
+	req GET "/v1/scans/$scan/projections/7" -r 100-199
+	expect_status 206
+	cmp "$body" <(view 7 | tail -c +101 | head -c 100) || fail "the range of a projection"
+	post_job "$small"
+	wait_job succeeded
+	is_undisturbed
+	stop_daemon
+}
+
+test_a_put_looks_at_the_disk_before_it_says_same() {
+	start_daemon
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	put_view 3
+	expect_status 200
+	flip "$(spool)/projections.raw" $((3 * one))
+	put_view 3
+	expect_status 201
+	put_view 3
+	expect_status 200
+	cmp "$(spool)/projections.raw" "$scan_dir/projections.raw" || fail "the damage is repaired"
+	flip "$(spool)/projections.raw" $((5 * one + 99))
+	flip "$(spool)/projections.raw" $((20 * one + 99))
+	req PUT "/v1/scans/$scan/projections" -T "$scan_dir/projections.raw"
+	expect_status 201
+	expect_json '.stored == 2 and .same == 22'
+	cmp "$(spool)/projections.raw" "$scan_dir/projections.raw" || fail "the damage is repaired"
+	req PUT "/v1/scans/$scan/projections/4" --data-binary @<(view 5)
+	expect_problem 409
+	stop_daemon
+}
+
+test_a_job_waits_for_what_was_damaged() {
+	start_daemon
+	reconstruct "$scan_dir" "$small"
+	undisturbed
+	flip "$(spool)/projections.raw" $((11 * one + 5))
+	flip "$(spool)/projections.raw" $((19 * one + 5))
+	post_job "$small"
+	state_becomes waiting
+	local end=$((SECONDS + 20))
+	until req GET "/v1/jobs/$job" && [ "$(json '.waiting_for | join(" ")')" = projections ]; do
+		[ $SECONDS -lt $end ] || fail "waiting for projections: $(json '{state, waiting_for, error}')"
+		sleep 0.05
+	done
+	missing_is '[[11, 11], [19, 19]]' # both, though the worker had met the first only
+	put_view 11
+	expect_status 201
+	put_view 19
+	expect_status 201
+	wait_job succeeded
+	expect_json '.attempts == 1 and .error == null'
+	is_right
+	stop_daemon
+}
+
+test_damage_while_the_daemon_is_down() {
+	local byte
+	start_daemon
+	reconstruct "$scan_dir" "$small"
+	undisturbed
+	for file in projections.raw projections.sums; do
+		stop_daemon
+		case $file in
+		projections.raw) byte=$((2 * one + 1)) ;;
+		projections.sums) byte=$((512 + 64 * 2 + 40)) ;; # the record of projection 2
+		esac
+		flip "$(spool)/$file" $byte
+		start_daemon
+		post_job "$small"
+		if [ $file = projections.raw ]; then
+			state_becomes waiting
+			put_view 2
+			expect_status 201
+		fi
+		wait_job succeeded
+		is_right
+	done
+	# the line of the file, its first half, all of it
+	for how in 'flip "$(spool)/projections.sums" 20' 'truncate -s 1000 "$(spool)/projections.sums"' 'rm "$(spool)/projections.sums"'; do
+		stop_daemon
+		eval "$how"
+		start_daemon
+		missing_is '[]'
+		post_job "$small"
+		wait_job succeeded
+		is_undisturbed
+		[ "$(stat -c %s "$(spool)/projections.sums")" = $((512 + 64 * 24)) ] || fail "the checksums are there again"
+	done
+	stop_daemon
+	flip "$(spool)/scan.json" 20
+	start_daemon
+	req GET "/v1/scans/$scan"
+	expect_damaged
+	expect_json '.detail | test("scan.json")'
+	req POST /v1/jobs -H 'Content-Type: application/json' --data-binary "${small/SCAN/$scan}"
+	expect_damaged
+	req GET /v1/scans
+	expect_status 200
+	req DELETE "/v1/scans/$scan"
+	expect_status 204
+	stop_daemon
+}
+
+test_a_document_that_is_damaged_while_it_is_used() {
+	start_daemon
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	flip "$(spool)/scan.json" 20
+	post_job "$small"
+	wait_job failed
+	expect_json '.error.type == "urn:cbctd:problem:damaged" and (.error.detail | test("scan.json"))'
+	stop_daemon
+}
+
+# Counts with a flat image, a dark one and a map of defects.
+counts() {
+	local to=$work/counts
+	[ -e "$to" ] || /usr/bin/python3 - "$scan_dir" "$to" <<'PY'
+import json, os, sys
+import numpy
+source, to = sys.argv[1:]
+os.makedirs(to)
+document = json.load(open(source + "/scan.json"))
+lines = numpy.fromfile(source + "/projections.raw", "<f4").reshape(24, 48, 64)
+document["projections"].update(sample="uint16", quantity="intensity")
+json.dump(document, open(to + "/scan.json", "w"))
+numpy.rint(100 + 50000 * numpy.exp(-lines)).astype("<u2").tofile(to + "/projections.raw")
+numpy.full((48, 64), 50100, "<f4").tofile(to + "/flat.f32")
+numpy.full((48, 64), 100, "<f4").tofile(to + "/dark.f32")
+defects = numpy.zeros((48, 64), "u1")
+defects[5, 7] = 1
+defects.tofile(to + "/defects.u8")
+PY
+	counts_dir=$to
+}
+
+test_a_damaged_image_is_told_and_can_be_sent_again() {
+	local image file
+	counts
+	start_daemon
+	reconstruct "$counts_dir" "$small"
+	undisturbed
+	for image in flat dark defects; do
+		file=$image.f32
+		[ $image != defects ] || file=defects.u8
+		flip "$(spool)/$file" 1234
+		post_job "$small"
+		state_becomes waiting
+		local end=$((SECONDS + 20))
+		until req GET "/v1/jobs/$job" && [ "$(json '.waiting_for | join(" ")')" = $image ]; do
+			[ $SECONDS -lt $end ] || fail "waiting for $image: $(json '{state, waiting_for, error}')"
+			sleep 0.05
+		done
+		missing_is '[]'
+		expect_json "[.warnings[] | select(.code == \"damaged_image\" and (.detail | test(\"$image\")))] | length == 1"
+		if [ $image = dark ]; then # over a restart, too
+			stop_daemon
+			start_daemon
+			req GET "/v1/jobs/$job"
+			expect_json '.state == "waiting"'
+		fi
+		req PUT "/v1/scans/$scan/$image" --data-binary @"$counts_dir/$file"
+		expect_status 201
+		wait_job succeeded
+		expect_json '.attempts == 1'
+		is_undisturbed
+		flip "$(spool)/$file" 77 # found by the PUT itself
+		req PUT "/v1/scans/$scan/$image" --data-binary @"$counts_dir/$file"
+		expect_status 201
+		req PUT "/v1/scans/$scan/$image" --data-binary @"$counts_dir/$file"
+		expect_status 200
+		missing_is '[]'
+		expect_json '[.warnings[] | select(.code | startswith("damaged"))] == []'
+	done
+	stop_daemon
+}
+
+test_what_the_catalogue_lost_is_found_beside_the_data() {
+	counts
+	start_daemon
+	post_scan "$counts_dir"
+	post_projections "$counts_dir"
+	stop_daemon
+	sqlite3 "$state/catalogue.sqlite" "DELETE FROM projections; UPDATE scans SET flat = NULL, dark = NULL, defects = NULL"
+	start_daemon
+	missing_is '[]'
+	expect_json '.flat and .dark and .defects and .state == "complete"'
+	post_job "$small"
+	wait_job succeeded
+	stop_daemon
+}
+
+test_cbct_recon_uses_no_damaged_file() {
+	start_daemon
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	stop_daemon
+	cp -r "$(spool)" "$work/copy"
+	echo "{$grid, \"fdk\": {}}" >"$work/recipe.json"
+	cbct recon "$work/copy" "$work/recipe.json" -o "$work/out" >/dev/null 2>"$work/err" || fail "a whole directory: $(cat "$work/err")"
+	flip "$work/copy/projections.raw" $((9 * one + 3))
+	! cbct recon "$work/copy" "$work/recipe.json" -o "$work/out" >/dev/null 2>"$work/err" || fail "a word of the damage"
+	grep -q 'projection 9 is damaged' "$work/err" || fail "the projection's number: $(cat "$work/err")"
+	rm "$work/copy/projections.sums"
+	cbct recon "$work/copy" "$work/recipe.json" -o "$work/out" >/dev/null 2>"$work/err" || fail "a directory without checksums"
+}
+
+run_tests
