@@ -178,6 +178,7 @@ struct shown {
 	const struct volume_record *volumes; /* in the order of their making */
 	int count, chosen;
 	const struct preset *preset;
+	struct patient patient;
 };
 
 static void put_choices(FILE *out, const struct shown *shown)
@@ -203,9 +204,44 @@ static void put_choices(FILE *out, const struct shown *shown)
 	fputs("</nav>\n", out);
 }
 
+/* Across which of the world's axes, and which run to the right and downwards, or upwards. */
 static const struct plane {
-	const char *axis, *name;
-} planes[] = {{"z", "axial"}, {"x", "sagittal"}, {"y", "coronal"}};
+	const char *axis, *plain_name;
+	int across, columns, rows;
+	bool down;
+} planes[] = {{"z", "z plane", 2, 0, 1, true}, {"x", "x plane", 0, 1, 2, false}, {"y", "y plane", 1, 0, 2, false}};
+
+/* By the patient's axes where they are known. */
+static const char *plane_name(const struct shown *shown, const struct plane *plane)
+{
+	char letters[PATIENT_LETTERS_MAX];
+
+	if (!shown->patient.known)
+		return plane->plain_name;
+	patient_letters(&shown->patient, plane->across, false, letters);
+	return strchr("SI", letters[0]) != NULL ? "axial" : strchr("AP", letters[0]) != NULL ? "coronal" : "sagittal";
+}
+
+static void put_sides(FILE *out, const struct shown *shown)
+{
+	fputs("<p>Left, right, top and bottom of the pictures:", out);
+	for (int i = 0; i < 3; i++) {
+		const struct plane *plane = &planes[i];
+		char edge[4][PATIENT_LETTERS_MAX];
+
+		patient_letters(&shown->patient, plane->columns, true, edge[0]);
+		patient_letters(&shown->patient, plane->columns, false, edge[1]);
+		patient_letters(&shown->patient, plane->rows, plane->down, edge[2]);
+		patient_letters(&shown->patient, plane->rows, !plane->down, edge[3]);
+		fprintf(out, "%s %s <strong>%s %s %s %s</strong>", i > 0 ? "," : "", plane_name(shown, plane), edge[0],
+			edge[1], edge[2], edge[3]);
+	}
+	if (!shown->patient.known)
+		fputs(". What of that is the patient's left and right is not known: nobody has said how the patient "
+		      "lies",
+		      out);
+	fputs(".</p>\n", out);
+}
 
 /* The address of a picture, to its end. */
 static void put_slice(FILE *out, const struct shown *shown, const struct plane *plane, const char *more)
@@ -228,13 +264,15 @@ static void put_planes(FILE *out, const struct shown *shown)
 	for (int i = 0; i < 3; i++) {
 		fputs("<img src=\"", out);
 		put_slice(out, shown, &planes[i], "");
-		fprintf(out, "\" alt=\"the middle %s plane of %s\">", planes[i].name, volume);
+		fprintf(out, "\" alt=\"the middle of %s: %s\">", volume, plane_name(shown, &planes[i]));
 	}
-	fputs("</p>\n<p>All planes: ", out);
+	fputs("</p>\n", out);
+	put_sides(out, shown);
+	fputs("<p>All planes: ", out);
 	for (int i = 0; i < 3; i++) {
 		fputs("<a href=\"", out);
 		put_slice(out, shown, &planes[i], "sheet=1&amp;");
-		fprintf(out, "\">%s</a> ", planes[i].name);
+		fprintf(out, "\">%s</a> ", plane_name(shown, &planes[i]));
 	}
 	fputs("</p>\n<p>Files: ", out);
 	put_file(out, shown, "?type=int16", "NIfTI, HU");
@@ -338,6 +376,8 @@ static int reply_job(struct api *api, struct request *request, struct job *job, 
 	shown.volumes = volumes;
 	read_choice(request, &shown);
 	document = job_document(job, false);
+	if (patient_read(cJSON_GetObjectItemCaseSensitive(document, "patient"), "/patient", &shown.patient, err) != 0)
+		shown.patient = patient_unknown;
 	out = document != NULL ? open_memstream(&text, &length) : NULL;
 	if (out != NULL)
 		put_job(out, api, document, facts.ended, &shown);

@@ -7,9 +7,10 @@
 #include "core/grid.h"
 
 /*
- * Planes of a volume as 8-bit gray pictures, seen as radiologists do: across z
- * from the feet with anterior (-y) on top and the patient's left (+x) to the
- * right; across y and x with superior (+z) on top.
+ * Planes of a volume as 8-bit gray pictures along its own axes, whichever way the
+ * patient lies: across z with x to the right and y down, across y with x to the
+ * right and z up, across x with y to the right and z up. Of a patient HFS that is
+ * as radiologists see them: from the feet, from the front, from the left.
  */
 struct slice {
 	int axis;            /* 0 x, 1 y, 2 z: across it */

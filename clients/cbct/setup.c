@@ -43,6 +43,9 @@ const struct option setup_rows[] = {
     ROW("scan", OPTION_TEXT, scan, "FILE", "take detector, views and geometry from this scan document instead", 0, 0, 0,
 	NULL),
     ROW("name", OPTION_TEXT, name, "NAME", "of the scan", 0, 0, 0, NULL),
+    ROW("patient", OPTION_CHOICE, patient, "POSITION",
+	"how the patient lies: HFS, HFP, FFS, FFP, HFDL, HFDR, FFDL or FFDR (default: not known)", 0, 0, 0,
+	patient_position_names),
     {0},
 };
 
@@ -86,6 +89,11 @@ static cJSON *document_json(const struct setup_options *options, cJSON *projecti
 	cJSON *document = cJSON_CreateObject(), *detector;
 
 	cJSON_AddStringToObject(document, "name", options->name);
+	if (options->patient != OPTION_UNSET_CHOICE) {
+		const struct patient patient = patient_in((enum patient_position)options->patient);
+
+		cJSON_AddItemToObject(document, "patient", patient_json(&patient));
+	}
 	detector = cJSON_AddObjectToObject(document, "detector");
 	cJSON_AddNumberToObject(detector, "columns", (double)options->columns);
 	cJSON_AddNumberToObject(detector, "rows", (double)options->rows);

@@ -15,13 +15,15 @@ struct setup_options {
 	double detector_offset[2], source_offset[2];
 	double wobble; /* mm */
 	long wobble_seed;
-	int kind; /* enum setup_kind */
+	int kind;    /* enum setup_kind */
+	int patient; /* enum patient_position, or unset */
 };
 extern const struct option setup_rows[];
 #define SETUP_OPTIONS_DEFAULTS                                                                                         \
 	{                                                                                                              \
 		.name = "simulated", .views = 180, .columns = 256, .rows = 256, .arc = 360, .pixel = {1.6, 1.6},       \
-		.source_to_isocentre = 620, .source_to_detector = 1100, .wobble_seed = 1                               \
+		.source_to_isocentre = 620, .source_to_detector = 1100, .wobble_seed = 1,                              \
+		.patient = OPTION_UNSET_CHOICE                                                                         \
 	}
 
 /*

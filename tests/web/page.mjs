@@ -140,22 +140,79 @@ test('the rendering shows the patient from the front, the left to the right', as
 		await page.keyboard.press('ArrowUp')
 	await page.evaluate(() => document.activeElement.blur())
 	await page.$$eval(`${tile('3d')} > :not(.stage)`, labels => labels.forEach(label => label.style.visibility = 'hidden'))
-	/* What lies behind each other along y, as seen with superior on top. */
+	await rendered(page, 0, 0.2, 'the solid from the front')
+	expect(await edges(page, '3d') === 'R L S I', `the patient's left to the right, got ${await edges(page, '3d')}`)
+	/* Further round: from its left, with the back to the right. */
+	await page.focus(tile('3d'))
+	for (let i = 0; i < 18; i++)
+		await page.keyboard.press('ArrowRight')
+	await page.evaluate(() => document.activeElement.blur())
+	await rendered(page, 1, 0.1, 'the solid from its left') /* where it is nearly the same upside down */
+	expect(await edges(page, '3d') === 'A P S I', `the patient's back to the right, got ${await edges(page, '3d')}`)
+	await page.context().close()
+})
+
+/* Left, right, top and bottom of a tile. */
+const edges = async (page, plane) => (await Promise.all(['left', 'right', 'top', 'bottom'].map(side => page.textContent(`${tile(plane)} .edge.${side}`)))).join(' ')
+
+/*
+ * Whether what is rendered is the shadow of the finished volume, with x (0) or y (1) to the right and z upwards, and
+ * by so much less its mirror images.
+ */
+async function rendered(page, columns, margin, what) {
 	const { size } = (await api(`/v1/jobs/${finished}/volumes`)).volumes[0]
 	const raw = await (await fetch(`${origin}/v1/jobs/${finished}/volumes/final?format=raw&type=int16`)).arrayBuffer()
 	const voxels = new Int16Array(raw), [nx, ny, nz] = size
-	const shadow = { width: nx, height: nz, pixels: new Float64Array(nx * nz) }
+	const shadow = { width: size[columns], height: nz, pixels: new Float64Array(size[columns] * nz) }
 	for (let i = 0; i < voxels.length; i++) {
-		const x = i % nx, z = Math.floor(i / nx / ny)
+		const at = [i % nx, Math.floor(i / nx) % ny], z = Math.floor(i / nx / ny)
 		if (voxels[i] > 150)
-			shadow.pixels[(nz - 1 - z) * nx + x] = 1
+			shadow.pixels[(nz - 1 - z) * size[columns] + at[columns]] = 1
 	}
-	const seen = await until('the rendering', async () => grayOf(await page.locator(`${tile('3d')} canvas`).screenshot()), one => one.pixels.some(value => value > 60))
-	const [a, b] = [cropped(shadow, 0.5), cropped(seen, 40, 12)].map(one => shrink(one))
-	const likeness = correlation(a, b)
-	expect(likeness > 0.6 && [mirrored(b), flipped(b), mirrored(flipped(b))].every(other => correlation(a, other) < likeness - 0.2),
-		`the solid, not its mirror image: ${likeness}, mirrored ${correlation(a, mirrored(b))}, upside down ${correlation(a, flipped(b))}`)
-	await page.context().close()
+	const a = shrink(cropped(shadow, 0.5))
+	await until(what, async () => {
+		const seen = grayOf(await page.locator(`${tile('3d')} canvas`).screenshot())
+		if (!seen.pixels.some(value => value > 60))
+			return { nothing: true }
+		const b = shrink(cropped(seen, 40, 12))
+		const others = [mirrored(b), flipped(b), mirrored(flipped(b))].map(other => correlation(a, other))
+		return { likeness: correlation(a, b), others }
+	}, ({ likeness, others }) => likeness > 0.6 && others.every(other => other < likeness - margin))
+}
+
+test('letters are the patient\'s sides where they are known, and the table\'s axes where they are not', async () => {
+	const cases = [
+		{ patient: null, names: 'z x y', z: '−x +x −y +y', y: '−x +x +z −z', x: '−y +y +z −z', render: '−x +x +z −z' },
+		{ patient: { position: 'HFP' }, names: 'Axial Sagittal Coronal', z: 'L R P A', y: 'L R S I', x: 'P A S I', render: 'L R S I' },
+		{ patient: { position: 'FFDR' }, names: 'Axial Coronal Sagittal', z: 'P A L R', y: 'P A I S', x: 'L R I S', render: 'P A I S' },
+		/* 30 degrees about z. */
+		{ patient: { world_to_patient: [0.866025, -0.5, 0, 0, 0.5, 0.866025, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1] }, names: 'Axial Sagittal Coronal',
+			z: 'RA LP AL PR', y: 'RA LP S I', x: 'AL PR S I', render: 'R L S I' },
+	]
+	for (const { patient, names, render, ...planes } of cases) {
+		const what = JSON.stringify(patient)
+		const job = await post('/v1/jobs', { scan, patient, grid: { size: [20, 20, 20], spacing_mm: [5, 5, 5] }, fdk: {} })
+		await ended(job.id)
+		const page = await open(browser, `/#/jobs/${job.id}`)
+		await planePixels(page, 'z')
+		await page.waitForSelector('.head .badge.succeeded')
+		await page.waitForSelector(`${tile('3d')}[data-shown=final]`)
+		for (const [plane, letters] of Object.entries(planes))
+			expect(await edges(page, plane) === letters, `${what}: ${letters} about the plane across ${plane}, got ${await edges(page, plane)}`)
+		const labels = await page.$$eval('[aria-label="What is shown"] button', buttons => buttons.slice(1, 4).map(button => button.textContent).join(' '))
+		expect(labels === names, `${what}: ${names}, got ${labels}`)
+		await page.focus(tile('3d'))
+		for (let i = 0; i < 4; i++)
+			await page.keyboard.press('ArrowLeft')
+		expect(await edges(page, '3d') === render, `${what}: ${render} about the rendering, got ${await edges(page, '3d')}`)
+		expect(await page.isVisible('.sides') === (patient === null), `${what}: said where it is not known`)
+		const said = await page.innerText('main')
+		expect(patient !== null || !/anterior|posterior|superior|inferior|Axial|Sagittal|Coronal/.test(said), `no word of the patient's sides: ${said}`)
+		const plain = await (await fetch(`${origin}/plain/${job.id}`)).text()
+		expect(plain.includes('is not known') === (patient === null) && /axial|coronal|sagittal/.test(plain) === (patient !== null), `${what}: so on the page without scripts`)
+		await shoot(page, `sides-${patient?.position ?? (patient ? 'tilted' : 'unknown')}`)
+		await page.context().close()
+	}
 })
 
 /* What is brighter than `least`, and no more around it; the margin, where the viewer's edge is, does not count. */
@@ -463,6 +520,7 @@ test('without JavaScript a text, and pages that need none', async () => {
 	await page.click(`a[href="/plain/${finished}"]`)
 	expect(await page.textContent('h1') === name, 'the scan\'s name as a text')
 	expect(await page.locator('img').count() === 3, 'three planes')
+	expect((await page.textContent('main, body')).includes('axial R L A P, sagittal A P S I, coronal R L S I.'), 'the sides of the pictures')
 	await page.click('text=soft tissue')
 	expect((await page.getAttribute('img >> nth=0', 'src')).includes('window=400'), 'another window')
 	await page.click('nav >> text=iter-1')

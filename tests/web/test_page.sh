@@ -6,7 +6,7 @@ here=$top/tests/web
 tools=$BUILD/web-tests
 name='knee <b>3</b> & "co"'
 
-# A daemon, a scan of the solid over 220 degrees, and a job of it that has ended.
+# A daemon, a scan of the solid over 220 degrees that does not say how it lies, and a job of it that does and has ended.
 prepare() {
 	node "$here/solid.mjs" "$work/solid.f32"
 	cbct simulate --volume "$work/solid.f32" --size 24,24,24 --spacing 4 --centre --name "$name" --views 56 --arc 220 --columns 64 --rows 64 \
@@ -14,7 +14,7 @@ prepare() {
 	start_daemon --threads 1
 	post_scan "$work/scan"
 	post_projections "$work/scan"
-	post_job '{"scan": "SCAN", "grid": {"size": [36, 32, 40], "spacing_mm": [3, 3.4, 2.8]}, "fdk": {}, "sart": {"iterations": 7}, "tv": {}, "emit": ["fdk", 1, 2, 4, 6]}'
+	post_job '{"scan": "SCAN", "grid": {"size": [36, 32, 40], "spacing_mm": [3, 3.4, 2.8]}, "fdk": {}, "sart": {"iterations": 7}, "tv": {}, "emit": ["fdk", 1, 2, 4, 6], "patient": {"position": "HFS"}}'
 	wait_job succeeded
 }
 
@@ -65,7 +65,7 @@ test_every_bundled_package_is_named_with_its_licence() {
 # What stands for the whole page where npm is not.
 test_the_plain_page_shows_jobs_and_escapes_names() {
 	start_daemon
-	req POST /v1/scans --data-binary '{"name": "<script>\"&", "detector": {"columns": 4, "rows": 4, "pixel_mm": [1, 1]},
+	req POST /v1/scans -H 'Content-Type: application/json' --data-binary '{"name": "<script>\"&", "detector": {"columns": 4, "rows": 4, "pixel_mm": [1, 1]},
 		"projections": {"count": 3, "sample": "float32", "quantity": "line_integral"},
 		"geometry": {"kind": "circular", "source_to_isocentre_mm": 600, "source_to_detector_mm": 1000, "angle_step_deg": 120}}'
 	expect_status 201

@@ -6,11 +6,17 @@ const list = entries => h('dl', {}, entries.filter(entry => entry && entry[1] !=
 
 const times = (numbers, digits = 4) => numbers.map(value => number(value, digits)).join(' × ')
 
-export function geometryFacts(scan) {
+const positions = { HFS: 'head first, on the back', HFP: 'head first, on the front', FFS: 'feet first, on the back', FFP: 'feet first, on the front',
+	HFDL: 'head first, on the left side', HFDR: 'head first, on the right side', FFDL: 'feet first, on the left side', FFDR: 'feet first, on the right side' }
+const patientText = patient => !patient ? 'not known how it lies' : patient.position ? `${patient.position}: ${positions[patient.position]}` : 'placed by a matrix'
+
+/* patient: of a job that says otherwise than its scan. */
+export function geometryFacts(scan, patient = scan.patient) {
 	const derived = scan.derived ?? {}
 	const { detector, projections } = scan
 	return list([
 		['Projections', `${projections.count} of ${detector.columns} × ${detector.rows}`],
+		['Patient', patientText(patient)],
 		['Pixel', detector.pixel_mm && `${times(detector.pixel_mm)} mm`],
 		['at the isocentre', derived.pixel_at_isocentre_mm && `${times(derived.pixel_at_isocentre_mm, 3)} mm`],
 		['Arc', derived.arc_deg !== undefined && [`${number(derived.arc_deg, 4)}°`, derived.direction === 'none' ? '' : derived.direction, { full: 'a full turn', short: 'a short scan' }[derived.scan] ?? derived.scan].filter(Boolean).join(', ')],

@@ -40,7 +40,7 @@ const groups = [
 	] },
 ]
 /* Members of a job's document that are parts of its request, whether they have a field above or not. */
-const members = ['grid', 'fdk', 'sart', 'tv', 'emit', 'priority', 'precision', 'mu_water', 'projector', 'metal']
+const members = ['grid', 'fdk', 'sart', 'tv', 'emit', 'priority', 'precision', 'mu_water', 'projector', 'metal', 'patient']
 
 const path = pointer => pointer.split('/').slice(1)
 const at = (value, pointer) => path(pointer).reduce((part, key) => part?.[key], value)

@@ -1,7 +1,7 @@
 /* A job's page: its volumes as they come, and everything about how they came. */
 import { h, replace, write, throttle, newId, bytes, duration } from './dom.js'
 import { get, request, jobPath, scanPath, volumePath, listVolumes, watch } from './api.js'
-import { View, presets } from './view.js'
+import { View, planeName, presets } from './view.js'
 import { Viewer } from './viewer.js'
 import { Plot } from './plot.js'
 import { Film } from './film.js'
@@ -61,6 +61,7 @@ export class JobPage {
 		this.stage.addEventListener('pointerdown', event => this.#grabSwipe(event), { capture: true })
 		this.plot = new Plot(iteration => this.#selectIteration(iteration))
 		this.film = new Film()
+		this.sides = h('p', { class: 'sides', hidden: true }, 'Left and right are not known: neither scan nor job says how the patient lies. The letters are those of the table\'s axes.')
 		this.controls = h('div', { class: 'controls', hidden: true }, this.#iterationControls(), this.#viewControls(), this.#compareControls())
 		this.warnings = h('div', {})
 		this.failure = h('div', {})
@@ -71,7 +72,7 @@ export class JobPage {
 		this.fileSection = h('section', { class: 'card', hidden: true }, h('h2', {}, 'Downloads'), this.files)
 		this.progress = h('div', { class: 'progress' }, this.bar.element, this.doing, this.left)
 		this.columns = h('div', { class: 'columns' },
-			h('div', { class: 'pictures' }, this.empty, this.stage, this.controls),
+			h('div', { class: 'pictures' }, this.empty, this.stage, this.sides, this.controls),
 			h('div', { class: 'aside' }, this.warnings, this.courseSection, this.fileSection,
 				h('section', { class: 'card' }, h('h2', {}, 'Projections'), this.film.element),
 				h('section', { class: 'card' }, h('h2', {}, 'Reconstruction'), this.about),
@@ -110,13 +111,20 @@ export class JobPage {
 		this.levelBox = box('Window level, HU', 'level')
 		this.tools = radio('What dragging does', [['window', 'Window', 'Dragging changes window and level; a click moves the cross'], ['cross', 'Cross', 'Dragging moves the cross'],
 			['pan', 'Pan', 'Dragging moves a zoomed plane']], 'window', tool => this.#view.set({ tool }))
-		this.tiles = radio('What is shown', [['all', 'All'], ['z', 'Axial'], ['x', 'Sagittal'], ['y', 'Coronal'], ['3d', '3D']], 'all', tile => this.#view.set({ tile }))
+		this.tiles = radio('What is shown', [['all', 'All'], ['z', ''], ['x', ''], ['y', ''], ['3d', '3D']], 'all', tile => this.#view.set({ tile }))
+		this.#nameTiles()
 		this.readout = h('output', { class: 'readout' })
 		return [h('div', { class: 'group' }, h('span', { class: 'label' }, 'Window'), this.presets,
 			h('span', { class: 'numbers' }, h('label', {}, h('span', { 'aria-hidden': 'true' }, 'W'), this.windowBox), h('label', {}, h('span', { 'aria-hidden': 'true' }, 'L'), this.levelBox)), this.readout),
 		h('div', { class: 'group' }, h('span', { class: 'label' }, 'View'), this.tiles,
 			h('button', { type: 'button', class: 'quiet', title: 'Middle, no zoom (r)', onclick: () => this.#view.reset() }, 'Reset')),
 		h('div', { class: 'group' }, h('span', { class: 'label' }, 'Drag'), this.tools)]
+	}
+
+	/* The planes by the patient's axes where they are known, else by the world's. */
+	#nameTiles() {
+		for (const plane of ['z', 'x', 'y'])
+			write(this.tiles.querySelector(`[data-value=${plane}]`), planeName(this.#view.sides, plane))
 	}
 
 	#compareControls() {
@@ -156,6 +164,8 @@ export class JobPage {
 			const job = await get(jobPath(this.id), this.#abort.signal)
 			const before = this.#job
 			this.#job = job
+			this.#view.set({ sides: job.axes })
+			this.sides.hidden = job.axes !== null
 			/* Of a complete one the warnings still change with the image that a job waits for. */
 			if (this.#scan === null || ((this.#scan.state !== 'complete' || before?.state === 'waiting') && !ended(job)))
 				this.#scan = await get(scanPath(job.scan), this.#abort.signal)
@@ -201,7 +211,7 @@ export class JobPage {
 		replace(this.failure, job.error ? h('div', { class: 'notice bad' }, `It failed: ${job.error.detail}`) : null)
 		replace(this.about, jobFacts(job))
 		if (this.#first)
-			replace(this.geometry, geometryFacts(scan))
+			replace(this.geometry, geometryFacts(scan, job.patient))
 		this.#first = false
 		this.film.show(scan)
 		if (ended(job) && this.#volumes.length === 0)
@@ -440,6 +450,8 @@ export class JobPage {
 	/* ---- view ---- */
 
 	#onView(changed) {
+		if (changed.sides)
+			this.#nameTiles()
 		if (changed.window || changed.level)
 			this.#writeWindow()
 		if (changed.tile)

@@ -5,7 +5,7 @@
  */
 import { h, write, inFrame } from './dom.js'
 import { volumePath } from './api.js'
-import { planes, axes, letters } from './view.js'
+import { planes, axes, lettersInWords, planeEdges, planeName } from './view.js'
 
 const clickMost = 4 /* px: a pointer that moved less has clicked */
 const narrowMost = 280 /* px: below, there is no room for words beside the letters */
@@ -60,7 +60,6 @@ export class Plane {
 	}
 
 	#build() {
-		const plane = planes[this.name]
 		this.image = h('img', { class: 'slice', alt: '', draggable: false, hidden: true })
 		this.canvas = h('canvas', { class: 'slice', hidden: true, role: 'img' })
 		this.picture = h('div', { class: 'picture' }, this.image, this.canvas)
@@ -69,14 +68,28 @@ export class Plane {
 		this.frame = h('div', { class: 'frame' }, this.picture, this.crossX, this.crossY)
 		this.stage = h('div', { class: 'stage' }, this.frame)
 		this.where = h('span', { class: 'where' })
-		this.slider = h('input', { type: 'range', class: 'depth', min: '0', step: '1', 'aria-label': `${plane.name} plane`,
-			oninput: () => this.#view.setIndex(plane.across, Number(this.slider.value)) })
-		this.maximise = h('button', { type: 'button', class: 'maximise', title: 'This one only (m)', 'aria-label': `Show the ${plane.name.toLowerCase()} plane only`,
+		this.slider = h('input', { type: 'range', class: 'depth', min: '0', step: '1',
+			oninput: () => this.#view.setIndex(planes[this.name].across, Number(this.slider.value)) })
+		this.maximise = h('button', { type: 'button', class: 'maximise', title: 'This one only (m)',
 			'aria-pressed': 'false', onclick: () => this.#maximise() })
-		const edge = side => h('span', { class: `edge ${side}`, title: letters[plane[side]], 'aria-hidden': 'true' }, plane[side])
-		this.element = h('section', { class: 'tile plane', tabindex: '0', 'aria-label': `${plane.name} plane`, 'data-plane': this.name },
-			this.stage, h('div', { class: 'caption' }, h('span', { class: 'name' }, plane.name), this.where), this.maximise,
-			edge('left'), edge('right'), edge('top'), edge('bottom'), this.slider)
+		this.title = h('span', { class: 'name' })
+		this.edges = Object.fromEntries(['left', 'right', 'top', 'bottom'].map(side => [side, h('span', { class: `edge ${side}`, 'aria-hidden': 'true' })]))
+		this.element = h('section', { class: 'tile plane', tabindex: '0', 'data-plane': this.name },
+			this.stage, h('div', { class: 'caption' }, this.title, this.where), this.maximise, Object.values(this.edges), this.slider)
+		this.#writeSides()
+	}
+
+	#writeSides() {
+		const { sides } = this.#view
+		const name = planeName(sides, this.name), edges = planeEdges(sides, this.name)
+		write(this.title, sides === null ? `${name} plane` : name)
+		this.element.setAttribute('aria-label', `${name} plane`)
+		this.slider.setAttribute('aria-label', `${name} plane`)
+		this.maximise.setAttribute('aria-label', `Show the ${name.toLowerCase()} plane only`)
+		for (const [side, letters] of Object.entries(edges)) {
+			write(this.edges[side], letters)
+			this.edges[side].title = lettersInWords(letters)
+		}
 	}
 
 	#maximise() {
@@ -97,6 +110,8 @@ export class Plane {
 
 	/* What of the view has changed. */
 	update(changed) {
+		if (changed.sides)
+			this.#writeSides()
 		if (this.#source === null)
 			return
 		if (changed.position || changed.grid)
@@ -197,7 +212,7 @@ export class Plane {
 	}
 
 	#reveal(which) {
-		const text = `${planes[this.name].name} plane of ${this.#source.volume.name} at ${this.where.textContent}`
+		const text = `${planeName(this.#view.sides, this.name)} plane of ${this.#source.volume.name} at ${this.where.textContent}`
 		this.canvas.hidden = which !== this.canvas
 		this.image.hidden = which !== this.image
 		if (which === this.image)

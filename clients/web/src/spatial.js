@@ -1,7 +1,8 @@
 /* The tile of the rendering. Without WebGL 2 it shows a contact sheet that the daemon draws. */
-import { h, inFrame, throttle } from './dom.js'
+import { h, write, inFrame, throttle } from './dom.js'
 import { volumePath } from './api.js'
 import { fetchVoxels, scaleFor } from './voxels.js'
+import { lettersInWords, planeEdges, renderingEdges } from './view.js'
 
 const settleTime = 150 /* ms: the rendering follows the window once the hand rests; each change costs a whole volume */
 
@@ -46,11 +47,23 @@ export class Spatial {
 		this.stage = h('div', { class: 'stage' }, this.canvas, this.sheet, h('div', { class: 'grip' }))
 		this.maximise = h('button', { type: 'button', class: 'maximise', title: 'This one only (m)', 'aria-label': 'Show the rendering only',
 			'aria-pressed': 'false', onclick: () => this.#maximise() })
+		this.edges = Object.fromEntries(['left', 'right', 'top', 'bottom'].map(side => [side, h('span', { class: `edge ${side}`, 'aria-hidden': 'true' })]))
 		this.element = h('section', { class: 'tile spatial', tabindex: '0', 'aria-label': 'Rendering', 'data-plane': '3d' },
-			this.stage, h('div', { class: 'caption' }, h('span', { class: 'name' }, '3D')), this.maximise, this.note)
+			this.stage, h('div', { class: 'caption' }, h('span', { class: 'name' }, '3D')), this.maximise, Object.values(this.edges), this.note)
 		this.turn = inFrame(() => this.#render?.turn(this.#view))
 		this.settle = throttle(settleTime, () => this.#settle())
 		this.#listen()
+		this.#writeSides()
+	}
+
+	/* Of the rendering as it is turned; a contact sheet is of planes across z. */
+	#writeSides() {
+		const { sides, azimuth, elevation } = this.#view
+		const edges = this.sheet.hidden ? renderingEdges(sides, azimuth, elevation) : planeEdges(sides, 'z')
+		for (const [side, letters] of Object.entries(edges)) {
+			write(this.edges[side], letters)
+			this.edges[side].title = letters && lettersInWords(letters)
+		}
 	}
 
 	#maximise() {
@@ -70,6 +83,8 @@ export class Spatial {
 			this.maximise.setAttribute('aria-pressed', String(this.#view.tile === '3d'))
 		if (changed.azimuth || changed.elevation)
 			this.turn()
+		if (changed.azimuth || changed.elevation || changed.sides)
+			this.#writeSides()
 		if (changed.window || changed.level)
 			this.settle()
 	}
@@ -117,6 +132,7 @@ export class Spatial {
 		const { window, level } = this.#view
 		this.canvas.hidden = true
 		this.sheet.hidden = false
+		this.#writeSides()
 		this.sheet.src = `${volumePath(job, volume.name)}/slice?sheet=1&axis=z&window=${window}&level=${level}`
 		this.sheet.alt = `Contact sheet of ${volume.name}`
 		this.note.textContent = 'This browser has no WebGL 2: a contact sheet in place of the rendering'

@@ -13,13 +13,59 @@ export const presets = [
 const zoomMost = 12
 
 export const axes = ['x', 'y', 'z']
-/* Which world axes run along a plane's columns and rows; rows of x and y run downwards from superior. */
+/* Which world axes run along a plane's columns and rows; rows of x and y run downwards from the top of z. */
 export const planes = {
-	z: { name: 'Axial', across: 2, columns: 0, rows: 1, down: true, left: 'R', right: 'L', top: 'A', bottom: 'P' },
-	y: { name: 'Coronal', across: 1, columns: 0, rows: 2, down: false, left: 'R', right: 'L', top: 'S', bottom: 'I' },
-	x: { name: 'Sagittal', across: 0, columns: 1, rows: 2, down: false, left: 'A', right: 'P', top: 'S', bottom: 'I' },
+	z: { across: 2, columns: 0, rows: 1, down: true },
+	y: { across: 1, columns: 0, rows: 2, down: false },
+	x: { across: 0, columns: 1, rows: 2, down: false },
 }
-export const letters = { R: 'right', L: 'left', A: 'anterior', P: 'posterior', S: 'superior', I: 'inferior' }
+
+/* ---- where the patient's sides are ---- */
+
+/*
+ * The daemon tells the letters of the sides that the world's +x, +y and +z point to, or null where nobody has said
+ * how the patient lies: then nothing here says left, right, front, back, head or feet.
+ */
+const opposite = { R: 'L', L: 'R', A: 'P', P: 'A', S: 'I', I: 'S' }
+const words = { R: 'right', L: 'left', A: 'anterior', P: 'posterior', S: 'superior', I: 'inferior' }
+const names = { L: 'Sagittal', R: 'Sagittal', A: 'Coronal', P: 'Coronal', S: 'Axial', I: 'Axial' }
+
+/* The letters at the end of a world's axis: its +, or the other one. */
+function lettersOf(sides, axis, negative) {
+	if (sides === null)
+		return `${negative ? '−' : '+'}${axes[axis]}`
+	const letters = sides[axes[axis]]
+	return negative ? [...letters].map(letter => opposite[letter]).join('') : letters
+}
+
+/* In words, for a tooltip: "LP" is left and posterior. */
+export const lettersInWords = letters => [...letters].map(letter => words[letter]).filter(Boolean).join(' and ') || `towards ${letters}`
+
+/* "Axial", or "z" where only the world's axis is known. */
+export const planeName = (sides, plane) => sides === null ? plane : names[sides[axes[planes[plane].across]][0]]
+
+export function planeEdges(sides, plane) {
+	const { columns, rows, down } = planes[plane]
+	return { left: lettersOf(sides, columns, true), right: lettersOf(sides, columns, false), top: lettersOf(sides, rows, down), bottom: lettersOf(sides, rows, !down) }
+}
+
+/*
+ * What lies at the edges of the rendering: the ends of the world's axes that its
+ * right and its top point to, the nearest and a second one that is far enough
+ * from a right angle. From azimuth 180 it is seen along +y, with +x to the right,
+ * from 90 along -x, with +y to the right.
+ */
+export function renderingEdges(sides, azimuth, elevation) {
+	const turn = (180 - azimuth) * Math.PI / 180, tilt = elevation * Math.PI / 180
+	const right = [Math.cos(turn), Math.sin(turn), 0]
+	const top = [-Math.sin(tilt) * Math.sin(turn), Math.sin(tilt) * Math.cos(turn), Math.cos(tilt)]
+	const end = (direction, sign) => {
+		const nearest = [0, 1, 2].filter(axis => Math.abs(direction[axis]) > 0.38).sort((a, b) => Math.abs(direction[b]) - Math.abs(direction[a]))
+		const letters = nearest.map(axis => lettersOf(sides, axis, direction[axis] * sign < 0))
+		return sides === null ? letters[0] : letters.slice(0, 2).map(each => each[0]).join('')
+	}
+	return { left: end(right, -1), right: end(right, 1), top: end(top, 1), bottom: end(top, -1) }
+}
 
 const clamp = (value, least, most) => Math.min(Math.max(value, least), most)
 
@@ -34,6 +80,7 @@ export class View extends EventTarget {
 	azimuth = 160
 	elevation = 12
 	grid = null /* { size, spacing, origin } */
+	sides = null /* of the patient: { x, y, z }, letters; null: not known */
 
 	/* Any of the members above; listeners are told which. */
 	set(changes) {
