@@ -29,6 +29,7 @@ struct filter_engine {
 	int pad, wide;                   /* zero columns before column 0; columns of a filtered row */
 	int extend;                      /* columns that truncated rows get on either side */
 	bool sides[2];                   /* that may be extended */
+	struct shell_table shells;       /* of core/extend.h */
 	float *levels;                   /* [view] extend_level, or NULL without extend */
 	struct transform plain, extended;
 	kiss_fft_cpx *buffers; /* [threads][2][PAIRS][stride] */
@@ -105,6 +106,7 @@ int filter_engine_new(const struct plan_options *options, int threads, struct fi
 	engine->pad = options->pad[0];
 	engine->wide = wide;
 	engine->extend = options->extend;
+	engine->shells = shell_table_make();
 	for (int side = 0; side < 2; side++)
 		engine->sides[side] = options->extend > 0 && options->pad[side] == 0;
 	engine->stride = buffer_stride(options);
@@ -198,6 +200,49 @@ static bool find_truncated(const struct filter_engine *engine, const struct rows
 			any = any || ret->truncated[side][r];
 		}
 	return any;
+}
+
+/* The shell around the object of row r of a group, where it is cut off; share 0 where there is none. */
+static struct shell find_shell(const struct filter_engine *engine, const struct rows *rows, int r,
+			       const struct extensions *extensions, int *ret_width)
+{
+	const float *p = at_edge(rows, 0, 0) + r;
+	const ptrdiff_t step = rows->rows;
+	int first = 0, last = rows->columns - 1;
+	float bins[SHELL_BINS], square, ellipse;
+
+	while (!extensions->truncated[0][r] && first < last && p[first * step] < rows->level)
+		first++;
+	while (!extensions->truncated[1][r] && last > first && p[last * step] < rows->level)
+		last--;
+	*ret_width = last - first + 1;
+	for (int bin = 0; bin < SHELL_BINS; bin++)
+		bins[bin] = shell_bin(p, step, first, *ret_width, bin);
+	square = shell_square(bins);
+	ellipse = shell_ellipse_error(bins, square);
+	if (!shell_is_tried(ellipse))
+		return (struct shell){.share = 0};
+	return shell_make(&engine->shells, bins, square, ellipse, shell_search(&engine->shells, bins, square));
+}
+
+static void fit_shells(const struct filter_engine *engine, const struct rows *rows, struct extensions *ret)
+{
+	for (int r = 0; r < rows->count; r++) {
+		struct shell shell;
+		int width;
+
+		if (!ret->truncated[0][r] && !ret->truncated[1][r])
+			continue;
+		shell = find_shell(engine, rows, r, ret, &width);
+		for (int side = 0; side < 2 && shell.share > 0; side++) {
+			float measured = 0;
+
+			for (int i = 0; i < extend_window(rows->columns); i++)
+				measured += at_edge(rows, side, i)[r];
+			if (ret->truncated[side][r])
+				extend_by_shell(&ret->edge[side][r], &shell, side, width, measured, rows->columns);
+		}
+	}
 }
 
 static void fit_extensions(const struct filter_engine *engine, const struct rows *rows, struct extensions *ret)
@@ -299,6 +344,7 @@ static void filter_rows(const struct filter_engine *engine, int view, const stru
 	}
 	if (transform == &engine->extended) {
 		fit_extensions(engine, rows, &extensions);
+		fit_shells(engine, rows, &extensions);
 		for (int side = 0; side < 2; side++) {
 			if (engine->sides[side])
 				write_extension(engine, view, rows, side, &extensions, in);

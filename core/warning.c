@@ -54,7 +54,7 @@ const struct warning_kind warning_kinds[] = {
     {"byte_order", SEVERITY_SERIOUS, "The projections look like noise: their bytes may be in the wrong order."},
     /* ---- of the reconstruction ---- */
     {"truncated", SEVERITY_CAUTION,
-     "The patient is wider than the detector: gray values near the rim of the image are estimates."},
+     "The patient is wider than the detector: gray values are estimates, most of all near the rim of the image."},
     {"outside_grid", SEVERITY_INFO, "The patient goes on outside of the image, and the image allows for it."},
     {"grid_unseen", SEVERITY_SERIOUS, "The image lies where no projection sees it: it shows nothing."},
     {"grid_too_small", SEVERITY_CAUTION, "The image was asked for as a single voxel or a line of voxels."},

@@ -45,7 +45,8 @@ struct fft {
 
 /* What is found at the edges of a batch's rows: [slot of the batch][row]. */
 struct edges {
-	float *levels;        /* [slot of the batch] what is not air */
+	float *levels; /* [slot of the batch] what is not air */
+	struct shell_table *shells;
 	unsigned char *sides; /* bit 0: cut off before column 0, bit 1: behind the last one */
 	struct extension (*fit)[2];
 	int *list; /* rows with any */
@@ -235,6 +236,21 @@ static __device__ double sum_block(double value, double *shared)
 	return sum;
 }
 
+/* The block's least value. */
+static __device__ int least_of_block(int value, int *shared)
+{
+	shared[threadIdx.x] = value;
+	for (int half = EDGE_THREADS / 2; half > 0; half /= 2) {
+		__syncthreads();
+		if (threadIdx.x < half)
+			shared[threadIdx.x] = min(shared[threadIdx.x], shared[threadIdx.x + half]);
+	}
+	__syncthreads();
+	int least = shared[0];
+	__syncthreads();
+	return least;
+}
+
 /* A block has one view. */
 static __global__ void __launch_bounds__(LEVEL_THREADS)
     find_levels(const filter_job job, const batch_slots slots, float *levels)
@@ -260,11 +276,67 @@ static __global__ void __launch_bounds__(LEVEL_THREADS)
 		levels[blockIdx.x] = extend_level(shared[0]);
 }
 
+/* What the block's threads share while they look for the shell around a row's object. */
+struct shell_search_shared {
+	float bins[SHELL_BINS], residual[SHELL_OUTLINES], square, ellipse;
+	struct shell_place place;
+	int columns[EDGE_THREADS];
+};
+static_assert(EDGE_THREADS == (int)SHELL_BINS, "a thread has one bin");
+
+/* core/extend.h's search, a candidate a thread; thread 0 has the result. */
+static __device__ struct shell find_shell(const struct shell_table *table, const float *p, int columns, float level,
+					  int sides, shell_search_shared *s, int *ret_width)
+{
+	int t = threadIdx.x, first = columns - 1, behind = columns - 1;
+	struct shell shell = {};
+
+	for (int c = t; c < columns; c += EDGE_THREADS)
+		if (p[c] >= level) {
+			first = min(first, c);
+			behind = min(behind, columns - 1 - c);
+		}
+	first = sides & 1 ? 0 : least_of_block(first, s->columns);
+	behind = sides & 2 ? 0 : least_of_block(behind, s->columns);
+	int width = max(columns - behind - first, 1);
+	s->bins[t] = shell_bin(p, 1, first, width, t);
+	__syncthreads();
+	if (t == 0) {
+		s->square = shell_square(s->bins);
+		s->ellipse = shell_ellipse_error(s->bins, s->square);
+		s->place = {};
+	}
+	__syncthreads();
+	*ret_width = width;
+	if (!shell_is_tried(s->ellipse))
+		return shell;
+	for (int step = 0; step < SHELL_STEPS; step++) {
+		if (t < SHELL_OUTLINES) {
+			struct shell_place next = shell_candidate(s->place, step, t);
+
+			s->residual[t] = shell_try(table, s->bins, s->square, next.at[0], next.at[1]).residual;
+		}
+		__syncthreads();
+		if (t == 0) {
+			int best = 0;
+
+			for (int k = 1; k < SHELL_OUTLINES; k++)
+				best = s->residual[k] < s->residual[best] ? k : best;
+			s->place = shell_candidate(s->place, step, best);
+		}
+		__syncthreads();
+	}
+	if (t == 0)
+		shell = shell_make(table, s->bins, s->square, s->ellipse, s->place);
+	return shell;
+}
+
 /* A block has one row; most rows end in air at both sides and cost no more than a look there. */
 static __global__ void __launch_bounds__(EDGE_THREADS)
     find_edges(const filter_job job, const batch_slots slots, bool before, bool behind, edges found)
 {
 	__shared__ double shared[EDGE_THREADS];
+	__shared__ shell_search_shared search;
 	int row = blockIdx.x, columns = job.columns, edge = extend_edge(columns), window = extend_window(columns);
 	const float *p = job.from + (size_t)slots.slot[blockIdx.y] * job.slot + (size_t)row * job.pitch;
 	size_t at = (size_t)blockIdx.y * job.rows + row;
@@ -304,20 +376,27 @@ static __global__ void __launch_bounds__(EDGE_THREADS)
 	row_sums.y = sum_block(own.y, shared);
 	row_sums.xy = sum_block(own.xy, shared);
 	row_sums.x2y = sum_block(own.x2y, shared);
+	int width;
+	struct shell shell = find_shell(found.shells, p, columns, level, sides, &search, &width);
 	for (int side = 0; side < 2; side++) {
 		struct extend_edge_sums edge_sums;
-		double y = 0, xy = 0;
+		double y = 0, xy = 0, measured = 0;
 
 		for (int i = threadIdx.x; i < window; i += EDGE_THREADS) {
-			double value = fmax((double)p[side == 0 ? i : columns - 1 - i], 0.0);
+			double sample = (double)p[side == 0 ? i : columns - 1 - i], value = fmax(sample, 0.0);
 
+			measured += sample;
 			y += value * value;
 			xy -= i * value * value;
 		}
 		edge_sums.y = sum_block(y, shared);
 		edge_sums.xy = sum_block(xy, shared);
-		if (threadIdx.x == 0 && (sides >> side & 1))
-			found.fit[at][side] = extend_fit(columns, job.extend, &row_sums, &edge_sums);
+		measured = sum_block(measured, shared);
+		if (threadIdx.x > 0 || !(sides >> side & 1))
+			continue;
+		found.fit[at][side] = extend_fit(columns, job.extend, &row_sums, &edge_sums);
+		if (shell.share > 0)
+			extend_by_shell(&found.fit[at][side], &shell, side, width, (float)measured, columns);
 	}
 }
 
@@ -472,7 +551,8 @@ size_t filter_bytes(const struct plan_shape *shape, int rows)
 		bytes = response_bytes(shape->fft_length);
 	if (shape->extended_length > 0)
 		bytes += response_bytes(shape->extended_length) +
-			 all * (1 + 2 * sizeof(struct extension) + sizeof(int)) + (size_t)shape->batch * sizeof(float);
+			 all * (1 + 2 * sizeof(struct extension) + sizeof(int)) + (size_t)shape->batch * sizeof(float) +
+			 sizeof(struct shell_table);
 	return bytes;
 }
 
@@ -629,6 +709,8 @@ static int prepare_edges(struct plan *plan, struct error *err)
 	if (edges->sides_host == NULL || edges->list_host == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for the edges of %zu rows", rows);
 	CUDA_TRY(cudaEventCreateWithFlags(&edges->used, cudaEventDisableTiming));
+	struct shell_table shells = shell_table_make();
+	TRY(upload(plan, &shells, sizeof(shells), (void **)&edges->shells, err));
 	TRY(device_allocate(plan->device, (size_t)plan->shape.batch * sizeof(float), (void **)&edges->levels, err));
 	TRY(device_allocate(plan->device, rows, (void **)&edges->sides, err));
 	TRY(device_allocate(plan->device, rows * sizeof(*edges->fit), (void **)&edges->fit, err));
@@ -639,6 +721,7 @@ static void edges_free(struct device *device, struct edges *edges, int batch)
 {
 	if (edges == NULL)
 		return;
+	device_release(device, edges->shells, sizeof(*edges->shells));
 	device_release(device, edges->levels, (size_t)batch * sizeof(float));
 	device_release(device, edges->sides, (size_t)edges->rows);
 	device_release(device, edges->fit, (size_t)edges->rows * sizeof(*edges->fit));

@@ -522,8 +522,21 @@ static void check_counts(struct device *devices[2], bool corrected)
 	scene_clear(&scene);
 }
 
-/* A ball that the detector cuts off: the same rows are extended, alike, on both sides; pieces of a batch as well. */
-static void check_extension(struct device *devices[2], int columns, int rows_each, double high)
+/* A brain in its skull, which the detector cuts off on both sides in most views. */
+static void make_skull(struct phantom *ret)
+{
+	const struct ellipsoid parts[] = {
+	    {.shape = SHAPE_CYLINDER, .semi_axes = {45, 52, 200}, .density = .048},
+	    {.shape = SHAPE_CYLINDER, .semi_axes = {40, 47, 200}, .density = -.028},
+	};
+
+	ret->count = 2;
+	ret->parts = malloc(sizeof(parts));
+	memcpy(ret->parts, parts, sizeof(parts));
+}
+
+/* An object that the detector cuts off: the same rows are extended, alike, on both sides; pieces of a batch as well. */
+static void check_extension(struct device *devices[2], int columns, int rows_each, double high, bool skull)
 {
 	const struct scene_options at = {.columns = columns,
 					 .rows = rows_each,
@@ -543,9 +556,13 @@ static void check_extension(struct device *devices[2], int columns, int rows_eac
 	struct scene scene;
 	struct error err = {0};
 
-	scene_make(&scene, "extended rows", &at);
-	must(phantom_named(&ball, "ball", 45, .02, &err), &err, "ball");
-	phantom_move(&ball, (const double[]){9, -6, 3});
+	scene_make(&scene, skull ? "extended rows of a skull" : "extended rows", &at);
+	if (skull)
+		make_skull(&ball);
+	else
+		must(phantom_named(&ball, "ball", 45, .02, &err), &err, "ball");
+	if (!skull)
+		phantom_move(&ball, (const double[]){9, -6, 3});
 	for (int i = 0; i < at.views; i++)
 		phantom_project(&ball, &scene.geometry, i, raw + pixels * (size_t)i);
 	options = scene_plan(&scene, NULL, 0, NULL, true);
@@ -1535,7 +1552,8 @@ static void check_briefly(struct device *devices[2])
 				scene_clear(&scene);
 			}
 	check_counts(devices, true);
-	check_extension(devices, 211, 97, 116);
+	check_extension(devices, 211, 97, 116, false);
+	check_extension(devices, 211, 97, 116, true);
 }
 
 /*
@@ -1607,8 +1625,9 @@ int main(int argc, char **argv)
 	}
 	check_counts(devices, false);
 	check_counts(devices, true);
-	check_extension(devices, 211, 97, 116);
-	check_extension(devices, 64, 601, 40); /* more rows than a launch has blocks below each other */
+	check_extension(devices, 211, 97, 116, false);
+	check_extension(devices, 211, 97, 116, true);
+	check_extension(devices, 64, 601, 40, false); /* more rows than a launch has blocks below each other */
 	check_transfers(devices[1]);
 	check_memory(devices[1]);
 	check_limit();

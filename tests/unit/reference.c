@@ -233,8 +233,8 @@ bool reference_is_cut(const float *row, int columns, bool behind, double not_air
 	return mean > 0 && mean >= not_air && mean >= 3 * sqrt(square / 6 / edge);
 }
 
-/* One side of a row by the words of core/extend.h; false: it ends in air. */
-static bool extend_row(const float *row, int columns, int extend, bool behind, double not_air, double *ret)
+/* One side of a row that is cut off, by the words of core/extend.h. */
+static void extend_row(const float *row, int columns, int extend, bool behind, double not_air, double *ret)
 {
 	const int window = columns / 16 > 4 ? columns / 16 : 4;
 	double *x = calloc((size_t)columns, sizeof(double)), *y = calloc((size_t)columns, sizeof(double));
@@ -271,7 +271,147 @@ static bool extend_row(const float *row, int columns, int extend, bool behind, d
 		ret[i - 1] = sqrt(fmax(0, a + b * i + c * i * i));
 	free(x);
 	free(y);
-	return reference_is_cut(row, columns, behind, not_air);
+}
+
+/* A and B of a body in a shell with the outlines o, in units of the width, by least squares; returns the error's
+ * square. */
+static double fit_shell(const double *p, int bins, const double o[2], double ret[2])
+{
+	double qq = 0, ii = 0, pq = 0, pi = 0, error = 0;
+
+	for (int k = 0; k < bins; k++) {
+		const double x = (k + 0.5) / bins, root = sqrt((x + o[0]) * (1 - x + o[1]));
+
+		qq += root * root;
+		ii += 1 / (root * root);
+		pq += p[k] * root;
+		pi += p[k] / root;
+	}
+	ret[0] = (pq * ii - pi * bins) / (qq * ii - (double)bins * bins);
+	ret[1] = (pi * qq - pq * bins) / (qq * ii - (double)bins * bins);
+	if (ret[1] <= 0) {
+		ret[0] = pq / qq;
+		ret[1] = 0;
+	} else if (ret[0] <= 0) {
+		ret[0] = 0;
+		ret[1] = pi / ii;
+	}
+	for (int k = 0; k < bins; k++) {
+		const double x = (k + 0.5) / bins, root = sqrt((x + o[0]) * (1 - x + o[1]));
+
+		error += pow(p[k] - ret[0] * root - ret[1] / root, 2);
+	}
+	return error;
+}
+
+static double ramp_between(double value, double none, double all)
+{
+	return fmin(fmax((value - none) / (all - none), 0), 1);
+}
+
+/* The outlines that fit best, of 14 on either side; their share. */
+static double find_shell(const double *p, int bins, double o[2], double ret[2])
+{
+	double squares[64], x[64], square = 0, ellipse = 0, fitted, outlines[14], a = 0, b = 0, c, x2 = 0, errors[3];
+	int at[2] = {0, 0};
+
+	for (int i = 0; i < 14; i++)
+		outlines[i] = 0.015 * pow(1 / 0.015, i / 13.0);
+	for (int k = 0; k < bins; k++) {
+		x[k] = (k + 0.5) / bins - 0.5;
+		squares[k] = p[k] * p[k];
+		square += squares[k];
+		x2 += x[k] * x[k];
+		b += x[k] * squares[k];
+	}
+	c = curvature(x, squares, bins);
+	b /= x2;
+	a = (square - c * x2) / bins;
+	for (int k = 0; k < bins; k++)
+		ellipse += pow(p[k] - sqrt(fmax(0, a + x[k] * (b + c * x[k]))), 2);
+	ellipse = sqrt(ellipse / square);
+	if (!(ellipse > 0.0015 && ellipse < 0.2))
+		return 0;
+	for (int step = 0; step < 5; step++) {
+		double least = INFINITY;
+		int best = 0;
+
+		for (int k = 0; k < 14; k++) {
+			const double tried[2] = {outlines[step == 0 || step % 2 == 1 ? k : at[0]],
+						 outlines[step % 2 == 0 ? k : at[1]]};
+			const double error = fit_shell(p, bins, tried, ret);
+
+			if (error < least) {
+				least = error;
+				best = k;
+			}
+		}
+		if (step == 0 || step % 2 == 1)
+			at[0] = best;
+		if (step % 2 == 0)
+			at[1] = best;
+	}
+	for (int side = 0; side < 2; side++) {
+		double shift = 0;
+
+		for (int k = -1; k < 2; k++) {
+			double tried[2] = {outlines[at[0]], outlines[at[1]]};
+
+			tried[side] = outlines[(int)fmin(fmax(at[side] + k, 0), 13)];
+			errors[k + 1] = fit_shell(p, bins, tried, ret);
+		}
+		if (at[side] > 0 && at[side] < 13 && errors[0] - 2 * errors[1] + errors[2] > 0)
+			shift =
+			    fmin(fmax((errors[0] - errors[2]) / 2 / (errors[0] - 2 * errors[1] + errors[2]), -1), 1);
+		o[side] = outlines[at[side]] * pow(1 / 0.015, shift / 13);
+	}
+	fitted = sqrt(fit_shell(p, bins, o, ret) / square);
+	return ramp_between(ellipse, 0.0015, 0.003) * ramp_between(ellipse, 1.1 * fitted, 1.3 * fitted) *
+	       (1 - ramp_between(fitted, 0.02, 0.035)) * ramp_between(ret[1] / (ret[1] + ret[0] / 4), 0.05, 0.1) *
+	       (1 - ramp_between(ret[1] / (ret[1] + ret[0] / 4), 0.3, 0.4)) *
+	       (1 - ramp_between(fmax(o[0], o[1]), 0.2, 0.35));
+}
+
+/* The extension of one side moved towards that of a body in a shell, where that is what the row shows. */
+static void extend_by_shell_of_row(const float *row, int columns, int extend, bool behind, const bool cut[2],
+				   double not_air, double *ret)
+{
+	enum { BINS = 64 };
+	const int window = columns / 16 > 4 ? columns / 16 : 4;
+	double p[BINS] = {0}, o[2], fit[2], share, measured = 0, explained = 0, width, half, outline;
+	int first = 0, last = columns - 1;
+
+	while (!cut[0] && first < last && (double)row[first] < not_air)
+		first++;
+	while (!cut[1] && last > first && (double)row[last] < not_air)
+		last--;
+	width = last - first + 1;
+	for (int k = 0; k < BINS; k++) {
+		const int from = first + (last - first + 1) * k / BINS,
+			  to = first + (last - first + 1) * (k + 1) / BINS;
+
+		for (int c = from; c < to || c == from; c++)
+			p[k] += (double)row[c] / (to > from ? to - from : 1);
+	}
+	share = find_shell(p, BINS, o, fit);
+	if (!(share > 0))
+		return;
+	half = (1 + o[0] + o[1]) / 2 * width;
+	outline = o[behind] * width;
+	for (int i = 0; i < window; i++) {
+		const double q = (outline + i + 0.5) * (2 * half - outline - i - 0.5);
+
+		measured += (double)row[behind ? columns - 1 - i : i];
+		explained += q > 0 ? fit[0] / width * sqrt(q) + fit[1] * width / sqrt(q) : 0;
+	}
+	for (int i = 1; i <= extend; i++) {
+		const double q = (outline - i + 0.5) * (2 * half - outline + i - 0.5), middle = outline - half;
+		const double shell =
+		    fit[0] / width * sqrt(fmax(0, q)) +
+		    fit[1] * width * (asin(fmin(1, (i - middle) / half)) - asin(fmin(1, (i - 1 - middle) / half)));
+
+		ret[i - 1] += share * (fmin(fmax(measured / explained, 1. / 3), 3) * shell - ret[i - 1]);
+	}
 }
 
 void reference_filter(const struct plan_options *options, int view, const float *projection, float *ret)
@@ -288,13 +428,17 @@ void reference_filter(const struct plan_options *options, int view, const float 
 		kernels[1] = kernel_of(options->extended_response, filter_length(wide + extend));
 	for (int row = 0; row < geometry->rows; row++) {
 		const float *from = projection + (size_t)row * (size_t)columns;
-		bool extended = false;
+		bool extended = false, cut[2] = {false, false};
 
+		for (int side = 0; side < 2 && extend > 0; side++)
+			cut[side] = options->pad[side] == 0 && reference_is_cut(from, columns, side == 1, not_air);
 		for (int c = -extend; c < columns + extend; c++)
 			line[c + extend] = c >= 0 && c < columns ? (double)from[c] : 0;
 		for (int side = 0; side < 2 && extend > 0; side++) {
-			if (options->pad[side] > 0 || !extend_row(from, columns, extend, side == 1, not_air, beyond))
+			if (!cut[side])
 				continue;
+			extend_row(from, columns, extend, side == 1, not_air, beyond);
+			extend_by_shell_of_row(from, columns, extend, side == 1, cut, not_air, beyond);
 			extended = true;
 			for (int i = 0; i < extend; i++)
 				line[side == 1 ? extend + columns + i : extend - 1 - i] = beyond[i];

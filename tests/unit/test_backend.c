@@ -688,6 +688,20 @@ static void elliptic_rows(const struct rig *rig, float *ret)
 	}
 }
 
+/* Rows that a body in a shell of bone gives, cut off on both sides or on one. */
+static void shell_rows(const struct rig *rig, float *ret)
+{
+	const int columns = rig->geometry.columns;
+
+	for (size_t i = 0; i < rig->all_pixels; i++) {
+		const int column = (int)(i % (size_t)columns), row = (int)(i / (size_t)columns);
+		const double first = -0.04 * columns * (1 + row % 3), last = columns * (row % 5 == 0 ? 0.8 : 1.1);
+		const double q = (column + .5 - first) * (last - column - .5);
+
+		ret[i] = q > 0 ? (float)((3 * sqrt(q) + .6 * columns * columns / sqrt(q) * 0.3) / columns) : 0;
+	}
+}
+
 /* Which of them a fit of core/extend.h concerns. */
 static void count_truncated(const struct rig *rig, const float *rows, const int pad[2], size_t ret[2])
 {
@@ -705,10 +719,10 @@ static void count_truncated(const struct rig *rig, const float *rows, const int 
 	}
 }
 
-/* With a padded side or without, and what lets through all but 4 % of the photons. */
+/* With a padded side or without, what lets through all but 4 % of the photons, and shells of bone. */
 START_TEST(truncated_rows_are_extended_before_the_ramp)
 {
-	static const int pads[][2] = {{0, 0}, {7, 0}, {0, 4}, {0, 0}};
+	static const int pads[][2] = {{0, 0}, {7, 0}, {0, 4}, {0, 0}, {0, 0}};
 	const int views[2] = {1, 0}, *pad = pads[_i];
 	const int columns = setups[0].columns, wide = pad[0] + columns + pad[1];
 	const size_t wide_pixels = (size_t)wide * (size_t)setups[0].rows;
@@ -728,7 +742,10 @@ START_TEST(truncated_rows_are_extended_before_the_ramp)
 	rig.options.extended_response = responses[1];
 	rig.options.extend = columns;
 	projections = floats(rig.all_pixels);
-	elliptic_rows(&rig, projections);
+	if (_i == 4)
+		shell_rows(&rig, projections);
+	else
+		elliptic_rows(&rig, projections);
 	for (size_t i = 0; i < rig.all_pixels && _i == 3; i++)
 		projections[i] *= .01f;
 	count_truncated(&rig, projections, pad, expected);
@@ -1784,7 +1801,7 @@ Suite *backend_suite(void)
 	tcase_add_loop_test(operations, backproject_is_the_bilinear_sum, 0, SETUPS);
 	tcase_add_loop_test(operations, filter_is_the_convolution_of_weighted_rows, 0, SETUPS);
 	tcase_add_test(operations, padded_filter_goes_on_beyond_the_detector);
-	tcase_add_loop_test(operations, truncated_rows_are_extended_before_the_ramp, 0, 4);
+	tcase_add_loop_test(operations, truncated_rows_are_extended_before_the_ramp, 0, 5);
 	tcase_add_loop_test(operations, sart_is_the_contracts_update, 0, SETUPS);
 	tcase_add_loop_test(operations, gradient_tv_takes_the_steps_of_the_equation, 0, SETUPS);
 	tcase_add_loop_test(known, ones_project_to_the_length_inside_the_grid, 0, SETUPS);

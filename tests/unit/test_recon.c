@@ -1728,6 +1728,174 @@ START_TEST(sart_alone_tells_of_truncation)
 }
 END_TEST
 
+/* ---- rows that the detector cuts off, by what they are cut in ---- */
+
+/* Ellipses across z in mm, turned by `angle` degrees; density in units of water's. */
+struct ellipse {
+	double x, y, a, b, angle, density;
+};
+enum { ELLIPSES_MOST = 6 };
+
+/* An outline of skin, a shell of bone and a brain. */
+#define SKULL(a, b, thick, bone, x, y)                                                                                 \
+	{                                                                                                              \
+		{x, y, (a) + 3, (b) + 3, 0, 1.03}, {x, y, a, b, 0, (bone)-1.03},                                       \
+		{                                                                                                      \
+			x, y, (a) - (thick), (b) - (thick), 0, 1.03 - (bone)                                           \
+		}                                                                                                      \
+	}
+
+/*
+ * Field of view, object, and the errors that are allowed in its middle, half way out and at its rim, HU. In the comment
+ * what the ellipse alone gives, and what no extension.
+ */
+static const struct {
+	const char *what;
+	double field_of_view, offset; /* mm; of the detector */
+	struct ellipse ellipses[ELLIPSES_MOST];
+	double photons; /* in air; 0: no noise */
+	double allowed[3];
+} cuts[] = {
+    /* -298 -373 -902; 51 78 664 */
+    {"a round skull", 129, 0, SKULL(70, 70, 7, 2.5, 0, 0), 0, {25, 30, 110}},
+    /* -106 -131 -246; 147 209 1172 */
+    {"a skull", 129, 0, SKULL(72, 90, 7, 2.5, 0, 0), 0, {18, 22, 32}},
+    {"a skull, 20000 photons", 129, 0, SKULL(72, 90, 7, 2.5, 0, 0), 20000, {30, 40, 60}},
+    /* -79 -101 -262; 99 142 846 */
+    {"a thin skull", 129, 0, SKULL(68, 88, 6, 2.0, 0, 0), 0, {20, 20, 60}},
+    /* -59 -73 -153; 144 201 1020 */
+    {"a skull beside the axis", 129, 0, SKULL(72, 90, 7, 2.5, 12, -9), 0, {32, 38, 82}},
+    /* -64 -82 -231; 36 54 393 */
+    {"a skull that is cut at the sides only", 160, 0, SKULL(75, 95, 8, 2.2, 0, 0), 0, {45, 55, 160}},
+    /* No worse than by the ellipse alone, below. */
+    {"a trunk", 200, 0, {{0, 0, 170, 120, 0, 1}}, 0, {10, 10, 20}},
+    {"a trunk, 20000 photons", 200, 0, {{0, 0, 170, 120, 0, 1}}, 20000, {15, 15, 25}},
+    {"a large trunk", 200, 0, {{0, 0, 250, 170, 0, 1}}, 0, {30, 35, 45}},
+    {"a trunk that is cut a little", 200, 0, {{0, 0, 115, 80, 0, 1}}, 0, {5, 5, 10}},
+    {"a trunk that is cut at one side", 200, 0, {{45, 10, 110, 85, 0, 1}, {45, -40, 15, 15, 0, .6}}, 0, {6, 6, 12}},
+    {"a trunk with a spine and bowel",
+     200,
+     0,
+     {{0, 0, 170, 120, 0, 1}, {0, -70, 22, 20, 0, .6}, {40, 20, 30, 25, 17, -.8}, {-50, 25, 35, 20, -11, -.7}},
+     0,
+     {12, 14, 24}},
+    {"a pelvis", 200, 0, {{0, 0, 170, 120, 0, 1}, {95, 0, 25, 40, 11, .8}, {-95, 0, 25, 40, -11, .8}}, 0, {10, 10, 15}},
+    {"lungs",
+     200,
+     0,
+     {{0, 0, 165, 115, 0, 1}, {75, 5, 55, 80, 0, -.75}, {-75, 5, 55, 80, 0, -.75}, {0, -80, 20, 18, 0, .5}},
+     0,
+     {12, 14, 35}},
+    {"a leg with its bone at the rim",
+     100,
+     0,
+     {{0, 0, 80, 75, 0, 1}, {46, 0, 17, 17, 0, 1.2}, {46, 0, 9, 9, 0, -.9}},
+     0,
+     {28, 32, 42}},
+    {"a trunk on a displaced detector", 300, 50, {{0, 0, 180, 125, 0, 1}}, 0, {15, 15, 40}},
+};
+enum { CUTS = sizeof(cuts) / sizeof(*cuts) };
+
+static void add_ellipses(struct scene *scene, const struct ellipse *ellipses)
+{
+	struct ellipsoid parts[ELLIPSES_MOST];
+	struct phantom phantom = {.parts = parts};
+
+	for (; phantom.count < ELLIPSES_MOST && ellipses[phantom.count].a > 0; phantom.count++) {
+		const struct ellipse *from = &ellipses[phantom.count];
+
+		parts[phantom.count] = (struct ellipsoid){.shape = SHAPE_CYLINDER,
+							  .semi_axes = {from->a, from->b, 500},
+							  .centre = {from->x, from->y, 0},
+							  .angle = from->angle * M_PI / 180,
+							  .density = 0.0192 * from->density};
+	}
+	scene_add(scene, &phantom);
+}
+
+/* Photons at random, sum of 12 uniform numbers for a normal one: their count is large. */
+static void add_noise(struct scene *scene, double photons)
+{
+	const size_t count =
+	    (size_t)scene->geometry.count * (size_t)scene->geometry.columns * (size_t)scene->geometry.rows;
+	unsigned seed = 12345;
+
+	for (size_t i = 0; i < count; i++) {
+		double normal = -6;
+
+		for (int k = 0; k < 12; k++) {
+			seed = seed * 1664525u + 1013904223u;
+			normal += (seed >> 8) / 16777216.0;
+		}
+		scene->projections[i] += (float)(normal * sqrt(exp((double)scene->projections[i]) / photons));
+	}
+}
+
+/* Means of volume - whole in the middle, half way out and at the rim, HU. */
+static void errors_by_radius(const float *volume, const float *whole, const struct grid *grid, double radius,
+			     double ret[3])
+{
+	static const double from[] = {0, 0.45, 0.88}, to[] = {0.25, 0.6, 0.97};
+	size_t count[3] = {0}, at = 0;
+
+	ret[0] = ret[1] = ret[2] = 0;
+	for (int j = 0; j < grid->size[1]; j++)
+		for (int i = 0; i < grid->size[0]; i++, at++) {
+			const double r =
+			    hypot(grid->origin[0] + i * grid->spacing[0], grid->origin[1] + j * grid->spacing[1]) /
+			    radius;
+
+			for (int k = 0; k < 3; k++) {
+				if (r < from[k] || r > to[k])
+					continue;
+				ret[k] += ((double)volume[at] - (double)whole[at]) / 0.0192 * 1000;
+				count[k]++;
+			}
+		}
+	for (int k = 0; k < 3; k++)
+		ret[k] /= (double)count[k];
+}
+
+/* Against FDK of the same object on a detector three times as wide, so that all that is seen is what is cut off. */
+START_TEST(rows_cut_in_bone_or_soft_tissue_keep_the_field_of_view)
+{
+	const double radius = cuts[_i].field_of_view / 2;
+	const bool displaced = cuts[_i].offset != 0;
+	/* A displaced detector reaches as far on its wide side; 192 columns in all. */
+	const double half = 1100 * tan(asin(radius / 620));
+	const double pixel = displaced ? (half - cuts[_i].offset) / 96 : half / 96;
+	const int views = displaced ? 360 : 180;
+	struct orbit_spec spec = {192,          1, views, {620, 1100, {pixel, pixel}, {cuts[_i].offset, 0}, {0, 0}}, 0,
+				  360.0 / views};
+	const double voxel = 2 * radius / 72;
+	struct grid grid = grid_of(72, 72, 1, voxel, voxel, voxel);
+	struct recipe recipe = recipe_on(&grid);
+	struct outcome cut = {0}, whole = {0};
+	struct scene scene;
+	double errors[3];
+
+	recipe.fdk.on = true;
+	scene_orbit(&scene, &spec);
+	add_ellipses(&scene, cuts[_i].ellipses);
+	if (cuts[_i].photons > 0)
+		add_noise(&scene, cuts[_i].photons);
+	run(&scene, &recipe, &cut);
+	scene_clear(&scene);
+	spec.columns = 600;
+	spec.circular.detector_offset[0] = 0;
+	scene_orbit(&scene, &spec);
+	add_ellipses(&scene, cuts[_i].ellipses);
+	run(&scene, &recipe, &whole);
+	errors_by_radius(cut.last, whole.last, &grid, radius, errors);
+	for (int k = 0; k < 3; k++)
+		ck_assert_msg(fabs(errors[k]) <= cuts[_i].allowed[k], "%s: %.0f %.0f %.0f HU", cuts[_i].what, errors[0],
+			      errors[1], errors[2]);
+	outcome_clear(&whole);
+	outcome_clear(&cut);
+	scene_clear(&scene);
+}
+END_TEST
+
 /* The real C-arm's sweep with pixels four times as wide; columns first .. first + count - 1. */
 static bool sweep_of(int first, int count, struct geometry *ret)
 {
@@ -1872,6 +2040,7 @@ Suite *recon_suite(void)
 	tcase_add_loop_test(images, a_grid_inside_of_the_body_shows_what_is_there, 0, 4);
 	tcase_add_loop_test(images, a_body_inside_of_the_grid_is_not_told_to_go_on, 0, 2);
 	tcase_add_loop_test(images, sart_alone_tells_of_truncation, 0, 2);
+	tcase_add_loop_test(images, rows_cut_in_bone_or_soft_tissue_keep_the_field_of_view, 0, CUTS);
 	tcase_add_test(images, a_truncated_abdomen_keeps_its_values);
 	tcase_add_test(images, sart_is_as_good_as_rtk_demands);
 	suite_add_tcase(suite, images);
