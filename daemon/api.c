@@ -18,6 +18,7 @@ const struct route api_routes[] = {
     {"GET", "/readyz", ready_get, BODY_NONE, 0, NULL, NULL, NULL},
     {"GET", "/metrics", metrics_get, BODY_NONE, 0, NULL, NULL, NULL},
     {"GET", "/v1/devices", device_list, BODY_NONE, 0, NULL, NULL, NULL},
+    {"GET", "/v1/quarantine", quarantine_get, BODY_NONE, 0, NULL, NULL, NULL},
     {"GET", "/v1/openapi.json", schema_get, BODY_NONE, 0, NULL, NULL, NULL},
 
     {"GET", "/v1/scans", scan_list, BODY_NONE, 0, NULL, NULL, "limit after"},

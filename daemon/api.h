@@ -69,6 +69,7 @@ int live_get(void *context, struct request *request, struct error *err);
 int ready_get(void *context, struct request *request, struct error *err);
 int metrics_get(void *context, struct request *request, struct error *err);
 int device_list(void *context, struct request *request, struct error *err);
+int quarantine_get(void *context, struct request *request, struct error *err);
 int schema_get(void *context, struct request *request, struct error *err);
 
 /* ---- what several of them need: api_common.c ---- */

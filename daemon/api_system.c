@@ -1,4 +1,4 @@
-/* /livez, /readyz, /metrics, /v1/devices, /v1/openapi.json */
+/* /livez, /readyz, /metrics, /v1/devices, /v1/quarantine, /v1/openapi.json */
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -22,13 +22,49 @@ int live_get(void *context, struct request *request, struct error *err)
 	return reply_word(request, "alive\n", err);
 }
 
+/* Ready all the same: what is set aside hinders nobody, but somebody should look at it. */
+static int reply_ready(struct request *request, const struct api *api, struct error *err)
+{
+	struct quarantined *entries;
+	char text[1024];
+	int count;
+
+	if (quarantine_list(store_directory(api->store), &entries, &count, err) != 0)
+		return err->code;
+	if (count == 0)
+		snprintf(text, sizeof(text), "ready\n");
+	else
+		snprintf(text, sizeof(text), "ready\nquarantine: %d set aside, see /v1/quarantine\n", count);
+	free(entries);
+	return reply_word(request, text, err);
+}
+
 int ready_get(void *context, struct request *request, struct error *err)
 {
 	struct api *api = context;
 
 	if (!supervise_ready(api->supervise))
 		return error_set(err, ERR_BUSY, "no worker can take a job");
-	return reply_word(request, "ready\n", err);
+	return reply_ready(request, api, err);
+}
+
+/* ---- what was set aside ---- */
+
+int quarantine_get(void *context, struct request *request, struct error *err)
+{
+	const struct api *api = context;
+	struct quarantined *entries;
+	cJSON *document, *list;
+	int count;
+
+	if (quarantine_list(store_directory(api->store), &entries, &count, err) != 0)
+		return err->code;
+	document = cJSON_CreateObject();
+	list = cJSON_AddArrayToObject(document, "entries");
+	for (int i = 0; i < count; i++)
+		cJSON_AddItemToArray(list, quarantined_document(&entries[i]));
+	free(entries);
+	return request_reply_json(request, 200, document, err);
 }
 
 int device_list(void *context, struct request *request, struct error *err)
@@ -109,6 +145,25 @@ static void write_store(FILE *out, struct api *api)
 	single(out, "commit_seconds_total", "counter", "Time they took.", store.commit_seconds);
 }
 
+static void write_repairs(FILE *out, struct api *api)
+{
+	struct store_repairs repairs;
+	struct quarantined *entries;
+	struct error err;
+	int count;
+
+	store_repairs(api->store, &repairs);
+	describe(out, "catalogue_found", "gauge", "What the last start found in directories only, by kind.");
+	fprintf(out, "cbctd_catalogue_found{kind=\"scan\"} %d\ncbctd_catalogue_found{kind=\"job\"} %d\n",
+		repairs.found[0], repairs.found[1]);
+	single(out, "catalogue_remade", "gauge", "1 when the last start found the catalogue damaged and made it again.",
+	       repairs.remade);
+	if (quarantine_list(store_directory(api->store), &entries, &count, &err) != 0)
+		return;
+	single(out, "quarantine_entries", "gauge", "What was set aside in quarantine/ and is still there.", count);
+	free(entries);
+}
+
 static void write_jobs(FILE *out, struct api *api)
 {
 	struct jobs_statistics jobs;
@@ -153,6 +208,7 @@ int metrics_get(void *context, struct request *request, struct error *err)
 	write_http(out, api);
 	write_uploads(out, api);
 	write_store(out, api);
+	write_repairs(out, api);
 	write_jobs(out, api);
 	write_workers(out, api);
 	if (fclose(out) != 0) {

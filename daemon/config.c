@@ -323,6 +323,10 @@ static int each_flag(int argc, char **argv, struct config *config, enum config_a
 			*action = CONFIG_PRINT;
 			continue;
 		}
+		if (strcmp(name, "--rebuild-catalogue") == 0) {
+			*action = CONFIG_REBUILD;
+			continue;
+		}
 		length = strcspn(name, "=");
 		setting = strncmp(name, "--", 2) == 0 ? setting_find(name + 2, length - 2) : NULL;
 		if (setting == NULL)
@@ -396,6 +400,9 @@ void config_help(FILE *out)
 		fputc('\n', out);
 	}
 	fputs("  --print-config\n        every setting as it is now, as a config file\n"
+	      "  --rebuild-catalogue\n        sets the catalogue aside, makes it again from the directories of scans "
+	      "and jobs,\n"
+	      "        and ends; no daemon may use the state directory\n"
 	      "  --help\n        this list\n",
 	      out);
 }

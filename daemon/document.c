@@ -485,3 +485,21 @@ cJSON *worker_document(const struct worker_facts *facts)
 	add_text_or_null(document, "last_error", facts->last_error);
 	return document;
 }
+
+/* ---- what was set aside ---- */
+
+cJSON *quarantined_document(const struct quarantined *entry)
+{
+	cJSON *document = cJSON_CreateObject();
+
+	cJSON_AddStringToObject(document, "name", entry->name);
+	if (entry->from[0] == '\0') {
+		cJSON_AddNullToObject(document, "from");
+		cJSON_AddNullToObject(document, "why");
+	} else {
+		cJSON_AddStringToObject(document, "from", entry->from);
+		cJSON_AddStringToObject(document, "why", entry->why);
+	}
+	add_time(document, "moved", entry->time);
+	return document;
+}

@@ -4,6 +4,7 @@
 #include <cjson/cJSON.h>
 
 #include "daemon/job.h"
+#include "daemon/store_quarantine.h"
 #include "daemon/supervise.h"
 
 /*
@@ -27,5 +28,7 @@ cJSON *history_row_document(const struct history_row *row);
 cJSON *error_document(int code, const char *pointer, const char *text);
 /* index, state, backend, device, driver, memory, job, restarts. */
 cJSON *worker_document(const struct worker_facts *facts);
+/* name, from, why, moved. */
+cJSON *quarantined_document(const struct quarantined *entry);
 
 #endif

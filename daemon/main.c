@@ -157,6 +157,21 @@ static int run(const struct config *config)
 	return code != 0 || atomic_load(&failed) ? 1 : 0;
 }
 
+static int rebuild(const struct config *config)
+{
+	struct store_repairs repairs;
+	struct error err;
+
+	log_set_level(level_named(config->log_level));
+	if (store_rebuild(config->state_dir, &repairs, &err) != 0) {
+		log_line(LEVEL_ERROR, "the catalogue cannot be made again: %s", err.text);
+		return 1;
+	}
+	printf("the catalogue has %d scans and %d jobs again; %d directories were set aside in %s/quarantine\n",
+	       repairs.found[0], repairs.found[1], repairs.set_aside, config->state_dir);
+	return 0;
+}
+
 int main(int argc, char **argv)
 {
 	enum config_action action;
@@ -177,6 +192,8 @@ int main(int argc, char **argv)
 		config_help(stdout);
 	else if (action == CONFIG_PRINT)
 		config_print(&config, stdout);
+	else if (action == CONFIG_REBUILD)
+		status = rebuild(&config);
 	else
 		status = run(&config);
 	config_clear(&config);

@@ -519,6 +519,10 @@ class Client:
         """The workers and what they run on."""
         return list(self._json("GET", "/v1/devices")["devices"])
 
+    def quarantine(self) -> List[Document]:
+        """What the daemon has set aside because it could not use it, and why."""
+        return list(self._json("GET", "/v1/quarantine")["entries"])
+
     def ready(self) -> bool:
         """Whether a worker can take a job just now."""
         try:

@@ -79,7 +79,10 @@ if [[ $wanted == *watchers* ]]; then
 		curl -s "$url/v1/jobs/$id" | jq .timings.sart
 		[ -n "$pid" ] || return 0
 		kill -0 $pid # it reads what comes now
-		sqlite3 -separator ' ' "file:$work/state/catalogue.sqlite?mode=ro" "SELECT e.number, printf('%.6f', e.created)
+		# a copy: the catalogue of a running daemon is its own
+		cp "$work/state/catalogue.sqlite" "$work/copy.sqlite"
+		cp "$work/state/catalogue.sqlite-wal" "$work/copy.sqlite-wal"
+		sqlite3 -separator ' ' "$work/copy.sqlite" "SELECT e.number, printf('%.6f', e.created)
 			FROM events e JOIN jobs j ON j.number = e.job WHERE j.id = '$id'" >"$work/created"
 		wait $pid
 	}

@@ -218,6 +218,7 @@ class Jobs(Case):
     def test_the_daemon(self) -> None:
         self.assertTrue(self.client.ready())
         self.assertEqual(self.client.devices()[0]["backend"], "cpu")
+        self.assertEqual(self.client.quarantine(), [])
         with cbctd.Client("http://127.0.0.1:1") as nobody:
             self.assertFalse(nobody.ready())
             with self.assertRaises(cbctd.Broken):

@@ -16,7 +16,8 @@ const routes = [
 const main = document.querySelector('main')
 const live = h('span', { class: 'live', role: 'status' })
 const devices = h('span', { class: 'devices' })
-document.querySelector('.status').append(devices, live)
+const quarantine = h('span', { class: 'devices bad' })
+document.querySelector('.status').append(quarantine, devices, live)
 
 let page = null
 
@@ -51,8 +52,12 @@ async function showDevices() {
 		const able = list.filter(device => ['idle', 'busy'].includes(device.state))
 		write(devices, able.length > 0 ? able.map(device => device.device ?? device.backend).join(', ') : 'no worker can take a job')
 		devices.classList.toggle('bad', able.length === 0)
+		const { entries } = await get('/v1/quarantine')
+		write(quarantine, entries.length > 0 ? `${entries.length} set aside in quarantine` : '')
+		quarantine.title = entries.map(entry => `${entry.from ?? entry.name}: ${entry.why ?? 'no note'}`).join('\n')
 	} catch {
 		write(devices, '')
+		write(quarantine, '')
 	}
 }
 

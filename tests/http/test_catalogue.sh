@@ -1,0 +1,155 @@
+#!/usr/bin/env bash
+# A catalogue that is lost, older or damaged takes nothing with it, and is told.
+. "$(dirname "$0")/lib.sh"
+
+scan_dir=$work/ball
+cbct simulate --phantom ball --scale 30 --density 0.02 --views 12 --arc 360 --columns 32 --rows 24 --pixel 8 \
+	--source-to-isocentre 600 --source-to-detector 1000 -o "$scan_dir" >/dev/null || exit 1
+small='{"scan": "SCAN", "grid": {"size": [16, 16, 8], "spacing_mm": [6, 6, 8]}, "fdk": {}, "sart": {"iterations": 2}, "emit": ["fdk"]}'
+
+# A scan with a finished job; all that is known of both is in $work/$1.*
+made() {
+	rm -rf "$state"
+	start_daemon
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "$small"
+	wait_job succeeded
+	req GET "/v1/jobs/$job/volumes?wait=20"
+	known before
+	expect_ready ""
+}
+known() {
+	req GET "/v1/scans/$scan"
+	expect_status 200
+	mv "$body" "$work/$1.scan"
+	req GET "/v1/jobs/$job"
+	expect_status 200
+	mv "$body" "$work/$1.job"
+	req GET "/v1/jobs/$job/volumes"
+	expect_status 200
+	mv "$body" "$work/$1.volumes"
+	curl -sS -N --max-time 60 "$url/v1/jobs/$job/events" >"$work/$1.events"
+	get_volume final "$work/$1.final"
+}
+known_as_before() {
+	local what
+	known after
+	for what in scan job volumes events final; do
+		cmp "$work/before.$what" "$work/after.$what" || fail "the same $what as before"
+	done
+}
+expect_ready() { # WHAT the second line of /readyz begins with
+	req GET /readyz
+	expect_status 200
+	[[ $(sed -n 2p "$body") == "$1"* ]] || fail "second line of /readyz \"$1\": $(cat "$body")"
+	[ -n "$1" ] || [ "$(wc -l <"$body")" = 1 ] || fail "nothing more: $(cat "$body")"
+}
+
+test_a_lost_catalogue_is_made_again_and_told() {
+	made
+	stop_daemon KILL
+	rm "$state"/catalogue.sqlite*
+	start_daemon
+	known_as_before
+	expect_ready "quarantine: 1 "
+	req GET /v1/quarantine
+	expect_json '.entries | length == 1 and .[0].from == "catalogue.sqlite" and (.[0].why | test("missing or empty: 1 scans and 1 jobs"))'
+	req GET /metrics
+	grep -qx 'cbctd_quarantine_entries 1' "$body" || fail "the entry in the metrics"
+	grep -qx 'cbctd_catalogue_found{kind="job"} 1' "$body" || fail "the job that was found in the metrics"
+	stop_daemon
+	start_daemon
+	known_as_before
+	rm "$state"/quarantine/*
+	expect_ready ""
+	stop_daemon
+}
+
+test_an_older_catalogue_loses_nothing_and_brings_nothing_back() {
+	local older scan_gone
+	made
+	scan_gone=$scan older=$job
+	stop_daemon
+	cp "$state/catalogue.sqlite" "$work/older"
+	start_daemon
+	req DELETE "/v1/jobs/$older"
+	expect_status 204
+	req DELETE "/v1/scans/$scan_gone"
+	expect_status 204
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "$small"
+	wait_job succeeded
+	req GET "/v1/jobs/$job/volumes?wait=20"
+	known before
+	stop_daemon KILL
+	rm "$state"/catalogue.sqlite*
+	cp "$work/older" "$state/catalogue.sqlite"
+	start_daemon
+	known_as_before
+	req GET /v1/scans
+	expect_json "[.scans[].id] == [\"$scan\"]"
+	req GET /v1/jobs
+	expect_json "[.jobs[].id] == [\"$job\"]"
+	stop_daemon
+}
+
+test_a_damaged_catalogue_is_set_aside_and_made_again() {
+	made
+	stop_daemon
+	# one bit of each page but the first
+	python3 - "$state/catalogue.sqlite" <<-'END'
+		import sys
+		data = bytearray(open(sys.argv[1], "rb").read())
+		for at in range(4096 + 1000, len(data), 4096):
+		    data[at] ^= 16
+		open(sys.argv[1], "wb").write(data)
+	END
+	start_daemon
+	known_as_before
+	req GET /v1/quarantine
+	expect_json '.entries | length == 1 and (.[0].why | test("damaged"))'
+	[ -s "$state/quarantine/$(json '.entries[0].name')" ] || fail "the damaged catalogue, kept"
+	stop_daemon
+}
+
+test_the_catalogue_is_made_again_when_asked() {
+	made
+	if "$BUILD/cbctd" --state-dir "$state" --rebuild-catalogue >"$work/rebuilt" 2>&1; then
+		fail "a refusal while a daemon runs"
+	fi
+	grep -q "in use by another" "$work/rebuilt" || fail "why: $(cat "$work/rebuilt")"
+	stop_daemon
+	"$BUILD/cbctd" --state-dir "$state" --rebuild-catalogue >"$work/rebuilt"
+	grep -q "has 1 scans and 1 jobs again; 0 " "$work/rebuilt" || fail "what was made: $(cat "$work/rebuilt")"
+	start_daemon
+	known_as_before
+	stop_daemon
+}
+
+test_what_nobody_knows_is_kept_and_comes_back_once_it_is_whole() {
+	made
+	stop_daemon
+	cp "$state/scans/$scan/record.json" "$work/record"
+	echo >>"$state/scans/$scan/record.json"
+	rm "$state/catalogue.sqlite"
+	mkdir "$state/jobs/1m7yam2f9rgevqe7"
+	echo something >"$state/jobs/1m7yam2f9rgevqe7/final.nii"
+	start_daemon
+	req GET "/v1/scans/$scan"
+	expect_problem 404
+	req GET /v1/quarantine
+	expect_json "[.entries[].from] | sort == [\"catalogue.sqlite\", \"jobs/1m7yam2f9rgevqe7\", \"scans/$scan\"]"
+	local name
+	name=$(json ".entries[] | select(.from == \"scans/$scan\").name")
+	[ -s "$state/quarantine/$name/projections.raw" ] || fail "the projections, kept"
+	stop_daemon
+	cp "$work/record" "$state/quarantine/$name/record.json"
+	"$BUILD/cbctd" --state-dir "$state" --rebuild-catalogue >"$work/rebuilt"
+	start_daemon
+	known_as_before
+	stop_daemon
+}
+
+stop_after_each=1 run_tests
