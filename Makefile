@@ -217,7 +217,7 @@ soak: setup ## the long tests: faults by the thousand, sweeps over anatomy and n
 FUZZ_SECONDS ?= 10
 fuzzers := $(patsubst tests/fuzz/%.c,$(BUILD)/%,$(wildcard tests/fuzz/fuzz_*.c))
 
-$(BUILD)/fuzz_%: $(BUILD)/tests/fuzz/fuzz_%.o $(call objects,daemon/http_text.c clients/cbct/numbers.c clients/cbct/npy.c) $(library)
+$(BUILD)/fuzz_%: $(BUILD)/tests/fuzz/fuzz_%.o $(call objects,daemon/http_text.c daemon/http_framing.c clients/cbct/numbers.c clients/cbct/npy.c) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -fsanitize=fuzzer -o $@ $^ $(call pkg,--libs,libcrypto $(files_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
 fuzzers: $(fuzzers)

@@ -12,20 +12,20 @@
 #include "daemon/http_internal.h"
 
 #include <errno.h>
+#include <limits.h>
 #include <math.h>
-#include <netinet/in.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/random.h>
+#include <sys/resource.h>
 #include <time.h>
 #include <unistd.h>
 
 #include "daemon/log.h"
 
 enum {
-	CONNECTION_MEMORY = 128 << 10, /* pieces of a body are at most half of it */
-	CONNECTIONS_SPARE = 128        /* beyond the limit, to be told so */
+	CONNECTION_MEMORY = 128 << 10 /* pieces of a body are at most half of it */
 };
 static const size_t bodies_max = 256 << 20;   /* bytes of whole bodies in memory, of all requests together */
 static const uint64_t drop_most = 2ull << 30; /* bytes dropped for the sake of an answer; then the connection goes */
@@ -45,6 +45,11 @@ static enum MHD_Result on_header(struct request *request, const char *method)
 
 	request->begun = true;
 	connection_phase(request->connection, PHASE_BODY, 0);
+	if (!gate_admits(request->connection)) {
+		log_line(LEVEL_ERROR, "request id=%s: the HTTP library reads around the gate, nothing is served",
+			 request->id);
+		return MHD_NO;
+	}
 	if (request_read_header(request, method, &err) != 0)
 		return MHD_NO;
 	/* Without a body the library comes back at once, as at the end of one. */
@@ -147,6 +152,10 @@ static enum MHD_Result on_whole(struct request *request)
 	struct error err = {0};
 
 	connection_phase(request->connection, PHASE_HANDLE, 0);
+	/* The body was refused on its way, and ended before its time. */
+	if (request->response == NULL && gate_refusal(request->connection) != NULL &&
+	    request_refuse(request, &err) != 0)
+		return MHD_NO;
 	while (request->response == NULL) {
 		enum suspension outcome;
 		int code;
@@ -186,18 +195,37 @@ static enum MHD_Result on_request(void *context, struct MHD_Connection *mhd, con
 /* The library's first word of a request; what is returned becomes its state. */
 static void *on_target(void *context, const char *target, struct MHD_Connection *mhd)
 {
-	const union MHD_ConnectionInfo *info = MHD_get_connection_info(mhd, MHD_CONNECTION_INFO_SOCKET_CONTEXT);
+	struct connection *connection =
+	    MHD_get_connection_info(mhd, MHD_CONNECTION_INFO_SOCKET_CONTEXT)->socket_context;
 
-	return info->socket_context != NULL ? request_new(context, info->socket_context, target) : NULL;
+	request_free(connection->request);
+	connection->request = request_new(context, connection, target);
+	return connection->request;
 }
 
 static void log_request(const struct request *request, bool whole)
 {
-	enum log_level level = whole && request->status >= 500 && request->status != 503 ? LEVEL_WARNING : LEVEL_DEBUG;
+	enum log_level level = whole && request->status >= 500 && request->status != 503 && request->status != 505
+				   ? LEVEL_WARNING
+				   : LEVEL_DEBUG;
 
 	log_line(level, "request id=%s method=%s target=%.200s status=%d bytes=%llu seconds=%.4f%s", request->id,
 		 request->method, request->target, request->status, (unsigned long long)request->received,
 		 http_now() - request->started, whole ? "" : " broken");
+}
+
+/*
+ * The answer is out and the connection closes. What the client has sent beyond
+ * would make the kernel reset it, and the answer would be lost on its way.
+ */
+static void drop_rest(const struct connection *connection)
+{
+	enum { MOST = 64 };
+	char rest[16384];
+
+	shutdown(connection->socket, SHUT_WR);
+	for (int i = 0; i < MOST && recv(connection->socket, rest, sizeof(rest), MSG_DONTWAIT) > 0; i++)
+		;
 }
 
 static void on_completed(void *context, struct MHD_Connection *mhd, void **state, enum MHD_RequestTerminationCode how)
@@ -219,89 +247,31 @@ static void on_completed(void *context, struct MHD_Connection *mhd, void **state
 			atomic_fetch_add(&http->bytes_out, request->response_size);
 		log_request(request, whole);
 	}
+	if (request->close)
+		drop_rest(request->connection);
 	connection_phase(request->connection, PHASE_IDLE, 0);
+	request->connection->request = NULL;
 	request_free(request);
 }
 
 /* ---- connections ---- */
 
-static bool same_host(const struct sockaddr_storage *a, const struct sockaddr_storage *b)
-{
-	if (a->ss_family != b->ss_family)
-		return false;
-	if (a->ss_family == AF_INET)
-		return ((const struct sockaddr_in *)(const void *)a)->sin_addr.s_addr ==
-		       ((const struct sockaddr_in *)(const void *)b)->sin_addr.s_addr;
-	if (a->ss_family == AF_INET6)
-		return memcmp(&((const struct sockaddr_in6 *)(const void *)a)->sin6_addr,
-			      &((const struct sockaddr_in6 *)(const void *)b)->sin6_addr, sizeof(struct in6_addr)) == 0;
-	return false; /* peers of a Unix socket have no address to count by */
-}
-
-/* Adds it to the list and judges whether it is one too many. */
-static void connection_enter(struct http *http, struct connection *connection)
-{
-	long same = 0;
-
-	pthread_mutex_lock(&http->lock);
-	for (struct connection *c = http->connections; c != NULL; c = c->next)
-		same += same_host(&c->address, &connection->address);
-	if (http->connection_count >= http->options.max_connections)
-		connection->refused = 503;
-	else if (same >= http->options.max_connections_per_address)
-		connection->refused = 429;
-	connection->next = http->connections;
-	if (http->connections != NULL)
-		http->connections->previous = connection;
-	http->connections = connection;
-	http->connection_count++;
-	pthread_mutex_unlock(&http->lock);
-}
-
-static struct connection *connection_new(struct http *http, struct MHD_Connection *mhd)
-{
-	struct connection *connection = calloc(1, sizeof(*connection));
-	const union MHD_ConnectionInfo *info;
-
-	if (connection == NULL)
-		return NULL;
-	connection->http = http;
-	connection->mhd = mhd;
-	pthread_mutex_init(&connection->lock, NULL);
-	connection->since = http_now();
-	info = MHD_get_connection_info(mhd, MHD_CONNECTION_INFO_CONNECTION_FD);
-	connection->socket = info->connect_fd;
-	socklen_t length = sizeof(connection->address);
-	if (getpeername(connection->socket, (struct sockaddr *)&connection->address, &length) != 0)
-		connection->address.ss_family = AF_UNSPEC;
-	connection_enter(http, connection);
-	return connection;
-}
-
-static void connection_free(struct connection *connection)
-{
-	struct http *http = connection->http;
-
-	pthread_mutex_lock(&http->lock);
-	if (connection->previous != NULL)
-		connection->previous->next = connection->next;
-	else
-		http->connections = connection->next;
-	if (connection->next != NULL)
-		connection->next->previous = connection->previous;
-	http->connection_count--;
-	pthread_mutex_unlock(&http->lock);
-	pthread_mutex_destroy(&connection->lock);
-	free(connection);
-}
-
 static void on_connection(void *context, struct MHD_Connection *mhd, void **state,
 			  enum MHD_ConnectionNotificationCode what)
 {
-	if (what == MHD_CONNECTION_NOTIFY_STARTED)
-		*state = connection_new(context, mhd);
-	else if (*state != NULL)
-		connection_free(*state);
+	struct connection *connection;
+
+	(void)context;
+	if (what == MHD_CONNECTION_NOTIFY_STARTED) {
+		connection = gate_find(MHD_get_connection_info(mhd, MHD_CONNECTION_INFO_CONNECTION_FD)->connect_fd);
+		connection_taken(connection, mhd);
+		*state = connection;
+	} else {
+		connection = *state;
+		/* That the library has dropped without a word, for lack of its memory. */
+		request_free(connection->request);
+		connection_free(connection);
+	}
 }
 
 /* ---- the server ---- */
@@ -316,6 +286,27 @@ static void on_library_message(void *context, const char *format, va_list args)
 	log_line(LEVEL_DEBUG, "libmicrohttpd: %s", text);
 }
 
+/* Each connection may have a file open as well, and the daemon has some of its own. */
+static void fit_connections(struct http *http)
+{
+	const long own = 64, least = 4;
+	struct http_options *options = &http->options;
+	struct rlimit limit;
+	long most;
+
+	if (getrlimit(RLIMIT_NOFILE, &limit) == 0 && limit.rlim_cur < LONG_MAX) {
+		most = ((long)limit.rlim_cur - own) / 2;
+		most = most > least ? most : least;
+		if (most < options->max_connections) {
+			log_line(LEVEL_WARNING, "%ld connections in place of %ld: the process may have %ld descriptors",
+				 most, options->max_connections, (long)limit.rlim_cur);
+			options->max_connections = most;
+		}
+	}
+	if (options->max_connections_per_address == 0)
+		options->max_connections_per_address = (options->max_connections + 1) / 2;
+}
+
 int http_new(const struct http_options *options, struct http **ret_http, struct error *err)
 {
 	struct http *http = calloc(1, sizeof(*http));
@@ -326,12 +317,14 @@ int http_new(const struct http_options *options, struct http **ret_http, struct 
 	if (getrandom(&http->id_prefix, sizeof(http->id_prefix), 0) != (ssize_t)sizeof(http->id_prefix))
 		http->id_prefix = (uint32_t)time(NULL);
 	http->options = *options;
+	http->admission_kick = -1;
+	fit_connections(http);
 	pthread_mutex_init(&http->lock, NULL);
 	pthread_condattr_init(&monotonic);
 	pthread_condattr_setclock(&monotonic, CLOCK_MONOTONIC);
 	pthread_cond_init(&http->clock_kick, &monotonic);
 	pthread_condattr_destroy(&monotonic);
-	if (server_names_check(options->server_names, err) != 0 ||
+	if (gate_open(err) != 0 || server_names_check(options->server_names, err) != 0 ||
 	    listeners_open(options->listen, http->listeners, &http->listener_count, err) != 0) {
 		http_free(http);
 		return err->code;
@@ -340,33 +333,27 @@ int http_new(const struct http_options *options, struct http **ret_http, struct 
 	return 0;
 }
 
-static int listener_start(struct http *http, struct listener *listener, struct error *err)
+static int library_start(struct http *http, struct error *err)
 {
-	unsigned flags = MHD_USE_EPOLL_INTERNAL_THREAD | MHD_ALLOW_SUSPEND_RESUME | MHD_USE_ERROR_LOG;
-	unsigned most = (unsigned)http->options.max_connections + CONNECTIONS_SPARE;
+	unsigned flags =
+	    MHD_USE_EPOLL_INTERNAL_THREAD | MHD_ALLOW_SUSPEND_RESUME | MHD_USE_NO_LISTEN_SOCKET | MHD_USE_ERROR_LOG;
+	unsigned threads = (unsigned)http->options.threads;
 
-	/* Each thread has its share of the library's limit, and new connections come as the threads find them. */
-	listener->daemon = MHD_start_daemon(
+	/* Admission counts; the library's own limit, of which each thread has its share, is out of its reach. */
+	http->daemon = MHD_start_daemon(
 	    flags, 0, NULL, NULL, on_request, http, MHD_OPTION_EXTERNAL_LOGGER, on_library_message, NULL,
-	    MHD_OPTION_LISTEN_SOCKET, listener->socket, MHD_OPTION_THREAD_POOL_SIZE, (unsigned)http->options.threads,
-	    MHD_OPTION_CONNECTION_LIMIT, most * (unsigned)http->options.threads, MHD_OPTION_CONNECTION_MEMORY_LIMIT,
-	    (size_t)CONNECTION_MEMORY, MHD_OPTION_CONNECTION_TIMEOUT, (unsigned)ceil(http->options.header_timeout),
-	    MHD_OPTION_URI_LOG_CALLBACK, on_target, http, MHD_OPTION_NOTIFY_COMPLETED, on_completed, http,
-	    MHD_OPTION_NOTIFY_CONNECTION, on_connection, http, MHD_OPTION_END);
-	if (listener->daemon == NULL)
-		return error_set(err, ERR_IO, "the HTTP server does not start on %s: %s", listener->name,
-				 strerror(errno));
-	return 0;
+	    MHD_OPTION_THREAD_POOL_SIZE, threads, MHD_OPTION_CONNECTION_LIMIT, (unsigned)DESCRIPTORS_MAX * threads,
+	    MHD_OPTION_CONNECTION_MEMORY_LIMIT, (size_t)CONNECTION_MEMORY, MHD_OPTION_CONNECTION_TIMEOUT,
+	    (unsigned)ceil(http->options.header_timeout), MHD_OPTION_URI_LOG_CALLBACK, on_target, http,
+	    MHD_OPTION_NOTIFY_COMPLETED, on_completed, http, MHD_OPTION_NOTIFY_CONNECTION, on_connection, http,
+	    MHD_OPTION_END);
+	return http->daemon != NULL ? 0 : error_set(err, ERR_IO, "the HTTP server does not start: %s", strerror(errno));
 }
 
 int http_start(struct http *http, struct error *err)
 {
-	if (clock_start(http, err) != 0)
+	if (clock_start(http, err) != 0 || library_start(http, err) != 0 || admission_start(http, err) != 0)
 		return err->code;
-	for (int i = 0; i < http->listener_count; i++) {
-		if (listener_start(http, &http->listeners[i], err) != 0)
-			return err->code;
-	}
 	for (int i = 0; i < http->listener_count; i++)
 		printf("listening on %s\n", http->listeners[i].name);
 	fflush(stdout);
@@ -379,22 +366,20 @@ void http_stop(struct http *http)
 	double end = http_now() + stop_grace;
 
 	atomic_store(&http->stopping, true);
-	for (int i = 0; i < http->listener_count; i++) {
-		if (http->listeners[i].daemon != NULL)
-			MHD_quiesce_daemon(http->listeners[i].daemon);
+	admission_end(http);
+	for (int i = 0; i < http->listener_count; i++)
 		listener_close(&http->listeners[i]);
-	}
 	do {
 		connections_wake(http);
 		nanosleep(&nap, NULL);
 	} while (!connections_idle(http) && http_now() < end);
 	atomic_store(&http->closing, true);
 	connections_wake(http);
-	for (int i = 0; i < http->listener_count; i++) {
-		if (http->listeners[i].daemon != NULL)
-			MHD_stop_daemon(http->listeners[i].daemon);
-		http->listeners[i].daemon = NULL;
-	}
+	if (http->daemon != NULL)
+		MHD_stop_daemon(http->daemon);
+	http->daemon = NULL;
+	while (http->connections != NULL) /* that the library had never taken */
+		connection_free(http->connections);
 	clock_end(http);
 }
 
@@ -403,6 +388,8 @@ void http_free(struct http *http)
 	if (http == NULL)
 		return;
 	http_stop(http);
+	if (http->admission_kick >= 0)
+		close(http->admission_kick);
 	pthread_cond_destroy(&http->clock_kick);
 	pthread_mutex_destroy(&http->lock);
 	free(http);

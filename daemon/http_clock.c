@@ -37,6 +37,8 @@ void connection_phase(struct connection *connection, enum phase phase, uint64_t 
 	connection->woken = false;
 	if (phase == PHASE_IDLE)
 		connection->patience = 0;
+	if (phase == PHASE_SEND)
+		connection->sent_before = live_acknowledged(connection);
 	pthread_mutex_unlock(&connection->lock);
 }
 
@@ -181,6 +183,10 @@ static double look(struct connection *connection, double now)
 	bool cut = false;
 
 	pthread_mutex_lock(&connection->lock);
+	if (connection->mhd == NULL) {
+		pthread_mutex_unlock(&connection->lock);
+		return next;
+	}
 	if (!connection->cut && now >= connection->looked_at + 1) {
 		connection->looked_at = now;
 		if (connection->patience > 0)

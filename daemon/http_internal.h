@@ -8,10 +8,18 @@
 #include <microhttpd.h>
 
 #include "daemon/http.h"
+#include "daemon/http_framing.h"
 
-/* Shared by http.c, http_clock.c, http_listen.c, http_reply.c and http_request.c; nobody else includes it. */
+/* Shared by the files http*.c; nobody else includes it. */
 
-enum { ARGUMENTS_MAX = 4, QUERIES_MAX = 16, SEGMENTS_MAX = 12, LISTENERS_MAX = 8, REQUEST_ID_SIZE = 24 };
+enum {
+	ARGUMENTS_MAX = 4,
+	QUERIES_MAX = 16,
+	SEGMENTS_MAX = 12,
+	LISTENERS_MAX = 8,
+	REQUEST_ID_SIZE = 24,
+	DESCRIPTORS_MAX = 1 << 20
+};
 
 /* Where a connection stands; the clock judges its pace by it. */
 enum phase {
@@ -21,13 +29,25 @@ enum phase {
 	PHASE_SEND    /* the answer goes out */
 };
 
+/* What was read from a connection's socket and may not go on yet; its thread's own. */
+struct gate {
+	struct framing framing;
+	char *held;                         /* bytes; NULL for none */
+	size_t given, passed, length, room; /* of held: gone on; may go on; all; allocated */
+	uint64_t handled;                   /* heads that the handler was called for */
+	bool refused;                       /* what goes on last ends the request that was refused */
+};
+
 struct connection {
 	struct http *http;
-	struct MHD_Connection *mhd;
+	struct MHD_Connection *mhd; /* NULL until one of its threads has taken it; guarded by lock */
 	int socket;
 	struct sockaddr_storage address;
+	uid_t user;                         /* of a Unix socket's peer */
 	struct connection *previous, *next; /* guarded by http->lock */
-	int refused;                        /* status of every answer, when it is one too many; 0: welcome */
+	int refused; /* status of its answers while it is one too many; 0: welcome; its thread's own */
+	struct gate gate;
+	struct request *request; /* that is under way, or was dropped by the library; its thread's own */
 
 	pthread_mutex_t lock; /* guards all below */
 	enum phase phase;
@@ -36,11 +56,12 @@ struct connection {
 	uint64_t bytes; /* of this phase's body so far, or in all when sending */
 	bool suspended; /* out of the library's hands until resumed */
 	double suspended_at;
-	bool woken;          /* request_wake came while it was not suspended */
-	double wait_until;   /* of a suspended one */
-	bool cut;            /* shut down for its pace, or because its peer has gone */
-	double looked_at;    /* by the clock, whether the peer is there */
-	uint64_t bytes_then; /* of a body, when that was */
+	bool woken;           /* request_wake came while it was not suspended */
+	double wait_until;    /* of a suspended one */
+	bool cut;             /* shut down for its pace, for another's sake, or because its peer has gone */
+	uint64_t sent_before; /* bytes that the peer had acknowledged when this phase began; of PHASE_SEND */
+	double looked_at;     /* by the clock, whether the peer is there */
+	uint64_t bytes_then;  /* of a body, when that was */
 
 	/* Of a reply without an end in sight: s that sent bytes may stay unacknowledged; 0: another kind. */
 	double patience;
@@ -88,13 +109,19 @@ struct listener {
 	struct sockaddr_storage address;
 	char name[160];      /* "http://127.0.0.1:2228", "unix:/run/x" */
 	char unix_path[108]; /* to be removed at the end; "" for TCP */
-	struct MHD_Daemon *daemon;
 };
 
 struct http {
 	struct http_options options;
 	struct listener listeners[LISTENERS_MAX];
 	int listener_count;
+	struct MHD_Daemon *daemon; /* the library's threads */
+
+	pthread_t admission;
+	bool admission_runs;
+	atomic_bool admission_stop;
+	int admission_kick;  /* an eventfd */
+	double exhausted_at; /* the last time that there was no descriptor; the thread's own */
 
 	pthread_mutex_t lock; /* guards the list, the clock's fields; taken before a connection's lock */
 	struct connection *connections;
@@ -110,6 +137,26 @@ struct http {
 	atomic_ullong requests[6], bytes_in, bytes_out, request_number;
 	uint32_t id_prefix;
 };
+
+/* ---- http_admit.c: who gets a connection ---- */
+int admission_start(struct http *http, struct error *err);
+void admission_end(struct http *http);
+/* A connection that was one too many asks for something: is it welcome by now? */
+bool admission_reconsider(struct connection *connection);
+/* The library has it now, or no more. */
+void connection_taken(struct connection *connection, struct MHD_Connection *mhd);
+void connection_free(struct connection *connection);
+
+/* ---- http_gate.c: between the socket and the library ---- */
+int gate_open(struct error *err);
+/* NULL: what is read from this descriptor is looked at no more. False when it is beyond the table. */
+bool gate_set(int descriptor, struct connection *connection);
+struct connection *gate_find(int descriptor);
+/* Once for each head that the library has parsed: whether it went through the gate. */
+bool gate_admits(struct connection *connection);
+/* Why the request that is under way was refused; NULL when it was not. */
+const struct framing *gate_refusal(const struct connection *connection);
+void gate_free(struct gate *gate);
 
 /* ---- http_listen.c: addresses and sockets ---- */
 int listeners_open(const char *listen, struct listener ret_listeners[LISTENERS_MAX], int *ret_count, struct error *err);
@@ -136,12 +183,16 @@ bool connections_idle(struct http *http);
 bool live_hung_up(const struct connection *connection);
 /* Whether a client has gone, with or without a word; with the connection's lock held. */
 bool live_peer_gone(struct connection *connection, double now);
+/* Bytes that the peer has acknowledged so far; UNKNOWN_SIZE on a Unix socket. */
+uint64_t live_acknowledged(const struct connection *connection);
 
 /* ---- http_request.c: what the request line and headers say ---- */
 struct request *request_new(struct http *http, struct connection *connection, const char *target);
 void request_free(struct request *request); /* NULL is fine */
 /* Method, framing, route; 0, or the reply is set (code < 0 when it is not). */
 int request_read_header(struct request *request, const char *method, struct error *err);
+/* Replies with the gate's reasons, and lets the connection end. */
+int request_refuse(struct request *request, struct error *err);
 
 /* ---- http_origin.c: who is addressed, and by whose page ---- */
 /* ERR_INVALID for a list of server names in which one is none. */

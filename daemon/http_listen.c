@@ -52,7 +52,7 @@ static int bind_tcp(const struct addrinfo *address, const char *text, struct lis
 {
 	int one = 1;
 
-	listener->socket = socket(address->ai_family, SOCK_STREAM | SOCK_CLOEXEC, 0);
+	listener->socket = socket(address->ai_family, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
 	if (listener->socket < 0)
 		return error_set_errno(err, errno, "socket for %s", text);
 	setsockopt(listener->socket, SOL_SOCKET, SO_REUSEADDR, &one, sizeof(one));
@@ -130,7 +130,7 @@ static int open_unix(const char *path, struct listener *listener, struct error *
 	memcpy(address.sun_path, path, strlen(path));
 	if (remove_stale(&address, err) != 0)
 		return err->code;
-	listener->socket = socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
+	listener->socket = socket(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
 	if (listener->socket < 0)
 		return error_set_errno(err, errno, "socket");
 	/* The file's mode is who may connect: owner and group. Nobody can before listen(2). */

@@ -28,6 +28,15 @@ bool live_hung_up(const struct connection *connection)
 	return got == 0 || (got < 0 && errno != EAGAIN && errno != EWOULDBLOCK && errno != EINTR);
 }
 
+uint64_t live_acknowledged(const struct connection *connection)
+{
+	struct tcp_info info = {0};
+	socklen_t size = sizeof(info);
+
+	return getsockopt(connection->socket, IPPROTO_TCP, TCP_INFO, &info, &size) == 0 ? info.tcpi_bytes_acked
+											: UNKNOWN_SIZE;
+}
+
 /*
  * Who vanished answers nothing: neither what was sent nor the probes of an idle
  * connection, whose end the kernel then makes an error of the socket. Who does

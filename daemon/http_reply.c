@@ -38,10 +38,13 @@ static const struct problem {
     {0, 403, "foreign-origin", "A page of another site may not do this"},
     {0, 405, "method-not-allowed", "The resource does not know this method"},
     {0, 411, "length-required", "The request needs a body"},
+    {0, 414, "target-too-long", "The request's target is longer than allowed"},
     {0, 415, "unsupported-encoding", "The body's encoding is not known"},
     {0, 415, "unsupported-media-type", "The body is of another type"},
     {0, 416, "range-outside", "The range lies outside of the body"},
     {0, 421, "misdirected", "The request is for another server"},
+    {0, 431, "head-too-large", "The request's head is longer than allowed"},
+    {0, 505, "version", "The request is in another version of HTTP"},
     {0, 429, "too-many-connections", "Too many connections from this address"},
 };
 enum { PROBLEM_COUNT = sizeof(problems) / sizeof(problems[0]) };

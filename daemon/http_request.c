@@ -2,9 +2,8 @@
  * What a request line and its headers say: target, query, framing, route.
  *
  * The target is read from the line as it was sent: the library decodes %2F
- * before anybody has looked for slashes. And it takes a length beside chunks
- * and two different lengths, about which two parties on the way may disagree:
- * refused here.
+ * before anybody has looked for slashes. That the head can be read in one way
+ * only is the gate's doing (http_framing.h).
  */
 #include "daemon/http_internal.h"
 
@@ -160,9 +159,8 @@ static int read_target(struct request *request, struct error *err)
 	char *path = request->decoded, *query, *segments[SEGMENTS_MAX];
 	int count;
 
-	if (strncasecmp(path, "http://", 7) == 0) /* the absolute form, as for a proxy */
-		path = path + 7 + strcspn(path + 7, "/");
-	path[strcspn(path, "#")] = '\0';
+	if (path[0] != '/' && strstr(path, "://") != NULL) /* the absolute form, as for a proxy */
+		path = strstr(path, "://") + 3 + strcspn(strstr(path, "://") + 3, "/");
 	query = strchr(path, '?');
 	if (query != NULL)
 		*query++ = '\0';
@@ -210,51 +208,33 @@ static int check_queries(const struct request *request, struct error *err)
 
 /* ---- framing ---- */
 
-struct framing {
-	int lengths, encodings;
-	const char *length, *encoding;
-};
-
-static enum MHD_Result count_header(void *context, enum MHD_ValueKind kind, const char *name, const char *value)
+/* The gate has let it through: there is one statement about the body, and it is well-formed. */
+static void read_framing(struct request *request)
 {
-	struct framing *framing = context;
+	const char *length = request_header(request, "Content-Length");
 
-	(void)kind;
-	if (strcasecmp(name, "Content-Length") == 0) {
-		framing->lengths++;
-		framing->length = value;
-	} else if (strcasecmp(name, "Transfer-Encoding") == 0) {
-		framing->encodings++;
-		framing->encoding = value;
-	}
-	return MHD_YES;
+	request->chunked = request_header(request, "Transfer-Encoding") != NULL;
+	request->framed = request->chunked || length != NULL;
+	request->content_length = request->chunked ? -1 : length != NULL ? strtoll(length, NULL, 10) : 0;
 }
 
-/* RFC 9112, 6: exactly one way to tell where the body ends. */
-static int read_framing(struct request *request, struct error *err)
+/* What the gate has refused: its head is not this one, or its body has an end that nobody sent. */
+int request_refuse(struct request *request, struct error *err)
 {
-	struct framing framing = {0};
-	double length = 0;
+	static const struct {
+		int status;
+		const char *name;
+	} names[] = {
+	    {400, "invalid"}, {413, "too-large"}, {414, "target-too-long"}, {431, "head-too-large"}, {505, "version"}};
+	const struct framing *refusal = gate_refusal(request->connection);
+	const char *name = names[0].name;
 
-	MHD_get_connection_values(request->mhd, MHD_HEADER_KIND, count_header, &framing);
-	if (framing.lengths > 1)
-		return error_set(err, ERR_INVALID, "%d Content-Length headers, expected one", framing.lengths);
-	if (framing.lengths > 0 && framing.encodings > 0)
-		return error_set(err, ERR_INVALID, "Content-Length beside Transfer-Encoding: where does the body end?");
-	if (framing.encodings > 1 || (framing.encodings == 1 && strcasecmp(framing.encoding, "chunked") != 0))
-		return error_set(err, ERR_INVALID, "Transfer-Encoding is \"%.60s\", expected chunked",
-				 framing.encoding);
-	request->chunked = framing.encodings == 1;
-	request->content_length = request->chunked ? -1 : 0;
-	request->framed = framing.encodings + framing.lengths > 0;
-	if (framing.lengths == 0)
-		return 0;
-	if (strspn(framing.length, "0123456789") != strlen(framing.length) ||
-	    !number_parse(framing.length, 0, 1e15, &length))
-		return error_set(err, ERR_INVALID, "Content-Length is \"%.60s\", expected a number up to 10^15",
-				 framing.length);
-	request->content_length = (int64_t)length;
-	return 0;
+	for (size_t i = 0; i < sizeof(names) / sizeof(*names); i++) {
+		if (names[i].status == refusal->status)
+			name = names[i].name;
+	}
+	request->close = true;
+	return request_reply_problem(request, name, err, "%s", refusal->detail);
 }
 
 /*
@@ -320,25 +300,40 @@ static bool should_drop(struct request *request)
 	return request->chunked || (uint64_t)request->content_length <= drop_max;
 }
 
-int request_read_header(struct request *request, const char *method, struct error *err)
+/* Beyond the limit only what writes is taken: acquisition. */
+static bool is_one_too_many(const struct request *request)
 {
-	int code = read_framing(request, err);
+	return request->connection->refused != 0 && !admission_reconsider(request->connection) &&
+	       strcmp(request->method, "PUT") != 0 && strcmp(request->method, "POST") != 0;
+}
 
-	snprintf(request->method, sizeof(request->method), "%s", method);
-	if (code != 0)
-		request->close = true; /* what comes next may be anything */
-	else if (request->connection->refused != 0)
-		code = refuse_connection(request, err);
-	else if (atomic_load(&request->http->stopping))
-		code = error_set(err, ERR_BUSY, "the daemon is stopping");
-	else
-		code = request_check_origin(request, err);
+static int read_header(struct request *request, struct error *err)
+{
+	int code = 0;
+
+	if (gate_refusal(request->connection) != NULL)
+		return request_refuse(request, err);
+	read_framing(request);
+	if (is_one_too_many(request))
+		return refuse_connection(request, err);
+	if (atomic_load(&request->http->stopping))
+		return error_set(err, ERR_BUSY, "the daemon is stopping");
+	code = request_check_origin(request, err);
 	if (code == 0 && request->response == NULL)
 		code = read_target(request, err);
 	if (code == 0 && request->response == NULL)
 		code = check_queries(request, err);
 	if (code == 0 && request->response == NULL)
 		code = check_body(request, err);
+	return code;
+}
+
+int request_read_header(struct request *request, const char *method, struct error *err)
+{
+	int code;
+
+	snprintf(request->method, sizeof(request->method), "%s", method);
+	code = read_header(request, err);
 	if (code != 0)
 		code = reply_problem_of(request, err);
 	request->dropping = request->response != NULL && should_drop(request);

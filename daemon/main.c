@@ -36,13 +36,14 @@ static enum log_level level_named(const char *name)
 	return (enum log_level)level;
 }
 
-/* A descriptor for each connection and more: as many as we may have. */
+/* A descriptor for each connection and more: as many as we may have, within reason. */
 static void raise_descriptors(void)
 {
+	const rlim_t most = 1 << 20;
 	struct rlimit limit;
 
-	if (getrlimit(RLIMIT_NOFILE, &limit) == 0 && limit.rlim_cur < limit.rlim_max) {
-		limit.rlim_cur = limit.rlim_max;
+	if (getrlimit(RLIMIT_NOFILE, &limit) == 0 && limit.rlim_cur < limit.rlim_max && limit.rlim_cur < most) {
+		limit.rlim_cur = limit.rlim_max < most ? limit.rlim_max : most;
 		setrlimit(RLIMIT_NOFILE, &limit);
 	}
 }

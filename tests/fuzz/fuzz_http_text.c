@@ -25,6 +25,19 @@ static void check_numbers(const char *text, size_t size)
 		PROMISE(number >= 0);
 }
 
+static void check_names(const char *text, size_t length)
+{
+	char host[HOST_MAX];
+	long port = 0;
+
+	if (authority_parse(text, length, host, &port))
+		PROMISE(host[0] != '\0' && strlen(host) <= length && port >= -1 && port <= 65535);
+	if (origin_parse(text, host, &port))
+		PROMISE(host[0] != '\0' && strlen(host) < length && port >= 0 && port <= 65535);
+	if (media_type_is_json(text))
+		PROMISE(length > 5);
+}
+
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 {
 	char *text = malloc(size + 1);
@@ -41,6 +54,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 	check_range(text, 1000);
 	check_range(text, UINT64_MAX);
 	check_numbers(text, length);
+	check_names(text, length);
 	accepts_coding(text, "zstd");
 	etag_in(text, "\"tag\"", false);
 	etag_in(text, "\"tag\"", true);

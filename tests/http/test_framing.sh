@@ -1,0 +1,30 @@
+#!/usr/bin/env bash
+# Requests that two readers could understand otherwise are refused, and nothing of them is obeyed, kept or lost.
+. "$(dirname "$0")/lib.sh"
+python=${PYTHON:-/usr/bin/python3}
+command -v "$python" >/dev/null || python=python3
+raw() { "$python" "$here/raw_http.py" "${url##*:}" "$@"; }
+
+test_malformed_requests_are_refused_with_a_problem() { raw malformed; }
+test_what_is_well_formed_is_understood() { raw fine; }
+test_no_request_is_smuggled_in_another() { raw smuggling; }
+test_requests_back_to_back_cut_anywhere() { raw pipelining; }
+test_bad_requests_leave_nothing_behind() {
+	# a sanitizer keeps what is freed for a while
+	[ "${SANITIZED:-0}" = 0 ] || skip "memory is not counted under a sanitizer"
+	raw leaks "$(cat "$work/daemon.pid")"
+}
+test_a_broken_body_keeps_the_projections_before_it() {
+	local one=$((16 * 12 * 4)) chunk
+	req POST /v1/scans -H 'Content-Type: application/json' --data-binary '{"detector": {"columns": 16, "rows": 12, "pixel_mm": [4, 4]},
+	  "projections": {"count": 6, "sample": "float32", "quantity": "line_integral"},
+	  "geometry": {"kind": "circular", "source_to_isocentre_mm": 600, "source_to_detector_mm": 1000, "first_angle_deg": 0, "angle_step_deg": 60}}'
+	expect_status 201
+	raw broken_body "$(json .id)" $one
+	req GET "/v1/scans/$(json .id)"
+	# chunked: its length was not told before, so nothing counts until the end
+	expect_json '.received == []'
+}
+
+start_daemon || exit 1
+run_tests
