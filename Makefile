@@ -237,7 +237,7 @@ $(BUILD)/tests/gpu/fault.o: tests/gpu/fault.cu
 	@mkdir -p $(@D)
 	$(call say,NVCC)$(NVCC) -std=c++17 $(cuda_code) -c -o $@ $<
 $(BUILD)/cbct-worker-faulty: $(call objects,daemon/worker.c) $(library) $(cuda_objects) $(BUILD)/tests/gpu/fault.o
-	$(call say,LINK)$(CC) $(LDFLAGS) -Wl,--wrap=_Z7cuda_tvP4planP6volumePK6cancelP5error -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(cuda_libs) $(LIBM)
+	$(call say,LINK)$(CC) $(LDFLAGS) -Wl,--wrap=_Z7cuda_tvP4planP6volumePK10tv_optionsPK6cancelP5error -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(cuda_libs) $(LIBM)
 
 ifdef cuda_objects
 check-gpu: ## the CUDA backend against the CPU's, and through the daemon; skipped aloud without a GPU

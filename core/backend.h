@@ -150,7 +150,7 @@ struct plan_options {
 	 * backprojection stays the interpolating one.
 	 */
 	bool matched;
-	const struct tv_options *tv; /* NULL: no TV */
+	const struct tv_options *tv; /* the most that `tv` is asked for, see there; NULL: no TV */
 	bool reference_precision;    /* float everywhere; otherwise storage may be packed within the stated bound */
 	/*
 	 * Bytes that the job takes on the device beside this plan, its projections and
@@ -299,8 +299,12 @@ struct backend {
 	 */
 	int (*sart_iterate)(struct plan *plan, const struct stack *projections, struct volume *volume,
 			    const struct cancel *cancel, struct sart_sums *ret_sums, struct error *err);
-	/* The plan's TV, in place. */
-	int (*tv)(struct plan *plan, struct volume *volume, const struct cancel *cancel, struct error *err);
+	/*
+	 * TV in place. Method and iterations are at most what plan_options.tv has, which the plan has memory for;
+	 * alpha, step and unit are free.
+	 */
+	int (*tv)(struct plan *plan, struct volume *volume, const struct tv_options *options,
+		  const struct cancel *cancel, struct error *err);
 	/* `other` may be NULL; unit as in tv_options. */
 	int (*norms)(struct plan *plan, const struct volume *volume, const struct volume *other, double unit,
 		     struct volume_norms *ret_norms, struct error *err);

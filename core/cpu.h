@@ -273,7 +273,8 @@ int cpu_sart_iterate(struct plan *plan, const struct stack *projections, struct 
 
 /* cpu_tv.c */
 size_t tv_planes_floats(const struct plan *plan);
-int cpu_tv(struct plan *plan, struct volume *volume, const struct cancel *cancel, struct error *err);
+int cpu_tv(struct plan *plan, struct volume *volume, const struct tv_options *options, const struct cancel *cancel,
+	   struct error *err);
 
 /* cpu_norms.c */
 int cpu_norms(struct plan *plan, const struct volume *volume, const struct volume *other, double unit,

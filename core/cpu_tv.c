@@ -199,9 +199,9 @@ static void run_pass(const struct plan *plan, const struct pass *pass)
  * cubic grid), and the steps are stable when step times that is at most 2. The
  * smallest epsilon for which they are is taken: 6 step for alpha = 0.
  */
-static int run_gradient(struct plan *plan, struct pass *pass, const struct cancel *cancel, struct error *err)
+static int run_gradient(const struct plan *plan, struct pass *pass, const struct tv_options *tv,
+			const struct cancel *cancel, struct error *err)
 {
-	const struct tv_options *tv = &plan->tv;
 	const double damping = fmax(2 - tv->alpha * tv->step, .1);
 	/* a single voxel has no differences and needs none: but 0, not 0 / 0 */
 	const double epsilon = fmax(4 * squared_weights(pass->box) * tv->step / damping * tv->unit, 1e-15);
@@ -230,9 +230,9 @@ static int run_gradient(struct plan *plan, struct pass *pass, const struct cance
  */
 static const double TAU_FIRST = 1; /* times 1 / alpha */
 
-static int run_proximal(struct plan *plan, struct pass *pass, const struct cancel *cancel, struct error *err)
+static int run_proximal(const struct plan *plan, struct pass *pass, const struct tv_options *tv,
+			const struct cancel *cancel, struct error *err)
 {
-	const struct tv_options *tv = &plan->tv;
 	const double square = fmax(4 * squared_weights(pass->box), 1);
 	double tau = TAU_FIRST / tv->alpha, sigma = 1 / (square * tau);
 
@@ -255,22 +255,23 @@ static int run_proximal(struct plan *plan, struct pass *pass, const struct cance
 	return 0;
 }
 
-int cpu_tv(struct plan *plan, struct volume *volume, const struct cancel *cancel, struct error *err)
+int cpu_tv(struct plan *plan, struct volume *volume, const struct tv_options *options, const struct cancel *cancel,
+	   struct error *err)
 {
 	struct box box;
 	struct pass pass = {.box = &box, .kernels = plan->device->kernels, .v = volume->data};
 	int code;
 
-	if (!plan->has_tv)
-		return error_set(err, ERR_INTERNAL, "the plan was made without TV");
+	if (!plan->has_tv || options->method > plan->tv.method)
+		return error_set(err, ERR_INTERNAL, "the plan was made without this TV");
 	box_of(plan, &box);
 	code = backend_cpu.volume_copy(plan->work, volume, err);
 	if (code < 0)
 		return code;
 	pass.f = plan->work->data;
-	if (plan->tv.method == TV_GRADIENT) {
+	if (options->method == TV_GRADIENT) {
 		pass.ahead = pass.v;
-		return run_gradient(plan, &pass, cancel, err);
+		return run_gradient(plan, &pass, options, cancel, err);
 	}
 	pass.ahead = plan->ahead->data;
 	code = backend_cpu.volume_copy(plan->ahead, volume, err);
@@ -278,5 +279,5 @@ int cpu_tv(struct plan *plan, struct volume *volume, const struct cancel *cancel
 		pass.dual[i] = plan->dual[i]->data;
 		code = backend_cpu.volume_fill(plan->dual[i], 0, err);
 	}
-	return code < 0 ? code : run_proximal(plan, &pass, cancel, err);
+	return code < 0 ? code : run_proximal(plan, &pass, options, cancel, err);
 }

@@ -99,7 +99,8 @@ int parts_sart_iterate(struct plan *plan, const struct stack *projections, struc
 		       const struct cancel *cancel, struct sart_sums *ret_sums, struct error *err);
 
 /* ---- parts_tv.c ---- */
-int parts_tv(struct plan *plan, struct volume *volume, const struct cancel *cancel, struct error *err);
+int parts_tv(struct plan *plan, struct volume *volume, const struct tv_options *options, const struct cancel *cancel,
+	     struct error *err);
 int parts_norms(struct plan *plan, const struct volume *volume, const struct volume *other, double unit,
 		struct volume_norms *ret_norms, struct error *err);
 

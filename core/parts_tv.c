@@ -24,7 +24,7 @@ static void keep_old(float *kept, int *kept_count, int halo, const float *slices
 }
 
 static int smooth_slab(struct plan *plan, struct slab *slab, const float *kept, struct volume *volume,
-		       const struct cancel *cancel, struct error *err)
+		       const struct tv_options *options, const struct cancel *cancel, struct error *err)
 {
 	const struct backend *backend = plan->device->backend;
 	int code = backend->volume_put(slab->volume, 0, slab->below, kept, err);
@@ -33,17 +33,18 @@ static int smooth_slab(struct plan *plan, struct slab *slab, const float *kept, 
 		code = backend->volume_put(slab->volume, slab->below, slab->count + slab->above,
 					   volume->data + volume->slice * (size_t)slab->first, err);
 	if (code == 0)
-		code = backend->tv(slab->plan, slab->volume, cancel, err);
+		code = backend->tv(slab->plan, slab->volume, options, cancel, err);
 	return code;
 }
 
-int parts_tv(struct plan *plan, struct volume *volume, const struct cancel *cancel, struct error *err)
+int parts_tv(struct plan *plan, struct volume *volume, const struct tv_options *options, const struct cancel *cancel,
+	     struct error *err)
 {
 	const struct backend *backend = plan->device->backend;
 	int kept = 0, code = 0;
 
-	if (plan->options.tv == NULL)
-		return error_set(err, ERR_INTERNAL, "the plan was made without TV");
+	if (plan->options.tv == NULL || options->iterations > plan->options.tv->iterations)
+		return error_set(err, ERR_INTERNAL, "the plan was made without this TV");
 	for (int z = 0; z < volume->size[2] && code == 0; z += plan->slices[FOR_TV]) {
 		float *here = volume->data + volume->slice * (size_t)z;
 		struct slab slab;
@@ -52,7 +53,7 @@ int parts_tv(struct plan *plan, struct volume *volume, const struct cancel *canc
 		if (code < 0)
 			break;
 		code = smooth_slab(plan, &slab, plan->sums + volume->slice * (size_t)(kept - slab.below), volume,
-				   cancel, err);
+				   options, cancel, err);
 		if (code == 0) {
 			keep_old(plan->sums, &kept, plan->options.tv->iterations, here, slab.count, volume->slice);
 			code = backend->volume_download(slab.volume, slab.below, slab.count, here, err);

@@ -10,6 +10,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+const char *const tv_strength_names[TV_STRENGTH_COUNT] = {"light", "medium", "strong"};
 const char *const projector_names[PROJECTOR_COUNT] = {"interpolating", "matched"};
 
 void recipe_defaults(struct recipe *ret_recipe)
@@ -17,10 +18,25 @@ void recipe_defaults(struct recipe *ret_recipe)
 	*ret_recipe = (struct recipe){
 	    .fdk = {.window = WINDOW_HANN, .cutoff = 1, .extend = true},
 	    .sart = {.iterations = 10, .relaxation = 1, .subsets = SUBSETS_DEFAULT, .nonnegative = true},
-	    .tv = {.after_fdk = true, .options = {.method = TV_GRADIENT, .alpha = 0.1, .step = 0.1, .iterations = 10}},
+	    .tv = {.after_fdk = true,
+		   .automatic = true,
+		   .strength = TV_MEDIUM,
+		   .options = {.method = TV_PROXIMAL, .alpha = 0.1, .step = 0.1, .iterations = 30}},
 	    .metal = {.threshold_hu = 2500},
 	    .mu_water = 0.0192,
 	};
+}
+
+void recipe_explicit_tv(struct recipe *recipe, enum tv_method method)
+{
+	struct tv_options *tv = &recipe->tv.options;
+
+	recipe->tv.automatic = false;
+	tv->method = method;
+	tv->alpha = tv->step = 0.1;
+	/* Explicit steps are a smoothing of their own; the minimiser is one when it is reached, to about a percent
+	 * here. */
+	tv->iterations = method == TV_GRADIENT ? 10 : 100;
 }
 
 void recipe_clear(struct recipe *recipe)
@@ -95,7 +111,13 @@ static int check_sart(const struct recipe *recipe, int views, struct error *err)
 static int check_tv(const struct recipe *recipe, struct error *err)
 {
 	const struct tv_options *tv = &recipe->tv.options;
-	int code = check_positive(tv->alpha, tv->method == TV_GRADIENT, "/tv/alpha", err);
+	int code = 0;
+
+	if (recipe->tv.automatic && tv->method != TV_PROXIMAL)
+		code = error_set_at(err, ERR_IMPOSSIBLE, "/tv/alpha",
+				    "alpha is found for the proximal method only, explicit steps want a number");
+	else if (!recipe->tv.automatic)
+		code = check_positive(tv->alpha, tv->method == TV_GRADIENT, "/tv/alpha", err);
 
 	if (code == 0)
 		code = check_positive(tv->step, false, "/tv/step", err);

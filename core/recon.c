@@ -15,6 +15,7 @@
 #include "core/exterior.h"
 #include "core/fdk.h"
 #include "core/metal.h"
+#include "core/noise.h"
 #include "core/input.h"
 #include "core/parts.h"
 #include "core/sart.h"
@@ -51,6 +52,9 @@ struct recon {
 
 	unsigned char *pushed; /* [views] */
 	int pushed_count;
+
+	struct volume_noise noise; /* where it is measured */
+	bool noise_measured;
 
 	bool resumed, ran;
 	int iteration; /* done so far */
@@ -475,6 +479,25 @@ static int measure(struct recon *recon, const struct volume *other, struct volum
 	return recon->backend->norms(recon->plan, recon->volume, other, recon->recipe.tv.options.unit, ret_norms, err);
 }
 
+static double tv_alpha(const struct recon *recon, enum noise_stage stage)
+{
+	const struct recipe *recipe = &recon->recipe;
+
+	if (!recipe->tv.automatic)
+		return recipe->tv.options.alpha;
+	return noise_alpha(&recon->noise, recipe->tv.strength, stage, recipe->tv.options.unit);
+}
+
+static void tell_noise(const struct recon *recon)
+{
+	const struct recipe *recipe = &recon->recipe;
+	const double alpha = tv_alpha(recon, recipe->sart.on ? NOISE_OF_SART : NOISE_OF_FDK);
+
+	if (recon->hooks->denoising != NULL)
+		recon->hooks->denoising(recon->hooks->context, recon->noise.sigma / recipe->mu_water * 1000,
+					isfinite(alpha) ? alpha : 0);
+}
+
 static struct metal_tools metal_tools(struct recon *recon)
 {
 	return (struct metal_tools){
@@ -608,6 +631,21 @@ int recon_resume_metal(struct recon *recon, const void *list, size_t bytes, stru
 	return metal_put(&recon->metal, &recon->recipe.grid, list, bytes, err);
 }
 
+const struct volume_noise *recon_noise(const struct recon *recon)
+{
+	return recon->noise_measured ? &recon->noise : NULL;
+}
+
+int recon_resume_noise(struct recon *recon, const struct volume_noise *noise, struct error *err)
+{
+	if (!recon->resumed || !recon->recipe.tv.on)
+		return error_set(err, ERR_INVALID, "the noise of a run that has no TV");
+	recon->noise = *noise;
+	recon->noise_measured = true;
+	tell_noise(recon);
+	return 0;
+}
+
 const void *recon_metal(const struct recon *recon, size_t *ret_bytes)
 {
 	*ret_bytes = recon->metal.voxels_count * sizeof(*recon->metal.voxels);
@@ -616,14 +654,36 @@ const void *recon_metal(const struct recon *recon, size_t *ret_bytes)
 
 /* ---- the run ---- */
 
+/* The noise that TV is to take out: that of the FDK volume, or without FDK of the first iterate. */
+static int measure_noise(struct recon *recon, struct error *err)
+{
+	int code = noise_measure(recon->backend, recon->volume, &recon->recipe.grid, &recon->noise, err);
+
+	if (code < 0)
+		return code;
+	recon->noise_measured = true;
+	tell_noise(recon);
+	warn_tv(recon->hooks, &recon->recipe, &recon->noise);
+	return 0;
+}
+
 static int run_tv(struct recon *recon, int iteration, struct error *err)
 {
-	int code;
+	struct tv_options tv = recon->recipe.tv.options;
 
 	tell_progress(recon, STAGE_TV, iteration);
-	code = recon->backend->tv(recon->plan, recon->volume, cancel_of(recon), err);
 	recon->work_done += WORK_TV;
-	return code;
+	if (!recon->noise_measured) {
+		int code = measure_noise(recon, err);
+
+		if (code < 0)
+			return code;
+	}
+	tv.alpha = tv_alpha(recon, iteration == 0 ? NOISE_OF_FDK : NOISE_OF_SART);
+	/* Nothing to smooth: the minimiser is the volume itself. */
+	if (tv.alpha == INFINITY)
+		return 0;
+	return recon->backend->tv(recon->plan, recon->volume, &tv, cancel_of(recon), err);
 }
 
 /* Known once all views are filtered. */
@@ -733,6 +793,8 @@ static int finish_fdk(struct recon *recon, struct error *err)
 		code = take_metal_out(recon, err);
 	if (code == 0 && is_wanted(recipe, EMIT_FDK))
 		code = keep(recon, "fdk", "fdk", err);
+	if (code == 0 && recipe->tv.on)
+		code = measure_noise(recon, err);
 	if (code < 0 || !recipe->tv.on || !recipe->tv.after_fdk)
 		return code;
 	code = check_cancelled(recon, err);

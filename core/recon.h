@@ -15,6 +15,10 @@ enum { EMIT_FDK = 0, EMIT_FDK_TV = -1 }; /* beside iterations 1, 2, ... */
 enum projector { PROJECTOR_INTERPOLATING, PROJECTOR_MATCHED, PROJECTOR_COUNT };
 extern const char *const projector_names[PROJECTOR_COUNT]; /* "interpolating", "matched" */
 
+/* "light", "medium", "strong": half, once, twice the balance that is found. */
+enum tv_strength { TV_LIGHT, TV_MEDIUM, TV_STRONG, TV_STRENGTH_COUNT };
+extern const char *const tv_strength_names[TV_STRENGTH_COUNT];
+
 struct recipe {
 	bool has_grid; /* otherwise chosen from field of view and resolution */
 	struct grid grid;
@@ -35,8 +39,10 @@ struct recipe {
 	} sart;
 	struct {
 		bool on;
-		bool after_fdk; /* false with "after": "sart" */
-		struct tv_options options;
+		bool after_fdk;            /* false with "after": "sart" */
+		bool automatic;            /* alpha is found from the noise (core/noise.h); TV_PROXIMAL only */
+		enum tv_strength strength; /* of what is found */
+		struct tv_options options; /* alpha counts for nothing where it is found */
 	} tv;
 	enum projector projector;
 	struct {
@@ -53,6 +59,8 @@ enum { SUBSETS_DEFAULT = 0, SUBSETS_VIEWS = -1 };
 enum { ITERATIONS_MAX = 100000, GRID_DEFAULT_MOST = 512, METAL_HU_LEAST = 500, METAL_HU_MOST = 1000000 };
 
 void recipe_defaults(struct recipe *ret_recipe); /* nothing on; the values that `{}` stages take */
+/* TV with numbers in place of those found: alpha 0.1, and 10 steps of 0.1 or 100 iterations; unit and `on` stay. */
+void recipe_explicit_tv(struct recipe *recipe, enum tv_method method);
 void recipe_clear(struct recipe *recipe);
 int recipe_copy(struct recipe *ret_recipe, const struct recipe *recipe, struct error *err);
 /* Pointers are those of the job's JSON, "/grid/size/0", "/sart/subsets"; ERR_IMPOSSIBLE for all that is out of range.
@@ -65,6 +73,12 @@ int recipe_check(const struct recipe *recipe, const struct geometry *geometry, s
  */
 int recipe_resolve(struct recipe *recipe, const struct geometry *geometry, const struct orbit *orbit,
 		   struct error *err);
+
+/* What a volume shows of its noise, see core/noise.h; both 0 where there is nothing to see. */
+struct volume_noise {
+	double sigma;    /* 1/mm: standard deviation of the noise */
+	double contrast; /* 1/mm: standard deviation of the object's gray levels without it */
+};
 
 /* Always finite. */
 struct history_row {
@@ -104,6 +118,11 @@ struct recon_hooks {
 	 * comes as "final", and before that under its own name where the recipe asks for that too.
 	 */
 	int (*keep)(void *context, struct recon *recon, const struct kept_volume *volume, struct error *err);
+	/*
+	 * With TV in the recipe, once, before the first TV: the noise in Hounsfield units, and the alpha of the TV that
+	 * follows SART, or FDK where there is no SART; 0 where nothing is to be smoothed.
+	 */
+	void (*denoising)(void *context, double noise_hu, double alpha);
 	/* The codes are in warn.h and input.h. */
 	void (*warning)(void *context, const char *code, const char *detail);
 }; /* any of them may be NULL */
@@ -155,6 +174,13 @@ int recon_resume(struct recon *recon, const float *volume, int iteration, struct
  */
 const void *recon_metal(const struct recon *recon, size_t *ret_bytes);
 int recon_resume_metal(struct recon *recon, const void *list, size_t bytes, struct error *err);
+
+/*
+ * The noise that was measured; NULL before that and without TV. A run that goes on wants it back, behind
+ * recon_resume: the FDK volume that showed it is not made again.
+ */
+const struct volume_noise *recon_noise(const struct recon *recon);
+int recon_resume_noise(struct recon *recon, const struct volume_noise *noise, struct error *err);
 
 /* Slices of the current iterate, 1/mm; while a volume is kept, with the metal in it. */
 int recon_read(struct recon *recon, int z_first, int z_count, float *ret_slices, struct error *err);

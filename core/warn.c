@@ -6,6 +6,7 @@
 #include <stdarg.h>
 #include <stdio.h>
 
+#include "core/noise.h"
 #include "core/outside.h"
 #include "core/warning.h"
 
@@ -187,6 +188,22 @@ void warn_exterior_stays(const struct recon_hooks *hooks, const struct exterior_
 	    "the object %s, and FDK of this orbit is too poor to take that out of the projections: SART piles it "
 	    "up in the grid",
 	    outside ? "goes on outside of the grid" : "reaches beyond the detector");
+}
+
+void warn_tv(const struct recon_hooks *hooks, const struct recipe *recipe, const struct volume_noise *noise)
+{
+	/* A voxel that is moved by so little of what it takes keeps nearly all of its noise. */
+	const double little = 0.25, unit = recipe->tv.options.unit, hu = recipe->mu_water / 1000;
+	const double needed = unit / noise_alpha(noise, TV_MEDIUM, NOISE_OF_FDK, unit);
+	const double reach = noise_reach(&recipe->tv.options);
+
+	if (recipe->tv.automatic || reach >= little * needed)
+		return;
+	recon_warn(
+	    hooks, "tv_without_effect",
+	    "TV with these settings moves a voxel by about %.3g HU, the noise is %.3g HU: it wants %.3g HU, which "
+	    "\"alpha\": \"auto\" finds",
+	    reach / hu, noise->sigma / hu, needed / hu);
 }
 
 void warn_metal(const struct recon_hooks *hooks, const struct geometry *geometry, const struct recipe *recipe,

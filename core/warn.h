@@ -31,6 +31,8 @@ void warn_truncated(const struct recon_hooks *hooks, const struct geometry *geom
 void warn_outside(const struct recon_hooks *hooks, const struct geometry *geometry, bool turned, size_t rows);
 /* "outside_grid" or "truncated": FDK of the orbit is too poor to take out what these rows count. */
 void warn_exterior_stays(const struct recon_hooks *hooks, const struct exterior_rows *rows);
+/* "tv_without_effect": explicit settings that cannot move a voxel by a fair share of the noise. */
+void warn_tv(const struct recon_hooks *hooks, const struct recipe *recipe, const struct volume_noise *noise);
 /* "metal", or "no_metal" where it has no voxels. */
 void warn_metal(const struct recon_hooks *hooks, const struct geometry *geometry, const struct recipe *recipe,
 		const struct metal *metal);

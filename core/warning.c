@@ -63,6 +63,8 @@ const struct warning_kind warning_kinds[] = {
     {"residual_high", SEVERITY_SERIOUS,
      "The image does not agree with the projections: it may be wrong, or need far more iterations."},
     {"tv_without_sart", SEVERITY_INFO, "Noise reduction was asked for after iterations, and there were none."},
+    {"tv_without_effect", SEVERITY_CAUTION,
+     "The noise reduction that was asked for is too weak for this scan: the image is about as noisy as without it."},
     {"metal", SEVERITY_CAUTION, "There is metal: what is shown within 10 mm of it is an estimate."},
     {"no_metal", SEVERITY_INFO, "No metal was found in the image."},
     {"checkpoint", SEVERITY_INFO, "The job went on from an earlier iteration than expected; the result is the same."},

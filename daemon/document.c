@@ -287,6 +287,20 @@ static void add_memory(cJSON *document, const struct recon_memory *memory)
 	cJSON_AddNumberToObject(object, "host", (double)memory->host);
 }
 
+/* What TV goes by; null without TV and before it is known. */
+static void add_denoising(cJSON *document, const struct job_record *record)
+{
+	cJSON *object;
+
+	if (isnan(record->noise_hu)) {
+		cJSON_AddNullToObject(document, "denoising");
+		return;
+	}
+	object = cJSON_AddObjectToObject(document, "denoising");
+	cJSON_AddNumberToObject(object, "noise_hu", record->noise_hu);
+	add_number_or_null(object, "alpha", record->tv_alpha > 0 ? record->tv_alpha : -1);
+}
+
 /* How many are there, and how many of them the reconstruction has; null when the scan has gone. */
 static void add_views(cJSON *document, const struct scan_facts *scan, const struct job_record *record)
 {
@@ -354,6 +368,7 @@ static void add_job_facts(cJSON *document, struct job *job, const struct job_rec
 	add_text_or_null(document, "device", record->device);
 	add_text_or_null(document, "plan", record->plan);
 	add_memory(document, &record->memory);
+	add_denoising(document, record);
 	cJSON_AddNumberToObject(document, "attempts", record->attempts);
 	cJSON_AddBoolToObject(document, "cancel_requested", record->cancel_asked);
 	add_time(document, "created", record->created);

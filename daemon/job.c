@@ -4,6 +4,7 @@
 #include <assert.h>
 #include <errno.h>
 #include <stddef.h>
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -664,6 +665,7 @@ static int fill_record(struct job_record *record, const struct job_request *requ
 	record->priority = request->priority;
 	record->mu_water = request->recipe.mu_water;
 	record->iterations = request->recipe.sart.on ? request->recipe.sart.iterations : 0;
+	record->noise_hu = record->tv_alpha = NAN;
 	if (memory != NULL)
 		record->memory = *memory;
 	if (key != NULL)
@@ -1133,6 +1135,14 @@ void job_set_plan(struct job *job, const struct recon_memory *memory, const char
 	pthread_mutex_lock(&job->jobs->lock);
 	job->record.memory = *memory;
 	snprintf(job->record.plan, sizeof(job->record.plan), "%s", plan);
+	pthread_mutex_unlock(&job->jobs->lock);
+}
+
+void job_set_denoising(struct job *job, double noise_hu, double alpha)
+{
+	pthread_mutex_lock(&job->jobs->lock);
+	job->record.noise_hu = noise_hu;
+	job->record.tv_alpha = alpha;
 	pthread_mutex_unlock(&job->jobs->lock);
 }
 

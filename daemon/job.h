@@ -161,7 +161,8 @@ int jobs_victim(struct jobs *jobs, const enum priority *arriving, const struct q
 		int idle);
 
 void job_set_plan(struct job *job, const struct recon_memory *memory, const char *plan);
-/* Memory only, until the next change of state. */
+/* recon_hooks.denoising. Memory only, until the next change of state, as is the progress. */
+void job_set_denoising(struct job *job, double noise_hu, double alpha);
 void job_progress(struct job *job, enum stage stage, int iteration, double fraction);
 enum { JOB_ROWS_MAX = 64 };
 /* In one commit, all or none: 1 to JOB_ROWS_MAX rows, each with its event. */

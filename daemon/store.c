@@ -139,6 +139,9 @@ static const char *const migrations[] = {
     /* Of the record in the directory, store_record.h. */
     ("ALTER TABLE scans ADD COLUMN stamp INTEGER NOT NULL DEFAULT 0;"
      "ALTER TABLE jobs ADD COLUMN stamp INTEGER NOT NULL DEFAULT 0;"),
+    /* What TV goes by, NULL before that was measured. */
+    ("ALTER TABLE jobs ADD COLUMN noise_hu REAL;"
+     "ALTER TABLE jobs ADD COLUMN tv_alpha REAL;"),
 };
 enum { MIGRATIONS = sizeof(migrations) / sizeof(migrations[0]) };
 

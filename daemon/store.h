@@ -295,7 +295,8 @@ struct job_record {
 	unsigned basis; /* of its scan, when it ran last */
 	char backend[16], device[96], plan[160];
 	struct recon_memory memory;
-	int error_code; /* 0: none */
+	double noise_hu, tv_alpha; /* recon_hooks.denoising; NaN before it was called */
+	int error_code;            /* 0: none */
 	char error_pointer[192], error_text[320];
 	double created, queued, started, ended; /* seconds since 1970, 0: not yet */
 	double seconds[STAGE_COUNT];            /* spent in each stage, all attempts together */

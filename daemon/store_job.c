@@ -89,6 +89,8 @@ static void bind_changing(struct query *query, const struct job_record *job)
 	query_integer(query, job->iteration);
 	query_real(query, job->fraction);
 	query_integer(query, job->basis);
+	query_real(query, job->noise_hu);
+	query_real(query, job->tv_alpha);
 	query_text(query, job->id);
 }
 
@@ -124,9 +126,10 @@ int store_job_insert(struct store *store, const struct job_record *job, const st
 	    &query, &store->writer,
 	    "INSERT INTO jobs (state, ticket, cancel_asked, attempts, crashes, checkpoint, backend, device, plan,"
 	    " memory, error_code, error_pointer, error_text, queued, started, ended, seconds, stage, iteration,"
-	    " fraction, basis, id, scan, priority, request, mu_water, iterations, idempotency_key, request_sha256,"
+	    " fraction, basis, noise_hu, tv_alpha, id, scan, priority, request, mu_water, iterations, idempotency_key, "
+	    "request_sha256,"
 	    " created) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?,"
-	    " ?, ?)",
+	    " ?, ?, ?, ?)",
 	    err);
 	bind_changing(&query, job);
 	query_text(&query, job->scan);
@@ -190,7 +193,8 @@ int store_job_update(struct store *store, const struct job_record *job, const st
 	    &query, &store->writer,
 	    "UPDATE jobs SET state = ?, ticket = ?, cancel_asked = ?, attempts = ?, crashes = ?, checkpoint = ?,"
 	    " backend = ?, device = ?, plan = ?, memory = ?, error_code = ?, error_pointer = ?, error_text = ?,"
-	    " queued = ?, started = ?, ended = ?, seconds = ?, stage = ?, iteration = ?, fraction = ?, basis = ?"
+	    " queued = ?, started = ?, ended = ?, seconds = ?, stage = ?, iteration = ?, fraction = ?, basis = ?,"
+	    " noise_hu = ?, tv_alpha = ?"
 	    " WHERE id = ?",
 	    err);
 	bind_changing(&query, job);
@@ -478,6 +482,14 @@ static void *grow(void *array, int count, size_t size)
 	return realloc(array, (size_t)(count == 0 ? 1 : 2 * count) * size);
 }
 
+/* SQLite keeps a NaN as NULL. */
+static double column_real(struct query *query, int column)
+{
+	return sqlite3_column_type(query->statement, column) == SQLITE_NULL
+		   ? NAN
+		   : sqlite3_column_double(query->statement, column);
+}
+
 static int read_job(struct query *query, struct job_record *job, struct error *err)
 {
 	sqlite3_stmt *row = query->statement;
@@ -512,6 +524,8 @@ static int read_job(struct query *query, struct job_record *job, struct error *e
 	job->iteration = sqlite3_column_int(row, 27);
 	job->fraction = sqlite3_column_double(row, 28);
 	job->basis = (unsigned)sqlite3_column_int64(row, 29);
+	job->noise_hu = column_real(query, 30);
+	job->tv_alpha = column_real(query, 31);
 	if (state < 0 || priority < 0 || stage < 0 || !id_valid(job->id))
 		return error_set(err, ERR_IO, "catalogue: the row of job \"%s\" makes no sense", job->id);
 	job->state = (enum job_state)state;
@@ -534,7 +548,7 @@ int store_job_load(struct store *store, struct job_record **ret_jobs, int *ret_c
 	    "SELECT id, scan, state, priority, ticket, request, mu_water, iterations, idempotency_key,"
 	    " request_sha256, cancel_asked, attempts, crashes, checkpoint, backend, device, plan, memory,"
 	    " error_code, error_pointer, error_text, created, queued, started, ended, seconds, stage, iteration,"
-	    " fraction, basis FROM jobs ORDER BY id",
+	    " fraction, basis, noise_hu, tv_alpha FROM jobs ORDER BY id",
 	    err);
 	while (code == 0 && query_row(&query)) {
 		more = grow(jobs, count, sizeof(*jobs));
@@ -555,14 +569,6 @@ int store_job_load(struct store *store, struct job_record **ret_jobs, int *ret_c
 	*ret_jobs = jobs;
 	*ret_count = count;
 	return 0;
-}
-
-/* SQLite keeps a NaN as NULL. */
-static double column_real(struct query *query, int column)
-{
-	return sqlite3_column_type(query->statement, column) == SQLITE_NULL
-		   ? NAN
-		   : sqlite3_column_double(query->statement, column);
 }
 
 static void read_row(struct query *query, void *element)

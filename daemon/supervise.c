@@ -598,6 +598,9 @@ static void on_message(struct supervise *supervise, struct worker *worker, const
 	case MESSAGE_OPENED:
 		job_set_plan(worker->job, &message->memory, message->plan);
 		break;
+	case MESSAGE_NOISE:
+		job_set_denoising(worker->job, message->noise_hu, message->alpha);
+		break;
 	case MESSAGE_TAKEN:
 		worker->taken = message->count;
 		job_taken(worker->job, message->count);

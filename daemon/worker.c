@@ -208,6 +208,13 @@ static void on_row(void *context, const struct history_row *row)
 	report(worker, &message);
 }
 
+static void on_denoising(void *context, double noise_hu, double alpha)
+{
+	struct message message = {.kind = MESSAGE_NOISE, .noise_hu = noise_hu, .alpha = alpha};
+
+	report(context, &message);
+}
+
 static void on_warning(void *context, const char *code, const char *detail)
 {
 	struct message message = {.kind = MESSAGE_WARNING};
@@ -312,6 +319,7 @@ static int run_job(struct worker *worker, const struct message *start, struct er
 						    .yield = on_yield,
 						    .progress = on_progress,
 						    .row = on_row,
+						    .denoising = on_denoising,
 						    .warning = on_warning},
 					  .on_volume = on_volume,
 					  .on_settled = on_settled,

@@ -206,9 +206,10 @@ static int sart_iterate(struct plan *plan, const struct stack *projections, stru
 	return mark_used(plan->device, volume->used, err);
 }
 
-static int tv(struct plan *plan, struct volume *volume, const struct cancel *cancel, struct error *err)
+static int tv(struct plan *plan, struct volume *volume, const struct tv_options *options, const struct cancel *cancel,
+	      struct error *err)
 {
-	TRY(cuda_tv(plan, volume, cancel, err));
+	TRY(cuda_tv(plan, volume, options, cancel, err));
 	return mark_used(plan->device, volume->used, err);
 }
 

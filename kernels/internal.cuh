@@ -493,7 +493,8 @@ int cuda_project(struct plan *plan, const struct volume *from, const int *views,
 		 struct error *err);
 int cuda_sart_iterate(struct plan *plan, const struct stack *projections, struct volume *volume,
 		      const struct cancel *cancel, struct sart_sums *ret_sums, struct error *err);
-int cuda_tv(struct plan *plan, struct volume *volume, const struct cancel *cancel, struct error *err);
+int cuda_tv(struct plan *plan, struct volume *volume, const struct tv_options *options, const struct cancel *cancel,
+	    struct error *err);
 int cuda_norms(struct plan *plan, const struct volume *volume, const struct volume *other, double unit,
 	       struct volume_norms *ret_norms, struct error *err);
 int cuda_plan_bytes(struct device *device, const struct plan_options *options, struct plan_bytes *ret_bytes,

@@ -385,9 +385,9 @@ size_t tv_scratch_bytes(const struct plan_options *options)
 }
 
 /* The smallest epsilon with which the steps are stable: see core/cpu_tv.c. */
-static int run_gradient(struct plan *plan, float *volume, const struct cancel *cancel, struct error *err)
+static int run_gradient(struct plan *plan, float *volume, const struct tv_options *tv, const struct cancel *cancel,
+			struct error *err)
 {
-	const struct tv_options *tv = plan->options.tv;
 	size_t voxels = grid_voxels(plan->options.grid);
 	tv_step s = step_make(plan, 1, tv->step * tv->unit, tv->step * tv->alpha);
 	double damping = fmax(2 - tv->alpha * tv->step, .1);
@@ -414,21 +414,20 @@ static int run_gradient(struct plan *plan, float *volume, const struct cancel *c
 struct pace {
 	double tau, sigma, theta;
 };
-static pace pace_first(const struct plan *plan)
+static pace pace_first(const struct plan *plan, const struct tv_options *tv)
 {
-	double square = fmax(4 * squared_weights(plan), 1), tau = 1 / plan->options.tv->alpha;
+	double square = fmax(4 * squared_weights(plan), 1), tau = 1 / tv->alpha;
 
 	return {tau, 1 / (square * tau), 0};
 }
-static pace pace_next(const struct plan *plan, pace p)
+static pace pace_next(const struct tv_options *tv, pace p)
 {
-	double theta = 1 / sqrt(1 + 2 * plan->options.tv->alpha * p.tau);
+	double theta = 1 / sqrt(1 + 2 * tv->alpha * p.tau);
 
 	return {p.tau * theta, p.sigma / theta, theta};
 }
-static tv_step step_at(const struct plan *plan, pace p)
+static tv_step step_at(const struct plan *plan, const struct tv_options *tv, pace p)
 {
-	const struct tv_options *tv = plan->options.tv;
 	double damping = 1 + p.tau * tv->alpha;
 	tv_step s = step_make(plan, p.sigma / tv->unit, p.tau * tv->unit / damping, p.tau * tv->alpha / damping);
 
@@ -436,21 +435,22 @@ static tv_step step_at(const struct plan *plan, pace p)
 	return s;
 }
 
-static int run_proximal(struct plan *plan, float *volume, const struct cancel *cancel, struct error *err)
+static int run_proximal(struct plan *plan, float *volume, const struct tv_options *tv, const struct cancel *cancel,
+			struct error *err)
 {
 	size_t voxels = grid_voxels(plan->options.grid);
-	int iterations = plan->options.tv->iterations;
+	int iterations = tv->iterations;
 	float *from = volume, *past = volume;
 	float *work[3] = {plan->scratch, plan->scratch + voxels, plan->scratch + 2 * voxels};
 	__half *dual[2] = {(__half *)(plan->scratch + 3 * voxels), (__half *)(plan->scratch + 3 * voxels) + 3 * voxels};
-	pace pace = pace_first(plan);
+	pace pace = pace_first(plan, tv);
 
-	for (int i = 0; i < iterations; i++, pace = pace_next(plan, pace)) {
+	for (int i = 0; i < iterations; i++, pace = pace_next(tv, pace)) {
 		bool last = i == iterations - 1;
 		/* The volume is f, and up to the second step v or past. */
 		float *to = last && i > 1 ? volume : work[i % 3];
 		tv_volumes volumes = {volume, from, past, to, {}, {}};
-		tv_step s = step_at(plan, pace);
+		tv_step s = step_at(plan, tv, pace);
 
 		for (int k = 0; k < 3; k++) {
 			volumes.dual[k] = dual[i % 2] + k * voxels;
@@ -516,22 +516,23 @@ static __global__ void step_primal(const tv_step s, const float *f, const float 
 }
 
 /* Two kernels a step, each in place: half the memory, and 56 bytes a voxel. */
-static int run_proximal_in_float(struct plan *plan, float *volume, const struct cancel *cancel, struct error *err)
+static int run_proximal_in_float(struct plan *plan, float *volume, const struct tv_options *tv,
+				 const struct cancel *cancel, struct error *err)
 {
 	size_t voxels = grid_voxels(plan->options.grid);
 	const int *size = plan->grid.size;
-	int iterations = plan->options.tv->iterations;
+	int iterations = tv->iterations;
 	float *work = plan->scratch, *u = plan->scratch + voxels;
 	float3 *p = (float3 *)(plan->scratch + 2 * voxels);
 	dim3 threads(32, 8), blocks(divide_up(size[0], 32), divide_up(size[1], 8), size[2]);
 	cudaStream_t stream = plan->device->stream;
-	pace pace = pace_first(plan);
+	pace pace = pace_first(plan, tv);
 
 	for (int i = 0; i < iterations; i++) {
-		tv_step s = step_at(plan, pace);
+		tv_step s = step_at(plan, tv, pace);
 		bool first = i == 0, last = i == iterations - 1;
 
-		pace = pace_next(plan, pace);
+		pace = pace_next(tv, pace);
 		TRY(cancel_check(cancel, err));
 		step_dual<<<blocks, threads, 0, stream>>>(s, first ? volume : u, p, first);
 		LAUNCHED();
@@ -543,14 +544,15 @@ static int run_proximal_in_float(struct plan *plan, float *volume, const struct 
 	return 0;
 }
 
-int cuda_tv(struct plan *plan, struct volume *volume, const struct cancel *cancel, struct error *err)
+int cuda_tv(struct plan *plan, struct volume *volume, const struct tv_options *options, const struct cancel *cancel,
+	    struct error *err)
 {
-	if (plan->options.tv == NULL)
-		return error_set(err, ERR_INTERNAL, "the plan was made without TV");
+	if (plan->options.tv == NULL || options->method > plan->options.tv->method)
+		return error_set(err, ERR_INTERNAL, "the plan was made without this TV");
 	TRY(device_enter(plan->device, err));
 	plan_end_slices(plan);
-	if (plan->options.tv->method == TV_GRADIENT)
-		return run_gradient(plan, volume->data, cancel, err);
-	return plan->options.reference_precision ? run_proximal_in_float(plan, volume->data, cancel, err)
-						 : run_proximal(plan, volume->data, cancel, err);
+	if (options->method == TV_GRADIENT)
+		return run_gradient(plan, volume->data, options, cancel, err);
+	return plan->options.reference_precision ? run_proximal_in_float(plan, volume->data, options, cancel, err)
+						 : run_proximal(plan, volume->data, options, cancel, err);
 }

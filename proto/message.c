@@ -96,6 +96,10 @@ static const struct field volume_fields[] = {FIELD("job", FIELD_STRING, job),
 					     FIELD("not_finite", FIELD_SIZE, norms.not_finite),
 					     {0}};
 static const struct field settled_fields[] = {FIELD("job", FIELD_STRING, job), FIELD("name", FIELD_STRING, name), {0}};
+static const struct field noise_fields[] = {FIELD("job", FIELD_STRING, job),
+					    FIELD("noise_hu", FIELD_NUMBER, noise_hu),
+					    FIELD("alpha", FIELD_NUMBER, alpha),
+					    {0}};
 static const struct field warning_fields[] = {
     FIELD("job", FIELD_STRING, job), FIELD("code", FIELD_STRING, code_name), FIELD("detail", FIELD_STRING, text), {0}};
 static const struct field ended_fields[] = {FIELD("job", FIELD_STRING, job),
@@ -120,6 +124,7 @@ static const struct {
     [MESSAGE_ROW] = {"row", row_fields},
     [MESSAGE_VOLUME] = {"volume", volume_fields},
     [MESSAGE_SETTLED] = {"settled", settled_fields},
+    [MESSAGE_NOISE] = {"noise", noise_fields},
     [MESSAGE_WARNING] = {"warning", warning_fields},
     [MESSAGE_ENDED] = {"ended", ended_fields},
 };

@@ -31,6 +31,7 @@ enum message_kind {
 	MESSAGE_ROW,      /* job, row */
 	MESSAGE_VOLUME,   /* job, name, stage, iteration, bytes, norms: the file is there, whole, for everybody */
 	MESSAGE_SETTLED,  /* job, name: that file is on the disk; before the job ends, but for what failed */
+	MESSAGE_NOISE,    /* job, noise_hu, alpha: what TV goes by, see recon_hooks.denoising */
 	MESSAGE_WARNING,  /* job, code, detail */
 	MESSAGE_ENDED,    /* job, code (0, ERR_CANCELLED, ERR_BUSY = yielded at `iteration`, or what failed), text */
 	MESSAGE_KIND_COUNT
@@ -62,6 +63,7 @@ struct message {
 	int iteration;
 	double fraction;
 	struct history_row row;
+	double noise_hu, alpha;
 	char name[32], volume_stage[16];
 	struct grid grid;
 	struct volume_norms norms;

@@ -118,29 +118,50 @@ static int read_sart(struct recipe *recipe, const cJSON *value, struct error *er
 	return code;
 }
 
-/* Explicit steps are a smoothing of their own; the minimiser is one only when it is reached, to about a percent here.
- */
-static const long PROXIMAL_ITERATIONS = 100;
+/* What numbers without a method have always meant: explicit steps. */
+static int method_meant(struct json_reader *reader)
+{
+	const cJSON *alpha = json_member(reader, "alpha", false);
+
+	return cJSON_IsNumber(alpha) || (alpha == NULL && json_has(reader, "step")) ? TV_GRADIENT : TV_PROXIMAL;
+}
+
+/* A number, or "auto", which is what no alpha means for the minimiser. */
+static void read_alpha(struct json_reader *reader, struct recipe *recipe, enum tv_method method)
+{
+	const cJSON *member = json_member(reader, "alpha", false);
+	const bool given = cJSON_IsString(member) && strcmp(member->valuestring, "auto") == 0;
+
+	if (given || (member == NULL && method == TV_PROXIMAL)) {
+		recipe->tv.options.method = method; /* recipe_check refuses "auto" for explicit steps */
+		return;
+	}
+	recipe_explicit_tv(recipe, method);
+	if (member != NULL && !cJSON_IsNumber(member))
+		json_fail(reader, ERR_INVALID, "alpha", "a number or \"auto\" is expected");
+	/* Nothing keeps explicit steps near f when alpha is 0, but the minimiser without f is a constant. */
+	json_number(reader, "alpha", false, method == TV_PROXIMAL ? 1e-9 : 0, 1e9, &recipe->tv.options.alpha);
+}
 
 static int read_tv(struct recipe *recipe, const cJSON *value, struct error *err)
 {
 	struct json_reader reader;
 	struct tv_options *tv = &recipe->tv.options;
-	long iterations = tv->iterations;
-	int method = tv->method, after = recipe->tv.after_fdk;
+	int method, strength = recipe->tv.strength, after = recipe->tv.after_fdk;
+	long iterations;
 
 	json_begin(&reader, value, "/tv", err);
+	method = method_meant(&reader);
 	json_choice(&reader, "method", false, tv_method_names, TV_METHOD_COUNT, &method);
-	/* Nothing keeps explicit steps near f when alpha is 0, but the minimiser without f is a constant. */
-	json_number(&reader, "alpha", false, method == TV_PROXIMAL ? 1e-9 : 0, 1e9, &tv->alpha);
+	read_alpha(&reader, recipe, (enum tv_method)method);
+	json_choice(&reader, "strength", false, tv_strength_names, TV_STRENGTH_COUNT, &strength);
 	json_number(&reader, "step", false, 1e-9, 1e9, &tv->step);
-	if (method == TV_PROXIMAL && !json_has(&reader, "iterations"))
-		iterations = PROXIMAL_ITERATIONS;
+	iterations = tv->iterations;
 	json_integer(&reader, "iterations", false, 1, ITERATIONS_MAX, &iterations);
 	json_number(&reader, "unit", false, 1e-12, 1e12, &tv->unit);
 	json_choice(&reader, "after", false, after_names, 2, &after);
-	tv->method = (enum tv_method)method;
 	tv->iterations = (int)iterations;
+	recipe->tv.strength = (enum tv_strength)strength;
 	recipe->tv.after_fdk = after != 0;
 	recipe->tv.on = true;
 	return json_end(&reader);
@@ -365,7 +386,12 @@ static void add_tv(cJSON *document, const struct recipe *recipe)
 	cJSON *tv = cJSON_AddObjectToObject(document, "tv");
 
 	cJSON_AddStringToObject(tv, "method", tv_method_names[options->method]);
-	cJSON_AddNumberToObject(tv, "alpha", options->alpha);
+	if (recipe->tv.automatic) {
+		cJSON_AddStringToObject(tv, "alpha", "auto");
+		cJSON_AddStringToObject(tv, "strength", tv_strength_names[recipe->tv.strength]);
+	} else {
+		cJSON_AddNumberToObject(tv, "alpha", options->alpha);
+	}
 	cJSON_AddNumberToObject(tv, "step", options->step);
 	cJSON_AddNumberToObject(tv, "iterations", options->iterations);
 	if (options->unit > 0)
@@ -460,8 +486,10 @@ static bool same_tv(const struct recipe *a, const struct recipe *b)
 	const struct tv_options *x = &a->tv.options, *y = &b->tv.options;
 
 	return a->tv.on == b->tv.on &&
-	       (!a->tv.on || (a->tv.after_fdk == b->tv.after_fdk && x->method == y->method && x->alpha == y->alpha &&
-			      x->step == y->step && x->iterations == y->iterations && x->unit == y->unit));
+	       (!a->tv.on ||
+		(a->tv.after_fdk == b->tv.after_fdk && x->method == y->method && a->tv.automatic == b->tv.automatic &&
+		 (a->tv.automatic ? a->tv.strength == b->tv.strength : x->alpha == y->alpha) && x->step == y->step &&
+		 x->iterations == y->iterations && x->unit == y->unit));
 }
 
 bool job_request_same(const struct job_request *a, const struct job_request *b)

@@ -324,6 +324,14 @@ static void run_row(void *context, const struct history_row *row)
 		hooks->recon.row(hooks->recon.context, row);
 }
 
+static void run_denoising(void *context, double noise_hu, double alpha)
+{
+	const struct spool_hooks *hooks = ((struct run *)context)->hooks;
+
+	if (hooks->recon.denoising != NULL)
+		hooks->recon.denoising(hooks->recon.context, noise_hu, alpha);
+}
+
 static void run_warning(void *context, const char *code, const char *detail)
 {
 	const struct spool_hooks *hooks = ((struct run *)context)->hooks;
@@ -512,15 +520,15 @@ static int run_keep(void *context, struct recon *recon, const struct kept_volume
 
 /* ---- checkpoints ---- */
 
-/* Behind the line lies the iterate, behind that the list of the metal that was taken out. */
+/* Behind the line lies the iterate, behind that the list of the metal that was taken out. No noise is written as 0. */
 static void checkpoint_line(char ret_line[SPOOL_CHECKPOINT_OFFSET], int iteration, const struct grid *grid,
-			    size_t metal_bytes)
+			    size_t metal_bytes, const struct volume_noise *noise)
 {
 	char text[SPOOL_CHECKPOINT_OFFSET];
 
 	memset(ret_line, ' ', SPOOL_CHECKPOINT_OFFSET);
-	snprintf(text, sizeof(text), "cbctd checkpoint %d of %d %d %d, metal %zu", iteration, grid->size[0],
-		 grid->size[1], grid->size[2], metal_bytes);
+	snprintf(text, sizeof(text), "cbctd checkpoint %d of %d %d %d, metal %zu, noise %a %a", iteration,
+		 grid->size[0], grid->size[1], grid->size[2], metal_bytes, noise->sigma, noise->contrast);
 	memcpy(ret_line, text, strlen(text));
 	ret_line[SPOOL_CHECKPOINT_OFFSET - 1] = '\n';
 }
@@ -552,6 +560,7 @@ static int save_checkpoint(struct recon *recon, const char *directory, struct er
 	struct durable d;
 	size_t metal_bytes;
 	const void *metal = recon_metal(recon, &metal_bytes);
+	const struct volume_noise *noise = recon_noise(recon), none = {0};
 	int code = join(path, sizeof(path), directory, SPOOL_CHECKPOINT, "", err);
 
 	if (code == 0)
@@ -559,7 +568,7 @@ static int save_checkpoint(struct recon *recon, const char *directory, struct er
 				    sizeof(header) + grid_voxels(recon_grid(recon)) * sizeof(float) + metal_bytes, err);
 	if (code != 0)
 		return code;
-	checkpoint_line(header, recon_iteration(recon), recon_grid(recon), metal_bytes);
+	checkpoint_line(header, recon_iteration(recon), recon_grid(recon), metal_bytes, noise != NULL ? noise : &none);
 	code = durable_write(&d, header, sizeof(header), err);
 	if (code == 0)
 		code = write_iterate(recon, &d, err);
@@ -573,21 +582,24 @@ static int save_checkpoint(struct recon *recon, const char *directory, struct er
 }
 
 static int check_checkpoint(const char *path, const char *bytes, size_t size, const struct grid *grid,
-			    int *ret_iteration, struct error *err)
+			    int *ret_iteration, struct volume_noise *ret_noise, struct error *err)
 {
 	size_t expected = SPOOL_CHECKPOINT_OFFSET + grid_voxels(grid) * sizeof(float);
 	char text[SPOOL_CHECKPOINT_OFFSET + 1] = "", line[SPOOL_CHECKPOINT_OFFSET];
+	struct volume_noise noise;
 	int iteration;
 
 	if (size < expected)
 		return error_set(err, ERR_INVALID, "%.200s: %zu bytes, %zu are expected", path, size, expected);
 	memcpy(text, bytes, SPOOL_CHECKPOINT_OFFSET);
-	if (sscanf(text, "cbctd checkpoint %d of", &iteration) != 1)
+	if (sscanf(text, "cbctd checkpoint %d of %*d %*d %*d, metal %*u, noise %la %la", &iteration, &noise.sigma,
+		   &noise.contrast) != 3)
 		return error_set(err, ERR_INVALID, "%.200s is no checkpoint", path);
-	checkpoint_line(line, iteration, grid, size - expected);
+	checkpoint_line(line, iteration, grid, size - expected, &noise);
 	if (memcmp(line, bytes, sizeof(line)) != 0)
 		return error_set(err, ERR_INVALID, "%.200s is of another grid", path);
 	*ret_iteration = iteration;
+	*ret_noise = noise;
 	return 0;
 }
 
@@ -596,6 +608,7 @@ static int resume(struct run *run, struct recon *recon, const char *path, int ex
 {
 	int file = open(path, O_RDONLY | O_CLOEXEC), code, iteration = 0;
 	struct stat status;
+	struct volume_noise noise;
 	size_t metal;
 	char *bytes = MAP_FAILED;
 
@@ -614,10 +627,12 @@ static int resume(struct run *run, struct recon *recon, const char *path, int ex
 		code = error_set(err, ERR_IO, "%.200s cannot be mapped", path);
 		goto out;
 	}
-	code = check_checkpoint(path, bytes, (size_t)status.st_size, recon_grid(recon), &iteration, err);
+	code = check_checkpoint(path, bytes, (size_t)status.st_size, recon_grid(recon), &iteration, &noise, err);
 	if (code == 0)
 		code =
 		    recon_resume(recon, (const float *)(const void *)(bytes + SPOOL_CHECKPOINT_OFFSET), iteration, err);
+	if (code == 0 && run->recipe->tv.on)
+		code = recon_resume_noise(recon, &noise, err);
 	metal = SPOOL_CHECKPOINT_OFFSET + grid_voxels(recon_grid(recon)) * sizeof(float);
 	if (code == 0 && (size_t)status.st_size > metal)
 		code = recon_resume_metal(recon, bytes + metal, (size_t)status.st_size - metal, err);
@@ -744,6 +759,7 @@ int spool_open(const struct backend *backend, struct device *device, const struc
 					    .progress = run_progress,
 					    .row = run_row,
 					    .keep = run_keep,
+					    .denoising = run_denoising,
 					    .warning = run_warning};
 	spool->files.projections = spool->files.sums = -1;
 	code = scan_files_open(options->scan_directory, &spool->files, err);

@@ -129,8 +129,9 @@ int spool_finish(struct spool *spool, struct error *err);
 int spool_run(const struct backend *backend, struct device *device, const struct spool_options *options,
 	      struct error *err);
 
-/* A line of text padded to SPOOL_CHECKPOINT_OFFSET bytes with iteration and size, then float32 voxels [z][y][x]. */
+/* A line of text padded to SPOOL_CHECKPOINT_OFFSET bytes with iteration, size and noise, then float32 voxels [z][y][x].
+ */
 #define SPOOL_CHECKPOINT "checkpoint.f32"
-enum { SPOOL_CHECKPOINT_OFFSET = 64 };
+enum { SPOOL_CHECKPOINT_OFFSET = 160 };
 
 #endif

@@ -30,7 +30,10 @@ const struct option recipe_option_rows[] = {
 	0, NULL),
     ROW("tv", OPTION_CHOICE, method, "METHOD", "total variation after FDK and each iteration", 0, 0, TV_METHOD_COUNT,
 	tv_method_names),
-    ROW("tv-alpha", OPTION_NUMBER, alpha, "A", "weight of the volume that entered the stage", 0, 0, 0, NULL),
+    ROW("tv-alpha", OPTION_TEXT, alpha, "A|auto",
+	"weight of the volume that entered the stage; auto finds it from the noise", 0, 0, 0, NULL),
+    ROW("tv-strength", OPTION_CHOICE, strength, "STRENGTH", "of what auto finds", 0, 0, TV_STRENGTH_COUNT,
+	tv_strength_names),
     ROW("tv-step", OPTION_NUMBER, step, "S", "of the gradient method", 0, 0, 0, NULL),
     ROW("tv-iterations", OPTION_INTEGER, tv_iterations, "N", "steps", 0, 0, 0, NULL),
     ROW("tv-unit", OPTION_NUMBER, unit, "MU", "one gray level, 1/mm", 0, 0, 0, NULL),
@@ -152,13 +155,17 @@ static void put_tv(cJSON *document, const struct recipe_options *options)
 {
 	cJSON *tv;
 
-	if (options->method == OPTION_UNSET_CHOICE && isnan(options->alpha) && isnan(options->step) &&
+	if (options->method == OPTION_UNSET_CHOICE && options->alpha == NULL &&
+	    options->strength == OPTION_UNSET_CHOICE && isnan(options->step) &&
 	    options->tv_iterations == OPTION_UNSET_INTEGER && isnan(options->unit) && !options->tv_after_sart)
 		return;
 	tv = stage(document, "tv");
 	if (options->method != OPTION_UNSET_CHOICE)
 		put(tv, "method", cJSON_CreateString(tv_method_names[options->method]));
-	put_number(tv, "alpha", options->alpha);
+	if (options->alpha != NULL)
+		put(tv, "alpha", word_json(options->alpha, strlen(options->alpha)));
+	if (options->strength != OPTION_UNSET_CHOICE)
+		put(tv, "strength", cJSON_CreateString(tv_strength_names[options->strength]));
 	put_number(tv, "step", options->step);
 	put_integer(tv, "iterations", options->tv_iterations);
 	put_number(tv, "unit", options->unit);

@@ -17,7 +17,9 @@ struct recipe_options {
 	bool negative;
 	double stop_residual, stop_change;
 	int method;
-	double alpha, step;
+	const char *alpha;
+	int strength;
+	double step;
 	long tv_iterations;
 	double unit;
 	bool tv_after_sart;
@@ -34,7 +36,7 @@ extern const struct option recipe_option_rows[];
 		.size = OPTION_UNSET_3, .spacing = OPTION_UNSET_3, .origin = OPTION_UNSET_3,                           \
 		.window = OPTION_UNSET_CHOICE, .cutoff = OPTION_UNSET_NUMBER, .iterations = OPTION_UNSET_INTEGER,      \
 		.relaxation = OPTION_UNSET_NUMBER, .stop_residual = OPTION_UNSET_NUMBER,                               \
-		.stop_change = OPTION_UNSET_NUMBER, .method = OPTION_UNSET_CHOICE, .alpha = OPTION_UNSET_NUMBER,       \
+		.stop_change = OPTION_UNSET_NUMBER, .method = OPTION_UNSET_CHOICE, .strength = OPTION_UNSET_CHOICE,    \
 		.step = OPTION_UNSET_NUMBER, .tv_iterations = OPTION_UNSET_INTEGER, .unit = OPTION_UNSET_NUMBER,       \
 		.projector = OPTION_UNSET_CHOICE, .metal = OPTION_UNSET_NUMBER, .priority = OPTION_UNSET_CHOICE,       \
 		.mu_water = OPTION_UNSET_NUMBER                                                                        \

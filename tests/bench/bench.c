@@ -197,7 +197,7 @@ static void run_once(struct bench *bench, const struct plan_options *options, st
 	must(backend_cpu.sart_iterate(bench->plan, bench->projections, bench->volume, NULL, &sums, &err));
 	add_since(begin, &ret[first ? SIRT : SUBSETS]);
 	begin = now();
-	must(backend_cpu.tv(bench->plan, bench->volume, NULL, &err));
+	must(backend_cpu.tv(bench->plan, bench->volume, options->tv, NULL, &err));
 	add_since(begin, &ret[first ? TV_STEPS : TV_MINIMUM]);
 }
 
@@ -307,7 +307,8 @@ static void reconstruct(enum tv_method method)
 	recipe.fdk.on = recipe.sart.on = recipe.tv.on = recipe.tv.after_fdk = true;
 	recipe.sart.iterations = 1;
 	recipe.sart.subsets = 1;
-	recipe.tv.options.method = method;
+	recipe_explicit_tv(&recipe, method);
+	recipe.tv.options.iterations = 10;
 	must(backend_cpu.open(0, &device_options, &device, &err));
 	must(recon_open(&backend_cpu, device, &geometry, &linearise, &recipe, &hooks, &recon, &err));
 	for (int k = 0; k < VIEWS; k++) {

@@ -185,8 +185,9 @@ struct bench {
 	struct volume *volume;
 	struct stack *projections, *filtered;
 	int *views;
-	int repeat;   /* calls in one measurement */
-	bool matched; /* plans are made for the matched projector */
+	int repeat;                  /* calls in one measurement */
+	bool matched;                /* plans are made for the matched projector */
+	const struct tv_options *tv; /* of the plan */
 };
 typedef void operation(struct bench *bench, struct error *err);
 
@@ -274,7 +275,7 @@ static void run_sart(struct bench *bench, struct error *err)
 
 static void run_tv(struct bench *bench, struct error *err)
 {
-	must(backend_cuda.tv(bench->plan, bench->volume, NULL, err), err, "tv");
+	must(backend_cuda.tv(bench->plan, bench->volume, bench->tv, NULL, err), err, "tv");
 }
 
 static void run_norms(struct bench *bench, struct error *err)
@@ -301,6 +302,7 @@ static void make_plan(struct bench *bench, struct sart_options *sart, int subset
 	struct error err = {0};
 
 	options.matched = bench->matched;
+	bench->tv = tv;
 	must(backend_cuda.plan_new(device, &options, &bench->plan, &err), &err, "plan");
 }
 

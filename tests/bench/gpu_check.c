@@ -260,7 +260,7 @@ static void check_scene(const struct scene *scene, struct device *devices[2], in
 	expect(scene, "SART", worst[4], 2 * tolerance);
 	/* the same bits again, whatever TV has left in the memory that stages share */
 	must(backend_cuda.volume_upload(sides[1].other, volume, &err), &err, "upload");
-	must(backend_cuda.tv(sides[1].plan, sides[1].other, NULL, &err), &err, "tv");
+	must(backend_cuda.tv(sides[1].plan, sides[1].other, &tv, NULL, &err), &err, "tv");
 	must(backend_cuda.volume_fill(sides[1].volume, 0, &err), &err, "fill");
 	for (int i = 0; i < 2; i++) {
 		struct sart_sums sums = {0};
@@ -274,7 +274,7 @@ static void check_scene(const struct scene *scene, struct device *devices[2], in
 	for (int s = 0; s < 2; s++) {
 		must(sides[s].backend->volume_upload(sides[s].volume, volume, &err), &err, "upload");
 		must(sides[s].backend->volume_copy(sides[s].other, sides[s].volume, &err), &err, "copy");
-		must(sides[s].backend->tv(sides[s].plan, sides[s].volume, NULL, &err), &err, "tv");
+		must(sides[s].backend->tv(sides[s].plan, sides[s].volume, &tv, NULL, &err), &err, "tv");
 		read_volume(&sides[s], scene, got[s]);
 	}
 	worst[5] = difference(got[1], got[0], voxels);
@@ -1028,6 +1028,7 @@ static void check_recon(struct device *devices[2], enum bend bend, bool referenc
 	projections = project_head(&scene);
 	head_recipe(&recipe, &scene, reference);
 	recipe.tv.on = tv;
+	recipe_explicit_tv(&recipe, TV_GRADIENT);
 	recipe.projector = matched ? PROJECTOR_MATCHED : PROJECTOR_INTERPOLATING;
 	got[0] = reconstruct(&backend_cpu, devices[0], &scene, &recipe, projections);
 	got[1] = reconstruct(&backend_cuda, devices[1], &scene, &recipe, projections);
@@ -1154,6 +1155,7 @@ static void check_parts(bool tv, bool untilted, bool matched)
 	recipe.sart.iterations = 2;
 	recipe.sart.subsets = 4;
 	recipe.tv.on = tv;
+	recipe_explicit_tv(&recipe, TV_GRADIENT);
 	recipe.reference_precision = true;
 	must(recon_memory(&backend_cuda, NULL, &scene.geometry, &recipe, &memory, &err), &err, "memory");
 	for (int s = 0; s < 3; s++) {
@@ -1398,7 +1400,8 @@ static void bound_recipe_make(struct recipe *ret, const struct bound_recipe *fro
 	ret->sart.iterations = 3;
 	ret->sart.subsets = from->subsets;
 	ret->tv.on = from->tv;
-	ret->tv.options.method = from->method;
+	recipe_explicit_tv(ret, from->method);
+	ret->tv.options.iterations = 10;
 	ret->metal.on = from->metal;
 	ret->projector = from->matched ? PROJECTOR_MATCHED : PROJECTOR_INTERPOLATING;
 	ret->reference_precision = from->reference;

@@ -10,22 +10,26 @@
 struct plan;
 struct volume;
 struct cancel;
+struct tv_options;
 struct error;
 
-extern "C" int __real__Z7cuda_tvP4planP6volumePK6cancelP5error(struct plan *, struct volume *, const struct cancel *,
-							       struct error *);
+extern "C" int __real__Z7cuda_tvP4planP6volumePK10tv_optionsPK6cancelP5error(struct plan *, struct volume *,
+									     const struct tv_options *,
+									     const struct cancel *, struct error *);
 
 static __global__ void write_nowhere(int *nowhere)
 {
 	nowhere[threadIdx.x] = 1;
 }
 
-extern "C" int __wrap__Z7cuda_tvP4planP6volumePK6cancelP5error(struct plan *plan, struct volume *volume,
-							       const struct cancel *cancel, struct error *err)
+extern "C" int __wrap__Z7cuda_tvP4planP6volumePK10tv_optionsPK6cancelP5error(struct plan *plan, struct volume *volume,
+									     const struct tv_options *options,
+									     const struct cancel *cancel,
+									     struct error *err)
 {
 	const char *file = getenv("CBCT_FAULT");
 
 	if (file != NULL && unlink(file) == 0)
 		write_nowhere<<<1, 32>>>((int *)64);
-	return __real__Z7cuda_tvP4planP6volumePK6cancelP5error(plan, volume, cancel, err);
+	return __real__Z7cuda_tvP4planP6volumePK10tv_optionsPK6cancelP5error(plan, volume, options, cancel, err);
 }

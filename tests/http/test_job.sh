@@ -37,6 +37,39 @@ test_pipeline_keeps_the_volumes_asked_for() {
 	expect_json '[.volumes[].name] == ["iter-1", "fdk-tv", "fdk"] and .next == null'
 }
 
+test_the_strength_of_tv_is_found_from_the_noise_and_told() {
+	local noisy=$work/noisy alpha medium recipe="$small"'"fdk": {}, "sart": {"iterations": 2, "subsets": 6}, "tv": '
+	cbct simulate --phantom ball --scale 30 --density 0.02 --shift 5,-8,6 --views 60 --columns 64 --rows 48 --pixel 4 \
+		--source-to-isocentre 600 --source-to-detector 1000 --photons 2000 -o "$noisy"
+	post_scan "$noisy"
+	post_projections "$noisy"
+	post_job "$recipe"'{"after": "sart"}}'
+	wait_job succeeded
+	expect_json '.tv.method == "proximal" and .tv.alpha == "auto" and .tv.strength == "medium"'
+	expect_json '.denoising | .noise_hu > 5 and .noise_hu < 200 and .alpha > 0'
+	medium=$(json .denoising.alpha)
+	get_volume final "$work/found.raw" format=raw
+	# The number that was found, given as a number, gives the same volume.
+	post_job "$recipe"'{"method": "proximal", "alpha": '"$medium"', "iterations": 30, "after": "sart"}}'
+	wait_job succeeded
+	expect_json ".tv.alpha == $medium and .denoising.alpha == $medium and (.tv | has(\"strength\") | not)"
+	get_volume final "$work/given.raw" format=raw
+	cmp "$work/found.raw" "$work/given.raw" || fail "the same voxels"
+	for alpha in light:2 strong:0.5; do
+		post_job "$recipe"'{"strength": "'"${alpha%:*}"'"}}'
+		wait_job succeeded
+		expect_json ".denoising.alpha / $medium / ${alpha#*:} - 1 | fabs < 1e-9"
+	done
+	# Ten steps of 0.1 gray levels cannot take out noise of tens.
+	post_job "$recipe"'{"method": "gradient"}}'
+	wait_job succeeded
+	expect_json '.tv.alpha == 0.1 and .tv.step == 0.1 and .tv.iterations == 10'
+	expect_json '[.warnings[] | select(.code == "tv_without_effect" and .severity == "caution")] | length == 1'
+	post_job "$small"'"fdk": {}}'
+	wait_job succeeded
+	expect_json '.tv == null and .denoising == null'
+}
+
 test_every_stage_may_be_left_out() {
 	uploaded_scan
 	local stages

@@ -115,6 +115,15 @@ static int on_keep(void *context, struct recon *recon, const struct kept_volume 
 	return recon_read(recon, 0, volume->grid->size[2], outcome->kept[i].voxels, err);
 }
 
+static void on_denoising(void *context, double noise_hu, double alpha)
+{
+	struct outcome *outcome = context;
+
+	outcome->told_noise++;
+	outcome->noise_hu = noise_hu;
+	outcome->alpha = alpha;
+}
+
 static void on_warning(void *context, const char *code, const char *detail)
 {
 	struct outcome *outcome = context;
@@ -159,6 +168,7 @@ void scene_run(const struct scene *scene, const struct recipe *recipe, struct ou
 	    .progress = on_progress,
 	    .row = on_row,
 	    .keep = on_keep,
+	    .denoising = on_denoising,
 	    .warning = on_warning,
 	};
 	struct device *device;
@@ -177,11 +187,14 @@ void scene_run(const struct scene *scene, const struct recipe *recipe, struct ou
 	if (outcome->code == 0 && outcome->resume_metal_bytes > 0)
 		outcome->code =
 		    recon_resume_metal(recon, outcome->resume_metal, outcome->resume_metal_bytes, &outcome->err);
+	if (outcome->code == 0 && outcome->resume_noise != NULL)
+		outcome->code = recon_resume_noise(recon, outcome->resume_noise, &outcome->err);
 	if (outcome->code == 0)
 		outcome->code = push_all(scene, outcome, recon);
 	if (outcome->code == 0)
 		outcome->code = recon_run(recon, &outcome->err);
 	outcome->iteration = recon_iteration(recon);
+	outcome->noise = recon_noise(recon) != NULL ? *recon_noise(recon) : (struct volume_noise){-1, -1};
 	metal = recon_metal(recon, &outcome->metal_bytes);
 	outcome->metal = malloc(outcome->metal_bytes + 1);
 	ck_assert_ptr_nonnull(outcome->metal);

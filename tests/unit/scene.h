@@ -35,6 +35,7 @@ struct outcome {
 	int resume_iteration;
 	const void *resume_metal; /* of resume_metal_bytes */
 	size_t resume_metal_bytes;
+	const struct volume_noise *resume_noise; /* or NULL */
 
 	/* what came of it */
 	int code; /* of the first call that failed */
@@ -56,6 +57,9 @@ struct outcome {
 	float *last; /* the iterate as it was at the end, kept or not */
 	void *metal; /* what recon_metal gave then */
 	size_t metal_bytes;
+	struct volume_noise noise; /* what recon_noise gave then; -1 where that was nothing */
+	int told_noise;            /* calls of the hook, */
+	double noise_hu, alpha;    /* and what the last one said */
 	int iteration;
 };
 

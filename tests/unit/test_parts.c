@@ -131,11 +131,12 @@ static void expect_parts(const struct result *result, int slabs_least)
 	ck_assert_uint_le(result->memory.total, result->memory.available);
 }
 
+enum { TV_OF_THE_NOISE = TV_METHOD_COUNT };
 static const struct {
 	const char *name;
 	const struct orbit_spec *spec;
 	bool fdk, sart;
-	int subsets, tv; /* TV: -1 none, else the method */
+	int subsets, tv; /* TV: -1 none, else the method, or TV_OF_THE_NOISE */
 	double tolerance;
 	bool matched;
 } cases[] = {
@@ -152,6 +153,7 @@ static const struct {
     {"seen in part", &displaced, false, true, 3, -1, 1e-5, false},
     {"TV by steps", &full, true, true, 4, TV_GRADIENT, 1e-4, false},
     {"proximal TV", &full, true, true, 4, TV_PROXIMAL, 1e-4, false},
+    {"TV of the noise", &full, true, true, 4, TV_OF_THE_NOISE, 1e-4, false},
 };
 
 START_TEST(parts_give_what_the_whole_gives)
@@ -174,12 +176,13 @@ START_TEST(parts_give_what_the_whole_gives)
 	recipe.emits = cases[_i].fdk ? 1 : 0;
 	if (cases[_i].tv >= 0) {
 		recipe.tv.on = true;
-		recipe.tv.options.method = (enum tv_method)cases[_i].tv;
+		if (cases[_i].tv != TV_OF_THE_NOISE)
+			recipe_explicit_tv(&recipe, (enum tv_method)cases[_i].tv);
 		recipe.tv.options.iterations = 5;
 	}
 	whole = reconstruct(&scene, &recipe, &linearise, scene.projections, 0);
 	/* the dual of proximal TV is most of the whole */
-	limit = whole.memory.total / (cases[_i].tv == TV_PROXIMAL ? 7 : 4);
+	limit = whole.memory.total / (cases[_i].tv >= TV_PROXIMAL ? 7 : 4);
 	parts = reconstruct(&scene, &recipe, &linearise, scene.projections, limit);
 	again = reconstruct(&scene, &recipe, &linearise, scene.projections, limit);
 	expect_parts(&parts, 2);

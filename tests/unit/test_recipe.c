@@ -68,6 +68,10 @@ static const char *const requests[] = {
     "\"emit\":[100000,7,3,7]}",
     "{\"scan\":\"a\",\"sart\":{},\"tv\":{\"alpha\":0,\"step\":0.25,\"iterations\":1,\"unit\":3.3e-5,"
     "\"after\":\"fdk+sart\"}}",
+    "{\"scan\":\"a\",\"fdk\":{},\"sart\":{},\"tv\":{\"strength\":\"light\"}}",
+    "{\"scan\":\"a\",\"fdk\":{},\"sart\":{},\"tv\":{\"method\":\"proximal\",\"alpha\":\"auto\",\"strength\":\"strong\"}"
+    "}",
+    "{\"scan\":\"a\",\"fdk\":{},\"sart\":{},\"tv\":{\"method\":\"gradient\"}}",
     "{\"scan\":\"a\",\"fdk\":{},\"sart\":{},\"projector\":\"matched\",\"metal\":{}}",
     "{\"scan\":\"a\",\"fdk\":{},\"projector\":null,\"metal\":{\"threshold_hu\":3071.5}}",
     "{\"scan\":\"a\",\"fdk\":{},\"grid\":{\"size\":[1,8192,7],\"spacing_mm\":[0.1,0.012345678901234567,1],"
@@ -151,10 +155,9 @@ START_TEST(defaults_are_the_contracts)
 	ck_assert_double_eq(recipe->sart.stop_residual, 0);
 	ck_assert_double_eq(recipe->sart.stop_change, 0);
 	ck_assert(recipe->tv.after_fdk);
-	ck_assert_int_eq(recipe->tv.options.method, TV_GRADIENT);
-	ck_assert_double_eq(recipe->tv.options.alpha, 0.1);
-	ck_assert_double_eq(recipe->tv.options.step, 0.1);
-	ck_assert_int_eq(recipe->tv.options.iterations, 10);
+	ck_assert_int_eq(recipe->tv.options.method, TV_PROXIMAL);
+	ck_assert(recipe->tv.automatic);
+	ck_assert_int_eq(recipe->tv.strength, TV_MEDIUM);
 	ck_assert_double_eq_tol(recipe->tv.options.unit, 0.0192 / 1000, 1e-18); /* one HU */
 	ck_assert_double_eq(recipe->mu_water, 0.0192);
 	ck_assert_int_eq(recipe->emits, 0);
@@ -167,6 +170,53 @@ START_TEST(defaults_are_the_contracts)
 	ck_assert_int_gt(recipe->grid.size[0], 40);
 	ck_assert_int_lt(recipe->grid.size[0], 80);
 	recipe_clear(&request.recipe);
+}
+END_TEST
+
+/* What a "tv" means: explicit numbers are what they were before there was "auto". */
+START_TEST(numbers_of_tv_mean_explicit_steps_and_none_means_auto)
+{
+	static const struct {
+		const char *tv;
+		enum tv_method method;
+		bool automatic;
+		enum tv_strength strength;
+		double alpha, step; /* where they count */
+		int iterations;
+	} rows[] = {
+	    {"{}", TV_PROXIMAL, true, TV_MEDIUM, 0, 0, 30},
+	    {"{\"after\":\"sart\",\"unit\":1e-5}", TV_PROXIMAL, true, TV_MEDIUM, 0, 0, 30},
+	    {"{\"alpha\":\"auto\"}", TV_PROXIMAL, true, TV_MEDIUM, 0, 0, 30},
+	    {"{\"strength\":\"strong\"}", TV_PROXIMAL, true, TV_STRONG, 0, 0, 30},
+	    {"{\"iterations\":30}", TV_PROXIMAL, true, TV_MEDIUM, 0, 0, 30},
+	    {"{\"method\":\"proximal\"}", TV_PROXIMAL, true, TV_MEDIUM, 0, 0, 30},
+	    {"{\"method\":\"proximal\",\"alpha\":0.2}", TV_PROXIMAL, false, TV_MEDIUM, .2, 0, 100},
+	    {"{\"method\":\"proximal\",\"alpha\":0.2,\"iterations\":7}", TV_PROXIMAL, false, TV_MEDIUM, .2, 0, 7},
+	    {"{\"method\":\"gradient\"}", TV_GRADIENT, false, TV_MEDIUM, .1, .1, 10},
+	    {"{\"method\":\"gradient\",\"iterations\":20}", TV_GRADIENT, false, TV_MEDIUM, .1, .1, 20},
+	    {"{\"alpha\":0.02,\"step\":1,\"iterations\":20}", TV_GRADIENT, false, TV_MEDIUM, .02, 1, 20},
+	    {"{\"alpha\":0}", TV_GRADIENT, false, TV_MEDIUM, 0, .1, 10},
+	    {"{\"step\":0.25}", TV_GRADIENT, false, TV_MEDIUM, .1, .25, 10},
+	};
+
+	for (size_t i = 0; i < sizeof(rows) / sizeof(rows[0]); i++) {
+		struct job_request request;
+		struct error err = {0};
+		char text[200];
+
+		snprintf(text, sizeof(text), "{\"scan\":\"a\",\"fdk\":{},\"tv\":%s}", rows[i].tv);
+		ck_assert_msg(parse(text, &request, &err) == 0, "%s: %s", text, err.text);
+		ck_assert_msg(request.recipe.tv.options.method == rows[i].method &&
+				  request.recipe.tv.automatic == rows[i].automatic &&
+				  request.recipe.tv.strength == rows[i].strength &&
+				  request.recipe.tv.options.iterations == rows[i].iterations,
+			      "%s", rows[i].tv);
+		if (!rows[i].automatic)
+			ck_assert_double_eq(request.recipe.tv.options.alpha, rows[i].alpha);
+		if (rows[i].method == TV_GRADIENT)
+			ck_assert_double_eq(request.recipe.tv.options.step, rows[i].step);
+		recipe_clear(&request.recipe);
+	}
 }
 END_TEST
 
@@ -276,6 +326,11 @@ static const struct {
     {"{\"scan\":\"a\",\"fdk\":{},\"tv\":{\"method\":\"rof\"}}", ERR_INVALID, "/tv/method", "proximal"},
     {"{\"scan\":\"a\",\"fdk\":{},\"tv\":{\"alpha\":-0.1}}", ERR_IMPOSSIBLE, "/tv/alpha", "-0.1"},
     {"{\"scan\":\"a\",\"fdk\":{},\"tv\":{\"method\":\"proximal\",\"alpha\":0}}", ERR_IMPOSSIBLE, "/tv/alpha", "0"},
+    {"{\"scan\":\"a\",\"fdk\":{},\"tv\":{\"alpha\":\"much\"}}", ERR_INVALID, "/tv/alpha", "auto"},
+    {"{\"scan\":\"a\",\"fdk\":{},\"tv\":{\"alpha\":true}}", ERR_INVALID, "/tv/alpha", "auto"},
+    {"{\"scan\":\"a\",\"fdk\":{},\"tv\":{\"method\":\"gradient\",\"alpha\":\"auto\"}}", ERR_IMPOSSIBLE, "/tv/alpha",
+     "a number"},
+    {"{\"scan\":\"a\",\"fdk\":{},\"tv\":{\"strength\":\"weak\"}}", ERR_INVALID, "/tv/strength", "medium"},
     {"{\"scan\":\"a\",\"fdk\":{},\"tv\":{\"step\":0}}", ERR_IMPOSSIBLE, "/tv/step", "0"},
     {"{\"scan\":\"a\",\"fdk\":{},\"tv\":{\"iterations\":0}}", ERR_IMPOSSIBLE, "/tv/iterations", "0"},
     {"{\"scan\":\"a\",\"fdk\":{},\"tv\":{\"unit\":0}}", ERR_IMPOSSIBLE, "/tv/unit", "0"},
@@ -375,6 +430,7 @@ Suite *recipe_suite(void)
 	tcase_add_test(tests, requests_come_back_the_same);
 	tcase_add_test(tests, different_requests_are_not_the_same);
 	tcase_add_test(tests, defaults_are_the_contracts);
+	tcase_add_test(tests, numbers_of_tv_mean_explicit_steps_and_none_means_auto);
 	tcase_add_test(tests, the_grid_is_centred_unless_it_says_otherwise);
 	tcase_add_test(tests, emitted_volumes_are_sorted_and_each_once);
 	tcase_add_test(tests, bad_requests_are_refused_by_their_pointer);

@@ -773,7 +773,8 @@ START_TEST(a_run_that_yielded_goes_on_as_if_it_had_not)
 	int emit[] = {2, 3};
 
 	recipe.fdk.on = recipe.tv.on = true;
-	recipe.tv.options.method = _i == 0 ? TV_GRADIENT : TV_PROXIMAL;
+	if (_i < 2)
+		recipe_explicit_tv(&recipe, _i == 0 ? TV_GRADIENT : TV_PROXIMAL);
 	recipe.sart.iterations = 4;
 	recipe.emit = emit;
 	recipe.emits = 2;
@@ -787,7 +788,10 @@ START_TEST(a_run_that_yielded_goes_on_as_if_it_had_not)
 
 	second.resume = first.last;
 	second.resume_iteration = first.iteration;
+	second.resume_noise = &first.noise;
 	run(&scene, &recipe, &second);
+	ck_assert_double_eq(second.noise_hu, whole.noise_hu);
+	ck_assert_double_eq(second.alpha, whole.alpha);
 	ck_assert_str_eq(second.log, "load sart tv row3 iter-3! sart tv row4 final!");
 	ck_assert_mem_eq(second.last, whole.last, sizeof(float) * grid_voxels(&whole.grid));
 	for (int i = 0; i < 2; i++) {
@@ -918,6 +922,7 @@ START_TEST(divergence_is_an_error_with_the_iteration)
 
 	recipe.sart.nonnegative = false;
 	recipe.tv.on = true;
+	recipe_explicit_tv(&recipe, TV_GRADIENT);
 	recipe.tv.options.step = 1e6;
 	recipe.tv.options.alpha = 1e6;
 	small_scene(&scene);
@@ -1148,12 +1153,17 @@ static void cutoff_zero(struct recipe *recipe)
 }
 static void tv_alpha(struct recipe *recipe)
 {
+	recipe_explicit_tv(recipe, TV_GRADIENT);
 	recipe->tv.options.alpha = -1;
 }
 static void tv_alpha_proximal(struct recipe *recipe)
 {
-	recipe->tv.options.method = TV_PROXIMAL;
+	recipe_explicit_tv(recipe, TV_PROXIMAL);
 	recipe->tv.options.alpha = 0;
+}
+static void tv_alpha_found_for_steps(struct recipe *recipe)
+{
+	recipe->tv.options.method = TV_GRADIENT;
 }
 static void tv_step(struct recipe *recipe)
 {
@@ -1221,6 +1231,7 @@ static const struct {
     {cutoff_zero, "/fdk/cutoff"},
     {tv_alpha, "/tv/alpha"},
     {tv_alpha_proximal, "/tv/alpha"},
+    {tv_alpha_found_for_steps, "/tv/alpha"},
     {tv_step, "/tv/step"},
     {tv_iterations, "/tv/iterations"},
     {tv_unit, "/tv/unit"},
@@ -2055,7 +2066,7 @@ Suite *recon_suite(void)
 	tcase_add_test(pipeline, fdk_is_a_start_for_sart_and_tv_smooths_it);
 	tcase_add_test(pipeline, views_may_come_in_any_order);
 	tcase_add_loop_test(pipeline, pushes_and_threads_do_not_change_a_bit, 0, 2);
-	tcase_add_loop_test(pipeline, a_run_that_yielded_goes_on_as_if_it_had_not, 0, 2);
+	tcase_add_loop_test(pipeline, a_run_that_yielded_goes_on_as_if_it_had_not, 0, 3);
 	tcase_add_test(pipeline, the_last_iteration_does_not_yield_and_can_be_resumed_from);
 	tcase_add_test(pipeline, a_resume_that_makes_no_sense_is_refused);
 	tcase_add_test(pipeline, a_run_can_be_cancelled_anywhere);

@@ -88,6 +88,7 @@ static struct recipe study_recipe(const struct study *study)
 	recipe.sart.on = true;
 	recipe.sart.iterations = 50;
 	recipe.sart.subsets = SUBSETS_VIEWS;
+	recipe_explicit_tv(&recipe, TV_GRADIENT);
 	recipe.tv.options.unit = study->maximum / 64;
 	return recipe;
 }

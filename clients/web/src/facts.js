@@ -39,7 +39,7 @@ export function jobFacts(job) {
 		['Grid', job.grid && `${times(job.grid.size)} at ${times(job.grid.spacing_mm, 3)} mm`],
 		['FDK', job.fdk ? `${job.fdk.window ?? 'hann'}, cutoff ${number(job.fdk.cutoff ?? 1)}` : 'none'],
 		['SART', job.sart ? `${job.sart.iterations} iterations, ${job.sart.subsets === 'views' ? 'an update a view' : `${job.sart.subsets} subsets`}, relaxation ${number(job.sart.relaxation)}` : 'none'],
-		['TV', job.tv ? `${job.tv.method}, alpha ${number(job.tv.alpha)}, ${job.tv.iterations} steps` : 'none'],
+		['TV', job.tv ? smoothing(job) : 'none'],
 		['Priority', job.priority],
 		['Runs on', job.device ? `${job.device} (${job.backend})` : job.backend],
 		['Memory', job.memory ? bytes(job.memory.total) : null],
@@ -52,6 +52,13 @@ export function jobFacts(job) {
 }
 
 const severities = ['serious', 'caution', 'info']
+
+function smoothing({ tv, denoising }) {
+	const found = tv.alpha === 'auto'
+	const alpha = found ? denoising?.alpha : tv.alpha
+	return [tv.method, found ? tv.strength : null, alpha === null || alpha === undefined ? null : `alpha ${number(alpha)}`, `${tv.iterations} steps`,
+		denoising ? `noise ${number(denoising.noise_hu)} HU` : null].filter(Boolean).join(', ')
+}
 
 /* The API's warnings, the most serious first; null where there are none. */
 export function warningList(warnings) {

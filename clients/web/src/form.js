@@ -28,7 +28,8 @@ const groups = [
 		number('/sart/stop/residual', 'Stop at residual'), number('/sart/stop/change', 'Stop at change'),
 	] },
 	{ title: 'Total variation', pointer: '/tv', optional: true, off: 'no smoothing', fields: [
-		choice('/tv/method', 'Method', ['gradient', 'proximal']), number('/tv/alpha', 'Alpha'), number('/tv/step', 'Step'),
+		choice('/tv/method', 'Method', ['proximal', 'gradient']), choice('/tv/strength', 'Strength', ['light', 'medium', 'strong']),
+		text('/tv/alpha', 'Alpha', { hint: 'or auto', read: value => value === 'auto' || Number.isNaN(Number(value)) ? value : Number(value) }), number('/tv/step', 'Step'),
 		number('/tv/iterations', 'Iterations', { step: 1 }), choice('/tv/after', 'After', ['fdk+sart', 'sart']), number('/tv/unit', 'Gray level, 1/mm'),
 	] },
 	{ title: 'Metal', pointer: '/metal', optional: true, rare: true, off: 'not corrected', fields: [number('/metal/threshold_hu', 'From, HU')] },
