@@ -84,7 +84,7 @@ static int set_text(struct stream *stream, char *text, int length)
 
 static int begin_part(struct stream *stream, const struct volume_record *volume)
 {
-	bool encoded = stream->zstd && !stream->options.shuffled;
+	bool encoded = stream->zstd && !content_is_packed(&stream->options);
 	char filename[VOLUME_FILENAME_MAX], *text = NULL;
 	struct error err;
 	int length;

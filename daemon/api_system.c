@@ -6,6 +6,7 @@
 #include "daemon/api.h"
 #include "daemon/document.h"
 #include "proto/openapi.h"
+#include "proto/provenance.h"
 
 enum { WORKERS_MAX = 64 };
 
@@ -19,7 +20,7 @@ static int reply_word(struct request *request, const char *word, struct error *e
 int live_get(void *context, struct request *request, struct error *err)
 {
 	(void)context;
-	return reply_word(request, "alive\n", err);
+	return reply_word(request, "alive, " CBCTD_PROGRAM "\n", err);
 }
 
 /* Ready all the same: what is set aside hinders nobody, but somebody should look at it. */

@@ -236,8 +236,8 @@ static int reply_plain(struct request *request, struct content *content, const s
 	return request_reply_read(request, selection->status, selection->length, part_read, part, part_free, err);
 }
 
-/* Takes the content. encoding: zstd is not the media type's own. */
-static int reply_zstd(struct request *request, struct content *content, bool encoding, struct error *err)
+/* Takes the content. encoding: what compresses it is not the media type's own. */
+static int reply_packed(struct request *request, struct content *content, bool encoding, struct error *err)
 {
 	struct content_stream *stream;
 
@@ -262,7 +262,7 @@ int volume_get(void *context, struct request *request, struct error *err)
 	/* Ranges are of the plain bytes: a frame of zstd cannot be entered in the middle. */
 	bool zstd = accepts_coding(request_header(request, "Accept-Encoding"), "zstd") &&
 		    (request_header(request, "Range") == NULL || request_is_head(request));
-	bool done;
+	bool done, packed;
 
 	if (volume_asked(api, request, &facts, &volume, err) != 0 ||
 	    volume_options(request, &facts, &options, err) != 0)
@@ -270,17 +270,18 @@ int volume_get(void *context, struct request *request, struct error *err)
 	store_volume_path(api->store, facts.id, volume.name, path);
 	if (content_open(path, &volume.grid, &options, &content, err) != 0)
 		return err->code;
-	zstd = zstd || options.shuffled;
+	packed = content_is_packed(&options);
+	zstd = options.shuffled || (zstd && !packed);
 	make_etag(facts.id, &volume, &options, zstd, etag, sizeof(etag));
 	volume_filename(facts.id, volume.name, &options, filename);
-	entity =
-	    (struct entity){etag, zstd ? UNKNOWN_SIZE : content_size(content), volume_media_type(&options), filename};
+	entity = (struct entity){etag, zstd || packed ? UNKNOWN_SIZE : content_size(content),
+				 volume_media_type(&options), filename};
 	if (entity_select(request, &entity, &selection, &done, err) != 0 || done) {
 		content_close(content);
 		return done ? 0 : err->code;
 	}
-	if ((zstd ? reply_zstd(request, content, !options.shuffled, err)
-		  : reply_plain(request, content, &selection, err)) != 0)
+	if ((zstd || packed ? reply_packed(request, content, !packed, err)
+			    : reply_plain(request, content, &selection, err)) != 0)
 		return err->code;
 	entity_headers(request, &entity, &selection);
 	return 0;

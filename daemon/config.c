@@ -327,6 +327,10 @@ static int each_flag(int argc, char **argv, struct config *config, enum config_a
 			*action = CONFIG_REBUILD;
 			continue;
 		}
+		if (strcmp(name, "--version") == 0) {
+			*action = CONFIG_VERSION;
+			continue;
+		}
 		length = strcspn(name, "=");
 		setting = strncmp(name, "--", 2) == 0 ? setting_find(name + 2, length - 2) : NULL;
 		if (setting == NULL)
@@ -344,6 +348,12 @@ static int each_flag(int argc, char **argv, struct config *config, enum config_a
 	return 0;
 }
 
+/* Help and version are told whatever the settings are. */
+static bool is_told(enum config_action action)
+{
+	return action == CONFIG_HELP || action == CONFIG_VERSION;
+}
+
 int config_load(int argc, char **argv, struct config *ret_config, enum config_action *ret_action, struct error *err)
 {
 	struct config config = {0};
@@ -357,9 +367,9 @@ int config_load(int argc, char **argv, struct config *ret_config, enum config_ac
 	/* The flags are read twice: first for the name of the file that goes before the other flags. */
 	if (code == 0)
 		code = each_flag(argc, argv, &config, &action, true, err);
-	if (code == 0 && config.config_file[0] != '\0' && action != CONFIG_HELP)
+	if (code == 0 && config.config_file[0] != '\0' && !is_told(action))
 		code = load_file(&config, config.config_file, err);
-	if (code == 0 && action != CONFIG_HELP)
+	if (code == 0 && !is_told(action))
 		code = load_environment(&config, err);
 	if (code == 0)
 		code = each_flag(argc, argv, &config, &action, false, err);

@@ -35,7 +35,7 @@ struct config {
 	double stop_timeout;                   /* s */
 };
 
-enum config_action { CONFIG_RUN, CONFIG_HELP, CONFIG_PRINT, CONFIG_REBUILD };
+enum config_action { CONFIG_RUN, CONFIG_HELP, CONFIG_PRINT, CONFIG_REBUILD, CONFIG_VERSION };
 
 /* Reads defaults, file, environment and arguments. Free with config_clear. ERR_INVALID names the setting and its
  * source. */

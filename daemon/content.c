@@ -98,6 +98,11 @@ static int make_header(struct content *content, const char *path, struct error *
 	return code;
 }
 
+bool content_is_packed(const struct content_options *options)
+{
+	return options->shuffled || options->format->gzip;
+}
+
 int content_open(const char *path, const struct grid *grid, const struct content_options *options,
 		 struct content **ret_content, struct error *err)
 {
@@ -337,7 +342,8 @@ int content_stream_new(struct content *content, int workers, struct content_stre
 		return error_set(err, ERR_NO_MEMORY, "no memory to compress a volume");
 	}
 	*stream = (struct content_stream){.content = content};
-	if (zencoder_new(STREAM_LEVEL, workers, &stream->encoder, err) != 0) {
+	if ((content->options.format->gzip ? gzip_encoder_new(STREAM_LEVEL, &stream->encoder, err)
+					   : zencoder_new(STREAM_LEVEL, workers, &stream->encoder, err)) != 0) {
 		content_stream_free(stream);
 		return err->code;
 	}

@@ -22,6 +22,9 @@ struct content_options {
 };
 enum { CONTENT_SCALE_MAX = 16 };
 
+/* Compressed by what it is: no encoding is put over that. */
+bool content_is_packed(const struct content_options *options);
+
 int content_open(const char *path, const struct grid *grid, const struct content_options *options,
 		 struct content **ret_content, struct error *err);
 void content_close(struct content *content); /* NULL is fine */
@@ -34,8 +37,8 @@ ssize_t content_read(struct content *content, uint64_t offset, void *to, size_t 
 int content_descriptor(const struct content *content, uint64_t *ret_offset);
 
 /*
- * The content as one zstd frame, in order; as content_read otherwise. Takes the content, on failure too.
- * workers: as of zencoder_new.
+ * The content as one zstd frame, or as the gzip stream that its format is, in order; as content_read otherwise.
+ * Takes the content, on failure too. workers: as of zencoder_new.
  */
 struct content_stream;
 int content_stream_new(struct content *content, int workers, struct content_stream **ret_stream, struct error *err);

@@ -14,6 +14,7 @@
 #include "daemon/api.h"
 #include "daemon/config.h"
 #include "daemon/log.h"
+#include "proto/provenance.h"
 
 enum { STREAM_THREADS = 2 }; /* that hash and compress what is streamed: the others are the worker's */
 
@@ -191,6 +192,8 @@ int main(int argc, char **argv)
 	}
 	if (action == CONFIG_HELP)
 		config_help(stdout);
+	else if (action == CONFIG_VERSION)
+		puts(CBCTD_PROGRAM);
 	else if (action == CONFIG_PRINT)
 		config_print(&config, stdout);
 	else if (action == CONFIG_REBUILD)

@@ -321,7 +321,7 @@ int rendition_get(struct renditions *renditions, const char *job, const struct v
 {
 	struct rendition *found;
 
-	zstd = zstd || options->shuffled;
+	zstd = zstd || content_is_packed(options);
 	pthread_mutex_lock(&renditions->lock);
 	found = renditions->first;
 	while (found != NULL && !is_same(found, job, volume, options, zstd))

@@ -19,8 +19,8 @@ int renditions_new(struct store *store, int threads, struct renditions **ret_ren
 void renditions_free(struct renditions *renditions); /* NULL is fine; all references must be back */
 
 /*
- * Of this volume with these options; zstd: as one frame (shuffled ones always
- * are). Returns at once; wake is called when it is made or has failed.
+ * Of this volume with these options; zstd: as one frame (what is packed by its
+ * format always is, in its own way). Returns at once; wake is called when it is made or has failed.
  */
 int rendition_get(struct renditions *renditions, const char *job, const struct volume_record *volume,
 		  const struct content_options *options, bool zstd, struct rendition **ret_rendition,

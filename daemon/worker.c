@@ -503,6 +503,8 @@ int main(int argc, char **argv)
 	struct error err;
 	int status;
 
+	if (argc == 2 && strcmp(argv[1], "--version") == 0)
+		return puts("cbct-worker " CBCT_VERSION) < 0 ? EXIT_START : 0;
 	if (!read_arguments(argc, argv, &arguments))
 		return usage();
 	/* Two workers must never write one job's files: this one ends when its daemon does, however that ends. */

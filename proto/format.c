@@ -362,11 +362,12 @@ static int raw_header(const struct grid *grid, enum volume_type type, const stru
 }
 
 const struct volume_format volume_formats[] = {
-    {"nifti", ".nii", "application/x-nifti", nifti_header},
-    {"mha", ".mha", "application/x-metaimage", mha_header},
-    {"nrrd", ".nrrd", "application/x-nrrd", nrrd_header},
-    {"raw", ".raw", "application/octet-stream", raw_header},
-    {NULL, NULL, NULL, NULL},
+    {"nifti", ".nii", "application/x-nifti", false, nifti_header},
+    {"nifti.gz", ".nii.gz", "application/gzip", true, nifti_header},
+    {"mha", ".mha", "application/x-metaimage", false, mha_header},
+    {"nrrd", ".nrrd", "application/x-nrrd", false, nrrd_header},
+    {"raw", ".raw", "application/octet-stream", false, raw_header},
+    {NULL, NULL, NULL, false, NULL},
 };
 
 const struct volume_format *volume_format_find(const char *name)

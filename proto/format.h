@@ -20,9 +20,10 @@ extern const char *const volume_type_names[VOLUME_TYPE_COUNT]; /* "float32", "in
 enum { FORMAT_HEADER_MAX = 16384, FORMAT_REVISION = 2 };
 
 struct volume_format {
-	const char *name;       /* "nifti", "mha", "raw": the value of ?format= */
+	const char *name;       /* "nifti", "nifti.gz", "mha", "raw": the value of ?format= */
 	const char *extension;  /* ".nii" */
 	const char *media_type; /* "application/octet-stream" ... */
+	bool gzip;              /* header and voxels together as one gzip stream */
 	/* Writes the header of a grid, 0 .. FORMAT_HEADER_MAX bytes. ERR_NO_MEMORY. */
 	int (*header)(const struct grid *grid, enum volume_type type, const struct provenance *provenance,
 		      uint8_t ret_header[FORMAT_HEADER_MAX], size_t *ret_length, struct error *err);

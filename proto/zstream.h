@@ -19,6 +19,9 @@ int zdecoder_step(struct zdecoder *decoder, const void *in, size_t in_size, size
 		  size_t out_size, size_t *ret_produced, bool *ret_ended, struct error *err);
 
 struct zencoder;
+/* Another coding through the same steps: one gzip member (RFC 1952), without name and time, so that the same input
+ * gives the same bytes. */
+int gzip_encoder_new(int level, struct zencoder **ret_encoder, struct error *err);
 /*
  * workers: threads of its own that compress while more is given, 0 none. The
  * frame depends on there being any, not on how many.

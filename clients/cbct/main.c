@@ -5,12 +5,14 @@
  *
  * Exit status: 0 done, 1 failed, 2 the command line is wrong.
  */
+#include <errno.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <unistd.h>
 
 #include "clients/cbct/commands.h"
+#include "proto/version.h"
 
 static const struct command *const commands[] = {
     &command_simulate, &command_import, &command_export_geometry, &command_upload,  &command_submit,
@@ -24,7 +26,7 @@ static int help_all(FILE *to)
 	fprintf(to, "usage: cbct COMMAND [arguments]\n\n");
 	for (int i = 0; i < COMMAND_COUNT; i++)
 		fprintf(to, "  %-15s %s\n", commands[i]->name, commands[i]->summary);
-	fprintf(to, "\n`cbct COMMAND --help` says more.\n");
+	fprintf(to, "\n`cbct COMMAND --help` says more, `cbct --version` which one this is.\n");
 	return to == stdout ? EXIT_SUCCESS : 2;
 }
 
@@ -91,6 +93,10 @@ int main(int count, char **arguments)
 	start_with_sleeping_threads(arguments);
 	if (count < 2)
 		return help_all(stderr);
+	if (strcmp(arguments[1], "--version") == 0) {
+		printf("%s %s\n", program_invocation_short_name, CBCT_VERSION);
+		return EXIT_SUCCESS;
+	}
 	if (strcmp(arguments[1], "help") == 0 || strcmp(arguments[1], "--help") == 0 ||
 	    strcmp(arguments[1], "-h") == 0) {
 		if (count < 3)

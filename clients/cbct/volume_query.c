@@ -8,7 +8,7 @@
 		name, 0, kind, offsetof(struct volume_query, member), argument, help, least, most, count, names        \
 	}
 const struct option volume_query_rows[] = {
-    ROW("format", OPTION_TEXT, format, "FORMAT", "nifti, mha, nrrd or raw (default nifti)", 0, 0, 0, NULL),
+    ROW("format", OPTION_TEXT, format, "FORMAT", "nifti, nifti.gz, mha, nrrd or raw (default nifti)", 0, 0, 0, NULL),
     ROW("type", OPTION_CHOICE, type, "TYPE", "float32 is 1/mm, int16 Hounsfield units", 0, 0, VOLUME_TYPE_COUNT,
 	volume_type_names),
     ROW("scale", OPTION_INTEGER, scale, "N", "each voxel the mean of N x N x N", 1, 64, 0, NULL),

@@ -132,10 +132,12 @@ class Volume:
     Attributes:
         name: ``fdk``, ``fdk-tv``, ``iter-5`` ..., ``final``.
         voxels: ``[z][y][x]``, float32 in 1/mm or int16 in Hounsfield units.
-        spacing_mm: of voxels along x, y and z.
-        origin_mm: centre of voxel 0,0,0: x, y, z.
+        spacing_mm: of voxels along the world's x, y and z.
+        origin_mm: centre of voxel 0,0,0 in the world: x, y, z.
         stage: ``fdk``, ``tv`` or ``sart``.
         iteration: of SART, 0 before it.
+        world_to_patient: 4 x 4, from (x, y, z, 1) of the world in mm to the patient's left, posterior and superior
+            (DICOM's LPS); None: nobody has said how the patient lies, and left and right are not known.
     """
 
     name: str
@@ -144,6 +146,7 @@ class Volume:
     origin_mm: Tuple[float, float, float]
     stage: str
     iteration: int
+    world_to_patient: Optional[Array] = None
 
 
 @dataclass(frozen=True)
@@ -271,6 +274,7 @@ class Client:
         dtype: npt.DTypeLike = np.float32,
         name: Optional[str] = None,
         quantity: str = "line_integral",
+        patient: Union[str, npt.ArrayLike, None] = None,
         **projections: Any,
     ) -> Document:
         """Announces a scan; returns its document, with ``id``, ``derived`` and ``warnings``.
@@ -281,6 +285,9 @@ class Client:
             dtype: of what is going to be uploaded, float32 or uint16.
             name: for people.
             quantity: ``line_integral``, or ``intensity`` with ``air=60000`` or with `put_flat` later.
+            patient: how the patient lies: ``"HFS"``, ``"HFP"``, ``"FFS"``, ``"FFP"``, ``"HFDL"``, ``"HFDR"``,
+                ``"FFDL"`` or ``"FFDR"`` on a table to which the world is fixed, or a rigid 4 x 4 matrix from the world
+                to the patient's LPS mm; None: not known, and then nothing says where left and right are.
             projections: more members of ``projections`` in the request, e.g. ``air``, ``saturation``.
         """
         views, rows, columns = (int(n) for n in shape)
@@ -293,6 +300,8 @@ class Client:
         }
         if name is not None:
             request["name"] = name
+        if patient is not None:
+            request["patient"] = _patient(patient)
         # A second one by mistake would stay for ever.
         return self._json("POST", "/v1/scans", json=request, repeatable=False)
 
@@ -503,7 +512,10 @@ class Client:
         return _volume(_Part(told, bytearray(response.content)))
 
     def volume_file(self, job: str, name: str = "final", **query: Any) -> bytes:
-        """A kept volume as a file; ``format``: ``nifti`` (default), ``mha``, ``nrrd``, ``raw``; ``type``, ``scale``."""
+        """A kept volume as a file; ``format``: ``nifti`` (default), ``nifti.gz``, ``mha``, ``nrrd``, ``raw``.
+
+        ``type`` and ``scale`` as GET /v1/jobs/{job}/volumes/{volume} takes them.
+        """
         params = {key: str(value) for key, value in query.items()}
         headers = {"Accept-Encoding": "identity"}
         return self._bytes(f"/v1/jobs/{job}/volumes/{name}", params, headers)
@@ -550,6 +562,7 @@ class Client:
         flat: Optional[npt.ArrayLike] = None,
         dark: Optional[npt.ArrayLike] = None,
         name: Optional[str] = None,
+        patient: Union[str, npt.ArrayLike, None] = None,
         progress: bool = True,
         keep: bool = False,
         **recipe: Any,
@@ -566,6 +579,7 @@ class Client:
             dtype: of the voxels: float32 is 1/mm, int16 Hounsfield units.
             quantity: ``line_integral``, or ``intensity`` with `air`, or `flat` and `dark` images ``[row][column]``.
             name: of the scan, for people.
+            patient: how the patient lies, as `Client.create_scan` has it.
             progress: bars of tqdm, where it is installed.
             keep: leaves scan and job with the daemon; otherwise they are removed, also when this is interrupted.
             recipe: more members of the job's request, e.g. ``priority="urgent"``.
@@ -574,7 +588,9 @@ class Client:
         if stack.ndim != 3:
             raise ValueError(f"projections of shape {stack.shape}, expected [view][row][column]")
         sample = np.uint16 if stack.dtype == np.uint16 else np.float32
-        scan = self.create_scan(geometry, stack.shape, dtype=sample, name=name, quantity=quantity, air=air)["id"]
+        scan = self.create_scan(
+            geometry, stack.shape, dtype=sample, name=name, quantity=quantity, patient=patient, air=air
+        )["id"]
         job: Optional[str] = None
         stages = {"grid": grid, "fdk": fdk, "sart": sart, "tv": tv, "emit": list(emit), **recipe}
         try:
@@ -847,22 +863,36 @@ def _read_parts(response: requests.Response) -> Iterator[_Part]:
 
 
 def _volume(part: _Part) -> Volume:
-    """NRRD says how large it is and where: directions and origin are along x, y and z of the scan."""
-    header, separator, _ = bytes(part.body[:4096]).partition(b"\n\n")
-    fields = dict(line.split(": ", 1) for line in header.decode("ascii").split("\n") if ": " in line)
+    """NRRD says how large it is and where, in the patient: the axes are the scan's x, y and z all the same."""
+    end = part.body.index(b"\n\n")
+    lines = bytes(part.body[:end]).decode("ascii").split("\n")
+    fields = dict(line.split(": ", 1) for line in lines if ": " in line and ":=" not in line)
+    keys = dict(line.split(":=", 1) for line in lines if ":=" in line)
     dtype = {"float": _FLOAT32, "short": _INT16}[fields["type"]]
     sizes = [int(n) for n in fields["sizes"].split()]
-    steps = [_vector(text) for text in fields["space directions"].split()]
+    steps = [float(np.linalg.norm(_vector(text))) for text in fields["space directions"].split()]
+    known = keys.get("cbct_world_to_patient")
+    matrix = None if known is None else np.array(json.loads(known), np.float64).reshape(4, 4)
+    origin = np.array(_vector(fields["space origin"]))
+    if matrix is not None:
+        origin = matrix[:3, :3].T @ (origin - matrix[:3, 3])
     # The header may end anywhere.
-    voxels = np.require(np.frombuffer(part.body, dtype, offset=len(header) + len(separator)), requirements=["A", "W"])
+    voxels = np.require(np.frombuffer(part.body, dtype, offset=end + 2), requirements=["A", "W"])
     return Volume(
         name=part.headers["cbct-volume"],
         voxels=voxels.reshape(sizes[::-1]),
-        spacing_mm=(steps[0][0], steps[1][1], steps[2][2]),
-        origin_mm=_vector(fields["space origin"]),
+        spacing_mm=(steps[0], steps[1], steps[2]),
+        origin_mm=(float(origin[0]), float(origin[1]), float(origin[2])),
         stage=part.headers["cbct-stage"],
         iteration=int(part.headers["cbct-iteration"]),
+        world_to_patient=matrix,
     )
+
+
+def _patient(patient: Union[str, npt.ArrayLike]) -> Document:
+    if isinstance(patient, str):
+        return {"position": patient}
+    return {"world_to_patient": np.asarray(patient, np.float64).ravel().tolist()}
 
 
 # ---- arrays and lists ----

@@ -248,6 +248,23 @@ class Volumes(Case):
             # half a voxel
             self.assertAlmostEqual(float((weight * place).sum() / weight.sum()), centre, delta=2.5)
 
+    def test_arrays_lie_along_the_world_however_the_patient_does(self) -> None:
+        plain = self.client.volume(self.finished(fdk={}))
+        self.assertIsNone(plain.world_to_patient)
+        tilt = [[0.8, -0.6, 0, 5], [0.6, 0.8, 0, -6], [0, 0, 1, 7], [0, 0, 0, 1]]
+        for patient in ({"position": "HFDR"}, {"world_to_patient": np.ravel(tilt).tolist()}):
+            volume = self.client.volume(self.finished(fdk={}, patient=patient))
+            np.testing.assert_array_equal(volume.voxels, plain.voxels)
+            np.testing.assert_allclose(volume.spacing_mm, plain.spacing_mm, rtol=1e-12)
+            np.testing.assert_allclose(volume.origin_mm, plain.origin_mm, rtol=1e-12)
+            right_side_down = [[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+            expected = right_side_down if "position" in patient else tilt
+            np.testing.assert_allclose(volume.world_to_patient, expected, atol=1e-12)
+        for lies in ("FFP", np.array(tilt)):
+            scan = self.client.create_scan(self.geometry, self.projections.shape, patient=lies)
+            self.assertEqual(self.client.scan(scan["id"])["axes"]["z"], "I" if isinstance(lies, str) else "S")
+            self.client.delete_scan(scan["id"])
+
     def test_types_scales_and_encodings(self) -> None:
         job = self.finished(fdk={})
         hu = self.client.volume(job, dtype=np.int16)

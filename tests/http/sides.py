@@ -2,8 +2,8 @@
 """The test object with a mark on each side, and where a volume's file says that the marks lie.
 
 Usage: sides.py make DIR                       a scan directory of the object, by exact line integrals
-       sides.py check POSITION FORMAT UNIT FILE [JOB SCAN]
-                                               POSITION: HFS ..., unknown, or tilted (world_to_patient of TILT)
+       sides.py check POSITION JOB SCAN FORMAT,UNIT,FILE ...
+                                               JOB and SCAN may be ""; POSITION: HFS ..., unknown, or tilted (world_to_patient of TILT)
        sides.py old FILE                       the same volume as files were before they had an extension
 
 A ball of water, in it three smaller ones of other densities towards the world's +x, +y and +z, none at its mirror
@@ -230,7 +230,7 @@ def check_words(volume: Volume, position: str, unit: str, ids: List[str]) -> Non
         fail(f"job and scan {ids}: {told}")
 
 
-def check(position: str, form: str, unit: str, path: str, *ids: str) -> None:
+def check(position: str, form: str, unit: str, path: str, ids: List[str]) -> None:
     volume = READERS[form](path)
     matrix = world_to_patient(position)
     if position != "tilted" and form.startswith("nifti"):
@@ -242,7 +242,7 @@ def check(position: str, form: str, unit: str, path: str, *ids: str) -> None:
             if codes != AXES[position]:
                 fail(f"axis codes {codes}, expected {AXES[position]}")
     check_marks(volume, unit, matrix)
-    check_words(volume, position, unit, list(ids))
+    check_words(volume, position, unit, ids)
 
 
 def old(path: str) -> None:
@@ -261,4 +261,8 @@ if sys.argv[1] == "make":
 elif sys.argv[1] == "old":
     old(sys.argv[2])
 else:
-    check(*sys.argv[2:])
+    for argument in sys.argv[5:]:
+        try:
+            check(sys.argv[2], *argument.split(",", 2), [word for word in sys.argv[3:5] if word])
+        except SystemExit as reason:
+            fail(f"{sys.argv[2]} as {argument}: {reason}")

@@ -31,20 +31,27 @@ job_of() { # POSITION: a scan of it and a job that has ended
 }
 
 test_every_position_puts_each_mark_on_its_side_in_every_format() {
-	local position format query unit at
+	local position format query unit at file files
 	need_nibabel
 	start_daemon
 	for position in $positions tilted unknown; do
 		job_of "$position"
-		for format in nifti mha nrrd; do
+		files=()
+		for format in nifti nifti.gz mha nrrd; do
 			for query in "" "&type=int16" "&type=int16&scale=2"; do
 				unit=1/mm
 				[[ $query != *int16* ]] || unit=HU
-				get_volume final "$work/volume.${format/nifti/nii}" "format=$format$query"
-				sides check "$position" $format $unit "$work/volume.${format/nifti/nii}" "$job" "$scan" ||
-					fail "$position as $format$query"
+				file=$work/$unit${query##*=}.${format/nifti/nii}
+				file=${file/1\/mm/mu}
+				get_volume final "$file" "format=$format$query"
+				files+=("$format,$unit,$file")
 			done
 		done
+		sides check "$position" "$job" "$scan" "${files[@]}"
+		get_volume final "$work/whole.nii.gz" format=nifti.gz
+		[[ $(header content-disposition) == *"final.nii.gz"* && $(header content-type) == application/gzip* ]] || fail "its name and type"
+		[ -z "$(header content-encoding)" ] || fail "compressed by what it is"
+		gzip -dc "$work/whole.nii.gz" | cmp - "$state/jobs/$job/final.nii" || fail "the same file, compressed"
 		# The default is the kept file itself, and what is made of parts of it is the same.
 		get_volume final "$work/whole.nii"
 		cmp "$work/whole.nii" "$state/jobs/$job/final.nii" || fail "the file as it is kept"
@@ -64,7 +71,7 @@ test_the_files_know_the_sides_when_the_scan_is_gone() {
 	req DELETE "/v1/scans/$scan"
 	expect_status 204
 	get_volume final "$work/file" "format=mha&type=int16"
-	sides check FFDR mha HU "$work/file" "$job" "$scan"
+	sides check FFDR "$job" "$scan" "mha,HU,$work/file"
 	req GET "/v1/jobs/$job"
 	expect_json '.patient == {position: "FFDR"} and .axes == {x: "A", y: "R", z: "I"}'
 }
@@ -118,7 +125,7 @@ test_recon_without_a_daemon_and_the_tools_know_the_sides() {
 	for position in HFDR tilted unknown; do
 		scan_of "$position" "$work/$position"
 		cbct recon "$work/$position" "$work/recipe.json" -o "$work/out" --quiet >/dev/null
-		sides check "$position" nifti 1/mm "$work/out/final.nii"
+		sides check "$position" "" "" "nifti,1/mm,$work/out/final.nii"
 		[ $position = unknown ] || mv "$work/out/final.nii" "$work/$position.nii"
 	done
 	# The same voxels in two positions are two volumes, and one as its own file is itself.
@@ -127,6 +134,18 @@ test_recon_without_a_daemon_and_the_tools_know_the_sides() {
 	! cbct compare "$work/tilted.nii" "$work/out/final.nii" 2>"$work/why" || fail "oblique against straight refused"
 	grep -q "turned against" "$work/why" || fail "the reason, got $(cat "$work/why")"
 	cbct slice "$work/tilted.nii" -o "$work/tilted.png"
+	gzip -k "$work/tilted.nii"
+	cbct slice "$work/tilted.nii.gz" -o "$work/packed.png"
+	cmp "$work/tilted.png" "$work/packed.png" || fail "the same slice of a compressed file"
+	cbct compare "$work/tilted.nii.gz" "$work/tilted.nii" | grep -q . || fail "a compressed file compared"
+	head -c 30000 "$work/tilted.nii.gz" >"$work/cut.nii.gz"
+	! cbct slice "$work/cut.nii.gz" -o "$work/packed.png" 2>"$work/why" || fail "a file that was cut off refused"
+	printf '\x55' | dd of="$work/tilted.nii.gz" bs=1 seek=40000 conv=notrunc status=none
+	! cbct slice "$work/tilted.nii.gz" -o "$work/packed.png" 2>"$work/why" || fail "a damaged file refused"
+	cbct simulate --phantom ball --scale 20 --views 3 --columns 8 --rows 8 --truth "$work/truth.nii.gz" --grid 20 --spacing 2 \
+		--patient FFP -o "$work/simulated" 2>/dev/null
+	"$python" -c 'import nibabel, sys
+assert nibabel.aff2axcodes(nibabel.load(sys.argv[1]).affine) == ("L", "A", "I")' "$work/truth.nii.gz" || fail "the truth of a patient FFP"
 }
 
 # Files of state directories from before there was an extension begin their voxels earlier.

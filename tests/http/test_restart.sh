@@ -399,6 +399,12 @@ test_two_daemons_do_not_share_a_state_directory() {
 
 test_settings_as_flag_line_and_environment() {
 	"$BUILD/cbctd" --help | grep -q -- --state-dir || fail "--help with --state-dir"
+	local name
+	for name in cbctd cbct-worker cbct cbct-cuda; do
+		[ -x "$BUILD/$name" ] || continue
+		[[ $("$BUILD/$name" --version) =~ ^$name\ [0-9]+\.[0-9]+\.[0-9]+$ ]] || fail "the version of $name"
+	done
+	! "$BUILD/cbctd" --listen nonsense --versions 2>/dev/null || fail "another flag refused"
 	"$BUILD/cbctd" --print-config >"$work/config"
 	grep -q '^listen' "$work/config" || fail "listen in --print-config"
 	CBCTD_LISTEN=127.0.0.1:3333 "$BUILD/cbctd" --print-config | grep -q '127.0.0.1:3333' || fail "the environment's value"

@@ -352,7 +352,7 @@ export class JobPage {
 		if (!this.#files) {
 			const select = (label, values) => h('select', { 'aria-label': label, onchange: () => this.#writeLinks() }, values.map(([value, text]) => h('option', { value }, text)))
 			this.#files = {
-				format: select('Format', [['nifti', 'NIfTI'], ['mha', 'MetaImage'], ['nrrd', 'NRRD'], ['raw', 'raw']]),
+				format: select('Format', [['nifti', 'NIfTI'], ['nifti.gz', 'NIfTI, gzip'], ['mha', 'MetaImage'], ['nrrd', 'NRRD'], ['raw', 'raw']]),
 				type: select('Values', [['int16', 'HU, int16'], ['float32', '1/mm, float32']]),
 				scale: select('Resolution', [['1', 'full'], ['2', 'half'], ['4', 'quarter']]),
 				list: h('ul', { class: 'files' }),
