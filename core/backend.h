@@ -58,6 +58,7 @@ struct linearise {
 	/* [row][column], not zero: a defect in every view; NULL for none. Given and found ones alike (core/defects.h).
 	 */
 	const unsigned char *defects;
+	const unsigned char *stuck; /* [row][column], likewise: found by core/stuck.h; NULL for none */
 	/*
 	 * First column, first row, last column, last row, all included: the mean
 	 * transmission (I - dark) / (flat - dark) there, defects left out, is each view's

@@ -175,7 +175,7 @@ int defect_map_make(struct defect_map *ret_map, const struct linearise *linearis
 	struct defect_map map = {0};
 	int code = 0;
 
-	if (!images && linearise->defects == NULL) {
+	if (!images && linearise->defects == NULL && linearise->stuck == NULL) {
 		*ret_map = map;
 		return 0;
 	}
@@ -188,7 +188,11 @@ int defect_map_make(struct defect_map *ret_map, const struct linearise *linearis
 	}
 	if (images)
 		code = examine(linearise, columns, rows, &map, err);
-	all = map.given + map.dead + map.hot + map.noisy;
+	for (size_t i = 0; linearise->stuck != NULL && i < pixels; i++) {
+		map.stuck += linearise->stuck[i] != 0 && !map.map[i];
+		map.map[i] = map.map[i] || linearise->stuck[i] != 0;
+	}
+	all = map.given + map.dead + map.hot + map.noisy + map.stuck;
 	if (code == 0 && 2 * all > pixels)
 		code = error_set(err, ERR_IMPOSSIBLE,
 				 "%.3g %% of the pixels are defects, half of them can be at most: %zu of the given "

@@ -24,12 +24,13 @@
 struct defect_map {
 	unsigned char *map; /* [row][column], owned; NULL where there is no defect */
 	size_t given, dead, hot, noisy;
+	size_t stuck; /* of linearise.stuck, and none of those before */
 };
 
 /*
- * From linearise's flat, dark, air, saturation and defects. ERR_IMPOSSIBLE where the flat is not above the dark in
- * most of the pixels, or most are defects: what is made up then is no projection. Line integrals have no flat: only the
- * given map counts then. Free with defect_map_clear.
+ * From linearise's flat, dark, air, saturation, defects and stuck. ERR_IMPOSSIBLE where the flat is not above the dark
+ * in most of the pixels, or most are defects: what is made up then is no projection. Line integrals have no flat: only
+ * the given map counts then. Free with defect_map_clear.
  */
 int defect_map_make(struct defect_map *ret_map, const struct linearise *linearise, int columns, int rows,
 		    struct error *err);

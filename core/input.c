@@ -59,24 +59,26 @@ static void exchange(const struct input *input, const void *from, size_t bytes, 
 static int turn(struct input *input, struct error *err)
 {
 	struct linearise *linearise = &input->linearise;
-	const void *const images[] = {linearise->flat, linearise->dark, linearise->defects};
-	const size_t bytes[] = {sizeof(float), sizeof(float), 1, sample_bytes(input)};
+	const void *const images[] = {linearise->flat, linearise->dark, linearise->defects, linearise->stuck};
+	const size_t bytes[] = {sizeof(float), sizeof(float), 1, 1, sample_bytes(input)};
+	enum { IMAGES = 4 };
 	const int region[] = {linearise->air_region[1], linearise->air_region[0], linearise->air_region[3],
 			      linearise->air_region[2]};
 
-	for (int i = 0; i < 4; i++) {
-		if (i < 3 && images[i] == NULL)
+	for (int i = 0; i <= IMAGES; i++) {
+		if (i < IMAGES && images[i] == NULL)
 			continue;
 		input->exchanged[i] = malloc((size_t)input->columns * (size_t)input->rows * bytes[i]);
 		if (input->exchanged[i] == NULL)
 			return error_set(err, ERR_NO_MEMORY, "no memory for images of %d x %d pixels", input->columns,
 					 input->rows);
-		if (i < 3)
+		if (i < IMAGES)
 			exchange(input, images[i], bytes[i], input->exchanged[i]);
 	}
 	linearise->flat = input->exchanged[0];
 	linearise->dark = input->exchanged[1];
 	linearise->defects = input->exchanged[2];
+	linearise->stuck = input->exchanged[3];
 	memcpy(linearise->air_region, region, sizeof(region));
 	return 0;
 }
@@ -116,7 +118,7 @@ size_t input_view_bytes(const struct input *input)
 
 void input_clear(struct input *input)
 {
-	for (int i = 0; i < 4; i++)
+	for (size_t i = 0; i < sizeof(input->exchanged) / sizeof(*input->exchanged); i++)
 		free(input->exchanged[i]);
 	defect_map_clear(&input->map);
 	free(input->blank);
@@ -212,8 +214,8 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 	int code;
 
 	if (input->turned) {
-		exchange(input, samples, sample_bytes(input), input->exchanged[3]);
-		samples = input->exchanged[3];
+		exchange(input, samples, sample_bytes(input), input->exchanged[4]);
+		samples = input->exchanged[4];
 	}
 	code = backend->linearise(plan, samples, 1, &slot, to, &input->counts, err);
 	if (code < 0)
@@ -330,7 +332,7 @@ void input_warn(const struct input *input, const struct geometry *geometry, cons
 		recon_warn(hooks, "no_dark",
 			   "a flat image is there, but no dark one: an offset that the detector adds to its counts "
 			   "makes all that is measured too thin");
-	if (map->map != NULL) {
+	if (map->map != NULL && map->given + map->dead + map->hot + map->noisy > 0) {
 		const size_t all = map->given + map->dead + map->hot + map->noisy;
 
 		recon_warn(
@@ -339,6 +341,12 @@ void input_warn(const struct input *input, const struct geometry *geometry, cons
 		    "map, and %zu dead, %zu hot and %zu noisy ones that the flat and dark images show",
 		    all, 100 * (double)all / pixels, map->given, map->dead, map->hot, map->noisy);
 	}
+	if (map->stuck > 0)
+		recon_warn(
+		    hooks, "stuck_pixels",
+		    "%zu pixels (%.3g %%) do not follow their neighbours over the views and were replaced from them; "
+		    "a map of the detector's defects with the scan is the surer way",
+		    map->stuck, 100 * (double)map->stuck / pixels);
 	if (found > 0)
 		recon_warn(
 		    hooks, "defects",

@@ -9,7 +9,7 @@ struct input {
 	struct linearise linearise; /* as given, with the whole map; exchanged where `turned` */
 	bool turned;                /* rows and columns of all images are exchanged on their way in */
 	int columns, rows;          /* as they come */
-	void *exchanged[4];         /* owned, NULL where not turned: flat, dark and given defects, a projection */
+	void *exchanged[5]; /* owned, NULL where not turned: flat, dark, given and stuck defects, a projection */
 	struct defect_map map;
 	struct defect_counts counts;
 	int views, defective_views; /* linearised so far, and those of them with defects */
@@ -50,7 +50,7 @@ void input_goes_on(const struct input *input, bool ret_ends[2]);
 double input_blank_share(const struct input *input, const struct orbit *orbit);
 /* ERR_IMPOSSIBLE where no view has a good pixel. */
 int input_check(const struct input *input, struct error *err);
-/* "no_dark", "defects", "defect_map", "blank_views", "air_region", "line_integrals",
+/* "no_dark", "defects", "defect_map", "stuck_pixels", "blank_views", "air_region", "line_integrals",
  * "byte_order". */
 void input_warn(const struct input *input, const struct geometry *geometry, const struct recon_hooks *hooks);
 

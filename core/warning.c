@@ -47,6 +47,8 @@ const struct warning_kind warning_kinds[] = {
     {"damaged_checkpoint", SEVERITY_INFO,
      "What the job had reached before a pause was damaged on the disk, so it began again; the result is the same."},
     {"defect_map", SEVERITY_INFO, "Bad pixels of the detector were replaced from their neighbours."},
+    {"stuck_pixels", SEVERITY_CAUTION,
+     "Some pixels of the detector do not follow the others and were replaced from their neighbours."},
     {"defects", SEVERITY_CAUTION, "Some samples could not be used and were replaced from their neighbours."},
     {"blank_views", SEVERITY_CAUTION, "Some projections are empty and were left out."},
     {"air_region", SEVERITY_CAUTION, "The brightness of air changed during the scan, and was corrected."},

@@ -15,6 +15,7 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
+#include "core/stuck.h"
 #include "proto/durable.h"
 #include "proto/format.h"
 #include "proto/nifti.h"
@@ -664,6 +665,15 @@ struct spool {
 	char *samples; /* [batch][row][column] */
 	struct recon *recon;
 	bool resumed;
+	/* What the recon is opened with. */
+	const struct backend *backend;
+	struct device *device;
+	const struct spool_options *options;
+	int iteration; /* that the checkpoint is expected to hold */
+	struct linearise linearise;
+	/* Looks for stuck pixels in the views as they pass; NULL before the recon is opened, and where too few are. */
+	struct stuck *stuck;
+	bool looked; /* its answer is known */
 };
 
 static int reduce(struct spool *spool, const unsigned char *present, struct error *err)
@@ -697,28 +707,73 @@ static int allocate(struct spool *spool, struct error *err)
 	return 0;
 }
 
-static int open_recon(struct spool *spool, const struct backend *backend, struct device *device,
-		      const struct recipe *recipe, struct error *err)
+static int set_linearise(struct spool *spool, struct error *err)
+{
+	const struct scan_files *files = &spool->files;
+	struct linearise *linearise = &spool->linearise;
+
+	*linearise = scan_linearise(files->scan);
+	linearise->flat = files->flat;
+	linearise->dark = files->dark;
+	linearise->defects = files->defects;
+	if (linearise->quantity == QUANTITY_INTENSITY && linearise->air <= 0 && linearise->flat == NULL)
+		return error_set(err, ERR_IMPOSSIBLE, "intensities need an air value or a flat image, none is there");
+	return 0;
+}
+
+static int open_recon(struct spool *spool, struct error *err)
+{
+	const struct spool_options *options = spool->options;
+	int code = recon_open(spool->backend, spool->device, &spool->files.scan->geometry, &spool->linearise,
+			      options->recipe, &spool->hooks, &spool->recon, err);
+
+	spool->run.recon = spool->recon;
+	if (code == 0 && spool->resumed)
+		code = resume(&spool->run, spool->recon, options->checkpoint, spool->iteration, err);
+	/* What the file holds: opened again, it is no surprise. */
+	if (code == 0 && spool->resumed)
+		spool->iteration = recon_iteration(spool->recon);
+	return code;
+}
+
+static int open_first(struct spool *spool, struct error *err)
 {
 	const struct spool_hooks *hooks = spool->run.hooks;
-	const struct scan_files *files = &spool->files;
-	struct linearise linearise = scan_linearise(files->scan);
+	const struct geometry *geometry = &spool->files.scan->geometry;
 	struct recon_memory memory;
-	int code = 0;
+	int code = set_linearise(spool, err);
 
-	linearise.flat = files->flat;
-	linearise.dark = files->dark;
-	linearise.defects = files->defects;
-	if (linearise.quantity == QUANTITY_INTENSITY && linearise.air <= 0 && linearise.flat == NULL)
-		return error_set(err, ERR_IMPOSSIBLE, "intensities need an air value or a flat image, none is there");
-	code = recon_memory(backend, device, &files->scan->geometry, recipe, &memory, err);
 	if (code == 0)
-		code = recon_open(backend, device, &files->scan->geometry, &linearise, recipe, &spool->hooks,
-				  &spool->recon, err);
-	spool->run.recon = spool->recon;
+		code = recon_memory(spool->backend, spool->device, geometry, spool->options->recipe, &memory, err);
+	if (code == 0)
+		code = open_recon(spool, err);
+	if (code == 0)
+		code = stuck_new(&spool->linearise, geometry, &spool->stuck, err);
 	if (code == 0 && hooks->on_open != NULL)
 		hooks->on_open(hooks->recon.context, &memory, recon_plan(spool->recon));
 	return code;
+}
+
+/*
+ * Once all views that stuck pixels are looked for in have come. Where some are found the reconstruction is opened anew
+ * with their map, *ret_again, and has none of the projections: those that it had were taken with these pixels.
+ */
+static int heed_stuck_pixels(struct spool *spool, bool *ret_again, struct error *err)
+{
+	*ret_again = false;
+	if (spool->stuck == NULL || spool->looked)
+		return 0;
+	spool->looked = true;
+	spool->linearise.stuck = stuck_find(spool->stuck);
+	if (spool->linearise.stuck == NULL)
+		return 0;
+	*ret_again = true;
+	recon_free(spool->recon);
+	spool->recon = NULL;
+	spool->run.recon = NULL;
+	memset(spool->pushed, 0, (size_t)spool->projections);
+	spool->pushed_count = 0;
+	return open_recon(spool, err);
 }
 
 static void set_text(char *ret, size_t size, const char *text)
@@ -771,11 +826,13 @@ int spool_open(const struct backend *backend, struct device *device, const struc
 		code = allocate(spool, err);
 	if (code == 0)
 		code = reduce(spool, options->present, err);
-	if (code == 0)
-		code = open_recon(spool, backend, device, options->recipe, err);
+	spool->backend = backend;
+	spool->device = device;
+	spool->options = options;
+	spool->iteration = options->iteration;
 	spool->resumed = options->checkpoint != NULL;
-	if (code == 0 && spool->resumed)
-		code = resume(&spool->run, spool->recon, options->checkpoint, options->iteration, err);
+	if (code == 0)
+		code = open_first(spool, err);
 	if (code != 0)
 		spool_close(spool);
 	else
@@ -790,6 +847,7 @@ void spool_close(struct spool *spool)
 	saver_free(spool->run.saver);
 	provenance_clear(&spool->run.provenance);
 	recon_free(spool->recon);
+	stuck_free(spool->stuck);
 	scan_files_close(&spool->files);
 	free(spool->view_of);
 	free(spool->pushed);
@@ -912,6 +970,7 @@ static int read_projections(struct spool *spool, const int *projections, int cou
 /* At most a batch. */
 static int push_some(struct spool *spool, const int *projections, int count, struct error *err)
 {
+	const size_t bytes = scan_projection_bytes(spool->files.scan);
 	int code;
 
 	for (int i = 0; i < count; i++) {
@@ -923,6 +982,9 @@ static int push_some(struct spool *spool, const int *projections, int count, str
 		spool->views[i] = spool->view_of[projection];
 	}
 	code = read_projections(spool, projections, count, err);
+	for (int i = 0; i < count && code == 0 && spool->stuck != NULL && !spool->looked; i++)
+		if (stuck_wants(spool->stuck, spool->views[i]))
+			stuck_add(spool->stuck, spool->samples + (size_t)i * bytes);
 	if (code == 0)
 		code = recon_push(spool->recon, spool->samples, spool->views, count, err);
 	for (int i = 0; i < count && code == 0; i++)
@@ -944,10 +1006,31 @@ int spool_push(struct spool *spool, const int *projections, int count, struct er
 	return code;
 }
 
+/* All views that stuck pixels are looked for in, ahead of the others, where none has been pushed yet. */
+static int look_ahead(struct spool *spool, struct error *err)
+{
+	bool again;
+	int code = 0;
+
+	if (spool->stuck == NULL || spool->looked || spool->pushed_count > 0)
+		return 0;
+	for (int i = 0; i < spool->projections && code == 0; i++) {
+		if (spool->view_of[i] < 0 || !stuck_wants(spool->stuck, spool->view_of[i]))
+			continue;
+		code = read_projections(spool, &i, 1, err);
+		if (code == 0)
+			stuck_add(spool->stuck, spool->samples);
+	}
+	return code == 0 ? heed_stuck_pixels(spool, &again, err) : code;
+}
+
 int spool_push_rest(struct spool *spool, struct error *err)
 {
-	int *rest = malloc((size_t)spool_wanted(spool) * sizeof(*rest)), count = 0, code;
+	int *rest, count = 0, code = look_ahead(spool, err);
 
+	if (code != 0)
+		return code;
+	rest = malloc((size_t)spool_wanted(spool) * sizeof(*rest));
 	if (rest == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a list of %d projections", spool_wanted(spool));
 	for (int i = 0; i < spool->projections; i++) {
@@ -963,7 +1046,14 @@ int spool_finish(struct spool *spool, struct error *err)
 {
 	struct run *run = &spool->run;
 	struct error trouble;
-	int code = recon_run(spool->recon, err);
+	bool again = false;
+	/* Of projections that came one by one it is known only now. */
+	int code = spool->pushed_count == spool_wanted(spool) ? heed_stuck_pixels(spool, &again, err) : 0;
+
+	if (code == 0 && again)
+		code = spool_push_rest(spool, err);
+	if (code == 0)
+		code = recon_run(spool->recon, err);
 
 	/* What was told of is settled, however the run ends. */
 	if (run->trouble.code == 0)

@@ -12,8 +12,8 @@
 #include <string.h>
 
 #define SUITES(row)                                                                                                    \
-	row(error) row(geometry) row(orbit) row(filter) row(phantom) row(raw) row(recon) row(metal) row(parts)         \
-	    row(study) row(backend) row(json) row(scan) row(recipe) row(format) row(patient) row(metaimage)            \
+	row(error) row(geometry) row(orbit) row(filter) row(phantom) row(raw) row(recon) row(metal) row(stuck)         \
+	    row(parts) row(study) row(backend) row(json) row(scan) row(recipe) row(format) row(patient) row(metaimage) \
 		row(rtk_geometry) row(slice) row(sums) row(spool) row(message) row(queue) row(store) row(catalogue)    \
 		    row(job)
 

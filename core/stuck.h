@@ -1,0 +1,53 @@
+#ifndef CBCT_CORE_STUCK_H
+#define CBCT_CORE_STUCK_H
+
+#include "core/backend.h"
+
+/*
+ * Pixels whose value does not follow their neighbours over the views: stuck at a
+ * value between dark and flat, which neither the flat nor the dark image shows, or
+ * flickering. Such a pixel makes a ring, and 1 % of all pixels make 400 HU.
+ *
+ * Some views spread over the scan are looked at. p is a pixel's line integral, m the
+ * median of the eight pixels two away in rows and columns, its neighbours, so that
+ * clusters of up to three pixels do not hide themselves, and e = p - m. A pixel is
+ * stuck where the root mean square of e is 3 % of the photons and one of these holds:
+ *
+ *   still    p varies over the views by less than a tenth (variance) of what the third
+ *            stillest neighbour's does, and e is three times as large as theirs. Noise
+ *            is enough of a variation.
+ *   wanders  e varies by 9 times (variance) what it does in the second wildest
+ *            neighbour, in most views and not in a few, as where something small
+ *            passes, and the pixels beside it do not.
+ *   apart    The mean of e is a tenth of the photons, three times as large as the second
+ *            largest of the neighbours', four times what it varies by, and the pixels
+ *            beside it are not like it: where nothing moves, as in air. An object with
+ *            such a shadow, one pixel in all views, lies on the axis of the rotation:
+ *            pixels whose rays pass it are left out.
+ *
+ * What is an object's own, however sharp, still or small, has its like beside it,
+ * passes, or lies on the axis. A gain that is wrong by less is none of this: that is
+ * what the flat is for. Where more than a tenth of the pixels would be stuck nothing is
+ * believed.
+ */
+enum { STUCK_VIEWS = 32, STUCK_VIEWS_LEAST = 8 };
+
+struct stuck;
+
+/*
+ * linearise and geometry, as they come, are borrowed. *ret_stuck is NULL where the scan has too few views to tell. Free
+ * with stuck_free.
+ */
+int stuck_new(const struct linearise *linearise, const struct geometry *geometry, struct stuck **ret_stuck,
+	      struct error *err);
+void stuck_free(struct stuck *stuck); /* NULL is fine */
+
+/* Whether a view is one of those that are looked at. */
+bool stuck_wants(const struct stuck *stuck, int view);
+/* One of them, [row][column]; in any order, each once: the result does not depend on it but for rounding. */
+void stuck_add(struct stuck *stuck, const void *samples);
+/* Once, when all have come: the map, [row][column], not zero where a pixel is stuck, the stuck's own; NULL where there
+ * is none. */
+const unsigned char *stuck_find(struct stuck *stuck);
+
+#endif

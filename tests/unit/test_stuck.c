@@ -1,0 +1,199 @@
+/* Pixels that do not follow their neighbours over the views (core/stuck.h), and objects that look like some. */
+#include <check.h>
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "core/stuck.h"
+#include "tests/unit/scene.h"
+
+Suite *stuck_suite(void);
+
+enum { COLUMNS = 96, ROWS = 64, PIXELS = COLUMNS * ROWS, VIEWS = 72, PARTS_MOST = 8 };
+static const double FLAT = 60000;
+
+/* What is scanned. */
+enum object { HEAD, CENTRED, CENTRED_SHORT, METAL, BEADS, EDGES, NOTHING, OBJECTS };
+static const char *const names[] = {"head",  "centred cylinder", "centred rod that ends", "metal", "beads",
+				    "boxes", "nothing"};
+static const struct ellipsoid objects[OBJECTS][PARTS_MOST] = {
+    [HEAD] = {{.shape = SHAPE_ELLIPSOID, .semi_axes = {36, 44, 50}, .density = .045},
+	      {.shape = SHAPE_ELLIPSOID, .semi_axes = {32, 40, 46}, .density = -.025},
+	      {.shape = SHAPE_ELLIPSOID, .semi_axes = {6, 9, 8}, .centre = {12, -15, 6}, .density = -.01}},
+    [CENTRED] = {{.shape = SHAPE_CYLINDER, .semi_axes = {30, 30, 200}, .density = .03},
+		 {.shape = SHAPE_CYLINDER, .semi_axes = {29, 29, 200}, .density = -.01},
+		 {.shape = SHAPE_CYLINDER, .semi_axes = {1, 1, 200}, .density = .2}},
+    [CENTRED_SHORT] = {{.shape = SHAPE_CYLINDER, .semi_axes = {8, 8, 15}, .density = .04},
+		       {.shape = SHAPE_ELLIPSOID, .semi_axes = {1, 1, 1}, .centre = {0, 0, 25}, .density = .3}},
+    [METAL] = {{.shape = SHAPE_CYLINDER, .semi_axes = {35, 30, 40}, .density = .02},
+	       {.shape = SHAPE_CYLINDER, .semi_axes = {1.5, 1.5, 18}, .centre = {14, 3, 5}, .density = .6},
+	       {.shape = SHAPE_BOX, .semi_axes = {2, 12, 2}, .centre = {-10, -4, -8}, .density = .6}},
+    [BEADS] = {{.shape = SHAPE_ELLIPSOID, .semi_axes = {.8, .8, .8}, .centre = {25, 3, 9}, .density = .5},
+	       {.shape = SHAPE_ELLIPSOID, .semi_axes = {.8, .8, .8}, .centre = {3, -1, -9}, .density = .5},
+	       {.shape = SHAPE_ELLIPSOID, .semi_axes = {.6, .6, .6}, .centre = {0, 1.5, 0}, .density = .5},
+	       {.shape = SHAPE_ELLIPSOID, .semi_axes = {30, 25, 28}, .density = .02}},
+    [EDGES] = {{.shape = SHAPE_BOX, .semi_axes = {20, 30, 20}, .centre = {5, 0, 0}, .density = .02},
+	       {.shape = SHAPE_BOX, .semi_axes = {2, 2, 30}, .centre = {-22, 10, 0}, .density = .1},
+	       {.shape = SHAPE_BOX, .semi_axes = {20, 30, .4}, .centre = {5, 0, 0}, .density = .1}},
+};
+
+static unsigned random_state;
+static double uniform(void)
+{
+	random_state = random_state * 1664525u + 1013904223u;
+	return (random_state >> 8) / 16777216.0;
+}
+
+/* Counts of one view, [row][column]; photons 0: exact. */
+static void make_view(const struct scene *scene, int view, double photons, bool integers, void *ret)
+{
+	for (size_t i = 0; i < PIXELS; i++) {
+		const double share = exp(-(double)scene->projections[(size_t)view * PIXELS + i]);
+		double normal = -6, counts = FLAT * share;
+
+		for (int k = 0; k < 12 && photons > 0; k++)
+			normal += uniform();
+		if (photons > 0)
+			counts = fmax(FLAT / photons, counts + normal * FLAT * sqrt(share / photons));
+		if (integers)
+			((uint16_t *)ret)[i] = (uint16_t)lround(counts);
+		else
+			((float *)ret)[i] = (float)counts;
+	}
+}
+
+/* How a pixel may be wrong: still at 70 % of the flat, at its own noise there, or at random between. */
+enum fault { FINE, STILL, NOISY, FLICKERS, FAULTS };
+
+static void spoil(enum fault fault, const bool *faulty, double photons, bool integers, void *samples)
+{
+	for (size_t i = 0; i < PIXELS; i++) {
+		double counts = 0.7 * FLAT;
+
+		if (!faulty[i] || fault == FINE)
+			continue;
+		if (fault == NOISY && photons > 0)
+			counts += FLAT * sqrt(0.7 / photons) * (uniform() - 0.5) * 3.46;
+		if (fault == FLICKERS)
+			counts = FLAT * (0.05 + 0.9 * uniform());
+		if (integers)
+			((uint16_t *)samples)[i] = (uint16_t)lround(counts);
+		else
+			((float *)samples)[i] = (float)counts;
+	}
+}
+
+struct trial {
+	enum object object;
+	enum fault fault;
+	double photons;
+	bool integers, line_integrals;
+	double arc; /* degrees */
+};
+
+/* Runs it; counts the faulty pixels that were found, all faulty ones, and pixels that were found and are none. */
+static void run_trial(const struct trial *trial, size_t ret[3])
+{
+	const struct orbit_spec spec = {COLUMNS,           ROWS, VIEWS, {620, 1100, {2, 2}, {0, 0}, {0, 0}}, 0,
+					trial->arc / VIEWS};
+	struct linearise linearise = {.sample = trial->integers ? SAMPLE_UINT16 : SAMPLE_FLOAT32,
+				      .quantity = trial->line_integrals ? QUANTITY_LINE_INTEGRAL : QUANTITY_INTENSITY,
+				      .air = FLAT};
+	struct phantom phantom = {.parts = (struct ellipsoid *)objects[trial->object]};
+	bool *faulty = calloc(PIXELS, sizeof(*faulty));
+	void *samples = malloc(PIXELS * sizeof(float));
+	const unsigned char *map;
+	struct stuck *stuck;
+	struct scene scene;
+	struct error err;
+
+	random_state = 7;
+	while (phantom.count < PARTS_MOST && phantom.parts[phantom.count].semi_axes[0] > 0)
+		phantom.count++;
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	for (size_t i = 0; i < PIXELS; i++)
+		faulty[i] = trial->fault != FINE && uniform() < 0.01;
+	ck_assert_int_eq(stuck_new(&linearise, &scene.geometry, &stuck, &err), 0);
+	ck_assert_ptr_nonnull(stuck);
+	for (int view = 0; view < VIEWS; view++) {
+		if (!stuck_wants(stuck, view))
+			continue;
+		make_view(&scene, view, trial->photons, trial->integers, samples);
+		spoil(trial->fault, faulty, trial->photons, trial->integers, samples);
+		for (size_t i = 0; i < PIXELS && trial->line_integrals; i++)
+			((float *)samples)[i] = -logf(((float *)samples)[i] / (float)FLAT);
+		stuck_add(stuck, samples);
+	}
+	map = stuck_find(stuck);
+	ret[0] = ret[1] = ret[2] = 0;
+	for (size_t i = 0; i < PIXELS; i++) {
+		const bool found = map != NULL && map[i];
+
+		ret[0] += found && faulty[i];
+		ret[1] += faulty[i];
+		ret[2] += found && !faulty[i];
+	}
+	stuck_free(stuck);
+	free(samples);
+	free(faulty);
+	scene_clear(&scene);
+}
+
+static const double photons_of[] = {0, 1e3, 2e4, 1e6};
+
+/* All objects, without noise and with much, on a full turn and a short scan, counts and line integrals. */
+START_TEST(an_object_is_no_stuck_pixel)
+{
+	for (int object = 0; object < OBJECTS; object++)
+		for (int form = 0; form < 4; form++) {
+			const struct trial trial = {.object = (enum object)object,
+						    .photons = photons_of[_i],
+						    .integers = form == 1,
+						    .line_integrals = form == 2,
+						    .arc = form == 3 ? 200 : 360};
+			size_t found[3];
+
+			run_trial(&trial, found);
+			ck_assert_msg(found[2] == 0, "%s, %g photons, form %d: %zu pixels", names[object],
+				      trial.photons, form, found[2]);
+		}
+}
+END_TEST
+
+/*
+ * 1 % of the pixels, but for corners, the axis where nothing moves, and what noise hides. Beside a faulty pixel one may
+ * be taken for another.
+ */
+START_TEST(a_pixel_that_does_not_follow_is_found)
+{
+	for (int object = 0; object < OBJECTS; object++)
+		for (int fault = STILL; fault < FAULTS; fault++) {
+			const struct trial trial = {.object = (enum object)object,
+						    .fault = (enum fault)fault,
+						    .photons = photons_of[_i],
+						    .integers = _i == 2,
+						    .arc = 360};
+			size_t found[3];
+
+			run_trial(&trial, found);
+			ck_assert_msg((double)found[0] >= (trial.photons == 1e3 ? 0.65 : 0.75) * (double)found[1],
+				      "%s, %g photons, fault %d: %zu of %zu", names[object], trial.photons, fault,
+				      found[0], found[1]);
+			ck_assert_msg(found[2] <= 2, "%s, %g photons, fault %d: %zu wrong", names[object],
+				      trial.photons, fault, found[2]);
+		}
+}
+END_TEST
+
+Suite *stuck_suite(void)
+{
+	Suite *suite = suite_create("stuck");
+	TCase *tests = tcase_create("tests");
+
+	tcase_set_timeout(tests, 0);
+	tcase_add_loop_test(tests, an_object_is_no_stuck_pixel, 0, 4);
+	tcase_add_loop_test(tests, a_pixel_that_does_not_follow_is_found, 0, 4);
+	suite_add_tcase(suite, tests);
+	return suite;
+}
