@@ -5,7 +5,8 @@
  *
  * XA: Positioner Primary and Secondary Angle, and their increments, which are one
  * step for all frames or each frame's offset from the first (C.8.7.5.1.3). Enhanced
- * XA: the same attributes in the functional groups, shared or of each frame.
+ * XA: the same attributes in the functional groups, shared or of each frame. Patient
+ * Position (0018,5100) and Patient Orientation (0020,0020) are the file's.
  */
 #include <dirent.h>
 #include <errno.h>
@@ -21,6 +22,7 @@
 
 #include "clients/cbct/images.h"
 #include "clients/cbct/tool.h"
+#include "proto/patient.h"
 #include "proto/spool.h"
 
 /* Numbers that belong to an object, or in Enhanced XA to each frame. */
@@ -39,6 +41,8 @@ struct dicom {
 	long columns, rows, frames, bits, bits_stored, is_signed, samples;
 	char relationship[RELATIONSHIP_MAX]; /* of the pixels to the intensity: "LIN", "LOG", "DISP" */
 	bool mirrored;
+	int patient;                /* enum patient_position, -1: not told */
+	char towards[2];            /* sides of the patient, 0: not told */
 	struct dicom_values object; /* of the file itself, or of the functional groups that frames share */
 	struct dicom_values *frame; /* [frames], Enhanced XA */
 	double *increments[2];      /* primary, secondary */
@@ -152,6 +156,26 @@ static void read_number(struct reader *reader, enum number number)
 		fail(reader, ERR_INVALID, "a number is expected");
 }
 
+/* One of the positions that a table has; a patient in a chair is none of them. */
+static void read_patient_position(struct dicom *dicom, const char *text)
+{
+	for (int i = 0; i < PATIENT_POSITION_COUNT; i++)
+		if (strcmp(text, patient_position_names[i]) == 0)
+			dicom->patient = i;
+}
+
+/* "L\\F" or "LP\\FA": the nearest side comes first. */
+static void read_patient_orientation(struct dicom *dicom, const char *text)
+{
+	const char *behind = strchr(text, '\\');
+
+	if (behind == NULL || strchr("LRAPHF", text[0]) == NULL || behind[1] == '\0' ||
+	    strchr("LRAPHF", behind[1]) == NULL)
+		return;
+	dicom->towards[0] = text[0];
+	dicom->towards[1] = behind[1];
+}
+
 /* What the file itself says, outside of any sequence. */
 static void read_top(struct reader *reader)
 {
@@ -173,6 +197,10 @@ static void read_top(struct reader *reader)
 		read_increments(reader, 0);
 	else if (strcmp(reader->tag, "0018,1521") == 0)
 		read_increments(reader, 1);
+	else if (strcmp(reader->tag, "0018,5100") == 0)
+		read_patient_position(dicom, reader->text);
+	else if (strcmp(reader->tag, "0020,0020") == 0)
+		read_patient_orientation(dicom, reader->text);
 }
 
 static void read_value(struct reader *reader)
@@ -392,6 +420,10 @@ static int find_positions(struct image_file *file, const struct dicom *dicom, st
 			position->secondary = 0;
 		position->source_to_detector = values->number[TO_DETECTOR];
 		position->source_to_isocentre = values->number[TO_ISOCENTRE];
+		position->patient = dicom->patient;
+		/* Of the first frame: the others turn. */
+		if (k == 0)
+			memcpy(position->towards, dicom->towards, sizeof(position->towards));
 	}
 	return code;
 }
@@ -465,6 +497,7 @@ static int dicom_open(struct image_file *file, const char *path, const struct im
 		return error_set(err, ERR_NO_MEMORY, "no memory for a DICOM file");
 	file->state = dicom;
 	dicom->file = -1;
+	dicom->patient = -1;
 	dicom->frames = 1;
 	dicom->samples = 1;
 	for (int i = 0; i < NUMBER_COUNT; i++)

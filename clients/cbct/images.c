@@ -336,6 +336,8 @@ static int look_into(struct images *images, int entry, struct error *err)
 		images->has_stack = file->has_stack;
 		images->stack = file->stack;
 		images->intensity = file->intensity;
+		images->flip_columns = files->options->flip_columns;
+		images->flip_rows = files->options->flip_rows;
 		memcpy(images->pixel, file->pixel, sizeof(images->pixel));
 	} else {
 		code = same_as_first(images, file, files->entries[entry].path, err);

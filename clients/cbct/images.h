@@ -33,6 +33,8 @@ extern const struct option image_option_rows[];
 struct image_position {
 	double primary, secondary;                      /* degrees, LAO and CRA positive */
 	double source_to_isocentre, source_to_detector; /* mm */
+	int patient;                                    /* enum patient_position, -1: not told */
+	char towards[2]; /* the patient's sides that columns and rows run to: L R A P H F; 0: not told */
 };
 
 struct image_file {
@@ -67,6 +69,7 @@ struct images {
 	bool has_stack;
 	struct rtk_stack stack;
 	struct image_position *positions; /* [count] or NULL */
+	bool flip_columns, flip_rows;     /* the images are mirrored as they are read */
 	const char *intensity;
 	struct images_files *files; /* images.c's own */
 };

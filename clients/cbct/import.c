@@ -63,11 +63,14 @@ static int make_document(const struct import_options *options, struct images *im
 			 struct error *err)
 {
 	cJSON *detector = NULL, *geometry = NULL, *projections = NULL;
-	int code = import_geometry(&options->geometry, images, &detector, &geometry, err);
+	struct patient patient = patient_unknown;
+	int code = import_geometry(&options->geometry, images, &detector, &geometry, &patient, err);
 
 	if (code == 0)
 		code = import_values(&options->values, images, &projections, err);
 	cJSON_AddStringToObject(document, "name", scan_name(options));
+	if (patient.known)
+		cJSON_AddItemToObject(document, "patient", patient_json(&patient));
 	cJSON_AddItemToObject(document, "detector", detector);
 	cJSON_AddItemToObject(document, "projections", projections);
 	cJSON_AddItemToObject(document, "geometry", geometry);

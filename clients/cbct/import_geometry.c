@@ -51,6 +51,10 @@ const struct option import_geometry_rows[] = {
 	"distance, for angles; in place of a DICOM file's own", 1e-6, 1e7, 0, NULL),
     ROW("detector-offset", OPTION_NUMBERS, detector_offset, "U,V", "moves the detector along its columns and rows, mm",
 	0, 0, 2, NULL),
+    ROW("patient", OPTION_TEXT, patient, "POSITION",
+	"how the patient lies: HFS, HFP, FFS, FFP, HFDL, HFDR, FFDL, FFDR or unknown, in place of a DICOM file's own "
+	"Patient Position",
+	0, 0, 0, NULL),
     ROW("source-offset", OPTION_NUMBERS, source_offset, "U,V", "moves the source, mm; for angles", 0, 0, 2, NULL),
     {0},
 };
@@ -278,9 +282,9 @@ static int from_angles(const struct import_geometry *options, const struct image
 /* ---- DICOM ---- */
 
 /*
- * Our world is the patient's: x left, y back, z head. At primary angle a (towards
- * LAO) and secondary angle b (towards CRA) the detector stands from the isocentre
- * along (sin a cos b, -cos a cos b, sin b), the source across from it. Images are
+ * DICOM's angles are the patient's: x left, y back, z head. At primary angle a
+ * (towards LAO) and secondary angle b (towards CRA) the detector stands from the
+ * isocentre along (sin a cos b, -cos a cos b, sin b), the source across from it. Images are
  * shown as one faces the patient: at a = b = 0 columns run to the patient's left
  * and rows to the feet.
  */
@@ -304,8 +308,80 @@ static void position_view(const struct image_position *position, const struct im
 	}
 }
 
+/* From the patient's axes to the world's, which is fixed to the table: back along the patient's position. */
+static void to_world(const struct patient *patient, double vector[3])
+{
+	double world[3];
+
+	for (int i = 0; i < 3; i++)
+		world[i] = patient->rotation[0][i] * vector[0] + patient->rotation[1][i] * vector[1] +
+			   patient->rotation[2][i] * vector[2];
+	memcpy(vector, world, sizeof(world));
+}
+
+static void view_to_world(const struct patient *patient, struct view *view)
+{
+	to_world(patient, view->source);
+	to_world(patient, view->pixel0);
+	to_world(patient, view->column_step);
+	to_world(patient, view->row_step);
+}
+
+/* Whether a direction of the patient's has its greater part away from one of its sides. */
+static bool runs_away(const double direction[3], char side)
+{
+	static const char towards[3] = {'L', 'P', 'H'}, away[3] = {'R', 'A', 'F'};
+
+	for (int i = 0; i < 3; i++) {
+		double part = direction[i] / vec_norm(direction);
+
+		if ((side == towards[i] && part < -0.5) || (side == away[i] && part > 0.5))
+			return true;
+	}
+	return false;
+}
+
+/*
+ * Patient Orientation says where the columns and rows of the first image run to. An image that was mirrored when it
+ * was stored would give the wrong side; against the angles it makes the sides unknown.
+ */
+static bool is_mirrored(const struct image_position *position, const struct images *images, const struct view *view)
+{
+	double columns[3], rows[3];
+
+	for (int i = 0; i < 3; i++) {
+		columns[i] = images->flip_columns ? -view->column_step[i] : view->column_step[i];
+		rows[i] = images->flip_rows ? -view->row_step[i] : view->row_step[i];
+	}
+	return runs_away(columns, position->towards[0]) || runs_away(rows, position->towards[1]);
+}
+
+/* Without a word of the files on how the patient lies nobody told the C-arm what its angles are about. */
+static struct patient patient_of(const struct images *images, const struct view *first)
+{
+	const struct image_position *positions = images->positions;
+
+	for (int k = 0; k < images->count; k++)
+		if (positions[k].patient < 0 || positions[k].patient != positions[0].patient) {
+			fprintf(stderr,
+				"note: the images do not say how the patient lies, so that left and right are not "
+				"known; --patient tells it\n");
+			return patient_unknown;
+		}
+	if (is_mirrored(&positions[0], images, first)) {
+		fprintf(
+		    stderr,
+		    "note: Patient Orientation %c\\%c contradicts the angles: the images may be mirrored, and left and "
+		    "right are taken as not known; --flip-columns and --flip-rows mirror them, --patient tells how the "
+		    "patient lies\n",
+		    positions[0].towards[0], positions[0].towards[1]);
+		return patient_unknown;
+	}
+	return patient_in((enum patient_position)positions[0].patient);
+}
+
 static int from_positions(const struct import_geometry *options, const struct images *images, const double pixel[2],
-			  cJSON **ret_geometry, struct error *err)
+			  cJSON **ret_geometry, struct patient *patient, struct error *err)
 {
 	struct geometry geometry;
 	struct view *views = calloc((size_t)images->count, sizeof(*views));
@@ -331,6 +407,10 @@ static int from_positions(const struct import_geometry *options, const struct im
 		else
 			position_view(&position, options, images, pixel, &views[k]);
 	}
+	if (code == 0 && options->patient == NULL)
+		*patient = patient_of(images, &views[0]);
+	for (int k = 0; k < images->count && code == 0; k++)
+		view_to_world(patient, &views[k]);
 	if (code == 0)
 		code = geometry_views(&geometry, images->columns, images->rows, images->count, views, err);
 	free(views);
@@ -342,6 +422,20 @@ static int from_positions(const struct import_geometry *options, const struct im
 }
 
 /* ---- which of them ---- */
+
+static int read_patient(const char *text, struct patient *ret, struct error *err)
+{
+	*ret = patient_unknown;
+	if (text == NULL || strcmp(text, "unknown") == 0)
+		return 0;
+	for (int i = 0; i < PATIENT_POSITION_COUNT; i++)
+		if (strcmp(text, patient_position_names[i]) == 0) {
+			*ret = patient_in((enum patient_position)i);
+			return 0;
+		}
+	return error_set(err, ERR_USAGE,
+			 "--patient: '%.40s' is none of HFS, HFP, FFS, FFP, HFDL, HFDR, FFDL, FFDR and unknown", text);
+}
 
 static int check_options(const struct import_geometry *options, struct error *err)
 {
@@ -375,12 +469,14 @@ static cJSON *detector_json(const struct images *images, const double pixel[2])
 }
 
 int import_geometry(const struct import_geometry *options, const struct images *images, cJSON **ret_detector,
-		    cJSON **ret_geometry, struct error *err)
+		    cJSON **ret_geometry, struct patient *ret_patient, struct error *err)
 {
 	bool given = !isnan(options->pixel[0]);
 	double pixel[2];
 	int code = check_options(options, err);
 
+	if (code == 0)
+		code = read_patient(options->patient, ret_patient, err);
 	memcpy(pixel, given ? options->pixel : images->pixel, sizeof(pixel));
 	if (code == 0 && given && options->rtk != NULL && images->has_stack)
 		code = error_set(err, ERR_USAGE, "the stack tells its pixels to RTK's geometry, --pixel does not");
@@ -395,7 +491,7 @@ int import_geometry(const struct import_geometry *options, const struct images *
 	else if (options->astra != NULL)
 		code = from_astra(options, images, pixel, ret_geometry, err);
 	else if (images->positions != NULL && options->angles == NULL && isnan(options->angle_step))
-		code = from_positions(options, images, pixel, ret_geometry, err);
+		code = from_positions(options, images, pixel, ret_geometry, ret_patient, err);
 	else
 		code = from_angles(options, images, ret_geometry, err);
 	if (code == 0)

@@ -184,6 +184,10 @@ def write_dicom(document, images, out, options):
     text += parts["distance"] + f"(0018,1111) DS [{document['geometry']['source_to_isocentre_mm']}]\n" + parts["spacing"]
     text += f"(0018,1500) CS [DYNAMIC]\n(0018,1510) DS [{first}]\n(0018,1511) DS [0]\n"
     text += "(0018,1520) DS [" + "\\".join(increments) + "]\n"
+    if "patient" in options:
+        text += f"(0018,5100) CS [{options['patient']}]\n"
+    if "orientation" in options:
+        text += "(0020,0020) CS [" + options["orientation"].replace("-", "\\") + "]\n"
     text += DICOM_PIXELS.format(**parts) + parts["pixels"]
     write_dump(text, out)
 

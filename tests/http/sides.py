@@ -1,9 +1,10 @@
 #!/usr/bin/python3
 """The test object with a mark on each side, and where a volume's file says that the marks lie.
 
-Usage: sides.py make DIR                       a scan directory of the object, by exact line integrals
+Usage: sides.py make DIR [counts]              a scan directory of the object, by exact line integrals
        sides.py check POSITION JOB SCAN FORMAT,UNIT,FILE ...
-                                               JOB and SCAN may be ""; POSITION: HFS ..., unknown, or tilted (world_to_patient of TILT)
+                                               JOB and SCAN may be ""; a POSITION with an @ behind it is that of a
+                                               patient in whose own axes the marks were made; POSITION: HFS ..., unknown, or tilted (world_to_patient of TILT)
        sides.py old FILE                       the same volume as files were before they had an extension
 
 A ball of water, in it three smaller ones of other densities towards the world's +x, +y and +z, none at its mirror
@@ -65,7 +66,7 @@ def chord(source: np.ndarray, direction: np.ndarray, centre: np.ndarray, radius:
     return 2 * np.sqrt(np.maximum(0, radius**2 - (to @ to - along**2)))
 
 
-def make(directory: str) -> None:
+def make(directory: str, counts: bool) -> None:
     columns = (np.arange(COLUMNS) - (COLUMNS - 1) / 2) * PIXEL
     rows = (np.arange(ROWS) - (ROWS - 1) / 2) * PIXEL
     stack = np.zeros((VIEWS, ROWS, COLUMNS), np.float32)
@@ -80,6 +81,8 @@ def make(directory: str) -> None:
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
         for centre, radius, density in BALLS:
             stack[view] += density * chord(source, rays, np.array(centre), radius)
+    if counts:
+        stack = np.rint(50000 * np.exp(-stack)).astype("<u2")
     stack.tofile(directory + "/projections.raw")
     document = {
         "name": "sides \u00e9",
@@ -93,6 +96,8 @@ def make(directory: str) -> None:
             "angle_step_deg": 360 / VIEWS,
         },
     }
+    if counts:
+        document["projections"].update(sample="uint16", quantity="intensity", air=50000)
     with open(directory + "/scan.json", "w", encoding="utf-8") as file:
         json.dump(document, file)
 
@@ -232,7 +237,8 @@ def check_words(volume: Volume, position: str, unit: str, ids: List[str]) -> Non
 
 def check(position: str, form: str, unit: str, path: str, ids: List[str]) -> None:
     volume = READERS[form](path)
-    matrix = world_to_patient(position)
+    matrix = np.eye(4) if position.endswith("@") else world_to_patient(position)
+    position = position.rstrip("@")
     if position != "tilted" and form.startswith("nifti"):
         import nibabel
 
@@ -257,7 +263,7 @@ def old(path: str) -> None:
 
 
 if sys.argv[1] == "make":
-    make(sys.argv[2])
+    make(sys.argv[2], "counts" in sys.argv[3:])
 elif sys.argv[1] == "old":
     old(sys.argv[2])
 else:

@@ -236,6 +236,53 @@ test_regions_of_air_and_maps_of_defects() {
 	refused 2 "--beam-hardening: '1,,2'" cbct import "$counts/projections.raw" "${here[@]}" --air 5 --beam-hardening 1,,2 -o "$work/never"
 }
 
+# DICOM's angles are about the patient: an object with a mark on each of the patient's sides has them there, however the
+# patient lies on the table; in the world, which is the table's, they lie elsewhere each time.
+test_dicom_tells_how_the_patient_lies() {
+	local position python=${PYTHON:-/usr/bin/python3} how=(--air 50000 --source-to-isocentre 600 --name 'sides é')
+	need_dcmtk
+	need_numpy
+	"$python" -c 'import nibabel' 2>/dev/null || skip "python3-nibabel is not here"
+	mkdir -p "$work/sides"
+	"$python" "$here/sides.py" make "$work/sides" counts
+	xa() { # NAME [OPTION ...]: imported as a scan directory
+		local name=$1
+		shift
+		images dicom "$work/sides" "$work/$name.dump" "$@"
+		(cd "$work" && dump2dcm --quiet "$name.dump" "$name.dcm")
+		cbct import "$work/$name.dcm" "${how[@]}" -o "$work/$name" 2>"$work/said"
+	}
+	for position in HFS HFP FFS FFDR; do
+		xa "lies$position" patient=$position
+		jq -e ".patient == {position: \"$position\"}" "$work/lies$position/scan.json" >/dev/null || fail "$position in $(head -c 200 "$work/lies$position/scan.json")"
+		cbct recon "$work/lies$position" --grid 42,42,42 --spacing 2 --quiet -o "$work/lies$position" >/dev/null
+		"$python" "$here/sides.py" check "$position@" "" "" "nifti,1/mm,$work/lies$position/final.nii"
+	done
+	# Nobody says: not known, and told. A patient in a chair has none of the positions.
+	for position in "" patient=SITTING; do
+		xa silent $position
+		jq -e 'has("patient") | not' "$work/silent/scan.json" >/dev/null || fail "no patient of $position"
+		grep -q "left and right are not known" "$work/said" || fail "said of $position, got $(cat "$work/said")"
+	done
+	how+=(--patient FFS)
+	xa told
+	cmp "$work/told/scan.json" "$work/liesFFS/scan.json" || fail "--patient as the attribute"
+	how=("${how[@]:0:6}" --patient unknown)
+	xa told patient=FFS
+	jq -e 'has("patient") | not' "$work/told/scan.json" >/dev/null || fail "--patient unknown"
+	how=("${how[@]:0:6}")
+	# At -90 degrees, the first frame, columns run to the front and rows to the feet: an image that says otherwise was mirrored.
+	xa right patient=HFS orientation=A-F
+	jq -e '.patient.position == "HFS"' "$work/right/scan.json" >/dev/null || fail "as the angles say"
+	xa wrong patient=HFS orientation=P-F
+	jq -e 'has("patient") | not' "$work/wrong/scan.json" >/dev/null || fail "sides of a mirrored image"
+	grep -q 'Patient Orientation P\\F contradicts' "$work/said" || fail "the contradiction, got $(cat "$work/said")"
+	how+=(--flip-columns)
+	xa wrong patient=HFS orientation=P-F
+	jq -e '.patient.position == "HFS"' "$work/wrong/scan.json" >/dev/null || fail "mirrored back"
+	refused 2 "none of HFS" cbct import "$work/wrong.dcm" --air 5 --patient supine -o "$work/never"
+}
+
 # Read as DICOM shows them, the frames are the scan's turned by half a turn, and so is their detector.
 test_dicom_angiography() {
 	local name how=(--air 50000)
