@@ -131,7 +131,7 @@ static void add_scan_warnings(cJSON *document, const struct scan *scan, const st
 		    detail, sizeof(detail),
 		    "the scan was completed with %d of %d projections: arc, weights and subsets are those of the views "
 		    "that are there",
-		    facts->received, facts->count);
+		    facts->received + facts->lost, facts->count);
 		add_warning(warnings, "incomplete", detail);
 	}
 	if (facts->complete && lacks_flat(facts))
@@ -311,7 +311,7 @@ static void add_views(cJSON *document, const struct scan_facts *scan, const stru
 		cJSON_AddNullToObject(document, "views");
 		return;
 	}
-	all = scan->closed ? scan->received : scan->count;
+	all = scan->closed ? scan->received + scan->lost : scan->count;
 	views = cJSON_AddObjectToObject(document, "views");
 	cJSON_AddNumberToObject(views, "received", scan->received);
 	cJSON_AddNumberToObject(views, "reconstructed", record->state == JOB_SUCCEEDED ? all : record->taken);

@@ -726,23 +726,26 @@ static void worker_died(struct supervise *supervise, struct worker *worker, bool
 
 /* ---- giving work ---- */
 
-/* Of a scan that was closed with projections missing: those that are there. */
+/* Of a scan that was closed with projections missing: those that were there then; what was damaged since comes again.
+ */
 static int add_present(struct message *message, struct stored_scan *scan, const struct scan_facts *facts,
 		       struct error *err)
 {
-	unsigned char *flags = malloc((size_t)facts->count);
+	unsigned char *flags = malloc(2 * (size_t)facts->count), *lost = flags + facts->count;
 	struct recipe *recipe = &message->request.recipe;
+	int count = facts->received + facts->lost;
 
 	if (flags == NULL)
 		return error_set_errno(err, ENOMEM, "list of %d projections", facts->count);
 	stored_scan_received(scan, flags);
+	stored_scan_lost(scan, lost);
 	message->reduced = true;
 	for (int i = 0; i < facts->count; i++)
-		message->present[i / 8] |= (uint8_t)(flags[i] << i % 8);
+		message->present[i / 8] |= (uint8_t)((flags[i] | lost[i]) << i % 8);
 	free(flags);
 	/* Asked for with all projections in mind. */
-	if (recipe->sart.on && recipe->sart.subsets > facts->received)
-		recipe->sart.subsets = facts->received;
+	if (recipe->sart.on && recipe->sart.subsets > count)
+		recipe->sart.subsets = count;
 	return 0;
 }
 
