@@ -118,6 +118,10 @@ struct job *job_waited_for(struct request *request);
 /* True: answer HTTP_WAIT. False: the time is over. */
 bool job_wait_goes_on(struct request *request);
 
+/* As store_volume_verify; damage is a warning of the job, too. */
+int volume_verify(struct api *api, const char *job, const struct volume_record *volume, uint64_t first, uint64_t bytes,
+		  struct error *err);
+
 /* ---- what several of them need of volumes: api_volume.c ---- */
 enum { VOLUME_FILENAME_MAX = 96 };
 int volume_find(struct api *api, const struct job_facts *job, const char *name, struct volume_record *ret_volume,

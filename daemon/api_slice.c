@@ -105,14 +105,20 @@ static void make_etag(const char *job, const struct volume_record *volume, const
 		 asked->sheet ? asked->slice.axis : asked->index, asked->window, asked->level);
 }
 
-static int reply_drawn(struct api *api, struct request *request, const char *path, const struct grid *grid,
+static int reply_drawn(struct api *api, struct request *request, const char *job, const struct volume_record *volume,
 		       const struct asked *asked, struct error *err)
 {
+	size_t plane = (size_t)volume->grid.size[0] * (size_t)volume->grid.size[1] * sizeof(float), length;
+	bool one = asked->slice.axis == 2 && !asked->sheet;
+	const struct grid *grid = &volume->grid;
 	struct mapping *mapping;
-	size_t length;
-	char *png;
-	int code;
+	char path[1024], *png;
+	int code =
+	    volume_verify(api, job, volume, one ? (uint64_t)asked->index * plane : 0, one ? plane : volume->bytes, err);
 
+	if (code != 0)
+		return code;
+	store_volume_path(api->store, job, volume->name, path);
 	if (mapping_get(api->mappings, path, grid, &mapping, err) != 0)
 		return err->code;
 	code = draw(mapping_voxels(mapping), grid, asked, &png, &length, err);
@@ -126,7 +132,7 @@ int slice_get(void *context, struct request *request, struct error *err)
 	struct volume_record volume;
 	struct job_facts facts;
 	struct asked asked;
-	char etag[160], path[1024];
+	char etag[160];
 	struct entity entity = {.etag = etag, .size = UNKNOWN_SIZE};
 	struct selection selection;
 	bool done;
@@ -137,8 +143,7 @@ int slice_get(void *context, struct request *request, struct error *err)
 	make_etag(facts.id, &volume, &asked, etag, sizeof(etag));
 	if (entity_select(request, &entity, &selection, &done, err) != 0 || done)
 		return done ? 0 : err->code;
-	store_volume_path(api->store, facts.id, volume.name, path);
-	if (reply_drawn(api, request, path, &volume.grid, &asked, err) != 0)
+	if (reply_drawn(api, request, facts.id, &volume, &asked, err) != 0)
 		return err->code;
 	request_reply_header(request, "Content-Type", "image/png");
 	request_reply_header(request, "ETag", "%s", etag);

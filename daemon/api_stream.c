@@ -38,7 +38,8 @@ struct stream {
 	char *text;
 	size_t length, sent;
 	struct rendition *rendition;
-	bool headed; /* length and digest were told */
+	struct volume_record volume; /* of the rendition */
+	bool headed;                 /* length and digest were told */
 	uint64_t offset;
 	bool last; /* nothing comes behind the text */
 };
@@ -93,6 +94,7 @@ static int begin_part(struct stream *stream, const struct volume_record *volume)
 			  &stream->rendition, &err) != 0)
 		return -1;
 	rendition_watch(stream->rendition, &stream->made);
+	stream->volume = *volume;
 	stream->headed = false;
 	stream->offset = 0;
 	volume_filename(stream->facts.id, volume->name, &stream->options, filename);
@@ -108,8 +110,12 @@ static int begin_body(struct stream *stream, const struct rendition_facts *facts
 {
 	unsigned char digest[64];
 	char *text = NULL;
+	struct error err;
 	int length;
 
+	/* It may have been made a while ago, and its bytes may be those of the kept file. */
+	if (volume_verify(stream->api, stream->facts.id, &stream->volume, 0, stream->volume.bytes, &err) != 0)
+		return -1;
 	EVP_EncodeBlock(digest, facts->sha256, sizeof(facts->sha256));
 	length = asprintf(&text, "Content-Length: %llu\r\nContent-Digest: sha-256=:%s:\r\n\r\n",
 			  (unsigned long long)facts->size, (const char *)digest);

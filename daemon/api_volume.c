@@ -106,6 +106,20 @@ int volume_asked(struct api *api, struct request *request, struct job_facts *ret
 	return volume_find(api, ret_facts, request_argument(request, 1), ret_volume, err);
 }
 
+int volume_verify(struct api *api, const char *job, const struct volume_record *volume, uint64_t first, uint64_t bytes,
+		  struct error *err)
+{
+	int code = store_volume_verify(api->store, job, volume, first, bytes, err);
+	struct error ignored;
+	struct job *found;
+
+	if (code == ERR_DAMAGED && jobs_find(api->jobs, job, &found, &ignored) == 0) {
+		job_add_warning(found, "damaged_volume", err->text, &ignored);
+		job_release(found);
+	}
+	return code;
+}
+
 /* The formats of files, and the one that is for programs only. */
 static const char shuffled_name[] = "shuffled", shuffled_media_type[] = "application/vnd.cbct.shuffled+zstd";
 
@@ -249,6 +263,20 @@ static int reply_packed(struct request *request, struct content *content, bool e
 	return 0;
 }
 
+/* What of the file goes into these bytes of the content; NULL: all of it. */
+static int verify_selected(struct api *api, const char *job, const struct volume_record *volume,
+			   const struct content *content, const struct selection *selection, struct error *err)
+{
+	uint64_t size = content_size(content), head = size - volume->bytes, first = 0, bytes = volume->bytes;
+
+	/* Voxel for voxel behind a header. */
+	if (selection != NULL && content_is_plain(content)) {
+		first = selection->first > head ? selection->first - head : 0;
+		bytes = selection->length;
+	}
+	return volume_verify(api, job, volume, first, bytes, err);
+}
+
 int volume_get(void *context, struct request *request, struct error *err)
 {
 	struct api *api = context;
@@ -268,7 +296,8 @@ int volume_get(void *context, struct request *request, struct error *err)
 	    volume_options(request, &facts, &options, err) != 0)
 		return err->code;
 	store_volume_path(api->store, facts.id, volume.name, path);
-	if (content_open(path, &volume.grid, &options, &content, err) != 0)
+	if (volume_verify(api, facts.id, &volume, 0, 0, err) != 0 ||
+	    content_open(path, &volume.grid, &options, &content, err) != 0)
 		return err->code;
 	packed = content_is_packed(&options);
 	zstd = options.shuffled || (zstd && !packed);
@@ -279,6 +308,10 @@ int volume_get(void *context, struct request *request, struct error *err)
 	if (entity_select(request, &entity, &selection, &done, err) != 0 || done) {
 		content_close(content);
 		return done ? 0 : err->code;
+	}
+	if (verify_selected(api, facts.id, &volume, content, zstd || packed ? NULL : &selection, err) != 0) {
+		content_close(content);
+		return err->code;
 	}
 	if ((zstd || packed ? reply_packed(request, content, !packed, err)
 			    : reply_plain(request, content, &selection, err)) != 0)

@@ -56,7 +56,7 @@ static size_t plane_voxels(const struct content *content)
 	return (size_t)content->scaled.size[0] * (size_t)content->scaled.size[1];
 }
 
-static bool is_plain(const struct content *content)
+bool content_is_plain(const struct content *content)
 {
 	return content->options.type == VOLUME_FLOAT32 && content->options.scale == 1;
 }
@@ -91,7 +91,7 @@ static int make_header(struct content *content, const char *path, struct error *
 				       &content->header_size, err);
 	provenance_clear(&provenance);
 	/* One from before there were extensions is sent with a header of today. */
-	content->as_stored = code == 0 && is_plain(content) && options->format == volume_formats &&
+	content->as_stored = code == 0 && content_is_plain(content) && options->format == volume_formats &&
 			     content->start == content->header_size && content->header_size == sizeof(stored) &&
 			     read_file(content, 0, stored, sizeof(stored)) == 0 &&
 			     memcmp(stored, content->header, sizeof(stored)) == 0;
@@ -154,7 +154,7 @@ uint64_t content_size(const struct content *content)
 int content_descriptor(const struct content *content, uint64_t *ret_offset)
 {
 	/* The file is a NIfTI; without its header it is raw. */
-	if (!is_plain(content) || (!content->as_stored && content->header_size != 0))
+	if (!content_is_plain(content) || (!content->as_stored && content->header_size != 0))
 		return -1;
 	*ret_offset = content->header_size != 0 ? 0 : content->start;
 	return fcntl(content->descriptor, F_DUPFD_CLOEXEC, 0);
@@ -297,7 +297,7 @@ static ssize_t read_body(struct content *content, uint64_t offset, void *to, siz
 {
 	if (content->options.shuffled)
 		return read_shuffled(content, offset, to, size);
-	if (is_plain(content))
+	if (content_is_plain(content))
 		return read_file(content, content->start + offset, to, size);
 	return read_converted(content, offset, to, size);
 }

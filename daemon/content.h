@@ -30,6 +30,8 @@ int content_open(const char *path, const struct grid *grid, const struct content
 void content_close(struct content *content); /* NULL is fine */
 
 uint64_t content_size(const struct content *content);
+/* Whether its voxels are the file's, byte for byte. */
+bool content_is_plain(const struct content *content);
 /* Fills `size` bytes from `offset` on, fewer at the end; -1 when the file cannot be read. */
 ssize_t content_read(struct content *content, uint64_t offset, void *to, size_t size);
 

@@ -17,6 +17,9 @@
 
 #include "daemon/log.h"
 #include "proto/durable.h"
+#include "proto/seal.h"
+#include "proto/spool.h"
+#include "proto/sums.h"
 #include "proto/format.h"
 
 enum { NICENESS = 10 /* behind the workers, too */ };
@@ -44,33 +47,69 @@ struct digester {
 
 /* ---- one volume ---- */
 
-static int hash_voxels(int file, const char *path, off_t at, const _Atomic bool *stop, EVP_MD_CTX *digest,
+/* Of a volume's file: where its voxels begin and end. */
+struct voxels {
+	size_t start, end;
+	struct seal seal; /* of no blocks: the file has none */
+};
+
+static int find_voxels(int file, const char *path, const struct volume_record *volume, struct voxels *ret,
 		       struct error *err)
 {
-	enum { BLOCK = 1 << 20 };
-	char *block = malloc(BLOCK);
-	ssize_t got = 1;
-	int code = block == NULL ? error_set_errno(err, ENOMEM, "digest") : 0;
+	struct voxels voxels = {.start = 0};
+	struct stat status;
+	int code = seal_read(file, &voxels.seal, err);
 
-	while (code == 0 && got != 0) {
-		got = pread(file, block, BLOCK, at);
-		if (got < 0 && errno != EINTR)
-			code = error_set_errno(err, errno, "%s cannot be read", path);
-		if (got > 0 && EVP_DigestUpdate(digest, block, (size_t)got) != 1)
+	if (code != 0 && code != ERR_NOT_FOUND)
+		return code;
+	if (volume_own_start(file, path, &volume->grid, &voxels.start, err) != 0 || fstat(file, &status) != 0)
+		code = error_set(err, ERR_DAMAGED, "the volume %s is damaged on the disk: its header", volume->name);
+	else
+		code = 0;
+	voxels.end = voxels.seal.count > 0 ? voxels.seal.content : voxels.start + volume->bytes;
+	/* From a version that wrote no checksums, or they are damaged. */
+	if (code == 0 && voxels.seal.count == 0 && (size_t)status.st_size != voxels.end)
+		code = error_set(err, ERR_DAMAGED, "the volume %s is damaged on the disk: its checksums are gone",
+				 volume->name);
+	if (code != 0)
+		seal_clear(&voxels.seal);
+	else
+		*ret = voxels;
+	return code;
+}
+
+/* Block by block, each held against its checksum: a digest is never made of damaged bytes. */
+static int hash_voxels(int file, const char *name, const struct voxels *voxels, const _Atomic bool *stop,
+		       EVP_MD_CTX *digest, struct error *err)
+{
+	char *block = malloc(SEAL_BLOCK);
+	int code = block == NULL ? error_set_errno(err, ENOMEM, "digest") : 0, number = 0;
+
+	for (size_t at = 0; at < voxels->end && code == 0; at += SEAL_BLOCK, number++) {
+		size_t bytes = voxels->end - at < SEAL_BLOCK ? voxels->end - at : SEAL_BLOCK;
+		size_t skip = voxels->start <= at ? 0 : voxels->start - at < bytes ? voxels->start - at : bytes;
+
+		code = file_read_at(file, block, bytes, at, name, err);
+		if (code == 0 && voxels->seal.count > 0 && checksum(0, block, bytes) != voxels->seal.blocks[number])
+			code = error_set(
+			    err, ERR_DAMAGED,
+			    "the volume %s is damaged on the disk (block %d of %d does not fit its checksum): "
+			    "it has to be made again",
+			    name, number, voxels->seal.count);
+		if (code == 0 && EVP_DigestUpdate(digest, block + skip, bytes - skip) != 1)
 			code = error_set(err, ERR_INTERNAL, "SHA-256 failed");
 		if (atomic_load(stop))
 			code = error_set(err, ERR_CANCELLED, "the daemon stops");
-		at += got > 0 ? got : 0;
 	}
 	free(block);
 	return code;
 }
 
-static int hash_volume(const char *path, const struct grid *grid, const _Atomic bool *stop, uint8_t ret_sha256[32],
-		       struct error *err)
+static int hash_volume(const char *path, const struct volume_record *volume, const _Atomic bool *stop,
+		       uint8_t ret_sha256[32], struct error *err)
 {
 	int file = open(path, O_RDONLY | O_CLOEXEC), code;
-	size_t start = 0;
+	struct voxels voxels = {.start = 0};
 	EVP_MD_CTX *digest;
 	uint8_t sha256[32];
 
@@ -80,12 +119,13 @@ static int hash_volume(const char *path, const struct grid *grid, const _Atomic 
 	if (digest == NULL || EVP_DigestInit_ex(digest, EVP_sha256(), NULL) != 1)
 		code = error_set_errno(err, ENOMEM, "digest");
 	else
-		code = volume_own_start(file, path, grid, &start, err);
+		code = find_voxels(file, path, volume, &voxels, err);
 	if (code == 0)
-		code = hash_voxels(file, path, (off_t)start, stop, digest, err);
+		code = hash_voxels(file, volume->name, &voxels, stop, digest, err);
 	if (code == 0 && EVP_DigestFinal_ex(digest, sha256, NULL) != 1)
 		code = error_set(err, ERR_INTERNAL, "SHA-256 failed");
 	EVP_MD_CTX_free(digest);
+	seal_clear(&voxels.seal);
 	close(file);
 	if (code == 0)
 		memcpy(ret_sha256, sha256, sizeof(sha256));
@@ -127,7 +167,7 @@ static int make_digest(struct digester *digester, struct job *job, const struct 
 	job_facts(job, &facts);
 	store_volume_path(store, facts.id, volume->name, path);
 	if (!copy_digest(store, facts.id, volumes, count, volume))
-		code = hash_volume(path, &volume->grid, &digester->stop, volume->sha256, err);
+		code = hash_volume(path, volume, &digester->stop, volume->sha256, err);
 	/* What it was told of is; but it may have been made again since. */
 	if (code == 0)
 		code = durable_settle_named(path, err);
@@ -158,6 +198,13 @@ static bool complain(struct job *job, const struct task *task, const struct erro
 	if (err->code == ERR_SYNC) {
 		/* A second sync would succeed, and mean nothing: the volume is made again after the next start. */
 		store_distrust(jobs_store(job_jobs(job)), err);
+		return false;
+	}
+	if (err->code == ERR_DAMAGED) {
+		struct error ignored;
+
+		log_line(LEVEL_ERROR, "job %s: %s", facts.id, err->text);
+		job_add_warning(job, "damaged_volume", err->text, &ignored);
 		return false;
 	}
 	log_line(LEVEL_ERROR, "job %s: a volume has no digest, tried again in %g s: %s", facts.id, task->retry,

@@ -130,7 +130,10 @@ static int make(struct rendition *rendition, struct rendition_facts *ret, struct
 	int code;
 
 	store_volume_path(rendition->owner->store, rendition->job, rendition->volume.name, path);
-	code = content_open(path, &rendition->volume.grid, &rendition->options, &source.content, err);
+	code = store_volume_verify(rendition->owner->store, rendition->job, &rendition->volume, 0,
+				   rendition->volume.bytes, err);
+	if (code == 0)
+		code = content_open(path, &rendition->volume.grid, &rendition->options, &source.content, err);
 	if (code != 0)
 		return code;
 	if (!rendition->zstd)

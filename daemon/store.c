@@ -781,7 +781,9 @@ static int open_store(const char *directory, const struct store_hooks *hooks, bo
 	pthread_mutex_init(&store->check_lock, NULL);
 	pthread_cond_init(&store->check_due, NULL);
 	watch_list_init(&store->arrivals);
-	code = pages_new(&store->pages, err);
+	code = verified_new(&store->verified, err);
+	if (code == 0)
+		code = pages_new(&store->pages, err);
 	if (code == 0)
 		code = open_catalogue(store, rebuild, err);
 	if (code != 0) {
@@ -889,6 +891,7 @@ void store_close(struct store *store)
 	pthread_mutex_destroy(&store->reader.lock);
 	pthread_mutex_destroy(&store->writer.lock);
 	watch_list_destroy(&store->arrivals);
+	verified_free(store->verified);
 	pthread_cond_destroy(&store->checkpoint_due);
 	pthread_cond_destroy(&store->check_due);
 	pthread_mutex_destroy(&store->check_lock);

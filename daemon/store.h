@@ -367,6 +367,14 @@ int store_job_add_volume(struct store *store, const char *id, const struct volum
 			 const struct event *event, struct error *err);
 /* Its digest; nothing when it was made again since, or is gone. Its file is on the disk. */
 int store_job_digest_volume(struct store *store, const char *id, const struct volume_record *volume, struct error *err);
+/*
+ * The header of a kept volume's file and `bytes` bytes of its voxels from `first` on (as many as there are) are held
+ * against its checksums, unless that was done lately. ERR_DAMAGED: they do not fit. ERR_NOT_FOUND: the file is gone.
+ */
+int store_volume_verify(struct store *store, const char *job, const struct volume_record *volume, uint64_t first,
+			uint64_t bytes, struct error *err);
+/* A worker has just made the file: what is read of it is still in memory. */
+void store_volume_trust(struct store *store, const char *job, const struct volume_record *volume);
 /* The jobs that have volumes without a digest. */
 int store_jobs_undigested(struct store *store, void (*visit)(void *context, const char *id), void *context,
 			  struct error *err);

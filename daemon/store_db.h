@@ -60,6 +60,8 @@ struct store {
 	int log_pages;
 	bool closing;
 
+	struct verified *verified; /* files of volumes; store_verify.c */
+
 	/* Checks scans whose files may be damaged (store_sums.c). */
 	pthread_t checker;
 	bool has_checker;
@@ -117,6 +119,11 @@ int store_end(struct store *store, int code, struct error *err);
 int store_savepoint(struct store *store, const char *sql, struct error *err);
 /* With writer.lock held, before the row goes: the deletion is on the disk, and what it names does not come back. */
 int store_note_deletion(struct store *store, int kind, const char *id, struct error *err);
+
+/* Which files of volumes were found whole. Any thread. */
+struct verified;
+int verified_new(struct verified **ret_verified, struct error *err);
+void verified_free(struct verified *verified); /* NULL is fine */
 
 /* Seconds since 1970. */
 double time_now(void);

@@ -562,6 +562,7 @@ static int add_volume(struct worker *worker, const struct message *message, stru
 	snprintf(volume.stage, sizeof(volume.stage), "%s", message->volume_stage);
 	clock_gettime(CLOCK_REALTIME, &now);
 	volume.created = (double)now.tv_sec + (double)now.tv_nsec * 1e-9;
+	store_volume_trust(jobs_store(job_jobs(worker->job)), message->job, &volume);
 	return job_add_volume(worker->job, &volume, err);
 }
 

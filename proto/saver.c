@@ -20,6 +20,7 @@
 #include <unistd.h>
 
 #include "proto/durable.h"
+#include "proto/seal.h"
 
 enum {
 	PIECE_BYTES = 4 << 20, /* populated or written back in one go */
@@ -41,6 +42,9 @@ struct saver {
 	size_t taken; /* bytes of `blank` that the preparers have populated, or are about to */
 	bool enough;  /* they shall stop */
 	bool refused; /* the disk had no pages for all of it */
+
+	bool sealed; /* constant */
+	struct seal_maker seal;
 
 	/* The caller's own; while a file is under way its thread reads them. */
 	bool busy;
@@ -96,6 +100,12 @@ static void unmap(struct mapped *mapped)
 	mapped->bytes = NULL;
 }
 
+/* Bytes of a file with that much in it. */
+static size_t file_bytes(const struct saver *saver, size_t content)
+{
+	return saver->sealed ? content + seal_bytes(content) : content;
+}
+
 /* ---- the next file ---- */
 
 static void *prepare_loop(void *context)
@@ -137,8 +147,9 @@ static void drop_blank(struct saver *saver)
 	durable_abandon(&saver->blank.file);
 }
 
-void saver_prepare(struct saver *saver, const char *path, size_t bytes)
+void saver_prepare(struct saver *saver, const char *path, size_t content)
 {
+	size_t bytes = file_bytes(saver, content);
 	struct error ignored;
 
 	if (saver->blank.bytes != NULL && saver->blank.size != bytes)
@@ -231,12 +242,13 @@ static void *sync_loop(void *context)
 
 /* ---- the caller ---- */
 
-int saver_new(struct saver **ret_saver, struct error *err)
+int saver_new(bool sealed, struct saver **ret_saver, struct error *err)
 {
 	struct saver *saver = calloc(1, sizeof(*saver));
 
 	if (saver == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a saver");
+	saver->sealed = sealed;
 	pthread_mutex_init(&saver->lock, NULL);
 	pthread_cond_init(&saver->changed, NULL);
 	*ret_saver = saver;
@@ -273,6 +285,7 @@ void saver_free(struct saver *saver)
 		return;
 	saver_abandon(saver);
 	drop_blank(saver);
+	seal_maker_clear(&saver->seal);
 	pthread_cond_destroy(&saver->changed);
 	pthread_mutex_destroy(&saver->lock);
 	free(saver);
@@ -303,13 +316,18 @@ int saver_begin(struct saver *saver, const char *path, const void *header, size_
 	void *place;
 
 	snprintf(saver->path, sizeof(saver->path), "%s", path);
-	code = take_file(saver, length + bytes, err);
+	seal_maker_clear(&saver->seal);
+	code = saver->sealed ? seal_maker_new(length + bytes, &saver->seal, err) : 0;
+	if (code == 0)
+		code = take_file(saver, file_bytes(saver, length + bytes), err);
 	if (code != 0)
 		return code;
 	saver->given = 0;
 	code = saver_piece(saver, length, &place, err);
 	if (code == 0) {
 		memcpy(place, header, length);
+		if (saver->sealed)
+			seal_maker_add(&saver->seal, header, length);
 		saver->given = length;
 		saver->trouble = (struct error){0};
 		saver->ended = saver->abandoned = saver->synced = false;
@@ -339,16 +357,36 @@ int saver_piece(struct saver *saver, size_t bytes, void **ret_place, struct erro
 
 void saver_give(struct saver *saver, size_t bytes)
 {
+	/* Before the thread behind may let go of the pages. */
+	if (saver->sealed)
+		seal_maker_add(&saver->seal, saver->file.bytes + saver->given, bytes);
 	pthread_mutex_lock(&saver->lock);
 	saver->given += bytes;
 	pthread_cond_broadcast(&saver->changed);
 	pthread_mutex_unlock(&saver->lock);
 }
 
+static int write_seal(struct saver *saver, struct error *err)
+{
+	size_t content = saver->given, bytes = seal_bytes(content);
+	void *place;
+	int code = saver_piece(saver, bytes, &place, err);
+
+	if (code != 0)
+		return code;
+	seal_write(saver->seal.blocks, content, place);
+	pthread_mutex_lock(&saver->lock);
+	saver->given += bytes;
+	pthread_mutex_unlock(&saver->lock);
+	return 0;
+}
+
 int saver_end(struct saver *saver, struct error *err)
 {
-	int code = durable_name(&saver->file.file, err);
+	int code = saver->sealed ? write_seal(saver, err) : 0;
 
+	if (code == 0)
+		code = durable_name(&saver->file.file, err);
 	if (code != 0) {
 		drop_file(saver);
 		return code;

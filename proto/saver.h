@@ -15,20 +15,21 @@
  */
 struct saver;
 
-int saver_new(struct saver **ret_saver, struct error *err);
+/* sealed: each file ends with the checksums of its bytes (proto/seal.h). */
+int saver_new(bool sealed, struct saver **ret_saver, struct error *err);
 /* What has its name is waited for, what has none yet leaves nothing behind. */
 void saver_abandon(struct saver *saver);
 /* The same first; what was prepared goes too. NULL is fine. */
 void saver_free(struct saver *saver);
 
 /*
- * A file of `bytes` bytes for the saver_begin to come, PATH.tmp until then: set
+ * A file of `content` bytes for the saver_begin to come, PATH.tmp until then: set
  * aside, mapped, and its pages got ready by threads of their own, since a page's
  * first use costs more than filling it. To be called when it is known that
  * another file comes soon, again when that took long. A hint: what fails here is
  * met again by saver_begin.
  */
-void saver_prepare(struct saver *saver, const char *path, size_t bytes);
+void saver_prepare(struct saver *saver, const char *path, size_t content);
 
 /* A file that begins with `header` and has `bytes` more. None may be under way. What is prepared is used when it fits.
  */

@@ -20,6 +20,7 @@
 #include "proto/format.h"
 #include "proto/nifti.h"
 #include "proto/saver.h"
+#include "proto/seal.h"
 #include "proto/sums.h"
 
 _Static_assert((int)SPOOL_VOLUME_OFFSET == (int)NIFTI_VOXELS, "a NIfTI-1 header and its extension");
@@ -270,7 +271,8 @@ struct run {
 	const struct recipe *recipe;
 	const struct recon *recon; /* NULL before it is opened */
 	struct provenance provenance;
-	bool ahead; /* the next volume's file is prepared while the device computes */
+	bool sealed; /* the volumes' files */
+	bool ahead;  /* the next volume's file is prepared while the device computes */
 	bool prepared;
 	struct saver *saver; /* NULL before the first */
 	/* The volume that was written last: "final" may be the same iterate. Told of, and settled while the run goes
@@ -376,7 +378,7 @@ static bool ends_with_volume(const struct recipe *recipe, enum stage stage, int 
 
 static int open_saver(struct run *run, struct error *err)
 {
-	return run->saver != NULL ? 0 : saver_new(&run->saver, err);
+	return run->saver != NULL ? 0 : saver_new(run->sealed, &run->saver, err);
 }
 
 /* Soon after the beginning of a stage: the file that it ends with, where the processor has nothing better to do. */
@@ -534,8 +536,34 @@ static void checkpoint_line(char ret_line[SPOOL_CHECKPOINT_OFFSET], int iteratio
 	ret_line[SPOOL_CHECKPOINT_OFFSET - 1] = '\n';
 }
 
+/* A checkpoint on its way to the disk. */
+struct sealed_file {
+	struct durable file;
+	struct seal_maker seal;
+};
+
+static int write_sealed(struct sealed_file *sealed, const void *bytes, size_t size, struct error *err)
+{
+	seal_maker_add(&sealed->seal, bytes, size);
+	return durable_write(&sealed->file, bytes, size, err);
+}
+
+static int write_end(struct sealed_file *sealed, struct error *err)
+{
+	size_t size = seal_bytes(sealed->seal.at);
+	char *end = malloc(size);
+	int code = end == NULL ? error_set(err, ERR_NO_MEMORY, "no memory for checksums") : 0;
+
+	if (code == 0) {
+		seal_write(sealed->seal.blocks, sealed->seal.at, end);
+		code = durable_write(&sealed->file, end, size, err);
+	}
+	free(end);
+	return code;
+}
+
 /* The iterate behind what the file holds already, piece by piece. */
-static int write_iterate(struct recon *recon, struct durable *d, struct error *err)
+static int write_iterate(struct recon *recon, struct sealed_file *sealed, struct error *err)
 {
 	const struct grid *grid = recon_grid(recon);
 	size_t slice;
@@ -549,54 +577,71 @@ static int write_iterate(struct recon *recon, struct durable *d, struct error *e
 
 		code = recon_read(recon, z, count, voxels, err);
 		if (code == 0)
-			code = durable_write(d, voxels, (size_t)count * slice, err);
+			code = write_sealed(sealed, voxels, (size_t)count * slice, err);
 	}
 	free(voxels);
 	return code;
 }
 
-static int save_checkpoint(struct recon *recon, const char *directory, struct error *err)
+static int write_checkpoint(struct recon *recon, struct sealed_file *sealed, struct error *err)
 {
-	char path[PATH_MAX], header[SPOOL_CHECKPOINT_OFFSET];
-	struct durable d;
+	char header[SPOOL_CHECKPOINT_OFFSET];
 	size_t metal_bytes;
 	const void *metal = recon_metal(recon, &metal_bytes);
 	const struct volume_noise *noise = recon_noise(recon), none = {0};
-	int code = join(path, sizeof(path), directory, SPOOL_CHECKPOINT, "", err);
+	int code;
 
-	if (code == 0)
-		code = durable_open(&d, path,
-				    sizeof(header) + grid_voxels(recon_grid(recon)) * sizeof(float) + metal_bytes, err);
-	if (code != 0)
-		return code;
 	checkpoint_line(header, recon_iteration(recon), recon_grid(recon), metal_bytes, noise != NULL ? noise : &none);
-	code = durable_write(&d, header, sizeof(header), err);
+	code = write_sealed(sealed, header, sizeof(header), err);
 	if (code == 0)
-		code = write_iterate(recon, &d, err);
+		code = write_iterate(recon, sealed, err);
 	if (code == 0 && metal_bytes > 0)
-		code = durable_write(&d, metal, metal_bytes, err);
-	if (code != 0) {
-		durable_abandon(&d);
-		return code;
-	}
-	return durable_commit(&d, err);
+		code = write_sealed(sealed, metal, metal_bytes, err);
+	return code != 0 ? code : write_end(sealed, err);
 }
 
-static int check_checkpoint(const char *path, const char *bytes, size_t size, const struct grid *grid,
+static int save_checkpoint(struct recon *recon, const char *directory, struct error *err)
+{
+	char path[PATH_MAX];
+	struct sealed_file sealed = {.seal = {0}};
+	size_t content = SPOOL_CHECKPOINT_OFFSET + grid_voxels(recon_grid(recon)) * sizeof(float), metal_bytes;
+	int code = join(path, sizeof(path), directory, SPOOL_CHECKPOINT, "", err);
+
+	recon_metal(recon, &metal_bytes);
+	content += metal_bytes;
+	if (code == 0)
+		code = seal_maker_new(content, &sealed.seal, err);
+	if (code == 0)
+		code = durable_open(&sealed.file, path, content + seal_bytes(content), err);
+	if (code == 0) {
+		code = write_checkpoint(recon, &sealed, err);
+		if (code != 0)
+			durable_abandon(&sealed.file);
+		else
+			code = durable_commit(&sealed.file, err);
+	}
+	seal_maker_clear(&sealed.seal);
+	return code;
+}
+
+static int check_checkpoint(const char *path, const char *bytes, const struct seal *seal, const struct grid *grid,
 			    int *ret_iteration, struct volume_noise *ret_noise, struct error *err)
 {
 	size_t expected = SPOOL_CHECKPOINT_OFFSET + grid_voxels(grid) * sizeof(float);
 	char text[SPOOL_CHECKPOINT_OFFSET + 1] = "", line[SPOOL_CHECKPOINT_OFFSET];
 	struct volume_noise noise;
-	int iteration;
+	int iteration, damaged = seal_first_damaged(seal, bytes);
 
-	if (size < expected)
-		return error_set(err, ERR_INVALID, "%.200s: %zu bytes, %zu are expected", path, size, expected);
+	if (damaged >= 0)
+		return error_set(err, ERR_INVALID, "%.200s: its block %d does not fit its checksum", path, damaged);
+	if (seal->content < expected)
+		return error_set(err, ERR_INVALID, "%.200s: %zu bytes, %zu are expected", path, seal->content,
+				 expected);
 	memcpy(text, bytes, SPOOL_CHECKPOINT_OFFSET);
 	if (sscanf(text, "cbctd checkpoint %d of %*d %*d %*d, metal %*u, noise %la %la", &iteration, &noise.sigma,
 		   &noise.contrast) != 3)
 		return error_set(err, ERR_INVALID, "%.200s is no checkpoint", path);
-	checkpoint_line(line, iteration, grid, size - expected, &noise);
+	checkpoint_line(line, iteration, grid, seal->content - expected, &noise);
 	if (memcmp(line, bytes, sizeof(line)) != 0)
 		return error_set(err, ERR_INVALID, "%.200s is of another grid", path);
 	*ret_iteration = iteration;
@@ -608,8 +653,8 @@ static int check_checkpoint(const char *path, const char *bytes, size_t size, co
 static int resume(struct run *run, struct recon *recon, const char *path, int expected, struct error *err)
 {
 	int file = open(path, O_RDONLY | O_CLOEXEC), code, iteration = 0;
-	struct stat status;
 	struct volume_noise noise;
+	struct seal seal = {0};
 	size_t metal;
 	char *bytes = MAP_FAILED;
 
@@ -617,26 +662,25 @@ static int resume(struct run *run, struct recon *recon, const char *path, int ex
 		return error_set(err, ERR_INVALID, "%.200s does not exist", path);
 	if (file < 0)
 		return error_set_errno(err, errno, "%s cannot be opened", path);
-	if (fstat(file, &status) == 0) {
-		if (status.st_size == 0) { /* nothing can be mapped; damaged like any other of a wrong size */
-			code = error_set(err, ERR_INVALID, "%.200s is empty", path);
-			goto out;
-		}
-		bytes = mmap(NULL, (size_t)status.st_size, PROT_READ, MAP_PRIVATE, file, 0);
-	}
+	code = seal_read(file, &seal, err);
+	if (code == ERR_NOT_FOUND)
+		code = error_set(err, ERR_INVALID, "%.200s is damaged: it has no whole checksums", path);
+	if (code != 0)
+		goto out;
+	bytes = mmap(NULL, seal.content, PROT_READ, MAP_PRIVATE, file, 0);
 	if (bytes == MAP_FAILED) {
 		code = error_set(err, ERR_IO, "%.200s cannot be mapped", path);
 		goto out;
 	}
-	code = check_checkpoint(path, bytes, (size_t)status.st_size, recon_grid(recon), &iteration, &noise, err);
+	code = check_checkpoint(path, bytes, &seal, recon_grid(recon), &iteration, &noise, err);
 	if (code == 0)
 		code =
 		    recon_resume(recon, (const float *)(const void *)(bytes + SPOOL_CHECKPOINT_OFFSET), iteration, err);
 	if (code == 0 && run->recipe->tv.on)
 		code = recon_resume_noise(recon, &noise, err);
 	metal = SPOOL_CHECKPOINT_OFFSET + grid_voxels(recon_grid(recon)) * sizeof(float);
-	if (code == 0 && (size_t)status.st_size > metal)
-		code = recon_resume_metal(recon, bytes + metal, (size_t)status.st_size - metal, err);
+	if (code == 0 && seal.content > metal)
+		code = recon_resume_metal(recon, bytes + metal, seal.content - metal, err);
 	if (code == 0 && iteration != expected) {
 		char detail[128];
 
@@ -644,8 +688,10 @@ static int resume(struct run *run, struct recon *recon, const char *path, int ex
 			 iteration, expected, iteration);
 		run_warning(run, "checkpoint", detail);
 	}
-	munmap(bytes, (size_t)status.st_size);
 out:
+	if (bytes != MAP_FAILED)
+		munmap(bytes, seal.content);
+	seal_clear(&seal);
 	close(file);
 	return code;
 }
@@ -807,6 +853,7 @@ int spool_open(const struct backend *backend, struct device *device, const struc
 	spool->run = (struct run){.hooks = options->hooks,
 				  .directory = options->out_directory,
 				  .recipe = options->recipe,
+				  .sealed = options->checked,
 				  .ahead = backend->own_memory};
 	spool->hooks = (struct recon_hooks){.context = &spool->run,
 					    .cancelled = run_cancelled,

@@ -84,7 +84,11 @@ struct spool_hooks {
 /* What is to be reconstructed; all of it is borrowed until spool_close. */
 struct spool_options {
 	const char *scan_directory, *out_directory;
-	bool checked; /* the scan directory must have projections.sums: ERR_DAMAGED without */
+	/*
+	 * In the daemon's spool: the scan directory must have projections.sums (ERR_DAMAGED without), and the volumes'
+	 * files end with their checksums (proto/seal.h).
+	 */
+	bool checked;
 	/* A flag for each projection of scan.json: those that make up the scan, the others never come. NULL: all. */
 	const unsigned char *present;
 	const struct recipe *recipe;
@@ -129,7 +133,9 @@ int spool_finish(struct spool *spool, struct error *err);
 int spool_run(const struct backend *backend, struct device *device, const struct spool_options *options,
 	      struct error *err);
 
-/* A line of text padded to SPOOL_CHECKPOINT_OFFSET bytes with iteration, size and noise, then float32 voxels [z][y][x].
+/*
+ * A line of text padded to SPOOL_CHECKPOINT_OFFSET bytes with iteration, size and noise, then float32 voxels [z][y][x],
+ * the list of metal where there is one, and a seal (proto/seal.h).
  */
 #define SPOOL_CHECKPOINT "checkpoint.f32"
 enum { SPOOL_CHECKPOINT_OFFSET = 160 };

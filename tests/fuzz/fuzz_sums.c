@@ -1,8 +1,9 @@
-/* Any bytes as projections.sums: only records that check themselves count. */
+/* Any bytes as projections.sums, and as a file with checksums at its end: only what checks itself counts. */
 #include <string.h>
 #include <sys/mman.h>
 #include <unistd.h>
 
+#include "proto/seal.h"
 #include "proto/sums.h"
 #include "tests/fuzz/fuzz.h"
 
@@ -12,6 +13,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 	struct sum sums[COUNT];
 	unsigned char states[COUNT];
 	uint8_t record[SUMS_RECORD_BYTES];
+	struct seal seal = {0};
 	struct error err = {0};
 	int file = memfd_create("sums", 0);
 
@@ -26,6 +28,11 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 		PROMISE(sums[i].bytes == 48 && at + SUMS_RECORD_BYTES <= size);
 		sum_pack(&sums[i], SUMS_SCAN + i, record);
 		PROMISE(memcmp(record, data + at, 56) == 0);
+	}
+	if (seal_read(file, &seal, &err) == 0) {
+		PROMISE(seal.content + seal_bytes(seal.content) == size);
+		PROMISE(seal_first_damaged(&seal, data) < seal.count);
+		seal_clear(&seal);
 	}
 	close(file);
 	return 0;

@@ -271,6 +271,108 @@ test_what_the_catalogue_lost_is_found_beside_the_data() {
 	stop_daemon
 }
 
+large='{"scan": "SCAN", "grid": {"size": [96, 96, 96], "spacing_mm": [1, 1, 1]}, "fdk": {}}' # four blocks of checksums
+made() { echo "$state/jobs/$job/final.nii"; }
+digested() { # its digest is there, so that nothing reads it any more
+	local end=$((SECONDS + 30))
+	until req GET "/v1/jobs/$job/volumes" && jq -e '.volumes | all(.digest != null)' "$body" >/dev/null; do
+		[ $SECONDS -lt $end ] || fail "a digest"
+	done
+}
+expect_damaged_volume() { # TARGET ...: under all of these
+	for target; do
+		req GET "/v1/jobs/$job/volumes/final$target"
+		expect_damaged
+		expect_json '.detail | test("volume final")'
+	done
+	req GET "/v1/jobs/$job"
+	expect_json '[.warnings[] | select(.code == "damaged_volume" and .severity == "serious" and (.detail | test("final")))] | length >= 1'
+}
+
+test_a_damaged_volume_is_told_and_never_sent() {
+	local third=$((4096 + 2 * 1048576))
+	start_daemon
+	reconstruct "$scan_dir" "$large"
+	digested
+	undisturbed
+	curl -sf -o "$work/stream" "$url/v1/jobs/$job/stream?format=raw" || fail "a stream"
+	flip "$(made)" $third
+	expect_damaged_volume "" "?format=raw" "?format=mha" "?type=int16" "?format=shuffled" "?scale=2" "/slice?axis=x" "/slice?sheet=1" "/slice?index=58"
+	req GET "/v1/jobs/$job/volumes/final" -H 'Accept-Encoding: zstd'
+	expect_damaged
+	# what is whole of it, by itself
+	req GET "/v1/jobs/$job/volumes/final?format=raw" -r 0-99999
+	expect_status 206
+	cmp "$body" <(head -c 100000 "$work/right") || fail "a part that is not damaged"
+	req GET "/v1/jobs/$job/volumes/final/slice?index=3"
+	expect_status 200
+	req GET "/v1/jobs/$job/volumes/final?format=raw" -r 2100000-2100099
+	expect_damaged
+	for query in format=raw type=int16; do # streamed before, and not
+		! curl -sf --max-time 20 -o "$work/stream" "$url/v1/jobs/$job/stream?$query" || fail "a stream that breaks off"
+		grep -q 'CBCT-Volume: final' "$work/stream" || fail "the head of a part"
+		! grep -q 'Content-Length' "$work/stream" || fail "no bytes of what is damaged"
+	done
+	flip "$(made)" $third # as it was
+	is_undisturbed
+	stop_daemon
+	flip "$(made)" 300 # the header
+	start_daemon
+	expect_damaged_volume "" "?format=raw" "/slice?axis=z"
+	flip "$(made)" 300
+	is_undisturbed
+	truncate -s $((third + 77)) "$(made)"
+	expect_damaged_volume "" "?format=raw" "/slice?axis=z" "/slice?axis=x"
+	stop_daemon
+}
+
+test_damaged_checksums_of_a_volume_that_is_whole_do_no_harm() {
+	local size
+	start_daemon
+	reconstruct "$scan_dir" "$large"
+	digested
+	undisturbed
+	size=$(stat -c %s "$(made)")
+	[ "$size" = $((4096 + 96 * 96 * 96 * 4 + 4 * 4 + 64)) ] || fail "checksums at the end, got $size bytes"
+	for byte in $((size - 70)) $((size - 64)) $((size - 40)) $((size - 5)); do
+		flip "$(made)" "$byte"
+		is_undisturbed
+		flip "$(made)" "$byte"
+	done
+	flip "$(made)" $((size - 40))
+	flip "$(made)" 9999
+	expect_damaged_volume "" # now nothing fits
+	stop_daemon
+}
+
+test_a_damaged_checkpoint_begins_the_job_again() {
+	local yielded again
+	start_daemon
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "{\"scan\": \"SCAN\", $grid, \"sart\": {\"iterations\": 150, \"subsets\": \"views\"}}"
+	wait_job succeeded
+	undisturbed
+	for again in flip truncate; do
+		post_job "{\"scan\": \"SCAN\", $grid, \"sart\": {\"iterations\": 150, \"subsets\": \"views\"}}"
+		yielded=$job
+		until req GET "/v1/jobs/$job" && jq -e '.iteration >= 2' "$body" >/dev/null; do sleep 0.02; done
+		post_job "{\"scan\": \"SCAN\", $grid, \"sart\": {\"iterations\": 100000, \"subsets\": \"views\"}, \"priority\": \"stat\"}"
+		until req GET "/v1/jobs/$job" && jq -e '.iteration >= 1' "$body" >/dev/null; do sleep 0.02; done
+		case $again in
+		flip) flip "$state/jobs/$yielded/checkpoint.f32" 3333 ;;
+		truncate) truncate -s -8 "$state/jobs/$yielded/checkpoint.f32" ;;
+		esac
+		req DELETE "/v1/jobs/$job?wait=30"
+		expect_json '.state == "cancelled"'
+		job=$yielded
+		wait_job succeeded
+		expect_json '.attempts == 2 and ([.history[].iteration] == [range(1; 151)]) and ([.warnings[] | select(.code == "damaged_checkpoint")] | length == 1)'
+		is_undisturbed
+	done
+	stop_daemon
+}
+
 test_cbct_recon_uses_no_damaged_file() {
 	start_daemon
 	post_scan "$scan_dir"

@@ -11,6 +11,7 @@
 #include "daemon/files.h"
 #include "proto/durable.h"
 #include "proto/format.h"
+#include "proto/seal.h"
 #include "proto/spool.h"
 #include "tests/unit/state.h"
 
@@ -557,12 +558,13 @@ static struct volume_record volume_of(const char *id, const char *name)
 	return found;
 }
 
-/* The volume's file: `text` as voxels. */
+/* The volume's file: `text` as voxels, and checksums. */
 static void put_voxels(const char *id, const char *name, const char *text)
 {
 	const struct provenance provenance = {.patient = patient_unknown};
 	const struct grid grid = {.size = {0}}; /* the tests' records have none */
 	uint8_t bytes[FORMAT_HEADER_MAX];
+	struct seal_maker seal;
 	struct error err = {0};
 	size_t length;
 
@@ -570,8 +572,13 @@ static void put_voxels(const char *id, const char *name, const char *text)
 	ck_assert_uint_eq(length, SPOOL_VOLUME_OFFSET);
 	ck_assert_int_eq(directory_make(state_path(&state, "jobs/%s", id), &err), 0);
 	memcpy(bytes + SPOOL_VOLUME_OFFSET, text, strlen(text));
+	length += strlen(text);
+	ck_assert_int_eq(seal_maker_new(length, &seal, &err), 0);
+	seal_maker_add(&seal, bytes, length);
+	seal_write(seal.blocks, length, bytes + length);
+	seal_maker_clear(&seal);
 	ck_assert_int_eq(file_write_durable(state_path(&state, "jobs/%s/%s.nii", id, name), bytes,
-					    SPOOL_VOLUME_OFFSET + strlen(text), &err),
+					    length + seal_bytes(length), &err),
 			 0);
 }
 

@@ -22,6 +22,7 @@
 #include "core/phantom.h"
 #include "proto/format.h"
 #include "proto/saver.h"
+#include "proto/seal.h"
 #include "proto/spool.h"
 
 static char directory[64], path[128], out[128];
@@ -259,6 +260,8 @@ enum {
 
 static char header[HEADER], voxels_saved[VOXELS], blank[160], blank_beside[200];
 
+static bool sealed; /* of the savers that are made next */
+
 static struct saver *new_saver(void)
 {
 	struct saver *saver = NULL;
@@ -269,7 +272,7 @@ static struct saver *new_saver(void)
 		voxels_saved[i] = (char)(i * 7 + i / 1000);
 	snprintf(blank, sizeof(blank), "%s/blank", directory);
 	snprintf(blank_beside, sizeof(blank_beside), "%s.tmp", blank);
-	ck_assert_int_eq(saver_new(&saver, &err), 0);
+	ck_assert_int_eq(saver_new(sealed, &saver, &err), 0);
 	return saver;
 }
 
@@ -336,6 +339,52 @@ START_TEST(a_saved_file_is_whole_once_it_has_its_name)
 	}
 	saver_free(saver);
 	saver_free(NULL);
+}
+END_TEST
+
+START_TEST(a_sealed_file_ends_with_its_checksums)
+{
+	struct saver *saver;
+	struct error err = {0};
+	struct seal seal;
+	size_t length;
+	char *bytes;
+	int file;
+
+	sealed = true;
+	saver = new_saver();
+	saver_prepare(saver, blank, HEADER + VOXELS);
+	for (int again = 0; again < 2; again++) {
+		ck_assert_msg(save(saver, &err) == 0, "%s", err.text);
+		settle(saver);
+		ck_assert_int_eq(file_read(path, 1 << 24, &bytes, &length, &err), 0);
+		ck_assert_uint_eq(length, HEADER + VOXELS + seal_bytes(HEADER + VOXELS));
+		ck_assert_int_eq(memcmp(bytes + HEADER, voxels_saved, VOXELS), 0);
+		file = open(path, O_RDWR | O_CLOEXEC);
+		ck_assert_msg(seal_read(file, &seal, &err) == 0, "%s", err.text);
+		ck_assert_uint_eq(seal.content, HEADER + VOXELS);
+		ck_assert_int_eq(seal_first_damaged(&seal, bytes), -1);
+		for (int block = 0; block < seal.count; block++) { /* its last byte */
+			size_t at = (size_t)block * SEAL_BLOCK + seal_block_bytes(&seal, block) - 1;
+
+			bytes[at] ^= 16;
+			ck_assert_int_eq(seal_first_damaged(&seal, bytes), block);
+			bytes[at] ^= 16;
+		}
+		seal_clear(&seal);
+		for (size_t at = HEADER + VOXELS; at < length; at++) { /* and each of the checksums themselves */
+			char byte = bytes[at] ^ 4;
+
+			ck_assert_int_eq(pwrite(file, &byte, 1, (off_t)at), 1);
+			ck_assert_int_eq(seal_read(file, &seal, &err), ERR_NOT_FOUND);
+			ck_assert_int_eq(pwrite(file, bytes + at, 1, (off_t)at), 1);
+		}
+		ck_assert_int_eq(ftruncate(file, (off_t)length - 1), 0);
+		ck_assert_int_eq(seal_read(file, &seal, &err), ERR_NOT_FOUND);
+		close(file);
+		free(bytes);
+	}
+	saver_free(saver);
 }
 END_TEST
 
@@ -1101,6 +1150,7 @@ Suite *spool_suite(void)
 	tcase_set_timeout(savers, 60);
 	tcase_add_checked_fixture(savers, make_directory, remove_directory);
 	tcase_add_test(savers, a_saved_file_is_whole_once_it_has_its_name);
+	tcase_add_test(savers, a_sealed_file_ends_with_its_checksums);
 	tcase_add_test(savers, what_has_its_name_stays_when_its_saver_goes_and_what_has_none_does_not);
 	tcase_add_test(savers, a_prepared_file_becomes_the_next_one_of_its_size);
 	tcase_add_test(savers, a_saver_notices_each_call_that_fails);
