@@ -12,6 +12,7 @@ enum { VIEWS_LOOKED_AT = 32 };
 
 /* One view on the host, [row][column]: line integrals as measured, through w and through w on the recipe's grid. */
 struct projection {
+	int steps;
 	const struct view *view;
 	int columns, rows;
 	const int *pad;
@@ -76,9 +77,11 @@ static struct exterior_rows subtract_row(const struct projection *of, int row)
 	const float *explained = of->explained + at, *inside = of->inside != NULL ? of->inside + at : NULL;
 	float *measured = of->measured + at;
 	double *smooth = of->smooth + at, outside = 0;
-	struct exterior_rows found = {.truncated = is_truncated(of->pad, measured, of->columns, of->largest)};
+	struct exterior_rows found = {0};
 
-	if (found.truncated == 0 && of->faces != NULL &&
+	if (of->steps & EXTERIOR_BEYOND)
+		found.truncated = is_truncated(of->pad, measured, of->columns, of->largest);
+	if (found.truncated == 0 && of->steps & EXTERIOR_OUTSIDE && of->faces != NULL &&
 	    faces_row_counts_outside(of->faces, of->view, of->columns, row, measured, explained, of->largest))
 		found.outside = 1;
 	if (found.truncated + found.outside > 0) {
@@ -157,7 +160,7 @@ static int project(const struct surroundings_options *options, struct plan *plan
 	return code < 0 ? code : options->backend->stack_download(batch, 0, count, ret, err);
 }
 
-int exterior_subtract(const struct surroundings *surroundings, const struct surroundings_options *options,
+int exterior_subtract(const struct surroundings *surroundings, const struct surroundings_options *options, int steps,
 		      struct volume *work, struct exterior_rows *ret_rows, struct error *err)
 {
 	const struct backend *backend = options->backend;
@@ -172,7 +175,7 @@ int exterior_subtract(const struct surroundings *surroundings, const struct surr
 	bool enough = measured != NULL && explained != NULL && smooth != NULL;
 	int code = 0;
 
-	if (surroundings->goes_on) {
+	if (surroundings->goes_on && steps & EXTERIOR_OUTSIDE) {
 		inside = malloc(most * sizeof(float));
 		enough = enough && inside != NULL;
 	}
@@ -197,6 +200,7 @@ int exterior_subtract(const struct surroundings *surroundings, const struct surr
 		for (int i = 0; i < count && code == 0; i++) {
 			const size_t at = (size_t)i * pixels;
 			const struct projection projection = {
+			    .steps = steps,
 			    .view = &geometry->views[first + i],
 			    .columns = geometry->columns,
 			    .rows = geometry->rows,
@@ -223,5 +227,42 @@ int exterior_subtract(const struct surroundings *surroundings, const struct surr
 	free(explained);
 	free(inside);
 	free(smooth);
+	return code;
+}
+
+/* Where the share that is not seen by all views is above 0, that share of w. */
+static void mix(const float *seen, const float *w, float *values, size_t count)
+{
+#pragma omp parallel for schedule(static)
+	for (size_t i = 0; i < count; i++)
+		values[i] += (1 - seen[i]) * (w[i] - values[i]);
+}
+
+int exterior_start(const struct surroundings *surroundings, const struct surroundings_options *options,
+		   struct volume *work, struct volume *volume, struct error *err)
+{
+	const struct backend *backend = options->backend;
+	const struct grid *grid = options->grid;
+	const size_t pixels = (size_t)grid->size[0] * (size_t)grid->size[1];
+	float *seen = malloc(pixels * sizeof(float)), *w = malloc(pixels * sizeof(float));
+	float *values = malloc(pixels * sizeof(float));
+	int code = 0;
+
+	if (seen == NULL || w == NULL || values == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for three slices");
+	for (int z = 0; z < grid->size[2] && code == 0; z++) {
+		if (surroundings_seen(surroundings, grid, z, seen))
+			continue;
+		code = backend->volume_download(work, z, 1, w, err);
+		if (code == 0)
+			code = backend->volume_download(volume, z, 1, values, err);
+		if (code == 0) {
+			mix(seen, w, values, pixels);
+			code = backend->volume_put(volume, z, 1, values, err);
+		}
+	}
+	free(seen);
+	free(w);
+	free(values);
 	return code;
 }

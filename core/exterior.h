@@ -10,8 +10,8 @@
  * a bright rim, and hundreds of HU in the middle. So it is taken out of the
  * projections, once, in two steps:
  *
- * 1. What lies in the field of view but outside of the grid: an FDK of all of
- *    the field of view on a coarse grid of its own, w (core/surroundings.h), has it.
+ * 1. What lies in the field of view but outside of the grid: a coarse volume w of all that
+ *    the rays meet there (core/surroundings.h) has it.
  *    p' = p - (A w - A u), u = w on the recipe's own grid. The part inside of it
  *    cancels but at the grid's faces, which stay as sharp as in SART's own
  *    projections (Ziegler, Nielsen and Grass, Med. Phys. 35, 2008, project the FDK
@@ -21,8 +21,12 @@
  *    Smooth is at each column the value of the straight line fitted to the columns
  *    up to 1/EXTERIOR_PART of the row away from it. So SART keeps FDK's means over
  *    many columns there and adds what is finer.
+ *
+ * Where both are there, step 2 goes first, with the start of w: its fit to the projections would otherwise put
+ * what lies beyond the field of view into it.
  */
 enum { EXTERIOR_PART = 32 };
+enum { EXTERIOR_OUTSIDE = 1, EXTERIOR_BEYOND = 2 }; /* the steps, as bits */
 
 /* How many rows of the projections are concerned. */
 struct exterior_rows {
@@ -34,10 +38,16 @@ struct exterior_rows {
 int exterior_look(const struct surroundings_options *options, struct exterior_rows *ret_rows, struct error *err);
 
 /*
- * Changes the projections; `work` is a volume on the recipe's grid to work in. Takes
- * SURROUNDINGS_VIEWS more slots on the device meanwhile.
+ * These steps. Changes the projections; `work` is a volume on the recipe's grid to work in, after EXTERIOR_OUTSIDE it
+ * holds w. Takes SURROUNDINGS_VIEWS more slots on the device meanwhile.
  */
-int exterior_subtract(const struct surroundings *surroundings, const struct surroundings_options *options,
+int exterior_subtract(const struct surroundings *surroundings, const struct surroundings_options *options, int steps,
 		      struct volume *work, struct exterior_rows *ret_rows, struct error *err);
+/*
+ * A better start for SART than the FDK volume where not all views see a place: there FDK lacks their share, and the
+ * few iterations of a job cannot make up for it. The volume becomes w there; `work` holds w.
+ */
+int exterior_start(const struct surroundings *surroundings, const struct surroundings_options *options,
+		   struct volume *work, struct volume *volume, struct error *err);
 
 #endif

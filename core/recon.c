@@ -87,12 +87,6 @@ static bool keeps_projections(const struct recipe *recipe)
 	return recipe->sart.on || recipe->metal.on;
 }
 
-/* Unless it was told to take truncated rows as they are. */
-static bool leaves_out_the_exterior(const struct recipe *recipe)
-{
-	return recipe->sart.on && recipe->fdk.extend;
-}
-
 static struct plan_options plan_options(const struct recipe *recipe, const struct geometry *geometry,
 					const struct linearise *linearise, const struct fdk_weights *weights,
 					const struct sart_options *sart)
@@ -215,7 +209,7 @@ static int memory_needed(const struct backend *backend, struct device *device, s
 
 	options->beside = options->lends = 0;
 	code = backend->plan_bytes(device, options, &bytes, err);
-	if (code == 0 && leaves_out_the_exterior(recipe))
+	if (code == 0 && recipe->sart.on)
 		code = surroundings_bytes(&surroundings, &around, err);
 	if (code == 0 && bytes.host == 0)
 		code = memory_whole(backend, device, options, recipe->metal.on, &around, &memory, err);
@@ -862,6 +856,38 @@ static int iterate(struct recon *recon, struct history_row *ret_row, struct erro
 	return 0;
 }
 
+/* FDK of a short arc is too low in many places; real sweeps lack some degrees, and that is at the rim. */
+static bool fdk_is_sound(const struct orbit *orbit)
+{
+	const double little = 0.2, covered = orbit->arc - orbit->holes;
+
+	return (!orbit->arc_too_short || covered > M_PI + orbit->fan - little) && orbit->tilt < little;
+}
+
+/* The steps of exterior.h, which change the projections; *ret_rows are those concerned. */
+static int subtract_the_exterior(struct recon *recon, const struct surroundings_options *options,
+				 const struct exterior_rows *seen, struct surroundings *surroundings,
+				 struct exterior_rows *ret_rows, struct error *err)
+{
+	struct exterior_rows rows = {0};
+	int steps = EXTERIOR_OUTSIDE | (recon->recipe.fdk.extend ? EXTERIOR_BEYOND : 0), code = 0;
+
+	if (surroundings->goes_on && seen->truncated > 0 && !options->poor) {
+		code = exterior_subtract(surroundings, options, EXTERIOR_BEYOND, recon->before, &rows, err);
+		steps = EXTERIOR_OUTSIDE;
+	}
+	if (code == 0 && surroundings->goes_on)
+		code = surroundings_fit(surroundings, options, err);
+	if (code == 0)
+		code = exterior_subtract(surroundings, options, steps, recon->before, &rows, err);
+	/* SART alone starts from zero. */
+	if (code == 0 && surroundings->goes_on && recon->recipe.fdk.on && recon->iteration == 0)
+		code = exterior_start(surroundings, options, recon->before, recon->volume, err);
+	if (code == 0)
+		*ret_rows = rows;
+	return code;
+}
+
 /*
  * What lies outside of the grid is taken out of the projections before SART sees
  * them. It is found from them alone, so that a run that goes on from an iterate
@@ -870,11 +896,7 @@ static int iterate(struct recon *recon, struct history_row *ret_row, struct erro
  */
 static int leave_out_the_exterior(struct recon *recon, struct error *err)
 {
-	/* FDK of a short arc is too low in many places; real sweeps lack some degrees, and that is at the rim. */
-	const double little = 0.2;
-	const double covered = recon->orbit.arc - recon->orbit.holes;
-	const bool sound =
-	    (!recon->orbit.arc_too_short || covered > M_PI + recon->orbit.fan - little) && recon->orbit.tilt < little;
+	const bool sound = fdk_is_sound(&recon->orbit), fdk = recon->recipe.fdk.on;
 	struct surroundings_options options = {
 	    .backend = recon->backend,
 	    .device = recon->device,
@@ -884,6 +906,8 @@ static int leave_out_the_exterior(struct recon *recon, struct error *err)
 	    .plan = recon->plan,
 	    .projections = recon->projections,
 	    .factor = blank_factor(recon),
+	    .blank = recon->input.blank,
+	    .blanks = recon->input.counts.blank,
 	    .poor = !sound,
 	    .cancel = cancel_of(recon),
 	};
@@ -891,18 +915,21 @@ static int leave_out_the_exterior(struct recon *recon, struct error *err)
 	struct exterior_rows seen, rows = {0};
 	int code = exterior_look(&options, &seen, err);
 
+	/* Rows that are cut off may be wanted as they are; what lies outside of the grid is another matter. */
+	if (!recon->recipe.fdk.extend)
+		seen.truncated = 0;
 	if (code < 0 || seen.truncated + seen.outside == 0)
 		return code;
-	if (!sound && (seen.outside > 0 || !recon->recipe.fdk.on))
-		warn_exterior_stays(recon->hooks, &seen);
-	if (!sound && (seen.truncated == 0 || !recon->recipe.fdk.on))
+	if (!sound && !fdk && seen.truncated > 0)
+		warn_exterior_stays(recon->hooks);
+	if (!sound && !fdk && seen.outside == 0)
 		return 0;
 	/* An object may end with the grid: FDK's blur beyond its faces is none of the object. */
-	options.inside_only = !sound || seen.beside == 0;
+	options.inside_only = seen.outside == 0;
 	code = surroundings_make(&surroundings, &options, err);
 	if (code == 0)
-		code = exterior_subtract(&surroundings, &options, recon->before, &rows, err);
-	if (code == 0 && !recon->recipe.fdk.on)
+		code = subtract_the_exterior(recon, &options, &seen, &surroundings, &rows, err);
+	if (code == 0 && !fdk && sound && recon->recipe.fdk.extend)
 		warn_truncated(recon->hooks, recon->geometry, recon->input.turned, surroundings.truncated,
 			       recon->geometry->columns);
 	if (code == 0)
@@ -941,7 +968,7 @@ static int run_sart(struct recon *recon, struct error *err)
 {
 	const struct recon_hooks *hooks = recon->hooks;
 	bool last = recon->iteration >= recon->recipe.sart.iterations;
-	int failed = last || !leaves_out_the_exterior(&recon->recipe) ? 0 : leave_out_the_exterior(recon, err);
+	int failed = last ? 0 : leave_out_the_exterior(recon, err);
 
 	if (failed < 0)
 		return failed;

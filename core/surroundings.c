@@ -5,6 +5,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "core/coarse.h"
 #include "core/extend.h"
 
 /* Spread over the orbit: what is empty shows in many views. */
@@ -19,39 +20,113 @@ static int voxels_a_side(const struct surroundings_options *options)
 {
 	const struct geometry *geometry = options->geometry;
 	const double pixels = (double)geometry->columns * geometry->rows * geometry->count;
-	const double most = cbrt(fmax((double)grid_voxels(options->grid), pixels / 4));
+	const double voxels = fmax((double)grid_voxels(options->grid), pixels / 4);
+	/* The fit takes several volumes. */
+	const double most = cbrt(options->inside_only ? voxels : voxels / 2);
 
 	return (int)fmin(fmax(most, SURROUNDINGS_LEAST), SURROUNDINGS_MOST);
 }
 
-/* The box around the field of view and the recipe's grid; that alone where the sources leave no room for more. */
+struct box {
+	double low[3], high[3];
+};
+
+static struct box box_of(const struct grid *grid)
+{
+	struct box box;
+
+	for (int i = 0; i < 3; i++) {
+		box.low[i] = grid->origin[i] - 0.5 * grid->spacing[i];
+		box.high[i] = grid->origin[i] + (grid->size[i] - 0.5) * grid->spacing[i];
+	}
+	return box;
+}
+
+static void box_add(struct box *box, const struct box *other)
+{
+	for (int i = 0; i < 3; i++) {
+		box->low[i] = fmin(box->low[i], other->low[i]);
+		box->high[i] = fmax(box->high[i], other->high[i]);
+	}
+}
+
+/* The two places where a ray meets the cylinder of the field of view. */
+static void box_add_ray(struct box *box, const struct orbit *orbit, const double from[3], const double way[3])
+{
+	const double radius = orbit->field_of_view / 2;
+	double a = 0, b = 0, c = -radius * radius;
+
+	for (int i = 0; i < 2; i++) {
+		const double start = vec_dot(orbit->frame[i], from), along = vec_dot(orbit->frame[i], way);
+
+		a += along * along;
+		b += start * along;
+		c += start * start;
+	}
+	for (int side = -1; side <= 1 && a > 0 && b * b > a * c; side += 2) {
+		const double part = (-b + side * sqrt(b * b - a * c)) / a;
+		struct box place;
+
+		for (int i = 0; i < 3; i++)
+			place.low[i] = place.high[i] = from[i] + part * way[i];
+		box_add(box, &place);
+	}
+}
+
+/* Around what the rays to the first and the last row meet of the field of view. */
+static void box_add_rays(struct box *box, const struct orbit *orbit, const struct geometry *geometry)
+{
+	enum { ALONG = 9 };
+
+	for (int k = 0; k < geometry->count; k++)
+		for (int i = 0; i < 2 * ALONG; i++) {
+			const struct view *view = &geometry->views[k];
+			const double column = (geometry->columns - 1.) * (i / 2) / (ALONG - 1);
+			const double row = i % 2 ? geometry->rows - 0.5 : -0.5;
+			double way[3];
+
+			for (int a = 0; a < 3; a++)
+				way[a] = view->pixel0[a] + column * view->column_step[a] + row * view->row_step[a] -
+					 view->source[a];
+			box_add_ray(box, orbit, view->source, way);
+		}
+}
+
+/* No side has more voxels than `most`. */
+static void grid_of_box(const struct box *box, double spacing, int most, struct grid *ret)
+{
+	for (int i = 0; i < 3; i++)
+		spacing = fmax(spacing, (box->high[i] - box->low[i]) / most);
+	for (int i = 0; i < 3; i++) {
+		const double side = box->high[i] - box->low[i];
+
+		/* A part of a millionth is rounding, not another voxel. */
+		ret->size[i] = (int)fmax(1, ceil(side / spacing - 1e-6));
+		ret->spacing[i] = side / ret->size[i];
+		ret->origin[i] = box->low[i] + 0.5 * ret->spacing[i];
+	}
+}
+
+/*
+ * Around the recipe's grid, the field of view and its rays; without the rays, or around the recipe's grid alone, where
+ * the sources leave no room for more.
+ */
 static void choose_grid(const struct surroundings_options *options, struct grid *ret)
 {
 	const int most = voxels_a_side(options);
-	struct grid wide, inner = *options->grid;
+	struct grid wide;
 	struct error err;
 
 	orbit_covering_grid(options->orbit, options->geometry, most, &wide);
-	for (int narrow = options->inside_only; narrow < 2; narrow++) {
-		double low[3], side[3], spacing = wide.spacing[0];
+	for (int parts = options->inside_only ? 0 : 2; parts >= 0; parts--) {
+		const struct box view = box_of(&wide);
+		struct box box = box_of(options->grid);
 
-		for (int i = 0; i < 3; i++) {
-			double high = inner.origin[i] + (inner.size[i] - 0.5) * inner.spacing[i];
-
-			low[i] = inner.origin[i] - 0.5 * inner.spacing[i];
-			if (!narrow) {
-				low[i] = fmin(low[i], wide.origin[i] - 0.5 * wide.spacing[i]);
-				high = fmax(high, wide.origin[i] + (wide.size[i] - 0.5) * wide.spacing[i]);
-			}
-			side[i] = high - low[i];
-			spacing = fmax(spacing, side[i] / most);
-		}
-		for (int i = 0; i < 3; i++) {
-			/* A part of a millionth is rounding, not another voxel. */
-			ret->size[i] = (int)fmax(1, ceil(side[i] / spacing - 1e-6));
-			ret->spacing[i] = side[i] / ret->size[i];
-			ret->origin[i] = low[i] + 0.5 * ret->spacing[i];
-		}
+		if (parts > 0)
+			box_add(&box, &view);
+		if (parts > 1)
+			box_add_rays(&box, options->orbit, options->geometry);
+		grid_of_box(&box, wide.spacing[0], most, ret);
 		if (grid_check_geometry(ret, options->geometry, &err) == 0)
 			return;
 	}
@@ -78,8 +153,28 @@ static struct plan_options plan_options_of(const struct surroundings_options *op
 	return plan;
 }
 
-int surroundings_bytes(const struct surroundings_options *options, struct surroundings_bytes *ret_bytes,
-		       struct error *err)
+static struct coarse_options coarse_options_of(const struct surroundings_options *options, const struct grid *grid)
+{
+	return (struct coarse_options){
+	    .backend = options->backend,
+	    .device = options->device,
+	    .geometry = options->geometry,
+	    .orbit = options->orbit,
+	    .blank = options->blank,
+	    .blanks = options->blanks,
+	    .grid = grid,
+	    .lender = options->plan,
+	    .cancel = options->cancel,
+	};
+}
+
+static size_t larger(size_t a, size_t b)
+{
+	return a > b ? a : b;
+}
+
+/* Of a job in which it turns out to be inside_only or not. */
+static int bytes_of(const struct surroundings_options *options, struct surroundings_bytes *ret_bytes, struct error *err)
 {
 	const struct backend *backend = options->backend;
 	const struct geometry *geometry = options->geometry;
@@ -88,27 +183,56 @@ int surroundings_bytes(const struct surroundings_options *options, struct surrou
 	float some = 0; /* stands for the weights: only whether there are any is asked here */
 	const struct fdk_weights weights = {
 	    .columns = &some, .response = &some, .extended = &some, .extend = geometry->columns};
+	struct coarse_options coarse_options;
+	struct coarse_bytes coarse = {0};
 	struct grid grid;
 	struct plan_options plan;
 	struct plan_bytes bytes;
+	size_t own;
 	int code;
 
 	choose_grid(options, &grid);
 	plan = plan_options_of(options, &grid, &weights);
+	coarse_options = coarse_options_of(options, &grid);
 	code = backend->plan_bytes(options->device, &plan, &bytes, err);
+	if (code == 0 && !options->inside_only)
+		code = coarse_bytes(&coarse_options, &coarse, err);
 	if (code < 0)
 		return code;
-	*ret_bytes = (struct surroundings_bytes){
-	    /* Filtered views and, when those are gone, projected ones. */
-	    .device = bytes.volumes + bytes.scratch - bytes.block + bytes.raw +
-		      backend->stack_bytes(wide, geometry->rows, slots),
-	    .borrowed = bytes.block,
-	    .host = bytes.host > 0 ? grid_voxels(&grid) * sizeof(float) : 0,
-	};
+	own = bytes.volumes + bytes.scratch - bytes.block + bytes.raw;
+	ret_bytes->borrowed = larger(bytes.block, coarse.borrowed);
+	ret_bytes->host = 0;
+	/* Filtered views; when those are gone, the coarse SART; when that has ended, projected views. */
+	ret_bytes->device = own + larger(backend->stack_bytes(wide, geometry->rows, slots), coarse.device);
+	/* In parts the device is free again after each operation, and the host holds the volume. */
+	if (bytes.host > 0) {
+		ret_bytes->device = larger(own, coarse.device);
+		ret_bytes->host = grid_voxels(&grid) * sizeof(float) + coarse.host;
+	}
 	return 0;
 }
 
-/* ---- what no view can know ---- */
+int surroundings_bytes(const struct surroundings_options *options, struct surroundings_bytes *ret_bytes,
+		       struct error *err)
+{
+	struct surroundings_options either[2] = {*options, *options};
+	struct surroundings_bytes bytes[2];
+	int code = 0;
+
+	for (int i = 0; i < 2 && code == 0; i++) {
+		either[i].inside_only = i == 1;
+		code = bytes_of(&either[i], &bytes[i], err);
+	}
+	if (code == 0)
+		*ret_bytes = (struct surroundings_bytes){
+		    .device = larger(bytes[0].device, bytes[1].device),
+		    .borrowed = larger(bytes[0].borrowed, bytes[1].borrowed),
+		    .host = larger(bytes[0].host, bytes[1].host),
+		};
+	return code;
+}
+
+/* ---- what FDK cannot know ---- */
 
 /* Sums over the pixels up to `reach` away along both axes, in place; `line` has room for the longer side. */
 static void box_sums(float *image, int columns, int rows, int reach, float *line)
@@ -135,9 +259,12 @@ static void box_sums(float *image, int columns, int rows, int reach, float *line
 	}
 }
 
-/* Voxels whose shadow misses the rows, or is air with what lies up to a voxel and a half around it. `line` as above. */
-static void find_empty(const struct surroundings *s, const struct geometry *geometry, const struct orbit *orbit,
-		       int index, float *measured, float *line, bool *empty)
+/*
+ * Voxels whose shadow is air with what lies up to a voxel and a half around it are empty, those whose shadow misses the
+ * rows are not seen. `line` as above.
+ */
+static void look_at(const struct surroundings *s, const struct geometry *geometry, const struct orbit *orbit, int index,
+		    float *measured, float *line, bool *empty)
 {
 	const struct grid *grid = &s->grid;
 	const int columns = geometry->columns, rows = geometry->rows;
@@ -164,9 +291,10 @@ static void find_empty(const struct surroundings *s, const struct geometry *geom
 				double column, row;
 
 				view_project(matrix, place, &column, &row);
-				if (row < -0.5 || row > rows - 0.5 ||
-				    (column >= 1 && row >= 1 && column <= columns - 2 && row <= rows - 2 &&
-				     measured[(size_t)lround(row) * (size_t)columns + (size_t)lround(column)] < 0.5f))
+				if (row < -0.5 || row > rows - 0.5)
+					s->seen[voxel_at(grid, x, y, z)] = false;
+				if (column >= 1 && row >= 1 && column <= columns - 2 && row <= rows - 2 &&
+				    measured[(size_t)lround(row) * (size_t)columns + (size_t)lround(column)] < 0.5f)
 					empty[voxel_at(grid, x, y, z)] = true;
 			}
 }
@@ -193,30 +321,34 @@ static bool is_in_view(const struct orbit *orbit, const double place[3])
 	return hypot(vec_dot(orbit->frame[0], place), vec_dot(orbit->frame[1], place)) <= orbit->field_of_view / 2;
 }
 
-/* What stays of the FDK volume on the host, blank views made up for. */
-static int keep_what_is_known(struct surroundings *s, const struct surroundings_options *options, struct error *err)
+/* Outwards from the middle: what not all views see becomes what is next to it, but for what is empty. */
+static void hold_ends(struct surroundings *s, const bool *empty)
 {
-	const struct geometry *geometry = options->geometry;
-	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
-	const int looked_at = geometry->count < VIEWS_LOOKED_AT ? geometry->count : VIEWS_LOOKED_AT;
-	const int longer = geometry->columns > geometry->rows ? geometry->columns : geometry->rows;
-	float *measured = malloc(pixels * sizeof(float)), *line = malloc((size_t)longer * sizeof(float));
-	bool *empty = calloc(grid_voxels(&s->grid), sizeof(bool));
+	const int *size = s->grid.size;
+
+#pragma omp parallel for schedule(static)
+	for (int y = 0; y < size[1]; y++)
+		for (int end = 0; end < 2; end++)
+			for (int i = size[2] / 2; i < size[2]; i++)
+				for (int x = 0; x < size[0]; x++) {
+					const int z = end ? i : size[2] - 1 - i, inner = end ? z - 1 : z + 1;
+					const size_t at = voxel_at(&s->grid, x, y, z);
+
+					if (s->seen[at] || inner < 0 || inner >= size[2])
+						continue;
+					s->voxels[at] = empty[at] ? 0 : s->voxels[voxel_at(&s->grid, x, y, inner)];
+				}
+}
+
+/* What stays of the FDK volume on the host, blank views made up for. */
+static void keep_what_is_known(struct surroundings *s, const struct surroundings_options *options, const bool *empty)
+{
 	size_t kept = 0;
-	int code = 0;
 
-	if (measured == NULL || line == NULL || empty == NULL)
-		code = error_set(err, ERR_NO_MEMORY, "no memory for a view of %d x %d pixels", geometry->columns,
-				 geometry->rows);
-	for (int i = 0; i < looked_at && code == 0; i++) {
-		const int view = (int)((long long)i * geometry->count / looked_at);
-
-		code = options->backend->stack_download(options->projections, view, 1, measured, err);
-		if (code == 0 && !is_blank(measured, pixels))
-			find_empty(s, geometry, options->orbit, view, measured, line, empty);
-	}
+	if (!options->inside_only)
+		hold_ends(s, empty);
 #pragma omp parallel for schedule(static) reduction(+ : kept)
-	for (int z = 0; z < (code == 0 ? s->grid.size[2] : 0); z++)
+	for (int z = 0; z < s->grid.size[2]; z++)
 		for (int y = 0; y < s->grid.size[1]; y++)
 			for (int x = 0; x < s->grid.size[0]; x++) {
 				const size_t at = voxel_at(&s->grid, x, y, z);
@@ -231,6 +363,34 @@ static int keep_what_is_known(struct surroundings *s, const struct surroundings_
 				kept += !inside && s->voxels[at] != 0;
 			}
 	s->goes_on = kept > 0;
+	if (options->poor && !options->inside_only) {
+		memset(s->voxels, 0, grid_voxels(&s->grid) * sizeof(float));
+		s->goes_on = true;
+	}
+}
+
+static int look_at_views(struct surroundings *s, const struct surroundings_options *options, struct error *err)
+{
+	const struct geometry *geometry = options->geometry;
+	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
+	const int looked_at = geometry->count < VIEWS_LOOKED_AT ? geometry->count : VIEWS_LOOKED_AT;
+	const int longer = geometry->columns > geometry->rows ? geometry->columns : geometry->rows;
+	float *measured = malloc(pixels * sizeof(float)), *line = malloc((size_t)longer * sizeof(float));
+	bool *empty = calloc(grid_voxels(&s->grid), sizeof(bool));
+	int code = 0;
+
+	if (measured == NULL || line == NULL || empty == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for a view of %d x %d pixels", geometry->columns,
+				 geometry->rows);
+	for (int i = 0; i < looked_at && code == 0; i++) {
+		const int view = (int)((long long)i * geometry->count / looked_at);
+
+		code = options->backend->stack_download(options->projections, view, 1, measured, err);
+		if (code == 0 && !is_blank(measured, pixels))
+			look_at(s, geometry, options->orbit, view, measured, line, empty);
+	}
+	if (code == 0)
+		keep_what_is_known(s, options, empty);
 	free(measured);
 	free(line);
 	free(empty);
@@ -273,8 +433,11 @@ int surroundings_make(struct surroundings *s, const struct surroundings_options 
 	if (code < 0)
 		return code;
 	s->voxels = malloc(grid_voxels(&s->grid) * sizeof(float));
-	if (s->voxels == NULL)
+	s->seen = malloc(grid_voxels(&s->grid) * sizeof(bool));
+	if (s->voxels == NULL || s->seen == NULL)
 		code = error_set(err, ERR_NO_MEMORY, "no memory for a volume of %zu voxels", grid_voxels(&s->grid));
+	else
+		memset(s->seen, true, grid_voxels(&s->grid) * sizeof(bool));
 	plan = plan_options_of(options, &s->grid, &s->weights);
 	if (code == 0)
 		code = backend->plan_new(options->device, &plan, &s->plan, err);
@@ -289,12 +452,20 @@ int surroundings_make(struct surroundings *s, const struct surroundings_options 
 	if (code == 0)
 		code = backend->volume_download(s->volume, 0, s->grid.size[2], s->voxels, err);
 	if (code == 0)
-		code = keep_what_is_known(s, options, err);
+		code = look_at_views(s, options, err);
 	if (code == 0)
 		code = backend->volume_upload(s->volume, s->voxels, err);
 	if (code < 0)
 		surroundings_clear(s);
 	return code;
+}
+
+int surroundings_fit(struct surroundings *s, const struct surroundings_options *options, struct error *err)
+{
+	const struct coarse_options coarse = coarse_options_of(options, &s->grid);
+	int code = coarse_sart(&coarse, options->projections, s->volume, err);
+
+	return code < 0 ? code : s->backend->volume_download(s->volume, 0, s->grid.size[2], s->voxels, err);
 }
 
 void surroundings_clear(struct surroundings *s)
@@ -305,6 +476,7 @@ void surroundings_clear(struct surroundings *s)
 	s->backend->plan_free(s->plan);
 	fdk_weights_clear(&s->weights);
 	free(s->voxels);
+	free(s->seen);
 	*s = (struct surroundings){0};
 }
 
@@ -321,6 +493,29 @@ static float between(const struct grid *from, const struct grid *to, int axis, i
 	return (float)(at - ret[0]);
 }
 
+/* The eight voxels around a place and their weights. */
+struct corners {
+	size_t at[8];
+	float weight[8];
+};
+
+static struct corners corners_of(const struct grid *from, const struct grid *to, int x, int y, int z)
+{
+	struct corners corners;
+	int at[3][2];
+	const float part[3] = {between(from, to, 0, x, at[0]), between(from, to, 1, y, at[1]),
+			       between(from, to, 2, z, at[2])};
+
+	for (int i = 0; i < 8; i++) {
+		const int a = i & 1, b = i >> 1 & 1, c = i >> 2;
+
+		corners.at[i] = voxel_at(from, at[0][a], at[1][b], at[2][c]);
+		corners.weight[i] =
+		    (a ? part[0] : 1 - part[0]) * (b ? part[1] : 1 - part[1]) * (c ? part[2] : 1 - part[2]);
+	}
+	return corners;
+}
+
 int surroundings_sample(const struct surroundings *s, const struct grid *grid, struct volume *to, struct error *err)
 {
 	const size_t nx = (size_t)grid->size[0];
@@ -333,23 +528,33 @@ int surroundings_sample(const struct surroundings *s, const struct grid *grid, s
 #pragma omp parallel for schedule(static)
 		for (int y = 0; y < grid->size[1]; y++)
 			for (int x = 0; x < grid->size[0]; x++) {
-				int at[3][2];
-				const float part[3] = {between(&s->grid, grid, 0, x, at[0]),
-						       between(&s->grid, grid, 1, y, at[1]),
-						       between(&s->grid, grid, 2, z, at[2])};
+				const struct corners corners = corners_of(&s->grid, grid, x, y, z);
 				float sum = 0;
 
-				for (int i = 0; i < 8; i++) {
-					const int a = i & 1, b = i >> 1 & 1, c = i >> 2;
-
-					sum += (a ? part[0] : 1 - part[0]) * (b ? part[1] : 1 - part[1]) *
-					       (c ? part[2] : 1 - part[2]) *
-					       s->voxels[voxel_at(&s->grid, at[0][a], at[1][b], at[2][c])];
-				}
+				for (int i = 0; i < 8; i++)
+					sum += corners.weight[i] * s->voxels[corners.at[i]];
 				slice[(size_t)y * nx + (size_t)x] = sum;
 			}
 		code = s->backend->volume_put(to, z, 1, slice, err);
 	}
 	free(slice);
 	return code;
+}
+
+bool surroundings_seen(const struct surroundings *s, const struct grid *grid, int z, float *ret_slice)
+{
+	bool all = true;
+
+#pragma omp parallel for schedule(static) reduction(&& : all)
+	for (int y = 0; y < grid->size[1]; y++)
+		for (int x = 0; x < grid->size[0]; x++) {
+			const struct corners corners = corners_of(&s->grid, grid, x, y, z);
+			float sum = 0;
+
+			for (int i = 0; i < 8; i++)
+				sum += corners.weight[i] * (float)s->seen[corners.at[i]];
+			ret_slice[(size_t)y * (size_t)grid->size[0] + (size_t)x] = sum;
+			all = all && sum >= 1;
+		}
+	return all;
 }

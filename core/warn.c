@@ -122,7 +122,7 @@ void warn_unseen_slices(const struct recon_hooks *hooks, const struct grid *grid
 	recon_warn(
 	    hooks, "slices_unseen",
 	    "the object goes on beyond the detector's rows, and the first %d and the last %d of %d slices are not "
-	    "seen by all views: their values are too low",
+	    "seen by all views: FDK's values there are too low, and SART's are estimates from the other views",
 	    slices[0], slices[1], grid->size[2]);
 }
 
@@ -174,20 +174,16 @@ void warn_outside(const struct recon_hooks *hooks, const struct geometry *geomet
 		return;
 	recon_warn(
 	    hooks, "outside_grid",
-	    "the object goes on outside of the grid: what FDK shows of that was taken out of %.3g %% of the %ss for "
-	    "SART",
+	    "the object goes on outside of the grid: what the projections show of that was taken out of %.3g %% of the "
+	    "%ss for SART",
 	    100 * (double)rows / ((double)geometry->count * geometry->rows), row_of(turned));
 }
 
-void warn_exterior_stays(const struct recon_hooks *hooks, const struct exterior_rows *rows)
+void warn_exterior_stays(const struct recon_hooks *hooks)
 {
-	const bool outside = rows->outside > 0;
-
-	recon_warn(
-	    hooks, outside ? "outside_grid" : "truncated",
-	    "the object %s, and FDK of this orbit is too poor to take that out of the projections: SART piles it "
-	    "up in the grid",
-	    outside ? "goes on outside of the grid" : "reaches beyond the detector");
+	recon_warn(hooks, "truncated",
+		   "the object reaches beyond the detector, and FDK of this orbit is too poor to take that out of the "
+		   "projections: SART piles it up in the grid");
 }
 
 void warn_tv(const struct recon_hooks *hooks, const struct recipe *recipe, const struct volume_noise *noise)

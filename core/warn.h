@@ -29,8 +29,8 @@ void warn_truncated(const struct recon_hooks *hooks, const struct geometry *geom
 		    int extend);
 /* "outside_grid": so many rows count something that lies outside of the grid; none: nothing is told. */
 void warn_outside(const struct recon_hooks *hooks, const struct geometry *geometry, bool turned, size_t rows);
-/* "outside_grid" or "truncated": FDK of the orbit is too poor to take out what these rows count. */
-void warn_exterior_stays(const struct recon_hooks *hooks, const struct exterior_rows *rows);
+/* "truncated": FDK of the orbit is too poor to take out what lies beyond the field of view. */
+void warn_exterior_stays(const struct recon_hooks *hooks);
 /* "tv_without_effect": explicit settings that cannot move a voxel by a fair share of the noise. */
 void warn_tv(const struct recon_hooks *hooks, const struct recipe *recipe, const struct volume_noise *noise);
 /* "metal", or "no_metal" where it has no voxels. */

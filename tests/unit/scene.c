@@ -7,6 +7,32 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "tests/unit/data.h"
+
+bool scene_sweep(struct geometry *ret_geometry, const struct sweep_spec *spec)
+{
+	enum { VIEWS = 248 };
+	const int bin = spec->bin, count = VIEWS / spec->every;
+	const double pitch[2] = {0.616 * bin, 0.616 * bin}, middle = 0.5 * (bin - 1);
+	double *matrices = data_npy("carm_kct_248.npy", VIEWS * 12);
+	struct error err;
+
+	if (matrices == NULL)
+		return false;
+	for (int k = 0; k < count; k++) {
+		double *matrix = matrices + 12 * (size_t)k;
+
+		memmove(matrix, matrices + 12 * (size_t)(k * spec->every), 12 * sizeof(*matrix));
+		for (int j = 0; j < 4; j++) {
+			matrix[j] = (matrix[j] - middle * matrix[8 + j]) / bin - spec->first * matrix[8 + j];
+			matrix[4 + j] = (matrix[4 + j] - middle * matrix[8 + j]) / bin;
+		}
+	}
+	ck_assert_int_eq(geometry_matrices(ret_geometry, spec->columns, 480 / bin, count, matrices, pitch, &err), 0);
+	free(matrices);
+	return true;
+}
+
 static size_t scene_samples(const struct scene *scene)
 {
 	return (size_t)scene->geometry.columns * (size_t)scene->geometry.rows;
@@ -160,7 +186,7 @@ static int push_all(const struct scene *scene, struct outcome *outcome, struct r
 
 void scene_run(const struct scene *scene, const struct recipe *recipe, struct outcome *outcome)
 {
-	const struct device_options options = {.threads = outcome->threads};
+	const struct device_options options = {.threads = outcome->threads, .memory_limit = outcome->memory_limit};
 	const struct recon_hooks hooks = {
 	    .context = outcome,
 	    .cancelled = on_cancelled,

@@ -16,6 +16,14 @@ struct scene {
 	float *projections; /* [view][row][column], line integrals */
 };
 
+/* The real C-arm's sweep of 248 views, one in so many; columns first .. first + columns - 1 of its pixels, which are
+ * `bin` times as wide and high as they were. */
+struct sweep_spec {
+	int bin, first, columns, every;
+};
+/* False, said aloud, where the test data are not there. */
+bool scene_sweep(struct geometry *ret_geometry, const struct sweep_spec *spec);
+
 /* These end the test where they fail. */
 void scene_orbit(struct scene *ret_scene, const struct orbit_spec *spec);
 void scene_add(struct scene *scene, const struct phantom *phantom);
@@ -31,6 +39,7 @@ struct outcome {
 	int cancel_at;              /* the n-th question is answered with yes, from 1; 0: never */
 	int yield_at;               /* iteration; 0: never */
 	int threads;                /* 0: all */
+	size_t memory_limit;        /* of the device, bytes; 0: none */
 	const float *resume;        /* iterate, or NULL */
 	int resume_iteration;
 	const void *resume_metal; /* of resume_metal_bytes */

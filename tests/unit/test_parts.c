@@ -253,6 +253,34 @@ START_TEST(any_limit_gives_the_same_volume)
 }
 END_TEST
 
+/* Its surroundings in parts as well: a cylinder that goes on beyond the grid and the rows, and a grid inside of it. */
+START_TEST(what_lies_outside_of_the_grid_is_left_out_in_parts)
+{
+	const struct linearise linearise = {.sample = SAMPLE_FLOAT32};
+	const struct orbit_spec spec = {48, 36, 40, {600, 1100, {4, 4}, {0, 0}, {0, 0}}, 0, 9};
+	struct ellipsoid trunk = {.shape = SHAPE_CYLINDER, .semi_axes = {40, 32, 200}, .density = 0.02};
+	const struct phantom phantom = {1, &trunk};
+	struct grid grid = grid_of(_i == 0 ? 60 : 30, 60, 42, 1.6, 1.6, 1.6);
+	struct recipe recipe = recipe_on(&grid);
+	struct scene scene;
+	struct result whole, parts;
+
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	recipe.fdk.on = recipe.sart.on = true;
+	recipe.sart.iterations = 2;
+	whole = reconstruct(&scene, &recipe, &linearise, scene.projections, 0);
+	parts = reconstruct(&scene, &recipe, &linearise, scene.projections, whole.memory.total / 4);
+	expect_parts(&parts, _i == 0 ? 2 : 1);
+	ck_assert_ptr_nonnull(strstr(parts.warnings, "outside_grid: "));
+	ck_assert_str_eq(parts.warnings, whole.warnings);
+	ck_assert_double_lt(apart(parts.volume, whole.volume, grid_voxels(&grid)), 1e-4);
+	result_clear(&whole);
+	result_clear(&parts);
+	scene_clear(&scene);
+}
+END_TEST
+
 /* In parts metal's volume to work in and its batch lie on the host. */
 START_TEST(what_metal_takes_of_the_host_is_said)
 {
@@ -318,6 +346,7 @@ Suite *parts_suite(void)
 	tcase_set_timeout(tests, 300);
 	tcase_add_loop_test(tests, parts_give_what_the_whole_gives, 0, (int)(sizeof(cases) / sizeof(cases[0])));
 	tcase_add_test(tests, any_limit_gives_the_same_volume);
+	tcase_add_loop_test(tests, what_lies_outside_of_the_grid_is_left_out_in_parts, 0, 2);
 	tcase_add_test(tests, what_metal_takes_of_the_host_is_said);
 	tcase_add_test(tests, defects_are_counted_once);
 	suite_add_tcase(suite, tests);

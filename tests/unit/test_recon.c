@@ -1907,27 +1907,6 @@ START_TEST(rows_cut_in_bone_or_soft_tissue_keep_the_field_of_view)
 }
 END_TEST
 
-/* The real C-arm's sweep with pixels four times as wide; columns first .. first + count - 1. */
-static bool sweep_of(int first, int count, struct geometry *ret)
-{
-	enum { VIEWS = 248, BIN = 4 };
-	double *matrices = data_npy("carm_kct_248.npy", VIEWS * 12), pitch[2] = {0.616 * BIN, 0.616 * BIN};
-	struct error err;
-
-	if (matrices == NULL)
-		return false;
-	for (int k = 0; k < VIEWS; k++)
-		for (int j = 0; j < 4; j++) {
-			double *matrix = matrices + 12 * (size_t)k;
-
-			matrix[j] = (matrix[j] - 0.5 * (BIN - 1) * matrix[8 + j]) / BIN - first * matrix[8 + j];
-			matrix[4 + j] = (matrix[4 + j] - 0.5 * (BIN - 1) * matrix[8 + j]) / BIN;
-		}
-	ck_assert_int_eq(geometry_matrices(ret, count, 480 / BIN, VIEWS, matrices, pitch, &err), 0);
-	free(matrices);
-	return true;
-}
-
 /* Mean and mean absolute error in HU of what is body and seen by every view; the grid is centred. */
 static void error_inside(const float *volume, const float *truth, const struct grid *grid, double radius,
 			 double half_height, double ret[2])
@@ -1965,7 +1944,8 @@ START_TEST(a_truncated_abdomen_keeps_its_values)
 	size_t pixels;
 	double errors[2];
 
-	if (body == NULL || !sweep_of(31, 92, &scene.geometry)) {
+	if (body == NULL ||
+	    !scene_sweep(&scene.geometry, &(struct sweep_spec){.bin = 4, .first = 31, .columns = 92, .every = 1})) {
 		free(body);
 		return;
 	}

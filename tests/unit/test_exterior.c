@@ -1,0 +1,399 @@
+/*
+ * SART where the object goes on outside of the grid: trunks longer than the panel, grids that end anywhere inside of
+ * what it covers, held slice by slice against exact densities.
+ */
+#include <check.h>
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "core/recon.h"
+#include "tests/unit/data.h"
+#include "tests/unit/scene.h"
+
+Suite *exterior_suite(void);
+
+static const double MU_WATER = 0.0192;
+
+/* The panel covers +-84 mm on the axis. */
+enum { COLUMNS = 64, ROWS = 44 };
+static const double PIXEL = 2 * 84 * 1100 / 620. / ROWS;
+
+/* +-250 mm long, with a spine, gas and denser organs, some of which cross the ends of the grids. */
+static struct ellipsoid trunk_parts[] = {
+    {SHAPE_CYLINDER, {100, 75, 250}, {0, 0, 0}, 0, .0192},     {SHAPE_CYLINDER, {18, 16, 250}, {0, -45, 0}, 0, .0115},
+    {SHAPE_CYLINDER, {6, 6, 250}, {0, -45, 0}, 0, -.006},      {SHAPE_ELLIPSOID, {30, 25, 60}, {45, 15, 60}, 0, -.012},
+    {SHAPE_ELLIPSOID, {25, 30, 50}, {-45, 20, -70}, .3, .004}, {SHAPE_ELLIPSOID, {8, 8, 8}, {60, -10, 78}, 0, .015},
+    {SHAPE_ELLIPSOID, {10, 8, 9}, {-20, 30, 95}, 0, .015},     {SHAPE_ELLIPSOID, {7, 9, 8}, {10, 40, -60}, 0, -.01},
+};
+static const struct phantom trunk = {8, trunk_parts};
+/* The same within an ellipsoid: narrower from slice to slice. */
+static struct ellipsoid tapered_parts[] = {
+    {SHAPE_ELLIPSOID, {105, 80, 200}, {0, 0, 0}, 0, .0192},  {SHAPE_CYLINDER, {16, 14, 150}, {0, -35, 0}, 0, .0115},
+    {SHAPE_ELLIPSOID, {30, 25, 60}, {40, 15, 60}, 0, -.012}, {SHAPE_ELLIPSOID, {25, 30, 50}, {-40, 20, -70}, .3, .004},
+    {SHAPE_ELLIPSOID, {8, 8, 8}, {50, -10, 78}, 0, .015},
+};
+static const struct phantom tapered = {5, tapered_parts};
+
+enum orbit_kind { CIRCLE, SHORT_SCAN, SWEEP };
+
+static bool scan_of(struct scene *ret_scene, enum orbit_kind kind, const struct phantom *phantom)
+{
+	struct orbit_spec spec = {COLUMNS, ROWS, 72, {620, 1100, {PIXEL, PIXEL}, {0, 0}, {0, 0}}, 13, 5};
+
+	if (kind == SHORT_SCAN) {
+		spec.views = 60;
+		spec.step_deg = 3.6;
+	}
+	if (kind != SWEEP)
+		scene_orbit(ret_scene, &spec);
+	else if (!scene_sweep(&ret_scene->geometry, &(struct sweep_spec){.bin = 8, .columns = 77, .every = 4}))
+		return false;
+	if (kind == SWEEP)
+		ret_scene->projections = calloc((size_t)77 * 60 * 62, sizeof(float));
+	ck_assert_ptr_nonnull(ret_scene->projections);
+	scene_add(ret_scene, phantom);
+	return true;
+}
+
+/* All of the body across, from -low to high along z. */
+static struct grid grid_between(double low, double high, double spacing)
+{
+	const int across = 2 * (int)ceil(110 / spacing);
+	struct grid grid = grid_of(across, across, (int)lround((low + high) / spacing), spacing, spacing, spacing);
+
+	grid.origin[2] = -low + 0.5 * spacing;
+	return grid;
+}
+
+/* ---- slice by slice ---- */
+
+/* Errors of slice means in HU over the body, the worst of all slices and of those that all views see. */
+struct worst {
+	double any, seen, root; /* root: root mean square over all slices */
+};
+
+static bool is_seen(const double (*matrices)[12], const struct geometry *geometry, const double place[3])
+{
+	for (int k = 0; k < geometry->count; k++) {
+		double column, row;
+
+		view_project(matrices[k], place, &column, &row);
+		if (row < -0.5 || row > geometry->rows - 0.5)
+			return false;
+	}
+	return true;
+}
+
+static struct worst slice_errors(const struct geometry *geometry, const struct grid *grid, const float *volume,
+				 const float *truth)
+{
+	double(*matrices)[12] = malloc(sizeof(*matrices) * (size_t)geometry->count);
+	struct worst worst = {0};
+	size_t at = 0, all = 0;
+
+	ck_assert_ptr_nonnull(matrices);
+	for (int k = 0; k < geometry->count; k++)
+		view_matrix(&geometry->views[k], matrices[k]);
+	for (int k = 0; k < grid->size[2]; k++) {
+		double sum = 0;
+		size_t count = 0;
+		bool seen = true;
+
+		for (int j = 0; j < grid->size[1]; j++)
+			for (int i = 0; i < grid->size[0]; i++, at++) {
+				const double place[3] = {grid->origin[0] + i * grid->spacing[0],
+							 grid->origin[1] + j * grid->spacing[1],
+							 grid->origin[2] + k * grid->spacing[2]};
+				const double error = 1000 * ((double)volume[at] - (double)truth[at]) / MU_WATER;
+
+				if ((double)truth[at] < 0.5 * MU_WATER)
+					continue;
+				sum += error;
+				worst.root += error * error;
+				count++;
+				seen = seen && is_seen((const double(*)[12])matrices, geometry, place);
+			}
+		all += count;
+		if (count == 0)
+			continue;
+		worst.any = fmax(worst.any, fabs(sum / (double)count));
+		if (seen)
+			worst.seen = fmax(worst.seen, fabs(sum / (double)count));
+	}
+	worst.root = sqrt(worst.root / (double)all);
+	free(matrices);
+	return worst;
+}
+
+static void run(const struct scene *scene, const struct recipe *recipe, struct outcome *outcome)
+{
+	scene_run(scene, recipe, outcome);
+	if (outcome->code < 0)
+		ck_abort_msg("%s %s", outcome->err.pointer, outcome->err.text);
+}
+
+static struct recipe sart_on(const struct grid *grid)
+{
+	struct recipe recipe = recipe_on(grid);
+
+	recipe.fdk.on = recipe.sart.on = true;
+	recipe.sart.iterations = 6;
+	return recipe;
+}
+
+/* ---- tests ---- */
+
+static const struct {
+	const char *what;
+	enum orbit_kind kind;
+	const struct phantom *phantom;
+	double low, high, spacing; /* mm */
+	int subsets;
+	enum projector projector;
+	bool no_fdk, no_extension;
+} ends[] = {
+    {"+-60", CIRCLE, &trunk, 60, 60, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0},
+    {"+-65", CIRCLE, &trunk, 65, 65, 5, SUBSETS_DEFAULT, PROJECTOR_MATCHED, 0, 0},
+    {"+-68", CIRCLE, &trunk, 68, 68, 4, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0},
+    {"+-72", CIRCLE, &trunk, 72, 72, 4, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 1},
+    {"+-75, one subset", CIRCLE, &trunk, 75, 75, 5, 1, PROJECTOR_INTERPOLATING, 0, 0},
+    {"+-75, by view", CIRCLE, &trunk, 75, 75, 5, SUBSETS_VIEWS, PROJECTOR_MATCHED, 0, 0},
+    {"+-76", CIRCLE, &trunk, 76, 76, 4, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0},
+    {"-20 to 80", CIRCLE, &trunk, 20, 80, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0},
+    {"+-85", CIRCLE, &trunk, 85, 85, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0},
+    {"tapered, +-65", CIRCLE, &tapered, 65, 65, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0},
+    {"tapered, -75 to 70", CIRCLE, &tapered, 75, 70, 5, SUBSETS_DEFAULT, PROJECTOR_MATCHED, 0, 0},
+    {"short scan, +-70", SHORT_SCAN, &trunk, 70, 70, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0},
+    {"short scan, +-80", SHORT_SCAN, &tapered, 80, 80, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0},
+    {"sweep, +-70", SWEEP, &trunk, 70, 70, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0},
+    {"sweep, +-80", SWEEP, &trunk, 80, 80, 5, SUBSETS_DEFAULT, PROJECTOR_MATCHED, 0, 0},
+    {"sweep, +-90", SWEEP, &tapered, 90, 90, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0},
+    {"SART alone, +-60", CIRCLE, &trunk, 60, 60, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 1, 0},
+    {"SART alone, +-70", CIRCLE, &trunk, 70, 70, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 1, 1},
+};
+
+/*
+ * The worst mean of a slice is off by 20 HU where all views see it, and by 40 elsewhere; hundreds and thousands where
+ * what lies beyond the grid's ends stays in the projections.
+ */
+START_TEST(the_end_slices_of_a_trunk_longer_than_the_panel_are_true)
+{
+	struct grid grid = grid_between(ends[_i].low, ends[_i].high, ends[_i].spacing);
+	struct recipe recipe = sart_on(&grid);
+	float *truth = malloc(sizeof(float) * grid_voxels(&grid));
+	struct outcome outcome = {0};
+	struct scene scene = {0};
+	struct worst worst;
+
+	ck_assert_ptr_nonnull(truth);
+	if (scan_of(&scene, ends[_i].kind, ends[_i].phantom)) {
+		phantom_voxelise(ends[_i].phantom, &grid, 3, truth);
+		recipe.sart.subsets = ends[_i].subsets;
+		recipe.projector = ends[_i].projector;
+		recipe.fdk.on = !ends[_i].no_fdk;
+		recipe.fdk.extend = !ends[_i].no_extension;
+		run(&scene, &recipe, &outcome);
+		worst = slice_errors(&scene.geometry, &grid, outcome.last, truth);
+		ck_assert_msg(worst.seen < 20 && worst.any < 40, "%s: %.1f HU where all views see it, else %.1f HU",
+			      ends[_i].what, worst.seen, worst.any);
+		ck_assert_ptr_nonnull(strstr(outcome.warnings, "outside_grid: "));
+	}
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(truth);
+}
+END_TEST
+
+/* Arcs that FDK can make little of: what SART makes of them must not get worse by what lies beyond the ends. */
+START_TEST(a_poor_orbit_does_not_pile_the_trunk_up)
+{
+	const struct orbit_spec spec = {COLUMNS, ROWS, 40, {620, 1100, {PIXEL, PIXEL}, {0, 0}, {0, 0}}, 13, 3};
+	struct grid grid = grid_between(65, 65, 5);
+	struct recipe recipe = sart_on(&grid);
+	float *truth = malloc(sizeof(float) * grid_voxels(&grid));
+	struct outcome outcome = {0};
+	struct scene scene;
+	struct worst worst;
+
+	ck_assert_ptr_nonnull(truth);
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &trunk);
+	phantom_voxelise(&trunk, &grid, 3, truth);
+	recipe.fdk.on = _i == 0;
+	run(&scene, &recipe, &outcome);
+	worst = slice_errors(&scene.geometry, &grid, outcome.last, truth);
+	/* In the middle slices the arc alone is worth 90 HU; more than 1000 at the ends where nothing is taken out. */
+	ck_assert_msg(worst.any < 130, "%.1f HU", worst.any);
+	ck_assert_ptr_nonnull(strstr(outcome.warnings, "outside_grid: "));
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(truth);
+}
+END_TEST
+
+/* A real abdomen, ray-marched through a real sweep's matrices; it fills the field of view and reaches beyond the rows.
+ */
+START_TEST(a_real_abdomen_keeps_its_end_slices)
+{
+	struct grid fine = grid_of(122, 101, 112, 1.9, 1.9, 1.9), grid = grid_between(70 + 10 * _i, 70 + 10 * _i, 5);
+	float *body = data_f32("abdomen_ts3mm.f32.zst", grid_voxels(&fine));
+	float *truth = malloc(sizeof(float) * grid_voxels(&grid));
+	struct recipe recipe = sart_on(&grid);
+	struct outcome outcome = {0};
+	struct scene scene = {0};
+	struct worst worst;
+
+	ck_assert_ptr_nonnull(truth);
+	if (body == NULL || !scene_sweep(&scene.geometry, &(struct sweep_spec){.bin = 8, .columns = 77, .every = 4})) {
+		free(truth);
+		free(body);
+		return;
+	}
+	for (size_t i = 0; i < grid_voxels(&fine); i++)
+		body[i] = fmaxf(0, 0.0192f * (1 + body[i] / 1000));
+	scene.projections = malloc(sizeof(float) * 77 * 60 * 62);
+	ck_assert_ptr_nonnull(scene.projections);
+	for (int view = 0; view < scene.geometry.count; view++)
+		volume_project_fine(body, &fine, &scene.geometry, view, SAMPLE_TRILINEAR, 3,
+				    scene.projections + (size_t)77 * 60 * (size_t)view);
+	/* Each voxel of the grid is the mean of those of the body whose centres lie in it. */
+	for (size_t at = 0; at < grid_voxels(&grid); at++) {
+		const int index[3] = {(int)at % grid.size[0], (int)at / grid.size[0] % grid.size[1],
+				      (int)at / grid.size[0] / grid.size[1]};
+		int first[3], last[3], count = 0;
+		double sum = 0;
+
+		for (int a = 0; a < 3; a++) {
+			const double low = grid.origin[a] + (index[a] - 0.5) * grid.spacing[a] - fine.origin[a];
+
+			first[a] = (int)fmax(0, ceil(low / fine.spacing[a]));
+			last[a] = (int)fmin(fine.size[a] - 1, floor((low + grid.spacing[a]) / fine.spacing[a]));
+		}
+		for (int z = first[2]; z <= last[2]; z++)
+			for (int y = first[1]; y <= last[1]; y++)
+				for (int x = first[0]; x <= last[0]; x++, count++)
+					sum += (double)body[((size_t)z * 101 + (size_t)y) * 122 + (size_t)x];
+		truth[at] = count > 0 ? (float)(sum / count) : 0;
+	}
+	run(&scene, &recipe, &outcome);
+	worst = slice_errors(&scene.geometry, &grid, outcome.last, truth);
+	ck_assert_msg(worst.seen < 30 && worst.any < 40, "%.1f HU where all views see it, else %.1f HU", worst.seen,
+		      worst.any);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(truth);
+	free(body);
+}
+END_TEST
+
+/* With truncated rows taken as they are, too: the two are different matters. A head, and a grid inside of it. */
+START_TEST(what_lies_outside_of_the_grid_is_looked_at_whatever_is_done_about_truncated_rows)
+{
+	const struct orbit_spec spec = {80, 60, 90, {620, 1100, {4, 4}, {0, 0}, {0, 0}}, 0, 4};
+	struct ellipsoid head[] = {
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {65, 78, 60}, .density = 0.035},
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {59, 72, 54}, .density = 0.0192 - 0.035},
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {8, 8, 8}, .centre = {10, 5, 4}, .density = 0.001},
+	};
+	const struct phantom phantom = {3, head};
+	struct grid grid = grid_of(24, 24, 20, 3, 3, 3);
+	struct recipe recipe = sart_on(&grid);
+	float *truth = malloc(sizeof(float) * grid_voxels(&grid));
+	struct outcome outcome = {0};
+	struct scene scene;
+	struct worst worst;
+
+	ck_assert_ptr_nonnull(truth);
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	phantom_voxelise(&phantom, &grid, 3, truth);
+	recipe.fdk.extend = _i == 0;
+	run(&scene, &recipe, &outcome);
+	worst = slice_errors(&scene.geometry, &grid, outcome.last, truth);
+	ck_assert_msg(worst.any < 20, "%.1f HU", worst.any);
+	ck_assert_ptr_nonnull(strstr(outcome.warnings, "outside_grid: "));
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(truth);
+}
+END_TEST
+
+/* With some views blank, which say nothing of what lies beyond the ends either. */
+START_TEST(blank_views_are_not_taken_for_air)
+{
+	struct grid grid = grid_between(65, 65, 5);
+	struct recipe recipe = sart_on(&grid);
+	float *truth = malloc(sizeof(float) * grid_voxels(&grid));
+	struct outcome outcome = {.linearise = {.quantity = QUANTITY_INTENSITY, .air = 1}};
+	struct scene scene = {0};
+	struct worst worst;
+
+	ck_assert_ptr_nonnull(truth);
+	scan_of(&scene, CIRCLE, &trunk);
+	phantom_voxelise(&trunk, &grid, 3, truth);
+	for (size_t i = 0; i < (size_t)COLUMNS * ROWS * 72; i++)
+		scene.projections[i] = i / (COLUMNS * ROWS) % 9 == 4 ? 0 : expf(-scene.projections[i]);
+	run(&scene, &recipe, &outcome);
+	worst = slice_errors(&scene.geometry, &grid, outcome.last, truth);
+	ck_assert_msg(worst.seen < 20 && worst.any < 40, "%.1f HU where all views see it, else %.1f HU", worst.seen,
+		      worst.any);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(truth);
+}
+END_TEST
+
+/* Any number of threads, a run that has yielded, and just the memory that the job says: the same bits. */
+START_TEST(the_same_bits_with_other_threads_after_a_yield_and_in_just_the_memory_that_was_said)
+{
+	struct grid grid = grid_between(75, 75, 5);
+	struct recipe recipe = sart_on(&grid);
+	struct outcome whole = {.threads = 1}, first = {.threads = 2, .yield_at = 2}, second = {.threads = 2};
+	struct recon_memory memory;
+	struct scene scene = {0};
+	struct device *device;
+	struct error err;
+
+	scan_of(&scene, CIRCLE, &trunk);
+	recipe.sart.iterations = 3;
+	recipe.projector = _i == 0 ? PROJECTOR_INTERPOLATING : PROJECTOR_MATCHED;
+	run(&scene, &recipe, &whole);
+	scene_run(&scene, &recipe, &first);
+	ck_assert_int_eq(first.code, ERR_BUSY);
+	second.resume = first.last;
+	second.resume_iteration = first.iteration;
+	ck_assert_int_eq(backend_cpu.open(0, &(struct device_options){.threads = 2}, &device, &err), 0);
+	ck_assert_int_eq(recon_memory(&backend_cpu, device, &scene.geometry, &recipe, &memory, &err), 0);
+	backend_cpu.close(device);
+	second.memory_limit = memory.total;
+	run(&scene, &recipe, &second);
+	ck_assert_mem_eq(second.last, whole.last, sizeof(float) * grid_voxels(&grid));
+	outcome_clear(&whole);
+	outcome_clear(&first);
+	outcome_clear(&second);
+	scene_clear(&scene);
+}
+END_TEST
+
+#define COUNT(table) ((int)(sizeof(table) / sizeof((table)[0])))
+
+Suite *exterior_suite(void)
+{
+	Suite *suite = suite_create("exterior");
+	TCase *tests = tcase_create("slices"), *bits = tcase_create("bits");
+
+	tcase_set_timeout(tests, 0);
+	tcase_set_timeout(bits, 0);
+	tcase_add_loop_test(tests, the_end_slices_of_a_trunk_longer_than_the_panel_are_true, 0, COUNT(ends));
+	tcase_add_loop_test(tests, a_poor_orbit_does_not_pile_the_trunk_up, 0, 2);
+	tcase_add_loop_test(tests, a_real_abdomen_keeps_its_end_slices, 0, 2);
+	tcase_add_loop_test(tests, what_lies_outside_of_the_grid_is_looked_at_whatever_is_done_about_truncated_rows, 0,
+			    2);
+	tcase_add_test(tests, blank_views_are_not_taken_for_air);
+	tcase_add_loop_test(bits, the_same_bits_with_other_threads_after_a_yield_and_in_just_the_memory_that_was_said,
+			    0, 2);
+	suite_add_tcase(suite, tests);
+	suite_add_tcase(suite, bits);
+	return suite;
+}
