@@ -126,32 +126,6 @@ int image_put(void *context, struct request *request, struct error *err)
 
 /* ---- out ---- */
 
-/* Its samples, held against their checksum; free them. */
-static int read_projection(struct stored_scan *scan, int index, void **ret_samples, uint8_t ret_sha256[32],
-			   struct error *err)
-{
-	size_t size = scan_projection_bytes(stored_scan_parsed(scan));
-	void *samples = malloc(size);
-	struct sum sum;
-	int file = -1, code = 0;
-
-	if (samples == NULL)
-		code = error_set(err, ERR_NO_MEMORY, "no memory for a projection of %zu bytes", size);
-	if (code == 0)
-		code = stored_scan_open(scan, false, &file, err);
-	if (code == 0)
-		code = stored_scan_read(scan, file, index, samples, &sum, err);
-	if (file >= 0)
-		close(file);
-	if (code != 0) {
-		free(samples);
-		return code;
-	}
-	memcpy(ret_sha256, sum.sha256, 32);
-	*ret_samples = samples;
-	return 0;
-}
-
 /* As float; the smallest finite sample and the largest. */
 static void read_samples(const void *samples, const struct scan *scan, size_t count, float *ret_values,
 			 struct slice *ret_range)
@@ -210,14 +184,17 @@ static void make_etag(const uint8_t sha256[32], const char *kind, char ret_etag[
 	snprintf(ret_etag, ETAG_MAX, "\"%s%s\"", digest, kind);
 }
 
-static int reply_picture(struct request *request, const struct scan *scan, const void *samples,
+static int reply_picture(struct request *request, struct stored_scan *stored, int descriptor, int index,
 			 const uint8_t sha256[32], struct error *err)
 {
 	enum { PICTURE_PIXELS_MAX = 64 << 20 };
+	const struct scan *scan = stored_scan_parsed(stored);
 	size_t size = scan_projection_bytes(scan), length;
 	char *png, etag[ETAG_MAX];
 	const struct entity entity = {.etag = etag, .size = UNKNOWN_SIZE, .media_type = "image/png"};
 	struct selection selection;
+	struct sum sum;
+	void *samples;
 	bool done;
 	int code;
 
@@ -227,16 +204,22 @@ static int reply_picture(struct request *request, const struct scan *scan, const
 	if (size > PICTURE_PIXELS_MAX * sample_bytes(scan->sample))
 		return error_set(err, ERR_IMPOSSIBLE, "a picture has at most %d pixels, the projection %zu",
 				 PICTURE_PIXELS_MAX, size / sample_bytes(scan->sample));
-	code = draw(samples, scan, &png, &length, err);
+	samples = malloc(size);
+	if (samples == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a picture");
+	code = stored_scan_read(stored, descriptor, index, samples, &sum, err);
+	if (code == 0)
+		code = draw(samples, scan, &png, &length, err);
 	if (code == 0)
 		code = request_reply_bytes(request, 200, png, length, err);
+	free(samples);
 	if (code == 0)
 		entity_headers(request, &entity, &selection);
 	return code;
 }
 
-/* Takes the samples. */
-static int reply_samples(struct request *request, const struct scan *scan, char *samples, int index,
+/* From the file, once it was held against its checksum. Takes the descriptor. */
+static int reply_samples(struct request *request, const struct scan *scan, int descriptor, int index,
 			 const uint8_t sha256[32], struct error *err)
 {
 	char etag[ETAG_MAX], filename[96];
@@ -250,12 +233,11 @@ static int reply_samples(struct request *request, const struct scan *scan, char 
 	make_etag(sha256, "", etag);
 	snprintf(filename, sizeof(filename), "%.40s-%d.raw", request_argument(request, 0), index);
 	if (entity_select(request, &entity, &selection, &done, err) != 0 || done) {
-		free(samples);
+		close(descriptor);
 		return done ? 0 : err->code;
 	}
-	if (selection.first > 0)
-		memmove(samples, samples + selection.first, selection.length);
-	if (request_reply_bytes(request, selection.status, samples, selection.length, err) != 0)
+	if (request_reply_file(request, selection.status, descriptor, (uint64_t)index * entity.size + selection.first,
+			       selection.length, err) != 0)
 		return err->code;
 	entity_headers(request, &entity, &selection);
 	return 0;
@@ -266,9 +248,8 @@ static int reply_projection(struct request *request, struct stored_scan *stored,
 	static const char *const formats[] = {"raw", "png", NULL};
 	const struct scan *scan = stored_scan_parsed(stored);
 	const char *text = request_argument(request, 1);
-	int format, code;
-	void *samples;
-	uint8_t sha256[32];
+	int format, descriptor, code;
+	struct sum sum;
 	long index;
 
 	if (query_choice(request, "format", formats, &format, err) != 0)
@@ -276,12 +257,14 @@ static int reply_projection(struct request *request, struct stored_scan *stored,
 	if (!index_parse(text, strlen(text), scan->count - 1, &index))
 		return error_set(err, ERR_NOT_FOUND, "projection \"%.40s\" is asked for, the scan has 0 to %d", text,
 				 scan->count - 1);
-	if (read_projection(stored, (int)index, &samples, sha256, err) != 0)
+	if (stored_scan_open(stored, false, &descriptor, err) != 0)
 		return err->code;
-	if (format == 0)
-		return reply_samples(request, scan, samples, (int)index, sha256, err);
-	code = reply_picture(request, scan, samples, sha256, err);
-	free(samples);
+	code = stored_scan_verify(stored, descriptor, (int)index, &sum, err);
+	if (code == 0 && format == 0)
+		return reply_samples(request, scan, descriptor, (int)index, sum.sha256, err);
+	if (code == 0)
+		code = reply_picture(request, stored, descriptor, (int)index, sum.sha256, err);
+	close(descriptor);
 	return code;
 }
 

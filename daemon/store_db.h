@@ -4,6 +4,7 @@
 #include <pthread.h>
 #include <sqlite3.h>
 #include <stdatomic.h>
+#include <sys/stat.h>
 
 #include "daemon/store.h"
 
@@ -124,6 +125,9 @@ int store_note_deletion(struct store *store, int kind, const char *id, struct er
 struct verified;
 int verified_new(struct verified **ret_verified, struct error *err);
 void verified_free(struct verified *verified); /* NULL is fine */
+/* Parts of any file, by their numbers, as long as nobody writes to it. */
+bool verified_knows(struct verified *verified, const struct stat *status, int part);
+void verified_note(struct verified *verified, const struct stat *status, int part);
 
 /* Seconds since 1970. */
 double time_now(void);

@@ -13,6 +13,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/resource.h>
+#include <sys/stat.h>
 #include <unistd.h>
 
 #include "daemon/log.h"
@@ -226,30 +227,86 @@ static void note_checked(struct stored_scan *scan, int index, const struct sum *
 	close(file);
 }
 
+static int lose(struct stored_scan *scan, int index, const struct sum *sum, struct error *err)
+{
+	stored_scan_lose(scan, index, sum);
+	return error_set(err, ERR_DAMAGED,
+			 "projection %d is damaged on the disk: it counts as missing and can be sent again", index);
+}
+
 int stored_scan_read(struct stored_scan *scan, int descriptor, int index, void *ret_samples, struct sum *ret_sum,
 		     struct error *err)
 {
 	size_t bytes = projection_bytes(scan);
 	struct sum sum;
+	uint32_t crc;
+
+	if (!stored_scan_sum(scan, index, &sum))
+		return error_set(err, ERR_NOT_FOUND, "projection %d has not been stored yet", index);
+	if (file_read_at(descriptor, ret_samples, bytes, (size_t)index * bytes, "projections.raw", err) != 0)
+		return lose(scan, index, &sum, err);
+	crc = checksum(0, ret_samples, bytes);
+	if (sum.bytes != 0 ? crc != sum.crc : !fits_sha256(ret_samples, bytes, sum.sha256))
+		return lose(scan, index, &sum, err);
+	if (sum.bytes == 0)
+		note_checked(scan, index, &sum, crc);
+	*ret_sum = sum;
+	return 0;
+}
+
+/* Piece by piece, each while it is in the processor's cache. */
+static int sum_samples(int descriptor, size_t offset, size_t bytes, uint32_t *ret_crc, struct error *err)
+{
+	enum { PIECE = 256 << 10 };
+	char *piece = malloc(PIECE);
 	uint32_t crc = 0;
-	bool fits;
+	int code = piece == NULL ? error_set_errno(err, ENOMEM, "samples") : 0;
+
+	for (size_t at = 0; at < bytes && code == 0; at += PIECE) {
+		size_t some = bytes - at < PIECE ? bytes - at : PIECE;
+
+		code = file_read_at(descriptor, piece, some, offset + at, "projections.raw", err);
+		if (code == 0)
+			crc = checksum(crc, piece, some);
+	}
+	free(piece);
+	*ret_crc = crc;
+	return code;
+}
+
+int stored_scan_verify(struct stored_scan *scan, int descriptor, int index, struct sum *ret_sum, struct error *err)
+{
+	size_t bytes = projection_bytes(scan);
+	struct stat status;
+	struct sum sum;
+	uint32_t crc;
+	void *samples;
 	int code;
 
 	if (!stored_scan_sum(scan, index, &sum))
 		return error_set(err, ERR_NOT_FOUND, "projection %d has not been stored yet", index);
-	code = file_read_at(descriptor, ret_samples, bytes, (size_t)index * bytes, "projections.raw", err);
-	if (code == 0)
-		crc = checksum(0, ret_samples, bytes);
-	fits = code == 0 && (sum.bytes != 0 ? crc == sum.crc : fits_sha256(ret_samples, bytes, sum.sha256));
-	if (fits && sum.bytes == 0)
-		note_checked(scan, index, &sum, crc);
-	if (fits) {
+	if (fstat(descriptor, &status) != 0)
+		return error_set_errno(err, errno, "projections.raw cannot be read");
+	if (verified_knows(scan->store->verified, &status, index)) {
 		*ret_sum = sum;
 		return 0;
 	}
-	stored_scan_lose(scan, index, &sum);
-	return error_set(err, ERR_DAMAGED,
-			 "projection %d is damaged on the disk: it counts as missing and can be sent again", index);
+	if (sum.bytes == 0) { /* only its SHA-256 is known */
+		samples = malloc(bytes);
+		if (samples == NULL)
+			return error_set(err, ERR_NO_MEMORY, "no memory for a projection of %zu bytes", bytes);
+		code = stored_scan_read(scan, descriptor, index, samples, ret_sum, err);
+		free(samples);
+		return code;
+	}
+	code = sum_samples(descriptor, (size_t)index * bytes, bytes, &crc, err);
+	if (code == ERR_NO_MEMORY)
+		return code;
+	if (code != 0 || crc != sum.crc)
+		return lose(scan, index, &sum, err);
+	verified_note(scan->store->verified, &status, index);
+	*ret_sum = sum;
+	return 0;
 }
 
 static int get_part(const struct stored_scan *scan, enum sums_part part, struct sum *ret_sum, bool *ret_known,

@@ -110,7 +110,7 @@ static void note_all(struct verified *verified, const struct stat *status)
 	pthread_mutex_unlock(&verified->lock);
 }
 
-static void note_block(struct verified *verified, const struct stat *status, int block)
+void verified_note(struct verified *verified, const struct stat *status, int block)
 {
 	if (block >= BLOCKS_MAX)
 		return;
@@ -131,7 +131,7 @@ static bool knows_all(struct verified *verified, const struct stat *status)
 	return all;
 }
 
-static bool knows_block(struct verified *verified, const struct stat *status, int block)
+bool verified_knows(struct verified *verified, const struct stat *status, int block)
 {
 	const struct known *known;
 	bool whole;
@@ -175,11 +175,11 @@ static int check_blocks(struct verified *verified, int file, const struct stat *
 	if (buffer == NULL)
 		return error_set_errno(err, ENOMEM, "a block of a volume");
 	for (int block = 0; block < seal->count && block <= to && code == 0; block++) {
-		if ((block > 0 && block < from) || knows_block(verified, status, block))
+		if ((block > 0 && block < from) || verified_knows(verified, status, block))
 			continue;
 		code = check_block(file, seal, block, buffer, volume, err);
 		if (code == 0)
-			note_block(verified, status, block);
+			verified_note(verified, status, block);
 	}
 	free(buffer);
 	return code;

@@ -9,6 +9,9 @@
 #include <string.h>
 #include <unistd.h>
 #include <zlib.h>
+#ifdef __x86_64__
+#include <wmmintrin.h>
+#endif
 
 #include "proto/spool.h"
 
@@ -16,8 +19,57 @@ enum { SLOT_LEAST = SUMS_SCAN, CHECKED_BYTES = SUMS_RECORD_BYTES - 4 };
 
 _Static_assert(SUMS_FIRST + SUMS_RECORD_BYTES * SLOT_LEAST == SUMS_RECORD_BYTES, "the line lies before the first part");
 
+#ifdef __x86_64__
+/*
+ * The same CRC by carry-less multiplication, four times as fast as zlib's tables: 128 bits of the message, times x to
+ * the power of a distance, are as good modulo the polynomial at that distance (Gopal and others, "Fast CRC Computation
+ * for Generic Polynomials Using PCLMULQDQ", Intel 2009). The numbers are x^(d+64) and x^d mod P for d = 512 - 32 and
+ * 128 - 32 bits, all bit-reflected. What is left in the end are 16 bytes that zlib sums.
+ */
+enum { FOLD_LEAST = 128 };
+
+__attribute__((target("pclmul"))) static __m128i fold(__m128i part, __m128i by, __m128i next)
+{
+	__m128i low = _mm_clmulepi64_si128(part, by, 0x00), high = _mm_clmulepi64_si128(part, by, 0x11);
+
+	return _mm_xor_si128(_mm_xor_si128(low, high), next);
+}
+
+/* `bytes` is a multiple of 16, at least 64. */
+__attribute__((target("pclmul"))) static uint32_t checksum_folded(uint32_t before, const uint8_t *data, size_t bytes)
+{
+	const __m128i by64 = _mm_set_epi64x(0x1c6e41596, 0x154442bd4), by16 = _mm_set_epi64x(0x0ccaa009e, 0x1751997d0);
+	const __m128i *from = (const __m128i *)(const void *)data, *end = from + bytes / 16;
+	uint8_t rest[16];
+	__m128i x[4];
+
+	for (int i = 0; i < 4; i++)
+		x[i] = _mm_loadu_si128(from + i);
+	x[0] = _mm_xor_si128(x[0], _mm_cvtsi32_si128((int)~before));
+	for (from += 4; end - from >= 4; from += 4) {
+		for (int i = 0; i < 4; i++)
+			x[i] = fold(x[i], by64, _mm_loadu_si128(from + i));
+	}
+	for (int i = 1; i < 4; i++)
+		x[0] = fold(x[0], by16, x[i]);
+	for (; from < end; from++)
+		x[0] = fold(x[0], by16, _mm_loadu_si128(from));
+	_mm_storeu_si128((__m128i *)(void *)rest, x[0]);
+	return (uint32_t)crc32_z(~0u, rest, sizeof(rest)); /* which takes ~0 for a register of zeros */
+}
+#endif
+
 uint32_t checksum(uint32_t before, const void *data, size_t bytes)
 {
+#ifdef __x86_64__
+	if (bytes >= FOLD_LEAST && __builtin_cpu_supports("pclmul")) {
+		size_t whole = bytes & ~(size_t)15;
+
+		before = checksum_folded(before, data, whole);
+		data = (const uint8_t *)data + whole;
+		bytes -= whole;
+	}
+#endif
 	return (uint32_t)crc32_z(before, data, bytes);
 }
 

@@ -76,6 +76,43 @@ START_TEST(the_checksum_is_crc_32)
 }
 END_TEST
 
+/* Bit by bit, as the standard has it. */
+static uint32_t crc_by_definition(uint32_t before, const uint8_t *bytes, size_t count)
+{
+	uint32_t crc = ~before;
+
+	for (size_t i = 0; i < count; i++) {
+		crc ^= bytes[i];
+		for (int bit = 0; bit < 8; bit++)
+			crc = crc >> 1 ^ (crc & 1 ? 0xedb88320u : 0);
+	}
+	return ~crc;
+}
+
+START_TEST(the_checksum_is_the_same_however_much_and_wherever_it_lies)
+{
+	uint8_t bytes[700];
+	uint32_t random = 1;
+
+	for (size_t i = 0; i < sizeof(bytes); i++) {
+		random = random * 1664525 + 1013904223;
+		bytes[i] = (uint8_t)(random >> 24);
+	}
+	for (size_t first = 0; first < 17; first++)
+		for (size_t count = 0; count + first <= sizeof(bytes); count++) {
+			uint32_t before = count % 3 == 0 ? 0 : random * (uint32_t)count;
+
+			ck_assert_uint_eq(checksum(before, bytes + first, count),
+					  crc_by_definition(before, bytes + first, count));
+		}
+	for (size_t count = 0; count <= sizeof(bytes); count += 7)
+		ck_assert_uint_eq(checksum_join(checksum(0, bytes, count),
+						checksum(0, bytes + count, sizeof(bytes) - count),
+						sizeof(bytes) - count),
+				  crc_by_definition(0, bytes, sizeof(bytes)));
+}
+END_TEST
+
 START_TEST(records_are_read_as_they_were_written)
 {
 	struct sum sums[COUNT - SUMS_SCAN];
@@ -215,6 +252,7 @@ Suite *sums_suite(void)
 
 	tcase_add_checked_fixture(tests, set_up, tear_down);
 	tcase_add_test(tests, the_checksum_is_crc_32);
+	tcase_add_test(tests, the_checksum_is_the_same_however_much_and_wherever_it_lies);
 	tcase_add_test(tests, records_are_read_as_they_were_written);
 	tcase_add_test(tests, a_flipped_bit_makes_a_record_void);
 	tcase_add_test(tests, a_record_of_other_bytes_is_void);
