@@ -134,6 +134,7 @@ static void look_at_line_integrals(struct input *input, const void *samples)
 		if (!isfinite(p) || (input->map.map != NULL && input->map.map[i]))
 			continue;
 		input->sum += (double)p;
+		input->most = p > input->most ? p : input->most;
 		input->looked_at++;
 	}
 }
@@ -304,6 +305,11 @@ static void warn_of_line_integrals(const struct input *input, const struct recon
 		    hooks, "line_integrals",
 		    "the line integrals are %.4g in the mean, where air is 0 and all else more: is their sign turned?",
 		    mean);
+	else if (input->looked_at > 0 && input->most <= 0)
+		recon_warn(
+		    hooks, "line_integrals",
+		    "none of %zu line integrals that were looked at is above 0: there is nothing but air in the scan",
+		    input->looked_at);
 }
 
 /* What has its bytes exchanged is noise. So are 8 bits in the upper byte, but for being below 256 the other way. */

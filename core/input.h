@@ -17,6 +17,7 @@ struct input {
 	size_t pixels;              /* of a view */
 	/* Of about 4096 pixels of each view. */
 	double sum; /* of line integrals */
+	float most; /* of them, at least 0 */
 	size_t looked_at;
 	/* Of about 32 views: how many were looked at, and how many had something that is not air on the first row and
 	 * on the last one. */

@@ -17,8 +17,13 @@ struct head {
 	const char *host;
 	size_t host_length;
 	int fields, hosts, lengths, encodings, cookies;
+	unsigned single; /* a bit for each of single_names that came */
 	uint64_t length;
 };
+
+/* Fields of one value: a proxy may go by the first of two where this daemon goes by the last, or the other way. */
+static const char *const single_names[] = {"Origin",        "Sec-Fetch-Site", "Idempotency-Key", "Content-Type",
+					   "Content-Range", "Authorization",  "If-Range",        "Last-Event-ID"};
 
 struct field {
 	const char *name, *value;
@@ -161,8 +166,22 @@ static bool read_length(struct framing *framing, struct head *head, const struct
 	return true;
 }
 
+static bool is_new_if_single(struct framing *framing, struct head *head, const struct field *field)
+{
+	for (size_t i = 0; i < sizeof(single_names) / sizeof(single_names[0]); i++) {
+		if (!is_name(field, single_names[i]))
+			continue;
+		if (head->single & 1u << i)
+			return refuse(framing, 400, "%s comes twice: which one counts?", single_names[i]);
+		head->single |= 1u << i;
+	}
+	return true;
+}
+
 static bool read_field(struct framing *framing, struct head *head, const struct field *field)
 {
+	if (!is_new_if_single(framing, head, field))
+		return false;
 	if (is_name(field, "Host")) {
 		if (head->hosts++ > 0)
 			return refuse(framing, 400, "Host comes twice: who is meant?");

@@ -282,7 +282,7 @@ void store_volume_trust(struct store *store, const char *job, const struct volum
 {
 	struct stat status;
 	struct error err;
-	int file;
+	int file = -1;
 
 	if (open_volume(store, job, volume, &file, &err) != 0)
 		return;
