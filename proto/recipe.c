@@ -261,7 +261,7 @@ int job_request_read(const cJSON *value, struct job_request *ret_request, struct
 {
 	struct job_request request = {0};
 	struct json_reader reader;
-	const cJSON *stages[STAGES], *patient;
+	const cJSON *stages[STAGES], *patient, *labels;
 	int priority = PRIORITY_ROUTINE, precision = 0, projector = PROJECTOR_INTERPOLATING, code;
 
 	recipe_defaults(&request.recipe);
@@ -273,6 +273,7 @@ int job_request_read(const cJSON *value, struct job_request *ret_request, struct
 	stages[3] = json_member(&reader, "tv", false);
 	stages[4] = json_member(&reader, "metal", false);
 	patient = json_member(&reader, "patient", false);
+	labels = json_member(&reader, "labels", false);
 	json_choice(&reader, "projector", false, projector_names, PROJECTOR_COUNT, &projector);
 	json_choice(&reader, "priority", false, priority_names, PRIORITY_COUNT, &priority);
 	json_choice(&reader, "precision", false, precision_names, 2, &precision);
@@ -284,6 +285,8 @@ int job_request_read(const cJSON *value, struct job_request *ret_request, struct
 	code = json_end(&reader);
 	if (code == 0)
 		code = patient_read(patient, "/patient", &request.patient, err);
+	if (code == 0)
+		code = labels_read(labels, "/labels", request.labels, err);
 	if (code == 0)
 		code = read_stages(&request.recipe, stages, err);
 	if (code == 0 && names_no_stage(value))
@@ -458,6 +461,8 @@ static cJSON *request_document(const struct job_request *request)
 
 	cJSON_AddStringToObject(document, "scan", request->scan);
 	cJSON_AddItemToObject(document, "patient", patient_json(&request->patient));
+	if (request->labels[0] != '\0')
+		cJSON_AddItemToObject(document, "labels", cJSON_Parse(request->labels));
 	add_emit(document, &request->recipe);
 	cJSON_AddStringToObject(document, "priority", priority_names[request->priority]);
 	return document;
@@ -497,7 +502,7 @@ bool job_request_same(const struct job_request *a, const struct job_request *b)
 	const struct recipe *x = &a->recipe, *y = &b->recipe;
 
 	return strcmp(a->scan, b->scan) == 0 && a->priority == b->priority && patient_same(&a->patient, &b->patient) &&
-	       same_grid(x, y) && x->fdk.on == y->fdk.on &&
+	       strcmp(a->labels, b->labels) == 0 && same_grid(x, y) && x->fdk.on == y->fdk.on &&
 	       (!x->fdk.on ||
 		(x->fdk.window == y->fdk.window && x->fdk.cutoff == y->fdk.cutoff && x->fdk.extend == y->fdk.extend)) &&
 	       same_sart(x, y) && same_tv(x, y) && x->metal.on == y->metal.on &&

@@ -2,6 +2,7 @@
 #define CBCT_PROTO_RECIPE_H
 
 #include "core/recon.h"
+#include "proto/labels.h"
 #include "proto/scan.h"
 
 enum priority { PRIORITY_ROUTINE, PRIORITY_URGENT, PRIORITY_STAT, PRIORITY_COUNT };
@@ -11,8 +12,9 @@ extern const char *const priority_names[PRIORITY_COUNT];
 struct job_request {
 	char scan[64];
 	enum priority priority;
-	struct patient patient; /* of the scan, once resolved, unless the job says otherwise */
-	struct recipe recipe;   /* owned: recipe_clear */
+	char labels[LABELS_TEXT_MAX]; /* JSON, "" for none */
+	struct patient patient;       /* of the scan, once resolved, unless the job says otherwise */
+	struct recipe recipe;         /* owned: recipe_clear */
 };
 
 enum { EMITS_MAX = 10000 }; /* each is a volume on the disk, and all of them fit into one message to the worker */

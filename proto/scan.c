@@ -15,6 +15,8 @@
 
 #include "core/warning.h"
 
+#include "proto/labels.h"
+
 const char *const sample_names[2] = {"float32", "uint16"};
 const char *const quantity_names[2] = {"line_integral", "intensity"};
 
@@ -327,7 +329,8 @@ static void drop_nulls(cJSON *object)
 static int read_document(struct scan *scan, struct error *err)
 {
 	struct json_reader reader;
-	const cJSON *detector, *projections, *geometry, *patient;
+	const cJSON *detector, *projections, *geometry, *patient, *labels;
+	char text[LABELS_TEXT_MAX]; /* the document has them */
 	int code;
 
 	json_begin(&reader, scan->document, "", err);
@@ -336,9 +339,12 @@ static int read_document(struct scan *scan, struct error *err)
 	projections = json_member(&reader, "projections", true);
 	geometry = json_member(&reader, "geometry", true);
 	patient = json_member(&reader, "patient", false);
+	labels = json_member(&reader, "labels", false);
 	code = json_end(&reader);
 	if (code == 0)
 		code = patient_read(patient, "/patient", &scan->patient, err);
+	if (code == 0)
+		code = labels_read(labels, "/labels", text, err);
 	if (code == 0)
 		code = read_detector(scan, detector, err);
 	if (code == 0)

@@ -51,10 +51,10 @@ test_every_position_puts_each_mark_on_its_side_in_every_format() {
 		get_volume final "$work/whole.nii.gz" format=nifti.gz
 		[[ $(header content-disposition) == *"final.nii.gz"* && $(header content-type) == application/gzip* ]] || fail "its name and type"
 		[ -z "$(header content-encoding)" ] || fail "compressed by what it is"
-		gzip -dc "$work/whole.nii.gz" | cmp - "$state/jobs/$job/final.nii" || fail "the same file, compressed"
 		# The default is the kept file itself, and what is made of parts of it is the same.
 		get_volume final "$work/whole.nii"
 		cmp "$work/whole.nii" <(head -c "$(stat -c %s "$work/whole.nii")" "$state/jobs/$job/final.nii") || fail "the file as it is kept"
+		gzip -dc "$work/whole.nii.gz" | cmp - "$work/whole.nii" || fail "the same file, compressed"
 		at=$(($(stat -c %s "$work/whole.nii") - 4000))
 		req GET "/v1/jobs/$job/volumes/final" -H "Range: bytes=300-$at"
 		expect_status 206
@@ -99,6 +99,39 @@ test_documents_tell_the_patient_and_the_axes() {
 	expect_json '.patient == {position: "HFP"} and .axes == {x: "R", y: "A", z: "S"}'
 	req GET /v1/jobs
 	expect_json '.jobs[0].axes == {x: "R", y: "A", z: "S"}'
+}
+
+# Beside the patient: texts of the client's own.
+test_labels_are_kept_and_shown() {
+	local many
+	start_daemon
+	labels='{"case": "2231", "Seite \u00e9 \"x\"": "links, 3"}'
+	document=$(jq -n --argjson labels "$labels" '{detector: {columns: 4, rows: 3, pixel_mm: [1, 1]}, projections: {count: 2, sample: "float32", quantity: "line_integral"},
+		geometry: {kind: "circular", source_to_isocentre_mm: 600, source_to_detector_mm: 1000, angle_step_deg: 180}, labels: $labels}')
+	post() { req POST "$1" -H 'Content-Type: application/json' --data-binary "$2"; }
+	post /v1/scans "$document"
+	expect_status 201
+	expect_json ".labels == $labels"
+	scan=$(json .id)
+	post_job "{\"scan\": \"SCAN\", \"fdk\": {}, \"labels\": $labels}"
+	expect_json ".labels == $labels"
+	stop_daemon
+	start_daemon
+	req GET "/v1/jobs/$job"
+	expect_json ".labels == $labels"
+	req GET /v1/jobs
+	expect_json ".jobs[0].labels == $labels"
+	req GET "/v1/scans/$scan"
+	expect_json ".labels == $labels"
+	many=$(jq -nc '[range(33) | {key: "k\(.)", value: "v"}] | from_entries')
+	for labels in '[]' '{"a": 3}' '{"": "x"}' '{"a": "b\u0007"}'; do
+		post /v1/jobs "{\"scan\": \"$scan\", \"fdk\": {}, \"labels\": $labels}"
+		expect_problem 400 /labels
+	done
+	for labels in "$many" "{\"a\": \"$(printf 'x%.0s' {1..257})\"}"; do
+		post /v1/scans "$(jq -c --argjson labels "$labels" '.labels = $labels' <<<"$document")"
+		expect_problem 422 /labels
+	done
 }
 
 refused() { # STATUS POINTER PATIENT

@@ -41,7 +41,7 @@ const groups = [
 	] },
 ]
 /* Members of a job's document that are parts of its request, whether they have a field above or not. */
-const members = ['grid', 'fdk', 'sart', 'tv', 'emit', 'priority', 'precision', 'mu_water', 'projector', 'metal', 'patient']
+const members = ['grid', 'fdk', 'sart', 'tv', 'emit', 'priority', 'precision', 'mu_water', 'projector', 'metal', 'patient', 'labels']
 
 const path = pointer => pointer.split('/').slice(1)
 const at = (value, pointer) => path(pointer).reduce((part, key) => part?.[key], value)

@@ -1,0 +1,76 @@
+/* Labels of scans and jobs: see labels.h. */
+#include "proto/labels.h"
+
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+static int fail(struct error *err, int code, const char *base, const char *what)
+{
+	error_set(err, code, "%s", what);
+	snprintf(err->pointer, sizeof(err->pointer), "%s", base);
+	return code;
+}
+
+static bool has_control(const char *text)
+{
+	for (; *text != '\0'; text++)
+		if ((unsigned char)*text < 0x20 || *text == 0x7f)
+			return true;
+	return false;
+}
+
+static int check_label(const cJSON *label, const char *base, struct error *err)
+{
+	char what[100];
+	size_t name = strlen(label->string);
+
+	if (!cJSON_IsString(label))
+		return fail(err, ERR_INVALID, base, "a label is no text: {\"key\": \"value\"} is expected");
+	if (name == 0 || has_control(label->string) || has_control(label->valuestring))
+		return fail(err, ERR_INVALID, base, "a label without a name or with control characters");
+	if (name > LABEL_NAME_MOST || strlen(label->valuestring) > LABEL_MOST) {
+		snprintf(what, sizeof(what), "a name of %zu bytes with %zu, at most %d and %d are expected", name,
+			 strlen(label->valuestring), LABEL_NAME_MOST, LABEL_MOST);
+		return fail(err, ERR_IMPOSSIBLE, base, what);
+	}
+	return 0;
+}
+
+int labels_read(const cJSON *value, const char *base, char ret_text[LABELS_TEXT_MAX], struct error *err)
+{
+	const cJSON *label;
+	char what[100], *text;
+	size_t length = 0;
+	int code = 0;
+
+	if (value == NULL || cJSON_IsNull(value)) {
+		ret_text[0] = '\0';
+		return 0;
+	}
+	if (!cJSON_IsObject(value))
+		return fail(err, ERR_INVALID, base, "an object of texts is expected");
+	if (cJSON_GetArraySize(value) > LABELS_MOST) {
+		snprintf(what, sizeof(what), "%d labels, at most %d are expected", cJSON_GetArraySize(value),
+			 LABELS_MOST);
+		return fail(err, ERR_IMPOSSIBLE, base, what);
+	}
+	cJSON_ArrayForEach(label, value)
+	{
+		code = check_label(label, base, err);
+		if (code != 0)
+			return code;
+	}
+	text = json_print(value, &length);
+	if (text == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for labels");
+	if (length >= LABELS_TEXT_MAX) {
+		snprintf(what, sizeof(what), "labels of %zu bytes in all, at most %d are expected", length,
+			 LABELS_TEXT_MAX - 1);
+		code = fail(err, ERR_IMPOSSIBLE, base, what);
+	} else {
+		memcpy(ret_text, text, length + 1);
+	}
+	free(text);
+	return code;
+}

@@ -1,0 +1,21 @@
+#ifndef CBCT_PROTO_LABELS_H
+#define CBCT_PROTO_LABELS_H
+
+#include "proto/json.h"
+
+/* The member "labels" of scans and jobs: free texts under names of the client's own, kept and shown. */
+enum {
+	LABELS_MOST = 32,
+	LABEL_NAME_MOST = 64, /* bytes of UTF-8 */
+	LABEL_MOST = 256,
+	LABELS_TEXT_MAX = 4096 /* of all of them as JSON, its end included */
+};
+
+/*
+ * Reads {"key": "value", ...} and gives it as compact JSON, "" for none; NULL and
+ * null are none. ERR_INVALID for another type, an empty name, control characters;
+ * ERR_IMPOSSIBLE for too many and too long ones.
+ */
+int labels_read(const cJSON *value, const char *base, char ret_text[LABELS_TEXT_MAX], struct error *err);
+
+#endif
