@@ -188,6 +188,9 @@ static ssize_t next_part(struct stream *stream)
 		return -1;
 	if (name[0] != '\0') {
 		code = volume_find(stream->api, &stream->facts, name, &volume, &err);
+		/* What is gone is left out, as long as no part of it was begun; the job's document tells of it. */
+		if (code == 0 && volume_verify(stream->api, stream->facts.id, &volume, 0, 0, &err) == ERR_DAMAGED)
+			return 0;
 		if (code == 0)
 			return begin_part(stream, &volume);
 		/* Told of before a crash that took it: the job makes it again. */

@@ -375,6 +375,8 @@ int store_job_digest_volume(struct store *store, const char *id, const struct vo
  */
 int store_volume_verify(struct store *store, const char *job, const struct volume_record *volume, uint64_t first,
 			uint64_t bytes, struct error *err);
+/* ERR_DAMAGED, and the words for a volume whose file is gone though its job is not. */
+int store_volume_gone(const struct volume_record *volume, struct error *err);
 /* A worker has just made the file: what is read of it is still in memory. */
 void store_volume_trust(struct store *store, const char *job, const struct volume_record *volume);
 /* The jobs that have volumes without a digest. */

@@ -12,6 +12,7 @@
 #include "daemon/store_deleted.h"
 #include "daemon/store_quarantine.h"
 #include "daemon/store_record.h"
+#include "proto/json.h"
 #include "proto/spool.h"
 
 enum { REMOVALS_KEPT = 1000 /* a page that was away for longer reads its list anew */ };
@@ -857,15 +858,36 @@ static int sweep_file(void *context, const char *name, struct error *err)
 	return 0;
 }
 
+/* A volume that is gone is a warning of its job; one that cannot be written now is told to who asks for the volume. */
+static void tell_gone(const struct sweep *sweep, const struct volume_record *volume)
+{
+	struct warning_record warning = {.code = "damaged_volume"};
+	struct event event = {.kind = "warning"};
+	cJSON *document;
+	struct error err;
+	bool new;
+
+	store_volume_gone(volume, &err);
+	log_line(LEVEL_ERROR, "job %s: %s", sweep->id, err.text);
+	snprintf(warning.detail, sizeof(warning.detail), "%s", err.text);
+	document = json_warning(warning.code, warning.detail);
+	event.data = json_print(document, NULL);
+	cJSON_Delete(document);
+	if (event.data == NULL)
+		return;
+	if (store_job_add_warning(sweep->store, sweep->id, &warning, &event, &new, &err) != 0)
+		log_line(LEVEL_WARNING, "job %s: a warning cannot be written: %s", sweep->id, err.text);
+	free(event.data);
+}
+
 static void check_volumes(const struct sweep *sweep)
 {
 	char path[1024];
 
 	for (int i = 0; i < sweep->count; i++) {
 		store_volume_path(sweep->store, sweep->id, sweep->volumes[i].name, path);
-		if (access(path, R_OK) != 0)
-			log_line(LEVEL_ERROR, "job %s: its volume %s is in the catalogue, but %s is not there",
-				 sweep->id, sweep->volumes[i].name, path);
+		if (access(path, F_OK) != 0 && errno == ENOENT)
+			tell_gone(sweep, &sweep->volumes[i]);
 	}
 }
 

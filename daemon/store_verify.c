@@ -185,6 +185,11 @@ static int check_blocks(struct verified *verified, int file, const struct stat *
 	return code;
 }
 
+int store_volume_gone(const struct volume_record *volume, struct error *err)
+{
+	return damaged(err, volume, "its file is gone");
+}
+
 /* One without checksums, or whose checksums are damaged: what the catalogue says of its voxels decides. */
 static int check_digest(int file, const struct stat *status, const struct volume_record *volume, struct error *err)
 {
