@@ -179,9 +179,10 @@ static int connection_error(struct connection *connection, int result, const cha
 {
 	struct store *store = connection->store;
 	int cause = sqlite3_system_errno(connection->db);
-	bool full = result == SQLITE_FULL ||
-		    (result == SQLITE_IOERR && sqlite3_extended_errcode(connection->db) != SQLITE_IOERR_FSYNC &&
-		     (cause == ENOSPC || cause == EDQUOT));
+	bool full =
+	    result == SQLITE_FULL ||
+	    (result == SQLITE_IOERR && sqlite3_extended_errcode(connection->db) != SQLITE_IOERR_FSYNC &&
+	     (cause == ENOSPC || cause == EDQUOT || sqlite3_extended_errcode(connection->db) == SQLITE_IOERR_SHMSIZE));
 	char text[200];
 
 	snprintf(text, sizeof(text), "%.60s: %.120s", what, sqlite3_errmsg(connection->db));
@@ -464,9 +465,7 @@ static int connection_open(struct store *store, struct connection *connection, s
 	}
 	if (result != SQLITE_OK && is_damage(connection->db, result & 0xff))
 		atomic_store(&store->damaged, true);
-	if (result != SQLITE_OK)
-		return error_set(err, ERR_IO, "open %s: %s", path, sqlite3_errmsg(connection->db));
-	return 0;
+	return result != SQLITE_OK ? connection_error(connection, result & 0xff, "open", err) : 0;
 }
 
 static void connection_close(struct connection *connection)
@@ -624,14 +623,25 @@ static int make_private(const struct store *store, struct error *err)
 	return code;
 }
 
-/* All of the log into the database, so that every page of it can be checked. */
+/*
+ * All of the log into the database, so that every page of it can be checked. Where the disk has no room for that the
+ * log stays, and each page is checked when it is read.
+ */
 static int empty_log(struct store *store, struct error *err)
 {
 	char path[1024];
-	int result = sqlite3_wal_checkpoint_v2(store->writer.db, NULL, SQLITE_CHECKPOINT_TRUNCATE, NULL, NULL), code;
+	int result, code;
 
-	if (result != SQLITE_OK)
-		return connection_error(&store->writer, result & 0xff, "checkpoint", err);
+	do {
+		result = sqlite3_wal_checkpoint_v2(store->writer.db, NULL, SQLITE_CHECKPOINT_TRUNCATE, NULL, NULL);
+		code = result == SQLITE_OK ? 0 : connection_error(&store->writer, result & 0xff, "checkpoint", err);
+	} while (code == ERR_NO_SPACE && store_reserve_spend(store));
+	if (code == ERR_NO_SPACE) {
+		log_line(LEVEL_WARNING, "the log of the catalogue stays: %s", err->text);
+		return 0;
+	}
+	if (code != 0)
+		return code;
 	catalogue_path(store, "", path);
 	code = pages_check(path, err);
 	if (code != 0)
@@ -735,6 +745,12 @@ static int open_catalogue(struct store *store, bool rebuild, struct error *err)
 	if (code != 0)
 		return code;
 	code = load(store, err);
+	/* What the start itself writes is small: the index of the log, records that follow. */
+	if (code == ERR_NO_SPACE && store_reserve_spend(store)) {
+		unload(store);
+		store->repairs = (struct store_repairs){.remade = false};
+		code = load(store, err);
+	}
 	if (code != 0 && atomic_load(&store->damaged) && !rebuild) {
 		snprintf(why, sizeof(why), "the catalogue is damaged and made again from the directories: %.300s",
 			 err->text);
@@ -850,10 +866,13 @@ bool store_reserve_spend(const struct store *store)
 	return true;
 }
 
-/* A small disk, or one that is nearly full, keeps most of itself; the reserve grows when there is more. */
+/*
+ * A small disk, or one that is nearly full, keeps most of itself; the reserve grows when there is more. It should be
+ * enough for the next start, which needs about `least`.
+ */
 void store_reserve_save(const struct store *store)
 {
-	const unsigned long long most = 8ull << 20, part = 16;
+	const unsigned long long most = 8ull << 20, least = 256ull << 10, part = 16;
 	unsigned long long available, bytes;
 	struct stat status;
 	char path[1024];
@@ -863,6 +882,8 @@ void store_reserve_save(const struct store *store)
 	if (store_space(store, &available, &err) != 0)
 		return;
 	bytes = available / part < most ? available / part : most;
+	if (bytes < least)
+		bytes = available / 2 < least ? available / 2 : least;
 	reserve_path(store, path);
 	file = open(path, O_WRONLY | O_CREAT | O_CLOEXEC, 0600);
 	if (file < 0)

@@ -95,6 +95,29 @@ test_a_full_disk_can_be_emptied() {
 	stop_daemon
 }
 
+test_a_start_on_a_full_disk() {
+	local full
+	small_disk 6m
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	for full in before after; do # the daemon has ended
+		[ $full = before ] || stop_daemon
+		cat /dev/zero >"$disk/fill.$full" 2>/dev/null || true
+		[ "$(df --output=avail "$disk" | tail -1)" -eq 0 ] || fail "a full disk"
+		[ $full = after ] || stop_daemon
+		state=$disk/state start_daemon
+		req GET "/v1/scans/$scan"
+		expect_json '.missing == []'
+		req GET "/v1/scans/$scan/projections/3?format=raw"
+		expect_status 200
+	done
+	req DELETE "/v1/scans/$scan"
+	expect_status 204
+	rm "$disk"/fill.*
+	post_scan "$scan_dir"
+	stop_daemon
+}
+
 test_a_moment_without_descriptors_or_with_a_slow_disk_ends_no_job() {
 	faulty_daemon
 	post_scan "$scan_dir"
