@@ -8,7 +8,7 @@
  *   newer          older, missing, damaged   the record is written again
  *   none           whole                     the rows are made: a catalogue that was lost is made again this way
  *   none           missing or damaged        the directory is set aside in quarantine/, with a note
- *   there          no directory at all       a job's is made again; a scan says that it is damaged
+ *   there          no directory at all       a job's is made again; a scan's is not, its row says that it is damaged
  *
  * Making the catalogue again is the same with an empty one. Projections, images and the end of a scan follow
  * projections.sums when the scans are loaded.

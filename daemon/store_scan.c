@@ -1170,7 +1170,7 @@ static int load_scan(struct store *store, struct query *query, struct error *err
 {
 	sqlite3_stmt *row = query->statement;
 	struct stored_scan *scan;
-	char text[32];
+	char text[32], directory[1024];
 	int sample, quantity, code = array_reserve(store, err);
 
 	if (code != 0)
@@ -1193,6 +1193,8 @@ static int load_scan(struct store *store, struct query *query, struct error *err
 	read_image_digest(query, 11, scan, IMAGE_DARK);
 	read_image_digest(query, 12, scan, IMAGE_DEFECTS);
 	scan->closed = scan->closing = sqlite3_column_int(row, 13) != 0;
+	store_scan_directory(store, scan->id, directory);
+	scan->gone = access(directory, F_OK) != 0 && errno == ENOENT;
 	if (sample < 0 || quantity < 0 || !id_valid(scan->id)) {
 		code = error_set(err, ERR_IO, "catalogue: the row of scan \"%s\" makes no sense", scan->id);
 		scan_free_memory(scan);
@@ -1281,28 +1283,67 @@ static int sweep_file(void *context, const char *name, struct error *err)
 	return 0;
 }
 
-/* A file of projections that is gone or cut off gets its size again: then what it lacks is found to be damaged. */
-static void check_files(struct stored_scan *scan)
+static unsigned long long projections_bytes(const struct stored_scan *scan)
 {
-	unsigned long long wanted = (unsigned long long)scan->columns * (unsigned long long)scan->rows *
-				    sample_bytes(scan->sample) * (unsigned long long)scan->count;
+	return (unsigned long long)scan->columns * (unsigned long long)scan->rows * sample_bytes(scan->sample) *
+	       (unsigned long long)scan->count;
+}
+
+/* -1: there is no such file. */
+static long long file_size(const struct stored_scan *scan, const char *name)
+{
 	char directory[1024], path[1100];
 	struct stat status;
-	struct error err;
-	int file;
 
 	store_scan_directory(scan->store, scan->id, directory);
+	snprintf(path, sizeof(path), "%s/%s", directory, name);
+	return stat(path, &status) == 0 ? (long long)status.st_size : -1;
+}
+
+int stored_scan_make_room(struct stored_scan *scan, struct error *err)
+{
+	const unsigned long long wanted = projections_bytes(scan);
+	char directory[1024], path[1100];
+	int file, result = 0, code = 0;
+
+	if (file_size(scan, "projections.raw") == (long long)wanted)
+		return 0;
+	store_scan_directory(scan->store, scan->id, directory);
 	snprintf(path, sizeof(path), "%s/projections.raw", directory);
-	if (stat(path, &status) == 0 && (unsigned long long)status.st_size == wanted)
-		return;
-	log_line(LEVEL_ERROR, "scan %s is in the catalogue, but %s is not there with its %llu bytes", scan->id, path,
-		 wanted);
 	file = open(path, O_RDWR | O_CREAT | O_CLOEXEC, 0640);
-	scan->damaged = file < 0 || ftruncate(file, (off_t)wanted) != 0 ||
-			posix_fallocate(file, 0, (off_t)wanted) != 0 || directory_sync(directory, &err) != 0;
+	if (file < 0)
+		return error_set_errno(err, errno, "make %s", path);
+	if (ftruncate(file, (off_t)wanted) != 0)
+		result = errno;
+	else
+		result = posix_fallocate(file, 0, (off_t)wanted);
+	close(file);
+	if (result != 0)
+		code = error_set_errno(err, result, "room for %llu bytes of projections", wanted);
+	return code == 0 ? directory_sync(directory, err) : code;
+}
+
+/* What is gone or cut off is lost before anybody can ask for it; what is left is checked in the background. */
+static void check_files(struct stored_scan *scan)
+{
+	const long long wanted = (long long)projections_bytes(scan), size = file_size(scan, "projections.raw");
+	struct error err;
+
+	if (file_size(scan, "scan.json") <= 0) {
+		log_line(LEVEL_ERROR, "scan %s: its document (scan.json) is gone", scan->id);
+		scan->document_damaged = true;
+	}
+	for (int i = 0; i < IMAGE_COUNT; i++) {
+		if (file_size(scan, image_files[i]) != (long long)image_bytes(scan, i))
+			stored_scan_lose_image(scan, i);
+	}
+	if (size == wanted)
+		return;
+	log_line(LEVEL_ERROR, "scan %s is in the catalogue, but its projections.raw is not there with its %lld bytes",
+		 scan->id, wanted);
+	stored_scan_lose_behind(scan, size > 0 ? (unsigned long long)size : 0);
 	scan->suspect = true;
-	if (file >= 0)
-		close(file);
+	scan->damaged = scan->gone || stored_scan_make_room(scan, &err) != 0;
 }
 
 int store_sweep_scans(struct store *store, struct error *err)
@@ -1312,6 +1353,8 @@ int store_sweep_scans(struct store *store, struct error *err)
 
 	for (int i = 0; i < store->scan_count && code == 0; i++) {
 		check_files(store->scans[i]);
+		if (store->scans[i]->gone)
+			continue;
 		store_scan_directory(store, store->scans[i]->id, path);
 		code = directory_visit(path, sweep_file, store->scans[i], err);
 	}

@@ -19,6 +19,7 @@ struct stored_scan {
 	enum quantity quantity;
 	double air;
 	bool damaged;
+	bool gone;            /* its directory was not there at the start: nothing is written for it */
 	uint64_t order_floor; /* of arrival: what comes from now on is above it; after the start guarded by lock */
 
 	/* Guarded by store->scans_lock. */
@@ -63,6 +64,12 @@ void stored_scan_add(struct stored_scan *scan, int index, const struct sum *sum)
  * SHA-256 only. A file that is missing, short or has a damaged line is made again from the records that are good.
  */
 int store_load_sums(struct store *store, struct stored_scan *scan, struct error *err);
+
+/* At the start, nobody else has the store: the samples of projections.raw behind its first `size` bytes are lost. */
+void stored_scan_lose_behind(struct stored_scan *scan, unsigned long long size);
+void stored_scan_lose_image(struct stored_scan *scan, enum image image);
+/* The file of the projections has its full size, with zeros for what it does not hold any more. */
+int stored_scan_make_room(struct stored_scan *scan, struct error *err);
 
 /* The scan goes on without what was lost, within the transaction that closes it. */
 int store_forget_lost(struct stored_scan *scan, struct error *err);

@@ -135,7 +135,38 @@ void stored_scan_lose(struct stored_scan *scan, int index, const struct sum *see
 const char *const image_names[IMAGE_COUNT] = {"flat", "dark", "defects"};
 static const char *const image_files[IMAGE_COUNT] = {"flat.f32", "dark.f32", "defects.u8"};
 
-static void lose_image(struct stored_scan *scan, enum image image)
+void stored_scan_lose_behind(struct stored_scan *scan, unsigned long long size)
+{
+	const unsigned long long bytes = projection_bytes(scan);
+	struct error err = {0};
+	bool whole;
+	int file = -1, count = 0, code = open_sums(scan, &whole, &file, &err);
+
+	for (int i = (int)(size / bytes); i < scan->count; i++) {
+		struct sum sum = scan->sums[i];
+
+		if (scan->progress[i] != STORED)
+			continue;
+		remove_received(scan, i);
+		scan->progress[i] = MISSING;
+		count++;
+		sum.bytes = bytes;
+		sum.lost = true;
+		if (code == 0)
+			code = sums_put(file, i, &sum, &err);
+	}
+	if (code == 0 && fdatasync(file) != 0)
+		code = error_set_sync(&err, errno, "sync checksums of scan %s", scan->id);
+	if (file >= 0)
+		close(file);
+	if (code != 0) /* the next start finds them damaged when it reads them */
+		log_line(LEVEL_WARNING, "scan %s: damage cannot be noted: %s", scan->id, err.text);
+	if (count > 0)
+		log_line(LEVEL_ERROR, "scan %s: %d projections are gone: they are missing until they are sent again",
+			 scan->id, count);
+}
+
+void stored_scan_lose_image(struct stored_scan *scan, enum image image)
 {
 	struct sum sum = {.bytes = 0};
 	bool lost;
@@ -361,7 +392,7 @@ int store_check_image(struct stored_scan *scan, enum image image, struct error *
 	free(bytes);
 	if (fits)
 		return code;
-	lose_image(scan, image);
+	stored_scan_lose_image(scan, image);
 	return error_set(err, ERR_DAMAGED, "the image %s is damaged on the disk: it is to be sent again",
 			 image_names[image]);
 }
@@ -415,7 +446,9 @@ static void check_projections(struct stored_scan *scan)
 	struct sum sum;
 	int file;
 
-	if (samples == NULL || stored_scan_open(scan, false, &file, &err) != 0) {
+	/* A file that was removed or cut off under the daemon has no samples: all that it lacks is found to be lost. */
+	if (samples == NULL || stored_scan_make_room(scan, &err) != 0 ||
+	    stored_scan_open(scan, false, &file, &err) != 0) {
 		free(samples);
 		return;
 	}
@@ -754,7 +787,7 @@ int store_load_sums(struct store *store, struct stored_scan *scan, struct error 
 		show_projections(scan, &records);
 	if (code == 0)
 		code = order_arrivals(scan, err);
-	if (code == 0 && !records.whole)
+	if (code == 0 && !records.whole && !scan->gone)
 		code = write_records(scan, &records, err);
 	free(records.projections);
 	free(records.states);

@@ -230,17 +230,28 @@ static int read_images(const char *directory, struct scan_files *files, struct e
 	return code;
 }
 
+/* Beside records of what they held, files that are gone or have another size were damaged since. */
+static int damaged_since(const struct scan_files *files, int code, struct error *err)
+{
+	char text[sizeof(err->text)];
+
+	if (files->sums < 0 || (code != ERR_NOT_FOUND && code != ERR_INVALID))
+		return code;
+	snprintf(text, sizeof(text), "%s", err->text);
+	return error_set(err, ERR_DAMAGED, "%s", text);
+}
+
 int scan_files_open(const char *directory, struct scan_files *ret_files, struct error *err)
 {
 	struct scan_files files = {.projections = -1, .sums = -1};
 	int code = open_sums(directory, &files.sums, err);
 
 	if (code == 0)
-		code = read_scan(directory, files.sums, &files.scan, err);
+		code = damaged_since(&files, read_scan(directory, files.sums, &files.scan, err), err);
 	if (code == 0)
-		code = open_projections(directory, files.scan, &files.projections, err);
+		code = damaged_since(&files, open_projections(directory, files.scan, &files.projections, err), err);
 	if (code == 0)
-		code = read_images(directory, &files, err);
+		code = damaged_since(&files, read_images(directory, &files, err), err);
 	if (code != 0)
 		scan_files_close(&files);
 	else

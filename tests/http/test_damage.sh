@@ -134,6 +134,100 @@ test_a_job_waits_for_what_was_damaged() {
 	stop_daemon
 }
 
+test_files_that_are_gone_are_told_before_the_first_request() {
+	local other job_dir
+	counts
+	start_daemon
+	post_scan "$counts_dir"
+	post_projections "$counts_dir"
+	other=$scan
+	reconstruct "$scan_dir" "$large"
+	digested
+	undisturbed
+	# the file of the projections, then its second half
+	for how in 'rm "$(spool)/projections.raw"' 'truncate -s $((12 * one + 5)) "$(spool)/projections.raw"'; do
+		stop_daemon KILL
+		eval "$how"
+		start_daemon
+		req GET "/v1/scans/$scan" # the very first
+		case $how in
+		rm*) expect_json '.missing == [[0, 23]] and .received == []' ;;
+		*) expect_json '.missing == [[12, 23]] and .received == [[0, 11]]' ;;
+		esac
+		stop_daemon KILL # noted on the disk, too
+		start_daemon
+		req GET "/v1/scans/$scan"
+		expect_json '.received_count < 13 and ([.warnings[] | select(.code == "damaged_projections")] | length == 1)'
+		req PUT "/v1/scans/$scan/projections" -T "$scan_dir/projections.raw"
+		expect_status 201
+		missing_is '[]'
+	done
+	stop_daemon KILL
+	truncate -s 100 "$state/scans/$other/flat.f32"
+	start_daemon
+	req GET "/v1/scans/$other"
+	expect_json '(.flat | not) and ([.warnings[] | select(.code == "damaged_image")] | length == 1)'
+	# all of a scan
+	stop_daemon
+	mv "$(spool)" "$work/away"
+	start_daemon
+	req GET "/v1/scans/$scan"
+	expect_damaged
+	req GET /v1/scans
+	expect_json ".scans | map({(.id): [.state, .received_count]}) | add | .\"$scan\" == [\"receiving\", 0] and .\"$other\" == [\"complete\", 24]"
+	is_undisturbed
+	[ ! -e "$(spool)" ] || fail "nothing in the place of what may come back"
+	stop_daemon
+	mv "$work/away" "$(spool)"
+	start_daemon
+	missing_is '[]'
+	stop_daemon
+	rm -r "$(spool)"
+	start_daemon
+	req DELETE "/v1/scans/$scan"
+	expect_status 204
+	req PUT "/v1/scans/$other/flat" --data-binary @"$counts_dir/flat.f32"
+	expect_status 201
+	# all of a job
+	stop_daemon
+	job_dir=$state/jobs/$job
+	rm -r "$job_dir"
+	start_daemon
+	req GET "/v1/jobs/$job"
+	expect_json '.state == "succeeded" and ([.warnings[] | select(.code == "damaged_volume" and .severity == "serious" and (.detail | test("volume final")))] | length == 1)'
+	expect_damaged_volume "" "?format=raw" "/slice?axis=z"
+	req GET "/v1/jobs/$job"
+	expect_json '[.warnings[] | select(.code == "damaged_volume")] | length == 1'
+	curl -sf --max-time 20 -o "$work/stream" "$url/v1/jobs/$job/stream" || fail "a stream that ends properly"
+	! grep -q 'CBCT-Volume' "$work/stream" || fail "no part of what is gone"
+	grep -q 'damaged_volume' "$work/stream" || fail "the job's document"
+	tail -1 "$work/stream" | grep -q -- '^--.*--' || fail "the closing boundary"
+	stop_daemon
+}
+
+test_a_file_that_is_cut_off_under_the_daemon() {
+	start_daemon
+	reconstruct "$scan_dir" "$small"
+	undisturbed
+	for how in 'truncate -s $((20 * one + 7)) "$(spool)/projections.raw"' 'rm "$(spool)/projections.raw"'; do
+		eval "$how"
+		post_job "$small"
+		local end=$((SECONDS + 20)) missing='[[20, 23]]'
+		[[ $how != rm* ]] || missing='[[0, 23]]'
+		until req GET "/v1/scans/$scan" && jq -e ".missing == $missing" "$body" >/dev/null; do
+			[ $SECONDS -lt $end ] || fail "what the file no longer holds is missing: $(json .missing)"
+			sleep 0.05
+		done
+		state_becomes waiting
+		req PUT "/v1/scans/$scan/projections" -T "$scan_dir/projections.raw"
+		expect_status 201
+		wait_job succeeded
+		is_right
+	done
+	cmp "$(spool)/projections.raw" "$scan_dir/projections.raw" || fail "the damage is repaired"
+	stop_daemon
+}
+
 test_damage_while_the_daemon_is_down() {
 	local byte
 	start_daemon
