@@ -937,7 +937,13 @@ static int sweep_directory(void *context, const char *name, struct error *err)
 int store_sweep_jobs(struct store *store, struct error *err)
 {
 	char path[1024];
+	int code;
 
+	/* One transaction for all that is read: each job's rows are read before they are changed. */
+	if (sqlite3_exec(store->reader.db, "BEGIN", NULL, NULL, NULL) != SQLITE_OK)
+		return error_set(err, ERR_IO, "catalogue: %s", sqlite3_errmsg(store->reader.db));
 	snprintf(path, sizeof(path), "%s/jobs", store->directory);
-	return directory_visit(path, sweep_directory, store, err);
+	code = directory_visit(path, sweep_directory, store, err);
+	sqlite3_exec(store->reader.db, "COMMIT", NULL, NULL, NULL);
+	return code;
 }
