@@ -4,6 +4,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/stat.h>
 #include <unistd.h>
 
 #include "daemon/files.h"
@@ -95,13 +96,16 @@ static void bind_changing(struct query *query, const struct job_record *job)
 	query_text(query, job->id);
 }
 
-/* Ends a transaction that changed what the job's record tells: that goes first. */
-static int end_with_record(struct store *store, const char *id, int code, struct error *err)
+/*
+ * Ends a transaction that changed what the job's record tells: that goes first. It is synced where somebody was or will
+ * be told for good; after a power cut any other is written again from the row.
+ */
+static int end_with_record(struct store *store, const char *id, bool synced, int code, struct error *err)
 {
 	bool written = code == 0;
 
 	if (code == 0)
-		code = record_write(store, RECORD_JOB, id, true, err);
+		code = record_write(store, RECORD_JOB, id, synced, err);
 	code = store_end(store, code, err);
 	if (code != 0 && written) {
 		pthread_mutex_lock(&store->writer.lock);
@@ -118,11 +122,13 @@ int store_job_insert(struct store *store, const struct job_record *job, const st
 	int code;
 
 	store_job_directory(store, job->id, directory);
-	code = directory_make(directory, err);
-	if (code == 0)
-		code = store_begin(store, err);
-	if (code != 0)
+	if (mkdir(directory, 0700) != 0) /* synced with its record */
+		return error_set_errno(err, errno, "mkdir %s", directory);
+	code = store_begin(store, err);
+	if (code != 0) {
+		rmdir(directory);
 		return code;
+	}
 	query_begin(
 	    &query, &store->writer,
 	    "INSERT INTO jobs (state, ticket, cancel_asked, attempts, crashes, checkpoint, backend, device, plan,"
@@ -144,7 +150,7 @@ int store_job_insert(struct store *store, const struct job_record *job, const st
 	code = query_run(&query);
 	if (code == 0)
 		code = add_event(store, job->id, event, err);
-	code = end_with_record(store, job->id, code, err);
+	code = end_with_record(store, job->id, true, code, err);
 	if (code != 0)
 		rmdir(directory); /* empty but for a record that could not be taken back: then the next start sees to it
 				   */
@@ -208,7 +214,7 @@ int store_job_update(struct store *store, const struct job_record *job, const st
 		code = add_event(store, job->id, event, err);
 	if (code == 0)
 		code = add_event(store, job->id, end, err);
-	return end_with_record(store, job->id, code, err);
+	return end_with_record(store, job->id, job->cancel_asked || job->ended != 0, code, err);
 }
 
 /* Takes a number from the job's own events, which go with it. */
@@ -408,7 +414,7 @@ int store_job_digest_volume(struct store *store, const char *id, const struct vo
 	query_text(&query, id);
 	query_text(&query, volume->name);
 	query_real(&query, volume->created);
-	return end_with_record(store, id, query_run(&query), err);
+	return end_with_record(store, id, false, query_run(&query), err);
 }
 
 int store_job_remove_volume(struct store *store, const char *id, const char *name, struct error *err)
@@ -422,7 +428,7 @@ int store_job_remove_volume(struct store *store, const char *id, const char *nam
 		    "DELETE FROM volumes WHERE job = (SELECT number FROM jobs WHERE id = ?) AND name = ?", err);
 	query_text(&query, id);
 	query_text(&query, name);
-	return end_with_record(store, id, query_run(&query), err);
+	return end_with_record(store, id, false, query_run(&query), err);
 }
 
 int store_job_add_warning(struct store *store, const char *id, const struct warning_record *warning,
@@ -445,7 +451,7 @@ int store_job_add_warning(struct store *store, const char *id, const struct warn
 	new = code == 0 && sqlite3_changes(store->writer.db) > 0;
 	if (new)
 		code = add_event(store, id, event, err);
-	code = new ? end_with_record(store, id, code, err) : store_end(store, code, err);
+	code = new ? end_with_record(store, id, false, code, err) : store_end(store, code, err);
 	if (code == 0)
 		*ret_new = new;
 	return code;

@@ -174,9 +174,9 @@ static int set_aside(struct reconciliation *r, const char *id, const char *why, 
 	return quarantine_move(r->store->directory, path, why, err);
 }
 
-/* *context: anything but half-written files; files that say that the directory itself is half-made set it back. */
 struct contents {
-	bool any, unfinished;
+	bool any;        /* but half-written files, and a record that a power cut left empty */
+	bool unfinished; /* the directory was being made */
 };
 
 static int note_content(void *context, const char *name, struct error *err)
@@ -184,7 +184,7 @@ static int note_content(void *context, const char *name, struct error *err)
 	struct contents *contents = context;
 
 	(void)err;
-	contents->any |= !name_is_temporary(name);
+	contents->any |= !name_is_temporary(name) && strcmp(name, RECORD_FILE) != 0;
 	contents->unfinished |= strcmp(name, STORE_UNFINISHED) == 0;
 	return 0;
 }
@@ -204,7 +204,7 @@ static int take_in(struct reconciliation *r, const char *id, const char *path, s
 		cJSON_Delete(record);
 		if (code == 0)
 			return 0;
-	} else if (code == ERR_NOT_FOUND) {
+	} else if (code == ERR_NOT_FOUND || record_empty(r->store, r->kind, id)) {
 		if (directory_visit(path, note_content, &contents, err) != 0)
 			return err->code;
 		/* The process died while it was made: nobody was told of it. */

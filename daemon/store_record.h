@@ -39,13 +39,16 @@ void record_directory(const struct store *store, enum record_kind kind, const ch
 
 /*
  * Gives the row a new stamp and writes its record into its directory, which is there. synced false: the caller sees to
- * that. ERR_IO is final, as for a commit.
+ * that. A power cut may leave a new record, the one before or an empty file; the row is there then, or nothing was
+ * told.
  */
 int record_write(struct store *store, enum record_kind kind, const char *id, bool synced, struct error *err);
 /* After a transaction that was rolled back, best effort: the record of the rows as they are; without a row it is
  * removed. */
 void record_undo(struct store *store, enum record_kind kind, const char *id);
 
+/* True where the record is a file of no bytes. */
+bool record_empty(const struct store *store, enum record_kind kind, const char *id);
 /* 0: there is none. Microseconds. */
 long long record_stamp(const struct store *store, enum record_kind kind, const char *id);
 /* That in `directory`. ERR_NOT_FOUND: there is none. ERR_INVALID: it is damaged. Free with cJSON_Delete. */

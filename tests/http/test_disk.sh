@@ -141,7 +141,7 @@ test_a_moment_without_descriptors_or_with_a_slow_disk_ends_no_job() {
 test_a_sync_that_failed_is_final() {
 	local what
 	# of a worker's volume, of the digest thread, of a job's record, of a directory: whoever asks a second time is told that all is well
-	for what in "fdatasync 5 .nii 1" "fdatasync 5 .nii 1 1" "fdatasync 5 record.json 1 1" "fsync 5 /jobs/ 1 2" "fsync 5 /scans/ 1"; do
+	for what in "fdatasync 5 .nii 1" "fdatasync 5 .nii 1 1" "fsync 5 record.json 1 1" "fsync 5 /jobs/ 1 1" "fsync 5 /scans/ 1"; do
 		faulty_daemon
 		post_scan "$scan_dir"
 		post_projections "$scan_dir"
