@@ -151,7 +151,7 @@ $(BUILD)/cbctd-held: $(call objects,$(daemon_sources) tests/http/held.c) $(BUILD
 	$(call say,LINK)$(CC) $(LDFLAGS) $(held_calls:%=-Wl,--wrap=%) -o $@ $^ $(call pkg,--libs,$(daemon_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
 # Every program that a test or a benchmark runs, so that none stops compiling unseen.
-test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held faults.so cpu-bench watchers slices acquire) \
+test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held faults.so cpu-bench denoise watchers slices acquire) \
                $(if $(cuda_objects),$(gpu_programs) $(BUILD)/gpu_ceilings $(BUILD)/cbct-worker-faulty,$(call objects,$(wildcard tests/bench/gpu_*.c)))
 
 # Faults of the disk, loaded into the programs by tests.
@@ -167,6 +167,10 @@ $(BUILD)/unit: $(call objects,$(unit_sources) $(state_sources)) $(library)
 
 $(BUILD)/cpu-bench: $(call objects,tests/bench/bench.c) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(LIBM)
+
+# Noise reduction on anatomies: on a card where there is one.
+$(BUILD)/denoise: $(call objects,tests/bench/denoise.c tests/unit/anatomy.c) $(core_objects) $(cuda_objects)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(if $(cuda_objects),$(cuda_libs)) $(LIBM)
 
 $(BUILD)/watchers $(BUILD)/slices $(BUILD)/acquire: $(BUILD)/%: $(BUILD)/tests/bench/%.o
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ -lpthread
@@ -227,6 +231,10 @@ fuzz: setup ## each fuzz target for FUZZ_SECONDS=10 (needs clang)
 	@$(MAKE) --no-print-directory -j$$(nproc) fuzzers BUILD=$(BUILD)/fuzz CC=clang \
 		SANITIZE=fuzzer-no-link,address,undefined OPENMP= CUDA=0
 	@BUILD=$(BUILD)/fuzz FUZZ_SECONDS=$(FUZZ_SECONDS) tests/fuzz/run.sh
+
+bench-denoise: setup ## the default TV on anatomies beside the best of a sweep, a table on standard output
+	@$(MAKE) --no-print-directory -j$$(nproc) $(BUILD)/denoise >&2
+	@$(BUILD)/denoise
 
 bench: setup ## CPU and HTTP benchmarks, results in build/bench/
 	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/cpu-bench $(BUILD)/acquire $(BUILD)/watchers $(BUILD)/slices
@@ -289,6 +297,6 @@ clean: ## removes build/
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-.PHONY: all test-programs again setup demo check soak fuzz fuzzers bench check-gpu bench-gpu asan tsan lint format install clean help
+.PHONY: all test-programs again setup demo check soak fuzz fuzzers bench bench-denoise check-gpu bench-gpu asan tsan lint format install clean help
 .SECONDARY:
 -include $(shell find $(BUILD) -name '*.d' 2>/dev/null)

@@ -2,11 +2,10 @@
  * The noise of a volume, from the volume itself: whatever its source, photons,
  * electronics or too few views, it is measured where it will be removed.
  *
- * Cubes of a few voxels that lie inside the object each give the mean square of
+ * Cubes of a few voxels that lie in the object each give the mean square of
  * differences between voxels that are one and two apart. Noise is in all cubes,
- * edges and texture are in some: the lower quartile of the cubes is taken, after
- * the idea of Immerkaer (Comput. Vis. Image Underst. 64, 1996) and of block methods
- * in general (Olsen, CVGIP: Graph. Models Image Process. 55, 1993). Two distances,
+ * edges and texture are in some: the lower quartile of the cubes is taken, as block
+ * methods do (Olsen, CVGIP: Graph. Models Image Process. 55, 1993). Two distances,
  * because reconstructed noise is correlated: neighbours of a finely sampled volume
  * are alike, and voxels at twice the distance, by the ramp filter, are rather opposite.
  */
@@ -15,23 +14,38 @@
 #include <math.h>
 #include <stdlib.h>
 
-/* Side of a cube in voxels: hundreds of differences, and yet places for it in a finger's bone. */
-enum { CUBE = 6 };
+#include "core/sart.h"
+
+/*
+ * Sides of a cube in voxels: hundreds of differences in the first. Where less than CUBES_LEAST of them fit into the
+ * object, a finger or a few slices, the next one is tried. Of a large volume some cubes are left out.
+ */
+static const int sides[] = {6, 4, 3};
+enum { SIDES = sizeof(sides) / sizeof(sides[0]), CUBES_LEAST = 12, CUBES_MOST = 40000 };
+
+/* A cube lies in the object when its mean is so much of the object's: fat counts, lung and a rim of air do not. */
+static const double INSIDE = 0.8;
 
 /* Bone and metal count as so many times the object's mean at most: a screw says nothing of the anatomy's contrast. */
 static const double BRIGHT = 2.5;
+
+/* Voxels above `level` are the object. */
+struct classes {
+	double level, mean; /* mean: of the object */
+};
 
 /*
  * The level between background and object: the mean of both classes' means
  * (Ridler and Calvard, IEEE Trans. Syst. Man Cybern. 8, 1978).
  */
-static double level_of(const float *slices, size_t voxels)
+static struct classes classes_of(const float *slices, size_t voxels)
 {
 	const size_t stride = voxels / 200000 + 1;
-	double level = 0;
+	struct classes classes = {0};
 
 	for (int pass = 0; pass < 20; pass++) {
-		double sum[2] = {0, 0}, last = level;
+		const double last = classes.level;
+		double sum[2] = {0, 0};
 		size_t count[2] = {0, 0};
 
 		for (size_t i = 0; i < voxels; i += stride) {
@@ -39,22 +53,25 @@ static double level_of(const float *slices, size_t voxels)
 
 			if (!isfinite(v))
 				continue;
-			sum[v > level] += v;
-			count[v > level]++;
+			sum[v > last] += v;
+			count[v > last]++;
 		}
 		if (count[1] == 0)
 			break;
-		level = (sum[1] / (double)count[1] + (count[0] > 0 ? sum[0] / (double)count[0] : 0)) / 2;
-		if (fabs(level - last) <= 1e-3 * fabs(level))
+		classes.mean = sum[1] / (double)count[1];
+		classes.level = (classes.mean + (count[0] > 0 ? sum[0] / (double)count[0] : 0)) / 2;
+		if (fabs(classes.level - last) <= 1e-3 * fabs(classes.level))
 			break;
 	}
-	return level;
+	return classes;
 }
 
-/* Half the mean square difference of voxels one and two apart along each axis; negative where a voxel is background. */
-static float cube_variance(const float *corner, const int side[3], const size_t stride[3], float level)
+/* Half the mean square difference of voxels one and two apart along each axis; negative where the mean is below
+ * `least`.
+ */
+static float cube_variance(const float *corner, const int side[3], const size_t stride[3], double least)
 {
-	double sum = 0;
+	double square = 0, sum = 0;
 	size_t count = 0;
 
 	for (int z = 0; z < side[2]; z++)
@@ -64,19 +81,20 @@ static float cube_variance(const float *corner, const int side[3], const size_t 
 				const float *v =
 				    corner + (size_t)z * stride[2] + (size_t)y * stride[1] + (size_t)x * stride[0];
 
-				if (!(*v > level))
-					return -1;
+				sum += (double)*v;
 				for (int axis = 0; axis < 3; axis++)
 					for (int apart = 1; apart <= 2; apart++) {
 						if (place[axis] + apart >= side[axis])
 							continue;
 						const double d = (double)(v[(size_t)apart * stride[axis]] - *v);
 
-						sum += d * d;
+						square += d * d;
 						count++;
 					}
 			}
-	return count > 0 ? (float)(sum / (2 * (double)count)) : 0;
+	if (!(sum >= least * side[0] * side[1] * side[2]) || count == 0 || !isfinite(square))
+		return -1;
+	return (float)(square / (2 * (double)count));
 }
 
 static int compare_floats(const void *a, const void *b)
@@ -86,62 +104,81 @@ static int compare_floats(const void *a, const void *b)
 	return (x > y) - (x < y);
 }
 
-static double contrast_of(const float *slices, size_t voxels, double level, double variance)
+static double contrast_of(const float *slices, size_t voxels, const struct classes *classes, double variance)
 {
 	const size_t stride = voxels / 200000 + 1;
-	double mean = 0, square = 0;
+	double square = 0;
 	size_t count = 0;
 
 	for (size_t i = 0; i < voxels; i += stride)
-		if ((double)slices[i] > level && isfinite(slices[i])) {
-			mean += (double)slices[i];
-			count++;
-		}
-	if (count == 0)
-		return 0;
-	mean /= (double)count;
-	for (size_t i = 0; i < voxels; i += stride)
-		if ((double)slices[i] > level && isfinite(slices[i])) {
-			const double d = fmin((double)slices[i], BRIGHT * mean) - mean;
+		if ((double)slices[i] > classes->level && isfinite(slices[i])) {
+			const double d = fmin((double)slices[i], BRIGHT * classes->mean) - classes->mean;
 
 			square += d * d;
+			count++;
 		}
-	return sqrt(fmax(0, square / (double)count - variance));
+	return count > 0 ? sqrt(fmax(0, square / (double)count - variance)) : 0;
 }
 
-int noise_of_slices(const float *slices, const int size[3], struct volume_noise *ret_noise, struct error *err)
+/*
+ * The lower quartile of the variances of cubes with this side, which overlap by half or, in a large volume, lie
+ * apart; *ret_count of them lie in the object.
+ */
+static int quartile_of_cubes(const float *slices, const int size[3], int side, double least, double *ret_variance,
+			     size_t *ret_count, struct error *err)
 {
 	const size_t stride[3] = {1, (size_t)size[0], (size_t)size[0] * (size_t)size[1]};
-	const size_t voxels = stride[2] * (size_t)size[2];
-	const double level = level_of(slices, voxels);
-	int side[3], cubes[3];
-	size_t all = 1, inside = 0;
+	int sides3[3], cubes[3], step = (side + 1) / 2;
+	size_t all, inside = 0;
 	float *variances;
 
-	for (int a = 0; a < 3; a++) {
-		side[a] = size[a] < CUBE ? size[a] : CUBE;
-		cubes[a] = size[a] / side[a];
-		all *= (size_t)cubes[a];
+	for (;; step++) {
+		all = 1;
+		for (int a = 0; a < 3; a++) {
+			sides3[a] = size[a] < side ? size[a] : side;
+			cubes[a] = (size[a] - sides3[a]) / step + 1;
+			all *= (size_t)cubes[a];
+		}
+		if (all <= CUBES_MOST)
+			break;
 	}
 	variances = malloc(all * sizeof(*variances));
 	if (variances == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for the noise of %zu cubes", all);
 #pragma omp parallel for schedule(static)
 	for (size_t i = 0; i < all; i++) {
-		const size_t x = i % (size_t)cubes[0], y = i / (size_t)cubes[0] % (size_t)cubes[1],
-			     z = i / ((size_t)cubes[0] * (size_t)cubes[1]);
+		const size_t place[3] = {i % (size_t)cubes[0], i / (size_t)cubes[0] % (size_t)cubes[1],
+					 i / ((size_t)cubes[0] * (size_t)cubes[1])};
 
-		variances[i] = cube_variance(slices + (size_t)side[2] * z * stride[2] +
-						 (size_t)side[1] * y * stride[1] + (size_t)side[0] * x,
-					     side, stride, (float)level);
+		variances[i] =
+		    cube_variance(slices + (size_t)step * (place[0] + place[1] * stride[1] + place[2] * stride[2]),
+				  sides3, stride, least);
 	}
 	for (size_t i = 0; i < all; i++)
 		if (variances[i] >= 0)
 			variances[inside++] = variances[i];
 	qsort(variances, inside, sizeof(*variances), compare_floats);
-	*ret_noise = (struct volume_noise){.sigma = inside > 0 ? sqrt((double)variances[inside / 4]) : 0};
-	ret_noise->contrast = contrast_of(slices, voxels, level, ret_noise->sigma * ret_noise->sigma);
+	*ret_variance = inside > 0 ? (double)variances[inside / 4] : 0;
+	*ret_count = inside;
 	free(variances);
+	return 0;
+}
+
+int noise_of_slices(const float *slices, const int size[3], struct volume_noise *ret_noise, struct error *err)
+{
+	const size_t voxels = (size_t)size[0] * (size_t)size[1] * (size_t)size[2];
+	const struct classes classes = classes_of(slices, voxels);
+	double variance = 0;
+	size_t count = 0;
+	int code = 0;
+
+	if (classes.mean > 0)
+		for (int i = 0; i < SIDES && code == 0 && count < CUBES_LEAST; i++)
+			code = quartile_of_cubes(slices, size, sides[i], INSIDE * classes.mean, &variance, &count, err);
+	if (code < 0)
+		return code;
+	*ret_noise =
+	    (struct volume_noise){.sigma = sqrt(variance), .contrast = contrast_of(slices, voxels, &classes, variance)};
 	return 0;
 }
 
@@ -149,18 +186,33 @@ int noise_of_slices(const float *slices, const int size[3], struct volume_noise 
  * How far medium TV moves a voxel, from phantoms of heads, wrists, necks and abdomens (tests/bench/denoise.c): the
  * balance with the least error beside the truth. The FDK volume is blurred already, and TV blurs its edges further:
  * there is nothing to be won before the noise exceeds a fortieth of the contrast. SART's iterations take up noise
- * again each time, and overshoot at edges by a share of the contrast, which grows when nothing holds it.
+ * again each time, the more updates they have, and overshoot at edges by a share of the contrast, the more the fewer
+ * views an update has. Both are given for ten updates of ten views; how they go with
+ * the updates was measured from one of 80 views to 80 of one.
  */
-static const double ALPHA_MOST = 1e9; /* beyond it, TV moves nothing that a float of a gray level could tell */
-static const double FDK_NOISE = 0.35, FDK_CONTRAST = 0.025, SART_NOISE = 0.2, SART_CONTRAST = 0.025;
+static const double FDK_NOISE = 0.35, FDK_CONTRAST = 0.025, SART_NOISE = 0.18, SART_CONTRAST = 0.035;
+static const double UPDATES = 10, VIEWS = 10;
+/* Beyond it, TV moves nothing that a float of a gray level could tell. */
+static const double ALPHA_MOST = 1e9;
 
-double noise_alpha(const struct volume_noise *noise, enum tv_strength strength, enum noise_stage stage, double unit)
+static double reach_after_fdk(const struct volume_noise *noise)
+{
+	return FDK_NOISE * fmax(0, noise->sigma - FDK_CONTRAST * noise->contrast);
+}
+
+static double reach_after_sart(const struct volume_noise *noise, const struct recipe *recipe, int views)
+{
+	const double subsets = subsets_count(recipe->sart.subsets, views), step = recipe->sart.relaxation;
+
+	return hypot(SART_NOISE * noise->sigma * step * subsets / UPDATES,
+		     SART_CONTRAST * noise->contrast * sqrt(step * VIEWS * subsets / views));
+}
+
+double noise_alpha(const struct volume_noise *noise, const struct recipe *recipe, int views, enum noise_stage stage)
 {
 	static const double factors[TV_STRENGTH_COUNT] = {[TV_LIGHT] = 0.5, [TV_MEDIUM] = 1, [TV_STRONG] = 2};
-	const double after_fdk = FDK_NOISE * fmax(0, noise->sigma - FDK_CONTRAST * noise->contrast);
-	const double after_sart = hypot(SART_NOISE * noise->sigma, SART_CONTRAST * noise->contrast);
-
-	const double alpha = unit / (factors[strength] * (stage == NOISE_OF_FDK ? after_fdk : after_sart));
+	const double reach = stage == NOISE_OF_FDK ? reach_after_fdk(noise) : reach_after_sart(noise, recipe, views);
+	const double alpha = recipe->tv.options.unit / (factors[recipe->tv.strength] * reach);
 
 	return alpha <= ALPHA_MOST ? alpha : INFINITY;
 }

@@ -22,9 +22,11 @@ int noise_measure(const struct backend *backend, struct volume *volume, const st
 int noise_of_slices(const float *slices, const int size[3], struct volume_noise *ret_noise, struct error *err);
 
 enum noise_stage { NOISE_OF_FDK, NOISE_OF_SART };
-/* The alpha of TV_PROXIMAL behind FDK or behind each SART iteration, with gray levels of `unit` 1/mm; INFINITY: no TV.
+/*
+ * The alpha of TV_PROXIMAL behind FDK or behind each SART iteration, in the recipe's gray levels and of its strength;
+ * the recipe is resolved. INFINITY: no TV.
  */
-double noise_alpha(const struct volume_noise *noise, enum tv_strength strength, enum noise_stage stage, double unit);
+double noise_alpha(const struct volume_noise *noise, const struct recipe *recipe, int views, enum noise_stage stage);
 /*
  * How far TV with these settings can move a voxel, in 1/mm, roughly: the proximal form by 1 / alpha, explicit steps by
  * their sum at most.

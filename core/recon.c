@@ -479,7 +479,7 @@ static double tv_alpha(const struct recon *recon, enum noise_stage stage)
 
 	if (!recipe->tv.automatic)
 		return recipe->tv.options.alpha;
-	return noise_alpha(&recon->noise, recipe->tv.strength, stage, recipe->tv.options.unit);
+	return noise_alpha(&recon->noise, recipe, recon->geometry->count, stage);
 }
 
 static void tell_noise(const struct recon *recon)
@@ -657,7 +657,7 @@ static int measure_noise(struct recon *recon, struct error *err)
 		return code;
 	recon->noise_measured = true;
 	tell_noise(recon);
-	warn_tv(recon->hooks, &recon->recipe, &recon->noise);
+	warn_tv(recon->hooks, &recon->recipe, &recon->noise, recon->geometry->count);
 	return 0;
 }
 

@@ -1,0 +1,237 @@
+/* The noise that a volume shows, the balance of TV that follows, and what the default TV makes of noisy anatomies. */
+#include <check.h>
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+
+#include "core/noise.h"
+#include "tests/unit/anatomy.h"
+
+static struct error err;
+
+static double random_normal(unsigned *state)
+{
+	double sum = -6;
+
+	for (int i = 0; i < 12; i++) {
+		*state = *state * 1664525u + 1013904223u;
+		sum += *state / 4294967296.0;
+	}
+	return sum;
+}
+
+/* A cylinder of `level` in air, with bones of twice that on a lattice, and noise everywhere. */
+static float *noisy_cylinder(const int size[3], double level, double sigma, int lattice)
+{
+	float *slices = malloc(sizeof(*slices) * (size_t)size[0] * (size_t)size[1] * (size_t)size[2]), *at = slices;
+	unsigned state = 7;
+
+	ck_assert_ptr_nonnull(slices);
+	for (int z = 0; z < size[2]; z++)
+		for (int y = 0; y < size[1]; y++)
+			for (int x = 0; x < size[0]; x++) {
+				const double out = hypot(x - size[0] / 2.0, y - size[1] / 2.0) / (size[0] / 2.0);
+				const bool bone = lattice > 0 && x % lattice < lattice / 4 && y % lattice < lattice / 4;
+
+				*at++ =
+				    (float)((out < 0.9 ? bone ? 2 * level : level : 0) + sigma * random_normal(&state));
+			}
+	return slices;
+}
+
+START_TEST(noise_is_found_whatever_its_strength_and_unit)
+{
+	const int size[3] = {72, 72, 20};
+
+	for (int lattice = 0; lattice <= 24; lattice += 24)
+		for (double level = 0.02; level < 3; level *= 50)
+			for (double share = 0.003; share < 0.2; share *= 3) {
+				float *slices = noisy_cylinder(size, level, share * level, lattice);
+				struct volume_noise noise;
+
+				ck_assert_int_eq(noise_of_slices(slices, size, &noise, &err), 0);
+				/* The lower quartile of cubes of 216 voxels lies some percent below their mean. */
+				ck_assert_msg(fabs(noise.sigma / (share * level) - 0.96) < 0.06,
+					      "noise %g of %g, lattice %d: %g", share, level, lattice, noise.sigma);
+				if (lattice > 0)
+					ck_assert_double_eq_tol(noise.contrast / level, 0.25, 0.06);
+				free(slices);
+			}
+}
+END_TEST
+
+/* A finger of 16 voxels, a few slices of it, air above and below; and noise that is half of the object. */
+START_TEST(noise_is_found_where_the_object_is_small_or_the_noise_is_large)
+{
+	static const struct {
+		int size[3], air; /* air: slices at either end */
+		double share, least, most;
+	} rows[] = {
+	    {{16, 16, 12}, 1, .05, .7, 1.3}, {{60, 60, 12}, 1, .05, .8, 1.1}, {{60, 60, 4}, 0, .05, .8, 1.1},
+	    {{60, 60, 1}, 0, .05, .7, 1.1},  {{72, 72, 20}, 2, .5, .7, 1.1},
+	};
+
+	for (size_t i = 0; i < sizeof(rows) / sizeof(rows[0]); i++) {
+		const int *size = rows[i].size;
+		const size_t slice = (size_t)size[0] * (size_t)size[1];
+		float *slices = noisy_cylinder(size, .02, rows[i].share * .02, 0);
+		struct volume_noise noise;
+
+		for (size_t k = 0; k < slice * (size_t)rows[i].air; k++)
+			slices[k] = slices[slice * (size_t)size[2] - 1 - k] = 0;
+		ck_assert_int_eq(noise_of_slices(slices, size, &noise, &err), 0);
+		ck_assert_msg(noise.sigma > rows[i].least * rows[i].share * .02 &&
+				  noise.sigma < rows[i].most * rows[i].share * .02,
+			      "row %zu: %g of %g", i, noise.sigma, rows[i].share * .02);
+		free(slices);
+	}
+}
+END_TEST
+
+START_TEST(nothing_to_see_is_no_noise)
+{
+	const int sizes[][3] = {{1, 1, 1}, {5, 3, 1}, {40, 40, 1}, {64, 64, 32}};
+
+	for (size_t i = 0; i < sizeof(sizes) / sizeof(sizes[0]); i++)
+		for (int value = -1; value <= 1; value++) {
+			const size_t voxels = (size_t)sizes[i][0] * (size_t)sizes[i][1] * (size_t)sizes[i][2];
+			float *slices = malloc(sizeof(*slices) * voxels);
+			struct volume_noise noise;
+			struct recipe recipe;
+
+			ck_assert_ptr_nonnull(slices);
+			for (size_t k = 0; k < voxels; k++)
+				slices[k] = (float)value;
+			ck_assert_int_eq(noise_of_slices(slices, sizes[i], &noise, &err), 0);
+			ck_assert_double_eq(noise.sigma, 0);
+			ck_assert_double_eq(noise.contrast, 0);
+			recipe_defaults(&recipe);
+			recipe.tv.options.unit = 1e-5;
+			ck_assert(isinf(noise_alpha(&noise, &recipe, 100, NOISE_OF_FDK)));
+			ck_assert(isinf(noise_alpha(&noise, &recipe, 100, NOISE_OF_SART)));
+			free(slices);
+		}
+}
+END_TEST
+
+static double alpha_of(double sigma, double contrast, enum tv_strength strength, double unit, int subsets)
+{
+	struct recipe recipe;
+
+	recipe_defaults(&recipe);
+	recipe.tv.strength = strength;
+	recipe.tv.options.unit = unit;
+	recipe.sart.subsets = subsets;
+	return noise_alpha(&(struct volume_noise){sigma, contrast}, &recipe, 100, NOISE_OF_SART);
+}
+
+START_TEST(alpha_falls_with_noise_contrast_and_strength_and_goes_with_the_unit)
+{
+	const double alpha = alpha_of(.002, .005, TV_MEDIUM, 2e-5, SUBSETS_DEFAULT);
+	struct recipe recipe;
+
+	ck_assert_double_gt(alpha, 0);
+	ck_assert_double_lt(alpha_of(.004, .005, TV_MEDIUM, 2e-5, SUBSETS_DEFAULT), alpha);
+	ck_assert_double_lt(alpha_of(.002, .02, TV_MEDIUM, 2e-5, SUBSETS_DEFAULT), alpha);
+	ck_assert_double_eq_tol(alpha_of(.002, .005, TV_LIGHT, 2e-5, SUBSETS_DEFAULT), 2 * alpha, 1e-9);
+	ck_assert_double_eq_tol(alpha_of(.002, .005, TV_STRONG, 2e-5, SUBSETS_DEFAULT), alpha / 2, 1e-9);
+	ck_assert_double_eq_tol(alpha_of(.002, .005, TV_MEDIUM, 4e-5, SUBSETS_DEFAULT), 2 * alpha, 1e-9);
+	ck_assert_double_eq_tol(alpha_of(.002, .005, TV_MEDIUM, 2e-5, 10), alpha, 1e-12);
+	ck_assert_double_gt(alpha_of(.002, .005, TV_MEDIUM, 2e-5, 1), 3 * alpha);
+	ck_assert_double_lt(alpha_of(.002, .005, TV_MEDIUM, 2e-5, SUBSETS_VIEWS), alpha / 3);
+	/* Behind FDK, noise below a fortieth of the contrast is left alone. */
+	recipe_defaults(&recipe);
+	recipe.tv.options.unit = 2e-5;
+	ck_assert(isinf(noise_alpha(&(struct volume_noise){.0001, .005}, &recipe, 100, NOISE_OF_FDK)));
+	ck_assert(isfinite(noise_alpha(&(struct volume_noise){.002, .005}, &recipe, 100, NOISE_OF_FDK)));
+}
+END_TEST
+
+/* ---- the default on anatomies; tests/bench/denoise.c has more of them ---- */
+
+static const struct anatomy_spec anatomies[] = {
+    {HEAD, .9, 2.5, {62, 76, 12}, 1.5, 60, 360, 3e4, 11},
+    {HEAD_AND_NECK, .8, 1.6, {66, 62, 12}, 1.1, 80, 360, 5e3, 12},
+    {WRIST, .9, .8, {74, 54, 12}, .7, 60, 200, 1e4, 13},
+};
+
+enum { THIRD, TENTH };
+
+static void reconstruct(const struct anatomy_scan *scan, const struct recipe *recipe, struct image_figures *ret_figures,
+			double *ret_alpha)
+{
+	struct device *device;
+	float *volumes[3];
+	double noise;
+
+	ck_assert_int_eq(backend_cpu.open(0, &(struct device_options){0}, &device, &err), 0);
+	ck_assert_msg(anatomy_reconstruct(scan, &backend_cpu, device, recipe, volumes, &noise, ret_alpha, &err) == 0,
+		      "%s", err.text);
+	if (recipe->sart.on)
+		ret_figures[THIRD] = anatomy_figures(scan, volumes[0]);
+	ret_figures[recipe->sart.on ? TENTH : 0] = anatomy_figures(scan, volumes[recipe->emits]);
+	for (int i = 0; i <= recipe->emits; i++)
+		free(volumes[i]);
+	backend_cpu.close(device);
+}
+
+START_TEST(the_default_takes_the_noise_and_leaves_the_anatomy)
+{
+	static const double factors[] = {.4, 2.5};
+	struct anatomy_scan scan;
+	struct recipe recipe;
+	struct image_figures fdk, found[2], other[2];
+	int emit[] = {3, 10};
+	double alpha, best[2];
+
+	ck_assert_int_eq(anatomy_scan_make(&scan, &anatomies[_i], &err), 0);
+	recipe_defaults(&recipe);
+	recipe.has_grid = recipe.has_origin = true;
+	recipe.grid = scan.grid;
+	recipe.fdk.on = true;
+	reconstruct(&scan, &recipe, &fdk, &alpha);
+	recipe.sart.on = recipe.tv.on = true;
+	recipe.emit = emit;
+	recipe.emits = 2;
+	reconstruct(&scan, &recipe, found, &alpha);
+	best[THIRD] = found[THIRD].rmse;
+	best[TENTH] = found[TENTH].rmse;
+	recipe_explicit_tv(&recipe, TV_PROXIMAL);
+	recipe.tv.options.iterations = 30;
+	for (size_t i = 0; i < sizeof(factors) / sizeof(factors[0]); i++) {
+		recipe.tv.options.alpha = alpha * factors[i];
+		reconstruct(&scan, &recipe, other, &recipe.tv.options.alpha);
+		for (int k = THIRD; k <= TENTH; k++)
+			best[k] = fmin(best[k], other[k].rmse);
+	}
+	for (int k = THIRD; k <= TENTH; k++) {
+		ck_assert_msg(found[k].rmse <= 1.12 * best[k] && found[k].rmse < fdk.rmse,
+			      "%s, iteration %d: %.1f HU, FDK %.1f, best %.1f", anatomy_names[anatomies[_i].what],
+			      emit[k], found[k].rmse, fdk.rmse, best[k]);
+		ck_assert_msg(found[k].bone > fdk.bone - 25, "bone %.0f HU, FDK %.0f", found[k].bone, fdk.bone);
+		ck_assert_msg(found[k].fwhm <= fdk.fwhm, "an edge of %.2f voxels, FDK %.2f", found[k].fwhm, fdk.fwhm);
+	}
+	ck_assert_msg(found[TENTH].rmse <= 1.05 * found[THIRD].rmse, "from %.1f to %.1f HU", found[THIRD].rmse,
+		      found[TENTH].rmse);
+	anatomy_scan_clear(&scan);
+}
+END_TEST
+
+Suite *noise_suite(void);
+Suite *noise_suite(void)
+{
+	Suite *suite = suite_create("noise");
+	TCase *measure = tcase_create("measure"), *anatomy = tcase_create("anatomy");
+
+	tcase_set_timeout(measure, 0);
+	tcase_set_timeout(anatomy, 0);
+	tcase_add_test(measure, noise_is_found_whatever_its_strength_and_unit);
+	tcase_add_test(measure, noise_is_found_where_the_object_is_small_or_the_noise_is_large);
+	tcase_add_test(measure, nothing_to_see_is_no_noise);
+	tcase_add_test(measure, alpha_falls_with_noise_contrast_and_strength_and_goes_with_the_unit);
+	tcase_add_loop_test(anatomy, the_default_takes_the_noise_and_leaves_the_anatomy, 0,
+			    sizeof(anatomies) / sizeof(anatomies[0]));
+	suite_add_tcase(suite, measure);
+	suite_add_tcase(suite, anatomy);
+	return suite;
+}
