@@ -150,6 +150,7 @@ held_calls := job_digest_volume store_job_update store_job_add_volume store_job_
 $(BUILD)/cbctd-held: $(call objects,$(daemon_sources) tests/http/held.c) $(BUILD)/proto/openapi.o $(BUILD)/web/assets.o $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) $(held_calls:%=-Wl,--wrap=%) -o $@ $^ $(call pkg,--libs,$(daemon_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
+gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench
 # Every program that a test or a benchmark runs, so that none stops compiling unseen.
 test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held faults.so cpu-bench denoise watchers slices acquire) \
                $(if $(cuda_objects),$(gpu_programs) $(BUILD)/gpu_ceilings $(BUILD)/cbct-worker-faulty,$(call objects,$(wildcard tests/bench/gpu_*.c)))
@@ -176,7 +177,6 @@ $(BUILD)/watchers $(BUILD)/slices $(BUILD)/acquire: $(BUILD)/%: $(BUILD)/tests/b
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ -lpthread
 
 # The GPU's checks and benchmarks need the mathematics and the kernels only, so that they run on a bare machine.
-gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench
 $(gpu_programs): $(BUILD)/%: $(call objects,tests/bench/%.c tests/bench/gpu_scene.c) $(core_objects) $(cuda_objects)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(if $(cuda_objects),$(cuda_libs)) $(LIBM)
 
