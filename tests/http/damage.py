@@ -227,9 +227,10 @@ def look(daemon, scans, jobs):
                 status, body = daemon.get(f"/v1/jobs/{job}/volumes/final?format=raw")
                 seen[key + ": final"] = (status, body)
             daemon.get(f"/v1/jobs/{job}/volumes?wait=20")
-            for _ in range(2): # cancelled, then removed
-                if daemon.request("DELETE", f"/v1/jobs/{job}")[0] in (204, 404):
+            for _ in range(200): # one that waits with a worker is cancelled soon, then removed
+                if daemon.request("DELETE", f"/v1/jobs/{job}?wait=5")[0] in (204, 404):
                     break
+                time.sleep(0.02)
     for scan in scans.values():
         path = f"/v1/scans/{scan}"
         seen[path] = document_of(daemon.get(path))
