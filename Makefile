@@ -73,9 +73,9 @@ flags_avx512 := -mavx512f -mavx512bw -mavx512dq -mavx512vl -mfma -mprefer-vector
 simd_sources   := $(wildcard core/*_simd.c)
 core_sources   := $(filter-out $(simd_sources),$(wildcard core/*.c))
 proto_sources  := $(wildcard proto/*.c)
-daemon_sources := $(filter-out daemon/worker.c,$(wildcard daemon/*.c))
+daemon_sources := $(filter-out daemon/worker.c,$(wildcard daemon/*.c daemon/*/*.c))
 # What the unit tests know of the daemon: its state, without HTTP.
-state_sources  := $(wildcard daemon/store*.c) $(patsubst %,daemon/%.c,job digest queue document supervise spawn files id log watch)
+state_sources  := $(wildcard daemon/store/*.c daemon/jobs/*.c) $(patsubst %,daemon/%.c,files id log watch)
 cbct_sources   := $(wildcard clients/cbct/*.c)
 unit_sources   := $(wildcard tests/unit/*.c)
 
@@ -221,7 +221,7 @@ soak: setup ## the long tests: faults by the thousand, sweeps over anatomy and n
 FUZZ_SECONDS ?= 10
 fuzzers := $(patsubst tests/fuzz/%.c,$(BUILD)/%,$(wildcard tests/fuzz/fuzz_*.c))
 
-$(BUILD)/fuzz_%: $(BUILD)/tests/fuzz/fuzz_%.o $(call objects,daemon/http_text.c daemon/http_framing.c clients/cbct/numbers.c clients/cbct/npy.c) $(library)
+$(BUILD)/fuzz_%: $(BUILD)/tests/fuzz/fuzz_%.o $(call objects,daemon/http/text.c daemon/http/framing.c clients/cbct/numbers.c clients/cbct/npy.c) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -fsanitize=fuzzer -o $@ $^ $(call pkg,--libs,libcrypto $(files_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
 fuzzers: $(fuzzers)

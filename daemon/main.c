@@ -11,7 +11,7 @@
 #include <sys/resource.h>
 #include <unistd.h>
 
-#include "daemon/api.h"
+#include "daemon/api/api.h"
 #include "daemon/config.h"
 #include "daemon/log.h"
 #include "proto/provenance.h"

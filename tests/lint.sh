@@ -23,8 +23,8 @@ rule "proto includes core and proto only" '#include "(kernels|daemon|clients|tes
 rule "clients do not include daemon or kernels" '#include "(kernels|daemon|tests)/' $(files clients)
 rule "nothing includes daemon but daemon and its tests" '#include "daemon/' $(files core kernels proto clients)
 rule "the daemon never touches CUDA" '#include [<"](cuda|cufft|kernels/)' $(files daemon)
-rule "libmicrohttpd stays in daemon/http*" '#include <microhttpd' $(files daemon | grep -v '/http')
-rule "SQLite stays in daemon/store.c" '#include <sqlite3' $(files daemon core proto clients | grep -v 'daemon/store')
+rule "libmicrohttpd stays in daemon/http" '#include <microhttpd' $(files daemon | grep -v '^daemon/http/')
+rule "SQLite stays in daemon/store" '#include <sqlite3' $(files daemon core proto clients | grep -v '^daemon/store/')
 rule "no process-wide string functions" '\b(strtok|sprintf|strcpy|strcat|gets|localtime|gmtime|strerror_l|rand|srand) *\(' $(files core proto daemon clients)
 rule "no unfinished work by its own words" '\b(TODO|FIXME|XXX|HACK)\b' $(files core kernels proto daemon clients tests)
 

@@ -98,7 +98,7 @@ readdirSync(files).sort().forEach((name, i) => {
 })
 
 writeFileSync(join(to, 'assets.c'), `/* Made by ${relative(process.cwd(), fileURLToPath(import.meta.url))}: the page's files, inside of the daemon. */
-#include "daemon/assets.h"
+#include "daemon/api/assets.h"
 
 __asm__(".section .rodata\\n"
 	${incbin.join('\n\t')}

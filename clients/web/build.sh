@@ -8,7 +8,7 @@ cd "$(dirname "$0")" || exit 1
 
 without() {
 	echo "building without the web page: $*" >&2
-	printf '#include "daemon/assets.h"\n\nconst struct asset assets[] = {{0}};\n' >"$to/without"
+	printf '#include "daemon/api/assets.h"\n\nconst struct asset assets[] = {{0}};\n' >"$to/without"
 	cmp -s "$to/without" "$to/assets.c" || cp "$to/without" "$to/assets.c"
 	rm -rf "$to/files"
 	exit 0

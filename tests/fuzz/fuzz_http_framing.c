@@ -4,7 +4,7 @@
  */
 #include <string.h>
 
-#include "daemon/http_framing.h"
+#include "daemon/http/framing.h"
 #include "tests/fuzz/fuzz.h"
 
 /* What goes on of the data, given in pieces of `step` bytes, what is held back in front of the next. */

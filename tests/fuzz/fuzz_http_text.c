@@ -1,7 +1,7 @@
 /* Any text where a header's value or a target is expected: what is understood lies within its bounds. */
 #include <string.h>
 
-#include "daemon/http_text.h"
+#include "daemon/http/text.h"
 #include "tests/fuzz/fuzz.h"
 
 static void check_range(const char *text, uint64_t size)

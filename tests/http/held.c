@@ -12,7 +12,7 @@
 #include <time.h>
 #include <unistd.h>
 
-#include "daemon/job.h"
+#include "daemon/jobs/job.h"
 
 /* Weak: a program has one of them. */
 int __real_fdatasync(int file) __attribute__((weak));

@@ -12,12 +12,12 @@ operations() {
 	' "$top/proto/openapi.yaml" | sort
 }
 routes() {
-	sed -nE 's/^[[:space:]]*\{"([A-Z]+)", "([^"]+)",.*/\1 \2/p' "$top/daemon/api.c" | sort
+	sed -nE 's/^[[:space:]]*\{"([A-Z]+)", "([^"]+)",.*/\1 \2/p' "$top/daemon/api/api.c" | sort
 }
 
 test_schema_and_routes_name_the_same_operations() {
-	[ "$(routes | wc -l)" -gt 10 ] || fail "the table of routes in daemon/api.c"
-	diff <(operations served) <(routes) || fail "proto/openapi.yaml (<) and daemon/api.c (>) with the same operations"
+	[ "$(routes | wc -l)" -gt 10 ] || fail "the table of routes in daemon/api/api.c"
+	diff <(operations served) <(routes) || fail "proto/openapi.yaml (<) and daemon/api/api.c (>) with the same operations"
 }
 
 test_what_is_planned_is_not_there_yet() {

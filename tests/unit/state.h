@@ -1,7 +1,7 @@
 #ifndef CBCT_TESTS_STATE_H
 #define CBCT_TESTS_STATE_H
 
-#include "daemon/job.h"
+#include "daemon/jobs/job.h"
 
 /* A state directory of its own for each test, and what tests of the store and the jobs do all the time. Failures end
  * the test. */

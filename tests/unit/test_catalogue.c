@@ -8,8 +8,8 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
-#include "daemon/store_pages.h"
-#include "daemon/store_quarantine.h"
+#include "daemon/store/pages.h"
+#include "daemon/store/quarantine.h"
 #include "proto/spool.h"
 #include "tests/unit/state.h"
 

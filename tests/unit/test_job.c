@@ -6,8 +6,8 @@
 #include <string.h>
 #include <time.h>
 
-#include "daemon/digest.h"
-#include "daemon/document.h"
+#include "daemon/jobs/digest.h"
+#include "daemon/jobs/document.h"
 #include "daemon/files.h"
 #include "proto/durable.h"
 #include "proto/format.h"

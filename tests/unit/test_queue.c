@@ -4,7 +4,7 @@
 #include <string.h>
 
 #include "daemon/id.h"
-#include "daemon/queue.h"
+#include "daemon/jobs/queue.h"
 
 /* The tickets of the queue from its front, "3 1 2". */
 static const char *order_of(const struct queue *queue)

@@ -12,7 +12,7 @@
 #include <unistd.h>
 
 #include "daemon/files.h"
-#include "daemon/store_pages.h"
+#include "daemon/store/pages.h"
 #include "proto/spool.h"
 #include "tests/unit/state.h"
 

@@ -1,0 +1,242 @@
+/* /v1/jobs */
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "daemon/api/api.h"
+#include "daemon/jobs/document.h"
+#include "daemon/http/text.h"
+
+/* ---- POST ---- */
+
+static int reply_accepted(struct request *request, struct job *job, struct error *err)
+{
+	struct job_facts facts;
+
+	job_facts(job, &facts);
+	if (request_reply_json(request, 202, job_document(job, false), err) != 0)
+		return err->code;
+	request_reply_header(request, "Location", "/v1/jobs/%s", facts.id);
+	return 0;
+}
+
+/* Everything that only the scan and the workers can tell, then the job itself. */
+static int post_resolved(struct api *api, struct job_request *wanted, struct stored_scan *scan, const char *key,
+			 const uint8_t digest[32], struct job **ret_job, struct error *err)
+{
+	struct recon_memory memory;
+	bool fresh;
+
+	if (job_request_resolve(wanted, stored_scan_measured(scan), err) != 0 ||
+	    supervise_check_memory(api->supervise, stored_scan_measured(scan), &wanted->recipe, &memory, err) != 0)
+		return err->code;
+	return jobs_post(api->jobs, wanted, scan, &memory, key, digest, ret_job, &fresh, err);
+}
+
+static int post(struct api *api, const char *text, size_t length, const char *key, const uint8_t digest[32],
+		struct job **ret_job, struct error *err)
+{
+	struct job_request wanted;
+	struct stored_scan *scan;
+	int code;
+
+	if (job_request_parse(text, length, &wanted, err) != 0)
+		return err->code;
+	code = store_scan_find(api->store, wanted.scan, &scan, err);
+	if (code == ERR_NOT_FOUND)
+		snprintf(err->pointer, sizeof(err->pointer), "/scan");
+	if (code == 0) {
+		code = post_resolved(api, &wanted, scan, key, digest, ret_job, err);
+		stored_scan_release(scan);
+	}
+	recipe_clear(&wanted.recipe);
+	return code;
+}
+
+int job_post(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	struct job *job = NULL;
+	struct store_key key;
+	size_t length;
+	const char *text = request_body(request, &length);
+	int code;
+
+	code = idempotency_read(request, &key, err);
+	if (code == 0 && key.text != NULL)
+		code = jobs_repeat(api->jobs, key.text, key.digest, &job, err);
+	if (code == 0 && job == NULL)
+		code = post(api, text, length, key.text, key.digest, &job, err);
+	if (code == 0)
+		code = reply_accepted(request, job, err);
+	job_release(job);
+	return code;
+}
+
+/* ---- lists ---- */
+
+int job_list(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	struct job *jobs[PAGE_MAX];
+	struct job_facts last;
+	cJSON *document, *list;
+	struct page page;
+	int count;
+	bool more;
+
+	if (page_read_ids(request, &page, err) != 0 ||
+	    jobs_list(api->jobs, page.after, page.limit, jobs, &count, &more, err) != 0)
+		return err->code;
+	document = cJSON_CreateObject();
+	list = cJSON_AddArrayToObject(document, "jobs");
+	for (int i = 0; i < count; i++) {
+		cJSON_AddItemToArray(list, job_document(jobs[i], true));
+		job_facts(jobs[i], &last);
+		job_release(jobs[i]);
+	}
+	if (more && count > 0)
+		cJSON_AddStringToObject(document, "next", last.id);
+	else
+		cJSON_AddNullToObject(document, "next");
+	return request_reply_json(request, 200, document, err);
+}
+
+/* ---- waiting for what becomes of one ---- */
+
+struct waiter {
+	struct job *job;
+	struct watch watch;
+	double until; /* http_now */
+};
+
+static void wake_request(void *context)
+{
+	request_wake(context);
+}
+
+static void waiter_free(void *state)
+{
+	struct waiter *waiter = state;
+
+	job_unwatch(waiter->job, &waiter->watch);
+	job_release(waiter->job);
+	free(waiter);
+}
+
+int wait_read(struct api *api, struct request *request, double initial, double *ret_seconds, struct error *err)
+{
+	const char *wait = request_query(request, "wait");
+	double seconds = initial;
+
+	if (wait == NULL)
+		prefer_wait(request_header(request, "Prefer"), &seconds);
+	else if (!number_parse(wait, 0, 1e9, &seconds))
+		return error_set(err, ERR_INVALID, "wait is \"%.40s\", expected a number of seconds from 0 on", wait);
+	*ret_seconds = seconds < api->max_wait ? seconds : api->max_wait;
+	return 0;
+}
+
+int job_wait_begin(struct request *request, struct job *job, double seconds, struct error *err)
+{
+	struct waiter *waiter = calloc(1, sizeof(*waiter));
+
+	if (waiter == NULL) {
+		job_release(job);
+		return error_set(err, ERR_NO_MEMORY, "no memory to wait for a job");
+	}
+	waiter->job = job;
+	waiter->until = http_now() + seconds;
+	waiter->watch.wake = wake_request;
+	waiter->watch.context = request;
+	job_watch(job, &waiter->watch);
+	request_set_state(request, waiter, waiter_free);
+	return 0;
+}
+
+struct job *job_waited_for(struct request *request)
+{
+	struct waiter *waiter = request_state(request);
+
+	return waiter != NULL ? waiter->job : NULL;
+}
+
+bool job_wait_goes_on(struct request *request)
+{
+	struct waiter *waiter = request_state(request);
+
+	if (http_now() >= waiter->until || request_stopping(request))
+		return false;
+	request_wait_until(request, waiter->until);
+	return true;
+}
+
+/* ---- one, and waiting for its end ---- */
+
+/* The job's document, once it has ended or the time is over. */
+static int wait_end(struct request *request, int status, struct error *err)
+{
+	struct job *job = job_waited_for(request);
+	struct job_facts facts;
+
+	job_facts(job, &facts);
+	if (facts.removed)
+		return error_set(err, ERR_NOT_FOUND, "job %s was removed", facts.id);
+	if (!facts.ended && job_wait_goes_on(request))
+		return HTTP_WAIT;
+	return request_reply_json(request, status, job_document(job, false), err);
+}
+
+int job_get(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	struct job *job;
+	double seconds;
+
+	if (request_state(request) != NULL)
+		return wait_end(request, 200, err);
+	if (wait_read(api, request, 0, &seconds, err) != 0 ||
+	    jobs_find(api->jobs, request_argument(request, 0), &job, err) != 0 ||
+	    job_wait_begin(request, job, seconds, err) != 0)
+		return err->code;
+	return wait_end(request, 200, err);
+}
+
+/* Its files are gone; what is still open of them would keep their space. */
+static void forget_files(struct api *api, struct job *job)
+{
+	char directory[1024];
+	struct job_facts facts;
+
+	job_facts(job, &facts);
+	store_job_directory(api->store, facts.id, directory);
+	mappings_forget(api->mappings, directory);
+	renditions_forget(api->renditions, facts.id);
+}
+
+int job_delete(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	struct job *job;
+	double seconds;
+	bool removed = false;
+	int code;
+
+	if (request_state(request) != NULL)
+		return wait_end(request, 202, err);
+	if (wait_read(api, request, 0, &seconds, err) != 0 ||
+	    jobs_find(api->jobs, request_argument(request, 0), &job, err) != 0)
+		return err->code;
+	code = jobs_delete(api->jobs, job, &removed, err);
+	if (code == ERR_NO_SPACE && store_reserve_spend(api->store))
+		code = jobs_delete(api->jobs, job, &removed, err);
+	if (code != 0 || removed) {
+		if (removed)
+			forget_files(api, job);
+		job_release(job);
+		return removed ? request_reply_empty(request, 204, err) : code;
+	}
+	if (job_wait_begin(request, job, seconds, err) != 0)
+		return err->code;
+	return wait_end(request, 202, err);
+}

@@ -1,0 +1,282 @@
+/* /v1/scans/{}/projections, flat, dark, defects */
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <unistd.h>
+
+#include "daemon/api/api.h"
+#include "daemon/http/text.h"
+#include "proto/slice.h"
+
+/* ---- in ---- */
+
+/* "" (all), "k" or "a-b". */
+static int read_run(const char *text, int count, struct upload_target *target, struct error *err)
+{
+	const char *dash = strchr(text, '-');
+	size_t length = dash != NULL ? (size_t)(dash - text) : strlen(text);
+	long first = 0, last = count - 1;
+
+	if (text[0] != '\0') {
+		if (!index_parse(text, length, 1000000000, &first))
+			return error_set(err, ERR_NOT_FOUND, "\"%.60s\" is neither a projection nor a run of them",
+					 text);
+		last = first;
+		if (dash != NULL && !index_parse(dash + 1, strlen(dash + 1), 1000000000, &last))
+			return error_set(err, ERR_NOT_FOUND, "\"%.60s\" is no run of projections", text);
+	}
+	if (first >= count || last >= count)
+		return error_set(err, ERR_NOT_FOUND, "projection %ld is asked for, the scan has 0 to %d",
+				 last > first ? last : first, count - 1);
+	if (last < first)
+		return error_set(err, ERR_INVALID, "the run %.60s ends before it begins", text);
+	*target = (struct upload_target){.kind = UPLOAD_PROJECTIONS, .first = (int)first, .last = (int)last};
+	return 0;
+}
+
+static void release_upload(void *state)
+{
+	upload_release(state);
+}
+
+static int begin(struct api *api, struct request *request, struct stored_scan *scan, const struct upload_target *target,
+		 struct error *err)
+{
+	struct upload *upload = NULL;
+
+	if (upload_new(api->uploads, request, scan, target, &upload, err) != 0)
+		return err->code;
+	request_set_state(request, upload, release_upload);
+	return 0;
+}
+
+int projections_begin(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	struct upload_target target;
+	struct stored_scan *scan;
+
+	if (store_scan_find(api->store, request_argument(request, 0), &scan, err) != 0)
+		return err->code;
+	if (read_run(request_argument(request, 1), stored_scan_parsed(scan)->count, &target, err) != 0) {
+		stored_scan_release(scan);
+		return err->code;
+	}
+	return begin(api, request, scan, &target, err);
+}
+
+static int image_begin(struct api *api, struct request *request, enum image image, struct error *err)
+{
+	const struct upload_target target = {.kind = UPLOAD_IMAGE, .image = image};
+	struct stored_scan *scan;
+
+	if (store_scan_find(api->store, request_argument(request, 0), &scan, err) != 0)
+		return err->code;
+	if (image != IMAGE_DEFECTS && stored_scan_parsed(scan)->quantity != QUANTITY_INTENSITY) {
+		stored_scan_release(scan);
+		return error_set(err, ERR_IMPOSSIBLE,
+				 "the scan's quantity is line_integral; flat and dark images are for intensity");
+	}
+	return begin(api, request, scan, &target, err);
+}
+
+int flat_begin(void *context, struct request *request, struct error *err)
+{
+	return image_begin(context, request, IMAGE_FLAT, err);
+}
+
+int dark_begin(void *context, struct request *request, struct error *err)
+{
+	return image_begin(context, request, IMAGE_DARK, err);
+}
+
+int defects_begin(void *context, struct request *request, struct error *err)
+{
+	return image_begin(context, request, IMAGE_DEFECTS, err);
+}
+
+int upload_take(void *context, struct request *request, const void *data, size_t size, size_t *ret_taken,
+		struct error *err)
+{
+	(void)context;
+	return upload_data(request_state(request), data, size, ret_taken, err);
+}
+
+int projections_put(void *context, struct request *request, struct error *err)
+{
+	struct upload_outcome outcome;
+	cJSON *document;
+	int code = upload_end(request_state(request), &outcome, err);
+
+	(void)context;
+	if (code != 0)
+		return code;
+	document = cJSON_CreateObject();
+	cJSON_AddStringToObject(document, "scan", request_argument(request, 0));
+	cJSON_AddNumberToObject(document, "stored", outcome.created);
+	cJSON_AddNumberToObject(document, "same", outcome.same);
+	return request_reply_json(request, outcome.created > 0 ? 201 : 200, document, err);
+}
+
+int image_put(void *context, struct request *request, struct error *err)
+{
+	return projections_put(context, request, err);
+}
+
+/* ---- out ---- */
+
+/* As float; the smallest finite sample and the largest. */
+static void read_samples(const void *samples, const struct scan *scan, size_t count, float *ret_values,
+			 struct slice *ret_range)
+{
+	float black = INFINITY, white = -INFINITY;
+
+	for (size_t i = 0; i < count; i++) {
+		uint16_t counts;
+
+		if (scan->sample == SAMPLE_UINT16) {
+			memcpy(&counts, (const char *)samples + i * sizeof(counts), sizeof(counts));
+			ret_values[i] = counts;
+		} else {
+			memcpy(&ret_values[i], (const char *)samples + i * sizeof(float), sizeof(float));
+		}
+		if (isfinite(ret_values[i])) {
+			black = fminf(black, ret_values[i]);
+			white = fmaxf(white, ret_values[i]);
+		}
+	}
+	ret_range->black = (double)black;
+	ret_range->white = (double)white;
+}
+
+/* The smallest finite sample black, the largest white. */
+static int draw(const void *samples, const struct scan *scan, char **ret_png, size_t *ret_length, struct error *err)
+{
+	const struct grid grid = {.size = {scan->geometry.columns, scan->geometry.rows, 1}, .spacing = {1, 1, 1}};
+	const size_t count = grid_voxels(&grid);
+	struct slice slice = {.axis = 2};
+	float *values = malloc(count * sizeof(*values));
+	unsigned char *pixels = malloc(count);
+	int code = 0;
+
+	if (values == NULL || pixels == NULL) {
+		code = error_set(err, ERR_NO_MEMORY, "no memory for a picture of %zu pixels", count);
+		goto out;
+	}
+	read_samples(samples, scan, count, values, &slice);
+	slice_make(values, &grid, &slice, 0, pixels);
+	code = gray_png(pixels, grid.size[0], grid.size[1], NULL, ret_png, ret_length, err);
+out:
+	free(values);
+	free(pixels);
+	return code;
+}
+
+enum { ETAG_MAX = 48 };
+
+static void make_etag(const uint8_t sha256[32], const char *kind, char ret_etag[ETAG_MAX])
+{
+	char digest[33];
+
+	for (int i = 0; i < 16; i++)
+		snprintf(digest + 2 * i, sizeof(digest) - 2 * (size_t)i, "%02x", sha256[i]);
+	snprintf(ret_etag, ETAG_MAX, "\"%s%s\"", digest, kind);
+}
+
+static int reply_picture(struct request *request, struct stored_scan *stored, int descriptor, int index,
+			 const uint8_t sha256[32], struct error *err)
+{
+	enum { PICTURE_PIXELS_MAX = 64 << 20 };
+	const struct scan *scan = stored_scan_parsed(stored);
+	size_t size = scan_projection_bytes(scan), length;
+	char *png, etag[ETAG_MAX];
+	const struct entity entity = {.etag = etag, .size = UNKNOWN_SIZE, .media_type = "image/png"};
+	struct selection selection;
+	struct sum sum;
+	void *samples;
+	bool done;
+	int code;
+
+	make_etag(sha256, "-png", etag);
+	if (entity_select(request, &entity, &selection, &done, err) != 0 || done)
+		return done ? 0 : err->code;
+	if (size > PICTURE_PIXELS_MAX * sample_bytes(scan->sample))
+		return error_set(err, ERR_IMPOSSIBLE, "a picture has at most %d pixels, the projection %zu",
+				 PICTURE_PIXELS_MAX, size / sample_bytes(scan->sample));
+	samples = malloc(size);
+	if (samples == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a picture");
+	code = stored_scan_read(stored, descriptor, index, samples, &sum, err);
+	if (code == 0)
+		code = draw(samples, scan, &png, &length, err);
+	if (code == 0)
+		code = request_reply_bytes(request, 200, png, length, err);
+	free(samples);
+	if (code == 0)
+		entity_headers(request, &entity, &selection);
+	return code;
+}
+
+/* From the file, once it was held against its checksum. Takes the descriptor. */
+static int reply_samples(struct request *request, const struct scan *scan, int descriptor, int index,
+			 const uint8_t sha256[32], struct error *err)
+{
+	char etag[ETAG_MAX], filename[96];
+	struct entity entity = {.etag = etag,
+				.size = scan_projection_bytes(scan),
+				.media_type = "application/octet-stream",
+				.filename = filename};
+	struct selection selection;
+	bool done;
+
+	make_etag(sha256, "", etag);
+	snprintf(filename, sizeof(filename), "%.40s-%d.raw", request_argument(request, 0), index);
+	if (entity_select(request, &entity, &selection, &done, err) != 0 || done) {
+		close(descriptor);
+		return done ? 0 : err->code;
+	}
+	if (request_reply_file(request, selection.status, descriptor, (uint64_t)index * entity.size + selection.first,
+			       selection.length, err) != 0)
+		return err->code;
+	entity_headers(request, &entity, &selection);
+	return 0;
+}
+
+static int reply_projection(struct request *request, struct stored_scan *stored, struct error *err)
+{
+	static const char *const formats[] = {"raw", "png", NULL};
+	const struct scan *scan = stored_scan_parsed(stored);
+	const char *text = request_argument(request, 1);
+	int format, descriptor, code;
+	struct sum sum;
+	long index;
+
+	if (query_choice(request, "format", formats, &format, err) != 0)
+		return err->code;
+	if (!index_parse(text, strlen(text), scan->count - 1, &index))
+		return error_set(err, ERR_NOT_FOUND, "projection \"%.40s\" is asked for, the scan has 0 to %d", text,
+				 scan->count - 1);
+	if (stored_scan_open(stored, false, &descriptor, err) != 0)
+		return err->code;
+	code = stored_scan_verify(stored, descriptor, (int)index, &sum, err);
+	if (code == 0 && format == 0)
+		return reply_samples(request, scan, descriptor, (int)index, sum.sha256, err);
+	if (code == 0)
+		code = reply_picture(request, stored, descriptor, (int)index, sum.sha256, err);
+	close(descriptor);
+	return code;
+}
+
+int projection_get(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	struct stored_scan *scan;
+	int code;
+
+	if (store_scan_find(api->store, request_argument(request, 0), &scan, err) != 0)
+		return err->code;
+	code = reply_projection(request, scan, err);
+	stored_scan_release(scan);
+	return code;
+}

@@ -1,0 +1,108 @@
+/* /v1/scans */
+#include "daemon/api/api.h"
+#include "daemon/jobs/document.h"
+
+/* A new scan, or the one that another request with the same key has made at the same time. */
+static int post(struct api *api, struct request *request, const struct store_key *key, struct stored_scan **ret_scan,
+		struct error *err)
+{
+	struct scan *scan = NULL;
+	size_t length;
+	const char *text = request_body(request, &length);
+	int code;
+
+	if (scan_parse(text, length, &scan, err) != 0)
+		return err->code;
+	code = store_scan_create(api->store, scan, key->text != NULL ? key : NULL, ret_scan, err);
+	if (code != 0)
+		scan_free(scan);
+	return code == ERR_CONFLICT ? store_scan_repeat(api->store, key, ret_scan, err) : code;
+}
+
+int scan_post(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	struct stored_scan *stored = NULL;
+	struct store_key key;
+	int code = idempotency_read(request, &key, err);
+
+	if (code == 0 && key.text != NULL)
+		code = store_scan_repeat(api->store, &key, &stored, err);
+	if (code == 0 && stored == NULL)
+		code = post(api, request, &key, &stored, err);
+	if (code != 0)
+		return code;
+	code = request_reply_json(request, 201, scan_document(stored, false), err);
+	if (code == 0)
+		request_reply_header(request, "Location", "/v1/scans/%s", stored_scan_id(stored));
+	stored_scan_release(stored);
+	return code;
+}
+
+int scan_list(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	struct stored_scan *scans[PAGE_MAX];
+	cJSON *document, *list;
+	struct page page;
+	int count;
+	bool more;
+
+	if (page_read_ids(request, &page, err) != 0 ||
+	    store_scan_list(api->store, page.after, page.limit, scans, &count, &more, err) != 0)
+		return err->code;
+	document = cJSON_CreateObject();
+	list = cJSON_AddArrayToObject(document, "scans");
+	for (int i = 0; i < count; i++)
+		cJSON_AddItemToArray(list, scan_document(scans[i], true));
+	if (more && count > 0)
+		cJSON_AddStringToObject(document, "next", stored_scan_id(scans[count - 1]));
+	else
+		cJSON_AddNullToObject(document, "next");
+	for (int i = 0; i < count; i++)
+		stored_scan_release(scans[i]);
+	return request_reply_json(request, 200, document, err);
+}
+
+int scan_get(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	struct stored_scan *scan;
+	int code;
+
+	if (store_scan_find(api->store, request_argument(request, 0), &scan, err) != 0)
+		return err->code;
+	code = request_reply_json(request, 200, scan_document(scan, false), err);
+	stored_scan_release(scan);
+	return code;
+}
+
+int scan_complete(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	struct stored_scan *scan;
+	int code;
+
+	if (store_scan_find(api->store, request_argument(request, 0), &scan, err) != 0)
+		return err->code;
+	code = store_scan_close(api->store, scan, err);
+	if (code == 0)
+		code = request_reply_json(request, 200, scan_document(scan, false), err);
+	stored_scan_release(scan);
+	return code;
+}
+
+int scan_delete(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	struct stored_scan *scan;
+	int code;
+
+	if (store_scan_refer(api->store, request_argument(request, 0), &scan, err) != 0)
+		return err->code;
+	code = jobs_delete_scan(api->jobs, scan, err);
+	if (code == ERR_NO_SPACE && store_reserve_spend(api->store))
+		code = jobs_delete_scan(api->jobs, scan, err);
+	stored_scan_release(scan);
+	return code != 0 ? code : request_reply_empty(request, 204, err);
+}

@@ -1,0 +1,326 @@
+/* /v1/jobs/{}/volumes */
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "daemon/api/api.h"
+#include "daemon/volumes/content.h"
+#include "daemon/jobs/document.h"
+#include "daemon/http/text.h"
+
+/* s that a list waits for digests: longer than a disk takes for a volume, or something is wrong with it. */
+static const double patience = 30;
+
+/* Newest first, as all lists; a page goes on behind the volume named by `after`. */
+static int reply_page(struct request *request, const char *job, const struct page *page,
+		      const struct volume_record *volumes, int count, struct error *err)
+{
+	cJSON *document = cJSON_CreateObject(), *list = cJSON_AddArrayToObject(document, "volumes");
+	int first = count - 1, last;
+
+	for (int i = 0; page->after != NULL && i < count; i++) {
+		if (strcmp(volumes[i].name, page->after) == 0)
+			first = i - 1;
+	}
+	last = first >= page->limit ? first - page->limit + 1 : 0;
+	for (int i = first; i >= last; i--)
+		cJSON_AddItemToArray(list, volume_document(job, &volumes[i]));
+	if (last > 0)
+		cJSON_AddStringToObject(document, "next", volumes[last].name);
+	else
+		cJSON_AddNullToObject(document, "next");
+	return request_reply_json(request, 200, document, err);
+}
+
+/* HTTP_WAIT while there is hope for the digests that are missing. */
+static int list_volumes(struct api *api, struct request *request, const struct page *page, struct job *job,
+			struct error *err)
+{
+	struct volume_record *volumes;
+	struct job_facts facts;
+	bool hashed = true;
+	int count, code;
+
+	job_facts(job, &facts);
+	if (facts.removed)
+		return error_set(err, ERR_NOT_FOUND, "job %s was removed", facts.id);
+	code = store_job_volumes(api->store, facts.id, &volumes, &count, err);
+	if (code != 0)
+		return code;
+	for (int i = 0; i < count; i++)
+		hashed = hashed && volumes[i].hashed;
+	if (!hashed && job_wait_goes_on(request))
+		code = HTTP_WAIT;
+	else
+		code = reply_page(request, facts.id, page, volumes, count, err);
+	free(volumes);
+	return code;
+}
+
+int volume_list(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	struct page page;
+	struct job *job;
+	double seconds;
+
+	if (page_read(request, &page, err) != 0)
+		return err->code;
+	if (job_waited_for(request) == NULL && (wait_read(api, request, patience, &seconds, err) != 0 ||
+						jobs_find(api->jobs, request_argument(request, 0), &job, err) != 0 ||
+						job_wait_begin(request, job, seconds, err) != 0))
+		return err->code;
+	return list_volumes(api, request, &page, job_waited_for(request), err);
+}
+
+int volume_find(struct api *api, const struct job_facts *job, const char *name, struct volume_record *ret_volume,
+		struct error *err)
+{
+	struct volume_record *volumes;
+	int count, found = -1;
+
+	if (store_job_volumes(api->store, job->id, &volumes, &count, err) != 0)
+		return err->code;
+	for (int i = 0; i < count && found < 0; i++) {
+		if (strcmp(volumes[i].name, name) == 0)
+			found = i;
+	}
+	if (found >= 0)
+		*ret_volume = volumes[found];
+	free(volumes);
+	if (found < 0)
+		return error_set(err, ERR_NOT_FOUND, "job %s has no volume \"%.40s\"%s", job->id, name,
+				 job->ended ? "" : " yet");
+	return 0;
+}
+
+int volume_asked(struct api *api, struct request *request, struct job_facts *ret_facts,
+		 struct volume_record *ret_volume, struct error *err)
+{
+	struct job *job;
+
+	if (jobs_find(api->jobs, request_argument(request, 0), &job, err) != 0)
+		return err->code;
+	job_facts(job, ret_facts);
+	job_release(job);
+	return volume_find(api, ret_facts, request_argument(request, 1), ret_volume, err);
+}
+
+int volume_verify(struct api *api, const char *job, const struct volume_record *volume, uint64_t first, uint64_t bytes,
+		  struct error *err)
+{
+	int code = store_volume_verify(api->store, job, volume, first, bytes, err);
+	struct error ignored;
+	struct job_facts facts;
+	struct job *found;
+
+	if ((code != ERR_DAMAGED && code != ERR_NOT_FOUND) || jobs_find(api->jobs, job, &found, &ignored) != 0)
+		return code;
+	job_facts(found, &facts);
+	if (code == ERR_NOT_FOUND && !facts.removed) /* the files of a removed job go with it */
+		code = store_volume_gone(volume, err);
+	if (code == ERR_DAMAGED)
+		job_add_warning(found, "damaged_volume", err->text, &ignored);
+	job_release(found);
+	return code;
+}
+
+/* The formats of files, and the one that is for programs only. */
+static const char shuffled_name[] = "shuffled", shuffled_media_type[] = "application/vnd.cbct.shuffled+zstd";
+
+static int read_format(struct request *request, struct content_options *options, struct error *err)
+{
+	const char *types[] = {volume_type_names[VOLUME_FLOAT32], volume_type_names[VOLUME_INT16], NULL};
+	const char *formats[16] = {NULL};
+	int format, type, count = 0;
+
+	for (; volume_formats[count].name != NULL && count < 14; count++)
+		formats[count] = volume_formats[count].name;
+	formats[count] = shuffled_name;
+	if (query_choice(request, "format", formats, &format, err) != 0 ||
+	    query_choice(request, "type", types, &type, err) != 0)
+		return err->code;
+	options->shuffled = format == count;
+	if (!options->shuffled) {
+		options->format = &volume_formats[format];
+		options->type = (enum volume_type)type;
+		return 0;
+	}
+	if (type != VOLUME_INT16 && request_query(request, "type") != NULL)
+		return error_set(err, ERR_INVALID, "type is \"%.40s\", expected int16 with format=%s", types[type],
+				 shuffled_name);
+	options->format = volume_format_find("raw");
+	options->type = VOLUME_INT16;
+	return 0;
+}
+
+int volume_options(struct request *request, const struct job_facts *job, struct content_options *ret_options,
+		   struct error *err)
+{
+	const char *scale_text = request_query(request, "scale");
+	struct content_options options = {.mu_water = job->mu_water};
+	long scale = 1;
+
+	if (read_format(request, &options, err) != 0)
+		return err->code;
+	if (scale_text != NULL &&
+	    (!index_parse(scale_text, strlen(scale_text), CONTENT_SCALE_MAX, &scale) || scale == 0))
+		return error_set(err, ERR_INVALID, "scale is \"%.40s\", expected a whole number from 1 to %d",
+				 scale_text, CONTENT_SCALE_MAX);
+	options.scale = (int)scale;
+	*ret_options = options;
+	return 0;
+}
+
+const char *volume_media_type(const struct content_options *options)
+{
+	return options->shuffled ? shuffled_media_type : options->format->media_type;
+}
+
+void volume_filename(const char *job, const char *name, const struct content_options *options,
+		     char ret_name[VOLUME_FILENAME_MAX])
+{
+	snprintf(ret_name, VOLUME_FILENAME_MAX, "%s-%s%s", job, name,
+		 options->shuffled ? ".shuffled.zst" : options->format->extension);
+}
+
+/* The digest would do as well, but comes later than the volume. */
+void volume_tag(const char *job, const struct volume_record *volume, char ret_tag[VOLUME_TAG_MAX])
+{
+	snprintf(ret_tag, VOLUME_TAG_MAX, "%s-%s-%llx", job, volume->name, (unsigned long long)(volume->created * 1e6));
+}
+
+/* Tells voxels, format, type, scale and encoding apart. */
+static void make_etag(const char *job, const struct volume_record *volume, const struct content_options *options,
+		      bool zstd, char *ret_etag, size_t size)
+{
+	char tag[VOLUME_TAG_MAX];
+
+	volume_tag(job, volume, tag);
+	snprintf(ret_etag, size, "\"%s-%s-%s-%d-%d%s\"", tag, options->shuffled ? shuffled_name : options->format->name,
+		 volume_type_names[options->type], options->scale, FORMAT_REVISION, zstd ? "-zstd" : "");
+}
+
+/* A part of the content that is made as it is sent. */
+struct part {
+	struct content *content;
+	uint64_t first;
+};
+
+static ssize_t part_read(void *context, uint64_t offset, void *to, size_t size)
+{
+	struct part *part = context;
+
+	return content_read(part->content, part->first + offset, to, size);
+}
+
+static void part_free(void *context)
+{
+	struct part *part = context;
+
+	content_close(part->content);
+	free(part);
+}
+
+static ssize_t stream_read(void *context, uint64_t offset, void *to, size_t size)
+{
+	(void)offset;
+	return content_stream_read(context, to, size);
+}
+
+static void stream_free(void *context)
+{
+	content_stream_free(context);
+}
+
+/* Takes the content. */
+static int reply_plain(struct request *request, struct content *content, const struct selection *selection,
+		       struct error *err)
+{
+	uint64_t offset;
+	int descriptor = content_descriptor(content, &offset);
+	struct part *part;
+
+	if (descriptor >= 0) {
+		content_close(content);
+		return request_reply_file(request, selection->status, descriptor, offset + selection->first,
+					  selection->length, err);
+	}
+	part = malloc(sizeof(*part));
+	if (part == NULL) {
+		content_close(content);
+		return error_set(err, ERR_NO_MEMORY, "no memory for a reply");
+	}
+	*part = (struct part){content, selection->first};
+	return request_reply_read(request, selection->status, selection->length, part_read, part, part_free, err);
+}
+
+/* Takes the content. encoding: what compresses it is not the media type's own. */
+static int reply_packed(struct request *request, struct content *content, bool encoding, struct error *err)
+{
+	struct content_stream *stream;
+
+	if (content_stream_new(content, 0, &stream, err) != 0 ||
+	    request_reply_read(request, 200, UNKNOWN_SIZE, stream_read, stream, stream_free, err) != 0)
+		return err->code;
+	if (encoding)
+		request_reply_header(request, "Content-Encoding", "zstd");
+	return 0;
+}
+
+/* What of the file goes into these bytes of the content; NULL: all of it. */
+static int verify_selected(struct api *api, const char *job, const struct volume_record *volume,
+			   const struct content *content, const struct selection *selection, struct error *err)
+{
+	uint64_t size = content_size(content), head = size - volume->bytes, first = 0, bytes = volume->bytes;
+
+	/* Voxel for voxel behind a header. */
+	if (selection != NULL && content_is_plain(content)) {
+		first = selection->first > head ? selection->first - head : 0;
+		bytes = selection->length;
+	}
+	return volume_verify(api, job, volume, first, bytes, err);
+}
+
+int volume_get(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	struct content_options options;
+	struct volume_record volume;
+	struct selection selection;
+	struct content *content;
+	struct job_facts facts;
+	struct entity entity;
+	char etag[160], filename[VOLUME_FILENAME_MAX], path[1024];
+	/* Ranges are of the plain bytes: a frame of zstd cannot be entered in the middle. */
+	bool zstd = accepts_coding(request_header(request, "Accept-Encoding"), "zstd") &&
+		    (request_header(request, "Range") == NULL || request_is_head(request));
+	bool done, packed;
+
+	if (volume_asked(api, request, &facts, &volume, err) != 0 ||
+	    volume_options(request, &facts, &options, err) != 0)
+		return err->code;
+	store_volume_path(api->store, facts.id, volume.name, path);
+	if (volume_verify(api, facts.id, &volume, 0, 0, err) != 0 ||
+	    content_open(path, &volume.grid, &options, &content, err) != 0)
+		return err->code;
+	packed = content_is_packed(&options);
+	zstd = options.shuffled || (zstd && !packed);
+	make_etag(facts.id, &volume, &options, zstd, etag, sizeof(etag));
+	volume_filename(facts.id, volume.name, &options, filename);
+	entity = (struct entity){etag, zstd || packed ? UNKNOWN_SIZE : content_size(content),
+				 volume_media_type(&options), filename};
+	if (entity_select(request, &entity, &selection, &done, err) != 0 || done) {
+		content_close(content);
+		return done ? 0 : err->code;
+	}
+	if (verify_selected(api, facts.id, &volume, content, zstd || packed ? NULL : &selection, err) != 0) {
+		content_close(content);
+		return err->code;
+	}
+	if ((zstd || packed ? reply_packed(request, content, !packed, err)
+			    : reply_plain(request, content, &selection, err)) != 0)
+		return err->code;
+	entity_headers(request, &entity, &selection);
+	return 0;
+}

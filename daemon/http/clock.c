@@ -1,0 +1,257 @@
+/*
+ * Connections and time: each one's pace is judged by the phase it is in, those
+ * that wait are woken when their time has come, those without an end in sight
+ * when their peer has gone. One thread looks at all
+ * of them; it sleeps until the next deadline it saw, or a second.
+ *
+ * The library knows idle time only, so that a client which sends a byte every
+ * few seconds would live for ever; and it cannot close a connection from
+ * another thread, but it sees the end when the socket is shut down.
+ */
+#include "daemon/http/internal.h"
+
+#include <math.h>
+#include <time.h>
+
+#include "daemon/log.h"
+
+/* Deadlines this close to each other are seen in one go. */
+static const double resolution = 0.01; /* s */
+
+double http_now(void)
+{
+	struct timespec now;
+
+	clock_gettime(CLOCK_MONOTONIC, &now);
+	return (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
+}
+
+void connection_phase(struct connection *connection, enum phase phase, uint64_t bytes)
+{
+	pthread_mutex_lock(&connection->lock);
+	connection->phase = phase;
+	connection->since = http_now();
+	connection->paused = 0;
+	connection->bytes = bytes;
+	connection->bytes_then = UNKNOWN_SIZE;
+	connection->woken = false;
+	if (phase == PHASE_IDLE)
+		connection->patience = 0;
+	if (phase == PHASE_SEND)
+		connection->sent_before = live_acknowledged(connection);
+	pthread_mutex_unlock(&connection->lock);
+}
+
+void connection_progress(struct connection *connection, uint64_t bytes)
+{
+	pthread_mutex_lock(&connection->lock);
+	connection->bytes += bytes;
+	pthread_mutex_unlock(&connection->lock);
+}
+
+enum suspension connection_suspend(struct connection *connection, double until)
+{
+	struct http *http = connection->http;
+	enum suspension outcome = SUSPENDED;
+	double now = http_now();
+
+	pthread_mutex_lock(&connection->lock);
+	if (atomic_load(&http->closing) || connection->cut) {
+		outcome = REFUSED;
+	} else if (connection->woken || until <= now) {
+		connection->woken = false;
+		outcome = WOKEN;
+	} else {
+		connection->suspended = true;
+		connection->suspended_at = now;
+		connection->wait_until = until;
+		MHD_suspend_connection(connection->mhd);
+	}
+	pthread_mutex_unlock(&connection->lock);
+	if (outcome == SUSPENDED && isfinite(until)) {
+		pthread_mutex_lock(&http->lock);
+		if (until < http->clock_next)
+			pthread_cond_signal(&http->clock_kick);
+		pthread_mutex_unlock(&http->lock);
+	}
+	return outcome;
+}
+
+/* With the connection's lock held. */
+static void resume(struct connection *connection)
+{
+	connection->suspended = false;
+	connection->paused += http_now() - connection->suspended_at;
+	MHD_resume_connection(connection->mhd);
+}
+
+void request_wake(struct request *request)
+{
+	struct connection *connection = request->connection;
+
+	pthread_mutex_lock(&connection->lock);
+	if (connection->suspended)
+		resume(connection);
+	else
+		connection->woken = true;
+	pthread_mutex_unlock(&connection->lock);
+}
+
+void request_wake_by(struct request *request, double time)
+{
+	struct connection *connection = request->connection;
+	struct http *http = connection->http;
+
+	pthread_mutex_lock(&connection->lock);
+	if (!connection->suspended)
+		connection->woken = true;
+	else if (time < connection->wait_until)
+		connection->wait_until = time;
+	pthread_mutex_unlock(&connection->lock);
+	pthread_mutex_lock(&http->lock);
+	if (time < http->clock_next)
+		pthread_cond_signal(&http->clock_kick);
+	pthread_mutex_unlock(&http->lock);
+}
+
+void connections_wake(struct http *http)
+{
+	pthread_mutex_lock(&http->lock);
+	for (struct connection *c = http->connections; c != NULL; c = c->next) {
+		pthread_mutex_lock(&c->lock);
+		if (c->suspended)
+			resume(c);
+		pthread_mutex_unlock(&c->lock);
+	}
+	pthread_mutex_unlock(&http->lock);
+}
+
+bool connections_idle(struct http *http)
+{
+	bool idle = true;
+
+	pthread_mutex_lock(&http->lock);
+	for (struct connection *c = http->connections; c != NULL && idle; c = c->next) {
+		pthread_mutex_lock(&c->lock);
+		idle = c->phase == PHASE_IDLE;
+		pthread_mutex_unlock(&c->lock);
+	}
+	pthread_mutex_unlock(&http->lock);
+	return idle;
+}
+
+/* When this connection is cut off; with its lock held. */
+static double deadline(const struct connection *connection)
+{
+	const struct http_options *options = &connection->http->options;
+
+	switch (connection->phase) {
+	case PHASE_IDLE:
+		return connection->since + options->header_timeout;
+	case PHASE_HANDLE:
+		return INFINITY;
+	case PHASE_BODY:
+	case PHASE_SEND:
+		if (connection->bytes == UNKNOWN_SIZE)
+			return INFINITY; /* still guarded by the library's idle time */
+		break;
+	}
+	return connection->since + connection->paused + options->transfer_grace +
+	       (double)connection->bytes / (double)options->minimum_rate;
+}
+
+/*
+ * A body that has stopped because its client is gone. The library waits for an
+ * edge of epoll; when the end of the connection came together with the last
+ * bytes there is none any more, and what had come would lie unsaved, its
+ * projections claimed, until the body's time is over. With the lock held.
+ */
+static bool body_is_broken(struct connection *connection)
+{
+	bool stopped = connection->bytes == connection->bytes_then;
+
+	connection->bytes_then = connection->bytes;
+	return stopped && live_hung_up(connection);
+}
+
+/* Looks at one connection; returns when to look again. With http->lock held: the socket is not closed meanwhile. */
+static double look(struct connection *connection, double now)
+{
+	static const char *const names[] = {"header", "body", "answer", "answer on its way"};
+	double next = INFINITY;
+	enum phase slow = PHASE_IDLE;
+	bool cut = false;
+
+	pthread_mutex_lock(&connection->lock);
+	if (connection->mhd == NULL) {
+		pthread_mutex_unlock(&connection->lock);
+		return next;
+	}
+	if (!connection->cut && now >= connection->looked_at + 1) {
+		connection->looked_at = now;
+		if (connection->patience > 0)
+			connection->cut = live_peer_gone(connection, now);
+		else if (connection->phase == PHASE_BODY && !connection->suspended)
+			connection->cut = body_is_broken(connection);
+		if (connection->cut)
+			shutdown(connection->socket, SHUT_RDWR);
+	}
+	if (connection->suspended) {
+		next = connection->wait_until;
+		if (next <= now || connection->cut) {
+			resume(connection);
+			next = INFINITY;
+		}
+	} else if (!connection->cut && deadline(connection) <= now) {
+		cut = connection->cut = true;
+		slow = connection->phase;
+		shutdown(connection->socket, SHUT_RDWR);
+	}
+	pthread_mutex_unlock(&connection->lock);
+	if (cut && slow != PHASE_IDLE)
+		log_line(LEVEL_INFO, "connection cut off: its %s is slower than the minimum rate", names[slow]);
+	return next;
+}
+
+static void *run_clock(void *context)
+{
+	struct http *http = context;
+
+	pthread_mutex_lock(&http->lock);
+	while (!http->clock_stop) {
+		double now = http_now();
+		struct timespec until;
+
+		http->clock_next = now + 1;
+		for (struct connection *c = http->connections; c != NULL; c = c->next)
+			http->clock_next = fmin(http->clock_next, look(c, now));
+		http->clock_next = fmax(http->clock_next, now + resolution);
+		until.tv_sec = (time_t)http->clock_next;
+		until.tv_nsec = (long)(1e9 * (http->clock_next - floor(http->clock_next)));
+		pthread_cond_timedwait(&http->clock_kick, &http->lock, &until);
+	}
+	pthread_mutex_unlock(&http->lock);
+	return NULL;
+}
+
+int clock_start(struct http *http, struct error *err)
+{
+	int code = pthread_create(&http->clock, NULL, run_clock, http);
+
+	if (code != 0)
+		return error_set_errno(err, code, "thread for deadlines");
+	http->clock_runs = true;
+	return 0;
+}
+
+void clock_end(struct http *http)
+{
+	if (!http->clock_runs)
+		return;
+	pthread_mutex_lock(&http->lock);
+	http->clock_stop = true;
+	pthread_cond_signal(&http->clock_kick);
+	pthread_mutex_unlock(&http->lock);
+	pthread_join(http->clock, NULL);
+	http->clock_runs = false;
+}

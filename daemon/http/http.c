@@ -1,0 +1,410 @@
+/*
+ * The HTTP server: connections and requests on top of libmicrohttpd, one epoll
+ * loop in each of a few threads.
+ *
+ * The library calls on_request several times for one request: when the header
+ * is there, for each piece of the body, at its end, and after each resumption.
+ * A reply can be given at the header or at the end only. So a refusal that is
+ * found out in between waits until the rest of the body was read and dropped;
+ * closing at once would reset the connection under a client that still writes,
+ * and the answer would be lost.
+ */
+#include "daemon/http/internal.h"
+
+#include <errno.h>
+#include <limits.h>
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/random.h>
+#include <sys/resource.h>
+#include <time.h>
+#include <unistd.h>
+
+#include "daemon/log.h"
+
+enum {
+	CONNECTION_MEMORY = 128 << 10 /* pieces of a body are at most half of it */
+};
+static const size_t bodies_max = 256 << 20;   /* bytes of whole bodies in memory, of all requests together */
+static const uint64_t drop_most = 2ull << 30; /* bytes dropped for the sake of an answer; then the connection goes */
+static const double stop_grace = 2;           /* s */
+
+/* ---- one request ---- */
+
+/* The request is answered, or the connection is given up. */
+static enum MHD_Result answer(struct request *request)
+{
+	return request->response != NULL && reply_send(request) ? MHD_YES : MHD_NO;
+}
+
+static enum MHD_Result on_header(struct request *request, const char *method)
+{
+	struct error err = {0};
+
+	request->begun = true;
+	connection_phase(request->connection, PHASE_BODY, 0);
+	if (!gate_admits(request->connection)) {
+		log_line(LEVEL_ERROR, "request id=%s: the HTTP library reads around the gate, nothing is served",
+			 request->id);
+		return MHD_NO;
+	}
+	if (request_read_header(request, method, &err) != 0)
+		return MHD_NO;
+	/* Without a body the library comes back at once, as at the end of one. */
+	if (request->response != NULL && !request->dropping)
+		return answer(request);
+	return MHD_YES;
+}
+
+/* From now on the body is only read to its end. */
+static int refuse_rest(struct request *request, const struct error *err)
+{
+	request->dropping = true;
+	return reply_problem_of(request, err);
+}
+
+static int keep_body(struct request *request, const char *data, size_t size, struct error *err)
+{
+	struct http *http = request->http;
+	size_t most = request->route->body_max, wanted = request->body_length + size;
+
+	if (wanted > most)
+		return error_set(err, ERR_TOO_LARGE, "the body has more than %zu bytes", most);
+	if (wanted + 1 > request->body_room) {
+		size_t room = request->body_room > 0 ? request->body_room : 4096;
+		char *grown;
+
+		while (room < wanted + 1)
+			room *= 2;
+		if (atomic_fetch_add(&http->bodies, room - request->body_room) + room > bodies_max) {
+			atomic_fetch_sub(&http->bodies, room - request->body_room);
+			return error_set(err, ERR_BUSY, "the bodies of all requests together have more than %zu bytes",
+					 bodies_max);
+		}
+		grown = realloc(request->body, room);
+		if (grown == NULL) {
+			atomic_fetch_sub(&http->bodies, room - request->body_room);
+			return error_set(err, ERR_NO_MEMORY, "no memory for a body of %zu bytes", wanted);
+		}
+		request->body = grown;
+		request->body_room = room;
+	}
+	memcpy(request->body + request->body_length, data, size);
+	request->body_length = wanted;
+	request->body[wanted] = '\0';
+	return 0;
+}
+
+/* *size: what is left when the connection was suspended, otherwise 0. */
+static enum MHD_Result stream_body(struct request *request, const char *data, size_t *size)
+{
+	const struct route *route = request->route;
+	struct error err = {0};
+
+	while (*size > 0) {
+		size_t taken = 0;
+		enum suspension outcome;
+		int code;
+
+		request->wait_until = INFINITY;
+		code = route->data(request->http->options.context, request, data, *size, &taken, &err);
+		data += taken;
+		*size -= taken;
+		if (code < 0) {
+			*size = 0;
+			return refuse_rest(request, &err) == 0 ? MHD_YES : MHD_NO;
+		}
+		if (code != HTTP_WAIT)
+			continue;
+		outcome = connection_suspend(request->connection, request->wait_until);
+		if (outcome != WOKEN)
+			return outcome == SUSPENDED ? MHD_YES : MHD_NO;
+	}
+	return MHD_YES;
+}
+
+static enum MHD_Result on_body(struct request *request, const char *data, size_t *size)
+{
+	size_t came = *size;
+	enum MHD_Result result = MHD_YES;
+	struct error err = {0};
+
+	if (request->dropping || request->route->body == BODY_NONE) {
+		request->dropped += came;
+		*size = 0;
+		result = request->dropped <= drop_most ? MHD_YES : MHD_NO;
+	} else if (request->route->body == BODY_WHOLE) {
+		*size = 0;
+		if (keep_body(request, data, came, &err) != 0)
+			result = refuse_rest(request, &err) == 0 ? MHD_YES : MHD_NO;
+	} else {
+		result = stream_body(request, data, size);
+	}
+	request->received += came - *size;
+	connection_progress(request->connection, came - *size);
+	return result;
+}
+
+static enum MHD_Result on_whole(struct request *request)
+{
+	struct error err = {0};
+
+	connection_phase(request->connection, PHASE_HANDLE, 0);
+	/* The body was refused on its way, and ended before its time. */
+	if (request->response == NULL && gate_refusal(request->connection) != NULL &&
+	    request_refuse(request, &err) != 0)
+		return MHD_NO;
+	while (request->response == NULL) {
+		enum suspension outcome;
+		int code;
+
+		request->wait_until = INFINITY;
+		code = request->route->handle(request->http->options.context, request, &err);
+		if (code < 0) {
+			if (reply_problem_of(request, &err) != 0)
+				return MHD_NO;
+		} else if (code == HTTP_WAIT) {
+			outcome = connection_suspend(request->connection, request->wait_until);
+			if (outcome != WOKEN)
+				return outcome == SUSPENDED ? MHD_YES : MHD_NO;
+		}
+	}
+	return answer(request);
+}
+
+static enum MHD_Result on_request(void *context, struct MHD_Connection *mhd, const char *url, const char *method,
+				  const char *version, const char *data, size_t *size, void **state)
+{
+	struct request *request = *state;
+
+	(void)context;
+	(void)mhd;
+	(void)url;
+	(void)version;
+	if (request == NULL) /* there was no memory for it */
+		return MHD_NO;
+	if (!request->begun)
+		return on_header(request, method);
+	if (*size > 0)
+		return on_body(request, data, size);
+	return on_whole(request);
+}
+
+/* The library's first word of a request; what is returned becomes its state. */
+static void *on_target(void *context, const char *target, struct MHD_Connection *mhd)
+{
+	struct connection *connection =
+	    MHD_get_connection_info(mhd, MHD_CONNECTION_INFO_SOCKET_CONTEXT)->socket_context;
+
+	request_free(connection->request);
+	connection->request = request_new(context, connection, target);
+	return connection->request;
+}
+
+static void log_request(const struct request *request, bool whole)
+{
+	enum log_level level = whole && request->status >= 500 && request->status != 503 && request->status != 505
+				   ? LEVEL_WARNING
+				   : LEVEL_DEBUG;
+
+	log_line(level, "request id=%s method=%s target=%.200s status=%d bytes=%llu seconds=%.4f%s", request->id,
+		 request->method, request->target, request->status, (unsigned long long)request->received,
+		 http_now() - request->started, whole ? "" : " broken");
+}
+
+/*
+ * The answer is out and the connection closes. What the client has sent beyond
+ * would make the kernel reset it, and the answer would be lost on its way.
+ */
+static void drop_rest(const struct connection *connection)
+{
+	enum { MOST = 64 };
+	char rest[16384];
+
+	shutdown(connection->socket, SHUT_WR);
+	for (int i = 0; i < MOST && recv(connection->socket, rest, sizeof(rest), MSG_DONTWAIT) > 0; i++)
+		;
+}
+
+static void on_completed(void *context, struct MHD_Connection *mhd, void **state, enum MHD_RequestTerminationCode how)
+{
+	struct http *http = context;
+	struct request *request = *state;
+	bool whole = how == MHD_REQUEST_TERMINATED_COMPLETED_OK;
+
+	(void)mhd;
+	*state = NULL;
+	if (request == NULL)
+		return;
+	if (request->begun) {
+		int class = whole && request->status >= 100 && request->status < 600 ? request->status / 100 : 0;
+
+		atomic_fetch_add(&http->requests[class], 1);
+		atomic_fetch_add(&http->bytes_in, request->received);
+		if (whole && request->response_size != UNKNOWN_SIZE && !request_is_head(request))
+			atomic_fetch_add(&http->bytes_out, request->response_size);
+		log_request(request, whole);
+	}
+	if (request->close)
+		drop_rest(request->connection);
+	connection_phase(request->connection, PHASE_IDLE, 0);
+	request->connection->request = NULL;
+	request_free(request);
+}
+
+/* ---- connections ---- */
+
+static void on_connection(void *context, struct MHD_Connection *mhd, void **state,
+			  enum MHD_ConnectionNotificationCode what)
+{
+	struct connection *connection;
+
+	(void)context;
+	if (what == MHD_CONNECTION_NOTIFY_STARTED) {
+		connection = gate_find(MHD_get_connection_info(mhd, MHD_CONNECTION_INFO_CONNECTION_FD)->connect_fd);
+		connection_taken(connection, mhd);
+		*state = connection;
+	} else {
+		connection = *state;
+		/* That the library has dropped without a word, for lack of its memory. */
+		request_free(connection->request);
+		connection_free(connection);
+	}
+}
+
+/* ---- the server ---- */
+
+static void on_library_message(void *context, const char *format, va_list args)
+{
+	char text[400];
+
+	(void)context;
+	vsnprintf(text, sizeof(text), format, args);
+	text[strcspn(text, "\r\n")] = '\0';
+	log_line(LEVEL_DEBUG, "libmicrohttpd: %s", text);
+}
+
+/* Each connection may have a file open as well, and the daemon has some of its own. */
+static void fit_connections(struct http *http)
+{
+	const long own = 64, least = 4;
+	struct http_options *options = &http->options;
+	struct rlimit limit;
+	long most;
+
+	if (getrlimit(RLIMIT_NOFILE, &limit) == 0 && limit.rlim_cur < LONG_MAX) {
+		most = ((long)limit.rlim_cur - own) / 2;
+		most = most > least ? most : least;
+		if (most < options->max_connections) {
+			log_line(LEVEL_WARNING, "%ld connections in place of %ld: the process may have %ld descriptors",
+				 most, options->max_connections, (long)limit.rlim_cur);
+			options->max_connections = most;
+		}
+	}
+	if (options->max_connections_per_address == 0)
+		options->max_connections_per_address = (options->max_connections + 1) / 2;
+}
+
+int http_new(const struct http_options *options, struct http **ret_http, struct error *err)
+{
+	struct http *http = calloc(1, sizeof(*http));
+	pthread_condattr_t monotonic;
+
+	if (http == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for the HTTP server");
+	if (getrandom(&http->id_prefix, sizeof(http->id_prefix), 0) != (ssize_t)sizeof(http->id_prefix))
+		http->id_prefix = (uint32_t)time(NULL);
+	http->options = *options;
+	http->admission_kick = -1;
+	fit_connections(http);
+	pthread_mutex_init(&http->lock, NULL);
+	pthread_condattr_init(&monotonic);
+	pthread_condattr_setclock(&monotonic, CLOCK_MONOTONIC);
+	pthread_cond_init(&http->clock_kick, &monotonic);
+	pthread_condattr_destroy(&monotonic);
+	if (gate_open(err) != 0 || server_names_check(options->server_names, err) != 0 ||
+	    listeners_open(options->listen, http->listeners, &http->listener_count, err) != 0) {
+		http_free(http);
+		return err->code;
+	}
+	*ret_http = http;
+	return 0;
+}
+
+static int library_start(struct http *http, struct error *err)
+{
+	unsigned flags =
+	    MHD_USE_EPOLL_INTERNAL_THREAD | MHD_ALLOW_SUSPEND_RESUME | MHD_USE_NO_LISTEN_SOCKET | MHD_USE_ERROR_LOG;
+	unsigned threads = (unsigned)http->options.threads;
+
+	/* Admission counts; the library's own limit, of which each thread has its share, is out of its reach. */
+	http->daemon = MHD_start_daemon(
+	    flags, 0, NULL, NULL, on_request, http, MHD_OPTION_EXTERNAL_LOGGER, on_library_message, NULL,
+	    MHD_OPTION_THREAD_POOL_SIZE, threads, MHD_OPTION_CONNECTION_LIMIT, (unsigned)DESCRIPTORS_MAX * threads,
+	    MHD_OPTION_CONNECTION_MEMORY_LIMIT, (size_t)CONNECTION_MEMORY, MHD_OPTION_CONNECTION_TIMEOUT,
+	    (unsigned)ceil(http->options.header_timeout), MHD_OPTION_URI_LOG_CALLBACK, on_target, http,
+	    MHD_OPTION_NOTIFY_COMPLETED, on_completed, http, MHD_OPTION_NOTIFY_CONNECTION, on_connection, http,
+	    MHD_OPTION_END);
+	return http->daemon != NULL ? 0 : error_set(err, ERR_IO, "the HTTP server does not start: %s", strerror(errno));
+}
+
+int http_start(struct http *http, struct error *err)
+{
+	if (clock_start(http, err) != 0 || library_start(http, err) != 0 || admission_start(http, err) != 0)
+		return err->code;
+	for (int i = 0; i < http->listener_count; i++)
+		printf("listening on %s\n", http->listeners[i].name);
+	fflush(stdout);
+	return 0;
+}
+
+void http_stop(struct http *http)
+{
+	const struct timespec nap = {0, 10 * 1000 * 1000};
+	double end = http_now() + stop_grace;
+
+	atomic_store(&http->stopping, true);
+	admission_end(http);
+	for (int i = 0; i < http->listener_count; i++)
+		listener_close(&http->listeners[i]);
+	do {
+		connections_wake(http);
+		nanosleep(&nap, NULL);
+	} while (!connections_idle(http) && http_now() < end);
+	atomic_store(&http->closing, true);
+	connections_wake(http);
+	if (http->daemon != NULL)
+		MHD_stop_daemon(http->daemon);
+	http->daemon = NULL;
+	while (http->connections != NULL) /* that the library had never taken */
+		connection_free(http->connections);
+	clock_end(http);
+}
+
+void http_free(struct http *http)
+{
+	if (http == NULL)
+		return;
+	http_stop(http);
+	if (http->admission_kick >= 0)
+		close(http->admission_kick);
+	pthread_cond_destroy(&http->clock_kick);
+	pthread_mutex_destroy(&http->lock);
+	free(http);
+}
+
+void http_statistics(struct http *http, struct http_statistics *ret)
+{
+	for (int i = 0; i < 6; i++)
+		ret->requests[i] = atomic_load(&http->requests[i]);
+	ret->bytes_in = atomic_load(&http->bytes_in);
+	ret->bytes_out = atomic_load(&http->bytes_out);
+	ret->connections = http_connections(http);
+}
+
+long http_connections(const struct http *http)
+{
+	return atomic_load(&http->connection_count);
+}

@@ -1,0 +1,161 @@
+#ifndef CBCT_DAEMON_HTTP_HTTP_H
+#define CBCT_DAEMON_HTTP_HTTP_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <sys/types.h>
+
+#include <cjson/cJSON.h>
+
+#include "core/error.h"
+
+/*
+ * HTTP without the library that speaks it (libmicrohttpd stays in http*.c):
+ * a table of routes, requests with their bodies, replies, and waiting without
+ * holding a thread.
+ *
+ * A request lives in the one thread of its connection: begin, data and handle
+ * are called there, never two at a time for one request, and must not wait for
+ * anything slow; they return HTTP_WAIT and are called again. Only request_wake
+ * may be called from other threads.
+ */
+struct http;
+struct request;
+
+/* A handler's answers beside 0 (a reply was set) and a negative code (which becomes a problem document). */
+enum { HTTP_WAIT = 1 /* call again after request_wake, or when the time of request_wait_until has come */ };
+
+enum body {
+	BODY_NONE,  /* what comes is read and dropped */
+	BODY_WHOLE, /* held in memory, at most body_max bytes: request_body */
+	BODY_STREAM /* given to `data` piece by piece */
+};
+
+struct route {
+	const char *method; /* GET is HEAD as well */
+	const char *path;   /* "/v1/scans/{}/projections/{}": {} is any one segment, request_argument */
+	/* The whole request is there. */
+	int (*handle)(void *context, struct request *request, struct error *err);
+	enum body body;
+	size_t body_max;
+	/* BODY_STREAM: the header is there; refuse now, before the client sends. */
+	int (*begin)(void *context, struct request *request, struct error *err);
+	/* BODY_STREAM: takes what it can; less than size only with HTTP_WAIT. After a failure the rest is dropped. */
+	int (*data)(void *context, struct request *request, const void *data, size_t size, size_t *ret_taken,
+		    struct error *err);
+	const char
+	    *queries; /* the names of its query parameters, with blanks between; others are refused. NULL: none */
+};
+
+struct http_options {
+	const char *listen;         /* as config.listen */
+	const char *server_names;   /* as config.server_names */
+	const char *state_dir;      /* paths in it are not told to clients */
+	const struct route *routes; /* ends with method == NULL */
+	void *context;              /* the handlers' */
+	int threads;
+	long max_connections, max_connections_per_address;
+	double header_timeout, transfer_grace; /* s */
+	size_t minimum_rate;                   /* bytes/s */
+};
+
+/*
+ * Binds, without accepting yet. ERR_IMPOSSIBLE for an address beyond loopback:
+ * there are no tokens and no TLS to guard it. The options are copied, what they point to is not.
+ */
+int http_new(const struct http_options *options, struct http **ret_http, struct error *err);
+/* Accepts from now on, and says where on standard output. */
+int http_start(struct http *http, struct error *err);
+/* No new connections; wakes all that wait; gives requests under way two seconds to end. Then http_free. */
+void http_stop(struct http *http);
+void http_free(struct http *http); /* NULL is fine */
+
+struct http_statistics {
+	unsigned long long requests[6]; /* by the status's first digit; [0]: broken off */
+	unsigned long long bytes_in;    /* of bodies */
+	unsigned long long bytes_out;   /* of replies that were sent whole, before compression */
+	long connections;               /* now */
+};
+void http_statistics(struct http *http, struct http_statistics *ret);
+/* Those that are open now; takes no lock. */
+long http_connections(const struct http *http);
+
+/* ---- what was asked ---- */
+const char *request_id(const struct request *request);
+/* The i-th {} of the route's path, decoded; never NULL. */
+const char *request_argument(const struct request *request, int i);
+/* Of ?name=value, decoded; NULL when it is not there. */
+const char *request_query(const struct request *request, const char *name);
+/* The first header of that name, or NULL. */
+const char *request_header(struct request *request, const char *name);
+bool request_is_head(const struct request *request);
+/* -1: not known (chunked). */
+int64_t request_content_length(const struct request *request);
+/* BODY_WHOLE; ends with a zero byte beyond its length. */
+const char *request_body(const struct request *request, size_t *ret_length);
+
+/* The handler's own, freed with the request; one at most. */
+void request_set_state(struct request *request, void *state, void (*state_free)(void *state));
+void *request_state(const struct request *request);
+
+/* ---- waiting ---- */
+double http_now(void); /* s, monotonic */
+/* Before HTTP_WAIT: be called again at that time (http_now) in any case. */
+void request_wait_until(struct request *request, double time);
+/* The daemon is about to stop: what waits for a change should answer now. */
+bool request_stopping(const struct request *request);
+/* Any thread, while the request lives; as often as you like; takes no lock of ours but its own. */
+void request_wake(struct request *request);
+/* The same, at that time (http_now) if not before. Not from within a call of the server's own. */
+void request_wake_by(struct request *request, double time);
+
+/* ---- replies: exactly one for each request ---- */
+/* Takes the value, NULL included (then ERR_NO_MEMORY). Cache-Control: no-store. */
+int request_reply_json(struct request *request, int status, cJSON *value, struct error *err);
+/* Takes the text (free). */
+int request_reply_text(struct request *request, int status, const char *media_type, char *text, size_t length,
+		       struct error *err);
+/* Takes the data (free); the headers are the caller's. */
+int request_reply_bytes(struct request *request, int status, void *data, size_t length, struct error *err);
+int request_reply_empty(struct request *request, int status, struct error *err);
+/* Bytes that stay where they are for as long as the program runs. */
+int request_reply_constant(struct request *request, int status, const void *data, size_t length, struct error *err);
+/* Takes the descriptor, on failure too. Sent by the kernel alone. */
+int request_reply_file(struct request *request, int status, int descriptor, uint64_t offset, uint64_t size,
+		       struct error *err);
+/*
+ * A body made as it is sent. read fills up to `size` bytes from `offset` on and
+ * says how many; 0 is the end, negative breaks the connection. size is
+ * UNKNOWN_SIZE where it is not known beforehand: offsets then only grow.
+ * Takes the context (context_free, once, on failure too).
+ */
+#define UNKNOWN_SIZE UINT64_MAX
+int request_reply_read(struct request *request, int status, uint64_t size,
+		       ssize_t (*read)(void *context, uint64_t offset, void *to, size_t size), void *context,
+		       void (*context_free)(void *context), struct error *err);
+/*
+ * A body that goes on for as long as something comes. read, as above, is called
+ * in the request's thread; READ_WAIT calls it again after request_wake, or when
+ * the time of request_wait_until has come. What it works on is request_state.
+ * A client that has gone is noticed within a second, one that vanished by
+ * keep-alive probes within 20; patience (s) is how long sent bytes may stay
+ * unacknowledged.
+ */
+enum { READ_WAIT = -2 };
+int request_reply_live(struct request *request, int status,
+		       ssize_t (*read)(struct request *request, void *to, size_t size), double patience,
+		       struct error *err);
+/* After one of the above. */
+void request_reply_header(struct request *request, const char *name, const char *format, ...)
+    __attribute__((format(printf, 3, 4)));
+
+/*
+ * A problem document by the name that ends its type ("range-outside", a row of
+ * problems[] in http/reply.c), for those that no error code stands for. Counts
+ * as a reply.
+ */
+int request_reply_problem(struct request *request, const char *name, struct error *err, const char *format, ...)
+    __attribute__((format(printf, 4, 5)));
+
+#endif

@@ -1,0 +1,208 @@
+#ifndef CBCT_DAEMON_HTTP_INTERNAL_H
+#define CBCT_DAEMON_HTTP_INTERNAL_H
+
+#include <pthread.h>
+#include <stdatomic.h>
+#include <sys/socket.h>
+
+#include <microhttpd.h>
+
+#include "daemon/http/http.h"
+#include "daemon/http/framing.h"
+
+/* Shared by the files http*.c; nobody else includes it. */
+
+enum {
+	ARGUMENTS_MAX = 4,
+	QUERIES_MAX = 16,
+	SEGMENTS_MAX = 12,
+	LISTENERS_MAX = 8,
+	REQUEST_ID_SIZE = 24,
+	DESCRIPTORS_MAX = 1 << 20
+};
+
+/* Where a connection stands; the clock judges its pace by it. */
+enum phase {
+	PHASE_IDLE,   /* the next request's header is not whole yet */
+	PHASE_BODY,   /* it comes in */
+	PHASE_HANDLE, /* it is whole, the answer is being made */
+	PHASE_SEND    /* the answer goes out */
+};
+
+/* What was read from a connection's socket and may not go on yet; its thread's own. */
+struct gate {
+	struct framing framing;
+	char *held;                         /* bytes; NULL for none */
+	size_t given, passed, length, room; /* of held: gone on; may go on; all; allocated */
+	uint64_t handled;                   /* heads that the handler was called for */
+	bool refused;                       /* what goes on last ends the request that was refused */
+};
+
+struct connection {
+	struct http *http;
+	struct MHD_Connection *mhd; /* NULL until one of its threads has taken it; guarded by lock */
+	int socket;
+	struct sockaddr_storage address;
+	uid_t user;                         /* of a Unix socket's peer */
+	struct connection *previous, *next; /* guarded by http->lock */
+	int refused; /* status of its answers while it is one too many; 0: welcome; its thread's own */
+	struct gate gate;
+	struct request *request; /* that is under way, or was dropped by the library; its thread's own */
+
+	pthread_mutex_t lock; /* guards all below */
+	enum phase phase;
+	double since;   /* of this phase */
+	double paused;  /* s of this phase that we made the client wait */
+	uint64_t bytes; /* of this phase's body so far, or in all when sending */
+	bool suspended; /* out of the library's hands until resumed */
+	double suspended_at;
+	bool woken;           /* request_wake came while it was not suspended */
+	double wait_until;    /* of a suspended one */
+	bool cut;             /* shut down for its pace, for another's sake, or because its peer has gone */
+	uint64_t sent_before; /* bytes that the peer had acknowledged when this phase began; of PHASE_SEND */
+	double looked_at;     /* by the clock, whether the peer is there */
+	uint64_t bytes_then;  /* of a body, when that was */
+
+	/* Of a reply without an end in sight: s that sent bytes may stay unacknowledged; 0: another kind. */
+	double patience;
+	double answered_at;    /* the last time that nothing was outstanding, or some of it came in */
+	uint64_t acknowledged; /* bytes, then */
+};
+
+struct request {
+	struct http *http;
+	struct connection *connection;
+	struct MHD_Connection *mhd;
+	char id[REQUEST_ID_SIZE];
+	double started;
+	char *target;  /* as it was sent; owned */
+	char *decoded; /* what arguments and queries point into; owned */
+	char method[16];
+	const struct route *route;
+	const char *arguments[ARGUMENTS_MAX];
+	struct {
+		const char *name, *value;
+	} queries[QUERIES_MAX];
+	int query_count;
+
+	bool begun;  /* the header was looked at */
+	bool framed; /* the header tells of a body, if only of 0 bytes */
+	bool chunked;
+	bool dropping; /* the answer is known, the rest of the body is not wanted */
+	int64_t content_length;
+	uint64_t received, dropped; /* bytes of body */
+	char *body;
+	size_t body_length, body_room;
+
+	struct MHD_Response *response;
+	int status;
+	uint64_t response_size; /* UNKNOWN_SIZE or bytes */
+	bool close;             /* no further request on this connection */
+
+	double wait_until; /* for the next suspension */
+	void *state;
+	void (*state_free)(void *state);
+};
+
+struct listener {
+	int socket; /* -1 once closed */
+	struct sockaddr_storage address;
+	char name[160];      /* "http://127.0.0.1:2228", "unix:/run/x" */
+	char unix_path[108]; /* to be removed at the end; "" for TCP */
+};
+
+struct http {
+	struct http_options options;
+	struct listener listeners[LISTENERS_MAX];
+	int listener_count;
+	struct MHD_Daemon *daemon; /* the library's threads */
+
+	pthread_t admission;
+	bool admission_runs;
+	atomic_bool admission_stop;
+	int admission_kick;  /* an eventfd */
+	double exhausted_at; /* the last time that there was no descriptor; the thread's own */
+
+	pthread_mutex_t lock; /* guards the list, the clock's fields; taken before a connection's lock */
+	struct connection *connections;
+	atomic_long connection_count; /* changed under the lock */
+	pthread_t clock;
+	bool clock_runs, clock_stop;
+	pthread_cond_t clock_kick;
+	double clock_next; /* when the clock looks again */
+
+	atomic_bool stopping; /* whoever waits should answer */
+	atomic_bool closing;  /* nothing may be suspended any more */
+	atomic_size_t bodies; /* bytes of whole bodies in memory */
+	atomic_ullong requests[6], bytes_in, bytes_out, request_number;
+	uint32_t id_prefix;
+};
+
+/* ---- http/admit.c: who gets a connection ---- */
+int admission_start(struct http *http, struct error *err);
+void admission_end(struct http *http);
+/* A connection that was one too many asks for something: is it welcome by now? */
+bool admission_reconsider(struct connection *connection);
+/* The library has it now, or no more. */
+void connection_taken(struct connection *connection, struct MHD_Connection *mhd);
+void connection_free(struct connection *connection);
+
+/* ---- http/gate.c: between the socket and the library ---- */
+int gate_open(struct error *err);
+/* NULL: what is read from this descriptor is looked at no more. False when it is beyond the table. */
+bool gate_set(int descriptor, struct connection *connection);
+struct connection *gate_find(int descriptor);
+/* Once for each head that the library has parsed: whether it went through the gate. */
+bool gate_admits(struct connection *connection);
+/* Why the request that is under way was refused; NULL when it was not. */
+const struct framing *gate_refusal(const struct connection *connection);
+void gate_free(struct gate *gate);
+
+/* ---- http/listen.c: addresses and sockets ---- */
+int listeners_open(const char *listen, struct listener ret_listeners[LISTENERS_MAX], int *ret_count, struct error *err);
+void listener_close(struct listener *listener);
+
+/* ---- http/clock.c: deadlines, and connections that wait ---- */
+int clock_start(struct http *http, struct error *err);
+void clock_end(struct http *http);
+void connection_phase(struct connection *connection, enum phase phase, uint64_t bytes);
+void connection_progress(struct connection *connection, uint64_t bytes);
+enum suspension {
+	SUSPENDED,
+	WOKEN,  /* not suspended: something has happened already, look again */
+	REFUSED /* the daemon closes, or the peer has gone: give the connection up */
+};
+enum suspension connection_suspend(struct connection *connection, double until);
+/* All that are suspended. */
+void connections_wake(struct http *http);
+/* None has a request under way. */
+bool connections_idle(struct http *http);
+
+/* ---- http/live.c: replies without an end in sight ---- */
+/* Closed or broken, and nothing of it is unread; who has shut down its side for writing counts, too. */
+bool live_hung_up(const struct connection *connection);
+/* Whether a client has gone, with or without a word; with the connection's lock held. */
+bool live_peer_gone(struct connection *connection, double now);
+/* Bytes that the peer has acknowledged so far; UNKNOWN_SIZE on a Unix socket. */
+uint64_t live_acknowledged(const struct connection *connection);
+
+/* ---- http/request.c: what the request line and headers say ---- */
+struct request *request_new(struct http *http, struct connection *connection, const char *target);
+void request_free(struct request *request); /* NULL is fine */
+/* Method, framing, route; 0, or the reply is set (code < 0 when it is not). */
+int request_read_header(struct request *request, const char *method, struct error *err);
+/* Replies with the gate's reasons, and lets the connection end. */
+int request_refuse(struct request *request, struct error *err);
+
+/* ---- http/origin.c: who is addressed, and by whose page ---- */
+/* ERR_INVALID for a list of server names in which one is none. */
+int server_names_check(const char *names, struct error *err);
+/* Host, Origin, Sec-Fetch-Site; 0, or 0 with a reply that refuses, or an error. */
+int request_check_origin(struct request *request, struct error *err);
+
+/* ---- http/reply.c ---- */
+int reply_problem_of(struct request *request, const struct error *err);
+/* The reply takes its way; false when the connection has to be given up. */
+bool reply_send(struct request *request);
+
+#endif

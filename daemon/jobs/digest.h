@@ -1,0 +1,23 @@
+#ifndef CBCT_DAEMON_JOBS_DIGEST_H
+#define CBCT_DAEMON_JOBS_DIGEST_H
+
+#include "daemon/jobs/job.h"
+
+/*
+ * The SHA-256 of kept volumes, made behind everything else: a volume is told of
+ * and its job ends without it. Threads that give way to all others read each
+ * file once it is on the disk, most often from the page cache.
+ *
+ * What fails is tried again, at longer and longer intervals; what is not done at the
+ * stop is done after the next start.
+ */
+struct digester;
+
+/* Begins with what the catalogue has without a digest: of those jobs only whose volumes are on the disk. */
+int digester_start(struct jobs *jobs, int threads, struct digester **ret_digester, struct error *err);
+void digester_stop(struct digester *digester); /* NULL is fine */
+
+/* This volume of the job is on the disk; NULL: all of its volumes are. A job that is deleted meanwhile needs none. */
+void digester_add(struct digester *digester, const char *job, const char *name);
+
+#endif

@@ -1,0 +1,181 @@
+#ifndef CBCT_DAEMON_JOBS_JOB_H
+#define CBCT_DAEMON_JOBS_JOB_H
+
+#include "daemon/jobs/queue.h"
+#include "daemon/store/store.h"
+#include "proto/recipe.h"
+
+/*
+ * The life of a job.
+ *
+ *   waiting -> queued -> running -> succeeded | failed | cancelled
+ *                 ^---------'  a yield, a dead worker, a restart
+ *
+ * A job whose scan loses projections or an image to the disk waits again (queued
+ * or running -> waiting) until they are sent again, and begins anew then.
+ *
+ * A waiting job may be attended: a worker reconstructs its projections as they
+ * arrive. With the last of them it is running, without having been queued; when
+ * the worker is taken from it or dies, it waits as before.
+ *
+ * Whoever changes a state goes through job_set_state: it checks the one table
+ * of transitions, commits the row with its event, then shows the change in
+ * memory, logs it and wakes the watchers, in this order. So whatever a reader
+ * sees is on the disk.
+ *
+ * Locks: jobs.change makes changes one at a time and is held over their commit;
+ * jobs.lock guards the fields in memory and is held for copying only, so that
+ * readers never wait for the disk. Order: change, then lock. Neither is held
+ * when watchers are woken or when a caller's code runs.
+ *
+ * Threads: any, for every function that says nothing else.
+ */
+struct jobs;
+struct job; /* counted references */
+
+bool job_state_ended(enum job_state state);
+bool job_state_may_follow(enum job_state from, enum job_state to);
+
+/*
+ * Loads all jobs. What was running goes back to the queue (with its checkpoint,
+ * where there is one); a cancel that had been asked for is carried out.
+ */
+int jobs_open(struct store *store, struct jobs **ret_jobs, struct error *err);
+void jobs_close(struct jobs *jobs); /* NULL is fine; all references must be back */
+struct store *jobs_store(const struct jobs *jobs);
+
+/* ---- what the API does ---- */
+/*
+ * The job that an Idempotency-Key made before, or NULL in *ret_job (and 0).
+ * ERR_CONFLICT, pointer "": that key came with another request (digest: SHA-256 of its body).
+ */
+int jobs_repeat(struct jobs *jobs, const char *key, const uint8_t digest[32], struct job **ret_job, struct error *err);
+
+/*
+ * A new job of a resolved request, queued when the scan is ready and waiting
+ * otherwise. The request is read, not taken. key may be NULL; if the key was used
+ * meanwhile, what jobs_repeat would say. *ret_new: false for such a repeat.
+ * ERR_NOT_FOUND, pointer "/scan", when the scan was deleted meanwhile.
+ */
+int jobs_post(struct jobs *jobs, const struct job_request *request, struct stored_scan *scan,
+	      const struct recon_memory *memory, const char *key, const uint8_t digest[32], struct job **ret_job,
+	      bool *ret_new, struct error *err);
+
+int jobs_find(struct jobs *jobs, const char *id, struct job **ret_job, struct error *err); /* ERR_NOT_FOUND */
+struct job *job_reference(struct job *job);
+void job_release(struct job *job); /* NULL is fine */
+struct jobs *job_jobs(const struct job *job);
+
+/* Newest first, as store_scan_list. */
+int jobs_list(struct jobs *jobs, const char *after, int limit, struct job **ret_jobs, int *ret_count, bool *ret_more,
+	      struct error *err);
+
+/*
+ * DELETE. A job that has not ended is asked to: waiting and queued ones are
+ * cancelled on return, a running or attended one soon after (watch it). An ended job is
+ * removed with its rows and files. *ret_removed tells which it was.
+ */
+int jobs_delete(struct jobs *jobs, struct job *job, bool *ret_removed, struct error *err);
+/* With its files. ERR_CONFLICT, naming the job, while one that has not ended uses the scan. */
+int jobs_delete_scan(struct jobs *jobs, struct stored_scan *scan, struct error *err);
+
+/* Woken at each change of state and each new event of this job, or of any; not at mere progress. See watch.h. */
+void job_watch(struct job *job, struct watch *watch);
+void job_unwatch(struct job *job, struct watch *watch);
+void jobs_watch(struct jobs *jobs, struct watch *watch);
+void jobs_unwatch(struct jobs *jobs, struct watch *watch);
+
+/* A copy of what a handler needs without making a document. */
+struct job_facts {
+	char id[ID_SIZE], scan[ID_SIZE];
+	enum job_state state;
+	bool ended, removed;
+	bool cancel_asked, attended;
+	enum priority priority;
+	double mu_water; /* 1/mm */
+};
+void job_facts(struct job *job, struct job_facts *ret);
+
+/* The record as it is now; request and key point into the job and live as long as the reference. */
+void job_record(struct job *job, struct job_record *ret_record);
+/* 1 = next; 0 when it is not queued. */
+int job_queue_position(struct job *job);
+/* Seconds to go, or negative when nobody can know. */
+double job_eta(struct job *job);
+
+struct jobs_statistics {
+	long count[JOB_STATE_COUNT];                  /* in each state now */
+	unsigned long long started, crashed, yielded; /* since the start */
+};
+void jobs_statistics(struct jobs *jobs, struct jobs_statistics *ret);
+
+/* ---- what the supervisor does, in its one thread ---- */
+struct job_change {
+	int error_code; /* with JOB_FAILED */
+	const char *error_pointer, *error_text;
+	int checkpoint;               /* to JOB_QUEUED: the iteration that checkpoint.f32 holds, 0: none */
+	bool crashed;                 /* to JOB_QUEUED, JOB_WAITING or JOB_FAILED: the worker died with it */
+	bool yielded;                 /* to JOB_QUEUED: it goes on later, which is no new attempt */
+	unsigned basis;               /* to JOB_RUNNING: of its scan; after another one it begins anew, its past goes */
+	const char *backend, *device; /* to JOB_RUNNING */
+	const char *reason;           /* for the log */
+};
+/* ERR_CONFLICT when the table does not allow it; the caller's picture was old. change may be NULL. */
+int job_set_state(struct job *job, enum job_state to, const struct job_change *change, struct error *err);
+
+/* Waiting jobs whose scan has become ready go to the queue, but for those that are attended. */
+int jobs_promote(struct jobs *jobs, struct error *err);
+/*
+ * The waiting job that an idle worker should attend, or NULL: it has FDK, and its
+ * projections can be converted and are not all there. Those whose projections came after `since`
+ * (CLOCK_MONOTONIC) go first, the higher priority before the lower; then those
+ * that came later. *ret_arriving: it is one of the former.
+ */
+struct job *jobs_arriving(struct jobs *jobs, double since, bool *ret_arriving);
+/* ERR_CONFLICT when it does not wait any more, or was cancelled. */
+int job_attend(struct job *job, const char *backend, const char *device, struct error *err);
+/* The worker goes; a job that still waits is where it was before. */
+void job_leave(struct job *job);
+/*
+ * A worker found its scan damaged, when the scan had lost that much: how many times in a row that has been without
+ * another loss since. The supervisor's thread only.
+ */
+int job_doubt(struct job *job, unsigned losses);
+/* Projections reconstructed so far. */
+void job_taken(struct job *job, int count);
+/*
+ * What keeps a job from a worker though everything of its scan is there. It is not given to one before `until` (of
+ * CLOCK_MONOTONIC) and before the disk has `space` bytes free; it keeps its place in the queue, and others go before
+ * it. Returns how often in a row it was held for this reason.
+ */
+enum job_obstacle { JOB_UNHINDERED, JOB_NO_SPACE, JOB_DISK_TROUBLE, JOB_OBSTACLE_COUNT };
+extern const char *const job_obstacle_names[JOB_OBSTACLE_COUNT]; /* as `waiting_for` tells: "space", "disk" */
+int job_hold(struct job *job, enum job_obstacle obstacle, double until, unsigned long long space);
+/* Lets go whose time has come and who has room now; true while others are still held. */
+bool jobs_review_holds(struct jobs *jobs, double now, unsigned long long space);
+enum job_obstacle job_obstacle(struct job *job); /* any thread */
+/* The queued job that is due and not held, or NULL; it stays queued until job_set_state. */
+struct job *jobs_next(struct jobs *jobs);
+/* queue_victim over the jobs' queue. */
+int jobs_victim(struct jobs *jobs, const enum priority *arriving, const struct queue_running *running, int count,
+		int idle);
+
+void job_set_plan(struct job *job, const struct recon_memory *memory, const char *plan);
+/* recon_hooks.denoising. Memory only, until the next change of state, as is the progress. */
+void job_set_denoising(struct job *job, double noise_hu, double alpha);
+void job_progress(struct job *job, enum stage stage, int iteration, double fraction);
+enum { JOB_ROWS_MAX = 64 };
+/* In one commit, all or none: 1 to JOB_ROWS_MAX rows, each with its event. */
+int job_add_rows(struct job *job, const struct history_row *rows, int count, struct error *err);
+/* A volume whose file is there; before its job ends, or is queued again, it must be on the disk. */
+int job_add_volume(struct job *job, const struct volume_record *volume, struct error *err);
+/*
+ * For a worker that did not live to do it: what has no digest reaches the disk; a file that cannot is removed. Any
+ * thread; waits for the disk, with no lock held.
+ */
+int job_settle(struct job *job, struct error *err);
+/* See store_job_digest_volume. */
+int job_digest_volume(struct job *job, const struct volume_record *volume, struct error *err);
+int job_add_warning(struct job *job, const char *code, const char *detail, struct error *err);
+
+#endif

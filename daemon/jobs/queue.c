@@ -1,0 +1,113 @@
+/* The order of the queue, and who makes room: queue.h. */
+#include "daemon/jobs/queue.h"
+
+#include <assert.h>
+#include <stddef.h>
+
+static bool goes_before(const struct queue_entry *a, const struct queue_entry *b)
+{
+	return a->priority != b->priority ? a->priority > b->priority : a->ticket < b->ticket;
+}
+
+void queue_add(struct queue *queue, struct queue_entry *entry)
+{
+	struct queue_entry *before = NULL, *behind = queue->first;
+
+	assert(!entry->queued);
+	while (behind != NULL && !goes_before(entry, behind)) {
+		before = behind;
+		behind = behind->next;
+	}
+	entry->previous = before;
+	entry->next = behind;
+	if (before != NULL)
+		before->next = entry;
+	else
+		queue->first = entry;
+	if (behind != NULL)
+		behind->previous = entry;
+	entry->queued = true;
+}
+
+void queue_remove(struct queue *queue, struct queue_entry *entry)
+{
+	if (!entry->queued)
+		return;
+	if (entry->previous != NULL)
+		entry->previous->next = entry->next;
+	else
+		queue->first = entry->next;
+	if (entry->next != NULL)
+		entry->next->previous = entry->previous;
+	entry->previous = entry->next = NULL;
+	entry->queued = false;
+}
+
+int queue_position(const struct queue_entry *entry)
+{
+	int position = 0;
+
+	if (!entry->queued)
+		return 0;
+	for (; entry != NULL; entry = entry->previous)
+		position++;
+	return position;
+}
+
+static struct queue_entry *not_held(struct queue_entry *entry)
+{
+	while (entry != NULL && entry->held)
+		entry = entry->next;
+	return entry;
+}
+
+struct queue_entry *queue_next(const struct queue *queue)
+{
+	return not_held(queue->first);
+}
+
+static bool yields_before(const struct queue_running *a, const struct queue_running *b)
+{
+	if (a->gives_way != b->gives_way)
+		return a->gives_way;
+	return a->priority != b->priority ? a->priority < b->priority : a->ticket > b->ticket;
+}
+
+/* Who gives way, or the lowest priority below `priority` and of those the latest ticket. */
+static int least_of(const struct queue_running *running, int count, enum priority priority)
+{
+	int least = -1;
+
+	for (int i = 0; i < count; i++) {
+		if (running[i].leaving || (running[i].priority >= priority && !running[i].gives_way))
+			continue;
+		if (least < 0 || yields_before(&running[i], &running[least]))
+			least = i;
+	}
+	return least;
+}
+
+int queue_victim(const struct queue *queue, const enum priority *arriving, const struct queue_running *running,
+		 int count, int idle)
+{
+	const struct queue_entry *entry = queue_next(queue);
+	int coming = idle;
+
+	for (int i = 0; i < count; i++)
+		coming += running[i].leaving;
+	/* The first `coming` jobs get workers that are free already; the next one may push somebody out. */
+	while (entry != NULL || arriving != NULL) {
+		enum priority next;
+
+		if (arriving != NULL && (entry == NULL || *arriving > entry->priority)) {
+			next = *arriving;
+			arriving = NULL;
+		} else {
+			next = entry->priority;
+			entry = not_held(entry->next);
+		}
+		if (coming-- <= 0)
+			return least_of(running, count, next);
+	}
+	return -1;
+}

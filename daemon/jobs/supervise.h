@@ -1,0 +1,72 @@
+#ifndef CBCT_DAEMON_JOBS_SUPERVISE_H
+#define CBCT_DAEMON_JOBS_SUPERVISE_H
+
+#include "daemon/jobs/job.h"
+
+/*
+ * Workers: started, given jobs, watched, restarted.
+ *
+ * One thread does all of it, and is the only one that talks to workers and
+ * moves jobs out of the queue and through `running`. A worker that dies takes
+ * nothing with it: its job is queued again (three times at most, then it has
+ * failed), and a new worker is started, later and later while they keep dying.
+ *
+ * A free worker attends a waiting job with FDK: it is told which projections are
+ * stored, in the order of their arrival, and reconstructs them. A job of higher
+ * priority takes the worker from it, and any other that has something to do
+ * after two seconds in which nothing arrived; it then begins again later. So it
+ * does, at once, when an image comes late or the scan is closed, since what was
+ * reconstructed is void then; a job that runs already is queued again for that.
+ * Uploads never wait for any of this: they wake the thread, and one message at a
+ * time is under way.
+ *
+ * Threads: any for everything below; supervise_start and supervise_stop once each.
+ */
+struct supervise;
+
+struct supervise_options {
+	const char *worker;    /* path of cbct-worker; NULL: beside this program, else from PATH */
+	const char *backend;   /* "auto", "cuda", "cpu" */
+	int workers;           /* 0 = 1 */
+	const int *devices;    /* [workers], the device of each; NULL: 0 .. workers - 1 */
+	int threads;           /* of the CPU backend; 0 = all */
+	size_t device_memory;  /* bytes a worker may use; 0 = what is free */
+	double hello_seconds;  /* until a new worker must have spoken; 0 = 30 */
+	double cancel_seconds; /* until a worker that does not cancel is killed; 0 = 10 */
+	double stop_seconds;   /* until a worker that does not leave its job at the stop is killed; 0 = 20 */
+};
+
+/* The strings are copied. Returns at once; the first worker says hello later. */
+int supervise_start(struct jobs *jobs, const struct supervise_options *options, struct supervise **ret_supervise,
+		    struct error *err);
+/* Running jobs leave a checkpoint and are queued, workers end, within stop_seconds + 2. NULL is fine. */
+void supervise_stop(struct supervise *supervise);
+
+/* At least one worker is there that can take jobs (idle or busy). */
+bool supervise_ready(struct supervise *supervise);
+
+/*
+ * What a job needs against what the workers have: ERR_IMPOSSIBLE with both
+ * numbers, pointer "/grid/size", when none of them could ever run it. Passes
+ * while no worker has said yet what it has: the worker asks again at the start.
+ */
+int supervise_check_memory(struct supervise *supervise, const struct scan *scan, const struct recipe *recipe,
+			   struct recon_memory *ret_memory, struct error *err);
+
+/* A copy of what is known of one worker, for GET /v1/devices, /readyz and /metrics. */
+enum worker_state { WORKER_ABSENT, WORKER_STARTING, WORKER_IDLE, WORKER_BUSY, WORKER_ENDING, WORKER_STATE_COUNT };
+extern const char *const worker_state_names[WORKER_STATE_COUNT];
+struct worker_facts {
+	int index, device_index; /* the second counts devices of its backend */
+	enum worker_state state;
+	long pid; /* 0: none */
+	char backend[16], device[96], driver[64];
+	size_t bytes_total, bytes_free;
+	char job[ID_SIZE];    /* "" when there is none */
+	unsigned restarts;    /* since the daemon's start */
+	char last_error[160]; /* why the last one ended, "" */
+};
+/* Fills at most `most` entries, returns how many there are. */
+int supervise_workers(struct supervise *supervise, struct worker_facts *ret_facts, int most);
+
+#endif

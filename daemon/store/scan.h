@@ -1,0 +1,89 @@
+#ifndef CBCT_DAEMON_STORE_SCAN_H
+#define CBCT_DAEMON_STORE_SCAN_H
+
+#include "daemon/store/db.h"
+#include "proto/sums.h"
+
+/* Inside of the scans, for store/scan.c and store/sums.c only. */
+enum progress { MISSING, CLAIMED, STORED };
+
+struct stored_scan {
+	/* Constant. */
+	struct store *store;
+	char id[ID_SIZE];
+	long long number; /* in the catalogue */
+	char name[256];
+	double created;
+	int columns, rows, count;
+	enum sample sample;
+	enum quantity quantity;
+	double air;
+	bool damaged;
+	bool gone;            /* its directory was not there at the start: nothing is written for it */
+	uint64_t order_floor; /* of arrival: what comes from now on is above it; after the start guarded by lock */
+
+	/* Guarded by store->scans_lock. */
+	int references; /* one of them is the array's */
+	struct scan *parsed;
+	struct scan *measured; /* of a closed one: what of it is there; NULL: all of it, or not parsed */
+	bool recent;
+	bool removed; /* from the array: whoever refers to it now may use its parsed form */
+
+	pthread_mutex_t lock;    /* guards what follows */
+	unsigned char *progress; /* [count], enum progress */
+	/*
+	 * [count], of those that are stored. `bytes` 0: only the SHA-256 is known, from the catalogue; the record of
+	 * projections.sums is missing or damaged, and made again once the samples were found to fit (store/sums.c).
+	 */
+	struct sum *sums;
+	int unchecked;       /* those with `bytes` 0 */
+	unsigned char *lost; /* [count]: was stored, was found damaged, and is missing until it is sent again */
+	int lost_count;
+	unsigned losses; /* since the start: what was counted in `order` has another place after one */
+	int *order;      /* [received]: the projections that are stored, as they came */
+	int received;
+	double arrived; /* monotonic: the last of them, 0: before the start */
+	enum progress image[IMAGE_COUNT];
+	uint8_t image_sha256[IMAGE_COUNT][32];
+	bool image_lost[IMAGE_COUNT]; /* as of projections */
+	bool document_damaged;        /* scan.json */
+	bool suspect;                 /* all of its files are to be checked before it is used (store/sums.c) */
+	bool deleted;                 /* written with writer.lock held too, as the next */
+	bool closing;                 /* takes no new projections */
+	bool closed;                  /* and that is on the disk */
+
+	struct watch_list watchers;
+};
+
+/* With the scan's lock held: projection `index` is on the disk, with its row. */
+void stored_scan_add(struct stored_scan *scan, int index, const struct sum *sum);
+
+/*
+ * At the start, when the scan's rows are loaded and nobody else has the store: reads projections.sums. A record that is
+ * good is what was acknowledged, whatever the rows say: the rows follow it. A row without such a record stays, with its
+ * SHA-256 only. A file that is missing, short or has a damaged line is made again from the records that are good.
+ */
+int store_load_sums(struct store *store, struct stored_scan *scan, struct error *err);
+
+/* At the start, nobody else has the store: the samples of projections.raw behind its first `size` bytes are lost. */
+void stored_scan_lose_behind(struct stored_scan *scan, unsigned long long size);
+void stored_scan_lose_image(struct stored_scan *scan, enum image image);
+/* The file of the projections has its full size, with zeros for what it does not hold any more. */
+int stored_scan_make_room(struct stored_scan *scan, struct error *err);
+
+/* The scan goes on without what was lost, within the transaction that closes it. */
+int store_forget_lost(struct stored_scan *scan, struct error *err);
+
+/* A thread that checks the files of scans that are suspect. */
+int store_start_checker(struct store *store, struct error *err);
+void store_stop_checker(struct store *store);
+
+/* The record of a part of the scan directory, synced: behind its file and before its row. */
+int store_put_part_sum(const struct stored_scan *scan, int part, const void *bytes, size_t size, struct error *err);
+/* ERR_DAMAGED: these bytes do not fit the part's record. One without a record is taken as it is. */
+int store_check_part(const struct stored_scan *scan, enum sums_part part, const void *bytes, size_t size,
+		     struct error *err);
+/* A stored image is read; ERR_DAMAGED: it does not fit its SHA-256, and is lost now. */
+int store_check_image(struct stored_scan *scan, enum image image, struct error *err);
+
+#endif
