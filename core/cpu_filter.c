@@ -209,7 +209,8 @@ static struct shell find_shell(const struct filter_engine *engine, const struct 
 	const float *p = at_edge(rows, 0, 0) + r;
 	const ptrdiff_t step = rows->rows;
 	int first = 0, last = rows->columns - 1;
-	float bins[SHELL_BINS], square, ellipse;
+	float bins[SHELL_BINS], ellipse;
+	double square;
 
 	while (!extensions->truncated[0][r] && first < last && p[first * step] < rows->level)
 		first++;

@@ -237,16 +237,19 @@ EXTEND_INLINE struct shell_table shell_table_make(void)
 	return table;
 }
 
-/* Sums over the bins for an outline, and what fits best. */
+/*
+ * Sums over the bins for an outline, and the A and B that fit best. In double: the residuals of neighbouring outlines
+ * differ by less than the rounding of such sums in float, which would then choose among them, on each backend another.
+ */
 struct shell_fit {
-	float body, bone; /* A and B */
-	float residual;   /* sum of squares */
+	double body, bone; /* A and B */
+	double residual;   /* sum of squares */
 };
 struct shell_sums {
-	float rr, ii, pr, pi; /* products of root, inverse and p; root times inverse is 1 */
+	double rr, ii, pr, pi; /* products of root, inverse and p; root times inverse is 1 */
 };
 
-EXTEND_INLINE void shell_sums_add(struct shell_sums *sums, float root, float inverse, float p)
+EXTEND_INLINE void shell_sums_add(struct shell_sums *sums, double root, double inverse, double p)
 {
 	sums->rr += root * root;
 	sums->ii += inverse * inverse;
@@ -255,9 +258,9 @@ EXTEND_INLINE void shell_sums_add(struct shell_sums *sums, float root, float inv
 }
 
 /* square: sum p^2 over the bins. */
-EXTEND_INLINE struct shell_fit shell_solve(const struct shell_sums *sums, float square)
+EXTEND_INLINE struct shell_fit shell_solve(const struct shell_sums *sums, double square)
 {
-	const float n = SHELL_BINS, determinant = sums->rr * sums->ii - n * n;
+	const double n = SHELL_BINS, determinant = sums->rr * sums->ii - n * n;
 	struct shell_fit fit;
 
 	fit.body = (sums->pr * sums->ii - sums->pi * n) / determinant;
@@ -269,32 +272,33 @@ EXTEND_INLINE struct shell_fit shell_solve(const struct shell_sums *sums, float 
 		fit.body = 0;
 		fit.bone = sums->pi / sums->ii;
 	}
-	fit.residual = fmaxf(square - fit.body * sums->pr - fit.bone * sums->pi, 0);
+	fit.residual = fmax(square - fit.body * sums->pr - fit.bone * sums->pi, 0);
 	return fit;
 }
 
 /* With the outlines i before the first bin and j behind the last one. */
-EXTEND_INLINE struct shell_fit shell_try(const struct shell_table *table, const float bins[SHELL_BINS], float square,
+EXTEND_INLINE struct shell_fit shell_try(const struct shell_table *table, const float bins[SHELL_BINS], double square,
 					 int i, int j)
 {
 	struct shell_sums sums = {0, 0, 0, 0};
 
 	for (int bin = 0; bin < SHELL_BINS; bin++)
-		shell_sums_add(&sums, table->root[i][bin] * table->root[j][SHELL_BINS - 1 - bin],
-			       table->inverse[i][bin] * table->inverse[j][SHELL_BINS - 1 - bin], bins[bin]);
+		shell_sums_add(&sums, (double)table->root[i][bin] * (double)table->root[j][SHELL_BINS - 1 - bin],
+			       (double)table->inverse[i][bin] * (double)table->inverse[j][SHELL_BINS - 1 - bin],
+			       (double)bins[bin]);
 	return shell_solve(&sums, square);
 }
 
 /* Between the outlines, at the lowest place of the parabola through the residuals of three neighbours. */
-EXTEND_INLINE float shell_refined(const struct shell_table *table, const float residual[3], int i)
+EXTEND_INLINE float shell_refined(const struct shell_table *table, const double residual[3], int i)
 {
-	const float bend = residual[0] - 2 * residual[1] + residual[2];
-	float step;
+	const double bend = residual[0] - 2 * residual[1] + residual[2];
+	double step;
 
 	if (i == 0 || i == SHELL_OUTLINES - 1 || !(bend > 0))
 		return table->outline[i];
-	step = fminf(fmaxf(0.5f * (residual[0] - residual[2]) / bend, -1), 1);
-	return table->outline[i] * powf(table->outline[1] / table->outline[0], step);
+	step = fmin(fmax(0.5 * (residual[0] - residual[2]) / bend, -1), 1);
+	return table->outline[i] * powf(table->outline[1] / table->outline[0], (float)step);
 }
 
 EXTEND_INLINE float shell_ramp(float value, float none, float all)
@@ -310,7 +314,7 @@ EXTEND_INLINE float shell_ramp(float value, float none, float all)
  */
 EXTEND_INLINE float extend_shell_share(float ellipse, float shell, const struct shell_fit *fit, float outline)
 {
-	const float bone = fit->bone / (fit->bone + 0.25f * fit->body);
+	const float bone = (float)(fit->bone / (fit->bone + 0.25 * fit->body));
 
 	return shell_ramp(ellipse, SHELL_ELLIPSE_LEAST, 2 * SHELL_ELLIPSE_LEAST) *
 	       shell_ramp(ellipse, 1.1f * shell, 1.3f * shell) * (1 - shell_ramp(shell, 0.02f, 0.035f)) *
@@ -334,12 +338,12 @@ EXTEND_INLINE float shell_bin(const float *p, ptrdiff_t step, int first, int wid
 	return sum / (float)(to > from ? to - from : 1);
 }
 
-EXTEND_INLINE float shell_square(const float bins[SHELL_BINS])
+EXTEND_INLINE double shell_square(const float bins[SHELL_BINS])
 {
-	float square = 0;
+	double square = 0;
 
 	for (int bin = 0; bin < SHELL_BINS; bin++)
-		square += bins[bin] * bins[bin];
+		square += (double)bins[bin] * (double)bins[bin];
 	return square;
 }
 /* Most rows are explained by the ellipse well enough, or by nothing: those are not tried. */
@@ -349,7 +353,7 @@ EXTEND_INLINE bool shell_is_tried(float ellipse)
 }
 
 /* The root mean square error of p where p^2 is the parabola nearest to the bins' squares. */
-EXTEND_INLINE float shell_ellipse_error(const float bins[SHELL_BINS], float square)
+EXTEND_INLINE float shell_ellipse_error(const float bins[SHELL_BINS], double square)
 {
 	struct extend_row_sums sums = {0, 0, 0, 0, 0, 0, 0, 0};
 	double c, b, a, spread, sum = 0;
@@ -367,7 +371,7 @@ EXTEND_INLINE float shell_ellipse_error(const float bins[SHELL_BINS], float squa
 
 		sum += error * error;
 	}
-	return (float)sqrt(sum / (double)square);
+	return (float)sqrt(sum / square);
 }
 
 /*
@@ -387,17 +391,17 @@ EXTEND_INLINE struct shell_place shell_candidate(struct shell_place place, int s
 	return place;
 }
 EXTEND_INLINE struct shell_place shell_search(const struct shell_table *table, const float bins[SHELL_BINS],
-					      float square)
+					      double square)
 {
 	struct shell_place place = {{0, 0}};
 
 	for (int step = 0; step < SHELL_STEPS; step++) {
 		struct shell_place best = place;
-		float least = INFINITY;
+		double least = INFINITY;
 
 		for (int k = 0; k < SHELL_OUTLINES; k++) {
 			const struct shell_place next = shell_candidate(place, step, k);
-			const float residual = shell_try(table, bins, square, next.at[0], next.at[1]).residual;
+			const double residual = shell_try(table, bins, square, next.at[0], next.at[1]).residual;
 
 			if (residual < least) {
 				least = residual;
@@ -416,7 +420,7 @@ struct shell {
 	struct shell_fit fit;
 };
 
-EXTEND_INLINE struct shell shell_make(const struct shell_table *table, const float bins[SHELL_BINS], float square,
+EXTEND_INLINE struct shell shell_make(const struct shell_table *table, const float bins[SHELL_BINS], double square,
 				      float ellipse, struct shell_place place)
 {
 	const int *at = place.at;
@@ -424,7 +428,7 @@ EXTEND_INLINE struct shell shell_make(const struct shell_table *table, const flo
 	struct shell shell;
 
 	for (int side = 0; side < 2; side++) {
-		float residual[3];
+		double residual[3];
 
 		for (int k = -1; k < 2; k++) {
 			int i = at[0] + (side == 0 ? k : 0), j = at[1] + (side == 1 ? k : 0);
@@ -437,12 +441,12 @@ EXTEND_INLINE struct shell shell_make(const struct shell_table *table, const flo
 	}
 	for (int bin = 0; bin < SHELL_BINS; bin++) {
 		const float x = shell_x(bin);
-		const float root = sqrtf((x + 0.5f + shell.outlines[0]) * (0.5f - x + shell.outlines[1]));
+		const double root = sqrt((double)((x + 0.5f + shell.outlines[0]) * (0.5f - x + shell.outlines[1])));
 
-		shell_sums_add(&sums, root, 1 / root, bins[bin]);
+		shell_sums_add(&sums, root, 1 / root, (double)bins[bin]);
 	}
 	shell.fit = shell_solve(&sums, square);
-	shell.share = extend_shell_share(ellipse, sqrtf(shell.fit.residual / square), &shell.fit,
+	shell.share = extend_shell_share(ellipse, (float)sqrt(shell.fit.residual / square), &shell.fit,
 					 fmaxf(shell.outlines[0], shell.outlines[1]));
 	return shell;
 }
@@ -468,8 +472,8 @@ EXTEND_INLINE void extend_by_shell(struct extension *extension, const struct she
 	extension->share = shell->share;
 	extension->outline = shell->outlines[side] * (float)width;
 	extension->half = 0.5f * (1 + shell->outlines[0] + shell->outlines[1]) * (float)width;
-	extension->body = shell->fit.body / (float)width;
-	extension->bone = shell->fit.bone * (float)width;
+	extension->body = (float)(shell->fit.body / width);
+	extension->bone = (float)(shell->fit.bone * width);
 	for (int i = 0; i < window; i++)
 		explained += shell_at(extension, -(float)i - 0.5f);
 	scale = explained > 0 ? fminf(fmaxf(measured / explained, 1.0f / 3), 3) : 0;

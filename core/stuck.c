@@ -27,6 +27,7 @@ struct stuck {
 	int views;
 	struct sums *sums;  /* [row][column] */
 	float *values;      /* [row][column], line integrals of a view */
+	float *medians;     /* [row][column], of each pixel's neighbours in the view */
 	unsigned char *bad; /* [row][column], of the view */
 	unsigned char *map;
 	float largest; /* line integral */
@@ -49,9 +50,11 @@ int stuck_new(const struct linearise *linearise, const struct geometry *geometry
 	stuck->views = geometry->count < STUCK_VIEWS ? geometry->count : STUCK_VIEWS;
 	stuck->sums = calloc(pixels, sizeof(*stuck->sums));
 	stuck->values = malloc(pixels * sizeof(*stuck->values));
+	stuck->medians = malloc(pixels * sizeof(*stuck->medians));
 	stuck->bad = malloc(pixels);
 	stuck->map = calloc(pixels, 1);
-	if (stuck->sums == NULL || stuck->values == NULL || stuck->bad == NULL || stuck->map == NULL) {
+	if (stuck->sums == NULL || stuck->values == NULL || stuck->medians == NULL || stuck->bad == NULL ||
+	    stuck->map == NULL) {
 		stuck_free(stuck);
 		return error_set(err, ERR_NO_MEMORY, "no memory to look for stuck pixels in %d x %d", geometry->columns,
 				 geometry->rows);
@@ -66,6 +69,7 @@ void stuck_free(struct stuck *stuck)
 		return;
 	free(stuck->sums);
 	free(stuck->values);
+	free(stuck->medians);
 	free(stuck->bad);
 	free(stuck->map);
 	free(stuck);
@@ -156,23 +160,76 @@ static void sort(float values[NEIGHBOURS])
 	}
 }
 
+static float median_of(const struct stuck *stuck, int column, int row)
+{
+	size_t near[NEIGHBOURS];
+	float values[NEIGHBOURS];
+
+	neighbours_of(stuck->geometry, column, row, near);
+	for (int i = 0; i < NEIGHBOURS; i++)
+		values[i] = stuck->values[near[i]];
+	sort(values);
+	return 0.5f * (values[NEIGHBOURS / 2 - 1] + values[NEIGHBOURS / 2]);
+}
+
+/*
+ * The medians of a row's pixels that have neighbours all around, for many columns at once: the exchanges are those of
+ * Batcher's merge sort of eight values (Batcher 1968) but those that the middle two do not depend on.
+ */
+static void medians_inside(const struct stuck *stuck, int row)
+{
+	static const int exchanges[][2] = {{0, 1}, {2, 3}, {4, 5}, {6, 7}, {0, 2}, {1, 3}, {4, 6}, {5, 7}, {1, 2},
+					   {5, 6}, {0, 4}, {1, 5}, {2, 6}, {3, 7}, {2, 4}, {3, 5}, {3, 4}};
+	enum { LANES = 16, EXCHANGES = sizeof(exchanges) / sizeof(exchanges[0]) };
+	const int columns = stuck->geometry->columns, behind = columns - AWAY;
+	const float *at = stuck->values + (size_t)row * (size_t)columns;
+
+	for (int first = AWAY; first < behind; first += LANES) {
+		const int count = behind - first < LANES ? behind - first : LANES;
+		float values[NEIGHBOURS][LANES] = {{0}};
+
+		for (int i = 0; i < NEIGHBOURS; i++)
+			memcpy(values[i], at + AWAY * (AROUND[i][0] * columns + AROUND[i][1]) + first,
+			       (size_t)count * sizeof(*at));
+		for (int k = 0; k < EXCHANGES; k++) {
+			float *low = values[exchanges[k][0]], *high = values[exchanges[k][1]];
+
+#pragma omp simd
+			for (int lane = 0; lane < LANES; lane++) {
+				const float a = low[lane], b = high[lane];
+
+				low[lane] = a < b ? a : b;
+				high[lane] = a > b ? a : b;
+			}
+		}
+		for (int lane = 0; lane < count; lane++)
+			stuck->medians[(size_t)row * (size_t)columns + (size_t)(first + lane)] =
+			    0.5f * (values[NEIGHBOURS / 2 - 1][lane] + values[NEIGHBOURS / 2][lane]);
+	}
+}
+
+static void medians_of_row(const struct stuck *stuck, int row)
+{
+	const int columns = stuck->geometry->columns;
+	const bool inside = edge_at(row, stuck->geometry->rows) == 0;
+
+	if (inside)
+		medians_inside(stuck, row);
+	for (int column = 0; column < columns; column++)
+		if (!inside || edge_at(column, columns) != 0)
+			stuck->medians[(size_t)row * (size_t)columns + (size_t)column] = median_of(stuck, column, row);
+}
+
 static void add_row(struct stuck *stuck, int row)
 {
-	const struct geometry *geometry = stuck->geometry;
+	const size_t columns = (size_t)stuck->geometry->columns, from = (size_t)row * columns;
 
-	for (int column = 0; column < geometry->columns; column++) {
-		const size_t at = (size_t)row * (size_t)geometry->columns + (size_t)column;
+	for (size_t at = from; at < from + columns; at++) {
 		struct sums *sums = &stuck->sums[at];
-		size_t near[NEIGHBOURS];
-		float values[NEIGHBOURS], p = stuck->values[at], e;
+		const float p = stuck->values[at], e = p - stuck->medians[at];
 
 		if (stuck->bad[at])
 			continue;
-		neighbours_of(geometry, column, row, near);
-		for (int i = 0; i < NEIGHBOURS; i++)
-			values[i] = stuck->values[near[i]];
-		sort(values);
-		e = p - 0.5f * (values[NEIGHBOURS / 2 - 1] + values[NEIGHBOURS / 2]);
 		if (sums->views++ == 0)
 			sums->first = p;
 		sums->p += p - sums->first;
@@ -193,8 +250,10 @@ void stuck_add(struct stuck *stuck, const void *samples)
 	for (int row = 0; row < rows; row++)
 		read_row(stuck, samples, row);
 #pragma omp parallel for schedule(static)
-	for (int row = 0; row < rows; row++)
+	for (int row = 0; row < rows; row++) {
+		medians_of_row(stuck, row);
 		add_row(stuck, row);
+	}
 	/* Of some pixels: a stuck one may be the largest of all. */
 	for (size_t i = 0; i < pixels; i += pixels / 4096 + 1)
 		largest = fmaxf(largest, stuck->values[i]);

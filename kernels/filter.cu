@@ -278,7 +278,8 @@ static __global__ void __launch_bounds__(LEVEL_THREADS)
 
 /* What the block's threads share while they look for the shell around a row's object. */
 struct shell_search_shared {
-	float bins[SHELL_BINS], residual[SHELL_OUTLINES], square, ellipse;
+	double residual[SHELL_OUTLINES], square;
+	float bins[SHELL_BINS], ellipse;
 	struct shell_place place;
 	int columns[EDGE_THREADS];
 };
