@@ -6,7 +6,8 @@
 #include <stdint.h>
 #include <string.h>
 #include <sys/random.h>
-#include <time.h>
+
+#include "proto/clock.h"
 
 /* In ASCII order, so that texts sort as the numbers do. */
 static const char digits[] = "0123456789abcdefghjkmnpqrstvwxyz";
@@ -25,13 +26,11 @@ static void put_digits(char *to, int count, uint64_t value)
 
 int id_make(char ret_id[ID_SIZE], struct error *err)
 {
-	struct timespec now;
 	uint64_t time, random;
 
 	if (getrandom(&random, sizeof(random), 0) != (ssize_t)sizeof(random))
 		return error_set_errno(err, errno, "random number for an id");
-	clock_gettime(CLOCK_REALTIME, &now);
-	time = (uint64_t)now.tv_sec * 1000 + (uint64_t)now.tv_nsec / 1000000;
+	time = (uint64_t)(clock_realtime() * 1000);
 	pthread_mutex_lock(&lock);
 	/* Several in one millisecond borrow from the next ones. */
 	if (time <= newest)

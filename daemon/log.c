@@ -5,10 +5,10 @@
 #include <stdatomic.h>
 #include <stdio.h>
 #include <stdlib.h>
-#include <time.h>
 #include <unistd.h>
 
 #include "core/error.h"
+#include "proto/clock.h"
 
 const char *const log_level_names[LEVEL_COUNT] = {"error", "warning", "info", "debug"};
 /* sd-daemon(3): what the journal takes as a priority. */
@@ -23,18 +23,13 @@ void log_set_level(enum log_level level)
 
 static size_t write_prefix(enum log_level level, char *ret_text, size_t size)
 {
-	struct timespec now;
-	struct tm parts;
-	size_t length;
+	char now[CLOCK_TEXT_SIZE];
 
 	/* The journal has its own clock. */
 	if (getenv("JOURNAL_STREAM") != NULL)
 		return (size_t)snprintf(ret_text, size, "%s", journal_prefixes[level]);
-	clock_gettime(CLOCK_REALTIME, &now);
-	gmtime_r(&now.tv_sec, &parts);
-	length = strftime(ret_text, size, "%Y-%m-%dT%H:%M:%S", &parts);
-	return length + (size_t)snprintf(ret_text + length, size - length, ".%03ldZ %s: ", now.tv_nsec / 1000000,
-					 log_level_names[level]);
+	clock_text(clock_realtime(), now);
+	return (size_t)snprintf(ret_text, size, "%s %s: ", now, log_level_names[level]);
 }
 
 void log_line(enum log_level level, const char *format, ...)
@@ -64,14 +59,4 @@ void log_line(enum log_level level, const char *format, ...)
 	 */
 	if (write(STDERR_FILENO, line, length) < 0)
 		return;
-}
-
-const char *error_name(int code)
-{
-	static const char *const names[] = {"none",      "invalid",   "impossible", "not-found", "conflict",
-					    "too-large", "no-memory", "no-space",   "io",        "device",
-					    "cancelled", "busy",      "internal",   "sync",      "damaged"};
-	unsigned index = code <= 0 ? (unsigned)-code : 0;
-
-	return index < sizeof(names) / sizeof(names[0]) ? names[index] : "internal";
 }

@@ -15,11 +15,4 @@ void log_set_level(enum log_level level);
 /* No newline at the end; control characters (a client's names) are written as '?'. */
 void log_line(enum log_level level, const char *format, ...) __attribute__((format(printf, 2, 3)));
 
-/*
- * The stable name of an enum error_code: "invalid", "impossible", "not-found",
- * "conflict", "too-large", "no-memory", "no-space", "io", "device", "cancelled",
- * "busy", "internal". Used in the log, in a job's error and in problem types.
- */
-const char *error_name(int code);
-
 #endif

@@ -13,7 +13,11 @@
 
 #include "daemon/api/api.h"
 #include "daemon/config.h"
+#include "daemon/intake/intake.h"
+#include "daemon/jobs/jobs.h"
 #include "daemon/log.h"
+#include "daemon/store/store.h"
+#include "daemon/volumes/volumes.h"
 #include "proto/provenance.h"
 
 enum { STREAM_THREADS = 2 }; /* that hash and compress what is streamed: the others are the worker's */
@@ -139,7 +143,7 @@ static int wait_for_stop(const sigset_t *stops)
 
 static int run(const struct config *config)
 {
-	struct api api = {.max_wait = config->max_wait, .started = http_now()};
+	struct api api = {.max_wait = config->max_wait, .started = clock_monotonic()};
 	struct error err = {0};
 	sigset_t stops;
 	int signal_number = 0, code;

@@ -20,6 +20,7 @@
 #include <time.h>
 #include <unistd.h>
 
+#include "proto/clock.h"
 #include "proto/message.h"
 #include "proto/provenance.h"
 
@@ -63,14 +64,6 @@ static void on_terminate(int number)
 	if (!working)
 		_exit(0);
 	terminated = 1;
-}
-
-static double now_monotonic(void)
-{
-	struct timespec now;
-
-	clock_gettime(CLOCK_MONOTONIC, &now);
-	return (double)now.tv_sec + (double)now.tv_nsec * 1e-9;
 }
 
 static void say(const struct error *err)
@@ -179,7 +172,7 @@ static bool on_yield(void *context)
 
 static void report_progress(struct worker *worker)
 {
-	worker->reported = now_monotonic();
+	worker->reported = clock_monotonic();
 	worker->behind = false;
 	report(worker, &worker->progress);
 }
@@ -195,7 +188,7 @@ static void on_progress(void *context, enum stage stage, int iteration, double f
 	last->iteration = iteration;
 	last->fraction = fraction;
 	worker->behind = true;
-	if (now_monotonic() - worker->reported >= (changed ? CHANGE_LEAST : PROGRESS_LEAST))
+	if (clock_monotonic() - worker->reported >= (changed ? CHANGE_LEAST : PROGRESS_LEAST))
 		report_progress(worker);
 }
 

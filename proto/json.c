@@ -16,6 +16,7 @@
 #include <string.h>
 
 #include "core/warning.h"
+#include "proto/clock.h"
 
 /* ---- pointers and UTF-8 ---- */
 
@@ -836,6 +837,23 @@ int json_end(struct json_reader *reader)
 		index++;
 	}
 	return reader->code;
+}
+
+void json_add_time(cJSON *object, const char *name, double seconds)
+{
+	char text[CLOCK_TEXT_SIZE];
+
+	if (seconds <= 0) {
+		cJSON_AddNullToObject(object, name);
+		return;
+	}
+	clock_text(seconds, text);
+	cJSON_AddStringToObject(object, name, text);
+}
+
+void json_add_seconds(cJSON *object, const char *name, double seconds)
+{
+	cJSON_AddNumberToObject(object, name, round(seconds * 1000) / 1000);
 }
 
 cJSON *json_runs(const unsigned char *flags, int count, bool value)

@@ -92,6 +92,11 @@ int json_fail(struct json_reader *reader, int code, const char *name, const char
  */
 cJSON *json_warning(const char *code, const char *detail);
 
+/* A time in seconds since 1970 as text (clock_text); null where it is not above 0, not known. */
+void json_add_time(cJSON *object, const char *name, double seconds);
+/* A duration, in seconds to the millisecond. */
+void json_add_seconds(cJSON *object, const char *name, double seconds);
+
 /* Adds [first, last] pairs of the runs of `value` in flags[count], as `received` and `missing` are written. */
 cJSON *json_runs(const unsigned char *flags, int count, bool value);
 

@@ -15,6 +15,7 @@
 #include <sys/socket.h>
 #include <time.h>
 
+#include "proto/clock.h"
 #include "proto/json.h"
 
 /* ---- the table ---- */
@@ -451,18 +452,10 @@ static int message_read(const cJSON *value, struct message *ret_message, struct 
 	return json_end(&reader);
 }
 
-static int64_t now_ms(void)
-{
-	struct timespec now;
-
-	clock_gettime(CLOCK_MONOTONIC, &now);
-	return (int64_t)now.tv_sec * 1000 + now.tv_nsec / 1000000;
-}
-
 /* 1 when there is something to receive (an end counts), 0 when the time is over. */
 static int wait_readable(int socket, int timeout_ms, struct error *err)
 {
-	int64_t deadline = now_ms() + timeout_ms;
+	double deadline = clock_monotonic() + timeout_ms * 1e-3;
 	int left = timeout_ms;
 
 	for (;;) {
@@ -474,7 +467,7 @@ static int wait_readable(int socket, int timeout_ms, struct error *err)
 		if (errno != EINTR)
 			return error_set_errno(err, errno, "cannot wait for a message");
 		if (timeout_ms > 0) {
-			int64_t rest = deadline - now_ms();
+			double rest = (deadline - clock_monotonic()) * 1e3;
 
 			left = rest > 0 ? (int)rest : 0;
 		}

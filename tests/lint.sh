@@ -4,14 +4,18 @@ set -uo pipefail
 cd "$(dirname "$0")/.."
 failed=0
 
+# found NAME LINES: a rule is broken where there are any
+found() {
+	[ -n "$2" ] || return 0
+	echo "lint: $1"
+	sed 's/^/    /' <<<"$2"
+	failed=1
+}
 # rule NAME PATTERN FILE...: no line of the files may match
 rule() {
-	local name=$1 pattern=$2 found
+	local name=$1 pattern=$2
 	shift 2
-	found=$(grep -nE "$pattern" "$@" /dev/null 2>/dev/null) || return 0
-	echo "lint: $name"
-	sed 's/^/    /' <<<"$found"
-	failed=1
+	found "$name" "$(grep -nE "$pattern" "$@" /dev/null 2>/dev/null)"
 }
 files() { find "$@" -name node_modules -prune -o \( -name '*.[ch]' -o -name '*.cu' -o -name '*.cuh' \) -print 2>/dev/null; }
 
@@ -25,6 +29,26 @@ rule "nothing includes daemon but daemon and its tests" '#include "daemon/' $(fi
 rule "the daemon never touches CUDA" '#include [<"](cuda|cufft|kernels/)' $(files daemon)
 rule "libmicrohttpd stays in daemon/http" '#include <microhttpd' $(files daemon | grep -v '^daemon/http/')
 rule "SQLite stays in daemon/store" '#include <sqlite3' $(files daemon core proto clients | grep -v '^daemon/store/')
+# The rooms of daemon/, each with those beneath it whose doors it may use. The door of a room is daemon/ROOM/ROOM.h;
+# what else is in a room is its own. What stands in daemon/ itself serves all rooms and knows none, but for main.c.
+rooms=("http:" "store:" "volumes: store" "jobs: store" "intake: http store" "api: http store volumes jobs intake")
+beneath=" "
+for row in "${rooms[@]}"; do
+	room=${row%%:*} others=${row#*:} known="daemon/${row%%:*}/"
+	for other in $others; do
+		[[ $beneath == *" $other "* ]] || found "daemon/$room is above the rooms that it uses" "$other"
+		known+="|daemon/$other/$other\.h"
+	done
+	beneath+="$room "
+	found "daemon/$room uses doors, of:${others:- no other room}" \
+		"$(grep -nE '#include "daemon/[a-z]+/' daemon/"$room"/*.[ch] | grep -vE "\"($known)")"
+done
+found "a folder of daemon/ without a row in rooms" \
+	"$(for room in daemon/*/; do [[ $beneath == *" $(basename "$room") "* ]] || echo "$room"; done)"
+rule "daemon/*.[ch] serve the rooms and know none" '#include "daemon/[a-z]+/' $(ls daemon/*.[ch] | grep -v daemon/main.c)
+rule "daemon/main.c uses doors" '#include "daemon/([a-z]+)/([a-z_]+)\.h"' \
+	<(grep -vE '#include "daemon/([a-z]+)/\1\.h"' daemon/main.c)
+
 rule "no process-wide string functions" '\b(strtok|sprintf|strcpy|strcat|gets|localtime|gmtime|strerror_l|rand|srand) *\(' $(files core proto daemon clients)
 rule "no unfinished work by its own words" '\b(TODO|FIXME|XXX|HACK)\b' $(files core kernels proto daemon clients tests)
 

@@ -6,8 +6,9 @@
 #include <stdbool.h>
 #include <stdlib.h>
 #include <string.h>
-#include <time.h>
 #include <unistd.h>
+
+#include "proto/clock.h"
 
 enum { BAR_CELLS = 24 };
 
@@ -19,14 +20,6 @@ struct progress {
 	double started, shown; /* s */
 };
 
-static double now(void)
-{
-	struct timespec time;
-
-	clock_gettime(CLOCK_MONOTONIC, &time);
-	return (double)time.tv_sec + 1e-9 * (double)time.tv_nsec;
-}
-
 struct progress *progress_new(FILE *to, enum progress_style style, const char *label)
 {
 	struct progress *progress = calloc(1, sizeof(*progress));
@@ -37,7 +30,7 @@ struct progress *progress_new(FILE *to, enum progress_style style, const char *l
 	progress->label = label;
 	progress->terminal = isatty(fileno(to)) == 1;
 	progress->lines = style == PROGRESS_OR_LINES;
-	progress->started = now();
+	progress->started = clock_monotonic();
 	return progress;
 }
 
@@ -68,7 +61,7 @@ static void draw(struct progress *progress, double fraction, const char *left)
 void progress_show(struct progress *progress, double fraction, double seconds_left, const char *format, ...)
 {
 	char text[sizeof(progress->text)], left[40];
-	double time = now();
+	double time = clock_monotonic();
 	bool changed;
 	va_list args;
 

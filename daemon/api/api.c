@@ -2,7 +2,7 @@
  * The API: one row for each endpoint. The schema of record is
  * proto/openapi.yaml.
  */
-#include "daemon/api/api.h"
+#include "daemon/api/internal.h"
 
 #include "proto/json.h"
 

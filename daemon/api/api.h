@@ -1,19 +1,11 @@
 #ifndef CBCT_DAEMON_API_API_H
 #define CBCT_DAEMON_API_API_H
 
-#include "daemon/volumes/content.h"
-#include "daemon/volumes/feed.h"
 #include "daemon/http/http.h"
-#include "daemon/jobs/job.h"
-#include "daemon/volumes/mapping.h"
-#include "daemon/volumes/rendition.h"
-#include "daemon/store/store.h"
-#include "daemon/jobs/supervise.h"
-#include "daemon/intake/upload.h"
 
-/* What the handlers work on; constant while the server runs. */
+/* The door of the API: its table of endpoints, and what the handlers work on. */
 struct api {
-	struct store *store;
+	struct store *store; /* these are constant while the server runs */
 	struct jobs *jobs;
 	struct supervise *supervise;
 	struct uploads *uploads;
@@ -22,121 +14,10 @@ struct api {
 	struct renditions *renditions;
 	struct http *http;
 	double max_wait; /* s */
-	double started;  /* http_now */
+	double started;  /* clock_monotonic */
 };
 
 /* Every endpoint; their context is a struct api. Ends with method == NULL. */
 extern const struct route api_routes[];
-
-/* ---- the handlers, as struct route wants them ---- */
-int scan_post(void *context, struct request *request, struct error *err);
-int scan_list(void *context, struct request *request, struct error *err);
-int scan_get(void *context, struct request *request, struct error *err);
-int scan_complete(void *context, struct request *request, struct error *err);
-int scan_delete(void *context, struct request *request, struct error *err);
-
-int projection_get(void *context, struct request *request, struct error *err);
-int projections_begin(void *context, struct request *request, struct error *err);
-int flat_begin(void *context, struct request *request, struct error *err);
-int dark_begin(void *context, struct request *request, struct error *err);
-int defects_begin(void *context, struct request *request, struct error *err);
-int upload_take(void *context, struct request *request, const void *data, size_t size, size_t *ret_taken,
-		struct error *err);
-int projections_put(void *context, struct request *request, struct error *err);
-int image_put(void *context, struct request *request, struct error *err);
-
-int job_post(void *context, struct request *request, struct error *err);
-int job_list(void *context, struct request *request, struct error *err);
-int job_get(void *context, struct request *request, struct error *err);
-int job_delete(void *context, struct request *request, struct error *err);
-
-int job_events(void *context, struct request *request, struct error *err);
-int all_events(void *context, struct request *request, struct error *err);
-
-int volume_list(void *context, struct request *request, struct error *err);
-int volume_get(void *context, struct request *request, struct error *err);
-
-int volume_stream(void *context, struct request *request, struct error *err);
-int slice_get(void *context, struct request *request, struct error *err);
-
-int page_get(void *context, struct request *request, struct error *err);
-int asset_get(void *context, struct request *request, struct error *err);
-int plain_list(void *context, struct request *request, struct error *err);
-int plain_job(void *context, struct request *request, struct error *err);
-int plain_style(void *context, struct request *request, struct error *err);
-
-int live_get(void *context, struct request *request, struct error *err);
-int ready_get(void *context, struct request *request, struct error *err);
-int metrics_get(void *context, struct request *request, struct error *err);
-int device_list(void *context, struct request *request, struct error *err);
-int quarantine_get(void *context, struct request *request, struct error *err);
-int schema_get(void *context, struct request *request, struct error *err);
-
-/* ---- what several of them need: api/common.c ---- */
-enum { PAGE_DEFAULT = 100, PAGE_MAX = 1000 };
-struct page {
-	int limit;
-	const char *after; /* an id or NULL */
-};
-/* ?limit= and ?after=. */
-int page_read(struct request *request, struct page *ret_page, struct error *err);
-int page_read_ids(struct request *request, struct page *ret_page, struct error *err); /* `after` is an id */
-
-/* The value of a query parameter among `names` (which ends with NULL); its index, 0 when it is absent. */
-int query_choice(struct request *request, const char *name, const char *const *names, int *ret_index,
-		 struct error *err);
-
-/* The request's Idempotency-Key, and the SHA-256 of its body; text is NULL where it has none. */
-int idempotency_read(struct request *request, struct store_key *ret_key, struct error *err);
-
-/* Bytes that do not change while they bear this tag. */
-struct entity {
-	const char *etag; /* quoted, strong */
-	uint64_t size;    /* UNKNOWN_SIZE: no ranges */
-	const char *media_type;
-	const char *filename; /* NULL: none, it is shown where it is asked for */
-};
-/*
- * If-None-Match, Range and If-Range. *ret_done: the reply is set (304, 416);
- * otherwise send bytes first .. first + length - 1 with that status, then call entity_headers.
- */
-struct selection {
-	int status; /* 200 or 206 */
-	uint64_t first, length;
-};
-int entity_select(struct request *request, const struct entity *entity, struct selection *ret_selection, bool *ret_done,
-		  struct error *err);
-void entity_headers(struct request *request, const struct entity *entity, const struct selection *selection);
-
-/* ---- what several of them need to wait for what becomes of a job: api/job.c ---- */
-/* ?wait=SECONDS, or Prefer: wait=N; `initial` when neither is there, and never more than api->max_wait. */
-int wait_read(struct api *api, struct request *request, double initial, double *ret_seconds, struct error *err);
-/* Takes the reference to the job. From now on the request is woken at each change of it: look once more after this. */
-int job_wait_begin(struct request *request, struct job *job, double seconds, struct error *err);
-/* The request's reference; NULL before it waits. */
-struct job *job_waited_for(struct request *request);
-/* True: answer HTTP_WAIT. False: the time is over. */
-bool job_wait_goes_on(struct request *request);
-
-/* As store_volume_verify; damage is a warning of the job, too. */
-int volume_verify(struct api *api, const char *job, const struct volume_record *volume, uint64_t first, uint64_t bytes,
-		  struct error *err);
-
-/* ---- what several of them need of volumes: api/volume.c ---- */
-enum { VOLUME_FILENAME_MAX = 96 };
-int volume_find(struct api *api, const struct job_facts *job, const char *name, struct volume_record *ret_volume,
-		struct error *err);
-/* Of the request's path: its job and the volume of it. */
-int volume_asked(struct api *api, struct request *request, struct job_facts *ret_facts,
-		 struct volume_record *ret_volume, struct error *err);
-/* ?format=, ?type= and ?scale=; the name is left to the caller. */
-int volume_options(struct request *request, const struct job_facts *job, struct content_options *ret_options,
-		   struct error *err);
-/* Another one for each volume, also of the same name when it is made again: for ETags. */
-enum { VOLUME_TAG_MAX = 80 };
-void volume_tag(const char *job, const struct volume_record *volume, char ret_tag[VOLUME_TAG_MAX]);
-const char *volume_media_type(const struct content_options *options);
-void volume_filename(const char *job, const char *name, const struct content_options *options,
-		     char ret_name[VOLUME_FILENAME_MAX]);
 
 #endif

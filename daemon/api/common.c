@@ -5,8 +5,7 @@
 
 #include <openssl/evp.h>
 
-#include "daemon/api/api.h"
-#include "daemon/http/text.h"
+#include "daemon/api/internal.h"
 
 int idempotency_read(struct request *request, struct store_key *ret_key, struct error *err)
 {

@@ -9,8 +9,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "daemon/api/api.h"
-#include "daemon/http/text.h"
+#include "daemon/api/internal.h"
 
 static const double heartbeat_every = 10; /* s */
 static const double patience = 15;        /* s; with one heartbeat more, a client that vanished is gone within 30 */
@@ -49,7 +48,7 @@ static void wake_watcher(void *context)
 	double pause = fmin(moment * (double)http_connections(watcher->http), moments_most);
 	double due = watcher->told_at + pause;
 
-	if (due <= http_now())
+	if (due <= clock_monotonic())
 		request_wake(request);
 	else
 		request_wake_by(request, ceil(due / instant) * instant);
@@ -71,7 +70,7 @@ static void watcher_free(void *state)
 /* On a grid of seconds, so that all watchers together wake the daemon once. */
 static double next_heartbeat(void)
 {
-	return floor(http_now()) + heartbeat_every;
+	return floor(clock_monotonic()) + heartbeat_every;
 }
 
 /* Takes as much as there is room for. */
@@ -104,7 +103,7 @@ static ssize_t read_nothing_new(struct request *request, struct watcher *watcher
 {
 	if (over || request_stopping(request))
 		return 0;
-	if (http_now() < watcher->heartbeat) {
+	if (clock_monotonic() < watcher->heartbeat) {
 		request_wait_until(request, watcher->heartbeat);
 		return READ_WAIT;
 	}
@@ -141,7 +140,7 @@ static ssize_t read_events(struct request *request, void *to, size_t size)
 	}
 	if (filled == 0)
 		return read_nothing_new(request, watcher, over, to);
-	watcher->told_at = http_now();
+	watcher->told_at = clock_monotonic();
 	return (ssize_t)filled;
 }
 

@@ -3,9 +3,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "daemon/api/api.h"
-#include "daemon/jobs/document.h"
-#include "daemon/http/text.h"
+#include "daemon/api/internal.h"
 
 /* ---- POST ---- */
 
@@ -107,7 +105,7 @@ int job_list(void *context, struct request *request, struct error *err)
 struct waiter {
 	struct job *job;
 	struct watch watch;
-	double until; /* http_now */
+	double until; /* clock_monotonic */
 };
 
 static void wake_request(void *context)
@@ -146,7 +144,7 @@ int job_wait_begin(struct request *request, struct job *job, double seconds, str
 		return error_set(err, ERR_NO_MEMORY, "no memory to wait for a job");
 	}
 	waiter->job = job;
-	waiter->until = http_now() + seconds;
+	waiter->until = clock_monotonic() + seconds;
 	waiter->watch.wake = wake_request;
 	waiter->watch.context = request;
 	job_watch(job, &waiter->watch);
@@ -165,7 +163,7 @@ bool job_wait_goes_on(struct request *request)
 {
 	struct waiter *waiter = request_state(request);
 
-	if (http_now() >= waiter->until || request_stopping(request))
+	if (clock_monotonic() >= waiter->until || request_stopping(request))
 		return false;
 	request_wait_until(request, waiter->until);
 	return true;

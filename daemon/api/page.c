@@ -6,9 +6,8 @@
 #include <stdio.h>
 #include <string.h>
 
-#include "daemon/api/api.h"
+#include "daemon/api/internal.h"
 #include "daemon/api/assets.h"
-#include "daemon/http/text.h"
 
 /*
  * Nothing from elsewhere, no script or style beside the files, nobody may frame

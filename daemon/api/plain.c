@@ -7,9 +7,8 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "daemon/api/api.h"
+#include "daemon/api/internal.h"
 #include "daemon/api/assets.h"
-#include "daemon/jobs/document.h"
 
 enum { LIST = 50, ROWS = 100 };
 

@@ -5,8 +5,7 @@
 #include <string.h>
 #include <unistd.h>
 
-#include "daemon/api/api.h"
-#include "daemon/http/text.h"
+#include "daemon/api/internal.h"
 #include "proto/slice.h"
 
 /* ---- in ---- */

@@ -1,6 +1,5 @@
 /* /v1/scans */
-#include "daemon/api/api.h"
-#include "daemon/jobs/document.h"
+#include "daemon/api/internal.h"
 
 /* A new scan, or the one that another request with the same key has made at the same time. */
 static int post(struct api *api, struct request *request, const struct store_key *key, struct stored_scan **ret_scan,

@@ -4,8 +4,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "daemon/api/api.h"
-#include "daemon/http/text.h"
+#include "daemon/api/internal.h"
 #include "proto/slice.h"
 
 /* HU: from air to hard bone. */

@@ -15,9 +15,7 @@
 
 #include <openssl/evp.h>
 
-#include "daemon/api/api.h"
-#include "daemon/jobs/document.h"
-#include "daemon/http/text.h"
+#include "daemon/api/internal.h"
 #include "proto/json.h"
 
 static const double patience = 15; /* s */

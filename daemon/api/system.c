@@ -3,8 +3,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "daemon/api/api.h"
-#include "daemon/jobs/document.h"
+#include "daemon/api/internal.h"
 #include "proto/openapi.h"
 #include "proto/provenance.h"
 
@@ -205,7 +204,7 @@ int metrics_get(void *context, struct request *request, struct error *err)
 
 	if (out == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for metrics");
-	single(out, "uptime_seconds", "gauge", "Since the daemon's start.", http_now() - api->started);
+	single(out, "uptime_seconds", "gauge", "Since the daemon's start.", clock_monotonic() - api->started);
 	write_http(out, api);
 	write_uploads(out, api);
 	write_store(out, api);

@@ -3,10 +3,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "daemon/api/api.h"
-#include "daemon/volumes/content.h"
-#include "daemon/jobs/document.h"
-#include "daemon/http/text.h"
+#include "daemon/api/internal.h"
 
 /* s that a list waits for digests: longer than a disk takes for a volume, or something is wrong with it. */
 static const double patience = 30;

@@ -81,7 +81,7 @@ static double dispensable(const struct connection *connection, double now)
 static bool make_room(struct http *http, const struct connection *like)
 {
 	struct connection *victim = NULL;
-	double now = http_now(), most = -1;
+	double now = clock_monotonic(), most = -1;
 
 	for (struct connection *c = http->connections; c != NULL; c = c->next) {
 		double needless;
@@ -170,7 +170,7 @@ static struct connection *connection_new(struct http *http, int socket, const st
 	connection->address = *address;
 	if (address->ss_family == AF_UNIX && getsockopt(socket, SOL_SOCKET, SO_PEERCRED, &peer, &size) == 0)
 		connection->user = peer.uid;
-	connection->since = http_now();
+	connection->since = clock_monotonic();
 	pthread_mutex_init(&connection->lock, NULL);
 	connection_enter(http, connection);
 	return connection;
@@ -246,7 +246,7 @@ static bool is_full(struct http *http)
 
 static void tell_exhausted(struct http *http, int reason)
 {
-	double now = http_now();
+	double now = clock_monotonic();
 
 	if (http->exhausted_at == 0 || now - http->exhausted_at > exhaustion_told)
 		log_line(LEVEL_WARNING, "no connection can be accepted just now, %ld are open: %s",

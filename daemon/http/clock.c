@@ -11,26 +11,17 @@
 #include "daemon/http/internal.h"
 
 #include <math.h>
-#include <time.h>
 
 #include "daemon/log.h"
 
 /* Deadlines this close to each other are seen in one go. */
 static const double resolution = 0.01; /* s */
 
-double http_now(void)
-{
-	struct timespec now;
-
-	clock_gettime(CLOCK_MONOTONIC, &now);
-	return (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
-}
-
 void connection_phase(struct connection *connection, enum phase phase, uint64_t bytes)
 {
 	pthread_mutex_lock(&connection->lock);
 	connection->phase = phase;
-	connection->since = http_now();
+	connection->since = clock_monotonic();
 	connection->paused = 0;
 	connection->bytes = bytes;
 	connection->bytes_then = UNKNOWN_SIZE;
@@ -53,7 +44,7 @@ enum suspension connection_suspend(struct connection *connection, double until)
 {
 	struct http *http = connection->http;
 	enum suspension outcome = SUSPENDED;
-	double now = http_now();
+	double now = clock_monotonic();
 
 	pthread_mutex_lock(&connection->lock);
 	if (atomic_load(&http->closing) || connection->cut) {
@@ -81,7 +72,7 @@ enum suspension connection_suspend(struct connection *connection, double until)
 static void resume(struct connection *connection)
 {
 	connection->suspended = false;
-	connection->paused += http_now() - connection->suspended_at;
+	connection->paused += clock_monotonic() - connection->suspended_at;
 	MHD_resume_connection(connection->mhd);
 }
 
@@ -219,15 +210,14 @@ static void *run_clock(void *context)
 
 	pthread_mutex_lock(&http->lock);
 	while (!http->clock_stop) {
-		double now = http_now();
+		double now = clock_monotonic();
 		struct timespec until;
 
 		http->clock_next = now + 1;
 		for (struct connection *c = http->connections; c != NULL; c = c->next)
 			http->clock_next = fmin(http->clock_next, look(c, now));
 		http->clock_next = fmax(http->clock_next, now + resolution);
-		until.tv_sec = (time_t)http->clock_next;
-		until.tv_nsec = (long)(1e9 * (http->clock_next - floor(http->clock_next)));
+		until = clock_timespec(http->clock_next);
 		pthread_cond_timedwait(&http->clock_kick, &http->lock, &until);
 	}
 	pthread_mutex_unlock(&http->lock);

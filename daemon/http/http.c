@@ -211,7 +211,7 @@ static void log_request(const struct request *request, bool whole)
 
 	log_line(level, "request id=%s method=%s target=%.200s status=%d bytes=%llu seconds=%.4f%s", request->id,
 		 request->method, request->target, request->status, (unsigned long long)request->received,
-		 http_now() - request->started, whole ? "" : " broken");
+		 clock_monotonic() - request->started, whole ? "" : " broken");
 }
 
 /*
@@ -363,7 +363,7 @@ int http_start(struct http *http, struct error *err)
 void http_stop(struct http *http)
 {
 	const struct timespec nap = {0, 10 * 1000 * 1000};
-	double end = http_now() + stop_grace;
+	double end = clock_monotonic() + stop_grace;
 
 	atomic_store(&http->stopping, true);
 	admission_end(http);
@@ -372,7 +372,7 @@ void http_stop(struct http *http)
 	do {
 		connections_wake(http);
 		nanosleep(&nap, NULL);
-	} while (!connections_idle(http) && http_now() < end);
+	} while (!connections_idle(http) && clock_monotonic() < end);
 	atomic_store(&http->closing, true);
 	connections_wake(http);
 	if (http->daemon != NULL)

@@ -9,6 +9,8 @@
 #include <cjson/cJSON.h>
 
 #include "core/error.h"
+#include "daemon/http/text.h"
+#include "proto/clock.h"
 
 /*
  * HTTP without the library that speaks it (libmicrohttpd stays in http*.c):
@@ -18,7 +20,7 @@
  * A request lives in the one thread of its connection: begin, data and handle
  * are called there, never two at a time for one request, and must not wait for
  * anything slow; they return HTTP_WAIT and are called again. Only request_wake
- * may be called from other threads.
+ * may be called from other threads. Times are those of clock_monotonic.
  */
 struct http;
 struct request;
@@ -100,14 +102,13 @@ void request_set_state(struct request *request, void *state, void (*state_free)(
 void *request_state(const struct request *request);
 
 /* ---- waiting ---- */
-double http_now(void); /* s, monotonic */
-/* Before HTTP_WAIT: be called again at that time (http_now) in any case. */
+/* Before HTTP_WAIT: be called again at that time (clock_monotonic) in any case. */
 void request_wait_until(struct request *request, double time);
 /* The daemon is about to stop: what waits for a change should answer now. */
 bool request_stopping(const struct request *request);
 /* Any thread, while the request lives; as often as you like; takes no lock of ours but its own. */
 void request_wake(struct request *request);
-/* The same, at that time (http_now) if not before. Not from within a call of the server's own. */
+/* The same, at that time (clock_monotonic) if not before. Not from within a call of the server's own. */
 void request_wake_by(struct request *request, double time);
 
 /* ---- replies: exactly one for each request ---- */
@@ -152,7 +153,7 @@ void request_reply_header(struct request *request, const char *name, const char 
 
 /*
  * A problem document by the name that ends its type ("range-outside", a row of
- * problems[] in http/reply.c), for those that no error code stands for. Counts
+ * problems[] in daemon/problem.c), for those that no error code stands for. Counts
  * as a reply.
  */
 int request_reply_problem(struct request *request, const char *name, struct error *err, const char *format, ...)

@@ -116,7 +116,7 @@ static void watch_peer(struct connection *connection, double patience)
 	setsockopt(connection->socket, IPPROTO_TCP, TCP_NODELAY, &on, sizeof(on));
 	pthread_mutex_lock(&connection->lock);
 	connection->patience = patience;
-	connection->looked_at = connection->answered_at = http_now();
+	connection->looked_at = connection->answered_at = clock_monotonic();
 	connection->acknowledged = 0;
 	pthread_mutex_unlock(&connection->lock);
 }

@@ -1,7 +1,4 @@
-/*
- * Replies, and RFC 9457 problem documents: one table of the problems there are,
- * and which of them an error code becomes.
- */
+/* Replies, RFC 9457 problem documents among them. */
 #include "daemon/http/internal.h"
 
 #include <assert.h>
@@ -13,60 +10,8 @@
 
 #include "daemon/files.h"
 #include "daemon/log.h"
+#include "daemon/problem.h"
 #include "proto/json.h"
-
-/* `name` ends the type, urn:cbctd:problem:NAME: it is stable, clients switch on it. The first of a code is its own. */
-static const struct problem {
-	int code; /* enum error_code, 0: none stands for it */
-	int status;
-	const char *name, *title;
-} problems[] = {
-    {ERR_INVALID, 400, "invalid", "The request is malformed"},
-    {ERR_IMPOSSIBLE, 422, "impossible", "The request is well-formed, but cannot be done"},
-    {ERR_NOT_FOUND, 404, "not-found", "There is no such thing"},
-    {ERR_CONFLICT, 409, "conflict", "The request contradicts what is there"},
-    {ERR_TOO_LARGE, 413, "too-large", "The body is longer than allowed"},
-    {ERR_NO_MEMORY, 503, "no-memory", "Memory ran out"},
-    {ERR_NO_SPACE, 507, "no-space", "The disk is full"},
-    {ERR_IO, 500, "io", "Reading or writing failed"},
-    {ERR_SYNC, 500, "sync", "The disk failed"},
-    {ERR_DEVICE, 500, "device", "The accelerator failed"},
-    {ERR_CANCELLED, 503, "cancelled", "The request was given up"},
-    {ERR_BUSY, 503, "busy", "Not just now"},
-    {ERR_INTERNAL, 500, "internal", "The daemon broke a promise of its own"},
-    {ERR_DAMAGED, 500, "damaged", "The disk has damaged what was stored"},
-    {0, 403, "foreign-origin", "A page of another site may not do this"},
-    {0, 405, "method-not-allowed", "The resource does not know this method"},
-    {0, 411, "length-required", "The request needs a body"},
-    {0, 414, "target-too-long", "The request's target is longer than allowed"},
-    {0, 415, "unsupported-encoding", "The body's encoding is not known"},
-    {0, 415, "unsupported-media-type", "The body is of another type"},
-    {0, 416, "range-outside", "The range lies outside of the body"},
-    {0, 421, "misdirected", "The request is for another server"},
-    {0, 431, "head-too-large", "The request's head is longer than allowed"},
-    {0, 505, "version", "The request is in another version of HTTP"},
-    {0, 429, "too-many-connections", "Too many connections from this address"},
-};
-enum { PROBLEM_COUNT = sizeof(problems) / sizeof(problems[0]) };
-
-static const struct problem *problem_of_code(int code)
-{
-	for (int i = 0; i < PROBLEM_COUNT; i++) {
-		if (problems[i].code == code && code != 0)
-			return &problems[i];
-	}
-	return problem_of_code(ERR_INTERNAL);
-}
-
-static const struct problem *problem_named(const char *name)
-{
-	for (int i = 0; i < PROBLEM_COUNT; i++) {
-		if (strcmp(problems[i].name, name) == 0)
-			return &problems[i];
-	}
-	assert(!"a row of problems[]");
-	return problem_of_code(ERR_INTERNAL);
-}
 
 /* ---- bodies ---- */
 
@@ -207,10 +152,8 @@ static int reply_problem(struct request *request, const struct problem *problem,
 			 const char *pointer, struct error *err)
 {
 	cJSON *value = cJSON_CreateObject();
-	char type[64];
 
-	snprintf(type, sizeof(type), "urn:cbctd:problem:%s", problem->name);
-	cJSON_AddStringToObject(value, "type", type);
+	problem_add_type(value, problem);
 	cJSON_AddStringToObject(value, "title", problem->title);
 	cJSON_AddNumberToObject(value, "status", problem->status);
 	cJSON_AddStringToObject(value, "detail", detail);

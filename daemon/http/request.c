@@ -27,7 +27,7 @@ struct request *request_new(struct http *http, struct connection *connection, co
 	request->http = http;
 	request->connection = connection;
 	request->mhd = connection->mhd;
-	request->started = http_now();
+	request->started = clock_monotonic();
 	request->wait_until = INFINITY;
 	request->target = strdup(target);
 	request->decoded = strdup(target);

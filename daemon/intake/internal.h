@@ -5,7 +5,7 @@
 #include <pthread.h>
 #include <stdbool.h>
 
-#include "daemon/intake/upload.h"
+#include "daemon/intake/intake.h"
 #include "proto/zstream.h"
 
 /*

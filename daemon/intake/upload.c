@@ -8,7 +8,6 @@
  *
  * Here is the connection's side; the writers' is in intake/write.c.
  */
-#include "daemon/intake/upload.h"
 
 #include <inttypes.h>
 #include <math.h>
@@ -18,7 +17,6 @@
 
 #include <openssl/evp.h>
 
-#include "daemon/http/text.h"
 #include "daemon/intake/internal.h"
 
 /* ---- an upload's life ---- */

@@ -72,7 +72,7 @@ static int compare_with_stored(struct slot *slot, bool *ret_lost, struct error *
 /* Another request has the claim: waits for its outcome, though not for ever. */
 static int park(struct slot *slot, struct error *err)
 {
-	double now = http_now();
+	double now = clock_monotonic();
 
 	if (slot->parked == 0)
 		slot->parked = now;
@@ -171,7 +171,7 @@ static void report_failure(struct uploads *uploads, const char *what)
 static int sync_batch(struct uploads *uploads, struct slot *const slots[], int count, struct error *err)
 {
 	for (int i = 0; i < count; i++) {
-		double started = http_now();
+		double started = clock_monotonic();
 		bool done = false;
 
 		for (int j = 0; j < i && !done; j++)
@@ -187,7 +187,7 @@ static int sync_batch(struct uploads *uploads, struct slot *const slots[], int c
 		}
 		pthread_mutex_lock(&uploads->lock);
 		uploads->statistics.syncs++;
-		uploads->statistics.sync_seconds += http_now() - started;
+		uploads->statistics.sync_seconds += clock_monotonic() - started;
 		pthread_mutex_unlock(&uploads->lock);
 	}
 	return 0;
@@ -411,10 +411,8 @@ static bool wait_for_work(struct uploads *uploads)
 		if (uploads->parked.first == NULL) {
 			pthread_cond_wait(&uploads->work, &uploads->lock);
 		} else { /* their patience has an end */
-			struct timespec until;
+			const struct timespec until = clock_timespec(clock_monotonic() + 1);
 
-			clock_gettime(CLOCK_MONOTONIC, &until);
-			until.tv_sec++;
 			if (pthread_cond_timedwait(&uploads->work, &uploads->lock, &until) == ETIMEDOUT)
 				uploads_requeue(uploads);
 		}

@@ -12,10 +12,10 @@
 #include <string.h>
 #include <sys/resource.h>
 #include <sys/stat.h>
-#include <time.h>
 #include <unistd.h>
 
 #include "daemon/log.h"
+#include "proto/clock.h"
 #include "proto/durable.h"
 #include "proto/seal.h"
 #include "proto/spool.h"
@@ -31,7 +31,7 @@ struct task {
 	struct task *next;
 	char job[ID_SIZE];
 	char name[32]; /* "": all of them */
-	double due;    /* of now(): not before */
+	double due;    /* clock_monotonic: not before */
 	double retry;  /* s to the next time, should it fail */
 };
 
@@ -179,14 +179,6 @@ static int make_digest(struct digester *digester, struct job *job, const struct 
 
 /* ---- the threads ---- */
 
-static double now(void)
-{
-	struct timespec at;
-
-	clock_gettime(CLOCK_MONOTONIC, &at);
-	return (double)at.tv_sec + 1e-9 * (double)at.tv_nsec;
-}
-
 /* Whether what failed is worth another try. */
 static bool complain(struct job *job, const struct task *task, const struct error *err)
 {
@@ -247,8 +239,7 @@ static void append(struct digester *digester, struct task *task)
 /* The first task that is due, or NULL after a sleep until one may be; holding the lock. */
 static struct task *next_task(struct digester *digester)
 {
-	double at = now(), until = INFINITY;
-	struct timespec end;
+	double at = clock_monotonic(), until = INFINITY;
 
 	for (struct task **place = &digester->first; *place != NULL; place = &(*place)->next) {
 		struct task *task = *place;
@@ -264,8 +255,8 @@ static struct task *next_task(struct digester *digester)
 	if (until == INFINITY) {
 		pthread_cond_wait(&digester->changed, &digester->lock);
 	} else {
-		end.tv_sec = (time_t)until;
-		end.tv_nsec = (long)(1e9 * (until - (double)end.tv_sec));
+		const struct timespec end = clock_timespec(until);
+
 		pthread_cond_timedwait(&digester->changed, &digester->lock, &end);
 	}
 	return NULL;
@@ -292,7 +283,7 @@ static void *digest_loop(void *context)
 			free(task);
 			continue;
 		}
-		task->due = now() + task->retry;
+		task->due = clock_monotonic() + task->retry;
 		task->retry = fmin(2 * task->retry, RETRY_LAST);
 		append(digester, task);
 	}

@@ -8,12 +8,12 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <time.h>
 #include <unistd.h>
 
 #include "daemon/jobs/document.h"
 #include "daemon/files.h"
 #include "daemon/log.h"
+#include "proto/clock.h"
 #include "proto/durable.h"
 #include "proto/json.h"
 #include "proto/spool.h"
@@ -83,22 +83,6 @@ bool job_state_ended(enum job_state state)
 bool job_state_may_follow(enum job_state from, enum job_state to)
 {
 	return transitions[from][to];
-}
-
-static double time_monotonic(void)
-{
-	struct timespec now;
-
-	clock_gettime(CLOCK_MONOTONIC, &now);
-	return (double)now.tv_sec + (double)now.tv_nsec * 1e-9;
-}
-
-static double time_of_day(void)
-{
-	struct timespec now;
-
-	clock_gettime(CLOCK_REALTIME, &now);
-	return (double)now.tv_sec + (double)now.tv_nsec * 1e-9;
 }
 
 /* ---- references ---- */
@@ -308,7 +292,7 @@ static cJSON *state_document(const struct job_record *record)
 /* Time since the last look belongs to the stage that ran; jobs->lock is held. */
 static void account_stage(struct job *job)
 {
-	double now = time_monotonic();
+	double now = clock_monotonic();
 
 	if (job->record.state == JOB_RUNNING && job->stage_since > 0)
 		job->record.seconds[job->record.stage] += now - job->stage_since;
@@ -320,7 +304,7 @@ static void enter_queue(struct job_record *record, enum job_state from, const st
 {
 	if (record->ticket == 0) {
 		record->ticket = jobs->next_ticket++;
-		record->queued = time_of_day();
+		record->queued = clock_realtime();
 		return;
 	}
 	/* What its scan lost was sent again: no run of its was lost. */
@@ -353,10 +337,10 @@ static void enter_running(struct job_record *record, enum job_state from, const 
 		record->attempts = 1;
 	if (record->ticket == 0) {
 		record->ticket = jobs->next_ticket++;
-		record->queued = time_of_day();
+		record->queued = clock_realtime();
 	}
 	if (record->started == 0)
-		record->started = time_of_day();
+		record->started = clock_realtime();
 	/* A checkpoint of what is understood otherwise now is of no use. */
 	if (from == JOB_QUEUED && record->basis != change->basis) {
 		record->checkpoint = 0;
@@ -377,7 +361,7 @@ static void enter_running(struct job_record *record, enum job_state from, const 
 /* directory: of the store; what lies in it is named without it. */
 static void enter_end(struct job_record *record, const struct job_change *change, const char *directory)
 {
-	record->ended = time_of_day();
+	record->ended = clock_realtime();
 	record->checkpoint = 0;
 	if (record->state == JOB_SUCCEEDED)
 		record->fraction = 1;
@@ -444,7 +428,7 @@ static void show_state(struct job *job, const struct job_record *record, const s
 		queue_add(&jobs->queue, &job->entry);
 		jobs->statistics.yielded += change->yielded;
 	} else if (record->state == JOB_RUNNING) {
-		job->run_since = job->stage_since = job->row_at = time_monotonic();
+		job->run_since = job->stage_since = job->row_at = clock_monotonic();
 		job->run_fraction = record->fraction;
 		job->row_seconds = 0;
 		jobs->statistics.started++;
@@ -670,7 +654,7 @@ static int fill_record(struct job_record *record, const struct job_request *requ
 		record->memory = *memory;
 	if (key != NULL)
 		memcpy(record->digest, digest, sizeof(record->digest));
-	record->created = time_of_day();
+	record->created = clock_realtime();
 	return id_make(record->id, err);
 }
 
@@ -877,7 +861,7 @@ int job_queue_position(struct job *job)
 /* From the time between history rows; before the first one, from the share of the whole that is done. */
 double job_eta(struct job *job)
 {
-	double now = time_monotonic(), eta = -1;
+	double now = clock_monotonic(), eta = -1;
 	const struct job_record *record = &job->record;
 
 	pthread_mutex_lock(&job->jobs->lock);
@@ -1160,7 +1144,7 @@ void job_progress(struct job *job, enum stage stage, int iteration, double fract
 
 static void note_rows(struct job *job, int count, int iteration)
 {
-	double now = time_monotonic(), seconds;
+	double now = clock_monotonic(), seconds;
 
 	pthread_mutex_lock(&job->jobs->lock);
 	seconds = (now - job->row_at) / count;

@@ -17,7 +17,6 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/eventfd.h>
-#include <time.h>
 #include <unistd.h>
 
 #include "daemon/jobs/digest.h"
@@ -25,6 +24,7 @@
 #include "daemon/files.h"
 #include "daemon/log.h"
 #include "daemon/jobs/spawn.h"
+#include "proto/clock.h"
 #include "proto/message.h"
 
 enum {
@@ -125,14 +125,6 @@ struct supervise {
 	struct worker_facts facts[WORKERS_MAX];
 	bool stop;
 };
-
-static double now_monotonic(void)
-{
-	struct timespec now;
-
-	clock_gettime(CLOCK_MONOTONIC, &now);
-	return (double)now.tv_sec + (double)now.tv_nsec * 1e-9;
-}
 
 static void wake_up(void *context)
 {
@@ -273,7 +265,7 @@ static void finish(struct supervise *supervise, struct worker *worker)
 		store_distrust(jobs_store(supervise->jobs), &err);
 		if (code == ERR_NO_SPACE)
 			store_reserve_spend(jobs_store(supervise->jobs));
-		worker->ending.again = now_monotonic() + RETRY;
+		worker->ending.again = clock_monotonic() + RETRY;
 		log_line(LEVEL_ERROR, "the end of a job cannot be recorded yet: %s", err.text);
 		return;
 	}
@@ -409,7 +401,7 @@ static void job_ended(struct supervise *supervise, struct worker *worker, const 
 	} else if (message->code == ERR_DEVICE) {
 		/* It is about to exit: a failed device is good for nothing more in that process. */
 		worker->state = WORKER_ENDING;
-		worker->deadline = now_monotonic() + EXIT;
+		worker->deadline = clock_monotonic() + EXIT;
 		lose_job(supervise, worker, ERR_DEVICE, message->text);
 	} else if (facts.cancel_asked) {
 		end_job(supervise, worker, (struct ending){.to = JOB_CANCELLED}, "");
@@ -419,7 +411,7 @@ static void job_ended(struct supervise *supervise, struct worker *worker, const 
 		/* Unasked: somebody told the process itself to end, it takes no more jobs. */
 		if (!worker->yielding) {
 			worker->state = WORKER_ENDING;
-			worker->deadline = now_monotonic() + EXIT;
+			worker->deadline = clock_monotonic() + EXIT;
 		}
 		end_job(supervise, worker,
 			(struct ending){.to = back_to(worker), .checkpoint = message->iteration, .yielded = true},
@@ -432,7 +424,7 @@ static void job_ended(struct supervise *supervise, struct worker *worker, const 
 	} else if (message->code == ERR_IO) {
 		/* It may pass: no descriptor was free, or a disk was slow to answer. */
 		job_record(worker->job, &record);
-		job_hold(worker->job, JOB_DISK_TROUBLE, now_monotonic() + RETRY * (1 << record.crashes % CRASHES_MAX),
+		job_hold(worker->job, JOB_DISK_TROUBLE, clock_monotonic() + RETRY * (1 << record.crashes % CRASHES_MAX),
 			 0);
 		lose_job(supervise, worker, ERR_IO, message->text);
 	} else if (message->code == ERR_DAMAGED) {
@@ -492,7 +484,7 @@ static void stop_worker(struct supervise *supervise, struct worker *worker)
 {
 	tell(worker, MESSAGE_CANCEL);
 	worker->cancelling = true;
-	worker->deadline = now_monotonic() + supervise->options.cancel_seconds;
+	worker->deadline = clock_monotonic() + supervise->options.cancel_seconds;
 }
 
 /*
@@ -519,11 +511,11 @@ static void feed(struct supervise *supervise, struct worker *worker)
 	stored_scan_facts(worker->arriving, &facts);
 	if (worker->told == worker->taken)
 		tell_arrivals(worker);
-	if (worker->told < facts.count || now_monotonic() < worker->again)
+	if (worker->told < facts.count || clock_monotonic() < worker->again)
 		return;
 	code = record_running(worker, &err);
 	if (code != 0) {
-		worker->again = now_monotonic() + RETRY;
+		worker->again = clock_monotonic() + RETRY;
 		log_line(LEVEL_ERROR, "a job cannot be running yet: %s", err.text);
 	}
 }
@@ -556,12 +548,10 @@ static int add_volume(struct worker *worker, const struct message *message, stru
 {
 	struct volume_record volume = {
 	    .iteration = message->iteration, .grid = message->grid, .bytes = message->bytes, .norms = message->norms};
-	struct timespec now;
 
 	snprintf(volume.name, sizeof(volume.name), "%s", message->name);
 	snprintf(volume.stage, sizeof(volume.stage), "%s", message->volume_stage);
-	clock_gettime(CLOCK_REALTIME, &now);
-	volume.created = (double)now.tv_sec + (double)now.tv_nsec * 1e-9;
+	volume.created = clock_realtime();
 	store_volume_trust(jobs_store(job_jobs(worker->job)), message->job, &volume);
 	return job_add_volume(worker->job, &volume, err);
 }
@@ -641,12 +631,12 @@ static void on_message(struct supervise *supervise, struct worker *worker, const
 static void read_messages(struct supervise *supervise, struct worker *worker, bool died, bool *ret_gone)
 {
 	struct message *message = malloc(sizeof(*message));
-	double end = died ? NEVER : now_monotonic() + TURN;
+	double end = died ? NEVER : clock_monotonic() + TURN;
 	struct error err;
 	bool got = true;
 	int code = message == NULL ? error_set_errno(&err, ENOMEM, "message") : 0;
 
-	while (code == 0 && got && now_monotonic() < end) {
+	while (code == 0 && got && clock_monotonic() < end) {
 		code = message_receive(worker->child.socket, 0, message, &got, &err);
 		if (code == 0 && got) {
 			on_message(supervise, worker, message);
@@ -670,7 +660,7 @@ static void start_worker(struct supervise *supervise, struct worker *worker)
 					      .threads = supervise->options.threads,
 					      .device_memory = supervise->options.device_memory};
 	struct error err;
-	double now = now_monotonic();
+	double now = clock_monotonic();
 
 	worker->starts++;
 	if (child_spawn(&options, &worker->child, &err) != 0) {
@@ -698,7 +688,7 @@ static double restart_delay(unsigned failures)
 static void worker_died(struct supervise *supervise, struct worker *worker, bool stopping)
 {
 	char how[128], text[160];
-	double now = now_monotonic();
+	double now = clock_monotonic();
 	bool gone;
 
 	/* Its last words first: they may say that the job is done. */
@@ -803,7 +793,7 @@ static void begin(struct supervise *supervise, struct worker *worker, struct job
 	worker->failure_code = 0;
 	worker->told = worker->taken = 0;
 	worker->again = 0;
-	worker->attended = now_monotonic();
+	worker->attended = clock_monotonic();
 	worker->state = WORKER_BUSY;
 	worker->deadline = NEVER;
 	if (message_send(worker->child.socket, message, &err) != 0) {
@@ -875,7 +865,7 @@ static int give_job(struct supervise *supervise, struct worker *worker, struct j
 		store_distrust(jobs_store(supervise->jobs), &why);
 	if (code == ERR_NO_SPACE || code == ERR_NO_MEMORY || code == ERR_SYNC) {
 		*err = why;
-	} else if (code == ERR_IO && job_hold(job, JOB_DISK_TROUBLE, now_monotonic() + RETRY, 0) < BEGINNINGS_MAX) {
+	} else if (code == ERR_IO && job_hold(job, JOB_DISK_TROUBLE, clock_monotonic() + RETRY, 0) < BEGINNINGS_MAX) {
 		log_line(LEVEL_WARNING, "job %s cannot begin yet: %s", record.id, why.text);
 		code = 0;
 	} else if (code != 0) {
@@ -895,7 +885,7 @@ static int give_job(struct supervise *supervise, struct worker *worker, struct j
  */
 static struct job *choose_job(struct supervise *supervise, const struct worker *worker, bool *ret_arriving)
 {
-	double since = now_monotonic() - PATIENCE;
+	double since = clock_monotonic() - PATIENCE;
 	struct job *queued = jobs_next(supervise->jobs), *waiting, *chosen;
 	struct job_facts a, b;
 	bool now;
@@ -934,7 +924,7 @@ static void dispatch(struct supervise *supervise)
 	}
 	if (code != 0) {
 		log_line(LEVEL_ERROR, "no job can be started: %s", err.text);
-		supervise->dispatch_at = now_monotonic() + RETRY;
+		supervise->dispatch_at = clock_monotonic() + RETRY;
 	}
 }
 
@@ -987,7 +977,7 @@ static void preempt(struct supervise *supervise)
 {
 	struct queue_running running[WORKERS_MAX];
 	int of[WORKERS_MAX], busy, idle, victim;
-	double now = now_monotonic(), since = arrivals_since(supervise, now);
+	double now = clock_monotonic(), since = arrivals_since(supervise, now);
 	bool arriving;
 	struct job *waiting = jobs_arriving(supervise->jobs, since, &arriving);
 	struct job_facts facts = {.priority = PRIORITY_ROUTINE};
@@ -1022,7 +1012,7 @@ static void preempt(struct supervise *supervise)
 
 static void look_at_clock(struct supervise *supervise, bool stopping)
 {
-	double now = now_monotonic();
+	double now = clock_monotonic();
 
 	for (int i = 0; i < supervise->count; i++) {
 		struct worker *worker = &supervise->workers[i];
@@ -1049,7 +1039,7 @@ static void look_at_clock(struct supervise *supervise, bool stopping)
 
 static int poll_timeout(const struct supervise *supervise, bool stopping)
 {
-	double next = NEVER, now = now_monotonic(), left;
+	double next = NEVER, now = clock_monotonic(), left;
 
 	for (int i = 0; i < supervise->count; i++) {
 		const struct worker *worker = &supervise->workers[i];
@@ -1081,7 +1071,7 @@ static int poll_timeout(const struct supervise *supervise, bool stopping)
 static void review_holds(struct supervise *supervise)
 {
 	unsigned long long available = 0;
-	double now = now_monotonic();
+	double now = clock_monotonic();
 	struct error ignored;
 
 	if (supervise->review_at > now)
@@ -1097,12 +1087,12 @@ static void move_jobs(struct supervise *supervise)
 	struct error err;
 
 	review_holds(supervise);
-	if (supervise->dispatch_at > now_monotonic())
+	if (supervise->dispatch_at > clock_monotonic())
 		return;
 	supervise->dispatch_at = 0;
 	if (jobs_promote(supervise->jobs, &err) != 0) {
 		log_line(LEVEL_ERROR, "no job can be queued: %s", err.text);
-		supervise->dispatch_at = now_monotonic() + RETRY;
+		supervise->dispatch_at = clock_monotonic() + RETRY;
 		return;
 	}
 	dispatch(supervise);
@@ -1130,7 +1120,7 @@ static void read_workers(struct supervise *supervise, const struct pollfd *fds, 
 		} else if (gone && worker->state != WORKER_ENDING) {
 			/* It closed its socket or speaks nonsense, but lives. */
 			worker->state = WORKER_ENDING;
-			worker->deadline = now_monotonic() + EXIT;
+			worker->deadline = clock_monotonic() + EXIT;
 			publish(supervise, worker);
 		}
 	}
@@ -1163,7 +1153,7 @@ static void wait_and_read(struct supervise *supervise, bool stopping)
 
 static void quit_workers(struct supervise *supervise)
 {
-	supervise->stop_by = now_monotonic() + supervise->options.stop_seconds;
+	supervise->stop_by = clock_monotonic() + supervise->options.stop_seconds;
 	for (int i = 0; i < supervise->count; i++) {
 		struct worker *worker = &supervise->workers[i];
 

@@ -129,9 +129,6 @@ void verified_free(struct verified *verified); /* NULL is fine */
 bool verified_knows(struct verified *verified, const struct stat *status, int part);
 void verified_note(struct verified *verified, const struct stat *status, int part);
 
-/* Seconds since 1970. */
-double time_now(void);
-
 /* store/reconcile.c. Called while nobody else has the store. */
 int store_reconcile(struct store *store, bool fresh, struct error *err);
 /* What is in quarantine/ and belongs back, before the catalogue is made again. */

@@ -13,6 +13,7 @@
 #include "daemon/store/deleted.h"
 #include "daemon/store/quarantine.h"
 #include "daemon/store/record.h"
+#include "proto/clock.h"
 #include "proto/json.h"
 #include "proto/spool.h"
 
@@ -58,7 +59,7 @@ static int add_event(struct store *store, const char *id, const struct event *ev
 		    " VALUES ((SELECT number FROM jobs WHERE id = ?), ?, ?, ?, ?) ON CONFLICT (job, once) DO NOTHING",
 		    err);
 	query_text(&query, id);
-	query_real(&query, time_now());
+	query_real(&query, clock_realtime());
 	query_text(&query, event->kind);
 	query_text(&query, event->data);
 	query_text(&query, event->once);

@@ -11,6 +11,7 @@
 
 #include "daemon/files.h"
 #include "daemon/log.h"
+#include "proto/clock.h"
 #include "proto/json.h"
 #include "proto/spool.h"
 
@@ -71,17 +72,16 @@ static int begin_entry(const char *state, const char *path, const char *why, cha
 		       struct error *err)
 {
 	char directory[1200];
-	struct timespec now;
+	double now = clock_realtime();
 	int code;
 
 	snprintf(directory, sizeof(directory), "%s/quarantine", state);
 	code = directory_make(directory, err);
 	if (code != 0)
 		return code;
-	clock_gettime(CLOCK_REALTIME, &now);
-	choose_name(state, path, (double)now.tv_sec, ret_name);
+	choose_name(state, path, floor(now), ret_name);
 	log_line(LEVEL_ERROR, "%s is set aside as quarantine/%s: %s", path, ret_name, why);
-	return write_note(state, ret_name, path, (double)now.tv_sec, why, err);
+	return write_note(state, ret_name, path, floor(now), why, err);
 }
 
 int quarantine_note(const char *state, const char *path, const char *why, struct error *err)

@@ -26,6 +26,7 @@
 #include "daemon/store/deleted.h"
 #include "daemon/store/quarantine.h"
 #include "daemon/store/record.h"
+#include "proto/clock.h"
 
 struct known {
 	char id[ID_SIZE];
@@ -343,7 +344,7 @@ static int pass_over_events(struct store *store, struct error *err)
 		return query.code;
 	query_begin(&query, &store->writer, "UPDATE sqlite_sequence SET seq = max(seq + 1, ?) WHERE name = 'events'",
 		    err);
-	query_integer(&query, (long long)((time_now() - 1577836800.0) * 1e3));
+	query_integer(&query, (long long)((clock_realtime() - 1577836800.0) * 1e3));
 	return query_run(&query);
 }
 

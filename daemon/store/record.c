@@ -12,6 +12,7 @@
 
 #include "daemon/files.h"
 #include "daemon/log.h"
+#include "proto/clock.h"
 #include "proto/durable.h"
 #include "proto/json.h"
 #include "proto/spool.h"
@@ -205,7 +206,7 @@ int record_write(struct store *store, enum record_kind kind, const char *id, boo
 {
 	static const char *const updates[RECORD_KINDS] = {"UPDATE scans SET stamp = ? WHERE id = ?",
 							  "UPDATE jobs SET stamp = ? WHERE id = ?"};
-	long long now = (long long)(time_now() * 1e6);
+	long long now = (long long)(clock_realtime() * 1e6);
 	struct query query;
 
 	store->stamp = now > store->stamp ? now : store->stamp + 1;

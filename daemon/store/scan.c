@@ -13,7 +13,6 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/stat.h>
-#include <time.h>
 #include <unistd.h>
 
 #include "daemon/files.h"
@@ -22,6 +21,7 @@
 #include "daemon/store/quarantine.h"
 #include "daemon/store/record.h"
 #include "daemon/store/scan.h"
+#include "proto/clock.h"
 #include "proto/spool.h"
 
 /* Left on the disk for the catalogue when room for projections is set aside. */
@@ -586,7 +586,7 @@ int store_scan_create(struct store *store, struct scan *parsed, const struct sto
 	if (scan == NULL)
 		return error_set_errno(err, ENOMEM, "scan of %d projections", parsed->count);
 	memcpy(scan->name, parsed->name, sizeof(scan->name));
-	scan->created = time_now();
+	scan->created = clock_realtime();
 	scan->columns = parsed->geometry.columns;
 	scan->rows = parsed->geometry.rows;
 	scan->sample = parsed->sample;
@@ -1040,16 +1040,16 @@ static void show_projection(const struct received_projection *projection, double
 int store_put_projections(struct store *store, struct received_projection *batch, int count, struct error *err)
 {
 	unsigned stored = 0;
-	struct timespec now;
+	double now;
 	int code = store_begin_unsynced(store, err);
 
 	if (code == 0)
 		code = store_end(store, insert_projections(store, batch, count, err), err);
 	if (code != 0)
 		return code;
-	clock_gettime(CLOCK_MONOTONIC, &now);
+	now = clock_monotonic();
 	for (int i = 0; i < count; i++) {
-		show_projection(&batch[i], (double)now.tv_sec + (double)now.tv_nsec * 1e-9);
+		show_projection(&batch[i], now);
 		stored += batch[i].stored;
 		if (i + 1 == count || batch[i + 1].scan != batch[i].scan)
 			watch_wake(&batch[i].scan->watchers);

@@ -21,7 +21,6 @@
 #include <string.h>
 #include <sys/file.h>
 #include <sys/stat.h>
-#include <time.h>
 #include <unistd.h>
 
 #include "daemon/files.h"
@@ -29,6 +28,7 @@
 #include "daemon/store/deleted.h"
 #include "daemon/store/pages.h"
 #include "daemon/store/quarantine.h"
+#include "proto/clock.h"
 
 /* Pages in the log (4 KiB each) before they are moved: enough to make it rare, few enough to keep reading fast. */
 enum { CHECKPOINT_PAGES = 1000 };
@@ -144,14 +144,6 @@ static const char *const migrations[] = {
      "ALTER TABLE jobs ADD COLUMN tv_alpha REAL;"),
 };
 enum { MIGRATIONS = sizeof(migrations) / sizeof(migrations[0]) };
-
-double time_now(void)
-{
-	struct timespec now;
-
-	clock_gettime(CLOCK_REALTIME, &now);
-	return (double)now.tv_sec + (double)now.tv_nsec * 1e-9;
-}
 
 /* ---- queries ---- */
 
@@ -351,7 +343,7 @@ int store_begin_unsynced(struct store *store, struct error *err)
 int store_end(struct store *store, int code, struct error *err)
 {
 	struct error ignored;
-	double before = time_now();
+	double before = clock_monotonic();
 
 	if (code == 0)
 		code = run_plain(&store->writer, "COMMIT", err);
@@ -364,7 +356,7 @@ int store_end(struct store *store, int code, struct error *err)
 	pthread_mutex_unlock(&store->writer.lock);
 	if (code == 0) {
 		atomic_fetch_add(&store->commits, 1);
-		atomic_fetch_add(&store->commit_microseconds, (unsigned long long)((time_now() - before) * 1e6));
+		atomic_fetch_add(&store->commit_microseconds, (unsigned long long)((clock_monotonic() - before) * 1e6));
 	}
 	return code;
 }

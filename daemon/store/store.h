@@ -6,6 +6,7 @@
 #include <stdint.h>
 
 #include "daemon/id.h"
+#include "daemon/store/quarantine.h"
 #include "daemon/watch.h"
 #include "proto/recipe.h"
 #include "proto/sums.h"

@@ -11,10 +11,10 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/stat.h>
-#include <time.h>
 #include <unistd.h>
 
 #include "daemon/store/db.h"
+#include "proto/clock.h"
 #include "proto/format.h"
 #include "proto/seal.h"
 #include "proto/spool.h"
@@ -36,14 +36,6 @@ struct verified {
 	struct known files[FILES_MAX];
 	int next;
 };
-
-static double now_monotonic(void)
-{
-	struct timespec now;
-
-	clock_gettime(CLOCK_MONOTONIC, &now);
-	return (double)now.tv_sec + (double)now.tv_nsec * 1e-9;
-}
 
 int verified_new(struct verified **ret_verified, struct error *err)
 {
@@ -78,7 +70,7 @@ static struct known *find(struct verified *verified, const struct stat *status)
 
 		if (known->status.st_ino == status->st_ino && known->status.st_dev == status->st_dev &&
 		    known->status.st_size == status->st_size && same_time(&known->status.st_mtim, &status->st_mtim) &&
-		    same_time(&known->status.st_ctim, &status->st_ctim) && now_monotonic() - known->since < WHILE)
+		    same_time(&known->status.st_ctim, &status->st_ctim) && clock_monotonic() - known->since < WHILE)
 			return known;
 	}
 	return NULL;
@@ -94,7 +86,7 @@ static struct known *find_or_take(struct verified *verified, const struct stat *
 	verified->next = (verified->next + 1) % FILES_MAX;
 	memset(known, 0, sizeof(*known));
 	known->status = *status;
-	known->since = now_monotonic();
+	known->since = clock_monotonic();
 	return known;
 }
 

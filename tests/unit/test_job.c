@@ -7,7 +7,9 @@
 #include <time.h>
 
 #include "daemon/jobs/digest.h"
-#include "daemon/jobs/document.h"
+#include "daemon/problem.h"
+#include "proto/clock.h"
+#include "daemon/api/document.h"
 #include "daemon/files.h"
 #include "proto/durable.h"
 #include "proto/format.h"
@@ -858,13 +860,27 @@ START_TEST(the_document_has_what_the_contract_names)
 }
 END_TEST
 
+START_TEST(each_error_code_has_one_problem_with_a_name_of_its_own)
+{
+	for (int code = ERR_DAMAGED; code <= ERR_INVALID; code++) {
+		const struct problem *problem = problem_of_code(code);
+
+		ck_assert_int_eq(problem->code, code);
+		ck_assert_ptr_eq(problem_named(problem->name), problem);
+	}
+	ck_assert_str_eq(problem_of_code(ERR_NO_SPACE)->name, "no-space");
+	ck_assert_int_eq(problem_of_code(12345)->code, ERR_INTERNAL);
+	ck_assert_int_eq(problem_named("range-outside")->status, 416);
+}
+END_TEST
+
 START_TEST(times_are_written_as_iso_8601)
 {
-	char text[TIME_TEXT_SIZE];
+	char text[CLOCK_TEXT_SIZE];
 
-	time_text(0.25, text);
+	clock_text(0.25, text);
 	ck_assert_str_eq(text, "1970-01-01T00:00:00.250Z");
-	time_text(951782400, text); /* the 29th of February 2000 */
+	clock_text(951782400, text); /* the 29th of February 2000 */
 	ck_assert_str_eq(text, "2000-02-29T00:00:00.000Z");
 }
 END_TEST
@@ -900,6 +916,7 @@ Suite *job_suite(void)
 	tcase_add_test(tests, digests_come_for_what_is_told_to_be_on_the_disk);
 	tcase_add_test(tests, what_a_dead_worker_told_of_is_settled_for_it);
 	tcase_add_test(tests, the_document_has_what_the_contract_names);
+	tcase_add_test(tests, each_error_code_has_one_problem_with_a_name_of_its_own);
 	tcase_add_test(tests, times_are_written_as_iso_8601);
 	tcase_set_timeout(tests, 60);
 	suite_add_tcase(suite, tests);

@@ -1,5 +1,5 @@
-#ifndef CBCT_DAEMON_INTAKE_UPLOAD_H
-#define CBCT_DAEMON_INTAKE_UPLOAD_H
+#ifndef CBCT_DAEMON_INTAKE_INTAKE_H
+#define CBCT_DAEMON_INTAKE_INTAKE_H
 
 #include <stdbool.h>
 #include <stddef.h>

@@ -1,0 +1,424 @@
+/* What the API shows of scans, jobs, workers and quarantine: document.h. */
+#include "daemon/api/document.h"
+
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "daemon/log.h"
+#include "proto/clock.h"
+#include "proto/json.h"
+
+static void add_text_or_null(cJSON *object, const char *name, const char *text)
+{
+	if (text[0] == '\0')
+		cJSON_AddNullToObject(object, name);
+	else
+		cJSON_AddStringToObject(object, name, text);
+}
+
+/* Numbers below zero stand for what nobody knows. */
+static void add_number_or_null(cJSON *object, const char *name, double value)
+{
+	if (value < 0)
+		cJSON_AddNullToObject(object, name);
+	else
+		cJSON_AddNumberToObject(object, name, value);
+}
+
+/* ---- scans ---- */
+
+static void add_posted(cJSON *document, const struct scan *scan)
+{
+	const cJSON *member;
+
+	cJSON_ArrayForEach(member, scan->document)
+	{
+		if (strcmp(member->string, "name") != 0)
+			cJSON_AddItemToObject(document, member->string, cJSON_Duplicate(member, true));
+	}
+}
+
+/* The same members as posted, but those that can be long. */
+static void add_essence(cJSON *document, const struct scan_facts *facts)
+{
+	const int size[2] = {facts->columns, facts->rows};
+	cJSON *detector = cJSON_AddObjectToObject(document, "detector");
+	cJSON *projections = cJSON_AddObjectToObject(document, "projections");
+
+	cJSON_AddNumberToObject(detector, "columns", size[0]);
+	cJSON_AddNumberToObject(detector, "rows", size[1]);
+	cJSON_AddNumberToObject(projections, "count", facts->count);
+	cJSON_AddStringToObject(projections, "sample", sample_names[facts->sample]);
+	cJSON_AddStringToObject(projections, "quantity", quantity_names[facts->quantity]);
+}
+
+static bool add_received(cJSON *document, struct stored_scan *scan, int count)
+{
+	unsigned char *flags = malloc((size_t)count);
+
+	if (flags == NULL)
+		return false;
+	stored_scan_received(scan, flags);
+	cJSON_AddItemToObject(document, "received", json_runs(flags, count, true));
+	cJSON_AddItemToObject(document, "missing", json_runs(flags, count, false));
+	free(flags);
+	return true;
+}
+
+static void add_warning(cJSON *list, const char *code, const char *detail)
+{
+	cJSON_AddItemToArray(list, json_warning(code, detail));
+}
+
+static bool lacks_flat(const struct scan_facts *facts)
+{
+	return facts->quantity == QUANTITY_INTENSITY && facts->air <= 0 && !facts->flat &&
+	       !facts->lost_image[IMAGE_FLAT];
+}
+
+static void add_scan_warnings(cJSON *document, const struct scan *scan, const struct scan_facts *facts)
+{
+	cJSON *warnings = scan_warnings(scan);
+	char detail[200];
+
+	if (facts->closed) {
+		snprintf(
+		    detail, sizeof(detail),
+		    "the scan was completed with %d of %d projections: arc, weights and subsets are those of the views "
+		    "that are there",
+		    facts->received + facts->lost, facts->count);
+		add_warning(warnings, "incomplete", detail);
+	}
+	if (facts->complete && lacks_flat(facts))
+		add_warning(
+		    warnings, "no_flat",
+		    "all projections are there, but no flat image, and the scan has no air value: its jobs wait "
+		    "for PUT /v1/scans/{scan}/flat");
+	if (facts->damaged)
+		add_warning(warnings, "files_missing", "the file of the projections is not there at its full size");
+	if (facts->lost > 0) {
+		snprintf(detail, sizeof(detail),
+			 "the disk has damaged %d projections that were stored: they are missing again, and the scan's "
+			 "jobs wait until they are sent again",
+			 facts->lost);
+		add_warning(warnings, "damaged_projections", detail);
+	}
+	for (int i = 0; i < IMAGE_COUNT; i++) {
+		if (!facts->lost_image[i])
+			continue;
+		snprintf(detail, sizeof(detail),
+			 "the disk has damaged the image %s: the scan's jobs wait until it is sent again",
+			 image_names[i]);
+		add_warning(warnings, "damaged_image", detail);
+	}
+	cJSON_AddItemToObject(document, "warnings", warnings);
+}
+
+cJSON *scan_document(struct stored_scan *stored, bool brief)
+{
+	const struct scan *scan = stored_scan_parsed(stored);
+	cJSON *document = cJSON_CreateObject();
+	struct scan_facts facts;
+	char href[64];
+
+	if (document == NULL)
+		return NULL;
+	stored_scan_facts(stored, &facts);
+	snprintf(href, sizeof(href), "/v1/scans/%s", stored_scan_id(stored));
+	cJSON_AddStringToObject(document, "id", stored_scan_id(stored));
+	cJSON_AddStringToObject(document, "name", facts.name);
+	cJSON_AddStringToObject(document, "href", href);
+	cJSON_AddStringToObject(document, "state", facts.complete ? "complete" : "receiving");
+	json_add_time(document, "created", facts.created);
+	cJSON_AddNumberToObject(document, "received_count", facts.received);
+	if (facts.quantity == QUANTITY_INTENSITY) {
+		cJSON_AddBoolToObject(document, "flat", facts.flat);
+		cJSON_AddBoolToObject(document, "dark", facts.dark);
+	}
+	cJSON_AddBoolToObject(document, "defects", facts.defects);
+	if (brief || scan == NULL) {
+		add_essence(document, &facts);
+		return document;
+	}
+	add_posted(document, scan);
+	if (!scan->patient.known)
+		cJSON_AddNullToObject(document, "patient");
+	cJSON_AddItemToObject(document, "axes", patient_axes_json(&scan->patient));
+	if (!add_received(document, stored, facts.count)) {
+		cJSON_Delete(document);
+		return NULL;
+	}
+	scan = stored_scan_measured(stored);
+	cJSON_AddItemToObject(document, "derived", scan_derived(scan));
+	add_scan_warnings(document, scan, &facts);
+	return document;
+}
+
+/* ---- jobs ---- */
+
+static void add_timings(cJSON *document, const struct job_record *record)
+{
+	cJSON *timings = cJSON_AddObjectToObject(document, "timings");
+	double now = record->ended, queued = record->queued, started = record->started;
+
+	if (now == 0)
+		now = clock_realtime();
+	queued = queued == 0 ? now : queued;
+	started = started == 0 ? now : started;
+	/* A clock that was set back makes no negative times. */
+	json_add_seconds(timings, "waiting", fmax(0, queued - record->created));
+	json_add_seconds(timings, "queued", fmax(0, started - queued));
+	for (int i = 0; i < STAGE_COUNT; i++)
+		json_add_seconds(timings, stage_names[i], record->seconds[i]);
+	json_add_seconds(timings, "total", fmax(0, now - record->created));
+}
+
+static void add_memory(cJSON *document, const struct recon_memory *memory)
+{
+	cJSON *object;
+
+	if (memory->total == 0) {
+		cJSON_AddNullToObject(document, "memory");
+		return;
+	}
+	object = cJSON_AddObjectToObject(document, "memory");
+	cJSON_AddNumberToObject(object, "projections", (double)memory->projections);
+	cJSON_AddNumberToObject(object, "volumes", (double)memory->volumes);
+	cJSON_AddNumberToObject(object, "scratch", (double)memory->scratch);
+	cJSON_AddNumberToObject(object, "total", (double)memory->total);
+	cJSON_AddNumberToObject(object, "host", (double)memory->host);
+}
+
+/* What TV goes by; null without TV and before it is known. */
+static void add_denoising(cJSON *document, const struct job_record *record)
+{
+	cJSON *object;
+
+	if (isnan(record->noise_hu)) {
+		cJSON_AddNullToObject(document, "denoising");
+		return;
+	}
+	object = cJSON_AddObjectToObject(document, "denoising");
+	cJSON_AddNumberToObject(object, "noise_hu", record->noise_hu);
+	add_number_or_null(object, "alpha", record->tv_alpha > 0 ? record->tv_alpha : -1);
+}
+
+/* How many are there, and how many of them the reconstruction has; null when the scan has gone. */
+static void add_views(cJSON *document, const struct scan_facts *scan, const struct job_record *record)
+{
+	cJSON *views;
+	int all;
+
+	if (scan == NULL) {
+		cJSON_AddNullToObject(document, "views");
+		return;
+	}
+	all = scan->closed ? scan->received + scan->lost : scan->count;
+	views = cJSON_AddObjectToObject(document, "views");
+	cJSON_AddNumberToObject(views, "received", scan->received);
+	cJSON_AddNumberToObject(views, "reconstructed", record->state == JOB_SUCCEEDED ? all : record->taken);
+	cJSON_AddNumberToObject(views, "of", all);
+}
+
+/* What a job that has not begun waits for, by name; an empty list for any other. */
+static void add_waiting_for(cJSON *document, const struct scan_facts *scan, const struct job_record *record,
+			    enum job_obstacle obstacle)
+{
+	cJSON *list = cJSON_AddArrayToObject(document, "waiting_for");
+
+	if (record->state == JOB_WAITING && scan != NULL) {
+		if (lacks_flat(scan))
+			cJSON_AddItemToArray(list, cJSON_CreateString("flat"));
+		for (int i = 0; i < IMAGE_COUNT; i++) {
+			if (scan->lost_image[i])
+				cJSON_AddItemToArray(list, cJSON_CreateString(image_names[i]));
+		}
+		if (!scan->complete)
+			cJSON_AddItemToArray(list, cJSON_CreateString("projections"));
+		if (!scan->checked)
+			cJSON_AddItemToArray(list, cJSON_CreateString("check"));
+	}
+	if (obstacle != JOB_UNHINDERED)
+		cJSON_AddItemToArray(list, cJSON_CreateString(job_obstacle_names[obstacle]));
+	else if (record->state == JOB_QUEUED)
+		cJSON_AddItemToArray(list, cJSON_CreateString("worker"));
+}
+
+static void add_job_facts(cJSON *document, struct job *job, const struct job_record *record)
+{
+	bool works = record->state == JOB_RUNNING || record->attended;
+	struct scan_facts facts, *scan = NULL;
+	struct error err;
+	int position = job_queue_position(job);
+	char href[64];
+
+	if (store_scan_look(jobs_store(job_jobs(job)), record->scan, &facts, &err) == 0)
+		scan = &facts;
+	snprintf(href, sizeof(href), "/v1/jobs/%s", record->id);
+	cJSON_AddStringToObject(document, "id", record->id);
+	cJSON_AddStringToObject(document, "href", href);
+	cJSON_AddStringToObject(document, "state", job_state_names[record->state]);
+	add_text_or_null(document, "stage", works ? stage_names[record->stage] : "");
+	cJSON_AddNumberToObject(document, "iteration", record->iteration);
+	cJSON_AddNumberToObject(document, "iterations", record->iterations);
+	cJSON_AddNumberToObject(document, "progress", record->fraction);
+	add_waiting_for(document, scan, record, job_obstacle(job));
+	add_views(document, scan, record);
+	add_number_or_null(document, "eta_s", job_eta(job));
+	add_number_or_null(document, "queue_position", position > 0 ? position : -1);
+	add_text_or_null(document, "backend", record->backend);
+	add_text_or_null(document, "device", record->device);
+	add_text_or_null(document, "plan", record->plan);
+	add_memory(document, &record->memory);
+	add_denoising(document, record);
+	cJSON_AddNumberToObject(document, "attempts", record->attempts);
+	cJSON_AddBoolToObject(document, "cancel_requested", record->cancel_asked);
+	json_add_time(document, "created", record->created);
+	json_add_time(document, "queued", record->queued);
+	json_add_time(document, "started", record->started);
+	json_add_time(document, "ended", record->ended);
+	add_timings(document, record);
+	if (record->error_code != 0)
+		cJSON_AddItemToObject(document, "error",
+				      error_document(record->error_code, record->error_pointer, record->error_text));
+	else
+		cJSON_AddNullToObject(document, "error");
+}
+
+/* Where the world's axes point to in the patient; jobs from before there was such a member do not know. */
+static void add_axes(cJSON *document, const cJSON *patient_member)
+{
+	struct patient patient;
+	struct error ignored;
+
+	if (patient_read(patient_member, "/patient", &patient, &ignored) != 0)
+		patient = patient_unknown;
+	if (patient_member == NULL)
+		cJSON_AddNullToObject(document, "patient");
+	cJSON_AddItemToObject(document, "axes", patient_axes_json(&patient));
+}
+
+static void add_request(cJSON *document, const struct job_record *record)
+{
+	cJSON *request = cJSON_Parse(record->request), *member;
+
+	add_axes(document, cJSON_GetObjectItemCaseSensitive(request, "patient"));
+
+	while (request != NULL && (member = request->child) != NULL) {
+		cJSON_DetachItemViaPointer(request, member);
+		cJSON_AddItemToObject(document, member->string, member);
+	}
+	cJSON_Delete(request);
+}
+
+static int add_warnings(cJSON *document, struct store *store, const char *id, struct error *err)
+{
+	struct warning_record *warnings;
+	int count, code = store_job_warnings(store, id, &warnings, &count, err);
+	cJSON *list;
+
+	if (code != 0)
+		return code;
+	list = cJSON_AddArrayToObject(document, "warnings");
+	for (int i = 0; i < count; i++)
+		add_warning(list, warnings[i].code, warnings[i].detail);
+	free(warnings);
+	return 0;
+}
+
+static int add_history(cJSON *document, struct store *store, const char *id, struct error *err)
+{
+	struct history_row *rows;
+	int count, code = store_job_rows(store, id, &rows, &count, err);
+	cJSON *list;
+
+	if (code != 0)
+		return code;
+	list = cJSON_AddArrayToObject(document, "history");
+	for (int i = 0; i < count; i++)
+		cJSON_AddItemToArray(list, history_row_document(&rows[i]));
+	free(rows);
+	return 0;
+}
+
+static int add_volume_count(cJSON *document, struct store *store, const char *id, struct error *err)
+{
+	struct volume_record *volumes;
+	int count, code = store_job_volumes(store, id, &volumes, &count, err);
+
+	if (code != 0)
+		return code;
+	cJSON_AddNumberToObject(document, "volumes", count);
+	free(volumes);
+	return 0;
+}
+
+cJSON *job_document(struct job *job, bool brief)
+{
+	cJSON *document = cJSON_CreateObject();
+	struct job_record record;
+	struct error err;
+	int code = 0;
+
+	if (document == NULL)
+		return NULL;
+	job_record(job, &record);
+	add_job_facts(document, job, &record);
+	add_request(document, &record);
+	if (!brief) {
+		struct store *store = jobs_store(job_jobs(job));
+
+		code = add_volume_count(document, store, record.id, &err);
+		if (code == 0)
+			code = add_warnings(document, store, record.id, &err);
+		if (code == 0)
+			code = add_history(document, store, record.id, &err);
+	}
+	if (code != 0) {
+		log_line(LEVEL_ERROR, "job %s: %s", record.id, err.text);
+		cJSON_Delete(document);
+		return NULL;
+	}
+	return document;
+}
+
+/* ---- workers ---- */
+
+cJSON *worker_document(const struct worker_facts *facts)
+{
+	cJSON *document = cJSON_CreateObject(), *memory;
+
+	cJSON_AddNumberToObject(document, "index", facts->index);
+	cJSON_AddStringToObject(document, "state", worker_state_names[facts->state]);
+	add_text_or_null(document, "backend", facts->backend);
+	add_text_or_null(document, "device", facts->device);
+	cJSON_AddNumberToObject(document, "device_index", facts->device_index);
+	add_text_or_null(document, "driver", facts->driver);
+	memory = cJSON_AddObjectToObject(document, "memory");
+	cJSON_AddNumberToObject(memory, "total", (double)facts->bytes_total);
+	cJSON_AddNumberToObject(memory, "free", (double)facts->bytes_free);
+	add_text_or_null(document, "job", facts->job);
+	cJSON_AddNumberToObject(document, "restarts", facts->restarts);
+	add_text_or_null(document, "last_error", facts->last_error);
+	return document;
+}
+
+/* ---- what was set aside ---- */
+
+cJSON *quarantined_document(const struct quarantined *entry)
+{
+	cJSON *document = cJSON_CreateObject();
+
+	cJSON_AddStringToObject(document, "name", entry->name);
+	if (entry->from[0] == '\0') {
+		cJSON_AddNullToObject(document, "from");
+		cJSON_AddNullToObject(document, "why");
+	} else {
+		cJSON_AddStringToObject(document, "from", entry->from);
+		cJSON_AddStringToObject(document, "why", entry->why);
+	}
+	json_add_time(document, "moved", entry->time);
+	return document;
+}

@@ -1,0 +1,23 @@
+#ifndef CBCT_DAEMON_API_DOCUMENT_H
+#define CBCT_DAEMON_API_DOCUMENT_H
+
+#include <cjson/cJSON.h>
+
+#include "daemon/jobs/jobs.h"
+#include "daemon/store/store.h"
+
+/*
+ * What the API shows of scans, jobs, workers and quarantine. New values of the caller's (cJSON_Delete); NULL when
+ * memory ran out or the catalogue could not be read. Any thread.
+ */
+
+/* brief: for lists, without geometry, derived, received and missing. Memory only. */
+cJSON *scan_document(struct stored_scan *scan, bool brief);
+/* The job with its request; brief: without history and warnings. */
+cJSON *job_document(struct job *job, bool brief);
+/* index, state, backend, device, driver, memory, job, restarts. */
+cJSON *worker_document(const struct worker_facts *facts);
+/* name, from, why, moved. */
+cJSON *quarantined_document(const struct quarantined *entry);
+
+#endif
