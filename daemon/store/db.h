@@ -9,7 +9,7 @@
 #include "daemon/store/store.h"
 
 /*
- * Inside of the store, for store*.c only: connections, queries, transactions.
+ * Inside of the store, for this room only: connections, queries, transactions.
  *
  * Locks, in the order in which they may be taken: insertion_lock, writer.lock (held over a
  * commit; makes one transaction at a time) or reader.lock (held over a SELECT),
@@ -80,6 +80,19 @@ struct store {
 	_Atomic unsigned long long projections_stored, commits, commit_microseconds;
 };
 
+/* Opens or makes the catalogue, with its pages checked as they are read. */
+int connection_open(struct store *store, struct connection *connection, struct error *err);
+void connection_close(struct connection *connection);
+/* Fills err for a result of SQLite's, of this connection, and notes what follows for the store. */
+int connection_error(struct connection *connection, int result, const char *what, struct error *err);
+/* The result says that the catalogue's file is damaged. */
+bool connection_damaged(sqlite3 *db, int result);
+/* The disk can no longer be trusted with what is acknowledged: hooks.failed, once. */
+void store_fail(struct store *store, const char *what);
+
+/* Brings an older or empty catalogue to this version (schema.c). ERR_CONFLICT: a later cbctd made it. */
+int store_migrate(struct store *store, bool *ret_fresh, struct error *err);
+
 /* A statement on its way: the first failure sticks, and query_end returns it. The connection's lock is held. */
 struct query {
 	struct connection *connection;
@@ -134,7 +147,7 @@ int store_reconcile(struct store *store, bool fresh, struct error *err);
 /* What is in quarantine/ and belongs back, before the catalogue is made again. */
 int store_take_back(struct store *store, struct error *err);
 
-/* store/scan.c, store/job.c: what store_open loads and tidies up. */
+/* What store_open loads and tidies up: store/scan_load.c, store/job_sweep.c. */
 int store_load_scans(struct store *store, struct error *err);
 int store_sweep_scans(struct store *store, struct error *err);
 int store_sweep_jobs(struct store *store, struct error *err);

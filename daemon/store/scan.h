@@ -4,7 +4,7 @@
 #include "daemon/store/db.h"
 #include "proto/sums.h"
 
-/* Inside of the scans, for store/scan.c and store/sums.c only. */
+/* Inside of the scans, for store/scan*.c and store/sums*.c only. */
 enum progress { MISSING, CLAIMED, STORED };
 
 struct stored_scan {
@@ -55,6 +55,30 @@ struct stored_scan {
 	struct watch_list watchers;
 };
 
+/* The memory of a scan with one reference; NULL: none. */
+struct stored_scan *stored_scan_new(struct store *store, int count);
+struct stored_scan *stored_scan_free(struct stored_scan *scan); /* returns NULL; NULL is fine */
+/* Room in the array for one more, so that the insertion after a commit cannot fail; both with scans_lock held. */
+int scans_reserve(struct store *store, struct error *err);
+void scans_insert(struct store *store, struct stored_scan *scan);
+/* A reference, or NULL where there is no such scan. will_use: its parsed form is worth keeping. */
+struct stored_scan *scans_find(struct store *store, const char *id, bool will_use);
+
+bool stored_scan_deleted(struct stored_scan *scan);
+/* With the scan's lock held: every projection that it will ever have is there. */
+bool stored_scan_complete(const struct stored_scan *scan);
+/* The scan of those views alone that present[count] names; the caller's to free. */
+int stored_scan_read_measured(struct stored_scan *scan, const unsigned char *present, struct scan **ret_measured,
+			      struct error *err);
+
+size_t stored_scan_bytes(const struct stored_scan *scan); /* of one projection */
+size_t stored_image_bytes(const struct stored_scan *scan, enum image image);
+extern const char *const image_files[IMAGE_COUNT]; /* names in the scan's directory */
+
+/* With the scan's lock held: projection `index` is not on the disk any more, and lost. */
+void stored_scan_remove(struct stored_scan *scan, int index);
+/* A descriptor of projections.sums, for writing; *ret_whole: no record of it is damaged. */
+int stored_scan_open_records(const struct stored_scan *scan, bool *ret_whole, int *ret_file, struct error *err);
 /* With the scan's lock held: projection `index` is on the disk, with its row. */
 void stored_scan_add(struct stored_scan *scan, int index, const struct sum *sum);
 

@@ -20,17 +20,17 @@
 #include "daemon/store/scan.h"
 #include "proto/spool.h"
 
-static size_t projection_bytes(const struct stored_scan *scan)
+size_t stored_scan_bytes(const struct stored_scan *scan)
 {
 	return (size_t)scan->columns * (size_t)scan->rows * sample_bytes(scan->sample);
 }
 
-static int open_sums(const struct stored_scan *scan, bool *ret_whole, int *ret_file, struct error *err)
+int stored_scan_open_records(const struct stored_scan *scan, bool *ret_whole, int *ret_file, struct error *err)
 {
 	char directory[1024];
 
 	store_scan_directory(scan->store, scan->id, directory);
-	return sums_open(directory, true, scan->count, projection_bytes(scan), ret_file, ret_whole, err);
+	return sums_open(directory, true, scan->count, stored_scan_bytes(scan), ret_file, ret_whole, err);
 }
 
 /* ---- writing ---- */
@@ -39,7 +39,7 @@ int stored_scan_open_sums(struct stored_scan *scan, int *ret_descriptor, struct 
 {
 	bool whole;
 
-	return open_sums(scan, &whole, ret_descriptor, err);
+	return stored_scan_open_records(scan, &whole, ret_descriptor, err);
 }
 
 int stored_scan_put_sum(struct received_projection *projection, int sums, uint64_t turn, struct error *err)
@@ -65,7 +65,7 @@ int store_put_part_sum(const struct stored_scan *scan, int part, const void *byt
 
 	if (EVP_Digest(bytes, size, sum.sha256, NULL, EVP_sha256(), NULL) != 1)
 		return error_set(err, ERR_INTERNAL, "SHA-256 failed");
-	code = open_sums(scan, &whole, &file, err);
+	code = stored_scan_open_records(scan, &whole, &file, err);
 	if (code != 0)
 		return code;
 	code = put_part(file, part, &sum, err);
@@ -78,7 +78,7 @@ int store_put_part_sum(const struct stored_scan *scan, int part, const void *byt
 /* ---- what does not fit ---- */
 
 /* From the list of those that are stored; the scan's lock is held. */
-static void remove_received(struct stored_scan *scan, int index)
+void stored_scan_remove(struct stored_scan *scan, int index)
 {
 	int at = 0;
 
@@ -97,7 +97,7 @@ static void note_lost(const struct stored_scan *scan, int slot, struct sum sum)
 {
 	struct error err;
 	bool whole;
-	int file, code = open_sums(scan, &whole, &file, &err);
+	int file, code = stored_scan_open_records(scan, &whole, &file, &err);
 
 	sum.lost = true;
 	if (code == 0) {
@@ -118,13 +118,13 @@ void stored_scan_lose(struct stored_scan *scan, int index, const struct sum *see
 	pthread_mutex_lock(&scan->lock);
 	lost = scan->progress[index] == STORED && scan->sums[index].order == seen->order;
 	if (lost) {
-		remove_received(scan, index);
+		stored_scan_remove(scan, index);
 		scan->progress[index] = CLAIMED; /* until that is noted nobody writes another record */
 	}
 	pthread_mutex_unlock(&scan->lock);
 	if (!lost)
 		return;
-	sum.bytes = projection_bytes(scan);
+	sum.bytes = stored_scan_bytes(scan);
 	note_lost(scan, index, sum);
 	log_line(LEVEL_ERROR, "scan %s: projection %d is damaged on the disk: it is missing until it is sent again",
 		 scan->id, index);
@@ -132,22 +132,19 @@ void stored_scan_lose(struct stored_scan *scan, int index, const struct sum *see
 	watch_wake(&scan->store->arrivals);
 }
 
-const char *const image_names[IMAGE_COUNT] = {"flat", "dark", "defects"};
-static const char *const image_files[IMAGE_COUNT] = {"flat.f32", "dark.f32", "defects.u8"};
-
 void stored_scan_lose_behind(struct stored_scan *scan, unsigned long long size)
 {
-	const unsigned long long bytes = projection_bytes(scan);
+	const unsigned long long bytes = stored_scan_bytes(scan);
 	struct error err = {0};
 	bool whole;
-	int file = -1, count = 0, code = open_sums(scan, &whole, &file, &err);
+	int file = -1, count = 0, code = stored_scan_open_records(scan, &whole, &file, &err);
 
 	for (int i = (int)(size / bytes); i < scan->count; i++) {
 		struct sum sum = scan->sums[i];
 
 		if (scan->progress[i] != STORED)
 			continue;
-		remove_received(scan, i);
+		stored_scan_remove(scan, i);
 		scan->progress[i] = MISSING;
 		count++;
 		sum.bytes = bytes;
@@ -196,7 +193,7 @@ int store_forget_lost(struct stored_scan *scan, struct error *err)
 {
 	struct query query;
 	bool whole, lost;
-	int file, code = open_sums(scan, &whole, &file, err);
+	int file, code = stored_scan_open_records(scan, &whole, &file, err);
 
 	if (code != 0)
 		return code;
@@ -241,7 +238,7 @@ static void note_checked(struct stored_scan *scan, int index, const struct sum *
 	int file;
 
 	sum.crc = crc;
-	sum.bytes = projection_bytes(scan);
+	sum.bytes = stored_scan_bytes(scan);
 	pthread_mutex_lock(&scan->lock);
 	mine = scan->progress[index] == STORED && scan->sums[index].bytes == 0;
 	if (mine) {
@@ -250,7 +247,7 @@ static void note_checked(struct stored_scan *scan, int index, const struct sum *
 		scan->unchecked--;
 	}
 	pthread_mutex_unlock(&scan->lock);
-	if (!mine || open_sums(scan, &whole, &file, &err) != 0)
+	if (!mine || stored_scan_open_records(scan, &whole, &file, &err) != 0)
 		return;
 	/* Not synced: it would be made again. */
 	if (sums_put(file, index, &sum, &err) != 0)
@@ -268,7 +265,7 @@ static int lose(struct stored_scan *scan, int index, const struct sum *sum, stru
 int stored_scan_read(struct stored_scan *scan, int descriptor, int index, void *ret_samples, struct sum *ret_sum,
 		     struct error *err)
 {
-	size_t bytes = projection_bytes(scan);
+	size_t bytes = stored_scan_bytes(scan);
 	struct sum sum;
 	uint32_t crc;
 
@@ -307,7 +304,7 @@ static int sum_samples(int descriptor, size_t offset, size_t bytes, uint32_t *re
 
 int stored_scan_verify(struct stored_scan *scan, int descriptor, int index, struct sum *ret_sum, struct error *err)
 {
-	size_t bytes = projection_bytes(scan);
+	size_t bytes = stored_scan_bytes(scan);
 	struct stat status;
 	struct sum sum;
 	uint32_t crc;
@@ -345,7 +342,7 @@ static int get_part(const struct stored_scan *scan, enum sums_part part, struct 
 {
 	unsigned char state = SUM_NONE;
 	bool whole;
-	int file, code = open_sums(scan, &whole, &file, err);
+	int file, code = stored_scan_open_records(scan, &whole, &file, err);
 
 	if (code != 0)
 		return code;
@@ -441,7 +438,7 @@ static void check_document(struct stored_scan *scan)
 
 static void check_projections(struct stored_scan *scan)
 {
-	char *samples = malloc(projection_bytes(scan));
+	char *samples = malloc(stored_scan_bytes(scan));
 	struct error err;
 	struct sum sum;
 	int file;
@@ -566,230 +563,4 @@ void store_stop_checker(struct store *store)
 	pthread_cond_signal(&store->check_due);
 	pthread_mutex_unlock(&store->check_lock);
 	pthread_join(store->checker, NULL);
-}
-
-/* ---- at the start ---- */
-
-enum { PARTS = -SUMS_SCAN };
-
-/* What the file says: the parts, then the projections. */
-struct records {
-	struct sum parts[PARTS], *projections;
-	unsigned char part_states[PARTS], *states; /* enum sum_state */
-	bool whole;
-};
-
-static int read_records(const struct stored_scan *scan, struct records *ret, struct error *err)
-{
-	struct error why;
-	int file, code = open_sums(scan, &ret->whole, &file, &why);
-
-	ret->projections = calloc((size_t)scan->count, sizeof(*ret->projections));
-	ret->states = calloc((size_t)scan->count, 1);
-	if (ret->projections == NULL || ret->states == NULL) {
-		if (code == 0)
-			close(file);
-		return error_set_errno(err, ENOMEM, "checksums of %d projections", scan->count);
-	}
-	if (code == ERR_NOT_FOUND || code == ERR_INVALID)
-		return 0; /* none, or another scan's: as if all were blank */
-	if (code != 0) {
-		*err = why;
-		return code;
-	}
-	code = sums_get(file, SUMS_SCAN, PARTS, 0, ret->parts, ret->part_states, err);
-	if (code == 0)
-		code = sums_get(file, 0, scan->count, projection_bytes(scan), ret->projections, ret->states, err);
-	close(file);
-	return code;
-}
-
-/* Anew, from those that are good. */
-static int write_records(const struct stored_scan *scan, const struct records *records, struct error *err)
-{
-	char directory[1024];
-	bool whole;
-	int file, code;
-
-	store_scan_directory(scan->store, scan->id, directory);
-	code = sums_create(directory, scan->count, projection_bytes(scan), err);
-	if (code == 0)
-		code = open_sums(scan, &whole, &file, err);
-	if (code != 0)
-		return code;
-	for (int i = 0; i < PARTS && code == 0; i++) {
-		if (records->part_states[i] == SUM_GOOD)
-			code = sums_put(file, SUMS_SCAN + i, &records->parts[i], err);
-	}
-	for (int i = 0; i < scan->count && code == 0; i++) {
-		if (records->states[i] == SUM_GOOD)
-			code = sums_put(file, i, &records->projections[i], err);
-	}
-	if (code == 0 && fdatasync(file) != 0)
-		code = error_set_sync(err, errno, "sync checksums of scan %s", scan->id);
-	close(file);
-	return code;
-}
-
-static int put_row(struct store *store, const struct stored_scan *scan, int index, const struct sum *sum,
-		   struct error *err)
-{
-	struct query query;
-
-	query_begin(&query, &store->writer, "INSERT OR REPLACE INTO projections (scan, view, sha256) VALUES (?, ?, ?)",
-		    err);
-	query_integer(&query, scan->number);
-	query_integer(&query, index);
-	query_blob(&query, sum->sha256, sizeof(sum->sha256));
-	return query_run(&query);
-}
-
-static bool row_fits(const struct stored_scan *scan, int index, const struct sum *sum)
-{
-	return scan->progress[index] == STORED && memcmp(scan->sums[index].sha256, sum->sha256, 32) == 0;
-}
-
-/* Rows of projections whose record says more than the catalogue. */
-static int follow_projections(struct store *store, const struct stored_scan *scan, const struct records *records,
-			      struct error *err)
-{
-	int code = 0, count = 0;
-
-	for (int i = 0; i < scan->count; i++)
-		count += records->states[i] == SUM_GOOD && !row_fits(scan, i, &records->projections[i]);
-	if (count == 0)
-		return 0;
-	log_line(LEVEL_WARNING, "scan %s: %d projections that the catalogue does not know are found beside their data",
-		 scan->id, count);
-	code = store_begin(store, err);
-	if (code != 0)
-		return code;
-	for (int i = 0; i < scan->count && code == 0; i++) {
-		if (records->states[i] == SUM_GOOD && !row_fits(scan, i, &records->projections[i]))
-			code = put_row(store, scan, i, &records->projections[i], err);
-	}
-	return store_end(store, code, err);
-}
-
-/* A column of the scan's row: the SHA-256, or 1 without. */
-static int put_column(struct store *store, const struct stored_scan *scan, const char *statement, const struct sum *sum,
-		      struct error *err)
-{
-	struct query query;
-	int code = store_begin(store, err);
-
-	if (code != 0)
-		return code;
-	query_begin(&query, &store->writer, statement, err);
-	if (sum != NULL)
-		query_blob(&query, sum->sha256, 32);
-	else
-		query_integer(&query, 1);
-	query_integer(&query, scan->number);
-	return store_end(store, query_run(&query), err);
-}
-
-/* The same of the images and of the scan's end. */
-static int follow_parts(struct store *store, struct stored_scan *scan, const struct records *records, struct error *err)
-{
-	static const char *const statements[IMAGE_COUNT] = {"UPDATE scans SET flat = ? WHERE number = ?",
-							    "UPDATE scans SET dark = ? WHERE number = ?",
-							    "UPDATE scans SET defects = ? WHERE number = ?"};
-	int code = 0;
-
-	for (int i = 0; i < IMAGE_COUNT && code == 0; i++) {
-		const struct sum *sum = &records->parts[SUMS_FLAT + i - SUMS_SCAN];
-
-		if (records->part_states[SUMS_FLAT + i - SUMS_SCAN] != SUM_GOOD ||
-		    (scan->image[i] == STORED && memcmp(scan->image_sha256[i], sum->sha256, 32) == 0))
-			continue;
-		code = put_column(store, scan, statements[i], sum, err);
-		memcpy(scan->image_sha256[i], sum->sha256, 32);
-		scan->image[i] = STORED;
-	}
-	for (int i = 0; i < IMAGE_COUNT; i++) {
-		scan->image_lost[i] = records->part_states[SUMS_FLAT + i - SUMS_SCAN] == SUM_GOOD &&
-				      records->parts[SUMS_FLAT + i - SUMS_SCAN].lost;
-		if (scan->image_lost[i])
-			scan->image[i] = MISSING;
-	}
-	if (code != 0 || scan->closed || records->part_states[SUMS_CLOSED - SUMS_SCAN] != SUM_GOOD)
-		return code;
-	scan->closed = scan->closing = true;
-	return put_column(store, scan, "UPDATE scans SET closed = ? WHERE number = ?", NULL, err);
-}
-
-struct arrival {
-	uint64_t order;
-	int index;
-};
-
-static int compare_arrivals(const void *a, const void *b)
-{
-	const struct arrival *x = a, *y = b;
-
-	if (x->order != y->order)
-		return x->order < y->order ? -1 : 1;
-	return x->index - y->index;
-}
-
-/* As they came; those without a record first, by their numbers. */
-static int order_arrivals(struct stored_scan *scan, struct error *err)
-{
-	struct arrival *arrivals = calloc((size_t)scan->received + 1, sizeof(*arrivals));
-
-	if (arrivals == NULL)
-		return error_set_errno(err, ENOMEM, "list of %d projections", scan->received);
-	for (int i = 0; i < scan->received; i++)
-		arrivals[i] = (struct arrival){scan->sums[scan->order[i]].order, scan->order[i]};
-	qsort(arrivals, (size_t)scan->received, sizeof(*arrivals), compare_arrivals);
-	for (int i = 0; i < scan->received; i++) {
-		scan->order[i] = arrivals[i].index;
-		if (arrivals[i].order >= scan->order_floor)
-			scan->order_floor = arrivals[i].order + 1;
-	}
-	free(arrivals);
-	return 0;
-}
-
-static void show_projections(struct stored_scan *scan, const struct records *records)
-{
-	for (int i = 0; i < scan->count; i++) {
-		if (records->states[i] != SUM_GOOD)
-			continue;
-		if (scan->progress[i] == STORED) {
-			scan->sums[i] = records->projections[i];
-			scan->unchecked--;
-		} else {
-			stored_scan_add(scan, i, &records->projections[i]);
-		}
-		if (records->projections[i].lost) {
-			remove_received(scan, i);
-			scan->progress[i] = MISSING;
-		}
-	}
-	scan->suspect = scan->unchecked > 0 || records->part_states[0] != SUM_GOOD;
-	for (int i = 0; i < IMAGE_COUNT; i++)
-		scan->suspect |=
-		    scan->image[i] == STORED && records->part_states[SUMS_FLAT + i - SUMS_SCAN] != SUM_GOOD;
-}
-
-int store_load_sums(struct store *store, struct stored_scan *scan, struct error *err)
-{
-	struct records records = {.whole = false};
-	int code = read_records(scan, &records, err);
-
-	if (code == 0)
-		code = follow_projections(store, scan, &records, err);
-	if (code == 0)
-		code = follow_parts(store, scan, &records, err);
-	if (code == 0)
-		show_projections(scan, &records);
-	if (code == 0)
-		code = order_arrivals(scan, err);
-	if (code == 0 && !records.whole && !scan->gone)
-		code = write_records(scan, &records, err);
-	free(records.projections);
-	free(records.states);
-	return code;
 }

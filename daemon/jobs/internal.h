@@ -1,0 +1,69 @@
+#ifndef CBCT_DAEMON_JOBS_INTERNAL_H
+#define CBCT_DAEMON_JOBS_INTERNAL_H
+
+#include <pthread.h>
+
+#include <cjson/cJSON.h>
+
+#include "daemon/jobs/job.h"
+
+/* What job.c (the list of jobs and what the API does), state.c and work.c (what the supervisor does) share. */
+
+/* Why a job that could run is not given to a worker just now. In memory only: after a restart it is tried at once. */
+struct hold {
+	enum job_obstacle obstacle;
+	double until;             /* monotonic seconds */
+	unsigned long long space; /* bytes that must be free on the disk */
+	int times;                /* in a row, without a run between them that got further */
+};
+
+struct job {
+	/* Constant. */
+	struct jobs *jobs;
+	char id[ID_SIZE], scan[ID_SIZE];
+	bool fdk; /* it has FDK; known of waiting jobs */
+
+	int doubts; /* job_doubt, with the next; the supervisor's own */
+	unsigned doubted_at;
+
+	struct watch_list watchers;
+
+	/* Guarded by jobs->lock; all but the running job's progress is changed with jobs->change held too. */
+	struct job_record record;
+	struct queue_entry entry;
+	struct hold hold;
+	int references; /* one of them is the array's */
+	bool removed;
+	double stage_since;  /* monotonic seconds, while running; 0 before this process saw it run */
+	double run_since;    /* monotonic seconds */
+	double run_fraction; /* at run_since */
+	double row_at;       /* monotonic seconds of the last history row, or of the last moment before the first */
+	double row_seconds;  /* smoothed time from row to row, 0 before the first */
+};
+
+struct jobs {
+	struct store *store; /* constant */
+	struct watch_list watchers;
+	pthread_mutex_t change; /* one change at a time; held over its commit; guards next_ticket */
+	long long next_ticket;
+	pthread_mutex_t lock; /* guards what follows and each job's fields; held for copying only */
+	struct job **all;     /* [count], by id: oldest first */
+	int count, space;
+	struct queue queue;
+	struct jobs_statistics statistics; /* count[] is made on demand */
+};
+
+/* Wakes those who watch the job or all jobs; no lock is held. */
+void job_wake(struct job *job);
+
+/* As job_set_state, with jobs->change held; the caller wakes the watchers after it. */
+int job_change_state(struct job *job, enum job_state to, const struct job_change *change, struct error *err);
+/* The time since the last call belongs to the stage that ran. jobs->lock is held. */
+void job_account_stage(struct job *job);
+
+/* An event that carries the document, which is taken. A NULL document becomes an error, so that callers check once. */
+int job_event_make(struct event *ret_event, const char *kind, cJSON *document, struct error *err);
+/* state, iteration, attempts, error: the event of a change of state. NULL when memory ran out. */
+cJSON *job_state_document(const struct job_record *record);
+
+#endif

@@ -1,0 +1,264 @@
+/* The states of a job: which may follow which (job.h), and how one becomes the next. */
+#include "daemon/jobs/internal.h"
+
+#include <errno.h>
+#include <stdio.h>
+#include <stdlib.h>
+
+#include "daemon/files.h"
+#include "daemon/jobs/document.h"
+#include "daemon/log.h"
+#include "proto/clock.h"
+#include "proto/json.h"
+
+/* The one table of transitions: [from][to]. */
+static const bool transitions[JOB_STATE_COUNT][JOB_STATE_COUNT] = {
+    [JOB_WAITING] =
+	{[JOB_WAITING] = true, [JOB_QUEUED] = true, [JOB_RUNNING] = true, [JOB_FAILED] = true, [JOB_CANCELLED] = true},
+    [JOB_QUEUED] = {[JOB_WAITING] = true, [JOB_RUNNING] = true, [JOB_FAILED] = true, [JOB_CANCELLED] = true},
+    [JOB_RUNNING] = {[JOB_WAITING] = true,
+		     [JOB_QUEUED] = true,
+		     [JOB_SUCCEEDED] = true,
+		     [JOB_FAILED] = true,
+		     [JOB_CANCELLED] = true},
+};
+
+bool job_state_ended(enum job_state state)
+{
+	return state == JOB_SUCCEEDED || state == JOB_FAILED || state == JOB_CANCELLED;
+}
+
+bool job_state_may_follow(enum job_state from, enum job_state to)
+{
+	return transitions[from][to];
+}
+
+/* ---- events ---- */
+
+int job_event_make(struct event *ret_event, const char *kind, cJSON *document, struct error *err)
+{
+	char *data = document == NULL ? NULL : json_print(document, NULL);
+
+	cJSON_Delete(document);
+	if (data == NULL)
+		return error_set_errno(err, ENOMEM, "event \"%s\"", kind);
+	*ret_event = (struct event){.kind = kind, .data = data};
+	return 0;
+}
+
+cJSON *job_state_document(const struct job_record *record)
+{
+	cJSON *document = cJSON_CreateObject();
+
+	if (document == NULL)
+		return NULL;
+	cJSON_AddStringToObject(document, "state", job_state_names[record->state]);
+	cJSON_AddNumberToObject(document, "iteration", record->iteration);
+	cJSON_AddNumberToObject(document, "attempts", record->attempts);
+	if (record->error_code != 0)
+		cJSON_AddItemToObject(document, "error",
+				      error_document(record->error_code, record->error_pointer, record->error_text));
+	return document;
+}
+
+/* ---- changes of state ---- */
+
+void job_account_stage(struct job *job)
+{
+	double now = clock_monotonic();
+
+	if (job->record.state == JOB_RUNNING && job->stage_since > 0)
+		job->record.seconds[job->record.stage] += now - job->stage_since;
+	job->stage_since = now;
+}
+
+static void enter_queue(struct job_record *record, enum job_state from, const struct job_change *change,
+			struct jobs *jobs)
+{
+	if (record->ticket == 0) {
+		record->ticket = jobs->next_ticket++;
+		record->queued = clock_realtime();
+		return;
+	}
+	/* What its scan lost was sent again: no run of its was lost. */
+	record->attempts += !change->yielded && from != JOB_WAITING;
+	record->checkpoint = change->checkpoint;
+	record->iteration = change->checkpoint;
+	record->stage = STAGE_LOAD;
+	if (change->checkpoint == 0) {
+		record->fraction = 0;
+		record->taken = 0;
+	}
+}
+
+/* A worker was lost over it, or its scan has lost something: it waits, and what it had reconstructed is gone. */
+static void enter_waiting(struct job_record *record, enum job_state from)
+{
+	if (from == JOB_WAITING)
+		record->attempts = (record->attempts == 0 ? 1 : record->attempts) + 1;
+	record->checkpoint = 0;
+	record->iteration = 0;
+	record->stage = STAGE_LOAD;
+	record->fraction = 0;
+	record->taken = 0;
+}
+
+static void enter_running(struct job_record *record, enum job_state from, const struct job_change *change,
+			  struct jobs *jobs)
+{
+	if (record->attempts == 0)
+		record->attempts = 1;
+	if (record->ticket == 0) {
+		record->ticket = jobs->next_ticket++;
+		record->queued = clock_realtime();
+	}
+	if (record->started == 0)
+		record->started = clock_realtime();
+	/* A checkpoint of what is understood otherwise now is of no use. */
+	if (from == JOB_QUEUED && record->basis != change->basis) {
+		record->checkpoint = 0;
+		record->fraction = 0;
+	}
+	record->basis = change->basis;
+	record->iteration = record->checkpoint;
+	if (from != JOB_WAITING) {
+		record->stage = STAGE_LOAD;
+		record->taken = 0;
+	}
+	if (change->backend != NULL)
+		snprintf(record->backend, sizeof(record->backend), "%s", change->backend);
+	if (change->device != NULL)
+		snprintf(record->device, sizeof(record->device), "%s", change->device);
+}
+
+/* directory: of the store; what lies in it is named without it. */
+static void enter_end(struct job_record *record, const struct job_change *change, const char *directory)
+{
+	record->ended = clock_realtime();
+	record->checkpoint = 0;
+	if (record->state == JOB_SUCCEEDED)
+		record->fraction = 1;
+	if (record->state != JOB_FAILED)
+		return;
+	record->error_code = change->error_code != 0 ? change->error_code : ERR_INTERNAL;
+	snprintf(record->error_pointer, sizeof(record->error_pointer), "%s",
+		 change->error_pointer == NULL ? "" : change->error_pointer);
+	snprintf(record->error_text, sizeof(record->error_text), "%s",
+		 change->error_text == NULL ? "" : change->error_text);
+	path_hide(record->error_text, directory);
+}
+
+static int save_state(struct jobs *jobs, const struct job_record *record, enum job_past past, struct error *err)
+{
+	struct event event = {0}, end = {0};
+	bool ended = job_state_ended(record->state);
+	int code = job_event_make(&event, "state", job_state_document(record), err);
+
+	if (code == 0 && ended)
+		code = job_event_make(&end, "end", job_state_document(record), err);
+	if (code == 0)
+		code = store_job_update(jobs->store, record, &event, ended ? &end : NULL, past, err);
+	free(event.data);
+	free(end.data);
+	return code;
+}
+
+/* The record as it will be; jobs->change is held. */
+static void next_record(struct job *job, enum job_state to, const struct job_change *change, struct job_record *ret)
+{
+	enum job_state from;
+
+	pthread_mutex_lock(&job->jobs->lock);
+	job_account_stage(job);
+	*ret = job->record;
+	pthread_mutex_unlock(&job->jobs->lock);
+	from = ret->state;
+	ret->state = to;
+	ret->attended = false;
+	ret->crashes += change->crashed;
+	if (to == JOB_WAITING)
+		enter_waiting(ret, from);
+	else if (to == JOB_QUEUED)
+		enter_queue(ret, from, change, job->jobs);
+	else if (to == JOB_RUNNING)
+		enter_running(ret, from, change, job->jobs);
+	else
+		enter_end(ret, change, store_directory(job->jobs->store));
+}
+
+static void show_state(struct job *job, const struct job_record *record, const struct job_change *change)
+{
+	struct jobs *jobs = job->jobs;
+	enum job_state from;
+
+	pthread_mutex_lock(&jobs->lock);
+	from = job->record.state;
+	job->record = *record;
+	queue_remove(&jobs->queue, &job->entry);
+	if (record->state == JOB_QUEUED) {
+		job->entry.priority = record->priority;
+		job->entry.ticket = record->ticket;
+		queue_add(&jobs->queue, &job->entry);
+		jobs->statistics.yielded += change->yielded;
+	} else if (record->state == JOB_RUNNING) {
+		job->run_since = job->stage_since = job->row_at = clock_monotonic();
+		job->run_fraction = record->fraction;
+		job->row_seconds = 0;
+		jobs->statistics.started++;
+	}
+	jobs->statistics.crashed += change->crashed;
+	pthread_mutex_unlock(&jobs->lock);
+	log_line(record->state == JOB_FAILED ? LEVEL_WARNING : LEVEL_INFO, "job %s: %s -> %s%s%s%s%s", record->id,
+		 job_state_names[from], job_state_names[record->state], change->reason != NULL ? ", " : "",
+		 change->reason != NULL ? change->reason : "", record->state == JOB_FAILED ? ": " : "",
+		 record->state == JOB_FAILED && change->error_text != NULL ? change->error_text : "");
+}
+
+int job_change_state(struct job *job, enum job_state to, const struct job_change *change, struct error *err)
+{
+	static const struct job_change nothing;
+	struct job_record record;
+	bool removed;
+	enum job_state from;
+	enum job_past past = PAST_STAYS;
+	unsigned basis;
+	int code;
+
+	if (change == NULL)
+		change = &nothing;
+	pthread_mutex_lock(&job->jobs->lock);
+	from = job->record.state;
+	removed = job->removed;
+	basis = job->record.basis;
+	pthread_mutex_unlock(&job->jobs->lock);
+	if (removed || !job_state_may_follow(from, to))
+		return error_set(err, ERR_CONFLICT, "job %s is %s and cannot become %s", job->id,
+				 removed ? "removed" : job_state_names[from], job_state_names[to]);
+	next_record(job, to, change, &record);
+	if (from == JOB_RUNNING && to == JOB_QUEUED)
+		past = PAST_REWINDS;
+	else if ((from == JOB_WAITING && to == JOB_QUEUED) || (from != JOB_WAITING && to == JOB_WAITING) ||
+		 (from == JOB_QUEUED && to == JOB_RUNNING && basis != change->basis))
+		past = PAST_GOES;
+	code = save_state(job->jobs, &record, past, err);
+	if (code != 0)
+		return code;
+	show_state(job, &record, change);
+	if (past == PAST_GOES)
+		store_job_remove_volumes(job->jobs->store, record.id);
+	if (job_state_ended(to))
+		store_job_tidy(job->jobs->store, record.id);
+	return 0;
+}
+
+int job_set_state(struct job *job, enum job_state to, const struct job_change *change, struct error *err)
+{
+	int code;
+
+	pthread_mutex_lock(&job->jobs->change);
+	code = job_change_state(job, to, change, err);
+	pthread_mutex_unlock(&job->jobs->change);
+	if (code == 0)
+		job_wake(job);
+	return code;
+}

@@ -1,0 +1,382 @@
+/* What the supervisor does with jobs: job.h. */
+#include <assert.h>
+#include <stddef.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <unistd.h>
+
+#include "daemon/jobs/document.h"
+#include "daemon/jobs/internal.h"
+#include "daemon/log.h"
+#include "proto/clock.h"
+#include "proto/durable.h"
+#include "proto/json.h"
+
+const char *const job_obstacle_names[JOB_OBSTACLE_COUNT] = {"", "space", "disk"};
+
+static int promote(struct jobs *jobs, struct job *job, struct error *err)
+{
+	struct job_change change = {.reason = "its scan is ready"};
+	struct scan_facts facts;
+	struct error why;
+	int code = store_scan_look(jobs->store, job->scan, &facts, &why);
+
+	if (code != 0) {
+		change = (struct job_change){.error_code = code, .error_text = why.text};
+		return job_set_state(job, JOB_FAILED, &change, err);
+	}
+	if (facts.ready)
+		return job_set_state(job, JOB_QUEUED, &change, err);
+	return 0;
+}
+
+/* References to all that wait and are not attended, oldest first; free the array. NULL when there are none. */
+static struct job **list_waiting(struct jobs *jobs, int *ret_count)
+{
+	struct job **waiting = NULL;
+	int count = 0;
+
+	pthread_mutex_lock(&jobs->lock);
+	for (int i = 0; i < jobs->count; i++)
+		count += jobs->all[i]->record.state == JOB_WAITING;
+	if (count > 0)
+		waiting = calloc((size_t)count, sizeof(struct job *));
+	count = 0;
+	for (int i = 0; i < jobs->count && waiting != NULL; i++) {
+		const struct job_record *record = &jobs->all[i]->record;
+
+		if (record->state != JOB_WAITING || record->attended)
+			continue;
+		waiting[count++] = jobs->all[i];
+		jobs->all[i]->references++;
+	}
+	pthread_mutex_unlock(&jobs->lock);
+	*ret_count = count;
+	return waiting;
+}
+
+int jobs_promote(struct jobs *jobs, struct error *err)
+{
+	int count, code = 0, result;
+	struct job **waiting = list_waiting(jobs, &count);
+
+	for (int i = 0; i < count; i++) {
+		result = code == 0 ? promote(jobs, waiting[i], err) : 0;
+		/* Cancelled meanwhile: somebody else's business. */
+		if (result != ERR_CONFLICT && code == 0)
+			code = result;
+		job_release(waiting[i]);
+	}
+	free(waiting);
+	return code;
+}
+
+struct candidate {
+	struct job *job;
+	enum priority priority;
+	double arrived;
+	bool arriving;
+};
+
+static bool goes_first(const struct candidate *a, const struct candidate *b)
+{
+	if (a->arriving != b->arriving)
+		return a->arriving;
+	/* A pause may end: most likely that of the scan that has just had one. */
+	if (!a->arriving && a->arrived != b->arrived)
+		return a->arrived > b->arrived;
+	return a->priority > b->priority;
+}
+
+struct job *jobs_arriving(struct jobs *jobs, double since, bool *ret_arriving)
+{
+	struct candidate best = {.job = NULL};
+	int count;
+	struct job **waiting = list_waiting(jobs, &count);
+
+	for (int i = 0; i < count; i++) {
+		struct candidate one = {.job = waiting[i], .priority = waiting[i]->record.priority};
+		struct scan_facts facts;
+		struct error err;
+
+		if (job_obstacle(one.job) != JOB_UNHINDERED || !one.job->fdk ||
+		    store_scan_look(jobs->store, one.job->scan, &facts, &err) != 0 || !facts.convertible ||
+		    facts.complete || !facts.checked)
+			continue;
+		one.arrived = facts.arrived;
+		one.arriving = facts.arrived > since;
+		if (best.job == NULL || goes_first(&one, &best))
+			best = one;
+	}
+	for (int i = 0; i < count; i++) {
+		if (waiting[i] != best.job)
+			job_release(waiting[i]);
+	}
+	free(waiting);
+	*ret_arriving = best.arriving;
+	return best.job;
+}
+
+int job_attend(struct job *job, const char *backend, const char *device, struct error *err)
+{
+	struct job_record *record = &job->record;
+	int code = 0;
+
+	/* A DELETE looks under the same lock: it finds it waiting alone, or attended. */
+	pthread_mutex_lock(&job->jobs->change);
+	pthread_mutex_lock(&job->jobs->lock);
+	if (record->state != JOB_WAITING || record->cancel_asked) {
+		code = error_set(err, ERR_CONFLICT, "job %s does not wait any more", job->id);
+	} else {
+		record->attended = true;
+		record->stage = STAGE_FDK;
+		snprintf(record->backend, sizeof(record->backend), "%s", backend);
+		snprintf(record->device, sizeof(record->device), "%s", device);
+	}
+	pthread_mutex_unlock(&job->jobs->lock);
+	pthread_mutex_unlock(&job->jobs->change);
+	if (code == 0)
+		job_wake(job);
+	return code;
+}
+
+void job_leave(struct job *job)
+{
+	struct job_record *record = &job->record;
+
+	pthread_mutex_lock(&job->jobs->change);
+	pthread_mutex_lock(&job->jobs->lock);
+	record->attended = false;
+	if (record->state == JOB_WAITING) {
+		record->stage = STAGE_LOAD;
+		record->fraction = 0;
+		record->taken = 0;
+	}
+	pthread_mutex_unlock(&job->jobs->lock);
+	pthread_mutex_unlock(&job->jobs->change);
+	job_wake(job);
+}
+
+int job_doubt(struct job *job, unsigned losses)
+{
+	job->doubts = job->doubted_at == losses ? job->doubts + 1 : 1;
+	job->doubted_at = losses;
+	return job->doubts;
+}
+
+void job_taken(struct job *job, int count)
+{
+	pthread_mutex_lock(&job->jobs->lock);
+	job->record.taken = count;
+	pthread_mutex_unlock(&job->jobs->lock);
+}
+
+int job_hold(struct job *job, enum job_obstacle obstacle, double until, unsigned long long space)
+{
+	struct hold *hold = &job->hold;
+	int times;
+
+	pthread_mutex_lock(&job->jobs->lock);
+	times = hold->obstacle == obstacle ? hold->times + 1 : 1;
+	*hold = (struct hold){.obstacle = obstacle, .until = until, .space = space, .times = times};
+	job->entry.held = true;
+	pthread_mutex_unlock(&job->jobs->lock);
+	job_wake(job);
+	return times;
+}
+
+bool jobs_review_holds(struct jobs *jobs, double now, unsigned long long space)
+{
+	bool some = false;
+
+	pthread_mutex_lock(&jobs->lock);
+	for (int i = 0; i < jobs->count; i++) {
+		struct job *job = jobs->all[i];
+
+		if (!job->entry.held)
+			continue;
+		job->entry.held = now < job->hold.until || space < job->hold.space;
+		some |= job->entry.held;
+	}
+	pthread_mutex_unlock(&jobs->lock);
+	return some;
+}
+
+enum job_obstacle job_obstacle(struct job *job)
+{
+	enum job_obstacle obstacle;
+
+	pthread_mutex_lock(&job->jobs->lock);
+	obstacle = job->entry.held ? job->hold.obstacle : JOB_UNHINDERED;
+	pthread_mutex_unlock(&job->jobs->lock);
+	return obstacle;
+}
+
+struct job *jobs_next(struct jobs *jobs)
+{
+	struct queue_entry *entry;
+	struct job *job = NULL;
+
+	pthread_mutex_lock(&jobs->lock);
+	entry = queue_next(&jobs->queue);
+	if (entry != NULL) {
+		job = (struct job *)((char *)entry - offsetof(struct job, entry));
+		job->references++;
+	}
+	pthread_mutex_unlock(&jobs->lock);
+	return job;
+}
+
+int jobs_victim(struct jobs *jobs, const enum priority *arriving, const struct queue_running *running, int count,
+		int idle)
+{
+	int victim;
+
+	pthread_mutex_lock(&jobs->lock);
+	victim = queue_victim(&jobs->queue, arriving, running, count, idle);
+	pthread_mutex_unlock(&jobs->lock);
+	return victim;
+}
+
+void job_set_plan(struct job *job, const struct recon_memory *memory, const char *plan)
+{
+	pthread_mutex_lock(&job->jobs->lock);
+	job->record.memory = *memory;
+	snprintf(job->record.plan, sizeof(job->record.plan), "%s", plan);
+	pthread_mutex_unlock(&job->jobs->lock);
+}
+
+void job_set_denoising(struct job *job, double noise_hu, double alpha)
+{
+	pthread_mutex_lock(&job->jobs->lock);
+	job->record.noise_hu = noise_hu;
+	job->record.tv_alpha = alpha;
+	pthread_mutex_unlock(&job->jobs->lock);
+}
+
+void job_progress(struct job *job, enum stage stage, int iteration, double fraction)
+{
+	pthread_mutex_lock(&job->jobs->lock);
+	job_account_stage(job);
+	job->record.stage = stage;
+	job->record.iteration = iteration;
+	/* Only forward, and no surprise from a worker's arithmetic. */
+	if (fraction > job->record.fraction)
+		job->record.fraction = fraction > 1 ? 1 : fraction;
+	pthread_mutex_unlock(&job->jobs->lock);
+}
+
+static void note_rows(struct job *job, int count, int iteration)
+{
+	double now = clock_monotonic(), seconds;
+
+	pthread_mutex_lock(&job->jobs->lock);
+	seconds = (now - job->row_at) / count;
+	/* The first row's time holds the loading too, the later ones count more. */
+	job->row_seconds = job->row_seconds == 0 ? seconds : 0.5 * (job->row_seconds + seconds);
+	job->row_at = now;
+	job->record.iteration = iteration;
+	pthread_mutex_unlock(&job->jobs->lock);
+}
+
+int job_add_rows(struct job *job, const struct history_row *rows, int count, struct error *err)
+{
+	struct event events[JOB_ROWS_MAX] = {0};
+	char once[JOB_ROWS_MAX][32];
+	int code = 0;
+
+	assert(count > 0 && count <= JOB_ROWS_MAX);
+	for (int i = 0; i < count && code == 0; i++) {
+		code = job_event_make(&events[i], "progress", history_row_document(&rows[i]), err);
+		/* A run that was lost is repeated, what was told of it is not. */
+		snprintf(once[i], sizeof(once[i]), "row %d", rows[i].iteration);
+		events[i].once = once[i];
+	}
+	if (code == 0)
+		code = store_job_add_rows(job->jobs->store, job->id, rows, events, count, err);
+	for (int i = 0; i < count; i++)
+		free(events[i].data);
+	if (code != 0)
+		return code;
+	note_rows(job, count, rows[count - 1].iteration);
+	job_wake(job);
+	return 0;
+}
+
+int job_add_volume(struct job *job, const struct volume_record *volume, struct error *err)
+{
+	struct event event;
+	char once[48];
+	int code = job_event_make(&event, "volume", volume_document(job->id, volume), err);
+
+	if (code != 0)
+		return code;
+	snprintf(once, sizeof(once), "volume %s", volume->name);
+	event.once = once;
+	code = store_job_add_volume(job->jobs->store, job->id, volume, &event, err);
+	free(event.data);
+	if (code == 0)
+		job_wake(job);
+	return code;
+}
+
+int job_digest_volume(struct job *job, const struct volume_record *volume, struct error *err)
+{
+	int code = store_job_digest_volume(job->jobs->store, job->id, volume, err);
+
+	if (code == 0)
+		job_wake(job);
+	return code;
+}
+
+static int settle_one(struct job *job, const char *name, struct error *err)
+{
+	struct store *store = job->jobs->store;
+	struct error why;
+	char path[1024];
+	int code;
+
+	store_volume_path(store, job->id, name, path);
+	if (durable_settle_named(path, &why) == 0)
+		return 0;
+	log_line(LEVEL_ERROR, "job %s: its volume %s is lost: %s", job->id, name, why.text);
+	code = store_job_remove_volume(store, job->id, name, err);
+	if (code == 0)
+		unlink(path);
+	return code;
+}
+
+int job_settle(struct job *job, struct error *err)
+{
+	struct volume_record *volumes;
+	int count, code = store_job_volumes(job->jobs->store, job->id, &volumes, &count, err);
+
+	if (code != 0)
+		return code;
+	for (int i = 0; i < count && code == 0; i++) {
+		if (!volumes[i].hashed)
+			code = settle_one(job, volumes[i].name, err);
+	}
+	free(volumes);
+	return code;
+}
+
+int job_add_warning(struct job *job, const char *code_name, const char *detail, struct error *err)
+{
+	struct warning_record warning;
+	struct event event;
+	bool new;
+	int code;
+
+	snprintf(warning.code, sizeof(warning.code), "%s", code_name);
+	snprintf(warning.detail, sizeof(warning.detail), "%s", detail);
+	code = job_event_make(&event, "warning", json_warning(warning.code, warning.detail), err);
+	if (code != 0)
+		return code;
+	code = store_job_add_warning(job->jobs->store, job->id, &warning, &event, &new, err);
+	free(event.data);
+	if (code == 0 && new)
+		job_wake(job);
+	return code;
+}

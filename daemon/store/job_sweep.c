@@ -1,0 +1,181 @@
+/* Jobs at the start: what their rows and their directories say of each other. */
+#include <errno.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include "daemon/files.h"
+#include "daemon/log.h"
+#include "daemon/store/db.h"
+#include "daemon/store/quarantine.h"
+#include "proto/spool.h"
+
+/* Of jobs that are gone, too: a client may have seen them. */
+int store_load_last_event(struct store *store, struct error *err)
+{
+	struct query query;
+
+	query_begin(&query, &store->reader, "SELECT seq FROM sqlite_sequence WHERE name = 'events'", err);
+	if (query_row(&query))
+		atomic_store(&store->last_event, sqlite3_column_int64(query.statement, 0));
+	return query_end(&query);
+}
+
+/*
+ * Volumes that were told of and may not be whole on the disk: their job was not
+ * through with them. A checkpoint may be of a later iteration than the catalogue
+ * knows: a run that went on from there would not make them again.
+ */
+static int remove_unsettled(struct store *store, const char *id, struct volume_record *volumes, int *count,
+			    struct error *err)
+{
+	int kept = 0, code = 0;
+	char path[1024];
+
+	for (int i = 0; i < *count && code == 0; i++) {
+		if (volumes[i].hashed) {
+			volumes[kept++] = volumes[i];
+			continue;
+		}
+		log_line(LEVEL_INFO, "job %s: its volume %s had not reached the disk, it is made again", id,
+			 volumes[i].name);
+		code = store_job_remove_volume(store, id, volumes[i].name, err);
+		store_volume_path(store, id, volumes[i].name, path);
+		if (code == 0)
+			unlink(path);
+	}
+	if (code == 0 && kept < *count)
+		store_job_remove_checkpoint(store, id);
+	*count = kept;
+	return code;
+}
+
+struct sweep {
+	struct store *store;
+	const char *id;
+	struct volume_record *volumes;
+	int count;
+	bool ended; /* else it makes the volumes that have no row again */
+};
+
+static bool has_row(const struct sweep *sweep, const char *name, size_t length)
+{
+	for (int i = 0; i < sweep->count; i++) {
+		if (strlen(sweep->volumes[i].name) == length && strncmp(sweep->volumes[i].name, name, length) == 0)
+			return true;
+	}
+	return false;
+}
+
+/* Half-written files go. A volume that no row tells of is set aside, unless the job makes it again over it. */
+static int sweep_file(void *context, const char *name, struct error *err)
+{
+	const struct sweep *sweep = context;
+	const char *extension = strrchr(name, '.');
+	char directory[1024], path[1400];
+
+	if (!name_is_temporary(name)) {
+		if (extension == NULL || strcmp(extension, ".nii") != 0 || !sweep->ended ||
+		    has_row(sweep, name, (size_t)(extension - name)))
+			return 0;
+		snprintf(path, sizeof(path), "jobs/%s/%s", sweep->id, name);
+		return quarantine_move(sweep->store->directory, path, "the catalogue does not know this volume", err);
+	}
+	store_job_directory(sweep->store, sweep->id, directory);
+	snprintf(path, sizeof(path), "%s/%s", directory, name);
+	if (unlink(path) < 0)
+		return error_set_errno(err, errno, "unlink %s", path);
+	return 0;
+}
+
+/* A volume that is gone is a warning of its job; one that cannot be written now is told to who asks for the volume. */
+static void tell_gone(const struct sweep *sweep, const struct volume_record *volume)
+{
+	struct warning_record warning = {.code = "damaged_volume"};
+	struct event event = {.kind = "warning"};
+	cJSON *document;
+	struct error err;
+	bool new;
+
+	store_volume_gone(volume, &err);
+	log_line(LEVEL_ERROR, "job %s: %s", sweep->id, err.text);
+	snprintf(warning.detail, sizeof(warning.detail), "%s", err.text);
+	document = json_warning(warning.code, warning.detail);
+	event.data = json_print(document, NULL);
+	cJSON_Delete(document);
+	if (event.data == NULL)
+		return;
+	if (store_job_add_warning(sweep->store, sweep->id, &warning, &event, &new, &err) != 0)
+		log_line(LEVEL_WARNING, "job %s: a warning cannot be written: %s", sweep->id, err.text);
+	free(event.data);
+}
+
+static void check_volumes(const struct sweep *sweep)
+{
+	char path[1024];
+
+	for (int i = 0; i < sweep->count; i++) {
+		store_volume_path(sweep->store, sweep->id, sweep->volumes[i].name, path);
+		if (access(path, F_OK) != 0 && errno == ENOENT)
+			tell_gone(sweep, &sweep->volumes[i]);
+	}
+}
+
+/* False where there is no such job; *ret_at_work: it is, or was, with a worker. */
+static int job_is_known(struct store *store, const char *id, bool *ret_known, bool *ret_at_work, bool *ret_ended,
+			struct error *err)
+{
+	struct query query;
+
+	query_begin(&query, &store->reader,
+		    "SELECT state IN ('waiting', 'running'), state IN ('succeeded', 'failed', 'cancelled')"
+		    " FROM jobs WHERE id = ?",
+		    err);
+	query_text(&query, id);
+	*ret_known = query_row(&query);
+	*ret_at_work = *ret_known && sqlite3_column_int(query.statement, 0) != 0;
+	*ret_ended = *ret_known && sqlite3_column_int(query.statement, 1) != 0;
+	return query_end(&query);
+}
+
+static int sweep_directory(void *context, const char *name, struct error *err)
+{
+	struct sweep sweep = {.store = context, .id = name};
+	char path[1024];
+	bool known = false, at_work = false;
+	int code;
+
+	if (!id_valid(name))
+		return 0; /* not ours */
+	store_job_directory(sweep.store, name, path);
+	code = job_is_known(sweep.store, name, &known, &at_work, &sweep.ended, err);
+	if (code != 0 || !known)
+		return code;
+	code = store_job_volumes(sweep.store, name, &sweep.volumes, &sweep.count, err);
+	if (code != 0)
+		return code;
+	if (at_work)
+		code = remove_unsettled(sweep.store, name, sweep.volumes, &sweep.count, err);
+	if (code == 0) {
+		check_volumes(&sweep);
+		code = directory_visit(path, sweep_file, &sweep, err);
+	}
+	free(sweep.volumes);
+	return code;
+}
+
+int store_sweep_jobs(struct store *store, struct error *err)
+{
+	char path[1024];
+	int code;
+
+	/* One transaction for all that is read: each job's rows are read before they are changed. */
+	if (sqlite3_exec(store->reader.db, "BEGIN", NULL, NULL, NULL) != SQLITE_OK)
+		return error_set(err, ERR_IO, "catalogue: %s", sqlite3_errmsg(store->reader.db));
+	snprintf(path, sizeof(path), "%s/jobs", store->directory);
+	code = directory_visit(path, sweep_directory, store, err);
+	sqlite3_exec(store->reader.db, "COMMIT", NULL, NULL, NULL);
+	return code;
+}

@@ -1,0 +1,220 @@
+/* Projections and images on their way in: store.h. */
+#include <assert.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <openssl/evp.h>
+#include <stdio.h>
+#include <string.h>
+#include <unistd.h>
+
+#include "daemon/files.h"
+#include "daemon/store/record.h"
+#include "daemon/store/scan.h"
+#include "proto/clock.h"
+#include "proto/spool.h"
+
+const char *const image_names[IMAGE_COUNT] = {"flat", "dark", "defects"};
+const char *const image_files[IMAGE_COUNT] = {"flat.f32", "dark.f32", "defects.u8"};
+static const enum sums_part image_parts[IMAGE_COUNT] = {SUMS_FLAT, SUMS_DARK, SUMS_DEFECTS};
+
+int stored_scan_claim(struct stored_scan *scan, int index, enum claim *ret_claim, struct error *err)
+{
+	int code = 0;
+
+	if (index < 0 || index >= scan->count)
+		return error_set(err, ERR_NOT_FOUND, "projection %d of a scan that has 0 .. %d", index,
+				 scan->count - 1);
+	pthread_mutex_lock(&scan->lock);
+	if (scan->deleted) {
+		code = error_set(err, ERR_NOT_FOUND, "scan %s was deleted meanwhile", scan->id);
+	} else if (scan->progress[index] == MISSING && scan->closing && !scan->lost[index]) {
+		code = error_set(err, ERR_CONFLICT, "the scan was completed without projection %d", index);
+	} else if (scan->progress[index] == MISSING) {
+		scan->progress[index] = CLAIMED;
+		*ret_claim = CLAIM_GRANTED;
+	} else {
+		*ret_claim = scan->progress[index] == STORED ? CLAIM_STORED : CLAIM_BUSY;
+	}
+	pthread_mutex_unlock(&scan->lock);
+	return code;
+}
+
+void stored_scan_unclaim(struct stored_scan *scan, int index)
+{
+	pthread_mutex_lock(&scan->lock);
+	assert(scan->progress[index] == CLAIMED);
+	scan->progress[index] = MISSING;
+	pthread_mutex_unlock(&scan->lock);
+	watch_wake(&scan->watchers);
+}
+
+int stored_scan_open(struct stored_scan *scan, bool writing, int *ret_descriptor, struct error *err)
+{
+	char directory[1024], path[1100];
+	int file;
+
+	store_scan_directory(scan->store, scan->id, directory);
+	snprintf(path, sizeof(path), "%s/projections.raw", directory);
+	file = open(path, (writing ? O_RDWR : O_RDONLY) | O_CLOEXEC);
+	if (file < 0 && stored_scan_deleted(scan))
+		return error_set(err, ERR_NOT_FOUND, "there is no scan \"%s\" any more", scan->id);
+	if (file < 0)
+		return error_set_errno(err, errno, "open %s", path);
+	*ret_descriptor = file;
+	return 0;
+}
+
+static int insert_projections(struct store *store, struct received_projection *batch, int count, struct error *err)
+{
+	struct query query;
+	int code = 0;
+
+	for (int i = 0; i < count && code == 0; i++) {
+		/* Cannot change: writer.lock is held. */
+		batch[i].stored =
+		    !batch[i].scan->deleted && (!batch[i].scan->closing || batch[i].scan->lost[batch[i].index]);
+		if (!batch[i].stored)
+			continue;
+		query_begin(&query, &store->writer,
+			    "INSERT OR REPLACE INTO projections (scan, view, sha256) VALUES (?, ?, ?)", err);
+		query_integer(&query, batch[i].scan->number);
+		query_integer(&query, batch[i].index);
+		query_blob(&query, batch[i].sum.sha256, sizeof(batch[i].sum.sha256));
+		code = query_run(&query);
+	}
+	return code;
+}
+
+/* Shows in memory what is on the disk now. */
+static void show_projection(const struct received_projection *projection, double now)
+{
+	struct stored_scan *scan = projection->scan;
+
+	pthread_mutex_lock(&scan->lock);
+	assert(scan->progress[projection->index] == CLAIMED);
+	scan->progress[projection->index] = MISSING;
+	if (projection->stored) {
+		stored_scan_add(scan, projection->index, &projection->sum);
+		scan->arrived = now;
+	}
+	pthread_mutex_unlock(&scan->lock);
+}
+
+int store_put_projections(struct store *store, struct received_projection *batch, int count, struct error *err)
+{
+	unsigned stored = 0;
+	double now;
+	int code = store_begin_unsynced(store, err);
+
+	if (code == 0)
+		code = store_end(store, insert_projections(store, batch, count, err), err);
+	if (code != 0)
+		return code;
+	now = clock_monotonic();
+	for (int i = 0; i < count; i++) {
+		show_projection(&batch[i], now);
+		stored += batch[i].stored;
+		if (i + 1 == count || batch[i + 1].scan != batch[i].scan)
+			watch_wake(&batch[i].scan->watchers);
+	}
+	atomic_fetch_add(&store->projections_stored, stored);
+	if (stored > 0)
+		watch_wake(&store->arrivals);
+	return 0;
+}
+
+/* ---- flat, dark, defects ---- */
+
+size_t stored_image_bytes(const struct stored_scan *scan, enum image image)
+{
+	return (size_t)scan->columns * (size_t)scan->rows * (image == IMAGE_DEFECTS ? 1 : sizeof(float));
+}
+
+/* Nobody else may write this image until claim_image's caller has set its progress again. */
+static int claim_image(struct stored_scan *scan, enum image image, const uint8_t sha256[32], bool *ret_there,
+		       struct error *err)
+{
+	static const char *const names[IMAGE_COUNT] = {"flat image", "dark image", "defect map"};
+	int code = 0;
+
+	*ret_there = false;
+	pthread_mutex_lock(&scan->lock);
+	if (scan->deleted)
+		code = error_set(err, ERR_NOT_FOUND, "scan %s was deleted meanwhile", scan->id);
+	else if (scan->image[image] == CLAIMED)
+		code = error_set(err, ERR_BUSY, "another request is writing this image");
+	else if (scan->image[image] == MISSING)
+		scan->image[image] = CLAIMED;
+	else if (memcmp(scan->image_sha256[image], sha256, 32) == 0)
+		*ret_there = true;
+	else
+		code = error_set(err, ERR_CONFLICT, "the scan has another %s already", names[image]);
+	pthread_mutex_unlock(&scan->lock);
+	return code;
+}
+
+static int write_image(struct store *store, struct stored_scan *scan, enum image image, const void *pixels,
+		       const uint8_t sha256[32], struct error *err)
+{
+	static const char *const statements[IMAGE_COUNT] = {"UPDATE scans SET flat = ? WHERE number = ?",
+							    "UPDATE scans SET dark = ? WHERE number = ?",
+							    "UPDATE scans SET defects = ? WHERE number = ?"};
+	char directory[1024], path[1100];
+	struct query query;
+	int code;
+
+	store_scan_directory(store, scan->id, directory);
+	snprintf(path, sizeof(path), "%s/%s", directory, image_files[image]);
+	code = file_write_durable(path, pixels, stored_image_bytes(scan, image), err);
+	if (code != 0)
+		store_distrust(store, err);
+	if (code == 0)
+		code = store_put_part_sum(scan, image_parts[image], pixels, stored_image_bytes(scan, image), err);
+	if (code == 0)
+		code = store_begin(store, err);
+	if (code != 0)
+		return code;
+	query_begin(&query, &store->writer, statements[image], err);
+	query_blob(&query, sha256, 32);
+	query_integer(&query, scan->number);
+	return store_end(store, query_run(&query), err);
+}
+
+int store_put_image(struct store *store, struct stored_scan *scan, enum image image, const void *pixels, bool *ret_new,
+		    struct error *err)
+{
+	uint8_t sha256[32];
+	bool there;
+	int code;
+
+	if (EVP_Digest(pixels, stored_image_bytes(scan, image), sha256, NULL, EVP_sha256(), NULL) != 1)
+		return error_set(err, ERR_INTERNAL, "SHA-256 failed");
+	code = claim_image(scan, image, sha256, &there, err);
+	if (code != 0)
+		return code;
+	if (there && store_check_image(scan, image, err) == 0) {
+		*ret_new = false;
+		return 0;
+	}
+	if (there) { /* not any more */
+		code = claim_image(scan, image, sha256, &there, err);
+		if (code == 0 && there)
+			code = error_set(err, ERR_BUSY, "another request is writing this image");
+		if (code != 0)
+			return code;
+	}
+	code = write_image(store, scan, image, pixels, sha256, err);
+	pthread_mutex_lock(&scan->lock);
+	scan->image[image] = code == 0 ? STORED : MISSING;
+	if (code == 0) {
+		scan->image_lost[image] = false;
+		memcpy(scan->image_sha256[image], sha256, 32);
+	}
+	pthread_mutex_unlock(&scan->lock);
+	watch_wake(&scan->watchers);
+	if (code == 0)
+		watch_wake(&store->arrivals);
+	if (code == 0)
+		*ret_new = true;
+	return code;
+}

@@ -1,0 +1,234 @@
+/* At the start: the rows of projections follow the records beside the samples (projections.sums, store/sums.c). */
+#include <errno.h>
+#include <fcntl.h>
+#include <stdlib.h>
+#include <string.h>
+#include <unistd.h>
+
+#include "daemon/log.h"
+#include "daemon/store/scan.h"
+#include "proto/spool.h"
+
+enum { PARTS = -SUMS_SCAN };
+
+/* What the file says: the parts, then the projections. */
+struct records {
+	struct sum parts[PARTS], *projections;
+	unsigned char part_states[PARTS], *states; /* enum sum_state */
+	bool whole;
+};
+
+static int read_records(const struct stored_scan *scan, struct records *ret, struct error *err)
+{
+	struct error why;
+	int file, code = stored_scan_open_records(scan, &ret->whole, &file, &why);
+
+	ret->projections = calloc((size_t)scan->count, sizeof(*ret->projections));
+	ret->states = calloc((size_t)scan->count, 1);
+	if (ret->projections == NULL || ret->states == NULL) {
+		if (code == 0)
+			close(file);
+		return error_set_errno(err, ENOMEM, "checksums of %d projections", scan->count);
+	}
+	if (code == ERR_NOT_FOUND || code == ERR_INVALID)
+		return 0; /* none, or another scan's: as if all were blank */
+	if (code != 0) {
+		*err = why;
+		return code;
+	}
+	code = sums_get(file, SUMS_SCAN, PARTS, 0, ret->parts, ret->part_states, err);
+	if (code == 0)
+		code = sums_get(file, 0, scan->count, stored_scan_bytes(scan), ret->projections, ret->states, err);
+	close(file);
+	return code;
+}
+
+/* Anew, from those that are good. */
+static int write_records(const struct stored_scan *scan, const struct records *records, struct error *err)
+{
+	char directory[1024];
+	bool whole;
+	int file, code;
+
+	store_scan_directory(scan->store, scan->id, directory);
+	code = sums_create(directory, scan->count, stored_scan_bytes(scan), err);
+	if (code == 0)
+		code = stored_scan_open_records(scan, &whole, &file, err);
+	if (code != 0)
+		return code;
+	for (int i = 0; i < PARTS && code == 0; i++) {
+		if (records->part_states[i] == SUM_GOOD)
+			code = sums_put(file, SUMS_SCAN + i, &records->parts[i], err);
+	}
+	for (int i = 0; i < scan->count && code == 0; i++) {
+		if (records->states[i] == SUM_GOOD)
+			code = sums_put(file, i, &records->projections[i], err);
+	}
+	if (code == 0 && fdatasync(file) != 0)
+		code = error_set_sync(err, errno, "sync checksums of scan %s", scan->id);
+	close(file);
+	return code;
+}
+
+static int put_row(struct store *store, const struct stored_scan *scan, int index, const struct sum *sum,
+		   struct error *err)
+{
+	struct query query;
+
+	query_begin(&query, &store->writer, "INSERT OR REPLACE INTO projections (scan, view, sha256) VALUES (?, ?, ?)",
+		    err);
+	query_integer(&query, scan->number);
+	query_integer(&query, index);
+	query_blob(&query, sum->sha256, sizeof(sum->sha256));
+	return query_run(&query);
+}
+
+static bool row_fits(const struct stored_scan *scan, int index, const struct sum *sum)
+{
+	return scan->progress[index] == STORED && memcmp(scan->sums[index].sha256, sum->sha256, 32) == 0;
+}
+
+/* Rows of projections whose record says more than the catalogue. */
+static int follow_projections(struct store *store, const struct stored_scan *scan, const struct records *records,
+			      struct error *err)
+{
+	int code = 0, count = 0;
+
+	for (int i = 0; i < scan->count; i++)
+		count += records->states[i] == SUM_GOOD && !row_fits(scan, i, &records->projections[i]);
+	if (count == 0)
+		return 0;
+	log_line(LEVEL_WARNING, "scan %s: %d projections that the catalogue does not know are found beside their data",
+		 scan->id, count);
+	code = store_begin(store, err);
+	if (code != 0)
+		return code;
+	for (int i = 0; i < scan->count && code == 0; i++) {
+		if (records->states[i] == SUM_GOOD && !row_fits(scan, i, &records->projections[i]))
+			code = put_row(store, scan, i, &records->projections[i], err);
+	}
+	return store_end(store, code, err);
+}
+
+/* A column of the scan's row: the SHA-256, or 1 without. */
+static int put_column(struct store *store, const struct stored_scan *scan, const char *statement, const struct sum *sum,
+		      struct error *err)
+{
+	struct query query;
+	int code = store_begin(store, err);
+
+	if (code != 0)
+		return code;
+	query_begin(&query, &store->writer, statement, err);
+	if (sum != NULL)
+		query_blob(&query, sum->sha256, 32);
+	else
+		query_integer(&query, 1);
+	query_integer(&query, scan->number);
+	return store_end(store, query_run(&query), err);
+}
+
+/* The same of the images and of the scan's end. */
+static int follow_parts(struct store *store, struct stored_scan *scan, const struct records *records, struct error *err)
+{
+	static const char *const statements[IMAGE_COUNT] = {"UPDATE scans SET flat = ? WHERE number = ?",
+							    "UPDATE scans SET dark = ? WHERE number = ?",
+							    "UPDATE scans SET defects = ? WHERE number = ?"};
+	int code = 0;
+
+	for (int i = 0; i < IMAGE_COUNT && code == 0; i++) {
+		const struct sum *sum = &records->parts[SUMS_FLAT + i - SUMS_SCAN];
+
+		if (records->part_states[SUMS_FLAT + i - SUMS_SCAN] != SUM_GOOD ||
+		    (scan->image[i] == STORED && memcmp(scan->image_sha256[i], sum->sha256, 32) == 0))
+			continue;
+		code = put_column(store, scan, statements[i], sum, err);
+		memcpy(scan->image_sha256[i], sum->sha256, 32);
+		scan->image[i] = STORED;
+	}
+	for (int i = 0; i < IMAGE_COUNT; i++) {
+		scan->image_lost[i] = records->part_states[SUMS_FLAT + i - SUMS_SCAN] == SUM_GOOD &&
+				      records->parts[SUMS_FLAT + i - SUMS_SCAN].lost;
+		if (scan->image_lost[i])
+			scan->image[i] = MISSING;
+	}
+	if (code != 0 || scan->closed || records->part_states[SUMS_CLOSED - SUMS_SCAN] != SUM_GOOD)
+		return code;
+	scan->closed = scan->closing = true;
+	return put_column(store, scan, "UPDATE scans SET closed = ? WHERE number = ?", NULL, err);
+}
+
+struct arrival {
+	uint64_t order;
+	int index;
+};
+
+static int compare_arrivals(const void *a, const void *b)
+{
+	const struct arrival *x = a, *y = b;
+
+	if (x->order != y->order)
+		return x->order < y->order ? -1 : 1;
+	return x->index - y->index;
+}
+
+/* As they came; those without a record first, by their numbers. */
+static int order_arrivals(struct stored_scan *scan, struct error *err)
+{
+	struct arrival *arrivals = calloc((size_t)scan->received + 1, sizeof(*arrivals));
+
+	if (arrivals == NULL)
+		return error_set_errno(err, ENOMEM, "list of %d projections", scan->received);
+	for (int i = 0; i < scan->received; i++)
+		arrivals[i] = (struct arrival){scan->sums[scan->order[i]].order, scan->order[i]};
+	qsort(arrivals, (size_t)scan->received, sizeof(*arrivals), compare_arrivals);
+	for (int i = 0; i < scan->received; i++) {
+		scan->order[i] = arrivals[i].index;
+		if (arrivals[i].order >= scan->order_floor)
+			scan->order_floor = arrivals[i].order + 1;
+	}
+	free(arrivals);
+	return 0;
+}
+
+static void show_projections(struct stored_scan *scan, const struct records *records)
+{
+	for (int i = 0; i < scan->count; i++) {
+		if (records->states[i] != SUM_GOOD)
+			continue;
+		if (scan->progress[i] == STORED) {
+			scan->sums[i] = records->projections[i];
+			scan->unchecked--;
+		} else {
+			stored_scan_add(scan, i, &records->projections[i]);
+		}
+		if (records->projections[i].lost) {
+			stored_scan_remove(scan, i);
+			scan->progress[i] = MISSING;
+		}
+	}
+	scan->suspect = scan->unchecked > 0 || records->part_states[0] != SUM_GOOD;
+	for (int i = 0; i < IMAGE_COUNT; i++)
+		scan->suspect |=
+		    scan->image[i] == STORED && records->part_states[SUMS_FLAT + i - SUMS_SCAN] != SUM_GOOD;
+}
+
+int store_load_sums(struct store *store, struct stored_scan *scan, struct error *err)
+{
+	struct records records = {.whole = false};
+	int code = read_records(scan, &records, err);
+
+	if (code == 0)
+		code = follow_projections(store, scan, &records, err);
+	if (code == 0)
+		code = follow_parts(store, scan, &records, err);
+	if (code == 0)
+		show_projections(scan, &records);
+	if (code == 0)
+		code = order_arrivals(scan, err);
+	if (code == 0 && !records.whole && !scan->gone)
+		code = write_records(scan, &records, err);
+	free(records.projections);
+	free(records.states);
+	return code;
+}
