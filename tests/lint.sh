@@ -48,6 +48,7 @@ found "a folder of daemon/ without a row in rooms" \
 rule "daemon/*.[ch] serve the rooms and know none" '#include "daemon/[a-z]+/' $(ls daemon/*.[ch] | grep -v daemon/main.c)
 rule "daemon/main.c uses doors" '#include "daemon/([a-z]+)/([a-z_]+)\.h"' \
 	<(grep -vE '#include "daemon/([a-z]+)/\1\.h"' daemon/main.c)
+found "files of daemon/ have at most 700 lines" "$(wc -l daemon/*.[ch] daemon/*/*.[ch] | awk '$1 > 700 && $2 != "total"')"
 
 rule "no process-wide string functions" '\b(strtok|sprintf|strcpy|strcat|gets|localtime|gmtime|strerror_l|rand|srand) *\(' $(files core proto daemon clients)
 rule "no unfinished work by its own words" '\b(TODO|FIXME|XXX|HACK)\b' $(files core kernels proto daemon clients tests)

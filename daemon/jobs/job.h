@@ -137,10 +137,11 @@ int job_attend(struct job *job, const char *backend, const char *device, struct 
 /* The worker goes; a job that still waits is where it was before. */
 void job_leave(struct job *job);
 /*
- * A worker found its scan damaged, when the scan had lost that much: how many times in a row that has been without
- * another loss since. The supervisor's thread only.
+ * A worker found the job's scan damaged when the scan had lost that much. How many times in a row workers did so,
+ * without another loss since. The supervisor's thread only.
  */
-int job_doubt(struct job *job, unsigned losses);
+void job_doubt(struct job *job, unsigned losses);
+int job_doubts(const struct job *job, unsigned losses);
 /* Projections reconstructed so far. */
 void job_taken(struct job *job, int count);
 /*

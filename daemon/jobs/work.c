@@ -158,11 +158,15 @@ void job_leave(struct job *job)
 	job_wake(job);
 }
 
-int job_doubt(struct job *job, unsigned losses)
+int job_doubts(const struct job *job, unsigned losses)
 {
-	job->doubts = job->doubted_at == losses ? job->doubts + 1 : 1;
+	return job->doubted_at == losses ? job->doubts : 0;
+}
+
+void job_doubt(struct job *job, unsigned losses)
+{
+	job->doubts = job_doubts(job, losses) + 1;
 	job->doubted_at = losses;
-	return job->doubts;
 }
 
 void job_taken(struct job *job, int count)

@@ -1,0 +1,227 @@
+/* What becomes of a job when its worker is through with it: decided in outcome.c, carried out here. */
+#include <stdio.h>
+
+#include "daemon/jobs/workers.h"
+#include "daemon/log.h"
+#include "proto/clock.h"
+
+static int record_ending(struct worker *worker, struct error *err)
+{
+	const struct ending *ending = &worker->ending;
+	const struct job_change change = {
+	    .error_code = ending->error_code,
+	    .error_text = ending->error_text,
+	    .checkpoint = ending->checkpoint,
+	    .crashed = ending->crashed,
+	    .yielded = ending->yielded,
+	    .reason = ending->to == JOB_QUEUED || ending->to == JOB_WAITING ? ending->error_text : NULL};
+	int code = 0;
+
+	/* It was faster than the catalogue. */
+	if (worker->arriving != NULL && ending->to == JOB_SUCCEEDED)
+		code = worker_record_running(worker, err);
+	/* One that waits as before has no news. */
+	if (code == 0 && (ending->to != JOB_WAITING || ending->crashed || worker->arriving == NULL))
+		code = job_set_state(worker->job, ending->to, &change, err);
+	return code;
+}
+
+static void *run_settler(void *context)
+{
+	struct settler *settler = context;
+
+	settler->code = job_settle(settler->job, &settler->err);
+	atomic_store(&settler->done, true);
+	supervise_wake(settler->supervise);
+	return NULL;
+}
+
+/* Makes sure that the job's volumes are synced. *ret_wait: a settler thread was started and will wake this loop. */
+static int settle(struct supervise *supervise, struct worker *worker, bool *ret_wait, struct error *err)
+{
+	struct settler *settler = &worker->settler;
+	struct job_facts facts;
+	int code;
+
+	*ret_wait = false;
+	if (settler->running) {
+		pthread_join(settler->thread, NULL);
+		settler->running = false;
+		if (settler->code != 0) {
+			*err = settler->err;
+			return settler->code;
+		}
+		worker->unsettled = 0;
+		job_facts(worker->job, &facts);
+		digester_add(supervise->digester, facts.id, NULL);
+	}
+	if (worker->unsettled == 0)
+		return 0;
+	*settler = (struct settler){.supervise = supervise, .job = worker->job};
+	code = pthread_create(&settler->thread, NULL, run_settler, settler);
+	if (code != 0)
+		return error_set_errno(err, code, "thread that settles volumes");
+	*ret_wait = settler->running = true;
+	return 0;
+}
+
+void worker_finish_job(struct supervise *supervise, struct worker *worker)
+{
+	struct error err;
+	bool wait;
+	int code = settle(supervise, worker, &wait, &err);
+
+	if (wait) {
+		worker->ending.again = NEVER;
+		return;
+	}
+	if (code == 0)
+		code = record_ending(worker, &err);
+	if (code != 0 && code != ERR_CONFLICT) {
+		store_distrust(jobs_store(supervise->jobs), &err);
+		if (code == ERR_NO_SPACE)
+			store_reserve_spend(jobs_store(supervise->jobs));
+		worker->ending.again = clock_monotonic() + RETRY;
+		log_line(LEVEL_ERROR, "the end of a job cannot be recorded yet: %s", err.text);
+		return;
+	}
+	if (worker->arriving != NULL)
+		job_leave(worker->job);
+	worker_stop_attending(worker);
+	job_release(worker->job);
+	worker->job = NULL;
+	worker->ending = (struct ending){0};
+	worker_publish(supervise, worker);
+}
+
+/* Clients were told that an image is stored or that the scan is closed, and may rely on it in every volume. */
+bool worker_is_stale(const struct worker *worker)
+{
+	struct job_facts facts;
+	struct scan_facts scan;
+	struct error err;
+
+	job_facts(worker->job, &facts);
+	if (store_scan_look(jobs_store(job_jobs(worker->job)), facts.scan, &scan, &err) != 0)
+		return false;
+	/* Projections that arrive are announced by their places in an order, which a loss changes. */
+	return scan.basis != worker->basis || (worker->arriving != NULL && scan.losses != worker->losses);
+}
+
+static unsigned conditions_of(const struct worker *worker)
+{
+	struct job_record record;
+	struct scan_facts scan = {0};
+	struct error ignored;
+	unsigned conditions = 0;
+
+	job_record(worker->job, &record);
+	store_scan_look(jobs_store(job_jobs(worker->job)), record.scan, &scan, &ignored);
+	conditions |= record.cancel_asked ? CONDITION_CANCELLED : 0;
+	conditions |= worker->failure_code != 0 ? CONDITION_UNRECORDED : 0;
+	conditions |= worker->failure_code == ERR_NO_SPACE ? CONDITION_FULL : 0;
+	conditions |= worker_is_stale(worker) ? CONDITION_STALE : 0;
+	conditions |= worker->arriving != NULL ? CONDITION_ARRIVING : 0;
+	conditions |= worker->checkpoint > 0 ? CONDITION_RESUMED : 0;
+	conditions |= record.crashes + 1 >= CRASHES_MAX ? CONDITION_BROKEN : 0;
+	conditions |= job_doubts(worker->job, scan.losses) + 1 >= CRASHES_MAX ? CONDITION_DOUBTED : 0;
+	conditions |= worker->yielding ? CONDITION_ASKED : 0;
+	return conditions;
+}
+
+/* The iteration that the job goes on from. */
+static int checkpoint_of(const struct worker *worker, const struct outcome *outcome, const struct worker_words *words)
+{
+	struct job_record record;
+
+	switch (outcome->from) {
+	case FROM_BEGINNING:
+		return worker->checkpoint;
+	case FROM_RECORDED:
+		job_record(worker->job, &record);
+		return record.checkpoint;
+	case FROM_SAID:
+		return words->iteration;
+	default:
+		return 0;
+	}
+}
+
+/* Keeps the job from a worker for as long as this one's obstacle is likely to be there. */
+static void hold_job(struct supervise *supervise, struct worker *worker, enum job_obstacle obstacle)
+{
+	unsigned long long available = 0;
+	struct job_record record;
+	struct error ignored;
+
+	if (obstacle == JOB_NO_SPACE) {
+		/* Room for one more volume than now. */
+		store_space(jobs_store(supervise->jobs), &available, &ignored);
+		job_hold(worker->job, obstacle, 0, available + worker->volume_bytes);
+	} else if (obstacle == JOB_DISK_TROUBLE) {
+		job_record(worker->job, &record);
+		job_hold(worker->job, obstacle, clock_monotonic() + RETRY * (1 << record.crashes % CRASHES_MAX), 0);
+	}
+}
+
+/* What an outcome asks for beside the job's new state. */
+static void carry_out(struct supervise *supervise, struct worker *worker, const struct outcome *outcome,
+		      const struct worker_words *words)
+{
+	struct store *store = jobs_store(supervise->jobs);
+	struct error said = {.code = words->code}, ignored;
+	struct scan_facts scan = {0};
+	struct job_facts facts;
+
+	job_facts(worker->job, &facts);
+	if (outcome->distrust) {
+		snprintf(said.text, sizeof(said.text), "%.319s", words->text);
+		store_distrust(store, &said);
+	}
+	if (outcome->check_scan) {
+		store_scan_look(store, facts.scan, &scan, &ignored);
+		job_doubt(worker->job, scan.losses);
+		store_scan_suspect(store, facts.scan);
+	}
+	if (outcome->warn)
+		job_add_warning(worker->job, "damaged_checkpoint", words->text, &ignored);
+	hold_job(supervise, worker, outcome->obstacle);
+	if (outcome->to == JOB_SUCCEEDED)
+		worker->failures = 0;
+}
+
+/* The words that a failed job bears, and the log otherwise. */
+static void write_text(const struct worker *worker, const struct outcome *outcome, const struct worker_words *words,
+		       char *ret_text, size_t size)
+{
+	const char *text = outcome->words == WORDS_DAEMON ? worker->failure_text : words->text;
+	struct job_record record;
+
+	if (outcome->to == JOB_FAILED && outcome->crashed) {
+		job_record(worker->job, &record);
+		snprintf(ret_text, size, "it was broken off %d times, last: %.260s", record.crashes + 1, text);
+		return;
+	}
+	snprintf(ret_text, size, "%.319s", outcome->reason != NULL ? outcome->reason : text);
+}
+
+void worker_end_job(struct supervise *supervise, struct worker *worker, const struct worker_words *words)
+{
+	unsigned conditions = conditions_of(worker);
+	struct outcome outcome = outcome_of(words->end, conditions);
+	struct ending ending = {.due = true,
+				.to = outcome.to,
+				.error_code = outcome.words == WORDS_DAEMON ? worker->failure_code : words->code,
+				.checkpoint = checkpoint_of(worker, &outcome, words),
+				.crashed = outcome.crashed,
+				.yielded = outcome.yielded};
+
+	if (worker_leaves(words->end, conditions)) {
+		worker->state = WORKER_ENDING;
+		worker->deadline = clock_monotonic() + EXIT;
+	}
+	carry_out(supervise, worker, &outcome, words);
+	write_text(worker, &outcome, words, ending.error_text, sizeof(ending.error_text));
+	worker->ending = ending;
+	worker_finish_job(supervise, worker);
+}

@@ -1,0 +1,259 @@
+/* Who gets which job: idle workers are given work, and others are asked to make room. */
+#include <errno.h>
+#include <limits.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "daemon/files.h"
+#include "daemon/jobs/workers.h"
+#include "daemon/log.h"
+#include "proto/clock.h"
+
+enum { BEGINNINGS_MAX = 5 }; /* tries to begin a job whose files cannot be read */
+
+/* Of a scan that was closed with projections missing: those that were there then; what was damaged since comes again.
+ */
+static int add_present(struct message *message, struct stored_scan *scan, const struct scan_facts *facts,
+		       struct error *err)
+{
+	unsigned char *flags = malloc(2 * (size_t)facts->count), *lost = flags + facts->count;
+	struct recipe *recipe = &message->request.recipe;
+	int count = facts->received + facts->lost;
+
+	if (flags == NULL)
+		return error_set_errno(err, ENOMEM, "list of %d projections", facts->count);
+	stored_scan_received(scan, flags);
+	stored_scan_lost(scan, lost);
+	message->reduced = true;
+	for (int i = 0; i < facts->count; i++)
+		message->present[i / 8] |= (uint8_t)((flags[i] | lost[i]) << i % 8);
+	free(flags);
+	/* Asked for with all projections in mind. */
+	if (recipe->sart.on && recipe->sart.subsets > count)
+		recipe->sart.subsets = count;
+	return 0;
+}
+
+/*
+ * The reference to the scan is the caller's. The facts are from before anything
+ * of the scan is read, here or by the worker: what changes from now on changes
+ * their basis.
+ */
+static int make_start(struct supervise *supervise, const struct job_record *record, struct message *message,
+		      struct stored_scan **ret_scan, struct scan_facts *ret_facts, struct error *err)
+{
+	struct store *store = jobs_store(supervise->jobs);
+	struct scan_facts facts;
+	struct stored_scan *scan;
+	int code = store_scan_find(store, record->scan, &scan, err);
+
+	if (code != 0)
+		return code;
+	stored_scan_facts(scan, &facts);
+	*message =
+	    (struct message){.kind = MESSAGE_START, .iteration = record->basis == facts.basis ? record->checkpoint : 0};
+	snprintf(message->job, sizeof(message->job), "%s", record->id);
+	store_scan_directory(store, record->scan, message->scan_directory);
+	store_job_directory(store, record->id, message->job_directory);
+	code = job_request_parse(record->request, strlen(record->request), &message->request, err);
+	if (code == 0 && facts.closed)
+		code = add_present(message, scan, &facts, err);
+	if (code == 0)
+		code = job_request_resolve(&message->request, stored_scan_measured(scan), err);
+	if (code == 0)
+		code = directory_make(message->job_directory, err);
+	if (code != 0) {
+		message_clear(message);
+		stored_scan_release(scan);
+	} else {
+		*ret_scan = scan;
+		*ret_facts = facts;
+	}
+	return code;
+}
+
+static void begin(struct supervise *supervise, struct worker *worker, struct job *job, const struct job_record *record,
+		  const struct message *message)
+{
+	struct error err;
+
+	worker->job = job_reference(job);
+	worker->running = (struct queue_running){.priority = record->priority, .ticket = record->ticket};
+	worker->checkpoint = message->iteration;
+	worker->volume_bytes = grid_voxels(&message->request.recipe.grid) * sizeof(float);
+	worker->unsettled = 0;
+	worker->cancelling = worker->yielding = false;
+	worker->room_since = NEVER;
+	worker->failure_code = 0;
+	worker->announced = worker->reconstructed = 0;
+	worker->again = 0;
+	worker->attended = clock_monotonic();
+	worker->state = WORKER_BUSY;
+	worker->deadline = NEVER;
+	if (message_send(worker->child.socket, message, &err) != 0) {
+		/* Most likely it has just died; its job comes back when that is seen. */
+		log_line(LEVEL_WARNING, "worker %d: %s", worker->index, err.text);
+		child_kill(&worker->child);
+		worker->state = WORKER_ENDING;
+	}
+	worker_publish(supervise, worker);
+}
+
+/* To running with all that is there, or, `arriving`, to attend it while the rest comes. */
+static int begin_job(struct supervise *supervise, struct worker *worker, struct job *job,
+		     const struct job_record *record, struct message *message, struct stored_scan *scan,
+		     const struct scan_facts *facts, bool arriving, struct error *err)
+{
+	const struct job_change change = {
+	    .backend = worker->backend, .device = worker->info.name, .basis = facts->basis};
+	int code;
+
+	message->arriving = arriving;
+	if (arriving)
+		code = job_attend(job, worker->backend, worker->info.name, err);
+	else
+		code = job_set_state(job, JOB_RUNNING, &change, err);
+	if (code != 0) {
+		stored_scan_release(scan);
+		return code;
+	}
+	worker->basis = facts->basis;
+	worker->losses = facts->losses;
+	begin(supervise, worker, job, record, message);
+	if (!arriving) {
+		stored_scan_release(scan);
+		return 0;
+	}
+	worker->running.ticket = LLONG_MAX; /* it has none before it runs, and makes room first */
+	worker->arriving = scan;
+	worker_attend(supervise, worker);
+	return 0;
+}
+
+/* A job to this idle worker; a code when no more can be given just now. */
+static int give_job(struct supervise *supervise, struct worker *worker, struct job *job, bool arriving,
+		    struct error *err)
+{
+	struct message *message = calloc(1, sizeof(*message));
+	struct stored_scan *scan;
+	struct scan_facts facts;
+	struct job_record record;
+	struct job_change change;
+	struct error why;
+	int code;
+
+	if (message == NULL)
+		return error_set_errno(err, ENOMEM, "message");
+	job_record(job, &record);
+	code = make_start(supervise, &record, message, &scan, &facts, &why);
+	/* It has lost something since the job was queued. */
+	if (code == 0 && !arriving && !facts.ready) {
+		message_clear(message);
+		free(message);
+		stored_scan_release(scan);
+		change = (struct job_change){.reason = "its scan has lost something to the disk"};
+		code = job_set_state(job, JOB_WAITING, &change, err);
+		return code == ERR_CONFLICT ? 0 : code;
+	}
+	if (code != 0)
+		store_distrust(jobs_store(supervise->jobs), &why);
+	if (code == ERR_NO_SPACE || code == ERR_NO_MEMORY || code == ERR_SYNC) {
+		*err = why;
+	} else if (code == ERR_IO && job_hold(job, JOB_DISK_TROUBLE, clock_monotonic() + RETRY, 0) < BEGINNINGS_MAX) {
+		log_line(LEVEL_WARNING, "job %s cannot begin yet: %s", record.id, why.text);
+		code = 0;
+	} else if (code != 0) {
+		change = (struct job_change){.error_code = code, .error_pointer = why.pointer, .error_text = why.text};
+		code = job_set_state(job, JOB_FAILED, &change, err);
+	} else {
+		code = begin_job(supervise, worker, job, &record, message, scan, &facts, arriving, err);
+		message_clear(message);
+	}
+	free(message);
+	return code == ERR_CONFLICT ? 0 : code; /* cancelled in this very moment */
+}
+
+/*
+ * The queue's first, or a waiting job: before it when it has the higher priority and its projections come just now, or
+ * came when the worker was told to make room for them: an iteration and a checkpoint may take longer than patience.
+ */
+static struct job *choose_job(struct supervise *supervise, const struct worker *worker, bool *ret_arriving)
+{
+	double since = clock_monotonic() - PATIENCE;
+	struct job *queued = jobs_next(supervise->jobs), *waiting, *chosen;
+	struct job_facts a, b;
+	bool now;
+
+	since = worker->room_since < since ? worker->room_since : since;
+	waiting = jobs_arriving(supervise->jobs, since, &now);
+	chosen = queued != NULL ? queued : waiting;
+	if (queued != NULL && waiting != NULL && now) {
+		job_facts(queued, &a);
+		job_facts(waiting, &b);
+		chosen = b.priority > a.priority ? waiting : queued;
+	}
+	*ret_arriving = chosen == waiting;
+	job_release(chosen == waiting ? queued : waiting);
+	return chosen;
+}
+
+void supervise_dispatch(struct supervise *supervise)
+{
+	struct error err;
+	int code = 0;
+
+	for (int i = 0; i < supervise->count && code == 0;) {
+		struct worker *worker = &supervise->workers[i];
+		struct job *job = NULL;
+		bool arriving = false;
+
+		if (worker->state == WORKER_IDLE && worker->job == NULL)
+			job = choose_job(supervise, worker, &arriving);
+		if (job == NULL) {
+			i++;
+			continue;
+		}
+		code = give_job(supervise, worker, job, arriving, &err);
+		job_release(job);
+	}
+	if (code != 0) {
+		log_line(LEVEL_ERROR, "no job can be started: %s", err.text);
+		supervise->dispatch_at = clock_monotonic() + RETRY;
+	}
+}
+
+void supervise_preempt(struct supervise *supervise)
+{
+	struct queue_running running[WORKERS_MAX];
+	int of[WORKERS_MAX], busy, idle, victim;
+	double now = clock_monotonic(), since = supervise_arrivals_since(supervise, now);
+	bool arriving;
+	struct job *waiting = jobs_arriving(supervise->jobs, since, &arriving);
+	struct job_facts facts = {.priority = PRIORITY_ROUTINE};
+
+	if (waiting != NULL)
+		job_facts(waiting, &facts);
+	job_release(waiting);
+	do {
+		busy = idle = 0;
+		for (int i = 0; i < supervise->count; i++) {
+			struct worker *worker = &supervise->workers[i];
+
+			idle += worker->state == WORKER_IDLE && worker->job == NULL;
+			if (worker->state != WORKER_BUSY || worker->job == NULL)
+				continue;
+			running[busy] = worker->running;
+			running[busy].leaving = worker->cancelling || worker->yielding;
+			running[busy].gives_way = worker_patience_ends(worker) <= now;
+			of[busy++] = i;
+		}
+		victim = jobs_victim(supervise->jobs, waiting != NULL && arriving ? &facts.priority : NULL, running,
+				     busy, idle);
+		if (victim >= 0) {
+			worker_order(&supervise->workers[of[victim]], MESSAGE_YIELD);
+			supervise->workers[of[victim]].yielding = true;
+			supervise->workers[of[victim]].room_since = arriving ? since : NEVER;
+		}
+	} while (victim >= 0);
+}

@@ -1,0 +1,173 @@
+/* What workers say: messages of proto/message.h, and what is said to them. */
+#include <errno.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "daemon/jobs/workers.h"
+#include "daemon/log.h"
+#include "proto/clock.h"
+
+static const double TURN = 0.01; /* s of reading what one worker says, before the others and the queue have theirs */
+
+void worker_order(struct worker *worker, enum message_kind kind)
+{
+	struct message message = {.kind = kind};
+	struct job_facts facts;
+	struct error err;
+
+	if (worker->job != NULL) {
+		job_facts(worker->job, &facts);
+		snprintf(message.job, sizeof(message.job), "%s", facts.id);
+	}
+	/* Gone already: its pidfd tells. */
+	if (message_send(worker->child.socket, &message, &err) != 0)
+		log_line(LEVEL_DEBUG, "worker %d: %s", worker->index, err.text);
+}
+
+void worker_cancel(struct supervise *supervise, struct worker *worker)
+{
+	worker_order(worker, MESSAGE_CANCEL);
+	worker->cancelling = true;
+	worker->deadline = clock_monotonic() + supervise->options.cancel_seconds;
+}
+
+/* ---- what they say ---- */
+
+/* Something of the job could not be kept: then it must not seem to have succeeded. */
+static void stop_job(struct supervise *supervise, struct worker *worker, const struct error *why)
+{
+	if (worker->failure_code != 0)
+		return;
+	log_line(LEVEL_ERROR, "worker %d: its job is stopped: %s", worker->index, why->text);
+	worker->failure_code = why->code;
+	snprintf(worker->failure_text, sizeof(worker->failure_text), "%s", why->text);
+	if (!worker->cancelling)
+		worker_cancel(supervise, worker);
+}
+
+static void hello(struct supervise *supervise, struct worker *worker, const struct message *message)
+{
+	worker->info = message->info;
+	snprintf(worker->backend, sizeof(worker->backend), "%s", message->backend);
+	worker->last_error[0] = '\0';
+	worker->deadline = NEVER;
+	worker->state = WORKER_IDLE;
+	log_line(LEVEL_INFO, "worker %d (pid %ld): %s, %s, %zu of %zu MiB free", worker->index, (long)worker->child.pid,
+		 worker->backend, worker->info.name, worker->info.bytes_free >> 20, worker->info.bytes_total >> 20);
+	worker_publish(supervise, worker);
+}
+
+static int add_volume(struct worker *worker, const struct message *message, struct error *err)
+{
+	struct volume_record volume = {
+	    .iteration = message->iteration, .grid = message->grid, .bytes = message->bytes, .norms = message->norms};
+
+	snprintf(volume.name, sizeof(volume.name), "%s", message->name);
+	snprintf(volume.stage, sizeof(volume.stage), "%s", message->volume_stage);
+	volume.created = clock_realtime();
+	store_volume_trust(jobs_store(job_jobs(worker->job)), message->job, &volume);
+	return job_add_volume(worker->job, &volume, err);
+}
+
+/* A commit each takes longer than the iterations of a small job: those that are there to read share one. */
+static void add_rows(struct supervise *supervise, struct worker *worker)
+{
+	int count = worker->row_count;
+	struct error err;
+
+	worker->row_count = 0;
+	if (count > 0 && job_add_rows(worker->job, worker->rows, count, &err) != 0)
+		stop_job(supervise, worker, &err);
+}
+
+static void job_ended(struct supervise *supervise, struct worker *worker, const struct message *message)
+{
+	worker->deadline = NEVER;
+	worker->state = WORKER_IDLE;
+	worker_end_job(supervise, worker,
+		       &(struct worker_words){.end = worker_end_of(message->code),
+					      .code = message->code,
+					      .iteration = message->iteration,
+					      .text = message->text});
+	worker_publish(supervise, worker);
+}
+
+static void on_message(struct supervise *supervise, struct worker *worker, const struct message *message)
+{
+	struct job_facts facts = {0};
+	struct error err;
+	int code = 0;
+
+	if (message->kind == MESSAGE_HELLO) {
+		if (worker->state == WORKER_STARTING)
+			hello(supervise, worker, message);
+		return;
+	}
+	if (worker->job != NULL)
+		job_facts(worker->job, &facts);
+	if (worker->job == NULL || worker->ending.due || strcmp(facts.id, message->job) != 0)
+		return;
+	/* All else after them, as it was told. */
+	if (message->kind != MESSAGE_ROW || worker->row_count == JOB_ROWS_MAX)
+		add_rows(supervise, worker);
+	switch (message->kind) {
+	case MESSAGE_OPENED:
+		job_set_plan(worker->job, &message->memory, message->plan);
+		break;
+	case MESSAGE_NOISE:
+		job_set_denoising(worker->job, message->noise_hu, message->alpha);
+		break;
+	case MESSAGE_TAKEN:
+		worker->reconstructed = message->count;
+		job_taken(worker->job, message->count);
+		worker_attend(supervise, worker);
+		break;
+	case MESSAGE_PROGRESS:
+		job_progress(worker->job, message->stage, message->iteration, message->fraction);
+		break;
+	case MESSAGE_ROW:
+		worker->rows[worker->row_count++] = message->row;
+		break;
+	case MESSAGE_VOLUME:
+		worker->unsettled++;
+		code = add_volume(worker, message, &err);
+		break;
+	case MESSAGE_SETTLED:
+		worker->unsettled--;
+		digester_add(supervise->digester, message->job, message->name);
+		break;
+	case MESSAGE_WARNING:
+		code = job_add_warning(worker->job, message->code_name, message->text, &err);
+		break;
+	case MESSAGE_ENDED:
+		job_ended(supervise, worker, message);
+		break;
+	default:
+		break;
+	}
+	if (code != 0)
+		stop_job(supervise, worker, &err);
+}
+
+void worker_read(struct supervise *supervise, struct worker *worker, bool died, bool *ret_gone)
+{
+	struct message *message = malloc(sizeof(*message));
+	double end = died ? NEVER : clock_monotonic() + TURN;
+	struct error err;
+	bool got = true;
+	int code = message == NULL ? error_set_errno(&err, ENOMEM, "message") : 0;
+
+	while (code == 0 && got && clock_monotonic() < end) {
+		code = message_receive(worker->child.socket, 0, message, &got, &err);
+		if (code == 0 && got) {
+			on_message(supervise, worker, message);
+			message_clear(message);
+		}
+	}
+	add_rows(supervise, worker);
+	free(message);
+	*ret_gone = code != 0;
+	if (code != 0 && code != ERR_IO)
+		log_line(LEVEL_ERROR, "worker %d: %s", worker->index, err.text);
+}

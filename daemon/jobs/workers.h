@@ -1,0 +1,163 @@
+#ifndef CBCT_DAEMON_JOBS_WORKERS_H
+#define CBCT_DAEMON_JOBS_WORKERS_H
+
+#include <pthread.h>
+#include <stdatomic.h>
+
+#include "daemon/jobs/digest.h"
+#include "daemon/jobs/outcome.h"
+#include "daemon/jobs/spawn.h"
+#include "daemon/jobs/supervise.h"
+#include "proto/message.h"
+
+/*
+ * Inside of the supervisor: supervise.c (the loop), listen.c (what workers say), ending.c (what becomes of their jobs),
+ * give.c (who gets which job) and attend.c (projections that still arrive). All of it is the supervisor's one thread,
+ * but where something else is said.
+ */
+enum {
+	WORKERS_MAX = 64,
+	CRASHES_MAX = 3, /* workers that may die with one job, or fail to read or write for it */
+};
+#define NEVER 1e300 /* a time of clock_monotonic that does not come */
+#define RETRY 1.0   /* s until a change that the disk refused is tried again */
+#define EXIT 2.0    /* s that a worker has to exit by itself */
+/*
+ * s without a projection after which a worker that waits for some is anybody's: an arm that turns sends several a
+ * second, and an arm that has stopped has nothing to lose but what the worker has reconstructed.
+ */
+#define PATIENCE 2.0
+
+/* What is to become of a worker's job; kept until the catalogue has taken it. */
+struct ending {
+	bool due;
+	enum job_state to;
+	int error_code;
+	char error_text[320];
+	int checkpoint;
+	bool crashed, yielded;
+	double again; /* monotonic: not before */
+};
+
+/*
+ * A worker died between telling of a volume and settling it: that is done for it,
+ * in a thread, since it waits for the disk and other workers wait for nobody.
+ */
+struct settler {
+	struct supervise *supervise;
+	struct job *job; /* the worker's */
+	pthread_t thread;
+	bool running; /* the supervisor's own */
+	_Atomic bool done;
+	int code; /* with the next: the thread's until it is done */
+	struct error err;
+};
+
+struct worker {
+	int index;
+	enum worker_state state;
+	struct child child;
+	double born, start_at; /* monotonic: of this process; of the next one */
+	double deadline;       /* monotonic: killed then; NEVER */
+	unsigned failures;     /* in a row */
+	unsigned starts;
+	char backend[16];
+	struct device_info info; /* of the last hello */
+	char last_error[160];
+
+	struct job *job; /* reference; NULL: none */
+	struct queue_running running;
+	int checkpoint;      /* that it began from */
+	size_t volume_bytes; /* of one volume of its job */
+	int unsettled;       /* volumes that it has told of and that are not on the disk, as far as it said */
+	/* What it told of last and the catalogue has yet to take; none between two turns. */
+	struct history_row rows[JOB_ROWS_MAX];
+	int row_count;
+	bool cancelling, yielding;
+	double room_since; /* monotonic: it was told to make room for projections that came later; NEVER */
+	/* While its job waits for the rest of its projections: the scan, a reference; NULL otherwise. */
+	struct stored_scan *arriving;
+	unsigned basis, losses;       /* of the scan when it began */
+	int announced, reconstructed; /* projections that it knows to be there, that it has reconstructed */
+	double attended, again;       /* monotonic: since when; not before, after the catalogue refused */
+	int failure_code;             /* why we told it to stop, 0: we did not */
+	char failure_text[320];
+	struct ending ending;
+	struct settler settler;
+};
+
+struct supervise {
+	struct jobs *jobs; /* constant, as the next five */
+	struct digester *digester;
+	char worker[1024], backend[16];
+	struct supervise_options options;
+	int count;
+	int devices[WORKERS_MAX];
+	int wake; /* eventfd */
+	struct watch jobs_watch, arrivals_watch;
+	pthread_t thread;
+
+	struct worker workers[WORKERS_MAX]; /* the thread's own */
+	double dispatch_at;                 /* monotonic; the thread's own */
+	double review_at;                   /* monotonic: when jobs that are held are looked at, 0: none; its own */
+	double stop_by;                     /* monotonic: the stop's end, NEVER before it; the thread's own */
+
+	pthread_mutex_t lock; /* guards what follows */
+	struct worker_facts facts[WORKERS_MAX];
+	bool stop;
+};
+
+/* ---- supervise.c ---- */
+/* Ends the sleep of the loop. Any thread. */
+void supervise_wake(void *supervise);
+/* Shows other threads the worker as it is now. */
+void worker_publish(struct supervise *supervise, const struct worker *worker);
+
+/* ---- listen.c ---- */
+/*
+ * Reads all that is there of a worker that died, else for one turn: iterations of a small job end faster than their
+ * rows are recorded. *ret_gone at the end of the stream, or when it makes no sense.
+ */
+void worker_read(struct supervise *supervise, struct worker *worker, bool died, bool *ret_gone);
+/* Sends a message that has no more to it than its kind. */
+void worker_order(struct worker *worker, enum message_kind kind);
+/* The worker is to end its job soon; it is killed if it does not. */
+void worker_cancel(struct supervise *supervise, struct worker *worker);
+
+/* ---- ending.c ---- */
+/* What a worker said of its job, or what its process did. */
+struct worker_words {
+	enum worker_end end;
+	int code;         /* enum error_code that a failed job bears */
+	int iteration;    /* with END_MADE_ROOM: of the checkpoint */
+	const char *text; /* one sentence */
+};
+/* The worker is through with its job, which goes where outcome.c says as soon as the catalogue takes that. */
+void worker_end_job(struct supervise *supervise, struct worker *worker, const struct worker_words *words);
+/* The job's new state reaches the catalogue now, or is tried again: a full disk must not lose how it ended. */
+void worker_finish_job(struct supervise *supervise, struct worker *worker);
+/* The job's scan is understood otherwise than when the worker began. */
+bool worker_is_stale(const struct worker *worker);
+
+/* ---- give.c ---- */
+/* Idle workers get jobs. */
+void supervise_dispatch(struct supervise *supervise);
+/* A worker whose job has a lower priority than one that waits for a worker is asked to make room. */
+void supervise_preempt(struct supervise *supervise);
+
+/* ---- attend.c ---- */
+/*
+ * Projections that came are announced to the worker that waits for them; with the last one its job runs. A job that is
+ * stale is left, running or not, and begins again.
+ */
+void worker_attend(struct supervise *supervise, struct worker *worker);
+/* The last projection was announced: from now on this is a job as any other. A code when the catalogue refused. */
+int worker_record_running(struct worker *worker, struct error *err);
+/* The worker does not wait for projections of its job any more. */
+void worker_stop_attending(struct worker *worker);
+/* When the patience with a worker that waits for projections ends; NEVER for any other. */
+double worker_patience_ends(const struct worker *worker);
+/* Projections that came later than this are worth a worker: just now, or after the last of a worker that gives way. */
+double supervise_arrivals_since(const struct supervise *supervise, double now);
+
+#endif
