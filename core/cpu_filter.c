@@ -273,7 +273,10 @@ static void fit_extensions(const struct filter_engine *engine, const struct rows
 		}
 		for (int r = 0; r < rows->count; r++)
 			if (ret->truncated[side][r])
-				ret->edge[side][r] = extend_fit(rows->columns, engine->extend, &sums[r], &edges[r]);
+				ret->edge[side][r] =
+				    extend_fit(rows->columns, engine->extend, &sums[r], &edges[r],
+					       extend_near(at_edge(rows, side, 0) + r,
+							   side == 0 ? rows->rows : -rows->rows, rows->columns));
 	}
 }
 

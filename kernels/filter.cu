@@ -332,6 +332,11 @@ static __device__ struct shell find_shell(const struct shell_table *table, const
 	return shell;
 }
 
+static __device__ struct extend_near near_side(const float *p, int columns, int side)
+{
+	return extend_near(side == 0 ? p : p + columns - 1, side == 0 ? 1 : -1, columns);
+}
+
 /* A block has one row; most rows end in air at both sides and cost no more than a look there. */
 static __global__ void __launch_bounds__(EDGE_THREADS)
     find_edges(const filter_job job, const batch_slots slots, bool before, bool behind, edges found)
@@ -350,7 +355,8 @@ static __global__ void __launch_bounds__(EDGE_THREADS)
 		for (int i = threadIdx.x; i < edge; i += EDGE_THREADS)
 			sum += (double)p[side == 0 ? i : columns - 1 - i];
 		sum = sum_block(sum, shared);
-		if (!(side == 0 ? before : behind) || !(sum > 0) || sum < (double)level * edge)
+		if (!(side == 0 ? before : behind) || !(sum > 0) || sum < (double)level * edge ||
+		    extend_ends_within(near_side(p, columns, side), level))
 			continue;
 		for (int i = threadIdx.x + 1; i < window - 1; i += EDGE_THREADS) {
 			const float *middle = p + (side == 0 ? i : columns - 1 - i);
@@ -395,7 +401,7 @@ static __global__ void __launch_bounds__(EDGE_THREADS)
 		measured = sum_block(measured, shared);
 		if (threadIdx.x > 0 || !(sides >> side & 1))
 			continue;
-		found.fit[at][side] = extend_fit(columns, job.extend, &row_sums, &edge_sums);
+		found.fit[at][side] = extend_fit(columns, job.extend, &row_sums, &edge_sums, near_side(p, columns, side));
 		if (shell.share > 0)
 			extend_by_shell(&found.fit[at][side], &shell, side, width, (float)measured, columns);
 	}

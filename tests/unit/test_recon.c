@@ -1575,6 +1575,31 @@ START_TEST(a_body_that_is_wholly_seen_is_not_called_cut_off)
 }
 END_TEST
 
+/* A skull with a pixel or two of air at its sides, and one whose outline lies in the outermost pixel. */
+START_TEST(a_skull_with_air_beside_it_is_not_called_cut_off)
+{
+	static const double half[] = {84, 86.5, 88};
+	const struct orbit_spec spec = {80, 8, 30, {620, 1100, {4, 4}, {0, 0}, {0, 0}}, 0, 12};
+	struct ellipsoid parts[] = {
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {70, half[_i], 80}, .density = 2 * 0.0192},
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {64, half[_i] - 6, 74}, .density = -0.96 * 0.0192},
+	};
+	struct phantom phantom = {.count = 2, .parts = parts};
+	struct grid grid = grid_of(16, 16, 4, 4, 4, 4);
+	struct recipe recipe = recipe_on(&grid);
+	struct outcome outcome = {0};
+	struct scene scene;
+
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	recipe.fdk.on = true;
+	run(&scene, &recipe, &outcome);
+	ck_assert_msg(strstr(outcome.warnings, "truncated: ") == NULL, "+-%g mm: %s", half[_i], outcome.warnings);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
 /*
  * A body longer than the detector is high, and grids that are a part of it: SART
  * keeps its values as far as the grid's last slice but one, also where the grid
@@ -1778,6 +1803,13 @@ static const struct {
     {"a skull beside the axis", 129, 0, SKULL(72, 90, 7, 2.5, 12, -9), 0, {32, 38, 82}},
     /* -64 -82 -231; 36 54 393 */
     {"a skull that is cut at the sides only", 160, 0, SKULL(75, 95, 8, 2.2, 0, 0), 0, {45, 55, 160}},
+    /* Within some columns of the outline, where p falls steeply at the edge: -8 -11 -67 with the window's slope. */
+    {"a skull that is cut within its bone at the sides",
+     160,
+     0,
+     {{0, 0, 65, 84, 0, 2}, {0, 0, 59, 78, 0, -.96}},
+     0,
+     {7, 10, 55}},
     /* No worse than by the ellipse alone, below. */
     {"a trunk", 200, 0, {{0, 0, 170, 120, 0, 1}}, 0, {10, 10, 20}},
     {"a trunk, 20000 photons", 200, 0, {{0, 0, 170, 120, 0, 1}}, 20000, {15, 15, 25}},
@@ -2026,6 +2058,7 @@ Suite *recon_suite(void)
 	tcase_add_test(images, without_a_grid_one_is_chosen);
 	tcase_add_loop_test(images, fdk_is_as_good_as_rtk_demands, 0, COUNT(rtk_fdk));
 	tcase_add_loop_test(images, truncation_leaves_no_rim_in_fdk_or_sart, 0, 5);
+	tcase_add_loop_test(images, a_skull_with_air_beside_it_is_not_called_cut_off, 0, 3);
 	tcase_add_loop_test(images, a_body_that_is_wholly_seen_is_not_called_cut_off, 0, COUNT(whole));
 	tcase_add_loop_test(images, a_body_that_goes_on_outside_of_the_grid_is_not_piled_up_at_its_faces, 0, 4);
 	tcase_add_loop_test(images, a_grid_inside_of_the_body_shows_what_is_there, 0, 4);
