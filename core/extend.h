@@ -200,7 +200,7 @@ EXTEND_INLINE double extend_nearness(struct extend_near near)
 
 	if (!(fall > 0))
 		return 0;
-	return fmin(fmax(2 - (double)near.outermost / (4 * fall), 0), 1);
+	return fmin(fmax(2 - (double)near.outermost / (4 * fall), 0.0), 1.0);
 }
 
 EXTEND_INLINE struct extension extend_fit(int columns, int extend, const struct extend_row_sums *row,
@@ -319,7 +319,7 @@ EXTEND_INLINE struct shell_fit shell_solve(const struct shell_sums *sums, double
 		fit.body = 0;
 		fit.bone = sums->pi / sums->ii;
 	}
-	fit.residual = fmax(square - fit.body * sums->pr - fit.bone * sums->pi, 0);
+	fit.residual = fmax(square - fit.body * sums->pr - fit.bone * sums->pi, 0.0);
 	return fit;
 }
 
@@ -344,7 +344,7 @@ EXTEND_INLINE float shell_refined(const struct shell_table *table, const double 
 
 	if (i == 0 || i == SHELL_OUTLINES - 1 || !(bend > 0))
 		return table->outline[i];
-	step = fmin(fmax(0.5 * (residual[0] - residual[2]) / bend, -1), 1);
+	step = fmin(fmax(0.5 * (residual[0] - residual[2]) / bend, -1.0), 1.0);
 	return table->outline[i] * powf(table->outline[1] / table->outline[0], (float)step);
 }
 

@@ -401,7 +401,8 @@ static __global__ void __launch_bounds__(EDGE_THREADS)
 		measured = sum_block(measured, shared);
 		if (threadIdx.x > 0 || !(sides >> side & 1))
 			continue;
-		found.fit[at][side] = extend_fit(columns, job.extend, &row_sums, &edge_sums, near_side(p, columns, side));
+		found.fit[at][side] =
+		    extend_fit(columns, job.extend, &row_sums, &edge_sums, near_side(p, columns, side));
 		if (shell.share > 0)
 			extend_by_shell(&found.fit[at][side], &shell, side, width, (float)measured, columns);
 	}
