@@ -180,8 +180,8 @@ struct plan_bytes {
 };
 
 struct sart_sums {
-	double residual2;   /* sum of (p - A v)^2, each view's as it is met */
-	double projection2; /* sum of p^2 */
+	double residual2;   /* sum of (p - A v)^2, each view's as it is met, over the rays that are not left out */
+	double projection2; /* sum of p^2 over the same rays */
 };
 
 struct volume_norms {
@@ -190,6 +190,12 @@ struct volume_norms {
 	double minimum, maximum, mean;
 	size_t not_finite;
 };
+
+/*
+ * In a stack of projections that sart_iterate reads, a line integral that is not a number is a ray that is left
+ * out: its measured value says nothing.
+ */
+#define RAY_LEFT_OUT NAN
 
 /* Asked between steps; true ends the operation with ERR_CANCELLED. */
 struct cancel {
@@ -296,7 +302,9 @@ struct backend {
 	 * miss the grid and voxels that no ray of the subset sees stay as they are;
 	 * a ray that only grazes it, with less than RAY_LENGTH_LEAST of the smallest
 	 * spacing inside, counts as one that misses, and the matched pair divides by
-	 * COLUMN_SUM_LEAST of that spacing at least.
+	 * COLUMN_SUM_LEAST of that spacing at least. A ray that is left out (p_i is
+	 * RAY_LEFT_OUT) has the correction 0, whatever the volume is. The column sums count
+	 * it still, so that its voxels move less; they need no pass of their own then.
 	 */
 	int (*sart_iterate)(struct plan *plan, const struct stack *projections, struct volume *volume,
 			    const struct cancel *cancel, struct sart_sums *ret_sums, struct error *err);

@@ -24,7 +24,8 @@ static void correct_block(const struct plan *plan, const float *measured, const 
 	double residual2 = 0, projection2 = 0;
 
 	for (int i = 0; i < pixels; i++) {
-		float p = measured[i], difference = p - projected[i];
+		const bool left_out = isnan(measured[i]);
+		float p = left_out ? 0 : measured[i], difference = left_out ? 0 : p - projected[i];
 
 		residual2 += (double)difference * difference;
 		projection2 += (double)p * p;

@@ -207,11 +207,76 @@ static void look_at_ends(struct input *input, const void *samples, int columns, 
 	input->views_looked_at++;
 }
 
+/* Not above the dark, where the detector could have counted. */
+static bool has_no_counts(const struct input *input, const void *samples, size_t at)
+{
+	const struct linearise *linearise = &input->linearise;
+	const float sample =
+	    linearise->sample == SAMPLE_UINT16 ? ((const uint16_t *)samples)[at] : ((const float *)samples)[at];
+	const float dark = linearise->dark != NULL ? linearise->dark[at] : 0;
+	const float flat = linearise->flat != NULL ? linearise->flat[at] : (float)linearise->air;
+
+	return sample <= dark && isfinite(sample) && flat > dark &&
+	       (linearise->defects == NULL || !linearise->defects[at]);
+}
+
+/* Notes the view's samples without counts; how many there are to *ret_count. */
+static int note_dark(const struct input *input, const void *samples, int columns, int view, struct metal *metal,
+		     size_t *ret_count, struct error *err)
+{
+	const int rows = (int)(input->pixels / (size_t)columns);
+	size_t count = 0;
+	int code = 0;
+
+	for (int row = 0; row < rows && code == 0; row++)
+		for (int first = 0, last; first < columns && code == 0; first = last + 1) {
+			const size_t at = (size_t)row * (size_t)columns;
+
+			last = first;
+			if (!has_no_counts(input, samples, at + (size_t)first))
+				continue;
+			while (last + 1 < columns && has_no_counts(input, samples, at + (size_t)last + 1))
+				last++;
+			count += (size_t)(last - first + 1);
+			code = metal_note_dark(metal, view, row, first, last, err);
+		}
+	*ret_count = count;
+	return code;
+}
+
+/* Of the view's largest line integral: in such a shadow a sample without counts is no dead pixel. */
+static const float SHADOW = 0.5f;
+
+/*
+ * Where a shadow has no counts, its line integrals are above all that was
+ * measured, and linearise has bridged them from the shadow's rim: metal would hardly be found.
+ */
+static int darken(const struct input *input, const struct backend *backend, const void *samples, int slot,
+		  struct stack *to, struct error *err)
+{
+	float *view = malloc(input->pixels * sizeof(float)), largest = 0;
+	int code;
+
+	if (view == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a view");
+	code = backend->stack_download(to, slot, 1, view, err);
+	for (size_t i = 0; i < input->pixels && code == 0; i++)
+		largest = fmaxf(largest, view[i]);
+	for (size_t i = 0; i < input->pixels && code == 0; i++)
+		if (view[i] >= SHADOW * largest && has_no_counts(input, samples, i))
+			view[i] = largest;
+	if (code == 0)
+		code = backend->stack_upload(to, slot, 1, view, err);
+	free(view);
+	return code;
+}
+
 int input_take(struct input *input, const struct backend *backend, struct plan *plan, const void *samples, int view,
-	       int slot, struct stack *to, struct error *err)
+	       int slot, struct stack *to, struct metal *metal, struct error *err)
 {
 	/* One by one, so that the views with defects are known. */
 	const struct defect_counts before = input->counts;
+	size_t dark = 0;
 	int code;
 
 	if (input->turned) {
@@ -234,7 +299,11 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 	    defects_total(&input->counts) - input->counts.mapped > defects_total(&before) - before.mapped;
 	if (input->counts.blank > before.blank)
 		input->blank[before.blank] = view;
-	return 0;
+	if (metal == NULL || input->linearise.quantity != QUANTITY_INTENSITY || input->counts.zero == before.zero ||
+	    input->counts.blank > before.blank)
+		return 0;
+	code = note_dark(input, samples, input->turned ? input->rows : input->columns, view, metal, &dark, err);
+	return code < 0 || dark == 0 ? code : darken(input, backend, samples, slot, to, err);
 }
 
 void input_goes_on(const struct input *input, bool ret_ends[2])

@@ -2,6 +2,7 @@
 #define CBCT_CORE_INPUT_H
 
 #include "core/defects.h"
+#include "core/metal.h"
 #include "core/recon.h"
 
 /* What core/recon.c knows of the samples that it was given, and tells of them. Nobody else's. */
@@ -37,9 +38,12 @@ void input_clear(struct input *input);
 
 size_t input_view_bytes(const struct input *input);
 
-/* linearise of one view into a slot. */
+/*
+ * linearise of one view into a slot. metal, or NULL: is told of samples without counts, which linearise has
+ * replaced from their neighbours. Those that lie in a dark shadow have at least the view's largest line integral.
+ */
 int input_take(struct input *input, const struct backend *backend, struct plan *plan, const void *samples, int view,
-	       int slot, struct stack *to, struct error *err);
+	       int slot, struct stack *to, struct metal *metal, struct error *err);
 
 /*
  * Whether the object goes on beyond the first row, [0], and the last one, [1]: more than a quarter of the views looked

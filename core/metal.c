@@ -2,35 +2,52 @@
  * Metal: what it swallows is not in the projections, and its streaks cover the
  * rest of the volume. So its shadows are replaced by what they would be without:
  *
- *  1. what has at least the threshold in the FDK volume is metal;
- *  2. its projection, a pixel wider all around, gives its traces;
- *  3. in each row a straight line leads over each trace (Kalender, Hebel and
- *     Ebersberger, Radiology 164, 1987), and FDK gives a volume with few streaks;
- *  4. that one, with air and soft tissue made even, bone left and water for the
+ *  1. Metal in the FDK volume: what has at least the threshold, and around it what
+ *     has half of it; of both what has half of the highest value near it, so that an
+ *     object is as wide as it is, and whole where it comes near the threshold.
+ *  2. Its projection, a pixel wider all around, gives its traces; samples without
+ *     counts that touch a trace belong to it.
+ *  3. Lines lead over each trace along the row and along the column (after
+ *     Kalender, Hebel and Ebersberger, Radiology 164, 1987, who have the row only), the nearer
+ *     ends count more, and FDK gives a volume with few streaks. A screw's shadow is
+ *     long in one direction and narrow in the other.
+ *  4. That one, with air and soft tissue made even, bone left and water for the
  *     metal, is the prior: its projection knows the edges that a straight line
- *     cannot (Meyer et al., Med. Phys. 37, 2010). The line now leads over the
- *     difference to it:    p' = P + line(p - P)
+ *     cannot (normalised interpolation: Meyer et al., Med. Phys. 37, 2010). The lines
+ *     now lead over the difference to it:    p' = P + line(p - P)
  *     in the trace. Where Meyer divides by the prior, a grid smaller than the
- *     object would be missing in P; a difference lets the line make up for it.
+ *     object would be missing in P; a difference lets the lines make up for it.
+ *  5. FDK and step 4 again, PASSES times in all: each prior is cleaner than the one
+ *     before it, and may keep fainter bone.
  *
- * The metal itself is put back into every volume that is kept. Steps 2 to 4 use
- * the list of voxels only and take the views in the order of their numbers: the
- * same list gives the same bits, also when a run goes on later.
+ * What is better of this volume and of the first one is taken place by place
+ * (metal_blend.c): a faint or thin object's shadow has photons enough. tests/bench/results/
+ * has the table of what else was tried.
+ *
+ * The metal itself is put back into every volume that is kept, and with it its rim:
+ * around the metal all that the first FDK showed above the volume, since the
+ * traces take the metal's blur away as well. Steps 2 to 5 use the list of voxels only
+ * and take the views in the order of their numbers: the same list gives the same
+ * bits, also when a run goes on later. SART leaves the traces' rays out.
  */
-#include "core/metal.h"
+#include "core/metal_internal.h"
 
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
+#include "core/outside.h"
+
 void metal_clear(struct metal *metal)
 {
 	free(metal->voxels);
+	free(metal->beneath);
 	free(metal->traces);
+	free(metal->dark);
 	*metal = (struct metal){0};
 }
 
-static int check_cancelled(const struct metal_tools *tools, struct error *err)
+int metal_check_cancelled(const struct metal_tools *tools, struct error *err)
 {
 	const struct cancel *cancel = tools->cancel;
 
@@ -39,13 +56,14 @@ static int check_cancelled(const struct metal_tools *tools, struct error *err)
 	return 0;
 }
 
-static size_t slice_voxels(const struct grid *grid)
+size_t metal_slice_voxels(const struct grid *grid)
 {
 	return (size_t)grid->size[0] * (size_t)grid->size[1];
 }
 
-/* `items` with room for one more than `count`; as it was where there is no memory. */
-static void *grown(void *items, size_t size, size_t count, size_t *room)
+/* ---- lists ---- */
+
+void *metal_grown(void *items, size_t size, size_t count, size_t *room)
 {
 	size_t wanted = *room > 0 ? 2 * *room : 1024;
 	void *more;
@@ -58,72 +76,9 @@ static void *grown(void *items, size_t size, size_t count, size_t *room)
 	return more;
 }
 
-/* ---- where it is ---- */
-
-/* One of the six beside it has the threshold too: noise stands alone. */
-static bool is_metal(const struct grid *grid, const float *const slices[3], size_t at, float threshold)
-{
-	const int nx = grid->size[0], ny = grid->size[1], x = (int)(at % (size_t)nx), y = (int)(at / (size_t)nx);
-	const float *slice = slices[1];
-
-	if (!(slice[at] >= threshold))
-		return false;
-	return (x > 0 && slice[at - 1] >= threshold) || (x + 1 < nx && slice[at + 1] >= threshold) ||
-	       (y > 0 && slice[at - (size_t)nx] >= threshold) || (y + 1 < ny && slice[at + (size_t)nx] >= threshold) ||
-	       (slices[0] != NULL && slices[0][at] >= threshold) || (slices[2] != NULL && slices[2][at] >= threshold);
-}
-
-static int find_in_slice(struct metal *metal, const struct grid *grid, const float *const slices[3], int z,
-			 float threshold, size_t *room, struct error *err)
-{
-	for (size_t at = 0; at < slice_voxels(grid); at++) {
-		struct metal_voxel *more;
-
-		if (!is_metal(grid, slices, at, threshold))
-			continue;
-		more = grown(metal->voxels, sizeof(*more), metal->voxels_count, room);
-		if (more == NULL)
-			return error_set(err, ERR_NO_MEMORY, "no memory for a list of %zu voxels of metal",
-					 metal->voxels_count);
-		metal->voxels = more;
-		more[metal->voxels_count++] = (struct metal_voxel){(uint32_t)z, (uint32_t)at, slices[1][at]};
-	}
-	return 0;
-}
-
-int metal_find(struct metal *metal, const struct metal_tools *tools, struct volume *from, double threshold,
-	       struct error *err)
-{
-	const struct grid *grid = tools->grid;
-	const size_t slice = slice_voxels(grid);
-	const int nz = grid->size[2];
-	float *ring = malloc(3 * slice * sizeof(float)); /* slices z - 1, z, z + 1, each at its number modulo 3 */
-	size_t room = 0;
-	int code = 0;
-
-	if (ring == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for three slices of %zu voxels", slice);
-	code = tools->backend->volume_download(from, 0, 1, ring, err);
-	for (int z = 0; z < nz && code == 0; z++) {
-		const float *const slices[3] = {z > 0 ? ring + (size_t)((z - 1) % 3) * slice : NULL,
-						ring + (size_t)(z % 3) * slice,
-						z + 1 < nz ? ring + (size_t)((z + 1) % 3) * slice : NULL};
-
-		if (z + 1 < nz)
-			code =
-			    tools->backend->volume_download(from, z + 1, 1, ring + (size_t)((z + 1) % 3) * slice, err);
-		if (code == 0)
-			code = find_in_slice(metal, grid, slices, z, (float)threshold, &room, err);
-		if (code == 0)
-			code = check_cancelled(tools, err);
-	}
-	free(ring);
-	return code;
-}
-
 int metal_put(struct metal *metal, const struct grid *grid, const void *bytes, size_t count, struct error *err)
 {
-	const size_t voxels = count / sizeof(struct metal_voxel), slice = slice_voxels(grid);
+	const size_t voxels = count / sizeof(struct metal_voxel), slice = metal_slice_voxels(grid);
 	struct metal_voxel *list;
 
 	if (count % sizeof(struct metal_voxel) != 0 || voxels > grid_voxels(grid))
@@ -136,7 +91,8 @@ int metal_put(struct metal *metal, const struct grid *grid, const void *bytes, s
 		bool later =
 		    i == 0 || list[i].z > list[i - 1].z || (list[i].z == list[i - 1].z && list[i].at > list[i - 1].at);
 
-		if (list[i].z >= (uint32_t)grid->size[2] || list[i].at >= slice || !later || !isfinite(list[i].value)) {
+		if (list[i].z >= (uint32_t)grid->size[2] || list[i].at >= slice || !later || list[i].kind > METAL_RIM ||
+		    !isfinite(list[i].value)) {
 			free(list);
 			return error_set(err, ERR_INVALID, "the list of voxels of metal is none of this grid");
 		}
@@ -144,17 +100,22 @@ int metal_put(struct metal *metal, const struct grid *grid, const void *bytes, s
 	free(metal->voxels);
 	metal->voxels = list;
 	metal->voxels_count = voxels;
+	metal->found = 0;
+	for (size_t i = 0; i < voxels; i++)
+		metal->found += list[i].kind == METAL_CORE;
 	return 0;
 }
 
 /* ---- slice by slice ---- */
 
-/* For each slice with metal: download, change it at its voxels, put it back. `change` may change the list as well. */
+/* What becomes of the volume's value at voxel i of the list. */
+typedef float voxel_change(struct metal *metal, size_t i, float there, double value);
+
+/* For each slice with metal: download, change it at the list's voxels, put it back. */
 static int change_slices(struct metal *metal, const struct metal_tools *tools, struct volume *volume,
-			 void (*change)(struct metal_voxel *voxel, float *at, double value), double value,
-			 struct error *err)
+			 voxel_change *change, double value, struct error *err)
 {
-	float *slice = malloc(slice_voxels(tools->grid) * sizeof(float));
+	float *slice = malloc(metal_slice_voxels(tools->grid) * sizeof(float));
 	int code = 0;
 
 	if (slice == NULL)
@@ -166,204 +127,159 @@ static int change_slices(struct metal *metal, const struct metal_tools *tools, s
 		if (code < 0)
 			break;
 		for (; i < metal->voxels_count && (int)metal->voxels[i].z == z; i++)
-			change(&metal->voxels[i], &slice[metal->voxels[i].at], value);
+			slice[metal->voxels[i].at] = change(metal, i, slice[metal->voxels[i].at], value);
 		code = tools->backend->volume_put(volume, z, 1, slice, err);
 	}
 	free(slice);
 	return code;
 }
 
-static void exchange(struct metal_voxel *voxel, float *at, double value)
+static float set_core(struct metal *metal, size_t i, float there, double value)
 {
-	const float there = *at;
+	return metal->voxels[i].kind == METAL_CORE ? (float)value : there;
+}
+
+/* Soft tissue where the metal is; bone that the volume shows there stays. */
+static float at_least_in_core(struct metal *metal, size_t i, float there, double value)
+{
+	return metal->voxels[i].kind == METAL_CORE ? fmaxf(there, (float)value) : there;
+}
+
+static float show(struct metal *metal, size_t i, float there, double value)
+{
+	const struct metal_voxel *voxel = &metal->voxels[i];
 
 	(void)value;
-	*at = voxel->value;
-	voxel->value = there;
+	metal->beneath[i] = there;
+	return voxel->kind == METAL_CORE ? voxel->value : fmaxf(there, voxel->value);
 }
 
-static void set(struct metal_voxel *voxel, float *at, double value)
+static float hide(struct metal *metal, size_t i, float there, double value)
 {
-	(void)voxel;
-	*at = (float)value;
+	(void)there;
+	(void)value;
+	return metal->beneath[i];
 }
 
-int metal_exchange(struct metal *metal, const struct metal_tools *tools, struct volume *volume, struct error *err)
+int metal_show(struct metal *metal, const struct metal_tools *tools, struct volume *volume, struct error *err)
 {
-	return change_slices(metal, tools, volume, exchange, 0, err);
+	if (metal->beneath == NULL)
+		metal->beneath = malloc((metal->voxels_count + 1) * sizeof(float));
+	if (metal->beneath == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for %zu voxels", metal->voxels_count);
+	return change_slices(metal, tools, volume, show, 0, err);
+}
+
+int metal_hide(struct metal *metal, const struct metal_tools *tools, struct volume *volume, struct error *err)
+{
+	return change_slices(metal, tools, volume, hide, 0, err);
 }
 
 /* ---- its traces ---- */
 
-/* Way through the mask that makes a shadow, in voxels: less lies within the pixel that is added all around. */
+/* Way through the mask that makes a shadow, in voxels: less lies within the pixels that are added all around. */
 static const double SHADOW_LEAST = 0.5;
-
-static bool is_dark(const float *shadow, int columns, int rows, int column, int row, float least)
+/* Pixels that are added all around: what half a voxel covers, or one. */
+static int trace_margin(const struct metal_tools *tools)
 {
-	for (int r = row - 1; r <= row + 1; r++)
-		for (int c = column - 1; c <= column + 1; c++)
-			if (r >= 0 && r < rows && c >= 0 && c < columns &&
-			    shadow[(size_t)r * (size_t)columns + (size_t)c] > least)
+	const double *mm = tools->grid->spacing, voxel = fmin(fmin(mm[0], mm[1]), mm[2]);
+
+	return (int)fmin(fmax(lround(0.5 * voxel / tools->pixel), 1), 3);
+}
+
+struct shadow {
+	const float *through; /* [row][column], mm through the mask */
+	int columns, rows, margin;
+	float least;
+	const struct metal_trace *dark; /* of the view: samples without counts; in order */
+	size_t dark_count;
+};
+
+static bool is_shadow(const struct shadow *shadow, int column, int row)
+{
+	const int m = shadow->margin;
+
+	for (int r = row - m; r <= row + m; r++)
+		for (int c = column - m; c <= column + m; c++)
+			if (r >= 0 && r < shadow->rows && c >= 0 && c < shadow->columns &&
+			    shadow->through[(size_t)r * (size_t)shadow->columns + (size_t)c] > shadow->least)
 				return true;
 	return false;
 }
 
-static int trace_row(struct metal *metal, int view, int row, const float *shadow, const struct metal_tools *tools,
-		     struct error *err)
+/* Marks the row's pixels in the metal's shadow, and the stretches without counts that touch them. */
+static void mark_row(const struct shadow *shadow, int row, bool *ret_marks)
 {
-	const int columns = tools->geometry->columns, rows = tools->geometry->rows;
-	const double *mm = tools->grid->spacing;
-	const float least = (float)(SHADOW_LEAST * fmin(fmin(mm[0], mm[1]), mm[2]));
+	for (int c = 0; c < shadow->columns; c++)
+		ret_marks[c] = is_shadow(shadow, c, row);
+	for (size_t i = 0; i < shadow->dark_count; i++) {
+		const struct metal_trace *dark = &shadow->dark[i];
+		const int low = dark->first > 0 ? dark->first - 1 : 0;
+		const int high = dark->last + 1 < shadow->columns ? dark->last + 1 : dark->last;
+		bool touches = false;
 
-	for (int first = 0; first < columns; first++) {
-		struct metal_trace *more;
-		int last;
-
-		if (!is_dark(shadow, columns, rows, first, row, least))
+		if (dark->row != row)
 			continue;
-		for (last = first; last + 1 < columns && is_dark(shadow, columns, rows, last + 1, row, least);)
+		for (int c = low; c <= high; c++)
+			touches = touches || ret_marks[c];
+		for (int c = dark->first; touches && c <= dark->last; c++)
+			ret_marks[c] = true;
+	}
+}
+
+static int add_traces(struct metal *metal, int view, int row, int columns, const bool *marks, struct error *err)
+{
+	for (int first = 0, last; first < columns; first = last + 1) {
+		struct metal_trace *more;
+
+		last = first;
+		if (!marks[first])
+			continue;
+		while (last + 1 < columns && marks[last + 1])
 			last++;
-		more = grown(metal->traces, sizeof(*more), metal->traces_count, &metal->traces_room);
+		more = metal_grown(metal->traces, sizeof(*more), metal->traces_count, &metal->traces_room);
 		if (more == NULL)
 			return error_set(err, ERR_NO_MEMORY, "no memory for a list of %zu traces", metal->traces_count);
 		metal->traces = more;
 		more[metal->traces_count++] = (struct metal_trace){view, row, first, last};
 		metal->replaced += (size_t)(last - first + 1);
-		first = last;
 	}
 	return 0;
 }
 
-/* ---- rows without them ---- */
+/* ---- samples without counts ---- */
 
-/*
- * Pixels on either side of a trace whose mean the line starts from: one alone
- * would draw its noise over the trace, with more the line starts too far away.
- */
-enum { FLANK = 2 };
-
-struct flank {
-	double place, value; /* of the mean of its pixels */
-	int pixels;
-};
-
-/* Up to FLANK pixels from `from` on in the direction `step`, as far as `end`, excluded. */
-static struct flank flank_of(const float *row, const float *prior, int from, int step, int end)
+int metal_note_dark(struct metal *metal, int view, int row, int first, int last, struct error *err)
 {
-	struct flank flank = {0};
+	struct metal_trace *more = metal_grown(metal->dark, sizeof(*more), metal->dark_count, &metal->dark_room);
 
-	for (int c = from; flank.pixels < FLANK && c != end; c += step, flank.pixels++) {
-		flank.place += c;
-		flank.value += (double)row[c] - (prior != NULL ? (double)prior[c] : 0);
-	}
-	if (flank.pixels > 0) {
-		flank.place /= flank.pixels;
-		flank.value /= flank.pixels;
-	}
-	return flank;
+	if (more == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a list of %zu samples without counts",
+				 metal->dark_count);
+	metal->dark = more;
+	more[metal->dark_count++] = (struct metal_trace){view, row, first, last};
+	return 0;
 }
 
-bool metal_fill_row(float *row, const float *prior, int columns, const struct metal_trace *traces, size_t count)
+static int compare_traces(const void *left, const void *right)
 {
-	if (count == 1 && traces[0].first == 0 && traces[0].last == columns - 1)
-		return false;
-	for (size_t i = 0; i < count; i++) {
-		const int first = traces[i].first, last = traces[i].last;
-		const int before = i > 0 ? traces[i - 1].last : -1;
-		const int behind = i + 1 < count ? traces[i + 1].first : columns;
-		struct flank left = flank_of(row, prior, first - 1, -1, before);
-		struct flank right = flank_of(row, prior, last + 1, 1, behind);
+	const struct metal_trace *a = left, *b = right;
 
-		if (left.pixels == 0) /* at the detector's edge: held */
-			left = (struct flank){right.place - 1, right.value, 0};
-		else if (right.pixels == 0)
-			right = (struct flank){left.place + 1, left.value, 0};
-		for (int c = first; c <= last; c++) {
-			const double part = (c - left.place) / (right.place - left.place);
-
-			row[c] = (float)(left.value + part * (right.value - left.value) +
-					 (prior != NULL ? (double)prior[c] : 0));
-		}
-	}
-	return true;
+	if (a->view != b->view)
+		return a->view < b->view ? -1 : 1;
+	if (a->row != b->row)
+		return a->row < b->row ? -1 : 1;
+	return (a->first > b->first) - (a->first < b->first);
 }
 
-/* A row that is all trace: a line from the next rows above and below that are not, as they are now. */
-static void fill_from_rows(float *view, const float *prior, int columns, int rows, int row, const bool *whole)
+size_t metal_traces_from(const struct metal_trace *traces, size_t count, int view)
 {
-	int above = row, below = row;
-
-	while (above >= 0 && whole[above])
-		above--;
-	while (below < rows && whole[below])
-		below++;
-	if (above < 0 && below >= rows) /* nothing but metal: there is nothing to go by */
-		return;
-	for (int c = 0; c < columns; c++) {
-		const size_t at = (size_t)row * (size_t)columns + (size_t)c;
-		const size_t over = (size_t)(above < 0 ? below : above) * (size_t)columns + (size_t)c;
-		const size_t under = (size_t)(below >= rows ? above : below) * (size_t)columns + (size_t)c;
-		const double part = above < 0 || below >= rows ? 0 : (double)(row - above) / (below - above);
-		const double from = (double)view[over] - (prior != NULL ? (double)prior[over] : 0);
-		const double to = (double)view[under] - (prior != NULL ? (double)prior[under] : 0);
-
-		view[at] = (float)(from + part * (to - from) + (prior != NULL ? (double)prior[at] : 0));
-	}
-}
-
-/* `whole` [rows] is scratch. */
-static void fill_view(float *view, const float *prior, int columns, int rows, const struct metal_trace *traces,
-		      size_t count, bool *whole)
-{
-	memset(whole, 0, (size_t)rows * sizeof(*whole));
-	for (size_t i = 0, next; i < count; i = next) {
-		const size_t at = (size_t)traces[i].row * (size_t)columns;
-
-		for (next = i; next < count && traces[next].row == traces[i].row;)
-			next++;
-		whole[traces[i].row] =
-		    !metal_fill_row(view + at, prior != NULL ? prior + at : NULL, columns, &traces[i], next - i);
-	}
-	for (int row = 0; row < rows; row++)
-		if (whole[row])
-			fill_from_rows(view, prior, columns, rows, row, whole);
-}
-
-/* ---- batch by batch ---- */
-
-/* Views first .. first + count - 1 of the volume to work in; the host's buffers are [slots][row][column]. */
-struct batch {
-	int first, count;
-	float *shadow; /* the volume's projections */
-	float *views;  /* those of the scan */
-	bool *whole;   /* [slots][rows] */
-};
-
-static int project_batch(const struct metal_tools *tools, const struct batch *batch, struct error *err)
-{
-	int *views = malloc((size_t)batch->count * sizeof(*views)), code = check_cancelled(tools, err);
-
-	if (views == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", batch->count);
-	for (int i = 0; i < batch->count; i++)
-		views[i] = batch->first + i;
-	if (code == 0)
-		code = tools->backend->project(tools->plan, tools->volume, views, batch->count, tools->batch, err);
-	if (code == 0)
-		code = tools->backend->stack_download(tools->batch, 0, batch->count, batch->shadow, err);
-	free(views);
-	return code;
-}
-
-/* First of the traces of this view or a later one. */
-static size_t traces_from(const struct metal *metal, int view)
-{
-	size_t low = 0, high = metal->traces_count;
+	size_t low = 0, high = count;
 
 	while (low < high) {
 		const size_t middle = low + (high - low) / 2;
 
-		if (metal->traces[middle].view < view)
+		if (traces[middle].view < view)
 			low = middle + 1;
 		else
 			high = middle;
@@ -371,71 +287,280 @@ static size_t traces_from(const struct metal *metal, int view)
 	return low;
 }
 
-/* The batch's projections with their traces filled; with_prior: `shadow` is the prior's projection. */
-static int fill_batch(const struct metal *metal, const struct metal_tools *tools, const struct batch *batch,
-		      bool with_prior, struct error *err)
+/* ---- lines over them ---- */
+
+/*
+ * Pixels on either side of a trace whose mean the line starts from: one alone
+ * would draw its noise over the trace, with more the line starts too far away.
+ */
+enum { FLANK = 2 };
+/* The column is searched so many times as far as the row's ends are: what lies beyond has no weight. */
+enum { COLUMN_SEARCH = 4 };
+
+/* Pixels beside a trace, in one direction from one of its own. */
+struct flank {
+	double place, value; /* means, the place in pixels from the trace's own, >= 1 */
+	int nearest;         /* pixels from that one to the first; 0: there is none */
+};
+
+/* From pixel (column, row) of the trace in a direction, looking no further than `most` pixels. */
+static struct flank flank_of(const struct metal_view *of, int column, int row, int dx, int dy, int most)
+{
+	struct flank flank = {0};
+	int pixels = 0;
+
+	for (int away = 1; away <= most || pixels > 0; away++) {
+		const int c = column + away * dx, r = row + away * dy;
+		const size_t at = (size_t)r * (size_t)of->columns + (size_t)c;
+
+		if (c < 0 || c >= of->columns || r < 0 || r >= of->rows)
+			break;
+		if (of->trace[at] && pixels == 0)
+			continue;
+		if (of->trace[at] || pixels == FLANK || (dy != 0 && !metal_is_whole(of, c, r)))
+			break;
+		flank.place += away;
+		flank.value += (double)of->values[at] - (of->prior != NULL ? (double)of->prior[at] : 0);
+		flank.nearest = pixels++ == 0 ? away : flank.nearest;
+	}
+	if (pixels > 0) {
+		flank.place /= pixels;
+		flank.value /= pixels;
+	}
+	return flank;
+}
+
+/*
+ * The line between two flanks, at 0; *ret_weight is the inverse square of the
+ * distance of its ends, taken as resistors side by side, 0 without any. One flank
+ * alone is held, and counts as if the other were as far.
+ */
+static double line_between(const struct flank *before, const struct flank *behind, double *ret_weight)
+{
+	double inverse;
+
+	*ret_weight = 0;
+	if (before->nearest == 0 && behind->nearest == 0)
+		return 0;
+	if (before->nearest == 0 || behind->nearest == 0) {
+		const struct flank *only = before->nearest == 0 ? behind : before;
+
+		inverse = 0.5 / only->nearest;
+		*ret_weight = inverse * inverse;
+		return only->value;
+	}
+	inverse = 1. / before->nearest + 1. / behind->nearest;
+	*ret_weight = inverse * inverse;
+	return (before->value * behind->place + behind->value * before->place) / (before->place + behind->place);
+}
+
+/*
+ * Without a prior a column may lead from the object to the air beyond its end,
+ * where the row lies in the object or does not: what the column says counts as far as it agrees with the row.
+ */
+static double agreement(double along, double across)
+{
+	const double part = 0.3;
+
+	return fmax(0, 1 - fabs(along - across) / fmax(part * fmax(fabs(along), fabs(across)), 1e-6));
+}
+
+void metal_fill_view(const struct metal_view *of)
+{
+	for (int row = 0; row < of->rows; row++)
+		for (int column = 0; column < of->columns; column++) {
+			const size_t at = (size_t)row * (size_t)of->columns + (size_t)column;
+			struct flank left, right, above, below;
+			double along, across, weights[2];
+			int near;
+
+			if (!of->trace[at])
+				continue;
+			left = flank_of(of, column, row, -1, 0, of->columns);
+			right = flank_of(of, column, row, 1, 0, of->columns);
+			near = left.nearest > right.nearest ? left.nearest : right.nearest;
+			near = near > 0 ? COLUMN_SEARCH * near : of->rows;
+			above = flank_of(of, column, row, 0, -1, near);
+			below = flank_of(of, column, row, 0, 1, near);
+			along = line_between(&left, &right, &weights[0]);
+			across = line_between(&above, &below, &weights[1]);
+			if (of->prior == NULL && weights[0] > 0)
+				weights[1] *= agreement(along, across);
+			if (weights[0] + weights[1] > 0) /* otherwise there is nothing but metal to go by */
+				of->values[at] =
+				    (float)((weights[0] * along + weights[1] * across) / (weights[0] + weights[1]) +
+					    (of->prior != NULL ? (double)of->prior[at] : 0));
+		}
+}
+
+/* What of the length a ray would have in a grid without ends along z makes it whole. */
+static const double WHOLE = 0.97;
+
+bool metal_is_whole(const struct metal_view *of, int column, int row)
+{
+	struct grid endless;
+
+	if (of->grid == NULL)
+		return true;
+	endless = *of->grid;
+	endless.spacing[2] = 1e6;
+	endless.origin[2] -= 0.5e6 * (endless.size[2] - 1);
+	return ray_within(of->grid, of->view, column, row) >= WHOLE * ray_within(&endless, of->view, column, row);
+}
+
+/* ---- batch by batch ---- */
+
+int metal_project_batch(const struct metal_tools *tools, const struct volume *volume, const struct metal_batch *batch,
+			struct error *err)
+{
+	int *views = malloc((size_t)batch->count * sizeof(*views)), code = metal_check_cancelled(tools, err);
+
+	if (views == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", batch->count);
+	for (int i = 0; i < batch->count; i++)
+		views[i] = batch->first + i;
+	if (code == 0)
+		code = tools->backend->project(tools->plan, volume, views, batch->count, tools->batch, err);
+	if (code == 0)
+		code = tools->backend->stack_download(tools->batch, 0, batch->count, batch->shadow, err);
+	free(views);
+	return code;
+}
+
+/* The batch's traces as a picture of slot i. */
+static bool *draw_traces(const struct metal *metal, const struct metal_tools *tools, const struct metal_batch *batch,
+			 int i)
+{
+	const size_t columns = (size_t)tools->geometry->columns, pixels = columns * (size_t)tools->geometry->rows;
+	const size_t first = metal_traces_from(metal->traces, metal->traces_count, batch->first + i);
+	const size_t end = metal_traces_from(metal->traces, metal->traces_count, batch->first + i + 1);
+	bool *trace = batch->trace + (size_t)i * pixels;
+
+	memset(trace, 0, pixels * sizeof(*trace));
+	for (size_t k = first; k < end; k++)
+		for (int c = metal->traces[k].first; c <= metal->traces[k].last; c++)
+			trace[(size_t)metal->traces[k].row * columns + (size_t)c] = true;
+	return trace;
+}
+
+/* What is done with one view of a batch that has traces. */
+enum treatment { TRACE, FILL, FILL_OVER_PRIOR, LEAVE_OUT };
+
+static void treat_view(const struct metal_tools *tools, const struct metal_batch *batch, int i,
+		       enum treatment treatment, const bool *trace)
 {
 	const int columns = tools->geometry->columns, rows = tools->geometry->rows;
 	const size_t pixels = (size_t)columns * (size_t)rows;
+	const struct metal_view of = {
+	    .columns = columns,
+	    .rows = rows,
+	    .values = batch->views + (size_t)i * pixels,
+	    .prior = treatment == FILL_OVER_PRIOR ? batch->shadow + (size_t)i * pixels : NULL,
+	    .trace = trace,
+	    .grid = tools->grid,
+	    .view = &tools->geometry->views[batch->first + i],
+	};
+
+	if (treatment != LEAVE_OUT)
+		metal_fill_view(&of);
+	for (size_t k = 0; treatment == LEAVE_OUT && k < pixels; k++)
+		if (trace[k])
+			of.values[k] = RAY_LEFT_OUT;
+}
+
+/* The batch's projections with their traces filled or left out; FILL_OVER_PRIOR: `shadow` is the prior's projection. */
+static int treat_batch(const struct metal *metal, const struct metal_tools *tools, const struct metal_batch *batch,
+		       enum treatment treatment, struct error *err)
+{
+	const size_t all = metal->traces_count;
 	int code;
 
-	if (traces_from(metal, batch->first) == traces_from(metal, batch->first + batch->count))
+	if (metal_traces_from(metal->traces, all, batch->first) ==
+	    metal_traces_from(metal->traces, all, batch->first + batch->count))
 		return 0;
 	code = tools->backend->stack_download(tools->projections, batch->first, batch->count, batch->views, err);
 	if (code < 0)
 		return code;
 #pragma omp parallel for schedule(dynamic)
-	for (int i = 0; i < batch->count; i++) {
-		const size_t first = traces_from(metal, batch->first + i),
-			     end = traces_from(metal, batch->first + i + 1);
-
-		fill_view(batch->views + (size_t)i * pixels, with_prior ? batch->shadow + (size_t)i * pixels : NULL,
-			  columns, rows, metal->traces + first, end - first, batch->whole + (size_t)i * (size_t)rows);
-	}
+	for (int i = 0; i < batch->count; i++)
+		treat_view(tools, batch, i, treatment, draw_traces(metal, tools, batch, i));
 	return tools->backend->stack_upload(tools->projections, batch->first, batch->count, batch->views, err);
 }
 
-static int trace_batch(struct metal *metal, const struct metal_tools *tools, const struct batch *batch,
+static bool is_blank(const struct metal_tools *tools, int view)
+{
+	for (int i = 0; i < tools->blanks; i++)
+		if (tools->blank[i] == view)
+			return true;
+	return false;
+}
+
+static int trace_batch(struct metal *metal, const struct metal_tools *tools, const struct metal_batch *batch,
 		       struct error *err)
 {
-	const int rows = tools->geometry->rows;
-	const size_t pixels = (size_t)tools->geometry->columns * (size_t)rows;
+	const int columns = tools->geometry->columns, rows = tools->geometry->rows;
+	const size_t pixels = (size_t)columns * (size_t)rows;
+	const double *mm = tools->grid->spacing;
 	int code = 0;
 
 	for (int i = 0; i < batch->count && code == 0; i++) {
 		const size_t before = metal->traces_count;
+		const size_t dark = metal_traces_from(metal->dark, metal->dark_count, batch->first + i);
+		const struct shadow shadow = {
+		    .through = batch->shadow + (size_t)i * pixels,
+		    .columns = columns,
+		    .rows = rows,
+		    .margin = trace_margin(tools),
+		    .least = (float)(SHADOW_LEAST * fmin(fmin(mm[0], mm[1]), mm[2])),
+		    .dark = metal->dark + dark,
+		    .dark_count = metal_traces_from(metal->dark, metal->dark_count, batch->first + i + 1) - dark,
+		};
+		bool *marks = batch->trace + (size_t)i * pixels;
 
+		if (is_blank(tools, batch->first + i))
+			continue;
+#pragma omp parallel for schedule(static)
+		for (int row = 0; row < rows; row++)
+			mark_row(&shadow, row, marks + (size_t)row * (size_t)columns);
 		for (int row = 0; row < rows && code == 0; row++)
-			code = trace_row(metal, batch->first + i, row, batch->shadow + (size_t)i * pixels, tools, err);
+			code = add_traces(metal, batch->first + i, row, columns, marks + (size_t)row * (size_t)columns,
+					  err);
 		metal->views += metal->traces_count > before;
 	}
 	return code;
 }
 
-/* Over all views: with the mask in the volume, finds the traces and fills them; with the prior, fills them. */
-static int fill_all(struct metal *metal, const struct metal_tools *tools, bool with_prior, struct error *err)
+/* Over all views: TRACE finds the traces of the mask in the volume to work in, FILL_OVER_PRIOR has the prior there. */
+static int treat_all(struct metal *metal, const struct metal_tools *tools, enum treatment treatment, struct error *err)
 {
-	const int all = tools->geometry->count, rows = tools->geometry->rows;
-	const size_t pixels = (size_t)tools->geometry->columns * (size_t)rows, slots = (size_t)tools->slots;
-	struct batch batch = {.shadow = malloc(slots * pixels * sizeof(float)),
-			      .views = malloc(slots * pixels * sizeof(float)),
-			      .whole = malloc(slots * (size_t)rows * sizeof(bool))};
+	const int all = tools->geometry->count;
+	const size_t pixels = (size_t)tools->geometry->columns * (size_t)tools->geometry->rows;
+	const size_t slots = (size_t)tools->slots;
+	struct metal_batch batch = {.shadow = malloc(slots * pixels * sizeof(float)),
+				    .views = malloc(slots * pixels * sizeof(float)),
+				    .trace = malloc(slots * pixels * sizeof(bool))};
 	int code = 0;
 
-	if (batch.shadow == NULL || batch.views == NULL || batch.whole == NULL)
+	if (batch.shadow == NULL || batch.views == NULL || batch.trace == NULL)
 		code = error_set(err, ERR_NO_MEMORY, "no memory for %zu projections", 2 * slots);
 	for (; batch.first < all && code == 0; batch.first += batch.count) {
 		batch.count = all - batch.first < tools->slots ? all - batch.first : tools->slots;
-		code = project_batch(tools, &batch, err);
-		if (code == 0 && !with_prior)
+		if (treatment == TRACE || treatment == FILL_OVER_PRIOR)
+			code = metal_project_batch(tools, tools->volume, &batch, err);
+		if (code == 0 && treatment == TRACE)
 			code = trace_batch(metal, tools, &batch, err);
-		if (code == 0)
-			code = fill_batch(metal, tools, &batch, with_prior, err);
+		if (code == 0 && treatment != TRACE)
+			code = treat_batch(metal, tools, &batch, treatment, err);
 	}
 	free(batch.shadow);
 	free(batch.views);
-	free(batch.whole);
+	free(batch.trace);
 	return code;
+}
+
+int metal_leave_out(struct metal *metal, const struct metal_tools *tools, struct error *err)
+{
+	return treat_all(metal, tools, LEAVE_OUT, err);
 }
 
 int metal_fdk(const struct metal_tools *tools, struct volume *to, struct error *err)
@@ -443,7 +568,7 @@ int metal_fdk(const struct metal_tools *tools, struct volume *to, struct error *
 	int code = tools->backend->volume_fill(to, 0, err);
 
 	for (int view = 0; view < tools->geometry->count && code == 0; view++) {
-		code = check_cancelled(tools, err);
+		code = metal_check_cancelled(tools, err);
 		if (code == 0)
 			code = fdk_add(tools->fdk, view, view, tools->projections, to, err);
 	}
@@ -452,8 +577,15 @@ int metal_fdk(const struct metal_tools *tools, struct volume *to, struct error *
 
 /* ---- the prior ---- */
 
-/* HU below which a voxel is air, and from which it is bone; streaks of the first volume stay between them. */
-static const double AIR_HU = -500, BONE_HU = 400;
+/* HU below which a voxel is air. */
+static const double AIR_HU = -500;
+/*
+ * What keeps its value as bone: nothing below the first, all from the second on,
+ * and between them a part that grows. Streaks of the first volume reach higher
+ * than those of the later ones.
+ */
+static const double BONE_FIRST[2] = {400, 400}, BONE_LATER[2] = {150, 300};
+enum { PASSES = 4 };
 
 /* (1 2 1)/4 along x and along y, outer values held. */
 static void smooth_slice(const struct grid *grid, const float *from, float *scratch, float *ret)
@@ -476,23 +608,29 @@ static void smooth_slice(const struct grid *grid, const float *from, float *scra
 	}
 }
 
-static void classify(const struct grid *grid, double mu_water, const float *before, const float *here,
-		     const float *behind, float *ret)
+static void classify(const struct grid *grid, double mu_water, const double bone[2], const float *before,
+		     const float *here, const float *behind, float *ret)
 {
-	const float air = (float)(mu_water * (1 + AIR_HU / 1000)), bone = (float)(mu_water * (1 + BONE_HU / 1000));
+	for (size_t i = 0; i < metal_slice_voxels(grid); i++) {
+		const double value = .25 * ((double)before[i] + 2 * (double)here[i] + (double)behind[i]);
+		const double hu = 1000 * (value / mu_water - 1);
 
-	for (size_t i = 0; i < slice_voxels(grid); i++) {
-		const float value = .25f * (before[i] + 2 * here[i] + behind[i]);
-
-		ret[i] = value < air ? 0 : value < bone ? (float)mu_water : value;
+		if (hu < AIR_HU)
+			ret[i] = 0;
+		else if (hu <= bone[0])
+			ret[i] = (float)mu_water;
+		else if (hu >= bone[1])
+			ret[i] = (float)value;
+		else
+			ret[i] = (float)(mu_water + (hu - bone[0]) / (bone[1] - bone[0]) * (value - mu_water));
 	}
 }
 
 /* The volume to work in becomes the prior, but for the metal. */
-static int make_prior(const struct metal_tools *tools, struct error *err)
+static int make_prior(const struct metal_tools *tools, const double bone[2], struct error *err)
 {
 	const struct grid *grid = tools->grid;
-	const size_t slice = slice_voxels(grid);
+	const size_t slice = metal_slice_voxels(grid);
 	const int nz = grid->size[2];
 	float *ring = malloc(5 * slice * sizeof(float)), *raw, *scratch;
 	int code = 0;
@@ -509,34 +647,42 @@ static int make_prior(const struct metal_tools *tools, struct error *err)
 		if (code == 0 && z >= 0) {
 			const float *here = ring + (size_t)(z % 3) * slice;
 
-			classify(grid, tools->mu_water, z > 0 ? ring + (size_t)((z - 1) % 3) * slice : here, here,
+			classify(grid, tools->mu_water, bone, z > 0 ? ring + (size_t)((z - 1) % 3) * slice : here, here,
 				 z + 1 < nz ? ring + (size_t)((z + 1) % 3) * slice : here, raw);
 			code = tools->backend->volume_put(tools->volume, z, 1, raw, err);
 		}
 		if (code == 0)
-			code = check_cancelled(tools, err);
+			code = metal_check_cancelled(tools, err);
 	}
 	free(ring);
 	return code;
 }
 
-int metal_replace(struct metal *metal, const struct metal_tools *tools, struct error *err)
+int metal_find_traces(struct metal *metal, const struct metal_tools *tools, struct error *err)
 {
 	int code = tools->backend->volume_fill(tools->volume, 0, err);
 
 	metal->traces_count = metal->replaced = 0;
 	metal->views = 0;
+	if (metal->dark_count > 0)
+		qsort(metal->dark, metal->dark_count, sizeof(*metal->dark), compare_traces);
 	if (code == 0)
-		code = change_slices(metal, tools, tools->volume, set, 1, err);
-	if (code == 0)
-		code = fill_all(metal, tools, false, err);
-	if (code == 0)
+		code = change_slices(metal, tools, tools->volume, set_core, 1, err);
+	return code < 0 ? code : treat_all(metal, tools, TRACE, err);
+}
+
+int metal_replace(struct metal *metal, const struct metal_tools *tools, struct error *err)
+{
+	int code = treat_all(metal, tools, FILL, err);
+
+	for (int pass = 0; pass < PASSES && code == 0; pass++) {
 		code = metal_fdk(tools, tools->volume, err);
-	if (code == 0)
-		code = make_prior(tools, err);
-	if (code == 0)
-		code = change_slices(metal, tools, tools->volume, set, tools->mu_water, err);
-	if (code == 0)
-		code = fill_all(metal, tools, true, err);
+		if (code == 0)
+			code = make_prior(tools, pass == 0 ? BONE_FIRST : BONE_LATER, err);
+		if (code == 0)
+			code = change_slices(metal, tools, tools->volume, at_least_in_core, tools->mu_water, err);
+		if (code == 0)
+			code = treat_all(metal, tools, FILL_OVER_PRIOR, err);
+	}
 	return code;
 }

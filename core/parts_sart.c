@@ -60,6 +60,10 @@ static void correct_row(const struct view *view, const struct box *box, int row,
 	for (int c = 0; c < columns; c++) {
 		double direction[3], length, residual = (double)measured[c] - (double)projected[c];
 
+		if (isnan(measured[c])) { /* RAY_LEFT_OUT */
+			projected[c] = 0;
+			continue;
+		}
 		for (int i = 0; i < 3; i++)
 			direction[i] =
 			    view->pixel0[i] + c * view->column_step[i] + row * view->row_step[i] - view->source[i];

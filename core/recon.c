@@ -47,8 +47,6 @@ struct recon {
 	struct volume *before;     /* the iterate before the iteration, and for metal to work in; NULL without both */
 	struct stack *batch;       /* for metal to work in; NULL without */
 	struct metal metal;
-	struct stack *stand_in; /* one slot, once a view is blank and SART is on */
-	float *stand_in_host;
 
 	unsigned char *pushed; /* [views] */
 	int pushed_count;
@@ -66,7 +64,7 @@ struct recon {
  * What the stages cost beside an FDK of the whole scan, roughly, as measured on
  * CPU and GPU alike: only the progress bar lives on it.
  */
-static const double WORK_LOAD = 0.2, WORK_FDK = 1, WORK_SART = 4, WORK_TV = 0.2, WORK_METAL = 6;
+static const double WORK_LOAD = 0.2, WORK_FDK = 1, WORK_SART = 4, WORK_TV = 0.2, WORK_METAL = 12;
 
 static double recipe_work(const struct recipe *recipe)
 {
@@ -191,7 +189,7 @@ static struct recon_memory memory_in_parts(const struct plan_options *options, c
 		memory.scratch = around->device - memory.volumes;
 	if (has_metal)
 		memory.host += sizeof(float) * ((size_t)metal_slots(geometry) * pixels +
-						(options->sart == NULL ? grid_voxels(options->grid) : 0));
+						(options->sart == NULL ? 2 : 1) * grid_voxels(options->grid));
 	return memory;
 }
 
@@ -419,7 +417,6 @@ void recon_free(struct recon *recon)
 		return;
 	recon->backend->volume_free(recon->before);
 	recon->backend->volume_free(recon->volume);
-	recon->backend->stack_free(recon->stand_in);
 	recon->backend->stack_free(recon->projections);
 	recon->backend->stack_free(recon->batch);
 	metal_clear(&recon->metal);
@@ -433,7 +430,6 @@ void recon_free(struct recon *recon)
 		backend_parts.close(recon->parts);
 	input_clear(&recon->input);
 	geometry_clear(&recon->upright);
-	free(recon->stand_in_host);
 	free(recon->pushed);
 	free(recon);
 }
@@ -505,6 +501,9 @@ static struct metal_tools metal_tools(struct recon *recon)
 	    .geometry = recon->geometry,
 	    .grid = &recon->recipe.grid,
 	    .mu_water = recon->recipe.mu_water,
+	    .blank = recon->input.blank,
+	    .blanks = recon->input.counts.blank,
+	    .pixel = fmax(recon->orbit.pixel_at_isocentre[0], recon->orbit.pixel_at_isocentre[1]),
 	    .cancel = cancel_of(recon),
 	};
 }
@@ -527,14 +526,14 @@ static int keep(struct recon *recon, const char *name, const char *stage, struct
 	tell_progress(recon, STAGE_SAVE, recon->iteration);
 	if (recon->metal.voxels_count == 0)
 		return recon->hooks->keep(recon->hooks->context, recon, &kept, err);
-	code = metal_exchange(&recon->metal, &tools, recon->volume, err);
+	code = metal_show(&recon->metal, &tools, recon->volume, err);
 	if (code == 0)
 		code = measure(recon, NULL, &kept.norms, err);
 	if (code == 0)
 		code = recon->hooks->keep(recon->hooks->context, recon, &kept, err);
 	if (code < 0)
 		return code;
-	return metal_exchange(&recon->metal, &tools, recon->volume, err);
+	return metal_hide(&recon->metal, &tools, recon->volume, err);
 }
 
 /* ---- views in ---- */
@@ -566,7 +565,8 @@ static int push_view(struct recon *recon, const void *samples, int view, struct 
 	/* Again here: the list of one call may name a view twice. */
 	if (recon->pushed[view])
 		return error_set(err, ERR_CONFLICT, "view %d came a second time", view);
-	code = input_take(&recon->input, recon->backend, recon->plan, samples, view, slot, recon->projections, err);
+	code = input_take(&recon->input, recon->backend, recon->plan, samples, view, slot, recon->projections,
+			  recon->recipe.metal.on ? &recon->metal : NULL, err);
 	if (code < 0)
 		return code;
 	recon->pushed[view] = 1;
@@ -720,30 +720,49 @@ static int make_up_for_blank_views(struct recon *recon, struct error *err)
 }
 
 /*
- * SART knows no view that is not there: a blank one is made to agree with the
- * iterate as it is before each iteration, and corrects next to nothing.
+ * Rays that say nothing are left out of SART: those through metal, and all of a
+ * blank view. It comes after all else that is done with the projections.
  */
-static int stand_in_for_blank_views(struct recon *recon, struct error *err)
+static int leave_rays_out(struct recon *recon, struct error *err)
 {
-	const struct backend *backend = recon->backend;
-	const struct geometry *geometry = recon->geometry;
-	int code = 0;
+	const struct metal_tools tools = metal_tools(recon);
+	const size_t pixels = (size_t)recon->geometry->columns * (size_t)recon->geometry->rows;
+	float *nothing = NULL;
+	int code = recon->metal.traces_count > 0 ? metal_leave_out(&recon->metal, &tools, err) : 0;
 
-	if (recon->input.counts.blank > 0 && recon->stand_in == NULL) {
-		recon->stand_in_host = malloc(sizeof(float) * (size_t)geometry->columns * (size_t)geometry->rows);
-		if (recon->stand_in_host == NULL)
-			return error_set(err, ERR_NO_MEMORY, "no memory for a view");
-		code = backend->stack_new(recon->device, geometry->columns, geometry->rows, 1, &recon->stand_in, err);
-	}
-	for (int i = 0; code == 0 && i < recon->input.counts.blank; i++) {
-		const int view = recon->input.blank[i];
+	if (code < 0 || recon->input.counts.blank == 0)
+		return code;
+	nothing = malloc(pixels * sizeof(*nothing));
+	if (nothing == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a view");
+	for (size_t i = 0; i < pixels; i++)
+		nothing[i] = RAY_LEFT_OUT;
+	for (int i = 0; i < recon->input.counts.blank && code == 0; i++)
+		code = recon->backend->stack_upload(recon->projections, recon->input.blank[i], 1, nothing, err);
+	free(nothing);
+	return code;
+}
 
-		code = backend->project(recon->plan, recon->volume, &view, 1, recon->stand_in, err);
-		if (code == 0)
-			code = backend->stack_download(recon->stand_in, 0, 1, recon->stand_in_host, err);
-		if (code == 0)
-			code = backend->stack_upload(recon->projections, view, 1, recon->stand_in_host, err);
-	}
+/* Metal's shadows out of the projections, and of the FDK of those and the one before what is better at each place. */
+static int replace_metal(struct recon *recon, const struct metal_tools *tools, struct error *err)
+{
+	struct metal *metal = &recon->metal;
+	struct metal_doubt doubt = {0};
+	int code = metal_find_traces(metal, tools, err);
+
+	if (code == 0)
+		code = metal_doubt_make(&doubt, metal, tools, recon->volume, err);
+	if (code == 0)
+		code = metal_replace(metal, tools, err);
+	if (code == 0)
+		code = metal_fdk(tools, recon->volume, err);
+	if (code == 0)
+		code = make_up_for_blank_views(recon, err);
+	if (code == 0)
+		code = metal_doubt_blend(&doubt, metal, tools, recon->volume, err);
+	if (code == 0)
+		code = measure(recon, NULL, &recon->norms, err);
+	metal_doubt_clear(&doubt);
 	return code;
 }
 
@@ -752,18 +771,15 @@ static int take_metal_out(struct recon *recon, struct error *err)
 {
 	const struct metal_tools tools = metal_tools(recon);
 	const double threshold = recon->recipe.mu_water * (1 + recon->recipe.metal.threshold_hu / 1000);
-	int code = metal_find(&recon->metal, &tools, recon->volume, threshold, err);
+	struct metal *metal = &recon->metal;
+	int code = metal_find(metal, &tools, recon->volume, threshold, err);
 
-	if (code == 0 && recon->metal.voxels_count > 0)
-		code = metal_replace(&recon->metal, &tools, err);
-	if (code == 0 && recon->metal.voxels_count > 0)
-		code = metal_fdk(&tools, recon->volume, err);
-	if (code == 0 && recon->metal.voxels_count > 0)
-		code = measure(recon, NULL, &recon->norms, err);
+	if (code == 0 && metal->voxels_count > 0)
+		code = replace_metal(recon, &tools, err);
 	if (code < 0)
 		return code;
 	recon->work_done += WORK_METAL;
-	warn_metal(recon->hooks, recon->geometry, &recon->recipe, &recon->metal);
+	warn_metal(recon->hooks, recon->geometry, &recon->recipe, metal);
 	return 0;
 }
 
@@ -809,11 +825,13 @@ static int finish_fdk(struct recon *recon, struct error *err)
 static int take_metal_out_again(struct recon *recon, struct error *err)
 {
 	const struct metal_tools tools = metal_tools(recon);
+	int code;
 
 	if (recon->metal.voxels_count == 0)
 		return 0;
 	tell_progress(recon, STAGE_LOAD, recon->iteration);
-	return metal_replace(&recon->metal, &tools, err);
+	code = metal_find_traces(&recon->metal, &tools, err);
+	return code < 0 ? code : metal_replace(&recon->metal, &tools, err);
 }
 
 static double now(void)
@@ -835,8 +853,6 @@ static int iterate(struct recon *recon, struct history_row *ret_row, struct erro
 
 	tell_progress(recon, STAGE_SART, iteration);
 	code = backend->volume_copy(recon->before, recon->volume, err);
-	if (code == 0)
-		code = stand_in_for_blank_views(recon, err);
 	if (code == 0)
 		code =
 		    backend->sart_iterate(recon->plan, recon->projections, recon->volume, cancel_of(recon), &sums, err);
@@ -970,6 +986,8 @@ static int run_sart(struct recon *recon, struct error *err)
 	bool last = recon->iteration >= recon->recipe.sart.iterations;
 	int failed = last ? 0 : leave_out_the_exterior(recon, err);
 
+	if (failed == 0 && !last)
+		failed = leave_rays_out(recon, err);
 	if (failed < 0)
 		return failed;
 

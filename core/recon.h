@@ -57,6 +57,8 @@ struct recipe {
 enum { SUBSETS_DEFAULT = 0, SUBSETS_VIEWS = -1 };
 
 enum { ITERATIONS_MAX = 100000, GRID_DEFAULT_MOST = 512, METAL_HU_LEAST = 500, METAL_HU_MOST = 1000000 };
+/* What is nearer to metal than this is an estimate: most of its rays cross the metal's shadows. */
+enum { METAL_ESTIMATE_MM = 10 };
 
 void recipe_defaults(struct recipe *ret_recipe); /* nothing on; the values that `{}` stages take */
 /* TV with numbers in place of those found: alpha 0.1, and 10 steps of 0.1 or 100 iterations; unit and `on` stay. */

@@ -215,8 +215,10 @@ void warn_metal(const struct recon_hooks *hooks, const struct geometry *geometry
 	}
 	recon_warn(
 	    hooks, "metal",
-	    "%zu voxels (%.3g %%) of %g HU or more are metal; %zu samples (%.3g %%) in %d projections were replaced "
-	    "from what lies beside them",
-	    metal->voxels_count, 100 * (double)metal->voxels_count / (double)grid_voxels(&recipe->grid),
-	    recipe->metal.threshold_hu, metal->replaced, 100 * (double)metal->replaced / samples, metal->views);
+	    "%zu voxels (%.3g %%) are metal: of %g HU or more, or at least half of that beside them; %zu samples (%.3g "
+	    "%%) "
+	    "in %d projections were replaced from what lies beside them, and are left out of SART: values within "
+	    "%d mm of metal are estimates",
+	    metal->found, 100 * (double)metal->found / (double)grid_voxels(&recipe->grid), recipe->metal.threshold_hu,
+	    metal->replaced, 100 * (double)metal->replaced / samples, metal->views, METAL_ESTIMATE_MM);
 }

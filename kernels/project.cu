@@ -81,8 +81,11 @@ static __device__ __forceinline__ float2 finish(const projection &p, int slot, i
 	if (p.use.measured != NULL) {
 		float measured = p.use.measured[(size_t)view * p.slot + pixel], residual = measured - integral;
 
-		value = slices > 0 && length >= p.use.least ? residual / length : 0.0f;
-		squares = {residual * residual, measured * measured};
+		bool left_out = isnan(measured);
+
+		value = !left_out && slices > 0 && length >= p.use.least ? residual / length : 0.0f;
+		if (!left_out)
+			squares = {residual * residual, measured * measured};
 	}
 	p.to[(size_t)slot * p.slot + pixel] = value;
 	if (p.use.array != 0)

@@ -42,9 +42,11 @@ static __device__ __forceinline__ float2 correct(const sweep_view &s, int column
 {
 	float measured = s.measured[(size_t)row * s.measured_pitch + column], residual = measured - integral;
 
+	bool left_out = isnan(measured);
+
 	s.correction[(size_t)column * s.correction_pitch + row] =
-	    length >= s.least && length > 0 ? residual / length : 0.0f;
-	return {residual * residual, measured * measured};
+	    !left_out && length >= s.least && length > 0 ? residual / length : 0.0f;
+	return left_out ? float2{0, 0} : float2{residual * residual, measured * measured};
 }
 
 enum { SWEEP_COLUMNS = 4, SWEEP_PARTS = 4 };

@@ -155,12 +155,13 @@ static __global__ void __launch_bounds__(32 * PARTS_MOST, ROWS > 4 || LEAN ? 3 :
 		for (int j = 0; j < PARTS_MOST; j++)
 			sum += j < parts ? shared[(j * 3 * ROWS + k) * 32 + threadIdx.x] : 0.0f;
 		float residual = measured - sum * factor * step;
-		float correction = length >= s.least && length > 0 ? residual / length : 0.0f;
+		bool left_out = isnan(measured);
+		float correction = !left_out && length >= s.least && length > 0 ? residual / length : 0.0f;
 		s.correction[slot * s.correction_slot + (size_t)row * s.correction_pitch + column] = correction;
 		if (s.array != 0)
 			surf2DLayeredwrite(correction, s.array, column * (int)sizeof(float), row, slot);
-		squares.x += residual * residual;
-		squares.y += measured * measured;
+		squares.x += left_out ? 0.0f : residual * residual;
+		squares.y += left_out ? 0.0f : measured * measured;
 	}
 	squares = block_sum(squares);
 	if (threadIdx.x == 0 && threadIdx.y == 0)
@@ -201,7 +202,7 @@ static __global__ void __launch_bounds__(MISSED_THREADS)
 			break;
 		float value = measured[(size_t)(s.rows_down ? s.rows - 1 - low : low) * s.measured_pitch + column];
 
-		squares.x += value * value;
+		squares.x += isnan(value) ? 0.0f : value * value;
 	}
 	squares.y = squares.x;
 	squares = block_sum(squares);

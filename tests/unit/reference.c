@@ -479,6 +479,10 @@ static void corrections(const struct geometry *geometry, const struct grid *grid
 			double length, integral = reference_ray(geometry, grid, view, column, row, volume, &length);
 			double difference = (double)measured[at] - integral;
 
+			if (isnan(measured[at])) { /* RAY_LEFT_OUT */
+				ret[at] = 0;
+				continue;
+			}
 			sums->residual2 += difference * difference;
 			sums->projection2 += (double)measured[at] * (double)measured[at];
 			ret[at] = length >= least ? (float)(difference / length) : 0;
