@@ -356,13 +356,16 @@ static double line_between(const struct flank *before, const struct flank *behin
 
 /*
  * Without a prior a column may lead from the object to the air beyond its end,
- * where the row lies in the object or does not: what the column says counts as far as it agrees with the row.
+ * and nothing tells where between them the object ends: such a column counts the less, the less its ends agree.
  */
-static double agreement(double along, double across)
+static double evenness(const struct flank *before, const struct flank *behind)
 {
-	const double part = 0.3;
+	const double part = 0.5;
 
-	return fmax(0, 1 - fabs(along - across) / fmax(part * fmax(fabs(along), fabs(across)), 1e-6));
+	if (before->nearest == 0 || behind->nearest == 0)
+		return 1;
+	return fmax(0, 1 - fabs(before->value - behind->value) /
+			       fmax(part * fmax(fabs(before->value), fabs(behind->value)), 1e-6));
 }
 
 void metal_fill_view(const struct metal_view *of)
@@ -385,7 +388,7 @@ void metal_fill_view(const struct metal_view *of)
 			along = line_between(&left, &right, &weights[0]);
 			across = line_between(&above, &below, &weights[1]);
 			if (of->prior == NULL && weights[0] > 0)
-				weights[1] *= agreement(along, across);
+				weights[1] *= evenness(&above, &below);
 			if (weights[0] + weights[1] > 0) /* otherwise there is nothing but metal to go by */
 				of->values[at] =
 				    (float)((weights[0] * along + weights[1] * across) / (weights[0] + weights[1]) +

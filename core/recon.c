@@ -526,6 +526,7 @@ static int keep(struct recon *recon, const char *name, const char *stage, struct
 	tell_progress(recon, STAGE_SAVE, recon->iteration);
 	if (recon->metal.voxels_count == 0)
 		return recon->hooks->keep(recon->hooks->context, recon, &kept, err);
+	kept.estimate_mm = METAL_ESTIMATE_MM;
 	code = metal_show(&recon->metal, &tools, recon->volume, err);
 	if (code == 0)
 		code = measure(recon, NULL, &kept.norms, err);

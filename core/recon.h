@@ -100,6 +100,7 @@ struct kept_volume {
 	int iteration;     /* 0 before the first */
 	const struct grid *grid;
 	struct volume_norms norms;
+	double estimate_mm; /* what is nearer to metal is an estimate (METAL_ESTIMATE_MM); 0: there is no metal */
 };
 
 struct recon;

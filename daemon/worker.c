@@ -232,6 +232,7 @@ static int on_volume(void *context, const struct kept_volume *volume, const stru
 				  .iteration = volume->iteration,
 				  .grid = *volume->grid,
 				  .norms = volume->norms,
+				  .estimate_mm = volume->estimate_mm,
 				  .bytes = saved->bytes};
 
 	snprintf(message.name, sizeof(message.name), "%s", volume->name);

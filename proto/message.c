@@ -95,6 +95,7 @@ static const struct field volume_fields[] = {FIELD("job", FIELD_STRING, job),
 					     FIELD("maximum", FIELD_NUMBER, norms.maximum),
 					     FIELD("mean", FIELD_NUMBER, norms.mean),
 					     FIELD("not_finite", FIELD_SIZE, norms.not_finite),
+					     FIELD("estimate_mm", FIELD_NUMBER, estimate_mm),
 					     {0}};
 static const struct field settled_fields[] = {FIELD("job", FIELD_STRING, job), FIELD("name", FIELD_STRING, name), {0}};
 static const struct field noise_fields[] = {FIELD("job", FIELD_STRING, job),

@@ -29,7 +29,8 @@ enum message_kind {
 	MESSAGE_TAKEN,    /* job, count: projections reconstructed so far */
 	MESSAGE_PROGRESS, /* job, stage, iteration, fraction */
 	MESSAGE_ROW,      /* job, row */
-	MESSAGE_VOLUME,   /* job, name, stage, iteration, bytes, norms: the file is there, whole, for everybody */
+	MESSAGE_VOLUME,   /* job, name, stage, iteration, bytes, norms, estimate_mm: the file is there, whole, for
+			     everybody */
 	MESSAGE_SETTLED,  /* job, name: that file is on the disk; before the job ends, but for what failed */
 	MESSAGE_NOISE,    /* job, noise_hu, alpha: what TV goes by, see recon_hooks.denoising */
 	MESSAGE_WARNING,  /* job, code, detail */
@@ -67,6 +68,7 @@ struct message {
 	char name[32], volume_stage[16];
 	struct grid grid;
 	struct volume_norms norms;
+	double estimate_mm;
 	size_t bytes;
 	char code_name[64], text[512]; /* WARNING: code and detail; ENDED: text */
 	int code;

@@ -266,6 +266,11 @@ static void put_planes(FILE *out, const struct shown *shown)
 		fprintf(out, "\" alt=\"the middle of %s: %s\">", volume, plane_name(shown, &planes[i]));
 	}
 	fputs("</p>\n", out);
+	if (shown->volumes[shown->chosen].estimate_mm > 0)
+		fprintf(
+		    out,
+		    "<p><strong>Within %g mm of metal this volume is an estimate: do not measure there.</strong></p>\n",
+		    shown->volumes[shown->chosen].estimate_mm);
 	put_sides(out, shown);
 	fputs("<p>All planes: ", out);
 	for (int i = 0; i < 3; i++) {

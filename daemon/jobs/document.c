@@ -65,6 +65,9 @@ cJSON *volume_document(const char *job, const struct volume_record *volume)
 	cJSON_AddNumberToObject(statistics, "norm", sqrt(volume->norms.norm2));
 	cJSON_AddNumberToObject(statistics, "tv", volume->norms.tv);
 	cJSON_AddNumberToObject(statistics, "not_finite", (double)volume->norms.not_finite);
+	if (volume->estimate_mm > 0)
+		cJSON_AddNumberToObject(cJSON_AddObjectToObject(document, "metal"), "estimate_within_mm",
+					volume->estimate_mm);
 	json_add_time(document, "created", volume->created);
 	return document;
 }

@@ -10,7 +10,10 @@
  * caller's (cJSON_Delete); NULL when memory ran out. Any thread.
  */
 
-/* name, stage, iteration, size, spacing_mm, origin_mm, bytes, digest (once it is known), statistics, created, href. */
+/*
+ * name, stage, iteration, size, spacing_mm, origin_mm, bytes, digest (once it is known), statistics, metal (where there
+ * is any), created, href.
+ */
 cJSON *volume_document(const char *job, const struct volume_record *volume);
 cJSON *history_row_document(const struct history_row *row);
 /* type (urn:cbctd:problem:NAME), detail, pointer where there is one: how a job says what went wrong. */

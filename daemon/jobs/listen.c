@@ -60,8 +60,11 @@ static void hello(struct supervise *supervise, struct worker *worker, const stru
 
 static int add_volume(struct worker *worker, const struct message *message, struct error *err)
 {
-	struct volume_record volume = {
-	    .iteration = message->iteration, .grid = message->grid, .bytes = message->bytes, .norms = message->norms};
+	struct volume_record volume = {.iteration = message->iteration,
+				       .grid = message->grid,
+				       .bytes = message->bytes,
+				       .norms = message->norms,
+				       .estimate_mm = message->estimate_mm};
 
 	snprintf(volume.name, sizeof(volume.name), "%s", message->name);
 	snprintf(volume.stage, sizeof(volume.stage), "%s", message->volume_stage);

@@ -370,9 +370,9 @@ int store_job_add_volume(struct store *store, const char *id, const struct volum
 	query_begin(
 	    &query, &store->writer,
 	    "INSERT OR REPLACE INTO volumes (job, name, stage, iteration, nx, ny, nz, dx, dy, dz, x0, y0, z0,"
-	    " bytes, sha256, norm2, difference2, tv, minimum, maximum, mean, not_finite, created)"
+	    " bytes, sha256, norm2, difference2, tv, minimum, maximum, mean, not_finite, created, estimate_mm)"
 	    " VALUES ((SELECT number FROM jobs WHERE id = ?), ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?,"
-	    " ?, ?, ?, ?, ?)",
+	    " ?, ?, ?, ?, ?, ?)",
 	    err);
 	query_text(&query, id);
 	query_text(&query, volume->name);
@@ -394,6 +394,7 @@ int store_job_add_volume(struct store *store, const char *id, const struct volum
 	query_real(&query, volume->norms.mean);
 	query_integer(&query, (long long)volume->norms.not_finite);
 	query_real(&query, volume->created);
+	query_real(&query, volume->estimate_mm);
 	code = query_run(&query);
 	if (code == 0)
 		code = add_event(store, id, event, err);

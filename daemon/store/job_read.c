@@ -161,6 +161,7 @@ static void read_volume(struct query *query, void *element)
 	volume->norms.mean = column_real(query, 19);
 	volume->norms.not_finite = (size_t)sqlite3_column_int64(row, 20);
 	volume->created = sqlite3_column_double(row, 21);
+	volume->estimate_mm = sqlite3_column_double(row, 22);
 }
 
 static void read_warning(struct query *query, void *element)
@@ -224,7 +225,7 @@ int store_job_volumes(struct store *store, const char *id, struct volume_record 
 	void *array;
 	int code = read_all(store,
 			    "SELECT name, stage, iteration, nx, ny, nz, dx, dy, dz, x0, y0, z0, bytes, sha256, norm2,"
-			    " difference2, tv, minimum, maximum, mean, not_finite, created FROM volumes"
+			    " difference2, tv, minimum, maximum, mean, not_finite, created, estimate_mm FROM volumes"
 			    " WHERE job = (SELECT number FROM jobs WHERE id = ?) ORDER BY number",
 			    id, sizeof(**ret_volumes), read_volume, &array, ret_count, err);
 

@@ -112,6 +112,7 @@ static const char *const migrations[] = {
     /* What TV goes by, NULL before that was measured. */
     ("ALTER TABLE jobs ADD COLUMN noise_hu REAL;"
      "ALTER TABLE jobs ADD COLUMN tv_alpha REAL;"),
+    "ALTER TABLE volumes ADD COLUMN estimate_mm REAL NOT NULL DEFAULT 0;", /* around metal; 0: there is none */
 };
 enum { MIGRATIONS = sizeof(migrations) / sizeof(migrations[0]) };
 

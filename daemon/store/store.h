@@ -319,7 +319,8 @@ struct volume_record {
 	bool hashed;        /* this is known, and its file is on the disk: */
 	uint8_t sha256[32]; /* of the voxels */
 	struct volume_norms norms;
-	double created; /* seconds since 1970; another one when it is made again */
+	double estimate_mm; /* kept_volume's */
+	double created;     /* seconds since 1970; another one when it is made again */
 };
 
 struct warning_record {

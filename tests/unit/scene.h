@@ -54,6 +54,7 @@ struct outcome {
 		char name[32], stage[8];
 		int iteration;
 		struct volume_norms norms;
+		double estimate_mm;
 		float *voxels;
 	} kept[SCENE_KEPT_MOST];
 	int kept_count;

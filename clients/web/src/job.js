@@ -62,6 +62,7 @@ export class JobPage {
 		this.plot = new Plot(iteration => this.#selectIteration(iteration))
 		this.film = new Film()
 		this.sides = h('p', { class: 'sides', hidden: true }, 'Left and right are not known: neither scan nor job says how the patient lies. The letters are those of the table\'s axes.')
+		this.estimate = h('p', { class: 'estimate', hidden: true })
 		this.controls = h('div', { class: 'controls', hidden: true }, this.#iterationControls(), this.#viewControls(), this.#compareControls())
 		this.warnings = h('div', {})
 		this.failure = h('div', {})
@@ -72,7 +73,7 @@ export class JobPage {
 		this.fileSection = h('section', { class: 'card', hidden: true }, h('h2', {}, 'Downloads'), this.files)
 		this.progress = h('div', { class: 'progress' }, this.bar.element, this.doing, this.left)
 		this.columns = h('div', { class: 'columns' },
-			h('div', { class: 'pictures' }, this.empty, this.stage, this.sides, this.controls),
+			h('div', { class: 'pictures' }, this.empty, this.stage, this.estimate, this.sides, this.controls),
 			h('div', { class: 'aside' }, this.warnings, this.courseSection, this.fileSection,
 				h('section', { class: 'card' }, h('h2', {}, 'Projections'), this.film.element),
 				h('section', { class: 'card' }, h('h2', {}, 'Reconstruction'), this.about),
@@ -342,6 +343,8 @@ export class JobPage {
 		this.slider.setAttribute('aria-valuetext', text)
 		write(this.sliderText, text)
 		this.viewer.tag.textContent = volume.name
+		this.estimate.hidden = !volume.metal
+		write(this.estimate, volume.metal ? `Within ${volume.metal.estimate_within_mm} mm of metal this volume is an estimate: do not measure there.` : '')
 		this.back.disabled = index === 0
 		this.forth.disabled = index === this.#volumes.length - 1
 		this.#showPlot()
