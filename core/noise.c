@@ -1,13 +1,15 @@
 /*
- * The noise of a volume, from the volume itself: whatever its source, photons,
- * electronics or too few views, it is measured where it will be removed.
+ * The noise of a volume, from the volume itself, where TV will remove it.
  *
- * Cubes of a few voxels that lie in the object each give the mean square of
- * differences between voxels that are one and two apart. Noise is in all cubes,
- * edges and texture are in some: the lower quartile of the cubes is taken, as block
- * methods do (Olsen, CVGIP: Graph. Models Image Process. 55, 1993). Two distances,
- * because reconstructed noise is correlated: neighbours of a finely sampled volume
- * are alike, and voxels at twice the distance, by the ramp filter, are rather opposite.
+ * Cubes of a few voxels that lie in the object each give the mean square of mixed
+ * differences, v(x, z) - v(x + 2, z) - v(x, z + 2) + v(x + 2, z + 2), and the same with y.
+ * White noise of variance s^2 makes that 4 s^2. A slope or an edge along an axis
+ * cancels, and so do the streaks of few views, which hardly change from slice to
+ * slice: they are no noise, and stronger TV takes small contrasts with them. Voxels
+ * two apart, because reconstructed noise is correlated and neighbours of a finely
+ * sampled volume are alike. Noise is in all cubes, edges and texture are in some:
+ * the lower quartile of the cubes is taken, as block methods do (Olsen, CVGIP: Graph.
+ * Models Image Process. 55, 1993).
  */
 #include "core/noise.h"
 
@@ -17,11 +19,14 @@
 #include "core/sart.h"
 
 /*
- * Sides of a cube in voxels: hundreds of differences in the first. Where less than CUBES_LEAST of them fit into the
- * object, a finger or a few slices, the next one is tried. Of a large volume some cubes are left out.
+ * Sides of a cube in voxels: hundreds of mixed differences in the first. Where less than CUBES_LEAST of them fit into
+ * the object, a finger or a few slices, the next one is tried. Of a large volume some cubes are left out.
  */
 static const int sides[] = {6, 4, 3};
-enum { SIDES = sizeof(sides) / sizeof(sides[0]), CUBES_LEAST = 12, CUBES_MOST = 40000 };
+enum { SIDES = sizeof(sides) / sizeof(sides[0]), CUBES_LEAST = 12, CUBES_MOST = 20000 };
+
+/* Voxels that the object's level, mean and contrast are taken from, about. */
+enum { SAMPLES = 100000 };
 
 /* A cube lies in the object when its mean is so much of the object's: fat counts, lung and a rim of air do not. */
 static const double INSIDE = 0.8;
@@ -40,7 +45,7 @@ struct classes {
  */
 static struct classes classes_of(const float *slices, size_t voxels)
 {
-	const size_t stride = voxels / 200000 + 1;
+	const size_t stride = voxels / SAMPLES + 1;
 	struct classes classes = {0};
 
 	for (int pass = 0; pass < 20; pass++) {
@@ -66,35 +71,57 @@ static struct classes classes_of(const float *slices, size_t voxels)
 	return classes;
 }
 
-/* Half the mean square difference of voxels one and two apart along each axis; negative where the mean is below
- * `least`.
- */
-static float cube_variance(const float *corner, const int side[3], const size_t stride[3], double least)
+/* The pairs of axes of the mixed differences: both with z, or of a single slice x with y. */
+static const int with_z[2][2] = {{0, 2}, {1, 2}}, in_slice[1][2] = {{0, 1}};
+enum { APART = 2 }; /* voxels */
+
+/* Sum of squares of the cube's mixed differences along two axes; *ret_count gets their number added. */
+static double mixed_differences(const float *corner, const int side[3], const size_t stride[3], const int axes[2],
+				size_t *ret_count)
 {
-	double square = 0, sum = 0;
-	size_t count = 0;
+	const size_t a = APART * stride[axes[0]], b = APART * stride[axes[1]];
+	int count[3] = {side[0], side[1], side[2]};
+	double square = 0;
+
+	for (int i = 0; i < 2; i++)
+		count[axes[i]] = side[axes[i]] > APART ? side[axes[i]] - APART : 0;
+	for (int z = 0; z < count[2]; z++)
+		for (int y = 0; y < count[1]; y++)
+			for (int x = 0; x < count[0]; x++) {
+				const float *v =
+				    corner + (size_t)z * stride[2] + (size_t)y * stride[1] + (size_t)x * stride[0];
+				const double d = (double)((v[a + b] - v[a]) - (v[b] - v[0]));
+
+				square += d * d;
+			}
+	*ret_count += (size_t)count[0] * (size_t)count[1] * (size_t)count[2];
+	return square;
+}
+
+static double cube_mean(const float *corner, const int side[3], const size_t stride[3])
+{
+	double sum = 0;
 
 	for (int z = 0; z < side[2]; z++)
 		for (int y = 0; y < side[1]; y++)
-			for (int x = 0; x < side[0]; x++) {
-				const int place[3] = {x, y, z};
-				const float *v =
-				    corner + (size_t)z * stride[2] + (size_t)y * stride[1] + (size_t)x * stride[0];
+			for (int x = 0; x < side[0]; x++)
+				sum += (double)
+				    corner[(size_t)z * stride[2] + (size_t)y * stride[1] + (size_t)x * stride[0]];
+	return sum / ((double)side[0] * side[1] * side[2]);
+}
 
-				sum += (double)*v;
-				for (int axis = 0; axis < 3; axis++)
-					for (int apart = 1; apart <= 2; apart++) {
-						if (place[axis] + apart >= side[axis])
-							continue;
-						const double d = (double)(v[(size_t)apart * stride[axis]] - *v);
+/* The variance of white noise with these mixed differences; negative where the mean is below `least`. */
+static float cube_variance(const float *corner, const int side[3], const size_t stride[3], double least)
+{
+	const bool deep = side[2] > APART;
+	double square = 0;
+	size_t count = 0;
 
-						square += d * d;
-						count++;
-					}
-			}
-	if (!(sum >= least * side[0] * side[1] * side[2]) || count == 0 || !isfinite(square))
+	if (!(cube_mean(corner, side, stride) >= least))
 		return -1;
-	return (float)(square / (2 * (double)count));
+	for (int i = 0; i < (deep ? 2 : 1); i++)
+		square += mixed_differences(corner, side, stride, deep ? with_z[i] : in_slice[i], &count);
+	return count > 0 && isfinite(square) ? (float)(square / (4 * (double)count)) : -1;
 }
 
 static int compare_floats(const void *a, const void *b)
@@ -106,7 +133,7 @@ static int compare_floats(const void *a, const void *b)
 
 static double contrast_of(const float *slices, size_t voxels, const struct classes *classes, double variance)
 {
-	const size_t stride = voxels / 200000 + 1;
+	const size_t stride = voxels / SAMPLES + 1;
 	double square = 0;
 	size_t count = 0;
 
@@ -183,15 +210,30 @@ int noise_of_slices(const float *slices, const int size[3], struct volume_noise 
 }
 
 /*
- * How far medium TV moves a voxel, from phantoms of heads, wrists, necks and abdomens (tests/bench/denoise.c): the
- * balance with the least error beside the truth. The FDK volume is blurred already, and TV blurs its edges further:
- * there is nothing to be won before the noise exceeds a fortieth of the contrast. SART's iterations take up noise
- * again each time, the more updates they have, and overshoot at edges by a share of the contrast, the more the fewer
- * views an update has. Both are given for ten updates of ten views; how they go with
- * the updates was measured from one of 80 views to 80 of one.
+ * How far medium TV moves a voxel: the balance with the least error beside the truth, or a weaker one where the error
+ * hardly changes and small contrasts stay. From phantoms of heads, wrists, necks and abdomens (tests/bench/denoise.c,
+ * and results/denoise.txt beside it, which has other rules, too).
+ *
+ * The FDK volume is blurred already, and TV blurs its edges further: there is nothing to be won before the noise
+ * exceeds a fortieth of the contrast.
  */
-static const double FDK_NOISE = 0.35, FDK_CONTRAST = 0.025, SART_NOISE = 0.18, SART_CONTRAST = 0.035;
-static const double UPDATES = 10, VIEWS = 10;
+static const double FDK_NOISE = 0.35, FDK_CONTRAST = 0.025;
+
+/*
+ * SART takes up noise again in each iteration, the more updates that has (measured from 1 to 80). Of FDK's noise it
+ * knows what the grid can hold: pixels that are finer than the voxels bring FDK noise that SART's rays average away.
+ * The power of the noise is just below 1: where there is little noise, the grid's own error adds to it.
+ */
+static const double SART_NOISE = 0.2, NOISE_POWER = 0.85, FINENESS_POWER = 0.9, FINENESS_MOST = 2, UPDATES = 10;
+
+/*
+ * What SART adds beside noise goes with the contrast. With few views, streaks. Where the detector resolves more than
+ * the grid can hold (`fineness`, pixel over voxel, below FINE), strong edges overshoot: that is bone, and the third
+ * power of the contrast beside STRONG of water's attenuation tells it from soft tissue.
+ */
+static const double FEW = 0.012, FEW_VIEWS = 60, FEWEST_VIEWS = 40;
+static const double EDGES = 0.057, FINE = 0.63, STRONG = 0.28;
+
 /* Beyond it, TV moves nothing that a float of a gray level could tell. */
 static const double ALPHA_MOST = 1e9;
 
@@ -200,18 +242,25 @@ static double reach_after_fdk(const struct volume_noise *noise)
 	return FDK_NOISE * fmax(0, noise->sigma - FDK_CONTRAST * noise->contrast);
 }
 
-static double reach_after_sart(const struct volume_noise *noise, const struct recipe *recipe, int views)
+static double reach_after_sart(const struct volume_noise *noise, const struct recipe *recipe, const struct orbit *orbit)
 {
-	const double subsets = subsets_count(recipe->sart.subsets, views), step = recipe->sart.relaxation;
+	const double *mm = recipe->grid.spacing, *pixel = orbit->pixel_at_isocentre;
+	const double fineness = sqrt(pixel[0] * pixel[1]) / cbrt(mm[0] * mm[1] * mm[2]);
+	const double updates = recipe->sart.relaxation * subsets_count(recipe->sart.subsets, orbit->count) / UPDATES;
+	const double streaks = FEW * pow(FEW_VIEWS / fmax(orbit->count, FEWEST_VIEWS), 4);
+	const double edges =
+	    EDGES * fmax(0, 1 - pow(fineness / FINE, 4)) * pow(noise->contrast / (STRONG * recipe->mu_water), 3);
+	const double noisy = SART_NOISE * pow(noise->sigma, NOISE_POWER) * pow(noise->contrast, 1 - NOISE_POWER) *
+			     pow(fmin(fineness, FINENESS_MOST), FINENESS_POWER);
 
-	return hypot(SART_NOISE * noise->sigma * step * subsets / UPDATES,
-		     SART_CONTRAST * noise->contrast * sqrt(step * VIEWS * subsets / views));
+	return updates * noisy + sqrt(updates) * noise->contrast * (streaks + edges);
 }
 
-double noise_alpha(const struct volume_noise *noise, const struct recipe *recipe, int views, enum noise_stage stage)
+double noise_alpha(const struct volume_noise *noise, const struct recipe *recipe, const struct orbit *orbit,
+		   enum noise_stage stage)
 {
 	static const double factors[TV_STRENGTH_COUNT] = {[TV_LIGHT] = 0.5, [TV_MEDIUM] = 1, [TV_STRONG] = 2};
-	const double reach = stage == NOISE_OF_FDK ? reach_after_fdk(noise) : reach_after_sart(noise, recipe, views);
+	const double reach = stage == NOISE_OF_FDK ? reach_after_fdk(noise) : reach_after_sart(noise, recipe, orbit);
 	const double alpha = recipe->tv.options.unit / (factors[recipe->tv.strength] * reach);
 
 	return alpha <= ALPHA_MOST ? alpha : INFINITY;

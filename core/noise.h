@@ -9,7 +9,7 @@
  */
 
 /* Slices that noise_measure looks at, at most: those in the middle of the volume. */
-enum { NOISE_SLICES = 32 };
+enum { NOISE_SLICES = 24 };
 
 /*
  * Of a volume's middle slices. All 0 where nothing stands out of the background.
@@ -26,7 +26,8 @@ enum noise_stage { NOISE_OF_FDK, NOISE_OF_SART };
  * The alpha of TV_PROXIMAL behind FDK or behind each SART iteration, in the recipe's gray levels and of its strength;
  * the recipe is resolved. INFINITY: no TV.
  */
-double noise_alpha(const struct volume_noise *noise, const struct recipe *recipe, int views, enum noise_stage stage);
+double noise_alpha(const struct volume_noise *noise, const struct recipe *recipe, const struct orbit *orbit,
+		   enum noise_stage stage);
 /*
  * How far TV with these settings can move a voxel, in 1/mm, roughly: the proximal form by 1 / alpha, explicit steps by
  * their sum at most.

@@ -475,7 +475,7 @@ static double tv_alpha(const struct recon *recon, enum noise_stage stage)
 
 	if (!recipe->tv.automatic)
 		return recipe->tv.options.alpha;
-	return noise_alpha(&recon->noise, recipe, recon->geometry->count, stage);
+	return noise_alpha(&recon->noise, recipe, &recon->orbit, stage);
 }
 
 static void tell_noise(const struct recon *recon)
@@ -658,7 +658,7 @@ static int measure_noise(struct recon *recon, struct error *err)
 		return code;
 	recon->noise_measured = true;
 	tell_noise(recon);
-	warn_tv(recon->hooks, &recon->recipe, &recon->noise, recon->geometry->count);
+	warn_tv(recon->hooks, &recon->recipe, &recon->noise, &recon->orbit);
 	return 0;
 }
 

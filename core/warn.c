@@ -186,12 +186,13 @@ void warn_exterior_stays(const struct recon_hooks *hooks)
 		   "projections: SART piles it up in the grid");
 }
 
-void warn_tv(const struct recon_hooks *hooks, const struct recipe *recipe, const struct volume_noise *noise, int views)
+void warn_tv(const struct recon_hooks *hooks, const struct recipe *recipe, const struct volume_noise *noise,
+	     const struct orbit *orbit)
 {
 	/* A voxel that is moved by so little of what it takes keeps nearly all of its noise. */
 	const double little = 0.25, hu = recipe->mu_water / 1000;
 	const enum noise_stage stage = recipe->sart.on ? NOISE_OF_SART : NOISE_OF_FDK;
-	const double needed = recipe->tv.options.unit / noise_alpha(noise, recipe, views, stage);
+	const double needed = recipe->tv.options.unit / noise_alpha(noise, recipe, orbit, stage);
 	const double reach = noise_reach(&recipe->tv.options);
 
 	if (recipe->tv.automatic || reach >= little * needed)

@@ -32,7 +32,8 @@ void warn_outside(const struct recon_hooks *hooks, const struct geometry *geomet
 /* "truncated": FDK of the orbit is too poor to take out what lies beyond the field of view. */
 void warn_exterior_stays(const struct recon_hooks *hooks);
 /* "tv_without_effect": explicit settings that cannot move a voxel by a fair share of the noise. */
-void warn_tv(const struct recon_hooks *hooks, const struct recipe *recipe, const struct volume_noise *noise, int views);
+void warn_tv(const struct recon_hooks *hooks, const struct recipe *recipe, const struct volume_noise *noise,
+	     const struct orbit *orbit);
 /* "metal", or "no_metal" where it has no voxels. */
 void warn_metal(const struct recon_hooks *hooks, const struct geometry *geometry, const struct recipe *recipe,
 		const struct metal *metal);

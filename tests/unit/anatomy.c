@@ -169,6 +169,61 @@ static void make_abdomen(struct body *body)
 	scatter(body, 80, (double[4]){30, -20, 70, 45}, (double[2]){3, 8}, 20, 60);
 }
 
+/* ---- small spheres ---- */
+
+/* Lengths in voxels. Tissue is even where it varies by a share of water's attenuation at most. */
+static const double SPHERE_RADIUS = 2, SPHERE_ROOM = 5, SPHERES_APART = 8, SPHERE_HU = 30, EVEN = 0.035;
+
+/* Whether the tissue is even around this voxel, and no other sphere is near. */
+static bool has_room(const struct anatomy_scan *scan, const int place[3])
+{
+	const int *size = scan->grid.size, room = (int)SPHERE_ROOM;
+	const size_t row = (size_t)size[0], slice = row * (size_t)size[1];
+	const float *at = scan->background + (size_t)place[2] * slice + (size_t)place[1] * row + place[0];
+
+	for (int z = -room; z <= room; z++)
+		for (int y = -room; y <= room; y++)
+			for (int x = -room; x <= room; x++)
+				if (x * x + y * y + z * z <= room * room &&
+				    fabs((double)(at[z * (long)slice + y * (long)row + x] - *at)) > EVEN * WATER)
+					return false;
+	for (int i = 0; i < scan->sphere_count; i++) {
+		double square = 0;
+
+		for (int a = 0; a < 3; a++) {
+			const double away =
+			    scan->grid.origin[a] + place[a] * scan->grid.spacing[a] - scan->spheres[i][a];
+
+			square += away * away;
+		}
+		if (square < pow(SPHERES_APART * scan->grid.spacing[0], 2))
+			return false;
+	}
+	return (double)*at > 0.8 * WATER && (double)*at < 1.2 * WATER;
+}
+
+/* Darker and brighter ones in turn, so that a slope beneath them does not count. */
+static void add_spheres(struct anatomy_scan *scan, struct body *body)
+{
+	const double radius = SPHERE_RADIUS * scan->grid.spacing[0];
+
+	for (int tries = 0; tries < 20000 && scan->sphere_count < SPHERES_MOST; tries++) {
+		double *sphere = scan->spheres[scan->sphere_count];
+		int place[3];
+
+		for (int a = 0; a < 3; a++) {
+			const int margin = (int)SPHERE_ROOM + (a == 2 ? 1 : 0);
+
+			place[a] = margin + (int)((scan->grid.size[a] - 2 * margin) * uniform(&body->random));
+			sphere[a] = scan->grid.origin[a] + place[a] * scan->grid.spacing[a];
+		}
+		if (!has_room(scan, place))
+			continue;
+		sphere[3] = scan->sphere_count++ % 2 ? SPHERE_HU : -SPHERE_HU;
+		add(body, SHAPE_ELLIPSOID, (double[3]){radius, radius, radius}, sphere, 0, sphere[3]);
+	}
+}
+
 /* ---- the scan ---- */
 
 static int make_geometry(struct geometry *ret_geometry, const struct anatomy_spec *spec, struct error *err)
@@ -220,7 +275,12 @@ int anatomy_scan_make(struct anatomy_scan *ret_scan, const struct anatomy_spec *
 	pixels = (size_t)scan.geometry.columns * (size_t)scan.geometry.rows;
 	scan.projections = malloc(sizeof(float) * pixels * (size_t)spec->views);
 	scan.truth = malloc(sizeof(float) * grid_voxels(&scan.grid));
-	if (body.failed || scan.projections == NULL || scan.truth == NULL) {
+	scan.background = malloc(sizeof(float) * grid_voxels(&scan.grid));
+	if (!body.failed && scan.background != NULL) {
+		phantom_voxelise(&body.phantom, &scan.grid, 3, scan.background);
+		add_spheres(&scan, &body);
+	}
+	if (body.failed || scan.projections == NULL || scan.truth == NULL || scan.background == NULL) {
 		code = error_set(err, ERR_NO_MEMORY, "no memory for a scan of %d views", spec->views);
 		goto out;
 	}
@@ -245,6 +305,7 @@ void anatomy_scan_clear(struct anatomy_scan *scan)
 	geometry_clear(&scan->geometry);
 	free(scan->projections);
 	free(scan->truth);
+	free(scan->background);
 	*scan = (struct anatomy_scan){0};
 }
 
@@ -329,6 +390,31 @@ static double edge_width(const struct anatomy_scan *scan, const float *volume)
 	return best * 2 * sqrt(2 * log(2));
 }
 
+/* How far the inner voxels of a sphere are above those of a shell around it. */
+static double sphere_contrast(const struct anatomy_scan *scan, const float *volume, const double sphere[4])
+{
+	const int *size = scan->grid.size, room = (int)SPHERE_ROOM;
+	double sum[2] = {0, 0}, count[2] = {0, 0};
+	int place[3];
+
+	for (int a = 0; a < 3; a++)
+		place[a] = (int)lround((sphere[a] - scan->grid.origin[a]) / scan->grid.spacing[a]);
+	for (int z = -room; z <= room; z++)
+		for (int y = -room; y <= room; y++)
+			for (int x = -room; x <= room; x++) {
+				const double away = sqrt(x * x + y * y + z * z);
+				const size_t i = ((size_t)(place[2] + z) * (size_t)size[1] + (size_t)(place[1] + y)) *
+						     (size_t)size[0] +
+						 (size_t)(place[0] + x);
+
+				if (away > 0.75 * SPHERE_RADIUS && (away < SPHERE_RADIUS + 1 || away > SPHERE_ROOM))
+					continue;
+				sum[away < SPHERE_RADIUS] += hu_of(volume[i]) - hu_of(scan->background[i]);
+				count[away < SPHERE_RADIUS]++;
+			}
+	return sum[1] / count[1] - sum[0] / count[0];
+}
+
 struct image_figures anatomy_figures(const struct anatomy_scan *scan, const float *volume)
 {
 	const int *size = scan->grid.size;
@@ -351,6 +437,9 @@ struct image_figures anatomy_figures(const struct anatomy_scan *scan, const floa
 	figures.rmse = sqrt(figures.rmse / fmax(body, 1));
 	figures.bone /= fmax(bone, 1);
 	figures.fwhm = edge_width(scan, volume);
+	for (int i = 0; i < scan->sphere_count; i++)
+		figures.contrast +=
+		    sphere_contrast(scan, volume, scan->spheres[i]) / scan->spheres[i][3] / scan->sphere_count;
 	return figures;
 }
 

@@ -6,8 +6,8 @@
 
 /*
  * Heads, wrists, necks and abdomens of ellipsoids and elliptic cylinders, with
- * shells of bone, trabecular texture and small contrasts of 20 to 100 HU, scanned
- * by exact line integrals with Poisson noise; and what an image of them is worth.
+ * shells of bone, trabecular texture, contrasts of 20 to 100 HU, and small spheres of
+ * 30 HU in even tissue, scanned by exact line integrals with Poisson noise; and what an image of them is worth.
  * The project's projector takes no part in it. For the tests of noise reduction
  * and for tests/bench/denoise.c. Nothing here ends a test: what fails is returned.
  */
@@ -26,12 +26,18 @@ struct anatomy_spec {
 	unsigned seed;  /* of the anatomy's small parts and of the noise */
 };
 
+enum { SPHERES_MOST = 24 };
+
 struct anatomy_scan {
 	struct geometry geometry;
 	struct grid grid;
 	float *projections; /* [view][row][column], line integrals */
 	float *truth;       /* [z][y][x], 1/mm, each voxel the mean of 27 points */
+	float *background;  /* the same without the spheres */
 	double edge[3];     /* mm: x, y and radius of a rod along z, about 300 HU above what is around it */
+	/* Spheres of four voxels' diameter: x, y, z in mm, and 30 or -30 HU; as many as the tissue has room for. */
+	double spheres[SPHERES_MOST][4];
+	int sphere_count;
 };
 
 int anatomy_scan_make(struct anatomy_scan *ret_scan, const struct anatomy_spec *spec, struct error *err);
@@ -39,9 +45,10 @@ void anatomy_scan_clear(struct anatomy_scan *scan);
 
 /* Of the middle half of the slices, in HU. */
 struct image_figures {
-	double rmse; /* where the truth is above -500 HU */
-	double bone; /* mean difference to the truth where that is above 500 HU; 0 without bone */
-	double fwhm; /* voxels: width of the rod's edge, from the error function that fits it best */
+	double rmse;     /* where the truth is above -500 HU */
+	double bone;     /* mean difference to the truth where that is above 500 HU; 0 without bone */
+	double fwhm;     /* voxels: width of the rod's edge, from the error function that fits it best */
+	double contrast; /* share of the spheres' contrast that the image shows */
 };
 struct image_figures anatomy_figures(const struct anatomy_scan *scan, const float *volume);
 
