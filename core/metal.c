@@ -4,7 +4,8 @@
  *
  *  1. Metal in the FDK volume: what has at least the threshold, and around it what
  *     has half of it; of both what has half of the highest value near it, so that an
- *     object is as wide as it is, and whole where it comes near the threshold.
+ *     object is as wide as it is, and whole where it comes near the threshold; and a
+ *     quarter of the highest value further around, where streaks are as bright as faint metal.
  *  2. Its projection, a pixel wider all around, gives its traces; samples without
  *     counts that touch a trace belong to it.
  *  3. Lines lead over each trace along the row and along the column (after
@@ -21,7 +22,7 @@
  *     before it, and may keep fainter bone.
  *
  * What is better of this volume and of the first one is taken place by place
- * (metal_blend.c): a faint or thin object's shadow has photons enough. tests/bench/results/
+ * (metal_blend.c): a faint or thin object's shadow has photons enough. tests/bench/results/metal.txt
  * has the table of what else was tried.
  *
  * The metal itself is put back into every volume that is kept, and with it its rim:

@@ -19,10 +19,14 @@ static int add_voxel(struct metal *metal, size_t *room, struct metal_voxel voxel
 
 /* ---- where it is ---- */
 
-/* Of the threshold, and of the highest metal within reach: what belongs to the object beside it. */
-static const double LOW = 0.5, HALF = 0.5;
-/* In widths of FDK's blur, which is a pixel or a voxel: the reach, and the rim. */
-static const double REACH = 3, RIM = 1.5;
+/*
+ * Of the threshold, and of the highest metal around: what belongs to the object beside it. Further away the share is
+ * less: there may be another object, but the streaks of metal that takes all photons away are as bright as faint metal.
+ */
+enum { NEAR, FAR, DISTANCES };
+static const double LOW = 0.5, SHARE[DISTANCES] = {0.5, 0.25};
+/* In widths of FDK's blur, which is a pixel or a voxel: how far around, and the rim. */
+static const double REACH[DISTANCES] = {3, 6}, RIM = 1.5;
 enum { REACH_MOST = 8 }; /* voxels */
 
 /* Of voxels along an axis, how many cover so many widths of the blur. */
@@ -37,17 +41,19 @@ static double voxels_along(const struct metal_tools *tools, int axis, double wid
 struct search {
 	const struct grid *grid;
 	float threshold;
-	int reach[3], length;
-	float *raw, *peak; /* [length][y][x], owned; peak 0: no metal within reach along x and y */
-	float *line;       /* [y][x], owned */
-	bool *has_peak;    /* [length], owned */
-	size_t room;       /* of the list */
+	int reach[DISTANCES][3], length;
+	float *raw;             /* [length][y][x], owned */
+	float *peak[DISTANCES]; /* likewise; 0: no metal within reach along x and y */
+	float *line;            /* [y][x], owned */
+	bool *has_peak;         /* [length], owned */
+	size_t room;            /* of the list */
 };
 
 static void search_clear(struct search *search)
 {
 	free(search->raw);
-	free(search->peak);
+	for (int i = 0; i < DISTANCES; i++)
+		free(search->peak[i]);
 	free(search->line);
 	free(search->has_peak);
 }
@@ -57,16 +63,21 @@ static int search_make(struct search *ret, const struct metal_tools *tools, doub
 	const size_t slice = metal_slice_voxels(tools->grid);
 	struct search search = {.grid = tools->grid, .threshold = (float)threshold};
 	size_t length;
+	bool whole = true;
 
-	for (int axis = 0; axis < 3; axis++)
-		search.reach[axis] = (int)ceil(voxels_along(tools, axis, REACH));
-	search.length = 2 * search.reach[2] + 3;
+	for (int i = 0; i < DISTANCES; i++)
+		for (int axis = 0; axis < 3; axis++)
+			search.reach[i][axis] = (int)ceil(voxels_along(tools, axis, REACH[i]));
+	search.length = 2 * search.reach[FAR][2] + 3;
 	length = (size_t)search.length;
 	search.raw = malloc(length * slice * sizeof(float));
-	search.peak = malloc(length * slice * sizeof(float));
+	for (int i = 0; i < DISTANCES; i++) {
+		search.peak[i] = malloc(length * slice * sizeof(float));
+		whole = whole && search.peak[i] != NULL;
+	}
 	search.line = malloc(slice * sizeof(float));
 	search.has_peak = calloc(length, sizeof(bool));
-	if (search.raw == NULL || search.peak == NULL || search.line == NULL || search.has_peak == NULL) {
+	if (!whole || search.raw == NULL || search.line == NULL || search.has_peak == NULL) {
 		search_clear(&search);
 		return error_set(err, ERR_NO_MEMORY, "no memory to look for metal in slices of %zu voxels", slice);
 	}
@@ -107,12 +118,11 @@ static void widen(const float *from, float *to, int count, size_t step, int reac
 	}
 }
 
-/* The slice's peaks: for each voxel the highest seed within reach along x and y; its neighbours' slices are there. */
-static void find_peaks(struct search *search, int z)
+/* The slice's seeds, 0: none; how many there are. */
+static size_t find_seeds(const struct search *search, int z, float *ret_seeds)
 {
 	const int nx = search->grid->size[0], ny = search->grid->size[1];
 	const float *raw = slice_of(search, search->raw, z);
-	float *peak = slice_of(search, search->peak, z), *line = search->line;
 	size_t found = 0;
 
 #pragma omp parallel for schedule(static) reduction(+ : found)
@@ -120,45 +130,65 @@ static void find_peaks(struct search *search, int z)
 		for (int x = 0; x < nx; x++) {
 			const size_t at = (size_t)y * (size_t)nx + (size_t)x;
 
-			peak[at] = is_seed(search, z, at) ? raw[at] : 0;
-			found += peak[at] > 0;
+			ret_seeds[at] = is_seed(search, z, at) ? raw[at] : 0;
+			found += ret_seeds[at] > 0;
 		}
-	search->has_peak[z % search->length] = found > 0;
-	if (found == 0)
+	return found;
+}
+
+/* The slice's peaks: for each voxel the highest seed within reach along x and y; its neighbours' slices are there. */
+static void find_peaks(struct search *search, int z)
+{
+	const int nx = search->grid->size[0], ny = search->grid->size[1];
+	float *line = search->line, *near = slice_of(search, search->peak[NEAR], z);
+
+	search->has_peak[z % search->length] = find_seeds(search, z, near) > 0;
+	if (!search->has_peak[z % search->length])
 		return;
+	for (int i = FAR; i >= NEAR; i--) { /* the seeds, in the last one's place, are overwritten last */
+		float *peak = slice_of(search, search->peak[i], z);
+
 #pragma omp parallel for schedule(static)
-	for (int y = 0; y < ny; y++)
-		widen(peak + (size_t)y * (size_t)nx, line + (size_t)y * (size_t)nx, nx, 1, search->reach[0]);
+		for (int y = 0; y < ny; y++)
+			widen(near + (size_t)y * (size_t)nx, line + (size_t)y * (size_t)nx, nx, 1, search->reach[i][0]);
 #pragma omp parallel for schedule(static)
-	for (int x = 0; x < nx; x++)
-		widen(line + x, peak + x, ny, (size_t)nx, search->reach[1]);
+		for (int x = 0; x < nx; x++)
+			widen(line + x, peak + x, ny, (size_t)nx, search->reach[i][1]);
+	}
+}
+
+/* The highest seed within reach of a voxel, 0: none. */
+static float peak_around(const struct search *search, int distance, int z, size_t at)
+{
+	const int nz = search->grid->size[2], reach = search->reach[distance][2];
+	const int first = z > reach ? z - reach : 0, last = z + reach < nz ? z + reach : nz - 1;
+	float peak = 0;
+
+	for (int k = first; k <= last; k++)
+		if (search->has_peak[k % search->length])
+			peak = fmaxf(peak, slice_of(search, search->peak[distance], k)[at]);
+	return peak;
 }
 
 /* The slice's voxels of metal, once all slices within reach have their peaks. */
 static int find_in_slice(struct metal *metal, struct search *search, int z, struct error *err)
 {
-	const int nz = search->grid->size[2], reach = search->reach[2];
-	const int first = z > reach ? z - reach : 0, last = z + reach < nz ? z + reach : nz - 1;
 	const float *raw = slice_of(search, search->raw, z), low = (float)LOW * search->threshold;
-	bool any = false;
 
-	for (int k = first; k <= last; k++)
-		any = any || search->has_peak[k % search->length];
-	for (size_t at = 0; any && at < metal_slice_voxels(search->grid); at++) {
-		float peak = 0;
+	for (size_t at = 0; at < metal_slice_voxels(search->grid); at++) {
+		const struct metal_voxel voxel = {(uint32_t)z, (uint32_t)at, METAL_CORE, raw[at]};
+		float near;
+		int code;
 
 		if (!(raw[at] >= low))
 			continue;
-		for (int k = first; k <= last; k++)
-			if (search->has_peak[k % search->length])
-				peak = fmaxf(peak, slice_of(search, search->peak, k)[at]);
-		if (peak > 0 && raw[at] >= (float)HALF * peak) {
-			const struct metal_voxel voxel = {(uint32_t)z, (uint32_t)at, METAL_CORE, raw[at]};
-			const int code = add_voxel(metal, &search->room, voxel, err);
-
-			if (code < 0)
-				return code;
-		}
+		near = peak_around(search, NEAR, z, at);
+		if (near == 0 || raw[at] < (float)SHARE[NEAR] * near ||
+		    raw[at] < (float)SHARE[FAR] * peak_around(search, FAR, z, at))
+			continue;
+		code = add_voxel(metal, &search->room, voxel, err);
+		if (code < 0)
+			return code;
 	}
 	return 0;
 }
@@ -279,8 +309,8 @@ int metal_find(struct metal *metal, const struct metal_tools *tools, struct volu
 		return code;
 	/* Slice z comes; the one before it has both neighbours and gets its peaks; then the one that is ready has all
 	 * within reach. */
-	for (int z = 0; z <= nz + search.reach[2] && code == 0; z++) {
-		const int ready = z - 1 - search.reach[2];
+	for (int z = 0; z <= nz + search.reach[FAR][2] && code == 0; z++) {
+		const int ready = z - 1 - search.reach[FAR][2];
 
 		if (z < nz)
 			code = tools->backend->volume_download(from, z, 1, slice_of(&search, search.raw, z), err);

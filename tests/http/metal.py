@@ -15,7 +15,7 @@ The body is of water, with an air bubble and a vertebra of bone; attenuations ar
 import json
 import os
 import sys
-from typing import Dict, List, NamedTuple, Tuple
+from typing import Any, Dict, List, NamedTuple, Tuple
 
 import numpy as np
 
@@ -37,10 +37,19 @@ class Part(NamedTuple):
 
 BONE = Part(True, (15, 12, 13), (0, -16, 0), 0, 1.2)
 BODY = [Part(True, (60, 48, 20), (0, 0, 0), 0, 1), Part(False, (9, 7, 9), (14, 22, 0), 0.3, -1), BONE]
-SCREWS = [Part(False, (17, 2.5, 2.5), (side * 13, -20, z), side * -0.5, 18) for z in (5, -5) for side in (-1, 1)]
+
+
+def screws(aside: float, behind: float, turn: float) -> List[Part]:
+    """Two above two others, towards each other in bone; of 17000 HU."""
+    return [Part(False, (17, 2.5, 2.5), (side * aside, behind, z), side * turn, 18) for z in (5, -5) for side in (-1, 1)]
+
+
 CASES: Dict[str, List[Part]] = {
     "clean": [],
-    "screws": SCREWS,
+    "screws": screws(20, -24, -0.5),
+    "crossing": screws(13, -20, -0.5),
+    "parallel": screws(11, -18, np.pi / 2 + 0.25),
+    "two screws": [part._replace(centre=part.centre[:2] + (0,)) for part in screws(20, -24, -0.5)[:2]],
     "rods": [Part(True, (3, 3, 19), (-17, -26, 0), 0, 9), Part(True, (3, 3, 19), (18, -24, 0), 0, 9)],
     # of 1.6 mm; the last part is what the mass is taken of
     "wire": [Part(False, (24, 0.8, 0.8), (-10, 16, 2), 0.3, 9)],
@@ -126,7 +135,7 @@ def within(part: Part, places: np.ndarray, more: float) -> np.ndarray:
     return (near**2).sum(-1) <= 1
 
 
-def beside(case: str, clean: str, volume: str) -> None:
+def beside(case: str, clean: str, volume: str) -> Dict[str, Any]:
     more = load(volume) - load(clean)
     axes = [(np.arange(count) - (count - 1) / 2) * SPACING for count in SIZE]
     places = np.stack(np.meshgrid(*axes[::-1], indexing="ij")[::-1], -1)
@@ -138,23 +147,19 @@ def beside(case: str, clean: str, volume: str) -> None:
     bone = there & within(BONE, places, -2)
     part = parts[-1]
     mass = 1000 * part.density * 4 / 3 * np.pi * np.prod(part.axes)
-    print(
-        json.dumps(
-            {
-                "rmse": float(np.sqrt((more[there] ** 2).mean())),
-                "bone": float(more[bone].mean()) if bone.any() else None,
-                "mass": float(more[within(part, places, 3.2)].sum() * SPACING**3 / mass),
-                "voxels": int(there.sum()),
-            }
-        )
-    )
+    return {
+        "rmse": float(np.sqrt((more[there] ** 2).mean())),
+        "bone": float(more[bone].mean()) if bone.any() else None,
+        "mass": float(more[within(part, places, 3.2)].sum() * SPACING**3 / mass),
+        "voxels": int(there.sum()),
+    }
 
 
 def main(arguments: List[str]) -> None:
     if arguments[:1] == ["make"] and len(arguments) == 3:
         make(*arguments[1:])
     elif arguments[:1] == ["beside"] and len(arguments) == 4:
-        beside(*arguments[1:])
+        print(json.dumps(beside(*arguments[1:])))
     elif arguments == ["grid"]:
         print(json.dumps({"size": SIZE, "spacing_mm": [SPACING] * 3}))
     elif arguments[:1] == ["dark"] and len(arguments) == 2:
@@ -163,4 +168,5 @@ def main(arguments: List[str]) -> None:
         sys.exit(__doc__)
 
 
-main(sys.argv[1:])
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -59,6 +59,20 @@ test_rods_are_not_made_worse() {
 	expect_number "$(of 'bone | fabs' rods-final-with)" '<' 60 "HU of bone in the mean after SART"
 }
 
+# Some samples between them have no counts at all.
+test_screws_leave_bone_as_it_is() {
+	local name
+	prepare
+	volumes screws
+	expect_number "$(metal dark "$work/screws")" '>' 100 "samples without counts"
+	volumes screws '{}'
+	told
+	not_worse screws .35
+	for name in fdk final; do
+		expect_number "$(of 'bone | fabs' "screws-$name-with")" '<' 60 "$name: HU of bone in the mean"
+	done
+}
+
 # 40 % of the wire and a third of the vessel were gone.
 test_what_is_thin_stays_whole() {
 	local case name
