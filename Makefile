@@ -75,7 +75,7 @@ core_sources   := $(filter-out $(simd_sources),$(wildcard core/*.c))
 proto_sources  := $(wildcard proto/*.c)
 daemon_sources := $(filter-out daemon/worker.c,$(wildcard daemon/*.c daemon/*/*.c))
 # What the unit tests know of the daemon: its state, without HTTP.
-state_sources  := $(wildcard daemon/store/*.c daemon/jobs/*.c) $(patsubst %,daemon/%.c,api/document files id log problem watch)
+state_sources  := $(wildcard daemon/store/*.c daemon/jobs/*.c) $(patsubst %,daemon/%.c,api/document files id lock log problem watch)
 cbct_sources   := $(wildcard clients/cbct/*.c)
 unit_sources   := $(wildcard tests/unit/*.c)
 
@@ -147,8 +147,10 @@ $(BUILD)/cbct-worker-held: $(call objects,daemon/worker.c tests/http/held.c) $(l
 	$(call say,LINK)$(CC) $(LDFLAGS) -Wl,--wrap=fdatasync -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(if $(cuda_objects),$(cuda_libs)) $(LIBM)
 
 held_calls := job_digest_volume store_job_update store_job_add_volume store_job_digest_volume
-$(BUILD)/cbctd-held: $(call objects,$(daemon_sources) tests/http/held.c) $(BUILD)/proto/openapi.o $(BUILD)/web/assets.o $(library)
-	$(call say,LINK)$(CC) $(LDFLAGS) $(held_calls:%=-Wl,--wrap=%) -o $@ $^ $(call pkg,--libs,$(daemon_libs) $(proto_libs) $(core_libs)) $(LIBM)
+# The order of locks is asserted in that daemon, and in the unit tests (tests/lock_order.c).
+lock_calls := lock_init pthread_mutex_lock pthread_mutex_unlock pthread_mutex_destroy pthread_cond_wait pthread_cond_timedwait
+$(BUILD)/cbctd-held: $(call objects,$(daemon_sources) tests/http/held.c tests/lock_order.c) $(BUILD)/proto/openapi.o $(BUILD)/web/assets.o $(library)
+	$(call say,LINK)$(CC) $(LDFLAGS) $(patsubst %,-Wl$(comma)--wrap=%,$(held_calls) $(lock_calls)) -o $@ $^ $(call pkg,--libs,$(daemon_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
 gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench
 # Every program that a test or a benchmark runs, so that none stops compiling unseen.
@@ -163,8 +165,8 @@ $(BUILD)/faults.so: tests/http/faults.c
 $(BUILD)/cbct-cuda: $(call objects,$(cbct_sources)) $(library) $(cuda_objects)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(cbct_libs) $(proto_libs) $(core_libs)) $(cuda_libs) $(LIBM)
 
-$(BUILD)/unit: $(call objects,$(unit_sources) $(state_sources)) $(library)
-	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,check sqlite3 libcrypto $(files_libs) $(proto_libs) $(core_libs)) $(LIBM)
+$(BUILD)/unit: $(call objects,$(unit_sources) $(state_sources) tests/lock_order.c) $(library)
+	$(call say,LINK)$(CC) $(LDFLAGS) $(lock_calls:%=-Wl$(comma)--wrap=%) -o $@ $^ $(call pkg,--libs,check sqlite3 libcrypto $(files_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
 $(BUILD)/cpu-bench: $(call objects,tests/bench/bench.c) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(LIBM)

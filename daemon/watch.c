@@ -4,9 +4,11 @@
 #include <assert.h>
 #include <stddef.h>
 
+#include "daemon/lock.h"
+
 void watch_list_init(struct watch_list *list)
 {
-	pthread_mutex_init(&list->lock, NULL);
+	lock_init(&list->lock, LOCK_WATCHERS);
 	list->first = NULL;
 }
 

@@ -50,6 +50,9 @@ rule "daemon/main.c uses doors" '#include "daemon/([a-z]+)/([a-z_]+)\.h"' \
 	<(grep -vE '#include "daemon/([a-z]+)/\1\.h"' daemon/main.c)
 found "files of daemon/ have at most 700 lines" "$(wc -l daemon/*.[ch] daemon/*/*.[ch] | awk '$1 > 700 && $2 != "total"')"
 
+rule "mutexes are made by lock_init, with their rank" 'pthread_mutex_init' $(files daemon | grep -v '^daemon/lock\.c$')
+found "daemon/THREADS.md (>) has the locks of daemon/lock.h (<) in their order" \
+	"$(diff <(sed -nE 's/^\t(LOCK_[A-Z]+),.*/\1/p' daemon/lock.h) <(sed -nE 's/^\| (LOCK_[A-Z]+) .*/\1/p' daemon/THREADS.md))"
 rule "no process-wide string functions" '\b(strtok|sprintf|strcpy|strcat|gets|localtime|gmtime|strerror_l|rand|srand) *\(' $(files core proto daemon clients)
 rule "no unfinished work by its own words" '\b(TODO|FIXME|XXX|HACK)\b' $(files core kernels proto daemon clients tests)
 

@@ -23,6 +23,7 @@
 #include <sys/eventfd.h>
 #include <unistd.h>
 
+#include "daemon/lock.h"
 #include "daemon/log.h"
 
 enum {
@@ -171,7 +172,7 @@ static struct connection *connection_new(struct http *http, int socket, const st
 	if (address->ss_family == AF_UNIX && getsockopt(socket, SOL_SOCKET, SO_PEERCRED, &peer, &size) == 0)
 		connection->user = peer.uid;
 	connection->since = clock_monotonic();
-	pthread_mutex_init(&connection->lock, NULL);
+	lock_init(&connection->lock, LOCK_CONNECTION);
 	connection_enter(http, connection);
 	return connection;
 }

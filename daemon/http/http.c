@@ -22,6 +22,7 @@
 #include <time.h>
 #include <unistd.h>
 
+#include "daemon/lock.h"
 #include "daemon/log.h"
 
 enum {
@@ -319,7 +320,7 @@ int http_new(const struct http_options *options, struct http **ret_http, struct 
 	http->options = *options;
 	http->admission_kick = -1;
 	fit_connections(http);
-	pthread_mutex_init(&http->lock, NULL);
+	lock_init(&http->lock, LOCK_HTTP);
 	pthread_condattr_init(&monotonic);
 	pthread_condattr_setclock(&monotonic, CLOCK_MONOTONIC);
 	pthread_cond_init(&http->clock_kick, &monotonic);

@@ -13,6 +13,8 @@
 
 #include "daemon/intake/internal.h"
 
+#include "daemon/lock.h"
+
 enum {
 	BATCH_SLOTS = 64,       /* in one commit */
 	BATCH_BYTES = 64 << 20, /* in one sync, so that nobody waits for long */
@@ -465,7 +467,7 @@ int uploads_new(struct store *store, const struct uploads_options *options, stru
 	slots_init(&uploads->queue);
 	slots_init(&uploads->parked);
 	uploads->starved_end = &uploads->starved_first;
-	pthread_mutex_init(&uploads->lock, NULL);
+	lock_init(&uploads->lock, LOCK_UPLOADS);
 	pthread_condattr_init(&monotonic);
 	pthread_condattr_setclock(&monotonic, CLOCK_MONOTONIC);
 	pthread_cond_init(&uploads->work, &monotonic);

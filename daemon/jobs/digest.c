@@ -14,6 +14,7 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
+#include "daemon/lock.h"
 #include "daemon/log.h"
 #include "proto/clock.h"
 #include "proto/durable.h"
@@ -324,7 +325,7 @@ int digester_start(struct jobs *jobs, int threads, struct digester **ret_digeste
 		return error_set_errno(err, ENOMEM, "digests");
 	digester->jobs = jobs;
 	digester->last = &digester->first;
-	pthread_mutex_init(&digester->lock, NULL);
+	lock_init(&digester->lock, LOCK_DIGESTS);
 	pthread_condattr_init(&monotonic);
 	pthread_condattr_setclock(&monotonic, CLOCK_MONOTONIC);
 	pthread_cond_init(&digester->changed, &monotonic);

@@ -9,6 +9,7 @@
 #include <string.h>
 #include <unistd.h>
 
+#include "daemon/lock.h"
 #include "daemon/log.h"
 #include "proto/clock.h"
 #include "proto/json.h"
@@ -276,8 +277,8 @@ int jobs_open(struct store *store, struct jobs **ret_jobs, struct error *err)
 		return error_set_errno(err, ENOMEM, "jobs");
 	jobs->store = store;
 	jobs->next_ticket = 1;
-	pthread_mutex_init(&jobs->change, NULL);
-	pthread_mutex_init(&jobs->lock, NULL);
+	lock_init(&jobs->change, LOCK_CHANGE);
+	lock_init(&jobs->lock, LOCK_JOBS);
 	watch_list_init(&jobs->watchers);
 	code = load_jobs(jobs, err);
 	if (code != 0) {

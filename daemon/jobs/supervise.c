@@ -19,6 +19,7 @@
 #include <sys/eventfd.h>
 #include <unistd.h>
 
+#include "daemon/lock.h"
 #include "daemon/log.h"
 #include "proto/clock.h"
 
@@ -388,7 +389,7 @@ int supervise_start(struct jobs *jobs, const struct supervise_options *options, 
 		    .index = i, .child = {.pidfd = -1, .socket = -1}, .deadline = NEVER, .room_since = NEVER};
 		supervise->facts[i].index = i;
 	}
-	pthread_mutex_init(&supervise->lock, NULL);
+	lock_init(&supervise->lock, LOCK_SUPERVISOR);
 	supervise->wake = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
 	if (supervise->wake < 0) {
 		result = errno;

@@ -15,6 +15,7 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
+#include "daemon/lock.h"
 #include "daemon/log.h"
 #include "proto/spool.h"
 #include "proto/sums.h"
@@ -301,7 +302,7 @@ int pages_new(struct pages **ret_pages, struct error *err)
 	pages->vfs.pNext = NULL;
 	pages->vfs.xOpen = vfs_open;
 	pages->vfs.szOsFile = (int)sizeof(struct page_file) + pages->base->szOsFile;
-	pthread_mutex_init(&pages->lock, NULL);
+	lock_init(&pages->lock, LOCK_PAGES);
 	if (sqlite3_vfs_register(&pages->vfs, 0) != SQLITE_OK) {
 		pthread_mutex_destroy(&pages->lock);
 		free(pages);

@@ -16,6 +16,7 @@
 #include <unistd.h>
 
 #include "daemon/files.h"
+#include "daemon/lock.h"
 #include "daemon/log.h"
 #include "daemon/store/deleted.h"
 #include "daemon/store/quarantine.h"
@@ -51,7 +52,7 @@ struct stored_scan *stored_scan_new(struct store *store, int count)
 
 	if (scan == NULL)
 		return NULL;
-	pthread_mutex_init(&scan->lock, NULL);
+	lock_init(&scan->lock, LOCK_SCAN);
 	watch_list_init(&scan->watchers);
 	scan->store = store;
 	scan->count = count;

@@ -24,6 +24,7 @@
 #include <unistd.h>
 
 #include "daemon/files.h"
+#include "daemon/lock.h"
 #include "daemon/log.h"
 #include "daemon/store/deleted.h"
 #include "daemon/store/pages.h"
@@ -363,14 +364,14 @@ static int open_store(const char *directory, const struct store_hooks *hooks, bo
 		store->hooks = *hooks;
 	store->lock_file = -1;
 	atomic_flag_clear(&store->failure_told);
-	pthread_mutex_init(&store->insertion_lock, NULL);
+	lock_init(&store->insertion_lock, LOCK_INSERTION);
 	store->writer.store = store->reader.store = store;
-	pthread_mutex_init(&store->writer.lock, NULL);
-	pthread_mutex_init(&store->reader.lock, NULL);
-	pthread_mutex_init(&store->scans_lock, NULL);
-	pthread_mutex_init(&store->checkpoint_lock, NULL);
+	lock_init(&store->writer.lock, LOCK_CATALOGUE);
+	lock_init(&store->reader.lock, LOCK_CATALOGUE);
+	lock_init(&store->scans_lock, LOCK_SCANS);
+	lock_init(&store->checkpoint_lock, LOCK_CHECKPOINT);
 	pthread_cond_init(&store->checkpoint_due, NULL);
-	pthread_mutex_init(&store->check_lock, NULL);
+	lock_init(&store->check_lock, LOCK_CHECKS);
 	pthread_cond_init(&store->check_due, NULL);
 	watch_list_init(&store->arrivals);
 	code = verified_new(&store->verified, err);

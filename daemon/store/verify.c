@@ -19,6 +19,7 @@
 #include "proto/seal.h"
 #include "proto/spool.h"
 #include "proto/sums.h"
+#include "daemon/lock.h"
 
 enum { FILES_MAX = 64, BLOCKS_MAX = 1 << 14 };
 static const double WHILE = 600; /* s */
@@ -43,7 +44,7 @@ int verified_new(struct verified **ret_verified, struct error *err)
 
 	if (verified == NULL)
 		return error_set_errno(err, ENOMEM, "list of files");
-	pthread_mutex_init(&verified->lock, NULL);
+	lock_init(&verified->lock, LOCK_VERIFIED);
 	*ret_verified = verified;
 	return 0;
 }

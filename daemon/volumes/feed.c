@@ -13,6 +13,8 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "daemon/lock.h"
+
 enum {
 	RING = 512, /* events: seconds of a busy daemon, and less than a megabyte */
 	BATCH = 64  /* events of the catalogue at a time */
@@ -68,7 +70,7 @@ int feed_new(struct store *store, struct feed **ret_feed, struct error *err)
 		return error_set_errno(err, ENOMEM, "feed of events");
 	feed->store = store;
 	feed->floor = feed->last = store_last_event(store);
-	pthread_mutex_init(&feed->lock, NULL);
+	lock_init(&feed->lock, LOCK_EVENTS);
 	*ret_feed = feed;
 	return 0;
 }

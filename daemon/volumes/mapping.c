@@ -14,6 +14,7 @@
 #include <unistd.h>
 
 #include "proto/format.h"
+#include "daemon/lock.h"
 
 enum { IDLE_MAX = 8 };
 
@@ -39,7 +40,7 @@ int mappings_new(struct mappings **ret_mappings, struct error *err)
 
 	if (mappings == NULL)
 		return error_set_errno(err, ENOMEM, "mapped volumes");
-	pthread_mutex_init(&mappings->lock, NULL);
+	lock_init(&mappings->lock, LOCK_MAPPINGS);
 	*ret_mappings = mappings;
 	return 0;
 }

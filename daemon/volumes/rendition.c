@@ -9,6 +9,7 @@
 #include <string.h>
 #include <unistd.h>
 
+#include "daemon/lock.h"
 #include "daemon/log.h"
 #include "daemon/volumes/sink.h"
 
@@ -263,7 +264,7 @@ int renditions_new(struct store *store, int threads, struct renditions **ret_ren
 	if (renditions == NULL)
 		return error_set_errno(err, ENOMEM, "volumes to be streamed");
 	renditions->store = store;
-	pthread_mutex_init(&renditions->lock, NULL);
+	lock_init(&renditions->lock, LOCK_ENCODED);
 	pthread_cond_init(&renditions->due, NULL);
 	while (renditions->thread_count < threads && renditions->thread_count < THREADS_MAX) {
 		int code = pthread_create(&renditions->threads[renditions->thread_count], NULL, run_maker, renditions);

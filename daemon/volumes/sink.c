@@ -13,6 +13,8 @@
 
 #include <openssl/evp.h>
 
+#include "daemon/lock.h"
+
 enum { BLOCKS = 4 };
 
 struct sink {
@@ -84,7 +86,7 @@ int sink_new(int file, struct sink **ret_sink, struct error *err)
 	sink->put = sink->taken = 0;
 	sink->runs = sink->ended = sink->failed = false;
 	sink->hash = EVP_MD_CTX_new();
-	pthread_mutex_init(&sink->lock, NULL);
+	lock_init(&sink->lock, LOCK_SINK);
 	pthread_cond_init(&sink->changed, NULL);
 	if (sink->hash == NULL || EVP_DigestInit_ex(sink->hash, EVP_sha256(), NULL) != 1)
 		code = ENOMEM;

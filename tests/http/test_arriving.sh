@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # FDK while the projections arrive: in any order, interrupted in every way; and scans that are broken off.
 . "$(dirname "$0")/lib.sh"
+program=cbctd-held # asserts the order of locks
 
 scan_dir=$work/ball raw_dir=$work/raw
 views=60 one=$((64 * 48 * 4))
@@ -324,7 +325,7 @@ test_a_daemon_that_dies_or_stops_in_the_middle() {
 }
 
 test_a_run_that_cannot_be_recorded_yet_is_recorded_later() {
-	program=cbctd-held CBCT_TEST_REFUSE=$work/refuse fresh_daemon
+	CBCT_TEST_REFUSE=$work/refuse fresh_daemon
 	post_scan "$scan_dir"
 	post_job "$fdk"
 	send "$scan_dir" 0 9
@@ -339,7 +340,7 @@ test_a_run_that_cannot_be_recorded_yet_is_recorded_later() {
 }
 
 test_a_digest_that_cannot_be_recorded_yet_is_recorded_later() {
-	program=cbctd-held CBCT_TEST_REFUSE=$work/refuse fresh_daemon
+	CBCT_TEST_REFUSE=$work/refuse fresh_daemon
 	echo digest >"$work/refuse"
 	post_scan "$scan_dir"
 	send "$scan_dir" 0 59

@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # A catalogue that is lost, older or damaged takes nothing with it, and is told.
 . "$(dirname "$0")/lib.sh"
+program=cbctd-held # asserts the order of locks
 
 scan_dir=$work/ball
 cbct simulate --phantom ball --scale 30 --density 0.02 --views 12 --arc 360 --columns 32 --rows 24 --pixel 8 \

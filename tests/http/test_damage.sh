@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Bits that the disk has turned round, in every kind of file: found by whoever reads them, told by name, never used.
 . "$(dirname "$0")/lib.sh"
+program=cbctd-held # asserts the order of locks
 stop_after_each=1
 
 scan_dir=$work/head

@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Full disks, disks that fail for a moment, syncs that fail: what waits, what is tried again, and what is final.
 . "$(dirname "$0")/lib.sh"
+program=cbctd-held # asserts the order of locks
 
 scan_dir=$work/ball
 cbct simulate --phantom ball --scale 30 --density 0.02 --views 60 --arc 360 --columns 64 --rows 48 --pixel 4 \

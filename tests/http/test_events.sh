@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Server-sent events of a job and of all jobs: nothing is missed, nothing comes twice, and nobody is kept waiting.
 . "$(dirname "$0")/lib.sh"
+program=cbctd-held # asserts the order of locks
 
 scan_dir=$work/ball
 cbct simulate --phantom ball --scale 30 --density 0.02 --views 60 --arc 360 --columns 64 --rows 48 --pixel 4 \

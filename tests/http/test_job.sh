@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Jobs and volumes over HTTP: the rules of the contract's section 4, on a small scan.
 . "$(dirname "$0")/lib.sh"
+program=cbctd-held # asserts the order of locks
 
 scan_dir=$work/ball
 small='{"scan": "SCAN", "grid": {"size": [32, 24, 16], "spacing_mm": [3, 4, 5]}, '

@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Whoever holds connections, for good or ill: acquisition gets in.
 . "$(dirname "$0")/lib.sh"
+program=cbctd-held # asserts the order of locks
 python=${PYTHON:-/usr/bin/python3}
 command -v "$python" >/dev/null || python=python3
 raw() { "$python" "$here/raw_http.py" "${url##*:}" "$@"; }

@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # What was acknowledged is there after kill -9, SIGTERM and a dead worker; full and failing disks are test_disk.sh's.
 . "$(dirname "$0")/lib.sh"
+program=cbctd-held # asserts the order of locks
 
 scan_dir=$work/ball
 cbct simulate --phantom ball --scale 30 --density 0.02 --views 60 --arc 360 --columns 64 --rows 48 --pixel 4 \
@@ -256,7 +257,7 @@ test_a_volume_that_was_told_of_is_made_again_when_the_daemon_dies_too_soon() {
 # A job that has ended and whose digests do not come for as long as $hold is there.
 ended_and_held() {
 	: >"$hold"
-	program=cbctd-held CBCT_TEST_HOLD_DIGEST=$hold start_daemon
+	CBCT_TEST_HOLD_DIGEST=$hold start_daemon
 	post_scan "$scan_dir"
 	post_projections "$scan_dir"
 	post_job "{\"scan\": \"SCAN\", $grid, \"fdk\": {}, \"emit\": [\"fdk\"]}"
@@ -377,7 +378,7 @@ test_a_worker_that_does_not_exit_keeps_nobody() {
 }
 
 test_a_volume_that_cannot_be_recorded_is_no_success() {
-	program=cbctd-held CBCT_TEST_REFUSE=$work/refuse start_daemon
+	CBCT_TEST_REFUSE=$work/refuse start_daemon
 	echo "volume final" >"$work/refuse"
 	post_scan "$scan_dir"
 	post_projections "$scan_dir"

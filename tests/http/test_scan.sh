@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Scans and their projections over HTTP: the rules of the contract's section 3.
 . "$(dirname "$0")/lib.sh"
+program=cbctd-held # asserts the order of locks
 
 columns=24 rows=10 count=12
 one=$((columns * rows * 4)) # bytes of one projection

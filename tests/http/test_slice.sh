@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Slices of a kept volume as PNG: the right plane the right way up, window and level in HU, refusals that name the parameter.
 . "$(dirname "$0")/lib.sh"
+program=cbctd-held # asserts the order of locks
 
 scan_dir=$work/ball
 cbct simulate --phantom ball --scale 30 --density 0.02 --shift 12,-9,10 --views 60 --arc 360 --columns 64 --rows 48 --pixel 4 \

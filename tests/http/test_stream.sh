@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # The stream of a job: every kept volume as one part, at once and as it is made, then the job's document.
 . "$(dirname "$0")/lib.sh"
+program=cbctd-held # asserts the order of locks
 
 scan_dir=$work/ball
 cbct simulate --phantom ball --scale 30 --density 0.02 --views 60 --arc 360 --columns 64 --rows 48 --pixel 4 \
