@@ -7,7 +7,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 
 enum kind {
 	KIND_TEXT,

@@ -23,6 +23,7 @@
 #include "proto/clock.h"
 #include "proto/message.h"
 #include "proto/provenance.h"
+#include "proto/reconstruction.h"
 
 enum { EXIT_START = 1, EXIT_USAGE = 2, EXIT_DEVICE = 3 };
 
@@ -250,9 +251,9 @@ static int on_settled(void *context, const char *name, struct error *err)
 
 /* ---- jobs ---- */
 
-static void report_taken(struct worker *worker, const struct spool *spool)
+static void report_taken(struct worker *worker, const struct reconstruction *reconstruction)
 {
-	struct message message = {.kind = MESSAGE_TAKEN, .count = spool_pushed(spool)};
+	struct message message = {.kind = MESSAGE_TAKEN, .count = reconstruction_pushed(reconstruction)};
 
 	report(worker, &message);
 }
@@ -261,78 +262,81 @@ static void report_taken(struct worker *worker, const struct spool *spool)
  * Projections as they arrive, until all are there. Who is to make room leaves at
  * once: there is nothing yet that could be gone on from.
  */
-static int push_arrivals(struct worker *worker, struct spool *spool, struct error *err)
+static int push_arrivals(struct worker *worker, struct reconstruction *reconstruction, struct error *err)
 {
 	enum { MOST = 8 }; /* projections between two looks at the socket */
 	int code = 0;
 
-	while (code == 0 && spool_pushed(spool) < spool_wanted(spool)) {
-		int pushed = spool_pushed(spool), count = worker->told_count - pushed;
+	while (code == 0 && reconstruction_pushed(reconstruction) < reconstruction_wanted(reconstruction)) {
+		int pushed = reconstruction_pushed(reconstruction), count = worker->told_count - pushed;
 
 		if (count > 0) {
-			code = spool_push(spool, worker->told + pushed, count < MOST ? count : MOST, err);
+			code = reconstruction_push(reconstruction, worker->told + pushed, count < MOST ? count : MOST,
+						   err);
 			if (code == 0)
-				report_taken(worker, spool);
+				report_taken(worker, reconstruction);
 			look_at_socket(worker);
 		} else {
 			if (worker->behind)
 				report_progress(worker);
 			obey_next(worker, LOOK_MS);
 		}
-		if (code != 0 || spool_pushed(spool) == spool_wanted(spool))
+		if (code != 0 || reconstruction_pushed(reconstruction) == reconstruction_wanted(reconstruction))
 			break;
 		if (worker->cancel)
 			return error_set(err, ERR_CANCELLED, "cancelled");
 		if (must_leave(worker))
-			return error_set(err, ERR_BUSY, "left with %d of %d projections", pushed, spool_wanted(spool));
+			return error_set(err, ERR_BUSY, "left with %d of %d projections", pushed,
+					 reconstruction_wanted(reconstruction));
 	}
 	return code;
 }
 
-static int run_spool(struct worker *worker, const struct spool_options *options, bool arriving, struct error *err)
+static int run_reconstruction(struct worker *worker, const struct reconstruction_options *options, bool arriving,
+			      struct error *err)
 {
-	struct spool *spool = NULL;
-	int code = spool_open(worker->backend, worker->device, options, &spool, err);
+	struct reconstruction *reconstruction = NULL;
+	int code = reconstruction_open(worker->backend, worker->device, options, &reconstruction, err);
 
 	if (code == 0 && arriving) {
-		code = push_arrivals(worker, spool, err);
+		code = push_arrivals(worker, reconstruction, err);
 	} else if (code == 0) {
-		code = spool_push_rest(spool, err);
-		report_taken(worker, spool);
+		code = reconstruction_push_rest(reconstruction, err);
+		report_taken(worker, reconstruction);
 	}
 	if (code == 0)
-		code = spool_finish(spool, err);
-	spool_close(spool);
+		code = reconstruction_finish(reconstruction, err);
+	reconstruction_close(reconstruction);
 	return code;
 }
 
 static int run_job(struct worker *worker, const struct message *start, struct error *err)
 {
-	const struct spool_hooks hooks = {.recon = {.context = worker,
-						    .cancelled = on_cancelled,
-						    .yield = on_yield,
-						    .progress = on_progress,
-						    .row = on_row,
-						    .denoising = on_denoising,
-						    .warning = on_warning},
-					  .on_volume = on_volume,
-					  .on_settled = on_settled,
-					  .on_open = on_open};
-	struct spool_options options = {.scan_directory = start->scan_directory,
-					.checked = true,
-					.out_directory = start->job_directory,
-					.recipe = &start->request.recipe,
-					.program = CBCTD_PROGRAM,
-					.job = start->job,
-					.scan = start->request.scan,
-					.patient = &start->request.patient,
-					.iteration = start->iteration,
-					.hooks = &hooks};
+	const struct reconstruction_hooks hooks = {.recon = {.context = worker,
+							     .cancelled = on_cancelled,
+							     .yield = on_yield,
+							     .progress = on_progress,
+							     .row = on_row,
+							     .denoising = on_denoising,
+							     .warning = on_warning},
+						   .on_volume = on_volume,
+						   .on_settled = on_settled,
+						   .on_open = on_open};
+	struct reconstruction_options options = {.scan_directory = start->scan_directory,
+						 .checked = true,
+						 .out_directory = start->job_directory,
+						 .recipe = &start->request.recipe,
+						 .program = CBCTD_PROGRAM,
+						 .job = start->job,
+						 .scan = start->request.scan,
+						 .patient = &start->request.patient,
+						 .iteration = start->iteration,
+						 .hooks = &hooks};
 	unsigned char *present = NULL;
 	char checkpoint[1100];
 	int code;
 
-	snprintf(checkpoint, sizeof(checkpoint), "%s/%s", start->job_directory, SPOOL_CHECKPOINT);
+	snprintf(checkpoint, sizeof(checkpoint), "%s/%s", start->job_directory, CHECKPOINT_FILE);
 	if (start->iteration > 0)
 		options.checkpoint = checkpoint;
 	if (start->reduced) {
@@ -343,7 +347,7 @@ static int run_job(struct worker *worker, const struct message *start, struct er
 			present[i] = start->present[i / 8] >> i % 8 & 1;
 		options.present = present;
 	}
-	code = run_spool(worker, &options, start->arriving, err);
+	code = run_reconstruction(worker, &options, start->arriving, err);
 	free(present);
 	return code;
 }

@@ -2,7 +2,7 @@
 #define CBCT_PROTO_MESSAGE_H
 
 #include "core/recon.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 
 /*
  * What the daemon and a worker say to each other, over a SOCK_SEQPACKET socket

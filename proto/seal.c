@@ -8,7 +8,7 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 #include "proto/sums.h"
 
 static int block_count(size_t content)

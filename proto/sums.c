@@ -13,7 +13,7 @@
 #include <wmmintrin.h>
 #endif
 
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 
 enum { SLOT_LEAST = SUMS_SCAN, CHECKED_BYTES = SUMS_RECORD_BYTES - 4 };
 

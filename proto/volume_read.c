@@ -18,7 +18,7 @@
 #include "proto/metaimage.h"
 #include "proto/nifti.h"
 #include "proto/pixel.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 
 enum { HEAD_BYTES = 1 << 16 }; /* what lies behind them is no header */
 

@@ -10,7 +10,7 @@
 #include "clients/cbct/commands.h"
 #include "clients/cbct/metrics.h"
 #include "clients/cbct/volume_input.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 
 struct compare_options {
 	const char *volume, *truth;

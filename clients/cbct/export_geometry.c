@@ -15,7 +15,7 @@
 #include "clients/cbct/output.h"
 #include "proto/rtk_geometry.h"
 #include "proto/scan.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 
 struct export_options {
 	const char *scan, *output, *stack;

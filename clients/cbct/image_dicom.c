@@ -23,7 +23,7 @@
 #include "clients/cbct/images.h"
 #include "clients/cbct/tool.h"
 #include "proto/patient.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 
 /* Numbers that belong to an object, or in Enhanced XA to each frame. */
 enum number { PRIMARY, SECONDARY, TO_DETECTOR, TO_ISOCENTRE, SLOPE, INTERCEPT, SIGN, NUMBER_COUNT };

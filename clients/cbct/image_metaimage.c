@@ -16,7 +16,7 @@
 
 #include "clients/cbct/images.h"
 #include "proto/metaimage.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 
 enum { PACKED_BYTES = 1 << 16 };
 

@@ -11,7 +11,7 @@
 
 #include "clients/cbct/images.h"
 #include "clients/cbct/npy.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 
 struct plain {
 	int file;

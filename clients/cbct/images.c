@@ -16,7 +16,7 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 
 const struct option image_option_rows[] = {
     {"pattern", 0, OPTION_TEXT, offsetof(struct image_options, pattern), "GLOB",

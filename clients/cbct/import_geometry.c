@@ -11,7 +11,7 @@
 
 #include "clients/cbct/numbers.h"
 #include "clients/cbct/view_json.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 
 static const double degree = M_PI / 180;
 

@@ -7,7 +7,7 @@
 
 #include "clients/cbct/npy.h"
 #include "core/geometry.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 
 enum { FILE_BYTES = 64 << 20 };
 

@@ -6,7 +6,7 @@
 #include <string.h>
 
 #include "proto/recipe.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 
 #define ROW(name, kind, member, argument, help, least, most, count, names)                                             \
 	{                                                                                                              \

@@ -12,7 +12,8 @@
 #include "clients/cbct/recipe_options.h"
 #include "clients/cbct/warning.h"
 #include "proto/provenance.h"
-#include "proto/spool.h"
+#include "proto/reconstruction.h"
+#include "proto/scan_directory.h"
 
 struct recon_options {
 	const char *directory, *recipe, *output, *backend;
@@ -165,16 +166,16 @@ static int pipeline_run(const struct recon_options *options, const struct job_re
 	const char *output = options->output != NULL ? options->output : options->directory;
 	const struct device_options device_options = {.threads = (int)options->threads};
 	struct display display = {.iterations = recipe->sart.on ? recipe->sart.iterations : 0, .residual = -1};
-	const struct spool_hooks hooks = {
+	const struct reconstruction_hooks hooks = {
 	    .recon = {.context = &display, .progress = on_progress, .row = on_row, .warning = on_warning},
 	    .on_volume = on_volume,
 	};
-	const struct spool_options run = {.scan_directory = options->directory,
-					  .out_directory = output,
-					  .recipe = recipe,
-					  .program = CBCT_PROGRAM,
-					  .patient = &request->patient,
-					  .hooks = &hooks};
+	const struct reconstruction_options run = {.scan_directory = options->directory,
+						   .out_directory = output,
+						   .recipe = recipe,
+						   .program = CBCT_PROGRAM,
+						   .patient = &request->patient,
+						   .hooks = &hooks};
 	struct device *device = NULL;
 	int code;
 
@@ -189,7 +190,7 @@ static int pipeline_run(const struct recon_options *options, const struct job_re
 		return code;
 	if (!options->quiet)
 		display.progress = progress_new(stderr, PROGRESS_BAR_ONLY, backend->name);
-	code = spool_run(backend, device, &run, err);
+	code = reconstruction_run(backend, device, &run, err);
 	progress_free(display.progress);
 	backend->close(device);
 	return code;

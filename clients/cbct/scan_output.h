@@ -3,7 +3,7 @@
 
 #include "proto/scan.h"
 
-/* Writing a scan directory (proto/spool.h): images and projections first, the document last. */
+/* Writing a scan directory (proto/scan_directory.h): images and projections first, the document last. */
 
 /* Makes the directory where it is missing, and removes what an earlier scan may have left and this one may lack. */
 int scan_output_begin(const char *directory, struct error *err);

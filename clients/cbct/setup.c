@@ -12,7 +12,7 @@
 
 #include "clients/cbct/rng.h"
 #include "clients/cbct/view_json.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 
 /* How the geometry is written. */
 enum setup_kind { KIND_CIRCULAR, KIND_ANGLES, KIND_MATRICES, KIND_VIEWS };

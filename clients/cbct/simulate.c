@@ -1,4 +1,4 @@
-/* cbct simulate: a scan directory (proto/spool.h) made from a phantom or a volume. */
+/* cbct simulate: a scan directory (proto/scan_directory.h) made from a phantom or a volume. */
 #include <errno.h>
 #include <math.h>
 #include <stdlib.h>
@@ -12,7 +12,7 @@
 #include "clients/cbct/scan_output.h"
 #include "clients/cbct/setup.h"
 #include "clients/cbct/volume_output.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 
 struct simulate_options {
 	const char *output;

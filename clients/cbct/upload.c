@@ -1,5 +1,5 @@
 /*
- * cbct upload: a scan directory (proto/spool.h) to the daemon. Projections go in
+ * cbct upload: a scan directory (proto/scan_directory.h) to the daemon. Projections go in
  * runs over several connections at once; what the daemon says is missing is
  * sent, so that an interrupted upload goes on with --scan ID, and a run whose
  * reply was lost is sent again at no harm.
@@ -20,7 +20,7 @@
 #include "clients/cbct/progress.h"
 #include "clients/cbct/upload.h"
 #include "clients/cbct/warning.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 #include "proto/zstream.h"
 
 enum { CONNECTIONS_MAX = 64, RUN_BYTES = 16 << 20 };

@@ -19,7 +19,7 @@
 #include "proto/clock.h"
 #include "proto/durable.h"
 #include "proto/seal.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 #include "proto/sums.h"
 #include "proto/format.h"
 

@@ -13,7 +13,7 @@
 #include "daemon/log.h"
 #include "proto/clock.h"
 #include "proto/json.h"
-#include "proto/spool.h"
+#include "proto/reconstruction.h"
 
 /* ---- references ---- */
 
@@ -196,7 +196,7 @@ static int checkpoint_there(const struct jobs *jobs, const struct job_record *re
 	char directory[1024], path[1100];
 
 	store_job_directory(jobs->store, record->id, directory);
-	snprintf(path, sizeof(path), "%s/%s", directory, SPOOL_CHECKPOINT);
+	snprintf(path, sizeof(path), "%s/%s", directory, CHECKPOINT_FILE);
 	return record->checkpoint > 0 && access(path, R_OK) == 0 ? record->checkpoint : 0;
 }
 

@@ -10,7 +10,7 @@
 #include <unistd.h>
 
 #include "daemon/log.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 #include "proto/sums.h"
 
 enum {

@@ -15,7 +15,7 @@
 #include "daemon/store/record.h"
 #include "proto/clock.h"
 #include "proto/json.h"
-#include "proto/spool.h"
+#include "proto/reconstruction.h"
 
 enum { REMOVALS_KEPT = 1000 /* a page that was away for longer reads its list anew */ };
 
@@ -276,7 +276,7 @@ void store_job_remove_checkpoint(const struct store *store, const char *id)
 	char directory[1024], path[1100];
 
 	store_job_directory(store, id, directory);
-	snprintf(path, sizeof(path), "%s/%s", directory, SPOOL_CHECKPOINT);
+	snprintf(path, sizeof(path), "%s/%s", directory, CHECKPOINT_FILE);
 	if (unlink(path) < 0 && errno != ENOENT && errno != ENOTDIR)
 		log_line(LEVEL_WARNING, "job %s: %s stays: %s", id, path, strerror(errno));
 }

@@ -10,7 +10,7 @@
 #include "daemon/log.h"
 #include "daemon/store/db.h"
 #include "daemon/store/quarantine.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 
 /* Of jobs that are gone, too: a client may have seen them. */
 int store_load_last_event(struct store *store, struct error *err)

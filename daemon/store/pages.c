@@ -17,7 +17,7 @@
 
 #include "daemon/lock.h"
 #include "daemon/log.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 #include "proto/sums.h"
 
 enum {

@@ -13,7 +13,7 @@
 #include "daemon/log.h"
 #include "proto/clock.h"
 #include "proto/json.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 
 enum { NOTE_BYTES_MAX = 4096 };
 

@@ -15,7 +15,7 @@
 #include "proto/clock.h"
 #include "proto/durable.h"
 #include "proto/json.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 #include "proto/sums.h"
 
 const struct record_words record_words[RECORD_KINDS] = {{"scan", "scans"}, {"job", "jobs"}};

@@ -23,7 +23,7 @@
 #include "daemon/store/record.h"
 #include "daemon/store/scan.h"
 #include "proto/clock.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 
 /* Left on the disk for the catalogue when room for projections is set aside. */
 static const unsigned long long SPACE_FOR_CATALOGUE = 4ull << 20;

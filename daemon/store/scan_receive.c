@@ -11,7 +11,7 @@
 #include "daemon/store/record.h"
 #include "daemon/store/scan.h"
 #include "proto/clock.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 
 const char *const image_names[IMAGE_COUNT] = {"flat", "dark", "defects"};
 const char *const image_files[IMAGE_COUNT] = {"flat.f32", "dark.f32", "defects.u8"};

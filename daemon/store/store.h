@@ -19,7 +19,7 @@
  *   STATE/deleted           what clients have deleted (store/deleted.h)
  *   STATE/quarantine/       what was found and belongs nowhere (store/quarantine.h)
  *   STATE/catalogue.sqlite  scans, projections, jobs, volumes, history, warnings, events
- *   STATE/scans/ID/         scan.json projections.raw flat.f32 dark.f32 defects.u8 (proto/spool.h)
+ *   STATE/scans/ID/         scan.json projections.raw flat.f32 dark.f32 defects.u8 (proto/scan_directory.h)
  *                           projections.sums (proto/sums.h)
  *   STATE/jobs/ID/          NAME.nii, checkpoint.f32
  *   STATE/{scans,jobs}/ID/record.json  its rows of the catalogue (store/record.h)

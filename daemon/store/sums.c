@@ -18,7 +18,7 @@
 
 #include "daemon/log.h"
 #include "daemon/store/scan.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 
 size_t stored_scan_bytes(const struct stored_scan *scan)
 {

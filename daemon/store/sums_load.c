@@ -7,7 +7,7 @@
 
 #include "daemon/log.h"
 #include "daemon/store/scan.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 
 enum { PARTS = -SUMS_SCAN };
 

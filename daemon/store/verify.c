@@ -17,7 +17,7 @@
 #include "proto/clock.h"
 #include "proto/format.h"
 #include "proto/seal.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 #include "proto/sums.h"
 #include "daemon/lock.h"
 

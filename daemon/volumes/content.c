@@ -8,7 +8,7 @@
 #include <string.h>
 #include <unistd.h>
 
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 #include "proto/zstream.h"
 
 enum {
@@ -82,7 +82,7 @@ static int make_header(struct content *content, const char *path, struct error *
 {
 	const struct content_options *options = &content->options;
 	struct provenance provenance;
-	uint8_t stored[SPOOL_VOLUME_OFFSET];
+	uint8_t stored[VOLUME_FILE_OFFSET];
 	int code = volume_own_head(content->descriptor, path, &content->grid, &content->start, &provenance, err);
 
 	if (code != 0)

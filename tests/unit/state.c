@@ -12,7 +12,7 @@
 #include <unistd.h>
 
 #include "daemon/log.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 
 static void count_failure(void *context, const char *what)
 {

@@ -10,7 +10,7 @@
 
 #include "daemon/store/pages.h"
 #include "daemon/store/quarantine.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 #include "tests/unit/state.h"
 
 static struct state state;

@@ -14,7 +14,7 @@
 #include "proto/durable.h"
 #include "proto/format.h"
 #include "proto/seal.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 #include "tests/unit/state.h"
 
 static struct state state;
@@ -572,9 +572,9 @@ static void put_voxels(const char *id, const char *name, const char *text)
 	size_t length;
 
 	ck_assert_int_eq(volume_formats[0].header(&grid, VOLUME_FLOAT32, &provenance, bytes, &length, &err), 0);
-	ck_assert_uint_eq(length, SPOOL_VOLUME_OFFSET);
+	ck_assert_uint_eq(length, VOLUME_FILE_OFFSET);
 	ck_assert_int_eq(directory_make(state_path(&state, "jobs/%s", id), &err), 0);
-	memcpy(bytes + SPOOL_VOLUME_OFFSET, text, strlen(text));
+	memcpy(bytes + VOLUME_FILE_OFFSET, text, strlen(text));
 	length += strlen(text);
 	ck_assert_int_eq(seal_maker_new(length, &seal, &err), 0);
 	seal_maker_add(&seal, bytes, length);

@@ -13,7 +13,7 @@
 
 #include "daemon/files.h"
 #include "daemon/store/pages.h"
-#include "proto/spool.h"
+#include "proto/scan_directory.h"
 #include "tests/unit/state.h"
 
 static struct state state;

@@ -1,4 +1,4 @@
-/* The spool: durable files, savers, scan directories, and the pipeline over one: volumes, links, checkpoints. */
+/* Scan directories: durable files, savers, scan directories, and the pipeline over one: volumes, links, checkpoints. */
 #include <check.h>
 #include <dirent.h>
 #include <errno.h>
@@ -23,7 +23,8 @@
 #include "proto/format.h"
 #include "proto/saver.h"
 #include "proto/seal.h"
-#include "proto/spool.h"
+#include "proto/reconstruction.h"
+#include "proto/scan_directory.h"
 
 static char directory[64], path[128], out[128];
 static struct backend backend; /* that pipelines run on */
@@ -49,7 +50,7 @@ static void remove_all(const char *name)
 
 static void make_directory(void)
 {
-	snprintf(directory, sizeof(directory), "/tmp/cbct-spool-XXXXXX");
+	snprintf(directory, sizeof(directory), "/tmp/cbct-scan-XXXXXX");
 	ck_assert_ptr_nonnull(mkdtemp(directory));
 	snprintf(path, sizeof(path), "%s/file", directory);
 	snprintf(out, sizeof(out), "%s/out", directory);
@@ -227,7 +228,8 @@ START_TEST(each_call_that_fails_is_noticed)
 		ck_assert_int_eq(waitpid(child, &status, 0), child);
 		ck_assert(WIFEXITED(status));
 		if (WEXITSTATUS(status) == FAULT_UNABLE) {
-			printf("SKIP spool each_call_that_fails_is_noticed: system calls cannot be filtered here\n");
+			printf("SKIP scan_directory each_call_that_fails_is_noticed: system calls cannot be filtered "
+			       "here\n");
 			return;
 		}
 		ck_assert_msg(WEXITSTATUS(status) == FAULT_RIGHT, "%s fails with %s", faults[i].name,
@@ -493,8 +495,9 @@ START_TEST(a_saver_notices_each_call_that_fails)
 		ck_assert_int_eq(waitpid(child, &status, 0), child);
 		ck_assert_msg(WIFEXITED(status), "%s: signal %d", saver_faults[i / 2].name, WTERMSIG(status));
 		if (WEXITSTATUS(status) == FAULT_UNABLE) {
-			printf("SKIP spool a_saver_notices_each_call_that_fails: system calls cannot be filtered "
-			       "here\n");
+			printf(
+			    "SKIP scan_directory a_saver_notices_each_call_that_fails: system calls cannot be filtered "
+			    "here\n");
 			return;
 		}
 		ck_assert_msg(WEXITSTATUS(status) == FAULT_RIGHT, "%s fails with %s", saver_faults[i / 2].name,
@@ -669,8 +672,8 @@ static int watched_settled(void *context, const char *name, struct error *err)
 	ck_assert_int_lt(watched->settled, watched->kept); /* after it was told of, in the same order, once */
 	ck_assert_str_eq(watched->names[watched->settled], name);
 	ck_assert_int_eq(file_read(saved->path, 1 << 24, &content, &length, err), 0);
-	ck_assert_uint_eq(length, SPOOL_VOLUME_OFFSET + saved->bytes);
-	EVP_Digest(content + SPOOL_VOLUME_OFFSET, saved->bytes, watched->sha256[watched->settled++], NULL, EVP_sha256(),
+	ck_assert_uint_eq(length, VOLUME_FILE_OFFSET + saved->bytes);
+	EVP_Digest(content + VOLUME_FILE_OFFSET, saved->bytes, watched->sha256[watched->settled++], NULL, EVP_sha256(),
 		   NULL);
 	free(content);
 	return 0;
@@ -699,29 +702,29 @@ static void watched_open(void *context, const struct recon_memory *memory, const
 static int run(const char *request_text, const char *where, const char *checkpoint, int iteration,
 	       struct watched *watched, struct error *err)
 {
-	const struct spool_hooks hooks = {.recon = {.context = watched,
-						    .cancelled = watched_cancelled,
-						    .yield = watched_yield,
-						    .progress = watched_progress,
-						    .row = watched_row,
-						    .warning = watched_warning},
-					  .on_volume = watched_volume,
-					  .on_settled = watched_settled,
-					  .on_open = watched_open};
+	const struct reconstruction_hooks hooks = {.recon = {.context = watched,
+							     .cancelled = watched_cancelled,
+							     .yield = watched_yield,
+							     .progress = watched_progress,
+							     .row = watched_row,
+							     .warning = watched_warning},
+						   .on_volume = watched_volume,
+						   .on_settled = watched_settled,
+						   .on_open = watched_open};
 	const struct device_options options = {.threads = 2};
-	struct spool_options spool = {.scan_directory = directory,
-				      .out_directory = where,
-				      .checkpoint = checkpoint,
-				      .iteration = iteration,
-				      .hooks = &hooks};
+	struct reconstruction_options what = {.scan_directory = directory,
+					      .out_directory = where,
+					      .checkpoint = checkpoint,
+					      .iteration = iteration,
+					      .hooks = &hooks};
 	struct job_request request;
 	struct device *device = NULL;
 	int code;
 
 	ck_assert_msg(job_request_parse(request_text, strlen(request_text), &request, err) == 0, "%s", err->text);
 	ck_assert_msg(backend_cpu.open(0, &options, &device, err) == 0, "%s", err->text);
-	spool.recipe = &request.recipe;
-	code = spool_run(&backend, device, &spool, err);
+	what.recipe = &request.recipe;
+	code = reconstruction_run(&backend, device, &what, err);
 	backend_cpu.close(device);
 	recipe_clear(&request.recipe);
 	return code;
@@ -778,13 +781,13 @@ START_TEST(kept_volumes_are_files_that_say_what_they_are)
 		ck_assert_str_eq(watched.saved[i].path, expected);
 		ck_assert_uint_eq(watched.saved[i].bytes, bytes);
 		load(out, strrchr(expected, '/') + 1, &content, &length);
-		ck_assert_uint_eq(length, SPOOL_VOLUME_OFFSET + bytes);
-		EVP_Digest(content + SPOOL_VOLUME_OFFSET, bytes, (unsigned char *)digest, NULL, EVP_sha256(), NULL);
+		ck_assert_uint_eq(length, VOLUME_FILE_OFFSET + bytes);
+		EVP_Digest(content + VOLUME_FILE_OFFSET, bytes, (unsigned char *)digest, NULL, EVP_sha256(), NULL);
 		ck_assert_mem_eq(digest, watched.sha256[i], 32);
 		ck_assert_int_eq(volume_read(expected, &grid, NULL, &voxels, &err), 0);
 		ck_assert_int_eq(grid.size[1], 16);
 		ck_assert_double_eq_tol(grid.spacing[2], 6, 1e-6); /* single precision in the header */
-		ck_assert_mem_eq(voxels, content + SPOOL_VOLUME_OFFSET, bytes);
+		ck_assert_mem_eq(voxels, content + VOLUME_FILE_OFFSET, bytes);
 		/* The middle of the ball at (4, -6, 3), 18 views: within a few percent. */
 		ck_assert_double_eq_tol(voxels[(6 * 16 + 6) * 20 + 10], 0.02, 0.002);
 		free(voxels);
@@ -861,28 +864,29 @@ END_TEST
 static int run_arriving(const int *order, int count, int piece, const unsigned char *present, struct watched *watched,
 			struct error *err)
 {
-	const struct spool_hooks hooks = {.recon = {.context = watched, .progress = watched_progress},
-					  .on_volume = watched_volume,
-					  .on_settled = watched_settled};
+	const struct reconstruction_hooks hooks = {.recon = {.context = watched, .progress = watched_progress},
+						   .on_volume = watched_volume,
+						   .on_settled = watched_settled};
 	const struct device_options options = {.threads = 2};
-	struct spool_options spool_options = {
+	struct reconstruction_options what = {
 	    .scan_directory = directory, .out_directory = out, .present = present, .hooks = &hooks};
 	struct job_request request;
-	struct spool *spool = NULL;
+	struct reconstruction *reconstruction = NULL;
 	struct device *device = NULL;
 	int code;
 
 	ck_assert_int_eq(job_request_parse(pipeline, strlen(pipeline), &request, err), 0);
-	spool_options.recipe = &request.recipe;
+	what.recipe = &request.recipe;
 	ck_assert_msg(backend_cpu.open(0, &options, &device, err) == 0, "%s", err->text);
-	code = spool_open(&backend, device, &spool_options, &spool, err);
+	code = reconstruction_open(&backend, device, &what, &reconstruction, err);
 	for (int first = 0; first < count && code == 0; first += piece) {
-		ck_assert_int_eq(spool_pushed(spool), first);
-		code = spool_push(spool, order + first, count - first < piece ? count - first : piece, err);
+		ck_assert_int_eq(reconstruction_pushed(reconstruction), first);
+		code = reconstruction_push(reconstruction, order + first, count - first < piece ? count - first : piece,
+					   err);
 	}
 	if (code == 0)
-		code = spool_finish(spool, err);
-	spool_close(spool);
+		code = reconstruction_finish(reconstruction, err);
+	reconstruction_close(reconstruction);
 	backend_cpu.close(device);
 	recipe_clear(&request.recipe);
 	return code;
@@ -915,7 +919,7 @@ START_TEST(projections_may_arrive_in_any_order_and_in_pieces)
 	free(a);
 	ck_assert_int_eq(run(pipeline, out, NULL, 0, &again, &err), 0);
 	load(out, "fdk.nii", &a, &length);
-	for (size_t i = SPOOL_VOLUME_OFFSET; i < length; i += sizeof(float)) {
+	for (size_t i = VOLUME_FILE_OFFSET; i < length; i += sizeof(float)) {
 		float x, y;
 
 		memcpy(&x, a + i, sizeof(x));
@@ -1001,12 +1005,12 @@ START_TEST(a_run_that_yields_goes_on_to_the_same_bits)
 
 	put_scan();
 	snprintf(straight, sizeof(straight), "%s/straight", directory);
-	snprintf(checkpoint, sizeof(checkpoint), "%s/%s", out, SPOOL_CHECKPOINT);
+	snprintf(checkpoint, sizeof(checkpoint), "%s/%s", out, CHECKPOINT_FILE);
 	ck_assert_int_eq(mkdir(straight, 0700), 0);
 	ck_assert_int_eq(run(pipeline, straight, NULL, 0, &whole, &err), 0);
 	ck_assert_int_eq(run(pipeline, out, NULL, 0, &first, &err), ERR_BUSY);
 	ck_assert_int_eq(first.last_row, 1);
-	ck_assert(is_there(out, SPOOL_CHECKPOINT));
+	ck_assert(is_there(out, CHECKPOINT_FILE));
 	ck_assert_int_eq(run(pipeline, out, checkpoint, 1, &second, &err), ERR_BUSY);
 	ck_assert_int_eq(second.rows, 2);
 	ck_assert_int_eq(second.last_row, 3);
@@ -1032,7 +1036,7 @@ START_TEST(a_checkpoint_knows_its_own_iteration)
 	char checkpoint[200];
 
 	put_scan();
-	snprintf(checkpoint, sizeof(checkpoint), "%s/%s", out, SPOOL_CHECKPOINT);
+	snprintf(checkpoint, sizeof(checkpoint), "%s/%s", out, CHECKPOINT_FILE);
 	ck_assert_int_eq(run(pipeline, out, NULL, 0, &first, &err), ERR_BUSY);
 	ck_assert_int_eq(run(pipeline, out, checkpoint, 1, &second, &err), 0); /* the caller missed the second */
 	ck_assert_int_eq(second.rows, 2);
@@ -1050,11 +1054,11 @@ START_TEST(a_checkpoint_of_something_else_is_refused)
 	size_t length;
 
 	put_scan();
-	snprintf(checkpoint, sizeof(checkpoint), "%s/%s", out, SPOOL_CHECKPOINT);
+	snprintf(checkpoint, sizeof(checkpoint), "%s/%s", out, CHECKPOINT_FILE);
 	ck_assert_int_eq(run(pipeline, out, checkpoint, 2, &second, &err), ERR_INVALID); /* none there */
 	ck_assert_int_eq(run(pipeline, out, NULL, 0, &first, &err), ERR_BUSY);
 	ck_assert_int_eq(run(other, out, checkpoint, 2, &second, &err), ERR_INVALID);
-	load(out, SPOOL_CHECKPOINT, &bytes, &length);
+	load(out, CHECKPOINT_FILE, &bytes, &length);
 	ck_assert_int_eq(file_write_durable(checkpoint, bytes, length - 1, &err), 0);
 	ck_assert_int_eq(run(pipeline, out, checkpoint, 2, &second, &err), ERR_INVALID);
 	bytes[0] = 'x';
@@ -1133,9 +1137,9 @@ START_TEST(intensities_need_air_or_a_flat_image)
 }
 END_TEST
 
-Suite *spool_suite(void)
+Suite *scan_directory_suite(void)
 {
-	Suite *suite = suite_create("spool");
+	Suite *suite = suite_create("scan_directory");
 	TCase *files = tcase_create("files"), *savers = tcase_create("savers"), *pipelines = tcase_create("pipeline");
 
 	tcase_add_checked_fixture(files, make_directory, remove_directory);

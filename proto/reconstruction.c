@@ -1,9 +1,8 @@
 /*
- * The spool: scan directories in, volumes out. Whatever a path names is there
- * whole or not at all: it is written beside it, synced, renamed, and the
- * directory synced; every return value on that way counts.
+ * A scan directory in, volumes out: reconstruction.h. A volume's file is there whole or not at all: it is written
+ * beside its place, synced and renamed; every return value on that way counts.
  */
-#include "proto/spool.h"
+#include "proto/reconstruction.h"
 
 #include <errno.h>
 #include <fcntl.h>
@@ -22,8 +21,9 @@
 #include "proto/saver.h"
 #include "proto/seal.h"
 #include "proto/sums.h"
+#include "proto/scan_directory.h"
 
-_Static_assert((int)SPOOL_VOLUME_OFFSET == (int)NIFTI_VOXELS, "a NIfTI-1 header and its extension");
+_Static_assert((int)VOLUME_FILE_OFFSET == (int)NIFTI_VOXELS, "a NIfTI-1 header and its extension");
 
 enum {
 	READ_BYTES = 8 << 20,  /* projections in one go: small beside the scan, large beside a system call */
@@ -31,253 +31,8 @@ enum {
 	PLACE_BYTES = 64 << 20 /* straight into a file: long enough for a device to overlap its own pieces */
 };
 
-/* ---- files ---- */
-
-int file_read_at(int file, void *ret_to, size_t size, size_t offset, const char *path, struct error *err)
-{
-	for (size_t done = 0; done < size;) {
-		ssize_t got = pread(file, (char *)ret_to + done, size - done, (off_t)(offset + done));
-
-		if (got < 0 && errno == EINTR)
-			continue;
-		if (got < 0)
-			return error_set_errno(err, errno, "%s cannot be read", path);
-		if (got == 0)
-			return error_set(err, ERR_IO, "%.200s ends at byte %zu, %zu are expected", path, offset + done,
-					 offset + size);
-		done += (size_t)got;
-	}
-	return 0;
-}
-
-int file_read(const char *path, size_t most, char **ret_text, size_t *ret_length, struct error *err)
-{
-	int file = open(path, O_RDONLY | O_CLOEXEC), code = 0;
-	struct stat status;
-	char *text = NULL;
-
-	if (file < 0 && errno == ENOENT)
-		return error_set(err, ERR_NOT_FOUND, "%.200s does not exist", path);
-	if (file < 0)
-		return error_set_errno(err, errno, "%s cannot be opened", path);
-	if (fstat(file, &status) != 0) {
-		code = error_set_errno(err, errno, "%s cannot be read", path);
-		goto out;
-	}
-	if ((size_t)status.st_size > most) {
-		code = error_set(err, ERR_TOO_LARGE, "%.200s: %zu bytes, at most %zu are expected", path,
-				 (size_t)status.st_size, most);
-		goto out;
-	}
-	text = malloc((size_t)status.st_size + 1);
-	if (text == NULL) {
-		code = error_set(err, ERR_NO_MEMORY, "no memory for the %zu bytes of %.200s", (size_t)status.st_size,
-				 path);
-		goto out;
-	}
-	code = file_read_at(file, text, (size_t)status.st_size, 0, path, err);
-	if (code == 0) {
-		text[status.st_size] = '\0';
-		*ret_text = text;
-		*ret_length = (size_t)status.st_size;
-		text = NULL;
-	}
-out:
-	free(text);
-	close(file);
-	return code;
-}
-
-int file_write_durable(const char *path, const void *data, size_t length, struct error *err)
-{
-	struct durable d;
-	int code = durable_open(&d, path, length, err);
-
-	if (code != 0)
-		return code;
-	code = durable_write(&d, data, length, err);
-	if (code != 0) {
-		durable_abandon(&d);
-		return code;
-	}
-	return durable_commit(&d, err);
-}
-
-/* ---- a scan directory ---- */
-
-static int join(char *ret_path, size_t size, const char *directory, const char *name, const char *extension,
-		struct error *err)
-{
-	if (snprintf(ret_path, size, "%s/%s%s", directory, name, extension) >= (int)size)
-		return error_set(err, ERR_INVALID, "the path of %s in %.200s is too long", name, directory);
-	return 0;
-}
-
-/* *ret_sums -1: there is none. */
-static int open_sums(const char *directory, int *ret_sums, struct error *err)
-{
-	struct error why;
-	bool whole;
-	int code = sums_open(directory, false, 0, 0, ret_sums, &whole, &why);
-
-	if (code == ERR_NOT_FOUND) {
-		*ret_sums = -1;
-		return 0;
-	}
-	if (code != 0)
-		*err = why;
-	return code;
-}
-
-/* A whole file against its record; bytes NULL: there is no such file. */
-static int check_part(int sums, enum sums_part part, const char *name, const void *bytes, size_t size,
-		      struct error *err)
-{
-	unsigned char state = SUM_NONE;
-	struct sum sum;
-	int code = sums < 0 ? 0 : sums_get(sums, part, 1, 0, &sum, &state, err);
-
-	if (sums < 0 || code != 0 || (state == SUM_NONE && bytes == NULL))
-		return code;
-	if (state == SUM_GOOD && !sum.lost && bytes != NULL && sum.bytes == size && sum.crc == checksum(0, bytes, size))
-		return 0;
-	return error_set(err, ERR_DAMAGED, "%s of the scan is damaged: it does not fit its record in %s", name,
-			 SUMS_FILE);
-}
-
-static int read_scan(const char *directory, int sums, struct scan **ret_scan, struct error *err)
-{
-	char path[PATH_MAX], *text = NULL;
-	size_t length = 0;
-	int code = join(path, sizeof(path), directory, "scan.json", "", err);
-
-	if (code == 0)
-		code = file_read(path, JSON_BYTES_MAX, &text, &length, err);
-	if (code == 0)
-		code = check_part(sums, SUMS_SCAN, "scan.json", text, length, err);
-	if (code == 0)
-		code = scan_parse(text, length, ret_scan, err);
-	free(text);
-	return code;
-}
-
-static int open_projections(const char *directory, const struct scan *scan, int *ret_file, struct error *err)
-{
-	size_t expected = scan_projection_bytes(scan) * (size_t)scan->count;
-	char path[PATH_MAX];
-	struct stat status;
-	int code = join(path, sizeof(path), directory, "projections.raw", "", err), file;
-
-	if (code != 0)
-		return code;
-	file = open(path, O_RDONLY | O_CLOEXEC);
-	if (file < 0 && errno == ENOENT)
-		return error_set(err, ERR_NOT_FOUND, "%.200s does not exist", path);
-	if (file < 0)
-		return error_set_errno(err, errno, "%s cannot be opened", path);
-	if (fstat(file, &status) != 0)
-		code = error_set_errno(err, errno, "%s cannot be read", path);
-	else if ((size_t)status.st_size != expected)
-		code = error_set(err, ERR_INVALID, "%.150s: %zu bytes, but %d projections of %d x %d %s have %zu", path,
-				 (size_t)status.st_size, scan->count, scan->geometry.columns, scan->geometry.rows,
-				 sample_names[scan->sample], expected);
-	if (code != 0)
-		close(file);
-	else
-		*ret_file = file;
-	return code;
-}
-
-/* An image of values of `size` bytes; *ret_image stays NULL where there is none. */
-static int read_image(const char *directory, const char *name, size_t size, const struct scan *scan, void **ret_image,
-		      struct error *err)
-{
-	size_t expected = (size_t)scan->geometry.columns * (size_t)scan->geometry.rows * size, length = 0;
-	char path[PATH_MAX], *bytes = NULL;
-	int code = join(path, sizeof(path), directory, name, "", err);
-
-	if (code != 0)
-		return code;
-	code = file_read(path, expected, &bytes, &length, err);
-	if (code == ERR_NOT_FOUND)
-		return 0;
-	if (code == 0 && length != expected) {
-		free(bytes);
-		return error_set(err, ERR_INVALID, "%.200s: %zu bytes, %zu are expected", path, length, expected);
-	}
-	if (code == 0)
-		*ret_image = bytes; /* malloc's alignment suits any type */
-	return code;
-}
-
-static int read_images(const char *directory, struct scan_files *files, struct error *err)
-{
-	static const char *const names[] = {"flat.f32", "dark.f32", "defects.u8"};
-	size_t pixels = (size_t)files->scan->geometry.columns * (size_t)files->scan->geometry.rows;
-	void *images[3] = {NULL};
-	int code = 0;
-
-	for (int i = 0; i < 3 && code == 0; i++) {
-		size_t size = i < 2 ? sizeof(float) : 1;
-
-		code = read_image(directory, names[i], size, files->scan, &images[i], err);
-		if (code == 0)
-			code = check_part(files->sums, SUMS_FLAT + i, names[i], images[i], pixels * size, err);
-	}
-	files->flat = images[0];
-	files->dark = images[1];
-	files->defects = images[2];
-	return code;
-}
-
-/* Beside records of what they held, files that are gone or have another size were damaged since. */
-static int damaged_since(const struct scan_files *files, int code, struct error *err)
-{
-	char text[sizeof(err->text)];
-
-	if (files->sums < 0 || (code != ERR_NOT_FOUND && code != ERR_INVALID))
-		return code;
-	snprintf(text, sizeof(text), "%s", err->text);
-	return error_set(err, ERR_DAMAGED, "%s", text);
-}
-
-int scan_files_open(const char *directory, struct scan_files *ret_files, struct error *err)
-{
-	struct scan_files files = {.projections = -1, .sums = -1};
-	int code = open_sums(directory, &files.sums, err);
-
-	if (code == 0)
-		code = damaged_since(&files, read_scan(directory, files.sums, &files.scan, err), err);
-	if (code == 0)
-		code = damaged_since(&files, open_projections(directory, files.scan, &files.projections, err), err);
-	if (code == 0)
-		code = damaged_since(&files, read_images(directory, &files, err), err);
-	if (code != 0)
-		scan_files_close(&files);
-	else
-		*ret_files = files;
-	return code;
-}
-
-void scan_files_close(struct scan_files *files)
-{
-	if (files == NULL)
-		return;
-	scan_free(files->scan);
-	if (files->projections >= 0)
-		close(files->projections);
-	if (files->sums >= 0)
-		close(files->sums);
-	free(files->flat);
-	free(files->dark);
-	free(files->defects);
-	*files = (struct scan_files){.projections = -1, .sums = -1};
-}
-
-/* ---- the pipeline ---- */
-
 struct run {
-	const struct spool_hooks *hooks;
+	const struct reconstruction_hooks *hooks;
 	const char *directory;
 	const struct recipe *recipe;
 	const struct recon *recon; /* NULL before it is opened */
@@ -302,7 +57,7 @@ static int settle(struct run *run, bool wait, struct error *err);
 static bool run_cancelled(void *context)
 {
 	struct run *run = context;
-	const struct spool_hooks *hooks = run->hooks;
+	const struct reconstruction_hooks *hooks = run->hooks;
 
 	if (run->trouble.code == 0)
 		settle(run, false, &run->trouble);
@@ -313,7 +68,7 @@ static bool run_cancelled(void *context)
 
 static bool run_yield(void *context)
 {
-	const struct spool_hooks *hooks = ((struct run *)context)->hooks;
+	const struct reconstruction_hooks *hooks = ((struct run *)context)->hooks;
 
 	return hooks->recon.yield != NULL && hooks->recon.yield(hooks->recon.context);
 }
@@ -322,7 +77,7 @@ static void prepare(struct run *run, enum stage stage, int iteration);
 
 static void run_progress(void *context, enum stage stage, int iteration, double fraction)
 {
-	const struct spool_hooks *hooks = ((struct run *)context)->hooks;
+	const struct reconstruction_hooks *hooks = ((struct run *)context)->hooks;
 
 	if (stage != STAGE_FDK) /* which is told of with every projection: push_some */
 		prepare(context, stage, iteration);
@@ -332,7 +87,7 @@ static void run_progress(void *context, enum stage stage, int iteration, double 
 
 static void run_row(void *context, const struct history_row *row)
 {
-	const struct spool_hooks *hooks = ((struct run *)context)->hooks;
+	const struct reconstruction_hooks *hooks = ((struct run *)context)->hooks;
 
 	if (hooks->recon.row != NULL)
 		hooks->recon.row(hooks->recon.context, row);
@@ -340,7 +95,7 @@ static void run_row(void *context, const struct history_row *row)
 
 static void run_denoising(void *context, double noise_hu, double alpha)
 {
-	const struct spool_hooks *hooks = ((struct run *)context)->hooks;
+	const struct reconstruction_hooks *hooks = ((struct run *)context)->hooks;
 
 	if (hooks->recon.denoising != NULL)
 		hooks->recon.denoising(hooks->recon.context, noise_hu, alpha);
@@ -348,7 +103,7 @@ static void run_denoising(void *context, double noise_hu, double alpha)
 
 static void run_warning(void *context, const char *code, const char *detail)
 {
-	const struct spool_hooks *hooks = ((struct run *)context)->hooks;
+	const struct reconstruction_hooks *hooks = ((struct run *)context)->hooks;
 
 	if (hooks->recon.warning != NULL)
 		hooks->recon.warning(hooks->recon.context, code, detail);
@@ -399,10 +154,10 @@ static void prepare(struct run *run, enum stage stage, int iteration)
 	char path[PATH_MAX];
 
 	if (!run->ahead || run->prepared || run->recon == NULL || !ends_with_volume(run->recipe, stage, iteration) ||
-	    join(path, sizeof(path), run->directory, "blank", "", &ignored) != 0 || open_saver(run, &ignored) != 0)
+	    path_join(path, sizeof(path), run->directory, "blank", "", &ignored) != 0 || open_saver(run, &ignored) != 0)
 		return;
 	run->prepared = true;
-	saver_prepare(run->saver, path, SPOOL_VOLUME_OFFSET + grid_voxels(recon_grid(run->recon)) * sizeof(float));
+	saver_prepare(run->saver, path, VOLUME_FILE_OFFSET + grid_voxels(recon_grid(run->recon)) * sizeof(float));
 }
 
 static int tell_settled(struct run *run, const char *name, struct error *err)
@@ -519,7 +274,7 @@ static int run_keep(void *context, struct recon *recon, const struct kept_volume
 	struct run *run = context;
 	struct saved_volume saved = {.bytes = grid_voxels(kept->grid) * sizeof(float)};
 	bool linked = false;
-	int code = join(saved.path, sizeof(saved.path), run->directory, kept->name, ".nii", err);
+	int code = path_join(saved.path, sizeof(saved.path), run->directory, kept->name, ".nii", err);
 
 	if (code == 0)
 		code = link_volume(run, kept, &saved, &linked, err);
@@ -535,16 +290,16 @@ static int run_keep(void *context, struct recon *recon, const struct kept_volume
 /* ---- checkpoints ---- */
 
 /* Behind the line lies the iterate, behind that the list of the metal that was taken out. No noise is written as 0. */
-static void checkpoint_line(char ret_line[SPOOL_CHECKPOINT_OFFSET], int iteration, const struct grid *grid,
+static void checkpoint_line(char ret_line[CHECKPOINT_FILE_OFFSET], int iteration, const struct grid *grid,
 			    size_t metal_bytes, const struct volume_noise *noise)
 {
-	char text[SPOOL_CHECKPOINT_OFFSET];
+	char text[CHECKPOINT_FILE_OFFSET];
 
-	memset(ret_line, ' ', SPOOL_CHECKPOINT_OFFSET);
+	memset(ret_line, ' ', CHECKPOINT_FILE_OFFSET);
 	snprintf(text, sizeof(text), "cbctd checkpoint %d of %d %d %d, metal %zu, noise %a %a", iteration,
 		 grid->size[0], grid->size[1], grid->size[2], metal_bytes, noise->sigma, noise->contrast);
 	memcpy(ret_line, text, strlen(text));
-	ret_line[SPOOL_CHECKPOINT_OFFSET - 1] = '\n';
+	ret_line[CHECKPOINT_FILE_OFFSET - 1] = '\n';
 }
 
 /* A checkpoint on its way to the disk. */
@@ -596,7 +351,7 @@ static int write_iterate(struct recon *recon, struct sealed_file *sealed, struct
 
 static int write_checkpoint(struct recon *recon, struct sealed_file *sealed, struct error *err)
 {
-	char header[SPOOL_CHECKPOINT_OFFSET];
+	char header[CHECKPOINT_FILE_OFFSET];
 	size_t metal_bytes;
 	const void *metal = recon_metal(recon, &metal_bytes);
 	const struct volume_noise *noise = recon_noise(recon), none = {0};
@@ -615,8 +370,8 @@ static int save_checkpoint(struct recon *recon, const char *directory, struct er
 {
 	char path[PATH_MAX];
 	struct sealed_file sealed = {.seal = {0}};
-	size_t content = SPOOL_CHECKPOINT_OFFSET + grid_voxels(recon_grid(recon)) * sizeof(float), metal_bytes;
-	int code = join(path, sizeof(path), directory, SPOOL_CHECKPOINT, "", err);
+	size_t content = CHECKPOINT_FILE_OFFSET + grid_voxels(recon_grid(recon)) * sizeof(float), metal_bytes;
+	int code = path_join(path, sizeof(path), directory, CHECKPOINT_FILE, "", err);
 
 	recon_metal(recon, &metal_bytes);
 	content += metal_bytes;
@@ -638,8 +393,8 @@ static int save_checkpoint(struct recon *recon, const char *directory, struct er
 static int check_checkpoint(const char *path, const char *bytes, const struct seal *seal, const struct grid *grid,
 			    int *ret_iteration, struct volume_noise *ret_noise, struct error *err)
 {
-	size_t expected = SPOOL_CHECKPOINT_OFFSET + grid_voxels(grid) * sizeof(float);
-	char text[SPOOL_CHECKPOINT_OFFSET + 1] = "", line[SPOOL_CHECKPOINT_OFFSET];
+	size_t expected = CHECKPOINT_FILE_OFFSET + grid_voxels(grid) * sizeof(float);
+	char text[CHECKPOINT_FILE_OFFSET + 1] = "", line[CHECKPOINT_FILE_OFFSET];
 	struct volume_noise noise;
 	int iteration, damaged = seal_first_damaged(seal, bytes);
 
@@ -648,7 +403,7 @@ static int check_checkpoint(const char *path, const char *bytes, const struct se
 	if (seal->content < expected)
 		return error_set(err, ERR_INVALID, "%.200s: %zu bytes, %zu are expected", path, seal->content,
 				 expected);
-	memcpy(text, bytes, SPOOL_CHECKPOINT_OFFSET);
+	memcpy(text, bytes, CHECKPOINT_FILE_OFFSET);
 	if (sscanf(text, "cbctd checkpoint %d of %*d %*d %*d, metal %*u, noise %la %la", &iteration, &noise.sigma,
 		   &noise.contrast) != 3)
 		return error_set(err, ERR_INVALID, "%.200s is no checkpoint", path);
@@ -686,10 +441,10 @@ static int resume(struct run *run, struct recon *recon, const char *path, int ex
 	code = check_checkpoint(path, bytes, &seal, recon_grid(recon), &iteration, &noise, err);
 	if (code == 0)
 		code =
-		    recon_resume(recon, (const float *)(const void *)(bytes + SPOOL_CHECKPOINT_OFFSET), iteration, err);
+		    recon_resume(recon, (const float *)(const void *)(bytes + CHECKPOINT_FILE_OFFSET), iteration, err);
 	if (code == 0 && run->recipe->tv.on)
 		code = recon_resume_noise(recon, &noise, err);
-	metal = SPOOL_CHECKPOINT_OFFSET + grid_voxels(recon_grid(recon)) * sizeof(float);
+	metal = CHECKPOINT_FILE_OFFSET + grid_voxels(recon_grid(recon)) * sizeof(float);
 	if (code == 0 && seal.content > metal)
 		code = recon_resume_metal(recon, bytes + metal, seal.content - metal, err);
 	if (code == 0 && iteration != expected) {
@@ -709,7 +464,7 @@ out:
 
 /* ---- the three steps ---- */
 
-struct spool {
+struct reconstruction {
 	struct run run;
 	struct recon_hooks hooks;
 	struct scan_files files;
@@ -725,7 +480,7 @@ struct spool {
 	/* What the recon is opened with. */
 	const struct backend *backend;
 	struct device *device;
-	const struct spool_options *options;
+	const struct reconstruction_options *options;
 	int iteration; /* that the checkpoint is expected to hold */
 	struct linearise linearise;
 	/* Looks for stuck pixels in the views as they pass; NULL before the recon is opened, and where too few are. */
@@ -733,41 +488,44 @@ struct spool {
 	bool looked; /* its answer is known */
 };
 
-static int reduce(struct spool *spool, const unsigned char *present, struct error *err)
+static int reduce(struct reconstruction *reconstruction, const unsigned char *present, struct error *err)
 {
-	struct scan *scan = spool->files.scan;
+	struct scan *scan = reconstruction->files.scan;
 	int code = present == NULL ? 0 : scan_reduce(scan, present, err);
 
 	if (code != 0)
 		return code;
-	for (int i = 0; i < spool->projections; i++)
-		spool->view_of[i] = -1;
+	for (int i = 0; i < reconstruction->projections; i++)
+		reconstruction->view_of[i] = -1;
 	for (int i = 0; i < scan->count; i++)
-		spool->view_of[scan->projection == NULL ? i : scan->projection[i]] = i;
+		reconstruction->view_of[scan->projection == NULL ? i : scan->projection[i]] = i;
 	return 0;
 }
 
-static int allocate(struct spool *spool, struct error *err)
+static int allocate(struct reconstruction *reconstruction, struct error *err)
 {
-	size_t bytes = scan_projection_bytes(spool->files.scan), count = (size_t)spool->files.scan->count;
+	size_t bytes = scan_projection_bytes(reconstruction->files.scan),
+	       count = (size_t)reconstruction->files.scan->count;
 
-	spool->projections = (int)count;
-	spool->batch = bytes < READ_BYTES ? (int)(READ_BYTES / bytes) : 1;
-	if (spool->batch > spool->projections)
-		spool->batch = spool->projections;
-	spool->view_of = malloc(count * sizeof(*spool->view_of));
-	spool->pushed = calloc(count, 1);
-	spool->views = malloc((size_t)spool->batch * sizeof(*spool->views));
-	spool->samples = malloc((size_t)spool->batch * bytes);
-	if (spool->view_of == NULL || spool->pushed == NULL || spool->views == NULL || spool->samples == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for %d projections of %zu bytes", spool->batch, bytes);
+	reconstruction->projections = (int)count;
+	reconstruction->batch = bytes < READ_BYTES ? (int)(READ_BYTES / bytes) : 1;
+	if (reconstruction->batch > reconstruction->projections)
+		reconstruction->batch = reconstruction->projections;
+	reconstruction->view_of = malloc(count * sizeof(*reconstruction->view_of));
+	reconstruction->pushed = calloc(count, 1);
+	reconstruction->views = malloc((size_t)reconstruction->batch * sizeof(*reconstruction->views));
+	reconstruction->samples = malloc((size_t)reconstruction->batch * bytes);
+	if (reconstruction->view_of == NULL || reconstruction->pushed == NULL || reconstruction->views == NULL ||
+	    reconstruction->samples == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for %d projections of %zu bytes", reconstruction->batch,
+				 bytes);
 	return 0;
 }
 
-static int set_linearise(struct spool *spool, struct error *err)
+static int set_linearise(struct reconstruction *reconstruction, struct error *err)
 {
-	const struct scan_files *files = &spool->files;
-	struct linearise *linearise = &spool->linearise;
+	const struct scan_files *files = &reconstruction->files;
+	struct linearise *linearise = &reconstruction->linearise;
 
 	*linearise = scan_linearise(files->scan);
 	linearise->flat = files->flat;
@@ -778,36 +536,39 @@ static int set_linearise(struct spool *spool, struct error *err)
 	return 0;
 }
 
-static int open_recon(struct spool *spool, struct error *err)
+static int open_recon(struct reconstruction *reconstruction, struct error *err)
 {
-	const struct spool_options *options = spool->options;
-	int code = recon_open(spool->backend, spool->device, &spool->files.scan->geometry, &spool->linearise,
-			      options->recipe, &spool->hooks, &spool->recon, err);
+	const struct reconstruction_options *options = reconstruction->options;
+	int code = recon_open(reconstruction->backend, reconstruction->device, &reconstruction->files.scan->geometry,
+			      &reconstruction->linearise, options->recipe, &reconstruction->hooks,
+			      &reconstruction->recon, err);
 
-	spool->run.recon = spool->recon;
-	if (code == 0 && spool->resumed)
-		code = resume(&spool->run, spool->recon, options->checkpoint, spool->iteration, err);
+	reconstruction->run.recon = reconstruction->recon;
+	if (code == 0 && reconstruction->resumed)
+		code = resume(&reconstruction->run, reconstruction->recon, options->checkpoint,
+			      reconstruction->iteration, err);
 	/* What the file holds: opened again, it is no surprise. */
-	if (code == 0 && spool->resumed)
-		spool->iteration = recon_iteration(spool->recon);
+	if (code == 0 && reconstruction->resumed)
+		reconstruction->iteration = recon_iteration(reconstruction->recon);
 	return code;
 }
 
-static int open_first(struct spool *spool, struct error *err)
+static int open_first(struct reconstruction *reconstruction, struct error *err)
 {
-	const struct spool_hooks *hooks = spool->run.hooks;
-	const struct geometry *geometry = &spool->files.scan->geometry;
+	const struct reconstruction_hooks *hooks = reconstruction->run.hooks;
+	const struct geometry *geometry = &reconstruction->files.scan->geometry;
 	struct recon_memory memory;
-	int code = set_linearise(spool, err);
+	int code = set_linearise(reconstruction, err);
 
 	if (code == 0)
-		code = recon_memory(spool->backend, spool->device, geometry, spool->options->recipe, &memory, err);
+		code = recon_memory(reconstruction->backend, reconstruction->device, geometry,
+				    reconstruction->options->recipe, &memory, err);
 	if (code == 0)
-		code = open_recon(spool, err);
+		code = open_recon(reconstruction, err);
 	if (code == 0)
-		code = stuck_new(&spool->linearise, geometry, &spool->stuck, err);
+		code = stuck_new(&reconstruction->linearise, geometry, &reconstruction->stuck, err);
 	if (code == 0 && hooks->on_open != NULL)
-		hooks->on_open(hooks->recon.context, &memory, recon_plan(spool->recon));
+		hooks->on_open(hooks->recon.context, &memory, recon_plan(reconstruction->recon));
 	return code;
 }
 
@@ -815,22 +576,22 @@ static int open_first(struct spool *spool, struct error *err)
  * Once all views that stuck pixels are looked for in have come. Where some are found the reconstruction is opened anew
  * with their map, *ret_again, and has none of the projections: those that it had were taken with these pixels.
  */
-static int heed_stuck_pixels(struct spool *spool, bool *ret_again, struct error *err)
+static int heed_stuck_pixels(struct reconstruction *reconstruction, bool *ret_again, struct error *err)
 {
 	*ret_again = false;
-	if (spool->stuck == NULL || spool->looked)
+	if (reconstruction->stuck == NULL || reconstruction->looked)
 		return 0;
-	spool->looked = true;
-	spool->linearise.stuck = stuck_find(spool->stuck);
-	if (spool->linearise.stuck == NULL)
+	reconstruction->looked = true;
+	reconstruction->linearise.stuck = stuck_find(reconstruction->stuck);
+	if (reconstruction->linearise.stuck == NULL)
 		return 0;
 	*ret_again = true;
-	recon_free(spool->recon);
-	spool->recon = NULL;
-	spool->run.recon = NULL;
-	memset(spool->pushed, 0, (size_t)spool->projections);
-	spool->pushed_count = 0;
-	return open_recon(spool, err);
+	recon_free(reconstruction->recon);
+	reconstruction->recon = NULL;
+	reconstruction->run.recon = NULL;
+	memset(reconstruction->pushed, 0, (size_t)reconstruction->projections);
+	reconstruction->pushed_count = 0;
+	return open_recon(reconstruction, err);
 }
 
 static void set_text(char *ret, size_t size, const char *text)
@@ -839,10 +600,11 @@ static void set_text(char *ret, size_t size, const char *text)
 }
 
 /* What the volumes' files will say, but for stage and iteration. */
-static int set_provenance(struct spool *spool, const struct spool_options *options, struct error *err)
+static int set_provenance(struct reconstruction *reconstruction, const struct reconstruction_options *options,
+			  struct error *err)
 {
-	struct provenance *provenance = &spool->run.provenance;
-	const struct scan *scan = spool->files.scan;
+	struct provenance *provenance = &reconstruction->run.provenance;
+	const struct scan *scan = reconstruction->files.scan;
 
 	provenance->patient = options->patient != NULL ? *options->patient : scan->patient;
 	set_text(provenance->program, sizeof(provenance->program), options->program);
@@ -853,75 +615,76 @@ static int set_provenance(struct spool *spool, const struct spool_options *optio
 	return provenance->recipe != NULL ? 0 : error_set(err, ERR_NO_MEMORY, "no memory for a recipe");
 }
 
-int spool_open(const struct backend *backend, struct device *device, const struct spool_options *options,
-	       struct spool **ret_spool, struct error *err)
+int reconstruction_open(const struct backend *backend, struct device *device,
+			const struct reconstruction_options *options, struct reconstruction **ret_reconstruction,
+			struct error *err)
 {
-	struct spool *spool = calloc(1, sizeof(*spool));
+	struct reconstruction *reconstruction = calloc(1, sizeof(*reconstruction));
 	int code;
 
-	if (spool == NULL)
+	if (reconstruction == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a reconstruction");
-	spool->run = (struct run){.hooks = options->hooks,
-				  .directory = options->out_directory,
-				  .recipe = options->recipe,
-				  .sealed = options->checked,
-				  .ahead = backend->own_memory};
-	spool->hooks = (struct recon_hooks){.context = &spool->run,
-					    .cancelled = run_cancelled,
-					    .yield = run_yield,
-					    .progress = run_progress,
-					    .row = run_row,
-					    .keep = run_keep,
-					    .denoising = run_denoising,
-					    .warning = run_warning};
-	spool->files.projections = spool->files.sums = -1;
-	code = scan_files_open(options->scan_directory, &spool->files, err);
-	if (code == 0 && options->checked && spool->files.sums < 0)
+	reconstruction->run = (struct run){.hooks = options->hooks,
+					   .directory = options->out_directory,
+					   .recipe = options->recipe,
+					   .sealed = options->checked,
+					   .ahead = backend->own_memory};
+	reconstruction->hooks = (struct recon_hooks){.context = &reconstruction->run,
+						     .cancelled = run_cancelled,
+						     .yield = run_yield,
+						     .progress = run_progress,
+						     .row = run_row,
+						     .keep = run_keep,
+						     .denoising = run_denoising,
+						     .warning = run_warning};
+	reconstruction->files.projections = reconstruction->files.sums = -1;
+	code = scan_files_open(options->scan_directory, &reconstruction->files, err);
+	if (code == 0 && options->checked && reconstruction->files.sums < 0)
 		code = error_set(err, ERR_DAMAGED, "the scan has no %s", SUMS_FILE);
 	if (code == 0)
-		code = set_provenance(spool, options, err);
+		code = set_provenance(reconstruction, options, err);
 	if (code == 0)
-		code = allocate(spool, err);
+		code = allocate(reconstruction, err);
 	if (code == 0)
-		code = reduce(spool, options->present, err);
-	spool->backend = backend;
-	spool->device = device;
-	spool->options = options;
-	spool->iteration = options->iteration;
-	spool->resumed = options->checkpoint != NULL;
+		code = reduce(reconstruction, options->present, err);
+	reconstruction->backend = backend;
+	reconstruction->device = device;
+	reconstruction->options = options;
+	reconstruction->iteration = options->iteration;
+	reconstruction->resumed = options->checkpoint != NULL;
 	if (code == 0)
-		code = open_first(spool, err);
+		code = open_first(reconstruction, err);
 	if (code != 0)
-		spool_close(spool);
+		reconstruction_close(reconstruction);
 	else
-		*ret_spool = spool;
+		*ret_reconstruction = reconstruction;
 	return code;
 }
 
-void spool_close(struct spool *spool)
+void reconstruction_close(struct reconstruction *reconstruction)
 {
-	if (spool == NULL)
+	if (reconstruction == NULL)
 		return;
-	saver_free(spool->run.saver);
-	provenance_clear(&spool->run.provenance);
-	recon_free(spool->recon);
-	stuck_free(spool->stuck);
-	scan_files_close(&spool->files);
-	free(spool->view_of);
-	free(spool->pushed);
-	free(spool->views);
-	free(spool->samples);
-	free(spool);
+	saver_free(reconstruction->run.saver);
+	provenance_clear(&reconstruction->run.provenance);
+	recon_free(reconstruction->recon);
+	stuck_free(reconstruction->stuck);
+	scan_files_close(&reconstruction->files);
+	free(reconstruction->view_of);
+	free(reconstruction->pushed);
+	free(reconstruction->views);
+	free(reconstruction->samples);
+	free(reconstruction);
 }
 
-int spool_pushed(const struct spool *spool)
+int reconstruction_pushed(const struct reconstruction *reconstruction)
 {
-	return spool->pushed_count;
+	return reconstruction->pushed_count;
 }
 
-int spool_wanted(const struct spool *spool)
+int reconstruction_wanted(const struct reconstruction *reconstruction)
 {
-	return spool->files.scan->count;
+	return reconstruction->files.scan->count;
 }
 
 /* A part of one projection, read and summed by one core while it is in that core's cache. */
@@ -975,10 +738,10 @@ static int check_projection(const struct sum *sum, enum sum_state state, int pro
 }
 
 /* `count` neighbours from `first` on, at most a batch. */
-static int read_run(struct spool *spool, int first, int count, char *ret_to, struct error *err)
+static int read_run(struct reconstruction *reconstruction, int first, int count, char *ret_to, struct error *err)
 {
 	enum { PIECE = 512 << 10 };
-	size_t bytes = scan_projection_bytes(spool->files.scan);
+	size_t bytes = scan_projection_bytes(reconstruction->files.scan);
 	int each = (int)((bytes + PIECE - 1) / PIECE), code = 0;
 	struct piece *pieces = calloc((size_t)count * (size_t)each, sizeof(*pieces));
 	struct sum *sums = calloc((size_t)count, sizeof(*sums));
@@ -994,14 +757,14 @@ static int read_run(struct spool *spool, int first, int count, char *ret_to, str
 		pieces[i].first = (size_t)(i / each) * bytes + at;
 		pieces[i].size = bytes - at < PIECE ? bytes - at : PIECE;
 	}
-	read_pieces(spool->files.projections, ret_to, (size_t)first * bytes, pieces, count * each);
-	if (spool->files.sums >= 0)
-		code = sums_get(spool->files.sums, first, count, bytes, sums, states, err);
+	read_pieces(reconstruction->files.projections, ret_to, (size_t)first * bytes, pieces, count * each);
+	if (reconstruction->files.sums >= 0)
+		code = sums_get(reconstruction->files.sums, first, count, bytes, sums, states, err);
 	for (int i = 0; i < count && code == 0; i++) {
 		uint32_t crc = 0;
 
 		code = join_pieces(pieces + i * each, each, &crc, err);
-		if (code == 0 && spool->files.sums >= 0)
+		if (code == 0 && reconstruction->files.sums >= 0)
 			code = check_projection(&sums[i], states[i], first + i, crc, err);
 	}
 out:
@@ -1012,106 +775,112 @@ out:
 }
 
 /* Into samples, neighbours in the file in one go. */
-static int read_projections(struct spool *spool, const int *projections, int count, struct error *err)
+static int read_projections(struct reconstruction *reconstruction, const int *projections, int count, struct error *err)
 {
-	size_t bytes = scan_projection_bytes(spool->files.scan);
+	size_t bytes = scan_projection_bytes(reconstruction->files.scan);
 	int code = 0;
 
 	for (int first = 0, next; first < count && code == 0; first = next) {
 		for (next = first + 1; next < count && projections[next] == projections[next - 1] + 1;)
 			next++;
-		code = read_run(spool, projections[first], next - first, spool->samples + (size_t)first * bytes, err);
+		code = read_run(reconstruction, projections[first], next - first,
+				reconstruction->samples + (size_t)first * bytes, err);
 	}
 	return code;
 }
 
 /* At most a batch. */
-static int push_some(struct spool *spool, const int *projections, int count, struct error *err)
+static int push_some(struct reconstruction *reconstruction, const int *projections, int count, struct error *err)
 {
-	const size_t bytes = scan_projection_bytes(spool->files.scan);
+	const size_t bytes = scan_projection_bytes(reconstruction->files.scan);
 	int code;
 
 	for (int i = 0; i < count; i++) {
 		int projection = projections[i];
 
-		if (projection < 0 || projection >= spool->projections || spool->view_of[projection] < 0)
+		if (projection < 0 || projection >= reconstruction->projections ||
+		    reconstruction->view_of[projection] < 0)
 			return error_set(err, ERR_INVALID, "projection %d is none of the scan's %d", projection,
-					 spool_wanted(spool));
-		spool->views[i] = spool->view_of[projection];
+					 reconstruction_wanted(reconstruction));
+		reconstruction->views[i] = reconstruction->view_of[projection];
 	}
-	code = read_projections(spool, projections, count, err);
-	for (int i = 0; i < count && code == 0 && spool->stuck != NULL && !spool->looked; i++)
-		if (stuck_wants(spool->stuck, spool->views[i]))
-			stuck_add(spool->stuck, spool->samples + (size_t)i * bytes);
+	code = read_projections(reconstruction, projections, count, err);
+	for (int i = 0; i < count && code == 0 && reconstruction->stuck != NULL && !reconstruction->looked; i++)
+		if (stuck_wants(reconstruction->stuck, reconstruction->views[i]))
+			stuck_add(reconstruction->stuck, reconstruction->samples + (size_t)i * bytes);
 	if (code == 0)
-		code = recon_push(spool->recon, spool->samples, spool->views, count, err);
+		code = recon_push(reconstruction->recon, reconstruction->samples, reconstruction->views, count, err);
 	for (int i = 0; i < count && code == 0; i++)
-		spool->pushed[projections[i]] = 1;
-	spool->pushed_count += code == 0 ? count : 0;
+		reconstruction->pushed[projections[i]] = 1;
+	reconstruction->pushed_count += code == 0 ? count : 0;
 	/* Not at the beginning: an arm may stand still for minutes, and the disk takes what is old. */
-	if (code == 0 && !spool->resumed && 2 * spool->pushed_count >= spool_wanted(spool))
-		prepare(&spool->run, STAGE_FDK, 0);
+	if (code == 0 && !reconstruction->resumed &&
+	    2 * reconstruction->pushed_count >= reconstruction_wanted(reconstruction))
+		prepare(&reconstruction->run, STAGE_FDK, 0);
 	return code;
 }
 
-int spool_push(struct spool *spool, const int *projections, int count, struct error *err)
+int reconstruction_push(struct reconstruction *reconstruction, const int *projections, int count, struct error *err)
 {
 	int code = 0;
 
-	for (int first = 0; first < count && code == 0; first += spool->batch)
-		code = push_some(spool, projections + first,
-				 count - first < spool->batch ? count - first : spool->batch, err);
+	for (int first = 0; first < count && code == 0; first += reconstruction->batch)
+		code = push_some(reconstruction, projections + first,
+				 count - first < reconstruction->batch ? count - first : reconstruction->batch, err);
 	return code;
 }
 
 /* All views that stuck pixels are looked for in, ahead of the others, where none has been pushed yet. */
-static int look_ahead(struct spool *spool, struct error *err)
+static int look_ahead(struct reconstruction *reconstruction, struct error *err)
 {
 	bool again;
 	int code = 0;
 
-	if (spool->stuck == NULL || spool->looked || spool->pushed_count > 0)
+	if (reconstruction->stuck == NULL || reconstruction->looked || reconstruction->pushed_count > 0)
 		return 0;
-	for (int i = 0; i < spool->projections && code == 0; i++) {
-		if (spool->view_of[i] < 0 || !stuck_wants(spool->stuck, spool->view_of[i]))
+	for (int i = 0; i < reconstruction->projections && code == 0; i++) {
+		if (reconstruction->view_of[i] < 0 || !stuck_wants(reconstruction->stuck, reconstruction->view_of[i]))
 			continue;
-		code = read_projections(spool, &i, 1, err);
+		code = read_projections(reconstruction, &i, 1, err);
 		if (code == 0)
-			stuck_add(spool->stuck, spool->samples);
+			stuck_add(reconstruction->stuck, reconstruction->samples);
 	}
-	return code == 0 ? heed_stuck_pixels(spool, &again, err) : code;
+	return code == 0 ? heed_stuck_pixels(reconstruction, &again, err) : code;
 }
 
-int spool_push_rest(struct spool *spool, struct error *err)
+int reconstruction_push_rest(struct reconstruction *reconstruction, struct error *err)
 {
-	int *rest, count = 0, code = look_ahead(spool, err);
+	int *rest, count = 0, code = look_ahead(reconstruction, err);
 
 	if (code != 0)
 		return code;
-	rest = malloc((size_t)spool_wanted(spool) * sizeof(*rest));
+	rest = malloc((size_t)reconstruction_wanted(reconstruction) * sizeof(*rest));
 	if (rest == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for a list of %d projections", spool_wanted(spool));
-	for (int i = 0; i < spool->projections; i++) {
-		if (spool->view_of[i] >= 0 && !spool->pushed[i])
+		return error_set(err, ERR_NO_MEMORY, "no memory for a list of %d projections",
+				 reconstruction_wanted(reconstruction));
+	for (int i = 0; i < reconstruction->projections; i++) {
+		if (reconstruction->view_of[i] >= 0 && !reconstruction->pushed[i])
 			rest[count++] = i;
 	}
-	code = spool_push(spool, rest, count, err);
+	code = reconstruction_push(reconstruction, rest, count, err);
 	free(rest);
 	return code;
 }
 
-int spool_finish(struct spool *spool, struct error *err)
+int reconstruction_finish(struct reconstruction *reconstruction, struct error *err)
 {
-	struct run *run = &spool->run;
+	struct run *run = &reconstruction->run;
 	struct error trouble;
 	bool again = false;
 	/* Of projections that came one by one it is known only now. */
-	int code = spool->pushed_count == spool_wanted(spool) ? heed_stuck_pixels(spool, &again, err) : 0;
+	int code = reconstruction->pushed_count == reconstruction_wanted(reconstruction)
+		       ? heed_stuck_pixels(reconstruction, &again, err)
+		       : 0;
 
 	if (code == 0 && again)
-		code = spool_push_rest(spool, err);
+		code = reconstruction_push_rest(reconstruction, err);
 	if (code == 0)
-		code = recon_run(spool->recon, err);
+		code = recon_run(reconstruction->recon, err);
 
 	/* What was told of is settled, however the run ends. */
 	if (run->trouble.code == 0)
@@ -1120,23 +889,23 @@ int spool_finish(struct spool *spool, struct error *err)
 		*err = run->trouble;
 		return run->trouble.code;
 	}
-	if (code == ERR_BUSY && save_checkpoint(spool->recon, run->directory, &trouble) != 0) {
+	if (code == ERR_BUSY && save_checkpoint(reconstruction->recon, run->directory, &trouble) != 0) {
 		*err = trouble;
 		code = trouble.code;
 	}
 	return code;
 }
 
-int spool_run(const struct backend *backend, struct device *device, const struct spool_options *options,
-	      struct error *err)
+int reconstruction_run(const struct backend *backend, struct device *device,
+		       const struct reconstruction_options *options, struct error *err)
 {
-	struct spool *spool = NULL;
-	int code = spool_open(backend, device, options, &spool, err);
+	struct reconstruction *reconstruction = NULL;
+	int code = reconstruction_open(backend, device, options, &reconstruction, err);
 
 	if (code == 0)
-		code = spool_push_rest(spool, err);
+		code = reconstruction_push_rest(reconstruction, err);
 	if (code == 0)
-		code = spool_finish(spool, err);
-	spool_close(spool);
+		code = reconstruction_finish(reconstruction, err);
+	reconstruction_close(reconstruction);
 	return code;
 }

@@ -1,0 +1,96 @@
+#ifndef CBCT_PROTO_RECONSTRUCTION_H
+#define CBCT_PROTO_RECONSTRUCTION_H
+
+#include <stdbool.h>
+#include <stddef.h>
+
+#include "core/recon.h"
+#include "proto/patient.h"
+#include "proto/recipe.h"
+
+/* The file of one kept volume. */
+struct saved_volume {
+	char path[1024];
+	size_t bytes; /* of voxels, the header not counted */
+};
+
+/*
+ * The pipeline over a directory, in three steps: opened, given its projections in
+ * any order and as they arrive, and finished. Each kept volume becomes a file of
+ * out_directory and is told of twice: by on_volume as soon as everybody can read
+ * it there, whole, and by on_settled when it is on the disk. However a run ends,
+ * what was told of is settled first, unless that is what failed: then its file is
+ * removed. Where "final" is the same iterate as
+ * the volume before it, it is another link to that file. The worker and `cbct
+ * recon` both do it this way. One thread at a time.
+ */
+struct reconstruction_hooks {
+	struct recon_hooks recon; /* any may be NULL, its context goes to all of these; keep is the reconstruction's own
+				     and must be NULL here */
+	int (*on_volume)(void *context, const struct kept_volume *volume, const struct saved_volume *saved,
+			 struct error *err);
+	int (*on_settled)(void *context, const char *name, struct error *err);
+	void (*on_open)(void *context, const struct recon_memory *memory, const char *plan);
+};
+
+/* What is to be reconstructed; all of it is borrowed until reconstruction_close. */
+struct reconstruction_options {
+	const char *scan_directory, *out_directory;
+	/*
+	 * In the daemon: the scan directory must have projections.sums (ERR_DAMAGED without), and the volumes'
+	 * files end with their checksums (proto/seal.h).
+	 */
+	bool checked;
+	/* A flag for each projection of scan.json: those that make up the scan, the others never come. NULL: all. */
+	const unsigned char *present;
+	const struct recipe *recipe;
+	/* For the files' descriptions: the program, job and scan by their names ("" or NULL: none). */
+	const char *program, *job, *scan;
+	const struct patient *patient; /* NULL: as scan.json says */
+	/*
+	 * Of a run that yielded, or NULL; `iteration` is the one it holds as far as the
+	 * caller knows. The file itself knows better (a crash may lie between its writing
+	 * and the caller's note): where they differ, the file counts and a warning
+	 * "checkpoint" says so. One that is missing or damaged is ERR_INVALID.
+	 */
+	const char *checkpoint;
+	int iteration;
+	const struct reconstruction_hooks *hooks;
+};
+
+struct reconstruction;
+int reconstruction_open(const struct backend *backend, struct device *device,
+			const struct reconstruction_options *options, struct reconstruction **ret_reconstruction,
+			struct error *err);
+void reconstruction_close(struct reconstruction *reconstruction); /* NULL is fine */
+
+/* Projections that the reconstruction has, and that it wants in all. */
+int reconstruction_pushed(const struct reconstruction *reconstruction);
+int reconstruction_wanted(const struct reconstruction *reconstruction);
+/*
+ * Reads these projections and reconstructs as far as they go, in this order: the
+ * same order gives the same bits, however many a call brings. Each once
+ * (ERR_CONFLICT), and only those that are present (ERR_INVALID). ERR_DAMAGED:
+ * one does not fit its checksum, and none of it was used.
+ */
+int reconstruction_push(struct reconstruction *reconstruction, const int *projections, int count, struct error *err);
+/* All that have not been pushed, by their numbers. */
+int reconstruction_push_rest(struct reconstruction *reconstruction, struct error *err);
+/*
+ * Once, when all are there: the rest of the pipeline. A run that hooks->recon.yield ended returns ERR_BUSY and has
+ * left its iterate as OUT/checkpoint.f32, durably.
+ */
+int reconstruction_finish(struct reconstruction *reconstruction, struct error *err);
+
+/* The three in a row. */
+int reconstruction_run(const struct backend *backend, struct device *device,
+		       const struct reconstruction_options *options, struct error *err);
+
+/*
+ * A line of text padded to CHECKPOINT_FILE_OFFSET bytes with iteration, size and noise, then float32 voxels [z][y][x],
+ * the list of metal where there is one, and a seal (proto/seal.h).
+ */
+#define CHECKPOINT_FILE "checkpoint.f32"
+enum { CHECKPOINT_FILE_OFFSET = 160 };
+
+#endif
