@@ -104,11 +104,11 @@ static int start_parts(const struct config *config, struct api *api, struct erro
 	if (code == 0)
 		code = supervise_start(api->jobs, &supervise, &api->supervise, err);
 	if (code == 0)
-		code = feed_new(api->store, &api->feed, err);
+		code = event_ring_new(api->store, &api->events, err);
 	if (code == 0)
 		code = mappings_new(&api->mappings, err);
 	if (code == 0)
-		code = renditions_new(api->store, STREAM_THREADS, &api->renditions, err);
+		code = encoded_copies_new(api->store, STREAM_THREADS, &api->copies, err);
 	if (code == 0)
 		code = uploads_new(api->store, &uploads, &api->uploads, err);
 	if (code == 0)
@@ -120,9 +120,9 @@ static void stop_parts(struct api *api)
 {
 	http_free(api->http);
 	uploads_free(api->uploads);
-	renditions_free(api->renditions);
+	encoded_copies_free(api->copies);
 	mappings_free(api->mappings);
-	feed_free(api->feed);
+	event_ring_free(api->events);
 	supervise_stop(api->supervise);
 	jobs_close(api->jobs);
 	store_close(api->store);

@@ -48,8 +48,9 @@ struct worker {
 	char job[64]; /* that runs */
 	bool cancel, yield, quit;
 	struct error trouble; /* why the job was given up here though nobody had asked for it; code 0: it was not */
-	int *told; /* [told_count], room for VIEWS_MAX: projections that are there, as the daemon named them */
-	int told_count;
+	int *
+	    announced; /* [announced_count], room for VIEWS_MAX: projections that are there, as the daemon named them */
+	int announced_count;
 	int iteration; /* done */
 	double reported;
 	struct message progress; /* the last that was reported, or, `behind`, that came too soon after it */
@@ -106,8 +107,8 @@ static int report_or_fail(struct worker *worker, struct message *message, struct
 static void note_arrivals(struct worker *worker, const struct projection_runs *runs)
 {
 	for (int i = 0; i < runs->count; i++) {
-		for (int k = runs->first[i]; k <= runs->last[i] && worker->told_count < VIEWS_MAX; k++)
-			worker->told[worker->told_count++] = k;
+		for (int k = runs->first[i]; k <= runs->last[i] && worker->announced_count < VIEWS_MAX; k++)
+			worker->announced[worker->announced_count++] = k;
 	}
 }
 
@@ -251,9 +252,9 @@ static int on_settled(void *context, const char *name, struct error *err)
 
 /* ---- jobs ---- */
 
-static void report_taken(struct worker *worker, const struct reconstruction *reconstruction)
+static void report_reconstructed(struct worker *worker, const struct reconstruction *reconstruction)
 {
-	struct message message = {.kind = MESSAGE_TAKEN, .count = reconstruction_pushed(reconstruction)};
+	struct message message = {.kind = MESSAGE_RECONSTRUCTED, .count = reconstruction_pushed(reconstruction)};
 
 	report(worker, &message);
 }
@@ -268,13 +269,13 @@ static int push_arrivals(struct worker *worker, struct reconstruction *reconstru
 	int code = 0;
 
 	while (code == 0 && reconstruction_pushed(reconstruction) < reconstruction_wanted(reconstruction)) {
-		int pushed = reconstruction_pushed(reconstruction), count = worker->told_count - pushed;
+		int pushed = reconstruction_pushed(reconstruction), count = worker->announced_count - pushed;
 
 		if (count > 0) {
-			code = reconstruction_push(reconstruction, worker->told + pushed, count < MOST ? count : MOST,
-						   err);
+			code = reconstruction_push(reconstruction, worker->announced + pushed,
+						   count < MOST ? count : MOST, err);
 			if (code == 0)
-				report_taken(worker, reconstruction);
+				report_reconstructed(worker, reconstruction);
 			look_at_socket(worker);
 		} else {
 			if (worker->behind)
@@ -302,7 +303,7 @@ static int run_reconstruction(struct worker *worker, const struct reconstruction
 		code = push_arrivals(worker, reconstruction, err);
 	} else if (code == 0) {
 		code = reconstruction_push_rest(reconstruction, err);
-		report_taken(worker, reconstruction);
+		report_reconstructed(worker, reconstruction);
 	}
 	if (code == 0)
 		code = reconstruction_finish(reconstruction, err);
@@ -360,7 +361,7 @@ static int serve_job(struct worker *worker, const struct message *start)
 
 	snprintf(worker->job, sizeof(worker->job), "%s", start->job);
 	worker->cancel = worker->yield = false;
-	worker->told_count = 0;
+	worker->announced_count = 0;
 	worker->iteration = start->iteration;
 	worker->reported = 0;
 	worker->progress = (struct message){0};
@@ -510,8 +511,8 @@ int main(int argc, char **argv)
 	sigaction(SIGTERM, &terminate, NULL);
 	lower_priority();
 	worker.socket = arguments.socket;
-	worker.told = malloc(VIEWS_MAX * sizeof(*worker.told));
-	if (worker.told == NULL) {
+	worker.announced = malloc(VIEWS_MAX * sizeof(*worker.announced));
+	if (worker.announced == NULL) {
 		perror("cbct-worker");
 		status = EXIT_START;
 	} else if (open_device(&worker, &arguments, &err) != 0) {
@@ -522,6 +523,6 @@ int main(int argc, char **argv)
 	}
 	if (worker.device != NULL)
 		worker.backend->close(worker.device);
-	free(worker.told);
+	free(worker.announced);
 	return status;
 }

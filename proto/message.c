@@ -69,7 +69,8 @@ static const struct field opened_fields[] = {FIELD("job", FIELD_STRING, job),
 					     FIELD("host", FIELD_SIZE, memory.host),
 					     FIELD("plan", FIELD_STRING, plan),
 					     {0}};
-static const struct field taken_fields[] = {FIELD("job", FIELD_STRING, job), FIELD("count", FIELD_INT, count), {0}};
+static const struct field reconstructed_fields[] = {
+    FIELD("job", FIELD_STRING, job), FIELD("count", FIELD_INT, count), {0}};
 static const struct field progress_fields[] = {FIELD("job", FIELD_STRING, job),
 					       FIELD("stage", FIELD_STAGE, stage),
 					       FIELD("iteration", FIELD_INT, iteration),
@@ -121,7 +122,7 @@ static const struct {
     [MESSAGE_QUIT] = {"quit", no_fields},
     [MESSAGE_HELLO] = {"hello", hello_fields},
     [MESSAGE_OPENED] = {"opened", opened_fields},
-    [MESSAGE_TAKEN] = {"taken", taken_fields},
+    [MESSAGE_RECONSTRUCTED] = {"reconstructed", reconstructed_fields},
     [MESSAGE_PROGRESS] = {"progress", progress_fields},
     [MESSAGE_ROW] = {"row", row_fields},
     [MESSAGE_VOLUME] = {"volume", volume_fields},

@@ -24,17 +24,17 @@ enum message_kind {
 	MESSAGE_YIELD,
 	MESSAGE_QUIT, /* finish or yield what runs, then exit 0 */
 	/* worker -> daemon */
-	MESSAGE_HELLO,    /* backend, device, driver, bytes_total, bytes_free */
-	MESSAGE_OPENED,   /* job, memory, plan */
-	MESSAGE_TAKEN,    /* job, count: projections reconstructed so far */
-	MESSAGE_PROGRESS, /* job, stage, iteration, fraction */
-	MESSAGE_ROW,      /* job, row */
-	MESSAGE_VOLUME,   /* job, name, stage, iteration, bytes, norms, estimate_mm: the file is there, whole, for
-			     everybody */
-	MESSAGE_SETTLED,  /* job, name: that file is on the disk; before the job ends, but for what failed */
-	MESSAGE_NOISE,    /* job, noise_hu, alpha: what TV goes by, see recon_hooks.denoising */
-	MESSAGE_WARNING,  /* job, code, detail */
-	MESSAGE_ENDED,    /* job, code (0, ERR_CANCELLED, ERR_BUSY = yielded at `iteration`, or what failed), text */
+	MESSAGE_HELLO,         /* backend, device, driver, bytes_total, bytes_free */
+	MESSAGE_OPENED,        /* job, memory, plan */
+	MESSAGE_RECONSTRUCTED, /* job, count: projections reconstructed so far */
+	MESSAGE_PROGRESS,      /* job, stage, iteration, fraction */
+	MESSAGE_ROW,           /* job, row */
+	MESSAGE_VOLUME,        /* job, name, stage, iteration, bytes, norms, estimate_mm: the file is there, whole, for
+				  everybody */
+	MESSAGE_SETTLED,       /* job, name: that file is on the disk; before the job ends, but for what failed */
+	MESSAGE_NOISE,         /* job, noise_hu, alpha: what TV goes by, see recon_hooks.denoising */
+	MESSAGE_WARNING,       /* job, code, detail */
+	MESSAGE_ENDED, /* job, code (0, ERR_CANCELLED, ERR_BUSY = yielded at `iteration`, or what failed), text */
 	MESSAGE_KIND_COUNT
 };
 

@@ -160,7 +160,7 @@ static void prepare(struct run *run, enum stage stage, int iteration)
 	saver_prepare(run->saver, path, VOLUME_FILE_OFFSET + grid_voxels(recon_grid(run->recon)) * sizeof(float));
 }
 
-static int tell_settled(struct run *run, const char *name, struct error *err)
+static int announce_settled(struct run *run, const char *name, struct error *err)
 {
 	if (run->hooks->on_settled == NULL)
 		return 0;
@@ -174,7 +174,7 @@ static int settle_link(struct run *run, struct error *err)
 	if (code != 0)
 		unlink(run->link.path);
 	run->link.bytes = 0;
-	return code != 0 ? code : tell_settled(run, run->link_name, err);
+	return code != 0 ? code : announce_settled(run, run->link_name, err);
 }
 
 /* Tells when the volume that was saved last is settled; waits for that where it must. */
@@ -191,7 +191,7 @@ static int settle(struct run *run, bool wait, struct error *err)
 			run->saved.bytes = run->link.bytes = 0;
 		}
 		if (code == 0 && done)
-			code = tell_settled(run, run->saved_name, err);
+			code = announce_settled(run, run->saved_name, err);
 	}
 	if (code == 0 && done && run->link.bytes > 0)
 		code = settle_link(run, err);

@@ -180,7 +180,7 @@ static void on_error(png_structp png, png_const_charp text)
 }
 
 /* Pixels for each metre, where the format has a number for them. */
-static void tell_size(png_structp png, png_infop info, const double *pixel_mm)
+static void write_size(png_structp png, png_infop info, const double *pixel_mm)
 {
 	double across = rint(1000 / pixel_mm[0]), down = rint(1000 / pixel_mm[1]);
 
@@ -197,7 +197,7 @@ static bool write_png(png_structp png, png_infop info, const unsigned char *pixe
 	png_set_IHDR(png, info, (png_uint_32)width, (png_uint_32)height, 8, PNG_COLOR_TYPE_GRAY, PNG_INTERLACE_NONE,
 		     PNG_COMPRESSION_TYPE_DEFAULT, PNG_FILTER_TYPE_DEFAULT);
 	if (pixel_mm != NULL)
-		tell_size(png, info, pixel_mm);
+		write_size(png, info, pixel_mm);
 	/* Differences of neighbours are small numbers: runs and Huffman's code do most of what deflate can. */
 	png_set_filter(png, 0, PNG_FILTER_SUB);
 	png_set_compression_level(png, 1);

@@ -9,9 +9,9 @@ struct api {
 	struct jobs *jobs;
 	struct supervise *supervise;
 	struct uploads *uploads;
-	struct feed *feed;
+	struct event_ring *events;
 	struct mappings *mappings;
-	struct renditions *renditions;
+	struct encoded_copies *copies;
 	struct http *http;
 	double max_wait; /* s */
 	double started;  /* clock_monotonic */

@@ -218,7 +218,7 @@ static void add_views(cJSON *document, const struct scan_facts *scan, const stru
 	all = scan->closed ? scan->received + scan->lost : scan->count;
 	views = cJSON_AddObjectToObject(document, "views");
 	cJSON_AddNumberToObject(views, "received", scan->received);
-	cJSON_AddNumberToObject(views, "reconstructed", record->state == JOB_SUCCEEDED ? all : record->taken);
+	cJSON_AddNumberToObject(views, "reconstructed", record->state == JOB_SUCCEEDED ? all : record->reconstructed);
 	cJSON_AddNumberToObject(views, "of", all);
 }
 

@@ -28,17 +28,17 @@ static const double moment = 80e-6, moments_most = 70e-3, instant = 10e-3; /* s 
 
 struct watcher {
 	struct http *http;
-	struct feed *feed;
+	struct event_ring *ring;
 	struct jobs *jobs;
 	struct job *job; /* NULL: all of them */
 	char id[ID_SIZE];
 	struct watch watch;
 	long long after; /* the number of the last event that was fetched */
 	double heartbeat;
-	_Atomic double told_at; /* the last time that there was something */
+	_Atomic double sent_at; /* the last time that there was something */
 	bool greeted;
-	struct telling *telling; /* on its way, NULL: none */
-	size_t told;             /* bytes of it */
+	struct event_text *text; /* on its way, NULL: none */
+	size_t sent;             /* bytes of it */
 };
 
 static void wake_watcher(void *context)
@@ -46,7 +46,7 @@ static void wake_watcher(void *context)
 	struct request *request = context;
 	struct watcher *watcher = request_state(request);
 	double pause = fmin(moment * (double)http_connections(watcher->http), moments_most);
-	double due = watcher->told_at + pause;
+	double due = watcher->sent_at + pause;
 
 	if (due <= clock_monotonic())
 		request_wake(request);
@@ -63,7 +63,7 @@ static void watcher_free(void *state)
 	else
 		jobs_unwatch(watcher->jobs, &watcher->watch);
 	job_release(watcher->job);
-	telling_release(watcher->telling);
+	event_text_release(watcher->text);
 	free(watcher);
 }
 
@@ -74,17 +74,17 @@ static double next_heartbeat(void)
 }
 
 /* Takes as much as there is room for. */
-static size_t tell(struct watcher *watcher, char *to, size_t size)
+static size_t send_text(struct watcher *watcher, char *to, size_t size)
 {
-	size_t part = watcher->telling->length - watcher->told;
+	size_t part = watcher->text->length - watcher->sent;
 
 	if (part > size)
 		part = size;
-	memcpy(to, watcher->telling->text + watcher->told, part);
-	watcher->told += part;
-	if (watcher->told == watcher->telling->length) {
-		telling_release(watcher->telling);
-		watcher->telling = NULL;
+	memcpy(to, watcher->text->text + watcher->sent, part);
+	watcher->sent += part;
+	if (watcher->sent == watcher->text->length) {
+		event_text_release(watcher->text);
+		watcher->text = NULL;
 	}
 	return part;
 }
@@ -127,20 +127,20 @@ static ssize_t read_events(struct request *request, void *to, size_t size)
 		filled = sizeof(greeting) - 1;
 	}
 	while (filled < size) {
-		if (watcher->telling == NULL) {
-			over = job_is_over(watcher); /* asked first: what comes before the end is in the feed by then */
-			watcher->told = 0;
-			if (feed_next(watcher->feed, watcher->job != NULL ? watcher->id : NULL, &watcher->after,
-				      &watcher->telling, &err) != 0)
+		if (watcher->text == NULL) {
+			over = job_is_over(watcher); /* asked first: what comes before the end is in the ring by then */
+			watcher->sent = 0;
+			if (event_ring_next(watcher->ring, watcher->job != NULL ? watcher->id : NULL, &watcher->after,
+					    &watcher->text, &err) != 0)
 				return -1;
 		}
-		if (watcher->telling == NULL)
+		if (watcher->text == NULL)
 			break;
-		filled += tell(watcher, (char *)to + filled, size - filled);
+		filled += send_text(watcher, (char *)to + filled, size - filled);
 	}
 	if (filled == 0)
 		return read_nothing_new(request, watcher, over, to);
-	watcher->told_at = clock_monotonic();
+	watcher->sent_at = clock_monotonic();
 	return (ssize_t)filled;
 }
 
@@ -180,7 +180,7 @@ static int reply_events(struct api *api, struct request *request, struct job *jo
 		return error_set(err, ERR_NO_MEMORY, "no memory for a watcher");
 	}
 	watcher->http = api->http;
-	watcher->feed = api->feed;
+	watcher->ring = api->events;
 	watcher->jobs = api->jobs;
 	watcher->job = job;
 	watcher->after = after < 0 ? 0 : after;

@@ -209,7 +209,7 @@ static void forget_files(struct api *api, struct job *job)
 	job_facts(job, &facts);
 	store_job_directory(api->store, facts.id, directory);
 	mappings_forget(api->mappings, directory);
-	renditions_forget(api->renditions, facts.id);
+	encoded_copies_forget(api->copies, facts.id);
 }
 
 int job_delete(void *context, struct request *request, struct error *err)

@@ -32,11 +32,11 @@ struct stream {
 	struct watch watch, made;
 	long long after; /* the number of the last event that was looked at */
 
-	/* What goes out next: text, then the rendition's bytes. */
+	/* What goes out next: text, then the encoded copy's bytes. */
 	char *text;
 	size_t length, sent;
-	struct rendition *rendition;
-	struct volume_record volume; /* of the rendition */
+	struct encoded *encoded;
+	struct volume_record volume; /* of the encoded copy */
 	bool headed;                 /* length and digest were told */
 	uint64_t offset;
 	bool last; /* nothing comes behind the text */
@@ -47,20 +47,20 @@ static void wake_stream(void *context)
 	request_wake(context);
 }
 
-static void drop_rendition(struct stream *stream)
+static void drop_encoded(struct stream *stream)
 {
-	if (stream->rendition == NULL)
+	if (stream->encoded == NULL)
 		return;
-	rendition_unwatch(stream->rendition, &stream->made);
-	rendition_release(stream->rendition);
-	stream->rendition = NULL;
+	encoded_unwatch(stream->encoded, &stream->made);
+	encoded_release(stream->encoded);
+	stream->encoded = NULL;
 }
 
 static void stream_free(void *state)
 {
 	struct stream *stream = state;
 
-	drop_rendition(stream);
+	drop_encoded(stream);
 	job_unwatch(stream->job, &stream->watch);
 	job_release(stream->job);
 	free(stream->text);
@@ -88,10 +88,10 @@ static int begin_part(struct stream *stream, const struct volume_record *volume)
 	struct error err;
 	int length;
 
-	if (rendition_get(stream->api->renditions, stream->facts.id, volume, &stream->options, stream->zstd,
-			  &stream->rendition, &err) != 0)
+	if (encoded_get(stream->api->copies, stream->facts.id, volume, &stream->options, stream->zstd, &stream->encoded,
+			&err) != 0)
 		return -1;
-	rendition_watch(stream->rendition, &stream->made);
+	encoded_watch(stream->encoded, &stream->made);
 	stream->volume = *volume;
 	stream->headed = false;
 	stream->offset = 0;
@@ -104,7 +104,7 @@ static int begin_part(struct stream *stream, const struct volume_record *volume)
 	return set_text(stream, text, length);
 }
 
-static int begin_body(struct stream *stream, const struct rendition_facts *facts)
+static int begin_body(struct stream *stream, const struct encoded_facts *facts)
 {
 	unsigned char digest[64];
 	char *text = NULL;
@@ -123,7 +123,7 @@ static int begin_body(struct stream *stream, const struct rendition_facts *facts
 
 static int end_part(struct stream *stream)
 {
-	drop_rendition(stream);
+	drop_encoded(stream);
 	return set_text(stream, strdup("\r\n"), 2);
 }
 
@@ -213,7 +213,7 @@ static ssize_t send_text(struct stream *stream, void *to, size_t size)
 	return (ssize_t)part;
 }
 
-static ssize_t send_body(struct stream *stream, const struct rendition_facts *facts, void *to, size_t size)
+static ssize_t send_body(struct stream *stream, const struct encoded_facts *facts, void *to, size_t size)
 {
 	ssize_t got;
 
@@ -231,11 +231,11 @@ static ssize_t send_body(struct stream *stream, const struct rendition_facts *fa
 /* Goes on to what comes next; 0: something was made ready. */
 static ssize_t go_on(struct stream *stream, void *to, size_t size, ssize_t *ret_sent)
 {
-	struct rendition_facts facts;
+	struct encoded_facts facts;
 
-	if (stream->rendition == NULL)
+	if (stream->encoded == NULL)
 		return next_part(stream);
-	rendition_look(stream->rendition, &facts);
+	encoded_look(stream->encoded, &facts);
 	if (facts.failed)
 		return -1;
 	if (!facts.made)

@@ -31,9 +31,9 @@ enum {
 	TURN = 64,               /* accepted from one socket before the next is looked at */
 	PAUSE = 100              /* ms, where there is neither room nor a descriptor */
 };
-static const double idle_after = 1;       /* s, before which a request may be on its way */
-static const double judged_after = 2;     /* s, before which no transfer counts as slow */
-static const double exhaustion_told = 60; /* s, for which it is told once */
+static const double idle_after = 1;         /* s, before which a request may be on its way */
+static const double judged_after = 2;       /* s, before which no transfer counts as slow */
+static const double exhaustion_logged = 60; /* s, for which it is told once */
 
 /* ---- the list of connections ---- */
 
@@ -245,11 +245,11 @@ static bool is_full(struct http *http)
 	return full;
 }
 
-static void tell_exhausted(struct http *http, int reason)
+static void log_exhausted(struct http *http, int reason)
 {
 	double now = clock_monotonic();
 
-	if (http->exhausted_at == 0 || now - http->exhausted_at > exhaustion_told)
+	if (http->exhausted_at == 0 || now - http->exhausted_at > exhaustion_logged)
 		log_line(LEVEL_WARNING, "no connection can be accepted just now, %ld are open: %s",
 			 atomic_load(&http->connection_count), strerror(reason));
 	http->exhausted_at = now;
@@ -272,7 +272,7 @@ static bool accept_from(struct http *http, const struct listener *listener)
 		if (socket >= 0) {
 			admit(http, socket, &address, size);
 		} else if (errno == EMFILE || errno == ENFILE || errno == ENOBUFS || errno == ENOMEM) {
-			tell_exhausted(http, errno);
+			log_exhausted(http, errno);
 			return false;
 		} else if (errno == EAGAIN || errno == EWOULDBLOCK) {
 			break;

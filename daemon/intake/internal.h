@@ -18,7 +18,7 @@
 
 enum { WRITERS = 2 }; /* one hashes while the other syncs */
 
-/* One projection or image between socket and disk; or, without data, an upload's wish to commit what it holds. */
+/* One projection or image between socket and disk; or, without data, the pending commit of what an upload holds. */
 struct slot {
 	struct slot *next;
 	struct upload *upload;
@@ -77,7 +77,7 @@ struct upload {
 	int held_count;
 	bool body_ended; /* and was right */
 	bool keeps;      /* the connection broke: what is held shall count */
-	struct slot wish;
+	struct slot commit;
 };
 
 struct uploads {

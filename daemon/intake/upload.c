@@ -78,9 +78,9 @@ void upload_commit_held(struct upload *upload)
 
 	if (!right || upload->pending > 0 || upload->held_count == 0 || upload->error.code != 0)
 		return;
-	memset(&upload->wish, 0, sizeof(upload->wish));
-	upload->wish.weight = upload->held_count;
-	upload_enqueue(upload, &upload->wish);
+	memset(&upload->commit, 0, sizeof(upload->commit));
+	upload->commit.weight = upload->held_count;
+	upload_enqueue(upload, &upload->commit);
 }
 
 void upload_release(struct upload *upload)

@@ -146,7 +146,7 @@ static void process(struct slot *slot)
 {
 	slot->outcome = SLOT_OPEN;
 	if (slot->data == NULL)
-		slot->outcome = SLOT_WRITTEN; /* the wish: what is held was written before */
+		slot->outcome = SLOT_WRITTEN; /* a pending commit: what is held was written before */
 	else if (slot->upload->target.kind == UPLOAD_IMAGE)
 		slot->code = process_image(slot, &slot->error);
 	else
@@ -368,7 +368,7 @@ static void settle(struct uploads *uploads, struct slot *slot)
 		break;
 	}
 	upload->pending--;
-	if (slot != &upload->wish)
+	if (slot != &upload->commit)
 		pool_give_back(uploads, slot);
 	upload_commit_held(upload);
 	if (upload->request != NULL && (upload->pending == 0 || upload->error.code != 0))

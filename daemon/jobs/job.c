@@ -436,7 +436,7 @@ int jobs_post(struct jobs *jobs, const struct job_request *request, struct store
 	return 0;
 }
 
-/* jobs->change is held: the wish is on the disk before it is shown, so that a restart carries it out. */
+/* jobs->change is held: the request to cancel is on the disk before it is shown, so that a restart carries it out. */
 static int ask_cancel(struct job *job, struct error *err)
 {
 	struct job_record record;

@@ -143,7 +143,7 @@ void job_leave(struct job *job);
 void job_doubt(struct job *job, unsigned losses);
 int job_doubts(const struct job *job, unsigned losses);
 /* Projections reconstructed so far. */
-void job_taken(struct job *job, int count);
+void job_reconstructed(struct job *job, int count);
 /*
  * What keeps a job from a worker though everything of its scan is there. It is not given to one before `until` (of
  * CLOCK_MONOTONIC) and before the disk has `space` bytes free; it keeps its place in the queue, and others go before

@@ -121,9 +121,9 @@ static void on_message(struct supervise *supervise, struct worker *worker, const
 	case MESSAGE_NOISE:
 		job_set_denoising(worker->job, message->noise_hu, message->alpha);
 		break;
-	case MESSAGE_TAKEN:
+	case MESSAGE_RECONSTRUCTED:
 		worker->reconstructed = message->count;
-		job_taken(worker->job, message->count);
+		job_reconstructed(worker->job, message->count);
 		worker_attend(supervise, worker);
 		break;
 	case MESSAGE_PROGRESS:

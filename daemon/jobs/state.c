@@ -87,7 +87,7 @@ static void enter_queue(struct job_record *record, enum job_state from, const st
 	record->stage = STAGE_LOAD;
 	if (change->checkpoint == 0) {
 		record->fraction = 0;
-		record->taken = 0;
+		record->reconstructed = 0;
 	}
 }
 
@@ -100,7 +100,7 @@ static void enter_waiting(struct job_record *record, enum job_state from)
 	record->iteration = 0;
 	record->stage = STAGE_LOAD;
 	record->fraction = 0;
-	record->taken = 0;
+	record->reconstructed = 0;
 }
 
 static void enter_running(struct job_record *record, enum job_state from, const struct job_change *change,
@@ -123,7 +123,7 @@ static void enter_running(struct job_record *record, enum job_state from, const 
 	record->iteration = record->checkpoint;
 	if (from != JOB_WAITING) {
 		record->stage = STAGE_LOAD;
-		record->taken = 0;
+		record->reconstructed = 0;
 	}
 	if (change->backend != NULL)
 		snprintf(record->backend, sizeof(record->backend), "%s", change->backend);

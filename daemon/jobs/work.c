@@ -151,7 +151,7 @@ void job_leave(struct job *job)
 	if (record->state == JOB_WAITING) {
 		record->stage = STAGE_LOAD;
 		record->fraction = 0;
-		record->taken = 0;
+		record->reconstructed = 0;
 	}
 	pthread_mutex_unlock(&job->jobs->lock);
 	pthread_mutex_unlock(&job->jobs->change);
@@ -169,10 +169,10 @@ void job_doubt(struct job *job, unsigned losses)
 	job->doubted_at = losses;
 }
 
-void job_taken(struct job *job, int count)
+void job_reconstructed(struct job *job, int count)
 {
 	pthread_mutex_lock(&job->jobs->lock);
-	job->record.taken = count;
+	job->record.reconstructed = count;
 	pthread_mutex_unlock(&job->jobs->lock);
 }
 

@@ -91,7 +91,7 @@ static int sweep_file(void *context, const char *name, struct error *err)
 }
 
 /* A volume that is gone is a warning of its job; one that cannot be written now is told to who asks for the volume. */
-static void tell_gone(const struct sweep *sweep, const struct volume_record *volume)
+static void warn_gone(const struct sweep *sweep, const struct volume_record *volume)
 {
 	struct warning_record warning = {.code = "damaged_volume"};
 	struct event event = {.kind = "warning"};
@@ -119,7 +119,7 @@ static void check_volumes(const struct sweep *sweep)
 	for (int i = 0; i < sweep->count; i++) {
 		store_volume_path(sweep->store, sweep->id, sweep->volumes[i].name, path);
 		if (access(path, F_OK) != 0 && errno == ENOENT)
-			tell_gone(sweep, &sweep->volumes[i]);
+			warn_gone(sweep, &sweep->volumes[i]);
 	}
 }
 

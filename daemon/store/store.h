@@ -307,8 +307,8 @@ struct job_record {
 	int iteration;
 	double fraction;
 	/* Memory only. */
-	bool attended; /* it waits, and a worker reconstructs what arrives */
-	int taken;     /* projections reconstructed */
+	bool attended;     /* it waits, and a worker reconstructs what arrives */
+	int reconstructed; /* projections */
 };
 
 struct volume_record {

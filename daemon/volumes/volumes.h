@@ -3,8 +3,8 @@
 
 /* The door of what a job gives: volumes as files of any format, mapped and streamed, and events. */
 #include "daemon/volumes/content.h"
-#include "daemon/volumes/feed.h"
+#include "daemon/volumes/event_ring.h"
 #include "daemon/volumes/mapping.h"
-#include "daemon/volumes/rendition.h"
+#include "daemon/volumes/encoded.h"
 
 #endif

@@ -167,7 +167,7 @@ test_a_volume_comes_while_the_job_runs_and_a_lost_reader_leaves_nothing_open() {
 		[ "$(open_files)" -le $((before + 2)) ] && break
 		sleep 0.5
 	done
-	# a rendition or two may stay for readers that are behind
+	# an encoded copy or two may stay for readers that are behind
 	[ "$(open_files)" -le $((before + 2)) ] || fail "descriptors as before ($before), got $(open_files)"
 	req DELETE "/v1/jobs/$job?wait=20"
 	expect_json '.state == "cancelled"'

@@ -15,7 +15,7 @@ post_scan "$scan_dir"
 post_projections "$scan_dir"
 post_job "{\"scan\": \"SCAN\", $grid, \"fdk\": {}, \"sart\": {\"iterations\": 100000, \"subsets\": \"views\"}, \"emit\": [\"fdk\"]}"
 until req GET "/v1/jobs/$job/volumes" && [ "$(json '.volumes | length')" = 1 ]; do sleep 0.1; done
-# the volume is ready to be streamed: its rendition stays open
+# the volume is ready to be streamed: its encoded copy stays open
 curl -sS -N --max-time 1 -o /dev/null "$url/v1/jobs/$job/stream" 2>/dev/null || true
 sleep 1
 before=$(open_files)

@@ -137,17 +137,17 @@ START_TEST(a_waiting_job_is_attended_and_runs_with_its_last_projection)
 	job_release(found);
 	ck_assert_int_eq(job_attend(job, "cpu", "some", &err), 0);
 	ck_assert_ptr_null(jobs_arriving(state.jobs, 0, &arriving));
-	job_taken(job, 2);
+	job_reconstructed(job, 2);
 	/* its scan is ready, but it is in a worker's hands */
 	state_put(&state, growing, 0, 2, 1);
 	ck_assert_int_eq(jobs_promote(state.jobs, &err), 0);
 	ck_assert_int_eq(state_of(job), JOB_WAITING);
 	job_record(job, &record);
-	ck_assert(record.attended && record.taken == 2 && record.attempts == 0);
+	ck_assert(record.attended && record.reconstructed == 2 && record.attempts == 0);
 	/* a worker that dies with it is an attempt, one that leaves is none */
 	state_set(job, JOB_WAITING, &died);
 	job_record(job, &record);
-	ck_assert(!record.attended && record.taken == 0 && record.attempts == 2 && record.crashes == 1);
+	ck_assert(!record.attended && record.reconstructed == 0 && record.attempts == 2 && record.crashes == 1);
 	ck_assert_int_eq(job_attend(job, "cpu", "some", &err), 0);
 	job_leave(job);
 	ck_assert_int_eq(job_attend(job, "cpu", "some", &err), 0);

@@ -166,7 +166,7 @@ START_TEST(what_a_worker_says_comes_back)
 	ck_assert_uint_eq(back.memory.available, 1000);
 	ck_assert_uint_eq(back.memory.host, 77);
 
-	message = (struct message){.kind = MESSAGE_TAKEN, .job = "j", .count = 118};
+	message = (struct message){.kind = MESSAGE_RECONSTRUCTED, .job = "j", .count = 118};
 	ck_assert_int_eq(through(&message).count, 118);
 
 	message = (struct message){.kind = MESSAGE_WARNING, .job = "j", .code_name = "defects", .text = "3 pixels"};

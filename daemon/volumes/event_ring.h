@@ -1,5 +1,5 @@
-#ifndef CBCT_DAEMON_VOLUMES_FEED_H
-#define CBCT_DAEMON_VOLUMES_FEED_H
+#ifndef CBCT_DAEMON_VOLUMES_EVENT_RING_H
+#define CBCT_DAEMON_VOLUMES_EVENT_RING_H
 
 #include <stdatomic.h>
 
@@ -10,13 +10,13 @@
  * watch. The latest are in memory; who is further behind is given a batch read
  * from the catalogue. Any thread; to be woken, watch the jobs.
  */
-struct feed;
+struct event_ring;
 
-int feed_new(struct store *store, struct feed **ret_feed, struct error *err);
-void feed_free(struct feed *feed); /* NULL is fine; all tellings must be back */
+int event_ring_new(struct store *store, struct event_ring **ret_ring, struct error *err);
+void event_ring_free(struct event_ring *ring); /* NULL is fine; all tellings must be back */
 
 /* One event, or several in order. Constant; counted references. */
-struct telling {
+struct event_text {
 	atomic_int references;
 	long long number; /* of the last */
 	char job[ID_SIZE];
@@ -26,10 +26,11 @@ struct telling {
 
 /*
  * What comes next behind event number *after, of this job or (NULL) of all, and
- * moves *after behind it. NULL in *ret_telling when there is nothing more yet;
+ * moves *after behind it. NULL in *ret_text when there is nothing more yet;
  * *after then may have moved over others' events.
  */
-int feed_next(struct feed *feed, const char *job, long long *after, struct telling **ret_telling, struct error *err);
-void telling_release(struct telling *telling); /* NULL is fine */
+int event_ring_next(struct event_ring *ring, const char *job, long long *after, struct event_text **ret_text,
+		    struct error *err);
+void event_text_release(struct event_text *text); /* NULL is fine */
 
 #endif
