@@ -179,7 +179,7 @@ struct plan_bytes {
 	size_t host;    /* beside the device's own memory, in parts.h; 0 elsewhere */
 };
 
-struct sart_sums {
+struct iteration_sums {
 	double residual2;   /* sum of (p - A v)^2, each view's as it is met, over the rays that are not left out */
 	double projection2; /* sum of p^2 over the same rays */
 };
@@ -307,7 +307,7 @@ struct backend {
 	 * it still, so that its voxels move less; they need no pass of their own then.
 	 */
 	int (*sart_iterate)(struct plan *plan, const struct stack *projections, struct volume *volume,
-			    const struct cancel *cancel, struct sart_sums *ret_sums, struct error *err);
+			    const struct cancel *cancel, struct iteration_sums *ret_sums, struct error *err);
 	/*
 	 * TV in place. Method and iterations are at most what plan_options.tv has, which the plan has memory for;
 	 * alpha, step and unit are free.
@@ -317,6 +317,28 @@ struct backend {
 	/* `other` may be NULL; unit as in tv_options. */
 	int (*norms)(struct plan *plan, const struct volume *volume, const struct volume *other, double unit,
 		     struct volume_norms *ret_norms, struct error *err);
+	/*
+	 * The algebra that iterative methods are written in. Volumes are of one grid. Of stacks, which are of one
+	 * detector, the first `count` slots of y take part, slot i with slot slots[i] of x; slots NULL: slot i. A ray
+	 * that is left out is NaN in the projections, and is made 0 by stack_mask before it meets a sum.
+	 */
+	/* y = a x + b y; with b = 0 whatever y was. */
+	int (*volume_axpby)(double a, const struct volume *x, double b, struct volume *y, struct error *err);
+	int (*stack_axpby)(double a, const struct stack *x, const int *slots, int count, double b, struct stack *y,
+			   struct error *err);
+	/* Sum over all elements of x y. */
+	int (*volume_dot)(struct plan *plan, const struct volume *x, const struct volume *y, double *ret_sum,
+			  struct error *err);
+	int (*stack_dot)(struct plan *plan, const struct stack *x, const struct stack *y, int count, double *ret_sum,
+			 struct error *err);
+	/* y / x where x is at least `least`, 0 elsewhere. */
+	int (*volume_divide)(const struct volume *x, double least, struct volume *y, struct error *err);
+	int (*stack_divide)(const struct stack *x, double least, int count, struct stack *y, struct error *err);
+	/* y = max(y, 0). */
+	int (*volume_clip)(struct volume *y, struct error *err);
+	int (*stack_fill)(struct stack *y, int count, float value, struct error *err);
+	/* y = 0 where x is NaN. */
+	int (*stack_mask)(const struct stack *x, const int *slots, int count, struct stack *y, struct error *err);
 	int (*sync)(struct device *device, struct error *err);
 };
 

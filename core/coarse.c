@@ -4,7 +4,7 @@
 #include <math.h>
 #include <stdlib.h>
 
-#include "core/sart.h"
+#include "core/recon.h"
 
 /* The reduced scan. */
 struct reduced {
@@ -208,7 +208,7 @@ int coarse_sart(const struct coarse_options *options, struct stack *projections,
 	struct stack *stack = NULL;
 	struct plan *plan = NULL;
 	struct reduced reduced;
-	struct sart_sums sums;
+	struct iteration_sums sums;
 	int code = reduce(&reduced, options, err);
 
 	if (code < 0)

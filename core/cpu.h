@@ -269,12 +269,26 @@ size_t tile_line(const struct plan *plan, const struct tile *tile, int line, siz
 
 /* cpu_sart.c */
 int cpu_sart_iterate(struct plan *plan, const struct stack *projections, struct volume *volume,
-		     const struct cancel *cancel, struct sart_sums *ret_sums, struct error *err);
+		     const struct cancel *cancel, struct iteration_sums *ret_sums, struct error *err);
 
 /* cpu_tv.c */
 size_t tv_planes_floats(const struct plan *plan);
 int cpu_tv(struct plan *plan, struct volume *volume, const struct tv_options *options, const struct cancel *cancel,
 	   struct error *err);
+
+/* cpu_algebra.c */
+int cpu_volume_axpby(double a, const struct volume *x, double b, struct volume *y, struct error *err);
+int cpu_stack_axpby(double a, const struct stack *x, const int *slots, int count, double b, struct stack *y,
+		    struct error *err);
+int cpu_volume_dot(struct plan *plan, const struct volume *x, const struct volume *y, double *ret_sum,
+		   struct error *err);
+int cpu_stack_dot(struct plan *plan, const struct stack *x, const struct stack *y, int count, double *ret_sum,
+		  struct error *err);
+int cpu_volume_divide(const struct volume *x, double least, struct volume *y, struct error *err);
+int cpu_stack_divide(const struct stack *x, double least, int count, struct stack *y, struct error *err);
+int cpu_volume_clip(struct volume *y, struct error *err);
+int cpu_stack_fill(struct stack *y, int count, float value, struct error *err);
+int cpu_stack_mask(const struct stack *x, const int *slots, int count, struct stack *y, struct error *err);
 
 /* cpu_norms.c */
 int cpu_norms(struct plan *plan, const struct volume *volume, const struct volume *other, double unit,

@@ -36,7 +36,7 @@ static void correct_block(const struct plan *plan, const float *measured, const 
 }
 
 static void correct(struct plan *plan, const struct volume *volume, const struct stack *projections, const int *views,
-		    int count, struct sart_sums *sums)
+		    int count, struct iteration_sums *sums)
 {
 	const int blocks = column_blocks(plan);
 	const size_t rows = (size_t)plan->rows, pixels = rows * (size_t)plan->columns;
@@ -121,7 +121,8 @@ static void update_tile(const struct plan *plan, const struct subset *subset, in
 }
 
 static int run_subset(struct plan *plan, const struct subset *subset, const struct stack *projections,
-		      struct volume *volume, const struct cancel *cancel, struct sart_sums *sums, struct error *err)
+		      struct volume *volume, const struct cancel *cancel, struct iteration_sums *sums,
+		      struct error *err)
 {
 	const int tiles = tile_count(plan, BACKPROJECT_PLAIN);
 
@@ -140,10 +141,10 @@ static int run_subset(struct plan *plan, const struct subset *subset, const stru
 }
 
 int cpu_sart_iterate(struct plan *plan, const struct stack *projections, struct volume *volume,
-		     const struct cancel *cancel, struct sart_sums *ret_sums, struct error *err)
+		     const struct cancel *cancel, struct iteration_sums *ret_sums, struct error *err)
 {
 	const struct subsets *subsets = &plan->sart.subsets;
-	struct sart_sums sums = {0};
+	struct iteration_sums sums = {0};
 
 	if (plan->batch == 0)
 		return error_set(err, ERR_INTERNAL, "the plan was made without SART");

@@ -16,7 +16,7 @@
 #include <math.h>
 #include <stdlib.h>
 
-#include "core/sart.h"
+#include "core/recon.h"
 
 /*
  * Sides of a cube in voxels: hundreds of mixed differences in the first. Where less than CUBES_LEAST of them fit into

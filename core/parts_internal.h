@@ -96,7 +96,21 @@ int parts_stack_download(struct stack *stack, int slot, int count, float *ret_to
 
 /* ---- parts_sart.c ---- */
 int parts_sart_iterate(struct plan *plan, const struct stack *projections, struct volume *volume,
-		       const struct cancel *cancel, struct sart_sums *ret_sums, struct error *err);
+		       const struct cancel *cancel, struct iteration_sums *ret_sums, struct error *err);
+
+/* ---- parts_algebra.c ---- */
+int parts_volume_axpby(double a, const struct volume *x, double b, struct volume *y, struct error *err);
+int parts_stack_axpby(double a, const struct stack *x, const int *slots, int count, double b, struct stack *y,
+		      struct error *err);
+int parts_volume_dot(struct plan *plan, const struct volume *x, const struct volume *y, double *ret_sum,
+		     struct error *err);
+int parts_stack_dot(struct plan *plan, const struct stack *x, const struct stack *y, int count, double *ret_sum,
+		    struct error *err);
+int parts_volume_divide(const struct volume *x, double least, struct volume *y, struct error *err);
+int parts_stack_divide(const struct stack *x, double least, int count, struct stack *y, struct error *err);
+int parts_volume_clip(struct volume *y, struct error *err);
+int parts_stack_fill(struct stack *y, int count, float value, struct error *err);
+int parts_stack_mask(const struct stack *x, const int *slots, int count, struct stack *y, struct error *err);
 
 /* ---- parts_tv.c ---- */
 int parts_tv(struct plan *plan, struct volume *volume, const struct tv_options *options, const struct cancel *cancel,

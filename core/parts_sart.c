@@ -77,7 +77,7 @@ static void correct_row(const struct view *view, const struct box *box, int row,
 }
 
 static void correct(struct plan *plan, const struct stack *projections, const int *views, int count,
-		    struct sart_sums *sums)
+		    struct iteration_sums *sums)
 {
 	const struct geometry *geometry = plan->options.geometry;
 	const struct box box = box_of(plan->options.grid);
@@ -240,10 +240,10 @@ static int update_volume(struct plan *plan, const int *views, int count, struct 
 }
 
 int parts_sart_iterate(struct plan *plan, const struct stack *projections, struct volume *volume,
-		       const struct cancel *cancel, struct sart_sums *ret_sums, struct error *err)
+		       const struct cancel *cancel, struct iteration_sums *ret_sums, struct error *err)
 {
 	const struct sart_options *sart = plan->options.sart;
-	struct sart_sums sums = {0};
+	struct iteration_sums sums = {0};
 	int code = 0;
 
 	if (sart == NULL)

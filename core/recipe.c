@@ -3,7 +3,7 @@
  * in where it leaves something open. Everything that can be refused is refused
  * here by its pointer, before a device is asked for anything.
  */
-#include "core/recon.h"
+#include "core/algorithm.h"
 
 #include <math.h>
 #include <stdio.h>
@@ -17,7 +17,8 @@ void recipe_defaults(struct recipe *ret_recipe)
 {
 	*ret_recipe = (struct recipe){
 	    .fdk = {.window = WINDOW_HANN, .cutoff = 1, .extend = true},
-	    .sart = {.iterations = 10, .relaxation = 1, .subsets = SUBSETS_DEFAULT, .nonnegative = true},
+	    .iterate = {.iterations = 10},
+	    .sart = {.relaxation = 1, .subsets = SUBSETS_DEFAULT, .nonnegative = true},
 	    .tv = {.after_fdk = true,
 		   .automatic = true,
 		   .strength = TV_MEDIUM,
@@ -37,6 +38,15 @@ void recipe_explicit_tv(struct recipe *recipe, enum tv_method method)
 	/* Explicit steps are a smoothing of their own; the minimiser is one when it is reached, to about a percent
 	 * here. */
 	tv->iterations = method == TV_GRADIENT ? 10 : 100;
+}
+
+void recipe_set_algorithm(struct recipe *recipe, const struct algorithm *algorithm)
+{
+	recipe->algorithm = algorithm;
+	if (algorithm == NULL)
+		return;
+	recipe->iterate.iterations = algorithm->iterations;
+	recipe->projector = algorithm->projector;
 }
 
 void recipe_clear(struct recipe *recipe)
@@ -89,22 +99,33 @@ static int check_positive(double value, bool zero_too, const char *pointer, stru
 	return code < 0 ? code : check_range(value, 0, INFINITY, zero_too, pointer, err);
 }
 
-static int check_sart(const struct recipe *recipe, int views, struct error *err)
+static int check_iterations(const struct recipe *recipe, struct error *err)
 {
-	int code = check_range(recipe->sart.iterations, 1, ITERATIONS_MAX, true, "/sart/iterations", err);
+	const char *name = recipe->algorithm->name;
+	char iterations[64], residual[64], change[64];
+	int code;
 
-	/* Each update is a projection for 1, a reflection for 2, and grows beyond that. */
+	snprintf(iterations, sizeof(iterations), "/%s/iterations", name);
+	snprintf(residual, sizeof(residual), "/%s/stop/residual", name);
+	snprintf(change, sizeof(change), "/%s/stop/change", name);
+	code = check_range(recipe->iterate.iterations, 1, ITERATIONS_MAX, true, iterations, err);
 	if (code == 0)
-		code = check_range(recipe->sart.relaxation, 0, 2, false, "/sart/relaxation", err);
+		code = check_positive(recipe->iterate.stop_residual, true, residual, err);
+	if (code == 0)
+		code = check_positive(recipe->iterate.stop_change, true, change, err);
+	return code;
+}
+
+static int check_subsets(const struct recipe *recipe, int views, struct error *err)
+{
+	/* Each update is a projection for 1, a reflection for 2, and grows beyond that. */
+	int code = check_range(recipe->sart.relaxation, 0, 2, false, "/sart/relaxation", err);
+
 	if (code == 0 && recipe->sart.subsets != SUBSETS_DEFAULT && recipe->sart.subsets != SUBSETS_VIEWS &&
 	    (recipe->sart.subsets < 1 || recipe->sart.subsets > views))
 		code = error_set_at(err, ERR_IMPOSSIBLE, "/sart/subsets",
 				    "%d subsets of %d views: there can be 1 to %d, or \"views\"", recipe->sart.subsets,
 				    views, views);
-	if (code == 0)
-		code = check_positive(recipe->sart.stop_residual, true, "/sart/stop/residual", err);
-	if (code == 0)
-		code = check_positive(recipe->sart.stop_change, true, "/sart/stop/change", err);
 	return code;
 }
 
@@ -141,7 +162,7 @@ static int check_metal(const struct recipe *recipe, struct error *err)
 static int check_emit(const struct recipe *recipe, struct error *err)
 {
 	for (int i = 0; i < recipe->emits; i++) {
-		int emit = recipe->emit[i], last = recipe->sart.on ? recipe->sart.iterations : 0;
+		int emit = recipe->emit[i], last = recipe->algorithm != NULL ? recipe->iterate.iterations : 0;
 		char pointer[32];
 
 		snprintf(pointer, sizeof(pointer), "/emit/%d", i);
@@ -176,12 +197,16 @@ int recipe_check(const struct recipe *recipe, const struct geometry *geometry, s
 {
 	int code = 0;
 
-	if (!recipe->fdk.on && !recipe->sart.on)
-		return error_set(err, ERR_IMPOSSIBLE, "neither \"fdk\" nor \"sart\" is given, there is nothing to run");
+	if (!recipe->fdk.on && recipe->algorithm == NULL)
+		return error_set(
+		    err, ERR_IMPOSSIBLE,
+		    "neither \"fdk\" nor an algorithm, \"sart\" or another, is given: there is nothing to run");
 	if (recipe->fdk.on)
 		code = check_range(recipe->fdk.cutoff, 0, 1, false, "/fdk/cutoff", err);
-	if (code == 0 && recipe->sart.on)
-		code = check_sart(recipe, geometry->count, err);
+	if (code == 0 && recipe->algorithm != NULL)
+		code = check_iterations(recipe, err);
+	if (code == 0 && recipe->algorithm != NULL && recipe->algorithm->subsets)
+		code = check_subsets(recipe, geometry->count, err);
 	if (code == 0 && recipe->tv.on)
 		code = check_tv(recipe, err);
 	if (code == 0 && recipe->metal.on)

@@ -12,16 +12,17 @@
 #include <string.h>
 #include <time.h>
 
+#include "core/algorithm.h"
 #include "core/exterior.h"
 #include "core/fdk.h"
 #include "core/metal.h"
 #include "core/noise.h"
 #include "core/input.h"
 #include "core/parts.h"
-#include "core/sart.h"
+#include "core/recon_internal.h"
 #include "core/warn.h"
 
-const char *const stage_names[STAGE_COUNT] = {"load", "fdk", "sart", "tv", "save"};
+const char *const stage_names[STAGE_COUNT] = {"load", "fdk", "sart", "tv", "save", "cgls"};
 
 /* ---- opening ---- */
 
@@ -38,15 +39,17 @@ struct recon {
 	struct orbit orbit;
 	struct input input;
 	struct fdk_weights weights;
-	struct sart_options sart;
+	struct sart_options sart; /* where the algorithm goes by subsets */
 
 	struct plan *plan;
 	struct fdk fdk;            /* where FDK is on */
-	struct stack *projections; /* a slot for each view with SART, else for each view of an FDK batch */
+	struct stack *projections; /* a slot for each view where they are kept, else for each view of an FDK batch */
 	struct volume *volume;     /* the iterate */
 	struct volume *before;     /* the iterate before the iteration, and for metal to work in; NULL without both */
 	struct stack *batch;       /* for metal to work in; NULL without */
 	struct metal metal;
+	struct problem problem; /* of the algorithm, where there is one */
+	void *algorithm_state;
 
 	unsigned char *pushed; /* [views] */
 	int pushed_count;
@@ -56,6 +59,7 @@ struct recon {
 
 	bool resumed, ran;
 	int iteration; /* done so far */
+	bool moved;    /* the iterate is not the one that the algorithm left */
 	struct volume_norms norms;
 	double work_done, work_total; /* in FDKs of the whole scan */
 };
@@ -64,7 +68,12 @@ struct recon {
  * What the stages cost beside an FDK of the whole scan, roughly, as measured on
  * CPU and GPU alike: only the progress bar lives on it.
  */
-static const double WORK_LOAD = 0.2, WORK_FDK = 1, WORK_SART = 4, WORK_TV = 0.2, WORK_METAL = 12;
+static const double WORK_LOAD = 0.2, WORK_FDK = 1, WORK_TV = 0.2, WORK_METAL = 12;
+
+static double iteration_work(const struct recipe *recipe)
+{
+	return recipe->algorithm->work + (recipe->tv.on ? WORK_TV : 0);
+}
 
 static double recipe_work(const struct recipe *recipe)
 {
@@ -74,229 +83,9 @@ static double recipe_work(const struct recipe *recipe)
 		work += WORK_FDK + (recipe->tv.on && recipe->tv.after_fdk ? WORK_TV : 0);
 	if (recipe->metal.on)
 		work += WORK_METAL;
-	if (recipe->sart.on)
-		work += recipe->sart.iterations * (WORK_SART + (recipe->tv.on ? WORK_TV : 0));
+	if (recipe->algorithm != NULL)
+		work += recipe->iterate.iterations * iteration_work(recipe);
 	return work;
-}
-
-/* SART goes over all projections again and again, metal is taken out of them when the last one has come. */
-static bool keeps_projections(const struct recipe *recipe)
-{
-	return recipe->sart.on || recipe->metal.on;
-}
-
-static struct plan_options plan_options(const struct recipe *recipe, const struct geometry *geometry,
-					const struct linearise *linearise, const struct fdk_weights *weights,
-					const struct sart_options *sart)
-{
-	struct plan_options options = {
-	    .geometry = geometry,
-	    .grid = &recipe->grid,
-	    .linearise = *linearise,
-	    .column_weights = recipe->fdk.on ? weights->columns : NULL,
-	    .filter_response = recipe->fdk.on ? weights->response : NULL,
-	    .pad = {recipe->fdk.on ? weights->pad[0] : 0, recipe->fdk.on ? weights->pad[1] : 0},
-	    .extend = recipe->fdk.on ? weights->extend : 0,
-	    .extended_response = recipe->fdk.on ? weights->extended : NULL,
-	    .sart = recipe->sart.on ? sart : NULL,
-	    .matched = recipe->sart.on && recipe->projector == PROJECTOR_MATCHED,
-	    .tv = recipe->tv.on ? &recipe->tv.options : NULL,
-	    .reference_precision = recipe->reference_precision,
-	    .no_projection = !keeps_projections(recipe),
-	    .resident = keeps_projections(recipe) ? 0 : fdk_batch_most(geometry->count),
-	};
-
-	memcpy(options.axis, weights->axis, sizeof(options.axis));
-	return options;
-}
-
-static int sart_options_make(struct sart_options *ret_sart, const struct recipe *recipe, const struct orbit *orbit,
-			     struct error *err)
-{
-	struct sart_options sart = {.relaxation = recipe->sart.relaxation, .nonnegative = recipe->sart.nonnegative};
-	int code = subsets_make(&sart.subsets, orbit, subsets_count(recipe->sart.subsets, orbit->count), err);
-
-	if (code == 0)
-		*ret_sart = sart;
-	return code;
-}
-
-/* One more volume to work in, as this backend holds one. */
-static int volume_bytes(const struct backend *backend, struct device *device, const struct plan_options *options,
-			size_t *ret_bytes, struct error *err)
-{
-	struct plan_options bare = *options;
-	struct plan_bytes bytes;
-	int code;
-
-	bare.sart = NULL;
-	bare.tv = NULL;
-	code = backend->plan_bytes(device, &bare, &bytes, err);
-	if (code == 0)
-		*ret_bytes = bytes.volumes;
-	return code;
-}
-
-/*
- * What the job takes beside its plan, whole on the device: FDK's filtered batch, its surroundings, and for metal a
- * batch that is projected and a volume to work in, which is SART's copy of the iterate where there is one. The
- * plan is told of these.
- */
-static int memory_whole(const struct backend *backend, struct device *device, struct plan_options *options,
-			bool has_metal, const struct surroundings_bytes *around, struct recon_memory *ret_memory,
-			struct error *err)
-{
-	const struct geometry *geometry = options->geometry;
-	const int columns = geometry->columns, rows = geometry->rows, *pad = options->pad;
-	size_t filtered = 0, projected = 0, work = 0;
-	struct plan_bytes bytes;
-	int code = 0;
-
-	if (options->column_weights != NULL)
-		filtered = backend->stack_bytes(pad[0] + columns + pad[1], rows, fdk_batch_most(geometry->count));
-	if (has_metal)
-		projected = backend->stack_bytes(columns, rows, metal_slots(geometry));
-	if (has_metal && options->sart == NULL)
-		code = volume_bytes(backend, device, options, &work, err);
-	options->beside = filtered + around->device + projected + work;
-	options->lends = around->borrowed;
-	if (code == 0)
-		code = backend->plan_bytes(device, options, &bytes, err);
-	if (code < 0)
-		return code;
-	*ret_memory = (struct recon_memory){
-	    .projections =
-		backend->stack_bytes(columns, rows, options->resident > 0 ? options->resident : geometry->count),
-	    .volumes = bytes.volumes + work,
-	    .scratch = bytes.scratch + bytes.raw + filtered + around->device + projected,
-	};
-	return 0;
-}
-
-/* The same in parts: the device holds slabs of one volume at a time, the host all the rest. */
-static struct recon_memory memory_in_parts(const struct plan_options *options, const struct plan_bytes *bytes,
-					   bool has_metal, const struct surroundings_bytes *around)
-{
-	const struct geometry *geometry = options->geometry;
-	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
-	struct recon_memory memory = {
-	    .volumes = bytes->volumes,
-	    .scratch = bytes->scratch + bytes->raw,
-	    .host = bytes->host + around->host,
-	};
-
-	if (around->device > memory.volumes + memory.scratch)
-		memory.scratch = around->device - memory.volumes;
-	if (has_metal)
-		memory.host += sizeof(float) * ((size_t)metal_slots(geometry) * pixels +
-						(options->sart == NULL ? 2 : 1) * grid_voxels(options->grid));
-	return memory;
-}
-
-static int memory_needed(const struct backend *backend, struct device *device, struct plan_options *options,
-			 const struct recipe *recipe, const struct orbit *orbit, struct recon_memory *ret_memory,
-			 struct error *err)
-{
-	const struct surroundings_options surroundings = {
-	    .backend = backend, .device = device, .geometry = options->geometry, .orbit = orbit, .grid = &recipe->grid};
-	struct surroundings_bytes around = {0};
-	struct recon_memory memory;
-	struct plan_bytes bytes;
-	struct device_info info;
-	int code;
-
-	options->beside = options->lends = 0;
-	code = backend->plan_bytes(device, options, &bytes, err);
-	if (code == 0 && recipe->sart.on)
-		code = surroundings_bytes(&surroundings, &around, err);
-	if (code == 0 && bytes.host == 0)
-		code = memory_whole(backend, device, options, recipe->metal.on, &around, &memory, err);
-	if (code < 0)
-		return code;
-	if (bytes.host > 0)
-		memory = memory_in_parts(options, &bytes, recipe->metal.on, &around);
-	memory.total = memory.projections + memory.volumes + memory.scratch;
-	if (device != NULL) {
-		backend->describe(device, &info);
-		memory.available = info.bytes_free;
-	}
-	*ret_memory = memory;
-	return 0;
-}
-
-/*
- * What the job takes, and on what: *ret_parts stays NULL where it fits as a
- * whole, otherwise it is the device in parts and the memory what that takes.
- */
-static int choose_device(const struct backend *backend, struct device *device, struct plan_options *options,
-			 const struct recipe *recipe, const struct orbit *orbit, struct recon_memory *ret_memory,
-			 struct device **ret_parts, struct error *err)
-{
-	struct device *parts = NULL;
-	int code = memory_needed(backend, device, options, recipe, orbit, ret_memory, err);
-
-	if (code < 0 || device == NULL || !backend->own_memory || ret_memory->total <= ret_memory->available)
-		return code;
-	code = parts_open(backend, device, &parts, err);
-	if (code == 0)
-		code = memory_needed(&backend_parts, parts, options, recipe, orbit, ret_memory, err);
-	if (code < 0)
-		backend_parts.close(parts);
-	else
-		*ret_parts = parts;
-	return code;
-}
-
-/*
- * The orbit, and the geometry that all goes by: FDK filters along the rows, so that
- * a detector that lies on its side has its rows and columns exchanged, in
- * *ret_upright. That stays as it is for any other.
- */
-static int stand_up(const struct geometry **geometry, struct geometry *ret_upright, struct orbit *ret_orbit,
-		    struct error *err)
-{
-	int code = orbit_analyse(ret_orbit, *geometry, err);
-
-	if (code < 0 || !ret_orbit->turned)
-		return code;
-	orbit_clear(ret_orbit);
-	code = geometry_exchange(ret_upright, *geometry, err);
-	if (code < 0)
-		return code;
-	*geometry = ret_upright;
-	return orbit_analyse(ret_orbit, *geometry, err);
-}
-
-int recon_memory(const struct backend *backend, struct device *device, const struct geometry *geometry,
-		 const struct recipe *recipe, struct recon_memory *ret_memory, struct error *err)
-{
-	float some = 0; /* stands for the weights: only whether there are any is asked here */
-	struct fdk_weights weights = {.columns = &some, .response = &some, .extended = &some};
-	const struct linearise linearise = {.sample = SAMPLE_FLOAT32};
-	struct recipe resolved = *recipe;
-	struct geometry upright = {0};
-	struct orbit orbit = {0};
-	struct sart_options sart = {0};
-	struct device *parts = NULL;
-	struct plan_options options;
-	int code = stand_up(&geometry, &upright, &orbit, err);
-
-	memcpy(weights.pad, orbit.pad, sizeof(weights.pad));
-	weights.extend = recipe->fdk.on && recipe->fdk.extend ? geometry->columns : 0;
-	if (code == 0)
-		code = recipe_resolve(&resolved, geometry, &orbit, err);
-	if (code == 0 && resolved.sart.on)
-		code = sart_options_make(&sart, &resolved, &orbit, err);
-	if (code == 0) {
-		options = plan_options(&resolved, geometry, &linearise, &weights, &sart);
-		code = choose_device(backend, device, &options, &resolved, &orbit, ret_memory, &parts, err);
-	}
-	if (parts != NULL)
-		backend_parts.close(parts);
-	subsets_clear(&sart.subsets);
-	orbit_clear(&orbit);
-	geometry_clear(&upright);
-	return code;
 }
 
 /* The host's memory is asked for where the job lies in it. */
@@ -342,7 +131,7 @@ static int recon_prepare(struct recon *recon, const struct recipe *recipe, struc
 	if (code == 0 && recon->recipe.fdk.on)
 		code = fdk_weights_make(&recon->weights, &recon->orbit, geometry, recon->recipe.fdk.window,
 					recon->recipe.fdk.cutoff, recon->recipe.fdk.extend, err);
-	if (code == 0 && recon->recipe.sart.on)
+	if (code == 0 && has_subsets(&recon->recipe))
 		code = sart_options_make(&recon->sart, &recon->recipe, &recon->orbit, err);
 	if (code < 0)
 		return code;
@@ -382,6 +171,32 @@ static int recon_allocate(struct recon *recon, struct error *err)
 	return code;
 }
 
+static const struct cancel *cancel_of(const struct recon *recon)
+{
+	return recon->cancel.asked != NULL ? &recon->cancel : NULL;
+}
+
+static int open_algorithm(struct recon *recon, struct error *err)
+{
+	const struct algorithm *algorithm = recon->recipe.algorithm;
+
+	if (algorithm == NULL)
+		return 0;
+	recon->problem = (struct problem){
+	    .backend = recon->backend,
+	    .device = recon->device,
+	    .plan = recon->plan,
+	    .geometry = recon->geometry,
+	    .grid = &recon->recipe.grid,
+	    .projections = recon->projections,
+	    .volume = recon->volume,
+	    .before = recon->before,
+	    .cancel = cancel_of(recon),
+	};
+	recon->moved = true;
+	return algorithm->open != NULL ? algorithm->open(&recon->problem, &recon->algorithm_state, err) : 0;
+}
+
 int recon_open(const struct backend *backend, struct device *device, const struct geometry *geometry,
 	       const struct linearise *linearise, const struct recipe *recipe, const struct recon_hooks *hooks,
 	       struct recon **ret_recon, struct error *err)
@@ -403,6 +218,8 @@ int recon_open(const struct backend *backend, struct device *device, const struc
 		code = recon_prepare(recon, recipe, err);
 	if (code == 0)
 		code = recon_allocate(recon, err);
+	if (code == 0)
+		code = open_algorithm(recon, err);
 	if (code < 0) {
 		recon_free(recon);
 		return code;
@@ -415,6 +232,8 @@ void recon_free(struct recon *recon)
 {
 	if (recon == NULL)
 		return;
+	if (recon->algorithm_state != NULL)
+		recon->recipe.algorithm->close(&recon->problem, recon->algorithm_state);
 	recon->backend->volume_free(recon->before);
 	recon->backend->volume_free(recon->volume);
 	recon->backend->stack_free(recon->projections);
@@ -451,11 +270,6 @@ static int check_cancelled(const struct recon *recon, struct error *err)
 	return 0;
 }
 
-static const struct cancel *cancel_of(const struct recon *recon)
-{
-	return recon->cancel.asked != NULL ? &recon->cancel : NULL;
-}
-
 static bool is_wanted(const struct recipe *recipe, int emit)
 {
 	for (int i = 0; i < recipe->emits; i++)
@@ -481,7 +295,7 @@ static double tv_alpha(const struct recon *recon, enum noise_stage stage)
 static void tell_noise(const struct recon *recon)
 {
 	const struct recipe *recipe = &recon->recipe;
-	const double alpha = tv_alpha(recon, recipe->sart.on ? NOISE_OF_SART : NOISE_OF_FDK);
+	const double alpha = tv_alpha(recon, recipe->algorithm != NULL ? NOISE_OF_SART : NOISE_OF_FDK);
 
 	if (recon->hooks->denoising != NULL)
 		recon->hooks->denoising(recon->hooks->context, recon->noise.sigma / recipe->mu_water * 1000,
@@ -601,11 +415,11 @@ int recon_resume(struct recon *recon, const float *volume, int iteration, struct
 {
 	int code;
 
-	if (!recon->recipe.sart.on)
-		return error_set(err, ERR_INVALID, "without SART there is no iteration to go on from");
-	if (iteration < 0 || iteration > recon->recipe.sart.iterations)
+	if (recon->recipe.algorithm == NULL)
+		return error_set(err, ERR_INVALID, "without iterations there is none to go on from");
+	if (iteration < 0 || iteration > recon->recipe.iterate.iterations)
 		return error_set(err, ERR_INVALID, "iteration %d to go on from: there are 0 to %d", iteration,
-				 recon->recipe.sart.iterations);
+				 recon->recipe.iterate.iterations);
 	if (recon->pushed_count > 0 || recon->ran)
 		return error_set(err, ERR_CONFLICT, "an iterate came after %d views", recon->pushed_count);
 	code = recon->backend->volume_upload(recon->volume, volume, err);
@@ -613,10 +427,38 @@ int recon_resume(struct recon *recon, const float *volume, int iteration, struct
 		return code;
 	recon->resumed = true;
 	recon->iteration = iteration;
-	recon->work_done =
-	    recon->work_total - WORK_LOAD -
-	    (recon->recipe.sart.iterations - iteration) * (WORK_SART + (recon->recipe.tv.on ? WORK_TV : 0));
+	recon->work_done = recon->work_total - WORK_LOAD -
+			   (recon->recipe.iterate.iterations - iteration) * iteration_work(&recon->recipe);
 	return 0;
+}
+
+size_t recon_state_bytes(const struct recon *recon)
+{
+	const struct algorithm *algorithm = recon->recipe.algorithm;
+
+	return algorithm != NULL && algorithm->state_bytes != NULL ? algorithm->state_bytes(&recon->problem) : 0;
+}
+
+int recon_save_state(struct recon *recon, const struct checkpoint_sink *sink, struct error *err)
+{
+	if (recon_state_bytes(recon) == 0)
+		return 0;
+	return recon->recipe.algorithm->save(&recon->problem, recon->algorithm_state, sink, err);
+}
+
+int recon_resume_state(struct recon *recon, const char *bytes, size_t size, struct error *err)
+{
+	int code;
+
+	if (!recon->resumed || size != recon_state_bytes(recon))
+		return error_set(err, ERR_INVALID, "%zu bytes of an algorithm that holds %zu", size,
+				 recon_state_bytes(recon));
+	if (size == 0)
+		return 0;
+	code = recon->recipe.algorithm->resume(&recon->problem, recon->algorithm_state, bytes, err);
+	/* With TV the iterate was moved behind the iteration that the state is of. */
+	recon->moved = recon->recipe.tv.on;
+	return code;
 }
 
 int recon_resume_metal(struct recon *recon, const void *list, size_t bytes, struct error *err)
@@ -846,26 +688,24 @@ static double now(void)
 /* One iteration, TV included, and its row of the history. */
 static int iterate(struct recon *recon, struct history_row *ret_row, struct error *err)
 {
-	const struct backend *backend = recon->backend;
+	const struct algorithm *algorithm = recon->recipe.algorithm;
 	int iteration = recon->iteration + 1;
 	double begin = now(), norm2_before = recon->norms.norm2;
-	struct sart_sums sums;
+	struct iteration_sums sums;
 	int code;
 
-	tell_progress(recon, STAGE_SART, iteration);
-	code = backend->volume_copy(recon->before, recon->volume, err);
-	if (code == 0)
-		code =
-		    backend->sart_iterate(recon->plan, recon->projections, recon->volume, cancel_of(recon), &sums, err);
+	tell_progress(recon, algorithm->stage, iteration);
+	code = algorithm->iterate(&recon->problem, recon->algorithm_state, recon->moved, &sums, err);
 	if (code < 0)
 		return code;
-	recon->work_done += WORK_SART;
+	recon->work_done += algorithm->work;
+	recon->moved = recon->recipe.tv.on;
 	if (recon->recipe.tv.on)
 		code = run_tv(recon, iteration, err);
 	if (code == 0)
 		code = measure(recon, recon->before, &recon->norms, err);
 	if (code == 0)
-		code = sart_row(iteration, &sums, &recon->norms, norm2_before, ret_row, err);
+		code = algorithm_row(iteration, &sums, &recon->norms, norm2_before, ret_row, err);
 	if (code < 0)
 		return code;
 	ret_row->seconds = now() - begin;
@@ -976,15 +816,15 @@ static int warn_of_unseen_slices(const struct recon *recon, struct error *err)
 
 static bool is_last(const struct recipe *recipe, const struct history_row *row)
 {
-	return row->iteration >= recipe->sart.iterations ||
-	       (recipe->sart.stop_residual > 0 && row->residual <= recipe->sart.stop_residual) ||
-	       (recipe->sart.stop_change > 0 && row->change <= recipe->sart.stop_change);
+	return row->iteration >= recipe->iterate.iterations ||
+	       (recipe->iterate.stop_residual > 0 && row->residual <= recipe->iterate.stop_residual) ||
+	       (recipe->iterate.stop_change > 0 && row->change <= recipe->iterate.stop_change);
 }
 
-static int run_sart(struct recon *recon, struct error *err)
+static int run_iterations(struct recon *recon, struct error *err)
 {
 	const struct recon_hooks *hooks = recon->hooks;
-	bool last = recon->iteration >= recon->recipe.sart.iterations;
+	bool last = recon->iteration >= recon->recipe.iterate.iterations;
 	int failed = last ? 0 : leave_out_the_exterior(recon, err);
 
 	if (failed == 0 && !last)
@@ -1008,7 +848,7 @@ static int run_sart(struct recon *recon, struct error *err)
 			warn_residual(hooks, &row);
 		snprintf(name, sizeof(name), "iter-%d", row.iteration);
 		if (is_wanted(&recon->recipe, row.iteration))
-			code = keep(recon, name, "sart", err);
+			code = keep(recon, name, recon->recipe.algorithm->name, err);
 		if (code < 0)
 			return code;
 		if (!last && hooks->yield != NULL && hooks->yield(hooks->context))
@@ -1034,7 +874,9 @@ static int check_complete(const struct recon *recon, struct error *err)
 int recon_run(struct recon *recon, struct error *err)
 {
 	const struct recipe *recipe = &recon->recipe;
-	const char *stage = recipe->sart.on ? "sart" : recipe->tv.on && recipe->tv.after_fdk ? "tv" : "fdk";
+	const char *stage = recipe->algorithm != NULL               ? recipe->algorithm->name
+			    : recipe->tv.on && recipe->tv.after_fdk ? "tv"
+								    : "fdk";
 	int code = check_complete(recon, err);
 
 	if (code < 0)
@@ -1054,8 +896,8 @@ int recon_run(struct recon *recon, struct error *err)
 		code = take_metal_out_again(recon, err);
 	if (code == 0)
 		code = fdk_runs(recon) ? finish_fdk(recon, err) : measure(recon, NULL, &recon->norms, err);
-	if (code == 0 && recipe->sart.on)
-		code = run_sart(recon, err);
+	if (code == 0 && recipe->algorithm != NULL)
+		code = run_iterations(recon, err);
 	if (code < 0)
 		return code;
 	recon->work_done = recon->work_total; /* a stop rule may have ended it early */

@@ -19,6 +19,9 @@ extern const char *const projector_names[PROJECTOR_COUNT]; /* "interpolating", "
 enum tv_strength { TV_LIGHT, TV_MEDIUM, TV_STRONG, TV_STRENGTH_COUNT };
 extern const char *const tv_strength_names[TV_STRENGTH_COUNT];
 
+struct algorithm; /* core/algorithm.h */
+extern const struct algorithm algorithm_sart, algorithm_cgls;
+
 struct recipe {
 	bool has_grid; /* otherwise chosen from field of view and resolution */
 	struct grid grid;
@@ -29,13 +32,15 @@ struct recipe {
 		double cutoff;
 		bool extend; /* rows that the detector cuts off, core/extend.h */
 	} fdk;
+	const struct algorithm *algorithm; /* of algorithms[], core/algorithm.h; NULL: no iterations */
 	struct {
-		bool on;
 		int iterations;
+		double stop_residual, stop_change; /* 0: never */
+	} iterate;                                 /* whatever the algorithm */
+	struct {
 		double relaxation;
 		int subsets; /* 1 .. views; SUBSETS_VIEWS: an update after each view; SUBSETS_DEFAULT: 10 or fewer */
 		bool nonnegative;
-		double stop_residual, stop_change; /* 0: never */
 	} sart;
 	struct {
 		bool on;
@@ -63,6 +68,8 @@ enum { METAL_ESTIMATE_MM = 10 };
 void recipe_defaults(struct recipe *ret_recipe); /* nothing on; the values that `{}` stages take */
 /* TV with numbers in place of those found: alpha 0.1, and 10 steps of 0.1 or 100 iterations; unit and `on` stay. */
 void recipe_explicit_tv(struct recipe *recipe, enum tv_method method);
+/* The algorithm, with its own number of iterations and projector; NULL: none. */
+void recipe_set_algorithm(struct recipe *recipe, const struct algorithm *algorithm);
 void recipe_clear(struct recipe *recipe);
 int recipe_copy(struct recipe *ret_recipe, const struct recipe *recipe, struct error *err);
 /* Pointers are those of the job's JSON, "/grid/size/0", "/sart/subsets"; ERR_IMPOSSIBLE for all that is out of range.
@@ -91,8 +98,8 @@ struct history_row {
 	double seconds; /* that the iteration took */
 };
 
-enum stage { STAGE_LOAD, STAGE_FDK, STAGE_SART, STAGE_TV, STAGE_SAVE, STAGE_COUNT };
-extern const char *const stage_names[STAGE_COUNT]; /* "load", "fdk", "sart", "tv", "save" */
+enum stage { STAGE_LOAD, STAGE_FDK, STAGE_SART, STAGE_TV, STAGE_SAVE, STAGE_CGLS, STAGE_COUNT };
+extern const char *const stage_names[STAGE_COUNT]; /* "load", "fdk", "sart", "tv", "save", "cgls" */
 
 struct kept_volume {
 	const char *name;  /* "fdk", "fdk-tv", "iter-5", "final" */
@@ -164,9 +171,9 @@ int recon_push(struct recon *recon, const void *samples, const int *views, int c
 int recon_run(struct recon *recon, struct error *err);
 
 /*
- * Goes on behind `iteration` (0 .. sart.iterations) with the iterate that was
+ * Goes on behind `iteration` (0 .. iterate.iterations) with the iterate that was
  * there, instead of FDK: the same bits as if it had never stopped. Call before
- * the first recon_push, which then skips FDK. A recipe without SART is refused.
+ * the first recon_push, which then skips FDK. A recipe without an algorithm is refused.
  */
 int recon_resume(struct recon *recon, const float *volume, int iteration, struct error *err);
 
@@ -177,6 +184,19 @@ int recon_resume(struct recon *recon, const float *volume, int iteration, struct
  */
 const void *recon_metal(const struct recon *recon, size_t *ret_bytes);
 int recon_resume_metal(struct recon *recon, const void *list, size_t bytes, struct error *err);
+
+/* Part of a checkpoint goes out: 0 or a negative code. */
+struct checkpoint_sink {
+	void *context;
+	int (*write)(void *context, const void *bytes, size_t size, struct error *err);
+};
+/*
+ * What the algorithm holds beside the iterate, 0 bytes where that is nothing. A run that goes on wants it back, behind
+ * recon_resume, for the same bits.
+ */
+size_t recon_state_bytes(const struct recon *recon);
+int recon_save_state(struct recon *recon, const struct checkpoint_sink *sink, struct error *err);
+int recon_resume_state(struct recon *recon, const char *bytes, size_t size, struct error *err);
 
 /*
  * The noise that was measured; NULL before that and without TV. A run that goes on wants it back, behind
@@ -194,6 +214,8 @@ size_t recon_defects(const struct recon *recon);
 const char *recon_plan(const struct recon *recon); /* how the backend does it */
 
 /* ---- sart.c: subsets ---- */
+/* The number of subsets that SUBSETS_DEFAULT and SUBSETS_VIEWS stand for. */
+int subsets_count(int subsets, int views);
 /*
  * `count` (1 .. views) ordered subsets, each of every count-th view along the
  * arc, so that each is spread over all of it; sizes differ by one at most. They

@@ -6,7 +6,7 @@
  *   v_j += relaxation * (sum_S w_ij (p_i - sum_m w_im v_m) / sum_m w_im) / sum_S w_ij
  *
  * The update itself is the backend's sart_iterate. Here: which views make a
- * subset, in which order the subsets are taken, and what an iteration reports.
+ * subset, and in which order the subsets are taken.
  *
  * The order decides how fast it converges, since neighbouring views nearly
  * repeat each other. The views are sorted by angle and visited with a stride
@@ -15,7 +15,7 @@
  * access scheme for iterative reconstruction based on the golden section, IEEE
  * NSS 2004), for any number of views, without a search.
  */
-#include "core/sart.h"
+#include "core/algorithm.h"
 
 #include <math.h>
 #include <stdlib.h>
@@ -122,29 +122,26 @@ int subsets_count(int subsets, int views)
 	return subsets;
 }
 
-/* sqrt(part / whole) with 0/0 = 0 and x/0 = 1: rows go out as JSON, which has no infinity. */
-static double relative(double part, double whole)
+static int sart_iterate(const struct problem *problem, void *state, bool moved, struct iteration_sums *ret_sums,
+			struct error *err)
 {
-	if (whole == 0)
-		return part > 0 ? 1 : 0;
-	return sqrt(part / whole);
+	const struct backend *backend = problem->backend;
+	int code = backend->volume_copy(problem->before, problem->volume, err);
+
+	(void)state;
+	(void)moved;
+	return code < 0 ? code
+			: backend->sart_iterate(problem->plan, problem->projections, problem->volume, problem->cancel,
+						ret_sums, err);
 }
 
-int sart_row(int iteration, const struct sart_sums *sums, const struct volume_norms *norms, double norm2_before,
-	     struct history_row *ret_row, struct error *err)
-{
-	struct history_row row = {
-	    .iteration = iteration,
-	    .residual = relative(sums->residual2, sums->projection2),
-	    .change = relative(norms->difference2, norm2_before),
-	    .tv = norms->tv,
-	};
-
-	if (norms->not_finite > 0 || !isfinite(row.residual) || !isfinite(row.change) || !isfinite(row.tv))
-		return error_set(err, ERR_IMPOSSIBLE,
-				 "iteration %d has diverged: %zu voxels are not finite, residual %g; "
-				 "a smaller relaxation or TV step is needed",
-				 iteration, norms->not_finite, row.residual);
-	*ret_row = row;
-	return 0;
-}
+const struct algorithm algorithm_sart = {
+    .name = "sart",
+    .summary = "SART, over ordered subsets of the views",
+    .iterations = 10,
+    .projector = PROJECTOR_INTERPOLATING,
+    .stage = STAGE_SART,
+    .subsets = true,
+    .work = 4,
+    .iterate = sart_iterate,
+};

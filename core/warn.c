@@ -103,14 +103,14 @@ void warn_recipe(const struct recon_hooks *hooks, const struct geometry *geometr
 		    "no view sees any of the grid, which begins at (%g, %g, %g) mm and is %g x %g x %g mm in size",
 		    grid->origin[0], grid->origin[1], grid->origin[2], grid->size[0] * grid->spacing[0],
 		    grid->size[1] * grid->spacing[1], grid->size[2] * grid->spacing[2]);
-	else if (recipe->sart.on && !is_crossed_in_any(grid, geometry))
+	else if (recipe->algorithm != NULL && !is_crossed_in_any(grid, geometry))
 		recon_warn(hooks, "grid_unseen",
 			   "every ray of every view passes beside the grid, which is %g x %g x %g mm in size, between "
 			   "the pixels: SART leaves it as it was",
 			   grid->size[0] * grid->spacing[0], grid->size[1] * grid->spacing[1],
 			   grid->size[2] * grid->spacing[2]);
 	warn_of_small_grid(hooks, grid);
-	if (recipe->tv.on && !recipe->tv.after_fdk && !recipe->sart.on)
+	if (recipe->tv.on && !recipe->tv.after_fdk && recipe->algorithm == NULL)
 		recon_warn(hooks, "tv_without_sart",
 			   "TV was wanted after SART iterations, and there are none: the FDK volume is left alone");
 }
@@ -191,7 +191,7 @@ void warn_tv(const struct recon_hooks *hooks, const struct recipe *recipe, const
 {
 	/* A voxel that is moved by so little of what it takes keeps nearly all of its noise. */
 	const double little = 0.25, hu = recipe->mu_water / 1000;
-	const enum noise_stage stage = recipe->sart.on ? NOISE_OF_SART : NOISE_OF_FDK;
+	const enum noise_stage stage = recipe->algorithm != NULL ? NOISE_OF_SART : NOISE_OF_FDK;
 	const double needed = recipe->tv.options.unit / noise_alpha(noise, recipe, orbit, stage);
 	const double reach = noise_reach(&recipe->tv.options);
 

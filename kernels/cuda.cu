@@ -199,7 +199,7 @@ static int project(struct plan *plan, const struct volume *from, const int *view
 }
 
 static int sart_iterate(struct plan *plan, const struct stack *projections, struct volume *volume,
-			const struct cancel *cancel, struct sart_sums *ret_sums, struct error *err)
+			const struct cancel *cancel, struct iteration_sums *ret_sums, struct error *err)
 {
 	TRY(cuda_sart_iterate(plan, projections, volume, cancel, ret_sums, err));
 	TRY(mark_used(plan->device, projections->used, err));
@@ -247,5 +247,14 @@ const struct backend backend_cuda = {
     .sart_iterate = sart_iterate,
     .tv = tv,
     .norms = cuda_norms,
+    .volume_axpby = cuda_volume_axpby,
+    .stack_axpby = cuda_stack_axpby,
+    .volume_dot = cuda_volume_dot,
+    .stack_dot = cuda_stack_dot,
+    .volume_divide = cuda_volume_divide,
+    .stack_divide = cuda_stack_divide,
+    .volume_clip = cuda_volume_clip,
+    .stack_fill = cuda_stack_fill,
+    .stack_mask = cuda_stack_mask,
     .sync = cuda_sync,
 };

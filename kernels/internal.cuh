@@ -492,11 +492,23 @@ int cuda_backproject(struct plan *plan, const struct stack *from, const int *vie
 int cuda_project(struct plan *plan, const struct volume *from, const int *views, int count, struct stack *to,
 		 struct error *err);
 int cuda_sart_iterate(struct plan *plan, const struct stack *projections, struct volume *volume,
-		      const struct cancel *cancel, struct sart_sums *ret_sums, struct error *err);
+		      const struct cancel *cancel, struct iteration_sums *ret_sums, struct error *err);
 int cuda_tv(struct plan *plan, struct volume *volume, const struct tv_options *options, const struct cancel *cancel,
 	    struct error *err);
 int cuda_norms(struct plan *plan, const struct volume *volume, const struct volume *other, double unit,
 	       struct volume_norms *ret_norms, struct error *err);
+int cuda_volume_axpby(double a, const struct volume *x, double b, struct volume *y, struct error *err);
+int cuda_stack_axpby(double a, const struct stack *x, const int *slots, int count, double b, struct stack *y,
+		     struct error *err);
+int cuda_volume_dot(struct plan *plan, const struct volume *x, const struct volume *y, double *ret_sum,
+		    struct error *err);
+int cuda_stack_dot(struct plan *plan, const struct stack *x, const struct stack *y, int count, double *ret_sum,
+		   struct error *err);
+int cuda_volume_divide(const struct volume *x, double least, struct volume *y, struct error *err);
+int cuda_stack_divide(const struct stack *x, double least, int count, struct stack *y, struct error *err);
+int cuda_volume_clip(struct volume *y, struct error *err);
+int cuda_stack_fill(struct stack *y, int count, float value, struct error *err);
+int cuda_stack_mask(const struct stack *x, const int *slots, int count, struct stack *y, struct error *err);
 int cuda_plan_bytes(struct device *device, const struct plan_options *options, struct plan_bytes *ret_bytes,
 		    struct error *err);
 int cuda_plan_new(struct device *device, const struct plan_options *options, struct plan **ret_plan, struct error *err);

@@ -177,3 +177,44 @@ int cuda_norms(struct plan *plan, const struct volume *volume, const struct volu
 	*ret_norms = result;
 	return 0;
 }
+
+/* A thread's products of float32 are exact in float64, which costs nothing beside the reads. */
+static __global__ void __launch_bounds__(THREADS)
+    dot(const float *__restrict__ x, const float *__restrict__ y, size_t count, double *blocks)
+{
+	double value[1] = {0};
+
+	for (size_t i = (size_t)blockIdx.x * THREADS + threadIdx.x; i < count; i += (size_t)gridDim.x * THREADS)
+		value[0] = fma((double)x[i], (double)y[i], value[0]);
+	reduce_block<1>(value);
+	if (threadIdx.x == 0)
+		blocks[blockIdx.x] = value[0];
+}
+
+static int reduce_dot(struct plan *plan, const float *x, const float *y, size_t count, double *ret_sum,
+		      struct error *err)
+{
+	struct device *device = plan->device;
+
+	TRY(device_enter(device, err));
+	dot<<<BLOCKS, THREADS, 0, device->stream>>>(x, y, count, plan->reduce);
+	LAUNCHED();
+	add_blocks<1><<<1, THREADS, 0, device->stream>>>(plan->reduce, BLOCKS, device->sums_device);
+	LAUNCHED();
+	TRY(device_wait(device, err));
+	*ret_sum = device->sums[0];
+	return 0;
+}
+
+int cuda_volume_dot(struct plan *plan, const struct volume *x, const struct volume *y, double *ret_sum,
+		    struct error *err)
+{
+	return reduce_dot(plan, x->data, y->data, y->bytes / sizeof(float), ret_sum, err);
+}
+
+/* The zeros between rows and slots add nothing. */
+int cuda_stack_dot(struct plan *plan, const struct stack *x, const struct stack *y, int count, double *ret_sum,
+		   struct error *err)
+{
+	return reduce_dot(plan, x->data, y->data, (size_t)count * y->shape.slot, ret_sum, err);
+}

@@ -396,7 +396,7 @@ static int record(struct plan *plan, const float *projections, float *volume, st
 }
 
 int cuda_sart_iterate(struct plan *plan, const struct stack *projections, struct volume *volume,
-		      const struct cancel *cancel, struct sart_sums *ret_sums, struct error *err)
+		      const struct cancel *cancel, struct iteration_sums *ret_sums, struct error *err)
 {
 	const struct sart_options *sart = plan->options.sart;
 	struct device *device = plan->device;

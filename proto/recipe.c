@@ -10,12 +10,12 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "core/sart.h"
+#include "core/algorithm.h"
 
 const char *const priority_names[PRIORITY_COUNT] = {"routine", "urgent", "stat"};
 
 static const char *const after_names[2] = {"sart", "fdk+sart"};
-static const char *const truncation_names[2] = {"off", "auto"};
+const char *const truncation_names[2] = {"off", "auto"};
 static const char *const precision_names[2] = {"standard", "reference"};
 
 /* ---- reading ---- */
@@ -87,35 +87,44 @@ static void read_subsets(struct json_reader *reader, int *ret_subsets)
 	}
 }
 
-static int read_stop(struct recipe *recipe, const cJSON *value, struct error *err)
+static int read_stop(struct recipe *recipe, const cJSON *value, const char *pointer, struct error *err)
 {
 	struct json_reader reader;
 
-	json_begin(&reader, value, "/sart/stop", err);
-	json_number(&reader, "residual", false, 0, 1e6, &recipe->sart.stop_residual);
-	json_number(&reader, "change", false, 0, 1e6, &recipe->sart.stop_change);
+	json_begin(&reader, value, pointer, err);
+	json_number(&reader, "residual", false, 0, 1e6, &recipe->iterate.stop_residual);
+	json_number(&reader, "change", false, 0, 1e6, &recipe->iterate.stop_change);
 	return json_end(&reader);
 }
 
-static int read_sart(struct recipe *recipe, const cJSON *value, struct error *err)
+/* An algorithm's member: what all of them have, and what is its own. */
+static int read_algorithm(struct recipe *recipe, const struct algorithm *algorithm, const cJSON *value,
+			  struct error *err)
 {
 	struct json_reader reader;
-	long iterations = recipe->sart.iterations;
 	const cJSON *stop;
+	char pointer[64], stop_pointer[80];
+	long iterations;
 	int code;
 
-	json_begin(&reader, value, "/sart", err);
+	snprintf(pointer, sizeof(pointer), "/%s", algorithm->name);
+	if (recipe->algorithm != NULL)
+		return error_set_at(err, ERR_IMPOSSIBLE, pointer, "\"%s\" beside \"%s\": a job has one algorithm",
+				    algorithm->name, recipe->algorithm->name);
+	recipe_set_algorithm(recipe, algorithm);
+	iterations = recipe->iterate.iterations;
+	snprintf(stop_pointer, sizeof(stop_pointer), "/%s/stop", algorithm->name);
+	json_begin(&reader, value, pointer, err);
 	json_integer(&reader, "iterations", false, 1, ITERATIONS_MAX, &iterations);
-	json_number(&reader, "relaxation", false, 1e-6, 2, &recipe->sart.relaxation);
-	read_subsets(&reader, &recipe->sart.subsets);
-	json_bool(&reader, "nonnegative", false, &recipe->sart.nonnegative);
+	recipe->iterate.iterations = (int)iterations;
+	if (algorithm->subsets) {
+		json_number(&reader, "relaxation", false, 1e-6, 2, &recipe->sart.relaxation);
+		read_subsets(&reader, &recipe->sart.subsets);
+		json_bool(&reader, "nonnegative", false, &recipe->sart.nonnegative);
+	}
 	stop = json_member(&reader, "stop", false);
-	recipe->sart.iterations = (int)iterations;
-	recipe->sart.on = true;
 	code = json_end(&reader);
-	if (code == 0 && stop != NULL)
-		code = read_stop(recipe, stop, err);
-	return code;
+	return code == 0 && stop != NULL ? read_stop(recipe, stop, stop_pointer, err) : code;
 }
 
 /* What numbers without a method have always meant: explicit steps. */
@@ -228,12 +237,12 @@ static void read_emit(struct json_reader *reader, struct recipe *recipe)
 	recipe->emits = count;
 }
 
-enum { STAGES = 5 };
+enum { STAGES = 4 };
 
 static int read_stages(struct recipe *recipe, const cJSON *const stages[STAGES], struct error *err)
 {
-	static int (*const readers[STAGES])(struct recipe *, const cJSON *,
-					    struct error *) = {read_grid, read_fdk, read_sart, read_tv, read_metal};
+	static int (*const readers[STAGES])(struct recipe *, const cJSON *, struct error *) = {read_grid, read_fdk,
+											       read_tv, read_metal};
 	int code = 0;
 
 	for (int i = 0; i < STAGES && code == 0; i++) {
@@ -249,10 +258,13 @@ static int read_stages(struct recipe *recipe, const cJSON *const stages[STAGES],
  */
 static bool names_no_stage(const cJSON *value)
 {
-	static const char *const names[] = {"fdk", "sart", "tv"};
+	static const char *const names[] = {"fdk", "tv"};
 
 	for (size_t i = 0; i < sizeof(names) / sizeof(names[0]); i++)
 		if (cJSON_GetObjectItemCaseSensitive(value, names[i]) != NULL)
+			return false;
+	for (int i = 0; i < ALGORITHM_COUNT; i++)
+		if (cJSON_GetObjectItemCaseSensitive(value, algorithms[i]->name) != NULL)
 			return false;
 	return true;
 }
@@ -261,17 +273,18 @@ int job_request_read(const cJSON *value, struct job_request *ret_request, struct
 {
 	struct job_request request = {0};
 	struct json_reader reader;
-	const cJSON *stages[STAGES], *patient, *labels;
-	int priority = PRIORITY_ROUTINE, precision = 0, projector = PROJECTOR_INTERPOLATING, code;
+	const cJSON *stages[STAGES], *iterative[ALGORITHM_COUNT], *patient, *labels;
+	int priority = PRIORITY_ROUTINE, precision = 0, projector = -1, code;
 
 	recipe_defaults(&request.recipe);
 	json_begin(&reader, value, "", err);
 	json_string(&reader, "scan", true, request.scan, sizeof(request.scan));
 	stages[0] = json_member(&reader, "grid", false);
 	stages[1] = json_member(&reader, "fdk", false);
-	stages[2] = json_member(&reader, "sart", false);
-	stages[3] = json_member(&reader, "tv", false);
-	stages[4] = json_member(&reader, "metal", false);
+	stages[2] = json_member(&reader, "tv", false);
+	stages[3] = json_member(&reader, "metal", false);
+	for (int i = 0; i < ALGORITHM_COUNT; i++)
+		iterative[i] = json_member(&reader, algorithms[i]->name, false);
 	patient = json_member(&reader, "patient", false);
 	labels = json_member(&reader, "labels", false);
 	json_choice(&reader, "projector", false, projector_names, PROJECTOR_COUNT, &projector);
@@ -281,7 +294,6 @@ int job_request_read(const cJSON *value, struct job_request *ret_request, struct
 	read_emit(&reader, &request.recipe);
 	request.priority = (enum priority)priority;
 	request.recipe.reference_precision = precision != 0;
-	request.recipe.projector = (enum projector)projector;
 	code = json_end(&reader);
 	if (code == 0)
 		code = patient_read(patient, "/patient", &request.patient, err);
@@ -289,8 +301,15 @@ int job_request_read(const cJSON *value, struct job_request *ret_request, struct
 		code = labels_read(labels, "/labels", request.labels, err);
 	if (code == 0)
 		code = read_stages(&request.recipe, stages, err);
-	if (code == 0 && names_no_stage(value))
-		request.recipe.fdk.on = request.recipe.sart.on = request.recipe.tv.on = true;
+	for (int i = 0; i < ALGORITHM_COUNT && code == 0; i++)
+		if (iterative[i] != NULL)
+			code = read_algorithm(&request.recipe, algorithms[i], iterative[i], err);
+	if (code == 0 && names_no_stage(value)) {
+		request.recipe.fdk.on = request.recipe.tv.on = true;
+		recipe_set_algorithm(&request.recipe, &algorithm_sart);
+	}
+	if (projector >= 0)
+		request.recipe.projector = (enum projector)projector;
 	if (code != 0) {
 		recipe_clear(&request.recipe);
 		return code;
@@ -367,20 +386,28 @@ static void add_grid(cJSON *document, const struct recipe *recipe)
 		add_numbers(grid, "origin_mm", recipe->grid.origin);
 }
 
-static void add_sart(cJSON *document, const struct recipe *recipe)
+/* The algorithm that runs; null for the others. */
+static void add_algorithm(cJSON *document, const struct algorithm *algorithm, const struct recipe *recipe)
 {
-	cJSON *sart = cJSON_AddObjectToObject(document, "sart"), *stop;
+	cJSON *object, *stop;
 
-	cJSON_AddNumberToObject(sart, "iterations", recipe->sart.iterations);
-	cJSON_AddNumberToObject(sart, "relaxation", recipe->sart.relaxation);
-	if (recipe->sart.subsets == SUBSETS_VIEWS)
-		cJSON_AddStringToObject(sart, "subsets", "views");
-	else if (recipe->sart.subsets != SUBSETS_DEFAULT)
-		cJSON_AddNumberToObject(sart, "subsets", recipe->sart.subsets);
-	cJSON_AddBoolToObject(sart, "nonnegative", recipe->sart.nonnegative);
-	stop = cJSON_AddObjectToObject(sart, "stop");
-	cJSON_AddNumberToObject(stop, "residual", recipe->sart.stop_residual);
-	cJSON_AddNumberToObject(stop, "change", recipe->sart.stop_change);
+	if (recipe->algorithm != algorithm) {
+		cJSON_AddNullToObject(document, algorithm->name);
+		return;
+	}
+	object = cJSON_AddObjectToObject(document, algorithm->name);
+	cJSON_AddNumberToObject(object, "iterations", recipe->iterate.iterations);
+	if (algorithm->subsets) {
+		cJSON_AddNumberToObject(object, "relaxation", recipe->sart.relaxation);
+		if (recipe->sart.subsets == SUBSETS_VIEWS)
+			cJSON_AddStringToObject(object, "subsets", "views");
+		else if (recipe->sart.subsets != SUBSETS_DEFAULT)
+			cJSON_AddNumberToObject(object, "subsets", recipe->sart.subsets);
+		cJSON_AddBoolToObject(object, "nonnegative", recipe->sart.nonnegative);
+	}
+	stop = cJSON_AddObjectToObject(object, "stop");
+	cJSON_AddNumberToObject(stop, "residual", recipe->iterate.stop_residual);
+	cJSON_AddNumberToObject(stop, "change", recipe->iterate.stop_change);
 }
 
 static void add_tv(cJSON *document, const struct recipe *recipe)
@@ -437,10 +464,8 @@ cJSON *recipe_json(const struct recipe *recipe)
 	} else {
 		cJSON_AddNullToObject(document, "fdk");
 	}
-	if (recipe->sart.on)
-		add_sart(document, recipe);
-	else
-		cJSON_AddNullToObject(document, "sart");
+	for (int i = 0; i < ALGORITHM_COUNT; i++)
+		add_algorithm(document, algorithms[i], recipe);
 	if (recipe->tv.on)
 		add_tv(document, recipe);
 	else
@@ -477,13 +502,16 @@ static bool same_grid(const struct recipe *a, const struct recipe *b)
 		 (!a->has_origin || memcmp(a->grid.origin, b->grid.origin, sizeof(a->grid.origin)) == 0)));
 }
 
-static bool same_sart(const struct recipe *a, const struct recipe *b)
+static bool same_algorithm(const struct recipe *a, const struct recipe *b)
 {
-	return a->sart.on == b->sart.on &&
-	       (!a->sart.on ||
-		(a->sart.iterations == b->sart.iterations && a->sart.relaxation == b->sart.relaxation &&
-		 a->sart.subsets == b->sart.subsets && a->sart.nonnegative == b->sart.nonnegative &&
-		 a->sart.stop_residual == b->sart.stop_residual && a->sart.stop_change == b->sart.stop_change));
+	if (a->algorithm != b->algorithm || a->algorithm == NULL)
+		return a->algorithm == b->algorithm;
+	return a->projector == b->projector && a->iterate.iterations == b->iterate.iterations &&
+	       a->iterate.stop_residual == b->iterate.stop_residual &&
+	       a->iterate.stop_change == b->iterate.stop_change &&
+	       (!a->algorithm->subsets ||
+		(a->sart.relaxation == b->sart.relaxation && a->sart.subsets == b->sart.subsets &&
+		 a->sart.nonnegative == b->sart.nonnegative));
 }
 
 static bool same_tv(const struct recipe *a, const struct recipe *b)
@@ -505,9 +533,8 @@ bool job_request_same(const struct job_request *a, const struct job_request *b)
 	       strcmp(a->labels, b->labels) == 0 && same_grid(x, y) && x->fdk.on == y->fdk.on &&
 	       (!x->fdk.on ||
 		(x->fdk.window == y->fdk.window && x->fdk.cutoff == y->fdk.cutoff && x->fdk.extend == y->fdk.extend)) &&
-	       same_sart(x, y) && same_tv(x, y) && x->metal.on == y->metal.on &&
-	       (!x->metal.on || x->metal.threshold_hu == y->metal.threshold_hu) &&
-	       (!x->sart.on || x->projector == y->projector) && x->mu_water == y->mu_water &&
+	       same_algorithm(x, y) && same_tv(x, y) && x->metal.on == y->metal.on &&
+	       (!x->metal.on || x->metal.threshold_hu == y->metal.threshold_hu) && x->mu_water == y->mu_water &&
 	       x->reference_precision == y->reference_precision && x->emits == y->emits &&
 	       (x->emits == 0 || memcmp(x->emit, y->emit, (size_t)x->emits * sizeof(*x->emit)) == 0);
 }

@@ -7,6 +7,7 @@
 
 enum priority { PRIORITY_ROUTINE, PRIORITY_URGENT, PRIORITY_STAT, PRIORITY_COUNT };
 extern const char *const priority_names[PRIORITY_COUNT];
+extern const char *const truncation_names[2]; /* "off", "auto" */
 
 /* The document of POST /v1/jobs. */
 struct job_request {

@@ -14,6 +14,7 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
+#include "core/algorithm.h"
 #include "core/stuck.h"
 #include "proto/durable.h"
 #include "proto/format.h"
@@ -136,10 +137,11 @@ static bool ends_with_volume(const struct recipe *recipe, enum stage stage, int 
 	bool tv = recipe->tv.on && recipe->tv.after_fdk;
 
 	if (stage == STAGE_FDK)
-		return recipe->fdk.on && (emits(recipe, EMIT_FDK) || (!recipe->sart.on && !tv));
+		return recipe->fdk.on && (emits(recipe, EMIT_FDK) || (recipe->algorithm == NULL && !tv));
 	if (stage == STAGE_TV && iteration == 0)
-		return emits(recipe, EMIT_FDK_TV) || !recipe->sart.on;
-	return stage == STAGE_SART && (iteration == recipe->sart.iterations || emits(recipe, iteration));
+		return emits(recipe, EMIT_FDK_TV) || recipe->algorithm == NULL;
+	return recipe->algorithm != NULL && stage == recipe->algorithm->stage &&
+	       (iteration == recipe->iterate.iterations || emits(recipe, iteration));
 }
 
 static int open_saver(struct run *run, struct error *err)
@@ -289,15 +291,20 @@ static int run_keep(void *context, struct recon *recon, const struct kept_volume
 
 /* ---- checkpoints ---- */
 
-/* Behind the line lies the iterate, behind that the list of the metal that was taken out. No noise is written as 0. */
+/*
+ * Behind the line lies the iterate, behind that what the algorithm holds, and then the list of the metal that was taken
+ * out. No noise is written as 0.
+ */
 static void checkpoint_line(char ret_line[CHECKPOINT_FILE_OFFSET], int iteration, const struct grid *grid,
-			    size_t metal_bytes, const struct volume_noise *noise)
+			    size_t state_bytes, size_t metal_bytes, const struct volume_noise *noise)
 {
-	char text[CHECKPOINT_FILE_OFFSET];
+	char text[CHECKPOINT_FILE_OFFSET], state[32] = "";
 
 	memset(ret_line, ' ', CHECKPOINT_FILE_OFFSET);
-	snprintf(text, sizeof(text), "cbctd checkpoint %d of %d %d %d, metal %zu, noise %a %a", iteration,
-		 grid->size[0], grid->size[1], grid->size[2], metal_bytes, noise->sigma, noise->contrast);
+	if (state_bytes > 0)
+		snprintf(state, sizeof(state), ", state %zu", state_bytes);
+	snprintf(text, sizeof(text), "cbctd checkpoint %d of %d %d %d, metal %zu, noise %a %a%s", iteration,
+		 grid->size[0], grid->size[1], grid->size[2], metal_bytes, noise->sigma, noise->contrast, state);
 	memcpy(ret_line, text, strlen(text));
 	ret_line[CHECKPOINT_FILE_OFFSET - 1] = '\n';
 }
@@ -349,18 +356,27 @@ static int write_iterate(struct recon *recon, struct sealed_file *sealed, struct
 	return code;
 }
 
+static int write_state(void *context, const void *bytes, size_t size, struct error *err)
+{
+	return write_sealed(context, bytes, size, err);
+}
+
 static int write_checkpoint(struct recon *recon, struct sealed_file *sealed, struct error *err)
 {
 	char header[CHECKPOINT_FILE_OFFSET];
 	size_t metal_bytes;
 	const void *metal = recon_metal(recon, &metal_bytes);
 	const struct volume_noise *noise = recon_noise(recon), none = {0};
+	const struct checkpoint_sink sink = {.context = sealed, .write = write_state};
 	int code;
 
-	checkpoint_line(header, recon_iteration(recon), recon_grid(recon), metal_bytes, noise != NULL ? noise : &none);
+	checkpoint_line(header, recon_iteration(recon), recon_grid(recon), recon_state_bytes(recon), metal_bytes,
+			noise != NULL ? noise : &none);
 	code = write_sealed(sealed, header, sizeof(header), err);
 	if (code == 0)
 		code = write_iterate(recon, sealed, err);
+	if (code == 0)
+		code = recon_save_state(recon, &sink, err);
 	if (code == 0 && metal_bytes > 0)
 		code = write_sealed(sealed, metal, metal_bytes, err);
 	return code != 0 ? code : write_end(sealed, err);
@@ -374,7 +390,7 @@ static int save_checkpoint(struct recon *recon, const char *directory, struct er
 	int code = path_join(path, sizeof(path), directory, CHECKPOINT_FILE, "", err);
 
 	recon_metal(recon, &metal_bytes);
-	content += metal_bytes;
+	content += recon_state_bytes(recon) + metal_bytes;
 	if (code == 0)
 		code = seal_maker_new(content, &sealed.seal, err);
 	if (code == 0)
@@ -390,10 +406,12 @@ static int save_checkpoint(struct recon *recon, const char *directory, struct er
 	return code;
 }
 
-static int check_checkpoint(const char *path, const char *bytes, const struct seal *seal, const struct grid *grid,
+static int check_checkpoint(const char *path, const char *bytes, const struct seal *seal, const struct recon *recon,
 			    int *ret_iteration, struct volume_noise *ret_noise, struct error *err)
 {
-	size_t expected = CHECKPOINT_FILE_OFFSET + grid_voxels(grid) * sizeof(float);
+	const struct grid *grid = recon_grid(recon);
+	const size_t state = recon_state_bytes(recon);
+	const size_t expected = CHECKPOINT_FILE_OFFSET + grid_voxels(grid) * sizeof(float) + state;
 	char text[CHECKPOINT_FILE_OFFSET + 1] = "", line[CHECKPOINT_FILE_OFFSET];
 	struct volume_noise noise;
 	int iteration, damaged = seal_first_damaged(seal, bytes);
@@ -407,9 +425,9 @@ static int check_checkpoint(const char *path, const char *bytes, const struct se
 	if (sscanf(text, "cbctd checkpoint %d of %*d %*d %*d, metal %*u, noise %la %la", &iteration, &noise.sigma,
 		   &noise.contrast) != 3)
 		return error_set(err, ERR_INVALID, "%.200s is no checkpoint", path);
-	checkpoint_line(line, iteration, grid, seal->content - expected, &noise);
+	checkpoint_line(line, iteration, grid, state, seal->content - expected, &noise);
 	if (memcmp(line, bytes, sizeof(line)) != 0)
-		return error_set(err, ERR_INVALID, "%.200s is of another grid", path);
+		return error_set(err, ERR_INVALID, "%.200s is of another grid or algorithm", path);
 	*ret_iteration = iteration;
 	*ret_noise = noise;
 	return 0;
@@ -438,13 +456,16 @@ static int resume(struct run *run, struct recon *recon, const char *path, int ex
 		code = error_set(err, ERR_IO, "%.200s cannot be mapped", path);
 		goto out;
 	}
-	code = check_checkpoint(path, bytes, &seal, recon_grid(recon), &iteration, &noise, err);
+	code = check_checkpoint(path, bytes, &seal, recon, &iteration, &noise, err);
 	if (code == 0)
 		code =
 		    recon_resume(recon, (const float *)(const void *)(bytes + CHECKPOINT_FILE_OFFSET), iteration, err);
 	if (code == 0 && run->recipe->tv.on)
 		code = recon_resume_noise(recon, &noise, err);
 	metal = CHECKPOINT_FILE_OFFSET + grid_voxels(recon_grid(recon)) * sizeof(float);
+	if (code == 0)
+		code = recon_resume_state(recon, bytes + metal, recon_state_bytes(recon), err);
+	metal += recon_state_bytes(recon);
 	if (code == 0 && seal.content > metal)
 		code = recon_resume_metal(recon, bytes + metal, seal.content - metal, err);
 	if (code == 0 && iteration != expected) {

@@ -19,8 +19,11 @@ const struct option recipe_option_rows[] = {
     ROW("origin", OPTION_NUMBERS, origin, "X,Y,Z", "centre of the first voxel (default: centred)", -1e7, 1e7, 3, NULL),
     ROW("fdk", OPTION_CHOICE, window, "WINDOW", "of the ramp filter", 0, 0, WINDOW_COUNT, window_names),
     ROW("cutoff", OPTION_NUMBER, cutoff, "SHARE", "of the highest frequency", 0, 0, 0, NULL),
+    ROW("truncation", OPTION_CHOICE, truncation, "auto|off", "whether rows that the detector cuts off are extended", 0,
+	0, 2, truncation_names),
     ROW("no-fdk", OPTION_FLAG, no_fdk, NULL, "start from zero", 0, 0, 0, NULL),
     ROW("sart", OPTION_INTEGER, iterations, "N", "iterations", 0, 0, 0, NULL),
+    ROW("cgls", OPTION_INTEGER, cgls, "N", "iterations of conjugate gradients in place of SART", 0, 0, 0, NULL),
     ROW("subsets", OPTION_TEXT, subsets, "N|views", "ordered subsets of the views; 1 is the simultaneous form", 0, 0, 0,
 	NULL),
     ROW("relaxation", OPTION_NUMBER, relaxation, "R", "of each SART update", 0, 0, 0, NULL),
@@ -38,7 +41,7 @@ const struct option recipe_option_rows[] = {
     ROW("tv-iterations", OPTION_INTEGER, tv_iterations, "N", "steps", 0, 0, 0, NULL),
     ROW("tv-unit", OPTION_NUMBER, unit, "MU", "one gray level, 1/mm", 0, 0, 0, NULL),
     ROW("tv-after-sart", OPTION_FLAG, tv_after_sart, NULL, "leave the FDK volume alone", 0, 0, 0, NULL),
-    ROW("projector", OPTION_CHOICE, projector, "NAME", "how SART projects backwards", 0, 0, PROJECTOR_COUNT,
+    ROW("projector", OPTION_CHOICE, projector, "NAME", "how iterations project backwards", 0, 0, PROJECTOR_COUNT,
 	projector_names),
     ROW("metal", OPTION_NUMBER, metal, "HU",
 	"take what is at least HU for metal, and its shadows out of the projections", METAL_HU_LEAST, METAL_HU_MOST, 0,
@@ -128,15 +131,34 @@ static void put_fdk(cJSON *document, const struct recipe_options *options)
 		put(stage(document, "fdk"), "window", cJSON_CreateString(window_names[options->window]));
 	if (!isnan(options->cutoff))
 		put_number(stage(document, "fdk"), "cutoff", options->cutoff);
+	if (options->truncation != OPTION_UNSET_CHOICE)
+		put(stage(document, "fdk"), "truncation", cJSON_CreateString(truncation_names[options->truncation]));
+}
+
+/* The same for every algorithm. */
+static void put_stop(cJSON *algorithm, const struct recipe_options *options)
+{
+	if (isnan(options->stop_residual) && isnan(options->stop_change))
+		return;
+	put_number(stage(algorithm, "stop"), "residual", options->stop_residual);
+	put_number(stage(algorithm, "stop"), "change", options->stop_change);
+}
+
+static void put_cgls(cJSON *document, const struct recipe_options *options)
+{
+	cJSON *cgls = stage(document, "cgls");
+
+	cJSON_DeleteItemFromObjectCaseSensitive(document, "sart");
+	put_integer(cgls, "iterations", options->cgls);
+	put_stop(cgls, options);
 }
 
 static void put_sart(cJSON *document, const struct recipe_options *options)
 {
-	bool stops = !isnan(options->stop_residual) || !isnan(options->stop_change);
 	cJSON *sart;
 
 	if (options->iterations == OPTION_UNSET_INTEGER && options->subsets == NULL && isnan(options->relaxation) &&
-	    !options->negative && !stops)
+	    !options->negative && isnan(options->stop_residual) && isnan(options->stop_change))
 		return;
 	sart = stage(document, "sart");
 	put_integer(sart, "iterations", options->iterations);
@@ -145,10 +167,7 @@ static void put_sart(cJSON *document, const struct recipe_options *options)
 		put(sart, "subsets", word_json(options->subsets, strlen(options->subsets)));
 	if (options->negative)
 		put(sart, "nonnegative", cJSON_CreateFalse());
-	if (stops) {
-		put_number(stage(sart, "stop"), "residual", options->stop_residual);
-		put_number(stage(sart, "stop"), "change", options->stop_change);
-	}
+	put_stop(sart, options);
 }
 
 static void put_tv(cJSON *document, const struct recipe_options *options)
@@ -197,8 +216,13 @@ int recipe_document(const struct recipe_options *options, const char *path, cons
 {
 	cJSON *document = NULL;
 
-	if (options->no_fdk && (options->window != OPTION_UNSET_CHOICE || !isnan(options->cutoff)))
+	if (options->no_fdk && (options->window != OPTION_UNSET_CHOICE || options->truncation != OPTION_UNSET_CHOICE ||
+				!isnan(options->cutoff)))
 		return error_set(err, ERR_USAGE, "--no-fdk together with options of the FDK");
+	if (options->cgls != OPTION_UNSET_INTEGER &&
+	    (options->iterations != OPTION_UNSET_INTEGER || options->subsets != NULL || !isnan(options->relaxation) ||
+	     options->negative))
+		return error_set(err, ERR_USAGE, "--cgls together with options of SART");
 	if (path != NULL) {
 		int code = recipe_read(path, &document, err);
 
@@ -211,7 +235,10 @@ int recipe_document(const struct recipe_options *options, const char *path, cons
 	put(document, "scan", cJSON_CreateString(scan));
 	put_grid(document, options);
 	put_fdk(document, options);
-	put_sart(document, options);
+	if (options->cgls != OPTION_UNSET_INTEGER)
+		put_cgls(document, options);
+	else
+		put_sart(document, options);
 	put_tv(document, options);
 	if (options->projector != OPTION_UNSET_CHOICE)
 		put(document, "projector", cJSON_CreateString(projector_names[options->projector]));

@@ -10,8 +10,9 @@ struct recipe_options {
 	double size[3], spacing[3], origin[3];
 	int window;
 	double cutoff;
+	int truncation;
 	bool no_fdk;
-	long iterations;
+	long iterations, cgls;
 	double relaxation;
 	const char *subsets;
 	bool negative;
@@ -35,11 +36,11 @@ extern const struct option recipe_option_rows[];
 	{                                                                                                              \
 		.size = OPTION_UNSET_3, .spacing = OPTION_UNSET_3, .origin = OPTION_UNSET_3,                           \
 		.window = OPTION_UNSET_CHOICE, .cutoff = OPTION_UNSET_NUMBER, .iterations = OPTION_UNSET_INTEGER,      \
-		.relaxation = OPTION_UNSET_NUMBER, .stop_residual = OPTION_UNSET_NUMBER,                               \
-		.stop_change = OPTION_UNSET_NUMBER, .method = OPTION_UNSET_CHOICE, .strength = OPTION_UNSET_CHOICE,    \
-		.step = OPTION_UNSET_NUMBER, .tv_iterations = OPTION_UNSET_INTEGER, .unit = OPTION_UNSET_NUMBER,       \
-		.projector = OPTION_UNSET_CHOICE, .metal = OPTION_UNSET_NUMBER, .priority = OPTION_UNSET_CHOICE,       \
-		.mu_water = OPTION_UNSET_NUMBER                                                                        \
+		.truncation = OPTION_UNSET_CHOICE, .cgls = OPTION_UNSET_INTEGER, .relaxation = OPTION_UNSET_NUMBER,    \
+		.stop_residual = OPTION_UNSET_NUMBER, .stop_change = OPTION_UNSET_NUMBER,                              \
+		.method = OPTION_UNSET_CHOICE, .strength = OPTION_UNSET_CHOICE, .step = OPTION_UNSET_NUMBER,           \
+		.tv_iterations = OPTION_UNSET_INTEGER, .unit = OPTION_UNSET_NUMBER, .projector = OPTION_UNSET_CHOICE,  \
+		.metal = OPTION_UNSET_NUMBER, .priority = OPTION_UNSET_CHOICE, .mu_water = OPTION_UNSET_NUMBER         \
 	}
 
 /* path may be NULL: it starts from an FDK with its defaults. Delete *ret_document. */

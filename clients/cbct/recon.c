@@ -165,7 +165,8 @@ static int pipeline_run(const struct recon_options *options, const struct job_re
 	const struct backend *backend = backend_find(options->backend);
 	const char *output = options->output != NULL ? options->output : options->directory;
 	const struct device_options device_options = {.threads = (int)options->threads};
-	struct display display = {.iterations = recipe->sart.on ? recipe->sart.iterations : 0, .residual = -1};
+	struct display display = {.iterations = recipe->algorithm != NULL ? recipe->iterate.iterations : 0,
+				  .residual = -1};
 	const struct reconstruction_hooks hooks = {
 	    .recon = {.context = &display, .progress = on_progress, .row = on_row, .warning = on_warning},
 	    .on_volume = on_volume,

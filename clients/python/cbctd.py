@@ -134,8 +134,8 @@ class Volume:
         voxels: ``[z][y][x]``, float32 in 1/mm or int16 in Hounsfield units.
         spacing_mm: of voxels along the world's x, y and z.
         origin_mm: centre of voxel 0,0,0 in the world: x, y, z.
-        stage: ``fdk``, ``tv`` or ``sart``.
-        iteration: of SART, 0 before it.
+        stage: ``fdk``, ``tv``, or the algorithm of the iterations, ``sart`` or ``cgls``.
+        iteration: 0 before the first.
         world_to_patient: 4 x 4, from (x, y, z, 1) of the world in mm to the patient's left, posterior and superior
             (DICOM's LPS); None: nobody has said how the patient lies, and left and right are not known.
     """
@@ -582,7 +582,7 @@ class Client:
             patient: how the patient lies, as `Client.create_scan` has it.
             progress: bars of tqdm, where it is installed.
             keep: leaves scan and job with the daemon; otherwise they are removed, also when this is interrupted.
-            recipe: more members of the job's request, e.g. ``priority="urgent"``.
+            recipe: more members of the job's request, e.g. ``priority="urgent"``, ``cgls={}``.
         """
         stack = np.asanyarray(projections)
         if stack.ndim != 3:
@@ -614,7 +614,7 @@ class Client:
         self, document: Document, bar: _Bar, on_volume: Optional[Callable[[Volume], None]], dtype: npt.DTypeLike
     ) -> Volume:
         job = str(document["id"])
-        total = int((document.get("sart") or {}).get("iterations") or 1)
+        total = int(document.get("iterations") or 1)
         bar.to(0, total)
         for event in self.events(job):
             if event.kind == "progress":

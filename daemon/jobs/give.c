@@ -30,7 +30,7 @@ static int add_present(struct message *message, struct stored_scan *scan, const 
 		message->present[i / 8] |= (uint8_t)((flags[i] | lost[i]) << i % 8);
 	free(flags);
 	/* Asked for with all projections in mind. */
-	if (recipe->sart.on && recipe->sart.subsets > count)
+	if (recipe->algorithm != NULL && recipe->sart.subsets > count)
 		recipe->sart.subsets = count;
 	return 0;
 }

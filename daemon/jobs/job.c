@@ -345,7 +345,7 @@ static int fill_record(struct job_record *record, const struct job_request *requ
 	memcpy(record->scan, scan, sizeof(record->scan));
 	record->priority = request->priority;
 	record->mu_water = request->recipe.mu_water;
-	record->iterations = request->recipe.sart.on ? request->recipe.sart.iterations : 0;
+	record->iterations = request->recipe.algorithm != NULL ? request->recipe.iterate.iterations : 0;
 	record->noise_hu = record->tv_alpha = NAN;
 	if (memory != NULL)
 		record->memory = *memory;

@@ -180,7 +180,7 @@ static void run_once(struct bench *bench, const struct plan_options *options, st
 {
 	const bool first = options->tv->method == TV_GRADIENT;
 	struct volume_norms norms;
-	struct sart_sums sums;
+	struct iteration_sums sums;
 	struct moment begin;
 
 	memset(ret, 0, TIMED * sizeof(*ret));
@@ -304,8 +304,9 @@ static void reconstruct(enum tv_method method)
 	recipe_defaults(&recipe);
 	recipe.has_grid = recipe.has_origin = true;
 	recipe.grid = make_grid();
-	recipe.fdk.on = recipe.sart.on = recipe.tv.on = recipe.tv.after_fdk = true;
-	recipe.sart.iterations = 1;
+	recipe.fdk.on = recipe.tv.on = recipe.tv.after_fdk = true;
+	recipe.algorithm = &algorithm_sart;
+	recipe.iterate.iterations = 1;
 	recipe.sart.subsets = 1;
 	recipe_explicit_tv(&recipe, method);
 	recipe.tv.options.iterations = 10;

@@ -86,7 +86,8 @@ static struct outcome reconstruct(const struct anatomy_scan *scan, const struct 
 	recipe_defaults(&recipe);
 	recipe.has_grid = recipe.has_origin = true;
 	recipe.grid = scan->grid;
-	recipe.fdk.on = recipe.sart.on = true;
+	recipe.fdk.on = true;
+	recipe.algorithm = &algorithm_sart;
 	recipe.tv.on = reach != 0;
 	recipe.emit = emit;
 	recipe.emits = KEPT;

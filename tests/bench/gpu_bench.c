@@ -268,7 +268,7 @@ static void run_fdk(struct bench *bench, struct error *err)
 
 static void run_sart(struct bench *bench, struct error *err)
 {
-	struct sart_sums sums;
+	struct iteration_sums sums;
 
 	must(backend_cuda.sart_iterate(bench->plan, bench->projections, bench->volume, NULL, &sums, err), err, "sart");
 }

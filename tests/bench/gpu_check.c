@@ -244,7 +244,7 @@ static void check_scene(const struct scene *scene, struct device *devices[2], in
 	 * left out, among them all of a view.
 	 */
 	for (int s = 0; s < 2; s++) {
-		struct sart_sums sums = {0};
+		struct iteration_sums sums = {0};
 
 		must(sides[s].backend->volume_upload(sides[s].volume, volume, &err), &err, "upload");
 		must(sides[s].backend->project(sides[s].plan, sides[s].volume, slots, geometry->count, sides[s].stack,
@@ -273,7 +273,7 @@ static void check_scene(const struct scene *scene, struct device *devices[2], in
 	must(backend_cuda.tv(sides[1].plan, sides[1].other, &tv, NULL, &err), &err, "tv");
 	must(backend_cuda.volume_fill(sides[1].volume, 0, &err), &err, "fill");
 	for (int i = 0; i < 2; i++) {
-		struct sart_sums sums = {0};
+		struct iteration_sums sums = {0};
 
 		must(backend_cuda.sart_iterate(sides[1].plan, sides[1].stack, sides[1].volume, NULL, &sums, &err), &err,
 		     "sart");
@@ -357,7 +357,7 @@ static void project_values(struct side *side, const struct scene *scene, const f
 
 static void iterate_from_zero(struct side *side, const struct scene *scene, float *ret)
 {
-	struct sart_sums sums;
+	struct iteration_sums sums;
 	struct error err = {0};
 
 	must(side->backend->volume_fill(side->volume, 0, &err), &err, "fill");
@@ -947,8 +947,9 @@ static void head_recipe(struct recipe *ret, const struct scene *scene, bool refe
 	recipe_defaults(ret);
 	ret->has_grid = true;
 	ret->grid = scene->grid;
-	ret->fdk.on = ret->sart.on = true;
-	ret->sart.iterations = 10;
+	ret->fdk.on = true;
+	ret->algorithm = &algorithm_sart;
+	ret->iterate.iterations = 10;
 	ret->reference_precision = reference;
 }
 
@@ -1160,9 +1161,9 @@ static void check_parts(bool tv, bool untilted, bool matched)
 	recipe.has_grid = recipe.has_origin = true;
 	recipe.grid = scene.grid;
 	recipe.fdk.on = true;
-	recipe.sart.on = tv || matched;
+	recipe.algorithm = tv || matched ? &algorithm_sart : NULL;
 	recipe.projector = matched ? PROJECTOR_MATCHED : PROJECTOR_INTERPOLATING;
-	recipe.sart.iterations = 2;
+	recipe.iterate.iterations = 2;
 	recipe.sart.subsets = 4;
 	recipe.tv.on = tv;
 	recipe_explicit_tv(&recipe, TV_GRADIENT);
@@ -1296,7 +1297,7 @@ static float *sart_within(size_t limit, const struct scene *scene, int subsets, 
 	struct sart_options sart = {.relaxation = 1};
 	struct plan_options options = scene_plan(scene, &sart, subsets, NULL, reference);
 	struct side side = {.backend = &backend_cuda};
-	struct sart_sums sums = {0};
+	struct iteration_sums sums = {0};
 	struct defect_counts defects = {0};
 	struct device *device;
 	struct plan_bytes bytes;
@@ -1406,8 +1407,8 @@ static void bound_recipe_make(struct recipe *ret, const struct bound_recipe *fro
 	ret->has_grid = ret->has_origin = true;
 	ret->grid = *grid;
 	ret->fdk.on = from->fdk;
-	ret->sart.on = from->subsets != 0;
-	ret->sart.iterations = 3;
+	ret->algorithm = from->subsets != 0 ? &algorithm_sart : NULL;
+	ret->iterate.iterations = 3;
 	ret->sart.subsets = from->subsets;
 	ret->tv.on = from->tv;
 	recipe_explicit_tv(ret, from->method);

@@ -213,7 +213,7 @@ def settled(value):
 
 def look(daemon, scans, jobs):
     """All replies by their paths: (status, bytes or document). Also makes a job of each scan that can have one."""
-    seen = {}
+    seen, stays = {}, set()
     wait_for(daemon, jobs["stopped"])
     for scan in ("images", "closed"):
         status, body = daemon.post("/v1/jobs", {"scan": scans[scan], "grid": GRID, "fdk": {}, "sart": None, "tv": None})
@@ -231,6 +231,8 @@ def look(daemon, scans, jobs):
                 if daemon.request("DELETE", f"/v1/jobs/{job}?wait=5")[0] in (204, 404):
                     break
                 time.sleep(0.02)
+            else:
+                stays.add(job) # each refusal was told
     for scan in scans.values():
         path = f"/v1/scans/{scan}"
         seen[path] = document_of(daemon.get(path))
@@ -248,7 +250,8 @@ def look(daemon, scans, jobs):
             seen[path + "/events"] = daemon.get(path + "/events")
     for kind in ("scans", "jobs"):
         status, body = daemon.get(f"/v1/{kind}")
-        seen[f"/v1/{kind}"] = (status, [entry["id"] for entry in json.loads(body)[kind]] if status == 200 else None)
+        listed = [entry["id"] for entry in json.loads(body)[kind]] if status == 200 else None
+        seen[f"/v1/{kind}"] = (status, listed and [entry for entry in listed if entry not in stays])
     seen = {key: reply if reply[0] < 400 else (reply[0], None) for key, reply in seen.items()} # request ids
     seen["quarantine"] = daemon.document("/v1/quarantine")["entries"]
     return seen

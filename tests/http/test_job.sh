@@ -38,6 +38,40 @@ test_pipeline_keeps_the_volumes_asked_for() {
 	expect_json '[.volumes[].name] == ["iter-1", "fdk-tv", "fdk"] and .next == null'
 }
 
+# Another algorithm by its name, preempted on its way: its stage, its iterates, its history, and the bits of an undisturbed run.
+test_conjugate_gradients_in_place_of_sart() {
+	uploaded_scan
+	post_job "$small"'"fdk": {}, "cgls": {"iterations": 6}, "emit": ["fdk", 2]}'
+	wait_job succeeded
+	expect_json '.cgls.iterations == 6 and .sart == null and .projector == "matched" and .iterations == 6'
+	expect_json '[.history[].residual] | length == 6 and . == (sort | reverse)'
+	expect_json '.timings.cgls > 0'
+	req GET "/v1/jobs/$job/volumes"
+	expect_json '[.volumes[] | [.name, .stage, .iteration]] == [["final", "cgls", 6], ["iter-2", "cgls", 2], ["fdk", "fdk", 0]]'
+	post_job "$small"'"cgls": {}, "projector": "interpolating", "tv": {"after": "sart"}}'
+	wait_job succeeded
+	expect_json '.cgls.iterations == 20 and .projector == "interpolating"'
+	req POST /v1/jobs -H 'Content-Type: application/json' -d "{\"scan\": \"$scan\", \"sart\": {}, \"cgls\": {}}"
+	expect_problem 422 /cgls
+
+	local recipe="$small"'"cgls": {"iterations": 300}}' undisturbed preempted
+	post_job "$recipe"
+	wait_job succeeded
+	req GET "/v1/jobs/$job/volumes"
+	undisturbed=$(json '.volumes[0].digest')
+	post_job "$recipe"
+	preempted=$job
+	until req GET "/v1/jobs/$job" && jq -e '.iteration >= 3' "$body" >/dev/null; do sleep 0.02; done
+	post_job "$small"'"fdk": {}, "priority": "stat"}'
+	wait_job succeeded
+	job=$preempted
+	req GET "/v1/jobs/$job"
+	expect_json '.state | IN("queued", "running")' # there is one worker, and the other job has had it
+	wait_job succeeded
+	req GET "/v1/jobs/$job/volumes"
+	[ "$(json '.volumes[0].digest')" = "$undisturbed" ] || fail "the digest of the undisturbed run"
+}
+
 test_the_strength_of_tv_is_found_from_the_noise_and_told() {
 	local noisy=$work/noisy alpha medium recipe="$small"'"fdk": {}, "sart": {"iterations": 2, "subsets": 6}, "tv": '
 	cbct simulate --phantom ball --scale 30 --density 0.02 --shift 5,-8,6 --views 60 --columns 64 --rows 48 --pixel 4 \

@@ -469,7 +469,7 @@ void reference_filter(const struct plan_options *options, int view, const float 
 
 /* Corrections of one view; what they are made from is added to sums. */
 static void corrections(const struct geometry *geometry, const struct grid *grid, int view, const float *measured,
-			const float *volume, float *ret, struct sart_sums *sums)
+			const float *volume, float *ret, struct iteration_sums *sums)
 {
 	const double least = RAY_LENGTH_LEAST * fmin(fmin(grid->spacing[0], grid->spacing[1]), grid->spacing[2]);
 
@@ -490,13 +490,13 @@ static void corrections(const struct geometry *geometry, const struct grid *grid
 	}
 }
 
-struct sart_sums reference_sart(const struct geometry *geometry, const struct grid *grid,
-				const struct sart_options *options, const float *projections, float *volume)
+struct iteration_sums reference_sart(const struct geometry *geometry, const struct grid *grid,
+				     const struct sart_options *options, const float *projections, float *volume)
 {
 	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows, voxels = grid_voxels(grid);
 	float *correction = malloc(pixels * sizeof(float));
 	double *sums = malloc(voxels * sizeof(double)), *cover = malloc(voxels * sizeof(double));
-	struct sart_sums ret = {0};
+	struct iteration_sums ret = {0};
 
 	for (int s = 0; s < options->subsets.count; s++) {
 		memset(sums, 0, voxels * sizeof(double));

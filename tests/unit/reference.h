@@ -27,8 +27,8 @@ bool reference_is_cut(const float *row, int columns, bool behind, double not_air
 /* One view: [row][column] -> [row][pad + column + pad]. */
 void reference_filter(const struct plan_options *options, int view, const float *projection, float *ret);
 
-struct sart_sums reference_sart(const struct geometry *geometry, const struct grid *grid,
-				const struct sart_options *options, const float *projections, float *volume);
+struct iteration_sums reference_sart(const struct geometry *geometry, const struct grid *grid,
+				     const struct sart_options *options, const float *projections, float *volume);
 
 /* Explicit steps with |grad u| smoothed by epsilon (gray levels), in place. */
 void reference_tv_gradient(const struct grid *grid, const struct tv_options *options, double epsilon, float *volume);

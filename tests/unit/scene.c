@@ -101,6 +101,16 @@ static bool on_yield(void *context)
 	return outcome->yield_at > 0 && outcome->rows[outcome->row_count - 1].iteration == outcome->yield_at;
 }
 
+static int on_state(void *context, const void *bytes, size_t size, struct error *err)
+{
+	struct outcome *outcome = context;
+
+	(void)err;
+	memcpy(outcome->state + outcome->state_bytes, bytes, size);
+	outcome->state_bytes += size;
+	return 0;
+}
+
 static void on_progress(void *context, enum stage stage, int iteration, double fraction)
 {
 	struct outcome *outcome = context;
@@ -200,6 +210,7 @@ void scene_run(const struct scene *scene, const struct recipe *recipe, struct ou
 	};
 	struct device *device;
 	struct recon *recon = NULL;
+	struct error state_err;
 	const void *metal;
 
 	if (backend_cpu.open(0, &options, &device, &outcome->err) < 0)
@@ -211,6 +222,9 @@ void scene_run(const struct scene *scene, const struct recipe *recipe, struct ou
 	outcome->grid = *recon_grid(recon);
 	if (outcome->resume != NULL)
 		outcome->code = recon_resume(recon, outcome->resume, outcome->resume_iteration, &outcome->err);
+	if (outcome->code == 0 && outcome->resume_state_bytes > 0)
+		outcome->code =
+		    recon_resume_state(recon, outcome->resume_state, outcome->resume_state_bytes, &outcome->err);
 	if (outcome->code == 0 && outcome->resume_metal_bytes > 0)
 		outcome->code =
 		    recon_resume_metal(recon, outcome->resume_metal, outcome->resume_metal_bytes, &outcome->err);
@@ -221,6 +235,10 @@ void scene_run(const struct scene *scene, const struct recipe *recipe, struct ou
 	if (outcome->code == 0)
 		outcome->code = recon_run(recon, &outcome->err);
 	outcome->iteration = recon_iteration(recon);
+	outcome->state = malloc(recon_state_bytes(recon) + 1);
+	ck_assert_ptr_nonnull(outcome->state);
+	if (outcome->code == 0 || outcome->code == ERR_BUSY)
+		ck_assert_int_eq(recon_save_state(recon, &(struct checkpoint_sink){outcome, on_state}, &state_err), 0);
 	outcome->noise = recon_noise(recon) != NULL ? *recon_noise(recon) : (struct volume_noise){-1, -1};
 	metal = recon_metal(recon, &outcome->metal_bytes);
 	outcome->metal = malloc(outcome->metal_bytes + 1);
@@ -250,6 +268,7 @@ void outcome_clear(struct outcome *outcome)
 	for (int i = 0; i < outcome->kept_count; i++)
 		free(outcome->kept[i].voxels);
 	free(outcome->last);
+	free(outcome->state);
 	free(outcome->metal);
 	*outcome = (struct outcome){0};
 }

@@ -42,6 +42,8 @@ struct outcome {
 	size_t memory_limit;        /* of the device, bytes; 0: none */
 	const float *resume;        /* iterate, or NULL */
 	int resume_iteration;
+	const char *resume_state; /* of resume_state_bytes */
+	size_t resume_state_bytes;
 	const void *resume_metal; /* of resume_metal_bytes */
 	size_t resume_metal_bytes;
 	const struct volume_noise *resume_noise; /* or NULL */
@@ -65,6 +67,8 @@ struct outcome {
 	double fraction;          /* of the last progress; the test ends where it falls */
 	int asked;
 	float *last; /* the iterate as it was at the end, kept or not */
+	char *state; /* what recon_save_state gave then */
+	size_t state_bytes;
 	void *metal; /* what recon_metal gave then */
 	size_t metal_bytes;
 	struct volume_noise noise; /* what recon_noise gave then; -1 where that was nothing */

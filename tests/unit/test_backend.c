@@ -796,7 +796,7 @@ START_TEST(sart_is_the_contracts_update)
 	const struct setup *setup = &setups[_i / 2];
 	struct rig rig;
 	float *projections, *start, *want, *have;
-	struct sart_sums sums_want, sums;
+	struct iteration_sums sums_want, sums;
 
 	random_state = 5;
 	rig_make(setup, &rig);
@@ -1193,7 +1193,7 @@ START_TEST(matched_sart_hardly_moves_what_rounding_touches)
 	    "coarse", 33, 31, 16, {620, 1100, {5, 6}, {0, 0}, {0, 0}}, 0, 22.5, PLAIN, {{65, 66, 67}, {1, 1, 1}, {0}},
 	    true};
 	float *projections, *moved[2];
-	struct sart_sums sums;
+	struct iteration_sums sums;
 	struct rig rig;
 
 	random_state = 21;
@@ -1354,7 +1354,7 @@ static float *everything(struct rig *rig, const struct machine *machine, const f
 {
 	const size_t wide = rig->all_pixels, voxels = rig->voxels;
 	float *ret = floats(2 * wide + 3 * voxels), *to = ret;
-	struct sart_sums sums;
+	struct iteration_sums sums;
 
 	rig_open(rig, machine);
 	ok(rig->backend->volume_upload(rig->volume, volume, &err));
@@ -1772,7 +1772,7 @@ START_TEST(cancel_is_asked_between_steps)
 	projections = random_floats(rig.all_pixels, 0, 1);
 	FOR_EACH_MACHINE(&rig)
 	{
-		struct sart_sums sums;
+		struct iteration_sums sums;
 		int asked = 0;
 		const struct cancel cancel = {second_time, &asked};
 

@@ -137,8 +137,9 @@ static struct recipe sart_on(const struct grid *grid)
 {
 	struct recipe recipe = recipe_on(grid);
 
-	recipe.fdk.on = recipe.sart.on = true;
-	recipe.sart.iterations = 6;
+	recipe.fdk.on = true;
+	recipe.algorithm = &algorithm_sart;
+	recipe.iterate.iterations = 6;
 	return recipe;
 }
 
@@ -356,7 +357,7 @@ START_TEST(the_same_bits_with_other_threads_after_a_yield_and_in_just_the_memory
 	struct error err;
 
 	scan_of(&scene, CIRCLE, &trunk);
-	recipe.sart.iterations = 3;
+	recipe.iterate.iterations = 3;
 	recipe.projector = _i == 0 ? PROJECTOR_INTERPOLATING : PROJECTOR_MATCHED;
 	run(&scene, &recipe, &whole);
 	scene_run(&scene, &recipe, &first);

@@ -163,8 +163,8 @@ START_TEST(streaks_fall_and_the_metal_stays)
 
 	scene_make(&bare, false);
 	scene_make(&scene, true);
-	with.sart.on = true;
-	with.sart.iterations = 2;
+	with.algorithm = &algorithm_sart;
+	with.iterate.iterations = 2;
 	/* The same steps in all volumes: TV that goes by the noise would smooth the streaks more than the rest. */
 	with.tv.on = true;
 	with.tv.automatic = false;
@@ -220,8 +220,8 @@ START_TEST(without_metal_nothing_changes)
 	struct scene scene;
 
 	scene_make(&scene, false);
-	without.sart.on = with.sart.on = _i == 1;
-	without.sart.iterations = with.sart.iterations = 1;
+	without.algorithm = with.algorithm = _i == 1 ? &algorithm_sart : NULL;
+	without.iterate.iterations = with.iterate.iterations = 1;
 	scene_run(&scene, &without, &plain);
 	scene_run(&scene, &with, &outcome);
 	ck_assert_mem_eq(outcome_volume(&outcome, "final"), outcome_volume(&plain, "final"),
@@ -242,8 +242,8 @@ START_TEST(a_run_with_metal_goes_on_with_the_same_bits)
 	struct scene scene;
 
 	scene_make(&scene, true);
-	recipe.sart.on = true;
-	recipe.sart.iterations = 2;
+	recipe.algorithm = &algorithm_sart;
+	recipe.iterate.iterations = 2;
 	scene_run(&scene, &recipe, &whole);
 	scene_run(&scene, &recipe, &first);
 	ck_assert_int_eq(first.code, ERR_BUSY);
@@ -309,7 +309,7 @@ START_TEST(memory_is_known_beforehand)
 
 	scene_make(&scene, true);
 	ck_assert_int_eq(recon_memory(&backend_cpu, NULL, &scene.geometry, &without, &alone, &err), 0);
-	without.sart.on = with.sart.on = _i == 1;
+	without.algorithm = with.algorithm = _i == 1 ? &algorithm_sart : NULL;
 	without.tv.on = with.tv.on = _i == 2;
 	without.tv.after_fdk = with.tv.after_fdk = true;
 	ck_assert_int_eq(recon_memory(&backend_cpu, NULL, &scene.geometry, &without, &plain, &err), 0);
@@ -436,8 +436,8 @@ static struct recipe object_recipe(bool with_metal, int iterations)
 
 	recipe.fdk.on = true;
 	recipe.metal.on = with_metal;
-	recipe.sart.on = iterations > 0;
-	recipe.sart.iterations = iterations;
+	recipe.algorithm = iterations > 0 ? &algorithm_sart : NULL;
+	recipe.iterate.iterations = iterations;
 	recipe.emit = emit_fdk;
 	recipe.emits = 1;
 	return recipe;

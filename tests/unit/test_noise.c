@@ -236,7 +236,8 @@ START_TEST(the_default_takes_the_noise_and_leaves_the_anatomy)
 	recipe.grid = scan.grid;
 	recipe.fdk.on = true;
 	reconstruct(&scan, &recipe, &fdk, &alpha);
-	recipe.sart.on = recipe.tv.on = true;
+	recipe.tv.on = true;
+	recipe.algorithm = &algorithm_sart;
 	recipe.emit = emit;
 	recipe.emits = 2;
 	reconstruct(&scan, &recipe, found, &alpha);
@@ -277,7 +278,8 @@ START_TEST(small_contrasts_stay_where_there_is_no_noise)
 	recipe_defaults(&recipe);
 	recipe.has_grid = recipe.has_origin = true;
 	recipe.grid = scan.grid;
-	recipe.fdk.on = recipe.sart.on = true;
+	recipe.fdk.on = true;
+	recipe.algorithm = &algorithm_sart;
 	reconstruct(&scan, &recipe, &without, &alpha);
 	recipe.tv.on = true;
 	reconstruct(&scan, &recipe, &with, &alpha);

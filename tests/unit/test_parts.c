@@ -139,21 +139,24 @@ static const struct {
 	int subsets, tv; /* TV: -1 none, else the method, or TV_OF_THE_NOISE */
 	double tolerance;
 	bool matched;
+	const struct algorithm *other; /* in place of SART */
 } cases[] = {
-    {"FDK", &full, true, false, 0, -1, 1e-6, false},
-    {"FDK, cut off", &narrow, true, false, 0, -1, 1e-6, false},
-    {"OS-SART, cut off", &narrow, true, true, 4, -1, 1e-4, false},
-    {"FDK, displaced", &displaced, true, false, 0, -1, 1e-6, false},
-    {"SIRT", &full, false, true, 1, -1, 1e-5, false},
-    {"OS-SART", &full, true, true, 4, -1, 1e-5, false},
-    {"by view", &full, false, true, SUBSETS_VIEWS, -1, 1e-5, false},
-    {"matched", &full, true, true, 4, -1, 1e-5, true},
-    {"matched, by view", &full, false, true, SUBSETS_VIEWS, -1, 1e-5, true},
-    {"matched, seen in part", &displaced, false, true, 3, -1, 1e-5, true},
-    {"seen in part", &displaced, false, true, 3, -1, 1e-5, false},
-    {"TV by steps", &full, true, true, 4, TV_GRADIENT, 1e-4, false},
-    {"proximal TV", &full, true, true, 4, TV_PROXIMAL, 1e-4, false},
-    {"TV of the noise", &full, true, true, 4, TV_OF_THE_NOISE, 1e-4, false},
+    {"FDK", &full, true, false, 0, -1, 1e-6, false, NULL},
+    {"FDK, cut off", &narrow, true, false, 0, -1, 1e-6, false, NULL},
+    {"OS-SART, cut off", &narrow, true, true, 4, -1, 1e-4, false, NULL},
+    {"FDK, displaced", &displaced, true, false, 0, -1, 1e-6, false, NULL},
+    {"SIRT", &full, false, true, 1, -1, 1e-5, false, NULL},
+    {"OS-SART", &full, true, true, 4, -1, 1e-5, false, NULL},
+    {"by view", &full, false, true, SUBSETS_VIEWS, -1, 1e-5, false, NULL},
+    {"matched", &full, true, true, 4, -1, 1e-5, true, NULL},
+    {"matched, by view", &full, false, true, SUBSETS_VIEWS, -1, 1e-5, true, NULL},
+    {"matched, seen in part", &displaced, false, true, 3, -1, 1e-5, true, NULL},
+    {"seen in part", &displaced, false, true, 3, -1, 1e-5, false, NULL},
+    {"TV by steps", &full, true, true, 4, TV_GRADIENT, 1e-4, false, NULL},
+    {"proximal TV", &full, true, true, 4, TV_PROXIMAL, 1e-4, false, NULL},
+    {"TV of the noise", &full, true, true, 4, TV_OF_THE_NOISE, 1e-4, false, NULL},
+    {"CGLS", &full, true, true, 4, -1, 1e-4, true, &algorithm_cgls},
+    {"CGLS and TV", &full, false, true, 4, TV_PROXIMAL, 1e-4, true, &algorithm_cgls},
 };
 
 START_TEST(parts_give_what_the_whole_gives)
@@ -168,10 +171,10 @@ START_TEST(parts_give_what_the_whole_gives)
 
 	make_scene(&scene, cases[_i].spec);
 	recipe.fdk.on = cases[_i].fdk;
-	recipe.sart.on = cases[_i].sart;
+	recipe.algorithm = cases[_i].other != NULL ? cases[_i].other : cases[_i].sart ? &algorithm_sart : NULL;
 	recipe.sart.subsets = cases[_i].subsets;
 	recipe.projector = cases[_i].matched ? PROJECTOR_MATCHED : PROJECTOR_INTERPOLATING;
-	recipe.sart.iterations = 2;
+	recipe.iterate.iterations = 2;
 	recipe.emit = emit;
 	recipe.emits = cases[_i].fdk ? 1 : 0;
 	if (cases[_i].tv >= 0) {
@@ -219,8 +222,8 @@ START_TEST(any_limit_gives_the_same_volume)
 
 	make_scene(&scene, &full);
 	recipe.fdk.on = true;
-	recipe.sart.on = true;
-	recipe.sart.iterations = 1;
+	recipe.algorithm = &algorithm_sart;
+	recipe.iterate.iterations = 1;
 	whole = reconstruct(&scene, &recipe, &linearise, scene.projections, 0);
 	for (size_t limit = whole.memory.total - 1; limit > 1 << 16; limit = limit * 2 / 3) {
 		const struct device_options options = {.threads = 2, .memory_limit = limit};
@@ -267,8 +270,9 @@ START_TEST(what_lies_outside_of_the_grid_is_left_out_in_parts)
 
 	scene_orbit(&scene, &spec);
 	scene_add(&scene, &phantom);
-	recipe.fdk.on = recipe.sart.on = true;
-	recipe.sart.iterations = 2;
+	recipe.fdk.on = true;
+	recipe.algorithm = &algorithm_sart;
+	recipe.iterate.iterations = 2;
 	whole = reconstruct(&scene, &recipe, &linearise, scene.projections, 0);
 	parts = reconstruct(&scene, &recipe, &linearise, scene.projections, whole.memory.total / 4);
 	expect_parts(&parts, _i == 0 ? 2 : 1);

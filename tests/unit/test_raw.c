@@ -49,8 +49,8 @@ static struct recipe recipe_of(bool sart)
 	struct recipe recipe = recipe_on(&grid);
 
 	recipe.fdk.on = true;
-	recipe.sart.on = sart;
-	recipe.sart.iterations = 3;
+	recipe.algorithm = sart ? &algorithm_sart : NULL;
+	recipe.iterate.iterations = 3;
 	return recipe;
 }
 

@@ -64,6 +64,8 @@ static const char *const requests[] = {
     "{\"scan\":\"a\",\"fdk\":{\"window\":\"hamming\"},\"priority\":\"stat\",\"precision\":\"reference\"}",
     "{\"scan\":\"a\",\"sart\":{\"subsets\":\"views\",\"relaxation\":0.1,\"nonnegative\":false,\"stop\":null},"
     "\"priority\":\"urgent\",\"mu_water\":0.020000000000000004}",
+    "{\"scan\":\"a\",\"cgls\":{\"iterations\":3,\"stop\":{\"residual\":0.1}},\"projector\":\"interpolating\"}",
+    "{\"scan\":\"a\",\"fdk\":{},\"cgls\":{},\"sart\":null}",
     "{\"scan\":\"a\",\"sart\":{\"subsets\":60,\"iterations\":100000,\"stop\":{\"change\":1e-9}},"
     "\"emit\":[100000,7,3,7]}",
     "{\"scan\":\"a\",\"sart\":{},\"tv\":{\"alpha\":0,\"step\":0.25,\"iterations\":1,\"unit\":3.3e-5,"
@@ -145,15 +147,15 @@ START_TEST(defaults_are_the_contracts)
 	ck_assert_int_eq(parse_and_resolve("{\"scan\":\"ID\",\"fdk\":{},\"sart\":{},\"tv\":{}}", &request, &err), 0);
 	ck_assert_str_eq(request.scan, "ID");
 	ck_assert_int_eq(request.priority, PRIORITY_ROUTINE);
-	ck_assert(recipe->fdk.on && recipe->sart.on && recipe->tv.on);
+	ck_assert(recipe->fdk.on && recipe->algorithm != NULL && recipe->tv.on);
 	ck_assert_int_eq(recipe->fdk.window, WINDOW_HANN);
 	ck_assert_double_eq(recipe->fdk.cutoff, 1);
-	ck_assert_int_eq(recipe->sart.iterations, 10);
+	ck_assert_int_eq(recipe->iterate.iterations, 10);
 	ck_assert_double_eq(recipe->sart.relaxation, 1);
 	ck_assert_int_eq(recipe->sart.subsets, 10);
 	ck_assert(recipe->sart.nonnegative);
-	ck_assert_double_eq(recipe->sart.stop_residual, 0);
-	ck_assert_double_eq(recipe->sart.stop_change, 0);
+	ck_assert_double_eq(recipe->iterate.stop_residual, 0);
+	ck_assert_double_eq(recipe->iterate.stop_change, 0);
 	ck_assert(recipe->tv.after_fdk);
 	ck_assert_int_eq(recipe->tv.options.method, TV_PROXIMAL);
 	ck_assert(recipe->tv.automatic);
@@ -314,6 +316,9 @@ static const struct {
     {"{\"scan\":\"a\",\"sart\":{\"iterations\":1.5}}", ERR_INVALID, "/sart/iterations", "whole"},
     {"{\"scan\":\"a\",\"sart\":{\"relaxation\":0}}", ERR_IMPOSSIBLE, "/sart/relaxation", "0"},
     {"{\"scan\":\"a\",\"sart\":{\"relaxation\":2.1}}", ERR_IMPOSSIBLE, "/sart/relaxation", "2.1"},
+    {"{\"scan\":\"a\",\"sart\":{},\"cgls\":{}}", ERR_IMPOSSIBLE, "/cgls", "one algorithm"},
+    {"{\"scan\":\"a\",\"cgls\":{\"iterations\":0}}", ERR_IMPOSSIBLE, "/cgls/iterations", "0"},
+    {"{\"scan\":\"a\",\"cgls\":{\"subsets\":2}}", ERR_INVALID, "/cgls/subsets", "nobody knows"},
     {"{\"scan\":\"a\",\"sart\":{\"subsets\":0}}", ERR_IMPOSSIBLE, "/sart/subsets", "0"},
     {"{\"scan\":\"a\",\"sart\":{\"subsets\":-1}}", ERR_IMPOSSIBLE, "/sart/subsets", "-1"},
     {"{\"scan\":\"a\",\"sart\":{\"subsets\":61}}", ERR_IMPOSSIBLE, "/sart/subsets", "60"},

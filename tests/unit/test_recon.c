@@ -8,7 +8,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "core/sart.h"
+#include "core/algorithm.h"
 #include "tests/unit/data.h"
 #include "tests/unit/scene.h"
 
@@ -88,8 +88,8 @@ START_TEST(balls_off_centre_are_where_they_were_put)
 	const float *volume;
 
 	recipe.fdk.on = !sart;
-	recipe.sart.on = sart;
-	recipe.sart.iterations = 4;
+	recipe.algorithm = sart ? &algorithm_sart : NULL;
+	recipe.iterate.iterations = 4;
 	scene_orbit(&scene, &orbits[_i % ORBITS].spec);
 	for (int b = 0; b < 3; b++)
 		add_ball(&scene, 7, densities[b], places[b][0], places[b][1], places[b][2]);
@@ -282,7 +282,7 @@ START_TEST(one_row_and_one_slice_give_a_disc)
 		struct outcome outcome = {0};
 
 		recipe.fdk.on = !sart;
-		recipe.sart.on = sart;
+		recipe.algorithm = sart ? &algorithm_sart : NULL;
 		run(&scene, &recipe, &outcome);
 		/* One ray through a voxel's middle stands for all of it: the rim is what costs 1 %. */
 		ck_assert_double_eq_tol(mean_near(outcome.last, &grid, place, 7), 0.02, 0.0002);
@@ -301,7 +301,8 @@ START_TEST(a_single_view_is_explained_by_sart_and_harmless_to_fdk)
 	struct scene scene;
 	struct outcome outcome = {0};
 
-	recipe.fdk.on = recipe.sart.on = true;
+	recipe.fdk.on = true;
+	recipe.algorithm = &algorithm_sart;
 	recipe.sart.subsets = SUBSETS_VIEWS;
 	scene_orbit(&scene, &spec);
 	add_ball(&scene, 20, 0.02, 0, 0, 0);
@@ -355,8 +356,8 @@ static struct recipe small_recipe(void)
 	struct grid grid = grid_of(32, 30, 28, 2, 2.1, 2.2);
 	struct recipe recipe = recipe_on(&grid);
 
-	recipe.sart.on = true;
-	recipe.sart.iterations = 6;
+	recipe.algorithm = &algorithm_sart;
+	recipe.iterate.iterations = 6;
 	recipe.sart.subsets = 6;
 	return recipe;
 }
@@ -468,7 +469,7 @@ START_TEST(a_residual_that_stays_high_is_told_at_the_end)
 		for (size_t i = 0; i < (size_t)scene.geometry.count * 44 * 44; i++)
 			scene.projections[i] = -scene.projections[i];
 	recipe.sart.subsets = 1;
-	recipe.sart.iterations = _i == 1 ? 1 : 6; /* the first row is 1 by what it is */
+	recipe.iterate.iterations = _i == 1 ? 1 : 6; /* the first row is 1 by what it is */
 	run(&scene, &recipe, &outcome);
 	ck_assert_msg((strstr(outcome.warnings, "residual_high: ") != NULL) == (_i == 0), "%s", outcome.warnings);
 	outcome_clear(&outcome);
@@ -484,7 +485,7 @@ START_TEST(sirt_lowers_the_residual_in_every_iteration)
 	struct outcome outcome = {0};
 
 	recipe.sart.subsets = 1;
-	recipe.sart.iterations = 25;
+	recipe.iterate.iterations = 25;
 	recipe.sart.nonnegative = _i % 2;
 	recipe.projector = _i / 2 ? PROJECTOR_MATCHED : PROJECTOR_INTERPOLATING;
 	small_scene(&scene);
@@ -510,7 +511,7 @@ START_TEST(more_subsets_converge_faster)
 	struct scene scene;
 	double before = INFINITY;
 
-	recipe.sart.iterations = 2;
+	recipe.iterate.iterations = 2;
 	small_scene(&scene);
 	for (size_t s = 0; s < sizeof(subsets) / sizeof(subsets[0]); s++) {
 		struct outcome outcome = {0};
@@ -554,7 +555,7 @@ START_TEST(relaxation_scales_the_update)
 	struct outcome whole = {0}, half = {0};
 
 	recipe.sart.subsets = 1;
-	recipe.sart.iterations = 1;
+	recipe.iterate.iterations = 1;
 	recipe.sart.nonnegative = false;
 	small_scene(&scene);
 	run(&scene, &recipe, &whole);
@@ -653,8 +654,8 @@ START_TEST(stages_rows_and_volumes_come_in_order)
 
 	memcpy(emit, pipelines[_i].emit, sizeof(emit));
 	recipe.fdk.on = pipelines[_i].fdk;
-	recipe.sart.on = pipelines[_i].sart;
-	recipe.sart.iterations = pipelines[_i].iterations > 0 ? pipelines[_i].iterations : 1;
+	recipe.algorithm = pipelines[_i].sart ? &algorithm_sart : NULL;
+	recipe.iterate.iterations = pipelines[_i].iterations > 0 ? pipelines[_i].iterations : 1;
 	recipe.tv.on = pipelines[_i].tv;
 	recipe.tv.after_fdk = pipelines[_i].after_fdk;
 	recipe.emit = emit;
@@ -680,7 +681,7 @@ START_TEST(fdk_is_a_start_for_sart_and_tv_smooths_it)
 	struct outcome outcome = {0}, zero = {0};
 
 	small_scene(&scene);
-	recipe.sart.iterations = 1;
+	recipe.iterate.iterations = 1;
 	run(&scene, &recipe, &zero);
 	recipe.fdk.on = recipe.tv.on = true;
 	recipe.emit = emit;
@@ -748,9 +749,9 @@ START_TEST(pushes_and_threads_do_not_change_a_bit)
 	struct outcome reference = {0};
 
 	recipe.fdk.on = true;
-	recipe.sart.on = _i;
+	recipe.algorithm = _i ? &algorithm_sart : NULL;
 	recipe.tv.on = true;
-	recipe.sart.iterations = 2;
+	recipe.iterate.iterations = 2;
 	small_scene(&scene);
 	run(&scene, &recipe, &reference);
 	for (size_t i = 0; i < sizeof(ways) / sizeof(ways[0]); i++) {
@@ -775,7 +776,7 @@ START_TEST(a_run_that_yielded_goes_on_as_if_it_had_not)
 	recipe.fdk.on = recipe.tv.on = true;
 	if (_i < 2)
 		recipe_explicit_tv(&recipe, _i == 0 ? TV_GRADIENT : TV_PROXIMAL);
-	recipe.sart.iterations = 4;
+	recipe.iterate.iterations = 4;
 	recipe.emit = emit;
 	recipe.emits = 2;
 	small_scene(&scene);
@@ -812,7 +813,7 @@ START_TEST(the_last_iteration_does_not_yield_and_can_be_resumed_from)
 	struct scene scene;
 	struct outcome outcome = {.yield_at = 2}, again = {0};
 
-	recipe.sart.iterations = 2;
+	recipe.iterate.iterations = 2;
 	small_scene(&scene);
 	run(&scene, &recipe, &outcome);
 	ck_assert_str_eq(outcome.log, "load sart row1 sart row2 final!");
@@ -839,7 +840,7 @@ START_TEST(a_resume_that_makes_no_sense_is_refused)
 	scene_run(&scene, &recipe, &outcome);
 	ck_assert_int_eq(outcome.code, ERR_INVALID);
 	outcome_clear(&outcome);
-	recipe.sart.on = false;
+	recipe.algorithm = NULL;
 	recipe.fdk.on = true;
 	outcome = (struct outcome){.resume = zero};
 	scene_run(&scene, &recipe, &outcome);
@@ -858,7 +859,7 @@ START_TEST(a_run_can_be_cancelled_anywhere)
 	struct outcome whole = {.at_once = 12};
 
 	recipe.fdk.on = recipe.tv.on = true;
-	recipe.sart.iterations = 2;
+	recipe.iterate.iterations = 2;
 	small_scene(&scene);
 	run(&scene, &recipe, &whole);
 	ck_assert_int_gt(whole.asked, 36 + 2);
@@ -892,7 +893,7 @@ START_TEST(stop_rules_end_it_at_the_first_row_that_meets_them)
 	ck_assert_double_lt(whole.rows[3].residual, whole.rows[2].residual);
 	ck_assert_double_lt(whole.rows[3].change, whole.rows[2].change);
 
-	recipe.sart.stop_residual = whole.rows[3].residual;
+	recipe.iterate.stop_residual = whole.rows[3].residual;
 	run(&scene, &recipe, &residual);
 	ck_assert_int_eq(residual.row_count, 4);
 	ck_assert_int_eq(residual.kept_count, 2);
@@ -902,8 +903,8 @@ START_TEST(stop_rules_end_it_at_the_first_row_that_meets_them)
 	ck_assert_mem_eq(residual.last, outcome_volume(&whole, "iter-4"), sizeof(float) * grid_voxels(&whole.grid));
 	ck_assert_double_eq(residual.fraction, 1);
 
-	recipe.sart.stop_residual = 0;
-	recipe.sart.stop_change = whole.rows[1].change;
+	recipe.iterate.stop_residual = 0;
+	recipe.iterate.stop_change = whole.rows[1].change;
 	run(&scene, &recipe, &change);
 	ck_assert_int_eq(change.row_count, 2);
 	outcome_clear(&whole);
@@ -1002,7 +1003,7 @@ START_TEST(tv_after_a_sart_that_is_not_there_is_told)
 
 	small_scene(&scene);
 	recipe.fdk.on = true;
-	recipe.sart.on = false;
+	recipe.algorithm = NULL;
 	run(&scene, &recipe, &plain);
 	recipe.tv.on = true;
 	recipe.tv.after_fdk = false;
@@ -1100,7 +1101,7 @@ START_TEST(fdk_alone_does_not_keep_the_projections)
 	scene_orbit(&scene, &spec);
 	recipe.fdk.on = true;
 	ck_assert_int_eq(recon_memory(&backend_cpu, NULL, &scene.geometry, &recipe, &fdk, &err), 0);
-	recipe.sart.on = true;
+	recipe.algorithm = &algorithm_sart;
 	ck_assert_int_eq(recon_memory(&backend_cpu, NULL, &scene.geometry, &recipe, &sart, &err), 0);
 	ck_assert_uint_ge(sart.projections, all);
 	ck_assert_uint_lt(fdk.projections, all / 10);
@@ -1121,11 +1122,12 @@ static void negative_subsets(struct recipe *recipe)
 }
 static void no_stage(struct recipe *recipe)
 {
-	recipe->fdk.on = recipe->sart.on = false;
+	recipe->fdk.on = false;
+	recipe->algorithm = NULL;
 }
 static void no_iterations(struct recipe *recipe)
 {
-	recipe->sart.iterations = 0;
+	recipe->iterate.iterations = 0;
 }
 static void relaxation_zero(struct recipe *recipe)
 {
@@ -1141,11 +1143,11 @@ static void relaxation_large(struct recipe *recipe)
 }
 static void stop_residual(struct recipe *recipe)
 {
-	recipe->sart.stop_residual = -1;
+	recipe->iterate.stop_residual = -1;
 }
 static void stop_change(struct recipe *recipe)
 {
-	recipe->sart.stop_change = INFINITY;
+	recipe->iterate.stop_change = INFINITY;
 }
 static void cutoff_zero(struct recipe *recipe)
 {
@@ -1281,7 +1283,8 @@ START_TEST(resolving_writes_every_default_and_is_stable)
 	struct error err = {0};
 
 	recipe_defaults(&recipe);
-	recipe.fdk.on = recipe.sart.on = recipe.tv.on = true;
+	recipe.fdk.on = recipe.tv.on = true;
+	recipe.algorithm = &algorithm_sart;
 	small_scene(&scene);
 	ck_assert_int_eq(orbit_analyse(&orbit, &scene.geometry, &err), 0);
 	ck_assert_int_eq(recipe_resolve(&recipe, &scene.geometry, &orbit, &err), 0);
@@ -1506,8 +1509,8 @@ START_TEST(truncation_leaves_no_rim_in_fdk_or_sart)
 	for (int sart = 0; sart < 2; sart++) {
 		struct outcome outcome = {0};
 
-		recipe.sart.on = sart;
-		recipe.sart.iterations = 5;
+		recipe.algorithm = sart ? &algorithm_sart : NULL;
+		recipe.iterate.iterations = 5;
 		run(&scene, &recipe, &outcome);
 		ck_assert_ptr_nonnull(strstr(outcome.warnings, "truncated: "));
 		for (int i = 0; i < 6; i++) {
@@ -1519,7 +1522,8 @@ START_TEST(truncation_leaves_no_rim_in_fdk_or_sart)
 		}
 		outcome_clear(&outcome);
 	}
-	recipe.sart.on = recipe.fdk.extend = false;
+	recipe.fdk.extend = false;
+	recipe.algorithm = NULL;
 	{
 		struct outcome outcome = {0};
 
@@ -1626,8 +1630,9 @@ START_TEST(a_body_that_goes_on_outside_of_the_grid_is_not_piled_up_at_its_faces)
 
 	scene_orbit(&scene, &spec);
 	scene_add(&scene, &phantom);
-	recipe.fdk.on = recipe.sart.on = true;
-	recipe.sart.iterations = 4;
+	recipe.fdk.on = true;
+	recipe.algorithm = &algorithm_sart;
+	recipe.iterate.iterations = 4;
 	run(&scene, &recipe, &outcome);
 	ck_assert_int_eq(strstr(outcome.warnings, "outside_grid: ") != NULL, cases[_i].outside);
 	for (int k = 1; k < grid.size[2] - 1; k++) {
@@ -1686,7 +1691,7 @@ START_TEST(a_grid_inside_of_the_body_shows_what_is_there)
 	scene_orbit(&scene, &spec);
 	scene_add(&scene, &phantom);
 	phantom_voxelise(&phantom, &grid, 3, truth);
-	recipe.sart.on = true;
+	recipe.algorithm = &algorithm_sart;
 	recipe.projector = _i / 2 ? PROJECTOR_MATCHED : PROJECTOR_INTERPOLATING;
 	recipe.fdk.on = _i % 2;
 	{
@@ -1723,8 +1728,9 @@ START_TEST(a_body_inside_of_the_grid_is_not_told_to_go_on)
 
 	scene_orbit(&scene, &spec);
 	scene_add(&scene, &phantom);
-	recipe.fdk.on = recipe.sart.on = true;
-	recipe.sart.iterations = 1;
+	recipe.fdk.on = true;
+	recipe.algorithm = &algorithm_sart;
+	recipe.iterate.iterations = 1;
 	run(&scene, &recipe, &outcome);
 	ck_assert_str_eq(outcome.warnings, "");
 	outcome_clear(&outcome);
@@ -1749,8 +1755,8 @@ START_TEST(sart_alone_tells_of_truncation)
 
 	scene_orbit(&scene, &spec);
 	scene_add(&scene, &phantom);
-	recipe.sart.on = true;
-	recipe.sart.iterations = 5;
+	recipe.algorithm = &algorithm_sart;
+	recipe.iterate.iterations = 5;
 	run(&scene, &recipe, &outcome);
 	ck_assert_ptr_nonnull(strstr(outcome.warnings, _i ? "FDK of this orbit is too poor" : "truncated: "));
 	for (int i = 0; i < 4 && _i == 0; i++) {
@@ -2015,8 +2021,8 @@ START_TEST(sart_is_as_good_as_rtk_demands)
 	struct outcome outcome = {0};
 	double error, psnr;
 
-	recipe.sart.on = true;
-	recipe.sart.iterations = 1;
+	recipe.algorithm = &algorithm_sart;
+	recipe.iterate.iterations = 1;
 	recipe.sart.relaxation = 0.5;
 	recipe.sart.subsets = SUBSETS_VIEWS;
 	recipe.sart.nonnegative = false;

@@ -34,11 +34,12 @@ export function geometryFacts(scan, patient = scan.patient) {
 
 export function jobFacts(job) {
 	const timings = job.timings ?? {}
-	const spent = ['waiting', 'queued', 'load', 'fdk', 'sart', 'tv', 'save'].filter(name => timings[name] > 0.05).map(name => `${name} ${duration(timings[name])}`)
+	const spent = ['waiting', 'queued', 'load', 'fdk', 'sart', 'cgls', 'tv', 'save'].filter(name => timings[name] > 0.05).map(name => `${name} ${duration(timings[name])}`)
 	return list([
 		['Grid', job.grid && `${times(job.grid.size)} at ${times(job.grid.spacing_mm, 3)} mm`],
 		['FDK', job.fdk ? `${job.fdk.window ?? 'hann'}, cutoff ${number(job.fdk.cutoff ?? 1)}` : 'none'],
-		['SART', job.sart ? `${job.sart.iterations} iterations, ${job.sart.subsets === 'views' ? 'an update a view' : `${job.sart.subsets} subsets`}, relaxation ${number(job.sart.relaxation)}` : 'none'],
+		['SART', job.sart ? `${job.sart.iterations} iterations, ${job.sart.subsets === 'views' ? 'an update a view' : `${job.sart.subsets} subsets`}, relaxation ${number(job.sart.relaxation)}` : job.cgls ? null : 'none'],
+		['CGLS', job.cgls ? `${job.cgls.iterations} iterations` : null],
 		['TV', job.tv ? smoothing(job) : 'none'],
 		['Priority', job.priority],
 		['Runs on', job.device ? `${job.device} (${job.backend})` : job.backend],

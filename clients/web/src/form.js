@@ -27,6 +27,9 @@ const groups = [
 		flag('/sart/nonnegative', 'Never below zero'),
 		number('/sart/stop/residual', 'Stop at residual'), number('/sart/stop/change', 'Stop at change'),
 	] },
+	{ title: 'Conjugate gradients', pointer: '/cgls', optional: true, rare: true, off: 'not in place of SART', fields: [
+		number('/cgls/iterations', 'Iterations', { step: 1 }), number('/cgls/stop/residual', 'Stop at residual'), number('/cgls/stop/change', 'Stop at change'),
+	] },
 	{ title: 'Total variation', pointer: '/tv', optional: true, off: 'no smoothing', fields: [
 		choice('/tv/method', 'Method', ['proximal', 'gradient']), choice('/tv/strength', 'Strength', ['light', 'medium', 'strong']),
 		text('/tv/alpha', 'Alpha', { hint: 'or auto', read: value => value === 'auto' || Number.isNaN(Number(value)) ? value : Number(value) }), number('/tv/step', 'Step'),
@@ -41,7 +44,7 @@ const groups = [
 	] },
 ]
 /* Members of a job's document that are parts of its request, whether they have a field above or not. */
-const members = ['grid', 'fdk', 'sart', 'tv', 'emit', 'priority', 'precision', 'mu_water', 'projector', 'metal', 'patient', 'labels']
+const members = ['grid', 'fdk', 'sart', 'cgls', 'tv', 'emit', 'priority', 'precision', 'mu_water', 'projector', 'metal', 'patient', 'labels']
 
 const path = pointer => pointer.split('/').slice(1)
 const at = (value, pointer) => path(pointer).reduce((part, key) => part?.[key], value)

@@ -13,7 +13,7 @@ const pollTime = 1500 /* ms: progress and time left are not told as events */
 const swipeReach = 12 /* px to either side of the line */
 const plainLimits = [-3000, 30000] /* HU: beyond, the numbers are no attenuation of a patient */
 
-const volumeText = volume => volume.stage === 'sart' ? `iteration ${volume.iteration}` : volume.stage === 'tv' ? 'FDK and TV' : 'FDK'
+const volumeText = volume => volume.iteration > 0 ? `iteration ${volume.iteration}` : volume.stage === 'tv' ? 'FDK and TV' : 'FDK'
 
 export class JobPage {
 	#job = null
@@ -246,10 +246,10 @@ export class JobPage {
 	}
 
 	#showPlot() {
-		const kept = new Map(this.#volumes.filter(volume => volume.stage === 'sart').map(volume => [volume.iteration, volume.name]))
+		const kept = new Map(this.#volumes.filter(volume => volume.iteration > 0).map(volume => [volume.iteration, volume.name]))
 		const selected = this.#volumes.find(volume => volume.name === this.#selected)
 		this.courseSection.hidden = !(this.#job?.history?.length > 0)
-		this.plot.show(this.#job?.history ?? [], kept, selected?.stage === 'sart' ? selected.iteration : null)
+		this.plot.show(this.#job?.history ?? [], kept, selected?.iteration > 0 ? selected.iteration : null)
 	}
 
 	/* ---- volumes ---- */
@@ -322,7 +322,7 @@ export class JobPage {
 	}
 
 	#selectIteration(iteration) {
-		const index = this.#volumes.findIndex(volume => volume.stage === 'sart' && volume.iteration === iteration)
+		const index = this.#volumes.findIndex(volume => volume.iteration > 0 && volume.iteration === iteration)
 		if (index >= 0)
 			this.#choose(index)
 	}
@@ -339,7 +339,7 @@ export class JobPage {
 		const index = this.#index(), volume = this.#volumes[index]
 		this.viewer.show(this.id, volume)
 		this.slider.value = String(index)
-		const text = `${volume.name === 'final' ? 'final' : volume.name}${volume.name === 'final' || volume.stage !== 'sart' ? `, ${volumeText(volume)}` : ''}`
+		const text = `${volume.name === 'final' ? 'final' : volume.name}${volume.name === 'final' || volume.iteration === 0 ? `, ${volumeText(volume)}` : ''}`
 		this.slider.setAttribute('aria-valuetext', text)
 		write(this.sliderText, text)
 		this.viewer.tag.textContent = volume.name

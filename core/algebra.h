@@ -1,0 +1,61 @@
+#ifndef CBCT_CORE_ALGEBRA_H
+#define CBCT_CORE_ALGEBRA_H
+
+#include <math.h>
+#include <stddef.h>
+
+/*
+ * The algebra of backend.h over contiguous floats in the host's memory, for one
+ * thread: what the CPU's and the out-of-core backend share.
+ */
+static inline void algebra_axpby(size_t count, float a, const float *x, float b, float *y)
+{
+	if (b == 0) {
+#pragma omp simd
+		for (size_t i = 0; i < count; i++)
+			y[i] = a * x[i];
+		return;
+	}
+#pragma omp simd
+	for (size_t i = 0; i < count; i++)
+		y[i] = a * x[i] + b * y[i];
+}
+
+static inline double algebra_dot(size_t count, const float *x, const float *y)
+{
+	double sum = 0;
+
+#pragma omp simd reduction(+ : sum)
+	for (size_t i = 0; i < count; i++)
+		sum += (double)x[i] * (double)y[i];
+	return sum;
+}
+
+static inline void algebra_divide(size_t count, const float *x, float least, float *y)
+{
+#pragma omp simd
+	for (size_t i = 0; i < count; i++)
+		y[i] = x[i] >= least ? y[i] / x[i] : 0;
+}
+
+static inline void algebra_clip(size_t count, float *y)
+{
+#pragma omp simd
+	for (size_t i = 0; i < count; i++)
+		y[i] = y[i] > 0 ? y[i] : 0;
+}
+
+static inline void algebra_mask(size_t count, const float *x, float *y)
+{
+#pragma omp simd
+	for (size_t i = 0; i < count; i++)
+		y[i] = isnan(x[i]) ? 0 : y[i];
+}
+
+static inline void algebra_fill(size_t count, float value, float *y)
+{
+	for (size_t i = 0; i < count; i++)
+		y[i] = value;
+}
+
+#endif

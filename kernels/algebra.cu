@@ -1,0 +1,124 @@
+/*
+ * The algebra of iterative methods: sums, products and quotients of volumes and
+ * stacks, element by element, at the speed of memory. Dots are in norms.cu.
+ */
+#include "kernels/internal.cuh"
+
+static const int THREADS = 256, BLOCKS = 4096;
+
+/* One element of y from one of x: the forms that backend.h names. */
+struct axpby {
+	float a, b;
+	__device__ float operator()(float x, float y) const
+	{
+		return b == 0 ? a * x : fmaf(a, x, b * y);
+	}
+};
+struct divide {
+	float least;
+	__device__ float operator()(float x, float y) const
+	{
+		return x >= least ? y / x : 0.0f;
+	}
+};
+struct clip {
+	__device__ float operator()(float, float y) const
+	{
+		return y > 0 ? y : 0.0f;
+	}
+};
+struct mask {
+	__device__ float operator()(float x, float y) const
+	{
+		return isnan(x) ? 0.0f : y;
+	}
+};
+struct fill {
+	float value;
+	__device__ float operator()(float, float) const
+	{
+		return value;
+	}
+};
+
+/* Columns 0 .. width - 1 of rows that are `pitch` floats apart; x may be y. */
+template <class Form>
+static __global__ void __launch_bounds__(THREADS)
+    each(Form form, const float *x, float *y, size_t rows, size_t width, size_t pitch)
+{
+	for (size_t i = (size_t)blockIdx.x * THREADS + threadIdx.x; i < rows * width;
+	     i += (size_t)gridDim.x * THREADS) {
+		size_t at = i / width * pitch + i % width;
+
+		y[at] = form(x[at], y[at]);
+	}
+}
+
+template <class Form>
+static int over_volume(Form form, const struct volume *x, struct volume *y, struct error *err)
+{
+	struct device *device = y->device;
+	size_t voxels = y->bytes / sizeof(float);
+
+	TRY(device_enter(device, err));
+	each<<<BLOCKS, THREADS, 0, device->stream>>>(form, x->data, y->data, (size_t)1, voxels, voxels);
+	LAUNCHED();
+	TRY(mark_used(device, x->used, err));
+	return mark_used(device, y->used, err);
+}
+
+/* The zeros between rows and slots stay zeros. */
+template <class Form>
+static int over_stack(Form form, const struct stack *x, const int *slots, int count, struct stack *y, struct error *err)
+{
+	struct device *device = y->device;
+	const struct stack_shape *shape = &y->shape;
+	size_t rows = (size_t)shape->rows, width = (size_t)shape->columns, pitch = (size_t)shape->pitch;
+
+	TRY(device_enter(device, err));
+	for (int i = 0; i < count; i++) {
+		const float *from = x->data + (size_t)(slots != NULL ? slots[i] : i) * x->shape.slot;
+
+		each<<<BLOCKS, THREADS, 0, device->stream>>>(form, from, y->data + (size_t)i * shape->slot, rows, width,
+							     pitch);
+		LAUNCHED();
+	}
+	TRY(mark_used(device, x->used, err));
+	return mark_used(device, y->used, err);
+}
+
+int cuda_volume_axpby(double a, const struct volume *x, double b, struct volume *y, struct error *err)
+{
+	return over_volume(axpby{(float)a, (float)b}, x, y, err);
+}
+
+int cuda_stack_axpby(double a, const struct stack *x, const int *slots, int count, double b, struct stack *y,
+		     struct error *err)
+{
+	return over_stack(axpby{(float)a, (float)b}, x, slots, count, y, err);
+}
+
+int cuda_volume_divide(const struct volume *x, double least, struct volume *y, struct error *err)
+{
+	return over_volume(divide{(float)least}, x, y, err);
+}
+
+int cuda_stack_divide(const struct stack *x, double least, int count, struct stack *y, struct error *err)
+{
+	return over_stack(divide{(float)least}, x, NULL, count, y, err);
+}
+
+int cuda_volume_clip(struct volume *y, struct error *err)
+{
+	return over_volume(clip{}, y, y, err);
+}
+
+int cuda_stack_fill(struct stack *y, int count, float value, struct error *err)
+{
+	return over_stack(fill{value}, y, NULL, count, y, err);
+}
+
+int cuda_stack_mask(const struct stack *x, const int *slots, int count, struct stack *y, struct error *err)
+{
+	return over_stack(mask{}, x, slots, count, y, err);
+}

@@ -1,0 +1,398 @@
+/*
+ * The rows of algorithms[], each in the same runs: kept iterates, history, stops,
+ * preemption with the same bits; conjugate gradients where they are known; and the
+ * algebra that they are written in, on the CPU and out of core.
+ */
+#include <check.h>
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "core/algorithm.h"
+#include "core/parts.h"
+#include "tests/unit/scene.h"
+
+Suite *algorithm_suite(void);
+
+static struct error err;
+
+static void ok(int code)
+{
+	ck_assert_msg(code == 0, "%s", err.text);
+}
+
+/* ---- the algebra ---- */
+
+enum { COLUMNS = 21, ROWS = 13, SLOTS = 5, PIXELS = COLUMNS * ROWS };
+
+static float value(unsigned *state)
+{
+	*state = *state * 1664525U + 1013904223U;
+	return (float)(*state >> 8) / 16777216.0f - 0.4f;
+}
+
+static void fill(float *to, size_t count, unsigned seed)
+{
+	for (size_t i = 0; i < count; i++)
+		to[i] = value(&seed);
+}
+
+struct table {
+	const struct backend *backend;
+	struct device *below, *device;
+	struct plan *plan;
+	struct scene scene;
+	struct grid grid;
+};
+
+/* _i = 0: the CPU; 1: out of core, over the CPU. */
+static void table_open(struct table *ret, int out_of_core)
+{
+	const struct orbit_spec spec = {COLUMNS, ROWS, SLOTS, {600, 1100, {4, 4}, {0, 0}, {0, 0}}, 0, 72};
+	struct table table = {.backend = out_of_core ? &backend_parts : &backend_cpu,
+			      .grid = grid_of(11, 7, 9, 2, 2, 2)};
+	struct plan_options options = {.linearise = {.sample = SAMPLE_FLOAT32}};
+
+	scene_orbit(&table.scene, &spec);
+	ok(backend_cpu.open(0, &(struct device_options){.threads = 2}, &table.below, &err));
+	table.device = table.below;
+	if (out_of_core)
+		ok(parts_open(&backend_cpu, table.below, &table.device, &err));
+	*ret = table;
+	options.geometry = &ret->scene.geometry;
+	options.grid = &ret->grid;
+	ok(table.backend->plan_new(table.device, &options, &ret->plan, &err));
+}
+
+static void table_close(struct table *table)
+{
+	table->backend->plan_free(table->plan);
+	if (table->device != table->below)
+		backend_parts.close(table->device);
+	backend_cpu.close(table->below);
+	scene_clear(&table->scene);
+}
+
+static void expect_near(const float *got, const double *wanted, size_t count, const char *what)
+{
+	for (size_t i = 0; i < count; i++)
+		ck_assert_msg(fabs((double)got[i] - wanted[i]) <= 1e-6, "%s %zu: %g, not %g", what, i, (double)got[i],
+			      wanted[i]);
+}
+
+START_TEST(volumes_are_added_multiplied_and_divided)
+{
+	struct table t;
+	float x[11 * 7 * 9], y[11 * 7 * 9], got[11 * 7 * 9];
+	double wanted[11 * 7 * 9], sum = 0, expected = 0;
+	const size_t voxels = sizeof(x) / sizeof(x[0]);
+	struct volume *vx, *vy;
+
+	table_open(&t, _i);
+	fill(x, voxels, 1);
+	fill(y, voxels, 2);
+	ok(t.backend->volume_new(t.device, &t.grid, &vx, &err));
+	ok(t.backend->volume_new(t.device, &t.grid, &vy, &err));
+	ok(t.backend->volume_upload(vx, x, &err));
+	ok(t.backend->volume_upload(vy, y, &err));
+	ok(t.backend->volume_dot(t.plan, vx, vy, &sum, &err));
+	for (size_t i = 0; i < voxels; i++)
+		expected += (double)x[i] * (double)y[i];
+	ck_assert_double_eq_tol(sum, expected, 1e-9);
+	ok(t.backend->volume_axpby(2, vx, -0.5, vy, &err));
+	ok(t.backend->volume_download(vy, 0, 9, got, &err));
+	for (size_t i = 0; i < voxels; i++)
+		wanted[i] = 2 * (double)x[i] - 0.5 * (double)y[i];
+	expect_near(got, wanted, voxels, "axpby");
+	ok(t.backend->volume_divide(vx, 0.1, vy, &err));
+	ok(t.backend->volume_download(vy, 0, 9, got, &err));
+	for (size_t i = 0; i < voxels; i++)
+		wanted[i] = x[i] >= 0.1f ? wanted[i] / (double)x[i] : 0;
+	for (size_t i = 0; i < voxels; i++)
+		ck_assert_double_eq_tol((double)got[i], wanted[i], 1e-5);
+	ok(t.backend->volume_clip(vy, &err));
+	ok(t.backend->volume_download(vy, 0, 9, got, &err));
+	for (size_t i = 0; i < voxels; i++)
+		ck_assert_double_eq_tol((double)got[i], fmax(wanted[i], 0), 1e-5);
+	/* With b = 0 nothing of y is left, not even what is no number. */
+	for (size_t i = 0; i < voxels; i++)
+		y[i] = NAN;
+	ok(t.backend->volume_upload(vy, y, &err));
+	ok(t.backend->volume_axpby(3, vx, 0, vy, &err));
+	ok(t.backend->volume_download(vy, 0, 9, got, &err));
+	for (size_t i = 0; i < voxels; i++)
+		wanted[i] = 3 * (double)x[i];
+	expect_near(got, wanted, voxels, "scale");
+	t.backend->volume_free(vx);
+	t.backend->volume_free(vy);
+	table_close(&t);
+}
+END_TEST
+
+START_TEST(stacks_are_added_multiplied_and_divided_by_slots)
+{
+	const int slots[] = {4, 0, 3};
+	struct table t;
+	float x[SLOTS * PIXELS], y[SLOTS * PIXELS], got[SLOTS * PIXELS];
+	double sum = 0, expected = 0;
+	struct stack *sx, *sy;
+
+	table_open(&t, _i);
+	fill(x, SLOTS * PIXELS, 3);
+	fill(y, SLOTS * PIXELS, 4);
+	ok(t.backend->stack_new(t.device, COLUMNS, ROWS, SLOTS, &sx, &err));
+	ok(t.backend->stack_new(t.device, COLUMNS, ROWS, SLOTS, &sy, &err));
+	ok(t.backend->stack_upload(sx, 0, SLOTS, x, &err));
+	ok(t.backend->stack_upload(sy, 0, SLOTS, y, &err));
+	ok(t.backend->stack_dot(t.plan, sx, sy, 3, &sum, &err));
+	for (size_t i = 0; i < 3 * PIXELS; i++)
+		expected += (double)x[i] * (double)y[i];
+	ck_assert_double_eq_tol(sum, expected, 1e-9);
+	ok(t.backend->stack_axpby(-1, sx, slots, 3, 2, sy, &err));
+	ok(t.backend->stack_download(sy, 0, SLOTS, got, &err));
+	for (int s = 0; s < SLOTS; s++)
+		for (int i = 0; i < PIXELS; i++) {
+			const double before = (double)y[s * PIXELS + i];
+
+			ck_assert_double_eq_tol((double)got[s * PIXELS + i],
+						s < 3 ? 2 * before - (double)x[slots[s] * PIXELS + i] : before, 1e-6);
+		}
+	x[0 * PIXELS + 17] = x[4 * PIXELS + 30] = NAN;
+	ok(t.backend->stack_upload(sx, 0, SLOTS, x, &err));
+	ok(t.backend->stack_upload(sy, 0, SLOTS, y, &err));
+	ok(t.backend->stack_mask(sx, slots, 2, sy, &err));
+	ok(t.backend->stack_download(sy, 0, SLOTS, got, &err));
+	for (int i = 0; i < SLOTS * PIXELS; i++)
+		ck_assert_double_eq((double)got[i], i == 30 || i == PIXELS + 17 ? 0 : (double)y[i]);
+	fill(x, SLOTS * PIXELS, 3);
+	ok(t.backend->stack_upload(sx, 0, SLOTS, x, &err));
+	ok(t.backend->stack_fill(sy, SLOTS, 1, &err));
+	ok(t.backend->stack_divide(sx, 0.2, SLOTS, sy, &err));
+	ok(t.backend->stack_download(sy, 0, SLOTS, got, &err));
+	for (int i = 0; i < SLOTS * PIXELS; i++)
+		ck_assert_double_eq_tol((double)got[i], x[i] >= 0.2f ? 1 / (double)x[i] : 0, 1e-5);
+	t.backend->stack_free(sx);
+	t.backend->stack_free(sy);
+	table_close(&t);
+}
+END_TEST
+
+/* ---- every row ---- */
+
+static void add_ball(struct scene *scene, double radius, double density, double x, double y, double z)
+{
+	struct ellipsoid ball = {.semi_axes = {radius, radius, radius}, .centre = {x, y, z}, .density = density};
+	struct phantom phantom = {.count = 1, .parts = &ball};
+
+	scene_add(scene, &phantom);
+}
+
+static void small_scene(struct scene *ret_scene)
+{
+	const struct orbit_spec spec = {44, 44, 36, {600, 1100, {3, 3}, {0, 0}, {0, 0}}, 0, 10};
+
+	scene_orbit(ret_scene, &spec);
+	add_ball(ret_scene, 25, 0.02, 2, -3, 1);
+	add_ball(ret_scene, 8, -0.015, -8, 6, 0);
+	add_ball(ret_scene, 6, 0.02, 10, 4, -7);
+}
+
+static struct recipe small_recipe(const struct algorithm *algorithm)
+{
+	struct grid grid = grid_of(32, 30, 28, 2, 2.1, 2.2);
+	struct recipe recipe = recipe_on(&grid);
+
+	recipe_set_algorithm(&recipe, algorithm);
+	recipe.sart.subsets = 6;
+	return recipe;
+}
+
+static void run(const struct scene *scene, const struct recipe *recipe, struct outcome *outcome)
+{
+	scene_run(scene, recipe, outcome);
+	ck_assert_msg(outcome->code == 0, "%s", outcome->err.text);
+}
+
+START_TEST(every_algorithm_is_found_by_its_name)
+{
+	for (int i = 0; i < ALGORITHM_COUNT; i++) {
+		struct recipe recipe;
+
+		ck_assert_ptr_eq(algorithm_find(algorithms[i]->name), algorithms[i]);
+		recipe_defaults(&recipe);
+		recipe_set_algorithm(&recipe, algorithms[i]);
+		ck_assert_int_eq(recipe.iterate.iterations, algorithms[i]->iterations);
+		ck_assert_int_eq((int)recipe.projector, (int)algorithms[i]->projector);
+		ck_assert_str_eq(stage_names[algorithms[i]->stage], algorithms[i]->name);
+	}
+	ck_assert_ptr_null(algorithm_find("no such algorithm"));
+	ck_assert_int_eq((int)algorithm_cgls.projector, PROJECTOR_MATCHED);
+}
+END_TEST
+
+/* _i: the algorithm; without and with TV. */
+START_TEST(a_run_that_yielded_ends_with_the_same_bits)
+{
+	struct recipe recipe = small_recipe(algorithms[_i / 2]);
+	struct scene scene;
+	struct outcome whole = {0}, first = {.yield_at = 2}, second = {0};
+	int emit[] = {EMIT_FDK, 1, 3};
+
+	recipe.fdk.on = true;
+	recipe.tv.on = _i % 2;
+	recipe.iterate.iterations = 4;
+	recipe.emit = emit;
+	recipe.emits = 3;
+	small_scene(&scene);
+	run(&scene, &recipe, &whole);
+	ck_assert_int_eq(whole.kept_count, 4);
+	ck_assert_str_eq(whole.kept[0].stage, "fdk");
+	ck_assert_str_eq(whole.kept[1].name, "iter-1");
+	for (int i = 1; i < 4; i++)
+		ck_assert_str_eq(whole.kept[i].stage, algorithms[_i / 2]->name);
+	ck_assert_int_eq(whole.row_count, 4);
+
+	scene_run(&scene, &recipe, &first);
+	ck_assert_int_eq(first.code, ERR_BUSY);
+	second.resume = first.last;
+	second.resume_iteration = first.iteration;
+	second.resume_state = first.state;
+	second.resume_state_bytes = first.state_bytes;
+	second.resume_noise = recipe.tv.on ? &first.noise : NULL;
+	run(&scene, &recipe, &second);
+	ck_assert_mem_eq(second.last, whole.last, sizeof(float) * grid_voxels(&whole.grid));
+	for (int i = 0; i < 2; i++)
+		ck_assert_double_eq(second.rows[i].residual, whole.rows[2 + i].residual);
+	outcome_clear(&whole);
+	outcome_clear(&first);
+	outcome_clear(&second);
+	scene_clear(&scene);
+}
+END_TEST
+
+START_TEST(every_algorithm_can_be_cancelled_and_stops_by_its_rules)
+{
+	struct recipe recipe = small_recipe(algorithms[_i]);
+	struct scene scene;
+	struct outcome whole = {0}, stopped = {0};
+
+	recipe.iterate.iterations = 3;
+	small_scene(&scene);
+	run(&scene, &recipe, &whole);
+	for (int at = whole.asked; at > whole.asked - 4; at--) {
+		struct outcome outcome = {.cancel_at = at};
+
+		scene_run(&scene, &recipe, &outcome);
+		ck_assert_int_eq(outcome.code, ERR_CANCELLED);
+		ck_assert_int_eq(outcome.kept_count, 0);
+		outcome_clear(&outcome);
+	}
+	recipe.iterate.stop_residual = whole.rows[1].residual;
+	run(&scene, &recipe, &stopped);
+	ck_assert_int_eq(stopped.row_count, 2);
+	outcome_clear(&whole);
+	outcome_clear(&stopped);
+	scene_clear(&scene);
+}
+END_TEST
+
+/* ---- conjugate gradients ---- */
+
+/*
+ * From zero and from the FDK volume, of exact integrals: the matched pair lets it fall at each iteration, and it ends
+ * below that of as many iterations of SIRT.
+ */
+START_TEST(the_residual_of_conjugate_gradients_falls)
+{
+	struct recipe recipe = small_recipe(&algorithm_cgls);
+	struct scene scene;
+	struct outcome cgls = {0}, sirt = {0};
+
+	recipe.fdk.on = _i == 1;
+	recipe.iterate.iterations = 25;
+	small_scene(&scene);
+	run(&scene, &recipe, &cgls);
+	ck_assert_int_eq(cgls.row_count, 25);
+	for (int i = 1; i < cgls.row_count; i++)
+		ck_assert_msg(cgls.rows[i].residual < cgls.rows[i - 1].residual, "iteration %d: %g, before %g", i + 1,
+			      cgls.rows[i].residual, cgls.rows[i - 1].residual);
+	recipe_set_algorithm(&recipe, &algorithm_sart);
+	recipe.sart.subsets = 1;
+	recipe.iterate.iterations = 25;
+	run(&scene, &recipe, &sirt);
+	ck_assert_double_lt(cgls.rows[24].residual, sirt.rows[24].residual);
+	outcome_clear(&cgls);
+	outcome_clear(&sirt);
+	scene_clear(&scene);
+}
+END_TEST
+
+/* The scan without two of its views, as line integrals or counts alike. */
+static void leave_away(struct scene *scene, const int away[2])
+{
+	const size_t pixels = (size_t)scene->geometry.columns * (size_t)scene->geometry.rows;
+	int kept = 0;
+
+	for (int i = 0; i < scene->geometry.count; i++) {
+		if (i == away[0] || i == away[1])
+			continue;
+		scene->geometry.views[kept] = scene->geometry.views[i];
+		memmove(scene->projections + pixels * (size_t)kept, scene->projections + pixels * (size_t)i,
+			sizeof(float) * pixels);
+		kept++;
+	}
+	scene->geometry.count = kept;
+}
+
+/* Views without one good pixel have no say: the volume is that of the scan without them. */
+START_TEST(blank_views_are_left_out_of_conjugate_gradients)
+{
+	const double air = 1e5;
+	const int away[] = {7, 20};
+	struct recipe recipe = small_recipe(&algorithm_cgls);
+	struct linearise counts = {.sample = SAMPLE_FLOAT32, .quantity = QUANTITY_INTENSITY, .air = air};
+	struct outcome without = {.linearise = counts}, blank = {.linearise = counts};
+	const size_t pixels = 44 * 44;
+	struct scene scene;
+	double apart = 0, norm = 0;
+
+	recipe.iterate.iterations = 12;
+	small_scene(&scene);
+	for (size_t i = 0; i < pixels * 36; i++)
+		scene.projections[i] = (float)(air * exp(-(double)scene.projections[i]));
+	for (int i = 0; i < 2; i++)
+		memset(scene.projections + (size_t)away[i] * pixels, 0, sizeof(float) * pixels);
+	run(&scene, &recipe, &blank);
+	leave_away(&scene, away);
+	run(&scene, &recipe, &without);
+	for (size_t i = 0; i < grid_voxels(&without.grid); i++) {
+		apart += pow((double)blank.last[i] - (double)without.last[i], 2);
+		norm += pow((double)without.last[i], 2);
+	}
+	ck_assert_double_lt(sqrt(apart / norm), 1e-3);
+	outcome_clear(&without);
+	outcome_clear(&blank);
+	scene_clear(&scene);
+}
+END_TEST
+
+Suite *algorithm_suite(void)
+{
+	Suite *suite = suite_create("algorithm");
+	TCase *algebra = tcase_create("algebra"), *rows = tcase_create("rows"), *cgls = tcase_create("cgls");
+
+	tcase_set_timeout(rows, 0);
+	tcase_set_timeout(cgls, 0);
+	tcase_add_loop_test(algebra, volumes_are_added_multiplied_and_divided, 0, 2);
+	tcase_add_loop_test(algebra, stacks_are_added_multiplied_and_divided_by_slots, 0, 2);
+	tcase_add_test(rows, every_algorithm_is_found_by_its_name);
+	tcase_add_loop_test(rows, a_run_that_yielded_ends_with_the_same_bits, 0, 2 * ALGORITHM_COUNT);
+	tcase_add_loop_test(rows, every_algorithm_can_be_cancelled_and_stops_by_its_rules, 0, ALGORITHM_COUNT);
+	tcase_add_loop_test(cgls, the_residual_of_conjugate_gradients_falls, 0, 2);
+	tcase_add_test(cgls, blank_views_are_left_out_of_conjugate_gradients);
+	suite_add_tcase(suite, algebra);
+	suite_add_tcase(suite, rows);
+	suite_add_tcase(suite, cgls);
+	return suite;
+}
