@@ -1,5 +1,5 @@
 /*
- * Who gets a connection: one thread accepts them for all addresses.
+ * Admission: one thread accepts the connections of all addresses.
  *
  * Acquisition must get in whatever else talks to the daemon, and on a
  * workstation all of it comes from the same address. So a limit (in all, and

@@ -9,7 +9,7 @@
 
 #include "daemon/http/text.h"
 
-/* What the fields of one head have said so far. */
+/* The fields of one head, as far as they were read. */
 struct head {
 	bool is_1_0;
 	const char *authority; /* of the target, NULL in the usual form */
@@ -229,7 +229,7 @@ static bool split_field(struct framing *framing, char *line, size_t length, stru
 	return true;
 }
 
-/* What all fields together say about who is meant and where the body ends (3.2, 6.3). */
+/* True if all fields together name one host and one end of the body (3.2, 6.3). */
 static bool judge_head(struct framing *framing, const struct head *head)
 {
 	if (head->hosts == 0 && !head->is_1_0)

@@ -42,7 +42,7 @@ struct framing {
 	uint64_t heads;   /* that were let through */
 	int status;       /* of the refusal; 0: there is none */
 	char detail[160]; /* of the refusal, one sentence */
-	/* What ends the request for a reader that has been given all that was let through. Before a head: "". */
+	/* Bytes that end the request for a reader of all that was let through. Before a head: "". */
 	const char *ending;
 };
 

@@ -73,7 +73,7 @@ struct connection *gate_find(int descriptor)
 
 /* ---- bytes that wait ---- */
 
-/* Of what is held, bytes that may go on. */
+/* The number of held bytes that may go on. */
 static size_t waiting(const struct gate *gate)
 {
 	return gate->passed - gate->given;

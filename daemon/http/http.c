@@ -269,7 +269,7 @@ static void on_connection(void *context, struct MHD_Connection *mhd, void **stat
 		*state = connection;
 	} else {
 		connection = *state;
-		/* That the library has dropped without a word, for lack of its memory. */
+		/* The library drops a request without a word when its memory runs out. */
 		request_free(connection->request);
 		connection_free(connection);
 	}

@@ -80,14 +80,14 @@ struct http_statistics {
 	long connections;               /* now */
 };
 void http_statistics(struct http *http, struct http_statistics *ret);
-/* Those that are open now; takes no lock. */
+/* The number of connections that are open now; takes no lock. */
 long http_connections(const struct http *http);
 
 /* ---- what was asked ---- */
 const char *request_id(const struct request *request);
 /* The i-th {} of the route's path, decoded; never NULL. */
 const char *request_argument(const struct request *request, int i);
-/* Of ?name=value, decoded; NULL when it is not there. */
+/* The value of ?name=value, decoded; NULL when the target has no such parameter. */
 const char *request_query(const struct request *request, const char *name);
 /* The first header of that name, or NULL. */
 const char *request_header(struct request *request, const char *name);

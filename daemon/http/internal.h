@@ -10,7 +10,7 @@
 #include "daemon/http/http.h"
 #include "daemon/http/framing.h"
 
-/* Shared by the files http*.c; nobody else includes it. */
+/* Shared by the files of this room; no other room includes this header. */
 
 enum {
 	ARGUMENTS_MAX = 4,
@@ -29,7 +29,7 @@ enum phase {
 	PHASE_SEND    /* the answer goes out */
 };
 
-/* What was read from a connection's socket and may not go on yet; its thread's own. */
+/* Bytes that were read from a connection's socket and may not go on yet; the connection's thread's own. */
 struct gate {
 	struct framing framing;
 	char *held;                         /* bytes; NULL for none */
@@ -63,7 +63,7 @@ struct connection {
 	double looked_at;     /* by the clock, whether the peer is there */
 	uint64_t bytes_then;  /* of a body, when that was */
 
-	/* Of a reply without an end in sight: s that sent bytes may stay unacknowledged; 0: another kind. */
+	/* For a reply without an end in sight, seconds that sent bytes may stay unacknowledged; 0 for other replies. */
 	double patience;
 	double answered_at;    /* the last time that nothing was outstanding, or some of it came in */
 	uint64_t acknowledged; /* bytes, then */

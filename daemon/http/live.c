@@ -38,9 +38,9 @@ uint64_t live_acknowledged(const struct connection *connection)
 }
 
 /*
- * Who vanished answers nothing: neither what was sent nor the probes of an idle
- * connection, whose end the kernel then makes an error of the socket. Who does
- * not read answers the probes of his closed window.
+ * A peer that vanished acknowledges neither data nor the probes of an idle
+ * connection; the kernel then makes its end an error of the socket. A peer that
+ * does not read still answers the probes of its closed window.
  */
 bool live_peer_gone(struct connection *connection, double now)
 {

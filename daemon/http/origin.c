@@ -1,5 +1,5 @@
 /*
- * Who is addressed, and by whose page.
+ * Host and Origin: whether this daemon is addressed, and by the page of which site.
  *
  * Listening on loopback keeps other machines out, but not the pages of other
  * sites in a browser on this machine. Such a page can resolve a name of its own

@@ -175,7 +175,7 @@ int reply_problem_of(struct request *request, const struct error *err)
 	char detail[sizeof(err->text)];
 	struct error unable;
 
-	/* What the daemon is to blame for is for its operator: clients do not see paths. */
+	/* Failures of the daemon itself are for its operator: clients do not see paths. */
 	if (problem->status >= 500 && problem->status != 503)
 		log_line(LEVEL_WARNING, "request id=%s: %s", request->id, err->text);
 	snprintf(detail, sizeof(detail), "%s", err->text);

@@ -1,5 +1,5 @@
 /*
- * What a request line and its headers say: target, query, framing, route.
+ * A request line and its headers: target, query, framing, route.
  *
  * The target is read from the line as it was sent: the library decodes %2F
  * before anybody has looked for slashes. That the head can be read in one way
@@ -218,7 +218,7 @@ static void read_framing(struct request *request)
 	request->content_length = request->chunked ? -1 : length != NULL ? strtoll(length, NULL, 10) : 0;
 }
 
-/* What the gate has refused: its head is not this one, or its body has an end that nobody sent. */
+/* Answers a request that the gate has refused: the library saw another head, or a body end that nobody sent. */
 int request_refuse(struct request *request, struct error *err)
 {
 	static const struct {

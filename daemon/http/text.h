@@ -7,7 +7,7 @@
 
 #include "core/error.h"
 
-/* What stands in targets and headers, read by the letter of the RFCs. Pure functions of their texts. */
+/* Targets and headers, read by the letter of the RFCs. Pure functions of their texts. */
 
 /*
  * Decodes %XX in place; plus: '+' is a space (queries). False for a bad escape
