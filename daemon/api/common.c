@@ -1,4 +1,4 @@
-/* What several handlers need: pages, choices, conditional and partial requests (RFC 9110, 13 and 14). */
+/* Parts of several handlers: pages, choices, conditional and partial requests (RFC 9110, 13 and 14). */
 #include <inttypes.h>
 #include <stdio.h>
 #include <string.h>
@@ -78,7 +78,7 @@ static ssize_t read_nothing(void *context, uint64_t offset, void *to, size_t siz
 
 static int reply_not_modified(struct request *request, const struct entity *entity, struct error *err)
 {
-	/* Its headers are those of a 200, the length too, but no body is ever sent. */
+	/* A 304 has the headers of a 200, the length too, but no body is ever sent. */
 	if (request_reply_read(request, 304, entity->size, read_nothing, NULL, NULL, err) != 0)
 		return err->code;
 	request_reply_header(request, "ETag", "%s", entity->etag);

@@ -1,4 +1,4 @@
-/* What the API shows of scans, jobs, workers and quarantine: document.h. */
+/* Scans, jobs, workers and quarantine as the API shows them: document.h. */
 #include "daemon/api/document.h"
 
 #include <math.h>
@@ -191,7 +191,7 @@ static void add_memory(cJSON *document, const struct recon_memory *memory)
 	cJSON_AddNumberToObject(object, "host", (double)memory->host);
 }
 
-/* What TV goes by; null without TV and before it is known. */
+/* Adds the noise and the alpha that TV uses; null without TV and before they are known. */
 static void add_denoising(cJSON *document, const struct job_record *record)
 {
 	cJSON *object;
@@ -222,7 +222,7 @@ static void add_views(cJSON *document, const struct scan_facts *scan, const stru
 	cJSON_AddNumberToObject(views, "of", all);
 }
 
-/* What a job that has not begun waits for, by name; an empty list for any other. */
+/* Adds the names of all that a job waits for before it can begin; an empty list for any other job. */
 static void add_waiting_for(cJSON *document, const struct scan_facts *scan, const struct job_record *record,
 			    enum job_obstacle obstacle)
 {

@@ -7,8 +7,8 @@
 #include "daemon/store/store.h"
 
 /*
- * What the API shows of scans, jobs, workers and quarantine. New values of the caller's (cJSON_Delete); NULL when
- * memory ran out or the catalogue could not be read. Any thread.
+ * Scans, jobs, workers and quarantine as the API shows them. Each call makes a new value, the caller's to delete
+ * (cJSON_Delete); NULL when memory ran out or the catalogue could not be read. Any thread.
  */
 
 /* brief: for lists, without geometry, derived, received and missing. Memory only. */

@@ -1,7 +1,7 @@
 /*
  * /v1/jobs/{}/events, /v1/events: server-sent events (WHATWG HTML, 9.2).
  *
- * What is told is what the catalogue holds, in its numbers: so a client that
+ * Events are sent as the catalogue holds them, with its numbers: so a client that
  * comes late or again, also to another run of the daemon, misses nothing and
  * sees nothing twice.
  */
@@ -16,11 +16,11 @@ static const double patience = 15;        /* s; with one heartbeat more, a clien
 static const char heartbeat_text[] = ":\n\n", greeting[] = "retry: 2000\n\n";
 
 /*
- * To tell one event to one watcher takes some 7 us of a processor, most of it in
- * the kernel's send. A crowd is told at once what happened within that many
+ * To send one event to one watcher takes some 7 us of a processor, most of it in
+ * the kernel's send. A crowd is sent at once what happened within that many
  * times a moment, so that however fast a job is, a thousand watchers take a
- * tenth of one processor from it, and are told within a tenth of a second.
- * What was put off is told to all in the same instant, of a grid of a few: each
+ * tenth of one processor from it, and are sent within a tenth of a second.
+ * Events that were put off are sent to all in the same instant, of a grid of a few: each
  * thread then works through its share without a sleep between, and beside the
  * others.
  */

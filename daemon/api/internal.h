@@ -8,7 +8,7 @@
 #include "daemon/store/store.h"
 #include "daemon/volumes/volumes.h"
 
-/* What the files of this room share. */
+/* Shared by the files of this room. */
 
 /* ---- the handlers, as struct route wants them ---- */
 int scan_post(void *context, struct request *request, struct error *err);
@@ -54,7 +54,7 @@ int device_list(void *context, struct request *request, struct error *err);
 int quarantine_get(void *context, struct request *request, struct error *err);
 int schema_get(void *context, struct request *request, struct error *err);
 
-/* ---- what several of them need: api/common.c ---- */
+/* ---- parts of several handlers: api/common.c ---- */
 enum { PAGE_DEFAULT = 100, PAGE_MAX = 1000 };
 struct page {
 	int limit;
@@ -90,7 +90,7 @@ int entity_select(struct request *request, const struct entity *entity, struct s
 		  struct error *err);
 void entity_headers(struct request *request, const struct entity *entity, const struct selection *selection);
 
-/* ---- what several of them need to wait for what becomes of a job: api/job.c ---- */
+/* ---- waiting for a job to change: api/job.c ---- */
 /* ?wait=SECONDS, or Prefer: wait=N; `initial` when neither is there, and never more than api->max_wait. */
 int wait_read(struct api *api, struct request *request, double initial, double *ret_seconds, struct error *err);
 /* Takes the reference to the job. From now on the request is woken at each change of it: look once more after this. */
@@ -104,11 +104,11 @@ bool job_wait_goes_on(struct request *request);
 int volume_verify(struct api *api, const char *job, const struct volume_record *volume, uint64_t first, uint64_t bytes,
 		  struct error *err);
 
-/* ---- what several of them need of volumes: api/volume.c ---- */
+/* ---- volumes in requests and replies: api/volume.c ---- */
 enum { VOLUME_FILENAME_MAX = 96 };
 int volume_find(struct api *api, const struct job_facts *job, const char *name, struct volume_record *ret_volume,
 		struct error *err);
-/* Of the request's path: its job and the volume of it. */
+/* Finds the job and the volume that the request's path names. */
 int volume_asked(struct api *api, struct request *request, struct job_facts *ret_facts,
 		 struct volume_record *ret_volume, struct error *err);
 /* ?format=, ?type= and ?scale=; the name is left to the caller. */

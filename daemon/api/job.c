@@ -200,7 +200,7 @@ int job_get(void *context, struct request *request, struct error *err)
 	return wait_end(request, 200, err);
 }
 
-/* Its files are gone; what is still open of them would keep their space. */
+/* The job's files are gone; a descriptor or mapping that is still open would keep their space. */
 static void forget_files(struct api *api, struct job *job)
 {
 	char directory[1024];

@@ -32,12 +32,12 @@ struct stream {
 	struct watch watch, made;
 	long long after; /* the number of the last event that was looked at */
 
-	/* What goes out next: text, then the encoded copy's bytes. */
+	/* The bytes that go out next: this text, then the encoded copy. */
 	char *text;
 	size_t length, sent;
 	struct encoded *encoded;
 	struct volume_record volume; /* of the encoded copy */
-	bool headed;                 /* length and digest were told */
+	bool headed;                 /* length and digest were sent */
 	uint64_t offset;
 	bool last; /* nothing comes behind the text */
 };
@@ -111,7 +111,7 @@ static int begin_body(struct stream *stream, const struct encoded_facts *facts)
 	struct error err;
 	int length;
 
-	/* It may have been made a while ago, and its bytes may be those of the kept file. */
+	/* The encoded copy may have been made a while ago, and its bytes may be those of the kept file. */
 	if (volume_verify(stream->api, stream->facts.id, &stream->volume, 0, stream->volume.bytes, &err) != 0)
 		return -1;
 	EVP_EncodeBlock(digest, facts->sha256, sizeof(facts->sha256));
@@ -145,7 +145,7 @@ static int last_part(struct stream *stream)
 	return set_text(stream, text, length);
 }
 
-/* The name of the next volume that was told of behind stream->after, "" for none yet. */
+/* The name of the next volume that has an event behind stream->after, "" for none yet. */
 static int next_volume(struct stream *stream, char *ret_name, size_t size)
 {
 	struct event_record *events;
@@ -181,17 +181,17 @@ static ssize_t next_part(struct stream *stream)
 	long long before = stream->after;
 	int code;
 
-	job_facts(stream->job, &facts); /* asked first: what comes before the end is told by then */
+	job_facts(stream->job, &facts); /* asked first: events from before the end are there by then */
 	if (facts.removed || next_volume(stream, name, sizeof(name)) != 0)
 		return -1;
 	if (name[0] != '\0') {
 		code = volume_find(stream->api, &stream->facts, name, &volume, &err);
-		/* What is gone is left out, as long as no part of it was begun; the job's document tells of it. */
+		/* A volume whose file is gone is left out before its part begins; the job's document has a warning. */
 		if (code == 0 && volume_verify(stream->api, stream->facts.id, &volume, 0, 0, &err) == ERR_DAMAGED)
 			return 0;
 		if (code == 0)
 			return begin_part(stream, &volume);
-		/* Told of before a crash that took it: the job makes it again. */
+		/* A crash took the volume after its event was sent: the job makes it again. */
 		stream->after = before;
 		return code == ERR_NOT_FOUND && !facts.ended && !request_stopping(stream->request) ? READ_WAIT : -1;
 	}
@@ -267,7 +267,7 @@ static ssize_t stream_read(struct request *request, void *to, size_t size)
 
 /* ---- the request ---- */
 
-/* Stands behind the event that told of this volume. */
+/* Moves stream->after behind the event of this volume. */
 static int skip_to(struct stream *stream, const char *name, struct error *err)
 {
 	char next[sizeof(((struct volume_record *)NULL)->name)];

@@ -265,7 +265,7 @@ static int reply_packed(struct request *request, struct content *content, bool e
 	return 0;
 }
 
-/* What of the file goes into these bytes of the content; NULL: all of it. */
+/* Checks the part of the file that these bytes of the content are made from; selection NULL: all of it. */
 static int verify_selected(struct api *api, const char *job, const struct volume_record *volume,
 			   const struct content *content, const struct selection *selection, struct error *err)
 {
