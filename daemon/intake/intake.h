@@ -20,7 +20,7 @@
  *
  * Each whole projection counts by itself: what came before a break is kept.
  * Where the end of a body may show that all of it was wrong (a digest, a
- * compressed frame, a length not told before), projections are written under
+ * compressed frame, a length not known before), projections are written under
  * their claims as they come, but recorded only at the end, or at a break; with
  * a Content-Digest it is all or nothing.
  */
@@ -47,7 +47,7 @@ struct uploads_statistics {
 void uploads_statistics(struct uploads *uploads, struct uploads_statistics *ret);
 
 /*
- * What the body should be: projections first .. last, or with `image` the
+ * The target says what the body should be: projections first .. last, or the
  * image named. Reads the request's Content-Length, -Encoding and -Digest and
  * refuses what cannot be right: ERR_INVALID with both lengths; for an unknown
  * encoding the reply is set and *ret_upload is NULL. Takes the reference to the

@@ -9,8 +9,8 @@
 #include "proto/zstream.h"
 
 /*
- * What upload.c (a body's way to the writers), intake/write.c (from there to the disk and the catalogue) and
- * intake/pool.c (the memory between them) share. Nobody else's.
+ * Shared by upload.c (a body's way to the writers), write.c (from there to the disk and the catalogue) and pool.c (the
+ * memory between them), and by no other file.
  *
  * uploads.lock guards the queue, the pool and the part of each upload that says so; it is never held over disk work or
  * hashing. request_wake is called under it.

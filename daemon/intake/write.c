@@ -1,6 +1,6 @@
 /*
  * Uploads, the writers' side: from the queue to the disk and the catalogue. The bytes are synced, then the rows are
- * committed, many projections at once; then each upload is told. upload.c has the picture.
+ * committed, many projections at once; then each upload learns its outcome. upload.c has the picture.
  */
 #include <assert.h>
 #include <errno.h>
@@ -102,7 +102,7 @@ static int write_claimed(struct slot *slot, struct error *err)
 	return err->code;
 }
 
-/* slot->outcome tells how far it came. */
+/* slot->outcome says how far the slot came. */
 static int process_projection(struct slot *slot, struct error *err)
 {
 	enum claim claim;
@@ -119,7 +119,7 @@ static int process_projection(struct slot *slot, struct error *err)
 	return claim == CLAIM_BUSY ? park(slot, err) : write_claimed(slot, err);
 }
 
-/* As it came, or the scan's own counts made float32. */
+/* Stores an image as it came, or converts it from the scan's sample type to float32. */
 static int process_image(struct slot *slot, struct error *err)
 {
 	struct upload *upload = slot->upload;
@@ -260,7 +260,7 @@ static int write_sums(unsigned long long number, struct slot *const slots[], int
 	return 0;
 }
 
-/* What was not stored has no record; unsynced, since what it would say is true. */
+/* Blanks the records of projections that were not stored; without a sync, since a record that stays is true. */
 static void take_back_sums(struct slot *const slots[], int count, const struct received_projection *batch, bool all)
 {
 	struct error ignored;
