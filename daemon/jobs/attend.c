@@ -86,7 +86,7 @@ double worker_patience_ends(const struct worker *worker)
 	if (worker->arriving == NULL || worker->ending.due || worker->yielding)
 		return NEVER;
 	stored_scan_facts(worker->arriving, &facts);
-	/* It has everything: what it does takes as long as it takes. */
+	/* All projections were announced: the worker takes as long as it takes. */
 	if (worker->announced == facts.count)
 		return NEVER;
 	return (facts.arrived > worker->attended ? facts.arrived : worker->attended) + PATIENCE;

@@ -48,7 +48,7 @@ struct digester {
 
 /* ---- one volume ---- */
 
-/* Of a volume's file: where its voxels begin and end. */
+/* Where the voxels of a volume's file begin and end. */
 struct voxels {
 	size_t start, end;
 	struct seal seal; /* of no blocks: the file has none */
@@ -169,7 +169,7 @@ static int make_digest(struct digester *digester, struct job *job, const struct 
 	store_volume_path(store, facts.id, volume->name, path);
 	if (!copy_digest(store, facts.id, volumes, count, volume))
 		code = hash_volume(path, volume, &digester->stop, volume->sha256, err);
-	/* What it was told of is; but it may have been made again since. */
+	/* The volume was settled when it was announced; but it may have been made again since. */
 	if (code == 0)
 		code = durable_settle_named(path, err);
 	if (code == 0)
@@ -268,7 +268,7 @@ static void *digest_loop(void *context)
 	struct digester *digester = context;
 	struct task *task;
 
-	/* Of this thread alone. Good manners, no condition. */
+	/* The priority is that of this thread alone; a failure is no trouble. */
 	setpriority(PRIO_PROCESS, (id_t)gettid(), NICENESS);
 	pthread_mutex_lock(&digester->lock);
 	while (!atomic_load(&digester->stop)) {

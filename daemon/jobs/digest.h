@@ -4,7 +4,7 @@
 #include "daemon/jobs/job.h"
 
 /*
- * The SHA-256 of kept volumes, made behind everything else: a volume is told of
+ * The SHA-256 of kept volumes, made behind everything else: a volume is announced
  * and its job ends without it. Threads that give way to all others read each
  * file once it is on the disk, most often from the page cache.
  *

@@ -1,4 +1,4 @@
-/* What becomes of a job when its worker is through with it: decided in outcome.c, carried out here. */
+/* The end of a worker's job, decided in outcome.c and carried out here. */
 #include <stdio.h>
 
 #include "daemon/jobs/workers.h"
@@ -17,10 +17,10 @@ static int record_ending(struct worker *worker, struct error *err)
 	    .reason = ending->to == JOB_QUEUED || ending->to == JOB_WAITING ? ending->error_text : NULL};
 	int code = 0;
 
-	/* It was faster than the catalogue. */
+	/* The worker was done before the catalogue had recorded that the job runs. */
 	if (worker->arriving != NULL && ending->to == JOB_SUCCEEDED)
 		code = worker_record_running(worker, err);
-	/* One that waits as before has no news. */
+	/* A job that waits as before has no change to record. */
 	if (code == 0 && (ending->to != JOB_WAITING || ending->crashed || worker->arriving == NULL))
 		code = job_set_state(worker->job, ending->to, &change, err);
 	return code;
@@ -164,7 +164,7 @@ static void hold_job(struct supervise *supervise, struct worker *worker, enum jo
 	}
 }
 
-/* What an outcome asks for beside the job's new state. */
+/* Does all that an outcome asks for beside the job's new state. */
 static void carry_out(struct supervise *supervise, struct worker *worker, const struct outcome *outcome,
 		      const struct worker_words *words)
 {

@@ -1,4 +1,4 @@
-/* Who gets which job: idle workers are given work, and others are asked to make room. */
+/* Dispatch: idle workers are given jobs, and others are asked to make room. */
 #include <errno.h>
 #include <limits.h>
 #include <stdio.h>
@@ -12,7 +12,9 @@
 
 enum { BEGINNINGS_MAX = 5 }; /* tries to begin a job whose files cannot be read */
 
-/* Of a scan that was closed with projections missing: those that were there then; what was damaged since comes again.
+/*
+ * For a scan that was closed with projections missing: names those that were there then. One that was damaged since
+ * comes again.
  */
 static int add_present(struct message *message, struct stored_scan *scan, const struct scan_facts *facts,
 		       struct error *err)
@@ -147,7 +149,7 @@ static int give_job(struct supervise *supervise, struct worker *worker, struct j
 		return error_set_errno(err, ENOMEM, "message");
 	job_record(job, &record);
 	code = make_start(supervise, &record, message, &scan, &facts, &why);
-	/* It has lost something since the job was queued. */
+	/* The scan has lost something since the job was queued. */
 	if (code == 0 && !arriving && !facts.ready) {
 		message_clear(message);
 		free(message);

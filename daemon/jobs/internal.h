@@ -7,7 +7,7 @@
 
 #include "daemon/jobs/job.h"
 
-/* What job.c (the list of jobs and what the API does), state.c and work.c (what the supervisor does) share. */
+/* Shared by job.c (the list of jobs, and the calls of the API), state.c and work.c (the calls of the supervisor). */
 
 /* Why a job that could run is not given to a worker just now. In memory only: after a restart it is tried at once. */
 struct hold {

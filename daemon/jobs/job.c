@@ -1,4 +1,4 @@
-/* The list of jobs, and what the API does with them: job.h. */
+/* The list of jobs, and the calls of the API: job.h. */
 #include "daemon/jobs/internal.h"
 
 #include <assert.h>
@@ -190,7 +190,7 @@ int jobs_list(struct jobs *jobs, const char *after, int limit, struct job **ret_
 
 /* ---- at the start ---- */
 
-/* What the files say of the iteration that the row promises. */
+/* The iteration of the checkpoint that the row promises, if its file is there; else 0. */
 static int checkpoint_there(const struct jobs *jobs, const struct job_record *record)
 {
 	char directory[1024], path[1100];
@@ -208,7 +208,7 @@ static int recover_waiting(struct job *job, struct error *err)
 
 	if (job->record.cancel_asked)
 		return job_change_state(job, JOB_CANCELLED, &asked, err);
-	/* One that cannot be read fails when it is to be run, with the reason. */
+	/* A request that cannot be read fails when the job is to be run, with the reason. */
 	if (job_request_parse(job->record.request, strlen(job->record.request), &request, &why) == 0) {
 		job->fdk = request.recipe.fdk.on;
 		recipe_clear(&request.recipe);
@@ -309,7 +309,7 @@ struct store *jobs_store(const struct jobs *jobs)
 	return jobs->store;
 }
 
-/* ---- what the API does ---- */
+/* ---- calls of the API ---- */
 
 int jobs_repeat(struct jobs *jobs, const char *key, const uint8_t digest[32], struct job **ret_job, struct error *err)
 {

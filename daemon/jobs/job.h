@@ -44,7 +44,7 @@ int jobs_open(struct store *store, struct jobs **ret_jobs, struct error *err);
 void jobs_close(struct jobs *jobs); /* NULL is fine; all references must be back */
 struct store *jobs_store(const struct jobs *jobs);
 
-/* ---- what the API does ---- */
+/* ---- calls of the API ---- */
 /*
  * The job that an Idempotency-Key made before, or NULL in *ret_job (and 0).
  * ERR_CONFLICT, pointer "": that key came with another request (digest: SHA-256 of its body).
@@ -73,7 +73,7 @@ int jobs_list(struct jobs *jobs, const char *after, int limit, struct job **ret_
 /*
  * DELETE. A job that has not ended is asked to: waiting and queued ones are
  * cancelled on return, a running or attended one soon after (watch it). An ended job is
- * removed with its rows and files. *ret_removed tells which it was.
+ * removed with its rows and files. *ret_removed says which it was.
  */
 int jobs_delete(struct jobs *jobs, struct job *job, bool *ret_removed, struct error *err);
 /* With its files. ERR_CONFLICT, naming the job, while one that has not ended uses the scan. */
@@ -109,7 +109,7 @@ struct jobs_statistics {
 };
 void jobs_statistics(struct jobs *jobs, struct jobs_statistics *ret);
 
-/* ---- what the supervisor does, in its one thread ---- */
+/* ---- calls of the supervisor, in its one thread ---- */
 struct job_change {
 	int error_code; /* with JOB_FAILED */
 	const char *error_pointer, *error_text;
@@ -145,14 +145,14 @@ int job_doubts(const struct job *job, unsigned losses);
 /* Projections reconstructed so far. */
 void job_reconstructed(struct job *job, int count);
 /*
- * What keeps a job from a worker though everything of its scan is there. It is not given to one before `until` (of
- * CLOCK_MONOTONIC) and before the disk has `space` bytes free; it keeps its place in the queue, and others go before
- * it. Returns how often in a row it was held for this reason.
+ * An obstacle keeps a job from a worker though its scan is complete. The job is not given to one before `until`
+ * (clock_monotonic) and before the disk has `space` bytes free; it keeps its place in the queue, and others go before
+ * it. Returns how often in a row it was held for this obstacle.
  */
 enum job_obstacle { JOB_UNHINDERED, JOB_NO_SPACE, JOB_DISK_TROUBLE, JOB_OBSTACLE_COUNT };
-extern const char *const job_obstacle_names[JOB_OBSTACLE_COUNT]; /* as `waiting_for` tells: "space", "disk" */
+extern const char *const job_obstacle_names[JOB_OBSTACLE_COUNT]; /* as in `waiting_for`: "space", "disk" */
 int job_hold(struct job *job, enum job_obstacle obstacle, double until, unsigned long long space);
-/* Lets go whose time has come and who has room now; true while others are still held. */
+/* Releases held jobs whose time has come and for which the disk has room; true while others are still held. */
 bool jobs_review_holds(struct jobs *jobs, double now, unsigned long long space);
 enum job_obstacle job_obstacle(struct job *job); /* any thread */
 /* The queued job that is due and not held, or NULL; it stays queued until job_set_state. */

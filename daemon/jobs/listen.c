@@ -1,4 +1,4 @@
-/* What workers say: messages of proto/message.h, and what is said to them. */
+/* Messages from the workers and to them (proto/message.h). */
 #include <errno.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -20,7 +20,7 @@ void worker_order(struct worker *worker, enum message_kind kind)
 		job_facts(worker->job, &facts);
 		snprintf(message.job, sizeof(message.job), "%s", facts.id);
 	}
-	/* Gone already: its pidfd tells. */
+	/* A worker that has gone already is seen by its pidfd. */
 	if (message_send(worker->child.socket, &message, &err) != 0)
 		log_line(LEVEL_DEBUG, "worker %d: %s", worker->index, err.text);
 }
@@ -32,7 +32,7 @@ void worker_cancel(struct supervise *supervise, struct worker *worker)
 	worker->deadline = clock_monotonic() + supervise->options.cancel_seconds;
 }
 
-/* ---- what they say ---- */
+/* ---- from the workers ---- */
 
 /* Something of the job could not be kept: then it must not seem to have succeeded. */
 static void stop_job(struct supervise *supervise, struct worker *worker, const struct error *why)
@@ -111,7 +111,7 @@ static void on_message(struct supervise *supervise, struct worker *worker, const
 		job_facts(worker->job, &facts);
 	if (worker->job == NULL || worker->ending.due || strcmp(facts.id, message->job) != 0)
 		return;
-	/* All else after them, as it was told. */
+	/* Rows are recorded before anything that the worker said after them. */
 	if (message->kind != MESSAGE_ROW || worker->row_count == JOB_ROWS_MAX)
 		add_rows(supervise, worker);
 	switch (message->kind) {

@@ -1,4 +1,4 @@
-/* What becomes of a job when its worker is through with it: outcome.h. The first row that fits decides. */
+/* The table of decisions at the end of a worker's job: outcome.h. The first row that fits decides. */
 #include "daemon/jobs/outcome.h"
 
 #include <assert.h>
@@ -24,7 +24,7 @@ static const struct row {
     /* Also where a client asked for its end meanwhile: the result is there. */
     {1 << END_DONE, 0, CONDITION_UNRECORDED | CONDITION_STALE, {.to = JOB_SUCCEEDED, .reason = ""}},
     {ANY, CONDITION_CANCELLED, 0, {.to = JOB_CANCELLED, .reason = ""}},
-    /* What could not be recorded is lost, even where the worker was done before it heard that it should stop. */
+    /* A result that could not be recorded is lost, even where the worker was done before it heard of that. */
     {ANY,
      CONDITION_UNRECORDED | CONDITION_FULL,
      0,

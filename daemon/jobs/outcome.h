@@ -4,8 +4,8 @@
 #include "daemon/jobs/job.h"
 
 /*
- * What becomes of a job when its worker is through with it: one table of decisions, without clocks, sockets, locks or
- * files. The supervisor gathers the conditions, asks, and carries out what it is told (ending.c). Any thread.
+ * The decision what becomes of a job when its worker is through with it: one table, without clocks, sockets, locks or
+ * files. The supervisor gathers the conditions, asks, and carries out the outcome (ending.c). Any thread.
  */
 
 /* How a worker was through with its job: what its last message said, or what its process did. */
@@ -18,7 +18,7 @@ enum worker_end {
 	END_IO,        /* a file could not be read or written; it may pass */
 	END_DAMAGED,   /* what it read of the scan does not fit its checksums */
 	END_INVALID,   /* what it was given makes no sense to it, a checkpoint for one */
-	END_OTHER,     /* any other error that it told */
+	END_OTHER,     /* any other error */
 	END_DIED,      /* its process ended without a word about the job */
 	END_STOPPED,   /* the same while the daemon stops */
 	END_COUNT
@@ -26,7 +26,7 @@ enum worker_end {
 /* For the code of a worker's last message about its job. */
 enum worker_end worker_end_of(int code);
 
-/* What else is known at that moment; bits. */
+/* Conditions at that moment; bits. */
 enum condition {
 	CONDITION_CANCELLED = 1 << 0,  /* a client asked for the job's end */
 	CONDITION_UNRECORDED = 1 << 1, /* the daemon could not record something of this run, and stopped it */
@@ -40,7 +40,7 @@ enum condition {
 	CONDITION_ALL = (1 << 9) - 1
 };
 
-/* Where the job goes on from. */
+/* The point from which the job goes on. */
 enum outcome_from {
 	FROM_START,
 	FROM_BEGINNING, /* the checkpoint that this worker began from */
@@ -48,7 +48,7 @@ enum outcome_from {
 	FROM_SAID       /* the iteration of the worker's last message */
 };
 
-/* Whose words the log and a failed job bear, with their error code. */
+/* The author of the words and of the error code that the log and a failed job bear. */
 enum outcome_words {
 	WORDS_WORKER, /* what it said, or how it died */
 	WORDS_DAEMON  /* why the daemon stopped the run */

@@ -73,7 +73,7 @@ static bool yields_before(const struct queue_running *a, const struct queue_runn
 	return a->priority != b->priority ? a->priority < b->priority : a->ticket > b->ticket;
 }
 
-/* Who gives way, or the lowest priority below `priority` and of those the latest ticket. */
+/* The job that gives way, or the one of the lowest priority below `priority`, and of those the latest ticket. */
 static int least_of(const struct queue_running *running, int count, enum priority priority)
 {
 	int least = -1;

@@ -6,7 +6,7 @@
 #include "proto/recipe.h"
 
 /*
- * Who is next: stat before urgent before routine, and in the order of their
+ * The order of jobs: stat before urgent before routine, and in the order of their
  * tickets within a priority. A job keeps the ticket of its first time in the
  * queue, so one that yielded stands in front of its class again.
  *
@@ -30,11 +30,11 @@ int queue_position(const struct queue_entry *entry);               /* 1 = next; 
 /* The first that is not held, or NULL. */
 struct queue_entry *queue_next(const struct queue *queue);
 
-/* What the workers are busy with. */
+/* A job that a worker is busy with. */
 struct queue_running {
 	enum priority priority;
 	long long ticket;
-	bool leaving;   /* told to yield or to cancel: its worker is as good as free */
+	bool leaving;   /* asked to yield or to cancel: its worker is as good as free */
 	bool gives_way; /* to any other: it has nothing to do just now */
 };
 

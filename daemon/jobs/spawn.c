@@ -37,7 +37,7 @@ void worker_path(char *ret_path, size_t size)
 	snprintf(ret_path, size, "cbct-worker");
 }
 
-/* What the child inherits: no input, our output and error, its socket. */
+/* Sets the descriptors that the child inherits: no input, our output and error, its socket. */
 static int set_files(posix_spawn_file_actions_t *files, int socket)
 {
 	int result = posix_spawn_file_actions_addopen(files, STDIN_FILENO, "/dev/null", O_RDONLY, 0);

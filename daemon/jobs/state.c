@@ -1,4 +1,4 @@
-/* The states of a job: which may follow which (job.h), and how one becomes the next. */
+/* The states of a job: the transitions that job.h allows, and how they are made. */
 #include "daemon/jobs/internal.h"
 
 #include <errno.h>
@@ -80,7 +80,7 @@ static void enter_queue(struct job_record *record, enum job_state from, const st
 		record->queued = clock_realtime();
 		return;
 	}
-	/* What its scan lost was sent again: no run of its was lost. */
+	/* A job that comes back from waiting for lost projections has not lost a run. */
 	record->attempts += !change->yielded && from != JOB_WAITING;
 	record->checkpoint = change->checkpoint;
 	record->iteration = change->checkpoint;

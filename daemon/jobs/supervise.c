@@ -39,7 +39,7 @@ void supervise_wake(void *context)
 		return;
 }
 
-/* What others see of a worker. */
+/* Other threads see this copy. */
 void worker_publish(struct supervise *supervise, const struct worker *worker)
 {
 	struct worker_facts facts = {.index = worker->index,
@@ -105,7 +105,7 @@ static void worker_died(struct supervise *supervise, struct worker *worker, bool
 	double now = clock_monotonic();
 	bool gone;
 
-	/* Its last words first: they may say that the job is done. */
+	/* The worker's last messages come first: they may say that the job is done. */
 	worker_read(supervise, worker, true, &gone);
 	child_reap(&worker->child, how, sizeof(how));
 	snprintf(text, sizeof(text), "its worker ended with %s", how);
@@ -154,7 +154,7 @@ static void look_at_clock(struct supervise *supervise, bool stopping)
 			worker_finish_job(supervise, worker);
 		if (worker->state == WORKER_ABSENT && !stopping && now >= worker->start_at)
 			start_worker(supervise, worker);
-		/* Also when its job has ended since: it was told to quit, and may not heed it. */
+		/* A worker whose job has ended since was asked to quit, too, and may not heed it. */
 		if (worker->state != WORKER_ENDING && worker->deadline > supervise->stop_by)
 			worker->deadline = supervise->stop_by;
 		if (worker->state != WORKER_ABSENT && now >= worker->deadline) {
@@ -250,7 +250,7 @@ static void read_workers(struct supervise *supervise, const struct pollfd *fds, 
 		if (fds[2 * i + 1].revents != 0) {
 			worker_died(supervise, worker, stopping);
 		} else if (gone && worker->state != WORKER_ENDING) {
-			/* It closed its socket or speaks nonsense, but lives. */
+			/* The worker closed its socket or speaks nonsense, but lives. */
 			worker->state = WORKER_ENDING;
 			worker->deadline = clock_monotonic() + EXIT;
 			worker_publish(supervise, worker);
@@ -291,7 +291,7 @@ static void quit_workers(struct supervise *supervise)
 
 		if (worker->state == WORKER_ABSENT)
 			continue;
-		/* One that has not even said hello has nothing to lose. */
+		/* A worker that has not even said hello has nothing to lose. */
 		if (worker->state == WORKER_STARTING)
 			child_kill(&worker->child);
 		else
@@ -334,7 +334,7 @@ static void *supervise_loop(void *context)
 		look_at_clock(supervise, true);
 		wait_and_read(supervise, true);
 	}
-	/* What the catalogue would not take stays `running` there; the next start queues it again. */
+	/* A job whose end the catalogue would not take stays `running` there; the next start queues it again. */
 	for (int i = 0; i < supervise->count; i++) {
 		if (supervise->workers[i].settler.running)
 			worker_finish_job(supervise, &supervise->workers[i]);

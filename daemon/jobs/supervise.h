@@ -11,8 +11,8 @@
  * nothing with it: its job is queued again (three times at most, then it has
  * failed), and a new worker is started, later and later while they keep dying.
  *
- * A free worker attends a waiting job with FDK: it is told which projections are
- * stored, in the order of their arrival, and reconstructs them. A job of higher
+ * A free worker attends a waiting job with FDK: the stored projections are announced
+ * to it, in the order of their arrival, and reconstructs them. A job of higher
  * priority takes the worker from it, and any other that has something to do
  * after two seconds in which nothing arrived; it then begins again later. So it
  * does, at once, when an image comes late or the scan is closed, since what was
@@ -46,7 +46,7 @@ void supervise_stop(struct supervise *supervise);
 bool supervise_ready(struct supervise *supervise);
 
 /*
- * What a job needs against what the workers have: ERR_IMPOSSIBLE with both
+ * Compares the memory that a job needs with that of the workers: ERR_IMPOSSIBLE with both
  * numbers, pointer "/grid/size", when none of them could ever run it. Passes
  * while no worker has said yet what it has: the worker asks again at the start.
  */

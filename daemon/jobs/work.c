@@ -1,4 +1,4 @@
-/* What the supervisor does with jobs: job.h. */
+/* The calls of the supervisor: job.h. */
 #include <assert.h>
 #include <stddef.h>
 #include <stdio.h>
@@ -293,7 +293,7 @@ int job_add_rows(struct job *job, const struct history_row *rows, int count, str
 	assert(count > 0 && count <= JOB_ROWS_MAX);
 	for (int i = 0; i < count && code == 0; i++) {
 		code = job_event_make(&events[i], "progress", history_row_document(&rows[i]), err);
-		/* A run that was lost is repeated, what was told of it is not. */
+		/* A run that was lost is repeated, its events are not. */
 		snprintf(once[i], sizeof(once[i]), "row %d", rows[i].iteration);
 		events[i].once = once[i];
 	}

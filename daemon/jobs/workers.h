@@ -11,8 +11,8 @@
 #include "proto/message.h"
 
 /*
- * Inside of the supervisor: supervise.c (the loop), listen.c (what workers say), ending.c (what becomes of their jobs),
- * give.c (who gets which job) and attend.c (projections that still arrive). All of it is the supervisor's one thread,
+ * Inside of the supervisor: supervise.c (the loop), listen.c (messages), ending.c (the end of their jobs),
+ * give.c (dispatch) and attend.c (projections that still arrive). All of it is the supervisor's one thread,
  * but where something else is said.
  */
 enum {
@@ -28,7 +28,7 @@ enum {
  */
 #define PATIENCE 2.0
 
-/* What is to become of a worker's job; kept until the catalogue has taken it. */
+/* The end of a worker's job; kept until the catalogue has taken it. */
 struct ending {
 	bool due;
 	enum job_state to;
@@ -40,8 +40,8 @@ struct ending {
 };
 
 /*
- * A worker died between telling of a volume and settling it: that is done for it,
- * in a thread, since it waits for the disk and other workers wait for nobody.
+ * Settles the volumes of a worker that died after it announced them, in a thread of
+ * its own: the disk may be slow, and other workers do not wait for it.
  */
 struct settler {
 	struct supervise *supervise;
@@ -69,18 +69,18 @@ struct worker {
 	struct queue_running running;
 	int checkpoint;      /* that it began from */
 	size_t volume_bytes; /* of one volume of its job */
-	int unsettled;       /* volumes that it has told of and that are not on the disk, as far as it said */
-	/* What it told of last and the catalogue has yet to take; none between two turns. */
+	int unsettled;       /* volumes that it has announced and not settled */
+	/* The latest rows of its history, which the catalogue has yet to take; none between two turns. */
 	struct history_row rows[JOB_ROWS_MAX];
 	int row_count;
 	bool cancelling, yielding;
-	double room_since; /* monotonic: it was told to make room for projections that came later; NEVER */
+	double room_since; /* monotonic: it was asked to make room for projections that came later; NEVER */
 	/* While its job waits for the rest of its projections: the scan, a reference; NULL otherwise. */
 	struct stored_scan *arriving;
 	unsigned basis, losses;       /* of the scan when it began */
 	int announced, reconstructed; /* projections that it knows to be there, that it has reconstructed */
 	double attended, again;       /* monotonic: since when; not before, after the catalogue refused */
-	int failure_code;             /* why we told it to stop, 0: we did not */
+	int failure_code;             /* why the daemon stopped its job; 0: it did not */
 	char failure_text[320];
 	struct ending ending;
 	struct settler settler;
@@ -125,7 +125,7 @@ void worker_order(struct worker *worker, enum message_kind kind);
 void worker_cancel(struct supervise *supervise, struct worker *worker);
 
 /* ---- ending.c ---- */
-/* What a worker said of its job, or what its process did. */
+/* The last that a worker said of its job, or what its process did. */
 struct worker_words {
 	enum worker_end end;
 	int code;         /* enum error_code that a failed job bears */
