@@ -90,7 +90,7 @@ static int make_header(struct content *content, const char *path, struct error *
 	code = options->format->header(&content->scaled, options->type, &provenance, content->header,
 				       &content->header_size, err);
 	provenance_clear(&provenance);
-	/* One from before there were extensions is sent with a header of today. */
+	/* A file from before there were extensions is sent with a header of today. */
 	content->as_stored = code == 0 && content_is_plain(content) && options->format == volume_formats &&
 			     content->start == content->header_size && content->header_size == sizeof(stored) &&
 			     read_file(content, 0, stored, sizeof(stored)) == 0 &&

@@ -57,7 +57,7 @@ static void encoded_free(struct encoded *encoded)
 
 /* ---- making one ---- */
 
-/* Nobody waits for it any more, or the daemon stops. */
+/* True if nobody waits for the copy any more, or the daemon stops. */
 static bool is_unwanted(struct encoded *encoded)
 {
 	struct encoded_copies *owner = encoded->owner;
@@ -94,7 +94,7 @@ static int pour(struct encoded *encoded, struct source *source, struct sink *sin
 		char *room = sink_room(sink);
 
 		if (room == NULL)
-			return 0; /* the sink tells why */
+			return 0; /* the sink says why */
 		if (is_unwanted(encoded))
 			return error_set(err, ERR_CANCELLED, "nobody waits for it");
 		got = source_read(source, room, SINK_BLOCK);
@@ -121,7 +121,7 @@ static int open_temporary(struct encoded *encoded, int *ret_file, struct error *
 	return 0;
 }
 
-/* Its descriptor is the caller's to close, also after a failure. */
+/* Makes the copy. ret->descriptor is the caller's to close, also after a failure. */
 static int make(struct encoded *encoded, struct encoded_facts *ret, struct error *err)
 {
 	struct source source = {0};

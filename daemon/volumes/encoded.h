@@ -19,8 +19,8 @@ int encoded_copies_new(struct store *store, int threads, struct encoded_copies *
 void encoded_copies_free(struct encoded_copies *copies); /* NULL is fine; all references must be back */
 
 /*
- * Of this volume with these options; zstd: as one frame (what is packed by its
- * format always is, in its own way). Returns at once; wake is called when it is made or has failed.
+ * The copy of this volume with these options; zstd: as one frame (a format that is
+ * packed by itself stays as it is). Returns at once; wake is called when it is made or has failed.
  */
 int encoded_get(struct encoded_copies *copies, const char *job, const struct volume_record *volume,
 		const struct content_options *options, bool zstd, struct encoded **ret_encoded, struct error *err);

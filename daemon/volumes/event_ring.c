@@ -34,7 +34,7 @@ void event_text_release(struct event_text *text)
 		free(text);
 }
 
-/* Data is one object on one line; it is told with the job that it is about. */
+/* Data is one object on one line; the job that it is about is added as its first member. */
 static int event_text(const struct event_record *event, char *to, size_t size)
 {
 	const char *members = event->data + 1;
@@ -119,7 +119,7 @@ static int catch_up(struct event_ring *ring, struct error *err)
 	long long newest = store_last_event(ring->store);
 	int code = 0;
 
-	/* What nobody has watched for long need not go through the ring. */
+	/* Events that nobody has watched for long need not go through the ring. */
 	if (newest - ring->last > RING) {
 		while (ring->count > 0)
 			ring_drop(ring);

@@ -25,7 +25,7 @@ struct event_text {
 };
 
 /*
- * What comes next behind event number *after, of this job or (NULL) of all, and
+ * Gives the next event behind number *after, of this job or (NULL) of all, and
  * moves *after behind it. NULL in *ret_text when there is nothing more yet;
  * *after then may have moved over others' events.
  */

@@ -125,7 +125,7 @@ static struct mapping *find(struct mappings *mappings, const struct stat *status
 	return NULL;
 }
 
-/* Those that match, or all beyond the ones that stay. */
+/* Drops the unused mappings of files in `directory`; NULL: all but the `stay` that were used last. */
 static void drop_idle(struct mappings *mappings, int stay, const char *directory)
 {
 	size_t length = directory != NULL ? strlen(directory) : 0;
