@@ -144,10 +144,10 @@ void verified_note(struct verified *verified, const struct stat *status, int par
 
 /* store/reconcile.c. Called while nobody else has the store. */
 int store_reconcile(struct store *store, bool fresh, struct error *err);
-/* What is in quarantine/ and belongs back, before the catalogue is made again. */
+/* Moves scans and jobs that are whole out of quarantine/ again, before the catalogue is made again. */
 int store_take_back(struct store *store, struct error *err);
 
-/* What store_open loads and tidies up: store/scan_load.c, store/job_sweep.c. */
+/* Parts of store_open: store/scan_load.c, store/job_sweep.c. */
 int store_load_scans(struct store *store, struct error *err);
 int store_sweep_scans(struct store *store, struct error *err);
 int store_sweep_jobs(struct store *store, struct error *err);

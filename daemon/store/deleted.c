@@ -1,4 +1,4 @@
-/* What clients have deleted: store/deleted.h. */
+/* The list of what clients have deleted: store/deleted.h. */
 #include "daemon/store/deleted.h"
 
 #include <errno.h>

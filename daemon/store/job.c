@@ -1,4 +1,4 @@
-/* Rows of jobs: what they are, what became of them, what they kept, and what is told of it. */
+/* Rows of jobs, of their history, volumes, warnings and events, as they are written. */
 #include <errno.h>
 #include <math.h>
 #include <stdio.h>
@@ -169,7 +169,7 @@ static int rewind_history(struct store *store, const struct job_record *job, str
 	return query_run(&query);
 }
 
-/* Events too: what is told once is told once more. */
+/* Events go too: those with a key may be recorded once more. */
 static int remove_past(struct store *store, const char *id, struct error *err)
 {
 	static const char *const statements[] = {

@@ -1,4 +1,4 @@
-/* Jobs at the start: what their rows and their directories say of each other. */
+/* Jobs at the start: their rows are held against their directories. */
 #include <errno.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -12,7 +12,7 @@
 #include "daemon/store/quarantine.h"
 #include "proto/scan_directory.h"
 
-/* Of jobs that are gone, too: a client may have seen them. */
+/* The numbers of removed jobs' events count, too: a client may have seen them. */
 int store_load_last_event(struct store *store, struct error *err)
 {
 	struct query query;
@@ -24,7 +24,7 @@ int store_load_last_event(struct store *store, struct error *err)
 }
 
 /*
- * Volumes that were told of and may not be whole on the disk: their job was not
+ * Removes volumes that were announced and may not be whole on the disk: their job was not
  * through with them. A checkpoint may be of a later iteration than the catalogue
  * knows: a run that went on from there would not make them again.
  */
@@ -69,7 +69,7 @@ static bool has_row(const struct sweep *sweep, const char *name, size_t length)
 	return false;
 }
 
-/* Half-written files go. A volume that no row tells of is set aside, unless the job makes it again over it. */
+/* Half-written files go. A volume without a row is set aside, unless the job makes it again over it. */
 static int sweep_file(void *context, const char *name, struct error *err)
 {
 	const struct sweep *sweep = context;
@@ -90,7 +90,7 @@ static int sweep_file(void *context, const char *name, struct error *err)
 	return 0;
 }
 
-/* A volume that is gone is a warning of its job; one that cannot be written now is told to who asks for the volume. */
+/* A volume that is gone is a warning of its job; where that fails, a request for the volume says so. */
 static void warn_gone(const struct sweep *sweep, const struct volume_record *volume)
 {
 	struct warning_record warning = {.code = "damaged_volume"};

@@ -18,12 +18,12 @@
 struct pages;
 enum { PAGES_BYTES = 4096, PAGES_RESERVE = 8 };
 
-/* One for each catalogue that is open; it must outlive the connections. */
+/* Makes the checker of one open catalogue; it must outlive the connections. */
 int pages_new(struct pages **ret_pages, struct error *err);
 void pages_free(struct pages *pages);             /* NULL is fine */
 const char *pages_vfs(const struct pages *pages); /* for sqlite3_open_v2 */
 
-/* What a database file is, by its first page alone. */
+/* The kind of a database file, by its first page alone. */
 enum pages_kind {
 	PAGES_NONE,   /* not there, or empty */
 	PAGES_PLAIN,  /* without checksums: made by an earlier cbctd */

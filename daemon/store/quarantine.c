@@ -1,4 +1,4 @@
-/* What was set aside: store/quarantine.h. */
+/* Entries of the quarantine: store/quarantine.h. */
 #include "daemon/store/quarantine.h"
 
 #include <errno.h>

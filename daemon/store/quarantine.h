@@ -6,10 +6,10 @@
 #include "core/error.h"
 
 /*
- * STATE/quarantine/: what was found in the state directory and cannot be used, each entry NAME with a note NAME.json of
- * where it was, when it was moved and why. The daemon puts things there and never takes them away, but for what a
- * rebuild of the catalogue finds to be whole (store/reconcile.c). An entry may be a note alone: of a catalogue that was
- * not there at all. Whoever runs the machine removes entries, or puts them back, once they were seen to.
+ * STATE/quarantine/: files that were found in the state directory and cannot be used, each entry NAME with a note
+ * NAME.json of where it was, when it was moved and why. The daemon puts things there and never takes them away, but for
+ * what a rebuild of the catalogue finds to be whole (store/reconcile.c). An entry may be a note alone: of a catalogue
+ * that was not there at all. Whoever runs the machine removes entries, or puts them back, once they were seen to.
  */
 enum { QUARANTINE_NAME_MAX = 96, QUARANTINE_WHY_MAX = 400 };
 

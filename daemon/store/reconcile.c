@@ -208,7 +208,7 @@ static int take_in(struct reconciliation *r, const char *id, const char *path, s
 	} else if (code == ERR_NOT_FOUND || record_empty(r->store, r->kind, id)) {
 		if (directory_visit(path, note_content, &contents, err) != 0)
 			return err->code;
-		/* The process died while it was made: nobody was told of it. */
+		/* The process died while the scan was made: no client knows of it. */
 		if (!contents.any || contents.unfinished)
 			return directory_remove(path, err);
 		snprintf(why.text, sizeof(why.text), "it has no " RECORD_FILE);
@@ -368,7 +368,8 @@ int store_reconcile(struct store *store, bool fresh, struct error *err)
 		 fresh ? "it was missing or empty" : "it was older than what was acknowledged",
 		 repairs->found[RECORD_SCAN], repairs->found[RECORD_JOB]);
 	log_line(LEVEL_WARNING, "catalogue: %s", why);
-	/* What was damaged has a note already; and one record may be ahead of the commit that a crash cut off. */
+	/* A catalogue that was damaged has a note already; and one record may be ahead of the commit that a crash cut
+	 * off. */
 	return repairs->remade || (!fresh && found == 1)
 		   ? 0
 		   : quarantine_note(store->directory, "catalogue.sqlite", why, err);

@@ -1,4 +1,4 @@
-/* Rows of the catalogue in the directory that they tell of: store/record.h. */
+/* Rows of the catalogue, kept in the directory that they describe: store/record.h. */
 #include "daemon/store/record.h"
 
 #include <errno.h>
@@ -375,8 +375,8 @@ static int bind_value(sqlite3_stmt *statement, int index, const cJSON *value)
 }
 
 /*
- * Of those members of the row that are columns: an INSERT, with `updated` the UPDATE of the row with an id, or with
- * `child` the INSERT of a row below that with an id. Returns how many values there are before the id.
+ * Writes a statement of those members of the row that are columns: an INSERT, with `updated` the UPDATE of the row with
+ * an id, or with `child` the INSERT of a row below that with an id. Returns how many values there are before the id.
  */
 static int make_statement(const char *table, const char *names, const cJSON *row, bool updated,
 			  const struct child *child, char ret_sql[SQL_MAX], const cJSON *ret_values[COLUMNS_MAX])

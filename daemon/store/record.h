@@ -51,9 +51,9 @@ void record_undo(struct store *store, enum record_kind kind, const char *id);
 bool record_empty(const struct store *store, enum record_kind kind, const char *id);
 /* 0: there is none. Microseconds. */
 long long record_stamp(const struct store *store, enum record_kind kind, const char *id);
-/* That in `directory`. ERR_NOT_FOUND: there is none. ERR_INVALID: it is damaged. Free with cJSON_Delete. */
+/* Reads the record in `directory`. ERR_NOT_FOUND: there is none. ERR_INVALID: it is damaged. Free with cJSON_Delete. */
 int record_read(const char *directory, enum record_kind kind, const char *id, cJSON **ret_record, struct error *err);
-/* Of a record that was read; 0 where it makes no sense. */
+/* The stamp inside of a record; 0 where it makes no sense. */
 long long record_own_stamp(enum record_kind kind, const cJSON *record);
 /* The rows become those of the record. On failure some may have: the caller rolls back. */
 int record_apply(struct store *store, enum record_kind kind, const cJSON *record, struct error *err);

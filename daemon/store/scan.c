@@ -557,7 +557,7 @@ static int insert_scan(struct store *store, struct stored_scan *scan, struct sca
 {
 	int code;
 
-	/* One at a time, so that the room in the array is still there after the commit. */
+	/* Scans are inserted one at a time, so that the room in the array is still there after the commit. */
 	pthread_mutex_lock(&store->insertion_lock);
 	pthread_mutex_lock(&store->scans_lock);
 	code = scans_reserve(store, err);

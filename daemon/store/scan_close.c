@@ -75,7 +75,7 @@ static int close_row(struct store *store, struct stored_scan *scan, int received
 	return code;
 }
 
-/* What it will be is made before the lock of the catalogue is taken. */
+/* The scan as it will be measured is made before the lock of the catalogue is taken. */
 static int close_once(struct store *store, struct stored_scan *scan, unsigned char *present, bool *ret_done,
 		      struct error *err)
 {

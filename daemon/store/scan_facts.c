@@ -1,4 +1,4 @@
-/* What is known of a scan without looking at the disk: store.h. */
+/* Facts of a scan that are in memory: store.h. */
 #include <stdio.h>
 #include <string.h>
 
@@ -34,7 +34,6 @@ void store_scan_directory(const struct store *store, const char *id, char ret_pa
 	snprintf(ret_path, 1024, "%s/scans/%s", store->directory, id);
 }
 
-/* These and the next: the scan's lock is held. */
 bool stored_scan_complete(const struct stored_scan *scan)
 {
 	return scan->received == scan->count || (scan->closed && scan->lost_count == 0);
@@ -51,7 +50,7 @@ static bool is_convertible(const struct stored_scan *scan)
 
 /*
  * Images and the end of a scan come and never go, though an image that was lost may come again as another: what is
- * there, and which images, tells all that its projections are understood by.
+ * there, and which images, is all that its projections are understood by.
  */
 static unsigned basis_of(const struct stored_scan *scan)
 {

@@ -178,7 +178,7 @@ int stored_scan_make_room(struct stored_scan *scan, struct error *err)
 	return code == 0 ? directory_sync(directory, err) : code;
 }
 
-/* What is gone or cut off is lost before anybody can ask for it; what is left is checked in the background. */
+/* Projections that are gone or cut off are lost before any request; the others are checked in the background. */
 static void check_files(struct stored_scan *scan)
 {
 	const long long wanted = (long long)projections_bytes(scan), size = file_size(scan, "projections.raw");

@@ -90,7 +90,7 @@ static const char *const migrations[] = {
     " kind TEXT NOT NULL,"
     " data TEXT NOT NULL);"
     "CREATE INDEX events_of_job ON events (job, number);",
-    /* What a job that starts again does once more is told once: the name of such an event, else NULL. */
+    /* De-duplication key: a restarted job repeats its work, an event with this key is recorded once. NULL: no key. */
     ("ALTER TABLE events ADD COLUMN once TEXT;"
      "CREATE UNIQUE INDEX events_once ON events (job, once);"),
     /* A removed job's events go with it; that it was removed stays, under a number of theirs. */
@@ -106,10 +106,10 @@ static const char *const migrations[] = {
      " request_sha256 BLOB NOT NULL,"
      " scan INTEGER NOT NULL REFERENCES scans(number) ON DELETE CASCADE) WITHOUT ROWID;"
      "CREATE INDEX scan_keys_of_scan ON scan_keys (scan);"),
-    /* Of the record in the directory, store/record.h. */
+    /* The stamp of the record in the directory, store/record.h. */
     ("ALTER TABLE scans ADD COLUMN stamp INTEGER NOT NULL DEFAULT 0;"
      "ALTER TABLE jobs ADD COLUMN stamp INTEGER NOT NULL DEFAULT 0;"),
-    /* What TV goes by, NULL before that was measured. */
+    /* The noise and the alpha that TV uses, NULL before they were measured. */
     ("ALTER TABLE jobs ADD COLUMN noise_hu REAL;"
      "ALTER TABLE jobs ADD COLUMN tv_alpha REAL;"),
     "ALTER TABLE volumes ADD COLUMN estimate_mm REAL NOT NULL DEFAULT 0;", /* around metal; 0: there is none */

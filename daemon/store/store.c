@@ -322,7 +322,7 @@ static int open_catalogue(struct store *store, bool rebuild, struct error *err)
 	if (code != 0)
 		return code;
 	code = load(store, err);
-	/* What the start itself writes is small: the index of the log, records that follow. */
+	/* The start itself writes little: the index of the log, records that follow. */
 	if (code == ERR_NO_SPACE && store_reserve_spend(store)) {
 		unload(store);
 		store->repairs = (struct store_repairs){.remade = false};

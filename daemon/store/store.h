@@ -16,8 +16,8 @@
  *
  *   STATE/lock              held by the one daemon that uses STATE
  *   STATE/reserve           room for the commits that empty a full disk
- *   STATE/deleted           what clients have deleted (store/deleted.h)
- *   STATE/quarantine/       what was found and belongs nowhere (store/quarantine.h)
+ *   STATE/deleted           ids that clients have deleted (store/deleted.h)
+ *   STATE/quarantine/       files that were found and belong nowhere (store/quarantine.h)
  *   STATE/catalogue.sqlite  scans, projections, jobs, volumes, history, warnings, events
  *   STATE/scans/ID/         scan.json projections.raw flat.f32 dark.f32 defects.u8 (proto/scan_directory.h)
  *                           projections.sums (proto/sums.h)
@@ -56,11 +56,10 @@ struct store_hooks {
 /* Makes STATE where it is missing. ERR_CONFLICT: another process has it. hooks may be NULL, else are copied. */
 int store_open(const char *directory, const struct store_hooks *hooks, struct store **ret_store, struct error *err);
 void store_close(struct store *store); /* NULL is fine; all references must be back */
-/* As it was given to store_open; lives as long as the store. */
+/* The path that was given to store_open; lives as long as the store. */
 const char *store_directory(const struct store *store);
 
-/* Of any thread: nothing happens unless err is of a sync that failed (ERR_SYNC); then the store has failed, see above.
- */
+/* Any thread. Does nothing unless err is of a sync that failed (ERR_SYNC); then the store has failed, see above. */
 void store_distrust(struct store *store, const struct error *err);
 
 /*
@@ -73,7 +72,7 @@ void store_reserve_save(const struct store *store);
 /* Bytes that the file system of STATE has free. */
 int store_space(const struct store *store, unsigned long long *ret_bytes, struct error *err);
 
-/* What store_open had to mend. */
+/* Repairs that store_open has made. */
 struct store_repairs {
 	int found[2];  /* scans, jobs that the catalogue did not know, or knew less of than their directories */
 	int set_aside; /* directories moved to quarantine/ */
@@ -106,7 +105,7 @@ struct store_key {
  * Takes the parsed scan over (on success only), makes its directory with
  * scan.json and projections.raw at full size. ERR_NO_SPACE when the disk cannot
  * hold all of it. key may be NULL; ERR_CONFLICT when another request has used it
- * meanwhile: store_scan_repeat tells which scan it made. The reference is the caller's.
+ * meanwhile: store_scan_repeat finds the scan that it made. The reference is the caller's.
  */
 int store_scan_create(struct store *store, struct scan *scan, const struct store_key *key,
 		      struct stored_scan **ret_scan, struct error *err);
@@ -136,7 +135,7 @@ void store_scan_remove_files(const struct store *store, const char *id);
 
 /* Constant while the reference lives; references from store_scan_list may have none (NULL). */
 const struct scan *stored_scan_parsed(struct stored_scan *scan);
-/* What is reconstructed: the same, or once it was closed with projections missing, those views that are there. */
+/* The scan that is reconstructed: the same, or once closed with projections missing, the views that are there. */
 const struct scan *stored_scan_measured(struct stored_scan *scan);
 const char *stored_scan_id(const struct stored_scan *scan);
 /* STATE/scans/ID */
@@ -225,7 +224,7 @@ int store_scan_close(struct store *store, struct stored_scan *scan, struct error
 
 /* ---- projections on their way in ---- */
 /*
- * Who wants to write projection k into projections.raw claims it first:
+ * A caller that wants to write projection k into projections.raw claims it first:
  *
  *   CLAIM_GRANTED  it is yours: pwrite at k * scan_projection_bytes(), then its record
  *                  (stored_scan_put_sum), fdatasync of both, then store_put_projections;
@@ -343,8 +342,8 @@ struct event {
 };
 int store_job_insert(struct store *store, const struct job_record *job, const struct event *event, struct error *err);
 /*
- * What becomes of the rows that tell of a job's runs: with PAST_REWINDS the history behind the checkpoint goes, with
- * PAST_GOES all history, volumes, warnings and events, but for its states.
+ * The rows that a job's runs have left stay (PAST_STAYS); with PAST_REWINDS the history behind the checkpoint goes,
+ * with PAST_GOES all history, volumes, warnings and events, but for its states.
  */
 enum job_past { PAST_STAYS, PAST_REWINDS, PAST_GOES };
 /* All columns that can change. `end`, when not NULL, is a second event. */
@@ -369,7 +368,7 @@ int store_job_add_rows(struct store *store, const char *id, const struct history
  */
 int store_job_add_volume(struct store *store, const char *id, const struct volume_record *volume,
 			 const struct event *event, struct error *err);
-/* Its digest; nothing when it was made again since, or is gone. Its file is on the disk. */
+/* Records a volume's digest, unless it was made again since, or is gone. Its file is on the disk. */
 int store_job_digest_volume(struct store *store, const char *id, const struct volume_record *volume, struct error *err);
 /*
  * The header of a kept volume's file and `bytes` bytes of its voxels from `first` on (as many as there are) are held

@@ -450,7 +450,7 @@ static void check_projections(struct stored_scan *scan)
 		return;
 	}
 	for (int i = 0; i < scan->count && !must_end(scan->store); i++)
-		stored_scan_read(scan, file, i, samples, &sum, &err); /* tells of what it finds itself */
+		stored_scan_read(scan, file, i, samples, &sum, &err); /* notes damage itself */
 	close(file);
 	free(samples);
 }
@@ -501,7 +501,7 @@ static void *check_loop(void *context)
 	struct store *store = context;
 	struct stored_scan *scan;
 
-	/* Of this thread alone. Good manners, no condition. */
+	/* The priority is that of this thread alone; a failure is no trouble. */
 	setpriority(PRIO_PROCESS, (id_t)gettid(), NICENESS);
 	pthread_mutex_lock(&store->check_lock);
 	while (!store->checks_end) {

@@ -11,7 +11,7 @@
 
 enum { PARTS = -SUMS_SCAN };
 
-/* What the file says: the parts, then the projections. */
+/* The records of the file: of the parts, then of the projections. */
 struct records {
 	struct sum parts[PARTS], *projections;
 	unsigned char part_states[PARTS], *states; /* enum sum_state */

@@ -158,7 +158,7 @@ static int check_block(int file, const struct seal *seal, int block, void *buffe
 	return damaged(err, volume, text);
 }
 
-/* Those blocks that hold bytes first .. last of the file, and the first, where the header is. */
+/* Checks the blocks that hold bytes first .. last of the file, and the first block, where the header is. */
 static int check_blocks(struct verified *verified, int file, const struct stat *status, const struct seal *seal,
 			uint64_t first, uint64_t last, const struct volume_record *volume, struct error *err)
 {
@@ -183,7 +183,7 @@ int store_volume_gone(const struct volume_record *volume, struct error *err)
 	return damaged(err, volume, "its file is gone");
 }
 
-/* One without checksums, or whose checksums are damaged: what the catalogue says of its voxels decides. */
+/* Checks a file whose checksums are missing or damaged against the digest in the catalogue. */
 static int check_digest(int file, const struct stat *status, const struct volume_record *volume, struct error *err)
 {
 	enum { BLOCK = 1 << 20 };
