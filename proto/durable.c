@@ -134,7 +134,7 @@ int durable_write(struct durable *d, const void *from, size_t size, struct error
 
 int durable_map(struct durable *d, size_t size, char **ret_bytes, struct error *err)
 {
-	/* What it does by itself where there is no such call takes long; elsewhere nothing is left to do. */
+	/* Where the file system cannot set space aside, the C library writes zeros, which takes long. */
 	int result = posix_fallocate(d->file, 0, (off_t)size);
 	void *bytes;
 

@@ -237,7 +237,7 @@ static void three(struct header_text *h, const char *before, const double number
 }
 
 /*
- * One key a line: a text as JSON writes it, without its quotes, anything else as
+ * Writes one key a line: a text as JSON writes it, without its quotes, anything else as
  * JSON. MetaIO reads 500 bytes of a line and loses what lies behind a longer one,
  * so that a longer value is left out; none is but what nobody would write by hand.
  */

@@ -16,7 +16,7 @@
 enum volume_type { VOLUME_FLOAT32 /* 1/mm */, VOLUME_INT16 /* HU */, VOLUME_TYPE_COUNT };
 extern const char *const volume_type_names[VOLUME_TYPE_COUNT]; /* "float32", "int16" */
 
-/* Of a file of ours; FORMAT_REVISION grows with each change of what is written for the same volume. */
+/* The longest header that is written; FORMAT_REVISION grows with each change of what is written for one volume. */
 enum { FORMAT_HEADER_MAX = 16384, FORMAT_REVISION = 2 };
 
 struct volume_format {

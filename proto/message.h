@@ -5,7 +5,7 @@
 #include "proto/scan_directory.h"
 
 /*
- * What the daemon and a worker say to each other, over a SOCK_SEQPACKET socket
+ * The messages between the daemon and a worker, over a SOCK_SEQPACKET socket
  * pair: one JSON object a packet, so that a trace of it can be read.
  *
  * The worker speaks first (hello), then waits. One job at a time.

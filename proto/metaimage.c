@@ -1,6 +1,6 @@
 /*
  * MetaImage headers (ITK's MetaIO): lines "Key = value", the last of which is
- * ElementDataFile. Keys that tell nothing of pixels or their place are passed over.
+ * ElementDataFile. Keys that say nothing of pixels or their place are passed over.
  */
 #include "proto/metaimage.h"
 
@@ -17,7 +17,7 @@ static const char *const type_names[PIXEL_TYPE_COUNT] = {
     [PIXEL_FLOAT32] = "MET_FLOAT", [PIXEL_FLOAT64] = "MET_DOUBLE",
 };
 
-/* What the lines told, before it is known how many dimensions there are. */
+/* The values of the lines, before it is known how many dimensions there are. */
 struct lines {
 	struct metaimage *image;
 	double size[4], spacing[4], element_size[4], origin[4], matrix[16];

@@ -83,7 +83,7 @@ int provenance_read(const cJSON *json, struct provenance *ret_provenance, struct
 	return 0;
 }
 
-/* One more part of the sentence where there is room for all of it. */
+/* Adds one more part to the sentence where there is room for all of it. */
 __attribute__((format(printf, 3, 4))) static void add_part(char *text, size_t size, const char *format, ...)
 {
 	char part[400];

@@ -4,12 +4,12 @@
 #include "proto/patient.h"
 #include "proto/version.h"
 
-/* Where a volume comes from: what its file says beside the voxels. Texts that are "" are not told. */
+/* Where a volume comes from: what its file says beside the voxels. Texts that are "" are left out. */
 struct provenance {
 	struct patient patient;
 	char program[40]; /* "cbctd 1.0.0", that made the voxels */
 	char stage[16];   /* of the job that made it: "fdk", "sart" ... */
-	int iteration;    /* told with a stage only */
+	int iteration;    /* with a stage only */
 	char job[64], scan[64];
 	char scan_name[256];
 	cJSON *recipe; /* owned, or NULL */

@@ -127,7 +127,7 @@ static int read_algorithm(struct recipe *recipe, const struct algorithm *algorit
 	return code == 0 && stop != NULL ? read_stop(recipe, stop, stop_pointer, err) : code;
 }
 
-/* What numbers without a method have always meant: explicit steps. */
+/* Numbers without a method have always meant explicit steps. */
 static int method_meant(struct json_reader *reader)
 {
 	const cJSON *alpha = json_member(reader, "alpha", false);

@@ -36,10 +36,9 @@ int job_request_resolve(struct job_request *request, const struct scan *scan, st
  * (print it with json_print: cJSON's own printer drops digits). NULL for no memory.
  */
 cJSON *job_request_json(const struct job_request *request);
-/* Of these members those that say what is computed: stages, grid, projector ... but not what is kept. NULL for no
- * memory. */
+/* Those members that say what is computed: stages, grid, projector ... but not what is kept. NULL for no memory. */
 cJSON *recipe_json(const struct recipe *recipe);
-/* What a stage that is off would have done does not count. */
+/* True if both compute the same: parameters of a stage that is off do not count. */
 bool job_request_same(const struct job_request *a, const struct job_request *b);
 
 #endif

@@ -42,19 +42,19 @@ struct run {
 	bool ahead;  /* the next volume's file is prepared while the device computes */
 	bool prepared;
 	struct saver *saver; /* NULL before the first */
-	/* The volume that was written last: "final" may be the same iterate. Told of, and settled while the run goes
+	/* The volume that was written last: "final" may be the same iterate. Announced, and settled while the run goes
 	 * on. */
 	struct saved_volume saved; /* no bytes: there is none */
 	char saved_name[32], saved_stage[16];
 	int saved_iteration;
-	struct saved_volume link; /* another name of it, told of and not settled; no bytes: there is none */
+	struct saved_volume link; /* another name of it, announced and not settled; no bytes: there is none */
 	char link_name[32];
 	struct error trouble; /* what stopped the run from a question of its */
 };
 
 static int settle(struct run *run, bool wait, struct error *err);
 
-/* Asked so often that a volume is told to be settled soon after it is. */
+/* Asked so often that a volume is reported settled soon after it is. */
 static bool run_cancelled(void *context)
 {
 	struct run *run = context;
@@ -80,7 +80,7 @@ static void run_progress(void *context, enum stage stage, int iteration, double 
 {
 	const struct reconstruction_hooks *hooks = ((struct run *)context)->hooks;
 
-	if (stage != STAGE_FDK) /* which is told of with every projection: push_some */
+	if (stage != STAGE_FDK) /* FDK's progress is reported with every projection: push_some */
 		prepare(context, stage, iteration);
 	if (hooks->recon.progress != NULL)
 		hooks->recon.progress(hooks->recon.context, stage, iteration, fraction);
@@ -179,7 +179,7 @@ static int settle_link(struct run *run, struct error *err)
 	return code != 0 ? code : announce_settled(run, run->link_name, err);
 }
 
-/* Tells when the volume that was saved last is settled; waits for that where it must. */
+/* Announces when the volume that was saved last is settled; waits for that where it must. */
 static int settle(struct run *run, bool wait, struct error *err)
 {
 	bool done = true;
@@ -498,7 +498,7 @@ struct reconstruction {
 	char *samples; /* [batch][row][column] */
 	struct recon *recon;
 	bool resumed;
-	/* What the recon is opened with. */
+	/* Parameters that the recon is opened with. */
 	const struct backend *backend;
 	struct device *device;
 	const struct reconstruction_options *options;
@@ -568,7 +568,7 @@ static int open_recon(struct reconstruction *reconstruction, struct error *err)
 	if (code == 0 && reconstruction->resumed)
 		code = resume(&reconstruction->run, reconstruction->recon, options->checkpoint,
 			      reconstruction->iteration, err);
-	/* What the file holds: opened again, it is no surprise. */
+	/* The iteration that the file holds: opened again, it causes no second warning. */
 	if (code == 0 && reconstruction->resumed)
 		reconstruction->iteration = recon_iteration(reconstruction->recon);
 	return code;
@@ -620,7 +620,7 @@ static void set_text(char *ret, size_t size, const char *text)
 	snprintf(ret, size, "%s", text != NULL ? text : "");
 }
 
-/* What the volumes' files will say, but for stage and iteration. */
+/* Sets the provenance in the volumes' files, but for stage and iteration. */
 static int set_provenance(struct reconstruction *reconstruction, const struct reconstruction_options *options,
 			  struct error *err)
 {
@@ -893,7 +893,7 @@ int reconstruction_finish(struct reconstruction *reconstruction, struct error *e
 	struct run *run = &reconstruction->run;
 	struct error trouble;
 	bool again = false;
-	/* Of projections that came one by one it is known only now. */
+	/* Where projections came one by one, stuck pixels are known only now. */
 	int code = reconstruction->pushed_count == reconstruction_wanted(reconstruction)
 		       ? heed_stuck_pixels(reconstruction, &again, err)
 		       : 0;
@@ -903,7 +903,7 @@ int reconstruction_finish(struct reconstruction *reconstruction, struct error *e
 	if (code == 0)
 		code = recon_run(reconstruction->recon, err);
 
-	/* What was told of is settled, however the run ends. */
+	/* Announced volumes are settled, however the run ends. */
 	if (run->trouble.code == 0)
 		settle(run, true, &run->trouble);
 	if (run->trouble.code != 0 && (code == 0 || code == ERR_BUSY || code == ERR_CANCELLED)) {

@@ -17,9 +17,9 @@ struct saved_volume {
 /*
  * The pipeline over a directory, in three steps: opened, given its projections in
  * any order and as they arrive, and finished. Each kept volume becomes a file of
- * out_directory and is told of twice: by on_volume as soon as everybody can read
+ * out_directory and is announced twice: by on_volume as soon as everybody can read
  * it there, whole, and by on_settled when it is on the disk. However a run ends,
- * what was told of is settled first, unless that is what failed: then its file is
+ * announced volumes are settled first, unless that is what failed: then its file is
  * removed. Where "final" is the same iterate as
  * the volume before it, it is another link to that file. The worker and `cbct
  * recon` both do it this way. One thread at a time.
@@ -33,7 +33,7 @@ struct reconstruction_hooks {
 	void (*on_open)(void *context, const struct recon_memory *memory, const char *plan);
 };
 
-/* What is to be reconstructed; all of it is borrowed until reconstruction_close. */
+/* The scan, the recipe and the place of the results; all of it is borrowed until reconstruction_close. */
 struct reconstruction_options {
 	const char *scan_directory, *out_directory;
 	/*
@@ -48,7 +48,7 @@ struct reconstruction_options {
 	const char *program, *job, *scan;
 	const struct patient *patient; /* NULL: as scan.json says */
 	/*
-	 * Of a run that yielded, or NULL; `iteration` is the one it holds as far as the
+	 * The checkpoint of a run that yielded, or NULL; `iteration` is the one it holds as far as the
 	 * caller knows. The file itself knows better (a crash may lie between its writing
 	 * and the caller's note): where they differ, the file counts and a warning
 	 * "checkpoint" says so. One that is missing or damaged is ERR_INVALID.

@@ -594,7 +594,7 @@ static void view_parameters(const struct view *view, const struct geometry *geom
 	ret->source_to_detector = source[2] - centre[2];
 }
 
-/* What RTK has one number for in a whole stack: pitch, square corners, handedness. */
+/* Checks what RTK has one number for in a whole stack: pitch, square corners, handedness. */
 static int check_pixels(const struct geometry *from, int k, const struct rtk_stack *stack, double tolerance,
 			struct error *err)
 {

@@ -199,7 +199,7 @@ static int write_back(const struct durable *file, size_t before, size_t at, size
 {
 	/* A hint: what is not begun here, the sync at the end does. */
 	sync_file_range(file->file, (off_t)at, (off_t)(end - at), SYNC_FILE_RANGE_WRITE);
-	/* An error that is told here is not told again. */
+	/* An error is reported once. */
 	if (at > before &&
 	    sync_file_range(file->file, (off_t)before, (off_t)(at - before), SYNC_FILE_RANGE_WAIT_AFTER) != 0 &&
 	    errno != ENOSYS)
@@ -255,7 +255,7 @@ int saver_new(bool sealed, struct saver **ret_saver, struct error *err)
 	return 0;
 }
 
-/* Its thread is told, and gone on return. */
+/* Ends the file's thread, which is gone on return. */
 static void drop_file(struct saver *saver)
 {
 	pthread_mutex_lock(&saver->lock);

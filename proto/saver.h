@@ -17,7 +17,7 @@ struct saver;
 
 /* sealed: each file ends with the checksums of its bytes (proto/seal.h). */
 int saver_new(bool sealed, struct saver **ret_saver, struct error *err);
-/* What has its name is waited for, what has none yet leaves nothing behind. */
+/* Waits for a file that has its name already; a file without one leaves nothing behind. */
 void saver_abandon(struct saver *saver);
 /* The same first; what was prepared goes too. NULL is fine. */
 void saver_free(struct saver *saver);

@@ -422,7 +422,7 @@ void scan_free(struct scan *scan)
 	free(scan);
 }
 
-/* ---- telling back ---- */
+/* ---- the scan in words ---- */
 
 /* To a millionth: what a different way to write the same orbit changes is not shown. */
 static double shown(double value)
@@ -483,7 +483,7 @@ __attribute__((format(printf, 3, 4))) static void warn(cJSON *list, const char *
 	cJSON_AddItemToArray(list, json_warning(code, detail));
 }
 
-/* What follows from the arc and the detector's place: which weights, and what they cannot mend. */
+/* Warns of weights that follow from the arc and the detector's place, and of what they cannot mend. */
 static void warn_weights(cJSON *list, const struct orbit *orbit)
 {
 	const double displaced_share = 0.1; /* of half the detector's width; a calibrated offset stays below */
@@ -566,7 +566,7 @@ static void warn_angles(cJSON *list, const struct orbit *orbit)
 	for (int i = 0; i < orbit->count; i++)
 		views[i] = (struct placed_view){orbit->angle[i] / degree, i};
 	qsort(views, (size_t)orbit->count, sizeof(*views), compare_angles);
-	/* What lies outside of a short arc is no hole in it: passed over once. */
+	/* The gap outside of a short arc is no hole in it: it is passed over once. */
 	for (int i = 0; i < orbit->count; i++) {
 		int next = (i + 1) % orbit->count;
 		double gap = views[next].angle - views[i].angle + (next == 0 ? 360 : 0);
@@ -617,7 +617,7 @@ static void warn_mirrored(cJSON *list, const struct geometry *geometry, bool tur
 
 		view_turns(&geometry->views[k], &columns, &handedness);
 		first = k == 0 ? handedness : first;
-		/* Of one on its side, columns run up or down. */
+		/* Columns of a detector on its side run up or down. */
 		against += columns < 0 && !turned;
 		if (handedness != first && odd++ == 0)
 			first_odd = k;

@@ -21,7 +21,7 @@
  * Kept volumes are NAME.nii files: a NIfTI header with an extension that says where
  * they come from, VOLUME_FILE_OFFSET bytes in all, and float32 voxels, so that raw
  * and nifti are both sent straight from the file. Files from before there was an
- * extension begin their voxels earlier: volume_own_head of proto/format.h tells.
+ * extension begin their voxels earlier: volume_own_head of proto/format.h says where.
  */
 enum { VOLUME_FILE_OFFSET = 4096 };
 

@@ -22,7 +22,7 @@
  *
  * A record is written and synced together with the bytes that it describes, before either is acknowledged. So a record
  * that is good says what was acknowledged, and the bytes are checked against it whenever they are read: CRC-32 (zlib's)
- * for speed, SHA-256 where somebody outside is told.
+ * for speed, SHA-256 where the outside sees it.
  *
  * Any thread; one writer of a record at a time.
  */
@@ -52,7 +52,7 @@ enum sum_state { SUM_NONE, SUM_GOOD, SUM_DAMAGED };
 /* CRC-32 of `before` and these bytes behind it; 0 is that of nothing. */
 uint32_t checksum(uint32_t before, const void *data, size_t bytes);
 
-/* Of `bytes` bytes with the checksum `after` behind others with `before`. */
+/* The CRC-32 of `bytes` bytes with the checksum `after` behind others with `before`. */
 uint32_t checksum_join(uint32_t before, uint32_t after, size_t bytes);
 
 /* The file with all records blank, durably; one that was there is replaced. */

@@ -22,7 +22,7 @@
 
 enum { HEAD_BYTES = 1 << 16 }; /* what lies behind them is no header */
 
-/* What the other formats call the types that they share. */
+/* The other formats' names for the types that they share. */
 static const struct {
 	int nifti;
 	const char *nrrd, *nrrd_too;
@@ -33,7 +33,7 @@ static const struct {
     [PIXEL_FLOAT32] = {16, "float", "float"},           [PIXEL_FLOAT64] = {64, "double", "double"},
 };
 
-/* What a header told. */
+/* The contents of a header. */
 struct layout {
 	int size[3];
 	double direction[3][3]; /* of axis i in LPS mm, spacing included */
