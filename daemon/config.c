@@ -348,7 +348,7 @@ static int each_flag(int argc, char **argv, struct config *config, enum config_a
 	return 0;
 }
 
-/* Help and version are told whatever the settings are. */
+/* Help and version are printed whatever the settings are. */
 static bool is_told(enum config_action action)
 {
 	return action == CONFIG_HELP || action == CONFIG_VERSION;

@@ -4,7 +4,7 @@
 #include <cjson/cJSON.h>
 
 /*
- * The kinds of problems that clients are told of (RFC 9457), in replies and in a job's `error` alike. The name ends the
+ * The kinds of problems in problem documents (RFC 9457), in replies and in a job's `error` alike. The name ends the
  * type, urn:cbctd:problem:NAME; it is stable, since clients switch on it. Any thread.
  */
 struct problem {

@@ -4,7 +4,7 @@
 #include <pthread.h>
 
 /*
- * Somebody who wants to be woken when something changes.
+ * A watcher is woken when something changes.
  *
  * wake() only wakes (resumes a connection, writes an eventfd): it runs in the
  * thread of the change, with the list's lock held, and must not block, nor call

@@ -7,7 +7,7 @@
  * between steps; so cancel and yield need no second thread. A job that begins
  * before its projections are complete gets their numbers over the same socket,
  * and reads them from the file, which the daemon has just written. It dies with the
- * daemon, and it may die alone: what it has told of stays.
+ * daemon, and it may die alone: what it has announced stays.
  */
 #include <errno.h>
 #include <getopt.h>
@@ -82,7 +82,7 @@ static int report(struct worker *worker, struct message *message)
 	snprintf(message->job, sizeof(message->job), "%s", worker->job);
 	code = message_send(worker->socket, message, &err);
 	if (code == ERR_NO_MEMORY) {
-		/* The daemon is there, and must not take a job for whole that lacks what could not be told. */
+		/* The daemon is there, and must not take a job for whole that lacks what could not be sent. */
 		worker->cancel = true;
 		worker->trouble = err;
 	} else if (code != 0) {
@@ -123,7 +123,7 @@ static void obey(struct worker *worker, const struct message *message)
 		note_arrivals(worker, &message->runs);
 }
 
-/* One message, waiting for it at most that long; false when there was none. */
+/* Obeys one message, waiting for it at most that long; false when there was none. */
 static bool obey_next(struct worker *worker, int timeout_ms)
 {
 	struct message message;
@@ -154,7 +154,7 @@ static bool must_leave(const struct worker *worker)
 	return worker->yield || worker->quit || terminated;
 }
 
-/* ---- what the pipeline asks and tells ---- */
+/* ---- hooks of the reconstruction ---- */
 
 static bool on_cancelled(void *context)
 {
