@@ -143,6 +143,8 @@ int exterior_look(const struct surroundings_options *options, struct exterior_ro
 		}
 	}
 	free(measured);
+	if (code == 0 && found.outside == 0)
+		code = surroundings_may_go_on(options, &found.possible, err);
 	if (code == 0)
 		*ret_rows = found;
 	return code;

@@ -32,6 +32,11 @@ enum { EXTERIOR_OUTSIDE = 1, EXTERIOR_BEYOND = 2 }; /* the steps, as bits */
 struct exterior_rows {
 	size_t truncated, outside;
 	size_t beside; /* of `outside`, those with rays that miss the grid and are not air; exterior_look only */
+	/*
+	 * No row counts anything outside, but that cannot be excluded, for the rays through what may be there pass the
+	 * grid as well: the end of a body some mm beyond the grid's. exterior_look only.
+	 */
+	bool possible;
 };
 
 /* From some of the projections and where the grid lies, sparing the rest when nothing has to be taken out. */

@@ -735,6 +735,14 @@ static int subtract_the_exterior(struct recon *recon, const struct surroundings_
 	}
 	if (code == 0 && surroundings->goes_on)
 		code = surroundings_fit(surroundings, options, err);
+	/* What was only possible is left alone where the fit does not find it. */
+	if (code == 0 && seen->possible && seen->truncated == 0 &&
+	    !(surroundings->goes_on && surroundings_has_outside(surroundings, options->grid)))
+		steps = 0;
+	if (code < 0 || steps == 0) {
+		*ret_rows = rows;
+		return code;
+	}
 	if (code == 0)
 		code = exterior_subtract(surroundings, options, steps, recon->before, &rows, err);
 	/* SART alone starts from zero. */
@@ -775,14 +783,14 @@ static int leave_out_the_exterior(struct recon *recon, struct error *err)
 	/* Rows that are cut off may be wanted as they are; what lies outside of the grid is another matter. */
 	if (!recon->recipe.fdk.extend)
 		seen.truncated = 0;
-	if (code < 0 || seen.truncated + seen.outside == 0)
+	if (code < 0 || (seen.truncated + seen.outside == 0 && !seen.possible))
 		return code;
 	if (!sound && !fdk && seen.truncated > 0)
 		warn_exterior_stays(recon->hooks);
-	if (!sound && !fdk && seen.outside == 0)
+	if (!sound && !fdk && seen.outside == 0 && !seen.possible)
 		return 0;
-	/* An object may end with the grid: FDK's blur beyond its faces is none of the object. */
-	options.inside_only = seen.outside == 0;
+	/* An object may end inside of the grid: FDK's blur beyond its faces is none of the object. */
+	options.inside_only = seen.outside == 0 && !seen.possible;
 	code = surroundings_make(&surroundings, &options, err);
 	if (code == 0)
 		code = subtract_the_exterior(recon, &options, &seen, &surroundings, &rows, err);

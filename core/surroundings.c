@@ -259,14 +259,20 @@ static void box_sums(float *image, int columns, int rows, int reach, float *line
 	}
 }
 
+/* What the views say of each voxel. */
+struct look {
+	bool *seen;  /* on the rows of all views; as of struct surroundings */
+	bool *met;   /* on the detector of one; NULL: not asked for */
+	bool *empty; /* some view sees it through air; owned */
+};
+
 /*
  * Voxels whose shadow is air with what lies up to a voxel and a half around it are empty, those whose shadow misses the
  * rows are not seen. `line` as above.
  */
-static void look_at(const struct surroundings *s, const struct geometry *geometry, const struct orbit *orbit, int index,
-		    float *measured, float *line, bool *empty)
+static void look_at(const struct look *look, const struct grid *grid, const struct geometry *geometry,
+		    const struct orbit *orbit, int index, float *measured, float *line)
 {
-	const struct grid *grid = &s->grid;
 	const int columns = geometry->columns, rows = geometry->rows;
 	const size_t pixels = (size_t)columns * (size_t)rows;
 	const double size = fmax(fmax(grid->spacing[0], grid->spacing[1]), grid->spacing[2]);
@@ -288,14 +294,18 @@ static void look_at(const struct surroundings *s, const struct geometry *geometr
 				const double place[3] = {grid->origin[0] + x * grid->spacing[0],
 							 grid->origin[1] + y * grid->spacing[1],
 							 grid->origin[2] + z * grid->spacing[2]};
+				const size_t at = voxel_at(grid, x, y, z);
 				double column, row;
 
 				view_project(matrix, place, &column, &row);
 				if (row < -0.5 || row > rows - 0.5)
-					s->seen[voxel_at(grid, x, y, z)] = false;
-				if (column >= 1 && row >= 1 && column <= columns - 2 && row <= rows - 2 &&
-				    measured[(size_t)lround(row) * (size_t)columns + (size_t)lround(column)] < 0.5f)
-					empty[voxel_at(grid, x, y, z)] = true;
+					look->seen[at] = false;
+				if (!(column >= 1 && row >= 1 && column <= columns - 2 && row <= rows - 2))
+					continue;
+				if (look->met != NULL)
+					look->met[at] = true;
+				if (measured[(size_t)lround(row) * (size_t)columns + (size_t)lround(column)] < 0.5f)
+					look->empty[at] = true;
 			}
 }
 
@@ -369,17 +379,17 @@ static void keep_what_is_known(struct surroundings *s, const struct surroundings
 	}
 }
 
-static int look_at_views(struct surroundings *s, const struct surroundings_options *options, struct error *err)
+static int look_at_views(const struct look *look, const struct grid *grid, const struct surroundings_options *options,
+			 struct error *err)
 {
 	const struct geometry *geometry = options->geometry;
 	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
 	const int looked_at = geometry->count < VIEWS_LOOKED_AT ? geometry->count : VIEWS_LOOKED_AT;
 	const int longer = geometry->columns > geometry->rows ? geometry->columns : geometry->rows;
 	float *measured = malloc(pixels * sizeof(float)), *line = malloc((size_t)longer * sizeof(float));
-	bool *empty = calloc(grid_voxels(&s->grid), sizeof(bool));
 	int code = 0;
 
-	if (measured == NULL || line == NULL || empty == NULL)
+	if (measured == NULL || line == NULL)
 		code = error_set(err, ERR_NO_MEMORY, "no memory for a view of %d x %d pixels", geometry->columns,
 				 geometry->rows);
 	for (int i = 0; i < looked_at && code == 0; i++) {
@@ -387,13 +397,44 @@ static int look_at_views(struct surroundings *s, const struct surroundings_optio
 
 		code = options->backend->stack_download(options->projections, view, 1, measured, err);
 		if (code == 0 && !is_blank(measured, pixels))
-			look_at(s, geometry, options->orbit, view, measured, line, empty);
+			look_at(look, grid, geometry, options->orbit, view, measured, line);
 	}
-	if (code == 0)
-		keep_what_is_known(s, options, empty);
 	free(measured);
 	free(line);
-	free(empty);
+	return code;
+}
+
+int surroundings_may_go_on(const struct surroundings_options *options, bool *ret_possible, struct error *err)
+{
+	struct look look;
+	struct grid grid;
+	size_t possible = 0;
+	int code;
+
+	choose_grid(options, &grid);
+	look.seen = calloc(grid_voxels(&grid), sizeof(bool));
+	look.met = calloc(grid_voxels(&grid), sizeof(bool));
+	look.empty = calloc(grid_voxels(&grid), sizeof(bool));
+	if (look.seen == NULL || look.met == NULL || look.empty == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for a volume of %zu voxels", grid_voxels(&grid));
+	else
+		code = look_at_views(&look, &grid, options, err);
+	for (int z = 0; z < grid.size[2] && code == 0; z++)
+		for (int y = 0; y < grid.size[1]; y++)
+			for (int x = 0; x < grid.size[0]; x++) {
+				const size_t at = voxel_at(&grid, x, y, z);
+				const double place[3] = {grid.origin[0] + x * grid.spacing[0],
+							 grid.origin[1] + y * grid.spacing[1],
+							 grid.origin[2] + z * grid.spacing[2]};
+
+				possible += look.met[at] && !look.empty[at] && !is_inside(options->grid, place) &&
+					    is_in_view(options->orbit, place);
+			}
+	free(look.seen);
+	free(look.met);
+	free(look.empty);
+	if (code == 0)
+		*ret_possible = possible > 0;
 	return code;
 }
 
@@ -422,6 +463,7 @@ int surroundings_make(struct surroundings *s, const struct surroundings_options 
 	const struct backend *backend = options->backend;
 	const struct orbit *orbit = options->orbit;
 	struct plan_options plan;
+	struct look look;
 	int code;
 
 	*s = (struct surroundings){.backend = backend};
@@ -434,7 +476,8 @@ int surroundings_make(struct surroundings *s, const struct surroundings_options 
 		return code;
 	s->voxels = malloc(grid_voxels(&s->grid) * sizeof(float));
 	s->seen = malloc(grid_voxels(&s->grid) * sizeof(bool));
-	if (s->voxels == NULL || s->seen == NULL)
+	look = (struct look){.seen = s->seen, .empty = calloc(grid_voxels(&s->grid), sizeof(bool))};
+	if (s->voxels == NULL || s->seen == NULL || look.empty == NULL)
 		code = error_set(err, ERR_NO_MEMORY, "no memory for a volume of %zu voxels", grid_voxels(&s->grid));
 	else
 		memset(s->seen, true, grid_voxels(&s->grid) * sizeof(bool));
@@ -452,9 +495,12 @@ int surroundings_make(struct surroundings *s, const struct surroundings_options 
 	if (code == 0)
 		code = backend->volume_download(s->volume, 0, s->grid.size[2], s->voxels, err);
 	if (code == 0)
-		code = look_at_views(s, options, err);
-	if (code == 0)
+		code = look_at_views(&look, &s->grid, options, err);
+	if (code == 0) {
+		keep_what_is_known(s, options, look.empty);
 		code = backend->volume_upload(s->volume, s->voxels, err);
+	}
+	free(look.empty);
 	if (code < 0)
 		surroundings_clear(s);
 	return code;
@@ -466,6 +512,32 @@ int surroundings_fit(struct surroundings *s, const struct surroundings_options *
 	int code = coarse_sart(&coarse, options->projections, s->volume, err);
 
 	return code < 0 ? code : s->backend->volume_download(s->volume, 0, s->grid.size[2], s->voxels, err);
+}
+
+bool surroundings_has_outside(const struct surroundings *s, const struct grid *grid)
+{
+	/* Of the object's density: 0.15 where a cylinder ends with the grid, 0.27 where it ends 0.4 mm beyond, then
+	 * more. */
+	const double density = 0.25;
+	const size_t least = 64; /* voxels, against noise */
+	double squares = 0, sum = 0;
+	size_t count = 0;
+
+	for (size_t i = 0; i < grid_voxels(&s->grid); i++) {
+		squares += (double)s->voxels[i] * (double)s->voxels[i];
+		sum += fabs((double)s->voxels[i]);
+	}
+	for (int z = 0; z < s->grid.size[2]; z++)
+		for (int y = 0; y < s->grid.size[1]; y++)
+			for (int x = 0; x < s->grid.size[0]; x++) {
+				const double place[3] = {s->grid.origin[0] + x * s->grid.spacing[0],
+							 s->grid.origin[1] + y * s->grid.spacing[1],
+							 s->grid.origin[2] + z * s->grid.spacing[2]};
+
+				count += !is_inside(grid, place) &&
+					 (double)s->voxels[voxel_at(&s->grid, x, y, z)] * sum >= density * squares;
+			}
+	return squares > 0 && count >= least;
 }
 
 void surroundings_clear(struct surroundings *s)

@@ -64,10 +64,20 @@ struct surroundings_bytes {
 int surroundings_bytes(const struct surroundings_options *options, struct surroundings_bytes *ret_bytes,
 		       struct error *err);
 
+/*
+ * Whether anything may lie outside of the recipe's grid: a place in the field of view that rays of the views looked at
+ * meet, none of them through air. It is looked for on the coarse grid, so that *ret_possible is false only where no
+ * fit is worth its time; blank views and those that FDK makes little of count as any other.
+ */
+int surroundings_may_go_on(const struct surroundings_options *options, bool *ret_possible, struct error *err);
+
 /* In place, for the plan points into it: not to be copied. Free with surroundings_clear. */
 int surroundings_make(struct surroundings *surroundings, const struct surroundings_options *options, struct error *err);
 /* The same options; the projections may have changed since. */
 int surroundings_fit(struct surroundings *surroundings, const struct surroundings_options *options, struct error *err);
+/* After the fit: whether it has some of the object, and not the smear of one that ends with that grid, outside of it.
+ */
+bool surroundings_has_outside(const struct surroundings *surroundings, const struct grid *grid);
 void surroundings_clear(struct surroundings *surroundings);
 
 /* `to` becomes the same on the recipe's grid. */
