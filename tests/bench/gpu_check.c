@@ -884,16 +884,15 @@ static void check_matched_beside(struct device *devices[2])
 
 /* What core/recon.c makes of line integrals of all views on one side; the caller frees it. */
 static float *reconstruct(const struct backend *side, struct device *device, const struct scene *scene,
-			  const struct recipe *recipe, const float *projections)
+			  const struct recipe *recipe, const struct recon_hooks *hooks, const float *projections)
 {
 	const struct linearise linearise = {.sample = SAMPLE_FLOAT32};
-	const struct recon_hooks hooks = {0};
 	float *volume = malloc(grid_voxels(&scene->grid) * sizeof(float));
 	int count = scene->geometry.count, *views = all_views(count);
 	struct recon *recon;
 	struct error err = {0};
 
-	must(recon_open(side, device, &scene->geometry, &linearise, recipe, &hooks, &recon, &err), &err, "open");
+	must(recon_open(side, device, &scene->geometry, &linearise, recipe, hooks, &recon, &err), &err, "open");
 	must(recon_push(recon, projections, views, count, &err), &err, "push");
 	must(recon_run(recon, &err), &err, "run");
 	must(recon_read(recon, 0, scene->grid.size[2], volume, &err), &err, "read");
@@ -1041,12 +1040,60 @@ static void check_recon(struct device *devices[2], enum bend bend, bool referenc
 	recipe.tv.on = tv;
 	recipe_explicit_tv(&recipe, TV_GRADIENT);
 	recipe.projector = matched ? PROJECTOR_MATCHED : PROJECTOR_INTERPOLATING;
-	got[0] = reconstruct(&backend_cpu, devices[0], &scene, &recipe, projections);
-	got[1] = reconstruct(&backend_cuda, devices[1], &scene, &recipe, projections);
+	got[0] = reconstruct(&backend_cpu, devices[0], &scene, &recipe, &(struct recon_hooks){0}, projections);
+	got[1] = reconstruct(&backend_cuda, devices[1], &scene, &recipe, &(struct recon_hooks){0}, projections);
 	rms = hu_rms(got[1], got[0], voxels);
 	printf("%-34s after 10 iterations: %.1e, %.3f HU RMS\n", scene.name, difference(got[1], got[0], voxels), rms);
 	expect(&scene, "SART of the head", difference(got[1], got[0], voxels), tolerance);
 	expect(&scene, "HU RMS", rms, .5);
+	for (int s = 0; s < 2; s++)
+		free(got[s]);
+	free(projections);
+	recipe_clear(&recipe);
+	scene_clear(&scene);
+}
+
+/* FDK and eight iterations of conjugate gradients: the algebra on both sides, and a residual that falls. */
+static double last_residual;
+
+static void residual_falls(void *context, const struct history_row *row)
+{
+	bool *falls = context;
+
+	*falls = *falls && row->residual < last_residual;
+	last_residual = row->residual;
+}
+
+static void check_cgls(struct device *devices[2], enum bend bend, bool reference, bool tv, double tolerance)
+{
+	struct recipe recipe;
+	struct scene scene;
+	float *projections, *got[2];
+	size_t voxels;
+	bool falls[2];
+	char name[64];
+
+	snprintf(name, sizeof(name), "CGLS, %s%s%s", bend_names[bend], reference ? ", reference" : "",
+		 tv ? ", TV" : "");
+	head_make(&scene, name, bend);
+	voxels = grid_voxels(&scene.grid);
+	projections = project_head(&scene);
+	head_recipe(&recipe, &scene, reference);
+	recipe_set_algorithm(&recipe, &algorithm_cgls);
+	recipe.iterate.iterations = 8;
+	recipe.tv.on = tv;
+	recipe_explicit_tv(&recipe, TV_GRADIENT);
+
+	for (int i = 0; i < 2; i++) {
+		last_residual = INFINITY;
+		falls[i] = true;
+		got[i] = reconstruct(i == 0 ? &backend_cpu : &backend_cuda, devices[i], &scene, &recipe,
+				     &(struct recon_hooks){.context = &falls[i], .row = residual_falls}, projections);
+	}
+	printf("%-34s after 8 iterations: %.1e, %.3f HU RMS\n", scene.name, difference(got[1], got[0], voxels),
+	       hu_rms(got[1], got[0], voxels));
+	expect(&scene, "conjugate gradients", difference(got[1], got[0], voxels), tolerance);
+	expect(&scene, "a residual that does not fall", !tv && !(falls[0] && falls[1]), 0);
 	for (int s = 0; s < 2; s++)
 		free(got[s]);
 	free(projections);
@@ -1088,7 +1135,7 @@ static void check_metal(struct device *devices[2], enum bend bend, bool referenc
 	}
 	phantom_voxelise(&metal, &scene.grid, 1, mask);
 	head_recipe(&recipe, &scene, reference);
-	bare = reconstruct(&backend_cuda, devices[1], &scene, &recipe, projections);
+	bare = reconstruct(&backend_cuda, devices[1], &scene, &recipe, &(struct recon_hooks){0}, projections);
 	streaks = reconstruct(&backend_cuda, devices[1], &scene, &recipe, screwed);
 	recipe.metal.on = true;
 	got[0] = reconstruct(&backend_cpu, devices[0], &scene, &recipe, screwed);
@@ -1507,8 +1554,8 @@ static void check_said(struct device *device)
 		must(recon_memory(&backend_cuda, NULL, &scene.geometry, &recipe, &memory, &err), &err, "memory");
 		limit.memory_limit = memory.total;
 		must(backend_cuda.open(0, &limit, &small, &err), &err, "open");
-		got[0] = reconstruct(&backend_cuda, device, &scene, &recipe, projections);
-		got[1] = reconstruct(&backend_cuda, small, &scene, &recipe, projections);
+		got[0] = reconstruct(&backend_cuda, device, &scene, &recipe, &(struct recon_hooks){0}, projections);
+		got[1] = reconstruct(&backend_cuda, small, &scene, &recipe, &(struct recon_hooks){0}, projections);
 		expect(&scene, "the same bits", memcmp(got[0], got[1], grid_voxels(&scene.grid) * sizeof(float)) != 0,
 		       0);
 		backend_cuda.close(small);
@@ -1658,6 +1705,10 @@ int main(int argc, char **argv)
 	for (int bend = 0; bend < BEND_COUNT; bend++)
 		check_recon(devices, (enum bend)bend, true, false, true, 1e-4);
 	check_recon(devices, BEND_TILTED, false, false, true, 5e-3);
+	for (int bend = 0; bend < 2; bend++)
+		check_cgls(devices, (enum bend)bend, true, false, 1e-3);
+	check_cgls(devices, BEND_NONE, false, false, 5e-3);
+	check_cgls(devices, BEND_TILTED, true, true, 1e-3);
 	check_matched_beside(devices);
 	check_metal(devices, BEND_NONE, true, 1e-4);
 	check_metal(devices, BEND_TURNED, false, 5e-3);
