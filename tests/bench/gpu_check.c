@@ -1136,10 +1136,10 @@ static void check_metal(struct device *devices[2], enum bend bend, bool referenc
 	phantom_voxelise(&metal, &scene.grid, 1, mask);
 	head_recipe(&recipe, &scene, reference);
 	bare = reconstruct(&backend_cuda, devices[1], &scene, &recipe, &(struct recon_hooks){0}, projections);
-	streaks = reconstruct(&backend_cuda, devices[1], &scene, &recipe, screwed);
+	streaks = reconstruct(&backend_cuda, devices[1], &scene, &recipe, &(struct recon_hooks){0}, screwed);
 	recipe.metal.on = true;
-	got[0] = reconstruct(&backend_cpu, devices[0], &scene, &recipe, screwed);
-	got[1] = reconstruct(&backend_cuda, devices[1], &scene, &recipe, screwed);
+	got[0] = reconstruct(&backend_cpu, devices[0], &scene, &recipe, &(struct recon_hooks){0}, screwed);
+	got[1] = reconstruct(&backend_cuda, devices[1], &scene, &recipe, &(struct recon_hooks){0}, screwed);
 	/* In the slices of the screws, three voxels and more from them. */
 	for (int z = 30; z < 50; z++)
 		for (int y = 3; y < scene.grid.size[1] - 3; y++)
