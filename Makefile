@@ -273,6 +273,20 @@ tsan: setup ## the daemon's tests under the thread sanitizer (OpenMP's runtime l
 lint: ## who includes whom, and the house's other rules
 	@tests/lint.sh
 
+rooms: ## docs/rooms.svg, the picture of who includes whom
+	@$(PYTHON) docs/rooms.py
+
+third-party: all ## docs/third-party.md, the parts of others with version and licence
+	@$(PYTHON) docs/third-party.py $(BUILD)
+
+# For clangd and other tools. What make would run to compile each C file; CUDA's are left out, clang takes other options.
+c_sources = $(shell find clients core daemon proto tests -name node_modules -prune -o -name '*.c' -print | sort)
+compile_commands.json: ## how each C file is compiled, for editors
+	@$(MAKE) --no-print-directory -nB V=1 $(call objects,$(filter-out $(simd_sources),$(c_sources))) $(simd_objects) | \
+	awk -v folder="$(CURDIR)" '/ -c -o [^ ]+ [^ ]+\.c$$/ { gsub(/[\\"]/, "\\\\&"); \
+		printf "%s{\"directory\": \"%s\", \"file\": \"%s\", \"output\": \"%s\", \"command\": \"%s\"}", \
+			n++ ? ",\n" : "[\n", folder, $$NF, $$(NF - 1), $$0 } END { print "\n]" }' >$@.part && mv $@.part $@
+
 format: ## clang-format over everything
 	@clang-format -i $$(git ls-files '*.c' '*.h' '*.cu' '*.cuh')
 
@@ -297,8 +311,8 @@ clean: ## removes build/
 	rm -rf $(BUILD)
 
 help: ## this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z_.-]+:.*## /{printf "  make %-21s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-.PHONY: all test-programs again setup demo check soak fuzz fuzzers bench bench-denoise check-gpu bench-gpu asan tsan lint format install clean help
+.PHONY: all test-programs again setup demo check soak fuzz fuzzers bench bench-denoise check-gpu bench-gpu asan tsan lint format rooms third-party compile_commands.json install clean help
 .SECONDARY:
 -include $(shell find $(BUILD) -name '*.d' 2>/dev/null)

@@ -56,6 +56,10 @@ found "daemon/THREADS.md (>) has the locks of daemon/lock.h (<) in their order" 
 rule "no process-wide string functions" '\b(strtok|sprintf|strcpy|strcat|gets|localtime|gmtime|strerror_l|rand|srand) *\(' $(files core proto daemon clients)
 rule "no unfinished work by its own words" '\b(TODO|FIXME|XXX|HACK)\b' $(files core kernels proto daemon clients tests)
 
+python=${PYTHON:-/usr/bin/python3}
+found "docs/rooms.svg is drawn from the includes" "$("$python" docs/rooms.py --check 2>&1)"
+found "docs/third-party.md has every library and every package of the page" "$("$python" docs/third-party.py --check 2>&1)"
+
 if command -v clang-format >/dev/null; then
 	for file in $(git ls-files '*.c' '*.h' '*.cu' '*.cuh' 2>/dev/null); do
 		[ -e "$file" ] || continue
