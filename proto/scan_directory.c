@@ -10,7 +10,6 @@
 #include <limits.h>
 #include <stdio.h>
 #include <stdlib.h>
-#include <string.h>
 #include <sys/mman.h>
 #include <sys/stat.h>
 #include <unistd.h>
@@ -20,7 +19,6 @@
 #include "proto/format.h"
 #include "proto/nifti.h"
 #include "proto/saver.h"
-#include "proto/seal.h"
 #include "proto/sums.h"
 
 /* ---- files ---- */

@@ -1,6 +1,5 @@
 /* Rows of jobs, of their history, volumes, warnings and events, as they are written. */
 #include <errno.h>
-#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -11,10 +10,8 @@
 #include "daemon/log.h"
 #include "daemon/store/db.h"
 #include "daemon/store/deleted.h"
-#include "daemon/store/quarantine.h"
 #include "daemon/store/record.h"
 #include "proto/clock.h"
-#include "proto/json.h"
 #include "proto/reconstruction.h"
 
 enum { REMOVALS_KEPT = 1000 /* a page that was away for longer reads its list anew */ };

@@ -3,14 +3,12 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <sys/stat.h>
 #include <unistd.h>
 
 #include "daemon/files.h"
 #include "daemon/log.h"
 #include "daemon/store/db.h"
 #include "daemon/store/quarantine.h"
-#include "proto/scan_directory.h"
 
 /* The numbers of removed jobs' events count, too: a client may have seen them. */
 int store_load_last_event(struct store *store, struct error *err)

@@ -8,18 +8,15 @@
 #include <assert.h>
 #include <errno.h>
 #include <fcntl.h>
-#include <openssl/evp.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <sys/stat.h>
 #include <unistd.h>
 
 #include "daemon/files.h"
 #include "daemon/lock.h"
 #include "daemon/log.h"
 #include "daemon/store/deleted.h"
-#include "daemon/store/quarantine.h"
 #include "daemon/store/record.h"
 #include "daemon/store/scan.h"
 #include "proto/clock.h"

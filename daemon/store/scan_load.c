@@ -11,7 +11,6 @@
 #include "daemon/files.h"
 #include "daemon/log.h"
 #include "daemon/store/scan.h"
-#include "proto/scan_directory.h"
 
 static void read_image_digest(struct query *query, int column, struct stored_scan *scan, enum image image)
 {

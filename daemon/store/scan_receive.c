@@ -5,10 +5,7 @@
 #include <openssl/evp.h>
 #include <stdio.h>
 #include <string.h>
-#include <unistd.h>
 
-#include "daemon/files.h"
-#include "daemon/store/record.h"
 #include "daemon/store/scan.h"
 #include "proto/clock.h"
 #include "proto/scan_directory.h"

@@ -13,7 +13,6 @@
  */
 #include "daemon/store/scan.h"
 
-#include <assert.h>
 #include <errno.h>
 #include <fcntl.h>
 #include <stdio.h>
@@ -29,7 +28,6 @@
 #include "daemon/store/deleted.h"
 #include "daemon/store/pages.h"
 #include "daemon/store/quarantine.h"
-#include "proto/clock.h"
 
 /* Pages in the log (4 KiB each) before they are moved: enough to make it rare, few enough to keep reading fast. */
 enum { CHECKPOINT_PAGES = 1000 };

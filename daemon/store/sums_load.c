@@ -1,13 +1,11 @@
 /* At the start: the rows of projections follow the records beside the samples (projections.sums, store/sums.c). */
 #include <errno.h>
-#include <fcntl.h>
 #include <stdlib.h>
 #include <string.h>
 #include <unistd.h>
 
 #include "daemon/log.h"
 #include "daemon/store/scan.h"
-#include "proto/scan_directory.h"
 
 enum { PARTS = -SUMS_SCAN };
 
