@@ -234,44 +234,66 @@ int surroundings_bytes(const struct surroundings_options *options, struct surrou
 
 /* ---- what FDK cannot know ---- */
 
-/* Sums over the pixels up to `reach` away along both axes, in place; `line` has room for the longer side. */
-static void box_sums(float *image, int columns, int rows, int reach, float *line)
+/* Columns whose sums run down the rows together: their floats lie side by side. */
+enum { COLUMNS_TOGETHER = 32 };
+
+static void sum_along_row(const float *from, float *ret, int columns, int reach)
 {
-	for (int pass = 0; pass < 2; pass++) {
-		const int count = pass == 0 ? columns : rows, lines = pass == 0 ? rows : columns;
-		const size_t step = pass == 0 ? 1 : (size_t)columns, next = pass == 0 ? (size_t)columns : 1;
+	double sum = 0;
 
-		for (int j = 0; j < lines; j++) {
-			float *first = image + (size_t)j * next;
-			double sum = 0;
-
-			for (int i = 0; i < count; i++)
-				line[i] = first[(size_t)i * step];
-			for (int i = -reach; i < count; i++) {
-				if (i + reach < count)
-					sum += (double)line[i + reach];
-				if (i - reach - 1 >= 0)
-					sum -= (double)line[i - reach - 1];
-				if (i >= 0)
-					first[(size_t)i * step] = (float)sum;
-			}
-		}
+	for (int c = -reach; c < columns; c++) {
+		if (c + reach < columns)
+			sum += (double)from[c + reach];
+		if (c - reach - 1 >= 0)
+			sum -= (double)from[c - reach - 1];
+		if (c >= 0)
+			ret[c] = (float)sum;
 	}
+}
+
+/* Of the columns first .. first + count - 1. */
+static void sum_along_columns(const float *from, float *ret, int columns, int rows, int first, int count, int reach)
+{
+	double sums[COLUMNS_TOGETHER] = {0};
+
+	for (int r = -reach; r < rows; r++) {
+		const float *enters = from + (size_t)(r + reach) * (size_t)columns + first;
+		const float *leaves = from + (ptrdiff_t)(r - reach - 1) * columns + first;
+
+		for (int c = 0; c < count && r + reach < rows; c++)
+			sums[c] += (double)enters[c];
+		for (int c = 0; c < count && r - reach - 1 >= 0; c++)
+			sums[c] -= (double)leaves[c];
+		for (int c = 0; c < count && r >= 0; c++)
+			ret[(size_t)r * (size_t)columns + (size_t)(first + c)] = (float)sums[c];
+	}
+}
+
+/* Sums over the pixels up to `reach` away along both axes, in place; `work` is another image. */
+static void box_sums(float *image, int columns, int rows, int reach, float *work)
+{
+#pragma omp parallel for schedule(static)
+	for (int r = 0; r < rows; r++)
+		sum_along_row(image + (size_t)r * (size_t)columns, work + (size_t)r * (size_t)columns, columns, reach);
+#pragma omp parallel for schedule(static)
+	for (int c = 0; c < columns; c += COLUMNS_TOGETHER)
+		sum_along_columns(work, image, columns, rows, c,
+				  columns - c < COLUMNS_TOGETHER ? columns - c : COLUMNS_TOGETHER, reach);
 }
 
 /* What the views say of each voxel. */
 struct look {
-	bool *seen;  /* on the rows of all views; as of struct surroundings */
+	bool *seen;  /* on the rows of all views; as of struct surroundings; NULL: not asked for */
 	bool *met;   /* on the detector of one; NULL: not asked for */
 	bool *empty; /* some view sees it through air; owned */
 };
 
 /*
  * Voxels whose shadow is air with what lies up to a voxel and a half around it are empty, those whose shadow misses the
- * rows are not seen. `line` as above.
+ * rows are not seen. `work` is another image of the view's size.
  */
 static void look_at(const struct look *look, const struct grid *grid, const struct geometry *geometry,
-		    const struct orbit *orbit, int index, float *measured, float *line)
+		    const struct orbit *orbit, int index, float *measured, float *work)
 {
 	const int columns = geometry->columns, rows = geometry->rows;
 	const size_t pixels = (size_t)columns * (size_t)rows;
@@ -283,10 +305,10 @@ static void look_at(const struct look *look, const struct grid *grid, const stru
 
 	view_matrix(&geometry->views[index], matrix);
 	/* Means of nine pixels against noise. */
-	box_sums(measured, columns, rows, 1, line);
+	box_sums(measured, columns, rows, 1, work);
 	for (size_t i = 0; i < pixels; i++)
 		measured[i] = measured[i] > 0 && measured[i] >= 9 * level;
-	box_sums(measured, columns, rows, reach, line);
+	box_sums(measured, columns, rows, reach, work);
 #pragma omp parallel for schedule(static)
 	for (int z = 0; z < grid->size[2]; z++)
 		for (int y = 0; y < grid->size[1]; y++)
@@ -297,8 +319,10 @@ static void look_at(const struct look *look, const struct grid *grid, const stru
 				const size_t at = voxel_at(grid, x, y, z);
 				double column, row;
 
+				if (look->seen == NULL && look->empty[at])
+					continue;
 				view_project(matrix, place, &column, &row);
-				if (row < -0.5 || row > rows - 0.5)
+				if (look->seen != NULL && (row < -0.5 || row > rows - 0.5))
 					look->seen[at] = false;
 				if (!(column >= 1 && row >= 1 && column <= columns - 2 && row <= rows - 2))
 					continue;
@@ -385,11 +409,10 @@ static int look_at_views(const struct look *look, const struct grid *grid, const
 	const struct geometry *geometry = options->geometry;
 	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
 	const int looked_at = geometry->count < VIEWS_LOOKED_AT ? geometry->count : VIEWS_LOOKED_AT;
-	const int longer = geometry->columns > geometry->rows ? geometry->columns : geometry->rows;
-	float *measured = malloc(pixels * sizeof(float)), *line = malloc((size_t)longer * sizeof(float));
+	float *measured = malloc(pixels * sizeof(float)), *work = malloc(pixels * sizeof(float));
 	int code = 0;
 
-	if (measured == NULL || line == NULL)
+	if (measured == NULL || work == NULL)
 		code = error_set(err, ERR_NO_MEMORY, "no memory for a view of %d x %d pixels", geometry->columns,
 				 geometry->rows);
 	for (int i = 0; i < looked_at && code == 0; i++) {
@@ -397,40 +420,47 @@ static int look_at_views(const struct look *look, const struct grid *grid, const
 
 		code = options->backend->stack_download(options->projections, view, 1, measured, err);
 		if (code == 0 && !is_blank(measured, pixels))
-			look_at(look, grid, geometry, options->orbit, view, measured, line);
+			look_at(look, grid, geometry, options->orbit, view, measured, work);
 	}
 	free(measured);
-	free(line);
+	free(work);
 	return code;
+}
+
+/* Voxels that are not asked for are empty from the beginning. */
+static void leave_inside_away(const struct surroundings_options *options, const struct grid *grid, bool *ret_empty)
+{
+#pragma omp parallel for schedule(static)
+	for (int z = 0; z < grid->size[2]; z++)
+		for (int y = 0; y < grid->size[1]; y++)
+			for (int x = 0; x < grid->size[0]; x++) {
+				const double place[3] = {grid->origin[0] + x * grid->spacing[0],
+							 grid->origin[1] + y * grid->spacing[1],
+							 grid->origin[2] + z * grid->spacing[2]};
+
+				ret_empty[voxel_at(grid, x, y, z)] =
+				    is_inside(options->grid, place) || !is_in_view(options->orbit, place);
+			}
 }
 
 int surroundings_may_go_on(const struct surroundings_options *options, bool *ret_possible, struct error *err)
 {
-	struct look look;
+	struct look look = {0};
 	struct grid grid;
 	size_t possible = 0;
 	int code;
 
 	choose_grid(options, &grid);
-	look.seen = calloc(grid_voxels(&grid), sizeof(bool));
 	look.met = calloc(grid_voxels(&grid), sizeof(bool));
-	look.empty = calloc(grid_voxels(&grid), sizeof(bool));
-	if (look.seen == NULL || look.met == NULL || look.empty == NULL)
+	look.empty = malloc(grid_voxels(&grid) * sizeof(bool));
+	if (look.met == NULL || look.empty == NULL) {
 		code = error_set(err, ERR_NO_MEMORY, "no memory for a volume of %zu voxels", grid_voxels(&grid));
-	else
+	} else {
+		leave_inside_away(options, &grid, look.empty);
 		code = look_at_views(&look, &grid, options, err);
-	for (int z = 0; z < grid.size[2] && code == 0; z++)
-		for (int y = 0; y < grid.size[1]; y++)
-			for (int x = 0; x < grid.size[0]; x++) {
-				const size_t at = voxel_at(&grid, x, y, z);
-				const double place[3] = {grid.origin[0] + x * grid.spacing[0],
-							 grid.origin[1] + y * grid.spacing[1],
-							 grid.origin[2] + z * grid.spacing[2]};
-
-				possible += look.met[at] && !look.empty[at] && !is_inside(options->grid, place) &&
-					    is_in_view(options->orbit, place);
-			}
-	free(look.seen);
+	}
+	for (size_t i = 0; i < grid_voxels(&grid) && code == 0; i++)
+		possible += look.met[i] && !look.empty[i];
 	free(look.met);
 	free(look.empty);
 	if (code == 0)
