@@ -60,6 +60,9 @@ python=${PYTHON:-/usr/bin/python3}
 found "docs/rooms.svg is drawn from the includes" "$("$python" docs/rooms.py --check 2>&1)"
 found "docs/third-party.md has every library and every package of the page" "$("$python" docs/third-party.py --check 2>&1)"
 
+found "files that CONTRIBUTING.md and README.md name exist" "$(grep -ohE '`(clients|core|daemon|docs|kernels|proto|tests)/[A-Za-z0-9_./-]+`' \
+	CONTRIBUTING.md README.md | tr -d '`' | grep -vE 'NAME|ROOM' | sort -u | while read -r path; do [ -e "$path" ] || echo "$path"; done)"
+
 if command -v clang-format >/dev/null; then
 	for file in $(git ls-files '*.c' '*.h' '*.cu' '*.cuh' 2>/dev/null); do
 		[ -e "$file" ] || continue
