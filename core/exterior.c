@@ -4,6 +4,7 @@
 #include <math.h>
 #include <stdlib.h>
 
+#include "core/air.h"
 #include "core/extend.h"
 #include "core/outside.h"
 
@@ -19,14 +20,15 @@ struct projection {
 	const struct faces *faces; /* of w; NULL: FDK is too poor for that */
 	float *measured;
 	float largest;                   /* extend_largest of it */
+	float air;                       /* air_level of it */
 	const float *explained, *inside; /* inside NULL: nothing lies outside of the grid */
 	double *smooth;                  /* to work in */
 };
 
-/* A side that FDK pads is none of a truncated row. */
-static bool is_truncated(const int pad[2], const float *row, int columns, float largest)
+/* A side that FDK pads is none of a truncated row; neither are ends that the tube alone keeps from 0. */
+static bool is_truncated(const int pad[2], const float *row, int columns, float largest, float air)
 {
-	const float level = extend_level(largest);
+	const float level = extend_level(largest) + fmaxf(air, 0);
 
 	return (pad[0] == 0 && extend_is_cut(row, 1, columns, level)) ||
 	       (pad[1] == 0 && extend_is_cut(row + columns - 1, -1, columns, level));
@@ -80,7 +82,7 @@ static struct exterior_rows subtract_row(const struct projection *of, int row)
 	struct exterior_rows found = {0};
 
 	if (of->steps & EXTERIOR_BEYOND)
-		found.truncated = is_truncated(of->pad, measured, of->columns, of->largest);
+		found.truncated = is_truncated(of->pad, measured, of->columns, of->largest, of->air);
 	if (found.truncated == 0 && of->steps & EXTERIOR_OUTSIDE && of->faces != NULL &&
 	    faces_row_counts_outside(of->faces, of->view, of->columns, row, measured, explained, of->largest))
 		found.outside = 1;
@@ -120,7 +122,7 @@ int exterior_look(const struct surroundings_options *options, struct exterior_ro
 	const int looked_at = geometry->count < VIEWS_LOOKED_AT ? geometry->count : VIEWS_LOOKED_AT;
 	float *measured = malloc((size_t)columns * (size_t)rows * sizeof(float));
 	struct exterior_rows found = {0};
-	float largest = 0;
+	float largest = 0, air = 0;
 	int code = 0;
 
 	if (measured == NULL)
@@ -129,11 +131,13 @@ int exterior_look(const struct surroundings_options *options, struct exterior_ro
 		const int view = (int)((long long)i * geometry->count / looked_at);
 
 		code = options->backend->stack_download(options->projections, view, 1, measured, err);
-		if (code == 0)
+		if (code == 0) {
 			largest = extend_largest(measured, columns, rows, 1, (size_t)columns);
+			air = air_level(measured, columns, rows, extend_edge(columns), largest);
+		}
 		for (int r = 0; r < rows && code == 0; r++)
-			found.truncated +=
-			    is_truncated(options->orbit->pad, measured + (size_t)r * (size_t)columns, columns, largest);
+			found.truncated += is_truncated(options->orbit->pad, measured + (size_t)r * (size_t)columns,
+							columns, largest, air);
 		if (code == 0) {
 			const struct outside_rows outside =
 			    outside_rows(options->grid, &geometry->views[view], columns, rows, measured);
@@ -201,6 +205,8 @@ int exterior_subtract(const struct surroundings *surroundings, const struct surr
 			code = backend->stack_download(options->projections, first, count, measured, err);
 		for (int i = 0; i < count && code == 0; i++) {
 			const size_t at = (size_t)i * pixels;
+			const float largest = extend_largest(measured + at, geometry->columns, geometry->rows, 1,
+							     (size_t)geometry->columns);
 			const struct projection projection = {
 			    .steps = steps,
 			    .view = &geometry->views[first + i],
@@ -209,8 +215,9 @@ int exterior_subtract(const struct surroundings *surroundings, const struct surr
 			    .pad = options->orbit->pad,
 			    .faces = options->poor ? NULL : &faces,
 			    .measured = measured + at,
-			    .largest = extend_largest(measured + at, geometry->columns, geometry->rows, 1,
-						      (size_t)geometry->columns),
+			    .largest = largest,
+			    .air = air_level(measured + at, geometry->columns, geometry->rows,
+					     extend_edge(geometry->columns), largest),
 			    .explained = explained + at,
 			    .inside = inside != NULL ? inside + at : NULL,
 			    .smooth = smooth,

@@ -6,6 +6,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "core/air.h"
 #include "core/extend.h"
 #include "core/warn.h"
 
@@ -193,8 +194,39 @@ static bool row_reaches(const struct input *input, const void *samples, size_t f
 	return false;
 }
 
-/* Whether the object goes on beyond the first and the last row. */
-static void look_at_ends(struct input *input, const void *samples, int columns, int rows)
+/* What air has at the ends of the rows, where no air region makes up for that. */
+static int look_at_air(struct input *input, const void *samples, int columns, int rows, float largest,
+		       struct error *err)
+{
+	const int edge = extend_edge(columns), wide = 4 * edge, looked_at = rows < 64 ? rows : 64;
+	float *ends, air;
+
+	if (input->linearise.has_air_region || columns < wide)
+		return 0;
+	ends = malloc(sizeof(*ends) * (size_t)looked_at * (size_t)wide);
+	if (ends == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for the ends of %d rows", looked_at);
+	for (int i = 0; i < looked_at; i++)
+		for (int c = 0; c < wide; c++) {
+			const int row = (int)((long long)i * rows / looked_at);
+			const int column = c < 2 * edge ? c : columns - wide + c;
+
+			ends[i * wide + c] =
+			    line_integral(input, samples, (size_t)row * (size_t)columns + (size_t)column);
+		}
+	air = air_level(ends, wide, looked_at, edge, largest);
+	free(ends);
+	if (air == 0)
+		return 0;
+	input->air_least = input->off == 0 ? air : fminf(input->air_least, air);
+	input->air_most = input->off == 0 ? air : fmaxf(input->air_most, air);
+	input->off++;
+	input->far_off += air >= extend_level(largest);
+	return 0;
+}
+
+/* Whether the object goes on beyond the first and the last row, and what air has beside it. */
+static int look_at_ends(struct input *input, const void *samples, int columns, int rows, struct error *err)
 {
 	float largest = 0, level;
 
@@ -205,6 +237,7 @@ static void look_at_ends(struct input *input, const void *samples, int columns, 
 		input->ends[end] +=
 		    row_reaches(input, samples, end ? (size_t)(rows - 1) * (size_t)columns : 0, columns, level);
 	input->views_looked_at++;
+	return look_at_air(input, samples, columns, rows, largest, err);
 }
 
 /* Not above the dark, where the detector could have counted. */
@@ -291,8 +324,10 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 	if (input->linearise.sample == SAMPLE_UINT16)
 		look_at_bytes(input, samples);
 	if (view % input->look_every == 0)
-		look_at_ends(input, samples, input->turned ? input->rows : input->columns,
-			     input->turned ? input->columns : input->rows);
+		code = look_at_ends(input, samples, input->turned ? input->rows : input->columns,
+				    input->turned ? input->columns : input->rows, err);
+	if (code < 0)
+		return code;
 	input->views++;
 	/* Those of the map are in every view. */
 	input->defective_views +=
@@ -310,6 +345,11 @@ void input_goes_on(const struct input *input, bool ret_ends[2])
 {
 	for (int end = 0; end < 2; end++)
 		ret_ends[end] = 4 * input->ends[end] > input->views_looked_at;
+}
+
+double input_air_off_share(const struct input *input)
+{
+	return input->views_looked_at > 0 ? (double)input->far_off / input->views_looked_at : 0;
 }
 
 double input_blank_share(const struct input *input, const struct orbit *orbit)
@@ -359,6 +399,18 @@ static void warn_of_air(const struct input *input, const struct recon_hooks *hoo
 		    "the air region lies between %.4g and %.4g of the flat; each projection was held against its own%s",
 		    least, most,
 		    most > 2 * least || least < FAINT ? ". That is more than a tube drifts: is the object in it?" : "");
+}
+
+static void warn_of_air_level(const struct input *input, const struct recon_hooks *hooks)
+{
+	if (input->off == 0)
+		return;
+	recon_warn(
+	    hooks, "air_level",
+	    "both ends of nearly all rows have line integrals between %.3g and %.3g, where air is 0, in %d of %d "
+	    "projections that were looked at: the tube gave less or more than the flat or \"air\" says. Nothing "
+	    "of that is taken out; an air_region makes up for it",
+	    (double)input->air_least, (double)input->air_most, input->off, input->views_looked_at);
 }
 
 static void warn_of_line_integrals(const struct input *input, const struct recon_hooks *hooks)
@@ -436,6 +488,7 @@ void input_warn(const struct input *input, const struct geometry *geometry, cons
 		    "in for them",
 		    counts->blank, lowest(input->blank, counts->blank));
 	warn_of_air(input, hooks);
+	warn_of_air_level(input, hooks);
 	warn_of_line_integrals(input, hooks);
 	warn_of_bytes(input, hooks);
 }

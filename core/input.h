@@ -23,6 +23,10 @@ struct input {
 	/* Of about 32 views: how many were looked at, and how many had something that is not air on the first row and
 	 * on the last one. */
 	int look_every, views_looked_at, ends[2];
+	/* And in how many of them air is not 0 (core/air.h), in how many by so much that it is not taken for air; the
+	 * least and the most it is in those. */
+	int off, far_off;
+	float air_least, air_most;
 	/* Of uint16, as it is and with its bytes exchanged: how far neighbours are apart; the largest then. */
 	double rough[2];
 	int largest;
@@ -51,11 +55,14 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
  */
 void input_goes_on(const struct input *input, bool ret_ends[2]);
 
+/* The share of views in which air is so far from 0 that it is not taken for air: none of that is an object. */
+double input_air_off_share(const struct input *input);
+
 /* The share that blank views have in FDK's density on the axis, 0 .. 1. */
 double input_blank_share(const struct input *input, const struct orbit *orbit);
 /* ERR_IMPOSSIBLE where no view has a good pixel. */
 int input_check(const struct input *input, struct error *err);
-/* "no_dark", "defects", "defect_map", "stuck_pixels", "blank_views", "air_region", "line_integrals",
+/* "no_dark", "defects", "defect_map", "stuck_pixels", "blank_views", "air_region", "air_level", "line_integrals",
  * "byte_order". */
 void input_warn(const struct input *input, const struct geometry *geometry, const struct recon_hooks *hooks);
 

@@ -523,6 +523,18 @@ static int run_tv(struct recon *recon, int iteration, struct error *err)
 	return recon->backend->tv(recon->plan, recon->volume, &tv, cancel_of(recon), err);
 }
 
+/* Rows whose ends the tube alone keeps from 0 are extended as well, which does no harm, and are none cut off. */
+static void warn_of_extended_rows(const struct recon *recon, const size_t extended[2], int extend)
+{
+	const double all = (double)recon->geometry->count * recon->geometry->rows;
+	const size_t off = (size_t)(input_air_off_share(&recon->input) * all);
+	size_t rows[2];
+
+	for (int side = 0; side < 2; side++)
+		rows[side] = extended[side] > off ? extended[side] - off : 0;
+	warn_truncated(recon->hooks, recon->geometry, recon->input.turned, rows, extend);
+}
+
 /* Known once all views are filtered. */
 static int warn_of_truncation(struct recon *recon, struct error *err)
 {
@@ -530,7 +542,7 @@ static int warn_of_truncation(struct recon *recon, struct error *err)
 	int code = recon->backend->filter_extended(recon->plan, rows, err);
 
 	if (code == 0)
-		warn_truncated(recon->hooks, recon->geometry, recon->input.turned, rows, recon->weights.extend);
+		warn_of_extended_rows(recon, rows, recon->weights.extend);
 	return code;
 }
 
@@ -795,8 +807,7 @@ static int leave_out_the_exterior(struct recon *recon, struct error *err)
 	if (code == 0)
 		code = subtract_the_exterior(recon, &options, &seen, &surroundings, &rows, err);
 	if (code == 0 && !fdk && sound && recon->recipe.fdk.extend)
-		warn_truncated(recon->hooks, recon->geometry, recon->input.turned, surroundings.truncated,
-			       recon->geometry->columns);
+		warn_of_extended_rows(recon, surroundings.truncated, recon->geometry->columns);
 	if (code == 0)
 		warn_outside(recon->hooks, recon->geometry, recon->input.turned, rows.outside);
 	surroundings_clear(&surroundings);

@@ -52,6 +52,8 @@ const struct warning_kind warning_kinds[] = {
     {"defects", SEVERITY_CAUTION, "Some samples could not be used and were replaced from their neighbours."},
     {"blank_views", SEVERITY_CAUTION, "Some projections are empty and were left out."},
     {"air_region", SEVERITY_CAUTION, "The brightness of air changed during the scan, and was corrected."},
+    {"air_level", SEVERITY_CAUTION,
+     "Air is darker or brighter in some projections than it should be: gray values may be off."},
     {"line_integrals", SEVERITY_SERIOUS, "The projections' values are unlike line integrals: the image may be wrong."},
     {"byte_order", SEVERITY_SERIOUS, "The projections look like noise: their bytes may be in the wrong order."},
     /* ---- of the reconstruction ---- */

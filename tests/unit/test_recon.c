@@ -1513,6 +1513,7 @@ START_TEST(truncation_leaves_no_rim_in_fdk_or_sart)
 		recipe.iterate.iterations = 5;
 		run(&scene, &recipe, &outcome);
 		ck_assert_ptr_nonnull(strstr(outcome.warnings, "truncated: "));
+		ck_assert_ptr_null(strstr(outcome.warnings, "air_level: "));
 		for (int i = 0; i < 6; i++) {
 			double value = mean_near(outcome.last, &grid, places[i], 5);
 
@@ -1542,9 +1543,15 @@ static const struct {
 	double tube, drift; /* of the flat; more and less of it */
 	double photons;     /* in air, 0: endless */
 } whole[] = {
-    {"a tube at 97 %", 96, 0.97, 0, 0}, {"a tube that drifts by 3 %", 96, 1, 0.03, 20000},
-    {"1000 photons", 96, 1, 0, 1000},   {"300 photons", 96, 1, 0, 300},
-    {"8 columns", 8, 1, 0, 0},          {"12 columns", 12, 1, 0, 0},
+    {"a tube at 97 %", 96, 0.97, 0, 0},
+    {"a tube at 92 %", 96, 0.92, 0, 0},
+    {"a tube at 108 %", 96, 1.08, 0, 20000},
+    {"a tube that drifts by 3 %", 96, 1, 0.03, 20000},
+    {"a tube that drifts by 8 %", 96, 1, 0.08, 20000},
+    {"1000 photons", 96, 1, 0, 1000},
+    {"300 photons", 96, 1, 0, 300},
+    {"8 columns", 8, 1, 0, 0},
+    {"12 columns", 12, 1, 0, 0},
     {"16 columns", 16, 1, 0, 0},
 };
 
@@ -1552,6 +1559,7 @@ static const struct {
 START_TEST(a_body_that_is_wholly_seen_is_not_called_cut_off)
 {
 	const int columns = whole[_i].columns;
+	const bool tells_of_air = whole[_i].tube != 1 || whole[_i].drift > 0;
 	const struct orbit_spec spec = {columns, 32, 60, {600, 1100, {256.0 / columns, 6}, {0, 0}, {0, 0}}, 0, 6};
 	struct ellipsoid ball = {.shape = SHAPE_ELLIPSOID, .semi_axes = {50, 50, 40}, .density = 0.02};
 	struct phantom phantom = {.count = 1, .parts = &ball};
@@ -1574,6 +1582,8 @@ START_TEST(a_body_that_is_wholly_seen_is_not_called_cut_off)
 	recipe.fdk.on = true;
 	run(&scene, &recipe, &outcome);
 	ck_assert_msg(strstr(outcome.warnings, "truncated: ") == NULL, "%s: %s", whole[_i].what, outcome.warnings);
+	ck_assert_msg((strstr(outcome.warnings, "air_level: ") != NULL) == tells_of_air, "%s: %s", whole[_i].what,
+		      outcome.warnings);
 	outcome_clear(&outcome);
 	scene_clear(&scene);
 }
