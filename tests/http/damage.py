@@ -354,6 +354,9 @@ def vanished(before, state, damaged, kind, stopped):
         if name == damaged and kind == "delete":
             continue
         base = name.split("/")
+        # What an attempt left that did not end: the repeated run makes it again, and its content is compared.
+        if base[:2] == ["jobs", stopped] and base[2:] != ["checkpoint.f32"]:
+            continue
         if not any(base[-1] in entry.split("/")[-1] and (len(base) < 3 or base[1] in entry) for entry in moved):
             gone.add(name)
     return gone
