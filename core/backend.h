@@ -349,6 +349,11 @@ struct backend {
 enum { BACKEND_COUNT = 2 };
 extern const struct backend *const backends[BACKEND_COUNT];
 extern const struct backend backend_cpu;
+/*
+ * How many threads of the host the calling thread's work is shared among, on any backend: what is done beside the
+ * device, and for the CPU's default. 0: all that the process may use.
+ */
+void backend_host_threads(int threads);
 /* By name; "auto" gives the first that has a device. NULL when there is none. */
 const struct backend *backend_find(const char *name);
 

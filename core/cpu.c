@@ -36,6 +36,15 @@ int cpu_threads(int asked)
 #endif
 }
 
+void backend_host_threads(int threads)
+{
+#ifdef _OPENMP
+	omp_set_num_threads(cpu_threads(threads));
+#else
+	(void)threads;
+#endif
+}
+
 int cpu_thread(void)
 {
 #ifdef _OPENMP

@@ -121,6 +121,9 @@ int parts_backproject(struct plan *plan, const struct stack *from, const int *vi
 			slab_close(plan, &slab);
 		else
 			drain = (struct drain){.slab = slab};
+		/* There is room for two slabs of FDK's purpose only. */
+		if (code == 0 && purpose != FOR_FDK)
+			code = drain_all(plan, &drain, to, err);
 	}
 	if (code == 0)
 		code = drain_all(plan, &drain, to, err);

@@ -510,6 +510,7 @@ int main(int argc, char **argv)
 	prctl(PR_SET_PDEATHSIG, SIGKILL);
 	sigaction(SIGTERM, &terminate, NULL);
 	lower_priority();
+	backend_host_threads(arguments.options.threads);
 	worker.socket = arguments.socket;
 	worker.announced = malloc(VIEWS_MAX * sizeof(*worker.announced));
 	if (worker.announced == NULL) {

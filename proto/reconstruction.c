@@ -718,9 +718,7 @@ struct piece {
 /* One core reads a fifth of what the page cache gives, and sums half as fast as it reads. */
 static void read_pieces(int file, char *ret_to, size_t offset, struct piece *pieces, int count)
 {
-	enum { THREADS = 16 };
-
-#pragma omp parallel for num_threads(count < THREADS ? count : THREADS) schedule(dynamic)
+#pragma omp parallel for schedule(dynamic)
 	for (int i = 0; i < count; i++) {
 		struct piece *piece = &pieces[i];
 

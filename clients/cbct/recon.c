@@ -186,6 +186,7 @@ static int pipeline_run(const struct recon_options *options, const struct job_re
 		return error_set(err, ERR_USAGE, "--backend: '%s' is none that this program has", options->backend);
 	if (mkdir(output, 0777) != 0 && errno != EEXIST)
 		return error_set_errno(err, errno, "%s", output);
+	backend_host_threads(device_options.threads);
 	code = backend->open((int)options->device, &device_options, &device, err);
 	if (code != 0)
 		return code;

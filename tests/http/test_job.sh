@@ -333,5 +333,23 @@ test_the_same_inputs_give_the_same_bits() {
 	[ "$(json '.volumes[0].digest')" = "$first" ] || fail "the digest of the first run with another number of threads"
 }
 
+# Whatever a job does beside its iterations: metal, the region outside of the grid, the search for stuck pixels, noise.
+test_a_worker_keeps_to_its_number_of_threads() {
+	[ "$(nproc)" -gt 1 ] || skip "one processor: no second thread could be seen"
+	local inside='{"scan": "SCAN", "grid": {"size": [12, 12, 12], "spacing_mm": [2, 2, 2]}, ' worker threads count
+	for count in 1 2; do
+		stop_daemon
+		start_daemon --threads "$count"
+		uploaded_scan
+		post_job "$inside"'"fdk": {}, "sart": {"iterations": 2}, "tv": {}, "metal": {"threshold_hu": 500}}'
+		wait_job succeeded
+		worker=$(pgrep -P "$(cat "$work/daemon.pid")" cbct-worker)
+		sleep 1; for t in /proc/$worker/task/*; do echo "$(basename $t) $(cat $t/comm) $(cat $t/wchan 2>/dev/null)"; done >&2; threads=$(grep -l "^cbct-worker" /proc/"$worker"/task/*/comm | wc -l)
+		echo "  threads of a worker with --threads $count = $threads"
+		eval "threads_$count=$threads"
+	done
+	expect_number "$threads_2" '==' $((threads_1 + 1)) "threads of a worker with one more"
+}
+
 start_daemon || exit 1
 run_tests
