@@ -544,6 +544,41 @@ int surroundings_fit(struct surroundings *s, const struct surroundings_options *
 	return code < 0 ? code : s->backend->volume_download(s->volume, 0, s->grid.size[2], s->voxels, err);
 }
 
+/* The axis along which a place lies beyond the grid's faces, the farthest where there are more; -1: it lies inside. */
+static int axis_outside(const struct grid *grid, const double place[3])
+{
+	double farthest = 0;
+	int axis = -1;
+
+	for (int i = 0; i < 3; i++) {
+		const double beyond = fabs(place[i] - grid->origin[i] - 0.5 * (grid->size[i] - 1) * grid->spacing[i]) -
+				      0.5 * grid->size[i] * grid->spacing[i];
+
+		if (beyond > farthest) {
+			farthest = beyond;
+			axis = i;
+		}
+	}
+	return axis;
+}
+
+/* Of the 3 x 3 voxels around one, across an axis: what goes on beyond a face does so beside it, noise does not. */
+static double mean_across(const struct surroundings *s, const int at[3], int axis)
+{
+	const int a = (axis + 1) % 3, b = (axis + 2) % 3, *size = s->grid.size;
+	double sum = 0;
+
+	for (int i = -1; i <= 1; i++)
+		for (int j = -1; j <= 1; j++) {
+			int near[3] = {at[0], at[1], at[2]};
+
+			near[a] = (int)fmin(fmax(at[a] + i, 0), size[a] - 1);
+			near[b] = (int)fmin(fmax(at[b] + j, 0), size[b] - 1);
+			sum += (double)s->voxels[voxel_at(&s->grid, near[0], near[1], near[2])];
+		}
+	return sum / 9;
+}
+
 bool surroundings_has_outside(const struct surroundings *s, const struct grid *grid)
 {
 	/* Of the object's density: 0.15 where a cylinder ends with the grid, 0.27 where it ends 0.4 mm beyond, then
@@ -563,9 +598,9 @@ bool surroundings_has_outside(const struct surroundings *s, const struct grid *g
 				const double place[3] = {s->grid.origin[0] + x * s->grid.spacing[0],
 							 s->grid.origin[1] + y * s->grid.spacing[1],
 							 s->grid.origin[2] + z * s->grid.spacing[2]};
+				const int axis = axis_outside(grid, place), at[3] = {x, y, z};
 
-				count += !is_inside(grid, place) &&
-					 (double)s->voxels[voxel_at(&s->grid, x, y, z)] * sum >= density * squares;
+				count += axis >= 0 && mean_across(s, at, axis) * sum >= density * squares;
 			}
 	return squares > 0 && count >= least;
 }

@@ -218,6 +218,17 @@ double reference_not_air(const float *view, size_t pixels)
 	return 0.05 * fmin(largest, 1);
 }
 
+/* Of a quarter of the outermost columns that decide, the k-th such stretch from the edge. */
+static double side_mean(const float *row, int columns, bool behind, int k)
+{
+	const int edge = columns / 64 > 4 ? columns / 64 : 4, count = edge / 4;
+	double mean = 0;
+
+	for (int i = k * count; i < (k + 1) * count; i++)
+		mean += (double)row[behind ? columns - 1 - i : i] / count;
+	return mean;
+}
+
 bool reference_is_cut(const float *row, int columns, bool behind, double not_air)
 {
 	const int edge = columns / 64 > 4 ? columns / 64 : 4, window = columns / 16 > 4 ? columns / 16 : 4;
@@ -230,7 +241,8 @@ bool reference_is_cut(const float *row, int columns, bool behind, double not_air
 
 		square += pow((double)at[0] - 2 * (double)at[1] + (double)at[2], 2) / (window - 2);
 	}
-	return mean > 0 && mean >= not_air && mean >= 3 * sqrt(square / 6 / edge);
+	return mean > 0 && mean >= not_air && mean >= 3 * sqrt(square / 6 / edge) &&
+	       2 * side_mean(row, columns, behind, 0) - side_mean(row, columns, behind, 1) >= not_air;
 }
 
 /* One side of a row that is cut off, by the words of core/extend.h. */
@@ -238,7 +250,7 @@ static void extend_row(const float *row, int columns, int extend, bool behind, d
 {
 	const int window = columns / 16 > 4 ? columns / 16 : 4;
 	double *x = calloc((size_t)columns, sizeof(double)), *y = calloc((size_t)columns, sizeof(double));
-	double mean = 0, mean_x = 0, c, a, b = 0, xx = 0, xy = 0, first = 0;
+	double mean = 0, mean_x = 0, c, a, b = 0, xx = 0, xy = 0, first = 0, near, next;
 	int count = 0;
 
 	for (int i = 0; i < columns; i++) {
@@ -266,7 +278,18 @@ static void extend_row(const float *row, int columns, int extend, bool behind, d
 		xy += (x[i] - mean_x) * (y[i] - mean);
 	}
 	b = fmin(0, xy / xx);
-	a = fmax(0, mean - b * mean_x);
+	a = mean - b * mean_x;
+	/* Where the row falls steeply at its edge, the parabola with that curvature through the outermost columns. */
+	near = side_mean(row, columns, behind, 0);
+	next = side_mean(row, columns, behind, 1);
+	if (next > near) {
+		const int k = columns / 64 > 4 ? columns / 256 : 1;
+		const double weight = fmin(fmax(2 - near / (4 * (next - near)), 0), 1), x0 = -(k - 1) / 2.0;
+
+		b += weight * (fmin((near * near - next * next) / k + c * k, b) - b);
+		a += weight * (near * near - b * x0 - c * x0 * x0 - a);
+	}
+	a = fmax(0, a);
 	for (int i = 1; i <= extend; i++)
 		ret[i - 1] = sqrt(fmax(0, a + b * i + c * i * i));
 	free(x);

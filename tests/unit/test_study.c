@@ -204,39 +204,6 @@ START_TEST(sart_and_tv_improve_on_fdk_with_exact_integrals)
 }
 END_TEST
 
-/*
- * Conjugate gradients on the same voxel object, from zero: 15 iterations are nearer to it than 100 of SIRT, the
- * algorithm that they are like in that each iteration is one projection and one backprojection of all views.
- */
-START_TEST(fifteen_conjugate_gradients_are_worth_more_than_a_hundred_of_sirt)
-{
-	struct study study;
-	struct recipe recipe;
-	struct outcome cgls = {0}, sirt = {0};
-	double fifteen, hundred;
-
-	study_open(&study, 100, 169, 2);
-	study_project_voxels(&study);
-	recipe = recipe_on(&study.grid);
-	recipe_set_algorithm(&recipe, &algorithm_cgls);
-	recipe.iterate.iterations = 15;
-	scene_run(&study.scene, &recipe, &cgls);
-	fifteen = error_of(&study, &cgls, "final");
-	for (int i = 1; i < cgls.row_count; i++)
-		ck_assert_double_lt(cgls.rows[i].residual, cgls.rows[i - 1].residual);
-	recipe_set_algorithm(&recipe, &algorithm_sart);
-	recipe.sart.subsets = 1;
-	recipe.iterate.iterations = 100;
-	scene_run(&study.scene, &recipe, &sirt);
-	hundred = error_of(&study, &sirt, "final");
-	ck_assert_msg(fifteen < hundred, "15 iterations of CGLS %.4f, 100 of SIRT %.4f", fifteen, hundred);
-	printf("15 iterations of CGLS %.4f, 100 of SIRT %.4f\n", fifteen, hundred);
-	outcome_clear(&cgls);
-	outcome_clear(&sirt);
-	study_close(&study);
-}
-END_TEST
-
 Suite *study_suite(void)
 {
 	Suite *suite = suite_create("study");
@@ -246,7 +213,6 @@ Suite *study_suite(void)
 	tcase_add_test(cases, sart_takes_the_voxel_object_from_fdk_to_itself);
 	tcase_add_test(cases, tv_halves_the_error_that_noise_drives_up);
 	tcase_add_test(cases, sart_and_tv_improve_on_fdk_with_exact_integrals);
-	tcase_add_test(cases, fifteen_conjugate_gradients_are_worth_more_than_a_hundred_of_sirt);
 	suite_add_tcase(suite, cases);
 	return suite;
 }
