@@ -306,6 +306,7 @@ static void look_at(const struct look *look, const struct grid *grid, const stru
 	view_matrix(&geometry->views[index], matrix);
 	/* Means of nine pixels against noise. */
 	box_sums(measured, columns, rows, 1, work);
+#pragma omp parallel for schedule(static)
 	for (size_t i = 0; i < pixels; i++)
 		measured[i] = measured[i] > 0 && measured[i] >= 9 * level;
 	box_sums(measured, columns, rows, reach, work);
