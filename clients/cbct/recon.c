@@ -86,7 +86,9 @@ static int on_volume(void *context, const struct kept_volume *volume, const stru
 	return 0;
 }
 
-static int request_make(const struct recon_options *options, struct job_request *ret_request, struct error *err)
+/* *ret_warnings is the list of the scan's, which a job does not repeat: delete it. */
+static int request_make(const struct recon_options *options, struct job_request *ret_request, cJSON **ret_warnings,
+			struct error *err)
 {
 	cJSON *document = NULL;
 	struct job_request request = {0};
@@ -100,8 +102,9 @@ static int request_make(const struct recon_options *options, struct job_request 
 		return code;
 	code = scan_files_open(options->directory, &files, err);
 	if (code == 0) {
-		warnings_print_scan(files.scan); /* a job does not repeat them */
 		code = job_request_resolve(&request, files.scan, err);
+		if (code == 0)
+			*ret_warnings = scan_warnings(files.scan);
 		scan_files_close(&files);
 	}
 	if (code == 0)
@@ -159,7 +162,8 @@ static void become_cuda(void)
 	free(text);
 }
 
-static int pipeline_run(const struct recon_options *options, const struct job_request *request, struct error *err)
+static int pipeline_run(const struct recon_options *options, const struct job_request *request,
+			const cJSON *warnings, struct error *err)
 {
 	const struct recipe *recipe = &request->recipe;
 	const struct backend *backend = backend_find(options->backend);
@@ -182,6 +186,7 @@ static int pipeline_run(const struct recon_options *options, const struct job_re
 
 	if (backends[0] == NULL && strcmp(options->backend, "cpu") != 0)
 		become_cuda();
+	warnings_print(warnings);
 	if (backend == NULL)
 		return error_set(err, ERR_USAGE, "--backend: '%s' is none that this program has", options->backend);
 	if (mkdir(output, 0777) != 0 && errno != EEXIST)
@@ -202,11 +207,13 @@ static int recon_run_command(const void *values, struct error *err)
 {
 	const struct recon_options *options = values;
 	struct job_request request;
-	int code = request_make(options, &request, err);
+	cJSON *warnings = NULL;
+	int code = request_make(options, &request, &warnings, err);
 
 	if (code != 0)
 		return code;
-	code = pipeline_run(options, &request, err);
+	code = pipeline_run(options, &request, warnings, err);
+	cJSON_Delete(warnings);
 	recipe_clear(&request.recipe);
 	return code;
 }
