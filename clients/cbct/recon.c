@@ -162,8 +162,8 @@ static void become_cuda(void)
 	free(text);
 }
 
-static int pipeline_run(const struct recon_options *options, const struct job_request *request,
-			const cJSON *warnings, struct error *err)
+static int pipeline_run(const struct recon_options *options, const struct job_request *request, const cJSON *warnings,
+			struct error *err)
 {
 	const struct recipe *recipe = &request->recipe;
 	const struct backend *backend = backend_find(options->backend);
