@@ -27,6 +27,17 @@ static int voxels_a_side(const struct surroundings_options *options)
 	return (int)fmin(fmax(most, SURROUNDINGS_LEAST), SURROUNDINGS_MOST);
 }
 
+/* The centre of a voxel, mm. */
+struct place {
+	double at[3];
+};
+
+static struct place place_of(const struct grid *grid, int x, int y, int z)
+{
+	return (struct place){{grid->origin[0] + x * grid->spacing[0], grid->origin[1] + y * grid->spacing[1],
+			       grid->origin[2] + z * grid->spacing[2]}};
+}
+
 struct box {
 	double low[3], high[3];
 };
@@ -314,15 +325,13 @@ static void look_at(const struct look *look, const struct grid *grid, const stru
 	for (int z = 0; z < grid->size[2]; z++)
 		for (int y = 0; y < grid->size[1]; y++)
 			for (int x = 0; x < grid->size[0]; x++) {
-				const double place[3] = {grid->origin[0] + x * grid->spacing[0],
-							 grid->origin[1] + y * grid->spacing[1],
-							 grid->origin[2] + z * grid->spacing[2]};
+				const struct place place = place_of(grid, x, y, z);
 				const size_t at = voxel_at(grid, x, y, z);
 				double column, row;
 
 				if (look->seen == NULL && look->empty[at])
 					continue;
-				view_project(matrix, place, &column, &row);
+				view_project(matrix, place.at, &column, &row);
 				if (look->seen != NULL && (row < -0.5 || row > rows - 0.5))
 					look->seen[at] = false;
 				if (!(column >= 1 && row >= 1 && column <= columns - 2 && row <= rows - 2))
@@ -387,12 +396,10 @@ static void keep_what_is_known(struct surroundings *s, const struct surroundings
 		for (int y = 0; y < s->grid.size[1]; y++)
 			for (int x = 0; x < s->grid.size[0]; x++) {
 				const size_t at = voxel_at(&s->grid, x, y, z);
-				const double place[3] = {s->grid.origin[0] + x * s->grid.spacing[0],
-							 s->grid.origin[1] + y * s->grid.spacing[1],
-							 s->grid.origin[2] + z * s->grid.spacing[2]};
-				const bool inside = is_inside(options->grid, place);
+				const struct place place = place_of(&s->grid, x, y, z);
+				const bool inside = is_inside(options->grid, place.at);
 
-				if (!inside && (empty[at] || !is_in_view(options->orbit, place)))
+				if (!inside && (empty[at] || !is_in_view(options->orbit, place.at)))
 					s->voxels[at] = 0;
 				s->voxels[at] *= (float)options->factor;
 				kept += !inside && s->voxels[at] != 0;
@@ -435,12 +442,10 @@ static void leave_inside_away(const struct surroundings_options *options, const 
 	for (int z = 0; z < grid->size[2]; z++)
 		for (int y = 0; y < grid->size[1]; y++)
 			for (int x = 0; x < grid->size[0]; x++) {
-				const double place[3] = {grid->origin[0] + x * grid->spacing[0],
-							 grid->origin[1] + y * grid->spacing[1],
-							 grid->origin[2] + z * grid->spacing[2]};
+				const struct place place = place_of(grid, x, y, z);
 
 				ret_empty[voxel_at(grid, x, y, z)] =
-				    is_inside(options->grid, place) || !is_in_view(options->orbit, place);
+				    is_inside(options->grid, place.at) || !is_in_view(options->orbit, place.at);
 			}
 }
 
@@ -596,10 +601,8 @@ bool surroundings_has_outside(const struct surroundings *s, const struct grid *g
 	for (int z = 0; z < s->grid.size[2]; z++)
 		for (int y = 0; y < s->grid.size[1]; y++)
 			for (int x = 0; x < s->grid.size[0]; x++) {
-				const double place[3] = {s->grid.origin[0] + x * s->grid.spacing[0],
-							 s->grid.origin[1] + y * s->grid.spacing[1],
-							 s->grid.origin[2] + z * s->grid.spacing[2]};
-				const int axis = axis_outside(grid, place), at[3] = {x, y, z};
+				const struct place place = place_of(&s->grid, x, y, z);
+				const int axis = axis_outside(grid, place.at), at[3] = {x, y, z};
 
 				count += axis >= 0 && mean_across(s, at, axis) * sum >= density * squares;
 			}
