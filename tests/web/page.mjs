@@ -174,11 +174,10 @@ async function rendered(page, columns, margin, what) {
 		const seen = grayOf(await page.locator(`${tile('3d')} canvas`).screenshot())
 		if (!seen.pixels.some(value => value > 60))
 			return { nothing: true }
-		const b = shrink(cropped(seen, 40, 12))
+		const b = shrink(cropped(seen, 60, 12))
 		const others = [mirrored(b), flipped(b), mirrored(flipped(b))].map(other => correlation(a, other))
 		return { likeness: correlation(a, b), others }
-	/* The likest mirror image reaches .46; from its left the right one has .60, for light thins the solid's edges. */
-	}, ({ likeness, others }) => likeness > 0.5 && others.every(other => other < likeness - margin))
+	}, ({ likeness, others }) => likeness > 0.6 && others.every(other => other < likeness - margin))
 }
 
 test('letters are the patient\'s sides where they are known, and the table\'s axes where they are not', async () => {
