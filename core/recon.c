@@ -1,6 +1,6 @@
 /*
- * One reconstruction: FDK, then SART, with TV after the FDK volume and after
- * each SART iteration, over any backend. Everything is allocated when it is
+ * One reconstruction: FDK, then an iterative algorithm, with TV after the FDK volume
+ * and after each iteration, over any backend. Everything is allocated when it is
  * opened, after the bytes it needs were compared with those that are free.
  */
 #include "core/recon.h"
@@ -575,7 +575,7 @@ static int make_up_for_blank_views(struct recon *recon, struct error *err)
 }
 
 /*
- * Rays that say nothing are left out of SART: those through metal, and all of a
+ * Rays that say nothing are left out of the iterations: those through metal, and all of a
  * blank view. It comes after all else that is done with the projections.
  */
 static int leave_rays_out(struct recon *recon, struct error *err)
@@ -757,7 +757,7 @@ static int subtract_the_exterior(struct recon *recon, const struct surroundings_
 	}
 	if (code == 0)
 		code = exterior_subtract(surroundings, options, steps, recon->before, &rows, err);
-	/* SART alone starts from zero. */
+	/* Iterations without FDK start from zero. */
 	if (code == 0 && surroundings->goes_on && recon->recipe.fdk.on && recon->iteration == 0)
 		code = exterior_start(surroundings, options, recon->before, recon->volume, err);
 	if (code == 0)
@@ -766,7 +766,7 @@ static int subtract_the_exterior(struct recon *recon, const struct surroundings_
 }
 
 /*
- * What lies outside of the grid is taken out of the projections before SART sees
+ * What lies outside of the grid is taken out of the projections before an iteration sees
  * them. It is found from them alone, so that a run that goes on from an iterate
  * gives the same bits; `before` is worked in, which the first iteration writes
  * anyway.

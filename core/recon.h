@@ -4,14 +4,14 @@
 #include "core/backend.h"
 
 /*
- * One reconstruction: FDK, then SART, with TV after the FDK volume and after
- * each SART iteration. Opened with a geometry and a recipe, fed with views in
+ * One reconstruction: FDK, then an iterative algorithm, with TV after the FDK volume
+ * and after each iteration. Opened with a geometry and a recipe, fed with views in
  * any order, then run; everything is allocated at the opening. One thread at a
  * time; the hooks are called in that thread.
  */
 enum { EMIT_FDK = 0, EMIT_FDK_TV = -1 }; /* beside iterations 1, 2, ... */
 
-/* How SART projects backwards: plan_options.matched. */
+/* How iterations project backwards: plan_options.matched. */
 enum projector { PROJECTOR_INTERPOLATING, PROJECTOR_MATCHED, PROJECTOR_COUNT };
 extern const char *const projector_names[PROJECTOR_COUNT]; /* "interpolating", "matched" */
 
@@ -145,7 +145,7 @@ struct recon_memory {
 
 /*
  * What a job will take at most, before it is opened. The projections are all
- * kept for SART; FDK alone needs a few at a time. device NULL (the daemon, that
+ * kept for iterations; FDK alone needs a few at a time. device NULL (the daemon, that
  * opens none): available is 0.
  */
 int recon_memory(const struct backend *backend, struct device *device, const struct geometry *geometry,
@@ -167,7 +167,7 @@ void recon_free(struct recon *recon);
  */
 int recon_push(struct recon *recon, const void *samples, const int *views, int count, struct error *err);
 
-/* Once, after the last view: finishes FDK, then TV, SART and TV in turn, calling the hooks. */
+/* Once, after the last view: finishes FDK, then TV, iterations and TV in turn, calling the hooks. */
 int recon_run(struct recon *recon, struct error *err);
 
 /*

@@ -47,12 +47,12 @@ struct table {
 };
 
 /* _i = 0: the CPU; 1: out of core, over the CPU. */
-static void table_open(struct table *ret, int out_of_core)
+static void table_open(struct table *ret, int out_of_core, const struct sart_options *sart)
 {
 	const struct orbit_spec spec = {COLUMNS, ROWS, SLOTS, {600, 1100, {4, 4}, {0, 0}, {0, 0}}, 0, 72};
 	struct table table = {.backend = out_of_core ? &backend_parts : &backend_cpu,
 			      .grid = grid_of(11, 7, 9, 2, 2, 2)};
-	struct plan_options options = {.linearise = {.sample = SAMPLE_FLOAT32}};
+	struct plan_options options = {.linearise = {.sample = SAMPLE_FLOAT32}, .sart = sart};
 
 	scene_orbit(&table.scene, &spec);
 	ok(backend_cpu.open(0, &(struct device_options){.threads = 2}, &table.below, &err));
@@ -89,7 +89,7 @@ START_TEST(volumes_are_added_multiplied_and_divided)
 	const size_t voxels = sizeof(x) / sizeof(x[0]);
 	struct volume *vx, *vy;
 
-	table_open(&t, _i);
+	table_open(&t, _i, NULL);
 	fill(x, voxels, 1);
 	fill(y, voxels, 2);
 	ok(t.backend->volume_new(t.device, &t.grid, &vx, &err));
@@ -138,7 +138,7 @@ START_TEST(stacks_are_added_multiplied_and_divided_by_slots)
 	double sum = 0, expected = 0;
 	struct stack *sx, *sy;
 
-	table_open(&t, _i);
+	table_open(&t, _i, NULL);
 	fill(x, SLOTS * PIXELS, 3);
 	fill(y, SLOTS * PIXELS, 4);
 	ok(t.backend->stack_new(t.device, COLUMNS, ROWS, SLOTS, &sx, &err));
@@ -213,6 +213,78 @@ static void run(const struct scene *scene, const struct recipe *recipe, struct o
 	scene_run(scene, recipe, outcome);
 	ck_assert_msg(outcome->code == 0, "%s", outcome->err.text);
 }
+
+/*
+ * SART's update by the formula of backend.h in plain steps of the algebra, over one subset: the oracle of the fused
+ * ones, on their own projectors.
+ */
+static void plain_update(const struct table *t, const struct stack *projections, const int *views, int count,
+			 const struct sart_options *sart, struct volume *v)
+{
+	const struct backend *b = t->backend;
+	const double shortest = fmin(fmin(t->grid.spacing[0], t->grid.spacing[1]), t->grid.spacing[2]);
+	struct volume *ones, *correction, *weights;
+	struct stack *rays, *lengths;
+
+	ok(b->volume_new(t->device, &t->grid, &ones, &err));
+	ok(b->volume_new(t->device, &t->grid, &correction, &err));
+	ok(b->volume_new(t->device, &t->grid, &weights, &err));
+	ok(b->stack_new(t->device, COLUMNS, ROWS, count, &rays, &err));
+	ok(b->stack_new(t->device, COLUMNS, ROWS, count, &lengths, &err));
+	ok(b->project(t->plan, v, views, count, rays, &err));
+	ok(b->stack_axpby(1, projections, views, count, -1, rays, &err));
+	ok(b->stack_mask(projections, views, count, rays, &err));
+	ok(b->volume_fill(ones, 1, &err));
+	ok(b->project(t->plan, ones, views, count, lengths, &err));
+	ok(b->stack_divide(lengths, RAY_LENGTH_LEAST * shortest, count, rays, &err));
+	ok(b->volume_fill(correction, 0, &err));
+	ok(b->backproject(t->plan, rays, views, count, BACKPROJECT_PLAIN, correction, &err));
+	ok(b->stack_fill(lengths, count, 1, &err));
+	ok(b->volume_fill(weights, 0, &err));
+	ok(b->backproject(t->plan, lengths, views, count, BACKPROJECT_PLAIN, weights, &err));
+	ok(b->volume_divide(weights, 1e-6, correction, &err));
+	ok(b->volume_axpby(sart->relaxation, correction, 1, v, &err));
+	ok(b->volume_clip(v, &err));
+	b->stack_free(lengths);
+	b->stack_free(rays);
+	b->volume_free(weights);
+	b->volume_free(correction);
+	b->volume_free(ones);
+}
+
+START_TEST(sart_in_plain_steps_is_the_fused_one)
+{
+	int order[SLOTS] = {3, 0, 4, 1, 2}, start[] = {0, 2, 5};
+	const struct sart_options sart = {.subsets = {2, order, start}, .relaxation = 0.8, .nonnegative = true};
+	float from[11 * 7 * 9], plain[11 * 7 * 9], fused[11 * 7 * 9], samples[SLOTS * PIXELS];
+	const size_t voxels = sizeof(from) / sizeof(from[0]);
+	struct iteration_sums sums;
+	struct volume *v;
+	struct stack *p;
+	struct table t;
+
+	table_open(&t, _i, &sart);
+	fill(from, voxels, 5);
+	fill(samples, SLOTS * PIXELS, 6);
+	samples[2 * PIXELS + 130] = RAY_LEFT_OUT;
+	ok(t.backend->volume_new(t.device, &t.grid, &v, &err));
+	ok(t.backend->stack_new(t.device, COLUMNS, ROWS, SLOTS, &p, &err));
+	ok(t.backend->stack_upload(p, 0, SLOTS, samples, &err));
+	ok(t.backend->volume_upload(v, from, &err));
+	for (int s = 0; s < 2; s++)
+		plain_update(&t, p, order + start[s], start[s + 1] - start[s], &sart, v);
+	ok(t.backend->volume_download(v, 0, 9, plain, &err));
+	ok(t.backend->volume_upload(v, from, &err));
+	ok(t.backend->sart_iterate(t.plan, p, v, NULL, &sums, &err));
+	ok(t.backend->volume_download(v, 0, 9, fused, &err));
+	ck_assert_mem_ne(fused, from, sizeof(from));
+	for (size_t i = 0; i < voxels; i++)
+		ck_assert_double_eq_tol((double)fused[i], (double)plain[i], 1e-5);
+	t.backend->stack_free(p);
+	t.backend->volume_free(v);
+	table_close(&t);
+}
+END_TEST
 
 START_TEST(every_algorithm_is_found_by_its_name)
 {
@@ -386,6 +458,7 @@ Suite *algorithm_suite(void)
 	tcase_set_timeout(cgls, 0);
 	tcase_add_loop_test(algebra, volumes_are_added_multiplied_and_divided, 0, 2);
 	tcase_add_loop_test(algebra, stacks_are_added_multiplied_and_divided_by_slots, 0, 2);
+	tcase_add_loop_test(algebra, sart_in_plain_steps_is_the_fused_one, 0, 2);
 	tcase_add_test(rows, every_algorithm_is_found_by_its_name);
 	tcase_add_loop_test(rows, a_run_that_yielded_ends_with_the_same_bits, 0, 2 * ALGORITHM_COUNT);
 	tcase_add_loop_test(rows, every_algorithm_can_be_cancelled_and_stops_by_its_rules, 0, ALGORITHM_COUNT);
