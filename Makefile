@@ -64,14 +64,14 @@ bundle_flags := -Wl,--disable-new-dtags,-rpath,'$$ORIGIN/../lib'
 override LDFLAGS += $(if $(BUNDLE),$(bundle_flags)) $(OPENMP) $(if $(SANITIZE),-fsanitize=$(SANITIZE))
 LIBM := -lm -lpthread
 
-# core/*_simd.c are compiled once for each instruction set; core/cpu.c picks one at run time.
+# core/cpu/*_simd.c are compiled once for each instruction set; core/cpu/cpu.c picks one at run time.
 SIMD_ISAS    := base avx2 avx512
 flags_base   :=
 flags_avx2   := -mavx2 -mfma -mf16c
 flags_avx512 := -mavx512f -mavx512bw -mavx512dq -mavx512vl -mfma -mprefer-vector-width=512
 
-simd_sources   := $(wildcard core/*_simd.c)
-core_sources   := $(filter-out $(simd_sources),$(wildcard core/*.c))
+simd_sources   := $(wildcard core/cpu/*_simd.c)
+core_sources   := $(filter-out $(simd_sources),$(wildcard core/*.c core/*/*.c))
 proto_sources  := $(wildcard proto/*.c)
 daemon_sources := $(filter-out daemon/worker.c,$(wildcard daemon/*.c daemon/*/*.c))
 # What the unit tests know of the daemon: its state, without HTTP.
@@ -116,7 +116,7 @@ $(BUILD)/kernels/%.o: kernels/%.cu
 # the client's `recon` and the GPU tests know of CUDA's row (core/backend.c).
 $(library): $(core_objects) $(call objects,$(proto_sources))
 	@rm -f $@
-	$(call say,AR  )$(AR) rcs $@ $^
+	$(call say,AR  )$(AR) qcs $@ $^
 
 $(BUILD)/proto/openapi.c: proto/openapi.py proto/openapi.yaml
 	@mkdir -p $(@D)

@@ -6,9 +6,9 @@
 #include <stddef.h>
 #include "core/error.h"
 #include "core/filter.h"
-#include "core/geometry.h"
-#include "core/grid.h"
-#include "core/orbit.h"
+#include "core/scan/geometry.h"
+#include "core/scan/grid.h"
+#include "core/scan/orbit.h"
 
 #ifdef __cplusplus
 extern "C" {
@@ -55,10 +55,11 @@ struct linearise {
 	const float *flat; /* [row][column] counts, or NULL; host memory that outlives the plan */
 	const float *dark; /* [row][column] counts, or NULL for none */
 	double saturation; /* counts at and above this are defects; 0 = 65535 for uint16, none for float32 */
-	/* [row][column], not zero: a defect in every view; NULL for none. Given and found ones alike (core/defects.h).
+	/* [row][column], not zero: a defect in every view; NULL for none. Given and found ones alike
+	 * (core/correct/defects.h).
 	 */
 	const unsigned char *defects;
-	const unsigned char *stuck; /* [row][column], likewise: found by core/stuck.h; NULL for none */
+	const unsigned char *stuck; /* [row][column], likewise: found by core/correct/stuck.h; NULL for none */
 	/*
 	 * First column, first row, last column, last row, all included: the mean
 	 * transmission (I - dark) / (flat - dark) there, defects left out, is each view's
@@ -139,7 +140,7 @@ struct plan_options {
 	int pad[2];
 	/*
 	 * Columns by which `filter` extends truncated rows on either side before the
-	 * ramp (core/extend.h), 0: none; and the response of filter_length(padded columns
+	 * ramp (core/truncation.h), 0: none; and the response of filter_length(padded columns
 	 * + extend) that these rows need. Other rows are filtered as without.
 	 */
 	int extend;
@@ -176,7 +177,7 @@ struct plan_bytes {
 	size_t scratch; /* the rest, */
 	size_t block;   /* and of it what another plan can lend */
 	size_t raw;     /* one projection on its way in */
-	size_t host;    /* beside the device's own memory, in parts.h; 0 elsewhere */
+	size_t host;    /* beside the device's own memory, of outofcore.h; 0 elsewhere */
 };
 
 struct iteration_sums {
@@ -217,7 +218,8 @@ enum backprojection { BACKPROJECT_PLAIN, BACKPROJECT_FDK /* times (D/depth)^2 */
 struct backend {
 	const char *name;    /* "cpu", "cuda" */
 	const char *summary; /* for --help */
-	/* Its devices have memory beside the host's: what does not fit there can go through it in parts (parts.h). */
+	/* Its devices have memory beside the host's: what does not fit there can go through it in slabs (outofcore.h).
+	 */
 	bool own_memory;
 
 	/* Devices that answer now; 0 when there is none. Never fails. */
@@ -267,7 +269,7 @@ struct backend {
 	/*
 	 * q = ramp of weights and cosine times p: view views[i] from slot slots[i] of `from` into slot i of `to`.
 	 * slots NULL: slot = view. FDK alone keeps no stack of all views, its slots are those of one batch.
-	 * With plan_options.extend truncated rows are extended, see core/extend.h.
+	 * With plan_options.extend truncated rows are extended, see core/truncation.h.
 	 */
 	int (*filter)(struct plan *plan, const struct stack *from, const int *slots, const int *views, int count,
 		      struct stack *to, struct error *err);

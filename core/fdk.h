@@ -3,7 +3,7 @@
 
 #include "core/backend.h"
 
-/* The FDK stage of core/recon.c, and nobody else's. */
+/* The FDK stage of core/recon/recon.c, and nobody else's. */
 
 /* What the backend's `filter` needs beside the projections. */
 struct fdk_weights {

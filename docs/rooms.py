@@ -42,7 +42,7 @@ def room_of(path):
     if path in ROOMS:
         return path
     folder = path.rpartition("/")[0]
-    return "daemon/*.c" if folder == "daemon" else folder
+    return "daemon/*.c" if folder == "daemon" else "core" if folder.startswith("core/") else folder
 
 
 def includes():

@@ -16,7 +16,7 @@
  * these are taken out of it and transformed anew, so that both give the same rows.
  *
  * Rows too long for that go through cuFFT in batches, and so do those that the
- * detector cuts off (core/extend.h): rows are looked at before they are filtered,
+ * detector cuts off (core/truncation.h): rows are looked at before they are filtered,
  * on the stream for what comes in, so that nobody waits for the card to come to
  * it. All are filtered as they are, those few then once more with their extension.
  */
@@ -26,7 +26,7 @@
 #include <cufft.h>
 #include <vector>
 
-#include "core/extend.h"
+#include "core/truncation.h"
 #include "kernels/fft.cuh"
 #include "kernels/internal.cuh"
 
@@ -257,7 +257,7 @@ static __global__ void __launch_bounds__(LEVEL_THREADS)
 {
 	__shared__ float shared[LEVEL_THREADS];
 	const float *p = job.from + (size_t)slots.slot[blockIdx.x] * job.slot;
-	int column_stride = extend_stride(job.columns), row_stride = extend_stride(job.rows);
+	int column_stride = truncation_stride(job.columns), row_stride = truncation_stride(job.rows);
 	int columns = (job.columns - 1) / column_stride + 1, rows = (job.rows - 1) / row_stride + 1;
 	float largest = 0;
 
@@ -273,7 +273,7 @@ static __global__ void __launch_bounds__(LEVEL_THREADS)
 			shared[threadIdx.x] = fmaxf(shared[threadIdx.x], shared[threadIdx.x + half]);
 	}
 	if (threadIdx.x == 0)
-		levels[blockIdx.x] = extend_level(shared[0]);
+		levels[blockIdx.x] = truncation_level(shared[0]);
 }
 
 /* What the block's threads share while they look for the shell around a row's object. */
@@ -285,7 +285,7 @@ struct shell_search_shared {
 };
 static_assert(EDGE_THREADS == (int)SHELL_BINS, "a thread has one bin");
 
-/* core/extend.h's search, a candidate a thread; thread 0 has the result. */
+/* core/truncation.h's search, a candidate a thread; thread 0 has the result. */
 static __device__ struct shell find_shell(const struct shell_table *table, const float *p, int columns, float level,
 					  int sides, shell_search_shared *s, int *ret_width)
 {
@@ -332,9 +332,9 @@ static __device__ struct shell find_shell(const struct shell_table *table, const
 	return shell;
 }
 
-static __device__ struct extend_near near_side(const float *p, int columns, int side)
+static __device__ struct truncation_near near_side(const float *p, int columns, int side)
 {
-	return extend_near(side == 0 ? p : p + columns - 1, side == 0 ? 1 : -1, columns);
+	return truncation_near(side == 0 ? p : p + columns - 1, side == 0 ? 1 : -1, columns);
 }
 
 /* A block has one row; most rows end in air at both sides and cost no more than a look there. */
@@ -343,7 +343,8 @@ static __global__ void __launch_bounds__(EDGE_THREADS)
 {
 	__shared__ double shared[EDGE_THREADS];
 	__shared__ shell_search_shared search;
-	int row = blockIdx.x, columns = job.columns, edge = extend_edge(columns), window = extend_window(columns);
+	int row = blockIdx.x, columns = job.columns, edge = truncation_edge(columns),
+	    window = truncation_window(columns);
 	const float *p = job.from + (size_t)slots.slot[blockIdx.y] * job.slot + (size_t)row * job.pitch;
 	size_t at = (size_t)blockIdx.y * job.rows + row;
 	const float level = found.levels[blockIdx.y];
@@ -356,7 +357,7 @@ static __global__ void __launch_bounds__(EDGE_THREADS)
 			sum += (double)p[side == 0 ? i : columns - 1 - i];
 		sum = sum_block(sum, shared);
 		if (!(side == 0 ? before : behind) || !(sum > 0) || sum < (double)level * edge ||
-		    extend_ends_within(near_side(p, columns, side), level))
+		    truncation_ends_within(near_side(p, columns, side), level))
 			continue;
 		for (int i = threadIdx.x + 1; i < window - 1; i += EDGE_THREADS) {
 			const float *middle = p + (side == 0 ? i : columns - 1 - i);
@@ -364,17 +365,17 @@ static __global__ void __launch_bounds__(EDGE_THREADS)
 
 			bends += bend * bend;
 		}
-		if (!extend_is_chance(columns, sum, sum_block(bends, shared)))
+		if (!truncation_is_chance(columns, sum, sum_block(bends, shared)))
 			sides |= 1 << side;
 	}
 	if (threadIdx.x == 0)
 		found.sides[at] = (unsigned char)sides;
 	if (sides == 0)
 		return;
-	struct extend_row_sums own = {}, row_sums;
+	struct truncation_row_sums own = {}, row_sums;
 	for (int c = threadIdx.x; c < columns; c += EDGE_THREADS)
 		if (p[c] >= level)
-			extend_row_add(&own, extend_x(c, columns), (double)p[c]);
+			truncation_row_add(&own, truncation_x(c, columns), (double)p[c]);
 	row_sums.n = sum_block(own.n, shared);
 	row_sums.x = sum_block(own.x, shared);
 	row_sums.x2 = sum_block(own.x2, shared);
@@ -386,7 +387,7 @@ static __global__ void __launch_bounds__(EDGE_THREADS)
 	int width;
 	struct shell shell = find_shell(found.shells, p, columns, level, sides, &search, &width);
 	for (int side = 0; side < 2; side++) {
-		struct extend_edge_sums edge_sums;
+		struct truncation_edge_sums edge_sums;
 		double y = 0, xy = 0, measured = 0;
 
 		for (int i = threadIdx.x; i < window; i += EDGE_THREADS) {
@@ -402,9 +403,9 @@ static __global__ void __launch_bounds__(EDGE_THREADS)
 		if (threadIdx.x > 0 || !(sides >> side & 1))
 			continue;
 		found.fit[at][side] =
-		    extend_fit(columns, job.extend, &row_sums, &edge_sums, near_side(p, columns, side));
+		    truncation_fit(columns, job.extend, &row_sums, &edge_sums, near_side(p, columns, side));
 		if (shell.share > 0)
-			extend_by_shell(&found.fit[at][side], &shell, side, width, (float)measured, columns);
+			truncation_by_shell(&found.fit[at][side], &shell, side, width, (float)measured, columns);
 	}
 }
 
@@ -433,7 +434,7 @@ static __device__ __forceinline__ float extended_at(const filter_job &job, const
 
 	if (!(job.sides[at.index] >> side & 1) || x > job.extend)
 		return 0;
-	return extend_value(&job.fit[at.index][side], x) * weight.column_weights[outermost] *
+	return truncation_value(&job.fit[at.index][side], x) * weight.column_weights[outermost] *
 	       cosine_at(job, weight, column);
 }
 

@@ -1,5 +1,5 @@
 /*
- * Raw samples to line integrals with the rules of core/cpu_linearise.c:
+ * Raw samples to line integrals with the rules of core/cpu/linearise.c:
  *
  *   p  = -ln((I - dark) / (a (flat - dark))),  a the view's own air (1 without an air region),
  *   p' = hardening[0] + hardening[1] p + hardening[2] p^2 + ...

@@ -3,7 +3,7 @@
 
 /*
  * Backprojection as the exact transpose of the forward projection (rays.cuh),
- * for SART's matched pair; core/matched_simd.c derives the weights. A ray of
+ * for SART's matched pair; core/cpu/matched_simd.c derives the weights. A ray of
  * dominant axis a that crosses the slice i at (fast, row) gives to its voxels
  *
  *   step w(i) B(fast - j) C(row - k) y,

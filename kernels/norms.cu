@@ -91,7 +91,7 @@ int reduce_pairs(struct plan *plan, const float2 *partial, size_t count, double 
 	return 0;
 }
 
-/* As in core/cpu_norms.c: what is not finite is counted and left out. */
+/* As in core/cpu/norms.c: what is not finite is counted and left out. */
 static __global__ void __launch_bounds__(THREADS)
     norms(const float *__restrict__ volume, const float *__restrict__ other, int nx, int ny, int nz, float wx, float wy,
 	  float wz, double *blocks)

@@ -11,7 +11,7 @@
  *
  * Joseph's sample is bilinear where the ray crosses the middle of the slice. Here
  * it is the linear interpolation along the fast axis, integrated over the way
- * between the slices beside it with weight 1 - |s| (core/project_simd.c derives
+ * between the slices beside it with weight 1 - |s| (core/cpu/project_simd.c derives
  * it): with S the change of the fast coordinate per slice and
  *   kink(y) = S/6 (1 - |y|/S)^3 for |y| < S, else 0,
  * the columns j - 1 .. j + 2 beside the position j + right count with k0,

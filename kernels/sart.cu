@@ -1,5 +1,5 @@
 /*
- * SART, OS-SART and SIRT (core/sart.c has the formula). Row sums are lengths
+ * SART, OS-SART and SIRT (core/recon/sart.c has the formula). Row sums are lengths
  * (rays.cuh), column sums are numbers of views where the whole grid is seen, so
  * neither needs memory. The matched projector has its own column sums, which
  * come along with its backprojection (matched.cuh).

@@ -1,5 +1,5 @@
 /*
- * Total variation, the two methods of core/cpu_tv.c step by step: explicit steps
+ * Total variation, the two methods of core/cpu/tv.c step by step: explicit steps
  * (Rudin, Osher and Fatemi 1992) and accelerated primal-dual steps (Chambolle and
  * Pock 2011, algorithm 2).
  *
@@ -384,7 +384,7 @@ size_t tv_scratch_bytes(const struct plan_options *options)
 	return options->reference_precision ? 5 * volume : 6 * volume;
 }
 
-/* The smallest epsilon with which the steps are stable: see core/cpu_tv.c. */
+/* The smallest epsilon with which the steps are stable: see core/cpu/tv.c. */
 static int run_gradient(struct plan *plan, float *volume, const struct tv_options *tv, const struct cancel *cancel,
 			struct error *err)
 {

@@ -3,7 +3,7 @@
 
 #include <stdint.h>
 
-#include "core/grid.h"
+#include "core/scan/grid.h"
 #include "proto/provenance.h"
 
 /*

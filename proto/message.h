@@ -1,7 +1,7 @@
 #ifndef CBCT_PROTO_MESSAGE_H
 #define CBCT_PROTO_MESSAGE_H
 
-#include "core/recon.h"
+#include "core/recon/recon.h"
 #include "proto/scan_directory.h"
 
 /*

@@ -4,7 +4,7 @@
 #include <math.h>
 #include <string.h>
 
-#include "core/geometry.h"
+#include "core/scan/geometry.h"
 
 const char *const patient_position_names[PATIENT_POSITION_COUNT + 1] = {"HFS",  "HFP",  "FFS",  "FFP", "HFDL",
 									"HFDR", "FFDL", "FFDR", NULL};

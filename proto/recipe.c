@@ -10,7 +10,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "core/algorithm.h"
+#include "core/recon/algorithm.h"
 
 const char *const priority_names[PRIORITY_COUNT] = {"routine", "urgent", "stat"};
 

@@ -1,7 +1,7 @@
 #ifndef CBCT_PROTO_RECIPE_H
 #define CBCT_PROTO_RECIPE_H
 
-#include "core/recon.h"
+#include "core/recon/recon.h"
 #include "proto/labels.h"
 #include "proto/scan.h"
 

@@ -14,8 +14,8 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
-#include "core/algorithm.h"
-#include "core/stuck.h"
+#include "core/recon/algorithm.h"
+#include "core/correct/stuck.h"
 #include "proto/durable.h"
 #include "proto/format.h"
 #include "proto/nifti.h"

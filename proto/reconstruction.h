@@ -4,7 +4,7 @@
 #include <stdbool.h>
 #include <stddef.h>
 
-#include "core/recon.h"
+#include "core/recon/recon.h"
 #include "proto/patient.h"
 #include "proto/recipe.h"
 

@@ -4,7 +4,7 @@
 #include <stdbool.h>
 #include <stddef.h>
 
-#include "core/geometry.h"
+#include "core/scan/geometry.h"
 
 /*
  * The geometry files of RTK (the Reconstruction Toolkit, openrtk.org):

@@ -2,7 +2,7 @@
 #define CBCT_PROTO_SCAN_H
 
 #include "core/backend.h"
-#include "core/orbit.h"
+#include "core/scan/orbit.h"
 #include "proto/json.h"
 #include "proto/patient.h"
 

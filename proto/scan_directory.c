@@ -14,7 +14,7 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
-#include "core/stuck.h"
+#include "core/correct/stuck.h"
 #include "proto/durable.h"
 #include "proto/format.h"
 #include "proto/nifti.h"

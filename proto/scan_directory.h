@@ -4,7 +4,7 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-#include "core/recon.h"
+#include "core/recon/recon.h"
 #include "proto/recipe.h"
 #include "proto/scan.h"
 

@@ -4,7 +4,7 @@
 #include <stddef.h>
 
 #include "core/error.h"
-#include "core/grid.h"
+#include "core/scan/grid.h"
 
 /*
  * Planes of a volume as 8-bit gray pictures along its own axes, whichever way the

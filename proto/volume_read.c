@@ -12,7 +12,7 @@
 #include <unistd.h>
 #include <zlib.h>
 
-#include "core/geometry.h"
+#include "core/scan/geometry.h"
 #include "proto/format.h"
 #include "proto/header.h"
 #include "proto/metaimage.h"

@@ -6,7 +6,7 @@
 #include <string.h>
 
 #include "clients/cbct/npy.h"
-#include "core/geometry.h"
+#include "core/scan/geometry.h"
 #include "proto/scan_directory.h"
 
 enum { FILE_BYTES = 64 << 20 };

@@ -2,7 +2,7 @@
 #define CBCT_CLIENTS_OBJECT_H
 
 #include "clients/cbct/volume_input.h"
-#include "core/phantom.h"
+#include "core/scan/phantom.h"
 
 /* What is simulated: an analytic phantom, or a voxel volume. */
 struct object_options {

@@ -3,7 +3,7 @@
 
 #include <cjson/cJSON.h>
 
-#include "core/geometry.h"
+#include "core/scan/geometry.h"
 
 /* An entry of a scan document's "views". */
 cJSON *view_json(const struct view *view);

@@ -2,7 +2,7 @@
 #define CBCT_DAEMON_VOLUMES_MAPPING_H
 
 #include "core/error.h"
-#include "core/grid.h"
+#include "core/scan/grid.h"
 
 /*
  * Volume files in memory, each mapped once for all who look at it. The few that

@@ -17,8 +17,8 @@
 #include <time.h>
 #include <unistd.h>
 
-#include "core/phantom.h"
-#include "core/recon.h"
+#include "core/scan/phantom.h"
+#include "core/recon/recon.h"
 
 enum { VOXELS = 256, VIEWS = 100, PIXELS = 559, REPEATS_MOST = 100 };
 

@@ -13,7 +13,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "core/noise.h"
+#include "core/recon/noise.h"
 #include "tests/unit/anatomy.h"
 
 static const struct {

@@ -17,7 +17,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "core/phantom.h"
+#include "core/scan/phantom.h"
 #include "tests/bench/gpu_scene.h"
 
 extern const struct backend backend_cuda;
@@ -370,7 +370,7 @@ static void bench_geometry(const struct bench_case *c, bool untilted)
 	scene_clear(&bench.scene);
 }
 
-/* Filtering where the detector cuts off all rows on both sides (core/extend.h). */
+/* Filtering where the detector cuts off all rows on both sides (core/truncation.h). */
 static void bench_cut_off(const struct bench_case *c)
 {
 	struct scene_options options = c->options;

@@ -15,7 +15,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "core/phantom.h"
+#include "core/scan/phantom.h"
 #include "tests/bench/gpu_scene.h"
 
 extern const struct backend backend_cuda;
@@ -882,7 +882,7 @@ static void check_matched_beside(struct device *devices[2])
 	}
 }
 
-/* What core/recon.c makes of line integrals of all views on one side; the caller frees it. */
+/* What core/recon/recon.c makes of line integrals of all views on one side; the caller frees it. */
 static float *reconstruct(const struct backend *side, struct device *device, const struct scene *scene,
 			  const struct recipe *recipe, const struct recon_hooks *hooks, const float *projections)
 {
@@ -1020,7 +1020,7 @@ static void check_scales(struct device *devices[2], enum bend bend, int subsets)
 	scene_clear(&scene);
 }
 
-/* FDK and ten SART iterations of the head through core/recon.c, on both sides. */
+/* FDK and ten SART iterations of the head through core/recon/recon.c, on both sides. */
 static void check_recon(struct device *devices[2], enum bend bend, bool reference, bool tv, bool matched,
 			double tolerance)
 {
@@ -1177,7 +1177,7 @@ static void check_metal(struct device *devices[2], enum bend bend, bool referenc
 	scene_clear(&scene);
 }
 
-/* A device that is too small for the job has it in parts: what the whole gives, and the same bits again. */
+/* A device that is too small for the job has it out of core: what the whole gives, and the same bits again. */
 static void check_parts(bool tv, bool untilted, bool matched)
 {
 	const struct scene_options at = {.columns = 257,
@@ -1199,7 +1199,7 @@ static void check_parts(bool tv, bool untilted, bool matched)
 	float *raw = malloc(pixels * (size_t)at.views * sizeof(float)), *got[3];
 	int *views = all_views(at.views);
 
-	scene_make(&scene, matched ? "in parts, matched" : tv ? "in parts, TV" : "in parts", &at);
+	scene_make(&scene, matched ? "out of core, matched" : tv ? "out of core, TV" : "out of core", &at);
 	voxels = grid_voxels(&scene.grid);
 	must(phantom_named(&head, "head", 42, .0192, &err), &err, "head");
 	for (int i = 0; i < at.views; i++)
@@ -1225,12 +1225,12 @@ static void check_parts(bool tv, bool untilted, bool matched)
 		got[s] = malloc(voxels * sizeof(float));
 		must(backend_cuda.open(0, &limit, &device, &err), &err, "open");
 		must(recon_open(&backend_cuda, device, &scene.geometry, &linearise, &recipe, &hooks, &recon, &err),
-		     &err, "open in parts");
+		     &err, "open out of core");
 		must(recon_push(recon, raw, views, at.views, &err), &err, "push");
 		must(recon_run(recon, &err), &err, "run");
 		must(recon_read(recon, 0, scene.grid.size[2], got[s], &err), &err, "read");
 		if (s > 0)
-			expect(&scene, "says so", strstr(recon_plan(recon), "in parts") == NULL, 0);
+			expect(&scene, "says so", strstr(recon_plan(recon), "out of core") == NULL, 0);
 		if (s < 2)
 			printf("%-34s %.1f MiB: %s\n", scene.name, (double)limit.memory_limit / (1 << 20),
 			       recon_plan(recon));
@@ -1238,7 +1238,7 @@ static void check_parts(bool tv, bool untilted, bool matched)
 		backend_cuda.close(device);
 	}
 	printf("%-34s difference %.1e\n", scene.name, difference(got[1], got[0], voxels));
-	expect(&scene, "parts", difference(got[1], got[0], voxels), tv || matched ? 1e-4 : 1e-5);
+	expect(&scene, "out of core", difference(got[1], got[0], voxels), tv || matched ? 1e-4 : 1e-5);
 	expect(&scene, "the same bits", memcmp(got[1], got[2], voxels * sizeof(float)) != 0, 0);
 	for (int s = 0; s < 3; s++)
 		free(got[s]);
@@ -1544,7 +1544,7 @@ static void check_said(struct device *device)
 		float *projections, *got[2];
 
 		head_make(&scene, bound_recipes[i].name, i % 2 ? BEND_TILTED : BEND_NONE);
-		/* Inside of the head, so that its surroundings are asked for. */
+		/* Inside of the head, so that its exterior are asked for. */
 		for (int k = 0; k < 3; k++) {
 			scene.grid.origin[k] += scene.grid.spacing[k] * (scene.grid.size[k] - 48) / 2;
 			scene.grid.size[k] = 48;

@@ -6,7 +6,7 @@
 
 #include "core/backend.h"
 #include "core/fdk.h"
-#include "core/recon.h"
+#include "core/recon/recon.h"
 
 struct scene {
 	char name[64];

@@ -1,8 +1,8 @@
 #ifndef CBCT_TESTS_ANATOMY_H
 #define CBCT_TESTS_ANATOMY_H
 
-#include "core/phantom.h"
-#include "core/recon.h"
+#include "core/scan/phantom.h"
+#include "core/recon/recon.h"
 
 /*
  * Heads, wrists, necks and abdomens of ellipsoids and elliptic cylinders, with

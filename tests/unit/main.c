@@ -13,7 +13,7 @@
 
 #define SUITES(row)                                                                                                    \
 	row(error) row(geometry) row(orbit) row(filter) row(phantom) row(raw) row(recon) row(algorithm) row(noise)     \
-	    row(exterior) row(metal) row(stuck) row(parts) row(study) row(backend) row(json) row(scan) row(recipe)     \
+	    row(exterior) row(metal) row(stuck) row(outofcore) row(study) row(backend) row(json) row(scan) row(recipe) \
 		row(format) row(patient) row(metaimage) row(rtk_geometry) row(slice) row(sums) row(scan_directory)     \
 		    row(message) row(queue) row(outcome) row(lock) row(store) row(catalogue) row(job)
 

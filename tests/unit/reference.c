@@ -245,8 +245,8 @@ bool reference_is_cut(const float *row, int columns, bool behind, double not_air
 	       2 * side_mean(row, columns, behind, 0) - side_mean(row, columns, behind, 1) >= not_air;
 }
 
-/* One side of a row that is cut off, by the words of core/extend.h. */
-static void extend_row(const float *row, int columns, int extend, bool behind, double not_air, double *ret)
+/* One side of a row that is cut off, by the words of core/truncation.h. */
+static void truncation_row(const float *row, int columns, int extend, bool behind, double not_air, double *ret)
 {
 	const int window = columns / 16 > 4 ? columns / 16 : 4;
 	double *x = calloc((size_t)columns, sizeof(double)), *y = calloc((size_t)columns, sizeof(double));
@@ -396,8 +396,8 @@ static double find_shell(const double *p, int bins, double o[2], double ret[2])
 }
 
 /* The extension of one side moved towards that of a body in a shell, where that is what the row shows. */
-static void extend_by_shell_of_row(const float *row, int columns, int extend, bool behind, const bool cut[2],
-				   double not_air, double *ret)
+static void truncation_by_shell_of_row(const float *row, int columns, int extend, bool behind, const bool cut[2],
+				       double not_air, double *ret)
 {
 	enum { BINS = 64 };
 	const int window = columns / 16 > 4 ? columns / 16 : 4;
@@ -460,8 +460,8 @@ void reference_filter(const struct plan_options *options, int view, const float 
 		for (int side = 0; side < 2 && extend > 0; side++) {
 			if (!cut[side])
 				continue;
-			extend_row(from, columns, extend, side == 1, not_air, beyond);
-			extend_by_shell_of_row(from, columns, extend, side == 1, cut, not_air, beyond);
+			truncation_row(from, columns, extend, side == 1, not_air, beyond);
+			truncation_by_shell_of_row(from, columns, extend, side == 1, cut, not_air, beyond);
 			extended = true;
 			for (int i = 0; i < extend; i++)
 				line[side == 1 ? extend + columns + i : extend - 1 - i] = beyond[i];

@@ -20,7 +20,7 @@ void reference_project(const struct geometry *geometry, const struct grid *grid,
 void reference_backproject(const struct geometry *geometry, const struct grid *grid, int view,
 			   enum backprojection weight, const float *projection, double *sums, double *cover);
 
-/* By the words of core/extend.h: the mean p at an edge that is not air, of a view of at most 64 x 64 pixels, and
+/* By the words of core/truncation.h: the mean p at an edge that is not air, of a view of at most 64 x 64 pixels, and
  * whether a row of 32 columns or more is cut off there. */
 double reference_not_air(const float *view, size_t pixels);
 bool reference_is_cut(const float *row, int columns, bool behind, double not_air);

@@ -1,8 +1,8 @@
 #ifndef CBCT_TESTS_SCENE_H
 #define CBCT_TESTS_SCENE_H
 
-#include "core/phantom.h"
-#include "core/recon.h"
+#include "core/scan/phantom.h"
+#include "core/recon/recon.h"
 
 /* A scan made from exact line integrals, and all that a reconstruction of it said: for the tests of the pipeline. */
 struct orbit_spec {

@@ -9,8 +9,8 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "core/algorithm.h"
-#include "core/parts.h"
+#include "core/recon/algorithm.h"
+#include "core/outofcore/outofcore.h"
 #include "tests/unit/scene.h"
 
 Suite *algorithm_suite(void);
@@ -50,7 +50,7 @@ struct table {
 static void table_open(struct table *ret, int out_of_core, const struct sart_options *sart)
 {
 	const struct orbit_spec spec = {COLUMNS, ROWS, SLOTS, {600, 1100, {4, 4}, {0, 0}, {0, 0}}, 0, 72};
-	struct table table = {.backend = out_of_core ? &backend_parts : &backend_cpu,
+	struct table table = {.backend = out_of_core ? &backend_outofcore : &backend_cpu,
 			      .grid = grid_of(11, 7, 9, 2, 2, 2)};
 	struct plan_options options = {.linearise = {.sample = SAMPLE_FLOAT32}, .sart = sart};
 
@@ -58,7 +58,7 @@ static void table_open(struct table *ret, int out_of_core, const struct sart_opt
 	ok(backend_cpu.open(0, &(struct device_options){.threads = 2}, &table.below, &err));
 	table.device = table.below;
 	if (out_of_core)
-		ok(parts_open(&backend_cpu, table.below, &table.device, &err));
+		ok(outofcore_open(&backend_cpu, table.below, &table.device, &err));
 	*ret = table;
 	options.geometry = &ret->scene.geometry;
 	options.grid = &ret->grid;
@@ -69,7 +69,7 @@ static void table_close(struct table *table)
 {
 	table->backend->plan_free(table->plan);
 	if (table->device != table->below)
-		backend_parts.close(table->device);
+		backend_outofcore.close(table->device);
 	backend_cpu.close(table->below);
 	scene_clear(&table->scene);
 }

@@ -12,8 +12,8 @@
 #include <string.h>
 
 #include "core/backend.h"
-#include "core/phantom.h"
-#include "core/recon.h"
+#include "core/scan/phantom.h"
+#include "core/recon/recon.h"
 #include "tests/unit/reference.h"
 
 static struct error err;
@@ -702,7 +702,7 @@ static void shell_rows(const struct rig *rig, float *ret)
 	}
 }
 
-/* Which of them a fit of core/extend.h concerns. */
+/* Which of them a fit of core/truncation.h concerns. */
 static void count_truncated(const struct rig *rig, const float *rows, const int pad[2], size_t ret[2])
 {
 	const int columns = rig->geometry.columns;
@@ -838,7 +838,7 @@ START_TEST(sart_is_the_contracts_update)
 }
 END_TEST
 
-/* The smallest smoothing with which the steps are stable, see core/cpu_tv.c. */
+/* The smallest smoothing with which the steps are stable, see core/cpu/tv.c. */
 static double smoothing(const struct grid *grid, const struct tv_options *tv)
 {
 	const double least = fmin(fmin(grid->spacing[0], grid->spacing[1]), grid->spacing[2]);

@@ -7,7 +7,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "core/recon.h"
+#include "core/recon/recon.h"
 #include "tests/unit/data.h"
 #include "tests/unit/scene.h"
 

@@ -7,7 +7,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "core/grid.h"
+#include "core/scan/grid.h"
 #include "tests/unit/data.h"
 
 /* Of double arithmetic over numbers of a thousand, with four digits to spare. */

@@ -8,7 +8,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "core/metal.h"
+#include "core/correct/metal.h"
 #include "tests/unit/scene.h"
 
 static const double MU_WATER = 0.0192;

@@ -4,7 +4,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 
-#include "core/noise.h"
+#include "core/recon/noise.h"
 #include "tests/unit/anatomy.h"
 
 static struct error err;

@@ -5,8 +5,8 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "core/orbit.h"
-#include "core/phantom.h"
+#include "core/scan/orbit.h"
+#include "core/scan/phantom.h"
 #include "tests/unit/data.h"
 
 static const double DEGREE = M_PI / 180;

@@ -6,7 +6,7 @@
 #include <string.h>
 #include <unistd.h>
 
-#include "core/geometry.h"
+#include "core/scan/geometry.h"
 #include "proto/format.h"
 #include "proto/nifti.h"
 

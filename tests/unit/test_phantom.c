@@ -4,7 +4,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "core/phantom.h"
+#include "core/scan/phantom.h"
 
 static double uniform(unsigned long long *seed, double from, double to)
 {

@@ -9,7 +9,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "core/defects.h"
+#include "core/correct/defects.h"
 #include "tests/unit/data.h"
 #include "tests/unit/scene.h"
 

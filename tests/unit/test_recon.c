@@ -1,5 +1,5 @@
 /*
- * The pipeline of core/recon.h over the CPU backend: what is reconstructed from
+ * The pipeline of core/recon/recon.h over the CPU backend: what is reconstructed from
  * exact line integrals, where it lies, what is told on the way, and what is refused.
  */
 #include <check.h>
@@ -8,7 +8,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "core/algorithm.h"
+#include "core/recon/algorithm.h"
 #include "tests/unit/data.h"
 #include "tests/unit/scene.h"
 

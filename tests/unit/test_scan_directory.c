@@ -19,7 +19,7 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
-#include "core/phantom.h"
+#include "core/scan/phantom.h"
 #include "proto/format.h"
 #include "proto/saver.h"
 #include "proto/seal.h"

@@ -1,10 +1,10 @@
-/* Pixels that do not follow their neighbours over the views (core/stuck.h), and objects that look like some. */
+/* Pixels that do not follow their neighbours over the views (core/correct/stuck.h), and objects that look like some. */
 #include <check.h>
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
-#include "core/stuck.h"
+#include "core/correct/stuck.h"
 #include "tests/unit/scene.h"
 
 Suite *stuck_suite(void);

@@ -1,0 +1,39 @@
+#ifndef CBCT_CORE_COARSE_H
+#define CBCT_CORE_COARSE_H
+
+#include "core/backend.h"
+
+/*
+ * SART on a coarse grid from a reduced scan: at most COARSE_VIEWS_MOST of its views, spread over the scan, blank ones
+ * left out, and their pixels averaged until they are about as wide as the coarse voxels at the isocentre. It finds
+ * what the projections say of the object as a whole in a small part of the time of one iteration of the job.
+ */
+enum { COARSE_VIEWS_MOST = 128, COARSE_ITERATIONS = 8, COARSE_SUBSETS_MOST = 10 };
+
+struct coarse_options {
+	const struct backend *backend;
+	struct device *device;
+	const struct geometry *geometry; /* of the whole scan */
+	const struct orbit *orbit;       /* of that */
+	const int *blank;                /* [blanks], views that were not measured */
+	int blanks;
+	const struct grid *grid; /* the coarse one */
+	struct plan *lender;     /* as of plan_options */
+	const struct cancel *cancel;
+};
+
+/* Bytes that coarse_sart takes while it runs: volumes (the caller's own and an unused one counted), scratch, stack. */
+struct coarse_bytes {
+	size_t device;   /* beside `borrowed` */
+	size_t borrowed; /* of the lender's block */
+	size_t host;     /* as of outofcore.h */
+};
+
+/* Of the options it needs neither lender nor cancel; blank views may be unknown: without them it takes less. */
+int coarse_bytes(const struct coarse_options *options, struct coarse_bytes *ret_bytes, struct error *err);
+
+/* `volume`, on options->grid, is the start and becomes the result; `projections` has a slot for each view. */
+int coarse_sart(const struct coarse_options *options, struct stack *projections, struct volume *volume,
+		struct error *err);
+
+#endif

@@ -1,0 +1,277 @@
+/* What lies outside of the grid is taken out of the projections: see exterior.h. */
+#include "core/correct/exterior.h"
+
+#include <math.h>
+#include <stdlib.h>
+
+#include "core/correct/air.h"
+#include "core/truncation.h"
+#include "core/correct/exterior_rows.h"
+
+/* Spread over the orbit: what goes on outside of the grid shows in many views. */
+enum { VIEWS_LOOKED_AT = 32 };
+
+/* One view on the host, [row][column]: line integrals as measured, through w and through w on the recipe's grid. */
+struct projection {
+	int steps;
+	const struct view *view;
+	int columns, rows;
+	const int *pad;
+	const struct faces *faces; /* of w; NULL: FDK is too poor for that */
+	float *measured;
+	float largest;                   /* truncation_largest of it */
+	float air;                       /* air_level of it */
+	const float *explained, *inside; /* inside NULL: nothing lies outside of the grid */
+	double *smooth;                  /* to work in */
+};
+
+/* A side that FDK pads is none of a truncated row; neither are ends that the tube alone keeps from 0. */
+static bool is_truncated(const int pad[2], const float *row, int columns, float largest, float air)
+{
+	const float level = truncation_level(largest) + fmaxf(air, 0);
+
+	return (pad[0] == 0 && truncation_is_cut(row, 1, columns, level)) ||
+	       (pad[1] == 0 && truncation_is_cut(row + columns - 1, -1, columns, level));
+}
+
+/* Sums of e and column e over the columns first .. last. */
+struct stretch {
+	int first, last;
+	double sum, moment;
+};
+
+static void stretch_add(struct stretch *stretch, int column, double e)
+{
+	stretch->sum += e;
+	stretch->moment += column * e;
+}
+
+/* The straight line nearest to e in the window, at a column. */
+static double line_at(const struct stretch *stretch, int column)
+{
+	const double n = stretch->last - stretch->first + 1, middle = 0.5 * (stretch->first + stretch->last);
+	const double spread = n * (n * n - 1) / 12;
+	const double slope = spread > 0 ? (stretch->moment - middle * stretch->sum) / spread : 0;
+
+	return stretch->sum / n + slope * (column - middle);
+}
+
+/* What changes slowly along the row of what w does not explain. */
+static void smooth_row(const float *measured, const float *explained, double *ret, int columns)
+{
+	const int reach = columns / EXTERIOR_PART > 2 ? columns / EXTERIOR_PART : 2;
+	struct stretch stretch = {.first = 0, .last = -1};
+
+	for (int c = 0; c < columns; c++) {
+		for (; stretch.last < columns - 1 && stretch.last < c + reach; stretch.last++)
+			stretch_add(&stretch, stretch.last + 1,
+				    (double)measured[stretch.last + 1] - (double)explained[stretch.last + 1]);
+		for (; stretch.first < c - reach; stretch.first++)
+			stretch_add(&stretch, stretch.first,
+				    (double)explained[stretch.first] - (double)measured[stretch.first]);
+		ret[c] = line_at(&stretch, c);
+	}
+}
+
+static struct exterior_rows subtract_row(const struct projection *of, int row)
+{
+	const size_t at = (size_t)row * (size_t)of->columns;
+	const float *explained = of->explained + at, *inside = of->inside != NULL ? of->inside + at : NULL;
+	float *measured = of->measured + at;
+	double *smooth = of->smooth + at, outside = 0;
+	struct exterior_rows found = {0};
+
+	if (of->steps & EXTERIOR_BEYOND)
+		found.truncated = is_truncated(of->pad, measured, of->columns, of->largest, of->air);
+	if (found.truncated == 0 && of->steps & EXTERIOR_OUTSIDE && of->faces != NULL &&
+	    faces_row_counts_outside(of->faces, of->view, of->columns, row, measured, explained, of->largest))
+		found.outside = 1;
+	if (found.truncated + found.outside > 0) {
+		smooth_row(measured, explained, smooth, of->columns);
+		for (int c = 0; c < of->columns; c++)
+			measured[c] = (float)((double)measured[c] - smooth[c]);
+	}
+	for (int c = 0; c < of->columns && inside != NULL; c++) {
+		outside += fabs((double)explained[c] - (double)inside[c]);
+		measured[c] -= explained[c] - inside[c];
+	}
+	if (outside > 0 && outside >= (double)truncation_level_of_many(of->largest) * of->columns)
+		found.outside = 1;
+	return found;
+}
+
+static void subtract_view(const struct projection *of, struct exterior_rows *rows)
+{
+	size_t truncated = 0, outside = 0;
+
+#pragma omp parallel for schedule(static) reduction(+ : truncated, outside)
+	for (int r = 0; r < of->rows; r++) {
+		const struct exterior_rows found = subtract_row(of, r);
+
+		truncated += found.truncated;
+		outside += found.outside;
+	}
+	rows->truncated += truncated;
+	rows->outside += outside;
+}
+
+int exterior_look(const struct exterior_volume_options *options, struct exterior_rows *ret_rows, struct error *err)
+{
+	const struct geometry *geometry = options->geometry;
+	const int columns = geometry->columns, rows = geometry->rows;
+	const int looked_at = geometry->count < VIEWS_LOOKED_AT ? geometry->count : VIEWS_LOOKED_AT;
+	float *measured = malloc((size_t)columns * (size_t)rows * sizeof(float));
+	struct exterior_rows found = {0};
+	float largest = 0, air = 0;
+	int code = 0;
+
+	if (measured == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a view of %d x %d pixels", columns, rows);
+	for (int i = 0; i < looked_at && code == 0; i++) {
+		const int view = (int)((long long)i * geometry->count / looked_at);
+
+		code = options->backend->stack_download(options->projections, view, 1, measured, err);
+		if (code == 0) {
+			largest = truncation_largest(measured, columns, rows, 1, (size_t)columns);
+			air = air_level(measured, columns, rows, truncation_edge(columns), largest);
+		}
+		for (int r = 0; r < rows && code == 0; r++)
+			found.truncated += is_truncated(options->orbit->pad, measured + (size_t)r * (size_t)columns,
+							columns, largest, air);
+		if (code == 0) {
+			const struct outside_rows outside =
+			    outside_rows(options->grid, &geometry->views[view], columns, rows, measured);
+
+			found.beside += outside.beside;
+			found.outside += outside.beside + outside.ends;
+		}
+	}
+	free(measured);
+	if (code == 0 && found.outside == 0)
+		code = exterior_volume_may_go_on(options, &found.possible, err);
+	if (code == 0)
+		*ret_rows = found;
+	return code;
+}
+
+/* Views first .. first + count - 1 through the volume, to the host. */
+static int project(const struct exterior_volume_options *options, struct plan *plan, const struct volume *volume,
+		   int first, int count, struct stack *batch, float *ret, struct error *err)
+{
+	int views[EXTERIOR_VOLUME_VIEWS], code;
+
+	for (int i = 0; i < count; i++)
+		views[i] = first + i;
+	code = options->backend->project(plan, volume, views, count, batch, err);
+	return code < 0 ? code : options->backend->stack_download(batch, 0, count, ret, err);
+}
+
+int exterior_subtract(const struct exterior_volume *exterior, const struct exterior_volume_options *options, int steps,
+		      struct volume *work, struct exterior_rows *ret_rows, struct error *err)
+{
+	const struct backend *backend = options->backend;
+	const struct geometry *geometry = options->geometry;
+	const int all = geometry->count, slots = all < EXTERIOR_VOLUME_VIEWS ? all : EXTERIOR_VOLUME_VIEWS;
+	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows, most = (size_t)slots * pixels;
+	float *measured = malloc(most * sizeof(float)), *explained = malloc(most * sizeof(float)), *inside = NULL;
+	double *smooth = malloc(pixels * sizeof(double));
+	struct exterior_rows found = {0};
+	struct faces faces = {0};
+	struct stack *batch = NULL;
+	bool enough = measured != NULL && explained != NULL && smooth != NULL;
+	int code = 0;
+
+	if (exterior->goes_on && steps & EXTERIOR_OUTSIDE) {
+		inside = malloc(most * sizeof(float));
+		enough = enough && inside != NULL;
+	}
+	if (!enough)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views of %d x %d pixels", slots,
+				 geometry->columns, geometry->rows);
+	if (code == 0)
+		code = faces_make(&faces, backend, exterior->volume, &exterior->grid, err);
+	if (code == 0 && inside != NULL)
+		code = exterior_volume_sample(exterior, options->grid, work, err);
+	if (code == 0)
+		code = backend->stack_new(options->device, geometry->columns, geometry->rows, slots, &batch, err);
+	/* Several at a time: a pass over the volume costs as much as some views do. */
+	for (int first = 0; first < all && code == 0; first += slots) {
+		const int count = all - first < slots ? all - first : slots;
+
+		code = project(options, exterior->plan, exterior->volume, first, count, batch, explained, err);
+		if (code == 0 && inside != NULL)
+			code = project(options, options->plan, work, first, count, batch, inside, err);
+		if (code == 0)
+			code = backend->stack_download(options->projections, first, count, measured, err);
+		for (int i = 0; i < count && code == 0; i++) {
+			const size_t at = (size_t)i * pixels;
+			const float largest = truncation_largest(measured + at, geometry->columns, geometry->rows, 1,
+								 (size_t)geometry->columns);
+			const struct projection projection = {
+			    .steps = steps,
+			    .view = &geometry->views[first + i],
+			    .columns = geometry->columns,
+			    .rows = geometry->rows,
+			    .pad = options->orbit->pad,
+			    .faces = options->poor ? NULL : &faces,
+			    .measured = measured + at,
+			    .largest = largest,
+			    .air = air_level(measured + at, geometry->columns, geometry->rows,
+					     truncation_edge(geometry->columns), largest),
+			    .explained = explained + at,
+			    .inside = inside != NULL ? inside + at : NULL,
+			    .smooth = smooth,
+			};
+
+			subtract_view(&projection, &found);
+		}
+		if (code == 0)
+			code = backend->stack_upload(options->projections, first, count, measured, err);
+	}
+	if (code == 0)
+		*ret_rows = found;
+	backend->stack_free(batch);
+	faces_clear(&faces);
+	free(measured);
+	free(explained);
+	free(inside);
+	free(smooth);
+	return code;
+}
+
+/* Where the share that is not seen by all views is above 0, that share of w. */
+static void mix(const float *seen, const float *w, float *values, size_t count)
+{
+#pragma omp parallel for schedule(static)
+	for (size_t i = 0; i < count; i++)
+		values[i] += (1 - seen[i]) * (w[i] - values[i]);
+}
+
+int exterior_start(const struct exterior_volume *exterior, const struct exterior_volume_options *options,
+		   struct volume *work, struct volume *volume, struct error *err)
+{
+	const struct backend *backend = options->backend;
+	const struct grid *grid = options->grid;
+	const size_t pixels = (size_t)grid->size[0] * (size_t)grid->size[1];
+	float *seen = malloc(pixels * sizeof(float)), *w = malloc(pixels * sizeof(float));
+	float *values = malloc(pixels * sizeof(float));
+	int code = 0;
+
+	if (seen == NULL || w == NULL || values == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for three slices");
+	for (int z = 0; z < grid->size[2] && code == 0; z++) {
+		if (exterior_volume_seen(exterior, grid, z, seen))
+			continue;
+		code = backend->volume_download(work, z, 1, w, err);
+		if (code == 0)
+			code = backend->volume_download(volume, z, 1, values, err);
+		if (code == 0) {
+			mix(seen, w, values, pixels);
+			code = backend->volume_put(volume, z, 1, values, err);
+		}
+	}
+	free(seen);
+	free(w);
+	free(values);
+	return code;
+}

@@ -1,0 +1,58 @@
+#ifndef CBCT_CORE_EXTERIOR_H
+#define CBCT_CORE_EXTERIOR_H
+
+#include "core/correct/exterior_volume.h"
+
+/*
+ * What lies outside of the grid, in SART. A line integral counts all of the
+ * object, the grid often holds less of it than the ray meets; SART would pile
+ * what lies outside up at the grid's faces and at the rim of the field of view:
+ * a bright rim, and hundreds of HU in the middle. So it is taken out of the
+ * projections, once, in two steps:
+ *
+ * 1. What lies in the field of view but outside of the grid: a coarse volume w of all that
+ *    the rays meet there (core/correct/exterior_volume.h) has it.
+ *    p' = p - (A w - A u), u = w on the recipe's own grid. The part inside of it
+ *    cancels but at the grid's faces, which stay as sharp as in SART's own
+ *    projections (Ziegler, Nielsen and Grass, Med. Phys. 35, 2008, project the FDK
+ *    volume without the region of interest: its voxels at the border are then neither in nor out).
+ * 2. What lies beyond the field of view, in rows that are truncated or that
+ *    count something outside of w's grid (core/correct/exterior_rows.h): p' - smooth(p - A w).
+ *    Smooth is at each column the value of the straight line fitted to the columns
+ *    up to 1/EXTERIOR_PART of the row away from it. So SART keeps FDK's means over
+ *    many columns there and adds what is finer.
+ *
+ * Where both are there, step 2 goes first, with the start of w: its fit to the projections would otherwise put
+ * what lies beyond the field of view into it.
+ */
+enum { EXTERIOR_PART = 32 };
+enum { EXTERIOR_OUTSIDE = 1, EXTERIOR_BEYOND = 2 }; /* the steps, as bits */
+
+/* How many rows of the projections are concerned. */
+struct exterior_rows {
+	size_t truncated, outside;
+	size_t beside; /* of `outside`, those with rays that miss the grid and are not air; exterior_look only */
+	/*
+	 * No row counts anything outside, but that cannot be excluded, for the rays through what may be there pass the
+	 * grid as well: the end of a body some mm beyond the grid's. exterior_look only.
+	 */
+	bool possible;
+};
+
+/* From some of the projections and where the grid lies, sparing the rest when nothing has to be taken out. */
+int exterior_look(const struct exterior_volume_options *options, struct exterior_rows *ret_rows, struct error *err);
+
+/*
+ * These steps. Changes the projections; `work` is a volume on the recipe's grid to work in, after EXTERIOR_OUTSIDE it
+ * holds w. Takes EXTERIOR_VOLUME_VIEWS more slots on the device meanwhile.
+ */
+int exterior_subtract(const struct exterior_volume *exterior, const struct exterior_volume_options *options, int steps,
+		      struct volume *work, struct exterior_rows *ret_rows, struct error *err);
+/*
+ * A better start for SART than the FDK volume where not all views see a place: there FDK lacks their share, and the
+ * few iterations of a job cannot make up for it. The volume becomes w there; `work` holds w.
+ */
+int exterior_start(const struct exterior_volume *exterior, const struct exterior_volume_options *options,
+		   struct volume *work, struct volume *volume, struct error *err);
+
+#endif

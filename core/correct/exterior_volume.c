@@ -1,0 +1,704 @@
+/* The object in and around the recipe's grid, coarsely: see exterior.h. */
+#include "core/correct/exterior_volume.h"
+
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "core/correct/coarse.h"
+#include "core/truncation.h"
+
+/* Spread over the orbit: what is empty shows in many views. */
+enum { VIEWS_LOOKED_AT = 32 };
+
+static size_t voxel_at(const struct grid *grid, int x, int y, int z)
+{
+	return ((size_t)z * (size_t)grid->size[1] + (size_t)y) * (size_t)grid->size[0] + (size_t)x;
+}
+
+static int voxels_a_side(const struct exterior_volume_options *options)
+{
+	const struct geometry *geometry = options->geometry;
+	const double pixels = (double)geometry->columns * geometry->rows * geometry->count;
+	const double voxels = fmax((double)grid_voxels(options->grid), pixels / 4);
+	/* The fit takes several volumes. */
+	const double most = cbrt(options->inside_only ? voxels : voxels / 2);
+
+	return (int)fmin(fmax(most, EXTERIOR_VOLUME_LEAST), EXTERIOR_VOLUME_MOST);
+}
+
+/* The centre of a voxel, mm. */
+struct place {
+	double at[3];
+};
+
+static struct place place_of(const struct grid *grid, int x, int y, int z)
+{
+	return (struct place){{grid->origin[0] + x * grid->spacing[0], grid->origin[1] + y * grid->spacing[1],
+			       grid->origin[2] + z * grid->spacing[2]}};
+}
+
+struct box {
+	double low[3], high[3];
+};
+
+static struct box box_of(const struct grid *grid)
+{
+	struct box box;
+
+	for (int i = 0; i < 3; i++) {
+		box.low[i] = grid->origin[i] - 0.5 * grid->spacing[i];
+		box.high[i] = grid->origin[i] + (grid->size[i] - 0.5) * grid->spacing[i];
+	}
+	return box;
+}
+
+static void box_add(struct box *box, const struct box *other)
+{
+	for (int i = 0; i < 3; i++) {
+		box->low[i] = fmin(box->low[i], other->low[i]);
+		box->high[i] = fmax(box->high[i], other->high[i]);
+	}
+}
+
+/* The two places where a ray meets the cylinder of the field of view. */
+static void box_add_ray(struct box *box, const struct orbit *orbit, const double from[3], const double way[3])
+{
+	const double radius = orbit->field_of_view / 2;
+	double a = 0, b = 0, c = -radius * radius;
+
+	for (int i = 0; i < 2; i++) {
+		const double start = vec_dot(orbit->frame[i], from), along = vec_dot(orbit->frame[i], way);
+
+		a += along * along;
+		b += start * along;
+		c += start * start;
+	}
+	for (int side = -1; side <= 1 && a > 0 && b * b > a * c; side += 2) {
+		const double part = (-b + side * sqrt(b * b - a * c)) / a;
+		struct box place;
+
+		for (int i = 0; i < 3; i++)
+			place.low[i] = place.high[i] = from[i] + part * way[i];
+		box_add(box, &place);
+	}
+}
+
+/* Around what the rays to the first and the last row meet of the field of view. */
+static void box_add_rays(struct box *box, const struct orbit *orbit, const struct geometry *geometry)
+{
+	enum { ALONG = 9 };
+
+	for (int k = 0; k < geometry->count; k++)
+		for (int i = 0; i < 2 * ALONG; i++) {
+			const struct view *view = &geometry->views[k];
+			const double column = (geometry->columns - 1.) * (i / 2) / (ALONG - 1);
+			const double row = i % 2 ? geometry->rows - 0.5 : -0.5;
+			double way[3];
+
+			for (int a = 0; a < 3; a++)
+				way[a] = view->pixel0[a] + column * view->column_step[a] + row * view->row_step[a] -
+					 view->source[a];
+			box_add_ray(box, orbit, view->source, way);
+		}
+}
+
+/* No side has more voxels than `most`. */
+static void grid_of_box(const struct box *box, double spacing, int most, struct grid *ret)
+{
+	for (int i = 0; i < 3; i++)
+		spacing = fmax(spacing, (box->high[i] - box->low[i]) / most);
+	for (int i = 0; i < 3; i++) {
+		const double side = box->high[i] - box->low[i];
+
+		/* A part of a millionth is rounding, not another voxel. */
+		ret->size[i] = (int)fmax(1, ceil(side / spacing - 1e-6));
+		ret->spacing[i] = side / ret->size[i];
+		ret->origin[i] = box->low[i] + 0.5 * ret->spacing[i];
+	}
+}
+
+/*
+ * Around the recipe's grid, the field of view and its rays; without the rays, or around the recipe's grid alone, where
+ * the sources leave no room for more.
+ */
+static void choose_grid(const struct exterior_volume_options *options, struct grid *ret)
+{
+	const int most = voxels_a_side(options);
+	struct grid wide;
+	struct error err;
+
+	orbit_covering_grid(options->orbit, options->geometry, most, &wide);
+	for (int reach = options->inside_only ? 0 : 2; reach >= 0; reach--) {
+		const struct box view = box_of(&wide);
+		struct box box = box_of(options->grid);
+
+		if (reach > 0)
+			box_add(&box, &view);
+		if (reach > 1)
+			box_add_rays(&box, options->orbit, options->geometry);
+		grid_of_box(&box, wide.spacing[0], most, ret);
+		if (grid_check_geometry(ret, options->geometry, &err) == 0)
+			return;
+	}
+}
+
+static struct plan_options plan_options_of(const struct exterior_volume_options *options, const struct grid *grid,
+					   const struct fdk_weights *weights)
+{
+	struct plan_options plan = {
+	    .geometry = options->geometry,
+	    .grid = grid,
+	    .linearise = {.sample = SAMPLE_FLOAT32},
+	    .column_weights = weights->columns,
+	    .filter_response = weights->response,
+	    .pad = {options->orbit->pad[0], options->orbit->pad[1]},
+	    .extend = weights->extend,
+	    .extended_response = weights->extended,
+	    .resident = 1, /* what is filtered in one go takes the most room, and the volume is small */
+	    .lender = options->plan,
+	    .no_samples = true,
+	};
+
+	memcpy(plan.axis, weights->axis, sizeof(plan.axis));
+	return plan;
+}
+
+static struct coarse_options coarse_options_of(const struct exterior_volume_options *options, const struct grid *grid)
+{
+	return (struct coarse_options){
+	    .backend = options->backend,
+	    .device = options->device,
+	    .geometry = options->geometry,
+	    .orbit = options->orbit,
+	    .blank = options->blank,
+	    .blanks = options->blanks,
+	    .grid = grid,
+	    .lender = options->plan,
+	    .cancel = options->cancel,
+	};
+}
+
+static size_t larger(size_t a, size_t b)
+{
+	return a > b ? a : b;
+}
+
+/* Of a job in which it turns out to be inside_only or not. */
+static int bytes_of(const struct exterior_volume_options *options, struct exterior_volume_bytes *ret_bytes,
+		    struct error *err)
+{
+	const struct backend *backend = options->backend;
+	const struct geometry *geometry = options->geometry;
+	const int *pad = options->orbit->pad, wide = pad[0] + geometry->columns + pad[1];
+	const int slots = geometry->count < EXTERIOR_VOLUME_VIEWS ? geometry->count : EXTERIOR_VOLUME_VIEWS;
+	float some = 0; /* stands for the weights: only whether there are any is asked here */
+	const struct fdk_weights weights = {
+	    .columns = &some, .response = &some, .extended = &some, .extend = geometry->columns};
+	struct coarse_options coarse_options;
+	struct coarse_bytes coarse = {0};
+	struct grid grid;
+	struct plan_options plan;
+	struct plan_bytes bytes;
+	size_t own;
+	int code;
+
+	choose_grid(options, &grid);
+	plan = plan_options_of(options, &grid, &weights);
+	coarse_options = coarse_options_of(options, &grid);
+	code = backend->plan_bytes(options->device, &plan, &bytes, err);
+	if (code == 0 && !options->inside_only)
+		code = coarse_bytes(&coarse_options, &coarse, err);
+	if (code < 0)
+		return code;
+	own = bytes.volumes + bytes.scratch - bytes.block + bytes.raw;
+	ret_bytes->borrowed = larger(bytes.block, coarse.borrowed);
+	ret_bytes->host = 0;
+	/* Filtered views; when those are gone, the coarse SART; when that has ended, projected views. */
+	ret_bytes->device = own + larger(backend->stack_bytes(wide, geometry->rows, slots), coarse.device);
+	/* Out of core, the device is free again after each operation, and the host holds the volume. */
+	if (bytes.host > 0) {
+		ret_bytes->device = larger(own, coarse.device);
+		ret_bytes->host = grid_voxels(&grid) * sizeof(float) + coarse.host;
+	}
+	return 0;
+}
+
+int exterior_volume_bytes(const struct exterior_volume_options *options, struct exterior_volume_bytes *ret_bytes,
+			  struct error *err)
+{
+	struct exterior_volume_options either[2] = {*options, *options};
+	struct exterior_volume_bytes bytes[2];
+	int code = 0;
+
+	for (int i = 0; i < 2 && code == 0; i++) {
+		either[i].inside_only = i == 1;
+		code = bytes_of(&either[i], &bytes[i], err);
+	}
+	if (code == 0)
+		*ret_bytes = (struct exterior_volume_bytes){
+		    .device = larger(bytes[0].device, bytes[1].device),
+		    .borrowed = larger(bytes[0].borrowed, bytes[1].borrowed),
+		    .host = larger(bytes[0].host, bytes[1].host),
+		};
+	return code;
+}
+
+/* ---- what FDK cannot know ---- */
+
+/* Columns whose sums run down the rows together: their floats lie side by side. */
+enum { COLUMNS_TOGETHER = 32 };
+
+static void sum_along_row(const float *from, float *ret, int columns, int reach)
+{
+	double sum = 0;
+
+	for (int c = -reach; c < columns; c++) {
+		if (c + reach < columns)
+			sum += (double)from[c + reach];
+		if (c - reach - 1 >= 0)
+			sum -= (double)from[c - reach - 1];
+		if (c >= 0)
+			ret[c] = (float)sum;
+	}
+}
+
+/* Of the columns first .. first + count - 1. */
+static void sum_along_columns(const float *from, float *ret, int columns, int rows, int first, int count, int reach)
+{
+	double sums[COLUMNS_TOGETHER] = {0};
+
+	for (int r = -reach; r < rows; r++) {
+		const float *enters = from + (size_t)(r + reach) * (size_t)columns + first;
+		const float *leaves = from + (ptrdiff_t)(r - reach - 1) * columns + first;
+
+		for (int c = 0; c < count && r + reach < rows; c++)
+			sums[c] += (double)enters[c];
+		for (int c = 0; c < count && r - reach - 1 >= 0; c++)
+			sums[c] -= (double)leaves[c];
+		for (int c = 0; c < count && r >= 0; c++)
+			ret[(size_t)r * (size_t)columns + (size_t)(first + c)] = (float)sums[c];
+	}
+}
+
+/* Sums over the pixels up to `reach` away along both axes, in place; `work` is another image. */
+static void box_sums(float *image, int columns, int rows, int reach, float *work)
+{
+#pragma omp parallel for schedule(static)
+	for (int r = 0; r < rows; r++)
+		sum_along_row(image + (size_t)r * (size_t)columns, work + (size_t)r * (size_t)columns, columns, reach);
+#pragma omp parallel for schedule(static)
+	for (int c = 0; c < columns; c += COLUMNS_TOGETHER)
+		sum_along_columns(work, image, columns, rows, c,
+				  columns - c < COLUMNS_TOGETHER ? columns - c : COLUMNS_TOGETHER, reach);
+}
+
+/* What the views say of each voxel. */
+struct look {
+	bool *seen;  /* on the rows of all views; as of struct exterior_volume; NULL: not asked for */
+	bool *met;   /* on the detector of one; NULL: not asked for */
+	bool *empty; /* some view sees it through air; owned */
+};
+
+/*
+ * Voxels whose shadow is air with what lies up to a voxel and a half around it are empty, those whose shadow misses the
+ * rows are not seen. `work` is another image of the view's size.
+ */
+static void look_at(const struct look *look, const struct grid *grid, const struct geometry *geometry,
+		    const struct orbit *orbit, int index, float *measured, float *work)
+{
+	const int columns = geometry->columns, rows = geometry->rows;
+	const size_t pixels = (size_t)columns * (size_t)rows;
+	const double size = fmax(fmax(grid->spacing[0], grid->spacing[1]), grid->spacing[2]);
+	const double pixel = fmin(orbit->pixel_at_isocentre[0], orbit->pixel_at_isocentre[1]);
+	const int reach = (int)fmin(ceil(1.5 * size / pixel), columns > rows ? columns : rows);
+	const float level = truncation_level_of_many(truncation_largest(measured, columns, rows, 1, (size_t)columns));
+	double matrix[12];
+
+	view_matrix(&geometry->views[index], matrix);
+	/* Means of nine pixels against noise. */
+	box_sums(measured, columns, rows, 1, work);
+#pragma omp parallel for schedule(static)
+	for (size_t i = 0; i < pixels; i++)
+		measured[i] = measured[i] > 0 && measured[i] >= 9 * level;
+	box_sums(measured, columns, rows, reach, work);
+#pragma omp parallel for schedule(static)
+	for (int z = 0; z < grid->size[2]; z++)
+		for (int y = 0; y < grid->size[1]; y++)
+			for (int x = 0; x < grid->size[0]; x++) {
+				const struct place place = place_of(grid, x, y, z);
+				const size_t at = voxel_at(grid, x, y, z);
+				double column, row;
+
+				if (look->seen == NULL && look->empty[at])
+					continue;
+				view_project(matrix, place.at, &column, &row);
+				if (look->seen != NULL && (row < -0.5 || row > rows - 0.5))
+					look->seen[at] = false;
+				if (!(column >= 1 && row >= 1 && column <= columns - 2 && row <= rows - 2))
+					continue;
+				if (look->met != NULL)
+					look->met[at] = true;
+				if (measured[(size_t)lround(row) * (size_t)columns + (size_t)lround(column)] < 0.5f)
+					look->empty[at] = true;
+			}
+}
+
+static bool is_blank(const float *measured, size_t pixels)
+{
+	for (size_t i = 0; i < pixels; i++)
+		if (measured[i] != 0)
+			return false;
+	return true;
+}
+
+static bool is_inside(const struct grid *grid, const double place[3])
+{
+	for (int i = 0; i < 3; i++)
+		if (fabs((place[i] - grid->origin[i]) / grid->spacing[i] - 0.5 * (grid->size[i] - 1)) >
+		    0.5 * grid->size[i])
+			return false;
+	return true;
+}
+
+static bool is_in_view(const struct orbit *orbit, const double place[3])
+{
+	return hypot(vec_dot(orbit->frame[0], place), vec_dot(orbit->frame[1], place)) <= orbit->field_of_view / 2;
+}
+
+/* Outwards from the middle: what not all views see becomes what is next to it, but for what is empty. */
+static void hold_ends(struct exterior_volume *s, const bool *empty)
+{
+	const int *size = s->grid.size;
+
+#pragma omp parallel for schedule(static)
+	for (int y = 0; y < size[1]; y++)
+		for (int end = 0; end < 2; end++)
+			for (int i = size[2] / 2; i < size[2]; i++)
+				for (int x = 0; x < size[0]; x++) {
+					const int z = end ? i : size[2] - 1 - i, inner = end ? z - 1 : z + 1;
+					const size_t at = voxel_at(&s->grid, x, y, z);
+
+					if (s->seen[at] || inner < 0 || inner >= size[2])
+						continue;
+					s->voxels[at] = empty[at] ? 0 : s->voxels[voxel_at(&s->grid, x, y, inner)];
+				}
+}
+
+/* What stays of the FDK volume on the host, blank views made up for. */
+static void keep_what_is_known(struct exterior_volume *s, const struct exterior_volume_options *options,
+			       const bool *empty)
+{
+	size_t kept = 0;
+
+	if (!options->inside_only)
+		hold_ends(s, empty);
+#pragma omp parallel for schedule(static) reduction(+ : kept)
+	for (int z = 0; z < s->grid.size[2]; z++)
+		for (int y = 0; y < s->grid.size[1]; y++)
+			for (int x = 0; x < s->grid.size[0]; x++) {
+				const size_t at = voxel_at(&s->grid, x, y, z);
+				const struct place place = place_of(&s->grid, x, y, z);
+				const bool inside = is_inside(options->grid, place.at);
+
+				if (!inside && (empty[at] || !is_in_view(options->orbit, place.at)))
+					s->voxels[at] = 0;
+				s->voxels[at] *= (float)options->factor;
+				kept += !inside && s->voxels[at] != 0;
+			}
+	s->goes_on = kept > 0;
+	if (options->poor && !options->inside_only) {
+		memset(s->voxels, 0, grid_voxels(&s->grid) * sizeof(float));
+		s->goes_on = true;
+	}
+}
+
+static int look_at_views(const struct look *look, const struct grid *grid,
+			 const struct exterior_volume_options *options, struct error *err)
+{
+	const struct geometry *geometry = options->geometry;
+	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
+	const int looked_at = geometry->count < VIEWS_LOOKED_AT ? geometry->count : VIEWS_LOOKED_AT;
+	float *measured = malloc(pixels * sizeof(float)), *work = malloc(pixels * sizeof(float));
+	int code = 0;
+
+	if (measured == NULL || work == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for a view of %d x %d pixels", geometry->columns,
+				 geometry->rows);
+	for (int i = 0; i < looked_at && code == 0; i++) {
+		const int view = (int)((long long)i * geometry->count / looked_at);
+
+		code = options->backend->stack_download(options->projections, view, 1, measured, err);
+		if (code == 0 && !is_blank(measured, pixels))
+			look_at(look, grid, geometry, options->orbit, view, measured, work);
+	}
+	free(measured);
+	free(work);
+	return code;
+}
+
+/* Voxels that are not asked for are empty from the beginning. */
+static void leave_inside_away(const struct exterior_volume_options *options, const struct grid *grid, bool *ret_empty)
+{
+#pragma omp parallel for schedule(static)
+	for (int z = 0; z < grid->size[2]; z++)
+		for (int y = 0; y < grid->size[1]; y++)
+			for (int x = 0; x < grid->size[0]; x++) {
+				const struct place place = place_of(grid, x, y, z);
+
+				ret_empty[voxel_at(grid, x, y, z)] =
+				    is_inside(options->grid, place.at) || !is_in_view(options->orbit, place.at);
+			}
+}
+
+int exterior_volume_may_go_on(const struct exterior_volume_options *options, bool *ret_possible, struct error *err)
+{
+	struct look look = {0};
+	struct grid grid;
+	size_t possible = 0;
+	int code;
+
+	choose_grid(options, &grid);
+	look.met = calloc(grid_voxels(&grid), sizeof(bool));
+	look.empty = malloc(grid_voxels(&grid) * sizeof(bool));
+	if (look.met == NULL || look.empty == NULL) {
+		code = error_set(err, ERR_NO_MEMORY, "no memory for a volume of %zu voxels", grid_voxels(&grid));
+	} else {
+		leave_inside_away(options, &grid, look.empty);
+		code = look_at_views(&look, &grid, options, err);
+	}
+	for (size_t i = 0; i < grid_voxels(&grid) && code == 0; i++)
+		possible += look.met[i] && !look.empty[i];
+	free(look.met);
+	free(look.empty);
+	if (code == 0)
+		*ret_possible = possible > 0;
+	return code;
+}
+
+/* ---- making ---- */
+
+static int run_fdk(struct exterior_volume *s, const struct exterior_volume_options *options, struct error *err)
+{
+	const struct cancel *cancel = options->cancel;
+	struct fdk fdk = {0};
+	int code = fdk_open(&fdk, s->backend, options->device, s->plan, options->geometry, s->weights.pad, err);
+
+	for (int view = 0; view < options->geometry->count && code == 0; view++) {
+		if (cancel != NULL && cancel->asked(cancel->context))
+			code = error_set(err, ERR_CANCELLED, "cancelled");
+		else
+			code = fdk_add(&fdk, view, view, options->projections, s->volume, err);
+	}
+	if (code == 0)
+		code = fdk_flush(&fdk, options->projections, s->volume, err);
+	fdk_clear(&fdk);
+	return code;
+}
+
+int exterior_volume_make(struct exterior_volume *s, const struct exterior_volume_options *options, struct error *err)
+{
+	const struct backend *backend = options->backend;
+	const struct orbit *orbit = options->orbit;
+	struct plan_options plan;
+	struct look look;
+	int code;
+
+	*s = (struct exterior_volume){.backend = backend};
+	choose_grid(options, &s->grid);
+	/* As sharp as the voxels can hold: what is smeared over the grid's faces would be missed inside. */
+	code = fdk_weights_make(&s->weights, orbit, options->geometry, WINDOW_RAM_LAK,
+				fmin(1, orbit->pixel_at_isocentre[0] / fmax(s->grid.spacing[0], s->grid.spacing[1])),
+				true, err);
+	if (code < 0)
+		return code;
+	s->voxels = malloc(grid_voxels(&s->grid) * sizeof(float));
+	s->seen = malloc(grid_voxels(&s->grid) * sizeof(bool));
+	look = (struct look){.seen = s->seen, .empty = calloc(grid_voxels(&s->grid), sizeof(bool))};
+	if (s->voxels == NULL || s->seen == NULL || look.empty == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for a volume of %zu voxels", grid_voxels(&s->grid));
+	else
+		memset(s->seen, true, grid_voxels(&s->grid) * sizeof(bool));
+	plan = plan_options_of(options, &s->grid, &s->weights);
+	if (code == 0)
+		code = backend->plan_new(options->device, &plan, &s->plan, err);
+	if (code == 0)
+		code = backend->volume_new(options->device, &s->grid, &s->volume, err);
+	if (code == 0)
+		code = backend->volume_fill(s->volume, 0, err);
+	if (code == 0)
+		code = run_fdk(s, options, err);
+	if (code == 0)
+		code = backend->filter_extended(s->plan, s->truncated, err);
+	if (code == 0)
+		code = backend->volume_download(s->volume, 0, s->grid.size[2], s->voxels, err);
+	if (code == 0)
+		code = look_at_views(&look, &s->grid, options, err);
+	if (code == 0) {
+		keep_what_is_known(s, options, look.empty);
+		code = backend->volume_upload(s->volume, s->voxels, err);
+	}
+	free(look.empty);
+	if (code < 0)
+		exterior_volume_clear(s);
+	return code;
+}
+
+int exterior_volume_fit(struct exterior_volume *s, const struct exterior_volume_options *options, struct error *err)
+{
+	const struct coarse_options coarse = coarse_options_of(options, &s->grid);
+	int code = coarse_sart(&coarse, options->projections, s->volume, err);
+
+	return code < 0 ? code : s->backend->volume_download(s->volume, 0, s->grid.size[2], s->voxels, err);
+}
+
+/* The axis along which a place lies beyond the grid's faces, the farthest where there are more; -1: it lies inside. */
+static int axis_outside(const struct grid *grid, const double place[3])
+{
+	double farthest = 0;
+	int axis = -1;
+
+	for (int i = 0; i < 3; i++) {
+		const double beyond = fabs(place[i] - grid->origin[i] - 0.5 * (grid->size[i] - 1) * grid->spacing[i]) -
+				      0.5 * grid->size[i] * grid->spacing[i];
+
+		if (beyond > farthest) {
+			farthest = beyond;
+			axis = i;
+		}
+	}
+	return axis;
+}
+
+/* Of the 3 x 3 voxels around one, across an axis: what goes on beyond a face does so beside it, noise does not. */
+static double mean_across(const struct exterior_volume *s, const int at[3], int axis)
+{
+	const int a = (axis + 1) % 3, b = (axis + 2) % 3, *size = s->grid.size;
+	double sum = 0;
+
+	for (int i = -1; i <= 1; i++)
+		for (int j = -1; j <= 1; j++) {
+			int near[3] = {at[0], at[1], at[2]};
+
+			near[a] = (int)fmin(fmax(at[a] + i, 0), size[a] - 1);
+			near[b] = (int)fmin(fmax(at[b] + j, 0), size[b] - 1);
+			sum += (double)s->voxels[voxel_at(&s->grid, near[0], near[1], near[2])];
+		}
+	return sum / 9;
+}
+
+bool exterior_volume_has_outside(const struct exterior_volume *s, const struct grid *grid)
+{
+	/* Of the object's density: 0.15 where a cylinder ends with the grid, 0.27 where it ends 0.4 mm beyond, then
+	 * more. */
+	const double density = 0.25;
+	const size_t least = 64; /* voxels, against noise */
+	double squares = 0, sum = 0;
+	size_t count = 0;
+
+	for (size_t i = 0; i < grid_voxels(&s->grid); i++) {
+		squares += (double)s->voxels[i] * (double)s->voxels[i];
+		sum += fabs((double)s->voxels[i]);
+	}
+	for (int z = 0; z < s->grid.size[2]; z++)
+		for (int y = 0; y < s->grid.size[1]; y++)
+			for (int x = 0; x < s->grid.size[0]; x++) {
+				const struct place place = place_of(&s->grid, x, y, z);
+				const int axis = axis_outside(grid, place.at), at[3] = {x, y, z};
+
+				count += axis >= 0 && mean_across(s, at, axis) * sum >= density * squares;
+			}
+	return squares > 0 && count >= least;
+}
+
+void exterior_volume_clear(struct exterior_volume *s)
+{
+	if (s->backend == NULL)
+		return;
+	s->backend->volume_free(s->volume);
+	s->backend->plan_free(s->plan);
+	fdk_weights_clear(&s->weights);
+	free(s->voxels);
+	free(s->seen);
+	*s = (struct exterior_volume){0};
+}
+
+/* ---- on the recipe's grid ---- */
+
+/* Between which two places of an axis a position lies, held beyond the outer ones, and how near to the second. */
+static float between(const struct grid *from, const struct grid *to, int axis, int index, int ret[2])
+{
+	const double place = to->origin[axis] + index * to->spacing[axis];
+	const double at = fmin(fmax((place - from->origin[axis]) / from->spacing[axis], 0), from->size[axis] - 1);
+
+	ret[0] = (int)at;
+	ret[1] = ret[0] + 1 < from->size[axis] ? ret[0] + 1 : ret[0];
+	return (float)(at - ret[0]);
+}
+
+/* The eight voxels around a place and their weights. */
+struct corners {
+	size_t at[8];
+	float weight[8];
+};
+
+static struct corners corners_of(const struct grid *from, const struct grid *to, int x, int y, int z)
+{
+	struct corners corners;
+	int at[3][2];
+	const float part[3] = {between(from, to, 0, x, at[0]), between(from, to, 1, y, at[1]),
+			       between(from, to, 2, z, at[2])};
+
+	for (int i = 0; i < 8; i++) {
+		const int a = i & 1, b = i >> 1 & 1, c = i >> 2;
+
+		corners.at[i] = voxel_at(from, at[0][a], at[1][b], at[2][c]);
+		corners.weight[i] =
+		    (a ? part[0] : 1 - part[0]) * (b ? part[1] : 1 - part[1]) * (c ? part[2] : 1 - part[2]);
+	}
+	return corners;
+}
+
+int exterior_volume_sample(const struct exterior_volume *s, const struct grid *grid, struct volume *to,
+			   struct error *err)
+{
+	const size_t nx = (size_t)grid->size[0];
+	float *slice = malloc(nx * (size_t)grid->size[1] * sizeof(float));
+	int code = 0;
+
+	if (slice == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a slice");
+	for (int z = 0; z < grid->size[2] && code == 0; z++) {
+#pragma omp parallel for schedule(static)
+		for (int y = 0; y < grid->size[1]; y++)
+			for (int x = 0; x < grid->size[0]; x++) {
+				const struct corners corners = corners_of(&s->grid, grid, x, y, z);
+				float sum = 0;
+
+				for (int i = 0; i < 8; i++)
+					sum += corners.weight[i] * s->voxels[corners.at[i]];
+				slice[(size_t)y * nx + (size_t)x] = sum;
+			}
+		code = s->backend->volume_put(to, z, 1, slice, err);
+	}
+	free(slice);
+	return code;
+}
+
+bool exterior_volume_seen(const struct exterior_volume *s, const struct grid *grid, int z, float *ret_slice)
+{
+	bool all = true;
+
+#pragma omp parallel for schedule(static) reduction(&& : all)
+	for (int y = 0; y < grid->size[1]; y++)
+		for (int x = 0; x < grid->size[0]; x++) {
+			const struct corners corners = corners_of(&s->grid, grid, x, y, z);
+			float sum = 0;
+
+			for (int i = 0; i < 8; i++)
+				sum += corners.weight[i] * (float)s->seen[corners.at[i]];
+			ret_slice[(size_t)y * (size_t)grid->size[0] + (size_t)x] = sum;
+			all = all && sum >= 1;
+		}
+	return all;
+}

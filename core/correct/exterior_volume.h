@@ -1,0 +1,94 @@
+#ifndef CBCT_CORE_SURROUNDINGS_H
+#define CBCT_CORE_SURROUNDINGS_H
+
+#include "core/fdk.h"
+
+/*
+ * What the object is outside of the recipe's grid (core/correct/exterior.h): a volume on a coarse grid that holds the
+ * recipe's grid, the field of view, and all places in it that any ray meets, also beyond the detector's rows.
+ *
+ * exterior_volume_make gives its start, an FDK volume. Out there two things are no object and set to zero: what lies
+ * beside the field of view, and a place that some view sees through air, whatever a wide cone or a short arc made of
+ * it. A place that is on the rows of some views only, where FDK's sums lack the others, has the value of the nearest
+ * slice towards the middle that all views see: bodies go on more often than they end.
+ *
+ * exterior_volume_fit makes that agree with the projections, by SART (core/correct/coarse.h). A ray near the end of the
+ * grid is in it for a short part of its length, to which SART ascribes all of the ray's error: a hundredth of the
+ * integral is hundreds of HU there. Slices of a trunk of +-250 mm that end inside of a panel of +-84 mm, worst error of
+ * their means: 500 to 1300 HU with that start set to zero where not all views see it, 30 to 340 with SART from there,
+ * 12 to 60 from FDK's low sums and 2 to 7 from the nearest slice.
+ */
+/*
+ * Voxels a side, and views that are projected in one go: little beside a job's own
+ * memory. That of a small job has room for as many voxels only as its grid or a quarter
+ * of its pixels, and for half as many where they are fitted; but not for fewer than EXTERIOR_VOLUME_LEAST a side.
+ */
+enum { EXTERIOR_VOLUME_LEAST = 64, EXTERIOR_VOLUME_MOST = 128, EXTERIOR_VOLUME_VIEWS = 4 };
+
+/* What it is made from, all of it borrowed. */
+struct exterior_volume_options {
+	const struct backend *backend;
+	struct device *device;
+	const struct geometry *geometry;
+	const struct orbit *orbit;
+	const struct grid *grid;   /* the recipe's */
+	struct plan *plan;         /* of that, in whose memory it works */
+	struct stack *projections; /* a slot for each view */
+	double factor;             /* that makes up for blank views, 1 without */
+	const int *blank;          /* [blanks], those */
+	int blanks;
+	bool poor;        /* FDK is, and not to be believed outside of the recipe's grid */
+	bool inside_only; /* leaves what lies outside of the recipe's grid away */
+	const struct cancel *cancel;
+};
+
+struct exterior_volume {
+	const struct backend *backend;
+	struct grid grid;
+	struct fdk_weights weights;
+	struct plan *plan;
+	struct volume *volume;
+	float *voxels;       /* the same on the host, owned */
+	bool *seen;          /* [voxels], owned: on the rows of all views */
+	size_t truncated[2]; /* as of backend.filter_extended */
+	bool goes_on;        /* something is left outside of the recipe's grid */
+};
+
+struct exterior_volume_bytes {
+	size_t device;   /* beside the job's own, */
+	size_t borrowed; /* and of its plan's block (plan_options.lends) */
+	size_t host;     /* as of outofcore.h */
+};
+
+/* Known beforehand, at most; of the options it needs backend, device, geometry, orbit and grid. */
+int exterior_volume_bytes(const struct exterior_volume_options *options, struct exterior_volume_bytes *ret_bytes,
+			  struct error *err);
+
+/*
+ * Whether anything may lie outside of the recipe's grid: a place in the field of view that rays of the views looked at
+ * meet, none of them through air. It is looked for on the coarse grid, so that *ret_possible is false only where no
+ * fit is worth its time; blank views and those that FDK makes little of count as any other.
+ */
+int exterior_volume_may_go_on(const struct exterior_volume_options *options, bool *ret_possible, struct error *err);
+
+/* In place, for the plan points into it: not to be copied. Free with exterior_volume_clear. */
+int exterior_volume_make(struct exterior_volume *exterior, const struct exterior_volume_options *options,
+			 struct error *err);
+/* The same options; the projections may have changed since. */
+int exterior_volume_fit(struct exterior_volume *exterior, const struct exterior_volume_options *options,
+			struct error *err);
+/* After the fit: whether it has some of the object, and not the smear of one that ends with that grid, outside of it.
+ */
+bool exterior_volume_has_outside(const struct exterior_volume *exterior, const struct grid *grid);
+void exterior_volume_clear(struct exterior_volume *exterior);
+
+/* `to` becomes the same on the recipe's grid. */
+int exterior_volume_sample(const struct exterior_volume *exterior, const struct grid *grid, struct volume *to,
+			   struct error *err);
+/*
+ * A slice of it [y][x]: 1 where all views see a place, 0 where one of them has it beside its rows, in between nearer
+ * to that than a voxel of the coarse grid. True when it is 1 all over the field of view.
+ */
+bool exterior_volume_seen(const struct exterior_volume *exterior, const struct grid *grid, int z, float *ret_slice);
+
+#endif

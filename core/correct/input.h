@@ -1,0 +1,69 @@
+#ifndef CBCT_CORE_INPUT_H
+#define CBCT_CORE_INPUT_H
+
+#include "core/correct/defects.h"
+#include "core/correct/metal.h"
+#include "core/recon/recon.h"
+
+/* What core/recon/recon.c knows of the samples that it was given, and tells of them. Nobody else's. */
+struct input {
+	struct linearise linearise; /* as given, with the whole map; exchanged where `turned` */
+	bool turned;                /* rows and columns of all images are exchanged on their way in */
+	int columns, rows;          /* as they come */
+	void *exchanged[5]; /* owned, NULL where not turned: flat, dark, given and stuck defects, a projection */
+	struct defect_map map;
+	struct defect_counts counts;
+	int views, defective_views; /* linearised so far, and those of them with defects */
+	int *blank;                 /* [counts.blank], owned: views without a good pixel, in the order they came */
+	size_t pixels;              /* of a view */
+	/* Of about 4096 pixels of each view. */
+	double sum; /* of line integrals */
+	float most; /* of them, at least 0 */
+	size_t looked_at;
+	/* Of about 32 views: how many were looked at, and how many had something that is not air on the first row and
+	 * on the last one. */
+	int look_every, views_looked_at, ends[2];
+	/* And in how many of them air is not 0 (core/correct/air.h), in how many by so much that it is not taken for
+	 * air; the least and the most it is in those. */
+	int off, far_off;
+	float air_least, air_most;
+	/* Of uint16, as it is and with its bytes exchanged: how far neighbours are apart; the largest then. */
+	double rough[2];
+	int largest;
+};
+
+/*
+ * Checks linearise against the detector; looks for defects in its images. turned: the geometry is that of
+ * geometry_exchange, linearise and all samples are as before that. Free with input_clear.
+ */
+int input_open(struct input *ret_input, const struct linearise *linearise, const struct geometry *geometry, bool turned,
+	       struct error *err);
+void input_clear(struct input *input);
+
+size_t input_view_bytes(const struct input *input);
+
+/*
+ * linearise of one view into a slot. metal, or NULL: is told of samples without counts, which linearise has
+ * replaced from their neighbours. Those that lie in a dark shadow have at least the view's largest line integral.
+ */
+int input_take(struct input *input, const struct backend *backend, struct plan *plan, const void *samples, int view,
+	       int slot, struct stack *to, struct metal *metal, struct error *err);
+
+/*
+ * Whether the object goes on beyond the first row, [0], and the last one, [1]: more than a quarter of the views looked
+ * at have it there.
+ */
+void input_goes_on(const struct input *input, bool ret_ends[2]);
+
+/* The share of views in which air is so far from 0 that it is not taken for air: none of that is an object. */
+double input_air_off_share(const struct input *input);
+
+/* The share that blank views have in FDK's density on the axis, 0 .. 1. */
+double input_blank_share(const struct input *input, const struct orbit *orbit);
+/* ERR_IMPOSSIBLE where no view has a good pixel. */
+int input_check(const struct input *input, struct error *err);
+/* "no_dark", "defects", "defect_map", "stuck_pixels", "blank_views", "air_region", "air_level", "line_integrals",
+ * "byte_order". */
+void input_warn(const struct input *input, const struct geometry *geometry, const struct recon_hooks *hooks);
+
+#endif

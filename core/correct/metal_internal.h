@@ -1,0 +1,43 @@
+#ifndef CBCT_CORE_METAL_INTERNAL_H
+#define CBCT_CORE_METAL_INTERNAL_H
+
+#include "core/correct/metal.h"
+
+/* What the files of the metal stage share: metal_find.c, metal.c, metal_blend.c. */
+
+int metal_check_cancelled(const struct metal_tools *tools, struct error *err);
+size_t metal_slice_voxels(const struct grid *grid);
+/* `items` with room for one more than `count`; NULL, and they are as they were, where there is no memory. */
+void *metal_grown(void *items, size_t size, size_t count, size_t *room);
+
+/* First of the list's voxels of this slice or a later one. */
+size_t metal_voxels_from(const struct metal *metal, int z);
+/* First of the traces, in order, of this view or a later one. */
+size_t metal_traces_from(const struct metal_trace *traces, size_t count, int view);
+
+/* What is around a voxel: an ellipsoid, in voxels along the axes. */
+struct metal_rim {
+	double radius[3];
+	int reach[3];
+};
+/* So many widths of FDK's blur. */
+struct metal_rim metal_rim_of(const struct metal_tools *tools, double widths);
+/*
+ * For each voxel of the slice the highest metal that has it in its rim, 0: none; and infinite where it is metal
+ * itself. False, and nothing is written, where all are 0.
+ */
+bool metal_mark_slice(const struct metal *metal, const struct grid *grid, const struct metal_rim *rim, int z,
+		      float *ret_peaks);
+
+/* Views first .. first + count - 1 of a volume; the host's buffers are [slots][row][column]. */
+struct metal_batch {
+	int first, count;
+	float *shadow; /* the volume's projections */
+	float *views;  /* those of the scan */
+	bool *trace;
+};
+/* Their line integrals through a volume, to `shadow`. */
+int metal_project_batch(const struct metal_tools *tools, const struct volume *volume, const struct metal_batch *batch,
+			struct error *err);
+
+#endif

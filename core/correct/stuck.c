@@ -1,0 +1,385 @@
+/* Pixels that do not follow their neighbours over the views: see stuck.h. */
+#include "core/correct/stuck.h"
+
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+enum { NEIGHBOURS = 8, AWAY = 2 };
+
+static const float MATTERS = 0.03f, APART = 0.1f; /* of the photons, or of the largest line integral below 1 */
+static const float STILL = 0.1f, LARGER = 3, WILDER = 9, FARTHER = 3, STEADY = 4, IN_FEW_VIEWS = 0.25f;
+static const double MOST = 0.1;      /* of all pixels */
+static const double AXIS_PIXELS = 4; /* between a ray and the axis */
+
+/* Over the views looked at; p counts from the first one that a pixel is good in, so that rounding leaves no variance.
+ */
+struct sums {
+	float first, p, p2;
+	float e, e2, magnitude; /* of e */
+	int views;
+};
+
+struct stuck {
+	const struct linearise *linearise;
+	const struct geometry *geometry;
+	int views;
+	struct sums *sums;  /* [row][column] */
+	float *values;      /* [row][column], line integrals of a view */
+	float *medians;     /* [row][column], of each pixel's neighbours in the view */
+	unsigned char *bad; /* [row][column], of the view */
+	unsigned char *map;
+	float largest; /* line integral */
+};
+
+int stuck_new(const struct linearise *linearise, const struct geometry *geometry, struct stuck **ret_stuck,
+	      struct error *err)
+{
+	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
+	struct stuck *stuck;
+
+	*ret_stuck = NULL;
+	if (geometry->count < STUCK_VIEWS_LEAST || geometry->columns <= 2 * AWAY || geometry->rows <= 2 * AWAY)
+		return 0;
+	stuck = calloc(1, sizeof(*stuck));
+	if (stuck == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory to look for stuck pixels");
+	stuck->linearise = linearise;
+	stuck->geometry = geometry;
+	stuck->views = geometry->count < STUCK_VIEWS ? geometry->count : STUCK_VIEWS;
+	stuck->sums = calloc(pixels, sizeof(*stuck->sums));
+	stuck->values = malloc(pixels * sizeof(*stuck->values));
+	stuck->medians = malloc(pixels * sizeof(*stuck->medians));
+	stuck->bad = malloc(pixels);
+	stuck->map = calloc(pixels, 1);
+	if (stuck->sums == NULL || stuck->values == NULL || stuck->medians == NULL || stuck->bad == NULL ||
+	    stuck->map == NULL) {
+		stuck_free(stuck);
+		return error_set(err, ERR_NO_MEMORY, "no memory to look for stuck pixels in %d x %d", geometry->columns,
+				 geometry->rows);
+	}
+	*ret_stuck = stuck;
+	return 0;
+}
+
+void stuck_free(struct stuck *stuck)
+{
+	if (stuck == NULL)
+		return;
+	free(stuck->sums);
+	free(stuck->values);
+	free(stuck->medians);
+	free(stuck->bad);
+	free(stuck->map);
+	free(stuck);
+}
+
+bool stuck_wants(const struct stuck *stuck, int view)
+{
+	const long long count = stuck->geometry->count, k = (view * (long long)stuck->views + count - 1) / count;
+
+	return k * count / stuck->views == view;
+}
+
+/* NAN where the sample says nothing. */
+static float line_integral(const struct linearise *linearise, const void *samples, size_t at)
+{
+	const float sample =
+	    linearise->sample == SAMPLE_UINT16 ? ((const uint16_t *)samples)[at] : ((const float *)samples)[at];
+	const float dark = linearise->dark != NULL ? linearise->dark[at] : 0;
+	const float flat = linearise->flat != NULL ? linearise->flat[at] : (float)linearise->air;
+
+	if (!isfinite(sample) || (linearise->defects != NULL && linearise->defects[at]))
+		return NAN;
+	if (linearise->quantity == QUANTITY_LINE_INTEGRAL)
+		return sample;
+	return sample > dark && flat > dark && sample < linearise_saturation(linearise)
+		   ? logf((flat - dark) / (sample - dark))
+		   : NAN;
+}
+
+/* A row of the view; what says nothing stands in for its neighbours as the last good pixel before it. */
+static void read_row(struct stuck *stuck, const void *samples, int row)
+{
+	const size_t columns = (size_t)stuck->geometry->columns, from = (size_t)row * columns;
+	float last = 0;
+
+	for (size_t at = from; at < from + columns; at++) {
+		const float p = line_integral(stuck->linearise, samples, at);
+
+		stuck->bad[at] = isnan(p);
+		last = isnan(p) ? last : p;
+		stuck->values[at] = last;
+	}
+}
+
+/* Beside an edge of the detector there is no other side: the neighbours lie along the edge and straight inwards. */
+static const int AROUND[NEIGHBOURS][2] = {{-1, -1}, {-1, 0}, {-1, 1}, {0, -1}, {0, 1}, {1, -1}, {1, 0}, {1, 1}};
+static const int ALONG[NEIGHBOURS][2] = {{0, -3}, {0, -2}, {0, -1}, {0, 1}, {0, 2}, {0, 3}, {1, 0}, {2, 0}};
+
+static int held(int index, int count)
+{
+	return index < 0 ? 0 : index < count ? index : count - 1;
+}
+
+/* Whether a pixel has no neighbours beyond this end of a row or column. */
+static int edge_at(int index, int count)
+{
+	return index < AWAY ? 1 : index >= count - AWAY ? -1 : 0;
+}
+
+static void neighbours_of(const struct geometry *geometry, int column, int row, size_t ret[NEIGHBOURS])
+{
+	const int inwards[2] = {edge_at(row, geometry->rows), edge_at(column, geometry->columns)};
+
+	for (int i = 0; i < NEIGHBOURS; i++) {
+		int r = AROUND[i][0], c = AROUND[i][1];
+
+		if (inwards[0] != 0) {
+			r = inwards[0] * ALONG[i][0];
+			c = ALONG[i][1];
+		} else if (inwards[1] != 0) {
+			r = ALONG[i][1];
+			c = inwards[1] * ALONG[i][0];
+		}
+		ret[i] = (size_t)held(row + AWAY * r, geometry->rows) * (size_t)geometry->columns +
+			 (size_t)held(column + AWAY * c, geometry->columns);
+	}
+}
+
+static void sort(float values[NEIGHBOURS])
+{
+	for (int i = 1; i < NEIGHBOURS; i++) {
+		const float value = values[i];
+		int at = i;
+
+		for (; at > 0 && values[at - 1] > value; at--)
+			values[at] = values[at - 1];
+		values[at] = value;
+	}
+}
+
+static float median_of(const struct stuck *stuck, int column, int row)
+{
+	size_t near[NEIGHBOURS];
+	float values[NEIGHBOURS];
+
+	neighbours_of(stuck->geometry, column, row, near);
+	for (int i = 0; i < NEIGHBOURS; i++)
+		values[i] = stuck->values[near[i]];
+	sort(values);
+	return 0.5f * (values[NEIGHBOURS / 2 - 1] + values[NEIGHBOURS / 2]);
+}
+
+/*
+ * The medians of a row's pixels that have neighbours all around, for many columns at once: the exchanges are those of
+ * Batcher's merge sort of eight values (Batcher 1968) but those that the middle two do not depend on.
+ */
+static void medians_inside(const struct stuck *stuck, int row)
+{
+	static const int exchanges[][2] = {{0, 1}, {2, 3}, {4, 5}, {6, 7}, {0, 2}, {1, 3}, {4, 6}, {5, 7}, {1, 2},
+					   {5, 6}, {0, 4}, {1, 5}, {2, 6}, {3, 7}, {2, 4}, {3, 5}, {3, 4}};
+	enum { LANES = 16, EXCHANGES = sizeof(exchanges) / sizeof(exchanges[0]) };
+	const int columns = stuck->geometry->columns, behind = columns - AWAY;
+	const float *at = stuck->values + (size_t)row * (size_t)columns;
+
+	for (int first = AWAY; first < behind; first += LANES) {
+		const int count = behind - first < LANES ? behind - first : LANES;
+		float values[NEIGHBOURS][LANES] = {{0}};
+
+		for (int i = 0; i < NEIGHBOURS; i++)
+			memcpy(values[i], at + AWAY * (AROUND[i][0] * columns + AROUND[i][1]) + first,
+			       (size_t)count * sizeof(*at));
+		for (int k = 0; k < EXCHANGES; k++) {
+			float *low = values[exchanges[k][0]], *high = values[exchanges[k][1]];
+
+#pragma omp simd
+			for (int lane = 0; lane < LANES; lane++) {
+				const float a = low[lane], b = high[lane];
+
+				low[lane] = a < b ? a : b;
+				high[lane] = a > b ? a : b;
+			}
+		}
+		for (int lane = 0; lane < count; lane++)
+			stuck->medians[(size_t)row * (size_t)columns + (size_t)(first + lane)] =
+			    0.5f * (values[NEIGHBOURS / 2 - 1][lane] + values[NEIGHBOURS / 2][lane]);
+	}
+}
+
+static void medians_of_row(const struct stuck *stuck, int row)
+{
+	const int columns = stuck->geometry->columns;
+	const bool inside = edge_at(row, stuck->geometry->rows) == 0;
+
+	if (inside)
+		medians_inside(stuck, row);
+	for (int column = 0; column < columns; column++)
+		if (!inside || edge_at(column, columns) != 0)
+			stuck->medians[(size_t)row * (size_t)columns + (size_t)column] = median_of(stuck, column, row);
+}
+
+static void add_row(struct stuck *stuck, int row)
+{
+	const size_t columns = (size_t)stuck->geometry->columns, from = (size_t)row * columns;
+
+	for (size_t at = from; at < from + columns; at++) {
+		struct sums *sums = &stuck->sums[at];
+		const float p = stuck->values[at], e = p - stuck->medians[at];
+
+		if (stuck->bad[at])
+			continue;
+		if (sums->views++ == 0)
+			sums->first = p;
+		sums->p += p - sums->first;
+		sums->p2 += (p - sums->first) * (p - sums->first);
+		sums->e += e;
+		sums->e2 += e * e;
+		sums->magnitude += fabsf(e);
+	}
+}
+
+void stuck_add(struct stuck *stuck, const void *samples)
+{
+	const int rows = stuck->geometry->rows;
+	const size_t pixels = (size_t)rows * (size_t)stuck->geometry->columns;
+	float largest = stuck->largest;
+
+#pragma omp parallel for schedule(static)
+	for (int row = 0; row < rows; row++)
+		read_row(stuck, samples, row);
+#pragma omp parallel for schedule(static)
+	for (int row = 0; row < rows; row++) {
+		medians_of_row(stuck, row);
+		add_row(stuck, row);
+	}
+	/* Of some pixels: a stuck one may be the largest of all. */
+	for (size_t i = 0; i < pixels; i += pixels / 4096 + 1)
+		largest = fmaxf(largest, stuck->values[i]);
+	stuck->largest = largest;
+}
+
+/* What the sums say of a pixel. */
+struct behaviour {
+	float varies;             /* variance of p */
+	float rms, mean, wanders; /* of e: root mean square, mean's magnitude, variance */
+	float spread;             /* mean |e| squared, in units of the mean square: small where few views make it */
+};
+
+static struct behaviour behaviour_of(const struct sums *sums)
+{
+	const float n = sums->views > 0 ? (float)sums->views : 1, mean = sums->p / n, e = sums->e / n;
+
+	return (struct behaviour){
+	    .varies = fmaxf(sums->p2 / n - mean * mean, 0),
+	    .rms = sqrtf(sums->e2 / n),
+	    .mean = fabsf(e),
+	    .wanders = fmaxf(sums->e2 / n - e * e, 0),
+	    .spread = sums->e2 > 0 ? sums->magnitude * sums->magnitude / (n * sums->e2) : 0,
+	};
+}
+
+/* Whether a pixel's ray passes the axis of the rotation, z, within some pixels in any view looked at. */
+static bool is_on_axis(const struct stuck *stuck, int column, int row)
+{
+	const struct geometry *geometry = stuck->geometry;
+
+	for (int k = 0; k < geometry->count; k++) {
+		double matrix[12], at[2][2], along[2], length;
+
+		if (!stuck_wants(stuck, k))
+			continue;
+		view_matrix(&geometry->views[k], matrix);
+		for (int end = 0; end < 2; end++)
+			view_project(matrix, (const double[3]){0, 0, end ? 10 : -10}, &at[end][0], &at[end][1]);
+		along[0] = at[1][0] - at[0][0];
+		along[1] = at[1][1] - at[0][1];
+		length = hypot(along[0], along[1]);
+		if (!(fabs((column - at[0][0]) * along[1] - (row - at[0][1]) * along[0]) > AXIS_PIXELS * length))
+			return true;
+	}
+	return false;
+}
+
+static float mean_of(const struct sums *sums)
+{
+	return sums->first + sums->p / (float)(sums->views > 0 ? sums->views : 1);
+}
+
+/*
+ * Whether the pixels right beside a pixel, all but one, are unlike it: in the mean by at least half of what it differs
+ * by from m, or where it wanders, by wandering less than a quarter of that.
+ */
+static bool is_alone(const struct stuck *stuck, int column, int row, bool wanders)
+{
+	const int columns = stuck->geometry->columns, rows = stuck->geometry->rows;
+	const struct sums *own = &stuck->sums[(size_t)row * (size_t)columns + (size_t)column];
+	const float e = own->e / (float)own->views, least = 0.25f * behaviour_of(own).wanders;
+	int like = 0;
+
+	for (int i = 0; i < NEIGHBOURS; i++) {
+		const int r = row + AROUND[i][0], c = column + AROUND[i][1];
+		const struct sums *other;
+		float apart;
+
+		if (r < 0 || r >= rows || c < 0 || c >= columns)
+			continue;
+		other = &stuck->sums[(size_t)r * (size_t)columns + (size_t)c];
+		apart = mean_of(own) - mean_of(other);
+		like += wanders ? behaviour_of(other).wanders > least : !(e > 0 ? apart > 0.5f * e : apart < 0.5f * e);
+	}
+	return like <= 1;
+}
+
+static bool is_stuck(const struct stuck *stuck, int column, int row)
+{
+	const float whole = fminf(stuck->largest, 1);
+	const size_t at = (size_t)row * (size_t)stuck->geometry->columns + (size_t)column;
+	const struct behaviour own = behaviour_of(&stuck->sums[at]);
+	float varies[NEIGHBOURS], rms[NEIGHBOURS], mean[NEIGHBOURS], wanders[NEIGHBOURS];
+	size_t near[NEIGHBOURS];
+
+	if (2 * stuck->sums[at].views < stuck->views || own.rms < MATTERS * whole)
+		return false;
+	/* A corner has neighbours on one side only. */
+	if (edge_at(column, stuck->geometry->columns) != 0 && edge_at(row, stuck->geometry->rows) != 0)
+		return false;
+	neighbours_of(stuck->geometry, column, row, near);
+	for (int i = 0; i < NEIGHBOURS; i++) {
+		const struct behaviour other = behaviour_of(&stuck->sums[near[i]]);
+
+		varies[i] = other.varies;
+		rms[i] = other.rms;
+		mean[i] = other.mean;
+		wanders[i] = other.wanders;
+	}
+	sort(varies);
+	sort(rms);
+	sort(mean);
+	sort(wanders);
+	if (own.varies < STILL * varies[2] && own.rms > LARGER * rms[NEIGHBOURS / 2])
+		return true;
+	if (own.wanders > MATTERS * MATTERS * whole * whole && own.wanders > WILDER * wanders[NEIGHBOURS - 2] &&
+	    own.spread > IN_FEW_VIEWS && own.rms > LARGER * rms[NEIGHBOURS - 2] && is_alone(stuck, column, row, true))
+		return true;
+	return own.mean > APART * whole && own.mean > FARTHER * mean[NEIGHBOURS - 2] &&
+	       own.mean * own.mean > STEADY * STEADY * own.wanders && is_alone(stuck, column, row, false) &&
+	       !is_on_axis(stuck, column, row);
+}
+
+const unsigned char *stuck_find(struct stuck *stuck)
+{
+	const int columns = stuck->geometry->columns, rows = stuck->geometry->rows;
+	size_t count = 0;
+
+#pragma omp parallel for schedule(dynamic, 16) reduction(+ : count)
+	for (int row = 0; row < rows; row++)
+		for (int column = 0; column < columns; column++) {
+			const size_t at = (size_t)row * (size_t)columns + (size_t)column;
+
+			stuck->map[at] = is_stuck(stuck, column, row);
+			count += stuck->map[at];
+		}
+	return count > 0 && (double)count <= MOST * columns * rows ? stuck->map : NULL;
+}

@@ -1,0 +1,435 @@
+/*
+ * The ramp filter of FDK: rows are weighted, transformed, multiplied with the
+ * response and transformed back. The response is real and even, so two rows go
+ * through one complex transform as its real and imaginary parts and come out as
+ * they went in. KissFFT (BSD) does the transforms; it allocates nothing as long
+ * as input and output differ and the length has the factors 2, 3 and 5 only.
+ */
+#include "core/cpu/cpu.h"
+#include "core/truncation.h"
+
+#include <kissfft/kiss_fft.h>
+#include <stdlib.h>
+#include <string.h>
+
+/* Rows that are neighbours in memory and are filtered together: one cache line of floats. */
+enum { ROWS = 16, PAIRS = ROWS / 2 };
+
+/* Transforms of one length. */
+struct transform {
+	int length;
+	kiss_fft_cfg forward, inverse;
+	float *response; /* [length], all frequencies, 1 / length included */
+};
+
+struct filter_engine {
+	const struct geometry *geometry; /* borrowed, as are the weights */
+	const float *column_weights;     /* [view][column] */
+	double axis[3];                  /* plan_options.axis */
+	int pad, wide;                   /* zero columns before column 0; columns of a filtered row */
+	int extend;                      /* columns that truncated rows get on either side */
+	bool sides[2];                   /* that may be extended */
+	struct shell_table shells;       /* of core/truncation.h */
+	float *levels;                   /* [view] truncation_level, or NULL without extend */
+	struct transform plain, extended;
+	kiss_fft_cpx *buffers; /* [threads][2][PAIRS][stride] */
+	size_t stride;
+};
+
+static int wide_columns(const struct plan_options *options)
+{
+	return options->pad[0] + options->geometry->columns + options->pad[1];
+}
+
+/* Of the longest transform; away from multiples of 4 KiB, where all pairs would share the same sets of the cache. */
+static size_t buffer_stride(const struct plan_options *options)
+{
+	return (size_t)filter_length(wide_columns(options) + options->extend) + 8;
+}
+
+static size_t buffers_count(const struct plan_options *options, int threads)
+{
+	return (size_t)threads * 2 * PAIRS * buffer_stride(options);
+}
+
+static size_t transform_bytes(int length)
+{
+	size_t bytes = 0;
+
+	kiss_fft_alloc(length, 0, NULL, &bytes);
+	return 2 * bytes + (size_t)length * sizeof(float);
+}
+
+size_t filter_engine_bytes(const struct plan_options *options, int threads)
+{
+	const int wide = wide_columns(options);
+	size_t bytes = sizeof(struct filter_engine) + transform_bytes(filter_length(wide));
+
+	if (options->extend > 0)
+		bytes += transform_bytes(filter_length(wide + options->extend)) +
+			 (size_t)options->geometry->count * sizeof(float);
+	return bytes + buffers_count(options, threads) * sizeof(kiss_fft_cpx);
+}
+
+static int transform_new(int length, const float *response, struct transform *ret, struct error *err)
+{
+	ret->length = length;
+	ret->forward = kiss_fft_alloc(length, 0, NULL, NULL);
+	ret->inverse = kiss_fft_alloc(length, 1, NULL, NULL);
+	ret->response = malloc((size_t)length * sizeof(float));
+	if (ret->forward == NULL || ret->inverse == NULL || ret->response == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for the ramp filter of %d samples", length);
+	for (int i = 0; i < length; i++)
+		ret->response[i] = response[i <= length / 2 ? i : length - i] / (float)length;
+	return 0;
+}
+
+static void transform_clear(struct transform *transform)
+{
+	kiss_fft_free(transform->forward);
+	kiss_fft_free(transform->inverse);
+	free(transform->response);
+}
+
+int filter_engine_new(const struct plan_options *options, int threads, struct filter_engine **ret_engine,
+		      struct error *err)
+{
+	struct filter_engine *engine = calloc(1, sizeof(*engine));
+	const int wide = wide_columns(options);
+	int code;
+
+	if (engine == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for the ramp filter");
+	engine->geometry = options->geometry;
+	engine->column_weights = options->column_weights;
+	memcpy(engine->axis, options->axis, sizeof(engine->axis));
+	engine->pad = options->pad[0];
+	engine->wide = wide;
+	engine->extend = options->extend;
+	engine->shells = shell_table_make();
+	for (int side = 0; side < 2; side++)
+		engine->sides[side] = options->extend > 0 && options->pad[side] == 0;
+	engine->stride = buffer_stride(options);
+	code = transform_new(filter_length(wide), options->filter_response, &engine->plain, err);
+	if (code == 0 && engine->extend > 0)
+		code = transform_new(filter_length(wide + engine->extend), options->extended_response,
+				     &engine->extended, err);
+	engine->buffers = calloc(buffers_count(options, threads), sizeof(kiss_fft_cpx));
+	if (engine->extend > 0)
+		engine->levels = malloc((size_t)options->geometry->count * sizeof(float));
+	if (code == 0 && (engine->buffers == NULL || (engine->extend > 0 && engine->levels == NULL)))
+		code = error_set(err, ERR_NO_MEMORY, "no memory for the buffers of the ramp filter");
+	if (code < 0) {
+		filter_engine_free(engine);
+		return code;
+	}
+	*ret_engine = engine;
+	return 0;
+}
+
+void filter_engine_free(struct filter_engine *engine)
+{
+	if (engine == NULL)
+		return;
+	transform_clear(&engine->plain);
+	transform_clear(&engine->extended);
+	free(engine->buffers);
+	free(engine->levels);
+	free(engine);
+}
+
+/*
+ * weight * cos(gamma) of rows row .. row + ROWS - 1 in one column:
+ * cos(gamma) = (ray . direction) / |ray|, the ray a + r v from the source.
+ */
+static void column_cosines(const struct view *view, const double direction[3], int column, int row, float weight,
+			   float ret_weights[ROWS])
+{
+	float along, along_step, square, square_step, square_step2;
+	double a[3];
+
+	for (int i = 0; i < 3; i++)
+		a[i] = view->pixel0[i] - view->source[i] + column * view->column_step[i] + row * view->row_step[i];
+	along = (float)vec_dot(a, direction) * weight;
+	along_step = (float)vec_dot(view->row_step, direction) * weight;
+	square = (float)vec_dot(a, a);
+	square_step = (float)(2 * vec_dot(a, view->row_step));
+	square_step2 = (float)vec_dot(view->row_step, view->row_step);
+	for (int i = 0; i < ROWS; i++) {
+		float r = (float)i;
+
+		ret_weights[i] = (along + r * along_step) / sqrtf(square + r * (square_step + r * square_step2));
+	}
+}
+
+/* ---- extension of truncated rows, see core/truncation.h ---- */
+
+/* A view, [column][row], and ROWS rows of it or fewer. */
+struct rows {
+	const float *view;
+	int columns, rows;
+	int first, count;
+	float level; /* of the view */
+};
+
+/* What each row of a group has before column 0 and behind the last one. */
+struct extensions {
+	bool truncated[2][ROWS];
+	struct extension edge[2][ROWS];
+};
+
+/* Column i from an edge, the group's first row. */
+static const float *at_edge(const struct rows *rows, int side, int i)
+{
+	const int column = side == 0 ? i : rows->columns - 1 - i;
+
+	return rows->view + (size_t)column * (size_t)rows->rows + (size_t)rows->first;
+}
+
+/* Which rows are cut off at an edge; returns whether any is. */
+static bool find_truncated(const struct filter_engine *engine, const struct rows *rows, struct extensions *ret)
+{
+	bool any = false;
+
+	memset(ret->truncated, 0, sizeof(ret->truncated));
+	for (int side = 0; side < 2; side++)
+		for (int r = 0; r < rows->count && engine->sides[side]; r++) {
+			ret->truncated[side][r] =
+			    truncation_is_cut(at_edge(rows, side, 0) + r, side == 0 ? rows->rows : -rows->rows,
+					      rows->columns, rows->level);
+			any = any || ret->truncated[side][r];
+		}
+	return any;
+}
+
+/* The shell around the object of row r of a group, where it is cut off; share 0 where there is none. */
+static struct shell find_shell(const struct filter_engine *engine, const struct rows *rows, int r,
+			       const struct extensions *extensions, int *ret_width)
+{
+	const float *p = at_edge(rows, 0, 0) + r;
+	const ptrdiff_t step = rows->rows;
+	int first = 0, last = rows->columns - 1;
+	float bins[SHELL_BINS], ellipse;
+	double square;
+
+	while (!extensions->truncated[0][r] && first < last && p[first * step] < rows->level)
+		first++;
+	while (!extensions->truncated[1][r] && last > first && p[last * step] < rows->level)
+		last--;
+	*ret_width = last - first + 1;
+	for (int bin = 0; bin < SHELL_BINS; bin++)
+		bins[bin] = shell_bin(p, step, first, *ret_width, bin);
+	square = shell_square(bins);
+	ellipse = shell_ellipse_error(bins, square);
+	if (!shell_is_tried(ellipse))
+		return (struct shell){.share = 0};
+	return shell_make(&engine->shells, bins, square, ellipse, shell_search(&engine->shells, bins, square));
+}
+
+static void fit_shells(const struct filter_engine *engine, const struct rows *rows, struct extensions *ret)
+{
+	for (int r = 0; r < rows->count; r++) {
+		struct shell shell;
+		int width;
+
+		if (!ret->truncated[0][r] && !ret->truncated[1][r])
+			continue;
+		shell = find_shell(engine, rows, r, ret, &width);
+		for (int side = 0; side < 2 && shell.share > 0; side++) {
+			float measured = 0;
+
+			for (int i = 0; i < truncation_window(rows->columns); i++)
+				measured += at_edge(rows, side, i)[r];
+			if (ret->truncated[side][r])
+				truncation_by_shell(&ret->edge[side][r], &shell, side, width, measured, rows->columns);
+		}
+	}
+}
+
+static void fit_extensions(const struct filter_engine *engine, const struct rows *rows, struct extensions *ret)
+{
+	struct truncation_row_sums sums[ROWS] = {{0}};
+
+	for (int c = 0; c < rows->columns; c++) {
+		const float *values = at_edge(rows, 0, c);
+		const double x = truncation_x(c, rows->columns);
+
+		for (int r = 0; r < rows->count; r++)
+			if (values[r] >= rows->level)
+				truncation_row_add(&sums[r], x, (double)values[r]);
+	}
+	for (int side = 0; side < 2; side++) {
+		struct truncation_edge_sums edges[ROWS] = {{0}};
+
+		for (int i = 0; i < truncation_window(rows->columns); i++) {
+			const float *values = at_edge(rows, side, i);
+
+			for (int r = 0; r < rows->count; r++) {
+				const double p = values[r] > 0 ? (double)values[r] : 0;
+
+				edges[r].y += p * p;
+				edges[r].xy -= i * p * p;
+			}
+		}
+		for (int r = 0; r < rows->count; r++)
+			if (ret->truncated[side][r])
+				ret->edge[side][r] = truncation_fit(
+				    rows->columns, engine->extend, &sums[r], &edges[r],
+				    truncation_near(at_edge(rows, side, 0) + r, side == 0 ? rows->rows : -rows->rows,
+						    rows->columns));
+	}
+}
+
+/* Writes the extension of one side into the buffers of all pairs; column -1 is the last of the buffer. */
+static void write_extension(const struct filter_engine *engine, int view, const struct rows *rows, int side,
+			    const struct extensions *extensions, kiss_fft_cpx *in)
+{
+	const int outermost = side == 0 ? 0 : rows->columns - 1;
+	const float weight = engine->column_weights[(size_t)view * (size_t)rows->columns + (size_t)outermost];
+	double direction[3];
+
+	axis_direction(engine->geometry->views[view].source, engine->axis, direction);
+	for (int x = 1; x <= engine->extend; x++) {
+		const int column = side == 0 ? -x : outermost + x;
+		const int at = engine->pad + column + (column < 0 ? engine->extended.length : 0);
+		float weights[ROWS], values[ROWS] = {0};
+
+		column_cosines(&engine->geometry->views[view], direction, column, rows->first, weight, weights);
+		for (int r = 0; r < rows->count; r++)
+			if (extensions->truncated[side][r])
+				values[r] = weights[r] * truncation_value(&extensions->edge[side][r], x);
+		for (int i = 0; i < PAIRS; i++)
+			in[(size_t)i * engine->stride + (size_t)at] = (kiss_fft_cpx){values[2 * i], values[2 * i + 1]};
+	}
+}
+
+/* ---- the filter ---- */
+
+/* Rows times their weights into the buffers of their pairs, from `pad` on. */
+static void weight_rows(const struct filter_engine *engine, int view, const struct rows *rows, kiss_fft_cpx *in)
+{
+	const struct view *from = &engine->geometry->views[view];
+	double direction[3];
+
+	axis_direction(from->source, engine->axis, direction);
+	for (int c = 0; c < rows->columns; c++) {
+		float weights[ROWS], values[ROWS] = {0};
+
+		memcpy(values, at_edge(rows, 0, c), (size_t)rows->count * sizeof(float));
+		column_cosines(from, direction, c, rows->first,
+			       engine->column_weights[(size_t)view * (size_t)rows->columns + (size_t)c], weights);
+		for (int i = 0; i < ROWS; i++)
+			values[i] *= weights[i];
+		for (int i = 0; i < PAIRS; i++)
+			in[(size_t)i * engine->stride + (size_t)(engine->pad + c)] =
+			    (kiss_fft_cpx){values[2 * i], values[2 * i + 1]};
+	}
+}
+
+/* Rows row .. row + count - 1 of one view; adds the rows that were extended on either side. */
+static void filter_rows(const struct filter_engine *engine, int view, const struct rows *rows, float *to,
+			kiss_fft_cpx *buffers, size_t extended[2])
+{
+	const size_t stride = engine->stride;
+	kiss_fft_cpx *in = buffers, *out = buffers + PAIRS * stride;
+	const int pairs = (rows->count + 1) / 2;
+	const struct transform *transform = &engine->plain;
+	struct extensions extensions;
+
+	weight_rows(engine, view, rows, in);
+	if (find_truncated(engine, rows, &extensions))
+		transform = &engine->extended;
+	for (int i = 0; i < pairs; i++) {
+		kiss_fft_cpx *row = in + (size_t)i * stride;
+
+		memset(row, 0, (size_t)engine->pad * sizeof(*row));
+		memset(row + engine->pad + rows->columns, 0,
+		       (size_t)(transform->length - engine->pad - rows->columns) * sizeof(*row));
+	}
+	if (transform == &engine->extended) {
+		fit_extensions(engine, rows, &extensions);
+		fit_shells(engine, rows, &extensions);
+		for (int side = 0; side < 2; side++) {
+			if (engine->sides[side])
+				write_extension(engine, view, rows, side, &extensions, in);
+			for (int r = 0; r < rows->count; r++)
+				extended[side] += extensions.truncated[side][r];
+		}
+	}
+	for (int i = 0; i < pairs; i++) {
+		kiss_fft_cpx *row_in = in + (size_t)i * stride, *row_out = out + (size_t)i * stride;
+
+		kiss_fft(transform->forward, row_in, row_out);
+		for (int k = 0; k < transform->length; k++) {
+			row_out[k].r *= transform->response[k];
+			row_out[k].i *= transform->response[k];
+		}
+		kiss_fft(transform->inverse, row_out, row_in);
+	}
+	for (int c = 0; c < engine->wide; c++) {
+		float values[ROWS];
+
+		for (int i = 0; i < pairs; i++) {
+			values[2 * i] = in[(size_t)i * stride + (size_t)c].r;
+			values[2 * i + 1] = in[(size_t)i * stride + (size_t)c].i;
+		}
+		memcpy(to + (size_t)c * (size_t)rows->rows + (size_t)rows->first, values,
+		       (size_t)rows->count * sizeof(float));
+	}
+}
+
+static void find_levels(struct plan *plan, const struct stack *from, const int *slots, const int *views, int count)
+{
+	const size_t rows = (size_t)plan->rows;
+
+#pragma omp parallel for num_threads(plan->device->threads)
+	for (int i = 0; i < count; i++) {
+		const float *view = stack_slot(from, slots != NULL ? slots[i] : views[i]);
+
+		plan->filter->levels[views[i]] =
+		    truncation_level(truncation_largest(view, plan->columns, plan->rows, rows, 1));
+	}
+}
+
+int cpu_filter(struct plan *plan, const struct stack *from, const int *slots, const int *views, int count,
+	       struct stack *to, struct error *err)
+{
+	const struct filter_engine *engine = plan->filter;
+	const int blocks = (plan->rows + ROWS - 1) / ROWS;
+	size_t extended[2] = {0};
+
+	if (engine == NULL)
+		return error_set(err, ERR_INTERNAL, "the plan was made without FDK");
+	if (to->columns != plan->wide)
+		return error_set(err, ERR_INTERNAL, "%d columns to filter into instead of %d", to->columns, plan->wide);
+	if (count > to->slots)
+		return error_set(err, ERR_INTERNAL, "%d views to filter into a stack of %d slots", count, to->slots);
+	if (engine->extend > 0)
+		find_levels(plan, from, slots, views, count);
+#pragma omp parallel for num_threads(plan->device->threads) schedule(dynamic) reduction(+ : extended[:2])
+	for (int job = 0; job < count * blocks; job++) {
+		const int i = job / blocks, row = job % blocks * ROWS, left = plan->rows - row;
+		const struct rows rows = {
+		    .view = stack_slot(from, slots != NULL ? slots[i] : views[i]),
+		    .columns = plan->columns,
+		    .rows = plan->rows,
+		    .first = row,
+		    .count = left < ROWS ? left : ROWS,
+		    .level = engine->extend > 0 ? engine->levels[views[i]] : 0,
+		};
+
+		filter_rows(engine, views[i], &rows, to->data + (size_t)i * (size_t)plan->wide * (size_t)plan->rows,
+			    engine->buffers + (size_t)cpu_thread() * 2 * PAIRS * engine->stride, extended);
+	}
+	for (int side = 0; side < 2; side++)
+		plan->extended[side] += extended[side];
+	return 0;
+}
+
+int cpu_filter_extended(struct plan *plan, size_t ret_rows[2], struct error *err)
+{
+	(void)err;
+	for (int side = 0; side < 2; side++)
+		ret_rows[side] = plan->extended[side];
+	return 0;
+}

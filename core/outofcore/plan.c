@@ -1,0 +1,395 @@
+/*
+ * How many slabs a job is cut into, and the slabs on the device. The fewest are
+ * taken that fit, all alike but for the last; each has its own plan of the
+ * backend below, whose grid is the slab with what its neighbours lend it:
+ *
+ *   FDK    nothing. Two slabs are there at a time: one is copied back while the next one is made.
+ *   sums   a slice of zeros on either side, where the linear interpolation of the slab ends.
+ *   TV     as many slices as there are steps: a step reaches one voxel.
+ */
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "core/outofcore/internal.h"
+
+/* Of what is free: the rest is for alignment, and what the backend below rounds up. */
+static const double SHARE = 0.97;
+
+static bool has_purpose(const struct plan_options *options, enum purpose purpose)
+{
+	switch (purpose) {
+	case FOR_FDK:
+		return options->column_weights != NULL;
+	case FOR_SUMS:
+		return !options->no_projection;
+	default:
+		return options->tv != NULL;
+	}
+}
+
+int outofcore_halo(const struct plan_options *options, enum purpose purpose)
+{
+	return purpose == FOR_TV ? options->tv->iterations : purpose == FOR_SUMS ? 1 : 0;
+}
+
+static int columns_of(const struct plan_options *options, enum purpose purpose)
+{
+	return options->geometry->columns + (purpose == FOR_FDK ? options->pad[0] + options->pad[1] : 0);
+}
+
+static struct plan_options options_for(const struct plan *plan, enum purpose purpose, const struct grid *grid)
+{
+	struct plan_options options = plan->options;
+
+	options.grid = grid;
+	options.linearise = (struct linearise){.sample = SAMPLE_FLOAT32};
+	options.sart = NULL;
+	options.beside = options.lends = 0;
+	options.lender = NULL;
+	options.no_samples = true;
+	options.no_projection = purpose != FOR_SUMS;
+	options.resident = plan->batch;
+	if (purpose != FOR_TV)
+		options.tv = NULL;
+	if (purpose != FOR_FDK) {
+		options.column_weights = options.filter_response = NULL;
+		options.pad[0] = options.pad[1] = options.extend = 0;
+	}
+	return options;
+}
+
+static struct grid grid_of_slices(const struct grid *grid, int first, int count)
+{
+	struct grid part = *grid;
+
+	part.size[2] = count;
+	part.origin[2] += first * grid->spacing[2];
+	return part;
+}
+
+/* The grid of what linearises: one voxel, since it needs none. */
+static struct grid intake_grid(const struct plan *plan)
+{
+	struct grid grid = *plan->options.grid;
+
+	for (int i = 0; i < 3; i++) {
+		grid.origin[i] += 0.5 * (grid.size[i] - 1) * grid.spacing[i];
+		grid.size[i] = 1;
+	}
+	return grid;
+}
+
+static struct plan_options intake_options(const struct plan *plan, const struct grid *grid)
+{
+	struct plan_options options = options_for(plan, FOR_TV, grid);
+
+	options.tv = NULL;
+	options.linearise = plan->options.linearise;
+	options.no_samples = false;
+	options.resident = 1;
+	return options;
+}
+
+static size_t stack_bytes(const struct plan *plan, enum purpose purpose, int slots)
+{
+	return plan->device->backend->stack_bytes(columns_of(&plan->options, purpose), plan->options.geometry->rows,
+						  slots);
+}
+
+/* What slabs of so many slices take on the device for a purpose, the volumes to *ret_volumes. */
+static int slab_bytes(const struct plan *plan, enum purpose purpose, int slices, size_t *ret_total, size_t *ret_volumes,
+		      struct error *err)
+{
+	const int most = plan->options.grid->size[2], stacks = purpose == FOR_TV ? 0 : 2;
+	int thick = slices + 2 * outofcore_halo(&plan->options, purpose);
+	struct grid grid = grid_of_slices(plan->options.grid, 0, thick < most ? thick : most);
+	struct plan_options options = options_for(plan, purpose, &grid);
+	struct plan_bytes bytes;
+	int code = plan->device->backend->plan_bytes(plan->device->below, &options, &bytes, err);
+
+	if (code < 0)
+		return code;
+	*ret_volumes = bytes.volumes * (purpose == FOR_FDK ? 2 : 1);
+	*ret_total = *ret_volumes + bytes.scratch + bytes.raw +
+		     (size_t)stacks * stack_bytes(plan, FOR_SUMS, plan->batch) +
+		     (purpose == FOR_FDK ? stack_bytes(plan, FOR_FDK, plan->batch) : 0);
+	return 0;
+}
+
+static int intake_bytes(const struct plan *plan, size_t *ret_bytes, struct error *err)
+{
+	struct grid grid = intake_grid(plan);
+	struct plan_options options = intake_options(plan, &grid);
+	struct plan_bytes bytes;
+	int code = plan->device->backend->plan_bytes(plan->device->below, &options, &bytes, err);
+
+	if (code == 0)
+		*ret_bytes = bytes.volumes + bytes.scratch + bytes.raw + stack_bytes(plan, FOR_SUMS, 1);
+	return code;
+}
+
+/* The fewest slabs that leave `budget` unbroken. */
+static int choose_slices(struct plan *plan, enum purpose purpose, size_t budget, struct error *err)
+{
+	const int nz = plan->options.grid->size[2];
+	size_t total = 0, volumes = 0;
+
+	for (int slabs = 1; slabs <= nz; slabs++) {
+		int slices = (nz + slabs - 1) / slabs, code;
+
+		code = slab_bytes(plan, purpose, slices, &total, &volumes, err);
+		if (code < 0)
+			return code;
+		if (total <= budget) {
+			plan->slices[purpose] = slices;
+			if (total > plan->bytes.volumes + plan->bytes.scratch)
+				plan->bytes = (struct plan_bytes){.volumes = volumes, .scratch = total - volumes};
+			return 0;
+		}
+	}
+	return error_set_at(err, ERR_NO_MEMORY, "/grid", "one slice alone takes %.1f MiB, %.1f MiB are free",
+			    (double)total / (1 << 20), (double)budget / (1 << 20));
+}
+
+static int choose_slabs(struct plan *plan, size_t budget, struct error *err)
+{
+	int code = 0;
+
+	plan->bytes = (struct plan_bytes){0};
+	for (int p = 0; p < PURPOSE_COUNT && code == 0; p++)
+		if (has_purpose(&plan->options, (enum purpose)p))
+			code = choose_slices(plan, (enum purpose)p, budget, err);
+	return code;
+}
+
+static int largest_subset(const struct plan_options *options)
+{
+	int most = 0;
+
+	for (int i = 0; options->sart != NULL && i < options->sart->subsets.count; i++) {
+		int count = options->sart->subsets.start[i + 1] - options->sart->subsets.start[i];
+
+		most = count > most ? count : most;
+	}
+	return most;
+}
+
+/* Host memory that the plan itself needs: a slab's sums and column sums; the slices that TV keeps. */
+static void size_scratch(struct plan *plan)
+{
+	const struct plan_options *options = &plan->options;
+	size_t slices = 0;
+
+	if (options->sart != NULL)
+		slices = 2 * (size_t)plan->slices[FOR_SUMS];
+	if (options->tv != NULL && (size_t)options->tv->iterations > slices)
+		slices = (size_t)options->tv->iterations;
+	plan->sums_floats = slices * (size_t)options->grid->size[0] * (size_t)options->grid->size[1];
+}
+
+static size_t host_bytes(const struct plan *plan)
+{
+	const struct plan_options *options = &plan->options;
+	const struct geometry *geometry = options->geometry;
+	size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
+	size_t views = (size_t)geometry->count + (size_t)plan->batch + (size_t)largest_subset(options);
+
+	return (views * pixels + plan->sums_floats + grid_voxels(options->grid) * (options->sart != NULL ? 2 : 1)) *
+	       sizeof(float);
+}
+
+static int plan_describe(struct plan *plan, struct device *device, const struct plan_options *options,
+			 struct error *err)
+{
+	struct device_info info;
+	size_t intake = 0, budget;
+	int code;
+
+	plan->device = device;
+	plan->options = *options;
+	for (int i = 0; i < OUTOFCORE_BATCH; i++)
+		plan->identity[i] = i;
+	device->backend->describe(device->below, &info);
+	code = intake_bytes(plan, &intake, err);
+	if (code < 0)
+		return code;
+	budget = (size_t)(SHARE * (double)info.bytes_free);
+	budget = budget > intake ? budget - intake : 0;
+	/* Thick slabs before long batches, but rather short batches than nothing. */
+	plan->batch = options->geometry->count < OUTOFCORE_BATCH ? options->geometry->count : OUTOFCORE_BATCH;
+	code = choose_slabs(plan, budget, err);
+	while (code == ERR_NO_MEMORY && plan->batch > 1) {
+		plan->batch /= 2;
+		code = choose_slabs(plan, budget, err);
+	}
+	if (code < 0)
+		return code;
+	size_scratch(plan);
+	plan->bytes.scratch += intake;
+	plan->bytes.host = host_bytes(plan);
+	return 0;
+}
+
+int outofcore_plan_bytes(struct device *device, const struct plan_options *options, struct plan_bytes *ret_bytes,
+			 struct error *err)
+{
+	struct plan plan = {0};
+	int code = plan_describe(&plan, device, options, err);
+
+	if (code == 0)
+		*ret_bytes = plan.bytes;
+	return code;
+}
+
+static int open_intake(struct plan *plan, struct error *err)
+{
+	const struct backend *backend = plan->device->backend;
+	const struct geometry *geometry = plan->options.geometry;
+	struct plan_options options;
+	int code;
+
+	plan->one = intake_grid(plan);
+	options = intake_options(plan, &plan->one);
+	code = backend->plan_new(plan->device->below, &options, &plan->intake, err);
+	if (code == 0)
+		code = backend->stack_new(plan->device->below, geometry->columns, geometry->rows, 1, &plan->taken, err);
+	return code;
+}
+
+static int allocate(struct plan *plan, struct error *err)
+{
+	const struct geometry *geometry = plan->options.geometry;
+	const int most = largest_subset(&plan->options);
+
+	plan->sums = outofcore_floats(plan->sums_floats + 1);
+	plan->partial = outofcore_floats((size_t)plan->batch * (size_t)geometry->columns * (size_t)geometry->rows);
+	plan->rows = malloc((size_t)geometry->rows * 2 * sizeof(double));
+	if (plan->sums == NULL || plan->partial == NULL || plan->rows == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for %zu voxels", plan->sums_floats);
+	if (most == 0)
+		return 0;
+	return backend_outofcore.stack_new(plan->device, geometry->columns, geometry->rows, most, &plan->correction,
+					   err);
+}
+
+/* What the backend below says of a slab's plan. */
+static int summarise(struct plan *plan, struct error *err)
+{
+	enum purpose purpose = plan->slices[FOR_SUMS] > 0 ? FOR_SUMS : plan->slices[FOR_FDK] > 0 ? FOR_FDK : FOR_TV;
+	int slices = plan->slices[purpose], slabs, code;
+	struct slab slab = {0};
+
+	if (slices == 0)
+		return 0;
+	code = slab_open(plan, purpose, 0, &slab, err);
+	if (code < 0)
+		return code;
+	slabs = (plan->options.grid->size[2] + slices - 1) / slices;
+	snprintf(plan->summary, sizeof(plan->summary),
+		 "out of core: %d slab%s of %d slices, %d views at a time; %.100s", slabs, slabs > 1 ? "s" : "", slices,
+		 plan->batch, plan->device->backend->plan_summary(slab.plan));
+	slab_close(plan, &slab);
+	return 0;
+}
+
+int outofcore_plan_new(struct device *device, const struct plan_options *options, struct plan **ret_plan,
+		       struct error *err)
+{
+	struct plan *plan = calloc(1, sizeof(*plan));
+	int code;
+
+	if (plan == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a plan");
+	code = plan_describe(plan, device, options, err);
+	if (code == 0)
+		code = open_intake(plan, err);
+	if (code == 0)
+		code = allocate(plan, err);
+	if (code == 0)
+		code = summarise(plan, err);
+	if (code < 0) {
+		outofcore_plan_free(plan);
+		return code;
+	}
+	*ret_plan = plan;
+	return 0;
+}
+
+void outofcore_plan_free(struct plan *plan)
+{
+	if (plan == NULL)
+		return;
+	plan->device->backend->stack_free(plan->taken);
+	plan->device->backend->plan_free(plan->intake);
+	backend_outofcore.stack_free(plan->correction);
+	outofcore_floats_free(plan->sums, plan->sums_floats + 1);
+	outofcore_floats_free(plan->partial, (size_t)plan->batch * (size_t)plan->options.geometry->columns *
+						 (size_t)plan->options.geometry->rows);
+	free(plan->rows);
+	free(plan);
+}
+
+int slab_open(struct plan *plan, enum purpose purpose, int first, struct slab *ret_slab, struct error *err)
+{
+	const struct backend *backend = plan->device->backend;
+	const int nz = plan->options.grid->size[2], slices = plan->slices[purpose];
+	const int halo = outofcore_halo(&plan->options, purpose);
+	struct plan_options options;
+	int code;
+
+	*ret_slab = (struct slab){.first = first, .count = first + slices < nz ? slices : nz - first};
+	ret_slab->below = first < halo ? first : halo;
+	ret_slab->above = nz - first - ret_slab->count;
+	if (ret_slab->above > halo)
+		ret_slab->above = halo;
+	ret_slab->grid = grid_of_slices(plan->options.grid, first - ret_slab->below,
+					ret_slab->below + ret_slab->count + ret_slab->above);
+	options = options_for(plan, purpose, &ret_slab->grid);
+	code = backend->plan_new(plan->device->below, &options, &ret_slab->plan, err);
+	if (code == 0)
+		code = backend->volume_new(plan->device->below, &ret_slab->grid, &ret_slab->volume, err);
+	if (code == 0)
+		code = backend->volume_fill(ret_slab->volume, 0, err);
+	if (code < 0)
+		slab_close(plan, ret_slab);
+	return code;
+}
+
+void slab_close(struct plan *plan, struct slab *slab)
+{
+	const struct backend *backend = plan->device->backend;
+
+	backend->plan_free(slab->plan);
+	backend->volume_free(slab->volume);
+	slab->plan = NULL;
+	slab->volume = NULL;
+}
+
+int feed_open(struct plan *plan, enum purpose purpose, struct feed *ret_feed, struct error *err)
+{
+	const struct backend *backend = plan->device->backend;
+	const int rows = plan->options.geometry->rows;
+	int code = 0;
+
+	*ret_feed = (struct feed){{NULL}, NULL};
+	for (int i = 0; i < 2 && code == 0; i++)
+		code = backend->stack_new(plan->device->below, plan->options.geometry->columns, rows, plan->batch,
+					  &ret_feed->in[i], err);
+	if (code == 0 && purpose == FOR_FDK)
+		code = backend->stack_new(plan->device->below, columns_of(&plan->options, purpose), rows, plan->batch,
+					  &ret_feed->filtered, err);
+	if (code < 0)
+		feed_close(plan, ret_feed);
+	return code;
+}
+
+void feed_close(struct plan *plan, struct feed *feed)
+{
+	const struct backend *backend = plan->device->backend;
+
+	backend->stack_free(feed->in[0]);
+	backend->stack_free(feed->in[1]);
+	backend->stack_free(feed->filtered);
+	*feed = (struct feed){{NULL}, NULL};
+}

@@ -1,0 +1,42 @@
+/* The table of iterative algorithms, and what their iterations have in common. */
+#include "core/recon/algorithm.h"
+
+#include <math.h>
+#include <string.h>
+
+const struct algorithm *const algorithms[ALGORITHM_COUNT] = {&algorithm_sart, &algorithm_cgls};
+
+const struct algorithm *algorithm_find(const char *name)
+{
+	for (int i = 0; i < ALGORITHM_COUNT; i++)
+		if (strcmp(algorithms[i]->name, name) == 0)
+			return algorithms[i];
+	return NULL;
+}
+
+/* sqrt(part / whole) with 0/0 = 0 and x/0 = 1: rows go out as JSON, which has no infinity. */
+static double relative(double part, double whole)
+{
+	if (whole == 0)
+		return part > 0 ? 1 : 0;
+	return sqrt(part / whole);
+}
+
+int algorithm_row(int iteration, const struct iteration_sums *sums, const struct volume_norms *norms,
+		  double norm2_before, struct history_row *ret_row, struct error *err)
+{
+	struct history_row row = {
+	    .iteration = iteration,
+	    .residual = relative(sums->residual2, sums->projection2),
+	    .change = relative(norms->difference2, norm2_before),
+	    .tv = norms->tv,
+	};
+
+	if (norms->not_finite > 0 || !isfinite(row.residual) || !isfinite(row.change) || !isfinite(row.tv))
+		return error_set(err, ERR_IMPOSSIBLE,
+				 "iteration %d has diverged: %zu voxels are not finite, residual %g; "
+				 "a smaller relaxation or TV step is needed",
+				 iteration, norms->not_finite, row.residual);
+	*ret_row = row;
+	return 0;
+}

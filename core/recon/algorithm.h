@@ -1,0 +1,70 @@
+#ifndef CBCT_CORE_ALGORITHM_H
+#define CBCT_CORE_ALGORITHM_H
+
+#include "core/recon/recon.h"
+
+/*
+ * The iterative algorithms: a row of algorithms[] for each, and all that a
+ * reconstruction, a recipe and a job's document need to know of it. The loop
+ * around it, with TV, kept volumes, history, stop rules and preemption, is
+ * core/recon/recon.c's. One thread at a time.
+ */
+
+/* What an algorithm works on, all of it borrowed. */
+struct problem {
+	const struct backend *backend;
+	struct device *device;
+	struct plan *plan;
+	const struct geometry *geometry;
+	const struct grid *grid;
+	const struct stack *projections; /* slot = view, line integrals; NaN: a ray that is left out */
+	struct volume *volume;           /* the iterate */
+	struct volume *before;       /* scratch at the beginning of an iteration, at its end the iterate before it */
+	const struct cancel *cancel; /* or NULL */
+};
+
+struct algorithm {
+	const char *name;         /* the recipe's member, the stage of its volumes: "sart" */
+	const char *summary;      /* for documentation */
+	int iterations;           /* that `{}` runs */
+	enum projector projector; /* that a recipe without one takes */
+	enum stage stage;         /* of its iterations, in progress and timings */
+	bool subsets;             /* its update is the backend's sart_iterate over ordered subsets */
+	/* Held on the device beside the projections, the iterate, its copy and the plan: volumes, and stacks of all
+	 * views. */
+	int volumes, stacks;
+	double work; /* of an iteration, in FDKs of the whole scan: for the progress bar */
+
+	/* Allocates what it holds; *ret_state may stay NULL where that is nothing. The problem outlives it. */
+	int (*open)(const struct problem *problem, void **ret_state, struct error *err);
+	void (*close)(const struct problem *problem, void *state); /* NULL is fine */
+	/*
+	 * One iteration. moved: the iterate is not the one that the last iteration left, TV was there, or it is the
+	 * first iteration.
+	 */
+	int (*iterate)(const struct problem *problem, void *state, bool moved, struct iteration_sums *ret_sums,
+		       struct error *err);
+	/*
+	 * What a run that goes on needs beside the iterate, to end with the same bits; NULL: nothing. `resume` gets
+	 * those bytes before the first iteration.
+	 */
+	size_t (*state_bytes)(const struct problem *problem);
+	int (*save)(const struct problem *problem, void *state, const struct checkpoint_sink *sink, struct error *err);
+	int (*resume)(const struct problem *problem, void *state, const char *bytes, struct error *err);
+};
+
+enum { ALGORITHM_COUNT = 2 };
+extern const struct algorithm *const algorithms[ALGORITHM_COUNT];
+/* By name; NULL when there is none. */
+const struct algorithm *algorithm_find(const char *name);
+
+/*
+ * The history row of one iteration, all of it finite whatever the scan was:
+ * residual is 0 where the projections are all zero and so is A v (else 1);
+ * change is 1 where the volume was zero before and no longer is, 0 where it
+ * still is. Fails with ERR_IMPOSSIBLE where the iteration has diverged.
+ */
+int algorithm_row(int iteration, const struct iteration_sums *sums, const struct volume_norms *norms,
+		  double norm2_before, struct history_row *ret_row, struct error *err);
+
+#endif

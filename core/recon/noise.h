@@ -1,0 +1,37 @@
+#ifndef CBCT_CORE_NOISE_H
+#define CBCT_CORE_NOISE_H
+
+#include "core/recon/recon.h"
+
+/*
+ * How noisy a volume is, and how strong its edges are (struct volume_noise), and the
+ * balance of TV that follows from them. For core/ only.
+ */
+
+/* Slices that noise_measure looks at, at most: those in the middle of the volume. */
+enum { NOISE_SLICES = 24 };
+
+/*
+ * Of a volume's middle slices. All 0 where nothing stands out of the background.
+ * The same voxels give the same bits, for any number of threads.
+ */
+int noise_measure(const struct backend *backend, struct volume *volume, const struct grid *grid,
+		  struct volume_noise *ret_noise, struct error *err);
+
+/* The same of slices [z][y][x] in the host's memory. */
+int noise_of_slices(const float *slices, const int size[3], struct volume_noise *ret_noise, struct error *err);
+
+enum noise_stage { NOISE_OF_FDK, NOISE_OF_SART };
+/*
+ * The alpha of TV_PROXIMAL behind FDK or behind each SART iteration, in the recipe's gray levels and of its strength;
+ * the recipe is resolved. INFINITY: no TV.
+ */
+double noise_alpha(const struct volume_noise *noise, const struct recipe *recipe, const struct orbit *orbit,
+		   enum noise_stage stage);
+/*
+ * How far TV with these settings can move a voxel, in 1/mm, roughly: the proximal form by 1 / alpha, explicit steps by
+ * their sum at most.
+ */
+double noise_reach(const struct tv_options *options);
+
+#endif

@@ -1,0 +1,229 @@
+#ifndef CBCT_CORE_RECON_H
+#define CBCT_CORE_RECON_H
+
+#include "core/backend.h"
+
+/*
+ * One reconstruction: FDK, then an iterative algorithm, with TV after the FDK volume
+ * and after each iteration. Opened with a geometry and a recipe, fed with views in
+ * any order, then run; everything is allocated at the opening. One thread at a
+ * time; the hooks are called in that thread.
+ */
+enum { EMIT_FDK = 0, EMIT_FDK_TV = -1 }; /* beside iterations 1, 2, ... */
+
+/* How iterations project backwards: plan_options.matched. */
+enum projector { PROJECTOR_INTERPOLATING, PROJECTOR_MATCHED, PROJECTOR_COUNT };
+extern const char *const projector_names[PROJECTOR_COUNT]; /* "interpolating", "matched" */
+
+/* "light", "medium", "strong": half, once, twice the balance that is found. */
+enum tv_strength { TV_LIGHT, TV_MEDIUM, TV_STRONG, TV_STRENGTH_COUNT };
+extern const char *const tv_strength_names[TV_STRENGTH_COUNT];
+
+struct algorithm; /* core/recon/algorithm.h */
+extern const struct algorithm algorithm_sart, algorithm_cgls;
+
+struct recipe {
+	bool has_grid; /* otherwise chosen from field of view and resolution */
+	struct grid grid;
+	bool has_origin; /* grid.origin was given; otherwise centred */
+	struct {
+		bool on;
+		enum window window;
+		double cutoff;
+		bool extend; /* rows that the detector cuts off, core/truncation.h */
+	} fdk;
+	const struct algorithm *algorithm; /* of algorithms[], core/recon/algorithm.h; NULL: no iterations */
+	struct {
+		int iterations;
+		double stop_residual, stop_change; /* 0: never */
+	} iterate;                                 /* whatever the algorithm */
+	struct {
+		double relaxation;
+		int subsets; /* 1 .. views; SUBSETS_VIEWS: an update after each view; SUBSETS_DEFAULT: 10 or fewer */
+		bool nonnegative;
+	} sart;
+	struct {
+		bool on;
+		bool after_fdk;            /* false with "after": "sart" */
+		bool automatic;            /* alpha is found from the noise (core/recon/noise.h); TV_PROXIMAL only */
+		enum tv_strength strength; /* of what is found */
+		struct tv_options options; /* alpha counts for nothing where it is found */
+	} tv;
+	enum projector projector;
+	struct {
+		bool on; /* needs fdk.on */
+		double threshold_hu;
+	} metal;         /* core/correct/metal.h */
+	double mu_water; /* 1/mm */
+	int *emit;       /* [emits], owned; iterations, EMIT_FDK, EMIT_FDK_TV */
+	int emits;
+	bool reference_precision;
+};
+enum { SUBSETS_DEFAULT = 0, SUBSETS_VIEWS = -1 };
+
+enum { ITERATIONS_MAX = 100000, GRID_DEFAULT_MOST = 512, METAL_HU_LEAST = 500, METAL_HU_MOST = 1000000 };
+/* What is nearer to metal than this is an estimate: most of its rays cross the metal's shadows. */
+enum { METAL_ESTIMATE_MM = 10 };
+
+void recipe_defaults(struct recipe *ret_recipe); /* nothing on; the values that `{}` stages take */
+/* TV with numbers in place of those found: alpha 0.1, and 10 steps of 0.1 or 100 iterations; unit and `on` stay. */
+void recipe_explicit_tv(struct recipe *recipe, enum tv_method method);
+/* The algorithm, with its own number of iterations and projector; NULL: none. */
+void recipe_set_algorithm(struct recipe *recipe, const struct algorithm *algorithm);
+void recipe_clear(struct recipe *recipe);
+int recipe_copy(struct recipe *ret_recipe, const struct recipe *recipe, struct error *err);
+/* Pointers are those of the job's JSON, "/grid/size/0", "/sart/subsets"; ERR_IMPOSSIBLE for all that is out of range.
+ */
+int recipe_check(const struct recipe *recipe, const struct geometry *geometry, struct error *err);
+/*
+ * Writes out what was left open: the grid (orbit_default_grid, at most
+ * GRID_DEFAULT_MOST voxels a side) or its origin, and tv.options.unit =
+ * mu_water / 1000; then checks. A resolved recipe stays as it is.
+ */
+int recipe_resolve(struct recipe *recipe, const struct geometry *geometry, const struct orbit *orbit,
+		   struct error *err);
+
+/* What a volume shows of its noise, see core/recon/noise.h; both 0 where there is nothing to see. */
+struct volume_noise {
+	double sigma;    /* 1/mm: standard deviation of the noise */
+	double contrast; /* 1/mm: standard deviation of the object's gray levels without it */
+};
+
+/* Always finite. */
+struct history_row {
+	int iteration;
+	double residual; /* ||p - A v|| / ||p||, each view's as it was met; 0 where all of it is zero */
+	double change;  /* ||v - v_before|| / ||v_before|| over the iteration, TV included; 1 where v_before was zero */
+	double tv;      /* sum |grad u| of the volume in gray levels */
+	double seconds; /* that the iteration took */
+};
+
+enum stage { STAGE_LOAD, STAGE_FDK, STAGE_SART, STAGE_TV, STAGE_SAVE, STAGE_CGLS, STAGE_COUNT };
+extern const char *const stage_names[STAGE_COUNT]; /* "load", "fdk", "sart", "tv", "save", "cgls" */
+
+struct kept_volume {
+	const char *name;  /* "fdk", "fdk-tv", "iter-5", "final" */
+	const char *stage; /* "fdk", "tv" (TV after the FDK), "sart" (an iteration, its TV included) */
+	int iteration;     /* 0 before the first */
+	const struct grid *grid;
+	struct volume_norms norms;
+	double estimate_mm; /* what is nearer to metal is an estimate (METAL_ESTIMATE_MM); 0: there is no metal */
+};
+
+struct recon;
+
+struct recon_hooks {
+	void *context;
+	bool (*cancelled)(void *context);
+	/*
+	 * Asked after each iteration but the last; true ends the run with ERR_BUSY:
+	 * recon_iteration and recon_read then give what recon_resume wants.
+	 */
+	bool (*yield)(void *context);
+	/* At the beginning of what `stage` says; the fraction is of the whole, 0..1. */
+	void (*progress)(void *context, enum stage stage, int iteration, double fraction);
+	void (*row)(void *context, const struct history_row *row);
+	/*
+	 * Called for each volume that is to be kept; reads it with recon_read. Below zero ends the run. The last volume
+	 * comes as "final", and before that under its own name where the recipe asks for that too.
+	 */
+	int (*keep)(void *context, struct recon *recon, const struct kept_volume *volume, struct error *err);
+	/*
+	 * With TV in the recipe, once, before the first TV: the noise in Hounsfield units, and the alpha of the TV that
+	 * follows SART, or FDK where there is no SART; 0 where nothing is to be smoothed.
+	 */
+	void (*denoising)(void *context, double noise_hu, double alpha);
+	/* The codes are in warn.h and input.h. */
+	void (*warning)(void *context, const char *code, const char *detail);
+}; /* any of them may be NULL */
+
+struct recon_memory {
+	size_t projections, volumes, scratch, total; /* bytes on the device */
+	size_t available;                            /* bytes free there */
+	size_t
+	    host; /* 0; or out of core (outofcore.h): bytes in the host's memory, where projections and volumes lie */
+};
+
+/*
+ * What a job will take at most, before it is opened. The projections are all
+ * kept for iterations; FDK alone needs a few at a time. device NULL (the daemon, that
+ * opens none): available is 0.
+ */
+int recon_memory(const struct backend *backend, struct device *device, const struct geometry *geometry,
+		 const struct recipe *recipe, struct recon_memory *ret_memory, struct error *err);
+
+/*
+ * geometry, linearise's images, hooks, backend and device are borrowed until
+ * recon_free; the recipe is copied and resolved. Checks, then refuses with
+ * ERR_NO_MEMORY what does not fit, then allocates.
+ */
+int recon_open(const struct backend *backend, struct device *device, const struct geometry *geometry,
+	       const struct linearise *linearise, const struct recipe *recipe, const struct recon_hooks *hooks,
+	       struct recon **ret_recon, struct error *err);
+void recon_free(struct recon *recon);
+
+/*
+ * Views as raw samples [view][row][column], in any order, each once (ERR_CONFLICT):
+ * linearised, and filtered and backprojected where FDK is on, however many a call brings.
+ */
+int recon_push(struct recon *recon, const void *samples, const int *views, int count, struct error *err);
+
+/* Once, after the last view: finishes FDK, then TV, iterations and TV in turn, calling the hooks. */
+int recon_run(struct recon *recon, struct error *err);
+
+/*
+ * Goes on behind `iteration` (0 .. iterate.iterations) with the iterate that was
+ * there, instead of FDK: the same bits as if it had never stopped. Call before
+ * the first recon_push, which then skips FDK. A recipe without an algorithm is refused.
+ */
+int recon_resume(struct recon *recon, const float *volume, int iteration, struct error *err);
+
+/*
+ * The metal that was found, as bytes that belong to the recon; 0 of them where
+ * there is none. A run that goes on wants them back, behind recon_resume: its
+ * projections are then what they were.
+ */
+const void *recon_metal(const struct recon *recon, size_t *ret_bytes);
+int recon_resume_metal(struct recon *recon, const void *list, size_t bytes, struct error *err);
+
+/* Part of a checkpoint goes out: 0 or a negative code. */
+struct checkpoint_sink {
+	void *context;
+	int (*write)(void *context, const void *bytes, size_t size, struct error *err);
+};
+/*
+ * What the algorithm holds beside the iterate, 0 bytes where that is nothing. A run that goes on wants it back, behind
+ * recon_resume, for the same bits.
+ */
+size_t recon_state_bytes(const struct recon *recon);
+int recon_save_state(struct recon *recon, const struct checkpoint_sink *sink, struct error *err);
+int recon_resume_state(struct recon *recon, const char *bytes, size_t size, struct error *err);
+
+/*
+ * The noise that was measured; NULL before that and without TV. A run that goes on wants it back, behind
+ * recon_resume: the FDK volume that showed it is not made again.
+ */
+const struct volume_noise *recon_noise(const struct recon *recon);
+int recon_resume_noise(struct recon *recon, const struct volume_noise *noise, struct error *err);
+
+/* Slices of the current iterate, 1/mm; while a volume is kept, with the metal in it. */
+int recon_read(struct recon *recon, int z_first, int z_count, float *ret_slices, struct error *err);
+
+const struct grid *recon_grid(const struct recon *recon);
+int recon_iteration(const struct recon *recon); /* iterations done so far */
+size_t recon_defects(const struct recon *recon);
+const char *recon_plan(const struct recon *recon); /* how the backend does it */
+
+/* ---- sart.c: subsets ---- */
+/* The number of subsets that SUBSETS_DEFAULT and SUBSETS_VIEWS stand for. */
+int subsets_count(int subsets, int views);
+/*
+ * `count` (1 .. views) ordered subsets, each of every count-th view along the
+ * arc, so that each is spread over all of it; sizes differ by one at most. They
+ * are ordered so that each is far in angle from those before it. The same orbit
+ * gives the same order. Free with subsets_clear.
+ */
+int subsets_make(struct subsets *ret_subsets, const struct orbit *orbit, int count, struct error *err);
+void subsets_clear(struct subsets *subsets);
+
+#endif

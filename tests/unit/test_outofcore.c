@@ -1,0 +1,358 @@
+/*
+ * Jobs that go through a device in parts (core/outofcore/outofcore.h) give what the whole
+ * gives: the CPU with a limit on its memory stands for a card that is too small.
+ */
+#include <check.h>
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "core/fdk.h"
+#include "core/outofcore/outofcore.h"
+#include "tests/unit/scene.h"
+
+Suite *outofcore_suite(void);
+
+static struct error err;
+
+#define ok(call) ck_assert_msg((call) == 0, "%s: %s", #call, err.text)
+
+/* A phantom that reaches out of the grid on all sides, so that every edge counts. */
+static void make_scene(struct scene *scene, const struct orbit_spec *spec)
+{
+	struct ellipsoid parts[] = {
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {30, 26, 34}, .centre = {2, -3, 1}, .density = 0.02},
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {7, 9, 8}, .centre = {-9, 6, -8}, .density = 0.015},
+	};
+	struct phantom phantom = {.count = 2, .parts = parts};
+
+	scene_orbit(scene, spec);
+	scene_add(scene, &phantom);
+}
+
+static const struct orbit_spec full = {71, 67, 47, {600, 1100, {1.9, 1.7}, {0, 0}, {0, 0}}, 3, 360. / 47};
+static const struct orbit_spec displaced = {71, 67, 60, {600, 1100, {1.9, 1.7}, {40, 0}, {0, 0}}, 0, 6};
+
+static const struct orbit_spec narrow = {37, 67, 47, {600, 1100, {1.9, 1.7}, {0, 0}, {0, 0}}, 3, 360. / 47};
+
+struct result {
+	float *volume, *fdk;
+	struct history_row rows[8];
+	int count;
+	struct recon_memory memory;
+	char plan[256], warnings[512];
+	size_t defects;
+};
+
+static void on_row(void *context, const struct history_row *row)
+{
+	struct result *result = context;
+
+	result->rows[result->count++] = *row;
+}
+
+static int on_keep(void *context, struct recon *recon, const struct kept_volume *volume, struct error *ret_err)
+{
+	struct result *result = context;
+	float **to = strcmp(volume->name, "fdk") == 0 ? &result->fdk : &result->volume;
+
+	*to = malloc(grid_voxels(volume->grid) * sizeof(float));
+	return recon_read(recon, 0, volume->grid->size[2], *to, ret_err);
+}
+
+static void on_warning(void *context, const char *code, const char *detail)
+{
+	struct result *result = context;
+	size_t used = strlen(result->warnings);
+
+	snprintf(result->warnings + used, sizeof(result->warnings) - used, "%s: %s\n", code, detail);
+}
+
+/* limit 0: the whole; otherwise a device with so many bytes that are not the host's. */
+static struct result reconstruct(const struct scene *scene, const struct recipe *recipe,
+				 const struct linearise *linearise, const void *samples, size_t limit)
+{
+	const struct device_options options = {.threads = 2, .memory_limit = limit};
+	struct result result = {0};
+	const struct recon_hooks hooks = {.context = &result, .row = on_row, .keep = on_keep, .warning = on_warning};
+	struct backend backend = backend_cpu;
+	int *views = malloc(sizeof(int) * (size_t)scene->geometry.count);
+	struct device *device;
+	struct device_info info;
+	struct recon *recon;
+	size_t free_before;
+
+	backend.own_memory = limit > 0;
+	for (int i = 0; i < scene->geometry.count; i++)
+		views[i] = i;
+	ok(backend.open(0, &options, &device, &err));
+	backend.describe(device, &info);
+	free_before = info.bytes_free;
+	ok(recon_memory(&backend, device, &scene->geometry, recipe, &result.memory, &err));
+	ok(recon_open(&backend, device, &scene->geometry, linearise, recipe, &hooks, &recon, &err));
+	snprintf(result.plan, sizeof(result.plan), "%s", recon_plan(recon));
+	ok(recon_push(recon, samples, views, scene->geometry.count, &err));
+	ok(recon_run(recon, &err));
+	result.defects = recon_defects(recon);
+	recon_free(recon);
+	backend.describe(device, &info);
+	if (limit > 0)
+		ck_assert_uint_eq(info.bytes_free, free_before);
+	backend.close(device);
+	free(views);
+	return result;
+}
+
+static void result_clear(struct result *result)
+{
+	free(result->volume);
+	free(result->fdk);
+}
+
+static double apart(const float *a, const float *b, size_t count)
+{
+	double sum = 0, norm = 0;
+
+	for (size_t i = 0; i < count; i++) {
+		sum += ((double)a[i] - b[i]) * ((double)a[i] - b[i]);
+		norm += (double)b[i] * b[i];
+	}
+	return sqrt(sum / norm);
+}
+
+static void expect_parts(const struct result *result, int slabs_least)
+{
+	int slabs = 0;
+
+	ck_assert_msg(sscanf(result->plan, "out of core: %d slab", &slabs) == 1, "%s", result->plan);
+	ck_assert_int_ge(slabs, slabs_least);
+	ck_assert_uint_gt(result->memory.host, 0);
+	ck_assert_uint_le(result->memory.total, result->memory.available);
+}
+
+enum { TV_OF_THE_NOISE = TV_METHOD_COUNT };
+static const struct {
+	const char *name;
+	const struct orbit_spec *spec;
+	bool fdk, sart;
+	int subsets, tv; /* TV: -1 none, else the method, or TV_OF_THE_NOISE */
+	double tolerance;
+	bool matched;
+	const struct algorithm *other; /* in place of SART */
+} cases[] = {
+    {"FDK", &full, true, false, 0, -1, 1e-6, false, NULL},
+    {"FDK, cut off", &narrow, true, false, 0, -1, 1e-6, false, NULL},
+    {"OS-SART, cut off", &narrow, true, true, 4, -1, 1e-4, false, NULL},
+    {"FDK, displaced", &displaced, true, false, 0, -1, 1e-6, false, NULL},
+    {"SIRT", &full, false, true, 1, -1, 1e-5, false, NULL},
+    {"OS-SART", &full, true, true, 4, -1, 1e-5, false, NULL},
+    {"by view", &full, false, true, SUBSETS_VIEWS, -1, 1e-5, false, NULL},
+    {"matched", &full, true, true, 4, -1, 1e-5, true, NULL},
+    {"matched, by view", &full, false, true, SUBSETS_VIEWS, -1, 1e-5, true, NULL},
+    {"matched, seen in part", &displaced, false, true, 3, -1, 1e-5, true, NULL},
+    {"seen in part", &displaced, false, true, 3, -1, 1e-5, false, NULL},
+    {"TV by steps", &full, true, true, 4, TV_GRADIENT, 1e-4, false, NULL},
+    {"proximal TV", &full, true, true, 4, TV_PROXIMAL, 1e-4, false, NULL},
+    {"TV of the noise", &full, true, true, 4, TV_OF_THE_NOISE, 1e-4, false, NULL},
+    {"CGLS", &full, true, true, 4, -1, 1e-4, true, &algorithm_cgls},
+    {"CGLS and TV", &full, false, true, 4, TV_PROXIMAL, 1e-4, true, &algorithm_cgls},
+};
+
+START_TEST(outofcore_give_what_the_whole_gives)
+{
+	const struct linearise linearise = {.sample = SAMPLE_FLOAT32};
+	struct grid grid = grid_of(73, 67, 81, .7, .75, .6);
+	struct recipe recipe = recipe_on(&grid);
+	struct scene scene;
+	struct result whole, parts, again;
+	size_t voxels = grid_voxels(&grid), limit;
+	int emit[] = {EMIT_FDK};
+
+	make_scene(&scene, cases[_i].spec);
+	recipe.fdk.on = cases[_i].fdk;
+	recipe.algorithm = cases[_i].other != NULL ? cases[_i].other : cases[_i].sart ? &algorithm_sart : NULL;
+	recipe.sart.subsets = cases[_i].subsets;
+	recipe.projector = cases[_i].matched ? PROJECTOR_MATCHED : PROJECTOR_INTERPOLATING;
+	recipe.iterate.iterations = 2;
+	recipe.emit = emit;
+	recipe.emits = cases[_i].fdk ? 1 : 0;
+	if (cases[_i].tv >= 0) {
+		recipe.tv.on = true;
+		if (cases[_i].tv != TV_OF_THE_NOISE)
+			recipe_explicit_tv(&recipe, (enum tv_method)cases[_i].tv);
+		recipe.tv.options.iterations = 5;
+	}
+	whole = reconstruct(&scene, &recipe, &linearise, scene.projections, 0);
+	/* the dual of proximal TV is most of the whole */
+	limit = whole.memory.total / (cases[_i].tv >= TV_PROXIMAL ? 7 : 4);
+	parts = reconstruct(&scene, &recipe, &linearise, scene.projections, limit);
+	again = reconstruct(&scene, &recipe, &linearise, scene.projections, limit);
+	expect_parts(&parts, 2);
+	ck_assert_uint_eq(whole.memory.host, 0);
+	ck_assert_msg(apart(parts.volume, whole.volume, voxels) < cases[_i].tolerance, "%s: %.2e", cases[_i].name,
+		      apart(parts.volume, whole.volume, voxels));
+	if (cases[_i].fdk)
+		ck_assert_double_lt(apart(parts.fdk, whole.fdk, voxels), 1e-6);
+	ck_assert_msg(memcmp(parts.volume, again.volume, voxels * sizeof(float)) == 0, "%s: other bits on a repeat",
+		      cases[_i].name);
+	ck_assert_str_eq(parts.warnings, whole.warnings);
+	ck_assert_int_eq(parts.count, whole.count);
+	for (int i = 0; i < whole.count; i++) {
+		ck_assert_double_eq_tol(parts.rows[i].residual / whole.rows[i].residual, 1, 1e-3);
+		ck_assert_double_eq_tol(parts.rows[i].change / whole.rows[i].change, 1, 1e-3);
+		ck_assert_double_eq_tol(parts.rows[i].tv / whole.rows[i].tv, 1, 1e-3);
+	}
+	result_clear(&whole);
+	result_clear(&parts);
+	result_clear(&again);
+	scene_clear(&scene);
+}
+END_TEST
+
+/* The slabs are cut from what is free, so any limit gives the same volume until not even a slice fits. */
+START_TEST(any_limit_gives_the_same_volume)
+{
+	const struct linearise linearise = {.sample = SAMPLE_FLOAT32};
+	struct grid grid = grid_of(53, 47, 61, 1, 1.1, .9);
+	struct recipe recipe = recipe_on(&grid);
+	struct scene scene;
+	struct result whole;
+	int refused = 0, done = 0;
+
+	make_scene(&scene, &full);
+	recipe.fdk.on = true;
+	recipe.algorithm = &algorithm_sart;
+	recipe.iterate.iterations = 1;
+	whole = reconstruct(&scene, &recipe, &linearise, scene.projections, 0);
+	for (size_t limit = whole.memory.total - 1; limit > 1 << 16; limit = limit * 2 / 3) {
+		const struct device_options options = {.threads = 2, .memory_limit = limit};
+		struct backend backend = backend_cpu;
+		struct recon_memory memory;
+		struct device *device;
+		struct result parts;
+		int code;
+
+		backend.own_memory = true;
+		ok(backend.open(0, &options, &device, &err));
+		code = recon_memory(&backend, device, &scene.geometry, &recipe, &memory, &err);
+		backend.close(device);
+		if (code != 0) {
+			ck_assert_int_eq(code, ERR_NO_MEMORY);
+			refused++;
+			continue;
+		}
+		ck_assert_int_eq(refused, 0);
+		parts = reconstruct(&scene, &recipe, &linearise, scene.projections, limit);
+		expect_parts(&parts, 1);
+		ck_assert_double_lt(apart(parts.volume, whole.volume, grid_voxels(&grid)), 1e-5);
+		result_clear(&parts);
+		done++;
+	}
+	ck_assert_int_ge(done, 4);
+	ck_assert_int_ge(refused, 1);
+	result_clear(&whole);
+	scene_clear(&scene);
+}
+END_TEST
+
+/* Its exterior in parts as well: a cylinder that goes on beyond the grid and the rows, and a grid inside of it. */
+START_TEST(what_lies_outside_of_the_grid_is_left_out_in_parts)
+{
+	const struct linearise linearise = {.sample = SAMPLE_FLOAT32};
+	const struct orbit_spec spec = {48, 36, 40, {600, 1100, {4, 4}, {0, 0}, {0, 0}}, 0, 9};
+	struct ellipsoid trunk = {.shape = SHAPE_CYLINDER, .semi_axes = {40, 32, 200}, .density = 0.02};
+	const struct phantom phantom = {1, &trunk};
+	struct grid grid = grid_of(_i == 0 ? 60 : 30, 60, 42, 1.6, 1.6, 1.6);
+	struct recipe recipe = recipe_on(&grid);
+	struct scene scene;
+	struct result whole, parts;
+
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	recipe.fdk.on = true;
+	recipe.algorithm = &algorithm_sart;
+	recipe.iterate.iterations = 2;
+	whole = reconstruct(&scene, &recipe, &linearise, scene.projections, 0);
+	parts = reconstruct(&scene, &recipe, &linearise, scene.projections, whole.memory.total / 4);
+	expect_parts(&parts, _i == 0 ? 2 : 1);
+	ck_assert_ptr_nonnull(strstr(parts.warnings, "outside_grid: "));
+	ck_assert_str_eq(parts.warnings, whole.warnings);
+	ck_assert_double_lt(apart(parts.volume, whole.volume, grid_voxels(&grid)), 1e-4);
+	result_clear(&whole);
+	result_clear(&parts);
+	scene_clear(&scene);
+}
+END_TEST
+
+/* In parts metal's two volumes, to work in and to compare with, and its batch lie on the host. */
+START_TEST(what_metal_takes_of_the_host_is_said)
+{
+	struct grid grid = grid_of(53, 47, 61, 1, 1.1, .9);
+	const struct device_options options = {.threads = 2, .memory_limit = 1 << 20};
+	const size_t volume = grid_voxels(&grid) * sizeof(float);
+	struct backend backend = backend_cpu;
+	struct recipe recipe = recipe_on(&grid);
+	struct recon_memory memory[2];
+	struct device *device;
+	struct scene scene;
+
+	backend.own_memory = true;
+	make_scene(&scene, &full);
+	recipe.fdk.on = true;
+	for (int i = 0; i < 2; i++) {
+		recipe.metal.on = i == 1;
+		ok(backend.open(0, &options, &device, &err));
+		ok(recon_memory(&backend, device, &scene.geometry, &recipe, &memory[i], &err));
+		backend.close(device);
+		ck_assert_uint_le(memory[i].total, memory[i].available);
+		ck_assert_uint_gt(memory[i].host, volume);
+	}
+	ck_assert_uint_gt(memory[1].host, memory[0].host + 2 * volume);
+	scene_clear(&scene);
+}
+END_TEST
+
+START_TEST(defects_are_counted_once)
+{
+	struct grid grid = grid_of(53, 47, 61, 1, 1.1, .9);
+	struct recipe recipe = recipe_on(&grid);
+	const struct linearise linearise = {.sample = SAMPLE_UINT16, .quantity = QUANTITY_INTENSITY, .air = 60000};
+	struct scene scene;
+	struct result whole, parts;
+	unsigned short *counts;
+	size_t samples;
+
+	make_scene(&scene, &full);
+	samples = (size_t)full.columns * (size_t)full.rows * (size_t)full.views;
+	counts = malloc(samples * sizeof(*counts));
+	for (size_t i = 0; i < samples; i++)
+		counts[i] = i % 1009 == 0 ? 0 : (unsigned short)(60000 * exp(-(double)scene.projections[i]));
+	recipe.fdk.on = true;
+	whole = reconstruct(&scene, &recipe, &linearise, counts, 0);
+	parts = reconstruct(&scene, &recipe, &linearise, counts, whole.memory.total / 4);
+	expect_parts(&parts, 2);
+	ck_assert_uint_eq(parts.defects, whole.defects);
+	ck_assert_uint_gt(parts.defects, 0);
+	ck_assert_double_lt(apart(parts.volume, whole.volume, grid_voxels(&grid)), 1e-6);
+	result_clear(&whole);
+	result_clear(&parts);
+	free(counts);
+	scene_clear(&scene);
+}
+END_TEST
+
+Suite *outofcore_suite(void)
+{
+	Suite *suite = suite_create("outofcore");
+	TCase *tests = tcase_create("outofcore");
+
+	tcase_set_timeout(tests, 300);
+	tcase_add_loop_test(tests, outofcore_give_what_the_whole_gives, 0, (int)(sizeof(cases) / sizeof(cases[0])));
+	tcase_add_test(tests, any_limit_gives_the_same_volume);
+	tcase_add_loop_test(tests, what_lies_outside_of_the_grid_is_left_out_in_parts, 0, 2);
+	tcase_add_test(tests, what_metal_takes_of_the_host_is_said);
+	tcase_add_test(tests, defects_are_counted_once);
+	suite_add_tcase(suite, tests);
+	return suite;
+}
