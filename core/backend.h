@@ -9,6 +9,7 @@
 #include "core/scan/geometry.h"
 #include "core/scan/grid.h"
 #include "core/scan/orbit.h"
+#include "core/subsets.h"
 
 #ifdef __cplusplus
 extern "C" {
@@ -109,13 +110,6 @@ struct tv_options {
 	double unit; /* 1/mm for one gray level */
 };
 
-/* An order of all views, cut into subsets: subset s is order[start[s]] .. order[start[s+1] - 1]. */
-struct subsets {
-	int count;
-	int *order; /* [views] */
-	int *start; /* [count + 1] */
-};
-
 struct sart_options {
 	struct subsets subsets; /* borrowed, must outlive the plan */
 	double relaxation;
@@ -200,9 +194,17 @@ struct volume_norms {
 
 /* Asked between steps; true ends the operation with ERR_CANCELLED. */
 struct cancel {
-	bool (*asked)(void *context);
+	bool (*asked)(void *context); /* NULL: never */
 	void *context;
 };
+
+/* ERR_CANCELLED when somebody asked; cancel NULL: nobody can. */
+static inline int cancel_check(const struct cancel *cancel, struct error *err)
+{
+	if (cancel != NULL && cancel->asked != NULL && cancel->asked(cancel->context))
+		return error_set(err, ERR_CANCELLED, "cancelled");
+	return 0;
+}
 
 /* Of the smallest voxel spacing: what a ray must have inside the grid to correct it, see sart_iterate. */
 #define RAY_LENGTH_LEAST 0.5

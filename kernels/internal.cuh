@@ -473,13 +473,6 @@ size_t sweep_partials(const struct plan *plan);
 size_t sweep_scratch_bytes(const struct plan *plan);
 size_t subsets_partials(const struct plan *plan);
 
-static inline int cancel_check(const struct cancel *cancel, struct error *err)
-{
-	if (cancel != NULL && cancel->asked != NULL && cancel->asked(cancel->context))
-		return error_set(err, ERR_CANCELLED, "cancelled");
-	return 0;
-}
-
 /* ---- the operations of the table ---- */
 int cuda_linearise(struct plan *plan, const void *samples, int count, const int *slots, struct stack *to,
 		   struct defect_counts *counts, struct error *err);

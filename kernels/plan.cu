@@ -29,16 +29,6 @@ static size_t at_least(size_t bytes, size_t least)
 	return bytes > least ? bytes : least;
 }
 
-static int largest_subset(const struct subsets *subsets)
-{
-	int most = 0;
-
-	for (int i = 0; i < subsets->count; i++)
-		if (subsets->start[i + 1] - subsets->start[i] > most)
-			most = subsets->start[i + 1] - subsets->start[i];
-	return most;
-}
-
 /* Columns of a filtered projection. */
 static int wide_columns(const struct plan_options *options)
 {
@@ -302,7 +292,7 @@ static struct plan_shape shape_of(const struct plan_options *options, enum thrif
 	bool indexed = columns_shape_make(grid->size).floats < (size_t)1 << 31; /* by an int */
 
 	if (options->sart != NULL)
-		subset = largest_subset(&options->sart->subsets);
+		subset = subsets_largest(&options->sart->subsets);
 	shape.z_rays = has_z_rays(geometry, grid);
 	shape.is_small = (double)grid_voxels(grid) * geometry->count < SMALL;
 	/* The transpose is that of the general projection in float, whose weights are its own to the last bits. */

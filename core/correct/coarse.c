@@ -4,8 +4,6 @@
 #include <math.h>
 #include <stdlib.h>
 
-#include "core/recon/recon.h"
-
 /* The reduced scan. */
 struct reduced {
 	struct geometry geometry;

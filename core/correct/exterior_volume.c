@@ -480,14 +480,12 @@ int exterior_volume_may_go_on(const struct exterior_volume_options *options, boo
 
 static int run_fdk(struct exterior_volume *s, const struct exterior_volume_options *options, struct error *err)
 {
-	const struct cancel *cancel = options->cancel;
 	struct fdk fdk = {0};
 	int code = fdk_open(&fdk, s->backend, options->device, s->plan, options->geometry, s->weights.pad, err);
 
 	for (int view = 0; view < options->geometry->count && code == 0; view++) {
-		if (cancel != NULL && cancel->asked(cancel->context))
-			code = error_set(err, ERR_CANCELLED, "cancelled");
-		else
+		code = cancel_check(options->cancel, err);
+		if (code == 0)
 			code = fdk_add(&fdk, view, view, options->projections, s->volume, err);
 	}
 	if (code == 0)

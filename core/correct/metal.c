@@ -48,15 +48,6 @@ void metal_clear(struct metal *metal)
 	*metal = (struct metal){0};
 }
 
-int metal_check_cancelled(const struct metal_tools *tools, struct error *err)
-{
-	const struct cancel *cancel = tools->cancel;
-
-	if (cancel != NULL && cancel->asked(cancel->context))
-		return error_set(err, ERR_CANCELLED, "cancelled");
-	return 0;
-}
-
 size_t metal_slice_voxels(const struct grid *grid)
 {
 	return (size_t)grid->size[0] * (size_t)grid->size[1];
@@ -417,7 +408,7 @@ bool metal_is_whole(const struct metal_view *of, int column, int row)
 int metal_project_batch(const struct metal_tools *tools, const struct volume *volume, const struct metal_batch *batch,
 			struct error *err)
 {
-	int *views = malloc((size_t)batch->count * sizeof(*views)), code = metal_check_cancelled(tools, err);
+	int *views = malloc((size_t)batch->count * sizeof(*views)), code = cancel_check(tools->cancel, err);
 
 	if (views == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", batch->count);
@@ -572,7 +563,7 @@ int metal_fdk(const struct metal_tools *tools, struct volume *to, struct error *
 	int code = tools->backend->volume_fill(to, 0, err);
 
 	for (int view = 0; view < tools->geometry->count && code == 0; view++) {
-		code = metal_check_cancelled(tools, err);
+		code = cancel_check(tools->cancel, err);
 		if (code == 0)
 			code = fdk_add(tools->fdk, view, view, tools->projections, to, err);
 	}
@@ -656,7 +647,7 @@ static int make_prior(const struct metal_tools *tools, const double bone[2], str
 			code = tools->backend->volume_put(tools->volume, z, 1, raw, err);
 		}
 		if (code == 0)
-			code = metal_check_cancelled(tools, err);
+			code = cancel_check(tools->cancel, err);
 	}
 	free(ring);
 	return code;

@@ -244,7 +244,7 @@ static int square_cells(const struct metal_doubt *doubt, const struct metal *met
 		const bool marked = metal_mark_slice(metal, grid, &rim, z, marks);
 		const size_t layer = (size_t)(z / doubt->cell[2]) * (size_t)doubt->cells[1];
 
-		code = metal_check_cancelled(tools, err);
+		code = cancel_check(tools->cancel, err);
 		if (code == 0)
 			code = tools->backend->volume_download(volume, z, 1, values, err);
 		for (size_t i = 0; i < slice && code == 0; i++) {

@@ -274,7 +274,7 @@ static int add_rim(struct metal *metal, const struct metal_tools *tools, struct 
 	for (int z = 0; z < grid->size[2] && code == 0; z++) {
 		if (!metal_mark_slice(metal, grid, &rim, z, peaks))
 			continue;
-		code = metal_check_cancelled(tools, err);
+		code = cancel_check(tools->cancel, err);
 		if (code == 0)
 			code = tools->backend->volume_download(from, z, 1, values, err);
 		for (size_t at = 0; at < slice && code == 0; at++) {
@@ -319,7 +319,7 @@ int metal_find(struct metal *metal, const struct metal_tools *tools, struct volu
 		if (code == 0 && ready >= 0 && ready < nz)
 			code = find_in_slice(metal, &search, ready, err);
 		if (code == 0)
-			code = metal_check_cancelled(tools, err);
+			code = cancel_check(tools->cancel, err);
 	}
 	search_clear(&search);
 	metal->found = metal->voxels_count;

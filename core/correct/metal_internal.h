@@ -5,7 +5,6 @@
 
 /* What the files of the metal stage share: metal_find.c, metal.c, metal_blend.c. */
 
-int metal_check_cancelled(const struct metal_tools *tools, struct error *err);
 size_t metal_slice_voxels(const struct grid *grid);
 /* `items` with room for one more than `count`; NULL, and they are as they were, where there is no memory. */
 void *metal_grown(void *items, size_t size, size_t count, size_t *room);

@@ -294,12 +294,4 @@ int cpu_stack_mask(const struct stack *x, const int *slots, int count, struct st
 int cpu_norms(struct plan *plan, const struct volume *volume, const struct volume *other, double unit,
 	      struct volume_norms *ret_norms, struct error *err);
 
-/* ERR_CANCELLED when somebody asked. */
-static inline int cancel_check(const struct cancel *cancel, struct error *err)
-{
-	if (cancel != NULL && cancel->asked != NULL && cancel->asked(cancel->context))
-		return error_set(err, ERR_CANCELLED, "cancelled");
-	return 0;
-}
-
 #endif

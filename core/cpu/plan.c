@@ -23,16 +23,6 @@ static int at_least_one(double count, int most)
 	return count < 1 ? 1 : count > most ? most : (int)count;
 }
 
-static int largest_subset(const struct subsets *subsets)
-{
-	int most = 0;
-
-	for (int s = 0; s < subsets->count; s++)
-		if (subsets->start[s + 1] - subsets->start[s] > most)
-			most = subsets->start[s + 1] - subsets->start[s];
-	return most;
-}
-
 /*
  * True when no ray passes more voxels along z than along x or y. Across z the
  * direction is linear in the column, so the largest of its two components is
@@ -95,7 +85,7 @@ static void plan_shape(const struct plan_options *options, struct plan *ret)
 	ret->filter_batch = at_least_one(share, geometry->count);
 	if (options->sart != NULL) {
 		ret->sart = *options->sart;
-		ret->batch = at_least_one(share, largest_subset(&ret->sart.subsets));
+		ret->batch = at_least_one(share, subsets_largest(&ret->sart.subsets));
 	}
 	if (options->tv != NULL) {
 		ret->has_tv = true;
@@ -109,7 +99,7 @@ static void plan_shape(const struct plan_options *options, struct plan *ret)
 
 static bool needs_work(const struct plan *plan)
 {
-	return plan->has_tv || (plan->batch > 0 && plan->batch < largest_subset(&plan->sart.subsets));
+	return plan->has_tv || (plan->batch > 0 && plan->batch < subsets_largest(&plan->sart.subsets));
 }
 
 static bool needs_dual(const struct plan *plan)

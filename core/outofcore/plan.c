@@ -163,16 +163,10 @@ static int choose_slabs(struct plan *plan, size_t budget, struct error *err)
 	return code;
 }
 
-static int largest_subset(const struct plan_options *options)
+/* Views that an update of SART takes at most; 0 without SART. */
+static int update_views(const struct plan_options *options)
 {
-	int most = 0;
-
-	for (int i = 0; options->sart != NULL && i < options->sart->subsets.count; i++) {
-		int count = options->sart->subsets.start[i + 1] - options->sart->subsets.start[i];
-
-		most = count > most ? count : most;
-	}
-	return most;
+	return options->sart != NULL ? subsets_largest(&options->sart->subsets) : 0;
 }
 
 /* Host memory that the plan itself needs: a slab's sums and column sums; the slices that TV keeps. */
@@ -193,7 +187,7 @@ static size_t host_bytes(const struct plan *plan)
 	const struct plan_options *options = &plan->options;
 	const struct geometry *geometry = options->geometry;
 	size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
-	size_t views = (size_t)geometry->count + (size_t)plan->batch + (size_t)largest_subset(options);
+	size_t views = (size_t)geometry->count + (size_t)plan->batch + (size_t)update_views(options);
 
 	return (views * pixels + plan->sums_floats + grid_voxels(options->grid) * (options->sart != NULL ? 2 : 1)) *
 	       sizeof(float);
@@ -260,7 +254,7 @@ static int open_intake(struct plan *plan, struct error *err)
 static int allocate(struct plan *plan, struct error *err)
 {
 	const struct geometry *geometry = plan->options.geometry;
-	const int most = largest_subset(&plan->options);
+	const int most = update_views(&plan->options);
 
 	plan->sums = outofcore_floats(plan->sums_floats + 1);
 	plan->partial = outofcore_floats((size_t)plan->batch * (size_t)geometry->columns * (size_t)geometry->rows);

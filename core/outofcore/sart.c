@@ -252,8 +252,9 @@ int outofcore_sart_iterate(struct plan *plan, const struct stack *projections, s
 		const int *views = sart->subsets.order + sart->subsets.start[s];
 		int count = sart->subsets.start[s + 1] - sart->subsets.start[s];
 
-		if (cancel != NULL && cancel->asked != NULL && cancel->asked(cancel->context))
-			return error_set(err, ERR_CANCELLED, "cancelled");
+		code = cancel_check(cancel, err);
+		if (code < 0)
+			break;
 		if (count == 0)
 			continue;
 		code = outofcore_project(plan, volume, views, count, plan->correction, err);

@@ -76,19 +76,12 @@ out:
 	return code;
 }
 
-static int check_cancelled(const struct problem *problem, struct error *err)
-{
-	const struct cancel *cancel = problem->cancel;
-
-	return cancel != NULL && cancel->asked(cancel->context) ? error_set(err, ERR_CANCELLED, "cancelled") : 0;
-}
-
 /* y = A x over all views, 0 on rays that are left out. */
 static int project(const struct problem *problem, const struct cgls *cgls, const struct volume *x, struct stack *y,
 		   struct error *err)
 {
 	const int views = problem->geometry->count;
-	int code = check_cancelled(problem, err);
+	int code = cancel_check(problem->cancel, err);
 
 	if (code == 0)
 		code = problem->backend->project(problem->plan, x, cgls->views, views, y, err);
@@ -121,7 +114,7 @@ static int next_direction(const struct problem *problem, struct cgls *cgls, stru
 	int code = backend->volume_fill(s, 0, err);
 
 	if (code == 0)
-		code = check_cancelled(problem, err);
+		code = cancel_check(problem->cancel, err);
 	if (code == 0)
 		code = backend->backproject(problem->plan, cgls->residual, cgls->views, problem->geometry->count,
 					    BACKPROJECT_PLAIN, s, err);

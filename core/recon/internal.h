@@ -1,10 +1,70 @@
 #ifndef CBCT_CORE_RECON_INTERNAL_H
 #define CBCT_CORE_RECON_INTERNAL_H
 
+#include "core/correct/input.h"
+#include "core/correct/metal.h"
 #include "core/fdk.h"
-#include "core/recon/recon.h"
+#include "core/recon/algorithm.h"
 
-/* What recon.c and recon_plan.c share. */
+/* What recon.c (life, views), run.c (the run) and memory.c (what it takes) share. */
+
+struct recon {
+	const struct backend *backend;
+	struct device *device;
+	struct device *outofcore;        /* out-of-core wrapper around `device`; NULL when the job fits as a whole */
+	const struct geometry *geometry; /* that which was given, or `upright` */
+	struct geometry upright;         /* owned, empty where the given one was that */
+	const struct recon_hooks *hooks;
+	struct cancel cancel;
+
+	struct recipe recipe; /* resolved */
+	struct orbit orbit;
+	struct input input;
+	struct fdk_weights weights;
+	struct sart_options sart; /* where the algorithm goes by subsets */
+
+	struct plan *plan;
+	struct fdk fdk;            /* where FDK is on */
+	struct stack *projections; /* a slot for each view where they are kept, else for each view of an FDK batch */
+	struct volume *volume;     /* the iterate */
+	struct volume *before;     /* the iterate before the iteration, and for metal to work in; NULL without both */
+	struct stack *batch;       /* for metal to work in; NULL without */
+	struct metal metal;
+	struct problem problem; /* of the algorithm, where there is one */
+	void *algorithm_state;
+
+	unsigned char *pushed; /* [views] */
+	int pushed_count;
+
+	struct volume_noise noise; /* where it is measured */
+	bool noise_measured;
+
+	bool resumed, ran;
+	int iteration; /* done so far */
+	bool moved;    /* the iterate is not the one that the algorithm left */
+	struct volume_norms norms;
+	double work_done, work_total; /* in FDKs of the whole scan */
+};
+
+/*
+ * What the stages cost beside an FDK of the whole scan, roughly, as measured on
+ * CPU and GPU alike: only the progress bar lives on it.
+ */
+static const double WORK_LOAD = 0.2, WORK_FDK = 1, WORK_TV = 0.2, WORK_METAL = 12;
+
+static inline double iteration_work(const struct recipe *recipe)
+{
+	return recipe->algorithm->work + (recipe->tv.on ? WORK_TV : 0);
+}
+
+/* A run that goes on from an iterate makes no FDK volume. */
+static inline bool recon_runs_fdk(const struct recon *recon)
+{
+	return recon->recipe.fdk.on && !recon->resumed;
+}
+
+/* Calls the hook at the beginning of what `stage` says. */
+void recon_tell_progress(struct recon *recon, enum stage stage, int iteration);
 
 /* Whether all projections are kept on the device, and not a batch of FDK's at a time. */
 bool keeps_projections(const struct recipe *recipe);

@@ -59,7 +59,6 @@ struct recipe {
 	int emits;
 	bool reference_precision;
 };
-enum { SUBSETS_DEFAULT = 0, SUBSETS_VIEWS = -1 };
 
 enum { ITERATIONS_MAX = 100000, GRID_DEFAULT_MOST = 512, METAL_HU_LEAST = 500, METAL_HU_MOST = 1000000 };
 /* What is nearer to metal than this is an estimate: most of its rays cross the metal's shadows. */
@@ -213,17 +212,5 @@ const struct grid *recon_grid(const struct recon *recon);
 int recon_iteration(const struct recon *recon); /* iterations done so far */
 size_t recon_defects(const struct recon *recon);
 const char *recon_plan(const struct recon *recon); /* how the backend does it */
-
-/* ---- sart.c: subsets ---- */
-/* The number of subsets that SUBSETS_DEFAULT and SUBSETS_VIEWS stand for. */
-int subsets_count(int subsets, int views);
-/*
- * `count` (1 .. views) ordered subsets, each of every count-th view along the
- * arc, so that each is spread over all of it; sizes differ by one at most. They
- * are ordered so that each is far in angle from those before it. The same orbit
- * gives the same order. Free with subsets_clear.
- */
-int subsets_make(struct subsets *ret_subsets, const struct orbit *orbit, int count, struct error *err);
-void subsets_clear(struct subsets *subsets);
 
 #endif
