@@ -223,6 +223,8 @@ struct backend {
 	/* Its devices have memory beside the host's: what does not fit there can go through it in slabs (outofcore.h).
 	 */
 	bool own_memory;
+	/* `filter` only notes what is to be filtered and `backproject` does it: FDK takes all views in one go. */
+	bool defers_filter;
 
 	/* Devices that answer now; 0 when there is none. Never fails. */
 	int (*count)(void);

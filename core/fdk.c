@@ -15,8 +15,6 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "core/outofcore/outofcore.h"
-
 int fdk_weights_make(struct fdk_weights *ret_weights, const struct orbit *orbit, const struct geometry *geometry,
 		     enum window window, double cutoff, bool extend, struct error *err)
 {
@@ -60,8 +58,7 @@ void fdk_weights_clear(struct fdk_weights *weights)
 
 int fdk_batch(const struct backend *backend, const struct plan *plan, int views)
 {
-	const int batch = backend->plan_batch(plan),
-		  most = backend == &backend_outofcore ? views : fdk_batch_most(views);
+	const int batch = backend->plan_batch(plan), most = backend->defers_filter ? views : fdk_batch_most(views);
 
 	return batch < most ? batch : most;
 }

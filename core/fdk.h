@@ -24,8 +24,8 @@ void fdk_weights_clear(struct fdk_weights *weights);
  * Of so many views those that are filtered and backprojected in one go, at most:
  * memory is counted with it before any plan can be asked. By 32 views the pass over
  * the volume that a batch costs is long hidden behind the samples it takes; of few
- * views a batch is a quarter, for the memory that it takes, but at least 8. Not in
- * parts: there the pass is over the host's memory, and all views go at once.
+ * views a batch is a quarter, for the memory that it takes, but at least 8. A backend that
+ * defers its filter (out of core) takes all views in one go: its pass is over the host's memory.
  */
 static inline int fdk_batch_most(int views)
 {

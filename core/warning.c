@@ -1,7 +1,10 @@
 /* The table of warnings: code, severity and the sentence for a clinician. */
 #include "core/warning.h"
 
+#include <assert.h>
+#include <stdarg.h>
 #include <stddef.h>
+#include <stdio.h>
 #include <string.h>
 
 const char *const severity_names[SEVERITY_COUNT] = {"info", "caution", "serious"};
@@ -89,4 +92,18 @@ const struct warning_kind *warning_kind(const char *code)
 bool warning_is_known(const char *code)
 {
 	return warning_kind(code)->code[0] != 0;
+}
+
+void warning_tell(const struct warning_sink *sink, const char *code, const char *format, ...)
+{
+	char detail[320];
+	va_list args;
+
+	assert(warning_is_known(code));
+	if (sink->tell == NULL)
+		return;
+	va_start(args, format);
+	vsnprintf(detail, sizeof(detail), format, args);
+	va_end(args);
+	sink->tell(sink->context, code, detail);
 }

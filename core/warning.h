@@ -36,4 +36,13 @@ const struct warning_kind *warning_kind(const char *code);
 /* Whether the code has a row: what this program itself warns of must have one. */
 bool warning_is_known(const char *code);
 
+/* Who is told of the warnings of a reconstruction, in the thread that makes it. */
+struct warning_sink {
+	void *context;
+	void (*tell)(void *context, const char *code, const char *detail); /* NULL: nobody */
+};
+/* A code of the table, and the technical detail, which is cut off at 319 characters. */
+__attribute__((format(printf, 3, 4))) void warning_tell(const struct warning_sink *sink, const char *code,
+							const char *format, ...);
+
 #endif

@@ -16,7 +16,8 @@ ROOT = Path(__file__).resolve().parent.parent
 PICTURE = ROOT / "docs" / "rooms.svg"
 
 # Every folder with C or CUDA sources has a row, except tests. daemon/ itself holds the mains of two programs and the
-# files that serve all folders beneath it, so those three have rows of their own.
+# files that serve all folders beneath it, so those three have rows of their own; so have the errors, which core/scan
+# knows, and the other files of core/ itself, which know core/scan.
 ROOMS = {
     "daemon/main.c": "main of cbctd",
     "daemon/api": "routes and their handlers",
@@ -29,7 +30,13 @@ ROOMS = {
     "daemon/worker.c": "main of cbct-worker",
     "clients/cbct": "command-line client",
     "proto": "JSON, file formats, messages",
-    "core": "mathematics, CPU backend",
+    "core/recon": "algorithms, the run",
+    "core/correct": "corrections",
+    "core/outofcore": "a backend over a backend",
+    "core/cpu": "CPU backend",
+    "core/*.c": "backends' contract, FDK, filter",
+    "core/scan": "geometry, grid, orbit",
+    "core/error.c": "what went wrong, in words",
     "kernels": "CUDA backend",
 }
 COLOURS = {"daemon": "#dbe9f6", "proto": "#fdebc8", "core": "#dff0d8", "kernels": "#f6dbdb", "clients": "#e9e0f3"}
@@ -39,10 +46,11 @@ WIDTH, HEIGHT, GAP_X, GAP_Y, LANE, MARGIN, LEGEND = 216, 52, 28, 54, 16, 20, 30
 
 def room_of(path):
     """The row of ROOMS that a file of the tree belongs to."""
-    if path in ROOMS:
-        return path
+    file = re.sub(r"\.h$", ".c", path)
+    if file in ROOMS:
+        return file
     folder = path.rpartition("/")[0]
-    return "daemon/*.c" if folder == "daemon" else "core" if folder.startswith("core/") else folder
+    return folder + "/*.c" if folder in ("core", "daemon") else folder
 
 
 def includes():

@@ -218,6 +218,7 @@ const struct backend backend_cuda = {
     .name = "cuda",
     .summary = "NVIDIA GPUs",
     .own_memory = true,
+    .defers_filter = false,
     .count = cuda_count,
     .open = cuda_open,
     .close = cuda_close,

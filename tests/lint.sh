@@ -29,26 +29,45 @@ rule "nothing includes daemon but daemon and its tests" '#include "daemon/' $(fi
 rule "the daemon never touches CUDA" '#include [<"](cuda|cufft|kernels/)' $(files daemon)
 rule "libmicrohttpd stays in daemon/http" '#include <microhttpd' $(files daemon | grep -v '^daemon/http/')
 rule "SQLite stays in daemon/store" '#include <sqlite3' $(files daemon core proto clients | grep -v '^daemon/store/')
-# The rooms of daemon/, each with those beneath it whose doors it may use. The door of a room is daemon/ROOM/ROOM.h;
-# what else is in a room is its own. What stands in daemon/ itself serves all rooms and knows none, but for main.c.
-rooms=("http:" "store:" "volumes: store" "jobs: store" "intake: http store" "api: http store volumes jobs intake")
-beneath=" "
-for row in "${rooms[@]}"; do
-	room=${row%%:*} others=${row#*:} known="daemon/${row%%:*}/"
-	for other in $others; do
-		[[ $beneath == *" $other "* ]] || found "daemon/$room is above the rooms that it uses" "$other"
-		known+="|daemon/$other/$other\.h"
+# The rooms of core/ and daemon/, lowest first, each with those beneath it whose doors it may use; a room's own files
+# may include each other. A room's doors are the headers that others may include: ROOM/ROOM.h, or those named in doors.
+core_rooms=("scan:" "cpu: scan" "outofcore: scan" "correct: scan" "recon: scan outofcore correct")
+daemon_rooms=("http:" "store:" "volumes: store" "jobs: store" "intake: http store" "api: http store volumes jobs intake")
+declare -A doors=(
+	[core/scan]="geometry|grid|orbit|phantom"
+	[core/cpu]="none"
+	[core/correct]="exterior|exterior_volume|input|metal|stuck"
+	[core/recon]="algorithm|recipe|recon"
+)
+door() { echo "$1/(${doors[$1]:-$(basename "$1")})\.h"; }
+for top in core daemon; do
+	declare -n rooms=${top}_rooms
+	beneath=" "
+	for row in "${rooms[@]}"; do
+		room=${row%%:*} others=${row#*:} known="$top/$room/"
+		for other in $others; do
+			[[ $beneath == *" $other "* ]] || found "$top/$room is above the rooms that it uses" "$other"
+			known+="|$(door "$top/$other")"
+		done
+		beneath+="$room "
+		found "$top/$room uses doors, of:${others:- no other room}" \
+			"$(grep -nE "#include \"$top/[a-z]+/" "$top/$room"/*.[ch] | grep -vE "\"($known)")"
 	done
-	beneath+="$room "
-	found "daemon/$room uses doors, of:${others:- no other room}" \
-		"$(grep -nE '#include "daemon/[a-z]+/' daemon/"$room"/*.[ch] | grep -vE "\"($known)")"
+	found "a folder of $top/ without a row in rooms" \
+		"$(for room in "$top"/*/; do [[ $beneath == *" $(basename "$room") "* ]] || echo "$room"; done)"
+	found "files of $top/ have at most 700 lines" "$(wc -l "$top"/*.[ch] "$top"/*/*.[ch] | awk '$1 > 700 && $2 != "total"')"
 done
-found "a folder of daemon/ without a row in rooms" \
-	"$(for room in daemon/*/; do [[ $beneath == *" $(basename "$room") "* ]] || echo "$room"; done)"
+# What stands in daemon/ itself serves all rooms and knows none, but for main.c. What stands in core/ itself, the
+# backends' contract and what is built on it, knows core/scan; that room knows core/error.h alone.
 rule "daemon/*.[ch] serve the rooms and know none" '#include "daemon/[a-z]+/' $(ls daemon/*.[ch] | grep -v daemon/main.c)
 rule "daemon/main.c uses doors" '#include "daemon/([a-z]+)/([a-z_]+)\.h"' \
 	<(grep -vE '#include "daemon/([a-z]+)/\1\.h"' daemon/main.c)
-found "files of daemon/ have at most 700 lines" "$(wc -l daemon/*.[ch] daemon/*/*.[ch] | awk '$1 > 700 && $2 != "total"')"
+rule "core/*.[ch] know core/scan and no other room" '#include "core/[a-z]+/' \
+	<(cat core/*.[ch] | grep -vE "#include \"$(door core/scan)\"")
+rule "core/scan knows core/error.h and nothing above" '#include "core/[a-z_]+\.h"' \
+	<(cat core/scan/*.[ch] | grep -v '#include "core/error\.h"')
+found "who is outside of core/ uses the doors of its rooms" "$(grep -nE '#include "core/[a-z]+/' $(files kernels proto daemon clients) |
+	grep -vE "\"($(for row in "${core_rooms[@]}"; do door "core/${row%%:*}"; done | paste -sd '|'))\"")"
 
 rule "mutexes are made by lock_init, with their rank" 'pthread_mutex_init' $(files daemon | grep -v '^daemon/lock\.c$')
 found "daemon/THREADS.md (>) has the locks of daemon/lock.h (<) in their order" \

@@ -13,63 +13,6 @@ enum {
 
 static const double OPEN_DENSITY = 0.25, OPEN_EXCESS = 0.02;
 
-/* Where a line meets the grid's box, half a voxel beyond the outer centres. */
-struct passage {
-	bool missed;
-	int axis[2]; /* that it comes in and goes out across */
-	double point[2][3];
-};
-
-static struct passage pass(const struct grid *grid, const double from[3], const double to[3])
-{
-	struct passage passage = {.axis = {0, 0}};
-	double near = 0, far = INFINITY; /* in front of the source */
-
-	for (int i = 0; i < 3; i++) {
-		const double way = to[i] - from[i];
-		const double low = grid->origin[i] - 0.5 * grid->spacing[i] - from[i];
-		const double high = low + grid->size[i] * grid->spacing[i];
-
-		if (way == 0) {
-			passage.missed = passage.missed || low > 0 || high < 0;
-			continue;
-		}
-		if (fmin(low / way, high / way) > near) {
-			near = fmin(low / way, high / way);
-			passage.axis[0] = i;
-		}
-		if (fmax(low / way, high / way) < far) {
-			far = fmax(low / way, high / way);
-			passage.axis[1] = i;
-		}
-	}
-	passage.missed = passage.missed || near >= far;
-	for (int i = 0; i < 3; i++) {
-		passage.point[0][i] = from[i] + near * (to[i] - from[i]);
-		passage.point[1][i] = from[i] + far * (to[i] - from[i]);
-	}
-	return passage;
-}
-
-static struct passage pass_of_ray(const struct grid *grid, const struct view *view, int column, int row)
-{
-	double pixel[3];
-
-	for (int i = 0; i < 3; i++)
-		pixel[i] = view->pixel0[i] + column * view->column_step[i] + row * view->row_step[i];
-	return pass(grid, view->source, pixel);
-}
-
-double ray_within(const struct grid *grid, const struct view *view, int column, int row)
-{
-	const struct passage passage = pass_of_ray(grid, view, column, row);
-	double way[3];
-
-	for (int i = 0; i < 3; i++)
-		way[i] = passage.point[1][i] - passage.point[0][i];
-	return passage.missed ? 0 : vec_norm(way);
-}
-
 static int stride_of(int columns)
 {
 	return columns > LOOKED_AT ? columns / LOOKED_AT : 1;
@@ -82,7 +25,7 @@ static void axes_of(int axis, int ret[2])
 	ret[1] = axis == 2 ? 1 : 2;
 }
 
-static bool is_open(const struct faces *faces, const struct passage *passage, int end)
+static bool is_open(const struct faces *faces, const struct grid_passage *passage, int end)
 {
 	const struct grid *grid = faces->grid;
 	const int axis = passage->axis[end];
@@ -107,7 +50,7 @@ bool faces_row_counts_outside(const struct faces *faces, const struct view *view
 	double beside = 0, all = 0, excess = 0;
 
 	for (int column = 0; column < columns; column += stride_of(columns)) {
-		const struct passage passage = pass_of_ray(faces->grid, view, column, row);
+		const struct grid_passage passage = grid_passage(faces->grid, view, column, row);
 
 		looked_at++;
 		if (passage.missed) {
@@ -139,7 +82,7 @@ struct outside_rows outside_rows(const struct grid *grid, const struct view *vie
 		double missed_sum = 0, passed_sum = 0;
 
 		for (int column = 0; column < columns; column += stride_of(columns)) {
-			const struct passage passage = pass_of_ray(grid, view, column, row);
+			const struct grid_passage passage = grid_passage(grid, view, column, row);
 			const double p = (double)measured[(size_t)row * (size_t)columns + (size_t)column];
 
 			if (passage.missed) {

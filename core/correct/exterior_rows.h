@@ -53,7 +53,4 @@ struct outside_rows {
 struct outside_rows outside_rows(const struct grid *grid, const struct view *view, int columns, int rows,
 				 const float *measured);
 
-/* mm of the ray through a pixel that lie inside of the grid. */
-double ray_within(const struct grid *grid, const struct view *view, int column, int row);
-
 #endif

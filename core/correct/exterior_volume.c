@@ -11,11 +11,6 @@
 /* Spread over the orbit: what is empty shows in many views. */
 enum { VIEWS_LOOKED_AT = 32 };
 
-static size_t voxel_at(const struct grid *grid, int x, int y, int z)
-{
-	return ((size_t)z * (size_t)grid->size[1] + (size_t)y) * (size_t)grid->size[0] + (size_t)x;
-}
-
 static int voxels_a_side(const struct exterior_volume_options *options)
 {
 	const struct geometry *geometry = options->geometry;
@@ -327,7 +322,7 @@ static void look_at(const struct look *look, const struct grid *grid, const stru
 		for (int y = 0; y < grid->size[1]; y++)
 			for (int x = 0; x < grid->size[0]; x++) {
 				const struct place place = place_of(grid, x, y, z);
-				const size_t at = voxel_at(grid, x, y, z);
+				const size_t at = grid_voxel(grid, x, y, z);
 				double column, row;
 
 				if (look->seen == NULL && look->empty[at])
@@ -377,11 +372,11 @@ static void hold_ends(struct exterior_volume *s, const bool *empty)
 			for (int i = size[2] / 2; i < size[2]; i++)
 				for (int x = 0; x < size[0]; x++) {
 					const int z = end ? i : size[2] - 1 - i, inner = end ? z - 1 : z + 1;
-					const size_t at = voxel_at(&s->grid, x, y, z);
+					const size_t at = grid_voxel(&s->grid, x, y, z);
 
 					if (s->seen[at] || inner < 0 || inner >= size[2])
 						continue;
-					s->voxels[at] = empty[at] ? 0 : s->voxels[voxel_at(&s->grid, x, y, inner)];
+					s->voxels[at] = empty[at] ? 0 : s->voxels[grid_voxel(&s->grid, x, y, inner)];
 				}
 }
 
@@ -397,7 +392,7 @@ static void keep_what_is_known(struct exterior_volume *s, const struct exterior_
 	for (int z = 0; z < s->grid.size[2]; z++)
 		for (int y = 0; y < s->grid.size[1]; y++)
 			for (int x = 0; x < s->grid.size[0]; x++) {
-				const size_t at = voxel_at(&s->grid, x, y, z);
+				const size_t at = grid_voxel(&s->grid, x, y, z);
 				const struct place place = place_of(&s->grid, x, y, z);
 				const bool inside = is_inside(options->grid, place.at);
 
@@ -446,7 +441,7 @@ static void leave_inside_away(const struct exterior_volume_options *options, con
 			for (int x = 0; x < grid->size[0]; x++) {
 				const struct place place = place_of(grid, x, y, z);
 
-				ret_empty[voxel_at(grid, x, y, z)] =
+				ret_empty[grid_voxel(grid, x, y, z)] =
 				    is_inside(options->grid, place.at) || !is_in_view(options->orbit, place.at);
 			}
 }
@@ -580,7 +575,7 @@ static double mean_across(const struct exterior_volume *s, const int at[3], int 
 
 			near[a] = (int)fmin(fmax(at[a] + i, 0), size[a] - 1);
 			near[b] = (int)fmin(fmax(at[b] + j, 0), size[b] - 1);
-			sum += (double)s->voxels[voxel_at(&s->grid, near[0], near[1], near[2])];
+			sum += (double)s->voxels[grid_voxel(&s->grid, near[0], near[1], near[2])];
 		}
 	return sum / 9;
 }
@@ -619,84 +614,4 @@ void exterior_volume_clear(struct exterior_volume *s)
 	free(s->voxels);
 	free(s->seen);
 	*s = (struct exterior_volume){0};
-}
-
-/* ---- on the recipe's grid ---- */
-
-/* Between which two places of an axis a position lies, held beyond the outer ones, and how near to the second. */
-static float between(const struct grid *from, const struct grid *to, int axis, int index, int ret[2])
-{
-	const double place = to->origin[axis] + index * to->spacing[axis];
-	const double at = fmin(fmax((place - from->origin[axis]) / from->spacing[axis], 0), from->size[axis] - 1);
-
-	ret[0] = (int)at;
-	ret[1] = ret[0] + 1 < from->size[axis] ? ret[0] + 1 : ret[0];
-	return (float)(at - ret[0]);
-}
-
-/* The eight voxels around a place and their weights. */
-struct corners {
-	size_t at[8];
-	float weight[8];
-};
-
-static struct corners corners_of(const struct grid *from, const struct grid *to, int x, int y, int z)
-{
-	struct corners corners;
-	int at[3][2];
-	const float part[3] = {between(from, to, 0, x, at[0]), between(from, to, 1, y, at[1]),
-			       between(from, to, 2, z, at[2])};
-
-	for (int i = 0; i < 8; i++) {
-		const int a = i & 1, b = i >> 1 & 1, c = i >> 2;
-
-		corners.at[i] = voxel_at(from, at[0][a], at[1][b], at[2][c]);
-		corners.weight[i] =
-		    (a ? part[0] : 1 - part[0]) * (b ? part[1] : 1 - part[1]) * (c ? part[2] : 1 - part[2]);
-	}
-	return corners;
-}
-
-int exterior_volume_sample(const struct exterior_volume *s, const struct grid *grid, struct volume *to,
-			   struct error *err)
-{
-	const size_t nx = (size_t)grid->size[0];
-	float *slice = malloc(nx * (size_t)grid->size[1] * sizeof(float));
-	int code = 0;
-
-	if (slice == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for a slice");
-	for (int z = 0; z < grid->size[2] && code == 0; z++) {
-#pragma omp parallel for schedule(static)
-		for (int y = 0; y < grid->size[1]; y++)
-			for (int x = 0; x < grid->size[0]; x++) {
-				const struct corners corners = corners_of(&s->grid, grid, x, y, z);
-				float sum = 0;
-
-				for (int i = 0; i < 8; i++)
-					sum += corners.weight[i] * s->voxels[corners.at[i]];
-				slice[(size_t)y * nx + (size_t)x] = sum;
-			}
-		code = s->backend->volume_put(to, z, 1, slice, err);
-	}
-	free(slice);
-	return code;
-}
-
-bool exterior_volume_seen(const struct exterior_volume *s, const struct grid *grid, int z, float *ret_slice)
-{
-	bool all = true;
-
-#pragma omp parallel for schedule(static) reduction(&& : all)
-	for (int y = 0; y < grid->size[1]; y++)
-		for (int x = 0; x < grid->size[0]; x++) {
-			const struct corners corners = corners_of(&s->grid, grid, x, y, z);
-			float sum = 0;
-
-			for (int i = 0; i < 8; i++)
-				sum += corners.weight[i] * (float)s->seen[corners.at[i]];
-			ret_slice[(size_t)y * (size_t)grid->size[0] + (size_t)x] = sum;
-			all = all && sum >= 1;
-		}
-	return all;
 }

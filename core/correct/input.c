@@ -8,7 +8,6 @@
 
 #include "core/correct/air.h"
 #include "core/truncation.h"
-#include "core/recon/warn.h"
 
 /* Air regions that differ by more than this tell of a tube or a detector that drifts. */
 static const double DRIFT = 0.05;
@@ -384,69 +383,69 @@ static int lowest(const int *views, int count)
 	return least;
 }
 
-static void warn_of_air(const struct input *input, const struct recon_hooks *hooks)
+static void warn_of_air(const struct input *input, const struct warning_sink *sink)
 {
 	const double least = (double)input->counts.air_least, most = (double)input->counts.air_most;
 
 	if (input->counts.no_air > 0)
-		recon_warn(
-		    hooks, "air_region",
+		warning_tell(
+		    sink, "air_region",
 		    "the air region has no good pixel in %d projections: those are taken against the flat as they are",
 		    input->counts.no_air);
 	if (least > 0 && (most > (1 + DRIFT) * least || least < FAINT))
-		recon_warn(
-		    hooks, "air_region",
+		warning_tell(
+		    sink, "air_region",
 		    "the air region lies between %.4g and %.4g of the flat; each projection was held against its own%s",
 		    least, most,
 		    most > 2 * least || least < FAINT ? ". That is more than a tube drifts: is the object in it?" : "");
 }
 
-static void warn_of_air_level(const struct input *input, const struct recon_hooks *hooks)
+static void warn_of_air_level(const struct input *input, const struct warning_sink *sink)
 {
 	if (input->off == 0)
 		return;
-	recon_warn(
-	    hooks, "air_level",
+	warning_tell(
+	    sink, "air_level",
 	    "both ends of nearly all rows have line integrals between %.3g and %.3g, where air is 0, in %d of %d "
 	    "projections that were looked at: the tube gave less or more than the flat or \"air\" says. Nothing "
 	    "of that is taken out; an air_region makes up for it",
 	    (double)input->air_least, (double)input->air_most, input->off, input->views_looked_at);
 }
 
-static void warn_of_line_integrals(const struct input *input, const struct recon_hooks *hooks)
+static void warn_of_line_integrals(const struct input *input, const struct warning_sink *sink)
 {
 	const double mean = input->looked_at > 0 ? input->sum / (double)input->looked_at : 0;
 
 	if (mean > COUNTS)
-		recon_warn(hooks, "line_integrals",
-			   "the line integrals are %.4g in the mean: are they counts, which would be intensities?",
-			   mean);
+		warning_tell(sink, "line_integrals",
+			     "the line integrals are %.4g in the mean: are they counts, which would be intensities?",
+			     mean);
 	if (mean < NEGATIVE)
-		recon_warn(
-		    hooks, "line_integrals",
+		warning_tell(
+		    sink, "line_integrals",
 		    "the line integrals are %.4g in the mean, where air is 0 and all else more: is their sign turned?",
 		    mean);
 	else if (input->looked_at > 0 && input->most <= 0)
-		recon_warn(
-		    hooks, "line_integrals",
+		warning_tell(
+		    sink, "line_integrals",
 		    "none of %zu line integrals that were looked at is above 0: there is nothing but air in the scan",
 		    input->looked_at);
 }
 
 /* What has its bytes exchanged is noise. So are 8 bits in the upper byte, but for being below 256 the other way. */
-static void warn_of_bytes(const struct input *input, const struct recon_hooks *hooks)
+static void warn_of_bytes(const struct input *input, const struct warning_sink *sink)
 {
 	const double smoother = 8;
 
 	if (input->largest > 255 && input->rough[0] > smoother * input->rough[1])
-		recon_warn(
-		    hooks, "byte_order",
+		warning_tell(
+		    sink, "byte_order",
 		    "pixels differ from their neighbours by %.3g times as much as with their bytes exchanged: are they "
 		    "big-endian?",
 		    input->rough[0] / fmax(input->rough[1], 1));
 }
 
-void input_warn(const struct input *input, const struct geometry *geometry, const struct recon_hooks *hooks)
+void input_warn(const struct input *input, const struct geometry *geometry, const struct warning_sink *sink)
 {
 	const struct defect_counts *counts = &input->counts;
 	const struct defect_map *map = &input->map;
@@ -456,39 +455,39 @@ void input_warn(const struct input *input, const struct geometry *geometry, cons
 	/* Who gives air as a number may have taken the offset away; a flat is what the detector gave. */
 	if (input->linearise.quantity == QUANTITY_INTENSITY && input->linearise.flat != NULL &&
 	    input->linearise.dark == NULL)
-		recon_warn(hooks, "no_dark",
-			   "a flat image is there, but no dark one: an offset that the detector adds to its counts "
-			   "makes all that is measured too thin");
+		warning_tell(sink, "no_dark",
+			     "a flat image is there, but no dark one: an offset that the detector adds to its counts "
+			     "makes all that is measured too thin");
 	if (map->map != NULL && map->given + map->dead + map->hot + map->noisy > 0) {
 		const size_t all = map->given + map->dead + map->hot + map->noisy;
 
-		recon_warn(
-		    hooks, "defect_map",
+		warning_tell(
+		    sink, "defect_map",
 		    "%zu pixels (%.3g %%) of every projection were replaced from their neighbours: %zu of the given "
 		    "map, and %zu dead, %zu hot and %zu noisy ones that the flat and dark images show",
 		    all, 100 * (double)all / pixels, map->given, map->dead, map->hot, map->noisy);
 	}
 	if (map->stuck > 0)
-		recon_warn(
-		    hooks, "stuck_pixels",
+		warning_tell(
+		    sink, "stuck_pixels",
 		    "%zu pixels (%.3g %%) do not follow their neighbours over the views and were replaced from them; "
 		    "a map of the detector's defects with the scan is the surer way",
 		    map->stuck, 100 * (double)map->stuck / pixels);
 	if (found > 0)
-		recon_warn(
-		    hooks, "defects",
+		warning_tell(
+		    sink, "defects",
 		    "%zu samples (%.3g %%) in %d projections were replaced from their neighbours: %zu not above the "
 		    "dark, %zu saturated, %zu not finite or without a flat",
 		    found, 100 * (double)found / (pixels * input->views), input->defective_views, counts->zero,
 		    counts->saturated, counts->not_finite);
 	if (counts->blank > 0)
-		recon_warn(
-		    hooks, "blank_views",
+		warning_tell(
+		    sink, "blank_views",
 		    "%d projections have no good pixel, the first of them is %d: they are left out, the others stand "
 		    "in for them",
 		    counts->blank, lowest(input->blank, counts->blank));
-	warn_of_air(input, hooks);
-	warn_of_air_level(input, hooks);
-	warn_of_line_integrals(input, hooks);
-	warn_of_bytes(input, hooks);
+	warn_of_air(input, sink);
+	warn_of_air_level(input, sink);
+	warn_of_line_integrals(input, sink);
+	warn_of_bytes(input, sink);
 }

@@ -3,7 +3,7 @@
 
 #include "core/correct/defects.h"
 #include "core/correct/metal.h"
-#include "core/recon/recon.h"
+#include "core/warning.h"
 
 /* What core/recon/recon.c knows of the samples that it was given, and tells of them. Nobody else's. */
 struct input {
@@ -64,6 +64,6 @@ double input_blank_share(const struct input *input, const struct orbit *orbit);
 int input_check(const struct input *input, struct error *err);
 /* "no_dark", "defects", "defect_map", "stuck_pixels", "blank_views", "air_region", "air_level", "line_integrals",
  * "byte_order". */
-void input_warn(const struct input *input, const struct geometry *geometry, const struct recon_hooks *hooks);
+void input_warn(const struct input *input, const struct geometry *geometry, const struct warning_sink *sink);
 
 #endif

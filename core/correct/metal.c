@@ -37,8 +37,6 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "core/correct/exterior_rows.h"
-
 void metal_clear(struct metal *metal)
 {
 	free(metal->voxels);
@@ -400,7 +398,8 @@ bool metal_is_whole(const struct metal_view *of, int column, int row)
 	endless = *of->grid;
 	endless.spacing[2] = 1e6;
 	endless.origin[2] -= 0.5e6 * (endless.size[2] - 1);
-	return ray_within(of->grid, of->view, column, row) >= WHOLE * ray_within(&endless, of->view, column, row);
+	return grid_ray_length(of->grid, of->view, column, row) >=
+	       WHOLE * grid_ray_length(&endless, of->view, column, row);
 }
 
 /* ---- batch by batch ---- */

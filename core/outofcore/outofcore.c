@@ -279,6 +279,7 @@ static int outofcore_plan_batch(const struct plan *plan)
 const struct backend backend_outofcore = {
     .name = "outofcore",
     .summary = "another device, out of core",
+    .defers_filter = true,
     .close = outofcore_close,
     .describe = outofcore_describe,
     .volume_new = outofcore_volume_new,

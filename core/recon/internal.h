@@ -5,6 +5,7 @@
 #include "core/correct/metal.h"
 #include "core/fdk.h"
 #include "core/recon/algorithm.h"
+#include "core/warning.h"
 
 /* What recon.c (life, views), run.c (the run) and memory.c (what it takes) share. */
 
@@ -16,6 +17,7 @@ struct recon {
 	struct geometry upright;         /* owned, empty where the given one was that */
 	const struct recon_hooks *hooks;
 	struct cancel cancel;
+	struct warning_sink warnings;
 
 	struct recipe recipe; /* resolved */
 	struct orbit orbit;

@@ -146,6 +146,7 @@ int recon_open(const struct backend *backend, struct device *device, const struc
 	recon->geometry = geometry;
 	recon->hooks = hooks;
 	recon->cancel = (struct cancel){.asked = hooks->cancelled, .context = hooks->context};
+	recon->warnings = (struct warning_sink){.context = hooks->context, .tell = hooks->warning};
 	code = stand_up(&recon->geometry, &recon->upright, &recon->orbit, err);
 	if (code == 0)
 		code = input_open(&recon->input, linearise, recon->geometry, recon->geometry != geometry, err);

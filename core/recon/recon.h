@@ -2,6 +2,7 @@
 #define CBCT_CORE_RECON_H
 
 #include "core/backend.h"
+#include "core/recon/recipe.h"
 
 /*
  * One reconstruction: FDK, then an iterative algorithm, with TV after the FDK volume
@@ -9,78 +10,6 @@
  * any order, then run; everything is allocated at the opening. One thread at a
  * time; the hooks are called in that thread.
  */
-enum { EMIT_FDK = 0, EMIT_FDK_TV = -1 }; /* beside iterations 1, 2, ... */
-
-/* How iterations project backwards: plan_options.matched. */
-enum projector { PROJECTOR_INTERPOLATING, PROJECTOR_MATCHED, PROJECTOR_COUNT };
-extern const char *const projector_names[PROJECTOR_COUNT]; /* "interpolating", "matched" */
-
-/* "light", "medium", "strong": half, once, twice the balance that is found. */
-enum tv_strength { TV_LIGHT, TV_MEDIUM, TV_STRONG, TV_STRENGTH_COUNT };
-extern const char *const tv_strength_names[TV_STRENGTH_COUNT];
-
-struct algorithm; /* core/recon/algorithm.h */
-extern const struct algorithm algorithm_sart, algorithm_cgls;
-
-struct recipe {
-	bool has_grid; /* otherwise chosen from field of view and resolution */
-	struct grid grid;
-	bool has_origin; /* grid.origin was given; otherwise centred */
-	struct {
-		bool on;
-		enum window window;
-		double cutoff;
-		bool extend; /* rows that the detector cuts off, core/truncation.h */
-	} fdk;
-	const struct algorithm *algorithm; /* of algorithms[], core/recon/algorithm.h; NULL: no iterations */
-	struct {
-		int iterations;
-		double stop_residual, stop_change; /* 0: never */
-	} iterate;                                 /* whatever the algorithm */
-	struct {
-		double relaxation;
-		int subsets; /* 1 .. views; SUBSETS_VIEWS: an update after each view; SUBSETS_DEFAULT: 10 or fewer */
-		bool nonnegative;
-	} sart;
-	struct {
-		bool on;
-		bool after_fdk;            /* false with "after": "sart" */
-		bool automatic;            /* alpha is found from the noise (core/recon/noise.h); TV_PROXIMAL only */
-		enum tv_strength strength; /* of what is found */
-		struct tv_options options; /* alpha counts for nothing where it is found */
-	} tv;
-	enum projector projector;
-	struct {
-		bool on; /* needs fdk.on */
-		double threshold_hu;
-	} metal;         /* core/correct/metal.h */
-	double mu_water; /* 1/mm */
-	int *emit;       /* [emits], owned; iterations, EMIT_FDK, EMIT_FDK_TV */
-	int emits;
-	bool reference_precision;
-};
-
-enum { ITERATIONS_MAX = 100000, GRID_DEFAULT_MOST = 512, METAL_HU_LEAST = 500, METAL_HU_MOST = 1000000 };
-/* What is nearer to metal than this is an estimate: most of its rays cross the metal's shadows. */
-enum { METAL_ESTIMATE_MM = 10 };
-
-void recipe_defaults(struct recipe *ret_recipe); /* nothing on; the values that `{}` stages take */
-/* TV with numbers in place of those found: alpha 0.1, and 10 steps of 0.1 or 100 iterations; unit and `on` stay. */
-void recipe_explicit_tv(struct recipe *recipe, enum tv_method method);
-/* The algorithm, with its own number of iterations and projector; NULL: none. */
-void recipe_set_algorithm(struct recipe *recipe, const struct algorithm *algorithm);
-void recipe_clear(struct recipe *recipe);
-int recipe_copy(struct recipe *ret_recipe, const struct recipe *recipe, struct error *err);
-/* Pointers are those of the job's JSON, "/grid/size/0", "/sart/subsets"; ERR_IMPOSSIBLE for all that is out of range.
- */
-int recipe_check(const struct recipe *recipe, const struct geometry *geometry, struct error *err);
-/*
- * Writes out what was left open: the grid (orbit_default_grid, at most
- * GRID_DEFAULT_MOST voxels a side) or its origin, and tv.options.unit =
- * mu_water / 1000; then checks. A resolved recipe stays as it is.
- */
-int recipe_resolve(struct recipe *recipe, const struct geometry *geometry, const struct orbit *orbit,
-		   struct error *err);
 
 /* What a volume shows of its noise, see core/recon/noise.h; both 0 where there is nothing to see. */
 struct volume_noise {
@@ -132,7 +61,7 @@ struct recon_hooks {
 	 * follows SART, or FDK where there is no SART; 0 where nothing is to be smoothed.
 	 */
 	void (*denoising)(void *context, double noise_hu, double alpha);
-	/* The codes are in warn.h and input.h. */
+	/* A code of core/warning.h and the technical detail. */
 	void (*warning)(void *context, const char *code, const char *detail);
 }; /* any of them may be NULL */
 

@@ -129,7 +129,7 @@ static int measure_noise(struct recon *recon, struct error *err)
 		return code;
 	recon->noise_measured = true;
 	tell_noise(recon);
-	warn_tv(recon->hooks, &recon->recipe, &recon->noise, &recon->orbit);
+	warn_tv(&recon->warnings, &recon->recipe, &recon->noise, &recon->orbit);
 	return 0;
 }
 
@@ -161,7 +161,7 @@ static void warn_of_extended_rows(const struct recon *recon, const size_t extend
 
 	for (int side = 0; side < 2; side++)
 		rows[side] = extended[side] > off ? extended[side] - off : 0;
-	warn_truncated(recon->hooks, recon->geometry, recon->input.turned, rows, extend);
+	warn_truncated(&recon->warnings, recon->geometry, recon->input.turned, rows, extend);
 }
 
 /* Known once all views are filtered. */
@@ -263,7 +263,7 @@ static int take_metal_out(struct recon *recon, struct error *err)
 	if (code < 0)
 		return code;
 	recon->work_done += WORK_METAL;
-	warn_metal(recon->hooks, recon->geometry, &recon->recipe, metal);
+	warn_metal(&recon->warnings, recon->geometry, &recon->recipe, metal);
 	return 0;
 }
 
@@ -427,7 +427,7 @@ static int leave_out_the_exterior(struct recon *recon, struct error *err)
 	if (code < 0 || (seen.truncated + seen.outside == 0 && !seen.possible))
 		return code;
 	if (!sound && !fdk && seen.truncated > 0)
-		warn_exterior_stays(recon->hooks);
+		warn_exterior_stays(&recon->warnings);
 	if (!sound && !fdk && seen.outside == 0 && !seen.possible)
 		return 0;
 	/* An object may end inside of the grid: FDK's blur beyond its faces is none of the object. */
@@ -438,7 +438,7 @@ static int leave_out_the_exterior(struct recon *recon, struct error *err)
 	if (code == 0 && !fdk && sound && recon->recipe.fdk.extend)
 		warn_of_extended_rows(recon, exterior.truncated, recon->geometry->columns);
 	if (code == 0)
-		warn_outside(recon->hooks, recon->geometry, recon->input.turned, rows.outside);
+		warn_outside(&recon->warnings, recon->geometry, recon->input.turned, rows.outside);
 	exterior_volume_clear(&exterior);
 	return code;
 }
@@ -458,7 +458,7 @@ static int warn_of_unseen_slices(const struct recon *recon, struct error *err)
 		if (!ends[downwards ? 1 - end : end])
 			slices[end] = 0;
 	if (code == 0)
-		warn_unseen_slices(recon->hooks, &recon->recipe.grid, slices);
+		warn_unseen_slices(&recon->warnings, &recon->recipe.grid, slices);
 	return code;
 }
 
@@ -493,7 +493,7 @@ static int run_iterations(struct recon *recon, struct error *err)
 		if (hooks->row != NULL)
 			hooks->row(hooks->context, &row);
 		if (last)
-			warn_residual(hooks, &row);
+			warn_residual(&recon->warnings, &row);
 		snprintf(name, sizeof(name), "iter-%d", row.iteration);
 		if (is_wanted(&recon->recipe, row.iteration))
 			code = keep(recon, name, recon->recipe.algorithm->name, err);
@@ -534,8 +534,8 @@ int recon_run(struct recon *recon, struct error *err)
 		return code;
 	recon->ran = true;
 	if (!recon->resumed) {
-		warn_recipe(recon->hooks, recon->geometry, recipe);
-		input_warn(&recon->input, recon->geometry, recon->hooks);
+		warn_recipe(&recon->warnings, recon->geometry, recipe);
+		input_warn(&recon->input, recon->geometry, &recon->warnings);
 		code = warn_of_unseen_slices(recon, err);
 	}
 	if (code == 0)

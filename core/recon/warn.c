@@ -1,28 +1,9 @@
 /* What a reconstruction warns of, in words. */
 #include "core/recon/warn.h"
 
-#include <assert.h>
 #include <math.h>
-#include <stdarg.h>
-#include <stdio.h>
 
 #include "core/recon/noise.h"
-#include "core/correct/exterior_rows.h"
-#include "core/warning.h"
-
-void recon_warn(const struct recon_hooks *hooks, const char *code, const char *format, ...)
-{
-	char detail[320];
-	va_list args;
-
-	assert(warning_is_known(code));
-	if (hooks->warning == NULL)
-		return;
-	va_start(args, format);
-	vsnprintf(detail, sizeof(detail), format, args);
-	va_end(args);
-	hooks->warning(hooks->context, code, detail);
-}
 
 /* Whether a view's detector has the shadow of any of 9 x 9 x 9 places that span the grid. */
 static bool is_seen(const struct grid *grid, const struct geometry *geometry)
@@ -68,7 +49,7 @@ static bool is_crossed(const struct grid *grid, const struct view *view, int col
 	}
 	for (double row = fmax(0, ceil(low[1])); row <= fmin(rows - 1, high[1]); row++)
 		for (double column = fmax(0, ceil(low[0])); column <= fmin(columns - 1, high[0]); column++)
-			if (ray_within(grid, view, (int)column, (int)row) >= least)
+			if (grid_ray_length(grid, view, (int)column, (int)row) >= least)
 				return true;
 	return false;
 }
@@ -81,60 +62,61 @@ static bool is_crossed_in_any(const struct grid *grid, const struct geometry *ge
 	return false;
 }
 
-static void warn_of_small_grid(const struct recon_hooks *hooks, const struct grid *grid)
+static void warn_of_small_grid(const struct warning_sink *sink, const struct grid *grid)
 {
 	const int single = (grid->size[0] == 1) + (grid->size[1] == 1) + (grid->size[2] == 1);
 
 	if (single >= 2)
-		recon_warn(hooks, "grid_too_small",
-			   "the grid has %d x %d x %d voxels of %g x %g x %g mm: it shows no cross-section of the "
-			   "object",
-			   grid->size[0], grid->size[1], grid->size[2], grid->spacing[0], grid->spacing[1],
-			   grid->spacing[2]);
+		warning_tell(sink, "grid_too_small",
+			     "the grid has %d x %d x %d voxels of %g x %g x %g mm: it shows no cross-section of the "
+			     "object",
+			     grid->size[0], grid->size[1], grid->size[2], grid->spacing[0], grid->spacing[1],
+			     grid->spacing[2]);
 }
 
-void warn_recipe(const struct recon_hooks *hooks, const struct geometry *geometry, const struct recipe *recipe)
+void warn_recipe(const struct warning_sink *sink, const struct geometry *geometry, const struct recipe *recipe)
 {
 	const struct grid *grid = &recipe->grid;
 
 	if (!is_seen(grid, geometry))
-		recon_warn(
-		    hooks, "grid_unseen",
+		warning_tell(
+		    sink, "grid_unseen",
 		    "no view sees any of the grid, which begins at (%g, %g, %g) mm and is %g x %g x %g mm in size",
 		    grid->origin[0], grid->origin[1], grid->origin[2], grid->size[0] * grid->spacing[0],
 		    grid->size[1] * grid->spacing[1], grid->size[2] * grid->spacing[2]);
 	else if (recipe->algorithm != NULL && !is_crossed_in_any(grid, geometry))
-		recon_warn(hooks, "grid_unseen",
-			   "every ray of every view passes beside the grid, which is %g x %g x %g mm in size, between "
-			   "the pixels: SART leaves it as it was",
-			   grid->size[0] * grid->spacing[0], grid->size[1] * grid->spacing[1],
-			   grid->size[2] * grid->spacing[2]);
-	warn_of_small_grid(hooks, grid);
+		warning_tell(
+		    sink, "grid_unseen",
+		    "every ray of every view passes beside the grid, which is %g x %g x %g mm in size, between "
+		    "the pixels: SART leaves it as it was",
+		    grid->size[0] * grid->spacing[0], grid->size[1] * grid->spacing[1],
+		    grid->size[2] * grid->spacing[2]);
+	warn_of_small_grid(sink, grid);
 	if (recipe->tv.on && !recipe->tv.after_fdk && recipe->algorithm == NULL)
-		recon_warn(hooks, "tv_without_sart",
-			   "TV was wanted after SART iterations, and there are none: the FDK volume is left alone");
+		warning_tell(sink, "tv_without_sart",
+			     "TV was wanted after SART iterations, and there are none: the FDK volume is left alone");
 }
 
-void warn_unseen_slices(const struct recon_hooks *hooks, const struct grid *grid, const int slices[2])
+void warn_unseen_slices(const struct warning_sink *sink, const struct grid *grid, const int slices[2])
 {
 	if (slices[0] + slices[1] == 0)
 		return;
-	recon_warn(
-	    hooks, "slices_unseen",
+	warning_tell(
+	    sink, "slices_unseen",
 	    "the object goes on beyond the detector's rows, and the first %d and the last %d of %d slices are not "
 	    "seen by all views: FDK's values there are too low, and SART's are estimates from the other views",
 	    slices[0], slices[1], grid->size[2]);
 }
 
-void warn_residual(const struct recon_hooks *hooks, const struct history_row *row)
+void warn_residual(const struct warning_sink *sink, const struct history_row *row)
 {
 	const double implausible = 0.5;
 
 	/* The first iteration meets the projections before it has explained any of them. */
 	if (row->iteration < 2 || !(row->residual > implausible))
 		return;
-	recon_warn(
-	    hooks, "residual_high",
+	warning_tell(
+	    sink, "residual_high",
 	    "after %d iterations the volume still leaves %.3g of the projections unexplained (residual): geometry, "
 	    "grid or projections do not fit each other, or far more iterations are needed",
 	    row->iteration, row->residual);
@@ -146,7 +128,7 @@ static const char *row_of(bool turned)
 	return turned ? "column" : "row";
 }
 
-void warn_truncated(const struct recon_hooks *hooks, const struct geometry *geometry, bool turned, const size_t rows[2],
+void warn_truncated(const struct warning_sink *sink, const struct geometry *geometry, bool turned, const size_t rows[2],
 		    int extend)
 {
 	/* What noise does by chance: 1.7 % with 100 photons in air. */
@@ -159,8 +141,8 @@ void warn_truncated(const struct recon_hooks *hooks, const struct geometry *geom
 
 	if ((double)rows[0] < few * all && (double)rows[1] < few * all)
 		return;
-	recon_warn(
-	    hooks, "truncated",
+	warning_tell(
+	    sink, "truncated",
 	    "the object reaches beyond the detector: %.3g %% of the %ss are cut off at the first %s and %.3g %% "
 	    "at the last; FDK extended them by up to %d %ss. All of the field of view is uncertain by that, by up to "
 	    "%.0f HU in its middle and %.0f HU at its rim",
@@ -168,25 +150,26 @@ void warn_truncated(const struct recon_hooks *hooks, const struct geometry *geom
 	    fmax(5, share * middle), fmax(10, share * rim));
 }
 
-void warn_outside(const struct recon_hooks *hooks, const struct geometry *geometry, bool turned, size_t rows)
+void warn_outside(const struct warning_sink *sink, const struct geometry *geometry, bool turned, size_t rows)
 {
 	if (rows == 0)
 		return;
-	recon_warn(
-	    hooks, "outside_grid",
+	warning_tell(
+	    sink, "outside_grid",
 	    "the object goes on outside of the grid: what the projections show of that was taken out of %.3g %% of the "
 	    "%ss for SART",
 	    100 * (double)rows / ((double)geometry->count * geometry->rows), row_of(turned));
 }
 
-void warn_exterior_stays(const struct recon_hooks *hooks)
+void warn_exterior_stays(const struct warning_sink *sink)
 {
-	recon_warn(hooks, "truncated",
-		   "the object reaches beyond the detector, and FDK of this orbit is too poor to take that out of the "
-		   "projections: SART piles it up in the grid");
+	warning_tell(
+	    sink, "truncated",
+	    "the object reaches beyond the detector, and FDK of this orbit is too poor to take that out of the "
+	    "projections: SART piles it up in the grid");
 }
 
-void warn_tv(const struct recon_hooks *hooks, const struct recipe *recipe, const struct volume_noise *noise,
+void warn_tv(const struct warning_sink *sink, const struct recipe *recipe, const struct volume_noise *noise,
 	     const struct orbit *orbit)
 {
 	/* A voxel that is moved by so little of what it takes keeps nearly all of its noise. */
@@ -197,25 +180,25 @@ void warn_tv(const struct recon_hooks *hooks, const struct recipe *recipe, const
 
 	if (recipe->tv.automatic || reach >= little * needed)
 		return;
-	recon_warn(
-	    hooks, "tv_without_effect",
+	warning_tell(
+	    sink, "tv_without_effect",
 	    "TV with these settings moves a voxel by about %.3g HU, the noise is %.3g HU: it wants %.3g HU, which "
 	    "\"alpha\": \"auto\" finds",
 	    reach / hu, noise->sigma / hu, needed / hu);
 }
 
-void warn_metal(const struct recon_hooks *hooks, const struct geometry *geometry, const struct recipe *recipe,
+void warn_metal(const struct warning_sink *sink, const struct geometry *geometry, const struct recipe *recipe,
 		const struct metal *metal)
 {
 	const double samples = (double)geometry->count * (double)geometry->columns * (double)geometry->rows;
 
 	if (metal->voxels_count == 0) {
-		recon_warn(hooks, "no_metal", "nothing in the FDK volume has %g HU or more: no metal was taken out",
-			   recipe->metal.threshold_hu);
+		warning_tell(sink, "no_metal", "nothing in the FDK volume has %g HU or more: no metal was taken out",
+			     recipe->metal.threshold_hu);
 		return;
 	}
-	recon_warn(
-	    hooks, "metal",
+	warning_tell(
+	    sink, "metal",
 	    "%zu voxels (%.3g %%) are metal: of %g HU or more, or at least half of that beside them; %zu samples (%.3g "
 	    "%%) "
 	    "in %d projections were replaced from what lies beside them, and are left out of SART: values within "

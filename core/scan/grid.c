@@ -73,3 +73,53 @@ int grid_check_geometry(const struct grid *grid, const struct geometry *geometry
 	}
 	return 0;
 }
+
+static struct grid_passage passage_of_line(const struct grid *grid, const double from[3], const double to[3])
+{
+	struct grid_passage passage = {.axis = {0, 0}};
+	double near = 0, far = INFINITY; /* in front of the source */
+
+	for (int i = 0; i < 3; i++) {
+		const double way = to[i] - from[i];
+		const double low = grid->origin[i] - 0.5 * grid->spacing[i] - from[i];
+		const double high = low + grid->size[i] * grid->spacing[i];
+
+		if (way == 0) {
+			passage.missed = passage.missed || low > 0 || high < 0;
+			continue;
+		}
+		if (fmin(low / way, high / way) > near) {
+			near = fmin(low / way, high / way);
+			passage.axis[0] = i;
+		}
+		if (fmax(low / way, high / way) < far) {
+			far = fmax(low / way, high / way);
+			passage.axis[1] = i;
+		}
+	}
+	passage.missed = passage.missed || near >= far;
+	for (int i = 0; i < 3; i++) {
+		passage.point[0][i] = from[i] + near * (to[i] - from[i]);
+		passage.point[1][i] = from[i] + far * (to[i] - from[i]);
+	}
+	return passage;
+}
+
+struct grid_passage grid_passage(const struct grid *grid, const struct view *view, int column, int row)
+{
+	double pixel[3];
+
+	for (int i = 0; i < 3; i++)
+		pixel[i] = view->pixel0[i] + column * view->column_step[i] + row * view->row_step[i];
+	return passage_of_line(grid, view->source, pixel);
+}
+
+double grid_ray_length(const struct grid *grid, const struct view *view, int column, int row)
+{
+	const struct grid_passage passage = grid_passage(grid, view, column, row);
+	double way[3];
+
+	for (int i = 0; i < 3; i++)
+		way[i] = passage.point[1][i] - passage.point[0][i];
+	return passage.missed ? 0 : vec_norm(way);
+}

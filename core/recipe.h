@@ -1,0 +1,62 @@
+#ifndef CBCT_CORE_RECIPE_H
+#define CBCT_CORE_RECIPE_H
+
+#include "core/backend.h"
+
+/*
+ * What a job asks for, as plain data that every room of core/ may read.
+ * core/recon/recipe.h has its defaults, its ranges, and what is filled in.
+ */
+enum { EMIT_FDK = 0, EMIT_FDK_TV = -1 }; /* beside iterations 1, 2, ... */
+
+/* How iterations project backwards: plan_options.matched. */
+enum projector { PROJECTOR_INTERPOLATING, PROJECTOR_MATCHED, PROJECTOR_COUNT };
+
+/* "light", "medium", "strong": half, once, twice the balance that is found. */
+enum tv_strength { TV_LIGHT, TV_MEDIUM, TV_STRONG, TV_STRENGTH_COUNT };
+
+struct algorithm; /* core/recon/algorithm.h */
+
+struct recipe {
+	bool has_grid; /* otherwise chosen from field of view and resolution */
+	struct grid grid;
+	bool has_origin; /* grid.origin was given; otherwise centred */
+	struct {
+		bool on;
+		enum window window;
+		double cutoff;
+		bool extend; /* rows that the detector cuts off, core/truncation.h */
+	} fdk;
+	const struct algorithm *algorithm; /* of algorithms[], core/recon/algorithm.h; NULL: no iterations */
+	struct {
+		int iterations;
+		double stop_residual, stop_change; /* 0: never */
+	} iterate;                                 /* whatever the algorithm */
+	struct {
+		double relaxation;
+		int subsets; /* 1 .. views; SUBSETS_VIEWS: an update after each view; SUBSETS_DEFAULT: 10 or fewer */
+		bool nonnegative;
+	} sart;
+	struct {
+		bool on;
+		bool after_fdk;            /* false with "after": "sart" */
+		bool automatic;            /* alpha is found from the noise (core/recon/noise.h); TV_PROXIMAL only */
+		enum tv_strength strength; /* of what is found */
+		struct tv_options options; /* alpha counts for nothing where it is found */
+	} tv;
+	enum projector projector;
+	struct {
+		bool on; /* needs fdk.on */
+		double threshold_hu;
+	} metal;         /* core/correct/metal.h */
+	double mu_water; /* 1/mm */
+	int *emit;       /* [emits], owned; iterations, EMIT_FDK, EMIT_FDK_TV */
+	int emits;
+	bool reference_precision;
+};
+
+enum { ITERATIONS_MAX = 100000, GRID_DEFAULT_MOST = 512, METAL_HU_LEAST = 500, METAL_HU_MOST = 1000000 };
+/* What is nearer to metal than this is an estimate: most of its rays cross the metal's shadows. */
+enum { METAL_ESTIMATE_MM = 10 };
+
+#endif

@@ -1,0 +1,29 @@
+#ifndef CBCT_CORE_RECON_RECIPE_H
+#define CBCT_CORE_RECON_RECIPE_H
+
+#include "core/recipe.h"
+
+/* The recipe's defaults, its ranges, and what is filled in where it leaves something open. */
+extern const char *const projector_names[PROJECTOR_COUNT]; /* "interpolating", "matched" */
+extern const char *const tv_strength_names[TV_STRENGTH_COUNT];
+extern const struct algorithm algorithm_sart, algorithm_cgls; /* core/recon/algorithm.h */
+
+void recipe_defaults(struct recipe *ret_recipe); /* nothing on; the values that `{}` stages take */
+/* TV with numbers in place of those found: alpha 0.1, and 10 steps of 0.1 or 100 iterations; unit and `on` stay. */
+void recipe_explicit_tv(struct recipe *recipe, enum tv_method method);
+/* The algorithm, with its own number of iterations and projector; NULL: none. */
+void recipe_set_algorithm(struct recipe *recipe, const struct algorithm *algorithm);
+void recipe_clear(struct recipe *recipe);
+int recipe_copy(struct recipe *ret_recipe, const struct recipe *recipe, struct error *err);
+/* Pointers are those of the job's JSON, "/grid/size/0", "/sart/subsets"; ERR_IMPOSSIBLE for all that is out of range.
+ */
+int recipe_check(const struct recipe *recipe, const struct geometry *geometry, struct error *err);
+/*
+ * Writes out what was left open: the grid (orbit_default_grid, at most
+ * GRID_DEFAULT_MOST voxels a side) or its origin, and tv.options.unit =
+ * mu_water / 1000; then checks. A resolved recipe stays as it is.
+ */
+int recipe_resolve(struct recipe *recipe, const struct geometry *geometry, const struct orbit *orbit,
+		   struct error *err);
+
+#endif
