@@ -14,7 +14,7 @@ enum lock_rank {
 	LOCK_CHANGE,     /* jobs.change */
 	LOCK_EVENTS,     /* event_ring.lock */
 	LOCK_INSERTION,  /* store.insertion_lock */
-	LOCK_CATALOGUE,  /* store.writer.lock, store.reader.lock */
+	LOCK_CATALOGUE,  /* catalogue.locks[] */
 	LOCK_SCANS,      /* store.scans_lock */
 	LOCK_SCAN,       /* stored_scan.lock */
 	LOCK_JOBS,       /* jobs.lock */
@@ -25,7 +25,7 @@ enum lock_rank {
 	LOCK_MAPPINGS,   /* mappings.lock */
 	LOCK_VERIFIED,   /* verified.lock */
 	LOCK_PAGES,      /* pages.lock */
-	LOCK_CHECKPOINT, /* store.checkpoint_lock */
+	LOCK_CHECKPOINT, /* database.checkpoint_lock, of SQLite */
 	LOCK_CHECKS,     /* store.check_lock */
 	LOCK_WATCHERS,   /* watch_list.lock */
 	LOCK_HTTP,       /* http.lock */

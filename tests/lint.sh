@@ -28,7 +28,9 @@ rule "clients do not include daemon or kernels" '#include "(kernels|daemon|tests
 rule "nothing includes daemon but daemon and its tests" '#include "daemon/' $(files core kernels proto clients)
 rule "the daemon never touches CUDA" '#include [<"](cuda|cufft|kernels/)' $(files daemon)
 rule "libmicrohttpd stays in daemon/http" '#include <microhttpd' $(files daemon | grep -v '^daemon/http/')
-rule "SQLite stays in daemon/store" '#include <sqlite3' $(files daemon core proto clients | grep -v '^daemon/store/')
+rule "SQLite stays in daemon/store/sqlite.c and its pages" '#include [<"](sqlite3|daemon/store/sqlite)' \
+	$(files daemon core proto clients | grep -vE '^daemon/store/sqlite(_pages)?\.[ch]$')
+rule "no struct is bytes in the catalogue" 'COLUMN_BYTES.*AT\(' <(grep COLUMN_BYTES daemon/store/tables.c | grep -vE '(sha256|digest)\)')
 # The rooms of core/ and daemon/, lowest first, each with those beneath it whose doors it may use; a room's own files
 # may include each other. A room's doors are the headers that others may include: ROOM/ROOM.h, or those named in doors.
 core_rooms=("scan:" "cpu: scan" "outofcore: scan" "correct: scan" "recon: scan outofcore correct")

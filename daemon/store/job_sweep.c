@@ -7,18 +7,18 @@
 
 #include "daemon/files.h"
 #include "daemon/log.h"
-#include "daemon/store/db.h"
+#include "daemon/store/internal.h"
 #include "daemon/store/quarantine.h"
 
 /* The numbers of removed jobs' events count, too: a client may have seen them. */
 int store_load_last_event(struct store *store, struct error *err)
 {
-	struct query query;
+	long long number;
+	int code = catalogue_last_event(store->catalogue, &number, err);
 
-	query_begin(&query, &store->reader, "SELECT seq FROM sqlite_sequence WHERE name = 'events'", err);
-	if (query_row(&query))
-		atomic_store(&store->last_event, sqlite3_column_int64(query.statement, 0));
-	return query_end(&query);
+	if (code == 0)
+		atomic_store(&store->last_event, number);
+	return code;
 }
 
 /*
@@ -121,40 +121,25 @@ static void check_volumes(const struct sweep *sweep)
 	}
 }
 
-/* False where there is no such job; *ret_at_work: it is, or was, with a worker. */
-static int job_is_known(struct store *store, const char *id, bool *ret_known, bool *ret_at_work, bool *ret_ended,
-			struct error *err)
-{
-	struct query query;
-
-	query_begin(&query, &store->reader,
-		    "SELECT state IN ('waiting', 'running'), state IN ('succeeded', 'failed', 'cancelled')"
-		    " FROM jobs WHERE id = ?",
-		    err);
-	query_text(&query, id);
-	*ret_known = query_row(&query);
-	*ret_at_work = *ret_known && sqlite3_column_int(query.statement, 0) != 0;
-	*ret_ended = *ret_known && sqlite3_column_int(query.statement, 1) != 0;
-	return query_end(&query);
-}
-
 static int sweep_directory(void *context, const char *name, struct error *err)
 {
 	struct sweep sweep = {.store = context, .id = name};
+	enum job_state state = JOB_WAITING;
 	char path[1024];
-	bool known = false, at_work = false;
+	bool known = false;
 	int code;
 
 	if (!id_valid(name))
 		return 0; /* not ours */
 	store_job_directory(sweep.store, name, path);
-	code = job_is_known(sweep.store, name, &known, &at_work, &sweep.ended, err);
+	code = catalogue_job_state(sweep.store->catalogue, name, &known, &state, err);
 	if (code != 0 || !known)
 		return code;
+	sweep.ended = state == JOB_SUCCEEDED || state == JOB_FAILED || state == JOB_CANCELLED;
 	code = store_job_volumes(sweep.store, name, &sweep.volumes, &sweep.count, err);
 	if (code != 0)
 		return code;
-	if (at_work)
+	if (state == JOB_WAITING || state == JOB_RUNNING) /* a worker has it, or had it */
 		code = remove_unsettled(sweep.store, name, sweep.volumes, &sweep.count, err);
 	if (code == 0) {
 		check_volumes(&sweep);
@@ -169,11 +154,12 @@ int store_sweep_jobs(struct store *store, struct error *err)
 	char path[1024];
 	int code;
 
-	/* One transaction for all that is read: each job's rows are read before they are changed. */
-	if (sqlite3_exec(store->reader.db, "BEGIN", NULL, NULL, NULL) != SQLITE_OK)
-		return error_set(err, ERR_IO, "catalogue: %s", sqlite3_errmsg(store->reader.db));
+	/* Of one moment, which saves a start with many jobs much time: each job's rows are read before they change. */
+	code = catalogue_freeze(store->catalogue, err);
+	if (code != 0)
+		return code;
 	snprintf(path, sizeof(path), "%s/jobs", store->directory);
 	code = directory_visit(path, sweep_directory, store, err);
-	sqlite3_exec(store->reader.db, "COMMIT", NULL, NULL, NULL);
+	catalogue_thaw(store->catalogue, code == 0 ? err : &(struct error){0});
 	return code;
 }

@@ -49,8 +49,9 @@ static int compare_known(const void *a, const void *b)
 
 /* ---- rows ---- */
 
-static int add_known(struct reconciliation *r, struct query *query, struct error *err)
+static int add_known(void *context, const char *id, long long stamp, struct error *err)
 {
+	struct reconciliation *r = context;
 	struct known *rows, *known;
 	int space = r->space == 0 ? 1024 : 2 * r->space;
 
@@ -61,27 +62,13 @@ static int add_known(struct reconciliation *r, struct query *query, struct error
 		r->rows = rows;
 		r->space = space;
 	}
+	if (!id_valid(id))
+		return error_set(err, ERR_IO, "catalogue: the row of %s \"%.64s\" makes no sense",
+				 record_words[r->kind].kind, id);
 	known = &r->rows[r->count++];
-	column_text(query, 0, known->id, sizeof(known->id));
-	known->stamp = sqlite3_column_int64(query->statement, 1);
-	known->seen = false;
-	if (!id_valid(known->id))
-		return error_set(err, ERR_IO, "catalogue: the row of %s \"%s\" makes no sense",
-				 record_words[r->kind].kind, known->id);
+	*known = (struct known){.stamp = stamp};
+	memcpy(known->id, id, sizeof(known->id));
 	return 0;
-}
-
-static int load_rows(struct reconciliation *r, struct error *err)
-{
-	static const char *const selects[RECORD_KINDS] = {"SELECT id, stamp FROM scans ORDER BY id",
-							  "SELECT id, stamp FROM jobs ORDER BY id"};
-	struct query query;
-	int code = 0;
-
-	query_begin(&query, &r->store->writer, selects[r->kind], err);
-	while (code == 0 && query_row(&query))
-		code = add_known(r, &query, err);
-	return query_end(&query) != 0 ? query.code : code;
 }
 
 static bool was_deleted(const struct reconciliation *r, const char *id)
@@ -92,21 +79,16 @@ static bool was_deleted(const struct reconciliation *r, const char *id)
 /* A crash came between a deletion and its row, or the catalogue is older than the deletion. */
 static int drop_deleted(struct reconciliation *r, struct error *err)
 {
-	static const char *const statements[RECORD_KINDS] = {"DELETE FROM scans WHERE id = ?",
-							     "DELETE FROM jobs WHERE id = ?"};
-	struct query query;
+	int code = 0;
 
-	for (int i = 0; i < r->count; i++) {
+	for (int i = 0; i < r->count && code == 0; i++) {
 		if (!was_deleted(r, r->rows[i].id))
 			continue;
 		log_line(LEVEL_INFO, "%s %s was deleted: its row goes", record_words[r->kind].kind, r->rows[i].id);
-		query_begin(&query, &r->store->writer, statements[r->kind], err);
-		query_text(&query, r->rows[i].id);
-		if (query_run(&query) != 0)
-			return query.code;
+		code = catalogue_remove(r->store->catalogue, r->kind, r->rows[i].id, err);
 		r->rows[i].seen = true;
 	}
-	return 0;
+	return code;
 }
 
 /* ---- a directory with a row ---- */
@@ -119,18 +101,14 @@ static int write_again(struct reconciliation *r, const char *id, struct error *e
 
 static int apply(struct reconciliation *r, const cJSON *record, struct error *err)
 {
-	struct error ignored;
-	int code = store_savepoint(r->store, "SAVEPOINT record", err);
+	int code = catalogue_try(r->store->catalogue, err);
 
 	if (code != 0)
 		return code;
 	code = record_apply(r->store, r->kind, record, err);
-	if (code != 0)
-		store_savepoint(r->store, "ROLLBACK TO record", &ignored);
-	else
+	if (code == 0)
 		r->store->repairs.found[r->kind]++;
-	return store_savepoint(r->store, "RELEASE record", code == 0 ? err : &ignored) != 0 && code == 0 ? err->code
-													 : code;
+	return catalogue_try_end(r->store->catalogue, code, err);
 }
 
 /* The row and the record are not of the same writing, as far as the time of modification tells. */
@@ -203,8 +181,10 @@ static int take_in(struct reconciliation *r, const char *id, const char *path, s
 			 record_words[r->kind].kind, id);
 		code = apply(r, record, &why);
 		cJSON_Delete(record);
-		if (code == 0)
-			return 0;
+		if (code != 0 && code != ERR_INVALID)
+			*err = why;
+		if (code != ERR_INVALID)
+			return code;
 	} else if (code == ERR_NOT_FOUND || record_empty(r->store, r->kind, id)) {
 		if (directory_visit(path, note_content, &contents, err) != 0)
 			return err->code;
@@ -263,7 +243,7 @@ static int reconcile_kind(struct store *store, enum record_kind kind, struct err
 {
 	struct reconciliation r = {.store = store, .kind = kind};
 	char path[1024];
-	int code = load_rows(&r, err), file;
+	int code = catalogue_stamps(store->catalogue, kind, add_known, &r, err), file;
 
 	snprintf(path, sizeof(path), "%s/%s", store->directory, record_words[kind].table);
 	if (code == 0)
@@ -334,18 +314,7 @@ int store_take_back(struct store *store, struct error *err)
  */
 static int pass_over_events(struct store *store, struct error *err)
 {
-	struct query query;
-
-	query_begin(&query, &store->writer,
-		    "INSERT INTO sqlite_sequence (name, seq) SELECT 'events', 0"
-		    " WHERE NOT EXISTS (SELECT 1 FROM sqlite_sequence WHERE name = 'events')",
-		    err);
-	if (query_run(&query) != 0)
-		return query.code;
-	query_begin(&query, &store->writer, "UPDATE sqlite_sequence SET seq = max(seq + 1, ?) WHERE name = 'events'",
-		    err);
-	query_integer(&query, (long long)((clock_realtime() - 1577836800.0) * 1e3));
-	return query_run(&query);
+	return catalogue_pass_events(store->catalogue, (long long)((clock_realtime() - 1577836800.0) * 1e3), err);
 }
 
 int store_reconcile(struct store *store, bool fresh, struct error *err)
@@ -359,7 +328,7 @@ int store_reconcile(struct store *store, bool fresh, struct error *err)
 	for (int kind = 0; kind < RECORD_KINDS && code == 0; kind++)
 		code = reconcile_kind(store, kind, err);
 	found = repairs->found[RECORD_SCAN] + repairs->found[RECORD_JOB];
-	if (code == 0 && (found > 0 || store->log_left))
+	if (code == 0 && (found > 0 || store->interrupted))
 		code = pass_over_events(store, err);
 	code = store_end(store, code, err);
 	if (code != 0 || found == 0)

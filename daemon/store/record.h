@@ -3,7 +3,7 @@
 
 #include <cjson/cJSON.h>
 
-#include "daemon/store/db.h"
+#include "daemon/store/internal.h"
 
 /*
  * record.json in the directory of a scan or a job: its rows of the catalogue, so that the catalogue can be made again
@@ -16,15 +16,13 @@
  *    "kind":"job", "id":"...", "rows":{"jobs":[{"id":"...", ...}], "history":[...], ...}}
  *
  * The members of a row are its columns: numbers, texts, null, and {"hex": "..."} for bytes. Columns that a later cbctd
- * has added take their defaults, those that it has dropped are passed over.
+ * has added take their defaults, those that it has dropped are passed over, or read as it says in store/upgrade.h.
  *
  * The row's column `stamp` (microseconds since 1970, growing) is that of the last writing, and the file has it as its
  * time of modification: at the start one look at each directory tells whether both are of the same writing.
  *
- * Inside of the store; writer.lock is held, in a transaction.
+ * Inside of the store, in a group of the catalogue.
  */
-enum record_kind { RECORD_SCAN, RECORD_JOB, RECORD_KINDS };
-
 /* The words that the kinds differ in. */
 struct record_words {
 	const char *kind;  /* "scan" */
@@ -43,8 +41,8 @@ void record_directory(const struct store *store, enum record_kind kind, const ch
  * told.
  */
 int record_write(struct store *store, enum record_kind kind, const char *id, bool synced, struct error *err);
-/* After a transaction that was rolled back, best effort: the record of the rows as they are; without a row it is
- * removed. */
+/* After a group that was rolled back, outside of any, best effort: the record of the rows as they are; without a row it
+ * is removed. */
 void record_undo(struct store *store, enum record_kind kind, const char *id);
 
 /* True where the record is a file of no bytes. */

@@ -455,16 +455,10 @@ static int make_files(struct store *store, const struct scan *parsed, const stru
 static int insert_key(struct store *store, const struct stored_scan *scan, const struct store_key *key,
 		      struct error *err)
 {
-	struct query query;
-	int code;
+	bool new = false;
+	int code = catalogue_add_scan_key(store->catalogue, scan->id, key, &new, err);
 
-	query_begin(&query, &store->writer,
-		    "INSERT OR IGNORE INTO scan_keys (key, request_sha256, scan) VALUES (?, ?, ?)", err);
-	query_text(&query, key->text);
-	query_blob(&query, key->digest, sizeof(key->digest));
-	query_integer(&query, scan->number);
-	code = query_run(&query);
-	if (code == 0 && sqlite3_changes(store->writer.db) == 0)
+	if (code == 0 && !new)
 		return error_set(err, ERR_CONFLICT, "this Idempotency-Key was used meanwhile");
 	return code;
 }
@@ -472,27 +466,13 @@ static int insert_key(struct store *store, const struct stored_scan *scan, const
 static int find_by_key(struct store *store, const struct store_key *key, struct stored_scan **ret_scan,
 		       struct error *err)
 {
-	struct query query;
-	char id[ID_SIZE] = "";
-	bool same = false;
-	int code;
+	uint8_t digest[32];
+	char id[ID_SIZE];
+	int code = catalogue_find_scan_key(store->catalogue, key->text, id, digest, err);
 
-	pthread_mutex_lock(&store->reader.lock);
-	query_begin(&query, &store->reader,
-		    "SELECT scans.id, request_sha256 = ? FROM scan_keys JOIN scans ON scans.number = scan_keys.scan"
-		    " WHERE key = ?",
-		    err);
-	query_blob(&query, key->digest, sizeof(key->digest));
-	query_text(&query, key->text);
-	if (query_row(&query)) {
-		column_text(&query, 0, id, sizeof(id));
-		same = sqlite3_column_int(query.statement, 1) != 0;
-	}
-	code = query_end(&query);
-	pthread_mutex_unlock(&store->reader.lock);
 	if (code != 0 || id[0] == '\0')
 		return code;
-	if (!same)
+	if (memcmp(digest, key->digest, sizeof(digest)) != 0)
 		return error_set(err, ERR_CONFLICT, "this Idempotency-Key came with another request before");
 	return store_scan_find(store, id, ret_scan, err);
 }
@@ -510,26 +490,20 @@ int store_scan_repeat(struct store *store, const struct store_key *key, struct s
 
 static int insert_row(struct store *store, struct stored_scan *scan, const struct store_key *key, struct error *err)
 {
-	struct query query;
+	struct catalogue_scan row = {.created = scan->created,
+				     .columns = scan->columns,
+				     .rows = scan->rows,
+				     .count = scan->count,
+				     .sample = scan->sample,
+				     .quantity = scan->quantity,
+				     .air = scan->air};
 	int code = store_begin(store, err);
 
 	if (code != 0)
 		return code;
-	query_begin(&query, &store->writer,
-		    "INSERT INTO scans (id, name, created, columns, rows, count, sample, quantity, air)"
-		    " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
-		    err);
-	query_text(&query, scan->id);
-	query_text(&query, scan->name);
-	query_real(&query, scan->created);
-	query_integer(&query, scan->columns);
-	query_integer(&query, scan->rows);
-	query_integer(&query, scan->count);
-	query_text(&query, sample_names[scan->sample]);
-	query_text(&query, quantity_names[scan->quantity]);
-	query_real(&query, scan->air);
-	code = query_run(&query);
-	scan->number = sqlite3_last_insert_rowid(store->writer.db);
+	memcpy(row.id, scan->id, sizeof(row.id));
+	memcpy(row.name, scan->name, sizeof(row.name));
+	code = catalogue_add_scan(store->catalogue, &row, &scan->number, err);
 	if (code == 0 && key != NULL)
 		code = insert_key(store, scan, key, err);
 	if (code == 0)
@@ -610,7 +584,6 @@ out:
 
 int store_scan_delete(struct store *store, struct stored_scan *scan, struct error *err)
 {
-	struct query query;
 	bool gone;
 	int code = store_begin(store, err);
 
@@ -631,9 +604,7 @@ int store_scan_delete(struct store *store, struct stored_scan *scan, struct erro
 		pthread_mutex_unlock(&scan->lock);
 		return store_end(store, code, err);
 	}
-	query_begin(&query, &store->writer, "DELETE FROM scans WHERE number = ?", err);
-	query_integer(&query, scan->number);
-	code = store_end(store, query_run(&query), err);
+	code = store_end(store, catalogue_remove(store->catalogue, RECORD_SCAN, scan->id, err), err);
 	/* From its note on it is deleted: on a full disk the row goes at the next start. */
 	if (code != 0 && code != ERR_NO_SPACE)
 		return code;

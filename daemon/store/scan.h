@@ -1,7 +1,7 @@
 #ifndef CBCT_DAEMON_STORE_SCAN_H
 #define CBCT_DAEMON_STORE_SCAN_H
 
-#include "daemon/store/db.h"
+#include "daemon/store/internal.h"
 #include "proto/sums.h"
 
 /* Inside of the scans, for store/scan*.c and store/sums*.c only. */
@@ -48,7 +48,7 @@ struct stored_scan {
 	bool image_lost[IMAGE_COUNT]; /* as of projections */
 	bool document_damaged;        /* scan.json */
 	bool suspect;                 /* all of its files are to be checked before it is used (store/sums.c) */
-	bool deleted;                 /* written with writer.lock held too, as the next */
+	bool deleted;                 /* written in a group of the catalogue too, as the next */
 	bool closing;                 /* takes no new projections */
 	bool closed;                  /* and that is on the disk */
 

@@ -43,7 +43,6 @@ static int look_before_closing(struct stored_scan *scan, unsigned char *ret_pres
 
 static int close_row(struct store *store, struct stored_scan *scan, int received, bool *ret_done, struct error *err)
 {
-	struct query query;
 	int code = store_begin(store, err);
 
 	if (code != 0)
@@ -61,11 +60,8 @@ static int close_row(struct store *store, struct stored_scan *scan, int received
 	code = store_forget_lost(scan, err);
 	if (code == 0)
 		code = store_put_part_sum(scan, SUMS_CLOSED, "", 0, err);
-	if (code == 0) {
-		query_begin(&query, &store->writer, "UPDATE scans SET closed = 1 WHERE number = ?", err);
-		query_integer(&query, scan->number);
-		code = query_run(&query);
-	}
+	if (code == 0)
+		code = catalogue_set_closed(store->catalogue, scan->id, err);
 	code = store_end(store, code, err);
 	if (code != 0) {
 		pthread_mutex_lock(&scan->lock);

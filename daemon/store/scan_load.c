@@ -12,94 +12,73 @@
 #include "daemon/log.h"
 #include "daemon/store/scan.h"
 
-static void read_image_digest(struct query *query, int column, struct stored_scan *scan, enum image image)
+static int load_scan(struct store *store, const struct catalogue_scan *row, struct error *err)
 {
-	if (sqlite3_column_bytes(query->statement, column) != 32)
-		return;
-	memcpy(scan->image_sha256[image], sqlite3_column_blob(query->statement, column), 32);
-	scan->image[image] = STORED;
-}
-
-static int load_scan(struct store *store, struct query *query, struct error *err)
-{
-	sqlite3_stmt *row = query->statement;
 	struct stored_scan *scan;
-	char text[32], directory[1024];
-	int sample, quantity, code = scans_reserve(store, err);
+	char directory[1024];
+	int code = scans_reserve(store, err);
 
 	if (code != 0)
 		return code;
-	scan = stored_scan_new(store, sqlite3_column_int(row, 6));
+	if (!id_valid(row->id))
+		return error_set(err, ERR_IO, "catalogue: the row of scan \"%s\" makes no sense", row->id);
+	scan = stored_scan_new(store, row->count);
 	if (scan == NULL)
 		return error_set_errno(err, ENOMEM, "list of scans");
-	scan->number = sqlite3_column_int64(row, 0);
-	column_text(query, 1, scan->id, sizeof(scan->id));
-	column_text(query, 2, scan->name, sizeof(scan->name));
-	scan->created = sqlite3_column_double(row, 3);
-	scan->columns = sqlite3_column_int(row, 4);
-	scan->rows = sqlite3_column_int(row, 5);
-	column_text(query, 7, text, sizeof(text));
-	sample = name_index(text, sample_names, 2);
-	column_text(query, 8, text, sizeof(text));
-	quantity = name_index(text, quantity_names, 2);
-	scan->air = sqlite3_column_double(row, 9);
-	read_image_digest(query, 10, scan, IMAGE_FLAT);
-	read_image_digest(query, 11, scan, IMAGE_DARK);
-	read_image_digest(query, 12, scan, IMAGE_DEFECTS);
-	scan->closed = scan->closing = sqlite3_column_int(row, 13) != 0;
+	scan->number = row->number;
+	memcpy(scan->id, row->id, sizeof(scan->id));
+	memcpy(scan->name, row->name, sizeof(scan->name));
+	scan->created = row->created;
+	scan->columns = row->columns;
+	scan->rows = row->rows;
+	scan->sample = row->sample;
+	scan->quantity = row->quantity;
+	scan->air = row->air;
+	for (int i = 0; i < IMAGE_COUNT; i++) {
+		if (row->images[i].known)
+			scan->image[i] = STORED;
+		memcpy(scan->image_sha256[i], row->images[i].sha256, sizeof(scan->image_sha256[i]));
+	}
+	scan->closed = scan->closing = row->closed;
 	store_scan_directory(store, scan->id, directory);
 	scan->gone = access(directory, F_OK) != 0 && errno == ENOENT;
-	if (sample < 0 || quantity < 0 || !id_valid(scan->id)) {
-		code = error_set(err, ERR_IO, "catalogue: the row of scan \"%s\" makes no sense", scan->id);
-		stored_scan_free(scan);
-		return code;
-	}
-	scan->sample = (enum sample)sample;
-	scan->quantity = (enum quantity)quantity;
 	id_floor(scan->id);
 	scans_insert(store, scan);
 	return 0;
 }
 
-static void load_projection(struct stored_scan *scan, sqlite3_stmt *row)
+static int load_projections(struct store *store, struct stored_scan *scan, struct error *err)
 {
-	int view = sqlite3_column_int(row, 1);
+	struct catalogue_projection *rows = NULL;
 	struct sum sum = {0};
+	int count = 0, code = catalogue_projections(store->catalogue, scan->number, &rows, &count, err);
 
-	if (view < 0 || view >= scan->count || sqlite3_column_bytes(row, 2) != 32) {
-		log_line(LEVEL_ERROR, "scan %s: the row of projection %d makes no sense", scan->id, view);
-		return;
+	for (int i = 0; i < count; i++) {
+		if (rows[i].view < 0 || rows[i].view >= scan->count) {
+			log_line(LEVEL_ERROR, "scan %s: the row of projection %d makes no sense", scan->id,
+				 rows[i].view);
+			continue;
+		}
+		memcpy(sum.sha256, rows[i].sha256, sizeof(sum.sha256));
+		stored_scan_add(scan, rows[i].view, &sum);
 	}
-	memcpy(sum.sha256, sqlite3_column_blob(row, 2), 32);
-	stored_scan_add(scan, view, &sum);
+	free(rows);
+	return code;
 }
 
 /* Called while nobody else has the store: no locks. */
 int store_load_scans(struct store *store, struct error *err)
 {
-	struct stored_scan *scan = NULL;
-	struct query query;
-	int code = 0;
+	struct catalogue_scan *rows = NULL;
+	int count = 0, code = catalogue_scans(store->catalogue, &rows, &count, err);
 
-	query_begin(
-	    &query, &store->reader,
-	    "SELECT number, id, name, created, columns, rows, count, sample, quantity, air, flat, dark, defects,"
-	    " closed FROM scans ORDER BY id",
-	    err);
-	while (code == 0 && query_row(&query))
-		code = load_scan(store, &query, err);
-	if (query_end(&query) != 0)
-		code = query.code;
+	for (int i = 0; i < count && code == 0; i++)
+		code = load_scan(store, &rows[i], err);
+	free(rows);
 	for (int i = 0; i < store->scan_count && code == 0; i++) {
-		scan = store->scans[i];
-		query_begin(&query, &store->reader,
-			    "SELECT scan, view, sha256 FROM projections WHERE scan = ? ORDER BY view", err);
-		query_integer(&query, scan->number);
-		while (query_row(&query))
-			load_projection(scan, query.statement);
-		code = query_end(&query);
+		code = load_projections(store, store->scans[i], err);
 		if (code == 0)
-			code = store_load_sums(store, scan, err);
+			code = store_load_sums(store, store->scans[i], err);
 	}
 	return code;
 }

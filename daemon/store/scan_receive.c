@@ -63,21 +63,18 @@ int stored_scan_open(struct stored_scan *scan, bool writing, int *ret_descriptor
 
 static int insert_projections(struct store *store, struct received_projection *batch, int count, struct error *err)
 {
-	struct query query;
+	struct catalogue_projection row;
 	int code = 0;
 
 	for (int i = 0; i < count && code == 0; i++) {
-		/* Cannot change: writer.lock is held. */
+		/* Cannot change during the group. */
 		batch[i].stored =
 		    !batch[i].scan->deleted && (!batch[i].scan->closing || batch[i].scan->lost[batch[i].index]);
 		if (!batch[i].stored)
 			continue;
-		query_begin(&query, &store->writer,
-			    "INSERT OR REPLACE INTO projections (scan, view, sha256) VALUES (?, ?, ?)", err);
-		query_integer(&query, batch[i].scan->number);
-		query_integer(&query, batch[i].index);
-		query_blob(&query, batch[i].sum.sha256, sizeof(batch[i].sum.sha256));
-		code = query_run(&query);
+		row = (struct catalogue_projection){.scan = batch[i].scan->number, .view = batch[i].index};
+		memcpy(row.sha256, batch[i].sum.sha256, sizeof(row.sha256));
+		code = catalogue_put_projection(store->catalogue, &row, err);
 	}
 	return code;
 }
@@ -153,11 +150,7 @@ static int claim_image(struct stored_scan *scan, enum image image, const uint8_t
 static int write_image(struct store *store, struct stored_scan *scan, enum image image, const void *pixels,
 		       const uint8_t sha256[32], struct error *err)
 {
-	static const char *const statements[IMAGE_COUNT] = {"UPDATE scans SET flat = ? WHERE number = ?",
-							    "UPDATE scans SET dark = ? WHERE number = ?",
-							    "UPDATE scans SET defects = ? WHERE number = ?"};
 	char directory[1024], path[1100];
-	struct query query;
 	int code;
 
 	store_scan_directory(store, scan->id, directory);
@@ -171,10 +164,7 @@ static int write_image(struct store *store, struct stored_scan *scan, enum image
 		code = store_begin(store, err);
 	if (code != 0)
 		return code;
-	query_begin(&query, &store->writer, statements[image], err);
-	query_blob(&query, sha256, 32);
-	query_integer(&query, scan->number);
-	return store_end(store, query_run(&query), err);
+	return store_end(store, catalogue_set_image(store->catalogue, scan->id, image, sha256, err), err);
 }
 
 int store_put_image(struct store *store, struct stored_scan *scan, enum image image, const void *pixels, bool *ret_new,

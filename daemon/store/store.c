@@ -1,16 +1,4 @@
-/*
- * The catalogue: one SQLite database in WAL mode.
- *
- * Every commit is synced (synchronous = FULL): one append to the log and one
- * fdatasync; but for projections, whose records beside the samples are synced
- * (store/sums.c). The log is moved into the database by a thread of its own, so that
- * no commit waits for most of that. One connection writes, another reads and never
- * waits for the writer. Every page is checked as it is read (store/pages.h).
- *
- * The catalogue is this process's own: the index of its log (-shm) is mapped memory
- * that nothing checks, so its file loses its name as soon as it is open. Another
- * program must not write into the catalogue of a running daemon.
- */
+/* The state directory: its opening, its end, its disk, and groups of its catalogue: store.h. */
 #include "daemon/store/scan.h"
 
 #include <errno.h>
@@ -26,70 +14,8 @@
 #include "daemon/lock.h"
 #include "daemon/log.h"
 #include "daemon/store/deleted.h"
-#include "daemon/store/pages.h"
 #include "daemon/store/quarantine.h"
-
-/* Pages in the log (4 KiB each) before they are moved: enough to make it rare, few enough to keep reading fast. */
-enum { CHECKPOINT_PAGES = 1000 };
-
-/* ---- the log and the database ---- */
-
-static int on_commit(void *context, sqlite3 *db, const char *name, int pages)
-{
-	struct store *store = context;
-
-	(void)db;
-	(void)name;
-	pthread_mutex_lock(&store->checkpoint_lock);
-	store->log_pages = pages;
-	if (pages >= CHECKPOINT_PAGES)
-		pthread_cond_signal(&store->checkpoint_due);
-	pthread_mutex_unlock(&store->checkpoint_lock);
-	return SQLITE_OK;
-}
-
-static void *checkpoint_loop(void *context)
-{
-	struct store *store = context;
-	sqlite3 *db = NULL;
-	char path[1024];
-	int result;
-
-	snprintf(path, sizeof(path), "%s/catalogue.sqlite", store->directory);
-	result = sqlite3_open_v2(path, &db, SQLITE_OPEN_READWRITE | SQLITE_OPEN_NOMUTEX, pages_vfs(store->pages));
-	if (result == SQLITE_OK) {
-		sqlite3_extended_result_codes(db, 1);
-		sqlite3_busy_timeout(db, 1000);
-		result = sqlite3_exec(db, "PRAGMA synchronous = FULL", NULL, NULL, NULL);
-	}
-	if (result != SQLITE_OK)
-		store_fail(store, "no connection for checkpoints");
-	pthread_mutex_lock(&store->checkpoint_lock);
-	while (!store->closing) {
-		if (store->log_pages < CHECKPOINT_PAGES || atomic_load(&store->failed)) {
-			pthread_cond_wait(&store->checkpoint_due, &store->checkpoint_lock);
-			continue;
-		}
-		store->log_pages = 0;
-		pthread_mutex_unlock(&store->checkpoint_lock);
-		/*
-		 * Passive: takes what no reader still needs, makes nobody wait. A full disk passes; the log only
-		 * grows. Then the little that came meanwhile, and the log is emptied: one that were damaged after it
-		 * was moved would put old pages between new ones when it is recovered.
-		 */
-		result = sqlite3_wal_checkpoint_v2(db, NULL, SQLITE_CHECKPOINT_PASSIVE, NULL, NULL);
-		if (result == SQLITE_OK)
-			result = sqlite3_wal_checkpoint_v2(db, NULL, SQLITE_CHECKPOINT_TRUNCATE, NULL, NULL);
-		if ((result & 0xff) == SQLITE_IOERR && sqlite3_system_errno(db) != ENOSPC)
-			store_fail(store, sqlite3_errmsg(db));
-		else if (result != SQLITE_OK && (result & 0xff) != SQLITE_BUSY)
-			log_line(LEVEL_WARNING, "checkpoint of the catalogue: %s", sqlite3_errmsg(db));
-		pthread_mutex_lock(&store->checkpoint_lock);
-	}
-	pthread_mutex_unlock(&store->checkpoint_lock);
-	sqlite3_close(db);
-	return NULL;
-}
+#include "proto/clock.h"
 
 /* ---- opening ---- */
 
@@ -117,158 +43,11 @@ static int take_directory(struct store *store, struct error *err)
 	return deleted_open(store->directory, &store->deleted, err);
 }
 
-static void catalogue_path(const struct store *store, const char *suffix, char ret_path[1024])
-{
-	snprintf(ret_path, 1024, "%s/catalogue.sqlite%s", store->directory, suffix);
-}
-
-/* A catalogue of an earlier cbctd gets pages that check themselves: a copy, which then takes its name. */
-static int convert(const struct store *store, struct error *err)
-{
-	int result, reserve = PAGES_RESERVE, code = 0;
-	char path[1024], copy[1024], sql[1200];
-	sqlite3 *db = NULL;
-
-	catalogue_path(store, "", path);
-	catalogue_path(store, ".tmp", copy);
-	unlink(copy);
-	snprintf(sql, sizeof(sql), "VACUUM INTO '%s'", copy);
-	result = sqlite3_open_v2(path, &db, SQLITE_OPEN_READWRITE | SQLITE_OPEN_NOMUTEX, NULL);
-	if (result == SQLITE_OK)
-		result = sqlite3_file_control(db, "main", SQLITE_FCNTL_RESERVE_BYTES, &reserve);
-	if (result == SQLITE_OK)
-		result = sqlite3_exec(db, sql, NULL, NULL, NULL);
-	if (result != SQLITE_OK)
-		code = error_set(err, ERR_IO, "the catalogue cannot be converted: %s", sqlite3_errmsg(db));
-	sqlite3_close(db);
-	if (code == 0)
-		code = pages_seal(copy, err);
-	if (code != 0)
-		return code;
-	if (rename(copy, path) != 0)
-		return error_set_errno(err, errno, "rename %s", copy);
-	/* All of it is in the copy; it must not be applied to that. */
-	catalogue_path(store, "-wal", path);
-	unlink(path);
-	log_line(LEVEL_INFO, "the catalogue has checksums now");
-	return directory_sync(store->directory, err);
-}
-
-/* Before SQLite sees them: the database's first page, and the log that a crash left. */
-static int check_files(struct store *store, struct error *err)
-{
-	enum pages_kind kind = PAGES_NONE;
-	struct log_facts log = {0};
-	char path[1024], log_path[1024];
-	int code;
-
-	catalogue_path(store, "", path);
-	catalogue_path(store, "-wal", log_path);
-	code = pages_look(path, &kind, err);
-	if (code == 0 && kind != PAGES_NONE)
-		code = log_check(log_path, &log, err);
-	if (code == 0 && log.damaged)
-		code = error_set(err, ERR_IO,
-				 "its log is damaged: %ld transactions are lost behind the %ld frames that are good",
-				 log.commits_lost, log.frames);
-	if (code != 0) {
-		atomic_store(&store->damaged, true);
-		return code;
-	}
-	store->log_left = log.frames > 0 || log.commits_lost > 0;
-	if (kind == PAGES_PLAIN)
-		code = convert(store, err);
-	if (code != 0)
-		atomic_store(&store->damaged, true);
-	return code;
-}
-
-/* Nobody but us may read who was scanned. */
-static int make_private(const struct store *store, struct error *err)
-{
-	char path[1024];
-	int file, code = 0;
-
-	catalogue_path(store, "", path);
-	file = open(path, O_RDWR | O_CREAT | O_CLOEXEC, 0600);
-	if (file < 0 || fchmod(file, 0600) != 0)
-		code = error_set_errno(err, errno, "open %s", path);
-	if (file >= 0)
-		close(file);
-	return code;
-}
-
-/*
- * All of the log into the database, so that every page of it can be checked. Where the disk has no room for that the
- * log stays, and each page is checked when it is read.
- */
-static int empty_log(struct store *store, struct error *err)
-{
-	char path[1024];
-	int result, code;
-
-	do {
-		result = sqlite3_wal_checkpoint_v2(store->writer.db, NULL, SQLITE_CHECKPOINT_TRUNCATE, NULL, NULL);
-		code = result == SQLITE_OK ? 0 : connection_error(&store->writer, result & 0xff, "checkpoint", err);
-	} while (code == ERR_NO_SPACE && store_reserve_spend(store));
-	if (code == ERR_NO_SPACE) {
-		log_line(LEVEL_WARNING, "the log of the catalogue stays: %s", err->text);
-		return 0;
-	}
-	if (code != 0)
-		return code;
-	catalogue_path(store, "", path);
-	code = pages_check(path, err);
-	if (code != 0)
-		atomic_store(&store->damaged, true);
-	return code;
-}
-
-/* Pages may be whole and yet not fit together: a write that never reached the disk. */
-static int check_structure(struct store *store, struct error *err)
-{
-	struct query query;
-	char text[200] = "";
-
-	query_begin(&query, &store->writer, "PRAGMA quick_check(1)", err);
-	if (query_row(&query))
-		column_text(&query, 0, text, sizeof(text));
-	if (query_end(&query) != 0)
-		return query.code;
-	if (strcmp(text, "ok") == 0)
-		return 0;
-	atomic_store(&store->damaged, true);
-	return error_set(err, ERR_IO, "it does not fit together: %s", text);
-}
-
-static int open_connections(struct store *store, struct error *err)
-{
-	char path[1024];
-	int code = make_private(store, err);
-
-	if (code == 0)
-		code = connection_open(store, &store->writer, err);
-	if (code == 0)
-		code = empty_log(store, err);
-	if (code == 0)
-		code = check_structure(store, err);
-	if (code == 0)
-		code = connection_open(store, &store->reader, err);
-	/* Connections of this process find it by the catalogue's inode. */
-	catalogue_path(store, "-shm", path);
-	unlink(path);
-	return code;
-}
-
 static int load(struct store *store, struct error *err)
 {
 	bool fresh = false;
-	int code = check_files(store, err);
+	int code = catalogue_open(store->catalogue, &fresh, &store->interrupted, err);
 
-	if (code == 0)
-		code = open_connections(store, err);
-	if (code == 0)
-		code = store_migrate(store, &fresh, err);
 	if (code == 0)
 		code = store_reconcile(store, fresh, err);
 	if (code == 0)
@@ -285,27 +64,15 @@ static int load(struct store *store, struct error *err)
 static void unload(struct store *store)
 {
 	store_free_scans(store);
-	connection_close(&store->reader);
-	connection_close(&store->writer);
+	catalogue_close(store->catalogue);
+	store->repairs = (struct store_repairs){.remade = false};
 }
 
-/* Catalogue and log to quarantine/; what SQLite keeps beside them goes. */
 static int set_catalogue_aside(struct store *store, const char *why, struct error *err)
 {
-	static const char *const names[] = {"catalogue.sqlite", "catalogue.sqlite-wal"};
-	char path[1024];
-	int code = 0;
-
-	for (size_t i = 0; i < sizeof(names) / sizeof(names[0]) && code == 0; i++) {
-		snprintf(path, sizeof(path), "%s/%s", store->directory, names[i]);
-		if (access(path, F_OK) == 0)
-			code = quarantine_move(store->directory, names[i], why, err);
-	}
-	catalogue_path(store, "-shm", path);
-	unlink(path);
-	store->repairs = (struct store_repairs){.remade = true};
-	atomic_store(&store->damaged, false);
-	return code;
+	unload(store);
+	store->repairs.remade = true;
+	return catalogue_set_aside(store->catalogue, why, err);
 }
 
 static int open_catalogue(struct store *store, bool rebuild, struct error *err)
@@ -323,13 +90,11 @@ static int open_catalogue(struct store *store, bool rebuild, struct error *err)
 	/* The start itself writes little: the index of the log, records that follow. */
 	if (code == ERR_NO_SPACE && store_reserve_spend(store)) {
 		unload(store);
-		store->repairs = (struct store_repairs){.remade = false};
 		code = load(store, err);
 	}
-	if (code != 0 && atomic_load(&store->damaged) && !rebuild) {
+	if (code != 0 && catalogue_damaged(store->catalogue) && !rebuild) {
 		snprintf(why, sizeof(why), "the catalogue is damaged and made again from the directories: %.300s",
 			 err->text);
-		unload(store);
 		code = set_catalogue_aside(store, why, err);
 		if (code == 0)
 			code = load(store, err);
@@ -337,18 +102,25 @@ static int open_catalogue(struct store *store, bool rebuild, struct error *err)
 	if (code != 0)
 		return code;
 	store->opened = true;
-	sqlite3_wal_hook(store->writer.db, on_commit, store);
-	code = pthread_create(&store->checkpointer, NULL, checkpoint_loop, store);
-	if (code != 0)
-		return error_set_errno(err, code, "thread for checkpoints");
-	store->has_checkpointer = true;
-	return store_start_checker(store, err);
+	code = catalogue_start(store->catalogue, err);
+	return code == 0 ? store_start_checker(store, err) : code;
+}
+
+static void on_failure(void *context, const char *what)
+{
+	store_fail(context, what);
+}
+
+static bool make_room(void *context)
+{
+	return store_reserve_spend(context);
 }
 
 static int open_store(const char *directory, const struct store_hooks *hooks, bool rebuild, struct store **ret_store,
 		      struct error *err)
 {
 	struct store *store = calloc(1, sizeof(*store));
+	struct catalogue_hooks own = {.context = store, .failed = on_failure, .make_room = make_room};
 	int code;
 
 	if (store == NULL)
@@ -363,18 +135,13 @@ static int open_store(const char *directory, const struct store_hooks *hooks, bo
 	store->lock_file = -1;
 	atomic_flag_clear(&store->failure_told);
 	lock_init(&store->insertion_lock, LOCK_INSERTION);
-	store->writer.store = store->reader.store = store;
-	lock_init(&store->writer.lock, LOCK_CATALOGUE);
-	lock_init(&store->reader.lock, LOCK_CATALOGUE);
 	lock_init(&store->scans_lock, LOCK_SCANS);
-	lock_init(&store->checkpoint_lock, LOCK_CHECKPOINT);
-	pthread_cond_init(&store->checkpoint_due, NULL);
 	lock_init(&store->check_lock, LOCK_CHECKS);
 	pthread_cond_init(&store->check_due, NULL);
 	watch_list_init(&store->arrivals);
 	code = verified_new(&store->verified, err);
 	if (code == 0)
-		code = pages_new(&store->pages, err);
+		code = catalogue_new(directory, &own, &store->catalogue, err);
 	if (code == 0)
 		code = open_catalogue(store, rebuild, err);
 	if (code != 0) {
@@ -413,6 +180,18 @@ const char *store_directory(const struct store *store)
 }
 
 /* ---- the disk ---- */
+
+void store_fail(struct store *store, const char *what)
+{
+	if (!store->opened)
+		return; /* store_open fails instead */
+	atomic_store(&store->failed, true);
+	if (!atomic_flag_test_and_set(&store->failure_told)) {
+		log_line(LEVEL_ERROR, "the catalogue has failed, nothing more is accepted: %s", what);
+		if (store->hooks.failed != NULL)
+			store->hooks.failed(store->hooks.context, what);
+	}
+}
 
 void store_distrust(struct store *store, const struct error *err)
 {
@@ -474,29 +253,68 @@ void store_close(struct store *store)
 	if (store == NULL)
 		return;
 	store_stop_checker(store);
-	if (store->has_checkpointer) {
-		pthread_mutex_lock(&store->checkpoint_lock);
-		store->closing = true;
-		pthread_cond_signal(&store->checkpoint_due);
-		pthread_mutex_unlock(&store->checkpoint_lock);
-		pthread_join(store->checkpointer, NULL);
-	}
-	unload(store);
-	pages_free(store->pages);
+	store_free_scans(store);
+	catalogue_free(store->catalogue);
 	deleted_free(store->deleted);
-	pthread_mutex_destroy(&store->reader.lock);
-	pthread_mutex_destroy(&store->writer.lock);
 	watch_list_destroy(&store->arrivals);
 	verified_free(store->verified);
-	pthread_cond_destroy(&store->checkpoint_due);
 	pthread_cond_destroy(&store->check_due);
 	pthread_mutex_destroy(&store->check_lock);
-	pthread_mutex_destroy(&store->checkpoint_lock);
 	pthread_mutex_destroy(&store->scans_lock);
 	pthread_mutex_destroy(&store->insertion_lock);
 	if (store->lock_file >= 0)
 		close(store->lock_file);
 	free(store);
+}
+
+/* ---- groups of the catalogue ---- */
+
+static int begin(struct store *store, bool synced, struct error *err)
+{
+	int code = catalogue_begin(store->catalogue, synced, err);
+
+	if (code == 0 && atomic_load(&store->failed)) {
+		code = error_set(err, ERR_IO, "the catalogue has failed before; nothing more is stored");
+		catalogue_end(store->catalogue, code, err);
+	}
+	return code;
+}
+
+int store_begin(struct store *store, struct error *err)
+{
+	return begin(store, true, err);
+}
+
+int store_begin_unsynced(struct store *store, struct error *err)
+{
+	return begin(store, false, err);
+}
+
+int store_end(struct store *store, int code, struct error *err)
+{
+	long long event = store->event_written, last;
+	double before = clock_monotonic();
+
+	store->event_written = 0;
+	code = catalogue_end(store->catalogue, code, err);
+	if (code != 0)
+		return code;
+	/* The next group may have been faster. */
+	last = atomic_load(&store->last_event);
+	while (event > last && !atomic_compare_exchange_weak(&store->last_event, &last, event))
+		;
+	atomic_fetch_add(&store->commits, 1);
+	atomic_fetch_add(&store->commit_microseconds, (unsigned long long)((clock_monotonic() - before) * 1e6));
+	return 0;
+}
+
+int store_note_deletion(struct store *store, int kind, const char *id, struct error *err)
+{
+	int code = deleted_add(store->deleted, (enum deleted_kind)kind, id, err);
+
+	if (code != 0)
+		store_distrust(store, err);
+	return code;
 }
 
 void store_statistics(struct store *store, struct store_statistics *ret)

@@ -305,6 +305,7 @@ struct job_record {
 	enum stage stage;
 	int iteration;
 	double fraction;
+	long long stamp; /* of its record in its directory; store/record.h */
 	/* Memory only. */
 	bool attended;     /* it waits, and a worker reconstructs what arrives */
 	int reconstructed; /* projections */

@@ -191,7 +191,6 @@ void stored_scan_lose_image(struct stored_scan *scan, enum image image)
 
 int store_forget_lost(struct stored_scan *scan, struct error *err)
 {
-	struct query query;
 	bool whole, lost;
 	int file, code = stored_scan_open_records(scan, &whole, &file, err);
 
@@ -208,13 +207,8 @@ int store_forget_lost(struct stored_scan *scan, struct error *err)
 		if (!lost)
 			continue;
 		code = sums_put(file, i, NULL, err);
-		if (code == 0) {
-			query_begin(&query, &scan->store->writer, "DELETE FROM projections WHERE scan = ? AND view = ?",
-				    err);
-			query_integer(&query, scan->number);
-			query_integer(&query, i);
-			code = query_run(&query);
-		}
+		if (code == 0)
+			code = catalogue_remove_projection(scan->store->catalogue, scan->number, i, err);
 	}
 	close(file);
 	return code;

@@ -71,14 +71,10 @@ static int write_records(const struct stored_scan *scan, const struct records *r
 static int put_row(struct store *store, const struct stored_scan *scan, int index, const struct sum *sum,
 		   struct error *err)
 {
-	struct query query;
+	struct catalogue_projection row = {.scan = scan->number, .view = index};
 
-	query_begin(&query, &store->writer, "INSERT OR REPLACE INTO projections (scan, view, sha256) VALUES (?, ?, ?)",
-		    err);
-	query_integer(&query, scan->number);
-	query_integer(&query, index);
-	query_blob(&query, sum->sha256, sizeof(sum->sha256));
-	return query_run(&query);
+	memcpy(row.sha256, sum->sha256, sizeof(row.sha256));
+	return catalogue_put_projection(store->catalogue, &row, err);
 }
 
 static bool row_fits(const struct stored_scan *scan, int index, const struct sum *sum)
@@ -108,30 +104,19 @@ static int follow_projections(struct store *store, const struct stored_scan *sca
 	return store_end(store, code, err);
 }
 
-/* A column of the scan's row: the SHA-256, or 1 without. */
-static int put_column(struct store *store, const struct stored_scan *scan, const char *statement, const struct sum *sum,
-		      struct error *err)
+static int put_image(struct store *store, const struct stored_scan *scan, enum image image, const struct sum *sum,
+		     struct error *err)
 {
-	struct query query;
 	int code = store_begin(store, err);
 
-	if (code != 0)
-		return code;
-	query_begin(&query, &store->writer, statement, err);
-	if (sum != NULL)
-		query_blob(&query, sum->sha256, 32);
-	else
-		query_integer(&query, 1);
-	query_integer(&query, scan->number);
-	return store_end(store, query_run(&query), err);
+	return code == 0
+		   ? store_end(store, catalogue_set_image(store->catalogue, scan->id, image, sum->sha256, err), err)
+		   : code;
 }
 
 /* The same of the images and of the scan's end. */
 static int follow_parts(struct store *store, struct stored_scan *scan, const struct records *records, struct error *err)
 {
-	static const char *const statements[IMAGE_COUNT] = {"UPDATE scans SET flat = ? WHERE number = ?",
-							    "UPDATE scans SET dark = ? WHERE number = ?",
-							    "UPDATE scans SET defects = ? WHERE number = ?"};
 	int code = 0;
 
 	for (int i = 0; i < IMAGE_COUNT && code == 0; i++) {
@@ -140,7 +125,7 @@ static int follow_parts(struct store *store, struct stored_scan *scan, const str
 		if (records->part_states[SUMS_FLAT + i - SUMS_SCAN] != SUM_GOOD ||
 		    (scan->image[i] == STORED && memcmp(scan->image_sha256[i], sum->sha256, 32) == 0))
 			continue;
-		code = put_column(store, scan, statements[i], sum, err);
+		code = put_image(store, scan, (enum image)i, sum, err);
 		memcpy(scan->image_sha256[i], sum->sha256, 32);
 		scan->image[i] = STORED;
 	}
@@ -153,7 +138,8 @@ static int follow_parts(struct store *store, struct stored_scan *scan, const str
 	if (code != 0 || scan->closed || records->part_states[SUMS_CLOSED - SUMS_SCAN] != SUM_GOOD)
 		return code;
 	scan->closed = scan->closing = true;
-	return put_column(store, scan, "UPDATE scans SET closed = ? WHERE number = ?", NULL, err);
+	code = store_begin(store, err);
+	return code == 0 ? store_end(store, catalogue_set_closed(store->catalogue, scan->id, err), err) : code;
 }
 
 struct arrival {

@@ -13,7 +13,7 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
-#include "daemon/store/db.h"
+#include "daemon/store/internal.h"
 #include "proto/clock.h"
 #include "proto/format.h"
 #include "proto/seal.h"

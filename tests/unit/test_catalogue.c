@@ -8,7 +8,7 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
-#include "daemon/store/pages.h"
+#include "daemon/store/sqlite_pages.h"
 #include "daemon/store/quarantine.h"
 #include "proto/scan_directory.h"
 #include "tests/unit/state.h"
@@ -497,16 +497,17 @@ START_TEST(a_catalogue_of_an_earlier_version_is_taken_over)
 	char *before = picture(), path[1024];
 	enum pages_kind kind;
 	struct error err = {0};
+	int version;
 
 	state_close(&state);
 	snprintf(path, sizeof(path), "%s", state_path(&state, "catalogue.sqlite"));
 	make_plain(path);
-	ck_assert_int_eq(pages_look(path, &kind, &err), 0);
+	ck_assert_int_eq(pages_look(path, &kind, &version, &err), 0);
 	ck_assert_int_eq(kind, PAGES_PLAIN);
 	ck_assert_int_eq(unlink(state_path(&state, "jobs/%s/record.json", job_id)), 0);
 	ck_assert_int_eq(unlink(state_path(&state, "scans/%s/record.json", scan_id)), 0);
 	state_reopen(&state);
-	ck_assert_int_eq(pages_look(path, &kind, &err), 0);
+	ck_assert_int_eq(pages_look(path, &kind, &version, &err), 0);
 	ck_assert_int_eq(kind, PAGES_CHECKED);
 	ck_assert(path_exists(state_path(&state, "jobs/%s/record.json", job_id)));
 	ck_assert(path_exists(state_path(&state, "scans/%s/record.json", scan_id)));

@@ -12,7 +12,7 @@
 #include <unistd.h>
 
 #include "daemon/files.h"
-#include "daemon/store/pages.h"
+#include "daemon/store/sqlite_pages.h"
 #include "proto/scan_directory.h"
 #include "tests/unit/state.h"
 

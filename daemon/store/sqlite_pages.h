@@ -1,5 +1,5 @@
-#ifndef CBCT_DAEMON_STORE_PAGES_H
-#define CBCT_DAEMON_STORE_PAGES_H
+#ifndef CBCT_DAEMON_STORE_SQLITE_PAGES_H
+#define CBCT_DAEMON_STORE_SQLITE_PAGES_H
 
 #include <sqlite3.h>
 #include <stdbool.h>
@@ -29,8 +29,8 @@ enum pages_kind {
 	PAGES_PLAIN,  /* without checksums: made by an earlier cbctd */
 	PAGES_CHECKED /* with them */
 };
-/* ERR_IO: it cannot be read, or is none. */
-int pages_look(const char *path, enum pages_kind *ret_kind, struct error *err);
+/* *ret_version: its user_version, as far as the log has not another. ERR_IO: it cannot be read, or is none. */
+int pages_look(const char *path, enum pages_kind *ret_kind, int *ret_version, struct error *err);
 /* Reads all pages of a file with checksums. ERR_IO: one is damaged, or some are missing; the text says which. */
 int pages_check(const char *path, struct error *err);
 /* Gives a closed file with reserved bytes its checksums, synced. */
@@ -44,6 +44,7 @@ int pages_seal(const char *path, struct error *err);
 struct log_facts {
 	long frames;       /* that are good; 0 too where there is no log */
 	long commits_lost; /* ends of transactions behind the first frame that is not */
+	int version;       /* the user_version that they leave; -1: that of the database file */
 	bool damaged;      /* more of it does not fit than one transaction in the midst of which everything ended */
 };
 int log_check(const char *path, struct log_facts *ret, struct error *err);

@@ -1,9 +1,9 @@
 /*
- * The VFS under the catalogue: store/pages.h. A database file is written page by page when the log is moved into it, so
- * the checksum is made there, in a copy. Offsets in the log: a header of 32 bytes, then frames of 24 bytes and a page
- * (https://sqlite.org/fileformat2.html, section 4).
+ * The VFS under the catalogue: store/sqlite_pages.h. A database file is written page by page when the log is moved into
+ * it, so the checksum is made there, in a copy. Offsets in the log: a header of 32 bytes, then frames of 24 bytes and a
+ * page (https://sqlite.org/fileformat2.html, section 4).
  */
-#include "daemon/store/pages.h"
+#include "daemon/store/sqlite_pages.h"
 
 #include <errno.h>
 #include <fcntl.h>
@@ -25,7 +25,8 @@ enum {
 	LOG_HEADER = 32,
 	FRAME_HEADER = 24,
 	FRAME = FRAME_HEADER + PAGES_BYTES,
-	DATABASE_HEADER = 100
+	DATABASE_HEADER = 100,
+	HEADER_VERSION = 60 /* in it: PRAGMA user_version */
 };
 static const unsigned char mark[4] = {'C', 'B', 'P', '1'};
 
@@ -366,7 +367,7 @@ static int look_at_header(const unsigned char *page, enum pages_kind *ret_kind, 
 	return 0;
 }
 
-int pages_look(const char *path, enum pages_kind *ret_kind, struct error *err)
+int pages_look(const char *path, enum pages_kind *ret_kind, int *ret_version, struct error *err)
 {
 	unsigned char page[PAGES_BYTES] = {0};
 	size_t size;
@@ -382,6 +383,8 @@ int pages_look(const char *path, enum pages_kind *ret_kind, struct error *err)
 		code = err->code;
 	else
 		code = look_at_header(page, ret_kind, err);
+	if (code == 0)
+		*ret_version = (int)big(page + HEADER_VERSION);
 	if (file >= 0)
 		close(file);
 	return code;
@@ -486,6 +489,7 @@ struct log_walk {
 	unsigned char salts[8];
 	bool broken;
 	long frames, last_commit; /* frames that fit, and those of them up to the last end of a transaction */
+	int version;              /* in the last first page among the frames that fit; -1: there was none */
 };
 
 static void walk_frame(struct log_walk *walk, const unsigned char *frame, struct log_facts *facts)
@@ -497,8 +501,12 @@ static void walk_frame(struct log_walk *walk, const unsigned char *frame, struct
 		log_sum(walk->sum, frame + FRAME_HEADER, PAGES_BYTES, walk->big_endian);
 		walk->broken = !current || big(frame + 16) != walk->sum[0] || big(frame + 20) != walk->sum[1];
 		walk->frames += !walk->broken;
-		if (!walk->broken && big(frame + 4) != 0)
+		if (!walk->broken && big(frame) == 1)
+			walk->version = (int)big(frame + FRAME_HEADER + HEADER_VERSION);
+		if (!walk->broken && big(frame + 4) != 0) {
 			walk->last_commit = walk->frames;
+			facts->version = walk->version;
+		}
 	}
 	/* Frames of an earlier round of the log have other salts. */
 	if (walk->broken && current && big(frame + 4) != 0)
@@ -508,7 +516,7 @@ static void walk_frame(struct log_walk *walk, const unsigned char *frame, struct
 static int walk_log(int file, size_t size, const char *path, struct log_facts *ret, struct error *err)
 {
 	unsigned char header[LOG_HEADER], *frame;
-	struct log_walk walk = {0};
+	struct log_walk walk = {.version = -1};
 	uint32_t magic;
 	int code = file_read_at(file, header, sizeof(header), 0, path, err);
 
@@ -540,7 +548,7 @@ int log_check(const char *path, struct log_facts *ret, struct error *err)
 	size_t size;
 	int file, code = open_file(path, O_RDONLY, &file, &size, err);
 
-	*ret = (struct log_facts){0};
+	*ret = (struct log_facts){.version = -1};
 	if (code != 0 || file < 0)
 		return code;
 	if (size >= LOG_HEADER)

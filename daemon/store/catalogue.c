@@ -1,0 +1,428 @@
+/* The catalogue over whatever database runs its statements: store/catalogue.h. */
+#include "daemon/store/catalogue.h"
+
+#include <assert.h>
+#include <errno.h>
+#include <pthread.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "daemon/lock.h"
+#include "daemon/store/catalogue_internal.h"
+#include "daemon/store/upgrade.h"
+
+extern const struct catalogue_backend catalogue_sqlite;
+
+/* The first is used. */
+static const struct catalogue_backend *const catalogue_backends[] = {&catalogue_sqlite};
+
+static const enum table_id record_tables[RECORD_KINDS] = {TABLE_SCANS, TABLE_JOBS};
+
+/* ---- opening ---- */
+
+static int make_statements(struct catalogue *catalogue, struct error *err)
+{
+	bool made = true;
+
+	for (int i = 0; i < TABLE_COUNT; i++) {
+		for (int j = 0; j < STATEMENT_COUNT; j++) {
+			catalogue->statements[i][j] = table_statement(&tables[i], (enum statement)j);
+			made = made && catalogue->statements[i][j] != NULL;
+		}
+		for (int j = 0; j < tables[i].count; j++) {
+			catalogue->assignments[i][j] = table_assignment(&tables[i], j);
+			made = made && catalogue->assignments[i][j] != NULL;
+		}
+	}
+	return made ? 0 : error_set_errno(err, ENOMEM, "catalogue");
+}
+
+int catalogue_new(const char *directory, const struct catalogue_hooks *hooks, struct catalogue **ret_catalogue,
+		  struct error *err)
+{
+	struct catalogue *catalogue = calloc(1, sizeof(*catalogue));
+	int code;
+
+	if (catalogue == NULL)
+		return error_set_errno(err, ENOMEM, "catalogue");
+	snprintf(catalogue->site.directory, sizeof(catalogue->site.directory), "%s", directory);
+	catalogue->site.context = hooks->context;
+	catalogue->site.failed = hooks->failed;
+	catalogue->site.make_room = hooks->make_room;
+	catalogue->backend = catalogue_backends[0];
+	for (int i = 0; i < SESSION_COUNT; i++)
+		lock_init(&catalogue->locks[i], LOCK_CATALOGUE);
+	code = make_statements(catalogue, err);
+	if (code != 0)
+		catalogue_free(catalogue);
+	else
+		*ret_catalogue = catalogue;
+	return code;
+}
+
+void catalogue_free(struct catalogue *catalogue)
+{
+	if (catalogue == NULL)
+		return;
+	catalogue_close(catalogue);
+	for (int i = 0; i < SESSION_COUNT; i++)
+		pthread_mutex_destroy(&catalogue->locks[i]);
+	for (int i = 0; i < TABLE_COUNT; i++) {
+		for (int j = 0; j < STATEMENT_COUNT; j++)
+			free(catalogue->statements[i][j]);
+		for (int j = 0; j < COLUMNS_MAX; j++)
+			free(catalogue->assignments[i][j]);
+	}
+	free(catalogue);
+}
+
+int catalogue_open(struct catalogue *catalogue, bool *ret_fresh, bool *ret_interrupted, struct error *err)
+{
+	const struct catalogue_backend *backend = catalogue->backend;
+	int version = 0, code = backend->look(&catalogue->site, &version, ret_interrupted, err);
+
+	if (code == 0 && version > CATALOGUE_VERSION)
+		code = error_set(err, ERR_CONFLICT,
+				 "the catalogue has version %d, made by a later cbctd; this one knows %d", version,
+				 CATALOGUE_VERSION);
+	if (code == 0)
+		code = backend->open(&catalogue->site, &catalogue->database, err);
+	if (code == 0 && version < CATALOGUE_VERSION)
+		code = catalogue_upgrade(backend, catalogue->database, version, err);
+	if (code != 0)
+		catalogue_close(catalogue);
+	else
+		*ret_fresh = version == 0;
+	return code;
+}
+
+void catalogue_close(struct catalogue *catalogue)
+{
+	catalogue->backend->close(catalogue->database);
+	catalogue->database = NULL;
+}
+
+bool catalogue_damaged(const struct catalogue *catalogue)
+{
+	return atomic_load(&catalogue->site.damaged);
+}
+
+int catalogue_set_aside(struct catalogue *catalogue, const char *why, struct error *err)
+{
+	catalogue_close(catalogue);
+	atomic_store(&catalogue->site.damaged, false);
+	return catalogue->backend->set_aside(&catalogue->site, why, err);
+}
+
+int catalogue_start(struct catalogue *catalogue, struct error *err)
+{
+	return catalogue->backend->start(catalogue->database, err);
+}
+
+int catalogue_freeze(struct catalogue *catalogue, struct error *err)
+{
+	return catalogue->backend->freeze(catalogue->database, true, err);
+}
+
+int catalogue_thaw(struct catalogue *catalogue, struct error *err)
+{
+	return catalogue->backend->freeze(catalogue->database, false, err);
+}
+
+/* ---- groups ---- */
+
+int catalogue_begin(struct catalogue *catalogue, bool synced, struct error *err)
+{
+	int code;
+
+	pthread_mutex_lock(&catalogue->locks[SESSION_WRITER]);
+	code = catalogue->backend->begin(catalogue->database, synced, err);
+	if (code != 0)
+		pthread_mutex_unlock(&catalogue->locks[SESSION_WRITER]);
+	return code;
+}
+
+int catalogue_end(struct catalogue *catalogue, int code, struct error *err)
+{
+	struct error ignored;
+
+	if (code == 0)
+		code = catalogue->backend->end(catalogue->database, true, err);
+	else
+		catalogue->backend->end(catalogue->database, false, &ignored);
+	pthread_mutex_unlock(&catalogue->locks[SESSION_WRITER]);
+	return code;
+}
+
+/* ---- statements ---- */
+
+int catalogue_write(struct catalogue *catalogue, const char *sql, const struct value *values, int count,
+		    struct error *err)
+{
+	return catalogue->backend->run(catalogue->database, SESSION_WRITER, sql, values, count, NULL, NULL, err);
+}
+
+int catalogue_read(struct catalogue *catalogue, const char *sql, const struct value *values, int count,
+		   row_function row, void *context, struct error *err)
+{
+	int code;
+
+	pthread_mutex_lock(&catalogue->locks[SESSION_READER]);
+	code = catalogue->backend->run(catalogue->database, SESSION_READER, sql, values, count, row, context, err);
+	pthread_mutex_unlock(&catalogue->locks[SESSION_READER]);
+	return code;
+}
+
+int catalogue_try(struct catalogue *catalogue, struct error *err)
+{
+	return catalogue_write(catalogue, "SAVEPOINT part", NULL, 0, err);
+}
+
+int catalogue_try_end(struct catalogue *catalogue, int code, struct error *err)
+{
+	struct error ignored;
+
+	if (code != 0)
+		catalogue_write(catalogue, "ROLLBACK TO part", NULL, 0, &ignored);
+	return catalogue_write(catalogue, "RELEASE part", NULL, 0, code == 0 ? err : &ignored) != 0 && code == 0
+		   ? err->code
+		   : code;
+}
+
+static int note_row(void *context, const struct value *values, struct error *err)
+{
+	long long *first = context;
+
+	(void)err;
+	*first = values[0].type == VALUE_INTEGER ? values[0].integer : 1;
+	return 0;
+}
+
+int catalogue_write_record(struct catalogue *catalogue, enum table_id table, enum statement statement,
+			   const char *parent, const void *record, long long *ret_first, struct error *err)
+{
+	const struct value id = value_text(parent);
+	long long first = 0;
+	struct row row;
+	int code, count = row_of_record(&tables[table], statement, record, &id, &row, err);
+
+	code = count < 0 ? count
+			 : catalogue->backend->run(catalogue->database, SESSION_WRITER,
+						   catalogue->statements[table][statement], row.values, count, note_row,
+						   &first, err);
+	row_clear(&row);
+	if (code == 0 && ret_first != NULL)
+		*ret_first = first;
+	return code;
+}
+
+int catalogue_remove_rows(struct catalogue *catalogue, enum table_id table, const char *id, struct error *err)
+{
+	const struct value value = value_text(id);
+
+	return catalogue_write(catalogue, catalogue->statements[table][STATEMENT_REMOVE], &value, 1, err);
+}
+
+int catalogue_assign(struct catalogue *catalogue, enum table_id table, const char *name, const void *record,
+		     const char *id, struct error *err)
+{
+	struct row row;
+	int column = 0, code;
+
+	while (strcmp(tables[table].columns[column].name, name) != 0)
+		column++;
+	assert(tables[table].columns[column].assigned);
+	code = row_of_column(&tables[table].columns[column], record, &row, err);
+	row.values[1] = value_text(id);
+	if (code == 0)
+		code = catalogue_write(catalogue, catalogue->assignments[table][column], row.values, 2, err);
+	row_clear(&row);
+	return code;
+}
+
+struct listing {
+	const struct table *table;
+	char *records;
+	int count;
+};
+
+static int add_record(void *context, const struct value *values, struct error *err)
+{
+	struct listing *listing = context;
+	size_t size = listing->table->size;
+	int count = listing->count;
+
+	if ((count & (count - 1)) == 0) { /* the array doubles */
+		char *more = realloc(listing->records, (size_t)(count == 0 ? 1 : 2 * count) * size);
+
+		if (more == NULL)
+			return error_set_errno(err, ENOMEM, "rows of %s", listing->table->name);
+		listing->records = more;
+	}
+	memset(listing->records + (size_t)count * size, 0, size);
+	listing->count++;
+	return record_of_row(listing->table, values, listing->records + (size_t)count * size, err);
+}
+
+int catalogue_list(struct catalogue *catalogue, enum table_id table, const struct value *parent, void **ret_records,
+		   int *ret_count, struct error *err)
+{
+	struct listing listing = {.table = &tables[table]};
+	int code = catalogue_read(catalogue, catalogue->statements[table][STATEMENT_LIST], parent, parent != NULL,
+				  add_record, &listing, err);
+
+	if (code != 0) {
+		for (int i = 0; i < listing.count; i++)
+			table_clear(listing.table, listing.records + (size_t)i * listing.table->size);
+		free(listing.records);
+		return code;
+	}
+	*ret_records = listing.records;
+	*ret_count = listing.count;
+	return 0;
+}
+
+/* ---- scans and jobs alike ---- */
+
+int catalogue_remove(struct catalogue *catalogue, enum record_kind kind, const char *id, struct error *err)
+{
+	return catalogue_remove_rows(catalogue, record_tables[kind], id, err);
+}
+
+int catalogue_set_stamp(struct catalogue *catalogue, enum record_kind kind, const char *id, long long stamp,
+			struct error *err)
+{
+	const struct catalogue_scan scan = {.stamp = stamp};
+	const struct job_record job = {.stamp = stamp};
+
+	return kind == RECORD_SCAN ? catalogue_assign(catalogue, TABLE_SCANS, "stamp", &scan, id, err)
+				   : catalogue_assign(catalogue, TABLE_JOBS, "stamp", &job, id, err);
+}
+
+struct stamp_visit {
+	int (*visit)(void *context, const char *id, long long stamp, struct error *err);
+	void *context;
+};
+
+static int visit_stamp(void *context, const struct value *values, struct error *err)
+{
+	const struct stamp_visit *visit = context;
+
+	return visit->visit(visit->context, values[0].bytes, values[1].integer, err);
+}
+
+int catalogue_stamps(struct catalogue *catalogue, enum record_kind kind,
+		     int (*visit)(void *context, const char *id, long long stamp, struct error *err), void *context,
+		     struct error *err)
+{
+	static const char *const statements[RECORD_KINDS] = {"SELECT id, stamp FROM scans ORDER BY id",
+							     "SELECT id, stamp FROM jobs ORDER BY id"};
+	struct stamp_visit each = {visit, context};
+
+	return catalogue->backend->run(catalogue->database, SESSION_WRITER, statements[kind], NULL, 0, visit_stamp,
+				       &each, err);
+}
+
+/* The tables whose rows go into a record beneath that of the scan or job; projections have records of their own. */
+static bool is_beneath(const struct table *table, enum record_kind kind)
+{
+	return table->parent != NULL && !table->by_number &&
+	       strcmp(table->parent, tables[record_tables[kind]].name) == 0;
+}
+
+struct exported {
+	const struct table *table;
+	cJSON *list;
+};
+
+static int export_row(void *context, const struct value *values, struct error *err)
+{
+	const struct exported *exported = context;
+	cJSON *object = json_of_row(exported->table, values);
+
+	if (object == NULL)
+		return error_set_errno(err, ENOMEM, "rows of %s", exported->table->name);
+	cJSON_AddItemToArray(exported->list, object);
+	return 0;
+}
+
+static int export_rows(struct catalogue *catalogue, enum table_id table, enum statement statement, const char *id,
+		       cJSON *rows, struct error *err)
+{
+	struct exported exported = {&tables[table], cJSON_AddArrayToObject(rows, tables[table].name)};
+	const struct value value = value_text(id);
+
+	return catalogue->backend->run(catalogue->database, SESSION_WRITER, catalogue->statements[table][statement],
+				       &value, 1, export_row, &exported, err);
+}
+
+int catalogue_export(struct catalogue *catalogue, enum record_kind kind, const char *id, cJSON **ret_rows,
+		     struct error *err)
+{
+	enum table_id own = record_tables[kind];
+	cJSON *rows = cJSON_CreateObject();
+	int code = export_rows(catalogue, own, STATEMENT_GET, id, rows, err);
+
+	for (int i = 0; i < TABLE_COUNT && code == 0; i++) {
+		if (is_beneath(&tables[i], kind))
+			code = export_rows(catalogue, (enum table_id)i, STATEMENT_LIST, id, rows, err);
+	}
+	if (code == 0 && cJSON_GetArraySize(cJSON_GetObjectItemCaseSensitive(rows, tables[own].name)) == 0) {
+		cJSON_Delete(rows);
+		rows = NULL;
+	}
+	if (code == 0)
+		*ret_rows = rows;
+	else
+		cJSON_Delete(rows);
+	return code;
+}
+
+static int import_row(struct catalogue *catalogue, enum table_id table, enum statement statement, const char *id,
+		      const cJSON *object, struct error *err)
+{
+	const struct value parent = value_text(id);
+	struct row row;
+	int code, count = row_of_json(&tables[table], statement, object, &parent, &row, err);
+
+	code = count < 0 ? count
+			 : catalogue_write(catalogue, catalogue->statements[table][statement], row.values, count, err);
+	row_clear(&row);
+	/* It breaks a rule of the table: a number or key that another row has. */
+	if (code == ERR_INTERNAL)
+		code = error_set(err, ERR_INVALID, "its row of %s does not fit beside the others", tables[table].name);
+	return code;
+}
+
+static int import_own(struct catalogue *catalogue, enum record_kind kind, const cJSON *object, struct error *err)
+{
+	cJSON *row = cJSON_Duplicate(object, true);
+	int code = kind == RECORD_JOB ? catalogue_upgrade_job(row, err) : 0;
+
+	if (code == 0)
+		code = import_row(catalogue, record_tables[kind], STATEMENT_PUT, NULL, row, err);
+	cJSON_Delete(row);
+	return code;
+}
+
+int catalogue_import(struct catalogue *catalogue, enum record_kind kind, const char *id, const cJSON *rows,
+		     struct error *err)
+{
+	const char *name = tables[record_tables[kind]].name;
+	const cJSON *row;
+	int code =
+	    import_own(catalogue, kind, cJSON_GetArrayItem(cJSON_GetObjectItemCaseSensitive(rows, name), 0), err);
+
+	for (int i = 0; i < TABLE_COUNT && code == 0; i++) {
+		if (!is_beneath(&tables[i], kind))
+			continue;
+		code = catalogue_remove_rows(catalogue, (enum table_id)i, id, err);
+		cJSON_ArrayForEach(row, cJSON_GetObjectItemCaseSensitive(rows, tables[i].name))
+		{
+			if (code == 0)
+				code = import_row(catalogue, (enum table_id)i, STATEMENT_RESTORE, id, row, err);
+		}
+	}
+	return code;
+}
