@@ -235,6 +235,8 @@ struct backend {
 	int (*volume_new)(struct device *device, const struct grid *grid, struct volume **ret_volume,
 			  struct error *err);
 	void (*volume_free)(struct volume *volume); /* NULL is fine */
+	/* Bytes that volume_new takes of the device's memory. */
+	size_t (*volume_bytes)(const struct grid *grid);
 	int (*volume_upload)(struct volume *volume, const float *from, struct error *err);
 	/* Slices z_first .. z_first + z_count - 1; the others stay. */
 	int (*volume_put)(struct volume *volume, int z_first, int z_count, const float *from, struct error *err);
@@ -246,7 +248,7 @@ struct backend {
 	int (*stack_new)(struct device *device, int columns, int rows, int slots, struct stack **ret_stack,
 			 struct error *err);
 	void (*stack_free)(struct stack *stack); /* NULL is fine */
-	/* What stack_new takes of the device's memory. */
+	/* Bytes that stack_new takes of the device's memory. */
 	size_t (*stack_bytes)(int columns, int rows, int slots);
 	int (*stack_download)(struct stack *stack, int slot, int count, float *ret_to, struct error *err);
 	/* Line integrals [slot][row][column]; `from` has been read when it returns. */

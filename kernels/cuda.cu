@@ -225,6 +225,7 @@ const struct backend backend_cuda = {
     .describe = cuda_describe,
     .volume_new = cuda_volume_new,
     .volume_free = cuda_volume_free,
+    .volume_bytes = cuda_volume_bytes,
     .volume_upload = cuda_volume_upload,
     .volume_put = cuda_volume_put,
     .volume_download = cuda_volume_download,

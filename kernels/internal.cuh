@@ -510,6 +510,7 @@ const char *cuda_plan_summary(const struct plan *plan);
 int cuda_plan_batch(const struct plan *plan);
 int cuda_volume_new(struct device *device, const struct grid *grid, struct volume **ret_volume, struct error *err);
 void cuda_volume_free(struct volume *volume);
+size_t cuda_volume_bytes(const struct grid *grid);
 int cuda_volume_upload(struct volume *volume, const float *from, struct error *err);
 int cuda_volume_put(struct volume *volume, int z_first, int z_count, const float *from, struct error *err);
 int cuda_volume_download(struct volume *volume, int z_first, int z_count, float *ret_to, struct error *err);

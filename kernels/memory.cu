@@ -120,6 +120,11 @@ static int event_new(cudaEvent_t *ret_event, struct error *err)
 	return 0;
 }
 
+size_t cuda_volume_bytes(const struct grid *grid)
+{
+	return grid_voxels(grid) * sizeof(float);
+}
+
 int cuda_volume_new(struct device *device, const struct grid *grid, struct volume **ret_volume, struct error *err)
 {
 	struct volume *volume = (struct volume *)calloc(1, sizeof(*volume));
@@ -130,7 +135,7 @@ int cuda_volume_new(struct device *device, const struct grid *grid, struct volum
 	volume->device = device;
 	for (int i = 0; i < 3; i++)
 		volume->size[i] = grid->size[i];
-	volume->bytes = grid_voxels(grid) * sizeof(float);
+	volume->bytes = cuda_volume_bytes(grid);
 	code = device_allocate(device, volume->bytes, (void **)&volume->data, err);
 	if (code == 0)
 		code = event_new(&volume->used, err);

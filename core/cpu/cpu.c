@@ -185,16 +185,15 @@ static void cpu_describe(struct device *device, struct device_info *ret_info)
  */
 static const size_t LARGE_PAGE = (size_t)2 << 20;
 
-float *cpu_floats(struct device *device, size_t count, const char *what, struct error *err)
+void *cpu_allocate(struct device *device, size_t bytes, const char *what, struct error *err)
 {
-	size_t bytes, alignment = 64;
-	float *floats;
+	size_t alignment = 4096;
+	void *memory;
 
-	if (count > SIZE_MAX / 8) {
-		error_set(err, ERR_NO_MEMORY, "%s: %zu floats are beyond any memory", what, count);
+	if (bytes >= ARENA_MOST) {
+		error_set(err, ERR_NO_MEMORY, "%s: more is needed than any memory has", what);
 		return NULL;
 	}
-	bytes = (count + SLACK) * sizeof(float);
 	if (device->memory_limit > 0 &&
 	    (bytes > device->memory_limit || device->memory_used > device->memory_limit - bytes)) {
 		error_set(err, ERR_NO_MEMORY, "%s: %zu bytes are needed, %zu of the limit of %zu are in use", what,
@@ -203,24 +202,24 @@ float *cpu_floats(struct device *device, size_t count, const char *what, struct 
 	}
 	if (bytes >= 2 * LARGE_PAGE)
 		alignment = LARGE_PAGE;
-	floats = aligned_alloc(alignment, (bytes + alignment - 1) / alignment * alignment);
-	if (floats == NULL) {
+	memory = aligned_alloc(alignment, (bytes + alignment - 1) / alignment * alignment);
+	if (memory == NULL) {
 		error_set(err, ERR_NO_MEMORY, "%s: no memory for %zu bytes", what, bytes);
 		return NULL;
 	}
 	if (alignment == LARGE_PAGE)
-		madvise(floats, bytes, MADV_HUGEPAGE); /* a hint: without it everything works, slower */
-	memset(floats, 0, bytes);
+		madvise(memory, bytes, MADV_HUGEPAGE); /* a hint: without it everything works, slower */
+	memset(memory, 0, bytes);
 	device->memory_used += bytes;
-	return floats;
+	return memory;
 }
 
-void cpu_floats_free(struct device *device, float *floats, size_t count)
+void cpu_release(struct device *device, void *memory, size_t bytes)
 {
-	if (floats == NULL)
+	if (memory == NULL)
 		return;
-	device->memory_used -= (count + SLACK) * sizeof(float);
-	free(floats);
+	device->memory_used -= bytes;
+	free(memory);
 }
 
 /* ---- volumes ---- */
@@ -237,6 +236,14 @@ void volume_strides(const struct grid *grid, size_t *ret_row, size_t *ret_plane)
 	*ret_plane = ((size_t)grid->size[0] + (grid->size[0] >= 16)) * nz;
 }
 
+size_t cpu_volume_bytes(const struct grid *grid)
+{
+	size_t row, plane;
+
+	volume_strides(grid, &row, &plane);
+	return floats_bytes(plane * (size_t)grid->size[1]);
+}
+
 static int cpu_volume_new(struct device *device, const struct grid *grid, struct volume **ret_volume, struct error *err)
 {
 	struct volume *volume = calloc(1, sizeof(*volume));
@@ -246,7 +253,7 @@ static int cpu_volume_new(struct device *device, const struct grid *grid, struct
 	volume->device = device;
 	memcpy(volume->size, grid->size, sizeof(volume->size));
 	volume_strides(grid, &volume->row, &volume->plane);
-	volume->data = cpu_floats(device, volume_floats(volume), "volume", err);
+	volume->data = cpu_allocate(device, cpu_volume_bytes(grid), "volume", err);
 	if (volume->data == NULL) {
 		free(volume);
 		return err->code;
@@ -259,7 +266,7 @@ static void cpu_volume_free(struct volume *volume)
 {
 	if (volume == NULL)
 		return;
-	cpu_floats_free(volume->device, volume->data, volume_floats(volume));
+	cpu_release(volume->device, volume->data, floats_bytes(volume_floats(volume)));
 	free(volume);
 }
 
@@ -347,7 +354,7 @@ static int cpu_volume_copy(struct volume *to, const struct volume *from, struct 
 
 static size_t cpu_stack_bytes(int columns, int rows, int slots)
 {
-	return (size_t)columns * (size_t)rows * (size_t)slots * sizeof(float);
+	return floats_bytes((size_t)columns * (size_t)rows * (size_t)slots);
 }
 
 static int cpu_stack_new(struct device *device, int columns, int rows, int slots, struct stack **ret_stack,
@@ -358,7 +365,7 @@ static int cpu_stack_new(struct device *device, int columns, int rows, int slots
 	if (stack == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a stack");
 	*stack = (struct stack){.device = device, .columns = columns, .rows = rows, .slots = slots};
-	stack->data = cpu_floats(device, stack_floats(stack), "projections", err);
+	stack->data = cpu_allocate(device, cpu_stack_bytes(columns, rows, slots), "projections", err);
 	if (stack->data == NULL) {
 		free(stack);
 		return err->code;
@@ -371,7 +378,7 @@ static void cpu_stack_free(struct stack *stack)
 {
 	if (stack == NULL)
 		return;
-	cpu_floats_free(stack->device, stack->data, stack_floats(stack));
+	cpu_release(stack->device, stack->data, cpu_stack_bytes(stack->columns, stack->rows, stack->slots));
 	free(stack);
 }
 
@@ -426,6 +433,7 @@ const struct backend backend_cpu = {
     .describe = cpu_describe,
     .volume_new = cpu_volume_new,
     .volume_free = cpu_volume_free,
+    .volume_bytes = cpu_volume_bytes,
     .volume_upload = cpu_volume_upload,
     .volume_put = cpu_volume_put,
     .volume_download = cpu_volume_download,

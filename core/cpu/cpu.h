@@ -4,6 +4,7 @@
 #include <math.h>
 #include <stdint.h>
 
+#include "core/arena.h"
 #include "core/backend.h"
 
 /*
@@ -63,10 +64,12 @@ struct cpu_view {
 	double isocentre_depth;                        /* mm */
 };
 
-struct filter_engine; /* cpu_filter.c */
+struct filter_engine; /* filter.c */
 
 struct plan {
 	struct device *device;
+	void *memory; /* everything that plan_walk takes, memory_bytes of it */
+	size_t memory_bytes;
 	int columns, rows, views;
 	struct grid grid;
 	size_t row, plane; /* strides of every volume of this grid, floats */
@@ -85,22 +88,23 @@ struct plan {
 
 	struct filter_engine *filter; /* NULL without FDK */
 	int wide;                     /* columns of a filtered view, plan_options.pad included */
-	/* How FDK's backprojection sees filtered views: this plan, or a copy with `wide` columns and views of its own.
-	 */
+	/* The plan as FDK's backprojection sees filtered views: this one, or a copy with `wide` columns and
+	 * filtered_view. */
 	struct plan *filtered;
+	struct cpu_view *filtered_view;
 	int filter_batch;   /* views that FDK should filter at once */
 	size_t extended[2]; /* rows that `filter` has extended on either side */
 
 	struct sart_options sart;
-	int batch;           /* views whose corrections are held at once; 0 without SART */
-	float *corrections;  /* [batch][column][row], 1/mm */
-	double *ray_sums;    /* [batch][blocks of columns][2]: squares of p - A v and of p */
-	struct volume *work; /* SART's numerators when a subset takes several batches; TV's f */
+	int batch;          /* views whose corrections are held at once; 0 without SART */
+	float *corrections; /* [batch][column][row], 1/mm */
+	double *ray_sums;   /* [batch][blocks of columns][2]: squares of p - A v and of p */
+	struct volume work; /* SART's numerators when a subset takes several batches; TV's f; without data: neither */
 
 	bool has_tv;
 	struct tv_options tv;
-	struct volume *dual[3], *ahead; /* proximal TV */
-	float *planes;                  /* TV's rolling planes, [threads][planes_floats] */
+	struct volume dual[3], ahead; /* proximal TV; without data: none */
+	float *planes;                /* TV's rolling planes, [threads][planes_floats] */
 	size_t planes_floats;
 
 	float *scratch;        /* [threads][scratch_floats] */
@@ -117,7 +121,7 @@ struct tile {
 	size_t stride;
 };
 
-/* ---- rows of TV's passes, cpu_tv.c ---- */
+/* ---- rows of TV's passes, tv.c ---- */
 struct tv_weights {
 	float slow, middle, fast; /* smallest spacing / spacing along each axis */
 };
@@ -178,9 +182,33 @@ extern const struct cpu_kernels cpu_kernels_base;
 extern const struct cpu_kernels cpu_kernels_avx2, cpu_kernels_avx512;
 #endif
 
-/* Zeroed, SLACK floats longer than asked, counted against the device's limit. NULL: no memory, err is filled. */
-float *cpu_floats(struct device *device, size_t count, const char *what, struct error *err);
-void cpu_floats_free(struct device *device, float *floats, size_t count);
+/*
+ * Zeroed memory, aligned for cpu_take and counted against the device's limit; 0 bytes are none at all. NULL: there is
+ * not enough, err is filled.
+ */
+void *cpu_allocate(struct device *device, size_t bytes, const char *what, struct error *err);
+void cpu_release(struct device *device, void *memory, size_t bytes);
+
+/* Bytes of so many floats and the SLACK behind them. */
+static inline size_t floats_bytes(size_t count)
+{
+	return (count + SLACK) * sizeof(float);
+}
+
+/* A piece on cache lines of its own; a large one on pages of its own, so that arrays agree in their sets of the cache.
+ */
+static inline void *cpu_take(struct arena *arena, size_t bytes)
+{
+	enum { LINE = 64, PAGE = 4096, LARGE = 64 << 10 };
+
+	return arena_take(arena, bytes, bytes >= LARGE ? PAGE : LINE);
+}
+
+/* Floats with their SLACK; none for 0. */
+static inline float *cpu_take_floats(struct arena *arena, size_t count)
+{
+	return cpu_take(arena, count > 0 ? floats_bytes(count) : 0);
+}
 
 /* Which thread of the current parallel region this is. */
 int cpu_thread(void);
@@ -228,8 +256,9 @@ static inline float *plan_scratch(const struct plan *plan)
 /* to[i * to_stride + j] = from[j * from_stride + i], i < from_columns, j < from_rows. */
 void transpose(const float *from, size_t from_stride, int from_rows, int from_columns, float *to, size_t to_stride);
 void volume_strides(const struct grid *grid, size_t *ret_row, size_t *ret_plane);
+size_t cpu_volume_bytes(const struct grid *grid); /* backend.volume_bytes */
 
-/* cpu_plan.c */
+/* plan.c */
 int cpu_plan_bytes(struct device *device, const struct plan_options *options, struct plan_bytes *ret_bytes,
 		   struct error *err);
 int cpu_plan_new(struct device *device, const struct plan_options *options, struct plan **ret_plan, struct error *err);
@@ -237,26 +266,24 @@ void cpu_plan_free(struct plan *plan);
 const char *cpu_plan_summary(const struct plan *plan);
 int cpu_plan_batch(const struct plan *plan);
 
-/* cpu_linearise.c */
+/* linearise.c */
 int cpu_linearise(struct plan *plan, const void *samples, int count, const int *slots, struct stack *to,
 		  struct defect_counts *counts, struct error *err);
 
-/* cpu_filter.c */
-size_t filter_engine_bytes(const struct plan_options *options, int threads);
-int filter_engine_new(const struct plan_options *options, int threads, struct filter_engine **ret_engine,
-		      struct error *err);
-void filter_engine_free(struct filter_engine *engine);
+/* filter.c */
+/* Takes the filter of a plan from the arena and fills it; NULL while the walk measures. */
+struct filter_engine *filter_engine_walk(const struct plan_options *options, int threads, struct arena *arena);
 int cpu_filter(struct plan *plan, const struct stack *from, const int *slots, const int *views, int count,
 	       struct stack *to, struct error *err);
 int cpu_filter_extended(struct plan *plan, size_t ret_rows[2], struct error *err);
 
-/* cpu_project.c */
+/* project.c */
 int cpu_project(struct plan *plan, const struct volume *from, const int *views, int count, struct stack *to,
 		struct error *err);
 /* Blocks of columns that a view is handed out in. */
 int column_blocks(const struct plan *plan);
 
-/* cpu_backproject.c */
+/* backproject.c */
 int cpu_backproject(struct plan *plan, const struct stack *from, const int *views, int count,
 		    enum backprojection weight, struct volume *to, struct error *err);
 /* Tiles that the grid is cut into; tile_at gives one of them. */
@@ -267,16 +294,16 @@ int tile_lines(const struct plan *plan, const struct tile *tile);
 /* The voxels of one line of a tile: first float in a volume, floats from one to the next, how many. */
 size_t tile_line(const struct plan *plan, const struct tile *tile, int line, size_t *ret_stride, int *ret_count);
 
-/* cpu_sart.c */
+/* sart.c */
 int cpu_sart_iterate(struct plan *plan, const struct stack *projections, struct volume *volume,
 		     const struct cancel *cancel, struct iteration_sums *ret_sums, struct error *err);
 
-/* cpu_tv.c */
+/* tv.c */
 size_t tv_planes_floats(const struct plan *plan);
 int cpu_tv(struct plan *plan, struct volume *volume, const struct tv_options *options, const struct cancel *cancel,
 	   struct error *err);
 
-/* cpu_algebra.c */
+/* algebra.c */
 int cpu_volume_axpby(double a, const struct volume *x, double b, struct volume *y, struct error *err);
 int cpu_stack_axpby(double a, const struct stack *x, const int *slots, int count, double b, struct stack *y,
 		    struct error *err);
@@ -290,7 +317,7 @@ int cpu_volume_clip(struct volume *y, struct error *err);
 int cpu_stack_fill(struct stack *y, int count, float value, struct error *err);
 int cpu_stack_mask(const struct stack *x, const int *slots, int count, struct stack *y, struct error *err);
 
-/* cpu_norms.c */
+/* norms.c */
 int cpu_norms(struct plan *plan, const struct volume *volume, const struct volume *other, double unit,
 	      struct volume_norms *ret_norms, struct error *err);
 

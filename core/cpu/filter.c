@@ -52,90 +52,52 @@ static size_t buffers_count(const struct plan_options *options, int threads)
 	return (size_t)threads * 2 * PAIRS * buffer_stride(options);
 }
 
-static size_t transform_bytes(int length)
+/* KissFFT's tables are made where they are to lie. */
+static kiss_fft_cfg fft_walk(int length, int inverse, struct arena *arena)
 {
 	size_t bytes = 0;
+	void *memory;
 
-	kiss_fft_alloc(length, 0, NULL, &bytes);
-	return 2 * bytes + (size_t)length * sizeof(float);
+	kiss_fft_alloc(length, inverse, NULL, &bytes);
+	memory = cpu_take(arena, bytes);
+	return memory != NULL ? kiss_fft_alloc(length, inverse, memory, &bytes) : NULL;
 }
 
-size_t filter_engine_bytes(const struct plan_options *options, int threads)
+static void transform_walk(struct transform *transform, int length, const float *response, struct arena *arena)
+{
+	transform->length = length;
+	transform->forward = fft_walk(length, 0, arena);
+	transform->inverse = fft_walk(length, 1, arena);
+	transform->response = cpu_take_floats(arena, (size_t)length);
+	for (int i = 0; transform->response != NULL && i < length; i++)
+		transform->response[i] = response[i <= length / 2 ? i : length - i] / (float)length;
+}
+
+struct filter_engine *filter_engine_walk(const struct plan_options *options, int threads, struct arena *arena)
 {
 	const int wide = wide_columns(options);
-	size_t bytes = sizeof(struct filter_engine) + transform_bytes(filter_length(wide));
+	struct filter_engine measured, *taken = cpu_take(arena, sizeof(*taken));
+	struct filter_engine *engine = taken != NULL ? taken : &measured;
 
-	if (options->extend > 0)
-		bytes += transform_bytes(filter_length(wide + options->extend)) +
-			 (size_t)options->geometry->count * sizeof(float);
-	return bytes + buffers_count(options, threads) * sizeof(kiss_fft_cpx);
-}
-
-static int transform_new(int length, const float *response, struct transform *ret, struct error *err)
-{
-	ret->length = length;
-	ret->forward = kiss_fft_alloc(length, 0, NULL, NULL);
-	ret->inverse = kiss_fft_alloc(length, 1, NULL, NULL);
-	ret->response = malloc((size_t)length * sizeof(float));
-	if (ret->forward == NULL || ret->inverse == NULL || ret->response == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for the ramp filter of %d samples", length);
-	for (int i = 0; i < length; i++)
-		ret->response[i] = response[i <= length / 2 ? i : length - i] / (float)length;
-	return 0;
-}
-
-static void transform_clear(struct transform *transform)
-{
-	kiss_fft_free(transform->forward);
-	kiss_fft_free(transform->inverse);
-	free(transform->response);
-}
-
-int filter_engine_new(const struct plan_options *options, int threads, struct filter_engine **ret_engine,
-		      struct error *err)
-{
-	struct filter_engine *engine = calloc(1, sizeof(*engine));
-	const int wide = wide_columns(options);
-	int code;
-
-	if (engine == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for the ramp filter");
-	engine->geometry = options->geometry;
-	engine->column_weights = options->column_weights;
-	memcpy(engine->axis, options->axis, sizeof(engine->axis));
-	engine->pad = options->pad[0];
-	engine->wide = wide;
-	engine->extend = options->extend;
-	engine->shells = shell_table_make();
-	for (int side = 0; side < 2; side++)
-		engine->sides[side] = options->extend > 0 && options->pad[side] == 0;
-	engine->stride = buffer_stride(options);
-	code = transform_new(filter_length(wide), options->filter_response, &engine->plain, err);
-	if (code == 0 && engine->extend > 0)
-		code = transform_new(filter_length(wide + engine->extend), options->extended_response,
-				     &engine->extended, err);
-	engine->buffers = calloc(buffers_count(options, threads), sizeof(kiss_fft_cpx));
-	if (engine->extend > 0)
-		engine->levels = malloc((size_t)options->geometry->count * sizeof(float));
-	if (code == 0 && (engine->buffers == NULL || (engine->extend > 0 && engine->levels == NULL)))
-		code = error_set(err, ERR_NO_MEMORY, "no memory for the buffers of the ramp filter");
-	if (code < 0) {
-		filter_engine_free(engine);
-		return code;
+	*engine = (struct filter_engine){
+	    .geometry = options->geometry,
+	    .column_weights = options->column_weights,
+	    .axis = {options->axis[0], options->axis[1], options->axis[2]},
+	    .pad = options->pad[0],
+	    .wide = wide,
+	    .extend = options->extend,
+	    .sides = {options->extend > 0 && options->pad[0] == 0, options->extend > 0 && options->pad[1] == 0},
+	    .shells = shell_table_make(),
+	    .stride = buffer_stride(options),
+	};
+	transform_walk(&engine->plain, filter_length(wide), options->filter_response, arena);
+	if (engine->extend > 0) {
+		transform_walk(&engine->extended, filter_length(wide + engine->extend), options->extended_response,
+			       arena);
+		engine->levels = cpu_take_floats(arena, (size_t)options->geometry->count);
 	}
-	*ret_engine = engine;
-	return 0;
-}
-
-void filter_engine_free(struct filter_engine *engine)
-{
-	if (engine == NULL)
-		return;
-	transform_clear(&engine->plain);
-	transform_clear(&engine->extended);
-	free(engine->buffers);
-	free(engine->levels);
-	free(engine);
+	engine->buffers = cpu_take(arena, buffers_count(options, threads) * sizeof(*engine->buffers));
+	return taken;
 }
 
 /*

@@ -112,27 +112,84 @@ static size_t ray_sums_count(const struct plan *plan)
 	return 2 * (size_t)plan->batch * (size_t)column_blocks(plan);
 }
 
+/* ---- memory ---- */
+
+static void volume_walk(const struct plan *plan, struct volume *volume, struct arena *arena)
+{
+	*volume = (struct volume){.device = plan->device, .row = plan->row, .plane = plan->plane};
+	memcpy(volume->size, plan->grid.size, sizeof(volume->size));
+	volume->data = cpu_take_floats(arena, volume_floats(volume));
+}
+
+static void plan_walk_volumes(struct plan *plan, struct arena *arena)
+{
+	if (needs_work(plan))
+		volume_walk(plan, &plan->work, arena);
+	for (int i = 0; needs_dual(plan) && i < 3; i++)
+		volume_walk(plan, &plan->dual[i], arena);
+	if (needs_dual(plan))
+		volume_walk(plan, &plan->ahead, arena);
+}
+
+/* Everything that a plan of `threads` threads holds, its volumes first, which take *ret_volumes bytes. */
+static void plan_walk(struct plan *plan, const struct plan_options *options, int threads, struct arena *arena,
+		      size_t *ret_volumes)
+{
+	const size_t pixels = (size_t)plan->columns * (size_t)plan->rows;
+	const size_t views = (size_t)plan->views * sizeof(*plan->view);
+
+	plan_walk_volumes(plan, arena);
+	*ret_volumes = arena->used;
+	plan->view = cpu_take(arena, views);
+	plan->filtered = plan;
+	if (plan->wide > plan->columns) {
+		plan->filtered = cpu_take(arena, sizeof(*plan->filtered));
+		plan->filtered_view = cpu_take(arena, views);
+	}
+	plan->defective = cpu_take(arena, pixels);
+	plan->reduce = cpu_take(arena, (size_t)plan->grid.size[1] * REDUCE * sizeof(*plan->reduce));
+	plan->ray_sums = cpu_take(arena, ray_sums_count(plan) * sizeof(*plan->ray_sums));
+	plan->scratch = cpu_take_floats(arena, (size_t)threads * plan->scratch_floats);
+	plan->planes = cpu_take_floats(arena, (size_t)threads * plan->planes_floats);
+	plan->corrections = cpu_take_floats(arena, (size_t)plan->batch * pixels);
+	if (options->column_weights != NULL)
+		plan->filter = filter_engine_walk(options, threads, arena);
+}
+
 int cpu_plan_bytes(struct device *device, const struct plan_options *options, struct plan_bytes *ret_bytes,
 		   struct error *err)
 {
 	const int threads = device != NULL ? device->threads : cpu_threads(0);
 	struct plan plan = {0};
-	size_t pixels, volume, floats;
+	struct arena arena = {0};
+	size_t own;
 
-	(void)err;
 	plan_shape(options, &plan);
-	pixels = (size_t)plan.columns * (size_t)plan.rows;
-	volume = plan.plane * (size_t)plan.grid.size[1] * sizeof(float);
-	floats = (size_t)threads * (plan.scratch_floats + plan.planes_floats) + (size_t)plan.batch * pixels;
+	plan_walk(&plan, options, threads, &arena, &own);
+	if (arena.used >= ARENA_MOST)
+		return error_set(err, ERR_NO_MEMORY, "a plan takes more than any memory has");
 	*ret_bytes = (struct plan_bytes){
-	    .volumes = volume * (size_t)(1 + (options->sart != NULL) + needs_work(&plan) + 4 * needs_dual(&plan)),
-	    .scratch = floats * sizeof(float) + pixels +
-		       (size_t)(1 + (plan.wide > plan.columns)) * (size_t)plan.views * sizeof(struct cpu_view) +
-		       (ray_sums_count(&plan) + (size_t)plan.grid.size[1] * REDUCE) * sizeof(double),
-	    .raw = pixels * (options->linearise.sample == SAMPLE_UINT16 ? sizeof(uint16_t) : sizeof(float)),
+	    .volumes = own + (size_t)(1 + (options->sart != NULL)) * cpu_volume_bytes(&plan.grid),
+	    .scratch = arena.used - own,
+	    .raw = (size_t)plan.columns * (size_t)plan.rows *
+		   (options->linearise.sample == SAMPLE_UINT16 ? sizeof(uint16_t) : sizeof(float)),
 	};
-	if (options->column_weights != NULL)
-		ret_bytes->scratch += filter_engine_bytes(options, threads);
+	return 0;
+}
+
+static int plan_allocate(struct plan *plan, const struct plan_options *options, struct error *err)
+{
+	const int threads = plan->device->threads;
+	struct arena arena = {0};
+	size_t own;
+
+	plan_walk(plan, options, threads, &arena, &own);
+	plan->memory = cpu_allocate(plan->device, arena.used, "the plan", err);
+	if (plan->memory == NULL)
+		return err->code;
+	plan->memory_bytes = arena.used;
+	arena = (struct arena){.base = plan->memory};
+	plan_walk(plan, options, threads, &arena, &own);
 	return 0;
 }
 
@@ -162,20 +219,14 @@ static void view_set(const struct view *view, const struct grid *grid, struct cp
 	}
 }
 
-/* Columns are counted from the first padded one. Needs plan->view. */
-static int plan_widen(struct plan *plan, const struct plan_options *options, struct error *err)
+/* The plan as FDK's backprojection sees it: columns are counted from the first padded one. Needs plan->view. */
+static void plan_widen(struct plan *plan, const struct plan_options *options)
 {
-	plan->filtered = plan;
-	if (plan->wide == plan->columns)
-		return 0;
-	plan->filtered = malloc(sizeof(*plan));
-	if (plan->filtered != NULL) {
-		*plan->filtered = *plan;
-		plan->filtered->columns = plan->wide;
-		plan->filtered->view = malloc((size_t)plan->views * sizeof(*plan->view));
-	}
-	if (plan->filtered == NULL || plan->filtered->view == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for a plan of %d views", plan->views);
+	if (plan->filtered == plan)
+		return;
+	*plan->filtered = *plan;
+	plan->filtered->columns = plan->wide;
+	plan->filtered->view = plan->filtered_view;
 	for (int i = 0; i < plan->views; i++) {
 		struct cpu_view *view = &plan->filtered->view[i];
 
@@ -183,43 +234,6 @@ static int plan_widen(struct plan *plan, const struct plan_options *options, str
 		for (int k = 0; k < 4; k++)
 			view->matrix[k] += options->pad[0] * view->matrix[8 + k];
 	}
-	return 0;
-}
-
-static int plan_volume(struct plan *plan, struct volume **ret_volume, struct error *err)
-{
-	return backend_cpu.volume_new(plan->device, &plan->grid, ret_volume, err);
-}
-
-static int plan_allocate(struct plan *plan, const struct plan_options *options, struct error *err)
-{
-	const size_t threads = (size_t)plan->device->threads, pixels = (size_t)plan->columns * (size_t)plan->rows;
-	int code = 0;
-
-	plan->view = calloc((size_t)plan->views, sizeof(*plan->view));
-	plan->defective = malloc(pixels);
-	plan->reduce = calloc((size_t)plan->grid.size[1] * REDUCE, sizeof(double));
-	plan->ray_sums = calloc(ray_sums_count(plan) + 1, sizeof(double));
-	if (plan->view == NULL || plan->defective == NULL || plan->reduce == NULL || plan->ray_sums == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for a plan of %d views", plan->views);
-	plan->scratch = cpu_floats(plan->device, threads * plan->scratch_floats, "scratch", err);
-	if (plan->scratch == NULL)
-		return err->code;
-	plan->planes = cpu_floats(plan->device, threads * plan->planes_floats, "TV's planes", err);
-	if (plan->planes == NULL)
-		return err->code;
-	plan->corrections = cpu_floats(plan->device, (size_t)plan->batch * pixels, "SART's corrections", err);
-	if (plan->corrections == NULL)
-		return err->code;
-	if (options->column_weights != NULL)
-		code = filter_engine_new(options, plan->device->threads, &plan->filter, err);
-	if (code == 0 && needs_work(plan))
-		code = plan_volume(plan, &plan->work, err);
-	for (int i = 0; code == 0 && needs_dual(plan) && i < 3; i++)
-		code = plan_volume(plan, &plan->dual[i], err);
-	if (code == 0 && needs_dual(plan))
-		code = plan_volume(plan, &plan->ahead, err);
-	return code;
 }
 
 /*
@@ -265,12 +279,11 @@ int cpu_plan_new(struct device *device, const struct plan_options *options, stru
 	for (int i = 0; i < plan->views; i++)
 		view_set(&options->geometry->views[i], &plan->grid, &plan->view[i]);
 	code = check_reach(plan, err);
-	if (code == 0)
-		code = plan_widen(plan, options, err);
 	if (code < 0) {
 		cpu_plan_free(plan);
 		return code;
 	}
+	plan_widen(plan, options);
 	snprintf(plan->summary, sizeof(plan->summary), "%s%s, %d thread%s, %s",
 		 plan->untilted ? "untilted" : "any geometry", plan->matched ? ", matched projector" : "",
 		 device->threads, device->threads == 1 ? "" : "s", device->kernels->name);
@@ -280,29 +293,9 @@ int cpu_plan_new(struct device *device, const struct plan_options *options, stru
 
 void cpu_plan_free(struct plan *plan)
 {
-	struct device *device;
-	size_t threads;
-
 	if (plan == NULL)
 		return;
-	device = plan->device;
-	threads = (size_t)device->threads;
-	cpu_floats_free(device, plan->scratch, threads * plan->scratch_floats);
-	cpu_floats_free(device, plan->planes, threads * plan->planes_floats);
-	cpu_floats_free(device, plan->corrections, (size_t)plan->batch * (size_t)plan->columns * (size_t)plan->rows);
-	backend_cpu.volume_free(plan->work);
-	backend_cpu.volume_free(plan->ahead);
-	for (int i = 0; i < 3; i++)
-		backend_cpu.volume_free(plan->dual[i]);
-	filter_engine_free(plan->filter);
-	if (plan->filtered != NULL && plan->filtered != plan) {
-		free(plan->filtered->view);
-		free(plan->filtered);
-	}
-	free(plan->view);
-	free(plan->defective);
-	free(plan->reduce);
-	free(plan->ray_sums);
+	cpu_release(plan->device, plan->memory, plan->memory_bytes);
 	free(plan);
 }
 

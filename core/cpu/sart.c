@@ -111,9 +111,9 @@ static void update_tile(const struct plan *plan, const struct subset *subset, in
 		size_t stride, at = tile_line(plan, &tile, line, &stride, &length);
 
 		for (int i = 0; !first && i < length; i++)
-			line_sums[i] += plan->work->data[at + (size_t)i * stride];
+			line_sums[i] += plan->work.data[at + (size_t)i * stride];
 		for (int i = 0; !last && i < length; i++)
-			plan->work->data[at + (size_t)i * stride] = line_sums[i];
+			plan->work.data[at + (size_t)i * stride] = line_sums[i];
 		if (last)
 			update_line(plan, line_sums, cover + (size_t)line * tile.stride, (float)everywhere, length,
 				    stride, volume->data + at);

@@ -265,19 +265,19 @@ int cpu_tv(struct plan *plan, struct volume *volume, const struct tv_options *op
 	if (!plan->has_tv || options->method > plan->tv.method)
 		return error_set(err, ERR_INTERNAL, "the plan was made without this TV");
 	box_of(plan, &box);
-	code = backend_cpu.volume_copy(plan->work, volume, err);
+	code = backend_cpu.volume_copy(&plan->work, volume, err);
 	if (code < 0)
 		return code;
-	pass.f = plan->work->data;
+	pass.f = plan->work.data;
 	if (options->method == TV_GRADIENT) {
 		pass.ahead = pass.v;
 		return run_gradient(plan, &pass, options, cancel, err);
 	}
-	pass.ahead = plan->ahead->data;
-	code = backend_cpu.volume_copy(plan->ahead, volume, err);
+	pass.ahead = plan->ahead.data;
+	code = backend_cpu.volume_copy(&plan->ahead, volume, err);
 	for (int i = 0; code == 0 && i < 3; i++) {
-		pass.dual[i] = plan->dual[i]->data;
-		code = backend_cpu.volume_fill(plan->dual[i], 0, err);
+		pass.dual[i] = plan->dual[i].data;
+		code = backend_cpu.volume_fill(&plan->dual[i], 0, err);
 	}
 	return code < 0 ? code : run_proximal(plan, &pass, options, cancel, err);
 }

@@ -1,6 +1,7 @@
-#ifndef CBCT_CORE_PARTS_INTERNAL_H
-#define CBCT_CORE_PARTS_INTERNAL_H
+#ifndef CBCT_CORE_OUTOFCORE_INTERNAL_H
+#define CBCT_CORE_OUTOFCORE_INTERNAL_H
 
+#include "core/arena.h"
 #include "core/outofcore/outofcore.h"
 
 /*
@@ -24,7 +25,8 @@ struct stack {
 	struct device *device;
 	int columns, rows, slots;
 	size_t pixels;
-	float *data; /* [slot][row][column], host; not touched where `by` is set */
+	size_t bytes; /* of `data`, `from` and `views`, in one piece that `data` begins */
+	float *data;  /* [slot][row][column], host; not touched where `by` is set */
 	/* What `filter` noted: slot i is views[i] filtered, from slot from[i] of `source`. */
 	struct plan *by;
 	const struct stack *source;
@@ -43,17 +45,19 @@ struct plan {
 	int batch;                 /* views on the device at a time */
 	int slices[PURPOSE_COUNT]; /* of a slab, 0 where the purpose has none */
 	struct plan_bytes bytes;
+	void *memory; /* everything of the host's that plan_walk takes, memory_bytes of it */
+	size_t memory_bytes;
 	int identity[OUTOFCORE_BATCH]; /* 0, 1, 2 ... */
 	char summary[192];
 
 	struct plan *intake; /* linearises, knows no volume but one of a voxel */
 	struct grid one;     /* that one */
 	struct stack *taken; /* one slot */
-	float *sums;         /* [slice of a slab and its neighbours][y][x] */
-	size_t sums_floats;
-	float *partial; /* [batch][row][column] */
-	double *rows;   /* [rows][2] of sums over a view */
-	struct stack *correction;
+	/* A slab's sums and column sums, or the slices that TV keeps: [slice][y][x]. */
+	float *sums;
+	float *partial;          /* [batch][row][column] */
+	double *rows;            /* [rows][2] of sums over a view */
+	struct stack correction; /* of the largest subset; no slots without SART */
 	size_t extended[2];
 };
 
@@ -70,11 +74,20 @@ struct feed {
 	struct stack *in[2], *filtered;
 };
 
-/* Zeros, not counted before they are touched; NULL: no memory. */
-float *outofcore_floats(size_t count);
-void outofcore_floats_free(float *floats, size_t count);
+/* Zeros of the host's memory, not counted before they are touched; NULL: no memory. */
+void *outofcore_allocate(size_t bytes);
+void outofcore_release(void *memory, size_t bytes);
+/* A piece on pages of its own, or on a cache line. */
+static inline void *outofcore_take(struct arena *arena, size_t bytes)
+{
+	enum { LINE = 64, PAGE = 4096, LARGE = 64 << 10 };
 
-/* ---- outofcore_plan.c ---- */
+	return arena_take(arena, bytes, bytes >= LARGE ? PAGE : LINE);
+}
+/* What a stack of these sizes holds, into *ret_stack. */
+void stack_walk(struct device *device, int columns, int rows, int slots, struct stack *ret_stack, struct arena *arena);
+
+/* ---- plan.c ---- */
 int outofcore_plan_bytes(struct device *device, const struct plan_options *options, struct plan_bytes *ret_bytes,
 			 struct error *err);
 int outofcore_plan_new(struct device *device, const struct plan_options *options, struct plan **ret_plan,
@@ -87,18 +100,18 @@ void slab_close(struct plan *plan, struct slab *slab); /* a closed one is fine *
 int feed_open(struct plan *plan, enum purpose purpose, struct feed *ret_feed, struct error *err);
 void feed_close(struct plan *plan, struct feed *feed);
 
-/* ---- outofcore_project.c ---- */
+/* ---- project.c ---- */
 int outofcore_project(struct plan *plan, const struct volume *from, const int *views, int count, struct stack *to,
 		      struct error *err);
 int outofcore_backproject(struct plan *plan, const struct stack *from, const int *views, int count,
 			  enum backprojection weight, struct volume *to, struct error *err);
 int outofcore_stack_download(struct stack *stack, int slot, int count, float *ret_to, struct error *err);
 
-/* ---- outofcore_sart.c ---- */
+/* ---- sart.c ---- */
 int outofcore_sart_iterate(struct plan *plan, const struct stack *projections, struct volume *volume,
 			   const struct cancel *cancel, struct iteration_sums *ret_sums, struct error *err);
 
-/* ---- outofcore_algebra.c ---- */
+/* ---- algebra.c ---- */
 int outofcore_volume_axpby(double a, const struct volume *x, double b, struct volume *y, struct error *err);
 int outofcore_stack_axpby(double a, const struct stack *x, const int *slots, int count, double b, struct stack *y,
 			  struct error *err);
@@ -112,7 +125,7 @@ int outofcore_volume_clip(struct volume *y, struct error *err);
 int outofcore_stack_fill(struct stack *y, int count, float value, struct error *err);
 int outofcore_stack_mask(const struct stack *x, const int *slots, int count, struct stack *y, struct error *err);
 
-/* ---- outofcore_tv.c ---- */
+/* ---- tv.c ---- */
 int outofcore_tv(struct plan *plan, struct volume *volume, const struct tv_options *options,
 		 const struct cancel *cancel, struct error *err);
 int outofcore_norms(struct plan *plan, const struct volume *volume, const struct volume *other, double unit,

@@ -10,21 +10,24 @@
 
 #include "core/truncation.h"
 
-float *outofcore_floats(size_t count)
+void *outofcore_allocate(size_t bytes)
 {
-	void *floats = mmap(NULL, count * sizeof(float), PROT_READ | PROT_WRITE,
-			    MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
+	void *memory = bytes >= ARENA_MOST ? MAP_FAILED
+					   : mmap(NULL, bytes, PROT_READ | PROT_WRITE,
+						  MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
 
-	if (floats == MAP_FAILED)
+	if (memory == MAP_FAILED)
 		return NULL;
-	madvise(floats, count * sizeof(float), MADV_HUGEPAGE); /* a hint: fewer faults where it is taken */
-	return floats;
+	madvise(memory, bytes, MADV_HUGEPAGE); /* a hint: fewer faults where it is taken */
+	return memory;
 }
 
-void outofcore_floats_free(float *floats, size_t count)
+void outofcore_release(void *memory, size_t bytes)
 {
-	if (floats != NULL)
-		munmap(floats, count * sizeof(float));
+	if (memory == NULL)
+		return;
+	arena_forget(memory, bytes);
+	munmap(memory, bytes);
 }
 
 int outofcore_open(const struct backend *backend, struct device *device, struct device **ret_device, struct error *err)
@@ -70,7 +73,7 @@ static int outofcore_volume_new(struct device *device, const struct grid *grid, 
 		memcpy(volume->size, grid->size, sizeof(volume->size));
 		volume->slice = (size_t)grid->size[0] * (size_t)grid->size[1];
 		volume->is_zero = true;
-		volume->data = outofcore_floats(volume_floats(volume));
+		volume->data = outofcore_allocate(volume_floats(volume) * sizeof(float));
 	}
 	if (volume == NULL || volume->data == NULL) {
 		free(volume);
@@ -84,8 +87,14 @@ static void outofcore_volume_free(struct volume *volume)
 {
 	if (volume == NULL)
 		return;
-	outofcore_floats_free(volume->data, volume_floats(volume));
+	outofcore_release(volume->data, volume_floats(volume) * sizeof(float));
 	free(volume);
+}
+
+static size_t outofcore_volume_bytes(const struct grid *grid)
+{
+	(void)grid;
+	return 0; /* it lies in the host's memory */
 }
 
 static int check_slices(const struct volume *volume, int z_first, int z_count, struct error *err)
@@ -156,9 +165,7 @@ static void outofcore_stack_free(struct stack *stack)
 {
 	if (stack == NULL)
 		return;
-	outofcore_floats_free(stack->data, stack->pixels * (size_t)stack->slots);
-	free(stack->from);
-	free(stack->views);
+	outofcore_release(stack->data, stack->bytes);
 	free(stack);
 }
 
@@ -170,19 +177,33 @@ static size_t outofcore_stack_bytes(int columns, int rows, int slots)
 	return 0; /* it lies in the host's memory */
 }
 
+void stack_walk(struct device *device, int columns, int rows, int slots, struct stack *ret_stack, struct arena *arena)
+{
+	const size_t pixels = (size_t)columns * (size_t)rows, count = (size_t)slots;
+
+	*ret_stack =
+	    (struct stack){.device = device, .columns = columns, .rows = rows, .slots = slots, .pixels = pixels};
+	ret_stack->data = outofcore_take(arena, pixels * count * sizeof(float));
+	ret_stack->from = outofcore_take(arena, count * sizeof(int));
+	ret_stack->views = outofcore_take(arena, count * sizeof(int));
+}
+
 static int outofcore_stack_new(struct device *device, int columns, int rows, int slots, struct stack **ret_stack,
 			       struct error *err)
 {
 	struct stack *stack = calloc(1, sizeof(*stack));
+	struct arena arena = {0};
+	size_t bytes;
 
 	if (stack != NULL) {
-		*stack = (struct stack){.device = device, .columns = columns, .rows = rows, .slots = slots};
-		stack->pixels = (size_t)columns * (size_t)rows;
-		stack->data = outofcore_floats(stack->pixels * (size_t)slots);
-		stack->from = calloc((size_t)slots, sizeof(int));
-		stack->views = calloc((size_t)slots, sizeof(int));
+		stack_walk(device, columns, rows, slots, stack, &arena);
+		bytes = arena.used;
+		arena = (struct arena){.base = outofcore_allocate(bytes)};
+		if (arena.base != NULL)
+			stack_walk(device, columns, rows, slots, stack, &arena);
+		stack->bytes = bytes;
 	}
-	if (stack == NULL || stack->data == NULL || stack->from == NULL || stack->views == NULL) {
+	if (stack == NULL || stack->data == NULL) {
 		outofcore_stack_free(stack);
 		return error_set(err, ERR_NO_MEMORY, "no memory for %d projections of %d x %d", slots, columns, rows);
 	}
@@ -284,6 +305,7 @@ const struct backend backend_outofcore = {
     .describe = outofcore_describe,
     .volume_new = outofcore_volume_new,
     .volume_free = outofcore_volume_free,
+    .volume_bytes = outofcore_volume_bytes,
     .volume_upload = outofcore_volume_upload,
     .volume_put = outofcore_volume_put,
     .volume_download = outofcore_volume_download,

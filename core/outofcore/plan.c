@@ -169,27 +169,31 @@ static int update_views(const struct plan_options *options)
 	return options->sart != NULL ? subsets_largest(&options->sart->subsets) : 0;
 }
 
-/* Host memory that the plan itself needs: a slab's sums and column sums; the slices that TV keeps. */
-static void size_scratch(struct plan *plan)
+/* Everything of the host's memory that the plan itself holds. */
+static void plan_walk(struct plan *plan, struct arena *arena)
 {
 	const struct plan_options *options = &plan->options;
+	const int columns = options->geometry->columns, rows = options->geometry->rows, *size = options->grid->size;
 	size_t slices = 0;
 
 	if (options->sart != NULL)
 		slices = 2 * (size_t)plan->slices[FOR_SUMS];
 	if (options->tv != NULL && (size_t)options->tv->iterations > slices)
 		slices = (size_t)options->tv->iterations;
-	plan->sums_floats = slices * (size_t)options->grid->size[0] * (size_t)options->grid->size[1];
+	plan->sums = outofcore_take(arena, slices * (size_t)size[0] * (size_t)size[1] * sizeof(float));
+	plan->partial =
+	    outofcore_take(arena, (size_t)plan->batch * (size_t)columns * (size_t)rows * sizeof(*plan->partial));
+	plan->rows = outofcore_take(arena, (size_t)rows * 2 * sizeof(*plan->rows));
+	stack_walk(plan->device, columns, rows, update_views(options), &plan->correction, arena);
 }
 
-static size_t host_bytes(const struct plan *plan)
+/* What the job has beside it: all projections, the iterate, and its copy for SART. */
+static size_t beside_bytes(const struct plan_options *options)
 {
-	const struct plan_options *options = &plan->options;
 	const struct geometry *geometry = options->geometry;
-	size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
-	size_t views = (size_t)geometry->count + (size_t)plan->batch + (size_t)update_views(options);
 
-	return (views * pixels + plan->sums_floats + grid_voxels(options->grid) * (options->sart != NULL ? 2 : 1)) *
+	return ((size_t)geometry->count * (size_t)geometry->columns * (size_t)geometry->rows +
+		grid_voxels(options->grid) * (options->sart != NULL ? 2 : 1)) *
 	       sizeof(float);
 }
 
@@ -197,6 +201,7 @@ static int plan_describe(struct plan *plan, struct device *device, const struct 
 			 struct error *err)
 {
 	struct device_info info;
+	struct arena host = {0};
 	size_t intake = 0, budget;
 	int code;
 
@@ -219,9 +224,10 @@ static int plan_describe(struct plan *plan, struct device *device, const struct 
 	}
 	if (code < 0)
 		return code;
-	size_scratch(plan);
+	plan_walk(plan, &host);
+	plan->memory_bytes = host.used;
 	plan->bytes.scratch += intake;
-	plan->bytes.host = host_bytes(plan);
+	plan->bytes.host = host.used + beside_bytes(options);
 	return 0;
 }
 
@@ -253,18 +259,14 @@ static int open_intake(struct plan *plan, struct error *err)
 
 static int allocate(struct plan *plan, struct error *err)
 {
-	const struct geometry *geometry = plan->options.geometry;
-	const int most = update_views(&plan->options);
+	struct arena arena;
 
-	plan->sums = outofcore_floats(plan->sums_floats + 1);
-	plan->partial = outofcore_floats((size_t)plan->batch * (size_t)geometry->columns * (size_t)geometry->rows);
-	plan->rows = malloc((size_t)geometry->rows * 2 * sizeof(double));
-	if (plan->sums == NULL || plan->partial == NULL || plan->rows == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for %zu voxels", plan->sums_floats);
-	if (most == 0)
-		return 0;
-	return backend_outofcore.stack_new(plan->device, geometry->columns, geometry->rows, most, &plan->correction,
-					   err);
+	plan->memory = outofcore_allocate(plan->memory_bytes);
+	if (plan->memory == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a plan of %zu bytes", plan->memory_bytes);
+	arena = (struct arena){.base = plan->memory};
+	plan_walk(plan, &arena);
+	return 0;
 }
 
 /* What the backend below says of a slab's plan. */
@@ -316,11 +318,7 @@ void outofcore_plan_free(struct plan *plan)
 		return;
 	plan->device->backend->stack_free(plan->taken);
 	plan->device->backend->plan_free(plan->intake);
-	backend_outofcore.stack_free(plan->correction);
-	outofcore_floats_free(plan->sums, plan->sums_floats + 1);
-	outofcore_floats_free(plan->partial, (size_t)plan->batch * (size_t)plan->options.geometry->columns *
-						 (size_t)plan->options.geometry->rows);
-	free(plan->rows);
+	outofcore_release(plan->memory, plan->memory_bytes);
 	free(plan);
 }
 

@@ -86,7 +86,7 @@ static void correct(struct plan *plan, const struct stack *projections, const in
 	for (int i = 0; i < count; i++) {
 		const struct view *view = &geometry->views[views[i]];
 		const float *measured = projections->data + projections->pixels * (size_t)views[i];
-		float *projected = plan->correction->data + plan->correction->pixels * (size_t)i;
+		float *projected = plan->correction.data + plan->correction.pixels * (size_t)i;
 
 #pragma omp parallel for schedule(static)
 		for (int row = 0; row < geometry->rows; row++)
@@ -132,7 +132,7 @@ static int backproject_slab(struct plan *plan, struct slab *slab, struct feed *f
 			    int count, struct error *err)
 {
 	const struct backend *backend = plan->device->backend;
-	const struct stack *correction = plan->correction;
+	const struct stack *correction = &plan->correction;
 	int code = 0;
 
 	if (ones) {
@@ -257,7 +257,7 @@ int outofcore_sart_iterate(struct plan *plan, const struct stack *projections, s
 			break;
 		if (count == 0)
 			continue;
-		code = outofcore_project(plan, volume, views, count, plan->correction, err);
+		code = outofcore_project(plan, volume, views, count, &plan->correction, err);
 		if (code < 0)
 			break;
 		correct(plan, projections, views, count, &sums);

@@ -1746,14 +1746,152 @@ START_TEST(what_was_said_to_be_needed_is_enough)
 		rig_open(&rig, &machine);
 		ok(rig.backend->plan_bytes(rig.device, &rig.options, &bytes, &err));
 		rig_close(&rig);
-		/* iterate and copy are among the volumes; a second stack, and 64 KiB for what allocations are rounded
-		 * up to */
+		/* iterate and copy are among the volumes */
 		machine.options.memory_limit =
-		    bytes.volumes + bytes.scratch + bytes.raw + 2 * rig.all_pixels * sizeof(float) + (64 << 10);
+		    bytes.volumes + bytes.scratch + (machine.backend->own_memory ? bytes.raw : 0) +
+		    2 * machine.backend->stack_bytes(rig.geometry.columns, rig.geometry.rows, rig.geometry.count);
 		rig_open(&rig, &machine);
 		rig_close(&rig);
 	}
 	rig_clear(&rig);
+}
+END_TEST
+
+/* Options of every kind, and what the plan holds by the way: a batch, numerators, the dual, a filter of its own. */
+static const struct {
+	const char *name;
+	int subsets; /* 0: no SART */
+	int tv;      /* enum tv_method; -1: none */
+	bool fdk, matched, pads, extend, no_projection, packed, words;
+} plans[] = {
+    {"bare", 0, -1, false, false, false, false, false, false, false},
+    {"FDK", 0, -1, true, false, false, false, true, false, false},
+    {"FDK of words, packed", 0, -1, true, false, false, false, true, true, true},
+    {"FDK, padded", 0, -1, true, false, true, false, true, false, false},
+    {"FDK, extended", 0, -1, true, false, false, true, false, false, false},
+    {"FDK, padded and extended, packed", 0, -1, true, false, true, true, false, true, false},
+    {"FDK and TV", 0, TV_GRADIENT, true, false, false, false, true, false, false},
+    {"TV alone", 0, TV_PROXIMAL, false, false, false, false, true, false, false},
+    {"SIRT", 1, -1, false, false, false, false, false, false, false},
+    {"SIRT, packed", 1, -1, true, false, false, false, false, true, false},
+    {"SART by subsets", 2, -1, false, false, false, false, false, false, false},
+    {"SART by view", 5, -1, true, false, false, false, false, false, false},
+    {"SART by view, packed", 5, -1, true, false, true, false, false, true, false},
+    {"SIRT, matched", 1, -1, true, true, false, false, false, false, false},
+    {"SART by view, matched, and TV", 5, TV_PROXIMAL, true, true, false, true, false, true, false},
+    {"all of it", 2, TV_PROXIMAL, true, false, true, true, false, false, true},
+};
+enum { PLANS = sizeof(plans) / sizeof(plans[0]) };
+
+/* Bytes that are left of a limit far below what the machine has, so that nobody else's memory shows. */
+static size_t bytes_free(const struct backend *backend, struct device *device)
+{
+	struct device_info info;
+
+	backend->describe(device, &info);
+	return info.bytes_free;
+}
+
+static void expect_plan_takes_what_it_says(const struct rig *rig, const struct machine *machine, struct device *device,
+					   const char *name)
+{
+	const struct backend *backend = machine->backend;
+	const size_t before = bytes_free(backend, device);
+	/* The iterate, and its copy for SART, are the job's own; a view on its way in lies in the host's memory. */
+	const size_t beside = (rig->options.sart != NULL ? 2 : 1) * backend->volume_bytes(&rig->grid);
+	struct plan_bytes said;
+	struct plan *plan;
+	size_t taken;
+
+	ok(backend->plan_bytes(device, &rig->options, &said, &err));
+	ok(backend->plan_new(device, &rig->options, &plan, &err));
+	taken = before - bytes_free(backend, device);
+	ck_assert_msg(taken == said.volumes - beside + said.scratch + (backend->own_memory ? said.raw : 0),
+		      "%s, %s: %zu bytes were taken, %zu + %zu + %zu said", machine->name, name, taken,
+		      said.volumes - beside, said.scratch, said.raw);
+	backend->plan_free(plan);
+	ck_assert_msg(bytes_free(backend, device) == before, "%s, %s: bytes are kept", machine->name, name);
+}
+
+/* The options of row `index`; subsets of one view each, or of a few. */
+static void rig_options(struct rig *rig, int index)
+{
+	const int views = rig->geometry.count;
+	struct plan_options *options = &rig->options;
+
+	rig->sart.subsets.count = plans[index].subsets < views ? plans[index].subsets : views;
+	for (int i = 0; i <= rig->sart.subsets.count && rig->sart.subsets.count > 0; i++)
+		rig->start[i] = i * views / rig->sart.subsets.count;
+	rig->tv.method = plans[index].tv >= 0 ? (enum tv_method)plans[index].tv : TV_GRADIENT;
+	options->sart = plans[index].subsets > 0 ? &rig->sart : NULL;
+	options->tv = plans[index].tv >= 0 ? &rig->tv : NULL;
+	options->column_weights = plans[index].fdk ? rig->column_weights : NULL;
+	options->filter_response = plans[index].fdk ? rig->response : NULL;
+	options->matched = plans[index].matched;
+	options->pad[0] = plans[index].pads ? 5 : 0;
+	options->pad[1] = plans[index].pads ? 9 : 0;
+	options->extend = plans[index].extend ? rig->geometry.columns : 0;
+	options->extended_response = plans[index].extend ? rig->response : NULL;
+	options->no_projection = plans[index].no_projection;
+	options->reference_precision = !plans[index].packed;
+	options->linearise.sample = plans[index].words ? SAMPLE_UINT16 : SAMPLE_FLOAT32;
+}
+
+START_TEST(a_plan_takes_what_it_says)
+{
+	struct machine list[MACHINES_MOST];
+	const int count = machines(list);
+	struct rig rig;
+
+	rig_make(&setups[_i], &rig);
+	/* long enough for every row of the table, whatever it holds */
+	free(rig.response);
+	rig.response = floats((size_t)filter_length(2 * rig.geometry.columns + 14) / 2 + 1);
+	for (int m = 0; m < count; m++) {
+		const struct backend *backend = list[m].backend;
+		const struct device_options options = {
+		    .threads = list[m].options.threads, .isa = list[m].options.isa, .memory_limit = 128 << 20};
+		struct device *device;
+
+		ok(backend->open(0, &options, &device, &err));
+		for (int k = 0; k < PLANS; k++) {
+			rig_options(&rig, k);
+			expect_plan_takes_what_it_says(&rig, &list[m], device, plans[k].name);
+		}
+		backend->close(device);
+	}
+	rig_clear(&rig);
+}
+END_TEST
+
+START_TEST(volumes_and_stacks_take_what_they_say)
+{
+	struct machine list[MACHINES_MOST];
+	const int count = machines(list);
+
+	for (int m = 0; m < count; m++) {
+		const struct backend *backend = list[m].backend;
+		const struct device_options options = {.memory_limit = 128 << 20};
+		struct device *device;
+		size_t before;
+
+		ok(backend->open(0, &options, &device, &err));
+		before = bytes_free(backend, device);
+		for (int k = 0; k < SETUPS; k++) {
+			struct volume *volume;
+			struct stack *stack;
+
+			ok(backend->volume_new(device, &setups[k].grid, &volume, &err));
+			ck_assert_uint_eq(before - bytes_free(backend, device), backend->volume_bytes(&setups[k].grid));
+			backend->volume_free(volume);
+			ok(backend->stack_new(device, setups[k].columns, setups[k].rows, 3, &stack, &err));
+			ck_assert_uint_eq(before - bytes_free(backend, device),
+					  backend->stack_bytes(setups[k].columns, setups[k].rows, 3));
+			backend->stack_free(stack);
+			ck_assert_uint_eq(bytes_free(backend, device), before);
+		}
+		backend->close(device);
+	}
 }
 END_TEST
 
@@ -1838,6 +1976,8 @@ Suite *backend_suite(void)
 	tcase_add_test(rest, bytes_are_known_beforehand);
 	tcase_add_test(rest, a_limit_of_memory_is_kept);
 	tcase_add_loop_test(rest, what_was_said_to_be_needed_is_enough, 0, SETUPS);
+	tcase_add_loop_test(rest, a_plan_takes_what_it_says, 0, SETUPS);
+	tcase_add_test(rest, volumes_and_stacks_take_what_they_say);
 	tcase_add_test(rest, cancel_is_asked_between_steps);
 	tcase_add_test(rest, freeing_nothing_is_fine);
 	suite_add_tcase(suite, operations);
