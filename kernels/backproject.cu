@@ -377,35 +377,34 @@ static __global__ void __launch_bounds__(256) update_from(const float *__restric
 		put_voxels<1>(job, x, y, z, sum + ((size_t)z * job.ny + y) * job.nx + x);
 }
 
-/* Whose views are in constant memory, so that they are not brought there again. */
-static struct {
-	const struct plan *plan;
-	unsigned long list;
-	int first, count, pad;
-	float flip;
-} loaded;
+/*
+ * The symbol `matrices` exists once on each GPU of a process, whoever has it open, and so does the record of what
+ * stands there: devices of one GPU share it, as they share the symbol.
+ */
+struct constants *backproject_constants(int gpu)
+{
+	static struct constants all[GPUS_MOST];
+
+	return &all[gpu];
+}
 
 static int load_matrices(struct plan *plan, int first, int count, int pad, bool fdk, struct error *err)
 {
+	struct constants *held = plan->device->constants;
 	cudaStream_t stream = plan->device->stream;
 	/* Pairs stand upside down where rows run down. */
 	bool flipped = back_by_pairs(plan, fdk) && plan->shape.rows_down;
 	float flip = flipped ? (float)(plan->stack.rows - 1) : -1.0f;
 
-	if (loaded.plan == plan && loaded.list == plan->views_list && loaded.first == first && loaded.count == count &&
-	    loaded.pad == pad && loaded.flip == flip)
+	if (held->plan == plan && held->list == plan->views_list && held->first == first && held->count == count &&
+	    held->pad == pad && held->flip == flip)
 		return 0;
 	gather<<<divide_up(count * 12, 256), 256, 0, stream>>>(plan->geometry, plan->views + first, count, (float)pad,
 							       flip, plan->matrices);
 	LAUNCHED();
 	CUDA_TRY(cudaMemcpyToSymbolAsync(matrices, plan->matrices, (size_t)count * 12 * sizeof(float), 0,
 					 cudaMemcpyDeviceToDevice, stream));
-	loaded.plan = plan;
-	loaded.list = plan->views_list;
-	loaded.first = first;
-	loaded.count = count;
-	loaded.pad = pad;
-	loaded.flip = flip;
+	*held = {plan, plan->views_list, first, count, pad, flip};
 	return 0;
 }
 
@@ -414,9 +413,9 @@ int backproject_prepare(struct plan *plan, int first, int count, struct error *e
 	return load_matrices(plan, first, count, 0, false, err);
 }
 
-void backproject_forget(void)
+void backproject_forget(struct device *device)
 {
-	loaded.plan = NULL;
+	device->constants->plan = NULL;
 }
 
 /* What a sum samples: padded rows and their array for FDK, the detector's own for SART. */
@@ -545,27 +544,94 @@ static void launch_pairs(const struct plan_shape *shape, const backprojection_jo
 	}
 }
 
+/* ---- the table ---- */
+
+static bool is_by_rows(const struct plan *plan, const struct voxel_use &use)
+{
+	return back_by_pairs(plan, use.fdk);
+}
+static bool has_array(const struct plan *plan, const struct voxel_use &use)
+{
+	return array_for(plan, use)->bytes > 0;
+}
+static bool is_small(const struct plan *plan, const struct voxel_use &use)
+{
+	(void)use;
+	return plan->shape.is_small;
+}
+static bool is_any(const struct plan *plan, const struct voxel_use &use)
+{
+	(void)plan;
+	(void)use;
+	return true;
+}
+
+static int by_rows(struct plan *plan, backprojection_job &job, struct error *err)
+{
+	TRY(layout_pairs(plan, shape_for(plan, job.use), job.from, job.views, err));
+	launch_pairs(&plan->shape, job, plan->device->stream);
+	return 0;
+}
+
+static int by_array(struct plan *plan, backprojection_job &job, struct error *err)
+{
+	if (!job.use.laid_out)
+		TRY(load_array(plan, job, err));
+	if (job.use.coverage != NULL) {
+		job.texture = plan->projections.held;
+		launch_general<8, BY_TEXTURE_HELD>(job, plan->device->stream);
+	} else {
+		launch_general<8, BY_TEXTURE>(job, plan->device->stream);
+	}
+	return 0;
+}
+
+static int by_voxel(struct plan *plan, backprojection_job &job, struct error *err)
+{
+	(void)err;
+	launch_small(job, plan->device->stream);
+	return 0;
+}
+
+static int by_loads(struct plan *plan, backprojection_job &job, struct error *err)
+{
+	(void)err;
+	launch_general<8, BY_LOADS>(job, plan->device->stream);
+	return 0;
+}
+
+/* How a call is done: the first that applies. The matched projector has a backprojection of its own, matched.cu. */
+static const struct backprojector {
+	const char *name;
+	bool (*applies)(const struct plan *plan, const struct voxel_use &use);
+	int (*launch)(struct plan *plan, backprojection_job &job, struct error *err);
+} backprojectors[] = {
+    {"by rows", is_by_rows, by_rows},
+    {"textures and loads", has_array, by_array},
+    {"small", is_small, by_voxel},
+    {"loads", is_any, by_loads},
+};
+
+static const struct backprojector *backprojector_of(const struct plan *plan, const struct voxel_use &use)
+{
+	const struct backprojector *backprojector = backprojectors;
+
+	while (!backprojector->applies(plan, use))
+		backprojector++;
+	return backprojector;
+}
+
+const char *backprojector_name(const struct plan *plan, bool fdk)
+{
+	struct voxel_use use = {};
+
+	use.fdk = fdk;
+	return plan->options.matched && !fdk ? "matched" : backprojector_of(plan, use)->name;
+}
+
 static int launch(struct plan *plan, backprojection_job &job, struct error *err)
 {
-	cudaStream_t stream = plan->device->stream;
-
-	if (back_by_pairs(plan, job.use.fdk)) {
-		TRY(layout_pairs(plan, shape_for(plan, job.use), job.from, job.views, err));
-		launch_pairs(&plan->shape, job, stream);
-	} else if (array_for(plan, job.use)->array != NULL) {
-		if (!job.use.laid_out)
-			TRY(load_array(plan, job, err));
-		if (job.use.coverage != NULL) {
-			job.texture = plan->projections.held;
-			launch_general<8, BY_TEXTURE_HELD>(job, stream);
-		} else {
-			launch_general<8, BY_TEXTURE>(job, stream);
-		}
-	} else if (plan->shape.is_small) {
-		launch_small(job, stream);
-	} else {
-		launch_general<8, BY_LOADS>(job, stream);
-	}
+	TRY(backprojector_of(plan, job.use)->launch(plan, job, err));
 	LAUNCHED();
 	return 0;
 }

@@ -62,7 +62,7 @@ static int cuda_count(void)
 		cudaGetLastError();
 		return 0;
 	}
-	return count;
+	return count < GPUS_MOST ? count : GPUS_MOST;
 }
 
 static int staging_make(struct staging *staging, struct error *err)
@@ -135,6 +135,7 @@ static int cuda_open(int index, const struct device_options *options, struct dev
 	if (device == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a device");
 	device->index = index;
+	device->constants = backproject_constants(index);
 	code = device_prepare(device, options, err);
 	if (code < 0) {
 		cuda_close(device);

@@ -57,6 +57,15 @@ struct edges {
 	size_t extended[2];
 };
 
+/* What the filter of a plan has. */
+struct filter {
+	float *column_weights; /* [count][columns] */
+	float *response;       /* the fused filter's, in the order of the kernel */
+	float2 *twiddles;
+	struct fft plain, extended; /* of no length where they are not needed */
+	struct edges edges;         /* no rows without plan_options.extend */
+};
+
 struct filter_job {
 	const device_view *geometry;
 	const int *views, *slots;
@@ -544,25 +553,34 @@ static int fft_at_once(const struct plan *plan, int length)
 	return (int)std::min(std::min(room / fft_row_bytes(length), all), launch_most);
 }
 
-static size_t response_bytes(int length)
+int filter_new(struct plan *plan, struct error *err)
 {
-	return ((size_t)length / 2 + 1) * sizeof(float);
+	plan->filter = (struct filter *)calloc(1, sizeof(*plan->filter));
+	return plan->filter != NULL ? 0 : error_set(err, ERR_NO_MEMORY, "no memory for the filter");
 }
 
-size_t filter_bytes(const struct plan_shape *shape, int rows)
+void filter_walk(struct plan *plan, struct arena *arena)
 {
-	size_t length = (size_t)shape->filter_length, bytes;
-	size_t all = (size_t)shape->batch * (size_t)rows;
+	const struct plan_shape *shape = &plan->shape;
+	struct filter measured = {}, *filter = plan->filter != NULL ? plan->filter : &measured;
+	size_t length = (size_t)shape->filter_length, batch = (size_t)shape->batch;
+	size_t rows = batch * (size_t)plan->stack.rows;
 
-	if (length > 0)
-		bytes = length * (sizeof(float) + sizeof(float2)) + 256 * sizeof(float2);
-	else
-		bytes = response_bytes(shape->fft_length);
-	if (shape->extended_length > 0)
-		bytes += response_bytes(shape->extended_length) +
-			 all * (1 + 2 * sizeof(struct extension) + sizeof(int)) + (size_t)shape->batch * sizeof(float) +
-			 sizeof(struct shell_table);
-	return bytes;
+	take(arena, &filter->column_weights, (size_t)plan->options.geometry->count * (size_t)plan->stack.columns);
+	if (length > 0) {
+		take(arena, &filter->response, length);
+		take(arena, &filter->twiddles, length + 256);
+	} else {
+		take(arena, &filter->plain.response, (size_t)shape->fft_length / 2 + 1);
+	}
+	if (shape->extended_length == 0)
+		return;
+	take(arena, &filter->extended.response, (size_t)shape->extended_length / 2 + 1);
+	take(arena, &filter->edges.shells, 1);
+	take(arena, &filter->edges.levels, batch);
+	take(arena, &filter->edges.sides, rows);
+	take(arena, &filter->edges.fit, rows);
+	take(arena, &filter->edges.list, rows);
 }
 
 /* The response at another length that convolves `columns` values alike. */
@@ -594,10 +612,9 @@ static std::vector<double> response_at(const float *response, int from, int colu
 	return result;
 }
 
-static int upload(struct plan *plan, const void *from, size_t bytes, void **ret_to, struct error *err)
+static int upload(void *to, const void *from, size_t bytes, struct error *err)
 {
-	TRY(device_allocate(plan->device, bytes, ret_to, err));
-	CUDA_TRY(cudaMemcpy(*ret_to, from, bytes, cudaMemcpyHostToDevice));
+	CUDA_TRY(cudaMemcpy(to, from, bytes, cudaMemcpyHostToDevice));
 	return 0;
 }
 
@@ -629,8 +646,8 @@ static int prepare_fused(struct plan *plan, struct error *err)
 
 			twiddles[(size_t)(length + 16 * k + m)] = make_float2((float)cos(angle), (float)sin(angle));
 		}
-	TRY(upload(plan, response.data(), response.size() * sizeof(float), (void **)&plan->response, err));
-	return upload(plan, twiddles.data(), twiddles.size() * sizeof(float2), (void **)&plan->twiddles, err);
+	TRY(upload(plan->filter->response, response.data(), response.size() * sizeof(float), err));
+	return upload(plan->filter->twiddles, twiddles.data(), twiddles.size() * sizeof(float2), err);
 }
 
 /* Both transforms of so many rows with one workspace of *ret_bytes; false: cuFFT will not. */
@@ -665,19 +682,15 @@ static void fft_unmake(struct fft *fft)
 	fft->has_forward = fft->has_inverse = false;
 }
 
-static int fft_new(struct plan *plan, int length, const float *from, struct fft **ret_fft, struct error *err)
+static int prepare_fft(struct plan *plan, struct fft *fft, int length, const float *from, struct error *err)
 {
 	int half = length / 2 + 1;
 	std::vector<float> response((size_t)half);
-	struct fft *fft = (struct fft *)calloc(1, sizeof(*fft));
 
-	if (fft == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for the filter");
-	*ret_fft = fft; /* the plan's, which releases it however far this comes */
 	fft->length = length;
 	for (int k = 0; k < half; k++)
 		response[(size_t)k] = from[k] / (float)length;
-	TRY(upload(plan, response.data(), response.size() * sizeof(float), (void **)&fft->response, err));
+	TRY(upload(fft->response, response.data(), response.size() * sizeof(float), err));
 	/* A workspace may be larger than the rows: fewer then. */
 	for (int rows = fft_at_once(plan, length); rows > 0; rows /= 2) {
 		size_t data = ((size_t)rows * fft_row_bytes(length) + FFT_ALIGNED - 1) / FFT_ALIGNED * FFT_ALIGNED;
@@ -695,80 +708,49 @@ static int fft_new(struct plan *plan, int length, const float *from, struct fft 
 			 plan->scratch_bytes);
 }
 
-static void fft_free(struct device *device, struct fft *fft)
-{
-	if (fft == NULL)
-		return;
-	fft_unmake(fft);
-	device_release(device, fft->response, response_bytes(fft->length));
-	free(fft);
-}
-
 static int prepare_edges(struct plan *plan, struct error *err)
 {
-	struct edges *edges = (struct edges *)calloc(1, sizeof(*edges));
+	struct edges *edges = &plan->filter->edges;
 	size_t rows = (size_t)plan->shape.batch * (size_t)plan->stack.rows;
+	struct shell_table shells = shell_table_make();
 
-	if (edges == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for the edges of rows");
-	plan->edges = edges;
 	edges->rows = (int)rows;
 	edges->sides_host = (unsigned char *)malloc(rows);
 	edges->list_host = (int *)malloc(rows * sizeof(int));
 	if (edges->sides_host == NULL || edges->list_host == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for the edges of %zu rows", rows);
 	CUDA_TRY(cudaEventCreateWithFlags(&edges->used, cudaEventDisableTiming));
-	struct shell_table shells = shell_table_make();
-	TRY(upload(plan, &shells, sizeof(shells), (void **)&edges->shells, err));
-	TRY(device_allocate(plan->device, (size_t)plan->shape.batch * sizeof(float), (void **)&edges->levels, err));
-	TRY(device_allocate(plan->device, rows, (void **)&edges->sides, err));
-	TRY(device_allocate(plan->device, rows * sizeof(*edges->fit), (void **)&edges->fit, err));
-	return device_allocate(plan->device, rows * sizeof(int), (void **)&edges->list, err);
-}
-
-static void edges_free(struct device *device, struct edges *edges, int batch)
-{
-	if (edges == NULL)
-		return;
-	device_release(device, edges->shells, sizeof(*edges->shells));
-	device_release(device, edges->levels, (size_t)batch * sizeof(float));
-	device_release(device, edges->sides, (size_t)edges->rows);
-	device_release(device, edges->fit, (size_t)edges->rows * sizeof(*edges->fit));
-	device_release(device, edges->list, (size_t)edges->rows * sizeof(int));
-	if (edges->used != NULL)
-		cudaEventDestroy(edges->used);
-	free(edges->sides_host);
-	free(edges->list_host);
-	free(edges);
+	return upload(edges->shells, &shells, sizeof(shells), err);
 }
 
 int filter_prepare(struct plan *plan, struct error *err)
 {
 	const struct plan_options *options = &plan->options;
+	struct filter *filter = plan->filter;
 	size_t bytes = (size_t)options->geometry->count * (size_t)plan->stack.columns * sizeof(float);
 
-	TRY(upload(plan, options->column_weights, bytes, (void **)&plan->column_weights, err));
+	TRY(upload(filter->column_weights, options->column_weights, bytes, err));
 	if (plan->shape.filter_length > 0)
 		TRY(prepare_fused(plan, err));
 	else
-		TRY(fft_new(plan, plan->shape.fft_length, options->filter_response, &plan->fft, err));
+		TRY(prepare_fft(plan, &filter->plain, plan->shape.fft_length, options->filter_response, err));
 	if (plan->shape.extended_length == 0)
 		return 0;
 	TRY(prepare_edges(plan, err));
-	return fft_new(plan, plan->shape.extended_length, options->extended_response, &plan->extended, err);
+	return prepare_fft(plan, &filter->extended, plan->shape.extended_length, options->extended_response, err);
 }
 
-void filter_release(struct plan *plan)
+void filter_free(struct filter *filter)
 {
-	size_t length = (size_t)plan->shape.filter_length;
-
-	device_release(plan->device, plan->column_weights,
-		       (size_t)plan->options.geometry->count * (size_t)plan->stack.columns * sizeof(float));
-	device_release(plan->device, plan->response, length * sizeof(float));
-	device_release(plan->device, plan->twiddles, (length + 256) * sizeof(float2));
-	fft_free(plan->device, plan->fft);
-	fft_free(plan->device, plan->extended);
-	edges_free(plan->device, plan->edges, plan->shape.batch);
+	if (filter == NULL)
+		return;
+	fft_unmake(&filter->plain);
+	fft_unmake(&filter->extended);
+	if (filter->edges.used != NULL)
+		cudaEventDestroy(filter->edges.used);
+	free(filter->edges.sides_host);
+	free(filter->edges.list_host);
+	free(filter);
 }
 
 template <int HALF>
@@ -799,9 +781,9 @@ static filter_job job_make(const struct plan *plan, const struct stack *from, co
 	job.wide = plan->filtered.columns;
 	job.wide_pitch = plan->filtered.pitch;
 	job.wide_slot = plan->filtered.slot;
-	job.column_weights = plan->column_weights;
-	job.response = plan->response;
-	job.twiddles = plan->twiddles;
+	job.column_weights = plan->filter->column_weights;
+	job.response = plan->filter->response;
+	job.twiddles = plan->filter->twiddles;
 	job.views = plan->views;
 	job.slots = plan->slots;
 	job.extend = plan->options.extend;
@@ -836,7 +818,7 @@ static int filter_plain(struct plan *plan, filter_job job, struct error *err)
 		launch_fused<8>(job, stream);
 		break;
 	default:
-		return filter_fft(plan, plan->fft, job, job.count * job.rows, err);
+		return filter_fft(plan, &plan->filter->plain, job, job.count * job.rows, err);
 	}
 	LAUNCHED();
 	return 0;
@@ -848,7 +830,7 @@ static int look_at_edges(struct plan *plan, const filter_job &job, const int *sl
 {
 	const int *pad = plan->options.pad;
 	cudaStream_t stream = plan->device->copy;
-	struct edges *edges = plan->edges;
+	struct edges *edges = &plan->filter->edges;
 	int rows = job.count * job.rows, count = 0;
 	batch_slots batch = {};
 
@@ -877,7 +859,7 @@ static int look_at_edges(struct plan *plan, const filter_job &job, const int *sl
 
 static int filter_extended_rows(struct plan *plan, filter_job job, int count, struct error *err)
 {
-	struct edges *edges = plan->edges;
+	struct edges *edges = &plan->filter->edges;
 	cudaStream_t stream = plan->device->stream;
 
 	CUDA_TRY(cudaMemcpyAsync(edges->list, edges->list_host, (size_t)count * sizeof(int), cudaMemcpyHostToDevice,
@@ -885,7 +867,7 @@ static int filter_extended_rows(struct plan *plan, filter_job job, int count, st
 	job.list = edges->list;
 	job.sides = edges->sides;
 	job.fit = edges->fit;
-	TRY(filter_fft(plan, plan->extended, job, count, err));
+	TRY(filter_fft(plan, &plan->filter->extended, job, count, err));
 	return mark_used(plan->device, edges->used, err); /* what was found is free for the next batch */
 }
 
@@ -894,7 +876,7 @@ int cuda_filter(struct plan *plan, const struct stack *from, const int *slots, c
 {
 	filter_job job;
 
-	if (plan->column_weights == NULL)
+	if (plan->filter == NULL)
 		return error_set(err, ERR_INTERNAL, "the plan was made without FDK");
 	slots = slots != NULL ? slots : views;
 	TRY(plan_check_views(plan, views, count, &plan->filtered, to, count, err));
@@ -902,7 +884,7 @@ int cuda_filter(struct plan *plan, const struct stack *from, const int *slots, c
 	TRY(plan_set_slots(plan, slots, count, from, err));
 	job = job_make(plan, from, to);
 	job.count = count;
-	if (plan->edges == NULL)
+	if (plan->filter->edges.rows == 0)
 		return filter_plain(plan, job, err);
 	for (int done = 0; done < count; done += plan->shape.batch) {
 		int extended = 0;
@@ -923,6 +905,6 @@ int cuda_filter_extended(struct plan *plan, size_t ret_rows[2], struct error *er
 {
 	(void)err;
 	for (int i = 0; i < 2; i++)
-		ret_rows[i] = plan->edges != NULL ? plan->edges->extended[i] : 0;
+		ret_rows[i] = plan->filter != NULL ? plan->filter->edges.extended[i] : 0;
 	return 0;
 }

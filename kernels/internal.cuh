@@ -16,6 +16,7 @@
 #include <cuda_runtime.h>
 
 extern "C" {
+#include "core/arena.h"
 #include "core/backend.h"
 #include "core/fdk.h"
 }
@@ -56,8 +57,18 @@ struct staging {
 	int next;
 };
 
+/* Which views' matrices stand in the constant memory of a GPU (backproject.cu); no plan: none. */
+struct constants {
+	const struct plan *plan;
+	unsigned long list; /* plan.views_list */
+	int first, count, pad;
+	float flip;
+};
+enum { GPUS_MOST = 64 };
+
 struct device {
 	int index;
+	struct constants *constants;
 	int multiprocessors;
 	cudaStream_t stream; /* everything that computes */
 	cudaStream_t copy;   /* what comes in, raw projections made line integrals included */
@@ -75,6 +86,14 @@ int device_enter(struct device *device, struct error *err);
 int device_allocate(struct device *device, size_t bytes, void **ret_memory, struct error *err);
 void device_release(struct device *device, void *memory, size_t bytes);
 int device_wait(struct device *device, struct error *err);
+
+/* The next `count` elements of an arena on the device, aligned for textures and vector loads; not cleared. */
+enum { DEVICE_ALIGNED = 512 };
+template <typename T>
+static inline void take(struct arena *arena, T **ret_memory, size_t count)
+{
+	*ret_memory = (T *)arena_take(arena, count * sizeof(T), DEVICE_ALIGNED);
+}
 
 /* ---- memory.cu: copies through pinned memory ---- */
 /*
@@ -126,6 +145,9 @@ struct stack {
 
 struct stack_shape stack_shape_make(int columns, int rows, int slots);
 size_t cuda_stack_bytes(int columns, int rows, int slots);
+/* Takes a stack of a plan's own, without an event; stack_clear writes its zeros. */
+void stack_walk(int columns, int rows, int slots, struct stack *ret_stack, struct arena *arena);
+int stack_clear(struct device *device, struct stack *stack, struct error *err);
 
 /* The pixels whose rays may meet the grid, and some around them. */
 struct shadow {
@@ -199,16 +221,18 @@ struct columns_shape {
 };
 struct columns_shape columns_shape_make(const int size[3]);
 
-struct layered { /* a layered 2D array with its texture: hardware bilinear samples */
+/* A layered 2D array with its texture: hardware bilinear samples, 0 beyond its sides. */
+struct layered {
+	int width, height, layers;
+	size_t bytes; /* 0: there is none */
 	cudaArray_t array;
 	cudaTextureObject_t texture;
-	cudaTextureObject_t held;    /* the same with the edges held, whatever `texture` has beyond them */
+	cudaTextureObject_t held;    /* the same with the edges held */
 	cudaSurfaceObject_t surface; /* to write it */
-	int width, height, layers;
-	size_t bytes;
 };
-int layered_new(struct device *device, int width, int height, int layers, cudaTextureAddressMode outside,
-		struct layered *ret_layered, struct error *err);
+/* Sizes alone; layered_new allocates what they say, nothing for 0 bytes. */
+struct layered layered_make(int width, int height, int layers);
+int layered_new(struct device *device, struct layered *layered, struct error *err);
 void layered_free(struct device *device, struct layered *layered);
 
 struct device_grid {
@@ -248,9 +272,10 @@ struct plan_shape {
 	bool parts;          /* it holds a part of a subset only */
 	int views_at_once;   /* that one launch of the backprojection takes; layers of the projection array */
 	int pairs_at_once;   /* that there is room for as pairs */
-	bool by_view;        /* SART goes view by view */
-	bool by_subset;      /* SART has updates of several views */
-	bool by_copies;      /* it projects from copies in half precision, not from slices or one with z fastest */
+	int subset;          /* views of SART's largest subset, 0 without SART */
+	bool indexed;        /* voxels are counted by an int */
+	bool few_views;      /* an update has too few views to fill the card by whole rays */
+	bool copied;         /* the volume may be projected from copies in half precision (by_view.cu) */
 	bool covered;        /* every view sees the whole grid: sum_S w_ij = views of S */
 	int filter_length;   /* of the fused filter, 0 for cuFFT */
 	int fft_length;      /* of cuFFT for all rows */
@@ -260,24 +285,27 @@ struct plan_shape {
 /* What has a scale in half precision: projections as pairs, those of ones, the volume. */
 enum { MOST_PAIRS, MOST_ONES, MOST_VOLUME, MOST_COUNT };
 
-struct fft;   /* filter.cu: cuFFT's plans */
-struct edges; /* what it finds at the edges of rows */
+struct filter;   /* filter.cu */
+struct strategy; /* below: how SART iterates */
 
 struct plan {
 	struct device *device;
 	struct plan_options options;
 	struct plan_shape shape;
-	struct plan_bytes bytes;
+	const struct strategy *strategy; /* NULL without SART */
 	struct device_grid grid;
 	struct slices_shape along_x, along_y;
 	struct columns_shape columns;
 	struct stack_shape stack;
 	struct stack_shape filtered; /* with plan_options.pad */
-	char summary[192];
+	char summary[224];
+
+	char *memory; /* everything that plan_walk takes, memory_bytes of it */
+	size_t memory_bytes;
 
 	int *views_host; /* what `views` holds, so that the same list is not copied again */
 	int views_held;
-	unsigned long views_list;     /* changes with the list, over all plans */
+	unsigned long views_list;     /* counts the lists that there have been */
 	int *views;                   /* [count], device: the views of the call in hand */
 	int *slots;                   /* [count], device: their slots, for those that need them */
 	struct device_view *geometry; /* [count], device */
@@ -295,39 +323,35 @@ struct plan {
 	const struct plan *slices_of;  /* of its own scratch: whose slices alone are there */
 	struct layered projections;    /* a batch of projections, with textures */
 	struct layered filtered_array; /* the same of padded rows, where they are longer */
-	void *pairs;                   /* a batch of projections as pairs of float or half, for the rows */
-	size_t pairs_bytes;
-	void *ones;      /* a projection of ones, where column sums are made of it */
+	char *pairs;                   /* a batch of projections as pairs of float or half, for the rows */
+	char *ones;                    /* a projection of ones, where column sums are made of it */
 	unsigned *most;  /* [MOST_COUNT]: the largest magnitudes, as bits, of what is kept in half precision */
 	float *coverage; /* [z][y][x], sum_S w_ij of subset `coverage_subset`, where not all is covered */
 	int coverage_subset;
 	float *work; /* [z][y][x], where an update takes more views than one launch */
-	struct stack *correction;
+	struct stack correction;
 	float *sampled_from;         /* the correction where SART goes view by view and by rows, */
 	cudaTextureObject_t sampled; /* and its texture */
 	float2 *partial; /* SART: squares of residuals and projections, one for each block of the forward projection */
 	size_t partial_count;
 	cudaEvent_t projected, summed; /* the last of them is there; all are summed up */
-	double *reduce;                /* partial sums of reductions */
+	double *reduce;                /* partial sums of reductions, reduce_count of them */
 	float *matrices;               /* of the views in hand, on their way into constant memory */
 
-	float *column_weights; /* [count][columns] */
-	float *response;       /* the filter's, in the order of the kernel */
-	float2 *twiddles;
-	struct fft *fft, *extended;
-	struct edges *edges; /* with plan_options.extend */
+	struct filter *filter; /* NULL without FDK */
 
 	/* linearise: raw samples of some views */
-	int raw_views; /* projections of the buffer */
-	void *raw;
+	int raw_views;    /* projections of the buffer; 0: the plan does not linearise */
+	size_t raw_bytes; /* of one projection */
+	char *raw;
 	float *flat, *dark;
 	unsigned char *map;          /* defects of every view */
 	unsigned char *marks[2];     /* defects of one view */
 	struct linearised *counters; /* linearise.cu */
 
 	/* A whole SART iteration, recorded at its first run for this volume and this stack. */
-	cudaGraphExec_t sweep;
-	const float *sweep_volume, *sweep_stack;
+	cudaGraphExec_t recorded;
+	const float *recorded_volume, *recorded_stack;
 };
 
 /* The list of views on the device; nothing is copied when it is there already. */
@@ -405,6 +429,7 @@ int project_prepare(struct plan *plan, const float *volume, struct error *err);
 int project_rays(struct plan *plan, const float *volume, int first, int count, struct ray_use use, float *to,
 		 struct error *err);
 size_t project_blocks(const struct plan *plan, int count);
+const char *projector_name(const struct plan *plan); /* of projectors[] */
 
 /* ---- backproject.cu ---- */
 /* What becomes of a voxel's sum. */
@@ -428,8 +453,10 @@ enum { VIEWS_AT_ONCE = 1024 };
  * views is used: what is recorded finds them there when they are brought before.
  */
 int backproject_prepare(struct plan *plan, int first, int count, struct error *err);
-void backproject_forget(void);
+void backproject_forget(struct device *device);
+struct constants *backproject_constants(int gpu);
 int coverage_sum(struct plan *plan, int first, int count, struct error *err);
+const char *backprojector_name(const struct plan *plan, bool fdk); /* of backprojectors[], or matched */
 
 /* ---- matched.cu ---- */
 /*
@@ -441,42 +468,77 @@ int matched_views(struct plan *plan, const float *from, int first, int count, st
 
 /* ---- filter.cu ---- */
 int filter_choose(int columns);
+/* plan->filter, before the walk that carves; filter_free takes NULL. */
+int filter_new(struct plan *plan, struct error *err);
+void filter_free(struct filter *filter);
+/* What the filter holds of the plan's memory; measures where plan->filter is NULL. */
+void filter_walk(struct plan *plan, struct arena *arena);
+/* Fills it. */
 int filter_prepare(struct plan *plan, struct error *err);
-void filter_release(struct plan *plan);
-/* Of its own, and in plan->scratch, which has `others` for other stages anyway. */
-size_t filter_bytes(const struct plan_shape *shape, int rows);
+/* Of plan->scratch, which has `others` for other stages anyway. */
 size_t filter_scratch_bytes(const struct plan *plan, size_t others);
 
+/* ---- linearise.cu ---- */
+/* What it holds of the plan's memory, nothing with plan_options.no_samples; and what is written there beforehand. */
+void linearise_walk(struct plan *plan, struct arena *arena);
+int linearise_prepare(struct plan *plan, struct error *err);
+
 /* ---- norms.cu ---- */
-size_t reduce_bytes(void);
+size_t reduce_count(void);
 /* partial[0 .. count - 1] -> sums[0], sums[1] += in a fixed order. */
 int reduce_pairs(struct plan *plan, const float2 *partial, size_t count, double *sums, cudaStream_t stream,
 		 struct error *err);
 
-/* ---- sweep.cu: one or few views an update, by rows, from copies in half precision in scratch ---- */
+/* ---- by_view.cu: one or few views an update, by rows, from copies in half precision in scratch ---- */
 size_t copies_bytes(const struct plan *plan);
-size_t copies_partials(const struct plan *plan); /* of a view */
+size_t copies_partials(const struct plan *plan, int count); /* of so many views */
 int copies_lay_out(struct plan *plan, const float *volume, struct error *err);
 /* What project_rays does, with `use.measured`. */
-int copies_project(struct plan *plan, int first, int count, struct ray_use use, float *to, struct error *err);
-int sweep_view_rows(const struct plan *plan); /* what view_rows is to be */
-size_t sweep_correction_bytes(const struct plan *plan);
-int sweep_rows_prepare(struct plan *plan, struct error *err);
-void sweep_rows_release(struct plan *plan);
+int copies_project(struct plan *plan, const float *volume, int first, int count, struct ray_use use, float *to,
+		   struct error *err);
+int copies_view_rows(const struct plan *plan); /* what view_rows is to be */
 /* An iteration view by view; partial sums of each view are left in plan->partial. */
-int sweep_rows(struct plan *plan, const float *projections, float *volume, float least, const struct cancel *cancel,
-	       struct error *err);
+void by_view_rows_walk(struct plan *plan, struct arena *arena);
+int by_view_rows_prepare(struct plan *plan, struct error *err);
+int by_view_rows_iterate(struct plan *plan, const float *projections, float *volume, const struct cancel *cancel,
+			 struct error *err);
 
-/* ---- tv.cu, sart.cu ---- */
+/* ---- sart.cu ---- */
+/* What a ray must have in the grid to correct it, mm. */
+float length_least(const struct plan *plan);
+
+/*
+ * How SART iterates: strategies[] of sart.cu, of which the first that applies is taken. Those of one view an
+ * update do it all in `iterate`; the others share theirs and differ in how a subset is projected.
+ */
+struct strategy {
+	const char *name;
+	bool by_view;                             /* an update after each view, else after each subset */
+	bool (*applies)(const struct plan *plan); /* options and shape are known */
+	/* Bytes of plan->scratch, beside the slices that are there for `project`. */
+	size_t (*scratch_bytes)(const struct plan *plan);
+	/* What it alone holds of the plan's memory, and what is written there beforehand. */
+	void (*walk)(struct plan *plan, struct arena *arena);
+	int (*prepare)(struct plan *plan, struct error *err);
+	/* Partial sums that `count` projections leave, those of all views or what one launch has. */
+	size_t (*partials)(const struct plan *plan, int count);
+	int (*iterate)(struct plan *plan, const float *projections, float *volume, const struct cancel *cancel,
+		       struct error *err);
+	/* By subsets: the volume as it is projected from, and the projection of some views. */
+	int (*lay_out)(struct plan *plan, const float *volume, struct error *err);
+	int (*project)(struct plan *plan, const float *volume, int first, int count, struct ray_use use, float *to,
+		       struct error *err);
+};
+/* NULL without SART. */
+const struct strategy *strategy_choose(const struct plan *plan);
+size_t strategy_partials(const struct plan *plan); /* of an iteration */
+
+/* ---- tv.cu ---- */
 size_t tv_scratch_bytes(const struct plan_options *options);
-size_t sweep_partials(const struct plan *plan);
-size_t sweep_scratch_bytes(const struct plan *plan);
-size_t subsets_partials(const struct plan *plan);
 
 /* ---- the operations of the table ---- */
 int cuda_linearise(struct plan *plan, const void *samples, int count, const int *slots, struct stack *to,
 		   struct defect_counts *counts, struct error *err);
-size_t linearise_counters_bytes(void);
 int cuda_filter_extended(struct plan *plan, size_t ret_rows[2], struct error *err);
 int cuda_filter(struct plan *plan, const struct stack *from, const int *slots, const int *views, int count,
 		struct stack *to, struct error *err);

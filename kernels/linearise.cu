@@ -36,9 +36,38 @@ struct linearised {
 	float air_least, air_most;
 };
 
-size_t linearise_counters_bytes(void)
+void linearise_walk(struct plan *plan, struct arena *arena)
 {
-	return sizeof(struct linearised);
+	const struct linearise *options = &plan->options.linearise;
+	size_t pixels = (size_t)plan->stack.columns * (size_t)plan->stack.rows;
+
+	if (plan->raw_views == 0)
+		return;
+	take(arena, &plan->raw, plan->raw_bytes * (size_t)plan->raw_views);
+	for (int i = 0; i < 2; i++)
+		take(arena, &plan->marks[i], pixels);
+	take(arena, &plan->counters, 1);
+	take(arena, &plan->flat, options->flat != NULL ? pixels : 0);
+	take(arena, &plan->dark, options->dark != NULL ? pixels : 0);
+	take(arena, &plan->map, options->defects != NULL ? pixels : 0);
+}
+
+/* An image of the scan, where it is given. */
+static int upload_image(void *to, const void *from, size_t bytes, struct error *err)
+{
+	if (to != NULL)
+		CUDA_TRY(cudaMemcpy(to, from, bytes, cudaMemcpyHostToDevice));
+	return 0;
+}
+
+int linearise_prepare(struct plan *plan, struct error *err)
+{
+	const struct linearise *options = &plan->options.linearise;
+	size_t pixels = (size_t)plan->stack.columns * (size_t)plan->stack.rows;
+
+	TRY(upload_image(plan->flat, options->flat, pixels * sizeof(float), err));
+	TRY(upload_image(plan->dark, options->dark, pixels * sizeof(float), err));
+	return upload_image(plan->map, options->defects, pixels, err);
 }
 
 static __device__ __forceinline__ float sample_at(const samples &s, size_t at)
@@ -216,7 +245,7 @@ static int linearise_piece(struct plan *plan, int count, const int *slots, struc
 	for (int i = 0; i < count; i++) {
 		float *slot = to->data + (size_t)slots[i] * to->shape.slot;
 
-		s.raw = (const char *)plan->raw + (size_t)i * plan->bytes.raw;
+		s.raw = plan->raw + (size_t)i * plan->raw_bytes;
 		if (s.has_air_region) {
 			find_air<<<1, 256, 0, stream>>>(s, plan->counters);
 			LAUNCHED();
@@ -250,7 +279,7 @@ int cuda_linearise(struct plan *plan, const void *samples, int count, const int 
 		   struct defect_counts *counts, struct error *err)
 {
 	struct device *device = plan->device;
-	size_t view = plan->bytes.raw;
+	size_t view = plan->raw_bytes;
 	linearised found;
 
 	if (plan->raw_views == 0)

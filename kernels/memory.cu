@@ -288,6 +288,22 @@ void cuda_stack_free(struct stack *stack)
 	free(stack);
 }
 
+void stack_walk(int columns, int rows, int slots, struct stack *ret_stack, struct arena *arena)
+{
+	*ret_stack = {};
+	ret_stack->shape = stack_shape_make(columns, rows, slots);
+	ret_stack->slots = slots;
+	take(arena, &ret_stack->memory, ret_stack->shape.floats);
+	if (ret_stack->memory != NULL)
+		ret_stack->data = ret_stack->memory + (size_t)ret_stack->shape.pitch * (STACK_PAD + 1);
+}
+
+int stack_clear(struct device *device, struct stack *stack, struct error *err)
+{
+	CUDA_TRY(cudaMemsetAsync(stack->memory, 0, stack->shape.floats * sizeof(float), device->stream));
+	return 0;
+}
+
 static int check_slots(const struct stack *stack, int slot, int count, struct error *err)
 {
 	if (slot < 0 || count < 0 || slot > stack->slots - count)
@@ -328,43 +344,47 @@ int cuda_stack_upload(struct stack *stack, int slot, int count, const float *fro
 
 /* ---- arrays ---- */
 
-int layered_new(struct device *device, int width, int height, int layers, cudaTextureAddressMode outside,
-		struct layered *ret_layered, struct error *err)
+struct layered layered_make(int width, int height, int layers)
 {
 	struct layered layered = {};
-	cudaChannelFormatDesc channel = cudaCreateChannelDesc<float>();
-	cudaResourceDesc resource = {};
-	cudaTextureDesc texture = {};
 
 	layered.width = width;
 	layered.height = height;
 	layered.layers = layers;
 	layered.bytes = (size_t)width * (size_t)height * (size_t)layers * sizeof(float);
-	if (layered.bytes > device->limit - device->used)
-		return error_set(err, ERR_NO_MEMORY, "an array of %zu bytes does not fit", layered.bytes);
-	CUDA_TRY(cudaMalloc3DArray(&layered.array, &channel,
-				   make_cudaExtent((size_t)width, (size_t)height, (size_t)layers),
-				   cudaArrayLayered | cudaArraySurfaceLoadStore));
+	return layered;
+}
+
+static cudaError_t layered_bind(struct layered *layered)
+{
+	cudaResourceDesc resource = {};
+	cudaTextureDesc texture = {};
+	cudaError_t status;
+
 	resource.resType = cudaResourceTypeArray;
-	resource.res.array.array = layered.array;
-	texture.addressMode[0] = texture.addressMode[1] = outside;
+	resource.res.array.array = layered->array;
+	texture.addressMode[0] = texture.addressMode[1] = cudaAddressModeBorder;
 	texture.filterMode = cudaFilterModeLinear;
 	texture.readMode = cudaReadModeElementType;
-	cudaError_t status = cudaCreateTextureObject(&layered.texture, &resource, &texture, NULL);
-	if (status == cudaSuccess) {
-		texture.addressMode[0] = texture.addressMode[1] = cudaAddressModeClamp;
-		status = cudaCreateTextureObject(&layered.held, &resource, &texture, NULL);
-	}
+	status = cudaCreateTextureObject(&layered->texture, &resource, &texture, NULL);
+	texture.addressMode[0] = texture.addressMode[1] = cudaAddressModeClamp;
 	if (status == cudaSuccess)
-		status = cudaCreateSurfaceObject(&layered.surface, &resource);
-	if (status != cudaSuccess) {
-		cudaDestroyTextureObject(layered.texture);
-		cudaDestroyTextureObject(layered.held);
-		cudaFreeArray(layered.array);
-		return cuda_error(err, status, "a texture or surface");
-	}
-	device->used += layered.bytes;
-	*ret_layered = layered;
+		status = cudaCreateTextureObject(&layered->held, &resource, &texture, NULL);
+	return status == cudaSuccess ? cudaCreateSurfaceObject(&layered->surface, &resource) : status;
+}
+
+int layered_new(struct device *device, struct layered *layered, struct error *err)
+{
+	cudaExtent extent = make_cudaExtent((size_t)layered->width, (size_t)layered->height, (size_t)layered->layers);
+	cudaChannelFormatDesc channel = cudaCreateChannelDesc<float>();
+
+	if (layered->bytes == 0)
+		return 0;
+	if (layered->bytes > device->limit - device->used)
+		return error_set(err, ERR_NO_MEMORY, "an array of %zu bytes does not fit", layered->bytes);
+	CUDA_TRY(cudaMalloc3DArray(&layered->array, &channel, extent, cudaArrayLayered | cudaArraySurfaceLoadStore));
+	device->used += layered->bytes;
+	CUDA_TRY(layered_bind(layered));
 	return 0;
 }
 
@@ -373,9 +393,12 @@ void layered_free(struct device *device, struct layered *layered)
 	if (layered->array == NULL)
 		return;
 	cudaSetDevice(device->index);
-	cudaDestroyTextureObject(layered->texture);
-	cudaDestroyTextureObject(layered->held);
-	cudaDestroySurfaceObject(layered->surface);
+	if (layered->texture != 0)
+		cudaDestroyTextureObject(layered->texture);
+	if (layered->held != 0)
+		cudaDestroyTextureObject(layered->held);
+	if (layered->surface != 0)
+		cudaDestroySurfaceObject(layered->surface);
 	cudaFreeArray(layered->array);
 	device->used -= layered->bytes;
 	*layered = {};

@@ -10,9 +10,9 @@
 enum { NORM2, DIFFERENCE2, VARIATION, SUM, MINIMUM, MAXIMUM, NOT_FINITE, NORMS };
 static const int THREADS = 256, BLOCKS = 1024;
 
-size_t reduce_bytes(void)
+size_t reduce_count(void)
 {
-	return (size_t)BLOCKS * NORMS * sizeof(double);
+	return (size_t)BLOCKS * NORMS;
 }
 
 static __device__ __forceinline__ double combine(int what, double a, double b)

@@ -287,12 +287,11 @@ static struct plan_shape shape_of(const struct plan_options *options, enum thrif
 	const struct geometry *geometry = options->geometry;
 	const struct grid *grid = options->grid;
 	struct plan_shape shape = {};
-	int most = grid->size[0] > grid->size[1] ? grid->size[0] : grid->size[1], subset = 0;
-	bool fits = most <= LAYERS_MOST && grid->size[2] <= SIDE_MOST, few;
-	bool indexed = columns_shape_make(grid->size).floats < (size_t)1 << 31; /* by an int */
+	int most = grid->size[0] > grid->size[1] ? grid->size[0] : grid->size[1];
+	bool fits = most <= LAYERS_MOST && grid->size[2] <= SIDE_MOST;
 
 	if (options->sart != NULL)
-		subset = subsets_largest(&options->sart->subsets);
+		shape.subset = subsets_largest(&options->sart->subsets);
 	shape.z_rays = has_z_rays(geometry, grid);
 	shape.is_small = (double)grid_voxels(grid) * geometry->count < SMALL;
 	/* The transpose is that of the general projection in float, whose weights are its own to the last bits. */
@@ -308,15 +307,13 @@ static struct plan_shape shape_of(const struct plan_options *options, enum thrif
 	shape.thrift = thrift;
 	/* Beside what SART takes FDK has no more than it will ask for. */
 	shape.batch = at_most(resident_views(options),
-			      lean_or(thrift, subset > 0 ? fdk_batch_most(geometry->count) : BATCH_MOST));
-	shape.by_view = subset == 1 && !options->matched && indexed;
-	shape.by_subset = subset > 0 && !shape.by_view;
+			      lean_or(thrift, shape.subset > 0 ? fdk_batch_most(geometry->count) : BATCH_MOST));
+	shape.indexed = columns_shape_make(grid->size).floats < (size_t)1 << 31;
 	/* Slices that are laid out once an iteration cost little, and their rays less. */
-	few = subset > 0 && options->sart->subsets.count > 1 && (long)shape.view_warps * subset < WARPS_ENOUGH;
-	shape.by_copies = (shape.by_view || few) && indexed && shape.halves && shape.forward_rows > 0 &&
-			  !shape.rows_apart && geometry->columns <= SIDE_MOST && geometry->rows <= SIDE_MOST;
-	shape.correction = shape.by_subset ? corrected_at_once(thrift, subset) : 0;
-	shape.parts = shape.correction < (shape.by_subset ? subset : 0);
+	shape.few_views = shape.subset > 0 && options->sart->subsets.count > 1 &&
+			  (long)shape.view_warps * shape.subset < WARPS_ENOUGH;
+	shape.copied = shape.indexed && shape.halves && shape.forward_rows > 0 && !shape.rows_apart &&
+		       geometry->columns <= SIDE_MOST && geometry->rows <= SIDE_MOST;
 	shape.covered = !options->matched && is_covered(geometry, grid);
 	shape.views_at_once = at_most(geometry->count, lean_or(thrift, VIEWS_AT_ONCE));
 	if (options->column_weights != NULL) {
@@ -331,6 +328,11 @@ static struct plan_shape shape_of(const struct plan_options *options, enum thrif
 }
 
 /* ---- what memory ---- */
+
+static size_t pixels_of(const struct plan *plan)
+{
+	return (size_t)plan->stack.columns * (size_t)plan->stack.rows;
+}
 
 static bool needs_arrays_back(const struct plan *plan)
 {
@@ -378,47 +380,78 @@ static int views_laid_out(const struct plan *plan)
 		views = divide_up(views, 2);
 	return at_most(views, plan->shape.views_at_once);
 }
+
+static void describe_raw(struct plan *plan)
+{
+	const struct plan_options *options = &plan->options;
+	const struct geometry *geometry = options->geometry;
+	int part = at_most(divide_up(geometry->count, RAW_PART), resident_views(options));
+
+	plan->raw_views = 1;
+	plan->raw_bytes = pixels_of(plan) * (options->linearise.sample == SAMPLE_UINT16 ? 2 : 4);
+	if (plan->raw_bytes < RAW_BYTES)
+		plan->raw_views = (int)(RAW_BYTES / plan->raw_bytes);
+	plan->raw_views = options->no_samples ? 0 : at_most(plan->raw_views, part);
+}
+
+/* The bytes of the block that the stages use in turn. */
+static void describe_scratch(struct plan *plan)
+{
+	const struct plan_options *options = &plan->options;
+
+	if (!options->no_projection && !plan->shape.is_small)
+		plan->slices_bytes = (plan->along_x.floats + plan->along_y.floats) * sizeof(float);
+	if (plan->strategy != NULL)
+		plan->slices_bytes = at_least(plan->slices_bytes, plan->strategy->scratch_bytes(plan));
+	plan->scratch_bytes = at_least(plan->slices_bytes, tv_scratch_bytes(options));
+	plan->scratch_bytes = at_least(plan->scratch_bytes, filter_scratch_bytes(plan, plan->scratch_bytes));
+	plan->scratch_bytes = at_least(plan->scratch_bytes, options->lends);
+}
+
+/* The views that are corrected and laid out at a time, and the arrays for them. */
+static void describe_batches(struct plan *plan)
+{
+	struct plan_shape *shape = &plan->shape;
+
+	if (shape->back_voxels > 0 || needs_arrays_back(plan))
+		shape->views_at_once = views_laid_out(plan);
+	shape->pairs_at_once =
+	    back_by_pairs(plan, false) ? shape->views_at_once : at_most(shape->batch, shape->views_at_once);
+	if (needs_arrays_back(plan))
+		plan->projections = layered_make(plan->stack.columns, plan->stack.rows, shape->views_at_once);
+	if (needs_filtered_array(plan))
+		plan->filtered_array = layered_make(plan->filtered.columns, plan->filtered.rows, shape->batch);
+}
+
 static void plan_describe(struct plan *plan, const struct plan_options *options, enum thrift thrift)
 {
 	const struct geometry *geometry = options->geometry;
 	const struct grid *grid = options->grid;
+	struct plan_shape *shape = &plan->shape;
 	const int *size = grid->size;
-	int part;
+	bool by_subset;
 
 	plan->options = *options;
-	plan->shape = shape_of(options, thrift);
+	*shape = shape_of(options, thrift);
 	for (int i = 0; i < 3; i++) {
 		plan->grid.size[i] = size[i];
 		plan->grid.spacing[i] = (float)grid->spacing[i];
 	}
-	plan->along_x = slices_shape_make(size[0], size[2], size[1], plan->shape.forward_rows > 0);
-	plan->along_y = slices_shape_make(size[1], size[2], size[0], plan->shape.forward_rows > 0);
+	plan->along_x = slices_shape_make(size[0], size[2], size[1], shape->forward_rows > 0);
+	plan->along_y = slices_shape_make(size[1], size[2], size[0], shape->forward_rows > 0);
 	plan->columns = columns_shape_make(size);
 	plan->stack = stack_shape_make(geometry->columns, geometry->rows, 1);
 	plan->filtered = stack_shape_make(wide_columns(options), geometry->rows, 1);
-	if (!options->no_projection && !plan->shape.is_small)
-		plan->slices_bytes = (plan->along_x.floats + plan->along_y.floats) * sizeof(float);
-	plan->shape.view_rows = sweep_view_rows(plan);
-	if ((plan->shape.by_view || plan->shape.by_copies) && sweep_scratch_bytes(plan) > plan->slices_bytes)
-		plan->slices_bytes = sweep_scratch_bytes(plan);
-	plan->scratch_bytes = at_least(plan->slices_bytes, tv_scratch_bytes(options));
-	plan->scratch_bytes = at_least(plan->scratch_bytes, filter_scratch_bytes(plan, plan->scratch_bytes));
-	plan->scratch_bytes = at_least(plan->scratch_bytes, options->lends);
-	if (plan->shape.by_view)
-		plan->partial_count = sweep_partials(plan);
-	else if (plan->shape.by_subset)
-		plan->partial_count = subsets_partials(plan);
-	if (plan->shape.back_voxels > 0 || needs_arrays_back(plan))
-		plan->shape.views_at_once = views_laid_out(plan);
-	plan->shape.pairs_at_once = back_by_pairs(plan, false) ? plan->shape.views_at_once
-							       : at_most(plan->shape.batch, plan->shape.views_at_once);
-	plan->raw_views = 1;
-	plan->bytes.raw =
-	    (size_t)geometry->columns * (size_t)geometry->rows * (options->linearise.sample == SAMPLE_UINT16 ? 2 : 4);
-	if (plan->bytes.raw < RAW_BYTES)
-		plan->raw_views = (int)(RAW_BYTES / plan->bytes.raw);
-	part = at_most(divide_up(geometry->count, RAW_PART), resident_views(options));
-	plan->raw_views = options->no_samples ? 0 : at_most(plan->raw_views, part);
+	plan->strategy = strategy_choose(plan);
+	by_subset = plan->strategy != NULL && !plan->strategy->by_view;
+	shape->correction = by_subset ? corrected_at_once(thrift, shape->subset) : 0;
+	shape->parts = by_subset && shape->correction < shape->subset;
+	shape->view_rows = copies_view_rows(plan);
+	describe_scratch(plan);
+	if (plan->strategy != NULL)
+		plan->partial_count = strategy_partials(plan);
+	describe_batches(plan);
+	describe_raw(plan);
 }
 
 static bool needs_work(const struct plan *plan)
@@ -428,54 +461,61 @@ static bool needs_work(const struct plan *plan)
 /* The matched projector has column sums by itself where a subset goes in one launch. */
 static bool needs_coverage(const struct plan *plan)
 {
-	return plan->shape.by_subset && !plan->shape.covered && (!plan->options.matched || needs_work(plan));
+	return plan->shape.correction > 0 && !plan->shape.covered && (!plan->options.matched || needs_work(plan));
 }
-static size_t pixels_of(const struct plan *plan)
+
+/* What SART holds: column sums, numerators, squares, and what its strategy has. */
+static void sart_walk(struct plan *plan, struct arena *arena)
 {
-	return (size_t)plan->stack.columns * (size_t)plan->stack.rows;
+	const size_t voxels = grid_voxels(plan->options.grid);
+
+	take(arena, &plan->in_order, (size_t)plan->options.geometry->count);
+	take(arena, &plan->partial, plan->partial_count);
+	if (needs_coverage(plan)) {
+		take(arena, &plan->coverage, voxels);
+		take(arena, &plan->ones, ones_bytes(plan));
+	}
+	if (needs_work(plan))
+		take(arena, &plan->work, voxels);
+	plan->strategy->walk(plan, arena);
+}
+
+/*
+ * Everything that a plan holds on the device, but for the block of scratch, which may be another plan's, and the
+ * layered arrays, which the driver lays out.
+ */
+static void plan_walk(struct plan *plan, struct arena *arena)
+{
+	const size_t views = (size_t)plan->options.geometry->count;
+
+	take(arena, &plan->geometry, views);
+	take(arena, &plan->views, views);
+	take(arena, &plan->slots, views);
+	take(arena, &plan->reduce, reduce_count());
+	take(arena, &plan->most, MOST_COUNT);
+	take(arena, &plan->matrices, VIEWS_AT_ONCE * 12);
+	if (plan->shape.back_voxels > 0)
+		take(arena, &plan->pairs, pairs_bytes(plan, plan->shape.pairs_at_once));
+	linearise_walk(plan, arena);
+	if (plan->strategy != NULL)
+		sart_walk(plan, arena);
+	if (plan->options.column_weights != NULL)
+		filter_walk(plan, arena);
 }
 
 static struct plan_bytes bytes_of(const struct plan_options *options, enum thrift thrift)
 {
 	struct plan plan = {};
 	struct plan_bytes bytes = {};
-	const struct geometry *geometry = options->geometry;
-	size_t voxels = grid_voxels(options->grid) * sizeof(float), views = (size_t)geometry->count;
+	struct arena arena = {};
 
 	plan_describe(&plan, options, thrift);
-	bytes.volumes = voxels * (options->sart != NULL ? 2 : 1);
-	bytes.raw = plan.bytes.raw * (size_t)plan.raw_views;
+	plan_walk(&plan, &arena);
+	bytes.volumes = cuda_volume_bytes(options->grid) * (options->sart != NULL ? 2 : 1);
+	bytes.raw = plan.raw_bytes * (size_t)plan.raw_views;
 	bytes.block = plan.scratch_bytes;
-	bytes.scratch = plan.scratch_bytes +
-			views * ((options->sart != NULL ? 2 : 1) * sizeof(struct device_view) + 2 * sizeof(int)) +
-			plan.partial_count * sizeof(float2) + reduce_bytes() + VIEWS_AT_ONCE * 12 * sizeof(float) +
-			pixels_of(&plan) * 2 + linearise_counters_bytes() + MOST_COUNT * sizeof(*plan.most);
-	if (needs_arrays_back(&plan))
-		bytes.scratch += pixels_of(&plan) * (size_t)views_laid_out(&plan) * sizeof(float);
-	if (needs_filtered_array(&plan))
-		bytes.scratch += (size_t)plan.filtered.columns * (size_t)plan.filtered.rows * (size_t)plan.shape.batch *
-				 sizeof(float);
-	if (plan.shape.back_voxels > 0)
-		bytes.scratch += pairs_bytes(&plan, plan.shape.pairs_at_once);
-	if (needs_coverage(&plan))
-		bytes.scratch += voxels + ones_bytes(&plan);
-	if (needs_work(&plan))
-		bytes.scratch += voxels;
-	if (plan.shape.by_view && plan.shape.by_copies)
-		bytes.scratch += sweep_correction_bytes(&plan);
-	else if (plan.shape.by_view)
-		bytes.scratch += cuda_stack_bytes(geometry->rows, geometry->columns, 1);
-	if (plan.shape.by_subset)
-		bytes.scratch += cuda_stack_bytes(geometry->columns, geometry->rows, plan.shape.correction);
-	if (options->column_weights != NULL)
-		bytes.scratch +=
-		    views * (size_t)geometry->columns * sizeof(float) + filter_bytes(&plan.shape, geometry->rows);
-	if (options->linearise.flat != NULL)
-		bytes.scratch += pixels_of(&plan) * sizeof(float);
-	if (options->linearise.dark != NULL)
-		bytes.scratch += pixels_of(&plan) * sizeof(float);
-	if (options->linearise.defects != NULL)
-		bytes.scratch += pixels_of(&plan);
+	bytes.scratch =
+	    plan.scratch_bytes + arena.used - bytes.raw + plan.projections.bytes + plan.filtered_array.bytes;
 	return bytes;
 }
 
@@ -618,98 +658,31 @@ static struct device_view view_make(const struct plan_options *options, int inde
 }
 
 /* In an order of their own, NULL: as they are. */
-static int upload_views(struct plan *plan, const int *order, struct device_view **ret_views, struct error *err)
+static int upload_views(struct plan *plan, const int *order, struct device_view *to, struct error *err)
 {
 	int count = plan->options.geometry->count;
 	size_t bytes = (size_t)count * sizeof(struct device_view);
 	struct device_view *views = (struct device_view *)malloc(bytes);
 	cudaError_t status;
-	int code;
 
 	if (views == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for %d views", count);
 	for (int i = 0; i < count; i++)
 		views[i] = view_make(&plan->options, order != NULL ? order[i] : i);
-	code = device_allocate(plan->device, bytes, (void **)ret_views, err);
-	if (code == 0) {
-		status = cudaMemcpy(*ret_views, views, bytes, cudaMemcpyHostToDevice);
-		if (status != cudaSuccess)
-			code = cuda_error(err, status, "uploading the geometry");
-	}
+	status = cudaMemcpy(to, views, bytes, cudaMemcpyHostToDevice);
 	free(views);
-	return code;
-}
-
-/* Something of each pixel, where it is given. */
-static int prepare_image(struct plan *plan, const void *from, size_t size, void **ret_to, struct error *err)
-{
-	size_t bytes = pixels_of(plan) * size;
-
-	if (from == NULL)
-		return 0;
-	TRY(device_allocate(plan->device, bytes, ret_to, err));
-	CUDA_TRY(cudaMemcpy(*ret_to, from, bytes, cudaMemcpyHostToDevice));
-	return 0;
-}
-
-static int prepare_linearise(struct plan *plan, struct error *err)
-{
-	const struct linearise *options = &plan->options.linearise;
-
-	TRY(device_allocate(plan->device, plan->bytes.raw * (size_t)plan->raw_views, &plan->raw, err));
-	for (int i = 0; i < 2; i++)
-		TRY(device_allocate(plan->device, pixels_of(plan), (void **)&plan->marks[i], err));
-	TRY(device_allocate(plan->device, linearise_counters_bytes(), (void **)&plan->counters, err));
-	TRY(prepare_image(plan, options->flat, sizeof(float), (void **)&plan->flat, err));
-	TRY(prepare_image(plan, options->dark, sizeof(float), (void **)&plan->dark, err));
-	return prepare_image(plan, options->defects, 1, (void **)&plan->map, err);
+	return status == cudaSuccess ? 0 : cuda_error(err, status, "uploading the geometry");
 }
 
 static int prepare_sart(struct plan *plan, struct error *err)
 {
-	const struct geometry *geometry = plan->options.geometry;
-	size_t voxels = grid_voxels(plan->options.grid) * sizeof(float);
-
-	if (plan->partial_count > 0) {
-		TRY(device_allocate(plan->device, plan->partial_count * sizeof(float2), (void **)&plan->partial, err));
-		CUDA_TRY(cudaEventCreateWithFlags(&plan->projected, cudaEventDisableTiming));
-		CUDA_TRY(cudaEventCreateWithFlags(&plan->summed, cudaEventDisableTiming));
-	}
+	TRY(upload_views(plan, plan->options.sart->subsets.order, plan->in_order, err));
+	CUDA_TRY(cudaEventCreateWithFlags(&plan->projected, cudaEventDisableTiming));
+	CUDA_TRY(cudaEventCreateWithFlags(&plan->summed, cudaEventDisableTiming));
 	plan->coverage_subset = -1;
-	if (needs_coverage(plan)) {
-		TRY(device_allocate(plan->device, voxels, (void **)&plan->coverage, err));
-		if (ones_bytes(plan) > 0) {
-			TRY(device_allocate(plan->device, ones_bytes(plan), &plan->ones, err));
-			TRY(layout_ones(plan, err));
-		}
-	}
-	if (needs_work(plan))
-		TRY(device_allocate(plan->device, voxels, (void **)&plan->work, err));
-	if (plan->shape.by_view && plan->shape.by_copies)
-		return sweep_rows_prepare(plan, err);
-	if (plan->shape.by_view) /* turned: [column][row] */
-		return cuda_stack_new(plan->device, geometry->rows, geometry->columns, 1, &plan->correction, err);
-	if (plan->shape.by_subset)
-		return cuda_stack_new(plan->device, geometry->columns, geometry->rows, plan->shape.correction,
-				      &plan->correction, err);
-	return 0;
-}
-
-static int prepare_arrays(struct plan *plan, struct error *err)
-{
-	if (plan->shape.back_voxels > 0) {
-		plan->pairs_bytes = pairs_bytes(plan, plan->shape.pairs_at_once);
-		TRY(device_allocate(plan->device, plan->pairs_bytes, &plan->pairs, err));
-	}
-	if (needs_arrays_back(plan)) {
-		TRY(layered_new(plan->device, plan->stack.columns, plan->stack.rows, plan->shape.views_at_once,
-				cudaAddressModeBorder, &plan->projections, err));
-	}
-	if (needs_filtered_array(plan)) {
-		TRY(layered_new(plan->device, plan->filtered.columns, plan->filtered.rows, plan->shape.batch,
-				cudaAddressModeBorder, &plan->filtered_array, err));
-	}
-	return 0;
+	if (plan->ones != NULL)
+		TRY(layout_ones(plan, err));
+	return plan->strategy->prepare(plan, err);
 }
 
 static int prepare_scratch(struct plan *plan, struct error *err)
@@ -726,27 +699,36 @@ static int prepare_scratch(struct plan *plan, struct error *err)
 	return 0;
 }
 
+static int plan_allocate(struct plan *plan, struct error *err)
+{
+	struct arena arena = {};
+
+	if (plan->options.column_weights != NULL)
+		TRY(filter_new(plan, err));
+	plan_walk(plan, &arena);
+	TRY(device_allocate(plan->device, arena.used, (void **)&plan->memory, err));
+	plan->memory_bytes = arena.used;
+	arena = {plan->memory, 0};
+	plan_walk(plan, &arena);
+	TRY(prepare_scratch(plan, err));
+	TRY(layered_new(plan->device, &plan->projections, err));
+	return layered_new(plan->device, &plan->filtered_array, err);
+}
+
 static int plan_prepare(struct plan *plan, struct error *err)
 {
 	size_t count = (size_t)plan->options.geometry->count;
 
 	TRY(device_enter(plan->device, err));
-	TRY(upload_views(plan, NULL, &plan->geometry, err));
-	if (plan->options.sart != NULL)
-		TRY(upload_views(plan, plan->options.sart->subsets.order, &plan->in_order, err));
 	plan->views_host = (int *)malloc(count * sizeof(int));
 	if (plan->views_host == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a plan of %zu views", count);
-	TRY(device_allocate(plan->device, count * sizeof(int), (void **)&plan->views, err));
-	TRY(device_allocate(plan->device, count * sizeof(int), (void **)&plan->slots, err));
-	TRY(device_allocate(plan->device, reduce_bytes(), (void **)&plan->reduce, err));
-	TRY(device_allocate(plan->device, MOST_COUNT * sizeof(*plan->most), (void **)&plan->most, err));
-	TRY(device_allocate(plan->device, VIEWS_AT_ONCE * 12 * sizeof(float), (void **)&plan->matrices, err));
-	TRY(prepare_scratch(plan, err));
-	TRY(prepare_arrays(plan, err));
-	TRY(prepare_linearise(plan, err));
-	TRY(prepare_sart(plan, err));
-	if (plan->options.column_weights != NULL)
+	TRY(plan_allocate(plan, err));
+	TRY(upload_views(plan, NULL, plan->geometry, err));
+	TRY(linearise_prepare(plan, err));
+	if (plan->strategy != NULL)
+		TRY(prepare_sart(plan, err));
+	if (plan->filter != NULL)
 		TRY(filter_prepare(plan, err));
 	/* What was uploaded at once may still be on its way, on a stream that the others do not wait for. */
 	CUDA_TRY(cudaStreamSynchronize(cudaStreamLegacy));
@@ -775,29 +757,31 @@ void plan_end_slices(struct plan *plan)
 
 static const char *const comb_names[] = {"", ", two a row", ", wide", ", narrow"};
 
+/* The rows of the tables that were chosen, and what they go by. */
 static void summarise(struct plan *plan)
 {
 	const struct plan_shape *shape = &plan->shape;
-	char forward[64] = "general", back[80] = "general", saves[32] = "";
+	const bool fdk = plan->options.column_weights != NULL;
+	char rows[64] = "", back[96] = "", saves[32] = "";
 
 	if (shape->forward_rows > 0)
-		snprintf(forward, sizeof(forward), "%s, %d rows a thread%s",
-			 shape->untilted ? "untilted" : "near untilted", shape->forward_rows,
-			 shape->rows_apart ? " apart" : "");
-	if (plan->options.matched)
-		snprintf(back, sizeof(back), "matched");
-	else if (shape->back_voxels > 0)
-		snprintf(back, sizeof(back), "%s, %d voxels a window%s",
-			 shape->untilted ? "untilted" : "general, FDK's near untilted", shape->back_voxels,
+		snprintf(rows, sizeof(rows), ", %s, %d rows a thread", shape->untilted ? "untilted" : "near untilted",
+			 shape->forward_rows);
+	if (shape->back_voxels > 0)
+		snprintf(back, sizeof(back), ", %s, %d voxels a window%s",
+			 shape->untilted ? "untilted" : "near untilted", shape->back_voxels,
 			 comb_names[shape->back_comb]);
 	if (shape->thrift != THRIFT_NONE)
-		snprintf(saves, sizeof(saves), "%s%d views at a time; ", shape->thrift == THRIFT_LEAN ? "lean, " : "",
-			 at_most(shape->views_at_once, shape->by_subset ? shape->correction : shape->views_at_once));
-	snprintf(plan->summary, sizeof(plan->summary), "%sforward %s; back %s; %s; %s", saves, forward, back,
-		 shape->textures ? "texture sampling" : "float32 sampling",
+		snprintf(
+		    saves, sizeof(saves), "%s%d views at a time; ", shape->thrift == THRIFT_LEAN ? "lean, " : "",
+		    at_most(shape->views_at_once, shape->correction > 0 ? shape->correction : shape->views_at_once));
+	snprintf(plan->summary, sizeof(plan->summary), "%sforward %s%s; back %s%s%s%s; %s%s%s", saves,
+		 projector_name(plan), rows, backprojector_name(plan, false), fdk ? ", FDK's " : "",
+		 fdk ? backprojector_name(plan, true) : "", back,
 		 shape->filter_length > 0 ? "fused filter"
 		 : shape->fft_length > 0  ? "cuFFT"
-					  : "no filter");
+					  : "no filter",
+		 plan->strategy != NULL ? "; SART " : "", plan->strategy != NULL ? plan->strategy->name : "");
 }
 
 int cuda_plan_new(struct device *device, const struct plan_options *options, struct plan **ret_plan, struct error *err)
@@ -823,53 +807,30 @@ int cuda_plan_new(struct device *device, const struct plan_options *options, str
 void cuda_plan_free(struct plan *plan)
 {
 	struct device *device;
-	size_t count, voxels;
 
 	if (plan == NULL)
 		return;
 	device = plan->device;
-	count = (size_t)plan->options.geometry->count;
-	voxels = grid_voxels(plan->options.grid) * sizeof(float);
 	cudaSetDevice(device->index);
 	cudaStreamSynchronize(device->copy);
 	cudaStreamSynchronize(device->stream);
-	backproject_forget();
-	if (plan->sweep != NULL)
-		cudaGraphExecDestroy(plan->sweep);
+	backproject_forget(device);
+	if (plan->recorded != NULL)
+		cudaGraphExecDestroy(plan->recorded);
 	if (plan->projected != NULL)
 		cudaEventDestroy(plan->projected);
 	if (plan->summed != NULL)
 		cudaEventDestroy(plan->summed);
-	filter_release(plan);
-	device_release(device, plan->geometry, count * sizeof(struct device_view));
-	device_release(device, plan->in_order, count * sizeof(struct device_view));
-	device_release(device, plan->views, count * sizeof(int));
-	device_release(device, plan->slots, count * sizeof(int));
-	device_release(device, plan->reduce, reduce_bytes());
-	device_release(device, plan->matrices, VIEWS_AT_ONCE * 12 * sizeof(float));
+	if (plan->sampled != 0)
+		cudaDestroyTextureObject(plan->sampled);
+	filter_free(plan->filter);
+	layered_free(device, &plan->projections);
+	layered_free(device, &plan->filtered_array);
 	if (plan->lender != NULL)
 		plan_end_slices(plan);
 	else
 		device_release(device, plan->scratch, plan->scratch_bytes);
-	for (int i = 0; i < 2; i++) {
-		device_release(device, plan->marks[i], pixels_of(plan));
-	}
-	device_release(device, plan->raw, plan->bytes.raw * (size_t)plan->raw_views);
-	layered_free(device, &plan->projections);
-	layered_free(device, &plan->filtered_array);
-	device_release(device, plan->pairs, plan->pairs_bytes);
-	device_release(device, plan->ones, ones_bytes(plan));
-	device_release(device, plan->most, MOST_COUNT * sizeof(*plan->most));
-	device_release(device, plan->counters, linearise_counters_bytes());
-	device_release(device, plan->map, pixels_of(plan));
-	device_release(device, plan->flat, pixels_of(plan) * sizeof(float));
-	device_release(device, plan->dark, pixels_of(plan) * sizeof(float));
-	device_release(device, plan->partial, plan->partial_count * sizeof(float2));
-	device_release(device, plan->coverage, voxels);
-	device_release(device, plan->work, voxels);
-	if (plan->shape.by_view && plan->shape.by_copies)
-		sweep_rows_release(plan);
-	cuda_stack_free(plan->correction);
+	device_release(device, plan->memory, plan->memory_bytes);
 	free(plan->views_host);
 	free(plan);
 }
@@ -903,8 +864,6 @@ int plan_check_views(const struct plan *plan, const int *views, int count, const
 	return 0;
 }
 
-static unsigned long lists; /* made so far, over all plans: one thread has all devices of a process */
-
 int plan_set_views(struct plan *plan, const int *views, int count, struct error *err)
 {
 	size_t bytes = (size_t)count * sizeof(int);
@@ -914,7 +873,7 @@ int plan_set_views(struct plan *plan, const int *views, int count, struct error 
 		return 0;
 	memcpy(plan->views_host, views, bytes);
 	plan->views_held = count;
-	plan->views_list = ++lists;
+	plan->views_list++;
 	/* From pageable memory: it has been read when the call returns. */
 	CUDA_TRY(cudaMemcpyAsync(plan->views, views, bytes, cudaMemcpyHostToDevice, plan->device->stream));
 	return 0;

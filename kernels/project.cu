@@ -481,34 +481,8 @@ static __global__ void __launch_bounds__(32 * ROWS_WARPS * ROWS_VIEWS, 32 / (ROW
 	}
 }
 
-static int rows_of_a_tile(const plan_shape &shape)
-{
-	return shape.forward_rows > 0 ? ROWS_WARPS * shape.forward_rows : GENERAL_ROWS;
-}
-
-static void count_tiles(const struct plan *plan, int *ret_across, int *ret_tiles)
-{
-	if (plan->shape.is_small) {
-		*ret_across = 0;
-		*ret_tiles = divide_up(plan->stack.columns * plan->stack.rows, SMALL_PIXELS);
-		return;
-	}
-	*ret_across = divide_up(plan->stack.columns, 32);
-	*ret_tiles = *ret_across * divide_up(plan->stack.rows, rows_of_a_tile(plan->shape));
-}
-
-size_t project_blocks(const struct plan *plan, int count)
-{
-	int across, tiles;
-
-	count_tiles(plan, &across, &tiles);
-	if (plan->shape.is_small)
-		return (size_t)tiles * (size_t)count;
-	return (size_t)tiles * (size_t)divide_up(count, plan->shape.forward_rows > 0 ? ROWS_VIEWS : GENERAL_VIEWS);
-}
-
 template <comb KIND, int ROWS>
-static void launch_rows(const plan_shape &shape, const projection &p, unsigned blocks, cudaStream_t stream)
+static void launch_comb(const plan_shape &shape, const projection &p, unsigned blocks, cudaStream_t stream)
 {
 	dim3 threads(32, ROWS_WARPS, ROWS_VIEWS);
 
@@ -520,41 +494,137 @@ static void launch_rows(const plan_shape &shape, const projection &p, unsigned b
 		project_rows<KIND, ROWS, __half2, true, false><<<blocks, threads, 0, stream>>>(p);
 }
 
-static void launch_apart(const plan_shape &shape, const projection &p, unsigned blocks, cudaStream_t stream)
+static void launch_rows(const struct plan *plan, const projection &p, unsigned blocks)
+{
+	const plan_shape &shape = plan->shape;
+	cudaStream_t stream = plan->device->stream;
+
+	switch (shape.forward_comb * 8 + shape.forward_rows) {
+	case COMB_EVEN * 8 + 3:
+		return launch_comb<COMB_EVEN, 3>(shape, p, blocks, stream);
+	case COMB_EVEN * 8 + 4:
+		return launch_comb<COMB_EVEN, 4>(shape, p, blocks, stream);
+	case COMB_EVEN * 8 + 5:
+		return launch_comb<COMB_EVEN, 5>(shape, p, blocks, stream);
+	case COMB_NARROW * 8 + 6:
+		return launch_comb<COMB_NARROW, 6>(shape, p, blocks, stream);
+	default:
+		return launch_comb<COMB_EVEN, 6>(shape, p, blocks, stream);
+	}
+}
+
+static void launch_apart(const struct plan *plan, const projection &p, unsigned blocks)
 {
 	dim3 threads(32, ROWS_WARPS, ROWS_VIEWS);
+	cudaStream_t stream = plan->device->stream;
 
-	if (shape.untilted)
+	if (plan->shape.untilted)
 		project_rows<COMB_EVEN, ROWS_APART, __half2, false, true><<<blocks, threads, 0, stream>>>(p);
 	else
 		project_rows<COMB_EVEN, ROWS_APART, __half2, true, true><<<blocks, threads, 0, stream>>>(p);
 }
 
 /* Cut once only where all of it would not run at one time. */
-static void launch_small(const struct device *device, const projection &p, unsigned blocks, cudaStream_t stream)
+static void launch_small(const struct plan *plan, const projection &p, unsigned blocks)
 {
+	const struct device *device = plan->device;
 	bool many = blocks * SMALL_WARPS * SMALL_PARTS > 32u * (unsigned)device->multiprocessors;
 
-	project_small<<<blocks, dim3(SMALL_PIXELS, many ? SMALL_PARTS / 2 : SMALL_PARTS), 0, stream>>>(p);
+	project_small<<<blocks, dim3(SMALL_PIXELS, many ? SMALL_PARTS / 2 : SMALL_PARTS), 0, device->stream>>>(p);
 }
 
 template <typename T>
-static void launch_general(const plan_shape &shape, const projection &p, unsigned blocks, cudaStream_t stream)
+static void launch_general(const struct plan *plan, const projection &p, unsigned blocks)
 {
 	dim3 threads(32, GENERAL_ROWS, GENERAL_VIEWS);
+	cudaStream_t stream = plan->device->stream;
 
-	if (shape.z_rays)
+	if (plan->shape.z_rays)
 		project_general<T, true><<<blocks, threads, 0, stream>>>(p);
 	else
 		project_general<T, false><<<blocks, threads, 0, stream>>>(p);
 }
 
+/* ---- the table ---- */
+
+static bool is_small(const struct plan_shape *shape)
+{
+	return shape->is_small;
+}
+static bool is_apart(const struct plan_shape *shape)
+{
+	return shape->rows_apart;
+}
+static bool is_by_rows(const struct plan_shape *shape)
+{
+	return shape->forward_rows > 0;
+}
+static bool is_in_halves(const struct plan_shape *shape)
+{
+	return shape->halves;
+}
+static bool is_any(const struct plan_shape *shape)
+{
+	(void)shape;
+	return true;
+}
+
+/* A block of the first that applies has 32 columns by so many rows of so many views; a small one has a run of pixels.
+ */
+struct projector {
+	const char *name;
+	bool (*applies)(const struct plan_shape *shape);
+	int warps; /* of a view, below each other, each with the rows of a thread */
+	int views;
+	void (*launch)(const struct plan *plan, const projection &p, unsigned blocks);
+};
+static const struct projector projectors[] = {
+    {"small", is_small, SMALL_WARPS, 1, launch_small},
+    {"rows apart", is_apart, ROWS_WARPS, ROWS_VIEWS, launch_apart},
+    {"by rows", is_by_rows, ROWS_WARPS, ROWS_VIEWS, launch_rows},
+    {"general, half precision", is_in_halves, GENERAL_ROWS, GENERAL_VIEWS, launch_general<__half2>},
+    {"general", is_any, GENERAL_ROWS, GENERAL_VIEWS, launch_general<float>},
+};
+
+static const struct projector *projector_of(const struct plan *plan)
+{
+	const struct projector *projector = projectors;
+
+	while (!projector->applies(&plan->shape))
+		projector++;
+	return projector;
+}
+
+const char *projector_name(const struct plan *plan)
+{
+	return projector_of(plan)->name;
+}
+
+static void count_tiles(const struct plan *plan, int *ret_across, int *ret_tiles)
+{
+	int thread_rows = plan->shape.forward_rows > 0 ? plan->shape.forward_rows : 1;
+
+	if (plan->shape.is_small) {
+		*ret_across = 0;
+		*ret_tiles = divide_up(plan->stack.columns * plan->stack.rows, SMALL_PIXELS);
+		return;
+	}
+	*ret_across = divide_up(plan->stack.columns, 32);
+	*ret_tiles = *ret_across * divide_up(plan->stack.rows, projector_of(plan)->warps * thread_rows);
+}
+
+size_t project_blocks(const struct plan *plan, int count)
+{
+	int across, tiles;
+
+	count_tiles(plan, &across, &tiles);
+	return (size_t)tiles * (size_t)divide_up(count, projector_of(plan)->views);
+}
+
 int project_rays(struct plan *plan, const float *volume, int first, int count, struct ray_use use, float *to,
 		 struct error *err)
 {
-	cudaStream_t stream = plan->device->stream;
 	projection p = {};
-	unsigned blocks = (unsigned)project_blocks(plan, count);
 
 	p.geometry = plan->geometry;
 	p.views = plan->views + first;
@@ -572,32 +642,7 @@ int project_rays(struct plan *plan, const float *volume, int first, int count, s
 	p.most = plan->most + MOST_VOLUME;
 	p.use = use;
 	p.to = to;
-	switch (plan->shape.rows_apart ? 0 : plan->shape.forward_comb * 8 + plan->shape.forward_rows) {
-	case COMB_EVEN * 8 + 3:
-		launch_rows<COMB_EVEN, 3>(plan->shape, p, blocks, stream);
-		break;
-	case COMB_EVEN * 8 + 4:
-		launch_rows<COMB_EVEN, 4>(plan->shape, p, blocks, stream);
-		break;
-	case COMB_EVEN * 8 + 5:
-		launch_rows<COMB_EVEN, 5>(plan->shape, p, blocks, stream);
-		break;
-	case COMB_EVEN * 8 + 6:
-		launch_rows<COMB_EVEN, 6>(plan->shape, p, blocks, stream);
-		break;
-	case COMB_NARROW * 8 + 6:
-		launch_rows<COMB_NARROW, 6>(plan->shape, p, blocks, stream);
-		break;
-	default:
-		if (plan->shape.is_small)
-			launch_small(plan->device, p, blocks, stream);
-		else if (plan->shape.rows_apart)
-			launch_apart(plan->shape, p, blocks, stream);
-		else if (plan->shape.halves)
-			launch_general<__half2>(plan->shape, p, blocks, stream);
-		else
-			launch_general<float>(plan->shape, p, blocks, stream);
-	}
+	projector_of(plan)->launch(plan, p, (unsigned)project_blocks(plan, count));
 	LAUNCHED();
 	return 0;
 }

@@ -7,7 +7,7 @@
  * Updates of several views: forward projection with the correction
  * (p - A v) / L as its result, then backprojection that ends in the update.
  *
- * An update after each view, for any geometry and in float (sweep.cu does it where
+ * An update after each view, for any geometry and in float (by_view.cu does it where
  * the projection goes by rows): one view cannot fill the card, and turning the
  * volume into the forward projection's layouts would cost more than the rest. So it
  * runs on one copy with z fastest, in which both directions of the slices are
@@ -21,7 +21,7 @@
 
 /* ---- view by view ---- */
 
-struct sweep_view {
+struct one_view {
 	const device_view *geometry; /* of this view */
 	device_grid grid;
 	float *volume; /* [x][y][z] */
@@ -38,7 +38,7 @@ struct sweep_view {
 };
 
 /* Stores what SART makes of a ray's line integral, and gives the squares for the sums. */
-static __device__ __forceinline__ float2 correct(const sweep_view &s, int column, int row, float integral, float length)
+static __device__ __forceinline__ float2 correct(const one_view &s, int column, int row, float integral, float length)
 {
 	float measured = s.measured[(size_t)row * s.measured_pitch + column], residual = measured - integral;
 
@@ -49,26 +49,26 @@ static __device__ __forceinline__ float2 correct(const sweep_view &s, int column
 	return left_out ? float2{0, 0} : float2{residual * residual, measured * measured};
 }
 
-enum { SWEEP_COLUMNS = 4, SWEEP_PARTS = 4 };
+enum { VIEW_COLUMNS = 4, VIEW_PARTS = 4 };
 
-static __global__ void __launch_bounds__(32 * SWEEP_COLUMNS * SWEEP_PARTS, 2) project_view(const sweep_view s)
+static __global__ void __launch_bounds__(32 * VIEW_COLUMNS * VIEW_PARTS, 2) project_view(const one_view s)
 {
-	__shared__ float sums[SWEEP_PARTS][SWEEP_COLUMNS][32];
+	__shared__ float sums[VIEW_PARTS][VIEW_COLUMNS][32];
 	const device_view &g = *s.geometry;
-	int row = blockIdx.y * 32 + threadIdx.x, column = blockIdx.x * SWEEP_COLUMNS + threadIdx.y;
+	int row = blockIdx.y * 32 + threadIdx.x, column = blockIdx.x * VIEW_COLUMNS + threadIdx.y;
 	int part = threadIdx.z;
 	bool valid = column < s.columns && row < s.rows;
 	float c = (float)column - 0.5f * (float)(s.columns - 1), r = (float)row - 0.5f * (float)(s.rows - 1);
 	float d[3], m[3];
 	line_to(g, c, r, d, m);
 	strided volume = {s.volume, s.grid.size[1] * s.pitch, s.pitch, 1};
-	ray_part way = walk_part<true>(volume, s.grid, d, m, valid, part, SWEEP_PARTS);
+	ray_part way = walk_part<true>(volume, s.grid, d, m, valid, part, VIEW_PARTS);
 
 	sums[part][threadIdx.y][threadIdx.x] = way.sum;
 	__syncthreads();
 	float2 squares = {0, 0};
 	if (part == 0 && valid) {
-		for (int k = 1; k < SWEEP_PARTS; k++)
+		for (int k = 1; k < VIEW_PARTS; k++)
 			way.sum += sums[k][threadIdx.y][threadIdx.x];
 		squares = correct(s, column, row, way.sum * way.step, way.slices * way.step);
 	}
@@ -84,7 +84,7 @@ enum { UPDATE_LINES = 8 }; /* of voxels along z, side by side in a block */
  * the view sees the whole grid. UNTILTED: column and depth stay the same along z.
  */
 template <int CHUNKS, bool COVERED, bool UNTILTED>
-static __global__ void __launch_bounds__(32 * UPDATE_LINES) update_view(const sweep_view s)
+static __global__ void __launch_bounds__(32 * UPDATE_LINES) update_view(const one_view s)
 {
 	const float(&m)[3][4] = s.geometry->matrix;
 	int y = blockIdx.x * UPDATE_LINES + threadIdx.y, x = blockIdx.z, z = blockIdx.y * 32 * CHUNKS + threadIdx.x;
@@ -129,22 +129,9 @@ static __global__ void __launch_bounds__(32 * UPDATE_LINES) update_view(const sw
 			at[32 * k] = value[k];
 }
 
-static dim3 sweep_blocks(const struct plan *plan)
+static dim3 view_blocks(const struct plan *plan)
 {
-	return dim3(divide_up(plan->stack.columns, SWEEP_COLUMNS), divide_up(plan->stack.rows, 32));
-}
-
-size_t sweep_scratch_bytes(const struct plan *plan)
-{
-	return plan->shape.by_copies ? copies_bytes(plan) : plan->columns.floats * sizeof(float);
-}
-
-size_t sweep_partials(const struct plan *plan)
-{
-	dim3 blocks = sweep_blocks(plan);
-	size_t each = plan->shape.by_copies ? copies_partials(plan) : (size_t)blocks.x * blocks.y;
-
-	return each * (size_t)plan->options.geometry->count;
+	return dim3(divide_up(plan->stack.columns, VIEW_COLUMNS), divide_up(plan->stack.rows, 32));
 }
 
 static float spacing_least(const struct plan *plan)
@@ -154,13 +141,13 @@ static float spacing_least(const struct plan *plan)
 	return fminf(fminf(spacing[0], spacing[1]), spacing[2]);
 }
 
-static float length_least(const struct plan *plan)
+float length_least(const struct plan *plan)
 {
 	return (float)RAY_LENGTH_LEAST * spacing_least(plan);
 }
 
 template <bool COVERED, bool UNTILTED>
-static void launch_update(const sweep_view &s, cudaStream_t stream)
+static void launch_update(const one_view &s, cudaStream_t stream)
 {
 	const int *size = s.grid.size;
 	dim3 threads(32, UPDATE_LINES);
@@ -174,7 +161,7 @@ static void launch_update(const sweep_view &s, cudaStream_t stream)
 		update_view<4, COVERED, UNTILTED><<<dim3(lines, divide_up(size[2], 128), nx), threads, 0, stream>>>(s);
 }
 
-static void update_by(const struct plan_shape *shape, const sweep_view &s, cudaStream_t stream)
+static void update_by(const struct plan_shape *shape, const one_view &s, cudaStream_t stream)
 {
 	if (shape->covered && shape->untilted)
 		launch_update<true, true>(s, stream);
@@ -186,14 +173,37 @@ static void update_by(const struct plan_shape *shape, const sweep_view &s, cudaS
 		launch_update<false, false>(s, stream);
 }
 
-static int sweep_views(struct plan *plan, const float *projections, float *volume, const struct cancel *cancel,
-		       struct error *err)
+static size_t by_view_scratch_bytes(const struct plan *plan)
+{
+	return plan->columns.floats * sizeof(float);
+}
+
+static size_t by_view_partials(const struct plan *plan, int count)
+{
+	dim3 blocks = view_blocks(plan);
+
+	return (size_t)blocks.x * blocks.y * (size_t)count;
+}
+
+/* The correction of one view, turned: [column][row]. */
+static void by_view_walk(struct plan *plan, struct arena *arena)
+{
+	stack_walk(plan->stack.rows, plan->stack.columns, 1, &plan->correction, arena);
+}
+
+static int clear_correction(struct plan *plan, struct error *err)
+{
+	return stack_clear(plan->device, &plan->correction, err);
+}
+
+static int by_view_iterate(struct plan *plan, const float *projections, float *volume, const struct cancel *cancel,
+			   struct error *err)
 {
 	const int *order = plan->options.sart->subsets.order;
 	cudaStream_t stream = plan->device->stream;
-	struct stack *correction = plan->correction;
-	dim3 blocks = sweep_blocks(plan);
-	sweep_view s = {};
+	struct stack *correction = &plan->correction;
+	dim3 blocks = view_blocks(plan);
+	one_view s = {};
 
 	TRY(layout_to_columns(plan, volume, plan->scratch, err));
 	s.grid = plan->grid;
@@ -212,7 +222,7 @@ static int sweep_views(struct plan *plan, const float *projections, float *volum
 		s.geometry = plan->geometry + order[i];
 		s.measured = projections + (size_t)order[i] * plan->stack.slot;
 		s.partial = plan->partial + (size_t)i * blocks.x * blocks.y;
-		project_view<<<blocks, dim3(32, SWEEP_COLUMNS, SWEEP_PARTS), 0, stream>>>(s);
+		project_view<<<blocks, dim3(32, VIEW_COLUMNS, VIEW_PARTS), 0, stream>>>(s);
 		LAUNCHED();
 		update_by(&plan->shape, s, stream);
 		LAUNCHED();
@@ -234,30 +244,14 @@ static int begin_sums(struct plan *plan, struct error *err)
 	return 0;
 }
 
-/* What few views are projected from cannot fill the card by whole rays. */
-static int prepare_subset(struct plan *plan, const float *volume, struct error *err)
-{
-	return plan->shape.by_copies ? copies_lay_out(plan, volume, err) : project_prepare(plan, volume, err);
-}
-static int project_subset(struct plan *plan, const float *volume, int first, int count, struct ray_use use,
-			  struct error *err)
-{
-	if (plan->shape.by_copies)
-		return copies_project(plan, first, count, use, plan->correction->data, err);
-	return project_rays(plan, volume, first, count, use, plan->correction->data, err);
-}
-/* Partial sums that it leaves. */
-static size_t project_partials(const struct plan *plan, int count)
-{
-	return plan->shape.by_copies ? copies_partials(plan) * (size_t)count : project_blocks(plan, count);
-}
-
 /* `last`: all partial sums are there behind its projection. */
 static int update_subset(struct plan *plan, int subset, const float *projections, float *volume, float2 *partial,
 			 bool last, struct error *err)
 {
 	const struct sart_options *sart = plan->options.sart;
+	auto project = plan->strategy->project;
 	int first = sart->subsets.start[subset], count = sart->subsets.start[subset + 1] - first;
+	float *correction = plan->correction.data;
 	struct ray_use rays = {projections, partial, length_least(plan), 0};
 	struct voxel_use voxels = {};
 	size_t bytes = grid_voxels(plan->options.grid) * sizeof(float);
@@ -267,7 +261,7 @@ static int update_subset(struct plan *plan, int subset, const float *projections
 	voxels.scale = (float)(plan->shape.covered ? sart->relaxation / count : sart->relaxation);
 	voxels.coverage = plan->shape.covered ? NULL : plan->coverage;
 	voxels.least = plan->options.matched ? (float)COLUMN_SUM_LEAST * spacing_least(plan) : 0.0f;
-	TRY(prepare_subset(plan, volume, err));
+	TRY(plan->strategy->lay_out(plan, volume, err));
 	if (!plan->shape.covered && !plan->options.matched && plan->coverage_subset != subset) {
 		TRY(coverage_sum(plan, first, count, err));
 		plan->coverage_subset = sart->subsets.count > 1 ? -1 : subset;
@@ -277,10 +271,10 @@ static int update_subset(struct plan *plan, int subset, const float *projections
 			rays.array = plan->projections.surface;
 			voxels.laid_out = true;
 		}
-		TRY(project_subset(plan, volume, first, count, rays, err));
+		TRY(project(plan, volume, first, count, rays, correction, err));
 		if (last)
 			TRY(begin_sums(plan, err));
-		return backproject_views(plan, plan->correction->data, first, count, voxels, volume, err);
+		return backproject_views(plan, correction, first, count, voxels, volume, err);
 	}
 	/* In parts: the volume stays as it is until all of the subset has been seen. */
 	struct voxel_use sum = voxels;
@@ -291,39 +285,40 @@ static int update_subset(struct plan *plan, int subset, const float *projections
 	for (int done = 0; done < count; done += plan->shape.correction) {
 		int now = count - done < plan->shape.correction ? count - done : plan->shape.correction;
 
-		TRY(project_subset(plan, volume, first + done, now, rays, err));
-		rays.partial += project_partials(plan, now);
+		TRY(project(plan, volume, first + done, now, rays, correction, err));
+		rays.partial += plan->strategy->partials(plan, now);
 		if (plan->options.matched)
-			TRY(matched_views(plan, plan->correction->data, first + done, now, sum, plan->work,
-					  plan->coverage, err));
+			TRY(matched_views(plan, correction, first + done, now, sum, plan->work, plan->coverage, err));
 		else
-			TRY(backproject_views(plan, plan->correction->data, first + done, now, sum, plan->work, err));
+			TRY(backproject_views(plan, correction, first + done, now, sum, plan->work, err));
 	}
 	if (last)
 		TRY(begin_sums(plan, err));
 	return update_volume(plan, voxels, volume, err);
 }
 
-/* Of the forward projection of a subset, part by part. */
-static size_t subset_blocks(const struct plan *plan, int count)
+/* Partial sums of a subset's projection, part by part. */
+static size_t subset_partials(const struct plan *plan, int count)
 {
 	int most = plan->shape.correction;
 
-	return (size_t)(count / most) * project_partials(plan, most) + project_partials(plan, count % most);
+	return (size_t)(count / most) * plan->strategy->partials(plan, most) +
+	       plan->strategy->partials(plan, count % most);
 }
 
-size_t subsets_partials(const struct plan *plan)
+static size_t no_scratch(const struct plan *plan)
 {
-	const struct subsets *subsets = &plan->options.sart->subsets;
-	size_t blocks = 0;
-
-	for (int i = 0; i < subsets->count; i++)
-		blocks += subset_blocks(plan, subsets->start[i + 1] - subsets->start[i]);
-	return blocks;
+	(void)plan;
+	return 0;
 }
 
-static int sweep_subsets(struct plan *plan, const float *projections, float *volume, const struct cancel *cancel,
-			 struct error *err)
+static void subsets_walk(struct plan *plan, struct arena *arena)
+{
+	stack_walk(plan->stack.columns, plan->stack.rows, plan->shape.correction, &plan->correction, arena);
+}
+
+static int subsets_iterate(struct plan *plan, const float *projections, float *volume, const struct cancel *cancel,
+			   struct error *err)
 {
 	const struct subsets *subsets = &plan->options.sart->subsets;
 	size_t blocks = 0;
@@ -336,7 +331,7 @@ static int sweep_subsets(struct plan *plan, const float *projections, float *vol
 		if (count == 0)
 			continue;
 		size_t here = blocks;
-		blocks += subset_blocks(plan, count);
+		blocks += subset_partials(plan, count);
 		TRY(update_subset(plan, i, projections, volume, plan->partial + here, blocks == plan->partial_count,
 				  err));
 	}
@@ -344,15 +339,123 @@ static int sweep_subsets(struct plan *plan, const float *projections, float *vol
 	return 0;
 }
 
-static int sweep(struct plan *plan, const float *projections, float *volume, const struct cancel *cancel,
-		 struct error *err)
+/* ---- the table ---- */
+
+static bool is_by_view(const struct plan *plan)
 {
-	if (!plan->shape.by_view)
-		return sweep_subsets(plan, projections, volume, cancel, err);
-	if (plan->shape.by_copies)
-		TRY(sweep_rows(plan, projections, volume, length_least(plan), cancel, err));
-	else
-		TRY(sweep_views(plan, projections, volume, cancel, err));
+	return plan->shape.subset == 1 && !plan->options.matched && plan->shape.indexed;
+}
+
+static bool is_by_view_rows(const struct plan *plan)
+{
+	return is_by_view(plan) && plan->shape.copied;
+}
+
+static bool is_of_few_views(const struct plan *plan)
+{
+	return plan->shape.few_views && plan->shape.copied;
+}
+
+static bool is_matched(const struct plan *plan)
+{
+	return plan->options.matched;
+}
+
+static bool is_any(const struct plan *plan)
+{
+	return plan->shape.subset > 0;
+}
+
+static const struct strategy strategies[] = {
+    {
+	.name = "view by view, by rows",
+	.by_view = true,
+	.applies = is_by_view_rows,
+	.scratch_bytes = copies_bytes,
+	.walk = by_view_rows_walk,
+	.prepare = by_view_rows_prepare,
+	.partials = copies_partials,
+	.iterate = by_view_rows_iterate,
+	.lay_out = NULL,
+	.project = NULL,
+    },
+    {
+	.name = "view by view",
+	.by_view = true,
+	.applies = is_by_view,
+	.scratch_bytes = by_view_scratch_bytes,
+	.walk = by_view_walk,
+	.prepare = clear_correction,
+	.partials = by_view_partials,
+	.iterate = by_view_iterate,
+	.lay_out = NULL,
+	.project = NULL,
+    },
+    {
+	.name = "in subsets of few views, by rows",
+	.by_view = false,
+	.applies = is_of_few_views,
+	.scratch_bytes = copies_bytes,
+	.walk = subsets_walk,
+	.prepare = clear_correction,
+	.partials = copies_partials,
+	.iterate = subsets_iterate,
+	.lay_out = copies_lay_out,
+	.project = copies_project,
+    },
+    {
+	.name = "in subsets, matched",
+	.by_view = false,
+	.applies = is_matched,
+	.scratch_bytes = no_scratch,
+	.walk = subsets_walk,
+	.prepare = clear_correction,
+	.partials = project_blocks,
+	.iterate = subsets_iterate,
+	.lay_out = project_prepare,
+	.project = project_rays,
+    },
+    {
+	.name = "in subsets",
+	.by_view = false,
+	.applies = is_any,
+	.scratch_bytes = no_scratch,
+	.walk = subsets_walk,
+	.prepare = clear_correction,
+	.partials = project_blocks,
+	.iterate = subsets_iterate,
+	.lay_out = project_prepare,
+	.project = project_rays,
+    },
+};
+
+const struct strategy *strategy_choose(const struct plan *plan)
+{
+	for (const struct strategy &strategy : strategies)
+		if (plan->options.sart != NULL && strategy.applies(plan))
+			return &strategy;
+	return NULL;
+}
+
+size_t strategy_partials(const struct plan *plan)
+{
+	const struct subsets *subsets = &plan->options.sart->subsets;
+	size_t partials = 0;
+
+	if (plan->strategy->by_view)
+		return plan->strategy->partials(plan, plan->options.geometry->count);
+	for (int i = 0; i < subsets->count; i++)
+		partials += subset_partials(plan, subsets->start[i + 1] - subsets->start[i]);
+	return partials;
+}
+
+static int iterate(struct plan *plan, const float *projections, float *volume, const struct cancel *cancel,
+		   struct error *err)
+{
+	TRY(plan->strategy->iterate(plan, projections, volume, cancel, err));
+	/* By subsets the squares have been added up on the way. */
+	if (!plan->strategy->by_view)
+		return 0;
 	return reduce_pairs(plan, plan->partial, plan->partial_count, plan->device->sums_device, plan->device->stream,
 			    err);
 }
@@ -376,22 +479,22 @@ static int record(struct plan *plan, const float *projections, float *volume, st
 	cudaGraph_t graph = NULL;
 	int code;
 
-	if (plan->sweep != NULL) {
-		cudaGraphExecDestroy(plan->sweep);
-		plan->sweep = NULL;
+	if (plan->recorded != NULL) {
+		cudaGraphExecDestroy(plan->recorded);
+		plan->recorded = NULL;
 	}
 	CUDA_TRY(cudaStreamBeginCapture(stream, cudaStreamCaptureModeThreadLocal));
-	code = sweep(plan, projections, volume, NULL, err);
+	code = iterate(plan, projections, volume, NULL, err);
 	cudaError_t status = cudaStreamEndCapture(stream, &graph);
 	if (code == 0 && status == cudaSuccess)
-		status = cudaGraphInstantiate(&plan->sweep, graph, 0);
+		status = cudaGraphInstantiate(&plan->recorded, graph, 0);
 	if (graph != NULL)
 		cudaGraphDestroy(graph);
 	if (code < 0)
 		return code;
 	CUDA_TRY(status);
-	plan->sweep_volume = volume;
-	plan->sweep_stack = projections;
+	plan->recorded_volume = volume;
+	plan->recorded_stack = projections;
 	return 0;
 }
 
@@ -411,15 +514,15 @@ int cuda_sart_iterate(struct plan *plan, const struct stack *projections, struct
 	TRY(plan_set_views(plan, sart->subsets.order, count, err));
 	TRY(plan_begin_slices(plan, err));
 	if (!worth_recording(plan)) {
-		TRY(sweep(plan, projections->data, volume->data, cancel, err));
+		TRY(iterate(plan, projections->data, volume->data, cancel, err));
 	} else {
 		TRY(cancel_check(cancel, err));
 		if (resident)
 			TRY(backproject_prepare(plan, 0, count, err));
 		else
-			backproject_forget(); /* what is recorded brings its own */
-		if (plan->sweep == NULL || plan->sweep_volume != volume->data ||
-		    plan->sweep_stack != projections->data) {
+			backproject_forget(device); /* what is recorded brings its own */
+		if (plan->recorded == NULL || plan->recorded_volume != volume->data ||
+		    plan->recorded_stack != projections->data) {
 			/* With one subset the column sums are made now and not again and again. */
 			if (plan->coverage != NULL && one && !matched && plan->coverage_subset != 0) {
 				TRY(coverage_sum(plan, 0, count, err));
@@ -427,9 +530,9 @@ int cuda_sart_iterate(struct plan *plan, const struct stack *projections, struct
 			}
 			TRY(record(plan, projections->data, volume->data, err));
 		}
-		CUDA_TRY(cudaGraphLaunch(plan->sweep, device->stream));
+		CUDA_TRY(cudaGraphLaunch(plan->recorded, device->stream));
 		if (!resident)
-			backproject_forget();
+			backproject_forget(device);
 	}
 	TRY(device_wait(device, err));
 	*ret_sums = {device->sums[0], device->sums[1]};

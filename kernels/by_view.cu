@@ -252,7 +252,7 @@ static __device__ __forceinline__ void put_pairs(__half2 *copy, int slice, int s
 	}
 }
 
-enum sweep_update { UPDATE_NOT, UPDATE_COVERED, UPDATE_SEEN };
+enum update_of { UPDATE_NOT, UPDATE_COVERED, UPDATE_SEEN };
 
 /*
  * The update of RUN voxels from one view, and the copies. UPDATE_NOT: only these;
@@ -326,7 +326,7 @@ static __global__ void __launch_bounds__(WIDE *HIGH) update_view_rows(const rows
 		  pair);
 }
 
-/* ---- the sweep ---- */
+/* ---- an iteration ---- */
 
 /* A copy: [pair][slice][fast], SLICE_HELD values held around a row, SLICE_PAD planes that can be read below and above.
  */
@@ -353,12 +353,13 @@ size_t copies_bytes(const struct plan *plan)
 }
 
 /* Rows of a thread: few where what a view sees of the grid would not fill the card. */
-int sweep_view_rows(const struct plan *plan)
+int copies_view_rows(const struct plan *plan)
 {
 	const int warps_least = 500, few = plan->shape.untilted ? 2 : 3; /* those that lean share more */
+	bool by_view = plan->strategy != NULL && plan->strategy->by_view;
 	int rows = plan->shape.forward_rows;
 
-	return plan->shape.by_view && plan->shape.view_warps < warps_least && rows > few ? few : rows;
+	return by_view && plan->shape.view_warps < warps_least && rows > few ? few : rows;
 }
 
 static dim3 blocks_of(const struct plan *plan)
@@ -366,11 +367,11 @@ static dim3 blocks_of(const struct plan *plan)
 	return dim3(divide_up(plan->stack.columns, 32), divide_up(plan->stack.rows, plan->shape.view_rows));
 }
 
-size_t copies_partials(const struct plan *plan)
+size_t copies_partials(const struct plan *plan, int count)
 {
 	dim3 blocks = blocks_of(plan);
 
-	return (size_t)blocks.x * blocks.y;
+	return (size_t)blocks.x * blocks.y * (size_t)count;
 }
 
 /*
@@ -402,7 +403,7 @@ static void wanted_by(const struct plan *plan, int index, bool ret_wanted[2])
 template <comb KIND, int ROWS>
 static void launch_rows(const struct plan *plan, const rows_view &s, int count, int views, cudaStream_t stream)
 {
-	int parts = plan->shape.by_view ? PARTS_MOST : PARTS_OF_FEW;
+	int parts = plan->strategy->by_view ? PARTS_MOST : PARTS_OF_FEW;
 	dim3 blocks(blocks_of(plan).x, count, views), threads(32, parts);
 	size_t shared = (size_t)parts * 3 * ROWS * 32 * sizeof(float);
 
@@ -451,17 +452,16 @@ static int correction_pitch(const struct plan *plan)
 	return round_up(plan->stack.columns, 32);
 }
 
-size_t sweep_correction_bytes(const struct plan *plan)
+void by_view_rows_walk(struct plan *plan, struct arena *arena)
 {
-	return (size_t)correction_pitch(plan) * (size_t)plan->stack.rows * sizeof(float);
+	take(arena, &plan->sampled_from, (size_t)correction_pitch(plan) * (size_t)plan->stack.rows);
 }
 
-int sweep_rows_prepare(struct plan *plan, struct error *err)
+int by_view_rows_prepare(struct plan *plan, struct error *err)
 {
 	cudaResourceDesc resource = {};
 	cudaTextureDesc sampling = {};
 
-	TRY(device_allocate(plan->device, sweep_correction_bytes(plan), (void **)&plan->sampled_from, err));
 	resource.resType = cudaResourceTypePitch2D;
 	resource.res.pitch2D.devPtr = plan->sampled_from;
 	resource.res.pitch2D.desc = cudaCreateChannelDesc<float>();
@@ -473,13 +473,6 @@ int sweep_rows_prepare(struct plan *plan, struct error *err)
 	sampling.readMode = cudaReadModeElementType;
 	CUDA_TRY(cudaCreateTextureObject(&plan->sampled, &resource, &sampling, NULL));
 	return 0;
-}
-
-void sweep_rows_release(struct plan *plan)
-{
-	if (plan->sampled != 0)
-		cudaDestroyTextureObject(plan->sampled);
-	device_release(plan->device, plan->sampled_from, sweep_correction_bytes(plan));
 }
 
 /* All but the views and what they give. */
@@ -519,10 +512,12 @@ int copies_lay_out(struct plan *plan, const float *volume, struct error *err)
 	return 0;
 }
 
-int copies_project(struct plan *plan, int first, int count, struct ray_use use, float *to, struct error *err)
+int copies_project(struct plan *plan, const float *volume, int first, int count, struct ray_use use, float *to,
+		   struct error *err)
 {
 	rows_view s = rows_view_make(plan, NULL, use.least);
 
+	(void)volume; /* the copies are there */
 	s.geometry = plan->in_order + first;
 	s.views = plan->views + first;
 	s.measured = use.measured;
@@ -536,13 +531,13 @@ int copies_project(struct plan *plan, int first, int count, struct ray_use use, 
 	return 0;
 }
 
-int sweep_rows(struct plan *plan, const float *projections, float *volume, float least, const struct cancel *cancel,
-	       struct error *err)
+int by_view_rows_iterate(struct plan *plan, const float *projections, float *volume, const struct cancel *cancel,
+			 struct error *err)
 {
 	const int *order = plan->options.sart->subsets.order;
 	cudaStream_t stream = plan->device->stream;
 	int count = plan->options.geometry->count;
-	rows_view s = rows_view_make(plan, volume, least);
+	rows_view s = rows_view_make(plan, volume, length_least(plan));
 
 	s.correction = plan->sampled_from;
 	s.correction_pitch = correction_pitch(plan);
@@ -565,7 +560,7 @@ int sweep_rows(struct plan *plan, const float *projections, float *volume, float
 		TRY(cancel_check(cancel, err));
 		s.geometry = plan->in_order + i;
 		s.measured = projections + (size_t)order[i] * plan->stack.slot;
-		s.partial = plan->partial + (size_t)i * copies_partials(plan);
+		s.partial = plan->partial + copies_partials(plan, i);
 		s.first_block = range.first;
 		if (range.end > range.first)
 			project_by(plan, s, range.end - range.first, 1, stream);
