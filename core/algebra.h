@@ -31,6 +31,23 @@ static inline double algebra_dot(size_t count, const float *x, const float *y)
 	return sum;
 }
 
+static inline double algebra_weighted_dot(size_t count, const float *w, const float *x, const float *y)
+{
+	double sum = 0;
+
+#pragma omp simd reduction(+ : sum)
+	for (size_t i = 0; i < count; i++)
+		sum += (double)w[i] * ((double)x[i] * (double)y[i]);
+	return sum;
+}
+
+static inline void algebra_multiply(size_t count, const float *x, float *y)
+{
+#pragma omp simd
+	for (size_t i = 0; i < count; i++)
+		y[i] *= x[i];
+}
+
 static inline void algebra_divide(size_t count, const float *x, float least, float *y)
 {
 #pragma omp simd
@@ -38,11 +55,14 @@ static inline void algebra_divide(size_t count, const float *x, float least, flo
 		y[i] = x[i] >= least ? y[i] / x[i] : 0;
 }
 
-static inline void algebra_clip(size_t count, float *y)
+static inline void algebra_maximum(size_t count, float a, const float *x, float *y)
 {
 #pragma omp simd
-	for (size_t i = 0; i < count; i++)
-		y[i] = y[i] > 0 ? y[i] : 0;
+	for (size_t i = 0; i < count; i++) {
+		const float least = a * x[i];
+
+		y[i] = y[i] > least ? y[i] : least;
+	}
 }
 
 static inline void algebra_mask(size_t count, const float *x, float *y)

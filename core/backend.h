@@ -334,16 +334,18 @@ struct backend {
 	int (*volume_axpby)(double a, const struct volume *x, double b, struct volume *y, struct error *err);
 	int (*stack_axpby)(double a, const struct stack *x, const int *slots, int count, double b, struct stack *y,
 			   struct error *err);
-	/* Sum over all elements of x y. */
+	/* Sum over all elements of x y, for stacks of w x y; w NULL: 1. */
 	int (*volume_dot)(struct plan *plan, const struct volume *x, const struct volume *y, double *ret_sum,
 			  struct error *err);
-	int (*stack_dot)(struct plan *plan, const struct stack *x, const struct stack *y, int count, double *ret_sum,
-			 struct error *err);
+	int (*stack_dot)(struct plan *plan, const struct stack *w, const struct stack *x, const struct stack *y,
+			 int count, double *ret_sum, struct error *err);
 	/* y / x where x is at least `least`, 0 elsewhere. */
 	int (*volume_divide)(const struct volume *x, double least, struct volume *y, struct error *err);
 	int (*stack_divide)(const struct stack *x, double least, int count, struct stack *y, struct error *err);
-	/* y = max(y, 0). */
-	int (*volume_clip)(struct volume *y, struct error *err);
+	/* y = x y. */
+	int (*stack_multiply)(const struct stack *x, int count, struct stack *y, struct error *err);
+	/* y = max(y, a x); x may be y, which with a = 0 clips y at 0. */
+	int (*volume_maximum)(double a, const struct volume *x, struct volume *y, struct error *err);
 	int (*stack_fill)(struct stack *y, int count, float value, struct error *err);
 	/* y = 0 where x is NaN. */
 	int (*stack_mask)(const struct stack *x, const int *slots, int count, struct stack *y, struct error *err);

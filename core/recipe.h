@@ -30,12 +30,12 @@ struct recipe {
 	const struct algorithm *algorithm; /* of algorithms[], core/recon/algorithm.h; NULL: no iterations */
 	struct {
 		int iterations;
+		bool nonnegative;                  /* no voxel below 0 */
 		double stop_residual, stop_change; /* 0: never */
 	} iterate;                                 /* whatever the algorithm */
 	struct {
 		double relaxation;
 		int subsets; /* 1 .. views; SUBSETS_VIEWS: an update after each view; SUBSETS_DEFAULT: 10 or fewer */
-		bool nonnegative;
 	} sart;
 	struct {
 		bool on;

@@ -14,6 +14,12 @@ struct axpby {
 		return b == 0 ? a * x : fmaf(a, x, b * y);
 	}
 };
+struct multiply {
+	__device__ float operator()(float x, float y) const
+	{
+		return x * y;
+	}
+};
 struct divide {
 	float least;
 	__device__ float operator()(float x, float y) const
@@ -21,10 +27,13 @@ struct divide {
 		return x >= least ? y / x : 0.0f;
 	}
 };
-struct clip {
-	__device__ float operator()(float, float y) const
+struct maximum {
+	float a;
+	__device__ float operator()(float x, float y) const
 	{
-		return y > 0 ? y : 0.0f;
+		const float least = a * x;
+
+		return y > least ? y : least;
 	}
 };
 struct mask {
@@ -108,9 +117,14 @@ int cuda_stack_divide(const struct stack *x, double least, int count, struct sta
 	return over_stack(divide{(float)least}, x, NULL, count, y, err);
 }
 
-int cuda_volume_clip(struct volume *y, struct error *err)
+int cuda_stack_multiply(const struct stack *x, int count, struct stack *y, struct error *err)
 {
-	return over_volume(clip{}, y, y, err);
+	return over_stack(multiply{}, x, NULL, count, y, err);
+}
+
+int cuda_volume_maximum(double a, const struct volume *x, struct volume *y, struct error *err)
+{
+	return over_volume(maximum{(float)a}, x, y, err);
 }
 
 int cuda_stack_fill(struct stack *y, int count, float value, struct error *err)

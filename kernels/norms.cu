@@ -178,26 +178,26 @@ int cuda_norms(struct plan *plan, const struct volume *volume, const struct volu
 	return 0;
 }
 
-/* A thread's products of float32 are exact in float64, which costs nothing beside the reads. */
-static __global__ void __launch_bounds__(THREADS)
-    dot(const float *__restrict__ x, const float *__restrict__ y, size_t count, double *blocks)
+/* A thread's products of float32 are exact in float64, which costs nothing beside the reads. w may be NULL. */
+static __global__ void __launch_bounds__(THREADS) dot(const float *__restrict__ w, const float *__restrict__ x,
+						      const float *__restrict__ y, size_t count, double *blocks)
 {
 	double value[1] = {0};
 
 	for (size_t i = (size_t)blockIdx.x * THREADS + threadIdx.x; i < count; i += (size_t)gridDim.x * THREADS)
-		value[0] = fma((double)x[i], (double)y[i], value[0]);
+		value[0] = fma(w != NULL ? (double)w[i] * (double)x[i] : (double)x[i], (double)y[i], value[0]);
 	reduce_block<1>(value);
 	if (threadIdx.x == 0)
 		blocks[blockIdx.x] = value[0];
 }
 
-static int reduce_dot(struct plan *plan, const float *x, const float *y, size_t count, double *ret_sum,
+static int reduce_dot(struct plan *plan, const float *w, const float *x, const float *y, size_t count, double *ret_sum,
 		      struct error *err)
 {
 	struct device *device = plan->device;
 
 	TRY(device_enter(device, err));
-	dot<<<BLOCKS, THREADS, 0, device->stream>>>(x, y, count, plan->reduce);
+	dot<<<BLOCKS, THREADS, 0, device->stream>>>(w, x, y, count, plan->reduce);
 	LAUNCHED();
 	add_blocks<1><<<1, THREADS, 0, device->stream>>>(plan->reduce, BLOCKS, device->sums_device);
 	LAUNCHED();
@@ -209,12 +209,13 @@ static int reduce_dot(struct plan *plan, const float *x, const float *y, size_t 
 int cuda_volume_dot(struct plan *plan, const struct volume *x, const struct volume *y, double *ret_sum,
 		    struct error *err)
 {
-	return reduce_dot(plan, x->data, y->data, y->bytes / sizeof(float), ret_sum, err);
+	return reduce_dot(plan, NULL, x->data, y->data, y->bytes / sizeof(float), ret_sum, err);
 }
 
 /* The zeros between rows and slots add nothing. */
-int cuda_stack_dot(struct plan *plan, const struct stack *x, const struct stack *y, int count, double *ret_sum,
-		   struct error *err)
+int cuda_stack_dot(struct plan *plan, const struct stack *w, const struct stack *x, const struct stack *y, int count,
+		   double *ret_sum, struct error *err)
 {
-	return reduce_dot(plan, x->data, y->data, (size_t)count * y->shape.slot, ret_sum, err);
+	return reduce_dot(plan, w != NULL ? w->data : NULL, x->data, y->data, (size_t)count * y->shape.slot, ret_sum,
+			  err);
 }

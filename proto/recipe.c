@@ -120,8 +120,8 @@ static int read_algorithm(struct recipe *recipe, const struct algorithm *algorit
 	if (algorithm->subsets) {
 		json_number(&reader, "relaxation", false, 1e-6, 2, &recipe->sart.relaxation);
 		read_subsets(&reader, &recipe->sart.subsets);
-		json_bool(&reader, "nonnegative", false, &recipe->sart.nonnegative);
 	}
+	json_bool(&reader, "nonnegative", false, &recipe->iterate.nonnegative);
 	stop = json_member(&reader, "stop", false);
 	code = json_end(&reader);
 	return code == 0 && stop != NULL ? read_stop(recipe, stop, stop_pointer, err) : code;
@@ -403,8 +403,8 @@ static void add_algorithm(cJSON *document, const struct algorithm *algorithm, co
 			cJSON_AddStringToObject(object, "subsets", "views");
 		else if (recipe->sart.subsets != SUBSETS_DEFAULT)
 			cJSON_AddNumberToObject(object, "subsets", recipe->sart.subsets);
-		cJSON_AddBoolToObject(object, "nonnegative", recipe->sart.nonnegative);
 	}
+	cJSON_AddBoolToObject(object, "nonnegative", recipe->iterate.nonnegative);
 	stop = cJSON_AddObjectToObject(object, "stop");
 	cJSON_AddNumberToObject(stop, "residual", recipe->iterate.stop_residual);
 	cJSON_AddNumberToObject(stop, "change", recipe->iterate.stop_change);
@@ -508,10 +508,9 @@ static bool same_algorithm(const struct recipe *a, const struct recipe *b)
 		return a->algorithm == b->algorithm;
 	return a->projector == b->projector && a->iterate.iterations == b->iterate.iterations &&
 	       a->iterate.stop_residual == b->iterate.stop_residual &&
-	       a->iterate.stop_change == b->iterate.stop_change &&
+	       a->iterate.stop_change == b->iterate.stop_change && a->iterate.nonnegative == b->iterate.nonnegative &&
 	       (!a->algorithm->subsets ||
-		(a->sart.relaxation == b->sart.relaxation && a->sart.subsets == b->sart.subsets &&
-		 a->sart.nonnegative == b->sart.nonnegative));
+		(a->sart.relaxation == b->sart.relaxation && a->sart.subsets == b->sart.subsets));
 }
 
 static bool same_tv(const struct recipe *a, const struct recipe *b)

@@ -27,7 +27,7 @@ const struct option recipe_option_rows[] = {
     ROW("subsets", OPTION_TEXT, subsets, "N|views", "ordered subsets of the views; 1 is the simultaneous form", 0, 0, 0,
 	NULL),
     ROW("relaxation", OPTION_NUMBER, relaxation, "R", "of each SART update", 0, 0, 0, NULL),
-    ROW("negative", OPTION_FLAG, negative, NULL, "let SART's voxels be negative", 0, 0, 0, NULL),
+    ROW("negative", OPTION_FLAG, negative, NULL, "let voxels be negative in the iterations", 0, 0, 0, NULL),
     ROW("stop-residual", OPTION_NUMBER, stop_residual, "R", "end when ||p - A v|| / ||p|| is at most R", 0, 0, 0, NULL),
     ROW("stop-change", OPTION_NUMBER, stop_change, "C", "end when an iteration changes the volume by at most C", 0, 0,
 	0, NULL),
@@ -150,6 +150,8 @@ static void put_cgls(cJSON *document, const struct recipe_options *options)
 
 	cJSON_DeleteItemFromObjectCaseSensitive(document, "sart");
 	put_integer(cgls, "iterations", options->cgls);
+	if (options->negative)
+		put(cgls, "nonnegative", cJSON_CreateFalse());
 	put_stop(cgls, options);
 }
 
@@ -220,8 +222,7 @@ int recipe_document(const struct recipe_options *options, const char *path, cons
 				!isnan(options->cutoff)))
 		return error_set(err, ERR_USAGE, "--no-fdk together with options of the FDK");
 	if (options->cgls != OPTION_UNSET_INTEGER &&
-	    (options->iterations != OPTION_UNSET_INTEGER || options->subsets != NULL || !isnan(options->relaxation) ||
-	     options->negative))
+	    (options->iterations != OPTION_UNSET_INTEGER || options->subsets != NULL || !isnan(options->relaxation)))
 		return error_set(err, ERR_USAGE, "--cgls together with options of SART");
 	if (path != NULL) {
 		int code = recipe_read(path, &document, err);

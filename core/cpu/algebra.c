@@ -61,15 +61,17 @@ int cpu_volume_dot(struct plan *plan, const struct volume *x, const struct volum
 	return 0;
 }
 
-int cpu_stack_dot(struct plan *plan, const struct stack *x, const struct stack *y, int count, double *ret_sum,
-		  struct error *err)
+int cpu_stack_dot(struct plan *plan, const struct stack *w, const struct stack *x, const struct stack *y, int count,
+		  double *ret_sum, struct error *err)
 {
 	double sum = 0;
 
 	(void)err;
 #pragma omp parallel for ordered num_threads(plan->device->threads) schedule(static, 1)
 	for (int i = 0; i < count; i++) {
-		const double part = algebra_dot(slot_floats(y), slot(x, NULL, i), slot(y, NULL, i));
+		const float *xs = slot(x, NULL, i), *ys = slot(y, NULL, i);
+		const double part = w == NULL ? algebra_dot(slot_floats(y), xs, ys)
+					      : algebra_weighted_dot(slot_floats(y), slot(w, NULL, i), xs, ys);
 
 #pragma omp ordered
 		sum += part;
@@ -96,12 +98,21 @@ int cpu_stack_divide(const struct stack *x, double least, int count, struct stac
 	return 0;
 }
 
-int cpu_volume_clip(struct volume *y, struct error *err)
+int cpu_stack_multiply(const struct stack *x, int count, struct stack *y, struct error *err)
+{
+	(void)err;
+#pragma omp parallel for num_threads(y->device->threads) schedule(static)
+	for (int i = 0; i < count; i++)
+		algebra_multiply(slot_floats(y), slot(x, NULL, i), slot(y, NULL, i));
+	return 0;
+}
+
+int cpu_volume_maximum(double a, const struct volume *x, struct volume *y, struct error *err)
 {
 	(void)err;
 #pragma omp parallel for num_threads(y->device->threads) schedule(static)
 	for (int i = 0; i < y->size[1]; i++)
-		algebra_clip(plane_floats(y), plane(y, i));
+		algebra_maximum(plane_floats(y), (float)a, plane(x, i), plane(y, i));
 	return 0;
 }
 

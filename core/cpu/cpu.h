@@ -309,11 +309,12 @@ int cpu_stack_axpby(double a, const struct stack *x, const int *slots, int count
 		    struct error *err);
 int cpu_volume_dot(struct plan *plan, const struct volume *x, const struct volume *y, double *ret_sum,
 		   struct error *err);
-int cpu_stack_dot(struct plan *plan, const struct stack *x, const struct stack *y, int count, double *ret_sum,
-		  struct error *err);
+int cpu_stack_dot(struct plan *plan, const struct stack *w, const struct stack *x, const struct stack *y, int count,
+		  double *ret_sum, struct error *err);
 int cpu_volume_divide(const struct volume *x, double least, struct volume *y, struct error *err);
 int cpu_stack_divide(const struct stack *x, double least, int count, struct stack *y, struct error *err);
-int cpu_volume_clip(struct volume *y, struct error *err);
+int cpu_stack_multiply(const struct stack *x, int count, struct stack *y, struct error *err);
+int cpu_volume_maximum(double a, const struct volume *x, struct volume *y, struct error *err);
 int cpu_stack_fill(struct stack *y, int count, float value, struct error *err);
 int cpu_stack_mask(const struct stack *x, const int *slots, int count, struct stack *y, struct error *err);
 

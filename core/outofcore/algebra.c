@@ -54,8 +54,8 @@ int outofcore_volume_dot(struct plan *plan, const struct volume *x, const struct
 	return 0;
 }
 
-int outofcore_stack_dot(struct plan *plan, const struct stack *x, const struct stack *y, int count, double *ret_sum,
-			struct error *err)
+int outofcore_stack_dot(struct plan *plan, const struct stack *w, const struct stack *x, const struct stack *y,
+			int count, double *ret_sum, struct error *err)
 {
 	double sum = 0;
 
@@ -63,7 +63,9 @@ int outofcore_stack_dot(struct plan *plan, const struct stack *x, const struct s
 	(void)err;
 #pragma omp parallel for ordered schedule(static, 1)
 	for (int i = 0; i < count; i++) {
-		const double part = algebra_dot(y->pixels, slot(x, NULL, i), slot(y, NULL, i));
+		const float *xs = slot(x, NULL, i), *ys = slot(y, NULL, i);
+		const double part = w == NULL ? algebra_dot(y->pixels, xs, ys)
+					      : algebra_weighted_dot(y->pixels, slot(w, NULL, i), xs, ys);
 
 #pragma omp ordered
 		sum += part;
@@ -90,12 +92,23 @@ int outofcore_stack_divide(const struct stack *x, double least, int count, struc
 	return 0;
 }
 
-int outofcore_volume_clip(struct volume *y, struct error *err)
+int outofcore_stack_multiply(const struct stack *x, int count, struct stack *y, struct error *err)
 {
 	(void)err;
+	y->by = NULL;
+#pragma omp parallel for schedule(static)
+	for (int i = 0; i < count; i++)
+		algebra_multiply(y->pixels, slot(x, NULL, i), slot(y, NULL, i));
+	return 0;
+}
+
+int outofcore_volume_maximum(double a, const struct volume *x, struct volume *y, struct error *err)
+{
+	(void)err;
+	y->is_zero = false;
 #pragma omp parallel for schedule(static)
 	for (int i = 0; i < y->size[2]; i++)
-		algebra_clip(y->slice, slice(y, i));
+		algebra_maximum(y->slice, (float)a, slice(x, i), slice(y, i));
 	return 0;
 }
 

@@ -21,6 +21,7 @@ struct problem {
 	struct volume *volume;           /* the iterate */
 	struct volume *before;       /* scratch at the beginning of an iteration, at its end the iterate before it */
 	const struct cancel *cancel; /* or NULL */
+	bool nonnegative;            /* the iterate has no voxel below 0 */
 };
 
 struct algorithm {

@@ -49,7 +49,7 @@ struct plan_options plan_options(const struct recipe *recipe, const struct geome
 int sart_options_make(struct sart_options *ret_sart, const struct recipe *recipe, const struct orbit *orbit,
 		      struct error *err)
 {
-	struct sart_options sart = {.relaxation = recipe->sart.relaxation, .nonnegative = recipe->sart.nonnegative};
+	struct sart_options sart = {.relaxation = recipe->sart.relaxation, .nonnegative = recipe->iterate.nonnegative};
 	int code = subsets_make(&sart.subsets, orbit, subsets_count(recipe->sart.subsets, orbit->count), err);
 
 	if (code == 0)

@@ -17,8 +17,8 @@ void recipe_defaults(struct recipe *ret_recipe)
 {
 	*ret_recipe = (struct recipe){
 	    .fdk = {.window = WINDOW_HANN, .cutoff = 1, .extend = true},
-	    .iterate = {.iterations = 10},
-	    .sart = {.relaxation = 1, .subsets = SUBSETS_DEFAULT, .nonnegative = true},
+	    .iterate = {.iterations = 10, .nonnegative = true},
+	    .sart = {.relaxation = 1, .subsets = SUBSETS_DEFAULT},
 	    .tv = {.after_fdk = true,
 		   .automatic = true,
 		   .strength = TV_MEDIUM,

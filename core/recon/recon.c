@@ -127,6 +127,7 @@ static int open_algorithm(struct recon *recon, struct error *err)
 	    .volume = recon->volume,
 	    .before = recon->before,
 	    .cancel = &recon->cancel,
+	    .nonnegative = recon->recipe.iterate.nonnegative,
 	};
 	recon->moved = true;
 	return algorithm->open != NULL ? algorithm->open(&recon->problem, &recon->algorithm_state, err) : 0;

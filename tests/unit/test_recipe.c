@@ -64,7 +64,8 @@ static const char *const requests[] = {
     "{\"scan\":\"a\",\"fdk\":{\"window\":\"hamming\"},\"priority\":\"stat\",\"precision\":\"reference\"}",
     "{\"scan\":\"a\",\"sart\":{\"subsets\":\"views\",\"relaxation\":0.1,\"nonnegative\":false,\"stop\":null},"
     "\"priority\":\"urgent\",\"mu_water\":0.020000000000000004}",
-    "{\"scan\":\"a\",\"cgls\":{\"iterations\":3,\"stop\":{\"residual\":0.1}},\"projector\":\"interpolating\"}",
+    "{\"scan\":\"a\",\"cgls\":{\"iterations\":3,\"nonnegative\":false,\"stop\":{\"residual\":0.1}},\"projector\":"
+    "\"interpolating\"}",
     "{\"scan\":\"a\",\"fdk\":{},\"cgls\":{},\"sart\":null}",
     "{\"scan\":\"a\",\"sart\":{\"subsets\":60,\"iterations\":100000,\"stop\":{\"change\":1e-9}},"
     "\"emit\":[100000,7,3,7]}",
@@ -153,7 +154,7 @@ START_TEST(defaults_are_the_contracts)
 	ck_assert_int_eq(recipe->iterate.iterations, 10);
 	ck_assert_double_eq(recipe->sart.relaxation, 1);
 	ck_assert_int_eq(recipe->sart.subsets, 10);
-	ck_assert(recipe->sart.nonnegative);
+	ck_assert(recipe->iterate.nonnegative);
 	ck_assert_double_eq(recipe->iterate.stop_residual, 0);
 	ck_assert_double_eq(recipe->iterate.stop_change, 0);
 	ck_assert(recipe->tv.after_fdk);

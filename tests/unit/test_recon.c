@@ -486,7 +486,7 @@ START_TEST(sirt_lowers_the_residual_in_every_iteration)
 
 	recipe.sart.subsets = 1;
 	recipe.iterate.iterations = 25;
-	recipe.sart.nonnegative = _i % 2;
+	recipe.iterate.nonnegative = _i % 2;
 	recipe.projector = _i / 2 ? PROJECTOR_MATCHED : PROJECTOR_INTERPOLATING;
 	small_scene(&scene);
 	run(&scene, &recipe, &outcome);
@@ -535,7 +535,7 @@ START_TEST(nonnegative_is_what_it_says)
 	for (int nonnegative = 0; nonnegative < 2; nonnegative++) {
 		struct outcome outcome = {0};
 
-		recipe.sart.nonnegative = nonnegative;
+		recipe.iterate.nonnegative = nonnegative;
 		run(&scene, &recipe, &outcome);
 		if (nonnegative)
 			ck_assert_double_ge(outcome.kept[0].norms.minimum, 0);
@@ -556,7 +556,7 @@ START_TEST(relaxation_scales_the_update)
 
 	recipe.sart.subsets = 1;
 	recipe.iterate.iterations = 1;
-	recipe.sart.nonnegative = false;
+	recipe.iterate.nonnegative = false;
 	small_scene(&scene);
 	run(&scene, &recipe, &whole);
 	recipe.sart.relaxation = 0.5;
@@ -921,7 +921,7 @@ START_TEST(divergence_is_an_error_with_the_iteration)
 	struct scene scene;
 	struct outcome outcome = {0};
 
-	recipe.sart.nonnegative = false;
+	recipe.iterate.nonnegative = false;
 	recipe.tv.on = true;
 	recipe_explicit_tv(&recipe, TV_GRADIENT);
 	recipe.tv.options.step = 1e6;
@@ -2035,7 +2035,7 @@ START_TEST(sart_is_as_good_as_rtk_demands)
 	recipe.iterate.iterations = 1;
 	recipe.sart.relaxation = 0.5;
 	recipe.sart.subsets = SUBSETS_VIEWS;
-	recipe.sart.nonnegative = false;
+	recipe.iterate.nonnegative = false;
 	scene_orbit(&scene, &spec);
 	scene_add(&scene, &phantom);
 	phantom_voxelise(&phantom, &grid, 1, truth);

@@ -17,6 +17,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 
+#include "core/recon/algorithm.h"
 #include "tests/unit/scene.h"
 
 Suite *study_suite(void);
@@ -120,6 +121,41 @@ START_TEST(sart_takes_the_voxel_object_from_fdk_to_itself)
 }
 END_TEST
 
+/*
+ * The same scan: 15 iterations of conjugate gradients are nearer to the truth than 100 of SIRT (SART with one subset
+ * and its other defaults), whose errors are .0673 from FDK and .161 from zero (tests/bench/results/algorithms.txt);
+ * without x >= 0 they were .089 and .203. The residual falls at every one of them.
+ */
+START_TEST(conjugate_gradients_pass_a_hundred_iterations_of_sirt)
+{
+	static const double sirt[] = {.161, .0673}, reached[] = {.150, .060};
+	struct study study;
+	struct recipe recipe;
+
+	study_open(&study, 100, 169, 2);
+	study_project_voxels(&study);
+	recipe = recipe_on(&study.grid);
+	recipe_set_algorithm(&recipe, &algorithm_cgls);
+	recipe.iterate.iterations = 15;
+	recipe.fdk.window = WINDOW_RAM_LAK;
+	for (int from_fdk = 0; from_fdk < 2; from_fdk++) {
+		struct outcome outcome = {0};
+		double last;
+
+		recipe.fdk.on = from_fdk;
+		scene_run(&study.scene, &recipe, &outcome);
+		last = error_of(&study, &outcome, "final");
+		ck_assert_int_eq(outcome.row_count, 15);
+		for (int i = 1; i < outcome.row_count; i++)
+			ck_assert_double_lt(outcome.rows[i].residual, outcome.rows[i - 1].residual);
+		ck_assert_msg(last <= reached[from_fdk] && last < sirt[from_fdk], "%.4f, of SIRT %.4f", last,
+			      sirt[from_fdk]);
+		outcome_clear(&outcome);
+	}
+	study_close(&study);
+}
+END_TEST
+
 static void add_multiplicative_noise(struct scene *scene)
 {
 	size_t count = (size_t)scene->geometry.count * (size_t)scene->geometry.columns * (size_t)scene->geometry.rows;
@@ -152,11 +188,11 @@ START_TEST(tv_halves_the_error_that_noise_drives_up)
 	recipe = study_recipe(&study);
 	recipe.emit = emit;
 	recipe.emits = 1;
-	recipe.sart.nonnegative = false;
+	recipe.iterate.nonnegative = false;
 	scene_run(&study.scene, &recipe, &plain);
 	first = error_of(&study, &plain, "iter-1");
 	climbed = error_of(&study, &plain, "final");
-	recipe.sart.nonnegative = true;
+	recipe.iterate.nonnegative = true;
 	recipe.tv.on = true;
 	scene_run(&study.scene, &recipe, &tv);
 	held = error_of(&study, &tv, "final");
@@ -211,6 +247,7 @@ Suite *study_suite(void)
 
 	tcase_set_timeout(cases, 0);
 	tcase_add_test(cases, sart_takes_the_voxel_object_from_fdk_to_itself);
+	tcase_add_test(cases, conjugate_gradients_pass_a_hundred_iterations_of_sirt);
 	tcase_add_test(cases, tv_halves_the_error_that_noise_drives_up);
 	tcase_add_test(cases, sart_and_tv_improve_on_fdk_with_exact_integrals);
 	suite_add_tcase(suite, cases);

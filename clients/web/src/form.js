@@ -28,7 +28,8 @@ const groups = [
 		number('/sart/stop/residual', 'Stop at residual'), number('/sart/stop/change', 'Stop at change'),
 	] },
 	{ title: 'Conjugate gradients', pointer: '/cgls', optional: true, rare: true, off: 'not in place of SART', fields: [
-		number('/cgls/iterations', 'Iterations', { step: 1 }), number('/cgls/stop/residual', 'Stop at residual'), number('/cgls/stop/change', 'Stop at change'),
+		number('/cgls/iterations', 'Iterations', { step: 1 }), flag('/cgls/nonnegative', 'Never below zero'),
+		number('/cgls/stop/residual', 'Stop at residual'), number('/cgls/stop/change', 'Stop at change'),
 	] },
 	{ title: 'Total variation', pointer: '/tv', optional: true, off: 'no smoothing', fields: [
 		choice('/tv/method', 'Method', ['proximal', 'gradient']), choice('/tv/strength', 'Strength', ['light', 'medium', 'strong']),
