@@ -365,7 +365,7 @@ static int write_checkpoint(struct recon *recon, struct sealed_file *sealed, str
 {
 	char header[CHECKPOINT_FILE_OFFSET];
 	size_t metal_bytes;
-	const void *metal = recon_metal(recon, &metal_bytes);
+	const void *metal = recon_found(recon, &metal_bytes);
 	const struct volume_noise *noise = recon_noise(recon), none = {0};
 	const struct checkpoint_sink sink = {.context = sealed, .write = write_state};
 	int code;
@@ -389,7 +389,7 @@ static int save_checkpoint(struct recon *recon, const char *directory, struct er
 	size_t content = CHECKPOINT_FILE_OFFSET + grid_voxels(recon_grid(recon)) * sizeof(float), metal_bytes;
 	int code = path_join(path, sizeof(path), directory, CHECKPOINT_FILE, "", err);
 
-	recon_metal(recon, &metal_bytes);
+	recon_found(recon, &metal_bytes);
 	content += recon_state_bytes(recon) + metal_bytes;
 	if (code == 0)
 		code = seal_maker_new(content, &sealed.seal, err);
@@ -467,7 +467,7 @@ static int resume(struct run *run, struct recon *recon, const char *path, int ex
 		code = recon_resume_state(recon, bytes + metal, recon_state_bytes(recon), err);
 	metal += recon_state_bytes(recon);
 	if (code == 0 && seal.content > metal)
-		code = recon_resume_metal(recon, bytes + metal, seal.content - metal, err);
+		code = recon_resume_found(recon, bytes + metal, seal.content - metal, err);
 	if (code == 0 && iteration != expected) {
 		char detail[128];
 

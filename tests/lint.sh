@@ -38,7 +38,7 @@ daemon_rooms=("http:" "store:" "volumes: store" "jobs: store" "intake: http stor
 declare -A doors=(
 	[core/scan]="geometry|grid|orbit|phantom"
 	[core/cpu]="none"
-	[core/correct]="exterior|exterior_volume|input|metal|stuck"
+	[core/correct]="correction|input|stuck"
 	[core/recon]="algorithm|recipe|recon"
 )
 door() { echo "$1/(${doors[$1]:-$(basename "$1")})\.h"; }

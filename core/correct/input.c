@@ -7,35 +7,8 @@
 #include <string.h>
 
 #include "core/correct/air.h"
+#include "core/correct/correction.h"
 #include "core/truncation.h"
-
-/* Air regions that differ by more than this tell of a tube or a detector that drifts. */
-static const double DRIFT = 0.05;
-/* Of the flat: below it something stands before the air region, in all views alike where they do not differ. */
-static const double FAINT = 0.7;
-
-/* Means of line integrals that no object has: no photon passes the one, and no flat is a tenth too dark for the other.
- */
-static const double COUNTS = 1000, NEGATIVE = -0.1;
-
-static int check(const struct linearise *linearise, const struct geometry *geometry, struct error *err)
-{
-	const int *region = linearise->air_region;
-
-	if (linearise->hardening_count < 0 || linearise->hardening_count > HARDENING_MOST)
-		return error_set(err, ERR_INVALID, "a beam-hardening polynomial of %d coefficients, at most %d",
-				 linearise->hardening_count, HARDENING_MOST);
-	if (!linearise->has_air_region)
-		return 0;
-	if (linearise->quantity != QUANTITY_INTENSITY)
-		return error_set(err, ERR_INVALID, "line integrals have no air region, intensities do");
-	if (region[0] < 0 || region[0] > region[2] || region[2] >= geometry->columns || region[1] < 0 ||
-	    region[1] > region[3] || region[3] >= geometry->rows)
-		return error_set(err, ERR_INVALID,
-				 "air region of columns %d to %d and rows %d to %d on a detector of %d x %d", region[0],
-				 region[2], region[1], region[3], geometry->columns, geometry->rows);
-	return 0;
-}
 
 static size_t sample_bytes(const struct input *input)
 {
@@ -93,7 +66,7 @@ int input_open(struct input *ret_input, const struct linearise *linearise, const
 	int code = turned ? turn(&input, err) : 0;
 
 	if (code == 0)
-		code = check(&input.linearise, geometry, err);
+		code = corrections_check(&input.linearise, geometry, err);
 	if (code == 0)
 		code = defect_map_make(&input.map, &input.linearise, geometry->columns, geometry->rows, err);
 	if (code == 0) {
@@ -239,76 +212,11 @@ static int look_at_ends(struct input *input, const void *samples, int columns, i
 	return look_at_air(input, samples, columns, rows, largest, err);
 }
 
-/* Not above the dark, where the detector could have counted. */
-static bool has_no_counts(const struct input *input, const void *samples, size_t at)
-{
-	const struct linearise *linearise = &input->linearise;
-	const float sample =
-	    linearise->sample == SAMPLE_UINT16 ? ((const uint16_t *)samples)[at] : ((const float *)samples)[at];
-	const float dark = linearise->dark != NULL ? linearise->dark[at] : 0;
-	const float flat = linearise->flat != NULL ? linearise->flat[at] : (float)linearise->air;
-
-	return sample <= dark && isfinite(sample) && flat > dark &&
-	       (linearise->defects == NULL || !linearise->defects[at]);
-}
-
-/* Notes the view's samples without counts; how many there are to *ret_count. */
-static int note_dark(const struct input *input, const void *samples, int columns, int view, struct metal *metal,
-		     size_t *ret_count, struct error *err)
-{
-	const int rows = (int)(input->pixels / (size_t)columns);
-	size_t count = 0;
-	int code = 0;
-
-	for (int row = 0; row < rows && code == 0; row++)
-		for (int first = 0, last; first < columns && code == 0; first = last + 1) {
-			const size_t at = (size_t)row * (size_t)columns;
-
-			last = first;
-			if (!has_no_counts(input, samples, at + (size_t)first))
-				continue;
-			while (last + 1 < columns && has_no_counts(input, samples, at + (size_t)last + 1))
-				last++;
-			count += (size_t)(last - first + 1);
-			code = metal_note_dark(metal, view, row, first, last, err);
-		}
-	*ret_count = count;
-	return code;
-}
-
-/* Of the view's largest line integral: in such a shadow a sample without counts is no dead pixel. */
-static const float SHADOW = 0.5f;
-
-/*
- * Where a shadow has no counts, its line integrals are above all that was
- * measured, and linearise has bridged them from the shadow's rim: metal would hardly be found.
- */
-static int darken(const struct input *input, const struct backend *backend, const void *samples, int slot,
-		  struct stack *to, struct error *err)
-{
-	float *view = malloc(input->pixels * sizeof(float)), largest = 0;
-	int code;
-
-	if (view == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for a view");
-	code = backend->stack_download(to, slot, 1, view, err);
-	for (size_t i = 0; i < input->pixels && code == 0; i++)
-		largest = fmaxf(largest, view[i]);
-	for (size_t i = 0; i < input->pixels && code == 0; i++)
-		if (view[i] >= SHADOW * largest && has_no_counts(input, samples, i))
-			view[i] = largest;
-	if (code == 0)
-		code = backend->stack_upload(to, slot, 1, view, err);
-	free(view);
-	return code;
-}
-
 int input_take(struct input *input, const struct backend *backend, struct plan *plan, const void *samples, int view,
-	       int slot, struct stack *to, struct metal *metal, struct error *err)
+	       int slot, struct stack *to, const void **ret_upright, struct error *err)
 {
 	/* One by one, so that the views with defects are known. */
 	const struct defect_counts before = input->counts;
-	size_t dark = 0;
 	int code;
 
 	if (input->turned) {
@@ -333,11 +241,8 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 	    defects_total(&input->counts) - input->counts.mapped > defects_total(&before) - before.mapped;
 	if (input->counts.blank > before.blank)
 		input->blank[before.blank] = view;
-	if (metal == NULL || input->linearise.quantity != QUANTITY_INTENSITY || input->counts.zero == before.zero ||
-	    input->counts.blank > before.blank)
-		return 0;
-	code = note_dark(input, samples, input->turned ? input->rows : input->columns, view, metal, &dark, err);
-	return code < 0 || dark == 0 ? code : darken(input, backend, samples, slot, to, err);
+	*ret_upright = samples;
+	return 0;
 }
 
 void input_goes_on(const struct input *input, bool ret_ends[2])
@@ -372,122 +277,4 @@ int input_check(const struct input *input, struct error *err)
 			 "not above the dark, %zu saturated, %zu not finite",
 			 input->views, input->counts.mapped, input->counts.zero, input->counts.saturated,
 			 input->counts.not_finite);
-}
-
-static int lowest(const int *views, int count)
-{
-	int least = views[0];
-
-	for (int i = 1; i < count; i++)
-		least = views[i] < least ? views[i] : least;
-	return least;
-}
-
-static void warn_of_air(const struct input *input, const struct warning_sink *sink)
-{
-	const double least = (double)input->counts.air_least, most = (double)input->counts.air_most;
-
-	if (input->counts.no_air > 0)
-		warning_tell(
-		    sink, "air_region",
-		    "the air region has no good pixel in %d projections: those are taken against the flat as they are",
-		    input->counts.no_air);
-	if (least > 0 && (most > (1 + DRIFT) * least || least < FAINT))
-		warning_tell(
-		    sink, "air_region",
-		    "the air region lies between %.4g and %.4g of the flat; each projection was held against its own%s",
-		    least, most,
-		    most > 2 * least || least < FAINT ? ". That is more than a tube drifts: is the object in it?" : "");
-}
-
-static void warn_of_air_level(const struct input *input, const struct warning_sink *sink)
-{
-	if (input->off == 0)
-		return;
-	warning_tell(
-	    sink, "air_level",
-	    "both ends of nearly all rows have line integrals between %.3g and %.3g, where air is 0, in %d of %d "
-	    "projections that were looked at: the tube gave less or more than the flat or \"air\" says. Nothing "
-	    "of that is taken out; an air_region makes up for it",
-	    (double)input->air_least, (double)input->air_most, input->off, input->views_looked_at);
-}
-
-static void warn_of_line_integrals(const struct input *input, const struct warning_sink *sink)
-{
-	const double mean = input->looked_at > 0 ? input->sum / (double)input->looked_at : 0;
-
-	if (mean > COUNTS)
-		warning_tell(sink, "line_integrals",
-			     "the line integrals are %.4g in the mean: are they counts, which would be intensities?",
-			     mean);
-	if (mean < NEGATIVE)
-		warning_tell(
-		    sink, "line_integrals",
-		    "the line integrals are %.4g in the mean, where air is 0 and all else more: is their sign turned?",
-		    mean);
-	else if (input->looked_at > 0 && input->most <= 0)
-		warning_tell(
-		    sink, "line_integrals",
-		    "none of %zu line integrals that were looked at is above 0: there is nothing but air in the scan",
-		    input->looked_at);
-}
-
-/* What has its bytes exchanged is noise. So are 8 bits in the upper byte, but for being below 256 the other way. */
-static void warn_of_bytes(const struct input *input, const struct warning_sink *sink)
-{
-	const double smoother = 8;
-
-	if (input->largest > 255 && input->rough[0] > smoother * input->rough[1])
-		warning_tell(
-		    sink, "byte_order",
-		    "pixels differ from their neighbours by %.3g times as much as with their bytes exchanged: are they "
-		    "big-endian?",
-		    input->rough[0] / fmax(input->rough[1], 1));
-}
-
-void input_warn(const struct input *input, const struct geometry *geometry, const struct warning_sink *sink)
-{
-	const struct defect_counts *counts = &input->counts;
-	const struct defect_map *map = &input->map;
-	const size_t found = defects_total(counts) - counts->mapped;
-	const double pixels = (double)geometry->columns * geometry->rows;
-
-	/* Who gives air as a number may have taken the offset away; a flat is what the detector gave. */
-	if (input->linearise.quantity == QUANTITY_INTENSITY && input->linearise.flat != NULL &&
-	    input->linearise.dark == NULL)
-		warning_tell(sink, "no_dark",
-			     "a flat image is there, but no dark one: an offset that the detector adds to its counts "
-			     "makes all that is measured too thin");
-	if (map->map != NULL && map->given + map->dead + map->hot + map->noisy > 0) {
-		const size_t all = map->given + map->dead + map->hot + map->noisy;
-
-		warning_tell(
-		    sink, "defect_map",
-		    "%zu pixels (%.3g %%) of every projection were replaced from their neighbours: %zu of the given "
-		    "map, and %zu dead, %zu hot and %zu noisy ones that the flat and dark images show",
-		    all, 100 * (double)all / pixels, map->given, map->dead, map->hot, map->noisy);
-	}
-	if (map->stuck > 0)
-		warning_tell(
-		    sink, "stuck_pixels",
-		    "%zu pixels (%.3g %%) do not follow their neighbours over the views and were replaced from them; "
-		    "a map of the detector's defects with the scan is the surer way",
-		    map->stuck, 100 * (double)map->stuck / pixels);
-	if (found > 0)
-		warning_tell(
-		    sink, "defects",
-		    "%zu samples (%.3g %%) in %d projections were replaced from their neighbours: %zu not above the "
-		    "dark, %zu saturated, %zu not finite or without a flat",
-		    found, 100 * (double)found / (pixels * input->views), input->defective_views, counts->zero,
-		    counts->saturated, counts->not_finite);
-	if (counts->blank > 0)
-		warning_tell(
-		    sink, "blank_views",
-		    "%d projections have no good pixel, the first of them is %d: they are left out, the others stand "
-		    "in for them",
-		    counts->blank, lowest(input->blank, counts->blank));
-	warn_of_air(input, sink);
-	warn_of_air_level(input, sink);
-	warn_of_line_integrals(input, sink);
-	warn_of_bytes(input, sink);
 }

@@ -2,10 +2,8 @@
 #define CBCT_CORE_INPUT_H
 
 #include "core/correct/defects.h"
-#include "core/correct/metal.h"
-#include "core/warning.h"
 
-/* What core/recon/recon.c knows of the samples that it was given, and tells of them. Nobody else's. */
+/* What is known of the samples that a reconstruction was given: how they come, and what was seen of them. */
 struct input {
 	struct linearise linearise; /* as given, with the whole map; exchanged where `turned` */
 	bool turned;                /* rows and columns of all images are exchanged on their way in */
@@ -42,12 +40,9 @@ void input_clear(struct input *input);
 
 size_t input_view_bytes(const struct input *input);
 
-/*
- * linearise of one view into a slot. metal, or NULL: is told of samples without counts, which linearise has
- * replaced from their neighbours. Those that lie in a dark shadow have at least the view's largest line integral.
- */
+/* linearise of one view into a slot. *ret_upright: the samples, or their rows and columns exchanged where `turned`. */
 int input_take(struct input *input, const struct backend *backend, struct plan *plan, const void *samples, int view,
-	       int slot, struct stack *to, struct metal *metal, struct error *err);
+	       int slot, struct stack *to, const void **ret_upright, struct error *err);
 
 /*
  * Whether the object goes on beyond the first row, [0], and the last one, [1]: more than a quarter of the views looked
@@ -62,8 +57,5 @@ double input_air_off_share(const struct input *input);
 double input_blank_share(const struct input *input, const struct orbit *orbit);
 /* ERR_IMPOSSIBLE where no view has a good pixel. */
 int input_check(const struct input *input, struct error *err);
-/* "no_dark", "defects", "defect_map", "stuck_pixels", "blank_views", "air_region", "air_level", "line_integrals",
- * "byte_order". */
-void input_warn(const struct input *input, const struct geometry *geometry, const struct warning_sink *sink);
 
 #endif

@@ -1,8 +1,8 @@
 #ifndef CBCT_CORE_RECON_INTERNAL_H
 #define CBCT_CORE_RECON_INTERNAL_H
 
+#include "core/correct/correction.h"
 #include "core/correct/input.h"
-#include "core/correct/metal.h"
 #include "core/fdk.h"
 #include "core/recon/algorithm.h"
 #include "core/warning.h"
@@ -29,9 +29,9 @@ struct recon {
 	struct fdk fdk;            /* where FDK is on */
 	struct stack *projections; /* a slot for each view where they are kept, else for each view of an FDK batch */
 	struct volume *volume;     /* the iterate */
-	struct volume *before;     /* the iterate before the iteration, and for metal to work in; NULL without both */
-	struct stack *batch;       /* for metal to work in; NULL without */
-	struct metal metal;
+	struct volume *before;     /* the iterate before the iteration, and for corrections; NULL without both */
+	struct stack *batch;       /* for corrections to work in; NULL without */
+	struct correction_chain corrections;
 	struct problem problem; /* of the algorithm, where there is one */
 	void *algorithm_state;
 
@@ -52,7 +52,7 @@ struct recon {
  * What the stages cost beside an FDK of the whole scan, roughly, as measured on
  * CPU and GPU alike: only the progress bar lives on it.
  */
-static const double WORK_LOAD = 0.2, WORK_FDK = 1, WORK_TV = 0.2, WORK_METAL = 12;
+static const double WORK_LOAD = 0.2, WORK_FDK = 1, WORK_TV = 0.2;
 
 static inline double iteration_work(const struct recipe *recipe)
 {

@@ -5,15 +5,16 @@
 #include <string.h>
 
 #include "core/recon/algorithm.h"
-#include "core/correct/metal.h"
+#include "core/correct/correction.h"
 #include "core/outofcore/outofcore.h"
 #include "core/recon/internal.h"
-#include "core/correct/exterior_volume.h"
 
-/* An iteration goes over all projections, metal is taken out of them when the last one has come. */
+/* An iteration goes over all projections, and so may a correction that the recipe asks for. */
 bool keeps_projections(const struct recipe *recipe)
 {
-	return recipe->algorithm != NULL || recipe->metal.on;
+	const struct linearise none = {.sample = SAMPLE_FLOAT32};
+
+	return recipe->algorithm != NULL || corrections_need(recipe, &none, NEEDS_ALL_VIEWS);
 }
 
 bool has_subsets(const struct recipe *recipe)
@@ -76,10 +77,11 @@ static int volume_bytes(const struct backend *backend, struct device *device, co
 /* What a job holds beside its plan, the projections and the iterate. */
 struct held {
 	int volumes, stacks; /* stacks of all views */
-	int slots;           /* of the batch that metal works in */
+	int slots;           /* of the stack that corrections work in */
 };
 
-static struct held held_by(const struct recipe *recipe, const struct geometry *geometry)
+static struct held held_by(const struct recipe *recipe, const struct linearise *linearise,
+			   const struct geometry *geometry)
 {
 	const struct algorithm *algorithm = recipe->algorithm;
 
@@ -88,14 +90,14 @@ static struct held held_by(const struct recipe *recipe, const struct geometry *g
 	    .volumes =
 		(keeps_projections(recipe) && !has_subsets(recipe)) + (algorithm != NULL ? algorithm->volumes : 0),
 	    .stacks = algorithm != NULL ? algorithm->stacks : 0,
-	    .slots = recipe->metal.on ? metal_slots(geometry) : 0,
+	    .slots = corrections_slots(recipe, linearise, geometry),
 	};
 }
 
 /* The plan is told of all that lies beside it: FDK's filtered batch, its exterior, and what is held. */
 static int memory_whole(const struct backend *backend, struct device *device, struct plan_options *options,
-			const struct held *held, const struct exterior_volume_bytes *around,
-			struct recon_memory *ret_memory, struct error *err)
+			const struct held *held, const struct correction_bytes *around, struct recon_memory *ret_memory,
+			struct error *err)
 {
 	const struct geometry *geometry = options->geometry;
 	const int columns = geometry->columns, rows = geometry->rows, *pad = options->pad;
@@ -127,11 +129,11 @@ static int memory_whole(const struct backend *backend, struct device *device, st
 
 /* The same out of core: the device holds slabs of one volume at a time, the host all the rest. */
 static struct recon_memory memory_outofcore(const struct plan_options *options, const struct plan_bytes *bytes,
-					    const struct held *held, const struct exterior_volume_bytes *around)
+					    const struct held *held, const struct correction_bytes *around)
 {
 	const struct geometry *geometry = options->geometry;
 	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
-	/* Metal copies a volume that lies in the host's memory. */
+	/* A correction copies a volume that lies in the host's memory. */
 	const int volumes = held->volumes + (held->slots > 0);
 	struct recon_memory memory = {
 	    .volumes = bytes->volumes,
@@ -150,10 +152,10 @@ static int memory_needed(const struct backend *backend, struct device *device, s
 			 const struct recipe *recipe, const struct orbit *orbit, struct recon_memory *ret_memory,
 			 struct error *err)
 {
-	const struct exterior_volume_options exterior = {
-	    .backend = backend, .device = device, .geometry = options->geometry, .orbit = orbit, .grid = &recipe->grid};
-	const struct held held = held_by(recipe, options->geometry);
-	struct exterior_volume_bytes around = {0};
+	const struct correction_ask ask = {
+	    .backend = backend, .device = device, .geometry = options->geometry, .orbit = orbit, .recipe = recipe};
+	const struct held held = held_by(recipe, &options->linearise, options->geometry);
+	struct correction_bytes around = {0};
 	struct recon_memory memory;
 	struct plan_bytes bytes;
 	struct device_info info;
@@ -161,8 +163,8 @@ static int memory_needed(const struct backend *backend, struct device *device, s
 
 	options->beside = options->lends = 0;
 	code = backend->plan_bytes(device, options, &bytes, err);
-	if (code == 0 && recipe->algorithm != NULL)
-		code = exterior_volume_bytes(&exterior, &around, err);
+	if (code == 0)
+		code = corrections_bytes(&ask, &options->linearise, &around, err);
 	if (code == 0 && bytes.host == 0)
 		code = memory_whole(backend, device, options, &held, &around, &memory, err);
 	if (code < 0)

@@ -15,14 +15,12 @@ const char *const stage_names[STAGE_COUNT] = {"load", "fdk", "sart", "tv", "save
 
 /* ---- opening ---- */
 
-static double recipe_work(const struct recipe *recipe)
+static double recipe_work(const struct recipe *recipe, const struct linearise *linearise)
 {
-	double work = WORK_LOAD;
+	double work = WORK_LOAD + corrections_work(recipe, linearise);
 
 	if (recipe->fdk.on)
 		work += WORK_FDK + (recipe->tv.on && recipe->tv.after_fdk ? WORK_TV : 0);
-	if (recipe->metal.on)
-		work += WORK_METAL;
 	if (recipe->algorithm != NULL)
 		work += recipe->iterate.iterations * iteration_work(recipe);
 	return work;
@@ -75,7 +73,7 @@ static int recon_prepare(struct recon *recon, const struct recipe *recipe, struc
 		code = sart_options_make(&recon->sart, &recon->recipe, &recon->orbit, err);
 	if (code < 0)
 		return code;
-	recon->work_total = recipe_work(&recon->recipe);
+	recon->work_total = recipe_work(&recon->recipe, &recon->input.linearise);
 	recon->pushed = calloc((size_t)geometry->count, 1);
 	if (recon->pushed == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for the list of %d views", geometry->count);
@@ -88,6 +86,7 @@ static int recon_allocate(struct recon *recon, struct error *err)
 	const struct recipe *recipe = &recon->recipe;
 	struct plan_options options =
 	    plan_options(recipe, geometry, &recon->input.linearise, &recon->weights, &recon->sart);
+	const int slots = corrections_slots(recipe, &options.linearise, geometry);
 	int code = refuse_what_does_not_fit(recon, &options, err);
 	const struct backend *backend = recon->backend; /* that may have changed it */
 
@@ -105,10 +104,33 @@ static int recon_allocate(struct recon *recon, struct error *err)
 		code = backend->volume_fill(recon->volume, 0, err);
 	if (code == 0 && keeps_projections(recipe))
 		code = backend->volume_new(recon->device, &recipe->grid, &recon->before, err);
-	if (code == 0 && recipe->metal.on)
-		code = backend->stack_new(recon->device, geometry->columns, geometry->rows, metal_slots(geometry),
-					  &recon->batch, err);
+	if (code == 0 && slots > 0)
+		code = backend->stack_new(recon->device, geometry->columns, geometry->rows, slots, &recon->batch, err);
 	return code;
+}
+
+static int open_corrections(struct recon *recon, struct error *err)
+{
+	const struct correction_job job = {
+	    .backend = recon->backend,
+	    .device = recon->device,
+	    .plan = recon->plan,
+	    .geometry = recon->geometry,
+	    .orbit = &recon->orbit,
+	    .recipe = &recon->recipe,
+	    .fdk = &recon->fdk,
+	    .extend = recon->weights.extend,
+	    .projections = recon->projections,
+	    .batch = recon->batch,
+	    .volume = recon->volume,
+	    .work = recon->before,
+	    .input = &recon->input,
+	    .iteration = &recon->iteration,
+	    .warnings = &recon->warnings,
+	    .cancel = &recon->cancel,
+	};
+
+	return corrections_open(&recon->corrections, &job, &recon->input, err);
 }
 
 static int open_algorithm(struct recon *recon, struct error *err)
@@ -156,6 +178,8 @@ int recon_open(const struct backend *backend, struct device *device, const struc
 	if (code == 0)
 		code = recon_allocate(recon, err);
 	if (code == 0)
+		code = open_corrections(recon, err);
+	if (code == 0)
 		code = open_algorithm(recon, err);
 	if (code < 0) {
 		recon_free(recon);
@@ -175,7 +199,7 @@ void recon_free(struct recon *recon)
 	recon->backend->volume_free(recon->volume);
 	recon->backend->stack_free(recon->projections);
 	recon->backend->stack_free(recon->batch);
-	metal_clear(&recon->metal);
+	corrections_close(&recon->corrections);
 	fdk_clear(&recon->fdk);
 	recon->backend->plan_free(recon->plan);
 	subsets_clear(&recon->sart.subsets);
@@ -214,8 +238,7 @@ static int push_view(struct recon *recon, const void *samples, int view, struct 
 	/* Again here: the list of one call may name a view twice. */
 	if (recon->pushed[view])
 		return error_set(err, ERR_CONFLICT, "view %d came a second time", view);
-	code = input_take(&recon->input, recon->backend, recon->plan, samples, view, slot, recon->projections,
-			  recon->recipe.metal.on ? &recon->metal : NULL, err);
+	code = corrections_take(&recon->corrections, samples, view, slot, recon->projections, err);
 	if (code < 0)
 		return code;
 	recon->pushed[view] = 1;
@@ -295,17 +318,16 @@ int recon_resume_state(struct recon *recon, const char *bytes, size_t size, stru
 	return code;
 }
 
-int recon_resume_metal(struct recon *recon, const void *list, size_t bytes, struct error *err)
+int recon_resume_found(struct recon *recon, const void *found, size_t bytes, struct error *err)
 {
-	if (!recon->resumed || !recon->recipe.metal.on)
-		return error_set(err, ERR_INVALID, "a list of metal for a run that has none");
-	return metal_put(&recon->metal, &recon->recipe.grid, list, bytes, err);
+	if (!recon->resumed)
+		return error_set(err, ERR_INVALID, "what corrections found, for a run that begins");
+	return corrections_resume(&recon->corrections, found, bytes, err);
 }
 
-const void *recon_metal(const struct recon *recon, size_t *ret_bytes)
+const void *recon_found(const struct recon *recon, size_t *ret_bytes)
 {
-	*ret_bytes = recon->metal.voxels_count * sizeof(*recon->metal.voxels);
-	return recon->metal.voxels;
+	return corrections_found(&recon->corrections, ret_bytes);
 }
 
 int recon_read(struct recon *recon, int z_first, int z_count, float *ret_slices, struct error *err)

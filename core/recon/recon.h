@@ -107,12 +107,11 @@ int recon_run(struct recon *recon, struct error *err);
 int recon_resume(struct recon *recon, const float *volume, int iteration, struct error *err);
 
 /*
- * The metal that was found, as bytes that belong to the recon; 0 of them where
- * there is none. A run that goes on wants them back, behind recon_resume: its
- * projections are then what they were.
+ * What the corrections found in the FDK volume, the list of metal, as bytes that belong to the recon; 0 of them where
+ * there is nothing. A run that goes on wants them back, behind recon_resume: its projections are then what they were.
  */
-const void *recon_metal(const struct recon *recon, size_t *ret_bytes);
-int recon_resume_metal(struct recon *recon, const void *list, size_t bytes, struct error *err);
+const void *recon_found(const struct recon *recon, size_t *ret_bytes);
+int recon_resume_found(struct recon *recon, const void *found, size_t bytes, struct error *err);
 
 /* Part of a checkpoint goes out: 0 or a negative code. */
 struct checkpoint_sink {

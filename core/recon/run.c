@@ -4,10 +4,8 @@
  */
 #include <math.h>
 #include <stdio.h>
-#include <stdlib.h>
 #include <time.h>
 
-#include "core/correct/exterior.h"
 #include "core/recon/internal.h"
 #include "core/recon/noise.h"
 #include "core/recon/warn.h"
@@ -69,31 +67,9 @@ int recon_resume_noise(struct recon *recon, const struct volume_noise *noise, st
 	return 0;
 }
 
-static struct metal_tools metal_tools(struct recon *recon)
-{
-	return (struct metal_tools){
-	    .backend = recon->backend,
-	    .plan = recon->plan,
-	    .fdk = &recon->fdk,
-	    .projections = recon->projections,
-	    .batch = recon->batch,
-	    .slots = metal_slots(recon->geometry),
-	    .volume = recon->before,
-	    .geometry = recon->geometry,
-	    .grid = &recon->recipe.grid,
-	    .mu_water = recon->recipe.mu_water,
-	    .blank = recon->input.blank,
-	    .blanks = recon->input.counts.blank,
-	    .pixel = fmax(recon->orbit.pixel_at_isocentre[0], recon->orbit.pixel_at_isocentre[1]),
-	    .cancel = &recon->cancel,
-	};
-}
-
-/* What is kept shows the metal; what is worked on does not. */
+/* A volume is kept with what corrections show in it, the metal; the iterate is worked on without. */
 static int keep(struct recon *recon, const char *name, const char *stage, struct error *err)
 {
-	const struct metal_tools tools = metal_tools(recon);
-	int code;
 	struct kept_volume kept = {
 	    .name = name,
 	    .stage = stage,
@@ -101,21 +77,17 @@ static int keep(struct recon *recon, const char *name, const char *stage, struct
 	    .grid = &recon->recipe.grid,
 	    .norms = recon->norms,
 	};
+	int code;
 
 	if (recon->hooks->keep == NULL)
 		return 0;
 	recon_tell_progress(recon, STAGE_SAVE, recon->iteration);
-	if (recon->metal.voxels_count == 0)
-		return recon->hooks->keep(recon->hooks->context, recon, &kept, err);
-	kept.estimate_mm = METAL_ESTIMATE_MM;
-	code = metal_show(&recon->metal, &tools, recon->volume, err);
-	if (code == 0)
+	code = corrections_show(&recon->corrections, &kept.estimate_mm, err);
+	if (code == 0 && kept.estimate_mm > 0)
 		code = measure(recon, NULL, &kept.norms, err);
 	if (code == 0)
 		code = recon->hooks->keep(recon->hooks->context, recon, &kept, err);
-	if (code < 0)
-		return code;
-	return metal_hide(&recon->metal, &tools, recon->volume, err);
+	return code < 0 ? code : corrections_hide(&recon->corrections, err);
 }
 
 /* ---- the run ---- */
@@ -152,119 +124,13 @@ static int run_tv(struct recon *recon, int iteration, struct error *err)
 	return recon->backend->tv(recon->plan, recon->volume, &tv, &recon->cancel, err);
 }
 
-/* Rows whose ends the tube alone keeps from 0 are extended as well, which does no harm, and are none cut off. */
-static void warn_of_extended_rows(const struct recon *recon, const size_t extended[2], int extend)
+/* The corrections of this time, and the norms of the volume where they have changed it. */
+static int correct(struct recon *recon, enum correction_time time, struct error *err)
 {
-	const double all = (double)recon->geometry->count * recon->geometry->rows;
-	const size_t off = (size_t)(input_air_off_share(&recon->input) * all);
-	size_t rows[2];
+	bool changed;
+	int code = corrections_apply(&recon->corrections, time, &changed, err);
 
-	for (int side = 0; side < 2; side++)
-		rows[side] = extended[side] > off ? extended[side] - off : 0;
-	warn_truncated(&recon->warnings, recon->geometry, recon->input.turned, rows, extend);
-}
-
-/* Known once all views are filtered. */
-static int warn_of_truncation(struct recon *recon, struct error *err)
-{
-	size_t rows[2];
-	int code = recon->backend->filter_extended(recon->plan, rows, err);
-
-	if (code == 0)
-		warn_of_extended_rows(recon, rows, recon->weights.extend);
-	return code;
-}
-
-/* The others stand in for blank views in equal shares. */
-static double blank_factor(const struct recon *recon)
-{
-	return 1 / (1 - input_blank_share(&recon->input, &recon->orbit));
-}
-
-/* What is missing where views were blank. */
-static int make_up_for_blank_views(struct recon *recon, struct error *err)
-{
-	const size_t voxels = grid_voxels(&recon->recipe.grid);
-	const float factor = (float)blank_factor(recon);
-	float *host;
-	int code;
-
-	if (recon->input.counts.blank == 0)
-		return 0;
-	host = malloc(voxels * sizeof(*host));
-	if (host == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for a volume of %zu voxels", voxels);
-	code = recon->backend->volume_download(recon->volume, 0, recon->recipe.grid.size[2], host, err);
-	for (size_t i = 0; code == 0 && i < voxels; i++)
-		host[i] *= factor;
-	if (code == 0)
-		code = recon->backend->volume_upload(recon->volume, host, err);
-	free(host);
-	return code;
-}
-
-/*
- * Rays that say nothing are left out of the iterations: those through metal, and all of a
- * blank view. It comes after all else that is done with the projections.
- */
-static int leave_rays_out(struct recon *recon, struct error *err)
-{
-	const struct metal_tools tools = metal_tools(recon);
-	const size_t pixels = (size_t)recon->geometry->columns * (size_t)recon->geometry->rows;
-	float *nothing = NULL;
-	int code = recon->metal.traces_count > 0 ? metal_leave_out(&recon->metal, &tools, err) : 0;
-
-	if (code < 0 || recon->input.counts.blank == 0)
-		return code;
-	nothing = malloc(pixels * sizeof(*nothing));
-	if (nothing == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for a view");
-	for (size_t i = 0; i < pixels; i++)
-		nothing[i] = RAY_LEFT_OUT;
-	for (int i = 0; i < recon->input.counts.blank && code == 0; i++)
-		code = recon->backend->stack_upload(recon->projections, recon->input.blank[i], 1, nothing, err);
-	free(nothing);
-	return code;
-}
-
-/* Metal's shadows out of the projections, and of the FDK of those and the one before what is better at each place. */
-static int replace_metal(struct recon *recon, const struct metal_tools *tools, struct error *err)
-{
-	struct metal *metal = &recon->metal;
-	struct metal_doubt doubt = {0};
-	int code = metal_find_traces(metal, tools, err);
-
-	if (code == 0)
-		code = metal_doubt_make(&doubt, metal, tools, recon->volume, err);
-	if (code == 0)
-		code = metal_replace(metal, tools, err);
-	if (code == 0)
-		code = metal_fdk(tools, recon->volume, err);
-	if (code == 0)
-		code = make_up_for_blank_views(recon, err);
-	if (code == 0)
-		code = metal_doubt_blend(&doubt, metal, tools, recon->volume, err);
-	if (code == 0)
-		code = measure(recon, NULL, &recon->norms, err);
-	metal_doubt_clear(&doubt);
-	return code;
-}
-
-/* The metal of the FDK volume out of the projections, and the FDK of those. */
-static int take_metal_out(struct recon *recon, struct error *err)
-{
-	const struct metal_tools tools = metal_tools(recon);
-	const double threshold = recon->recipe.mu_water * (1 + recon->recipe.metal.threshold_hu / 1000);
-	struct metal *metal = &recon->metal;
-	int code = metal_find(metal, &tools, recon->volume, threshold, err);
-
-	if (code == 0 && metal->voxels_count > 0)
-		code = replace_metal(recon, &tools, err);
-	if (code < 0)
-		return code;
-	recon->work_done += WORK_METAL;
-	warn_metal(&recon->warnings, recon->geometry, &recon->recipe, metal);
-	return 0;
+	return code == 0 && changed ? measure(recon, NULL, &recon->norms, err) : code;
 }
 
 /* The FDK volume and what is made of it before the first iteration. */
@@ -274,17 +140,14 @@ static int finish_fdk(struct recon *recon, struct error *err)
 	int code = fdk_flush(&recon->fdk, recon->projections, recon->volume, err);
 
 	if (code == 0)
-		code = warn_of_truncation(recon, err);
-	if (code == 0)
-		code = make_up_for_blank_views(recon, err);
-	if (code == 0)
 		code = measure(recon, NULL, &recon->norms, err);
 	if (code == 0 && recon->norms.not_finite > 0)
 		code = error_set(err, ERR_IMPOSSIBLE,
 				 "%zu voxels of the FDK volume are not finite: the projections' values are too large",
 				 recon->norms.not_finite);
-	if (code == 0 && recipe->metal.on)
-		code = take_metal_out(recon, err);
+	if (code == 0)
+		code = correct(recon, CORRECT_AFTER_FDK, err);
+	recon->work_done += corrections_work(recipe, &recon->input.linearise);
 	if (code == 0 && is_wanted(recipe, EMIT_FDK))
 		code = keep(recon, "fdk", "fdk", err);
 	if (code == 0 && recipe->tv.on)
@@ -305,17 +168,15 @@ static int finish_fdk(struct recon *recon, struct error *err)
 	return code;
 }
 
-/* Where a run goes on, what its projections were before. */
-static int take_metal_out_again(struct recon *recon, struct error *err)
+/* Where a run goes on, the projections become what they were. */
+static int correct_again(struct recon *recon, struct error *err)
 {
-	const struct metal_tools tools = metal_tools(recon);
-	int code;
+	size_t found;
 
-	if (recon->metal.voxels_count == 0)
-		return 0;
-	recon_tell_progress(recon, STAGE_LOAD, recon->iteration);
-	code = metal_find_traces(&recon->metal, &tools, err);
-	return code < 0 ? code : metal_replace(&recon->metal, &tools, err);
+	recon_found(recon, &found);
+	if (found > 0)
+		recon_tell_progress(recon, STAGE_LOAD, recon->iteration);
+	return correct(recon, CORRECT_RESUMED, err);
 }
 
 static double now(void)
@@ -354,114 +215,6 @@ static int iterate(struct recon *recon, struct history_row *ret_row, struct erro
 	return 0;
 }
 
-/* FDK of a short arc is too low in many places; real sweeps lack some degrees, and that is at the rim. */
-static bool fdk_is_sound(const struct orbit *orbit)
-{
-	const double little = 0.2, covered = orbit->arc - orbit->holes;
-
-	return (!orbit->arc_too_short || covered > M_PI + orbit->fan - little) && orbit->tilt < little;
-}
-
-/* The steps of exterior.h, which change the projections; *ret_rows are those concerned. */
-static int subtract_the_exterior(struct recon *recon, const struct exterior_volume_options *options,
-				 const struct exterior_rows *seen, struct exterior_volume *exterior,
-				 struct exterior_rows *ret_rows, struct error *err)
-{
-	struct exterior_rows rows = {0};
-	int steps = EXTERIOR_OUTSIDE | (recon->recipe.fdk.extend ? EXTERIOR_BEYOND : 0), code = 0;
-
-	if (exterior->goes_on && seen->truncated > 0 && !options->poor) {
-		code = exterior_subtract(exterior, options, EXTERIOR_BEYOND, recon->before, &rows, err);
-		steps = EXTERIOR_OUTSIDE;
-	}
-	if (code == 0 && exterior->goes_on)
-		code = exterior_volume_fit(exterior, options, err);
-	/* What was only possible is left alone where the fit does not find it. */
-	if (code == 0 && seen->possible && seen->truncated == 0 &&
-	    !(exterior->goes_on && exterior_volume_has_outside(exterior, options->grid)))
-		steps = 0;
-	if (code < 0 || steps == 0) {
-		*ret_rows = rows;
-		return code;
-	}
-	if (code == 0)
-		code = exterior_subtract(exterior, options, steps, recon->before, &rows, err);
-	/* Iterations without FDK start from zero. */
-	if (code == 0 && exterior->goes_on && recon->recipe.fdk.on && recon->iteration == 0)
-		code = exterior_start(exterior, options, recon->before, recon->volume, err);
-	if (code == 0)
-		*ret_rows = rows;
-	return code;
-}
-
-/*
- * What lies outside of the grid is taken out of the projections before an iteration sees
- * them. It is found from them alone, so that a run that goes on from an iterate
- * gives the same bits; `before` is worked in, which the first iteration writes
- * anyway.
- */
-static int leave_out_the_exterior(struct recon *recon, struct error *err)
-{
-	const bool sound = fdk_is_sound(&recon->orbit), fdk = recon->recipe.fdk.on;
-	struct exterior_volume_options options = {
-	    .backend = recon->backend,
-	    .device = recon->device,
-	    .geometry = recon->geometry,
-	    .orbit = &recon->orbit,
-	    .grid = &recon->recipe.grid,
-	    .plan = recon->plan,
-	    .projections = recon->projections,
-	    .factor = blank_factor(recon),
-	    .blank = recon->input.blank,
-	    .blanks = recon->input.counts.blank,
-	    .poor = !sound,
-	    .cancel = &recon->cancel,
-	};
-	struct exterior_volume exterior = {0};
-	struct exterior_rows seen, rows = {0};
-	int code = exterior_look(&options, &seen, err);
-
-	/* Rows that are cut off may be wanted as they are; what lies outside of the grid is another matter. */
-	if (!recon->recipe.fdk.extend)
-		seen.truncated = 0;
-	if (code < 0 || (seen.truncated + seen.outside == 0 && !seen.possible))
-		return code;
-	if (!sound && !fdk && seen.truncated > 0)
-		warn_exterior_stays(&recon->warnings);
-	if (!sound && !fdk && seen.outside == 0 && !seen.possible)
-		return 0;
-	/* An object may end inside of the grid: FDK's blur beyond its faces is none of the object. */
-	options.inside_only = seen.outside == 0 && !seen.possible;
-	code = exterior_volume_make(&exterior, &options, err);
-	if (code == 0)
-		code = subtract_the_exterior(recon, &options, &seen, &exterior, &rows, err);
-	if (code == 0 && !fdk && sound && recon->recipe.fdk.extend)
-		warn_of_extended_rows(recon, exterior.truncated, recon->geometry->columns);
-	if (code == 0)
-		warn_outside(&recon->warnings, recon->geometry, recon->input.turned, rows.outside);
-	exterior_volume_clear(&exterior);
-	return code;
-}
-
-/* Slices of the grid's ends that lack views, where the object is there. */
-static int warn_of_unseen_slices(const struct recon *recon, struct error *err)
-{
-	const struct geometry *geometry = recon->geometry;
-	const bool downwards = vec_dot(geometry->views[0].row_step, recon->orbit.frame[2]) < 0;
-	bool ends[2];
-	int slices[2] = {0}, code = 0;
-
-	input_goes_on(&recon->input, ends);
-	if (geometry->rows > 1 && (ends[0] || ends[1]))
-		code = orbit_unseen_slices(&recon->orbit, geometry, &recon->recipe.grid, slices, err);
-	for (int end = 0; end < 2; end++)
-		if (!ends[downwards ? 1 - end : end])
-			slices[end] = 0;
-	if (code == 0)
-		warn_unseen_slices(&recon->warnings, &recon->recipe.grid, slices);
-	return code;
-}
-
 static bool is_last(const struct recipe *recipe, const struct history_row *row)
 {
 	return row->iteration >= recipe->iterate.iterations ||
@@ -472,11 +225,9 @@ static bool is_last(const struct recipe *recipe, const struct history_row *row)
 static int run_iterations(struct recon *recon, struct error *err)
 {
 	const struct recon_hooks *hooks = recon->hooks;
-	bool last = recon->iteration >= recon->recipe.iterate.iterations;
-	int failed = last ? 0 : leave_out_the_exterior(recon, err);
+	bool last = recon->iteration >= recon->recipe.iterate.iterations, changed;
+	int failed = last ? 0 : corrections_apply(&recon->corrections, CORRECT_BEFORE_ITERATING, &changed, err);
 
-	if (failed == 0 && !last)
-		failed = leave_rays_out(recon, err);
 	if (failed < 0)
 		return failed;
 
@@ -535,13 +286,12 @@ int recon_run(struct recon *recon, struct error *err)
 	recon->ran = true;
 	if (!recon->resumed) {
 		warn_recipe(&recon->warnings, recon->geometry, recipe);
-		input_warn(&recon->input, recon->geometry, &recon->warnings);
-		code = warn_of_unseen_slices(recon, err);
+		code = corrections_warn(&recon->corrections, err);
 	}
 	if (code == 0)
 		code = cancel_check(&recon->cancel, err);
 	if (code == 0 && recon->resumed)
-		code = take_metal_out_again(recon, err);
+		code = correct_again(recon, err);
 	if (code == 0)
 		code = recon_runs_fdk(recon) ? finish_fdk(recon, err) : measure(recon, NULL, &recon->norms, err);
 	if (code == 0 && recipe->algorithm != NULL)

@@ -97,17 +97,6 @@ void warn_recipe(const struct warning_sink *sink, const struct geometry *geometr
 			     "TV was wanted after SART iterations, and there are none: the FDK volume is left alone");
 }
 
-void warn_unseen_slices(const struct warning_sink *sink, const struct grid *grid, const int slices[2])
-{
-	if (slices[0] + slices[1] == 0)
-		return;
-	warning_tell(
-	    sink, "slices_unseen",
-	    "the object goes on beyond the detector's rows, and the first %d and the last %d of %d slices are not "
-	    "seen by all views: FDK's values there are too low, and SART's are estimates from the other views",
-	    slices[0], slices[1], grid->size[2]);
-}
-
 void warn_residual(const struct warning_sink *sink, const struct history_row *row)
 {
 	const double implausible = 0.5;
@@ -120,53 +109,6 @@ void warn_residual(const struct warning_sink *sink, const struct history_row *ro
 	    "after %d iterations the volume still leaves %.3g of the projections unexplained (residual): geometry, "
 	    "grid or projections do not fit each other, or far more iterations are needed",
 	    row->iteration, row->residual);
-}
-
-/* What FDK calls rows, and the sides of a detector, are named as they came. */
-static const char *row_of(bool turned)
-{
-	return turned ? "column" : "row";
-}
-
-void warn_truncated(const struct warning_sink *sink, const struct geometry *geometry, bool turned, const size_t rows[2],
-		    int extend)
-{
-	/* What noise does by chance: 1.7 % with 100 photons in air. */
-	const double few = 0.02;
-	/* The largest errors in the middle and at the rim of any object of tests/bench/results/truncation.txt. */
-	const double middle = 35, rim = 110;
-	const char *const row = row_of(turned), *const column = row_of(!turned);
-	const double all = (double)geometry->count * geometry->rows;
-	const double share = fmin(1, fmax((double)rows[0], (double)rows[1]) / all);
-
-	if ((double)rows[0] < few * all && (double)rows[1] < few * all)
-		return;
-	warning_tell(
-	    sink, "truncated",
-	    "the object reaches beyond the detector: %.3g %% of the %ss are cut off at the first %s and %.3g %% "
-	    "at the last; FDK extended them by up to %d %ss. All of the field of view is uncertain by that, by up to "
-	    "%.0f HU in its middle and %.0f HU at its rim",
-	    100 * (double)rows[0] / all, row, column, 100 * (double)rows[1] / all, extend, column,
-	    fmax(5, share * middle), fmax(10, share * rim));
-}
-
-void warn_outside(const struct warning_sink *sink, const struct geometry *geometry, bool turned, size_t rows)
-{
-	if (rows == 0)
-		return;
-	warning_tell(
-	    sink, "outside_grid",
-	    "the object goes on outside of the grid: what the projections show of that was taken out of %.3g %% of the "
-	    "%ss for SART",
-	    100 * (double)rows / ((double)geometry->count * geometry->rows), row_of(turned));
-}
-
-void warn_exterior_stays(const struct warning_sink *sink)
-{
-	warning_tell(
-	    sink, "truncated",
-	    "the object reaches beyond the detector, and FDK of this orbit is too poor to take that out of the "
-	    "projections: SART piles it up in the grid");
 }
 
 void warn_tv(const struct warning_sink *sink, const struct recipe *recipe, const struct volume_noise *noise,
@@ -185,24 +127,4 @@ void warn_tv(const struct warning_sink *sink, const struct recipe *recipe, const
 	    "TV with these settings moves a voxel by about %.3g HU, the noise is %.3g HU: it wants %.3g HU, which "
 	    "\"alpha\": \"auto\" finds",
 	    reach / hu, noise->sigma / hu, needed / hu);
-}
-
-void warn_metal(const struct warning_sink *sink, const struct geometry *geometry, const struct recipe *recipe,
-		const struct metal *metal)
-{
-	const double samples = (double)geometry->count * (double)geometry->columns * (double)geometry->rows;
-
-	if (metal->voxels_count == 0) {
-		warning_tell(sink, "no_metal", "nothing in the FDK volume has %g HU or more: no metal was taken out",
-			     recipe->metal.threshold_hu);
-		return;
-	}
-	warning_tell(
-	    sink, "metal",
-	    "%zu voxels (%.3g %%) are metal: of %g HU or more, or at least half of that beside them; %zu samples (%.3g "
-	    "%%) "
-	    "in %d projections were replaced from what lies beside them, and are left out of SART: values within "
-	    "%d mm of metal are estimates",
-	    metal->found, 100 * (double)metal->found / (double)grid_voxels(&recipe->grid), recipe->metal.threshold_hu,
-	    metal->replaced, 100 * (double)metal->replaced / samples, metal->views, METAL_ESTIMATE_MM);
 }

@@ -227,7 +227,7 @@ void scene_run(const struct scene *scene, const struct recipe *recipe, struct ou
 		    recon_resume_state(recon, outcome->resume_state, outcome->resume_state_bytes, &outcome->err);
 	if (outcome->code == 0 && outcome->resume_metal_bytes > 0)
 		outcome->code =
-		    recon_resume_metal(recon, outcome->resume_metal, outcome->resume_metal_bytes, &outcome->err);
+		    recon_resume_found(recon, outcome->resume_metal, outcome->resume_metal_bytes, &outcome->err);
 	if (outcome->code == 0 && outcome->resume_noise != NULL)
 		outcome->code = recon_resume_noise(recon, outcome->resume_noise, &outcome->err);
 	if (outcome->code == 0)
@@ -240,7 +240,7 @@ void scene_run(const struct scene *scene, const struct recipe *recipe, struct ou
 	if (outcome->code == 0 || outcome->code == ERR_BUSY)
 		ck_assert_int_eq(recon_save_state(recon, &(struct checkpoint_sink){outcome, on_state}, &state_err), 0);
 	outcome->noise = recon_noise(recon) != NULL ? *recon_noise(recon) : (struct volume_noise){-1, -1};
-	metal = recon_metal(recon, &outcome->metal_bytes);
+	metal = recon_found(recon, &outcome->metal_bytes);
 	outcome->metal = malloc(outcome->metal_bytes + 1);
 	ck_assert_ptr_nonnull(outcome->metal);
 	if (outcome->metal_bytes > 0)

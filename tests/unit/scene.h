@@ -69,7 +69,7 @@ struct outcome {
 	float *last; /* the iterate as it was at the end, kept or not */
 	char *state; /* what recon_save_state gave then */
 	size_t state_bytes;
-	void *metal; /* what recon_metal gave then */
+	void *metal; /* what recon_found gave then */
 	size_t metal_bytes;
 	struct volume_noise noise; /* what recon_noise gave then; -1 where that was nothing */
 	int told_noise;            /* calls of the hook, */

@@ -1,0 +1,194 @@
+/* The table of corrections, and what goes over it: see correction.h. */
+#include "core/correct/correction.h"
+
+#include <string.h>
+
+#include "core/correct/input.h"
+
+extern const struct correction correction_flat_dark, correction_air_region, correction_hardening, correction_defects,
+    correction_samples, correction_truncation, correction_exterior, correction_blank_views, correction_metal;
+
+/*
+ * In the order in which they run. Defects of the map are known before an air region's mean is taken, and hardening is
+ * that of line integrals. The exterior goes before what leaves rays out, which it could not see through. Blank views
+ * are made up for before metal is looked for.
+ */
+const struct correction *const corrections[CORRECTION_COUNT] = {
+    &correction_flat_dark,  &correction_defects,  &correction_air_region,  &correction_hardening, &correction_samples,
+    &correction_truncation, &correction_exterior, &correction_blank_views, &correction_metal,
+};
+
+static bool is_wanted(const struct correction *row, const struct recipe *recipe, const struct linearise *linearise)
+{
+	return row->wanted == NULL || row->wanted(recipe, linearise);
+}
+
+static bool chain_has(const struct correction_chain *chain, int i)
+{
+	return is_wanted(corrections[i], chain->job.recipe, &chain->input->linearise);
+}
+
+bool corrections_need(const struct recipe *recipe, const struct linearise *linearise, unsigned int needs)
+{
+	for (int i = 0; i < CORRECTION_COUNT; i++)
+		if ((corrections[i]->needs & needs) != 0 && is_wanted(corrections[i], recipe, linearise))
+			return true;
+	return false;
+}
+
+double corrections_work(const struct recipe *recipe, const struct linearise *linearise)
+{
+	double work = 0;
+
+	for (int i = 0; i < CORRECTION_COUNT; i++)
+		work += is_wanted(corrections[i], recipe, linearise) ? corrections[i]->work : 0;
+	return work;
+}
+
+int corrections_check(const struct linearise *linearise, const struct geometry *geometry, struct error *err)
+{
+	int code = 0;
+
+	for (int i = 0; i < CORRECTION_COUNT && code == 0; i++)
+		if (corrections[i]->check != NULL)
+			code = corrections[i]->check(linearise, geometry, err);
+	return code;
+}
+
+int corrections_slots(const struct recipe *recipe, const struct linearise *linearise, const struct geometry *geometry)
+{
+	int most = 0;
+
+	for (int i = 0; i < CORRECTION_COUNT; i++) {
+		const struct correction *row = corrections[i];
+		const int slots = row->slots != NULL && is_wanted(row, recipe, linearise) ? row->slots(geometry) : 0;
+
+		most = slots > most ? slots : most;
+	}
+	return most;
+}
+
+int corrections_bytes(const struct correction_ask *ask, const struct linearise *linearise,
+		      struct correction_bytes *ret_bytes, struct error *err)
+{
+	struct correction_bytes bytes = {0};
+	int code = 0;
+
+	for (int i = 0; i < CORRECTION_COUNT && code == 0; i++)
+		if (corrections[i]->bytes != NULL && is_wanted(corrections[i], ask->recipe, linearise))
+			code = corrections[i]->bytes(ask, &bytes, err);
+	if (code == 0)
+		*ret_bytes = bytes;
+	return code;
+}
+
+int corrections_open(struct correction_chain *ret_chain, const struct correction_job *job, struct input *input,
+		     struct error *err)
+{
+	int code = 0;
+
+	*ret_chain = (struct correction_chain){.job = *job, .input = input};
+	for (int i = 0; i < CORRECTION_COUNT && code == 0; i++)
+		if (corrections[i]->open != NULL && chain_has(ret_chain, i))
+			code = corrections[i]->open(&ret_chain->job, &ret_chain->state[i], err);
+	if (code < 0)
+		corrections_close(ret_chain);
+	return code;
+}
+
+void corrections_close(struct correction_chain *chain)
+{
+	for (int i = 0; i < CORRECTION_COUNT; i++)
+		if (corrections[i]->close != NULL)
+			corrections[i]->close(chain->state[i]);
+	memset(chain->state, 0, sizeof(chain->state));
+}
+
+int corrections_take(struct correction_chain *chain, const void *samples, int view, int slot, struct stack *to,
+		     struct error *err)
+{
+	const struct defect_counts before = chain->input->counts;
+	struct correction_view taken = {.view = view, .slot = slot, .to = to, .before = &before};
+	int code =
+	    input_take(chain->input, chain->job.backend, chain->job.plan, samples, view, slot, to, &taken.samples, err);
+
+	for (int i = 0; i < CORRECTION_COUNT && code == 0; i++)
+		if (corrections[i]->view != NULL && chain_has(chain, i))
+			code = corrections[i]->view(&chain->job, chain->state[i], &taken, err);
+	return code;
+}
+
+int corrections_apply(struct correction_chain *chain, enum correction_time time, bool *ret_changed, struct error *err)
+{
+	int code = 0;
+
+	*ret_changed = false;
+	for (int i = 0; i < CORRECTION_COUNT && code == 0; i++) {
+		const struct correction *row = corrections[i];
+
+		if ((row->times & 1U << time) != 0 && row->apply != NULL && chain_has(chain, i))
+			code = row->apply(&chain->job, chain->state[i], time, ret_changed, err);
+	}
+	return code;
+}
+
+int corrections_warn(struct correction_chain *chain, struct error *err)
+{
+	int code = 0;
+
+	for (int i = 0; i < CORRECTION_COUNT && code == 0; i++)
+		if (corrections[i]->warn != NULL && chain_has(chain, i))
+			code = corrections[i]->warn(&chain->job, chain->state[i], err);
+	return code;
+}
+
+int corrections_show(struct correction_chain *chain, double *ret_estimate_mm, struct error *err)
+{
+	int code = 0;
+
+	*ret_estimate_mm = 0;
+	for (int i = 0; i < CORRECTION_COUNT && code == 0; i++)
+		if (corrections[i]->show != NULL && chain_has(chain, i))
+			code = corrections[i]->show(&chain->job, chain->state[i], ret_estimate_mm, err);
+	return code;
+}
+
+int corrections_hide(struct correction_chain *chain, struct error *err)
+{
+	int code = 0;
+
+	for (int i = CORRECTION_COUNT - 1; i >= 0 && code == 0; i--)
+		if (corrections[i]->hide != NULL && chain_has(chain, i))
+			code = corrections[i]->hide(&chain->job, chain->state[i], err);
+	return code;
+}
+
+/* The row that keeps what it has found; NULL where the job has none. */
+static const struct correction *finder(const struct correction_chain *chain, int *ret_index)
+{
+	for (int i = 0; i < CORRECTION_COUNT; i++)
+		if (corrections[i]->found != NULL && chain_has(chain, i)) {
+			*ret_index = i;
+			return corrections[i];
+		}
+	return NULL;
+}
+
+const void *corrections_found(const struct correction_chain *chain, size_t *ret_bytes)
+{
+	int index;
+	const struct correction *row = finder(chain, &index);
+
+	*ret_bytes = 0;
+	return row != NULL ? row->found(chain->state[index], ret_bytes) : NULL;
+}
+
+int corrections_resume(struct correction_chain *chain, const void *bytes, size_t size, struct error *err)
+{
+	int index;
+	const struct correction *row = finder(chain, &index);
+
+	if (row == NULL)
+		return error_set(err, ERR_INVALID, "%zu bytes of a correction that the job has not", size);
+	return row->resume(&chain->job, chain->state[index], bytes, size, err);
+}

@@ -1,0 +1,156 @@
+#ifndef CBCT_CORE_CORRECTION_H
+#define CBCT_CORE_CORRECTION_H
+
+#include "core/fdk.h"
+#include "core/recipe.h"
+#include "core/warning.h"
+
+/*
+ * What happens to a scan beside its reconstruction: a chain of corrections, each a row of corrections[], which stand
+ * there in the order in which they run. core/recon goes over the table at five times and knows no correction by name.
+ * One thread at a time.
+ */
+enum correction_time {
+	CORRECT_SAMPLES,          /* each view's raw samples, on their way to line integrals */
+	CORRECT_LINE_INTEGRALS,   /* each view's line integrals, before FDK takes them */
+	CORRECT_AFTER_FDK,        /* the FDK volume, once; where `needs` says so all projections are there */
+	CORRECT_BEFORE_ITERATING, /* all projections, once, before an iteration sees them */
+	/* In place of AFTER_FDK where a run goes on from an iterate: the projections become what they were then. */
+	CORRECT_RESUMED,
+	CORRECTION_TIMES
+};
+
+/* What a correction is given beside the values that it changes, as bits. */
+enum correction_needs {
+	NEEDS_NEIGHBOURS = 1,   /* of a pixel, in its row and column */
+	NEEDS_WHOLE_IMAGES = 2, /* all of a view */
+	NEEDS_ALL_VIEWS = 4,    /* the projections of all views, kept from the first one on, and a volume to work in */
+	NEEDS_VOLUME = 8        /* the FDK volume */
+};
+
+/* A pointwise row may be done by an operation of the backend, together with others. The row checks and warns then. */
+enum correction_fused { FUSED_NOT, FUSED_LINEARISE, FUSED_FILTER };
+
+/* What the corrections of one reconstruction work on; all of it is borrowed, and outlives their states. */
+struct correction_job {
+	const struct backend *backend;
+	struct device *device;
+	struct plan *plan;
+	const struct geometry *geometry; /* upright, see struct input.turned */
+	const struct orbit *orbit;
+	const struct recipe *recipe; /* resolved */
+	struct fdk *fdk;             /* nothing pending; where FDK is on */
+	int extend;                  /* columns by which FDK extends truncated rows, plan_options.extend */
+	struct stack *projections;   /* a slot for each view where a row needs all views */
+	struct stack *batch;         /* of corrections_slots slots, to work in */
+	struct volume *volume;       /* FDK's, then the iterate */
+	struct volume *work;         /* on the recipe's grid, to work in */
+	const struct input *input;   /* what was seen of the samples so far (core/correct/input.h) */
+	const int *iteration;        /* iterations that are done */
+	const struct warning_sink *warnings;
+	const struct cancel *cancel;
+};
+
+/* A view on its way in. */
+struct correction_view {
+	const void *samples; /* [row][column], upright */
+	int view, slot;
+	struct stack *to;                   /* has its line integrals in `slot` */
+	const struct defect_counts *before; /* what linearise had counted before this view */
+};
+
+/* What corrections hold beside the job's plan, projections, volumes and their stack to work in; the sum of the rows'.
+ */
+struct correction_bytes {
+	size_t device;   /* beside `borrowed` */
+	size_t borrowed; /* of the job's plan's block (plan_options.lends) */
+	size_t host;     /* out of core (core/outofcore/outofcore.h) */
+};
+/* The job before anything is open; the recipe is resolved. */
+struct correction_ask {
+	const struct backend *backend;
+	struct device *device;
+	const struct geometry *geometry;
+	const struct orbit *orbit;
+	const struct recipe *recipe;
+};
+
+struct correction {
+	const char *name;    /* "metal" */
+	const char *summary; /* for documentation */
+	unsigned int times;  /* bits 1 << enum correction_time */
+	unsigned int needs;  /* of enum correction_needs */
+	enum correction_fused fused;
+	double work; /* in FDKs of the whole scan: for the progress bar */
+
+	/* Whether the job has it; NULL: every job. */
+	bool (*wanted)(const struct recipe *recipe, const struct linearise *linearise);
+	/* Refuses what cannot be, before anything is taken; the geometry is upright, and so is linearise. */
+	int (*check)(const struct linearise *linearise, const struct geometry *geometry, struct error *err);
+	/* Slots of the stack that it works in; NULL: none. */
+	int (*slots)(const struct geometry *geometry);
+	/* Adds to *bytes what it holds. NULL: nothing. */
+	int (*bytes)(const struct correction_ask *ask, struct correction_bytes *bytes, struct error *err);
+	/* *ret_state may stay NULL. */
+	int (*open)(const struct correction_job *job, void **ret_state, struct error *err);
+	void (*close)(void *state); /* NULL is fine */
+
+	/* At SAMPLES and LINE_INTEGRALS. The slot has the view's line integrals already. */
+	int (*view)(const struct correction_job *job, void *state, const struct correction_view *view,
+		    struct error *err);
+	/* At the other times. *ret_changed: the volume is another one now. */
+	int (*apply)(const struct correction_job *job, void *state, enum correction_time time, bool *ret_changed,
+		     struct error *err);
+	/* Once, when all views have come, and not where a run goes on: what has to be said of them. */
+	int (*warn)(const struct correction_job *job, void *state, struct error *err);
+
+	/*
+	 * What is shown in a volume that is kept, and not worked on. *ret_estimate_mm: what is nearer to it is an
+	 * estimate; 0: there is nothing to show, and the volume is as it was. `hide` gives the same bits as before.
+	 */
+	int (*show)(const struct correction_job *job, void *state, double *ret_estimate_mm, struct error *err);
+	int (*hide)(const struct correction_job *job, void *state, struct error *err);
+	/* What was found AFTER_FDK, bytes of the state's own, which a run that goes on gets back. One row has any. */
+	const void *(*found)(const void *state, size_t *ret_bytes);
+	int (*resume)(const struct correction_job *job, void *state, const void *bytes, size_t size, struct error *err);
+};
+
+enum { CORRECTION_COUNT = 9 };
+extern const struct correction *const corrections[CORRECTION_COUNT];
+
+/* The corrections of one reconstruction. */
+struct correction_chain {
+	struct correction_job job;
+	struct input *input;
+	const struct linearise *linearise;
+	void *state[CORRECTION_COUNT];
+};
+
+/* ---- going over the table ---- */
+
+bool corrections_need(const struct recipe *recipe, const struct linearise *linearise, unsigned int needs);
+double corrections_work(const struct recipe *recipe, const struct linearise *linearise);
+int corrections_check(const struct linearise *linearise, const struct geometry *geometry, struct error *err);
+/* Slots of the one stack that they work in in turn. */
+int corrections_slots(const struct recipe *recipe, const struct linearise *linearise, const struct geometry *geometry);
+int corrections_bytes(const struct correction_ask *ask, const struct linearise *linearise,
+		      struct correction_bytes *ret_bytes, struct error *err);
+
+/* Opens the rows that the job wants. `input` is the job's too, open, and is written while views come in. */
+int corrections_open(struct correction_chain *ret_chain, const struct correction_job *job, struct input *input,
+		     struct error *err);
+void corrections_close(struct correction_chain *chain);
+
+/* Linearises a view, in rows and columns as it came, into a slot, and corrects it. */
+int corrections_take(struct correction_chain *chain, const void *samples, int view, int slot, struct stack *to,
+		     struct error *err);
+/* Not of a view; *ret_changed: the volume is another one now. */
+int corrections_apply(struct correction_chain *chain, enum correction_time time, bool *ret_changed, struct error *err);
+int corrections_warn(struct correction_chain *chain, struct error *err);
+int corrections_show(struct correction_chain *chain, double *ret_estimate_mm, struct error *err);
+int corrections_hide(struct correction_chain *chain, struct error *err);
+const void *corrections_found(const struct correction_chain *chain, size_t *ret_bytes);
+/* ERR_INVALID where the job has no correction that finds anything. */
+int corrections_resume(struct correction_chain *chain, const void *bytes, size_t size, struct error *err);
+
+#endif

@@ -1,0 +1,147 @@
+/* What lies outside of the grid, as a correction: see exterior.h. */
+#include <math.h>
+
+#include "core/correct/blank.h"
+#include "core/correct/exterior.h"
+#include "core/correct/input.h"
+#include "core/correct/truncated.h"
+
+/* FDK of a short arc is too low in many places; real sweeps lack some degrees, and that is at the rim. */
+static bool fdk_is_sound(const struct orbit *orbit)
+{
+	const double little = 0.2, covered = orbit->arc - orbit->holes;
+
+	return (!orbit->arc_too_short || covered > M_PI + orbit->fan - little) && orbit->tilt < little;
+}
+
+static bool wanted(const struct recipe *recipe, const struct linearise *linearise)
+{
+	(void)linearise;
+	return recipe->algorithm != NULL;
+}
+
+static int bytes_of(const struct correction_ask *ask, struct correction_bytes *bytes, struct error *err)
+{
+	const struct exterior_volume_options options = {.backend = ask->backend,
+							.device = ask->device,
+							.geometry = ask->geometry,
+							.orbit = ask->orbit,
+							.grid = &ask->recipe->grid};
+	struct exterior_volume_bytes own;
+	int code = exterior_volume_bytes(&options, &own, err);
+
+	if (code < 0)
+		return code;
+	bytes->device += own.device;
+	bytes->borrowed += own.borrowed;
+	bytes->host += own.host;
+	return 0;
+}
+
+/* The steps of exterior.h, which change the projections; *ret_rows are those concerned. */
+static int subtract(const struct correction_job *job, const struct exterior_volume_options *options,
+		    const struct exterior_rows *seen, struct exterior_volume *exterior, struct exterior_rows *ret_rows,
+		    struct error *err)
+{
+	const struct recipe *recipe = job->recipe;
+	struct exterior_rows rows = {0};
+	int steps = EXTERIOR_OUTSIDE | (recipe->fdk.extend ? EXTERIOR_BEYOND : 0), code = 0;
+
+	if (exterior->goes_on && seen->truncated > 0 && !options->poor) {
+		code = exterior_subtract(exterior, options, EXTERIOR_BEYOND, job->work, &rows, err);
+		steps = EXTERIOR_OUTSIDE;
+	}
+	if (code == 0 && exterior->goes_on)
+		code = exterior_volume_fit(exterior, options, err);
+	/* What was only possible is left alone where the fit does not find it. */
+	if (code == 0 && seen->possible && seen->truncated == 0 &&
+	    !(exterior->goes_on && exterior_volume_has_outside(exterior, options->grid)))
+		steps = 0;
+	if (code < 0 || steps == 0) {
+		*ret_rows = rows;
+		return code;
+	}
+	code = exterior_subtract(exterior, options, steps, job->work, &rows, err);
+	/* Iterations without FDK start from zero. */
+	if (code == 0 && exterior->goes_on && recipe->fdk.on && *job->iteration == 0)
+		code = exterior_start(exterior, options, job->work, job->volume, err);
+	if (code == 0)
+		*ret_rows = rows;
+	return code;
+}
+
+static void warn_of_outside(const struct correction_job *job, size_t rows)
+{
+	const double all = (double)job->geometry->count * job->geometry->rows;
+
+	if (rows > 0)
+		warning_tell(
+		    job->warnings, "outside_grid",
+		    "the object goes on outside of the grid: what the projections show of that was taken out of %.3g "
+		    "%% of the %ss for SART",
+		    100 * (double)rows / all, truncated_row_name(job));
+}
+
+/*
+ * The exterior is found from the projections alone, so that a run that goes on from an iterate gives the same bits.
+ * `work` holds the iterate before the iteration, which the first iteration writes anyway.
+ */
+static int apply(const struct correction_job *job, void *state, enum correction_time time, bool *ret_changed,
+		 struct error *err)
+{
+	const bool sound = fdk_is_sound(job->orbit), fdk = job->recipe->fdk.on;
+	struct exterior_volume_options options = {
+	    .backend = job->backend,
+	    .device = job->device,
+	    .geometry = job->geometry,
+	    .orbit = job->orbit,
+	    .grid = &job->recipe->grid,
+	    .plan = job->plan,
+	    .projections = job->projections,
+	    .factor = blank_factor(job),
+	    .blank = job->input->blank,
+	    .blanks = job->input->counts.blank,
+	    .poor = !sound,
+	    .cancel = job->cancel,
+	};
+	struct exterior_volume exterior = {0};
+	struct exterior_rows seen, rows = {0};
+	int code = exterior_look(&options, &seen, err);
+
+	(void)state;
+	(void)time;
+	(void)ret_changed;
+	/* Rows that are cut off may be wanted as they are; what lies outside of the grid is another matter. */
+	if (!job->recipe->fdk.extend)
+		seen.truncated = 0;
+	if (code < 0 || (seen.truncated + seen.outside == 0 && !seen.possible))
+		return code;
+	if (!sound && !fdk && seen.truncated > 0)
+		warning_tell(job->warnings, "truncated",
+			     "the object reaches beyond the detector, and FDK of this orbit is too poor to take that "
+			     "out of the projections: SART piles it up in the grid");
+	if (!sound && !fdk && seen.outside == 0 && !seen.possible)
+		return 0;
+	/* An object may end inside of the grid: FDK's blur beyond its faces is none of the object. */
+	options.inside_only = seen.outside == 0 && !seen.possible;
+	code = exterior_volume_make(&exterior, &options, err);
+	if (code == 0)
+		code = subtract(job, &options, &seen, &exterior, &rows, err);
+	if (code == 0 && !fdk && sound && job->recipe->fdk.extend)
+		truncated_warn(job, exterior.truncated, job->geometry->columns);
+	if (code == 0)
+		warn_of_outside(job, rows.outside);
+	exterior_volume_clear(&exterior);
+	return code;
+}
+
+extern const struct correction correction_exterior;
+const struct correction correction_exterior = {
+    .name = "exterior",
+    .summary = "what lies outside of the grid is taken out of the projections before an iteration sees them",
+    .times = 1U << CORRECT_BEFORE_ITERATING,
+    .needs = NEEDS_WHOLE_IMAGES | NEEDS_ALL_VIEWS,
+    .wanted = wanted,
+    .bytes = bytes_of,
+    .apply = apply,
+};

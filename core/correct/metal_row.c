@@ -1,0 +1,264 @@
+/* Metal as a correction: see metal.c. */
+#include <math.h>
+#include <stdlib.h>
+
+#include "core/correct/blank.h"
+#include "core/correct/input.h"
+#include "core/correct/metal.h"
+
+static bool wanted(const struct recipe *recipe, const struct linearise *linearise)
+{
+	(void)linearise;
+	return recipe->metal.on;
+}
+
+static int open_metal(const struct correction_job *job, void **ret_state, struct error *err)
+{
+	(void)job;
+	*ret_state = calloc(1, sizeof(struct metal));
+	return *ret_state != NULL ? 0 : error_set(err, ERR_NO_MEMORY, "no memory for a list of metal");
+}
+
+static void close_metal(void *state)
+{
+	if (state != NULL)
+		metal_clear(state);
+	free(state);
+}
+
+static struct metal_tools tools_of(const struct correction_job *job)
+{
+	return (struct metal_tools){
+	    .backend = job->backend,
+	    .plan = job->plan,
+	    .fdk = job->fdk,
+	    .projections = job->projections,
+	    .batch = job->batch,
+	    .slots = metal_slots(job->geometry),
+	    .volume = job->work,
+	    .geometry = job->geometry,
+	    .grid = &job->recipe->grid,
+	    .mu_water = job->recipe->mu_water,
+	    .blank = job->input->blank,
+	    .blanks = job->input->counts.blank,
+	    .pixel = fmax(job->orbit->pixel_at_isocentre[0], job->orbit->pixel_at_isocentre[1]),
+	    .cancel = job->cancel,
+	};
+}
+
+/* ---- samples without counts ---- */
+
+/* Not above the dark, where the detector could have counted. */
+static bool has_no_counts(const struct input *input, const void *samples, size_t at)
+{
+	const struct linearise *linearise = &input->linearise;
+	const float sample =
+	    linearise->sample == SAMPLE_UINT16 ? ((const uint16_t *)samples)[at] : ((const float *)samples)[at];
+	const float dark = linearise->dark != NULL ? linearise->dark[at] : 0;
+	const float flat = linearise->flat != NULL ? linearise->flat[at] : (float)linearise->air;
+
+	return sample <= dark && isfinite(sample) && flat > dark &&
+	       (linearise->defects == NULL || !linearise->defects[at]);
+}
+
+/* Notes the view's samples without counts; how many there are to *ret_count. */
+static int note_dark(const struct input *input, const void *samples, int columns, int view, struct metal *metal,
+		     size_t *ret_count, struct error *err)
+{
+	const int rows = (int)(input->pixels / (size_t)columns);
+	size_t count = 0;
+	int code = 0;
+
+	for (int row = 0; row < rows && code == 0; row++)
+		for (int first = 0, last; first < columns && code == 0; first = last + 1) {
+			const size_t at = (size_t)row * (size_t)columns;
+
+			last = first;
+			if (!has_no_counts(input, samples, at + (size_t)first))
+				continue;
+			while (last + 1 < columns && has_no_counts(input, samples, at + (size_t)last + 1))
+				last++;
+			count += (size_t)(last - first + 1);
+			code = metal_note_dark(metal, view, row, first, last, err);
+		}
+	*ret_count = count;
+	return code;
+}
+
+/* Of the view's largest line integral: in such a shadow a sample without counts is no dead pixel. */
+static const float SHADOW = 0.5f;
+
+/*
+ * Where a shadow has no counts, its line integrals are above all that was
+ * measured, and linearise has bridged them from the shadow's rim: metal would hardly be found.
+ */
+static int darken(const struct input *input, const struct backend *backend, const void *samples, int slot,
+		  struct stack *to, struct error *err)
+{
+	float *view = malloc(input->pixels * sizeof(float)), largest = 0;
+	int code;
+
+	if (view == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a view");
+	code = backend->stack_download(to, slot, 1, view, err);
+	for (size_t i = 0; i < input->pixels && code == 0; i++)
+		largest = fmaxf(largest, view[i]);
+	for (size_t i = 0; i < input->pixels && code == 0; i++)
+		if (view[i] >= SHADOW * largest && has_no_counts(input, samples, i))
+			view[i] = largest;
+	if (code == 0)
+		code = backend->stack_upload(to, slot, 1, view, err);
+	free(view);
+	return code;
+}
+
+/* Samples without counts are noted: a shadow of metal may have them. */
+static int take_view(const struct correction_job *job, void *state, const struct correction_view *view,
+		     struct error *err)
+{
+	const struct input *input = job->input;
+	size_t dark = 0;
+	int code;
+
+	if (input->linearise.quantity != QUANTITY_INTENSITY || input->counts.zero == view->before->zero ||
+	    input->counts.blank > view->before->blank)
+		return 0;
+	code = note_dark(input, view->samples, job->geometry->columns, view->view, state, &dark, err);
+	return code < 0 || dark == 0 ? code : darken(input, job->backend, view->samples, view->slot, view->to, err);
+}
+
+/* ---- the FDK volume ---- */
+
+/* Metal's shadows out of the projections, and of the FDK of those and the one before what is better at each place. */
+static int replace(const struct correction_job *job, struct metal *metal, bool *ret_changed, struct error *err)
+{
+	const struct metal_tools tools = tools_of(job);
+	struct metal_doubt doubt = {0};
+	int code = metal_find_traces(metal, &tools, err);
+
+	if (code == 0)
+		code = metal_doubt_make(&doubt, metal, &tools, job->volume, err);
+	if (code == 0)
+		code = metal_replace(metal, &tools, err);
+	if (code == 0)
+		code = metal_fdk(&tools, job->volume, err);
+	if (code == 0)
+		code = blank_make_up(job, job->volume, ret_changed, err);
+	if (code == 0)
+		code = metal_doubt_blend(&doubt, metal, &tools, job->volume, err);
+	metal_doubt_clear(&doubt);
+	*ret_changed = true;
+	return code;
+}
+
+static void warn_of_metal(const struct correction_job *job, const struct metal *metal)
+{
+	const struct geometry *geometry = job->geometry;
+	const double samples = (double)geometry->count * (double)geometry->columns * (double)geometry->rows;
+
+	if (metal->voxels_count == 0)
+		warning_tell(job->warnings, "no_metal",
+			     "nothing in the FDK volume has %g HU or more: no metal was taken out",
+			     job->recipe->metal.threshold_hu);
+	else
+		warning_tell(job->warnings, "metal",
+			     "%zu voxels (%.3g %%) are metal: of %g HU or more, or at least half of that beside them; "
+			     "%zu samples (%.3g %%) in %d projections were replaced from what lies beside them, and "
+			     "are left out of SART: values within %d mm of metal are estimates",
+			     metal->found, 100 * (double)metal->found / (double)grid_voxels(&job->recipe->grid),
+			     job->recipe->metal.threshold_hu, metal->replaced, 100 * (double)metal->replaced / samples,
+			     metal->views, METAL_ESTIMATE_MM);
+}
+
+/* The metal of the FDK volume out of the projections, and the FDK of those. */
+static int take_out(const struct correction_job *job, struct metal *metal, bool *ret_changed, struct error *err)
+{
+	const struct metal_tools tools = tools_of(job);
+	const double threshold = job->recipe->mu_water * (1 + job->recipe->metal.threshold_hu / 1000);
+	int code = metal_find(metal, &tools, job->volume, threshold, err);
+
+	if (code == 0 && metal->voxels_count > 0)
+		code = replace(job, metal, ret_changed, err);
+	if (code == 0)
+		warn_of_metal(job, metal);
+	return code;
+}
+
+/* Where a run goes on: the projections become what they were. */
+static int take_out_again(const struct correction_job *job, struct metal *metal, struct error *err)
+{
+	const struct metal_tools tools = tools_of(job);
+	int code;
+
+	if (metal->voxels_count == 0)
+		return 0;
+	code = metal_find_traces(metal, &tools, err);
+	return code < 0 ? code : metal_replace(metal, &tools, err);
+}
+
+static int apply(const struct correction_job *job, void *state, enum correction_time time, bool *ret_changed,
+		 struct error *err)
+{
+	const struct metal_tools tools = tools_of(job);
+	struct metal *metal = state;
+
+	if (time == CORRECT_AFTER_FDK)
+		return take_out(job, metal, ret_changed, err);
+	if (time == CORRECT_RESUMED)
+		return take_out_again(job, metal, err);
+	return metal->traces_count > 0 ? metal_leave_out(metal, &tools, err) : 0;
+}
+
+/* ---- volumes that are kept, runs that go on ---- */
+
+static int show(const struct correction_job *job, void *state, double *ret_estimate_mm, struct error *err)
+{
+	const struct metal_tools tools = tools_of(job);
+	struct metal *metal = state;
+
+	if (metal->voxels_count == 0)
+		return 0;
+	*ret_estimate_mm = METAL_ESTIMATE_MM;
+	return metal_show(metal, &tools, job->volume, err);
+}
+
+static int hide(const struct correction_job *job, void *state, struct error *err)
+{
+	const struct metal_tools tools = tools_of(job);
+	struct metal *metal = state;
+
+	return metal->voxels_count == 0 ? 0 : metal_hide(metal, &tools, job->volume, err);
+}
+
+static const void *found(const void *state, size_t *ret_bytes)
+{
+	const struct metal *metal = state;
+
+	*ret_bytes = metal->voxels_count * sizeof(*metal->voxels);
+	return metal->voxels;
+}
+
+static int resume(const struct correction_job *job, void *state, const void *bytes, size_t size, struct error *err)
+{
+	return metal_put(state, &job->recipe->grid, bytes, size, err);
+}
+
+extern const struct correction correction_metal;
+const struct correction correction_metal = {
+    .name = "metal",
+    .summary = "metal's shadows are replaced by what they would be without, and left out of the iterations",
+    .times =
+	1U << CORRECT_LINE_INTEGRALS | 1U << CORRECT_AFTER_FDK | 1U << CORRECT_BEFORE_ITERATING | 1U << CORRECT_RESUMED,
+    .needs = NEEDS_WHOLE_IMAGES | NEEDS_ALL_VIEWS | NEEDS_VOLUME,
+    .work = 12,
+    .wanted = wanted,
+    .slots = metal_slots,
+    .open = open_metal,
+    .close = close_metal,
+    .view = take_view,
+    .apply = apply,
+    .show = show,
+    .hide = hide,
+    .found = found,
+    .resume = resume,
+};
