@@ -8,6 +8,7 @@
 #include "core/filter.h"
 #include "core/scan/geometry.h"
 #include "core/scan/grid.h"
+#include "core/scan/image.h"
 #include "core/scan/orbit.h"
 #include "core/subsets.h"
 
@@ -61,6 +62,9 @@ struct linearise {
 	 */
 	const unsigned char *defects;
 	const unsigned char *stuck; /* [row][column], likewise: found by core/correct/stuck.h; NULL for none */
+	/* [row][column], the images that the scan has, NULL for none: for the rows of corrections[] that need others
+	 * than these. */
+	const void *image[IMAGE_COUNT];
 	/*
 	 * First column, first row, last column, last row, all included: the mean
 	 * transmission (I - dark) / (flat - dark) there, defects left out, is each view's

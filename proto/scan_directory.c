@@ -178,11 +178,10 @@ static int open_projections(const char *directory, const struct scan *scan, int 
 	return code;
 }
 
-/* An image of values of `size` bytes; *ret_image stays NULL where there is none. */
-static int read_image(const char *directory, const char *name, size_t size, const struct scan *scan, void **ret_image,
-		      struct error *err)
+/* An image of so many bytes; *ret_image stays NULL where there is none. */
+static int read_image(const char *directory, const char *name, size_t expected, void **ret_image, struct error *err)
 {
-	size_t expected = (size_t)scan->geometry.columns * (size_t)scan->geometry.rows * size, length = 0;
+	size_t length = 0;
 	char path[PATH_MAX], *bytes = NULL;
 	int code = path_join(path, sizeof(path), directory, name, "", err);
 
@@ -202,21 +201,17 @@ static int read_image(const char *directory, const char *name, size_t size, cons
 
 static int read_images(const char *directory, struct scan_files *files, struct error *err)
 {
-	static const char *const names[] = {"flat.f32", "dark.f32", "defects.u8"};
-	size_t pixels = (size_t)files->scan->geometry.columns * (size_t)files->scan->geometry.rows;
-	void *images[3] = {NULL};
+	const struct geometry *geometry = &files->scan->geometry;
 	int code = 0;
 
-	for (int i = 0; i < 3 && code == 0; i++) {
-		size_t size = i < 2 ? sizeof(float) : 1;
+	for (int i = 0; i < IMAGE_COUNT && code == 0; i++) {
+		const struct image_kind *kind = &image_kinds[i];
+		const size_t bytes = image_bytes(i, geometry->columns, geometry->rows);
 
-		code = read_image(directory, names[i], size, files->scan, &images[i], err);
+		code = read_image(directory, kind->file, bytes, &files->image[i], err);
 		if (code == 0)
-			code = check_part(files->sums, SUMS_FLAT + i, names[i], images[i], pixels * size, err);
+			code = check_part(files->sums, kind->slot, kind->file, files->image[i], bytes, err);
 	}
-	files->flat = images[0];
-	files->dark = images[1];
-	files->defects = images[2];
 	return code;
 }
 
@@ -258,8 +253,7 @@ void scan_files_close(struct scan_files *files)
 		close(files->projections);
 	if (files->sums >= 0)
 		close(files->sums);
-	free(files->flat);
-	free(files->dark);
-	free(files->defects);
+	for (int i = 0; i < IMAGE_COUNT; i++)
+		free(files->image[i]);
 	*files = (struct scan_files){.projections = -1, .sums = -1};
 }

@@ -5,6 +5,7 @@
 #include <stdint.h>
 
 #include "core/recon/recon.h"
+#include "core/scan/image.h"
 #include "proto/recipe.h"
 #include "proto/scan.h"
 
@@ -15,8 +16,7 @@
  *   scan.json        the document of POST /v1/scans
  *   projections.raw  [view][row][column] of the scan's sample type, preallocated
  *   projections.sums checksums of all these files (proto/sums.h); the daemon always has them
- *   flat.f32 dark.f32  [row][column] float32, where given
- *   defects.u8         [row][column] bytes, not zero where a pixel is defective, where given
+ *   flat.f32 ...     the images that are given, core/scan/image.h
  *
  * Kept volumes are NAME.nii files: a NIfTI header with an extension that says where
  * they come from, VOLUME_FILE_OFFSET bytes in all, and float32 voxels, so that raw
@@ -46,10 +46,9 @@ int path_join(char *ret_path, size_t size, const char *directory, const char *na
 /* A scan directory opened for reading. */
 struct scan_files {
 	struct scan *scan;
-	int projections;    /* descriptor */
-	int sums;           /* descriptor of projections.sums, -1: there is none, and nothing is checked */
-	float *flat, *dark; /* [row][column] or NULL */
-	unsigned char *defects;
+	int projections;          /* descriptor */
+	int sums;                 /* descriptor of projections.sums, -1: there is none, and nothing is checked */
+	void *image[IMAGE_COUNT]; /* [row][column] of the kind's pixels, or NULL */
 };
 /*
  * Reads scan.json and the images and checks that every file is as long as the

@@ -32,11 +32,9 @@ enum { SUMS_RECORD_BYTES = 64, SUMS_FIRST = 512 };
 
 /* Slots of records: projections by their numbers, and these. */
 enum sums_part {
-	SUMS_SCAN = -7, /* scan.json */
-	SUMS_FLAT,      /* flat.f32 */
-	SUMS_DARK,      /* dark.f32 */
-	SUMS_DEFECTS,   /* defects.u8 */
-	SUMS_CLOSED     /* of no bytes: the scan was completed with those projections that are there */
+	SUMS_SCAN = -7,   /* scan.json */
+	SUMS_CLOSED = -3, /* of no bytes: the scan was completed with those projections that are there */
+	SUMS_PARTS = 7    /* slots of parts: these, and those of core/scan/image.h between and behind them */
 };
 
 struct sum {

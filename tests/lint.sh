@@ -36,7 +36,7 @@ rule "no struct is bytes in the catalogue" 'COLUMN_BYTES.*AT\(' <(grep COLUMN_BY
 core_rooms=("scan:" "cpu: scan" "outofcore: scan" "correct: scan" "recon: scan outofcore correct")
 daemon_rooms=("http:" "store:" "volumes: store" "jobs: store" "intake: http store" "api: http store volumes jobs intake")
 declare -A doors=(
-	[core/scan]="geometry|grid|orbit|phantom"
+	[core/scan]="geometry|grid|image|orbit|phantom"
 	[core/cpu]="none"
 	[core/correct]="correction|input|stuck"
 	[core/recon]="algorithm|recipe|recon"

@@ -245,16 +245,20 @@ static int make_runs(struct upload *upload, const cJSON *missing, int count, int
 	return 0;
 }
 
-static int send_image(struct http *http, const struct upload *upload, const char *name, const void *image, size_t size,
-		      const struct scan *scan, struct error *err)
+static int send_images(struct http *http, const struct upload *upload, const struct scan_files *files,
+		       struct error *err)
 {
-	size_t length = (size_t)scan->geometry.columns * (size_t)scan->geometry.rows * size;
+	const struct geometry *geometry = &files->scan->geometry;
 	char path[160];
+	int code = 0;
 
-	if (image == NULL)
-		return 0;
-	snprintf(path, sizeof(path), "/v1/scans/%s/%s", upload->id, name);
-	return put(http, path, image, length, upload->options->zstd, err);
+	for (int i = 0; i < IMAGE_COUNT && code == 0; i++) {
+		snprintf(path, sizeof(path), "/v1/scans/%s/%s", upload->id, image_kinds[i].name);
+		if (files->image[i] != NULL)
+			code = put(http, path, files->image[i], image_bytes(i, geometry->columns, geometry->rows),
+				   upload->options->zstd, err);
+	}
+	return code;
 }
 
 /* The scan as the daemon knows it: posted now, or begun before. */
@@ -321,11 +325,7 @@ static int upload_files(struct upload *upload, const struct scan_files *files, s
 		code = make_runs(upload, cJSON_GetObjectItemCaseSensitive(document, "missing"), scan->count, most, err);
 	}
 	if (code == 0)
-		code = send_image(http, upload, "flat", files->flat, sizeof(float), scan, err);
-	if (code == 0)
-		code = send_image(http, upload, "dark", files->dark, sizeof(float), scan, err);
-	if (code == 0)
-		code = send_image(http, upload, "defects", files->defects, 1, scan, err);
+		code = send_images(http, upload, files, err);
 	if (code == 0)
 		code = send_runs(upload, err);
 	cJSON_Delete(document);

@@ -70,7 +70,7 @@ int metal_note_dark(struct metal *metal, int view, int row, int first, int last,
  */
 int metal_find(struct metal *metal, const struct metal_tools *tools, struct volume *from, double threshold,
 	       struct error *err);
-/* Takes the list from where recon_metal's bytes went; ERR_INVALID where it is none of this grid. */
+/* Takes the list from where recon_found's bytes went; ERR_INVALID where it is none of this grid. */
 int metal_put(struct metal *metal, const struct grid *grid, const void *bytes, size_t count, struct error *err);
 
 /* The shadows of the list's voxels, and the samples without counts that touch them. */

@@ -6,6 +6,9 @@
 
 #include "proto/json.h"
 
+#define IMAGE_ROUTE(id, name, ...)                                                                                     \
+	{"PUT", "/v1/scans/{}/{" name "}", image_put, BODY_STREAM, 0, image_begin, upload_take, NULL},
+
 /* GET is HEAD as well. A body that is streamed has begin and data beside handle. */
 const struct route api_routes[] = {
     {"GET", "/", page_get, BODY_NONE, 0, NULL, NULL, NULL},
@@ -26,9 +29,7 @@ const struct route api_routes[] = {
     {"GET", "/v1/scans/{}", scan_get, BODY_NONE, 0, NULL, NULL, NULL},
     {"DELETE", "/v1/scans/{}", scan_delete, BODY_NONE, 0, NULL, NULL, NULL},
     {"POST", "/v1/scans/{}/complete", scan_complete, BODY_NONE, 0, NULL, NULL, NULL},
-    {"PUT", "/v1/scans/{}/flat", image_put, BODY_STREAM, 0, flat_begin, upload_take, NULL},
-    {"PUT", "/v1/scans/{}/dark", image_put, BODY_STREAM, 0, dark_begin, upload_take, NULL},
-    {"PUT", "/v1/scans/{}/defects", image_put, BODY_STREAM, 0, defects_begin, upload_take, NULL},
+    IMAGES(IMAGE_ROUTE) // one for each
     {"PUT", "/v1/scans/{}/projections", projections_put, BODY_STREAM, 0, projections_begin, upload_take, NULL},
     {"GET", "/v1/scans/{}/projections/{}", projection_get, BODY_NONE, 0, NULL, NULL, "format"},
     {"PUT", "/v1/scans/{}/projections/{}", projections_put, BODY_STREAM, 0, projections_begin, upload_take, NULL},

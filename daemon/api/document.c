@@ -74,7 +74,7 @@ static void add_warning(cJSON *list, const char *code, const char *detail)
 
 static bool lacks_flat(const struct scan_facts *facts)
 {
-	return facts->quantity == QUANTITY_INTENSITY && facts->air <= 0 && !facts->flat &&
+	return facts->quantity == QUANTITY_INTENSITY && facts->air <= 0 && !facts->image[IMAGE_FLAT] &&
 	       !facts->lost_image[IMAGE_FLAT];
 }
 
@@ -110,7 +110,7 @@ static void add_scan_warnings(cJSON *document, const struct scan *scan, const st
 			continue;
 		snprintf(detail, sizeof(detail),
 			 "the disk has damaged the image %s: the scan's jobs wait until it is sent again",
-			 image_names[i]);
+			 image_kinds[i].name);
 		add_warning(warnings, "damaged_image", detail);
 	}
 	cJSON_AddItemToObject(document, "warnings", warnings);
@@ -133,11 +133,9 @@ cJSON *scan_document(struct stored_scan *stored, bool brief)
 	cJSON_AddStringToObject(document, "state", facts.complete ? "complete" : "receiving");
 	json_add_time(document, "created", facts.created);
 	cJSON_AddNumberToObject(document, "received_count", facts.received);
-	if (facts.quantity == QUANTITY_INTENSITY) {
-		cJSON_AddBoolToObject(document, "flat", facts.flat);
-		cJSON_AddBoolToObject(document, "dark", facts.dark);
-	}
-	cJSON_AddBoolToObject(document, "defects", facts.defects);
+	for (int i = 0; i < IMAGE_COUNT; i++)
+		if (facts.quantity == QUANTITY_INTENSITY || !image_kinds[i].intensities)
+			cJSON_AddBoolToObject(document, image_kinds[i].name, facts.image[i]);
 	if (brief || scan == NULL) {
 		add_essence(document, &facts);
 		return document;
@@ -233,7 +231,7 @@ static void add_waiting_for(cJSON *document, const struct scan_facts *scan, cons
 			cJSON_AddItemToArray(list, cJSON_CreateString("flat"));
 		for (int i = 0; i < IMAGE_COUNT; i++) {
 			if (scan->lost_image[i])
-				cJSON_AddItemToArray(list, cJSON_CreateString(image_names[i]));
+				cJSON_AddItemToArray(list, cJSON_CreateString(image_kinds[i].name));
 		}
 		if (!scan->complete)
 			cJSON_AddItemToArray(list, cJSON_CreateString("projections"));

@@ -1,4 +1,4 @@
-/* /v1/scans/{}/projections, flat, dark, defects */
+/* /v1/scans/{}/projections, and the images of core/scan/image.h */
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -65,34 +65,22 @@ int projections_begin(void *context, struct request *request, struct error *err)
 	return begin(api, request, scan, &target, err);
 }
 
-static int image_begin(struct api *api, struct request *request, enum image image, struct error *err)
+/* The route's second argument is the name of an image. */
+int image_begin(void *context, struct request *request, struct error *err)
 {
-	const struct upload_target target = {.kind = UPLOAD_IMAGE, .image = image};
+	const int image = image_find(request_argument(request, 1));
+	const struct upload_target target = {.kind = UPLOAD_IMAGE, .image = (enum image)image};
+	struct api *api = context;
 	struct stored_scan *scan;
 
 	if (store_scan_find(api->store, request_argument(request, 0), &scan, err) != 0)
 		return err->code;
-	if (image != IMAGE_DEFECTS && stored_scan_parsed(scan)->quantity != QUANTITY_INTENSITY) {
+	if (image_kinds[image].intensities && stored_scan_parsed(scan)->quantity != QUANTITY_INTENSITY) {
 		stored_scan_release(scan);
-		return error_set(err, ERR_IMPOSSIBLE,
-				 "the scan's quantity is line_integral; flat and dark images are for intensity");
+		return error_set(err, ERR_IMPOSSIBLE, "the scan's quantity is line_integral; a %s is for intensity",
+				 image_kinds[image].title);
 	}
 	return begin(api, request, scan, &target, err);
-}
-
-int flat_begin(void *context, struct request *request, struct error *err)
-{
-	return image_begin(context, request, IMAGE_FLAT, err);
-}
-
-int dark_begin(void *context, struct request *request, struct error *err)
-{
-	return image_begin(context, request, IMAGE_DARK, err);
-}
-
-int defects_begin(void *context, struct request *request, struct error *err)
-{
-	return image_begin(context, request, IMAGE_DEFECTS, err);
 }
 
 int upload_take(void *context, struct request *request, const void *data, size_t size, size_t *ret_taken,

@@ -36,7 +36,7 @@ enum body {
 
 struct route {
 	const char *method; /* GET is HEAD as well */
-	const char *path;   /* "/v1/scans/{}/projections/{}": {} is any one segment, request_argument */
+	const char *path; /* "/v1/scans/{}/projections/{}": {} is any one segment, {flat} this one: request_argument */
 	/* The whole request is there. */
 	int (*handle)(void *context, struct request *request, struct error *err);
 	enum body body;

@@ -111,6 +111,10 @@ static bool path_matches(const char *pattern, char *const segments[], int count,
 			if (segments[i][0] == '\0')
 				return false;
 			arguments[used++] = segments[i];
+		} else if (*pattern == '{') {
+			if (strlen(segments[i]) != length - 2 || memcmp(pattern + 1, segments[i], length - 2) != 0)
+				return false;
+			arguments[used++] = segments[i];
 		} else if (strlen(segments[i]) != length || memcmp(pattern, segments[i], length) != 0) {
 			return false;
 		}

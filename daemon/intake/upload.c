@@ -112,7 +112,7 @@ size_t upload_image_pixels(const struct scan *scan)
 
 size_t upload_image_bytes(const struct scan *scan, enum image image)
 {
-	return upload_image_pixels(scan) * (image == IMAGE_DEFECTS ? 1 : sizeof(float));
+	return image_bytes(image, scan->geometry.columns, scan->geometry.rows);
 }
 
 /* "2 projections of 1249924 bytes (559 x 559 float32)" */
@@ -126,7 +126,7 @@ static void describe_expected(const struct upload *upload, char *ret_text, size_
 		snprintf(ret_text, size, "%" PRIu64 " bytes: %d projection%s of %d x %d %s", upload->expected, count,
 			 count == 1 ? "" : "s", scan->geometry.columns, scan->geometry.rows,
 			 sample_names[scan->sample]);
-	else if (upload->target.image == IMAGE_DEFECTS)
+	else if (image_kinds[upload->target.image].pixel == IMAGE_MARKS)
 		snprintf(ret_text, size, "%zu bytes: %d x %d of one byte each", pixels, scan->geometry.columns,
 			 scan->geometry.rows);
 	else if (scan->sample == SAMPLE_FLOAT32)
@@ -144,7 +144,7 @@ static bool length_is_right(const struct upload *upload, uint64_t length)
 
 	if (upload->target.kind == UPLOAD_IMAGE)
 		return length == upload_image_bytes(scan, upload->target.image) ||
-		       (upload->target.image != IMAGE_DEFECTS &&
+		       (image_kinds[upload->target.image].pixel == IMAGE_COUNTS &&
 			length == upload_image_pixels(scan) * sample_bytes(scan->sample));
 	return length == upload->expected;
 }

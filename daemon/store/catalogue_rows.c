@@ -78,7 +78,7 @@ int catalogue_set_image(struct catalogue *catalogue, const char *scan, enum imag
 
 	record.images[image].known = true;
 	memcpy(record.images[image].sha256, sha256, 32);
-	return catalogue_assign(catalogue, TABLE_SCANS, image_names[image], &record, scan, err);
+	return catalogue_assign(catalogue, TABLE_SCANS, image_kinds[image].name, &record, scan, err);
 }
 
 int catalogue_set_closed(struct catalogue *catalogue, const char *scan, struct error *err)

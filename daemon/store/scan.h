@@ -73,7 +73,6 @@ int stored_scan_read_measured(struct stored_scan *scan, const unsigned char *pre
 
 size_t stored_scan_bytes(const struct stored_scan *scan); /* of one projection */
 size_t stored_image_bytes(const struct stored_scan *scan, enum image image);
-extern const char *const image_files[IMAGE_COUNT]; /* names in the scan's directory */
 
 /* With the scan's lock held: projection `index` is not on the disk any more, and lost. */
 void stored_scan_remove(struct stored_scan *scan, int index);

@@ -93,16 +93,15 @@ void stored_scan_facts(struct stored_scan *scan, struct scan_facts *ret)
 	memcpy(ret->name, scan->name, sizeof(ret->name));
 	pthread_mutex_lock(&scan->lock);
 	ret->received = scan->received;
-	ret->flat = scan->image[IMAGE_FLAT] == STORED;
-	ret->dark = scan->image[IMAGE_DARK] == STORED;
-	ret->defects = scan->image[IMAGE_DEFECTS] == STORED;
 	ret->closed = scan->closed;
 	ret->complete = stored_scan_complete(scan);
 	ret->convertible = is_convertible(scan);
 	ret->checked = !scan->suspect;
 	ret->ready = ret->complete && ret->convertible && ret->checked;
-	for (int i = 0; i < IMAGE_COUNT; i++)
+	for (int i = 0; i < IMAGE_COUNT; i++) {
+		ret->image[i] = scan->image[i] == STORED;
 		ret->lost_image[i] = scan->image_lost[i];
+	}
 	ret->lost = scan->lost_count;
 	ret->losses = scan->losses;
 	ret->document_damaged = scan->document_damaged;

@@ -102,7 +102,7 @@ static int sweep_file(void *context, const char *name, struct error *err)
 	bool stray = false;
 
 	for (int i = 0; i < IMAGE_COUNT; i++)
-		stray |= strcmp(name, image_files[i]) == 0 && scan->image[i] != STORED && !scan->image_lost[i];
+		stray |= strcmp(name, image_kinds[i].file) == 0 && scan->image[i] != STORED && !scan->image_lost[i];
 	if (stray) {
 		snprintf(path, sizeof(path), "scans/%s/%s", scan->id, name);
 		return quarantine_move(scan->store->directory, path, "it was never acknowledged", err);
@@ -167,7 +167,7 @@ static void check_files(struct stored_scan *scan)
 		scan->document_damaged = true;
 	}
 	for (int i = 0; i < IMAGE_COUNT; i++) {
-		if (file_size(scan, image_files[i]) != (long long)stored_image_bytes(scan, i))
+		if (file_size(scan, image_kinds[i].file) != (long long)stored_image_bytes(scan, i))
 			stored_scan_lose_image(scan, i);
 	}
 	if (size == wanted)

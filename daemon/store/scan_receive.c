@@ -10,10 +10,6 @@
 #include "proto/clock.h"
 #include "proto/scan_directory.h"
 
-const char *const image_names[IMAGE_COUNT] = {"flat", "dark", "defects"};
-const char *const image_files[IMAGE_COUNT] = {"flat.f32", "dark.f32", "defects.u8"};
-static const enum sums_part image_parts[IMAGE_COUNT] = {SUMS_FLAT, SUMS_DARK, SUMS_DEFECTS};
-
 int stored_scan_claim(struct stored_scan *scan, int index, enum claim *ret_claim, struct error *err)
 {
 	int code = 0;
@@ -117,18 +113,17 @@ int store_put_projections(struct store *store, struct received_projection *batch
 	return 0;
 }
 
-/* ---- flat, dark, defects ---- */
+/* ---- images ---- */
 
 size_t stored_image_bytes(const struct stored_scan *scan, enum image image)
 {
-	return (size_t)scan->columns * (size_t)scan->rows * (image == IMAGE_DEFECTS ? 1 : sizeof(float));
+	return image_bytes(image, scan->columns, scan->rows);
 }
 
 /* Nobody else may write this image until claim_image's caller has set its progress again. */
 static int claim_image(struct stored_scan *scan, enum image image, const uint8_t sha256[32], bool *ret_there,
 		       struct error *err)
 {
-	static const char *const names[IMAGE_COUNT] = {"flat image", "dark image", "defect map"};
 	int code = 0;
 
 	*ret_there = false;
@@ -142,7 +137,7 @@ static int claim_image(struct stored_scan *scan, enum image image, const uint8_t
 	else if (memcmp(scan->image_sha256[image], sha256, 32) == 0)
 		*ret_there = true;
 	else
-		code = error_set(err, ERR_CONFLICT, "the scan has another %s already", names[image]);
+		code = error_set(err, ERR_CONFLICT, "the scan has another %s already", image_kinds[image].title);
 	pthread_mutex_unlock(&scan->lock);
 	return code;
 }
@@ -154,12 +149,12 @@ static int write_image(struct store *store, struct stored_scan *scan, enum image
 	int code;
 
 	store_scan_directory(store, scan->id, directory);
-	snprintf(path, sizeof(path), "%s/%s", directory, image_files[image]);
+	snprintf(path, sizeof(path), "%s/%s", directory, image_kinds[image].file);
 	code = file_write_durable(path, pixels, stored_image_bytes(scan, image), err);
 	if (code != 0)
 		store_distrust(store, err);
 	if (code == 0)
-		code = store_put_part_sum(scan, image_parts[image], pixels, stored_image_bytes(scan, image), err);
+		code = store_put_part_sum(scan, image_kinds[image].slot, pixels, stored_image_bytes(scan, image), err);
 	if (code == 0)
 		code = store_begin(store, err);
 	if (code != 0)

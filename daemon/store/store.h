@@ -5,6 +5,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "core/scan/image.h"
 #include "daemon/id.h"
 #include "daemon/store/quarantine.h"
 #include "daemon/watch.h"
@@ -151,15 +152,15 @@ struct scan_facts {
 	int columns, rows, count;
 	enum sample sample;
 	enum quantity quantity;
-	double air;               /* counts, 0: not given */
-	int received;             /* projections */
-	bool flat, dark, defects; /* images that are there */
-	bool lost_image[3];       /* of enum image: it was found damaged and is to be sent again */
-	int lost;                 /* projections that were found damaged: missing until they are sent again */
-	unsigned losses;          /* grows with each of them */
-	bool document_damaged;    /* scan.json: the scan cannot be used any more */
-	bool checked;             /* its files are not being held against their checksums just now */
-	bool closed;              /* by store_scan_close, with projections missing */
+	double air;                   /* counts, 0: not given */
+	int received;                 /* projections */
+	bool image[IMAGE_COUNT];      /* that are there */
+	bool lost_image[IMAGE_COUNT]; /* found damaged, and to be sent again */
+	int lost;                     /* projections that were found damaged: missing until they are sent again */
+	unsigned losses;              /* grows with each of them */
+	bool document_damaged;        /* scan.json: the scan cannot be used any more */
+	bool checked;                 /* its files are not being held against their checksums just now */
+	bool closed;                  /* by store_scan_close, with projections missing */
 	bool complete, convertible, ready;
 	double arrived; /* when the last projection came, seconds of CLOCK_MONOTONIC; 0: none since the start */
 	unsigned basis; /* another number: an image came or it was closed, what was made of its projections is void */
@@ -266,12 +267,9 @@ int stored_scan_put_sum(struct received_projection *projection, int sums, uint64
 int store_put_projections(struct store *store, struct received_projection *batch, int count, struct error *err);
 
 /*
- * An image, [row][column]: flat and dark in float32 counts, the defect map in
- * bytes. *ret_new false: the same pixels were there. ERR_CONFLICT: other pixels
+ * An image of core/scan/image.h, [row][column]. *ret_new false: the same pixels were there. ERR_CONFLICT: other pixels
  * are there. ERR_BUSY: another request is writing it just now.
  */
-enum image { IMAGE_FLAT, IMAGE_DARK, IMAGE_DEFECTS, IMAGE_COUNT };
-extern const char *const image_names[IMAGE_COUNT]; /* as in the paths of the API */
 int store_put_image(struct store *store, struct stored_scan *scan, enum image image, const void *pixels, bool *ret_new,
 		    struct error *err);
 

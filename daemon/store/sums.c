@@ -179,9 +179,9 @@ void stored_scan_lose_image(struct stored_scan *scan, enum image image)
 	pthread_mutex_unlock(&scan->lock);
 	if (!lost)
 		return;
-	note_lost(scan, SUMS_FLAT + (int)image, sum);
+	note_lost(scan, image_kinds[image].slot, sum);
 	log_line(LEVEL_ERROR, "scan %s: its image %s is damaged on the disk: its jobs wait until it is sent again",
-		 scan->id, image_names[image]);
+		 scan->id, image_kinds[image].name);
 	pthread_mutex_lock(&scan->lock);
 	scan->image[image] = MISSING;
 	pthread_mutex_unlock(&scan->lock);
@@ -363,14 +363,13 @@ int store_check_part(const struct stored_scan *scan, enum sums_part part, const 
 int store_check_image(struct stored_scan *scan, enum image image, struct error *err)
 {
 	char directory[1024], path[1100], *bytes = NULL;
-	size_t expected = (size_t)scan->columns * (size_t)scan->rows * (image == IMAGE_DEFECTS ? 1 : sizeof(float)),
-	       size = 0;
+	size_t expected = stored_image_bytes(scan, image), size = 0;
 	uint8_t sha256[32];
 	bool fits;
 	int code;
 
 	store_scan_directory(scan->store, scan->id, directory);
-	snprintf(path, sizeof(path), "%s/%s", directory, image_files[image]);
+	snprintf(path, sizeof(path), "%s/%s", directory, image_kinds[image].file);
 	code = file_read(path, expected, &bytes, &size, err);
 	if (code == ERR_NO_MEMORY)
 		return code;
@@ -379,13 +378,13 @@ int store_check_image(struct stored_scan *scan, enum image image, struct error *
 	pthread_mutex_unlock(&scan->lock);
 	fits = code == 0 && size == expected && fits_sha256(bytes, size, sha256);
 	if (fits)
-		code = store_put_part_sum(scan, SUMS_FLAT + (int)image, bytes, size, err);
+		code = store_put_part_sum(scan, image_kinds[image].slot, bytes, size, err);
 	free(bytes);
 	if (fits)
 		return code;
 	stored_scan_lose_image(scan, image);
 	return error_set(err, ERR_DAMAGED, "the image %s is damaged on the disk: it is to be sent again",
-			 image_names[image]);
+			 image_kinds[image].name);
 }
 
 /* ---- checking all of a scan ---- */
@@ -458,7 +457,7 @@ static void check_scan(struct stored_scan *scan)
 	check_document(scan);
 	stored_scan_facts(scan, &facts);
 	for (int i = 0; i < IMAGE_COUNT; i++) {
-		if (i == IMAGE_FLAT ? facts.flat : i == IMAGE_DARK ? facts.dark : facts.defects)
+		if (facts.image[i])
 			store_check_image(scan, i, &err);
 	}
 	check_projections(scan);

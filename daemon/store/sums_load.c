@@ -120,9 +120,9 @@ static int follow_parts(struct store *store, struct stored_scan *scan, const str
 	int code = 0;
 
 	for (int i = 0; i < IMAGE_COUNT && code == 0; i++) {
-		const struct sum *sum = &records->parts[SUMS_FLAT + i - SUMS_SCAN];
+		const struct sum *sum = &records->parts[image_kinds[i].slot - SUMS_SCAN];
 
-		if (records->part_states[SUMS_FLAT + i - SUMS_SCAN] != SUM_GOOD ||
+		if (records->part_states[image_kinds[i].slot - SUMS_SCAN] != SUM_GOOD ||
 		    (scan->image[i] == STORED && memcmp(scan->image_sha256[i], sum->sha256, 32) == 0))
 			continue;
 		code = put_image(store, scan, (enum image)i, sum, err);
@@ -130,8 +130,8 @@ static int follow_parts(struct store *store, struct stored_scan *scan, const str
 		scan->image[i] = STORED;
 	}
 	for (int i = 0; i < IMAGE_COUNT; i++) {
-		scan->image_lost[i] = records->part_states[SUMS_FLAT + i - SUMS_SCAN] == SUM_GOOD &&
-				      records->parts[SUMS_FLAT + i - SUMS_SCAN].lost;
+		scan->image_lost[i] = records->part_states[image_kinds[i].slot - SUMS_SCAN] == SUM_GOOD &&
+				      records->parts[image_kinds[i].slot - SUMS_SCAN].lost;
 		if (scan->image_lost[i])
 			scan->image[i] = MISSING;
 	}
@@ -194,7 +194,7 @@ static void show_projections(struct stored_scan *scan, const struct records *rec
 	scan->suspect = scan->unchecked > 0 || records->part_states[0] != SUM_GOOD;
 	for (int i = 0; i < IMAGE_COUNT; i++)
 		scan->suspect |=
-		    scan->image[i] == STORED && records->part_states[SUMS_FLAT + i - SUMS_SCAN] != SUM_GOOD;
+		    scan->image[i] == STORED && records->part_states[image_kinds[i].slot - SUMS_SCAN] != SUM_GOOD;
 }
 
 int store_load_sums(struct store *store, struct stored_scan *scan, struct error *err)

@@ -20,14 +20,14 @@ static const struct column scan_columns[] = {
     {"sample", COLUMN_CHOICE, AT(catalogue_scan, sample), .names = sample_names, .choices = 2},
     {"quantity", COLUMN_CHOICE, AT(catalogue_scan, quantity), .names = quantity_names, .choices = 2},
     {"air", COLUMN_REAL, AT(catalogue_scan, air)},
-#define IMAGE(name, image)                                                                                             \
-	{                                                                                                              \
-		name, COLUMN_BYTES, AT(catalogue_scan, images[image].sha256),                                          \
-		    .known = offsetof(struct catalogue_scan, images[image].known), .nullable = true, .assigned = true  \
-	}
-    IMAGE("flat", IMAGE_FLAT),
-    IMAGE("dark", IMAGE_DARK),
-    IMAGE("defects", IMAGE_DEFECTS),
+#define IMAGE_COLUMN(id, name, ...)                                                                                    \
+	{name,                                                                                                         \
+	 COLUMN_BYTES,                                                                                                 \
+	 AT(catalogue_scan, images[IMAGE_##id].sha256),                                                                \
+	 .known = offsetof(struct catalogue_scan, images[IMAGE_##id].known),                                           \
+	 .nullable = true,                                                                                             \
+	 .assigned = true},
+    IMAGES(IMAGE_COLUMN) // SHA-256 of each image
     {"closed", COLUMN_BOOL, AT(catalogue_scan, closed), .initial = "0", .assigned = true},
     {"stamp", COLUMN_LONG, AT(catalogue_scan, stamp), .initial = "0", .assigned = true},
 };

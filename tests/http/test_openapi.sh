@@ -11,8 +11,12 @@ operations() {
 		/^    (get|put|post|delete):$/ { method = toupper($1); sub(/:/, "", method); if (later == (planned == "planned")) print method, path }
 	' "$top/proto/openapi.yaml" | sort
 }
+# The images of core/scan/image.h have a route each.
 routes() {
-	sed -nE 's/^[[:space:]]*\{"([A-Z]+)", "([^"]+)",.*/\1 \2/p' "$top/daemon/api/api.c" | sort
+	{
+		sed -nE 's/^[[:space:]]*\{"([A-Z]+)", "([^" ]+)",.*/\1 \2/p' "$top/daemon/api/api.c"
+		sed -nE 's/^[[:space:]]*row\([A-Z]+, "([a-z]+)", .*/PUT \/v1\/scans\/{}\/\1/p' "$top/core/scan/image.h"
+	} | sort
 }
 
 test_schema_and_routes_name_the_same_operations() {

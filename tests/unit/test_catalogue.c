@@ -84,7 +84,7 @@ static void print_scans(FILE *out)
 		stored_scan_facts(scans[i], &facts);
 		stored_scan_received(scans[i], flags);
 		fprintf(out, "scan %s \"%s\" %.17g: %d of %d, flat %d closed %d damaged %d\n", stored_scan_id(scans[i]),
-			facts.name, facts.created, facts.received, facts.count, facts.flat, facts.closed,
+			facts.name, facts.created, facts.received, facts.count, facts.image[IMAGE_FLAT], facts.closed,
 			facts.damaged);
 		for (int k = 0; k < facts.count; k++) {
 			if (flags[k] && stored_scan_sum(scans[i], k, &sum))

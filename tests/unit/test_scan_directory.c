@@ -564,8 +564,8 @@ START_TEST(a_scan_directory_is_read)
 	ck_assert_msg(scan_files_open(directory, &files, &err) == 0, "%s", err.text);
 	ck_assert_int_eq(files.scan->count, VIEWS);
 	ck_assert_int_ne(fcntl(files.projections, F_GETFD) & FD_CLOEXEC, 0);
-	ck_assert_mem_eq(files.flat, image, sizeof(image));
-	ck_assert_ptr_null(files.dark);
+	ck_assert_mem_eq(files.image[IMAGE_FLAT], image, sizeof(image));
+	ck_assert_ptr_null(files.image[IMAGE_DARK]);
 	scan_files_close(&files);
 	scan_files_close(&files);
 	scan_files_close(NULL);

@@ -204,8 +204,8 @@ START_TEST(intensities_are_ready_with_their_flat_image)
 	stored_scan_release(scan);
 	state_reopen(&state);
 	scan = find(id);
-	ck_assert(facts_of(scan).flat);
-	ck_assert(!facts_of(scan).dark);
+	ck_assert(facts_of(scan).image[IMAGE_FLAT]);
+	ck_assert(!facts_of(scan).image[IMAGE_DARK]);
 	ck_assert(facts_of(scan).ready);
 	ck_assert_int_eq(store_put_image(state.store, scan, IMAGE_FLAT, other, &new, &err), ERR_CONFLICT);
 	stored_scan_release(scan);
@@ -512,7 +512,7 @@ START_TEST(what_an_earlier_version_stored_is_checked_against_the_catalogue)
 	change_catalogue("DELETE FROM projections; UPDATE scans SET flat = NULL"); /* it has records now */
 	scan = find(id);
 	ck_assert_int_eq(facts_of(scan).received, 3);
-	ck_assert(facts_of(scan).flat);
+	ck_assert(facts_of(scan).image[IMAGE_FLAT]);
 	stored_scan_release(scan);
 }
 END_TEST
@@ -634,7 +634,7 @@ START_TEST(what_was_acknowledged_is_found_again_beside_its_data)
 		ck_assert_uint_eq(sum.bytes, sizeof(pixels));
 		ck_assert_int_eq(stored_scan_arrivals(scan, 0, order, 10), 4);
 		ck_assert_mem_eq(order, ((int[]){7, 8, 0, 1}), 4 * sizeof(int));
-		ck_assert(facts_of(scan).flat && facts_of(scan).closed && facts_of(scan).ready);
+		ck_assert(facts_of(scan).image[IMAGE_FLAT] && facts_of(scan).closed && facts_of(scan).ready);
 		stored_scan_release(scan);
 		state_reopen(&state);
 	}
