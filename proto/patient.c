@@ -133,22 +133,26 @@ int patient_read(const cJSON *value, const char *base, struct patient *ret_patie
 
 cJSON *patient_json(const struct patient *patient)
 {
-	cJSON *json;
+	cJSON *json, *value;
 	double numbers[16] = {[15] = 1};
 
 	if (!patient->known)
 		return cJSON_CreateNull();
-	json = cJSON_CreateObject();
-	if (patient->position >= 0) {
-		cJSON_AddStringToObject(json, "position", patient_position_names[patient->position]);
-		return json;
-	}
 	for (int i = 0; i < 3; i++) {
 		memcpy(numbers + (size_t)4 * (size_t)i, patient->rotation[i], sizeof(patient->rotation[i]));
 		numbers[4 * i + 3] = patient->offset[i];
 	}
-	cJSON_AddItemToObject(json, "world_to_patient", cJSON_CreateDoubleArray(numbers, 16));
-	return json;
+	json = cJSON_CreateObject();
+	if (patient->position >= 0)
+		value = cJSON_CreateString(patient_position_names[patient->position]);
+	else
+		value = cJSON_CreateDoubleArray(numbers, 16);
+	if (value != NULL &&
+	    cJSON_AddItemToObject(json, patient->position >= 0 ? "position" : "world_to_patient", value))
+		return json;
+	cJSON_Delete(value);
+	cJSON_Delete(json);
+	return NULL;
 }
 
 bool patient_same(const struct patient *a, const struct patient *b)

@@ -10,180 +10,85 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "core/recon/algorithm.h"
+#include "core/recon/parameters.h"
+#include "proto/parameter.h"
 
 const char *const priority_names[PRIORITY_COUNT] = {"routine", "urgent", "stat"};
 
-static const char *const after_names[2] = {"sart", "fdk+sart"};
-const char *const truncation_names[2] = {"off", "auto"};
-static const char *const precision_names[2] = {"standard", "reference"};
+/* Of struct job_request, whose other parameters are the recipe's. */
+const struct parameter priority_parameter = {"",
+					     "priority",
+					     PARAMETER_CHOICE,
+					     .offset = offsetof(struct job_request, priority),
+					     .names = priority_names,
+					     .count = PRIORITY_COUNT,
+					     .help = "A job of higher priority goes before others in the queue."};
+
+/* The recipe's parameters that are members of `object`. */
+static struct parameter_set members_of(const char *object)
+{
+	return (struct parameter_set){.parameters = recipe_parameters,
+				      .count = RECIPE_PARAMETERS,
+				      .object = object,
+				      .counting = strcmp(object, OBJECT_ALGORITHM) == 0};
+}
 
 /* ---- reading ---- */
 
-/* Whole numbers first, then their range: 8.5 is malformed, -8 is impossible. */
-static void read_size(struct json_reader *reader, int ret_size[3])
-{
-	double size[3];
-
-	if (json_member(reader, "size", true) == NULL)
-		return;
-	json_numbers(reader, "size", true, 3, -1e100, 1e100, size);
-	for (int i = 0; i < 3 && reader->code == 0; i++) {
-		char place[24];
-
-		snprintf(place, sizeof(place), "size/%d", i);
-		if (size[i] != rint(size[i]))
-			json_fail(reader, ERR_INVALID, place, "%.10g, a whole number is expected", size[i]);
-		else if (size[i] < 1 || size[i] > GRID_SIZE_MAX)
-			json_fail(reader, ERR_IMPOSSIBLE, place, "%.10g voxels, 1 to %d are expected", size[i],
-				  GRID_SIZE_MAX);
-		else
-			ret_size[i] = (int)size[i];
-	}
-}
-
 static int read_grid(struct recipe *recipe, const cJSON *value, struct error *err)
 {
-	struct json_reader reader;
+	const struct parameter_set set = members_of("/grid");
+	const cJSON *origin = cJSON_GetObjectItemCaseSensitive(value, "origin_mm");
 
-	json_begin(&reader, value, "/grid", err);
-	read_size(&reader, recipe->grid.size);
-	json_numbers(&reader, "spacing_mm", true, 3, 1e-6, 1e3, recipe->grid.spacing);
-	recipe->has_origin = json_has(&reader, "origin_mm");
-	json_numbers(&reader, "origin_mm", false, 3, -1e7, 1e7, recipe->grid.origin);
 	recipe->has_grid = true;
-	return json_end(&reader);
+	recipe->has_origin = origin != NULL && !cJSON_IsNull(origin);
+	return parameters_read(value, "/grid", &set, recipe, err);
 }
 
 static int read_fdk(struct recipe *recipe, const cJSON *value, struct error *err)
 {
-	struct json_reader reader;
-	int window = recipe->fdk.window, truncation = recipe->fdk.extend;
+	const struct parameter_set set = members_of("/fdk");
 
-	json_begin(&reader, value, "/fdk", err);
-	json_choice(&reader, "window", false, window_names, WINDOW_COUNT, &window);
-	json_number(&reader, "cutoff", false, 1e-3, 1, &recipe->fdk.cutoff);
-	json_choice(&reader, "truncation", false, truncation_names, 2, &truncation);
-	recipe->fdk.window = (enum window)window;
-	recipe->fdk.extend = truncation != 0;
 	recipe->fdk.on = true;
-	return json_end(&reader);
+	return parameters_read(value, "/fdk", &set, recipe, err);
 }
 
-static void read_subsets(struct json_reader *reader, int *ret_subsets)
+/*
+ * What a "tv" means before its members are read. Numbers without a method have always meant explicit steps; no alpha
+ * means "auto" to the minimiser.
+ */
+static void presume_tv(struct recipe *recipe, const cJSON *value)
 {
-	const cJSON *member = json_member(reader, "subsets", false);
-	long subsets = SUBSETS_DEFAULT;
+	const cJSON *named = cJSON_GetObjectItemCaseSensitive(value, "method");
+	const cJSON *alpha = cJSON_GetObjectItemCaseSensitive(value, "alpha");
+	const cJSON *step = cJSON_GetObjectItemCaseSensitive(value, "step");
+	const bool no_alpha = alpha == NULL || cJSON_IsNull(alpha), no_step = step == NULL || cJSON_IsNull(step);
+	enum tv_method method = cJSON_IsNumber(alpha) || (no_alpha && !no_step) ? TV_GRADIENT : TV_PROXIMAL;
 
-	if (member == NULL)
-		return;
-	if (cJSON_IsString(member) && strcmp(member->valuestring, "views") == 0) {
-		*ret_subsets = SUBSETS_VIEWS;
-	} else if (!cJSON_IsNumber(member)) {
-		json_fail(reader, ERR_INVALID, "subsets", "a number of subsets or \"views\" is expected");
-	} else {
-		json_integer(reader, "subsets", false, 1, VIEWS_MAX, &subsets);
-		*ret_subsets = (int)subsets;
-	}
-}
-
-static int read_stop(struct recipe *recipe, const cJSON *value, const char *pointer, struct error *err)
-{
-	struct json_reader reader;
-
-	json_begin(&reader, value, pointer, err);
-	json_number(&reader, "residual", false, 0, 1e6, &recipe->iterate.stop_residual);
-	json_number(&reader, "change", false, 0, 1e6, &recipe->iterate.stop_change);
-	return json_end(&reader);
-}
-
-/* An algorithm's member: what all of them have, and what is its own. */
-static int read_algorithm(struct recipe *recipe, const struct algorithm *algorithm, const cJSON *value,
-			  struct error *err)
-{
-	struct json_reader reader;
-	const cJSON *stop;
-	char pointer[64], stop_pointer[80];
-	long iterations;
-	int code;
-
-	snprintf(pointer, sizeof(pointer), "/%s", algorithm->name);
-	if (recipe->algorithm != NULL)
-		return error_set_at(err, ERR_IMPOSSIBLE, pointer, "\"%s\" beside \"%s\": a job has one algorithm",
-				    algorithm->name, recipe->algorithm->name);
-	recipe_set_algorithm(recipe, algorithm);
-	iterations = recipe->iterate.iterations;
-	snprintf(stop_pointer, sizeof(stop_pointer), "/%s/stop", algorithm->name);
-	json_begin(&reader, value, pointer, err);
-	json_integer(&reader, "iterations", false, 1, ITERATIONS_MAX, &iterations);
-	recipe->iterate.iterations = (int)iterations;
-	if (algorithm->subsets) {
-		json_number(&reader, "relaxation", false, 1e-6, 2, &recipe->sart.relaxation);
-		read_subsets(&reader, &recipe->sart.subsets);
-	}
-	json_bool(&reader, "nonnegative", false, &recipe->iterate.nonnegative);
-	stop = json_member(&reader, "stop", false);
-	code = json_end(&reader);
-	return code == 0 && stop != NULL ? read_stop(recipe, stop, stop_pointer, err) : code;
-}
-
-/* Numbers without a method have always meant explicit steps. */
-static int method_meant(struct json_reader *reader)
-{
-	const cJSON *alpha = json_member(reader, "alpha", false);
-
-	return cJSON_IsNumber(alpha) || (alpha == NULL && json_has(reader, "step")) ? TV_GRADIENT : TV_PROXIMAL;
-}
-
-/* A number, or "auto", which is what no alpha means for the minimiser. */
-static void read_alpha(struct json_reader *reader, struct recipe *recipe, enum tv_method method)
-{
-	const cJSON *member = json_member(reader, "alpha", false);
-	const bool given = cJSON_IsString(member) && strcmp(member->valuestring, "auto") == 0;
-
-	if (given || (member == NULL && method == TV_PROXIMAL)) {
-		recipe->tv.options.method = method; /* recipe_check refuses "auto" for explicit steps */
-		return;
-	}
-	recipe_explicit_tv(recipe, method);
-	if (member != NULL && !cJSON_IsNumber(member))
-		json_fail(reader, ERR_INVALID, "alpha", "a number or \"auto\" is expected");
-	/* Nothing keeps explicit steps near f when alpha is 0, but the minimiser without f is a constant. */
-	json_number(reader, "alpha", false, method == TV_PROXIMAL ? 1e-9 : 0, 1e9, &recipe->tv.options.alpha);
+	for (int i = 0; i < TV_METHOD_COUNT; i++)
+		if (cJSON_IsString(named) && strcmp(named->valuestring, tv_method_names[i]) == 0)
+			method = (enum tv_method)i;
+	if (cJSON_IsNumber(alpha) || (no_alpha && method == TV_GRADIENT))
+		recipe_explicit_tv(recipe, method);
+	else
+		recipe->tv.options.method = method;
 }
 
 static int read_tv(struct recipe *recipe, const cJSON *value, struct error *err)
 {
-	struct json_reader reader;
-	struct tv_options *tv = &recipe->tv.options;
-	int method, strength = recipe->tv.strength, after = recipe->tv.after_fdk;
-	long iterations;
+	const struct parameter_set set = members_of("/tv");
 
-	json_begin(&reader, value, "/tv", err);
-	method = method_meant(&reader);
-	json_choice(&reader, "method", false, tv_method_names, TV_METHOD_COUNT, &method);
-	read_alpha(&reader, recipe, (enum tv_method)method);
-	json_choice(&reader, "strength", false, tv_strength_names, TV_STRENGTH_COUNT, &strength);
-	json_number(&reader, "step", false, 1e-9, 1e9, &tv->step);
-	iterations = tv->iterations;
-	json_integer(&reader, "iterations", false, 1, ITERATIONS_MAX, &iterations);
-	json_number(&reader, "unit", false, 1e-12, 1e12, &tv->unit);
-	json_choice(&reader, "after", false, after_names, 2, &after);
-	tv->iterations = (int)iterations;
-	recipe->tv.strength = (enum tv_strength)strength;
-	recipe->tv.after_fdk = after != 0;
 	recipe->tv.on = true;
-	return json_end(&reader);
+	presume_tv(recipe, value);
+	return parameters_read(value, "/tv", &set, recipe, err);
 }
 
 static int read_metal(struct recipe *recipe, const cJSON *value, struct error *err)
 {
-	struct json_reader reader;
+	const struct parameter_set set = members_of("/metal");
 
-	json_begin(&reader, value, "/metal", err);
-	json_number(&reader, "threshold_hu", false, METAL_HU_LEAST, METAL_HU_MOST, &recipe->metal.threshold_hu);
 	recipe->metal.on = true;
-	return json_end(&reader);
+	return parameters_read(value, "/metal", &set, recipe, err);
 }
 
 static int read_emitted(struct json_reader *reader, const cJSON *element, int index, int *ret_emit)
@@ -238,18 +143,23 @@ static void read_emit(struct json_reader *reader, struct recipe *recipe)
 }
 
 enum { STAGES = 4 };
+static const struct {
+	const char *name;
+	int (*read)(struct recipe *, const cJSON *, struct error *);
+} stages[STAGES] = {{"grid", read_grid}, {"fdk", read_fdk}, {"tv", read_tv}, {"metal", read_metal}};
 
-static int read_stages(struct recipe *recipe, const cJSON *const stages[STAGES], struct error *err)
+/* An algorithm's member; the recipe has the first algorithm that the document names. */
+static int read_algorithm(struct recipe *recipe, const struct algorithm *algorithm, const cJSON *value,
+			  struct error *err)
 {
-	static int (*const readers[STAGES])(struct recipe *, const cJSON *, struct error *) = {read_grid, read_fdk,
-											       read_tv, read_metal};
-	int code = 0;
+	const struct parameter_set set = members_of(OBJECT_ALGORITHM);
+	char pointer[PARAMETER_POINTER_MAX];
 
-	for (int i = 0; i < STAGES && code == 0; i++) {
-		if (stages[i] != NULL)
-			code = readers[i](recipe, stages[i], err);
-	}
-	return code;
+	snprintf(pointer, sizeof(pointer), "/%s", algorithm->name);
+	if (recipe->algorithm != algorithm)
+		return error_set_at(err, ERR_IMPOSSIBLE, pointer, "\"%s\" beside \"%s\": a job has one algorithm",
+				    algorithm->name, recipe->algorithm->name);
+	return parameters_read(value, pointer, &set, recipe, err);
 }
 
 /*
@@ -269,47 +179,56 @@ static bool names_no_stage(const cJSON *value)
 	return true;
 }
 
+/* The members of the document itself, and those whose objects are still to be read. */
+struct members {
+	const cJSON *stages[STAGES], *algorithms[ALGORITHM_COUNT], *patient, *labels;
+};
+
+static int read_members(struct job_request *request, const cJSON *value, struct members *ret, struct error *err)
+{
+	const struct parameter_set set = members_of("");
+	struct json_reader reader;
+
+	json_begin(&reader, value, "", err);
+	json_string(&reader, "scan", true, request->scan, sizeof(request->scan));
+	for (int i = 0; i < STAGES; i++)
+		ret->stages[i] = json_member(&reader, stages[i].name, false);
+	for (int i = 0; i < ALGORITHM_COUNT; i++) {
+		ret->algorithms[i] = json_member(&reader, algorithms[i]->name, false);
+		/* The algorithm brings defaults of its own, a projector too: before other members are read. */
+		if (ret->algorithms[i] != NULL && request->recipe.algorithm == NULL)
+			recipe_set_algorithm(&request->recipe, algorithms[i]);
+	}
+	ret->patient = json_member(&reader, "patient", false);
+	ret->labels = json_member(&reader, "labels", false);
+	if (names_no_stage(value)) {
+		request->recipe.fdk.on = request->recipe.tv.on = true;
+		recipe_set_algorithm(&request->recipe, &algorithm_sart);
+	}
+	json_parameter(&reader, &priority_parameter, "priority", request);
+	json_parameters(&reader, &set, &request->recipe);
+	read_emit(&reader, &request->recipe);
+	return json_end(&reader);
+}
+
 int job_request_read(const cJSON *value, struct job_request *ret_request, struct error *err)
 {
 	struct job_request request = {0};
-	struct json_reader reader;
-	const cJSON *stages[STAGES], *iterative[ALGORITHM_COUNT], *patient, *labels;
-	int priority = PRIORITY_ROUTINE, precision = 0, projector = -1, code;
+	struct members members = {0};
+	int code;
 
 	recipe_defaults(&request.recipe);
-	json_begin(&reader, value, "", err);
-	json_string(&reader, "scan", true, request.scan, sizeof(request.scan));
-	stages[0] = json_member(&reader, "grid", false);
-	stages[1] = json_member(&reader, "fdk", false);
-	stages[2] = json_member(&reader, "tv", false);
-	stages[3] = json_member(&reader, "metal", false);
-	for (int i = 0; i < ALGORITHM_COUNT; i++)
-		iterative[i] = json_member(&reader, algorithms[i]->name, false);
-	patient = json_member(&reader, "patient", false);
-	labels = json_member(&reader, "labels", false);
-	json_choice(&reader, "projector", false, projector_names, PROJECTOR_COUNT, &projector);
-	json_choice(&reader, "priority", false, priority_names, PRIORITY_COUNT, &priority);
-	json_choice(&reader, "precision", false, precision_names, 2, &precision);
-	json_number(&reader, "mu_water", false, 1e-9, 1e3, &request.recipe.mu_water);
-	read_emit(&reader, &request.recipe);
-	request.priority = (enum priority)priority;
-	request.recipe.reference_precision = precision != 0;
-	code = json_end(&reader);
+	code = read_members(&request, value, &members, err);
 	if (code == 0)
-		code = patient_read(patient, "/patient", &request.patient, err);
+		code = patient_read(members.patient, "/patient", &request.patient, err);
 	if (code == 0)
-		code = labels_read(labels, "/labels", request.labels, err);
-	if (code == 0)
-		code = read_stages(&request.recipe, stages, err);
+		code = labels_read(members.labels, "/labels", request.labels, err);
+	for (int i = 0; i < STAGES && code == 0; i++)
+		if (members.stages[i] != NULL)
+			code = stages[i].read(&request.recipe, members.stages[i], err);
 	for (int i = 0; i < ALGORITHM_COUNT && code == 0; i++)
-		if (iterative[i] != NULL)
-			code = read_algorithm(&request.recipe, algorithms[i], iterative[i], err);
-	if (code == 0 && names_no_stage(value)) {
-		request.recipe.fdk.on = request.recipe.tv.on = true;
-		recipe_set_algorithm(&request.recipe, &algorithm_sart);
-	}
-	if (projector >= 0)
-		request.recipe.projector = (enum projector)projector;
+		if (members.algorithms[i] != NULL)
+			code = read_algorithm(&request.recipe, algorithms[i], members.algorithms[i], err);
 	if (code != 0) {
 		recipe_clear(&request.recipe);
 		return code;
@@ -371,191 +290,124 @@ int job_request_resolve(struct job_request *request, const struct scan *scan, st
 
 /* ---- writing ---- */
 
-static void add_numbers(cJSON *object, const char *name, const double numbers[3])
+/* The value is the caller's no longer, whatever comes of it. */
+static bool add(cJSON *document, const char *name, cJSON *value)
 {
-	cJSON_AddItemToObject(object, name, cJSON_CreateDoubleArray(numbers, 3));
+	if (value != NULL && cJSON_AddItemToObject(document, name, value))
+		return true;
+	cJSON_Delete(value);
+	return false;
 }
 
-static void add_grid(cJSON *document, const struct recipe *recipe)
+/* The object `name` with the recipe's parameters of `object`; null for a stage that is off. */
+static bool add_stage(cJSON *document, const char *name, const char *object, bool on, const struct recipe *recipe)
 {
-	cJSON *grid = cJSON_AddObjectToObject(document, "grid");
+	const struct parameter_set set = members_of(object);
+	cJSON *stage;
 
-	cJSON_AddItemToObject(grid, "size", cJSON_CreateIntArray(recipe->grid.size, 3));
-	add_numbers(grid, "spacing_mm", recipe->grid.spacing);
-	if (recipe->has_origin)
-		add_numbers(grid, "origin_mm", recipe->grid.origin);
+	if (!on)
+		return add(document, name, cJSON_CreateNull());
+	stage = cJSON_AddObjectToObject(document, name);
+	return stage != NULL && parameters_add(stage, &set, recipe);
 }
 
-/* The algorithm that runs; null for the others. */
-static void add_algorithm(cJSON *document, const struct algorithm *algorithm, const struct recipe *recipe)
-{
-	cJSON *object, *stop;
-
-	if (recipe->algorithm != algorithm) {
-		cJSON_AddNullToObject(document, algorithm->name);
-		return;
-	}
-	object = cJSON_AddObjectToObject(document, algorithm->name);
-	cJSON_AddNumberToObject(object, "iterations", recipe->iterate.iterations);
-	if (algorithm->subsets) {
-		cJSON_AddNumberToObject(object, "relaxation", recipe->sart.relaxation);
-		if (recipe->sart.subsets == SUBSETS_VIEWS)
-			cJSON_AddStringToObject(object, "subsets", "views");
-		else if (recipe->sart.subsets != SUBSETS_DEFAULT)
-			cJSON_AddNumberToObject(object, "subsets", recipe->sart.subsets);
-	}
-	cJSON_AddBoolToObject(object, "nonnegative", recipe->iterate.nonnegative);
-	stop = cJSON_AddObjectToObject(object, "stop");
-	cJSON_AddNumberToObject(stop, "residual", recipe->iterate.stop_residual);
-	cJSON_AddNumberToObject(stop, "change", recipe->iterate.stop_change);
-}
-
-static void add_tv(cJSON *document, const struct recipe *recipe)
-{
-	const struct tv_options *options = &recipe->tv.options;
-	cJSON *tv = cJSON_AddObjectToObject(document, "tv");
-
-	cJSON_AddStringToObject(tv, "method", tv_method_names[options->method]);
-	if (recipe->tv.automatic) {
-		cJSON_AddStringToObject(tv, "alpha", "auto");
-		cJSON_AddStringToObject(tv, "strength", tv_strength_names[recipe->tv.strength]);
-	} else {
-		cJSON_AddNumberToObject(tv, "alpha", options->alpha);
-	}
-	cJSON_AddNumberToObject(tv, "step", options->step);
-	cJSON_AddNumberToObject(tv, "iterations", options->iterations);
-	if (options->unit > 0)
-		cJSON_AddNumberToObject(tv, "unit", options->unit);
-	cJSON_AddStringToObject(tv, "after", after_names[recipe->tv.after_fdk]);
-}
-
-static void add_metal(cJSON *document, const struct recipe *recipe)
-{
-	cJSON *metal = cJSON_AddObjectToObject(document, "metal");
-
-	cJSON_AddNumberToObject(metal, "threshold_hu", recipe->metal.threshold_hu);
-}
-
-static void add_emit(cJSON *document, const struct recipe *recipe)
+static bool add_emit(cJSON *document, const struct recipe *recipe)
 {
 	cJSON *emit = cJSON_AddArrayToObject(document, "emit");
+	bool added = emit != NULL;
 
-	for (int i = 0; i < recipe->emits; i++) {
-		int one = recipe->emit[i];
+	for (int i = 0; i < recipe->emits && added; i++) {
+		const int one = recipe->emit[i];
+		cJSON *json = one == EMIT_FDK      ? cJSON_CreateString("fdk")
+			      : one == EMIT_FDK_TV ? cJSON_CreateString("fdk-tv")
+						   : cJSON_CreateNumber(one);
 
-		if (one == EMIT_FDK || one == EMIT_FDK_TV)
-			cJSON_AddItemToArray(emit, cJSON_CreateString(one == EMIT_FDK ? "fdk" : "fdk-tv"));
-		else
-			cJSON_AddItemToArray(emit, cJSON_CreateNumber(one));
+		added = json != NULL && cJSON_AddItemToArray(emit, json);
+		if (!added)
+			cJSON_Delete(json);
 	}
+	return added;
+}
+
+static bool add_recipe(cJSON *document, const struct recipe *recipe)
+{
+	const struct parameter_set set = members_of("");
+	bool added = !recipe->has_grid || add_stage(document, "grid", "/grid", true, recipe);
+
+	added = added && add_stage(document, "fdk", "/fdk", recipe->fdk.on, recipe);
+	for (int i = 0; i < ALGORITHM_COUNT && added; i++)
+		added = add_stage(document, algorithms[i]->name, OBJECT_ALGORITHM, recipe->algorithm == algorithms[i],
+				  recipe);
+	return added && add_stage(document, "tv", "/tv", recipe->tv.on, recipe) &&
+	       add_stage(document, "metal", "/metal", recipe->metal.on, recipe) &&
+	       parameters_add(document, &set, recipe);
 }
 
 cJSON *recipe_json(const struct recipe *recipe)
 {
-	cJSON *document = cJSON_CreateObject(), *fdk;
+	cJSON *document = cJSON_CreateObject();
 
-	if (recipe->has_grid)
-		add_grid(document, recipe);
-	if (recipe->fdk.on) {
-		fdk = cJSON_AddObjectToObject(document, "fdk");
-		cJSON_AddStringToObject(fdk, "window", window_names[recipe->fdk.window]);
-		cJSON_AddNumberToObject(fdk, "cutoff", recipe->fdk.cutoff);
-		cJSON_AddStringToObject(fdk, "truncation", truncation_names[recipe->fdk.extend]);
-	} else {
-		cJSON_AddNullToObject(document, "fdk");
-	}
-	for (int i = 0; i < ALGORITHM_COUNT; i++)
-		add_algorithm(document, algorithms[i], recipe);
-	if (recipe->tv.on)
-		add_tv(document, recipe);
-	else
-		cJSON_AddNullToObject(document, "tv");
-	if (recipe->metal.on)
-		add_metal(document, recipe);
-	else
-		cJSON_AddNullToObject(document, "metal");
-	cJSON_AddStringToObject(document, "projector", projector_names[recipe->projector]);
-	cJSON_AddStringToObject(document, "precision", precision_names[recipe->reference_precision]);
-	cJSON_AddNumberToObject(document, "mu_water", recipe->mu_water);
-	return document;
-}
-
-static cJSON *request_document(const struct job_request *request)
-{
-	cJSON *document = recipe_json(&request->recipe);
-
-	cJSON_AddStringToObject(document, "scan", request->scan);
-	cJSON_AddItemToObject(document, "patient", patient_json(&request->patient));
-	if (request->labels[0] != '\0')
-		cJSON_AddItemToObject(document, "labels", cJSON_Parse(request->labels));
-	add_emit(document, &request->recipe);
-	cJSON_AddStringToObject(document, "priority", priority_names[request->priority]);
-	return document;
-}
-
-static bool same_grid(const struct recipe *a, const struct recipe *b)
-{
-	return a->has_grid == b->has_grid && a->has_origin == b->has_origin &&
-	       (!a->has_grid ||
-		(memcmp(a->grid.size, b->grid.size, sizeof(a->grid.size)) == 0 &&
-		 memcmp(a->grid.spacing, b->grid.spacing, sizeof(a->grid.spacing)) == 0 &&
-		 (!a->has_origin || memcmp(a->grid.origin, b->grid.origin, sizeof(a->grid.origin)) == 0)));
-}
-
-static bool same_algorithm(const struct recipe *a, const struct recipe *b)
-{
-	if (a->algorithm != b->algorithm || a->algorithm == NULL)
-		return a->algorithm == b->algorithm;
-	return a->projector == b->projector && a->iterate.iterations == b->iterate.iterations &&
-	       a->iterate.stop_residual == b->iterate.stop_residual &&
-	       a->iterate.stop_change == b->iterate.stop_change && a->iterate.nonnegative == b->iterate.nonnegative &&
-	       (!a->algorithm->subsets ||
-		(a->sart.relaxation == b->sart.relaxation && a->sart.subsets == b->sart.subsets));
-}
-
-static bool same_tv(const struct recipe *a, const struct recipe *b)
-{
-	const struct tv_options *x = &a->tv.options, *y = &b->tv.options;
-
-	return a->tv.on == b->tv.on &&
-	       (!a->tv.on ||
-		(a->tv.after_fdk == b->tv.after_fdk && x->method == y->method && a->tv.automatic == b->tv.automatic &&
-		 (a->tv.automatic ? a->tv.strength == b->tv.strength : x->alpha == y->alpha) && x->step == y->step &&
-		 x->iterations == y->iterations && x->unit == y->unit));
+	if (document != NULL && add_recipe(document, recipe))
+		return document;
+	cJSON_Delete(document);
+	return NULL;
 }
 
 bool job_request_same(const struct job_request *a, const struct job_request *b)
 {
-	const struct recipe *x = &a->recipe, *y = &b->recipe;
-
 	return strcmp(a->scan, b->scan) == 0 && a->priority == b->priority && patient_same(&a->patient, &b->patient) &&
-	       strcmp(a->labels, b->labels) == 0 && same_grid(x, y) && x->fdk.on == y->fdk.on &&
-	       (!x->fdk.on ||
-		(x->fdk.window == y->fdk.window && x->fdk.cutoff == y->fdk.cutoff && x->fdk.extend == y->fdk.extend)) &&
-	       same_algorithm(x, y) && same_tv(x, y) && x->metal.on == y->metal.on &&
-	       (!x->metal.on || x->metal.threshold_hu == y->metal.threshold_hu) && x->mu_water == y->mu_water &&
-	       x->reference_precision == y->reference_precision && x->emits == y->emits &&
-	       (x->emits == 0 || memcmp(x->emit, y->emit, (size_t)x->emits * sizeof(*x->emit)) == 0);
+	       strcmp(a->labels, b->labels) == 0 && recipe_same(&a->recipe, &b->recipe);
 }
 
 cJSON *job_request_json(const struct job_request *request)
 {
-	cJSON *document = request_document(request);
-	struct job_request back;
-	struct error err;
-	bool whole;
+	cJSON *document = recipe_json(&request->recipe);
 
-	/* cJSON says nothing when it has no memory for a member: a stage could be lost in silence. So it is read back.
-	 */
-	if (document == NULL || job_request_read(document, &back, &err) != 0) {
-		cJSON_Delete(document);
-		return NULL;
+	if (document != NULL && add(document, "scan", cJSON_CreateString(request->scan)) &&
+	    add(document, "patient", patient_json(&request->patient)) &&
+	    (request->labels[0] == '\0' || add(document, "labels", cJSON_Parse(request->labels))) &&
+	    add_emit(document, &request->recipe) &&
+	    add(document, "priority", cJSON_CreateString(priority_names[request->priority])))
+		return document;
+	cJSON_Delete(document);
+	return NULL;
+}
+
+static bool add_row(cJSON *list, const struct parameter *parameter, const char *object, const void *record)
+{
+	cJSON *row = parameter_json(parameter, object, record);
+
+	return row != NULL && cJSON_AddItemToArray(list, row);
+}
+
+/* One row for each algorithm that has the parameter, where it is one of algorithms. */
+static bool add_rows(cJSON *list, const struct parameter *parameter, struct recipe *recipe)
+{
+	const bool own = strcmp(parameter->object, OBJECT_ALGORITHM) == 0;
+	bool added = true;
+
+	for (int i = 0; i < (own ? ALGORITHM_COUNT : 1) && added; i++) {
+		char object[PARAMETER_POINTER_MAX];
+
+		recipe_set_algorithm(recipe, algorithms[i]);
+		recipe_object(parameter, algorithms[i], object);
+		if (!own || parameter_counts(parameter, recipe))
+			added = add_row(list, parameter, object, recipe);
 	}
-	whole = job_request_same(request, &back);
-	recipe_clear(&back.recipe);
-	if (!whole) {
-		cJSON_Delete(document);
-		return NULL;
-	}
-	return document;
+	return added;
+}
+
+cJSON *job_parameters_json(void)
+{
+	struct job_request request = {0};
+	cJSON *list = cJSON_CreateArray();
+	bool added = list != NULL;
+
+	recipe_defaults(&request.recipe);
+	for (int i = 0; i < RECIPE_PARAMETERS && added; i++)
+		added = add_rows(list, &recipe_parameters[i], &request.recipe);
+	if (added && add_row(list, &priority_parameter, NULL, &request))
+		return list;
+	cJSON_Delete(list);
+	return NULL;
 }

@@ -1,13 +1,14 @@
 #ifndef CBCT_PROTO_RECIPE_H
 #define CBCT_PROTO_RECIPE_H
 
+#include "core/parameter.h"
 #include "core/recon/recon.h"
 #include "proto/labels.h"
 #include "proto/scan.h"
 
 enum priority { PRIORITY_ROUTINE, PRIORITY_URGENT, PRIORITY_STAT, PRIORITY_COUNT };
 extern const char *const priority_names[PRIORITY_COUNT];
-extern const char *const truncation_names[2]; /* "off", "auto" */
+extern const struct parameter priority_parameter; /* of struct job_request */
 
 /* The document of POST /v1/jobs. */
 struct job_request {
@@ -38,6 +39,8 @@ int job_request_resolve(struct job_request *request, const struct scan *scan, st
 cJSON *job_request_json(const struct job_request *request);
 /* Those members that say what is computed: stages, grid, projector ... but not what is kept. NULL for no memory. */
 cJSON *recipe_json(const struct recipe *recipe);
+/* Every parameter of a job as parameter_json has it (proto/parameter.h), in the order of the document. */
+cJSON *job_parameters_json(void);
 /* True if both compute the same: parameters of a stage that is off do not count. */
 bool job_request_same(const struct job_request *a, const struct job_request *b);
 

@@ -39,7 +39,7 @@ declare -A doors=(
 	[core/scan]="geometry|grid|image|orbit|phantom"
 	[core/cpu]="none"
 	[core/correct]="correction|input|stuck"
-	[core/recon]="algorithm|recipe|recon"
+	[core/recon]="algorithm|parameters|recipe|recon"
 )
 door() { echo "$1/(${doors[$1]:-$(basename "$1")})\.h"; }
 for top in core daemon; do

@@ -12,12 +12,13 @@
 #include <unistd.h>
 
 #include "clients/cbct/commands.h"
+#include "clients/cbct/recipe_options.h"
 #include "proto/version.h"
 
 static const struct command *const commands[] = {
-    &command_simulate, &command_import, &command_export_geometry, &command_upload,  &command_submit,
-    &command_watch,    &command_get,    &command_recon,           &command_compare, &command_slice,
-    &command_scans,    &command_jobs,   &command_status,          &command_rm,      &command_complete,
+    &command_simulate, &command_import, &command_export_geometry, &command_upload,     &command_submit, &command_watch,
+    &command_get,      &command_recon,  &command_compare,         &command_slice,      &command_scans,  &command_jobs,
+    &command_status,   &command_rm,     &command_complete,        &command_parameters,
 };
 enum { COMMAND_COUNT = sizeof(commands) / sizeof(commands[0]) };
 
@@ -91,6 +92,7 @@ int main(int count, char **arguments)
 	const struct command *command;
 
 	start_with_sleeping_threads(arguments);
+	recipe_options_make();
 	if (count < 2)
 		return help_all(stderr);
 	if (strcmp(arguments[1], "--version") == 0) {

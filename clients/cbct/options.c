@@ -91,7 +91,7 @@ static int choice_parse(const struct option *option, const char *text, int *ret,
 	return error_set(err, ERR_USAGE, "--%s: '%s' is none of: %s", option->name, text, list);
 }
 
-static int value_parse(const struct option *option, const char *text, void *to, struct error *err)
+int option_value_parse(const struct option *option, const char *text, void *to, struct error *err)
 {
 	char *end;
 	int code;
@@ -163,7 +163,7 @@ static int option_parse(const struct command *command, int count, char *const *a
 			return error_set(err, ERR_USAGE, "--%s needs its argument %s", option->name, option->argument);
 		text = arguments[++*at];
 	}
-	return value_parse(option, text, to, err);
+	return option_value_parse(option, text, to, err);
 }
 
 int options_parse(const struct command *command, int count, char *const *arguments, void *ret_values, struct error *err)

@@ -72,6 +72,8 @@ enum { ERR_USAGE = -64 };
 /* Fills `ret_values` (command->size bytes) from the defaults and the arguments; ERR_USAGE says what is wrong. */
 int options_parse(const struct command *command, int count, char *const *arguments, void *ret_values,
 		  struct error *err);
+/* One value as the option takes it, to where its kind says; ERR_USAGE names the option and the text. */
+int option_value_parse(const struct option *option, const char *text, void *to, struct error *err);
 void options_help(const struct command *command, FILE *to);
 
 #endif

@@ -1,58 +1,183 @@
 /* Job documents from the command line: see recipe_options.h. */
 #include "clients/cbct/recipe_options.h"
 
-#include <math.h>
+#include <assert.h>
+#include <stdarg.h>
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
+#include "core/recon/parameters.h"
 #include "proto/recipe.h"
 #include "proto/scan_directory.h"
 
-#define ROW(name, kind, member, argument, help, least, most, count, names)                                             \
-	{                                                                                                              \
-		name, 0, kind, offsetof(struct recipe_options, member), argument, help, least, most, count, names      \
-	}
-const struct option recipe_option_rows[] = {
-    ROW("grid", OPTION_EACH, size, "N[,N,N]", "voxels along x, y, z (default: chosen from the field of view)", 1,
-	GRID_SIZE_MAX, 3, NULL),
-    ROW("spacing", OPTION_EACH, spacing, "MM[,MM,MM]", "of the voxels", 1e-6, 1e3, 3, NULL),
-    ROW("origin", OPTION_NUMBERS, origin, "X,Y,Z", "centre of the first voxel (default: centred)", -1e7, 1e7, 3, NULL),
-    ROW("fdk", OPTION_CHOICE, window, "WINDOW", "of the ramp filter", 0, 0, WINDOW_COUNT, window_names),
-    ROW("cutoff", OPTION_NUMBER, cutoff, "SHARE", "of the highest frequency", 0, 0, 0, NULL),
-    ROW("truncation", OPTION_CHOICE, truncation, "auto|off", "whether rows that the detector cuts off are extended", 0,
-	0, 2, truncation_names),
-    ROW("no-fdk", OPTION_FLAG, no_fdk, NULL, "start from zero", 0, 0, 0, NULL),
-    ROW("sart", OPTION_INTEGER, iterations, "N", "iterations", 0, 0, 0, NULL),
-    ROW("cgls", OPTION_INTEGER, cgls, "N", "iterations of conjugate gradients in place of SART", 0, 0, 0, NULL),
-    ROW("subsets", OPTION_TEXT, subsets, "N|views", "ordered subsets of the views; 1 is the simultaneous form", 0, 0, 0,
-	NULL),
-    ROW("relaxation", OPTION_NUMBER, relaxation, "R", "of each SART update", 0, 0, 0, NULL),
-    ROW("negative", OPTION_FLAG, negative, NULL, "let voxels be negative in the iterations", 0, 0, 0, NULL),
-    ROW("stop-residual", OPTION_NUMBER, stop_residual, "R", "end when ||p - A v|| / ||p|| is at most R", 0, 0, 0, NULL),
-    ROW("stop-change", OPTION_NUMBER, stop_change, "C", "end when an iteration changes the volume by at most C", 0, 0,
-	0, NULL),
-    ROW("tv", OPTION_CHOICE, method, "METHOD", "total variation after FDK and each iteration", 0, 0, TV_METHOD_COUNT,
-	tv_method_names),
-    ROW("tv-alpha", OPTION_TEXT, alpha, "A|auto",
-	"weight of the volume that entered the stage; auto finds it from the noise", 0, 0, 0, NULL),
-    ROW("tv-strength", OPTION_CHOICE, strength, "STRENGTH", "of what auto finds", 0, 0, TV_STRENGTH_COUNT,
-	tv_strength_names),
-    ROW("tv-step", OPTION_NUMBER, step, "S", "of the gradient method", 0, 0, 0, NULL),
-    ROW("tv-iterations", OPTION_INTEGER, tv_iterations, "N", "steps", 0, 0, 0, NULL),
-    ROW("tv-unit", OPTION_NUMBER, unit, "MU", "one gray level, 1/mm", 0, 0, 0, NULL),
-    ROW("tv-after-sart", OPTION_FLAG, tv_after_sart, NULL, "leave the FDK volume alone", 0, 0, 0, NULL),
-    ROW("projector", OPTION_CHOICE, projector, "NAME", "how iterations project backwards", 0, 0, PROJECTOR_COUNT,
-	projector_names),
-    ROW("metal", OPTION_NUMBER, metal, "HU",
-	"take what is at least HU for metal, and its shadows out of the projections", METAL_HU_LEAST, METAL_HU_MOST, 0,
-	NULL),
-    ROW("emit", OPTION_TEXT, emit, "LIST", "volumes to keep beside the last one, e.g. fdk,fdk-tv,1,5", 0, 0, 0, NULL),
-    ROW("priority", OPTION_CHOICE, priority, "PRIORITY", "in the queue", 0, 0, PRIORITY_COUNT, priority_names),
-    ROW("mu-water", OPTION_NUMBER, mu_water, "MU", "water, 1/mm", 0, 0, 0, NULL),
-    ROW("reference-precision", OPTION_FLAG, reference_precision, NULL, "float32 everywhere, however slow", 0, 0, 0,
-	NULL),
-    {0},
+/* ---- options from parameters ---- */
+
+/* A parameter's option where its name does not follow from the pointer, or it is more than a value. */
+static const struct special {
+	const char *object, *parameter, *option;
+	const char *argument; /* NULL: as the type has it */
+	const char *flag;     /* help of an option without an argument, that gives the other value than the default */
+	bool each;            /* one number stands for the whole list */
+} specials[] = {
+    {"/grid", "size", "grid", "N[,N,N]", NULL, true},
+    {"/grid", "spacing_mm", "spacing", "MM[,MM,MM]", NULL, true},
+    {"/grid", "origin_mm", "origin", "X,Y,Z", NULL, false},
+    {"/fdk", "window", "fdk", "WINDOW", NULL, false},
+    {"/fdk", "cutoff", "cutoff", "SHARE", NULL, false},
+    {"/fdk", "truncation", "truncation", "auto|off", NULL, false},
+    {OBJECT_ALGORITHM, "nonnegative", "negative", NULL, "let voxels be negative in the iterations", false},
+    {"/tv", "method", "tv", "METHOD", NULL, false},
+    {"/tv", "unit", "tv-unit", "MU", NULL, false},
+    {"/tv", "after", "tv-after-sart", NULL, "leave the FDK volume alone", false},
+    {"/metal", "threshold_hu", "metal", "HU", NULL, false},
+    {"", "precision", "reference-precision", NULL, "float32 everywhere, however slow", false},
+    {"", "mu_water", "mu-water", "MU", NULL, false},
 };
+
+/* What stands behind a row of recipe_option_rows. */
+static struct entry {
+	const struct parameter *parameter;
+	const struct algorithm *algorithm; /* that the option chooses, with its iterations; else NULL */
+	const struct special *special;     /* or NULL */
+	char name[40], argument[40], help[400];
+} entries[RECIPE_OPTIONS_MAX];
+static int entry_count;
+struct option recipe_option_rows[RECIPE_OPTIONS_MAX + 1];
+
+static const struct special *special_of(const struct parameter *parameter)
+{
+	for (size_t i = 0; i < sizeof(specials) / sizeof(specials[0]); i++)
+		if (strcmp(specials[i].object, parameter->object) == 0 &&
+		    strcmp(specials[i].parameter, parameter->name) == 0)
+			return &specials[i];
+	return NULL;
+}
+
+/* "/tv/step" is --tv-step, an algorithm's "stop/residual" --stop-residual. */
+static void name_option(struct entry *entry)
+{
+	const struct parameter *parameter = entry->parameter;
+	const bool bare = parameter->object[0] == '\0' || strcmp(parameter->object, OBJECT_ALGORITHM) == 0;
+
+	if (entry->algorithm != NULL)
+		snprintf(entry->name, sizeof(entry->name), "%s", entry->algorithm->name);
+	else if (entry->special != NULL)
+		snprintf(entry->name, sizeof(entry->name), "%s", entry->special->option);
+	else
+		snprintf(entry->name, sizeof(entry->name), "%s%s%s", bare ? "" : parameter->object + 1, bare ? "" : "-",
+			 parameter->name);
+	for (char *at = entry->name; *at != '\0'; at++)
+		if (*at == '/' || *at == '_')
+			*at = '-';
+}
+
+static void name_argument(struct entry *entry)
+{
+	const struct parameter *parameter = entry->parameter;
+	const char *type = parameter->names != NULL ? "NAME" : parameter->type == PARAMETER_INTEGER ? "N" : "X";
+
+	if (entry->special != NULL && entry->special->argument != NULL)
+		type = entry->special->argument;
+	snprintf(entry->argument, sizeof(entry->argument), "%s%s%s", type, parameter->word != NULL ? "|" : "",
+		 parameter->word != NULL ? parameter->word : "");
+}
+
+static void append(struct entry *entry, const char *format, ...) __attribute__((format(printf, 2, 3)));
+static void append(struct entry *entry, const char *format, ...)
+{
+	const size_t used = strlen(entry->help);
+	va_list args;
+
+	va_start(args, format);
+	vsnprintf(entry->help + used, sizeof(entry->help) - used, format, args);
+	va_end(args);
+}
+
+static void append_value(struct entry *entry, const struct recipe *defaults)
+{
+	const struct parameter *parameter = entry->parameter;
+	const double value =
+	    parameter == &priority_parameter ? parameter->preset : parameter_get(parameter, defaults, 0);
+
+	if (parameter->word != NULL && value == PARAMETER_WORD)
+		append(entry, "%s", parameter->word);
+	else if (parameter->names != NULL)
+		append(entry, "%s", parameter->names[(int)value]);
+	else
+		append(entry, "%.10g", value);
+}
+
+/* The sentence of the table, then choices or range, unit and default. */
+static void write_help(struct entry *entry)
+{
+	const struct parameter *parameter = entry->parameter;
+	struct recipe defaults;
+
+	recipe_defaults(&defaults);
+	recipe_set_algorithm(&defaults, entry->algorithm);
+	if (entry->algorithm != NULL)
+		append(entry, "Iterations of %s.", entry->algorithm->summary);
+	else
+		append(entry, "%s", parameter->help);
+	append(entry, " (");
+	for (int i = 0; parameter->names != NULL && i < parameter->count; i++)
+		append(entry, "%s%s", i > 0 ? ", " : "", parameter->names[i]);
+	if (parameter->names == NULL)
+		append(entry, "%.10g to %.10g", parameter->least, parameter->most);
+	if (parameter->unit != NULL)
+		append(entry, " %s", parameter->unit);
+	if (parameter->presets == PRESET_FIXED) {
+		append(entry, "; default ");
+		append_value(entry, &defaults);
+	}
+	append(entry, ")");
+}
+
+static void add_option(const struct parameter *parameter, const struct algorithm *algorithm)
+{
+	struct entry *entry = &entries[entry_count];
+	struct option *row = &recipe_option_rows[entry_count];
+	const bool flag = (entry->special = special_of(parameter)) != NULL && entry->special->flag != NULL;
+
+	assert(entry_count < RECIPE_OPTIONS_MAX - 2);
+	entry->parameter = parameter;
+	entry->algorithm = algorithm;
+	name_option(entry);
+	name_argument(entry);
+	if (!flag)
+		write_help(entry);
+	*row = (struct option){.name = entry->name,
+			       .kind = flag ? OPTION_FLAG : OPTION_TEXT,
+			       .argument = entry->argument,
+			       .help = flag ? entry->special->flag : entry->help};
+	row->offset = flag ? offsetof(struct recipe_options, flags) + (size_t)entry_count * sizeof(bool)
+			   : offsetof(struct recipe_options, values) + (size_t)entry_count * sizeof(char *);
+	entry_count++;
+}
+
+void recipe_options_make(void)
+{
+	for (int i = 0; i < RECIPE_PARAMETERS; i++) {
+		const struct parameter *parameter = &recipe_parameters[i];
+		const bool runs =
+		    strcmp(parameter->object, OBJECT_ALGORITHM) == 0 && strcmp(parameter->name, "iterations") == 0;
+
+		for (int k = 0; k < (runs ? ALGORITHM_COUNT : 1); k++)
+			add_option(parameter, runs ? algorithms[k] : NULL);
+	}
+	add_option(&priority_parameter, NULL);
+	recipe_option_rows[entry_count] = (struct option){
+	    "no-fdk", 0, OPTION_FLAG, offsetof(struct recipe_options, no_fdk), NULL, "start from zero", 0, 0, 0, NULL};
+	recipe_option_rows[entry_count + 1] =
+	    (struct option){"emit",      0,
+			    OPTION_TEXT, offsetof(struct recipe_options, emit),
+			    "LIST",      "volumes to keep beside the last one, e.g. fdk,fdk-tv,1,5",
+			    0,           0,
+			    0,           NULL};
+}
+
+/* ---- documents from options ---- */
 
 static void put(cJSON *object, const char *name, cJSON *value)
 {
@@ -60,19 +185,7 @@ static void put(cJSON *object, const char *name, cJSON *value)
 	cJSON_AddItemToObject(object, name, value);
 }
 
-static void put_number(cJSON *object, const char *name, double value)
-{
-	if (!isnan(value))
-		put(object, name, cJSON_CreateNumber(value));
-}
-
-static void put_integer(cJSON *object, const char *name, long value)
-{
-	if (value != OPTION_UNSET_INTEGER)
-		put(object, name, cJSON_CreateNumber((double)value));
-}
-
-/* The stage, made where it is missing. */
+/* The object that is the member `name`, made where it is missing. */
 static cJSON *stage(cJSON *document, const char *name)
 {
 	cJSON *object = cJSON_GetObjectItemCaseSensitive(document, name);
@@ -82,6 +195,21 @@ static cJSON *stage(cJSON *document, const char *name)
 		put(document, name, object);
 	}
 	return object;
+}
+
+/* Puts the value where the pointer says. */
+static void put_at(cJSON *document, const char *pointer, cJSON *value)
+{
+	const char *name = pointer + 1, *slash;
+
+	while ((slash = strchr(name, '/')) != NULL) {
+		char part[PARAMETER_POINTER_MAX];
+
+		snprintf(part, sizeof(part), "%.*s", (int)(slash - name), name);
+		document = stage(document, part);
+		name = slash + 1;
+	}
+	put(document, name, value);
 }
 
 /* A word between commas as a number where it is one. */
@@ -108,90 +236,128 @@ static void put_emit(cJSON *document, const char *list)
 	put(document, "emit", emit);
 }
 
-static void put_grid(cJSON *document, const struct recipe_options *options)
+/*
+ * A value as it was given. Its type is looked at here; whether it is within its range is said by whoever reads the
+ * document, with a pointer.
+ */
+static int value_json(const struct entry *entry, const char *text, cJSON **ret_json, struct error *err)
 {
-	cJSON *grid;
+	static const enum option_kind kinds[PARAMETER_TYPE_COUNT] = {
+	    OPTION_NUMBER, OPTION_INTEGER, OPTION_FLAG, OPTION_CHOICE, OPTION_CHOICE, OPTION_NUMBERS, OPTION_NUMBERS};
+	const struct parameter *parameter = entry->parameter;
+	const struct option option = {.name = entry->name,
+				      .kind = entry->special != NULL && entry->special->each ? OPTION_EACH
+											     : kinds[parameter->type],
+				      .count = parameter->count,
+				      .names = parameter->names};
+	union {
+		double number, numbers[OPTION_NUMBERS_MAX];
+		long integer;
+		int index;
+	} value;
+	int code;
 
-	if (isnan(options->size[0]) && isnan(options->spacing[0]) && isnan(options->origin[0]))
-		return;
-	grid = stage(document, "grid");
-	if (!isnan(options->size[0]))
-		put(grid, "size", cJSON_CreateDoubleArray(options->size, 3));
-	if (!isnan(options->spacing[0]))
-		put(grid, "spacing_mm", cJSON_CreateDoubleArray(options->spacing, 3));
-	if (!isnan(options->origin[0]))
-		put(grid, "origin_mm", cJSON_CreateDoubleArray(options->origin, 3));
+	if (parameter->word != NULL && strcmp(text, parameter->word) == 0) {
+		*ret_json = cJSON_CreateString(text);
+		return 0;
+	}
+	code = option_value_parse(&option, text, &value, err);
+	if (code != 0)
+		return code;
+	if (option.kind == OPTION_INTEGER)
+		*ret_json = cJSON_CreateNumber((double)value.integer);
+	else if (option.kind == OPTION_CHOICE)
+		*ret_json = cJSON_CreateString(parameter->names[value.index]);
+	else if (parameter_is_list(parameter))
+		*ret_json = cJSON_CreateDoubleArray(value.numbers, parameter->count);
+	else
+		*ret_json = cJSON_CreateNumber(value.number);
+	return 0;
 }
 
-static void put_fdk(cJSON *document, const struct recipe_options *options)
+/* The other value than the default. */
+static cJSON *flag_json(const struct parameter *parameter)
 {
-	if (options->no_fdk)
-		put(document, "fdk", cJSON_CreateNull());
-	if (options->window != OPTION_UNSET_CHOICE)
-		put(stage(document, "fdk"), "window", cJSON_CreateString(window_names[options->window]));
-	if (!isnan(options->cutoff))
-		put_number(stage(document, "fdk"), "cutoff", options->cutoff);
-	if (options->truncation != OPTION_UNSET_CHOICE)
-		put(stage(document, "fdk"), "truncation", cJSON_CreateString(truncation_names[options->truncation]));
+	if (parameter->type == PARAMETER_FLAG)
+		return cJSON_CreateBool(parameter->preset == 0);
+	return cJSON_CreateString(parameter->names[parameter->preset == 0]);
 }
 
-/* The same for every algorithm. */
-static void put_stop(cJSON *algorithm, const struct recipe_options *options)
+static bool given(const struct recipe_options *options, int i)
 {
-	if (isnan(options->stop_residual) && isnan(options->stop_change))
-		return;
-	put_number(stage(algorithm, "stop"), "residual", options->stop_residual);
-	put_number(stage(algorithm, "stop"), "change", options->stop_change);
+	return options->values[i] != NULL || options->flags[i];
 }
 
-static void put_cgls(cJSON *document, const struct recipe_options *options)
+/* The algorithm that an option chooses, else the document's, else the first. */
+static int choose_algorithm(const struct recipe_options *options, const cJSON *document,
+			    const struct algorithm **ret_algorithm, struct error *err)
 {
-	cJSON *cgls = stage(document, "cgls");
+	const struct algorithm *chosen = NULL;
 
-	cJSON_DeleteItemFromObjectCaseSensitive(document, "sart");
-	put_integer(cgls, "iterations", options->cgls);
-	if (options->negative)
-		put(cgls, "nonnegative", cJSON_CreateFalse());
-	put_stop(cgls, options);
+	for (int i = 0; i < entry_count; i++) {
+		if (!given(options, i) || entries[i].algorithm == NULL)
+			continue;
+		if (chosen != NULL)
+			return error_set(err, ERR_USAGE, "--%s together with --%s", entries[i].algorithm->name,
+					 chosen->name);
+		chosen = entries[i].algorithm;
+	}
+	for (int i = 0; i < ALGORITHM_COUNT && chosen == NULL; i++)
+		if (cJSON_IsObject(cJSON_GetObjectItemCaseSensitive(document, algorithms[i]->name)))
+			chosen = algorithms[i];
+	*ret_algorithm = chosen != NULL ? chosen : algorithms[0];
+	return 0;
 }
 
-static void put_sart(cJSON *document, const struct recipe_options *options)
+/* True if the parameter is one of that algorithm's, or none of an algorithm at all. */
+static bool fits_algorithm(const struct parameter *parameter, const struct algorithm *algorithm)
 {
-	cJSON *sart;
+	struct recipe recipe;
 
-	if (options->iterations == OPTION_UNSET_INTEGER && options->subsets == NULL && isnan(options->relaxation) &&
-	    !options->negative && isnan(options->stop_residual) && isnan(options->stop_change))
-		return;
-	sart = stage(document, "sart");
-	put_integer(sart, "iterations", options->iterations);
-	put_number(sart, "relaxation", options->relaxation);
-	if (options->subsets != NULL)
-		put(sart, "subsets", word_json(options->subsets, strlen(options->subsets)));
-	if (options->negative)
-		put(sart, "nonnegative", cJSON_CreateFalse());
-	put_stop(sart, options);
+	recipe_defaults(&recipe);
+	recipe_set_algorithm(&recipe, algorithm);
+	return strcmp(parameter->object, OBJECT_ALGORITHM) != 0 || parameter_counts(parameter, &recipe);
 }
 
-static void put_tv(cJSON *document, const struct recipe_options *options)
+static int put_option(const struct recipe_options *options, int i, const struct algorithm *algorithm, cJSON *document,
+		      struct error *err)
 {
-	cJSON *tv;
+	const struct entry *entry = &entries[i];
+	char object[PARAMETER_POINTER_MAX], pointer[PARAMETER_POINTER_MAX];
+	cJSON *value = NULL;
+	int code = 0;
 
-	if (options->method == OPTION_UNSET_CHOICE && options->alpha == NULL &&
-	    options->strength == OPTION_UNSET_CHOICE && isnan(options->step) &&
-	    options->tv_iterations == OPTION_UNSET_INTEGER && isnan(options->unit) && !options->tv_after_sart)
-		return;
-	tv = stage(document, "tv");
-	if (options->method != OPTION_UNSET_CHOICE)
-		put(tv, "method", cJSON_CreateString(tv_method_names[options->method]));
-	if (options->alpha != NULL)
-		put(tv, "alpha", word_json(options->alpha, strlen(options->alpha)));
-	if (options->strength != OPTION_UNSET_CHOICE)
-		put(tv, "strength", cJSON_CreateString(tv_strength_names[options->strength]));
-	put_number(tv, "step", options->step);
-	put_integer(tv, "iterations", options->tv_iterations);
-	put_number(tv, "unit", options->unit);
-	if (options->tv_after_sart)
-		put(tv, "after", cJSON_CreateString("sart"));
+	if (!fits_algorithm(entry->parameter, algorithm))
+		return error_set(err, ERR_USAGE, "--%s is no option of --%s", entry->name, algorithm->name);
+	if (options->no_fdk && strcmp(entry->parameter->object, "/fdk") == 0)
+		return error_set(err, ERR_USAGE, "--no-fdk together with --%s, an option of the FDK", entry->name);
+	if (options->flags[i])
+		value = flag_json(entry->parameter);
+	else
+		code = value_json(entry, options->values[i], &value, err);
+	if (code != 0)
+		return code;
+	recipe_object(entry->parameter, algorithm, object);
+	parameter_pointer(entry->parameter, object, pointer);
+	put_at(document, pointer, value);
+	return 0;
+}
+
+static int put_options(const struct recipe_options *options, cJSON *document, struct error *err)
+{
+	const struct algorithm *algorithm = NULL;
+	int code = choose_algorithm(options, document, &algorithm, err);
+
+	for (int i = 0; i < entry_count && code == 0; i++) {
+		if (!given(options, i))
+			continue;
+		/* In place of those that a file may have. */
+		for (int k = 0; k < ALGORITHM_COUNT; k++)
+			if (entries[i].algorithm != NULL && algorithms[k] != algorithm)
+				cJSON_DeleteItemFromObjectCaseSensitive(document, algorithms[k]->name);
+		code = put_option(options, i, algorithm, document, err);
+	}
+	return code;
 }
 
 static int recipe_read(const char *path, cJSON **ret_document, struct error *err)
@@ -217,16 +383,10 @@ int recipe_document(const struct recipe_options *options, const char *path, cons
 		    struct error *err)
 {
 	cJSON *document = NULL;
+	int code = 0;
 
-	if (options->no_fdk && (options->window != OPTION_UNSET_CHOICE || options->truncation != OPTION_UNSET_CHOICE ||
-				!isnan(options->cutoff)))
-		return error_set(err, ERR_USAGE, "--no-fdk together with options of the FDK");
-	if (options->cgls != OPTION_UNSET_INTEGER &&
-	    (options->iterations != OPTION_UNSET_INTEGER || options->subsets != NULL || !isnan(options->relaxation)))
-		return error_set(err, ERR_USAGE, "--cgls together with options of SART");
 	if (path != NULL) {
-		int code = recipe_read(path, &document, err);
-
+		code = recipe_read(path, &document, err);
 		if (code != 0)
 			return code;
 	} else {
@@ -234,24 +394,15 @@ int recipe_document(const struct recipe_options *options, const char *path, cons
 		stage(document, "fdk");
 	}
 	put(document, "scan", cJSON_CreateString(scan));
-	put_grid(document, options);
-	put_fdk(document, options);
-	if (options->cgls != OPTION_UNSET_INTEGER)
-		put_cgls(document, options);
-	else
-		put_sart(document, options);
-	put_tv(document, options);
-	if (options->projector != OPTION_UNSET_CHOICE)
-		put(document, "projector", cJSON_CreateString(projector_names[options->projector]));
-	if (!isnan(options->metal))
-		put_number(stage(document, "metal"), "threshold_hu", options->metal);
+	if (options->no_fdk)
+		put(document, "fdk", cJSON_CreateNull());
+	code = put_options(options, document, err);
+	if (code != 0) {
+		cJSON_Delete(document);
+		return code;
+	}
 	if (options->emit != NULL)
 		put_emit(document, options->emit);
-	if (options->priority != OPTION_UNSET_CHOICE)
-		put(document, "priority", cJSON_CreateString(priority_names[options->priority]));
-	put_number(document, "mu_water", options->mu_water);
-	if (options->reference_precision)
-		put(document, "precision", cJSON_CreateString("reference"));
 	*ret_document = document;
 	return 0;
 }

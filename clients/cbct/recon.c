@@ -218,7 +218,7 @@ static int recon_run_command(const void *values, struct error *err)
 	return code;
 }
 
-static const struct recon_options defaults = {.backend = "auto", .pipeline = RECIPE_OPTIONS_DEFAULTS};
+static const struct recon_options defaults = {.backend = "auto"};
 static const struct positional positionals[] = {
     {"DIR", "a scan directory: scan.json, projections.raw", offsetof(struct recon_options, directory), true},
     {"RECIPE", "a job document; without it, FDK with its defaults", offsetof(struct recon_options, recipe), false},

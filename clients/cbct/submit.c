@@ -76,7 +76,7 @@ static int submit_run(const void *values, struct error *err)
 	return code;
 }
 
-static const struct submit_options defaults = {.pipeline = RECIPE_OPTIONS_DEFAULTS};
+static const struct submit_options defaults;
 static const struct positional positionals[] = {
     {"SCAN", "its id", offsetof(struct submit_options, scan), true},
     {"RECIPE", "a job document; without it, FDK with its defaults", offsetof(struct submit_options, recipe), false},

@@ -3,9 +3,8 @@
  * in where it leaves something open. Everything that can be refused is refused
  * here by its pointer, before a device is asked for anything.
  */
-#include "core/recon/algorithm.h"
+#include "core/recon/parameters.h"
 
-#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -15,17 +14,8 @@ const char *const projector_names[PROJECTOR_COUNT] = {"interpolating", "matched"
 
 void recipe_defaults(struct recipe *ret_recipe)
 {
-	*ret_recipe = (struct recipe){
-	    .fdk = {.window = WINDOW_HANN, .cutoff = 1, .extend = true},
-	    .iterate = {.iterations = 10, .nonnegative = true},
-	    .sart = {.relaxation = 1, .subsets = SUBSETS_DEFAULT},
-	    .tv = {.after_fdk = true,
-		   .automatic = true,
-		   .strength = TV_MEDIUM,
-		   .options = {.method = TV_PROXIMAL, .alpha = 0.1, .step = 0.1, .iterations = 30}},
-	    .metal = {.threshold_hu = 2500},
-	    .mu_water = 0.0192,
-	};
+	*ret_recipe = (struct recipe){.tv.options.alpha = 0.1};
+	parameters_preset(recipe_parameters, RECIPE_PARAMETERS, ret_recipe);
 }
 
 void recipe_explicit_tv(struct recipe *recipe, enum tv_method method)
@@ -73,89 +63,50 @@ int recipe_copy(struct recipe *ret_recipe, const struct recipe *recipe, struct e
 	return 0;
 }
 
-/* A NaN is in no range. */
-static int check_range(double value, double least, double most, bool least_too, const char *pointer, struct error *err)
-{
-	if (value <= most && (value > least || (least_too && value == least)))
-		return 0;
-	if (most == INFINITY)
-		return error_set_at(err, ERR_IMPOSSIBLE, pointer, "%g is not %s %g", value,
-				    least_too ? "at least" : "above", least);
-	return error_set_at(err, ERR_IMPOSSIBLE, pointer, "%g is not %s %g and at most %g", value,
-			    least_too ? "at least" : "above", least, most);
-}
-
-static int check_finite(double value, const char *pointer, struct error *err)
-{
-	if (isfinite(value))
-		return 0;
-	return error_set_at(err, ERR_IMPOSSIBLE, pointer, "%g is not a finite number", value);
-}
-
-static int check_positive(double value, bool zero_too, const char *pointer, struct error *err)
-{
-	int code = check_finite(value, pointer, err);
-
-	return code < 0 ? code : check_range(value, 0, INFINITY, zero_too, pointer, err);
-}
-
-static int check_iterations(const struct recipe *recipe, struct error *err)
-{
-	const char *name = recipe->algorithm->name;
-	char iterations[64], residual[64], change[64];
-	int code;
-
-	snprintf(iterations, sizeof(iterations), "/%s/iterations", name);
-	snprintf(residual, sizeof(residual), "/%s/stop/residual", name);
-	snprintf(change, sizeof(change), "/%s/stop/change", name);
-	code = check_range(recipe->iterate.iterations, 1, ITERATIONS_MAX, true, iterations, err);
-	if (code == 0)
-		code = check_positive(recipe->iterate.stop_residual, true, residual, err);
-	if (code == 0)
-		code = check_positive(recipe->iterate.stop_change, true, change, err);
-	return code;
-}
-
-static int check_subsets(const struct recipe *recipe, int views, struct error *err)
-{
-	/* Each update is a projection for 1, a reflection for 2, and grows beyond that. */
-	int code = check_range(recipe->sart.relaxation, 0, 2, false, "/sart/relaxation", err);
-
-	if (code == 0 && recipe->sart.subsets != SUBSETS_DEFAULT && recipe->sart.subsets != SUBSETS_VIEWS &&
-	    (recipe->sart.subsets < 1 || recipe->sart.subsets > views))
-		code = error_set_at(err, ERR_IMPOSSIBLE, "/sart/subsets",
-				    "%d subsets of %d views: there can be 1 to %d, or \"views\"", recipe->sart.subsets,
-				    views, views);
-	return code;
-}
+/* The minimiser without the volume that enters it is a constant; explicit steps may go without. */
+static const double proximal_alpha_least = 1e-9;
 
 static int check_tv(const struct recipe *recipe, struct error *err)
 {
 	const struct tv_options *tv = &recipe->tv.options;
-	int code = 0;
 
 	if (recipe->tv.automatic && tv->method != TV_PROXIMAL)
-		code = error_set_at(err, ERR_IMPOSSIBLE, "/tv/alpha",
+		return error_set_at(err, ERR_IMPOSSIBLE, "/tv/alpha",
 				    "alpha is found for the proximal method only, explicit steps want a number");
-	else if (!recipe->tv.automatic)
-		code = check_positive(tv->alpha, tv->method == TV_GRADIENT, "/tv/alpha", err);
-
-	if (code == 0)
-		code = check_positive(tv->step, false, "/tv/step", err);
-	if (code == 0)
-		code = check_range(tv->iterations, 1, ITERATIONS_MAX, true, "/tv/iterations", err);
-	if (code == 0)
-		code = check_positive(tv->unit, true, "/tv/unit", err);
-	return code;
+	if (!recipe->tv.automatic && tv->method == TV_PROXIMAL && tv->alpha < proximal_alpha_least)
+		return error_set_at(err, ERR_IMPOSSIBLE, "/tv/alpha",
+				    "%.10g, the proximal method wants a number of at least %.10g", tv->alpha,
+				    proximal_alpha_least);
+	return 0;
 }
 
-/* Bone reaches 2000 HU; what lies below the least is soft tissue, whose shadow covers all projections. */
-static int check_metal(const struct recipe *recipe, struct error *err)
+static int check_subsets(const struct recipe *recipe, int views, struct error *err)
 {
-	if (!recipe->fdk.on)
-		return error_set_at(err, ERR_IMPOSSIBLE, "/metal",
-				    "metal is found in the FDK volume, but no FDK is run");
-	return check_range(recipe->metal.threshold_hu, METAL_HU_LEAST, METAL_HU_MOST, true, "/metal/threshold_hu", err);
+	char pointer[64];
+
+	if (recipe->sart.subsets <= views)
+		return 0;
+	snprintf(pointer, sizeof(pointer), "/%s/subsets", recipe->algorithm->name);
+	return error_set_at(err, ERR_IMPOSSIBLE, pointer, "%d subsets of %d views: there can be 1 to %d, or \"views\"",
+			    recipe->sart.subsets, views, views);
+}
+
+/* Each parameter by itself. */
+static int check_parameters(const struct recipe *recipe, struct error *err)
+{
+	for (int i = 0; i < RECIPE_PARAMETERS; i++) {
+		const struct parameter *parameter = &recipe_parameters[i];
+		char object[PARAMETER_POINTER_MAX];
+		int code;
+
+		if (!parameter_counts(parameter, recipe))
+			continue;
+		recipe_object(parameter, recipe->algorithm, object);
+		code = parameter_check(parameter, recipe, object, err);
+		if (code != 0)
+			return code;
+	}
+	return 0;
 }
 
 /* A volume that can never come is refused here, not missed at the end. */
@@ -195,24 +146,20 @@ static int check_grid(const struct recipe *recipe, const struct geometry *geomet
 
 int recipe_check(const struct recipe *recipe, const struct geometry *geometry, struct error *err)
 {
-	int code = 0;
+	int code;
 
 	if (!recipe->fdk.on && recipe->algorithm == NULL)
 		return error_set(
 		    err, ERR_IMPOSSIBLE,
 		    "neither \"fdk\" nor an algorithm, \"sart\" or another, is given: there is nothing to run");
-	if (recipe->fdk.on)
-		code = check_range(recipe->fdk.cutoff, 0, 1, false, "/fdk/cutoff", err);
-	if (code == 0 && recipe->algorithm != NULL)
-		code = check_iterations(recipe, err);
+	code = check_parameters(recipe, err);
 	if (code == 0 && recipe->algorithm != NULL && recipe->algorithm->subsets)
 		code = check_subsets(recipe, geometry->count, err);
 	if (code == 0 && recipe->tv.on)
 		code = check_tv(recipe, err);
-	if (code == 0 && recipe->metal.on)
-		code = check_metal(recipe, err);
-	if (code == 0)
-		code = check_positive(recipe->mu_water, false, "/mu_water", err);
+	if (code == 0 && recipe->metal.on && !recipe->fdk.on)
+		code =
+		    error_set_at(err, ERR_IMPOSSIBLE, "/metal", "metal is found in the FDK volume, but no FDK is run");
 	if (code == 0)
 		code = check_emit(recipe, err);
 	if (code == 0 && recipe->has_grid)

@@ -58,6 +58,16 @@ test_what_is_served_is_the_schema() {
 	stop_daemon
 }
 
+# Ranges, choices and defaults of the documents' parameters have one source, the programs' own tables.
+test_parameters_of_the_schema_are_those_of_the_tables() {
+	local python=${PYTHON:-/usr/bin/python3}
+	"$python" -c 'import yaml' 2>/dev/null || skip "python3-yaml is not here"
+	cbct parameters --json >"$work/parameters.json"
+	"$python" "$top/proto/openapi.py" --json "$top/proto/openapi.yaml" >"$work/openapi.json"
+	"$python" "$top/tests/openapi/parameters.py" "$work/parameters.json" "$work/openapi.json" ||
+		fail "proto/openapi.yaml with the tables that \`cbct parameters\` shows"
+}
+
 # A parameter that nobody knows is refused, and the refusal names those of the schema.
 test_query_parameters_are_those_of_the_schema() {
 	local method path names count=0
