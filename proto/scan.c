@@ -16,14 +16,92 @@
 #include "core/warning.h"
 
 #include "proto/labels.h"
+#include "proto/parameter.h"
 
 const char *const sample_names[2] = {"float32", "uint16"};
 const char *const quantity_names[2] = {"line_integral", "intensity"};
 
 static const double degree = M_PI / 180;
-static const double length_least = 1e-6, length_most = 1e7; /* mm */
-static const double count_most = 1e12;                      /* of photons or digital units */
-static const uint64_t bytes_most = 1ull << 40;              /* of one scan's projections */
+static const double length_most = 1e7;         /* mm, of vectors */
+static const uint64_t bytes_most = 1ull << 40; /* of one scan's projections */
+
+/* What a circular orbit is read into. */
+struct circular_document {
+	struct circular orbit;
+	double first, step; /* degrees */
+};
+
+#define RANGE(low, high) .least = (low), .most = (high)
+#define LENGTH RANGE(1e-6, 1e7), .unit = "mm"
+#define COORDINATE RANGE(-1e7, 1e7), .unit = "mm"
+#define COUNTS RANGE(1e-6, 1e12), .unit = "counts" /* of photons or digital units */
+
+/* Of struct scan. What is no scalar, air_region and beam_hardening, is read by hand. */
+#define AT(member) .offset = offsetof(struct scan, member)
+static const struct parameter scan_parameters[] = {
+    {"/detector", "columns", PARAMETER_INTEGER, AT(geometry.columns), RANGE(1, DETECTOR_MAX),
+     .presets = PRESET_REQUIRED, .unit = "pixels", .help = "Pixels along a row of the detector."},
+    {"/detector", "rows", PARAMETER_INTEGER, AT(geometry.rows), RANGE(1, DETECTOR_MAX), .presets = PRESET_REQUIRED,
+     .unit = "pixels", .help = "Rows of the detector."},
+    {"/detector", "pixel_mm", PARAMETER_NUMBERS, AT(pixel_mm), .count = 2, LENGTH, .presets = PRESET_REQUIRED,
+     .help = "Pitch of the pixels along the columns' axis u and the rows' axis v."},
+    {"/projections", "count", PARAMETER_INTEGER, AT(count), RANGE(1, VIEWS_MAX), .presets = PRESET_REQUIRED,
+     .unit = "projections", .help = "Projections of the scan."},
+    {"/projections", "sample", PARAMETER_CHOICE, AT(sample), .names = sample_names, .count = 2,
+     .presets = PRESET_REQUIRED, .help = "Type of a pixel's value."},
+    {"/projections", "quantity", PARAMETER_CHOICE, AT(quantity), .names = quantity_names, .count = 2,
+     .presets = PRESET_REQUIRED, .help = "Whether values are line integrals or intensities."},
+    {"/projections", "air", PARAMETER_NUMBER, AT(air), COUNTS, .presets = PRESET_NONE,
+     .help = "Intensity without an object; without it a flat image must be put."},
+    {"/projections", "saturation", PARAMETER_NUMBER, AT(saturation), COUNTS, .presets = PRESET_NONE,
+     .help = "Intensity from which on a pixel is a defect; by default 65535 for uint16."},
+};
+#undef AT
+enum { SCAN_PARAMETERS = sizeof(scan_parameters) / sizeof(scan_parameters[0]) };
+
+/* Of struct circular_document. Beyond 1e6 degrees a double no longer tells 1e-10. */
+#define AT(member) .offset = offsetof(struct circular_document, member)
+static const struct parameter circular_parameters[] = {
+    {"/geometry", "source_to_isocentre_mm", PARAMETER_NUMBER, AT(orbit.source_to_isocentre), LENGTH,
+     .presets = PRESET_REQUIRED, .help = "Distance of the source from the isocentre."},
+    {"/geometry", "source_to_detector_mm", PARAMETER_NUMBER, AT(orbit.source_to_detector), LENGTH,
+     .presets = PRESET_REQUIRED, .help = "Distance of the source from the detector; more than to the isocentre."},
+    {"/geometry", "detector_offset_mm", PARAMETER_NUMBERS, AT(orbit.detector_offset), .count = 2, COORDINATE,
+     .help = "How far the detector is moved along +u and +v."},
+    {"/geometry", "source_offset_mm", PARAMETER_NUMBERS, AT(orbit.source_offset), .count = 2, COORDINATE,
+     .help = "How far the source is moved along +u and +v."},
+    {"/geometry", "first_angle_deg", PARAMETER_NUMBER, AT(first), RANGE(-1e6, 1e6), .unit = "degrees",
+     .help = "Gantry angle of the first view."},
+    {"/geometry", "angle_step_deg", PARAMETER_NUMBER, AT(step), RANGE(-360, 360), .presets = PRESET_NONE,
+     .unit = "degrees", .help = "Angle from a view to the next, needed unless there is one view or a list of angles."},
+};
+#undef AT
+enum { CIRCULAR_PARAMETERS = sizeof(circular_parameters) / sizeof(circular_parameters[0]) };
+static const double angle_most = 1e6; /* degrees, of a list */
+
+static bool add_rows(cJSON *list, const struct parameter *parameters, int count, const void *record)
+{
+	for (int i = 0; i < count; i++) {
+		cJSON *row = parameter_json(&parameters[i], NULL, record);
+
+		if (row == NULL || !cJSON_AddItemToArray(list, row))
+			return false;
+	}
+	return true;
+}
+
+cJSON *scan_parameters_json(void)
+{
+	const struct scan scan = {0};
+	const struct circular_document circular = {0};
+	cJSON *list = cJSON_CreateArray();
+
+	if (list != NULL && add_rows(list, scan_parameters, SCAN_PARAMETERS, &scan) &&
+	    add_rows(list, circular_parameters, CIRCULAR_PARAMETERS, &circular))
+		return list;
+	cJSON_Delete(list);
+	return NULL;
+}
 
 size_t sample_bytes(enum sample sample)
 {
@@ -55,16 +133,10 @@ struct linearise scan_linearise(const struct scan *scan)
 
 static int read_detector(struct scan *scan, const cJSON *detector, struct error *err)
 {
-	struct json_reader reader;
-	long columns = 0, rows = 0;
+	const struct parameter_set set = {
+	    .parameters = scan_parameters, .count = SCAN_PARAMETERS, .object = "/detector"};
 
-	json_begin(&reader, detector, "/detector", err);
-	json_integer(&reader, "columns", true, 1, DETECTOR_MAX, &columns);
-	json_integer(&reader, "rows", true, 1, DETECTOR_MAX, &rows);
-	json_numbers(&reader, "pixel_mm", true, 2, length_least, length_most, scan->pixel_mm);
-	scan->geometry.columns = (int)columns;
-	scan->geometry.rows = (int)rows;
-	return json_end(&reader);
+	return parameters_read(detector, "/detector", &set, scan, err);
 }
 
 /* [first column, first row, last column, last row], all included. */
@@ -112,29 +184,24 @@ static void read_hardening(struct json_reader *reader, struct scan *scan)
 
 static int read_projections(struct scan *scan, const cJSON *projections, struct error *err)
 {
+	const struct parameter_set set = {
+	    .parameters = scan_parameters, .count = SCAN_PARAMETERS, .object = "/projections"};
 	struct json_reader reader;
-	long count = 0;
-	int sample = 0, quantity = 0;
+	bool integrals;
 	uint64_t bytes;
 
 	json_begin(&reader, projections, "/projections", err);
-	json_integer(&reader, "count", true, 1, VIEWS_MAX, &count);
-	json_choice(&reader, "sample", true, sample_names, 2, &sample);
-	json_choice(&reader, "quantity", true, quantity_names, 2, &quantity);
-	json_number(&reader, "air", false, 1e-6, count_most, &scan->air);
-	json_number(&reader, "saturation", false, 1e-6, count_most, &scan->saturation);
+	json_parameters(&reader, &set, scan);
+	integrals = scan->quantity == QUANTITY_LINE_INTEGRAL;
 	read_air_region(&reader, scan);
 	read_hardening(&reader, scan);
-	if (quantity == QUANTITY_LINE_INTEGRAL && scan->has_air_region)
+	if (integrals && scan->has_air_region)
 		json_fail(&reader, ERR_INVALID, "air_region", "line integrals have no air, it belongs to intensity");
-	if (quantity == QUANTITY_LINE_INTEGRAL && scan->air != 0)
+	if (integrals && scan->air != 0)
 		json_fail(&reader, ERR_INVALID, "air", "line integrals have no air value, it belongs to intensity");
-	if (quantity == QUANTITY_LINE_INTEGRAL && scan->saturation != 0)
+	if (integrals && scan->saturation != 0)
 		json_fail(&reader, ERR_INVALID, "saturation", "line integrals do not saturate, intensities do");
-	scan->count = (int)count;
-	scan->sample = (enum sample)sample;
-	scan->quantity = (enum quantity)quantity;
-	bytes = scan_projection_bytes(scan) * (uint64_t)count;
+	bytes = scan_projection_bytes(scan) * (uint64_t)scan->count;
 	if (bytes > bytes_most)
 		json_fail(&reader, ERR_IMPOSSIBLE, "count", "projections of %.4g GB in all, at most %.4g are accepted",
 			  (double)bytes * 1e-9, (double)bytes_most * 1e-9);
@@ -157,23 +224,22 @@ static const cJSON *view_list(struct json_reader *reader, const char *name, int 
 }
 
 /* In degrees on both sides of the border; `circular` has either a list or first and step. */
-static void read_angles(struct json_reader *reader, int count, double *ret_angles)
+static void read_angles(struct json_reader *reader, int count, const struct circular_document *circular,
+			double *ret_angles)
 {
-	const double most = 1e6; /* degrees; beyond it a double no longer tells 1e-10 */
-	double first = 0, step = 0;
+	const bool has_first = json_has(reader, "first_angle_deg");
 
 	if (json_has(reader, "angles_deg")) {
 		if (view_list(reader, "angles_deg", count) == NULL)
 			return;
-		json_numbers(reader, "angles_deg", true, count, -most, most, ret_angles);
-		if (json_has(reader, "first_angle_deg") || json_has(reader, "angle_step_deg"))
+		json_numbers(reader, "angles_deg", true, count, -angle_most, angle_most, ret_angles);
+		if (has_first || json_has(reader, "angle_step_deg"))
 			json_fail(reader, ERR_INVALID, "angles_deg",
 				  "stands in place of first_angle_deg and angle_step_deg");
 	} else {
-		json_number(reader, "first_angle_deg", false, -most, most, &first);
-		json_number(reader, "angle_step_deg", count > 1, -360, 360, &step);
+		json_member(reader, "angle_step_deg", count > 1);
 		for (int i = 0; i < count; i++)
-			ret_angles[i] = first + i * step;
+			ret_angles[i] = circular->first + i * circular->step;
 	}
 	for (int i = 0; i < count; i++)
 		ret_angles[i] *= degree;
@@ -181,25 +247,25 @@ static void read_angles(struct json_reader *reader, int count, double *ret_angle
 
 static int read_circular(struct scan *scan, struct json_reader *reader)
 {
-	struct circular orbit = {.pixel = {scan->pixel_mm[0], scan->pixel_mm[1]}};
+	const struct parameter_set set = {
+	    .parameters = circular_parameters, .count = CIRCULAR_PARAMETERS, .object = "/geometry"};
+	struct circular_document circular = {.orbit.pixel = {scan->pixel_mm[0], scan->pixel_mm[1]}};
+	const struct circular *orbit = &circular.orbit;
 	double *angles = calloc((size_t)scan->count, sizeof(*angles));
 	int code;
 
 	if (angles == NULL)
 		return json_fail(reader, ERR_NO_MEMORY, "", "no memory for %d angles", scan->count);
-	json_number(reader, "source_to_isocentre_mm", true, length_least, length_most, &orbit.source_to_isocentre);
-	json_number(reader, "source_to_detector_mm", true, length_least, length_most, &orbit.source_to_detector);
-	json_numbers(reader, "detector_offset_mm", false, 2, -length_most, length_most, orbit.detector_offset);
-	json_numbers(reader, "source_offset_mm", false, 2, -length_most, length_most, orbit.source_offset);
-	read_angles(reader, scan->count, angles);
-	if (orbit.source_to_detector <= orbit.source_to_isocentre)
+	json_parameters(reader, &set, &circular);
+	read_angles(reader, scan->count, &circular, angles);
+	if (orbit->source_to_detector <= orbit->source_to_isocentre)
 		json_fail(reader, ERR_IMPOSSIBLE, "source_to_detector_mm",
-			  "%.10g, more than source_to_isocentre_mm, %.10g, is expected", orbit.source_to_detector,
-			  orbit.source_to_isocentre);
+			  "%.10g, more than source_to_isocentre_mm, %.10g, is expected", orbit->source_to_detector,
+			  orbit->source_to_isocentre);
 	code = json_end(reader);
 	if (code == 0) {
 		code = geometry_circular(&scan->geometry, scan->geometry.columns, scan->geometry.rows, scan->count,
-					 &orbit, angles, reader->err);
+					 orbit, angles, reader->err);
 		if (code != 0 && !json_has(reader, "angles_deg"))
 			reader->err->pointer[0] = '\0'; /* there is no list that it could point into */
 		if (code != 0)

@@ -46,6 +46,9 @@ size_t scan_projection_bytes(const struct scan *scan); /* columns * rows * sampl
 /* All of it but the images; borrows from the scan. */
 struct linearise scan_linearise(const struct scan *scan);
 
+/* Every scalar parameter of the document as parameter_json has it (proto/parameter.h). NULL for no memory. */
+cJSON *scan_parameters_json(void);
+
 /* `derived` and `warnings` of the reply, new cJSON values of the caller's. */
 cJSON *scan_derived(const struct scan *scan);
 cJSON *scan_warnings(const struct scan *scan);

@@ -13,7 +13,7 @@ struct parameters_options {
 
 static const struct option rows[] = {
     {"json", 0, OPTION_FLAG, offsetof(struct parameters_options, json), NULL,
-     "as JSON: {\"job\": [...]}, a member for each document", 0, 0, 0, NULL},
+     "as JSON: {\"job\": [...], \"scan\": [...]}", 0, 0, 0, NULL},
     {0},
 };
 static const struct option_group groups[] = {{"options", rows, 0}, {0}};
@@ -21,7 +21,8 @@ static const struct option_group groups[] = {{"options", rows, 0}, {0}};
 static const struct {
 	const char *name, *title;
 	cJSON *(*rows)(void);
-} documents[] = {{"job", "Job (POST /v1/jobs)", job_parameters_json}};
+} documents[] = {{"job", "Job (POST /v1/jobs)", job_parameters_json},
+		 {"scan", "Scan (POST /v1/scans), its geometry a circular one", scan_parameters_json}};
 enum { DOCUMENTS = sizeof(documents) / sizeof(documents[0]) };
 
 /* A JSON value without the quotes of a text. */
@@ -87,7 +88,7 @@ static const struct parameters_options defaults;
 static const struct positional positionals[] = {{0}};
 
 const struct command command_parameters = {
-    "parameters",  "what a job's document may say: ranges, defaults, units, meaning",
+    "parameters",  "what the documents of jobs and scans may say: ranges, defaults, units, meaning",
     positionals,   groups,
     &defaults,     sizeof(defaults),
     parameters_run};

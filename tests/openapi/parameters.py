@@ -11,10 +11,12 @@ from typing import Any, Dict, Iterator, List
 # Members of the documents that are no parameters, or no scalars: their shapes are tested elsewhere.
 OTHERS = {
     "job": {"/scan", "/emit", "/labels", "/patient"},
+    "scan": {"/name", "/labels", "/patient", "/projections/air_region", "/projections/beam_hardening"}
+    | {f"/geometry/{name}" for name in ("kind", "angles_deg", "matrices", "views")},
 }
-REQUESTS = {"job": "JobRequest"}
+REQUESTS = {"job": "JobRequest", "scan": "ScanRequest"}
 # Replies that repeat members of the request with schemas of their own.
-REPLIES = {"job": ["JobBrief"]}
+REPLIES: Dict[str, List[str]] = {"job": ["JobBrief"], "scan": []}
 
 Node = Dict[str, Any]
 

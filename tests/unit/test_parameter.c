@@ -44,6 +44,18 @@ static char *job_round_trip(const char *text, struct error *err)
 	return printed;
 }
 
+static char *scan_round_trip(const char *text, struct error *err)
+{
+	struct scan *scan;
+	char *printed;
+
+	if (scan_parse(text, strlen(text), &scan, err) != 0)
+		return NULL;
+	printed = json_print(scan->document, NULL);
+	scan_free(scan);
+	return printed;
+}
+
 /* The document that a row is put into: with every stage, and with the algorithm that the pointer names. */
 static cJSON *job_with(const char *pointer)
 {
@@ -53,6 +65,12 @@ static cJSON *job_with(const char *pointer)
 
 	cJSON_AddObjectToObject(json, algorithm);
 	return json;
+}
+
+static cJSON *scan_with(const char *pointer)
+{
+	(void)pointer;
+	return cJSON_Parse(scan_text);
 }
 
 /* Puts the value where the pointer says, in place of what is there. */
@@ -98,6 +116,7 @@ struct subject {
 };
 static const struct subject subjects[] = {
     {"job", job_parameters_json, job_with, job_round_trip},
+    {"scan", scan_parameters_json, scan_with, scan_round_trip},
 };
 enum { SUBJECTS = sizeof(subjects) / sizeof(subjects[0]) };
 

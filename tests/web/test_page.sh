@@ -62,6 +62,14 @@ test_every_bundled_package_is_named_with_its_licence() {
 	done
 }
 
+# Every parameter of a job has a field in the form and is shown in the job's view.
+test_the_page_knows_every_parameter() {
+	command -v node >/dev/null || skip "node is not here"
+	cbct parameters --json >"$work/parameters.json"
+	node "$here/parameters.mjs" "$top/clients/web/src/parameters.js" "$work/parameters.json" ||
+		fail "clients/web/src/parameters.js with the table that \`cbct parameters\` shows"
+}
+
 # What stands for the whole page where npm is not.
 test_the_plain_page_shows_jobs_and_escapes_names() {
 	start_daemon

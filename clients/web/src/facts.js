@@ -1,5 +1,6 @@
 /* Geometry, grid, times and warnings as lists. */
 import { h, number, duration, bytes, timeElement } from './dom.js'
+import { groups, at, stageText, valueText } from './parameters.js'
 
 const list = entries => h('dl', {}, entries.filter(entry => entry && entry[1] !== null && entry[1] !== undefined)
 	.map(([name, value]) => h('div', {}, h('dt', {}, name), h('dd', {}, value))))
@@ -32,16 +33,29 @@ export function geometryFacts(scan, patient = scan.patient) {
 	])
 }
 
+/* Every parameter of the job but its grid: a line for each stage, "none" for one that is off, and one for each of the rest. */
+function parameterFacts(job) {
+	const plain = value => number(value, Number.isInteger(value) ? 15 : 4)
+	const iterates = groups.some(({ algorithm, pointer }) => algorithm && at(job, pointer))
+	return groups.flatMap(group => {
+		if (group.three)
+			return []
+		if (!group.pointer)
+			return group.fields.map(field => [field.label.split(', ')[0], valueText(job, field, plain)])
+		if (at(job, group.pointer))
+			return [[group.title, stageText(job, group, plain)]]
+		return group.algorithm && iterates ? [] : [[group.title, 'none']]
+	})
+}
+
 export function jobFacts(job) {
 	const timings = job.timings ?? {}
 	const spent = ['waiting', 'queued', 'load', 'fdk', 'sart', 'cgls', 'tv', 'save'].filter(name => timings[name] > 0.05).map(name => `${name} ${duration(timings[name])}`)
 	return list([
-		['Grid', job.grid && `${times(job.grid.size)} at ${times(job.grid.spacing_mm, 3)} mm`],
-		['FDK', job.fdk ? `${job.fdk.window ?? 'hann'}, cutoff ${number(job.fdk.cutoff ?? 1)}` : 'none'],
-		['SART', job.sart ? `${job.sart.iterations} iterations, ${job.sart.subsets === 'views' ? 'an update a view' : `${job.sart.subsets} subsets`}, relaxation ${number(job.sart.relaxation)}` : job.cgls ? null : 'none'],
-		['CGLS', job.cgls ? `${job.cgls.iterations} iterations` : null],
-		['TV', job.tv ? smoothing(job) : 'none'],
-		['Priority', job.priority],
+		['Grid', job.grid && `${times(job.grid.size)} at ${times(job.grid.spacing_mm, 3)} mm, from ${job.grid.origin_mm.map(mm => number(mm, 4)).join(', ')} mm`],
+		...parameterFacts(job),
+		['Noise', job.denoising ? `${number(job.denoising.noise_hu)} HU` : null],
+		['Alpha found', job.tv?.alpha === 'auto' && job.denoising ? (job.denoising.alpha === null ? 'nothing to smooth' : number(job.denoising.alpha)) : null],
 		['Runs on', job.device ? `${job.device} (${job.backend})` : job.backend],
 		['Memory', job.memory ? bytes(job.memory.total) : null],
 		['Asked for', timeElement(job.created)],
@@ -53,13 +67,6 @@ export function jobFacts(job) {
 }
 
 const severities = ['serious', 'caution', 'info']
-
-function smoothing({ tv, denoising }) {
-	const found = tv.alpha === 'auto'
-	const alpha = found ? denoising?.alpha : tv.alpha
-	return [tv.method, found ? tv.strength : null, alpha === null || alpha === undefined ? null : `alpha ${number(alpha)}`, `${tv.iterations} steps`,
-		denoising ? `noise ${number(denoising.noise_hu)} HU` : null].filter(Boolean).join(', ')
-}
 
 /* The API's warnings, the most serious first; null where there are none. */
 export function warningList(warnings) {

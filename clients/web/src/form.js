@@ -1,54 +1,10 @@
 /*
- * "Reconstruct again with ...": a job's request as a form, from one table of
- * its fields. A problem (RFC 9457) is shown at the field its pointer names.
+ * "Reconstruct again with ...": a job's request as a form, from the table of
+ * its parameters. A problem (RFC 9457) is shown at the field its pointer names.
  */
 import { h, replace, newId } from './dom.js'
 import { request, newKey, Problem } from './api.js'
-
-const number = (pointer, label, options) => ({ pointer, label, kind: 'number', ...options })
-const choice = (pointer, label, values, options) => ({ pointer, label, kind: 'choice', values, ...options })
-const flag = (pointer, label, options) => ({ pointer, label, kind: 'flag', ...options })
-const text = (pointer, label, options) => ({ pointer, label, kind: 'text', ...options })
-
-/* A stage is left out by its checkbox; what is empty is left to the daemon's defaults. */
-const groups = [
-	{ title: 'Grid', pointer: '/grid', optional: true, three: true, off: 'chosen from the field of view', fields: [
-		number('/grid/size/0', 'Voxels along x', { step: 1 }), number('/grid/size/1', 'along y', { step: 1 }), number('/grid/size/2', 'along z', { step: 1 }),
-		number('/grid/spacing_mm/0', 'Spacing x, mm'), number('/grid/spacing_mm/1', 'y, mm'), number('/grid/spacing_mm/2', 'z, mm'),
-	] },
-	{ title: 'FDK', pointer: '/fdk', optional: true, off: 'start from zero', fields: [
-		choice('/fdk/window', 'Window', ['ram-lak', 'shepp-logan', 'cosine', 'hamming', 'hann']),
-		number('/fdk/cutoff', 'Cutoff, of Nyquist'),
-		choice('/fdk/truncation', 'Truncated rows', ['auto', 'off']),
-	] },
-	{ title: 'SART', pointer: '/sart', optional: true, off: 'no iterations', fields: [
-		number('/sart/iterations', 'Iterations', { step: 1 }), number('/sart/relaxation', 'Relaxation'),
-		text('/sart/subsets', 'Subsets', { hint: 'or views', read: value => value === 'views' ? value : Number(value) }),
-		flag('/sart/nonnegative', 'Never below zero'),
-		number('/sart/stop/residual', 'Stop at residual'), number('/sart/stop/change', 'Stop at change'),
-	] },
-	{ title: 'Conjugate gradients', pointer: '/cgls', optional: true, rare: true, off: 'not in place of SART', fields: [
-		number('/cgls/iterations', 'Iterations', { step: 1 }), flag('/cgls/nonnegative', 'Never below zero'),
-		number('/cgls/stop/residual', 'Stop at residual'), number('/cgls/stop/change', 'Stop at change'),
-	] },
-	{ title: 'Total variation', pointer: '/tv', optional: true, off: 'no smoothing', fields: [
-		choice('/tv/method', 'Method', ['proximal', 'gradient']), choice('/tv/strength', 'Strength', ['light', 'medium', 'strong']),
-		text('/tv/alpha', 'Alpha', { hint: 'or auto', read: value => value === 'auto' || Number.isNaN(Number(value)) ? value : Number(value) }), number('/tv/step', 'Step'),
-		number('/tv/iterations', 'Iterations', { step: 1 }), choice('/tv/after', 'After', ['fdk+sart', 'sart']), number('/tv/unit', 'Gray level, 1/mm'),
-	] },
-	{ title: 'Metal', pointer: '/metal', optional: true, rare: true, off: 'not corrected', fields: [number('/metal/threshold_hu', 'From, HU')] },
-	{ title: 'Job', pointer: '', fields: [
-		text('/emit', 'Keep volumes', { hint: 'fdk, fdk-tv, iterations', empty: 'the last one only', wide: true, read: value => value.split(/[\s,]+/).filter(Boolean).map(name => /^\d+$/.test(name) ? Number(name) : name),
-			write: list => (list ?? []).join(', ') }),
-		choice('/priority', 'Priority', ['routine', 'urgent', 'stat']), choice('/precision', 'Precision', ['standard', 'reference']),
-		choice('/projector', 'Projector', ['interpolating', 'matched']), number('/mu_water', 'Water, 1/mm'),
-	] },
-]
-/* Members of a job's document that are parts of its request, whether they have a field above or not. */
-const members = ['grid', 'fdk', 'sart', 'cgls', 'tv', 'emit', 'priority', 'precision', 'mu_water', 'projector', 'metal', 'patient', 'labels']
-
-const path = pointer => pointer.split('/').slice(1)
-const at = (value, pointer) => path(pointer).reduce((part, key) => part?.[key], value)
+import { groups, members, path, at } from './parameters.js'
 
 function put(value, pointer, what) {
 	const keys = path(pointer), last = keys.pop()
@@ -151,7 +107,7 @@ export class JobForm {
 			if (raw === '')
 				remove(document, pointer)
 			else
-				put(document, pointer, field.kind === 'number' ? (Number.isNaN(Number(raw)) ? raw : Number(raw)) : field.read ? field.read(raw) : raw)
+				put(document, pointer, field.read ? field.read(raw) : raw)
 		}
 		this.#keepMiddle(document.grid)
 		return document

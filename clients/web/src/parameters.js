@@ -1,0 +1,78 @@
+/*
+ * The parameters of a job as the page shows and asks for them: labels and the
+ * order of fields. Which parameters there are, their choices and units is
+ * known to `cbct parameters --json`; tests/web/parameters.mjs holds this table to it.
+ */
+export const path = pointer => pointer.split('/').slice(1)
+export const at = (value, pointer) => path(pointer).reduce((part, key) => part?.[key], value)
+
+/* Text that is no number goes as it is: the daemon says best what it expects. */
+const numberOrText = value => Number.isNaN(Number(value)) ? value : Number(value)
+
+const number = (pointer, label, options) => ({ pointer, label, kind: 'number', read: numberOrText, ...options })
+const choice = (pointer, label, values, options) => ({ pointer, label, kind: 'choice', values, ...options })
+const flag = (pointer, label, options) => ({ pointer, label, kind: 'flag', ...options })
+const text = (pointer, label, options) => ({ pointer, label, kind: 'text', ...options })
+
+/*
+ * label: with the unit behind a comma. kind: how it is asked for. hint, empty, wide, write, read: of the form. word:
+ * that may stand in place of the number. zero: what 0 means.
+ * A group with a pointer is a stage: the form leaves it out by its checkbox. What is empty is left to the daemon's
+ * defaults.
+ */
+export const groups = [
+	{ title: 'Grid', pointer: '/grid', optional: true, three: true, off: 'chosen from the field of view', fields: [
+		number('/grid/size/0', 'Voxels along x', { step: 1 }), number('/grid/size/1', 'along y', { step: 1 }), number('/grid/size/2', 'along z', { step: 1 }),
+		number('/grid/spacing_mm/0', 'Spacing x, mm'), number('/grid/spacing_mm/1', 'y, mm'), number('/grid/spacing_mm/2', 'z, mm'),
+	] },
+	{ title: 'FDK', pointer: '/fdk', optional: true, off: 'start from zero', fields: [
+		choice('/fdk/window', 'Window', ['ram-lak', 'shepp-logan', 'cosine', 'hamming', 'hann']),
+		number('/fdk/cutoff', 'Cutoff, of Nyquist'),
+		choice('/fdk/truncation', 'Truncated rows', ['auto', 'off']),
+	] },
+	{ title: 'SART', pointer: '/sart', optional: true, algorithm: true, off: 'no iterations', fields: [
+		number('/sart/iterations', 'Iterations', { step: 1 }), number('/sart/relaxation', 'Relaxation'),
+		text('/sart/subsets', 'Subsets', { hint: 'or views', word: 'views', read: numberOrText }),
+		flag('/sart/nonnegative', 'Never below zero'),
+		number('/sart/stop/residual', 'Stop at residual', { zero: 'never' }), number('/sart/stop/change', 'Stop at change', { zero: 'never' }),
+	] },
+	{ title: 'Conjugate gradients', pointer: '/cgls', optional: true, algorithm: true, rare: true, off: 'not in place of SART', fields: [
+		number('/cgls/iterations', 'Iterations', { step: 1 }), flag('/cgls/nonnegative', 'Never below zero'),
+		number('/cgls/stop/residual', 'Stop at residual', { zero: 'never' }), number('/cgls/stop/change', 'Stop at change', { zero: 'never' }),
+	] },
+	{ title: 'Total variation', pointer: '/tv', optional: true, off: 'no smoothing', fields: [
+		choice('/tv/method', 'Method', ['proximal', 'gradient']), choice('/tv/strength', 'Strength', ['light', 'medium', 'strong']),
+		text('/tv/alpha', 'Alpha', { hint: 'or auto', word: 'auto', read: numberOrText }), number('/tv/step', 'Step'),
+		number('/tv/iterations', 'Iterations', { step: 1 }), choice('/tv/after', 'After', ['fdk+sart', 'sart']), number('/tv/unit', 'Gray level, 1/mm'),
+	] },
+	{ title: 'Metal', pointer: '/metal', optional: true, rare: true, off: 'not corrected', fields: [number('/metal/threshold_hu', 'From, HU')] },
+	{ title: 'Job', pointer: '', fields: [
+		text('/emit', 'Keep volumes', { hint: 'fdk, fdk-tv, iterations', empty: 'the last one only', wide: true, read: value => value.split(/[\s,]+/).filter(Boolean).map(name => /^\d+$/.test(name) ? Number(name) : name),
+			write: list => (list ?? []).join(', ') }),
+		choice('/priority', 'Priority', ['routine', 'urgent', 'stat']), choice('/precision', 'Precision', ['standard', 'reference']),
+		choice('/projector', 'Projector', ['interpolating', 'matched']), number('/mu_water', 'Water, 1/mm'),
+	] },
+]
+/* Members of a job's document that are parts of its request, whether they have a field above or not. */
+export const members = [...new Set([...groups.flatMap(({ pointer, fields }) => pointer ? [pointer] : fields.map(field => field.pointer)).map(pointer => path(pointer)[0]),
+	'patient', 'labels'])]
+
+/* ---- as words ---- */
+
+/* The value of a field in a job, with its unit; null where the job has none. */
+export function valueText(job, { pointer, label, zero, write, empty }, format) {
+	const value = at(job, pointer), unit = label.split(', ')[1]
+	if (value === undefined || value === null)
+		return null
+	if (write)
+		return write(value) || empty
+	if (typeof value === 'boolean')
+		return value ? 'yes' : 'no'
+	return typeof value !== 'number' ? String(value) : value === 0 && zero ? zero : `${format(value)}${unit ? ` ${unit}` : ''}`
+}
+
+/* All fields of a stage that the job has: "window hann, cutoff 1 of Nyquist". */
+export function stageText(job, group, format) {
+	const name = ({ label }) => label.split(', ')[0].toLowerCase()
+	return group.fields.map(field => [name(field), valueText(job, field, format)]).filter(([, text]) => text !== null).map(parts => parts.join(' ')).join(', ')
+}

@@ -1,0 +1,69 @@
+/*
+ * The page's table of a job's parameters against the program's own: the same
+ * parameters, choices and words, each with a field that fits its type.
+ *
+ * Usage: node parameters.mjs clients/web/src/parameters.js PARAMETERS.json     (`cbct parameters --json`)
+ */
+import { readFileSync } from 'node:fs'
+import { resolve } from 'node:path'
+import { pathToFileURL } from 'node:url'
+
+const { groups, stageText, valueText } = await import(pathToFileURL(resolve(process.argv[2])))
+const rows = JSON.parse(readFileSync(process.argv[3], 'utf8')).job
+
+/* Lists have a field for each number. The grid's corner has none: the form keeps the grid about its middle. */
+const without = new Set(['/grid/origin_mm'])
+/* No parameter of the table: a list of volumes. */
+const others = new Set(['/emit'])
+
+const fields = new Map(groups.flatMap(group => group.fields).map(field => [field.pointer, field]))
+const wanted = new Map(rows.filter(({ pointer }) => !without.has(pointer))
+	.flatMap(row => row.count ? Array.from({ length: row.count }, (_, i) => [`${row.pointer}/${i}`, row]) : [[row.pointer, row]]))
+const differences = []
+
+const kindOf = ({ type, word }) => word ? 'text' : { boolean: 'flag', choice: 'choice' }[type] ?? 'number'
+
+for (const [pointer, row] of wanted) {
+	const field = fields.get(pointer)
+	const differs = what => differences.push(`${pointer}: ${what}`)
+	if (!field) {
+		differs('no field')
+		continue
+	}
+	if (field.kind !== kindOf(row))
+		differs(`a field of kind ${field.kind}, ${kindOf(row)} is expected`)
+	if (row.choices && [...row.choices].sort().join() !== [...field.values].sort().join())
+		differs(`choices ${field.values}, ${row.choices} are expected`)
+	if (row.word !== field.word)
+		differs(`the word ${field.word}, ${row.word} is expected`)
+	if (row.word && (field.read(row.word) !== row.word || field.read('7') !== 7))
+		differs('text and numbers are not read as they are')
+	if (row.type.startsWith('integer') && !row.word && field.step !== 1)
+		differs('whole numbers have the step 1')
+	if (['mm', '1/mm', 'HU'].includes(row.unit) && !field.label.endsWith(`, ${row.unit}`))
+		differs(`the label "${field.label}" without the unit ${row.unit}`)
+}
+for (const pointer of fields.keys())
+	if (!wanted.has(pointer) && !others.has(pointer))
+		differences.push(`${pointer}: a field of a parameter that does not exist`)
+
+/* What a job has is shown: every field with a value of its own. */
+const job = {}
+rows.forEach(({ pointer, count, choices, type, minimum, maximum }, i) => {
+	const keys = pointer.split('/').slice(1), last = keys.pop()
+	const value = choices ? choices.at(-1) : type === 'boolean' ? false : Math.min(Math.max(1 + i / 128, minimum), maximum)
+	const part = keys.reduce((inner, key) => inner[key] ??= {}, job)
+	part[last] = count ? Array(count).fill(value) : value
+})
+for (const group of groups) {
+	for (const field of group.fields.filter(({ pointer }) => !others.has(pointer))) {
+		const text = valueText(job, field, String)
+		if (text === null || !(group.pointer ? stageText(job, group, String) : text).includes(text))
+			differences.push(`${field.pointer}: not shown`)
+	}
+}
+
+for (const line of differences)
+	console.log(line)
+console.log(`${wanted.size} fields, ${differences.length} differences`)
+process.exitCode = differences.length ? 1 : 0
