@@ -28,7 +28,7 @@ const struct parameter priority_parameter = {"",
 static struct parameter_set members_of(const char *object)
 {
 	return (struct parameter_set){.parameters = recipe_parameters,
-				      .count = RECIPE_PARAMETERS,
+				      .count = recipe_parameter_count,
 				      .object = object,
 				      .counting = strcmp(object, OBJECT_ALGORITHM) == 0};
 }
@@ -404,7 +404,7 @@ cJSON *job_parameters_json(void)
 	bool added = list != NULL;
 
 	recipe_defaults(&request.recipe);
-	for (int i = 0; i < RECIPE_PARAMETERS && added; i++)
+	for (int i = 0; i < recipe_parameter_count && added; i++)
 		added = add_rows(list, &recipe_parameters[i], &request.recipe);
 	if (added && add_row(list, &priority_parameter, NULL, &request))
 		return list;

@@ -158,7 +158,7 @@ static void add_option(const struct parameter *parameter, const struct algorithm
 
 void recipe_options_make(void)
 {
-	for (int i = 0; i < RECIPE_PARAMETERS; i++) {
+	for (int i = 0; i < recipe_parameter_count; i++) {
 		const struct parameter *parameter = &recipe_parameters[i];
 		const bool runs =
 		    strcmp(parameter->object, OBJECT_ALGORITHM) == 0 && strcmp(parameter->name, "iterations") == 0;

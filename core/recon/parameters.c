@@ -52,7 +52,7 @@ static bool corrects_metal(const void *recipe)
 #define RANGE(low, high) .least = (low), .most = (high)
 #define NAMES(list) .names = (list), .count = sizeof(list) / sizeof((list)[0])
 
-const struct parameter recipe_parameters[RECIPE_PARAMETERS] = {
+const struct parameter recipe_parameters[] = {
     {"/grid", "size", PARAMETER_INTEGERS, AT(grid.size), .count = 3, RANGE(1, GRID_SIZE_MAX),
      .presets = PRESET_REQUIRED, .counts = has_grid, .unit = "voxels", .help = "Voxels along x, y and z."},
     {"/grid", "spacing_mm", PARAMETER_NUMBERS, AT(grid.spacing), .count = 3, RANGE(1e-6, 1e3),
@@ -110,6 +110,7 @@ const struct parameter recipe_parameters[RECIPE_PARAMETERS] = {
     {"", "mu_water", PARAMETER_NUMBER, AT(mu_water), RANGE(1e-9, 1e3), .preset = 0.0192, .unit = "1/mm",
      .help = "Attenuation of water, which Hounsfield units and the default gray level go by."},
 };
+const int recipe_parameter_count = sizeof(recipe_parameters) / sizeof(recipe_parameters[0]);
 
 void recipe_object(const struct parameter *parameter, const struct algorithm *algorithm,
 		   char ret_object[PARAMETER_POINTER_MAX])
@@ -124,7 +125,7 @@ bool recipe_same(const struct recipe *a, const struct recipe *b)
 	if (a->has_grid != b->has_grid || a->has_origin != b->has_origin || a->fdk.on != b->fdk.on ||
 	    a->algorithm != b->algorithm || a->tv.on != b->tv.on || a->metal.on != b->metal.on || a->emits != b->emits)
 		return false;
-	for (int i = 0; i < RECIPE_PARAMETERS; i++)
+	for (int i = 0; i < recipe_parameter_count; i++)
 		if (!parameter_same(&recipe_parameters[i], a, b))
 			return false;
 	return a->emits == 0 || memcmp(a->emit, b->emit, (size_t)a->emits * sizeof(*a->emit)) == 0;

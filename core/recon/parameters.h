@@ -9,8 +9,8 @@
  * parameter has an effect in a recipe; what several parameters must fulfil together is checked by recipe_check.
  */
 #define OBJECT_ALGORITHM "/ALGORITHM" /* the object of whichever algorithm the recipe has */
-enum { RECIPE_PARAMETERS = 23 };
-extern const struct parameter recipe_parameters[RECIPE_PARAMETERS];
+extern const struct parameter recipe_parameters[];
+extern const int recipe_parameter_count;
 
 /* Pointer of the object whose member the parameter is in a recipe with that algorithm. */
 void recipe_object(const struct parameter *parameter, const struct algorithm *algorithm,

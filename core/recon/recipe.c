@@ -15,7 +15,7 @@ const char *const projector_names[PROJECTOR_COUNT] = {"interpolating", "matched"
 void recipe_defaults(struct recipe *ret_recipe)
 {
 	*ret_recipe = (struct recipe){.tv.options.alpha = 0.1};
-	parameters_preset(recipe_parameters, RECIPE_PARAMETERS, ret_recipe);
+	parameters_preset(recipe_parameters, recipe_parameter_count, ret_recipe);
 }
 
 void recipe_explicit_tv(struct recipe *recipe, enum tv_method method)
@@ -94,7 +94,7 @@ static int check_subsets(const struct recipe *recipe, int views, struct error *e
 /* Each parameter by itself. */
 static int check_parameters(const struct recipe *recipe, struct error *err)
 {
-	for (int i = 0; i < RECIPE_PARAMETERS; i++) {
+	for (int i = 0; i < recipe_parameter_count; i++) {
 		const struct parameter *parameter = &recipe_parameters[i];
 		char object[PARAMETER_POINTER_MAX];
 		int code;

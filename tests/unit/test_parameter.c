@@ -395,7 +395,7 @@ START_TEST(the_core_has_the_same_ranges)
 	struct error err = {0};
 
 	ck_assert_int_eq(scan_parse(scan_text, strlen(scan_text), &scan, &err), 0);
-	for (int i = 0; i < RECIPE_PARAMETERS; i++) {
+	for (int i = 0; i < recipe_parameter_count; i++) {
 		const struct parameter *parameter = &recipe_parameters[i];
 		const bool real = parameter->type == PARAMETER_NUMBER || parameter->type == PARAMETER_NUMBERS;
 		const struct recipe good = full_recipe(&algorithm_sart);
@@ -433,7 +433,7 @@ static double other_value(const struct parameter *parameter, const struct recipe
 
 START_TEST(recipes_that_differ_in_one_parameter_are_not_the_same)
 {
-	for (int i = 0; i < RECIPE_PARAMETERS; i++) {
+	for (int i = 0; i < recipe_parameter_count; i++) {
 		const struct parameter *parameter = &recipe_parameters[i];
 		const struct recipe recipe = full_recipe(&algorithm_sart);
 		struct recipe other = recipe;
