@@ -58,22 +58,6 @@ int sart_options_make(struct sart_options *ret_sart, const struct recipe *recipe
 	return code;
 }
 
-/* One more volume to work in, as this backend holds one. */
-static int volume_bytes(const struct backend *backend, struct device *device, const struct plan_options *options,
-			size_t *ret_bytes, struct error *err)
-{
-	struct plan_options bare = *options;
-	struct plan_bytes bytes;
-	int code;
-
-	bare.sart = NULL;
-	bare.tv = NULL;
-	code = backend->plan_bytes(device, &bare, &bytes, err);
-	if (code == 0)
-		*ret_bytes = bytes.volumes;
-	return code;
-}
-
 /* What a job holds beside its plan, the projections and the iterate. */
 struct held {
 	int volumes, stacks; /* stacks of all views */
@@ -103,19 +87,16 @@ static int memory_whole(const struct backend *backend, struct device *device, st
 	const int columns = geometry->columns, rows = geometry->rows, *pad = options->pad;
 	const size_t stacks = (size_t)held->stacks * backend->stack_bytes(columns, rows, geometry->count);
 	const size_t batch = held->slots > 0 ? backend->stack_bytes(columns, rows, held->slots) : 0;
-	size_t filtered = 0, volumes = 0;
+	const size_t volumes = (size_t)held->volumes * backend->volume_bytes(options->grid);
+	size_t filtered = 0;
 	struct plan_bytes bytes;
-	int code = 0;
+	int code;
 
 	if (options->column_weights != NULL)
 		filtered = backend->stack_bytes(pad[0] + columns + pad[1], rows, fdk_batch_most(geometry->count));
-	if (held->volumes > 0)
-		code = volume_bytes(backend, device, options, &volumes, err);
-	volumes *= (size_t)held->volumes;
 	options->beside = filtered + around->device + batch + volumes + stacks;
 	options->lends = around->borrowed;
-	if (code == 0)
-		code = backend->plan_bytes(device, options, &bytes, err);
+	code = backend->plan_bytes(device, options, &bytes, err);
 	if (code < 0)
 		return code;
 	*ret_memory = (struct recon_memory){

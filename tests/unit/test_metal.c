@@ -320,7 +320,7 @@ START_TEST(memory_is_known_beforehand)
 	ck_assert_uint_gt(memory.total, plain.total);
 	/* a volume to work in, which SART's copy of the iterate is */
 	ck_assert_uint_eq(memory.volumes, plain.volumes + (_i == 1 ? 0 : alone.volumes));
-	options.memory_limit = memory.total + (64 << 10); /* for what allocations are rounded up to */
+	options.memory_limit = memory.total;
 	ck_assert_int_eq(backend_cpu.open(0, &options, &device, &err), 0);
 	ck_assert_msg(recon_open(&backend_cpu, device, &scene.geometry, &linearise, &with, &hooks, &recon, &err) == 0,
 		      "%s", err.text);
