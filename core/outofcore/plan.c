@@ -91,41 +91,108 @@ static struct plan_options intake_options(const struct plan *plan, const struct 
 	return options;
 }
 
-static size_t stack_bytes(const struct plan *plan, enum purpose purpose, int slots)
+/*
+ * What lies on the device below: a walk over it makes everything, or only adds up what that would take, so that
+ * what is said and what is taken come from the same lines.
+ */
+struct below {
+	const struct backend *backend;
+	struct device *device;
+	bool measures;
+	size_t volumes, rest; /* bytes, where it measures */
+};
+
+static struct below below_of(const struct plan *plan, bool measures)
 {
-	return plan->device->backend->stack_bytes(columns_of(&plan->options, purpose), plan->options.geometry->rows,
-						  slots);
+	return (struct below){.backend = plan->device->backend, .device = plan->device->below, .measures = measures};
 }
 
-/* What slabs of so many slices take on the device for a purpose, the volumes to *ret_volumes. */
-static int slab_bytes(const struct plan *plan, enum purpose purpose, int slices, size_t *ret_total, size_t *ret_volumes,
+static int below_plan(struct below *below, const struct plan_options *options, struct plan **ret_plan,
 		      struct error *err)
 {
-	const int most = plan->options.grid->size[2], stacks = purpose == FOR_TV ? 0 : 2;
-	int thick = slices + 2 * outofcore_halo(&plan->options, purpose);
-	struct grid grid = grid_of_slices(plan->options.grid, 0, thick < most ? thick : most);
-	struct plan_options options = options_for(plan, purpose, &grid);
 	struct plan_bytes bytes;
-	int code = plan->device->backend->plan_bytes(plan->device->below, &options, &bytes, err);
+	int code;
 
+	if (!below->measures)
+		return below->backend->plan_new(below->device, options, ret_plan, err);
+	code = below->backend->plan_bytes(below->device, options, &bytes, err);
 	if (code < 0)
 		return code;
-	*ret_volumes = bytes.volumes * (purpose == FOR_FDK ? 2 : 1);
-	*ret_total = *ret_volumes + bytes.scratch + bytes.raw +
-		     (size_t)stacks * stack_bytes(plan, FOR_SUMS, plan->batch) +
-		     (purpose == FOR_FDK ? stack_bytes(plan, FOR_FDK, plan->batch) : 0);
+	/* It speaks of the iterate, too, which the walk has by itself. */
+	below->volumes += bytes.volumes - below->backend->volume_bytes(options->grid);
+	below->rest += bytes.scratch + bytes.raw;
 	return 0;
 }
 
-static int intake_bytes(const struct plan *plan, size_t *ret_bytes, struct error *err)
+static int below_volume(struct below *below, const struct grid *grid, struct volume **ret_volume, struct error *err)
 {
-	struct grid grid = intake_grid(plan);
-	struct plan_options options = intake_options(plan, &grid);
-	struct plan_bytes bytes;
-	int code = plan->device->backend->plan_bytes(plan->device->below, &options, &bytes, err);
+	if (!below->measures)
+		return below->backend->volume_new(below->device, grid, ret_volume, err);
+	below->volumes += below->backend->volume_bytes(grid);
+	return 0;
+}
 
-	if (code == 0)
-		*ret_bytes = bytes.volumes + bytes.scratch + bytes.raw + stack_bytes(plan, FOR_SUMS, 1);
+static int below_stack(struct below *below, int columns, int rows, int slots, struct stack **ret_stack,
+		       struct error *err)
+{
+	if (!below->measures)
+		return below->backend->stack_new(below->device, columns, rows, slots, ret_stack, err);
+	below->rest += below->backend->stack_bytes(columns, rows, slots);
+	return 0;
+}
+
+/* A slab's plan and volume; slab->grid is known. */
+static int slab_walk(struct plan *plan, enum purpose purpose, struct below *below, struct slab *slab, struct error *err)
+{
+	struct plan_options options = options_for(plan, purpose, &slab->grid);
+	int code = below_plan(below, &options, &slab->plan, err);
+
+	return code < 0 ? code : below_volume(below, &slab->grid, &slab->volume, err);
+}
+
+static int feed_walk(struct plan *plan, enum purpose purpose, struct below *below, struct feed *feed, struct error *err)
+{
+	const int columns = plan->options.geometry->columns, rows = plan->options.geometry->rows;
+	int code = 0;
+
+	for (int i = 0; i < 2 && code == 0; i++)
+		code = below_stack(below, columns, rows, plan->batch, &feed->in[i], err);
+	if (code == 0 && purpose == FOR_FDK)
+		code = below_stack(below, columns_of(&plan->options, purpose), rows, plan->batch, &feed->filtered, err);
+	return code;
+}
+
+/* What linearises: its plan, and a stack of one slot. */
+static int intake_walk(struct plan *plan, struct below *below, struct error *err)
+{
+	const struct geometry *geometry = plan->options.geometry;
+	struct plan_options options;
+	int code;
+
+	plan->one = intake_grid(plan);
+	options = intake_options(plan, &plan->one);
+	code = below_plan(below, &options, &plan->intake, err);
+	return code < 0 ? code : below_stack(below, geometry->columns, geometry->rows, 1, &plan->taken, err);
+}
+
+/* What slabs of so many slices take on the device for a purpose, the volumes to *ret_volumes. */
+static int slab_bytes(struct plan *plan, enum purpose purpose, int slices, size_t *ret_total, size_t *ret_volumes,
+		      struct error *err)
+{
+	const int most = plan->options.grid->size[2];
+	const int thick = slices + 2 * outofcore_halo(&plan->options, purpose);
+	struct below below = below_of(plan, true);
+	struct slab slab = {.grid = grid_of_slices(plan->options.grid, 0, thick < most ? thick : most)};
+	struct feed feed;
+	int code = slab_walk(plan, purpose, &below, &slab, err);
+
+	/* The slab before is still on its way back. */
+	if (code == 0 && purpose == FOR_FDK)
+		code = below_volume(&below, &slab.grid, &slab.volume, err);
+	if (code == 0 && purpose != FOR_TV)
+		code = feed_walk(plan, purpose, &below, &feed, err);
+	*ret_volumes = below.volumes;
+	*ret_total = below.volumes + below.rest;
 	return code;
 }
 
@@ -202,7 +269,8 @@ static int plan_describe(struct plan *plan, struct device *device, const struct 
 {
 	struct device_info info;
 	struct arena host = {0};
-	size_t intake = 0, budget;
+	struct below below;
+	size_t intake, budget;
 	int code;
 
 	plan->device = device;
@@ -210,9 +278,11 @@ static int plan_describe(struct plan *plan, struct device *device, const struct 
 	for (int i = 0; i < OUTOFCORE_BATCH; i++)
 		plan->identity[i] = i;
 	device->backend->describe(device->below, &info);
-	code = intake_bytes(plan, &intake, err);
+	below = below_of(plan, true);
+	code = intake_walk(plan, &below, err);
 	if (code < 0)
 		return code;
+	intake = below.volumes + below.rest;
 	budget = (size_t)(SHARE * (double)info.bytes_free);
 	budget = budget > intake ? budget - intake : 0;
 	/* Thick slabs before long batches, but rather short batches than nothing. */
@@ -239,21 +309,6 @@ int outofcore_plan_bytes(struct device *device, const struct plan_options *optio
 
 	if (code == 0)
 		*ret_bytes = plan.bytes;
-	return code;
-}
-
-static int open_intake(struct plan *plan, struct error *err)
-{
-	const struct backend *backend = plan->device->backend;
-	const struct geometry *geometry = plan->options.geometry;
-	struct plan_options options;
-	int code;
-
-	plan->one = intake_grid(plan);
-	options = intake_options(plan, &plan->one);
-	code = backend->plan_new(plan->device->below, &options, &plan->intake, err);
-	if (code == 0)
-		code = backend->stack_new(plan->device->below, geometry->columns, geometry->rows, 1, &plan->taken, err);
 	return code;
 }
 
@@ -293,13 +348,15 @@ int outofcore_plan_new(struct device *device, const struct plan_options *options
 		       struct error *err)
 {
 	struct plan *plan = calloc(1, sizeof(*plan));
+	struct below below;
 	int code;
 
 	if (plan == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a plan");
 	code = plan_describe(plan, device, options, err);
+	below = below_of(plan, false);
 	if (code == 0)
-		code = open_intake(plan, err);
+		code = intake_walk(plan, &below, err);
 	if (code == 0)
 		code = allocate(plan, err);
 	if (code == 0)
@@ -324,10 +381,9 @@ void outofcore_plan_free(struct plan *plan)
 
 int slab_open(struct plan *plan, enum purpose purpose, int first, struct slab *ret_slab, struct error *err)
 {
-	const struct backend *backend = plan->device->backend;
 	const int nz = plan->options.grid->size[2], slices = plan->slices[purpose];
 	const int halo = outofcore_halo(&plan->options, purpose);
-	struct plan_options options;
+	struct below below = below_of(plan, false);
 	int code;
 
 	*ret_slab = (struct slab){.first = first, .count = first + slices < nz ? slices : nz - first};
@@ -337,12 +393,9 @@ int slab_open(struct plan *plan, enum purpose purpose, int first, struct slab *r
 		ret_slab->above = halo;
 	ret_slab->grid = grid_of_slices(plan->options.grid, first - ret_slab->below,
 					ret_slab->below + ret_slab->count + ret_slab->above);
-	options = options_for(plan, purpose, &ret_slab->grid);
-	code = backend->plan_new(plan->device->below, &options, &ret_slab->plan, err);
+	code = slab_walk(plan, purpose, &below, ret_slab, err);
 	if (code == 0)
-		code = backend->volume_new(plan->device->below, &ret_slab->grid, &ret_slab->volume, err);
-	if (code == 0)
-		code = backend->volume_fill(ret_slab->volume, 0, err);
+		code = below.backend->volume_fill(ret_slab->volume, 0, err);
 	if (code < 0)
 		slab_close(plan, ret_slab);
 	return code;
@@ -360,17 +413,11 @@ void slab_close(struct plan *plan, struct slab *slab)
 
 int feed_open(struct plan *plan, enum purpose purpose, struct feed *ret_feed, struct error *err)
 {
-	const struct backend *backend = plan->device->backend;
-	const int rows = plan->options.geometry->rows;
-	int code = 0;
+	struct below below = below_of(plan, false);
+	int code;
 
 	*ret_feed = (struct feed){{NULL}, NULL};
-	for (int i = 0; i < 2 && code == 0; i++)
-		code = backend->stack_new(plan->device->below, plan->options.geometry->columns, rows, plan->batch,
-					  &ret_feed->in[i], err);
-	if (code == 0 && purpose == FOR_FDK)
-		code = backend->stack_new(plan->device->below, columns_of(&plan->options, purpose), rows, plan->batch,
-					  &ret_feed->filtered, err);
+	code = feed_walk(plan, purpose, &below, ret_feed, err);
 	if (code < 0)
 		feed_close(plan, ret_feed);
 	return code;
