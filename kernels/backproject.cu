@@ -10,8 +10,8 @@
  * samples with the edges held, and the exact coverage is a factor.
  *
  * By rows, untilted: a voxel column along z has one detector column u, one depth and
- * an even spacing of rows in each view. Its voxels are the neighbours of combs (comb.cuh): the
- * few rows that a comb takes are interpolated across once. In standard precision this goes in half
+ * an even spacing of rows in each view. Its voxels are neighbours with few common values (neighbours.cuh): the
+ * rows that these are taken from are interpolated across once. In standard precision this goes in half
  * precision, and FDK's for rows that lean a little as well.
  *
  * Small problems: a voxel a thread, its views cut into parts for several warps.
@@ -183,10 +183,10 @@ static __device__ __forceinline__ int place_of(int column, const pairs_shape &sh
 
 enum { ROWS_WIDE = 8, ROWS_HIGH = 16 }; /* of a block, by rows */
 
-template <int VOXELS, int WINDOWS, comb KIND>
+template <int VOXELS, int WINDOWS, neighbours KIND>
 static __global__ void __launch_bounds__(ROWS_WIDE *ROWS_HIGH, 8) backproject_untilted(const backprojection_job job)
 {
-	const int run = VOXELS * WINDOWS, rows = comb_values(KIND, VOXELS);
+	const int run = VOXELS * WINDOWS, rows = neighbours_values(KIND, VOXELS);
 	int x = blockIdx.x * ROWS_WIDE + threadIdx.x, y = blockIdx.y * ROWS_HIGH + threadIdx.y, z = blockIdx.z * run;
 	float sum[run], fx = (float)x, fy = (float)y, fz = (float)z;
 	const float2 *p = (const float2 *)job.pairs;
@@ -199,7 +199,7 @@ static __global__ void __launch_bounds__(ROWS_WIDE *ROWS_HIGH, 8) backproject_un
 		float a = fmaf(m[0], fx, fmaf(m[1], fy, m[3])), c = fmaf(m[8], fx, fmaf(m[9], fy, m[11]));
 		float b = fmaf(m[4], fx, fmaf(m[5], fy, fmaf(m[6], fz, m[7]))), w = reciprocal(c);
 		float u = fminf(fmaxf(a * w, -1.0f), job.columns), first = b * w, rise = m[6] * w;
-		float e = rise - comb_spacing(KIND), lowest = comb_lowest(KIND, VOXELS, e);
+		float e = rise - neighbours_spacing(KIND), lowest = neighbours_lowest(KIND, VOXELS, e);
 		float weight = job.use.fdk ? w * w : 1.0f, across;
 		int within = place_of(split(u, across), job.shape);
 		float right = across * weight, left = weight - right;
@@ -216,8 +216,8 @@ static __global__ void __launch_bounds__(ROWS_WIDE *ROWS_HIGH, 8) backproject_un
 				q[j] = fmaf(left, r[j * PANEL].x, right * r[j * PANEL].y);
 #pragma unroll
 			for (int k = 0; k < VOXELS; k++) {
-				const int j = comb_begin(KIND, k);
-				float above = fmaf((float)k, e, t + comb_offset(KIND, k));
+				const int j = neighbours_begin(KIND, k);
+				float above = fmaf((float)k, e, t + neighbours_offset(KIND, k));
 				float &s = sum[n * VOXELS + k];
 
 				s += q[j + 1];
@@ -245,11 +245,11 @@ static __device__ __forceinline__ float single(const __half2 *pairs, int k)
  */
 enum { HALF_VIEWS = 8 };
 
-template <int VOXELS, int WINDOWS, comb KIND, bool LEAN, bool FDK>
+template <int VOXELS, int WINDOWS, neighbours KIND, bool LEAN, bool FDK>
 static __global__ void __launch_bounds__(ROWS_WIDE *ROWS_HIGH, 5) backproject_pairs(const backprojection_job job)
 {
 	const int run = VOXELS * WINDOWS, twos = (VOXELS + 1) / 2;
-	const int pairs = (comb_values(KIND, VOXELS) + 1) / 2;
+	const int pairs = (neighbours_values(KIND, VOXELS) + 1) / 2;
 	int x = blockIdx.x * ROWS_WIDE + threadIdx.x, y = blockIdx.y * ROWS_HIGH + threadIdx.y, z = blockIdx.z * run;
 	float sum[run], fx = (float)x, fy = (float)y, fz = (float)z + (LEAN ? 0.5f * (float)(run - 1) : 0.0f);
 	const __half2 *p = (const __half2 *)job.pairs;
@@ -274,9 +274,9 @@ static __global__ void __launch_bounds__(ROWS_WIDE *ROWS_HIGH, 5) backproject_pa
 			float w = reciprocal(c), middle = b * w, up = LEAN ? fmaf(-middle, m[10], m[6]) : m[6];
 			float u = fminf(fmaxf(a * w, -2.0f), job.columns + 1.0f), rise = up * w;
 			float aside = LEAN ? fmaf(-u, m[10], m[2]) * reciprocal(up) : 0.0f;
-			float e = rise - comb_spacing(KIND), weight = w * w;
+			float e = rise - neighbours_spacing(KIND), weight = w * w;
 			float first = LEAN ? fmaf(-0.5f * (float)(run - 1), rise, middle) : middle, across;
-			float lowest = comb_lowest(KIND, VOXELS, e);
+			float lowest = neighbours_lowest(KIND, VOXELS, e);
 			float slip = LEAN ? -2.0f * w * m[10] * weight : 0.0f;
 			int column = split(u, across);
 			const __half2 *there = p + (place_of(column, job.shape) - (LEAN ? column : 0));
@@ -459,7 +459,7 @@ static int load_array(struct plan *plan, const backprojection_job &job, struct e
 }
 
 /* In float runs are shorter: a thread needs twice the registers. */
-template <comb KIND, int VOXELS, int WINDOWS, int FLOAT_WINDOWS>
+template <neighbours KIND, int VOXELS, int WINDOWS, int FLOAT_WINDOWS>
 static void launch_rows(const struct plan_shape *shape, const backprojection_job &job, cudaStream_t stream)
 {
 	const int run = VOXELS * (shape->back_pairs ? WINDOWS : FLOAT_WINDOWS);
@@ -517,30 +517,30 @@ static backprojection_job job_make(const struct plan *plan, float *volume, struc
 /* By rows, of pairs that are laid out. */
 static void launch_pairs(const struct plan_shape *shape, const backprojection_job &job, cudaStream_t stream)
 {
-	switch (shape->back_comb * 8 + shape->back_voxels) {
-	case COMB_TWOS * 8 + 5:
-		launch_rows<COMB_TWOS, 5, 4, 3>(shape, job, stream);
+	switch (shape->back_neighbours * 8 + shape->back_voxels) {
+	case NEIGHBOURS_TWOS * 8 + 5:
+		launch_rows<NEIGHBOURS_TWOS, 5, 4, 3>(shape, job, stream);
 		break;
-	case COMB_WIDE * 8 + 5:
-		launch_rows<COMB_WIDE, 5, 4, 3>(shape, job, stream);
+	case NEIGHBOURS_WIDE * 8 + 5:
+		launch_rows<NEIGHBOURS_WIDE, 5, 4, 3>(shape, job, stream);
 		break;
-	case COMB_WIDE * 8 + 4:
-		launch_rows<COMB_WIDE, 4, 5, 4>(shape, job, stream);
+	case NEIGHBOURS_WIDE * 8 + 4:
+		launch_rows<NEIGHBOURS_WIDE, 4, 5, 4>(shape, job, stream);
 		break;
-	case COMB_NARROW * 8 + 5:
-		launch_rows<COMB_NARROW, 5, 4, 3>(shape, job, stream);
+	case NEIGHBOURS_NARROW * 8 + 5:
+		launch_rows<NEIGHBOURS_NARROW, 5, 4, 3>(shape, job, stream);
 		break;
-	case COMB_EVEN * 8 + 3:
-		launch_rows<COMB_EVEN, 3, 6, 4>(shape, job, stream);
+	case NEIGHBOURS_EVEN * 8 + 3:
+		launch_rows<NEIGHBOURS_EVEN, 3, 6, 4>(shape, job, stream);
 		break;
-	case COMB_EVEN * 8 + 4:
-		launch_rows<COMB_EVEN, 4, 5, 4>(shape, job, stream);
+	case NEIGHBOURS_EVEN * 8 + 4:
+		launch_rows<NEIGHBOURS_EVEN, 4, 5, 4>(shape, job, stream);
 		break;
-	case COMB_EVEN * 8 + 5:
-		launch_rows<COMB_EVEN, 5, 4, 3>(shape, job, stream);
+	case NEIGHBOURS_EVEN * 8 + 5:
+		launch_rows<NEIGHBOURS_EVEN, 5, 4, 3>(shape, job, stream);
 		break;
 	default:
-		launch_rows<COMB_EVEN, 6, 3, 2>(shape, job, stream);
+		launch_rows<NEIGHBOURS_EVEN, 6, 3, 2>(shape, job, stream);
 	}
 }
 

@@ -49,7 +49,7 @@ struct rows_view {
 /* Into how many parts rays are cut, at most; a warp each. */
 enum { PARTS_MOST = 8, PARTS_OF_FEW = 4 };
 
-template <comb KIND, int ROWS, bool LEAN>
+template <neighbours KIND, int ROWS, bool LEAN>
 static __global__ void __launch_bounds__(32 * PARTS_MOST, ROWS > 4 || LEAN ? 3 : 4) project_view_rows(const rows_view s)
 {
 	extern __shared__ float shared[]; /* [part][3 ROWS][32]: sums, and where rows begin and end */
@@ -91,7 +91,7 @@ static __global__ void __launch_bounds__(32 * PARTS_MOST, ROWS > 4 || LEAN ? 3 :
 		int slice = s.slice[axis], pair = s.pair[axis];
 		half_wandering wander = half_of(wander_of(f.fast_step));
 		auto add = [&](auto guard, int first, int last) {
-			constexpr int GUARD = decltype(guard)::value, pairs = (comb_values(KIND, ROWS) + 1) / 2;
+			constexpr int GUARD = decltype(guard)::value, pairs = (neighbours_values(KIND, ROWS) + 1) / 2;
 			auto place = [&](float i) {
 				spread p;
 
@@ -400,7 +400,7 @@ static void wanted_by(const struct plan *plan, int index, bool ret_wanted[2])
 	ret_wanted[ACROSS_Y] = abs(along[ACROSS_X]) != 4;
 }
 
-template <comb KIND, int ROWS>
+template <neighbours KIND, int ROWS>
 static void launch_rows(const struct plan *plan, const rows_view &s, int count, int views, cudaStream_t stream)
 {
 	int parts = plan->strategy->by_view ? PARTS_MOST : PARTS_OF_FEW;
@@ -418,20 +418,20 @@ static void project_by(const struct plan *plan, const rows_view &s, int count, i
 {
 	const int rows = plan->shape.view_rows;
 
-	/* So few rows find their values in any comb. */
-	switch ((rows <= 3 ? COMB_EVEN : plan->shape.forward_comb) * 8 + rows) {
-	case COMB_EVEN * 8 + 2:
-		return launch_rows<COMB_EVEN, 2>(plan, s, count, views, stream);
-	case COMB_EVEN * 8 + 3:
-		return launch_rows<COMB_EVEN, 3>(plan, s, count, views, stream);
-	case COMB_EVEN * 8 + 4:
-		return launch_rows<COMB_EVEN, 4>(plan, s, count, views, stream);
-	case COMB_EVEN * 8 + 5:
-		return launch_rows<COMB_EVEN, 5>(plan, s, count, views, stream);
-	case COMB_NARROW * 8 + 6:
-		return launch_rows<COMB_NARROW, 6>(plan, s, count, views, stream);
+	/* So few rows find their values however they are spaced. */
+	switch ((rows <= 3 ? NEIGHBOURS_EVEN : plan->shape.forward_neighbours) * 8 + rows) {
+	case NEIGHBOURS_EVEN * 8 + 2:
+		return launch_rows<NEIGHBOURS_EVEN, 2>(plan, s, count, views, stream);
+	case NEIGHBOURS_EVEN * 8 + 3:
+		return launch_rows<NEIGHBOURS_EVEN, 3>(plan, s, count, views, stream);
+	case NEIGHBOURS_EVEN * 8 + 4:
+		return launch_rows<NEIGHBOURS_EVEN, 4>(plan, s, count, views, stream);
+	case NEIGHBOURS_EVEN * 8 + 5:
+		return launch_rows<NEIGHBOURS_EVEN, 5>(plan, s, count, views, stream);
+	case NEIGHBOURS_NARROW * 8 + 6:
+		return launch_rows<NEIGHBOURS_NARROW, 6>(plan, s, count, views, stream);
 	default:
-		return launch_rows<COMB_EVEN, 6>(plan, s, count, views, stream);
+		return launch_rows<NEIGHBOURS_EVEN, 6>(plan, s, count, views, stream);
 	}
 }
 

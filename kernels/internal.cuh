@@ -20,7 +20,7 @@ extern "C" {
 #include "core/backend.h"
 #include "core/fdk.h"
 }
-#include "kernels/comb.cuh"
+#include "kernels/neighbours.cuh"
 
 /* Returns from the calling function, which has `err`, when a CUDA call fails. */
 #define CUDA_TRY(call)                                                                                                 \
@@ -255,14 +255,14 @@ struct plan_shape {
 	bool untilted;    /* the fast kernels apply */
 	bool rows_down;   /* untilted, and rows count against z */
 	int forward_rows; /* rows of one thread in the forward projection by rows; 0: the general one */
-	enum comb forward_comb;
+	enum neighbours forward_neighbours;
 	int view_warps;  /* of forward_rows by 32 rays that meet the grid: of the view with most */
 	int view_rows;   /* forward_rows where SART goes by copies: fewer where a single view sees little of the grid */
 	bool rows_apart; /* they share columns, but no values */
 	bool halves;     /* the forward projection reads pairs in half precision */
 	int back_voxels; /* voxels of one window in the untilted backprojection; 0: the general one */
 	bool is_small;   /* launches take longer than samples: the plainest kernels */
-	enum comb back_comb;
+	enum neighbours back_neighbours;
 	bool back_pairs; /* it reads pairs in half precision */
 	bool textures;   /* 8-bit interpolation weights are allowed */
 	bool z_rays;     /* some ray runs closer to z than to x and y */

@@ -163,28 +163,30 @@ static void row_spacing(const struct geometry *geometry, const struct grid *grid
 	*ret_sign = abs(up) == geometry->count ? (up > 0 ? 1 : -1) : 0;
 }
 
-/* Combs in the order of preference: the more neighbours for a value, the better. */
-struct comb_choice {
-	enum comb kind;
+/* In the order of preference: the more neighbours for a common value, the better. */
+struct neighbours_choice {
+	enum neighbours kind;
 	int count;
 };
-static const comb_choice forward_combs[] = {{COMB_EVEN, 6}, {COMB_EVEN, 5}, {COMB_NARROW, 6},
-					    {COMB_EVEN, 4}, {COMB_EVEN, 3}, {COMB_EVEN, 0}};
-static const comb_choice back_combs[] = {{COMB_TWOS, 5},   {COMB_EVEN, 6}, {COMB_EVEN, 5},
-					 {COMB_NARROW, 5}, {COMB_WIDE, 5}, {COMB_EVEN, 4},
-					 {COMB_WIDE, 4},   {COMB_EVEN, 3}, {COMB_EVEN, 0}};
+static const neighbours_choice forward_neighbours[] = {{NEIGHBOURS_EVEN, 6},   {NEIGHBOURS_EVEN, 5},
+						       {NEIGHBOURS_NARROW, 6}, {NEIGHBOURS_EVEN, 4},
+						       {NEIGHBOURS_EVEN, 3},   {NEIGHBOURS_EVEN, 0}};
+static const neighbours_choice back_neighbours[] = {{NEIGHBOURS_TWOS, 5},   {NEIGHBOURS_EVEN, 6}, {NEIGHBOURS_EVEN, 5},
+						    {NEIGHBOURS_NARROW, 5}, {NEIGHBOURS_WIDE, 5}, {NEIGHBOURS_EVEN, 4},
+						    {NEIGHBOURS_WIDE, 4},   {NEIGHBOURS_EVEN, 3}, {NEIGHBOURS_EVEN, 0}};
 
 /*
- * Whether all neighbours of a comb find their values at this spacing: as the kernels place it, each lies
+ * Whether all neighbours find their values at this spacing: as the kernels place them, each lies
  * 0 .. 1 above the first of its own, and the lowest is up to one value above that.
  */
-static bool comb_holds(comb_choice comb, double spacing)
+static bool neighbours_hold(neighbours_choice choice, double spacing)
 {
 	const double margin = 1e-4; /* float32 */
-	double e = spacing - comb_spacing(comb.kind), lowest = comb_lowest(comb.kind, comb.count, (float)e);
+	double e = spacing - neighbours_spacing(choice.kind),
+	       lowest = neighbours_lowest(choice.kind, choice.count, (float)e);
 
-	for (int k = 0; k < comb.count; k++) {
-		double above = k * e + comb_offset(comb.kind, k) - lowest;
+	for (int k = 0; k < choice.count; k++) {
+		double above = k * e + neighbours_offset(choice.kind, k) - lowest;
 
 		if (above < -margin || above > 1 - margin)
 			return false;
@@ -192,12 +194,12 @@ static bool comb_holds(comb_choice comb, double spacing)
 	return true;
 }
 
-/* The spread of a comb's places is a convex function of the spacing: what holds at both ends, holds between. */
-static comb_choice choose_comb(const comb_choice *combs, double least, double most)
+/* The spread of the neighbours' places is a convex function of the spacing: what holds at both ends, holds between. */
+static neighbours_choice choose_neighbours(const neighbours_choice *choices, double least, double most)
 {
-	while (combs->count > 0 && !(comb_holds(*combs, least) && comb_holds(*combs, most)))
-		combs++;
-	return *combs;
+	while (choices->count > 0 && !(neighbours_hold(*choices, least) && neighbours_hold(*choices, most)))
+		choices++;
+	return *choices;
 }
 
 /*
@@ -224,7 +226,7 @@ static void choose_rows(const struct plan_options *options, struct plan_shape *s
 	const struct geometry *geometry = options->geometry;
 	const double *spacing = options->grid->spacing;
 	double least, most, lean = 0;
-	comb_choice comb;
+	neighbours_choice choice;
 	int sign;
 
 	for (int k = 0; k < geometry->count; k++)
@@ -238,9 +240,9 @@ static void choose_rows(const struct plan_options *options, struct plan_shape *s
 		return;
 	shape->rows_down = sign < 0;
 	if (!shape->z_rays) {
-		comb = choose_comb(forward_combs, least, most);
-		shape->forward_comb = comb.kind;
-		shape->forward_rows = comb.count;
+		choice = choose_neighbours(forward_neighbours, least, most);
+		shape->forward_neighbours = choice.kind;
+		shape->forward_rows = choice.count;
 		shape->rows_apart = shape->forward_rows == 0 && shape->halves;
 		if (shape->rows_apart)
 			shape->forward_rows = ROWS_APART;
@@ -249,9 +251,9 @@ static void choose_rows(const struct plan_options *options, struct plan_shape *s
 	if (!shape->untilted && !(columns_aside(geometry) * BACK_ROWS_MOST < 1))
 		return;
 	shape->back_pairs = shape->halves;
-	comb = choose_comb(back_combs, 1 / most, 1 / least);
-	shape->back_comb = comb.kind;
-	shape->back_voxels = comb.count;
+	choice = choose_neighbours(back_neighbours, 1 / most, 1 / least);
+	shape->back_neighbours = choice.kind;
+	shape->back_voxels = choice.count;
 }
 
 /* Of `rows` by 32 rays that meet the grid: of the view with most. */
@@ -755,7 +757,7 @@ void plan_end_slices(struct plan *plan)
 	owner_of_scratch(plan)->slices_of = NULL;
 }
 
-static const char *const comb_names[] = {"", ", two a row", ", wide", ", narrow"};
+static const char *const neighbours_names[] = {"", ", two a row", ", wide", ", narrow"};
 
 /* The rows of the tables that were chosen, and what they go by. */
 static void summarise(struct plan *plan)
@@ -770,7 +772,7 @@ static void summarise(struct plan *plan)
 	if (shape->back_voxels > 0)
 		snprintf(back, sizeof(back), ", %s, %d voxels a window%s",
 			 shape->untilted ? "untilted" : "near untilted", shape->back_voxels,
-			 comb_names[shape->back_comb]);
+			 neighbours_names[shape->back_neighbours]);
 	if (shape->thrift != THRIFT_NONE)
 		snprintf(
 		    saves, sizeof(saves), "%s%d views at a time; ", shape->thrift == THRIFT_LEAN ? "lean, " : "",

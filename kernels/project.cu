@@ -248,12 +248,12 @@ static __device__ __forceinline__ int first_column(float fast, int panel, float 
 }
 
 /* The samples of slice i in float. */
-template <comb KIND, int ROWS, int GUARD>
+template <neighbours KIND, int ROWS, int GUARD>
 static __device__ __forceinline__ void sample_rows(const float *__restrict__ slice, int panel, const fan &f,
 						   const wandering &wander, float i, const slice_axes &axes,
 						   float value[ROWS])
 {
-	const int values = comb_values(KIND, ROWS);
+	const int values = neighbours_values(KIND, ROWS);
 	float e = fmaf(i, f.spread_step, f.spread), right, t, x[values];
 	int low = lowest_row<KIND, ROWS, GUARD>(f, i, e, axes, t);
 	const float *q =
@@ -265,15 +265,15 @@ static __device__ __forceinline__ void sample_rows(const float *__restrict__ sli
 		x[j] = across_four(q + j * PANEL, 1, four);
 #pragma unroll
 	for (int k = 0; k < ROWS; k++) {
-		const int j = comb_begin(KIND, k);
-		float above = fmaf((float)k, e, t + comb_offset(KIND, k));
+		const int j = neighbours_begin(KIND, k);
+		float above = fmaf((float)k, e, t + neighbours_offset(KIND, k));
 
 		value[k] = fmaf(__saturatef(above), x[j + 2] - x[j + 1],
 				fmaf(-__saturatef(-above), x[j + 1] - x[j], x[j + 1]));
 	}
 }
 
-template <comb KIND, int ROWS, int GUARD, bool LEAN, typename Ends>
+template <neighbours KIND, int ROWS, int GUARD, bool LEAN, typename Ends>
 static __device__ __forceinline__ void add_slices(const float *at, const slices &across, int from, int to, const fan &f,
 						  const wandering &wander, const slice_axes &axes, Ends &ends,
 						  float sum[ROWS])
@@ -287,12 +287,12 @@ static __device__ __forceinline__ void add_slices(const float *at, const slices 
 }
 
 /* The same in half precision. */
-template <comb KIND, int ROWS, int GUARD, bool LEAN, typename Ends>
+template <neighbours KIND, int ROWS, int GUARD, bool LEAN, typename Ends>
 static __device__ __forceinline__ void add_slices(const __half2 *at, const slices &across, int from, int to,
 						  const fan &f, const half_wandering &wander, const slice_axes &axes,
 						  Ends &ends, float sum[ROWS])
 {
-	const int pairs = (comb_values(KIND, ROWS) + 1) / 2;
+	const int pairs = (neighbours_values(KIND, ROWS) + 1) / 2;
 	auto place = [&](float i) {
 		spread s;
 
@@ -392,7 +392,7 @@ static __device__ __forceinline__ void add_apart(const __half2 *at, const slices
 	}
 }
 
-template <comb KIND, int ROWS, typename T, bool LEAN, bool APART>
+template <neighbours KIND, int ROWS, typename T, bool LEAN, bool APART>
 static __global__ void __launch_bounds__(32 * ROWS_WARPS * ROWS_VIEWS, 32 / (ROWS_WARPS * ROWS_VIEWS))
     project_rows(const projection p)
 {
@@ -481,8 +481,8 @@ static __global__ void __launch_bounds__(32 * ROWS_WARPS * ROWS_VIEWS, 32 / (ROW
 	}
 }
 
-template <comb KIND, int ROWS>
-static void launch_comb(const plan_shape &shape, const projection &p, unsigned blocks, cudaStream_t stream)
+template <neighbours KIND, int ROWS>
+static void launch_neighbours(const plan_shape &shape, const projection &p, unsigned blocks, cudaStream_t stream)
 {
 	dim3 threads(32, ROWS_WARPS, ROWS_VIEWS);
 
@@ -499,17 +499,17 @@ static void launch_rows(const struct plan *plan, const projection &p, unsigned b
 	const plan_shape &shape = plan->shape;
 	cudaStream_t stream = plan->device->stream;
 
-	switch (shape.forward_comb * 8 + shape.forward_rows) {
-	case COMB_EVEN * 8 + 3:
-		return launch_comb<COMB_EVEN, 3>(shape, p, blocks, stream);
-	case COMB_EVEN * 8 + 4:
-		return launch_comb<COMB_EVEN, 4>(shape, p, blocks, stream);
-	case COMB_EVEN * 8 + 5:
-		return launch_comb<COMB_EVEN, 5>(shape, p, blocks, stream);
-	case COMB_NARROW * 8 + 6:
-		return launch_comb<COMB_NARROW, 6>(shape, p, blocks, stream);
+	switch (shape.forward_neighbours * 8 + shape.forward_rows) {
+	case NEIGHBOURS_EVEN * 8 + 3:
+		return launch_neighbours<NEIGHBOURS_EVEN, 3>(shape, p, blocks, stream);
+	case NEIGHBOURS_EVEN * 8 + 4:
+		return launch_neighbours<NEIGHBOURS_EVEN, 4>(shape, p, blocks, stream);
+	case NEIGHBOURS_EVEN * 8 + 5:
+		return launch_neighbours<NEIGHBOURS_EVEN, 5>(shape, p, blocks, stream);
+	case NEIGHBOURS_NARROW * 8 + 6:
+		return launch_neighbours<NEIGHBOURS_NARROW, 6>(shape, p, blocks, stream);
 	default:
-		return launch_comb<COMB_EVEN, 6>(shape, p, blocks, stream);
+		return launch_neighbours<NEIGHBOURS_EVEN, 6>(shape, p, blocks, stream);
 	}
 }
 
@@ -519,9 +519,9 @@ static void launch_apart(const struct plan *plan, const projection &p, unsigned 
 	cudaStream_t stream = plan->device->stream;
 
 	if (plan->shape.untilted)
-		project_rows<COMB_EVEN, ROWS_APART, __half2, false, true><<<blocks, threads, 0, stream>>>(p);
+		project_rows<NEIGHBOURS_EVEN, ROWS_APART, __half2, false, true><<<blocks, threads, 0, stream>>>(p);
 	else
-		project_rows<COMB_EVEN, ROWS_APART, __half2, true, true><<<blocks, threads, 0, stream>>>(p);
+		project_rows<NEIGHBOURS_EVEN, ROWS_APART, __half2, true, true><<<blocks, threads, 0, stream>>>(p);
 }
 
 /* Cut once only where all of it would not run at one time. */

@@ -4,8 +4,8 @@
 /*
  * The rays of ROWS neighbouring rows in one column of the detector, where rows run
  * across z. They share their way across the rows' direction, and in every slice
- * they are evenly spaced along z, 1 + e voxels apart: the neighbours of a comb
- * (comb.cuh), whose few values are interpolated across once.
+ * they are evenly spaced along z, 1 + e voxels apart: neighbours with few common
+ * values (neighbours.cuh), which are interpolated across once.
  *
  * In half precision, two neighbours along z a register. Where the rows LEAN, by a
  * degree or so, each pair across counts with its own weights, on the tangent of
@@ -37,10 +37,10 @@ static __device__ __forceinline__ float held(float fast, const slice_axes &axes)
 }
 
 /* The lowest of the values that a fan needs in slice i, and the fan's first row counted from the one above it. */
-template <comb KIND, int ROWS, int GUARD>
+template <neighbours KIND, int ROWS, int GUARD>
 static __device__ __forceinline__ int lowest_row(const fan &f, float i, float e, const slice_axes &axes, float &t)
 {
-	float row = fmaf(i, f.row_step, f.row), base = row + comb_lowest(KIND, ROWS, e);
+	float row = fmaf(i, f.row_step, f.row), base = row + neighbours_lowest(KIND, ROWS, e);
 
 	if (GUARD != GUARD_NONE)
 		base = fminf(fmaxf(base, (float)-SLICE_PAD), (float)axes.rows);

@@ -749,7 +749,7 @@ static const struct kind kinds[] = {
       .size = {43, 41, 37},
       .spacing = {1.5, 1.5, 1.5}},
      11},
-    /* Rows and voxels along z in all the ratios that comb.cuh knows. */
+    /* Rows and voxels along z in all the ratios that neighbours.cuh knows. */
     {"rows a little closer",
      {.columns = 61,
       .rows = 57,
