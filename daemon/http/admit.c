@@ -27,13 +27,13 @@
 #include "daemon/log.h"
 
 enum {
-	CONNECTIONS_SPARE = 128, /* beyond the limit, to be told so or to write */
+	CONNECTIONS_SPARE = 128, /* beyond the limit, to be refused or to write */
 	TURN = 64,               /* accepted from one socket before the next is looked at */
 	PAUSE = 100              /* ms, where there is neither room nor a descriptor */
 };
 static const double idle_after = 1;         /* s, before which a request may be on its way */
 static const double judged_after = 2;       /* s, before which no transfer counts as slow */
-static const double exhaustion_logged = 60; /* s, for which it is told once */
+static const double exhaustion_logged = 60; /* s, within which it is logged once */
 
 /* ---- the list of connections ---- */
 

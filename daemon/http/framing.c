@@ -102,9 +102,10 @@ static bool read_target(struct framing *framing, struct head *head, const char *
 				      (unsigned)(unsigned char)target[i]);
 	}
 	if (length > TARGET_BYTES_MAX)
-		return refuse(framing, 414, "the target has %zu bytes, at most %d are taken", length, TARGET_BYTES_MAX);
+		return refuse(framing, 414, "the target has %zu bytes, at most %d are accepted", length,
+			      TARGET_BYTES_MAX);
 	if (count_of(target, length, '&') >= HEAD_PARAMETERS_MAX)
-		return refuse(framing, 400, "the query has %zu parameters, at most %d are taken",
+		return refuse(framing, 400, "the query has %zu parameters, at most %d are accepted",
 			      count_of(target, length, '&') + 1, HEAD_PARAMETERS_MAX);
 	if (target[0] == '/' || (length == 1 && target[0] == '*'))
 		return true;
@@ -184,7 +185,7 @@ static bool read_field(struct framing *framing, struct head *head, const struct 
 		return false;
 	if (is_name(field, "Host")) {
 		if (head->hosts++ > 0)
-			return refuse(framing, 400, "Host comes twice: who is meant?");
+			return refuse(framing, 400, "Host comes twice, only one is accepted");
 		head->host = field->value;
 		head->host_length = field->value_length;
 	} else if (is_name(field, "Content-Length")) {
@@ -209,7 +210,7 @@ static bool split_field(struct framing *framing, char *line, size_t length, stru
 	size_t blanks = 0, name_length = colon != NULL ? (size_t)(colon - line) : 0, value_length;
 
 	if (line[0] == ' ' || line[0] == '\t')
-		return refuse(framing, 400, "a line begins with a blank: folded fields are not taken");
+		return refuse(framing, 400, "a line begins with a blank: folded fields are not accepted");
 	if (colon == NULL)
 		return refuse(framing, 400, "a line of the head has no colon");
 	if (!is_token(line, name_length))
@@ -237,7 +238,7 @@ static bool judge_head(struct framing *framing, const struct head *head)
 	if (head->authority != NULL && head->hosts > 0 &&
 	    (head->authority_length != head->host_length ||
 	     strncasecmp(head->authority, head->host, head->host_length) != 0))
-		return refuse(framing, 400, "the target names another server than Host: who is meant?");
+		return refuse(framing, 400, "the target names another server than Host does");
 	if (head->encodings > 0 && head->lengths > 0)
 		return refuse(framing, 400, "Content-Length beside Transfer-Encoding: where does the body end?");
 	if (head->encodings > 0 && head->is_1_0)

@@ -53,7 +53,7 @@ struct route {
 struct http_options {
 	const char *listen;         /* as config.listen */
 	const char *server_names;   /* as config.server_names */
-	const char *state_dir;      /* paths in it are not told to clients */
+	const char *state_dir;      /* replies do not show paths in it */
 	const struct route *routes; /* ends with method == NULL */
 	void *context;              /* the handlers' */
 	int threads;

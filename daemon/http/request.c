@@ -276,7 +276,7 @@ static int check_body(struct request *request, struct error *err)
 		return request_reply_problem(request, "length-required", err,
 					     "neither Content-Length nor Transfer-Encoding tells of a body");
 	if (route->body == BODY_WHOLE && request->content_length > (int64_t)route->body_max)
-		return error_set(err, ERR_TOO_LARGE, "the body has %" PRId64 " bytes, at most %zu are taken",
+		return error_set(err, ERR_TOO_LARGE, "the body has %" PRId64 " bytes, at most %zu are accepted",
 				 request->content_length, route->body_max);
 	return route->begin != NULL ? route->begin(request->http->options.context, request, err) : 0;
 }

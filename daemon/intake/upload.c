@@ -196,7 +196,7 @@ static int read_digest(struct upload *upload, struct error *err)
 /*
  * Wrong bytes once stored could never be replaced. So what may still turn out
  * to be wrong counts only when the body has ended well: with a digest promised;
- * compressed, since a frame's checksum comes last; of a length not told before.
+ * compressed, since a frame's checksum comes last; of a length that no header gave.
  */
 static int prepare_holding(struct upload *upload, struct error *err)
 {

@@ -26,30 +26,30 @@ static int record_ending(struct worker *worker, struct error *err)
 	return code;
 }
 
-static void *run_settler(void *context)
+static void *run_syncer(void *context)
 {
-	struct settler *settler = context;
+	struct syncer *syncer = context;
 
-	settler->code = job_settle(settler->job, &settler->err);
-	atomic_store(&settler->done, true);
-	supervise_wake(settler->supervise);
+	syncer->code = job_sync_volumes(syncer->job, &syncer->err);
+	atomic_store(&syncer->done, true);
+	supervise_wake(syncer->supervise);
 	return NULL;
 }
 
-/* Makes sure that the job's volumes are synced. *ret_wait: a settler thread was started and will wake this loop. */
+/* Makes sure that the job's volumes are synced. *ret_wait: a syncer thread was started and will wake this loop. */
 static int settle(struct supervise *supervise, struct worker *worker, bool *ret_wait, struct error *err)
 {
-	struct settler *settler = &worker->settler;
+	struct syncer *syncer = &worker->syncer;
 	struct job_facts facts;
 	int code;
 
 	*ret_wait = false;
-	if (settler->running) {
-		pthread_join(settler->thread, NULL);
-		settler->running = false;
-		if (settler->code != 0) {
-			*err = settler->err;
-			return settler->code;
+	if (syncer->running) {
+		pthread_join(syncer->thread, NULL);
+		syncer->running = false;
+		if (syncer->code != 0) {
+			*err = syncer->err;
+			return syncer->code;
 		}
 		worker->unsettled = 0;
 		job_facts(worker->job, &facts);
@@ -57,11 +57,11 @@ static int settle(struct supervise *supervise, struct worker *worker, bool *ret_
 	}
 	if (worker->unsettled == 0)
 		return 0;
-	*settler = (struct settler){.supervise = supervise, .job = worker->job};
-	code = pthread_create(&settler->thread, NULL, run_settler, settler);
+	*syncer = (struct syncer){.supervise = supervise, .job = worker->job};
+	code = pthread_create(&syncer->thread, NULL, run_syncer, syncer);
 	if (code != 0)
-		return error_set_errno(err, code, "thread that settles volumes");
-	*ret_wait = settler->running = true;
+		return error_set_errno(err, code, "thread that syncs volumes");
+	*ret_wait = syncer->running = true;
 	return 0;
 }
 
@@ -94,7 +94,7 @@ void worker_finish_job(struct supervise *supervise, struct worker *worker)
 	worker_publish(supervise, worker);
 }
 
-/* Clients were told that an image is stored or that the scan is closed, and may rely on it in every volume. */
+/* The daemon has acknowledged an image or the scan's end: every volume must have been made with it. */
 bool worker_is_stale(const struct worker *worker)
 {
 	struct job_facts facts;

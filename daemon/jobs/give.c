@@ -178,7 +178,7 @@ static int give_job(struct supervise *supervise, struct worker *worker, struct j
 
 /*
  * The queue's first, or a waiting job: before it when it has the higher priority and its projections come just now, or
- * came when the worker was told to make room for them: an iteration and a checkpoint may take longer than patience.
+ * came when the worker was asked to make room for them: an iteration and a checkpoint may take longer than patience.
  */
 static struct job *choose_job(struct supervise *supervise, const struct worker *worker, bool *ret_arriving)
 {

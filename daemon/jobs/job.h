@@ -174,7 +174,7 @@ int job_add_volume(struct job *job, const struct volume_record *volume, struct e
  * For a worker that did not live to do it: what has no digest reaches the disk; a file that cannot is removed. Any
  * thread; waits for the disk, with no lock held.
  */
-int job_settle(struct job *job, struct error *err);
+int job_sync_volumes(struct job *job, struct error *err);
 /* See store_job_digest_volume. */
 int job_digest_volume(struct job *job, const struct volume_record *volume, struct error *err);
 int job_add_warning(struct job *job, const char *code, const char *detail, struct error *err);

@@ -74,7 +74,7 @@ struct outcome outcome_of(enum worker_end end, unsigned conditions)
 
 bool worker_leaves(enum worker_end end, unsigned conditions)
 {
-	/* Unasked, somebody told the process itself to end. */
+	/* Without a request of ours, a signal from outside ended the process. */
 	return end == END_DEVICE || (end == END_MADE_ROOM && (conditions & CONDITION_ASKED) == 0);
 }
 

@@ -150,7 +150,7 @@ static void look_at_clock(struct supervise *supervise, bool stopping)
 		struct worker *worker = &supervise->workers[i];
 
 		if (worker->ending.due &&
-		    (now >= worker->ending.again || (worker->settler.running && atomic_load(&worker->settler.done))))
+		    (now >= worker->ending.again || (worker->syncer.running && atomic_load(&worker->syncer.done))))
 			worker_finish_job(supervise, worker);
 		if (worker->state == WORKER_ABSENT && !stopping && now >= worker->start_at)
 			start_worker(supervise, worker);
@@ -336,7 +336,7 @@ static void *supervise_loop(void *context)
 	}
 	/* A job whose end the catalogue would not take stays `running` there; the next start queues it again. */
 	for (int i = 0; i < supervise->count; i++) {
-		if (supervise->workers[i].settler.running)
+		if (supervise->workers[i].syncer.running)
 			worker_finish_job(supervise, &supervise->workers[i]);
 		worker_stop_attending(&supervise->workers[i]);
 		job_release(supervise->workers[i].job);

@@ -350,7 +350,7 @@ static int settle_one(struct job *job, const char *name, struct error *err)
 	return code;
 }
 
-int job_settle(struct job *job, struct error *err)
+int job_sync_volumes(struct job *job, struct error *err)
 {
 	struct volume_record *volumes;
 	int count, code = store_job_volumes(job->jobs->store, job->id, &volumes, &count, err);

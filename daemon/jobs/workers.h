@@ -40,10 +40,10 @@ struct ending {
 };
 
 /*
- * Settles the volumes of a worker that died after it announced them, in a thread of
+ * Syncs the volumes of a worker that died after it announced them, in a thread of
  * its own: the disk may be slow, and other workers do not wait for it.
  */
-struct settler {
+struct syncer {
 	struct supervise *supervise;
 	struct job *job; /* the worker's */
 	pthread_t thread;
@@ -83,7 +83,7 @@ struct worker {
 	int failure_code;             /* why the daemon stopped its job; 0: it did not */
 	char failure_text[320];
 	struct ending ending;
-	struct settler settler;
+	struct syncer syncer;
 };
 
 struct supervise {

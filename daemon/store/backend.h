@@ -58,7 +58,7 @@ struct catalogue_backend {
 	int (*look)(struct catalogue_site *site, int *ret_version, bool *ret_interrupted, struct error *err);
 	/* Opens or makes it and checks that it is whole. */
 	int (*open)(struct catalogue_site *site, void **ret_database, struct error *err);
-	/* From now on requests come. */
+	/* The start is over and requests come. */
 	int (*start)(void *database, struct error *err);
 	void (*close)(void *database); /* NULL is fine */
 	/* Moves a closed catalogue out of the way, with a note of the reason (store/quarantine.h). */
@@ -78,7 +78,7 @@ struct catalogue_backend {
 	/* All that the reader sees from now on is of one moment, or of the present again. */
 	int (*freeze)(void *database, bool frozen, struct error *err);
 
-	/* By the writer. */
+	/* The rest is called in a transaction of the writer, or during the start. */
 	int (*set_version)(void *database, int version, struct error *err);
 	int (*columns)(void *database, const char *table, row_function name, void *context, struct error *err);
 	/* The highest number that COLUMN_SEQUENCE of a table has given; from now on it gives higher ones than `least`.

@@ -16,7 +16,7 @@
  *
  * Errors are those of store.h: ERR_NO_SPACE changes nothing and may pass; when a commit fails for another reason,
  * hooks.failed is called and nothing more should be written. ERR_IO of a reading call: the catalogue is damaged, then
- * catalogue_damaged() says so too, or a row makes no sense.
+ * catalogue_damaged() says so too, or a row is invalid.
  */
 struct catalogue;
 
@@ -41,9 +41,9 @@ void catalogue_close(struct catalogue *catalogue); /* also when it is not open *
 bool catalogue_damaged(const struct catalogue *catalogue);
 /* Closes it and moves it to quarantine/; it is whole then, and empty. */
 int catalogue_set_aside(struct catalogue *catalogue, const char *why, struct error *err);
-/* From now on requests come; a thread of the backend may begin to tidy up. */
+/* The start is over and requests come; a thread of the backend may begin to tidy up. */
 int catalogue_start(struct catalogue *catalogue, struct error *err);
-/* What is read between these two is of one moment; for the start, which reads many small things. */
+/* Calls between these two read the catalogue of one moment; for the start, which makes many of them. */
 int catalogue_freeze(struct catalogue *catalogue, struct error *err);
 int catalogue_thaw(struct catalogue *catalogue, struct error *err);
 
@@ -134,7 +134,7 @@ int catalogue_remove_volume(struct catalogue *catalogue, const char *job, const 
 /* In a group. *ret_new false: this very warning is there already. */
 int catalogue_add_warning(struct catalogue *catalogue, const char *job, const struct warning_record *warning,
 			  bool *ret_new, struct error *err);
-/* In a group: the history behind an iteration; everything that runs have left, but for the events of states. */
+/* In a group: these remove the history behind an iteration; all that runs have left, but for the events of states. */
 int catalogue_rewind(struct catalogue *catalogue, const char *job, int iteration, struct error *err);
 int catalogue_remove_past(struct catalogue *catalogue, const char *job, struct error *err);
 
@@ -165,11 +165,12 @@ struct catalogue_scan_key {
 /* In a group. *ret_number 0: an event of the job with this `once` is there already. */
 int catalogue_add_event(struct catalogue *catalogue, const char *job, const struct event *event, long long *ret_number,
 			struct error *err);
-/* In a group: that this job is gone is an event with the number of one of its own. The latest ones are kept. */
+/* In a group: the removal of a job is an event with the number of one of its own. The latest 1000 are kept. */
 int catalogue_add_removal(struct catalogue *catalogue, const char *job, long long number, struct error *err);
-/* As store_job_events. */
+/* The same as store_job_events. */
 int catalogue_events(struct catalogue *catalogue, const char *job, long long after, int limit,
 		     struct event_record **ret_events, int *ret_count, struct error *err);
+/* At the start. The highest number that an event has had. */
 int catalogue_last_event(struct catalogue *catalogue, long long *ret_number, struct error *err);
 /* In a group: events get numbers above this one, and above all that were given. */
 int catalogue_pass_events(struct catalogue *catalogue, long long least, struct error *err);

@@ -41,7 +41,7 @@ static int take_key(void *context, const struct value *values, struct error *err
 	const struct found_key *found = context;
 
 	if (values[1].size != 32)
-		return error_set(err, ERR_IO, "catalogue: the row of a key makes no sense");
+		return error_set(err, ERR_IO, "catalogue: the row of a key is invalid");
 	snprintf(found->scan, ID_SIZE, "%s", (const char *)values[0].bytes);
 	memcpy(found->sha256, values[1].bytes, 32);
 	return 0;
@@ -158,7 +158,7 @@ static int take_state(void *context, const struct value *values, struct error *e
 		if (strcmp(values[0].bytes, job_state_names[found->state]) == 0)
 			return 0;
 	}
-	return error_set(err, ERR_IO, "catalogue: a job's state makes no sense");
+	return error_set(err, ERR_IO, "catalogue: a job has a state that does not exist");
 }
 
 int catalogue_job_state(struct catalogue *catalogue, const char *job, bool *ret_known, enum job_state *ret_state,

@@ -36,7 +36,7 @@ struct store {
 	bool opened;
 	bool interrupted;    /* the process before did not end as it should */
 	_Atomic bool failed; /* a commit did not reach the disk: nothing is acknowledged any more */
-	atomic_flag failure_told;
+	atomic_flag failure_logged;
 	_Atomic long long last_event;
 
 	struct verified *verified; /* files of volumes; store/verify.c */

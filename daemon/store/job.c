@@ -53,8 +53,8 @@ static int add_event(struct store *store, const char *id, const struct event *ev
 }
 
 /*
- * Ends a transaction that changed what the job's record tells: that goes first. It is synced where somebody was or will
- * be told for good; after a power cut any other is written again from the row.
+ * Ends a group that changed rows of the job's record: the record is written first. It is synced where a client has or
+ * will have an acknowledgement; after a power cut any other record is written again from the rows.
  */
 static int end_with_record(struct store *store, const char *id, bool synced, int code, struct error *err)
 {

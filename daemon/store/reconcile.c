@@ -63,7 +63,7 @@ static int add_known(void *context, const char *id, long long stamp, struct erro
 		r->space = space;
 	}
 	if (!id_valid(id))
-		return error_set(err, ERR_IO, "catalogue: the row of %s \"%.64s\" makes no sense",
+		return error_set(err, ERR_IO, "catalogue: the row of %s \"%.64s\" is invalid",
 				 record_words[r->kind].kind, id);
 	known = &r->rows[r->count++];
 	*known = (struct known){.stamp = stamp};
@@ -84,7 +84,8 @@ static int drop_deleted(struct reconciliation *r, struct error *err)
 	for (int i = 0; i < r->count && code == 0; i++) {
 		if (!was_deleted(r, r->rows[i].id))
 			continue;
-		log_line(LEVEL_INFO, "%s %s was deleted: its row goes", record_words[r->kind].kind, r->rows[i].id);
+		log_line(LEVEL_INFO, "%s %s was deleted: its row is removed", record_words[r->kind].kind,
+			 r->rows[i].id);
 		code = catalogue_remove(r->store->catalogue, r->kind, r->rows[i].id, err);
 		r->rows[i].seen = true;
 	}
@@ -177,7 +178,7 @@ static int take_in(struct reconciliation *r, const char *id, const char *path, s
 	int code = record_read(path, r->kind, id, &record, &why);
 
 	if (code == 0) {
-		log_line(LEVEL_WARNING, "%s %s is not in the catalogue: it is taken in again from its directory",
+		log_line(LEVEL_WARNING, "%s %s is not in the catalogue: it is added again from its directory",
 			 record_words[r->kind].kind, id);
 		code = apply(r, record, &why);
 		cJSON_Delete(record);

@@ -38,7 +38,7 @@ void record_directory(const struct store *store, enum record_kind kind, const ch
 /*
  * Gives the row a new stamp and writes its record into its directory, which is there. synced false: the caller sees to
  * that. A power cut may leave a new record, the one before or an empty file; the row is there then, or nothing was
- * told.
+ * acknowledged.
  */
 int record_write(struct store *store, enum record_kind kind, const char *id, bool synced, struct error *err);
 /* After a group that was rolled back, outside of any, best effort: the record of the rows as they are; without a row it

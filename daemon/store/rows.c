@@ -149,7 +149,7 @@ int row_of_record(const struct table *table, enum statement statement, const voi
 
 /* ---- values to records ---- */
 
-/* What it does not name stays 0; names that this version does not know are passed over. */
+/* Numbers without a name in the text stay 0; names that this version does not know are passed over. */
 static bool read_named(const struct column *column, const char *text, double *ret)
 {
 	cJSON *object = cJSON_Parse(text);
@@ -186,7 +186,7 @@ static void put_integer(const struct column *column, long long number, void *at)
 		memcpy(at, &small, sizeof(small));
 }
 
-/* False: the value makes no sense, or there is no memory (*ret_memory false). */
+/* False: the value is invalid, or there is no memory (*ret_memory false). */
 static bool read_value(const struct column *column, const struct value *value, void *record, bool *ret_memory)
 {
 	char *at = (char *)record + column->at;
@@ -244,8 +244,8 @@ int record_of_row(const struct table *table, const struct value *values, void *r
 		if (!column_takes_part(&table->columns[i], STATEMENT_LIST))
 			continue;
 		if (!read_value(&table->columns[i], values++, record, &memory))
-			return memory ? error_set(err, ERR_IO, "catalogue: a row of %s makes no sense in column %s",
-						  table->name, table->columns[i].name)
+			return memory ? error_set(err, ERR_IO, "catalogue: a row of %s has an invalid %s", table->name,
+						  table->columns[i].name)
 				      : error_set_errno(err, ENOMEM, "rows of %s", table->name);
 	}
 	return 0;

@@ -21,7 +21,7 @@ static int load_scan(struct store *store, const struct catalogue_scan *row, stru
 	if (code != 0)
 		return code;
 	if (!id_valid(row->id))
-		return error_set(err, ERR_IO, "catalogue: the row of scan \"%s\" makes no sense", row->id);
+		return error_set(err, ERR_IO, "catalogue: the row of scan \"%s\" is invalid", row->id);
 	scan = stored_scan_new(store, row->count);
 	if (scan == NULL)
 		return error_set_errno(err, ENOMEM, "list of scans");
@@ -55,8 +55,7 @@ static int load_projections(struct store *store, struct stored_scan *scan, struc
 
 	for (int i = 0; i < count; i++) {
 		if (rows[i].view < 0 || rows[i].view >= scan->count) {
-			log_line(LEVEL_ERROR, "scan %s: the row of projection %d makes no sense", scan->id,
-				 rows[i].view);
+			log_line(LEVEL_ERROR, "scan %s: the row of projection %d is invalid", scan->id, rows[i].view);
 			continue;
 		}
 		memcpy(sum.sha256, rows[i].sha256, sizeof(sum.sha256));

@@ -147,6 +147,17 @@ static void connection_close(struct connection *connection)
 
 /* ---- statements ---- */
 
+/* SQLite numbers parameters as they first appear, and values are bound by these numbers. */
+static void check_parameters(sqlite3_stmt *statement)
+{
+	char name[16];
+
+	for (int i = 1; i <= sqlite3_bind_parameter_count(statement); i++) {
+		snprintf(name, sizeof(name), "$%d", i);
+		assert(strcmp(sqlite3_bind_parameter_name(statement, i), name) == 0);
+	}
+}
+
 static int prepare(struct connection *connection, const char *sql, sqlite3_stmt **ret_statement, struct error *err)
 {
 	int i = 0, result;
@@ -159,6 +170,7 @@ static int prepare(struct connection *connection, const char *sql, sqlite3_stmt 
 					    &connection->cache[i].statement, NULL);
 		if (result != SQLITE_OK)
 			return connection_error(connection, result & 0xff, sql, err);
+		check_parameters(connection->cache[i].statement);
 		connection->cache[i].sql = sql;
 		connection->cached++;
 	}

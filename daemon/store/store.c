@@ -133,7 +133,7 @@ static int open_store(const char *directory, const struct store_hooks *hooks, bo
 	if (hooks != NULL)
 		store->hooks = *hooks;
 	store->lock_file = -1;
-	atomic_flag_clear(&store->failure_told);
+	atomic_flag_clear(&store->failure_logged);
 	lock_init(&store->insertion_lock, LOCK_INSERTION);
 	lock_init(&store->scans_lock, LOCK_SCANS);
 	lock_init(&store->check_lock, LOCK_CHECKS);
@@ -186,7 +186,7 @@ void store_fail(struct store *store, const char *what)
 	if (!store->opened)
 		return; /* store_open fails instead */
 	atomic_store(&store->failed, true);
-	if (!atomic_flag_test_and_set(&store->failure_told)) {
+	if (!atomic_flag_test_and_set(&store->failure_logged)) {
 		log_line(LEVEL_ERROR, "the catalogue has failed, nothing more is accepted: %s", what);
 		if (store->hooks.failed != NULL)
 			store->hooks.failed(store->hooks.context, what);

@@ -25,8 +25,7 @@ enum column_type {
 	COLUMN_TEXT,     /* char[] */
 	COLUMN_STRING,   /* char *, owned by the record; NULL is NULL */
 	COLUMN_CHOICE,   /* enum: the text names[value] */
-	COLUMN_BYTES,    /* uint8_t[]; none while the bool at `known` is false: NULL, or empty bytes in a column that is
-			    not    nullable */
+	COLUMN_BYTES,    /* uint8_t[]; while the bool at `known` is false NULL, or no bytes where NULL is not allowed */
 	COLUMN_NAMED,    /* double[choices]: the text {"fdk": 1.2, ...} by names[], without those that are 0 */
 	COLUMN_PARENT,   /* number of the row of the parent's table, which a statement gets as that row's id */
 	COLUMN_NUMBER,   /* long long, given by the database */
@@ -88,7 +87,7 @@ enum statement {
 	STATEMENT_REMOVE,  /* the row with this id, or all rows of this parent */
 	STATEMENT_COUNT
 };
-/* NULL: no memory. The caller frees it; of a statement that makes no sense for a table nothing is to be expected. */
+/* NULL: no memory. The caller frees it; a statement for rows with an `id` is of use only for a table that has one. */
 char *table_statement(const struct table *table, enum statement statement);
 /* "UPDATE scans SET flat = $1 WHERE id = $2" for column i. */
 char *table_assignment(const struct table *table, int column);
@@ -120,7 +119,7 @@ void row_clear(struct row *row);
 int row_of_column(const struct column *column, const void *record, struct row *ret_row, struct error *err);
 
 /*
- * Fills a zeroed record from a result of LIST. ERR_IO: a value makes no sense. On failure too table_clear frees what
+ * Fills a zeroed record from a result of LIST. ERR_IO: a value is invalid. On failure too table_clear frees what
  * the record owns.
  */
 int record_of_row(const struct table *table, const struct value *values, void *record, struct error *err);
@@ -131,7 +130,7 @@ void table_clear(const struct table *table, void *record);
 cJSON *json_of_row(const struct table *table, const struct value *values);
 /*
  * The parameters of RESTORE or PUT from such an object; members that are no columns are passed over, columns that are
- * missing take their defaults. ERR_INVALID: one has none, or a value makes no sense. `bytes` of all values belong to
+ * missing take their defaults. ERR_INVALID: one has none, or a value is invalid. `bytes` of all values belong to
  * ret_row (row_clear) or to the object.
  */
 int row_of_json(const struct table *table, enum statement statement, const cJSON *object, const struct value *parent,

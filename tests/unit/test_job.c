@@ -818,7 +818,7 @@ START_TEST(what_a_dead_worker_told_of_is_settled_for_it)
 	put_voxels(id, "fdk", "abcd");
 	ck_assert_int_eq(job_add_volume(job, &fdk, &err), 0);
 	ck_assert_int_eq(job_add_volume(job, &lost, &err), 0); /* whose file is not there */
-	ck_assert_int_eq(job_settle(job, &err), 0);
+	ck_assert_int_eq(job_sync_volumes(job, &err), 0);
 	ck_assert_str_eq(volume_of(id, "fdk").name, "fdk");
 	ck_assert_str_eq(volume_of(id, "iter-1").name, "");
 	/* What it was at goes when the job has ended. */

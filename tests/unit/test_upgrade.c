@@ -1,6 +1,7 @@
 /* A catalogue of an earlier version says the same after its upgrade; one of a later version is left alone. */
 #include <check.h>
 #include <inttypes.h>
+#include <math.h>
 #include <signal.h>
 #include <sqlite3.h>
 #include <stdio.h>
@@ -279,6 +280,41 @@ START_TEST(a_catalogue_of_version_10_says_the_same)
 }
 END_TEST
 
+/* Version 1 had neither of these. */
+START_TEST(an_older_catalogue_gets_the_columns_that_it_lacks)
+{
+	sqlite3 *db = open_database();
+	char *arrays = arrays_of_database(db), *volumes;
+	struct job_record *jobs;
+	struct error err = {0};
+	int count;
+
+	run(db,
+	    "DROP TABLE removals; DROP TABLE scan_keys; DROP INDEX events_once; ALTER TABLE events DROP COLUMN once;"
+	    " ALTER TABLE jobs DROP COLUMN basis; ALTER TABLE jobs DROP COLUMN stamp;"
+	    " ALTER TABLE jobs DROP COLUMN noise_hu; ALTER TABLE jobs DROP COLUMN tv_alpha;"
+	    " ALTER TABLE scans DROP COLUMN defects; ALTER TABLE scans DROP COLUMN closed;"
+	    " ALTER TABLE scans DROP COLUMN stamp; ALTER TABLE volumes DROP COLUMN estimate_mm;"
+	    " PRAGMA user_version = 1");
+	volumes = answer(db, "SELECT *, 0.0 FROM volumes ORDER BY number");
+	close_database(db);
+	state_reopen(&state);
+	same_text(arrays_of_store(), arrays);
+	ck_assert_int_eq(store_job_load(state.store, &jobs, &count, &err), 0);
+	ck_assert_int_eq(count, 4);
+	ck_assert_uint_eq(jobs[0].basis, 0);
+	ck_assert(isnan(jobs[0].noise_hu) && isnan(jobs[0].tv_alpha));
+	job_records_free(jobs, count);
+	state_close(&state);
+	db = open_database();
+	same_text(answer(db, "SELECT * FROM volumes ORDER BY number"), volumes);
+	same_text(answer(db, "SELECT DISTINCT defects, closed FROM scans"), "NULL|0\n");
+	close_database(db);
+	free(arrays);
+	free(volumes);
+}
+END_TEST
+
 /* Digests and keys are bytes; everything else has a name or is a number. */
 START_TEST(only_digests_are_bytes)
 {
@@ -540,6 +576,7 @@ Suite *upgrade_suite(void)
 	tcase_add_checked_fixture(tests, set_up, tear_down);
 	tcase_set_timeout(tests, 60);
 	tcase_add_test(tests, a_catalogue_of_version_10_says_the_same);
+	tcase_add_test(tests, an_older_catalogue_gets_the_columns_that_it_lacks);
 	tcase_add_test(tests, only_digests_are_bytes);
 	tcase_add_test(tests, an_upgraded_catalogue_has_the_columns_of_a_new_one);
 	tcase_add_test(tests, stages_that_come_or_go_leave_the_others_their_seconds);
