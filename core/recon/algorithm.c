@@ -4,6 +4,11 @@
 #include <math.h>
 #include <string.h>
 
+const char *const stage_names[STAGE_COUNT] = {
+    [STAGE_LOAD] = "load", [STAGE_FDK] = "fdk",   [STAGE_SART] = "sart",
+    [STAGE_TV] = "tv",     [STAGE_SAVE] = "save", [STAGE_CGLS] = "cgls",
+};
+
 const struct algorithm *const algorithms[ALGORITHM_COUNT] = {&algorithm_sart, &algorithm_cgls};
 
 const struct algorithm *algorithm_find(const char *name)

@@ -54,7 +54,6 @@ struct algorithm {
 	int (*resume)(const struct problem *problem, void *state, const char *bytes, struct error *err);
 };
 
-enum { ALGORITHM_COUNT = 2 };
 extern const struct algorithm *const algorithms[ALGORITHM_COUNT];
 /* By name; NULL when there is none. */
 const struct algorithm *algorithm_find(const char *name);

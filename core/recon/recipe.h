@@ -6,6 +6,7 @@
 /* The recipe's defaults, its ranges, and what is filled in where it leaves something open. */
 extern const char *const projector_names[PROJECTOR_COUNT]; /* "interpolating", "matched" */
 extern const char *const tv_strength_names[TV_STRENGTH_COUNT];
+enum { ALGORITHM_COUNT = 2 };
 extern const struct algorithm algorithm_sart, algorithm_cgls; /* core/recon/algorithm.h */
 
 void recipe_defaults(struct recipe *ret_recipe); /* nothing on; the values that `{}` stages take */

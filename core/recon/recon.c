@@ -11,8 +11,6 @@
 #include "core/outofcore/outofcore.h"
 #include "core/recon/internal.h"
 
-const char *const stage_names[STAGE_COUNT] = {"load", "fdk", "sart", "tv", "save", "cgls"};
-
 /* ---- opening ---- */
 
 static double recipe_work(const struct recipe *recipe, const struct linearise *linearise)
