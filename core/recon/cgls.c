@@ -7,7 +7,7 @@
  * of the rays in the grid, as SART does; ||r||_W^2 = <r, W r>.
  *
  *   r = b - A x                           once, and after TV has moved x
- *   s = A^T W r, 0 where x = 0 and s < 0  the gradient on the free voxels
+ *   s = max(A^T W r, -k x / c)            the gradient; what x >= 0 holds back has no part in it
  *   p = s + p ||s||^2 / ||s of the iteration before||^2
  *   p = max(p, -x / c)                    x + t p >= 0 for all t <= c
  *   q = A p
@@ -45,6 +45,9 @@ struct cgls {
 		double step;      /* a of the last iteration that moved x, 0 before it */
 	} numbers;
 };
+
+/* c over the step of the iteration before, and k. */
+static const double LONGER = 3, STEEPER = 100;
 
 static void cgls_close(const struct problem *problem, void *state)
 {
@@ -141,12 +144,16 @@ static int residual_of(const struct problem *problem, struct cgls *cgls, struct 
 	return code == 0 ? backend->stack_axpby(-1, cgls->projected, NULL, views, 1, r, err) : code;
 }
 
-/* s = A^T W r on the free voxels, and ||s||^2. */
+/*
+ * s = max(A^T W r, -k x / c), and ||s||^2; before the first step 0 where x is 0. With k = 100 few voxels are between
+ * free and held, but s goes over smoothly from the ones to the others: were it 0 where x is exactly 0, rounding would
+ * decide which voxels those are, and a change of 1e-6 in the projections would become one of 1e-3 in the volume.
+ */
 static int gradient(const struct problem *problem, const struct cgls *cgls, struct volume *s, double *ret_gradient2,
 		    struct error *err)
 {
 	const struct backend *backend = problem->backend;
-	const double far = 1e30; /* -far x: 0 where x is 0, else below any s */
+	const double far = cgls->numbers.step > 0 ? STEEPER / (LONGER * cgls->numbers.step) : 1e30;
 	const int views = problem->geometry->count;
 	int code = backend->stack_axpby(1, cgls->residual, NULL, views, 0, cgls->projected, err);
 
@@ -185,8 +192,7 @@ static int line_search(const struct problem *problem, const struct cgls *cgls, d
 /* Bends p, which is set, and finds q and the step along it. */
 static int step_along(const struct problem *problem, const struct cgls *cgls, double *ret_step, struct error *err)
 {
-	const double longer = 3;
-	double most = longer * cgls->numbers.step, step = 0;
+	double most = LONGER * cgls->numbers.step, step = 0;
 	int code = 0;
 
 	if (!problem->nonnegative)
