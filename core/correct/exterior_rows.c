@@ -1,4 +1,4 @@
-/* Rows of the projections that count what lies outside of the grid: see outside.h. */
+/* Rows of the projections that count what lies outside of the grid: see exterior_rows.h. */
 #include "core/correct/exterior_rows.h"
 
 #include <math.h>

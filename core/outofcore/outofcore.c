@@ -242,7 +242,7 @@ static int outofcore_linearise(struct plan *plan, const void *samples, int count
 	return code;
 }
 
-/* Rows of a projection that the filter will extend, by the rule of extend.h. */
+/* Rows of a projection that the filter will extend, by the rule of truncation.h. */
 static void count_extended(const struct plan *plan, const float *projection, size_t counts[2])
 {
 	const struct plan_options *options = &plan->options;

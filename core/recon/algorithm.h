@@ -7,7 +7,7 @@
  * The iterative algorithms: a row of algorithms[] for each, and all that a
  * reconstruction, a recipe and a job's document need to know of it. The loop
  * around it, with TV, kept volumes, history, stop rules and preemption, is
- * core/recon/recon.c's. One thread at a time.
+ * core/recon/run.c's. One thread at a time.
  */
 
 /* What an algorithm works on, all of it borrowed. */
