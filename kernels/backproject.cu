@@ -88,9 +88,7 @@ static __device__ __forceinline__ void put_voxels(const backprojection_job &job,
 				value /= fmaxf(coverage, job.use.least);
 				sure = coverage > job.use.least;
 			}
-			value = fmaf(job.use.scale, value, held[k]);
-			if (job.use.nonnegative && sure)
-				value = fmaxf(value, 0.0f);
+			value = update_voxel(held[k], job.use.scale, value, job.use.nonnegative && sure);
 		} else {
 			value += held[k];
 		}

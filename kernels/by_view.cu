@@ -154,14 +154,12 @@ static __global__ void __launch_bounds__(32 * PARTS_MOST, ROWS > 4 || LEAN ? 3 :
 #pragma unroll
 		for (int j = 0; j < PARTS_MOST; j++)
 			sum += j < parts ? shared[(j * 3 * ROWS + k) * 32 + threadIdx.x] : 0.0f;
-		float residual = measured - sum * factor * step;
-		bool left_out = isnan(measured);
-		float correction = !left_out && length >= s.least && length > 0 ? residual / length : 0.0f;
-		s.correction[slot * s.correction_slot + (size_t)row * s.correction_pitch + column] = correction;
+		corrected ray = correct_ray(measured, sum * factor * step, length, s.least);
+		s.correction[slot * s.correction_slot + (size_t)row * s.correction_pitch + column] = ray.correction;
 		if (s.array != 0)
-			surf2DLayeredwrite(correction, s.array, column * (int)sizeof(float), row, slot);
-		squares.x += left_out ? 0.0f : residual * residual;
-		squares.y += left_out ? 0.0f : measured * measured;
+			surf2DLayeredwrite(ray.correction, s.array, column * (int)sizeof(float), row, slot);
+		squares.x += ray.squares.x;
+		squares.y += ray.squares.y;
 	}
 	squares = block_sum(squares);
 	if (threadIdx.x == 0 && threadIdx.y == 0)
@@ -291,12 +289,11 @@ static __global__ void __launch_bounds__(WIDE *HIGH) update_view_rows(const rows
 				u = fmaf((float)k, m[0][2], a) * w;
 			}
 			float v = fmaf((float)k, m[1][2], b) * w;
-			float next = fmaf(s.relaxation, tex2D<float>(s.sampled, u + 0.5f, v + 0.5f), value[k]);
+			float next = update_voxel(value[k], s.relaxation, tex2D<float>(s.sampled, u + 0.5f, v + 0.5f),
+						  s.nonnegative);
 			bool seen = UPDATE == UPDATE_COVERED ||
 				    (u > -1.0f && v > -1.0f && u < (float)s.columns && v < (float)s.rows);
 
-			if (s.nonnegative)
-				next = fmaxf(next, 0.0f);
 			value[k] = seen ? next : value[k];
 		}
 #pragma unroll

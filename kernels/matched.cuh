@@ -181,9 +181,8 @@ static __device__ __forceinline__ void matched_put(const matched_job &job, size_
 		if (job.cover != NULL)
 			job.cover[at] += cover;
 	} else if (cover > 0) { /* else no ray sees it */
-		float value = fmaf(job.use.scale, sum / fmaxf(cover, job.use.least), job.volume[at]);
-
-		job.volume[at] = job.use.nonnegative && cover > job.use.least ? fmaxf(value, 0.0f) : value;
+		job.volume[at] = update_voxel(job.volume[at], job.use.scale, sum / fmaxf(cover, job.use.least),
+					      job.use.nonnegative && cover > job.use.least);
 	}
 }
 

@@ -79,13 +79,11 @@ static __device__ __forceinline__ float2 finish(const projection &p, int slot, i
 	float2 squares = {0, 0};
 
 	if (p.use.measured != NULL) {
-		float measured = p.use.measured[(size_t)view * p.slot + pixel], residual = measured - integral;
+		corrected ray =
+		    correct_ray(p.use.measured[(size_t)view * p.slot + pixel], integral, length, p.use.least);
 
-		bool left_out = isnan(measured);
-
-		value = !left_out && slices > 0 && length >= p.use.least ? residual / length : 0.0f;
-		if (!left_out)
-			squares = {residual * residual, measured * measured};
+		value = ray.correction;
+		squares = ray.squares;
 	}
 	p.to[(size_t)slot * p.slot + pixel] = value;
 	if (p.use.array != 0)

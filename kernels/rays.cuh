@@ -21,6 +21,7 @@
 #include <cuda_fp16.h>
 
 #include "kernels/internal.cuh"
+#include "kernels/update.cuh"
 
 /* Axes of a slice: across (the dominant one), fast (contiguous in the copies) and row. */
 enum { ACROSS_X, ACROSS_Y, ACROSS_Z };

@@ -40,13 +40,11 @@ struct one_view {
 /* Stores what SART makes of a ray's line integral, and gives the squares for the sums. */
 static __device__ __forceinline__ float2 correct(const one_view &s, int column, int row, float integral, float length)
 {
-	float measured = s.measured[(size_t)row * s.measured_pitch + column], residual = measured - integral;
+	float measured = s.measured[(size_t)row * s.measured_pitch + column];
+	corrected ray = correct_ray(measured, integral, length, s.least);
 
-	bool left_out = isnan(measured);
-
-	s.correction[(size_t)column * s.correction_pitch + row] =
-	    !left_out && length >= s.least && length > 0 ? residual / length : 0.0f;
-	return left_out ? float2{0, 0} : float2{residual * residual, measured * measured};
+	s.correction[(size_t)column * s.correction_pitch + row] = ray.correction;
+	return ray.squares;
 }
 
 enum { VIEW_COLUMNS = 4, VIEW_PARTS = 4 };
@@ -117,11 +115,8 @@ static __global__ void __launch_bounds__(32 * UPDATE_LINES) update_view(const on
 			coverage = __saturatef(fminf(u + 1.0f, columns - u)) * __saturatef(fminf(v + 1.0f, rows - v));
 			sum /= fmaxf(coverage, 1e-30f);
 		}
-		if (coverage > 0) {
-			value[k] = fmaf(s.relaxation, sum, value[k]);
-			if (s.nonnegative)
-				value[k] = fmaxf(value[k], 0.0f);
-		}
+		if (coverage > 0)
+			value[k] = update_voxel(value[k], s.relaxation, sum, s.nonnegative);
 	}
 #pragma unroll
 	for (int k = 0; k < CHUNKS; k++)

@@ -161,26 +161,12 @@ static int bring_back(struct plan *plan, const struct slab *slab, float *ret_to,
 	return plan->device->backend->volume_download(slab->volume, slab->below, slab->count, ret_to, err);
 }
 
-/* v += relaxation sum / coverage; the sums are made relative first where coverages differ. */
-static void update(const struct plan *plan, float *volume, const float *sums, size_t slice, int slices, double scale)
+/* v += relaxation sum / coverage, slice by slice. coverage NULL: `count` views see every voxel. */
+static void update(const struct plan *plan, float *volume, const float *sums, const float *coverage, int count,
+		   size_t slice, int slices)
 {
-	const bool nonnegative = plan->options.sart->nonnegative;
-	const float factor = (float)scale;
-
-#pragma omp parallel for schedule(static)
-	for (int z = 0; z < slices; z++)
-		for (size_t i = (size_t)z * slice; i < ((size_t)z + 1) * slice; i++) {
-			float value = volume[i] + factor * sums[i];
-
-			volume[i] = nonnegative && value < 0 ? 0 : value;
-		}
-}
-
-static void update_covered(const struct plan *plan, float *volume, const float *sums, const float *coverage,
-			   size_t slice, int slices)
-{
-	const bool nonnegative = plan->options.sart->nonnegative;
-	const float relaxation = (float)plan->options.sart->relaxation;
+	const struct sart_options *sart = plan->options.sart;
+	const float relaxation = (float)sart->relaxation, factor = (float)(sart->relaxation / count);
 	const double *spacing = plan->options.grid->spacing;
 	const float least =
 	    plan->options.matched ? (float)(COLUMN_SUM_LEAST * fmin(fmin(spacing[0], spacing[1]), spacing[2])) : 0;
@@ -188,12 +174,14 @@ static void update_covered(const struct plan *plan, float *volume, const float *
 #pragma omp parallel for schedule(static)
 	for (int z = 0; z < slices; z++)
 		for (size_t i = (size_t)z * slice; i < ((size_t)z + 1) * slice; i++) {
+			const bool sure = coverage == NULL || coverage[i] > least;
 			float value;
 
-			if (!(coverage[i] > 0))
+			if (coverage != NULL && !(coverage[i] > 0))
 				continue; /* no ray sees it */
-			value = volume[i] + relaxation * (sums[i] / fmaxf(coverage[i], least));
-			volume[i] = nonnegative && coverage[i] > least && value < 0 ? 0 : value;
+			value = volume[i] + (coverage == NULL ? factor * sums[i]
+							      : relaxation * (sums[i] / fmaxf(coverage[i], least)));
+			volume[i] = sart->nonnegative && sure && value < 0 ? 0 : value;
 		}
 }
 
@@ -209,14 +197,14 @@ static int update_slab(struct plan *plan, struct slab *slab, struct feed *feed, 
 	if (code < 0)
 		return code;
 	if (is_covered(plan, slab, views, count)) {
-		update(plan, here, plan->sums, volume->slice, slab->count, plan->options.sart->relaxation / count);
+		update(plan, here, plan->sums, NULL, count, volume->slice, slab->count);
 		return 0;
 	}
 	code = backproject_slab(plan, slab, feed, true, views, count, err);
 	if (code == 0)
 		code = bring_back(plan, slab, coverage, err);
 	if (code == 0)
-		update_covered(plan, here, plan->sums, coverage, volume->slice, slab->count);
+		update(plan, here, plan->sums, coverage, count, volume->slice, slab->count);
 	return code;
 }
 

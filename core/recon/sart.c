@@ -5,9 +5,153 @@
  *
  *   v_j += relaxation * (sum_S w_ij (p_i - sum_m w_im v_m) / sum_m w_im) / sum_S w_ij
  *
- * The update itself is the backend's sart_iterate; the subsets are core/subsets.h's.
+ * p the line integrals, v the volume, w the weights of the projector. sart_iterate_plainly has
+ * those steps one by one; what runs is the backend's sart_iterate, which fuses them. The subsets
+ * are core/subsets.h's.
  */
+#include "core/recon/sart.h"
+
+#include <math.h>
+
 #include "core/recon/algorithm.h"
+
+/* ---- in plain steps ---- */
+
+struct held {
+	struct volume *update, *coverage; /* sum_S w_ij (...), sum_S w_ij; both hold ones before */
+	struct stack *rays, *lengths;     /* [slot of the subset]: the corrections, sum_m w_im */
+};
+
+static void held_clear(const struct backend *backend, struct held *held)
+{
+	backend->volume_free(held->update);
+	backend->volume_free(held->coverage);
+	backend->stack_free(held->rays);
+	backend->stack_free(held->lengths);
+}
+
+static int held_allocate(const struct sart_steps *steps, struct held *held, struct error *err)
+{
+	const struct backend *backend = steps->backend;
+	const int columns = steps->geometry->columns, rows = steps->geometry->rows;
+	const int slots = subsets_largest(&steps->sart->subsets);
+	int code = backend->volume_new(steps->device, steps->grid, &held->update, err);
+
+	if (code == 0)
+		code = backend->volume_new(steps->device, steps->grid, &held->coverage, err);
+	if (code == 0)
+		code = backend->stack_new(steps->device, columns, rows, slots, &held->rays, err);
+	if (code == 0)
+		code = backend->stack_new(steps->device, columns, rows, slots, &held->lengths, err);
+	return code;
+}
+
+/* Adds ||p||^2 over the rays that are not left out, and ||rays||^2. `lengths` is worked in. */
+static int add_sums(const struct sart_steps *steps, const struct held *held, const struct stack *projections,
+		    const int *views, int count, struct iteration_sums *sums, struct error *err)
+{
+	const struct backend *backend = steps->backend;
+	double residual2 = 0, projection2 = 0;
+	int code = backend->stack_dot(steps->plan, NULL, held->rays, held->rays, count, &residual2, err);
+
+	if (code == 0)
+		code = backend->stack_axpby(1, projections, views, count, 0, held->lengths, err);
+	if (code == 0)
+		code = backend->stack_mask(projections, views, count, held->lengths, err);
+	if (code == 0)
+		code = backend->stack_dot(steps->plan, NULL, held->lengths, held->lengths, count, &projection2, err);
+	sums->residual2 += residual2;
+	sums->projection2 += projection2;
+	return code;
+}
+
+/* rays = (p - A v) / L. `update` is worked in. */
+static int correct(const struct sart_steps *steps, const struct held *held, const struct stack *projections,
+		   const struct volume *volume, const int *views, int count, struct iteration_sums *sums,
+		   struct error *err)
+{
+	const struct backend *backend = steps->backend;
+	const double *mm = steps->grid->spacing, least = RAY_LENGTH_LEAST * fmin(fmin(mm[0], mm[1]), mm[2]);
+	int code = backend->project(steps->plan, volume, views, count, held->rays, err);
+
+	if (code == 0)
+		code = backend->stack_axpby(1, projections, views, count, -1, held->rays, err);
+	if (code == 0)
+		code = backend->stack_mask(projections, views, count, held->rays, err);
+	if (code == 0)
+		code = add_sums(steps, held, projections, views, count, sums, err);
+	if (code == 0)
+		code = backend->volume_fill(held->update, 1, err);
+	if (code == 0)
+		code = backend->project(steps->plan, held->update, views, count, held->lengths, err);
+	return code == 0 ? backend->stack_divide(held->lengths, least, count, held->rays, err) : code;
+}
+
+/* coverage = A^T 1, the least that counts where no ray comes. `update` and `lengths` are worked in. */
+static int cover(const struct sart_steps *steps, const struct held *held, const int *views, int count,
+		 struct error *err)
+{
+	const struct backend *backend = steps->backend;
+	const double *mm = steps->grid->spacing, shortest = fmin(fmin(mm[0], mm[1]), mm[2]);
+	const double least = steps->matched ? COLUMN_SUM_LEAST * shortest : 1e-6;
+	int code = backend->stack_fill(held->lengths, count, 1, err);
+
+	if (code == 0)
+		code = backend->volume_fill(held->coverage, 0, err);
+	if (code == 0)
+		code = backend->backproject(steps->plan, held->lengths, views, count, BACKPROJECT_PLAIN, held->coverage,
+					    err);
+	if (code == 0)
+		code = backend->volume_fill(held->update, 1, err);
+	return code == 0 ? backend->volume_maximum(least, held->update, held->coverage, err) : code;
+}
+
+static int take_subset(const struct sart_steps *steps, const struct held *held, const struct stack *projections,
+		       struct volume *volume, const int *views, int count, struct iteration_sums *sums,
+		       struct error *err)
+{
+	const struct backend *backend = steps->backend;
+	int code = correct(steps, held, projections, volume, views, count, sums, err);
+
+	if (code == 0)
+		code = cover(steps, held, views, count, err);
+	if (code == 0)
+		code = backend->volume_fill(held->update, 0, err);
+	if (code == 0)
+		code =
+		    backend->backproject(steps->plan, held->rays, views, count, BACKPROJECT_PLAIN, held->update, err);
+	if (code == 0)
+		code = backend->volume_divide(held->coverage, 0, held->update, err);
+	if (code == 0)
+		code = backend->volume_axpby(steps->sart->relaxation, held->update, 1, volume, err);
+	if (code == 0 && steps->sart->nonnegative)
+		code = backend->volume_maximum(0, volume, volume, err);
+	return code;
+}
+
+int sart_iterate_plainly(const struct sart_steps *steps, const struct stack *projections, struct volume *volume,
+			 const struct cancel *cancel, struct iteration_sums *ret_sums, struct error *err)
+{
+	const struct subsets *subsets = &steps->sart->subsets;
+	struct iteration_sums sums = {0};
+	struct held held = {0};
+	int code = held_allocate(steps, &held, err);
+
+	for (int s = 0; s < subsets->count && code == 0; s++) {
+		const int first = subsets->start[s], count = subsets->start[s + 1] - first;
+
+		code = cancel_check(cancel, err);
+		if (code == 0 && count > 0)
+			code =
+			    take_subset(steps, &held, projections, volume, subsets->order + first, count, &sums, err);
+	}
+	held_clear(steps->backend, &held);
+	if (code == 0)
+		*ret_sums = sums;
+	return code;
+}
+
+/* ---- the row of algorithms[] ---- */
 
 static int sart_iterate(const struct problem *problem, void *state, bool moved, struct iteration_sums *ret_sums,
 			struct error *err)

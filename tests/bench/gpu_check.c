@@ -15,6 +15,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "core/recon/sart.h"
 #include "core/scan/phantom.h"
 #include "tests/bench/gpu_scene.h"
 
@@ -268,6 +269,18 @@ static void check_scene(const struct scene *scene, struct device *devices[2], in
 	expect(scene, "SART's residual", fabs(worst[5] / worst[4] - 1), 50 * tolerance);
 	worst[4] = difference(got[1], got[0], voxels);
 	expect(scene, "SART", worst[4], 2 * tolerance);
+	/* SART in plain steps on the card's own projectors */
+	must(backend_cuda.volume_fill(sides[1].volume, 0, &err), &err, "fill");
+	for (int i = 0; i < 2; i++) {
+		const struct sart_steps steps = {&backend_cuda, sides[1].device, sides[1].plan, geometry,
+						 &scene->grid,  &sart,           false};
+		struct iteration_sums sums = {0};
+
+		must(sart_iterate_plainly(&steps, sides[1].stack, sides[1].volume, NULL, &sums, &err), &err,
+		     "SART in plain steps");
+	}
+	read_volume(&sides[1], scene, got[2]);
+	expect(scene, "SART in plain steps", difference(got[1], got[2], voxels), 2 * tolerance);
 	/* the same bits again, whatever TV has left in the memory that stages share */
 	must(backend_cuda.volume_upload(sides[1].other, volume, &err), &err, "upload");
 	must(backend_cuda.tv(sides[1].plan, sides[1].other, &tv, NULL, &err), &err, "tv");
