@@ -31,6 +31,12 @@ rule "libmicrohttpd stays in daemon/http" '#include <microhttpd' $(files daemon 
 rule "SQLite stays in daemon/store/sqlite.c and its pages" '#include [<"](sqlite3|daemon/store/sqlite)' \
 	$(files daemon core proto clients | grep -vE '^daemon/store/sqlite(_pages)?\.[ch]$')
 rule "no struct is bytes in the catalogue" 'COLUMN_BYTES.*AT\(' <(grep COLUMN_BYTES daemon/store/tables.c | grep -vE '(sha256|digest)\)')
+found "scripts that their own language cannot read" "$(
+	git ls-files '*.sh' | while read -r script; do bash -n "$script" 2>/dev/null || echo "$script"; done
+	git ls-files '*.py' | while read -r script; do
+		python3 -c 'import ast, sys; ast.parse(open(sys.argv[1]).read())' "$script" 2>/dev/null || echo "$script"
+	done
+)"
 # The rooms of core/ and daemon/, lowest first, each with those beneath it whose doors it may use; a room's own files
 # may include each other. A room's doors are the headers that others may include: ROOM/ROOM.h, or those named in doors.
 core_rooms=("scan:" "cpu: scan" "outofcore: scan" "correct: scan" "recon: scan outofcore correct")
