@@ -6,9 +6,9 @@
 #include <stddef.h>
 #include "core/error.h"
 #include "core/filter.h"
+#include "core/linearise.h"
 #include "core/scan/geometry.h"
 #include "core/scan/grid.h"
-#include "core/scan/image.h"
 #include "core/scan/orbit.h"
 #include "core/subsets.h"
 
@@ -46,44 +46,6 @@ struct device_info {
 	char driver[64]; /* "" on the CPU */
 	size_t bytes_total, bytes_free;
 };
-
-/* How raw samples become line integrals. */
-enum sample { SAMPLE_FLOAT32, SAMPLE_UINT16 };
-enum quantity { QUANTITY_LINE_INTEGRAL, QUANTITY_INTENSITY };
-struct linearise {
-	enum sample sample;
-	enum quantity quantity;
-	double air;        /* counts; used when flat is NULL */
-	const float *flat; /* [row][column] counts, or NULL; host memory that outlives the plan */
-	const float *dark; /* [row][column] counts, or NULL for none */
-	double saturation; /* counts at and above this are defects; 0 = 65535 for uint16, none for float32 */
-	/* [row][column], not zero: a defect in every view; NULL for none. Given and found ones alike
-	 * (core/correct/defects.h).
-	 */
-	const unsigned char *defects;
-	const unsigned char *stuck; /* [row][column], likewise: found by core/correct/stuck.h; NULL for none */
-	/* [row][column], the images that the scan has, NULL for none: for the rows of corrections[] that need others
-	 * than these. */
-	const void *image[IMAGE_COUNT];
-	/*
-	 * First column, first row, last column, last row, all included: the mean
-	 * transmission (I - dark) / (flat - dark) there, defects left out, is each view's
-	 * own air, so that p is 0 where the mean is. For QUANTITY_INTENSITY only.
-	 */
-	bool has_air_region;
-	int air_region[4];
-	/* p' = sum over k of hardening[k] p^k, the last step before defects are replaced; count 0 for none. */
-	const double *hardening;
-	int hardening_count;
-};
-enum { HARDENING_MOST = 8 }; /* coefficients */
-/* From which on a sample says nothing. */
-static inline float linearise_saturation(const struct linearise *linearise)
-{
-	if (linearise->saturation > 0)
-		return (float)linearise->saturation;
-	return linearise->sample == SAMPLE_UINT16 ? 65535.0f : INFINITY;
-}
 
 /* What linearise met, added up and never reset. A pixel counts once, in the first row that fits. */
 struct defect_counts {

@@ -344,8 +344,7 @@ struct plan {
 	int raw_views;    /* projections of the buffer; 0: the plan does not linearise */
 	size_t raw_bytes; /* of one projection */
 	char *raw;
-	float *flat, *dark;
-	unsigned char *map;          /* defects of every view */
+	char *image[IMAGE_COUNT];    /* those of linearise; NULL for none */
 	unsigned char *marks[2];     /* defects of one view */
 	struct linearised *counters; /* linearise.cu */
 

@@ -14,27 +14,25 @@
 #include "kernels/internal.cuh"
 
 struct samples {
+	struct linearise how; /* its images are on the device; its hardening is not, and stands below */
 	const void *raw;
-	bool is_uint16, is_intensity, has_air_region;
-	float air, saturation;
-	const float *flat, *dark;     /* NULL: air, 0 */
-	const unsigned char *defects; /* of every view, NULL: none */
+	float saturation;
 	int columns, rows;
-	int region[4];
 	float hardening[HARDENING_MOST];
-	int hardening_count;
 };
-
-/* What a pixel is; all but GOOD are defects. */
-enum kind { GOOD, MAPPED, NOT_FINITE, SATURATED, ZERO, KIND_COUNT };
 
 /* What a call met, struct defect_counts in numbers that a kernel can add to. */
 struct linearised {
-	unsigned long long kinds[KIND_COUNT]; /* GOOD is not counted */
+	unsigned long long kinds[PIXEL_KINDS]; /* PIXEL_GOOD is not counted */
 	int blank, no_air;
 	float air; /* of the view in hand */
 	float air_least, air_most;
 };
+
+static size_t pixel_bytes(int image)
+{
+	return image_bytes((enum image)image, 1, 1);
+}
 
 void linearise_walk(struct plan *plan, struct arena *arena)
 {
@@ -47,17 +45,8 @@ void linearise_walk(struct plan *plan, struct arena *arena)
 	for (int i = 0; i < 2; i++)
 		take(arena, &plan->marks[i], pixels);
 	take(arena, &plan->counters, 1);
-	take(arena, &plan->flat, options->flat != NULL ? pixels : 0);
-	take(arena, &plan->dark, options->dark != NULL ? pixels : 0);
-	take(arena, &plan->map, options->defects != NULL ? pixels : 0);
-}
-
-/* An image of the scan, where it is given. */
-static int upload_image(void *to, const void *from, size_t bytes, struct error *err)
-{
-	if (to != NULL)
-		CUDA_TRY(cudaMemcpy(to, from, bytes, cudaMemcpyHostToDevice));
-	return 0;
+	for (int i = 0; i < IMAGE_COUNT; i++)
+		take(arena, &plan->image[i], options->image[i] != NULL ? pixels * pixel_bytes(i) : 0);
 }
 
 int linearise_prepare(struct plan *plan, struct error *err)
@@ -65,28 +54,16 @@ int linearise_prepare(struct plan *plan, struct error *err)
 	const struct linearise *options = &plan->options.linearise;
 	size_t pixels = (size_t)plan->stack.columns * (size_t)plan->stack.rows;
 
-	TRY(upload_image(plan->flat, options->flat, pixels * sizeof(float), err));
-	TRY(upload_image(plan->dark, options->dark, pixels * sizeof(float), err));
-	return upload_image(plan->map, options->defects, pixels, err);
+	for (int i = 0; i < IMAGE_COUNT; i++)
+		if (plan->image[i] != NULL)
+			CUDA_TRY(cudaMemcpy(plan->image[i], options->image[i], pixels * pixel_bytes(i),
+					    cudaMemcpyHostToDevice));
+	return 0;
 }
 
-static __device__ __forceinline__ float sample_at(const samples &s, size_t at)
+static __device__ __forceinline__ enum pixel_kind transmission(const samples &s, size_t at, float &ret)
 {
-	return s.is_uint16 ? (float)((const unsigned short *)s.raw)[at] : ((const float *)s.raw)[at];
-}
-
-/* (I - dark) / (flat - dark); anything for a defect. */
-static __device__ __forceinline__ kind transmission(const samples &s, size_t at, float &ret)
-{
-	float sample = sample_at(s, at), dark = s.dark != NULL ? s.dark[at] : 0.0f;
-	float above = sample - dark, range = (s.flat != NULL ? s.flat[at] : s.air) - dark;
-
-	ret = above / range;
-	if (!isfinite(sample) || !isfinite(range) || !(range > 0))
-		return NOT_FINITE;
-	if (!(sample < s.saturation))
-		return SATURATED;
-	return above > 0 ? GOOD : ZERO;
+	return linearise_transmission(&s.how, linearise_sample(&s.how, s.raw, at), at, s.saturation, &ret);
 }
 
 /* The mean transmission of the air region's good pixels, in a fixed order; 0 where there is none. */
@@ -94,14 +71,15 @@ static __global__ void __launch_bounds__(256) find_air(const samples s, linearis
 {
 	__shared__ double sums[256];
 	__shared__ int counts[256];
-	int wide = s.region[2] - s.region[0] + 1, pixels = wide * (s.region[3] - s.region[1] + 1), good = 0;
+	const int *region = s.how.air_region;
+	int wide = region[2] - region[0] + 1, pixels = wide * (region[3] - region[1] + 1), good = 0;
 	double sum = 0;
 
 	for (int i = threadIdx.x; i < pixels; i += 256) {
-		size_t at = (size_t)(s.region[1] + i / wide) * s.columns + (size_t)(s.region[0] + i % wide);
+		size_t at = (size_t)(region[1] + i / wide) * s.columns + (size_t)(region[0] + i % wide);
 		float value;
 
-		if ((s.defects != NULL && s.defects[at]) || transmission(s, at, value) != GOOD)
+		if (linearise_mapped(&s.how, at) || transmission(s, at, value) != PIXEL_GOOD)
 			continue;
 		sum += (double)value;
 		good++;
@@ -135,33 +113,33 @@ static __global__ void __launch_bounds__(256)
 {
 	int column = blockIdx.x * 32 + threadIdx.x, row = blockIdx.y * 8 + threadIdx.y;
 	size_t at = (size_t)row * s.columns + column;
-	kind what = GOOD;
+	enum pixel_kind what = PIXEL_GOOD;
 	float p;
 
 	if (column >= s.columns || row >= s.rows)
 		return;
-	if (s.defects != NULL && s.defects[at]) {
-		what = MAPPED;
+	if (linearise_mapped(&s.how, at)) {
+		what = PIXEL_MAPPED;
 		p = 0;
 	} else {
-		p = sample_at(s, at);
-		if (s.is_intensity) {
+		p = linearise_sample(&s.how, s.raw, at);
+		if (s.how.quantity == QUANTITY_INTENSITY) {
 			what = transmission(s, at, p);
-			p = -logf(s.has_air_region ? p / found->air : p);
+			p = -logf(s.how.has_air_region ? p / found->air : p);
 		}
-		if (s.hardening_count > 0) {
+		if (s.how.hardening_count > 0) {
 			float sum = 0;
 
-			for (int k = s.hardening_count - 1; k >= 0; k--)
+			for (int k = s.how.hardening_count - 1; k >= 0; k--)
 				sum = fmaf(sum, p, s.hardening[k]);
 			p = sum;
 		}
-		if (what == GOOD && !isfinite(p))
-			what = NOT_FINITE;
+		if (what == PIXEL_GOOD && !isfinite(p))
+			what = PIXEL_NOT_FINITE;
 	}
-	slot[(size_t)row * pitch + column] = what == GOOD ? p : 0.0f;
-	marks[at] = what != GOOD;
-	if (what != GOOD)
+	slot[(size_t)row * pitch + column] = what == PIXEL_GOOD ? p : 0.0f;
+	marks[at] = what != PIXEL_GOOD;
+	if (what != PIXEL_GOOD)
 		atomicAdd(&found->kinds[what], 1ull); /* defects are rare */
 }
 
@@ -216,20 +194,14 @@ static samples samples_make(const struct plan *plan)
 	const struct linearise *options = &plan->options.linearise;
 	samples s = {};
 
+	s.how = *options;
+	for (int i = 0; i < IMAGE_COUNT; i++)
+		s.how.image[i] = plan->image[i];
+	s.how.has_air_region = options->has_air_region && options->quantity == QUANTITY_INTENSITY;
 	s.raw = plan->raw;
-	s.is_uint16 = options->sample == SAMPLE_UINT16;
-	s.is_intensity = options->quantity == QUANTITY_INTENSITY;
-	s.air = (float)options->air;
 	s.saturation = linearise_saturation(options);
-	s.flat = plan->flat;
-	s.dark = plan->dark;
-	s.defects = plan->map;
 	s.columns = plan->stack.columns;
 	s.rows = plan->stack.rows;
-	s.has_air_region = s.is_intensity && options->has_air_region;
-	for (int i = 0; i < 4; i++)
-		s.region[i] = options->air_region[i];
-	s.hardening_count = options->hardening_count;
 	for (int k = 0; k < options->hardening_count; k++)
 		s.hardening[k] = (float)options->hardening[k];
 	return s;
@@ -246,7 +218,7 @@ static int linearise_piece(struct plan *plan, int count, const int *slots, struc
 		float *slot = to->data + (size_t)slots[i] * to->shape.slot;
 
 		s.raw = plan->raw + (size_t)i * plan->raw_bytes;
-		if (s.has_air_region) {
+		if (s.how.has_air_region) {
 			find_air<<<1, 256, 0, stream>>>(s, plan->counters);
 			LAUNCHED();
 		}
@@ -263,10 +235,10 @@ static int linearise_piece(struct plan *plan, int count, const int *slots, struc
 
 static void add_counts(struct defect_counts *counts, const linearised *found)
 {
-	counts->mapped += (size_t)found->kinds[MAPPED];
-	counts->not_finite += (size_t)found->kinds[NOT_FINITE];
-	counts->saturated += (size_t)found->kinds[SATURATED];
-	counts->zero += (size_t)found->kinds[ZERO];
+	counts->mapped += (size_t)found->kinds[PIXEL_MAPPED];
+	counts->not_finite += (size_t)found->kinds[PIXEL_NOT_FINITE];
+	counts->saturated += (size_t)found->kinds[PIXEL_SATURATED];
+	counts->zero += (size_t)found->kinds[PIXEL_ZERO];
 	counts->blank += found->blank;
 	counts->no_air += found->no_air;
 	if (found->air_least > 0 && (found->air_least < counts->air_least || counts->air_least == 0))

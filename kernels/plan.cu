@@ -390,7 +390,7 @@ static void describe_raw(struct plan *plan)
 	int part = at_most(divide_up(geometry->count, RAW_PART), resident_views(options));
 
 	plan->raw_views = 1;
-	plan->raw_bytes = pixels_of(plan) * (options->linearise.sample == SAMPLE_UINT16 ? 2 : 4);
+	plan->raw_bytes = pixels_of(plan) * linearise_sample_bytes(&options->linearise);
 	if (plan->raw_bytes < RAW_BYTES)
 		plan->raw_views = (int)(RAW_BYTES / plan->raw_bytes);
 	plan->raw_views = options->no_samples ? 0 : at_most(plan->raw_views, part);

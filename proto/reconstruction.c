@@ -549,12 +549,9 @@ static int set_linearise(struct reconstruction *reconstruction, struct error *er
 	struct linearise *linearise = &reconstruction->linearise;
 
 	*linearise = scan_linearise(files->scan);
-	linearise->flat = files->image[IMAGE_FLAT];
-	linearise->dark = files->image[IMAGE_DARK];
-	linearise->defects = files->image[IMAGE_DEFECTS];
 	for (int i = 0; i < IMAGE_COUNT; i++)
 		linearise->image[i] = files->image[i];
-	if (linearise->quantity == QUANTITY_INTENSITY && linearise->air <= 0 && linearise->flat == NULL)
+	if (linearise->quantity == QUANTITY_INTENSITY && linearise->air <= 0 && linearise->image[IMAGE_FLAT] == NULL)
 		return error_set(err, ERR_IMPOSSIBLE, "intensities need an air value or a flat image, none is there");
 	return 0;
 }

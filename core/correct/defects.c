@@ -74,9 +74,9 @@ static size_t read_images(struct images *images)
 	size_t without = 0;
 
 	for (size_t i = 0; i < pixels; i++) {
-		const float flat = linearise->flat != NULL ? linearise->flat[i] : (float)linearise->air;
+		const float flat = linearise_counts(linearise, IMAGE_FLAT, i, linearise->air);
 
-		images->dark[i] = linearise->dark != NULL ? linearise->dark[i] : 0;
+		images->dark[i] = linearise_counts(linearise, IMAGE_DARK, i, 0);
 		images->range[i] = flat - images->dark[i];
 		if (!isfinite(images->dark[i]))
 			images->dark[i] = NAN;
@@ -97,7 +97,7 @@ static enum verdict judge(const struct images *images, size_t at)
 
 	if (isnan(range))
 		return NOISY_PIXEL;
-	if (linearise->flat != NULL && linearise->flat[at] >= images->saturation)
+	if (linearise_counts(linearise, IMAGE_FLAT, at, 0) >= images->saturation)
 		return HOT_PIXEL;
 	if (!(around >= images->lit))
 		return GOOD;
@@ -114,7 +114,7 @@ static void find(struct images *images, struct defect_map *map)
 	const size_t pixels = (size_t)images->columns * (size_t)images->rows;
 
 	neighbourhood(images, images->range, images->range_median);
-	if (images->linearise->dark != NULL)
+	if (images->linearise->image[IMAGE_DARK] != NULL)
 		neighbourhood(images, images->dark, images->dark_median);
 	else
 		memset(images->dark_median, 0, pixels * sizeof(float));
@@ -157,7 +157,7 @@ static int examine(const struct linearise *linearise, int columns, int rows, str
 	if (2 * without > pixels)
 		code = error_set(err, ERR_IMPOSSIBLE,
 				 "%s is not above the dark image in %.3g %% of the pixels: are they exchanged?",
-				 linearise->flat != NULL ? "the flat image" : "the air value",
+				 linearise->image[IMAGE_FLAT] != NULL ? "the flat image" : "the air value",
 				 100 * (double)without / (double)pixels);
 	else
 		find(&images, map);
@@ -170,20 +170,20 @@ int defect_map_make(struct defect_map *ret_map, const struct linearise *linearis
 {
 	const size_t pixels = (size_t)columns * (size_t)rows;
 	size_t all;
-	const bool images =
-	    linearise->quantity == QUANTITY_INTENSITY && (linearise->flat != NULL || linearise->dark != NULL);
+	const bool images = linearise->quantity == QUANTITY_INTENSITY &&
+			    (linearise->image[IMAGE_FLAT] != NULL || linearise->image[IMAGE_DARK] != NULL);
 	struct defect_map map = {0};
 	int code = 0;
 
-	if (!images && linearise->defects == NULL && linearise->stuck == NULL) {
+	if (!images && linearise->image[IMAGE_DEFECTS] == NULL && linearise->stuck == NULL) {
 		*ret_map = map;
 		return 0;
 	}
 	map.map = calloc(pixels, 1);
 	if (map.map == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a defect map of %d x %d pixels", columns, rows);
-	for (size_t i = 0; linearise->defects != NULL && i < pixels; i++) {
-		map.map[i] = linearise->defects[i] != 0;
+	for (size_t i = 0; i < pixels; i++) {
+		map.map[i] = linearise_mapped(linearise, i);
 		map.given += map.map[i];
 	}
 	if (images)

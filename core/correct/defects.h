@@ -28,7 +28,7 @@ struct defect_map {
 };
 
 /*
- * From linearise's flat, dark, air, saturation, defects and stuck. ERR_IMPOSSIBLE where the flat is not above the dark
+ * From linearise's images, air, saturation and stuck. ERR_IMPOSSIBLE where the flat is not above the dark
  * in most of the pixels, or most are defects: what is made up then is no projection. Line integrals have no flat: only
  * the given map counts then. Free with defect_map_clear.
  */

@@ -10,11 +10,6 @@
 #include "core/correct/correction.h"
 #include "core/truncation.h"
 
-static size_t sample_bytes(const struct input *input)
-{
-	return input->linearise.sample == SAMPLE_UINT16 ? sizeof(uint16_t) : sizeof(float);
-}
-
 /* [row][column] to [column][row], pixels of 1, 2 or 4 bytes. */
 static void exchange(const struct input *input, const void *from, size_t bytes, void *to)
 {
@@ -28,32 +23,38 @@ static void exchange(const struct input *input, const void *from, size_t bytes, 
 			       source + ((size_t)row * (size_t)input->columns + (size_t)column) * bytes, bytes);
 }
 
+/* Room for an image; exchanges it where there is one. */
+static int turn_image(struct input *input, const void *image, size_t bytes, void **ret_exchanged, struct error *err)
+{
+	*ret_exchanged = malloc((size_t)input->columns * (size_t)input->rows * bytes);
+	if (*ret_exchanged == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for images of %d x %d pixels", input->columns,
+				 input->rows);
+	if (image != NULL)
+		exchange(input, image, bytes, *ret_exchanged);
+	return 0;
+}
+
 /* linearise's images and region as the turned detector has them, and room for a projection. */
 static int turn(struct input *input, struct error *err)
 {
 	struct linearise *linearise = &input->linearise;
-	const void *const images[] = {linearise->flat, linearise->dark, linearise->defects, linearise->stuck};
-	const size_t bytes[] = {sizeof(float), sizeof(float), 1, 1, sample_bytes(input)};
-	enum { IMAGES = 4 };
 	const int region[] = {linearise->air_region[1], linearise->air_region[0], linearise->air_region[3],
 			      linearise->air_region[2]};
+	int code = turn_image(input, NULL, linearise_sample_bytes(linearise), &input->projection, err);
 
-	for (int i = 0; i <= IMAGES; i++) {
-		if (i < IMAGES && images[i] == NULL)
+	for (int i = 0; i < IMAGE_COUNT && code == 0; i++) {
+		if (linearise->image[i] == NULL)
 			continue;
-		input->exchanged[i] = malloc((size_t)input->columns * (size_t)input->rows * bytes[i]);
-		if (input->exchanged[i] == NULL)
-			return error_set(err, ERR_NO_MEMORY, "no memory for images of %d x %d pixels", input->columns,
-					 input->rows);
-		if (i < IMAGES)
-			exchange(input, images[i], bytes[i], input->exchanged[i]);
+		code = turn_image(input, linearise->image[i], image_bytes(i, 1, 1), &input->image[i], err);
+		linearise->image[i] = input->image[i];
 	}
-	linearise->flat = input->exchanged[0];
-	linearise->dark = input->exchanged[1];
-	linearise->defects = input->exchanged[2];
-	linearise->stuck = input->exchanged[3];
+	if (code == 0 && linearise->stuck != NULL) {
+		code = turn_image(input, linearise->stuck, 1, &input->stuck, err);
+		linearise->stuck = input->stuck;
+	}
 	memcpy(linearise->air_region, region, sizeof(region));
-	return 0;
+	return code;
 }
 
 int input_open(struct input *ret_input, const struct linearise *linearise, const struct geometry *geometry, bool turned,
@@ -70,7 +71,7 @@ int input_open(struct input *ret_input, const struct linearise *linearise, const
 	if (code == 0)
 		code = defect_map_make(&input.map, &input.linearise, geometry->columns, geometry->rows, err);
 	if (code == 0) {
-		input.linearise.defects = input.map.map;
+		input.linearise.image[IMAGE_DEFECTS] = input.map.map;
 		input.pixels = (size_t)geometry->columns * (size_t)geometry->rows;
 		input.look_every = geometry->count / 32 + 1;
 		input.blank = calloc((size_t)geometry->count, sizeof(*input.blank));
@@ -86,13 +87,15 @@ int input_open(struct input *ret_input, const struct linearise *linearise, const
 
 size_t input_view_bytes(const struct input *input)
 {
-	return sample_bytes(input) * (size_t)input->columns * (size_t)input->rows;
+	return linearise_sample_bytes(&input->linearise) * (size_t)input->columns * (size_t)input->rows;
 }
 
 void input_clear(struct input *input)
 {
-	for (size_t i = 0; i < sizeof(input->exchanged) / sizeof(*input->exchanged); i++)
-		free(input->exchanged[i]);
+	for (int i = 0; i < IMAGE_COUNT; i++)
+		free(input->image[i]);
+	free(input->stuck);
+	free(input->projection);
 	defect_map_clear(&input->map);
 	free(input->blank);
 	*input = (struct input){0};
@@ -101,10 +104,9 @@ void input_clear(struct input *input)
 static void look_at_line_integrals(struct input *input, const void *samples)
 {
 	for (size_t i = 0; i < input->pixels; i += input->pixels / 4096 + 1) {
-		const float p = input->linearise.sample == SAMPLE_UINT16 ? ((const uint16_t *)samples)[i]
-									 : ((const float *)samples)[i];
+		const float p = linearise_sample(&input->linearise, samples, i);
 
-		if (!isfinite(p) || (input->map.map != NULL && input->map.map[i]))
+		if (!isfinite(p) || linearise_mapped(&input->linearise, i))
 			continue;
 		input->sum += (double)p;
 		input->most = p > input->most ? p : input->most;
@@ -130,19 +132,9 @@ static void look_at_bytes(struct input *input, const uint16_t *samples)
 /* The line integral of a pixel as it comes, NAN for a defect; without the air region and hardening. */
 static float line_integral(const struct input *input, const void *samples, size_t at)
 {
-	const struct linearise *linearise = &input->linearise;
-	const float sample =
-	    linearise->sample == SAMPLE_UINT16 ? ((const uint16_t *)samples)[at] : ((const float *)samples)[at];
-	const float dark = linearise->dark != NULL ? linearise->dark[at] : 0;
-	const float flat = linearise->flat != NULL ? linearise->flat[at] : (float)linearise->air;
+	float p = NAN;
 
-	if ((input->map.map != NULL && input->map.map[at]) || !isfinite(sample))
-		return NAN;
-	if (linearise->quantity == QUANTITY_LINE_INTEGRAL)
-		return sample;
-	return sample < linearise_saturation(linearise) && sample > dark && flat > dark
-		   ? -logf((sample - dark) / (flat - dark))
-		   : NAN;
+	return linearise_pixel(&input->linearise, samples, at, &p) == PIXEL_GOOD ? p : NAN;
 }
 
 /* Whether the mean of a piece of the row, 1/32 of it or 8 pixels, reaches the level. */
@@ -220,8 +212,8 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 	int code;
 
 	if (input->turned) {
-		exchange(input, samples, sample_bytes(input), input->exchanged[4]);
-		samples = input->exchanged[4];
+		exchange(input, samples, linearise_sample_bytes(&input->linearise), input->projection);
+		samples = input->projection;
 	}
 	code = backend->linearise(plan, samples, 1, &slot, to, &input->counts, err);
 	if (code < 0)

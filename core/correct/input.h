@@ -8,7 +8,8 @@ struct input {
 	struct linearise linearise; /* as given, with the whole map; exchanged where `turned` */
 	bool turned;                /* rows and columns of all images are exchanged on their way in */
 	int columns, rows;          /* as they come */
-	void *exchanged[5]; /* owned, NULL where not turned: flat, dark, given and stuck defects, a projection */
+	/* Owned, with rows and columns exchanged; NULL where not turned: linearise's images, and room for a view. */
+	void *image[IMAGE_COUNT], *stuck, *projection;
 	struct defect_map map;
 	struct defect_counts counts;
 	int views, defective_views; /* linearised so far, and those of them with defects */

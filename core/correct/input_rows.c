@@ -29,7 +29,7 @@ static int warn_of_no_dark(const struct correction_job *job, void *state, struct
 {
 	(void)state;
 	(void)err;
-	if (job->input->linearise.flat != NULL && job->input->linearise.dark == NULL)
+	if (job->input->linearise.image[IMAGE_FLAT] != NULL && job->input->linearise.image[IMAGE_DARK] == NULL)
 		warning_tell(job->warnings, "no_dark",
 			     "a flat image is there, but no dark one: an offset that the detector adds to its counts "
 			     "makes all that is measured too thin");

@@ -51,14 +51,9 @@ static struct metal_tools tools_of(const struct correction_job *job)
 /* Not above the dark, where the detector could have counted. */
 static bool has_no_counts(const struct input *input, const void *samples, size_t at)
 {
-	const struct linearise *linearise = &input->linearise;
-	const float sample =
-	    linearise->sample == SAMPLE_UINT16 ? ((const uint16_t *)samples)[at] : ((const float *)samples)[at];
-	const float dark = linearise->dark != NULL ? linearise->dark[at] : 0;
-	const float flat = linearise->flat != NULL ? linearise->flat[at] : (float)linearise->air;
+	float p;
 
-	return sample <= dark && isfinite(sample) && flat > dark &&
-	       (linearise->defects == NULL || !linearise->defects[at]);
+	return linearise_pixel(&input->linearise, samples, at, &p) == PIXEL_ZERO;
 }
 
 /* Notes the view's samples without counts; how many there are to *ret_count. */

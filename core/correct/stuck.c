@@ -82,23 +82,6 @@ bool stuck_wants(const struct stuck *stuck, int view)
 	return k * count / stuck->views == view;
 }
 
-/* NAN where the sample says nothing. */
-static float line_integral(const struct linearise *linearise, const void *samples, size_t at)
-{
-	const float sample =
-	    linearise->sample == SAMPLE_UINT16 ? ((const uint16_t *)samples)[at] : ((const float *)samples)[at];
-	const float dark = linearise->dark != NULL ? linearise->dark[at] : 0;
-	const float flat = linearise->flat != NULL ? linearise->flat[at] : (float)linearise->air;
-
-	if (!isfinite(sample) || (linearise->defects != NULL && linearise->defects[at]))
-		return NAN;
-	if (linearise->quantity == QUANTITY_LINE_INTEGRAL)
-		return sample;
-	return sample > dark && flat > dark && sample < linearise_saturation(linearise)
-		   ? logf((flat - dark) / (sample - dark))
-		   : NAN;
-}
-
 /* A row of the view; what says nothing stands in for its neighbours as the last good pixel before it. */
 static void read_row(struct stuck *stuck, const void *samples, int row)
 {
@@ -106,10 +89,7 @@ static void read_row(struct stuck *stuck, const void *samples, int row)
 	float last = 0;
 
 	for (size_t at = from; at < from + columns; at++) {
-		const float p = line_integral(stuck->linearise, samples, at);
-
-		stuck->bad[at] = isnan(p);
-		last = isnan(p) ? last : p;
+		stuck->bad[at] = linearise_pixel(stuck->linearise, samples, at, &last) != PIXEL_GOOD;
 		stuck->values[at] = last;
 	}
 }

@@ -11,43 +11,19 @@
 
 #include <stdlib.h>
 
-/* What a pixel is; all but GOOD are defects, struct defect_counts says which. */
-enum kind { GOOD, MAPPED, NOT_FINITE, SATURATED, ZERO, KIND_COUNT };
-
-/* The sample at `at`, [row][column] of one view. */
-static float sample_at(const struct linearise *options, const void *samples, size_t at)
-{
-	return options->sample == SAMPLE_UINT16 ? ((const uint16_t *)samples)[at] : ((const float *)samples)[at];
-}
-
-/* (I - dark) / (flat - dark); anything for a defect. */
-static enum kind transmission(const struct linearise *options, float sample, size_t at, float saturation, float *ret)
-{
-	const float flat = options->flat != NULL ? options->flat[at] : (float)options->air;
-	const float dark = options->dark != NULL ? options->dark[at] : 0;
-	const float above = sample - dark, range = flat - dark;
-
-	*ret = above / range;
-	if (!isfinite(sample) || !isfinite(range) || !(range > 0))
-		return NOT_FINITE;
-	if (!(sample < saturation))
-		return SATURATED;
-	return above > 0 ? GOOD : ZERO;
-}
-
 /* A sample as a line integral; `air` is that of the view. */
-static enum kind linear(const struct linearise *options, float sample, size_t at, float saturation, float air,
-			float *ret)
+static enum pixel_kind linear(const struct linearise *options, float sample, size_t at, float saturation, float air,
+			      float *ret)
 {
-	enum kind kind = GOOD;
+	enum pixel_kind kind = PIXEL_GOOD;
 	float p = sample, sum = 0;
 
-	if (options->defects != NULL && options->defects[at]) {
+	if (linearise_mapped(options, at)) {
 		*ret = 0;
-		return MAPPED;
+		return PIXEL_MAPPED;
 	}
 	if (options->quantity == QUANTITY_INTENSITY) {
-		kind = transmission(options, sample, at, saturation, &p);
+		kind = linearise_transmission(options, sample, at, saturation, &p);
 		p = -logf(p / air);
 	}
 	if (options->hardening_count > 0) {
@@ -55,9 +31,9 @@ static enum kind linear(const struct linearise *options, float sample, size_t at
 			sum = sum * p + (float)options->hardening[k];
 		p = sum;
 	}
-	if (kind == GOOD && !isfinite(p))
-		kind = NOT_FINITE;
-	*ret = kind == GOOD ? p : 0;
+	if (kind == PIXEL_GOOD && !isfinite(p))
+		kind = PIXEL_NOT_FINITE;
+	*ret = kind == PIXEL_GOOD ? p : 0;
 	return kind;
 }
 
@@ -75,9 +51,10 @@ static double air_of(const struct plan *plan, const void *samples)
 			const size_t at = (size_t)row * (size_t)plan->columns + (size_t)column;
 			float value;
 
-			if (options->defects != NULL && options->defects[at])
+			if (linearise_mapped(options, at))
 				continue;
-			if (transmission(options, sample_at(options, samples, at), at, saturation, &value) != GOOD)
+			if (linearise_transmission(options, linearise_sample(options, samples, at), at, saturation,
+						   &value) != PIXEL_GOOD)
 				continue;
 			sum += (double)value;
 			good++;
@@ -88,7 +65,7 @@ static double air_of(const struct plan *plan, const void *samples)
 
 /* Rows row .. row + count - 1 of one view; adds up each kind of pixel. */
 static void linearise_rows(struct plan *plan, const void *samples, int row, int count, float air, float *ret_view,
-			   size_t kinds[KIND_COUNT])
+			   size_t kinds[PIXEL_KINDS])
 {
 	const struct linearise *options = &plan->linearise;
 	const float saturation = linearise_saturation(options);
@@ -98,10 +75,10 @@ static void linearise_rows(struct plan *plan, const void *samples, int row, int 
 		for (int r = row; r < row + count; r++) {
 			const size_t from = (size_t)r * (size_t)plan->columns + (size_t)column;
 			const size_t to = (size_t)column * rows + (size_t)r;
-			const enum kind kind =
-			    linear(options, sample_at(options, samples, from), from, saturation, air, &ret_view[to]);
+			const enum pixel_kind kind = linear(options, linearise_sample(options, samples, from), from,
+							    saturation, air, &ret_view[to]);
 
-			plan->defective[to] = kind != GOOD;
+			plan->defective[to] = kind != PIXEL_GOOD;
 			kinds[kind]++;
 		}
 	}
@@ -210,13 +187,13 @@ static void replace_defects(struct plan *plan, float *view)
 		replace_once(plan, view);
 }
 
-static void count_defects(struct defect_counts *counts, const size_t kinds[KIND_COUNT])
+static void count_defects(struct defect_counts *counts, const size_t kinds[PIXEL_KINDS])
 {
-	counts->mapped += kinds[MAPPED];
-	counts->not_finite += kinds[NOT_FINITE];
-	counts->saturated += kinds[SATURATED];
-	counts->zero += kinds[ZERO];
-	counts->blank += kinds[GOOD] == 0;
+	counts->mapped += kinds[PIXEL_MAPPED];
+	counts->not_finite += kinds[PIXEL_NOT_FINITE];
+	counts->saturated += kinds[PIXEL_SATURATED];
+	counts->zero += kinds[PIXEL_ZERO];
+	counts->blank += kinds[PIXEL_GOOD] == 0;
 }
 
 static void count_air(struct defect_counts *counts, float air)
@@ -236,12 +213,12 @@ int cpu_linearise(struct plan *plan, const void *samples, int count, const int *
 {
 	enum { BLOCK = 16 };
 	const size_t pixels = (size_t)plan->columns * (size_t)plan->rows;
-	const size_t sample = plan->linearise.sample == SAMPLE_UINT16 ? sizeof(uint16_t) : sizeof(float);
+	const size_t sample = linearise_sample_bytes(&plan->linearise);
 	const int rows = plan->rows;
 
 	for (int i = 0; i < count; i++) {
 		const char *view = (const char *)samples + (size_t)i * pixels * sample;
-		size_t kinds[KIND_COUNT] = {0};
+		size_t kinds[PIXEL_KINDS] = {0};
 		float *slot, air = 1;
 
 		if (slots[i] < 0 || slots[i] >= to->slots)
@@ -252,10 +229,10 @@ int cpu_linearise(struct plan *plan, const void *samples, int count, const int *
 			count_air(counts, air);
 			air = air > 0 ? air : 1;
 		}
-#pragma omp parallel for num_threads(plan->device->threads) reduction(+ : kinds[:KIND_COUNT])
+#pragma omp parallel for num_threads(plan->device->threads) reduction(+ : kinds[:PIXEL_KINDS])
 		for (int row = 0; row < rows; row += BLOCK)
 			linearise_rows(plan, view, row, rows - row < BLOCK ? rows - row : BLOCK, air, slot, kinds);
-		if (kinds[GOOD] < pixels)
+		if (kinds[PIXEL_GOOD] < pixels)
 			replace_defects(plan, slot);
 		count_defects(counts, kinds);
 	}

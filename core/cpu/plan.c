@@ -171,8 +171,7 @@ int cpu_plan_bytes(struct device *device, const struct plan_options *options, st
 	*ret_bytes = (struct plan_bytes){
 	    .volumes = own + (size_t)(1 + (options->sart != NULL)) * cpu_volume_bytes(&plan.grid),
 	    .scratch = arena.used - own,
-	    .raw = (size_t)plan.columns * (size_t)plan.rows *
-		   (options->linearise.sample == SAMPLE_UINT16 ? sizeof(uint16_t) : sizeof(float)),
+	    .raw = (size_t)plan.columns * (size_t)plan.rows * linearise_sample_bytes(&options->linearise),
 	};
 	return 0;
 }

@@ -226,7 +226,7 @@ static int outofcore_linearise(struct plan *plan, const void *samples, int count
 			       struct defect_counts *counts, struct error *err)
 {
 	const struct backend *backend = plan->device->backend;
-	const size_t bytes = to->pixels * (plan->options.linearise.sample == SAMPLE_UINT16 ? 2 : 4);
+	const size_t bytes = to->pixels * linearise_sample_bytes(&plan->options.linearise);
 	int code = 0;
 
 	to->by = NULL;

@@ -4,6 +4,10 @@
 #include <stdbool.h>
 #include <stddef.h>
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 /*
  * The images that a scan may have beside its projections, [row][column] as the detector has them. A row here is all
  * that store, upload, the API's routes and documents, the scan directory and `cbct upload` know of an image:
@@ -47,5 +51,9 @@ static inline size_t image_bytes(enum image image, int columns, int rows)
 
 /* By name; -1 when there is none. */
 int image_find(const char *name);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

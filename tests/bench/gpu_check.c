@@ -513,10 +513,12 @@ static void check_counts(struct device *devices[2], bool corrected)
 			raw[i] = 0; /* nothing to go by */
 	}
 	options = scene_plan(&scene, NULL, 0, NULL, true);
-	options.linearise =
-	    (struct linearise){.sample = SAMPLE_UINT16, .quantity = QUANTITY_INTENSITY, .flat = flat, .dark = dark};
+	options.linearise = (struct linearise){.sample = SAMPLE_UINT16,
+					       .quantity = QUANTITY_INTENSITY,
+					       .image[IMAGE_FLAT] = flat,
+					       .image[IMAGE_DARK] = dark};
 	if (corrected) {
-		options.linearise.defects = map;
+		options.linearise.image[IMAGE_DEFECTS] = map;
 		options.linearise.has_air_region = true;
 		memcpy(options.linearise.air_region, (int[]){3, 5, 17, 30}, sizeof(options.linearise.air_region));
 		options.linearise.hardening = hardening;

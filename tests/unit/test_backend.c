@@ -1555,8 +1555,8 @@ START_TEST(counts_become_line_integrals)
 		    .sample = integers ? SAMPLE_UINT16 : SAMPLE_FLOAT32,
 		    .quantity = QUANTITY_INTENSITY,
 		    .air = 55000,
-		    .flat = images ? flat : NULL,
-		    .dark = images ? dark : NULL,
+		    .image[IMAGE_FLAT] = images ? flat : NULL,
+		    .image[IMAGE_DARK] = images ? dark : NULL,
 		};
 		FOR_EACH_MACHINE(&rig)
 		{

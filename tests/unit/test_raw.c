@@ -131,10 +131,10 @@ static struct linearise as_they_come(const struct counts *counts)
 	return (struct linearise){
 	    .sample = SAMPLE_FLOAT32,
 	    .quantity = QUANTITY_INTENSITY,
-	    .flat = counts->flat,
-	    .dark = counts->dark,
+	    .image[IMAGE_FLAT] = counts->flat,
+	    .image[IMAGE_DARK] = counts->dark,
 	    .saturation = 65535,
-	    .defects = counts->map,
+	    .image[IMAGE_DEFECTS] = counts->map,
 	    .has_air_region = true,
 	    .air_region = {1, 1, 6, 50},
 	    .hardening = water,
@@ -196,8 +196,8 @@ START_TEST(gain_drift_and_hardening_leave_no_trace)
 	outcome.linearise = (struct linearise){
 	    .sample = SAMPLE_FLOAT32,
 	    .quantity = QUANTITY_INTENSITY,
-	    .flat = counts->flat,
-	    .dark = counts->dark,
+	    .image[IMAGE_FLAT] = counts->flat,
+	    .image[IMAGE_DARK] = counts->dark,
 	    .has_air_region = true,
 	    .air_region = {0, 0, COLUMNS - 1, 2},
 	    .hardening = water,
@@ -227,8 +227,8 @@ START_TEST(an_air_region_without_a_good_pixel_is_told)
 	outcome.samples = counts->samples;
 	outcome.linearise = (struct linearise){.sample = SAMPLE_FLOAT32,
 					       .quantity = QUANTITY_INTENSITY,
-					       .flat = counts->flat,
-					       .dark = counts->dark,
+					       .image[IMAGE_FLAT] = counts->flat,
+					       .image[IMAGE_DARK] = counts->dark,
 					       .has_air_region = true};
 	run(&scene, &recipe, &outcome);
 	ck_assert_ptr_nonnull(
@@ -407,7 +407,9 @@ START_TEST(a_detector_on_its_side_gives_the_same_volume)
 	struct recipe recipe = recipe_of(_i);
 	struct outcome outcome = {0}, upright = {0};
 	struct scene scene, side;
-	struct counts *counts = malloc(sizeof(*counts)), *turned = malloc(sizeof(*turned));
+	struct counts *counts = malloc(sizeof(*counts));
+	void *images[IMAGE_COUNT] = {NULL};
+	float *samples = malloc(sizeof(*samples) * PIXELS * VIEWS);
 	struct error err;
 
 	make_scene(&scene);
@@ -421,17 +423,19 @@ START_TEST(a_detector_on_its_side_gives_the_same_volume)
 	side = scene;
 	ck_assert_int_eq(geometry_exchange(&side.geometry, &scene.geometry, &err), 0);
 	ck_assert_int_eq(side.geometry.columns, ROWS);
-	exchange(counts->flat, sizeof(float), turned->flat);
-	exchange(counts->dark, sizeof(float), turned->dark);
-	exchange(counts->map, 1, turned->map);
-	turned->samples = malloc(sizeof(float) * PIXELS * VIEWS);
 	for (int k = 0; k < VIEWS; k++)
-		exchange(&counts->samples[k * PIXELS], sizeof(float), &turned->samples[k * PIXELS]);
-	outcome.samples = turned->samples;
+		exchange(&counts->samples[k * PIXELS], sizeof(float), &samples[k * PIXELS]);
+	outcome.samples = samples;
 	outcome.linearise = upright.linearise;
-	outcome.linearise.flat = turned->flat;
-	outcome.linearise.dark = turned->dark;
-	outcome.linearise.defects = turned->map;
+	for (int i = 0; i < IMAGE_COUNT; i++) {
+		const void *image = upright.linearise.image[i];
+
+		if (image == NULL)
+			continue;
+		images[i] = malloc(image_bytes(i, COLUMNS, ROWS));
+		exchange(image, image_bytes(i, 1, 1), images[i]);
+		outcome.linearise.image[i] = images[i];
+	}
 	memcpy(outcome.linearise.air_region, (const int[]){1, 1, 50, 6}, sizeof(outcome.linearise.air_region));
 	run(&side, &recipe, &outcome);
 	ck_assert_str_eq(outcome.warnings, upright.warnings);
@@ -440,10 +444,11 @@ START_TEST(a_detector_on_its_side_gives_the_same_volume)
 	outcome_clear(&upright);
 	geometry_clear(&side.geometry);
 	scene_clear(&scene);
+	for (int i = 0; i < IMAGE_COUNT; i++)
+		free(images[i]);
+	free(samples);
 	free(counts->samples);
-	free(turned->samples);
 	free(counts);
-	free(turned);
 }
 END_TEST
 
@@ -510,8 +515,8 @@ START_TEST(defects_are_found_in_flat_and_dark)
 		for (int r = rows[i].rows[0]; r <= rows[i].rows[1]; r++)
 			for (int c = rows[i].columns[0]; c <= rows[i].columns[1]; c++)
 				place(counts, c, r, rows[i].fault);
-		linearise.flat = counts->flat;
-		linearise.dark = counts->dark;
+		linearise.image[IMAGE_FLAT] = counts->flat;
+		linearise.image[IMAGE_DARK] = counts->dark;
 		ck_assert_int_eq(defect_map_make(&map, &linearise, COLUMNS, ROWS, &err), 0);
 		ck_assert_msg(map.dead == rows[i].dead && map.hot == rows[i].hot && map.noisy == rows[i].noisy,
 			      "%s: %zu dead, %zu hot, %zu noisy", rows[i].what, map.dead, map.hot, map.noisy);
@@ -537,8 +542,10 @@ END_TEST
 START_TEST(the_shadow_of_a_collimator_is_no_defect)
 {
 	struct counts *counts = malloc(sizeof(*counts));
-	struct linearise linearise = {
-	    .sample = SAMPLE_UINT16, .quantity = QUANTITY_INTENSITY, .flat = counts->flat, .dark = counts->dark};
+	struct linearise linearise = {.sample = SAMPLE_UINT16,
+				      .quantity = QUANTITY_INTENSITY,
+				      .image[IMAGE_FLAT] = counts->flat,
+				      .image[IMAGE_DARK] = counts->dark};
 	struct defect_map map;
 	struct scene scene;
 	struct error err;
@@ -567,8 +574,10 @@ START_TEST(exchanged_images_are_refused)
 	make_scene(&scene);
 	make_counts(&scene, counts);
 	outcome.samples = counts->samples;
-	outcome.linearise = (struct linearise){
-	    .sample = SAMPLE_FLOAT32, .quantity = QUANTITY_INTENSITY, .flat = counts->dark, .dark = counts->flat};
+	outcome.linearise = (struct linearise){.sample = SAMPLE_FLOAT32,
+					       .quantity = QUANTITY_INTENSITY,
+					       .image[IMAGE_FLAT] = counts->dark,
+					       .image[IMAGE_DARK] = counts->flat};
 	scene_run(&scene, &recipe, &outcome);
 	ck_assert_int_eq(outcome.code, ERR_IMPOSSIBLE);
 	ck_assert_ptr_nonnull(
@@ -576,7 +585,7 @@ START_TEST(exchanged_images_are_refused)
 	outcome_clear(&outcome);
 	outcome.samples = counts->samples;
 	outcome.linearise = (struct linearise){
-	    .sample = SAMPLE_FLOAT32, .quantity = QUANTITY_INTENSITY, .air = 150, .dark = counts->dark};
+	    .sample = SAMPLE_FLOAT32, .quantity = QUANTITY_INTENSITY, .air = 150, .image[IMAGE_DARK] = counts->dark};
 	scene_run(&scene, &recipe, &outcome);
 	ck_assert_int_eq(outcome.code, ERR_IMPOSSIBLE);
 	outcome_clear(&outcome);
@@ -605,9 +614,9 @@ START_TEST(a_detector_of_defects_is_refused)
 	outcome.samples = counts->samples;
 	outcome.linearise = (struct linearise){.sample = SAMPLE_FLOAT32,
 					       .quantity = QUANTITY_INTENSITY,
-					       .flat = counts->flat,
-					       .dark = counts->dark,
-					       .defects = counts->map};
+					       .image[IMAGE_FLAT] = counts->flat,
+					       .image[IMAGE_DARK] = counts->dark,
+					       .image[IMAGE_DEFECTS] = counts->map};
 	scene_run(&scene, &recipe, &outcome);
 	ck_assert_int_eq(outcome.code, ERR_IMPOSSIBLE);
 	ck_assert_msg(strstr(outcome.err.text, "% of the pixels are defects, half of them can be at most: ") != NULL,
@@ -654,8 +663,10 @@ START_TEST(measured_counts_are_what_their_publishers_say)
 		slots[k] = k;
 	}
 	ck_assert_int_eq(geometry_circular(&geometry, SIDE, SIDE, SHOT, &circular, angles, &err), 0);
-	options.linearise =
-	    (struct linearise){.sample = SAMPLE_FLOAT32, .quantity = QUANTITY_INTENSITY, .flat = flat, .dark = images};
+	options.linearise = (struct linearise){.sample = SAMPLE_FLOAT32,
+					       .quantity = QUANTITY_INTENSITY,
+					       .image[IMAGE_FLAT] = flat,
+					       .image[IMAGE_DARK] = images};
 	ck_assert_int_eq(defect_map_make(&map, &options.linearise, SIDE, SIDE, &err), 0);
 	ck_assert_ptr_null(map.map);
 	ck_assert_int_eq(backend_cpu.open(0, &device_options, &device, &err), 0);
