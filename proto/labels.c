@@ -37,15 +37,14 @@ static int check_label(const cJSON *label, const char *base, struct error *err)
 	return 0;
 }
 
-int labels_read(const cJSON *value, const char *base, char ret_text[LABELS_TEXT_MAX], struct error *err)
+int labels_read(const cJSON *value, const char *base, char **ret_text, struct error *err)
 {
 	const cJSON *label;
 	char what[100], *text;
 	size_t length = 0;
-	int code = 0;
 
 	if (value == NULL || cJSON_IsNull(value)) {
-		ret_text[0] = '\0';
+		*ret_text = NULL;
 		return 0;
 	}
 	if (!cJSON_IsObject(value))
@@ -57,9 +56,8 @@ int labels_read(const cJSON *value, const char *base, char ret_text[LABELS_TEXT_
 	}
 	cJSON_ArrayForEach(label, value)
 	{
-		code = check_label(label, base, err);
-		if (code != 0)
-			return code;
+		if (check_label(label, base, err) != 0)
+			return err->code;
 	}
 	text = json_print(value, &length);
 	if (text == NULL)
@@ -67,10 +65,9 @@ int labels_read(const cJSON *value, const char *base, char ret_text[LABELS_TEXT_
 	if (length >= LABELS_TEXT_MAX) {
 		snprintf(what, sizeof(what), "labels of %zu bytes in all, at most %d are expected", length,
 			 LABELS_TEXT_MAX - 1);
-		code = fail(err, ERR_IMPOSSIBLE, base, what);
-	} else {
-		memcpy(ret_text, text, length + 1);
+		free(text);
+		return fail(err, ERR_IMPOSSIBLE, base, what);
 	}
-	free(text);
-	return code;
+	*ret_text = text;
+	return 0;
 }

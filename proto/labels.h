@@ -12,10 +12,10 @@ enum {
 };
 
 /*
- * Reads {"key": "value", ...} and gives it as compact JSON, "" for none; NULL and
- * null are none. ERR_INVALID for another type, an empty name, control characters;
+ * Reads {"key": "value", ...} and gives it as compact JSON, owned by the caller, NULL for none; NULL
+ * and null are none. ERR_INVALID for another type, an empty name, control characters;
  * ERR_IMPOSSIBLE for too many and too long ones.
  */
-int labels_read(const cJSON *value, const char *base, char ret_text[LABELS_TEXT_MAX], struct error *err);
+int labels_read(const cJSON *value, const char *base, char **ret_text, struct error *err);
 
 #endif

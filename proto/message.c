@@ -541,5 +541,5 @@ int message_receive(int socket, int timeout_ms, struct message *ret_message, boo
 
 void message_clear(struct message *message)
 {
-	recipe_clear(&message->request.recipe);
+	job_request_clear(&message->request);
 }

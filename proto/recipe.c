@@ -33,6 +33,29 @@ static struct parameter_set members_of(const char *object)
 				      .counting = strcmp(object, OBJECT_ALGORITHM) == 0};
 }
 
+void job_request_clear(struct job_request *request)
+{
+	recipe_clear(&request->recipe);
+	free(request->labels);
+	*request = (struct job_request){0};
+}
+
+int job_request_copy(struct job_request *ret_request, const struct job_request *request, struct error *err)
+{
+	struct job_request copy = *request;
+	int code = recipe_copy(&copy.recipe, &request->recipe, err);
+
+	if (code != 0)
+		return code;
+	copy.labels = request->labels == NULL ? NULL : strdup(request->labels);
+	if (request->labels != NULL && copy.labels == NULL) {
+		recipe_clear(&copy.recipe);
+		return error_set(err, ERR_NO_MEMORY, "no memory for labels");
+	}
+	*ret_request = copy;
+	return 0;
+}
+
 /* ---- reading ---- */
 
 static int read_grid(struct recipe *recipe, const cJSON *value, struct error *err)
@@ -222,7 +245,7 @@ int job_request_read(const cJSON *value, struct job_request *ret_request, struct
 	if (code == 0)
 		code = patient_read(members.patient, "/patient", &request.patient, err);
 	if (code == 0)
-		code = labels_read(members.labels, "/labels", request.labels, err);
+		code = labels_read(members.labels, "/labels", &request.labels, err);
 	for (int i = 0; i < STAGES && code == 0; i++)
 		if (members.stages[i] != NULL)
 			code = stages[i].read(&request.recipe, members.stages[i], err);
@@ -230,7 +253,7 @@ int job_request_read(const cJSON *value, struct job_request *ret_request, struct
 		if (members.algorithms[i] != NULL)
 			code = read_algorithm(&request.recipe, algorithms[i], members.algorithms[i], err);
 	if (code != 0) {
-		recipe_clear(&request.recipe);
+		job_request_clear(&request);
 		return code;
 	}
 	*ret_request = request;
@@ -356,7 +379,8 @@ cJSON *recipe_json(const struct recipe *recipe)
 bool job_request_same(const struct job_request *a, const struct job_request *b)
 {
 	return strcmp(a->scan, b->scan) == 0 && a->priority == b->priority && patient_same(&a->patient, &b->patient) &&
-	       strcmp(a->labels, b->labels) == 0 && recipe_same(&a->recipe, &b->recipe);
+	       strcmp(a->labels != NULL ? a->labels : "", b->labels != NULL ? b->labels : "") == 0 &&
+	       recipe_same(&a->recipe, &b->recipe);
 }
 
 cJSON *job_request_json(const struct job_request *request)
@@ -365,7 +389,7 @@ cJSON *job_request_json(const struct job_request *request)
 
 	if (document != NULL && add(document, "scan", cJSON_CreateString(request->scan)) &&
 	    add(document, "patient", patient_json(&request->patient)) &&
-	    (request->labels[0] == '\0' || add(document, "labels", cJSON_Parse(request->labels))) &&
+	    (request->labels == NULL || add(document, "labels", cJSON_Parse(request->labels))) &&
 	    add_emit(document, &request->recipe) &&
 	    add(document, "priority", cJSON_CreateString(priority_names[request->priority])))
 		return document;

@@ -14,10 +14,12 @@ extern const struct parameter priority_parameter; /* of struct job_request */
 struct job_request {
 	char scan[64];
 	enum priority priority;
-	char labels[LABELS_TEXT_MAX]; /* JSON, "" for none */
-	struct patient patient;       /* of the scan, once resolved, unless the job says otherwise */
-	struct recipe recipe;         /* owned: recipe_clear */
+	char *labels;           /* JSON, owned; NULL for none */
+	struct patient patient; /* of the scan, once resolved, unless the job says otherwise */
+	struct recipe recipe;   /* owned */
 };
+void job_request_clear(struct job_request *request);
+int job_request_copy(struct job_request *ret_request, const struct job_request *request, struct error *err);
 
 enum { EMITS_MAX = 10000 }; /* each is a volume on the disk, and all of them fit into one message to the worker */
 

@@ -396,7 +396,7 @@ static int read_document(struct scan *scan, struct error *err)
 {
 	struct json_reader reader;
 	const cJSON *detector, *projections, *geometry, *patient, *labels;
-	char text[LABELS_TEXT_MAX]; /* the document has them */
+	char *text = NULL; /* the document has them */
 	int code;
 
 	json_begin(&reader, scan->document, "", err);
@@ -410,7 +410,8 @@ static int read_document(struct scan *scan, struct error *err)
 	if (code == 0)
 		code = patient_read(patient, "/patient", &scan->patient, err);
 	if (code == 0)
-		code = labels_read(labels, "/labels", text, err);
+		code = labels_read(labels, "/labels", &text, err);
+	free(text);
 	if (code == 0)
 		code = read_detector(scan, detector, err);
 	if (code == 0)

@@ -110,7 +110,7 @@ static int request_make(const struct recon_options *options, struct job_request 
 	if (code == 0)
 		*ret_request = request;
 	else
-		recipe_clear(&request.recipe);
+		job_request_clear(&request);
 	return code;
 }
 
@@ -214,7 +214,7 @@ static int recon_run_command(const void *values, struct error *err)
 		return code;
 	code = pipeline_run(options, &request, warnings, err);
 	cJSON_Delete(warnings);
-	recipe_clear(&request.recipe);
+	job_request_clear(&request);
 	return code;
 }
 

@@ -285,25 +285,21 @@ static void add_job_facts(cJSON *document, struct job *job, const struct job_rec
 		cJSON_AddNullToObject(document, "error");
 }
 
-/* Where the world's axes point to in the patient; jobs from before there was such a member do not know. */
-static void add_axes(cJSON *document, const cJSON *patient_member)
+/* The members of the request, and where the world's axes point to in the patient. */
+static void add_request(cJSON *document, const struct job *job, const struct job_record *record)
 {
-	struct patient patient;
+	const struct job_request *asked;
 	struct error ignored;
+	cJSON *request, *member;
 
-	if (patient_read(patient_member, "/patient", &patient, &ignored) != 0)
-		patient = patient_unknown;
-	if (patient_member == NULL)
+	if (job_request(job, &asked, &ignored) != 0) {
+		cJSON_AddStringToObject(document, "scan", record->scan);
 		cJSON_AddNullToObject(document, "patient");
-	cJSON_AddItemToObject(document, "axes", patient_axes_json(&patient));
-}
-
-static void add_request(cJSON *document, const struct job_record *record)
-{
-	cJSON *request = cJSON_Parse(record->request), *member;
-
-	add_axes(document, cJSON_GetObjectItemCaseSensitive(request, "patient"));
-
+		cJSON_AddItemToObject(document, "axes", patient_axes_json(&patient_unknown));
+		return;
+	}
+	cJSON_AddItemToObject(document, "axes", patient_axes_json(&asked->patient));
+	request = job_request_json(asked);
 	while (request != NULL && (member = request->child) != NULL) {
 		cJSON_DetachItemViaPointer(request, member);
 		cJSON_AddItemToObject(document, member->string, member);
@@ -364,7 +360,7 @@ cJSON *job_document(struct job *job, bool brief)
 		return NULL;
 	job_record(job, &record);
 	add_job_facts(document, job, &record);
-	add_request(document, &record);
+	add_request(document, job, &record);
 	if (!brief) {
 		struct store *store = jobs_store(job_jobs(job));
 

@@ -47,7 +47,7 @@ static int post(struct api *api, const char *text, size_t length, const char *ke
 		code = post_resolved(api, &wanted, scan, key, digest, ret_job, err);
 		stored_scan_release(scan);
 	}
-	recipe_clear(&wanted.recipe);
+	job_request_clear(&wanted);
 	return code;
 }
 

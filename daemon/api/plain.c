@@ -367,6 +367,7 @@ static int reply_job(struct api *api, struct request *request, struct job *job, 
 {
 	struct volume_record *volumes = NULL;
 	struct shown shown = {0};
+	const struct job_request *asked;
 	struct job_facts facts;
 	cJSON *document;
 	char *text = NULL;
@@ -380,8 +381,7 @@ static int reply_job(struct api *api, struct request *request, struct job *job, 
 	shown.volumes = volumes;
 	read_choice(request, &shown);
 	document = job_document(job, false);
-	if (patient_read(cJSON_GetObjectItemCaseSensitive(document, "patient"), "/patient", &shown.patient, err) != 0)
-		shown.patient = patient_unknown;
+	shown.patient = job_request(job, &asked, err) == 0 ? asked->patient : patient_unknown;
 	out = document != NULL ? open_memstream(&text, &length) : NULL;
 	if (out != NULL)
 		put_job(out, api, document, facts.ended, &shown);

@@ -42,10 +42,12 @@ static int add_present(struct message *message, struct stored_scan *scan, const 
  * of the scan is read, here or by the worker: what changes from now on changes
  * their basis.
  */
-static int make_start(struct supervise *supervise, const struct job_record *record, struct message *message,
-		      struct stored_scan **ret_scan, struct scan_facts *ret_facts, struct error *err)
+static int make_start(struct supervise *supervise, const struct job *job, const struct job_record *record,
+		      struct message *message, struct stored_scan **ret_scan, struct scan_facts *ret_facts,
+		      struct error *err)
 {
 	struct store *store = jobs_store(supervise->jobs);
+	const struct job_request *request;
 	struct scan_facts facts;
 	struct stored_scan *scan;
 	int code = store_scan_find(store, record->scan, &scan, err);
@@ -58,11 +60,11 @@ static int make_start(struct supervise *supervise, const struct job_record *reco
 	snprintf(message->job, sizeof(message->job), "%s", record->id);
 	store_scan_directory(store, record->scan, message->scan_directory);
 	store_job_directory(store, record->id, message->job_directory);
-	code = job_request_parse(record->request, strlen(record->request), &message->request, err);
+	code = job_request(job, &request, err);
+	if (code == 0)
+		code = job_request_copy(&message->request, request, err);
 	if (code == 0 && facts.closed)
 		code = add_present(message, scan, &facts, err);
-	if (code == 0)
-		code = job_request_resolve(&message->request, stored_scan_measured(scan), err);
 	if (code == 0)
 		code = directory_make(message->job_directory, err);
 	if (code != 0) {
@@ -148,7 +150,7 @@ static int give_job(struct supervise *supervise, struct worker *worker, struct j
 	if (message == NULL)
 		return error_set_errno(err, ENOMEM, "message");
 	job_record(job, &record);
-	code = make_start(supervise, &record, message, &scan, &facts, &why);
+	code = make_start(supervise, job, &record, message, &scan, &facts, &why);
 	/* The scan has lost something since the job was queued. */
 	if (code == 0 && !arriving && !facts.ready) {
 		message_clear(message);

@@ -21,7 +21,8 @@ struct job {
 	/* Constant. */
 	struct jobs *jobs;
 	char id[ID_SIZE], scan[ID_SIZE];
-	bool fdk; /* it has FDK; known of waiting jobs */
+	struct job_request request; /* see job_request */
+	struct error unreadable;    /* code 0: request is there */
 
 	int doubts; /* job_doubt, with the next; the supervisor's own */
 	unsigned doubted_at;

@@ -38,6 +38,7 @@ static void job_free(struct job *job)
 {
 	if (job == NULL)
 		return;
+	job_request_clear(&job->request);
 	job_record_clear(&job->record);
 	watch_list_destroy(&job->watchers);
 	free(job);
@@ -190,6 +191,15 @@ int jobs_list(struct jobs *jobs, const char *after, int limit, struct job **ret_
 
 /* ---- at the start ---- */
 
+/* The one place where a stored request is read. A job whose request cannot be read fails when it is to be run. */
+static void read_request(struct job *job)
+{
+	const char *text = job->record.request;
+
+	if (job_request_parse(text, strlen(text), &job->request, &job->unreadable) == 0)
+		job->unreadable.code = 0;
+}
+
 /* The iteration of the checkpoint that the row promises, if its file is there; else 0. */
 static int checkpoint_there(const struct jobs *jobs, const struct job_record *record)
 {
@@ -203,17 +213,8 @@ static int checkpoint_there(const struct jobs *jobs, const struct job_record *re
 static int recover_waiting(struct job *job, struct error *err)
 {
 	static const struct job_change asked = {.reason = "as asked"};
-	struct job_request request;
-	struct error why;
 
-	if (job->record.cancel_asked)
-		return job_change_state(job, JOB_CANCELLED, &asked, err);
-	/* A request that cannot be read fails when the job is to be run, with the reason. */
-	if (job_request_parse(job->record.request, strlen(job->record.request), &request, &why) == 0) {
-		job->fdk = request.recipe.fdk.on;
-		recipe_clear(&request.recipe);
-	}
-	return 0;
+	return job->record.cancel_asked ? job_change_state(job, JOB_CANCELLED, &asked, err) : 0;
 }
 
 static int recover(struct job *job, struct error *err)
@@ -255,6 +256,7 @@ static int load_jobs(struct jobs *jobs, struct error *err)
 			code = error_set_errno(err, ENOMEM, "list of jobs");
 			break;
 		}
+		read_request(job);
 		array_insert(jobs, job);
 		id_floor(job->id);
 		if (job->record.ticket >= jobs->next_ticket)
@@ -405,14 +407,14 @@ int jobs_post(struct jobs *jobs, const struct job_request *request, struct store
 
 	if (code == 0) {
 		job = job_new(jobs, &record);
-		if (job == NULL)
-			code = error_set_errno(err, ENOMEM, "job");
-		else
-			job->fdk = request->recipe.fdk.on;
+		code =
+		    job == NULL ? error_set_errno(err, ENOMEM, "job") : job_request_copy(&job->request, request, err);
 	}
 	job_record_clear(&record);
-	if (code != 0)
+	if (code != 0) {
+		job_free(job);
 		return code;
+	}
 	pthread_mutex_lock(&jobs->change);
 	if (key != NULL)
 		code = jobs_repeat(jobs, key, digest, &repeat, err);
@@ -535,6 +537,16 @@ void job_facts(struct job *job, struct job_facts *ret)
 	ret->priority = job->record.priority;
 	ret->mu_water = job->record.mu_water;
 	pthread_mutex_unlock(&job->jobs->lock);
+}
+
+int job_request(const struct job *job, const struct job_request **ret_request, struct error *err)
+{
+	if (job->unreadable.code != 0) {
+		*err = job->unreadable;
+		return err->code;
+	}
+	*ret_request = &job->request;
+	return 0;
 }
 
 void job_record(struct job *job, struct job_record *ret_record)

@@ -53,7 +53,7 @@ int jobs_repeat(struct jobs *jobs, const char *key, const uint8_t digest[32], st
 
 /*
  * A new job of a resolved request, queued when the scan is ready and waiting
- * otherwise. The request is read, not taken. key may be NULL; if the key was used
+ * otherwise. The request is copied. key may be NULL; if the key was used
  * meanwhile, what jobs_repeat would say. *ret_new: false for such a repeat.
  * ERR_NOT_FOUND, pointer "/scan", when the scan was deleted meanwhile.
  */
@@ -96,6 +96,11 @@ struct job_facts {
 };
 void job_facts(struct job *job, struct job_facts *ret);
 
+/*
+ * What was asked for, resolved: as it was posted, or read from the catalogue when the daemon started. Lives as long
+ * as the reference. What reading it gave, ERR_INVALID or another, where the stored one cannot be read.
+ */
+int job_request(const struct job *job, const struct job_request **ret_request, struct error *err);
 /* The record as it is now; request and key point into the job and live as long as the reference. */
 void job_record(struct job *job, struct job_record *ret_record);
 /* 1 = next; 0 when it is not queued. */

@@ -99,7 +99,7 @@ struct job *jobs_arriving(struct jobs *jobs, double since, bool *ret_arriving)
 		struct scan_facts facts;
 		struct error err;
 
-		if (job_obstacle(one.job) != JOB_UNHINDERED || !one.job->fdk ||
+		if (job_obstacle(one.job) != JOB_UNHINDERED || !one.job->request.recipe.fdk.on ||
 		    store_scan_look(jobs->store, one.job->scan, &facts, &err) != 0 || !facts.convertible ||
 		    facts.complete || !facts.checked)
 			continue;

@@ -18,7 +18,7 @@ static void check_round_trip(const struct job_request *request)
 
 	PROMISE(text != NULL && job_request_parse(text, strlen(text), &back, &err) == 0);
 	PROMISE(job_request_same(request, &back));
-	recipe_clear(&back.recipe);
+	job_request_clear(&back);
 	cJSON_Delete(json);
 	free(text);
 }
@@ -40,6 +40,6 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 		check_round_trip(&request);
 	else
 		PROMISE(err.code < 0 && err.text[0] != '\0');
-	recipe_clear(&request.recipe);
+	job_request_clear(&request);
 	return 0;
 }

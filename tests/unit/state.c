@@ -166,7 +166,7 @@ struct job *state_post(struct state *state, struct stored_scan *scan, const char
 	ck_assert_msg(job_request_resolve(&request, stored_scan_parsed(scan), &err) == 0, "%s", err.text);
 	ck_assert_msg(jobs_post(state->jobs, &request, scan, NULL, NULL, NULL, &job, &new, &err) == 0, "%s", err.text);
 	ck_assert(new);
-	recipe_clear(&request.recipe);
+	job_request_clear(&request);
 	return job;
 }
 

@@ -40,7 +40,7 @@ static char *job_round_trip(const char *text, struct error *err)
 	if (job_request_parse(text, strlen(text), &request, err) != 0)
 		return NULL;
 	printed = job_printed(&request);
-	recipe_clear(&request.recipe);
+	job_request_clear(&request);
 	return printed;
 }
 
@@ -473,12 +473,12 @@ static void expect_resolved_round_trip(const char *request_text, const char *tex
 		ck_assert_msg(job_request_parse(printed, strlen(printed), &back, &err) == 0, "%s: %s at %s", printed,
 			      err.text, err.pointer);
 		ck_assert(job_request_same(&request, &back));
-		recipe_clear(&back.recipe);
+		job_request_clear(&back);
 		free(printed);
 	} else {
 		ck_assert_int_eq(err.code, ERR_IMPOSSIBLE);
 	}
-	recipe_clear(&request.recipe);
+	job_request_clear(&request);
 	scan_free(scan);
 }
 
@@ -546,7 +546,7 @@ START_TEST(a_request_is_printed_whole_or_not_at_all)
 	ck_assert_int_gt(allocations, 50);
 	free(printed);
 	free(whole);
-	recipe_clear(&request.recipe);
+	job_request_clear(&request);
 }
 END_TEST
 

@@ -41,7 +41,7 @@ static int parse_and_resolve(const char *text, struct job_request *ret, struct e
 		if (code == 0)
 			*ret = request;
 		else
-			recipe_clear(&request.recipe);
+			job_request_clear(&request);
 	}
 	return code;
 }
@@ -112,8 +112,8 @@ START_TEST(requests_come_back_the_same)
 			ck_assert_str_eq(once, twice);
 			free(once);
 			free(twice);
-			recipe_clear(&request.recipe);
-			recipe_clear(&back.recipe);
+			job_request_clear(&request);
+			job_request_clear(&back);
 		}
 	}
 }
@@ -135,7 +135,7 @@ START_TEST(different_requests_are_not_the_same)
 		}
 	}
 	for (int i = 0; i < REQUESTS; i++)
-		recipe_clear(&all[i].recipe);
+		job_request_clear(&all[i]);
 }
 END_TEST
 
@@ -172,7 +172,7 @@ START_TEST(defaults_are_the_contracts)
 	/* The field of view, 128 mm at half of 1000 mm away, in pixels of 4 * 0.6 mm. */
 	ck_assert_int_gt(recipe->grid.size[0], 40);
 	ck_assert_int_lt(recipe->grid.size[0], 80);
-	recipe_clear(&request.recipe);
+	job_request_clear(&request);
 }
 END_TEST
 
@@ -218,7 +218,7 @@ START_TEST(numbers_of_tv_mean_explicit_steps_and_none_means_auto)
 			ck_assert_double_eq(request.recipe.tv.options.alpha, rows[i].alpha);
 		if (rows[i].method == TV_GRADIENT)
 			ck_assert_double_eq(request.recipe.tv.options.step, rows[i].step);
-		recipe_clear(&request.recipe);
+		job_request_clear(&request);
 	}
 }
 END_TEST
@@ -235,14 +235,14 @@ START_TEST(the_grid_is_centred_unless_it_says_otherwise)
 	ck_assert_double_eq(request.recipe.grid.origin[0], -4);
 	ck_assert_double_eq(request.recipe.grid.origin[1], -4.5);
 	ck_assert_double_eq(request.recipe.grid.origin[2], 0);
-	recipe_clear(&request.recipe);
+	job_request_clear(&request);
 	ck_assert_int_eq(parse_and_resolve("{\"scan\":\"a\",\"fdk\":{},\"grid\":{\"size\":[5,4,1],"
 					   "\"spacing_mm\":[2,3,4],\"origin_mm\":[7,8,9]}}",
 					   &request, &err),
 			 0);
 	ck_assert_double_eq(request.recipe.grid.origin[0], 7);
 	ck_assert_double_eq(request.recipe.grid.origin[2], 9);
-	recipe_clear(&request.recipe);
+	job_request_clear(&request);
 }
 END_TEST
 
@@ -258,7 +258,7 @@ START_TEST(emitted_volumes_are_sorted_and_each_once)
 			 0);
 	ck_assert_int_eq(request.recipe.emits, 6);
 	ck_assert_mem_eq(request.recipe.emit, expected, sizeof(expected));
-	recipe_clear(&request.recipe);
+	job_request_clear(&request);
 }
 END_TEST
 
@@ -395,7 +395,7 @@ START_TEST(a_list_of_too_many_volumes_is_refused)
 	memcpy(at, "]}", 3);
 	ck_assert_int_eq(parse(text, &request, &err), 0);
 	ck_assert_int_eq(request.recipe.emits, EMITS_MAX);
-	recipe_clear(&request.recipe);
+	job_request_clear(&request);
 	memcpy(at, ",9]}", 5);
 	ck_assert_int_eq(parse(text, &request, &err), ERR_IMPOSSIBLE);
 	ck_assert_str_eq(err.pointer, "/emit");
@@ -418,11 +418,11 @@ START_TEST(subsets_left_out_are_ten_or_as_many_as_views)
 	ck_assert_int_eq(parse("{\"scan\":\"a\",\"sart\":{}}", &request, &err), 0);
 	ck_assert_int_eq(job_request_resolve(&request, few, &err), 0);
 	ck_assert_int_eq(request.recipe.sart.subsets, 6);
-	recipe_clear(&request.recipe);
+	job_request_clear(&request);
 	ck_assert_int_eq(parse("{\"scan\":\"a\",\"sart\":{\"subsets\":\"views\"}}", &request, &err), 0);
 	ck_assert_int_eq(job_request_resolve(&request, few, &err), 0);
 	ck_assert_int_eq(request.recipe.sart.subsets, SUBSETS_VIEWS);
-	recipe_clear(&request.recipe);
+	job_request_clear(&request);
 	scan_free(few);
 }
 END_TEST

@@ -726,7 +726,7 @@ static int run(const char *request_text, const char *where, const char *checkpoi
 	what.recipe = &request.recipe;
 	code = reconstruction_run(&backend, device, &what, err);
 	backend_cpu.close(device);
-	recipe_clear(&request.recipe);
+	job_request_clear(&request);
 	return code;
 }
 
@@ -888,7 +888,7 @@ static int run_arriving(const int *order, int count, int piece, const unsigned c
 		code = reconstruction_finish(reconstruction, err);
 	reconstruction_close(reconstruction);
 	backend_cpu.close(device);
-	recipe_clear(&request.recipe);
+	job_request_clear(&request);
 	return code;
 }
 

@@ -377,6 +377,37 @@ START_TEST(stages_that_come_or_go_leave_the_others_their_seconds)
 }
 END_TEST
 
+/* A later cbctd's, perhaps: the job stays with its reason, the others have theirs as they were posted. */
+START_TEST(a_stored_request_that_cannot_be_read_says_why)
+{
+	const struct job_request *request = NULL;
+	struct job *jobs[8];
+	struct error err = {0};
+	int count;
+	bool more;
+
+	state_reopen(&state);
+	state_close(&state);
+	change("UPDATE jobs SET request = '{\"scan\": \"s\", \"later\": 1}' WHERE id = '" RECORDED_JOB "'");
+	state_reopen(&state);
+	ck_assert_int_eq(jobs_list(state.jobs, NULL, 8, jobs, &count, &more, &err), 0);
+	ck_assert_int_eq(count, 4);
+	for (int i = 0; i < count; i++) {
+		struct job_record record;
+
+		job_record(jobs[i], &record);
+		if (strcmp(record.id, RECORDED_JOB) == 0) {
+			ck_assert_int_eq(job_request(jobs[i], &request, &err), ERR_INVALID);
+			ck_assert_str_eq(err.pointer, "/later");
+		} else {
+			ck_assert_int_eq(job_request(jobs[i], &request, &err), 0);
+			ck_assert_str_eq(request->scan, record.scan);
+		}
+		job_release(jobs[i]);
+	}
+}
+END_TEST
+
 START_TEST(a_record_of_version_10_is_read)
 {
 	sqlite3 *db = open_database();
@@ -580,6 +611,7 @@ Suite *upgrade_suite(void)
 	tcase_add_test(tests, only_digests_are_bytes);
 	tcase_add_test(tests, an_upgraded_catalogue_has_the_columns_of_a_new_one);
 	tcase_add_test(tests, stages_that_come_or_go_leave_the_others_their_seconds);
+	tcase_add_test(tests, a_stored_request_that_cannot_be_read_says_why);
 	tcase_add_test(tests, a_record_of_version_10_is_read);
 	tcase_add_test(tests, a_start_that_is_killed_leaves_the_old_catalogue_or_the_new_one);
 	tcase_add_test(tests, a_commit_that_is_cut_off_leaves_the_old_catalogue_or_the_new_one);
