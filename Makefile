@@ -276,6 +276,9 @@ lint: ## who includes whom, and the house's other rules
 rooms: ## docs/rooms.svg, the picture of who includes whom
 	@$(PYTHON) docs/rooms.py
 
+python-parameters: all ## the table of parameters in clients/python/cbctd.py
+	@$(BUILD)/cbct parameters --json | $(PYTHON) clients/python/parameters.py
+
 third-party: all ## docs/third-party.md, the parts of others with version and licence
 	@$(PYTHON) docs/third-party.py $(BUILD)
 

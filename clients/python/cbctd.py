@@ -18,8 +18,9 @@ Or step by step, while the arm still turns::
 
 Everywhere: projections are ``[view][row][column]``, volumes ``[z][y][x]``; lengths are mm, angles degrees; the world's
 origin is the isocentre, z the rotation axis. Voxels are linear attenuation in 1/mm (float32) or Hounsfield units
-(int16). What the daemon refuses is raised as `Problem`, with its words. Connections that break are taken up again where
-they broke, busy daemons (429, 503) are asked again after the pause that they ask for.
+(int16). What the daemon refuses is raised as `Problem`, with its words; a parameter out of its range before it is sent.
+Connections that break are taken up again where they broke, busy daemons (429, 503) are asked again after the pause that
+they ask for.
 
 A `Client` may be used from several threads.
 """
@@ -72,6 +73,57 @@ _BREAKS = (
 _HEARTBEAT = 10.0  # s: the longest that a living daemon keeps silent in events
 _RUN_BYTES = 16 << 20  # of one request of an upload: the daemon syncs its disk once for each
 
+# The table of `cbct parameters`: parameters.py writes it.
+_PARAMETERS: Dict[str, Dict[str, Document]] = {
+    "job": {
+        "/grid/size": {"type": "integers", "minimum": 1, "maximum": 8192, "count": 3, "unit": "voxels"},
+        "/grid/spacing_mm": {"type": "numbers", "minimum": 1e-06, "maximum": 1000, "count": 3},
+        "/grid/origin_mm": {"type": "numbers", "minimum": -10000000, "maximum": 10000000, "count": 3},
+        "/fdk/window": {"type": "choice", "choices": ["ram-lak", "shepp-logan", "cosine", "hamming", "hann"]},
+        "/fdk/cutoff": {"type": "number", "minimum": 0.001, "maximum": 1},
+        "/fdk/truncation": {"type": "choice", "choices": ["off", "auto"]},
+        "/sart/iterations": {"type": "integer", "minimum": 1, "maximum": 100000},
+        "/cgls/iterations": {"type": "integer", "minimum": 1, "maximum": 100000},
+        "/sart/relaxation": {"type": "number", "minimum": 1e-06, "maximum": 2},
+        "/sart/subsets": {"type": "integer", "minimum": 1, "maximum": 20000, "word": "views"},
+        "/sart/nonnegative": {"type": "boolean"},
+        "/cgls/nonnegative": {"type": "boolean"},
+        "/sart/stop/residual": {"type": "number", "minimum": 0, "maximum": 1000000},
+        "/cgls/stop/residual": {"type": "number", "minimum": 0, "maximum": 1000000},
+        "/sart/stop/change": {"type": "number", "minimum": 0, "maximum": 1000000},
+        "/cgls/stop/change": {"type": "number", "minimum": 0, "maximum": 1000000},
+        "/tv/method": {"type": "choice", "choices": ["gradient", "proximal"]},
+        "/tv/alpha": {"type": "number", "minimum": 0, "maximum": 1000000000, "word": "auto"},
+        "/tv/strength": {"type": "choice", "choices": ["light", "medium", "strong"]},
+        "/tv/step": {"type": "number", "minimum": 1e-09, "maximum": 1000000000},
+        "/tv/iterations": {"type": "integer", "minimum": 1, "maximum": 100000},
+        "/tv/unit": {"type": "number", "minimum": 1e-12, "maximum": 1000000000000},
+        "/tv/after": {"type": "choice", "choices": ["sart", "fdk+sart"]},
+        "/metal/threshold_hu": {"type": "number", "minimum": 500, "maximum": 1000000},
+        "/projector": {"type": "choice", "choices": ["interpolating", "matched"]},
+        "/precision": {"type": "choice", "choices": ["standard", "reference"]},
+        "/mu_water": {"type": "number", "minimum": 1e-09, "maximum": 1000},
+        "/priority": {"type": "choice", "choices": ["routine", "urgent", "stat"]},
+    },
+    "scan": {
+        "/detector/columns": {"type": "integer", "minimum": 1, "maximum": 16384},
+        "/detector/rows": {"type": "integer", "minimum": 1, "maximum": 16384},
+        "/detector/pixel_mm": {"type": "numbers", "minimum": 1e-06, "maximum": 10000000, "count": 2},
+        "/projections/count": {"type": "integer", "minimum": 1, "maximum": 20000},
+        "/projections/sample": {"type": "choice", "choices": ["float32", "uint16"]},
+        "/projections/quantity": {"type": "choice", "choices": ["line_integral", "intensity"]},
+        "/projections/air": {"type": "number", "minimum": 1e-06, "maximum": 1000000000000},
+        "/projections/saturation": {"type": "number", "minimum": 1e-06, "maximum": 1000000000000},
+        "/geometry/source_to_isocentre_mm": {"type": "number", "minimum": 1e-06, "maximum": 10000000},
+        "/geometry/source_to_detector_mm": {"type": "number", "minimum": 1e-06, "maximum": 10000000},
+        "/geometry/detector_offset_mm": {"type": "numbers", "minimum": -10000000, "maximum": 10000000, "count": 2},
+        "/geometry/source_offset_mm": {"type": "numbers", "minimum": -10000000, "maximum": 10000000, "count": 2},
+        "/geometry/first_angle_deg": {"type": "number", "minimum": -1000000, "maximum": 1000000},
+        "/geometry/angle_step_deg": {"type": "number", "minimum": -360, "maximum": 360},
+    },
+}
+# The end of the table.
+
 
 class Error(Exception):
     """Anything that goes wrong between here and the daemon."""
@@ -90,7 +142,7 @@ class Problem(Error):
         title: what kind of problem it is.
         detail: one sentence with the number that was wrong and the one that was expected.
         pointer: RFC 6901 pointer to the field of the request, or "".
-        request_id: to be found in the daemon's log.
+        request_id: to be found in the daemon's log; "" where the client itself has refused a value, before sending it.
     """
 
     def __init__(self, status: int, document: Mapping[str, Any]) -> None:
@@ -302,6 +354,7 @@ class Client:
             request["name"] = name
         if patient is not None:
             request["patient"] = _patient(patient)
+        _check("scan", request)
         # A second one by mistake would stay for ever.
         return self._json("POST", "/v1/scans", json=request, repeatable=False)
 
@@ -393,6 +446,7 @@ class Client:
             idempotency_key: a repeat with the same key returns the same job; one is made up if none is given, so that
                 a connection that breaks never makes two jobs.
         """
+        _check("job", recipe)
         headers = {"Idempotency-Key": idempotency_key or uuid.uuid4().hex}
         return self._json("POST", "/v1/jobs", json={**recipe, "scan": scan}, headers=headers)
 
@@ -588,11 +642,12 @@ class Client:
         if stack.ndim != 3:
             raise ValueError(f"projections of shape {stack.shape}, expected [view][row][column]")
         sample = np.uint16 if stack.dtype == np.uint16 else np.float32
+        stages = {"grid": grid, "fdk": fdk, "sart": sart, "tv": tv, "emit": list(emit), **recipe}
+        _check("job", stages)
         scan = self.create_scan(
             geometry, stack.shape, dtype=sample, name=name, quantity=quantity, patient=patient, air=air
         )["id"]
         job: Optional[str] = None
-        stages = {"grid": grid, "fdk": fdk, "sart": sart, "tv": tv, "emit": list(emit), **recipe}
         try:
             if flat is not None:
                 self.put_flat(scan, flat)
@@ -765,6 +820,84 @@ def _problem(response: requests.Response) -> Problem:
     finally:
         response.close()
     return Problem(int(response.status_code), document)
+
+
+_INVALID = (400, "invalid", "The request is malformed")
+_IMPOSSIBLE = (422, "impossible", "The request is well-formed, but cannot be done")
+
+
+def _refusal(kind: Tuple[int, str, str], pointer: str, detail: str) -> Problem:
+    status, name, title = kind
+    return Problem(
+        status, {"type": f"urn:cbctd:problem:{name}", "title": title, "detail": detail, "pointer": pointer}
+    )
+
+
+def _json_type(value: Any) -> str:
+    """What the daemon calls a value's type."""
+    if isinstance(value, bool):
+        return "a boolean"
+    if isinstance(value, (int, float)):
+        return "a number"
+    if isinstance(value, str):
+        return "a string"
+    if isinstance(value, (list, tuple)):
+        return "an array"
+    return "an object" if isinstance(value, Mapping) else "null"
+
+
+def _check_number(value: Any, pointer: str, least: float, most: float) -> None:
+    if _json_type(value) != "a number":
+        raise _refusal(_INVALID, pointer, f"{_json_type(value)}, a number is expected")
+    if not least <= value <= most:
+        detail = f"{value:.10g}, a number from {least:.10g} to {most:.10g} is expected"
+        raise _refusal(_IMPOSSIBLE, pointer, detail)
+
+
+def _check_list(values: Any, pointer: str, row: Document) -> None:
+    if _json_type(values) != "an array":
+        detail = f"{_json_type(values)}, an array of {row['count']} numbers is expected"
+        raise _refusal(_INVALID, pointer, detail)
+    if len(values) != row["count"]:
+        raise _refusal(_INVALID, pointer, f"{len(values)} numbers, {row['count']} are expected")
+    whole = row["type"] == "integers"
+    least, most = row["minimum"], row["maximum"]
+    for i, value in enumerate(values):
+        _check_number(value, f"{pointer}/{i}", *((-1e100, 1e100) if whole else (least, most)))
+    for i, value in enumerate(values if whole else ()):
+        if value != int(value):
+            raise _refusal(_INVALID, f"{pointer}/{i}", f"{value:.10g}, a whole number is expected")
+        if not least <= value <= most:
+            detail = f"{value:.10g} {row['unit']}, {least:.10g} to {most:.10g} are expected"
+            raise _refusal(_IMPOSSIBLE, f"{pointer}/{i}", detail)
+
+
+def _check_value(value: Any, pointer: str, row: Document) -> None:
+    if row["type"] in ("numbers", "integers"):
+        _check_list(value, pointer, row)
+    elif row["type"] == "boolean":
+        if not isinstance(value, bool):
+            raise _refusal(_INVALID, pointer, f"{_json_type(value)}, true or false is expected")
+    elif row["type"] == "choice":
+        if not (isinstance(value, str) and value in row["choices"]):
+            what = "an unknown word" if isinstance(value, str) else _json_type(value)
+            raise _refusal(_INVALID, pointer, f"{what}, one of {', '.join(row['choices'])} is expected")
+    elif value != row.get("word"):
+        if "word" in row and _json_type(value) != "a number":
+            raise _refusal(_INVALID, pointer, f"a number or \"{row['word']}\" is expected")
+        if row["type"] == "integer" and isinstance(value, float) and np.isfinite(value) and value % 1 != 0:
+            raise _refusal(_INVALID, pointer, f"{value:.10g}, a whole number is expected")
+        _check_number(value, pointer, row["minimum"], row["maximum"])
+
+
+def _check(name: str, document: Mapping[str, Any]) -> None:
+    """Refuses a value as the daemon would, in its words. Members that the table does not have are left to the daemon."""
+    for pointer, row in _PARAMETERS[name].items():
+        value: Any = document
+        for member in pointer.split("/")[1:]:
+            value = value.get(member) if isinstance(value, Mapping) else None
+        if value is not None:
+            _check_value(value, pointer, row)
 
 
 def _judge(job: Document) -> Document:

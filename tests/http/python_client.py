@@ -12,6 +12,7 @@ import warnings
 from typing import Any, Dict, List, Tuple
 
 import numpy as np
+import requests
 
 import cbctd
 
@@ -181,9 +182,9 @@ class Jobs(Case):
     def test_refusals_carry_the_daemons_words(self) -> None:
         scan = self.uploaded()
         with self.assertRaises(cbctd.Problem) as caught:
-            self.client.submit(scan, {"fdk": {}, "grid": {"size": [8, 0, 8], "spacing_mm": [1, 1, 1]}})
+            self.client.submit(scan, {"fdk": {}, "emit": [3]})
         problem = caught.exception
-        self.assertEqual((problem.status, problem.pointer), (422, "/grid/size/1"))
+        self.assertEqual((problem.status, problem.pointer), (422, "/emit/0"))
         self.assertEqual(problem.type, "urn:cbctd:problem:impossible")
         self.assertTrue(problem.title and problem.detail and problem.request_id)
         self.assertIn(problem.detail, str(problem))
@@ -223,6 +224,72 @@ class Jobs(Case):
             self.assertFalse(nobody.ready())
             with self.assertRaises(cbctd.Broken):
                 nobody.devices()
+
+
+def wrong_values(row: Dict[str, Any]) -> List[Any]:
+    """Values that the row of `cbct parameters` has no place for."""
+    if row["type"] == "boolean":
+        return [1, "true", [True]]
+    if row["type"] == "choice":
+        return ["none of them", 3, True, {}]
+    if row["type"] in ("numbers", "integers"):
+        good = [row["minimum"]] * row["count"]
+        wrong = [good[:-1], good + good[:1], 7, "seven", good[:-1] + ["x"], good[:-1] + [10 * row["maximum"] + 1]]
+        return wrong + ([good[:-1] + [row["minimum"] + 0.25]] if row["type"] == "integers" else [])
+    wrong = [row["maximum"] * 1.5 + 1, row["minimum"] - 1, "many", [row["minimum"]], {"no": 1}, True]
+    return wrong + ([row["minimum"] + 0.5] if row["type"] == "integer" else [])
+
+
+def with_value(pointer: str, value: Any, document: Dict[str, Any]) -> Dict[str, Any]:
+    """A copy of the document with this member."""
+    document = json.loads(json.dumps(document))
+    *path, name = pointer.split("/")[1:]
+    holder = document
+    for member in path:
+        holder = holder.setdefault(member, {})
+    holder[name] = value
+    return document
+
+
+class Checks(Case):
+    def test_wrong_values_are_refused_with_the_daemons_words(self) -> None:
+        """Each parameter of both documents, with values of the wrong type and out of range."""
+        with open(os.environ["PARAMETERS"]) as file:
+            parameters = json.load(file)
+        documents = {"job": {"scan": self.uploaded(), "grid": dict(GRID)}, "scan": dict(self.scan_json)}
+        documents["scan"]["projections"] = {**self.scan_json["projections"], "quantity": "intensity"}
+        tried = 0
+        for name, rows in parameters.items():
+            for row in rows:
+                for value in wrong_values(row):
+                    document = with_value(row["pointer"], value, documents[name])
+                    with self.subTest(pointer=row["pointer"], value=value):
+                        reply = requests.post(f"{self.client.url}/v1/{name}s", json=document)
+                        said = reply.json()
+                        with self.assertRaises(cbctd.Problem) as caught:
+                            cbctd._check(name, document)
+                        problem = caught.exception
+                        self.assertEqual(
+                            [problem.status, problem.type, problem.title, problem.detail, problem.pointer],
+                            [reply.status_code, said["type"], said["title"], said["detail"], said.get("pointer", "")],
+                        )
+                        tried += 1
+        self.assertGreater(tried, 150)
+
+    def test_nothing_is_sent_of_a_wrong_value(self) -> None:
+        with cbctd.Client("http://127.0.0.1:1") as nobody:
+            with self.assertRaises(cbctd.Problem) as caught:
+                nobody.submit("any", {"grid": {"size": [8, 0, 8], "spacing_mm": [1, 1, 1]}})
+            self.assertEqual((caught.exception.pointer, caught.exception.request_id), ("/grid/size/1", ""))
+            with self.assertRaises(cbctd.Problem):
+                nobody.recon(self.projections, self.geometry, sart={"relaxation": 3})
+            with self.assertRaises(cbctd.Problem):
+                nobody.create_scan(self.geometry, self.projections.shape, quantity="counts")
+
+    def test_what_the_daemon_takes_passes(self) -> None:
+        cbctd._check("job", {"grid": GRID, "fdk": {}, "sart": {"subsets": "views"}, "tv": {"alpha": "auto"}, "x": 1})
+        cbctd._check("job", {"fdk": None, "cgls": {"iterations": 3.0, "stop": {"residual": 0}}, "emit": [1]})
+        cbctd._check("scan", self.scan_json)
 
 
 class Volumes(Case):

@@ -66,6 +66,7 @@ test_parameters_of_the_schema_are_those_of_the_tables() {
 	"$python" "$top/proto/openapi.py" --json "$top/proto/openapi.yaml" >"$work/openapi.json"
 	"$python" "$top/tests/openapi/parameters.py" "$work/parameters.json" "$work/openapi.json" ||
 		fail "proto/openapi.yaml with the tables that \`cbct parameters\` shows"
+	"$python" "$top/clients/python/parameters.py" --check <"$work/parameters.json" || fail "the Python client's table"
 }
 
 # A parameter that nobody knows is refused, and the refusal names those of the schema.

@@ -9,11 +9,15 @@ cbct simulate --phantom ball --scale 30 --density 0.02 --shift 12,-9,10 --views 
 
 client() { # CLASS: its tests in python_client.py
 	"$python" -c 'import numpy, requests' 2>/dev/null || skip "python3-numpy and python3-requests are not here"
-	SCAN_DIR=$scan_dir PYTHONPATH=$top/clients/python PYTHONDONTWRITEBYTECODE=1 timeout 300 "$python" "$here/python_client.py" "$1"
+	PARAMETERS=$work/parameters.json SCAN_DIR=$scan_dir PYTHONPATH=$top/clients/python PYTHONDONTWRITEBYTECODE=1 timeout 300 "$python" "$here/python_client.py" "$1"
 }
 
 test_scans_and_uploads() { client Scans; }
 test_jobs_and_refusals() { client Jobs; }
+test_wrong_values_are_refused_before_they_are_sent() {
+	cbct parameters --json >"$work/parameters.json"
+	client Checks
+}
 test_volumes_as_arrays() { client Volumes; }
 test_events() { client Events; }
 test_reconstruction_in_one_call() { client Recon; }
