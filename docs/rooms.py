@@ -31,6 +31,7 @@ ROOMS = {
     "clients/cbct": "command-line client",
     "proto": "JSON, file formats, messages",
     "core/recon": "algorithms, the run",
+    "core/calibrate": "an arm's geometry from balls",
     "core/correct": "corrections",
     "core/outofcore": "a backend over a backend",
     "core/cpu": "CPU backend",

@@ -1,0 +1,143 @@
+#ifndef CBCT_CORE_CALIBRATE_INTERNAL_H
+#define CBCT_CORE_CALIBRATE_INTERNAL_H
+
+#include <stddef.h>
+
+#include "core/calibrate/calibrate.h"
+
+/* ---- dense.c: small dense systems, row by row ---- */
+/*
+ * a = L L^T in place, of which only the lower triangle is read and written; a is symmetric. Negative when a is not
+ * positive definite.
+ */
+int dense_cholesky(double *a, int n);
+/* x := (L L^T)^-1 x */
+void dense_solve(const double *l, int n, double *x);
+/* Eigenvalues of a symmetric 3x3, largest first. */
+void dense_eigenvalues(const double a[3][3], double ret_values[3]);
+/* The k-th smallest of count values, which are reordered. */
+float dense_select(float *values, int count, int k);
+
+/* ---- shadows.c ---- */
+struct shadow {
+	double column, row; /* pixels: centroid of the line integrals above the background */
+	double radius;      /* pixels, of the ball that has this second moment */
+	double height;      /* at the centre, line integral above the background */
+	double likeness;    /* share of the variance that a ball's shadow explains */
+};
+
+enum { SHADOWS_MOST = 768 };
+
+struct shadow_scale {
+	double small, large; /* pixels: expected radii of the smallest and of the largest ball's shadow */
+};
+
+/* Scratch of one thread for images of one size. */
+struct shadow_finder;
+struct shadow_finder *shadow_finder_open(int columns, int rows, const struct shadow_scale *scale);
+struct shadow_finder *shadow_finder_free(struct shadow_finder *finder);
+
+/* What a picture without shadows is told by. */
+struct shadow_facts {
+	double median, noise; /* of the picture's line integrals and of its background's residual */
+	double highest;       /* above the background */
+	int candidates;       /* bumps above the noise, of any shape */
+};
+
+/* Writes at most SHADOWS_MOST shadows that look like a ball's and returns how many, highest first. */
+int shadows_find(struct shadow_finder *finder, const float *image, struct shadow *ret_shadows,
+		 struct shadow_facts *ret_facts);
+
+/* ---- pose.c ---- */
+struct pose {
+	double source[3];   /* mm */
+	double axes[3][3];  /* unit vectors along columns' step, rows' step, and their cross product */
+	double detector[3]; /* mm, of pixel 0, 0 from the source along the axes */
+};
+
+void pose_of_view(struct pose *ret_pose, const struct view *view);
+void pose_view(const struct pose *pose, const double pixel_mm[2], struct view *ret_view);
+/* Pixel coordinates of a point, and pixels for a millimetre across there; 0 for a point behind the source. */
+double pose_project(const struct pose *pose, const double pixel_mm[2], const double point[3], double ret_pixel[2]);
+/*
+ * Where the centroid of a ball's shadow lies: its centre's projection and the part by which the ellipse's is further
+ * out. Returns the radius in pixels.
+ */
+double pose_shadow(const struct pose *pose, const double pixel_mm[2], const struct ball *ball, double ret_pixel[2]);
+
+/* A ball and its shadow in one view. */
+struct pair {
+	int ball;
+	int shadow; /* its index in the view's list */
+	double pixel[2];
+};
+
+/* Residuals' Jacobian of a ball in a view: by the pose's nine steps and by the ball's place. */
+struct pose_row {
+	double residual[2]; /* measured - modelled, pixels */
+	double pose[2][9];  /* d modelled / d (source, turns, detector) */
+	double place[2][3]; /* d modelled / d place */
+};
+void pose_row(const struct pose *pose, const double pixel_mm[2], const struct ball *ball, const double pixel[2],
+	      struct pose_row *ret_row);
+/* Moves a pose by nine steps: source in mm, turns in radians about its axes, detector in mm along them. */
+void pose_step(struct pose *pose, const double step[9]);
+/* Levenberg-Marquardt over one view; the pose is moved to the least sum of squares. Returns the RMS in pixels. */
+double pose_fit(struct pose *pose, const double pixel_mm[2], const struct balls *balls, const struct pair *pairs,
+		int count);
+double pose_rms(const struct pose *pose, const double pixel_mm[2], const struct balls *balls, const struct pair *pairs,
+		int count, double *ret_worst);
+
+/* ---- resect.c ---- */
+/*
+ * A first pose by RANSAC over the normalised DLT; pairs that do not agree with it are dropped from the list, ret_count
+ * is how many are left. Negative when no six of the pairs say where the view stood.
+ */
+int resect(const struct balls *balls, struct pair *pairs, int count, const double pixel_mm[2], unsigned seed,
+	   struct pose *ret_pose, int *ret_count);
+
+/* ---- match.c ---- */
+/* The shadows of a view, and where the nominal geometry expects each ball. */
+struct match_view {
+	const struct shadow *shadows;
+	int count;
+	struct pose nominal;
+	int columns, rows;
+};
+
+/* Pairs of shadows and balls, the phantom turned about z by an angle; returns their number, at most balls->count. */
+int match_view(const struct match_view *view, const double pixel_mm[2], const struct balls *balls, double turn,
+	       struct pair *ret_pairs);
+/* The pairs under a pose: for each ball the nearest shadow within `reach` pixels whose nearest ball it is. */
+int match_pose(const struct match_view *view, const struct pose *pose, const double pixel_mm[2],
+	       const struct balls *balls, double reach, struct pair *ret_pairs);
+/*
+ * The angle about z by which the phantom stood turned: the one under which most balls of some views have shadows, and
+ * of several such the smallest.
+ */
+int match_turn(const struct match_view *views, int count, const double pixel_mm[2], const struct balls *balls,
+	       double *ret_turn, struct error *err);
+
+/* ---- bundle.c ---- */
+struct bundle_view {
+	struct pose *pose;
+	const struct pair *pairs;
+	int count; /* 0: not used */
+};
+/*
+ * All poses and all balls' places at once; the drawing is known to `drawing` mm, which also fixes the frame. Poses and
+ * balls are moved.
+ */
+int bundle_fit(const struct bundle_view *views, int count, const double pixel_mm[2], struct balls *balls,
+	       double drawing, struct error *err);
+
+/* ---- sweep.c ---- */
+/*
+ * Refuses views that do not follow their neighbours: from the shift of the balls' shadows against the nominal
+ * geometry, which is smooth over a sweep.
+ */
+int sweep_refuse(struct calibration *calibration, const struct calibrate_request *request, struct error *err);
+/* Gives views that are not used the pose between their neighbours'. */
+int sweep_fill(struct calibration *calibration, const struct geometry *nominal, struct error *err);
+
+#endif

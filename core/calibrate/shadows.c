@@ -1,0 +1,456 @@
+/*
+ * Shadows of balls in a picture of line integrals.
+ *
+ * Candidates are found on an image of block means, where a ball is some pixels wide: the image less its grey opening
+ * keeps what is narrower than the opening's square, whatever lies behind it, and its local maxima above the noise are
+ * judged at full resolution, each by itself. There, a plane through a ring around the shadow is the background; the
+ * centroid, the second moment and the height of what is above it are iterated to rest; and the share of the variance
+ * that a ball's chord lengths, 2 sqrt(R^2 - d^2), explain tells a ball from a wire, a clip's edge or two balls in one.
+ */
+#include <math.h>
+#include <stdbool.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "core/calibrate/internal.h"
+
+enum { BLOCK_RADIUS = 2 }; /* blocks, at least, of the smallest ball: for its maximum to stand out */
+enum { RING_MOST = 1024 }; /* pixels of a ring that are looked at */
+enum { BUMPS_MOST = 8192 };
+static const double NOISE_FACTOR = 6;   /* a candidate's height, of the noise */
+static const double HEIGHT_LEAST = .01; /* line integral: below it nothing is a ball */
+static const double WINDOW = 1.25;      /* radius of the window, of the ball's */
+static const double LIKENESS_LEAST = .85;
+static const double MEDIAN_TO_SIGMA = 1.4826;
+
+struct bump {
+	float height;
+	int place; /* in the image of block means */
+};
+
+struct shadow_finder {
+	int columns, rows, block;
+	int wide, high; /* of the image of block means */
+	int opening;    /* half width of the opening's square, blocks */
+	int apart;      /* blocks, from a maximum to another one of the same height */
+	/* Radii to begin with, pixels: those expected, and others for where these find no ball. */
+	double start[4];
+	int expected, starts;
+	float *line, *means, *opened, *scratch;
+	struct bump bumps[BUMPS_MOST];
+	float ring[RING_MOST], spread[RING_MOST];
+	float ring_x[RING_MOST], ring_y[RING_MOST];
+};
+
+struct shadow_finder *shadow_finder_open(int columns, int rows, const struct shadow_scale *scale)
+{
+	struct shadow_finder *finder = calloc(1, sizeof(*finder));
+	size_t blocks;
+
+	if (finder == NULL)
+		return NULL;
+	finder->columns = columns;
+	finder->rows = rows;
+	finder->block = (int)fmax(1, floor(scale->small / BLOCK_RADIUS));
+	finder->wide = columns / finder->block;
+	finder->high = rows / finder->block;
+	finder->opening = 1 + (int)ceil(1.8 * scale->large / finder->block);
+	finder->apart = (int)fmax(1, .6 * scale->small / finder->block);
+	finder->start[finder->expected++] = scale->large;
+	if (scale->large > 1.15 * scale->small)
+		finder->start[finder->expected++] = scale->small;
+	finder->starts = finder->expected;
+	finder->start[finder->starts++] = 1.6 * scale->large;
+	finder->start[finder->starts++] = .6 * scale->small;
+	blocks = (size_t)finder->wide * (size_t)finder->high;
+	finder->line = malloc((size_t)columns * sizeof(float));
+	finder->means = malloc((blocks + 1) * sizeof(float));
+	finder->opened = malloc((blocks + 1) * sizeof(float));
+	finder->scratch = malloc((blocks + 1) * sizeof(float));
+	if (finder->line == NULL || finder->means == NULL || finder->opened == NULL || finder->scratch == NULL)
+		return shadow_finder_free(finder);
+	return finder;
+}
+
+struct shadow_finder *shadow_finder_free(struct shadow_finder *finder)
+{
+	if (finder == NULL)
+		return NULL;
+	free(finder->line);
+	free(finder->means);
+	free(finder->opened);
+	free(finder->scratch);
+	free(finder);
+	return NULL;
+}
+
+static void block_means(struct shadow_finder *finder, const float *image)
+{
+	const int block = finder->block;
+	const float share = 1.0F / (float)(block * block);
+
+	for (int y = 0; y < finder->high; y++) {
+		float *line = finder->line;
+
+		memset(line, 0, (size_t)finder->columns * sizeof(*line));
+		for (int i = 0; i < block; i++) {
+			const float *row = image + (size_t)(y * block + i) * (size_t)finder->columns;
+#pragma omp simd
+			for (int x = 0; x < finder->columns; x++)
+				line[x] += row[x];
+		}
+		for (int x = 0; x < finder->wide; x++) {
+			float sum = 0;
+
+			for (int i = 0; i < block; i++)
+				sum += line[x * block + i];
+			finder->means[(size_t)y * (size_t)finder->wide + (size_t)x] = sum * share;
+		}
+	}
+}
+
+/* target = min or max of target and source, element by element. */
+static void extreme(float *target, const float *source, int count, bool least)
+{
+	if (least) {
+#pragma omp simd
+		for (int i = 0; i < count; i++)
+			target[i] = source[i] < target[i] ? source[i] : target[i];
+	} else {
+#pragma omp simd
+		for (int i = 0; i < count; i++)
+			target[i] = source[i] > target[i] ? source[i] : target[i];
+	}
+}
+
+/* The least or greatest value within `reach` to either side, along rows and then along columns; over the border
+ * nothing counts. */
+static void slide(const struct shadow_finder *finder, const float *from, float *to, float *between, bool least)
+{
+	const int wide = finder->wide, high = finder->high, reach = finder->opening;
+
+	memcpy(between, from, (size_t)wide * (size_t)high * sizeof(*to));
+	for (int y = 0; y < high; y++) {
+		const float *row = from + (size_t)y * (size_t)wide;
+		float *target = between + (size_t)y * (size_t)wide;
+
+		for (int i = 1; i <= reach && i < wide; i++) {
+			extreme(target, row + i, wide - i, least);
+			extreme(target + i, row, wide - i, least);
+		}
+	}
+	memcpy(to, between, (size_t)wide * (size_t)high * sizeof(*to));
+	for (int y = 0; y < high; y++)
+		for (int i = 1; i <= reach; i++) {
+			float *target = to + (size_t)y * (size_t)wide;
+
+			if (y + i < high)
+				extreme(target, between + (size_t)(y + i) * (size_t)wide, wide, least);
+			if (y - i >= 0)
+				extreme(target, between + (size_t)(y - i) * (size_t)wide, wide, least);
+		}
+}
+
+static int bump_order(const void *a, const void *b)
+{
+	const struct bump *x = a, *y = b;
+
+	if (x->height != y->height)
+		return x->height < y->height ? 1 : -1;
+	return (x->place > y->place) - (x->place < y->place);
+}
+
+/* The median and the noise, by the median of distances from it, of every n-th block. */
+static void measure(struct shadow_finder *finder, const float *blocks, double *ret_median, double *ret_noise)
+{
+	const int count = finder->wide * finder->high, step = 1 + count / 20000;
+	int taken = 0;
+
+	for (int i = 0; i < count; i += step)
+		finder->scratch[taken++] = blocks[i];
+	*ret_median = dense_select(finder->scratch, taken, taken / 2);
+	for (int i = 0; i < taken; i++)
+		finder->scratch[i] = fabsf(finder->scratch[i] - (float)*ret_median);
+	*ret_noise = MEDIAN_TO_SIGMA * dense_select(finder->scratch, taken, taken / 2);
+}
+
+static bool is_highest(const struct shadow_finder *finder, const float *above, int x, int y)
+{
+	const float height = above[(size_t)y * (size_t)finder->wide + (size_t)x];
+
+	for (int j = -finder->apart; j <= finder->apart; j++)
+		for (int i = -finder->apart; i <= finder->apart; i++) {
+			float other;
+
+			if (x + i < 0 || x + i >= finder->wide || y + j < 0 || y + j >= finder->high)
+				continue;
+			other = above[(size_t)(y + j) * (size_t)finder->wide + (size_t)(x + i)];
+			if (other > height || (other == height && (j < 0 || (j == 0 && i < 0))))
+				return false;
+		}
+	return true;
+}
+
+/* Local maxima above the noise, highest first; `above` is the image of block means less its opening. */
+static int find_bumps(struct shadow_finder *finder, const float *above, struct shadow_facts *facts)
+{
+	double median, least;
+	int count = 0;
+
+	measure(finder, above, &median, &facts->noise);
+	least = HEIGHT_LEAST + NOISE_FACTOR * facts->noise;
+	for (int y = 0; y < finder->high; y++)
+		for (int x = 0; x < finder->wide; x++) {
+			const float height = above[(size_t)y * (size_t)finder->wide + (size_t)x] - (float)median;
+
+			facts->highest = fmax(facts->highest, height);
+			if (height > least && count < BUMPS_MOST && is_highest(finder, above, x, y))
+				finder->bumps[count++] = (struct bump){.height = height, .place = y * finder->wide + x};
+		}
+	qsort(finder->bumps, (size_t)count, sizeof(*finder->bumps), bump_order);
+	return count < SHADOWS_MOST ? count : SHADOWS_MOST;
+}
+
+struct plane {
+	double at, by_x, by_y; /* at the middle, and for a pixel */
+	double noise;
+};
+
+static bool fit_plane(struct shadow_finder *finder, int count, struct plane *plane)
+{
+	double normal[9] = {0}, right[3] = {0}, limit, scale = 0;
+	int kept = 0;
+
+	for (int i = 0; i < count; i++) {
+		finder->spread[i] = fabsf(finder->ring[i] - (float)(plane->at + plane->by_x * finder->ring_x[i] +
+								    plane->by_y * finder->ring_y[i]));
+		scale = fmax(scale, fabs(finder->ring_x[i]));
+	}
+	plane->noise = MEDIAN_TO_SIGMA * dense_select(finder->spread, count, count / 2);
+	limit = 3 * plane->noise + 1e-6;
+	for (int i = 0; i < count; i++) {
+		const double x[3] = {1, finder->ring_x[i] / scale, finder->ring_y[i] / scale};
+		const double value = finder->ring[i];
+
+		if (fabs(value - plane->at - plane->by_x * finder->ring_x[i] - plane->by_y * finder->ring_y[i]) > limit)
+			continue;
+		kept++;
+		for (int a = 0; a < 3; a++) {
+			right[a] += x[a] * value;
+			for (int b = 0; b <= a; b++)
+				normal[3 * a + b] += x[a] * x[b];
+		}
+	}
+	if (kept < 8 || dense_cholesky(normal, 3) < 0)
+		return false;
+	dense_solve(normal, 3, right);
+	plane->at = right[0];
+	plane->by_x = right[1] / scale;
+	plane->by_y = right[2] / scale;
+	return true;
+}
+
+/* The background of a shadow from a ring around it; false where too little of the ring is on the picture. */
+static bool find_background(struct shadow_finder *finder, const float *image, double column, double row, double radius,
+			    struct plane *ret_plane)
+{
+	const double inner = WINDOW * radius + 1.5, outer = inner + fmax(3, .6 * radius);
+	const double area = M_PI * (outer * outer - inner * inner);
+	const int step = (int)ceil(sqrt(area / 500));
+	int count = 0;
+
+	for (int y = (int)ceil(fmax(0, row - outer)); y < finder->rows && y <= row + outer; y += step)
+		for (int x = (int)ceil(fmax(0, column - outer)); x < finder->columns && x <= column + outer;
+		     x += step) {
+			const double dx = x - column, dy = y - row, distance = dx * dx + dy * dy;
+
+			if (distance < inner * inner || distance > outer * outer || count >= RING_MOST)
+				continue;
+			finder->ring[count] = finder->spread[count] =
+			    image[(size_t)y * (size_t)finder->columns + (size_t)x];
+			finder->ring_x[count] = (float)dx;
+			finder->ring_y[count++] = (float)dy;
+		}
+	if (count < 16)
+		return false;
+	*ret_plane = (struct plane){.at = dense_select(finder->spread, count, count / 2)};
+	return fit_plane(finder, count, ret_plane) && fit_plane(finder, count, ret_plane);
+}
+
+/* Sums over a window of what is above the background. */
+struct moments {
+	double mass, column, row, second;
+};
+
+/* Whether a shadow's window is wholly on the picture. */
+static bool on_picture(const struct shadow_finder *finder, double column, double row, double radius)
+{
+	const double window = WINDOW * radius;
+
+	return column >= window && row >= window && column + window <= finder->columns - 1 &&
+	       row + window <= finder->rows - 1;
+}
+
+static bool take_moments(const struct shadow_finder *finder, const float *image, double column, double row,
+			 double radius, const struct plane *plane, struct moments *ret)
+{
+	const double window = WINDOW * radius;
+	struct moments m = {0};
+
+	if (!on_picture(finder, column, row, radius))
+		return false;
+	for (int y = (int)ceil(row - window); y <= row + window; y++)
+		for (int x = (int)ceil(column - window); x <= column + window; x++) {
+			const double dx = x - column, dy = y - row, square = dx * dx + dy * dy;
+			double value;
+
+			/* The outermost pixels count by the part of them that is inside, or the window's edge moves
+			 * the centroid in steps. */
+			const double inside = fmin(1, window - sqrt(square) + .5);
+
+			if (inside <= 0)
+				continue;
+			value = inside * (image[(size_t)y * (size_t)finder->columns + (size_t)x] - plane->at -
+					  plane->by_x * dx - plane->by_y * dy);
+			m.mass += value;
+			m.column += value * dx;
+			m.row += value * dy;
+			m.second += value * square;
+		}
+	*ret = m;
+	return m.mass > 0;
+}
+
+/* Sums over a window of values, of a ball's chord lengths there (1 in the middle), and of what noise adds. */
+struct agreement {
+	double count, sum, squares, chords, both, noise;
+};
+
+static void take_agreement(const struct shadow_finder *finder, const float *image, const struct plane *plane,
+			   const struct shadow *shadow, struct agreement *ret)
+{
+	const double radius = shadow->radius, window = WINDOW * radius, variance = plane->noise * plane->noise;
+	struct agreement sums = {0};
+
+	for (int y = (int)ceil(shadow->row - window); y <= shadow->row + window; y++)
+		for (int x = (int)ceil(shadow->column - window); x <= shadow->column + window; x++) {
+			const double dx = x - shadow->column, dy = y - shadow->row, square = dx * dx + dy * dy;
+			double value, chord;
+
+			if (square > window * window)
+				continue;
+			chord = sqrt(fmax(0, 1 - square / (radius * radius)));
+			value = image[(size_t)y * (size_t)finder->columns + (size_t)x] - plane->at - plane->by_x * dx -
+				plane->by_y * dy;
+			sums.count++;
+			sums.sum += value;
+			sums.squares += value * value;
+			sums.chords += chord * chord;
+			sums.both += chord * value;
+			sums.noise += variance * exp(fmax(0, fmin(8, value)));
+		}
+	*ret = sums;
+}
+
+/*
+ * The share of the variance that a ball's chord lengths explain. Noise is none of what has to be explained: its
+ * variance in a line integral grows with exp(p), as counts go down.
+ */
+static void judge(const struct shadow_finder *finder, const float *image, const struct plane *plane,
+		  struct shadow *shadow)
+{
+	struct agreement sums;
+	double left, all;
+
+	take_agreement(finder, image, plane, shadow, &sums);
+	shadow->height = sums.both / sums.chords;
+	left = fmax(0, sums.squares - sums.both * shadow->height - sums.noise);
+	all = sums.squares - sums.sum * sums.sum / sums.count - sums.noise;
+	shadow->likeness = all > .25 * (all + sums.noise) && shadow->height > 3 * plane->noise ? 1 - left / all : 0;
+}
+
+/* Lets centre and radius come to rest, beginning with a radius; false where no ball can be. */
+static bool settle(struct shadow_finder *finder, const float *image, double start, struct shadow *shadow)
+{
+	struct plane plane = {0};
+	double radius = start;
+
+	for (int i = 0; i < 8; i++) {
+		struct moments m;
+		double found, shift;
+
+		if (!find_background(finder, image, shadow->column, shadow->row, radius, &plane) ||
+		    !take_moments(finder, image, shadow->column, shadow->row, radius, &plane, &m) || m.second <= 0)
+			return false;
+		/* <rho^2> of chord lengths over their disc is 2/5 R^2. */
+		found = fmin(1.3 * radius, fmax(.7 * radius, sqrt(2.5 * m.second / m.mass)));
+		shift = hypot(m.column, m.row) / m.mass;
+		if (shift > radius)
+			return false;
+		shadow->column += m.column / m.mass;
+		shadow->row += m.row / m.mass;
+		shift += fabs(found - radius);
+		radius = found;
+		if (radius < .4 * start || radius > 2.5 * start || radius < .7)
+			return false;
+		if (i > 1 && shift < .02)
+			break;
+	}
+	if (!on_picture(finder, shadow->column, shadow->row, radius))
+		return false;
+	shadow->radius = radius;
+	judge(finder, image, &plane, shadow);
+	return true;
+}
+
+/* The shadow at a bump, by the radius to begin with that a ball explains best; false when it is no ball's. */
+static bool find_shadow(struct shadow_finder *finder, const float *image, const struct bump *bump,
+			struct shadow *ret_shadow)
+{
+	const double middle = .5 * (finder->block - 1);
+	struct shadow best = {.likeness = 0};
+
+	for (int i = 0; i < finder->starts; i++) {
+		struct shadow shadow = {.column = bump->place % finder->wide * finder->block + middle,
+					.row = bump->place / finder->wide * finder->block + middle};
+
+		if (i >= finder->expected && best.likeness >= LIKENESS_LEAST)
+			break;
+		if (settle(finder, image, finder->start[i], &shadow) && shadow.likeness > best.likeness)
+			best = shadow;
+	}
+	*ret_shadow = best;
+	return best.likeness >= LIKENESS_LEAST;
+}
+
+int shadows_find(struct shadow_finder *finder, const float *image, struct shadow *ret_shadows,
+		 struct shadow_facts *ret_facts)
+{
+	const int blocks = finder->wide * finder->high;
+	struct shadow_facts facts = {0};
+	double spread;
+	int count = 0, bumps;
+
+	block_means(finder, image);
+	measure(finder, finder->means, &facts.median, &spread);
+	slide(finder, finder->means, finder->opened, finder->scratch, true);
+	slide(finder, finder->opened, finder->opened, finder->scratch, false);
+	for (int i = 0; i < blocks; i++)
+		finder->means[i] -= finder->opened[i];
+	bumps = find_bumps(finder, finder->means, &facts);
+	facts.candidates = bumps;
+	for (int i = 0; i < bumps; i++) {
+		struct shadow shadow;
+		bool known = false;
+
+		if (!find_shadow(finder, image, &finder->bumps[i], &shadow))
+			continue;
+		for (int j = 0; j < count && !known; j++)
+			known = hypot(shadow.column - ret_shadows[j].column, shadow.row - ret_shadows[j].row) <
+				.5 * shadow.radius;
+		if (!known)
+			ret_shadows[count++] = shadow;
+	}
+	*ret_facts = facts;
+	return count;
+}

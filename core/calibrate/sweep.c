@@ -1,0 +1,279 @@
+/*
+ * A sweep as a whole: views that do not follow their neighbours, and poses between calibrated views.
+ *
+ * An arm sags smoothly. Between two views a pose is interpolated in the frame that turns with the arm: source,
+ * detector and axes turned back by the source's nominal angle. Smoothness decides nothing else: no view that is used
+ * is drawn towards its neighbours.
+ */
+#include <math.h>
+#include <stdbool.h>
+#include <stdio.h>
+#include <stdlib.h>
+
+#include "core/calibrate/internal.h"
+
+static const double GAP_MOST = 30 * M_PI / 180; /* between the neighbours of a view that is held against them */
+static const double STRAY_LEAST = 1;            /* mm at the detector: below it no view strays */
+static const double STRAY_FACTOR = 8;           /* of the median over the views */
+
+/* A view's place in the order of the angles. */
+struct station {
+	double angle; /* radians, -pi to pi, of its nominal source */
+	int view;
+};
+
+static int station_order(const void *a, const void *b)
+{
+	const struct station *x = a, *y = b;
+
+	if (x->angle != y->angle)
+		return x->angle < y->angle ? -1 : 1;
+	return x->view - y->view;
+}
+
+static struct station *stations_of(const struct geometry *nominal)
+{
+	struct station *stations = malloc((size_t)nominal->count * sizeof(*stations));
+
+	for (int k = 0; k < nominal->count && stations != NULL; k++)
+		stations[k] = (struct station){.angle = atan2(nominal->views[k].source[1], nominal->views[k].source[0]),
+					       .view = k};
+	if (stations != NULL)
+		qsort(stations, (size_t)nominal->count, sizeof(*stations), station_order);
+	return stations;
+}
+
+/* From one angle on to another, 0 to 2 pi. */
+static double onward(double from, double to)
+{
+	const double angle = fmod(to - from, 2 * M_PI);
+
+	return angle < 0 ? angle + 2 * M_PI : angle;
+}
+
+static void turn_about_z(double v[3], double angle)
+{
+	const double x = v[0], y = v[1];
+
+	v[0] = cos(angle) * x - sin(angle) * y;
+	v[1] = sin(angle) * x + cos(angle) * y;
+}
+
+static void pose_turn(struct pose *pose, double angle)
+{
+	turn_about_z(pose->source, angle);
+	for (int i = 0; i < 3; i++)
+		turn_about_z(pose->axes[i], angle);
+}
+
+/* The pose at `share` of the way from a to b. */
+static struct pose blend(const struct pose *a, const struct pose *b, double share)
+{
+	const double still[9] = {0};
+	struct pose pose = *a;
+
+	for (int i = 0; i < 3; i++) {
+		pose.source[i] += share * (b->source[i] - a->source[i]);
+		pose.detector[i] += share * (b->detector[i] - a->detector[i]);
+		for (int axis = 0; axis < 3; axis++)
+			pose.axes[axis][i] += share * (b->axes[axis][i] - a->axes[axis][i]);
+	}
+	pose_step(&pose, still); /* the axes are made orthogonal again */
+	return pose;
+}
+
+/* The view at an angle between those of two stations. */
+static struct view between(const struct station *a, const struct view *of_a, const struct station *b,
+			   const struct view *of_b, double angle)
+{
+	const double gap = onward(a->angle, b->angle), share = gap > 0 ? onward(a->angle, angle) / gap : 0;
+	const double pixel_mm[2] = {vec_norm(of_a->column_step), vec_norm(of_a->row_step)};
+	struct pose from, to, pose;
+	struct view view;
+
+	pose_of_view(&from, of_a);
+	pose_of_view(&to, of_b);
+	pose_turn(&from, -a->angle);
+	pose_turn(&to, -b->angle);
+	pose = blend(&from, &to, share);
+	pose_turn(&pose, angle);
+	pose_view(&pose, pixel_mm, &view);
+	return view;
+}
+
+static double wrapped(double angle)
+{
+	return atan2(sin(angle), cos(angle));
+}
+
+static double median_gap(const struct station *stations, int count)
+{
+	float *gaps = malloc((size_t)count * sizeof(*gaps)), median = 0;
+
+	for (int i = 0; i < count && gaps != NULL; i++)
+		gaps[i] = (float)onward(stations[i].angle, stations[(i + 1) % count].angle);
+	if (gaps != NULL)
+		median = dense_select(gaps, count, count / 2);
+	free(gaps);
+	return median;
+}
+
+int calibration_between(struct geometry *ret_geometry, const struct geometry *nominal, const struct view *views,
+			const double *angles, int count, struct error *err)
+{
+	struct station *stations = stations_of(nominal);
+	struct view *found = malloc((size_t)count * sizeof(*found));
+	double gap_most, beyond_most;
+	int code = 0;
+
+	if (stations == NULL || found == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views", count);
+	gap_most = code == 0 ? fmax(5 * M_PI / 180, 3 * median_gap(stations, nominal->count)) : 0;
+	beyond_most = fmax(.5 * M_PI / 180, gap_most / 6);
+	for (int k = 0; k < count && code == 0; k++) {
+		const double angle = wrapped(angles[k]);
+		const struct station *a = &stations[nominal->count - 1], *b = &stations[0];
+		double before, after;
+
+		for (int i = 0; i < nominal->count && stations[i].angle <= angle; i++) {
+			a = &stations[i];
+			b = &stations[(i + 1) % nominal->count];
+		}
+		before = onward(a->angle, angle);
+		after = onward(angle, b->angle);
+		if (before + after <= gap_most)
+			found[k] = between(a, &views[a->view], b, &views[b->view], angle);
+		else if (fmin(before, after) <= beyond_most) {
+			const struct station *nearest = before < after ? a : b;
+
+			found[k] = between(nearest, &views[nearest->view], nearest, &views[nearest->view], angle);
+		} else
+			code = error_set(err, ERR_IMPOSSIBLE,
+					 "view %d stands at %.2f degrees, %.2f degrees from the nearest calibrated one",
+					 k, angles[k] * 180 / M_PI, fmin(before, after) * 180 / M_PI);
+	}
+	if (code == 0)
+		code = geometry_views(ret_geometry, nominal->columns, nominal->rows, count, found, err);
+	free(stations);
+	free(found);
+	return code;
+}
+
+/* The stations next to one of the list, before and after it, whose views are used; NULL where there is none. */
+static void neighbours(const struct calibration *calibration, const struct station *stations, int at,
+		       const struct station *ret[2])
+{
+	const int count = calibration->count;
+
+	for (int side = 0; side < 2; side++) {
+		ret[side] = NULL;
+		for (int i = 1; i < count && ret[side] == NULL; i++) {
+			const struct station *other = &stations[(at + (side == 0 ? count - i : i)) % count];
+
+			if (calibration->views[other->view].used)
+				ret[side] = other;
+		}
+	}
+}
+
+/* How far a view's shadows lie from where its neighbours' poses have them: RMS over the balls, pixels. */
+static double stray(const struct calibration *calibration, const struct calibrate_request *request,
+		    const struct station *stations, int at)
+{
+	const struct calibrated_view *views = calibration->views;
+	const struct station *side[2];
+	struct pose own, expected;
+	struct view view;
+	double squares = 0;
+
+	neighbours(calibration, stations, at, side);
+	if (side[0] == NULL || side[1] == NULL || side[0] == side[1] ||
+	    onward(side[0]->angle, stations[at].angle) + onward(stations[at].angle, side[1]->angle) > GAP_MOST)
+		return 0;
+	view = between(side[0], &views[side[0]->view].view, side[1], &views[side[1]->view].view, stations[at].angle);
+	pose_of_view(&own, &views[stations[at].view].view);
+	pose_of_view(&expected, &view);
+	for (int b = 0; b < calibration->balls.count; b++) {
+		double is[2] = {0}, should[2] = {0};
+
+		pose_shadow(&own, request->pixel_mm, &calibration->balls.ball[b], is);
+		pose_shadow(&expected, request->pixel_mm, &calibration->balls.ball[b], should);
+		squares += (is[0] - should[0]) * (is[0] - should[0]) + (is[1] - should[1]) * (is[1] - should[1]);
+	}
+	return sqrt(squares / calibration->balls.count);
+}
+
+/* Refuses the view that strays most, when it strays too far; a stray view also draws its neighbours' figures up. */
+static bool refuse_farthest(struct calibration *calibration, const struct calibrate_request *request,
+			    const struct station *stations, float *scratch)
+{
+	double most = 0, limit;
+	int count = 0, worst = 0;
+
+	for (int i = 0; i < calibration->count; i++) {
+		double far;
+
+		if (!calibration->views[stations[i].view].used)
+			continue;
+		far = stray(calibration, request, stations, i);
+		scratch[count++] = (float)far;
+		if (far > most) {
+			most = far;
+			worst = stations[i].view;
+		}
+	}
+	if (count < 5)
+		return false;
+	limit = fmax(STRAY_LEAST / request->pixel_mm[0], STRAY_FACTOR * dense_select(scratch, count, count / 2));
+	if (most <= limit)
+		return false;
+	calibration->views[worst].used = false;
+	snprintf(calibration->views[worst].refused, sizeof(calibration->views[worst].refused),
+		 "its shadows lie %.1f pixels from where the neighbouring views have them, expected at most %.1f", most,
+		 limit);
+	return true;
+}
+
+int sweep_refuse(struct calibration *calibration, const struct calibrate_request *request, struct error *err)
+{
+	struct station *stations = stations_of(request->nominal);
+	float *scratch = malloc((size_t)calibration->count * sizeof(*scratch));
+	int code = 0;
+
+	if (stations == NULL || scratch == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views", calibration->count);
+	for (int i = 0; i < calibration->count / 4 && code == 0; i++)
+		if (!refuse_farthest(calibration, request, stations, scratch))
+			break;
+	free(stations);
+	free(scratch);
+	return code;
+}
+
+int sweep_fill(struct calibration *calibration, const struct geometry *nominal, struct error *err)
+{
+	struct station *stations = stations_of(nominal);
+
+	if (stations == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for %d views", calibration->count);
+	for (int i = 0; i < calibration->count; i++) {
+		struct calibrated_view *view = &calibration->views[stations[i].view];
+		const struct station *side[2];
+		double to[2];
+
+		if (view->used)
+			continue;
+		neighbours(calibration, stations, i, side);
+		if (side[0] == NULL || side[1] == NULL)
+			continue;
+		to[0] = onward(side[0]->angle, stations[i].angle);
+		to[1] = onward(stations[i].angle, side[1]->angle);
+		/* Across the opening of a short scan nothing is between: the nearer end's pose is turned on. */
+		if (to[0] + to[1] > GAP_MOST)
+			side[to[0] < to[1] ? 1 : 0] = side[to[0] < to[1] ? 0 : 1];
+		view->view = between(side[0], &calibration->views[side[0]->view].view, side[1],
+				     &calibration->views[side[1]->view].view, stations[i].angle);
+	}
+	free(stations);
+	return 0;
+}

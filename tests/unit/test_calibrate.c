@@ -1,0 +1,494 @@
+/* Calibration from balls (core/calibrate), of an arm that sags, with pictures of exact chord lengths. */
+#include <check.h>
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "core/calibrate/internal.h"
+#include "tests/unit/arm.h"
+
+Suite *calibrate_suite(void);
+
+static const struct arm arm_sagging = {.columns = 620,
+				       .rows = 480,
+				       .count = 18,
+				       .pixel = .616,
+				       .first = -.3,
+				       .step = 20 * M_PI / 180,
+				       .sag = 1,
+				       .jitter = .05,
+				       .seed = 1};
+static const struct ball_circles circles = {
+    .circles = 2, .balls = 12, .diameter = 110, .distance = 90, .ball = 3.2, .first = .2, .shift = .26};
+
+struct scene {
+	struct arm arm;
+	struct target target;
+};
+
+static int take_picture(void *context, int view, float *ret_image, struct error *err)
+{
+	const struct scene *scene = context;
+
+	(void)err;
+	arm_picture(&scene->arm, &scene->target, view, ret_image);
+	return 0;
+}
+
+static int run(struct scene *scene, const struct balls *balls, bool adjust, struct calibration *ret_calibration,
+	       struct error *err)
+{
+	const double pixel_mm[2] = {scene->arm.pixel, scene->arm.pixel};
+	struct geometry nominal;
+	struct calibrate_request request = {.nominal = &nominal,
+					    .pixel_mm = pixel_mm,
+					    .balls = balls,
+					    .adjust_balls = adjust,
+					    .image = take_picture,
+					    .context = scene};
+	int code;
+
+	ck_assert_msg(arm_nominal_geometry(&scene->arm, &nominal, err) == 0, "%s", err->text);
+	code = calibrate(ret_calibration, &request, err);
+	geometry_clear(&nominal);
+	return code;
+}
+
+/*
+ * By how much a point is misplaced in the volume, mm: where the rays of the true views through it come nearest to each
+ * other once found views say how they run, against where it is. Rays as lines: the point of least squares.
+ */
+static double misplacement(const struct arm *arm, const struct calibration *calibration, const double point[3])
+{
+	double normal[3][3] = {{0}}, right[3] = {0}, det[4];
+
+	for (int k = 0; k < calibration->count; k++) {
+		const struct view truth = arm_view(arm, k), *found = &calibration->views[k].view;
+		double matrix[12], column, row, way[3];
+
+		view_matrix(&truth, matrix);
+		view_project(matrix, point, &column, &row);
+		for (int i = 0; i < 3; i++)
+			way[i] = found->pixel0[i] + column * found->column_step[i] + row * found->row_step[i] -
+				 found->source[i];
+		for (int i = 0; i < 3; i++)
+			for (int j = 0; j < 3; j++) {
+				const double across = (i == j) - way[i] * way[j] / vec_dot(way, way);
+
+				normal[i][j] += across;
+				right[i] += across * found->source[j];
+			}
+	}
+	for (int c = 0; c < 4; c++) {
+		double m[3][3];
+
+		memcpy(m, normal, sizeof(m));
+		for (int i = 0; i < 3 && c > 0; i++)
+			m[i][c - 1] = right[i];
+		det[c] = m[0][0] * (m[1][1] * m[2][2] - m[1][2] * m[2][1]) -
+			 m[0][1] * (m[1][0] * m[2][2] - m[1][2] * m[2][0]) +
+			 m[0][2] * (m[1][0] * m[2][1] - m[1][1] * m[2][0]);
+	}
+	return sqrt(pow(det[1] / det[0] - point[0], 2) + pow(det[2] / det[0] - point[1], 2) +
+		    pow(det[3] / det[0] - point[2], 2));
+}
+
+/* The largest misplacement over points of the volume. */
+static double worst_misplacement(const struct arm *arm, const struct calibration *calibration)
+{
+	double worst = 0;
+
+	for (int i = 0; i < 27; i++) {
+		const double point[3] = {(i % 3 - 1) * 40, (i / 3 % 3 - 1) * 40, (i / 9 - 1) * 40};
+
+		worst = fmax(worst, misplacement(arm, calibration, point));
+	}
+	return worst;
+}
+
+/* RMS distance, pixels, between where found and true views see points of the volume. */
+static double reprojection(const struct arm *arm, const struct calibration *calibration)
+{
+	double squares = 0;
+
+	for (int k = 0; k < calibration->count; k++)
+		for (int i = 0; i < 27; i++) {
+			const double point[3] = {(i % 3 - 1) * 40, (i / 3 % 3 - 1) * 40, (i / 9 - 1) * 40};
+			const struct view truth = arm_view(arm, k);
+			double a[12], b[12], pixel[4];
+
+			view_matrix(&truth, a);
+			view_matrix(&calibration->views[k].view, b);
+			view_project(a, point, &pixel[0], &pixel[1]);
+			view_project(b, point, &pixel[2], &pixel[3]);
+			squares += pow(pixel[0] - pixel[2], 2) + pow(pixel[1] - pixel[3], 2);
+		}
+	return sqrt(squares / (27 * calibration->count));
+}
+
+/* All views are used, and residual, poses and volume are as true as asked for. */
+static void assert_found(const char *what, const struct arm *arm, const struct calibration *calibration,
+			 double residual)
+{
+	for (int k = 0; k < calibration->count; k++)
+		ck_assert_msg(calibration->views[k].used, "%s: view %d: %s", what, k, calibration->views[k].refused);
+	ck_assert_int_eq(calibration->used, calibration->count);
+	ck_assert_msg(calibration->rms <= residual, "%s: residual of %.3f pixels", what, calibration->rms);
+	ck_assert_msg(reprojection(arm, calibration) <= residual, "%s: views are wrong by %.3f pixels", what,
+		      reprojection(arm, calibration));
+	ck_assert_msg(worst_misplacement(arm, calibration) <= .1, "%s: the volume is wrong by %.3f mm", what,
+		      worst_misplacement(arm, calibration));
+}
+
+/* A large ball far off the middle: its shadow's centroid, summed up over fine pixels, against the formula for it. */
+START_TEST(the_centroid_of_an_ellipse_is_known)
+{
+	const struct arm arm = {
+	    .columns = 1400, .rows = 1400, .count = 1, .pixel = .2, .sag = 1, .first = .4, .seed = 1};
+	const double pixel_mm[2] = {arm.pixel, arm.pixel}, place[3] = {-5, 50, 45};
+	struct ball ball = {.diameter = 40};
+	const struct balls balls = {.count = 1, .ball = &ball};
+	const struct target target = {.balls = &balls, .ball = 1};
+	const struct view view = arm_view(&arm, 0);
+	float *picture = malloc((size_t)arm.columns * (size_t)arm.rows * sizeof(*picture));
+	double mass = 0, sums[2] = {0}, centre[2], modelled[2];
+	struct pose pose;
+
+	ball.centre[0] = cos(arm.first) * place[0] - sin(arm.first) * place[1];
+	ball.centre[1] = sin(arm.first) * place[0] + cos(arm.first) * place[1];
+	ball.centre[2] = place[2];
+	arm_picture(&arm, &target, 0, picture);
+	for (int i = 0; i < arm.columns * arm.rows; i++) {
+		mass += picture[i];
+		sums[0] += (double)picture[i] * (i % arm.columns);
+		sums[1] += (double)picture[i] * (i / arm.columns);
+	}
+	pose_of_view(&pose, &view);
+	ck_assert_double_ge(pose_shadow(&pose, pixel_mm, &ball, modelled), 100);
+	pose_project(&pose, pixel_mm, ball.centre, centre);
+	ck_assert_double_ge(hypot(sums[0] / mass - centre[0], sums[1] / mass - centre[1]), .4);
+	ck_assert_double_le(hypot(sums[0] / mass - modelled[0], sums[1] / mass - modelled[1]), .01);
+	free(picture);
+}
+END_TEST
+
+/* A row each: what is in the pictures, and what is asked of the result. */
+static const struct {
+	const char *what;
+	double photons, residual; /* pixels */
+	int missing;
+	bool metal;
+} rows[] = {
+    {"no noise", 0, .1, 0, false},
+    {"20,000 photons", 20000, .2, 0, false},
+    {"five balls missing, a clip and a cable", 20000, .2, 5, true},
+};
+
+START_TEST(finds_views_of_a_sagging_arm)
+{
+	struct scene scene = {.arm = arm_sagging};
+	struct balls balls;
+	struct calibration calibration;
+	struct error err = {0};
+
+	ck_assert(balls_circles(&balls, &circles, &err) == 0);
+	scene.target = (struct target){.balls = &balls,
+				       .ball = .8,
+				       .body = .02,
+				       .radius = 62,
+				       .missing = rows[_i].missing,
+				       .metal = rows[_i].metal,
+				       .photons = rows[_i].photons};
+	ck_assert_msg(run(&scene, &balls, false, &calibration, &err) == 0, "%s: %s", rows[_i].what, err.text);
+	assert_found(rows[_i].what, &scene.arm, &calibration, rows[_i].residual);
+	ck_assert_double_eq_tol(calibration.diameter_ratio, 1, .03);
+	ck_assert_double_eq_tol(calibration.turn, 0, .01);
+	ck_assert_int_eq(calibration.views[3].balls >= 12, 1);
+	calibration_clear(&calibration);
+	balls_clear(&balls);
+}
+END_TEST
+
+/* A phantom away from the axis: in a third of the views half of its balls are outside of the picture. */
+START_TEST(finds_views_that_see_half_of_the_balls)
+{
+	struct scene scene = {.arm = arm_sagging};
+	struct balls balls;
+	struct calibration calibration;
+	struct error err = {0};
+	int half = 0;
+
+	ck_assert(balls_circles(&balls, &circles, &err) == 0);
+	for (int b = 0; b < balls.count; b++)
+		balls.ball[b].centre[0] += 122;
+	scene.target = (struct target){.balls = &balls, .ball = .8, .photons = 20000};
+	ck_assert_msg(run(&scene, &balls, false, &calibration, &err) == 0, "%s", err.text);
+	for (int k = 0; k < calibration.count; k++)
+		half += calibration.views[k].balls <= balls.count / 2;
+	ck_assert_int_ge(half, calibration.count / 3);
+	for (int k = 0; k < calibration.count; k++)
+		ck_assert_msg(calibration.views[k].used, "view %d: %s", k, calibration.views[k].refused);
+	ck_assert_double_le(calibration.rms, .2);
+	calibration_clear(&calibration);
+	balls_clear(&balls);
+}
+END_TEST
+
+/* Balls of two sizes on a helix tell by themselves how the phantom was turned. */
+START_TEST(the_code_of_two_sizes_finds_a_phantom_however_it_is_turned)
+{
+	static const bool large[40] = {1, 1, 0, 1, 0, 0, 1, 1, 1, 0, 1, 0, 0, 0, 1, 0, 1, 1, 0, 0,
+				       1, 0, 1, 0, 0, 1, 1, 0, 1, 1, 1, 1, 0, 0, 0, 0, 1, 0, 0, 1};
+	const double turn = 100 * M_PI / 180;
+	const struct ball_helix helix = {
+	    .balls = 40, .diameter = 110, .pitch = 40, .step = .42, .ball = {3, 5}, .large = large};
+	struct scene scene = {.arm = arm_sagging};
+	struct balls drawing, standing;
+	struct calibration calibration;
+	struct error err = {0};
+
+	ck_assert(balls_helix(&drawing, &helix, &err) == 0);
+	ck_assert(balls_copy(&standing, drawing.ball, drawing.count, &err) == 0);
+	for (int b = 0; b < standing.count; b++) {
+		const double *from = drawing.ball[b].centre;
+
+		standing.ball[b].centre[0] = cos(turn) * from[0] - sin(turn) * from[1];
+		standing.ball[b].centre[1] = sin(turn) * from[0] + cos(turn) * from[1];
+	}
+	scene.target = (struct target){.balls = &standing, .ball = .5, .photons = 20000};
+	ck_assert_msg(run(&scene, &standing, false, &calibration, &err) == 0, "%s", err.text);
+	assert_found("as drawn", &scene.arm, &calibration, .2);
+	calibration_clear(&calibration);
+	/* The result's world is the drawing's: views turn back with the phantom. */
+	ck_assert_msg(run(&scene, &drawing, false, &calibration, &err) == 0, "%s", err.text);
+	ck_assert_double_eq_tol(calibration.turn, turn, .01);
+	ck_assert_int_eq(calibration.used, calibration.count);
+	ck_assert_double_le(calibration.rms, .2);
+	calibration_clear(&calibration);
+	balls_clear(&drawing);
+	balls_clear(&standing);
+}
+END_TEST
+
+/* Balls up to .08 mm from their drawing: adjusted, residual and balls come nearer to the truth. */
+START_TEST(adjusting_the_balls_takes_errors_of_machining_out)
+{
+	struct scene scene = {.arm = arm_sagging};
+	struct balls drawing, machined;
+	struct calibration plain, adjusted;
+	struct error err = {0};
+
+	ck_assert(balls_circles(&drawing, &circles, &err) == 0);
+	ck_assert(balls_copy(&machined, drawing.ball, drawing.count, &err) == 0);
+	for (int b = 0; b < machined.count; b++)
+		for (int a = 0; a < 3; a++)
+			machined.ball[b].centre[a] += .08 * sin(12.9898 * b + 78.233 * a + 1);
+	scene.target = (struct target){.balls = &machined, .ball = .8, .photons = 20000};
+	ck_assert_msg(run(&scene, &drawing, false, &plain, &err) == 0, "%s", err.text);
+	ck_assert_msg(run(&scene, &drawing, true, &adjusted, &err) == 0, "%s", err.text);
+	ck_assert_double_ge(plain.rms, .1);
+	ck_assert_double_le(adjusted.rms, .06);
+	ck_assert_double_ge(adjusted.adjusted_rms, .03);
+	ck_assert_double_le(worst_misplacement(&scene.arm, &adjusted), .1);
+	calibration_clear(&plain);
+	calibration_clear(&adjusted);
+	balls_clear(&drawing);
+	balls_clear(&machined);
+}
+END_TEST
+
+/* Views between, by angle, are those of the arm there; beyond the sweep there are none. */
+START_TEST(views_between_calibrated_ones_are_the_arms)
+{
+	struct arm arm = arm_sagging, other = arm_sagging;
+	struct geometry nominal, between;
+	struct view views[64];
+	double angles[40], worst = 0;
+	struct error err = {0};
+
+	arm.jitter = other.jitter = 0;
+	arm.count = 50;
+	arm.step = 4 * M_PI / 180;
+	other.count = 40;
+	other.step = 49.0 / 39 * arm.step;
+	ck_assert(arm_nominal_geometry(&arm, &nominal, &err) == 0);
+	for (int k = 0; k < arm.count; k++)
+		views[k] = arm_view(&arm, k);
+	for (int k = 0; k < other.count; k++)
+		angles[k] = other.first + (other.count - 1 - k) * other.step;
+	ck_assert_msg(calibration_between(&between, &nominal, views, angles, other.count, &err) == 0, "%s", err.text);
+	for (int k = 0; k < other.count; k++) {
+		const struct view truth = arm_view(&other, other.count - 1 - k);
+		const double point[3] = {30, -20, 40};
+		double a[12], b[12], pixel[4];
+
+		view_matrix(&truth, a);
+		view_matrix(&between.views[k], b);
+		view_project(a, point, &pixel[0], &pixel[1]);
+		view_project(b, point, &pixel[2], &pixel[3]);
+		worst = fmax(worst, hypot(pixel[0] - pixel[2], pixel[1] - pixel[3]));
+	}
+	ck_assert_double_le(worst, .05);
+	geometry_clear(&between);
+	angles[7] += M_PI;
+	ck_assert_int_eq(calibration_between(&between, &nominal, views, angles, other.count, &err), ERR_IMPOSSIBLE);
+	ck_assert_msg(strstr(err.text, "view 7 stands at") != NULL, "%s", err.text);
+	geometry_clear(&nominal);
+}
+END_TEST
+
+/* What pictures can be that no calibration comes of, and what it is told by. */
+enum fault { WRONG_PHANTOM, WRONG_DIAMETER, EMPTY, COUNTS, WRONG_SCALE };
+static const struct {
+	enum fault fault;
+	const char *words;
+} faults[] = {
+    {WRONG_PHANTOM, "do not fit this phantom, at a mean residual of"},
+    {WRONG_DIAMETER, "(4.7"},
+    {EMPTY, "shadows of a ball are in a view, expected 7 or more"},
+    {COUNTS, "no line integral: these are counts without their air"},
+    {WRONG_SCALE, "times as far from the isocentre"},
+};
+
+static int take_counts(void *context, int view, float *ret_image, struct error *err)
+{
+	const struct scene *scene = context;
+	const int code = take_picture(context, view, ret_image, err);
+
+	for (int i = 0; i < scene->arm.columns * scene->arm.rows; i++)
+		ret_image[i] = 60000 * expf(-ret_image[i]);
+	return code;
+}
+
+START_TEST(pictures_that_do_not_fit_are_refused_with_their_numbers)
+{
+	struct ball_circles given = circles;
+	struct scene scene = {.arm = arm_sagging};
+	struct balls balls, asked;
+	struct geometry nominal;
+	struct calibration calibration = {0};
+	struct error err = {0};
+	const double pixel_mm[2] = {arm_sagging.pixel, arm_sagging.pixel};
+	struct calibrate_request request = {
+	    .nominal = &nominal, .pixel_mm = pixel_mm, .balls = &asked, .image = take_picture, .context = &scene};
+
+	scene.arm.count = 9;
+	scene.arm.step *= 2;
+	scene.target = (struct target){.balls = &balls, .ball = .8, .body = .02, .radius = 62, .photons = 20000};
+	switch (faults[_i].fault) {
+	case WRONG_PHANTOM:
+		given.balls = 10;
+		given.distance = 70;
+		break;
+	case WRONG_DIAMETER:
+		given.ball = 4.7;
+		break;
+	case EMPTY:
+		scene.target.ball = 0;
+		break;
+	case COUNTS:
+		request.image = take_counts;
+		break;
+	case WRONG_SCALE:
+		given.diameter *= 1.12;
+		given.distance *= 1.12;
+		given.ball *= 1.12;
+		break;
+	}
+	ck_assert(balls_circles(&balls, faults[_i].fault == WRONG_DIAMETER ? &given : &circles, &err) == 0);
+	ck_assert(balls_circles(&asked, faults[_i].fault == WRONG_DIAMETER ? &circles : &given, &err) == 0);
+	ck_assert(arm_nominal_geometry(&scene.arm, &nominal, &err) == 0);
+	ck_assert_int_eq(calibrate(&calibration, &request, &err), ERR_IMPOSSIBLE);
+	ck_assert_msg(strstr(err.text, faults[_i].words) != NULL, "%s", err.text);
+	ck_assert_ptr_eq(calibration.views, NULL);
+	geometry_clear(&nominal);
+	balls_clear(&balls);
+	balls_clear(&asked);
+}
+END_TEST
+
+/* One view whose arm was pushed: it alone is refused, and gets the pose between its neighbours'. */
+static int take_pushed(void *context, int view, float *ret_image, struct error *err)
+{
+	struct scene scene = *(const struct scene *)context;
+
+	if (view == 9)
+		scene.arm.first += 1.5 * M_PI / 180;
+	return take_picture(&scene, view, ret_image, err);
+}
+
+START_TEST(a_view_that_does_not_follow_its_neighbours_is_refused)
+{
+	struct scene scene = {.arm = arm_sagging};
+	const double pixel_mm[2] = {scene.arm.pixel, scene.arm.pixel};
+	struct balls balls;
+	struct geometry nominal;
+	struct calibration calibration;
+	struct error err = {0};
+	const struct calibrate_request request = {
+	    .nominal = &nominal, .pixel_mm = pixel_mm, .balls = &balls, .image = take_pushed, .context = &scene};
+
+	scene.arm.count = 40;
+	scene.arm.step = 2 * M_PI / 180;
+	scene.target = (struct target){.balls = &balls, .ball = .8};
+	ck_assert(balls_circles(&balls, &circles, &err) == 0);
+	ck_assert(arm_nominal_geometry(&scene.arm, &nominal, &err) == 0);
+	ck_assert_msg(calibrate(&calibration, &request, &err) == 0, "%s", err.text);
+	ck_assert_int_eq(calibration.used, 39);
+	ck_assert(!calibration.views[9].used);
+	ck_assert_msg(strstr(calibration.views[9].refused, "from where the neighbouring views have them") != NULL, "%s",
+		      calibration.views[9].refused);
+	ck_assert_double_le(reprojection(&scene.arm, &calibration), .3);
+	geometry_clear(&nominal);
+	calibration_clear(&calibration);
+	balls_clear(&balls);
+}
+END_TEST
+
+START_TEST(phantoms_that_determine_no_view_are_refused)
+{
+	struct ball line[9], plane[9];
+	struct balls balls;
+	struct error err = {0};
+
+	for (int i = 0; i < 9; i++) {
+		line[i] = (struct ball){.centre = {10 * i, 5 * i, 2}, .diameter = 3};
+		plane[i] = (struct ball){.centre = {10 * i, 7 * (i * i % 9), 2}, .diameter = 3};
+	}
+	ck_assert_int_eq(balls_copy(&balls, line, 3, &err), ERR_INVALID);
+	ck_assert_str_eq(err.text, "a phantom of 3 balls, expected 8 to 512");
+	ck_assert_int_eq(balls_copy(&balls, line, 9, &err), ERR_IMPOSSIBLE);
+	ck_assert_msg(strstr(err.text, "all balls lie on a line: their places spread by 28.9, ") != NULL, "%s",
+		      err.text);
+	ck_assert_int_eq(balls_copy(&balls, plane, 9, &err), ERR_IMPOSSIBLE);
+	ck_assert_msg(strstr(err.text, "all balls lie in a plane") != NULL, "%s", err.text);
+	plane[4].centre[2] = NAN;
+	ck_assert_int_eq(balls_copy(&balls, plane, 9, &err), ERR_INVALID);
+	ck_assert_str_eq(err.pointer, "/balls_mm/4");
+	plane[4].centre[2] = 30;
+	plane[5] = plane[4];
+	ck_assert_int_eq(balls_copy(&balls, plane, 9, &err), ERR_IMPOSSIBLE);
+	ck_assert_str_eq(err.pointer, "/balls_mm/5");
+	ck_assert_msg(strstr(err.text, "inside of another ball") != NULL, "%s", err.text);
+}
+END_TEST
+
+Suite *calibrate_suite(void)
+{
+	Suite *suite = suite_create("calibrate");
+	TCase *tests = tcase_create("calibrate");
+
+	tcase_set_timeout(tests, 120);
+	tcase_add_loop_test(tests, finds_views_of_a_sagging_arm, 0, sizeof(rows) / sizeof(*rows));
+	tcase_add_test(tests, the_centroid_of_an_ellipse_is_known);
+	tcase_add_test(tests, finds_views_that_see_half_of_the_balls);
+	tcase_add_test(tests, the_code_of_two_sizes_finds_a_phantom_however_it_is_turned);
+	tcase_add_test(tests, adjusting_the_balls_takes_errors_of_machining_out);
+	tcase_add_test(tests, views_between_calibrated_ones_are_the_arms);
+	tcase_add_loop_test(tests, pictures_that_do_not_fit_are_refused_with_their_numbers, 0,
+			    sizeof(faults) / sizeof(*faults));
+	tcase_add_test(tests, a_view_that_does_not_follow_its_neighbours_is_refused);
+	tcase_add_test(tests, phantoms_that_determine_no_view_are_refused);
+	suite_add_tcase(suite, tests);
+	return suite;
+}
