@@ -349,29 +349,30 @@ static int add_volume_count(cJSON *document, struct store *store, const char *id
 	return 0;
 }
 
-cJSON *job_document(struct job *job, bool brief)
+cJSON *job_document(struct job *job, bool brief, struct error *err)
 {
 	cJSON *document = cJSON_CreateObject();
 	struct job_record record;
-	struct error err;
 	int code = 0;
 
-	if (document == NULL)
+	if (document == NULL) {
+		error_set(err, ERR_NO_MEMORY, "no memory for a job's document");
 		return NULL;
+	}
 	job_record(job, &record);
 	add_job_facts(document, job, &record);
 	add_request(document, job, &record);
 	if (!brief) {
 		struct store *store = jobs_store(job_jobs(job));
 
-		code = add_volume_count(document, store, record.id, &err);
+		code = add_volume_count(document, store, record.id, err);
 		if (code == 0)
-			code = add_warnings(document, store, record.id, &err);
+			code = add_warnings(document, store, record.id, err);
 		if (code == 0)
-			code = add_history(document, store, record.id, &err);
+			code = add_history(document, store, record.id, err);
 	}
 	if (code != 0) {
-		log_line(LEVEL_ERROR, "job %s: %s", record.id, err.text);
+		log_line(LEVEL_ERROR, "job %s: %s", record.id, err->text);
 		cJSON_Delete(document);
 		return NULL;
 	}

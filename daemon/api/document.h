@@ -8,13 +8,13 @@
 
 /*
  * Scans, jobs, workers and quarantine as the API shows them. Each call makes a new value, the caller's to delete
- * (cJSON_Delete); NULL when memory ran out or the catalogue could not be read. Any thread.
+ * (cJSON_Delete); NULL when memory ran out. Any thread.
  */
 
 /* brief: for lists, without geometry, derived, received and missing. Memory only. */
 cJSON *scan_document(struct stored_scan *scan, bool brief);
-/* The job with its request; brief: without history and warnings. */
-cJSON *job_document(struct job *job, bool brief);
+/* The job with its request; brief: without history and warnings. NULL: *err says what the catalogue has against it. */
+cJSON *job_document(struct job *job, bool brief, struct error *err);
 /* index, state, backend, device, driver, memory, job, restarts. */
 cJSON *worker_document(const struct worker_facts *facts);
 /* name, from, why, moved. */

@@ -7,12 +7,19 @@
 
 /* ---- POST ---- */
 
+static int reply_job(struct request *request, int status, struct job *job, struct error *err)
+{
+	cJSON *document = job_document(job, false, err);
+
+	return document == NULL ? err->code : request_reply_json(request, status, document, err);
+}
+
 static int reply_accepted(struct request *request, struct job *job, struct error *err)
 {
 	struct job_facts facts;
 
 	job_facts(job, &facts);
-	if (request_reply_json(request, 202, job_document(job, false), err) != 0)
+	if (reply_job(request, 202, job, err) != 0)
 		return err->code;
 	request_reply_header(request, "Location", "/v1/jobs/%s", facts.id);
 	return 0;
@@ -89,7 +96,7 @@ int job_list(void *context, struct request *request, struct error *err)
 	document = cJSON_CreateObject();
 	list = cJSON_AddArrayToObject(document, "jobs");
 	for (int i = 0; i < count; i++) {
-		cJSON_AddItemToArray(list, job_document(jobs[i], true));
+		cJSON_AddItemToArray(list, job_document(jobs[i], true, err));
 		job_facts(jobs[i], &last);
 		job_release(jobs[i]);
 	}
@@ -182,7 +189,7 @@ static int wait_end(struct request *request, int status, struct error *err)
 		return error_set(err, ERR_NOT_FOUND, "job %s was removed", facts.id);
 	if (!facts.ended && job_wait_goes_on(request))
 		return HTTP_WAIT;
-	return request_reply_json(request, status, job_document(job, false), err);
+	return reply_job(request, status, job, err);
 }
 
 int job_get(void *context, struct request *request, struct error *err)

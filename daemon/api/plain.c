@@ -127,7 +127,8 @@ static void put_state(FILE *out, const cJSON *job)
 
 static void put_job_row(FILE *out, struct api *api, struct job *job)
 {
-	cJSON *document = job_document(job, true);
+	struct error err;
+	cJSON *document = job_document(job, true, &err);
 	char name[256];
 
 	scan_name(api, text_of(document, "scan"), name);
@@ -380,9 +381,13 @@ static int reply_job(struct api *api, struct request *request, struct job *job, 
 	shown.job = facts.id;
 	shown.volumes = volumes;
 	read_choice(request, &shown);
-	document = job_document(job, false);
 	shown.patient = job_request(job, &asked, err) == 0 ? asked->patient : patient_unknown;
-	out = document != NULL ? open_memstream(&text, &length) : NULL;
+	document = job_document(job, false, err);
+	if (document == NULL) {
+		free(volumes);
+		return err->code;
+	}
+	out = open_memstream(&text, &length);
 	if (out != NULL)
 		put_job(out, api, document, facts.ended, &shown);
 	cJSON_Delete(document);

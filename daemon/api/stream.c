@@ -130,7 +130,8 @@ static int end_part(struct stream *stream)
 static int last_part(struct stream *stream)
 {
 	size_t size = 0;
-	cJSON *document = job_document(stream->job, false);
+	struct error err;
+	cJSON *document = job_document(stream->job, false, &err);
 	char *json = document != NULL ? json_print(document, &size) : NULL, *text = NULL;
 	int length = -1;
 

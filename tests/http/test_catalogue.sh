@@ -115,6 +115,26 @@ test_a_damaged_catalogue_is_set_aside_and_made_again() {
 	stop_daemon
 }
 
+# Under a running daemon: what it answers names the damage, and it ends; the next one has everything again.
+test_damage_of_the_log_is_named_in_the_reply() {
+	local file
+	made
+	stop_daemon
+	start_daemon # it has not read the rows of the job's volumes
+	kill -STOP "$(cat "$work/daemon.pid")"
+	for file in catalogue.sqlite catalogue.sqlite-wal; do
+		head -c "$(stat -c %s "$state/$file")" /dev/urandom | dd of="$state/$file" conv=notrunc status=none
+	done
+	kill -CONT "$(cat "$work/daemon.pid")"
+	req GET "/v1/jobs/$job"
+	expect_problem 500
+	expect_json '.detail | test("the catalogue is damaged")'
+	stop_daemon || true
+	start_daemon
+	known_as_before
+	stop_daemon
+}
+
 test_the_catalogue_is_made_again_when_asked() {
 	made
 	if "$BUILD/cbctd" --state-dir "$state" --rebuild-catalogue >"$work/rebuilt" 2>&1; then

@@ -843,11 +843,12 @@ START_TEST(the_document_has_what_the_contract_names)
 	    .error_code = ERR_NO_MEMORY, .error_pointer = "/grid/size", .error_text = "too much"};
 	struct job *job = state_post(&state, scan, "urgent");
 	cJSON *document, *error;
+	struct error err;
 
 	state_set(job, JOB_RUNNING, NULL);
 	add_row(job, 1);
 	state_set(job, JOB_FAILED, &failed);
-	document = job_document(job, false);
+	document = job_document(job, false, &err);
 	for (size_t i = 0; i < sizeof(members) / sizeof(members[0]); i++)
 		ck_assert_msg(cJSON_HasObjectItem(document, members[i]), "%s", members[i]);
 	error = cJSON_GetObjectItem(document, "error");
