@@ -97,8 +97,11 @@ TRUNCATION_INLINE float truncation_largest(const float *view, int columns, int r
 	float largest = 0;
 
 	for (int r = 0; r < rows; r += truncation_stride(rows))
-		for (int c = 0; c < columns; c += truncation_stride(columns))
-			largest = fmaxf(largest, view[(size_t)c * column_step + (size_t)r * row_step]);
+		for (int c = 0; c < columns; c += truncation_stride(columns)) {
+			const float value = view[(size_t)c * column_step + (size_t)r * row_step];
+
+			largest = value > largest ? value : largest;
+		}
 	return largest;
 }
 /* What is not air in a view. */

@@ -242,20 +242,24 @@ int exterior_volume_bytes(const struct exterior_volume_options *options, struct 
 /* ---- what FDK cannot know ---- */
 
 /* Columns whose sums run down the rows together: their floats lie side by side. */
-enum { COLUMNS_TOGETHER = 32 };
+enum { COLUMNS_TOGETHER = 32, ROWS_TOGETHER = 8 };
 
-static void sum_along_row(const float *from, float *ret, int columns, int reach)
+/* Of `count` rows, side by side: each sum waits for the one before it. */
+static void sum_along_rows(const float *from, float *ret, int count, int columns, int reach)
 {
-	double sum = 0;
+	double sums[ROWS_TOGETHER] = {0};
 
-	for (int c = -reach; c < columns; c++) {
-		if (c + reach < columns)
-			sum += (double)from[c + reach];
-		if (c - reach - 1 >= 0)
-			sum -= (double)from[c - reach - 1];
-		if (c >= 0)
-			ret[c] = (float)sum;
-	}
+	for (int c = -reach; c < columns; c++)
+		for (int r = 0; r < count; r++) {
+			const size_t at = (size_t)r * (size_t)columns;
+
+			if (c + reach < columns)
+				sums[r] += (double)from[at + (size_t)(c + reach)];
+			if (c - reach - 1 >= 0)
+				sums[r] -= (double)from[at + (size_t)(c - reach - 1)];
+			if (c >= 0)
+				ret[at + (size_t)c] = (float)sums[r];
+		}
 }
 
 /* Of the columns first .. first + count - 1. */
@@ -276,13 +280,17 @@ static void sum_along_columns(const float *from, float *ret, int columns, int ro
 	}
 }
 
-/* Sums over the pixels up to `reach` away along both axes, in place; `work` is another image. */
+/*
+ * Sums over the pixels up to `reach` away along both axes, in place; `work` is another image. Every thread of a
+ * parallel region calls it.
+ */
 static void box_sums(float *image, int columns, int rows, int reach, float *work)
 {
-#pragma omp parallel for schedule(static)
-	for (int r = 0; r < rows; r++)
-		sum_along_row(image + (size_t)r * (size_t)columns, work + (size_t)r * (size_t)columns, columns, reach);
-#pragma omp parallel for schedule(static)
+#pragma omp for schedule(static)
+	for (int r = 0; r < rows; r += ROWS_TOGETHER)
+		sum_along_rows(image + (size_t)r * (size_t)columns, work + (size_t)r * (size_t)columns,
+			       rows - r < ROWS_TOGETHER ? rows - r : ROWS_TOGETHER, columns, reach);
+#pragma omp for schedule(static)
 	for (int c = 0; c < columns; c += COLUMNS_TOGETHER)
 		sum_along_columns(work, image, columns, rows, c,
 				  columns - c < COLUMNS_TOGETHER ? columns - c : COLUMNS_TOGETHER, reach);
@@ -294,6 +302,56 @@ struct look {
 	bool *met;   /* on the detector of one; NULL: not asked for */
 	bool *empty; /* some view sees it through air; owned */
 };
+
+/* A view as voxels are held against it. */
+struct shadow {
+	double matrix[12];
+	int columns, rows;
+	const float *matter; /* [row][column]: 0 where all around is air */
+};
+
+/* Whether a line of voxels along x lies beyond the rows as a whole: its row changes one way along it. */
+static bool misses_rows(const struct shadow *shadow, const struct grid *grid, int y, int z)
+{
+	double column, row[2];
+
+	for (int end = 0; end < 2; end++)
+		view_project(shadow->matrix, place_of(grid, end ? grid->size[0] - 1 : 0, y, z).at, &column, &row[end]);
+	return (row[0] < 1 && row[1] < 1) || (row[0] > shadow->rows - 2 && row[1] > shadow->rows - 2);
+}
+
+/* The next voxel of the line from x on that the view can say more of; the line's end where there is none. */
+static int next_of_line(const struct look *look, const struct grid *grid, size_t line, int x)
+{
+	const bool *found = look->empty + line + x;
+
+	if (look->seen == NULL)
+		found = memchr(found, false, (size_t)(grid->size[0] - x));
+	return found != NULL ? (int)(found - (look->empty + line)) : grid->size[0];
+}
+
+static void look_along(const struct look *look, const struct grid *grid, const struct shadow *shadow, int y, int z)
+{
+	const int columns = shadow->columns, rows = shadow->rows;
+	const size_t line = grid_voxel(grid, 0, y, z);
+
+	if (look->seen == NULL && misses_rows(shadow, grid, y, z))
+		return;
+	for (int x = next_of_line(look, grid, line, 0); x < grid->size[0]; x = next_of_line(look, grid, line, x + 1)) {
+		const struct place place = place_of(grid, x, y, z);
+		double column, row;
+
+		view_project(shadow->matrix, place.at, &column, &row);
+		if (look->seen != NULL && (row < -0.5 || row > rows - 0.5))
+			look->seen[line + (size_t)x] = false;
+		if (!(column >= 1 && row >= 1 && column <= columns - 2 && row <= rows - 2))
+			continue;
+		if (look->met != NULL)
+			look->met[line + (size_t)x] = true;
+		if (shadow->matter[(size_t)lround(row) * (size_t)columns + (size_t)lround(column)] < 0.5f)
+			look->empty[line + (size_t)x] = true;
+	}
+}
 
 /*
  * Voxels whose shadow is air with what lies up to a voxel and a half around it are empty, those whose shadow misses the
@@ -308,35 +366,22 @@ static void look_at(const struct look *look, const struct grid *grid, const stru
 	const double pixel = fmin(orbit->pixel_at_isocentre[0], orbit->pixel_at_isocentre[1]);
 	const int reach = (int)fmin(ceil(1.5 * size / pixel), columns > rows ? columns : rows);
 	const float level = truncation_level_of_many(truncation_largest(measured, columns, rows, 1, (size_t)columns));
-	double matrix[12];
+	struct shadow shadow = {.columns = columns, .rows = rows, .matter = measured};
 
-	view_matrix(&geometry->views[index], matrix);
-	/* Means of nine pixels against noise. */
-	box_sums(measured, columns, rows, 1, work);
-#pragma omp parallel for schedule(static)
-	for (size_t i = 0; i < pixels; i++)
-		measured[i] = measured[i] > 0 && measured[i] >= 9 * level;
-	box_sums(measured, columns, rows, reach, work);
-#pragma omp parallel for schedule(static)
-	for (int z = 0; z < grid->size[2]; z++)
-		for (int y = 0; y < grid->size[1]; y++)
-			for (int x = 0; x < grid->size[0]; x++) {
-				const struct place place = place_of(grid, x, y, z);
-				const size_t at = grid_voxel(grid, x, y, z);
-				double column, row;
-
-				if (look->seen == NULL && look->empty[at])
-					continue;
-				view_project(matrix, place.at, &column, &row);
-				if (look->seen != NULL && (row < -0.5 || row > rows - 0.5))
-					look->seen[at] = false;
-				if (!(column >= 1 && row >= 1 && column <= columns - 2 && row <= rows - 2))
-					continue;
-				if (look->met != NULL)
-					look->met[at] = true;
-				if (measured[(size_t)lround(row) * (size_t)columns + (size_t)lround(column)] < 0.5f)
-					look->empty[at] = true;
-			}
+	view_matrix(&geometry->views[index], shadow.matrix);
+#pragma omp parallel
+	{
+		/* Means of nine pixels against noise. */
+		box_sums(measured, columns, rows, 1, work);
+#pragma omp for schedule(static)
+		for (size_t i = 0; i < pixels; i++)
+			measured[i] = measured[i] > 0 && measured[i] >= 9 * level;
+		box_sums(measured, columns, rows, reach, work);
+#pragma omp for collapse(2) schedule(dynamic, 16)
+		for (int z = 0; z < grid->size[2]; z++)
+			for (int y = 0; y < grid->size[1]; y++)
+				look_along(look, grid, &shadow, y, z);
+	}
 }
 
 static bool is_blank(const float *measured, size_t pixels)

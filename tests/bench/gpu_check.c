@@ -165,6 +165,30 @@ static void check_norms(const struct scene *scene, const struct side sides[2])
 	expect(scene, "maximum", apart(norms[1].maximum, norms[0].maximum), 1e-5);
 }
 
+/*
+ * Two iterations in plain steps on the card's own projectors, from zero, beside the fused ones. In reference
+ * precision: packed storage would give the plain steps a coverage that the fused ones do not use.
+ */
+static void check_plain_sart(const struct scene *scene, const struct side *side, const struct sart_options *sart,
+			     const float *fused, float *scratch, double tolerance)
+{
+	const struct sart_steps steps = {.backend = side->backend,
+					 .device = side->device,
+					 .plan = side->plan,
+					 .geometry = &scene->geometry,
+					 .grid = &scene->grid,
+					 .sart = sart};
+	struct iteration_sums sums;
+	struct error err = {0};
+
+	must(side->backend->volume_fill(side->volume, 0, &err), &err, "fill");
+	for (int i = 0; i < 2; i++)
+		must(sart_iterate_plainly(&steps, side->stack, side->volume, NULL, &sums, &err), &err,
+		     "SART in plain steps");
+	read_volume(side, scene, scratch);
+	expect(scene, "SART in plain steps", difference(fused, scratch, grid_voxels(&scene->grid)), tolerance);
+}
+
 static void check_scene(const struct scene *scene, struct device *devices[2], int subsets, bool reference)
 {
 	const struct backend *backends_here[2] = {&backend_cpu, &backend_cuda};
@@ -269,18 +293,8 @@ static void check_scene(const struct scene *scene, struct device *devices[2], in
 	expect(scene, "SART's residual", fabs(worst[5] / worst[4] - 1), 50 * tolerance);
 	worst[4] = difference(got[1], got[0], voxels);
 	expect(scene, "SART", worst[4], 2 * tolerance);
-	/* SART in plain steps on the card's own projectors */
-	must(backend_cuda.volume_fill(sides[1].volume, 0, &err), &err, "fill");
-	for (int i = 0; i < 2; i++) {
-		const struct sart_steps steps = {&backend_cuda, sides[1].device, sides[1].plan, geometry,
-						 &scene->grid,  &sart,           false};
-		struct iteration_sums sums = {0};
-
-		must(sart_iterate_plainly(&steps, sides[1].stack, sides[1].volume, NULL, &sums, &err), &err,
-		     "SART in plain steps");
-	}
-	read_volume(&sides[1], scene, got[2]);
-	expect(scene, "SART in plain steps", difference(got[1], got[2], voxels), 2 * tolerance);
+	if (reference)
+		check_plain_sart(scene, &sides[1], &sart, got[1], got[2], 2 * tolerance);
 	/* the same bits again, whatever TV has left in the memory that stages share */
 	must(backend_cuda.volume_upload(sides[1].other, volume, &err), &err, "upload");
 	must(backend_cuda.tv(sides[1].plan, sides[1].other, &tv, NULL, &err), &err, "tv");
