@@ -4,9 +4,10 @@
 #include "clients/cbct/volume_input.h"
 #include "core/scan/phantom.h"
 
-/* What is simulated: an analytic phantom, or a voxel volume. */
+/* What is simulated: an analytic phantom, a phantom of balls, or a voxel volume. */
 struct object_options {
-	int phantom; /* an index into phantom_names, or unset */
+	int phantom;       /* an index into phantom_names, or unset */
+	const char *balls; /* file of a phantom as proto/calibration.h reads it */
 	const char *volume;
 	double scale, density; /* of the phantom: mm and 1/mm */
 	double shift[3];       /* mm */

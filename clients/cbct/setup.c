@@ -11,12 +11,14 @@
 #include <string.h>
 
 #include "clients/cbct/rng.h"
+#include "clients/cbct/sag.h"
 #include "clients/cbct/view_json.h"
 #include "proto/scan_directory.h"
 
 /* How the geometry is written. */
 enum setup_kind { KIND_CIRCULAR, KIND_ANGLES, KIND_MATRICES, KIND_VIEWS };
 static const char *const kind_names[] = {"circular", "angles", "matrices", "views", NULL};
+static const char *const sag_names[] = {"daly", NULL};
 
 #define ROW(name, kind, member, argument, help, least, most, count, names)                                             \
 	{                                                                                                              \
@@ -38,6 +40,12 @@ const struct option setup_rows[] = {
     ROW("wobble", OPTION_NUMBER, wobble, "MM", "let source and detector wander slowly by up to so much", 0, 1000, 0,
 	NULL),
     ROW("wobble-seed", OPTION_INTEGER, wobble_seed, "N", "another number, another C-arm", 0, 0, 0, NULL),
+    ROW("sag", OPTION_CHOICE, sag, "ARM",
+	"let the arm sag as one was measured to; scan.json keeps the circle unless --kind says matrices or views", 0, 0,
+	0, sag_names),
+    ROW("jitter", OPTION_NUMBER, jitter, "MM",
+	"move source and detector at random in each view, others for another --wobble-seed; written as --sag is", 0,
+	100, 0, NULL),
     ROW("kind", OPTION_CHOICE, kind, "KIND", "how scan.json writes the geometry (a wobbling one: matrices or views)", 0,
 	0, 0, kind_names),
     ROW("scan", OPTION_TEXT, scan, "FILE", "take detector, views and geometry from this scan document instead", 0, 0, 0,
@@ -132,6 +140,16 @@ static void view_wobble(struct view *view, double turn, double wobble, uint64_t 
 	memcpy(view->column_step, turned, sizeof(turned));
 }
 
+/* Where a view of the circle stands in truth: sag and jitter. */
+static void view_stand(const struct setup_options *options, const struct geometry *geometry, int index,
+		       struct view *view)
+{
+	if (options->sag != OPTION_UNSET_CHOICE)
+		view_sag(view, geometry->columns, geometry->rows, 1);
+	if (options->jitter > 0)
+		view_jitter(view, options->jitter, (uint64_t)options->wobble_seed, index);
+}
+
 static cJSON *vectors_json(const struct setup_options *options, const struct geometry *geometry)
 {
 	cJSON *json = cJSON_CreateObject(), *list;
@@ -144,6 +162,7 @@ static cJSON *vectors_json(const struct setup_options *options, const struct geo
 		struct view view = geometry->views[i];
 
 		view_wobble(&view, (double)i / geometry->count, options->wobble, (uint64_t)options->wobble_seed);
+		view_stand(options, geometry, i, &view);
 		view_matrix(&view, matrix);
 		cJSON_AddItemToArray(list, matrices ? numbers(matrix, 12) : view_json(&view));
 	}
@@ -187,6 +206,7 @@ int setup_scan(const struct setup_options *options, cJSON *projections, struct s
 {
 	struct scan *scan = NULL;
 	cJSON *document = NULL;
+	bool vectors;
 	int code = 0;
 
 	if (options->scan != NULL) {
@@ -198,13 +218,16 @@ int setup_scan(const struct setup_options *options, cJSON *projections, struct s
 	}
 	if (code == 0)
 		code = document_parse(document, &scan, err);
-	if (code == 0 && options->scan == NULL &&
-	    (options->wobble > 0 || options->kind == KIND_MATRICES || options->kind == KIND_VIEWS)) {
+	vectors = options->scan == NULL &&
+		  (options->wobble > 0 || options->kind == KIND_MATRICES || options->kind == KIND_VIEWS);
+	if (code == 0 && vectors) {
 		cJSON_ReplaceItemInObjectCaseSensitive(document, "geometry", vectors_json(options, &scan->geometry));
 		scan_free(scan);
 		scan = NULL;
 		code = document_parse(document, &scan, err);
 	}
+	for (int i = 0; code == 0 && !vectors && i < scan->count; i++)
+		view_stand(options, &scan->geometry, i, &scan->geometry.views[i]);
 	cJSON_Delete(document);
 	if (code == 0)
 		*ret_scan = scan;

@@ -1,0 +1,83 @@
+#!/usr/bin/env bash
+# cbct calibrate: an arm that sags, from a scan of balls to a scan of a head with the geometry that was found.
+. "$(dirname "$0")/lib.sh"
+
+arm=(--columns 400 --rows 320 --pixel 0.95 --sag daly)
+sweep=(--views 30 --photons 20000)
+phantom='{"kind": "circles", "balls": 12, "diameter_mm": 110, "distance_mm": 90, "ball_mm": 4, "first_angle_deg": 10, "shift_deg": 15}'
+
+# refused WORDS COMMAND ...: it ends with status 1 and says these words
+refused() {
+	local words=$1 status=0
+	shift
+	"$@" >"$work/said" 2>&1 || status=$?
+	[ $status = 1 ] || fail "exit status 1 of $*, got $status: $(cat "$work/said")"
+	grep -qF -- "$words" "$work/said" || fail "'$words' in: $(cat "$work/said")"
+}
+# rmse_of SCAN: error of its FDK volume against the head's truth
+rmse_of() {
+	cbct recon "$1" "$work/job.json" --backend cpu -o "$1.out" --quiet >/dev/null 2>&1
+	cbct compare --json "$1.out/final.nii" "$work/truth.nii" | jq .rmse
+}
+
+# Raw counts with flat and dark; .15 mm of jitter, another one in each sweep; other angles the other way round.
+test_a_head_is_as_good_as_with_the_true_matrices() {
+	local head=(--phantom head --scale 70 --density 0.02 --views 72 --first-angle 4 --clockwise --jitter .15 --wobble-seed 2)
+	local calibrated true nominal
+	printf '%s' "$phantom" >"$work/phantom.json"
+	cbct simulate -o "$work/balls" --balls "$work/phantom.json" --density .6 "${arm[@]}" "${sweep[@]}" --raw flat --jitter .15
+	cbct calibrate "$work/balls" "$work/phantom.json" -o "$work/calibration.json" 2>"$work/said"
+	grep -q '^30 of 30 views, residual 0\.0' "$work/said" || fail "all views and their residual: $(cat "$work/said")"
+	jq -e '.residual_pixels < .2 and .used == 30 and (.views | length) == 30 and (.geometry.matrices | length) == 30 and
+		(.views | all(.used and .refused == null and .balls >= 12))' "$work/calibration.json" >/dev/null ||
+		fail "a calibration's document: $(head -c 600 "$work/calibration.json")"
+
+	cbct simulate -o "$work/head" "${arm[@]}" "${head[@]}" --truth "$work/truth.nii" --grid 80 --spacing 2
+	cbct simulate -o "$work/true" "${arm[@]}" "${head[@]}" --kind matrices
+	cp -r "$work/head" "$work/nominal"
+	echo '{"scan": "directory", "grid": {"size": [80, 80, 80], "spacing_mm": [2, 2, 2]}, "fdk": {}}' >"$work/job.json"
+	cbct calibrate "$work/balls" "$work/phantom.json" -o /dev/null --apply "$work/head" 2>/dev/null
+	[ "$(jq -r .geometry.kind "$work/head/scan.json")" = matrices ] || fail "matrices in the head's scan.json"
+	calibrated=$(rmse_of "$work/head") true=$(rmse_of "$work/true") nominal=$(rmse_of "$work/nominal")
+	expect_number "$(jq -n "$calibrated / $true")" '<' 1.05 "the calibrated head's error over the true matrices'"
+	expect_number "$(jq -n "$nominal / $true")" '>' 2 "the nominal circle's error over the true matrices'"
+}
+
+test_what_does_not_fit_is_told_with_numbers() {
+	printf '%s' "$phantom" >"$work/phantom.json"
+	local few=("${arm[@]}" --views 8 --photons 20000)
+	cbct simulate -o "$work/balls" --balls "$work/phantom.json" --density .6 "${few[@]}" --raw flat
+	echo '{"balls_mm": [[0, 0, 0, 3], [10, 0, 0, 3], [0, 10, 0, 3]]}' >"$work/three.json"
+	refused 'a phantom of 3 balls, expected 8 to 512' cbct calibrate "$work/balls" "$work/three.json"
+	jq -n '{balls_mm: [range(9) | [10 * ., 5 * ., 2, 3]]}' >"$work/line.json"
+	refused 'all balls lie on a line: their places spread by' cbct calibrate "$work/balls" "$work/line.json"
+	jq -c '.ball_mm = 2.4' "$work/phantom.json" >"$work/small.json"
+	refused 'times the given diameter' cbct calibrate "$work/balls" "$work/small.json"
+	jq -c '.balls = 10 | .distance_mm = 70' "$work/phantom.json" >"$work/wrong.json"
+	refused '8 of 8 views do not fit this phantom, at a mean residual of' cbct calibrate "$work/balls" "$work/wrong.json"
+	jq -c '.bals = 12' "$work/phantom.json" >"$work/misspelt.json"
+	refused 'bals' cbct calibrate "$work/balls" "$work/misspelt.json"
+	jq -nc '{kind: "helix", balls: 40, diameter_mm: 110, pitch_mm: 40, angle_step_deg: 24, ball_mm: 3, large_ball_mm: 5,
+		code: "101"}' >"$work/code.json"
+	refused '40 characters 0 (small) or 1 (large) are expected' cbct calibrate "$work/balls" "$work/code.json"
+	cbct simulate -o "$work/empty" --phantom ball --density 0 "${few[@]}"
+	refused 'shadows of a ball are in a view, expected 7 or more' cbct calibrate "$work/empty" "$work/phantom.json"
+	jq -c '.projections.quantity = "line_integral" | .projections.sample = "uint16"' "$work/balls/scan.json" >"$work/counts.json"
+	cp "$work/counts.json" "$work/balls/scan.json"
+	rm "$work/balls/flat.f32" "$work/balls/dark.f32"
+	refused 'no line integral: these are counts without their air' cbct calibrate "$work/balls" "$work/phantom.json"
+}
+
+test_only_a_scan_of_the_same_sweep_and_detector_takes_a_calibration() {
+	printf '%s' "$phantom" >"$work/phantom.json"
+	cbct simulate -o "$work/balls" --balls "$work/phantom.json" --density .6 "${arm[@]}" --views 40 --arc 195
+	cbct simulate -o "$work/long" --phantom ball --scale 20 "${arm[@]}" --views 8 --arc 240
+	refused 'degrees from the nearest calibrated one' \
+		cbct calibrate "$work/balls" "$work/phantom.json" -o /dev/null --apply "$work/long"
+	cbct simulate -o "$work/other" --phantom ball --scale 20 --columns 200 --rows 160 --pixel 1.9 --views 8
+	refused 'the calibration is of a detector of 400 x 320 pixels' \
+		cbct calibrate "$work/balls" "$work/phantom.json" -o /dev/null --apply "$work/other"
+	[ "$(jq -r .geometry.kind "$work/other/scan.json")" = circular ] || fail "a scan.json that was left alone"
+}
+
+run_tests
