@@ -1,4 +1,4 @@
-/* One table of settings; flags, environment, config file, help and --print-config are made from it. */
+/* The settings of daemon/settings.def: flags, environment, config file, help and --print-config are made from it. */
 #include "daemon/config.h"
 
 #include <ctype.h>
@@ -9,18 +9,7 @@
 
 #include "proto/scan_directory.h"
 
-enum kind {
-	KIND_TEXT,
-	KIND_LIST, /* text; a flag given again adds to it */
-	KIND_CHOICE,
-	KIND_INDICES, /* text: numbers from 0 with commas between them, or nothing */
-	KIND_INTEGER,
-	KIND_BYTES,
-	KIND_SECONDS
-};
-
-static const char *const backend_choices[] = {"auto", "cuda", "cpu", NULL};
-static const char *const level_choices[] = {"error", "warning", "info", "debug", NULL};
+enum kind { KIND_TEXT, KIND_LIST, KIND_CHOICE, KIND_INDICES, KIND_INTEGER, KIND_BYTES, KIND_SECONDS };
 
 /* The default is read by the same parser as any other value. */
 static const struct setting {
@@ -32,46 +21,16 @@ static const struct setting {
 	const char *const *choices;
 	const char *help;
 } settings[] = {
-#define FIELD(member) offsetof(struct config, member)
-    {"listen", "ADDR:PORT|unix:PATH", KIND_LIST, FIELD(listen), "127.0.0.1:2228", 0, 0, NULL,
-     "where to accept requests; loopback or Unix sockets; may be given again; port 0: the kernel chooses"},
-    {"server-name", "NAME", KIND_LIST, FIELD(server_names), "", 0, 0, NULL,
-     "a name that requests may give as Host, beside localhost and the listening addresses; may be given again"},
-    {"state-dir", "DIR", KIND_TEXT, FIELD(state_dir), NULL, 0, 0, NULL,
-     "where scans, volumes and the catalogue are kept; $STATE_DIRECTORY, else $XDG_STATE_HOME/cbctd"},
-    {"backend", "NAME", KIND_CHOICE, FIELD(backend), "auto", 0, 0, backend_choices,
-     "auto, cuda or cpu; auto: CUDA where a device answers, else the CPU"},
-    {"config", "FILE", KIND_TEXT, FIELD(config_file), "", 0, 0, NULL,
-     "a file of lines NAME = VALUE; # begins a comment"},
-    {"worker", "PATH", KIND_TEXT, FIELD(worker), "", 0, 0, NULL,
-     "the worker program; empty: cbct-worker beside cbctd, else from PATH"},
-    {"workers", "N", KIND_INTEGER, FIELD(workers), "1", 1, 64, NULL, "worker processes, one for each device from 0 on"},
-    {"devices", "LIST", KIND_INDICES, FIELD(devices), "", 0, 0, NULL,
-     "a worker for each of these devices, as 0,2; empty: as many as --workers says"},
-    {"threads", "N", KIND_INTEGER, FIELD(threads), "0", 0, 4096, NULL,
-     "threads of a CPU worker; 0: all that the process may use"},
-    {"device-memory", "BYTES", KIND_BYTES, FIELD(device_memory), "0", 0, 1e15, NULL,
-     "memory that a worker may use; 0: what is free"},
-    {"log-level", "LEVEL", KIND_CHOICE, FIELD(log_level), "info", 0, 0, level_choices,
-     "error, warning, info or debug; debug has a line for every request"},
-    {"http-threads", "N", KIND_INTEGER, FIELD(http_threads), "4", 2, 64, NULL, "threads that serve requests"},
-    {"max-connections", "N", KIND_INTEGER, FIELD(max_connections), "2048", 1, 100000, NULL,
-     "connections at a time; idle and slow ones make room, then more are answered 503"},
-    {"max-connections-per-address", "N", KIND_INTEGER, FIELD(max_connections_per_address), "0", 0, 100000, NULL,
-     "connections at a time from one address; more are answered 429; 0: half of max-connections"},
-    {"upload-buffer", "BYTES", KIND_BYTES, FIELD(upload_buffer), "256M", 1, 1e13, NULL,
-     "projections held in memory between socket and disk"},
-    {"max-wait", "SECONDS", KIND_SECONDS, FIELD(max_wait), "300", 0, 86400, NULL,
-     "longest ?wait=; a longer one is cut to it"},
-    {"header-timeout", "SECONDS", KIND_SECONDS, FIELD(header_timeout), "60", 0.1, 86400, NULL,
-     "a connection whose next request is not there in full by then is closed"},
-    {"transfer-grace", "SECONDS", KIND_SECONDS, FIELD(transfer_grace), "30", 0.1, 86400, NULL,
-     "time that any body may take, beside its length at the minimum rate"},
-    {"minimum-rate", "BYTES", KIND_BYTES, FIELD(minimum_rate), "16K", 1, 1e12, NULL,
-     "a body slower than that many bytes a second is cut off"},
-    {"stop-timeout", "SECONDS", KIND_SECONDS, FIELD(stop_timeout), "20", 0.1, 3600, NULL,
-     "at SIGTERM, time for workers to leave a checkpoint"},
-#undef FIELD
+#define CHOICES(...)                                                                                                   \
+	(const char *const[])                                                                                          \
+	{                                                                                                              \
+		__VA_ARGS__, NULL                                                                                      \
+	}
+#define SETTING(kind, member, name, metavar, initial, least, most, choices, help)                                      \
+	{name, metavar, KIND_##kind, offsetof(struct config, member), initial, least, most, choices, help},
+#include "daemon/settings.def"
+#undef SETTING
+#undef CHOICES
 };
 enum { SETTING_COUNT = sizeof(settings) / sizeof(settings[0]) };
 

@@ -7,33 +7,22 @@
 #include "core/error.h"
 
 /*
- * The daemon's settings. Each is one row of a table in config.c, and from it
- * come the flag --NAME, the environment variable CBCTD_NAME, the line
- * `NAME = VALUE` of a config file, the help and --print-config. A flag goes
- * before the environment, the environment before the file, the file before the
- * default.
+ * The daemon's settings: the rows of daemon/settings.def, a member for each. A flag goes before the environment, the
+ * environment before the file, the file before the default. Texts are never NULL; seconds are double, numbers of
+ * bytes size_t, other numbers long.
  */
+#define SETTING_TEXT char *
+#define SETTING_LIST char *
+#define SETTING_CHOICE char *
+#define SETTING_INDICES char *
+#define SETTING_INTEGER long
+#define SETTING_BYTES size_t
+#define SETTING_SECONDS double
+#define SETTING(kind, member, ...) SETTING_##kind member;
 struct config {
-	char *listen; /* ADDR:PORT and unix:PATH, separated by commas */
-	char
-	    *server_names; /* that Host may have beside localhost and the addresses, separated by commas; "" for none */
-	char *state_dir;   /* where everything is kept */
-	char *backend;     /* "auto", "cuda", "cpu" */
-	char *config_file; /* "" for none */
-	char *worker;      /* path of cbct-worker, "" for the one beside this program */
-	long workers;
-	char *devices; /* of the workers, "0,2"; "" for 0 .. workers - 1 */
-	long threads;
-	size_t device_memory; /* bytes, 0 = what is free */
-	char *log_level;
-	long http_threads;
-	long max_connections, max_connections_per_address;
-	size_t upload_buffer;                  /* bytes of projections between socket and disk */
-	double max_wait;                       /* s */
-	double header_timeout, transfer_grace; /* s */
-	size_t minimum_rate;                   /* bytes/s */
-	double stop_timeout;                   /* s */
+#include "daemon/settings.def"
 };
+#undef SETTING
 
 enum config_action { CONFIG_RUN, CONFIG_HELP, CONFIG_PRINT, CONFIG_REBUILD, CONFIG_VERSION };
 
