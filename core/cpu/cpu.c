@@ -141,8 +141,8 @@ static void cpu_close(struct device *device)
 /* ---- memory ---- */
 
 /*
- * What can be had without swapping, the page cache counted as free: only
- * /proc/meminfo says it, sysinfo(2) counts a cache full of projections as used.
+ * Memory that can be had without swapping, the page cache counted as free: only /proc/meminfo says it, sysinfo(2)
+ * counts a cache full of projections as used.
  */
 static size_t memory_available(size_t total)
 {

@@ -41,7 +41,10 @@ static int wide_columns(const struct plan_options *options)
 	return options->pad[0] + options->geometry->columns + options->pad[1];
 }
 
-/* Of the longest transform; away from multiples of 4 KiB, where all pairs would share the same sets of the cache. */
+/*
+ * Floats from a buffer to the next: the longest transform's, away from multiples of 4 KiB, where all pairs would share
+ * the same sets of the cache.
+ */
 static size_t buffer_stride(const struct plan_options *options)
 {
 	return (size_t)filter_length(wide_columns(options) + options->extend) + 8;
@@ -134,7 +137,7 @@ struct rows {
 	float level; /* of the view */
 };
 
-/* What each row of a group has before column 0 and behind the last one. */
+/* Extensions of each row of a group, before column 0 and behind the last one. */
 struct extensions {
 	bool truncated[2][ROWS];
 	struct extension edge[2][ROWS];

@@ -177,9 +177,8 @@ static size_t replace_once(struct plan *plan, float *view)
 }
 
 /*
- * What was replaced counts as good from the next pass on. After the first one
- * the row and the column of any good pixel are whole, so the second reaches all
- * the rest; without a good pixel all stays 0, air.
+ * Replaced pixels count as good from the next pass on. After the first one the row and the column of any good pixel are
+ * whole, so the second reaches all the rest; without a good pixel all stays 0, air.
  */
 static void replace_defects(struct plan *plan, float *view)
 {

@@ -227,7 +227,7 @@ static inline __attribute__((always_inline)) void fan_gather(const struct fan_ro
 	*ret_cover = cover;
 }
 
-/* What the voxels of the slice take from the rows that are let in. */
+/* Adds to the voxels of the slice what they take from the rows in_first .. in_last. */
 static inline __attribute__((always_inline)) void fan_add_slice(const struct fan_rows *rows,
 								const struct fan_slice *slice,
 								const struct target *target, bool windowed,

@@ -22,7 +22,7 @@
  */
 #include "core/cpu/matched_simd.h"
 
-/* Whose rays may come near the tile: within two voxels of it. */
+/* Finds the pixels whose rays may come near the tile, within two voxels of it. */
 static void pixels_near(const struct plan *plan, const double m[12], const struct tile *tile, struct pixels *ret)
 {
 	double column[2] = {INFINITY, -INFINITY}, row[2] = {INFINITY, -INFINITY};

@@ -3,14 +3,17 @@
 
 #include "core/cpu/rays_simd.h"
 
-/* What the files of the matched backprojection share, for one instruction set: matched_simd.c has the mathematics. */
+/*
+ * Declarations that the files of the matched backprojection share, for one instruction set; matched_simd.c has the
+ * mathematics.
+ */
 
 /* Pixels first .. last, in columns and rows; none where first > last. */
 struct pixels {
 	int column[2], row[2];
 };
 
-/* What is added to, and where its voxels are. */
+/* The sums of a tile's voxels, and where they lie in memory. */
 struct target {
 	const struct tile *tile;
 	ptrdiff_t stride[3]; /* floats from one voxel to the next along x, y, z */

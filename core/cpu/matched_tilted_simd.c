@@ -19,9 +19,11 @@ struct column {
 	double direction[3];  /* from the source to row 0 */
 	const float *pixels;  /* [row], or NULL */
 	struct group *groups; /* from that of row `first` on; rays of another axis miss the grid */
-	/* Of the slice at hand: the height at which a row crosses it, and by voxel across, from the tile's first, what
-	 * that takes from a row; other rows than begin .. end - 1 give nothing, and are 0 as far as a window of them
-	 * reaches. */
+	/*
+	 * For the slice at hand: the height at which a row crosses it, and for each voxel across, from the tile's
+	 * first, what it takes from a row; rows other than begin .. end - 1 give nothing, and are 0 as far as a window
+	 * of them reaches.
+	 */
 	float *height;
 	float *value[MATCHED_ACROSS], *step[MATCHED_ACROSS];
 	int begin[MATCHED_ACROSS], end[MATCHED_ACROSS];
@@ -117,15 +119,15 @@ static double slice_spacing(const struct column *column, int a, int i)
 	return fabs((i - column->view->source[a]) * (e[2] * d[a] - d[2] * e[a])) / (most * most);
 }
 
-/* Of the ray to the row in the middle, along an axis. */
+/* Component along an axis of the way from the source to the row in the middle. */
 static double column_direction(const struct column *column, int axis)
 {
 	return column->direction[axis] + .5 * (column->first + column->last) * column->view->row_step[axis];
 }
 
 /*
- * What a voxel j across takes of rays that cross the slice at b: B(j) of the
- * header, with the kinks at j - 1, j and j + 1.
+ * B(j) of matched_simd.c, the weight across of voxel j for rays that cross the slice at b, with the kinks at j - 1, j
+ * and j + 1.
  */
 static inline vf part_of(vf b, int j, int last, const vf kinks[3])
 {
@@ -183,7 +185,7 @@ static inline void column_give(struct column *column, int n, int first, vf value
 	column->end[n] = first + LANES;
 }
 
-/* What all rows give in the slice i of axis a; false: nothing. */
+/* Sets what all rows give to the slice i of axis a; false: nothing. */
 static bool column_cross(const struct plan *plan, const struct target *target, int a, int i, struct column *column)
 {
 	const int b_axis = 1 - a, size = target->tile->count[b_axis], low = target->tile->first[b_axis];
@@ -287,7 +289,7 @@ static inline vf look_up(const struct gatherer *gatherer, const float *rows, vi 
 	    rows, vi_from(vf_clamp(vf_from(index) + (float)gatherer->base, vf_all((float)begin), vf_all((float)end))));
 }
 
-/* What the voxels of one column take, in all columns of the tile across the slice. */
+/* Adds the rows' contributions to LANES voxels along z, in each of the tile's columns across the slice. */
 static void gather(const struct column *column, const struct gatherer *gatherer, int columns, ptrdiff_t to,
 		   ptrdiff_t stride, const struct target *target)
 {

@@ -1,5 +1,5 @@
 /*
- * What a history row says of a volume. Each plane along y is summed by one
+ * The norms of a volume, for a row of the history. Each plane along y is summed by one
  * thread, the planes are then added in order: the same bits for any number of
  * threads.
  */

@@ -10,8 +10,8 @@
 #include <string.h>
 
 /*
- * Of projections and three volumes: what a batch of corrections, and one of
- * filtered views, may take; FDK alone holds neither all projections nor two more volumes.
+ * Share of the memory of all projections and three volumes that a batch of corrections, and one of filtered views, may
+ * take; FDK alone holds neither all projections nor two more volumes.
  */
 static const double BATCH_SHARE = 0.035, BATCH_SHARE_ALONE = 0.25;
 

@@ -345,7 +345,7 @@ enum {
 	PREFETCH = 8,     /* slices that the voxels are asked for ahead of their use */
 };
 
-/* What the rows of a column need in every slice, [rows rounded up to LANES_MOST]. */
+/* Values of the rows of a column that hold in every slice, [rows rounded up to LANES_MOST]. */
 struct fan_rows {
 	float *begin, *end; /* in slices, begin >= end: misses the grid */
 	float *sum;
@@ -454,7 +454,7 @@ static void fan_prefetch(const struct plan *plan, const struct fan *fan, int i, 
 			__builtin_prefetch(crossing.column[k] + z);
 }
 
-/* That line, its ends held for one voxel more. */
+/* Blends the four columns into one line along z, its ends held for one voxel more. */
 static void fan_blend(const struct plan *plan, const struct fan *fan, int i, const float *volume, float *ret)
 {
 	const int nz = plan->grid.size[2];
@@ -553,7 +553,7 @@ static void project_column(const struct plan *plan, int view, int column, const 
 			begin++;
 		while (rows.any_last[end - 1] < 0)
 			end--;
-		/* One slice ahead, so that the blend is in the cache by the time that windows of it are read. */
+		/* The blend is made one slice ahead, to be in the cache by the time that windows of it are read. */
 		fan_blend(plan, &fan, first, volume, rows.blend[first & 1]);
 		for (int i = first; i <= last; i++) {
 			if (i + PREFETCH <= last)

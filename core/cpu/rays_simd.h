@@ -17,7 +17,9 @@ struct rays {
 	float step[LANES];                    /* mm a slice */
 };
 
-/* Of three values, one for each axis: that of the axis a, and those of the two others b < c. */
+/*
+ * Choice among three values, one for each axis: of_a that of the axis a, of_b and of_c those of the two others b < c.
+ */
 static inline double of_a(int a, double x, double y, double z)
 {
 	return a == 0 ? x : a == 1 ? y : z;
@@ -103,8 +105,8 @@ static inline vf kink(vf y, vf slope, vf inverse)
 static const float SLOPE_LEAST = 1e-6f; /* below that there is no wandering, and its inverse stays finite */
 
 /*
- * Of the four voxels j - 1 .. j + 2 across, held at 0 .. last, what each counts
- * for in a slice that is crossed at `at` with that slope. Returns j.
+ * Weights of the four voxels j - 1 .. j + 2 across, held at 0 .. last, in a slice that is crossed at `at` with that
+ * slope. Returns j.
  */
 static inline int parts_across(double at, double slope, int last, float ret_part[4])
 {

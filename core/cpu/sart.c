@@ -60,7 +60,7 @@ static void correct(struct plan *plan, const struct volume *volume, const struct
 	}
 }
 
-/* One line of a tile: `everywhere` views cover all of it, the others have left their part in cover. */
+/* Updates one line of a tile: `everywhere` views cover all of it, the others have left their part in cover. */
 static void update_line(const struct plan *plan, const float *sums, const float *cover, float everywhere, int count,
 			size_t stride, float *voxels)
 {

@@ -315,7 +315,7 @@ static inline float vf_lowest(vf v)
 	return x;
 }
 
-/* What each core/NAME_simd.c gives to the table in core/cpu/kernels_simd.c; see struct cpu_kernels. */
+/* Functions of each core/cpu/NAME_simd.c for the table in core/cpu/kernels_simd.c; see struct cpu_kernels. */
 void SIMD_NAME(project)(const struct plan *plan, int view, int column, int count, const float *volume, float *ret,
 			float *ret_length, float *scratch);
 bool SIMD_NAME(backproject)(const struct plan *plan, int view, const struct tile *tile, enum backprojection weight,

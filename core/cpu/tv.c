@@ -53,7 +53,7 @@ static double squared_weights(const struct box *box)
 	return (box->slow > 1) * slow * slow + (box->middle > 1) * middle * middle + (box->fast > 1) * fast * fast;
 }
 
-/* What one thread keeps while it goes through its planes. */
+/* State of a thread that goes through its planes. */
 struct part {
 	int begin, end;      /* planes */
 	float *next;         /* plane `end` as it was before the pass */
