@@ -5,8 +5,8 @@
 #include "core/outofcore/outofcore.h"
 
 /*
- * What the files of core/outofcore share. Inside of these four structs, what belongs to
- * the backend below is reached through device->backend only.
+ * Declarations that the files of core/outofcore share. Members of these four structs that
+ * belong to the backend below are used through device->backend only.
  */
 struct device {
 	const struct backend *backend; /* the one below */
@@ -27,14 +27,14 @@ struct stack {
 	size_t pixels;
 	size_t bytes; /* of `data`, `from` and `views`, in one piece that `data` begins */
 	float *data;  /* [slot][row][column], host; not touched where `by` is set */
-	/* What `filter` noted: slot i is views[i] filtered, from slot from[i] of `source`. */
+	/* Views that `filter` only noted: slot i is views[i] filtered, from slot from[i] of `source`. */
 	struct plan *by;
 	const struct stack *source;
 	int *from, *views;
 	int filtered;
 };
 
-/* What a slab on the device is for: which plan, and what lies beside it. */
+/* Purpose of a slab on the device: it decides on the slab's plan and on the memory beside it. */
 enum purpose { FOR_FDK, FOR_SUMS, FOR_TV, PURPOSE_COUNT };
 
 enum { OUTOFCORE_BATCH = 32 }; /* views on the device at a time: by then launches are long hidden */
@@ -84,7 +84,7 @@ static inline void *outofcore_take(struct arena *arena, size_t bytes)
 
 	return arena_take(arena, bytes, bytes >= LARGE ? PAGE : LINE);
 }
-/* What a stack of these sizes holds, into *ret_stack. */
+/* Walk over the memory of a stack of these sizes, into *ret_stack. */
 void stack_walk(struct device *device, int columns, int rows, int slots, struct stack *ret_stack, struct arena *arena);
 
 /* ---- plan.c ---- */

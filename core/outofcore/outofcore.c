@@ -1,6 +1,6 @@
 /*
- * Volumes and projections in the host's memory, and the table of what works on
- * them in slabs: outofcore.h.
+ * Volumes and projections in the host's memory, and the table of the operations on
+ * them, which go slab by slab: outofcore.h.
  */
 #include "core/outofcore/internal.h"
 
@@ -18,7 +18,7 @@ void *outofcore_allocate(size_t bytes)
 
 	if (memory == MAP_FAILED)
 		return NULL;
-	madvise(memory, bytes, MADV_HUGEPAGE); /* a hint: fewer faults where it is taken */
+	madvise(memory, bytes, MADV_HUGEPAGE); /* a hint: fewer faults where the kernel heeds it */
 	return memory;
 }
 

@@ -1,9 +1,9 @@
 /*
  * How many slabs a job is cut into, and the slabs on the device. The fewest are
- * taken that fit, all alike but for the last; each has its own plan of the
- * backend below, whose grid is the slab with what its neighbours lend it:
+ * used that fit, all alike but for the last; each has its own plan of the
+ * backend below, whose grid is the slab with slices of its neighbours:
  *
- *   FDK    nothing. Two slabs are there at a time: one is copied back while the next one is made.
+ *   FDK    none. Two slabs are there at a time: one is copied back while the next one is made.
  *   sums   a slice of zeros on either side, where the linear interpolation of the slab ends.
  *   TV     as many slices as there are steps: a step reaches one voxel.
  */
@@ -13,7 +13,7 @@
 
 #include "core/outofcore/internal.h"
 
-/* Of what is free: the rest is for alignment, and what the backend below rounds up. */
+/* Share of the free memory that is used: the rest is for alignment, and for what the backend below rounds up. */
 static const double SHARE = 0.97;
 
 static bool has_purpose(const struct plan_options *options, enum purpose purpose)
@@ -68,7 +68,7 @@ static struct grid grid_of_slices(const struct grid *grid, int first, int count)
 	return part;
 }
 
-/* The grid of what linearises: one voxel, since it needs none. */
+/* The grid of the plan that linearises: one voxel, since it needs none. */
 static struct grid intake_grid(const struct plan *plan)
 {
 	struct grid grid = *plan->options.grid;
@@ -92,8 +92,8 @@ static struct plan_options intake_options(const struct plan *plan, const struct 
 }
 
 /*
- * What lies on the device below: a walk over it makes everything, or only adds up what that would take, so that
- * what is said and what is taken come from the same lines.
+ * A walk over the memory on the device below: it makes everything, or only adds up the bytes, so that the estimate and
+ * what is allocated come from the same lines.
  */
 struct below {
 	const struct backend *backend;
@@ -118,7 +118,7 @@ static int below_plan(struct below *below, const struct plan_options *options, s
 	code = below->backend->plan_bytes(below->device, options, &bytes, err);
 	if (code < 0)
 		return code;
-	/* It speaks of the iterate, too, which the walk has by itself. */
+	/* plan_bytes counts the iterate, too, which the walk has by itself. */
 	below->volumes += bytes.volumes - below->backend->volume_bytes(options->grid);
 	below->rest += bytes.scratch + bytes.raw;
 	return 0;
@@ -162,7 +162,7 @@ static int feed_walk(struct plan *plan, enum purpose purpose, struct below *belo
 	return code;
 }
 
-/* What linearises: its plan, and a stack of one slot. */
+/* The plan that linearises, and a stack of one slot. */
 static int intake_walk(struct plan *plan, struct below *below, struct error *err)
 {
 	const struct geometry *geometry = plan->options.geometry;
@@ -175,7 +175,7 @@ static int intake_walk(struct plan *plan, struct below *below, struct error *err
 	return code < 0 ? code : below_stack(below, geometry->columns, geometry->rows, 1, &plan->taken, err);
 }
 
-/* What slabs of so many slices take on the device for a purpose, the volumes to *ret_volumes. */
+/* Device memory of slabs of so many slices for a purpose, that of the volumes to *ret_volumes. */
 static int slab_bytes(struct plan *plan, enum purpose purpose, int slices, size_t *ret_total, size_t *ret_volumes,
 		      struct error *err)
 {
@@ -254,7 +254,7 @@ static void plan_walk(struct plan *plan, struct arena *arena)
 	stack_walk(plan->device, columns, rows, update_views(options), &plan->correction, arena);
 }
 
-/* What the job has beside it: all projections, the iterate, and its copy for SART. */
+/* Bytes in the host's memory beside the plan: all projections, the iterate, and its copy for SART. */
 static size_t beside_bytes(const struct plan_options *options)
 {
 	const struct geometry *geometry = options->geometry;
@@ -324,7 +324,7 @@ static int allocate(struct plan *plan, struct error *err)
 	return 0;
 }
 
-/* What the backend below says of a slab's plan. */
+/* Writes the plan's summary, with that of a slab's plan by the backend below. */
 static int summarise(struct plan *plan, struct error *err)
 {
 	enum purpose purpose = plan->slices[FOR_SUMS] > 0 ? FOR_SUMS : plan->slices[FOR_FDK] > 0 ? FOR_FDK : FOR_TV;
