@@ -1,4 +1,4 @@
-/* What air has in a view: see air.h. */
+/* The level of air in a view: see air.h. */
 #include "core/correct/air.h"
 
 #include <math.h>
@@ -6,13 +6,13 @@
 
 enum { LOOKED_AT = 64 }; /* rows */
 
-/* Line integrals: of a drift that matters, and of more than a tube drifts. */
+/* Levels of air, line integrals: the least drift that matters, and the most that a tube drifts. */
 static const float LEAST = 0.02f, MOST = 0.15f;
-/* Of the view's largest line integral: air has no more. */
+/* The most that air can have, as a share of the view's largest line integral. */
 static const float LITTLE = 0.25f;
-/* Ends that agree: of the level, and beside that noise. */
+/* How far a mean at a row's ends may lie from the level to agree: a share of it, and an allowance for noise. */
 static const float SHARE = 0.25f, NOISE = 0.01f;
-/* Of the rows: those that agree. */
+/* The share of the rows that must agree. */
 static const float NEARLY_ALL = 0.9f;
 
 static float mean_of(const float *p, int count)

@@ -29,7 +29,7 @@ static int bins(int pixels, double pixel, double voxel)
 	return (pixels + pixels_of_a_bin - 1) / pixels_of_a_bin;
 }
 
-/* Of the views that are not blank every so many; *ret_count of them, in ret_views [count of the whole scan]. */
+/* Spreads *ret_count views over those that are not blank, into ret_views [count of the whole scan]. */
 static int choose_views(const struct coarse_options *options, int *ret_views, int *ret_count, struct error *err)
 {
 	const int all = options->geometry->count;

@@ -29,7 +29,7 @@ struct coarse_bytes {
 	size_t host;     /* as of outofcore.h */
 };
 
-/* Of the options it needs neither lender nor cancel; blank views may be unknown: without them it takes less. */
+/* `lender` and `cancel` of the options are not used. Blank views may be unknown: without them SART takes less. */
 int coarse_bytes(const struct coarse_options *options, struct coarse_bytes *ret_bytes, struct error *err);
 
 /* `volume`, on options->grid, is the start and becomes the result; `projections` has a slot for each view. */

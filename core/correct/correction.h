@@ -6,7 +6,7 @@
 #include "core/warning.h"
 
 /*
- * What happens to a scan beside its reconstruction: a chain of corrections, each a row of corrections[], which stand
+ * The chain of corrections that a scan passes beside its reconstruction: each is a row of corrections[], which stand
  * there in the order in which they run. core/recon goes over the table at five times and knows no correction by name.
  * One thread at a time.
  */
@@ -15,12 +15,14 @@ enum correction_time {
 	CORRECT_LINE_INTEGRALS,   /* each view's line integrals, before FDK takes them */
 	CORRECT_AFTER_FDK,        /* the FDK volume, once; where `needs` says so all projections are there */
 	CORRECT_BEFORE_ITERATING, /* all projections, once, before an iteration sees them */
-	/* In place of AFTER_FDK where a run goes on from an iterate: the projections become what they were then. */
+	/*
+	 * In place of AFTER_FDK in a resumed run, which starts from an iterate: the projections become what they were.
+	 */
 	CORRECT_RESUMED,
 	CORRECTION_TIMES
 };
 
-/* What a correction is given beside the values that it changes, as bits. */
+/* Bits: the data that a correction needs beside the values that it changes. */
 enum correction_needs {
 	NEEDS_NEIGHBOURS = 1,   /* of a pixel, in its row and column */
 	NEEDS_WHOLE_IMAGES = 2, /* all of a view */
@@ -31,7 +33,7 @@ enum correction_needs {
 /* A pointwise row may be done by an operation of the backend, together with others. The row checks and warns then. */
 enum correction_fused { FUSED_NOT, FUSED_LINEARISE, FUSED_FILTER };
 
-/* What the corrections of one reconstruction work on; all of it is borrowed, and outlives their states. */
+/* The data that the corrections of one reconstruction work on; all of it is borrowed, and outlives their states. */
 struct correction_job {
 	const struct backend *backend;
 	struct device *device;
@@ -59,8 +61,7 @@ struct correction_view {
 	const struct defect_counts *before; /* what linearise had counted before this view */
 };
 
-/* What corrections hold beside the job's plan, projections, volumes and their stack to work in; the sum of the rows'.
- */
+/* Memory that corrections hold beside the job's plan, projections, volumes and working stack: the sum over the rows. */
 struct correction_bytes {
 	size_t device;   /* beside `borrowed` */
 	size_t borrowed; /* of the job's plan's block (plan_options.lends) */
@@ -101,16 +102,19 @@ struct correction {
 	/* At the other times. *ret_changed: the volume is another one now. */
 	int (*apply)(const struct correction_job *job, void *state, enum correction_time time, bool *ret_changed,
 		     struct error *err);
-	/* Once, when all views have come, and not where a run goes on: what has to be said of them. */
+	/* Called once, when all views have come, but not in a resumed run: warns of what they showed. */
 	int (*warn)(const struct correction_job *job, void *state, struct error *err);
 
 	/*
-	 * What is shown in a volume that is kept, and not worked on. *ret_estimate_mm: what is nearer to it is an
-	 * estimate; 0: there is nothing to show, and the volume is as it was. `hide` gives the same bits as before.
+	 * Puts into a volume that is to be kept what belongs into the image only; `hide` takes it out again and
+	 * restores the same bits. *ret_estimate_mm: voxels nearer to it than this are an estimate; 0: there was nothing
+	 * to show, and the volume is as it was.
 	 */
 	int (*show)(const struct correction_job *job, void *state, double *ret_estimate_mm, struct error *err);
 	int (*hide)(const struct correction_job *job, void *state, struct error *err);
-	/* What was found AFTER_FDK, bytes of the state's own, which a run that goes on gets back. One row has any. */
+	/*
+	 * Findings of AFTER_FDK, bytes that the state owns; `resume` gets them back in a resumed run. One row has any.
+	 */
 	const void *(*found)(const void *state, size_t *ret_bytes);
 	int (*resume)(const struct correction_job *job, void *state, const void *bytes, size_t size, struct error *err);
 };

@@ -21,7 +21,7 @@ struct images {
 	float *scratch;
 };
 
-/* Of up to WINDOW values, those that are NAN left out; NAN where all are. Sorts them. */
+/* The median of up to WINDOW values without those that are NAN; NAN where all are. Sorts them. */
 static float median(float *values, int count)
 {
 	int good = 0;

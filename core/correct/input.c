@@ -158,7 +158,7 @@ static bool row_reaches(const struct input *input, const void *samples, size_t f
 	return false;
 }
 
-/* What air has at the ends of the rows, where no air region makes up for that. */
+/* Notes the level of air at the ends of the rows, where no air region makes up for it. */
 static int look_at_air(struct input *input, const void *samples, int columns, int rows, float largest,
 		       struct error *err)
 {
@@ -189,7 +189,7 @@ static int look_at_air(struct input *input, const void *samples, int columns, in
 	return 0;
 }
 
-/* Whether the object goes on beyond the first and the last row, and what air has beside it. */
+/* Notes whether the object extends beyond the first and the last row, and the level of air beside it. */
 static int look_at_ends(struct input *input, const void *samples, int columns, int rows, struct error *err)
 {
 	float largest = 0, level;
@@ -207,7 +207,7 @@ static int look_at_ends(struct input *input, const void *samples, int columns, i
 int input_take(struct input *input, const struct backend *backend, struct plan *plan, const void *samples, int view,
 	       int slot, struct stack *to, const void **ret_upright, struct error *err)
 {
-	/* One by one, so that the views with defects are known. */
+	/* Views are linearised one by one, so that those with defects are known. */
 	const struct defect_counts before = input->counts;
 	int code;
 
@@ -228,7 +228,7 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 	if (code < 0)
 		return code;
 	input->views++;
-	/* Those of the map are in every view. */
+	/* Defects of the map do not count: every view has them. */
 	input->defective_views +=
 	    defects_total(&input->counts) - input->counts.mapped > defects_total(&before) - before.mapped;
 	if (input->counts.blank > before.blank)

@@ -3,7 +3,7 @@
 
 #include "core/correct/defects.h"
 
-/* What is known of the samples that a reconstruction was given: how they come, and what was seen of them. */
+/* The samples that a reconstruction was given: how they come, and statistics of those seen so far. */
 struct input {
 	struct linearise linearise; /* as given, with the whole map; exchanged where `turned` */
 	bool turned;                /* rows and columns of all images are exchanged on their way in */
@@ -15,18 +15,25 @@ struct input {
 	int views, defective_views; /* linearised so far, and those of them with defects */
 	int *blank;                 /* [counts.blank], owned: views without a good pixel, in the order they came */
 	size_t pixels;              /* of a view */
-	/* Of about 4096 pixels of each view. */
+	/* Statistics of about 4096 pixels of each view. */
 	double sum; /* of line integrals */
 	float most; /* of them, at least 0 */
 	size_t looked_at;
-	/* Of about 32 views: how many were looked at, and how many had something that is not air on the first row and
-	 * on the last one. */
+	/*
+	 * About 32 views are looked at: how many were, and how many had something that is not air on the first row and
+	 * on the last one.
+	 */
 	int look_every, views_looked_at, ends[2];
-	/* And in how many of them air is not 0 (core/correct/air.h), in how many by so much that it is not taken for
-	 * air; the least and the most it is in those. */
+	/*
+	 * How many of these had air that is not 0 (core/correct/air.h), how many so far from 0 that it does not pass
+	 * for air; the least and the largest level of air that is not 0.
+	 */
 	int off, far_off;
 	float air_least, air_most;
-	/* Of uint16, as it is and with its bytes exchanged: how far neighbours are apart; the largest then. */
+	/*
+	 * For uint16, as it is and with its bytes exchanged: the sum of differences of neighbours; and the largest
+	 * value when exchanged.
+	 */
 	double rough[2];
 	int largest;
 };
@@ -46,12 +53,12 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 	       int slot, struct stack *to, const void **ret_upright, struct error *err);
 
 /*
- * Whether the object goes on beyond the first row, [0], and the last one, [1]: more than a quarter of the views looked
+ * Whether the object extends beyond the first row, [0], and the last one, [1]: more than a quarter of the views looked
  * at have it there.
  */
 void input_goes_on(const struct input *input, bool ret_ends[2]);
 
-/* The share of views in which air is so far from 0 that it is not taken for air: none of that is an object. */
+/* The share of views in which air is so far from 0 that it does not pass for air: none of that is an object. */
 double input_air_off_share(const struct input *input);
 
 /* The share that blank views have in FDK's density on the axis, 0 .. 1. */

@@ -7,9 +7,9 @@
 #include "core/correct/correction.h"
 #include "core/correct/input.h"
 
-/* Air regions that differ by more than this tell of a tube or a detector that drifts. */
+/* Air regions that differ by more than this mean that the tube or the detector drifts. */
 static const double DRIFT = 0.05;
-/* Of the flat: below it something stands before the air region, in all views alike where they do not differ. */
+/* Below this share of the flat something stands before the air region, in all views alike where they do not differ. */
 static const double FAINT = 0.7;
 
 /* Means of line integrals that no object has: no photon passes the one, and no flat is a tenth too dark for the other.

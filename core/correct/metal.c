@@ -2,26 +2,26 @@
  * Metal: what it swallows is not in the projections, and its streaks cover the
  * rest of the volume. So its shadows are replaced by what they would be without:
  *
- *  1. Metal in the FDK volume: what has at least the threshold, and around it what
- *     has half of it; of both what has half of the highest value near it, so that an
- *     object is as wide as it is, and whole where it comes near the threshold; and a
- *     quarter of the highest value further around, where streaks are as bright as faint metal.
+ *  1. Metal in the FDK volume: voxels of at least the threshold, and beside them voxels of at
+ *     least half of it; of both those that have half of the highest value near them, so that an
+ *     object keeps its width and is whole where it comes near the threshold; and a quarter
+ *     of the highest value further away, where streaks are as bright as faint metal.
  *  2. Its projection, a pixel wider all around, gives its traces; samples without
  *     counts that touch a trace belong to it.
- *  3. Lines lead over each trace along the row and along the column (after
- *     Kalender, Hebel and Ebersberger, Radiology 164, 1987, who have the row only), the nearer
- *     ends count more, and FDK gives a volume with few streaks. A screw's shadow is
+ *  3. Each trace is interpolated linearly along the row and along the column (after
+ *     Kalender, Hebel and Ebersberger, Radiology 164, 1987, who have the row only), the
+ *     nearer ends count more, and FDK gives a volume with few streaks. A screw's shadow is
  *     long in one direction and narrow in the other.
- *  4. That one, with air and soft tissue made even, bone left and water for the
+ *  4. That volume, with air and soft tissue made even, bone left and water for the
  *     metal, is the prior: its projection knows the edges that a straight line
- *     cannot (normalised interpolation: Meyer et al., Med. Phys. 37, 2010). The lines
- *     now lead over the difference to it:    p' = P + line(p - P)
+ *     cannot (normalised interpolation: Meyer et al., Med. Phys. 37, 2010). Now the
+ *     difference to it is interpolated:    p' = P + line(p - P)
  *     in the trace. Where Meyer divides by the prior, a grid smaller than the
  *     object would be missing in P; a difference lets the lines make up for it.
  *  5. FDK and step 4 again, PASSES times in all: each prior is cleaner than the one
  *     before it, and may keep fainter bone.
  *
- * What is better of this volume and of the first one is taken place by place
+ * The better of this volume and the first one is chosen place by place
  * (metal_blend.c): a faint or thin object's shadow has photons enough. tests/bench/results/metal.txt
  * has the table of what else was tried.
  *
@@ -29,7 +29,7 @@
  * around the metal all that the first FDK showed above the volume, since the
  * traces take the metal's blur away as well. Steps 2 to 5 use the list of voxels only
  * and take the views in the order of their numbers: the same list gives the same
- * bits, also when a run goes on later. SART leaves the traces' rays out.
+ * bits, also in a resumed run. SART leaves the traces' rays out.
  */
 #include "core/correct/metal_internal.h"
 
@@ -98,7 +98,7 @@ int metal_put(struct metal *metal, const struct grid *grid, const void *bytes, s
 
 /* ---- slice by slice ---- */
 
-/* What becomes of the volume's value at voxel i of the list. */
+/* Returns the new value of voxel i of the list, which has the value `there` in the volume. */
 typedef float voxel_change(struct metal *metal, size_t i, float there, double value);
 
 /* For each slice with metal: download, change it at the list's voxels, put it back. */
@@ -386,7 +386,7 @@ void metal_fill_view(const struct metal_view *of)
 		}
 }
 
-/* What of the length a ray would have in a grid without ends along z makes it whole. */
+/* Share of the length that a ray would have in a grid without ends along z, from which on the ray is whole. */
 static const double WHOLE = 0.97;
 
 bool metal_is_whole(const struct metal_view *of, int column, int row)
@@ -437,7 +437,7 @@ static bool *draw_traces(const struct metal *metal, const struct metal_tools *to
 	return trace;
 }
 
-/* What is done with one view of a batch that has traces. */
+/* Treatments of a view that has traces. */
 enum treatment { TRACE, FILL, FILL_OVER_PRIOR, LEAVE_OUT };
 
 static void treat_view(const struct metal_tools *tools, const struct metal_batch *batch, int i,
@@ -574,9 +574,8 @@ int metal_fdk(const struct metal_tools *tools, struct volume *to, struct error *
 /* HU below which a voxel is air. */
 static const double AIR_HU = -500;
 /*
- * What keeps its value as bone: nothing below the first, all from the second on,
- * and between them a part that grows. Streaks of the first volume reach higher
- * than those of the later ones.
+ * HU of bone in the prior: a voxel keeps nothing of its value as bone up to the first, all from the second on, and
+ * between them a growing part. Streaks of the first volume reach higher than those of the later ones.
  */
 static const double BONE_FIRST[2] = {400, 400}, BONE_LATER[2] = {150, 300};
 enum { PASSES = 4 };

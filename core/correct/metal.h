@@ -37,7 +37,7 @@ struct metal {
 };
 void metal_clear(struct metal *metal);
 
-/* What the stage works with, all of it borrowed. */
+/* Data and scratch of the stage, all of it borrowed. */
 struct metal_tools {
 	const struct backend *backend;
 	struct plan *plan;
@@ -103,7 +103,7 @@ int metal_doubt_blend(struct metal_doubt *doubt, const struct metal *metal, cons
 int metal_show(struct metal *metal, const struct metal_tools *tools, struct volume *volume, struct error *err);
 int metal_hide(struct metal *metal, const struct metal_tools *tools, struct volume *volume, struct error *err);
 
-/* Of the projections, the shadows' rays are RAY_LEFT_OUT from now on. After metal_replace. */
+/* Marks the rays of the shadows in the projections as RAY_LEFT_OUT. After metal_replace. */
 int metal_leave_out(struct metal *metal, const struct metal_tools *tools, struct error *err);
 
 /* ---- for tests: one view ---- */

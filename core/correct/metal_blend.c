@@ -49,7 +49,7 @@ static int compare_floats(const void *left, const void *right)
 	return (a > b) - (a < b);
 }
 
-/* Of one view: second differences along the rows, as if each pixel had got all photons in air. */
+/* Magnitudes of a view's second differences along its rows, scaled as if each pixel had got all photons in air. */
 static size_t add_differences(const float *view, int columns, int rows, size_t step, float *ret)
 {
 	size_t count = 0;

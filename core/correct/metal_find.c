@@ -20,16 +20,17 @@ static int add_voxel(struct metal *metal, size_t *room, struct metal_voxel voxel
 /* ---- where it is ---- */
 
 /*
- * Of the threshold, and of the highest metal around: what belongs to the object beside it. Further away the share is
- * less: there may be another object, but the streaks of metal that takes all photons away are as bright as faint metal.
+ * Least value of a voxel of metal, as a share of the threshold and of the highest metal in its neighbourhood: less
+ * belongs to the object beside it. Further away the share is less: there may be another object, but the streaks of
+ * metal that takes all photons away are as bright as faint metal.
  */
 enum { NEAR, FAR, DISTANCES };
 static const double LOW = 0.5, SHARE[DISTANCES] = {0.5, 0.25};
-/* In widths of FDK's blur, which is a pixel or a voxel: how far around, and the rim. */
+/* Radii of these neighbourhoods and of the rim, in widths of FDK's blur, which is a pixel or a voxel. */
 static const double REACH[DISTANCES] = {3, 6}, RIM = 1.5;
 enum { REACH_MOST = 8 }; /* voxels */
 
-/* Of voxels along an axis, how many cover so many widths of the blur. */
+/* The number of voxels along an axis that cover so many widths of the blur. */
 static double voxels_along(const struct metal_tools *tools, int axis, double widths)
 {
 	const double spacing = tools->grid->spacing[axis], blur = fmax(tools->pixel, spacing);
@@ -105,7 +106,7 @@ static bool is_seed(const struct search *search, int z, size_t at)
 	       (z + 1 < grid->size[2] && slice_of(search, search->raw, z + 1)[at] >= threshold);
 }
 
-/* Of `count` values, `step` apart, the largest up to `reach` away from each. */
+/* Replaces each of `count` values, `step` apart, by the largest up to `reach` away from it. */
 static void widen(const float *from, float *to, int count, size_t step, int reach)
 {
 	for (int i = 0; i < count; i++) {
@@ -254,7 +255,7 @@ bool metal_mark_slice(const struct metal *metal, const struct grid *grid, const 
 	return true;
 }
 
-/* What of the metal's peak above water still counts as its blur; streaks are fainter. */
+/* Least share of the metal's peak above water that counts as its blur; streaks are fainter. */
 static const float BLUR = 0.07f;
 
 /* The list of metal becomes that of metal and its rim. */

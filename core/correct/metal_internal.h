@@ -3,7 +3,7 @@
 
 #include "core/correct/metal.h"
 
-/* What the files of the metal stage share: metal_find.c, metal.c, metal_blend.c. */
+/* Declarations that the files of the metal stage share: metal_find.c, metal.c, metal_blend.c. */
 
 size_t metal_slice_voxels(const struct grid *grid);
 /* `items` with room for one more than `count`; NULL, and they are as they were, where there is no memory. */
@@ -14,7 +14,7 @@ size_t metal_voxels_from(const struct metal *metal, int z);
 /* First of the traces, in order, of this view or a later one. */
 size_t metal_traces_from(const struct metal_trace *traces, size_t count, int view);
 
-/* What is around a voxel: an ellipsoid, in voxels along the axes. */
+/* The neighbourhood of a voxel: an ellipsoid, in voxels along the axes. */
 struct metal_rim {
 	double radius[3];
 	int reach[3];

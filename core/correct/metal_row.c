@@ -80,7 +80,7 @@ static int note_dark(const struct input *input, const void *samples, int columns
 	return code;
 }
 
-/* Of the view's largest line integral: in such a shadow a sample without counts is no dead pixel. */
+/* In a shadow of at least this share of the view's largest line integral a sample without counts is no dead pixel. */
 static const float SHADOW = 0.5f;
 
 /*
@@ -179,7 +179,7 @@ static int take_out(const struct correction_job *job, struct metal *metal, bool 
 	return code;
 }
 
-/* Where a run goes on: the projections become what they were. */
+/* In a resumed run: the projections become what they were. */
 static int take_out_again(const struct correction_job *job, struct metal *metal, struct error *err)
 {
 	const struct metal_tools tools = tools_of(job);

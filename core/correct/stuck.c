@@ -234,13 +234,13 @@ void stuck_add(struct stuck *stuck, const void *samples)
 		medians_of_row(stuck, row);
 		add_row(stuck, row);
 	}
-	/* Of some pixels: a stuck one may be the largest of all. */
+	/* The largest of a sample of the pixels: a stuck one may be the largest of all. */
 	for (size_t i = 0; i < pixels; i += pixels / 4096 + 1)
 		largest = fmaxf(largest, stuck->values[i]);
 	stuck->largest = largest;
 }
 
-/* What the sums say of a pixel. */
+/* A pixel's behaviour over the views, from its sums. */
 struct behaviour {
 	float varies;             /* variance of p */
 	float rms, mean, wanders; /* of e: root mean square, mean's magnitude, variance */

@@ -44,10 +44,12 @@ void stuck_free(struct stuck *stuck); /* NULL is fine */
 
 /* Whether a view is one of those that are looked at. */
 bool stuck_wants(const struct stuck *stuck, int view);
-/* One of them, [row][column]; in any order, each once: the result does not depend on it but for rounding. */
+/* Adds one of these views, [row][column], each once; their order changes the result by rounding only. */
 void stuck_add(struct stuck *stuck, const void *samples);
-/* Once, when all have come: the map, [row][column], not zero where a pixel is stuck, the stuck's own; NULL where there
- * is none. */
+/*
+ * Makes the map, once all of them have come: [row][column], not zero where a pixel is stuck, owned by `stuck`; NULL
+ * where there is none.
+ */
 const unsigned char *stuck_find(struct stuck *stuck);
 
 #endif

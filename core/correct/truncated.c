@@ -17,7 +17,7 @@ const char *truncated_row_name(const struct correction_job *job)
 
 void truncated_warn(const struct correction_job *job, const size_t rows[2], int extend)
 {
-	/* What noise does by chance: 1.7 % with 100 photons in air. */
+	/* Share of rows below which noise may have done it: by chance it does 1.7 % with 100 photons in air. */
 	const double few = 0.02;
 	/* The largest errors in the middle and at the rim of any object of tests/bench/results/truncation.txt. */
 	const double middle = 35, rim = 110;
