@@ -47,7 +47,10 @@ struct device_info {
 	size_t bytes_total, bytes_free;
 };
 
-/* What linearise met, added up and never reset. A pixel counts once, in the first row that fits. */
+/*
+ * Counts of the defects that linearise met, summed over its calls and never reset. A pixel counts once, in the first
+ * field that applies.
+ */
 struct defect_counts {
 	size_t mapped;     /* pixels of the map */
 	size_t not_finite; /* NaN, infinite, or no flat above the dark to hold it against */
@@ -82,7 +85,7 @@ struct sart_options {
 	bool nonnegative;
 };
 
-/* What a plan is made from. Everything pointed to is borrowed and must outlive the plan. */
+/* Inputs of plan_new and plan_bytes. Everything pointed to is borrowed and must outlive the plan. */
 struct plan_options {
 	const struct geometry *geometry;
 	const struct grid *grid;
@@ -172,12 +175,13 @@ static inline int cancel_check(const struct cancel *cancel, struct error *err)
 	return 0;
 }
 
-/* Of the smallest voxel spacing: what a ray must have inside the grid to correct it, see sart_iterate. */
+/*
+ * Least length inside the grid of a ray that corrects it, as a share of the smallest voxel spacing: see sart_iterate.
+ */
 #define RAY_LENGTH_LEAST 0.5
 /*
- * Likewise: what the sum of weights of a voxel counts for at least in the matched
- * pair. Symmetric scans have rays that pass at exactly the distance where their
- * weight ends: a voxel that rounding alone lets them touch must hardly move.
+ * Least column sum that the matched pair divides by, as a share of the same spacing. Symmetric scans have rays that
+ * pass at exactly the distance where their weight ends: a voxel that rounding alone lets them touch must hardly move.
  */
 #define COLUMN_SUM_LEAST 0.01
 
@@ -186,8 +190,7 @@ enum backprojection { BACKPROJECT_PLAIN, BACKPROJECT_FDK /* times (D/depth)^2 */
 struct backend {
 	const char *name;    /* "cpu", "cuda" */
 	const char *summary; /* for --help */
-	/* Its devices have memory beside the host's: what does not fit there can go through it in slabs (outofcore.h).
-	 */
+	/* The devices have memory of their own: a job too large for it can run out of core, in slabs (outofcore.h). */
 	bool own_memory;
 	/* `filter` only notes what is to be filtered and `backproject` does it: FDK takes all views in one go. */
 	bool defers_filter;

@@ -2,7 +2,7 @@
 #define CBCT_CORE_ERROR_H
 
 /*
- * What went wrong, in one value that the caller owns and passes down.
+ * An error (code, guilty field, one sentence) in one value that the caller owns and passes down.
  *
  * A function that can fail returns 0, or a negative enum error_code, and takes
  * a `struct error *` last. It fills the error exactly once, where the cause is

@@ -5,7 +5,7 @@
 
 /* The FDK stage of core/recon/recon.c, and nobody else's. */
 
-/* What the backend's `filter` needs beside the projections. */
+/* Weights and responses that the backend's `filter` needs beside the projections. */
 struct fdk_weights {
 	float *columns;  /* [view][column], owned */
 	float *response; /* [length/2 + 1], owned */
@@ -21,11 +21,10 @@ int fdk_weights_make(struct fdk_weights *ret_weights, const struct orbit *orbit,
 void fdk_weights_clear(struct fdk_weights *weights);
 
 /*
- * Of so many views those that are filtered and backprojected in one go, at most:
- * memory is counted with it before any plan can be asked. By 32 views the pass over
- * the volume that a batch costs is long hidden behind the samples it takes; of few
- * views a batch is a quarter, for the memory that it takes, but at least 8. A backend that
- * defers its filter (out of core) takes all views in one go: its pass is over the host's memory.
+ * The most views of a scan that are filtered and backprojected in one go; memory is counted with it before there is a
+ * plan to ask. By 32 views the pass over the volume that a batch costs is long hidden behind the samples it takes; of
+ * few views a batch is a quarter, for the memory that it takes, but at least 8. A backend that defers its filter (out
+ * of core) takes all views in one go: its pass is over the host's memory.
  */
 static inline int fdk_batch_most(int views)
 {

@@ -44,7 +44,7 @@ struct linearise {
 };
 enum { HARDENING_MOST = 8 }; /* coefficients */
 
-/* What a pixel is; all but PIXEL_GOOD are defects, struct defect_counts says which. */
+/* Kinds of pixels; all but PIXEL_GOOD are defects, which struct defect_counts explains. */
 enum pixel_kind { PIXEL_GOOD, PIXEL_MAPPED, PIXEL_NOT_FINITE, PIXEL_SATURATED, PIXEL_ZERO, PIXEL_KINDS };
 
 #ifdef __CUDACC__

@@ -32,7 +32,7 @@ enum parameter_preset {
 	PRESET_NONE      /* the parameter may be absent for good */
 };
 
-/* What parameter_get gives where struct parameter.word stands in place of the number. */
+/* The value that parameter_get gives where struct parameter.word stands in place of the number. */
 enum { PARAMETER_WORD = -1 };
 
 struct parameter {

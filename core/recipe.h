@@ -4,7 +4,7 @@
 #include "core/backend.h"
 
 /*
- * What a job asks for, as plain data that every room of core/ may read.
+ * The recipe of a job: what it asks for, as plain data that every room of core/ may read.
  * core/recon/recipe.h has its defaults, its ranges, and what is filled in.
  */
 enum { EMIT_FDK = 0, EMIT_FDK_TV = -1 }; /* beside iterations 1, 2, ... */
@@ -56,7 +56,7 @@ struct recipe {
 };
 
 enum { ITERATIONS_MAX = 100000, GRID_DEFAULT_MOST = 512, METAL_HU_LEAST = 500, METAL_HU_MOST = 1000000 };
-/* What is nearer to metal than this is an estimate: most of its rays cross the metal's shadows. */
+/* Voxels nearer to metal than this are an estimate: most of their rays lie in the metal's shadows. */
 enum { METAL_ESTIMATE_MM = 10 };
 
 #endif

@@ -104,7 +104,7 @@ TRUNCATION_INLINE float truncation_largest(const float *view, int columns, int r
 		}
 	return largest;
 }
-/* What is not air in a view. */
+/* Line integrals of at least this are not air. largest: the largest line integral of the view. */
 TRUNCATION_INLINE float truncation_level(float largest)
 {
 	return TRUNCATION_SHARE * (largest < 1 ? largest : 1);
@@ -176,10 +176,13 @@ struct truncation_row_sums {
 struct truncation_edge_sums {
 	double y, xy;
 };
-/* One side of a row. */
+/* The extension of a row beyond one of its sides: the ellipse's p^2 = a + b x + c x^2, and the shell. */
 struct extension {
 	float a, b, c;
-	/* Of the shell, 0 .. 1; its outline, columns beyond the edge of the outermost one; half its width, columns. */
+	/*
+	 * share: how far the shell is believed, 0 .. 1; outline: where it ends, columns beyond the outermost one's
+	 * edge; half: half of its width, columns.
+	 */
 	float share, outline, half;
 	float body, bone; /* A and B for columns */
 };
@@ -262,7 +265,7 @@ enum { SHELL_BINS = 64, SHELL_OUTLINES = 14 };
 #define SHELL_ELLIPSE_LEAST 0.0015f
 #define SHELL_ELLIPSE_MOST 0.2f
 
-/* Of all outlines, made once for a plan. In units of the object's width within the row: x = -1/2 .. 1/2. */
+/* Table of all outlines, made once for a plan. Unit: the object's width within the row, x = -1/2 .. 1/2. */
 struct shell_table {
 	float outline[SHELL_OUTLINES];          /* beyond x = 1/2 */
 	float root[SHELL_OUTLINES][SHELL_BINS]; /* sqrt(x + 1/2 + outline), mirrored for the other side */
@@ -465,7 +468,7 @@ TRUNCATION_INLINE struct shell_place shell_search(const struct shell_table *tabl
 	return place;
 }
 
-/* What the fit of a row found; share 0: no shell. */
+/* The shell fitted to a row; share 0: there is none. */
 struct shell {
 	float share;
 	float outlines[2]; /* before the first bin, behind the last one */

@@ -36,7 +36,7 @@ const struct warning_kind *warning_kind(const char *code);
 /* Whether the code has a row: what this program itself warns of must have one. */
 bool warning_is_known(const char *code);
 
-/* Who is told of the warnings of a reconstruction, in the thread that makes it. */
+/* The receiver of a reconstruction's warnings, called in the thread that runs the reconstruction. */
 struct warning_sink {
 	void *context;
 	void (*tell)(void *context, const char *code, const char *detail); /* NULL: nobody */

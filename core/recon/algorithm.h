@@ -10,7 +10,7 @@
  * core/recon/run.c's. One thread at a time.
  */
 
-/* What an algorithm works on, all of it borrowed. */
+/* The problem that an algorithm works on, all of it borrowed. */
 struct problem {
 	const struct backend *backend;
 	struct device *device;
@@ -46,8 +46,8 @@ struct algorithm {
 	int (*iterate)(const struct problem *problem, void *state, bool moved, struct iteration_sums *ret_sums,
 		       struct error *err);
 	/*
-	 * What a run that goes on needs beside the iterate, to end with the same bits; NULL: nothing. `resume` gets
-	 * those bytes before the first iteration.
+	 * The algorithm's part of a checkpoint: what a resumed run needs beside the iterate to end with the same bits;
+	 * NULL: nothing. `resume` gets those bytes before the first iteration.
 	 */
 	size_t (*state_bytes)(const struct problem *problem);
 	int (*save)(const struct problem *problem, void *state, const struct checkpoint_sink *sink, struct error *err);

@@ -38,7 +38,7 @@ struct cgls {
 	struct stack *weights;    /* W, 1/mm */
 	bool weighted;            /* W is known */
 	int *views;               /* [views]: 0, 1, 2 ... */
-	/* What a run that goes on needs, beside p and r. */
+	/* Numbers that a resumed run needs beside p and r. */
 	struct cgls_numbers {
 		double gradient2; /* ||s||^2 of the iteration before, 0 before the first */
 		double data2;     /* ||b||^2 over the rays that are not left out */

@@ -7,7 +7,7 @@
 #include "core/recon/algorithm.h"
 #include "core/warning.h"
 
-/* What recon.c (life, views), run.c (the run) and memory.c (what it takes) share. */
+/* Declarations that recon.c (life, views), run.c (the run) and memory.c (the memory it takes) share. */
 
 struct recon {
 	const struct backend *backend;
@@ -49,8 +49,8 @@ struct recon {
 };
 
 /*
- * What the stages cost beside an FDK of the whole scan, roughly, as measured on
- * CPU and GPU alike: only the progress bar lives on it.
+ * Cost of the stages relative to an FDK of the whole scan, roughly, as measured on CPU and GPU alike: used for the
+ * progress bar only.
  */
 static const double WORK_LOAD = 0.2, WORK_FDK = 1, WORK_TV = 0.2;
 
@@ -59,7 +59,7 @@ static inline double iteration_work(const struct recipe *recipe)
 	return recipe->algorithm->work + (recipe->tv.on ? WORK_TV : 0);
 }
 
-/* A run that goes on from an iterate makes no FDK volume. */
+/* A resumed run starts from an iterate and makes no FDK volume. */
 static inline bool recon_runs_fdk(const struct recon *recon)
 {
 	return recon->recipe.fdk.on && !recon->resumed;
@@ -82,8 +82,8 @@ int sart_options_make(struct sart_options *ret_sart, const struct recipe *recipe
 		      struct error *err);
 
 /*
- * What the job takes, and on what: *ret_outofcore stays NULL where it fits as a
- * whole, otherwise it is the out-of-core device and the memory what that takes.
+ * Chooses the device and counts the memory that the job takes: *ret_outofcore stays NULL where the job fits as a whole,
+ * otherwise it is the out-of-core device and *ret_memory what that takes.
  */
 int choose_device(const struct backend *backend, struct device *device, struct plan_options *options,
 		  const struct recipe *recipe, const struct orbit *orbit, struct recon_memory *ret_memory,

@@ -56,7 +56,7 @@ static int refuse_what_does_not_fit(struct recon *recon, struct plan_options *op
 	return code;
 }
 
-/* What the plan is made from: everything that is known before any device memory is taken. */
+/* Makes the inputs of the plan: everything that is known before any device memory is allocated. */
 static int recon_prepare(struct recon *recon, const struct recipe *recipe, struct error *err)
 {
 	const struct geometry *geometry = recon->geometry;

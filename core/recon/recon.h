@@ -11,7 +11,7 @@
  * time; the hooks are called in that thread.
  */
 
-/* What a volume shows of its noise, see core/recon/noise.h; both 0 where there is nothing to see. */
+/* Noise measured in a volume, see core/recon/noise.h; both 0 where nothing stands out of the background. */
 struct volume_noise {
 	double sigma;    /* 1/mm: standard deviation of the noise */
 	double contrast; /* 1/mm: standard deviation of the object's gray levels without it */
@@ -73,9 +73,8 @@ struct recon_memory {
 };
 
 /*
- * What a job will take at most, before it is opened. The projections are all
- * kept for iterations; FDK alone needs a few at a time. device NULL (the daemon, that
- * opens none): available is 0.
+ * The most memory that a job will take, known before it is opened. The projections are all kept for iterations; FDK
+ * alone needs a few at a time. device NULL (the daemon, which opens none): available is 0.
  */
 int recon_memory(const struct backend *backend, struct device *device, const struct geometry *geometry,
 		 const struct recipe *recipe, struct recon_memory *ret_memory, struct error *err);
@@ -107,8 +106,8 @@ int recon_run(struct recon *recon, struct error *err);
 int recon_resume(struct recon *recon, const float *volume, int iteration, struct error *err);
 
 /*
- * What the corrections found in the FDK volume, the list of metal, as bytes that belong to the recon; 0 of them where
- * there is nothing. A run that goes on wants them back, behind recon_resume: its projections are then what they were.
+ * Findings of the corrections in the FDK volume, the list of metal, as bytes that belong to the recon; 0 bytes where
+ * there are none. A resumed run must get them back after recon_resume: its projections then become what they were.
  */
 const void *recon_found(const struct recon *recon, size_t *ret_bytes);
 int recon_resume_found(struct recon *recon, const void *found, size_t bytes, struct error *err);
@@ -119,16 +118,16 @@ struct checkpoint_sink {
 	int (*write)(void *context, const void *bytes, size_t size, struct error *err);
 };
 /*
- * What the algorithm holds beside the iterate, 0 bytes where that is nothing. A run that goes on wants it back, behind
- * recon_resume, for the same bits.
+ * The algorithm's state beside the iterate, 0 bytes where it has none. A resumed run must get it back after
+ * recon_resume, to end with the same bits.
  */
 size_t recon_state_bytes(const struct recon *recon);
 int recon_save_state(struct recon *recon, const struct checkpoint_sink *sink, struct error *err);
 int recon_resume_state(struct recon *recon, const char *bytes, size_t size, struct error *err);
 
 /*
- * The noise that was measured; NULL before that and without TV. A run that goes on wants it back, behind
- * recon_resume: the FDK volume that showed it is not made again.
+ * The noise that was measured; NULL before that and without TV. A resumed run must get it back
+ * after recon_resume: the FDK volume that showed it is not made again.
  */
 const struct volume_noise *recon_noise(const struct recon *recon);
 int recon_resume_noise(struct recon *recon, const struct volume_noise *noise, struct error *err);

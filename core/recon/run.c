@@ -168,7 +168,7 @@ static int finish_fdk(struct recon *recon, struct error *err)
 	return code;
 }
 
-/* Where a run goes on, the projections become what they were. */
+/* In a resumed run the projections become what they were. */
 static int correct_again(struct recon *recon, struct error *err)
 {
 	size_t found;

@@ -1,4 +1,4 @@
-/* What a reconstruction warns of, in words. */
+/* Warnings of a reconstruction, in words. */
 #include "core/recon/warn.h"
 
 #include <math.h>

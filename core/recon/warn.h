@@ -5,9 +5,9 @@
 #include "core/recon/recon.h"
 #include "core/warning.h"
 
-/* What a reconstruction warns of, in words; those of its corrections are in their rows. For core/ only. */
+/* Warnings of a reconstruction, in words; those of its corrections are in their rows. For core/ only. */
 
-/* "grid_unseen", "grid_too_small", "tv_without_sart". What the orbit lacks is told with the scan (proto/scan.h). */
+/* "grid_unseen", "grid_too_small", "tv_without_sart". Warnings of the orbit come with the scan (proto/scan.h). */
 void warn_recipe(const struct warning_sink *sink, const struct geometry *geometry, const struct recipe *recipe);
 /* "residual_high": SART has ended, and the volume explains less than half of the projections. */
 void warn_residual(const struct warning_sink *sink, const struct history_row *row);

@@ -43,7 +43,7 @@ struct image_kind {
 };
 extern const struct image_kind image_kinds[IMAGE_COUNT];
 
-/* As it is stored. */
+/* Bytes of an image as it is stored. */
 static inline size_t image_bytes(enum image image, int columns, int rows)
 {
 	return (size_t)columns * (size_t)rows * (image_kinds[image].pixel == IMAGE_MARKS ? 1 : sizeof(float));

@@ -7,13 +7,13 @@
 #include "core/scan/grid.h"
 
 /*
- * What a radiographer would say of a geometry: the arc, which way round, short
- * or full, how wide the fan is, how far the detector is off centre. Found from
- * the actual sources, so it holds for calibrated C-arms as well; and the FDK
- * weights that follow from it. Nothing here changes silently: what was decided
- * stands in these fields, which the scan's `derived` shows.
+ * Description of a geometry in a radiographer's terms: the arc, which way round,
+ * short or full, how wide the fan is, how far the detector is off centre; and the
+ * FDK weights that follow from it. It is found from the actual sources, so it holds
+ * for calibrated C-arms as well. Every decision stands in these fields, which the
+ * scan's `derived` shows.
  *
- * All of it is told in the orbit's own frame: its axis is z, unless the sources
+ * All of it is in the orbit's own frame: its axis is z, unless the sources
  * lie in a plane that leans against z's by more than LEAN_LEAST (an arm swung out,
  * a sweep about another axis of the patient). Then it is that plane's normal
  * through the isocentre, on z's side.
@@ -111,8 +111,8 @@ void orbit_column_weights(const struct orbit *orbit, const struct geometry *geom
 int orbit_directions(const struct orbit *orbit);
 
 /*
- * What the view counts for in FDK's density on the axis: its angular weight times
- * the short-scan or displaced weight of its ray through the axis.
+ * Weight of the view in FDK's density on the axis: its angular weight times the short-scan or displaced weight of its
+ * ray through the axis.
  */
 double orbit_axis_weight(const struct orbit *orbit, int view);
 
@@ -129,7 +129,7 @@ struct geometry orbit_sides(const struct orbit *orbit, const struct geometry *ge
  * whole field of view on its rows, not centred where the detector is not. One slice, where its plane meets the axis,
  * for a detector of one row. An orbit that leans so far that this leaves less than half of the height gets the box
  * around what all views see, and one whose views have next to no height in common the grid of orbit_covering_grid:
- * orbit_unseen_slices then tells.
+ * orbit_unseen_slices counts what some views do not see.
  */
 void orbit_default_grid(const struct orbit *orbit, const struct geometry *geometry, int most, struct grid *ret_grid);
 /*

@@ -1,5 +1,5 @@
 /*
- * What of an orbit's field of view all views see, and the grids that follow from it.
+ * The part of an orbit's field of view that all views see, and the grids that follow from it.
  *
  * A detector row of the orbit's frame bounds a cone of rays; a place (x, y, z) of the field of view is on the rows of
  * a view where matrix . (x, y, z, 1) = w (column, row, 1) has 0 <= row <= rows - 1. The row is solved for z, so that
