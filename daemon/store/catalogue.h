@@ -78,18 +78,18 @@ struct catalogue_scan {
 	long long stamp; /* of the record in its directory, store/record.h */
 };
 
-/* In a group. *ret_number as above. */
-int catalogue_add_scan(struct catalogue *catalogue, const struct catalogue_scan *scan, long long *ret_number,
-		       struct error *err);
-/* In a group. *ret_new false: a scan has this key already. */
-int catalogue_add_scan_key(struct catalogue *catalogue, const char *scan, const struct store_key *key, bool *ret_new,
-			   struct error *err);
-/* The scan with this key; ret_scan "" where there is none. */
+/*
+ * Adds a scan, in a group, and the key that it was posted with; key NULL: none. *ret_number: the number that the
+ * database gave it. ERR_CONFLICT: another scan has this key.
+ */
+int catalogue_add_scan(struct catalogue *catalogue, const struct catalogue_scan *scan, const struct store_key *key,
+		       long long *ret_number, struct error *err);
+/* Finds the scan with this key; ret_scan "" where there is none. */
 int catalogue_find_scan_key(struct catalogue *catalogue, const char *key, char ret_scan[ID_SIZE],
 			    uint8_t ret_sha256[32], struct error *err);
-/* All of them, by id; the caller frees the array. */
+/* Reads all scans, by id; the caller frees the array. */
 int catalogue_scans(struct catalogue *catalogue, struct catalogue_scan **ret_scans, int *ret_count, struct error *err);
-/* In a group. */
+/* These two change a scan's row, in a group. */
 int catalogue_set_image(struct catalogue *catalogue, const char *scan, enum image image, const uint8_t sha256[32],
 			struct error *err);
 int catalogue_set_closed(struct catalogue *catalogue, const char *scan, struct error *err);
@@ -99,46 +99,46 @@ struct catalogue_projection {
 	int view;
 	uint8_t sha256[32];
 };
-/* In a group: the row, in place of the one of this view. */
+/* Writes a projection's row, in a group, in place of the one of this view. */
 int catalogue_put_projection(struct catalogue *catalogue, const struct catalogue_projection *projection,
 			     struct error *err);
 int catalogue_remove_projection(struct catalogue *catalogue, long long scan, int view, struct error *err);
-/* Of the scan with this number, by view; the caller frees the array. */
+/* Reads the projections of the scan with this number, by view; the caller frees the array. */
 int catalogue_projections(struct catalogue *catalogue, long long scan, struct catalogue_projection **ret_projections,
 			  int *ret_count, struct error *err);
 
 /* ---- jobs ---- */
 
-/* In a group. */
+/* Adds a job, in a group. */
 int catalogue_add_job(struct catalogue *catalogue, const struct job_record *job, struct error *err);
-/* All that changes of a job, but for its stamp. */
-int catalogue_update_job(struct catalogue *catalogue, const struct job_record *job, struct error *err);
-/* By id; free with job_records_free. */
+/*
+ * Writes all that changes of a job, but for its stamp, in a group. PAST_REWINDS removes its history behind
+ * job->checkpoint; PAST_GOES removes all that its runs have left, but for the events of states.
+ */
+int catalogue_update_job(struct catalogue *catalogue, const struct job_record *job, enum job_past past,
+			 struct error *err);
+/* Reads all jobs, by id; free with job_records_free. */
 int catalogue_jobs(struct catalogue *catalogue, struct job_record **ret_jobs, int *ret_count, struct error *err);
-/* *ret_known false: there is no such job. */
+/* Reads a job's state; *ret_known false: there is no such job. */
 int catalogue_job_state(struct catalogue *catalogue, const char *job, bool *ret_known, enum job_state *ret_state,
 			struct error *err);
-/* The jobs that have volumes without a digest, oldest first. */
+/* Visits the jobs that have volumes without a digest, oldest first. */
 int catalogue_undigested(struct catalogue *catalogue, void (*visit)(void *context, const char *job), void *context,
 			 struct error *err);
 
-/* In a group: in place of the row of this iteration, of the volume of this name. */
+/* These two write a row, in a group, in place of the one of this iteration, or of the volume of this name. */
 int catalogue_put_history(struct catalogue *catalogue, const char *job, const struct history_row *row,
 			  struct error *err);
 int catalogue_put_volume(struct catalogue *catalogue, const char *job, const struct volume_record *volume,
 			 struct error *err);
-/* In a group. The digest of the volume of this name and time of making, if it is still there. */
+/* Writes the digest of the volume of this name and time of making, in a group, if the volume is still there. */
 int catalogue_set_digest(struct catalogue *catalogue, const char *job, const struct volume_record *volume,
 			 struct error *err);
 int catalogue_remove_volume(struct catalogue *catalogue, const char *job, const char *name, struct error *err);
-/* In a group. *ret_new false: this very warning is there already. */
+/* Adds a warning, in a group. *ret_new false: this very warning is there already. */
 int catalogue_add_warning(struct catalogue *catalogue, const char *job, const struct warning_record *warning,
 			  bool *ret_new, struct error *err);
-/* In a group: these remove the history behind an iteration; all that runs have left, but for the events of states. */
-int catalogue_rewind(struct catalogue *catalogue, const char *job, int iteration, struct error *err);
-int catalogue_remove_past(struct catalogue *catalogue, const char *job, struct error *err);
-
-/* In the order of making; the caller frees the arrays. */
+/* These read what a job has left, in the order of making; the caller frees the arrays. */
 int catalogue_history(struct catalogue *catalogue, const char *job, struct history_row **ret_rows, int *ret_count,
 		      struct error *err);
 int catalogue_volumes(struct catalogue *catalogue, const char *job, struct volume_record **ret_volumes, int *ret_count,
@@ -162,32 +162,33 @@ struct catalogue_scan_key {
 	const char *key;
 	uint8_t sha256[32];
 };
-/* In a group. *ret_number 0: an event of the job with this `once` is there already. */
+/* Adds an event, in a group. *ret_number 0: an event of the job with this `once` is there already. */
 int catalogue_add_event(struct catalogue *catalogue, const char *job, const struct event *event, long long *ret_number,
 			struct error *err);
-/* In a group: the removal of a job is an event with the number of one of its own. The latest 1000 are kept. */
+/* Notes the removal of a job, in a group: an event with the number of one of the job's. The latest 1000 are kept. */
 int catalogue_add_removal(struct catalogue *catalogue, const char *job, long long number, struct error *err);
-/* The same as store_job_events. */
+/* Does what store_job_events says. */
 int catalogue_events(struct catalogue *catalogue, const char *job, long long after, int limit,
 		     struct event_record **ret_events, int *ret_count, struct error *err);
-/* At the start. The highest number that an event has had. */
+/* Reads the highest number that an event has had; called at the start. */
 int catalogue_last_event(struct catalogue *catalogue, long long *ret_number, struct error *err);
-/* In a group: events get numbers above this one, and above all that were given. */
+/* Makes the numbers of events go on above this one, in a group, and above all that were given. */
 int catalogue_pass_events(struct catalogue *catalogue, long long least, struct error *err);
 
 /* ---- scans and jobs alike: their records in the directories, store/record.h ---- */
 
 enum record_kind { RECORD_SCAN, RECORD_JOB, RECORD_KINDS };
-/* All in a group. */
+/* These two are called in a group. */
 int catalogue_remove(struct catalogue *catalogue, enum record_kind kind, const char *id, struct error *err);
 int catalogue_set_stamp(struct catalogue *catalogue, enum record_kind kind, const char *id, long long stamp,
 			struct error *err);
-/* Every id with its stamp, by id. Below zero ends it. */
+/* Visits every id with its stamp, by id; a visit that returns less than zero is the last. */
 int catalogue_stamps(struct catalogue *catalogue, enum record_kind kind,
 		     int (*visit)(void *context, const char *id, long long stamp, struct error *err), void *context,
 		     struct error *err);
 /*
- * All rows of a scan or job but its projections, by the names of their tables: {"jobs": [{...}], "history": [...],
+ * Reads all rows of a scan or job but its projections, by the names of their tables: {"jobs": [{...}], "history":
+ * [...],
  * ...}. NULL in *ret_rows: there is none with this id. Free with cJSON_Delete.
  */
 int catalogue_export(struct catalogue *catalogue, enum record_kind kind, const char *id, cJSON **ret_rows,

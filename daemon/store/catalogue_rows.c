@@ -11,23 +11,20 @@ enum { REMOVALS_KEPT = 1000 /* a page that was away for longer reads its list an
 
 /* ---- scans ---- */
 
-int catalogue_add_scan(struct catalogue *catalogue, const struct catalogue_scan *scan, long long *ret_number,
-		       struct error *err)
+int catalogue_add_scan(struct catalogue *catalogue, const struct catalogue_scan *scan, const struct store_key *key,
+		       long long *ret_number, struct error *err)
 {
-	return catalogue_write_record(catalogue, TABLE_SCANS, STATEMENT_INSERT, NULL, scan, ret_number, err);
-}
-
-int catalogue_add_scan_key(struct catalogue *catalogue, const char *scan, const struct store_key *key, bool *ret_new,
-			   struct error *err)
-{
-	struct catalogue_scan_key row = {.key = key->text};
+	int code = catalogue_write_record(catalogue, TABLE_SCANS, STATEMENT_INSERT, NULL, scan, ret_number, err);
+	struct catalogue_scan_key row;
 	long long first;
-	int code;
 
+	if (code != 0 || key == NULL)
+		return code;
+	row.key = key->text;
 	memcpy(row.sha256, key->digest, sizeof(row.sha256));
-	code = catalogue_write_record(catalogue, TABLE_SCAN_KEYS, STATEMENT_INSERT, scan, &row, &first, err);
-	if (code == 0)
-		*ret_new = first != 0;
+	code = catalogue_write_record(catalogue, TABLE_SCAN_KEYS, STATEMENT_INSERT, scan->id, &row, &first, err);
+	if (code == 0 && first == 0)
+		return error_set(err, ERR_CONFLICT, "this Idempotency-Key was used meanwhile");
 	return code;
 }
 
@@ -120,7 +117,7 @@ int catalogue_add_job(struct catalogue *catalogue, const struct job_record *job,
 	return catalogue_write_record(catalogue, TABLE_JOBS, STATEMENT_INSERT, NULL, job, NULL, err);
 }
 
-int catalogue_update_job(struct catalogue *catalogue, const struct job_record *job, struct error *err)
+static int update_row(struct catalogue *catalogue, const struct job_record *job, struct error *err)
 {
 	struct row row;
 	int code, count = row_of_record(&tables[TABLE_JOBS], STATEMENT_UPDATE, job, NULL, &row, err);
@@ -131,6 +128,43 @@ int catalogue_update_job(struct catalogue *catalogue, const struct job_record *j
 			 : catalogue_write(catalogue, catalogue->statements[TABLE_JOBS][STATEMENT_UPDATE], row.values,
 					   count + 1, err);
 	row_clear(&row);
+	return code;
+}
+
+static int rewind_history(struct catalogue *catalogue, const char *job, int iteration, struct error *err)
+{
+	const struct value values[] = {value_text(job), value_integer(iteration)};
+
+	return catalogue_write(
+	    catalogue, "DELETE FROM history WHERE job = (SELECT number FROM jobs WHERE id = $1) AND iteration > $2",
+	    values, 2, err);
+}
+
+/* Events go too: those with a key may be recorded once more. */
+static int remove_past(struct catalogue *catalogue, const char *job, struct error *err)
+{
+	static const enum table_id past[] = {TABLE_HISTORY, TABLE_VOLUMES, TABLE_WARNINGS};
+	const struct value id = value_text(job);
+	int code = 0;
+
+	for (size_t i = 0; i < sizeof(past) / sizeof(past[0]) && code == 0; i++)
+		code = catalogue_remove_rows(catalogue, past[i], job, err);
+	if (code != 0)
+		return code;
+	return catalogue_write(
+	    catalogue, "DELETE FROM events WHERE job = (SELECT number FROM jobs WHERE id = $1) AND kind <> 'state'",
+	    &id, 1, err);
+}
+
+int catalogue_update_job(struct catalogue *catalogue, const struct job_record *job, enum job_past past,
+			 struct error *err)
+{
+	int code = update_row(catalogue, job, err);
+
+	if (code == 0 && past == PAST_REWINDS)
+		code = rewind_history(catalogue, job->id, job->checkpoint, err);
+	else if (code == 0 && past == PAST_GOES)
+		code = remove_past(catalogue, job->id, err);
 	return code;
 }
 
@@ -247,31 +281,6 @@ int catalogue_add_warning(struct catalogue *catalogue, const char *job, const st
 	if (code == 0)
 		*ret_new = number != 0;
 	return code;
-}
-
-int catalogue_rewind(struct catalogue *catalogue, const char *job, int iteration, struct error *err)
-{
-	const struct value values[] = {value_text(job), value_integer(iteration)};
-
-	return catalogue_write(
-	    catalogue, "DELETE FROM history WHERE job = (SELECT number FROM jobs WHERE id = $1) AND iteration > $2",
-	    values, 2, err);
-}
-
-/* Events go too: those with a key may be recorded once more. */
-int catalogue_remove_past(struct catalogue *catalogue, const char *job, struct error *err)
-{
-	static const enum table_id past[] = {TABLE_HISTORY, TABLE_VOLUMES, TABLE_WARNINGS};
-	const struct value id = value_text(job);
-	int code = 0;
-
-	for (size_t i = 0; i < sizeof(past) / sizeof(past[0]) && code == 0; i++)
-		code = catalogue_remove_rows(catalogue, past[i], job, err);
-	if (code != 0)
-		return code;
-	return catalogue_write(
-	    catalogue, "DELETE FROM events WHERE job = (SELECT number FROM jobs WHERE id = $1) AND kind <> 'state'",
-	    &id, 1, err);
 }
 
 static int list_of_job(struct catalogue *catalogue, enum table_id table, const char *job, void **ret_records,

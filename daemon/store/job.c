@@ -98,11 +98,7 @@ int store_job_update(struct store *store, const struct job_record *job, const st
 
 	if (code != 0)
 		return code;
-	code = catalogue_update_job(store->catalogue, job, err);
-	if (code == 0 && past == PAST_REWINDS)
-		code = catalogue_rewind(store->catalogue, job->id, job->checkpoint, err);
-	else if (code == 0 && past == PAST_GOES)
-		code = catalogue_remove_past(store->catalogue, job->id, err);
+	code = catalogue_update_job(store->catalogue, job, past, err);
 	if (code == 0)
 		code = add_event(store, job->id, event, err);
 	if (code == 0)

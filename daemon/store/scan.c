@@ -451,18 +451,6 @@ static int make_files(struct store *store, const struct scan *parsed, const stru
 	return code;
 }
 
-/* In the transaction that inserts the scan, so that a key and its scan are both there or neither is. */
-static int insert_key(struct store *store, const struct stored_scan *scan, const struct store_key *key,
-		      struct error *err)
-{
-	bool new = false;
-	int code = catalogue_add_scan_key(store->catalogue, scan->id, key, &new, err);
-
-	if (code == 0 && !new)
-		return error_set(err, ERR_CONFLICT, "this Idempotency-Key was used meanwhile");
-	return code;
-}
-
 static int find_by_key(struct store *store, const struct store_key *key, struct stored_scan **ret_scan,
 		       struct error *err)
 {
@@ -503,9 +491,7 @@ static int insert_row(struct store *store, struct stored_scan *scan, const struc
 		return code;
 	memcpy(row.id, scan->id, sizeof(row.id));
 	memcpy(row.name, scan->name, sizeof(row.name));
-	code = catalogue_add_scan(store->catalogue, &row, &scan->number, err);
-	if (code == 0 && key != NULL)
-		code = insert_key(store, scan, key, err);
+	code = catalogue_add_scan(store->catalogue, &row, key, &scan->number, err);
 	if (code == 0)
 		code = record_write(store, RECORD_SCAN, scan->id, true, err);
 	return store_end(store, code, err);
