@@ -57,7 +57,7 @@ static __global__ void gather(const device_view *geometry, const int *views, int
 		to[i] = fmaf(flip, m[2][k], -m[1][k]);
 }
 
-/* What the sums of `COUNT` voxels from z on do to the volume. */
+/* Applies the sums of `COUNT` voxels from z on to the volume: adds them, or makes SART's update. */
 template <int COUNT>
 static __device__ __forceinline__ void put_voxels(const backprojection_job &job, int x, int y, int z,
 						  const float sum[COUNT])
@@ -140,7 +140,10 @@ static __global__ void __launch_bounds__(ACROSS *ALONG) backproject_general(cons
 	put_voxels<VOXELS>(job, x, y, z, sum);
 }
 
-/* Of a block: voxels along x and y, and parts into which the views are cut; what takes time is to wait for samples. */
+/*
+ * Size of a block: voxels along x and y, and parts into which the views are cut, since the time goes into waiting for
+ * samples.
+ */
 enum { SMALL_SIDE = 8, SMALL_PARTS = 4 };
 
 static __global__ void __launch_bounds__(SMALL_SIDE *SMALL_SIDE *SMALL_PARTS)
@@ -288,7 +291,7 @@ static __global__ void __launch_bounds__(ROWS_WIDE *ROWS_HIGH, 5) backproject_pa
 				float row = fmaf((float)(n * VOXELS), rise, first);
 				float base = fminf(fmaxf(row + lowest, (float)-STACK_PAD), job.rows);
 				float shifted = __fadd_rd(base, SPLIT_SHIFT), low = shifted - SPLIT_SHIFT;
-				/* Of the first voxel above the second row. */
+				/* How far the first voxel lies above the second row. */
 				float t = row - (shifted - (SPLIT_SHIFT - 1.0f));
 				const __half2 *r = there + (int)(__float_as_uint(shifted) - SPLIT_BITS) * PANEL;
 				__half2 q[pairs], value[twos];
@@ -416,7 +419,7 @@ void backproject_forget(struct device *device)
 	device->constants->plan = NULL;
 }
 
-/* What a sum samples: padded rows and their array for FDK, the detector's own for SART. */
+/* The stack that a sum samples: padded rows and their array for FDK, the detector's own for SART. */
 static const struct stack_shape *shape_for(const struct plan *plan, const struct voxel_use &use)
 {
 	return use.fdk ? &plan->filtered : &plan->stack;

@@ -11,7 +11,7 @@
 int cuda_error(struct error *err, cudaError_t status, const char *what)
 {
 	if (status == cudaErrorMemoryAllocation) {
-		cudaGetLastError(); /* not sticky: the device goes on */
+		cudaGetLastError(); /* not sticky: the device stays usable */
 		return error_set(err, ERR_NO_MEMORY, "%s: %s", what, cudaGetErrorString(status));
 	}
 	return error_set(err, ERR_DEVICE, "%s: %s", what, cudaGetErrorString(status));
@@ -170,7 +170,7 @@ static int cuda_sync(struct device *device, struct error *err)
 }
 
 /*
- * What works on volumes and stacks, with a mark behind it: copies from and to the
+ * Operations on volumes and stacks, each with a mark behind it: copies from and to the
  * host wait for these marks (memory.cu).
  */
 static int filter(struct plan *plan, const struct stack *from, const int *slots, const int *views, int count,

@@ -30,9 +30,9 @@
 #include "kernels/fft.cuh"
 #include "kernels/internal.cuh"
 
-/* Of the rows that cuFFT takes at once: the second cache holds them. */
+/* Bytes of the rows that cuFFT takes at once: they stay in the L2 cache. */
 static const size_t FFT_BYTES = (size_t)16 << 20;
-/* Rows that it has room for at least; bytes that its workspace is aligned to. */
+/* Rows that cuFFT has room for at least; bytes that its workspace is aligned to. */
 enum { FFT_ROWS = 8, FFT_ALIGNED = 256 };
 
 /* cuFFT's part: transforms of one length, so many rows at once, in the plan's scratch with the workspace behind. */
@@ -43,7 +43,7 @@ struct fft {
 	bool has_forward, has_inverse;
 };
 
-/* What is found at the edges of a batch's rows: [slot of the batch][row]. */
+/* Truncation found at the edges of a batch's rows: [slot of the batch][row]. */
 struct edges {
 	float *levels; /* [slot of the batch] what is not air */
 	struct shell_table *shells;
@@ -57,7 +57,7 @@ struct edges {
 	size_t extended[2];
 };
 
-/* What the filter of a plan has. */
+/* The filter of a plan: weights, responses and transforms. */
 struct filter {
 	float *column_weights; /* [count][columns] */
 	float *response;       /* the fused filter's, in the order of the kernel */
@@ -285,7 +285,7 @@ static __global__ void __launch_bounds__(LEVEL_THREADS)
 		levels[blockIdx.x] = truncation_level(shared[0]);
 }
 
-/* What the block's threads share while they look for the shell around a row's object. */
+/* Shared memory of a block that looks for the shell around a row's object. */
 struct shell_search_shared {
 	double residual[SHELL_OUTLINES], square;
 	float bins[SHELL_BINS], ellipse;
@@ -435,7 +435,7 @@ static __device__ __forceinline__ row_place place_of(const filter_job &job, int 
 		(size_t)i * job.wide_slot + (size_t)row * job.wide_pitch, (size_t)index};
 }
 
-/* The row beyond its ends: where it goes on `x` columns past the outermost one. */
+/* The extended row, `x` columns beyond its outermost one. */
 static __device__ __forceinline__ float extended_at(const filter_job &job, const row_place &at,
 						    const row_weight &weight, int side, int x)
 {
@@ -528,8 +528,8 @@ static size_t fft_row_bytes(int length)
 }
 
 /*
- * What cuFFT has of the scratch: room for as many rows as the cache holds and a
- * workspace as large; for a small job no more than a stack, or what others need anyway.
+ * cuFFT's part of the scratch: room for as many rows as the cache holds and a
+ * workspace as large; for a small job no more than a stack, or what other stages need anyway.
  */
 size_t filter_scratch_bytes(const struct plan *plan, size_t others)
 {

@@ -2,14 +2,14 @@
 #define CBCT_KERNELS_INTERNAL_CUH
 
 /*
- * What the files of the CUDA backend share: the four structs, the layouts of
+ * Declarations that the files of the CUDA backend share: the four structs, the layouts of
  * their memory, and how errors and allocations go.
  *
- * All work of a device runs on one stream in the order it was asked for; what
- * comes from the host and goes there has streams beside it, and waits for those
- * who use that volume or stack only. Lengths on the device are in
- * voxels and pixels, counted from the centre of the grid and of the detector,
- * so that float32 keeps four digits behind the point.
+ * All work of a device runs on one stream in the order it was asked for; copies
+ * from and to the host have streams of their own, and wait only for the work on
+ * their volume or stack. Lengths on the device are in voxels and pixels, counted
+ * from the centre of the grid and of the detector, so that float32 keeps four
+ * digits behind the point.
  */
 #include <cstddef>
 #include <cstdint>
@@ -149,7 +149,7 @@ size_t cuda_stack_bytes(int columns, int rows, int slots);
 void stack_walk(int columns, int rows, int slots, struct stack *ret_stack, struct arena *arena);
 int stack_clear(struct device *device, struct stack *stack, struct error *err);
 
-/* The pixels whose rays may meet the grid, and some around them. */
+/* The pixels whose rays may meet the grid, with a margin. */
 struct shadow {
 	int first_column, end_column, first_row, end_row;
 };
@@ -161,7 +161,7 @@ struct shadow {
  * A ray is a line through the source s along d(c', r'), both linear forms in c' and r':
  * value = [0] + [1] c' + [2] r'. With its moment m = s x d (Pluecker), the
  * ray crosses the plane x = t at y = (-m_z + d_y t) / d_x, z = (m_y + d_z t) / d_x
- * and so on around, without the source's large coordinates cancelling.
+ * and so on cyclically, without the source's large coordinates cancelling.
  */
 struct device_view {
 	float direction[3][3];
@@ -174,7 +174,7 @@ struct device_view {
 
 /*
  * The volume as a stack of slices across one axis, for the forward projection:
- * [slice][row][fast], SLICE_PAD rows between the slices, edge values held around.
+ * [slice][row][fast], SLICE_PAD rows between the slices, padded with edge values.
  *
  * The untilted kernel reads many rows below each other and wants a distance from
  * row to row that the compiler knows: there the fast axis is cut into panels,
@@ -282,7 +282,7 @@ struct plan_shape {
 	int extended_length; /* of cuFFT for rows that are extended, 0: none are */
 };
 
-/* What has a scale in half precision: projections as pairs, those of ones, the volume. */
+/* Data with a scale in half precision: projections as pairs, those of ones, the volume. */
 enum { MOST_PAIRS, MOST_ONES, MOST_VOLUME, MOST_COUNT };
 
 struct filter;   /* filter.cu */
@@ -358,9 +358,9 @@ int plan_set_views(struct plan *plan, const int *views, int count, struct error 
 int plan_set_slots(struct plan *plan, const int *slots, int count, const struct stack *from, struct error *err);
 /* The scratch is to hold slices: zeros where anything else has been. */
 int plan_begin_slices(struct plan *plan, struct error *err);
-/* It is to hold something else. */
+/* The scratch is to hold something else than slices. */
 void plan_end_slices(struct plan *plan);
-/* The views, and a stack of projections of this shape. */
+/* Checks the views, and a stack of projections of this shape. */
 int plan_check_views(const struct plan *plan, const int *views, int count, const struct stack_shape *shape,
 		     const struct stack *stack, int slots, struct error *err);
 
@@ -380,9 +380,8 @@ static inline bool back_by_pairs(const struct plan *plan, bool fdk)
 	return plan->shape.back_voxels > 0 && (fdk || plan->shape.untilted);
 }
 /*
- * What is multiplied by this before it is kept in half precision, a power of two, by the largest magnitude of all, as
- * bits. Nearly always, from 2^least to 2^most, it is the same; else the largest becomes 2^target at least and half of
- * what comes after at most. What is not a number stays none.
+ * Factor before half precision, a power of two, from the largest magnitude of all, as bits. Nearly always, from 2^least
+ * to 2^most, it is HALF_SCALE; else it brings the largest to 2^target .. 2^(target + 1). NaN stays NaN.
  */
 static const float HALF_SCALE = 64.0f;
 static __device__ __forceinline__ float half_scale(unsigned magnitude, int least, int most, int target)
@@ -397,12 +396,18 @@ static __device__ __forceinline__ float unscale(float scale)
 {
 	return __uint_as_float((254u << 23) - __float_as_uint(scale)); /* 1 / scale, a power of two */
 }
-/* Of projections: the largest is 2^-10 to 2^12, the least step 2^-15 of it; sums of eight stay finite. */
+/*
+ * The scale of projections: with it the largest is 2^-10 to 2^12, the least step 2^-15 of it; sums of eight stay
+ * finite.
+ */
 static __device__ __forceinline__ float pairs_scale(unsigned most)
 {
 	return half_scale(most, -16, 6, 11);
 }
-/* Of a volume: 2^-6 to 2^9, so that what it is before SART's first update leaves room for what it becomes. */
+/*
+ * The scale of a volume: with it the largest is 2^-6 to 2^9, which leaves room for what SART's first update makes of
+ * it.
+ */
 static __device__ __forceinline__ float volume_scale(unsigned most)
 {
 	return half_scale(most, -12, 3, 3);
@@ -415,7 +420,7 @@ int layout_to_columns(struct plan *plan, const float *volume, float *columns, st
 int layout_from_columns(struct plan *plan, const float *columns, float *volume, struct error *err);
 
 /* ---- project.cu ---- */
-/* What becomes of a ray's sum. */
+/* The use of a ray's sum. */
 struct ray_use {
 	const float *measured;     /* NULL: the sum itself is wanted; else (p - sum) / row sum, slot = view */
 	float2 *partial;           /* one a block: residual^2, p^2 */
@@ -431,7 +436,7 @@ size_t project_blocks(const struct plan *plan, int count);
 const char *projector_name(const struct plan *plan); /* of projectors[] */
 
 /* ---- backproject.cu ---- */
-/* What becomes of a voxel's sum. */
+/* The use of a voxel's sum. */
 struct voxel_use {
 	bool update; /* false: added to the volume */
 	bool fdk;    /* weight (D/depth)^2 */
@@ -470,15 +475,15 @@ int filter_choose(int columns);
 /* plan->filter, before the walk that carves; filter_free takes NULL. */
 int filter_new(struct plan *plan, struct error *err);
 void filter_free(struct filter *filter);
-/* What the filter holds of the plan's memory; measures where plan->filter is NULL. */
+/* The filter's part of the plan's memory; only measured where plan->filter is NULL. */
 void filter_walk(struct plan *plan, struct arena *arena);
-/* Fills it. */
+/* Fills the filter's memory. */
 int filter_prepare(struct plan *plan, struct error *err);
-/* Of plan->scratch, which has `others` for other stages anyway. */
+/* Bytes of plan->scratch that the filter takes, which has `others` for other stages anyway. */
 size_t filter_scratch_bytes(const struct plan *plan, size_t others);
 
 /* ---- linearise.cu ---- */
-/* What it holds of the plan's memory, nothing with plan_options.no_samples; and what is written there beforehand. */
+/* linearise's part of the plan's memory, nothing with plan_options.no_samples; and what is written there beforehand. */
 void linearise_walk(struct plan *plan, struct arena *arena);
 int linearise_prepare(struct plan *plan, struct error *err);
 
@@ -492,7 +497,7 @@ int reduce_pairs(struct plan *plan, const float2 *partial, size_t count, double 
 size_t copies_bytes(const struct plan *plan);
 size_t copies_partials(const struct plan *plan, int count); /* of so many views */
 int copies_lay_out(struct plan *plan, const float *volume, struct error *err);
-/* What project_rays does, with `use.measured`. */
+/* The same as project_rays with `use.measured`, from the copies. */
 int copies_project(struct plan *plan, const float *volume, int first, int count, struct ray_use use, float *to,
 		   struct error *err);
 int copies_view_rows(const struct plan *plan); /* what view_rows is to be */
@@ -503,11 +508,11 @@ int by_view_rows_iterate(struct plan *plan, const float *projections, float *vol
 			 struct error *err);
 
 /* ---- sart.cu ---- */
-/* What a ray must have in the grid to correct it, mm. */
+/* Least length in the grid of a ray that corrects it, mm. */
 float length_least(const struct plan *plan);
 
 /*
- * How SART iterates: strategies[] of sart.cu, of which the first that applies is taken. Those of one view an
+ * How SART iterates: strategies[] of sart.cu, of which the first that applies is used. Those of one view an
  * update do it all in `iterate`; the others share theirs and differ in how a subset is projected.
  */
 struct strategy {
@@ -516,7 +521,7 @@ struct strategy {
 	bool (*applies)(const struct plan *plan); /* options and shape are known */
 	/* Bytes of plan->scratch, beside the slices that are there for `project`. */
 	size_t (*scratch_bytes)(const struct plan *plan);
-	/* What it alone holds of the plan's memory, and what is written there beforehand. */
+	/* The strategy's own part of the plan's memory, and what is written there beforehand. */
 	void (*walk)(struct plan *plan, struct arena *arena);
 	int (*prepare)(struct plan *plan, struct error *err);
 	/* Partial sums that `count` projections leave, those of all views or what one launch has. */

@@ -1,7 +1,7 @@
 /*
  * The volume in the orders in which the projectors read it. [z][y][x] is what
  * everybody else sees; here it is copied into slices across x and across y with
- * edge values held around, into texture arrays, or with z fastest.
+ * edge values as padding, into texture arrays, or with z fastest.
  */
 #include <cuda_fp16.h>
 #include <type_traits>
@@ -16,7 +16,7 @@ struct slices_shape slices_shape_make(int slices, int rows, int fast, bool panel
 	shape.slices = slices;
 	shape.rows = rows;
 	shape.fast = fast;
-	/* What is held before a row lies behind the row before. A sample on the held edge reads one value more. */
+	/* Values held before a row lie behind the row before it. A sample on the held edge reads one value more. */
 	shape.row = panels ? PANEL : round_up(fast + 2 * SLICE_HELD, 32);
 	shape.panel = panels ? PANEL * padded : 0;
 	shape.slice = panels ? (size_t)shape.panel * (size_t)divide_up(fast + 2 * SLICE_HELD + 1, SLICE_STEP)
@@ -51,7 +51,7 @@ struct columns_shape columns_shape_make(const int size[3])
 	shape.nz = size[2];
 	/* Long columns start on cache lines, short ones on sectors; the next value behind a column can be read. */
 	shape.pitch = round_up(size[2] + 1, size[2] >= 128 ? 32 : 8);
-	/* One more plane and column: read with weight 0 at the far ends. */
+	/* One more plane and column are read with weight 0 at the far ends. */
 	shape.floats = ((size_t)shape.nx + 1) * (size_t)shape.ny * (size_t)shape.pitch + (size_t)shape.pitch + 32;
 	return shape;
 }
@@ -68,7 +68,7 @@ static __device__ __forceinline__ void note_most(unsigned *most, float own)
 
 enum { MOST_THREADS = 256, MOST_BLOCKS = 1024 };
 
-/* Of `rows` rows of `width` values, `pitch` apart, aligned to four; magnitudes count `factor` times. */
+/* Notes the largest magnitude, times `factor`, of `rows` rows of `width` values, `pitch` apart, aligned to four. */
 static __global__ void __launch_bounds__(MOST_THREADS)
     find_most(const float *__restrict__ from, size_t width, size_t pitch, int rows, float factor, unsigned *most)
 {
@@ -109,7 +109,10 @@ int layout_scale(struct plan *plan, const float *volume, const float *projection
 	LAUNCHED();
 	if (projections == NULL)
 		return 0;
-	/* What they are on the average of the grid is near enough: some rows will do, other ones in each view. */
+	/*
+	 * The projections divided by the grid's diagonal estimate the volume well enough: some rows will do, others in
+	 * each view.
+	 */
 	while (step > 1 && period % step == 0)
 		step += 2;
 	for (int i = 0; i < 3; i++)
@@ -121,7 +124,7 @@ int layout_scale(struct plan *plan, const float *volume, const float *projection
 	return 0;
 }
 
-/* What is kept of a voxel: itself, or in half precision with the next one along the rows' axis. */
+/* The stored form of a voxel: itself, or in half precision with the next one along the rows' axis. */
 static __device__ __forceinline__ void make(float &ret, float value, float, float)
 {
 	ret = value;

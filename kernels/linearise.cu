@@ -21,7 +21,7 @@ struct samples {
 	float hardening[HARDENING_MOST];
 };
 
-/* What a call met, struct defect_counts in numbers that a kernel can add to. */
+/* Defects that a call met: struct defect_counts in numbers that a kernel can add to. */
 struct linearised {
 	unsigned long long kinds[PIXEL_KINDS]; /* PIXEL_GOOD is not counted */
 	int blank, no_air;
@@ -107,7 +107,7 @@ static __global__ void __launch_bounds__(256) find_air(const samples s, linearis
 		found->air_most = air;
 }
 
-/* One view: [row][column] into a slot, and a mark for each defect. */
+/* Linearises one view, [row][column], into a slot, with a mark for each defect. */
 static __global__ void __launch_bounds__(256)
     to_integrals(const samples s, float *slot, int pitch, unsigned char *marks, linearised *found)
 {
@@ -143,7 +143,7 @@ static __global__ void __launch_bounds__(256)
 		atomicAdd(&found->kinds[what], 1ull); /* defects are rare */
 }
 
-/* What the nearest good pixel in one direction says. */
+/* Adds the nearest good pixel in one direction, weighted by 1 / distance. */
 static __device__ void look(const samples &s, const float *slot, int pitch, const unsigned char *marks, int column,
 			    int row, int column_step, int row_step, float &sum, float &weights)
 {

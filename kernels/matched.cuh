@@ -124,7 +124,7 @@ static __device__ __forceinline__ float part_across(float fast, int j, int count
 	return fmaf(slope * (1.0f / 6.0f), kinks, __saturatef(1.0f - fabsf(held)));
 }
 
-/* What a run takes from the rays of its axis in one view; and from ones. */
+/* Gathers what a run takes from the rays of its axis in one view, and from ones. */
 template <int COUNT>
 static __device__ __forceinline__ void matched_gather(const matched_job &job, const device_view &g,
 						      const float *projection, const matched_run &run, float sum[COUNT],
@@ -173,7 +173,7 @@ static __device__ __forceinline__ void matched_gather(const matched_job &job, co
 	}
 }
 
-/* What the sums of a voxel do. */
+/* Applies the sums of a voxel to the volume: adds them, or makes SART's update. */
 static __device__ __forceinline__ void matched_put(const matched_job &job, size_t at, float sum, float cover)
 {
 	if (!job.use.update) {

@@ -2,7 +2,7 @@
  * Volumes, stacks and layered arrays on the device, and the copies between them
  * and the host. These go through pinned memory in pieces, two in turn, on streams
  * of their own: the bus has one while the host's cores copy the other, and
- * whatever computes goes on, as long as it is not about the same memory.
+ * kernels run on, as long as they do not use the same memory.
  */
 #include <cstdlib>
 #include <cstring>
@@ -11,7 +11,7 @@
 
 /* ---- copies ---- */
 
-/* One core copies a fifth of what the bus takes, and waits for new pages on the way. */
+/* Copies with several cores: one alone reaches a fifth of the bus's rate, and waits for new pages on the way. */
 static void copy_by_cores(char *to, const char *from, size_t bytes)
 {
 	const int stripes = 8;
@@ -87,7 +87,7 @@ int copy_out(struct device *device, void *to, const void *from, size_t pitch, si
 	struct staging *staging = &device->out;
 	size_t most = rows_at_once(&pitch, &width, &rows), before = 0;
 
-	/* A piece is asked for, then the one before it is taken out. */
+	/* The copy of a piece is started, then the piece before it is moved out of pinned memory. */
 	for (size_t done = 0; done < rows || before > 0; done += most) {
 		size_t now = done >= rows ? 0 : rows - done < most ? rows - done : most;
 		int half = staging->next;

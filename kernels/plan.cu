@@ -256,7 +256,7 @@ static void choose_rows(const struct plan_options *options, struct plan_shape *s
 	shape->back_voxels = choice.count;
 }
 
-/* Of `rows` by 32 rays that meet the grid: of the view with most. */
+/* Warps of `rows` by 32 rays that meet the grid, in the view with most. */
 static int view_warps(const struct geometry *geometry, const struct grid *grid, int rows)
 {
 	int most = 0;
@@ -276,7 +276,7 @@ static int lean_or(enum thrift thrift, int most)
 	return thrift == THRIFT_LEAN ? at_most(most, BATCH_LEAN) : most;
 }
 
-/* Of a subset, whose corrections are made in one go. */
+/* Views of a subset whose corrections are made in one go. */
 static int corrected_at_once(enum thrift thrift, int subset)
 {
 	bool in_parts = thrift >= THRIFT_2_PARTS && thrift < THRIFT_LEAN;
@@ -339,7 +339,7 @@ static size_t pixels_of(const struct plan *plan)
 static bool needs_arrays_back(const struct plan *plan)
 {
 	const struct plan_options *options = &plan->options;
-	/* Of rows that lean FDK needs none. */
+	/* FDK needs no arrays for rows that lean, plain sums do. */
 	bool sums = plan->shape.correction > 0 || (options->sart == NULL && options->column_weights == NULL);
 
 	return plan->shape.textures && !back_by_pairs(plan, false) && (plan->shape.back_voxels == 0 || sums);
@@ -466,7 +466,7 @@ static bool needs_coverage(const struct plan *plan)
 	return plan->shape.correction > 0 && !plan->shape.covered && (!plan->options.matched || needs_work(plan));
 }
 
-/* What SART holds: column sums, numerators, squares, and what its strategy has. */
+/* SART's part of the plan's memory: column sums, numerators, squares, and that of its strategy. */
 static void sart_walk(struct plan *plan, struct arena *arena)
 {
 	const size_t voxels = grid_voxels(plan->options.grid);
@@ -732,7 +732,7 @@ static int plan_prepare(struct plan *plan, struct error *err)
 		TRY(prepare_sart(plan, err));
 	if (plan->filter != NULL)
 		TRY(filter_prepare(plan, err));
-	/* What was uploaded at once may still be on its way, on a stream that the others do not wait for. */
+	/* Copies by cudaMemcpy may still be on their way, on a stream that the others do not wait for. */
 	CUDA_TRY(cudaStreamSynchronize(cudaStreamLegacy));
 	return device_wait(plan->device, err);
 }

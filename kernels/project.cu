@@ -38,7 +38,7 @@ struct projection {
 	float *to;
 };
 
-/* What a sum over slices of T is to be multiplied by. */
+/* Factor that takes the volume's scale out of a sum over slices of T. */
 template <typename T>
 static __device__ __forceinline__ float unscale_for(const projection &p)
 {
@@ -60,7 +60,7 @@ static __device__ __forceinline__ place place_of(const projection &p)
 	return {(group * group_most + rest - tile * here) * VIEWS + (int)threadIdx.z, tile - row * p.tiles_across, row};
 }
 
-/* What a ray needs to know of its wandering, for either kind of values. */
+/* The wandering of a ray, in the form that its kind of values needs. */
 template <typename T>
 static __device__ __forceinline__ auto wander_for(float fast_step)
 {
@@ -91,7 +91,10 @@ static __device__ __forceinline__ float2 finish(const projection &p, int slot, i
 	return squares;
 }
 
-/* Of a block, 32 columns wide, a warp a row: rays far apart share little among rows, but much with the next views. */
+/*
+ * Rows of a block, 32 columns wide, a warp a row, and its views: rays far apart share little among rows, but much with
+ * the next views.
+ */
 enum { GENERAL_ROWS = 2 };
 static const int GENERAL_VIEWS = 4;
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ < 800 /* multiprocessors of 1024 threads */
@@ -197,8 +200,10 @@ static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS, GENE
 
 /* ---- small problems ---- */
 
-/* Of a block: warps of pixels one after the other, and parts into which rays are cut at most; what takes time is to
- * wait. */
+/*
+ * Size of a block: warps of pixels one after the other, and the most parts into which rays are cut, since the time goes
+ * into waiting.
+ */
 enum { SMALL_WARPS = 2, SMALL_PARTS = 4, SMALL_PIXELS = 32 * SMALL_WARPS };
 
 /* From the volume as it is, which the caches hold. */

@@ -58,7 +58,7 @@ static __device__ __forceinline__ kinks kinks_at(const wandering &w, float right
 	return {a * a * a, b * b * b};
 }
 
-/* What the columns j - 1 .. j + 2 count for. */
+/* Weights of the columns j - 1 .. j + 2. */
 struct four_parts {
 	float p[4];
 };
@@ -96,7 +96,7 @@ static __device__ __forceinline__ half_parts parts_at(const half_wandering &w, _
 	return {{k0, __hadd2(__hfma2(k0, minus_two, left), k1), __hadd2(__hfma2(k1, minus_two, right), k0), k1}};
 }
 
-/* What `by` more of `right` adds to the parts. */
+/* Change of the weights where `right` grows by `by`. */
 static __device__ __forceinline__ half_parts changes_at(const half_wandering &w, __half2 right, __half2 by)
 {
 	const __half2 one = __float2half2_rn(1.0f), minus_two = __float2half2_rn(-2.0f);
@@ -281,7 +281,7 @@ static __device__ __forceinline__ float sample(const float *__restrict__ slice, 
 	return mix(mix(p[0], p[fast_stride], across), mix(q[0], q[fast_stride], across), up);
 }
 
-/* One row of the four columns from p on. */
+/* Weighted sum of one row of the four columns from p on. */
 static __device__ __forceinline__ float across_four(const float *__restrict__ p, int fast_stride,
 						    const four_parts &part)
 {
@@ -445,15 +445,15 @@ struct strided {
 	int x, y, z;
 };
 
-/* What a ray has added up, times `step` mm; and how many slices it crosses in all. */
+/* Sum of a ray's samples, to be multiplied by `step` mm; and the number of slices that it crosses in all. */
 struct ray_part {
 	float sum, slices, step;
 };
 
 /*
- * One of `parts` equal parts of the way of a ray along d with moment m, where
- * `valid`. TOGETHER: of the way of all rays of the warp, whose lanes then read
- * neighbours in each slice; else each lane goes its own.
+ * Walks one of `parts` equal parts of the slices that a ray along d with moment m
+ * crosses, where `valid`. TOGETHER: of the slices that any ray of the warp crosses, so
+ * that its lanes read neighbours in each slice; else each lane has its own.
  */
 template <bool TOGETHER>
 static __device__ __forceinline__ ray_part walk_part(const strided &volume, const device_grid &grid, const float d[3],

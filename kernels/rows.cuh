@@ -267,7 +267,7 @@ static __device__ __forceinline__ reach reach_of(const fan &f, bool mine, int lo
 	return r;
 }
 
-/* What a lane without rays follows. */
+/* The fan that a lane without rays follows. */
 static __device__ __forceinline__ fan fan_idle(const slice_axes &axes)
 {
 	fan f = {};

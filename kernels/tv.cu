@@ -6,7 +6,7 @@
  * Both need, at a voxel, the new flux of itself and of its three predecessors.
  * A block marches along z over a tile of ROWS rows. A warp has a row, a lane as many
  * neighbours along x as one load brings; one more warp has the row above, of which
- * only the flux is wanted, and one what else is needed around the tile, so that all
+ * only the flux is wanted, and one the rest of the tile's rim, so that all
  * rows begin at whole sectors. Neighbours and their fluxes meet in shuffles along x,
  * in shared memory along y, in registers along z, and the next plane is loaded
  * before this one is waited for. So each step reads and writes every volume once,
@@ -84,7 +84,7 @@ struct iterate {
 		if constexpr (READS_DUAL<KIND>)
 			past = load<V>(from_past + at);
 	}
-	/* What the gradient is taken of. */
+	/* The point whose gradient is taken: v, or u^ of the primal-dual steps. */
 	__device__ __forceinline__ group<float, V> ahead(float theta) const
 	{
 		group<float, V> u = v;
@@ -97,7 +97,7 @@ struct iterate {
 	}
 };
 
-/* What is loaded a plane early. */
+/* Values that are loaded a plane early. */
 template <tv_kind KIND, int V>
 struct arrival {
 	group<__half, V> dual[3];
@@ -150,7 +150,7 @@ static __device__ __forceinline__ void meet()
 	asm volatile("bar.sync 1, %0;" ::"n"(32 * WARPS) : "memory");
 }
 
-/* What the warps of a block have for each other, two planes in turn. */
+/* Shared memory of a block's warps, two planes in turn. */
 template <int V>
 struct tile {
 	enum { WIDE = 32 * V, PITCH = WIDE + 4 };
@@ -228,7 +228,7 @@ static __device__ __forceinline__ void march_row(const tv_volumes &a, const tv_s
 }
 
 /*
- * The warp that has what lies around the tile: a group of the row below each, and
+ * The warp that has the rim of the tile: a group of the row below each, and
  * one voxel, of the column to the left (lower half of the warp) or to the right (upper
  * half, from the row above on). Neighbours in a column are neighbours in the warp.
  */
@@ -410,7 +410,7 @@ static int run_gradient(struct plan *plan, float *volume, const struct tv_option
 	return 0;
 }
 
-/* Of step i: p, then v, go by these; theta is that of the step before. */
+/* Step sizes of step i, for p and then v; theta is that of the step before. */
 struct pace {
 	double tau, sigma, theta;
 };

@@ -7,7 +7,7 @@
  */
 #include <cuda_runtime.h>
 
-/* What SART makes of a ray. */
+/* The correction that SART makes from a ray. */
 struct corrected {
 	float correction; /* (p - A v) / L; 0 for a ray that is left out, misses the grid or only grazes it */
 	float2 squares;   /* (p - A v)^2 and p^2, 0 for a ray that is left out */
