@@ -326,6 +326,10 @@ cJSON *calibration_json(const struct calibration *calibration)
 	cJSON_AddNumberToObject(json, "residual_isocentre_mm", calibration->rms_isocentre);
 	cJSON_AddNumberToObject(json, "used", calibration->used);
 	cJSON_AddNumberToObject(json, "turned_deg", calibration->turn / degree);
+	if (calibration->rival_turn != 0)
+		cJSON_AddNumberToObject(json, "other_turn_deg", calibration->rival_turn / degree);
+	else
+		cJSON_AddNullToObject(json, "other_turn_deg");
 	cJSON_AddNumberToObject(json, "diameter_ratio", calibration->diameter_ratio);
 	cJSON_AddNumberToObject(json, "balls_moved_mm", calibration->adjusted_rms);
 	list = cJSON_AddArrayToObject(json, "balls_mm");

@@ -66,6 +66,12 @@ static void result_say(const struct calibration *calibration)
 {
 	fprintf(stderr, "%d of %d views, residual %.3f pixels, %.4f mm at the isocentre\n", calibration->used,
 		calibration->count, calibration->rms, calibration->rms_isocentre);
+	if (calibration->rival_turn != 0)
+		fprintf(stderr,
+			"the phantom looks about the same turned by %.0f degrees: it was taken to stand as near as "
+			"possible to "
+			"where the nominal geometry has it\n",
+			calibration->rival_turn * 180 / M_PI);
 	for (int k = 0; k < calibration->count; k++)
 		if (!calibration->views[k].used)
 			fprintf(stderr, "view %d is not used, its pose is between its neighbours': %s\n", k,

@@ -9,9 +9,12 @@
 
 #include "core/calibrate/internal.h"
 
-enum { PAIRS_LEAST = 7 };             /* of a view: nine unknowns, and some balls to hold them against */
-static const double SHARE_LEAST = .4; /* of the balls whose shadows should be on the picture */
-static const double RMS_MOST = 1;     /* pixels */
+enum { PAIRS_LEAST = 7 };                /* of a view: nine unknowns, and some balls to hold them against */
+static const double SHARE_LEAST = .4;    /* of the balls whose shadows should be on the picture */
+static const double RMS_MOST = 1;        /* pixels */
+static const double UNEVEN_FACTOR = 4;   /* of the median of the views' residuals */
+static const double UNEVEN_LEAST = .1;   /* pixels */
+static const double NEIGHBOUR_REACH = 4; /* mm at the detector, from a pose between the neighbours' */
 static const double DIAMETER_TOLERANCE = .15;
 static const double SCALE_TOLERANCE = .1; /* of the mean distance of the sources, against the nominal one */
 static const double COUNTS_LEAST = 30;    /* a line integral that no picture has as its median */
@@ -236,20 +239,31 @@ static void measure_view(const struct run *run, int view)
 	pose_view(&work->pose, run->request->pixel_mm, &result->view);
 }
 
-static void find_view(const struct run *run, int view, double turn, struct pair *pairs)
+/* Pairs of a view by the nominal geometry; on the second round by the pose between its neighbours'. */
+static int pair_view(const struct run *run, int view, double turn, bool again, struct pair *pairs)
+{
+	const double *pixel_mm = run->request->pixel_mm;
+	const struct balls *balls = &run->calibration->balls;
+	struct pose pose;
+
+	if (!again)
+		return match_view(&run->matches[view], pixel_mm, balls, turn, pairs);
+	pose_of_view(&pose, &run->calibration->views[view].view);
+	return match_pose(&run->matches[view], &pose, pixel_mm, balls, NEIGHBOUR_REACH / pixel_mm[0], pairs);
+}
+
+static void find_view(const struct run *run, int view, double turn, bool again, struct pair *pairs)
 {
 	const double *pixel_mm = run->request->pixel_mm;
 	const struct balls *balls = &run->calibration->balls;
 	struct calibrated_view *result = &run->calibration->views[view];
 	struct work *work = &run->works[view];
 	struct pose pose;
-	int matched = match_view(&run->matches[view], pixel_mm, balls, turn, pairs), agreeing, used, expected;
+	int matched = pair_view(run, view, turn, again, pairs), agreeing, used, expected;
 
 	if (matched < PAIRS_LEAST) {
-		refuse(result,
-		       "%d of its %d shadows are where the nominal geometry and this phantom have balls, expected %d "
-		       "or more",
-		       matched, work->count, PAIRS_LEAST);
+		refuse(result, "%d of its %d shadows are where %s and this phantom have balls, expected %d or more",
+		       matched, work->count, again ? "its neighbours" : "the nominal geometry", PAIRS_LEAST);
 		return;
 	}
 	if (resect(balls, pairs, matched, pixel_mm, (unsigned)view, &pose, &agreeing) < 0) {
@@ -272,11 +286,41 @@ static void find_view(const struct run *run, int view, double turn, struct pair 
 	memcpy(work->pairs, pairs, (size_t)used * sizeof(*pairs));
 	measure_view(run, view);
 	result->used = true;
+	result->refused[0] = '\0';
 	if (result->rms > RMS_MOST)
 		refuse(result, "its residual is %.2f pixels, expected at most %g", result->rms, RMS_MOST);
 }
 
-static int find_views(struct run *run, double turn, struct error *err)
+/*
+ * Refuses views whose residual is far above the others': shadows taken for other balls' leave some tenths of a pixel
+ * where a true pose leaves hundredths.
+ */
+static int refuse_uneven(const struct run *run, struct error *err)
+{
+	const int count = run->calibration->count;
+	float *all = malloc((size_t)count * sizeof(*all));
+	double limit;
+	int used = 0;
+
+	if (all == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for %d views", count);
+	for (int k = 0; k < count; k++)
+		if (run->calibration->views[k].used)
+			all[used++] = (float)run->calibration->views[k].rms;
+	limit = used > 0 ? fmax(UNEVEN_LEAST, UNEVEN_FACTOR * dense_select(all, used, used / 2)) : 0;
+	for (int k = 0; k < count; k++) {
+		struct calibrated_view *view = &run->calibration->views[k];
+
+		if (view->used && view->rms > limit)
+			refuse(view, "its residual is %.2f pixels, expected at most %.2f by those of the other views",
+			       view->rms, limit);
+	}
+	free(all);
+	return 0;
+}
+
+/* All views that are not used yet. */
+static int find_round(const struct run *run, double turn, bool again, struct error *err)
 {
 	int failed = 0;
 
@@ -290,11 +334,28 @@ static int find_views(struct run *run, double turn, struct error *err)
 		}
 #pragma omp for schedule(dynamic)
 		for (int k = 0; k < run->calibration->count; k++)
-			if (pairs != NULL)
-				find_view(run, k, turn, pairs);
+			if (pairs != NULL && !run->calibration->views[k].used)
+				find_view(run, k, turn, again, pairs);
 		free(pairs);
 	}
 	return failed ? error_set(err, ERR_NO_MEMORY, "no memory for the pairs of a view") : 0;
+}
+
+/*
+ * First from the nominal geometry; then those that were refused begin once more, from where their neighbours stand.
+ * They only begin there: their own shadows alone say where they end.
+ */
+static int find_views(struct run *run, double turn, struct error *err)
+{
+	int code = find_round(run, turn, false, err);
+
+	if (code == 0)
+		code = refuse_uneven(run, err);
+	if (code == 0)
+		code = sweep_fill(run->calibration, run->request->nominal, err);
+	if (code == 0)
+		code = find_round(run, turn, true, err);
+	return code == 0 ? refuse_uneven(run, err) : code;
 }
 
 /* ---- all views ---- */
@@ -507,7 +568,8 @@ int calibrate(struct calibration *ret_calibration, const struct calibrate_reques
 		code = check_pictures(&run, err);
 	if (code == 0) {
 		prepare_matches(&run);
-		code = match_turn(run.matches, calibration.count, request->pixel_mm, request->balls, &turn, err);
+		code = match_turn(run.matches, calibration.count, request->pixel_mm, request->balls, &turn,
+				  &calibration.rival_turn, err);
 	}
 	if (code == 0)
 		code = find_views(&run, turn, err);

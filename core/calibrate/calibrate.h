@@ -99,8 +99,13 @@ struct calibration {
 	struct balls balls;            /* as they are, or as they were adjusted; owned */
 	double rms, rms_isocentre;     /* pixels, mm: over all shadows used */
 	double turn;                   /* radians about z by which the phantom stood turned against its drawing */
-	double diameter_ratio;         /* median of shadow's to expected diameter */
-	double adjusted_rms;           /* mm, by which balls were moved; 0 unless asked for */
+	/*
+	 * Radians, of a few degrees' resolution, by which the phantom could as well stand turned further: balls of one
+	 * size at equal steps look the same. The turn nearest to the nominal geometry was taken. 0: no other turn fits.
+	 */
+	double rival_turn;
+	double diameter_ratio; /* median of shadow's to expected diameter */
+	double adjusted_rms;   /* mm, by which balls were moved; 0 unless asked for */
 };
 
 /*

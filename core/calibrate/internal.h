@@ -112,11 +112,12 @@ int match_view(const struct match_view *view, const double pixel_mm[2], const st
 int match_pose(const struct match_view *view, const struct pose *pose, const double pixel_mm[2],
 	       const struct balls *balls, double reach, struct pair *ret_pairs);
 /*
- * The angle about z by which the phantom stood turned: the one under which most balls of some views have shadows, and
- * of several such the smallest.
+ * The angle about z by which the phantom stood turned: of those under which about as many balls of some views have
+ * shadows as under any, the smallest. A phantom that looks the same a ball further on is taken to stand as the nominal
+ * geometry has it; *ret_rival is then how much further it looks the same, 0 for any other.
  */
 int match_turn(const struct match_view *views, int count, const double pixel_mm[2], const struct balls *balls,
-	       double *ret_turn, struct error *err);
+	       double *ret_turn, double *ret_rival, struct error *err);
 
 /* ---- bundle.c ---- */
 struct bundle_view {

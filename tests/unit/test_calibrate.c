@@ -234,6 +234,82 @@ START_TEST(finds_views_that_see_half_of_the_balls)
 }
 END_TEST
 
+/* Puts a phantom down beside its place: turned about z, then about x, then moved. */
+static void put_down(struct balls *balls, double turn, double tilt, const double shift[3])
+{
+	for (int b = 0; b < balls->count; b++) {
+		double *c = balls->ball[b].centre;
+		const double x = cos(turn) * c[0] - sin(turn) * c[1], y = sin(turn) * c[0] + cos(turn) * c[1];
+		const double z = c[2];
+
+		c[0] = x + shift[0];
+		c[1] = cos(tilt) * y - sin(tilt) * z + shift[1];
+		c[2] = sin(tilt) * y + cos(tilt) * z + shift[2];
+	}
+}
+
+/*
+ * Phantoms that look the same a ball further on, put down some degrees and millimetres beside their place: each view
+ * that is used has every ball where it stands, and the turn is that of the phantom, not a ball further.
+ */
+static const struct {
+	struct arm arm;
+	struct ball_circles circles; /* or */
+	struct ball_helix helix;
+	double turn, tilt, shift[3];
+} beside[] = {
+    {.arm = {.first = 4.6461, .step = -.628319, .sag = 1.036, .jitter = .032, .seed = 36},
+     .circles = {.circles = 2, .balls = 9, .diameter = 104.9, .distance = 56, .ball = 3, .first = 3.109, .shift = .2},
+     .turn = .0403,
+     .tilt = .0246,
+     .shift = {-4.7, .6, -8.8}},
+    {.arm = {.first = 3.17783, .step = -.628319, .sag = 1.2716, .jitter = .023, .seed = 34},
+     .helix = {.balls = 22, .diameter = 101.6, .pitch = 47.15, .first = -.736, .step = .356, .ball = {2.51, 2.51}},
+     .turn = .0942,
+     .tilt = -.067,
+     .shift = {-4.2, 3.9, 2.4}},
+};
+
+START_TEST(a_phantom_beside_its_place_is_taken_for_no_other)
+{
+	struct scene scene = {.arm = beside[_i].arm};
+	struct balls drawing, standing;
+	struct calibration calibration;
+	struct error err = {0};
+
+	scene.arm.columns = arm_sagging.columns;
+	scene.arm.rows = arm_sagging.rows;
+	scene.arm.pixel = arm_sagging.pixel;
+	scene.arm.count = 10;
+	if (beside[_i].helix.balls > 0)
+		ck_assert(balls_helix(&drawing, &beside[_i].helix, &err) == 0);
+	else
+		ck_assert(balls_circles(&drawing, &beside[_i].circles, &err) == 0);
+	ck_assert(balls_copy(&standing, drawing.ball, drawing.count, &err) == 0);
+	put_down(&standing, beside[_i].turn, beside[_i].tilt, beside[_i].shift);
+	scene.target = (struct target){.balls = &standing, .ball = .7, .photons = 20000};
+	ck_assert_msg(run(&scene, &drawing, false, &calibration, &err) == 0, "%s", err.text);
+	ck_assert_double_eq_tol(calibration.turn, beside[_i].turn, .02);
+	ck_assert_double_ge(fabs(calibration.rival_turn), .2);
+	for (int k = 0; k < calibration.count; k++)
+		for (int b = 0; b < drawing.count && calibration.views[k].used; b++) {
+			const struct view truth = arm_view(&scene.arm, k);
+			double is[12], found[12], pixel[4];
+
+			view_matrix(&truth, is);
+			view_matrix(&calibration.views[k].view, found);
+			view_project(is, standing.ball[b].centre, &pixel[0], &pixel[1]);
+			view_project(found, drawing.ball[b].centre, &pixel[2], &pixel[3]);
+			ck_assert_msg(hypot(pixel[0] - pixel[2], pixel[1] - pixel[3]) < .2,
+				      "view %d, ball %d: at %.2f %.2f, expected %.2f %.2f", k, b, pixel[2], pixel[3],
+				      pixel[0], pixel[1]);
+		}
+	calibration_clear(&calibration);
+	balls_clear(&drawing);
+	balls_clear(&standing);
+}
+END_TEST
+
 /* Balls of two sizes on a helix tell by themselves how the phantom was turned. */
 START_TEST(the_code_of_two_sizes_finds_a_phantom_however_it_is_turned)
 {
@@ -262,6 +338,7 @@ START_TEST(the_code_of_two_sizes_finds_a_phantom_however_it_is_turned)
 	/* The result's world is the drawing's: views turn back with the phantom. */
 	ck_assert_msg(run(&scene, &drawing, false, &calibration, &err) == 0, "%s", err.text);
 	ck_assert_double_eq_tol(calibration.turn, turn, .01);
+	ck_assert_double_eq(calibration.rival_turn, 0);
 	ck_assert_int_eq(calibration.used, calibration.count);
 	ck_assert_double_le(calibration.rms, .2);
 	calibration_clear(&calibration);
@@ -482,6 +559,8 @@ Suite *calibrate_suite(void)
 	tcase_add_loop_test(tests, finds_views_of_a_sagging_arm, 0, sizeof(rows) / sizeof(*rows));
 	tcase_add_test(tests, the_centroid_of_an_ellipse_is_known);
 	tcase_add_test(tests, finds_views_that_see_half_of_the_balls);
+	tcase_add_loop_test(tests, a_phantom_beside_its_place_is_taken_for_no_other, 0,
+			    sizeof(beside) / sizeof(*beside));
 	tcase_add_test(tests, the_code_of_two_sizes_finds_a_phantom_however_it_is_turned);
 	tcase_add_test(tests, adjusting_the_balls_takes_errors_of_machining_out);
 	tcase_add_test(tests, views_between_calibrated_ones_are_the_arms);
