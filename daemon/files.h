@@ -12,7 +12,7 @@
 int directory_make(const char *path, struct error *err);
 /* Whatever was renamed, made or removed in it is on the disk. */
 int directory_sync(const char *path, struct error *err);
-/* With the files in it, which has no directories. One that is not there is fine. */
+/* Removes a directory and the files in it; it has no directories. One that is not there is fine. */
 int directory_remove(const char *path, struct error *err);
 
 /*

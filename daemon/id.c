@@ -9,7 +9,7 @@
 
 #include "proto/clock.h"
 
-/* In ASCII order, so that texts sort as the numbers do. */
+/* The digits stand in ASCII order, so that texts sort as the numbers do. */
 static const char digits[] = "0123456789abcdefghjkmnpqrstvwxyz";
 enum { DIGIT_BITS = 5, TIME_DIGITS = 9, RANDOM_DIGITS = ID_LENGTH - TIME_DIGITS };
 

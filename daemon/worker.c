@@ -1,7 +1,7 @@
 /*
  * cbct-worker: one process for one device, in the daemon's service.
  *
- * It says hello, then takes one job at a time from the socket and runs it in
+ * The worker says hello, then takes one job at a time from the socket and runs it in
  * its only thread (the backends bring their own). While a job runs, the socket
  * is looked at whenever the pipeline asks whether to go on, which it does
  * between steps; so cancel and yield need no second thread. A job that begins

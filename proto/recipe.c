@@ -15,7 +15,7 @@
 
 const char *const priority_names[PRIORITY_COUNT] = {"routine", "urgent", "stat"};
 
-/* Of struct job_request, whose other parameters are the recipe's. */
+/* The one parameter of struct job_request itself; the others are the recipe's. */
 const struct parameter priority_parameter = {"",
 					     "priority",
 					     PARAMETER_CHOICE,
@@ -77,8 +77,8 @@ static int read_fdk(struct recipe *recipe, const cJSON *value, struct error *err
 }
 
 /*
- * What a "tv" means before its members are read. Numbers without a method have always meant explicit steps; no alpha
- * means "auto" to the minimiser.
+ * Sets the defaults of a "tv" before its members are read. Numbers without a method have always meant explicit steps;
+ * no alpha means "auto" to the minimiser.
  */
 static void presume_tv(struct recipe *recipe, const cJSON *value)
 {
@@ -300,7 +300,7 @@ int job_request_resolve(struct job_request *request, const struct scan *scan, st
 		recipe->sart.subsets = subsets_count(SUBSETS_DEFAULT, scan->geometry.count);
 	if (!request->patient.known)
 		request->patient = scan->patient;
-	/* Not before: until here the pointers of errors are places in the list as it was posted. */
+	/* The list is sorted last: until here the pointers of errors are places in it as it was posted. */
 	if (recipe->emits > 0)
 		qsort(recipe->emit, (size_t)recipe->emits, sizeof(*recipe->emit), compare_emits);
 	for (int i = 0; i < recipe->emits; i++) {

@@ -31,7 +31,7 @@ enum { EMITS_MAX = 10000 }; /* each is a volume on the disk, and all of them fit
  */
 int job_request_parse(const char *text, size_t length, struct job_request *ret_request, struct error *err);
 int job_request_read(const cJSON *value, struct job_request *ret_request, struct error *err); /* from a parsed one */
-/* Also sorts `emit` and drops what stands there twice. On failure the request stays as it was. */
+/* Resolving sorts `emit` and drops what stands there twice. On failure the request stays as it was. */
 int job_request_resolve(struct job_request *request, const struct scan *scan, struct error *err);
 
 /*
@@ -39,7 +39,7 @@ int job_request_resolve(struct job_request *request, const struct scan *scan, st
  * (print it with json_print: cJSON's own printer drops digits). NULL for no memory.
  */
 cJSON *job_request_json(const struct job_request *request);
-/* Those members that say what is computed: stages, grid, projector ... but not what is kept. NULL for no memory. */
+/* The members that say what is computed: stages, grid, projector ... but not what is kept. NULL for no memory. */
 cJSON *recipe_json(const struct recipe *recipe);
 /* Every parameter of a job as parameter_json has it (proto/parameter.h), in the order of the document. */
 cJSON *job_parameters_json(void);

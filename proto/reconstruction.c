@@ -292,8 +292,8 @@ static int run_keep(void *context, struct recon *recon, const struct kept_volume
 /* ---- checkpoints ---- */
 
 /*
- * Behind the line lies the iterate, behind that what the algorithm holds, and then the list of the metal that was taken
- * out. No noise is written as 0.
+ * After the line come the iterate, then the algorithm's state, then the list of the metal that was removed.
+ * No noise is written as 0.
  */
 static void checkpoint_line(char ret_line[CHECKPOINT_FILE_OFFSET], int iteration, const struct grid *grid,
 			    size_t state_bytes, size_t metal_bytes, const struct volume_noise *noise)
@@ -593,8 +593,8 @@ static int open_first(struct reconstruction *reconstruction, struct error *err)
 }
 
 /*
- * Once all views that stuck pixels are looked for in have come. Where some are found the reconstruction is opened anew
- * with their map, *ret_again, and has none of the projections: those that it had were taken with these pixels.
+ * Called once all views in which stuck pixels are looked for have come. Where some are found the reconstruction is
+ * opened anew with their map, *ret_again, and has none of the projections: earlier ones went in with these pixels.
  */
 static int heed_stuck_pixels(struct reconstruction *reconstruction, bool *ret_again, struct error *err)
 {
@@ -831,7 +831,7 @@ static int push_some(struct reconstruction *reconstruction, const int *projectio
 	for (int i = 0; i < count && code == 0; i++)
 		reconstruction->pushed[projections[i]] = 1;
 	reconstruction->pushed_count += code == 0 ? count : 0;
-	/* Not at the beginning: an arm may stand still for minutes, and the disk takes what is old. */
+	/* The file is not prepared at the beginning: an arm may stand still for minutes. */
 	if (code == 0 && !reconstruction->resumed &&
 	    2 * reconstruction->pushed_count >= reconstruction_wanted(reconstruction))
 		prepare(&reconstruction->run, STAGE_FDK, 0);

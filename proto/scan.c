@@ -25,7 +25,7 @@ static const double degree = M_PI / 180;
 static const double length_most = 1e7;         /* mm, of vectors */
 static const uint64_t bytes_most = 1ull << 40; /* of one scan's projections */
 
-/* What a circular orbit is read into. */
+/* A circular orbit as the document has it. */
 struct circular_document {
 	struct circular orbit;
 	double first, step; /* degrees */
@@ -36,7 +36,7 @@ struct circular_document {
 #define COORDINATE RANGE(-1e7, 1e7), .unit = "mm"
 #define COUNTS RANGE(1e-6, 1e12), .unit = "counts" /* of photons or digital units */
 
-/* Of struct scan. What is no scalar, air_region and beam_hardening, is read by hand. */
+/* Parameters of struct scan. air_region and beam_hardening are no scalars and are read by hand. */
 #define AT(member) .offset = offsetof(struct scan, member)
 static const struct parameter scan_parameters[] = {
     {"/detector", "columns", PARAMETER_INTEGER, AT(geometry.columns), RANGE(1, DETECTOR_MAX),
@@ -59,7 +59,7 @@ static const struct parameter scan_parameters[] = {
 #undef AT
 enum { SCAN_PARAMETERS = sizeof(scan_parameters) / sizeof(scan_parameters[0]) };
 
-/* Of struct circular_document. Beyond 1e6 degrees a double no longer tells 1e-10. */
+/* Parameters of struct circular_document. Beyond 1e6 degrees a double cannot resolve 1e-10. */
 #define AT(member) .offset = offsetof(struct circular_document, member)
 static const struct parameter circular_parameters[] = {
     {"/geometry", "source_to_isocentre_mm", PARAMETER_NUMBER, AT(orbit.source_to_isocentre), LENGTH,

@@ -62,7 +62,7 @@ int sums_create(const char *directory, int count, size_t projection_bytes, struc
  */
 int sums_open(const char *directory, bool writing, int count, size_t projection_bytes, int *ret_file, bool *ret_whole,
 	      struct error *err);
-/* Not synced. NULL: blank. */
+/* Writes a record and does not sync it; sum NULL: a blank one. */
 int sums_put(int file, int slot, const struct sum *sum, struct error *err);
 /*
  * Records `slot`, slot + 1, ...; a file that ends before them has none there. `bytes` is what each must be of, 0: any

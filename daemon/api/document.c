@@ -40,7 +40,7 @@ static void add_posted(cJSON *document, const struct scan *scan)
 	}
 }
 
-/* The same members as posted, but those that can be long. */
+/* Adds the members as posted, but those that can be long. */
 static void add_essence(cJSON *document, const struct scan_facts *facts)
 {
 	const int size[2] = {facts->columns, facts->rows};

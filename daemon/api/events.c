@@ -67,7 +67,7 @@ static void watcher_free(void *state)
 	free(watcher);
 }
 
-/* On a grid of seconds, so that all watchers together wake the daemon once. */
+/* Heartbeats lie on whole seconds, so that all watchers together wake the daemon once. */
 static double next_heartbeat(void)
 {
 	return floor(clock_monotonic()) + heartbeat_every;

@@ -211,7 +211,7 @@ static const struct plane {
 	bool down;
 } planes[] = {{"z", "z plane", 2, 0, 1, true}, {"x", "x plane", 0, 1, 2, false}, {"y", "y plane", 1, 0, 2, false}};
 
-/* By the patient's axes where they are known. */
+/* Names the plane by the patient's axes where they are known. */
 static const char *plane_name(const struct shown *shown, const struct plane *plane)
 {
 	char letters[PATIENT_LETTERS_MAX];

@@ -10,7 +10,7 @@
  * a connection begins and ends, and whether two readers could disagree about
  * it. A pure function of the connection's bytes; one thread.
  *
- * What is taken has no reading but one: line ends are CRLF, names of fields end
+ * A request that is accepted has one reading only: line ends are CRLF, names of fields end
  * at their colon, there is one Host, and one statement about the body's length.
  */
 enum {

@@ -35,7 +35,7 @@
 #include <string.h>
 #include <sys/resource.h>
 
-/* In place of the request whose head was refused. */
+/* Stands in place of the request whose head was refused. */
 static const char substitute[] = "GET /refused HTTP/1.1\r\nHost: refused\r\nConnection: close\r\n\r\n";
 
 /*
@@ -215,7 +215,7 @@ static ssize_t gate_read(struct gate *gate, int descriptor, char *to, size_t siz
 	return done > 0 ? (ssize_t)done : got;
 }
 
-/* In place of the C library's, of which recvfrom is the general form. */
+/* Replaces the C library's recv, of which recvfrom is the general form. */
 ssize_t recv(int descriptor, void *to, size_t size, int flags)
 {
 	struct connection *connection = flags == 0 && size > 0 ? gate_find(descriptor) : NULL;

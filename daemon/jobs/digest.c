@@ -68,7 +68,7 @@ static int find_voxels(int file, const char *path, const struct volume_record *v
 	else
 		code = 0;
 	voxels.end = voxels.seal.count > 0 ? voxels.seal.content : voxels.start + volume->bytes;
-	/* From a version that wrote no checksums, or they are damaged. */
+	/* The file is of a version that wrote no checksums, or they are damaged. */
 	if (code == 0 && voxels.seal.count == 0 && (size_t)status.st_size != voxels.end)
 		code = error_set(err, ERR_DAMAGED, "the volume %s is damaged on the disk: its checksums are gone",
 				 volume->name);

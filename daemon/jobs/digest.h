@@ -8,12 +8,13 @@
  * and its job ends without it. Threads that give way to all others read each
  * file once it is on the disk, most often from the page cache.
  *
- * What fails is tried again, at longer and longer intervals; what is not done at the
- * stop is done after the next start.
+ * A digest that fails is tried again, at longer and longer intervals; one that is not
+ * made before the stop is made after the next start.
  */
 struct digester;
 
-/* Begins with what the catalogue has without a digest: of those jobs only whose volumes are on the disk. */
+/* Starts the threads with the volumes that the catalogue has without a digest, of jobs whose volumes are on the disk.
+ */
 int digester_start(struct jobs *jobs, int threads, struct digester **ret_digester, struct error *err);
 void digester_stop(struct digester *digester); /* NULL is fine */
 

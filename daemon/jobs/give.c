@@ -104,7 +104,7 @@ static void begin(struct supervise *supervise, struct worker *worker, struct job
 	worker_publish(supervise, worker);
 }
 
-/* To running with all that is there, or, `arriving`, to attend it while the rest comes. */
+/* Sets the job running with all projections, or, `arriving`, has it attended while the rest comes. */
 static int begin_job(struct supervise *supervise, struct worker *worker, struct job *job,
 		     const struct job_record *record, struct message *message, struct stored_scan *scan,
 		     const struct scan_facts *facts, bool arriving, struct error *err)

@@ -567,7 +567,7 @@ int job_queue_position(struct job *job)
 	return position;
 }
 
-/* From the time between history rows; before the first one, from the share of the whole that is done. */
+/* Estimates from the time between history rows; before the first one, from the share of the whole that is done. */
 double job_eta(struct job *job)
 {
 	double now = clock_monotonic(), eta = -1;

@@ -76,7 +76,7 @@ int jobs_list(struct jobs *jobs, const char *after, int limit, struct job **ret_
  * removed with its rows and files. *ret_removed says which it was.
  */
 int jobs_delete(struct jobs *jobs, struct job *job, bool *ret_removed, struct error *err);
-/* With its files. ERR_CONFLICT, naming the job, while one that has not ended uses the scan. */
+/* Deletes a scan with its files. ERR_CONFLICT, naming the job, while one that has not ended uses the scan. */
 int jobs_delete_scan(struct jobs *jobs, struct stored_scan *scan, struct error *err);
 
 /* Woken at each change of state and each new event of this job, or of any; not at mere progress. See watch.h. */
@@ -97,8 +97,8 @@ struct job_facts {
 void job_facts(struct job *job, struct job_facts *ret);
 
 /*
- * What was asked for, resolved: as it was posted, or read from the catalogue when the daemon started. Lives as long
- * as the reference. What reading it gave, ERR_INVALID or another, where the stored one cannot be read.
+ * Gives the resolved request: as it was posted, or read from the catalogue when the daemon started. It lives as long
+ * as the reference. The error of reading it, ERR_INVALID or another, where the stored one cannot be read.
  */
 int job_request(const struct job *job, const struct job_request **ret_request, struct error *err);
 /* The record as it is now; request and key point into the job and live as long as the reference. */

@@ -5,8 +5,8 @@
 #include "daemon/jobs/workers.h"
 
 /*
- * All that may come free until the job's turn; the worker looks again when it begins. What does not fit on a card goes
- * through it in parts and lies in the host's memory.
+ * The memory that may come free until the job's turn; the worker looks again when it begins. A job that does not fit on
+ * a card runs out of core, with its volumes in the host's memory.
  */
 static size_t memory_available(const struct worker_facts *facts)
 {

@@ -21,7 +21,7 @@ static const struct row {
     {1 << END_SYNC, 0, 0, {.to = BACK, .distrust = true}},
     /* The next start carries out a cancel that was asked for. */
     {1 << END_STOPPED, 0, 0, {.to = BACK, .from = FROM_BEGINNING, .reason = "the daemon stops"}},
-    /* Also where a client asked for its end meanwhile: the result is there. */
+    /* A job that a client has cancelled meanwhile succeeds too: the result is there. */
     {1 << END_DONE, 0, CONDITION_UNRECORDED | CONDITION_STALE, {.to = JOB_SUCCEEDED, .reason = ""}},
     {ANY, CONDITION_CANCELLED, 0, {.to = JOB_CANCELLED, .reason = ""}},
     /* A result that could not be recorded is lost, even where the worker was done before it heard of that. */
@@ -30,7 +30,7 @@ static const struct row {
      0,
      {.to = BACK, .from = FROM_BEGINNING, .obstacle = JOB_NO_SPACE, .words = WORDS_DAEMON}},
     {ANY, CONDITION_UNRECORDED, 0, {.to = JOB_FAILED, .words = WORDS_DAEMON}},
-    /* Also when the run is stale: the job that begins again sees that its basis differs, and leaves the checkpoint. */
+    /* A stale run comes back too: the job that begins again sees that its basis differs, and leaves the checkpoint. */
     {1 << END_MADE_ROOM, 0, 0, {.to = BACK, .from = FROM_SAID, .yielded = true, .reason = "it made room"}},
     /* Whatever the worker says of it, and if it dies over it: that is no fault of the job's. */
     {ANY, CONDITION_STALE, 0, {.to = BACK, .reason = "its scan is understood otherwise now"}},

@@ -139,6 +139,6 @@ void child_reap(struct child *child, char *ret_how, size_t size)
 
 void child_kill(const struct child *child)
 {
-	/* Not collected yet, so the number is still its own. */
+	/* The child has not been waited for yet, so the number is still its own. */
 	kill(child->pid, SIGKILL);
 }

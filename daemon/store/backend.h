@@ -8,7 +8,7 @@
 #include "core/error.h"
 
 /*
- * What a database must do to hold the catalogue: a file daemon/store/NAME.c that exports one struct catalogue_backend,
+ * A database that is to hold the catalogue is a file daemon/store/NAME.c that exports one struct catalogue_backend,
  * and a row in catalogue_backends[] (store/catalogue.c). The statements come from store/tables.c and
  * store/catalogue.c.
  *
@@ -39,7 +39,7 @@ struct dialect {
 	const char *clustered;                     /* behind a table that is kept in the order of its primary key */
 };
 
-/* Where the catalogue is, and whom to tell; lives longer than the database that was opened with it. */
+/* The catalogue's place and its hooks; they live longer than the database that was opened with them. */
 struct catalogue_site {
 	char directory[900];
 	void *context;

@@ -389,7 +389,7 @@ static int import_row(struct catalogue *catalogue, enum table_id table, enum sta
 	code = count < 0 ? count
 			 : catalogue_write(catalogue, catalogue->statements[table][statement], row.values, count, err);
 	row_clear(&row);
-	/* It breaks a rule of the table: a number or key that another row has. */
+	/* The row breaks a rule of its table: another row has this number or key. */
 	if (code == ERR_INTERNAL)
 		code = error_set(err, ERR_INVALID, "its row of %s does not fit beside the others", tables[table].name);
 	return code;

@@ -129,7 +129,7 @@ int store_job_delete(struct store *store, const char *id, struct error *err)
 	if (code == 0)
 		code = catalogue_remove(store->catalogue, RECORD_JOB, id, err);
 	code = store_end(store, code, err);
-	/* From its note on it is deleted: on a full disk the row goes at the next start. */
+	/* The job counts as deleted from its note on: on a full disk the row goes at the next start. */
 	return code == ERR_NO_SPACE ? 0 : code;
 }
 

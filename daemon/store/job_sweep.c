@@ -154,7 +154,8 @@ int store_sweep_jobs(struct store *store, struct error *err)
 	char path[1024];
 	int code;
 
-	/* Of one moment, which saves a start with many jobs much time: each job's rows are read before they change. */
+	/* All rows are read as of one moment, which saves a start with many jobs much time: none changes before it is
+	 * read. */
 	code = catalogue_freeze(store->catalogue, err);
 	if (code != 0)
 		return code;

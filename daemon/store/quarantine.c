@@ -22,7 +22,7 @@ static void entry_path(const char *state, const char *name, const char *extensio
 	snprintf(ret_path, 1200, "%s/quarantine/%s%s", state, name, extension);
 }
 
-/* From the path and the time; another one where that is taken. */
+/* Makes a name from the path and the time; another one where that is in use. */
 static void choose_name(const char *state, const char *path, double now, char ret_name[QUARANTINE_NAME_MAX])
 {
 	char entry[1200], note[1200];

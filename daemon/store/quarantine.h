@@ -26,7 +26,7 @@ struct quarantined {
 	double time;                    /* seconds since 1970, 0: not known */
 	char why[QUARANTINE_WHY_MAX];
 };
-/* All entries by their names; free the array. Reads the directory anew. */
+/* Reads the directory: all entries by their names; free the array. */
 int quarantine_list(const char *state, struct quarantined **ret_entries, int *ret_count, struct error *err);
 
 #endif

@@ -118,7 +118,7 @@ int store_scan_repeat(struct store *store, const struct store_key *key, struct s
 		      struct error *err);
 /* ERR_NOT_FOUND. Reads scan.json when the scan has not been used for a while; otherwise memory only. */
 int store_scan_find(struct store *store, const char *id, struct stored_scan **ret_scan, struct error *err);
-/* The same whatever state its files are in: for its removal. It may have no parsed form. */
+/* Finds a scan whatever state its files are in: for its removal. It may have no parsed form. */
 int store_scan_refer(struct store *store, const char *id, struct stored_scan **ret_scan, struct error *err);
 void stored_scan_release(struct stored_scan *scan); /* NULL is fine */
 
@@ -186,7 +186,7 @@ void stored_scan_lost(struct stored_scan *scan, unsigned char *ret_flags);
 /*
  * ---- damage ----
  *
- * What is read of a scan directory is held against projections.sums. A projection that does not fit is lost: missing as
+ * Every read of a scan directory is held against projections.sums. A projection that does not fit is lost: missing as
  * if it had never come, though it may be sent again also to a scan that was closed with it. An image that does not fit
  * keeps its scan from being used until it is sent again. A document that does not fit cannot be had again: who finds
  * the scan gets ERR_DAMAGED.
@@ -345,7 +345,7 @@ int store_job_insert(struct store *store, const struct job_record *job, const st
  * with PAST_GOES all history, volumes, warnings and events, but for its states.
  */
 enum job_past { PAST_STAYS, PAST_REWINDS, PAST_GOES };
-/* All columns that can change. `end`, when not NULL, is a second event. */
+/* Writes all columns that can change. `end`, when not NULL, is a second event. */
 int store_job_update(struct store *store, const struct job_record *job, const struct event *event,
 		     const struct event *end, enum job_past past, struct error *err);
 /* Removes the rows; then the files may go. Of the events only that it was removed stays, for those who watch all jobs.
@@ -388,7 +388,7 @@ int store_job_remove_volume(struct store *store, const char *id, const char *nam
 int store_job_add_warning(struct store *store, const char *id, const struct warning_record *warning,
 			  const struct event *event, bool *ret_new, struct error *err);
 
-/* All jobs, oldest first; free the array with job_records_free. */
+/* Reads all jobs, oldest first; free the array with job_records_free. */
 int store_job_load(struct store *store, struct job_record **ret_jobs, int *ret_count, struct error *err);
 void job_record_clear(struct job_record *job);
 void job_records_free(struct job_record *jobs, int count);

@@ -243,7 +243,7 @@ static void note_checked(struct stored_scan *scan, int index, const struct sum *
 	pthread_mutex_unlock(&scan->lock);
 	if (!mine || stored_scan_open_records(scan, &whole, &file, &err) != 0)
 		return;
-	/* Not synced: it would be made again. */
+	/* The record is not synced: a lost one is made again. */
 	if (sums_put(file, index, &sum, &err) != 0)
 		log_line(LEVEL_WARNING, "scan %s: %s", scan->id, err.text);
 	close(file);

@@ -1,8 +1,8 @@
 /*
  * Kept volumes against the checksums at the end of their files (proto/seal.h), before anybody gets to see them.
  *
- * What was found whole is remembered by what the file system says of the file, for a while: whoever writes to it
- * changes that, and what a disk does by itself is found after the while at the latest.
+ * A file that was found whole is remembered for a while by its size and times: whoever writes to it changes them, and
+ * damage that a disk does by itself is found after that while at the latest.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -201,7 +201,7 @@ static int check_digest(int file, const struct stat *status, const struct volume
 		code = damaged(err, volume, "its header");
 		goto out;
 	}
-	/* From a version that wrote no checksums, and not yet hashed: nobody can know better. */
+	/* The file is of a version that wrote no checksums, and not yet hashed: it cannot be checked. */
 	if (!volume->hashed && (uint64_t)status->st_size == start + volume->bytes)
 		goto out;
 	for (size_t at = 0; at < volume->bytes && code == 0; at += BLOCK) {

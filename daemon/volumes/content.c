@@ -77,7 +77,7 @@ static int read_file(const struct content *content, uint64_t offset, void *to, s
 	return 0;
 }
 
-/* From what the file itself says of its origin: the scan may be gone. */
+/* The origin is what the file itself says: the scan may be gone. */
 static int make_header(struct content *content, const char *path, struct error *err)
 {
 	const struct content_options *options = &content->options;

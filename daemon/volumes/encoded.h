@@ -8,7 +8,7 @@
 /*
  * Volumes as they are streamed: length and digest known before the first byte
  * goes out, made once for all who want the same, by a few threads of their own.
- * What is not the kept file itself is an unlinked file in the job's directory:
+ * An encoded copy is an unlinked file in the job's directory, unless it is the kept file itself:
  * neither fast nor slow readers cost memory. The last few stay for readers that
  * are behind. Any thread.
  */

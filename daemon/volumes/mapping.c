@@ -107,7 +107,7 @@ out:
 	return code;
 }
 
-/* With the lock held; it comes to the front. */
+/* Finds the mapping and moves it to the front; the lock is held. */
 static struct mapping *find(struct mappings *mappings, const struct stat *status, size_t bytes)
 {
 	for (struct mapping **at = &mappings->first; *at != NULL; at = &(*at)->next) {
