@@ -69,8 +69,9 @@ struct slab {
 	struct volume *volume;
 };
 
-/* Two stacks of a batch, one being filled while the other is in use, and one of filtered views. */
-struct feed {
+/* Stacks on the device for batches of views: two in turn, one filled while the other is in use, and one of filtered
+ * views. */
+struct transfer {
 	struct stack *in[2], *filtered;
 };
 
@@ -97,8 +98,8 @@ void outofcore_plan_free(struct plan *plan);
 int outofcore_halo(const struct plan_options *options, enum purpose purpose);
 int slab_open(struct plan *plan, enum purpose purpose, int first, struct slab *ret_slab, struct error *err);
 void slab_close(struct plan *plan, struct slab *slab); /* a closed one is fine */
-int feed_open(struct plan *plan, enum purpose purpose, struct feed *ret_feed, struct error *err);
-void feed_close(struct plan *plan, struct feed *feed);
+int transfer_open(struct plan *plan, enum purpose purpose, struct transfer *ret_transfer, struct error *err);
+void transfer_close(struct plan *plan, struct transfer *transfer);
 
 /* ---- project.c ---- */
 int outofcore_project(struct plan *plan, const struct volume *from, const int *views, int count, struct stack *to,

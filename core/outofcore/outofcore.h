@@ -1,5 +1,5 @@
-#ifndef CBCT_CORE_PARTS_H
-#define CBCT_CORE_PARTS_H
+#ifndef CBCT_CORE_OUTOFCORE_H
+#define CBCT_CORE_OUTOFCORE_H
 
 #include "core/backend.h"
 

@@ -150,15 +150,17 @@ static int slab_walk(struct plan *plan, enum purpose purpose, struct below *belo
 	return code < 0 ? code : below_volume(below, &slab->grid, &slab->volume, err);
 }
 
-static int feed_walk(struct plan *plan, enum purpose purpose, struct below *below, struct feed *feed, struct error *err)
+static int transfer_walk(struct plan *plan, enum purpose purpose, struct below *below, struct transfer *transfer,
+			 struct error *err)
 {
 	const int columns = plan->options.geometry->columns, rows = plan->options.geometry->rows;
 	int code = 0;
 
 	for (int i = 0; i < 2 && code == 0; i++)
-		code = below_stack(below, columns, rows, plan->batch, &feed->in[i], err);
+		code = below_stack(below, columns, rows, plan->batch, &transfer->in[i], err);
 	if (code == 0 && purpose == FOR_FDK)
-		code = below_stack(below, columns_of(&plan->options, purpose), rows, plan->batch, &feed->filtered, err);
+		code = below_stack(below, columns_of(&plan->options, purpose), rows, plan->batch, &transfer->filtered,
+				   err);
 	return code;
 }
 
@@ -183,14 +185,14 @@ static int slab_bytes(struct plan *plan, enum purpose purpose, int slices, size_
 	const int thick = slices + 2 * outofcore_halo(&plan->options, purpose);
 	struct below below = below_of(plan, true);
 	struct slab slab = {.grid = grid_of_slices(plan->options.grid, 0, thick < most ? thick : most)};
-	struct feed feed;
+	struct transfer transfer;
 	int code = slab_walk(plan, purpose, &below, &slab, err);
 
 	/* The slab before is still on its way back. */
 	if (code == 0 && purpose == FOR_FDK)
 		code = below_volume(&below, &slab.grid, &slab.volume, err);
 	if (code == 0 && purpose != FOR_TV)
-		code = feed_walk(plan, purpose, &below, &feed, err);
+		code = transfer_walk(plan, purpose, &below, &transfer, err);
 	*ret_volumes = below.volumes;
 	*ret_total = below.volumes + below.rest;
 	return code;
@@ -411,24 +413,24 @@ void slab_close(struct plan *plan, struct slab *slab)
 	slab->volume = NULL;
 }
 
-int feed_open(struct plan *plan, enum purpose purpose, struct feed *ret_feed, struct error *err)
+int transfer_open(struct plan *plan, enum purpose purpose, struct transfer *ret_transfer, struct error *err)
 {
 	struct below below = below_of(plan, false);
 	int code;
 
-	*ret_feed = (struct feed){{NULL}, NULL};
-	code = feed_walk(plan, purpose, &below, ret_feed, err);
+	*ret_transfer = (struct transfer){{NULL}, NULL};
+	code = transfer_walk(plan, purpose, &below, ret_transfer, err);
 	if (code < 0)
-		feed_close(plan, ret_feed);
+		transfer_close(plan, ret_transfer);
 	return code;
 }
 
-void feed_close(struct plan *plan, struct feed *feed)
+void transfer_close(struct plan *plan, struct transfer *transfer)
 {
 	const struct backend *backend = plan->device->backend;
 
-	backend->stack_free(feed->in[0]);
-	backend->stack_free(feed->in[1]);
-	backend->stack_free(feed->filtered);
-	*feed = (struct feed){{NULL}, NULL};
+	backend->stack_free(transfer->in[0]);
+	backend->stack_free(transfer->in[1]);
+	backend->stack_free(transfer->filtered);
+	*transfer = (struct transfer){{NULL}, NULL};
 }

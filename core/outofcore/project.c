@@ -20,25 +20,25 @@ static int at_most(int count, int most)
 }
 
 /* Slots first .. first + count - 1 into a stack on the device; *ret_there is the one that has them. */
-static int feed_batch(struct plan *plan, const struct slab *slab, struct feed *feed, int half, const struct stack *from,
-		      int first, int count, struct stack **ret_there, struct error *err)
+static int upload_batch(struct plan *plan, const struct slab *slab, struct transfer *transfer, int half,
+			const struct stack *from, int first, int count, struct stack **ret_there, struct error *err)
 {
 	const struct backend *backend = plan->device->backend;
-	struct stack *in = feed->in[half];
+	struct stack *in = transfer->in[half];
 	int code = 0;
 
-	if (from->by == NULL && feed->filtered != NULL)
-		in = feed->filtered;
+	if (from->by == NULL && transfer->filtered != NULL)
+		in = transfer->filtered;
 	*ret_there = in;
 	if (from->by == NULL)
 		return backend->stack_upload(in, 0, count, from->data + from->pixels * (size_t)first, err);
 	for (int i = 0; i < count && code == 0; i++)
 		code = backend->stack_upload(
 		    in, i, 1, from->source->data + from->source->pixels * (size_t)from->from[first + i], err);
-	*ret_there = feed->filtered;
-	return code < 0
-		   ? code
-		   : backend->filter(slab->plan, in, plan->identity, from->views + first, count, feed->filtered, err);
+	*ret_there = transfer->filtered;
+	return code < 0 ? code
+			: backend->filter(slab->plan, in, plan->identity, from->views + first, count,
+					  transfer->filtered, err);
 }
 
 /* Slices of a slab on the device that have not come back yet. */
@@ -70,7 +70,7 @@ static int drain_all(struct plan *plan, struct drain *drain, struct volume *to, 
 }
 
 /* All batches into one slab, the one before it coming back meanwhile. */
-static int fill_slab(struct plan *plan, struct slab *slab, struct feed *feed, const struct stack *from,
+static int fill_slab(struct plan *plan, struct slab *slab, struct transfer *transfer, const struct stack *from,
 		     const int *views, int count, enum backprojection weight, struct drain *drain, struct volume *to,
 		     struct error *err)
 {
@@ -85,7 +85,7 @@ static int fill_slab(struct plan *plan, struct slab *slab, struct feed *feed, co
 		int first = b * plan->batch, now = at_most(plan->batch, count - first);
 		struct stack *there;
 
-		code = feed_batch(plan, slab, feed, b % 2, from, first, now, &there, err);
+		code = upload_batch(plan, slab, transfer, b % 2, from, first, now, &there, err);
 		if (code == 0)
 			code = backend->backproject(slab->plan, there, views + first, now, weight, slab->volume, err);
 		if (code == 0)
@@ -100,19 +100,19 @@ int outofcore_backproject(struct plan *plan, const struct stack *from, const int
 	const struct backend *backend = plan->device->backend;
 	enum purpose purpose = weight == BACKPROJECT_FDK ? FOR_FDK : FOR_SUMS;
 	struct drain drain = {.done = 0};
-	struct feed feed;
+	struct transfer transfer;
 	int code;
 
 	if (plan->slices[purpose] == 0)
 		return error_set(err, ERR_INTERNAL, "the plan was made without this backprojection");
-	code = feed_open(plan, purpose, &feed, err);
+	code = transfer_open(plan, purpose, &transfer, err);
 	for (int z = 0; z < to->size[2] && code == 0; z += plan->slices[purpose]) {
 		struct slab slab;
 
 		code = slab_open(plan, purpose, z, &slab, err);
 		if (code < 0)
 			break;
-		code = fill_slab(plan, &slab, &feed, from, views, count, weight, &drain, to, err);
+		code = fill_slab(plan, &slab, &transfer, from, views, count, weight, &drain, to, err);
 		if (code == 0)
 			code = drain_all(plan, &drain, to, err);
 		backend->plan_free(slab.plan);
@@ -128,7 +128,7 @@ int outofcore_backproject(struct plan *plan, const struct stack *from, const int
 	if (code == 0)
 		code = drain_all(plan, &drain, to, err);
 	slab_close(plan, &drain.slab);
-	feed_close(plan, &feed);
+	transfer_close(plan, &transfer);
 	to->is_zero = false;
 	return code;
 }
@@ -155,7 +155,7 @@ static int collect(struct plan *plan, const struct slab *slab, struct stack *in,
 	return code;
 }
 
-static int project_slab(struct plan *plan, struct slab *slab, struct feed *feed, const struct volume *from,
+static int project_slab(struct plan *plan, struct slab *slab, struct transfer *transfer, const struct volume *from,
 			const int *views, int count, struct stack *to, struct error *err)
 {
 	const struct backend *backend = plan->device->backend;
@@ -165,11 +165,12 @@ static int project_slab(struct plan *plan, struct slab *slab, struct feed *feed,
 	for (int first = 0, b = 0; first < count && code == 0; first += plan->batch, b++) {
 		int now = at_most(plan->batch, count - first);
 
-		code = backend->project(slab->plan, slab->volume, views + first, now, feed->in[b % 2], err);
+		code = backend->project(slab->plan, slab->volume, views + first, now, transfer->in[b % 2], err);
 		if (code == 0 && b > 0)
-			code = collect(plan, slab, feed->in[(b - 1) % 2], first - plan->batch, plan->batch, to, err);
+			code =
+			    collect(plan, slab, transfer->in[(b - 1) % 2], first - plan->batch, plan->batch, to, err);
 		if (code == 0 && first + now == count)
-			code = collect(plan, slab, feed->in[b % 2], first, now, to, err);
+			code = collect(plan, slab, transfer->in[b % 2], first, now, to, err);
 	}
 	return code;
 }
@@ -177,23 +178,23 @@ static int project_slab(struct plan *plan, struct slab *slab, struct feed *feed,
 int outofcore_project(struct plan *plan, const struct volume *from, const int *views, int count, struct stack *to,
 		      struct error *err)
 {
-	struct feed feed;
+	struct transfer transfer;
 	int code;
 
 	if (plan->slices[FOR_SUMS] == 0)
 		return error_set(err, ERR_INTERNAL, "the plan was made without forward projection");
 	to->by = NULL;
-	code = feed_open(plan, FOR_SUMS, &feed, err);
+	code = transfer_open(plan, FOR_SUMS, &transfer, err);
 	for (int z = 0; z < from->size[2] && code == 0; z += plan->slices[FOR_SUMS]) {
 		struct slab slab;
 
 		code = slab_open(plan, FOR_SUMS, z, &slab, err);
 		if (code < 0)
 			break;
-		code = project_slab(plan, &slab, &feed, from, views, count, to, err);
+		code = project_slab(plan, &slab, &transfer, from, views, count, to, err);
 		slab_close(plan, &slab);
 	}
-	feed_close(plan, &feed);
+	transfer_close(plan, &transfer);
 	return code;
 }
 
@@ -202,7 +203,7 @@ int outofcore_project(struct plan *plan, const struct volume *from, const int *v
 int outofcore_stack_download(struct stack *stack, int slot, int count, float *ret_to, struct error *err)
 {
 	struct plan *plan = stack->by;
-	struct feed feed;
+	struct transfer transfer;
 	struct slab slab;
 	int code;
 
@@ -213,7 +214,7 @@ int outofcore_stack_download(struct stack *stack, int slot, int count, float *re
 		       stack->pixels * (size_t)count * sizeof(float));
 		return 0;
 	}
-	code = feed_open(plan, FOR_FDK, &feed, err);
+	code = transfer_open(plan, FOR_FDK, &transfer, err);
 	if (code < 0)
 		return code;
 	code = slab_open(plan, FOR_FDK, 0, &slab, err);
@@ -221,12 +222,12 @@ int outofcore_stack_download(struct stack *stack, int slot, int count, float *re
 		int now = at_most(plan->batch, count - done);
 		struct stack *there;
 
-		code = feed_batch(plan, &slab, &feed, 0, stack, slot + done, now, &there, err);
+		code = upload_batch(plan, &slab, &transfer, 0, stack, slot + done, now, &there, err);
 		if (code == 0)
 			code = plan->device->backend->stack_download(there, 0, now,
 								     ret_to + stack->pixels * (size_t)done, err);
 	}
 	slab_close(plan, &slab);
-	feed_close(plan, &feed);
+	transfer_close(plan, &transfer);
 	return code;
 }

@@ -128,8 +128,8 @@ static bool is_covered(const struct plan *plan, const struct slab *slab, const i
 }
 
 /* Corrections, or ones, of all views of a subset into the slab's zeros. */
-static int backproject_slab(struct plan *plan, struct slab *slab, struct feed *feed, bool ones, const int *views,
-			    int count, struct error *err)
+static int backproject_slab(struct plan *plan, struct slab *slab, struct transfer *transfer, bool ones,
+			    const int *views, int count, struct error *err)
 {
 	const struct backend *backend = plan->device->backend;
 	const struct stack *correction = &plan->correction;
@@ -138,13 +138,13 @@ static int backproject_slab(struct plan *plan, struct slab *slab, struct feed *f
 	if (ones) {
 		for (size_t i = 0; i < correction->pixels * (size_t)plan->batch; i++)
 			plan->partial[i] = 1;
-		code = backend->stack_upload(feed->in[0], 0, plan->batch, plan->partial, err);
+		code = backend->stack_upload(transfer->in[0], 0, plan->batch, plan->partial, err);
 		if (code == 0)
 			code = backend->volume_fill(slab->volume, 0, err);
 	}
 	for (int first = 0, b = 0; first < count && code == 0; first += plan->batch, b++) {
 		int now = count - first < plan->batch ? count - first : plan->batch;
-		struct stack *in = feed->in[ones ? 0 : b % 2];
+		struct stack *in = transfer->in[ones ? 0 : b % 2];
 
 		if (!ones)
 			code = backend->stack_upload(in, 0, now, correction->data + correction->pixels * (size_t)first,
@@ -185,12 +185,12 @@ static void update(const struct plan *plan, float *volume, const float *sums, co
 		}
 }
 
-static int update_slab(struct plan *plan, struct slab *slab, struct feed *feed, const int *views, int count,
+static int update_slab(struct plan *plan, struct slab *slab, struct transfer *transfer, const int *views, int count,
 		       struct volume *volume, struct error *err)
 {
 	float *here = volume->data + volume->slice * (size_t)slab->first;
 	float *coverage = plan->sums + volume->slice * (size_t)slab->count;
-	int code = backproject_slab(plan, slab, feed, false, views, count, err);
+	int code = backproject_slab(plan, slab, transfer, false, views, count, err);
 
 	if (code == 0)
 		code = bring_back(plan, slab, plan->sums, err);
@@ -200,7 +200,7 @@ static int update_slab(struct plan *plan, struct slab *slab, struct feed *feed, 
 		update(plan, here, plan->sums, NULL, count, volume->slice, slab->count);
 		return 0;
 	}
-	code = backproject_slab(plan, slab, feed, true, views, count, err);
+	code = backproject_slab(plan, slab, transfer, true, views, count, err);
 	if (code == 0)
 		code = bring_back(plan, slab, coverage, err);
 	if (code == 0)
@@ -210,8 +210,8 @@ static int update_slab(struct plan *plan, struct slab *slab, struct feed *feed, 
 
 static int update_volume(struct plan *plan, const int *views, int count, struct volume *volume, struct error *err)
 {
-	struct feed feed;
-	int code = feed_open(plan, FOR_SUMS, &feed, err);
+	struct transfer transfer;
+	int code = transfer_open(plan, FOR_SUMS, &transfer, err);
 
 	for (int z = 0; z < volume->size[2] && code == 0; z += plan->slices[FOR_SUMS]) {
 		struct slab slab;
@@ -219,10 +219,10 @@ static int update_volume(struct plan *plan, const int *views, int count, struct 
 		code = slab_open(plan, FOR_SUMS, z, &slab, err);
 		if (code < 0)
 			break;
-		code = update_slab(plan, &slab, &feed, views, count, volume, err);
+		code = update_slab(plan, &slab, &transfer, views, count, volume, err);
 		slab_close(plan, &slab);
 	}
-	feed_close(plan, &feed);
+	transfer_close(plan, &transfer);
 	volume->is_zero = false;
 	return code;
 }
