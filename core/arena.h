@@ -22,7 +22,7 @@ extern "C" {
  *	arena = (struct arena){.base = allocate(arena.used)};
  *	walk(object, &arena);                     the object's pointers are set
  *
- * So what is said beforehand and what is taken come from the same lines, and the base is all that is freed. A
+ * So the estimate and the allocation come from the same lines, and the base is all that is freed. A
  * walk must take the same pieces both times. The memory is as it was allocated: nothing is cleared here. The
  * base may lie on a device.
  */

@@ -57,7 +57,7 @@ struct defect_counts {
 	size_t saturated;
 	size_t zero; /* nothing above the dark */
 	int blank;   /* views without one good pixel: all of their slot is 0, and says nothing */
-	int no_air;  /* views whose air region has no good pixel: taken against the flat as they are */
+	int no_air;  /* views whose air region has no good pixel: divided by the flat as they are */
 	/* The least and the most of the air regions' means so far; both 0 before the first. */
 	float air_least, air_most;
 };

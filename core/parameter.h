@@ -46,7 +46,7 @@ struct parameter {
 	enum parameter_preset presets;
 	double preset;
 	const char *word;   /* may stand in place of the number, "views", "auto"; or NULL */
-	size_t word_offset; /* bool in the record that tells that it does; 0: the int itself is PARAMETER_WORD */
+	size_t word_offset; /* bool in the record, true where it does; 0: the int itself is PARAMETER_WORD */
 	bool (*counts)(const void *record); /* false: no effect, neither checked nor printed; NULL: it always counts */
 	const char *unit;                   /* "mm"; NULL: none */
 	const char *help;                   /* one plain sentence, or the part of one that a list of options shows */

@@ -6,7 +6,7 @@
  * the ramp: the filter would take the cut for the object's edge and put a bright
  * rim and cups of hundreds of HU into the field of view.
  *
- * The object beyond an edge is taken for an ellipse (Hsieh et al. 2004 with the
+ * The object beyond an edge is modelled as an ellipse (Hsieh et al. 2004 with the
  * curvature from the row itself in place of water's): the square of its line
  * integrals is a parabola,
  *
@@ -25,10 +25,10 @@
  * Rows that are cut inside of a skull, or of another shell of bone, are no such
  * parabola: p rises towards the edge, b would be above 0, and an extension that is
  * level there and ends as the row's curvature says is five times as wide as the
- * bone, which lowers all of the field of view by 100 HU. There the object is taken
- * for a body in a thin shell with the same outline, xl .. xr: chords through the
- * body are as sqrt(q), those through the shell as 1/sqrt(q) (its thickness over the
- * cosine to its normal),
+ * bone, which lowers all of the field of view by 100 HU. There the object is
+ * modelled as a body in a thin shell with the same outline, xl .. xr: chords through
+ * the body are as sqrt(q), those through the shell as 1/sqrt(q) (its thickness over
+ * the cosine to its normal),
  *
  *   p(x) = A sqrt(q) + B / sqrt(q),   q = (x - xl) (xr - x),
  *
@@ -47,7 +47,7 @@
  *   not its end the line through the outermost columns is not air where it leaves the
  *               detector: an object that ends within an edge of many columns is whole;
  *   not chance  three times the deviation that noise gives to that mean, noise as
- *               the second differences of the columns beside the edge tell it.
+ *               estimated from the second differences of the columns beside the edge.
  *
  * So an object of any p is extended alike: an abdomen whose largest p is 4, or
  * 0.0004, is right by 6 HU, by 169 without. Nothing but the view has a part in it,

@@ -86,7 +86,7 @@ struct correction {
 
 	/* Whether the job has it; NULL: every job. */
 	bool (*wanted)(const struct recipe *recipe, const struct linearise *linearise);
-	/* Refuses what cannot be, before anything is taken; the geometry is upright, and so is linearise. */
+	/* Refuses input that cannot be corrected, before a view is read; geometry and linearise are upright. */
 	int (*check)(const struct linearise *linearise, const struct geometry *geometry, struct error *err);
 	/* Slots of the stack that it works in; NULL: none. */
 	int (*slots)(const struct geometry *geometry);

@@ -6,7 +6,7 @@
  *     least half of it; of both those that have half of the highest value near them, so that an
  *     object keeps its width and is whole where it comes near the threshold; and a quarter
  *     of the highest value further away, where streaks are as bright as faint metal.
- *  2. Its projection, a pixel wider all around, gives its traces; samples without
+ *  2. Its projection, wider by a pixel on all sides, gives its traces; samples without
  *     counts that touch a trace belong to it.
  *  3. Each trace is interpolated linearly along the row and along the column (after
  *     Kalender, Hebel and Ebersberger, Radiology 164, 1987, who have the row only), the
@@ -167,9 +167,9 @@ int metal_hide(struct metal *metal, const struct metal_tools *tools, struct volu
 
 /* ---- its traces ---- */
 
-/* Way through the mask that makes a shadow, in voxels: less lies within the pixels that are added all around. */
+/* Way through the mask that makes a shadow, in voxels: less lies within the pixels that are added on all sides. */
 static const double SHADOW_LEAST = 0.5;
-/* Pixels that are added all around: what half a voxel covers, or one. */
+/* Pixels that are added on all sides: what half a voxel covers, or one. */
 static int trace_margin(const struct metal_tools *tools)
 {
 	const double *mm = tools->grid->spacing, voxel = fmin(fmin(mm[0], mm[1]), mm[2]);
@@ -346,7 +346,7 @@ static double line_between(const struct flank *before, const struct flank *behin
 
 /*
  * Without a prior a column may lead from the object to the air beyond its end,
- * and nothing tells where between them the object ends: such a column counts the less, the less its ends agree.
+ * and nothing shows where between them the object ends: such a column counts the less, the less its ends agree.
  */
 static double evenness(const struct flank *before, const struct flank *behind)
 {

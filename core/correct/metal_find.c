@@ -38,7 +38,7 @@ static double voxels_along(const struct metal_tools *tools, int axis, double wid
 	return fmin(widths * blur / spacing, REACH_MOST);
 }
 
-/* Slices of the volume and of the peaks around each voxel, each at its number modulo `length`. */
+/* Slices of the volume and of the peaks in each voxel's neighbourhood, each at its number modulo `length`. */
 struct search {
 	const struct grid *grid;
 	float threshold;

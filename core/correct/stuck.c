@@ -153,7 +153,7 @@ static float median_of(const struct stuck *stuck, int column, int row)
 }
 
 /*
- * The medians of a row's pixels that have neighbours all around, for many columns at once: the exchanges are those of
+ * The medians of a row's pixels that have neighbours on all sides, for many columns at once: the exchanges are those of
  * Batcher's merge sort of eight values (Batcher 1968) but those that the middle two do not depend on.
  */
 static void medians_inside(const struct stuck *stuck, int row)

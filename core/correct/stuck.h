@@ -35,8 +35,8 @@ enum { STUCK_VIEWS = 32, STUCK_VIEWS_LEAST = 8 };
 struct stuck;
 
 /*
- * linearise and geometry, as they come, are borrowed. *ret_stuck is NULL where the scan has too few views to tell. Free
- * with stuck_free.
+ * linearise and geometry, as they come, are borrowed. *ret_stuck is NULL where the scan has too few views to decide.
+ * Free with stuck_free.
  */
 int stuck_new(const struct linearise *linearise, const struct geometry *geometry, struct stuck **ret_stuck,
 	      struct error *err);

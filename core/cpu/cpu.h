@@ -31,8 +31,8 @@ enum {
 	MATCHED_ACROSS = 16, /* the same for the matched backprojection, whose rays reach two voxels beyond a tile */
 	TILE_ALONG = 512,    /* and at most so many along one */
 	TILE_LINES = TILE_ACROSS * TILE_ACROSS,
-	BLEND_MARGIN = 2 * LANES_MOST, /* floats around a column of voxels in scratch, for windows beyond its ends */
-	ROWS_MARGIN = 4 * LANES_MOST,  /* the same around a column of pixels */
+	BLEND_MARGIN = 2 * LANES_MOST, /* floats beside a column of voxels in scratch, for windows beyond its ends */
+	ROWS_MARGIN = 4 * LANES_MOST,  /* the same beside a column of pixels */
 };
 
 struct device {
@@ -241,8 +241,7 @@ static inline size_t project_scratch_floats(const struct plan *plan)
 	return 4 * lanes_padded(plan->rows) + 2 * (lanes_padded(plan->grid.size[2]) + 2 * BLEND_MARGIN);
 }
 
-/* For each row of a column its height, its ray, and two floats for each voxel across a tile; rows around, for windows.
- */
+/* For each row of a column its height, its ray, and two floats for each voxel across a tile; margins for windows. */
 static inline size_t matched_scratch_floats(const struct plan *plan)
 {
 	return plan->matched ? (10 + 2 * MATCHED_ACROSS) * (lanes_padded(plan->rows) + 2 * ROWS_MARGIN) : 0;

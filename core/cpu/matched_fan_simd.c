@@ -11,7 +11,8 @@
 struct fan_rows {
 	int first, last;     /* those that come near the tile in any of its slices */
 	float *value, *step; /* projection times step, and step: of those */
-	/* The same of rows in_first .. in_last, which cross the slice between its outer centres; 0 around them. */
+	/* The same of rows in_first .. in_last, which cross the slice between its outer centres; 0 before and behind
+	 * them. */
 	float *value_in, *step_in;
 	int in_first, in_last;
 };

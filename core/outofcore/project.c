@@ -3,7 +3,7 @@
  *
  * A projection is the sum of those through the slabs, each between two slices of
  * zeros: linear interpolation of the volume is the sum of the interpolations of
- * its slabs with zeros around, and a ray that enters or leaves a slab's box does
+ * its slabs between zeros, and a ray that enters or leaves a slab's box does
  * so where that is zero. At the ends of the volume there are no such slices, and
  * edge values are held as they are in the whole.
  *

@@ -5,7 +5,7 @@
 #include "core/recon/algorithm.h"
 
 /*
- * The parameters of a recipe (struct recipe), in the order in which a job's document has them. `counts` tells whether a
+ * The parameters of a recipe (struct recipe), in the order in which a job's document has them. `counts` is true where a
  * parameter has an effect in a recipe; what several parameters must fulfil together is checked by recipe_check.
  */
 #define OBJECT_ALGORITHM "/ALGORITHM" /* the object of whichever algorithm the recipe has */
