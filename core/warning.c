@@ -67,6 +67,8 @@ const struct warning_kind warning_kinds[] = {
     {"grid_too_small", SEVERITY_CAUTION, "The image was asked for as a single voxel or a line of voxels."},
     {"slices_unseen", SEVERITY_CAUTION,
      "The first or last slices are not seen by all projections: their gray values are not reliable."},
+    {"end_slices", SEVERITY_CAUTION,
+     "The patient ends close to the first or the last slices of the image: their gray values are uncertain."},
     {"residual_high", SEVERITY_SERIOUS,
      "The image does not agree with the projections: it may be wrong, or need far more iterations."},
     {"tv_without_sart", SEVERITY_INFO, "Noise reduction was asked for after iterations, and there were none."},

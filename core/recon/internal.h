@@ -5,6 +5,7 @@
 #include "core/correct/input.h"
 #include "core/fdk.h"
 #include "core/recon/algorithm.h"
+#include "core/recon/ends.h"
 #include "core/warning.h"
 
 /* Declarations that recon.c (life, views), run.c (the run) and memory.c (the memory it takes) share. */
@@ -34,6 +35,7 @@ struct recon {
 	struct correction_chain corrections;
 	struct problem problem; /* of the algorithm, where there is one */
 	void *algorithm_state;
+	struct ends *ends; /* the end slices of volumes that are kept; NULL: they are the iterate's */
 
 	unsigned char *pushed; /* [views] */
 	int pushed_count;
@@ -41,9 +43,9 @@ struct recon {
 	struct volume_noise noise; /* where it is measured */
 	bool noise_measured;
 
-	bool resumed, ran;
-	int iteration; /* done so far */
-	bool moved;    /* the iterate is not the one that the algorithm left */
+	bool resumed, ran, ended; /* ended: behind the last iteration */
+	int iteration;            /* done so far */
+	bool moved;               /* the iterate is not the one that the algorithm left */
 	struct volume_norms norms;
 	double work_done, work_total; /* in FDKs of the whole scan */
 };
@@ -63,6 +65,12 @@ static inline double iteration_work(const struct recipe *recipe)
 static inline bool recon_runs_fdk(const struct recon *recon)
 {
 	return recon->recipe.fdk.on && !recon->resumed;
+}
+
+/* Without FDK there is nothing to hold the end slices against. */
+static inline bool recipe_has_ends(const struct recipe *recipe)
+{
+	return recipe->fdk.on && recipe->algorithm != NULL;
 }
 
 /* Calls the hook at the beginning of what `stage` says. */

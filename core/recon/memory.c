@@ -62,10 +62,11 @@ int sart_options_make(struct sart_options *ret_sart, const struct recipe *recipe
 struct held {
 	int volumes, stacks; /* stacks of all views */
 	int slots;           /* of the stack that corrections work in */
+	size_t ends;         /* bytes of the host's memory, core/recon/ends.h */
 };
 
 static struct held held_by(const struct recipe *recipe, const struct linearise *linearise,
-			   const struct geometry *geometry)
+			   const struct geometry *geometry, const struct orbit *orbit)
 {
 	const struct algorithm *algorithm = recipe->algorithm;
 
@@ -75,6 +76,7 @@ static struct held held_by(const struct recipe *recipe, const struct linearise *
 		(keeps_projections(recipe) && !has_subsets(recipe)) + (algorithm != NULL ? algorithm->volumes : 0),
 	    .stacks = algorithm != NULL ? algorithm->stacks : 0,
 	    .slots = corrections_slots(recipe, linearise, geometry),
+	    .ends = recipe_has_ends(recipe) ? ends_bytes(&recipe->grid, geometry, orbit) : 0,
 	};
 }
 
@@ -103,7 +105,9 @@ static int memory_whole(const struct backend *backend, struct device *device, st
 	    .projections = stacks + backend->stack_bytes(columns, rows,
 							 options->resident > 0 ? options->resident : geometry->count),
 	    .volumes = bytes.volumes + volumes,
-	    .scratch = bytes.scratch + bytes.raw + filtered + around->device + batch,
+	    /* A backend without memory of its own works in the host's. */
+	    .scratch =
+		bytes.scratch + bytes.raw + filtered + around->device + batch + (backend->own_memory ? 0 : held->ends),
 	};
 	return 0;
 }
@@ -119,7 +123,7 @@ static struct recon_memory memory_outofcore(const struct plan_options *options, 
 	struct recon_memory memory = {
 	    .volumes = bytes->volumes,
 	    .scratch = bytes->scratch + bytes->raw,
-	    .host = bytes->host + around->host +
+	    .host = bytes->host + around->host + held->ends +
 		    sizeof(float) * (((size_t)held->slots + (size_t)held->stacks * (size_t)geometry->count) * pixels +
 				     (size_t)volumes * grid_voxels(options->grid)),
 	};
@@ -135,7 +139,7 @@ static int memory_needed(const struct backend *backend, struct device *device, s
 {
 	const struct correction_ask ask = {
 	    .backend = backend, .device = device, .geometry = options->geometry, .orbit = orbit, .recipe = recipe};
-	const struct held held = held_by(recipe, &options->linearise, options->geometry);
+	const struct held held = held_by(recipe, &options->linearise, options->geometry, orbit);
 	struct correction_bytes around = {0};
 	struct recon_memory memory;
 	struct plan_bytes bytes;

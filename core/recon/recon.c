@@ -153,6 +153,16 @@ static int open_algorithm(struct recon *recon, struct error *err)
 	return algorithm->open != NULL ? algorithm->open(&recon->problem, &recon->algorithm_state, err) : 0;
 }
 
+static int open_ends(struct recon *recon, struct error *err)
+{
+	const struct recipe *recipe = &recon->recipe;
+
+	if (!recipe_has_ends(recipe))
+		return 0;
+	return ends_new(&recipe->grid, recon->geometry, &recon->orbit, recipe->mu_water, recipe->iterate.nonnegative,
+			&recon->ends, err);
+}
+
 int recon_open(const struct backend *backend, struct device *device, const struct geometry *geometry,
 	       const struct linearise *linearise, const struct recipe *recipe, const struct recon_hooks *hooks,
 	       struct recon **ret_recon, struct error *err)
@@ -179,6 +189,8 @@ int recon_open(const struct backend *backend, struct device *device, const struc
 		code = open_corrections(recon, err);
 	if (code == 0)
 		code = open_algorithm(recon, err);
+	if (code == 0)
+		code = open_ends(recon, err);
 	if (code < 0) {
 		recon_free(recon);
 		return code;
@@ -193,6 +205,7 @@ void recon_free(struct recon *recon)
 		return;
 	if (recon->algorithm_state != NULL)
 		recon->recipe.algorithm->close(&recon->problem, recon->algorithm_state);
+	ends_free(recon->ends);
 	recon->backend->volume_free(recon->before);
 	recon->backend->volume_free(recon->volume);
 	recon->backend->stack_free(recon->projections);
@@ -287,32 +300,45 @@ int recon_resume(struct recon *recon, const float *volume, int iteration, struct
 	return 0;
 }
 
-size_t recon_state_bytes(const struct recon *recon)
+static size_t algorithm_bytes(const struct recon *recon)
 {
 	const struct algorithm *algorithm = recon->recipe.algorithm;
 
 	return algorithm != NULL && algorithm->state_bytes != NULL ? algorithm->state_bytes(&recon->problem) : 0;
 }
 
+size_t recon_state_bytes(const struct recon *recon)
+{
+	return algorithm_bytes(recon) + ends_state_bytes(recon->ends);
+}
+
+/* What the algorithm holds, and behind it the end slices that the iterations began with. */
 int recon_save_state(struct recon *recon, const struct checkpoint_sink *sink, struct error *err)
 {
-	if (recon_state_bytes(recon) == 0)
-		return 0;
-	return recon->recipe.algorithm->save(&recon->problem, recon->algorithm_state, sink, err);
+	int code = 0;
+
+	if (algorithm_bytes(recon) > 0)
+		code = recon->recipe.algorithm->save(&recon->problem, recon->algorithm_state, sink, err);
+	if (code == 0 && recon->ends != NULL)
+		code = sink->write(sink->context, ends_state(recon->ends), ends_state_bytes(recon->ends), err);
+	return code;
 }
 
 int recon_resume_state(struct recon *recon, const char *bytes, size_t size, struct error *err)
 {
-	int code;
+	const size_t own = algorithm_bytes(recon);
+	int code = 0;
 
 	if (!recon->resumed || size != recon_state_bytes(recon))
 		return error_set(err, ERR_INVALID, "%zu bytes of an algorithm that holds %zu", size,
 				 recon_state_bytes(recon));
-	if (size == 0)
-		return 0;
-	code = recon->recipe.algorithm->resume(&recon->problem, recon->algorithm_state, bytes, err);
-	/* With TV the iterate was moved behind the iteration that the state is of. */
-	recon->moved = recon->recipe.tv.on;
+	if (own > 0) {
+		code = recon->recipe.algorithm->resume(&recon->problem, recon->algorithm_state, bytes, err);
+		/* With TV the iterate was moved behind the iteration that the state is of. */
+		recon->moved = recon->recipe.tv.on;
+	}
+	if (code == 0 && recon->ends != NULL)
+		ends_resume(recon->ends, bytes + own);
 	return code;
 }
 

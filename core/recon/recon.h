@@ -118,8 +118,8 @@ struct checkpoint_sink {
 	int (*write)(void *context, const void *bytes, size_t size, struct error *err);
 };
 /*
- * The algorithm's state beside the iterate, 0 bytes where it has none. A resumed run must get it back after
- * recon_resume, to end with the same bits.
+ * The algorithm's state beside the iterate, and the end slices that its iterations began with (core/recon/ends.h); 0
+ * bytes where there is neither. A resumed run must get them back after recon_resume, to keep the same volumes.
  */
 size_t recon_state_bytes(const struct recon *recon);
 int recon_save_state(struct recon *recon, const struct checkpoint_sink *sink, struct error *err);

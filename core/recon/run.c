@@ -67,6 +67,29 @@ int recon_resume_noise(struct recon *recon, const struct volume_noise *noise, st
 	return 0;
 }
 
+/* The end slices of an iterate as they are kept; the last one's are told of where they are uncertain. */
+static int show_ends(struct recon *recon, struct volume_norms *norms, struct error *err)
+{
+	struct ends_report report = {0};
+	int code = 0;
+
+	if (recon->ends != NULL && recon->iteration > 0)
+		code = ends_show(recon->ends, recon->backend, recon->volume, &report, err);
+	if (code == 0 && report.changed)
+		code = measure(recon, NULL, norms, err);
+	if (code == 0 && recon->ended)
+		warn_ends(&recon->warnings, &recon->recipe, &report);
+	return code;
+}
+
+/* Takes out again what was shown in a volume while it was kept. */
+static int hide(struct recon *recon, struct error *err)
+{
+	int code = corrections_hide(&recon->corrections, err);
+
+	return code == 0 && recon->ends != NULL ? ends_hide(recon->ends, recon->backend, recon->volume, err) : code;
+}
+
 /* A volume is kept with what corrections show in it, the metal; the iterate is worked on without. */
 static int keep(struct recon *recon, const char *name, const char *stage, struct error *err)
 {
@@ -82,12 +105,14 @@ static int keep(struct recon *recon, const char *name, const char *stage, struct
 	if (recon->hooks->keep == NULL)
 		return 0;
 	recon_tell_progress(recon, STAGE_SAVE, recon->iteration);
-	code = corrections_show(&recon->corrections, &kept.estimate_mm, err);
+	code = show_ends(recon, &kept.norms, err);
+	if (code == 0)
+		code = corrections_show(&recon->corrections, &kept.estimate_mm, err);
 	if (code == 0 && kept.estimate_mm > 0)
 		code = measure(recon, NULL, &kept.norms, err);
 	if (code == 0)
 		code = recon->hooks->keep(recon->hooks->context, recon, &kept, err);
-	return code < 0 ? code : corrections_hide(&recon->corrections, err);
+	return code < 0 ? code : hide(recon, err);
 }
 
 /* ---- the run ---- */
@@ -228,6 +253,8 @@ static int run_iterations(struct recon *recon, struct error *err)
 	bool last = recon->iteration >= recon->recipe.iterate.iterations, changed;
 	int failed = last ? 0 : corrections_apply(&recon->corrections, CORRECT_BEFORE_ITERATING, &changed, err);
 
+	if (failed == 0 && !last && recon->ends != NULL && recon->iteration == 0)
+		failed = ends_begin(recon->ends, recon->backend, recon->volume, err);
 	if (failed < 0)
 		return failed;
 
@@ -298,6 +325,7 @@ int recon_run(struct recon *recon, struct error *err)
 		code = run_iterations(recon, err);
 	if (code < 0)
 		return code;
+	recon->ended = true;
 	recon->work_done = recon->work_total; /* a stop rule may have ended it early */
 	return keep(recon, "final", stage, err);
 }

@@ -128,3 +128,18 @@ void warn_tv(const struct warning_sink *sink, const struct recipe *recipe, const
 	    "\"alpha\": \"auto\" finds",
 	    reach / hu, noise->sigma / hu, needed / hu);
 }
+
+void warn_ends(const struct warning_sink *sink, const struct recipe *recipe, const struct ends_report *report)
+{
+	const double hu = recipe->mu_water / 1000;
+
+	if (!report->uncertain)
+		return;
+	warning_tell(sink, "end_slices",
+		     "the object ends near the grid's faces: the first %d and the last %d slices are uncertain. Their "
+		     "means depart "
+		     "from FDK's by up to %.0f HU; what alternated from slice to slice was taken back towards FDK, by "
+		     "up to %.0f HU "
+		     "in the mean of a slice",
+		     report->slices[0], report->slices[1], report->departure / hu, report->corrected / hu);
+}

@@ -2,6 +2,7 @@
 #define CBCT_CORE_WARN_H
 
 #include "core/scan/orbit.h"
+#include "core/recon/ends.h"
 #include "core/recon/recon.h"
 #include "core/warning.h"
 
@@ -14,4 +15,6 @@ void warn_residual(const struct warning_sink *sink, const struct history_row *ro
 /* "tv_without_effect": explicit settings that cannot move a voxel by a fair share of the noise. */
 void warn_tv(const struct warning_sink *sink, const struct recipe *recipe, const struct volume_noise *noise,
 	     const struct orbit *orbit);
+/* "end_slices": the object ends near the grid's z faces, and SART and FDK differ there. */
+void warn_ends(const struct warning_sink *sink, const struct recipe *recipe, const struct ends_report *report);
 #endif

@@ -252,6 +252,8 @@ START_TEST(a_run_with_metal_goes_on_with_the_same_bits)
 	second.resume_iteration = 1;
 	second.resume_metal = first.metal;
 	second.resume_metal_bytes = first.metal_bytes;
+	second.resume_state = first.state;
+	second.resume_state_bytes = first.state_bytes;
 	scene_run(&scene, &recipe, &second);
 	ck_assert_mem_eq(outcome_volume(&second, "final"), outcome_volume(&whole, "final"),
 			 sizeof(float) * grid_voxels(&whole.grid));

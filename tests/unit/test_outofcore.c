@@ -76,7 +76,7 @@ static struct result reconstruct(const struct scene *scene, const struct recipe 
 	const struct device_options options = {.threads = 2, .memory_limit = limit};
 	struct result result = {0};
 	const struct recon_hooks hooks = {.context = &result, .row = on_row, .keep = on_keep, .warning = on_warning};
-	struct backend backend = backend_cpu;
+	struct backend backend = backend_cpu, own = backend_cpu;
 	int *views = malloc(sizeof(int) * (size_t)scene->geometry.count);
 	struct device *device;
 	struct device_info info;
@@ -84,12 +84,14 @@ static struct result reconstruct(const struct scene *scene, const struct recipe 
 	size_t free_before;
 
 	backend.own_memory = limit > 0;
+	/* Limits are of what the whole takes of a device's own memory, without what lies in the host's anyway. */
+	own.own_memory = true;
 	for (int i = 0; i < scene->geometry.count; i++)
 		views[i] = i;
 	ok(backend.open(0, &options, &device, &err));
 	backend.describe(device, &info);
 	free_before = info.bytes_free;
-	ok(recon_memory(&backend, device, &scene->geometry, recipe, &result.memory, &err));
+	ok(recon_memory(&own, device, &scene->geometry, recipe, &result.memory, &err));
 	ok(recon_open(&backend, device, &scene->geometry, linearise, recipe, &hooks, &recon, &err));
 	snprintf(result.plan, sizeof(result.plan), "%s", recon_plan(recon));
 	ok(recon_push(recon, samples, views, scene->geometry.count, &err));

@@ -1,0 +1,455 @@
+/* The end slices of the iterate, held against the volume that the iterations began with: see ends.h. */
+#include "core/recon/ends.h"
+
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+/* The first and the last slices of the volume. */
+enum { ENDS = 2 };
+/* Slices that may be changed at an end: so many times the reach, as far as the volume has them. */
+enum { DEEP = 6, REACH_MOST = 4 };
+/* Of water's density, or of half the object's where that is more: 40 HU and 150 HU. */
+static const double LITTLE = 0.04, MUCH = 0.15;
+/* Voxels of the body that a slice must have for its means to say something, and at the face for an end to be looked at.
+ */
+enum { BODY_LEAST = 16, BODY_AT_FACE = 4 };
+
+struct ends {
+	int columns, rows, slices; /* of the volume: x, y, z */
+	int reach;                 /* n of ends.h */
+	int inner, zone;           /* slices at an end that may be changed, and that are looked at */
+	size_t pixels;             /* of a slice */
+	double mu_water;
+	bool nonnegative;
+
+	bool known;   /* B is */
+	double level; /* 1/mm: water's density, or half of the object's */
+	bool shown[ENDS];
+	/* Of either end, slices counted from the face inwards, [end][slice][y][x]. */
+	float *start; /* [zone] slices: B */
+	float *held;  /* [inner] slices: V, while V' is shown */
+	/* Of the end at work. */
+	float *values;    /* [zone] slices: V, then V' */
+	float *smooth;    /* [zone] slices: D */
+	float *alternate; /* [inner] slices: a */
+	float *work;      /* a slice */
+};
+
+/* ---- life ---- */
+
+static int reach_of(const struct grid *grid, const struct orbit *orbit)
+{
+	const double rows_height = orbit->pixel_at_isocentre[1] / grid->spacing[2];
+
+	return (int)fmin(fmax(round(rows_height), 1), REACH_MOST);
+}
+
+/* Slices that may be changed at an end; 0: there are too few, or nothing to tell them apart. */
+static int inner_of(const struct grid *grid, const struct geometry *geometry, int reach)
+{
+	const int part = grid->size[2] / 2 - reach;
+
+	if (geometry->rows == 1 || part < 1)
+		return 0;
+	return part < DEEP * reach ? part : DEEP * reach;
+}
+
+/* In slices: start, held, values, smooth, alternate, work. */
+static size_t slices_held(int inner, int reach)
+{
+	const size_t zone = (size_t)inner + (size_t)reach;
+
+	return ENDS * zone + ENDS * (size_t)inner + zone + zone + (size_t)inner + 1;
+}
+
+size_t ends_bytes(const struct grid *grid, const struct geometry *geometry, const struct orbit *orbit)
+{
+	const int reach = reach_of(grid, orbit), inner = inner_of(grid, geometry, reach);
+	const size_t pixels = (size_t)grid->size[0] * (size_t)grid->size[1];
+
+	return inner > 0 ? slices_held(inner, reach) * pixels * sizeof(float) : 0;
+}
+
+int ends_new(const struct grid *grid, const struct geometry *geometry, const struct orbit *orbit, double mu_water,
+	     bool nonnegative, struct ends **ret_ends, struct error *err)
+{
+	const size_t bytes = ends_bytes(grid, geometry, orbit);
+	const int reach = reach_of(grid, orbit), inner = inner_of(grid, geometry, reach), zone = inner + reach;
+	struct ends *ends;
+
+	if (bytes == 0)
+		return 0;
+	ends = malloc(sizeof(*ends));
+	if (ends == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for the end slices");
+	*ends = (struct ends){
+	    .columns = grid->size[0],
+	    .rows = grid->size[1],
+	    .slices = grid->size[2],
+	    .reach = reach,
+	    .inner = inner,
+	    .zone = zone,
+	    .pixels = (size_t)grid->size[0] * (size_t)grid->size[1],
+	    .mu_water = mu_water,
+	    .nonnegative = nonnegative,
+	    .start = calloc(bytes, 1),
+	};
+	if (ends->start == NULL) {
+		free(ends);
+		return error_set(err, ERR_NO_MEMORY, "no memory for %d end slices", ENDS * zone);
+	}
+	ends->held = ends->start + (size_t)(ENDS * zone) * ends->pixels;
+	ends->values = ends->held + (size_t)(ENDS * inner) * ends->pixels;
+	ends->smooth = ends->values + (size_t)zone * ends->pixels;
+	ends->alternate = ends->smooth + (size_t)zone * ends->pixels;
+	ends->work = ends->alternate + (size_t)inner * ends->pixels;
+	*ret_ends = ends;
+	return 0;
+}
+
+void ends_free(struct ends *ends)
+{
+	if (ends == NULL)
+		return;
+	free(ends->start);
+	free(ends);
+}
+
+/* ---- slices in and out ---- */
+
+/* The volume's z of a slice counted from the face. */
+static int z_of(const struct ends *ends, int end, int slice)
+{
+	return end == 0 ? slice : ends->slices - 1 - slice;
+}
+
+static int read_slices(const struct ends *ends, const struct backend *backend, struct volume *volume, int end,
+		       float *ret_slices, struct error *err)
+{
+	int code = 0;
+
+	for (int i = 0; i < ends->zone && code == 0; i++)
+		code =
+		    backend->volume_download(volume, z_of(ends, end, i), 1, ret_slices + (size_t)i * ends->pixels, err);
+	return code;
+}
+
+static int write_slices(const struct ends *ends, const struct backend *backend, struct volume *volume, int end,
+			const float *slices, struct error *err)
+{
+	int code = 0;
+
+	for (int i = 0; i < ends->inner && code == 0; i++)
+		code = backend->volume_put(volume, z_of(ends, end, i), 1, slices + (size_t)i * ends->pixels, err);
+	return code;
+}
+
+/* The object's density is the mean of its voxels, each weighted by its own value: air counts for nothing. */
+static void know_start(struct ends *ends)
+{
+	const size_t count = (size_t)(ENDS * ends->zone) * ends->pixels;
+	double sum = 0, squares = 0;
+
+	for (size_t i = 0; i < count; i++) {
+		const double value = fmax((double)ends->start[i], 0);
+
+		sum += value;
+		squares += value * value;
+	}
+	ends->level = fmax(ends->mu_water, sum > 0 ? 0.5 * squares / sum : 0);
+	ends->known = true;
+}
+
+int ends_begin(struct ends *ends, const struct backend *backend, struct volume *volume, struct error *err)
+{
+	int code = 0;
+
+	for (int end = 0; end < ENDS && code == 0; end++)
+		code = read_slices(ends, backend, volume, end, ends->start + (size_t)(end * ends->zone) * ends->pixels,
+				   err);
+	if (code == 0)
+		know_start(ends);
+	return code;
+}
+
+size_t ends_state_bytes(const struct ends *ends)
+{
+	return ends != NULL ? (size_t)(ENDS * ends->zone) * ends->pixels * sizeof(float) : 0;
+}
+
+const float *ends_state(const struct ends *ends)
+{
+	return ends->start;
+}
+
+void ends_resume(struct ends *ends, const char *bytes)
+{
+	memcpy(ends->start, bytes, ends_state_bytes(ends));
+	know_start(ends);
+}
+
+/* ---- one end ---- */
+
+static int clamp(int at, int count)
+{
+	return at < 0 ? 0 : at >= count ? count - 1 : at;
+}
+
+/* D of one slice from V and B; what lies beyond the slice's edges is as at them. */
+static void smooth_slice(struct ends *ends, const float *start, const float *values, float *ret_smooth)
+{
+	const int columns = ends->columns, rows = ends->rows, n = ends->reach, side = 2 * n + 1;
+	const float share = 1 / (float)(side * side);
+
+#pragma omp parallel for schedule(static)
+	for (int y = 0; y < rows; y++)
+		for (int x = 0; x < columns; x++) {
+			const size_t row = (size_t)y * (size_t)columns;
+			float sum = 0;
+
+			for (int k = -n; k <= n; k++) {
+				const size_t at = row + (size_t)clamp(x + k, columns);
+
+				sum += values[at] - start[at];
+			}
+			ends->work[row + (size_t)x] = sum;
+		}
+#pragma omp parallel for schedule(static)
+	for (int y = 0; y < rows; y++)
+		for (int x = 0; x < columns; x++) {
+			float sum = 0;
+
+			for (int k = -n; k <= n; k++)
+				sum += ends->work[(size_t)clamp(y + k, rows) * (size_t)columns + (size_t)x];
+			ret_smooth[(size_t)y * (size_t)columns + (size_t)x] = share * sum;
+		}
+}
+
+/* a of one slice, before the largest nearby is taken. */
+static void alternate_slice(const struct ends *ends, int slice, float *ret_alternate)
+{
+	const float *here = ends->smooth + (size_t)slice * ends->pixels;
+
+#pragma omp parallel for schedule(static)
+	for (size_t i = 0; i < ends->pixels; i++) {
+		float most = 0;
+
+		for (int k = -ends->reach; k <= ends->reach; k++) {
+			const float there =
+			    slice + k >= 0 ? ends->smooth[(size_t)(slice + k) * ends->pixels + i] : here[i];
+
+			if (here[i] * there < 0)
+				most = fmaxf(most, fminf(fabsf(here[i]), fabsf(there)));
+		}
+		ret_alternate[i] = most;
+	}
+}
+
+/* The largest within 2n voxels along x and y, in place. */
+static void spread_slice(struct ends *ends, float *alternate)
+{
+	const int columns = ends->columns, rows = ends->rows, far = 2 * ends->reach;
+
+#pragma omp parallel for schedule(static)
+	for (int y = 0; y < rows; y++)
+		for (int x = 0; x < columns; x++) {
+			const size_t row = (size_t)y * (size_t)columns;
+			float most = 0;
+
+			for (int k = -far; k <= far; k++)
+				most = fmaxf(most, alternate[row + (size_t)clamp(x + k, columns)]);
+			ends->work[row + (size_t)x] = most;
+		}
+#pragma omp parallel for schedule(static)
+	for (int y = 0; y < rows; y++)
+		for (int x = 0; x < columns; x++) {
+			float most = 0;
+
+			for (int k = -far; k <= far; k++)
+				most =
+				    fmaxf(most, ends->work[(size_t)clamp(y + k, rows) * (size_t)columns + (size_t)x]);
+			alternate[(size_t)y * (size_t)columns + (size_t)x] = most;
+		}
+}
+
+static bool is_body(const struct ends *ends, float start, float value)
+{
+	return fmax((double)start, (double)value) > 0.5 * ends->level;
+}
+
+/* Whether the body comes as near to the face as the reach. By the iterate: FDK blurs a body's end across slices. */
+static bool is_at_face(const struct ends *ends, const float *values)
+{
+	for (int slice = 0; slice < ends->reach; slice++) {
+		const size_t at = (size_t)slice * ends->pixels;
+		int count = 0;
+
+		for (size_t i = at; i < at + ends->pixels; i++)
+			count += (double)values[i] > 0.5 * ends->level;
+		if (count >= BODY_AT_FACE)
+			return true;
+	}
+	return false;
+}
+
+/* The median over the body of a slice, to a part in BINS of the level. */
+static double median_in_body(const struct ends *ends, const float *start, const float *values, const float *of)
+{
+	enum { BINS = 1024 };
+	size_t count[BINS] = {0}, all = 0, below = 0;
+	int bin = 0;
+
+	for (size_t i = 0; i < ends->pixels; i++)
+		if (is_body(ends, start[i], values[i])) {
+			count[(int)fmin(BINS * ((double)of[i] / ends->level), BINS - 1)]++;
+			all++;
+		}
+	while (2 * (below + count[bin]) < all) {
+		below += count[bin];
+		bin++;
+	}
+	return bin * ends->level / BINS;
+}
+
+/* V' of one slice. */
+static void blend_slice(const struct ends *ends, int slice, double doubt, const float *start, float *values)
+{
+	const int n = ends->reach, whole = (n + 1) * (n + 1);
+	const double much = MUCH * ends->level;
+
+#pragma omp parallel for schedule(static)
+	for (size_t i = 0; i < ends->pixels; i++) {
+		const double a = (double)ends->alternate[(size_t)slice * ends->pixels + i];
+		const double e = fmax(a - doubt / 2, 0), w = e * e / (e * e + doubt * doubt / 4);
+		double s = 0, wanted;
+
+		if (e == 0)
+			continue;
+		for (int k = -n; k <= n; k++) {
+			const int there = slice + k < 0 ? 0 : slice + k;
+
+			s += (double)(n + 1 - abs(k)) / whole * (double)ends->smooth[(size_t)there * ends->pixels + i];
+		}
+		wanted = (double)start[i] + s / (1 + a * a / (much * much));
+		if (ends->nonnegative && wanted < 0)
+			wanted = 0;
+		values[i] = (float)((double)values[i] + w * (wanted - (double)values[i]));
+	}
+}
+
+/* What became of a slice, means over the body in 1/mm. */
+struct slice_change {
+	double corrected; /* of |V' - V| */
+	double departure; /* |of V' - B| */
+};
+
+static struct slice_change change_of(const struct ends *ends, const float *start, const float *before,
+				     const float *after)
+{
+	struct slice_change change = {0};
+	double departure = 0;
+	size_t count = 0;
+
+	for (size_t i = 0; i < ends->pixels; i++)
+		if (is_body(ends, start[i], before[i])) {
+			change.corrected += fabs((double)after[i] - (double)before[i]);
+			departure += (double)after[i] - (double)start[i];
+			count++;
+		}
+	if (count < BODY_LEAST)
+		return (struct slice_change){0};
+	change.corrected /= (double)count;
+	change.departure = fabs(departure) / (double)count;
+	return change;
+}
+
+/* The slices whose change is too large to say nothing of it. The innermost one shows what d is without an end. */
+static void report_end(const struct ends *ends, int end, struct ends_report *report)
+{
+	const float *start = ends->start + (size_t)(end * ends->zone) * ends->pixels;
+	const float *before = ends->held + (size_t)(end * ends->inner) * ends->pixels;
+	double usual = 0;
+
+	for (int i = ends->inner - 1; i >= 0; i--) {
+		const size_t at = (size_t)i * ends->pixels;
+		const struct slice_change change = change_of(ends, start + at, before + at, ends->values + at);
+
+		if (i == ends->inner - 1)
+			usual = change.departure;
+		if (change.corrected <= LITTLE * ends->level && change.departure - usual <= LITTLE * ends->level)
+			continue;
+		report->uncertain = true;
+		report->slices[end] = report->slices[end] > i ? report->slices[end] : i + 1;
+		report->corrected = fmax(report->corrected, change.corrected);
+		report->departure = fmax(report->departure, change.departure);
+	}
+}
+
+/* V' of an end, whose V is in values. */
+static void blend_end(struct ends *ends, int end)
+{
+	const float *start = ends->start + (size_t)(end * ends->zone) * ends->pixels;
+	const size_t innermost = (size_t)(ends->inner - 1) * ends->pixels;
+	double doubt;
+
+	for (int i = 0; i < ends->zone; i++) {
+		const size_t at = (size_t)i * ends->pixels;
+
+		smooth_slice(ends, start + at, ends->values + at, ends->smooth + at);
+	}
+	for (int i = 0; i < ends->inner; i++)
+		alternate_slice(ends, i, ends->alternate + (size_t)i * ends->pixels);
+	doubt = LITTLE * ends->level;
+	doubt += 2 * fmin(doubt, median_in_body(ends, start + innermost, ends->values + innermost,
+						ends->alternate + innermost));
+	for (int i = 0; i < ends->inner; i++) {
+		const size_t at = (size_t)i * ends->pixels;
+
+		spread_slice(ends, ends->alternate + at);
+		blend_slice(ends, i, doubt, start + at, ends->values + at);
+	}
+}
+
+/* ---- both ends ---- */
+
+int ends_show(struct ends *ends, const struct backend *backend, struct volume *volume, struct ends_report *ret_report,
+	      struct error *err)
+{
+	const size_t bytes = (size_t)ends->inner * ends->pixels * sizeof(float);
+	struct ends_report report = {0};
+	int code = 0;
+
+	for (int end = 0; end < ENDS && ends->known && code == 0; end++) {
+		float *held = ends->held + (size_t)(end * ends->inner) * ends->pixels;
+
+		code = read_slices(ends, backend, volume, end, ends->values, err);
+		if (code < 0)
+			break;
+		if (!is_at_face(ends, ends->values))
+			continue;
+		memcpy(held, ends->values, bytes);
+		blend_end(ends, end);
+		report_end(ends, end, &report);
+		ends->shown[end] = memcmp(held, ends->values, bytes) != 0;
+		if (ends->shown[end])
+			code = write_slices(ends, backend, volume, end, ends->values, err);
+		report.changed = report.changed || ends->shown[end];
+	}
+	if (code == 0)
+		*ret_report = report;
+	return code;
+}
+
+int ends_hide(struct ends *ends, const struct backend *backend, struct volume *volume, struct error *err)
+{
+	int code = 0;
+
+	for (int end = 0; end < ENDS && code == 0; end++) {
+		if (ends->shown[end])
+			code = write_slices(ends, backend, volume, end,
+					    ends->held + (size_t)(end * ends->inner) * ends->pixels, err);
+		ends->shown[end] = false;
+	}
+	return code;
+}
