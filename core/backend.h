@@ -295,9 +295,9 @@ struct backend {
 	int (*norms)(struct plan *plan, const struct volume *volume, const struct volume *other, double unit,
 		     struct volume_norms *ret_norms, struct error *err);
 	/*
-	 * The algebra that iterative methods are written in. Volumes are of one grid. Of stacks, which are of one
-	 * detector, the first `count` slots of y take part, slot i with slot slots[i] of x; slots NULL: slot i. A ray
-	 * that is left out is NaN in the projections, and is made 0 by stack_mask before it meets a sum.
+	 * The algebra that iterative methods are written in. Volumes are of one grid. Stacks are of one detector; slot
+	 * i of y, the first `count` of them, goes with slot slots[i] of x; slots NULL: slot i. A ray that is left out
+	 * is NaN in the projections, and is made 0 by stack_mask before it meets a sum.
 	 */
 	/* y = a x + b y; with b = 0 whatever y was. */
 	int (*volume_axpby)(double a, const struct volume *x, double b, struct volume *y, struct error *err);

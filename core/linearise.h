@@ -53,7 +53,7 @@ enum pixel_kind { PIXEL_GOOD, PIXEL_MAPPED, PIXEL_NOT_FINITE, PIXEL_SATURATED, P
 #define LINEARISE_INLINE static inline
 #endif
 
-/* From which on a sample says nothing. */
+/* The count from which on a sample is saturated; INFINITY: none is. */
 static inline float linearise_saturation(const struct linearise *linearise)
 {
 	if (linearise->saturation > 0)
@@ -86,7 +86,7 @@ LINEARISE_INLINE bool linearise_mapped(const struct linearise *linearise, size_t
 	return map != NULL && ((const unsigned char *)map)[at] != 0;
 }
 
-/* (I - dark) / (flat - dark); anything for a defect. Of intensities; the defect map is not asked. */
+/* (I - dark) / (flat - dark); anything for a defect. For intensities; the defect map is not used. */
 LINEARISE_INLINE enum pixel_kind linearise_transmission(const struct linearise *linearise, float sample, size_t at,
 							float saturation, float *ret)
 {

@@ -601,7 +601,8 @@ static int by_loads(struct plan *plan, backprojection_job &job, struct error *er
 	return 0;
 }
 
-/* How a call is done: the first that applies. The matched projector has a backprojection of its own, matched.cu. */
+/* The ways to do a call, of which the first that applies is used. The matched projector has a backprojection of its
+ * own, matched.cu. */
 static const struct backprojector {
 	const char *name;
 	bool (*applies)(const struct plan *plan, const struct voxel_use &use);

@@ -46,7 +46,7 @@ struct rows_view {
 
 /* ---- forward ---- */
 
-/* Into how many parts rays are cut, at most; a warp each. */
+/* The most parts into which rays are cut; a warp each. */
 enum { PARTS_MOST = 8, PARTS_OF_FEW = 4 };
 
 template <neighbours KIND, int ROWS, bool LEAN>

@@ -57,7 +57,7 @@ struct staging {
 	int next;
 };
 
-/* Which views' matrices stand in the constant memory of a GPU (backproject.cu); no plan: none. */
+/* The views whose matrices stand in the constant memory of a GPU (backproject.cu); no plan: none. */
 struct constants {
 	const struct plan *plan;
 	unsigned long list; /* plan.views_list */

@@ -112,7 +112,7 @@ struct shared_row_ends {
 	}
 };
 
-/* Where a slice counts in part, what a row of no part has read may be anything. */
+/* In a slice that counts in part, a row without a part may have read anything. */
 template <int ROWS, int GUARD, typename Ends>
 static __device__ __forceinline__ void add_values(float i, Ends &ends, const float value[ROWS], float sum[ROWS])
 {

@@ -148,7 +148,7 @@ void corrections_close(struct correction_chain *chain);
 /* Linearises a view, in rows and columns as it came, into a slot, and corrects it. */
 int corrections_take(struct correction_chain *chain, const void *samples, int view, int slot, struct stack *to,
 		     struct error *err);
-/* Not of a view; *ret_changed: the volume is another one now. */
+/* Runs the corrections of a time that is not one of views; *ret_changed: the volume is another one now. */
 int corrections_apply(struct correction_chain *chain, enum correction_time time, bool *ret_changed, struct error *err);
 int corrections_warn(struct correction_chain *chain, struct error *err);
 int corrections_show(struct correction_chain *chain, double *ret_estimate_mm, struct error *err);

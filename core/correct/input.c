@@ -256,7 +256,7 @@ double input_blank_share(const struct input *input, const struct orbit *orbit)
 		blank += orbit_axis_weight(orbit, input->blank[i]);
 	for (int k = 0; k < orbit->count; k++)
 		all += orbit_axis_weight(orbit, k);
-	/* Where the others are next to nothing on the axis, as an arc's two ends, they cannot stand in. */
+	/* Views that weigh next to nothing on the axis, as an arc's two ends, cannot stand in for the blank ones. */
 	return blank < (1 - 1e-6) * all ? blank / all : 0;
 }
 

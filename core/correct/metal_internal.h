@@ -19,7 +19,7 @@ struct metal_rim {
 	double radius[3];
 	int reach[3];
 };
-/* So many widths of FDK's blur. */
+/* The neighbourhood of so many widths of FDK's blur. */
 struct metal_rim metal_rim_of(const struct metal_tools *tools, double widths);
 /*
  * For each voxel of the slice the highest metal that has it in its rim, 0: none; and infinite where it is metal

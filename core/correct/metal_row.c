@@ -48,7 +48,7 @@ static struct metal_tools tools_of(const struct correction_job *job)
 
 /* ---- samples without counts ---- */
 
-/* Not above the dark, where the detector could have counted. */
+/* Whether a sample is not above the dark, where the detector could have counted. */
 static bool has_no_counts(const struct input *input, const void *samples, size_t at)
 {
 	float p;

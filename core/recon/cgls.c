@@ -232,7 +232,7 @@ static int begin(const struct problem *problem, struct cgls *cgls, double *ret_s
 	return code == 0 ? step_along(problem, cgls, ret_step, err) : code;
 }
 
-/* Where x is what something else has made of it: the copy for the history, x >= 0, r and ||b||^2. */
+/* Starts from an x that another stage made: the copy for the history, x >= 0, r and ||b||^2. */
 static int take_over(const struct problem *problem, struct cgls *cgls, struct error *err)
 {
 	const struct backend *backend = problem->backend;
