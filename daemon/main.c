@@ -92,6 +92,7 @@ static int start_parts(const struct config *config, struct api *api, struct erro
 						    .devices = given > 0 ? devices : NULL,
 						    .threads = (int)config->threads,
 						    .device_memory = config->device_memory,
+						    .checkpoint_seconds = config->checkpoint_seconds,
 						    .stop_seconds = config->stop_timeout};
 	int code;
 

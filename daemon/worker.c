@@ -20,6 +20,7 @@
 #include <time.h>
 #include <unistd.h>
 
+#include "proto/checkpoint.h"
 #include "proto/clock.h"
 #include "proto/message.h"
 #include "proto/provenance.h"
@@ -250,6 +251,13 @@ static int on_settled(void *context, const char *name, struct error *err)
 	return report_or_fail(context, &message, err);
 }
 
+static int on_checkpoint(void *context, int iteration, struct error *err)
+{
+	struct message message = {.kind = MESSAGE_CHECKPOINT, .iteration = iteration};
+
+	return report_or_fail(context, &message, err);
+}
+
 /* ---- jobs ---- */
 
 static void report_reconstructed(struct worker *worker, const struct reconstruction *reconstruction)
@@ -322,6 +330,7 @@ static int run_job(struct worker *worker, const struct message *start, struct er
 							     .warning = on_warning},
 						   .on_volume = on_volume,
 						   .on_settled = on_settled,
+						   .on_checkpoint = on_checkpoint,
 						   .on_open = on_open};
 	struct reconstruction_options options = {.scan_directory = start->scan_directory,
 						 .checked = true,
@@ -332,6 +341,7 @@ static int run_job(struct worker *worker, const struct message *start, struct er
 						 .scan = start->request.scan,
 						 .patient = &start->request.patient,
 						 .iteration = start->iteration,
+						 .checkpoint_seconds = start->checkpoint_seconds,
 						 .hooks = &hooks};
 	unsigned char *present = NULL;
 	char checkpoint[1100];

@@ -49,6 +49,7 @@ static const struct field start_fields[] = {FIELD("job", FIELD_STRING, job),
 					    FIELD("job_directory", FIELD_STRING, job_directory),
 					    FIELD("request", FIELD_REQUEST, request),
 					    FIELD("iteration", FIELD_INT, iteration),
+					    FIELD("checkpoint_seconds", FIELD_NUMBER, checkpoint_seconds),
 					    FIELD("arriving", FIELD_BOOL, arriving),
 					    FIELD("reduced", FIELD_BOOL, reduced),
 					    FIELD("present", FIELD_BITS, present),
@@ -99,6 +100,8 @@ static const struct field volume_fields[] = {FIELD("job", FIELD_STRING, job),
 					     FIELD("estimate_mm", FIELD_NUMBER, estimate_mm),
 					     {0}};
 static const struct field settled_fields[] = {FIELD("job", FIELD_STRING, job), FIELD("name", FIELD_STRING, name), {0}};
+static const struct field checkpoint_fields[] = {
+    FIELD("job", FIELD_STRING, job), FIELD("iteration", FIELD_INT, iteration), {0}};
 static const struct field noise_fields[] = {FIELD("job", FIELD_STRING, job),
 					    FIELD("noise_hu", FIELD_NUMBER, noise_hu),
 					    FIELD("alpha", FIELD_NUMBER, alpha),
@@ -127,6 +130,7 @@ static const struct {
     [MESSAGE_ROW] = {"row", row_fields},
     [MESSAGE_VOLUME] = {"volume", volume_fields},
     [MESSAGE_SETTLED] = {"settled", settled_fields},
+    [MESSAGE_CHECKPOINT] = {"checkpoint", checkpoint_fields},
     [MESSAGE_NOISE] = {"noise", noise_fields},
     [MESSAGE_WARNING] = {"warning", warning_fields},
     [MESSAGE_ENDED] = {"ended", ended_fields},

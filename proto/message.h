@@ -13,8 +13,9 @@
 enum message_kind {
 	/* daemon -> worker */
 	/*
-	 * job, scan_directory, job_directory, recipe, iteration (0, or resume from the checkpoint), reduced and
-	 * present, arriving: the projections come by MESSAGE_VIEWS; otherwise all that are present are there
+	 * job, scan_directory, job_directory, recipe, iteration (0, or resume from the checkpoint), checkpoint_seconds,
+	 * reduced and present, arriving: the projections come by MESSAGE_VIEWS; otherwise all that are present are
+	 * there
 	 */
 	MESSAGE_START,
 	/* job, runs: these projections are there, to be reconstructed in this order. Not before the last were taken. */
@@ -32,6 +33,7 @@ enum message_kind {
 	MESSAGE_VOLUME,        /* job, name, stage, iteration, bytes, norms, estimate_mm: the file is there, whole, for
 				  everybody */
 	MESSAGE_SETTLED,       /* job, name: that file is on the disk; before the job ends, but for what failed */
+	MESSAGE_CHECKPOINT,    /* job, iteration: a checkpoint of it is on the disk */
 	MESSAGE_NOISE,         /* job, noise_hu, alpha: what TV goes by, see recon_hooks.denoising */
 	MESSAGE_WARNING,       /* job, code, detail */
 	MESSAGE_ENDED, /* job, code (0, ERR_CANCELLED, ERR_BUSY = yielded at `iteration`, or what failed), text */
@@ -54,6 +56,7 @@ struct message {
 	char scan_directory[1024], job_directory[1024];
 	struct job_request request; /* START; recipe owned by the message: message_clear */
 	bool arriving, reduced;
+	double checkpoint_seconds;
 	uint8_t present[(VIEWS_MAX + 7) / 8]; /* START with `reduced`: bit k % 8 of byte k / 8 for projection k */
 	struct projection_runs runs;
 	int count;

@@ -16,6 +16,7 @@
 
 #include "core/recon/algorithm.h"
 #include "core/correct/stuck.h"
+#include "proto/checkpoint.h"
 #include "proto/durable.h"
 #include "proto/format.h"
 #include "proto/nifti.h"
@@ -36,7 +37,8 @@ struct run {
 	const struct reconstruction_hooks *hooks;
 	const char *directory;
 	const struct recipe *recipe;
-	const struct recon *recon; /* NULL before it is opened */
+	struct recon *recon;               /* NULL before it is opened */
+	struct checkpointer *checkpointer; /* NULL where nobody asks for checkpoints */
 	struct provenance provenance;
 	bool sealed; /* the volumes' files */
 	bool ahead;  /* the next volume's file is prepared while the device computes */
@@ -67,11 +69,43 @@ static bool run_cancelled(void *context)
 	return hooks->recon.cancelled != NULL && hooks->recon.cancelled(hooks->recon.context);
 }
 
+/* Announces a checkpoint that has reached the disk. */
+static int announce_checkpoint(struct run *run, bool wait, struct error *err)
+{
+	int iteration, code = checkpointer_settled(run->checkpointer, wait, &iteration, err);
+
+	if (code == 0 && iteration > 0)
+		code = run->hooks->on_checkpoint(run->hooks->recon.context, iteration, err);
+	return code;
+}
+
+/*
+ * Behind an iteration that is not the last. The volumes that were announced are on the disk before a checkpoint is
+ * begun: a run that goes on from it would not make them again.
+ */
+static int keep_checkpoint(struct run *run, struct error *err)
+{
+	int code = announce_checkpoint(run, false, err);
+
+	if (code != 0 || !checkpointer_due(run->checkpointer))
+		return code;
+	code = settle(run, false, err);
+	if (code != 0 || (run->saver != NULL && saver_busy(run->saver)))
+		return code;
+	return checkpointer_begin(run->checkpointer, run->recon, err);
+}
+
 static bool run_yield(void *context)
 {
-	const struct reconstruction_hooks *hooks = ((struct run *)context)->hooks;
+	struct run *run = context;
+	const struct reconstruction_hooks *hooks = run->hooks;
 
-	return hooks->recon.yield != NULL && hooks->recon.yield(hooks->recon.context);
+	if (hooks->recon.yield != NULL && hooks->recon.yield(hooks->recon.context))
+		return true;
+	/* The run's next question is whether it is cancelled, which the trouble answers. */
+	if (run->checkpointer != NULL && run->trouble.code == 0)
+		keep_checkpoint(run, &run->trouble);
+	return false;
 }
 
 static void prepare(struct run *run, enum stage stage, int iteration);
@@ -289,200 +323,6 @@ static int run_keep(void *context, struct recon *recon, const struct kept_volume
 	return code != 0 ? code : settle(run, false, err);
 }
 
-/* ---- checkpoints ---- */
-
-/*
- * After the line come the iterate, then the algorithm's state, then the list of the metal that was removed.
- * No noise is written as 0.
- */
-static void checkpoint_line(char ret_line[CHECKPOINT_FILE_OFFSET], int iteration, const struct grid *grid,
-			    size_t state_bytes, size_t metal_bytes, const struct volume_noise *noise)
-{
-	char text[CHECKPOINT_FILE_OFFSET], state[32] = "";
-
-	memset(ret_line, ' ', CHECKPOINT_FILE_OFFSET);
-	if (state_bytes > 0)
-		snprintf(state, sizeof(state), ", state %zu", state_bytes);
-	snprintf(text, sizeof(text), "cbctd checkpoint %d of %d %d %d, metal %zu, noise %a %a%s", iteration,
-		 grid->size[0], grid->size[1], grid->size[2], metal_bytes, noise->sigma, noise->contrast, state);
-	memcpy(ret_line, text, strlen(text));
-	ret_line[CHECKPOINT_FILE_OFFSET - 1] = '\n';
-}
-
-/* A checkpoint on its way to the disk. */
-struct sealed_file {
-	struct durable file;
-	struct seal_maker seal;
-};
-
-static int write_sealed(struct sealed_file *sealed, const void *bytes, size_t size, struct error *err)
-{
-	seal_maker_add(&sealed->seal, bytes, size);
-	return durable_write(&sealed->file, bytes, size, err);
-}
-
-static int write_end(struct sealed_file *sealed, struct error *err)
-{
-	size_t size = seal_bytes(sealed->seal.at);
-	char *end = malloc(size);
-	int code = end == NULL ? error_set(err, ERR_NO_MEMORY, "no memory for checksums") : 0;
-
-	if (code == 0) {
-		seal_write(sealed->seal.blocks, sealed->seal.at, end);
-		code = durable_write(&sealed->file, end, size, err);
-	}
-	free(end);
-	return code;
-}
-
-/* The iterate behind what the file holds already, piece by piece. */
-static int write_iterate(struct recon *recon, struct sealed_file *sealed, struct error *err)
-{
-	const struct grid *grid = recon_grid(recon);
-	size_t slice;
-	int slices = slices_of_a_piece(grid, PIECE_BYTES, &slice), code = 0;
-	float *voxels = malloc((size_t)slices * slice);
-
-	if (voxels == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for %d slices of %zu bytes", slices, slice);
-	for (int z = 0; z < grid->size[2] && code == 0; z += slices) {
-		int count = z + slices <= grid->size[2] ? slices : grid->size[2] - z;
-
-		code = recon_read(recon, z, count, voxels, err);
-		if (code == 0)
-			code = write_sealed(sealed, voxels, (size_t)count * slice, err);
-	}
-	free(voxels);
-	return code;
-}
-
-static int write_state(void *context, const void *bytes, size_t size, struct error *err)
-{
-	return write_sealed(context, bytes, size, err);
-}
-
-static int write_checkpoint(struct recon *recon, struct sealed_file *sealed, struct error *err)
-{
-	char header[CHECKPOINT_FILE_OFFSET];
-	size_t metal_bytes;
-	const void *metal = recon_found(recon, &metal_bytes);
-	const struct volume_noise *noise = recon_noise(recon), none = {0};
-	const struct checkpoint_sink sink = {.context = sealed, .write = write_state};
-	int code;
-
-	checkpoint_line(header, recon_iteration(recon), recon_grid(recon), recon_state_bytes(recon), metal_bytes,
-			noise != NULL ? noise : &none);
-	code = write_sealed(sealed, header, sizeof(header), err);
-	if (code == 0)
-		code = write_iterate(recon, sealed, err);
-	if (code == 0)
-		code = recon_save_state(recon, &sink, err);
-	if (code == 0 && metal_bytes > 0)
-		code = write_sealed(sealed, metal, metal_bytes, err);
-	return code != 0 ? code : write_end(sealed, err);
-}
-
-static int save_checkpoint(struct recon *recon, const char *directory, struct error *err)
-{
-	char path[PATH_MAX];
-	struct sealed_file sealed = {.seal = {0}};
-	size_t content = CHECKPOINT_FILE_OFFSET + grid_voxels(recon_grid(recon)) * sizeof(float), metal_bytes;
-	int code = path_join(path, sizeof(path), directory, CHECKPOINT_FILE, "", err);
-
-	recon_found(recon, &metal_bytes);
-	content += recon_state_bytes(recon) + metal_bytes;
-	if (code == 0)
-		code = seal_maker_new(content, &sealed.seal, err);
-	if (code == 0)
-		code = durable_open(&sealed.file, path, content + seal_bytes(content), err);
-	if (code == 0) {
-		code = write_checkpoint(recon, &sealed, err);
-		if (code != 0)
-			durable_abandon(&sealed.file);
-		else
-			code = durable_commit(&sealed.file, err);
-	}
-	seal_maker_clear(&sealed.seal);
-	return code;
-}
-
-static int check_checkpoint(const char *path, const char *bytes, const struct seal *seal, const struct recon *recon,
-			    int *ret_iteration, struct volume_noise *ret_noise, struct error *err)
-{
-	const struct grid *grid = recon_grid(recon);
-	const size_t state = recon_state_bytes(recon);
-	const size_t expected = CHECKPOINT_FILE_OFFSET + grid_voxels(grid) * sizeof(float) + state;
-	char text[CHECKPOINT_FILE_OFFSET + 1] = "", line[CHECKPOINT_FILE_OFFSET];
-	struct volume_noise noise;
-	int iteration, damaged = seal_first_damaged(seal, bytes);
-
-	if (damaged >= 0)
-		return error_set(err, ERR_INVALID, "%.200s: its block %d does not fit its checksum", path, damaged);
-	if (seal->content < expected)
-		return error_set(err, ERR_INVALID, "%.200s: %zu bytes, %zu are expected", path, seal->content,
-				 expected);
-	memcpy(text, bytes, CHECKPOINT_FILE_OFFSET);
-	if (sscanf(text, "cbctd checkpoint %d of %*d %*d %*d, metal %*u, noise %la %la", &iteration, &noise.sigma,
-		   &noise.contrast) != 3)
-		return error_set(err, ERR_INVALID, "%.200s is no checkpoint", path);
-	checkpoint_line(line, iteration, grid, state, seal->content - expected, &noise);
-	if (memcmp(line, bytes, sizeof(line)) != 0)
-		return error_set(err, ERR_INVALID, "%.200s is of another grid or algorithm", path);
-	*ret_iteration = iteration;
-	*ret_noise = noise;
-	return 0;
-}
-
-/* Mapped, not read: one volume less in memory at the worst moment. */
-static int resume(struct run *run, struct recon *recon, const char *path, int expected, struct error *err)
-{
-	int file = open(path, O_RDONLY | O_CLOEXEC), code, iteration = 0;
-	struct volume_noise noise;
-	struct seal seal = {0};
-	size_t metal;
-	char *bytes = MAP_FAILED;
-
-	if (file < 0 && errno == ENOENT)
-		return error_set(err, ERR_INVALID, "%.200s does not exist", path);
-	if (file < 0)
-		return error_set_errno(err, errno, "%s cannot be opened", path);
-	code = seal_read(file, &seal, err);
-	if (code == ERR_NOT_FOUND)
-		code = error_set(err, ERR_INVALID, "%.200s is damaged: it has no whole checksums", path);
-	if (code != 0)
-		goto out;
-	bytes = mmap(NULL, seal.content, PROT_READ, MAP_PRIVATE, file, 0);
-	if (bytes == MAP_FAILED) {
-		code = error_set(err, ERR_IO, "%.200s cannot be mapped", path);
-		goto out;
-	}
-	code = check_checkpoint(path, bytes, &seal, recon, &iteration, &noise, err);
-	if (code == 0)
-		code =
-		    recon_resume(recon, (const float *)(const void *)(bytes + CHECKPOINT_FILE_OFFSET), iteration, err);
-	if (code == 0 && run->recipe->tv.on)
-		code = recon_resume_noise(recon, &noise, err);
-	metal = CHECKPOINT_FILE_OFFSET + grid_voxels(recon_grid(recon)) * sizeof(float);
-	if (code == 0)
-		code = recon_resume_state(recon, bytes + metal, recon_state_bytes(recon), err);
-	metal += recon_state_bytes(recon);
-	if (code == 0 && seal.content > metal)
-		code = recon_resume_found(recon, bytes + metal, seal.content - metal, err);
-	if (code == 0 && iteration != expected) {
-		char detail[128];
-
-		snprintf(detail, sizeof(detail), "the checkpoint holds iteration %d, not %d: the run goes on behind %d",
-			 iteration, expected, iteration);
-		run_warning(run, "checkpoint", detail);
-	}
-out:
-	if (bytes != MAP_FAILED)
-		munmap(bytes, seal.content);
-	seal_clear(&seal);
-	close(file);
-	return code;
-}
-
 /* ---- the three steps ---- */
 
 struct reconstruction {
@@ -556,6 +396,30 @@ static int set_linearise(struct reconstruction *reconstruction, struct error *er
 	return 0;
 }
 
+static int resume(struct reconstruction *reconstruction, struct error *err)
+{
+	struct run *run = &reconstruction->run;
+	struct error damage;
+	char detail[128];
+	int code = checkpoint_resume(run->recon, reconstruction->options->checkpoint, reconstruction->iteration,
+				     &damage, err),
+	    iteration;
+
+	if (code != 0)
+		return code;
+	if (damage.code != 0)
+		run_warning(run, "damaged_checkpoint", damage.text);
+	iteration = recon_iteration(run->recon);
+	if (iteration != reconstruction->iteration) {
+		snprintf(detail, sizeof(detail), "the checkpoint holds iteration %d, not %d: the run goes on behind %d",
+			 iteration, reconstruction->iteration, iteration);
+		run_warning(run, "checkpoint", detail);
+	}
+	/* Opened again, it causes no second warning. */
+	reconstruction->iteration = iteration;
+	return 0;
+}
+
 static int open_recon(struct reconstruction *reconstruction, struct error *err)
 {
 	const struct reconstruction_options *options = reconstruction->options;
@@ -564,13 +428,7 @@ static int open_recon(struct reconstruction *reconstruction, struct error *err)
 			      &reconstruction->recon, err);
 
 	reconstruction->run.recon = reconstruction->recon;
-	if (code == 0 && reconstruction->resumed)
-		code = resume(&reconstruction->run, reconstruction->recon, options->checkpoint,
-			      reconstruction->iteration, err);
-	/* The iteration that the file holds: opened again, it causes no second warning. */
-	if (code == 0 && reconstruction->resumed)
-		reconstruction->iteration = recon_iteration(reconstruction->recon);
-	return code;
+	return code == 0 && reconstruction->resumed ? resume(reconstruction, err) : code;
 }
 
 static int open_first(struct reconstruction *reconstruction, struct error *err)
@@ -672,6 +530,9 @@ int reconstruction_open(const struct backend *backend, struct device *device,
 	reconstruction->options = options;
 	reconstruction->iteration = options->iteration;
 	reconstruction->resumed = options->checkpoint != NULL;
+	if (code == 0 && options->checkpoint_seconds > 0)
+		code = checkpointer_new(options->out_directory, options->checkpoint_seconds,
+					&reconstruction->run.checkpointer, err);
 	if (code == 0)
 		code = open_first(reconstruction, err);
 	if (code != 0)
@@ -685,6 +546,7 @@ void reconstruction_close(struct reconstruction *reconstruction)
 {
 	if (reconstruction == NULL)
 		return;
+	checkpointer_free(reconstruction->run.checkpointer);
 	saver_free(reconstruction->run.saver);
 	provenance_clear(&reconstruction->run.provenance);
 	recon_free(reconstruction->recon);
@@ -903,11 +765,14 @@ int reconstruction_finish(struct reconstruction *reconstruction, struct error *e
 	/* Announced volumes are settled, however the run ends. */
 	if (run->trouble.code == 0)
 		settle(run, true, &run->trouble);
+	/* A checkpoint on its way would take the place of one that is written now. */
+	if (run->trouble.code == 0 && run->checkpointer != NULL)
+		announce_checkpoint(run, true, &run->trouble);
 	if (run->trouble.code != 0 && (code == 0 || code == ERR_BUSY || code == ERR_CANCELLED)) {
 		*err = run->trouble;
 		return run->trouble.code;
 	}
-	if (code == ERR_BUSY && save_checkpoint(reconstruction->recon, run->directory, &trouble) != 0) {
+	if (code == ERR_BUSY && checkpoint_save(reconstruction->recon, run->directory, &trouble) != 0) {
 		*err = trouble;
 		code = trouble.code;
 	}

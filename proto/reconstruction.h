@@ -30,6 +30,9 @@ struct reconstruction_hooks {
 	int (*on_volume)(void *context, const struct kept_volume *volume, const struct saved_volume *saved,
 			 struct error *err);
 	int (*on_settled)(void *context, const char *name, struct error *err);
+	/* A checkpoint of that iteration is on the disk in out_directory (proto/checkpoint.h). NULL where none are
+	 * made. */
+	int (*on_checkpoint)(void *context, int iteration, struct error *err);
 	void (*on_open)(void *context, const struct recon_memory *memory, const char *plan);
 };
 
@@ -48,13 +51,14 @@ struct reconstruction_options {
 	const char *program, *job, *scan;
 	const struct patient *patient; /* NULL: as scan.json says */
 	/*
-	 * The checkpoint of a run that yielded, or NULL; `iteration` is the one it holds as far as the
-	 * caller knows. The file itself knows better (a crash may lie between its writing
-	 * and the caller's note): where they differ, the file counts and a warning
-	 * "checkpoint" says so. One that is missing or damaged is ERR_INVALID.
+	 * The checkpoint of a run that yielded or was broken off, or NULL; `iteration` is the one it holds as far
+	 * as the caller knows. The file itself knows better (a crash may lie between its writing and the caller's
+	 * note): where they differ, the file counts and a warning "checkpoint" says so. Where it is missing or
+	 * damaged the one before it serves (checkpoint_resume); without that: ERR_INVALID.
 	 */
 	const char *checkpoint;
 	int iteration;
+	double checkpoint_seconds; /* of work between two checkpoints; 0: none are made */
 	const struct reconstruction_hooks *hooks;
 };
 
@@ -78,19 +82,12 @@ int reconstruction_push(struct reconstruction *reconstruction, const int *projec
 int reconstruction_push_rest(struct reconstruction *reconstruction, struct error *err);
 /*
  * Once, when all are there: the rest of the pipeline. A run that hooks->recon.yield ended returns ERR_BUSY and has
- * left its iterate as OUT/checkpoint.f32, durably.
+ * left its iterate as a checkpoint in OUT, durably.
  */
 int reconstruction_finish(struct reconstruction *reconstruction, struct error *err);
 
 /* The three in a row. */
 int reconstruction_run(const struct backend *backend, struct device *device,
 		       const struct reconstruction_options *options, struct error *err);
-
-/*
- * A line of text padded to CHECKPOINT_FILE_OFFSET bytes with iteration, size and noise, then float32 voxels [z][y][x],
- * the list of metal where there is one, and a seal (proto/seal.h).
- */
-#define CHECKPOINT_FILE "checkpoint.f32"
-enum { CHECKPOINT_FILE_OFFSET = 160 };
 
 #endif

@@ -127,7 +127,7 @@ int recon_resume_state(struct recon *recon, const char *bytes, size_t size, stru
 
 /*
  * The noise that was measured; NULL before that and without TV. A resumed run must get it back
- * after recon_resume: the FDK volume that showed it is not made again.
+ * after recon_resume: the FDK volume that showed it is not made again. Without TV nothing is taken.
  */
 const struct volume_noise *recon_noise(const struct recon *recon);
 int recon_resume_noise(struct recon *recon, const struct volume_noise *noise, struct error *err);

@@ -135,8 +135,6 @@ static int checkpoint_of(const struct worker *worker, const struct outcome *outc
 	struct job_record record;
 
 	switch (outcome->from) {
-	case FROM_BEGINNING:
-		return worker->checkpoint;
 	case FROM_RECORDED:
 		job_record(worker->job, &record);
 		return record.checkpoint;

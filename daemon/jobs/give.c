@@ -55,8 +55,9 @@ static int make_start(struct supervise *supervise, const struct job *job, const 
 	if (code != 0)
 		return code;
 	stored_scan_facts(scan, &facts);
-	*message =
-	    (struct message){.kind = MESSAGE_START, .iteration = record->basis == facts.basis ? record->checkpoint : 0};
+	*message = (struct message){.kind = MESSAGE_START,
+				    .iteration = record->basis == facts.basis ? record->checkpoint : 0,
+				    .checkpoint_seconds = supervise->options.checkpoint_seconds};
 	snprintf(message->job, sizeof(message->job), "%s", record->id);
 	store_scan_directory(store, record->scan, message->scan_directory);
 	store_job_directory(store, record->id, message->job_directory);

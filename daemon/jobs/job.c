@@ -13,7 +13,7 @@
 #include "daemon/log.h"
 #include "proto/clock.h"
 #include "proto/json.h"
-#include "proto/reconstruction.h"
+#include "proto/checkpoint.h"
 
 /* ---- references ---- */
 
@@ -200,14 +200,19 @@ static void read_request(struct job *job)
 		job->unreadable.code = 0;
 }
 
-/* The iteration of the checkpoint that the row promises, if its file is there; else 0. */
+/* The iteration of the checkpoint that the row promises, if its file or the one before it is there; else 0. */
 static int checkpoint_there(const struct jobs *jobs, const struct job_record *record)
 {
+	static const char *const files[] = {CHECKPOINT_FILE, CHECKPOINT_FILE_BEFORE};
 	char directory[1024], path[1100];
 
 	store_job_directory(jobs->store, record->id, directory);
-	snprintf(path, sizeof(path), "%s/%s", directory, CHECKPOINT_FILE);
-	return record->checkpoint > 0 && access(path, R_OK) == 0 ? record->checkpoint : 0;
+	for (size_t i = 0; i < sizeof(files) / sizeof(files[0]); i++) {
+		snprintf(path, sizeof(path), "%s/%s", directory, files[i]);
+		if (record->checkpoint > 0 && access(path, R_OK) == 0)
+			return record->checkpoint;
+	}
+	return 0;
 }
 
 static int recover_waiting(struct job *job, struct error *err)

@@ -169,6 +169,11 @@ int jobs_victim(struct jobs *jobs, const enum priority *arriving, const struct q
 void job_set_plan(struct job *job, const struct recon_memory *memory, const char *plan);
 /* recon_hooks.denoising. Memory only, until the next change of state, as is the progress. */
 void job_set_denoising(struct job *job, double noise_hu, double alpha);
+/*
+ * A checkpoint of that iteration is on the disk: the job goes on from it when its worker or the daemon is lost, and
+ * workers that died before count against it no more. In one commit.
+ */
+int job_checkpointed(struct job *job, int iteration, struct error *err);
 void job_progress(struct job *job, enum stage stage, int iteration, double fraction);
 enum { JOB_ROWS_MAX = 64 };
 /* In one commit, all or none: 1 to JOB_ROWS_MAX rows, each with its event. */

@@ -140,6 +140,9 @@ static void on_message(struct supervise *supervise, struct worker *worker, const
 		worker->unsettled--;
 		digester_add(supervise->digester, message->job, message->name);
 		break;
+	case MESSAGE_CHECKPOINT:
+		code = job_checkpointed(worker->job, message->iteration, &err);
+		break;
 	case MESSAGE_WARNING:
 		code = job_add_warning(worker->job, message->code_name, message->text, &err);
 		break;

@@ -20,7 +20,7 @@ static const struct row {
     /* After the next start, since nothing can be recorded any more. */
     {1 << END_SYNC, 0, 0, {.to = BACK, .distrust = true}},
     /* The next start carries out a cancel that was asked for. */
-    {1 << END_STOPPED, 0, 0, {.to = BACK, .from = FROM_BEGINNING, .reason = "the daemon stops"}},
+    {1 << END_STOPPED, 0, 0, {.to = BACK, .from = FROM_RECORDED, .reason = "the daemon stops"}},
     /* A job that a client has cancelled meanwhile succeeds too: the result is there. */
     {1 << END_DONE, 0, CONDITION_UNRECORDED | CONDITION_STALE, {.to = JOB_SUCCEEDED, .reason = ""}},
     {ANY, CONDITION_CANCELLED, 0, {.to = JOB_CANCELLED, .reason = ""}},
@@ -28,13 +28,13 @@ static const struct row {
     {ANY,
      CONDITION_UNRECORDED | CONDITION_FULL,
      0,
-     {.to = BACK, .from = FROM_BEGINNING, .obstacle = JOB_NO_SPACE, .words = WORDS_DAEMON}},
+     {.to = BACK, .from = FROM_RECORDED, .obstacle = JOB_NO_SPACE, .words = WORDS_DAEMON}},
     {ANY, CONDITION_UNRECORDED, 0, {.to = JOB_FAILED, .words = WORDS_DAEMON}},
     /* A stale run comes back too: the job that begins again sees that its basis differs, and leaves the checkpoint. */
     {1 << END_MADE_ROOM, 0, 0, {.to = BACK, .from = FROM_SAID, .yielded = true, .reason = "it made room"}},
     /* Whatever the worker says of it, and if it dies over it: that is no fault of the job's. */
     {ANY, CONDITION_STALE, 0, {.to = BACK, .reason = "its scan is understood otherwise now"}},
-    {1 << END_NO_SPACE, 0, 0, {.to = BACK, .from = FROM_BEGINNING, .obstacle = JOB_NO_SPACE}},
+    {1 << END_NO_SPACE, 0, 0, {.to = BACK, .from = FROM_RECORDED, .obstacle = JOB_NO_SPACE}},
     {LOST | 1 << END_IO, CONDITION_BROKEN, 0, {.to = JOB_FAILED, .crashed = true}},
     {LOST, 0, 0, {.to = BACK, .from = FROM_RECORDED, .crashed = true}},
     /* No descriptor was free, or a disk was slow to answer. */

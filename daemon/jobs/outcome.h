@@ -43,9 +43,8 @@ enum condition {
 /* The point from which the job goes on. */
 enum outcome_from {
 	FROM_START,
-	FROM_BEGINNING, /* the checkpoint that this worker began from */
-	FROM_RECORDED,  /* the checkpoint that the catalogue knows */
-	FROM_SAID       /* the iteration of the worker's last message */
+	FROM_RECORDED, /* the checkpoint that the catalogue knows */
+	FROM_SAID      /* the iteration of the worker's last message */
 };
 
 /* The author of the words and of the error code that the log and a failed job bear. */

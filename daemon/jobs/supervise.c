@@ -361,6 +361,8 @@ static void set_options(struct supervise *supervise, const struct supervise_opti
 		supervise->options.hello_seconds = 30;
 	if (options->cancel_seconds <= 0)
 		supervise->options.cancel_seconds = 10;
+	if (options->checkpoint_seconds <= 0)
+		supervise->options.checkpoint_seconds = 5;
 	if (options->stop_seconds <= 0)
 		supervise->options.stop_seconds = 20;
 	supervise->count = options->workers < 1 ? 1 : options->workers > WORKERS_MAX ? WORKERS_MAX : options->workers;

@@ -25,15 +25,16 @@
 struct supervise;
 
 struct supervise_options {
-	const char *worker;    /* path of cbct-worker; NULL: beside this program, else from PATH */
-	const char *backend;   /* "auto", "cuda", "cpu" */
-	int workers;           /* 0 = 1 */
-	const int *devices;    /* [workers], the device of each; NULL: 0 .. workers - 1 */
-	int threads;           /* of the CPU backend; 0 = all */
-	size_t device_memory;  /* bytes a worker may use; 0 = what is free */
-	double hello_seconds;  /* until a new worker must have spoken; 0 = 30 */
-	double cancel_seconds; /* until a worker that does not cancel is killed; 0 = 10 */
-	double stop_seconds;   /* until a worker that does not leave its job at the stop is killed; 0 = 20 */
+	const char *worker;        /* path of cbct-worker; NULL: beside this program, else from PATH */
+	const char *backend;       /* "auto", "cuda", "cpu" */
+	int workers;               /* 0 = 1 */
+	const int *devices;        /* [workers], the device of each; NULL: 0 .. workers - 1 */
+	int threads;               /* of the CPU backend; 0 = all */
+	size_t device_memory;      /* bytes a worker may use; 0 = what is free */
+	double checkpoint_seconds; /* of work between two checkpoints of a job; 0 = 5 */
+	double hello_seconds;      /* until a new worker must have spoken; 0 = 30 */
+	double cancel_seconds;     /* until a worker that does not cancel is killed; 0 = 10 */
+	double stop_seconds;       /* until a worker that does not leave its job at the stop is killed; 0 = 20 */
 };
 
 /* The strings are copied. Returns at once; the first worker says hello later. */

@@ -258,6 +258,29 @@ void job_set_denoising(struct job *job, double noise_hu, double alpha)
 	pthread_mutex_unlock(&job->jobs->lock);
 }
 
+int job_checkpointed(struct job *job, int iteration, struct error *err)
+{
+	struct jobs *jobs = job->jobs;
+	struct job_record record;
+	int code;
+
+	pthread_mutex_lock(&jobs->change);
+	pthread_mutex_lock(&jobs->lock);
+	record = job->record;
+	pthread_mutex_unlock(&jobs->lock);
+	record.checkpoint = iteration;
+	record.crashes = 0;
+	code = store_job_update(jobs->store, &record, NULL, NULL, PAST_STAYS, err);
+	if (code == 0) {
+		pthread_mutex_lock(&jobs->lock);
+		job->record.checkpoint = record.checkpoint;
+		job->record.crashes = record.crashes;
+		pthread_mutex_unlock(&jobs->lock);
+	}
+	pthread_mutex_unlock(&jobs->change);
+	return code;
+}
+
 void job_progress(struct job *job, enum stage stage, int iteration, double fraction)
 {
 	pthread_mutex_lock(&job->jobs->lock);

@@ -11,7 +11,7 @@
 #include "daemon/store/internal.h"
 #include "daemon/store/deleted.h"
 #include "daemon/store/record.h"
-#include "proto/reconstruction.h"
+#include "proto/checkpoint.h"
 
 const char *const job_state_names[JOB_STATE_COUNT] = {"waiting",   "queued", "running",
 						      "succeeded", "failed", "cancelled"};
@@ -146,12 +146,15 @@ void store_job_remove_files(const struct store *store, const char *id)
 
 void store_job_remove_checkpoint(const struct store *store, const char *id)
 {
+	static const char *const files[] = {CHECKPOINT_FILE, CHECKPOINT_FILE_BEFORE};
 	char directory[1024], path[1100];
 
 	store_job_directory(store, id, directory);
-	snprintf(path, sizeof(path), "%s/%s", directory, CHECKPOINT_FILE);
-	if (unlink(path) < 0 && errno != ENOENT && errno != ENOTDIR)
-		log_line(LEVEL_WARNING, "job %s: %s stays: %s", id, path, strerror(errno));
+	for (size_t i = 0; i < sizeof(files) / sizeof(files[0]); i++) {
+		snprintf(path, sizeof(path), "%s/%s", directory, files[i]);
+		if (unlink(path) < 0 && errno != ENOENT && errno != ENOTDIR)
+			log_line(LEVEL_WARNING, "job %s: %s stays: %s", id, path, strerror(errno));
+	}
 }
 
 static int remove_volume(void *context, const char *name, struct error *err)

@@ -156,6 +156,81 @@ test_a_dead_worker_takes_nothing_with_it() {
 	stop_daemon
 }
 
+# held_at FILE: the iteration of a checkpoint, 0 where there is none
+held_at() {
+	local text
+	text=$(head -c 40 "$work/state/jobs/$job/$1" 2>/dev/null | tr -d '\0') || true
+	[[ $text =~ ^cbctd\ checkpoint\ ([0-9]+) ]] && echo "${BASH_REMATCH[1]}" || echo 0
+}
+held_behind() { # ITERATION: waits until the newest checkpoint is of a later one; prints it
+	local i at
+	for ((i = 0; i < 400; i++)); do
+		at=$(held_at checkpoint.f32)
+		[ "$at" -le "$1" ] || { echo "$at"; return 0; }
+		sleep 0.02
+	done
+	fail "a checkpoint behind iteration $1"
+}
+
+test_a_job_goes_on_from_its_newest_checkpoint_however_often_it_is_killed() {
+	local recipe at=0 i many=250
+	for recipe in '"sart": {"iterations": '$many', "subsets": "views"}, "tv": {"method": "gradient", "iterations": 1}' '"cgls": {"iterations": '$many'}'; do
+		at=0
+		start_daemon --checkpoint-seconds 0.05
+		post_scan "$scan_dir"
+		post_projections "$scan_dir"
+		recipe="{\"scan\": \"SCAN\", $grid, \"fdk\": {}, $recipe, \"emit\": [20]}"
+		post_job "$recipe"
+		wait_job succeeded 240
+		[ ! -e "$work/state/jobs/$job/checkpoint.f32" ] || fail "no checkpoint of a job that has ended"
+		cp "$body" "$work/undisturbed"
+		get_volume final "$work/final.undisturbed" format=raw
+		post_job "$recipe"
+		# More often than a job without progress may lose its worker; every third time the daemon goes, too.
+		for ((i = 1; i <= 5; i++)); do
+			at=$(held_behind "$at")
+			if [ $((i % 3)) = 0 ]; then
+				stop_daemon KILL
+				at=$(held_at checkpoint.f32)
+				start_daemon --checkpoint-seconds 0.05
+			else
+				kill -9 "$(worker_of)"
+			fi
+			running_at "$at"
+			expect_json '.state == "running" or .state == "queued" or .state == "succeeded"'
+		done
+		wait_job succeeded 240
+		expect_json ".attempts > 3 and ([.history[].iteration] == [range(1; $many + 1)])"
+		diff <(jq -S '[.history[] | del(.seconds)]' "$body") <(jq -S '[.history[] | del(.seconds)]' "$work/undisturbed") ||
+			fail "the history of an undisturbed run"
+		get_volume final "$work/final" format=raw
+		cmp "$work/final" "$work/final.undisturbed" || fail "the bits of an undisturbed run"
+		stop_daemon
+	done
+}
+
+test_a_damaged_checkpoint_is_passed_over_for_the_one_before_it() {
+	local at before
+	start_daemon --checkpoint-seconds 0.05
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "{\"scan\": \"SCAN\", $grid, \"sart\": {\"iterations\": $long, \"subsets\": \"views\"}}"
+	wait_job succeeded 240
+	get_volume final "$work/final.undisturbed" format=raw
+	post_job "{\"scan\": \"SCAN\", $grid, \"sart\": {\"iterations\": $long, \"subsets\": \"views\"}}"
+	at=$(held_behind "$(held_behind 0)")
+	stop_daemon KILL
+	before=$(held_at checkpoint-before.f32)
+	[ "$before" -gt 0 ] || fail "two checkpoints kept in turn"
+	printf 'X' | dd of="$work/state/jobs/$job/checkpoint.f32" bs=1 seek=5000 conv=notrunc status=none
+	start_daemon --checkpoint-seconds 0.05
+	wait_job succeeded 240
+	expect_json '[.warnings[].code] | index("damaged_checkpoint")'
+	get_volume final "$work/final" format=raw
+	cmp "$work/final" "$work/final.undisturbed" || fail "the bits of an undisturbed run"
+	stop_daemon
+}
+
 # A job whose FDK volume is told of and stays unsettled for as long as $hold is there.
 hold=$work/hold
 told_and_held() {

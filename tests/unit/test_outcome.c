@@ -29,9 +29,9 @@ static const struct {
     {0, END_SYNC, CANCELLED, {.to = JOB_QUEUED, .distrust = true}},
     {0, END_SYNC, UNRECORDED, {.to = JOB_QUEUED, .distrust = true}},
     /* The daemon stops. */
-    {1, END_STOPPED, 0, {.to = JOB_QUEUED, .from = FROM_BEGINNING}},
-    {1, END_STOPPED, ARRIVING, {.to = JOB_WAITING, .from = FROM_BEGINNING}},
-    {1, END_STOPPED, CANCELLED | BROKEN, {.to = JOB_QUEUED, .from = FROM_BEGINNING}},
+    {1, END_STOPPED, 0, {.to = JOB_QUEUED, .from = FROM_RECORDED}},
+    {1, END_STOPPED, ARRIVING, {.to = JOB_WAITING, .from = FROM_RECORDED}},
+    {1, END_STOPPED, CANCELLED | BROKEN, {.to = JOB_QUEUED, .from = FROM_RECORDED}},
     /* Done. */
     {2, END_DONE, 0, {.to = JOB_SUCCEEDED}},
     {2, END_DONE, ARRIVING, {.to = JOB_SUCCEEDED}},
@@ -45,15 +45,15 @@ static const struct {
     {3, END_DONE, CANCELLED | UNRECORDED, {.to = JOB_CANCELLED}},
     {3, END_DAMAGED, CANCELLED | STALE, {.to = JOB_CANCELLED}},
     /* The daemon could not record something. */
-    {4, END_OTHER, FULL, {.to = JOB_QUEUED, .from = FROM_BEGINNING, .obstacle = JOB_NO_SPACE, .words = WORDS_DAEMON}},
+    {4, END_OTHER, FULL, {.to = JOB_QUEUED, .from = FROM_RECORDED, .obstacle = JOB_NO_SPACE, .words = WORDS_DAEMON}},
     {4,
      END_DONE,
      FULL | ARRIVING,
-     {.to = JOB_WAITING, .from = FROM_BEGINNING, .obstacle = JOB_NO_SPACE, .words = WORDS_DAEMON}},
+     {.to = JOB_WAITING, .from = FROM_RECORDED, .obstacle = JOB_NO_SPACE, .words = WORDS_DAEMON}},
     {4,
      END_DIED,
      FULL | BROKEN,
-     {.to = JOB_QUEUED, .from = FROM_BEGINNING, .obstacle = JOB_NO_SPACE, .words = WORDS_DAEMON}},
+     {.to = JOB_QUEUED, .from = FROM_RECORDED, .obstacle = JOB_NO_SPACE, .words = WORDS_DAEMON}},
     {5, END_OTHER, UNRECORDED, {.to = JOB_FAILED, .words = WORDS_DAEMON}},
     {5, END_DONE, UNRECORDED | STALE, {.to = JOB_FAILED, .words = WORDS_DAEMON}},
     {5, END_DIED, UNRECORDED | ARRIVING, {.to = JOB_FAILED, .words = WORDS_DAEMON}},
@@ -68,8 +68,8 @@ static const struct {
     {7, END_DIED, STALE | BROKEN, {.to = JOB_QUEUED}},
     {7, END_DAMAGED, STALE | DOUBTED, {.to = JOB_QUEUED}},
     /* The disk is full. */
-    {8, END_NO_SPACE, 0, {.to = JOB_QUEUED, .from = FROM_BEGINNING, .obstacle = JOB_NO_SPACE}},
-    {8, END_NO_SPACE, ARRIVING | BROKEN, {.to = JOB_WAITING, .from = FROM_BEGINNING, .obstacle = JOB_NO_SPACE}},
+    {8, END_NO_SPACE, 0, {.to = JOB_QUEUED, .from = FROM_RECORDED, .obstacle = JOB_NO_SPACE}},
+    {8, END_NO_SPACE, ARRIVING | BROKEN, {.to = JOB_WAITING, .from = FROM_RECORDED, .obstacle = JOB_NO_SPACE}},
     /* Broken off as often as may be. */
     {9, END_DIED, BROKEN, {.to = JOB_FAILED, .crashed = true}},
     {9, END_DEVICE, BROKEN, {.to = JOB_FAILED, .crashed = true}},

@@ -23,6 +23,7 @@
 #include "proto/format.h"
 #include "proto/saver.h"
 #include "proto/seal.h"
+#include "proto/checkpoint.h"
 #include "proto/reconstruction.h"
 #include "proto/scan_directory.h"
 

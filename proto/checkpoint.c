@@ -1,0 +1,381 @@
+/* Checkpoints: see checkpoint.h. */
+#include "proto/checkpoint.h"
+
+#include <errno.h>
+#include <fcntl.h>
+#include <limits.h>
+#include <math.h>
+#include <pthread.h>
+#include <stdatomic.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/mman.h>
+#include <unistd.h>
+
+#include "proto/clock.h"
+#include "proto/durable.h"
+#include "proto/scan_directory.h"
+#include "proto/seal.h"
+
+enum { PIECE_BYTES = 8 << 20 }; /* voxels in one go on their way to the disk */
+static const double SHARE = 50; /* a copy takes at most one part in so many of the time */
+
+/* ---- writing ---- */
+
+/*
+ * After the line come the iterate, then the algorithm's state, then the list of the metal that was removed.
+ * No noise is written as 0.
+ */
+static void checkpoint_line(char ret_line[CHECKPOINT_FILE_OFFSET], int iteration, const struct grid *grid,
+			    size_t state_bytes, size_t metal_bytes, const struct volume_noise *noise)
+{
+	char text[CHECKPOINT_FILE_OFFSET], state[32] = "";
+
+	memset(ret_line, ' ', CHECKPOINT_FILE_OFFSET);
+	if (state_bytes > 0)
+		snprintf(state, sizeof(state), ", state %zu", state_bytes);
+	snprintf(text, sizeof(text), "cbctd checkpoint %d of %d %d %d, metal %zu, noise %a %a%s", iteration,
+		 grid->size[0], grid->size[1], grid->size[2], metal_bytes, noise->sigma, noise->contrast, state);
+	memcpy(ret_line, text, strlen(text));
+	ret_line[CHECKPOINT_FILE_OFFSET - 1] = '\n';
+}
+
+/* A checkpoint on its way to the disk. */
+struct sealed_file {
+	struct durable file;
+	struct seal_maker seal;
+};
+
+static int write_sealed(struct sealed_file *sealed, const void *bytes, size_t size, struct error *err)
+{
+	seal_maker_add(&sealed->seal, bytes, size);
+	return durable_write(&sealed->file, bytes, size, err);
+}
+
+static int write_end(struct sealed_file *sealed, struct error *err)
+{
+	size_t size = seal_bytes(sealed->seal.at);
+	char *end = malloc(size);
+	int code = end == NULL ? error_set(err, ERR_NO_MEMORY, "no memory for checksums") : 0;
+
+	if (code == 0) {
+		seal_write(sealed->seal.blocks, sealed->seal.at, end);
+		code = durable_write(&sealed->file, end, size, err);
+	}
+	free(end);
+	return code;
+}
+
+/* Whole slices, at least one. */
+static int slices_of_a_piece(const struct grid *grid, size_t *ret_slice)
+{
+	const size_t slice = (size_t)grid->size[0] * (size_t)grid->size[1] * sizeof(float);
+	const int slices = slice < PIECE_BYTES ? (int)(PIECE_BYTES / slice) : 1;
+
+	*ret_slice = slice;
+	return slices < grid->size[2] ? slices : grid->size[2];
+}
+
+/* The iterate behind what the file holds already, piece by piece. */
+static int write_iterate(struct recon *recon, struct sealed_file *sealed, struct error *err)
+{
+	const struct grid *grid = recon_grid(recon);
+	size_t slice;
+	int slices = slices_of_a_piece(grid, &slice), code = 0;
+	float *voxels = malloc((size_t)slices * slice);
+
+	if (voxels == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for %d slices of %zu bytes", slices, slice);
+	for (int z = 0; z < grid->size[2] && code == 0; z += slices) {
+		int count = z + slices <= grid->size[2] ? slices : grid->size[2] - z;
+
+		code = recon_read(recon, z, count, voxels, err);
+		if (code == 0)
+			code = write_sealed(sealed, voxels, (size_t)count * slice, err);
+	}
+	free(voxels);
+	return code;
+}
+
+static int write_state(void *context, const void *bytes, size_t size, struct error *err)
+{
+	return write_sealed(context, bytes, size, err);
+}
+
+static int write_checkpoint(struct recon *recon, struct sealed_file *sealed, struct error *err)
+{
+	char header[CHECKPOINT_FILE_OFFSET];
+	size_t metal_bytes;
+	const void *metal = recon_found(recon, &metal_bytes);
+	const struct volume_noise *noise = recon_noise(recon), none = {0};
+	const struct checkpoint_sink sink = {.context = sealed, .write = write_state};
+	int code;
+
+	checkpoint_line(header, recon_iteration(recon), recon_grid(recon), recon_state_bytes(recon), metal_bytes,
+			noise != NULL ? noise : &none);
+	code = write_sealed(sealed, header, sizeof(header), err);
+	if (code == 0)
+		code = write_iterate(recon, sealed, err);
+	if (code == 0)
+		code = recon_save_state(recon, &sink, err);
+	if (code == 0 && metal_bytes > 0)
+		code = write_sealed(sealed, metal, metal_bytes, err);
+	return code != 0 ? code : write_end(sealed, err);
+}
+
+/* The whole file, under its name beside `path`; nothing is left of it when that fails. `path` is borrowed. */
+static int write_beside(struct recon *recon, const char *path, struct durable *ret_file, struct error *err)
+{
+	struct sealed_file sealed = {.seal = {0}};
+	size_t content = CHECKPOINT_FILE_OFFSET + grid_voxels(recon_grid(recon)) * sizeof(float), found_bytes;
+	int code;
+
+	recon_found(recon, &found_bytes);
+	content += recon_state_bytes(recon) + found_bytes;
+	code = seal_maker_new(content, &sealed.seal, err);
+	if (code == 0)
+		code = durable_open(&sealed.file, path, content + seal_bytes(content), err);
+	if (code == 0) {
+		code = write_checkpoint(recon, &sealed, err);
+		if (code != 0)
+			durable_abandon(&sealed.file);
+	}
+	seal_maker_clear(&sealed.seal);
+	if (code == 0)
+		*ret_file = sealed.file;
+	return code;
+}
+
+static int path_of(const char *directory, const char *name, char ret_path[PATH_MAX], struct error *err)
+{
+	return path_join(ret_path, PATH_MAX, directory, name, "", err);
+}
+
+int checkpoint_save(struct recon *recon, const char *directory, struct error *err)
+{
+	char path[PATH_MAX], before[PATH_MAX];
+	struct durable file;
+	int code = path_of(directory, CHECKPOINT_FILE, path, err);
+
+	if (code == 0)
+		code = path_of(directory, CHECKPOINT_FILE_BEFORE, before, err);
+	if (code == 0)
+		code = write_beside(recon, path, &file, err);
+	if (code == 0)
+		code = durable_commit(&file, err);
+	if (code == 0)
+		unlink(before);
+	return code;
+}
+
+/* ---- while the run goes on ---- */
+
+struct checkpointer {
+	char path[PATH_MAX], before[PATH_MAX];
+	double seconds, due; /* the latter by clock_monotonic */
+	/* The thread that syncs, from checkpointer_begin until checkpointer_settled has joined it. */
+	pthread_t thread;
+	bool busy;
+	atomic_bool done; /* the thread has written result, and ends */
+	struct durable file;
+	int iteration;
+	struct error result;
+};
+
+int checkpointer_new(const char *directory, double seconds, struct checkpointer **ret, struct error *err)
+{
+	struct checkpointer *checkpointer = calloc(1, sizeof(*checkpointer));
+	int code = checkpointer == NULL ? error_set(err, ERR_NO_MEMORY, "no memory for checkpoints") : 0;
+
+	if (code == 0)
+		code = path_of(directory, CHECKPOINT_FILE, checkpointer->path, err);
+	if (code == 0)
+		code = path_of(directory, CHECKPOINT_FILE_BEFORE, checkpointer->before, err);
+	if (code != 0) {
+		free(checkpointer);
+		return code;
+	}
+	checkpointer->seconds = seconds;
+	checkpointer->due = clock_monotonic() + seconds;
+	*ret = checkpointer;
+	return 0;
+}
+
+void checkpointer_free(struct checkpointer *checkpointer)
+{
+	if (checkpointer == NULL)
+		return;
+	if (checkpointer->busy)
+		pthread_join(checkpointer->thread, NULL);
+	free(checkpointer);
+}
+
+bool checkpointer_due(const struct checkpointer *checkpointer)
+{
+	return !checkpointer->busy && clock_monotonic() >= checkpointer->due;
+}
+
+/* What was the newest has its second name before the file that takes its first one is synced. */
+static void *sync_and_name(void *context)
+{
+	struct checkpointer *checkpointer = context;
+	struct error *result = &checkpointer->result;
+
+	result->code = 0;
+	if (rename(checkpointer->path, checkpointer->before) != 0 && errno != ENOENT) {
+		error_set_errno(result, errno, "%s cannot be renamed", checkpointer->path);
+		durable_abandon(&checkpointer->file);
+	} else {
+		durable_commit(&checkpointer->file, result);
+	}
+	atomic_store(&checkpointer->done, true);
+	return NULL;
+}
+
+int checkpointer_begin(struct checkpointer *checkpointer, struct recon *recon, struct error *err)
+{
+	const double begin = clock_monotonic();
+	int code = write_beside(recon, checkpointer->path, &checkpointer->file, err), result;
+
+	checkpointer->due = clock_monotonic() + fmax(checkpointer->seconds, SHARE * (clock_monotonic() - begin));
+	if (code == ERR_NO_SPACE)
+		return 0;
+	if (code != 0)
+		return code;
+	checkpointer->iteration = recon_iteration(recon);
+	atomic_store(&checkpointer->done, false);
+	result = pthread_create(&checkpointer->thread, NULL, sync_and_name, checkpointer);
+	checkpointer->busy = result == 0;
+	if (result == 0)
+		return 0;
+	durable_abandon(&checkpointer->file);
+	return error_set_errno(err, result, "thread for checkpoints");
+}
+
+int checkpointer_settled(struct checkpointer *checkpointer, bool wait, int *ret_iteration, struct error *err)
+{
+	*ret_iteration = 0;
+	if (!checkpointer->busy || (!wait && !atomic_load(&checkpointer->done)))
+		return 0;
+	pthread_join(checkpointer->thread, NULL);
+	checkpointer->busy = false;
+	if (checkpointer->result.code == ERR_NO_SPACE)
+		return 0;
+	if (checkpointer->result.code != 0) {
+		*err = checkpointer->result;
+		return err->code;
+	}
+	*ret_iteration = checkpointer->iteration;
+	return 0;
+}
+
+/* ---- reading ---- */
+
+static int check_checkpoint(const char *path, const char *bytes, const struct seal *seal, const struct recon *recon,
+			    int *ret_iteration, struct volume_noise *ret_noise, struct error *err)
+{
+	const struct grid *grid = recon_grid(recon);
+	const size_t state = recon_state_bytes(recon);
+	const size_t expected = CHECKPOINT_FILE_OFFSET + grid_voxels(grid) * sizeof(float) + state;
+	char text[CHECKPOINT_FILE_OFFSET + 1] = "", line[CHECKPOINT_FILE_OFFSET];
+	struct volume_noise noise;
+	int iteration, damaged = seal_first_damaged(seal, bytes);
+
+	if (damaged >= 0)
+		return error_set(err, ERR_INVALID, "%.200s: its block %d does not fit its checksum", path, damaged);
+	if (seal->content < expected)
+		return error_set(err, ERR_INVALID, "%.200s: %zu bytes, %zu are expected", path, seal->content,
+				 expected);
+	memcpy(text, bytes, CHECKPOINT_FILE_OFFSET);
+	if (sscanf(text, "cbctd checkpoint %d of %*d %*d %*d, metal %*u, noise %la %la", &iteration, &noise.sigma,
+		   &noise.contrast) != 3)
+		return error_set(err, ERR_INVALID, "%.200s is no checkpoint", path);
+	checkpoint_line(line, iteration, grid, state, seal->content - expected, &noise);
+	if (memcmp(line, bytes, sizeof(line)) != 0)
+		return error_set(err, ERR_INVALID, "%.200s is of another grid or algorithm", path);
+	*ret_iteration = iteration;
+	*ret_noise = noise;
+	return 0;
+}
+
+/* Mapped, not read: one volume less in memory at the worst moment. */
+static int resume_from(struct recon *recon, const char *path, struct error *err)
+{
+	int file = open(path, O_RDONLY | O_CLOEXEC), code, iteration = 0;
+	struct volume_noise noise;
+	struct seal seal = {0};
+	size_t at;
+	char *bytes = MAP_FAILED;
+
+	if (file < 0 && errno == ENOENT)
+		return error_set(err, ERR_INVALID, "%.200s does not exist", path);
+	if (file < 0)
+		return error_set_errno(err, errno, "%s cannot be opened", path);
+	code = seal_read(file, &seal, err);
+	if (code == ERR_NOT_FOUND)
+		code = error_set(err, ERR_INVALID, "%.200s is damaged: it has no whole checksums", path);
+	if (code != 0)
+		goto out;
+	bytes = mmap(NULL, seal.content, PROT_READ, MAP_PRIVATE, file, 0);
+	if (bytes == MAP_FAILED) {
+		code = error_set(err, ERR_IO, "%.200s cannot be mapped", path);
+		goto out;
+	}
+	code = check_checkpoint(path, bytes, &seal, recon, &iteration, &noise, err);
+	if (code == 0)
+		code =
+		    recon_resume(recon, (const float *)(const void *)(bytes + CHECKPOINT_FILE_OFFSET), iteration, err);
+	if (code == 0)
+		code = recon_resume_noise(recon, &noise, err);
+	at = CHECKPOINT_FILE_OFFSET + grid_voxels(recon_grid(recon)) * sizeof(float);
+	if (code == 0)
+		code = recon_resume_state(recon, bytes + at, recon_state_bytes(recon), err);
+	at += recon_state_bytes(recon);
+	if (code == 0 && seal.content > at)
+		code = recon_resume_found(recon, bytes + at, seal.content - at, err);
+out:
+	if (bytes != MAP_FAILED)
+		munmap(bytes, seal.content);
+	seal_clear(&seal);
+	close(file);
+	return code;
+}
+
+/* The iteration that a checkpoint's first line names; 0 where there is none. */
+static int iteration_of(const char *path)
+{
+	char line[CHECKPOINT_FILE_OFFSET + 1] = "";
+	int file = open(path, O_RDONLY | O_CLOEXEC), iteration = 0;
+
+	if (file < 0)
+		return 0;
+	if (read(file, line, CHECKPOINT_FILE_OFFSET) != CHECKPOINT_FILE_OFFSET ||
+	    sscanf(line, "cbctd checkpoint %d of", &iteration) != 1)
+		iteration = 0;
+	close(file);
+	return iteration;
+}
+
+int checkpoint_resume(struct recon *recon, const char *path, int expected, struct error *ret_damage, struct error *err)
+{
+	const char *slash = strrchr(path, '/'), *first = path, *second;
+	const int directory = slash == NULL ? 0 : (int)(slash - path) + 1;
+	char before[PATH_MAX];
+	struct error other;
+	int code;
+
+	ret_damage->code = 0;
+	if (snprintf(before, sizeof(before), "%.*s%s", directory, path, CHECKPOINT_FILE_BEFORE) >= (int)sizeof(before))
+		return error_set(err, ERR_INVALID, "a path of %zu bytes is too long", strlen(path));
+	second = before;
+	if (iteration_of(path) != expected && iteration_of(before) == expected) {
+		first = before;
+		second = path;
+	}
+	code = resume_from(recon, first, err);
+	if (code != ERR_INVALID || resume_from(recon, second, &other) != 0)
+		return code;
+	*ret_damage = *err;
+	return 0;
+}

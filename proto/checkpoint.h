@@ -1,0 +1,48 @@
+#ifndef CBCT_PROTO_CHECKPOINT_H
+#define CBCT_PROTO_CHECKPOINT_H
+
+#include <stdbool.h>
+
+#include "core/recon/recon.h"
+
+/*
+ * Checkpoints: all that a reconstruction needs to go on behind an iteration and to end with the bits
+ * of a run that was never broken off. A file is a line of text padded to CHECKPOINT_FILE_OFFSET bytes
+ * with iteration, size and noise, then float32 voxels [z][y][x], what the algorithm holds, the list of
+ * metal where there is one, and a seal (proto/seal.h). The directory has two, the newest as
+ * CHECKPOINT_FILE and the one before it as CHECKPOINT_FILE_BEFORE, so that there is one to go on from
+ * where the newest turns out to be damaged.
+ */
+#define CHECKPOINT_FILE "checkpoint.f32"
+#define CHECKPOINT_FILE_BEFORE "checkpoint-before.f32"
+enum { CHECKPOINT_FILE_OFFSET = 160 };
+
+/* Writes the checkpoint durably, as the only one. For a run that stops here. */
+int checkpoint_save(struct recon *recon, const char *directory, struct error *err);
+
+/*
+ * Gives an opened recon the checkpoint at `path`, or the one before it in the same directory: whichever is of the
+ * expected iteration, which the caller has the history of, else the newest. Where that is missing or damaged the other
+ * one serves; *ret_damage then says why, its code is 0 otherwise. Without any: ERR_INVALID.
+ */
+int checkpoint_resume(struct recon *recon, const char *path, int expected, struct error *ret_damage, struct error *err);
+
+/*
+ * Checkpoints of a run that goes on. The iterate is copied into a file's pages by the caller's thread and
+ * synced by another, so that no memory is held and the iterations wait for the copy alone. One thread calls.
+ */
+struct checkpointer;
+/* seconds: of work between two checkpoints. */
+int checkpointer_new(const char *directory, double seconds, struct checkpointer **ret, struct error *err);
+void checkpointer_free(struct checkpointer *checkpointer); /* waits for the disk; NULL is fine */
+/*
+ * Whether the next checkpoint is due: so many seconds of work after the last, or later where the copies
+ * would take more than a fiftieth of the time, and the last one is on the disk.
+ */
+bool checkpointer_due(const struct checkpointer *checkpointer);
+/* Begins a checkpoint of the iterate as it is. A disk without room is no error: there is none then. */
+int checkpointer_begin(struct checkpointer *checkpointer, struct recon *recon, struct error *err);
+/* *ret_iteration: of the checkpoint that has reached the disk since the last call, 0: none has. */
+int checkpointer_settled(struct checkpointer *checkpointer, bool wait, int *ret_iteration, struct error *err);
+
+#endif
