@@ -72,6 +72,31 @@ static inline void algebra_mask(size_t count, const float *x, float *y)
 		y[i] = isnan(x[i]) ? 0 : y[i];
 }
 
+/*
+ * The mean around element `at` of a line of `count` elements, `stride` apart, over `width` of them: see stack_average
+ * of backend.h.
+ */
+static inline float algebra_mean_around(const float *line, int count, size_t stride, int at, double width)
+{
+	const int room = at < count - 1 - at ? at : count - 1 - at;
+	const double reach = fmin((width - 1) / 2, room);
+	const int whole = (int)reach, most = whole < room ? whole + 1 : whole;
+	double sum = 0, weights = 0;
+
+	if (isnan(line[(size_t)at * stride]))
+		return NAN;
+	for (int k = -most; k <= most; k++) {
+		const float value = line[(size_t)(at + k) * stride];
+		const double weight = k < -whole || k > whole ? reach - whole : 1;
+
+		if (isnan(value))
+			continue;
+		sum += weight * (double)value;
+		weights += weight;
+	}
+	return (float)(sum / weights);
+}
+
 static inline void algebra_fill(size_t count, float value, float *y)
 {
 	for (size_t i = 0; i < count; i++)

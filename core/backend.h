@@ -318,6 +318,13 @@ struct backend {
 	int (*stack_fill)(struct stack *y, int count, float value, struct error *err);
 	/* y = 0 where x is NaN. */
 	int (*stack_mask)(const struct stack *x, const int *slots, int count, struct stack *y, struct error *err);
+	/*
+	 * Each pixel of one slot becomes the mean over width[0] columns and width[1] rows (>= 1, odd numbers of pixels
+	 * or with shares of the outermost ones) around it. At the detector's edge the range shrinks on both sides, so
+	 * that its centre stays; NaN stays NaN, and is no part of others' means. work: a stack of the same detector,
+	 * whose slot 0 is overwritten.
+	 */
+	int (*stack_average)(struct stack *y, int slot, const double width[2], struct stack *work, struct error *err);
 	int (*sync)(struct device *device, struct error *err);
 };
 

@@ -63,8 +63,13 @@ const struct warning_kind warning_kinds[] = {
     {"truncated", SEVERITY_CAUTION,
      "The patient is wider than the detector: gray values are estimates, most of all near the rim of the image."},
     {"outside_grid", SEVERITY_INFO, "The patient goes on outside of the image, and the image allows for it."},
+    {"averaged_pixels", SEVERITY_INFO,
+     "The image's voxels are coarser than what the projections show, which was smoothed to fit them; smaller voxels "
+     "would show more."},
     {"grid_unseen", SEVERITY_SERIOUS, "The image lies where no projection sees it: it shows nothing."},
     {"grid_too_small", SEVERITY_CAUTION, "The image was asked for as a single voxel or a line of voxels."},
+    {"sparse_views", SEVERITY_CAUTION,
+     "There are far fewer projections than so fine an image needs: expect streaks, most of all away from the centre."},
     {"slices_unseen", SEVERITY_CAUTION,
      "The first or last slices are not seen by all projections: their gray values are not reliable."},
     {"end_slices", SEVERITY_CAUTION,

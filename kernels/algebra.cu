@@ -136,3 +136,47 @@ int cuda_stack_mask(const struct stack *x, const int *slots, int count, struct s
 {
 	return over_stack(mask{}, x, slots, count, y, err);
 }
+
+/* As algebra_mean_around of core/algebra.h; a thread for each pixel, `along` floats between neighbours of its line. */
+static __global__ void __launch_bounds__(THREADS)
+    average(const float *x, float *y, int rows, int columns, int pitch, bool by_rows, float width)
+{
+	int column = blockIdx.x * blockDim.x + threadIdx.x, row = blockIdx.y * blockDim.y + threadIdx.y;
+
+	if (column >= columns || row >= rows)
+		return;
+	int at = by_rows ? row : column, last = (by_rows ? rows : columns) - 1, along = by_rows ? pitch : 1;
+	int room = min(at, last - at);
+	float reach = fminf((width - 1) / 2, (float)room);
+	int whole = (int)reach, most = min(whole + 1, room);
+	size_t place = (size_t)row * pitch + column;
+	float sum = 0, weights = 0;
+
+	for (int k = -most; k <= most; k++) {
+		float value = x[(long)place + (long)k * along], weight = abs(k) > whole ? reach - whole : 1.0f;
+
+		if (!isnan(value)) {
+			sum += weight * value;
+			weights += weight;
+		}
+	}
+	y[place] = isnan(x[place]) ? x[place] : sum / weights;
+}
+
+int cuda_stack_average(struct stack *y, int slot, const double width[2], struct stack *work, struct error *err)
+{
+	struct device *device = y->device;
+	const struct stack_shape *shape = &y->shape;
+	float *data = y->data + (size_t)slot * shape->slot;
+	dim3 threads(32, THREADS / 32), blocks(divide_up(shape->columns, 32), divide_up(shape->rows, THREADS / 32));
+
+	TRY(device_enter(device, err));
+	average<<<blocks, threads, 0, device->stream>>>(data, work->data, shape->rows, shape->columns, shape->pitch,
+							false, (float)width[0]);
+	LAUNCHED();
+	average<<<blocks, threads, 0, device->stream>>>(work->data, data, shape->rows, shape->columns, shape->pitch,
+							true, (float)width[1]);
+	LAUNCHED();
+	TRY(mark_used(device, work->used, err));
+	return mark_used(device, y->used, err);
+}

@@ -260,5 +260,6 @@ const struct backend backend_cuda = {
     .volume_maximum = cuda_volume_maximum,
     .stack_fill = cuda_stack_fill,
     .stack_mask = cuda_stack_mask,
+    .stack_average = cuda_stack_average,
     .sync = cuda_sync,
 };

@@ -569,6 +569,7 @@ int cuda_stack_multiply(const struct stack *x, int count, struct stack *y, struc
 int cuda_volume_maximum(double a, const struct volume *x, struct volume *y, struct error *err);
 int cuda_stack_fill(struct stack *y, int count, float value, struct error *err);
 int cuda_stack_mask(const struct stack *x, const int *slots, int count, struct stack *y, struct error *err);
+int cuda_stack_average(struct stack *y, int slot, const double width[2], struct stack *work, struct error *err);
 int cuda_plan_bytes(struct device *device, const struct plan_options *options, struct plan_bytes *ret_bytes,
 		    struct error *err);
 int cuda_plan_new(struct device *device, const struct plan_options *options, struct plan **ret_plan, struct error *err);

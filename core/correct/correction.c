@@ -6,16 +6,17 @@
 #include "core/correct/input.h"
 
 extern const struct correction correction_flat_dark, correction_air_region, correction_hardening, correction_defects,
-    correction_samples, correction_truncation, correction_exterior, correction_blank_views, correction_metal;
+    correction_samples, correction_truncation, correction_exterior, correction_blank_views, correction_metal,
+    correction_averaging;
 
 /*
  * In the order in which they run. Defects of the map are known before an air region's mean is taken, and hardening is
  * that of line integrals. The exterior goes before what leaves rays out, which it could not see through. Blank views
- * are made up for before metal is looked for.
+ * are made up for before metal is looked for. Pixels are averaged when the rays that are left out are known.
  */
 const struct correction *const corrections[CORRECTION_COUNT] = {
     &correction_flat_dark,  &correction_defects,  &correction_air_region,  &correction_hardening, &correction_samples,
-    &correction_truncation, &correction_exterior, &correction_blank_views, &correction_metal,
+    &correction_truncation, &correction_exterior, &correction_blank_views, &correction_metal,     &correction_averaging,
 };
 
 static bool is_wanted(const struct correction *row, const struct recipe *recipe, const struct linearise *linearise)

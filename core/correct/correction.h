@@ -119,7 +119,7 @@ struct correction {
 	int (*resume)(const struct correction_job *job, void *state, const void *bytes, size_t size, struct error *err);
 };
 
-enum { CORRECTION_COUNT = 9 };
+enum { CORRECTION_COUNT = 10 };
 extern const struct correction *const corrections[CORRECTION_COUNT];
 
 /* The corrections of one reconstruction. */

@@ -133,3 +133,21 @@ int cpu_stack_mask(const struct stack *x, const int *slots, int count, struct st
 		algebra_mask(slot_floats(y), slot(x, slots, i), slot(y, NULL, i));
 	return 0;
 }
+
+int cpu_stack_average(struct stack *y, int at, const double width[2], struct stack *work, struct error *err)
+{
+	float *to = slot(y, NULL, at), *between = slot(work, NULL, 0);
+
+	(void)err;
+#pragma omp parallel for num_threads(y->device->threads) schedule(static)
+	for (int r = 0; r < y->rows; r++)
+		for (int c = 0; c < y->columns; c++)
+			between[(size_t)c * (size_t)y->rows + (size_t)r] =
+			    algebra_mean_around(to + r, y->columns, (size_t)y->rows, c, width[0]);
+#pragma omp parallel for num_threads(y->device->threads) schedule(static)
+	for (int c = 0; c < y->columns; c++)
+		for (int r = 0; r < y->rows; r++)
+			to[(size_t)c * (size_t)y->rows + (size_t)r] =
+			    algebra_mean_around(between + (size_t)c * (size_t)y->rows, y->rows, 1, r, width[1]);
+	return 0;
+}

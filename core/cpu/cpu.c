@@ -467,5 +467,6 @@ const struct backend backend_cpu = {
     .volume_maximum = cpu_volume_maximum,
     .stack_fill = cpu_stack_fill,
     .stack_mask = cpu_stack_mask,
+    .stack_average = cpu_stack_average,
     .sync = cpu_sync,
 };

@@ -316,6 +316,7 @@ int cpu_stack_multiply(const struct stack *x, int count, struct stack *y, struct
 int cpu_volume_maximum(double a, const struct volume *x, struct volume *y, struct error *err);
 int cpu_stack_fill(struct stack *y, int count, float value, struct error *err);
 int cpu_stack_mask(const struct stack *x, const int *slots, int count, struct stack *y, struct error *err);
+int cpu_stack_average(struct stack *y, int slot, const double width[2], struct stack *work, struct error *err);
 
 /* norms.c */
 int cpu_norms(struct plan *plan, const struct volume *volume, const struct volume *other, double unit,

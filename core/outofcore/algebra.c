@@ -130,3 +130,21 @@ int outofcore_stack_mask(const struct stack *x, const int *slots, int count, str
 		algebra_mask(y->pixels, slot(x, slots, i), slot(y, NULL, i));
 	return 0;
 }
+
+int outofcore_stack_average(struct stack *y, int at, const double width[2], struct stack *work, struct error *err)
+{
+	float *to = slot(y, NULL, at), *between = slot(work, NULL, 0);
+
+	(void)err;
+#pragma omp parallel for schedule(static)
+	for (int r = 0; r < y->rows; r++)
+		for (int c = 0; c < y->columns; c++)
+			between[(size_t)r * (size_t)y->columns + (size_t)c] =
+			    algebra_mean_around(to + (size_t)r * (size_t)y->columns, y->columns, 1, c, width[0]);
+#pragma omp parallel for schedule(static)
+	for (int c = 0; c < y->columns; c++)
+		for (int r = 0; r < y->rows; r++)
+			to[(size_t)r * (size_t)y->columns + (size_t)c] =
+			    algebra_mean_around(between + c, y->rows, (size_t)y->columns, r, width[1]);
+	return 0;
+}

@@ -126,6 +126,7 @@ int outofcore_stack_multiply(const struct stack *x, int count, struct stack *y, 
 int outofcore_volume_maximum(double a, const struct volume *x, struct volume *y, struct error *err);
 int outofcore_stack_fill(struct stack *y, int count, float value, struct error *err);
 int outofcore_stack_mask(const struct stack *x, const int *slots, int count, struct stack *y, struct error *err);
+int outofcore_stack_average(struct stack *y, int slot, const double width[2], struct stack *work, struct error *err);
 
 /* ---- tv.c ---- */
 int outofcore_tv(struct plan *plan, struct volume *volume, const struct tv_options *options,

@@ -339,5 +339,6 @@ const struct backend backend_outofcore = {
     .volume_maximum = outofcore_volume_maximum,
     .stack_fill = outofcore_stack_fill,
     .stack_mask = outofcore_stack_mask,
+    .stack_average = outofcore_stack_average,
     .sync = outofcore_sync,
 };

@@ -16,6 +16,7 @@
 #include <math.h>
 #include <stdlib.h>
 
+#include "core/correct/averaging.h"
 #include "core/recon/recon.h"
 
 /*
@@ -229,10 +230,11 @@ static const double SART_NOISE = 0.2, NOISE_POWER = 0.85, FINENESS_POWER = 0.9, 
 /*
  * What SART adds beside noise goes with the contrast. With few views, streaks. Where the detector resolves more than
  * the grid can hold (`fineness`, pixel over voxel, below FINE), strong edges overshoot: that is bone, and the third
- * power of the contrast beside STRONG of water's attenuation tells it from soft tissue.
+ * power of the contrast beside STRONG of water's attenuation tells it from soft tissue. Where pixels are finer
+ * still, they are averaged if they show edges (core/correct/averaging.h), and AVERAGED of it is left.
  */
 static const double FEW = 0.012, FEW_VIEWS = 60, FEWEST_VIEWS = 40;
-static const double EDGES = 0.057, FINE = 0.63, STRONG = 0.28;
+static const double EDGES = 0.057, FINE = 0.63, STRONG = 0.28, AVERAGED = 0.25;
 
 /* Beyond it, TV moves nothing that a float of a gray level could tell. */
 static const double ALPHA_MOST = 1e9;
@@ -248,8 +250,9 @@ static double reach_after_sart(const struct volume_noise *noise, const struct re
 	const double fineness = sqrt(pixel[0] * pixel[1]) / cbrt(mm[0] * mm[1] * mm[2]);
 	const double updates = recipe->sart.relaxation * subsets_count(recipe->sart.subsets, orbit->count) / UPDATES;
 	const double streaks = FEW * pow(FEW_VIEWS / fmax(orbit->count, FEWEST_VIEWS), 4);
+	const double left = 1 - (1 - AVERAGED) * averaging_fineness(1 / fineness);
 	const double edges =
-	    EDGES * fmax(0, 1 - pow(fineness / FINE, 4)) * pow(noise->contrast / (STRONG * recipe->mu_water), 3);
+	    EDGES * left * fmax(0, 1 - pow(fineness / FINE, 4)) * pow(noise->contrast / (STRONG * recipe->mu_water), 3);
 	const double noisy = SART_NOISE * pow(noise->sigma, NOISE_POWER) * pow(noise->contrast, 1 - NOISE_POWER) *
 			     pow(fmin(fineness, FINENESS_MOST), FINENESS_POWER);
 

@@ -314,7 +314,7 @@ int recon_run(struct recon *recon, struct error *err)
 		return code;
 	recon->ran = true;
 	if (!recon->resumed) {
-		warn_recipe(&recon->warnings, recon->geometry, recipe);
+		warn_recipe(&recon->warnings, recon->geometry, &recon->orbit, recipe);
 		code = corrections_warn(&recon->corrections, err);
 	}
 	if (code == 0)

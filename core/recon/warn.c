@@ -74,7 +74,29 @@ static void warn_of_small_grid(const struct warning_sink *sink, const struct gri
 			     grid->spacing[2]);
 }
 
-void warn_recipe(const struct warning_sink *sink, const struct geometry *geometry, const struct recipe *recipe)
+/*
+ * Views that stand apart by the angle d leave a body of radius r streaks from a distance of v / d from the axis on, v
+ * being the voxel (Kak and Slaney, Principles of Computerized Tomographic Imaging, ch. 5): r d / v is 1 for as many
+ * views as the grid could use. Half of them, and a quarter, are common.
+ */
+static void warn_of_sparse_views(const struct warning_sink *sink, const struct orbit *orbit, const struct grid *grid)
+{
+	const double caution = 16, pi = acos(-1);
+	const double across = fmax(grid->size[0] * grid->spacing[0], grid->size[1] * grid->spacing[1]);
+	const double radius = fmin(across, orbit->field_of_view) / 2, voxel = fmin(grid->spacing[0], grid->spacing[1]);
+	const double step = orbit->arc / orbit->count, apart = step * radius / voxel;
+
+	/* Fewer than five directions are told with the scan (few_views). */
+	if (orbit_directions(orbit) >= 5 && apart > caution)
+		warning_tell(
+		    sink, "sparse_views",
+		    "%d views, %.3g degrees apart, are %.3g voxels apart at %.4g mm from the axis: streaks; about "
+		    "%.0f views are what a grid of %.3g mm can use, or voxels of %.3g mm what these views can",
+		    orbit->count, step * 180 / pi, apart, radius, ceil(orbit->count * apart), voxel, voxel * apart);
+}
+
+void warn_recipe(const struct warning_sink *sink, const struct geometry *geometry, const struct orbit *orbit,
+		 const struct recipe *recipe)
 {
 	const struct grid *grid = &recipe->grid;
 
@@ -92,6 +114,7 @@ void warn_recipe(const struct warning_sink *sink, const struct geometry *geometr
 		    grid->size[0] * grid->spacing[0], grid->size[1] * grid->spacing[1],
 		    grid->size[2] * grid->spacing[2]);
 	warn_of_small_grid(sink, grid);
+	warn_of_sparse_views(sink, orbit, grid);
 	if (recipe->tv.on && !recipe->tv.after_fdk && recipe->algorithm == NULL)
 		warning_tell(sink, "tv_without_sart",
 			     "TV was wanted after SART iterations, and there are none: the FDK volume is left alone");

@@ -8,8 +8,12 @@
 
 /* Warnings of a reconstruction, in words; those of its corrections are in their rows. For core/ only. */
 
-/* "grid_unseen", "grid_too_small", "tv_without_sart". Warnings of the orbit come with the scan (proto/scan.h). */
-void warn_recipe(const struct warning_sink *sink, const struct geometry *geometry, const struct recipe *recipe);
+/*
+ * "grid_unseen", "grid_too_small", "sparse_views", "tv_without_sart". Warnings of the orbit come with the scan
+ * (proto/scan.h).
+ */
+void warn_recipe(const struct warning_sink *sink, const struct geometry *geometry, const struct orbit *orbit,
+		 const struct recipe *recipe);
 /* "residual_high": SART has ended, and the volume explains less than half of the projections. */
 void warn_residual(const struct warning_sink *sink, const struct history_row *row);
 /* "tv_without_effect": explicit settings that cannot move a voxel by a fair share of the noise. */

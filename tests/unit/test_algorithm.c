@@ -194,6 +194,64 @@ START_TEST(stacks_are_added_multiplied_and_divided_by_slots)
 }
 END_TEST
 
+/* The mean over a window of `width` elements' extent around `at`, cut on both sides to what lies within the line. */
+static double window_mean(const float *line, int count, int stride, int at, double width)
+{
+	const double reach = fmin((width - 1) / 2, fmin(at, count - 1 - at)) + 0.5;
+	double sum = 0, weights = 0;
+
+	if (isnan(line[at * stride]))
+		return NAN;
+	for (int i = 0; i < count; i++) {
+		/* The part of element i, from i - 1/2 to i + 1/2, that the window covers. */
+		const double covered = fmin(i + 0.5, at + reach) - fmax(i - 0.5, at - reach);
+
+		if (covered > 0 && !isnan(line[i * stride])) {
+			sum += covered * (double)line[i * stride];
+			weights += covered;
+		}
+	}
+	return sum / weights;
+}
+
+/* Whole and broken widths, one wider than the detector, and none; a ray that is left out takes no part. */
+START_TEST(pixels_of_one_slot_are_averaged)
+{
+	static const double widths[][2] = {{1, 1}, {3, 1}, {1, 2.4}, {2.5, 3.8}, {100, 5}};
+	float x[SLOTS * PIXELS], rows[PIXELS], got[SLOTS * PIXELS];
+	struct stack *stack, *work;
+	struct table t;
+
+	table_open(&t, _i, NULL);
+	fill(x, SLOTS * PIXELS, 5);
+	x[2 * PIXELS + 3 * COLUMNS + 4] = NAN;
+	ok(t.backend->stack_new(t.device, COLUMNS, ROWS, SLOTS, &stack, &err));
+	ok(t.backend->stack_new(t.device, COLUMNS, ROWS, 1, &work, &err));
+	for (size_t k = 0; k < sizeof(widths) / sizeof(widths[0]); k++) {
+		ok(t.backend->stack_upload(stack, 0, SLOTS, x, &err));
+		ok(t.backend->stack_average(stack, 2, widths[k], work, &err));
+		ok(t.backend->stack_download(stack, 0, SLOTS, got, &err));
+		for (int i = 0; i < SLOTS * PIXELS; i++)
+			if (i / PIXELS != 2)
+				ck_assert_double_eq((double)got[i], (double)x[i]);
+		for (int i = 0; i < PIXELS; i++)
+			rows[i] = (float)window_mean(x + 2 * PIXELS + i / COLUMNS * COLUMNS, COLUMNS, 1, i % COLUMNS,
+						     widths[k][0]);
+		for (int i = 0; i < PIXELS; i++) {
+			const double want = window_mean(rows + i % COLUMNS, ROWS, COLUMNS, i / COLUMNS, widths[k][1]);
+
+			if (isnan(want))
+				ck_assert(isnan(got[2 * PIXELS + i]));
+			else
+				ck_assert_double_eq_tol((double)got[2 * PIXELS + i], want, 1e-5);
+		}
+	}
+	t.backend->stack_free(stack);
+	t.backend->stack_free(work);
+	table_close(&t);
+}
+END_TEST
+
 /* ---- every row ---- */
 
 static void add_ball(struct scene *scene, double radius, double density, double x, double y, double z)
@@ -319,6 +377,34 @@ START_TEST(a_run_that_yielded_ends_with_the_same_bits)
 	ck_assert_mem_eq(second.last, whole.last, sizeof(float) * grid_voxels(&whole.grid));
 	for (int i = 0; i < 2; i++)
 		ck_assert_double_eq(second.rows[i].residual, whole.rows[2 + i].residual);
+	outcome_clear(&whole);
+	outcome_clear(&first);
+	outcome_clear(&second);
+	scene_clear(&scene);
+}
+END_TEST
+
+/* Pixels of which two and a half make a voxel, and balls with edges: told once. */
+START_TEST(a_run_whose_pixels_are_averaged_goes_on_with_the_same_bits)
+{
+	struct grid grid = grid_of(15, 14, 14, 4.2, 4.2, 4.2);
+	struct recipe recipe = small_recipe(&algorithm_sart);
+	struct scene scene;
+	struct outcome whole = {0}, first = {.yield_at = 1}, second = {0};
+
+	recipe.grid = grid;
+	recipe.fdk.on = true;
+	recipe.iterate.iterations = 2;
+	small_scene(&scene);
+	run(&scene, &recipe, &whole);
+	ck_assert_ptr_nonnull(strstr(whole.warnings, "averaged_pixels: "));
+	scene_run(&scene, &recipe, &first);
+	ck_assert_int_eq(first.code, ERR_BUSY);
+	second.resume = first.last;
+	second.resume_iteration = first.iteration;
+	run(&scene, &recipe, &second);
+	ck_assert_ptr_null(strstr(second.warnings, "averaged_pixels: "));
+	ck_assert_mem_eq(second.last, whole.last, sizeof(float) * grid_voxels(&grid));
 	outcome_clear(&whole);
 	outcome_clear(&first);
 	outcome_clear(&second);
@@ -504,9 +590,11 @@ Suite *algorithm_suite(void)
 	tcase_set_timeout(cgls, 0);
 	tcase_add_loop_test(algebra, volumes_are_added_multiplied_and_divided, 0, 2);
 	tcase_add_loop_test(algebra, stacks_are_added_multiplied_and_divided_by_slots, 0, 2);
+	tcase_add_loop_test(algebra, pixels_of_one_slot_are_averaged, 0, 2);
 	tcase_add_loop_test(algebra, sart_in_plain_steps_is_the_fused_one, 0, 8);
 	tcase_add_test(rows, every_algorithm_is_found_by_its_name);
 	tcase_add_loop_test(rows, a_run_that_yielded_ends_with_the_same_bits, 0, 2 * ALGORITHM_COUNT);
+	tcase_add_test(rows, a_run_whose_pixels_are_averaged_goes_on_with_the_same_bits);
 	tcase_add_loop_test(rows, every_algorithm_can_be_cancelled_and_stops_by_its_rules, 0, ALGORITHM_COUNT);
 	tcase_add_loop_test(cgls, the_residual_of_conjugate_gradients_falls, 0, 4 * SCENES);
 	tcase_add_test(cgls, conjugate_gradients_by_default_are_no_worse_than_fdk);

@@ -145,7 +145,8 @@ struct circumstances {
 
 static double alpha_of(struct circumstances of, enum noise_stage stage)
 {
-	const struct orbit orbit = {.count = of.views, .pixel_at_isocentre = {1, 1}};
+	const struct orbit orbit = {
+	    .count = of.views, .pixel_at_isocentre = {1, 1}, .frame = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}};
 	struct recipe recipe;
 
 	recipe_defaults(&recipe);
@@ -170,7 +171,9 @@ START_TEST(alpha_falls_with_noise_and_strength_and_goes_with_the_unit)
 	     */
 	    {{1e-5, .004, TV_MEDIUM, 2e-5, 1, 10, 100}, 5, 50},
 	    {{1e-5, .004, TV_MEDIUM, 2e-5, 1, 10, 40}, .3, 1},
-	    {{1e-5, .006, TV_MEDIUM, 2e-5, 4, 10, 100}, .1, 1},
+	    {{1e-5, .006, TV_MEDIUM, 2e-5, 2, 10, 100}, .1, 1},
+	    /* Where pixels are averaged, bone overshoots less. */
+	    {{1e-5, .006, TV_MEDIUM, 2e-5, 4, 10, 100}, 1, 5},
 	    {{.0005, .004, TV_LIGHT, 2e-5, 1, 10, 100}, 2 - 1e-9, 2 + 1e-9},
 	    {{.0005, .004, TV_STRONG, 2e-5, 1, 10, 100}, .5 - 1e-9, .5 + 1e-9},
 	    {{.0005, .004, TV_MEDIUM, 4e-5, 1, 10, 100}, 2 - 1e-9, 2 + 1e-9},
@@ -264,6 +267,36 @@ START_TEST(the_default_takes_the_noise_and_leaves_the_anatomy)
 }
 END_TEST
 
+/* Rays of pixels that are a quarter of a voxel wide: without a mean over them, 37 HU after ten iterations. */
+START_TEST(pixels_finer_than_the_voxels_do_not_make_iterations_worse_than_fdk)
+{
+	static const struct anatomy_spec spec = {ABDOMEN, .25, 1.6, {56, 40, 12}, .4, 60, 200, 1e5, 151};
+	struct anatomy_scan scan;
+	struct recipe recipe;
+	struct image_figures fdk, found[2];
+	int emit[] = {3, 10};
+	double alpha;
+
+	ck_assert_int_eq(anatomy_scan_make(&scan, &spec, &err), 0);
+	recipe_defaults(&recipe);
+	recipe.has_grid = recipe.has_origin = true;
+	recipe.grid = scan.grid;
+	recipe.fdk.on = true;
+	reconstruct(&scan, &recipe, &fdk, &alpha);
+	recipe.tv.on = true;
+	recipe.algorithm = &algorithm_sart;
+	recipe.emit = emit;
+	recipe.emits = 2;
+	reconstruct(&scan, &recipe, found, &alpha);
+	for (int k = THIRD; k <= TENTH; k++)
+		ck_assert_msg(found[k].rmse < 0.75 * fdk.rmse, "iteration %d: %.1f HU, FDK %.1f", emit[k],
+			      found[k].rmse, fdk.rmse);
+	ck_assert_msg(found[TENTH].rmse <= 1.05 * found[THIRD].rmse, "from %.1f to %.1f HU", found[THIRD].rmse,
+		      found[TENTH].rmse);
+	anatomy_scan_clear(&scan);
+}
+END_TEST
+
 /* Spheres of 30 HU and four voxels in a head without noise: SART with TV shows them as SART without does. */
 START_TEST(small_contrasts_stay_where_there_is_no_noise)
 {
@@ -305,6 +338,7 @@ Suite *noise_suite(void)
 	tcase_add_test(measure, alpha_falls_with_noise_and_strength_and_goes_with_the_unit);
 	tcase_add_loop_test(anatomy, the_default_takes_the_noise_and_leaves_the_anatomy, 0,
 			    sizeof(anatomies) / sizeof(anatomies[0]));
+	tcase_add_test(anatomy, pixels_finer_than_the_voxels_do_not_make_iterations_worse_than_fdk);
 	tcase_add_test(anatomy, small_contrasts_stay_where_there_is_no_noise);
 	suite_add_tcase(suite, measure);
 	suite_add_tcase(suite, anatomy);

@@ -258,6 +258,31 @@ START_TEST(any_limit_gives_the_same_volume)
 }
 END_TEST
 
+/* Voxels of more than two pixels, and a body with edges. */
+START_TEST(pixels_are_averaged_in_parts)
+{
+	const struct linearise linearise = {.sample = SAMPLE_FLOAT32};
+	struct grid grid = grid_of(27, 25, 25, 2.7, 2.7, 2.7);
+	struct recipe recipe = recipe_on(&grid);
+	struct scene scene;
+	struct result whole, parts;
+
+	make_scene(&scene, &full);
+	recipe.fdk.on = true;
+	recipe.algorithm = &algorithm_sart;
+	recipe.iterate.iterations = 2;
+	whole = reconstruct(&scene, &recipe, &linearise, scene.projections, 0);
+	parts = reconstruct(&scene, &recipe, &linearise, scene.projections, whole.memory.total / 4);
+	expect_parts(&parts, 1);
+	ck_assert_ptr_nonnull(strstr(parts.warnings, "averaged_pixels: "));
+	ck_assert_str_eq(parts.warnings, whole.warnings);
+	ck_assert_double_lt(apart(parts.volume, whole.volume, grid_voxels(&grid)), 1e-5);
+	result_clear(&whole);
+	result_clear(&parts);
+	scene_clear(&scene);
+}
+END_TEST
+
 /* Its exterior in parts as well: a cylinder that goes on beyond the grid and the rows, and a grid inside of it. */
 START_TEST(what_lies_outside_of_the_grid_is_left_out_in_parts)
 {
@@ -352,6 +377,7 @@ Suite *outofcore_suite(void)
 	tcase_set_timeout(tests, 300);
 	tcase_add_loop_test(tests, outofcore_give_what_the_whole_gives, 0, (int)(sizeof(cases) / sizeof(cases[0])));
 	tcase_add_test(tests, any_limit_gives_the_same_volume);
+	tcase_add_test(tests, pixels_are_averaged_in_parts);
 	tcase_add_loop_test(tests, what_lies_outside_of_the_grid_is_left_out_in_parts, 0, 2);
 	tcase_add_test(tests, what_metal_takes_of_the_host_is_said);
 	tcase_add_test(tests, defects_are_counted_once);

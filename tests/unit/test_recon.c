@@ -439,6 +439,29 @@ START_TEST(slices_that_lack_views_are_told_where_the_object_is_there)
 }
 END_TEST
 
+/* 8 and 40 views of a ball on 64 x 64 voxels: 25 and 5 voxels apart at the rim. */
+START_TEST(views_too_few_for_the_grid_are_told)
+{
+	const int views = _i == 0 ? 8 : 40;
+	const struct orbit_spec spec = {96, 12, views, {600, 1100, {2.2, 2.2}, {0, 0}, {0, 0}}, 3, 360.0 / views};
+	struct grid grid = grid_of(64, 64, 4, 1, 1, 1);
+	struct recipe recipe = recipe_on(&grid);
+	struct outcome outcome = {0};
+	struct scene scene;
+
+	recipe.fdk.on = true;
+	scene_orbit(&scene, &spec);
+	add_ball(&scene, 25, 0.02, 1, 2, 0);
+	run(&scene, &recipe, &outcome);
+	ck_assert_msg((strstr(outcome.warnings, "sparse_views: 8 views, 45 degrees apart, are 25.1 voxels apart") !=
+		       NULL) == (_i == 0),
+		      "%s", outcome.warnings);
+	ck_assert_int_eq(strstr(outcome.warnings, "sparse_views: ") != NULL, _i == 0);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
 START_TEST(a_grid_without_a_cross_section_is_told)
 {
 	struct grid grid = _i == 0   ? grid_of(1, 1, 1, 5, 5, 5)
@@ -2068,6 +2091,7 @@ Suite *recon_suite(void)
 	tcase_add_test(images, one_row_and_one_slice_give_a_disc);
 	tcase_add_loop_test(images, the_automatic_grid_has_no_slice_that_lacks_views, 0, 2);
 	tcase_add_loop_test(images, slices_that_lack_views_are_told_where_the_object_is_there, 0, 4);
+	tcase_add_loop_test(images, views_too_few_for_the_grid_are_told, 0, 2);
 	tcase_add_loop_test(images, a_grid_without_a_cross_section_is_told, 0, 3);
 	tcase_add_loop_test(images, a_residual_that_stays_high_is_told_at_the_end, 0, 3);
 	tcase_add_test(images, a_single_view_is_explained_by_sart_and_harmless_to_fdk);

@@ -1,0 +1,128 @@
+/*
+ * Whether projections show more than the grid can hold (core/correct/averaging.h): objects of voxels do not, bodies
+ * with edges do, whatever the noise.
+ */
+#include <check.h>
+#include <math.h>
+#include <stdlib.h>
+
+#include "core/correct/averaging.h"
+#include "tests/unit/anatomy.h"
+#include "tests/unit/scene.h"
+
+Suite *averaging_suite(void);
+
+static struct error err;
+
+static double ratio_of(const struct geometry *geometry, const float *projections, double pixels)
+{
+	const size_t size = (size_t)geometry->columns * (size_t)geometry->rows;
+	struct averaging_sums sums[AVERAGING_DISTANCES] = {0};
+	int distances[AVERAGING_DISTANCES];
+
+	averaging_distances(pixels, distances);
+	for (int view = 0; view < geometry->count; view++)
+		for (int i = 0; i < AVERAGING_DISTANCES; i++)
+			ck_assert_int_eq(averaging_add(projections + size * (size_t)view, geometry->columns,
+						       geometry->rows, 1, distances[i], &sums[i], &err),
+					 0);
+	return averaging_ratio(pixels, sums);
+}
+
+enum { SIDE = 40, VIEWS = 8 };
+static const double CUBE = 96; /* mm */
+
+/* The head of Kak and Slaney: as linear interpolation between voxels has it, and its exact integrals. _i: fineness. */
+START_TEST(an_object_of_voxels_has_no_more_than_its_grid)
+{
+	static const double pixels[] = {2.2, 3, 4.1};
+	const double m = pixels[_i], pixel = CUBE / SIDE / m;
+	const int across = (int)(1.45 * CUBE / pixel);
+	const struct orbit_spec spec = {across, across,
+					VIEWS,  {620, 1100, {pixel / 620 * 1100, pixel / 620 * 1100}, {0, 0}, {0, 0}},
+					7,      360. / VIEWS};
+	const struct grid grid = grid_of(SIDE, SIDE, SIDE, CUBE / SIDE, CUBE / SIDE, CUBE / SIDE);
+	float *volume = malloc(sizeof(*volume) * grid_voxels(&grid));
+	struct phantom head;
+	struct scene scene;
+	double of_voxels, exact;
+
+	ck_assert_ptr_nonnull(volume);
+	ck_assert_int_eq(phantom_named(&head, "head", CUBE / 2, .0192, &err), 0);
+	phantom_voxelise(&head, &grid, 2, volume);
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &head);
+	exact = ratio_of(&scene.geometry, scene.projections, m);
+	for (int view = 0; view < VIEWS; view++)
+		volume_project_fine(volume, &grid, &scene.geometry, view, SAMPLE_TRILINEAR, .2 * CUBE / SIDE,
+				    scene.projections + (size_t)across * (size_t)across * (size_t)view);
+	of_voxels = ratio_of(&scene.geometry, scene.projections, m);
+	ck_assert_msg(of_voxels > 0.1 && of_voxels < AVERAGING_SMOOTH && exact > 0.17,
+		      "%g pixels a voxel: of voxels %.3f, exact %.3f", m, of_voxels, exact);
+	ck_assert_double_eq(averaging_share(of_voxels), 0);
+	ck_assert_double_eq(averaging_share(exact), 1);
+	free(volume);
+	phantom_clear(&head);
+	scene_clear(&scene);
+}
+END_TEST
+
+/* Each anatomy with much noise and with none. */
+START_TEST(anatomy_has_edges_within_voxels_whatever_the_noise)
+{
+	static const struct anatomy_spec specs[ANATOMY_COUNT] = {
+	    {HEAD, .4, 2, {40, 50, 12}, .6, 24, 360, 0, 121},
+	    {HEAD_AND_NECK, .6, 1.2, {66, 62, 14}, .5, 24, 200, 0, 104},
+	    {WRIST, .8, .7, {74, 54, 14}, .25, 24, 360, 0, 107},
+	    {ABDOMEN, .25, 1.6, {56, 40, 12}, .4, 24, 360, 0, 151},
+	};
+	static const double photons[] = {0, 3e3};
+	double ratio[2];
+
+	for (int k = 0; k < 2; k++) {
+		struct anatomy_spec spec = specs[_i];
+		struct anatomy_scan scan;
+
+		spec.photons = photons[k];
+		ck_assert_int_eq(anatomy_scan_make(&scan, &spec, &err), 0);
+		ratio[k] = ratio_of(&scan.geometry, scan.projections, spec.voxel / spec.pixel);
+		anatomy_scan_clear(&scan);
+	}
+	ck_assert_msg(ratio[0] > 0.17 && ratio[1] > 0.17 && fabs(ratio[1] / ratio[0] - 1) < 0.15,
+		      "%s: without noise %.3f, with %.3f", anatomy_names[_i], ratio[0], ratio[1]);
+}
+END_TEST
+
+/* Noise alone, a detector of one row, and nothing at all. */
+START_TEST(without_structure_nothing_is_decided)
+{
+	enum { COLUMNS = 200, ROWS = 60 };
+	struct geometry geometry = {.columns = COLUMNS, .rows = ROWS, .count = 1};
+	float *view = calloc((size_t)COLUMNS * ROWS, sizeof(*view));
+
+	ck_assert_ptr_nonnull(view);
+	ck_assert_double_eq(ratio_of(&geometry, view, 3), 0);
+	srand(3);
+	for (int i = 0; i < COLUMNS * ROWS; i++)
+		view[i] = (float)(rand() % 1000) / 1000;
+	ck_assert_double_eq(ratio_of(&geometry, view, 3), 0);
+	for (int i = 0; i < COLUMNS; i++)
+		view[i] = (float)sqrt(fmax(0, 60 * 60 - pow(i - 100, 2)));
+	geometry.rows = 1;
+	ck_assert_double_eq(ratio_of(&geometry, view, 3), 0);
+	free(view);
+}
+END_TEST
+
+Suite *averaging_suite(void)
+{
+	Suite *suite = suite_create("averaging");
+	TCase *decision = tcase_create("decision");
+
+	tcase_set_timeout(decision, 0);
+	tcase_add_loop_test(decision, an_object_of_voxels_has_no_more_than_its_grid, 0, 3);
+	tcase_add_loop_test(decision, anatomy_has_edges_within_voxels_whatever_the_noise, 0, ANATOMY_COUNT);
+	tcase_add_test(decision, without_structure_nothing_is_decided);
+	suite_add_tcase(suite, decision);
+	return suite;
+}
