@@ -6,6 +6,7 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <openssl/evp.h>
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <time.h>
@@ -14,6 +15,7 @@
 #include "daemon/intake/internal.h"
 
 #include "daemon/lock.h"
+#include "proto/scan_directory.h"
 
 enum {
 	BATCH_SLOTS = 64,       /* in one commit */
@@ -119,6 +121,47 @@ static int process_projection(struct slot *slot, struct error *err)
 	return claim == CLAIM_BUSY ? park(slot, err) : write_claimed(slot, err);
 }
 
+/* Where the other image is not there, or damaged, nothing is said: it is held against this one when it comes. */
+static int check_with_other(const struct slot *slot, enum image other, struct error *err)
+{
+	const struct upload *upload = slot->upload;
+	const size_t pixels = upload_image_pixels(stored_scan_parsed(upload->scan)), expected = pixels * sizeof(float);
+	const bool is_flat = upload->target.image == IMAGE_FLAT;
+	char directory[1024], path[1100], *bytes = NULL;
+	struct scan_facts facts;
+	struct error why;
+	size_t size = 0;
+	int code;
+
+	stored_scan_facts(upload->scan, &facts);
+	if (!facts.image[other])
+		return 0;
+	store_scan_directory(upload->uploads->store, stored_scan_id(upload->scan), directory);
+	snprintf(path, sizeof(path), "%s/%s", directory, image_kinds[other].file);
+	code = file_read(path, expected, &bytes, &size, &why);
+	if (code == 0 && size == expected)
+		code = image_check_pair((const float *)(is_flat ? (const char *)slot->data : bytes),
+					(const float *)(is_flat ? bytes : (const char *)slot->data), pixels, err);
+	else if (code == ERR_NO_MEMORY)
+		*err = why;
+	else
+		code = 0;
+	free(bytes);
+	return code;
+}
+
+/* What every job would be refused for, now or with the other image of the two that is there. */
+static int check_image(const struct slot *slot, struct error *err)
+{
+	const struct upload *upload = slot->upload;
+	const enum image image = upload->target.image;
+	int code = image_check(image, slot->data, upload_image_pixels(stored_scan_parsed(upload->scan)), err);
+
+	if (code != 0 || image_kinds[image].pixel != IMAGE_COUNTS)
+		return code;
+	return check_with_other(slot, image == IMAGE_FLAT ? IMAGE_DARK : IMAGE_FLAT, err);
+}
+
 /* Stores an image as it came, or converts it from the scan's sample type to float32. */
 static int process_image(struct slot *slot, struct error *err)
 {
@@ -136,6 +179,8 @@ static int process_image(struct slot *slot, struct error *err)
 			memcpy(slot->data + i * sizeof(value), &value, sizeof(value));
 		}
 	}
+	if (check_image(slot, err) != 0)
+		return err->code;
 	if (store_put_image(upload->uploads->store, upload->scan, upload->target.image, slot->data, &created, err) != 0)
 		return err->code;
 	slot->outcome = created ? SLOT_CREATED : SLOT_SAME;

@@ -240,6 +240,7 @@ test_uint16_intensities_with_flat_and_dark() {
 	expect_problem 400
 	req PUT "/v1/scans/$scan/flat" -T "$work/whole" # float32
 	[[ $status == 20[01] ]] || fail "flat stored, got $status"
+	fill 0 1 | head -c $((one / 2)) >"$work/half"
 	req PUT "/v1/scans/$scan/dark" -T "$work/half" # the sample's type
 	[[ $status == 20[01] ]] || fail "dark stored, got $status"
 	req PUT "/v1/scans/$scan/flat" --data-binary 123
@@ -248,7 +249,7 @@ test_uint16_intensities_with_flat_and_dark() {
 
 test_a_map_of_defects() {
 	new_scan
-	fill 17 1 | head -c $((one / 4)) >"$work/map"
+	{ fill 17 1 | head -c $columns; fill 0 1 | head -c $((one / 4 - columns)); } >"$work/map"
 	req GET "/v1/scans/$scan"
 	expect_json '.defects == false'
 	req PUT "/v1/scans/$scan/defects" -T "$work/map"
@@ -257,12 +258,47 @@ test_a_map_of_defects() {
 	expect_status 200
 	req GET "/v1/scans/$scan"
 	expect_json '.defects == true'
-	fill 18 1 | head -c $((one / 4)) >"$work/map"
+	{ fill 18 1 | head -c $columns; fill 0 1 | head -c $((one / 4 - columns)); } >"$work/map"
 	req PUT "/v1/scans/$scan/defects" -T "$work/map"
 	expect_problem 409
 	fill 18 1 >"$work/map"
 	req PUT "/v1/scans/$scan/defects" -T "$work/map" # as long as a float32 image
 	expect_problem 400
+}
+
+# What every job would be refused for is not stored, and the right image may follow.
+test_images_that_nothing_can_be_made_of() {
+	refused() { # IMAGE FILE TEXT
+		req PUT "/v1/scans/$scan/$1" -T "$2"
+		expect_problem 422
+		[[ $(json .detail) == *"$3"* ]] || fail "$1: $(json .detail)"
+		req GET "/v1/scans/$scan"
+		expect_json ".$1 == false"
+	}
+	new_scan '.projections.quantity = "intensity"'
+	fill 0 1 >"$work/zero"
+	fill 377 1 >"$work/nan"
+	fill 300 1 >"$work/negative" # -6.0
+	fill 100 1 >"$work/three"
+	fill 101 1 >"$work/twelve"
+	refused flat "$work/zero" "no pixel above 0"
+	refused flat "$work/negative" "no pixel above 0"
+	refused flat "$work/nan" "finite in 0 %"
+	refused dark "$work/nan" "finite in 0 %"
+	head -c $((one / 4)) "$work/nan" >"$work/map"
+	refused defects "$work/map" "100 %"
+	req PUT "/v1/scans/$scan/flat" -T "$work/three"
+	expect_status 201
+	refused dark "$work/three" "exchanged?"
+	refused dark "$work/twelve" "not above the dark image in 100 %"
+	req PUT "/v1/scans/$scan/dark" -T "$work/zero"
+	expect_status 201
+	new_scan '.projections.quantity = "intensity"'
+	req PUT "/v1/scans/$scan/dark" -T "$work/three"
+	expect_status 201
+	refused flat "$work/three" "exchanged?"
+	req PUT "/v1/scans/$scan/flat" -T "$work/twelve"
+	expect_status 201
 }
 
 test_lists_newest_first_in_pages() {
