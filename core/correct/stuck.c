@@ -6,7 +6,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { NEIGHBOURS = 8, AWAY = 2 };
+enum { NEIGHBOURS = 8, AWAY = 2, BESIDE_LEAST = 4 }; /* good pixels right beside one that is taken for alone */
 
 static const float MATTERS = 0.03f, APART = 0.1f; /* of the photons, or of the largest line integral below 1 */
 static const float STILL = 0.1f, LARGER = 3, WILDER = 9, FARTHER = 3, STEADY = 4, IN_FEW_VIEWS = 0.25f;
@@ -28,7 +28,8 @@ struct stuck {
 	struct sums *sums;  /* [row][column] */
 	float *values;      /* [row][column], line integrals of a view */
 	float *medians;     /* [row][column], of each pixel's neighbours in the view */
-	unsigned char *bad; /* [row][column], of the view */
+	unsigned char *bad; /* [row][column], of the view: the pixel says nothing there */
+	bool *some_bad;     /* [row], of the view */
 	unsigned char *map;
 	float largest; /* line integral */
 };
@@ -52,9 +53,10 @@ int stuck_new(const struct linearise *linearise, const struct geometry *geometry
 	stuck->values = malloc(pixels * sizeof(*stuck->values));
 	stuck->medians = malloc(pixels * sizeof(*stuck->medians));
 	stuck->bad = malloc(pixels);
+	stuck->some_bad = malloc((size_t)geometry->rows * sizeof(*stuck->some_bad));
 	stuck->map = calloc(pixels, 1);
 	if (stuck->sums == NULL || stuck->values == NULL || stuck->medians == NULL || stuck->bad == NULL ||
-	    stuck->map == NULL) {
+	    stuck->some_bad == NULL || stuck->map == NULL) {
 		stuck_free(stuck);
 		return error_set(err, ERR_NO_MEMORY, "no memory to look for stuck pixels in %d x %d", geometry->columns,
 				 geometry->rows);
@@ -71,6 +73,7 @@ void stuck_free(struct stuck *stuck)
 	free(stuck->values);
 	free(stuck->medians);
 	free(stuck->bad);
+	free(stuck->some_bad);
 	free(stuck->map);
 	free(stuck);
 }
@@ -86,12 +89,15 @@ bool stuck_wants(const struct stuck *stuck, int view)
 static void read_row(struct stuck *stuck, const void *samples, int row)
 {
 	const size_t columns = (size_t)stuck->geometry->columns, from = (size_t)row * columns;
+	unsigned char some = 0;
 	float last = 0;
 
 	for (size_t at = from; at < from + columns; at++) {
 		stuck->bad[at] = linearise_pixel(stuck->linearise, samples, at, &last) != PIXEL_GOOD;
 		stuck->values[at] = last;
+		some |= stuck->bad[at];
 	}
+	stuck->some_bad[row] = some != 0;
 }
 
 /* Beside an edge of the detector there is no other side: the neighbours lie along the edge and straight inwards. */
@@ -128,9 +134,9 @@ static void neighbours_of(const struct geometry *geometry, int column, int row, 
 	}
 }
 
-static void sort(float values[NEIGHBOURS])
+static void sort(float values[NEIGHBOURS], int count)
 {
-	for (int i = 1; i < NEIGHBOURS; i++) {
+	for (int i = 1; i < count; i++) {
 		const float value = values[i];
 		int at = i;
 
@@ -140,16 +146,21 @@ static void sort(float values[NEIGHBOURS])
 	}
 }
 
+/* Of the good neighbours; the pixel's own value where none is good, which is_stuck takes for no stuck one. */
 static float median_of(const struct stuck *stuck, int column, int row)
 {
 	size_t near[NEIGHBOURS];
 	float values[NEIGHBOURS];
+	int count = 0;
 
 	neighbours_of(stuck->geometry, column, row, near);
 	for (int i = 0; i < NEIGHBOURS; i++)
-		values[i] = stuck->values[near[i]];
-	sort(values);
-	return 0.5f * (values[NEIGHBOURS / 2 - 1] + values[NEIGHBOURS / 2]);
+		if (!stuck->bad[near[i]])
+			values[count++] = stuck->values[near[i]];
+	if (count == 0)
+		return stuck->values[(size_t)row * (size_t)stuck->geometry->columns + (size_t)column];
+	sort(values, count);
+	return 0.5f * (values[(count - 1) / 2] + values[count / 2]);
 }
 
 /*
@@ -188,13 +199,33 @@ static void medians_inside(const struct stuck *stuck, int row)
 	}
 }
 
+/* Again, without the neighbours that say nothing, for those pixels of medians_inside that have such. */
+static void medians_beside_bad(const struct stuck *stuck, int row)
+{
+	const int columns = stuck->geometry->columns;
+	const unsigned char *at = stuck->bad + (size_t)row * (size_t)columns;
+
+	if (!stuck->some_bad[row - AWAY] && !stuck->some_bad[row] && !stuck->some_bad[row + AWAY])
+		return;
+	for (int column = AWAY; column < columns - AWAY; column++) {
+		unsigned char some = 0;
+
+		for (int i = 0; i < NEIGHBOURS; i++)
+			some |= at[AWAY * (AROUND[i][0] * columns + AROUND[i][1]) + column];
+		if (some)
+			stuck->medians[(size_t)row * (size_t)columns + (size_t)column] = median_of(stuck, column, row);
+	}
+}
+
 static void medians_of_row(const struct stuck *stuck, int row)
 {
 	const int columns = stuck->geometry->columns;
 	const bool inside = edge_at(row, stuck->geometry->rows) == 0;
 
-	if (inside)
+	if (inside) {
 		medians_inside(stuck, row);
+		medians_beside_bad(stuck, row);
+	}
 	for (int column = 0; column < columns; column++)
 		if (!inside || edge_at(column, columns) != 0)
 			stuck->medians[(size_t)row * (size_t)columns + (size_t)column] = median_of(stuck, column, row);
@@ -282,21 +313,27 @@ static bool is_on_axis(const struct stuck *stuck, int column, int row)
 	return false;
 }
 
+/* Whether a pixel was good in half of the views at least. */
+static bool is_known(const struct stuck *stuck, size_t at)
+{
+	return 2 * stuck->sums[at].views >= stuck->views;
+}
+
 static float mean_of(const struct sums *sums)
 {
 	return sums->first + sums->p / (float)(sums->views > 0 ? sums->views : 1);
 }
 
 /*
- * Whether the pixels right beside a pixel, all but one, are unlike it: in the mean by at least half of what it differs
- * by from m, or where it wanders, by wandering less than a quarter of that.
+ * Whether the good pixels right beside a pixel, all but one, are unlike it, and there are enough to tell: in the mean
+ * by at least half of what it differs by from m, or where it wanders, by wandering less than a quarter of that.
  */
 static bool is_alone(const struct stuck *stuck, int column, int row, bool wanders)
 {
 	const int columns = stuck->geometry->columns, rows = stuck->geometry->rows;
 	const struct sums *own = &stuck->sums[(size_t)row * (size_t)columns + (size_t)column];
 	const float e = own->e / (float)own->views, least = 0.25f * behaviour_of(own).wanders;
-	int like = 0;
+	int like = 0, bad = 0;
 
 	for (int i = 0; i < NEIGHBOURS; i++) {
 		const int r = row + AROUND[i][0], c = column + AROUND[i][1];
@@ -305,11 +342,15 @@ static bool is_alone(const struct stuck *stuck, int column, int row, bool wander
 
 		if (r < 0 || r >= rows || c < 0 || c >= columns)
 			continue;
+		if (!is_known(stuck, (size_t)r * (size_t)columns + (size_t)c)) {
+			bad++;
+			continue;
+		}
 		other = &stuck->sums[(size_t)r * (size_t)columns + (size_t)c];
 		apart = mean_of(own) - mean_of(other);
 		like += wanders ? behaviour_of(other).wanders > least : !(e > 0 ? apart > 0.5f * e : apart < 0.5f * e);
 	}
-	return like <= 1;
+	return like <= 1 && bad <= NEIGHBOURS - BESIDE_LEAST;
 }
 
 static bool is_stuck(const struct stuck *stuck, int column, int row)
@@ -320,7 +361,7 @@ static bool is_stuck(const struct stuck *stuck, int column, int row)
 	float varies[NEIGHBOURS], rms[NEIGHBOURS], mean[NEIGHBOURS], wanders[NEIGHBOURS];
 	size_t near[NEIGHBOURS];
 
-	if (2 * stuck->sums[at].views < stuck->views || own.rms < MATTERS * whole)
+	if (!is_known(stuck, at) || own.rms < MATTERS * whole)
 		return false;
 	/* A corner has neighbours on one side only. */
 	if (edge_at(column, stuck->geometry->columns) != 0 && edge_at(row, stuck->geometry->rows) != 0)
@@ -329,15 +370,17 @@ static bool is_stuck(const struct stuck *stuck, int column, int row)
 	for (int i = 0; i < NEIGHBOURS; i++) {
 		const struct behaviour other = behaviour_of(&stuck->sums[near[i]]);
 
-		varies[i] = other.varies;
-		rms[i] = other.rms;
-		mean[i] = other.mean;
-		wanders[i] = other.wanders;
+		const bool known = is_known(stuck, near[i]);
+
+		varies[i] = known ? other.varies : 0;
+		rms[i] = known ? other.rms : INFINITY;
+		mean[i] = known ? other.mean : INFINITY;
+		wanders[i] = known ? other.wanders : INFINITY;
 	}
-	sort(varies);
-	sort(rms);
-	sort(mean);
-	sort(wanders);
+	sort(varies, NEIGHBOURS);
+	sort(rms, NEIGHBOURS);
+	sort(mean, NEIGHBOURS);
+	sort(wanders, NEIGHBOURS);
 	if (own.varies < STILL * varies[2] && own.rms > LARGER * rms[NEIGHBOURS / 2])
 		return true;
 	if (own.wanders > MATTERS * MATTERS * whole * whole && own.wanders > WILDER * wanders[NEIGHBOURS - 2] &&

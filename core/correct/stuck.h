@@ -25,6 +25,9 @@
  *            such a shadow, one pixel in all views, lies on the axis of the rotation:
  *            pixels whose rays pass it are left out.
  *
+ * A neighbour that says nothing, as one of the scan's map, is left out of m, and where that is
+ * so in most views it counts as one that speaks for the pixel in the comparisons above.
+ *
  * What is an object's own, however sharp, still or small, has its like beside it,
  * passes, or lies on the axis. A gain that is wrong by less is none of this: that is
  * what the flat is for. Where more than a tenth of the pixels would be stuck nothing is
