@@ -138,6 +138,8 @@ static void enter_end(struct job_record *record, const struct job_change *change
 	record->checkpoint = 0;
 	if (record->state == JOB_SUCCEEDED)
 		record->fraction = 1;
+	else
+		record->reconstructed = 0; /* it went with its worker, and is not in the catalogue */
 	if (record->state != JOB_FAILED)
 		return;
 	record->error_code = change->error_code != 0 ? change->error_code : ERR_INTERNAL;

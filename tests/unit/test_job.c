@@ -344,6 +344,30 @@ START_TEST(a_checkpoint_is_kept_over_a_restart_where_its_file_is)
 }
 END_TEST
 
+START_TEST(a_failed_job_reads_the_same_after_a_restart)
+{
+	const struct job_change failed = {.error_code = ERR_IO, .error_text = "no more"};
+	struct job *job = state_post(&state, scan, "routine");
+	struct job_record before, after;
+	char id[ID_SIZE];
+
+	state_set(job, JOB_RUNNING, NULL);
+	job_reconstructed(job, 3);
+	state_set(job, JOB_FAILED, &failed);
+	job_record(job, &before);
+	keep_id(job, id);
+	job_release(job);
+	restart();
+	job = find(id);
+	job_record(job, &after);
+	ck_assert_int_eq(after.state, JOB_FAILED);
+	ck_assert_int_eq(before.reconstructed, after.reconstructed);
+	ck_assert(before.fraction == after.fraction && before.iteration == after.iteration);
+	ck_assert_str_eq(before.error_text, after.error_text);
+	job_release(job);
+}
+END_TEST
+
 START_TEST(a_cancel_that_was_asked_for_survives_a_restart)
 {
 	struct job *job = state_post(&state, scan, "routine");
@@ -903,6 +927,7 @@ Suite *job_suite(void)
 	tcase_add_test(tests, only_a_run_from_the_start_is_an_attempt);
 	tcase_add_test(tests, a_running_job_is_queued_again_after_a_restart);
 	tcase_add_test(tests, a_checkpoint_is_kept_over_a_restart_where_its_file_is);
+	tcase_add_test(tests, a_failed_job_reads_the_same_after_a_restart);
 	tcase_add_test(tests, a_cancel_that_was_asked_for_survives_a_restart);
 	tcase_add_test(tests, deleting_cancels_first_and_then_removes);
 	tcase_add_test(tests, a_scan_stays_while_a_job_needs_it);
