@@ -196,7 +196,7 @@ START_TEST(a_pixel_that_does_not_follow_is_found)
 }
 END_TEST
 
-/* A map that is right makes no pixel beside its own a stuck one; of those farther away as many are found as before. */
+/* A map that is right makes no pixel beside its own a stuck one; most of those farther away are found. */
 START_TEST(a_neighbour_of_mapped_pixels_is_judged_by_good_ones)
 {
 	for (int object = 0; object < OBJECTS; object++)
