@@ -25,6 +25,8 @@ const struct warning_kind warning_kinds[] = {
     {"duplicate_angles", SEVERITY_CAUTION, "Some projections were taken at the same angle as another."},
     {"uneven_angles", SEVERITY_CAUTION, "There is a gap between the projections: expect streaks."},
     {"single_view", SEVERITY_SERIOUS, "There is only one projection: depth cannot be told from it."},
+    {"not_converged", SEVERITY_CAUTION,
+     "The reconstruction was ended before it could reach its full quality: dense parts may look too faint."},
     {"few_views", SEVERITY_SERIOUS,
      "There are too few projections, or all are from the same side: the image is not reliable."},
     {"implausible_lengths", SEVERITY_SERIOUS,

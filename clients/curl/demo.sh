@@ -53,6 +53,7 @@ jq -c '.geometry.matrices |= "[\(length) matrices of 12 numbers]"' "$out/scan/sc
 
 step "2. The daemon starts on a free port of this machine"
 echo "\$ cbctd --listen 127.0.0.1:0 --state-dir $out/state &"
+: >"$out/cbctd.out" # the shell below may look at it before the daemon's has made it
 cbctd --listen 127.0.0.1:0 --state-dir "$out/state" >"$out/cbctd.out" 2>"$out/cbctd.log" &
 daemon=$!
 url=

@@ -34,6 +34,9 @@ struct algorithm {
 	/* Held on the device beside the projections, the iterate, its copy and the plan: volumes, and stacks of all
 	 * views. */
 	int volumes, stacks;
+	double updates; /* of SART, that take up as much noise as one iteration; 0: as many as there are subsets */
+	/* Iterations after which a start from zero has its least error on anatomies; fewer are told. 0: never told. */
+	int from_zero;
 	double work; /* of an iteration, in FDKs of the whole scan: for the progress bar */
 
 	/* Allocates what it holds; *ret_state may stay NULL where that is nothing. The problem outlives it. */

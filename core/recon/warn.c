@@ -3,6 +3,7 @@
 
 #include <math.h>
 
+#include "core/recon/algorithm.h"
 #include "core/recon/noise.h"
 
 /* Whether a view's detector has the shadow of any of 9 x 9 x 9 places that span the grid. */
@@ -115,6 +116,12 @@ void warn_recipe(const struct warning_sink *sink, const struct geometry *geometr
 		    grid->size[2] * grid->spacing[2]);
 	warn_of_small_grid(sink, grid);
 	warn_of_sparse_views(sink, orbit, grid);
+	if (recipe->algorithm != NULL && !recipe->fdk.on && recipe->iterate.iterations < recipe->algorithm->from_zero)
+		warning_tell(
+		    sink, "not_converged",
+		    "%d iterations of %s from zero are too few: begin with the FDK volume (\"fdk\": {}), or ask "
+		    "for %d and more",
+		    recipe->iterate.iterations, recipe->algorithm->name, recipe->algorithm->from_zero);
 	if (recipe->tv.on && !recipe->tv.after_fdk && recipe->algorithm == NULL)
 		warning_tell(sink, "tv_without_sart",
 			     "TV was wanted after SART iterations, and there are none: the FDK volume is left alone");

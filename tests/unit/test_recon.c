@@ -465,6 +465,29 @@ START_TEST(views_too_few_for_the_grid_are_told)
 }
 END_TEST
 
+/* The default iterations of CGLS from zero; from FDK; twelve from zero; SART's from zero. */
+START_TEST(iterations_from_zero_that_are_too_few_are_told)
+{
+	const struct orbit_spec spec = {32, 12, 24, {600, 1100, {4, 4}, {0, 0}, {0, 0}}, 3, 15};
+	struct grid grid = grid_of(24, 24, 4, 2, 2, 2);
+	struct recipe recipe = recipe_on(&grid);
+	struct outcome outcome = {0};
+	struct scene scene;
+
+	recipe.fdk.on = _i == 1;
+	recipe_set_algorithm(&recipe, _i == 3 ? &algorithm_sart : &algorithm_cgls);
+	if (_i == 2)
+		recipe.iterate.iterations = 12;
+	scene_orbit(&scene, &spec);
+	add_ball(&scene, 15, 0.02, 1, 2, 0);
+	run(&scene, &recipe, &outcome);
+	ck_assert_int_eq(strstr(outcome.warnings, "not_converged: 4 iterations of cgls from zero") != NULL, _i == 0);
+	ck_assert_int_eq(strstr(outcome.warnings, "not_converged: ") != NULL, _i == 0);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
 START_TEST(a_grid_without_a_cross_section_is_told)
 {
 	struct grid grid = _i == 0   ? grid_of(1, 1, 1, 5, 5, 5)
@@ -2095,6 +2118,7 @@ Suite *recon_suite(void)
 	tcase_add_loop_test(images, the_automatic_grid_has_no_slice_that_lacks_views, 0, 2);
 	tcase_add_loop_test(images, slices_that_lack_views_are_told_where_the_object_is_there, 0, 4);
 	tcase_add_loop_test(images, views_too_few_for_the_grid_are_told, 0, 2);
+	tcase_add_loop_test(images, iterations_from_zero_that_are_too_few_are_told, 0, 4);
 	tcase_add_loop_test(images, a_grid_without_a_cross_section_is_told, 0, 3);
 	tcase_add_loop_test(images, a_residual_that_stays_high_is_told_at_the_end, 0, 3);
 	tcase_add_test(images, a_single_view_is_explained_by_sart_and_harmless_to_fdk);
