@@ -224,6 +224,20 @@ static void reconstruct(const struct anatomy_scan *scan, const struct recipe *re
 	backend_cpu.close(device);
 }
 
+/* The scan, a recipe of FDK alone on its grid, and what that gives. Free with anatomy_scan_clear. */
+static void begin_with_fdk(const struct anatomy_spec *spec, struct anatomy_scan *ret_scan, struct recipe *ret_recipe,
+			   struct image_figures *ret_fdk)
+{
+	double ignored;
+
+	ck_assert_int_eq(anatomy_scan_make(ret_scan, spec, &err), 0);
+	recipe_defaults(ret_recipe);
+	ret_recipe->has_grid = ret_recipe->has_origin = true;
+	ret_recipe->grid = ret_scan->grid;
+	ret_recipe->fdk.on = true;
+	reconstruct(ret_scan, ret_recipe, ret_fdk, &ignored);
+}
+
 START_TEST(the_default_takes_the_noise_and_leaves_the_anatomy)
 {
 	static const double factors[] = {.4, 2.5};
@@ -233,12 +247,7 @@ START_TEST(the_default_takes_the_noise_and_leaves_the_anatomy)
 	int emit[] = {3, 10};
 	double alpha, best[2];
 
-	ck_assert_int_eq(anatomy_scan_make(&scan, &anatomies[_i], &err), 0);
-	recipe_defaults(&recipe);
-	recipe.has_grid = recipe.has_origin = true;
-	recipe.grid = scan.grid;
-	recipe.fdk.on = true;
-	reconstruct(&scan, &recipe, &fdk, &alpha);
+	begin_with_fdk(&anatomies[_i], &scan, &recipe, &fdk);
 	recipe.tv.on = true;
 	recipe.algorithm = &algorithm_sart;
 	recipe.emit = emit;
@@ -277,12 +286,7 @@ START_TEST(pixels_finer_than_the_voxels_do_not_make_iterations_worse_than_fdk)
 	int emit[] = {3, 10};
 	double alpha;
 
-	ck_assert_int_eq(anatomy_scan_make(&scan, &spec, &err), 0);
-	recipe_defaults(&recipe);
-	recipe.has_grid = recipe.has_origin = true;
-	recipe.grid = scan.grid;
-	recipe.fdk.on = true;
-	reconstruct(&scan, &recipe, &fdk, &alpha);
+	begin_with_fdk(&spec, &scan, &recipe, &fdk);
 	recipe.tv.on = true;
 	recipe.algorithm = &algorithm_sart;
 	recipe.emit = emit;
@@ -309,12 +313,7 @@ START_TEST(cgls_with_tv_is_better_than_fdk)
 	struct image_figures fdk, found;
 	double alpha;
 
-	ck_assert_int_eq(anatomy_scan_make(&scan, &spec, &err), 0);
-	recipe_defaults(&recipe);
-	recipe.has_grid = recipe.has_origin = true;
-	recipe.grid = scan.grid;
-	recipe.fdk.on = true;
-	reconstruct(&scan, &recipe, &fdk, &alpha);
+	begin_with_fdk(&spec, &scan, &recipe, &fdk);
 	recipe_set_algorithm(&recipe, &algorithm_cgls);
 	recipe.tv.on = true;
 	reconstruct(&scan, &recipe, &found, &alpha);
