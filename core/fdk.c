@@ -58,7 +58,8 @@ void fdk_weights_clear(struct fdk_weights *weights)
 
 int fdk_batch(const struct backend *backend, const struct plan *plan, int views)
 {
-	const int batch = backend->plan_batch(plan), most = backend->defers_filter ? views : fdk_batch_most(views);
+	const int most = backend->defers_filter ? views : fdk_batch_most(views);
+	const int batch = plan != NULL ? backend->plan_batch(plan) : most;
 
 	return batch < most ? batch : most;
 }
@@ -81,6 +82,12 @@ int fdk_open(struct fdk *ret_fdk, const struct backend *backend, struct device *
 	else
 		*ret_fdk = fdk;
 	return code;
+}
+
+size_t fdk_bytes(const struct backend *backend, const struct geometry *geometry, const int pad[2])
+{
+	return backend->stack_bytes(pad[0] + geometry->columns + pad[1], geometry->rows,
+				    fdk_batch(backend, NULL, geometry->count));
 }
 
 void fdk_clear(struct fdk *fdk)

@@ -43,11 +43,13 @@ struct fdk {
 	int *views, *slots;     /* [batch], of those, and where they lie; owned */
 };
 
-/* Views in one go for this plan and this many views. */
+/* Views in one go for this plan and this many views; plan NULL: the most for any plan. */
 int fdk_batch(const struct backend *backend, const struct plan *plan, int views);
 int fdk_open(struct fdk *ret_fdk, const struct backend *backend, struct device *device, struct plan *plan,
 	     const struct geometry *geometry, const int pad[2], struct error *err);
 void fdk_clear(struct fdk *fdk);
+/* Bytes that fdk_open takes of the device's memory, at most. */
+size_t fdk_bytes(const struct backend *backend, const struct geometry *geometry, const int pad[2]);
 
 /* Takes the view that lies in this slot of `from`; when the batch is full, fdk_flush. */
 int fdk_add(struct fdk *fdk, int view, int slot, const struct stack *from, struct volume *to, struct error *err);

@@ -435,18 +435,15 @@ static int open_first(struct reconstruction *reconstruction, struct error *err)
 {
 	const struct reconstruction_hooks *hooks = reconstruction->run.hooks;
 	const struct geometry *geometry = &reconstruction->files.scan->geometry;
-	struct recon_memory memory;
 	int code = set_linearise(reconstruction, err);
 
-	if (code == 0)
-		code = recon_memory(reconstruction->backend, reconstruction->device, geometry,
-				    reconstruction->options->recipe, &memory, err);
 	if (code == 0)
 		code = open_recon(reconstruction, err);
 	if (code == 0)
 		code = stuck_new(&reconstruction->linearise, geometry, &reconstruction->stuck, err);
 	if (code == 0 && hooks->on_open != NULL)
-		hooks->on_open(hooks->recon.context, &memory, recon_plan(reconstruction->recon));
+		hooks->on_open(hooks->recon.context, recon_memory_taken(reconstruction->recon),
+			       recon_plan(reconstruction->recon));
 	return code;
 }
 

@@ -12,6 +12,14 @@ static bool wanted(const struct recipe *recipe, const struct linearise *linearis
 	return recipe->metal.on;
 }
 
+/* The volume that metal_doubt_make copies. */
+static int bytes_of(const struct correction_ask *ask, struct correction_bytes *bytes, struct error *err)
+{
+	(void)err;
+	bytes->host += grid_voxels(&ask->recipe->grid) * sizeof(float);
+	return 0;
+}
+
 static int open_metal(const struct correction_job *job, void **ret_state, struct error *err)
 {
 	(void)job;
@@ -248,6 +256,7 @@ const struct correction correction_metal = {
     .work = 12,
     .wanted = wanted,
     .slots = metal_slots,
+    .bytes = bytes_of,
     .open = open_metal,
     .close = close_metal,
     .view = take_view,

@@ -10,6 +10,8 @@
  * core/recon/run.c's. One thread at a time.
  */
 
+enum { ALGORITHM_HOLDS = 4 }; /* volumes at most, and stacks */
+
 /* The problem that an algorithm works on, all of it borrowed. */
 struct problem {
 	const struct backend *backend;
@@ -19,9 +21,12 @@ struct problem {
 	const struct grid *grid;
 	const struct stack *projections; /* slot = view, line integrals; NaN: a ray that is left out */
 	struct volume *volume;           /* the iterate */
-	struct volume *before;       /* scratch at the beginning of an iteration, at its end the iterate before it */
-	const struct cancel *cancel; /* or NULL */
-	bool nonnegative;            /* the iterate has no voxel below 0 */
+	struct volume *before; /* scratch at the beginning of an iteration, at its end the iterate before it */
+	/* The algorithm's own, as many as its row asks for, not cleared. */
+	struct volume *volumes[ALGORITHM_HOLDS];
+	struct stack *stacks[ALGORITHM_HOLDS]; /* of all views */
+	const struct cancel *cancel;           /* or NULL */
+	bool nonnegative;                      /* the iterate has no voxel below 0 */
 };
 
 struct algorithm {
@@ -31,15 +36,15 @@ struct algorithm {
 	enum projector projector; /* that a recipe without one takes */
 	enum stage stage;         /* of its iterations, in progress and timings */
 	bool subsets;             /* its update is the backend's sart_iterate over ordered subsets */
-	/* Held on the device beside the projections, the iterate, its copy and the plan: volumes, and stacks of all
-	 * views. */
+	/* That it holds on the device beside the projections, the iterate, its copy and the plan: problem.volumes and
+	 * stacks. */
 	int volumes, stacks;
 	double updates; /* of SART, that take up as much noise as one iteration; 0: as many as there are subsets */
 	/* Iterations after which a start from zero has its least error on anatomies; fewer are told. 0: never told. */
 	int from_zero;
 	double work; /* of an iteration, in FDKs of the whole scan: for the progress bar */
 
-	/* Allocates what it holds; *ret_state may stay NULL where that is nothing. The problem outlives it. */
+	/* Allocates the rest of its state; *ret_state may stay NULL without any. The problem outlives it. */
 	int (*open)(const struct problem *problem, void **ret_state, struct error *err);
 	void (*close)(const struct problem *problem, void *state); /* NULL is fine */
 	/*

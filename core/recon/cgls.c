@@ -32,6 +32,7 @@
 #include <string.h>
 
 struct cgls {
+	/* The problem's volume and stacks: */
 	struct volume *direction; /* p */
 	struct stack *residual;   /* r, 0 on rays that are left out */
 	struct stack *projected;  /* q, likewise; or W r */
@@ -53,47 +54,32 @@ static void cgls_close(const struct problem *problem, void *state)
 {
 	struct cgls *cgls = state;
 
+	(void)problem;
 	if (cgls == NULL)
 		return;
-	problem->backend->volume_free(cgls->direction);
-	problem->backend->stack_free(cgls->residual);
-	problem->backend->stack_free(cgls->projected);
-	problem->backend->stack_free(cgls->weights);
 	free(cgls->views);
 	free(cgls);
 }
 
 static int cgls_open(const struct problem *problem, void **ret_state, struct error *err)
 {
-	const struct backend *backend = problem->backend;
-	const struct geometry *geometry = problem->geometry;
-	const int views = geometry->count;
+	const int views = problem->geometry->count;
 	struct cgls *cgls = calloc(1, sizeof(*cgls));
-	struct stack **stacks[3];
-	int code = 0;
 
 	if (cgls != NULL)
 		cgls->views = malloc(sizeof(int) * (size_t)views);
 	if (cgls == NULL || cgls->views == NULL) {
-		code = error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", views);
-		goto out;
+		cgls_close(problem, cgls);
+		return error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", views);
 	}
 	for (int i = 0; i < views; i++)
 		cgls->views[i] = i;
-	stacks[0] = &cgls->residual;
-	stacks[1] = &cgls->projected;
-	stacks[2] = &cgls->weights;
-	code = backend->volume_new(problem->device, problem->grid, &cgls->direction, err);
-	if (code == 0)
-		code = backend->volume_fill(cgls->direction, 0, err);
-	for (int i = 0; i < 3 && code == 0; i++)
-		code = backend->stack_new(problem->device, geometry->columns, geometry->rows, views, stacks[i], err);
-out:
-	if (code < 0)
-		cgls_close(problem, cgls);
-	else
-		*ret_state = cgls;
-	return code;
+	cgls->direction = problem->volumes[0];
+	cgls->residual = problem->stacks[0];
+	cgls->projected = problem->stacks[1];
+	cgls->weights = problem->stacks[2];
+	*ret_state = cgls;
+	return problem->backend->volume_fill(cgls->direction, 0, err);
 }
 
 /* y = A x over all views, 0 on rays that are left out. */

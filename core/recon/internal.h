@@ -26,6 +26,7 @@ struct recon {
 	struct fdk_weights weights;
 	struct sart_options sart; /* where the algorithm goes by subsets */
 
+	struct recon_memory memory; /* counted before anything was allocated */
 	struct plan *plan;
 	struct fdk fdk;            /* where FDK is on */
 	struct stack *projections; /* a slot for each view where they are kept, else for each view of an FDK batch */
@@ -81,28 +82,23 @@ bool keeps_projections(const struct recipe *recipe);
 /* Whether the recipe's algorithm is the backend's own update over ordered subsets. */
 bool has_subsets(const struct recipe *recipe);
 
-/* The recipe is resolved; everything that the options point to is the caller's. */
-struct plan_options plan_options(const struct recipe *recipe, const struct geometry *geometry,
-				 const struct linearise *linearise, const struct fdk_weights *weights,
-				 const struct sart_options *sart);
-/* Free with subsets_clear(&ret_sart->subsets). */
-int sart_options_make(struct sart_options *ret_sart, const struct recipe *recipe, const struct orbit *orbit,
-		      struct error *err);
+/* The options point into recon, which is described, has its input, and its weights where FDK is on. */
+struct plan_options plan_options(const struct recon *recon);
 
 /*
- * Chooses the device and counts the memory that the job takes: *ret_outofcore stays NULL where the job fits as a whole,
- * otherwise it is the out-of-core device and *ret_memory what that takes.
+ * The first step of an opening: the orbit, the geometry that all goes by (recon->geometry goes in and comes out), the
+ * recipe resolved, and its subsets. All that takes no memory of the device. Whatever it returns, recon_clear.
  */
-int choose_device(const struct backend *backend, struct device *device, struct plan_options *options,
-		  const struct recipe *recipe, const struct orbit *orbit, struct recon_memory *ret_memory,
-		  struct device **ret_outofcore, struct error *err);
-
+int recon_describe(struct recon *recon, const struct recipe *recipe, struct error *err);
 /*
- * The orbit, and the geometry that all goes by: FDK filters along the rows, so that
- * a detector that lies on its side has its rows and columns exchanged, in
- * *ret_upright. That stays as it is for any other.
+ * Counts the memory that the job takes, recon->memory, and goes out of core (recon->outofcore, backend and device)
+ * where the device is too small for the whole. Sets options->beside and lends.
  */
-int stand_up(const struct geometry **geometry, struct geometry *ret_upright, struct orbit *ret_orbit,
-	     struct error *err);
+int recon_choose_device(struct recon *recon, struct plan_options *options, struct error *err);
+/* Everything that lies on the device beside the plan, which is there; released before the plan is freed. */
+int recon_allocate(struct recon *recon, struct error *err);
+void recon_release(struct recon *recon);
+/* Frees all that recon holds, but not itself. */
+void recon_clear(struct recon *recon);
 
 #endif

@@ -1,6 +1,6 @@
 /*
- * What a reconstruction's plan is made from, and the memory that it takes, all of it
- * known before the start.
+ * The plan of a reconstruction, and all that the job holds beside it, measured and allocated by one walk: the memory
+ * that a job takes is known before the start.
  */
 #include <string.h>
 
@@ -22,20 +22,21 @@ bool has_subsets(const struct recipe *recipe)
 	return recipe->algorithm != NULL && recipe->algorithm->subsets;
 }
 
-struct plan_options plan_options(const struct recipe *recipe, const struct geometry *geometry,
-				 const struct linearise *linearise, const struct fdk_weights *weights,
-				 const struct sart_options *sart)
+struct plan_options plan_options(const struct recon *recon)
 {
+	const struct recipe *recipe = &recon->recipe;
+	const struct geometry *geometry = recon->geometry;
+	const struct fdk_weights none = {0}, *weights = recipe->fdk.on ? &recon->weights : &none;
 	struct plan_options options = {
 	    .geometry = geometry,
 	    .grid = &recipe->grid,
-	    .linearise = *linearise,
-	    .column_weights = recipe->fdk.on ? weights->columns : NULL,
-	    .filter_response = recipe->fdk.on ? weights->response : NULL,
-	    .pad = {recipe->fdk.on ? weights->pad[0] : 0, recipe->fdk.on ? weights->pad[1] : 0},
-	    .extend = recipe->fdk.on ? weights->extend : 0,
-	    .extended_response = recipe->fdk.on ? weights->extended : NULL,
-	    .sart = has_subsets(recipe) ? sart : NULL,
+	    .linearise = recon->input.linearise,
+	    .column_weights = weights->columns,
+	    .filter_response = weights->response,
+	    .pad = {weights->pad[0], weights->pad[1]},
+	    .extend = weights->extend,
+	    .extended_response = weights->extended,
+	    .sart = has_subsets(recipe) ? &recon->sart : NULL,
 	    .matched = recipe->algorithm != NULL && recipe->projector == PROJECTOR_MATCHED,
 	    .tv = recipe->tv.on ? &recipe->tv.options : NULL,
 	    .reference_precision = recipe->reference_precision,
@@ -43,119 +44,154 @@ struct plan_options plan_options(const struct recipe *recipe, const struct geome
 	    .resident = keeps_projections(recipe) ? 0 : fdk_batch_most(geometry->count),
 	};
 
-	memcpy(options.axis, weights->axis, sizeof(options.axis));
+	memcpy(options.axis, recon->weights.axis, sizeof(options.axis));
 	return options;
 }
 
-int sart_options_make(struct sart_options *ret_sart, const struct recipe *recipe, const struct orbit *orbit,
-		      struct error *err)
-{
-	struct sart_options sart = {.relaxation = recipe->sart.relaxation, .nonnegative = recipe->iterate.nonnegative};
-	int code = subsets_make(&sart.subsets, orbit, subsets_count(recipe->sart.subsets, orbit->count), err);
+/* ---- the walk over what lies on the device beside the plan ---- */
 
-	if (code == 0)
-		*ret_sart = sart;
-	return code;
-}
-
-/* What a job holds beside its plan, the projections and the iterate. */
-struct held {
-	int volumes, stacks; /* stacks of all views */
-	int slots;           /* of the stack that corrections work in */
-	size_t ends;         /* bytes of the host's memory, core/recon/ends.h */
+/* It allocates every piece, or adds up the bytes, so that the estimate and the allocation come from the same lines. */
+struct walk {
+	const struct backend *backend;
+	struct device *device;
+	bool measures;
+	/* Where it measures. A piece of the out-of-core backend takes 0 bytes of the device, and some of the host. */
+	size_t projections, volumes, scratch, host;
 };
 
-static struct held held_by(const struct recipe *recipe, const struct linearise *linearise,
-			   const struct geometry *geometry, const struct orbit *orbit)
+static int walk_volume(struct walk *walk, const struct grid *grid, struct volume **ret_volume, struct error *err)
 {
-	const struct algorithm *algorithm = recipe->algorithm;
-
-	return (struct held){
-	    /* The copy of the iterate; a plan for the backend's own update has counted it. */
-	    .volumes =
-		(keeps_projections(recipe) && !has_subsets(recipe)) + (algorithm != NULL ? algorithm->volumes : 0),
-	    .stacks = algorithm != NULL ? algorithm->stacks : 0,
-	    .slots = corrections_slots(recipe, linearise, geometry),
-	    .ends = recipe_has_ends(recipe) ? ends_bytes(&recipe->grid, geometry, orbit) : 0,
-	};
-}
-
-/* The plan is told of all that lies beside it: FDK's filtered batch, its exterior, and what is held. */
-static int memory_whole(const struct backend *backend, struct device *device, struct plan_options *options,
-			const struct held *held, const struct correction_bytes *around, struct recon_memory *ret_memory,
-			struct error *err)
-{
-	const struct geometry *geometry = options->geometry;
-	const int columns = geometry->columns, rows = geometry->rows, *pad = options->pad;
-	const size_t stacks = (size_t)held->stacks * backend->stack_bytes(columns, rows, geometry->count);
-	const size_t batch = held->slots > 0 ? backend->stack_bytes(columns, rows, held->slots) : 0;
-	const size_t volumes = (size_t)held->volumes * backend->volume_bytes(options->grid);
-	size_t filtered = 0;
-	struct plan_bytes bytes;
-	int code;
-
-	if (options->column_weights != NULL)
-		filtered = backend->stack_bytes(pad[0] + columns + pad[1], rows, fdk_batch_most(geometry->count));
-	options->beside = filtered + around->device + batch + volumes + stacks;
-	options->lends = around->borrowed;
-	code = backend->plan_bytes(device, options, &bytes, err);
-	if (code < 0)
-		return code;
-	*ret_memory = (struct recon_memory){
-	    .projections = stacks + backend->stack_bytes(columns, rows,
-							 options->resident > 0 ? options->resident : geometry->count),
-	    .volumes = bytes.volumes + volumes,
-	    /* A backend without memory of its own works in the host's. */
-	    .scratch =
-		bytes.scratch + bytes.raw + filtered + around->device + batch + (backend->own_memory ? 0 : held->ends),
-	};
+	if (!walk->measures)
+		return walk->backend->volume_new(walk->device, grid, ret_volume, err);
+	walk->volumes += walk->backend->volume_bytes(grid);
+	walk->host += grid_voxels(grid) * sizeof(float);
 	return 0;
 }
 
-/* The same out of core: the device holds slabs of one volume at a time, the host all the rest. */
-static struct recon_memory memory_outofcore(const struct plan_options *options, const struct plan_bytes *bytes,
-					    const struct held *held, const struct correction_bytes *around)
+/* *bytes is the sum that the stack belongs to. */
+static int walk_stack(struct walk *walk, const struct geometry *geometry, int slots, size_t *bytes,
+		      struct stack **ret_stack, struct error *err)
 {
-	const struct geometry *geometry = options->geometry;
-	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
-	/* A correction copies a volume that lies in the host's memory. */
-	const int volumes = held->volumes + (held->slots > 0);
-	struct recon_memory memory = {
-	    .volumes = bytes->volumes,
-	    .scratch = bytes->scratch + bytes->raw,
-	    .host = bytes->host + around->host + held->ends +
-		    sizeof(float) * (((size_t)held->slots + (size_t)held->stacks * (size_t)geometry->count) * pixels +
-				     (size_t)volumes * grid_voxels(options->grid)),
-	};
+	const int columns = geometry->columns, rows = geometry->rows;
 
-	if (around->device > memory.volumes + memory.scratch)
-		memory.scratch = around->device - memory.volumes;
-	return memory;
+	if (!walk->measures)
+		return walk->backend->stack_new(walk->device, columns, rows, slots, ret_stack, err);
+	*bytes += walk->backend->stack_bytes(columns, rows, slots);
+	walk->host += (size_t)columns * (size_t)rows * (size_t)slots * sizeof(float);
+	return 0;
 }
 
-static int memory_needed(const struct backend *backend, struct device *device, struct plan_options *options,
-			 const struct recipe *recipe, const struct orbit *orbit, struct recon_memory *ret_memory,
-			 struct error *err)
+/* FDK's batch of filtered views; out of core nothing is written to it. */
+static int walk_fdk(struct recon *recon, struct walk *walk, struct error *err)
 {
-	const struct correction_ask ask = {
-	    .backend = backend, .device = device, .geometry = options->geometry, .orbit = orbit, .recipe = recipe};
-	const struct held held = held_by(recipe, &options->linearise, options->geometry, orbit);
-	struct correction_bytes around = {0};
-	struct recon_memory memory;
-	struct plan_bytes bytes;
-	struct device_info info;
-	int code;
+	const int *pad = recon->weights.pad;
 
-	options->beside = options->lends = 0;
-	code = backend->plan_bytes(device, options, &bytes, err);
+	if (!walk->measures)
+		return fdk_open(&recon->fdk, walk->backend, walk->device, recon->plan, recon->geometry, pad, err);
+	walk->scratch += fdk_bytes(walk->backend, recon->geometry, pad);
+	return 0;
+}
+
+/* The projections, the iterate, and its copy for the backend's own update, all of which plan_bytes heeds by itself. */
+static int walk_planned(struct recon *recon, struct walk *walk, struct error *err)
+{
+	const struct recipe *recipe = &recon->recipe;
+	const int views = recon->geometry->count;
+	const int slots = keeps_projections(recipe) ? views : fdk_batch(walk->backend, recon->plan, views);
+	int code = walk_stack(walk, recon->geometry, slots, &walk->projections, &recon->projections, err);
+
 	if (code == 0)
-		code = corrections_bytes(&ask, &options->linearise, &around, err);
-	if (code == 0 && bytes.host == 0)
-		code = memory_whole(backend, device, options, &held, &around, &memory, err);
+		code = walk_volume(walk, &recipe->grid, &recon->volume, err);
+	if (code == 0 && has_subsets(recipe))
+		code = walk_volume(walk, &recipe->grid, &recon->before, err);
+	return code;
+}
+
+/* All the rest: plan_options.beside. */
+static int walk_beside(struct recon *recon, struct walk *walk, struct error *err)
+{
+	const struct recipe *recipe = &recon->recipe;
+	const struct geometry *geometry = recon->geometry;
+	const struct algorithm *algorithm = recipe->algorithm;
+	const int slots = corrections_slots(recipe, &recon->input.linearise, geometry);
+	int code = recipe->fdk.on ? walk_fdk(recon, walk, err) : 0;
+
+	if (code == 0 && keeps_projections(recipe) && !has_subsets(recipe))
+		code = walk_volume(walk, &recipe->grid, &recon->before, err);
+	if (code == 0 && slots > 0)
+		code = walk_stack(walk, geometry, slots, &walk->scratch, &recon->batch, err);
+	for (int i = 0; algorithm != NULL && i < algorithm->volumes && code == 0; i++)
+		code = walk_volume(walk, &recipe->grid, &recon->problem.volumes[i], err);
+	for (int i = 0; algorithm != NULL && i < algorithm->stacks && code == 0; i++)
+		code = walk_stack(walk, geometry, geometry->count, &walk->projections, &recon->problem.stacks[i], err);
+	return code;
+}
+
+int recon_allocate(struct recon *recon, struct error *err)
+{
+	struct walk walk = {.backend = recon->backend, .device = recon->device};
+	int code = walk_beside(recon, &walk, err);
+
+	return code == 0 ? walk_planned(recon, &walk, err) : code;
+}
+
+void recon_release(struct recon *recon)
+{
+	const struct backend *backend = recon->backend;
+
+	for (int i = 0; i < ALGORITHM_HOLDS; i++) {
+		backend->volume_free(recon->problem.volumes[i]);
+		backend->stack_free(recon->problem.stacks[i]);
+	}
+	backend->stack_free(recon->batch);
+	backend->volume_free(recon->before);
+	backend->volume_free(recon->volume);
+	backend->stack_free(recon->projections);
+	fdk_clear(&recon->fdk);
+}
+
+/* ---- the sum ---- */
+
+/* Memory of the job on this device. Sets options->beside and lends, so that the plan sees what is left. */
+static int memory_on(const struct backend *backend, struct device *device, struct recon *recon,
+		     struct plan_options *options, struct recon_memory *ret_memory, struct error *err)
+{
+	const struct recipe *recipe = &recon->recipe;
+	const struct correction_ask ask = {.backend = backend,
+					   .device = device,
+					   .geometry = recon->geometry,
+					   .orbit = &recon->orbit,
+					   .recipe = recipe};
+	const size_t ends = recipe_has_ends(recipe) ? ends_bytes(&recipe->grid, recon->geometry, &recon->orbit) : 0;
+	struct walk beside = {.backend = backend, .device = device, .measures = true}, planned = beside;
+	struct correction_bytes around = {0};
+	struct recon_memory memory = {0};
+	struct device_info info;
+	struct plan_bytes bytes;
+	int code = corrections_bytes(&ask, &recon->input.linearise, &around, err);
+
+	if (code == 0)
+		code = walk_beside(recon, &beside, err);
+	if (code == 0)
+		code = walk_planned(recon, &planned, err);
+	options->beside = around.device + beside.projections + beside.volumes + beside.scratch;
+	options->lends = around.borrowed;
+	if (code == 0)
+		code = backend->plan_bytes(device, options, &bytes, err);
 	if (code < 0)
 		return code;
-	if (bytes.host > 0)
-		memory = memory_outofcore(options, &bytes, &held, &around);
+	memory.volumes = bytes.volumes + beside.volumes;
+	memory.scratch = bytes.scratch + bytes.raw + beside.scratch;
+	if (backend == &backend_outofcore) {
+		/* The device holds slabs of one volume at a time, or a correction's; the host has all the rest. */
+		memory.host = bytes.host + beside.host + around.host + ends;
+		if (around.device > memory.volumes + memory.scratch)
+			memory.scratch = around.device - memory.volumes;
+	} else {
+		/* A backend without memory of its own works in the host's. */
+		memory.projections = planned.projections + beside.projections;
+		memory.scratch += around.device + (backend->own_memory ? 0 : ends);
+	}
 	memory.total = memory.projections + memory.volumes + memory.scratch;
 	if (device != NULL) {
 		backend->describe(device, &info);
@@ -165,76 +201,81 @@ static int memory_needed(const struct backend *backend, struct device *device, s
 	return 0;
 }
 
-/*
- * What the job takes, and on what: *ret_outofcore stays NULL where it fits as a
- * whole, otherwise it is the out-of-core device and the memory what that takes.
- */
-int choose_device(const struct backend *backend, struct device *device, struct plan_options *options,
-		  const struct recipe *recipe, const struct orbit *orbit, struct recon_memory *ret_memory,
-		  struct device **ret_outofcore, struct error *err)
+int recon_choose_device(struct recon *recon, struct plan_options *options, struct error *err)
 {
-	struct device *outofcore = NULL;
-	int code = memory_needed(backend, device, options, recipe, orbit, ret_memory, err);
+	struct recon_memory *memory = &recon->memory;
+	int code = memory_on(recon->backend, recon->device, recon, options, memory, err);
 
-	if (code < 0 || device == NULL || !backend->own_memory || ret_memory->total <= ret_memory->available)
+	if (code < 0 || recon->device == NULL || !recon->backend->own_memory || memory->total <= memory->available)
 		return code;
-	code = outofcore_open(backend, device, &outofcore, err);
-	if (code == 0)
-		code = memory_needed(&backend_outofcore, outofcore, options, recipe, orbit, ret_memory, err);
+	code = outofcore_open(recon->backend, recon->device, &recon->outofcore, err);
 	if (code < 0)
-		backend_outofcore.close(outofcore);
-	else
-		*ret_outofcore = outofcore;
-	return code;
+		return code;
+	recon->backend = &backend_outofcore;
+	recon->device = recon->outofcore;
+	return memory_on(recon->backend, recon->device, recon, options, memory, err);
 }
 
-/*
- * The orbit, and the geometry that all goes by: FDK filters along the rows, so that
- * a detector that lies on its side has its rows and columns exchanged, in
- * *ret_upright. That stays as it is for any other.
- */
-int stand_up(const struct geometry **geometry, struct geometry *ret_upright, struct orbit *ret_orbit, struct error *err)
-{
-	int code = orbit_analyse(ret_orbit, *geometry, err);
+/* ---- the job before its views ---- */
 
-	if (code < 0 || !ret_orbit->turned)
+/*
+ * The orbit, and the geometry that all goes by: FDK filters along the rows, so that a detector that lies on its side
+ * has its rows and columns exchanged, in recon->upright. That stays empty for any other.
+ */
+static int stand_up(struct recon *recon, struct error *err)
+{
+	int code = orbit_analyse(&recon->orbit, recon->geometry, err);
+
+	if (code < 0 || !recon->orbit.turned)
 		return code;
-	orbit_clear(ret_orbit);
-	code = geometry_exchange(ret_upright, *geometry, err);
+	orbit_clear(&recon->orbit);
+	code = geometry_exchange(&recon->upright, recon->geometry, err);
 	if (code < 0)
 		return code;
-	*geometry = ret_upright;
-	return orbit_analyse(ret_orbit, *geometry, err);
+	recon->geometry = &recon->upright;
+	return orbit_analyse(&recon->orbit, recon->geometry, err);
+}
+
+int recon_describe(struct recon *recon, const struct recipe *recipe, struct error *err)
+{
+	int code = stand_up(recon, err);
+
+	if (code == 0)
+		code = recipe_copy(&recon->recipe, recipe, err);
+	if (code == 0)
+		code = recipe_resolve(&recon->recipe, recon->geometry, &recon->orbit, err);
+	if (code < 0 || !has_subsets(&recon->recipe))
+		return code;
+	recon->sart.relaxation = recon->recipe.sart.relaxation;
+	recon->sart.nonnegative = recon->recipe.iterate.nonnegative;
+	return subsets_make(&recon->sart.subsets, &recon->orbit,
+			    subsets_count(recon->recipe.sart.subsets, recon->orbit.count), err);
 }
 
 int recon_memory(const struct backend *backend, struct device *device, const struct geometry *geometry,
-		 const struct recipe *recipe, struct recon_memory *ret_memory, struct error *err)
+		 const struct linearise *linearise, const struct recipe *recipe, struct recon_memory *ret_memory,
+		 struct error *err)
 {
 	float some = 0; /* stands for the weights: only whether there are any is asked here */
-	struct fdk_weights weights = {.columns = &some, .response = &some, .extended = &some};
-	const struct linearise linearise = {.sample = SAMPLE_FLOAT32};
-	struct recipe resolved = *recipe;
-	struct geometry upright = {0};
-	struct orbit orbit = {0};
-	struct sart_options sart = {0};
-	struct device *outofcore = NULL;
+	struct recon recon = {.backend = backend, .device = device, .geometry = geometry};
 	struct plan_options options;
-	int code = stand_up(&geometry, &upright, &orbit, err);
+	int code = recon_describe(&recon, recipe, err);
 
-	memcpy(weights.pad, orbit.pad, sizeof(weights.pad));
-	weights.extend = recipe->fdk.on && recipe->fdk.extend ? geometry->columns : 0;
-	if (code == 0)
-		code = recipe_resolve(&resolved, geometry, &orbit, err);
-	if (code == 0 && has_subsets(&resolved))
-		code = sart_options_make(&sart, &resolved, &orbit, err);
 	if (code == 0) {
-		options = plan_options(&resolved, geometry, &linearise, &weights, &sart);
-		code = choose_device(backend, device, &options, &resolved, &orbit, ret_memory, &outofcore, err);
+		recon.weights = (struct fdk_weights){
+		    .columns = &some,
+		    .response = &some,
+		    .extended = &some,
+		    .pad = {recon.orbit.pad[0], recon.orbit.pad[1]},
+		    .extend = recipe->fdk.extend ? recon.geometry->columns : 0,
+		};
+		recon.input.linearise = *linearise;
+		options = plan_options(&recon);
+		code = recon_choose_device(&recon, &options, err);
+		recon.weights = (struct fdk_weights){0};
 	}
-	if (outofcore != NULL)
-		backend_outofcore.close(outofcore);
-	subsets_clear(&sart.subsets);
-	orbit_clear(&orbit);
-	geometry_clear(&upright);
+	if (code == 0)
+		*ret_memory = recon.memory;
+	recon_clear(&recon);
 	return code;
 }

@@ -27,84 +27,61 @@ static double recipe_work(const struct recipe *recipe, const struct linearise *l
 /* The host's memory is asked for where the job lies in it. */
 static int refuse_what_does_not_fit(struct recon *recon, struct plan_options *options, struct error *err)
 {
+	const struct recon_memory *memory = &recon->memory;
 	const double mib = 1 << 20;
-	struct recon_memory memory;
 	struct device_info host = {.bytes_free = SIZE_MAX};
 	struct device *processor;
-	int code = choose_device(recon->backend, recon->device, options, &recon->recipe, &recon->orbit, &memory,
-				 &recon->outofcore, err);
+	int code = recon_choose_device(recon, options, err);
 
 	if (code == 0 && recon->outofcore != NULL) {
-		recon->backend = &backend_outofcore;
-		recon->device = recon->outofcore;
 		code = backend_cpu.open(0, &(struct device_options){0}, &processor, err);
 		if (code < 0)
 			return code;
 		backend_cpu.describe(processor, &host);
 		backend_cpu.close(processor);
 	}
-	if (code == 0 && memory.total > memory.available)
+	if (code == 0 && memory->total > memory->available)
 		return error_set_at(
 		    err, ERR_NO_MEMORY, "/grid",
 		    "%.1f MiB are needed (projections %.1f, volumes %.1f, scratch %.1f), %.1f MiB are free",
-		    (double)memory.total / mib, (double)memory.projections / mib, (double)memory.volumes / mib,
-		    (double)memory.scratch / mib, (double)memory.available / mib);
-	if (code == 0 && memory.host > host.bytes_free)
+		    (double)memory->total / mib, (double)memory->projections / mib, (double)memory->volumes / mib,
+		    (double)memory->scratch / mib, (double)memory->available / mib);
+	if (code == 0 && memory->host > host.bytes_free)
 		return error_set_at(err, ERR_NO_MEMORY, "/grid",
 				    "%.1f MiB of the host's memory are needed, %.1f MiB are free",
-				    (double)memory.host / mib, (double)host.bytes_free / mib);
+				    (double)memory->host / mib, (double)host.bytes_free / mib);
 	return code;
 }
 
-/* Makes the inputs of the plan: everything that is known before any device memory is allocated. */
-static int recon_prepare(struct recon *recon, const struct recipe *recipe, struct error *err)
+/* Makes the inputs of the plan that take memory or time, behind recon_describe. */
+static int recon_prepare(struct recon *recon, struct error *err)
 {
 	const struct geometry *geometry = recon->geometry;
-	int code = recipe_copy(&recon->recipe, recipe, err);
+	const struct recipe *recipe = &recon->recipe;
+	int code = 0;
 
-	if (code == 0)
-		code = recipe_resolve(&recon->recipe, geometry, &recon->orbit, err);
-	if (code == 0 && recon->recipe.fdk.on)
-		code = fdk_weights_make(&recon->weights, &recon->orbit, geometry, recon->recipe.fdk.window,
-					recon->recipe.fdk.cutoff, recon->recipe.fdk.extend, err);
-	if (code == 0 && has_subsets(&recon->recipe))
-		code = sart_options_make(&recon->sart, &recon->recipe, &recon->orbit, err);
+	if (recipe->fdk.on)
+		code = fdk_weights_make(&recon->weights, &recon->orbit, geometry, recipe->fdk.window,
+					recipe->fdk.cutoff, recipe->fdk.extend, err);
 	if (code < 0)
 		return code;
-	recon->work_total = recipe_work(&recon->recipe, &recon->input.linearise);
+	recon->work_total = recipe_work(recipe, &recon->input.linearise);
 	recon->pushed = calloc((size_t)geometry->count, 1);
 	if (recon->pushed == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for the list of %d views", geometry->count);
 	return 0;
 }
 
-static int recon_allocate(struct recon *recon, struct error *err)
+static int open_plan(struct recon *recon, struct error *err)
 {
-	const struct geometry *geometry = recon->geometry;
-	const struct recipe *recipe = &recon->recipe;
-	struct plan_options options =
-	    plan_options(recipe, geometry, &recon->input.linearise, &recon->weights, &recon->sart);
-	const int slots = corrections_slots(recipe, &options.linearise, geometry);
+	struct plan_options options = plan_options(recon);
 	int code = refuse_what_does_not_fit(recon, &options, err);
-	const struct backend *backend = recon->backend; /* that may have changed it */
 
 	if (code == 0)
-		code = backend->plan_new(recon->device, &options, &recon->plan, err);
-	if (code == 0 && recipe->fdk.on)
-		code = fdk_open(&recon->fdk, backend, recon->device, recon->plan, geometry, recon->weights.pad, err);
+		code = recon->backend->plan_new(recon->device, &options, &recon->plan, err);
 	if (code == 0)
-		code = backend->stack_new(recon->device, geometry->columns, geometry->rows,
-					  keeps_projections(recipe) ? geometry->count : recon->fdk.batch,
-					  &recon->projections, err);
-	if (code == 0)
-		code = backend->volume_new(recon->device, &recipe->grid, &recon->volume, err);
-	if (code == 0)
-		code = backend->volume_fill(recon->volume, 0, err);
-	if (code == 0 && keeps_projections(recipe))
-		code = backend->volume_new(recon->device, &recipe->grid, &recon->before, err);
-	if (code == 0 && slots > 0)
-		code = backend->stack_new(recon->device, geometry->columns, geometry->rows, slots, &recon->batch, err);
-	return code;
+		code = recon_allocate(recon, err);
+	return code == 0 ? recon->backend->volume_fill(recon->volume, 0, err) : code;
 }
 
 static int open_corrections(struct recon *recon, struct error *err)
@@ -137,18 +114,16 @@ static int open_algorithm(struct recon *recon, struct error *err)
 
 	if (algorithm == NULL)
 		return 0;
-	recon->problem = (struct problem){
-	    .backend = recon->backend,
-	    .device = recon->device,
-	    .plan = recon->plan,
-	    .geometry = recon->geometry,
-	    .grid = &recon->recipe.grid,
-	    .projections = recon->projections,
-	    .volume = recon->volume,
-	    .before = recon->before,
-	    .cancel = &recon->cancel,
-	    .nonnegative = recon->recipe.iterate.nonnegative,
-	};
+	recon->problem.backend = recon->backend;
+	recon->problem.device = recon->device;
+	recon->problem.plan = recon->plan;
+	recon->problem.geometry = recon->geometry;
+	recon->problem.grid = &recon->recipe.grid;
+	recon->problem.projections = recon->projections;
+	recon->problem.volume = recon->volume;
+	recon->problem.before = recon->before;
+	recon->problem.cancel = &recon->cancel;
+	recon->problem.nonnegative = recon->recipe.iterate.nonnegative;
 	recon->moved = true;
 	return algorithm->open != NULL ? algorithm->open(&recon->problem, &recon->algorithm_state, err) : 0;
 }
@@ -178,13 +153,13 @@ int recon_open(const struct backend *backend, struct device *device, const struc
 	recon->hooks = hooks;
 	recon->cancel = (struct cancel){.asked = hooks->cancelled, .context = hooks->context};
 	recon->warnings = (struct warning_sink){.context = hooks->context, .tell = hooks->warning};
-	code = stand_up(&recon->geometry, &recon->upright, &recon->orbit, err);
+	code = recon_describe(recon, recipe, err);
 	if (code == 0)
 		code = input_open(&recon->input, linearise, recon->geometry, recon->geometry != geometry, err);
 	if (code == 0)
-		code = recon_prepare(recon, recipe, err);
+		code = recon_prepare(recon, err);
 	if (code == 0)
-		code = recon_allocate(recon, err);
+		code = open_plan(recon, err);
 	if (code == 0)
 		code = open_corrections(recon, err);
 	if (code == 0)
@@ -199,19 +174,13 @@ int recon_open(const struct backend *backend, struct device *device, const struc
 	return 0;
 }
 
-void recon_free(struct recon *recon)
+void recon_clear(struct recon *recon)
 {
-	if (recon == NULL)
-		return;
 	if (recon->algorithm_state != NULL)
 		recon->recipe.algorithm->close(&recon->problem, recon->algorithm_state);
 	ends_free(recon->ends);
-	recon->backend->volume_free(recon->before);
-	recon->backend->volume_free(recon->volume);
-	recon->backend->stack_free(recon->projections);
-	recon->backend->stack_free(recon->batch);
 	corrections_close(&recon->corrections);
-	fdk_clear(&recon->fdk);
+	recon_release(recon);
 	recon->backend->plan_free(recon->plan);
 	subsets_clear(&recon->sart.subsets);
 	fdk_weights_clear(&recon->weights);
@@ -222,6 +191,13 @@ void recon_free(struct recon *recon)
 	input_clear(&recon->input);
 	geometry_clear(&recon->upright);
 	free(recon->pushed);
+}
+
+void recon_free(struct recon *recon)
+{
+	if (recon == NULL)
+		return;
+	recon_clear(recon);
 	free(recon);
 }
 
@@ -372,6 +348,11 @@ int recon_iteration(const struct recon *recon)
 size_t recon_defects(const struct recon *recon)
 {
 	return defects_total(&recon->input.counts);
+}
+
+const struct recon_memory *recon_memory_taken(const struct recon *recon)
+{
+	return &recon->memory;
 }
 
 const char *recon_plan(const struct recon *recon)

@@ -74,10 +74,12 @@ struct recon_memory {
 
 /*
  * The most memory that a job will take, known before it is opened. The projections are all kept for iterations; FDK
- * alone needs a few at a time. device NULL (the daemon, which opens none): available is 0.
+ * alone needs a few at a time. device NULL (the daemon, which opens none): available is 0. Of linearise's images it
+ * matters only which there are.
  */
 int recon_memory(const struct backend *backend, struct device *device, const struct geometry *geometry,
-		 const struct recipe *recipe, struct recon_memory *ret_memory, struct error *err);
+		 const struct linearise *linearise, const struct recipe *recipe, struct recon_memory *ret_memory,
+		 struct error *err);
 
 /*
  * geometry, linearise's images, hooks, backend and device are borrowed until
@@ -136,7 +138,8 @@ int recon_resume_noise(struct recon *recon, const struct volume_noise *noise, st
 int recon_read(struct recon *recon, int z_first, int z_count, float *ret_slices, struct error *err);
 
 const struct grid *recon_grid(const struct recon *recon);
-int recon_iteration(const struct recon *recon); /* iterations done so far */
+int recon_iteration(const struct recon *recon);                           /* iterations done so far */
+const struct recon_memory *recon_memory_taken(const struct recon *recon); /* as recon_open counted it */
 size_t recon_defects(const struct recon *recon);
 const char *recon_plan(const struct recon *recon); /* how the backend does it */
 

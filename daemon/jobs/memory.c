@@ -24,9 +24,10 @@ static int memory_needed(const char *backend, const struct scan *scan, const str
 {
 	const struct backend *row = backend_find(backend);
 	const struct geometry *geometry = &scan->geometry;
+	const struct linearise linearise = scan_linearise(scan);
 
 	if (row != NULL)
-		return recon_memory(row, NULL, geometry, recipe, ret_memory, err);
+		return recon_memory(row, NULL, geometry, &linearise, recipe, ret_memory, err);
 	*ret_memory = (struct recon_memory){.projections = (size_t)geometry->columns * (size_t)geometry->rows *
 							   (size_t)geometry->count * sizeof(float),
 					    .volumes = 2 * grid_voxels(&recipe->grid) * sizeof(float)};

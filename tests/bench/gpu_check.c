@@ -20,6 +20,7 @@
 #include "tests/bench/gpu_scene.h"
 
 extern const struct backend backend_cuda;
+static const struct linearise line_integrals = {.sample = SAMPLE_FLOAT32};
 
 static const double REFERENCE = 1e-4, STANDARD = 2e-3;
 static int failures;
@@ -939,13 +940,12 @@ static void check_matched_beside(struct device *devices[2])
 static float *reconstruct(const struct backend *side, struct device *device, const struct scene *scene,
 			  const struct recipe *recipe, const struct recon_hooks *hooks, const float *projections)
 {
-	const struct linearise linearise = {.sample = SAMPLE_FLOAT32};
 	float *volume = malloc(grid_voxels(&scene->grid) * sizeof(float));
 	int count = scene->geometry.count, *views = all_views(count);
 	struct recon *recon;
 	struct error err = {0};
 
-	must(recon_open(side, device, &scene->geometry, &linearise, recipe, hooks, &recon, &err), &err, "open");
+	must(recon_open(side, device, &scene->geometry, &line_integrals, recipe, hooks, &recon, &err), &err, "open");
 	must(recon_push(recon, projections, views, count, &err), &err, "push");
 	must(recon_run(recon, &err), &err, "run");
 	must(recon_read(recon, 0, scene->grid.size[2], volume, &err), &err, "read");
@@ -1241,7 +1241,6 @@ static void check_parts(bool tv, bool untilted, bool matched)
 					 .size = {161, 157, 149},
 					 .spacing = {.6, .6, .6},
 					 .bend = untilted ? BEND_NONE : BEND_TILTED};
-	const struct linearise linearise = {.sample = SAMPLE_FLOAT32};
 	const struct recon_hooks hooks = {0};
 	struct recon_memory memory;
 	struct phantom head;
@@ -1268,7 +1267,8 @@ static void check_parts(bool tv, bool untilted, bool matched)
 	recipe.tv.on = tv;
 	recipe_explicit_tv(&recipe, TV_GRADIENT);
 	recipe.reference_precision = true;
-	must(recon_memory(&backend_cuda, NULL, &scene.geometry, &recipe, &memory, &err), &err, "memory");
+	must(recon_memory(&backend_cuda, NULL, &scene.geometry, &line_integrals, &recipe, &memory, &err), &err,
+	     "memory");
 	for (int s = 0; s < 3; s++) {
 		const struct device_options limit = {.memory_limit =
 							 s == 0 ? 0 : memory.total / (tv || matched ? 4 : 2)};
@@ -1277,7 +1277,7 @@ static void check_parts(bool tv, bool untilted, bool matched)
 
 		got[s] = malloc(voxels * sizeof(float));
 		must(backend_cuda.open(0, &limit, &device, &err), &err, "open");
-		must(recon_open(&backend_cuda, device, &scene.geometry, &linearise, &recipe, &hooks, &recon, &err),
+		must(recon_open(&backend_cuda, device, &scene.geometry, &line_integrals, &recipe, &hooks, &recon, &err),
 		     &err, "open out of core");
 		must(recon_push(recon, raw, views, at.views, &err), &err, "push");
 		must(recon_run(recon, &err), &err, "run");
@@ -1338,7 +1338,6 @@ static void check_large(void)
 					 .size = {SIZE, SIZE, SIZE},
 					 .spacing = {.04655, .04655, .04655}};
 	const struct device_options limit = {.memory_limit = (size_t)24 << 30};
-	const struct linearise linearise = {.sample = SAMPLE_FLOAT32};
 	const struct recon_hooks hooks = {0};
 	const double density = .02;
 	struct phantom ball;
@@ -1361,7 +1360,7 @@ static void check_large(void)
 	printf("%-34s prepared in %.1f s\n", scene.name, seconds() - begin);
 	must(backend_cuda.open(0, &limit, &device, &err), &err, "open");
 	begin = seconds();
-	must(recon_open(&backend_cuda, device, &scene.geometry, &linearise, &recipe, &hooks, &recon, &err), &err,
+	must(recon_open(&backend_cuda, device, &scene.geometry, &line_integrals, &recipe, &hooks, &recon, &err), &err,
 	     "open in parts");
 	printf("%-34s %s\n", scene.name, recon_plan(recon));
 	for (int i = 0; i < VIEWS; i++)
@@ -1568,8 +1567,9 @@ static void check_bound(void)
 				struct error err = {0};
 
 				bound_recipe_make(&recipe, of, &scene.grid);
-				must(recon_memory(&backend_cuda, NULL, &scene.geometry, &recipe, &memory, &err), &err,
-				     of->name);
+				must(recon_memory(&backend_cuda, NULL, &scene.geometry, &line_integrals, &recipe,
+						  &memory, &err),
+				     &err, of->name);
 				expect(&scene, of->name, (double)memory.total, bound + (jobs[k].subsets > 0 ? 7e6 : 0));
 				if ((double)memory.total / bound > worst) {
 					worst = (double)memory.total / bound;
@@ -1604,7 +1604,8 @@ static void check_said(struct device *device)
 		}
 		projections = project_head(&scene);
 		bound_recipe_make(&recipe, &bound_recipes[i], &scene.grid);
-		must(recon_memory(&backend_cuda, NULL, &scene.geometry, &recipe, &memory, &err), &err, "memory");
+		must(recon_memory(&backend_cuda, NULL, &scene.geometry, &line_integrals, &recipe, &memory, &err), &err,
+		     "memory");
 		limit.memory_limit = memory.total;
 		must(backend_cuda.open(0, &limit, &small, &err), &err, "open");
 		got[0] = reconstruct(&backend_cuda, device, &scene, &recipe, &(struct recon_hooks){0}, projections);

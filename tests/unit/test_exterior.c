@@ -482,7 +482,8 @@ START_TEST(the_same_bits_with_other_threads_after_a_yield_and_in_just_the_memory
 	second.resume = first.last;
 	second.resume_iteration = first.iteration;
 	ck_assert_int_eq(backend_cpu.open(0, &(struct device_options){.threads = 2}, &device, &err), 0);
-	ck_assert_int_eq(recon_memory(&backend_cpu, device, &scene.geometry, &recipe, &memory, &err), 0);
+	ck_assert_int_eq(recon_memory(&backend_cpu, device, &scene.geometry, &whole.linearise, &recipe, &memory, &err),
+			 0);
 	backend_cpu.close(device);
 	second.memory_limit = memory.total;
 	run(&scene, &recipe, &second);

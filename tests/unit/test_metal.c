@@ -312,12 +312,12 @@ START_TEST(memory_is_known_beforehand)
 	scene_make(&scene, true);
 	/* All of it on one thread: what is worked in grows with them. */
 	ck_assert_int_eq(backend_cpu.open(0, &options, &device, &err), 0);
-	ck_assert_int_eq(recon_memory(&backend_cpu, device, &scene.geometry, &without, &alone, &err), 0);
+	ck_assert_int_eq(recon_memory(&backend_cpu, device, &scene.geometry, &linearise, &without, &alone, &err), 0);
 	without.algorithm = with.algorithm = _i == 1 ? &algorithm_sart : NULL;
 	without.tv.on = with.tv.on = _i == 2;
 	without.tv.after_fdk = with.tv.after_fdk = true;
-	ck_assert_int_eq(recon_memory(&backend_cpu, device, &scene.geometry, &without, &plain, &err), 0);
-	ck_assert_int_eq(recon_memory(&backend_cpu, device, &scene.geometry, &with, &memory, &err), 0);
+	ck_assert_int_eq(recon_memory(&backend_cpu, device, &scene.geometry, &linearise, &without, &plain, &err), 0);
+	ck_assert_int_eq(recon_memory(&backend_cpu, device, &scene.geometry, &linearise, &with, &memory, &err), 0);
 	backend_cpu.close(device);
 	ck_assert_uint_ge(memory.projections, sizeof(float) * COLUMNS * ROWS * VIEWS);
 	ck_assert_uint_gt(memory.total, plain.total);

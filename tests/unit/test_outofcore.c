@@ -91,7 +91,7 @@ static struct result reconstruct(const struct scene *scene, const struct recipe 
 	ok(backend.open(0, &options, &device, &err));
 	backend.describe(device, &info);
 	free_before = info.bytes_free;
-	ok(recon_memory(&own, device, &scene->geometry, recipe, &result.memory, &err));
+	ok(recon_memory(&own, device, &scene->geometry, linearise, recipe, &result.memory, &err));
 	ok(recon_open(&backend, device, &scene->geometry, linearise, recipe, &hooks, &recon, &err));
 	snprintf(result.plan, sizeof(result.plan), "%s", recon_plan(recon));
 	ok(recon_push(recon, samples, views, scene->geometry.count, &err));
@@ -237,7 +237,7 @@ START_TEST(any_limit_gives_the_same_volume)
 
 		backend.own_memory = true;
 		ok(backend.open(0, &options, &device, &err));
-		code = recon_memory(&backend, device, &scene.geometry, &recipe, &memory, &err);
+		code = recon_memory(&backend, device, &scene.geometry, &linearise, &recipe, &memory, &err);
 		backend.close(device);
 		if (code != 0) {
 			ck_assert_int_eq(code, ERR_NO_MEMORY);
@@ -317,6 +317,7 @@ START_TEST(what_metal_takes_of_the_host_is_said)
 {
 	struct grid grid = grid_of(53, 47, 61, 1, 1.1, .9);
 	const struct device_options options = {.threads = 2, .memory_limit = 1 << 20};
+	const struct linearise linearise = {.sample = SAMPLE_FLOAT32};
 	const size_t volume = grid_voxels(&grid) * sizeof(float);
 	struct backend backend = backend_cpu;
 	struct recipe recipe = recipe_on(&grid);
@@ -330,7 +331,7 @@ START_TEST(what_metal_takes_of_the_host_is_said)
 	for (int i = 0; i < 2; i++) {
 		recipe.metal.on = i == 1;
 		ok(backend.open(0, &options, &device, &err));
-		ok(recon_memory(&backend, device, &scene.geometry, &recipe, &memory[i], &err));
+		ok(recon_memory(&backend, device, &scene.geometry, &linearise, &recipe, &memory[i], &err));
 		backend.close(device);
 		ck_assert_uint_le(memory[i].total, memory[i].available);
 		ck_assert_uint_gt(memory[i].host, volume);

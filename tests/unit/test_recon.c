@@ -1129,9 +1129,48 @@ START_TEST(what_does_not_fit_is_refused_before_it_is_allocated)
 			 5);
 	ck_assert_double_ge(numbers[2], 512);
 	ck_assert_double_gt(numbers[0], numbers[4]);
-	ck_assert_int_eq(recon_memory(&backend_cpu, device, &scene.geometry, &recipe, &memory, &err), 0);
+	ck_assert_int_eq(recon_memory(&backend_cpu, device, &scene.geometry, &plain, &recipe, &memory, &err), 0);
 	ck_assert_uint_le(memory.available, 3 << 20);
 	ck_assert_uint_eq(memory.total, memory.projections + memory.volumes + memory.scratch);
+	backend_cpu.close(device);
+	scene_clear(&scene);
+}
+END_TEST
+
+/* _i: FDK alone, then with each algorithm; metal asks for a stack and a volume to work in. */
+START_TEST(what_is_allocated_is_what_was_said)
+{
+	const struct algorithm *algorithm = _i / 2 == 0 ? NULL : algorithms[_i / 2 - 1];
+	struct grid grid = grid_of(48, 44, 40, 1, 1, 1);
+	struct recipe recipe = recipe_on(&grid);
+	struct recon_memory memory;
+	struct device_info before, after;
+	struct scene scene;
+	struct device *device;
+	struct recon *recon;
+	struct error err = {0};
+	size_t taken, pixels;
+
+	small_scene(&scene);
+	pixels = (size_t)scene.geometry.columns * (size_t)scene.geometry.rows;
+	recipe.fdk.on = true;
+	recipe.metal.on = _i % 2 == 1;
+	recipe_set_algorithm(&recipe, algorithm);
+	ck_assert_int_eq(backend_cpu.open(0, &(struct device_options){.memory_limit = 1 << 28}, &device, &err), 0);
+	ck_assert_int_eq(recon_memory(&backend_cpu, device, &scene.geometry, &plain, &recipe, &memory, &err), 0);
+	backend_cpu.describe(device, &before);
+	ck_assert_int_eq(recon_open(&backend_cpu, device, &scene.geometry, &plain, &recipe, &no_hooks, &recon, &err),
+			 0);
+	ck_assert_mem_eq(recon_memory_taken(recon), &memory, sizeof(memory));
+	backend_cpu.describe(device, &after);
+	taken = before.bytes_free - after.bytes_free;
+	/* Later come a projection on its way in, and with iterations the coarse volumes of the exterior. */
+	if (algorithm == NULL)
+		ck_assert_uint_eq(taken, memory.total - sizeof(float) * pixels);
+	ck_assert_uint_le(taken, memory.total);
+	recon_free(recon);
+	backend_cpu.describe(device, &after);
+	ck_assert_uint_eq(after.bytes_free, before.bytes_free);
 	backend_cpu.close(device);
 	scene_clear(&scene);
 }
@@ -1149,9 +1188,9 @@ START_TEST(fdk_alone_does_not_keep_the_projections)
 
 	scene_orbit(&scene, &spec);
 	recipe.fdk.on = true;
-	ck_assert_int_eq(recon_memory(&backend_cpu, NULL, &scene.geometry, &recipe, &fdk, &err), 0);
+	ck_assert_int_eq(recon_memory(&backend_cpu, NULL, &scene.geometry, &plain, &recipe, &fdk, &err), 0);
 	recipe.algorithm = &algorithm_sart;
-	ck_assert_int_eq(recon_memory(&backend_cpu, NULL, &scene.geometry, &recipe, &sart, &err), 0);
+	ck_assert_int_eq(recon_memory(&backend_cpu, NULL, &scene.geometry, &plain, &recipe, &sart, &err), 0);
 	ck_assert_uint_ge(sart.projections, all);
 	ck_assert_uint_lt(fdk.projections, all / 10);
 	ck_assert_uint_lt(fdk.volumes, sart.volumes);
@@ -2157,6 +2196,7 @@ Suite *recon_suite(void)
 	tcase_add_test(pipeline, tv_after_a_sart_that_is_not_there_is_told);
 	tcase_add_test(pipeline, views_must_be_there_once_each);
 	tcase_add_test(pipeline, what_does_not_fit_is_refused_before_it_is_allocated);
+	tcase_add_loop_test(pipeline, what_is_allocated_is_what_was_said, 0, 2 * (1 + ALGORITHM_COUNT));
 	tcase_add_test(pipeline, fdk_alone_does_not_keep_the_projections);
 	tcase_add_loop_test(pipeline, impossible_recipes_are_refused_by_their_field, 0, COUNT(refusals));
 	tcase_add_test(pipeline, resolving_writes_every_default_and_is_stable);
