@@ -5,7 +5,7 @@
  * its only thread (the backends bring their own). While a job runs, the socket
  * is looked at whenever the pipeline asks whether to go on, which it does
  * between steps; so cancel and yield need no second thread. A job that begins
- * before its projections are complete gets their numbers over the same socket,
+ * before its projections are complete hears over the same socket how many are there,
  * and reads them from the file, which the daemon has just written. It dies with the
  * daemon, and it may die alone: what it has announced stays.
  */
@@ -49,10 +49,8 @@ struct worker {
 	char job[64]; /* that runs */
 	bool cancel, yield, quit;
 	struct error trouble; /* why the job was given up here though nobody had asked for it; code 0: it was not */
-	int *
-	    announced; /* [announced_count], room for VIEWS_MAX: projections that are there, as the daemon named them */
-	int announced_count;
-	int iteration; /* done */
+	int announced;        /* projections that are there: so many of those that are present, by their numbers */
+	int iteration;        /* done */
 	double reported;
 	struct message progress; /* the last that was reported, or, `behind`, that came too soon after it */
 	bool behind;
@@ -105,14 +103,6 @@ static int report_or_fail(struct worker *worker, struct message *message, struct
 	return code;
 }
 
-static void note_arrivals(struct worker *worker, const struct projection_runs *runs)
-{
-	for (int i = 0; i < runs->count; i++) {
-		for (int k = runs->first[i]; k <= runs->last[i] && worker->announced_count < VIEWS_MAX; k++)
-			worker->announced[worker->announced_count++] = k;
-	}
-}
-
 static void obey(struct worker *worker, const struct message *message)
 {
 	bool mine = strcmp(message->job, worker->job) == 0;
@@ -121,7 +111,7 @@ static void obey(struct worker *worker, const struct message *message)
 	worker->yield |= message->kind == MESSAGE_YIELD && mine;
 	worker->quit |= message->kind == MESSAGE_QUIT;
 	if (message->kind == MESSAGE_VIEWS && mine)
-		note_arrivals(worker, &message->runs);
+		worker->announced = message->count;
 }
 
 /* Obeys one message, waiting for it at most that long; false when there was none. */
@@ -277,11 +267,10 @@ static int push_arrivals(struct worker *worker, struct reconstruction *reconstru
 	int code = 0;
 
 	while (code == 0 && reconstruction_pushed(reconstruction) < reconstruction_wanted(reconstruction)) {
-		int pushed = reconstruction_pushed(reconstruction), count = worker->announced_count - pushed;
+		int pushed = reconstruction_pushed(reconstruction), count = worker->announced - pushed;
 
 		if (count > 0) {
-			code = reconstruction_push(reconstruction, worker->announced + pushed,
-						   count < MOST ? count : MOST, err);
+			code = reconstruction_push(reconstruction, pushed + (count < MOST ? count : MOST), err);
 			if (code == 0)
 				report_reconstructed(worker, reconstruction);
 			look_at_socket(worker);
@@ -371,7 +360,7 @@ static int serve_job(struct worker *worker, const struct message *start)
 
 	snprintf(worker->job, sizeof(worker->job), "%s", start->job);
 	worker->cancel = worker->yield = false;
-	worker->announced_count = 0;
+	worker->announced = 0;
 	worker->iteration = start->iteration;
 	worker->reported = 0;
 	worker->progress = (struct message){0};
@@ -522,11 +511,7 @@ int main(int argc, char **argv)
 	lower_priority();
 	backend_host_threads(arguments.options.threads);
 	worker.socket = arguments.socket;
-	worker.announced = malloc(VIEWS_MAX * sizeof(*worker.announced));
-	if (worker.announced == NULL) {
-		perror("cbct-worker");
-		status = EXIT_START;
-	} else if (open_device(&worker, &arguments, &err) != 0) {
+	if (open_device(&worker, &arguments, &err) != 0) {
 		say(&err);
 		status = EXIT_START;
 	} else {
@@ -534,6 +519,5 @@ int main(int argc, char **argv)
 	}
 	if (worker.device != NULL)
 		worker.backend->close(worker.device);
-	free(worker.announced);
 	return status;
 }

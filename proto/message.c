@@ -28,7 +28,6 @@ enum field_type {
 	FIELD_BOOL,
 	FIELD_STAGE,
 	FIELD_BITS,
-	FIELD_RUNS,
 	FIELD_GRID,
 	FIELD_REQUEST
 };
@@ -54,7 +53,7 @@ static const struct field start_fields[] = {FIELD("job", FIELD_STRING, job),
 					    FIELD("reduced", FIELD_BOOL, reduced),
 					    FIELD("present", FIELD_BITS, present),
 					    {0}};
-static const struct field views_fields[] = {FIELD("job", FIELD_STRING, job), FIELD("runs", FIELD_RUNS, runs), {0}};
+static const struct field views_fields[] = {FIELD("job", FIELD_STRING, job), FIELD("count", FIELD_INT, count), {0}};
 static const struct field job_fields[] = {FIELD("job", FIELD_STRING, job), {0}};
 static const struct field no_fields[] = {{0}};
 static const struct field hello_fields[] = {
@@ -136,23 +135,6 @@ static const struct {
     [MESSAGE_ENDED] = {"ended", ended_fields},
 };
 
-/* ---- runs ---- */
-
-bool projection_runs_add(struct projection_runs *runs, int projection)
-{
-	int at = runs->count - 1;
-
-	if (at >= 0 && runs->last[at] + 1 == projection) {
-		runs->last[at]++;
-		return true;
-	}
-	if (runs->count == MESSAGE_RUNS_MAX)
-		return false;
-	runs->first[runs->count] = runs->last[runs->count] = projection;
-	runs->count++;
-	return true;
-}
-
 /* ---- writing ---- */
 
 /* Two digits a byte; zero bytes at the end are left out. */
@@ -175,18 +157,6 @@ static cJSON *bytes_json(const uint8_t *bytes, size_t count)
 	json = cJSON_CreateString(text);
 	free(text);
 	return json;
-}
-
-/* first, last, first, last ... */
-static cJSON *runs_json(const struct projection_runs *runs)
-{
-	int numbers[2 * MESSAGE_RUNS_MAX];
-
-	for (int i = 0; i < runs->count; i++) {
-		numbers[2 * i] = runs->first[i];
-		numbers[2 * i + 1] = runs->last[i];
-	}
-	return cJSON_CreateIntArray(numbers, 2 * runs->count);
 }
 
 /* size, spacing, origin: nine numbers in a row. */
@@ -221,8 +191,6 @@ static cJSON *field_json(const struct field *field, const struct message *messag
 		return cJSON_CreateString(stage_names[*(const enum stage *)at]);
 	case FIELD_BITS:
 		return bytes_json(at, field->size);
-	case FIELD_RUNS:
-		return runs_json(at);
 	case FIELD_GRID:
 		return grid_json(at);
 	case FIELD_REQUEST:
@@ -325,30 +293,6 @@ static void read_bytes(struct json_reader *reader, const char *name, size_t size
 	}
 }
 
-static void read_runs(struct json_reader *reader, const char *name, struct projection_runs *ret_runs)
-{
-	const cJSON *member = json_member(reader, name, true), *first, *last;
-	int length = cJSON_IsArray(member) ? cJSON_GetArraySize(member) : -1;
-
-	if (member == NULL)
-		return;
-	if (length < 0 || length % 2 != 0 || length > 2 * MESSAGE_RUNS_MAX) {
-		json_fail(reader, ERR_INVALID, name, "at most %d pairs are expected", MESSAGE_RUNS_MAX);
-		return;
-	}
-	ret_runs->count = 0;
-	for (first = member->child; first != NULL; first = last->next) {
-		last = first->next;
-		if (!cJSON_IsNumber(first) || !cJSON_IsNumber(last) || first->valueint < 0 ||
-		    last->valueint < first->valueint || last->valueint >= VIEWS_MAX) {
-			json_fail(reader, ERR_INVALID, name, "a run from 0 to %d is expected", VIEWS_MAX - 1);
-			return;
-		}
-		ret_runs->first[ret_runs->count] = first->valueint;
-		ret_runs->last[ret_runs->count++] = last->valueint;
-	}
-}
-
 static void read_grid(struct json_reader *reader, const char *name, struct grid *ret_grid)
 {
 	double numbers[9] = {0};
@@ -427,9 +371,6 @@ static void read_field(struct json_reader *reader, const struct field *field, st
 		break;
 	case FIELD_BITS:
 		read_bytes(reader, field->name, field->size, at);
-		break;
-	case FIELD_RUNS:
-		read_runs(reader, field->name, at);
 		break;
 	case FIELD_GRID:
 		read_grid(reader, field->name, at);

@@ -18,7 +18,10 @@ enum message_kind {
 	 * there
 	 */
 	MESSAGE_START,
-	/* job, runs: these projections are there, to be reconstructed in this order. Not before the last were taken. */
+	/*
+	 * job, count: the first so many projections of those that are present are there. Not before those of the
+	 * message before were reconstructed.
+	 */
 	MESSAGE_VIEWS,
 	MESSAGE_CANCEL, /* job */
 	/* job: leave it at the next iteration's end; one that still waits for projections is left at once */
@@ -40,16 +43,6 @@ enum message_kind {
 	MESSAGE_KIND_COUNT
 };
 
-enum { MESSAGE_RUNS_MAX = 512 };
-
-/* Projections in an order: first .. last of each run after those of the one before. */
-struct projection_runs {
-	int count;
-	int first[MESSAGE_RUNS_MAX], last[MESSAGE_RUNS_MAX];
-};
-/* Adds one behind the last; false when there is no room. */
-bool projection_runs_add(struct projection_runs *runs, int projection);
-
 struct message {
 	enum message_kind kind;
 	char job[64];
@@ -58,7 +51,6 @@ struct message {
 	bool arriving, reduced;
 	double checkpoint_seconds;
 	uint8_t present[(VIEWS_MAX + 7) / 8]; /* START with `reduced`: bit k % 8 of byte k / 8 for projection k */
-	struct projection_runs runs;
 	int count;
 	struct device_info info;
 	char backend[16], plan[160];

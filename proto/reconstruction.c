@@ -329,10 +329,7 @@ struct reconstruction {
 	struct run run;
 	struct recon_hooks hooks;
 	struct scan_files files;
-	int projections;       /* of scan.json */
-	int *view_of;          /* [projections]: the view of the scan that it is, -1 where it is not present */
-	unsigned char *pushed; /* [projections] */
-	int pushed_count;
+	int pushed;    /* views that the recon has: the first of them */
 	int batch;     /* projections that are read at once */
 	int *views;    /* [batch] */
 	char *samples; /* [batch][row][column] */
@@ -349,35 +346,16 @@ struct reconstruction {
 	bool looked; /* its answer is known */
 };
 
-static int reduce(struct reconstruction *reconstruction, const unsigned char *present, struct error *err)
-{
-	struct scan *scan = reconstruction->files.scan;
-	int code = present == NULL ? 0 : scan_reduce(scan, present, err);
-
-	if (code != 0)
-		return code;
-	for (int i = 0; i < reconstruction->projections; i++)
-		reconstruction->view_of[i] = -1;
-	for (int i = 0; i < scan->count; i++)
-		reconstruction->view_of[scan->projection == NULL ? i : scan->projection[i]] = i;
-	return 0;
-}
-
 static int allocate(struct reconstruction *reconstruction, struct error *err)
 {
-	size_t bytes = scan_projection_bytes(reconstruction->files.scan),
-	       count = (size_t)reconstruction->files.scan->count;
+	size_t bytes = scan_projection_bytes(reconstruction->files.scan);
 
-	reconstruction->projections = (int)count;
 	reconstruction->batch = bytes < READ_BYTES ? (int)(READ_BYTES / bytes) : 1;
-	if (reconstruction->batch > reconstruction->projections)
-		reconstruction->batch = reconstruction->projections;
-	reconstruction->view_of = malloc(count * sizeof(*reconstruction->view_of));
-	reconstruction->pushed = calloc(count, 1);
+	if (reconstruction->batch > reconstruction->files.scan->count)
+		reconstruction->batch = reconstruction->files.scan->count;
 	reconstruction->views = malloc((size_t)reconstruction->batch * sizeof(*reconstruction->views));
 	reconstruction->samples = malloc((size_t)reconstruction->batch * bytes);
-	if (reconstruction->view_of == NULL || reconstruction->pushed == NULL || reconstruction->views == NULL ||
-	    reconstruction->samples == NULL)
+	if (reconstruction->views == NULL || reconstruction->samples == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for %d projections of %zu bytes", reconstruction->batch,
 				 bytes);
 	return 0;
@@ -464,8 +442,7 @@ static int heed_stuck_pixels(struct reconstruction *reconstruction, bool *ret_ag
 	recon_free(reconstruction->recon);
 	reconstruction->recon = NULL;
 	reconstruction->run.recon = NULL;
-	memset(reconstruction->pushed, 0, (size_t)reconstruction->projections);
-	reconstruction->pushed_count = 0;
+	reconstruction->pushed = 0;
 	return open_recon(reconstruction, err);
 }
 
@@ -519,9 +496,9 @@ int reconstruction_open(const struct backend *backend, struct device *device,
 	if (code == 0)
 		code = set_provenance(reconstruction, options, err);
 	if (code == 0)
-		code = allocate(reconstruction, err);
+		code = options->present == NULL ? 0 : scan_reduce(reconstruction->files.scan, options->present, err);
 	if (code == 0)
-		code = reduce(reconstruction, options->present, err);
+		code = allocate(reconstruction, err);
 	reconstruction->backend = backend;
 	reconstruction->device = device;
 	reconstruction->options = options;
@@ -549,8 +526,6 @@ void reconstruction_close(struct reconstruction *reconstruction)
 	recon_free(reconstruction->recon);
 	stuck_free(reconstruction->stuck);
 	scan_files_close(&reconstruction->files);
-	free(reconstruction->view_of);
-	free(reconstruction->pushed);
 	free(reconstruction->views);
 	free(reconstruction->samples);
 	free(reconstruction);
@@ -558,7 +533,7 @@ void reconstruction_close(struct reconstruction *reconstruction)
 
 int reconstruction_pushed(const struct reconstruction *reconstruction)
 {
-	return reconstruction->pushed_count;
+	return reconstruction->pushed;
 }
 
 int reconstruction_wanted(const struct reconstruction *reconstruction)
@@ -651,59 +626,62 @@ out:
 	return code;
 }
 
-/* Into samples, neighbours in the file in one go. */
-static int read_projections(struct reconstruction *reconstruction, const int *projections, int count, struct error *err)
+static int projection_of(const struct reconstruction *reconstruction, int view)
+{
+	const int *projection = reconstruction->files.scan->projection;
+
+	return projection == NULL ? view : projection[view];
+}
+
+/* Into samples, at most a batch of views from `view` on; neighbours in the file in one go. */
+static int read_views(struct reconstruction *reconstruction, int view, int count, struct error *err)
 {
 	size_t bytes = scan_projection_bytes(reconstruction->files.scan);
 	int code = 0;
 
-	for (int first = 0, next; first < count && code == 0; first = next) {
-		for (next = first + 1; next < count && projections[next] == projections[next - 1] + 1;)
+	for (int at = 0, next; at < count && code == 0; at = next) {
+		int first = projection_of(reconstruction, view + at);
+
+		for (next = at + 1; next < count && projection_of(reconstruction, view + next) == first + next - at;)
 			next++;
-		code = read_run(reconstruction, projections[first], next - first,
-				reconstruction->samples + (size_t)first * bytes, err);
+		code = read_run(reconstruction, first, next - at, reconstruction->samples + (size_t)at * bytes, err);
 	}
 	return code;
 }
 
 /* At most a batch. */
-static int push_some(struct reconstruction *reconstruction, const int *projections, int count, struct error *err)
+static int push_some(struct reconstruction *reconstruction, int count, struct error *err)
 {
 	const size_t bytes = scan_projection_bytes(reconstruction->files.scan);
-	int code;
+	int code = read_views(reconstruction, reconstruction->pushed, count, err);
 
-	for (int i = 0; i < count; i++) {
-		int projection = projections[i];
-
-		if (projection < 0 || projection >= reconstruction->projections ||
-		    reconstruction->view_of[projection] < 0)
-			return error_set(err, ERR_INVALID, "projection %d is none of the scan's %d", projection,
-					 reconstruction_wanted(reconstruction));
-		reconstruction->views[i] = reconstruction->view_of[projection];
-	}
-	code = read_projections(reconstruction, projections, count, err);
+	for (int i = 0; i < count; i++)
+		reconstruction->views[i] = reconstruction->pushed + i;
 	for (int i = 0; i < count && code == 0 && reconstruction->stuck != NULL && !reconstruction->looked; i++)
 		if (stuck_wants(reconstruction->stuck, reconstruction->views[i]))
 			stuck_add(reconstruction->stuck, reconstruction->samples + (size_t)i * bytes);
 	if (code == 0)
 		code = recon_push(reconstruction->recon, reconstruction->samples, reconstruction->views, count, err);
-	for (int i = 0; i < count && code == 0; i++)
-		reconstruction->pushed[projections[i]] = 1;
-	reconstruction->pushed_count += code == 0 ? count : 0;
+	reconstruction->pushed += code == 0 ? count : 0;
 	/* The file is not prepared at the beginning: an arm may stand still for minutes. */
 	if (code == 0 && !reconstruction->resumed &&
-	    2 * reconstruction->pushed_count >= reconstruction_wanted(reconstruction))
+	    2 * reconstruction->pushed >= reconstruction_wanted(reconstruction))
 		prepare(&reconstruction->run, STAGE_FDK, 0);
 	return code;
 }
 
-int reconstruction_push(struct reconstruction *reconstruction, const int *projections, int count, struct error *err)
+int reconstruction_push(struct reconstruction *reconstruction, int count, struct error *err)
 {
 	int code = 0;
 
-	for (int first = 0; first < count && code == 0; first += reconstruction->batch)
-		code = push_some(reconstruction, projections + first,
-				 count - first < reconstruction->batch ? count - first : reconstruction->batch, err);
+	if (count > reconstruction_wanted(reconstruction))
+		return error_set(err, ERR_INVALID, "%d projections of a scan of %d", count,
+				 reconstruction_wanted(reconstruction));
+	while (reconstruction->pushed < count && code == 0) {
+		int rest = count - reconstruction->pushed;
+
+		code = push_some(reconstruction, rest < reconstruction->batch ? rest : reconstruction->batch, err);
+	}
 	return code;
 }
 
@@ -713,12 +691,12 @@ static int look_ahead(struct reconstruction *reconstruction, struct error *err)
 	bool again;
 	int code = 0;
 
-	if (reconstruction->stuck == NULL || reconstruction->looked || reconstruction->pushed_count > 0)
+	if (reconstruction->stuck == NULL || reconstruction->looked || reconstruction->pushed > 0)
 		return 0;
-	for (int i = 0; i < reconstruction->projections && code == 0; i++) {
-		if (reconstruction->view_of[i] < 0 || !stuck_wants(reconstruction->stuck, reconstruction->view_of[i]))
+	for (int i = 0; i < reconstruction_wanted(reconstruction) && code == 0; i++) {
+		if (!stuck_wants(reconstruction->stuck, i))
 			continue;
-		code = read_projections(reconstruction, &i, 1, err);
+		code = read_views(reconstruction, i, 1, err);
 		if (code == 0)
 			stuck_add(reconstruction->stuck, reconstruction->samples);
 	}
@@ -727,21 +705,9 @@ static int look_ahead(struct reconstruction *reconstruction, struct error *err)
 
 int reconstruction_push_rest(struct reconstruction *reconstruction, struct error *err)
 {
-	int *rest, count = 0, code = look_ahead(reconstruction, err);
+	int code = look_ahead(reconstruction, err);
 
-	if (code != 0)
-		return code;
-	rest = malloc((size_t)reconstruction_wanted(reconstruction) * sizeof(*rest));
-	if (rest == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for a list of %d projections",
-				 reconstruction_wanted(reconstruction));
-	for (int i = 0; i < reconstruction->projections; i++) {
-		if (reconstruction->view_of[i] >= 0 && !reconstruction->pushed[i])
-			rest[count++] = i;
-	}
-	code = reconstruction_push(reconstruction, rest, count, err);
-	free(rest);
-	return code;
+	return code == 0 ? reconstruction_push(reconstruction, reconstruction_wanted(reconstruction), err) : code;
 }
 
 int reconstruction_finish(struct reconstruction *reconstruction, struct error *err)
@@ -750,7 +716,7 @@ int reconstruction_finish(struct reconstruction *reconstruction, struct error *e
 	struct error trouble;
 	bool again = false;
 	/* Where projections came one by one, stuck pixels are known only now. */
-	int code = reconstruction->pushed_count == reconstruction_wanted(reconstruction)
+	int code = reconstruction->pushed == reconstruction_wanted(reconstruction)
 		       ? heed_stuck_pixels(reconstruction, &again, err)
 		       : 0;
 

@@ -15,8 +15,8 @@ struct saved_volume {
 };
 
 /*
- * The pipeline over a directory, in three steps: opened, given its projections in
- * any order and as they arrive, and finished. Each kept volume becomes a file of
+ * The pipeline over a directory, in three steps: opened, given its projections as
+ * far as they have arrived, and finished. Each kept volume becomes a file of
  * out_directory and is announced twice: by on_volume as soon as everybody can read
  * it there, whole, and by on_settled when it is on the disk. However a run ends,
  * announced volumes are settled first, unless that is what failed: then its file is
@@ -72,13 +72,12 @@ void reconstruction_close(struct reconstruction *reconstruction); /* NULL is fin
 int reconstruction_pushed(const struct reconstruction *reconstruction);
 int reconstruction_wanted(const struct reconstruction *reconstruction);
 /*
- * Reads these projections and reconstructs as far as they go, in this order: the
- * same order gives the same bits, however many a call brings. Each once
- * (ERR_CONFLICT), and only those that are present (ERR_INVALID). ERR_DAMAGED:
- * one does not fit its checksum, and none of it was used.
+ * Reads the next of the projections, by their numbers, until the first `count` of those that are present are there, and
+ * reconstructs as far as they go. The order of the sum is always the same, and so are the bits, however many a call
+ * brings. ERR_INVALID: there are not so many. ERR_DAMAGED: one does not fit its checksum, and none of it was used.
  */
-int reconstruction_push(struct reconstruction *reconstruction, const int *projections, int count, struct error *err);
-/* All that have not been pushed, by their numbers. */
+int reconstruction_push(struct reconstruction *reconstruction, int count, struct error *err);
+/* All that have not been pushed. */
 int reconstruction_push_rest(struct reconstruction *reconstruction, struct error *err);
 /*
  * Once, when all are there: the rest of the pipeline. A run that hooks->recon.yield ended returns ERR_BUSY and has

@@ -28,23 +28,27 @@ int worker_record_running(struct worker *worker, struct error *err)
 	return 0;
 }
 
-/* One message at a time is under way, however far behind the worker is. */
+/* Of a closed scan, those that it was closed without are not waited for. */
+static int projections_of(const struct scan_facts *facts)
+{
+	return facts->closed ? facts->received + facts->lost : facts->count;
+}
+
+/*
+ * In the order of their numbers, up to the first that is missing: FDK's sum then has the same order for every arrival,
+ * and the job the same bits. One message at a time is under way, however far behind the worker is.
+ */
 static void announce_arrivals(struct worker *worker)
 {
-	enum { MOST = 4 * MESSAGE_RUNS_MAX };
-	struct message message = {.kind = MESSAGE_VIEWS};
+	struct message message = {.kind = MESSAGE_VIEWS, .count = stored_scan_leading(worker->arriving)};
 	struct job_facts facts;
 	struct error err;
-	int projections[MOST], count, added = 0;
 
-	count = stored_scan_arrivals(worker->arriving, worker->announced, projections, MOST);
-	while (added < count && projection_runs_add(&message.runs, projections[added]))
-		added++;
-	if (added == 0)
+	if (message.count <= worker->announced)
 		return;
 	job_facts(worker->job, &facts);
 	snprintf(message.job, sizeof(message.job), "%s", facts.id);
-	worker->announced += added;
+	worker->announced = message.count;
 	/* Gone already: its pidfd tells. */
 	if (message_send(worker->child.socket, &message, &err) != 0)
 		log_line(LEVEL_DEBUG, "worker %d: %s", worker->index, err.text);
@@ -70,7 +74,7 @@ void worker_attend(struct supervise *supervise, struct worker *worker)
 	stored_scan_facts(worker->arriving, &facts);
 	if (worker->announced == worker->reconstructed)
 		announce_arrivals(worker);
-	if (worker->announced < facts.count || clock_monotonic() < worker->again)
+	if (worker->announced < projections_of(&facts) || clock_monotonic() < worker->again)
 		return;
 	code = worker_record_running(worker, &err);
 	if (code != 0) {
@@ -87,7 +91,7 @@ double worker_patience_ends(const struct worker *worker)
 		return NEVER;
 	stored_scan_facts(worker->arriving, &facts);
 	/* All projections were announced: the worker takes as long as it takes. */
-	if (worker->announced == facts.count)
+	if (worker->announced == projections_of(&facts))
 		return NEVER;
 	return (facts.arrived > worker->attended ? facts.arrived : worker->attended) + PATIENCE;
 }

@@ -104,7 +104,7 @@ bool worker_is_stale(const struct worker *worker)
 	job_facts(worker->job, &facts);
 	if (store_scan_look(jobs_store(job_jobs(worker->job)), facts.scan, &scan, &err) != 0)
 		return false;
-	/* Projections that arrive are announced by their places in an order, which a loss changes. */
+	/* One that was announced may be the one that was lost. */
 	return scan.basis != worker->basis || (worker->arriving != NULL && scan.losses != worker->losses);
 }
 

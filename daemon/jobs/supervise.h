@@ -12,7 +12,7 @@
  * failed), and a new worker is started, later and later while they keep dying.
  *
  * A free worker attends a waiting job with FDK: the stored projections are announced
- * to it, in the order of their arrival, and reconstructs them. A job of higher
+ * to it, in the order of their numbers up to the first that is missing, and it reconstructs them. A job of higher
  * priority takes the worker from it, and any other that has something to do
  * after two seconds in which nothing arrived; it then begins again later. So it
  * does, at once, when an image comes late or the scan is closed, since what was

@@ -33,7 +33,6 @@ struct stored_scan *stored_scan_free(struct stored_scan *scan)
 		return NULL;
 	scan_free(scan->parsed);
 	scan_free(scan->measured);
-	free(scan->order);
 	free(scan->progress);
 	free(scan->lost);
 	free(scan->sums);
@@ -56,11 +55,8 @@ struct stored_scan *stored_scan_new(struct store *store, int count)
 	scan->references = 1;
 	scan->progress = calloc((size_t)count, 1);
 	scan->sums = calloc((size_t)count, sizeof(scan->sums[0]));
-	scan->order = calloc((size_t)count, sizeof(scan->order[0]));
 	scan->lost = calloc((size_t)count, 1);
-	return scan->progress == NULL || scan->sums == NULL || scan->order == NULL || scan->lost == NULL
-		   ? stored_scan_free(scan)
-		   : scan;
+	return scan->progress == NULL || scan->sums == NULL || scan->lost == NULL ? stored_scan_free(scan) : scan;
 }
 
 /* ---- the array ---- */

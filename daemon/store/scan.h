@@ -39,8 +39,7 @@ struct stored_scan {
 	int unchecked;       /* those with `bytes` 0 */
 	unsigned char *lost; /* [count]: was stored, was found damaged, and is missing until it is sent again */
 	int lost_count;
-	unsigned losses; /* since the start: what was counted in `order` has another place after one */
-	int *order;      /* [received]: the projections that are stored, as they came */
+	unsigned losses; /* since the start: projections that were stored and are not any more */
 	int received;
 	double arrived; /* monotonic: the last of them, 0: before the start */
 	enum progress image[IMAGE_COUNT];

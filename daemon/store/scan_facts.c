@@ -75,7 +75,7 @@ void stored_scan_add(struct stored_scan *scan, int index, const struct sum *sum)
 	scan->lost_count -= scan->lost[index];
 	scan->lost[index] = 0;
 	scan->progress[index] = STORED;
-	scan->order[scan->received++] = index;
+	scan->received++;
 }
 
 void stored_scan_facts(struct stored_scan *scan, struct scan_facts *ret)
@@ -137,17 +137,19 @@ void stored_scan_lost(struct stored_scan *scan, unsigned char *ret_flags)
 	pthread_mutex_unlock(&scan->lock);
 }
 
-int stored_scan_arrivals(struct stored_scan *scan, int from, int *ret_projections, int most)
+int stored_scan_leading(struct stored_scan *scan)
 {
-	int count;
+	int leading = 0;
 
 	pthread_mutex_lock(&scan->lock);
-	count = scan->received - from;
-	count = count < 0 ? 0 : count < most ? count : most;
-	if (count > 0)
-		memcpy(ret_projections, scan->order + from, (size_t)count * sizeof(*ret_projections));
+	for (int i = 0; i < scan->count; i++) {
+		if (scan->progress[i] == STORED)
+			leading++;
+		else if (!scan->closed || scan->lost[i])
+			break;
+	}
 	pthread_mutex_unlock(&scan->lock);
-	return count;
+	return leading;
 }
 
 bool stored_scan_sum(struct stored_scan *scan, int index, struct sum *ret_sum)

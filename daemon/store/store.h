@@ -173,10 +173,10 @@ int store_scan_look(struct store *store, const char *id, struct scan_facts *ret,
 /* flags[count]: 1 where the projection is stored. */
 void stored_scan_received(struct stored_scan *scan, unsigned char *ret_flags);
 /*
- * The projections in the order in which they came: numbers `from`, from + 1, ... of that order, at most `most`.
- * Returns how many.
+ * How many of the scan's projections are there before the first that is missing. Those that a closed scan was closed
+ * without are none of its projections.
  */
-int stored_scan_arrivals(struct stored_scan *scan, int from, int *ret_projections, int most);
+int stored_scan_leading(struct stored_scan *scan);
 /* False when it is not stored. ret_sum->bytes 0: only its SHA-256 is known yet. */
 bool stored_scan_sum(struct stored_scan *scan, int index, struct sum *ret_sum);
 

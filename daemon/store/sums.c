@@ -77,15 +77,10 @@ int store_put_part_sum(const struct stored_scan *scan, int part, const void *byt
 
 /* ---- what does not fit ---- */
 
-/* From the list of those that are stored; the scan's lock is held. */
+/* The projection is stored no more; the scan's lock is held. */
 void stored_scan_remove(struct stored_scan *scan, int index)
 {
-	int at = 0;
-
-	while (scan->order[at] != index)
-		at++;
 	scan->received--;
-	memmove(scan->order + at, scan->order + at + 1, (size_t)(scan->received - at) * sizeof(scan->order[0]));
 	scan->unchecked -= scan->sums[index].bytes == 0;
 	scan->lost[index] = 1;
 	scan->lost_count++;

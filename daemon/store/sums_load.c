@@ -142,37 +142,13 @@ static int follow_parts(struct store *store, struct stored_scan *scan, const str
 	return code == 0 ? store_end(store, catalogue_set_closed(store->catalogue, scan->id, err), err) : code;
 }
 
-struct arrival {
-	uint64_t order;
-	int index;
-};
-
-static int compare_arrivals(const void *a, const void *b)
+/* What comes from now on has a later place in the order of arrival than all that is there. */
+static void raise_order_floor(struct stored_scan *scan)
 {
-	const struct arrival *x = a, *y = b;
-
-	if (x->order != y->order)
-		return x->order < y->order ? -1 : 1;
-	return x->index - y->index;
-}
-
-/* As they came; those without a record first, by their numbers. */
-static int order_arrivals(struct stored_scan *scan, struct error *err)
-{
-	struct arrival *arrivals = calloc((size_t)scan->received + 1, sizeof(*arrivals));
-
-	if (arrivals == NULL)
-		return error_set_errno(err, ENOMEM, "list of %d projections", scan->received);
-	for (int i = 0; i < scan->received; i++)
-		arrivals[i] = (struct arrival){scan->sums[scan->order[i]].order, scan->order[i]};
-	qsort(arrivals, (size_t)scan->received, sizeof(*arrivals), compare_arrivals);
-	for (int i = 0; i < scan->received; i++) {
-		scan->order[i] = arrivals[i].index;
-		if (arrivals[i].order >= scan->order_floor)
-			scan->order_floor = arrivals[i].order + 1;
+	for (int i = 0; i < scan->count; i++) {
+		if (scan->progress[i] == STORED && scan->sums[i].order >= scan->order_floor)
+			scan->order_floor = scan->sums[i].order + 1;
 	}
-	free(arrivals);
-	return 0;
 }
 
 static void show_projections(struct stored_scan *scan, const struct records *records)
@@ -209,7 +185,7 @@ int store_load_sums(struct store *store, struct stored_scan *scan, struct error 
 	if (code == 0)
 		show_projections(scan, &records);
 	if (code == 0)
-		code = order_arrivals(scan, err);
+		raise_order_floor(scan);
 	if (code == 0 && !records.whole && !scan->gone)
 		code = write_records(scan, &records, err);
 	free(records.projections);
