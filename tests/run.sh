@@ -1,47 +1,43 @@
 #!/usr/bin/env bash
-# Every test: the house's rules, the unit tests, then the black-box tests over HTTP.
-# What cannot run here is skipped aloud. Closes with `N passed, N failed, N skipped`.
+# Every test: the house's rules, the unit tests, then the black-box tests over HTTP, JOBS parts (one for each processor)
+# at a time. What cannot run here is skipped aloud. Closes with `N passed, N failed, N skipped`.
 # Usage: tests/run.sh [--soak] [FILTER ...]   only the parts whose path has one of the words in it; --soak: the long
 # tests of tests/soak in place of all others
 set -uo pipefail
 cd "$(dirname "$0")/.."
 export BUILD=${BUILD:-build}
-mkdir -p "$BUILD/test"
+JOBS=${JOBS:-$(nproc)}
+out=$BUILD/test/parts
+rm -rf "$BUILD"/test/{exchanges,reported.*,parts}
+mkdir -p "$out"
 results=$BUILD/test/results
-rm -rf "$BUILD"/test/{exchanges,reported.*}
 : >"$results"
 
-parts=(tests/http/test_*.sh tests/web/test_*.sh)
+# Parts take from a second to two minutes. The longest begin first, so that none of them is left alone on one processor
+# at the end.
 if [ "${1:-}" = --soak ]; then
 	shift
 	parts=(tests/soak/test_*.sh)
-	soak=1
+else
+	parts=(tests/http/test_real.sh unit/study tests/web/test_page.sh unit/recon tests/http/test_phantom.sh lint)
+	rest=$("$BUILD/unit" --list | sed 's,^,unit/,') || exit 1
+	for part in $rest tests/http/test_*.sh tests/web/test_*.sh; do
+		[[ " ${parts[*]} " == *" $part "* ]] || parts+=("$part")
+	done
 fi
 
 wanted() {
 	local path=$1
 	shift
-	[[ -n ${soak:-} && $path != tests/soak/* ]] && return 1
 	[ $# = 0 ] && return 0
 	local word
 	for word; do [[ $path == *$word* ]] && return 0; done
 	return 1
 }
 
-part() {
-	printf '\n== %s\n' "$1"
-}
-
-# What a sanitizer has to say of any process, the daemon and its workers too, comes into files of its own; only the
+# The reports of a sanitizer, of any process of a part, the daemon and its workers too, come into files of its own; only the
 # one for undefined behaviour, beside another, writes to standard error whatever it is told, and ends the process.
 # A part that leaves a report has failed.
-reports=$(realpath "$BUILD/test")/sanitizer
-rm -f "$reports".*
-for tool in ASAN LSAN UBSAN TSAN; do
-	options=${tool}_OPTIONS
-	export "$options=${!options:+${!options}:}log_path=$reports"
-done
-export UBSAN_OPTIONS=$UBSAN_OPTIONS:halt_on_error=1:print_stacktrace=1
 sanitized() { # PART FILE-OR-FOLDER: its output
 	grep -rIhs -A 12 'runtime error: ' "$2" >"$reports.undefined" || rm "$reports.undefined"
 	local report
@@ -49,53 +45,90 @@ sanitized() { # PART FILE-OR-FOLDER: its output
 		[ -e "$report" ] || continue
 		echo "FAIL $1: a sanitizer's report"
 		head -60 "$report" | sed 's/^/    /'
-		echo "fail $1 sanitizer" >>"$results"
-		mv "$report" "$BUILD/test/reported.$(basename "$1" .sh).${report##*.}"
+		echo "fail $1 sanitizer" >>"$RESULTS"
+		mv "$report" "$BUILD/test/reported.${1//\//.}.${report##*.}"
 	done
 }
 
-if wanted lint "$@"; then
-	part "lint"
-	if tests/lint.sh; then echo "pass lint" >>"$results"; else echo "fail lint" >>"$results"; fi
-fi
-
-if wanted unit "$@"; then
-	part "unit"
-	log=$BUILD/test/unit.log
+unit_suite() { # NAME
+	local log=$out/unit.$1.log status counts checks failures errors skips i
 	# The study's 50 iterations take half an hour under a sanitizer; LEAVE_OUT names suites (-NAME) that are left out aloud.
-	for suite in ${LEAVE_OUT:-}; do
-		echo "SKIP unit suite ${suite#-}: too slow under a sanitizer"
-		echo "skip unit suite ${suite#-}: too slow under a sanitizer" >>"$results"
-	done
-	# shellcheck disable=SC2086
-	CK_LOG_FILE_NAME=$BUILD/test/unit.check "$BUILD/unit" ${LEAVE_OUT:-} 2>&1 | tee "$log"
+	if [[ " ${LEAVE_OUT:-} " == *" -$1 "* ]]; then
+		echo "SKIP unit suite $1: too slow under a sanitizer"
+		echo "skip unit suite $1: too slow under a sanitizer" >>"$RESULTS"
+		return
+	fi
+	CK_LOG_FILE_NAME=$out/unit.$1.check "$BUILD/unit" "$1" 2>&1 | tee "$log"
 	status=${PIPESTATUS[0]}
 	# check's closing line: "100%: Checks: 42, Failures: 0, Errors: 0"
 	counts=$(grep -oE 'Checks: [0-9]+, Failures: [0-9]+, Errors: [0-9]+' "$log" | tail -1)
 	read -r checks failures errors <<<"$(tr -dc '0-9 ' <<<"$counts")"
 	if [ -z "${checks:-}" ] || { [ "$status" != 0 ] && [ "$((failures + errors))" = 0 ]; }; then
-		echo "FAIL unit: ended with status $status before its summary"
-		echo "fail unit" >>"$results"
+		echo "FAIL unit $1: ended with status $status before its summary"
+		echo "fail unit $1" >>"$RESULTS"
 	else
 		# A unit test that finds no data says "SKIP unit: why", and passes nothing.
-		skips=$(grep -E '^SKIP ' "$log" | grep -vc '^SKIP unit suite' || true)
-		for ((i = 0; i < checks - failures - errors - skips; i++)); do echo "pass unit"; done >>"$results"
-		for ((i = 0; i < failures + errors; i++)); do echo "fail unit"; done >>"$results"
+		skips=$(grep -cE '^SKIP ' "$log")
+		for ((i = 0; i < checks - failures - errors - skips; i++)); do echo "pass unit"; done >>"$RESULTS"
+		for ((i = 0; i < failures + errors; i++)); do echo "fail unit $1"; done >>"$RESULTS"
 	fi
-	grep -E '^SKIP ' "$log" | sed 's/^SKIP /skip /' >>"$results"
-	sanitized unit "$log"
-fi
+	grep -E '^SKIP ' "$log" | sed 's/^SKIP /skip /' >>"$RESULTS"
+	sanitized "unit/$1" "$log"
+}
 
-for file in "${parts[@]}"; do
-	[ -e "$file" ] || continue
-	wanted "$file" "$@" || continue
-	part "$file"
-	RESULTS=$results bash "$file" || true
-	sanitized "$(basename "$file")" "$BUILD/test/$(basename "$file" .sh)"
+# One part in a process of its own; its lines for the sum at the end come into a file of its own.
+run_part() { # PART
+	local name=${1//\//.} started=$SECONDS tool options reports
+	export RESULTS=$out/$name.results
+	reports=$(realpath "$BUILD/test")/sanitizer.$name
+	rm -f "$reports".*
+	for tool in ASAN LSAN UBSAN TSAN; do
+		options=${tool}_OPTIONS
+		export "$options=${!options:+${!options}:}log_path=$reports"
+	done
+	export UBSAN_OPTIONS=$UBSAN_OPTIONS:halt_on_error=1:print_stacktrace=1
+	case $1 in
+	lint)
+		if tests/lint.sh; then echo "pass lint" >>"$RESULTS"; else echo "fail lint" >>"$RESULTS"; fi
+		;;
+	unit/*) unit_suite "${1#unit/}" ;;
+	*)
+		bash "$1" || true
+		sanitized "$1" "$BUILD/test/$(basename "$1" .sh)"
+		;;
+	esac
+	[ -s "$RESULTS" ] || echo "fail $1: it has no result" >"$RESULTS"
+	echo "-- $((SECONDS - started)) s"
+}
+
+# JOBS parts at a time. A part's output is shown in one piece when it has ended. Each is a process group of its own (-m),
+# so that all of it, its daemons too, ends when this script is told to.
+set -m
+declare -A running=()
+show() { # waits for the part that ends next
+	local ended
+	wait -n -p ended "${!running[@]}"
+	printf '\n== %s\n' "${running[$ended]}"
+	cat "$out/${running[$ended]//\//.}.out"
+	unset "running[$ended]"
+}
+stop_all() {
+	local pid
+	for pid in "${!running[@]}"; do kill -- "-$pid" 2>/dev/null; done
+	exit 1
+}
+trap stop_all INT TERM
+for part in "${parts[@]}"; do
+	{ [ "$part" = lint ] || [[ $part == unit/* ]] || [ -e "$part" ]; } && wanted "$part" "$@" || continue
+	[ ${#running[@]} -lt "$JOBS" ] || show
+	run_part "$part" >"$out/${part//\//.}.out" 2>&1 &
+	running[$!]=$part
 done
+while [ ${#running[@]} -gt 0 ]; do show; done
+cat "$out"/*.results >"$results" 2>/dev/null
 
-if wanted http "$@"; then
-	part "exchanges and proto/openapi.yaml"
+if wanted http "$@" && [ -d "$BUILD/test/exchanges" ]; then
+	printf '\n== %s\n' "exchanges and proto/openapi.yaml"
 	python=${PYTHON:-/usr/bin/python3}
 	if ! "$python" -c 'import jsonschema, yaml' 2>/dev/null; then
 		echo "SKIP exchanges: python3-jsonschema and python3-yaml are not here"

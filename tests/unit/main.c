@@ -1,6 +1,6 @@
 /*
  * Runs the suites of the table below; `unit NAME ...` runs those named only,
- * `unit -NAME ...` all but those.
+ * `unit -NAME ...` all but those; `unit --list` prints their names.
  * CK_FORK=no keeps the tests in one process, for debuggers and sanitizers.
  *
  * A new suite is a file tests/unit/test_NAME.c that exports NAME_suite, and a row.
@@ -44,9 +44,15 @@ static bool wanted(const char *name, int count, char **names)
 
 int main(int argc, char **argv)
 {
-	SRunner *runner = srunner_create(NULL);
+	SRunner *runner;
 	int failed, found = 0, named = 0;
 
+	if (argc == 2 && strcmp(argv[1], "--list") == 0) {
+		for (size_t i = 0; i < sizeof(suites) / sizeof(*suites); i++)
+			printf("%s\n", suites[i].name);
+		return EXIT_SUCCESS;
+	}
+	runner = srunner_create(NULL);
 	for (size_t i = 0; i < sizeof(suites) / sizeof(*suites); i++) {
 		if (!wanted(suites[i].name, argc - 1, argv + 1))
 			continue;
