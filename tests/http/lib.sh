@@ -131,6 +131,16 @@ expect_number() { # VALUE OP LIMIT NAME, OP one of <= >= < > ==
 	echo "  $4 = $1 ($2 $3)"
 }
 
+# The daemon's worker, or the one that comes after one that has just died.
+worker_of() {
+	local i pid
+	for ((i = 0; i < 400; i++)); do
+		pid=$(pgrep -P "$(cat "$work/daemon.pid")" | head -1) && [ -n "$pid" ] && { echo "$pid"; return 0; }
+		sleep 0.02
+	done
+	fail "a worker"
+}
+
 # state_becomes STATE [SECONDS]: of $job, that it may leave again
 state_becomes() {
 	local end=$((SECONDS + ${2:-60}))

@@ -57,7 +57,6 @@ kill_worker() {
 		sleep 0.02
 	done
 }
-worker_of() { pgrep -P "$(cat "$work/daemon.pid")" | head -1; }
 
 test_fdk_goes_along_and_the_rest_of_the_pipeline_follows() {
 	fresh_daemon

@@ -149,7 +149,7 @@ test_a_dead_worker_takes_nothing_with_it() {
 	post_projections "$scan_dir"
 	post_job "{\"scan\": \"SCAN\", $grid, \"sart\": {\"iterations\": $long, \"subsets\": \"views\"}}"
 	running_at 2
-	worker=$(pgrep -P "$(cat "$work/daemon.pid")" | head -1)
+	worker=$(worker_of)
 	kill -9 "$worker"
 	wait_job succeeded 240
 	expect_json '.attempts == 2'
@@ -251,7 +251,6 @@ told_and_held() {
 	etag=$(header etag)
 }
 digest_of() { echo "sha-256=:$(openssl dgst -sha256 -binary "$1" | base64 -w 0):"; }
-worker_of() { pgrep -P "$(cat "$work/daemon.pid")" | head -1; }
 events_of() { curl -sS -N --max-time 60 "$url/v1/jobs/$job/events" | awk '/^event: /{ printf "%s%s", sep, $2; sep = " " }'; }
 
 test_a_volume_is_told_of_before_it_is_on_the_disk_and_the_job_ends_after() {
