@@ -253,6 +253,25 @@ out:
 	backend_cpu.close(device);
 }
 
+void run(const struct scene *scene, const struct recipe *recipe, struct outcome *outcome)
+{
+	scene_run(scene, recipe, outcome);
+	if (outcome->code < 0)
+		ck_abort_msg("%s %s", outcome->err.pointer, outcome->err.text);
+}
+
+void outcome_resume(struct outcome *outcome, const struct outcome *yielded)
+{
+	ck_assert_int_eq(yielded->code, ERR_BUSY);
+	outcome->resume = yielded->last;
+	outcome->resume_iteration = yielded->iteration;
+	outcome->resume_state = yielded->state;
+	outcome->resume_state_bytes = yielded->state_bytes;
+	outcome->resume_metal = yielded->metal;
+	outcome->resume_metal_bytes = yielded->metal_bytes;
+	outcome->resume_noise = yielded->noise.sigma >= 0 ? &yielded->noise : NULL;
+}
+
 const float *outcome_volume(const struct outcome *outcome, const char *name)
 {
 	if (outcome->code < 0)

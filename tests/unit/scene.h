@@ -79,6 +79,10 @@ struct outcome {
 
 /* Opens the CPU, pushes, runs. */
 void scene_run(const struct scene *scene, const struct recipe *recipe, struct outcome *outcome);
+/* The same; ends the test where the run fails. */
+void run(const struct scene *scene, const struct recipe *recipe, struct outcome *outcome);
+/* What a run that goes on is given of one that has yielded, which must outlive it. */
+void outcome_resume(struct outcome *outcome, const struct outcome *yielded);
 const float *outcome_volume(const struct outcome *outcome, const char *name); /* ends the test where it is not there */
 void outcome_clear(struct outcome *outcome);
 

@@ -282,12 +282,6 @@ static struct recipe small_recipe(const struct algorithm *algorithm)
 	return recipe;
 }
 
-static void run(const struct scene *scene, const struct recipe *recipe, struct outcome *outcome)
-{
-	scene_run(scene, recipe, outcome);
-	ck_assert_msg(outcome->code == 0, "%s", outcome->err.text);
-}
-
 START_TEST(sart_in_plain_steps_is_the_fused_one)
 {
 	int order[SLOTS] = {3, 0, 4, 1, 2}, start[] = {0, 2, 5};
@@ -367,12 +361,7 @@ START_TEST(a_run_that_yielded_ends_with_the_same_bits)
 	ck_assert_int_eq(whole.row_count, 4);
 
 	scene_run(&scene, &recipe, &first);
-	ck_assert_int_eq(first.code, ERR_BUSY);
-	second.resume = first.last;
-	second.resume_iteration = first.iteration;
-	second.resume_state = first.state;
-	second.resume_state_bytes = first.state_bytes;
-	second.resume_noise = recipe.tv.on ? &first.noise : NULL;
+	outcome_resume(&second, &first);
 	run(&scene, &recipe, &second);
 	ck_assert_mem_eq(second.last, whole.last, sizeof(float) * grid_voxels(&whole.grid));
 	for (int i = 0; i < 2; i++)
@@ -399,9 +388,7 @@ START_TEST(a_run_whose_pixels_are_averaged_goes_on_with_the_same_bits)
 	run(&scene, &recipe, &whole);
 	ck_assert_ptr_nonnull(strstr(whole.warnings, "averaged_pixels: "));
 	scene_run(&scene, &recipe, &first);
-	ck_assert_int_eq(first.code, ERR_BUSY);
-	second.resume = first.last;
-	second.resume_iteration = first.iteration;
+	outcome_resume(&second, &first);
 	run(&scene, &recipe, &second);
 	ck_assert_ptr_null(strstr(second.warnings, "averaged_pixels: "));
 	ck_assert_mem_eq(second.last, whole.last, sizeof(float) * grid_voxels(&grid));

@@ -127,13 +127,6 @@ static struct worst slice_errors(const struct geometry *geometry, const struct g
 	return worst;
 }
 
-static void run(const struct scene *scene, const struct recipe *recipe, struct outcome *outcome)
-{
-	scene_run(scene, recipe, outcome);
-	if (outcome->code < 0)
-		ck_abort_msg("%s %s", outcome->err.pointer, outcome->err.text);
-}
-
 static struct recipe sart_on(const struct grid *grid)
 {
 	struct recipe recipe = recipe_on(grid);
@@ -478,9 +471,7 @@ START_TEST(the_same_bits_with_other_threads_after_a_yield_and_in_just_the_memory
 	recipe.projector = _i == 0 ? PROJECTOR_INTERPOLATING : PROJECTOR_MATCHED;
 	run(&scene, &recipe, &whole);
 	scene_run(&scene, &recipe, &first);
-	ck_assert_int_eq(first.code, ERR_BUSY);
-	second.resume = first.last;
-	second.resume_iteration = first.iteration;
+	outcome_resume(&second, &first);
 	ck_assert_int_eq(backend_cpu.open(0, &(struct device_options){.threads = 2}, &device, &err), 0);
 	ck_assert_int_eq(recon_memory(&backend_cpu, device, &scene.geometry, &whole.linearise, &recipe, &memory, &err),
 			 0);
@@ -610,12 +601,7 @@ START_TEST(the_end_slices_are_the_same_bits_with_other_threads_and_after_a_yield
 	recipe.emits = 1;
 	run(&scene, &recipe, &whole);
 	scene_run(&scene, &recipe, &first);
-	ck_assert_int_eq(first.code, ERR_BUSY);
-	second.resume = first.last;
-	second.resume_iteration = first.iteration;
-	second.resume_state = first.state;
-	second.resume_state_bytes = first.state_bytes;
-	second.resume_noise = &first.noise;
+	outcome_resume(&second, &first);
 	run(&scene, &recipe, &second);
 	ck_assert_mem_eq(second.last, whole.last, bytes);
 	ck_assert_int_ne(memcmp(outcome_volume(&whole, "final"), whole.last, bytes), 0);

@@ -8,34 +8,10 @@
 
 #include "proto/format.h"
 #include "proto/nifti.h"
+#include "tests/unit/volume_file.h"
 
 static const struct grid grid = {{3, 2, 4}, {0.5, 0.75, 1.25}, {-10, 20.5, 0.1}};
 enum { VOXELS = 3 * 2 * 4 };
-
-static char directory[] = "/tmp/cbct-format-XXXXXX", path[64];
-
-static void make_directory(void)
-{
-	memcpy(directory + strlen(directory) - 6, "XXXXXX", 6);
-	ck_assert_ptr_nonnull(mkdtemp(directory));
-	snprintf(path, sizeof(path), "%s/volume", directory);
-}
-
-static void remove_directory(void)
-{
-	unlink(path);
-	rmdir(directory);
-}
-
-static void write_file(const void *header, size_t header_size, const void *voxels, size_t voxels_size)
-{
-	FILE *file = fopen(path, "wb");
-
-	ck_assert_ptr_nonnull(file);
-	ck_assert_uint_eq(fwrite(header, 1, header_size, file), header_size);
-	ck_assert_uint_eq(fwrite(voxels, 1, voxels_size, file), voxels_size);
-	ck_assert_int_eq(fclose(file), 0);
-}
 
 /* ---- headers ---- */
 
@@ -335,9 +311,9 @@ START_TEST(every_format_comes_back)
 
 			if (length == 0 && type == VOLUME_INT16)
 				continue; /* raw says nothing of its type: it is float32 */
-			write_file(h, length, type == VOLUME_INT16 ? (void *)counts : voxels,
-				   VOXELS * volume_type_bytes((enum volume_type)type));
-			ck_assert_msg(volume_read(path, &found, NULL, &back, &err) == 0, "%s: %s", format->name,
+			volume_file_write(h, length, type == VOLUME_INT16 ? (void *)counts : voxels,
+					  VOXELS * volume_type_bytes((enum volume_type)type));
+			ck_assert_msg(volume_read(volume_file, &found, NULL, &back, &err) == 0, "%s: %s", format->name,
 				      err.text);
 			assert_grid(&found, &grid);
 			for (int i = 0; i < VOXELS; i++)
@@ -360,8 +336,8 @@ START_TEST(axes_that_run_the_other_way_are_turned_round)
 	fill(voxels);
 	header_of("nifti", &grid, VOLUME_FLOAT32, nothing(), h);
 	memcpy(h + 280, row, sizeof(row));
-	write_file(h, 4096, voxels, sizeof(voxels));
-	ck_assert_msg(volume_read(path, &found, NULL, &back, &err) == 0, "%s", err.text);
+	volume_file_write(h, 4096, voxels, sizeof(voxels));
+	ck_assert_msg(volume_read(volume_file, &found, NULL, &back, &err) == 0, "%s", err.text);
 	/* RAS 9 .. 10 is LPS -10 .. -9: voxel 2 of the file comes first. */
 	ck_assert_double_eq_tol(found.origin[0], -10, 1e-6);
 	ck_assert_double_eq_tol(found.spacing[0], 0.5, 1e-6);
@@ -372,8 +348,8 @@ START_TEST(axes_that_run_the_other_way_are_turned_round)
 	header_of("nifti", &grid, VOLUME_FLOAT32, nothing(), h);
 	memset(h + 254, 0, 2);
 	memset(h + 256, 0, 12);
-	write_file(h, 4096, voxels, sizeof(voxels));
-	ck_assert_msg(volume_read(path, &found, NULL, &back, &err) == 0, "%s", err.text);
+	volume_file_write(h, 4096, voxels, sizeof(voxels));
+	ck_assert_msg(volume_read(volume_file, &found, NULL, &back, &err) == 0, "%s", err.text);
 	ck_assert_double_eq_tol(found.origin[0], -10 - 2 * 0.5, 1e-6);
 	ck_assert_double_eq_tol(found.origin[1], 20.5 - 0.75, 1e-6);
 	ck_assert_float_eq(back[0], voxels[5]); /* both x and y */
@@ -381,8 +357,8 @@ START_TEST(axes_that_run_the_other_way_are_turned_round)
 	/* And with the header's own quaternion, half a turn about z, nothing moves. */
 	header_of("nifti", &grid, VOLUME_FLOAT32, nothing(), h);
 	memset(h + 254, 0, 2);
-	write_file(h, 4096, voxels, sizeof(voxels));
-	ck_assert_msg(volume_read(path, &found, NULL, &back, &err) == 0, "%s", err.text);
+	volume_file_write(h, 4096, voxels, sizeof(voxels));
+	ck_assert_msg(volume_read(volume_file, &found, NULL, &back, &err) == 0, "%s", err.text);
 	assert_grid(&found, &grid);
 	ck_assert_mem_eq(back, voxels, sizeof(voxels));
 	free(back);
@@ -402,8 +378,8 @@ START_TEST(scale_and_offset_are_applied)
 	header_of("nifti", &grid, VOLUME_INT16, nothing(), h);
 	memcpy(h + 112, &slope, 4);
 	memcpy(h + 116, &offset, 4);
-	write_file(h, 4096, counts, sizeof(counts));
-	ck_assert_int_eq(volume_read(path, &found, NULL, &back, &err), 0);
+	volume_file_write(h, 4096, counts, sizeof(counts));
+	ck_assert_int_eq(volume_read(volume_file, &found, NULL, &back, &err), 0);
 	for (int i = 0; i < VOXELS; i++)
 		ck_assert_float_eq(back[i], 0.5f * (float)i - 3);
 	free(back);
@@ -449,8 +425,8 @@ START_TEST(what_cannot_be_read_right_is_refused)
 		struct grid found = {.size = {0}};
 		struct error err = {0};
 
-		write_file(unread[i].header, strlen(unread[i].header), voxels, i < 18 ? sizeof(voxels) : 0);
-		ck_assert_msg(volume_read(path, &found, NULL, &back, &err) < 0, "%s", unread[i].header);
+		volume_file_write(unread[i].header, strlen(unread[i].header), voxels, i < 18 ? sizeof(voxels) : 0);
+		ck_assert_msg(volume_read(volume_file, &found, NULL, &back, &err) < 0, "%s", unread[i].header);
 		ck_assert_msg(strstr(err.text, unread[i].says) != NULL, "%s: %s", unread[i].header, err.text);
 		ck_assert_ptr_null(back);
 		ck_assert_int_eq(found.size[0], 0);
@@ -461,11 +437,12 @@ START_TEST(what_cannot_be_read_right_is_refused)
 		struct grid found = grid;
 		struct error err = {0};
 
-		write_file(h, length, voxels, sizeof(voxels) - 1);
-		ck_assert_int_eq(volume_read(path, &found, NULL, &back, &err), ERR_INVALID);
+		volume_file_write(h, length, voxels, sizeof(voxels) - 1);
+		ck_assert_int_eq(volume_read(volume_file, &found, NULL, &back, &err), ERR_INVALID);
 	}
-	unlink(path);
-	ck_assert_int_lt(volume_read(path, &(struct grid){.size = {1, 1, 1}}, NULL, &back, &(struct error){0}), 0);
+	unlink(volume_file);
+	ck_assert_int_lt(volume_read(volume_file, &(struct grid){.size = {1, 1, 1}}, NULL, &back, &(struct error){0}),
+			 0);
 }
 END_TEST
 
@@ -488,8 +465,8 @@ START_TEST(damaged_headers_do_no_harm)
 				float *back = NULL;
 
 				h[at] = bytes[b];
-				write_file(h, length, voxels, sizeof(voxels));
-				if (volume_read(path, &found, NULL, &back, &err) == 0)
+				volume_file_write(h, length, voxels, sizeof(voxels));
+				if (volume_read(volume_file, &found, NULL, &back, &err) == 0)
 					free(back);
 			}
 			h[at] = before;
@@ -512,7 +489,7 @@ Suite *format_suite(void)
 	tcase_add_test(headers, hounsfield_units_are_rounded_to_the_nearest);
 	suite_add_tcase(suite, headers);
 	tcase_set_timeout(reading, 60); /* thousands of small files on a loaded machine */
-	tcase_add_checked_fixture(reading, make_directory, remove_directory);
+	tcase_add_checked_fixture(reading, volume_file_make, volume_file_remove);
 	tcase_add_test(reading, every_format_comes_back);
 	tcase_add_test(reading, axes_that_run_the_other_way_are_turned_round);
 	tcase_add_test(reading, scale_and_offset_are_applied);

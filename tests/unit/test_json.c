@@ -7,6 +7,7 @@
 #include <string.h>
 
 #include "proto/json.h"
+#include "tests/unit/documents.h"
 
 /* Parsed from memory that ends where the text does, so that a sanitizer sees a byte too many. */
 static int parse(const char *text, size_t length, cJSON **ret_value, struct error *err)
@@ -127,10 +128,8 @@ START_TEST(what_is_not_strict_json_is_refused_by_its_place)
 		struct error err = {0};
 		int code = parse(refused[i].text, strlen(refused[i].text), &value, &err);
 
-		ck_assert_msg(code == ERR_INVALID && err.code == code, "%s: %d", refused[i].text, code);
 		ck_assert_ptr_null(value);
-		ck_assert_msg(strcmp(err.pointer, refused[i].pointer) == 0, "%s: at %s", refused[i].text, err.pointer);
-		ck_assert_msg(strstr(err.text, refused[i].says) != NULL, "%s: %s", refused[i].text, err.text);
+		expect_refused(refused[i].text, code, &err, ERR_INVALID, refused[i].pointer, refused[i].says);
 	}
 }
 END_TEST
@@ -404,9 +403,7 @@ START_TEST(reader_refuses_by_pointer)
 		struct error err = {0};
 		int code = read_all(misread[i].text, &answers, &err);
 
-		ck_assert_msg(code == misread[i].code, "%s: %d %s", misread[i].text, code, err.text);
-		ck_assert_msg(strcmp(err.pointer, misread[i].pointer) == 0, "%s: at %s", misread[i].text, err.pointer);
-		ck_assert_msg(strstr(err.text, misread[i].says) != NULL, "%s: %s", misread[i].text, err.text);
+		expect_refused(misread[i].text, code, &err, misread[i].code, misread[i].pointer, misread[i].says);
 	}
 }
 END_TEST

@@ -10,6 +10,7 @@
 
 #include "core/recon/parameters.h"
 #include "proto/recipe.h"
+#include "tests/unit/documents.h"
 
 static const char scan_text[] = "{\"detector\":{\"columns\":64,\"rows\":48,\"pixel_mm\":[4,4]},"
 				"\"projections\":{\"count\":60,\"sample\":\"float32\",\"quantity\":\"intensity\"},"
@@ -21,17 +22,6 @@ static const char scan_text[] = "{\"detector\":{\"columns\":64,\"rows\":48,\"pix
 /* Reads a text and prints what was understood, to be freed; NULL with the error. */
 typedef char *(*round_trip)(const char *text, struct error *err);
 
-static char *job_printed(const struct job_request *request)
-{
-	cJSON *json = job_request_json(request);
-	char *printed;
-
-	ck_assert_ptr_nonnull(json);
-	printed = json_print(json, NULL);
-	cJSON_Delete(json);
-	return printed;
-}
-
 static char *job_round_trip(const char *text, struct error *err)
 {
 	struct job_request request;
@@ -39,7 +29,7 @@ static char *job_round_trip(const char *text, struct error *err)
 
 	if (job_request_parse(text, strlen(text), &request, err) != 0)
 		return NULL;
-	printed = job_printed(&request);
+	printed = request_printed(&request);
 	job_request_clear(&request);
 	return printed;
 }
@@ -469,7 +459,7 @@ static void expect_resolved_round_trip(const char *request_text, const char *tex
 	ck_assert_msg(scan_parse(text, strlen(text), &scan, &err) == 0, "%s: %s at %s", text, err.text, err.pointer);
 	ck_assert_msg(job_request_parse(request_text, strlen(request_text), &request, &err) == 0, "%s", err.text);
 	if (job_request_resolve(&request, scan, &err) == 0) {
-		printed = job_printed(&request);
+		printed = request_printed(&request);
 		ck_assert_msg(job_request_parse(printed, strlen(printed), &back, &err) == 0, "%s: %s at %s", printed,
 			      err.text, err.pointer);
 		ck_assert(job_request_same(&request, &back));
@@ -530,7 +520,7 @@ START_TEST(a_request_is_printed_whole_or_not_at_all)
 	int allocations = 0;
 
 	ck_assert_int_eq(job_request_parse(text, strlen(text), &request, &err), 0);
-	whole = job_printed(&request);
+	whole = request_printed(&request);
 	for (; printed == NULL; allocations++) {
 		cJSON *json;
 

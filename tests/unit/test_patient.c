@@ -9,6 +9,8 @@
 #include "core/scan/geometry.h"
 #include "proto/format.h"
 #include "proto/nifti.h"
+#include "tests/unit/documents.h"
+#include "tests/unit/volume_file.h"
 
 static int read_text(const char *text, struct patient *ret, struct error *err)
 {
@@ -171,9 +173,7 @@ START_TEST(what_is_no_position_is_refused_by_its_pointer)
 		struct error err = {0};
 		int code = read_text(refused[i].text, &patient, &err);
 
-		ck_assert_msg(code == refused[i].code, "%s: %d %s", refused[i].text, code, err.text);
-		ck_assert_msg(strcmp(err.pointer, refused[i].pointer) == 0, "%s: at %s", refused[i].text, err.pointer);
-		ck_assert_msg(strstr(err.text, refused[i].says) != NULL, "%s: %s", refused[i].text, err.text);
+		expect_refused(refused[i].text, code, &err, refused[i].code, refused[i].pointer, refused[i].says);
 		ck_assert_int_eq(patient.position, 77);
 	}
 }
@@ -183,20 +183,6 @@ END_TEST
 
 static const struct grid grid = {{3, 4, 5}, {0.5, 0.75, 1.25}, {-10, 20.5, 0.125}};
 enum { VOXELS = 3 * 4 * 5 };
-static char directory[] = "/tmp/cbct-patient-XXXXXX", path[64];
-
-static void make_directory(void)
-{
-	memcpy(directory + strlen(directory) - 6, "XXXXXX", 6);
-	ck_assert_ptr_nonnull(mkdtemp(directory));
-	snprintf(path, sizeof(path), "%s/volume", directory);
-}
-
-static void remove_directory(void)
-{
-	unlink(path);
-	rmdir(directory);
-}
 
 static void write_volume(const struct volume_format *format, const struct patient *patient, bool sform)
 {
@@ -205,17 +191,13 @@ static void write_volume(const struct volume_format *format, const struct patien
 	size_t length;
 	float voxels[VOXELS];
 	struct error err = {0};
-	FILE *file = fopen(path, "wb");
 
 	for (int i = 0; i < VOXELS; i++)
 		voxels[i] = (float)i;
 	ck_assert_int_eq(format->header(&grid, VOLUME_FLOAT32, &provenance, h, &length, &err), 0);
 	if (!sform)
 		memset(h + NIFTI_SFORM_CODE, 0, 2);
-	ck_assert_ptr_nonnull(file);
-	ck_assert_uint_eq(fwrite(h, 1, length, file), length);
-	ck_assert_uint_eq(fwrite(voxels, sizeof(float), VOXELS, file), VOXELS);
-	ck_assert_int_eq(fclose(file), 0);
+	volume_file_write(h, length, voxels, sizeof(voxels));
 }
 
 /* Each voxel of the world stands in the patient's volume where the patient's position says. */
@@ -225,7 +207,7 @@ static void assert_placed(const struct patient *patient, const char *what)
 	struct error err = {0};
 	float *voxels = NULL;
 
-	ck_assert_msg(volume_read(path, &found, NULL, &voxels, &err) == 0, "%s: %s", what, err.text);
+	ck_assert_msg(volume_read(volume_file, &found, NULL, &voxels, &err) == 0, "%s: %s", what, err.text);
 	for (int i = 0; i < VOXELS; i++) {
 		const int at[3] = {i % 3, i / 3 % 4, i / 12};
 		double world[3], point[3];
@@ -283,11 +265,11 @@ START_TEST(oblique_volumes_come_back_along_their_own_axes)
 				patient.rotation[i][j] =
 				    (i == j ? c : 0) + s * cross[i][j] + (1 - c) * axis[i] * axis[j];
 		write_volume(volume_formats, &patient, true);
-		ck_assert_int_eq(volume_read(path, &found[0], NULL, &voxels, &err), ERR_INVALID);
-		ck_assert_msg(volume_read(path, &found[0], of_matrix, &voxels, &err) == 0, "%s", err.text);
+		ck_assert_int_eq(volume_read(volume_file, &found[0], NULL, &voxels, &err), ERR_INVALID);
+		ck_assert_msg(volume_read(volume_file, &found[0], of_matrix, &voxels, &err) == 0, "%s", err.text);
 		free(voxels);
 		write_volume(volume_formats, &patient, false);
-		ck_assert_int_eq(volume_read(path, &found[1], of_quaternion, &voxels, &err), 0);
+		ck_assert_int_eq(volume_read(volume_file, &found[1], of_quaternion, &voxels, &err), 0);
 		free(voxels);
 		for (int i = 0; i < 3; i++) {
 			ck_assert_int_eq(found[0].size[i], found[1].size[i]);
@@ -310,9 +292,9 @@ START_TEST(a_damaged_header_does_not_make_sides_unknown)
 	FILE *file;
 
 	write_volume(volume_formats, &patient, true);
-	file = fopen(path, "r+b");
+	file = fopen(volume_file, "r+b");
 	ck_assert_ptr_nonnull(file);
-	ck_assert_int_eq(volume_own_head(fileno(file), path, &grid, &start, &provenance, &err), 0);
+	ck_assert_int_eq(volume_own_head(fileno(file), volume_file, &grid, &start, &provenance, &err), 0);
 	ck_assert_uint_eq(start, NIFTI_VOXELS);
 	ck_assert(patient_same(&provenance.patient, &patient));
 	provenance_clear(&provenance);
@@ -321,11 +303,12 @@ START_TEST(a_damaged_header_does_not_make_sides_unknown)
 
 		ck_assert_int_eq(pread(fileno(file), &before, 1, at), 1);
 		ck_assert_int_eq(pwrite(fileno(file), &after, 1, at), 1);
-		ck_assert_int_eq(volume_own_head(fileno(file), path, &grid, &start, &provenance, &err), ERR_INVALID);
+		ck_assert_int_eq(volume_own_head(fileno(file), volume_file, &grid, &start, &provenance, &err),
+				 ERR_INVALID);
 		ck_assert_int_eq(pwrite(fileno(file), &before, 1, at), 1);
 	}
 	ck_assert_int_eq(ftruncate(fileno(file), NIFTI_VOXELS + VOXELS * 4 - 1), 0);
-	ck_assert_int_eq(volume_own_head(fileno(file), path, &grid, &start, &provenance, &err), ERR_INVALID);
+	ck_assert_int_eq(volume_own_head(fileno(file), volume_file, &grid, &start, &provenance, &err), ERR_INVALID);
 	fclose(file);
 }
 END_TEST
@@ -341,7 +324,7 @@ Suite *patient_suite(void)
 	tcase_add_test(lies, a_matrix_of_few_digits_becomes_the_nearest_rotation);
 	tcase_add_test(lies, what_is_no_position_is_refused_by_its_pointer);
 	suite_add_tcase(suite, lies);
-	tcase_add_checked_fixture(files, make_directory, remove_directory);
+	tcase_add_checked_fixture(files, volume_file_make, volume_file_remove);
 	tcase_add_test(files, every_format_puts_the_voxels_where_they_belong);
 	tcase_add_test(files, oblique_volumes_come_back_along_their_own_axes);
 	tcase_add_test(files, a_damaged_header_does_not_make_sides_unknown);

@@ -54,13 +54,6 @@ static struct recipe recipe_of(bool sart)
 	return recipe;
 }
 
-static void run(const struct scene *scene, const struct recipe *recipe, struct outcome *outcome)
-{
-	scene_run(scene, recipe, outcome);
-	if (outcome->code < 0)
-		ck_abort_msg("%s %s", outcome->err.pointer, outcome->err.text);
-}
-
 /* ---- counts ---- */
 
 /* p' = p + 0.06 p^2 - 0.002 p^3 rises over all line integrals of the scene. */

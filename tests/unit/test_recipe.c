@@ -5,6 +5,7 @@
 #include <string.h>
 
 #include "proto/recipe.h"
+#include "tests/unit/documents.h"
 
 static struct scan *scan;
 
@@ -82,18 +83,6 @@ static const char *const requests[] = {
 };
 enum { REQUESTS = sizeof(requests) / sizeof(requests[0]) };
 
-/* The text of a request, by way of its JSON. */
-static char *written(const struct job_request *request)
-{
-	cJSON *json = job_request_json(request);
-	char *text;
-
-	ck_assert_ptr_nonnull(json);
-	text = json_print(json, NULL);
-	cJSON_Delete(json);
-	return text;
-}
-
 START_TEST(requests_come_back_the_same)
 {
 	for (int resolved = 0; resolved < 2; resolved++) {
@@ -105,10 +94,10 @@ START_TEST(requests_come_back_the_same)
 			char *once, *twice;
 
 			ck_assert_msg(code == 0, "%s: %s at %s", requests[i], err.text, err.pointer);
-			once = written(&request);
+			once = request_printed(&request);
 			ck_assert_msg(parse(once, &back, &err) == 0, "%s: %s at %s", once, err.text, err.pointer);
 			ck_assert_msg(job_request_same(&request, &back), "%s is not %s", once, requests[i]);
-			twice = written(&back);
+			twice = request_printed(&back);
 			ck_assert_str_eq(once, twice);
 			free(once);
 			free(twice);
@@ -374,9 +363,7 @@ START_TEST(bad_requests_are_refused_by_their_pointer)
 		struct error err = {0};
 		int code = parse_and_resolve(refused[i].text, &request, &err);
 
-		ck_assert_msg(code == refused[i].code, "%s: %d %s", refused[i].text, code, err.text);
-		ck_assert_msg(strcmp(err.pointer, refused[i].pointer) == 0, "%s: at %s", refused[i].text, err.pointer);
-		ck_assert_msg(strstr(err.text, refused[i].says) != NULL, "%s: %s", refused[i].text, err.text);
+		expect_refused(refused[i].text, code, &err, refused[i].code, refused[i].pointer, refused[i].says);
 		ck_assert_str_eq(request.scan, "untouched");
 	}
 }
