@@ -42,6 +42,8 @@ const struct warning_kind warning_kinds[] = {
     {"air_saturated", SEVERITY_SERIOUS, "The value given for air is one at which the detector is saturated."},
     {"incomplete", SEVERITY_CAUTION, "The scan was broken off: the image is made of the projections that arrived."},
     {"no_flat", SEVERITY_SERIOUS, "The scan lacks its flat image: nothing can be reconstructed before it arrives."},
+    {"implausible_images", SEVERITY_SERIOUS,
+     "The flat or the dark image is unlike any that a detector makes: gray values may be wrong."},
     {"no_dark", SEVERITY_CAUTION, "The scan has a flat but no dark image: gray values may be too low."},
     {"files_missing", SEVERITY_SERIOUS, "The file of the projections is gone: the scan must be sent again."},
     {"damaged_projections", SEVERITY_SERIOUS,
@@ -59,6 +61,8 @@ const struct warning_kind warning_kinds[] = {
     {"air_region", SEVERITY_CAUTION, "The brightness of air changed during the scan, and was corrected."},
     {"air_level", SEVERITY_CAUTION,
      "Air is darker or brighter in some projections than it should be: gray values may be off."},
+    {"brighter_than_air", SEVERITY_SERIOUS,
+     "The projections are brighter than the flat image or the value for air: gray values are wrong."},
     {"line_integrals", SEVERITY_SERIOUS, "The projections' values are unlike line integrals: the image may be wrong."},
     {"byte_order", SEVERITY_SERIOUS, "The projections look like noise: their bytes may be in the wrong order."},
     /* ---- of the reconstruction ---- */

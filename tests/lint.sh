@@ -44,7 +44,7 @@ daemon_rooms=("http:" "store:" "volumes: store" "jobs: store" "intake: http stor
 declare -A doors=(
 	[core/scan]="geometry|grid|image|orbit|phantom"
 	[core/cpu]="none"
-	[core/correct]="averaging|correction|input|stuck"
+	[core/correct]="averaging|correction|images|input|stuck"
 	[core/recon]="algorithm|parameters|recipe|recon"
 )
 door() { echo "$1/(${doors[$1]:-$(basename "$1")})\.h"; }

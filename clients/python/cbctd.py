@@ -427,6 +427,11 @@ class Client:
         """Sends the dark image ``[row][column]`` of a scan of intensities, float32. False when it was there."""
         return self._put_image(self.scan(scan), "dark", image, _FLOAT32)
 
+    def delete_image(self, scan: str, name: str) -> None:
+        """Removes the image ``flat``, ``dark`` or ``defects``, so that another one can be sent; `Problem` 409 while a job
+        runs with it."""
+        self._delete(f"/v1/scans/{scan}/{name}")
+
     def projection(self, scan: str, view: int) -> Array:
         """One projection ``[row][column]`` as it was stored."""
         document = self.scan(scan)

@@ -9,6 +9,13 @@
 enum { REACH = 7, WINDOW = 2 * REACH + 1 };
 
 static const float DEAD = 0.5f, HOT = 1.5f, HOT_DARK = 0.25f, NOISY_DARK = 0.05f, LIT = 0.02f;
+/* Counts: the least range of a pixel, the least that `air` may be. */
+static const float RANGE_LEAST = 1e-6f;
+/*
+ * A dark that is further below 0 than the flat is above by this factor leaves nothing of the counts: all of them are
+ * the same share of the range. Detectors whose counts are signed stay far below.
+ */
+static const float DEEP = 1000;
 
 /* The images of one detector; range is NAN where a value is not finite. */
 struct images {
@@ -21,39 +28,54 @@ struct images {
 	float *scratch;
 };
 
-/* The median of up to WINDOW values without those that are NAN; NAN where all are. Sorts them. */
-static float median(float *values, int count)
+/* The values of a window that slides along a line, in ascending order, without those that are NAN. */
+struct sliding {
+	float sorted[WINDOW];
+	int count;
+};
+
+static void sliding_add(struct sliding *window, float value)
 {
-	int good = 0;
+	int at = window->count;
 
-	for (int i = 0; i < count; i++) {
-		const float value = values[i];
-		int at = good;
-
-		if (isnan(value))
-			continue;
-		for (; at > 0 && values[at - 1] > value; at--)
-			values[at] = values[at - 1];
-		values[at] = value;
-		good++;
-	}
-	return good > 0 ? values[good / 2] : NAN;
+	if (isnan(value))
+		return;
+	for (; at > 0 && window->sorted[at - 1] > value; at--)
+		window->sorted[at] = window->sorted[at - 1];
+	window->sorted[at] = value;
+	window->count++;
 }
 
-/* For each value the median of those up to REACH away along one direction. */
+static void sliding_remove(struct sliding *window, float value)
+{
+	int at = 0;
+
+	if (isnan(value))
+		return;
+	while (window->sorted[at] < value)
+		at++;
+	window->count--;
+	for (; at < window->count; at++)
+		window->sorted[at] = window->sorted[at + 1];
+}
+
+/* For each value the median of those up to REACH away along one direction; NAN where there is none. */
 static void median_along(const float *from, float *to, int lines, size_t line, int count, size_t step)
 {
 #pragma omp parallel for schedule(static)
 	for (int l = 0; l < lines; l++) {
 		const float *in = from + (size_t)l * line;
+		struct sliding window = {.count = 0};
 
+		for (int i = 0; i < REACH && i < count; i++)
+			sliding_add(&window, in[(size_t)i * step]);
 		for (int i = 0; i < count; i++) {
-			const int first = i > REACH ? i - REACH : 0, last = i + REACH < count ? i + REACH : count - 1;
-			float values[WINDOW];
-
-			for (int k = first; k <= last; k++)
-				values[k - first] = in[(size_t)k * step];
-			to[(size_t)l * line + (size_t)i * step] = median(values, last - first + 1);
+			if (i > REACH)
+				sliding_remove(&window, in[(size_t)(i - REACH - 1) * step]);
+			if (i + REACH < count)
+				sliding_add(&window, in[(size_t)(i + REACH) * step]);
+			to[(size_t)l * line + (size_t)i * step] =
+			    window.count > 0 ? window.sorted[window.count / 2] : NAN;
 		}
 	}
 }
@@ -66,25 +88,74 @@ static void neighbourhood(const struct images *images, const float *from, float 
 	median_along(images->scratch, ret, images->columns, 1, images->rows, columns);
 }
 
-/* Fills range and dark; returns how many pixels have no range above 0. */
-static size_t read_images(struct images *images)
+/* Why a pixel's flat and dark can be no reference for any count. */
+enum reference { REFERENCE_GOOD, NOT_FINITE, NOT_ABOVE, TOO_FAINT, TOO_DEEP, REFERENCES };
+
+static enum reference reference_of(float flat, float dark)
+{
+	const float range = flat - dark;
+
+	if (!isfinite(range))
+		return NOT_FINITE;
+	if (!(range > 0))
+		return NOT_ABOVE;
+	if (range < RANGE_LEAST)
+		return TOO_FAINT;
+	return -dark > DEEP * fabsf(flat) ? TOO_DEEP : REFERENCE_GOOD;
+}
+
+/* Fills range and dark; counts the kinds of reference. */
+static void read_images(struct images *images, size_t ret_counts[REFERENCES])
 {
 	const struct linearise *linearise = images->linearise;
 	const size_t pixels = (size_t)images->columns * (size_t)images->rows;
-	size_t without = 0;
 
 	for (size_t i = 0; i < pixels; i++) {
 		const float flat = linearise_counts(linearise, IMAGE_FLAT, i, linearise->air);
+		const float dark = linearise_counts(linearise, IMAGE_DARK, i, 0);
+		const enum reference reference = reference_of(flat, dark);
 
-		images->dark[i] = linearise_counts(linearise, IMAGE_DARK, i, 0);
-		images->range[i] = flat - images->dark[i];
-		if (!isfinite(images->dark[i]))
-			images->dark[i] = NAN;
-		if (!isfinite(images->range[i]))
-			images->range[i] = NAN;
-		without += !(images->range[i] > 0);
+		images->dark[i] = isfinite(dark) ? dark : NAN;
+		/* A range of 0 and below is that of a collimator's shadow, where each sample is taken for what it is.
+		 */
+		images->range[i] = reference == REFERENCE_GOOD || reference == NOT_ABOVE ? flat - dark : NAN;
+		ret_counts[reference]++;
 	}
-	return without;
+}
+
+/* Refuses images that are a reference in less than half of the pixels, for the reason that most of the others have. */
+static int check_references(const struct linearise *linearise, const size_t counts[REFERENCES], size_t pixels,
+			    struct error *err)
+{
+	const char *flat = linearise->image[IMAGE_FLAT] != NULL ? "flat image" : "air value";
+	const bool has_dark = linearise->image[IMAGE_DARK] != NULL;
+	enum reference most = NOT_FINITE;
+	size_t bad = 0;
+	double share;
+
+	for (int i = NOT_FINITE; i < REFERENCES; i++) {
+		bad += counts[i];
+		most = counts[i] > counts[most] ? (enum reference)i : most;
+	}
+	if (2 * bad <= pixels)
+		return 0;
+	share = 100 * (double)bad / (double)pixels;
+	switch (most) {
+	case NOT_FINITE:
+		return error_set(err, ERR_IMPOSSIBLE, "the flat or dark image is not finite in %.3g %% of the pixels",
+				 share);
+	case TOO_FAINT:
+		return error_set(err, ERR_IMPOSSIBLE, "the %s is less than %g above the dark in %.3g %% of the pixels",
+				 flat, (double)RANGE_LEAST, share);
+	case TOO_DEEP:
+		return error_set(err, ERR_IMPOSSIBLE,
+				 "the dark image lies too far below 0, more than %g times the %s, in %.3g %% of the "
+				 "pixels: nothing of the counts would be left",
+				 (double)DEEP, flat, share);
+	default:
+		return error_set(err, ERR_IMPOSSIBLE, "the %s is not above %s in %.3g %% of the pixels%s", flat,
+				 has_dark ? "the dark image" : "0", share, has_dark ? ": are they exchanged?" : "");
+	}
 }
 
 enum verdict { GOOD, DEAD_PIXEL, HOT_PIXEL, NOISY_PIXEL };
@@ -137,8 +208,8 @@ static int examine(const struct linearise *linearise, int columns, int rows, str
 	const size_t pixels = (size_t)columns * (size_t)rows;
 	float *floats = malloc(5 * pixels * sizeof(*floats));
 	struct images images;
-	size_t without;
-	int code = 0;
+	size_t references[REFERENCES] = {0};
+	int code;
 
 	if (floats == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory to look for defects in %d x %d pixels", columns, rows);
@@ -153,13 +224,9 @@ static int examine(const struct linearise *linearise, int columns, int rows, str
 	    .dark_median = floats + 3 * pixels,
 	    .scratch = floats + 4 * pixels,
 	};
-	without = read_images(&images);
-	if (2 * without > pixels)
-		code = error_set(err, ERR_IMPOSSIBLE,
-				 "%s is not above the dark image in %.3g %% of the pixels: are they exchanged?",
-				 linearise->image[IMAGE_FLAT] != NULL ? "the flat image" : "the air value",
-				 100 * (double)without / (double)pixels);
-	else
+	read_images(&images, references);
+	code = check_references(linearise, references, pixels, err);
+	if (code == 0)
 		find(&images, map);
 	free(floats);
 	return code;
@@ -196,7 +263,8 @@ int defect_map_make(struct defect_map *ret_map, const struct linearise *linearis
 	if (code == 0 && 2 * all > pixels)
 		code = error_set(err, ERR_IMPOSSIBLE,
 				 "%.3g %% of the pixels are defects, half of them can be at most: %zu of the given "
-				 "map, and %zu dead, %zu hot and %zu noisy ones that the flat and dark images show",
+				 "map, and %zu dead, %zu hot or saturated and %zu noisy ones that the flat and dark "
+				 "images show",
 				 100 * (double)all / (double)pixels, map.given, map.dead, map.hot, map.noisy);
 	if (code < 0 || all == 0)
 		defect_map_clear(&map);

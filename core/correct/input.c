@@ -101,12 +101,20 @@ void input_clear(struct input *input)
 	*input = (struct input){0};
 }
 
+/* The line integral of a pixel, NAN for a defect; against the view's own air, without hardening. */
+static float line_integral(const struct input *input, const void *samples, size_t at)
+{
+	float p = NAN;
+
+	return linearise_pixel(&input->linearise, samples, at, &p) == PIXEL_GOOD ? p + input->log_air : NAN;
+}
+
 static void look_at_line_integrals(struct input *input, const void *samples)
 {
 	for (size_t i = 0; i < input->pixels; i += input->pixels / 4096 + 1) {
-		const float p = linearise_sample(&input->linearise, samples, i);
+		const float p = line_integral(input, samples, i);
 
-		if (!isfinite(p) || linearise_mapped(&input->linearise, i))
+		if (isnan(p))
 			continue;
 		input->sum += (double)p;
 		input->most = p > input->most ? p : input->most;
@@ -127,14 +135,6 @@ static void look_at_bytes(struct input *input, const uint16_t *samples)
 		if (exchanged(samples[i]) > input->largest)
 			input->largest = exchanged(samples[i]);
 	}
-}
-
-/* The line integral of a pixel as it comes, NAN for a defect; without the air region and hardening. */
-static float line_integral(const struct input *input, const void *samples, size_t at)
-{
-	float p = NAN;
-
-	return linearise_pixel(&input->linearise, samples, at, &p) == PIXEL_GOOD ? p : NAN;
 }
 
 /* Whether the mean of a piece of the row, 1/32 of it or 8 pixels, reaches the level. */
@@ -204,22 +204,37 @@ static int look_at_ends(struct input *input, const void *samples, int columns, i
 	return look_at_air(input, samples, columns, rows, largest, err);
 }
 
+static void add_counts(struct defect_counts *counts, const struct defect_counts *view)
+{
+	counts->mapped += view->mapped;
+	counts->not_finite += view->not_finite;
+	counts->saturated += view->saturated;
+	counts->zero += view->zero;
+	counts->blank += view->blank;
+	counts->no_air += view->no_air;
+	if (view->air_least > 0 && (view->air_least < counts->air_least || counts->air_least == 0))
+		counts->air_least = view->air_least;
+	counts->air_most = fmaxf(counts->air_most, view->air_most);
+}
+
 int input_take(struct input *input, const struct backend *backend, struct plan *plan, const void *samples, int view,
 	       int slot, struct stack *to, const void **ret_upright, struct error *err)
 {
-	/* Views are linearised one by one, so that those with defects are known. */
+	/* Views are linearised one by one, so that those with defects, and each one's own air, are known. */
 	const struct defect_counts before = input->counts;
+	struct defect_counts counts = {0};
 	int code;
 
 	if (input->turned) {
 		exchange(input, samples, linearise_sample_bytes(&input->linearise), input->projection);
 		samples = input->projection;
 	}
-	code = backend->linearise(plan, samples, 1, &slot, to, &input->counts, err);
+	code = backend->linearise(plan, samples, 1, &slot, to, &counts, err);
 	if (code < 0)
 		return code;
-	if (input->linearise.quantity == QUANTITY_LINE_INTEGRAL)
-		look_at_line_integrals(input, samples);
+	add_counts(&input->counts, &counts);
+	input->log_air = counts.air_most > 0 ? logf(counts.air_most) : 0;
+	look_at_line_integrals(input, samples);
 	if (input->linearise.sample == SAMPLE_UINT16)
 		look_at_bytes(input, samples);
 	if (view % input->look_every == 0)

@@ -15,6 +15,7 @@ struct input {
 	int views, defective_views; /* linearised so far, and those of them with defects */
 	int *blank;                 /* [counts.blank], owned: views without a good pixel, in the order they came */
 	size_t pixels;              /* of a view */
+	float log_air; /* of the latest view's own air: line integrals are larger by it; 0 without a region */
 	/* Statistics of about 4096 pixels of each view. */
 	double sum; /* of line integrals */
 	float most; /* of them, at least 0 */

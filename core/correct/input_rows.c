@@ -5,6 +5,7 @@
 #include <math.h>
 
 #include "core/correct/correction.h"
+#include "core/correct/images.h"
 #include "core/correct/input.h"
 
 /* Air regions that differ by more than this mean that the tube or the detector drifts. */
@@ -25,7 +26,7 @@ static bool is_intensity(const struct recipe *recipe, const struct linearise *li
 }
 
 /* With air given, the client may have subtracted the dark already; with a flat image nobody has. */
-static int warn_of_no_dark(const struct correction_job *job, void *state, struct error *err)
+static int warn_of_flat_and_dark(const struct correction_job *job, void *state, struct error *err)
 {
 	(void)state;
 	(void)err;
@@ -33,6 +34,7 @@ static int warn_of_no_dark(const struct correction_job *job, void *state, struct
 		warning_tell(job->warnings, "no_dark",
 			     "a flat image is there, but no dark one: an offset that the detector adds to its counts "
 			     "makes all that is measured too thin");
+	images_warn(&job->input->linearise, job->geometry->columns, job->geometry->rows, job->warnings);
 	return 0;
 }
 
@@ -44,7 +46,7 @@ const struct correction correction_flat_dark = {
     .times = 1U << CORRECT_SAMPLES,
     .fused = FUSED_LINEARISE,
     .wanted = is_intensity,
-    .warn = warn_of_no_dark,
+    .warn = warn_of_flat_and_dark,
 };
 
 /* ---- air region ---- */
@@ -191,6 +193,14 @@ static void warn_of_line_integrals(const struct input *input, const struct warni
 {
 	const double mean = input->looked_at > 0 ? input->sum / (double)input->looked_at : 0;
 
+	if (input->linearise.quantity == QUANTITY_INTENSITY) {
+		if (mean < NEGATIVE)
+			warning_tell(sink, "brighter_than_air",
+				     "the projections are %.4g times as bright as the flat image or \"air\", less the "
+				     "dark, in the mean of logarithms: line integrals are %.4g",
+				     exp(-mean), mean);
+		return;
+	}
 	if (mean > COUNTS)
 		warning_tell(sink, "line_integrals",
 			     "the line integrals are %.4g in the mean: are they counts, which would be intensities?",

@@ -54,14 +54,6 @@ static inline size_t image_bytes(enum image image, int columns, int rows)
 /* By name; -1 when there is none. */
 int image_find(const char *name);
 
-/*
- * Whether any reconstruction could use an image as it is stored: ERR_IMPOSSIBLE for counts that are finite in less than
- * half of the pixels, a flat image without a pixel above 0, and a defect map that marks more than half of the pixels.
- */
-int image_check(enum image image, const void *pixels, size_t count, struct error *err);
-/* ERR_IMPOSSIBLE where the flat is not above the dark in more than half of the pixels: core/correct/defects.h. */
-int image_check_pair(const float *flat, const float *dark, size_t count, struct error *err);
-
 #ifdef __cplusplus
 }
 #endif

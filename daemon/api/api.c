@@ -7,7 +7,8 @@
 #include "proto/json.h"
 
 #define IMAGE_ROUTE(id, name, ...)                                                                                     \
-	{"PUT", "/v1/scans/{}/{" name "}", image_put, BODY_STREAM, 0, image_begin, upload_take, NULL},
+	{"PUT", "/v1/scans/{}/{" name "}", image_put, BODY_STREAM, 0, image_begin, upload_take, NULL},                 \
+	    {"DELETE", "/v1/scans/{}/{" name "}", image_delete, BODY_NONE, 0, NULL, NULL, NULL},
 
 /* GET is HEAD as well. A body that is streamed has begin and data beside handle. */
 const struct route api_routes[] = {

@@ -103,12 +103,28 @@ int projections_put(void *context, struct request *request, struct error *err)
 	cJSON_AddStringToObject(document, "scan", request_argument(request, 0));
 	cJSON_AddNumberToObject(document, "stored", outcome.created);
 	cJSON_AddNumberToObject(document, "same", outcome.same);
+	if (outcome.warnings != NULL)
+		cJSON_AddItemToObject(document, "warnings", outcome.warnings);
 	return request_reply_json(request, outcome.created > 0 ? 201 : 200, document, err);
 }
 
 int image_put(void *context, struct request *request, struct error *err)
 {
 	return projections_put(context, request, err);
+}
+
+int image_delete(void *context, struct request *request, struct error *err)
+{
+	const enum image image = (enum image)image_find(request_argument(request, 1));
+	struct api *api = context;
+	struct stored_scan *scan;
+	int code;
+
+	if (store_scan_find(api->store, request_argument(request, 0), &scan, err) != 0)
+		return err->code;
+	code = jobs_remove_image(api->jobs, scan, image, err);
+	stored_scan_release(scan);
+	return code != 0 ? code : request_reply_empty(request, 204, err);
 }
 
 /* ---- out ---- */

@@ -6,6 +6,7 @@
 
 #include "daemon/http/http.h"
 #include "daemon/store/store.h"
+#include "proto/json.h"
 
 /*
  * Projections and images from a request's body to the disk.
@@ -67,6 +68,7 @@ int upload_data(struct upload *upload, const void *data, size_t size, size_t *re
 
 struct upload_outcome {
 	int created, same; /* projections or images */
+	cJSON *warnings;   /* of an image, what is doubtful about it: the caller's to delete; NULL for projections */
 };
 /* The body has ended: HTTP_WAIT until all of it has its outcome. */
 int upload_end(struct upload *upload, struct upload_outcome *ret_outcome, struct error *err);

@@ -6,6 +6,7 @@
 #include <stdbool.h>
 
 #include "daemon/intake/intake.h"
+#include "proto/json.h"
 #include "proto/zstream.h"
 
 /*
@@ -63,6 +64,9 @@ struct upload {
 	uint8_t promised[32];
 	bool holds;   /* projections count only when the body's end, or a break, has shown that they are right */
 	bool spoiled; /* the body was wrong */
+
+	/* Of an image: what is doubtful about it. The writer's until the slot is settled, then the connection's. */
+	cJSON *warnings;
 
 	/* Guarded by uploads.lock. */
 	struct request *request; /* NULL once it is over */

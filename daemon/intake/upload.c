@@ -59,6 +59,7 @@ void upload_unreference_and_unlock(struct upload *upload)
 	zdecoder_free(upload->decoder);
 	EVP_MD_CTX_free(upload->digest);
 	stored_scan_release(upload->scan);
+	cJSON_Delete(upload->warnings);
 	free(upload->held);
 	free(upload);
 }
@@ -484,8 +485,11 @@ int upload_end(struct upload *upload, struct upload_outcome *ret_outcome, struct
 	pending = upload->pending > 0;
 	if (code != 0)
 		*err = upload->error;
-	else if (!pending)
+	else if (!pending) {
 		*ret_outcome = upload->outcome;
+		ret_outcome->warnings = upload->warnings;
+		upload->warnings = NULL;
+	}
 	pthread_mutex_unlock(&uploads->lock);
 	return code != 0 ? code : pending ? HTTP_WAIT : 0;
 }

@@ -14,6 +14,8 @@
 
 #include "daemon/intake/internal.h"
 
+#include "core/backend.h"
+#include "core/correct/images.h"
 #include "daemon/lock.h"
 #include "proto/scan_directory.h"
 
@@ -121,45 +123,66 @@ static int process_projection(struct slot *slot, struct error *err)
 	return claim == CLAIM_BUSY ? park(slot, err) : write_claimed(slot, err);
 }
 
-/* Where the other image is not there, or damaged, nothing is said: it is held against this one when it comes. */
-static int check_with_other(const struct slot *slot, enum image other, struct error *err)
+/*
+ * An image that the scan has, NULL for none. One that is damaged counts as none: it must be sent again, and is held
+ * against the others then.
+ */
+static int read_image(const struct upload *upload, enum image image, char **ret_pixels, struct error *err)
 {
-	const struct upload *upload = slot->upload;
-	const size_t pixels = upload_image_pixels(stored_scan_parsed(upload->scan)), expected = pixels * sizeof(float);
-	const bool is_flat = upload->target.image == IMAGE_FLAT;
-	char directory[1024], path[1100], *bytes = NULL;
-	struct scan_facts facts;
+	const size_t expected = upload_image_bytes(stored_scan_parsed(upload->scan), image);
+	char directory[1024], path[1100], *pixels = NULL;
 	struct error why;
 	size_t size = 0;
 	int code;
 
-	stored_scan_facts(upload->scan, &facts);
-	if (!facts.image[other])
-		return 0;
 	store_scan_directory(upload->uploads->store, stored_scan_id(upload->scan), directory);
-	snprintf(path, sizeof(path), "%s/%s", directory, image_kinds[other].file);
-	code = file_read(path, expected, &bytes, &size, &why);
-	if (code == 0 && size == expected)
-		code = image_check_pair((const float *)(is_flat ? (const char *)slot->data : bytes),
-					(const float *)(is_flat ? bytes : (const char *)slot->data), pixels, err);
-	else if (code == ERR_NO_MEMORY)
+	snprintf(path, sizeof(path), "%s/%s", directory, image_kinds[image].file);
+	code = file_read(path, expected, &pixels, &size, &why);
+	if (code == ERR_NO_MEMORY) {
 		*err = why;
+		return code;
+	}
+	if (code == 0 && size == expected)
+		*ret_pixels = pixels;
 	else
-		code = 0;
-	free(bytes);
-	return code;
+		free(pixels);
+	return 0;
 }
 
-/* What every job would be refused for, now or with the other image of the two that is there. */
-static int check_image(const struct slot *slot, struct error *err)
+static void add_warning(void *context, const char *code, const char *detail)
+{
+	cJSON_AddItemToArray(context, json_warning(code, detail));
+}
+
+/* Refuses what every job would be refused for with the images that are there; what is doubtful goes to *ret_warnings.
+ */
+static int check_image(const struct slot *slot, cJSON **ret_warnings, struct error *err)
 {
 	const struct upload *upload = slot->upload;
-	const enum image image = upload->target.image;
-	int code = image_check(image, slot->data, upload_image_pixels(stored_scan_parsed(upload->scan)), err);
+	const struct scan *scan = stored_scan_parsed(upload->scan);
+	const int columns = scan->geometry.columns, rows = scan->geometry.rows;
+	struct linearise linearise = scan_linearise(scan);
+	struct warning_sink sink = {.tell = add_warning};
+	char *others[IMAGE_COUNT] = {NULL};
+	struct scan_facts facts;
+	int code = 0;
 
-	if (code != 0 || image_kinds[image].pixel != IMAGE_COUNTS)
-		return code;
-	return check_with_other(slot, image == IMAGE_FLAT ? IMAGE_DARK : IMAGE_FLAT, err);
+	stored_scan_facts(upload->scan, &facts);
+	for (int i = 0; i < IMAGE_COUNT && code == 0; i++) {
+		if (facts.image[i] && i != (int)upload->target.image)
+			code = read_image(upload, i, &others[i], err);
+		linearise.image[i] = i == (int)upload->target.image ? (char *)slot->data : others[i];
+	}
+	if (code == 0)
+		code = images_check(&linearise, columns, rows, err);
+	if (code == 0) {
+		*ret_warnings = sink.context = cJSON_CreateArray();
+		if (image_kinds[upload->target.image].pixel == IMAGE_COUNTS)
+			images_warn(&linearise, columns, rows, &sink);
+	}
+	for (int i = 0; i < IMAGE_COUNT; i++)
+		free(others[i]);
+	return code;
 }
 
 /* Stores an image as it came, or converts it from the scan's sample type to float32. */
@@ -167,6 +190,7 @@ static int process_image(struct slot *slot, struct error *err)
 {
 	struct upload *upload = slot->upload;
 	size_t pixels = upload_image_pixels(stored_scan_parsed(upload->scan));
+	cJSON *warnings = NULL;
 	bool created;
 
 	if (slot->filled != upload_image_bytes(stored_scan_parsed(upload->scan), upload->target.image)) {
@@ -179,10 +203,14 @@ static int process_image(struct slot *slot, struct error *err)
 			memcpy(slot->data + i * sizeof(value), &value, sizeof(value));
 		}
 	}
-	if (check_image(slot, err) != 0)
+	if (check_image(slot, &warnings, err) != 0)
 		return err->code;
-	if (store_put_image(upload->uploads->store, upload->scan, upload->target.image, slot->data, &created, err) != 0)
+	if (store_put_image(upload->uploads->store, upload->scan, upload->target.image, slot->data, &created, err) !=
+	    0) {
+		cJSON_Delete(warnings);
 		return err->code;
+	}
+	upload->warnings = warnings;
 	slot->outcome = created ? SLOT_CREATED : SLOT_SAME;
 	return 0;
 }
@@ -472,6 +500,7 @@ static void *run_writer(void *context)
 	struct uploads *uploads = context;
 	struct slot *slots[BATCH_SLOTS], *written[BATCH_SLOTS];
 
+	backend_host_threads(1); /* images are judged in this thread alone */
 	pthread_mutex_lock(&uploads->lock);
 	while (wait_for_work(uploads)) {
 		int count = take_batch(uploads, slots), written_count = 0;

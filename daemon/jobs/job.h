@@ -78,6 +78,8 @@ int jobs_list(struct jobs *jobs, const char *after, int limit, struct job **ret_
 int jobs_delete(struct jobs *jobs, struct job *job, bool *ret_removed, struct error *err);
 /* Deletes a scan with its files. ERR_CONFLICT, naming the job, while one that has not ended uses the scan. */
 int jobs_delete_scan(struct jobs *jobs, struct stored_scan *scan, struct error *err);
+/* Removes an image of a scan. ERR_CONFLICT, naming the job, while one that runs uses the scan. */
+int jobs_remove_image(struct jobs *jobs, struct stored_scan *scan, enum image image, struct error *err);
 
 /* Woken at each change of state and each new event of this job, or of any; not at mere progress. See watch.h. */
 void job_watch(struct job *job, struct watch *watch);

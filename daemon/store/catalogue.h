@@ -89,7 +89,7 @@ int catalogue_find_scan_key(struct catalogue *catalogue, const char *key, char r
 			    uint8_t ret_sha256[32], struct error *err);
 /* Reads all scans, by id; the caller frees the array. */
 int catalogue_scans(struct catalogue *catalogue, struct catalogue_scan **ret_scans, int *ret_count, struct error *err);
-/* These two change a scan's row, in a group. */
+/* These two change a scan's row, in a group. sha256 NULL: the scan has no such image any more. */
 int catalogue_set_image(struct catalogue *catalogue, const char *scan, enum image image, const uint8_t sha256[32],
 			struct error *err);
 int catalogue_set_closed(struct catalogue *catalogue, const char *scan, struct error *err);

@@ -73,8 +73,9 @@ int catalogue_set_image(struct catalogue *catalogue, const char *scan, enum imag
 {
 	struct catalogue_scan record = {.closed = false};
 
-	record.images[image].known = true;
-	memcpy(record.images[image].sha256, sha256, 32);
+	record.images[image].known = sha256 != NULL;
+	if (sha256 != NULL)
+		memcpy(record.images[image].sha256, sha256, 32);
 	return catalogue_assign(catalogue, TABLE_SCANS, image_kinds[image].name, &record, scan, err);
 }
 

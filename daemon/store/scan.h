@@ -100,7 +100,7 @@ int store_forget_lost(struct stored_scan *scan, struct error *err);
 int store_start_checker(struct store *store, struct error *err);
 void store_stop_checker(struct store *store);
 
-/* The record of a part of the scan directory, synced: behind its file and before its row. */
+/* The record of a part of the scan directory, synced: behind its file and before its row. bytes NULL: it has none. */
 int store_put_part_sum(const struct stored_scan *scan, int part, const void *bytes, size_t size, struct error *err);
 /* ERR_DAMAGED: these bytes do not fit the part's record. One without a record is taken as it is. */
 int store_check_part(const struct stored_scan *scan, enum sums_part part, const void *bytes, size_t size,

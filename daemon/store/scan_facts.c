@@ -49,8 +49,8 @@ static bool is_convertible(const struct stored_scan *scan)
 }
 
 /*
- * Images and the end of a scan come and never go, though an image that was lost may come again as another: what is
- * there, and which images, is all that its projections are understood by.
+ * Which images are there, and whether the scan has ended, is all that its projections are understood by. An image that
+ * was lost or removed may come again as another.
  */
 static unsigned basis_of(const struct stored_scan *scan)
 {

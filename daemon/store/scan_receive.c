@@ -5,9 +5,11 @@
 #include <openssl/evp.h>
 #include <stdio.h>
 #include <string.h>
+#include <unistd.h>
 
 #include "daemon/store/scan.h"
 #include "proto/clock.h"
+#include "proto/durable.h"
 #include "proto/scan_directory.h"
 
 int stored_scan_claim(struct stored_scan *scan, int index, enum claim *ret_claim, struct error *err)
@@ -137,7 +139,8 @@ static int claim_image(struct stored_scan *scan, enum image image, const uint8_t
 	else if (memcmp(scan->image_sha256[image], sha256, 32) == 0)
 		*ret_there = true;
 	else
-		code = error_set(err, ERR_CONFLICT, "the scan has another %s already", image_kinds[image].title);
+		code = error_set(err, ERR_CONFLICT, "the scan has another %s already; DELETE removes it",
+				 image_kinds[image].title);
 	pthread_mutex_unlock(&scan->lock);
 	return code;
 }
@@ -198,5 +201,52 @@ int store_put_image(struct store *store, struct stored_scan *scan, enum image im
 		watch_wake(&store->arrivals);
 	if (code == 0)
 		*ret_new = true;
+	return code;
+}
+
+/* The file first: an image whose file is gone counts as damaged at the next start, and may be removed or sent again. */
+static int remove_image(struct store *store, struct stored_scan *scan, enum image image, struct error *err)
+{
+	char directory[1024], path[1100];
+	int code = 0;
+
+	store_scan_directory(store, scan->id, directory);
+	snprintf(path, sizeof(path), "%s/%s", directory, image_kinds[image].file);
+	if (unlink(path) < 0 && errno != ENOENT)
+		code = error_set_errno(err, errno, "unlink %s", path);
+	if (code == 0)
+		code = durable_sync_names(path, err);
+	if (code == 0)
+		code = store_put_part_sum(scan, image_kinds[image].slot, NULL, 0, err);
+	if (code == 0)
+		code = store_begin(store, err);
+	if (code != 0)
+		return code;
+	return store_end(store, catalogue_set_image(store->catalogue, scan->id, image, NULL, err), err);
+}
+
+int store_remove_image(struct store *store, struct stored_scan *scan, enum image image, struct error *err)
+{
+	int code = 0;
+
+	pthread_mutex_lock(&scan->lock);
+	if (scan->deleted)
+		code = error_set(err, ERR_NOT_FOUND, "scan %s was deleted meanwhile", scan->id);
+	else if (scan->image[image] == CLAIMED)
+		code = error_set(err, ERR_BUSY, "another request is writing this image");
+	else if (scan->image[image] == MISSING && !scan->image_lost[image])
+		code = error_set(err, ERR_NOT_FOUND, "the scan has no %s", image_kinds[image].title);
+	else
+		scan->image[image] = CLAIMED;
+	pthread_mutex_unlock(&scan->lock);
+	if (code != 0)
+		return code;
+	code = remove_image(store, scan, image, err);
+	pthread_mutex_lock(&scan->lock);
+	scan->image[image] = MISSING;
+	scan->image_lost[image] = code != 0;
+	pthread_mutex_unlock(&scan->lock);
+	watch_wake(&scan->watchers);
+	watch_wake(&store->arrivals);
 	return code;
 }

@@ -272,6 +272,8 @@ int store_put_projections(struct store *store, struct received_projection *batch
  */
 int store_put_image(struct store *store, struct stored_scan *scan, enum image image, const void *pixels, bool *ret_new,
 		    struct error *err);
+/* Removes an image, so that another one can be put. ERR_NOT_FOUND where there is none; ERR_BUSY as above. */
+int store_remove_image(struct store *store, struct stored_scan *scan, enum image image, struct error *err);
 
 /* ---- rows of jobs: for job.c, which keeps the rules; everybody else uses job.h ---- */
 

@@ -59,16 +59,18 @@ static int put_part(int file, int part, const struct sum *sum, struct error *err
 
 int store_put_part_sum(const struct stored_scan *scan, int part, const void *bytes, size_t size, struct error *err)
 {
-	struct sum sum = {.crc = checksum(0, bytes, size), .bytes = size};
+	struct sum sum = {.bytes = size};
 	bool whole;
 	int file, code;
 
-	if (EVP_Digest(bytes, size, sum.sha256, NULL, EVP_sha256(), NULL) != 1)
+	if (bytes != NULL)
+		sum.crc = checksum(0, bytes, size);
+	if (bytes != NULL && EVP_Digest(bytes, size, sum.sha256, NULL, EVP_sha256(), NULL) != 1)
 		return error_set(err, ERR_INTERNAL, "SHA-256 failed");
 	code = stored_scan_open_records(scan, &whole, &file, err);
 	if (code != 0)
 		return code;
-	code = put_part(file, part, &sum, err);
+	code = put_part(file, part, bytes != NULL ? &sum : NULL, err);
 	close(file);
 	if (code != 0)
 		store_distrust(scan->store, err);

@@ -154,6 +154,8 @@ class Scans(Case):
         self.assertTrue(self.client.put_flat(scan, flat))
         self.assertFalse(self.client.put_flat(scan, flat))
         self.assertTrue(self.client.put_dark(scan, np.full(shape[1:], 100)))
+        self.client.delete_image(scan, "dark")
+        self.assertTrue(self.client.put_dark(scan, np.full(shape[1:], 100)))
         document = self.client.scan(scan)
         self.assertEqual((document["flat"], document["dark"]), (True, True))
 

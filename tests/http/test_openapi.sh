@@ -15,7 +15,7 @@ operations() {
 routes() {
 	{
 		sed -nE 's/^[[:space:]]*\{"([A-Z]+)", "([^" ]+)",.*/\1 \2/p' "$top/daemon/api/api.c"
-		sed -nE 's/^[[:space:]]*row\([A-Z]+, "([a-z]+)", .*/PUT \/v1\/scans\/{}\/\1/p' "$top/core/scan/image.h"
+		sed -nE 's/^[[:space:]]*row\([A-Z]+, "([a-z]+)", .*/PUT \/v1\/scans\/{}\/\1\nDELETE \/v1\/scans\/{}\/\1/p' "$top/core/scan/image.h"
 	} | sort
 }
 

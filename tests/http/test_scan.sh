@@ -281,24 +281,119 @@ test_images_that_nothing_can_be_made_of() {
 	fill 300 1 >"$work/negative" # -6.0
 	fill 100 1 >"$work/three"
 	fill 101 1 >"$work/twelve"
-	refused flat "$work/zero" "no pixel above 0"
-	refused flat "$work/negative" "no pixel above 0"
-	refused flat "$work/nan" "finite in 0 %"
-	refused dark "$work/nan" "finite in 0 %"
+	deep=$(printf '\\%03o' 0x28 0x6b 0x6e 0xce) # -1e9
+	for i in $(seq $((one / 4))); do printf "$deep"; done >"$work/deep"
+	for i in $(seq $((one / 4))); do printf '\312\002\0\0'; done >"$work/faint" # 1e-42
+	{ fill 101 1 | head -c 4; fill 0 1 | tail -c +5; } >"$work/single"
+	{ fill 101 1 | head -c $((one / 2)); fill 377 1 | tail -c +$((one / 2 + 1)); } >"$work/half"
+	refused flat "$work/zero" "not above 0"
+	refused flat "$work/negative" "not above 0"
+	refused flat "$work/nan" "not finite in 100 %"
+	refused dark "$work/nan" "not finite"
+	refused flat "$work/faint" "less than 1e-06"
+	refused flat "$work/single" "not above 0"
 	head -c $((one / 4)) "$work/nan" >"$work/map"
 	refused defects "$work/map" "100 %"
 	req PUT "/v1/scans/$scan/flat" -T "$work/three"
 	expect_status 201
 	refused dark "$work/three" "exchanged?"
 	refused dark "$work/twelve" "not above the dark image in 100 %"
+	refused dark "$work/deep" "too far below 0"
 	req PUT "/v1/scans/$scan/dark" -T "$work/zero"
 	expect_status 201
+	expect_json '.warnings == []'
 	new_scan '.projections.quantity = "intensity"'
 	req PUT "/v1/scans/$scan/dark" -T "$work/three"
 	expect_status 201
 	refused flat "$work/three" "exchanged?"
 	req PUT "/v1/scans/$scan/flat" -T "$work/twelve"
 	expect_status 201
+	# the same for air; a detector that is saturated everywhere; a flat and a map that leave nothing, whichever comes first
+	new_scan '.projections.quantity = "intensity" | .projections.air = 40000'
+	refused dark "$work/deep" "too far below 0"
+	new_scan '.projections.quantity = "intensity" | .projections.sample = "uint16"'
+	fill 377 1 | head -c $((one / 2)) >"$work/saturated"
+	refused flat "$work/saturated" "saturated"
+	{ fill 0 1 | head -c $((one / 8)); fill 1 1 | head -c $((one / 8)); } >"$work/rest"
+	{ fill 1 1 | head -c $((one / 8)); fill 0 1 | head -c $((one / 8)); } >"$work/other"
+	for order in "flat half defects other" "defects other flat half"; do
+		set -- $order
+		new_scan '.projections.quantity = "intensity"'
+		req PUT "/v1/scans/$scan/$1" -T "$work/$2"
+		expect_status 201
+		refused "$3" "$work/$4" "are defects"
+	done
+	req PUT "/v1/scans/$scan/defects" -T "$work/other"
+	expect_status 200
+}
+
+# What is doubtful is told with the answer.
+test_images_that_are_doubtful() {
+	new_scan '.projections.quantity = "intensity"'
+	fill 101 1 >"$work/twelve"
+	fill 300 1 >"$work/six" # -6.0
+	req PUT "/v1/scans/$scan/flat" -T "$work/twelve"
+	expect_status 201
+	expect_json '.warnings == []'
+	req PUT "/v1/scans/$scan/dark" -T "$work/six"
+	expect_status 201
+	expect_json '.stored == 1 and [.warnings[] | .code, .severity] == ["implausible_images", "serious"]'
+	put /0 -T "$work/twelve"
+	expect_status 201
+	expect_json 'has("warnings") | not'
+}
+
+# Other bytes are refused; what was sent by mistake is removed and sent again, unless a job runs with it.
+test_an_image_can_be_removed_and_put_again() {
+	local image
+	new_scan '.projections.quantity = "intensity" | .projections.air = 40000'
+	fill 100 1 >"$work/three"
+	fill 101 1 >"$work/twelve"
+	fill 1 1 | head -c 40 >"$work/marks"
+	{ cat "$work/marks"; fill 0 1 | head -c $((one / 4 - 40)); } >"$work/map"
+	for image in "flat twelve three" "dark three zero" "defects map none"; do
+		set -- $image
+		fill 0 1 >"$work/zero"
+		fill 0 1 | head -c $((one / 4)) >"$work/none"
+		req DELETE "/v1/scans/$scan/$1"
+		expect_problem 404
+		req PUT "/v1/scans/$scan/$1" -T "$work/$2"
+		expect_status 201
+		req PUT "/v1/scans/$scan/$1" -T "$work/$3"
+		expect_problem 409
+		json .detail | grep -q DELETE || fail "a way out: $(json .detail)"
+		req DELETE "/v1/scans/$scan/$1"
+		expect_status 204
+		req GET "/v1/scans/$scan"
+		expect_json ".$1 == false and ([.warnings[] | select(.code == \"damaged_image\")] == [])"
+		req PUT "/v1/scans/$scan/$1" -T "$work/$3"
+		expect_status 201
+		req DELETE "/v1/scans/$scan/$1"
+		expect_status 204
+		if [ "$1" = flat ]; then
+			req PUT "/v1/scans/$scan/flat" -T "$work/twelve"
+			expect_status 201
+		fi
+	done
+	# a job that runs with it keeps it
+	req PUT "/v1/scans/$scan/projections" --data-binary @<(fill 100 $count)
+	expect_status 201
+	post_job '{"scan": "SCAN", "grid": {"size": [32, 32, 16], "spacing_mm": [2, 2, 2]}, "sart": {"iterations": 1000, "subsets": 12}}'
+	state_becomes running
+	req DELETE "/v1/scans/$scan/flat"
+	expect_problem 409
+	json .detail | grep -q "$job" || fail "the job's name: $(json .detail)"
+	req DELETE "/v1/jobs/$job"
+	expect_status 202
+	wait_job cancelled
+	stop_daemon KILL
+	port=${url##*:} start_daemon
+	req GET "/v1/scans/$scan"
+	expect_json '.flat and (.dark | not) and (.defects | not) and ([.warnings[] | select(.code == "damaged_image")] == [])'
+	req GET /v1/quarantine
+	expect_json '.entries == []'
+	req PUT "/v1/scans/$scan/flat" -T "$work/twelve"
+	expect_status 200
 }
 
 test_lists_newest_first_in_pages() {

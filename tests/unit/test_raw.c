@@ -10,6 +10,7 @@
 #include <string.h>
 
 #include "core/correct/defects.h"
+#include "core/correct/images.h"
 #include "tests/unit/data.h"
 #include "tests/unit/scene.h"
 
@@ -265,6 +266,55 @@ START_TEST(an_object_in_the_air_region_is_told)
 			      "%s", outcome.warnings);
 	else
 		ck_assert_str_eq(outcome.warnings, "");
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(samples);
+}
+END_TEST
+
+/* A ball within the detector's rows, a grid beyond them, and a tube that gives 60 to 75 % of the flat. */
+START_TEST(a_tube_that_drifts_makes_no_object_beyond_the_rows)
+{
+	struct recipe recipe = recipe_of(false);
+	struct outcome outcome = {0};
+	struct scene scene;
+	float *samples = malloc(sizeof(float) * PIXELS * VIEWS);
+
+	recipe.grid = grid_of(24, 24, 60, 3.6, 3.6, 3.6);
+	make_scene(&scene);
+	for (int i = 0; i < PIXELS * VIEWS; i++)
+		samples[i] = (float)(50000 * (0.75 - 0.15 * i / (PIXELS * VIEWS)) * exp(-(double)scene.projections[i]));
+	outcome.samples = samples;
+	outcome.linearise = (struct linearise){.sample = SAMPLE_FLOAT32,
+					       .quantity = QUANTITY_INTENSITY,
+					       .air = 50000,
+					       .has_air_region = true,
+					       .air_region = {0, 0, 5, ROWS - 1}};
+	run(&scene, &recipe, &outcome);
+	ck_assert_ptr_nonnull(strstr(outcome.warnings, "air_region: "));
+	ck_assert_msg(strstr(outcome.warnings, "slices_unseen: ") == NULL, "%s", outcome.warnings);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(samples);
+}
+END_TEST
+
+/* A flat or an air value far below the projections, which a job would take for an object thinner than nothing. */
+START_TEST(projections_brighter_than_air_are_told)
+{
+	struct recipe recipe = recipe_of(false);
+	struct outcome outcome = {0};
+	struct scene scene;
+	float *samples = malloc(sizeof(float) * PIXELS * VIEWS);
+
+	make_scene(&scene);
+	for (int i = 0; i < PIXELS * VIEWS; i++)
+		samples[i] = (float)(50000 * exp(-(double)scene.projections[i]));
+	outcome.samples = samples;
+	outcome.linearise =
+	    (struct linearise){.sample = SAMPLE_FLOAT32, .quantity = QUANTITY_INTENSITY, .air = _i ? 500 : 50000};
+	run(&scene, &recipe, &outcome);
+	ck_assert_msg((strstr(outcome.warnings, "brighter_than_air: ") != NULL) == (_i == 1), "%s", outcome.warnings);
 	outcome_clear(&outcome);
 	scene_clear(&scene);
 	free(samples);
@@ -621,6 +671,87 @@ START_TEST(a_detector_of_defects_is_refused)
 }
 END_TEST
 
+/* A detector's images, each pixel of `some` in every `every` of them, else of `rest`. */
+static void fill(float *image, int every, float some, float rest)
+{
+	for (int i = 0; i < PIXELS; i++)
+		image[i] = i % every == 0 ? some : rest;
+}
+
+static void tell(void *context, const char *code, const char *detail)
+{
+	(void)code;
+	snprintf(context, 400, "%s", detail);
+}
+
+/* Images are judged together, whichever of them is there: what no job could use, and what is to be doubted. */
+START_TEST(images_are_refused_and_doubted)
+{
+	static const struct {
+		const char *what;
+		struct {
+			int every; /* 0: no such image */
+			float some, rest;
+		} flat, dark;
+		double air;
+		int map_every; /* 0: no map */
+		const char *refused, *doubted;
+	} rows[] = {
+	    {"a good pair", {1, 40000, 0}, {1, 100, 0}, 0, 0, NULL, NULL},
+	    {"a good dark whose flat is to come", {0, 0, 0}, {1, 100, 0}, 0, 0, NULL, NULL},
+	    {"a good dark with air", {0, 0, 0}, {1, 100, 0}, 40000, 0, NULL, NULL},
+	    {"a subtracted offset", {1, 40000, 0}, {2, -30, 30}, 0, 0, NULL, NULL},
+	    {"an infinitely deep dark", {1, 40000, 0}, {1, -1e9f, 0}, 0, 0, "too far below 0", NULL},
+	    {"the same with air", {0, 0, 0}, {1, -1e9f, 0}, 40000, 0, "too far below 0", NULL},
+	    {"a deep dark", {1, 40000, 0}, {1, -50000, 0}, 0, 0, NULL, "below 0"},
+	    {"light in the dark", {1, 40000, 0}, {1, 30000, 0}, 0, 0, NULL, "was there light"},
+	    {"a saturated flat", {1, 65535, 0}, {0, 0, 0}, 0, 0, "hot or saturated", NULL},
+	    {"a flat with full pixels", {9, 4095, 3900}, {1, 10, 0}, 0, 0, NULL, "is it saturated"},
+	    {"a flat next to nothing", {1, 1e-42f, 0}, {0, 0, 0}, 0, 0, "less than 1e-06", NULL},
+	    {"a flat of nothing", {1, 0, 0}, {0, 0, 0}, 0, 0, "not above 0 in 100 %", NULL},
+	    {"a flat with one good pixel", {PIXELS, 40000, 0}, {0, 0, 0}, 0, 0, "not above 0 in 100 %", NULL},
+	    {"half a flat", {2, 40000, NAN}, {0, 0, 0}, 0, 0, NULL, NULL},
+	    {"half a flat and a map of the rest", {2, 40000, NAN}, {0, 0, 0}, 0, 2, "are defects", NULL},
+	    {"a dark that is no number", {0, 0, 0}, {1, NAN, 0}, 0, 0, "not finite", NULL},
+	    {"half a dark and a map of the rest", {0, 0, 0}, {2, 0, NAN}, 0, 2, "not finite", NULL},
+	    {"a map of all", {0, 0, 0}, {0, 0, 0}, 40000, 1, "are defects", NULL},
+	};
+	struct counts *counts = malloc(sizeof(*counts));
+
+	for (size_t i = 0; i < sizeof(rows) / sizeof(rows[0]); i++) {
+		struct linearise linearise = {
+		    .sample = SAMPLE_UINT16, .quantity = QUANTITY_INTENSITY, .air = rows[i].air};
+		char doubt[400] = "";
+		const struct warning_sink sink = {doubt, tell};
+		struct error err = {0};
+		int code;
+
+		if (rows[i].flat.every > 0) {
+			fill(counts->flat, rows[i].flat.every, rows[i].flat.some, rows[i].flat.rest);
+			linearise.image[IMAGE_FLAT] = counts->flat;
+		}
+		if (rows[i].dark.every > 0) {
+			fill(counts->dark, rows[i].dark.every, rows[i].dark.some, rows[i].dark.rest);
+			linearise.image[IMAGE_DARK] = counts->dark;
+		}
+		for (int k = 0; k < PIXELS; k++)
+			counts->map[k] = rows[i].map_every > 0 && k % rows[i].map_every == 0;
+		if (rows[i].map_every > 0)
+			linearise.image[IMAGE_DEFECTS] = counts->map;
+		code = images_check(&linearise, COLUMNS, ROWS, &err);
+		ck_assert_msg((code == ERR_IMPOSSIBLE) == (rows[i].refused != NULL), "%s: %s", rows[i].what, err.text);
+		if (code < 0) {
+			ck_assert_msg(strstr(err.text, rows[i].refused) != NULL, "%s: %s", rows[i].what, err.text);
+			continue;
+		}
+		images_warn(&linearise, COLUMNS, ROWS, &sink);
+		ck_assert_msg(rows[i].doubted == NULL ? doubt[0] == '\0' : strstr(doubt, rows[i].doubted) != NULL,
+			      "%s: %s", rows[i].what, doubt);
+	}
+	free(counts);
+}
+END_TEST
+
 /* ---- a detector's own counts ---- */
 
 /*
@@ -706,6 +837,8 @@ Suite *raw_suite(void)
 	tcase_add_loop_test(volumes, counts_turned_signs_and_mere_air_among_line_integrals_are_told, 0, 3);
 	tcase_add_loop_test(volumes, big_endian_counts_are_told, 0, 3);
 	tcase_add_loop_test(volumes, an_object_in_the_air_region_is_told, 0, 2);
+	tcase_add_test(volumes, a_tube_that_drifts_makes_no_object_beyond_the_rows);
+	tcase_add_loop_test(volumes, projections_brighter_than_air_are_told, 0, 2);
 	tcase_add_loop_test(volumes, a_blank_view_is_told_and_is_not_air, 0, 2);
 	tcase_add_loop_test(volumes, a_detector_on_its_side_gives_the_same_volume, 0, 2);
 	tcase_add_test(volumes, blank_views_of_a_short_scan_leave_the_level);
@@ -714,6 +847,7 @@ Suite *raw_suite(void)
 	tcase_add_test(images, defects_are_found_in_flat_and_dark);
 	tcase_add_test(images, the_shadow_of_a_collimator_is_no_defect);
 	tcase_add_test(images, exchanged_images_are_refused);
+	tcase_add_test(images, images_are_refused_and_doubted);
 	tcase_add_loop_test(images, a_detector_of_defects_is_refused, 0, 2);
 	suite_add_tcase(suite, images);
 	return suite;
