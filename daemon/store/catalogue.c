@@ -61,11 +61,17 @@ int catalogue_new(const char *directory, const struct catalogue_hooks *hooks, st
 	return code;
 }
 
+static void close_database(struct catalogue *catalogue)
+{
+	catalogue->backend->close(catalogue->database);
+	catalogue->database = NULL;
+}
+
 void catalogue_free(struct catalogue *catalogue)
 {
 	if (catalogue == NULL)
 		return;
-	catalogue_close(catalogue);
+	close_database(catalogue);
 	for (int i = 0; i < SESSION_COUNT; i++)
 		pthread_mutex_destroy(&catalogue->locks[i]);
 	for (int i = 0; i < TABLE_COUNT; i++) {
@@ -80,8 +86,10 @@ void catalogue_free(struct catalogue *catalogue)
 int catalogue_open(struct catalogue *catalogue, bool *ret_fresh, bool *ret_interrupted, struct error *err)
 {
 	const struct catalogue_backend *backend = catalogue->backend;
-	int version = 0, code = backend->look(&catalogue->site, &version, ret_interrupted, err);
+	int version = 0, code;
 
+	close_database(catalogue);
+	code = backend->look(&catalogue->site, &version, ret_interrupted, err);
 	if (code == 0 && version > CATALOGUE_VERSION)
 		code = error_set(err, ERR_CONFLICT,
 				 "the catalogue has version %d, made by a later cbctd; this one knows %d", version,
@@ -91,16 +99,10 @@ int catalogue_open(struct catalogue *catalogue, bool *ret_fresh, bool *ret_inter
 	if (code == 0 && version < CATALOGUE_VERSION)
 		code = catalogue_upgrade(backend, catalogue->database, version, err);
 	if (code != 0)
-		catalogue_close(catalogue);
+		close_database(catalogue);
 	else
 		*ret_fresh = version == 0;
 	return code;
-}
-
-void catalogue_close(struct catalogue *catalogue)
-{
-	catalogue->backend->close(catalogue->database);
-	catalogue->database = NULL;
 }
 
 bool catalogue_damaged(const struct catalogue *catalogue)
@@ -110,7 +112,7 @@ bool catalogue_damaged(const struct catalogue *catalogue)
 
 int catalogue_set_aside(struct catalogue *catalogue, const char *why, struct error *err)
 {
-	catalogue_close(catalogue);
+	close_database(catalogue);
 	atomic_store(&catalogue->site.damaged, false);
 	return catalogue->backend->set_aside(&catalogue->site, why, err);
 }
@@ -120,14 +122,9 @@ int catalogue_start(struct catalogue *catalogue, struct error *err)
 	return catalogue->backend->start(catalogue->database, err);
 }
 
-int catalogue_freeze(struct catalogue *catalogue, struct error *err)
+int catalogue_freeze(struct catalogue *catalogue, bool frozen, struct error *err)
 {
-	return catalogue->backend->freeze(catalogue->database, true, err);
-}
-
-int catalogue_thaw(struct catalogue *catalogue, struct error *err)
-{
-	return catalogue->backend->freeze(catalogue->database, false, err);
+	return catalogue->backend->freeze(catalogue->database, frozen, err);
 }
 
 /* ---- groups ---- */
@@ -172,22 +169,6 @@ int catalogue_read(struct catalogue *catalogue, const char *sql, const struct va
 	code = catalogue->backend->run(catalogue->database, SESSION_READER, sql, values, count, row, context, err);
 	pthread_mutex_unlock(&catalogue->locks[SESSION_READER]);
 	return code;
-}
-
-int catalogue_try(struct catalogue *catalogue, struct error *err)
-{
-	return catalogue_write(catalogue, "SAVEPOINT part", NULL, 0, err);
-}
-
-int catalogue_try_end(struct catalogue *catalogue, int code, struct error *err)
-{
-	struct error ignored;
-
-	if (code != 0)
-		catalogue_write(catalogue, "ROLLBACK TO part", NULL, 0, &ignored);
-	return catalogue_write(catalogue, "RELEASE part", NULL, 0, code == 0 ? err : &ignored) != 0 && code == 0
-		   ? err->code
-		   : code;
 }
 
 static int note_row(void *context, const struct value *values, struct error *err)
@@ -406,8 +387,8 @@ static int import_own(struct catalogue *catalogue, enum record_kind kind, const 
 	return code;
 }
 
-int catalogue_import(struct catalogue *catalogue, enum record_kind kind, const char *id, const cJSON *rows,
-		     struct error *err)
+static int import_rows(struct catalogue *catalogue, enum record_kind kind, const char *id, const cJSON *rows,
+		       struct error *err)
 {
 	const char *name = tables[record_tables[kind]].name;
 	const cJSON *row;
@@ -424,5 +405,21 @@ int catalogue_import(struct catalogue *catalogue, enum record_kind kind, const c
 				code = import_row(catalogue, (enum table_id)i, STATEMENT_RESTORE, id, row, err);
 		}
 	}
+	return code;
+}
+
+int catalogue_import(struct catalogue *catalogue, enum record_kind kind, const char *id, const cJSON *rows,
+		     struct error *err)
+{
+	struct error ignored;
+	int code = catalogue_write(catalogue, "SAVEPOINT import", NULL, 0, err);
+
+	if (code != 0)
+		return code;
+	code = import_rows(catalogue, kind, id, rows, err);
+	if (code == 0)
+		return catalogue_write(catalogue, "RELEASE import", NULL, 0, err);
+	catalogue_write(catalogue, "ROLLBACK TO import", NULL, 0, &ignored);
+	catalogue_write(catalogue, "RELEASE import", NULL, 0, &ignored);
 	return code;
 }

@@ -32,20 +32,18 @@ int catalogue_new(const char *directory, const struct catalogue_hooks *hooks, st
 		  struct error *err);
 void catalogue_free(struct catalogue *catalogue); /* NULL is fine; closes it */
 /*
- * Opens, checks and upgrades it, or makes an empty one (*ret_fresh). *ret_interrupted: a process ended without closing
- * it. ERR_CONFLICT: a later cbctd made it; nothing was touched. After a failure it is closed again, and
- * catalogue_damaged tells whether it is to be set aside.
+ * Opens, checks and upgrades it, anew where it is open, or makes an empty one (*ret_fresh). *ret_interrupted: a process
+ * ended without closing it. ERR_CONFLICT: a later cbctd made it; nothing was touched. After a failure it is closed
+ * again, and catalogue_damaged tells whether it is to be set aside.
  */
 int catalogue_open(struct catalogue *catalogue, bool *ret_fresh, bool *ret_interrupted, struct error *err);
-void catalogue_close(struct catalogue *catalogue); /* also when it is not open */
 bool catalogue_damaged(const struct catalogue *catalogue);
 /* Closes it and moves it to quarantine/; it is whole then, and empty. */
 int catalogue_set_aside(struct catalogue *catalogue, const char *why, struct error *err);
 /* The start is over and requests come; a thread of the backend may begin to tidy up. */
 int catalogue_start(struct catalogue *catalogue, struct error *err);
-/* Calls between these two read the catalogue of one moment; for the start, which makes many of them. */
-int catalogue_freeze(struct catalogue *catalogue, struct error *err);
-int catalogue_thaw(struct catalogue *catalogue, struct error *err);
+/* Between frozen and not, calls read the catalogue of one moment; for the start, which makes many of them. */
+int catalogue_freeze(struct catalogue *catalogue, bool frozen, struct error *err);
 
 /* ---- groups ---- */
 
@@ -56,9 +54,6 @@ int catalogue_thaw(struct catalogue *catalogue, struct error *err);
 int catalogue_begin(struct catalogue *catalogue, bool synced, struct error *err);
 /* Commits when code is 0, else takes everything back. Returns code, or why the commit failed. */
 int catalogue_end(struct catalogue *catalogue, int code, struct error *err);
-/* A part of a group that can be taken back alone. */
-int catalogue_try(struct catalogue *catalogue, struct error *err);
-int catalogue_try_end(struct catalogue *catalogue, int code, struct error *err);
 
 /* ---- scans ---- */
 
@@ -99,10 +94,9 @@ struct catalogue_projection {
 	int view;
 	uint8_t sha256[32];
 };
-/* Writes a projection's row, in a group, in place of the one of this view. */
-int catalogue_put_projection(struct catalogue *catalogue, const struct catalogue_projection *projection,
+/* Writes the row of a projection of the scan with this number, in a group; sha256 NULL: removes it. */
+int catalogue_put_projection(struct catalogue *catalogue, long long scan, int view, const uint8_t *sha256,
 			     struct error *err);
-int catalogue_remove_projection(struct catalogue *catalogue, long long scan, int view, struct error *err);
 /* Reads the projections of the scan with this number, by view; the caller frees the array. */
 int catalogue_projections(struct catalogue *catalogue, long long scan, struct catalogue_projection **ret_projections,
 			  int *ret_count, struct error *err);
@@ -119,9 +113,6 @@ int catalogue_update_job(struct catalogue *catalogue, const struct job_record *j
 			 struct error *err);
 /* Reads all jobs, by id; free with job_records_free. */
 int catalogue_jobs(struct catalogue *catalogue, struct job_record **ret_jobs, int *ret_count, struct error *err);
-/* Reads a job's state; *ret_known false: there is no such job. */
-int catalogue_job_state(struct catalogue *catalogue, const char *job, bool *ret_known, enum job_state *ret_state,
-			struct error *err);
 /* Visits the jobs that have volumes without a digest, oldest first. */
 int catalogue_undigested(struct catalogue *catalogue, void (*visit)(void *context, const char *job), void *context,
 			 struct error *err);
@@ -194,8 +185,8 @@ int catalogue_stamps(struct catalogue *catalogue, enum record_kind kind,
 int catalogue_export(struct catalogue *catalogue, enum record_kind kind, const char *id, cJSON **ret_rows,
 		     struct error *err);
 /*
- * The rows of a scan or job become those that catalogue_export gave, of this cbctd or an earlier one. ERR_INVALID: they
- * do not fit. On failure some may have: the caller takes that back.
+ * The rows of a scan or job become those that catalogue_export gave, of this cbctd or an earlier one, in a group.
+ * ERR_INVALID: they do not fit. A failure changes nothing.
  */
 int catalogue_import(struct catalogue *catalogue, enum record_kind kind, const char *id, const cJSON *rows,
 		     struct error *err);

@@ -86,17 +86,22 @@ int catalogue_set_closed(struct catalogue *catalogue, const char *scan, struct e
 	return catalogue_assign(catalogue, TABLE_SCANS, "closed", &record, scan, err);
 }
 
-int catalogue_put_projection(struct catalogue *catalogue, const struct catalogue_projection *projection,
-			     struct error *err)
-{
-	return catalogue_write_record(catalogue, TABLE_PROJECTIONS, STATEMENT_PUT, NULL, projection, NULL, err);
-}
-
-int catalogue_remove_projection(struct catalogue *catalogue, long long scan, int view, struct error *err)
+static int remove_projection(struct catalogue *catalogue, long long scan, int view, struct error *err)
 {
 	const struct value values[] = {value_integer(scan), value_integer(view)};
 
 	return catalogue_write(catalogue, "DELETE FROM projections WHERE scan = $1 AND view = $2", values, 2, err);
+}
+
+int catalogue_put_projection(struct catalogue *catalogue, long long scan, int view, const uint8_t *sha256,
+			     struct error *err)
+{
+	struct catalogue_projection row = {.scan = scan, .view = view};
+
+	if (sha256 == NULL)
+		return remove_projection(catalogue, scan, view, err);
+	memcpy(row.sha256, sha256, sizeof(row.sha256));
+	return catalogue_write_record(catalogue, TABLE_PROJECTIONS, STATEMENT_PUT, NULL, &row, NULL, err);
 }
 
 int catalogue_projections(struct catalogue *catalogue, long long scan, struct catalogue_projection **ret_projections,
@@ -176,37 +181,6 @@ int catalogue_jobs(struct catalogue *catalogue, struct job_record **ret_jobs, in
 
 	if (code == 0)
 		*ret_jobs = records;
-	return code;
-}
-
-struct found_state {
-	bool known;
-	int state;
-};
-
-static int take_state(void *context, const struct value *values, struct error *err)
-{
-	struct found_state *found = context;
-
-	found->known = true;
-	for (found->state = 0; found->state < JOB_STATE_COUNT; found->state++) {
-		if (strcmp(values[0].bytes, job_state_names[found->state]) == 0)
-			return 0;
-	}
-	return error_set(err, ERR_IO, "catalogue: a job has a state that does not exist");
-}
-
-int catalogue_job_state(struct catalogue *catalogue, const char *job, bool *ret_known, enum job_state *ret_state,
-			struct error *err)
-{
-	const struct value id = value_text(job);
-	struct found_state found = {false, 0};
-	int code = catalogue_read(catalogue, "SELECT state FROM jobs WHERE id = $1", &id, 1, take_state, &found, err);
-
-	if (code == 0) {
-		*ret_known = found.known;
-		*ret_state = (enum job_state)found.state;
-	}
 	return code;
 }
 

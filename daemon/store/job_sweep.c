@@ -52,7 +52,9 @@ static int remove_unsettled(struct store *store, const char *id, struct volume_r
 
 struct sweep {
 	struct store *store;
-	const char *id;
+	const struct job_record *jobs; /* [job_count], by id */
+	int job_count;
+	const char *id; /* of the job whose directory is looked at, as all that follows */
 	struct volume_record *volumes;
 	int count;
 	bool ended; /* else it makes the volumes that have no row again */
@@ -121,20 +123,27 @@ static void check_volumes(const struct sweep *sweep)
 	}
 }
 
+static int compare_id(const void *id, const void *job)
+{
+	return strcmp(id, ((const struct job_record *)job)->id);
+}
+
+/* Directories that are no job's are passed over. */
 static int sweep_directory(void *context, const char *name, struct error *err)
 {
-	struct sweep sweep = {.store = context, .id = name};
-	enum job_state state = JOB_WAITING;
+	const struct sweep *all = context;
+	const struct job_record *job =
+	    all->job_count == 0 ? NULL
+				: bsearch(name, all->jobs, (size_t)all->job_count, sizeof(*all->jobs), compare_id);
+	struct sweep sweep = {.store = all->store, .id = name};
+	enum job_state state;
 	char path[1024];
-	bool known = false;
 	int code;
 
-	if (!id_valid(name))
-		return 0; /* not ours */
+	if (job == NULL)
+		return 0;
+	state = job->state;
 	store_job_directory(sweep.store, name, path);
-	code = catalogue_job_state(sweep.store->catalogue, name, &known, &state, err);
-	if (code != 0 || !known)
-		return code;
 	sweep.ended = state == JOB_SUCCEEDED || state == JOB_FAILED || state == JOB_CANCELLED;
 	code = store_job_volumes(sweep.store, name, &sweep.volumes, &sweep.count, err);
 	if (code != 0)
@@ -151,16 +160,21 @@ static int sweep_directory(void *context, const char *name, struct error *err)
 
 int store_sweep_jobs(struct store *store, struct error *err)
 {
+	struct sweep sweep = {.store = store};
+	struct job_record *jobs = NULL;
 	char path[1024];
-	int code;
+	int code = catalogue_jobs(store->catalogue, &jobs, &sweep.job_count, err);
 
 	/* All rows are read as of one moment, which saves a start with many jobs much time: none changes before it is
 	 * read. */
-	code = catalogue_freeze(store->catalogue, err);
-	if (code != 0)
-		return code;
-	snprintf(path, sizeof(path), "%s/jobs", store->directory);
-	code = directory_visit(path, sweep_directory, store, err);
-	catalogue_thaw(store->catalogue, code == 0 ? err : &(struct error){0});
+	if (code == 0)
+		code = catalogue_freeze(store->catalogue, true, err);
+	if (code == 0) {
+		sweep.jobs = jobs;
+		snprintf(path, sizeof(path), "%s/jobs", store->directory);
+		code = directory_visit(path, sweep_directory, &sweep, err);
+		catalogue_freeze(store->catalogue, false, code == 0 ? err : &(struct error){0});
+	}
+	job_records_free(jobs, sweep.job_count);
 	return code;
 }

@@ -102,14 +102,11 @@ static int write_again(struct reconciliation *r, const char *id, struct error *e
 
 static int apply(struct reconciliation *r, const cJSON *record, struct error *err)
 {
-	int code = catalogue_try(r->store->catalogue, err);
+	int code = record_apply(r->store, r->kind, record, err);
 
-	if (code != 0)
-		return code;
-	code = record_apply(r->store, r->kind, record, err);
 	if (code == 0)
 		r->store->repairs.found[r->kind]++;
-	return catalogue_try_end(r->store->catalogue, code, err);
+	return code;
 }
 
 /* The row and the record are not of the same writing, as far as the time of modification tells. */

@@ -53,7 +53,7 @@ long long record_stamp(const struct store *store, enum record_kind kind, const c
 int record_read(const char *directory, enum record_kind kind, const char *id, cJSON **ret_record, struct error *err);
 /* The stamp inside of a record; 0 where it makes no sense. */
 long long record_own_stamp(enum record_kind kind, const cJSON *record);
-/* The rows become those of the record. On failure some may have: the caller rolls back. */
+/* The rows become those of the record, in a group. A failure changes nothing. */
 int record_apply(struct store *store, enum record_kind kind, const cJSON *record, struct error *err);
 /* The time of modification of the record becomes the stamp that it has inside. */
 void record_touch(const struct store *store, enum record_kind kind, const char *id, long long stamp);

@@ -61,7 +61,6 @@ int stored_scan_open(struct stored_scan *scan, bool writing, int *ret_descriptor
 
 static int insert_projections(struct store *store, struct received_projection *batch, int count, struct error *err)
 {
-	struct catalogue_projection row;
 	int code = 0;
 
 	for (int i = 0; i < count && code == 0; i++) {
@@ -70,9 +69,8 @@ static int insert_projections(struct store *store, struct received_projection *b
 		    !batch[i].scan->deleted && (!batch[i].scan->closing || batch[i].scan->lost[batch[i].index]);
 		if (!batch[i].stored)
 			continue;
-		row = (struct catalogue_projection){.scan = batch[i].scan->number, .view = batch[i].index};
-		memcpy(row.sha256, batch[i].sum.sha256, sizeof(row.sha256));
-		code = catalogue_put_projection(store->catalogue, &row, err);
+		code = catalogue_put_projection(store->catalogue, batch[i].scan->number, batch[i].index,
+						batch[i].sum.sha256, err);
 	}
 	return code;
 }

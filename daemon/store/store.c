@@ -64,7 +64,6 @@ static int load(struct store *store, struct error *err)
 static void unload(struct store *store)
 {
 	store_free_scans(store);
-	catalogue_close(store->catalogue);
 	store->repairs = (struct store_repairs){.remade = false};
 }
 

@@ -205,7 +205,7 @@ int store_forget_lost(struct stored_scan *scan, struct error *err)
 			continue;
 		code = sums_put(file, i, NULL, err);
 		if (code == 0)
-			code = catalogue_remove_projection(scan->store->catalogue, scan->number, i, err);
+			code = catalogue_put_projection(scan->store->catalogue, scan->number, i, NULL, err);
 	}
 	close(file);
 	return code;

@@ -68,15 +68,6 @@ static int write_records(const struct stored_scan *scan, const struct records *r
 	return code;
 }
 
-static int put_row(struct store *store, const struct stored_scan *scan, int index, const struct sum *sum,
-		   struct error *err)
-{
-	struct catalogue_projection row = {.scan = scan->number, .view = index};
-
-	memcpy(row.sha256, sum->sha256, sizeof(row.sha256));
-	return catalogue_put_projection(store->catalogue, &row, err);
-}
-
 static bool row_fits(const struct stored_scan *scan, int index, const struct sum *sum)
 {
 	return scan->progress[index] == STORED && memcmp(scan->sums[index].sha256, sum->sha256, 32) == 0;
@@ -99,7 +90,8 @@ static int follow_projections(struct store *store, const struct stored_scan *sca
 		return code;
 	for (int i = 0; i < scan->count && code == 0; i++) {
 		if (records->states[i] == SUM_GOOD && !row_fits(scan, i, &records->projections[i]))
-			code = put_row(store, scan, i, &records->projections[i], err);
+			code = catalogue_put_projection(store->catalogue, scan->number, i,
+							records->projections[i].sha256, err);
 	}
 	return store_end(store, code, err);
 }
