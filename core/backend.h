@@ -229,7 +229,7 @@ struct backend {
 	int (*plan_new)(struct device *device, const struct plan_options *options, struct plan **ret_plan,
 			struct error *err);
 	void (*plan_free)(struct plan *plan); /* NULL is fine */
-	/* How this plan does its work, e.g. "untilted, 16 x 16 tiles, AVX-512": said in the job's document. */
+	/* Says how this plan does its work, e.g. "untilted, 16 x 16 tiles, AVX-512": said in the job's document. */
 	const char *(*plan_summary)(const struct plan *plan);
 	/* Views that FDK should filter and backproject in one go. */
 	int (*plan_batch)(const struct plan *plan);
@@ -340,7 +340,7 @@ extern const struct backend backend_cpu;
  * device, and for the CPU's default. 0: all that the process may use.
  */
 void backend_host_threads(int threads);
-/* By name; "auto" gives the first that has a device. NULL when there is none. */
+/* Finds a backend by its name; "auto" gives the first that has a device. NULL when there is none. */
 const struct backend *backend_find(const char *name);
 
 #ifdef __cplusplus

@@ -40,7 +40,7 @@ struct error {
 /* Fills err and returns code. */
 int error_set(struct error *err, int code, const char *format, ...) __attribute__((format(printf, 3, 4)));
 
-/* The same with the field that is to blame, e.g. "/grid/size/0". */
+/* error_set with the field that is to blame, e.g. "/grid/size/0". */
 int error_set_at(struct error *err, int code, const char *pointer, const char *format, ...)
     __attribute__((format(printf, 4, 5)));
 

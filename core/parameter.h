@@ -23,7 +23,7 @@ enum parameter_type {
 	PARAMETER_TYPE_COUNT
 };
 
-/* Whether a document without the parameter always means the same. */
+/* Value of a parameter that a document leaves out. */
 enum parameter_preset {
 	PRESET_FIXED,    /* struct parameter.preset */
 	PRESET_VARIES,   /* preset, or what other members of the document make of it */
@@ -62,9 +62,9 @@ bool parameter_is_word(const struct parameter *parameter, const void *record);
 double parameter_get(const struct parameter *parameter, const void *record, int i);
 /* The value must fit the type; a number takes the word's place. */
 void parameter_set(const struct parameter *parameter, void *record, int i, double value);
-/* All of a record's parameters to what documents without them mean. Lists are left alone. */
+/* Sets all of a record's parameters to the values that documents without them have. Lists are left alone. */
 void parameters_preset(const struct parameter *parameters, int count, void *record);
-/* In place of parameter->object, object counts where it is not NULL. */
+/* `object`, where it is not NULL, takes the place of parameter->object. */
 void parameter_pointer(const struct parameter *parameter, const char *object, char ret_pointer[PARAMETER_POINTER_MAX]);
 /* ERR_IMPOSSIBLE at its pointer for a value that is out of range, and for NaN; what does not count passes. */
 int parameter_check(const struct parameter *parameter, const void *record, const char *object, struct error *err);

@@ -9,7 +9,7 @@
  */
 enum { EMIT_FDK = 0, EMIT_FDK_TV = -1 }; /* beside iterations 1, 2, ... */
 
-/* How iterations project backwards: plan_options.matched. */
+/* Backprojection of the iterations: plan_options.matched. */
 enum projector { PROJECTOR_INTERPOLATING, PROJECTOR_MATCHED, PROJECTOR_COUNT };
 
 /* "light", "medium", "strong": half, once, twice the balance that is found. */

@@ -33,7 +33,7 @@ extern const struct warning_kind warning_kinds[];
  * never NULL.
  */
 const struct warning_kind *warning_kind(const char *code);
-/* Whether the code has a row: what this program itself warns of must have one. */
+/* True if the code has a row; every code that this program emits must have one. */
 bool warning_is_known(const char *code);
 
 /* The receiver of a reconstruction's warnings, called in the thread that runs the reconstruction. */

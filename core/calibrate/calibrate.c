@@ -22,7 +22,7 @@ static const double USED_LEAST = .75;     /* of the views */
 static const double CLEARANCE = 2;        /* pixels between two shadows that do not touch */
 static const double DRAWING_SIGMA = .1;   /* mm, of machining, where balls are adjusted */
 
-/* What is known of one view on the way. */
+/* Findings in one view while the scan is calibrated. */
 struct work {
 	struct shadow *shadows; /* [count], owned */
 	struct shadow_facts facts;
@@ -187,7 +187,7 @@ static int drop_outliers(const struct run *run, const struct pose *pose, struct 
 	return kept;
 }
 
-/* How many balls' shadows are wholly on the picture under a pose. */
+/* Counts the balls whose shadows are wholly on the picture under a pose. */
 static int on_picture(const struct run *run, const struct pose *pose)
 {
 	const struct geometry *nominal = run->request->nominal;
@@ -204,7 +204,7 @@ static int on_picture(const struct run *run, const struct pose *pose)
 	return count;
 }
 
-/* From the first pose of a view to its last; the pairs are found anew under each. Returns how many are used. */
+/* Refines a view's pose step by step, with new pairs under each pose. Returns how many pairs are used. */
 static int refine(const struct run *run, int view, struct pose *pose, struct pair *pairs, int count)
 {
 	static const double reaches[] = {4, 2.5, 2.5};
@@ -319,7 +319,7 @@ static int refuse_uneven(const struct run *run, struct error *err)
 	return 0;
 }
 
-/* All views that are not used yet. */
+/* Tries all views that are not used yet. */
 static int find_round(const struct run *run, double turn, bool again, struct error *err)
 {
 	int failed = 0;

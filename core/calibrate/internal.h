@@ -37,7 +37,7 @@ struct shadow_finder;
 struct shadow_finder *shadow_finder_open(int columns, int rows, const struct shadow_scale *scale);
 struct shadow_finder *shadow_finder_free(struct shadow_finder *finder);
 
-/* What a picture without shadows is told by. */
+/* Statistics of a picture; they tell why one has no shadows. */
 struct shadow_facts {
 	double median, noise; /* of the picture's line integrals and of its background's residual */
 	double highest;       /* above the background */

@@ -25,7 +25,7 @@ struct expected {
 	double pixel[2], radius; /* radius 0: not in front of the source */
 };
 
-/* What the search goes over: turns in the picture in degrees, and sizes. */
+/* Steps of the search: turns of the model in the picture, in degrees, and its sizes. */
 struct search {
 	int turns, sizes;
 	double turn, size; /* step */
@@ -275,7 +275,7 @@ int match_pose(const struct match_view *view, const struct pose *pose, const dou
 	return pair_up(&task, (const double(*)[2])places, reach, ret_pairs);
 }
 
-/* From a turn up to the one next to it with most pairs, over dips of a step. */
+/* Climbs from a turn to the one near it with the most pairs, over dips of a step. */
 static int climb(const int pairs[TURN_STEPS], int turn)
 {
 	for (bool higher = true; higher;) {

@@ -101,7 +101,7 @@ static bool transform(const struct balls *balls, const struct pair *pairs, const
 	return isfinite(ret_matrix[0]);
 }
 
-/* Which pairs agree with a matrix; all of them on the same side of the source. */
+/* Chooses the pairs that agree with a matrix; all of them lie on the same side of the source. */
 static int agreeing(const struct balls *balls, const struct pair *pairs, int count, const double matrix[12],
 		    int *ret_chosen)
 {

@@ -282,7 +282,7 @@ struct moments {
 	double mass, column, row, second;
 };
 
-/* Whether a shadow's window is wholly on the picture. */
+/* True if a shadow's window is wholly on the picture. */
 static bool on_picture(const struct shadow_finder *finder, double column, double row, double radius)
 {
 	const double window = WINDOW * radius;

@@ -43,7 +43,7 @@ static struct station *stations_of(const struct geometry *nominal)
 	return stations;
 }
 
-/* From one angle on to another, 0 to 2 pi. */
+/* Angle from one direction on to another, 0 to 2 pi. */
 static double onward(double from, double to)
 {
 	const double angle = fmod(to - from, 2 * M_PI);
@@ -176,7 +176,7 @@ static void neighbours(const struct calibration *calibration, const struct stati
 	}
 }
 
-/* How far a view's shadows lie from where its neighbours' poses have them: RMS over the balls, pixels. */
+/* Distance of a view's shadows from where its neighbours' poses have them: RMS over the balls, pixels. */
 static double stray(const struct calibration *calibration, const struct calibrate_request *request,
 		    const struct station *stations, int at)
 {

@@ -5,7 +5,7 @@
 
 /* Views without a good pixel: their slots are 0 and say nothing. */
 
-/* By how much an FDK volume is too low without them: the other views stand in for them in equal shares. */
+/* Factor by which an FDK volume is too low without blank views: the others stand in for them in equal shares. */
 double blank_factor(const struct correction_job *job);
 /* Makes up for them in an FDK volume; *ret_changed is set where there are any. */
 int blank_make_up(const struct correction_job *job, struct volume *volume, bool *ret_changed, struct error *err);

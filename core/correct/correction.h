@@ -84,7 +84,7 @@ struct correction {
 	enum correction_fused fused;
 	double work; /* in FDKs of the whole scan: for the progress bar */
 
-	/* Whether the job has it; NULL: every job. */
+	/* True if the job has this correction; NULL: every job has. */
 	bool (*wanted)(const struct recipe *recipe, const struct linearise *linearise);
 	/* Refuses input that cannot be corrected, before a view is read; geometry and linearise are upright. */
 	int (*check)(const struct linearise *linearise, const struct geometry *geometry, struct error *err);

@@ -59,7 +59,7 @@ static void sliding_remove(struct sliding *window, float value)
 		window->sorted[at] = window->sorted[at + 1];
 }
 
-/* For each value the median of those up to REACH away along one direction; NAN where there is none. */
+/* Writes for each value the median of those up to REACH away along one direction; NAN where there is none. */
 static void median_along(const float *from, float *to, int lines, size_t line, int count, size_t step)
 {
 #pragma omp parallel for schedule(static)

@@ -183,7 +183,7 @@ struct columns {
 	int begin[TILE_LINES], end[TILE_LINES]; /* groups of LANES voxels that see rows only */
 };
 
-/* All lines of a tile together, in vectors; `distance` is the isocentre's depth, or 0 for the weight 1. */
+/* Sets all lines of a tile together, in vectors; `distance` is the isocentre's depth, or 0 for the weight 1. */
 static void columns_set(const struct plan *plan, const double m[12], const struct tile *tile, double distance,
 			struct columns *ret)
 {
@@ -274,7 +274,7 @@ static void column_inside(const struct plan *plan, const struct columns *columns
 		for (int g = 0; g < count; g++) {
 			const float *l = left + base[g], *r = right + base[g];
 			float *sum = sums + (size_t)(begin + g) * LANES;
-			/* Where the lowest lies on a row exactly, rounding may leave it below. */
+			/* Rounding may leave the lowest sample below its row where it lies on that exactly. */
 			vf low = vf_fma(left_weight, vf_load(l), right_weight * vf_load(r));
 			vf high = vf_fma(left_weight, vf_load(l + LANES), right_weight * vf_load(r + LANES));
 

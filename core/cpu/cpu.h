@@ -210,7 +210,7 @@ static inline float *cpu_take_floats(struct arena *arena, size_t count)
 	return cpu_take(arena, count > 0 ? floats_bytes(count) : 0);
 }
 
-/* Which thread of the current parallel region this is. */
+/* Number of the calling thread in the current parallel region. */
 int cpu_thread(void);
 /* The number that 0 stands for, else what was asked; 1 without OpenMP. */
 int cpu_threads(int asked);
@@ -241,7 +241,7 @@ static inline size_t project_scratch_floats(const struct plan *plan)
 	return 4 * lanes_padded(plan->rows) + 2 * (lanes_padded(plan->grid.size[2]) + 2 * BLEND_MARGIN);
 }
 
-/* For each row of a column its height, its ray, and two floats for each voxel across a tile; margins for windows. */
+/* Scratch for a column: of each row its height, its ray, and two floats for each voxel across a tile; with margins. */
 static inline size_t matched_scratch_floats(const struct plan *plan)
 {
 	return plan->matched ? (10 + 2 * MATCHED_ACROSS) * (lanes_padded(plan->rows) + 2 * ROWS_MARGIN) : 0;

@@ -151,7 +151,7 @@ static const float *at_edge(const struct rows *rows, int side, int i)
 	return rows->view + (size_t)column * (size_t)rows->rows + (size_t)rows->first;
 }
 
-/* Which rows are cut off at an edge; returns whether any is. */
+/* Marks the rows that are cut off at an edge; returns true if any is. */
 static bool find_truncated(const struct filter_engine *engine, const struct rows *rows, struct extensions *ret)
 {
 	bool any = false;

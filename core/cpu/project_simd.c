@@ -174,7 +174,8 @@ static inline vf window_sample(const float *from, size_t stride, int columns, vf
 	return vf_fma(upper, above - below, below);
 }
 
-/* At most SLICES_AT_ONCE slices that lie whole between entry and exit and are crossed well inside; c runs along z. */
+/* Sums up at most SLICES_AT_ONCE slices that lie whole between entry and exit and are crossed well inside; c runs along
+ * z. */
 static vf march_inside(const struct rays *rays, const struct axes *axes, const float *volume, int first, int last)
 {
 	const vf b0 = vf_load(rays->b), c0 = vf_load(rays->c);
@@ -526,7 +527,8 @@ static void fan_sample(const struct plan *plan, const struct fan *fan, const str
 			float *sum = rows->sum + g * LANES;
 
 			if (windowed && i >= rows->full_first[g] && i <= rows->full_last[g]) {
-				/* Where the lowest lies on a voxel exactly, rounding may leave it below. */
+				/* Rounding may leave the lowest sample below its voxel where it lies on that exactly.
+				 */
 				vf low = vf_load(blend + base[k]), high = vf_load(blend + base[k] + LANES);
 
 				vf_store(sum, vf_load(sum) +

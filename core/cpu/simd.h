@@ -286,7 +286,7 @@ static inline vf vf_window_sample(vf low, vf high, vf position)
 	return vf_fma(fraction, b - a, a);
 }
 
-/* Whether LANES samples so far apart fall into such a window, wherever in its first cell the first lies. */
+/* True if LANES samples so far apart fall into such a window, wherever in its first cell the first lies. */
 static inline int window_holds(double step)
 {
 	return (LANES - 1) * (step < 0 ? -step : step) < 2 * LANES - 2;

@@ -18,7 +18,7 @@
  */
 extern const struct backend backend_outofcore; /* count and open are NULL: outofcore_open */
 
-/* Both are borrowed; close with backend_outofcore.close, which leaves the other device open. */
+/* Backend and device are borrowed; close with backend_outofcore.close, which leaves the other device open. */
 int outofcore_open(const struct backend *backend, struct device *device, struct device **ret_device, struct error *err);
 
 #endif

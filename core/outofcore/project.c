@@ -69,7 +69,7 @@ static int drain_all(struct plan *plan, struct drain *drain, struct volume *to, 
 	return code;
 }
 
-/* All batches into one slab, the one before it coming back meanwhile. */
+/* Backprojects all batches into one slab, while the slab before it is copied back. */
 static int fill_slab(struct plan *plan, struct slab *slab, struct transfer *transfer, const struct stack *from,
 		     const int *views, int count, enum backprojection weight, struct drain *drain, struct volume *to,
 		     struct error *err)

@@ -36,8 +36,7 @@ struct algorithm {
 	enum projector projector; /* that a recipe without one takes */
 	enum stage stage;         /* of its iterations, in progress and timings */
 	bool subsets;             /* its update is the backend's sart_iterate over ordered subsets */
-	/* That it holds on the device beside the projections, the iterate, its copy and the plan: problem.volumes and
-	 * stacks. */
+	/* How many problem.volumes and stacks it works in, beside projections, iterate, its copy and the plan. */
 	int volumes, stacks;
 	double updates; /* of SART, that take up as much noise as one iteration; 0: as many as there are subsets */
 	/* Iterations after which a start from zero has its least error on anatomies; fewer are told. 0: never told. */
@@ -63,7 +62,7 @@ struct algorithm {
 };
 
 extern const struct algorithm *const algorithms[ALGORITHM_COUNT];
-/* By name; NULL when there is none. */
+/* Finds an algorithm by its name; NULL when there is none. */
 const struct algorithm *algorithm_find(const char *name);
 
 /*

@@ -77,9 +77,9 @@ static inline bool recipe_has_ends(const struct recipe *recipe)
 /* Calls the hook at the beginning of what `stage` says. */
 void recon_tell_progress(struct recon *recon, enum stage stage, int iteration);
 
-/* Whether all projections are kept on the device, and not a batch of FDK's at a time. */
+/* True if all projections are kept on the device, and not a batch of FDK's at a time. */
 bool keeps_projections(const struct recipe *recipe);
-/* Whether the recipe's algorithm is the backend's own update over ordered subsets. */
+/* True if the recipe's algorithm is the backend's own update over ordered subsets. */
 bool has_subsets(const struct recipe *recipe);
 
 /* The options point into recon, which is described, has its input, and its weights where FDK is on. */

@@ -50,12 +50,13 @@ struct plan_options plan_options(const struct recon *recon)
 
 /* ---- the walk over what lies on the device beside the plan ---- */
 
-/* It allocates every piece, or adds up the bytes, so that the estimate and the allocation come from the same lines. */
+/* A walk allocates every piece, or adds up the bytes, so that the estimate and the allocation come from the same lines.
+ */
 struct walk {
 	const struct backend *backend;
 	struct device *device;
 	bool measures;
-	/* Where it measures. A piece of the out-of-core backend takes 0 bytes of the device, and some of the host. */
+	/* Sums of a walk that measures. Pieces of the out-of-core backend take bytes of the host alone. */
 	size_t projections, volumes, scratch, host;
 };
 
@@ -107,7 +108,7 @@ static int walk_planned(struct recon *recon, struct walk *walk, struct error *er
 	return code;
 }
 
-/* All the rest: plan_options.beside. */
+/* All other pieces, plan_options.beside: FDK's batch, and what corrections and the algorithm work in. */
 static int walk_beside(struct recon *recon, struct walk *walk, struct error *err)
 {
 	const struct recipe *recipe = &recon->recipe;

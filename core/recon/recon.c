@@ -288,7 +288,7 @@ size_t recon_state_bytes(const struct recon *recon)
 	return algorithm_bytes(recon) + ends_state_bytes(recon->ends);
 }
 
-/* What the algorithm holds, and behind it the end slices that the iterations began with. */
+/* Writes the algorithm's state, and behind it the end slices that the iterations began with. */
 int recon_save_state(struct recon *recon, const struct checkpoint_sink *sink, struct error *err)
 {
 	int code = 0;

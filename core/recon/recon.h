@@ -48,7 +48,7 @@ struct recon_hooks {
 	 * recon_iteration and recon_read then give what recon_resume wants.
 	 */
 	bool (*yield)(void *context);
-	/* At the beginning of what `stage` says; the fraction is of the whole, 0..1. */
+	/* Called at the beginning of a stage; the fraction is of the whole job, 0..1. */
 	void (*progress)(void *context, enum stage stage, int iteration, double fraction);
 	void (*row)(void *context, const struct history_row *row);
 	/*
@@ -97,7 +97,7 @@ void recon_free(struct recon *recon);
  */
 int recon_push(struct recon *recon, const void *samples, const int *views, int count, struct error *err);
 
-/* Once, after the last view: finishes FDK, then TV, iterations and TV in turn, calling the hooks. */
+/* Called once, after the last view: finishes FDK, then TV, iterations and TV in turn, calling the hooks. */
 int recon_run(struct recon *recon, struct error *err);
 
 /*

@@ -6,7 +6,7 @@
 #include "core/recon/algorithm.h"
 #include "core/recon/noise.h"
 
-/* Whether a view's detector has the shadow of any of 9 x 9 x 9 places that span the grid. */
+/* True if any view's detector has the shadow of one of 9 x 9 x 9 places that span the grid. */
 static bool is_seen(const struct grid *grid, const struct geometry *geometry)
 {
 	enum { ALONG = 9 };
@@ -30,7 +30,7 @@ static bool is_seen(const struct grid *grid, const struct geometry *geometry)
 	return false;
 }
 
-/* Whether a view has a ray that SART corrects the grid by; of its pixels those around the grid's shadow are tried. */
+/* True if a view has a ray that SART corrects the grid by; of its pixels those around the grid's shadow are tried. */
 static bool is_crossed(const struct grid *grid, const struct view *view, int columns, int rows)
 {
 	const double *mm = grid->spacing, least = RAY_LENGTH_LEAST * fmin(fmin(mm[0], mm[1]), mm[2]);
