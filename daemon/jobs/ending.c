@@ -77,6 +77,8 @@ void worker_finish_job(struct supervise *supervise, struct worker *worker)
 	}
 	if (code == 0)
 		code = record_ending(worker, &err);
+	if ((code == 0 || code == ERR_CONFLICT) && worker->arriving != NULL)
+		code = job_leave(worker->job, &err);
 	if (code != 0 && code != ERR_CONFLICT) {
 		store_distrust(jobs_store(supervise->jobs), &err);
 		if (code == ERR_NO_SPACE)
@@ -85,8 +87,6 @@ void worker_finish_job(struct supervise *supervise, struct worker *worker)
 		log_line(LEVEL_ERROR, "the end of a job cannot be recorded yet: %s", err.text);
 		return;
 	}
-	if (worker->arriving != NULL)
-		job_leave(worker->job);
 	worker_stop_attending(worker);
 	job_release(worker->job);
 	worker->job = NULL;

@@ -93,7 +93,6 @@ static void begin(struct supervise *supervise, struct worker *worker, struct job
 	worker->failure_code = 0;
 	worker->announced = worker->reconstructed = 0;
 	worker->again = 0;
-	worker->attended = clock_monotonic();
 	worker->state = WORKER_BUSY;
 	worker->deadline = NEVER;
 	if (message_send(worker->child.socket, message, &err) != 0) {
@@ -105,6 +104,17 @@ static void begin(struct supervise *supervise, struct worker *worker, struct job
 	worker_publish(supervise, worker);
 }
 
+/*
+ * A projection that came later than this counts as coming just now for a worker that is to be given a job; so does one
+ * that came when the worker was asked to make room for it: an iteration and a checkpoint may take longer than patience.
+ */
+static double just_now(const struct worker *worker)
+{
+	const double since = clock_monotonic() - PATIENCE;
+
+	return worker->room_since < since ? worker->room_since : since;
+}
+
 /* Sets the job running with all projections, or, `arriving`, has it attended while the rest comes. */
 static int begin_job(struct supervise *supervise, struct worker *worker, struct job *job,
 		     const struct job_record *record, struct message *message, struct stored_scan *scan,
@@ -112,6 +122,7 @@ static int begin_job(struct supervise *supervise, struct worker *worker, struct 
 {
 	const struct job_change change = {
 	    .backend = worker->backend, .device = worker->info.name, .basis = facts->basis};
+	const double since = just_now(worker);
 	int code;
 
 	message->arriving = arriving;
@@ -132,6 +143,7 @@ static int begin_job(struct supervise *supervise, struct worker *worker, struct 
 	}
 	worker->running.ticket = LLONG_MAX; /* it has none before it runs, and makes room first */
 	worker->arriving = scan;
+	worker->attended = watchdog_attended(facts->arrived, since, clock_monotonic());
 	worker_attend(supervise, worker);
 	return 0;
 }
@@ -180,18 +192,15 @@ static int give_job(struct supervise *supervise, struct worker *worker, struct j
 }
 
 /*
- * The queue's first, or a waiting job: before it when it has the higher priority and its projections come just now, or
- * came when the worker was asked to make room for them: an iteration and a checkpoint may take longer than patience.
+ * The queue's first, or a waiting job: before it when it has the higher priority and its projections come just now.
  */
 static struct job *choose_job(struct supervise *supervise, const struct worker *worker, bool *ret_arriving)
 {
-	double since = clock_monotonic() - PATIENCE;
 	struct job *queued = jobs_next(supervise->jobs), *waiting, *chosen;
 	struct job_facts a, b;
 	bool now;
 
-	since = worker->room_since < since ? worker->room_since : since;
-	waiting = jobs_arriving(supervise->jobs, since, &now);
+	waiting = jobs_arriving(supervise->jobs, just_now(worker), &now);
 	chosen = queued != NULL ? queued : waiting;
 	if (queued != NULL && waiting != NULL && now) {
 		job_facts(queued, &a);

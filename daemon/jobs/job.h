@@ -141,8 +141,8 @@ int jobs_promote(struct jobs *jobs, struct error *err);
 struct job *jobs_arriving(struct jobs *jobs, double since, bool *ret_arriving);
 /* ERR_CONFLICT when it does not wait any more, or was cancelled. */
 int job_attend(struct job *job, const char *backend, const char *device, struct error *err);
-/* The worker goes; a job that still waits is where it was before. */
-void job_leave(struct job *job);
+/* The worker goes; a job that still waits is where it was before, or cancelled where that was asked for. */
+int job_leave(struct job *job, struct error *err);
 /*
  * A worker found the job's scan damaged when the scan had lost that much. How many times in a row workers did so,
  * without another loss since. The supervisor's thread only.

@@ -19,7 +19,7 @@ static const struct row {
 } rows[] = {
     /* After the next start, since nothing can be recorded any more. */
     {1 << END_SYNC, 0, 0, {.to = BACK, .distrust = true}},
-    /* The next start carries out a cancel that was asked for. */
+    /* A cancel that was asked for is carried out when this is recorded: job_change_state. */
     {1 << END_STOPPED, 0, 0, {.to = BACK, .from = FROM_RECORDED, .reason = "the daemon stops"}},
     /* A job that a client has cancelled meanwhile succeeds too: the result is there. */
     {1 << END_DONE, 0, CONDITION_UNRECORDED | CONDITION_STALE, {.to = JOB_SUCCEEDED, .reason = ""}},

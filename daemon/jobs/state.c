@@ -219,6 +219,7 @@ static void show_state(struct job *job, const struct job_record *record, const s
 int job_change_state(struct job *job, enum job_state to, const struct job_change *change, struct error *err)
 {
 	static const struct job_change nothing;
+	static const struct job_change asked = {.reason = "as asked"};
 	struct job_record record;
 	bool removed;
 	enum job_state from;
@@ -232,6 +233,14 @@ int job_change_state(struct job *job, enum job_state to, const struct job_change
 	from = job->record.state;
 	removed = job->removed;
 	basis = job->record.basis;
+	/*
+	 * The cancel was asked for after the worker's end had been judged. The job has no worker any more that could
+	 * carry it out, and the next one may be long in coming.
+	 */
+	if (job->record.cancel_asked && (to == JOB_QUEUED || to == JOB_WAITING)) {
+		to = JOB_CANCELLED;
+		change = &asked;
+	}
 	pthread_mutex_unlock(&job->jobs->lock);
 	if (removed || !job_state_may_follow(from, to))
 		return error_set(err, ERR_CONFLICT, "job %s is %s and cannot become %s", job->id,

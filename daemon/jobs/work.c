@@ -140,11 +140,23 @@ int job_attend(struct job *job, const char *backend, const char *device, struct 
 	return code;
 }
 
-void job_leave(struct job *job)
+int job_leave(struct job *job, struct error *err)
 {
+	static const struct job_change asked = {.reason = "as asked"};
 	struct job_record *record = &job->record;
+	bool cancelled;
+	int code = 0;
 
 	pthread_mutex_lock(&job->jobs->change);
+	pthread_mutex_lock(&job->jobs->lock);
+	cancelled = record->state == JOB_WAITING && record->cancel_asked;
+	pthread_mutex_unlock(&job->jobs->lock);
+	if (cancelled)
+		code = job_change_state(job, JOB_CANCELLED, &asked, err);
+	if (code != 0) {
+		pthread_mutex_unlock(&job->jobs->change);
+		return code;
+	}
 	pthread_mutex_lock(&job->jobs->lock);
 	record->attended = false;
 	if (record->state == JOB_WAITING) {
@@ -155,6 +167,7 @@ void job_leave(struct job *job)
 	pthread_mutex_unlock(&job->jobs->lock);
 	pthread_mutex_unlock(&job->jobs->change);
 	job_wake(job);
+	return 0;
 }
 
 int job_doubts(const struct job *job, unsigned losses)

@@ -8,6 +8,7 @@
 #include "daemon/jobs/outcome.h"
 #include "daemon/jobs/spawn.h"
 #include "daemon/jobs/supervise.h"
+#include "daemon/jobs/watchdog.h"
 #include "proto/message.h"
 
 /*
@@ -79,7 +80,7 @@ struct worker {
 	struct stored_scan *arriving;
 	unsigned basis, losses;       /* of the scan when it began */
 	int announced, reconstructed; /* projections that it knows to be there, that it has reconstructed */
-	double attended, again;       /* monotonic: since when; not before, after the catalogue refused */
+	double attended, again;       /* monotonic: watchdog_attended; not before, after the catalogue refused */
 	int failure_code;             /* why the daemon stopped its job; 0: it did not */
 	char failure_text[320];
 	struct ending ending;

@@ -149,7 +149,8 @@ START_TEST(a_waiting_job_is_attended_and_runs_with_its_last_projection)
 	job_record(job, &record);
 	ck_assert(!record.attended && record.reconstructed == 0 && record.attempts == 2 && record.crashes == 1);
 	ck_assert_int_eq(job_attend(job, "cpu", "some", &err), 0);
-	job_leave(job);
+	ck_assert_int_eq(job_leave(job, &err), 0);
+	ck_assert_int_eq(state_of(job), JOB_WAITING);
 	ck_assert_int_eq(job_attend(job, "cpu", "some", &err), 0);
 	state_set(job, JOB_RUNNING, NULL);
 	job_record(job, &record);
@@ -191,27 +192,54 @@ START_TEST(who_arrives_goes_before_who_does_not_then_the_higher_priority)
 }
 END_TEST
 
-START_TEST(a_cancel_of_an_attended_job_waits_for_its_worker_and_survives_a_restart)
+/* A worker was lost over the job, which is about to go back to the queue or to wait when the DELETE comes. */
+START_TEST(a_cancel_that_comes_between_the_end_of_a_worker_and_its_record_is_carried_out)
+{
+	const enum job_state back[] = {JOB_QUEUED, JOB_WAITING};
+	const struct job_change died = {.crashed = true};
+
+	for (int i = 0; i < 2; i++) {
+		struct job *job = state_post(&state, scan, "routine");
+		struct error err = {0};
+		bool removed;
+
+		state_set(job, JOB_RUNNING, NULL);
+		ck_assert_int_eq(jobs_delete(state.jobs, job, &removed, &err), 0);
+		ck_assert_int_eq(state_of(job), JOB_RUNNING);
+		state_set(job, back[i], &died);
+		ck_assert_int_eq(state_of(job), JOB_CANCELLED);
+		ck_assert_ptr_null(jobs_next(state.jobs));
+		job_release(job);
+	}
+}
+END_TEST
+
+START_TEST(a_cancel_of_an_attended_job_waits_for_its_worker_or_a_restart)
 {
 	struct stored_scan *growing = state_scan(&state, 3, false);
-	struct job *job = state_post(&state, growing, "routine");
 	struct error err = {0};
 	char id[ID_SIZE];
 	bool removed;
 
-	keep_id(job, id);
-	stored_scan_release(growing);
-	ck_assert_int_eq(job_attend(job, "cpu", "some", &err), 0);
-	ck_assert_int_eq(jobs_delete(state.jobs, job, &removed, &err), 0);
-	ck_assert(!removed);
-	ck_assert_int_eq(state_of(job), JOB_WAITING);
-	job_leave(job);
-	ck_assert_int_eq(job_attend(job, "cpu", "some", &err), ERR_CONFLICT);
-	job_release(job);
-	restart();
-	job = find(id);
-	ck_assert_int_eq(state_of(job), JOB_CANCELLED);
-	job_release(job);
+	for (int restarts = 0; restarts < 2; restarts++) {
+		struct job *job = state_post(&state, growing, "routine");
+
+		keep_id(job, id);
+		ck_assert_int_eq(job_attend(job, "cpu", "some", &err), 0);
+		ck_assert_int_eq(jobs_delete(state.jobs, job, &removed, &err), 0);
+		ck_assert(!removed);
+		ck_assert_int_eq(state_of(job), JOB_WAITING);
+		if (restarts == 0)
+			ck_assert_int_eq(job_leave(job, &err), 0);
+		job_release(job);
+		if (restarts > 0) {
+			stored_scan_release(growing);
+			restart();
+		}
+		job = find(id);
+		ck_assert_int_eq(state_of(job), JOB_CANCELLED);
+		job_release(job);
+	}
 }
 END_TEST
 
@@ -921,7 +949,8 @@ Suite *job_suite(void)
 	tcase_add_test(tests, a_job_waits_for_its_last_projection);
 	tcase_add_test(tests, a_waiting_job_is_attended_and_runs_with_its_last_projection);
 	tcase_add_test(tests, who_arrives_goes_before_who_does_not_then_the_higher_priority);
-	tcase_add_test(tests, a_cancel_of_an_attended_job_waits_for_its_worker_and_survives_a_restart);
+	tcase_add_test(tests, a_cancel_of_an_attended_job_waits_for_its_worker_or_a_restart);
+	tcase_add_test(tests, a_cancel_that_comes_between_the_end_of_a_worker_and_its_record_is_carried_out);
 	tcase_add_test(tests, a_waiting_job_is_found_again_after_a_restart);
 	tcase_add_test(tests, one_that_yielded_stands_in_front_of_its_class);
 	tcase_add_test(tests, only_a_run_from_the_start_is_an_attempt);
