@@ -7,6 +7,7 @@
 #include "core/error.h"
 #include "core/filter.h"
 #include "core/linearise.h"
+#include "core/pulse.h"
 #include "core/scan/geometry.h"
 #include "core/scan/grid.h"
 #include "core/scan/orbit.h"
@@ -167,9 +168,10 @@ struct cancel {
 	void *context;
 };
 
-/* ERR_CANCELLED when somebody asked; cancel NULL: nobody can. */
+/* Between two steps: counts one, and gives ERR_CANCELLED when somebody asked; cancel NULL: nobody can. */
 static inline int cancel_check(const struct cancel *cancel, struct error *err)
 {
+	pulse_beat();
 	if (cancel != NULL && cancel->asked != NULL && cancel->asked(cancel->context))
 		return error_set(err, ERR_CANCELLED, "cancelled");
 	return 0;

@@ -2,7 +2,8 @@
  * cbct-worker: one process for one device, in the daemon's service.
  *
  * The worker says hello, then takes one job at a time from the socket and runs it in
- * its only thread (the backends bring their own). While a job runs, the socket
+ * its main thread (the backends bring their own); beside it a thread sends signs of
+ * life (proto/heartbeat.h). While a job runs, the socket
  * is looked at whenever the pipeline asks whether to go on, which it does
  * between steps; so cancel and yield need no second thread. A job that begins
  * before its projections are complete hears over the same socket how many are there,
@@ -22,6 +23,7 @@
 
 #include "proto/checkpoint.h"
 #include "proto/clock.h"
+#include "proto/heartbeat.h"
 #include "proto/message.h"
 #include "proto/provenance.h"
 #include "proto/reconstruction.h"
@@ -33,6 +35,13 @@ enum { NICENESS = 5, OOM_SCORE = 500 };
 
 static const double PROGRESS_LEAST = 0.1; /* s between two reports of mere progress */
 enum { LOOK_MS = 250 };                   /* between two looks for SIGTERM while nothing arrives */
+enum { IDLE_MS = 1000 };                  /* between two steps of a worker that waits for a job */
+static const double OPEN_SECONDS = 60;    /* that memory for a job and the device's code for it may take */
+/*
+ * Bytes a second: a step is at most a pass over all memory of a job, by one core. Other steps are blocks of a
+ * projection or of a volume, which take far less.
+ */
+static const double PASS_RATE = 300e6;
 static const double CHANGE_LEAST = 0.005; /* s between two reports of a new stage or iteration */
 
 struct arguments {
@@ -45,8 +54,10 @@ struct worker {
 	int socket;
 	const struct backend *backend;
 	struct device *device;
+	struct heartbeat *heartbeat;
 
 	char job[64]; /* that runs */
+	double step;  /* s that a step of it may take by its nature */
 	bool cancel, yield, quit;
 	struct error trouble; /* why the job was given up here though nobody had asked for it; code 0: it was not */
 	int announced;        /* projections that are there: so many of those that are present, by their numbers */
@@ -121,6 +132,7 @@ static bool obey_next(struct worker *worker, int timeout_ms)
 	struct error err;
 	bool got = false;
 
+	pulse_beat();
 	if (message_receive(worker->socket, timeout_ms, &message, &got, &err) != 0) {
 		if (err.code == ERR_NO_MEMORY)
 			worker->trouble = err;
@@ -210,10 +222,20 @@ static void on_warning(void *context, const char *code, const char *detail)
 	report(context, &message);
 }
 
+static void on_step(void *context, double seconds)
+{
+	struct worker *worker = context;
+
+	heartbeat_step(worker->heartbeat, seconds > worker->step ? seconds : worker->step);
+}
+
 static void on_open(void *context, const struct recon_memory *memory, const char *plan)
 {
 	struct message message = {.kind = MESSAGE_OPENED, .memory = *memory};
+	struct worker *worker = context;
 
+	worker->step = (double)(memory->total + memory->host) / PASS_RATE;
+	heartbeat_step(worker->heartbeat, worker->step);
 	snprintf(message.plan, sizeof(message.plan), "%s", plan);
 	report(context, &message);
 }
@@ -320,7 +342,8 @@ static int run_job(struct worker *worker, const struct message *start, struct er
 						   .on_volume = on_volume,
 						   .on_settled = on_settled,
 						   .on_checkpoint = on_checkpoint,
-						   .on_open = on_open};
+						   .on_open = on_open,
+						   .on_step = on_step};
 	struct reconstruction_options options = {.scan_directory = start->scan_directory,
 						 .checked = true,
 						 .out_directory = start->job_directory,
@@ -367,7 +390,10 @@ static int serve_job(struct worker *worker, const struct message *start)
 	worker->behind = false;
 	working = 1;
 	worker->trouble = (struct error){0};
+	worker->step = 0;
+	heartbeat_step(worker->heartbeat, OPEN_SECONDS);
 	ended.code = run_job(worker, start, &err);
+	heartbeat_step(worker->heartbeat, 0);
 	if (worker->trouble.code != 0) {
 		err = worker->trouble;
 		ended.code = err.code;
@@ -394,8 +420,9 @@ static int serve(struct worker *worker)
 	int status = -1;
 
 	while (status < 0) {
+		pulse_beat();
 		/* The end of the stream is the daemon's end. */
-		if (message_receive(worker->socket, -1, &message, &got, &err) != 0)
+		if (message_receive(worker->socket, IDLE_MS, &message, &got, &err) != 0)
 			return 0;
 		if (!got)
 			continue;
@@ -441,7 +468,8 @@ static int open_device(struct worker *worker, const struct arguments *arguments,
 		return code;
 	worker->backend->describe(worker->device, &hello.info);
 	snprintf(hello.backend, sizeof(hello.backend), "%s", worker->backend->name);
-	return message_send(worker->socket, &hello, err);
+	code = message_send(worker->socket, &hello, err);
+	return code == 0 ? heartbeat_start(worker->socket, &worker->heartbeat, err) : code;
 }
 
 static int usage(void)
@@ -517,6 +545,7 @@ int main(int argc, char **argv)
 	} else {
 		status = serve(&worker);
 	}
+	heartbeat_stop(worker.heartbeat);
 	if (worker.device != NULL)
 		worker.backend->close(worker.device);
 	return status;

@@ -28,7 +28,12 @@ enum message_kind {
 	MESSAGE_YIELD,
 	MESSAGE_QUIT, /* finish or yield what runs, then exit 0 */
 	/* worker -> daemon */
-	MESSAGE_HELLO,         /* backend, device, driver, bytes_total, bytes_free */
+	MESSAGE_HELLO, /* backend, device, driver, bytes_total, bytes_free */
+	/*
+	 * steps: that it has finished since its start, whatever they were of; step_seconds: that the one under way may
+	 * take by its nature, 0: as any other. Every second (proto/heartbeat.h), also without a job.
+	 */
+	MESSAGE_ALIVE,
 	MESSAGE_OPENED,        /* job, memory, plan */
 	MESSAGE_RECONSTRUCTED, /* job, count: projections reconstructed so far */
 	MESSAGE_PROGRESS,      /* job, stage, iteration, fraction */
@@ -58,6 +63,8 @@ struct message {
 	enum stage stage;
 	int iteration;
 	double fraction;
+	size_t steps;
+	double step_seconds;
 	struct history_row row;
 	double noise_hu, alpha;
 	char name[32], volume_stage[16];

@@ -33,6 +33,9 @@ enum {
 	PLACE_BYTES = 64 << 20 /* straight into a file: long enough for a device to overlap its own pieces */
 };
 
+/* A disk that is spun down, or busy with another's writes, is waited for; then it takes so many bytes a second. */
+static const double SLOW_DISK_SECONDS = 60, SLOW_DISK_RATE = 10e6;
+
 struct run {
 	const struct reconstruction_hooks *hooks;
 	const char *directory;
@@ -55,6 +58,16 @@ struct run {
 };
 
 static int settle(struct run *run, bool wait, struct error *err);
+
+/* `volumes` of the iterate's size go to the disk, or come from there, at the rate of a slow one; 0: they are there. */
+static void disk_step(struct run *run, int volumes)
+{
+	const double bytes = run->recon != NULL ? (double)grid_voxels(recon_grid(run->recon)) * sizeof(float) : 0;
+
+	if (run->hooks->on_step != NULL)
+		run->hooks->on_step(run->hooks->recon.context,
+				    volumes > 0 ? SLOW_DISK_SECONDS + volumes * bytes / SLOW_DISK_RATE : 0);
+}
 
 /* Asked so often that a volume is reported settled soon after it is. */
 static bool run_cancelled(void *context)
@@ -92,7 +105,10 @@ static int keep_checkpoint(struct run *run, struct error *err)
 	code = settle(run, false, err);
 	if (code != 0 || (run->saver != NULL && saver_busy(run->saver)))
 		return code;
-	return checkpointer_begin(run->checkpointer, run->recon, err);
+	disk_step(run, 1);
+	code = checkpointer_begin(run->checkpointer, run->recon, err);
+	disk_step(run, 0);
+	return code;
 }
 
 static bool run_yield(void *context)
@@ -312,12 +328,14 @@ static int run_keep(void *context, struct recon *recon, const struct kept_volume
 	bool linked = false;
 	int code = path_join(saved.path, sizeof(saved.path), run->directory, kept->name, ".nii", err);
 
+	disk_step(run, 2);
 	if (code == 0)
 		code = link_volume(run, kept, &saved, &linked, err);
 	if (code == 0 && !linked)
 		code = settle(run, true, err);
 	if (code == 0 && !linked)
 		code = write_volume(run, recon, kept, &saved, err);
+	disk_step(run, 0);
 	if (code == 0 && run->hooks->on_volume != NULL)
 		code = run->hooks->on_volume(run->hooks->recon.context, kept, &saved, err);
 	return code != 0 ? code : settle(run, false, err);
@@ -653,8 +671,11 @@ static int read_views(struct reconstruction *reconstruction, int view, int count
 static int push_some(struct reconstruction *reconstruction, int count, struct error *err)
 {
 	const size_t bytes = scan_projection_bytes(reconstruction->files.scan);
-	int code = read_views(reconstruction, reconstruction->pushed, count, err);
+	int code;
 
+	disk_step(&reconstruction->run, 1);
+	code = read_views(reconstruction, reconstruction->pushed, count, err);
+	disk_step(&reconstruction->run, 0);
 	for (int i = 0; i < count; i++)
 		reconstruction->views[i] = reconstruction->pushed + i;
 	for (int i = 0; i < count && code == 0 && reconstruction->stuck != NULL && !reconstruction->looked; i++)
@@ -726,6 +747,7 @@ int reconstruction_finish(struct reconstruction *reconstruction, struct error *e
 		code = recon_run(reconstruction->recon, err);
 
 	/* Announced volumes are settled, however the run ends. */
+	disk_step(run, 3);
 	if (run->trouble.code == 0)
 		settle(run, true, &run->trouble);
 	/* A checkpoint on its way would take the place of one that is written now. */

@@ -34,6 +34,8 @@ struct reconstruction_hooks {
 	 * made. */
 	int (*on_checkpoint)(void *context, int iteration, struct error *err);
 	void (*on_open)(void *context, const struct recon_memory *memory, const char *plan);
+	/* A step begins that may take so many seconds on a slow disk; 0: it is finished. */
+	void (*on_step)(void *context, double seconds);
 };
 
 /* The scan, the recipe and the place of the results; all of it is borrowed until reconstruction_close. */

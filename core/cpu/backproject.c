@@ -115,6 +115,7 @@ int cpu_backproject(struct plan *plan, const struct stack *from, const int *view
 								   NULL);
 		}
 		tile_add(plan, &tile, sums, to->data);
+		pulse_beat();
 	}
 	return 0;
 }

@@ -385,6 +385,7 @@ int cpu_filter(struct plan *plan, const struct stack *from, const int *slots, co
 
 		filter_rows(engine, views[i], &rows, to->data + (size_t)i * (size_t)plan->wide * (size_t)plan->rows,
 			    engine->buffers + (size_t)cpu_thread() * 2 * PAIRS * engine->stride, extended);
+		pulse_beat();
 	}
 	for (int side = 0; side < 2; side++)
 		plan->extended[side] += extended[side];

@@ -24,6 +24,7 @@ int cpu_project(struct plan *plan, const struct volume *from, const int *views, 
 					       to->data + ((size_t)slot * (size_t)plan->columns + (size_t)column) *
 							      (size_t)plan->rows,
 					       lengths, scratch);
+		pulse_beat();
 	}
 	return 0;
 }

@@ -53,6 +53,7 @@ static void correct(struct plan *plan, const struct volume *volume, const struct
 					       scratch);
 		correct_block(plan, stack_slot(projections, views[slot]) + first, lengths, columns * plan->rows,
 			      projected, plan->ray_sums + 2 * (size_t)job);
+		pulse_beat();
 	}
 	for (int job = 0; job < count * blocks; job++) {
 		sums->residual2 += plan->ray_sums[2 * (size_t)job];
@@ -134,8 +135,10 @@ static int run_subset(struct plan *plan, const struct subset *subset, const stru
 			return code;
 		correct(plan, volume, projections, subset->views + begin, count, sums);
 #pragma omp parallel for num_threads(plan->device->threads) schedule(dynamic)
-		for (int t = 0; t < tiles; t++)
+		for (int t = 0; t < tiles; t++) {
 			update_tile(plan, subset, begin, count, t, volume);
+			pulse_beat();
+		}
 	}
 	return 0;
 }

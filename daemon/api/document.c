@@ -395,6 +395,10 @@ cJSON *worker_document(const struct worker_facts *facts)
 	cJSON_AddNumberToObject(memory, "total", (double)facts->bytes_total);
 	cJSON_AddNumberToObject(memory, "free", (double)facts->bytes_free);
 	add_text_or_null(document, "job", facts->job);
+	if (facts->stepped > 0)
+		cJSON_AddNumberToObject(document, "step_age_s", fmax(clock_monotonic() - facts->stepped, 0));
+	else
+		cJSON_AddNullToObject(document, "step_age_s");
 	cJSON_AddNumberToObject(document, "restarts", facts->restarts);
 	add_text_or_null(document, "last_error", facts->last_error);
 	return document;

@@ -94,6 +94,9 @@ static void begin(struct supervise *supervise, struct worker *worker, struct job
 	worker->announced = worker->reconstructed = 0;
 	worker->again = 0;
 	worker->state = WORKER_BUSY;
+	worker->signs.busy = true;
+	worker->signs.step_seconds = 0;
+	worker->signs.stepped = clock_monotonic();
 	worker->deadline = NEVER;
 	if (message_send(worker->child.socket, message, &err) != 0) {
 		/* Most likely it has just died; its job comes back when that is seen. */

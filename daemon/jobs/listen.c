@@ -53,6 +53,8 @@ static void hello(struct supervise *supervise, struct worker *worker, const stru
 	worker->last_error[0] = '\0';
 	worker->deadline = NEVER;
 	worker->state = WORKER_IDLE;
+	worker->steps = 0;
+	worker->signs = (struct watchdog_signs){.heard = clock_monotonic(), .stepped = clock_monotonic()};
 	log_line(LEVEL_INFO, "worker %d (pid %ld): %s, %s, %zu of %zu MiB free", worker->index, (long)worker->child.pid,
 		 worker->backend, worker->info.name, worker->info.bytes_free >> 20, worker->info.bytes_total >> 20);
 	worker_publish(supervise, worker);
@@ -84,10 +86,20 @@ static void add_rows(struct supervise *supervise, struct worker *worker)
 		stop_job(supervise, worker, &err);
 }
 
+static void alive(struct supervise *supervise, struct worker *worker, const struct message *message)
+{
+	if (message->steps != worker->steps)
+		worker->signs.stepped = worker->signs.heard;
+	worker->steps = message->steps;
+	worker->signs.step_seconds = message->step_seconds;
+	worker_publish(supervise, worker);
+}
+
 static void job_ended(struct supervise *supervise, struct worker *worker, const struct message *message)
 {
 	worker->deadline = NEVER;
 	worker->state = WORKER_IDLE;
+	worker->signs.busy = false;
 	worker_end_job(supervise, worker,
 		       &(struct worker_words){.end = worker_end_of(message->code),
 					      .code = message->code,
@@ -107,6 +119,12 @@ static void on_message(struct supervise *supervise, struct worker *worker, const
 			hello(supervise, worker, message);
 		return;
 	}
+	worker->signs.heard = clock_monotonic();
+	if (message->kind == MESSAGE_ALIVE) {
+		alive(supervise, worker, message);
+		return;
+	}
+	worker->signs.stepped = worker->signs.heard;
 	if (worker->job != NULL)
 		job_facts(worker->job, &facts);
 	if (worker->job == NULL || worker->ending.due || strcmp(facts.id, message->job) != 0)

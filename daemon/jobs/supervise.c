@@ -54,6 +54,7 @@ void worker_publish(struct supervise *supervise, const struct worker *worker)
 	snprintf(facts.last_error, sizeof(facts.last_error), "%s", worker->last_error);
 	facts.bytes_total = worker->info.bytes_total;
 	facts.bytes_free = worker->info.bytes_free;
+	facts.stepped = worker->state == WORKER_IDLE || worker->state == WORKER_BUSY ? worker->signs.stepped : 0;
 	facts.restarts = worker->starts > 0 ? worker->starts - 1 : 0;
 	if (worker->job != NULL) {
 		job_facts(worker->job, &job);
@@ -85,6 +86,7 @@ static void start_worker(struct supervise *supervise, struct worker *worker)
 	} else {
 		worker->state = WORKER_STARTING;
 		worker->born = now;
+		worker->killed[0] = '\0';
 		worker->deadline = now + supervise->options.hello_seconds;
 	}
 	worker_publish(supervise, worker);
@@ -99,6 +101,40 @@ static double restart_delay(unsigned failures)
 	return delay < RESTART_LAST ? delay : RESTART_LAST;
 }
 
+void worker_kill(struct supervise *supervise, struct worker *worker, const char *why)
+{
+	log_line(LEVEL_WARNING, "worker %d %s", worker->index, why);
+	snprintf(worker->killed, sizeof(worker->killed), "%s", why);
+	child_kill(&worker->child);
+	worker->state = WORKER_ENDING;
+	worker->deadline = NEVER;
+	worker_publish(supervise, worker);
+}
+
+/* Once all that is there was read: the daemon may have been held up itself. */
+static void judge_workers(struct supervise *supervise)
+{
+	const double now = clock_monotonic();
+	char why[128];
+
+	for (int i = 0; i < supervise->count; i++) {
+		struct worker *worker = &supervise->workers[i];
+		const struct watchdog_signs *signs = &worker->signs;
+		enum watchdog_verdict verdict;
+
+		if (worker->state != WORKER_IDLE && worker->state != WORKER_BUSY)
+			continue;
+		verdict = watchdog_judge(signs, now);
+		if (verdict == WATCHDOG_SILENT)
+			snprintf(why, sizeof(why), "gave no sign of life for %.1f s and was killed",
+				 now - signs->heard);
+		else if (verdict == WATCHDOG_HUNG)
+			snprintf(why, sizeof(why), "finished no step for %.1f s and was killed", now - signs->stepped);
+		if (verdict != WATCHDOG_ALIVE)
+			worker_kill(supervise, worker, why);
+	}
+}
+
 static void worker_died(struct supervise *supervise, struct worker *worker, bool stopping)
 {
 	char how[128], text[160];
@@ -108,7 +144,10 @@ static void worker_died(struct supervise *supervise, struct worker *worker, bool
 	/* The worker's last messages come first: they may say that the job is done. */
 	worker_read(supervise, worker, true, &gone);
 	child_reap(&worker->child, how, sizeof(how));
-	snprintf(text, sizeof(text), "its worker ended with %s", how);
+	if (worker->killed[0] != '\0')
+		snprintf(text, sizeof(text), "its worker %s", worker->killed);
+	else
+		snprintf(text, sizeof(text), "its worker ended with %s", how);
 	worker->state = WORKER_ABSENT;
 	worker->deadline = NEVER;
 	if (worker->job != NULL && !worker->ending.due)
@@ -118,7 +157,8 @@ static void worker_died(struct supervise *supervise, struct worker *worker, bool
 	if (!stopping) {
 		worker->failures = now - worker->born > STEADY ? 1 : worker->failures + 1;
 		worker->start_at = now + restart_delay(worker->failures);
-		snprintf(worker->last_error, sizeof(worker->last_error), "%s", how);
+		snprintf(worker->last_error, sizeof(worker->last_error), "%s",
+			 worker->killed[0] != '\0' ? worker->killed : how);
 		log_line(LEVEL_WARNING, "worker %d ended with %s, the next one starts in %.1f s", worker->index, how,
 			 worker->start_at - now);
 	}
@@ -158,13 +198,10 @@ static void look_at_clock(struct supervise *supervise, bool stopping)
 		if (worker->state != WORKER_ENDING && worker->deadline > supervise->stop_by)
 			worker->deadline = supervise->stop_by;
 		if (worker->state != WORKER_ABSENT && now >= worker->deadline) {
-			log_line(LEVEL_WARNING, "worker %d does not %s: killed", worker->index,
-				 worker->state == WORKER_STARTING ? "start"
-				 : worker->cancelling             ? "cancel"
-								  : "end");
-			child_kill(&worker->child);
-			worker->state = WORKER_ENDING;
-			worker->deadline = NEVER;
+			worker_kill(supervise, worker,
+				    worker->state == WORKER_STARTING ? "did not start in time and was killed"
+				    : worker->cancelling             ? "did not cancel in time and was killed"
+								     : "did not end in time and was killed");
 		}
 	}
 }
@@ -188,6 +225,9 @@ static int poll_timeout(const struct supervise *supervise, bool stopping)
 			next = worker->start_at;
 		if (worker->state != WORKER_ABSENT && worker->deadline < next)
 			next = worker->deadline;
+		if ((worker->state == WORKER_IDLE || worker->state == WORKER_BUSY) &&
+		    watchdog_due(&worker->signs) < next)
+			next = watchdog_due(&worker->signs);
 	}
 	if (!stopping && supervise->dispatch_at > 0 && supervise->dispatch_at < next)
 		next = supervise->dispatch_at;
@@ -281,6 +321,7 @@ static void wait_and_read(struct supervise *supervise, bool stopping)
 	if (fds[2 * count].revents != 0 && read(supervise->wake, &ignored, sizeof(ignored)) < 0)
 		log_line(LEVEL_DEBUG, "eventfd: %s", strerror(errno));
 	read_workers(supervise, fds, stopping);
+	judge_workers(supervise);
 }
 
 static void quit_workers(struct supervise *supervise)
@@ -360,7 +401,7 @@ static void set_options(struct supervise *supervise, const struct supervise_opti
 	if (options->hello_seconds <= 0)
 		supervise->options.hello_seconds = 30;
 	if (options->cancel_seconds <= 0)
-		supervise->options.cancel_seconds = 10;
+		supervise->options.cancel_seconds = 1.5;
 	if (options->checkpoint_seconds <= 0)
 		supervise->options.checkpoint_seconds = 5;
 	if (options->stop_seconds <= 0)

@@ -20,6 +20,9 @@
  * Uploads never wait for any of this: they wake the thread, and one message at a
  * time is under way.
  *
+ * A worker that is stopped or hangs is killed and another one started: watchdog.h
+ * says after which time.
+ *
  * Threads: any for everything below; supervise_start and supervise_stop once each.
  */
 struct supervise;
@@ -33,7 +36,7 @@ struct supervise_options {
 	size_t device_memory;      /* bytes a worker may use; 0 = what is free */
 	double checkpoint_seconds; /* of work between two checkpoints of a job; 0 = 5 */
 	double hello_seconds;      /* until a new worker must have spoken; 0 = 30 */
-	double cancel_seconds;     /* until a worker that does not cancel is killed; 0 = 10 */
+	double cancel_seconds;     /* until a worker that does not cancel is killed; 0 = 1.5 */
 	double stop_seconds;       /* until a worker that does not leave its job at the stop is killed; 0 = 20 */
 };
 
@@ -64,6 +67,7 @@ struct worker_facts {
 	char backend[16], device[96], driver[64];
 	size_t bytes_total, bytes_free;
 	char job[ID_SIZE];    /* "" when there is none */
+	double stepped;       /* monotonic: when it was last seen to have finished a step; 0: it does not work */
 	unsigned restarts;    /* since the daemon's start */
 	char last_error[160]; /* why the last one ended, "" */
 };

@@ -65,6 +65,9 @@ struct worker {
 	char backend[16];
 	struct device_info info; /* of the last hello */
 	char last_error[160];
+	struct watchdog_signs signs;
+	size_t steps;     /* that it has finished by its last sign of life */
+	char killed[128]; /* why the daemon ended the process: it ...; "" as long as it has not */
 
 	struct job *job; /* reference; NULL: none */
 	struct queue_running running;
@@ -111,6 +114,8 @@ struct supervise {
 /* ---- supervise.c ---- */
 /* Ends the sleep of the loop. Any thread. */
 void supervise_wake(void *supervise);
+/* Ends the process at once; `why` goes on after "it". */
+void worker_kill(struct supervise *supervise, struct worker *worker, const char *why);
 /* Shows other threads the worker as it is now. */
 void worker_publish(struct supervise *supervise, const struct worker *worker);
 

@@ -1,7 +1,8 @@
 /*
  * What a volume waits for held up, so that tests can look at it meanwhile, and the catalogue made to refuse: linked
  * with --wrap=fdatasync, a worker whose syncs do not return while the file that
- * CBCT_TEST_HOLD names is there; with --wrap=job_digest_volume, a daemon whose
+ * CBCT_TEST_HOLD names is there; with --wrap=recon_push, a worker that takes no projection while that of
+ * CBCT_TEST_HANG is; with --wrap=job_digest_volume, a daemon whose
  * digests do not come while that of CBCT_TEST_HOLD_DIGEST is; and with the calls
  * of the store below, a daemon that cannot record what the file of
  * CBCT_TEST_REFUSE names: "running", "digest" or "volume NAME".
@@ -17,6 +18,9 @@
 /* Weak: a program has one of them. */
 int __real_fdatasync(int file) __attribute__((weak));
 int __wrap_fdatasync(int file);
+int __real_recon_push(struct recon *recon, const void *samples, const int *views, int count, struct error *err)
+    __attribute__((weak));
+int __wrap_recon_push(struct recon *recon, const void *samples, const int *views, int count, struct error *err);
 int __real_job_digest_volume(struct job *job, const struct volume_record *volume, struct error *err)
     __attribute__((weak));
 int __wrap_job_digest_volume(struct job *job, const struct volume_record *volume, struct error *err);
@@ -47,6 +51,12 @@ int __wrap_fdatasync(int file)
 {
 	hold("CBCT_TEST_HOLD");
 	return __real_fdatasync(file);
+}
+
+int __wrap_recon_push(struct recon *recon, const void *samples, const int *views, int count, struct error *err)
+{
+	hold("CBCT_TEST_HANG");
+	return __real_recon_push(recon, samples, views, count, err);
 }
 
 int __wrap_job_digest_volume(struct job *job, const struct volume_record *volume, struct error *err)
