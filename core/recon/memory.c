@@ -2,6 +2,7 @@
  * The plan of a reconstruction, and all that the job holds beside it, measured and allocated by one walk: the memory
  * that a job takes is known before the start.
  */
+#include <assert.h>
 #include <string.h>
 
 #include "core/recon/algorithm.h"
@@ -117,6 +118,7 @@ static int walk_beside(struct recon *recon, struct walk *walk, struct error *err
 	const int slots = corrections_slots(recipe, &recon->input.linearise, geometry);
 	int code = recipe->fdk.on ? walk_fdk(recon, walk, err) : 0;
 
+	assert(algorithm == NULL || (algorithm->volumes <= ALGORITHM_HOLDS && algorithm->stacks <= ALGORITHM_HOLDS));
 	if (code == 0 && keeps_projections(recipe) && !has_subsets(recipe))
 		code = walk_volume(walk, &recipe->grid, &recon->before, err);
 	if (code == 0 && slots > 0)
