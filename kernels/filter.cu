@@ -26,7 +26,7 @@
 #include <cufft.h>
 #include <vector>
 
-#include "core/truncation.h"
+#include "core/truncation_bone.h"
 #include "kernels/fft.cuh"
 #include "kernels/internal.cuh"
 
@@ -290,16 +290,15 @@ struct shell_search_shared {
 	double residual[SHELL_OUTLINES], square;
 	float bins[SHELL_BINS], ellipse;
 	struct shell_place place;
+	struct truncation_end ends[2];
 	int columns[EDGE_THREADS];
 };
 static_assert(EDGE_THREADS == (int)SHELL_BINS, "a thread has one bin");
 
-/* core/truncation.h's search, a candidate a thread; thread 0 has the result. */
-static __device__ struct shell find_shell(const struct shell_table *table, const float *p, int columns, float level,
-					  int sides, shell_search_shared *s, int *ret_width)
+/* Both ends of the row's object to s->ends, by a thread of either warp. */
+static __device__ void find_ends(const float *p, int columns, float level, int sides, shell_search_shared *s)
 {
 	int t = threadIdx.x, first = columns - 1, behind = columns - 1;
-	struct shell shell = {};
 
 	for (int c = t; c < columns; c += EDGE_THREADS)
 		if (p[c] >= level) {
@@ -308,8 +307,24 @@ static __device__ struct shell find_shell(const struct shell_table *table, const
 		}
 	first = sides & 1 ? 0 : least_of_block(first, s->columns);
 	behind = sides & 2 ? 0 : least_of_block(behind, s->columns);
-	int width = max(columns - behind - first, 1);
-	s->bins[t] = shell_bin(p, 1, first, width, t);
+	int count = max(columns - behind - first, 1);
+	if (t == 0)
+		s->ends[0] = truncation_end_of(p + first, 1, count, columns);
+	if (t == EDGE_THREADS / 2)
+		s->ends[1] = truncation_end_of(p + first + count - 1, -1, count, columns);
+	__syncthreads();
+}
+
+/*
+ * core/truncation_bone.h's search between the cusps of s->ends, a candidate a thread; thread 0 has the result. width:
+ * of what lies between them, columns.
+ */
+static __device__ struct shell find_shell(const struct shell_table *table, int width, shell_search_shared *s)
+{
+	int t = threadIdx.x;
+	struct shell shell = {};
+
+	s->bins[t] = shell_bin(s->ends[0].p + s->ends[0].cap, 1, 0, width, t);
 	__syncthreads();
 	if (t == 0) {
 		s->square = shell_square(s->bins);
@@ -317,7 +332,6 @@ static __device__ struct shell find_shell(const struct shell_table *table, const
 		s->place = {};
 	}
 	__syncthreads();
-	*ret_width = width;
 	if (!shell_is_tried(s->ellipse))
 		return shell;
 	for (int step = 0; step < SHELL_STEPS; step++) {
@@ -337,7 +351,8 @@ static __device__ struct shell find_shell(const struct shell_table *table, const
 		__syncthreads();
 	}
 	if (t == 0)
-		shell = shell_make(table, s->bins, s->square, s->ellipse, s->place);
+		shell =
+		    shell_make(table, s->bins, s->square, s->ellipse, shell_noise(s->ends, s->square, width), s->place);
 	return shell;
 }
 
@@ -393,16 +408,19 @@ static __global__ void __launch_bounds__(EDGE_THREADS)
 	row_sums.y = sum_block(own.y, shared);
 	row_sums.xy = sum_block(own.xy, shared);
 	row_sums.x2y = sum_block(own.x2y, shared);
-	int width;
-	struct shell shell = find_shell(found.shells, p, columns, level, sides, &search, &width);
+	find_ends(p, columns, level, sides, &search);
+	int width = search.ends[0].count - search.ends[0].cap - search.ends[1].cap;
+	struct shell shell = find_shell(found.shells, width, &search);
 	for (int side = 0; side < 2; side++) {
 		struct truncation_edge_sums edge_sums;
 		double y = 0, xy = 0, measured = 0;
+		const int cap = search.ends[side].cap;
 
 		for (int i = threadIdx.x; i < window; i += EDGE_THREADS) {
 			double sample = (double)p[side == 0 ? i : columns - 1 - i], value = fmax(sample, 0.0);
 
-			measured += sample;
+			if (sides >> side & 1)
+				measured += (double)p[side == 0 ? i + cap : columns - 1 - i - cap];
 			y += value * value;
 			xy -= i * value * value;
 		}
@@ -411,10 +429,12 @@ static __global__ void __launch_bounds__(EDGE_THREADS)
 		measured = sum_block(measured, shared);
 		if (threadIdx.x > 0 || !(sides >> side & 1))
 			continue;
-		found.fit[at][side] =
-		    truncation_fit(columns, job.extend, &row_sums, &edge_sums, near_side(p, columns, side));
+		struct extension *fit = &found.fit[at][side];
+
+		*fit = truncation_fit(columns, job.extend, &row_sums, &edge_sums);
 		if (shell.share > 0)
-			truncation_by_shell(&found.fit[at][side], &shell, side, width, (float)measured, columns);
+			truncation_by_shell(fit, &shell, side, cap, width, (float)measured, columns);
+		truncation_by_cap(fit, &search.ends[side]);
 	}
 }
 

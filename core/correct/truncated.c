@@ -19,8 +19,12 @@ void truncated_warn(const struct correction_job *job, const size_t rows[2], int 
 {
 	/* Share of rows below which noise may have done it: by chance it does 1.7 % with 100 photons in air. */
 	const double few = 0.02;
-	/* The largest errors in the middle and at the rim of any object of tests/bench/results/truncation.txt. */
-	const double middle = 35, rim = 110;
+	/*
+	 * The largest errors of any object of tests/bench/results/truncation.txt with 1e4 photons or more, in the
+	 * inner 60 % of the field of view and at its rim, between which they grow.
+	 */
+	const double inner = 45, rim = 90, inner_share = 0.6;
+	const double radius = job->orbit->field_of_view / 2;
 	const char *const row = row_of(job->input->turned), *const column = row_of(!job->input->turned);
 	const double all = (double)job->geometry->count * job->geometry->rows;
 	/* Rows whose ends the tube alone keeps from 0 are extended as well, which does no harm, and are none cut off.
@@ -35,10 +39,10 @@ void truncated_warn(const struct correction_job *job, const size_t rows[2], int 
 	warning_tell(
 	    job->warnings, "truncated",
 	    "the object reaches beyond the detector: %.3g %% of the %ss are cut off at the first %s and %.3g %% "
-	    "at the last; FDK extended them by up to %d %ss. All of the field of view is uncertain by that, by up to "
-	    "%.0f HU in its middle and %.0f HU at its rim",
-	    100 * first / all, row, column, 100 * last / all, extend, column, fmax(5, share * middle),
-	    fmax(10, share * rim));
+	    "at the last; FDK extended them by up to %d %ss. All of the field of view is uncertain by that: by up to "
+	    "%.0f HU within %.0f mm of its axis, and from there outwards by more, up to %.0f HU at its rim, at %.0f mm",
+	    100 * first / all, row, column, 100 * last / all, extend, column, fmax(5, share * inner),
+	    inner_share * radius, fmax(10, share * rim), radius);
 }
 
 static bool wanted(const struct recipe *recipe, const struct linearise *linearise)

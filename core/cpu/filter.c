@@ -6,7 +6,7 @@
  * as input and output differ and the length has the factors 2, 3 and 5 only.
  */
 #include "core/cpu/cpu.h"
-#include "core/truncation.h"
+#include "core/truncation_bone.h"
 
 #include <kissfft/kiss_fft.h>
 #include <stdlib.h>
@@ -29,7 +29,7 @@ struct filter_engine {
 	int pad, wide;                   /* zero columns before column 0; columns of a filtered row */
 	int extend;                      /* columns that truncated rows get on either side */
 	bool sides[2];                   /* that may be extended */
-	struct shell_table shells;       /* of core/truncation.h */
+	struct shell_table shells;       /* of core/truncation_bone.h */
 	float *levels;                   /* [view] truncation_level, or NULL without extend */
 	struct transform plain, extended;
 	kiss_fft_cpx *buffers; /* [threads][2][PAIRS][stride] */
@@ -167,46 +167,64 @@ static bool find_truncated(const struct filter_engine *engine, const struct rows
 	return any;
 }
 
-/* The shell around the object of row r of a group, where it is cut off; share 0 where there is none. */
-static struct shell find_shell(const struct filter_engine *engine, const struct rows *rows, int r,
-			       const struct extensions *extensions, int *ret_width)
+/* Both ends of the object of row r of a group. */
+static void find_ends(const struct rows *rows, int r, const struct extensions *extensions, struct truncation_end ret[2])
 {
 	const float *p = at_edge(rows, 0, 0) + r;
 	const ptrdiff_t step = rows->rows;
-	int first = 0, last = rows->columns - 1;
-	float bins[SHELL_BINS], ellipse;
-	double square;
+	int first = 0, last = rows->columns - 1, count;
 
 	while (!extensions->truncated[0][r] && first < last && p[first * step] < rows->level)
 		first++;
 	while (!extensions->truncated[1][r] && last > first && p[last * step] < rows->level)
 		last--;
-	*ret_width = last - first + 1;
+	count = last - first + 1;
+	ret[0] = truncation_end_of(p + first * step, step, count, rows->columns);
+	ret[1] = truncation_end_of(p + last * step, -step, count, rows->columns);
+}
+
+/* The shell around the object between the cusps of both ends; share 0 where there is none. width: of that, columns. */
+static struct shell find_shell(const struct filter_engine *engine, const struct truncation_end ends[2], int width)
+{
+	const float *p = ends[0].p + ends[0].cap * ends[0].step;
+	float bins[SHELL_BINS], ellipse;
+	double square;
+
 	for (int bin = 0; bin < SHELL_BINS; bin++)
-		bins[bin] = shell_bin(p, step, first, *ret_width, bin);
+		bins[bin] = shell_bin(p, ends[0].step, 0, width, bin);
 	square = shell_square(bins);
 	ellipse = shell_ellipse_error(bins, square);
 	if (!shell_is_tried(ellipse))
 		return (struct shell){.share = 0};
-	return shell_make(&engine->shells, bins, square, ellipse, shell_search(&engine->shells, bins, square));
+	return shell_make(&engine->shells, bins, square, ellipse, shell_noise(ends, square, width),
+			  shell_search(&engine->shells, bins, square));
 }
 
-static void fit_shells(const struct filter_engine *engine, const struct rows *rows, struct extensions *ret)
+/* Shells and caps of the rows that are cut off. */
+static void fit_bone(const struct filter_engine *engine, const struct rows *rows, struct extensions *ret)
 {
 	for (int r = 0; r < rows->count; r++) {
+		struct truncation_end ends[2];
 		struct shell shell;
 		int width;
 
 		if (!ret->truncated[0][r] && !ret->truncated[1][r])
 			continue;
-		shell = find_shell(engine, rows, r, ret, &width);
-		for (int side = 0; side < 2 && shell.share > 0; side++) {
+		find_ends(rows, r, ret, ends);
+		width = ends[0].count - ends[0].cap - ends[1].cap;
+		shell = find_shell(engine, ends, width);
+		for (int side = 0; side < 2; side++) {
+			const struct truncation_end *end = &ends[side];
 			float measured = 0;
 
+			if (!ret->truncated[side][r])
+				continue;
 			for (int i = 0; i < truncation_window(rows->columns); i++)
-				measured += at_edge(rows, side, i)[r];
-			if (ret->truncated[side][r])
-				truncation_by_shell(&ret->edge[side][r], &shell, side, width, measured, rows->columns);
+				measured += end->p[(end->cap + i) * end->step];
+			if (shell.share > 0)
+				truncation_by_shell(&ret->edge[side][r], &shell, side, end->cap, width, measured,
+						    rows->columns);
+			truncation_by_cap(&ret->edge[side][r], end);
 		}
 	}
 }
@@ -238,10 +256,7 @@ static void fit_extensions(const struct filter_engine *engine, const struct rows
 		}
 		for (int r = 0; r < rows->count; r++)
 			if (ret->truncated[side][r])
-				ret->edge[side][r] = truncation_fit(
-				    rows->columns, engine->extend, &sums[r], &edges[r],
-				    truncation_near(at_edge(rows, side, 0) + r, side == 0 ? rows->rows : -rows->rows,
-						    rows->columns));
+				ret->edge[side][r] = truncation_fit(rows->columns, engine->extend, &sums[r], &edges[r]);
 	}
 }
 
@@ -313,7 +328,7 @@ static void filter_rows(const struct filter_engine *engine, int view, const stru
 	}
 	if (transform == &engine->extended) {
 		fit_extensions(engine, rows, &extensions);
-		fit_shells(engine, rows, &extensions);
+		fit_bone(engine, rows, &extensions);
 		for (int side = 0; side < 2; side++) {
 			if (engine->sides[side])
 				write_extension(engine, view, rows, side, &extensions, in);

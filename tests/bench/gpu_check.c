@@ -562,12 +562,12 @@ static void check_counts(struct device *devices[2], bool corrected)
 	scene_clear(&scene);
 }
 
-/* A brain in its skull, which the detector cuts off on both sides in most views. */
-static void make_skull(struct phantom *ret)
+/* A brain in a skull of 5 mm of bone, which the detector cuts off on both sides in most views. */
+static void make_skull(double width, double depth, struct phantom *ret)
 {
 	const struct ellipsoid parts[] = {
-	    {.shape = SHAPE_CYLINDER, .semi_axes = {45, 52, 200}, .density = .048},
-	    {.shape = SHAPE_CYLINDER, .semi_axes = {40, 47, 200}, .density = -.028},
+	    {.shape = SHAPE_CYLINDER, .semi_axes = {width, depth, 200}, .density = .048},
+	    {.shape = SHAPE_CYLINDER, .semi_axes = {width - 5, depth - 5, 200}, .density = -.028},
 	};
 
 	ret->count = 2;
@@ -575,8 +575,12 @@ static void make_skull(struct phantom *ret)
 	memcpy(ret->parts, parts, sizeof(parts));
 }
 
-/* An object that the detector cuts off: the same rows are extended, alike, on both sides; pieces of a batch as well. */
-static void check_extension(struct device *devices[2], int columns, int rows_each, double high, bool skull)
+/*
+ * An object that the detector cuts off: the same rows are extended, alike, on both sides; pieces of a batch as well.
+ * skull: its half axes in mm, 0: a ball.
+ */
+static void check_extension(struct device *devices[2], int columns, int rows_each, double high, double skull,
+			    double depth)
 {
 	const struct scene_options at = {.columns = columns,
 					 .rows = rows_each,
@@ -596,12 +600,12 @@ static void check_extension(struct device *devices[2], int columns, int rows_eac
 	struct scene scene;
 	struct error err = {0};
 
-	scene_make(&scene, skull ? "extended rows of a skull" : "extended rows", &at);
-	if (skull)
-		make_skull(&ball);
+	scene_make(&scene, skull > 0 ? "extended rows of a skull" : "extended rows", &at);
+	if (skull > 0)
+		make_skull(skull, depth, &ball);
 	else
 		must(phantom_named(&ball, "ball", 45, .02, &err), &err, "ball");
-	if (!skull)
+	if (!(skull > 0))
 		phantom_move(&ball, (const double[]){9, -6, 3});
 	for (int i = 0; i < at.views; i++)
 		phantom_project(&ball, &scene.geometry, i, raw + pixels * (size_t)i);
@@ -1668,8 +1672,9 @@ static void check_briefly(struct device *devices[2])
 				scene_clear(&scene);
 			}
 	check_counts(devices, true);
-	check_extension(devices, 211, 97, 116, false);
-	check_extension(devices, 211, 97, 116, true);
+	check_extension(devices, 211, 97, 116, 0, 0);
+	check_extension(devices, 211, 97, 116, 45, 52);
+	check_extension(devices, 211, 97, 116, 37.5, 39); /* cut within the bone */
 }
 
 /*
@@ -1741,9 +1746,11 @@ int main(int argc, char **argv)
 	}
 	check_counts(devices, false);
 	check_counts(devices, true);
-	check_extension(devices, 211, 97, 116, false);
-	check_extension(devices, 211, 97, 116, true);
-	check_extension(devices, 64, 601, 40, false); /* more rows than a launch has blocks below each other */
+	check_extension(devices, 211, 97, 116, 0, 0);
+	check_extension(devices, 211, 97, 116, 45, 52);
+	check_extension(devices, 211, 97, 116, 37.5, 39); /* cut within the bone */
+	check_extension(devices, 520, 33, 40, 37.5, 39);
+	check_extension(devices, 64, 601, 40, 0, 0); /* more rows than a launch has blocks below each other */
 	check_transfers(devices[1]);
 	check_memory(devices[1]);
 	check_limit();

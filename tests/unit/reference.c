@@ -250,7 +250,7 @@ static void truncation_row(const float *row, int columns, int extend, bool behin
 {
 	const int window = columns / 16 > 4 ? columns / 16 : 4;
 	double *x = calloc((size_t)columns, sizeof(double)), *y = calloc((size_t)columns, sizeof(double));
-	double mean = 0, mean_x = 0, c, a, b = 0, xx = 0, xy = 0, first = 0, near, next;
+	double mean = 0, mean_x = 0, c, a, b = 0, xx = 0, xy = 0, first = 0;
 	int count = 0;
 
 	for (int i = 0; i < columns; i++) {
@@ -279,16 +279,6 @@ static void truncation_row(const float *row, int columns, int extend, bool behin
 	}
 	b = fmin(0, xy / xx);
 	a = mean - b * mean_x;
-	/* Where the row falls steeply at its edge, the parabola with that curvature through the outermost columns. */
-	near = side_mean(row, columns, behind, 0);
-	next = side_mean(row, columns, behind, 1);
-	if (next > near) {
-		const int k = columns / 64 > 4 ? columns / 256 : 1;
-		const double weight = fmin(fmax(2 - near / (4 * (next - near)), 0), 1), x0 = -(k - 1) / 2.0;
-
-		b += weight * (fmin((near * near - next * next) / k + c * k, b) - b);
-		a += weight * (near * near - b * x0 - c * x0 * x0 - a);
-	}
 	a = fmax(0, a);
 	for (int i = 1; i <= extend; i++)
 		ret[i - 1] = sqrt(fmax(0, a + b * i + c * i * i));
@@ -332,8 +322,88 @@ static double ramp_between(double value, double none, double all)
 	return fmin(fmax((value - none) / (all - none), 0), 1);
 }
 
-/* The outlines that fit best, of 14 on either side; their share. */
-static double find_shell(const double *p, int bins, double o[2], double ret[2])
+/* An end of a row's object: the noise of its samples, and the cap beyond its cusp. */
+struct row_end {
+	int outermost; /* column */
+	double deviation, peak, drop;
+	int cap;
+	double a, b, share; /* of the line through p^2 of the cap */
+};
+
+/* Sample i from an end. */
+static double sample_of(const float *row, const struct row_end *end, bool behind, int i)
+{
+	return (double)row[behind ? end->outermost - i : end->outermost + i];
+}
+
+static double noise_of(const float *row, const struct row_end *end, bool behind, int from, int window)
+{
+	double square = 0;
+
+	for (int i = from + 1; i < from + window - 1; i++)
+		square += pow(sample_of(row, end, behind, i - 1) - 2 * sample_of(row, end, behind, i) +
+				  sample_of(row, end, behind, i + 1),
+			      2) /
+			  6 / (window - 2);
+	return sqrt(square);
+}
+
+static void find_cap(const float *row, int columns, int count, bool behind, struct row_end *end)
+{
+	const int window = columns / 16 > 8 ? columns / 16 : 8, mean = columns < 256 ? 1 : columns / 128;
+	const int reach = columns / 6 < count / 4 - mean ? columns / 6 : count / 4 - mean;
+	double *means = calloc((size_t)columns, sizeof(double)), noise, deepest = INFINITY;
+	int peak = 0, found = -1;
+
+	if (count < 2 * window)
+		goto out;
+	end->deviation = fmin(noise_of(row, end, behind, 0, window), noise_of(row, end, behind, window, window));
+	noise = 3 * end->deviation / sqrt(mean);
+	for (int i = 0; i <= reach; i++)
+		for (int k = 0; k < mean; k++)
+			means[i] += sample_of(row, end, behind, i + k) / mean;
+	for (int i = 0; i <= reach && found < 0; i++) {
+		if (means[i] > means[peak])
+			peak = i;
+		if (means[i] < 0.98 * means[peak] - noise)
+			found = i;
+	}
+	if (found < 0 || peak == 0)
+		goto out;
+	for (int i = found; i <= reach && (i == found || i <= 2 * (peak + mean)); i++)
+		deepest = fmin(deepest, means[i]);
+	end->cap = peak + mean / 2;
+	end->peak = means[peak];
+	end->drop = (means[peak] - noise - deepest) / means[peak];
+out:
+	free(means);
+}
+
+/* The line through p^2 of the cap; none where that does not end near. */
+static void fit_cap(const float *row, int columns, bool behind, struct row_end *end)
+{
+	const int n = end->cap > 2 ? end->cap : 2;
+	double mean = 0, mean_x = -(n - 1) / 2.0, xx = 0, xy = 0;
+
+	for (int i = 0; i < n; i++)
+		mean += pow(fmax(0, sample_of(row, end, behind, i)), 2) / n;
+	for (int i = 0; i < n; i++) {
+		xx += pow(-i - mean_x, 2);
+		xy += (-i - mean_x) * (pow(fmax(0, sample_of(row, end, behind, i)), 2) - mean);
+	}
+	end->b = xy / xx;
+	end->a = mean - end->b * mean_x;
+	if (end->b < 0)
+		end->share =
+		    ramp_between(end->drop, 0.02, 0.05) * (1 - ramp_between(end->a / -end->b / columns, 0.06, 0.12));
+	if (end->share > 0)
+		end->share *= 1 - ramp_between(2 * end->peak * end->deviation / sqrt(xx) / -end->b, 0.3, 0.6);
+	else
+		end->cap = 0;
+}
+
+/* The outlines that fit best, of 14 on either side; their share. noise: mean square of it in a bin. */
+static double find_shell(const double *p, int bins, double noise, double o[2], double ret[2])
 {
 	double squares[64], x[64], square = 0, ellipse = 0, fitted, outlines[14], a = 0, b = 0, c, x2 = 0, errors[3];
 	int at[2] = {0, 0};
@@ -388,53 +458,62 @@ static double find_shell(const double *p, int bins, double o[2], double ret[2])
 			    fmin(fmax((errors[0] - errors[2]) / 2 / (errors[0] - 2 * errors[1] + errors[2]), -1), 1);
 		o[side] = outlines[at[side]] * pow(1 / 0.015, shift / 13);
 	}
-	fitted = sqrt(fit_shell(p, bins, o, ret) / square);
+	fitted = sqrt(fmax(0, fit_shell(p, bins, o, ret) / square - noise * bins / square));
+	ellipse = sqrt(fmax(0, ellipse * ellipse - noise * bins / square));
 	return ramp_between(ellipse, 0.0015, 0.003) * ramp_between(ellipse, 1.1 * fitted, 1.3 * fitted) *
 	       (1 - ramp_between(fitted, 0.02, 0.035)) * ramp_between(ret[1] / (ret[1] + ret[0] / 4), 0.05, 0.1) *
 	       (1 - ramp_between(ret[1] / (ret[1] + ret[0] / 4), 0.3, 0.4)) *
 	       (1 - ramp_between(fmax(o[0], o[1]), 0.2, 0.35));
 }
 
-/* The extension of one side moved towards that of a body in a shell, where that is what the row shows. */
-static void truncation_by_shell_of_row(const float *row, int columns, int extend, bool behind, const bool cut[2],
-				       double not_air, double *ret)
+/* The extension of one side moved towards that of a body in a shell and of the bone's cap, where that is what the row
+ * shows. */
+static void extend_by_bone(const float *row, int columns, int extend, bool behind, const bool cut[2], double not_air,
+			   double *ret)
 {
 	enum { BINS = 64 };
 	const int window = columns / 16 > 4 ? columns / 16 : 4;
-	double p[BINS] = {0}, o[2], fit[2], share, measured = 0, explained = 0, width, half, outline;
-	int first = 0, last = columns - 1;
+	double p[BINS] = {0}, o[2] = {0}, fit[2], share, noise, measured = 0, explained = 0, half, outline;
+	struct row_end ends[2] = {{.outermost = 0}, {.outermost = columns - 1}};
+	int width;
 
-	while (!cut[0] && first < last && (double)row[first] < not_air)
-		first++;
-	while (!cut[1] && last > first && (double)row[last] < not_air)
-		last--;
-	width = last - first + 1;
+	while (!cut[0] && ends[0].outermost < columns - 1 && (double)row[ends[0].outermost] < not_air)
+		ends[0].outermost++;
+	while (!cut[1] && ends[1].outermost > ends[0].outermost && (double)row[ends[1].outermost] < not_air)
+		ends[1].outermost--;
+	width = ends[1].outermost - ends[0].outermost + 1;
+	for (int side = 0, count = width; side < 2; side++) {
+		find_cap(row, columns, count, side == 1, &ends[side]);
+		if (ends[side].cap > 0)
+			fit_cap(row, columns, side == 1, &ends[side]);
+		width -= ends[side].cap;
+	}
 	for (int k = 0; k < BINS; k++) {
-		const int from = first + (last - first + 1) * k / BINS,
-			  to = first + (last - first + 1) * (k + 1) / BINS;
+		const int from = ends[0].outermost + ends[0].cap + width * k / BINS,
+			  to = ends[0].outermost + ends[0].cap + width * (k + 1) / BINS;
 
 		for (int c = from; c < to || c == from; c++)
 			p[k] += (double)row[c] / (to > from ? to - from : 1);
 	}
-	share = find_shell(p, BINS, o, fit);
-	if (!(share > 0))
-		return;
+	noise = (pow(ends[0].deviation, 2) + pow(ends[1].deviation, 2)) / 2 / fmax(1, (double)width / BINS);
+	share = find_shell(p, BINS, noise, o, fit);
 	half = (1 + o[0] + o[1]) / 2 * width;
-	outline = o[behind] * width;
-	for (int i = 0; i < window; i++) {
+	outline = o[behind] * width - ends[behind].cap;
+	for (int i = ends[behind].cap; i < ends[behind].cap + window && share > 0; i++) {
 		const double q = (outline + i + 0.5) * (2 * half - outline - i - 0.5);
 
-		measured += (double)row[behind ? columns - 1 - i : i];
+		measured += sample_of(row, &ends[behind], behind, i);
 		explained += q > 0 ? fit[0] / width * sqrt(q) + fit[1] * width / sqrt(q) : 0;
 	}
-	for (int i = 1; i <= extend; i++) {
+	for (int i = 1; i <= extend && share > 0; i++) {
 		const double q = (outline - i + 0.5) * (2 * half - outline + i - 0.5), middle = outline - half;
-		const double shell =
-		    fit[0] / width * sqrt(fmax(0, q)) +
-		    fit[1] * width * (asin(fmin(1, (i - middle) / half)) - asin(fmin(1, (i - 1 - middle) / half)));
+		const double from = fmin(1, (i - 1 - middle) / half), to = fmin(1, (i - middle) / half);
+		const double shell = fit[0] / width * sqrt(fmax(0, q)) + fit[1] * width * (asin(to) - asin(from));
 
 		ret[i - 1] += share * (fmin(fmax(measured / explained, 1. / 3), 3) * shell - ret[i - 1]);
 	}
+	for (int i = 1; i <= extend; i++)
+		ret[i - 1] += ends[behind].share * (sqrt(fmax(0, ends[behind].a + ends[behind].b * i)) - ret[i - 1]);
 }
 
 void reference_filter(const struct plan_options *options, int view, const float *projection, float *ret)
@@ -461,7 +540,7 @@ void reference_filter(const struct plan_options *options, int view, const float 
 			if (!cut[side])
 				continue;
 			truncation_row(from, columns, extend, side == 1, not_air, beyond);
-			truncation_by_shell_of_row(from, columns, extend, side == 1, cut, not_air, beyond);
+			extend_by_bone(from, columns, extend, side == 1, cut, not_air, beyond);
 			extended = true;
 			for (int i = 0; i < extend; i++)
 				line[side == 1 ? extend + columns + i : extend - 1 - i] = beyond[i];

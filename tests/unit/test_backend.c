@@ -702,6 +702,22 @@ static void shell_rows(const struct rig *rig, float *ret)
 	}
 }
 
+/* Rows that are cut within the bone of a shell, on both sides or on one, and within other columns in each. */
+static void cap_rows(const struct rig *rig, float *ret)
+{
+	const int columns = rig->geometry.columns;
+
+	for (size_t i = 0; i < rig->all_pixels; i++) {
+		const int column = (int)(i % (size_t)columns), row = (int)(i / (size_t)columns);
+		const double x = column + .5 - (row % 5 == 0 ? .4 : .5) * columns,
+			     outer = (.52 + .01 * (row % 4)) * columns;
+		const double inner = outer - .09 * columns;
+		const double whole = sqrt(fmax(0, outer * outer - x * x)), brain = sqrt(fmax(0, inner * inner - x * x));
+
+		ret[i] = (float)((4 * whole - 2 * brain) / columns);
+	}
+}
+
 /* Which of them a fit of core/truncation.h concerns. */
 static void count_truncated(const struct rig *rig, const float *rows, const int pad[2], size_t ret[2])
 {
@@ -719,20 +735,24 @@ static void count_truncated(const struct rig *rig, const float *rows, const int 
 	}
 }
 
-/* With a padded side or without, what lets through all but 4 % of the photons, and shells of bone. */
+/* With a padded side or without, what lets through all but 4 % of the photons, shells of bone, and cuts within bone. */
 START_TEST(truncated_rows_are_extended_before_the_ramp)
 {
-	static const int pads[][2] = {{0, 0}, {7, 0}, {0, 4}, {0, 0}, {0, 0}};
+	static const int pads[][2] = {{0, 0}, {7, 0}, {0, 4}, {0, 0}, {0, 0}, {0, 0}, {0, 0}};
+	static const struct setup wide_one = {
+	    "wide", 520, 6, 2, {200, 350, {.12, .12}, {0, 0}, {0, 0}}, 3.1, 71, PLAIN, {{9, 9, 9}, {1, 1, 1}, {0}},
+	    true};
+	const struct setup *setup = _i == 6 ? &wide_one : &setups[0];
 	const int views[2] = {1, 0}, *pad = pads[_i];
-	const int columns = setups[0].columns, wide = pad[0] + columns + pad[1];
-	const size_t wide_pixels = (size_t)wide * (size_t)setups[0].rows;
+	const int columns = setup->columns, wide = pad[0] + columns + pad[1];
+	const size_t wide_pixels = (size_t)wide * (size_t)setup->rows;
 	const int lengths[2] = {filter_length(wide), filter_length(wide + columns)};
 	float *responses[2], *projections, *want, *have;
 	size_t expected[2], rows[2];
 	struct rig rig;
 
 	random_state = 5;
-	rig_make(&setups[0], &rig);
+	rig_make(setup, &rig);
 	for (int i = 0; i < 2; i++) {
 		responses[i] = floats((size_t)lengths[i] / 2 + 1);
 		ok(filter_response(WINDOW_HANN, 1, 1, lengths[i], responses[i], &err));
@@ -744,6 +764,8 @@ START_TEST(truncated_rows_are_extended_before_the_ramp)
 	projections = floats(rig.all_pixels);
 	if (_i == 4)
 		shell_rows(&rig, projections);
+	else if (_i >= 5)
+		cap_rows(&rig, projections);
 	else
 		elliptic_rows(&rig, projections);
 	for (size_t i = 0; i < rig.all_pixels && _i == 3; i++)
@@ -760,7 +782,7 @@ START_TEST(truncated_rows_are_extended_before_the_ramp)
 		struct stack *stack;
 
 		load(&rig, projections);
-		ok(rig.backend->stack_new(rig.device, wide, setups[0].rows, 2, &stack, &err));
+		ok(rig.backend->stack_new(rig.device, wide, setup->rows, 2, &stack, &err));
 		ok(rig.backend->filter(rig.plan, rig.stack, NULL, views, 2, stack, &err));
 		ok(rig.backend->stack_download(stack, 0, 2, have, &err));
 		ok(rig.backend->filter_extended(rig.plan, rows, &err));
@@ -1954,7 +1976,7 @@ Suite *backend_suite(void)
 	tcase_add_loop_test(operations, backproject_is_the_bilinear_sum, 0, SETUPS);
 	tcase_add_loop_test(operations, filter_is_the_convolution_of_weighted_rows, 0, SETUPS);
 	tcase_add_test(operations, padded_filter_goes_on_beyond_the_detector);
-	tcase_add_loop_test(operations, truncated_rows_are_extended_before_the_ramp, 0, 5);
+	tcase_add_loop_test(operations, truncated_rows_are_extended_before_the_ramp, 0, 7);
 	tcase_add_loop_test(operations, sart_is_the_contracts_update, 0, 2 * SETUPS);
 	tcase_add_loop_test(operations, gradient_tv_takes_the_steps_of_the_equation, 0, SETUPS);
 	tcase_add_loop_test(known, ones_project_to_the_length_inside_the_grid, 0, SETUPS);
