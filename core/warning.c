@@ -52,7 +52,7 @@ const struct warning_kind warning_kinds[] = {
      "The disk has damaged a calibration image of the scan: it must be sent again before the scan can be used."},
     {"damaged_volume", SEVERITY_SERIOUS, "The disk has damaged this image: it must be made again."},
     {"damaged_checkpoint", SEVERITY_INFO,
-     "What the job had reached before a pause was damaged on the disk, so it began again; the result is the same."},
+     "What the job had saved for a restart was damaged on the disk and was left out; the result is the same."},
     {"defect_map", SEVERITY_INFO, "Bad pixels of the detector were replaced from their neighbours."},
     {"stuck_pixels", SEVERITY_CAUTION,
      "Some pixels of the detector do not follow the others and were replaced from their neighbours."},
@@ -87,7 +87,6 @@ const struct warning_kind warning_kinds[] = {
      "The noise reduction that was asked for is too weak for this scan: the image is about as noisy as without it."},
     {"metal", SEVERITY_CAUTION, "There is metal: what is shown within 10 mm of it is an estimate."},
     {"no_metal", SEVERITY_INFO, "No metal was found in the image."},
-    {"checkpoint", SEVERITY_INFO, "The job went on from an earlier iteration than expected; the result is the same."},
     {0},
 };
 

@@ -11,6 +11,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/mman.h>
+#include <sys/statvfs.h>
 #include <unistd.h>
 
 #include "proto/clock.h"
@@ -21,22 +22,75 @@
 enum { PIECE_BYTES = 8 << 20 }; /* voxels in one go on their way to the disk */
 static const double SHARE = 50; /* a copy takes at most one part in so many of the time */
 
+/* ---- the history ---- */
+
+enum { ROW_NUMBERS = 5, ROW_BYTES = ROW_NUMBERS * (int)sizeof(double) };
+
+static void row_pack(const struct history_row *row, double ret[ROW_NUMBERS])
+{
+	ret[0] = row->iteration;
+	ret[1] = row->residual;
+	ret[2] = row->change;
+	ret[3] = row->tv;
+	ret[4] = row->seconds;
+}
+
+static struct history_row row_unpack(const char *bytes)
+{
+	double numbers[ROW_NUMBERS];
+
+	memcpy(numbers, bytes, sizeof(numbers));
+	return (struct history_row){.iteration = (int)numbers[0],
+				    .residual = numbers[1],
+				    .change = numbers[2],
+				    .tv = numbers[3],
+				    .seconds = numbers[4]};
+}
+
+int history_add(struct history *history, const struct history_row *row, struct error *err)
+{
+	if (history->count == history->room) {
+		const int room = history->room == 0 ? 64 : 2 * history->room;
+		struct history_row *rows = realloc(history->rows, (size_t)room * sizeof(*rows));
+
+		if (rows == NULL)
+			return error_set(err, ERR_NO_MEMORY, "no memory for the history of %d iterations", room);
+		history->rows = rows;
+		history->room = room;
+	}
+	history->rows[history->count++] = *row;
+	return 0;
+}
+
+static int read_history(const char *bytes, int count, struct history *history, struct error *err)
+{
+	int code = 0;
+
+	history->count = 0;
+	for (int i = 0; i < count && code == 0; i++) {
+		const struct history_row row = row_unpack(bytes + (size_t)i * ROW_BYTES);
+
+		code = history_add(history, &row, err);
+	}
+	return code;
+}
+
 /* ---- writing ---- */
 
 /*
- * After the line come the iterate, then the algorithm's state, then the list of the metal that was removed.
- * No noise is written as 0.
+ * After the line come the iterate, then the algorithm's state, then the list of the metal that was removed, then the
+ * history. No noise is written as 0.
  */
 static void checkpoint_line(char ret_line[CHECKPOINT_FILE_OFFSET], int iteration, const struct grid *grid,
-			    size_t state_bytes, size_t metal_bytes, const struct volume_noise *noise)
+			    size_t state_bytes, size_t metal_bytes, int rows, const struct volume_noise *noise)
 {
 	char text[CHECKPOINT_FILE_OFFSET], state[32] = "";
 
 	memset(ret_line, ' ', CHECKPOINT_FILE_OFFSET);
 	if (state_bytes > 0)
 		snprintf(state, sizeof(state), ", state %zu", state_bytes);
-	snprintf(text, sizeof(text), "cbctd checkpoint %d of %d %d %d, metal %zu, noise %a %a%s", iteration,
-		 grid->size[0], grid->size[1], grid->size[2], metal_bytes, noise->sigma, noise->contrast, state);
+	snprintf(text, sizeof(text), "cbctd checkpoint %d of %d %d %d, metal %zu, rows %d, noise %a %a%s", iteration,
+		 grid->size[0], grid->size[1], grid->size[2], metal_bytes, rows, noise->sigma, noise->contrast, state);
 	memcpy(ret_line, text, strlen(text));
 	ret_line[CHECKPOINT_FILE_OFFSET - 1] = '\n';
 }
@@ -103,7 +157,21 @@ static int write_state(void *context, const void *bytes, size_t size, struct err
 	return write_sealed(context, bytes, size, err);
 }
 
-static int write_checkpoint(struct recon *recon, struct sealed_file *sealed, struct error *err)
+static int write_history(const struct history *history, struct sealed_file *sealed, struct error *err)
+{
+	int code = 0;
+
+	for (int i = 0; i < history->count && code == 0; i++) {
+		double numbers[ROW_NUMBERS];
+
+		row_pack(&history->rows[i], numbers);
+		code = write_sealed(sealed, numbers, sizeof(numbers), err);
+	}
+	return code;
+}
+
+static int write_checkpoint(struct recon *recon, const struct history *history, struct sealed_file *sealed,
+			    struct error *err)
 {
 	char header[CHECKPOINT_FILE_OFFSET];
 	size_t metal_bytes;
@@ -113,7 +181,7 @@ static int write_checkpoint(struct recon *recon, struct sealed_file *sealed, str
 	int code;
 
 	checkpoint_line(header, recon_iteration(recon), recon_grid(recon), recon_state_bytes(recon), metal_bytes,
-			noise != NULL ? noise : &none);
+			history->count, noise != NULL ? noise : &none);
 	code = write_sealed(sealed, header, sizeof(header), err);
 	if (code == 0)
 		code = write_iterate(recon, sealed, err);
@@ -121,23 +189,33 @@ static int write_checkpoint(struct recon *recon, struct sealed_file *sealed, str
 		code = recon_save_state(recon, &sink, err);
 	if (code == 0 && metal_bytes > 0)
 		code = write_sealed(sealed, metal, metal_bytes, err);
+	if (code == 0)
+		code = write_history(history, sealed, err);
 	return code != 0 ? code : write_end(sealed, err);
 }
 
-/* The whole file, under its name beside `path`; nothing is left of it when that fails. `path` is borrowed. */
-static int write_beside(struct recon *recon, const char *path, struct durable *ret_file, struct error *err)
+static size_t content_bytes(const struct recon *recon, const struct history *history)
 {
+	size_t found;
+
+	recon_found(recon, &found);
+	return CHECKPOINT_FILE_OFFSET + grid_voxels(recon_grid(recon)) * sizeof(float) + recon_state_bytes(recon) +
+	       found + (size_t)history->count * ROW_BYTES;
+}
+
+/* The whole file, under its name beside `path`; nothing is left of it when that fails. `path` is borrowed. */
+static int write_beside(struct recon *recon, const struct history *history, const char *path, struct durable *ret_file,
+			struct error *err)
+{
+	const size_t content = content_bytes(recon, history);
 	struct sealed_file sealed = {.seal = {0}};
-	size_t content = CHECKPOINT_FILE_OFFSET + grid_voxels(recon_grid(recon)) * sizeof(float), found_bytes;
 	int code;
 
-	recon_found(recon, &found_bytes);
-	content += recon_state_bytes(recon) + found_bytes;
 	code = seal_maker_new(content, &sealed.seal, err);
 	if (code == 0)
 		code = durable_open(&sealed.file, path, content + seal_bytes(content), err);
 	if (code == 0) {
-		code = write_checkpoint(recon, &sealed, err);
+		code = write_checkpoint(recon, history, &sealed, err);
 		if (code != 0)
 			durable_abandon(&sealed.file);
 	}
@@ -152,7 +230,19 @@ static int path_of(const char *directory, const char *name, char ret_path[PATH_M
 	return path_join(ret_path, PATH_MAX, directory, name, "", err);
 }
 
-int checkpoint_save(struct recon *recon, const char *directory, struct error *err)
+void checkpoint_remove(const char *directory)
+{
+	static const char *const names[] = {CHECKPOINT_FILE, CHECKPOINT_FILE_BEFORE};
+	char path[PATH_MAX];
+	struct error ignored;
+
+	for (size_t i = 0; i < sizeof(names) / sizeof(names[0]); i++) {
+		if (path_of(directory, names[i], path, &ignored) == 0)
+			unlink(path);
+	}
+}
+
+int checkpoint_save(struct recon *recon, const struct history *history, const char *directory, struct error *err)
 {
 	char path[PATH_MAX], before[PATH_MAX];
 	struct durable file;
@@ -161,7 +251,7 @@ int checkpoint_save(struct recon *recon, const char *directory, struct error *er
 	if (code == 0)
 		code = path_of(directory, CHECKPOINT_FILE_BEFORE, before, err);
 	if (code == 0)
-		code = write_beside(recon, path, &file, err);
+		code = write_beside(recon, history, path, &file, err);
 	if (code == 0)
 		code = durable_commit(&file, err);
 	if (code == 0)
@@ -233,16 +323,33 @@ static void *sync_and_name(void *context)
 	return NULL;
 }
 
-int checkpointer_begin(struct checkpointer *checkpointer, struct recon *recon, struct error *err)
+/* Beside the checkpoint, the disk must keep room for a volume of the job, and for the daemon's records. */
+static bool has_room(const char *path, size_t bytes)
+{
+	char directory[PATH_MAX];
+	struct statvfs disk;
+
+	snprintf(directory, sizeof(directory), "%s", path);
+	*strrchr(directory, '/') = '\0';
+	return statvfs(directory, &disk) != 0 || (double)disk.f_bavail * (double)disk.f_frsize >= 2 * (double)bytes;
+}
+
+int checkpointer_begin(struct checkpointer *checkpointer, struct recon *recon, const struct history *history,
+		       struct error *err)
 {
 	const double begin = clock_monotonic();
-	int code = write_beside(recon, checkpointer->path, &checkpointer->file, err), result;
+	struct error why;
+	int code = ERR_NO_SPACE, result;
 
+	if (has_room(checkpointer->path, content_bytes(recon, history)))
+		code = write_beside(recon, history, checkpointer->path, &checkpointer->file, &why);
 	checkpointer->due = clock_monotonic() + fmax(checkpointer->seconds, SHARE * (clock_monotonic() - begin));
 	if (code == ERR_NO_SPACE)
 		return 0;
-	if (code != 0)
+	if (code != 0) {
+		*err = why;
 		return code;
+	}
 	checkpointer->iteration = recon_iteration(recon);
 	atomic_store(&checkpointer->done, false);
 	result = pthread_create(&checkpointer->thread, NULL, sync_and_name, checkpointer);
@@ -272,15 +379,21 @@ int checkpointer_settled(struct checkpointer *checkpointer, bool wait, int *ret_
 
 /* ---- reading ---- */
 
+struct checkpoint_facts {
+	int iteration, rows;
+	struct volume_noise noise;
+	size_t metal; /* bytes */
+};
+
 static int check_checkpoint(const char *path, const char *bytes, const struct seal *seal, const struct recon *recon,
-			    int *ret_iteration, struct volume_noise *ret_noise, struct error *err)
+			    struct checkpoint_facts *ret_facts, struct error *err)
 {
 	const struct grid *grid = recon_grid(recon);
 	const size_t state = recon_state_bytes(recon);
 	const size_t expected = CHECKPOINT_FILE_OFFSET + grid_voxels(grid) * sizeof(float) + state;
 	char text[CHECKPOINT_FILE_OFFSET + 1] = "", line[CHECKPOINT_FILE_OFFSET];
-	struct volume_noise noise;
-	int iteration, damaged = seal_first_damaged(seal, bytes);
+	struct checkpoint_facts facts;
+	int damaged = seal_first_damaged(seal, bytes);
 
 	if (damaged >= 0)
 		return error_set(err, ERR_INVALID, "%.200s: its block %d does not fit its checksum", path, damaged);
@@ -288,22 +401,22 @@ static int check_checkpoint(const char *path, const char *bytes, const struct se
 		return error_set(err, ERR_INVALID, "%.200s: %zu bytes, %zu are expected", path, seal->content,
 				 expected);
 	memcpy(text, bytes, CHECKPOINT_FILE_OFFSET);
-	if (sscanf(text, "cbctd checkpoint %d of %*d %*d %*d, metal %*u, noise %la %la", &iteration, &noise.sigma,
-		   &noise.contrast) != 3)
+	if (sscanf(text, "cbctd checkpoint %d of %*d %*d %*d, metal %zu, rows %d, noise %la %la", &facts.iteration,
+		   &facts.metal, &facts.rows, &facts.noise.sigma, &facts.noise.contrast) != 5)
 		return error_set(err, ERR_INVALID, "%.200s is no checkpoint", path);
-	checkpoint_line(line, iteration, grid, state, seal->content - expected, &noise);
-	if (memcmp(line, bytes, sizeof(line)) != 0)
+	checkpoint_line(line, facts.iteration, grid, state, facts.metal, facts.rows, &facts.noise);
+	if (memcmp(line, bytes, sizeof(line)) != 0 || facts.rows != facts.iteration ||
+	    seal->content != expected + facts.metal + (size_t)facts.rows * ROW_BYTES)
 		return error_set(err, ERR_INVALID, "%.200s is of another grid or algorithm", path);
-	*ret_iteration = iteration;
-	*ret_noise = noise;
+	*ret_facts = facts;
 	return 0;
 }
 
 /* Mapped, not read: one volume less in memory at the worst moment. */
-static int resume_from(struct recon *recon, const char *path, struct error *err)
+static int resume_from(struct recon *recon, const char *path, int latest, struct history *history, struct error *err)
 {
-	int file = open(path, O_RDONLY | O_CLOEXEC), code, iteration = 0;
-	struct volume_noise noise;
+	int file = open(path, O_RDONLY | O_CLOEXEC), code;
+	struct checkpoint_facts facts = {0};
 	struct seal seal = {0};
 	size_t at;
 	char *bytes = MAP_FAILED;
@@ -322,18 +435,24 @@ static int resume_from(struct recon *recon, const char *path, struct error *err)
 		code = error_set(err, ERR_IO, "%.200s cannot be mapped", path);
 		goto out;
 	}
-	code = check_checkpoint(path, bytes, &seal, recon, &iteration, &noise, err);
+	code = check_checkpoint(path, bytes, &seal, recon, &facts, err);
+	if (code == 0 && facts.iteration > latest)
+		code = error_set(err, ERR_INVALID, "%.200s is of iteration %d: a volume of one before that is missing",
+				 path, facts.iteration);
 	if (code == 0)
-		code =
-		    recon_resume(recon, (const float *)(const void *)(bytes + CHECKPOINT_FILE_OFFSET), iteration, err);
+		code = recon_resume(recon, (const float *)(const void *)(bytes + CHECKPOINT_FILE_OFFSET),
+				    facts.iteration, err);
 	if (code == 0)
-		code = recon_resume_noise(recon, &noise, err);
+		code = recon_resume_noise(recon, &facts.noise, err);
 	at = CHECKPOINT_FILE_OFFSET + grid_voxels(recon_grid(recon)) * sizeof(float);
 	if (code == 0)
 		code = recon_resume_state(recon, bytes + at, recon_state_bytes(recon), err);
 	at += recon_state_bytes(recon);
-	if (code == 0 && seal.content > at)
-		code = recon_resume_found(recon, bytes + at, seal.content - at, err);
+	if (code == 0 && facts.metal > 0)
+		code = recon_resume_found(recon, bytes + at, facts.metal, err);
+	at += facts.metal;
+	if (code == 0)
+		code = read_history(bytes + at, facts.rows, history, err);
 out:
 	if (bytes != MAP_FAILED)
 		munmap(bytes, seal.content);
@@ -357,7 +476,8 @@ static int iteration_of(const char *path)
 	return iteration;
 }
 
-int checkpoint_resume(struct recon *recon, const char *path, int expected, struct error *ret_damage, struct error *err)
+int checkpoint_resume(struct recon *recon, const char *path, const struct checkpoint_wish *wish,
+		      struct history *history, struct error *ret_damage, struct error *err)
 {
 	const char *slash = strrchr(path, '/'), *first = path, *second;
 	const int directory = slash == NULL ? 0 : (int)(slash - path) + 1;
@@ -369,12 +489,12 @@ int checkpoint_resume(struct recon *recon, const char *path, int expected, struc
 	if (snprintf(before, sizeof(before), "%.*s%s", directory, path, CHECKPOINT_FILE_BEFORE) >= (int)sizeof(before))
 		return error_set(err, ERR_INVALID, "a path of %zu bytes is too long", strlen(path));
 	second = before;
-	if (iteration_of(path) != expected && iteration_of(before) == expected) {
+	if (iteration_of(path) != wish->iteration && iteration_of(before) == wish->iteration) {
 		first = before;
 		second = path;
 	}
-	code = resume_from(recon, first, err);
-	if (code != ERR_INVALID || resume_from(recon, second, &other) != 0)
+	code = resume_from(recon, first, wish->latest, history, err);
+	if (code != ERR_INVALID || resume_from(recon, second, wish->latest, history, &other) != 0)
 		return code;
 	*ret_damage = *err;
 	return 0;

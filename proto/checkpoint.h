@@ -9,23 +9,37 @@
  * Checkpoints: all that a reconstruction needs to go on behind an iteration and to end with the bits
  * of a run that was never broken off. A file is a line of text padded to CHECKPOINT_FILE_OFFSET bytes
  * with iteration, size and noise, then float32 voxels [z][y][x], what the algorithm holds, the list of
- * metal where there is one, and a seal (proto/seal.h). The directory has two, the newest as
- * CHECKPOINT_FILE and the one before it as CHECKPOINT_FILE_BEFORE, so that there is one to go on from
- * where the newest turns out to be damaged.
+ * metal where there is one, the history, five float64 for each iteration, and a seal (proto/seal.h). The directory has
+ * two, the newest as CHECKPOINT_FILE and the one before it as CHECKPOINT_FILE_BEFORE, so that there is one to go on
+ * from where the newest turns out to be damaged.
  */
 #define CHECKPOINT_FILE "checkpoint.f32"
 #define CHECKPOINT_FILE_BEFORE "checkpoint-before.f32"
 enum { CHECKPOINT_FILE_OFFSET = 160 };
 
-/* Writes the checkpoint durably, as the only one. For a run that stops here. */
-int checkpoint_save(struct recon *recon, const char *directory, struct error *err);
+/* The rows of the iterations so far, in their order from the first on. */
+struct history {
+	struct history_row *rows; /* owned; free it */
+	int count, room;
+};
+int history_add(struct history *history, const struct history_row *row, struct error *err);
 
+/* Writes the checkpoint durably, as the only one. For a run that stops here. */
+int checkpoint_save(struct recon *recon, const struct history *history, const char *directory, struct error *err);
+/* Removes those of the directory. For a run that begins: they are of another one, and must not serve for it. */
+void checkpoint_remove(const char *directory);
+
+/* The iteration that the checkpoint expected by the caller is of, and the latest that may serve where it is damaged. */
+struct checkpoint_wish {
+	int iteration, latest;
+};
 /*
  * Gives an opened recon the checkpoint at `path`, or the one before it in the same directory: whichever is of the
- * expected iteration, which the caller has the history of, else the newest. Where that is missing or damaged the other
- * one serves; *ret_damage then says why, its code is 0 otherwise. Without any: ERR_INVALID.
+ * iteration that is wished for, else the newest. Where that is missing or damaged the other one serves; *ret_damage
+ * then says why, its code is 0 otherwise. The history is replaced by that of the checkpoint. Without any: ERR_INVALID.
  */
-int checkpoint_resume(struct recon *recon, const char *path, int expected, struct error *ret_damage, struct error *err);
+int checkpoint_resume(struct recon *recon, const char *path, const struct checkpoint_wish *wish,
+		      struct history *history, struct error *ret_damage, struct error *err);
 
 /*
  * Checkpoints of a run that goes on. The iterate is copied into a file's pages by the caller's thread and
@@ -40,8 +54,12 @@ void checkpointer_free(struct checkpointer *checkpointer); /* waits for the disk
  * would take more than a fiftieth of the time, and the last one is on the disk.
  */
 bool checkpointer_due(const struct checkpointer *checkpointer);
-/* Begins a checkpoint of the iterate as it is. A disk without room is no error: there is none then. */
-int checkpointer_begin(struct checkpointer *checkpointer, struct recon *recon, struct error *err);
+/*
+ * Begins a checkpoint of the iterate as it is. A disk without room for it, and for a volume of the job beside it, is no
+ * error: there is none then.
+ */
+int checkpointer_begin(struct checkpointer *checkpointer, struct recon *recon, const struct history *history,
+		       struct error *err);
 /* *ret_iteration: of the checkpoint that has reached the disk since the last call, 0: none has. */
 int checkpointer_settled(struct checkpointer *checkpointer, bool wait, int *ret_iteration, struct error *err);
 

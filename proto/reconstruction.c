@@ -42,6 +42,7 @@ struct run {
 	const struct recipe *recipe;
 	struct recon *recon;               /* NULL before it is opened */
 	struct checkpointer *checkpointer; /* NULL where nobody asks for checkpoints */
+	struct history history;            /* of the iterations so far */
 	struct provenance provenance;
 	bool sealed; /* the volumes' files */
 	bool ahead;  /* the next volume's file is prepared while the device computes */
@@ -106,7 +107,7 @@ static int keep_checkpoint(struct run *run, struct error *err)
 	if (code != 0 || (run->saver != NULL && saver_busy(run->saver)))
 		return code;
 	disk_step(run, 1);
-	code = checkpointer_begin(run->checkpointer, run->recon, err);
+	code = checkpointer_begin(run->checkpointer, run->recon, &run->history, err);
 	disk_step(run, 0);
 	return code;
 }
@@ -138,8 +139,12 @@ static void run_progress(void *context, enum stage stage, int iteration, double 
 
 static void run_row(void *context, const struct history_row *row)
 {
-	const struct reconstruction_hooks *hooks = ((struct run *)context)->hooks;
+	struct run *run = context;
+	const struct reconstruction_hooks *hooks = run->hooks;
 
+	/* The run's next question is whether it is cancelled, which the trouble answers. */
+	if (run->trouble.code == 0)
+		history_add(&run->history, row, &run->trouble);
 	if (hooks->recon.row != NULL)
 		hooks->recon.row(hooks->recon.context, row);
 }
@@ -392,27 +397,42 @@ static int set_linearise(struct reconstruction *reconstruction, struct error *er
 	return 0;
 }
 
+/* The last iteration behind which no volume has been kept since `iteration`: a run that began later would lack one. */
+static int latest_checkpoint(const struct recipe *recipe, int iteration)
+{
+	int latest = INT_MAX;
+
+	for (int i = 0; i < recipe->emits; i++) {
+		if (recipe->emit[i] > iteration && recipe->emit[i] <= latest)
+			latest = recipe->emit[i] - 1;
+	}
+	return latest;
+}
+
 static int resume(struct reconstruction *reconstruction, struct error *err)
 {
 	struct run *run = &reconstruction->run;
+	const int known = reconstruction->iteration;
+	const struct checkpoint_wish wish = {.iteration = known,
+					     .latest = latest_checkpoint(reconstruction->options->recipe, known)};
 	struct error damage;
-	char detail[128];
-	int code = checkpoint_resume(run->recon, reconstruction->options->checkpoint, reconstruction->iteration,
-				     &damage, err),
-	    iteration;
+	char detail[512];
+	int code =
+	    checkpoint_resume(run->recon, reconstruction->options->checkpoint, &wish, &run->history, &damage, err);
 
 	if (code != 0)
 		return code;
-	if (damage.code != 0)
-		run_warning(run, "damaged_checkpoint", damage.text);
-	iteration = recon_iteration(run->recon);
-	if (iteration != reconstruction->iteration) {
-		snprintf(detail, sizeof(detail), "the checkpoint holds iteration %d, not %d: the run goes on behind %d",
-			 iteration, reconstruction->iteration, iteration);
-		run_warning(run, "checkpoint", detail);
+	/* Opened again, it causes no second warning, and no row comes twice. */
+	reconstruction->iteration = recon_iteration(run->recon);
+	if (damage.code != 0) {
+		snprintf(detail, sizeof(detail), "%.350s; the job went on behind iteration %d", damage.text,
+			 reconstruction->iteration);
+		run_warning(run, "damaged_checkpoint", detail);
 	}
-	/* Opened again, it causes no second warning. */
-	reconstruction->iteration = iteration;
+	for (int i = 0; i < run->history.count && run->hooks->recon.row != NULL; i++) {
+		if (run->history.rows[i].iteration > known)
+			run->hooks->recon.row(run->hooks->recon.context, &run->history.rows[i]);
+	}
 	return 0;
 }
 
@@ -522,6 +542,8 @@ int reconstruction_open(const struct backend *backend, struct device *device,
 	reconstruction->options = options;
 	reconstruction->iteration = options->iteration;
 	reconstruction->resumed = options->checkpoint != NULL;
+	if (code == 0 && options->checkpoint_seconds > 0 && options->checkpoint == NULL)
+		checkpoint_remove(options->out_directory);
 	if (code == 0 && options->checkpoint_seconds > 0)
 		code = checkpointer_new(options->out_directory, options->checkpoint_seconds,
 					&reconstruction->run.checkpointer, err);
@@ -539,6 +561,7 @@ void reconstruction_close(struct reconstruction *reconstruction)
 	if (reconstruction == NULL)
 		return;
 	checkpointer_free(reconstruction->run.checkpointer);
+	free(reconstruction->run.history.rows);
 	saver_free(reconstruction->run.saver);
 	provenance_clear(&reconstruction->run.provenance);
 	recon_free(reconstruction->recon);
@@ -757,7 +780,7 @@ int reconstruction_finish(struct reconstruction *reconstruction, struct error *e
 		*err = run->trouble;
 		return run->trouble.code;
 	}
-	if (code == ERR_BUSY && checkpoint_save(reconstruction->recon, run->directory, &trouble) != 0) {
+	if (code == ERR_BUSY && checkpoint_save(reconstruction->recon, &run->history, run->directory, &trouble) != 0) {
 		*err = trouble;
 		code = trouble.code;
 	}

@@ -54,9 +54,9 @@ struct reconstruction_options {
 	const struct patient *patient; /* NULL: as scan.json says */
 	/*
 	 * The checkpoint of a run that yielded or was broken off, or NULL; `iteration` is the one it holds as far
-	 * as the caller knows. The file itself knows better (a crash may lie between its writing and the caller's
-	 * note): where they differ, the file counts and a warning "checkpoint" says so. Where it is missing or
-	 * damaged the one before it serves (checkpoint_resume); without that: ERR_INVALID.
+	 * as the caller knows, which has the history and the volumes so far. Where it is missing or damaged the other
+	 * one of the directory serves, with a warning "damaged_checkpoint" (checkpoint_resume); rows of its history
+	 * that the caller may not have come first. Without that: ERR_INVALID.
 	 */
 	const char *checkpoint;
 	int iteration;

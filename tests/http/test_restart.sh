@@ -209,25 +209,52 @@ test_a_job_goes_on_from_its_newest_checkpoint_however_often_it_is_killed() {
 	done
 }
 
-test_a_damaged_checkpoint_is_passed_over_for_the_one_before_it() {
-	local at before
-	start_daemon --checkpoint-seconds 0.05
+# recorded: the iteration that the catalogue knows a checkpoint of; a copy is read, since another program's writes are damage
+recorded() {
+	rm -rf "$work/copy" && mkdir "$work/copy" && cp "$work/state"/catalogue.sqlite* "$work/copy"
+	python3 -c 'import sqlite3, sys; print(sqlite3.connect(sys.argv[1]).execute("SELECT checkpoint FROM jobs WHERE id = ?", sys.argv[2:]).fetchone()[0])' \
+		"$work/copy/catalogue.sqlite" "$job"
+}
+
+test_a_job_goes_on_from_the_other_checkpoint_where_one_is_damaged_or_not_recorded() {
+	local at kind name recipe
+	recipe="{\"scan\": \"SCAN\", $grid, \"sart\": {\"iterations\": $long, \"subsets\": \"views\"}}"
+	start_daemon --checkpoint-seconds 0.3
 	post_scan "$scan_dir"
 	post_projections "$scan_dir"
-	post_job "{\"scan\": \"SCAN\", $grid, \"sart\": {\"iterations\": $long, \"subsets\": \"views\"}}"
+	post_job "$recipe"
 	wait_job succeeded 240
 	get_volume final "$work/final.undisturbed" format=raw
-	post_job "{\"scan\": \"SCAN\", $grid, \"sart\": {\"iterations\": $long, \"subsets\": \"views\"}}"
-	at=$(held_behind "$(held_behind 0)")
-	stop_daemon KILL
-	before=$(held_at checkpoint-before.f32)
-	[ "$before" -gt 0 ] || fail "two checkpoints kept in turn"
-	printf 'X' | dd of="$work/state/jobs/$job/checkpoint.f32" bs=1 seek=5000 conv=notrunc status=none
-	start_daemon --checkpoint-seconds 0.05
-	wait_job succeeded 240
-	expect_json '[.warnings[].code] | index("damaged_checkpoint")'
-	get_volume final "$work/final" format=raw
-	cmp "$work/final" "$work/final.undisturbed" || fail "the bits of an undisturbed run"
+	for kind in damaged unrecorded; do
+		post_job "$recipe"
+		at=$(held_behind "$(held_behind 0)")
+		stop_daemon KILL
+		if [ $kind = damaged ]; then
+			at=$(recorded)
+			[ "$(held_at checkpoint-before.f32)" -gt 0 ] || fail "two checkpoints kept in turn"
+			[ "$at" -gt 0 ] || fail "a checkpoint in the catalogue"
+			name=checkpoint.f32
+			[ "$(held_at checkpoint-before.f32)" != "$at" ] || name=checkpoint-before.f32
+			printf 'X' | dd of="$work/state/jobs/$job/$name" bs=1 seek=5000 conv=notrunc status=none
+		else # a catalogue that has not heard of the last ones
+			rm -rf "$work/older" && mkdir "$work/older" && cp "$work/state"/catalogue.sqlite* "$work/older"
+			start_daemon --checkpoint-seconds 0.3
+			held_behind "$(held_behind "$at")" >/dev/null
+			stop_daemon KILL
+			rm "$work/state"/catalogue.sqlite*
+			cp "$work/older"/* "$work/state"
+		fi
+		start_daemon --checkpoint-seconds 0.3
+		wait_job succeeded 240
+		expect_json "[.history[].iteration] == [range(1; $long + 1)]"
+		if [ $kind = damaged ]; then
+			expect_json '[.warnings[].code] == ["damaged_checkpoint"]'
+		else
+			expect_json '.warnings == []'
+		fi
+		get_volume final "$work/final" format=raw
+		cmp "$work/final" "$work/final.undisturbed" || fail "the bits of an undisturbed run"
+	done
 	stop_daemon
 }
 
@@ -429,6 +456,26 @@ test_on_a_full_disk_who_makes_room_waits_for_it() {
 	req DELETE "/v1/jobs/$low"
 	wait_job cancelled
 	stop_daemon
+}
+
+test_checkpoints_leave_room_for_the_volume() {
+	local size
+	small=$work/small
+	# of 8 MiB each: room for the volume alone, and for one or two checkpoints beside it
+	for size in 14m 22m 30m; do
+		mkdir -p "$small"
+		mount -t tmpfs -o size=$size none "$small" 2>/dev/null || skip "no permission to mount a small tmpfs"
+		trap 'stop_daemon; umount "$small"' EXIT
+		state=$small/state start_daemon --checkpoint-seconds 0.1
+		post_scan "$scan_dir"
+		post_projections "$scan_dir"
+		post_job '{"scan": "SCAN", "grid": {"size": [128, 128, 128], "spacing_mm": [1, 1, 1]}, "fdk": null, "sart": {"iterations": 6, "subsets": 1}}'
+		wait_job succeeded
+		expect_json '.attempts == 1'
+		stop_daemon
+		umount "$small"
+		trap - EXIT
+	done
 }
 
 test_a_worker_that_does_not_exit_keeps_nobody() {

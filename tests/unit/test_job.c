@@ -369,6 +369,10 @@ START_TEST(a_checkpoint_is_kept_over_a_restart_where_its_file_is)
 	ck_assert(!path_exists(state_path(&state, "jobs/%s/checkpoint.f32", with_id)));
 	job_release(with);
 	job_release(without);
+	/* As a daemon leaves it that dies before it has removed the files of a job that has ended. */
+	path_fill(state_path(&state, "jobs/%s/checkpoint-before.f32", with_id));
+	restart();
+	ck_assert(!path_exists(state_path(&state, "jobs/%s/checkpoint-before.f32", with_id)));
 }
 END_TEST
 

@@ -999,18 +999,24 @@ START_TEST(a_run_that_yields_goes_on_to_the_same_bits)
 }
 END_TEST
 
-START_TEST(a_checkpoint_knows_its_own_iteration)
+START_TEST(a_checkpoint_that_is_newer_brings_its_history_and_serves_where_no_volume_is_missing)
 {
-	struct watched first = {.yield_at = 2}, second = {0};
+	struct watched first = {.yield_at = 3}, second = {0}, third = {.yield_at = 2}, fourth = {0};
 	struct error err = {0};
 	char checkpoint[200];
 
 	put_scan();
 	snprintf(checkpoint, sizeof(checkpoint), "%s/%s", out, CHECKPOINT_FILE);
 	ck_assert_int_eq(run(pipeline, out, NULL, 0, &first, &err), ERR_BUSY);
-	ck_assert_int_eq(run(pipeline, out, checkpoint, 1, &second, &err), 0); /* the caller missed the second */
+	/* The caller missed the third iteration: its row comes first. */
+	ck_assert_msg(run(pipeline, out, checkpoint, 2, &second, &err) == 0, "%s", err.text);
 	ck_assert_int_eq(second.rows, 2);
-	ck_assert_ptr_nonnull(strstr(second.warnings, "checkpoint"));
+	ck_assert_int_eq(second.last_row, 4);
+	ck_assert_str_eq(second.warnings, "");
+	/* It missed the second, of which a volume is kept that nobody would make again. */
+	ck_assert_int_eq(run(pipeline, out, NULL, 0, &third, &err), ERR_BUSY);
+	ck_assert_int_eq(run(pipeline, out, checkpoint, 1, &fourth, &err), ERR_INVALID);
+	ck_assert_int_eq(fourth.rows, 0);
 }
 END_TEST
 
@@ -1139,7 +1145,7 @@ Suite *scan_directory_suite(void)
 	tcase_add_test(pipelines, projections_that_make_no_sense_are_refused);
 	tcase_add_test(pipelines, a_scan_of_what_is_there_is_as_if_no_more_had_been_planned);
 	tcase_add_test(pipelines, a_run_that_yields_goes_on_to_the_same_bits);
-	tcase_add_test(pipelines, a_checkpoint_knows_its_own_iteration);
+	tcase_add_test(pipelines, a_checkpoint_that_is_newer_brings_its_history_and_serves_where_no_volume_is_missing);
 	tcase_add_test(pipelines, a_checkpoint_of_something_else_is_refused);
 	tcase_add_test(pipelines, a_run_that_is_stopped_leaves_nothing_half_written);
 	tcase_add_test(pipelines, intensities_need_air_or_a_flat_image);
