@@ -7,9 +7,7 @@
 #include "core/correct/air.h"
 #include "core/truncation.h"
 #include "core/correct/exterior_rows.h"
-
-/* Spread over the orbit: what goes on outside of the grid shows in many views. */
-enum { VIEWS_LOOKED_AT = 32 };
+#include "core/correct/exterior_views.h"
 
 /* One view on the host, [row][column]: line integrals as measured, through w and through w on the recipe's grid. */
 struct projection {
@@ -115,38 +113,45 @@ static void subtract_view(const struct projection *of, struct exterior_rows *row
 	rows->outside += outside;
 }
 
-int exterior_look(const struct exterior_volume_options *options, struct exterior_rows *ret_rows, struct error *err)
+/* The rows of one view. */
+static struct exterior_rows look_at_rows(const struct exterior_volume_options *options, int view, const float *measured)
 {
 	const struct geometry *geometry = options->geometry;
 	const int columns = geometry->columns, rows = geometry->rows;
-	const int looked_at = geometry->count < VIEWS_LOOKED_AT ? geometry->count : VIEWS_LOOKED_AT;
-	float *measured = malloc((size_t)columns * (size_t)rows * sizeof(float));
-	struct exterior_rows found = {0};
-	float largest = 0, air = 0;
-	int code = 0;
+	const float largest = truncation_largest(measured, columns, rows, 1, (size_t)columns);
+	const float air = air_level(measured, columns, rows, truncation_edge(columns), largest);
+	const struct outside_rows outside =
+	    outside_rows(options->grid, &geometry->views[view], columns, rows, measured);
+	struct exterior_rows found = {.beside = outside.beside, .outside = outside.beside + outside.ends};
 
-	if (measured == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for a view of %d x %d pixels", columns, rows);
-	for (int i = 0; i < looked_at && code == 0; i++) {
-		const int view = (int)((long long)i * geometry->count / looked_at);
+	for (int r = 0; r < rows; r++)
+		found.truncated += is_truncated(options->orbit->pad, measured + (size_t)r * (size_t)columns, columns,
+						largest, air);
+	return found;
+}
 
-		code = options->backend->stack_download(options->projections, view, 1, measured, err);
-		if (code == 0) {
-			largest = truncation_largest(measured, columns, rows, 1, (size_t)columns);
-			air = air_level(measured, columns, rows, truncation_edge(columns), largest);
-		}
-		for (int r = 0; r < rows && code == 0; r++)
-			found.truncated += is_truncated(options->orbit->pad, measured + (size_t)r * (size_t)columns,
-							columns, largest, air);
-		if (code == 0) {
-			const struct outside_rows outside =
-			    outside_rows(options->grid, &geometry->views[view], columns, rows, measured);
+int exterior_look(const struct exterior_volume_options *options, struct exterior_rows *ret_rows, struct error *err)
+{
+	size_t truncated = 0, outside = 0, beside = 0;
+	struct exterior_rows found;
+	struct exterior_views views;
+	int code = exterior_views_open(&views, options, err);
 
-			found.beside += outside.beside;
-			found.outside += outside.beside + outside.ends;
+	if (code < 0)
+		return code;
+	while (exterior_views_next(&views, &code, err)) {
+#pragma omp parallel for schedule(static) reduction(+ : truncated, outside, beside)
+		for (int i = 0; i < views.here; i++) {
+			const struct exterior_rows rows = look_at_rows(options, exterior_views_index(&views, i),
+								       views.images + (size_t)i * views.pixels);
+
+			truncated += rows.truncated;
+			outside += rows.outside;
+			beside += rows.beside;
 		}
 	}
-	free(measured);
+	exterior_views_close(&views);
+	found = (struct exterior_rows){.truncated = truncated, .outside = outside, .beside = beside};
 	if (code == 0 && found.outside == 0)
 		code = exterior_volume_may_go_on(options, &found.possible, err);
 	if (code == 0)

@@ -75,7 +75,6 @@ struct outside_rows outside_rows(const struct grid *grid, const struct view *vie
 	    (double)truncation_level_of_many(truncation_largest(measured, columns, rows, 1, (size_t)columns));
 	size_t beside = 0, ends = 0;
 
-#pragma omp parallel for schedule(static) reduction(+ : beside, ends)
 	for (int i = 0; i < looked_at; i++) {
 		const int row = looked_at > 1 ? (int)((long long)i * (rows - 1) / (looked_at - 1)) : 0;
 		int missed = 0, passed = 0;

@@ -6,10 +6,8 @@
 #include <string.h>
 
 #include "core/correct/coarse.h"
+#include "core/correct/exterior_views.h"
 #include "core/truncation.h"
-
-/* Spread over the orbit: what is empty shows in many views. */
-enum { VIEWS_LOOKED_AT = 32 };
 
 static int voxels_a_side(const struct exterior_volume_options *options)
 {
@@ -280,17 +278,12 @@ static void sum_along_columns(const float *from, float *ret, int columns, int ro
 	}
 }
 
-/*
- * Sums over the pixels up to `reach` away along both axes, in place; `work` is another image. Every thread of a
- * parallel region calls it.
- */
+/* Sums over the pixels up to `reach` away along both axes, in place; `work` is another image. */
 static void box_sums(float *image, int columns, int rows, int reach, float *work)
 {
-#pragma omp for schedule(static)
 	for (int r = 0; r < rows; r += ROWS_TOGETHER)
 		sum_along_rows(image + (size_t)r * (size_t)columns, work + (size_t)r * (size_t)columns,
 			       rows - r < ROWS_TOGETHER ? rows - r : ROWS_TOGETHER, columns, reach);
-#pragma omp for schedule(static)
 	for (int c = 0; c < columns; c += COLUMNS_TOGETHER)
 		sum_along_columns(work, image, columns, rows, c,
 				  columns - c < COLUMNS_TOGETHER ? columns - c : COLUMNS_TOGETHER, reach);
@@ -307,7 +300,7 @@ struct look {
 struct shadow {
 	double matrix[12];
 	int columns, rows;
-	const float *matter; /* [row][column]: 0 where all around is air */
+	const float *matter; /* [row][column]: 0 where all around is air; NULL: the view is blank */
 };
 
 /* Whether a line of voxels along x lies beyond the rows as a whole: its row changes one way along it. */
@@ -350,37 +343,6 @@ static void look_along(const struct look *look, const struct grid *grid, const s
 			look->met[line + (size_t)x] = true;
 		if (shadow->matter[(size_t)lround(row) * (size_t)columns + (size_t)lround(column)] < 0.5f)
 			look->empty[line + (size_t)x] = true;
-	}
-}
-
-/*
- * Voxels whose shadow is air with what lies up to a voxel and a half around it are empty, those whose shadow misses the
- * rows are not seen. `work` is another image of the view's size.
- */
-static void look_at(const struct look *look, const struct grid *grid, const struct geometry *geometry,
-		    const struct orbit *orbit, int index, float *measured, float *work)
-{
-	const int columns = geometry->columns, rows = geometry->rows;
-	const size_t pixels = (size_t)columns * (size_t)rows;
-	const double size = fmax(fmax(grid->spacing[0], grid->spacing[1]), grid->spacing[2]);
-	const double pixel = fmin(orbit->pixel_at_isocentre[0], orbit->pixel_at_isocentre[1]);
-	const int reach = (int)fmin(ceil(1.5 * size / pixel), columns > rows ? columns : rows);
-	const float level = truncation_level_of_many(truncation_largest(measured, columns, rows, 1, (size_t)columns));
-	struct shadow shadow = {.columns = columns, .rows = rows, .matter = measured};
-
-	view_matrix(&geometry->views[index], shadow.matrix);
-#pragma omp parallel
-	{
-		/* Means of nine pixels against noise. */
-		box_sums(measured, columns, rows, 1, work);
-#pragma omp for schedule(static)
-		for (size_t i = 0; i < pixels; i++)
-			measured[i] = measured[i] > 0 && measured[i] >= 9 * level;
-		box_sums(measured, columns, rows, reach, work);
-#pragma omp for collapse(2) schedule(dynamic, 16)
-		for (int z = 0; z < grid->size[2]; z++)
-			for (int y = 0; y < grid->size[1]; y++)
-				look_along(look, grid, &shadow, y, z);
 	}
 }
 
@@ -453,26 +415,64 @@ static void keep_what_is_known(struct exterior_volume *s, const struct exterior_
 	}
 }
 
+/* `measured` becomes where the object is with what lies up to a voxel and a half around it; `work` is another image. */
+static struct shadow shadow_make(const struct exterior_volume_options *options, const struct grid *grid, int view,
+				 float *measured, float *work)
+{
+	const struct geometry *geometry = options->geometry;
+	const int columns = geometry->columns, rows = geometry->rows;
+	const size_t pixels = (size_t)columns * (size_t)rows;
+	const double size = fmax(fmax(grid->spacing[0], grid->spacing[1]), grid->spacing[2]);
+	const double pixel = fmin(options->orbit->pixel_at_isocentre[0], options->orbit->pixel_at_isocentre[1]);
+	const int reach = (int)fmin(ceil(1.5 * size / pixel), columns > rows ? columns : rows);
+	const float level = truncation_level_of_many(truncation_largest(measured, columns, rows, 1, (size_t)columns));
+	struct shadow shadow = {.columns = columns, .rows = rows};
+
+	if (is_blank(measured, pixels))
+		return shadow;
+	view_matrix(&geometry->views[view], shadow.matrix);
+	/* Means of nine pixels against noise. */
+	box_sums(measured, columns, rows, 1, work);
+	for (size_t i = 0; i < pixels; i++)
+		measured[i] = measured[i] > 0 && measured[i] >= 9 * level;
+	box_sums(measured, columns, rows, reach, work);
+	shadow.matter = measured;
+	return shadow;
+}
+
+/* Voxels whose shadow in any view is air are empty, those whose shadow misses the rows of one are not seen. */
 static int look_at_views(const struct look *look, const struct grid *grid,
 			 const struct exterior_volume_options *options, struct error *err)
 {
-	const struct geometry *geometry = options->geometry;
-	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
-	const int looked_at = geometry->count < VIEWS_LOOKED_AT ? geometry->count : VIEWS_LOOKED_AT;
-	float *measured = malloc(pixels * sizeof(float)), *work = malloc(pixels * sizeof(float));
-	int code = 0;
+	struct exterior_views views;
+	struct shadow *shadows = NULL;
+	float *work = NULL;
+	int code = exterior_views_open(&views, options, err);
 
-	if (measured == NULL || work == NULL)
-		code = error_set(err, ERR_NO_MEMORY, "no memory for a view of %d x %d pixels", geometry->columns,
-				 geometry->rows);
-	for (int i = 0; i < looked_at && code == 0; i++) {
-		const int view = (int)((long long)i * geometry->count / looked_at);
-
-		code = options->backend->stack_download(options->projections, view, 1, measured, err);
-		if (code == 0 && !is_blank(measured, pixels))
-			look_at(look, grid, geometry, options->orbit, view, measured, work);
+	if (code < 0)
+		return code;
+	shadows = malloc((size_t)views.together * sizeof(*shadows));
+	work = malloc((size_t)views.together * views.pixels * sizeof(*work));
+	if (shadows == NULL || work == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for the shadows of %d views", views.together);
+	while (code == 0 && exterior_views_next(&views, &code, err)) {
+#pragma omp parallel
+		{
+#pragma omp for schedule(static)
+			for (int i = 0; i < views.here; i++)
+				shadows[i] = shadow_make(options, grid, exterior_views_index(&views, i),
+							 views.images + (size_t)i * views.pixels,
+							 work + (size_t)i * views.pixels);
+#pragma omp for collapse(2) schedule(dynamic, 16)
+			for (int z = 0; z < grid->size[2]; z++)
+				for (int y = 0; y < grid->size[1]; y++)
+					for (int i = 0; i < views.here; i++)
+						if (shadows[i].matter != NULL)
+							look_along(look, grid, &shadows[i], y, z);
+		}
 	}
-	free(measured);
+	exterior_views_close(&views);
+	free(shadows);
 	free(work);
 	return code;
 }

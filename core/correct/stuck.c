@@ -257,13 +257,16 @@ void stuck_add(struct stuck *stuck, const void *samples)
 	const size_t pixels = (size_t)rows * (size_t)stuck->geometry->columns;
 	float largest = stuck->largest;
 
-#pragma omp parallel for schedule(static)
-	for (int row = 0; row < rows; row++)
-		read_row(stuck, samples, row);
-#pragma omp parallel for schedule(static)
-	for (int row = 0; row < rows; row++) {
-		medians_of_row(stuck, row);
-		add_row(stuck, row);
+#pragma omp parallel
+	{
+#pragma omp for schedule(static)
+		for (int row = 0; row < rows; row++)
+			read_row(stuck, samples, row);
+#pragma omp for schedule(static)
+		for (int row = 0; row < rows; row++) {
+			medians_of_row(stuck, row);
+			add_row(stuck, row);
+		}
 	}
 	/* The largest of a sample of the pixels: a stuck one may be the largest of all. */
 	for (size_t i = 0; i < pixels; i += pixels / 4096 + 1)
