@@ -125,8 +125,8 @@ static struct exterior_rows look_at_rows(const struct exterior_volume_options *o
 	struct exterior_rows found = {.beside = outside.beside, .outside = outside.beside + outside.ends};
 
 	for (int r = 0; r < rows; r++)
-		found.truncated += is_truncated(options->orbit->pad, measured + (size_t)r * (size_t)columns, columns,
-						largest, air);
+		found.truncated +=
+		    is_truncated(options->orbit->pad, measured + (size_t)r * (size_t)columns, columns, largest, air);
 	return found;
 }
 

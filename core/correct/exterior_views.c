@@ -44,9 +44,8 @@ bool exterior_views_next(struct exterior_views *views, int *ret_code, struct err
 	views->here = here < views->together ? here : views->together;
 	*ret_code = 0;
 	for (int i = 0; i < views->here && *ret_code == 0; i++)
-		*ret_code =
-		    options->backend->stack_download(options->projections, exterior_views_index(views, i), 1,
-						     views->images + (size_t)i * views->pixels, err);
+		*ret_code = options->backend->stack_download(options->projections, exterior_views_index(views, i), 1,
+							     views->images + (size_t)i * views->pixels, err);
 	return *ret_code == 0 && views->here > 0;
 }
 

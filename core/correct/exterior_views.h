@@ -4,8 +4,8 @@
 #include "core/correct/exterior_volume.h"
 
 /*
- * Some of a scan's projections, spread over the orbit: what is empty, and what goes on outside of the grid, shows in many
- * of them. They come to the host a few at a time, so that each processor has one to itself.
+ * Some of a scan's projections, spread over the orbit: what is empty, and what goes on outside of the grid, shows in
+ *many of them. They come to the host a few at a time, so that each processor has one to itself.
  *
  *	for (code = exterior_views_open(...); code == 0 && exterior_views_next(&views, &code, err);)
  *		... views.images[i], i < views.here
