@@ -662,7 +662,7 @@ int backproject_views(struct plan *plan, const float *from, int first, int count
 	struct voxel_use sum = use;
 
 	if (plan->options.matched && !use.fdk)
-		return matched_views(plan, from, first, count, use, volume, NULL, err);
+		return matched_views(plan, from, first, count, use, volume, err);
 	if (parts) {
 		sum.update = false;
 		CUDA_TRY(cudaMemsetAsync(plan->work, 0, grid_voxels(plan->options.grid) * sizeof(float),
@@ -683,6 +683,8 @@ int coverage_sum(struct plan *plan, int first, int count, struct error *err)
 {
 	cudaStream_t stream = plan->device->stream;
 
+	if (plan->options.matched)
+		return matched_coverage(plan, first, count, err);
 	CUDA_TRY(cudaMemsetAsync(plan->coverage, 0, grid_voxels(plan->options.grid) * sizeof(float), stream));
 	for (int done = 0; done < count; done += VIEWS_AT_ONCE) {
 		backprojection_job job = job_make(plan, plan->coverage, {});

@@ -250,6 +250,12 @@ enum { ROWS_APART = 4 };   /* rows of a thread that share columns, but no values
  */
 enum thrift { THRIFT_NONE, THRIFT_HALVES, THRIFT_2_PARTS, THRIFT_3_PARTS, THRIFT_4_PARTS, THRIFT_LEAN };
 
+/*
+ * The matched backprojection, by what its rays are like: no ray along z and the detector's columns along z, rows at
+ * least a voxel or half a voxel apart; no ray along z; any.
+ */
+enum matched { MATCHED_ANY, MATCHED_TILTED, MATCHED_UPRIGHT, MATCHED_UPRIGHT_FAR };
+
 /* How a plan does its work; chosen once from geometry and options. */
 struct plan_shape {
 	bool untilted;    /* the fast kernels apply */
@@ -263,10 +269,11 @@ struct plan_shape {
 	int back_voxels; /* voxels of one window in the untilted backprojection; 0: the general one */
 	bool is_small;   /* launches take longer than samples: the plainest kernels */
 	enum neighbours back_neighbours;
-	bool back_pairs; /* it reads pairs in half precision */
-	bool textures;   /* 8-bit interpolation weights are allowed */
-	bool z_rays;     /* some ray runs closer to z than to x and y */
-	int batch;       /* views filtered and backprojected in one go */
+	bool back_pairs;      /* it reads pairs in half precision */
+	bool textures;        /* 8-bit interpolation weights are allowed */
+	bool z_rays;          /* some ray runs closer to z than to x and y */
+	enum matched matched; /* how the matched backprojection goes */
+	int batch;            /* views filtered and backprojected in one go */
 	enum thrift thrift;
 	int correction;      /* slots of the correction stack, 0 without SART */
 	bool parts;          /* it holds a part of a subset only */
@@ -464,11 +471,14 @@ const char *backprojector_name(const struct plan *plan, bool fdk); /* of backpro
 
 /* ---- matched.cu ---- */
 /*
- * The transpose of project_rays, any number of views in one launch. An update has its
- * column sums by itself; a mere sum adds them to `cover`, unless that is NULL.
+ * The transpose of project_rays. The plan's own corrections are changed on the way, and any number of them is
+ * one launch; other projections take the scratch, and are added to the volume.
  */
 int matched_views(struct plan *plan, const float *from, int first, int count, struct voxel_use use, float *volume,
-		  float *cover, struct error *err);
+		  struct error *err);
+/* -> coverage; takes the scratch */
+int matched_coverage(struct plan *plan, int first, int count, struct error *err);
+size_t matched_scratch_bytes(const struct plan *plan); /* at least */
 
 /* ---- filter.cu ---- */
 int filter_choose(int columns);

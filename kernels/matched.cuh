@@ -12,6 +12,9 @@
  *   B(y) = hat(y) + kink(y - 1) - 2 kink(y) + kink(y + 1), hat(y) = max(1 - |y|, 0),
  *   C(y) = hat(y);
  *
+ * step is the way per slice: from the source to the pixel in mm, over the direction's part along the axis. The former
+ * is the pixel's alone, so projections come multiplied by it (matched.cu).
+ *
  * what falls beyond the outer voxels goes to these, whose values the projection holds.
  *
  * Voxels gather: a thread has a run of them along z and takes, view by view and
@@ -29,13 +32,13 @@ struct matched_job {
 	const device_view *geometry;
 	const int *views;
 	int count;
-	const float *from; /* row 0, column 0 of the first view's slot */
+	const float *from; /* row 0, column 0 of the first view's slot, values times the way to the pixel */
 	int columns, rows, pitch;
 	size_t slot;
 	device_grid grid;
 	bool z_rays; /* some rays run along z */
 	struct voxel_use use;
-	float *volume, *cover;
+	float *volume;
 };
 
 /* Voxels row .. row + COUNT - 1 in column `fast` of slice `slice` of an axis. */
@@ -124,11 +127,10 @@ static __device__ __forceinline__ float part_across(float fast, int j, int count
 	return fmaf(slope * (1.0f / 6.0f), kinks, __saturatef(1.0f - fabsf(held)));
 }
 
-/* Gathers what a run takes from the rays of its axis in one view, and from ones. */
+/* Gathers what a run takes from the rays of its axis in one view. */
 template <int COUNT>
 static __device__ __forceinline__ void matched_gather(const matched_job &job, const device_view &g,
-						      const float *projection, const matched_run &run, float sum[COUNT],
-						      float cover[COUNT])
+						      const float *projection, const matched_run &run, float sum[COUNT])
 {
 	slice_axes axes = axes_of(job.grid, run.axis);
 	float reach = reach_across(g, axes, run, COUNT), least = 1e-6f, slice = (float)run.slice;
@@ -157,32 +159,30 @@ static __device__ __forceinline__ void matched_gather(const matched_job &job, co
 			float weight = part_across(fmaf(slice, s.fast_step, s.fast), run.fast, axes.fast, slope,
 						   1.0f / fmaxf(slope, least));
 
-			weight *= inside ? s.step : s.step * part_of(run.slice, s.begin, s.end);
+			weight /= fabsf(run.axis == ACROSS_X ? d[0] : run.axis == ACROSS_Y ? d[1] : d[2]);
+			weight *= inside ? 1.0f : part_of(run.slice, s.begin, s.end);
 			if (!(weight > 0))
 				continue;
 			up = fminf(fmaxf(up, 0.0f), (float)(axes.rows - 1));
-			float value = values[column];
+			weight *= values[column];
 #pragma unroll
-			for (int n = 0; n < COUNT; n++) {
-				float part = weight * __saturatef(1.0f - fabsf(up - (float)(run.row + n)));
-
-				sum[n] = fmaf(part, value, sum[n]);
-				cover[n] += part;
-			}
+			for (int n = 0; n < COUNT; n++)
+				sum[n] = fmaf(weight, __saturatef(1.0f - fabsf(up - (float)(run.row + n))), sum[n]);
 		}
 	}
 }
 
-/* Applies the sums of a voxel to the volume: adds them, or makes SART's update. */
-static __device__ __forceinline__ void matched_put(const matched_job &job, size_t at, float sum, float cover)
+/* Applies the sum of a voxel to the volume: adds it, or makes SART's update. */
+static __device__ __forceinline__ void matched_put(const matched_job &job, size_t at, float sum)
 {
 	if (!job.use.update) {
 		job.volume[at] += sum;
-		if (job.cover != NULL)
-			job.cover[at] += cover;
-	} else if (cover > 0) { /* else no ray sees it */
-		job.volume[at] = update_voxel(job.volume[at], job.use.scale, sum / fmaxf(cover, job.use.least),
-					      job.use.nonnegative && cover > job.use.least);
+	} else {
+		float cover = job.use.coverage[at];
+
+		if (cover > 0) /* else no ray sees it */
+			job.volume[at] = update_voxel(job.volume[at], job.use.scale, sum / fmaxf(cover, job.use.least),
+						      job.use.nonnegative && cover > job.use.least);
 	}
 }
 
@@ -190,7 +190,7 @@ static __device__ __forceinline__ void matched_put(const matched_job &job, size_
 static __device__ __forceinline__ void matched_thread(const matched_job &job, int x, int y, int z)
 {
 	const int *size = job.grid.size;
-	float sum[MATCHED_RUN] = {}, cover[MATCHED_RUN] = {};
+	float sum[MATCHED_RUN] = {};
 	const float *projection = job.from;
 
 	if (x >= size[0] || y >= size[1])
@@ -200,14 +200,13 @@ static __device__ __forceinline__ void matched_thread(const matched_job &job, in
 
 		for (int axis = ACROSS_X; axis <= ACROSS_Y; axis++)
 			matched_gather<MATCHED_RUN>(job, g, projection,
-						    {axis, axis == ACROSS_X ? x : y, axis == ACROSS_X ? y : x, z}, sum,
-						    cover);
+						    {axis, axis == ACROSS_X ? x : y, axis == ACROSS_X ? y : x, z}, sum);
 		for (int n = 0; job.z_rays && n < MATCHED_RUN; n++)
 			if (z + n < size[2])
-				matched_gather<1>(job, g, projection, {ACROSS_Z, z + n, x, y}, sum + n, cover + n);
+				matched_gather<1>(job, g, projection, {ACROSS_Z, z + n, x, y}, sum + n);
 	}
 	for (int n = 0; n < MATCHED_RUN && z + n < size[2]; n++)
-		matched_put(job, ((size_t)(z + n) * size[1] + y) * size[0] + x, sum[n], cover[n]);
+		matched_put(job, ((size_t)(z + n) * size[1] + y) * size[0] + x, sum[n]);
 }
 
 #endif

@@ -221,6 +221,54 @@ static bool is_untilted(const struct plan_options *options)
 	return true;
 }
 
+/* The same for the matched backprojection, which leaves the columns' lean out: to what float32 rounds. */
+static bool is_upright(const struct geometry *geometry)
+{
+	const double pixels = 1e-6;
+
+	for (int k = 0; k < geometry->count; k++) {
+		const double *u = geometry->views[k].column_step, *v = geometry->views[k].row_step;
+
+		if (fabs(u[2]) * geometry->columns > pixels * vec_norm(v) ||
+		    hypot(v[0], v[1]) * geometry->rows > pixels * vec_norm(u))
+			return false;
+	}
+	return true;
+}
+
+/* All of the grid is well before the source: places on the detector can be told by quotients. */
+static bool is_before_source(const struct geometry *geometry, const struct grid *grid)
+{
+	const double least = 0.05; /* of the isocentre's depth */
+	const double isocentre[3] = {0, 0, 0};
+
+	for (int k = 0; k < geometry->count; k++) {
+		double matrix[12], point[3], column, row, depth;
+
+		view_matrix(&geometry->views[k], matrix);
+		depth = view_project(matrix, isocentre, &column, &row);
+		for (int corner = 0; corner < 8; corner++) {
+			corner_of(grid, corner, 2, point);
+			if (!(view_project(matrix, point, &column, &row) > least * depth) || !(depth > 0))
+				return false;
+		}
+	}
+	return true;
+}
+
+static enum matched choose_matched(const struct plan_options *options, bool z_rays)
+{
+	double least, most;
+	int sign;
+
+	if (z_rays || !is_before_source(options->geometry, options->grid))
+		return MATCHED_ANY;
+	if (!is_upright(options->geometry))
+		return MATCHED_TILTED;
+	row_spacing(options->geometry, options->grid, &least, &most, &sign);
+	return least >= 1.01 ? MATCHED_UPRIGHT_FAR : least >= 0.505 ? MATCHED_UPRIGHT : MATCHED_TILTED;
+}
+
 static void choose_rows(const struct plan_options *options, struct plan_shape *shape)
 {
 	const struct geometry *geometry = options->geometry;
@@ -296,12 +344,13 @@ static struct plan_shape shape_of(const struct plan_options *options, enum thrif
 		shape.subset = subsets_largest(&options->sart->subsets);
 	shape.z_rays = has_z_rays(geometry, grid);
 	shape.is_small = (double)grid_voxels(grid) * geometry->count < SMALL;
+	shape.matched = choose_matched(options, shape.z_rays);
 	/* The transpose is that of the general projection in float, whose weights are its own to the last bits. */
 	shape.halves = !options->reference_precision && !shape.is_small && !options->matched;
 	choose_rows(options, &shape);
 	if (shape.is_small)
 		shape.back_voxels = 0;
-	if (shape.is_small || options->matched)
+	if (shape.is_small || (options->matched && shape.matched < MATCHED_UPRIGHT))
 		shape.forward_rows = 0;
 	shape.view_warps = view_warps(geometry, grid, shape.forward_rows);
 	shape.textures = thrift != THRIFT_LEAN && !shape.is_small && !options->reference_precision && fits &&
@@ -407,6 +456,7 @@ static void describe_scratch(struct plan *plan)
 		plan->slices_bytes = at_least(plan->slices_bytes, plan->strategy->scratch_bytes(plan));
 	plan->scratch_bytes = at_least(plan->slices_bytes, tv_scratch_bytes(options));
 	plan->scratch_bytes = at_least(plan->scratch_bytes, filter_scratch_bytes(plan, plan->scratch_bytes));
+	plan->scratch_bytes = at_least(plan->scratch_bytes, matched_scratch_bytes(plan));
 	plan->scratch_bytes = at_least(plan->scratch_bytes, options->lends);
 }
 
@@ -460,10 +510,9 @@ static bool needs_work(const struct plan *plan)
 {
 	return plan->shape.parts || (plan->shape.correction > plan->shape.views_at_once && !plan->options.matched);
 }
-/* The matched projector has column sums by itself where a subset goes in one launch. */
 static bool needs_coverage(const struct plan *plan)
 {
-	return plan->shape.correction > 0 && !plan->shape.covered && (!plan->options.matched || needs_work(plan));
+	return plan->shape.correction > 0 && !plan->shape.covered;
 }
 
 /* SART's part of the plan's memory: column sums, numerators, squares, and that of its strategy. */

@@ -1,8 +1,7 @@
 /*
  * SART, OS-SART and SIRT (core/recon/sart.c has the formula). Row sums are lengths
  * (rays.cuh), column sums are numbers of views where the whole grid is seen, so
- * neither needs memory. The matched projector has its own column sums, which
- * come along with its backprojection (matched.cuh).
+ * neither needs memory. The matched projector has its own column sums (matched.cu).
  *
  * Updates of several views: forward projection with the correction
  * (p - A v) / L as its result, then backprojection that ends in the update.
@@ -256,11 +255,11 @@ static int update_subset(struct plan *plan, int subset, const float *projections
 	voxels.scale = (float)(plan->shape.covered ? sart->relaxation / count : sart->relaxation);
 	voxels.coverage = plan->shape.covered ? NULL : plan->coverage;
 	voxels.least = plan->options.matched ? (float)COLUMN_SUM_LEAST * spacing_least(plan) : 0.0f;
-	TRY(plan->strategy->lay_out(plan, volume, err));
-	if (!plan->shape.covered && !plan->options.matched && plan->coverage_subset != subset) {
+	if (!plan->shape.covered && plan->coverage_subset != subset) {
 		TRY(coverage_sum(plan, first, count, err));
 		plan->coverage_subset = sart->subsets.count > 1 ? -1 : subset;
 	}
+	TRY(plan->strategy->lay_out(plan, volume, err));
 	if (count <= plan->shape.correction) {
 		if (plan->projections.array != NULL && !plan->options.matched && count <= plan->shape.views_at_once) {
 			rays.array = plan->projections.surface;
@@ -275,17 +274,12 @@ static int update_subset(struct plan *plan, int subset, const float *projections
 	struct voxel_use sum = voxels;
 	sum.update = false;
 	CUDA_TRY(cudaMemsetAsync(plan->work, 0, bytes, plan->device->stream));
-	if (plan->options.matched)
-		CUDA_TRY(cudaMemsetAsync(plan->coverage, 0, bytes, plan->device->stream));
 	for (int done = 0; done < count; done += plan->shape.correction) {
 		int now = count - done < plan->shape.correction ? count - done : plan->shape.correction;
 
 		TRY(project(plan, volume, first + done, now, rays, correction, err));
 		rays.partial += plan->strategy->partials(plan, now);
-		if (plan->options.matched)
-			TRY(matched_views(plan, correction, first + done, now, sum, plan->work, plan->coverage, err));
-		else
-			TRY(backproject_views(plan, correction, first + done, now, sum, plan->work, err));
+		TRY(backproject_views(plan, correction, first + done, now, sum, plan->work, err));
 	}
 	if (last)
 		TRY(begin_sums(plan, err));
@@ -463,7 +457,7 @@ static int iterate(struct plan *plan, const float *projections, float *volume, c
  */
 static bool worth_recording(const struct plan *plan)
 {
-	const double updates_a_second = plan->options.matched ? 5e10 : 5e11; /* the former by count of instructions */
+	const double updates_a_second = plan->options.matched ? 1e11 : 5e11;
 
 	return (double)grid_voxels(plan->options.grid) * plan->options.geometry->count < 0.5 * updates_a_second;
 }
@@ -519,7 +513,7 @@ int cuda_sart_iterate(struct plan *plan, const struct stack *projections, struct
 		if (plan->recorded == NULL || plan->recorded_volume != volume->data ||
 		    plan->recorded_stack != projections->data) {
 			/* With one subset the column sums are made now and not again and again. */
-			if (plan->coverage != NULL && one && !matched && plan->coverage_subset != 0) {
+			if (plan->coverage != NULL && one && plan->coverage_subset != 0) {
 				TRY(coverage_sum(plan, 0, count, err));
 				plan->coverage_subset = 0;
 			}

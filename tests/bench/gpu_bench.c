@@ -28,7 +28,7 @@ struct bench_case {
 	char letter;
 	struct scene_options options;
 	/* ms: any geometry, untilted; 0: none stated */
-	double project[2], backproject[2], filter[2], fdk[2], sirt[2], subsets[2], views[2];
+	double project[2], backproject[2], filter[2], fdk[2], sirt[2], subsets[2], views[2], matched[2];
 	int sirt_count; /* iterations in one measurement */
 	double samples; /* 1e9, of the forward projection along dominant axes; 0: not counted */
 };
@@ -49,6 +49,7 @@ static const struct bench_case cases[] = {
      {4.2, 3.6},
      {5.5, 5},
      {10, 8},
+     {10, 8},
      1,
      2.393},
     {'B',
@@ -66,6 +67,7 @@ static const struct bench_case cases[] = {
      {.9, .8},
      {0, 0},
      {2.5, 2.2},
+     {0, 0},
      1,
      0},
     {'C',
@@ -81,6 +83,7 @@ static const struct bench_case cases[] = {
      {0, 0},
      {0, 0},
      {.6, .6},
+     {0, 0},
      {0, 0},
      {0, 0},
      20,
@@ -100,6 +103,7 @@ static const struct bench_case cases[] = {
      {135, 95},
      {0, 0},
      {330, 300},
+     {300, 220},
      1,
      70.31},
     {'E',
@@ -114,6 +118,7 @@ static const struct bench_case cases[] = {
      {700, 500},
      {0, 0},
      {715, 515},
+     {0, 0},
      {0, 0},
      {0, 0},
      {0, 0},
@@ -356,7 +361,7 @@ static void bench_geometry(const struct bench_case *c, bool untilted)
 		   c->sirt_count);
 	if (c->letter == 'A' || c->letter == 'D') {
 		bench.matched = true;
-		bench_sart(&bench, c, kind, 1, "matched SIRT iteration", 0, 1);
+		bench_sart(&bench, c, kind, 1, "matched SIRT iteration", c->matched[untilted], 1);
 		bench.matched = false;
 	}
 	if (!big) {
