@@ -97,7 +97,8 @@ TRUNCATION_INLINE float truncation_level_of_many(float largest)
 {
 	return 0.6f * truncation_level(largest);
 }
-/* From the sum over the edge and that of squared second differences, six times the noise's variance each. */
+/* True if the edge's mean is within 3 sigma of zero. bends: sum of squared second differences, expectation 6 sigma^2
+ * each. */
 TRUNCATION_INLINE bool truncation_is_chance(int columns, double sum, double bends)
 {
 	const int window = truncation_window(columns);

@@ -291,7 +291,7 @@ static __global__ void __launch_bounds__(ROWS_WIDE *ROWS_HIGH, 5) backproject_pa
 				float row = fmaf((float)(n * VOXELS), rise, first);
 				float base = fminf(fmaxf(row + lowest, (float)-STACK_PAD), job.rows);
 				float shifted = __fadd_rd(base, SPLIT_SHIFT), low = shifted - SPLIT_SHIFT;
-				/* How far the first voxel lies above the second row. */
+				/* Distance of the first voxel above the second row. */
 				float t = row - (shifted - (SPLIT_SHIFT - 1.0f));
 				const __half2 *r = there + (int)(__float_as_uint(shifted) - SPLIT_BITS) * PANEL;
 				__half2 q[pairs], value[twos];
@@ -459,7 +459,7 @@ static int load_array(struct plan *plan, const backprojection_job &job, struct e
 	return 0;
 }
 
-/* In float runs are shorter: a thread needs twice the registers. */
+/* Runs are shorter in float: a thread needs twice the registers. */
 template <neighbours KIND, int VOXELS, int WINDOWS, int FLOAT_WINDOWS>
 static void launch_rows(const struct plan_shape *shape, const backprojection_job &job, cudaStream_t stream)
 {
@@ -515,7 +515,7 @@ static backprojection_job job_make(const struct plan *plan, float *volume, struc
 	return job;
 }
 
-/* By rows, of pairs that are laid out. */
+/* Launches the backprojection by rows, of pairs that are laid out. */
 static void launch_pairs(const struct plan_shape *shape, const backprojection_job &job, cudaStream_t stream)
 {
 	switch (shape->back_neighbours * 8 + shape->back_voxels) {

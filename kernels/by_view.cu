@@ -472,7 +472,7 @@ int by_view_rows_prepare(struct plan *plan, struct error *err)
 	return 0;
 }
 
-/* All but the views and what they give. */
+/* Sets all members but the views and their results. */
 static rows_view rows_view_make(const struct plan *plan, float *volume, float least)
 {
 	__half2 *memory = (__half2 *)plan->scratch;

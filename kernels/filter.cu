@@ -440,7 +440,7 @@ static __global__ void __launch_bounds__(EDGE_THREADS)
 
 /* ---- cuFFT ---- */
 
-/* Where a row of all rows of the call comes from and goes to. */
+/* Source and target of one of the call's rows. */
 struct row_place {
 	int view, row;
 	size_t from, to, index;
@@ -670,7 +670,7 @@ static int prepare_fused(struct plan *plan, struct error *err)
 	return upload(plan->filter->twiddles, twiddles.data(), twiddles.size() * sizeof(float2), err);
 }
 
-/* Both transforms of so many rows with one workspace of *ret_bytes; false: cuFFT will not. */
+/* Makes both transforms of so many rows with one workspace of *ret_bytes; false: cuFFT refuses. */
 static bool fft_make(struct fft *fft, int length, int rows, cudaStream_t stream, void *workspace, size_t *ret_bytes)
 {
 	int half = length / 2 + 1, padded = length + 2;
@@ -810,7 +810,7 @@ static filter_job job_make(const struct plan *plan, const struct stack *from, co
 	return job;
 }
 
-/* All rows as they are. */
+/* Filters all rows without extending any. */
 static int filter_plain(struct plan *plan, filter_job job, struct error *err)
 {
 	cudaStream_t stream = plan->device->stream;

@@ -96,7 +96,7 @@ static bool has_z_rays(const struct geometry *geometry, const struct grid *grid)
 	return false;
 }
 
-/* How far a detector's rows step aside for a step along z, and what that may be for the projection by rows. */
+/* The rows' step aside for a step along z; the most of it that the projection by rows allows. */
 static double lean_of(const struct view *view)
 {
 	return hypot(view->row_step[0], view->row_step[1]) / fabs(view->row_step[2]);
@@ -163,7 +163,7 @@ static void row_spacing(const struct geometry *geometry, const struct grid *grid
 	*ret_sign = abs(up) == geometry->count ? (up > 0 ? 1 : -1) : 0;
 }
 
-/* In the order of preference: the more neighbours for a common value, the better. */
+/* Choices stand in the order of preference: the more neighbours for a common value, the better. */
 struct neighbours_choice {
 	enum neighbours kind;
 	int count;
@@ -176,7 +176,7 @@ static const neighbours_choice back_neighbours[] = {{NEIGHBOURS_TWOS, 5},   {NEI
 						    {NEIGHBOURS_WIDE, 4},   {NEIGHBOURS_EVEN, 3}, {NEIGHBOURS_EVEN, 0}};
 
 /*
- * Whether all neighbours find their values at this spacing: as the kernels place them, each lies
+ * True if all neighbours find their values at this spacing: as the kernels place them, each lies
  * 0 .. 1 above the first of its own, and the lowest is up to one value above that.
  */
 static bool neighbours_hold(neighbours_choice choice, double spacing)
@@ -708,7 +708,7 @@ static struct device_view view_make(const struct plan_options *options, int inde
 	return result;
 }
 
-/* In an order of their own, NULL: as they are. */
+/* Uploads the views in this order; NULL: by their numbers. */
 static int upload_views(struct plan *plan, const int *order, struct device_view *to, struct error *err)
 {
 	int count = plan->options.geometry->count;

@@ -206,7 +206,7 @@ static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS, GENE
  */
 enum { SMALL_WARPS = 2, SMALL_PARTS = 4, SMALL_PIXELS = 32 * SMALL_WARPS };
 
-/* From the volume as it is, which the caches hold. */
+/* Projects from the volume as it is, which the caches hold. */
 static __global__ void __launch_bounds__(SMALL_PIXELS *SMALL_PARTS, 4) project_small(const projection p)
 {
 	__shared__ float sums[SMALL_PARTS][SMALL_PIXELS];
@@ -289,7 +289,7 @@ static __device__ __forceinline__ void add_slices(const float *at, const slices 
 	}
 }
 
-/* The same in half precision. */
+/* Adds slices in half precision. */
 template <neighbours KIND, int ROWS, int GUARD, bool LEAN, typename Ends>
 static __device__ __forceinline__ void add_slices(const __half2 *at, const slices &across, int from, int to,
 						  const fan &f, const half_wandering &wander, const slice_axes &axes,

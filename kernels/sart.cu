@@ -270,7 +270,7 @@ static int update_subset(struct plan *plan, int subset, const float *projections
 			TRY(begin_sums(plan, err));
 		return backproject_views(plan, correction, first, count, voxels, volume, err);
 	}
-	/* In parts: the volume stays as it is until all of the subset has been seen. */
+	/* A subset in parts leaves the volume as it is until all of it has been seen. */
 	struct voxel_use sum = voxels;
 	sum.update = false;
 	CUDA_TRY(cudaMemsetAsync(plan->work, 0, bytes, plan->device->stream));

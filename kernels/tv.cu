@@ -326,7 +326,7 @@ static void launch_groups(const struct device *device, const tv_volumes &volumes
 	blocks.z = divide_up(step.nz, step.planes);
 	march<KIND, V><<<blocks, dim3(32, WARPS), 0, device->stream>>>(volumes, step);
 }
-/* In groups as long as keep rows aligned. */
+/* Launches with the longest groups of voxels that keep rows aligned. */
 template <tv_kind KIND>
 static void launch(const struct device *device, const tv_volumes &volumes, const tv_step &step)
 {
@@ -346,7 +346,7 @@ static double weight_of(const struct plan *plan, int axis)
 	return fmin(fmin(spacing[0], spacing[1]), spacing[2]) / spacing[axis];
 }
 
-/* With flux and v in proportion to these; u = v / unit. */
+/* Makes a step with flux and v in proportion to these; u = v / unit. */
 static tv_step step_make(const struct plan *plan, double slope, double flow, double fidelity)
 {
 	tv_step s = {};

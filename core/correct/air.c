@@ -10,7 +10,7 @@ enum { LOOKED_AT = 64 }; /* rows */
 static const float LEAST = 0.02f, MOST = 0.15f;
 /* The most that air can have, as a share of the view's largest line integral. */
 static const float LITTLE = 0.25f;
-/* How far a mean at a row's ends may lie from the level to agree: a share of it, and an allowance for noise. */
+/* A mean at a row's ends agrees with the level if it is this near: a share of it, and an allowance for noise. */
 static const float SHARE = 0.25f, NOISE = 0.01f;
 /* The share of the rows that must agree. */
 static const float NEARLY_ALL = 0.9f;

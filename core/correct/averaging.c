@@ -111,7 +111,7 @@ double averaging_ratio(double pixels, const struct averaging_sums sums[AVERAGING
 }
 
 /*
- * What is seen of views on their way in, before the exterior is taken out: that leaves edges of its own where its
+ * Statistics of the views on their way in, before the exterior is taken out: that leaves edges of its own where its
  * coarse model ends. Sums of each view by itself, so that the order in which they come makes no difference.
  */
 struct state {

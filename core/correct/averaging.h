@@ -55,7 +55,7 @@ int averaging_add(const float *view, int columns, int rows, int row_step, int ap
 enum { AVERAGING_DISTANCES = 4 };
 void averaging_distances(double pixels, int ret_distances[AVERAGING_DISTANCES]);
 double averaging_ratio(double pixels, const struct averaging_sums sums[AVERAGING_DISTANCES]);
-/* Of a voxel's width, 0 .. 1, over which the mean goes. */
+/* Share of a voxel's width, 0 .. 1, over which the mean goes. */
 double averaging_share(double ratio);
 
 #endif

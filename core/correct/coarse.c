@@ -21,7 +21,7 @@ static void reduced_clear(struct reduced *reduced)
 
 /* ---- which rays ---- */
 
-/* At least as many bins as keep them no wider than a voxel. */
+/* Number of bins, as many as keep them no wider than a voxel. */
 static int bins(int pixels, double pixel, double voxel)
 {
 	const int pixels_of_a_bin = (int)fmax(1, floor(voxel / pixel + 1e-6));
@@ -51,7 +51,7 @@ static int choose_views(const struct coarse_options *options, int *ret_views, in
 	return 0;
 }
 
-/* The same rays in bins: the first one's centre lies half of what it holds from the detector's edge. */
+/* Geometry of the same rays in bins: the first one's centre lies half of what it holds from the detector's edge. */
 static struct view view_in_bins(const struct view *view, const double pixels_of_a_bin[2])
 {
 	struct view ret = *view;

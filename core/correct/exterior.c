@@ -1,4 +1,4 @@
-/* What lies outside of the grid is taken out of the projections: see exterior.h. */
+/* The exterior, all matter outside of the grid, is taken out of the projections: see exterior.h. */
 #include "core/correct/exterior.h"
 
 #include <math.h>
@@ -54,7 +54,7 @@ static double line_at(const struct stretch *stretch, int column)
 	return stretch->sum / n + slope * (column - middle);
 }
 
-/* What changes slowly along the row of what w does not explain. */
+/* Smooths the difference of a measured row and the one that w explains. */
 static void smooth_row(const float *measured, const float *explained, double *ret, int columns)
 {
 	const int reach = columns / EXTERIOR_PART > 2 ? columns / EXTERIOR_PART : 2;
@@ -244,7 +244,7 @@ int exterior_subtract(const struct exterior_volume *exterior, const struct exter
 	return code;
 }
 
-/* Where the share that is not seen by all views is above 0, that share of w. */
+/* Blends w into the values by the share, 1 - seen, that not all views see. */
 static void mix(const float *seen, const float *w, float *values, size_t count)
 {
 #pragma omp parallel for schedule(static)

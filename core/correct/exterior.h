@@ -4,7 +4,7 @@
 #include "core/correct/exterior_volume.h"
 
 /*
- * What lies outside of the grid, in SART. A line integral counts all of the
+ * The exterior, all matter outside of the grid, in SART. A line integral counts all of the
  * object, the grid often holds less of it than the ray meets; SART would pile
  * what lies outside up at the grid's faces and at the rim of the field of view:
  * a bright rim, and hundreds of HU in the middle. So it is taken out of the
@@ -28,7 +28,7 @@
 enum { EXTERIOR_PART = 32 };
 enum { EXTERIOR_OUTSIDE = 1, EXTERIOR_BEYOND = 2 }; /* the steps, as bits */
 
-/* How many rows of the projections are concerned. */
+/* Numbers of the projections' rows that are concerned. */
 struct exterior_rows {
 	size_t truncated, outside;
 	size_t beside; /* of `outside`, those with rays that miss the grid and are not air; exterior_look only */
@@ -39,7 +39,7 @@ struct exterior_rows {
 	bool possible;
 };
 
-/* From some of the projections and where the grid lies, sparing the rest when nothing has to be taken out. */
+/* Counts the rows by some of the projections and the place of the grid, which spares a job without any the rest. */
 int exterior_look(const struct exterior_volume_options *options, struct exterior_rows *ret_rows, struct error *err);
 
 /*

@@ -1,4 +1,4 @@
-/* What lies outside of the grid, as a correction: see exterior.h. */
+/* The exterior as a correction: see exterior.h. */
 #include <math.h>
 
 #include "core/correct/blank.h"
@@ -53,7 +53,7 @@ static int subtract(const struct correction_job *job, const struct exterior_volu
 	}
 	if (code == 0 && exterior->goes_on)
 		code = exterior_volume_fit(exterior, options, err);
-	/* What was only possible is left alone where the fit does not find it. */
+	/* An exterior that was only possible is left alone where the fit does not find it. */
 	if (code == 0 && seen->possible && seen->truncated == 0 &&
 	    !(exterior->goes_on && exterior_volume_has_outside(exterior, options->grid)))
 		steps = 0;

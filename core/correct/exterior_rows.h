@@ -27,7 +27,7 @@ struct faces {
 	bool *open[6];
 };
 
-/* Of the FDK volume, which waits for it. Free with faces_clear. */
+/* Reads the faces of the FDK volume, and waits for that. Free with faces_clear. */
 int faces_make(struct faces *ret_faces, const struct backend *backend, struct volume *volume, const struct grid *grid,
 	       struct error *err);
 void faces_clear(struct faces *faces);

@@ -177,7 +177,7 @@ static size_t larger(size_t a, size_t b)
 	return a > b ? a : b;
 }
 
-/* Of a job in which it turns out to be inside_only or not. */
+/* Memory of a job that turns out to be inside_only, or not, as the options say. */
 static int bytes_of(const struct exterior_volume_options *options, struct exterior_volume_bytes *ret_bytes,
 		    struct error *err)
 {
@@ -242,7 +242,7 @@ int exterior_volume_bytes(const struct exterior_volume_options *options, struct 
 /* Columns whose sums run down the rows together: their floats lie side by side. */
 enum { COLUMNS_TOGETHER = 32, ROWS_TOGETHER = 8 };
 
-/* Of `count` rows, side by side: each sum waits for the one before it. */
+/* Sums along `count` rows, side by side: each sum waits for the one before it. */
 static void sum_along_rows(const float *from, float *ret, int count, int columns, int reach)
 {
 	double sums[ROWS_TOGETHER] = {0};
@@ -260,7 +260,7 @@ static void sum_along_rows(const float *from, float *ret, int count, int columns
 		}
 }
 
-/* Of the columns first .. first + count - 1. */
+/* Sums along the columns first .. first + count - 1. */
 static void sum_along_columns(const float *from, float *ret, int columns, int rows, int first, int count, int reach)
 {
 	double sums[COLUMNS_TOGETHER] = {0};
@@ -289,7 +289,7 @@ static void box_sums(float *image, int columns, int rows, int reach, float *work
 				  columns - c < COLUMNS_TOGETHER ? columns - c : COLUMNS_TOGETHER, reach);
 }
 
-/* What the views say of each voxel. */
+/* Findings of the views in each voxel. */
 struct look {
 	bool *seen;  /* on the rows of all views; as of struct exterior_volume; NULL: not asked for */
 	bool *met;   /* on the detector of one; NULL: not asked for */
@@ -303,7 +303,7 @@ struct shadow {
 	const float *matter; /* [row][column]: 0 where all around is air; NULL: the view is blank */
 };
 
-/* Whether a line of voxels along x lies beyond the rows as a whole: its row changes one way along it. */
+/* True if a line of voxels along x lies beyond the rows as a whole: its row changes one way along it. */
 static bool misses_rows(const struct shadow *shadow, const struct grid *grid, int y, int z)
 {
 	double column, row[2];
@@ -387,7 +387,7 @@ static void hold_ends(struct exterior_volume *s, const bool *empty)
 				}
 }
 
-/* What stays of the FDK volume on the host, blank views made up for. */
+/* Keeps those voxels of the FDK volume that are known, on the host, blank views made up for. */
 static void keep_what_is_known(struct exterior_volume *s, const struct exterior_volume_options *options,
 			       const bool *empty)
 {
@@ -544,7 +544,8 @@ int exterior_volume_make(struct exterior_volume *s, const struct exterior_volume
 
 	*s = (struct exterior_volume){.backend = backend};
 	choose_grid(options, &s->grid);
-	/* As sharp as the voxels can hold: what is smeared over the grid's faces would be missed inside. */
+	/* The filter is as sharp as the voxels can hold: an exterior smeared over the grid's faces would be missed
+	 * inside. */
 	code = fdk_weights_make(&s->weights, orbit, options->geometry, WINDOW_RAM_LAK,
 				fmin(1, orbit->pixel_at_isocentre[0] / fmax(s->grid.spacing[0], s->grid.spacing[1])),
 				true, err);
@@ -608,7 +609,8 @@ static int axis_outside(const struct grid *grid, const double place[3])
 	return axis;
 }
 
-/* Of the 3 x 3 voxels around one, across an axis: what goes on beyond a face does so beside it, noise does not. */
+/* Mean of the 3 x 3 voxels around one, across an axis: a body that goes on beyond a face has neighbours there, noise
+ * has none. */
 static double mean_across(const struct exterior_volume *s, const int at[3], int axis)
 {
 	const int a = (axis + 1) % 3, b = (axis + 2) % 3, *size = s->grid.size;
@@ -627,8 +629,8 @@ static double mean_across(const struct exterior_volume *s, const int at[3], int 
 
 bool exterior_volume_has_outside(const struct exterior_volume *s, const struct grid *grid)
 {
-	/* Of the object's density: 0.15 where a cylinder ends with the grid, 0.27 where it ends 0.4 mm beyond, then
-	 * more. */
+	/* Share of the object's density: 0.15 where a cylinder ends with the grid, 0.27 where it ends 0.4 mm beyond,
+	 * then more. */
 	const double density = 0.25;
 	const size_t least = 64; /* voxels, against noise */
 	double squares = 0, sum = 0;

@@ -4,8 +4,9 @@
 #include "core/fdk.h"
 
 /*
- * What the object is outside of the recipe's grid (core/correct/exterior.h): a volume on a coarse grid that holds the
- * recipe's grid, the field of view, and all places in it that any ray meets, also beyond the detector's rows.
+ * A model of the exterior, the object outside of the recipe's grid (core/correct/exterior.h): a volume on a coarse grid
+ * that holds the recipe's grid, the field of view, and all places in it that any ray meets, also beyond the detector's
+ * rows.
  *
  * exterior_volume_make gives its start, an FDK volume. Out there two things are no object and set to zero: what lies
  * beside the field of view, and a place that some view sees through air, whatever a wide cone or a short arc made of
@@ -25,7 +26,7 @@
  */
 enum { EXTERIOR_VOLUME_LEAST = 64, EXTERIOR_VOLUME_MOST = 128, EXTERIOR_VOLUME_VIEWS = 4 };
 
-/* What it is made from, all of it borrowed. */
+/* Inputs of the model, all of them borrowed. */
 struct exterior_volume_options {
 	const struct backend *backend;
 	struct device *device;
@@ -65,13 +66,13 @@ int exterior_volume_bytes(const struct exterior_volume_options *options, struct 
 			  struct error *err);
 
 /*
- * Whether anything may lie outside of the recipe's grid: a place in the field of view that rays of the views looked at
- * meet, none of them through air. It is looked for on the coarse grid, so that *ret_possible is false only where no
- * fit is worth its time; blank views and those that FDK makes little of count as any other.
+ * Tells whether anything may lie outside of the recipe's grid: a place in the field of view that rays of the views
+ * looked at meet, none of them through air. It is looked for on the coarse grid, so that *ret_possible is false only
+ * where no fit is worth its time; blank views and those that FDK makes little of count as any other.
  */
 int exterior_volume_may_go_on(const struct exterior_volume_options *options, bool *ret_possible, struct error *err);
 
-/* In place, for the plan points into it: not to be copied. Free with exterior_volume_clear. */
+/* Makes the model in place, for its plan points into it: it must not be copied. Free with exterior_volume_clear. */
 int exterior_volume_make(struct exterior_volume *exterior, const struct exterior_volume_options *options,
 			 struct error *err);
 /* The same options; the projections may have changed since. */

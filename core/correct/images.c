@@ -1,4 +1,4 @@
-/* What a scan's images of its detector are worth: see images.h. */
+/* Checks of a scan's images of its detector: see images.h. */
 #include "core/correct/images.h"
 
 #include <math.h>

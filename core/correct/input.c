@@ -137,7 +137,7 @@ static void look_at_bytes(struct input *input, const uint16_t *samples)
 	}
 }
 
-/* Whether the mean of a piece of the row, 1/32 of it or 8 pixels, reaches the level. */
+/* True if the mean of a piece of the row, 1/32 of it or 8 pixels, reaches the level. */
 static bool row_reaches(const struct input *input, const void *samples, size_t first, int columns, float level)
 {
 	const int piece = columns > 256 ? columns / 32 : 8;

@@ -54,8 +54,8 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 	       int slot, struct stack *to, const void **ret_upright, struct error *err);
 
 /*
- * Whether the object extends beyond the first row, [0], and the last one, [1]: more than a quarter of the views looked
- * at have it there.
+ * Tells whether the object extends beyond the first row, [0], and the last one, [1]: more than a quarter of the views
+ * looked at have it there.
  */
 void input_goes_on(const struct input *input, bool ret_ends[2]);
 

@@ -101,7 +101,7 @@ int metal_put(struct metal *metal, const struct grid *grid, const void *bytes, s
 /* Returns the new value of voxel i of the list, which has the value `there` in the volume. */
 typedef float voxel_change(struct metal *metal, size_t i, float there, double value);
 
-/* For each slice with metal: download, change it at the list's voxels, put it back. */
+/* Downloads each slice with metal, changes it at the list's voxels, and puts it back. */
 static int change_slices(struct metal *metal, const struct metal_tools *tools, struct volume *volume,
 			 voxel_change *change, double value, struct error *err)
 {
@@ -293,7 +293,7 @@ struct flank {
 	int nearest;         /* pixels from that one to the first; 0: there is none */
 };
 
-/* From pixel (column, row) of the trace in a direction, looking no further than `most` pixels. */
+/* Finds the flank of the trace from pixel (column, row) in a direction, no further than `most` pixels away. */
 static struct flank flank_of(const struct metal_view *of, int column, int row, int dx, int dy, int most)
 {
 	struct flank flank = {0};

@@ -82,7 +82,7 @@ int metal_replace(struct metal *metal, const struct metal_tools *tools, struct e
 /* FDK of all projections, in the order of their numbers, instead of what is in `to`. */
 int metal_fdk(const struct metal_tools *tools, struct volume *to, struct error *err);
 
-/* How far the first volume can be believed: see metal_blend.c. */
+/* Reliability of the first volume in each place: see metal_blend.c. */
 struct metal_doubt {
 	float *first;               /* [z][y][x], owned: that volume, on the host */
 	int cell[3], cells[3];      /* voxels a cell, and how many cells there are along the axes */

@@ -29,7 +29,7 @@
 
 static const double RESIDUAL = 2, STARVED = 12;
 static const double CELL = 6; /* mm */
-/* In widths of FDK's blur: what is nearer to metal shows its blur in one volume and not in the other. */
+/* Distance in widths of FDK's blur: nearer to metal, one volume shows its blur and the other does not. */
 static const double BLURRED = 2.5, METAL = 1.5;
 
 void metal_doubt_clear(struct metal_doubt *doubt)

@@ -1,4 +1,4 @@
-/* Where metal is in a volume: see metal.c. */
+/* Finds the metal in a volume: see metal.c. */
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>

@@ -56,7 +56,7 @@ static struct metal_tools tools_of(const struct correction_job *job)
 
 /* ---- samples without counts ---- */
 
-/* Whether a sample is not above the dark, where the detector could have counted. */
+/* True if a sample is not above the dark, where the detector could have counted. */
 static bool has_no_counts(const struct input *input, const void *samples, size_t at)
 {
 	float p;

@@ -109,7 +109,7 @@ static int held(int index, int count)
 	return index < 0 ? 0 : index < count ? index : count - 1;
 }
 
-/* Whether a pixel has no neighbours beyond this end of a row or column. */
+/* 1: a pixel has no neighbours before it in its row or column; -1: none behind it; 0: both. */
 static int edge_at(int index, int count)
 {
 	return index < AWAY ? 1 : index >= count - AWAY ? -1 : 0;
@@ -146,7 +146,7 @@ static void sort(float values[NEIGHBOURS], int count)
 	}
 }
 
-/* Of the good neighbours; the pixel's own value where none is good, which is_stuck takes for no stuck one. */
+/* Median of the good neighbours; the pixel's own value where none is good, which is_stuck takes for no stuck one. */
 static float median_of(const struct stuck *stuck, int column, int row)
 {
 	size_t near[NEIGHBOURS];
@@ -294,7 +294,7 @@ static struct behaviour behaviour_of(const struct sums *sums)
 	};
 }
 
-/* Whether a pixel's ray passes the axis of the rotation, z, within some pixels in any view looked at. */
+/* True if a pixel's ray passes the axis of the rotation, z, within some pixels in any view looked at. */
 static bool is_on_axis(const struct stuck *stuck, int column, int row)
 {
 	const struct geometry *geometry = stuck->geometry;
@@ -316,7 +316,7 @@ static bool is_on_axis(const struct stuck *stuck, int column, int row)
 	return false;
 }
 
-/* Whether a pixel was good in half of the views at least. */
+/* True if a pixel was good in half of the views at least. */
 static bool is_known(const struct stuck *stuck, size_t at)
 {
 	return 2 * stuck->sums[at].views >= stuck->views;
@@ -328,7 +328,7 @@ static float mean_of(const struct sums *sums)
 }
 
 /*
- * Whether the good pixels right beside a pixel, all but one, are unlike it, and there are enough to tell: in the mean
+ * True if the good pixels right beside a pixel, all but one, are unlike it, and there are enough to tell: in the mean
  * by at least half of what it differs by from m, or where it wanders, by wandering less than a quarter of that.
  */
 static bool is_alone(const struct stuck *stuck, int column, int row, bool wanders)

@@ -28,7 +28,7 @@
  * A neighbour that says nothing, as one of the scan's map, is left out of m, and where that is
  * so in most views it counts as one that speaks for the pixel in the comparisons above.
  *
- * What is an object's own, however sharp, still or small, has its like beside it,
+ * A detail of the object, however sharp, still or small, has its like beside it,
  * passes, or lies on the axis. A gain that is wrong by less is none of this: that is
  * what the flat is for. Where more than a tenth of the pixels would be stuck nothing is
  * believed.
@@ -45,7 +45,7 @@ int stuck_new(const struct linearise *linearise, const struct geometry *geometry
 	      struct error *err);
 void stuck_free(struct stuck *stuck); /* NULL is fine */
 
-/* Whether a view is one of those that are looked at. */
+/* True if a view is one of those that are looked at. */
 bool stuck_wants(const struct stuck *stuck, int view);
 /* Adds one of these views, [row][column], each once; their order changes the result by rounding only. */
 void stuck_add(struct stuck *stuck, const void *samples);

@@ -9,7 +9,7 @@
 enum { ENDS = 2 };
 /* Slices that may be changed at an end: so many times the reach, as far as the volume has them. */
 enum { DEEP = 6, REACH_MOST = 4 };
-/* Of water's density, or of half the object's where that is more: 40 HU and 150 HU. */
+/* Shares of water's density, or of half the object's where that is more: 40 HU and 150 HU. */
 static const double LITTLE = 0.04, MUCH = 0.15;
 /* Voxels of the body that a slice must have for its means to say something, and at the face for an end to be looked at.
  */
@@ -26,10 +26,10 @@ struct ends {
 	bool known;   /* B is */
 	double level; /* 1/mm: water's density, or half of the object's */
 	bool shown[ENDS];
-	/* Of either end, slices counted from the face inwards, [end][slice][y][x]. */
+	/* Slices of either end, counted from the face inwards, [end][slice][y][x]. */
 	float *start; /* [zone] slices: B */
 	float *held;  /* [inner] slices: V, while V' is shown */
-	/* Of the end at work. */
+	/* Slices of the end at work. */
 	float *values;    /* [zone] slices: V, then V' */
 	float *smooth;    /* [zone] slices: D */
 	float *alternate; /* [inner] slices: a */
@@ -55,7 +55,7 @@ static int inner_of(const struct grid *grid, const struct geometry *geometry, in
 	return part < DEEP * reach ? part : DEEP * reach;
 }
 
-/* In slices: start, held, values, smooth, alternate, work. */
+/* Counts the slices of start, held, values, smooth, alternate and work. */
 static size_t slices_held(int inner, int reach)
 {
 	const size_t zone = (size_t)inner + (size_t)reach;
@@ -278,7 +278,7 @@ static bool is_body(const struct ends *ends, float start, float value)
 	return fmax((double)start, (double)value) > 0.5 * ends->level;
 }
 
-/* Whether the body comes as near to the face as the reach. By the iterate: FDK blurs a body's end across slices. */
+/* True if the body comes as near to the face as the reach. The iterate tells: FDK blurs a body's end across slices. */
 static bool is_at_face(const struct ends *ends, const float *values)
 {
 	for (int slice = 0; slice < ends->reach; slice++) {
@@ -338,7 +338,7 @@ static void blend_slice(const struct ends *ends, int slice, double doubt, const 
 	}
 }
 
-/* What became of a slice, means over the body in 1/mm. */
+/* Change of a slice, means over the body in 1/mm. */
 struct slice_change {
 	double corrected; /* of |V' - V| */
 	double departure; /* |of V' - B| */

@@ -32,7 +32,7 @@
  */
 struct ends;
 
-/* Of both ends together. */
+/* Changes at both ends together. */
 struct ends_report {
 	bool changed;     /* some voxel of the volume */
 	bool uncertain;   /* a slice is, by 40 HU */

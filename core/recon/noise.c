@@ -229,7 +229,7 @@ static const double FDK_NOISE = 0.35, FDK_CONTRAST = 0.025;
 static const double SART_NOISE = 0.2, NOISE_POWER = 0.85, FINENESS_POWER = 0.9, FINENESS_MOST = 2, UPDATES = 10;
 
 /*
- * What SART adds beside noise goes with the contrast. With few views, streaks. Where the detector resolves more than
+ * SART's artefacts beside noise go with the contrast. Few views leave streaks. Where the detector resolves more than
  * the grid can hold (`fineness`, pixel over voxel, below FINE), strong edges overshoot: that is bone, and the third
  * power of the contrast beside STRONG of water's attenuation tells it from soft tissue. Where pixels are finer
  * still, they are averaged if they show edges (core/correct/averaging.h), and AVERAGED of it is left.

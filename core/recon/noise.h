@@ -12,13 +12,13 @@
 enum { NOISE_SLICES = 24 };
 
 /*
- * Of a volume's middle slices. All 0 where nothing stands out of the background.
+ * Measures the noise of a volume's middle slices. All is 0 where nothing stands out of the background.
  * The same voxels give the same bits, for any number of threads.
  */
 int noise_measure(const struct backend *backend, struct volume *volume, const struct grid *grid,
 		  struct volume_noise *ret_noise, struct error *err);
 
-/* The same of slices [z][y][x] in the host's memory. */
+/* Measures the noise of slices [z][y][x] in the host's memory. */
 int noise_of_slices(const float *slices, const int size[3], struct volume_noise *ret_noise, struct error *err);
 
 enum noise_stage { NOISE_OF_FDK, NOISE_OF_SART };

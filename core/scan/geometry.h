@@ -54,7 +54,7 @@ int geometry_matrices(struct geometry *ret_geometry, int columns, int rows, int 
 int geometry_views(struct geometry *ret_geometry, int columns, int rows, int count, const struct view *views,
 		   struct error *err);
 int geometry_copy(struct geometry *ret_geometry, const struct geometry *geometry, struct error *err);
-/* The same detector read out the other way: its columns are rows, and its rows columns. */
+/* Makes the geometry of the same detector read out the other way: its columns are rows, and its rows columns. */
 int geometry_exchange(struct geometry *ret_geometry, const struct geometry *geometry, struct error *err);
 void geometry_clear(struct geometry *geometry);
 

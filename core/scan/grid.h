@@ -39,7 +39,7 @@ int grid_check(const struct grid *grid, struct error *err);
  */
 int grid_check_geometry(const struct grid *grid, const struct geometry *geometry, struct error *err);
 
-/* Where a line meets the grid's box, half a voxel beyond the outer centres. */
+/* Finds where a line meets the grid's box, half a voxel beyond the outer centres. */
 struct grid_passage {
 	bool missed;
 	int axis[2]; /* that it comes in and goes out across */

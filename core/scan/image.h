@@ -51,7 +51,7 @@ static inline size_t image_bytes(enum image image, int columns, int rows)
 	return (size_t)columns * (size_t)rows * (image_kinds[image].pixel == IMAGE_MARKS ? 1 : sizeof(float));
 }
 
-/* By name; -1 when there is none. */
+/* Finds an image by its name; -1 when there is none. */
 int image_find(const char *name);
 
 #ifdef __cplusplus

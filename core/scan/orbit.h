@@ -107,7 +107,8 @@ void orbit_clear(struct orbit *orbit);
  */
 void orbit_column_weights(const struct orbit *orbit, const struct geometry *geometry, float *ret_weights);
 
-/* How many directions the views look along; those within a degree of another or of its opposite are one with it. */
+/* Counts the directions that the views look along; those within a degree of another or of its opposite are one with it.
+ */
 int orbit_directions(const struct orbit *orbit);
 
 /*

@@ -187,7 +187,7 @@ void orbit_default_grid(const struct orbit *orbit, const struct geometry *given,
 		*ret_grid = grid;
 }
 
-/* Whether every view has this place of the field of view on its rows, a quarter of a row is rounding. */
+/* True if every view has this place of the field of view on its rows, a quarter of a row is rounding. */
 static bool is_seen_by_all(const struct orbit *orbit, const struct geometry *geometry, double (*matrices)[12],
 			   const double world[3])
 {
