@@ -197,7 +197,9 @@ static void write_text(const struct worker *worker, const struct outcome *outcom
 
 	if (outcome->to == JOB_FAILED && outcome->crashed) {
 		job_record(worker->job, &record);
-		snprintf(ret_text, size, "it was broken off %d times, last: %.260s", record.crashes + 1, text);
+		snprintf(ret_text, size,
+			 "it was broken off %d times, last: %.160s; it was in stage %s behind iteration %d on %.70s",
+			 record.crashes + 1, text, stage_names[record.stage], record.iteration, record.device);
 		return;
 	}
 	snprintf(ret_text, size, "%.319s", outcome->reason != NULL ? outcome->reason : text);
