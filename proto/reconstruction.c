@@ -456,7 +456,8 @@ static int open_first(struct reconstruction *reconstruction, struct error *err)
 	if (code == 0)
 		code = open_recon(reconstruction, err);
 	if (code == 0)
-		code = stuck_new(&reconstruction->linearise, geometry, &reconstruction->stuck, err);
+		code = stuck_new(&reconstruction->linearise, geometry, reconstruction->backend != &backend_cpu,
+				 &reconstruction->stuck, err);
 	if (code == 0 && hooks->on_open != NULL)
 		hooks->on_open(hooks->recon.context, recon_memory_taken(reconstruction->recon),
 			       recon_plan(reconstruction->recon));

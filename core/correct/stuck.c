@@ -2,6 +2,10 @@
 #include "core/correct/stuck.h"
 
 #include <math.h>
+#ifdef _OPENMP
+#include <omp.h>
+#endif
+#include <pthread.h>
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
@@ -31,14 +35,108 @@ struct stuck {
 	unsigned char *bad; /* [row][column], of the view: the pixel says nothing there */
 	bool *some_bad;     /* [row], of the view */
 	unsigned char *map;
-	float largest; /* line integral */
+	float largest;         /* line integral */
+	struct beside *beside; /* NULL: the caller's thread does it all */
 };
 
-int stuck_new(const struct linearise *linearise, const struct geometry *geometry, struct stuck **ret_stuck,
+/* The thread that looks at views, and the one view that waits for it or is looked at. */
+struct beside {
+	pthread_t thread;
+	pthread_mutex_t lock;
+	pthread_cond_t changed;
+	int host_threads; /* those of the caller */
+	size_t bytes;     /* of a view */
+	void *samples;
+	bool waits, ended;
+};
+
+static void add_view(struct stuck *stuck, const void *samples);
+
+static void *look_beside(void *argument)
+{
+	struct stuck *stuck = argument;
+	struct beside *beside = stuck->beside;
+
+	backend_host_threads(beside->host_threads);
+	pthread_mutex_lock(&beside->lock);
+	while (!beside->ended || beside->waits) {
+		if (!beside->waits) {
+			pthread_cond_wait(&beside->changed, &beside->lock);
+			continue;
+		}
+		pthread_mutex_unlock(&beside->lock);
+		add_view(stuck, beside->samples);
+		pthread_mutex_lock(&beside->lock);
+		beside->waits = false;
+		pthread_cond_broadcast(&beside->changed);
+	}
+	pthread_mutex_unlock(&beside->lock);
+	return NULL;
+}
+
+static int beside_new(struct stuck *stuck, struct error *err)
+{
+	const struct geometry *geometry = stuck->geometry;
+	struct beside *beside = calloc(1, sizeof(*beside));
+
+	if (beside == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a thread that looks for stuck pixels");
+	beside->host_threads = 1;
+#ifdef _OPENMP
+	beside->host_threads = omp_get_max_threads();
+#endif
+	beside->bytes = (size_t)geometry->columns * (size_t)geometry->rows * linearise_sample_bytes(stuck->linearise);
+	beside->samples = malloc(beside->bytes);
+	pthread_mutex_init(&beside->lock, NULL);
+	pthread_cond_init(&beside->changed, NULL);
+	stuck->beside = beside;
+	if (beside->samples == NULL || pthread_create(&beside->thread, NULL, look_beside, stuck) != 0) {
+		free(beside->samples);
+		free(beside);
+		stuck->beside = NULL;
+		return error_set(err, ERR_NO_MEMORY, "no memory for a thread that looks for stuck pixels");
+	}
+	return 0;
+}
+
+/* Until the view that was added last has been looked at. */
+static void beside_wait(struct beside *beside)
+{
+	while (beside->waits)
+		pthread_cond_wait(&beside->changed, &beside->lock);
+}
+
+static void beside_add(struct beside *beside, const void *samples)
+{
+	pthread_mutex_lock(&beside->lock);
+	beside_wait(beside);
+	memcpy(beside->samples, samples, beside->bytes);
+	beside->waits = true;
+	pthread_cond_broadcast(&beside->changed);
+	pthread_mutex_unlock(&beside->lock);
+}
+
+static void beside_free(struct beside *beside)
+{
+	if (beside == NULL)
+		return;
+	pthread_mutex_lock(&beside->lock);
+	beside->ended = true;
+	pthread_cond_broadcast(&beside->changed);
+	pthread_mutex_unlock(&beside->lock);
+	pthread_join(beside->thread, NULL);
+	pthread_cond_destroy(&beside->changed);
+	pthread_mutex_destroy(&beside->lock);
+	free(beside->samples);
+	free(beside);
+}
+
+int stuck_new(const struct linearise *linearise, const struct geometry *geometry, bool beside, struct stuck **ret_stuck,
 	      struct error *err)
 {
 	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
 	struct stuck *stuck;
+	int code;
 
 	*ret_stuck = NULL;
 	if (geometry->count < STUCK_VIEWS_LEAST || geometry->columns <= 2 * AWAY || geometry->rows <= 2 * AWAY)
@@ -61,6 +159,11 @@ int stuck_new(const struct linearise *linearise, const struct geometry *geometry
 		return error_set(err, ERR_NO_MEMORY, "no memory to look for stuck pixels in %d x %d", geometry->columns,
 				 geometry->rows);
 	}
+	code = beside ? beside_new(stuck, err) : 0;
+	if (code < 0) {
+		stuck_free(stuck);
+		return code;
+	}
 	*ret_stuck = stuck;
 	return 0;
 }
@@ -69,6 +172,7 @@ void stuck_free(struct stuck *stuck)
 {
 	if (stuck == NULL)
 		return;
+	beside_free(stuck->beside);
 	free(stuck->sums);
 	free(stuck->values);
 	free(stuck->medians);
@@ -251,7 +355,7 @@ static void add_row(struct stuck *stuck, int row)
 	}
 }
 
-void stuck_add(struct stuck *stuck, const void *samples)
+static void add_view(struct stuck *stuck, const void *samples)
 {
 	const int rows = stuck->geometry->rows;
 	const size_t pixels = (size_t)rows * (size_t)stuck->geometry->columns;
@@ -272,6 +376,14 @@ void stuck_add(struct stuck *stuck, const void *samples)
 	for (size_t i = 0; i < pixels; i += pixels / 4096 + 1)
 		largest = fmaxf(largest, stuck->values[i]);
 	stuck->largest = largest;
+}
+
+void stuck_add(struct stuck *stuck, const void *samples)
+{
+	if (stuck->beside != NULL)
+		beside_add(stuck->beside, samples);
+	else
+		add_view(stuck, samples);
 }
 
 /* A pixel's behaviour over the views, from its sums. */
@@ -399,6 +511,11 @@ const unsigned char *stuck_find(struct stuck *stuck)
 	const int columns = stuck->geometry->columns, rows = stuck->geometry->rows;
 	size_t count = 0;
 
+	if (stuck->beside != NULL) {
+		pthread_mutex_lock(&stuck->beside->lock);
+		beside_wait(stuck->beside);
+		pthread_mutex_unlock(&stuck->beside->lock);
+	}
 #pragma omp parallel for schedule(dynamic, 16) reduction(+ : count)
 	for (int row = 0; row < rows; row++)
 		for (int column = 0; column < columns; column++) {

@@ -39,15 +39,19 @@ struct stuck;
 
 /*
  * linearise and geometry, as they come, are borrowed. *ret_stuck is NULL where the scan has too few views to decide.
+ * beside: views are looked at in a thread of their own, for callers whose work is done by another device meanwhile.
  * Free with stuck_free.
  */
-int stuck_new(const struct linearise *linearise, const struct geometry *geometry, struct stuck **ret_stuck,
+int stuck_new(const struct linearise *linearise, const struct geometry *geometry, bool beside, struct stuck **ret_stuck,
 	      struct error *err);
 void stuck_free(struct stuck *stuck); /* NULL is fine */
 
 /* True if a view is one of those that are looked at. */
 bool stuck_wants(const struct stuck *stuck, int view);
-/* Adds one of these views, [row][column], each once; their order changes the result by rounding only. */
+/*
+ * Adds one of these views, [row][column], each once; their order changes the result by rounding only. The samples may
+ * be changed behind it.
+ */
 void stuck_add(struct stuck *stuck, const void *samples);
 /*
  * Makes the map, once all of them have come: [row][column], not zero where a pixel is stuck, owned by `stuck`; NULL

@@ -90,6 +90,7 @@ struct trial {
 	bool integers, line_integrals;
 	double arc;  /* degrees */
 	bool mapped; /* 2 % of the pixels and two columns hold anything, and the scan's map says so */
+	bool beside; /* looked at by a thread of its own */
 };
 
 /* Runs it; counts the faulty pixels that were found, all faulty ones, and pixels that were found and are none. */
@@ -120,7 +121,7 @@ static void run_trial(const struct trial *trial, size_t ret[3])
 		mapped[i] = uniform() < 0.02 || i % COLUMNS / 2 == 15;
 	if (trial->mapped)
 		linearise.image[IMAGE_DEFECTS] = mapped;
-	ck_assert_int_eq(stuck_new(&linearise, &scene.geometry, &stuck, &err), 0);
+	ck_assert_int_eq(stuck_new(&linearise, &scene.geometry, trial->beside, &stuck, &err), 0);
 	ck_assert_ptr_nonnull(stuck);
 	for (int view = 0; view < VIEWS; view++) {
 		if (!stuck_wants(stuck, view))
@@ -218,6 +219,41 @@ START_TEST(a_neighbour_of_mapped_pixels_is_judged_by_good_ones)
 }
 END_TEST
 
+/* The buffer of a view is used again for the next one at once; what is found is the same. */
+START_TEST(a_thread_of_its_own_finds_the_same)
+{
+	struct trial trial = {.object = 0, .fault = FINE + 1, .photons = 1e5, .arc = 360};
+	size_t found[3], beside[3];
+
+	run_trial(&trial, found);
+	trial.beside = true;
+	run_trial(&trial, beside);
+	ck_assert_uint_gt(found[0], 0);
+	ck_assert_mem_eq(found, beside, sizeof(found));
+}
+END_TEST
+
+START_TEST(a_look_that_is_given_up_leaves_nothing_behind)
+{
+	const struct orbit_spec spec = {COLUMNS, ROWS, VIEWS, {620, 1100, {2, 2}, {0, 0}, {0, 0}}, 0, 360. / VIEWS};
+	struct linearise linearise = {.sample = SAMPLE_FLOAT32, .quantity = QUANTITY_LINE_INTEGRAL};
+	float *samples = calloc(PIXELS, sizeof(*samples));
+	struct stuck *stuck;
+	struct scene scene;
+	struct error err;
+
+	scene_orbit(&scene, &spec);
+	for (int added = 0; added < 3; added++) {
+		ck_assert_int_eq(stuck_new(&linearise, &scene.geometry, true, &stuck, &err), 0);
+		for (int i = 0; i < added; i++)
+			stuck_add(stuck, samples);
+		stuck_free(stuck);
+	}
+	free(samples);
+	scene_clear(&scene);
+}
+END_TEST
+
 Suite *stuck_suite(void)
 {
 	Suite *suite = suite_create("stuck");
@@ -227,6 +263,8 @@ Suite *stuck_suite(void)
 	tcase_add_loop_test(tests, an_object_is_no_stuck_pixel, 0, 4);
 	tcase_add_loop_test(tests, a_pixel_that_does_not_follow_is_found, 0, 4);
 	tcase_add_loop_test(tests, a_neighbour_of_mapped_pixels_is_judged_by_good_ones, 0, 4);
+	tcase_add_test(tests, a_thread_of_its_own_finds_the_same);
+	tcase_add_test(tests, a_look_that_is_given_up_leaves_nothing_behind);
 	suite_add_tcase(suite, tests);
 	return suite;
 }
