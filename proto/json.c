@@ -727,6 +727,26 @@ void json_bool(struct json_reader *reader, const char *name, bool required, bool
 		json_fail(reader, ERR_INVALID, name, "%s, true or false is expected", type_name(member));
 }
 
+size_t utf8_length(const char *text)
+{
+	size_t length = 0;
+
+	for (; *text != '\0'; text++)
+		length += ((unsigned char)*text & 0xc0) != 0x80; /* no byte within a character */
+	return length;
+}
+
+void json_text(struct json_reader *reader, const char *name, bool required, int most, char *ret)
+{
+	const cJSON *member = json_member(reader, name, required);
+	const size_t length = cJSON_IsString(member) ? utf8_length(member->valuestring) : 0;
+
+	if (length > (size_t)most)
+		json_fail(reader, ERR_INVALID, name, "%zu characters, at most %d are expected", length, most);
+	else
+		json_string(reader, name, required, ret, TEXT_BYTES((size_t)most));
+}
+
 void json_string(struct json_reader *reader, const char *name, bool required, char *ret, size_t size)
 {
 	const cJSON *member = json_member(reader, name, required);

@@ -67,6 +67,12 @@ void json_integer(struct json_reader *reader, const char *name, bool required, l
 void json_bool(struct json_reader *reader, const char *name, bool required, bool *ret);
 /* At most size - 1 bytes of UTF-8 without control characters. */
 void json_string(struct json_reader *reader, const char *name, bool required, char *ret, size_t size);
+/* At most `most` characters of Unicode, without control characters; ret has TEXT_BYTES(most). */
+void json_text(struct json_reader *reader, const char *name, bool required, int most, char *ret);
+enum { UTF8_BYTES_MOST = 4 }; /* of a character */
+#define TEXT_BYTES(most) (UTF8_BYTES_MOST * (most) + 1)
+/* Characters of Unicode, as JSON Schema counts them, in valid UTF-8. */
+size_t utf8_length(const char *text);
 /* One of `names` (`count` entries); gives its index. */
 void json_choice(struct json_reader *reader, const char *name, bool required, const char *const *names, int count,
 		 int *ret);

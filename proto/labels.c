@@ -23,15 +23,15 @@ static bool has_control(const char *text)
 static int check_label(const cJSON *label, const char *base, struct error *err)
 {
 	char what[100];
-	size_t name = strlen(label->string);
+	const size_t name = utf8_length(label->string);
 
 	if (!cJSON_IsString(label))
 		return fail(err, ERR_INVALID, base, "a label is no text: {\"key\": \"value\"} is expected");
 	if (name == 0 || has_control(label->string) || has_control(label->valuestring))
 		return fail(err, ERR_INVALID, base, "a label without a name or with control characters");
-	if (name > LABEL_NAME_MOST || strlen(label->valuestring) > LABEL_MOST) {
-		snprintf(what, sizeof(what), "a name of %zu bytes with %zu, at most %d and %d are expected", name,
-			 strlen(label->valuestring), LABEL_NAME_MOST, LABEL_MOST);
+	if (name > LABEL_NAME_MOST || utf8_length(label->valuestring) > LABEL_MOST) {
+		snprintf(what, sizeof(what), "a name of %zu characters with %zu, at most %d and %d are expected", name,
+			 utf8_length(label->valuestring), LABEL_NAME_MOST, LABEL_MOST);
 		return fail(err, ERR_IMPOSSIBLE, base, what);
 	}
 	return 0;

@@ -6,9 +6,9 @@
 /* The member "labels" of scans and jobs: free texts under names of the client's own, kept and shown. */
 enum {
 	LABELS_MOST = 32,
-	LABEL_NAME_MOST = 64, /* bytes of UTF-8 */
+	LABEL_NAME_MOST = 64, /* characters of Unicode */
 	LABEL_MOST = 256,
-	LABELS_TEXT_MAX = 4096 /* of all of them as JSON, its end included */
+	LABELS_TEXT_MAX = 4096 /* bytes of all of them as JSON, its end included */
 };
 
 /*

@@ -74,7 +74,7 @@ static void make_orthogonal(double m[3][3])
 static void read_matrix(struct json_reader *reader, struct patient *patient)
 {
 	const char *const name = "world_to_patient";
-	const double most = 1e7;     /* mm */
+	const double most = 1e6;     /* mm */
 	const double printed = 1e-3; /* matrices with three digits behind the point are read */
 	double numbers[16], skew;
 

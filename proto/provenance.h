@@ -1,7 +1,7 @@
 #ifndef CBCT_PROTO_PROVENANCE_H
 #define CBCT_PROTO_PROVENANCE_H
 
-#include "proto/patient.h"
+#include "proto/scan.h"
 #include "proto/version.h"
 
 /* Where a volume comes from: what its file says beside the voxels. Texts that are "" are left out. */
@@ -11,7 +11,7 @@ struct provenance {
 	char stage[16];   /* of the job that made it: "fdk", "sart" ... */
 	int iteration;    /* with a stage only */
 	char job[64], scan[64];
-	char scan_name[256];
+	char scan_name[SCAN_NAME_BYTES];
 	cJSON *recipe; /* owned, or NULL */
 };
 #define CBCTD_PROGRAM "cbctd " CBCT_VERSION

@@ -22,7 +22,8 @@ const char *const sample_names[2] = {"float32", "uint16"};
 const char *const quantity_names[2] = {"line_integral", "intensity"};
 
 static const double degree = M_PI / 180;
-static const double length_most = 1e7;         /* mm, of vectors */
+static const double length_most = 1e6;         /* mm, of vectors: a source a kilometre away is a parallel beam */
+static const double matrix_most = 1e12;        /* of a matrix in any scale */
 static const uint64_t bytes_most = 1ull << 40; /* of one scan's projections */
 
 /* A circular orbit as the document has it. */
@@ -32,8 +33,8 @@ struct circular_document {
 };
 
 #define RANGE(low, high) .least = (low), .most = (high)
-#define LENGTH RANGE(1e-6, 1e7), .unit = "mm"
-#define COORDINATE RANGE(-1e7, 1e7), .unit = "mm"
+#define LENGTH RANGE(1e-6, 1e6), .unit = "mm"
+#define COORDINATE RANGE(-1e6, 1e6), .unit = "mm"
 #define COUNTS RANGE(1e-6, 1e12), .unit = "counts" /* of photons or digital units */
 
 /* Parameters of struct scan. air_region and beam_hardening are no scalars and are read by hand. */
@@ -43,8 +44,8 @@ static const struct parameter scan_parameters[] = {
      .presets = PRESET_REQUIRED, .unit = "pixels", .help = "Pixels along a row of the detector."},
     {"/detector", "rows", PARAMETER_INTEGER, AT(geometry.rows), RANGE(1, DETECTOR_MAX), .presets = PRESET_REQUIRED,
      .unit = "pixels", .help = "Rows of the detector."},
-    {"/detector", "pixel_mm", PARAMETER_NUMBERS, AT(pixel_mm), .count = 2, LENGTH, .presets = PRESET_REQUIRED,
-     .help = "Pitch of the pixels along the columns' axis u and the rows' axis v."},
+    {"/detector", "pixel_mm", PARAMETER_NUMBERS, AT(pixel_mm), .count = 2, RANGE(1e-6, 1e4), .unit = "mm",
+     .presets = PRESET_REQUIRED, .help = "Pitch of the pixels along the columns' axis u and the rows' axis v."},
     {"/projections", "count", PARAMETER_INTEGER, AT(count), RANGE(1, VIEWS_MAX), .presets = PRESET_REQUIRED,
      .unit = "projections", .help = "Projections of the scan."},
     {"/projections", "sample", PARAMETER_CHOICE, AT(sample), .names = sample_names, .count = 2,
@@ -291,7 +292,8 @@ static int read_matrices(struct scan *scan, struct json_reader *reader)
 		char pointer[64];
 
 		snprintf(pointer, sizeof(pointer), "/geometry/matrices/%d", index);
-		code = json_array(matrix, pointer, 12, -1e100, 1e100, numbers + 12 * (size_t)index, reader->err);
+		code = json_array(matrix, pointer, 12, -matrix_most, matrix_most, numbers + 12 * (size_t)index,
+				  reader->err);
 		if (code != 0)
 			goto out;
 		index++;
@@ -400,7 +402,7 @@ static int read_document(struct scan *scan, struct error *err)
 	int code;
 
 	json_begin(&reader, scan->document, "", err);
-	json_string(&reader, "name", false, scan->name, sizeof(scan->name));
+	json_text(&reader, "name", false, SCAN_NAME_MOST, scan->name);
 	detector = json_member(&reader, "detector", true);
 	projections = json_member(&reader, "projections", true);
 	geometry = json_member(&reader, "geometry", true);

@@ -6,9 +6,12 @@
 #include "proto/json.h"
 #include "proto/patient.h"
 
+enum { SCAN_NAME_MOST = 255 }; /* characters */
+#define SCAN_NAME_BYTES TEXT_BYTES(SCAN_NAME_MOST)
+
 /* A scan as it is posted: what the detector and the orbit are, not the samples themselves. */
 struct scan {
-	char name[256];
+	char name[SCAN_NAME_BYTES];
 	double pixel_mm[2];
 	int count; /* projections */
 	enum sample sample;

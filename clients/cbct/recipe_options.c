@@ -379,6 +379,16 @@ static int recipe_read(const char *path, cJSON **ret_document, struct error *err
 	return code;
 }
 
+/* Whether the document says which stages it wants, and not with fdk already. */
+static bool names_stage(const cJSON *document)
+{
+	bool names = cJSON_GetObjectItemCaseSensitive(document, "tv") != NULL;
+
+	for (int i = 0; i < ALGORITHM_COUNT; i++)
+		names = names || cJSON_GetObjectItemCaseSensitive(document, algorithms[i]->name) != NULL;
+	return names && cJSON_GetObjectItemCaseSensitive(document, "fdk") == NULL;
+}
+
 int recipe_document(const struct recipe_options *options, const char *path, const char *scan, cJSON **ret_document,
 		    struct error *err)
 {
@@ -391,12 +401,14 @@ int recipe_document(const struct recipe_options *options, const char *path, cons
 			return code;
 	} else {
 		document = cJSON_CreateObject();
-		stage(document, "fdk");
 	}
 	put(document, "scan", cJSON_CreateString(scan));
 	if (options->no_fdk)
 		put(document, "fdk", cJSON_CreateNull());
 	code = put_options(options, document, err);
+	/* Options that name a stage are beside the FDK; a document without any stage has all of them. */
+	if (code == 0 && path == NULL && names_stage(document))
+		stage(document, "fdk");
 	if (code != 0) {
 		cJSON_Delete(document);
 		return code;

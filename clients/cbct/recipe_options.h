@@ -19,7 +19,10 @@ struct recipe_options {
 extern struct option recipe_option_rows[];
 void recipe_options_make(void); /* fills the rows; once, before any command line is parsed */
 
-/* path may be NULL: it starts from an FDK with its defaults. Delete *ret_document. */
+/*
+ * path may be NULL: without options that name a stage, the whole job with its defaults, as over HTTP; with them, the
+ * FDK and those stages. Delete *ret_document.
+ */
 int recipe_document(const struct recipe_options *options, const char *path, const char *scan, cJSON **ret_document,
 		    struct error *err);
 

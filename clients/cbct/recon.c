@@ -221,7 +221,8 @@ static int recon_run_command(const void *values, struct error *err)
 static const struct recon_options defaults = {.backend = "auto"};
 static const struct positional positionals[] = {
     {"DIR", "a scan directory: scan.json, projections.raw", offsetof(struct recon_options, directory), true},
-    {"RECIPE", "a job document; without it, FDK with its defaults", offsetof(struct recon_options, recipe), false},
+    {"RECIPE", "a job document; without it, and without options of a stage, every stage with its defaults",
+     offsetof(struct recon_options, recipe), false},
     {0},
 };
 

@@ -79,7 +79,8 @@ static int submit_run(const void *values, struct error *err)
 static const struct submit_options defaults;
 static const struct positional positionals[] = {
     {"SCAN", "its id", offsetof(struct submit_options, scan), true},
-    {"RECIPE", "a job document; without it, FDK with its defaults", offsetof(struct submit_options, recipe), false},
+    {"RECIPE", "a job document; without it, and without options of a stage, every stage with its defaults",
+     offsetof(struct submit_options, recipe), false},
     {0},
 };
 

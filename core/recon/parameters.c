@@ -57,7 +57,7 @@ const struct parameter recipe_parameters[] = {
      .presets = PRESET_REQUIRED, .counts = has_grid, .unit = "voxels", .help = "Voxels along x, y and z."},
     {"/grid", "spacing_mm", PARAMETER_NUMBERS, AT(grid.spacing), .count = 3, RANGE(1e-6, 1e3),
      .presets = PRESET_REQUIRED, .counts = has_grid, .unit = "mm", .help = "Sides of a voxel along x, y and z."},
-    {"/grid", "origin_mm", PARAMETER_NUMBERS, AT(grid.origin), .count = 3, RANGE(-1e7, 1e7), .presets = PRESET_NONE,
+    {"/grid", "origin_mm", PARAMETER_NUMBERS, AT(grid.origin), .count = 3, RANGE(-1e6, 1e6), .presets = PRESET_NONE,
      .counts = has_origin, .unit = "mm",
      .help = "Centre of the first voxel; without it the grid is centred on the isocentre."},
     {"/fdk", "window", PARAMETER_CHOICE, AT(fdk.window), NAMES(window_names), .preset = WINDOW_HANN, .counts = runs_fdk,

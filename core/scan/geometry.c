@@ -17,7 +17,7 @@
 #include <string.h>
 
 /* Bounds that keep every product of three lengths far inside a double, and every real scanner inside. */
-static const double LENGTH_MAX = 1e7;  /* mm */
+static const double LENGTH_MAX = 1e6;  /* mm */
 static const double STEP_MIN = 1e-6;   /* mm */
 static const double DEGENERATE = 1e-6; /* sine of an angle that counts as none */
 
@@ -58,7 +58,7 @@ static const char *view_fault(const struct view *view, int columns, int rows)
 
 	if (!all_bounded(view->source, 3, LENGTH_MAX) || !all_bounded(view->pixel0, 3, LENGTH_MAX) ||
 	    !(length_u * columns <= LENGTH_MAX) || !(length_v * rows <= LENGTH_MAX))
-		return "a number is not finite or beyond 10 km";
+		return "a number is not finite or beyond 1 km";
 	if (length_u < STEP_MIN || length_v < STEP_MIN)
 		return "the step from pixel to pixel is zero";
 	vec_cross(view->column_step, view->row_step, cross);

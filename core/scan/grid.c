@@ -20,7 +20,7 @@ static int refuse_axis(struct error *err, const char *member, int axis, const ch
 
 int grid_check(const struct grid *grid, struct error *err)
 {
-	const double spacing_min = 1e-6, length_max = 1e7; /* mm */
+	const double spacing_min = 1e-6, length_max = 1e6; /* mm */
 	char sizes[64];
 
 	snprintf(sizes, sizeof(sizes), "1 to %d voxels", GRID_SIZE_MAX);

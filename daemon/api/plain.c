@@ -102,12 +102,12 @@ static int reply_page(struct request *request, FILE *out, char **text, size_t *l
 	return 0;
 }
 
-static void scan_name(struct api *api, const char *id, char ret_name[256])
+static void scan_name(struct api *api, const char *id, char ret_name[SCAN_NAME_BYTES])
 {
 	struct scan_facts facts;
 	struct error err;
 
-	snprintf(ret_name, 256, "scan %s", id);
+	snprintf(ret_name, SCAN_NAME_BYTES, "scan %s", id);
 	if (store_scan_look(api->store, id, &facts, &err) == 0 && facts.name[0] != '\0')
 		memcpy(ret_name, facts.name, sizeof(facts.name));
 }
@@ -129,7 +129,7 @@ static void put_job_row(FILE *out, struct api *api, struct job *job)
 {
 	struct error err;
 	cJSON *document = job_document(job, true, &err);
-	char name[256];
+	char name[SCAN_NAME_BYTES];
 
 	scan_name(api, text_of(document, "scan"), name);
 	fprintf(out, "<tr><td><a href=\"/plain/%s\">", text_of(document, "id"));
@@ -330,7 +330,7 @@ static void put_history(FILE *out, const cJSON *job)
 
 static void put_job(FILE *out, struct api *api, const cJSON *job, bool ended, const struct shown *shown)
 {
-	char name[256];
+	char name[SCAN_NAME_BYTES];
 
 	scan_name(api, text_of(job, "scan"), name);
 	put_head(out, name, !ended);

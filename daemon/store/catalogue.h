@@ -59,7 +59,7 @@ int catalogue_end(struct catalogue *catalogue, int code, struct error *err);
 
 struct catalogue_scan {
 	long long number; /* given by the database, for its projections */
-	char id[ID_SIZE], name[256];
+	char id[ID_SIZE], name[SCAN_NAME_BYTES];
 	double created; /* seconds since 1970 */
 	int columns, rows, count;
 	enum sample sample;

@@ -12,7 +12,7 @@ struct stored_scan {
 	struct store *store;
 	char id[ID_SIZE];
 	long long number; /* in the catalogue */
-	char name[256];
+	char name[SCAN_NAME_BYTES];
 	double created;
 	int columns, rows, count;
 	enum sample sample;

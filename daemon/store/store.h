@@ -147,7 +147,7 @@ void store_scan_directory(const struct store *store, const char *id, char ret_pa
  * Convertible: so is whatever else makes line integrals of them. Ready: both, and nothing of it is being checked.
  */
 struct scan_facts {
-	char name[256];
+	char name[SCAN_NAME_BYTES];
 	double created; /* seconds since 1970 */
 	int columns, rows, count;
 	enum sample sample;

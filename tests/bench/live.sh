@@ -29,7 +29,7 @@ scan_of() { # COLUMNS VIEWS
 }
 
 if [[ $wanted == *s[lt]* ]]; then
-	job=$(cbct submit "$(scan_of 128 40)" --grid 512 --spacing 0.4 --wait 2>/dev/null)
+	job=$(cbct submit "$(scan_of 128 40)" --fdk hann --grid 512 --spacing 0.4 --wait 2>/dev/null)
 fi
 
 if [[ $wanted == *slices* ]]; then

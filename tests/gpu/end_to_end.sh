@@ -76,7 +76,7 @@ check "the same bits again" cmp -s "$work/a.raw" "$work/b.raw"
 before=$(memory)
 for ((i = 0; i < JOBS; i++)); do
 	case $((i % 4)) in
-	0) last=$(cbct submit "$scan" --grid 64 --spacing 1.5) ;;
+	0) last=$(cbct submit "$scan" --fdk hann --grid 64 --spacing 1.5) ;;
 	1) last=$(cbct submit "$scan" --grid 48,50,33 --spacing 1.5 --sart 2 --subsets views) ;;
 	2) last=$(cbct submit "$scan" --grid 64 --spacing 1.5 --sart 2 --tv proximal) ;;
 	3) last=$(cbct submit "$scan" --grid 33 --spacing 2 --sart 3 --subsets 1 --tv gradient --no-fdk) ;;

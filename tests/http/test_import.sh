@@ -255,7 +255,7 @@ test_dicom_tells_how_the_patient_lies() {
 	for position in HFS HFP FFS FFDR; do
 		xa "lies$position" patient=$position
 		jq -e ".patient == {position: \"$position\"}" "$work/lies$position/scan.json" >/dev/null || fail "$position in $(head -c 200 "$work/lies$position/scan.json")"
-		cbct recon "$work/lies$position" --grid 42,42,42 --spacing 2 --quiet -o "$work/lies$position" >/dev/null
+		cbct recon "$work/lies$position" --fdk hann --grid 42,42,42 --spacing 2 --quiet -o "$work/lies$position" >/dev/null
 		"$python" "$here/sides.py" check "$position@" "" "" "nifti,1/mm,$work/lies$position/final.nii"
 	done
 	# Nobody says: not known, and told. A patient in a chair has none of the positions.
@@ -301,8 +301,8 @@ test_dicom_angiography() {
 		# Texts of numbers have at most 16 characters in DICOM.
 		same_views "$work/xa" "$work/$name" 1e-6 "$name"
 	done
-	cbct recon "$work/xa" "${grid[@]}" --quiet -o "$work/xa" >/dev/null
-	cbct recon "$counts" "${grid[@]}" --quiet -o "$work/direct" >/dev/null
+	cbct recon "$work/xa" --fdk hann "${grid[@]}" --quiet -o "$work/xa" >/dev/null
+	cbct recon "$counts" --fdk hann "${grid[@]}" --quiet -o "$work/direct" >/dev/null
 	# The same rays in other pixels: float32's rounding, and filters that begin at the other end of the rows.
 	expect_number "$(cbct compare --json "$work/xa/final.nii" "$work/direct/final.nii" | jq .relative_error)" '<' 1e-4 "DICOM against the scan itself"
 	# In front of and behind the patient: primary angle 0 has the detector in front, at -y, CRA lifts it.

@@ -396,6 +396,28 @@ test_an_image_can_be_removed_and_put_again() {
 	expect_status 200
 }
 
+# As long as the schema says, in its own measure: characters, not bytes. Lengths that no arm has, at their pointers.
+test_names_and_lengths_within_the_schema() {
+	local umlauts
+	umlauts=$(printf 'ä%.0s' {1..256})
+	new_scan ".name = \"${umlauts:1}\" | .labels = {\"${umlauts:0:64}\": \"$umlauts\"}"
+	req GET "/v1/scans/$scan"
+	expect_json ".name == \"${umlauts:1}\" and .labels.\"${umlauts:0:64}\" == \"$umlauts\""
+	refused_at() { # FILTER STATUS POINTER
+		scan_json "$1" >"$work/scan.json"
+		req POST /v1/scans -H 'Content-Type: application/json' --data-binary @"$work/scan.json"
+		expect_problem "$2" "$3"
+	}
+	refused_at ".name = \"$umlauts\"" 400 /name
+	refused_at ".labels = {x: \"ä$umlauts\"}" 422 /labels
+	refused_at '.detector.pixel_mm = [2, 1e7]' 422 /detector/pixel_mm/1
+	refused_at '.geometry.source_to_detector_mm = 1e7' 422 /geometry/source_to_detector_mm
+	refused_at '.geometry.source_offset_mm = [0, -1e7]' 422 /geometry/source_offset_mm/1
+	matrices='.geometry = {kind: "matrices", matrices: [range(12) | [-500, 10, 0, 0, 0, 0, 500, 5, -1, 0, 0, 600]]}'
+	refused_at "$matrices | .geometry.matrices[3][7] = 1e100" 422 /geometry/matrices/3/7
+	refused_at "$matrices | .geometry.matrices[3][11] = 1e9" 422 /geometry/matrices/3
+}
+
 test_lists_newest_first_in_pages() {
 	local first second third
 	new_scan && first=$scan
