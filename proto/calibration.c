@@ -331,6 +331,7 @@ cJSON *calibration_json(const struct calibration *calibration)
 	else
 		cJSON_AddNullToObject(json, "other_turn_deg");
 	cJSON_AddNumberToObject(json, "diameter_ratio", calibration->diameter_ratio);
+	cJSON_AddNumberToObject(json, "distance_ratio", calibration->distance_ratio);
 	cJSON_AddNumberToObject(json, "balls_moved_mm", calibration->adjusted_rms);
 	list = cJSON_AddArrayToObject(json, "balls_mm");
 	for (int b = 0; b < calibration->balls.count; b++) {

@@ -13,7 +13,7 @@
 
 struct calibrate_options {
 	const char *directory, *phantom, *output, *apply;
-	bool adjust_balls;
+	bool adjust_balls, other_arm;
 };
 
 #define ROW(name, letter, kind, member, argument, help)                                                                \
@@ -27,6 +27,8 @@ static const struct option rows[] = {
     ROW("apply", 0, OPTION_TEXT, apply, "DIR",
 	"put the geometry that was found into the scan.json of another scan directory of this arm, view by view by its "
 	"angles"),
+    ROW("other-arm", 0, OPTION_FLAG, other_arm, NULL,
+	"with --apply, also where that scan's source or detector stands at other distances than the calibrated one's"),
     {0},
 };
 static const struct option_group groups[] = {{"options", rows, 0}, {0}};
@@ -61,9 +63,25 @@ static int result_write(const struct calibrate_options *options, const struct ca
 	return code;
 }
 
+/* Shadows or distances of another size than the drawing and the nominal geometry have together. */
+static void scale_say(const struct calibration *calibration)
+{
+	const double doubtful = 0.03;
+
+	if (fabs(calibration->diameter_ratio - 1) <= doubtful && fabs(calibration->distance_ratio - 1) <= doubtful)
+		return;
+	fprintf(
+	    stderr,
+	    "caution: the shadows are %.3f times as wide as those of the drawing's balls, and the sources stand %.3f "
+	    "times as far from the isocentre as the scan's geometry has them: the drawing may have another scale than "
+	    "the phantom\n",
+	    calibration->diameter_ratio, calibration->distance_ratio);
+}
+
 /* What a person wants to know at once. */
 static void result_say(const struct calibration *calibration)
 {
+	scale_say(calibration);
 	fprintf(stderr, "%d of %d views, residual %.3f pixels, %.4f mm at the isocentre\n", calibration->used,
 		calibration->count, calibration->rms, calibration->rms_isocentre);
 	if (calibration->rival_turn != 0)
@@ -111,6 +129,24 @@ static int same_detector(const struct scan *from, const struct scan *to, struct 
 			 to->geometry.columns, to->geometry.rows, to->pixel_mm[0], to->pixel_mm[1]);
 }
 
+/* Poses are those of one arm: what its nominal distances tell. */
+static int same_arm(const struct scan *from, const struct scan *to, struct error *err)
+{
+	const double most = 0.02; /* an arm that sags, or was calibrated already, stays below */
+	const double is[2] = {to->orbit.source_radius, to->orbit.source_to_detector};
+	const double was[2] = {from->orbit.source_radius, from->orbit.source_to_detector};
+
+	for (int i = 0; i < 2; i++)
+		if (fabs(is[i] / was[i] - 1) > most)
+			return error_set(
+			    err, ERR_CONFLICT,
+			    "the calibration is of an arm whose source stands %.4g mm from the isocentre and "
+			    "%.4g mm from the detector, the scan of one with %.4g and %.4g mm; --other-arm "
+			    "applies it all the same",
+			    was[0], was[1], is[0], is[1]);
+	return 0;
+}
+
 /* Writes the document of `to` with the views that were found for it. */
 static int document_write(const char *path, const struct scan *to, const struct geometry *geometry, struct error *err)
 {
@@ -126,9 +162,11 @@ static int document_write(const char *path, const struct scan *to, const struct 
 	return code;
 }
 
-static int apply(const char *directory, const struct calibration *calibration, const struct scan *from,
-		 struct error *err)
+static int apply(const struct calibrate_options *options, const struct calibration *calibration,
+		 const struct scan *from, struct error *err)
 {
+	const char *directory = options->apply;
+
 	char path[1200], sums[1200], *text = NULL;
 	struct geometry geometry = {0};
 	struct scan *to = NULL;
@@ -145,6 +183,8 @@ static int apply(const char *directory, const struct calibration *calibration, c
 		code = scan_parse(text, length, &to, err);
 	if (code == 0)
 		code = same_detector(from, to, err);
+	if (code == 0 && !options->other_arm)
+		code = same_arm(from, to, err);
 	if (code == 0)
 		code = views_for(calibration, from, to, &geometry, err);
 	if (code == 0)
@@ -175,7 +215,7 @@ static int calibrate_run(const void *values, struct error *err)
 		result_say(&calibration);
 		code = result_write(options, &calibration, err);
 		if (code == 0 && options->apply != NULL)
-			code = apply(options->apply, &calibration, files.scan, err);
+			code = apply(options, &calibration, files.scan, err);
 		calibration_clear(&calibration);
 	}
 	scan_files_close(&files);

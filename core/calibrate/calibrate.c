@@ -392,6 +392,25 @@ static int adjust_balls(struct run *run, struct error *err)
 	return 0;
 }
 
+/* Mean distance of the sources from their middle plane's centre, of the found ones over the nominal ones. */
+static double scale_ratio(const struct run *run)
+{
+	const struct calibration *calibration = run->calibration;
+	double is = 0, was = 0;
+
+	for (int k = 0; k < calibration->count; k++) {
+		const struct pose *pose = &run->works[k].pose;
+		struct pose nominal;
+
+		if (!calibration->views[k].used)
+			continue;
+		pose_of_view(&nominal, &run->request->nominal->views[k]);
+		is += vec_norm(pose->source);
+		was += vec_norm(nominal.source);
+	}
+	return was > 0 ? is / was : 1;
+}
+
 /* Residuals over all views, and by how much the phantom was turned and its shadows are too large. */
 static int summarise(struct run *run, struct error *err)
 {
@@ -430,6 +449,7 @@ static int summarise(struct run *run, struct error *err)
 		calibration->rms = sqrt(squares / (double)count);
 		calibration->rms_isocentre = sqrt(squares_isocentre / (double)count);
 		calibration->turn = atan2(across, along);
+		calibration->distance_ratio = scale_ratio(run);
 		calibration->diameter_ratio = dense_select(ratios, (int)taken, (int)taken / 2);
 	}
 	free(ratios);
@@ -456,38 +476,21 @@ static const struct calibrated_view *typical_refusal(const struct calibration *c
 	return first;
 }
 
-/* Mean distance of the sources from their middle plane's centre, of the found ones over the nominal ones. */
-static double scale_ratio(const struct run *run)
-{
-	const struct calibration *calibration = run->calibration;
-	double is = 0, was = 0;
-
-	for (int k = 0; k < calibration->count; k++) {
-		const struct pose *pose = &run->works[k].pose;
-		struct pose nominal;
-
-		if (!calibration->views[k].used)
-			continue;
-		pose_of_view(&nominal, &run->request->nominal->views[k]);
-		is += vec_norm(pose->source);
-		was += vec_norm(nominal.source);
-	}
-	return was > 0 ? is / was : 1;
-}
-
 static int check_result(const struct run *run, struct error *err)
 {
 	const struct calibration *calibration = run->calibration;
-	const double ratio = calibration->diameter_ratio, scale = scale_ratio(run);
+	const double ratio = calibration->diameter_ratio, scale = calibration->distance_ratio;
 	double residual;
 
 	if (calibration->used < USED_LEAST * calibration->count) {
 		const struct calibrated_view *view = typical_refusal(calibration, &residual);
 
-		return error_set(err, ERR_IMPOSSIBLE,
-				 "%d of %d views do not fit this phantom, at a mean residual of %.2f pixels; view %td: "
-				 "%s",
-				 calibration->count - calibration->used, calibration->count, residual,
+		char how[64] = "and no pose could be fitted to any of them";
+
+		if (residual > 0)
+			snprintf(how, sizeof(how), "at a mean residual of %.2f pixels", residual);
+		return error_set(err, ERR_IMPOSSIBLE, "%d of %d views do not fit this phantom, %s; view %td: %s",
+				 calibration->count - calibration->used, calibration->count, how,
 				 view - calibration->views, view->refused);
 	}
 	if (fabs(ratio - 1) > DIAMETER_TOLERANCE)

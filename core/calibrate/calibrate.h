@@ -105,6 +105,7 @@ struct calibration {
 	 */
 	double rival_turn;
 	double diameter_ratio; /* median of shadow's to expected diameter */
+	double distance_ratio; /* of the sources' mean distance from the isocentre to the nominal one */
 	double adjusted_rms;   /* mm, by which balls were moved; 0 unless asked for */
 };
 

@@ -53,8 +53,13 @@ test_what_does_not_fit_is_told_with_numbers() {
 	refused 'all balls lie on a line: their places spread by' cbct calibrate "$work/balls" "$work/line.json"
 	jq -c '.ball_mm = 2.4' "$work/phantom.json" >"$work/small.json"
 	refused 'times the given diameter' cbct calibrate "$work/balls" "$work/small.json"
+	# a drawing a tenth too large: the poses are, too
+	jq -c '.diameter_mm *= 1.1 | .distance_mm *= 1.1' "$work/phantom.json" >"$work/tenth.json"
+	cbct calibrate "$work/balls" "$work/tenth.json" -o "$work/tenth.out" 2>"$work/said" || fail "$(cat "$work/said")"
+	grep -q '^caution: the shadows are 1\.[01].. times as wide' "$work/said" || fail "a caution in: $(cat "$work/said")"
+	jq -e '.distance_ratio > 1.08 and .distance_ratio < 1.12' "$work/tenth.out" >/dev/null || fail "the distances' ratio"
 	jq -c '.balls = 10 | .distance_mm = 70' "$work/phantom.json" >"$work/wrong.json"
-	refused '8 of 8 views do not fit this phantom, at a mean residual of' cbct calibrate "$work/balls" "$work/wrong.json"
+	refused '8 of 8 views do not fit this phantom, and no pose could be fitted to any of them' cbct calibrate "$work/balls" "$work/wrong.json"
 	jq -c '.bals = 12' "$work/phantom.json" >"$work/misspelt.json"
 	refused 'bals' cbct calibrate "$work/balls" "$work/misspelt.json"
 	jq -nc '{kind: "helix", balls: 40, diameter_mm: 110, pitch_mm: 40, angle_step_deg: 24, ball_mm: 3, large_ball_mm: 5,
@@ -78,6 +83,13 @@ test_only_a_scan_of_the_same_sweep_and_detector_takes_a_calibration() {
 	refused 'the calibration is of a detector of 400 x 320 pixels' \
 		cbct calibrate "$work/balls" "$work/phantom.json" -o /dev/null --apply "$work/other"
 	[ "$(jq -r .geometry.kind "$work/other/scan.json")" = circular ] || fail "a scan.json that was left alone"
+	cbct simulate -o "$work/wide" --phantom ball --scale 20 --columns 400 --rows 320 --pixel 0.95 --views 8 --arc 150 \
+		--source-to-isocentre 700 --source-to-detector 1180
+	refused 'from the detector, the scan of one with 700 and 1180 mm; --other-arm' \
+		cbct calibrate "$work/balls" "$work/phantom.json" -o /dev/null --apply "$work/wide"
+	[ "$(jq -r .geometry.kind "$work/wide/scan.json")" = circular ] || fail "a scan.json that was left alone"
+	cbct calibrate "$work/balls" "$work/phantom.json" -o /dev/null --apply "$work/wide" --other-arm 2>/dev/null
+	[ "$(jq -r .geometry.kind "$work/wide/scan.json")" = matrices ] || fail "matrices where they are asked for"
 }
 
 run_tests
