@@ -89,12 +89,30 @@ static int park(struct slot *slot, struct error *err)
 	return 0;
 }
 
+/* A projection that the disk has damaged is known by its digest: other bytes are another projection. */
+static int check_lost(struct slot *slot, struct error *err)
+{
+	struct sum known;
+
+	if (!stored_scan_lost_sum(slot->upload->scan, slot->index, &known))
+		return 0;
+	if (hash_slot(slot, err) != 0)
+		return err->code;
+	if (memcmp(slot->sum.sha256, known.sha256, sizeof(known.sha256)) == 0)
+		return 0;
+	return error_set(
+	    err, ERR_CONFLICT,
+	    "projection %d was stored with other bytes, and damaged by the disk: it is to be sent again as it "
+	    "was",
+	    slot->index);
+}
+
 /* Under its claim; the disk begins at once, while the bytes are hashed. */
 static int write_claimed(struct slot *slot, struct error *err)
 {
 	const struct upload *upload = slot->upload;
 
-	if (write_slot(slot, err) == 0) {
+	if (check_lost(slot, err) == 0 && write_slot(slot, err) == 0) {
 		sync_file_range(upload->descriptor, (off_t)slot->index * (off_t)slot->size, (off_t)slot->size,
 				SYNC_FILE_RANGE_WRITE);
 		if (hash_slot(slot, err) == 0) {

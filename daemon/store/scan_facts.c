@@ -164,6 +164,18 @@ bool stored_scan_sum(struct stored_scan *scan, int index, struct sum *ret_sum)
 	return stored;
 }
 
+bool stored_scan_lost_sum(struct stored_scan *scan, int index, struct sum *ret_sum)
+{
+	bool lost;
+
+	pthread_mutex_lock(&scan->lock);
+	lost = scan->lost[index];
+	if (lost)
+		*ret_sum = scan->sums[index];
+	pthread_mutex_unlock(&scan->lock);
+	return lost;
+}
+
 void stored_scan_watch(struct stored_scan *scan, struct watch *watch)
 {
 	watch_add(&scan->watchers, watch);

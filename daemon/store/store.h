@@ -199,6 +199,8 @@ int stored_scan_read(struct stored_scan *scan, int descriptor, int index, void *
 		     struct error *err);
 /* The same without the samples, for who sends them from the file; not again while nothing was written to that. */
 int stored_scan_verify(struct stored_scan *scan, int descriptor, int index, struct sum *ret_sum, struct error *err);
+/* Whether a projection is lost; its sum, as it was stored. */
+bool stored_scan_lost_sum(struct stored_scan *scan, int index, struct sum *ret_sum);
 /* The projection was found not to fit `seen`: it is lost, unless it was sent again since. */
 void stored_scan_lose(struct stored_scan *scan, int index, const struct sum *seen);
 /*

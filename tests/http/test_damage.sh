@@ -74,6 +74,17 @@ test_a_damaged_projection_is_missing_and_can_be_sent_again() {
 		missing_is '[[7, 7]]'
 		expect_json '.received == [[0, 6], [8, 23]] and .state == "receiving" and
 			([.warnings[] | select(.code == "damaged_projections" and .severity == "serious")] | length == 1)'
+		# its digest is known still, also behind a restart: other bytes are no repair
+		req PUT "/v1/scans/$scan/projections/7" --data-binary @<(view 6)
+		expect_problem 409
+		json .detail | grep -q 'damaged by the disk' || fail "why not: $(json .detail)"
+		if [ $format = png ]; then
+			stop_daemon KILL
+			start_daemon
+			req PUT "/v1/scans/$scan/projections/7" --data-binary @<(view 6)
+			expect_problem 409
+		fi
+		missing_is '[[7, 7]]'
 		put_view 7
 		expect_status 201
 		missing_is '[]'
