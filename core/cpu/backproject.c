@@ -115,7 +115,8 @@ int cpu_backproject(struct plan *plan, const struct stack *from, const int *view
 								   NULL);
 		}
 		tile_add(plan, &tile, sums, to->data);
-		pulse_beat();
+		if (t % PULSE_TILES == 0)
+			pulse_beat();
 	}
 	return 0;
 }

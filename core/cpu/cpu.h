@@ -31,6 +31,7 @@ enum {
 	MATCHED_ACROSS = 16, /* the same for the matched backprojection, whose rays reach two voxels beyond a tile */
 	TILE_ALONG = 512,    /* and at most so many along one */
 	TILE_LINES = TILE_ACROSS * TILE_ACROSS,
+	PULSE_TILES = 16, /* one in so many small tiles counts as a step: the counter is shared by all threads */
 	BLEND_MARGIN = 2 * LANES_MOST, /* floats beside a column of voxels in scratch, for windows beyond its ends */
 	ROWS_MARGIN = 4 * LANES_MOST,  /* the same beside a column of pixels */
 };

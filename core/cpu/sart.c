@@ -137,7 +137,8 @@ static int run_subset(struct plan *plan, const struct subset *subset, const stru
 #pragma omp parallel for num_threads(plan->device->threads) schedule(dynamic)
 		for (int t = 0; t < tiles; t++) {
 			update_tile(plan, subset, begin, count, t, volume);
-			pulse_beat();
+			if (t % PULSE_TILES == 0)
+				pulse_beat();
 		}
 	}
 	return 0;
