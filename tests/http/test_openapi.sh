@@ -55,6 +55,11 @@ test_what_is_served_is_the_schema() {
 	expect_status 304
 	req GET /readyz
 	expect_status 200
+	# the plain page's style, which browsers fetch and no other test
+	req GET /plain.css
+	expect_status 200
+	[[ $(header content-type) == text/css* ]] || fail "text/css, got $(header content-type)"
+	grep -q '{' "$body" || fail "rules of a style: $(head -c 100 "$body")"
 	stop_daemon
 }
 
