@@ -327,6 +327,21 @@ test('warnings, parameters, geometry, projections and downloads', async () => {
 	await page.context().close()
 })
 
+test('beside metal the volume is called an estimate, and only there', async () => {
+	const plain = await openFinished()
+	expect(!await plain.isVisible('p.estimate'), 'no word of metal where there is none')
+	await plain.context().close()
+	const job = await post('/v1/jobs', {
+		scan, grid: { size: [36, 32, 40], spacing_mm: [3, 3.4, 2.8] }, fdk: {}, metal: { threshold_hu: 500 },
+	})
+	await ended(job.id)
+	const page = await open(browser, `/#/jobs/${job.id}`)
+	await page.waitForSelector('p.estimate:not([hidden])')
+	const said = await page.textContent('p.estimate')
+	expect(said === 'Within 10 mm of metal this volume is an estimate: do not measure there.', `the sentence, got: ${said}`)
+	await page.context().close()
+})
+
 /* ---- two volumes ---- */
 
 test('two iterations side by side and under a swipe', async () => {
