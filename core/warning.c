@@ -80,6 +80,8 @@ const struct warning_kind warning_kinds[] = {
      "The first or last slices are not seen by all projections: their gray values are not reliable."},
     {"end_slices", SEVERITY_CAUTION,
      "The patient ends close to the first or the last slices of the image: their gray values are uncertain."},
+    {"slices_smoothed", SEVERITY_INFO,
+     "The projections do not show how neighbouring slices differ: the image is smoothed across slices."},
     {"residual_high", SEVERITY_SERIOUS,
      "The image does not agree with the projections: it may be wrong, or need far more iterations."},
     {"tv_without_sart", SEVERITY_INFO, "Noise reduction was asked for after iterations, and there were none."},

@@ -5,6 +5,7 @@
 #include "core/correct/input.h"
 #include "core/fdk.h"
 #include "core/recon/algorithm.h"
+#include "core/recon/alternation.h"
 #include "core/recon/ends.h"
 #include "core/warning.h"
 
@@ -36,7 +37,9 @@ struct recon {
 	struct correction_chain corrections;
 	struct problem problem; /* of the algorithm, where there is one */
 	void *algorithm_state;
-	struct ends *ends; /* the end slices of volumes that are kept; NULL: they are the iterate's */
+	struct ends *ends;               /* the end slices of volumes that are kept; NULL: they are the iterate's */
+	struct alternation *alternation; /* from slice to slice, not in volumes that are kept; NULL: views see it */
+	bool smoothed;                   /* while a volume is kept, `before` has the iterate */
 
 	unsigned char *pushed; /* [views] */
 	int pushed_count;

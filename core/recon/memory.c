@@ -155,6 +155,19 @@ void recon_release(struct recon *recon)
 
 /* ---- the sum ---- */
 
+/* The host's, for what is taken out of volumes that are kept. */
+static size_t kept_bytes(const struct recon *recon)
+{
+	const struct recipe *recipe = &recon->recipe;
+	size_t bytes = 0;
+
+	if (recipe_has_ends(recipe))
+		bytes += ends_bytes(&recipe->grid, recon->geometry, &recon->orbit);
+	if (recipe->algorithm != NULL)
+		bytes += alternation_bytes(&recipe->grid);
+	return bytes;
+}
+
 /* Memory of the job on this device. Sets options->beside and lends, so that the plan sees what is left. */
 static int memory_on(const struct backend *backend, struct device *device, struct recon *recon,
 		     struct plan_options *options, struct recon_memory *ret_memory, struct error *err)
@@ -165,7 +178,7 @@ static int memory_on(const struct backend *backend, struct device *device, struc
 					   .geometry = recon->geometry,
 					   .orbit = &recon->orbit,
 					   .recipe = recipe};
-	const size_t ends = recipe_has_ends(recipe) ? ends_bytes(&recipe->grid, recon->geometry, &recon->orbit) : 0;
+	const size_t kept = kept_bytes(recon);
 	struct walk beside = {.backend = backend, .device = device, .measures = true}, planned = beside;
 	struct correction_bytes around = {0};
 	struct recon_memory memory = {0};
@@ -187,13 +200,13 @@ static int memory_on(const struct backend *backend, struct device *device, struc
 	memory.scratch = bytes.scratch + bytes.raw + beside.scratch;
 	if (backend == &backend_outofcore) {
 		/* The device holds slabs of one volume at a time, or a correction's; the host has all the rest. */
-		memory.host = bytes.host + beside.host + around.host + ends;
+		memory.host = bytes.host + beside.host + around.host + kept;
 		if (around.device > memory.volumes + memory.scratch)
 			memory.scratch = around.device - memory.volumes;
 	} else {
 		/* A backend without memory of its own works in the host's. */
 		memory.projections = planned.projections + beside.projections;
-		memory.scratch += around.device + (backend->own_memory ? 0 : ends);
+		memory.scratch += around.device + (backend->own_memory ? 0 : kept);
 	}
 	memory.total = memory.projections + memory.volumes + memory.scratch;
 	if (device != NULL) {

@@ -166,6 +166,9 @@ int recon_open(const struct backend *backend, struct device *device, const struc
 		code = open_algorithm(recon, err);
 	if (code == 0)
 		code = open_ends(recon, err);
+	if (code == 0 && recon->recipe.algorithm != NULL)
+		code = alternation_new(&recon->recipe.grid, recon->geometry, recon->recipe.mu_water,
+				       &recon->alternation, err);
 	if (code < 0) {
 		recon_free(recon);
 		return code;
@@ -179,6 +182,7 @@ void recon_clear(struct recon *recon)
 	if (recon->algorithm_state != NULL)
 		recon->recipe.algorithm->close(&recon->problem, recon->algorithm_state);
 	ends_free(recon->ends);
+	alternation_free(recon->alternation);
 	corrections_close(&recon->corrections);
 	recon_release(recon);
 	recon->backend->plan_free(recon->plan);

@@ -69,6 +69,26 @@ int recon_resume_noise(struct recon *recon, const struct volume_noise *noise, st
 	return 0;
 }
 
+/* An iterate without what alternates from slice to slice unseen; `before`, which no iteration reads, has the iterate.
+ */
+static int show_smoothed(struct recon *recon, struct volume_norms *norms, struct error *err)
+{
+	struct alternation_report report = {0};
+	int code;
+
+	if (recon->alternation == NULL || recon->iteration == 0)
+		return 0;
+	code = recon->backend->volume_copy(recon->before, recon->volume, err);
+	recon->smoothed = code == 0;
+	if (code == 0)
+		code = alternation_show(recon->alternation, recon->backend, recon->volume, &report, err);
+	if (code == 0)
+		code = measure(recon, NULL, norms, err);
+	if (code == 0 && recon->ended)
+		warn_alternation(&recon->warnings, &recon->recipe, &report);
+	return code;
+}
+
 /* The end slices of an iterate as they are kept; the last one's are told of where they are uncertain. */
 static int show_ends(struct recon *recon, struct volume_norms *norms, struct error *err)
 {
@@ -89,7 +109,12 @@ static int hide(struct recon *recon, struct error *err)
 {
 	int code = corrections_hide(&recon->corrections, err);
 
-	return code == 0 && recon->ends != NULL ? ends_hide(recon->ends, recon->backend, recon->volume, err) : code;
+	if (code == 0 && recon->ends != NULL)
+		code = ends_hide(recon->ends, recon->backend, recon->volume, err);
+	if (code == 0 && recon->smoothed)
+		code = recon->backend->volume_copy(recon->volume, recon->before, err);
+	recon->smoothed = false;
+	return code;
 }
 
 /* A volume is kept with what corrections show in it, the metal; the iterate is worked on without. */
@@ -107,7 +132,9 @@ static int keep(struct recon *recon, const char *name, const char *stage, struct
 	if (recon->hooks->keep == NULL)
 		return 0;
 	recon_tell_progress(recon, STAGE_SAVE, recon->iteration);
-	code = show_ends(recon, &kept.norms, err);
+	code = show_smoothed(recon, &kept.norms, err);
+	if (code == 0)
+		code = show_ends(recon, &kept.norms, err);
 	if (code == 0)
 		code = corrections_show(&recon->corrections, &kept.estimate_mm, err);
 	if (code == 0 && kept.estimate_mm > 0)

@@ -2,6 +2,7 @@
 #define CBCT_CORE_WARN_H
 
 #include "core/scan/orbit.h"
+#include "core/recon/alternation.h"
 #include "core/recon/ends.h"
 #include "core/recon/recon.h"
 #include "core/warning.h"
@@ -21,4 +22,7 @@ void warn_tv(const struct warning_sink *sink, const struct recipe *recipe, const
 	     const struct orbit *orbit);
 /* "end_slices": the object ends near the grid's z faces, and SART and FDK differ there. */
 void warn_ends(const struct warning_sink *sink, const struct recipe *recipe, const struct ends_report *report);
+/* "slices_smoothed": what alternated from slice to slice, seen by no view, was more than a little. */
+void warn_alternation(const struct warning_sink *sink, const struct recipe *recipe,
+		      const struct alternation_report *report);
 #endif

@@ -1,0 +1,153 @@
+/*
+ * What alternates from slice to slice where no view sees it (core/recon/alternation.h): how much of it views see, and
+ * bodies with flat ends whose rows lie on the borders of slices.
+ */
+#include <check.h>
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "core/recon/alternation.h"
+#include "core/recon/algorithm.h"
+#include "tests/unit/anatomy.h"
+#include "tests/unit/scene.h"
+
+Suite *alternation_suite(void);
+
+static struct error err;
+
+enum { ROWS = 23, VIEWS = 60 };
+
+static struct orbit_spec orbit_of(double pixel)
+{
+	const double at_detector = pixel * 1100 / 620;
+
+	return (struct orbit_spec){90, ROWS,        VIEWS, {620, 1100, {at_detector, at_detector}, {0, 0}, {0, 0}},
+				   0,  360. / VIEWS};
+}
+
+/* Slices of .4 mm; the rows' height at the isocentre, and where the middle row passes, in slices. */
+START_TEST(views_see_alternation_as_far_as_their_rows_lie_within_slices)
+{
+	static const struct {
+		double pixel; /* mm */
+		int slices;
+		double place[3]; /* in voxels, from the grid's centre */
+		double least, most;
+	} rows[] = {
+	    {.4, 15, {0, 0, 0}, .99, 1},     {.4, 14, {0, 0, .5}, 0, .001},   {.4, 14, {30, 0, 6.5}, .01, .1},
+	    {.4, 64, {38, 0, 9.5}, .05, .2}, {.4, 14, {0, 0, -3.5}, 0, .001}, {.3, 14, {0, 0, .5}, .2, .5},
+	    {.2, 14, {0, 0, .5}, 1, 1},      {.8, 14, {0, 0, .5}, 1, 1},      {.4, 14, {0, 0, 60.5}, 1, 1},
+	};
+
+	for (size_t i = 0; i < sizeof(rows) / sizeof(rows[0]); i++) {
+		const struct orbit_spec spec = orbit_of(rows[i].pixel);
+		const struct grid grid = grid_of(80, 58, rows[i].slices, .4, .4, .4);
+		double place[3], seen;
+		struct scene scene;
+
+		for (int a = 0; a < 3; a++)
+			place[a] = rows[i].place[a] + 0.5 * (grid.size[a] - 1);
+		scene_orbit(&scene, &spec);
+		seen = alternation_visibility(&scene.geometry, &grid, place);
+		ck_assert_msg(seen >= rows[i].least && seen <= rows[i].most, "row %zu: %.4f", i, seen);
+		scene_clear(&scene);
+	}
+}
+END_TEST
+
+/* Errors within a wrist were three times those of FDK. */
+START_TEST(flat_ends_between_rows_do_not_make_iterations_worse_than_fdk)
+{
+	static const struct anatomy_spec spec = {WRIST, .5, .4, {80, 58, 14}, .4, 60, 360, 1e5, 108};
+	struct anatomy_scan scan;
+	struct device *device;
+	struct recipe recipe;
+	int emit[] = {EMIT_FDK, 3, 10};
+	double noise, alpha, fdk;
+	float *volumes[4];
+
+	ck_assert_int_eq(anatomy_scan_make(&scan, &spec, &err), 0);
+	recipe_defaults(&recipe);
+	recipe.has_grid = recipe.has_origin = true;
+	recipe.grid = scan.grid;
+	recipe.fdk.on = recipe.tv.on = true;
+	recipe.algorithm = &algorithm_sart;
+	recipe.emit = emit;
+	recipe.emits = 3;
+	ck_assert_int_eq(backend_cpu.open(0, &(struct device_options){0}, &device, &err), 0);
+	ck_assert_msg(anatomy_reconstruct(&scan, &backend_cpu, device, &recipe, volumes, &noise, &alpha, &err) == 0,
+		      "%s", err.text);
+	fdk = anatomy_figures(&scan, volumes[0]).rmse;
+	for (int i = 1; i < 4; i++) {
+		const double rmse = anatomy_figures(&scan, volumes[i]).rmse;
+
+		ck_assert_msg(rmse < 0.85 * fdk, "volume %d: %.1f HU, FDK %.1f", i, rmse, fdk);
+	}
+	for (int i = 0; i < 4; i++)
+		free(volumes[i]);
+	backend_cpu.close(device);
+	anatomy_scan_clear(&scan);
+}
+END_TEST
+
+static struct outcome run_cylinder(const struct scene *scene, const struct grid *grid, int threads, bool all)
+{
+	struct recipe recipe = recipe_on(grid);
+	struct outcome outcome = {.threads = threads};
+	int emit[] = {1, 2};
+
+	recipe.fdk.on = true;
+	recipe.algorithm = &algorithm_sart;
+	recipe.iterate.iterations = 3;
+	recipe.emit = emit;
+	recipe.emits = all ? 2 : 0;
+	scene_run(scene, &recipe, &outcome);
+	ck_assert_msg(outcome.code == 0, "%s", outcome.err.text);
+	return outcome;
+}
+
+/* The volume is smoothed and told of; the iterate goes on as it is, whatever is kept, with any number of threads. */
+START_TEST(kept_volumes_are_smoothed_and_the_iterate_is_not)
+{
+	/* Its end is an eighth of a voxel within a slice. */
+	struct ellipsoid part = {.shape = SHAPE_CYLINDER, .semi_axes = {10, 8, 5.85 * .4}, .density = .0192};
+	const struct phantom phantom = {.parts = &part, .count = 1};
+	const struct orbit_spec spec = orbit_of(.4);
+	const struct grid grids[] = {grid_of(60, 60, 14, .4, .4, .4), grid_of(60, 60, 15, .4, .4, .4)};
+	const size_t bytes = sizeof(float) * grid_voxels(&grids[0]);
+	struct outcome all, last, seen;
+	struct scene scene;
+
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	all = run_cylinder(&scene, &grids[0], 1, true);
+	last = run_cylinder(&scene, &grids[0], 2, false);
+	seen = run_cylinder(&scene, &grids[1], 0, false);
+	ck_assert_mem_eq(all.last, last.last, bytes);
+	ck_assert_mem_eq(outcome_volume(&all, "final"), outcome_volume(&last, "final"), bytes);
+	ck_assert_int_ne(memcmp(outcome_volume(&all, "final"), all.last, bytes), 0);
+	ck_assert_double_gt(all.kept[2].norms.maximum, 0);
+	ck_assert_msg(strstr(all.warnings, "slices_smoothed: ") != NULL, "%s", all.warnings);
+	/* A slice more, and the rows lie on slices. */
+	ck_assert_ptr_null(strstr(seen.warnings, "slices_smoothed: "));
+	ck_assert_mem_eq(outcome_volume(&seen, "final"), seen.last, sizeof(float) * grid_voxels(&grids[1]));
+	outcome_clear(&all);
+	outcome_clear(&last);
+	outcome_clear(&seen);
+	scene_clear(&scene);
+}
+END_TEST
+
+Suite *alternation_suite(void)
+{
+	Suite *suite = suite_create("alternation");
+	TCase *tests = tcase_create("slices");
+
+	tcase_set_timeout(tests, 0);
+	tcase_add_test(tests, views_see_alternation_as_far_as_their_rows_lie_within_slices);
+	tcase_add_test(tests, flat_ends_between_rows_do_not_make_iterations_worse_than_fdk);
+	tcase_add_test(tests, kept_volumes_are_smoothed_and_the_iterate_is_not);
+	suite_add_tcase(suite, tests);
+	return suite;
+}
