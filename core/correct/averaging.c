@@ -3,11 +3,14 @@
 
 #include <math.h>
 #include <stdlib.h>
+#include <string.h>
 
 #include "core/correct/correction.h"
 
 /* About so many views are looked at, and of each so many pixels. */
 enum { VIEWS = 32, PIXELS = 300000 };
+/* The distances of the settling's decision, in pixels, behind those of the averaging's. */
+enum { SETTLING_DISTANCES = 2, DISTANCES = AVERAGING_DISTANCES + SETTLING_DISTANCES };
 /* D is told from noise where it exceeds its standard error by this. */
 static const double CERTAIN = 4;
 
@@ -33,6 +36,41 @@ double averaging_fineness(double pixels)
 double averaging_share(double ratio)
 {
 	return fmin(1, fmax(0, (ratio - AVERAGING_SMOOTH) / (AVERAGING_SHARP - AVERAGING_SMOOTH)));
+}
+
+/* ---- settling ---- */
+
+double settling_share(double pixels, const struct averaging_sums sums[2])
+{
+	/* Of objects of voxels at most, and so much more with edges. */
+	const double smooth = fmax(0.135, 0.2 - 0.07 * (pixels - 1.3)), sharper = 0.03;
+	double ratio;
+
+	for (int i = 0; i < SETTLING_DISTANCES; i++)
+		if (!(sums[i].product > CERTAIN * sqrt(sums[i].square)))
+			return 0;
+	ratio = sums[0].product / (double)sums[0].count / (sums[1].product / (double)sums[1].count);
+	return fmin(1, fmax(0, (ratio - smooth) / sharper));
+}
+
+double settling_after(double pixels, double averaged, double share)
+{
+	/* A voxel of 1.67 pixels does as one of which all pixels are averaged. */
+	const double whole = 1.67, left = averaged > 0 ? pixels + averaged * (whole - pixels) : pixels;
+
+	return left > SETTLING_NONE && share > 0 ? (1 + 2 / (left - 1)) / share : INFINITY;
+}
+
+double settling_from(double after, double updates)
+{
+	return fmax(2, after * 10 / updates);
+}
+
+double settling_relaxation(int iteration, double after, double updates)
+{
+	const double from = settling_from(after, updates);
+
+	return iteration > from ? pow(0.5, (iteration - from) * fmin(1, updates / 10)) : 1;
 }
 
 /* ---- the decision ---- */
@@ -117,8 +155,8 @@ double averaging_ratio(double pixels, const struct averaging_sums sums[AVERAGING
 struct state {
 	double pixels[2];
 	int every; /* one view in so many is looked at */
-	int distances[AVERAGING_DISTANCES];
-	struct averaging_sums (*sums)[AVERAGING_DISTANCES]; /* [views looked at], owned */
+	int distances[DISTANCES];
+	struct averaging_sums (*sums)[DISTANCES]; /* [views looked at], owned */
 	int looked_at;
 	float *view; /* [row][column], owned */
 };
@@ -134,17 +172,16 @@ static void close_state(void *context)
 	free(state);
 }
 
-static double ratio_of(const struct state *state)
+static void sum_up(const struct state *state, struct averaging_sums sums[DISTANCES])
 {
-	struct averaging_sums sums[AVERAGING_DISTANCES] = {0};
+	memset(sums, 0, DISTANCES * sizeof(*sums));
 
 	for (int k = 0; k < state->looked_at; k++)
-		for (int i = 0; i < AVERAGING_DISTANCES; i++) {
+		for (int i = 0; i < DISTANCES; i++) {
 			sums[i].product += state->sums[k][i].product;
 			sums[i].square += state->sums[k][i].square;
 			sums[i].count += state->sums[k][i].count;
 		}
-	return averaging_ratio(state->pixels[0], sums);
 }
 
 /* ---- the row ---- */
@@ -178,7 +215,8 @@ static int open_state(const struct correction_job *job, void **ret_state, struct
 	struct state *state;
 	double pixels[2];
 
-	if (!is_fine(job->orbit, &job->recipe->grid, pixels))
+	is_fine(job->orbit, &job->recipe->grid, pixels);
+	if (!(pixels[0] > SETTLING_NONE))
 		return 0;
 	state = calloc(1, sizeof(*state));
 	if (state == NULL)
@@ -186,6 +224,8 @@ static int open_state(const struct correction_job *job, void **ret_state, struct
 	for (int i = 0; i < 2; i++)
 		state->pixels[i] = pixels[i];
 	averaging_distances(pixels[0], state->distances);
+	for (int i = 0; i < SETTLING_DISTANCES; i++)
+		state->distances[AVERAGING_DISTANCES + i] = 1 + i;
 	state->every = geometry->count / VIEWS + 1;
 	state->looked_at = (geometry->count - 1) / state->every + 1;
 	state->sums = calloc((size_t)state->looked_at, sizeof(*state->sums));
@@ -210,7 +250,8 @@ static int look_at(const struct correction_job *job, void *context, const struct
 	if (state == NULL || view->view % state->every != 0)
 		return 0;
 	code = job->backend->stack_download(view->to, view->slot, 1, state->view, err);
-	for (int i = 0; i < AVERAGING_DISTANCES && code == 0; i++) {
+	for (int i = averaging_fineness(state->pixels[0]) > 0 ? 0 : AVERAGING_DISTANCES; i < DISTANCES && code == 0;
+	     i++) {
 		struct averaging_sums *sums = &state->sums[view->view / state->every][i];
 
 		*sums = (struct averaging_sums){0};
@@ -239,14 +280,18 @@ static int apply(const struct correction_job *job, void *context, enum correctio
 		 struct error *err)
 {
 	const struct state *state = context;
+	struct averaging_sums sums[DISTANCES];
 	double widths[2], ratio, share;
 
 	(void)time;
 	(void)ret_changed;
 	if (state == NULL)
 		return 0;
-	ratio = ratio_of(state);
+	sum_up(state, sums);
+	ratio = averaging_ratio(state->pixels[0], sums);
 	share = averaging_share(ratio);
+	*job->settled = settling_after(state->pixels[0], share * averaging_fineness(state->pixels[0]),
+				       settling_share(state->pixels[0], sums + AVERAGING_DISTANCES));
 	if (share == 0)
 		return 0;
 	for (int i = 0; i < 2; i++)

@@ -49,6 +49,7 @@ struct correction_job {
 	struct volume *work;         /* on the recipe's grid, to work in */
 	const struct input *input;   /* what was seen of the samples so far (core/correct/input.h) */
 	const int *iteration;        /* iterations that are done */
+	double *settled;             /* iterations after which relaxation falls (averaging.h); INFINITY: never */
 	const struct warning_sink *warnings;
 	const struct cancel *cancel;
 };

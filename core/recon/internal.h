@@ -49,6 +49,7 @@ struct recon {
 
 	bool resumed, ran, ended; /* ended: behind the last iteration */
 	int iteration;            /* done so far */
+	double settled;           /* iterations after which relaxation falls; INFINITY: never */
 	bool moved;               /* the iterate is not the one that the algorithm left */
 	struct volume_norms norms;
 	double work_done, work_total; /* in FDKs of the whole scan */

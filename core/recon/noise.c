@@ -249,11 +249,7 @@ static double reach_after_sart(const struct volume_noise *noise, const struct re
 {
 	const double *mm = recipe->grid.spacing, *pixel = orbit->pixel_at_isocentre;
 	const double fineness = sqrt(pixel[0] * pixel[1]) / cbrt(mm[0] * mm[1] * mm[2]);
-	const struct algorithm *algorithm = recipe->algorithm;
-	const double each = algorithm != NULL && algorithm->updates > 0
-				? algorithm->updates
-				: recipe->sart.relaxation * subsets_count(recipe->sart.subsets, orbit->count);
-	const double updates = each / UPDATES;
+	const double updates = recipe_updates(recipe, orbit) / UPDATES;
 	const double streaks = FEW * pow(FEW_VIEWS / fmax(orbit->count, FEWEST_VIEWS), 4);
 	const double left = 1 - (1 - AVERAGED) * averaging_fineness(1 / fineness);
 	const double edges =

@@ -184,3 +184,12 @@ int recipe_resolve(struct recipe *recipe, const struct geometry *geometry, const
 		*recipe = resolved;
 	return code;
 }
+
+double recipe_updates(const struct recipe *recipe, const struct orbit *orbit)
+{
+	const struct algorithm *algorithm = recipe->algorithm;
+
+	return algorithm != NULL && algorithm->updates > 0
+		   ? algorithm->updates
+		   : recipe->sart.relaxation * subsets_count(recipe->sart.subsets, orbit->count);
+}

@@ -27,4 +27,7 @@ int recipe_check(const struct recipe *recipe, const struct geometry *geometry, s
 int recipe_resolve(struct recipe *recipe, const struct geometry *geometry, const struct orbit *orbit,
 		   struct error *err);
 
+/* Updates of SART that change the iterate as much as one iteration does. */
+double recipe_updates(const struct recipe *recipe, const struct orbit *orbit);
+
 #endif

@@ -101,6 +101,7 @@ static int open_corrections(struct recon *recon, struct error *err)
 	    .work = recon->before,
 	    .input = &recon->input,
 	    .iteration = &recon->iteration,
+	    .settled = &recon->settled,
 	    .warnings = &recon->warnings,
 	    .cancel = &recon->cancel,
 	};
@@ -151,6 +152,7 @@ int recon_open(const struct backend *backend, struct device *device, const struc
 	recon->device = device;
 	recon->geometry = geometry;
 	recon->hooks = hooks;
+	recon->settled = INFINITY;
 	recon->cancel = (struct cancel){.asked = hooks->cancelled, .context = hooks->context};
 	recon->warnings = (struct warning_sink){.context = hooks->context, .tell = hooks->warning};
 	code = recon_describe(recon, recipe, err);

@@ -6,6 +6,7 @@
 #include <stdio.h>
 #include <time.h>
 
+#include "core/correct/averaging.h"
 #include "core/recon/internal.h"
 #include "core/recon/noise.h"
 #include "core/recon/warn.h"
@@ -241,6 +242,16 @@ static double now(void)
 	return (double)time.tv_sec + 1e-9 * (double)time.tv_nsec;
 }
 
+/* Where projections show more than the grid holds, late iterations keep a falling share of their change (averaging.h).
+ */
+static int relax(struct recon *recon, int iteration, struct error *err)
+{
+	const double updates = recipe_updates(&recon->recipe, &recon->orbit);
+	const double share = has_subsets(&recon->recipe) ? settling_relaxation(iteration, recon->settled, updates) : 1;
+
+	return share < 1 ? recon->backend->volume_axpby(1 - share, recon->before, share, recon->volume, err) : 0;
+}
+
 /* One iteration, TV included, and its row of the history. */
 static int iterate(struct recon *recon, struct history_row *ret_row, struct error *err)
 {
@@ -258,6 +269,8 @@ static int iterate(struct recon *recon, struct history_row *ret_row, struct erro
 	recon->moved = recon->recipe.tv.on;
 	if (recon->recipe.tv.on)
 		code = run_tv(recon, iteration, err);
+	if (code == 0)
+		code = relax(recon, iteration, err);
 	if (code == 0)
 		code = measure(recon, recon->before, &recon->norms, err);
 	if (code == 0)
@@ -286,6 +299,9 @@ static int run_iterations(struct recon *recon, struct error *err)
 		failed = ends_begin(recon->ends, recon->backend, recon->volume, err);
 	if (failed < 0)
 		return failed;
+	if (has_subsets(&recon->recipe) && recon->iteration == 0)
+		warn_settled(&recon->warnings, &recon->recipe,
+			     settling_from(recon->settled, recipe_updates(&recon->recipe, &recon->orbit)));
 
 	while (!last) {
 		struct history_row row;

@@ -188,3 +188,13 @@ void warn_alternation(const struct warning_sink *sink, const struct recipe *reci
 	    "along z. A slice more or less, or half a voxel along z, puts slices on rows",
 	    report->removed / hu, report->slices);
 }
+
+void warn_settled(const struct warning_sink *sink, const struct recipe *recipe, double from)
+{
+	if (from < recipe->iterate.iterations)
+		warning_tell(
+		    sink, "iterations_settled",
+		    "the projections show edges within voxels, which iterations would overshoot beside: from the "
+		    "%d. of %d iterations on, each keeps less of its change than the one before",
+		    (int)from + 1, recipe->iterate.iterations);
+}

@@ -32,11 +32,10 @@ static double ratio_of(const struct geometry *geometry, const float *projections
 enum { SIDE = 40, VIEWS = 8 };
 static const double CUBE = 96; /* mm */
 
-/* The head of Kak and Slaney: as linear interpolation between voxels has it, and its exact integrals. _i: fineness. */
-START_TEST(an_object_of_voxels_has_no_more_than_its_grid)
+/* Exact integrals of the head of Kak and Slaney, and of what linear interpolation between voxels makes of it. */
+static void scan_head(double pixels, struct scene *ret_exact, struct scene *ret_of_voxels)
 {
-	static const double pixels[] = {2.2, 3, 4.1};
-	const double m = pixels[_i], pixel = CUBE / SIDE / m;
+	const double pixel = CUBE / SIDE / pixels;
 	const int across = (int)(1.45 * CUBE / pixel);
 	const struct orbit_spec spec = {across, across,
 					VIEWS,  {620, 1100, {pixel / 620 * 1100, pixel / 620 * 1100}, {0, 0}, {0, 0}},
@@ -44,26 +43,83 @@ START_TEST(an_object_of_voxels_has_no_more_than_its_grid)
 	const struct grid grid = grid_of(SIDE, SIDE, SIDE, CUBE / SIDE, CUBE / SIDE, CUBE / SIDE);
 	float *volume = malloc(sizeof(*volume) * grid_voxels(&grid));
 	struct phantom head;
-	struct scene scene;
-	double of_voxels, exact;
 
 	ck_assert_ptr_nonnull(volume);
 	ck_assert_int_eq(phantom_named(&head, "head", CUBE / 2, .0192, &err), 0);
 	phantom_voxelise(&head, &grid, 2, volume);
-	scene_orbit(&scene, &spec);
-	scene_add(&scene, &head);
-	exact = ratio_of(&scene.geometry, scene.projections, m);
+	scene_orbit(ret_exact, &spec);
+	scene_add(ret_exact, &head);
+	scene_orbit(ret_of_voxels, &spec);
 	for (int view = 0; view < VIEWS; view++)
-		volume_project_fine(volume, &grid, &scene.geometry, view, SAMPLE_TRILINEAR, .2 * CUBE / SIDE,
-				    scene.projections + (size_t)across * (size_t)across * (size_t)view);
-	of_voxels = ratio_of(&scene.geometry, scene.projections, m);
-	ck_assert_msg(of_voxels > 0.1 && of_voxels < AVERAGING_SMOOTH && exact > 0.17,
-		      "%g pixels a voxel: of voxels %.3f, exact %.3f", m, of_voxels, exact);
-	ck_assert_double_eq(averaging_share(of_voxels), 0);
-	ck_assert_double_eq(averaging_share(exact), 1);
+		volume_project_fine(volume, &grid, &ret_of_voxels->geometry, view, SAMPLE_TRILINEAR, .2 * CUBE / SIDE,
+				    ret_of_voxels->projections + (size_t)across * (size_t)across * (size_t)view);
 	free(volume);
 	phantom_clear(&head);
-	scene_clear(&scene);
+}
+
+/* _i: fineness. */
+START_TEST(an_object_of_voxels_has_no_more_than_its_grid)
+{
+	static const double pixels[] = {2.2, 3, 4.1};
+	struct scene exact, of_voxels;
+	double sharp, smooth;
+
+	scan_head(pixels[_i], &exact, &of_voxels);
+	sharp = ratio_of(&exact.geometry, exact.projections, pixels[_i]);
+	smooth = ratio_of(&of_voxels.geometry, of_voxels.projections, pixels[_i]);
+	ck_assert_msg(smooth > 0.1 && smooth < AVERAGING_SMOOTH && sharp > 0.17,
+		      "%g pixels a voxel: of voxels %.3f, exact %.3f", pixels[_i], smooth, sharp);
+	ck_assert_double_eq(averaging_share(smooth), 0);
+	ck_assert_double_eq(averaging_share(sharp), 1);
+	scene_clear(&exact);
+	scene_clear(&of_voxels);
+}
+END_TEST
+
+static double settling_of(const struct geometry *geometry, const float *projections, double pixels)
+{
+	const size_t size = (size_t)geometry->columns * (size_t)geometry->rows;
+	struct averaging_sums sums[2] = {0};
+
+	for (int view = 0; view < geometry->count; view++)
+		for (int i = 0; i < 2; i++)
+			ck_assert_int_eq(averaging_add(projections + size * (size_t)view, geometry->columns,
+						       geometry->rows, 1, 1 + i, &sums[i], &err),
+					 0);
+	return settling_share(pixels, sums);
+}
+
+/* _i: fineness. */
+START_TEST(iterations_settle_where_there_are_edges_within_voxels)
+{
+	static const double pixels[] = {1.3, 1.6, 2.1};
+	struct scene exact, of_voxels;
+
+	scan_head(pixels[_i], &exact, &of_voxels);
+	ck_assert_double_eq(settling_of(&exact.geometry, exact.projections, pixels[_i]), 1);
+	ck_assert_double_eq(settling_of(&of_voxels.geometry, of_voxels.projections, pixels[_i]), 0);
+	scene_clear(&exact);
+	scene_clear(&of_voxels);
+}
+END_TEST
+
+START_TEST(the_change_of_late_iterations_falls_the_earlier_the_finer_the_pixels)
+{
+	ck_assert(isinf(settling_after(1.1, 0, 1)));
+	ck_assert(isinf(settling_after(2, 0, 0)));
+	ck_assert_double_eq_tol(settling_after(1.5, 0, 1), 5, 1e-9);
+	ck_assert_double_eq_tol(settling_after(2, 0, 1), 3, 1e-9);
+	ck_assert_double_eq_tol(settling_after(2, 0, .5), 6, 1e-9);
+	/* Averaged pixels count as coarse ones. */
+	ck_assert_double_gt(settling_after(3, 1, 1), settling_after(2, 0, 1));
+	ck_assert_double_eq(settling_relaxation(3, 3, 10), 1);
+	ck_assert_double_eq(settling_relaxation(5, 3, 10), .25);
+	ck_assert_double_eq(settling_relaxation(1000, INFINITY, 10), 1);
+	/* SIRT has one update in an iteration; after each view, the first two iterations stay whole. */
+	ck_assert_double_eq(settling_relaxation(30, 3, 1), 1);
+	ck_assert_double_eq_tol(settling_relaxation(40, 3, 1), .5, 1e-9);
+	ck_assert_double_eq(settling_relaxation(2, 3, 100), 1);
+	ck_assert_double_lt(settling_relaxation(3, 3, 100), 1);
 }
 END_TEST
 
@@ -121,6 +177,8 @@ Suite *averaging_suite(void)
 
 	tcase_set_timeout(decision, 0);
 	tcase_add_loop_test(decision, an_object_of_voxels_has_no_more_than_its_grid, 0, 3);
+	tcase_add_loop_test(decision, iterations_settle_where_there_are_edges_within_voxels, 0, 3);
+	tcase_add_test(decision, the_change_of_late_iterations_falls_the_earlier_the_finer_the_pixels);
 	tcase_add_loop_test(decision, anatomy_has_edges_within_voxels_whatever_the_noise, 0, ANATOMY_COUNT);
 	tcase_add_test(decision, without_structure_nothing_is_decided);
 	suite_add_tcase(suite, decision);
