@@ -13,13 +13,18 @@ enum { STEP = 8 };
 static const double ROWS_LEAST = 0.7, ROWS_MOST = 1.4;
 /* A slice whose body is smaller says nothing. */
 enum { BODY_LEAST = 16 };
+/* Of water's density, or of the object's where that is more: 40 HU. */
+static const double LITTLE = 0.04;
+/* Slices at hand at a time. */
+enum { WINDOW = 3 };
 
 struct alternation {
 	int size[3];
 	int nodes[2];    /* of the lattice, along x and y */
 	double mu_water; /* 1/mm */
 	float *weight;   /* [z][node y][node x] */
-	float *values;   /* [3] slices: V of the slice before, at work, and behind */
+	float *values;   /* [WINDOW] slices of V: before the one at hand, that one, and behind it */
+	float *away;     /* [WINDOW] slices of A, the last of them of the one at hand */
 	float *changed;  /* a slice: V' */
 };
 
@@ -117,7 +122,7 @@ static size_t pixels_of(const int size[3])
 
 size_t alternation_bytes(const struct grid *grid)
 {
-	return sizeof(float) * (weights_of(grid) + 4 * pixels_of(grid->size));
+	return sizeof(float) * (weights_of(grid) + (2 * WINDOW + 1) * pixels_of(grid->size));
 }
 
 /* Whether the rows that pass the grid's centre are about as far apart as its slices. */
@@ -140,19 +145,20 @@ int alternation_new(const struct grid *grid, const struct geometry *geometry, do
 		return 0;
 	alternation = malloc(sizeof(*alternation));
 	if (alternation == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for three slices");
+		return error_set(err, ERR_NO_MEMORY, "no memory for some slices");
 	*alternation = (struct alternation){
 	    .size = {grid->size[0], grid->size[1], grid->size[2]},
 	    .nodes = {nodes_along(grid->size[0]), nodes_along(grid->size[1])},
 	    .mu_water = mu_water,
-	    .weight = malloc(alternation_bytes(grid)),
+	    .weight = calloc(alternation_bytes(grid), 1),
 	};
 	if (alternation->weight == NULL) {
 		free(alternation);
-		return error_set(err, ERR_NO_MEMORY, "no memory for three slices");
+		return error_set(err, ERR_NO_MEMORY, "no memory for some slices");
 	}
 	alternation->values = alternation->weight + weights_of(grid);
-	alternation->changed = alternation->values + 3 * pixels_of(grid->size);
+	alternation->away = alternation->values + WINDOW * pixels_of(grid->size);
+	alternation->changed = alternation->away + WINDOW * pixels_of(grid->size);
 	if (!find_weights(alternation, geometry, grid)) {
 		alternation_free(alternation);
 		return 0;
@@ -193,72 +199,128 @@ static float weight_between(const struct alternation *alternation, int x, int y,
 	return (1 - v) * ((1 - u) * at[0] + u * at[1]) + v * ((1 - u) * at[nodes[0]] + u * at[nodes[0] + 1]);
 }
 
-/* V' of slice z from its neighbours and itself; beyond the last slice it goes on as it is. */
-static void smooth_slice(struct alternation *alternation, int z)
+/* Goes through the slices: the one at hand is `here` with those before and behind it, its part A = N V is `away`. */
+struct pass {
+	const struct backend *backend;
+	struct volume *volume;
+	int z;
+};
+
+static struct pass pass_begin(const struct backend *backend, struct volume *volume)
+{
+	return (struct pass){.backend = backend, .volume = volume, .z = -1};
+}
+
+/* Slice 0 of the window becomes slice 1, and 1 becomes 2's. */
+static void shift(float *window, size_t pixels)
+{
+	memmove(window, window + pixels, (WINDOW - 1) * pixels * sizeof(float));
+}
+
+/* On to the next slice; beyond the first and the last one the volume goes on as it is. */
+static int pass_on(struct alternation *alternation, struct pass *pass, struct error *err)
+{
+	const size_t pixels = pixels_of(alternation->size);
+	float *before = alternation->values, *here = before + pixels, *behind = here + pixels;
+	float *away = alternation->away + (WINDOW - 1) * pixels;
+	int code = 0;
+
+	pass->z++;
+	if (pass->z == 0) {
+		code = pass->backend->volume_download(pass->volume, 0, 1, behind, err);
+		memcpy(here, behind, pixels * sizeof(float));
+	}
+	shift(alternation->values, pixels);
+	shift(alternation->away, pixels);
+	if (code == 0 && pass->z + 1 < alternation->size[2])
+		code = pass->backend->volume_download(pass->volume, pass->z + 1, 1, behind, err);
+#pragma omp parallel for schedule(static)
+	for (size_t i = 0; i < pixels; i++)
+		away[i] = (2 * here[i] - before[i] - behind[i]) / 4;
+	return code;
+}
+
+/* a of one voxel, from A there and in the slices to both sides. */
+static double alternates(float before, float here, float behind)
+{
+	if (!(before * here < 0 && here * behind < 0))
+		return 0;
+	return (double)fminf(fabsf(here), fminf(fabsf(before), fabsf(behind)));
+}
+
+/* The mean of a over the body of the slice before the one at hand. */
+static void measure_slice(const struct alternation *alternation, int z, struct alternation_report *report)
+{
+	const int columns = alternation->size[0];
+	const size_t pixels = pixels_of(alternation->size);
+	const float *values = alternation->values, *away = alternation->away;
+	double sum = 0, body = 0;
+	size_t count = 0;
+
+	for (size_t i = 0; i < pixels; i++) {
+		const int x = (int)(i % (size_t)columns), y = (int)(i / (size_t)columns);
+		/* Without what alternates; where that is most, every other slice is as dark as air. */
+		const double level = (double)values[i] - (double)away[pixels + i];
+
+		if (!(level > 0.5 * alternation->mu_water))
+			continue;
+		sum += (double)weight_between(alternation, x, y, z) *
+		       alternates(away[i], away[pixels + i], away[2 * pixels + i]);
+		body += level;
+		count++;
+	}
+	if (count < BODY_LEAST || sum <= report->amplitude * (double)count)
+		return;
+	report->amplitude = sum / (double)count;
+	report->much = report->amplitude > LITTLE * fmax(alternation->mu_water, body / (double)count);
+}
+
+static int measure(struct alternation *alternation, struct pass pass, struct alternation_report *report,
+		   struct error *err)
+{
+	int code = 0;
+
+	for (int z = 0; z < alternation->size[2] && code == 0; z++) {
+		code = pass_on(alternation, &pass, err);
+		if (code == 0 && z > 1 && has_weight(alternation, z - 1))
+			measure_slice(alternation, z - 1, report);
+	}
+	return code;
+}
+
+static int take_out(struct alternation *alternation, struct pass pass, struct alternation_report *report,
+		    struct error *err)
 {
 	const int columns = alternation->size[0], rows = alternation->size[1];
 	const size_t pixels = pixels_of(alternation->size);
-	const float *before = alternation->values, *here = before + pixels, *behind = here + pixels;
+	const float *here = alternation->values + pixels, *away = alternation->away + (WINDOW - 1) * pixels;
+	int code = 0;
 
+	for (int z = 0; z < alternation->size[2] && code == 0; z++) {
+		code = pass_on(alternation, &pass, err);
+		if (code < 0 || !has_weight(alternation, z))
+			continue;
 #pragma omp parallel for schedule(static)
-	for (int y = 0; y < rows; y++)
-		for (int x = 0; x < columns; x++) {
-			const size_t i = (size_t)y * (size_t)columns + (size_t)x;
-			const float away = (2 * here[i] - before[i] - behind[i]) / 4;
+		for (int y = 0; y < rows; y++)
+			for (int x = 0; x < columns; x++) {
+				const size_t i = (size_t)y * (size_t)columns + (size_t)x;
 
-			alternation->changed[i] = here[i] - weight_between(alternation, x, y, z) * away;
-		}
-}
-
-static void report_slice(const struct alternation *alternation, struct alternation_report *report)
-{
-	const size_t pixels = pixels_of(alternation->size);
-	const float *here = alternation->values + pixels;
-	double removed = 0, body = 0;
-	size_t count = 0;
-
-	report->slices++;
-	for (size_t i = 0; i < pixels; i++)
-		if ((double)fmaxf(here[i], alternation->changed[i]) > 0.5 * alternation->mu_water) {
-			removed += fabs((double)here[i] - (double)alternation->changed[i]);
-			body += (double)alternation->changed[i];
-			count++;
-		}
-	if (count < BODY_LEAST || removed / (double)count <= report->removed)
-		return;
-	report->removed = removed / (double)count;
-	report->body = body / (double)count;
-}
-
-/* Slices z - 1, z, z + 1 of V become those of z + 1. */
-static int move_on(struct alternation *alternation, const struct backend *backend, struct volume *volume, int z,
-		   struct error *err)
-{
-	const size_t pixels = pixels_of(alternation->size);
-	float *behind = alternation->values + 2 * pixels;
-
-	memmove(alternation->values, alternation->values + pixels, 2 * pixels * sizeof(float));
-	return z + 1 < alternation->size[2] ? backend->volume_download(volume, z + 1, 1, behind, err) : 0;
+				alternation->changed[i] = here[i] - weight_between(alternation, x, y, z) * away[i];
+			}
+		code = pass.backend->volume_put(pass.volume, z, 1, alternation->changed, err);
+		report->slices++;
+	}
+	return code;
 }
 
 int alternation_show(struct alternation *alternation, const struct backend *backend, struct volume *volume,
 		     struct alternation_report *ret_report, struct error *err)
 {
-	const size_t pixels = pixels_of(alternation->size);
 	struct alternation_report report = {0};
-	int code = backend->volume_download(volume, 0, 1, alternation->values + 2 * pixels, err);
+	int code = measure(alternation, pass_begin(backend, volume), &report, err);
 
-	/* The first slice stands for the one before it. */
-	if (code == 0)
-		memcpy(alternation->values + pixels, alternation->values + 2 * pixels, pixels * sizeof(float));
-	for (int z = 0; z < alternation->size[2] && code == 0; z++) {
-		code = move_on(alternation, backend, volume, z, err);
-		if (code < 0 || !has_weight(alternation, z))
-			continue;
-		smooth_slice(alternation, z);
-		report_slice(alternation, &report);
-		code = backend->volume_put(volume, z, 1, alternation->changed, err);
-	}
+	if (code == 0 && report.much)
+		code = take_out(alternation, pass_begin(backend, volume), &report, err);
 	if (code == 0)
 		*ret_report = report;
 	return code;

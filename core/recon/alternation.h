@@ -18,7 +18,9 @@
  * alternating slices has there. Rows nearer to the centre count more, 1 - |s|. It is 1 where rows lie on slices, 1/3
  * where they lie anywhere, 0 where all lie on borders.
  *
- *   V' = V - w (-1, 2, -1) / 4 along z,  w = 1 for a visibility up to ALTERNATION_UNSEEN, 0 from ALTERNATION_SEEN on
+ *   A = (-1, 2, -1) / 4 of V along z,  w = 1 for a visibility up to ALTERNATION_UNSEEN, 0 from ALTERNATION_SEEN on
+ *   a = the least of |A| in three slices in a row where A changes its sign twice, else 0: an edge has none
+ *   V' = V - w A where w a exceeds 40 HU in the mean over the body of some slice; else V' = V, to the bit
  *
  * Only volumes that are kept have V'; the iterate goes on as it is. All of it is found from the geometry, before the
  * start. One thread at a time.
@@ -29,9 +31,9 @@
 struct alternation;
 
 struct alternation_report {
-	int slices;     /* that were changed */
-	double removed; /* the most of a slice's mean change over the body, 1/mm */
-	double body;    /* the mean of that slice's body, 1/mm */
+	bool much;        /* the volume was changed */
+	int slices;       /* that were */
+	double amplitude; /* the most of a slice's mean of w a over the body, 1/mm */
 };
 
 /* Of alternation at a place of the grid, in voxels; 1 where no view sees the place, or rows and slices differ in
@@ -45,7 +47,7 @@ int alternation_new(const struct grid *grid, const struct geometry *geometry, do
 		    struct alternation **ret_alternation, struct error *err);
 void alternation_free(struct alternation *alternation); /* NULL is fine */
 
-/* V becomes V' in the slices that have any weight. The caller keeps a copy of V. */
+/* V becomes V'. The caller keeps a copy of V. */
 int alternation_show(struct alternation *alternation, const struct backend *backend, struct volume *volume,
 		     struct alternation_report *ret_report, struct error *err);
 

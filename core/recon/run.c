@@ -80,10 +80,10 @@ static int show_smoothed(struct recon *recon, struct volume_norms *norms, struct
 	if (recon->alternation == NULL || recon->iteration == 0)
 		return 0;
 	code = recon->backend->volume_copy(recon->before, recon->volume, err);
-	recon->smoothed = code == 0;
 	if (code == 0)
 		code = alternation_show(recon->alternation, recon->backend, recon->volume, &report, err);
-	if (code == 0)
+	recon->smoothed = report.much;
+	if (code == 0 && report.much)
 		code = measure(recon, NULL, norms, err);
 	if (code == 0 && recon->ended)
 		warn_alternation(&recon->warnings, &recon->recipe, &report);

@@ -177,16 +177,15 @@ void warn_ends(const struct warning_sink *sink, const struct recipe *recipe, con
 void warn_alternation(const struct warning_sink *sink, const struct recipe *recipe,
 		      const struct alternation_report *report)
 {
-	const double little = 0.04, hu = recipe->mu_water / 1000;
+	const double hu = recipe->mu_water / 1000;
 
-	if (!(report->removed > little * fmax(recipe->mu_water, report->body)))
-		return;
-	warning_tell(
-	    sink, "slices_smoothed",
-	    "the detector's rows lie on the borders between slices, where no view sees what alternates from slice "
-	    "to slice: it grew to %.0f HU in the mean of a slice, and %d slices of kept volumes are smoothed "
-	    "along z. A slice more or less, or half a voxel along z, puts slices on rows",
-	    report->removed / hu, report->slices);
+	if (report->much)
+		warning_tell(
+		    sink, "slices_smoothed",
+		    "the detector's rows lie on the borders between slices, where no view sees what alternates "
+		    "from slice to slice: it grew to %.0f HU in the mean of a slice, and %d slices of kept volumes "
+		    "are smoothed along z. A slice more or less, or half a voxel along z, puts slices on rows",
+		    report->amplitude / hu, report->slices);
 }
 
 void warn_settled(const struct warning_sink *sink, const struct recipe *recipe, double from)
