@@ -242,12 +242,18 @@ static double now(void)
 	return (double)time.tv_sec + 1e-9 * (double)time.tv_nsec;
 }
 
+/* A relaxation that was asked for is kept to. */
+static bool may_settle(const struct recipe *recipe)
+{
+	return has_subsets(recipe) && recipe->sart.relaxation == 1;
+}
+
 /* Where projections show more than the grid holds, late iterations keep a falling share of their change (averaging.h).
  */
 static int relax(struct recon *recon, int iteration, struct error *err)
 {
 	const double updates = recipe_updates(&recon->recipe, &recon->orbit);
-	const double share = has_subsets(&recon->recipe) ? settling_relaxation(iteration, recon->settled, updates) : 1;
+	const double share = may_settle(&recon->recipe) ? settling_relaxation(iteration, recon->settled, updates) : 1;
 
 	return share < 1 ? recon->backend->volume_axpby(1 - share, recon->before, share, recon->volume, err) : 0;
 }
@@ -299,7 +305,7 @@ static int run_iterations(struct recon *recon, struct error *err)
 		failed = ends_begin(recon->ends, recon->backend, recon->volume, err);
 	if (failed < 0)
 		return failed;
-	if (has_subsets(&recon->recipe) && recon->iteration == 0)
+	if (may_settle(&recon->recipe) && recon->iteration == 0)
 		warn_settled(&recon->warnings, &recon->recipe,
 			     settling_from(recon->settled, recipe_updates(&recon->recipe, &recon->orbit)));
 
