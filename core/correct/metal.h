@@ -87,6 +87,7 @@ struct metal_doubt {
 	float *first;               /* [z][y][x], owned: that volume, on the host */
 	int cell[3], cells[3];      /* voxels a cell, and how many cells there are along the axes */
 	float *expected, *measured; /* [cells], owned: mean squares in each cell */
+	bool cut;                   /* metal lies at the grid's sides */
 };
 void metal_doubt_clear(struct metal_doubt *doubt);
 /* Before metal_replace: from the projections as they were measured and the volume `first`, FDK of them. */

@@ -15,9 +15,12 @@
  *
  *   noise  normal deviates of variance s = exp(p) / N, Poisson's; N, the photons
  *          in air, is found from how pixels differ from their neighbours,
- *   r      the mean over a trace of p - A v1: 0 for samples that agree with each
+ *   r      the mean over a trace of p - A v1 beyond that beside it: 0 for samples that agree with each
  *          other, however blurred the metal is in v1, and not where beams hardened or photons were missing,
  *   s      again: with few photons the logarithm is too small by itself.
+ *
+ * Where metal lies at the grid's sides e is noise alone: what of it goes on beside the grid is missing in v1 and
+ * stays in the samples beside the traces, so that v2 is wrong by more than v1, whatever r is, also in the metal's rim.
  *
  * Both are squared and averaged over cells of CELL mm.
  */
@@ -115,11 +118,39 @@ static float deviate_of(int view, size_t pixel)
 /* Pixels on either side of a trace that its mean residual counts as well: there lies the rest of the metal's blur. */
 enum { BESIDE = 2 };
 
+/* Pixels farther out on either side, where metal has no part in the residual. */
+enum { FARTHER = 3 };
+
+/* The larger one of the mean residuals on either side of pixels low .. high of the row that begins with pixel `row`. */
+static double residual_beside(const struct metal_view *of, const float *through, size_t row, int low, int high)
+{
+	double largest = 0;
+
+	for (int side = -1; side < 2; side += 2) {
+		double sum = 0;
+		int count = 0;
+
+		for (int i = 1; i <= FARTHER; i++) {
+			const int c = side < 0 ? low - i : high + i;
+
+			if (c < 0 || c >= of->columns)
+				break;
+			sum += (double)of->values[row + (size_t)c] - (double)through[row + (size_t)c];
+			count++;
+		}
+		largest = fmax(largest, count > 0 ? fabs(sum) / count : 0);
+	}
+	return largest;
+}
+
 /*
  * The mean over a trace of what was measured against `through`, the first volume's
- * projection. 0 for a ray that leaves the grid across its ends, beyond which the volume has nothing.
+ * projection; where the object goes on beside the grid, as far as it is larger than beside the trace: what lies
+ * there is not in the volume, and makes residuals where the volume is right. 0 for a ray that leaves the grid across
+ * its ends.
  */
-static double residual_of(const struct metal_trace *trace, const struct metal_view *of, const float *through)
+static double residual_of(const struct metal_trace *trace, const struct metal_view *of, const float *through,
+			  bool goes_on)
 {
 	const size_t row = (size_t)trace->row * (size_t)of->columns;
 	const int low = trace->first > BESIDE ? trace->first - BESIDE : 0;
@@ -130,38 +161,79 @@ static double residual_of(const struct metal_trace *trace, const struct metal_vi
 		return 0;
 	for (int c = low; c <= high; c++)
 		sum += (double)of->values[row + (size_t)c] - (double)through[row + (size_t)c];
-	return sum / (high - low + 1);
+	sum /= high - low + 1;
+	if (!goes_on)
+		return sum;
+	return copysign(fmax(fabs(sum) - residual_beside(of, through, row, low, high), 0), sum);
 }
+
+/* Whether metal lies at the grid's sides, and may go on beside the grid. */
+static bool lies_at_sides(const struct metal *metal, const struct grid *grid)
+{
+	const uint32_t nx = (uint32_t)grid->size[0], ny = (uint32_t)grid->size[1];
+
+	for (size_t i = 0; i < metal->voxels_count; i++) {
+		const uint32_t x = metal->voxels[i].at % nx, y = metal->voxels[i].at / nx;
+
+		if (metal->voxels[i].kind == METAL_CORE && (x == 0 || x + 1 == nx || y == 0 || y + 1 == ny))
+			return true;
+	}
+	return false;
+}
+
+/* Whether the object goes on beside the grid: a hundredth of the volume's sides, or more, is no air. */
+static bool goes_on_aside(const float *volume, const struct grid *grid, double mu_water)
+{
+	const size_t nx = (size_t)grid->size[0], ny = (size_t)grid->size[1];
+	size_t sides = 0, filled = 0;
+
+	for (size_t i = 0; i < grid_voxels(grid); i++) {
+		const size_t x = i % nx, y = i / nx % ny;
+
+		if (x > 0 && x + 1 < nx && y > 0 && y + 1 < ny)
+			continue;
+		sides++;
+		filled += (double)volume[i] > mu_water / 2;
+	}
+	return 100 * filled > sides;
+}
+
+/* Whether metal, and the object, go on beside the grid. */
+struct sides {
+	bool metal, object;
+};
 
 /* `ret_errors` of the pixels that are none of a trace are left alone. */
 static void foretell_view(const struct metal *metal, int view, const struct metal_view *of, double noise,
-			  const float *through, float *ret_errors)
+			  const float *through, const struct sides *sides, float *ret_errors)
 {
 	const size_t first = metal_traces_from(metal->traces, metal->traces_count, view);
 	const size_t end = metal_traces_from(metal->traces, metal->traces_count, view + 1);
 
 	for (size_t k = first; k < end; k++) {
 		const struct metal_trace *trace = &metal->traces[k];
-		const double residual = residual_of(trace, of, through);
+		const double residual = residual_of(trace, of, through, sides->object);
 
 		for (int c = trace->first; c <= trace->last; c++) {
 			const size_t at = (size_t)trace->row * (size_t)of->columns + (size_t)c;
 			const double variance = fmin(noise * exp((double)of->values[at]), 1);
+			const double wrong = sides->metal ? 0 : RESIDUAL * residual - STARVED * variance;
 
-			ret_errors[at] = (float)(sqrt(variance) * (double)deviate_of(view, at) + RESIDUAL * residual -
-						 STARVED * variance);
+			ret_errors[at] = (float)(sqrt(variance) * (double)deviate_of(view, at) + wrong);
 		}
 	}
 }
 
-/* FDK of the errors, into the volume to work in. */
+/* FDK of the errors, into the volume to work in; values: of `first`, on the host. */
 static int foretell(const struct metal *metal, const struct metal_tools *tools, const struct volume *first,
-		    double noise, struct error *err)
+		    const float *values, double noise, struct error *err)
 {
 	const int all = tools->geometry->count;
 	const size_t pixels = (size_t)tools->geometry->columns * (size_t)tools->geometry->rows;
 	const size_t most = (size_t)tools->slots * pixels;
 	struct metal_batch batch = {.shadow = malloc(most * sizeof(float)), .views = malloc(most * sizeof(float))};
+	const struct sides sides = {lies_at_sides(metal, tools->grid),
+				    goes_on_aside(values, tools->grid, tools->mu_water)};
 	float *errors = malloc(most * sizeof(float));
 	int code = tools->backend->volume_fill(tools->volume, 0, err);
 
@@ -183,7 +255,7 @@ static int foretell(const struct metal *metal, const struct metal_tools *tools, 
 			    .view = &tools->geometry->views[batch.first + i],
 			};
 
-			foretell_view(metal, batch.first + i, &of, noise, batch.shadow + (size_t)i * pixels,
+			foretell_view(metal, batch.first + i, &of, noise, batch.shadow + (size_t)i * pixels, &sides,
 				      errors + (size_t)i * pixels);
 		}
 		if (code == 0)
@@ -288,10 +360,11 @@ int metal_doubt_make(struct metal_doubt *ret_doubt, const struct metal *metal, c
 		code = error_set(err, ERR_NO_MEMORY, "no memory for a volume of %zu voxels", grid_voxels(grid));
 	if (code == 0)
 		code = tools->backend->volume_download(first, 0, grid->size[2], doubt.first, err);
+	doubt.cut = lies_at_sides(metal, grid);
 	if (code == 0)
 		code = find_noise(tools, &noise, err);
 	if (code == 0)
-		code = foretell(metal, tools, first, noise, err);
+		code = foretell(metal, tools, first, doubt.first, noise, err);
 	if (code == 0)
 		code = square_cells(&doubt, metal, tools, tools->volume, false, doubt.expected, err);
 	if (code < 0) {
@@ -370,7 +443,7 @@ int metal_doubt_blend(struct metal_doubt *doubt, const struct metal *metal, cons
 		code = tools->backend->volume_download(volume, z, 1, values, err);
 		if (code < 0)
 			break;
-		blend_slice(doubt, grid, z, marked ? marks : NULL, values);
+		blend_slice(doubt, grid, z, marked && !doubt->cut ? marks : NULL, values);
 		code = tools->backend->volume_put(volume, z, 1, values, err);
 	}
 	free(values);
