@@ -7,8 +7,11 @@
 
 /* So many views are asked, about. */
 enum { VIEWS = 24 };
-/* The weights stand on a lattice of places this many voxels apart; each is the mean of places as far to its sides. */
-enum { STEP = 8 };
+/*
+ * The weights stand on a lattice of places this many voxels apart, or more on a grid of more than NODES_MOST of them a
+ * side; each is the mean of those beside it.
+ */
+enum { STEP_LEAST = 8, NODES_MOST = 32 };
 /* Rows per slice: beyond these, rows and slices fall in and out of step within a few slices. */
 static const double ROWS_LEAST = 0.7, ROWS_MOST = 1.4;
 /* A slice whose body is smaller says nothing. */
@@ -20,7 +23,8 @@ enum { WINDOW = 3 };
 
 struct alternation {
 	int size[3];
-	int nodes[2];    /* of the lattice, along x and y */
+	int step;        /* of the lattice, in voxels */
+	int nodes[2];    /* along x and y */
 	double mu_water; /* 1/mm */
 	float *weight;   /* [z][node y][node x] */
 	float *values;   /* [WINDOW] slices of V: before the one at hand, that one, and behind it */
@@ -30,17 +34,31 @@ struct alternation {
 
 /* ---- what views see ---- */
 
+/* Some of a scan's views. */
+struct sights {
+	int count, columns, rows;
+	double matrix[2 * VIEWS][12];
+};
+
+static void sights_make(const struct geometry *geometry, int most, struct sights *ret)
+{
+	const int every = (geometry->count - 1) / most + 1;
+
+	*ret = (struct sights){.columns = geometry->columns, .rows = geometry->rows};
+	for (int view = 0; view < geometry->count; view += every)
+		view_matrix(&geometry->views[view], ret->matrix[ret->count++]);
+}
+
 /* What the rows of one view see at this place: the sum of (1 - |s|) (1 - 2 |s|)^2, and that of the weights. */
-static bool add_view(const struct geometry *geometry, int view, const double world[3], double height, double sums[2])
+static bool add_view(const struct sights *sights, int view, const double world[3], double height, double sums[2])
 {
 	const double above[3] = {world[0], world[1], world[2] + height};
-	double matrix[12], column, row, next, column_above;
+	double column, row, next, column_above;
 
-	view_matrix(&geometry->views[view], matrix);
-	if (!(view_project(matrix, world, &column, &row) > 0) ||
-	    !(view_project(matrix, above, &column_above, &next) > 0))
+	if (!(view_project(sights->matrix[view], world, &column, &row) > 0) ||
+	    !(view_project(sights->matrix[view], above, &column_above, &next) > 0))
 		return true;
-	if (column < 0 || row < 0 || column > geometry->columns - 1 || row > geometry->rows - 1)
+	if (column < 0 || row < 0 || column > sights->columns - 1 || row > sights->rows - 1)
 		return true;
 	if (fabs(next - row) < ROWS_LEAST || fabs(next - row) > ROWS_MOST)
 		return false;
@@ -49,70 +67,109 @@ static bool add_view(const struct geometry *geometry, int view, const double wor
 
 		if (s >= 1)
 			continue;
-		sums[0] += (1 - s) * pow(1 - 2 * s, 2);
+		sums[0] += (1 - s) * (1 - 2 * s) * (1 - 2 * s);
 		sums[1] += 1 - s;
 	}
 	return true;
 }
 
-double alternation_visibility(const struct geometry *geometry, const struct grid *grid, const double place[3])
+static double visibility(const struct sights *sights, const struct grid *grid, const double place[3])
 {
-	const int every = (geometry->count - 1) / VIEWS + 1;
 	double world[3], sums[2] = {0, 0};
 
 	for (int a = 0; a < 3; a++)
 		world[a] = grid->origin[a] + place[a] * grid->spacing[a];
-	for (int view = 0; view < geometry->count; view += every)
-		if (!add_view(geometry, view, world, grid->spacing[2], sums))
+	for (int view = 0; view < sights->count; view++)
+		if (!add_view(sights, view, world, grid->spacing[2], sums))
 			return 1;
 	return sums[1] > 0 ? sums[0] / sums[1] : 1;
 }
 
-/* Near the axis of the cone all views agree, but what is narrower than the lattice is not held apart from the rest. */
-static double weight_at(const struct alternation *alternation, const struct geometry *geometry, const struct grid *grid,
-			int x, int y, int z)
+double alternation_visibility(const struct geometry *geometry, const struct grid *grid, const double place[3])
 {
-	static const int sides[4][2] = {{-STEP, 0}, {STEP, 0}, {0, -STEP}, {0, STEP}};
-	double seen = 0;
+	struct sights sights;
 
-	for (int i = 0; i < 4; i++) {
-		const double place[3] = {fmin(fmax(x * STEP + sides[i][0], 0), alternation->size[0] - 1),
-					 fmin(fmax(y * STEP + sides[i][1], 0), alternation->size[1] - 1), z};
-
-		seen += alternation_visibility(geometry, grid, place) / 4;
-	}
-	return fmin(1, fmax(0, (ALTERNATION_SEEN - seen) / (ALTERNATION_SEEN - ALTERNATION_UNSEEN)));
+	sights_make(geometry, VIEWS, &sights);
+	return visibility(&sights, grid, place);
 }
 
-/* Whether any place has a weight. */
-static bool find_weights(struct alternation *alternation, const struct geometry *geometry, const struct grid *grid)
+static int held(int index, int count)
+{
+	return index < 0 ? 0 : index < count ? index : count - 1;
+}
+
+/*
+ * The weights of a slice, from the visibility at its nodes [y][x]. Near the axis of the cone all views agree, but what
+ * is narrower than the lattice is not held apart from the rest. True where any is above 0.
+ */
+static bool weigh_slice(const struct alternation *alternation, const float *seen, float *ret_weight)
 {
 	const int *nodes = alternation->nodes;
 	bool any = false;
 
+	for (int y = 0; y < nodes[1]; y++)
+		for (int x = 0; x < nodes[0]; x++) {
+			const float *row = seen + (size_t)y * (size_t)nodes[0];
+			const double mean =
+			    0.25 * ((double)row[held(x - 1, nodes[0])] + (double)row[held(x + 1, nodes[0])] +
+				    (double)seen[(size_t)held(y - 1, nodes[1]) * (size_t)nodes[0] + (size_t)x] +
+				    (double)seen[(size_t)held(y + 1, nodes[1]) * (size_t)nodes[0] + (size_t)x]);
+			const double weight =
+			    fmin(1, fmax(0, (ALTERNATION_SEEN - mean) / (ALTERNATION_SEEN - ALTERNATION_UNSEEN)));
+
+			ret_weight[(size_t)y * (size_t)nodes[0] + (size_t)x] = (float)weight;
+			any = any || weight > 0;
+		}
+	return any;
+}
+
+/* Whether any place has a weight; `work` is as large as the weights. */
+static bool find_weights(struct alternation *alternation, const struct geometry *geometry, const struct grid *grid,
+			 float *work)
+{
+	const int *nodes = alternation->nodes, step = alternation->step;
+	const size_t count = (size_t)nodes[0] * (size_t)nodes[1];
+	struct sights sights;
+	bool any = false;
+
+	sights_make(geometry, VIEWS, &sights);
 #pragma omp parallel for schedule(dynamic) reduction(|| : any)
-	for (int z = 0; z < alternation->size[2]; z++)
+	for (int z = 0; z < alternation->size[2]; z++) {
+		float *seen = work + (size_t)z * count;
+
 		for (int y = 0; y < nodes[1]; y++)
 			for (int x = 0; x < nodes[0]; x++) {
-				const double weight = weight_at(alternation, geometry, grid, x, y, z);
+				const double place[3] = {fmin(x * step, alternation->size[0] - 1),
+							 fmin(y * step, alternation->size[1] - 1), z};
 
-				alternation->weight[((size_t)z * (size_t)nodes[1] + (size_t)y) * (size_t)nodes[0] +
-						    (size_t)x] = (float)weight;
-				any = any || weight > 0;
+				seen[(size_t)y * (size_t)nodes[0] + (size_t)x] =
+				    (float)visibility(&sights, grid, place);
 			}
+		any = weigh_slice(alternation, seen, alternation->weight + (size_t)z * count) || any;
+	}
 	return any;
 }
 
 /* ---- life ---- */
 
-static int nodes_along(int voxels)
+static int step_of(const struct grid *grid)
 {
-	return (voxels - 1) / STEP + 2;
+	const int side = grid->size[0] > grid->size[1] ? grid->size[0] : grid->size[1];
+
+	return side > STEP_LEAST * NODES_MOST ? (side - 1) / NODES_MOST + 1 : STEP_LEAST;
+}
+
+static int nodes_along(int voxels, int step)
+{
+	return (voxels - 1) / step + 2;
 }
 
 static size_t weights_of(const struct grid *grid)
 {
-	return (size_t)nodes_along(grid->size[0]) * (size_t)nodes_along(grid->size[1]) * (size_t)grid->size[2];
+	const int step = step_of(grid);
+
+	return (size_t)nodes_along(grid->size[0], step) * (size_t)nodes_along(grid->size[1], step) *
+	       (size_t)grid->size[2];
 }
 
 static size_t pixels_of(const int size[3])
@@ -122,7 +179,7 @@ static size_t pixels_of(const int size[3])
 
 size_t alternation_bytes(const struct grid *grid)
 {
-	return sizeof(float) * (weights_of(grid) + (2 * WINDOW + 1) * pixels_of(grid->size));
+	return sizeof(float) * (2 * weights_of(grid) + (2 * WINDOW + 1) * pixels_of(grid->size));
 }
 
 /* Whether the rows that pass the grid's centre are about as far apart as its slices. */
@@ -130,10 +187,12 @@ static bool may_alternate(const struct geometry *geometry, const struct grid *gr
 {
 	const double centre[3] = {(grid->size[0] - 1) / 2, (grid->size[1] - 1) / 2, (grid->size[2] - 1) / 2};
 	double world[3], sums[2] = {0, 0};
+	struct sights first;
 
+	sights_make(geometry, 1, &first);
 	for (int a = 0; a < 3; a++)
 		world[a] = grid->origin[a] + centre[a] * grid->spacing[a];
-	return grid->size[2] > 2 && geometry->rows > 1 && add_view(geometry, 0, world, grid->spacing[2], sums);
+	return grid->size[2] > 2 && geometry->rows > 1 && add_view(&first, 0, world, grid->spacing[2], sums);
 }
 
 int alternation_new(const struct grid *grid, const struct geometry *geometry, double mu_water,
@@ -148,7 +207,8 @@ int alternation_new(const struct grid *grid, const struct geometry *geometry, do
 		return error_set(err, ERR_NO_MEMORY, "no memory for some slices");
 	*alternation = (struct alternation){
 	    .size = {grid->size[0], grid->size[1], grid->size[2]},
-	    .nodes = {nodes_along(grid->size[0]), nodes_along(grid->size[1])},
+	    .step = step_of(grid),
+	    .nodes = {nodes_along(grid->size[0], step_of(grid)), nodes_along(grid->size[1], step_of(grid))},
 	    .mu_water = mu_water,
 	    .weight = calloc(alternation_bytes(grid), 1),
 	};
@@ -156,10 +216,10 @@ int alternation_new(const struct grid *grid, const struct geometry *geometry, do
 		free(alternation);
 		return error_set(err, ERR_NO_MEMORY, "no memory for some slices");
 	}
-	alternation->values = alternation->weight + weights_of(grid);
+	alternation->values = alternation->weight + 2 * weights_of(grid);
 	alternation->away = alternation->values + WINDOW * pixels_of(grid->size);
 	alternation->changed = alternation->away + WINDOW * pixels_of(grid->size);
-	if (!find_weights(alternation, geometry, grid)) {
+	if (!find_weights(alternation, geometry, grid, alternation->weight + weights_of(grid))) {
 		alternation_free(alternation);
 		return 0;
 	}
@@ -191,10 +251,10 @@ static bool has_weight(const struct alternation *alternation, int z)
 /* Between the nodes of slice z. */
 static float weight_between(const struct alternation *alternation, int x, int y, int z)
 {
-	const int *nodes = alternation->nodes;
-	const float *at = alternation->weight + ((size_t)z * (size_t)nodes[1] + (size_t)(y / STEP)) * (size_t)nodes[0] +
-			  (size_t)(x / STEP);
-	const float u = (float)(x % STEP) / STEP, v = (float)(y % STEP) / STEP;
+	const int *nodes = alternation->nodes, step = alternation->step;
+	const float *at = alternation->weight + ((size_t)z * (size_t)nodes[1] + (size_t)(y / step)) * (size_t)nodes[0] +
+			  (size_t)(x / step);
+	const float u = (float)(x % step) / (float)step, v = (float)(y % step) / (float)step;
 
 	return (1 - v) * ((1 - u) * at[0] + u * at[1]) + v * ((1 - u) * at[nodes[0]] + u * at[nodes[0] + 1]);
 }
@@ -204,11 +264,19 @@ struct pass {
 	const struct backend *backend;
 	struct volume *volume;
 	int z;
+	bool begun;
 };
 
 static struct pass pass_begin(const struct backend *backend, struct volume *volume)
 {
 	return (struct pass){.backend = backend, .volume = volume, .z = -1};
+}
+
+/* The next slice that comes is z. */
+static void pass_leap(struct pass *pass, int z)
+{
+	pass->begun = pass->begun && pass->z == z - 1;
+	pass->z = z - 1;
 }
 
 /* Slice 0 of the window becomes slice 1, and 1 becomes 2's. */
@@ -226,9 +294,13 @@ static int pass_on(struct alternation *alternation, struct pass *pass, struct er
 	int code = 0;
 
 	pass->z++;
-	if (pass->z == 0) {
-		code = pass->backend->volume_download(pass->volume, 0, 1, behind, err);
-		memcpy(here, behind, pixels * sizeof(float));
+	if (!pass->begun) {
+		code = pass->backend->volume_download(pass->volume, pass->z, 1, behind, err);
+		if (code == 0 && pass->z > 0)
+			code = pass->backend->volume_download(pass->volume, pass->z - 1, 1, here, err);
+		else
+			memcpy(here, behind, pixels * sizeof(float));
+		pass->begun = true;
 	}
 	shift(alternation->values, pixels);
 	shift(alternation->away, pixels);
@@ -280,10 +352,16 @@ static int measure(struct alternation *alternation, struct pass pass, struct alt
 {
 	int code = 0;
 
-	for (int z = 0; z < alternation->size[2] && code == 0; z++) {
-		code = pass_on(alternation, &pass, err);
-		if (code == 0 && z > 1 && has_weight(alternation, z - 1))
-			measure_slice(alternation, z - 1, report);
+	/* A slice is measured with A on both sides: from the pass over the slice before it to that behind it. */
+	for (int z = 1; z < alternation->size[2] - 1 && code == 0; z++) {
+		if (!has_weight(alternation, z))
+			continue;
+		if (pass.z < z - 2 || !pass.begun)
+			pass_leap(&pass, z - 1);
+		while (pass.z < z + 1 && code == 0)
+			code = pass_on(alternation, &pass, err);
+		if (code == 0)
+			measure_slice(alternation, z, report);
 	}
 	return code;
 }
