@@ -100,12 +100,11 @@ static int held(int index, int count)
 
 /*
  * The weights of a slice, from the visibility at its nodes [y][x]. Near the axis of the cone all views agree, but what
- * is narrower than the lattice is not held apart from the rest. True where any is above 0.
+ * is narrower than the lattice is not held apart from the rest.
  */
-static bool weigh_slice(const struct alternation *alternation, const float *seen, float *ret_weight)
+static void weigh_slice(const struct alternation *alternation, const float *seen, float *ret_weight)
 {
 	const int *nodes = alternation->nodes;
-	bool any = false;
 
 	for (int y = 0; y < nodes[1]; y++)
 		for (int x = 0; x < nodes[0]; x++) {
@@ -118,24 +117,33 @@ static bool weigh_slice(const struct alternation *alternation, const float *seen
 			    fmin(1, fmax(0, (ALTERNATION_SEEN - mean) / (ALTERNATION_SEEN - ALTERNATION_UNSEEN)));
 
 			ret_weight[(size_t)y * (size_t)nodes[0] + (size_t)x] = (float)weight;
-			any = any || weight > 0;
 		}
-	return any;
+}
+
+/* The least weight at a node in a slice and those to both sides: what is to alternate takes three that do not see it.
+ */
+static float least_of_three(const float *weight, size_t nodes, int slices, int z, size_t node)
+{
+	float least = weight[(size_t)z * nodes + node];
+
+	if (z > 0)
+		least = fminf(least, weight[(size_t)(z - 1) * nodes + node]);
+	return z + 1 < slices ? fminf(least, weight[(size_t)(z + 1) * nodes + node]) : least;
 }
 
 /* Whether any place has a weight; `work` is as large as the weights. */
 static bool find_weights(struct alternation *alternation, const struct geometry *geometry, const struct grid *grid,
 			 float *work)
 {
-	const int *nodes = alternation->nodes, step = alternation->step;
+	const int *nodes = alternation->nodes, step = alternation->step, slices = alternation->size[2];
 	const size_t count = (size_t)nodes[0] * (size_t)nodes[1];
 	struct sights sights;
 	bool any = false;
 
 	sights_make(geometry, VIEWS, &sights);
-#pragma omp parallel for schedule(dynamic) reduction(|| : any)
-	for (int z = 0; z < alternation->size[2]; z++) {
-		float *seen = work + (size_t)z * count;
+#pragma omp parallel for schedule(dynamic)
+	for (int z = 0; z < slices; z++) {
+		float *seen = alternation->weight + (size_t)z * count;
 
 		for (int y = 0; y < nodes[1]; y++)
 			for (int x = 0; x < nodes[0]; x++) {
@@ -145,8 +153,16 @@ static bool find_weights(struct alternation *alternation, const struct geometry 
 				seen[(size_t)y * (size_t)nodes[0] + (size_t)x] =
 				    (float)visibility(&sights, grid, place);
 			}
-		any = weigh_slice(alternation, seen, alternation->weight + (size_t)z * count) || any;
+		weigh_slice(alternation, seen, work + (size_t)z * count);
 	}
+#pragma omp parallel for schedule(static) reduction(|| : any)
+	for (int z = 0; z < slices; z++)
+		for (size_t node = 0; node < count; node++) {
+			const float weight = least_of_three(work, count, slices, z, node);
+
+			alternation->weight[(size_t)z * count + node] = weight;
+			any = any || weight > 0;
+		}
 	return any;
 }
 

@@ -19,6 +19,7 @@
  * where they lie anywhere, 0 where all lie on borders.
  *
  *   A = (-1, 2, -1) / 4 of V along z,  w = 1 for a visibility up to ALTERNATION_UNSEEN, 0 from ALTERNATION_SEEN on
+ *       and the least of that in three slices in a row: what alternates takes as many
  *   a = the least of |A| in three slices in a row where A changes its sign twice, else 0: an edge has none
  *   V' = V - w A where w a exceeds 40 HU in the mean over the body of some slice; else V' = V, to the bit
  *
