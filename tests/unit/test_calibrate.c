@@ -420,7 +420,7 @@ static const struct {
 	enum fault fault;
 	const char *words;
 } faults[] = {
-    {WRONG_PHANTOM, "do not fit this phantom, at a mean residual of"},
+    {WRONG_PHANTOM, "do not fit this phantom, and no pose could be fitted to any of them; view 0: 1 of its 22"},
     {WRONG_DIAMETER, "(4.7"},
     {EMPTY, "shadows of a ball are in a view, expected 7 or more"},
     {COUNTS, "no line integral: these are counts without their air"},
