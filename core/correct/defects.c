@@ -232,6 +232,58 @@ static int examine(const struct linearise *linearise, int columns, int rows, str
 	return code;
 }
 
+/* How many bad pixels lie in a row through one, `step` bytes apart, where `before` lie before it and `behind` behind.
+ */
+static int run_through(const unsigned char *at, ptrdiff_t step, int before, int behind)
+{
+	int low = 0, high = 0;
+
+	while (low < before && at[-(low + 1) * step])
+		low++;
+	while (high < behind && at[(high + 1) * step])
+		high++;
+	return low + 1 + high;
+}
+
+/* The side of the largest square of bad pixels, row by row from those that end at the pixels above and before. */
+static int find_widest(struct defect_map *map, int columns, int rows, struct error *err)
+{
+	int *side = calloc((size_t)columns, sizeof(*side)); /* of the square whose last corner is the pixel above */
+
+	if (side == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a row of %d pixels", columns);
+	for (int r = 0; r < rows; r++)
+		for (int c = 0, corner = 0; c < columns; c++) {
+			const unsigned char *at = map->map + (size_t)r * (size_t)columns + (size_t)c;
+			const int above = side[c], before = c > 0 ? side[c - 1] : 0;
+			const int least = above < before ? above : before;
+
+			side[c] = !*at ? 0 : 1 + (corner < least ? corner : least);
+			corner = above;
+			if (side[c] <= map->widest)
+				continue;
+			map->widest = side[c];
+			map->lines = 2 * run_through(at, 1, c, columns - 1 - c) >= columns ||
+				     2 * run_through(at, columns, r, rows - 1 - r) >= rows;
+		}
+	free(side);
+	return 0;
+}
+
+void defect_map_warn(const struct defect_map *map, int columns, int rows, const struct warning_sink *sink)
+{
+	enum { BLOCK = 6, LINES = 4 };
+	const double share = 0.35, pixels = (double)columns * rows;
+	const size_t all = map->given + map->dead + map->hot + map->noisy + map->stuck;
+
+	if (map->widest >= (map->lines ? LINES : BLOCK) || (double)all >= share * pixels)
+		warning_tell(
+		    sink, "defects_wide",
+		    "%.3g %% of the pixels are bad, and up to %d of them side by side: what is filled in there "
+		    "is a guess, and the image may be off by 50 HU and more where rays pass it",
+		    100 * (double)all / pixels, map->widest);
+}
+
 int defect_map_make(struct defect_map *ret_map, const struct linearise *linearise, int columns, int rows,
 		    struct error *err)
 {
@@ -266,6 +318,8 @@ int defect_map_make(struct defect_map *ret_map, const struct linearise *linearis
 				 "map, and %zu dead, %zu hot or saturated and %zu noisy ones that the flat and dark "
 				 "images show",
 				 100 * (double)all / (double)pixels, map.given, map.dead, map.hot, map.noisy);
+	if (code == 0)
+		code = find_widest(&map, columns, rows, err);
 	if (code < 0 || all == 0)
 		defect_map_clear(&map);
 	if (code == 0)

@@ -28,7 +28,8 @@ static int check_dark(const struct linearise *linearise, size_t pixels, struct e
 			 100 * (double)bad / (double)pixels);
 }
 
-int images_check(const struct linearise *linearise, int columns, int rows, struct error *err)
+int images_check(const struct linearise *linearise, int columns, int rows, const struct warning_sink *sink,
+		 struct error *err)
 {
 	struct defect_map map;
 	int code;
@@ -36,9 +37,11 @@ int images_check(const struct linearise *linearise, int columns, int rows, struc
 	if (linearise->image[IMAGE_DARK] != NULL && linearise->image[IMAGE_FLAT] == NULL && !(linearise->air > 0))
 		return check_dark(linearise, (size_t)columns * (size_t)rows, err);
 	code = defect_map_make(&map, linearise, columns, rows, err);
-	if (code == 0)
-		defect_map_clear(&map);
-	return code;
+	if (code < 0)
+		return code;
+	defect_map_warn(&map, columns, rows, sink);
+	defect_map_clear(&map);
+	return 0;
 }
 
 /* The share of the flat's pixels that have the largest number of 8 bits or more, where that is the flat's maximum. */

@@ -150,6 +150,7 @@ static int warn_of_defects(const struct correction_job *job, void *state, struct
 		    "%zu pixels (%.3g %%) of every projection were replaced from their neighbours: %zu of the given "
 		    "map, and %zu dead, %zu hot and %zu noisy ones that the flat and dark images show",
 		    mapped, 100 * (double)mapped / pixels, map->given, map->dead, map->hot, map->noisy);
+	defect_map_warn(map, job->geometry->columns, job->geometry->rows, job->warnings);
 	if (map->stuck > 0)
 		warning_tell(
 		    job->warnings, "stuck_pixels",

@@ -191,13 +191,15 @@ static int check_image(const struct slot *slot, cJSON **ret_warnings, struct err
 			code = read_image(upload, i, &others[i], err);
 		linearise.image[i] = i == (int)upload->target.image ? (char *)slot->data : others[i];
 	}
+	sink.context = cJSON_CreateArray();
 	if (code == 0)
-		code = images_check(&linearise, columns, rows, err);
-	if (code == 0) {
-		*ret_warnings = sink.context = cJSON_CreateArray();
-		if (image_kinds[upload->target.image].pixel == IMAGE_COUNTS)
-			images_warn(&linearise, columns, rows, &sink);
-	}
+		code = images_check(&linearise, columns, rows, &sink, err);
+	if (code == 0 && image_kinds[upload->target.image].pixel == IMAGE_COUNTS)
+		images_warn(&linearise, columns, rows, &sink);
+	if (code == 0)
+		*ret_warnings = sink.context;
+	else
+		cJSON_Delete(sink.context);
 	for (int i = 0; i < IMAGE_COUNT; i++)
 		free(others[i]);
 	return code;

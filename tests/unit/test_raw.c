@@ -710,7 +710,8 @@ START_TEST(images_are_refused_and_doubted)
 	    {"a flat next to nothing", {1, 1e-42f, 0}, {0, 0, 0}, 0, 0, "less than 1e-06", NULL},
 	    {"a flat of nothing", {1, 0, 0}, {0, 0, 0}, 0, 0, "not above 0 in 100 %", NULL},
 	    {"a flat with one good pixel", {PIXELS, 40000, 0}, {0, 0, 0}, 0, 0, "not above 0 in 100 %", NULL},
-	    {"half a flat", {2, 40000, NAN}, {0, 0, 0}, 0, 0, NULL, NULL},
+	    {"half a flat", {2, 40000, NAN}, {0, 0, 0}, 0, 0, NULL, "50 % of the pixels are bad"},
+	    {"a third of a flat", {3, NAN, 40000}, {0, 0, 0}, 0, 0, NULL, NULL},
 	    {"half a flat and a map of the rest", {2, 40000, NAN}, {0, 0, 0}, 0, 2, "are defects", NULL},
 	    {"a dark that is no number", {0, 0, 0}, {1, NAN, 0}, 0, 0, "not finite", NULL},
 	    {"half a dark and a map of the rest", {0, 0, 0}, {2, 0, NAN}, 0, 2, "not finite", NULL},
@@ -738,7 +739,7 @@ START_TEST(images_are_refused_and_doubted)
 			counts->map[k] = rows[i].map_every > 0 && k % rows[i].map_every == 0;
 		if (rows[i].map_every > 0)
 			linearise.image[IMAGE_DEFECTS] = counts->map;
-		code = images_check(&linearise, COLUMNS, ROWS, &err);
+		code = images_check(&linearise, COLUMNS, ROWS, &sink, &err);
 		ck_assert_msg((code == ERR_IMPOSSIBLE) == (rows[i].refused != NULL), "%s: %s", rows[i].what, err.text);
 		if (code < 0) {
 			ck_assert_msg(strstr(err.text, rows[i].refused) != NULL, "%s: %s", rows[i].what, err.text);
@@ -749,6 +750,42 @@ START_TEST(images_are_refused_and_doubted)
 			      "%s: %s", rows[i].what, doubt);
 	}
 	free(counts);
+}
+END_TEST
+
+/* What has to be filled in is the shorter way across a gap. */
+START_TEST(gaps_that_are_too_wide_are_told)
+{
+	static const struct {
+		const char *what;
+		int column, row, columns, rows; /* a block of bad pixels */
+		bool told;
+	} blocks[] = {
+	    {"a pixel", 30, 20, 1, 1, false},         {"a cluster", 30, 20, 5, 5, false},
+	    {"a wide block", 30, 20, 6, 6, true},     {"three rows", 0, 20, COLUMNS, 3, false},
+	    {"four rows", 0, 20, COLUMNS, 4, true},   {"four columns", 30, 0, 4, ROWS, true},
+	    {"a long scratch", 10, 20, 30, 5, false},
+	};
+	static unsigned char map[PIXELS];
+
+	for (size_t i = 0; i < sizeof(blocks) / sizeof(blocks[0]); i++) {
+		struct linearise linearise = {.sample = SAMPLE_FLOAT32, .quantity = QUANTITY_LINE_INTEGRAL};
+		char doubt[400] = "";
+		const struct warning_sink sink = {doubt, tell};
+		struct error err = {0};
+
+		memset(map, 0, sizeof(map));
+		for (int r = 0; r < blocks[i].rows; r++)
+			memset(map + (size_t)(blocks[i].row + r) * COLUMNS + blocks[i].column, 1,
+			       (size_t)blocks[i].columns);
+		/* A lost column that crosses it makes nothing wider. */
+		for (int r = 0; r < ROWS; r++)
+			map[r * COLUMNS + 60] = 1;
+		linearise.image[IMAGE_DEFECTS] = map;
+		ck_assert_int_eq(images_check(&linearise, COLUMNS, ROWS, &sink, &err), 0);
+		ck_assert_msg((strstr(doubt, "side by side") != NULL) == blocks[i].told, "%s: %s", blocks[i].what,
+			      doubt);
+	}
 }
 END_TEST
 
@@ -848,6 +885,7 @@ Suite *raw_suite(void)
 	tcase_add_test(images, the_shadow_of_a_collimator_is_no_defect);
 	tcase_add_test(images, exchanged_images_are_refused);
 	tcase_add_test(images, images_are_refused_and_doubted);
+	tcase_add_test(images, gaps_that_are_too_wide_are_told);
 	tcase_add_loop_test(images, a_detector_of_defects_is_refused, 0, 2);
 	suite_add_tcase(suite, images);
 	return suite;
