@@ -345,7 +345,7 @@ static struct plan_shape shape_of(const struct plan_options *options, enum thrif
 	shape.z_rays = has_z_rays(geometry, grid);
 	shape.is_small = (double)grid_voxels(grid) * geometry->count < SMALL;
 	shape.matched = choose_matched(options, shape.z_rays);
-	/* The transpose is that of the general projection in float, whose weights are its own to the last bits. */
+	/* The matched pair is in float: upright with the projection by rows, else with the general one. */
 	shape.halves = !options->reference_precision && !shape.is_small && !options->matched;
 	choose_rows(options, &shape);
 	if (shape.is_small)

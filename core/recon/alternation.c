@@ -5,7 +5,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-/* So many views are asked, about. */
+/* So many views are asked at most. */
 enum { VIEWS = 24 };
 /*
  * The weights stand on a lattice of places this many voxels apart, or more on a grid of more than NODES_MOST of them a
@@ -34,10 +34,10 @@ struct alternation {
 
 /* ---- what views see ---- */
 
-/* Some of a scan's views. */
+/* Some of a scan's views, VIEWS at most. */
 struct sights {
 	int count, columns, rows;
-	double matrix[2 * VIEWS][12];
+	double matrix[VIEWS][12];
 };
 
 static void sights_make(const struct geometry *geometry, int most, struct sights *ret)
