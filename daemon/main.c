@@ -69,6 +69,7 @@ static int start_http(const struct config *config, struct api *api, struct error
 	const struct http_options options = {.listen = config->listen,
 					     .server_names = config->server_names,
 					     .state_dir = config->state_dir,
+					     .tokens = config->tokens,
 					     .routes = api_routes,
 					     .context = api,
 					     .threads = (int)config->http_threads,
@@ -129,8 +130,18 @@ static void stop_parts(struct api *api)
 	store_close(api->store);
 }
 
-/* A terminal that is closed, or a reload that is asked for, ends nothing: settings are read at the start alone. */
-static int wait_for_stop(const sigset_t *stops)
+/* Settings are read at the start alone; the files that some of them name are read again. */
+static void reload(struct api *api)
+{
+	struct error err;
+
+	log_line(LEVEL_INFO, "SIGHUP: reading tokens again");
+	if (http_reload(api->http, &err) != 0)
+		log_line(LEVEL_ERROR, "nothing changes, what was read before holds: %s", err.text);
+}
+
+/* A terminal that is closed ends nothing. */
+static int wait_for_stop(const sigset_t *stops, struct api *api)
 {
 	int signal_number = 0;
 
@@ -138,7 +149,7 @@ static int wait_for_stop(const sigset_t *stops)
 		sigwait(stops, &signal_number);
 		if (signal_number != SIGHUP)
 			return signal_number;
-		log_line(LEVEL_INFO, "SIGHUP: settings are read at the start only, nothing changes");
+		reload(api);
 	}
 }
 
@@ -156,7 +167,7 @@ static int run(const struct config *config)
 	if (code != 0)
 		log_line(LEVEL_ERROR, "cbctd cannot start: %s", err.text);
 	else
-		signal_number = wait_for_stop(&stops);
+		signal_number = wait_for_stop(&stops, &api);
 	if (signal_number != 0)
 		log_line(LEVEL_INFO, "stopping: %s",
 			 atomic_load(&failed) ? "the disk failed" : strsignal(signal_number));

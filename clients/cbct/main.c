@@ -19,7 +19,7 @@ static const struct command *const commands[] = {
     &command_simulate,   &command_import,    &command_export_geometry, &command_upload,  &command_submit,
     &command_watch,      &command_get,       &command_recon,           &command_compare, &command_slice,
     &command_scans,      &command_jobs,      &command_status,          &command_rm,      &command_complete,
-    &command_parameters, &command_calibrate,
+    &command_parameters, &command_calibrate, &command_token,
 };
 enum { COMMAND_COUNT = sizeof(commands) / sizeof(commands[0]) };
 

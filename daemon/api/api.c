@@ -7,43 +7,51 @@
 #include "proto/json.h"
 
 #define IMAGE_ROUTE(id, name, ...)                                                                                     \
-	{"PUT", "/v1/scans/{}/{" name "}", image_put, BODY_STREAM, 0, image_begin, upload_take, NULL},                 \
-	    {"DELETE", "/v1/scans/{}/{" name "}", image_delete, BODY_NONE, 0, NULL, NULL, NULL},
+	{"PUT", "/v1/scans/{}/{" name "}", ROLE_ACQUIRE, image_put, BODY_STREAM, 0, image_begin, upload_take, NULL},   \
+	    {"DELETE", "/v1/scans/{}/{" name "}", ROLE_ACQUIRE, image_delete, BODY_NONE, 0, NULL, NULL, NULL},
 
-/* GET is HEAD as well. A body that is streamed has begin and data beside handle. */
+/* Each row says the least role that may. GET is HEAD as well. A body that is streamed has begin and data beside handle.
+ */
 const struct route api_routes[] = {
-    {"GET", "/", page_get, BODY_NONE, 0, NULL, NULL, NULL},
-    {"GET", "/assets/{}", asset_get, BODY_NONE, 0, NULL, NULL, NULL},
-    {"GET", "/plain", plain_list, BODY_NONE, 0, NULL, NULL, NULL},
-    {"GET", "/plain.css", plain_style, BODY_NONE, 0, NULL, NULL, NULL},
-    {"GET", "/plain/{}", plain_job, BODY_NONE, 0, NULL, NULL, "volume window"},
+    {"GET", "/", ROLE_ANYONE, page_get, BODY_NONE, 0, NULL, NULL, NULL},
+    {"GET", "/assets/{}", ROLE_ANYONE, asset_get, BODY_NONE, 0, NULL, NULL, NULL},
+    {"GET", "/plain", ROLE_VIEW, plain_list, BODY_NONE, 0, NULL, NULL, NULL},
+    {"GET", "/plain.css", ROLE_ANYONE, plain_style, BODY_NONE, 0, NULL, NULL, NULL},
+    {"GET", "/plain/{}", ROLE_VIEW, plain_job, BODY_NONE, 0, NULL, NULL, "volume window"},
 
-    {"GET", "/livez", live_get, BODY_NONE, 0, NULL, NULL, NULL},
-    {"GET", "/readyz", ready_get, BODY_NONE, 0, NULL, NULL, NULL},
-    {"GET", "/metrics", metrics_get, BODY_NONE, 0, NULL, NULL, NULL},
-    {"GET", "/v1/devices", device_list, BODY_NONE, 0, NULL, NULL, NULL},
-    {"GET", "/v1/quarantine", quarantine_get, BODY_NONE, 0, NULL, NULL, NULL},
-    {"GET", "/v1/openapi.json", schema_get, BODY_NONE, 0, NULL, NULL, NULL},
+    {"GET", "/livez", ROLE_ANYONE, live_get, BODY_NONE, 0, NULL, NULL, NULL},
+    {"GET", "/readyz", ROLE_ANYONE, ready_get, BODY_NONE, 0, NULL, NULL, NULL},
+    {"GET", "/metrics", ROLE_VIEW, metrics_get, BODY_NONE, 0, NULL, NULL, NULL},
+    {"GET", "/v1/devices", ROLE_VIEW, device_list, BODY_NONE, 0, NULL, NULL, NULL},
+    {"GET", "/v1/quarantine", ROLE_VIEW, quarantine_get, BODY_NONE, 0, NULL, NULL, NULL},
+    {"GET", "/v1/openapi.json", ROLE_ANYONE, schema_get, BODY_NONE, 0, NULL, NULL, NULL},
 
-    {"GET", "/v1/scans", scan_list, BODY_NONE, 0, NULL, NULL, "limit after"},
-    {"POST", "/v1/scans", scan_post, BODY_WHOLE, JSON_BYTES_MAX, NULL, NULL, NULL},
-    {"GET", "/v1/scans/{}", scan_get, BODY_NONE, 0, NULL, NULL, NULL},
-    {"DELETE", "/v1/scans/{}", scan_delete, BODY_NONE, 0, NULL, NULL, NULL},
-    {"POST", "/v1/scans/{}/complete", scan_complete, BODY_NONE, 0, NULL, NULL, NULL},
+    {"POST", "/v1/session", ROLE_VIEW, session_post, BODY_NONE, 0, NULL, NULL, NULL},
+    {"GET", "/v1/session", ROLE_VIEW, session_get, BODY_NONE, 0, NULL, NULL, NULL},
+    {"DELETE", "/v1/session", ROLE_VIEW, session_delete, BODY_NONE, 0, NULL, NULL, NULL},
+
+    {"GET", "/v1/scans", ROLE_VIEW, scan_list, BODY_NONE, 0, NULL, NULL, "limit after"},
+    {"POST", "/v1/scans", ROLE_ACQUIRE, scan_post, BODY_WHOLE, JSON_BYTES_MAX, NULL, NULL, NULL},
+    {"GET", "/v1/scans/{}", ROLE_VIEW, scan_get, BODY_NONE, 0, NULL, NULL, NULL},
+    {"DELETE", "/v1/scans/{}", ROLE_ACQUIRE, scan_delete, BODY_NONE, 0, NULL, NULL, NULL},
+    {"POST", "/v1/scans/{}/complete", ROLE_ACQUIRE, scan_complete, BODY_NONE, 0, NULL, NULL, NULL},
     IMAGES(IMAGE_ROUTE) // one for each
-    {"PUT", "/v1/scans/{}/projections", projections_put, BODY_STREAM, 0, projections_begin, upload_take, NULL},
-    {"GET", "/v1/scans/{}/projections/{}", projection_get, BODY_NONE, 0, NULL, NULL, "format"},
-    {"PUT", "/v1/scans/{}/projections/{}", projections_put, BODY_STREAM, 0, projections_begin, upload_take, NULL},
+    {"PUT", "/v1/scans/{}/projections", ROLE_ACQUIRE, projections_put, BODY_STREAM, 0, projections_begin, upload_take,
+     NULL},
+    {"GET", "/v1/scans/{}/projections/{}", ROLE_VIEW, projection_get, BODY_NONE, 0, NULL, NULL, "format"},
+    {"PUT", "/v1/scans/{}/projections/{}", ROLE_ACQUIRE, projections_put, BODY_STREAM, 0, projections_begin,
+     upload_take, NULL},
 
-    {"GET", "/v1/jobs", job_list, BODY_NONE, 0, NULL, NULL, "limit after"},
-    {"POST", "/v1/jobs", job_post, BODY_WHOLE, JSON_BYTES_MAX, NULL, NULL, NULL},
-    {"GET", "/v1/jobs/{}", job_get, BODY_NONE, 0, NULL, NULL, "wait"},
-    {"DELETE", "/v1/jobs/{}", job_delete, BODY_NONE, 0, NULL, NULL, "wait"},
-    {"GET", "/v1/jobs/{}/events", job_events, BODY_NONE, 0, NULL, NULL, "after"},
-    {"GET", "/v1/events", all_events, BODY_NONE, 0, NULL, NULL, "after"},
-    {"GET", "/v1/jobs/{}/volumes", volume_list, BODY_NONE, 0, NULL, NULL, "limit after wait"},
-    {"GET", "/v1/jobs/{}/volumes/{}", volume_get, BODY_NONE, 0, NULL, NULL, "format type scale"},
-    {"GET", "/v1/jobs/{}/volumes/{}/slice", slice_get, BODY_NONE, 0, NULL, NULL, "axis index window level sheet"},
-    {"GET", "/v1/jobs/{}/stream", volume_stream, BODY_NONE, 0, NULL, NULL, "format type scale after"},
-    {NULL, NULL, NULL, BODY_NONE, 0, NULL, NULL, NULL},
+    {"GET", "/v1/jobs", ROLE_VIEW, job_list, BODY_NONE, 0, NULL, NULL, "limit after"},
+    {"POST", "/v1/jobs", ROLE_ACQUIRE, job_post, BODY_WHOLE, JSON_BYTES_MAX, NULL, NULL, NULL},
+    {"GET", "/v1/jobs/{}", ROLE_VIEW, job_get, BODY_NONE, 0, NULL, NULL, "wait"},
+    {"DELETE", "/v1/jobs/{}", ROLE_ACQUIRE, job_delete, BODY_NONE, 0, NULL, NULL, "wait"},
+    {"GET", "/v1/jobs/{}/events", ROLE_VIEW, job_events, BODY_NONE, 0, NULL, NULL, "after"},
+    {"GET", "/v1/events", ROLE_VIEW, all_events, BODY_NONE, 0, NULL, NULL, "after"},
+    {"GET", "/v1/jobs/{}/volumes", ROLE_VIEW, volume_list, BODY_NONE, 0, NULL, NULL, "limit after wait"},
+    {"GET", "/v1/jobs/{}/volumes/{}", ROLE_VIEW, volume_get, BODY_NONE, 0, NULL, NULL, "format type scale"},
+    {"GET", "/v1/jobs/{}/volumes/{}/slice", ROLE_VIEW, slice_get, BODY_NONE, 0, NULL, NULL,
+     "axis index window level sheet"},
+    {"GET", "/v1/jobs/{}/stream", ROLE_VIEW, volume_stream, BODY_NONE, 0, NULL, NULL, "format type scale after"},
+    {NULL, NULL, ROLE_UNSAID, NULL, BODY_NONE, 0, NULL, NULL, NULL},
 };

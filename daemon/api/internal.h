@@ -11,6 +11,10 @@
 /* Shared by the files of this room. */
 
 /* ---- the handlers, as struct route wants them ---- */
+int session_post(void *context, struct request *request, struct error *err);
+int session_get(void *context, struct request *request, struct error *err);
+int session_delete(void *context, struct request *request, struct error *err);
+
 int scan_post(void *context, struct request *request, struct error *err);
 int scan_list(void *context, struct request *request, struct error *err);
 int scan_get(void *context, struct request *request, struct error *err);

@@ -60,8 +60,11 @@ int page_get(void *context, struct request *request, struct error *err)
 {
 	const struct asset *page = asset_find("");
 
-	if (page == NULL) /* built without npm */
-		return plain_list(context, request, err);
+	if (page == NULL) { /* built without npm: a list of jobs, which is not for anyone */
+		int code = request_require(request, ROLE_VIEW, err);
+
+		return code != 0 || request_replied(request) ? code : plain_list(context, request, err);
+	}
 	return reply_asset(request, page, "no-cache", err);
 }
 

@@ -18,7 +18,7 @@ enum {
 	TARGET_BYTES_MAX = 8 << 10,
 	HEAD_FIELDS_MAX = 100,
 	HEAD_PARAMETERS_MAX = 64, /* of the query; the library makes a record of each before anybody is asked */
-	HEAD_COOKIES_MAX = 200,   /* likewise, of which nothing here takes any */
+	HEAD_COOKIES_MAX = 200,   /* likewise, of which nothing here takes more than one */
 	CHUNK_LINE_MAX = 1 << 10,
 	TRAILER_BYTES_MAX = 4 << 10
 };

@@ -325,7 +325,8 @@ int http_new(const struct http_options *options, struct http **ret_http, struct 
 	pthread_condattr_setclock(&monotonic, CLOCK_MONOTONIC);
 	pthread_cond_init(&http->clock_kick, &monotonic);
 	pthread_condattr_destroy(&monotonic);
-	if (gate_open(err) != 0 || server_names_check(options->server_names, err) != 0 ||
+	if (access_check_routes(options->routes, err) != 0 || access_new(options->tokens, &http->access, err) != 0 ||
+	    gate_open(err) != 0 || server_names_check(options->server_names, err) != 0 ||
 	    listeners_open(options->listen, http->listeners, &http->listener_count, err) != 0) {
 		http_free(http);
 		return err->code;
@@ -361,6 +362,11 @@ int http_start(struct http *http, struct error *err)
 	return 0;
 }
 
+int http_reload(struct http *http, struct error *err)
+{
+	return access_reload(http->access, err);
+}
+
 void http_stop(struct http *http)
 {
 	const struct timespec nap = {0, 10 * 1000 * 1000};
@@ -391,6 +397,7 @@ void http_free(struct http *http)
 	http_stop(http);
 	if (http->admission_kick >= 0)
 		close(http->admission_kick);
+	access_free(http->access);
 	pthread_cond_destroy(&http->clock_kick);
 	pthread_mutex_destroy(&http->lock);
 	free(http);

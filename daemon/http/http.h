@@ -11,6 +11,7 @@
 #include "core/error.h"
 #include "daemon/http/text.h"
 #include "proto/clock.h"
+#include "proto/tokens.h"
 
 /*
  * HTTP without the library that speaks it (libmicrohttpd stays in http*.c):
@@ -37,6 +38,7 @@ enum body {
 struct route {
 	const char *method; /* GET is HEAD as well */
 	const char *path; /* "/v1/scans/{}/projections/{}": {} is any one segment, {flat} this one: request_argument */
+	enum role role;   /* the least that may; never ROLE_UNSAID */
 	/* The whole request is there. */
 	int (*handle)(void *context, struct request *request, struct error *err);
 	enum body body;
@@ -54,6 +56,7 @@ struct http_options {
 	const char *listen;         /* as config.listen */
 	const char *server_names;   /* as config.server_names */
 	const char *state_dir;      /* replies do not show paths in it */
+	const char *tokens;         /* the file of tokens; "": nobody is asked who they are */
 	const struct route *routes; /* ends with method == NULL */
 	void *context;              /* the handlers' */
 	int threads;
@@ -69,6 +72,8 @@ struct http_options {
 int http_new(const struct http_options *options, struct http **ret_http, struct error *err);
 /* Accepts from now on, and says where on standard output. */
 int http_start(struct http *http, struct error *err);
+/* Reads the file of tokens again. On failure the one before stays. Any thread, one at a time. */
+int http_reload(struct http *http, struct error *err);
 /* No new connections; wakes all that wait; gives requests under way two seconds to end. Then http_free. */
 void http_stop(struct http *http);
 void http_free(struct http *http); /* NULL is fine */
@@ -100,6 +105,26 @@ const char *request_body(const struct request *request, size_t *ret_length);
 /* The handler's own, freed with the request; one at most. */
 void request_set_state(struct request *request, void *state, void (*state_free)(void *state));
 void *request_state(const struct request *request);
+
+/* ---- who asks ---- */
+/* What showed who asks. */
+enum proof { PROOF_NONE, PROOF_NOT_ASKED /* there are no tokens */, PROOF_TOKEN, PROOF_SESSION };
+struct identity {
+	char name[TOKEN_NAME_SIZE]; /* of the token, "" without one */
+	enum role role;             /* ROLE_ANYONE: not known; ROLE_ADMIN where nobody is asked */
+	int64_t expires;            /* as in struct token */
+	enum proof proof;
+	uint8_t token[TOKEN_DIGEST_BYTES];
+};
+/* The request's. It may do what its route is about: that was seen to before its handler is called. */
+const struct identity *request_identity(const struct request *request);
+/* For a handler that gives more to some: 0, or 0 with a reply that refuses (request_replied), or an error. */
+int request_require(struct request *request, enum role least, struct error *err);
+bool request_replied(const struct request *request);
+/* After the reply was made. The cookie of a session for who asks with a token. */
+int request_session_open(struct request *request, struct error *err);
+/* Ends the session whose cookie the request has, and has the browser forget it. */
+void request_session_close(struct request *request);
 
 /* ---- waiting ---- */
 /* Before HTTP_WAIT: be called again at that time (clock_monotonic) in any case. */

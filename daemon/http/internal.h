@@ -79,6 +79,7 @@ struct request {
 	char *decoded; /* what arguments and queries point into; owned */
 	char method[16];
 	const struct route *route;
+	struct identity who;
 	const char *arguments[ARGUMENTS_MAX];
 	struct {
 		const char *name, *value;
@@ -113,6 +114,7 @@ struct listener {
 
 struct http {
 	struct http_options options;
+	struct access *access;
 	struct listener listeners[LISTENERS_MAX];
 	int listener_count;
 	struct MHD_Daemon *daemon; /* the library's threads */
@@ -199,6 +201,17 @@ int request_refuse(struct request *request, struct error *err);
 int server_names_check(const char *names, struct error *err);
 /* Host, Origin, Sec-Fetch-Site; 0, or 0 with a reply that refuses, or an error. */
 int request_check_origin(struct request *request, struct error *err);
+
+/* ---- http/access.c: who asks, and what they may ---- */
+int access_new(const char *path, struct access **ret_access, struct error *err);
+void access_free(struct access *access); /* NULL is fine */
+/* There are tokens, and whoever has none is nobody. */
+bool access_is_asked(const struct access *access);
+/* On failure the tokens before stay. */
+int access_reload(struct access *access, struct error *err);
+int access_check_routes(const struct route *routes, struct error *err);
+/* Of a request that has found its route; 0, or 0 with a reply that refuses, or an error. */
+int access_check(struct request *request, struct error *err);
 
 /* ---- http/reply.c ---- */
 int reply_problem_of(struct request *request, const struct error *err);

@@ -326,6 +326,8 @@ static int read_header(struct request *request, struct error *err)
 	if (code == 0 && request->response == NULL)
 		code = read_target(request, err);
 	if (code == 0 && request->response == NULL)
+		code = access_check(request, err);
+	if (code == 0 && request->response == NULL)
 		code = check_queries(request, err);
 	if (code == 0 && request->response == NULL)
 		code = check_body(request, err);
@@ -400,6 +402,11 @@ void *request_state(const struct request *request)
 void request_wait_until(struct request *request, double time)
 {
 	request->wait_until = time;
+}
+
+bool request_replied(const struct request *request)
+{
+	return request->response != NULL;
 }
 
 bool request_stopping(const struct request *request)

@@ -1,0 +1,307 @@
+/*
+ * Who asks, and whether this route is for them.
+ *
+ * Without a file of tokens everybody who reaches the daemon may do everything:
+ * it listens on loopback and Unix sockets only (http/listen.c). With one, a
+ * request shows a token (RFC 6750), or the cookie of a session that a token
+ * opened. A cookie holds random bits of its own, never the token; the daemon
+ * has the SHA-256 of them, and asks the table of tokens again at each request,
+ * so that a token that expires or is revoked takes its sessions along.
+ *
+ * A cookie is sent by the browser whoever asks it to. Two things keep pages of
+ * other sites from using it: SameSite=Strict, and the rules of http/origin.c.
+ */
+#include "daemon/http/internal.h"
+
+#include <errno.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <strings.h>
+#include <sys/random.h>
+#include <time.h>
+
+#include <openssl/crypto.h>
+#include <openssl/evp.h>
+
+#include "daemon/lock.h"
+#include "daemon/log.h"
+
+enum { SESSIONS_MAX = 256 };
+static const double session_seconds = 12 * 3600; /* a working day */
+static const char session_cookie[] = "cbctd_session";
+
+/* Guarded by access.lock. */
+struct session {
+	uint8_t cookie[TOKEN_DIGEST_BYTES]; /* SHA-256 of the cookie's value */
+	uint8_t token[TOKEN_DIGEST_BYTES];  /* of the token that opened it */
+	double ends;                        /* clock_monotonic; 0: free */
+};
+
+struct access {
+	const char *path; /* "": nobody is asked */
+	pthread_mutex_t lock;
+	struct tokens tokens; /* guarded by lock, as is all below */
+	struct session sessions[SESSIONS_MAX];
+};
+
+/* ---- life ---- */
+
+int access_new(const char *path, struct access **ret_access, struct error *err)
+{
+	struct access *access = calloc(1, sizeof(*access));
+
+	if (access == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for tokens");
+	access->path = path;
+	if (path[0] != '\0' && tokens_read(path, &access->tokens, err) != 0) {
+		free(access);
+		return err->code;
+	}
+	lock_init(&access->lock, LOCK_ACCESS);
+	*ret_access = access;
+	return 0;
+}
+
+void access_free(struct access *access)
+{
+	if (access == NULL)
+		return;
+	pthread_mutex_destroy(&access->lock);
+	tokens_clear(&access->tokens);
+	free(access);
+}
+
+bool access_is_asked(const struct access *access)
+{
+	return access->path[0] != '\0';
+}
+
+int access_reload(struct access *access, struct error *err)
+{
+	struct tokens fresh, old;
+
+	if (!access_is_asked(access))
+		return 0;
+	if (tokens_read(access->path, &fresh, err) != 0)
+		return err->code;
+	pthread_mutex_lock(&access->lock);
+	old = access->tokens;
+	access->tokens = fresh;
+	pthread_mutex_unlock(&access->lock);
+	tokens_clear(&old);
+	log_line(LEVEL_INFO, "%d tokens in %s", fresh.count, access->path);
+	return 0;
+}
+
+/* Every route says who may; 0 when one does not. */
+int access_check_routes(const struct route *routes, struct error *err)
+{
+	for (; routes->method != NULL; routes++) {
+		if (routes->role <= ROLE_UNSAID || routes->role >= ROLE_COUNT)
+			return error_set(err, ERR_INTERNAL, "%s %s does not say which role may", routes->method,
+					 routes->path);
+	}
+	return 0;
+}
+
+/* ---- what a request shows ---- */
+
+static bool digest_text(const char *text, uint8_t ret_sha256[TOKEN_DIGEST_BYTES])
+{
+	return EVP_Digest(text, strlen(text), ret_sha256, NULL, EVP_sha256(), NULL) == 1;
+}
+
+/* False where the row is missing or its time is over. */
+static bool take(const struct token *token, enum proof proof, struct identity *ret)
+{
+	if (token == NULL || !token_is_valid(token, time(NULL)))
+		return false;
+	snprintf(ret->name, sizeof(ret->name), "%s", token->name);
+	ret->role = token->role;
+	ret->expires = token->expires;
+	ret->proof = proof;
+	memcpy(ret->token, token->sha256, sizeof(ret->token));
+	return true;
+}
+
+static bool find_token(struct access *access, const char *text, struct identity *ret)
+{
+	uint8_t sha256[TOKEN_DIGEST_BYTES];
+	bool found;
+
+	if (!digest_text(text, sha256))
+		return false;
+	pthread_mutex_lock(&access->lock);
+	found = take(tokens_find(&access->tokens, sha256), PROOF_TOKEN, ret);
+	pthread_mutex_unlock(&access->lock);
+	return found;
+}
+
+/* With the lock held. */
+static struct session *session_find(struct access *access, const char *cookie)
+{
+	uint8_t sha256[TOKEN_DIGEST_BYTES];
+	struct session *found = NULL;
+	double now = clock_monotonic();
+
+	if (cookie == NULL || !digest_text(cookie, sha256))
+		return NULL;
+	for (int i = 0; i < SESSIONS_MAX; i++) {
+		struct session *session = &access->sessions[i];
+
+		if (now < session->ends && CRYPTO_memcmp(session->cookie, sha256, sizeof(sha256)) == 0)
+			found = session;
+	}
+	return found;
+}
+
+static bool find_session(struct access *access, const char *cookie, struct identity *ret)
+{
+	const struct session *session;
+	bool found;
+
+	pthread_mutex_lock(&access->lock);
+	session = session_find(access, cookie);
+	found = session != NULL && take(tokens_find(&access->tokens, session->token), PROOF_SESSION, ret);
+	pthread_mutex_unlock(&access->lock);
+	return found;
+}
+
+enum shown { SHOWN_NOTHING, SHOWN_BAD, SHOWN_GOOD };
+
+static enum shown read_authorization(struct request *request, struct identity *ret)
+{
+	static const char scheme[] = "Bearer ";
+	const char *text = request_header(request, "Authorization"); /* one at most: http/framing.c */
+
+	if (text == NULL)
+		return SHOWN_NOTHING;
+	if (strncasecmp(text, scheme, sizeof(scheme) - 1) != 0)
+		return SHOWN_BAD;
+	text += sizeof(scheme) - 1;
+	text += strspn(text, " ");
+	return text[0] != '\0' && find_token(request->http->access, text, ret) ? SHOWN_GOOD : SHOWN_BAD;
+}
+
+static enum shown read_proof(struct request *request, struct identity *ret)
+{
+	enum shown shown = read_authorization(request, ret);
+	const char *cookie;
+
+	if (shown != SHOWN_NOTHING)
+		return shown;
+	cookie = MHD_lookup_connection_value(request->mhd, MHD_COOKIE_KIND, session_cookie);
+	if (find_session(request->http->access, cookie, ret))
+		return SHOWN_GOOD;
+	return SHOWN_NOTHING;
+}
+
+/* ---- refusals ---- */
+
+static int refuse_unknown(struct request *request, enum shown shown, struct error *err)
+{
+	bool bad = shown == SHOWN_BAD;
+
+	if (request_reply_problem(request, "unauthorized", err, "%s",
+				  bad ? "Authorization has no token that is valid here"
+				      : "a token is wanted: Authorization: Bearer TOKEN") != 0)
+		return err->code;
+	request_reply_header(request, "WWW-Authenticate", "Bearer realm=\"cbctd\"%s",
+			     bad ? ", error=\"invalid_token\"" : "");
+	return 0;
+}
+
+static int refuse_role(struct request *request, enum role least, struct error *err)
+{
+	if (request_reply_problem(request, "forbidden", err, "%s has the role %s, %s is wanted", request->who.name,
+				  role_names[request->who.role], role_names[least]) != 0)
+		return err->code;
+	request_reply_header(request, "WWW-Authenticate",
+			     "Bearer realm=\"cbctd\", error=\"insufficient_scope\", scope=\"%s\"", role_names[least]);
+	return 0;
+}
+
+int request_require(struct request *request, enum role least, struct error *err)
+{
+	if (request->who.role >= least)
+		return 0;
+	return request->who.role == ROLE_ANYONE ? refuse_unknown(request, SHOWN_NOTHING, err)
+						: refuse_role(request, least, err);
+}
+
+int access_check(struct request *request, struct error *err)
+{
+	enum role least = request->route->role;
+	enum shown shown;
+
+	if (!access_is_asked(request->http->access)) {
+		request->who = (struct identity){.role = ROLE_ADMIN, .expires = TOKEN_NEVER, .proof = PROOF_NOT_ASKED};
+		return 0;
+	}
+	request->who = (struct identity){.role = ROLE_ANYONE};
+	shown = read_proof(request, &request->who);
+	/* Probes and the page itself do not fail for a token that is old. */
+	if (shown == SHOWN_BAD && least > ROLE_ANYONE)
+		return refuse_unknown(request, shown, err);
+	return request_require(request, least, err);
+}
+
+const struct identity *request_identity(const struct request *request)
+{
+	return &request->who;
+}
+
+/* ---- sessions ---- */
+
+/* The one that is over, else the one that ends first. With the lock held. */
+static struct session *session_place(struct access *access)
+{
+	struct session *place = &access->sessions[0];
+
+	for (int i = 1; i < SESSIONS_MAX; i++) {
+		if (access->sessions[i].ends < place->ends)
+			place = &access->sessions[i];
+	}
+	return place;
+}
+
+static void set_cookie(struct request *request, const char *value, double seconds)
+{
+	request_reply_header(request, "Set-Cookie", "%s=%s; Path=/; Max-Age=%.0f; HttpOnly; SameSite=Strict",
+			     session_cookie, value, seconds);
+}
+
+int request_session_open(struct request *request, struct error *err)
+{
+	struct access *access = request->http->access;
+	uint8_t random[TOKEN_DIGEST_BYTES];
+	struct session fresh = {.ends = clock_monotonic() + session_seconds};
+	char value[TOKEN_TEXT_SIZE];
+
+	if (getrandom(random, sizeof(random), 0) != (ssize_t)sizeof(random))
+		return error_set_errno(err, errno, "random bits for a session");
+	token_text(random, value);
+	if (!digest_text(value, fresh.cookie))
+		return error_set(err, ERR_INTERNAL, "the digest of a session cannot be made");
+	memcpy(fresh.token, request->who.token, sizeof(fresh.token));
+	pthread_mutex_lock(&access->lock);
+	*session_place(access) = fresh;
+	pthread_mutex_unlock(&access->lock);
+	set_cookie(request, value, session_seconds);
+	return 0;
+}
+
+void request_session_close(struct request *request)
+{
+	struct access *access = request->http->access;
+	const char *cookie = MHD_lookup_connection_value(request->mhd, MHD_COOKIE_KIND, session_cookie);
+	struct session *session;
+
+	pthread_mutex_lock(&access->lock);
+	session = session_find(access, cookie);
+	if (session != NULL)
+		*session = (struct session){.ends = 0};
+	pthread_mutex_unlock(&access->lock);
+	set_cookie(request, "", 0);
+}
