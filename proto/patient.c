@@ -199,21 +199,18 @@ void axes_nearest(double axes[3][3], int ret_nearest[3])
 	}
 }
 
-void patient_letters(const struct patient *patient, int axis, bool negative, char ret_letters[PATIENT_LETTERS_MAX])
+void patient_letters_towards(const struct patient *patient, const double world[3],
+			     char ret_letters[PATIENT_LETTERS_MAX])
 {
 	static const char towards[3] = {'L', 'P', 'S'}, away[3] = {'R', 'A', 'I'};
 	const double least = 0.2; /* of a unit vector: 11.5 degrees off another axis are told */
 	double part[3];
 	int count = 0;
 
-	if (!patient->known) {
-		ret_letters[0] = negative ? '-' : '+';
-		ret_letters[1] = "xyz"[axis];
-		ret_letters[2] = '\0';
-		return;
-	}
-	for (int i = 0; i < 3; i++)
-		part[i] = patient->rotation[i][axis] * (negative ? -1 : 1);
+	if (patient->known)
+		patient_direction(patient, world, part);
+	else
+		memcpy(part, world, sizeof(part));
 	for (;;) {
 		int longest = 0;
 
@@ -222,10 +219,23 @@ void patient_letters(const struct patient *patient, int axis, bool negative, cha
 				longest = i;
 		if (fabs(part[longest]) < least)
 			break;
-		ret_letters[count++] = part[longest] > 0 ? towards[longest] : away[longest];
+		if (patient->known) {
+			ret_letters[count++] = part[longest] > 0 ? towards[longest] : away[longest];
+		} else {
+			ret_letters[count++] = part[longest] > 0 ? '+' : '-';
+			ret_letters[count++] = "xyz"[longest];
+		}
 		part[longest] = 0;
 	}
 	ret_letters[count] = '\0';
+}
+
+void patient_letters(const struct patient *patient, int axis, bool negative, char ret_letters[PATIENT_LETTERS_MAX])
+{
+	double world[3] = {0};
+
+	world[axis] = negative ? -1 : 1;
+	patient_letters_towards(patient, world, ret_letters);
 }
 
 cJSON *patient_axes_json(const struct patient *patient)

@@ -67,8 +67,11 @@ void axes_nearest(double axes[3][3], int ret_nearest[3]);
  * away from): "L", "R", "P", "A", "S" or "I"; in between up to three of them, the
  * nearest first. Neutral where not known: "+x", "-x" ...
  */
-enum { PATIENT_LETTERS_MAX = 4 };
+enum { PATIENT_LETTERS_MAX = 8 };
 void patient_letters(const struct patient *patient, int axis, bool negative, char ret_letters[PATIENT_LETTERS_MAX]);
+/* The same of any direction of length 1 in the world; not known: the ends of the axes that it points to, "+x-z". */
+void patient_letters_towards(const struct patient *patient, const double world[3],
+			     char ret_letters[PATIENT_LETTERS_MAX]);
 /* {"x": "L", "y": "P", "z": "S"}, the letters of the world's three axes; null where not known. */
 cJSON *patient_axes_json(const struct patient *patient);
 

@@ -57,12 +57,51 @@ test_tags_save_the_drawing() {
 	expect_status 200
 }
 
+test_planes_and_slabs_at_any_angle_are_the_volume_resampled() {
+	local python=${PYTHON:-/usr/bin/python3}
+	"$python" -c 'import numpy' 2>/dev/null || skip "numpy is not here"
+	get_volume final "$work/v.raw" format=raw
+	"$python" "$here/oblique.py" "$url" "$volume" "$work/v.raw" 31,24,15 3,4,5 -45,-46,-35 700 0 0.0192 || fail "the same pixels"
+	# Without center, size and spacing: all of the volume, about its middle, a pixel as small as a voxel's smallest side.
+	req GET "$volume/slice?normal=0,0,-1"
+	expect_status 200
+	[ "$(picture)" = "31 32 8 0" ] || fail "31 x 32 pixels of 3 mm for 93 x 96 mm, got $(picture)"
+	req GET "$volume/slice?normal=1,1,0&size=64,48&spacing=2"
+	expect_status 200
+	[ "$(picture)" = "64 48 8 0" ] || fail "64 x 48, got $(picture)"
+}
+
+test_the_sides_of_the_picture_are_told() {
+	local position expected
+	sides() { header cbct-sides; }
+	req GET "$volume/slice?axis=x"
+	[ "$(sides)" = 'left="-y", right="+y", top="+z", bottom="-z"' ] || fail "the world's axes where no position is known, got $(sides)"
+	req GET "$volume/slice?normal=1,1,0"
+	[ "$(sides)" = 'left="+x-y", right="-x+y", top="+z", bottom="-z"' ] || fail "two axes each, got $(sides)"
+	while read -r position expected; do
+		post_job '{"scan": "SCAN", "grid": {"size": [8, 8, 8], "spacing_mm": [9, 9, 9]}, "fdk": {}, "patient": {"position": "'"$position"'"}}'
+		wait_job succeeded
+		req GET "/v1/jobs/$job/volumes/final/slice?normal=1,-0.5,0&thickness=10"
+		expect_status 200
+		[ "$(sides | tr -d '"')" = "$expected" ] || fail "$position: $expected, got $(sides)"
+	done <<-EOF
+		HFS left=AR, right=PL, top=S, bottom=I
+		FFS left=AL, right=PR, top=I, bottom=S
+		HFP left=PL, right=AR, top=S, bottom=I
+	EOF
+}
+
 test_what_cannot_be_is_refused_by_its_name() {
 	local query
-	for query in axis=w index=15 index=-1 index=1.5 index=x "axis=x&index=31" window=0 window=-5 window=nan level=high sheet=2; do
+	for query in axis=w index=15 index=-1 index=1.5 index=x "axis=x&index=31" window=0 window=-5 window=nan level=high sheet=2 \
+		normal=0,0,0 normal=1,0 normal=1,0,0,0 normal=1,x,0 normal=1,0, normal=1e3,0,0 normal= "normal=1,0,0&up=2,0,0" "normal=1,0,0&up=0,0,0" \
+		"normal=1,0,0&center=500,0,0" "normal=1,0,0&center=1,2" "normal=1,0,0&size=0,5" "normal=1,0,0&size=5" "normal=1,0,0&size=2049,5" \
+		"normal=1,0,0&size=5.5,5" "normal=1,0,0&spacing=0" "normal=1,0,0&spacing=-1" "normal=1,0,0&axis=x" "normal=1,0,0&index=3" \
+		"normal=1,0,0&sheet=1" up=0,0,1 center=0,0,0 size=5,5 spacing=1 thickness=0 thickness=-3 thickness=thick thickness=1001 \
+		"thickness=5&mode=median" mode=max "sheet=1&thickness=4" "normal=1,0,0&size=2048,2048&thickness=200"; do
 		req GET "$volume/slice?$query"
 		expect_problem 400
-		expect_json ".detail | contains(\"$(sed 's/.*&//; s/=.*//' <<<"$query")\")"
+		expect_json ".detail | contains(\"$(sed 's/.*&//; s/=.*//' <<<"$query")\")" # the last one is at fault
 	done
 	req GET "/v1/jobs/$job/volumes/iter-7/slice"
 	expect_problem 404
