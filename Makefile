@@ -32,7 +32,7 @@ WERROR ?= 0
 prefix ?= /usr/local
 
 # pkg-config name:Debian package, then command:Debian package.
-PACKAGES := libmicrohttpd:libmicrohttpd-dev libcjson:libcjson-dev libzstd:libzstd-dev sqlite3:libsqlite3-dev \
+PACKAGES := libmicrohttpd:libmicrohttpd-dev gnutls:libgnutls28-dev libcjson:libcjson-dev libzstd:libzstd-dev sqlite3:libsqlite3-dev \
             kissfft-float:libkissfft-dev libpng:libpng-dev libcurl:libcurl4-openssl-dev libcrypto:libssl-dev \
             expat:libexpat1-dev libtiff-4:libtiff-dev zlib:zlib1g-dev check:check
 COMMANDS := gcc:gcc pkg-config:pkg-config curl:curl jq:jq zstd:zstd openssl:openssl pgrep:procps sqlite3:sqlite3 \
@@ -44,7 +44,7 @@ MODULES  := yaml:python3-yaml jsonschema:python3-jsonschema numpy:python3-numpy 
 
 core_libs   := kissfft-float
 proto_libs  := libcjson libzstd libpng zlib
-daemon_libs := libmicrohttpd sqlite3 libcrypto
+daemon_libs := libmicrohttpd gnutls sqlite3 libcrypto
 # Other tools' files: the client reads and writes them, the daemon and the worker know none of them.
 files_libs  := expat libtiff-4
 cbct_libs   := libcurl libcrypto $(files_libs)

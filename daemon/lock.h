@@ -29,6 +29,7 @@ enum lock_rank {
 	LOCK_CHECKS,     /* store.check_lock */
 	LOCK_WATCHERS,   /* watch_list.lock */
 	LOCK_ACCESS,     /* access.lock */
+	LOCK_TLS,        /* tls.lock */
 	LOCK_HTTP,       /* http.lock */
 	LOCK_CONNECTION, /* connection.lock */
 	LOCK_COUNT

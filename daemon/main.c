@@ -70,6 +70,9 @@ static int start_http(const struct config *config, struct api *api, struct error
 					     .server_names = config->server_names,
 					     .state_dir = config->state_dir,
 					     .tokens = config->tokens,
+					     .tls_certificate = config->tls_certificate,
+					     .tls_key = config->tls_key,
+					     .tls_client_authorities = config->tls_client_authorities,
 					     .routes = api_routes,
 					     .context = api,
 					     .threads = (int)config->http_threads,
@@ -133,11 +136,8 @@ static void stop_parts(struct api *api)
 /* Settings are read at the start alone; the files that some of them name are read again. */
 static void reload(struct api *api)
 {
-	struct error err;
-
-	log_line(LEVEL_INFO, "SIGHUP: reading tokens again");
-	if (http_reload(api->http, &err) != 0)
-		log_line(LEVEL_ERROR, "nothing changes, what was read before holds: %s", err.text);
+	log_line(LEVEL_INFO, "SIGHUP: reading tokens and certificates again");
+	http_reload(api->http);
 }
 
 /* A terminal that is closed ends nothing. */

@@ -168,6 +168,16 @@ static bool find_session(struct access *access, const char *cookie, struct ident
 	return found;
 }
 
+static bool find_certificate(struct access *access, const char *name, struct identity *ret)
+{
+	bool found;
+
+	pthread_mutex_lock(&access->lock);
+	found = take(tokens_find_certificate(&access->tokens, name), PROOF_CERTIFICATE, ret);
+	pthread_mutex_unlock(&access->lock);
+	return found;
+}
+
 enum shown { SHOWN_NOTHING, SHOWN_BAD, SHOWN_GOOD };
 
 static enum shown read_authorization(struct request *request, struct identity *ret)
@@ -192,7 +202,8 @@ static enum shown read_proof(struct request *request, struct identity *ret)
 	if (shown != SHOWN_NOTHING)
 		return shown;
 	cookie = MHD_lookup_connection_value(request->mhd, MHD_COOKIE_KIND, session_cookie);
-	if (find_session(request->http->access, cookie, ret))
+	if (find_certificate(request->http->access, tls_peer_name(request->connection), ret) ||
+	    find_session(request->http->access, cookie, ret))
 		return SHOWN_GOOD;
 	return SHOWN_NOTHING;
 }
@@ -268,8 +279,8 @@ static struct session *session_place(struct access *access)
 
 static void set_cookie(struct request *request, const char *value, double seconds)
 {
-	request_reply_header(request, "Set-Cookie", "%s=%s; Path=/; Max-Age=%.0f; HttpOnly; SameSite=Strict",
-			     session_cookie, value, seconds);
+	request_reply_header(request, "Set-Cookie", "%s=%s; Path=/; Max-Age=%.0f; HttpOnly; SameSite=Strict%s",
+			     session_cookie, value, seconds, request->connection->tls ? "; Secure" : "");
 }
 
 int request_session_open(struct request *request, struct error *err)

@@ -158,7 +158,8 @@ static void connection_enter(struct http *http, struct connection *connection)
 	pthread_mutex_unlock(&http->lock);
 }
 
-static struct connection *connection_new(struct http *http, int socket, const struct sockaddr_storage *address)
+static struct connection *connection_new(struct http *http, int socket, const struct sockaddr_storage *address,
+					 bool tls)
 {
 	struct connection *connection = calloc(1, sizeof(*connection));
 	struct ucred peer;
@@ -169,6 +170,7 @@ static struct connection *connection_new(struct http *http, int socket, const st
 	connection->http = http;
 	connection->socket = socket;
 	connection->address = *address;
+	connection->tls = tls;
 	if (address->ss_family == AF_UNIX && getsockopt(socket, SOL_SOCKET, SO_PEERCRED, &peer, &size) == 0)
 		connection->user = peer.uid;
 	connection->since = clock_monotonic();
@@ -216,12 +218,13 @@ static void forget_lost(int socket)
 		connection_free(lost);
 }
 
-static void admit(struct http *http, int socket, const struct sockaddr_storage *address, socklen_t size)
+static void admit(struct http *http, int socket, const struct sockaddr_storage *address, socklen_t size, bool tls)
 {
+	struct MHD_Daemon *daemon = tls ? http->tls_daemon : http->plain_daemon;
 	struct connection *connection;
 
 	forget_lost(socket);
-	connection = connection_new(http, socket, address);
+	connection = connection_new(http, socket, address, tls);
 	if (connection == NULL || !gate_set(socket, connection)) {
 		if (connection != NULL)
 			connection_free(connection);
@@ -229,7 +232,7 @@ static void admit(struct http *http, int socket, const struct sockaddr_storage *
 		return;
 	}
 	/* The library closes it if it fails. */
-	if (MHD_add_connection(http->daemon, socket, (const struct sockaddr *)address, size) != MHD_YES)
+	if (MHD_add_connection(daemon, socket, (const struct sockaddr *)address, size) != MHD_YES)
 		connection_free(connection);
 }
 
@@ -270,7 +273,7 @@ static bool accept_from(struct http *http, const struct listener *listener)
 			return false;
 		socket = accept4(listener->socket, (struct sockaddr *)&address, &size, SOCK_NONBLOCK | SOCK_CLOEXEC);
 		if (socket >= 0) {
-			admit(http, socket, &address, size);
+			admit(http, socket, &address, size, listener->tls);
 		} else if (errno == EMFILE || errno == ENFILE || errno == ENOBUFS || errno == ENOMEM) {
 			log_exhausted(http, errno);
 			return false;

@@ -25,7 +25,11 @@
  * body that is refused midway is ended in the form that the library expects; so
  * the answer takes the way of every other, and the connection is closed after it.
  *
- * Should a later library read by other means than recv, gate_admits tells: the
+ * With TLS the library calls gnutls_record_recv in place of recv, and this file
+ * stands in for that in the same way: what is looked at has been decrypted.
+ * GnuTLS itself reads the socket by recv, which then passes all on.
+ *
+ * Should a later library read by other means than these, gate_admits tells: the
  * handler is called for more heads than went through, and refuses all.
  */
 #include "daemon/http/internal.h"
@@ -143,12 +147,34 @@ static bool end_refused(struct gate *gate)
 
 /* ---- reading ---- */
 
-enum { HELD_STEP = 4096 };
+enum { HELD_STEP = 4096, RECORD_MAX = 16384 /* bytes in one record of TLS (RFC 8446, 5.1) */ };
+
+/* Where a connection's bytes come from; each read returns as recv does. */
+struct source {
+	int descriptor;
+	gnutls_session_t session; /* NULL: no TLS */
+	size_t most;              /* bytes that one read returns at most */
+};
+
+static ssize_t source_read(const struct source *source, void *to, size_t size)
+{
+	unsigned char sequence[8];
+	ssize_t got;
+
+	if (source->session == NULL)
+		return recvfrom(source->descriptor, to, size, 0, NULL, NULL);
+	/* The general form of gnutls_record_recv. */
+	got = gnutls_record_recv_seq(source->session, to, size, sequence);
+	if (got >= 0)
+		return got;
+	errno = got == GNUTLS_E_AGAIN ? EAGAIN : got == GNUTLS_E_INTERRUPTED ? EINTR : EIO;
+	return -1;
+}
 
 /* Reads into `to`, looks at it there, and holds back what may not go on yet. *ret_passed bytes may. */
-static ssize_t read_through(struct gate *gate, int descriptor, char *to, size_t size, size_t *ret_passed)
+static ssize_t read_through(struct gate *gate, const struct source *source, char *to, size_t size, size_t *ret_passed)
 {
-	ssize_t got = recvfrom(descriptor, to, size, 0, NULL, NULL);
+	ssize_t got = source_read(source, to, size);
 
 	*ret_passed = 0;
 	if (got <= 0)
@@ -162,7 +188,7 @@ static ssize_t read_through(struct gate *gate, int descriptor, char *to, size_t 
 }
 
 /* The same for what continues an incomplete head: it grows where it is held. */
-static ssize_t read_held(struct gate *gate, int descriptor, size_t size)
+static ssize_t read_held(struct gate *gate, const struct source *source, size_t size)
 {
 	ssize_t got;
 
@@ -170,7 +196,7 @@ static ssize_t read_held(struct gate *gate, int descriptor, size_t size)
 		errno = ENOMEM;
 		return -1;
 	}
-	got = recvfrom(descriptor, gate->held + gate->length, size, 0, NULL, NULL);
+	got = source_read(source, gate->held + gate->length, size);
 	if (got <= 0)
 		return got;
 	gate->length += (size_t)got;
@@ -178,7 +204,7 @@ static ssize_t read_held(struct gate *gate, int descriptor, size_t size)
 	return got;
 }
 
-static ssize_t gate_read(struct gate *gate, int descriptor, char *to, size_t size)
+static ssize_t gate_read(struct gate *gate, const struct source *source, char *to, size_t size)
 {
 	size_t done = 0, wanted = 0;
 	ssize_t got = 0;
@@ -205,10 +231,10 @@ static ssize_t gate_read(struct gate *gate, int descriptor, char *to, size_t siz
 		}
 		if (gate->length > 0) {
 			wanted = HELD_STEP;
-			got = read_held(gate, descriptor, wanted);
+			got = read_held(gate, source, wanted);
 		} else {
-			wanted = size - done;
-			got = read_through(gate, descriptor, to + done, wanted, &passed);
+			got = read_through(gate, source, to + done, size - done, &passed);
+			wanted = size - done < source->most ? size - done : source->most;
 		}
 		done += passed;
 	}
@@ -220,9 +246,23 @@ ssize_t recv(int descriptor, void *to, size_t size, int flags)
 {
 	struct connection *connection = flags == 0 && size > 0 ? gate_find(descriptor) : NULL;
 
-	if (connection == NULL)
+	if (connection == NULL || connection->tls)
 		return recvfrom(descriptor, to, size, flags, NULL, NULL);
-	return gate_read(&connection->gate, descriptor, to, size);
+	return gate_read(&connection->gate, &(struct source){.descriptor = descriptor, .most = SIZE_MAX}, to, size);
+}
+
+/* Replaces GnuTLS's. */
+ssize_t gnutls_record_recv(gnutls_session_t session, void *to, size_t size)
+{
+	struct connection *connection = gate_find(gnutls_transport_get_int(session));
+	ssize_t got;
+
+	if (connection == NULL)
+		return GNUTLS_E_INVALID_SESSION;
+	got = gate_read(&connection->gate, &(struct source){.session = session, .most = RECORD_MAX}, to, size);
+	if (got >= 0)
+		return got;
+	return errno == EAGAIN ? GNUTLS_E_AGAIN : errno == EINTR ? GNUTLS_E_INTERRUPTED : GNUTLS_E_PULL_ERROR;
 }
 
 /* ---- what the handler asks ---- */

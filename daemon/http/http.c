@@ -219,11 +219,12 @@ static void log_request(const struct request *request, bool whole)
  * The answer is out and the connection closes. What the client has sent beyond
  * would make the kernel reset it, and the answer would be lost on its way.
  */
-static void drop_rest(const struct connection *connection)
+static void drop_rest(struct connection *connection)
 {
 	enum { MOST = 64 };
 	char rest[16384];
 
+	tls_end(connection);
 	shutdown(connection->socket, SHUT_WR);
 	for (int i = 0; i < MOST && recv(connection->socket, rest, sizeof(rest), MSG_DONTWAIT) > 0; i++)
 		;
@@ -308,6 +309,12 @@ static void fit_connections(struct http *http)
 		options->max_connections_per_address = (options->max_connections + 1) / 2;
 }
 
+static unsigned guards_of(const struct http *http)
+{
+	return (access_is_asked(http->access) ? GUARD_TOKENS : GUARD_NONE) |
+	       (http->tls != NULL ? GUARD_TLS : GUARD_NONE);
+}
+
 int http_new(const struct http_options *options, struct http **ret_http, struct error *err)
 {
 	struct http *http = calloc(1, sizeof(*http));
@@ -326,8 +333,9 @@ int http_new(const struct http_options *options, struct http **ret_http, struct 
 	pthread_cond_init(&http->clock_kick, &monotonic);
 	pthread_condattr_destroy(&monotonic);
 	if (access_check_routes(options->routes, err) != 0 || access_new(options->tokens, &http->access, err) != 0 ||
-	    gate_open(err) != 0 || server_names_check(options->server_names, err) != 0 ||
-	    listeners_open(options->listen, http->listeners, &http->listener_count, err) != 0) {
+	    tls_new(options, &http->tls, err) != 0 || gate_open(err) != 0 ||
+	    server_names_check(options->server_names, err) != 0 ||
+	    listeners_open(options->listen, guards_of(http), http->listeners, &http->listener_count, err) != 0) {
 		http_free(http);
 		return err->code;
 	}
@@ -335,21 +343,34 @@ int http_new(const struct http_options *options, struct http **ret_http, struct 
 	return 0;
 }
 
+/* Admission counts; the library's own limit, of which each thread has its share, is out of its reach. */
+#define LIBRARY_OPTIONS(http, threads)                                                                                 \
+	MHD_OPTION_EXTERNAL_LOGGER, on_library_message, NULL, MHD_OPTION_THREAD_POOL_SIZE, (threads),                  \
+	    MHD_OPTION_CONNECTION_LIMIT, (unsigned)DESCRIPTORS_MAX *(threads), MHD_OPTION_CONNECTION_MEMORY_LIMIT,     \
+	    (size_t)CONNECTION_MEMORY, MHD_OPTION_CONNECTION_TIMEOUT, (unsigned)ceil((http)->options.header_timeout),  \
+	    MHD_OPTION_URI_LOG_CALLBACK, on_target, (http), MHD_OPTION_NOTIFY_COMPLETED, on_completed, (http),         \
+	    MHD_OPTION_NOTIFY_CONNECTION, on_connection, (http)
+
 static int library_start(struct http *http, struct error *err)
 {
 	unsigned flags =
 	    MHD_USE_EPOLL_INTERNAL_THREAD | MHD_ALLOW_SUSPEND_RESUME | MHD_USE_NO_LISTEN_SOCKET | MHD_USE_ERROR_LOG;
 	unsigned threads = (unsigned)http->options.threads;
+	bool wanted[2] = {false, false};
 
-	/* Admission counts; the library's own limit, of which each thread has its share, is out of its reach. */
-	http->daemon = MHD_start_daemon(
-	    flags, 0, NULL, NULL, on_request, http, MHD_OPTION_EXTERNAL_LOGGER, on_library_message, NULL,
-	    MHD_OPTION_THREAD_POOL_SIZE, threads, MHD_OPTION_CONNECTION_LIMIT, (unsigned)DESCRIPTORS_MAX * threads,
-	    MHD_OPTION_CONNECTION_MEMORY_LIMIT, (size_t)CONNECTION_MEMORY, MHD_OPTION_CONNECTION_TIMEOUT,
-	    (unsigned)ceil(http->options.header_timeout), MHD_OPTION_URI_LOG_CALLBACK, on_target, http,
-	    MHD_OPTION_NOTIFY_COMPLETED, on_completed, http, MHD_OPTION_NOTIFY_CONNECTION, on_connection, http,
-	    MHD_OPTION_END);
-	return http->daemon != NULL ? 0 : error_set(err, ERR_IO, "the HTTP server does not start: %s", strerror(errno));
+	for (int i = 0; i < http->listener_count; i++)
+		wanted[http->listeners[i].tls] = true;
+	if (wanted[false])
+		http->plain_daemon = MHD_start_daemon(flags, 0, NULL, NULL, on_request, http,
+						      LIBRARY_OPTIONS(http, threads), MHD_OPTION_END);
+	if (wanted[true])
+		http->tls_daemon = MHD_start_daemon(flags | MHD_USE_TLS, 0, NULL, NULL, on_request, http,
+						    LIBRARY_OPTIONS(http, threads), MHD_OPTION_HTTPS_PRIORITIES,
+						    tls_priorities, MHD_OPTION_HTTPS_CERT_CALLBACK2, tls_certificate,
+						    MHD_OPTION_HTTPS_MEM_TRUST, tls_trust(http->tls), MHD_OPTION_END);
+	if ((wanted[false] && http->plain_daemon == NULL) || (wanted[true] && http->tls_daemon == NULL))
+		return error_set(err, ERR_IO, "the HTTP server does not start: %s", strerror(errno));
+	return 0;
 }
 
 int http_start(struct http *http, struct error *err)
@@ -362,9 +383,14 @@ int http_start(struct http *http, struct error *err)
 	return 0;
 }
 
-int http_reload(struct http *http, struct error *err)
+void http_reload(struct http *http)
 {
-	return access_reload(http->access, err);
+	struct error err;
+
+	if (access_reload(http->access, &err) != 0)
+		log_line(LEVEL_ERROR, "the tokens that were read before stay: %s", err.text);
+	if (tls_reload(http->tls, &err) != 0)
+		log_line(LEVEL_ERROR, "the certificate that was read before stays: %s", err.text);
 }
 
 void http_stop(struct http *http)
@@ -382,9 +408,11 @@ void http_stop(struct http *http)
 	} while (!connections_idle(http) && clock_monotonic() < end);
 	atomic_store(&http->closing, true);
 	connections_wake(http);
-	if (http->daemon != NULL)
-		MHD_stop_daemon(http->daemon);
-	http->daemon = NULL;
+	if (http->plain_daemon != NULL)
+		MHD_stop_daemon(http->plain_daemon);
+	if (http->tls_daemon != NULL)
+		MHD_stop_daemon(http->tls_daemon);
+	http->plain_daemon = http->tls_daemon = NULL;
 	while (http->connections != NULL) /* that the library had never taken */
 		connection_free(http->connections);
 	clock_end(http);
@@ -398,6 +426,7 @@ void http_free(struct http *http)
 	if (http->admission_kick >= 0)
 		close(http->admission_kick);
 	access_free(http->access);
+	tls_free(http->tls);
 	pthread_cond_destroy(&http->clock_kick);
 	pthread_mutex_destroy(&http->lock);
 	free(http);

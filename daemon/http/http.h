@@ -53,9 +53,11 @@ struct route {
 };
 
 struct http_options {
-	const char *listen;         /* as config.listen */
-	const char *server_names;   /* as config.server_names */
-	const char *state_dir;      /* replies do not show paths in it */
+	const char *listen;       /* as config.listen */
+	const char *server_names; /* as config.server_names */
+	const char *state_dir;    /* replies do not show paths in it */
+	/* Paths; "" and "" for no TLS. The last may be "": clients are not asked for certificates. */
+	const char *tls_certificate, *tls_key, *tls_client_authorities;
 	const char *tokens;         /* the file of tokens; "": nobody is asked who they are */
 	const struct route *routes; /* ends with method == NULL */
 	void *context;              /* the handlers' */
@@ -66,14 +68,14 @@ struct http_options {
 };
 
 /*
- * Binds, without accepting yet. ERR_IMPOSSIBLE for an address beyond loopback:
- * there are no tokens and no TLS to guard it. The options are copied, what they point to is not.
+ * Binds, without accepting yet. ERR_IMPOSSIBLE for an address beyond loopback
+ * unless there are both tokens and TLS to guard it. The options are copied, what they point to is not.
  */
 int http_new(const struct http_options *options, struct http **ret_http, struct error *err);
 /* Accepts from now on, and says where on standard output. */
 int http_start(struct http *http, struct error *err);
-/* Reads the file of tokens again. On failure the one before stays. Any thread, one at a time. */
-int http_reload(struct http *http, struct error *err);
+/* Reads tokens and certificates again; what is bad is logged, and the one before stays. One thread at a time. */
+void http_reload(struct http *http);
 /* No new connections; wakes all that wait; gives requests under way two seconds to end. Then http_free. */
 void http_stop(struct http *http);
 void http_free(struct http *http); /* NULL is fine */
@@ -108,7 +110,7 @@ void *request_state(const struct request *request);
 
 /* ---- who asks ---- */
 /* What showed who asks. */
-enum proof { PROOF_NONE, PROOF_NOT_ASKED /* there are no tokens */, PROOF_TOKEN, PROOF_SESSION };
+enum proof { PROOF_NONE, PROOF_NOT_ASKED /* there are no tokens */, PROOF_TOKEN, PROOF_SESSION, PROOF_CERTIFICATE };
 struct identity {
 	char name[TOKEN_NAME_SIZE]; /* of the token, "" without one */
 	enum role role;             /* ROLE_ANYONE: not known; ROLE_ADMIN where nobody is asked */

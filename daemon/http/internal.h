@@ -5,6 +5,7 @@
 #include <stdatomic.h>
 #include <sys/socket.h>
 
+#include <gnutls/abstract.h>
 #include <microhttpd.h>
 
 #include "daemon/http/http.h"
@@ -44,6 +45,9 @@ struct connection {
 	int socket;
 	struct sockaddr_storage address;
 	uid_t user;                         /* of a Unix socket's peer */
+	bool tls;                           /* constant */
+	bool certificate_read;              /* its thread's own, as is the next */
+	char certificate[TOKEN_NAME_SIZE];  /* common name of the client's, which was verified; "" without one */
 	struct connection *previous, *next; /* guarded by http->lock */
 	int refused; /* status of its answers while it is one too many; 0: welcome; its thread's own */
 	struct gate gate;
@@ -108,6 +112,7 @@ struct request {
 struct listener {
 	int socket; /* -1 once closed */
 	struct sockaddr_storage address;
+	bool tls;
 	char name[160];      /* "http://127.0.0.1:2228", "unix:/run/x" */
 	char unix_path[108]; /* to be removed at the end; "" for TCP */
 };
@@ -117,7 +122,9 @@ struct http {
 	struct access *access;
 	struct listener listeners[LISTENERS_MAX];
 	int listener_count;
-	struct MHD_Daemon *daemon; /* the library's threads */
+	struct tls *tls; /* NULL: none */
+	/* The library's threads, for connections without TLS and with; NULL where no listener has such. */
+	struct MHD_Daemon *plain_daemon, *tls_daemon;
 
 	pthread_t admission;
 	bool admission_runs;
@@ -161,8 +168,29 @@ const struct framing *gate_refusal(const struct connection *connection);
 void gate_free(struct gate *gate);
 
 /* ---- http/listen.c: addresses and sockets ---- */
-int listeners_open(const char *listen, struct listener ret_listeners[LISTENERS_MAX], int *ret_count, struct error *err);
+enum guard { GUARD_NONE = 0, GUARD_TOKENS = 1, GUARD_TLS = 2 };
+/* guards: what there is of enum guard; with both, others than loopback addresses are allowed. */
+int listeners_open(const char *listen, unsigned guards, struct listener ret_listeners[LISTENERS_MAX], int *ret_count,
+		   struct error *err);
 void listener_close(struct listener *listener);
+
+/* ---- http/tls.c: certificates ---- */
+extern const char tls_priorities[]; /* as GnuTLS writes them */
+/* *ret_tls stays NULL where no TLS is configured. */
+int tls_new(const struct http_options *options, struct tls **ret_tls, struct error *err);
+void tls_free(struct tls *tls); /* NULL is fine */
+/* On failure the certificates before stay. NULL is fine. */
+int tls_reload(struct tls *tls, struct error *err);
+/* PEM of those who sign clients' certificates; NULL where none is asked for. */
+const char *tls_trust(const struct tls *tls);
+/* The daemon's certificate, as gnutls_certificate_retrieve_function3 wants it. */
+int tls_certificate(gnutls_session_t session, const struct gnutls_cert_retr_st *info, gnutls_pcert_st **ret_chain,
+		    unsigned *ret_length, gnutls_ocsp_data_st **ret_ocsp, unsigned *ret_ocsp_length,
+		    gnutls_privkey_t *ret_key, unsigned *ret_flags);
+/* The common name of the client's certificate, "" without one that is trusted. Its thread alone. */
+const char *tls_peer_name(struct connection *connection);
+/* Tells the client that nothing more comes. */
+void tls_end(struct connection *connection);
 
 /* ---- http/clock.c: deadlines, and connections that wait ---- */
 int clock_start(struct http *http, struct error *err);

@@ -1,6 +1,6 @@
 /*
- * Where the daemon listens: loopback addresses and Unix sockets only, since
- * nothing yet asks a client who it is.
+ * Where the daemon listens: loopback addresses and Unix sockets, and others
+ * where tokens say who may, and TLS keeps them from being read on the way.
  */
 #include "daemon/http/internal.h"
 #include "daemon/http/text.h"
@@ -43,8 +43,8 @@ static int name_socket(struct listener *listener, struct error *err)
 			NI_NUMERICHOST | NI_NUMERICSERV) != 0)
 		return error_set(err, ERR_IO, "the listening socket's address has no name");
 	six = bound->ss_family == AF_INET6;
-	snprintf(listener->name, sizeof(listener->name), "http://%s%.64s%s:%.8s", six ? "[" : "", host, six ? "]" : "",
-		 port);
+	snprintf(listener->name, sizeof(listener->name), "http%s://%s%.64s%s:%.8s", listener->tls ? "s" : "",
+		 six ? "[" : "", host, six ? "]" : "", port);
 	return 0;
 }
 
@@ -56,13 +56,16 @@ static int bind_tcp(const struct addrinfo *address, const char *text, struct lis
 	if (listener->socket < 0)
 		return error_set_errno(err, errno, "socket for %s", text);
 	setsockopt(listener->socket, SOL_SOCKET, SO_REUSEADDR, &one, sizeof(one));
+	/* [::] is IPv6 alone; 0.0.0.0 is listened on beside it by who wants both. */
+	if (address->ai_family == AF_INET6)
+		setsockopt(listener->socket, IPPROTO_IPV6, IPV6_V6ONLY, &one, sizeof(one));
 	if (bind(listener->socket, address->ai_addr, address->ai_addrlen) != 0)
 		return error_set_errno(err, errno, "listen on %s", text);
 	return name_socket(listener, err);
 }
 
 /* ADDR:PORT with a numeric address, [ADDR]:PORT for IPv6, or localhost:PORT. */
-static int open_tcp(const char *text, struct listener *listener, struct error *err)
+static int open_tcp(const char *text, unsigned guards, struct listener *listener, struct error *err)
 {
 	struct addrinfo hints = {.ai_flags = AI_NUMERICHOST | AI_NUMERICSERV | AI_PASSIVE, .ai_socktype = SOCK_STREAM};
 	struct addrinfo *found = NULL;
@@ -87,13 +90,15 @@ static int open_tcp(const char *text, struct listener *listener, struct error *e
 		return error_set(err, ERR_INVALID, "listen: the port of \"%s\" is not between 0 and 65535", text);
 	if (getaddrinfo(host, colon + 1, &hints, &found) != 0)
 		return error_set(err, ERR_INVALID, "listen: \"%s\" is no numeric address with a port", text);
-	if (is_loopback(found->ai_addr))
+	listener->tls = (guards & GUARD_TLS) != 0;
+	if (is_loopback(found->ai_addr) || guards == (GUARD_TOKENS | GUARD_TLS))
 		code = bind_tcp(found, text, listener, err);
 	else
 		code = error_set(err, ERR_IMPOSSIBLE,
 				 "listen: %s is reached from other machines; without tokens and TLS only loopback "
-				 "addresses and Unix sockets are allowed",
-				 text);
+				 "addresses and Unix sockets are allowed%s%s",
+				 text, (guards & GUARD_TOKENS) != 0 ? "" : "; --tokens is not given",
+				 (guards & GUARD_TLS) != 0 ? "" : "; --tls-cert is not given");
 	freeaddrinfo(found);
 	return code;
 }
@@ -141,8 +146,8 @@ static int open_unix(const char *path, struct listener *listener, struct error *
 	return 0;
 }
 
-int listeners_open(const char *listen_text, struct listener ret_listeners[LISTENERS_MAX], int *ret_count,
-		   struct error *err)
+int listeners_open(const char *listen_text, unsigned guards, struct listener ret_listeners[LISTENERS_MAX],
+		   int *ret_count, struct error *err)
 {
 	char *copy = strdup(listen_text), *next = copy, *text;
 	int count = 0, code = 0;
@@ -164,7 +169,7 @@ int listeners_open(const char *listen_text, struct listener ret_listeners[LISTEN
 		if (strncmp(text, unix_prefix, sizeof(unix_prefix) - 1) == 0)
 			code = open_unix(text + sizeof(unix_prefix) - 1, listener, err);
 		else
-			code = open_tcp(text, listener, err);
+			code = open_tcp(text, guards, listener, err);
 		if (code == 0 && listen(listener->socket, SOMAXCONN) != 0)
 			code = error_set_errno(err, errno, "listen on %s", text);
 	}

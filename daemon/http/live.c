@@ -13,17 +13,33 @@
 #include <math.h>
 #include <linux/tcp.h> /* the C library's has not all of struct tcp_info */
 #include <netinet/in.h>
+#include <poll.h>
 #include <stdlib.h>
+#include <sys/ioctl.h>
 
 struct live {
 	struct request *request;
 	ssize_t (*read)(struct request *request, void *to, size_t size);
 };
 
+/* Beneath TLS a farewell, which is one short record, may lie unread before the end. */
+static bool tls_hung_up(const struct connection *connection)
+{
+	enum { FAREWELL_MAX = 64 };
+	struct pollfd poll_one = {connection->socket, POLLRDHUP, 0};
+	int unread = 0;
+
+	return poll(&poll_one, 1, 0) > 0 && ioctl(connection->socket, FIONREAD, &unread) == 0 && unread <= FAREWELL_MAX;
+}
+
 bool live_hung_up(const struct connection *connection)
 {
 	char byte;
-	ssize_t got = recv(connection->socket, &byte, 1, MSG_PEEK | MSG_DONTWAIT);
+	ssize_t got;
+
+	if (connection->tls)
+		return tls_hung_up(connection);
+	got = recv(connection->socket, &byte, 1, MSG_PEEK | MSG_DONTWAIT);
 
 	return got == 0 || (got < 0 && errno != EAGAIN && errno != EWOULDBLOCK && errno != EINTR);
 }

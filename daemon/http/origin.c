@@ -20,19 +20,19 @@
 
 #include "daemon/http/text.h"
 
-/* "[::1]" and "127.0.0.1": the address that this socket listens on? */
-static bool is_address_of(const struct listener *listener, const char *host)
+/* "[::1]" and "127.0.0.1": is that this socket's own address? */
+static bool is_address(const struct sockaddr_storage *own, const char *host)
 {
-	const struct sockaddr_in *four = (const struct sockaddr_in *)(const void *)&listener->address;
-	const struct sockaddr_in6 *six = (const struct sockaddr_in6 *)(const void *)&listener->address;
+	const struct sockaddr_in *four = (const struct sockaddr_in *)(const void *)own;
+	const struct sockaddr_in6 *six = (const struct sockaddr_in6 *)(const void *)own;
 	struct in6_addr address;
 	char literal[HOST_MAX];
 	size_t length = strlen(host);
 
-	if (listener->address.ss_family == AF_INET)
+	if (own->ss_family == AF_INET)
 		return inet_pton(AF_INET, host, &address) == 1 &&
 		       memcmp(&address, &four->sin_addr, sizeof(four->sin_addr)) == 0;
-	if (listener->address.ss_family != AF_INET6 || host[0] != '[')
+	if (own->ss_family != AF_INET6 || host[0] != '[')
 		return false;
 	memcpy(literal, host + 1, length - 1);
 	literal[length - 2] = '\0';
@@ -80,15 +80,18 @@ int server_names_check(const char *names, struct error *err)
 static bool is_ours(const struct request *request, const char *host)
 {
 	const struct http *http = request->http;
+	struct sockaddr_storage own;
+	socklen_t size = sizeof(own);
 
 	if (request->connection->address.ss_family == AF_UNIX || strcmp(host, "localhost") == 0 ||
 	    is_configured(http, host))
 		return true;
 	for (int i = 0; i < http->listener_count; i++) {
-		if (is_address_of(&http->listeners[i], host))
+		if (is_address(&http->listeners[i].address, host))
 			return true;
 	}
-	return false;
+	/* Who listens on all addresses is reached by each. */
+	return getsockname(request->connection->socket, (struct sockaddr *)&own, &size) == 0 && is_address(&own, host);
 }
 
 static bool is_safe(const struct request *request)

@@ -63,7 +63,9 @@ def operations(document: Dict[str, Any]) -> List[Tuple[str, str, str]]:
         for method in ("get", "put", "post", "delete"):
             if method in item:
                 security = item[method].get("security", document["security"])
-                roles = {role for kind in security for names in kind.values() for role in names}
+                roles = {role for kind in security for some in kind.values() for role in some}
+                names = {name for kind in security for name in kind}
+                assert names <= set(document["components"]["securitySchemes"]), f"{method} {path}: {names}"
                 assert len(roles) <= 1, f"{method} {path}: one least role for every way to show it"
                 while "{" in path:
                     path = path[: path.index("{")] + "x" + path[path.index("}") + 1 :]

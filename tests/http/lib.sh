@@ -24,7 +24,7 @@ start_daemon() {
 	daemon_pid=$!
 	echo "$daemon_pid" >"$work/daemon.pid"
 	for ((i = 0; i < 300; i++)); do
-		url=$(sed -n 's/^listening on \(http:\)/\1/p' "$out")
+		url=$(sed -n 's/^listening on \(https*:\)/\1/p' "$out" | head -1)
 		[ -n "$url" ] && break
 		kill -0 "$daemon_pid" 2>/dev/null || break
 		sleep 0.05

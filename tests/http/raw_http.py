@@ -2,12 +2,14 @@
 """Requests as no client library sends them, over sockets of its own. Used by test_framing.sh and test_limits.sh.
 
 Usage: raw_http.py PORT CASE [ARGUMENT ...]     exits with 1 and says what it expected
+With RAW_TLS_CA=FILE in the environment the bytes go through TLS, whose certificate that authority has signed.
 """
 import json
 import os
 import re
 import resource
 import socket
+import ssl
 import sys
 import time
 from typing import List, Optional, Tuple
@@ -15,6 +17,7 @@ from typing import List, Optional, Tuple
 PORT = int(sys.argv[1])
 OK = b"GET /livez HTTP/1.1\r\nHost: localhost\r\n\r\n"
 PATIENCE = 10  # s, until an answer
+TLS = ssl.create_default_context(cafile=os.environ["RAW_TLS_CA"]) if "RAW_TLS_CA" in os.environ else None
 
 
 class Peer:
@@ -28,6 +31,8 @@ class Peer:
         self.socket.connect(path or ("127.0.0.1", PORT))
         if not path:
             self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            if TLS is not None:
+                self.socket = TLS.wrap_socket(self.socket, server_hostname="localhost")
         self.rest = b""
         if data:
             self.send(data)
@@ -47,7 +52,7 @@ class Peer:
     def more(self) -> bool:
         try:
             data = self.socket.recv(65536)
-        except ConnectionResetError:
+        except (ConnectionResetError, ssl.SSLEOFError):
             data = b""
         self.rest += data
         return bool(data)
