@@ -19,6 +19,7 @@ PROGRAMS = ("cbctd", "cbct-worker", "cbct")
 # Packages whose copyright file is prose. Read in Debian 12.
 PROSE = {
     "libc6": "LGPL-2.1+",
+    "libgnutls30": "LGPL-2.1+",
     "libgomp1": "GPL-3+ with GCC Runtime Library Exception",
     "python3-numpy": "BSD-3-Clause",
 }
