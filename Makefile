@@ -75,7 +75,7 @@ core_sources   := $(filter-out $(simd_sources),$(wildcard core/*.c core/*/*.c))
 proto_sources  := $(wildcard proto/*.c)
 daemon_sources := $(filter-out daemon/worker.c,$(wildcard daemon/*.c daemon/*/*.c))
 # What the unit tests know of the daemon: its state, without HTTP.
-state_sources  := $(wildcard daemon/store/*.c daemon/jobs/*.c) $(patsubst %,daemon/%.c,api/document files id lock log problem watch)
+state_sources  := $(wildcard daemon/store/*.c daemon/jobs/*.c) $(patsubst %,daemon/%.c,api/document files id lock log problem process watch)
 cbct_sources   := $(wildcard clients/cbct/*.c)
 unit_sources   := $(wildcard tests/unit/*.c)
 

@@ -19,6 +19,7 @@ enum lock_rank {
 	LOCK_SCAN,       /* stored_scan.lock */
 	LOCK_JOBS,       /* jobs.lock */
 	LOCK_SUPERVISOR, /* supervise.lock */
+	LOCK_CALIBRATED, /* calibrations.lock */
 	LOCK_DIGESTS,    /* digester.lock */
 	LOCK_ENCODED,    /* encoded_copies.lock */
 	LOCK_SINK,       /* sink.lock */

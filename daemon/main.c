@@ -12,6 +12,7 @@
 #include <unistd.h>
 
 #include "daemon/api/api.h"
+#include "daemon/calibrations/calibrations.h"
 #include "daemon/config.h"
 #include "daemon/intake/intake.h"
 #include "daemon/jobs/jobs.h"
@@ -98,6 +99,8 @@ static int start_parts(const struct config *config, struct api *api, struct erro
 						    .device_memory = config->device_memory,
 						    .checkpoint_seconds = config->checkpoint_seconds,
 						    .stop_seconds = config->stop_timeout};
+	const struct calibrations_options calibrations = {
+	    .worker = supervise.worker, .threads = (int)config->threads, .age = config->calibration_age};
 	int code;
 
 	/* The addresses first: a mistake there should be said before anything is touched. */
@@ -108,6 +111,8 @@ static int start_parts(const struct config *config, struct api *api, struct erro
 		code = jobs_open(api->store, &api->jobs, err);
 	if (code == 0)
 		code = supervise_start(api->jobs, &supervise, &api->supervise, err);
+	if (code == 0)
+		code = calibrations_open(api->store, &calibrations, &api->calibrations, err);
 	if (code == 0)
 		code = event_ring_new(api->store, &api->events, err);
 	if (code == 0)
@@ -128,6 +133,7 @@ static void stop_parts(struct api *api)
 	encoded_copies_free(api->copies);
 	mappings_free(api->mappings);
 	event_ring_free(api->events);
+	calibrations_close(api->calibrations);
 	supervise_stop(api->supervise);
 	jobs_close(api->jobs);
 	store_close(api->store);

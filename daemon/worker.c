@@ -9,6 +9,8 @@
  * before its projections are complete hears over the same socket how many are there,
  * and reads them from the file, which the daemon has just written. It dies with the
  * daemon, and it may die alone: what it has announced stays.
+ *
+ * With --calibrate it makes one calibration and ends.
  */
 #include <errno.h>
 #include <getopt.h>
@@ -21,6 +23,7 @@
 #include <time.h>
 #include <unistd.h>
 
+#include "proto/calibration_files.h"
 #include "proto/checkpoint.h"
 #include "proto/clock.h"
 #include "proto/heartbeat.h"
@@ -46,6 +49,7 @@ static const double CHANGE_LEAST = 0.005; /* s between two reports of a new stag
 
 struct arguments {
 	const char *backend;
+	const char *calibration, *scan; /* directories; NULL: jobs are served */
 	int device, socket;
 	struct device_options options;
 };
@@ -475,7 +479,8 @@ static int open_device(struct worker *worker, const struct arguments *arguments,
 static int usage(void)
 {
 	fputs("cbct-worker is started by cbctd:\n"
-	      "  --backend auto|cuda|cpu  --device N  --threads N  --device-memory BYTES  --socket DESCRIPTOR\n",
+	      "  --backend auto|cuda|cpu  --device N  --threads N  --device-memory BYTES  --socket DESCRIPTOR\n"
+	      "  --calibrate DIR  --scan DIR  --threads N\n",
 	      stderr);
 	return EXIT_USAGE;
 }
@@ -498,17 +503,22 @@ static bool read_arguments(int argc, char **argv, struct arguments *ret)
 	static const struct option options[] = {
 	    {"backend", required_argument, NULL, 'b'}, {"device", required_argument, NULL, 'd'},
 	    {"threads", required_argument, NULL, 't'}, {"device-memory", required_argument, NULL, 'm'},
-	    {"socket", required_argument, NULL, 's'},  {0}};
+	    {"socket", required_argument, NULL, 's'},  {"calibrate", required_argument, NULL, 'c'},
+	    {"scan", required_argument, NULL, 'S'},    {0}};
 	unsigned long long value = 0;
 	int option;
 
 	*ret = (struct arguments){.backend = "auto", .socket = 3};
 	while ((option = getopt_long(argc, argv, "", options, NULL)) != -1) {
 		if (option == '?' ||
-		    (option != 'b' && !read_number(optarg, option == 'm' ? 1ull << 60 : 65535, &value)))
+		    (strchr("bcS", option) == NULL && !read_number(optarg, option == 'm' ? 1ull << 60 : 65535, &value)))
 			return false;
 		if (option == 'b')
 			ret->backend = optarg;
+		else if (option == 'c')
+			ret->calibration = optarg;
+		else if (option == 'S')
+			ret->scan = optarg;
 		else if (option == 'd')
 			ret->device = (int)value;
 		else if (option == 't')
@@ -518,7 +528,17 @@ static bool read_arguments(int argc, char **argv, struct arguments *ret)
 		else
 			ret->socket = (int)value;
 	}
-	return optind == argc;
+	return optind == argc && (ret->calibration == NULL) == (ret->scan == NULL);
+}
+
+static int make_calibration(const struct arguments *arguments)
+{
+	struct error err;
+
+	if (calibration_run(arguments->calibration, arguments->scan, &err) == 0)
+		return 0;
+	say(&err);
+	return EXIT_START;
 }
 
 int main(int argc, char **argv)
@@ -538,6 +558,8 @@ int main(int argc, char **argv)
 	sigaction(SIGTERM, &terminate, NULL);
 	lower_priority();
 	backend_host_threads(arguments.options.threads);
+	if (arguments.calibration != NULL)
+		return make_calibration(&arguments);
 	worker.socket = arguments.socket;
 	if (open_device(&worker, &arguments, &err) != 0) {
 		say(&err);

@@ -23,6 +23,7 @@ ROOMS = {
     "daemon/api": "routes and their handlers",
     "daemon/intake": "uploads",
     "daemon/jobs": "queue, supervisor",
+    "daemon/calibrations": "library of calibrations",
     "daemon/volumes": "files, slices, streams, events",
     "daemon/http": "connections, requests, replies",
     "daemon/store": "catalogue, scan directories",

@@ -8,6 +8,7 @@
 #include <string.h>
 
 #include "core/correct/input.h"
+#include "proto/sums.h"
 
 static const double degree = M_PI / 180;
 static const double length_least = 1e-3, length_most = 1000; /* mm, of phantoms */
@@ -208,11 +209,27 @@ static void reader_give_back(struct source *source, struct reader *reader)
 	pthread_mutex_unlock(&source->lock);
 }
 
+/* Samples of a projection, held against their checksum where the directory has some. */
+static int read_samples(const struct scan_files *files, int view, void *ret_samples, struct error *err)
+{
+	const size_t bytes = scan_projection_bytes(files->scan);
+	unsigned char state = SUM_NONE;
+	struct sum sum = {0};
+	int code = file_read_at(files->projections, ret_samples, bytes, (size_t)view * bytes, "projections.raw", err);
+
+	if (code != 0 || files->sums < 0)
+		return code;
+	code = sums_get(files->sums, view, 1, bytes, &sum, &state, err);
+	if (code == 0 && (state != SUM_GOOD || sum.lost || sum.crc != checksum(0, ret_samples, bytes)))
+		code = error_set(err, ERR_DAMAGED, "projection %d is damaged: its samples do not fit their checksum",
+				 view);
+	return code;
+}
+
 /* The calibrate_image of a scan directory. */
 static int read_view(void *context, int view, float *ret_image, struct error *err)
 {
 	struct source *source = context;
-	const size_t bytes = scan_projection_bytes(source->files->scan);
 	const int slot = 0;
 	struct defect_counts counts = {0};
 	struct reader *reader = NULL;
@@ -220,8 +237,7 @@ static int read_view(void *context, int view, float *ret_image, struct error *er
 
 	if (code != 0)
 		return code;
-	code = file_read_at(source->files->projections, reader->samples, bytes, (size_t)view * bytes, "projections.raw",
-			    err);
+	code = read_samples(source->files, view, reader->samples, err);
 	if (code == 0)
 		code = source->backend->linearise(reader->plan, reader->samples, 1, &slot, reader->stack, &counts, err);
 	if (code == 0)

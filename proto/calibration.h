@@ -22,7 +22,8 @@ int balls_parse(const char *text, size_t length, struct balls *ret_balls, struct
 
 /*
  * Calibrates from a scan directory with the geometry of its scan.json as the nominal one; every projection must be
- * there. ERR_IMPOSSIBLE for intensities without their air. Free with calibration_clear.
+ * there, and fit its checksum where there are some (ERR_DAMAGED). ERR_IMPOSSIBLE for intensities without their air.
+ * Free with calibration_clear.
  */
 int calibration_from_directory(const struct scan_files *files, const struct balls *balls, bool adjust_balls,
 			       struct calibration *ret_calibration, struct error *err);

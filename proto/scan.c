@@ -15,6 +15,7 @@
 
 #include "core/warning.h"
 
+#include "proto/calibration.h"
 #include "proto/labels.h"
 #include "proto/parameter.h"
 
@@ -348,10 +349,123 @@ out:
 	return code;
 }
 
+/* ---- a calibration ---- */
+
+/* Warnings that a geometry by a calibration brings along. */
+static const char *const note_codes[] = {"calibration_interpolated", "calibration_old", "calibration_other_detector",
+					 "calibration_other_sweep"};
+enum { NOTE_CODES = sizeof(note_codes) / sizeof(note_codes[0]), NOTE_CHARACTERS = 319 };
+
+static int read_note(const cJSON *note, int index, struct error *err)
+{
+	struct json_reader reader;
+	char pointer[64], detail[TEXT_BYTES(NOTE_CHARACTERS)];
+	int code = 0;
+
+	snprintf(pointer, sizeof(pointer), "/geometry/notes/%d", index);
+	json_begin(&reader, note, pointer, err);
+	json_choice(&reader, "code", true, note_codes, NOTE_CODES, &code);
+	json_text(&reader, "detail", true, NOTE_CHARACTERS, detail);
+	return json_end(&reader);
+}
+
+/* Angles of the sources, radians, in a list or as first and step; *ret_angles NULL where there are none. */
+static int read_source_angles(struct json_reader *reader, int count, double **ret_angles)
+{
+	struct circular_document circular = {0};
+	double *angles;
+
+	if (!json_has(reader, "angles_deg") && !json_has(reader, "angle_step_deg") &&
+	    !json_has(reader, "first_angle_deg"))
+		return reader->code;
+	angles = calloc((size_t)count, sizeof(*angles));
+	if (angles == NULL)
+		return json_fail(reader, ERR_NO_MEMORY, "", "no memory for %d angles", count);
+	json_number(reader, "first_angle_deg", false, -angle_most, angle_most, &circular.first);
+	json_number(reader, "angle_step_deg", false, -360, 360, &circular.step);
+	read_angles(reader, count, &circular, angles);
+	if (reader->code != 0)
+		free(angles);
+	else
+		*ret_angles = angles;
+	return reader->code;
+}
+
+/* Once its matrices are there, a geometry by a calibration is one of matrices, and says where they come from. */
+static int read_calibration(struct scan *scan, struct json_reader *reader)
+{
+	const cJSON *notes = json_member(reader, "notes", false), *note;
+	double *angles = NULL;
+	char id[64] = "";
+	int index = 0;
+
+	json_string(reader, "id", true, id, sizeof(id));
+	read_source_angles(reader, scan->count, &angles);
+	free(angles);
+	if (!json_has(reader, "matrices"))
+		json_fail(
+		    reader, ERR_INVALID, "matrices",
+		    "calibrations are known by their ids to the daemon that made them; elsewhere the matrices are "
+		    "needed");
+	if (notes != NULL && !cJSON_IsArray(notes))
+		json_fail(reader, ERR_INVALID, "notes", "a list is expected");
+	cJSON_ArrayForEach(note, notes)
+	{
+		if (reader->code == 0)
+			reader->code = read_note(note, index++, reader->err);
+	}
+	return read_matrices(scan, reader);
+}
+
+static int find_calibration(const struct scan *scan, cJSON *document, const struct scan_calibrations *calibrations,
+			    struct json_reader *reader)
+{
+	struct geometry geometry = {0};
+	cJSON *notes = cJSON_CreateArray(), *matrices;
+	double *angles = NULL;
+	char id[64] = "";
+	int code;
+
+	json_string(reader, "id", true, id, sizeof(id));
+	code = read_source_angles(reader, scan->count, &angles);
+	if (code == 0)
+		code = calibrations->find(calibrations->context, id, scan, angles, &geometry, notes, reader->err);
+	if (code == 0) {
+		matrices = matrices_json(geometry.views, geometry.count);
+		cJSON_AddItemToObject(document, "matrices",
+				      cJSON_DetachItemFromObjectCaseSensitive(matrices, "matrices"));
+		cJSON_Delete(matrices);
+		cJSON_DeleteItemFromObjectCaseSensitive(document, "notes");
+		cJSON_AddItemToObject(document, "notes", notes);
+		notes = NULL;
+	}
+	cJSON_Delete(notes);
+	geometry_clear(&geometry);
+	free(angles);
+	return code;
+}
+
+/* Gives a geometry that names a calibration its matrices; one that has them keeps them. */
+static int resolve_calibration(const struct scan *scan, const struct scan_calibrations *calibrations, struct error *err)
+{
+	cJSON *geometry = cJSON_GetObjectItemCaseSensitive(scan->document, "geometry");
+	const cJSON *kind = cJSON_GetObjectItemCaseSensitive(geometry, "kind");
+	const cJSON *matrices = cJSON_GetObjectItemCaseSensitive(geometry, "matrices");
+	struct json_reader reader;
+
+	if (calibrations == NULL || !cJSON_IsString(kind) || strcmp(kind->valuestring, "calibration") != 0 ||
+	    (matrices != NULL && !cJSON_IsNull(matrices)))
+		return 0;
+	json_begin(&reader, geometry, "/geometry", err);
+	cJSON_DeleteItemFromObjectCaseSensitive(geometry, "matrices");
+	return find_calibration(scan, geometry, calibrations, &reader);
+}
+
 static const struct {
 	const char *name;
 	int (*read)(struct scan *scan, struct json_reader *reader);
-} kinds[] = {{"circular", read_circular}, {"matrices", read_matrices}, {"views", read_views}};
+} kinds[] = {
+    {"circular", read_circular}, {"matrices", read_matrices}, {"views", read_views}, {"calibration", read_calibration}};
 enum { KIND_COUNT = sizeof(kinds) / sizeof(kinds[0]) };
 
 static int read_geometry(struct scan *scan, const cJSON *geometry, struct error *err)
@@ -394,7 +508,7 @@ static void drop_nulls(cJSON *object)
 	}
 }
 
-static int read_document(struct scan *scan, struct error *err)
+static int read_document(struct scan *scan, const struct scan_calibrations *calibrations, struct error *err)
 {
 	struct json_reader reader;
 	const cJSON *detector, *projections, *geometry, *patient, *labels;
@@ -419,6 +533,8 @@ static int read_document(struct scan *scan, struct error *err)
 	if (code == 0)
 		code = read_projections(scan, projections, err);
 	if (code == 0)
+		code = resolve_calibration(scan, calibrations, err);
+	if (code == 0)
 		code = read_geometry(scan, geometry, err);
 	if (code == 0)
 		code = orbit_analyse(&scan->orbit, &scan->geometry, err);
@@ -427,6 +543,12 @@ static int read_document(struct scan *scan, struct error *err)
 
 int scan_parse(const char *text, size_t length, struct scan **ret_scan, struct error *err)
 {
+	return scan_parse_calibrated(text, length, NULL, ret_scan, err);
+}
+
+int scan_parse_calibrated(const char *text, size_t length, const struct scan_calibrations *calibrations,
+			  struct scan **ret_scan, struct error *err)
+{
 	struct scan *scan = calloc(1, sizeof(*scan));
 	int code;
 
@@ -434,7 +556,7 @@ int scan_parse(const char *text, size_t length, struct scan **ret_scan, struct e
 		return error_set(err, ERR_NO_MEMORY, "no memory for a scan");
 	code = json_parse(text, length, &scan->document, err);
 	if (code == 0)
-		code = read_document(scan, err);
+		code = read_document(scan, calibrations, err);
 	if (code != 0) {
 		scan_free(scan);
 		return code;
@@ -792,6 +914,18 @@ static void warn_hardening(cJSON *list, const struct scan *scan)
 	}
 }
 
+/* What the calibration that the geometry comes from had to tell. */
+static void warn_notes(cJSON *list, const struct scan *scan)
+{
+	const cJSON *geometry = cJSON_GetObjectItemCaseSensitive(scan->document, "geometry"), *note;
+
+	cJSON_ArrayForEach(note, cJSON_GetObjectItemCaseSensitive(geometry, "notes"))
+	{
+		warn(list, cJSON_GetObjectItemCaseSensitive(note, "code")->valuestring, "%s",
+		     cJSON_GetObjectItemCaseSensitive(note, "detail")->valuestring);
+	}
+}
+
 static void warn_air(cJSON *list, const struct scan *scan)
 {
 	const struct linearise linearise = scan_linearise(scan);
@@ -814,6 +948,7 @@ cJSON *scan_warnings(const struct scan *scan)
 	} else {
 		warn(list, "single_view", "one view only: depth cannot be told");
 	}
+	warn_notes(list, scan);
 	warn_implausible(list, scan);
 	warn_uneven_distances(list, &scan->geometry);
 	warn_mirrored(list, &scan->geometry, orbit->turned);

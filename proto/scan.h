@@ -32,8 +32,22 @@ struct scan {
 extern const char *const sample_names[2];   /* "float32", "uint16" */
 extern const char *const quantity_names[2]; /* "line_integral", "intensity" */
 
+/*
+ * Where a geometry of the kind "calibration" comes from. find: the views for `scan`, of which detector and projections
+ * are read, whose sources stand at `angles` [count], radians (NULL: as they were calibrated); adds what is to be told
+ * to ret_notes, a list of {"code", "detail"}. Allocates ret_geometry->views. Its errors point into the scan's document.
+ */
+struct scan_calibrations {
+	void *context;
+	int (*find)(void *context, const char *id, const struct scan *scan, const double *angles,
+		    struct geometry *ret_geometry, cJSON *ret_notes, struct error *err);
+};
+
 /* Reads and checks the document of POST /v1/scans. Free with scan_free. */
 int scan_parse(const char *text, size_t length, struct scan **ret_scan, struct error *err);
+/* The same where calibrations are known by their ids: the document gets the matrices of the one that it names. */
+int scan_parse_calibrated(const char *text, size_t length, const struct scan_calibrations *calibrations,
+			  struct scan **ret_scan, struct error *err);
 void scan_free(struct scan *scan);
 
 /*

@@ -1,4 +1,4 @@
-/* cbct scans, jobs, status, complete, rm: what the daemon knows, a line each. */
+/* cbct scans, jobs, calibrations, status, complete, rm: what the daemon knows, a line each. */
 #include "clients/cbct/commands.h"
 #include "clients/cbct/http.h"
 
@@ -64,6 +64,15 @@ static void print_job(const cJSON *job)
 	       100 * member_number(job, "progress", 0), member_text(job, "scan", "?"));
 }
 
+static void print_calibration(const cJSON *calibration)
+{
+	const double day = 86400;
+
+	printf("%-20s %-10s %6.3f mm  %4.0f days  %s\n", member_text(calibration, "id", "?"),
+	       member_text(calibration, "state", "?"), member_number(calibration, "residual_isocentre_mm", 0),
+	       member_number(calibration, "age_s", 0) / day, member_text(calibration, "arm", ""));
+}
+
 static void print_device(const cJSON *device)
 {
 	printf("%-6s %-8s %s\n", member_text(device, "backend", "?"), member_text(device, "state", "?"),
@@ -105,27 +114,35 @@ static int jobs_run(const void *values, struct error *err)
 	return list(options, path, "jobs", print_job, err);
 }
 
+static int calibrations_run(const void *values, struct error *err)
+{
+	const struct list_options *options = values;
+	char path[80];
+
+	snprintf(path, sizeof(path), "/v1/calibrations?limit=%ld", options->limit);
+	return list(options, path, "calibrations", print_calibration, err);
+}
+
 static int status_run(const void *values, struct error *err)
 {
 	return list(values, "/v1/devices", "devices", print_device, err);
 }
 
-/* An id says not whether it is a scan's or a job's: both are tried. */
+/* An id says not whose it is: all kinds are tried. */
 static int rm_run(const void *values, struct error *err)
 {
+	static const char *const kinds[] = {"jobs", "scans", "calibrations"};
 	const struct list_options *options = values;
 	cJSON *document = NULL;
 	char path[100];
-	int code;
+	int code = ERR_NOT_FOUND;
 
-	snprintf(path, sizeof(path), "/v1/jobs/%.63s", options->id);
-	code = fetch(options, "DELETE", path, &document, err);
-	if (code == ERR_NOT_FOUND) {
-		snprintf(path, sizeof(path), "/v1/scans/%.63s", options->id);
+	for (size_t i = 0; i < sizeof(kinds) / sizeof(kinds[0]) && code == ERR_NOT_FOUND; i++) {
+		snprintf(path, sizeof(path), "/v1/%s/%.63s", kinds[i], options->id);
 		code = fetch(options, "DELETE", path, &document, err);
-		if (code == ERR_NOT_FOUND)
-			code = error_set(err, code, "there is neither a job nor a scan \"%s\"", options->id);
 	}
+	if (code == ERR_NOT_FOUND)
+		code = error_set(err, code, "there is neither a job nor a scan \"%s\", nor a calibration", options->id);
 	cJSON_Delete(document);
 	return code;
 }
@@ -159,7 +176,7 @@ static int complete_run(const void *values, struct error *err)
 static const struct list_options defaults = {.limit = 20};
 static const struct positional none[] = {{0}};
 static const struct positional rm_positionals[] = {
-    {"ID", "of a job or a scan", offsetof(struct list_options, id), true},
+    {"ID", "of a job, a scan or a calibration", offsetof(struct list_options, id), true},
     {0},
 };
 
@@ -179,9 +196,12 @@ const struct command command_scans = {"scans",   "the newest scans", none,     l
 				      &defaults, sizeof(defaults),   scans_run};
 const struct command command_jobs = {"jobs",    "the newest jobs", none,    list_groups,
 				     &defaults, sizeof(defaults),  jobs_run};
+const struct command command_calibrations = {"calibrations",   "the newest calibrations", none, list_groups, &defaults,
+					     sizeof(defaults), calibrations_run};
 const struct command command_status = {
     "status", "the devices that reconstruct", none, status_groups, &defaults, sizeof(defaults), status_run};
-const struct command command_rm = {"rm",           "cancels a running job, removes a finished one or a scan",
-				   rm_positionals, rm_groups,
-				   &defaults,      sizeof(defaults),
-				   rm_run};
+const struct command command_rm = {
+    "rm",           "cancels a running job, removes a finished one, a scan or a calibration",
+    rm_positionals, rm_groups,
+    &defaults,      sizeof(defaults),
+    rm_run};

@@ -46,6 +46,7 @@ import requests.adapters
 
 __all__ = [
     "Broken",
+    "CalibrationFailed",
     "Client",
     "Error",
     "Event",
@@ -165,6 +166,14 @@ class JobFailed(Error):
         super().__init__(f"job {job.get('id')} {self.state}: {(job.get('error') or {}).get('detail', '')}".rstrip(": "))
 
 
+class CalibrationFailed(Error):
+    """The pictures do not fit the phantom; `calibration` is the calibration's document."""
+
+    def __init__(self, calibration: Document) -> None:
+        self.calibration = calibration
+        super().__init__(f"calibration {calibration.get('id')}: {(calibration.get('error') or {}).get('detail', '')}")
+
+
 class Event(NamedTuple):
     """Something that happened to a job.
 
@@ -270,6 +279,15 @@ class Geometry:
             raise ValueError("source, pixel0, column step and row step have different numbers of views")
         views = [dict(zip(lists, vectors)) for vectors in zip(*lists.values())]
         return Geometry({"kind": "views", "views": views}, _pair(pixel_mm))
+
+    @staticmethod
+    def calibration(calibration: str, pixel_mm: Sequence[float], *, angles_deg: Optional[npt.ArrayLike] = None) -> Geometry:
+        """What a calibration of the daemon has found (`Client.calibrate`), view by view, or by the nominal angles of the
+        scan's sources, for any number of views of the same sweep."""
+        document: Document = {"kind": "calibration", "id": calibration}
+        if angles_deg is not None:
+            document["angles_deg"] = np.asarray(angles_deg, dtype=float).ravel().tolist()
+        return Geometry(document, _pair(pixel_mm))
 
 
 class _Adapter(requests.adapters.HTTPAdapter):
@@ -438,6 +456,58 @@ class Client:
         detector = document["detector"]
         body = self._request("GET", f"/v1/scans/{scan}/projections/{int(view)}").content
         return np.frombuffer(bytearray(body), _wire_type(document)).reshape(detector["rows"], detector["columns"])
+
+    # ---- calibrations ----
+
+    def calibrate(
+        self,
+        scan: str,
+        phantom: Mapping[str, Any],
+        *,
+        arm: Optional[str] = None,
+        adjust_balls: bool = False,
+        timeout: Optional[float] = None,
+    ) -> Document:
+        """Calibrates an arm from a complete scan of balls and waits for the result; its document has the residuals, what
+        was refused and ``geometry``. `CalibrationFailed` where the pictures do not fit the phantom.
+
+        Args:
+            scan: id of the scan, whose geometry is the nominal one.
+            phantom: ``{"balls_mm": [[x, y, z, diameter], ...]}``, or of the kind circles or helix.
+            arm: a name of the arm, for people.
+            adjust_balls: the balls' own places follow the shadows, too.
+            timeout: s; `TimeoutError` after these.
+        """
+        request: Document = {"scan": scan, "phantom": dict(phantom), "adjust_balls": adjust_balls}
+        if arm is not None:
+            request["arm"] = arm
+        # A second one by mistake would stay for ever.
+        document = self._json("POST", "/v1/calibrations", json=request, repeatable=False)
+        end = None if timeout is None else time.monotonic() + timeout
+        while document["state"] not in ("succeeded", "failed"):
+            left = self.timeout / 2 if end is None else min(self.timeout / 2, max(0.0, end - time.monotonic()))
+            document = self._json("GET", f"/v1/calibrations/{document['id']}", params={"wait": f"{left:.3f}"})
+            if document["state"] not in ("succeeded", "failed") and end is not None and time.monotonic() >= end:
+                raise TimeoutError(f"calibration {document['id']} is {document['state']} after {timeout} s")
+        if document["state"] == "failed":
+            raise CalibrationFailed(document)
+        return document
+
+    def calibration(self, calibration: str) -> Document:
+        """The calibration's document."""
+        return self._json("GET", f"/v1/calibrations/{calibration}")
+
+    def calibrations(self) -> Iterator[Document]:
+        """All calibrations, newest first."""
+        return self._pages("/v1/calibrations", "calibrations")
+
+    def calibration_view(self, calibration: str, view: int) -> bytes:
+        """A view of the balls as PNG, with a circle where the calibration has each of them."""
+        return self._bytes(f"/v1/calibrations/{calibration}/views/{view}", {})
+
+    def delete_calibration(self, calibration: str) -> None:
+        """Removes a calibration; scans that use it keep its matrices."""
+        self._delete(f"/v1/calibrations/{calibration}")
 
     # ---- jobs ----
 

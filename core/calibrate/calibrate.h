@@ -126,4 +126,10 @@ void calibration_clear(struct calibration *calibration);
 int calibration_between(struct geometry *ret_geometry, const struct geometry *nominal, const struct view *views,
 			const double *angles, int count, struct error *err);
 
+/*
+ * Where a ball's shadow lies in a view: its centroid in pixels. Returns its radius in pixels; 0 for a ball behind the
+ * source, whose ret_pixel is not set.
+ */
+double ball_shadow(const struct view *view, const struct ball *ball, double ret_pixel[2]);
+
 #endif

@@ -99,6 +99,15 @@ double pose_shadow(const struct pose *pose, const double pixel_mm[2], const stru
 	return .5 * ball->diameter * scale / pixel_mm[0];
 }
 
+double ball_shadow(const struct view *view, const struct ball *ball, double ret_pixel[2])
+{
+	const double pixel_mm[2] = {vec_norm(view->column_step), vec_norm(view->row_step)};
+	struct pose pose;
+
+	pose_of_view(&pose, view);
+	return pose_shadow(&pose, pixel_mm, ball, ret_pixel);
+}
+
 /* The factor of the ellipse hardly changes with the pose: it is no part of the derivatives. */
 void pose_row(const struct pose *pose, const double pixel_mm[2], const struct ball *ball, const double pixel[2],
 	      struct pose_row *ret_row)

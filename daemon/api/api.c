@@ -42,6 +42,12 @@ const struct route api_routes[] = {
     {"PUT", "/v1/scans/{}/projections/{}", ROLE_ACQUIRE, projections_put, BODY_STREAM, 0, projections_begin,
      upload_take, NULL},
 
+    {"GET", "/v1/calibrations", ROLE_VIEW, calibration_list, BODY_NONE, 0, NULL, NULL, "limit after"},
+    {"POST", "/v1/calibrations", ROLE_ACQUIRE, calibration_post, BODY_WHOLE, JSON_BYTES_MAX, NULL, NULL, NULL},
+    {"GET", "/v1/calibrations/{}", ROLE_VIEW, calibration_get, BODY_NONE, 0, NULL, NULL, "wait"},
+    {"DELETE", "/v1/calibrations/{}", ROLE_ACQUIRE, calibration_delete, BODY_NONE, 0, NULL, NULL, NULL},
+    {"GET", "/v1/calibrations/{}/views/{}", ROLE_VIEW, calibration_view_get, BODY_NONE, 0, NULL, NULL, NULL},
+
     {"GET", "/v1/jobs", ROLE_VIEW, job_list, BODY_NONE, 0, NULL, NULL, "limit after"},
     {"POST", "/v1/jobs", ROLE_ACQUIRE, job_post, BODY_WHOLE, JSON_BYTES_MAX, NULL, NULL, NULL},
     {"GET", "/v1/jobs/{}", ROLE_VIEW, job_get, BODY_NONE, 0, NULL, NULL, "wait"},

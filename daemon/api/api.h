@@ -12,6 +12,7 @@ struct api {
 	struct event_ring *events;
 	struct mappings *mappings;
 	struct encoded_copies *copies;
+	struct calibrations *calibrations;
 	struct http *http;
 	double max_wait; /* s */
 	double started;  /* clock_monotonic */

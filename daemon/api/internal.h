@@ -3,6 +3,7 @@
 
 #include "daemon/api/api.h"
 #include "daemon/api/document.h"
+#include "daemon/calibrations/calibrations.h"
 #include "daemon/intake/intake.h"
 #include "daemon/jobs/jobs.h"
 #include "daemon/store/store.h"
@@ -29,6 +30,12 @@ int upload_take(void *context, struct request *request, const void *data, size_t
 		struct error *err);
 int projections_put(void *context, struct request *request, struct error *err);
 int image_put(void *context, struct request *request, struct error *err);
+
+int calibration_post(void *context, struct request *request, struct error *err);
+int calibration_list(void *context, struct request *request, struct error *err);
+int calibration_get(void *context, struct request *request, struct error *err);
+int calibration_delete(void *context, struct request *request, struct error *err);
+int calibration_view_get(void *context, struct request *request, struct error *err);
 
 int job_post(void *context, struct request *request, struct error *err);
 int job_list(void *context, struct request *request, struct error *err);

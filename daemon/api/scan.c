@@ -5,12 +5,13 @@
 static int post(struct api *api, struct request *request, const struct store_key *key, struct stored_scan **ret_scan,
 		struct error *err)
 {
+	const struct scan_calibrations calibrations = {.context = api->calibrations, .find = calibrations_find_views};
 	struct scan *scan = NULL;
 	size_t length;
 	const char *text = request_body(request, &length);
 	int code;
 
-	if (scan_parse(text, length, &scan, err) != 0)
+	if (scan_parse_calibrated(text, length, &calibrations, &scan, err) != 0)
 		return err->code;
 	code = store_scan_create(api->store, scan, key->text != NULL ? key : NULL, ret_scan, err);
 	if (code != 0)

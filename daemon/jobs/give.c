@@ -101,7 +101,7 @@ static void begin(struct supervise *supervise, struct worker *worker, struct job
 	if (message_send(worker->child.socket, message, &err) != 0) {
 		/* Most likely it has just died; its job comes back when that is seen. */
 		log_line(LEVEL_WARNING, "worker %d: %s", worker->index, err.text);
-		child_kill(&worker->child);
+		process_kill(&worker->child.process);
 		worker->state = WORKER_ENDING;
 	}
 	worker_publish(supervise, worker);

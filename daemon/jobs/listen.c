@@ -55,8 +55,9 @@ static void hello(struct supervise *supervise, struct worker *worker, const stru
 	worker->state = WORKER_IDLE;
 	worker->steps = 0;
 	worker->signs = (struct watchdog_signs){.heard = clock_monotonic(), .stepped = clock_monotonic()};
-	log_line(LEVEL_INFO, "worker %d (pid %ld): %s, %s, %zu of %zu MiB free", worker->index, (long)worker->child.pid,
-		 worker->backend, worker->info.name, worker->info.bytes_free >> 20, worker->info.bytes_total >> 20);
+	log_line(LEVEL_INFO, "worker %d (pid %ld): %s, %s, %zu of %zu MiB free", worker->index,
+		 (long)worker->child.process.pid, worker->backend, worker->info.name, worker->info.bytes_free >> 20,
+		 worker->info.bytes_total >> 20);
 	worker_publish(supervise, worker);
 }
 

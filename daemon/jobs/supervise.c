@@ -45,7 +45,7 @@ void worker_publish(struct supervise *supervise, const struct worker *worker)
 	struct worker_facts facts = {.index = worker->index,
 				     .device_index = supervise->devices[worker->index],
 				     .state = worker->state,
-				     .pid = worker->child.pid};
+				     .pid = worker->child.process.pid};
 	struct job_facts job;
 
 	snprintf(facts.backend, sizeof(facts.backend), "%s", worker->backend);
@@ -105,7 +105,7 @@ void worker_kill(struct supervise *supervise, struct worker *worker, const char 
 {
 	log_line(LEVEL_WARNING, "worker %d %s", worker->index, why);
 	snprintf(worker->killed, sizeof(worker->killed), "%s", why);
-	child_kill(&worker->child);
+	process_kill(&worker->child.process);
 	worker->state = WORKER_ENDING;
 	worker->deadline = NEVER;
 	worker_publish(supervise, worker);
@@ -312,7 +312,7 @@ static void wait_and_read(struct supervise *supervise, bool stopping)
 		/* A closed socket is always readable: once it is known to end, its pidfd is enough. */
 		fds[2 * i] = (struct pollfd){.fd = there && worker->state != WORKER_ENDING ? worker->child.socket : -1,
 					     .events = POLLIN};
-		fds[2 * i + 1] = (struct pollfd){.fd = there ? worker->child.pidfd : -1, .events = POLLIN};
+		fds[2 * i + 1] = (struct pollfd){.fd = there ? worker->child.process.pidfd : -1, .events = POLLIN};
 	}
 	fds[2 * count] = (struct pollfd){.fd = supervise->wake, .events = POLLIN};
 	if (poll(fds, (nfds_t)(2 * count + 1), poll_timeout(supervise, stopping)) < 0)
@@ -334,7 +334,7 @@ static void quit_workers(struct supervise *supervise)
 			continue;
 		/* A worker that has not even said hello has nothing to lose. */
 		if (worker->state == WORKER_STARTING)
-			child_kill(&worker->child);
+			process_kill(&worker->child.process);
 		else
 			worker_order(worker, MESSAGE_QUIT);
 	}
@@ -429,7 +429,7 @@ int supervise_start(struct jobs *jobs, const struct supervise_options *options, 
 	}
 	for (int i = 0; i < supervise->count; i++) {
 		supervise->workers[i] = (struct worker){
-		    .index = i, .child = {.pidfd = -1, .socket = -1}, .deadline = NEVER, .room_since = NEVER};
+		    .index = i, .child = {.process.pidfd = -1, .socket = -1}, .deadline = NEVER, .room_since = NEVER};
 		supervise->facts[i].index = i;
 	}
 	lock_init(&supervise->lock, LOCK_SUPERVISOR);

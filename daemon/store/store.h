@@ -18,6 +18,7 @@
  *   STATE/lock              held by the one daemon that uses STATE
  *   STATE/reserve           room for the commits that empty a full disk
  *   STATE/deleted           ids that clients have deleted (store/deleted.h)
+ *   STATE/calibrations/     of another room (daemon/calibrations/calibrations.h)
  *   STATE/quarantine/       files that were found and belong nowhere (store/quarantine.h)
  *   STATE/catalogue.sqlite  scans, projections, jobs, volumes, history, warnings, events
  *   STATE/scans/ID/         scan.json projections.raw flat.f32 dark.f32 defects.u8 (proto/scan_directory.h)

@@ -12,7 +12,7 @@ from typing import Any, Dict, Iterator, List
 OTHERS = {
     "job": {"/scan", "/emit", "/labels", "/patient"},
     "scan": {"/name", "/labels", "/patient", "/projections/air_region", "/projections/beam_hardening"}
-    | {f"/geometry/{name}" for name in ("kind", "angles_deg", "matrices", "views")},
+    | {f"/geometry/{name}" for name in ("kind", "angles_deg", "matrices", "views", "id", "notes")},
 }
 REQUESTS = {"job": "JobRequest", "scan": "ScanRequest"}
 # Replies that repeat members of the request with schemas of their own.

@@ -1,0 +1,136 @@
+/* /v1/calibrations */
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "daemon/api/internal.h"
+
+int calibration_post(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	char id[ID_SIZE];
+	cJSON *document;
+	size_t length;
+	const char *text = request_body(request, &length);
+
+	if (calibrations_post(api->calibrations, text, length, id, err) != 0 ||
+	    calibration_document(api->calibrations, id, false, &document, NULL, err) != 0 ||
+	    request_reply_json(request, 202, document, err) != 0)
+		return err->code;
+	request_reply_header(request, "Location", "/v1/calibrations/%s", id);
+	return 0;
+}
+
+int calibration_list(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	char last[ID_SIZE] = "";
+	cJSON *document, *list;
+	struct page page;
+	bool more = false;
+	int code;
+
+	if (page_read_ids(request, &page, err) != 0)
+		return err->code;
+	document = cJSON_CreateObject();
+	list = cJSON_AddArrayToObject(document, "calibrations");
+	code = calibrations_list(api->calibrations, page.after, page.limit, list, last, &more, err);
+	if (code != 0) {
+		cJSON_Delete(document);
+		return code;
+	}
+	if (more && last[0] != '\0')
+		cJSON_AddStringToObject(document, "next", last);
+	else
+		cJSON_AddNullToObject(document, "next");
+	return request_reply_json(request, 200, document, err);
+}
+
+/* ---- one, and waiting for its end ---- */
+
+struct waiter {
+	struct calibrations *calibrations;
+	struct watch watch;
+	double until; /* clock_monotonic */
+};
+
+static void wake_request(void *context)
+{
+	request_wake(context);
+}
+
+static void waiter_free(void *state)
+{
+	struct waiter *waiter = state;
+
+	calibrations_unwatch(waiter->calibrations, &waiter->watch);
+	free(waiter);
+}
+
+static int wait_begin(struct api *api, struct request *request, struct error *err)
+{
+	struct waiter *waiter = calloc(1, sizeof(*waiter));
+	double seconds;
+
+	if (waiter == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory to wait for a calibration");
+	if (wait_read(api, request, 0, &seconds, err) != 0) {
+		free(waiter);
+		return err->code;
+	}
+	waiter->calibrations = api->calibrations;
+	waiter->until = clock_monotonic() + seconds;
+	waiter->watch = (struct watch){.wake = wake_request, .context = request};
+	calibrations_watch(api->calibrations, &waiter->watch);
+	request_set_state(request, waiter, waiter_free);
+	return 0;
+}
+
+int calibration_get(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	const char *id = request_argument(request, 0);
+	const struct waiter *waiter;
+	cJSON *document;
+	bool ended;
+
+	if (request_state(request) == NULL && wait_begin(api, request, err) != 0)
+		return err->code;
+	waiter = request_state(request);
+	if (calibration_document(api->calibrations, id, true, &document, &ended, err) != 0)
+		return err->code;
+	cJSON_Delete(document);
+	if (!ended && clock_monotonic() < waiter->until && !request_stopping(request)) {
+		request_wait_until(request, waiter->until);
+		return HTTP_WAIT;
+	}
+	if (calibration_document(api->calibrations, id, false, &document, NULL, err) != 0)
+		return err->code;
+	return request_reply_json(request, 200, document, err);
+}
+
+int calibration_delete(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	int code = calibrations_delete(api->calibrations, request_argument(request, 0), err);
+
+	return code != 0 ? code : request_reply_empty(request, 204, err);
+}
+
+int calibration_view_get(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	const char *text = request_argument(request, 1);
+	size_t length;
+	char *png;
+	long view;
+
+	if (!index_parse(text, strlen(text), VIEWS_MAX, &view))
+		return error_set(err, ERR_NOT_FOUND, "\"%.40s\" is no view", text);
+	if (calibration_picture(api->calibrations, request_argument(request, 0), view, &png, &length, err) != 0 ||
+	    request_reply_bytes(request, 200, png, length, err) != 0)
+		return err->code;
+	request_reply_header(request, "Content-Type", "image/png");
+	request_reply_header(request, "Cache-Control", "private, no-cache");
+	return 0;
+}

@@ -1,0 +1,62 @@
+#ifndef CBCT_DAEMON_CALIBRATIONS_INTERNAL_H
+#define CBCT_DAEMON_CALIBRATIONS_INTERNAL_H
+
+#include <pthread.h>
+
+#include "daemon/calibrations/calibrations.h"
+#include "daemon/process.h"
+#include "proto/calibration_files.h"
+
+/* Shared by the files of this room. */
+
+enum calibration_state { CALIBRATION_QUEUED, CALIBRATION_RUNNING, CALIBRATION_SUCCEEDED, CALIBRATION_FAILED };
+extern const char *const calibration_state_names[];
+
+struct entry {
+	char id[ID_SIZE], scan[ID_SIZE];
+	enum calibration_state state;
+	double acquired; /* seconds since 1970 */
+	cJSON *brief;    /* all of the brief document but state and age, owned */
+};
+
+struct calibrations {
+	struct store *store; /* constant, as the next four */
+	char worker[1024];
+	int threads;
+	long age;
+	int wake; /* eventfd, of the calibrator */
+
+	pthread_mutex_t lock;  /* guards what follows */
+	struct entry *entries; /* [count], by id */
+	int count, space;
+	bool stop;
+
+	struct watch_list watchers;
+	pthread_t thread;
+	bool has_thread;
+};
+
+/* ---- library.c ---- */
+/* STATE/calibrations/ID, or a file in it. */
+void calibration_path(const struct calibrations *calibrations, const char *id, const char *file, char ret_path[1024]);
+/* NULL where there is none; the lock is held. */
+struct entry *calibration_entry(struct calibrations *calibrations, const char *id);
+/* Both documents; the result is NULL where there is none yet. ERR_NOT_FOUND, ERR_DAMAGED. */
+int calibration_read(struct calibrations *calibrations, const char *id, cJSON **ret_request, cJSON **ret_result,
+		     struct error *err);
+
+/* An entry from the files of a calibration; brief is the caller's. */
+int calibration_load(struct calibrations *calibrations, const char *id, struct entry *ret_entry, struct error *err);
+
+/* ---- document.c ---- */
+/* All of the brief document but state and age. result may be NULL. NULL: no memory. */
+cJSON *calibration_brief(const char *id, const cJSON *request, const cJSON *result, const struct error *failure);
+/* Members that are left out of brief documents. */
+void calibration_add_rest(cJSON *document, const cJSON *request, const cJSON *result);
+
+/* ---- runner.c ---- */
+int calibrator_start(struct calibrations *calibrations, struct error *err);
+void calibrator_stop(struct calibrations *calibrations);
+void calibrator_wake(struct calibrations *calibrations);
+
+#endif

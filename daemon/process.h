@@ -1,0 +1,29 @@
+#ifndef CBCT_DAEMON_PROCESS_H
+#define CBCT_DAEMON_PROCESS_H
+
+#include <stddef.h>
+#include <sys/types.h>
+
+#include "core/error.h"
+
+/* Programs that the daemon starts: their start and their end. Any thread. */
+struct process {
+	pid_t pid;
+	int pidfd; /* readable once it has ended */
+};
+
+/* Where cbct-worker is when nobody says: beside this program, else by PATH. */
+void worker_path(char *ret_path, size_t size);
+
+/*
+ * Starts a program with these arguments (the first is its name, the last NULL). It has standard output and error of
+ * ours, no input, `descriptor` as its descriptor 3 (-1: none), and nothing else; a terminal's Ctrl-C does not reach it.
+ */
+enum { PROCESS_DESCRIPTOR = 3 };
+int process_start(const char *program, char *const *arguments, int descriptor, struct process *ret_process,
+		  struct error *err);
+/* Waits for the end; says how it ended ("signal 9 (Killed)"); returns the exit status, -1 where a signal ended it. */
+int process_reap(struct process *process, char *ret_how, size_t size);
+void process_kill(const struct process *process);
+
+#endif

@@ -1,0 +1,56 @@
+#ifndef CBCT_PROTO_CALIBRATION_FILES_H
+#define CBCT_PROTO_CALIBRATION_FILES_H
+
+#include "proto/calibration.h"
+
+/*
+ * The directory of one of the daemon's calibrations:
+ *
+ *   request.json  {"scan": id, "arm", "phantom": {...}, "adjust_balls", "created", "acquired": seconds since
+ *                 1970, "sweep": the document of the scan}: what to do, written by the daemon
+ *   result.json   {"ended", "error": null} and the members of calibration_json; or
+ *                 {"ended", "error": {"code": enum error_code, "detail", "pointer"}}: written by cbct-worker
+ *
+ * Both end with their checksums (proto/seal.h). A directory without a result is a calibration that is still to be made.
+ */
+#define CALIBRATION_REQUEST "request.json"
+#define CALIBRATION_RESULT "result.json"
+
+/* Whole or not at all, as file_write_durable. */
+int sealed_write(const char *path, const cJSON *document, struct error *err);
+/* ERR_NOT_FOUND where there is no file, ERR_DAMAGED where it does not fit its checksums. Free with cJSON_Delete. */
+int sealed_read(const char *path, cJSON **ret_document, struct error *err);
+
+/*
+ * Calibrates as request.json says, from the scan's directory, and writes result.json, with the error where the pictures
+ * do not fit. Fails where no result could be written.
+ */
+int calibration_run(const char *directory, const char *scan_directory, struct error *err);
+
+/* What was found, read again from both documents; pointers are owned. Free with calibrated_clear. */
+struct calibrated {
+	struct scan *sweep; /* the scan of the phantom: nominal geometry, detector */
+	double acquired;    /* when that scan was made, seconds since 1970 */
+	struct geometry geometry;
+	struct balls balls;
+};
+int calibrated_read(const cJSON *request, const cJSON *result, struct calibrated *ret, struct error *err);
+void calibrated_clear(struct calibrated *calibrated);
+
+/*
+ * The views of another scan by a calibration. angles: [count] of its sources, radians; NULL: those of the calibrated
+ * sweep, view by view. Allocates ret_geometry->views, for the scan's own detector. Adds to ret_notes, a list, what is
+ * to be told: {"code", "detail"} of warnings. ERR_IMPOSSIBLE for another count without angles and for angles beyond the
+ * sweep; errors point into the geometry's document.
+ */
+int calibrated_views(const struct calibrated *calibrated, const struct scan *scan, const double *angles,
+		     struct geometry *ret_geometry, cJSON *ret_notes, struct error *err);
+
+/*
+ * A view's samples as a picture, with a circle where the calibration has each ball. samples: of the scan's type,
+ * [row][column]. Allocates *ret_png (free).
+ */
+int calibrated_picture(const struct calibrated *calibrated, int view, const void *samples, char **ret_png,
+		       size_t *ret_length, struct error *err);
+
+#endif

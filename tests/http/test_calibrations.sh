@@ -1,0 +1,208 @@
+#!/usr/bin/env bash
+# /v1/calibrations: an arm that sags is calibrated by the daemon, and other scans of that arm use what was found.
+. "$(dirname "$0")/lib.sh"
+program=cbctd-held
+
+arm=(--columns 300 --rows 240 --pixel 1.27 --sag daly)
+phantom='{"kind": "circles", "balls": 12, "diameter_mm": 110, "distance_mm": 90, "ball_mm": 6, "first_angle_deg": 10, "shift_deg": 15}'
+json=(-H 'Content-Type: application/json' --data-binary)
+
+# balls [OPTION ...]: a scan directory of the phantom, sent to the daemon; sets $balls, its id
+balls() {
+	printf '%s' "$phantom" >"$work/phantom.json"
+	rm -rf "$work/balls"
+	cbct simulate -o "$work/balls" --balls "$work/phantom.json" --density .6 "${arm[@]}" --views 24 --photons 20000 --raw flat "$@"
+	balls=$(cbct upload "$work/balls" | head -1)
+}
+# calibrated: has the daemon calibrate $balls; sets $calibration
+calibrated() {
+	req POST /v1/calibrations "${json[@]}" "{\"scan\": \"$balls\", \"arm\": \"arm in room 2\", \"phantom\": $phantom}"
+	expect_status 202
+	calibration=$(jq -r .id "$body")
+	[ "$(sed -n 's/^[Ll]ocation: \([^\r]*\).*/\1/p' "$headers")" = "/v1/calibrations/$calibration" ] || fail "its Location"
+	req GET "/v1/calibrations/$calibration?wait=60"
+	expect_status 200
+}
+# scan GEOMETRY [VIEWS]: announces a scan of this arm by the calibration
+scan() {
+	req POST /v1/scans "${json[@]}" "{\"detector\": {\"columns\": 300, \"rows\": 240, \"pixel_mm\": [1.27, 1.27]},
+		\"projections\": {\"count\": ${2:-24}, \"sample\": \"float32\", \"quantity\": \"line_integral\"}, \"geometry\": $1}"
+}
+expect_warning() { # CODE: the last reply has it
+	jq -e --arg code "$1" 'any(.warnings[]; .code == $code)' "$body" >/dev/null || fail "$1 among: $(jq -c .warnings "$body")"
+}
+
+test_a_sagging_arm_is_calibrated_and_its_scans_use_it() {
+	start_daemon
+	balls
+	calibrated
+	jq -e '.state == "succeeded" and .used == 24 and .residual_pixels < .2 and .residual_isocentre_mm < .1 and .arm == "arm in room 2" and
+		.sweep.views == 24 and .detector.columns == 300 and .age_s >= 0 and (.geometry.matrices | length) == 24 and
+		(.views | length) == 24 and all(.views[]; .used and .balls >= 7)' "$body" >/dev/null || fail "a result: $(head -c 900 "$body")"
+	jq -c .geometry.matrices "$body" >"$work/matrices"
+	expect_warning calibration_turn
+	req GET /v1/calibrations
+	jq -e --arg id "$calibration" '.calibrations | length == 1 and .[0].id == $id and (.[0] | has("geometry") | not)' "$body" >/dev/null ||
+		fail "a list: $(head -c 300 "$body")"
+
+	# view by view; the scan has the matrices, and keeps them when the calibration goes
+	scan "{\"kind\": \"calibration\", \"id\": \"$calibration\"}"
+	expect_status 201
+	local taken
+	taken=$(jq -r .id "$body")
+	jq -e --slurpfile found "$work/matrices" '[.geometry.matrices, $found[0] | map(map(. * 1))] | transpose |
+		all(.[0] as $a | .[1] as $b | [range(12) | ($a[.] / $a[11] - $b[.] / $b[11]) | fabs] | max < 1e-6)' "$body" >/dev/null ||
+		fail "the calibration's matrices in the scan"
+	jq -e '.geometry.kind == "calibration" and .warnings == []' "$body" >/dev/null || jq -e '[.warnings[].code] | index("calibration_interpolated") | not' "$body" >/dev/null ||
+		fail "no word of interpolation: $(jq -c .warnings "$body")"
+
+	# other views of the same sweep, by their angles
+	scan "{\"kind\": \"calibration\", \"id\": \"$calibration\", \"first_angle_deg\": 3, \"angle_step_deg\": 10}" 36
+	expect_status 201
+	expect_warning calibration_interpolated
+	jq -e '(.geometry.matrices | length) == 36' "$body" >/dev/null || fail "36 matrices"
+	scan "{\"kind\": \"calibration\", \"id\": \"$calibration\"}" 36
+	expect_status 422
+	expect_json '.pointer == "/geometry/angles_deg"'
+	scan "{\"kind\": \"calibration\", \"id\": \"$calibration\", \"first_angle_deg\": 3, \"angle_step_deg\": -10}" 36
+	expect_warning calibration_other_sweep
+	scan '{"kind": "calibration", "id": "00000000000000000"}'
+	expect_status 404
+	expect_json '.pointer == "/geometry/id"'
+
+	# a picture, while the phantom's scan is there
+	req GET "/v1/calibrations/$calibration/views/3"
+	expect_status 200
+	[ "$(head -c 4 "$body" | od -An -tx1 | tr -d ' \n')" = 89504e47 ] || fail "a PNG"
+	req GET "/v1/calibrations/$calibration/views/24"
+	expect_status 404
+	req DELETE "/v1/scans/$balls"
+	expect_status 204
+	req GET "/v1/calibrations/$calibration/views/3"
+	expect_status 404
+	req GET "/v1/calibrations/$calibration"
+	expect_json '.state == "succeeded"'
+
+	# it outlives the daemon and the catalogue, and a scan outlives it
+	stop_daemon
+	"$BUILD/cbctd" --state-dir "$state" --rebuild-catalogue >/dev/null 2>&1 || fail "a catalogue made again"
+	start_daemon --calibration-age 1
+	req GET "/v1/calibrations/$calibration"
+	expect_json '.state == "succeeded"'
+	jq -c .geometry.matrices "$body" | cmp - "$work/matrices" || fail "the same matrices"
+	req DELETE "/v1/calibrations/$calibration"
+	expect_status 204
+	req GET "/v1/calibrations/$calibration"
+	expect_status 404
+	req GET "/v1/scans/$taken"
+	expect_status 200
+	jq -e '(.geometry.matrices | length) == 24' "$body" >/dev/null || fail "matrices of a deleted calibration"
+	stop_daemon
+}
+
+test_what_does_not_fit_is_told() {
+	start_daemon
+	balls
+	req POST /v1/calibrations "${json[@]}" "{\"scan\": \"$balls\", \"phantom\": {\"balls_mm\": [[0, 0, 0, 3], [10, 0, 0, 3], [0, 10, 0, 3]]}}"
+	expect_status 400
+	expect_json '.pointer == "/phantom/balls_mm"'
+	grep -q '3 balls, expected 8 to 512' "$body" || fail "the numbers: $(cat "$body")"
+	req POST /v1/calibrations "${json[@]}" "{\"scan\": \"$balls\", \"phantom\": $(jq -nc '{balls_mm: [range(9) | [10 * ., 5 * ., 2, 3]]}')}"
+	expect_status 422
+	req POST /v1/calibrations "${json[@]}" "{\"scan\": \"1m7yaj2sssx8c7cg\", \"phantom\": $phantom}"
+	expect_status 404
+	expect_json '.pointer == "/scan"'
+	req POST /v1/calibrations "${json[@]}" "{\"scan\": \"$balls\", \"phantom\": $phantom, \"bals\": 3}"
+	expect_status 400
+	expect_json '.pointer == "/bals"'
+	# another phantom is known only from the pictures
+	req POST /v1/calibrations "${json[@]}" "{\"scan\": \"$balls\", \"phantom\": $(jq -c '.ball_mm = 3.6' <<<"$phantom")}"
+	expect_status 202
+	req GET "$(jq -r .href "$body")?wait=60"
+	expect_json '.state == "failed"'
+	expect_json '.error.type == "urn:cbctd:problem:impossible"'
+	grep -q 'times the given diameter' "$body" || fail "the ratio: $(jq -c .error "$body")"
+	req GET "$(jq -r .href "$body")/views/0"
+	expect_status 409
+	# projections and air that are not there
+	jq -c 'del(.projections.air)' "$work/balls/scan.json" >"$work/request.json"
+	req POST /v1/scans -H 'Content-Type: application/json' --data-binary "@$work/request.json"
+	expect_status 201
+	local empty
+	empty=$(jq -r .id "$body")
+	req POST /v1/calibrations "${json[@]}" "{\"scan\": \"$empty\", \"phantom\": $phantom}"
+	expect_status 409
+	curl -sf -T "$work/balls/projections.raw" "$url/v1/scans/$empty/projections" >/dev/null
+	req POST /v1/calibrations "${json[@]}" "{\"scan\": \"$empty\", \"phantom\": $phantom}"
+	expect_status 409
+	grep -q 'neither an air value nor a flat image' "$body" || fail "$(cat "$body")"
+	stop_daemon
+}
+
+# One that was being made when the daemon was killed is made after the next start; a damaged one is set aside.
+test_calibrations_outlive_crashes_and_damage_is_told() {
+	printf '#!/bin/sh\n[ "$1" != --calibrate ] || exec sleep 60\nexec "%s" "$@"\n' "$BUILD/cbct-worker" >"$work/slow"
+	chmod +x "$work/slow"
+	start_daemon --worker "$work/slow"
+	balls
+	req POST /v1/calibrations "${json[@]}" "{\"scan\": \"$balls\", \"phantom\": $phantom}"
+	calibration=$(jq -r .id "$body")
+	for ((i = 0; i < 100; i++)); do
+		req GET "/v1/calibrations/$calibration"
+		[ "$(jq -r .state "$body")" = running ] && break
+		sleep .05
+	done
+	expect_json '.state == "running"'
+	expect_json '.geometry == null'
+	# one that waits behind it can be deleted, and so can one that is being made
+	req POST /v1/calibrations "${json[@]}" "{\"scan\": \"$balls\", \"phantom\": $phantom}"
+	expect_json '.state == "queued"'
+	req DELETE "$(jq -r .href "$body")"
+	expect_status 204
+	stop_daemon KILL
+	start_daemon
+	req GET "/v1/calibrations/$calibration?wait=60"
+	expect_json '.state == "succeeded"'
+	stop_daemon
+	printf x | dd of="$state/calibrations/$calibration/result.json" bs=1 seek=100 conv=notrunc status=none
+	start_daemon
+	req GET "/v1/calibrations/$calibration"
+	expect_status 404
+	req GET /v1/quarantine
+	jq -e --arg from "calibrations/$calibration" 'any(.entries[]; .from == $from and (.why | test("checksums")))' "$body" >/dev/null ||
+		fail "what was set aside: $(cat "$body")"
+	stop_daemon
+}
+
+test_cbct_and_python_calibrate() {
+	start_daemon
+	balls
+	calibration=$(cbct calibrate-scan "$balls" "$work/phantom.json" --arm left 2>"$work/said") || fail "$(cat "$work/said")"
+	grep -q '^24 of 24 views, residual' "$work/said" || fail "$(cat "$work/said")"
+	cbct calibrations | grep -q "^$calibration  *succeeded .* left$" || fail "a line: $(cbct calibrations)"
+	/usr/bin/python3 - "$url" "$balls" "$calibration" "$phantom" <<-'END' || fail "what Python has asked for"
+		import json, sys
+		sys.path.insert(0, "clients/python")
+		import cbctd
+		url, balls, calibration, phantom = sys.argv[1:]
+		with cbctd.Client(url) as client:
+		    made = client.calibrate(balls, json.loads(phantom), arm="left", adjust_balls=True)
+		    assert made["used"] == 24 and made["balls_moved_mm"] < 0.1, made
+		    assert [c["id"] for c in client.calibrations()][:2] == [made["id"], calibration]
+		    assert client.calibration_view(made["id"], 0)[:4] == b"\x89PNG"
+		    geometry = cbctd.Geometry.calibration(made["id"], (1.27, 1.27), angles_deg=[0, 7, 14])
+		    scan = client.create_scan(geometry, (3, 240, 300))
+		    assert len(scan["geometry"]["matrices"]) == 3
+		    client.delete_calibration(made["id"])
+		    try:
+		        client.calibrate(balls, {"kind": "circles", "balls": 10, "diameter_mm": 90, "distance_mm": 70, "ball_mm": 6})
+		        raise SystemExit("another phantom was taken")
+		    except cbctd.CalibrationFailed as error:
+		        assert "do not fit" in str(error), error
+	END
+	cbct rm "$calibration"
+	[ -z "$(cbct calibrations | grep "$calibration")" ] || fail "a calibration that was removed"
+	stop_daemon
+}
+
+run_tests
