@@ -71,6 +71,7 @@ static int start_http(const struct config *config, struct api *api, struct error
 					     .server_names = config->server_names,
 					     .state_dir = config->state_dir,
 					     .tokens = config->tokens,
+					     .unix_roles = config->unix_roles,
 					     .tls_certificate = config->tls_certificate,
 					     .tls_key = config->tls_key,
 					     .tls_client_authorities = config->tls_client_authorities,

@@ -1,26 +1,40 @@
 /* Requests over libcurl: see http.h. */
 #include "clients/cbct/http.h"
 
+#include <errno.h>
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/stat.h>
 #include <time.h>
 
 #include <curl/curl.h>
 
 #include "proto/json.h"
+#include "proto/scan_directory.h"
+#include "proto/tokens.h"
 
 #define HTTP_URL_DEFAULT "http://127.0.0.1:2228"
 
 const struct option http_option_rows[] = {
     {"url", 0, OPTION_TEXT, offsetof(struct http_options, url), "URL",
-     "the daemon, http://HOST:PORT or unix:PATH (default $CBCT_URL, else " HTTP_URL_DEFAULT ")", 0, 0, 0, NULL},
+     "the daemon, http://HOST:PORT, https://HOST:PORT or unix:PATH (default $CBCT_URL, else " HTTP_URL_DEFAULT ")", 0,
+     0, 0, NULL},
+    {"token-file", 0, OPTION_TEXT, offsetof(struct http_options, token_file), "FILE",
+     "the token that the daemon asks for (default $CBCT_TOKEN_FILE; or the token itself in $CBCT_TOKEN)", 0, 0, 0,
+     NULL},
+    {"cacert", 0, OPTION_TEXT, offsetof(struct http_options, authorities), "FILE",
+     "who signs the daemon's certificate (default $CBCT_CACERT, else those that the system trusts)", 0, 0, 0, NULL},
+    {"cert", 0, OPTION_TEXT, offsetof(struct http_options, certificate), "FILE",
+     "a client certificate in place of a token (default $CBCT_CERT)", 0, 0, 0, NULL},
+    {"key", 0, OPTION_TEXT, offsetof(struct http_options, key), "FILE", "its key (default $CBCT_KEY)", 0, 0, 0, NULL},
     {0},
 };
 
 struct http {
 	CURL *easy;
-	char *base; /* no slash at the end */
+	char *authorization; /* a header field, or NULL */
+	char *base;          /* no slash at the end */
 	char message[CURL_ERROR_SIZE];
 	bool unreachable;
 	double retry_after; /* s, of the last reply */
@@ -32,6 +46,67 @@ struct transfer {
 	const struct http_request *request;
 	struct http_reply *reply;
 };
+
+/* An option, else the environment's; NULL where neither is there. */
+static const char *given(const char *option, const char *variable)
+{
+	const char *text = option != NULL ? option : getenv(variable);
+
+	return text != NULL && text[0] != 0 ? text : NULL;
+}
+
+static int take_token(struct http *http, const char *text, const char *from, struct error *err)
+{
+	size_t length;
+
+	text += strspn(text, " \t\r\n");
+	length = strcspn(text, " \t\r\n");
+	if (length == 0 || text[length + strspn(text + length, " \t\r\n")] != 0)
+		return error_set(err, ERR_INVALID, "%s has no token, or more than one", from);
+	if (asprintf(&http->authorization, "Authorization: Bearer %.*s", (int)length, text) < 0) {
+		http->authorization = NULL;
+		return error_set(err, ERR_NO_MEMORY, "no memory for a token");
+	}
+	return 0;
+}
+
+/* A file that is named goes before the environment's token. Others must not be able to read it. */
+static int read_token(struct http *http, const struct http_options *options, struct error *err)
+{
+	enum { TOKEN_BYTES_MAX = 4096 };
+	const char *path = options->token_file, *token = given(NULL, "CBCT_TOKEN");
+	struct stat status;
+	size_t length;
+	char *text;
+	int code;
+
+	if (path == NULL && token != NULL)
+		return take_token(http, token, "CBCT_TOKEN", err);
+	path = given(path, "CBCT_TOKEN_FILE");
+	if (path == NULL)
+		return 0;
+	if (stat(path, &status) != 0)
+		return error_set_errno(err, errno, "%s", path);
+	if (file_is_guarded(path, &status, err) != 0 || file_read(path, TOKEN_BYTES_MAX, &text, &length, err) != 0)
+		return err->code;
+	code = take_token(http, text, path, err);
+	free(text);
+	return code;
+}
+
+static void use_certificates(struct http *http, const struct http_options *options)
+{
+	const char *authorities = given(options->authorities, "CBCT_CACERT");
+	const char *certificate = given(options->certificate, "CBCT_CERT"), *key = given(options->key, "CBCT_KEY");
+
+	if (authorities != NULL)
+		curl_easy_setopt(http->easy, CURLOPT_CAINFO, authorities);
+	if (certificate != NULL)
+		curl_easy_setopt(http->easy, CURLOPT_SSLCERT, certificate);
+	if (key != NULL)
+		curl_easy_setopt(http->easy, CURLOPT_SSLKEY, key);
+	curl_easy_setopt(http->easy, CURLOPT_SSLVERSION, CURL_SSLVERSION_TLSv1_2);
+}
 
 int http_new(const struct http_options *options, struct http **ret_http, struct error *err)
 {
@@ -53,6 +128,11 @@ int http_new(const struct http_options *options, struct http **ret_http, struct 
 		http_free(http);
 		return error_set(err, ERR_NO_MEMORY, "no memory for a connection");
 	}
+	if (read_token(http, options, err) != 0) {
+		http_free(http);
+		return err->code;
+	}
+	use_certificates(http, options);
 	for (size_t n = strlen(http->base); n > 0 && http->base[n - 1] == '/'; n--)
 		http->base[n - 1] = 0;
 	curl_easy_setopt(http->easy, CURLOPT_ERRORBUFFER, http->message);
@@ -77,6 +157,7 @@ void http_free(struct http *http)
 		return;
 	curl_easy_cleanup(http->easy);
 	free(http->base);
+	free(http->authorization);
 	free(http);
 }
 
@@ -216,6 +297,8 @@ int http_send(struct http *http, const struct http_request *request, struct http
 	snprintf(url, sizeof(url), "%s%s", http->base, request->path);
 	for (int i = 0; i < HTTP_HEADERS_MAX && request->headers[i] != NULL; i++)
 		headers = curl_slist_append(headers, request->headers[i]);
+	if (http->authorization != NULL)
+		headers = curl_slist_append(headers, http->authorization);
 	http->message[0] = 0;
 	curl_easy_setopt(http->easy, CURLOPT_URL, url);
 	curl_easy_setopt(http->easy, CURLOPT_HTTPHEADER, headers);

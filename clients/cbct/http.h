@@ -17,6 +17,8 @@ struct http;
 /* The options of every subcommand that talks to a daemon. */
 struct http_options {
 	const char *url; /* "http://HOST:PORT" or "unix:PATH"; NULL: $CBCT_URL, else http://127.0.0.1:2228 */
+	/* Paths; NULL: as the environment says, else none. */
+	const char *token_file, *authorities, *certificate, *key;
 };
 extern const struct option http_option_rows[];
 

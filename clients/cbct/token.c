@@ -18,7 +18,7 @@
 
 struct token_options {
 	const char *action, *name;
-	const char *file, *role, *expires;
+	const char *file, *role, *expires, *output;
 	long days;
 	bool certificate;
 };
@@ -147,6 +147,25 @@ static void tell_reload(void)
 	fputs("cbctd reads the file at its start and at SIGHUP (systemctl reload cbctd)\n", stderr);
 }
 
+/* On standard output, or in a new file that others cannot read, as --token-file wants it. */
+static int token_show(const char *path, const char *text, struct error *err)
+{
+	int file;
+
+	if (path == NULL) {
+		puts(text);
+		return 0;
+	}
+	file = open(path, O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, 0600);
+	if (file < 0)
+		return error_set_errno(err, errno, "%s", path);
+	if (dprintf(file, "%s\n", text) < 0)
+		error_set_errno(err, errno, "%s", path);
+	if (close(file) != 0)
+		error_set_errno(err, errno, "%s", path);
+	return err->code;
+}
+
 static int token_new(const struct token_options *options, struct error *err)
 {
 	const char *path = file_path(options);
@@ -158,6 +177,8 @@ static int token_new(const struct token_options *options, struct error *err)
 	if (options->name == NULL)
 		return error_set(err, ERR_USAGE, "NAME says whose token it is");
 	code = token_make(options, &token, text, err);
+	if (code == 0 && options->output != NULL && access(options->output, F_OK) == 0)
+		code = error_set(err, ERR_CONFLICT, "%s is there already", options->output);
 	if (code != 0)
 		return code;
 	code = file_open(path, true, &file, err);
@@ -167,9 +188,9 @@ static int token_new(const struct token_options *options, struct error *err)
 	if (code != 0)
 		return code;
 	if (!token.certificate)
-		puts(text);
+		code = token_show(options->output, text, err);
 	tell_reload();
-	return 0;
+	return code;
 }
 
 /* ---- revoke ---- */
@@ -260,6 +281,7 @@ static const struct option rows[] = {
 	"of a new one: view reads, acquire makes and removes scans and jobs, too, admin everything", 0, 0),
     ROW("days", OPTION_INTEGER, days, "N", "a new one is valid for so many days", 1, 36500),
     ROW("expires", OPTION_TEXT, expires, "TIME", "or until then: a date, 2027-01-31T00:00:00Z, or never", 0, 0),
+    ROW("output", OPTION_TEXT, output, "FILE", "a new file for a new one, in place of standard output", 0, 0),
     ROW("certificate", OPTION_FLAG, certificate, NULL,
 	"of a new one: no token, but a client certificate whose common name is NAME", 0, 0),
     {0},

@@ -290,6 +290,16 @@ class Geometry:
         return Geometry(document, _pair(pixel_mm))
 
 
+def _token(path: Optional[str]) -> Optional[str]:
+    if path is None and os.environ.get("CBCT_TOKEN"):
+        return os.environ["CBCT_TOKEN"]
+    path = path or os.environ.get("CBCT_TOKEN_FILE")
+    if not path:
+        return None
+    with open(path, encoding="ascii") as file:
+        return file.read().strip()
+
+
 class _Adapter(requests.adapters.HTTPAdapter):
     """Connections whose peer is probed while they are silent."""
 
@@ -305,13 +315,27 @@ class Client:
     """A daemon.
 
     Args:
-        url: ``http://HOST:PORT``; default ``$CBCT_URL``, else ``http://127.0.0.1:2228``.
+        url: ``http://HOST:PORT`` or ``https://HOST:PORT``; default ``$CBCT_URL``, else ``http://127.0.0.1:2228``.
         timeout: s, to wait for a connection and between two bytes of an answer.
         patience: s, for how long broken connections are taken up again and a busy daemon is asked again before
             `Broken` or `Problem` is raised. One that was never reached is given up at once.
+        token: what the daemon asks for; default ``$CBCT_TOKEN``.
+        token_file: a file that has it; default ``$CBCT_TOKEN_FILE``. Goes before ``$CBCT_TOKEN``.
+        cacert: a file of those who sign the daemon's certificate; default ``$CBCT_CACERT``, else those that requests trusts.
+        cert: a client certificate in place of a token, a file or (certificate, key).
     """
 
-    def __init__(self, url: Optional[str] = None, *, timeout: float = 60.0, patience: float = 60.0) -> None:
+    def __init__(
+        self,
+        url: Optional[str] = None,
+        *,
+        timeout: float = 60.0,
+        patience: float = 60.0,
+        token: Optional[str] = None,
+        token_file: Optional[str] = None,
+        cacert: Optional[str] = None,
+        cert: Union[str, Tuple[str, str], None] = None,
+    ) -> None:
         self.url = (url or os.environ.get("CBCT_URL") or "http://127.0.0.1:2228").rstrip("/")
         self.timeout = timeout
         self.patience = patience
@@ -321,6 +345,11 @@ class Client:
         # The daemon is near: no proxies, and no passwords of other services.
         self._session.trust_env = False
         self._session.headers["User-Agent"] = "cbctd-python"
+        token = token or _token(token_file)
+        if token:
+            self._session.headers["Authorization"] = f"Bearer {token}"
+        self._session.verify = cacert or os.environ.get("CBCT_CACERT") or True
+        self._session.cert = cert
         for scheme in ("http://", "https://"):
             self._session.mount(scheme, _Adapter(pool_maxsize=32))
 

@@ -5,11 +5,9 @@
  */
 #include "daemon/api/internal.h"
 
-static const char *const proofs[] = {[PROOF_NONE] = "none",
-				     [PROOF_NOT_ASKED] = "not asked",
-				     [PROOF_TOKEN] = "token",
-				     [PROOF_SESSION] = "session",
-				     [PROOF_CERTIFICATE] = "certificate"};
+static const char *const proofs[] = {
+    [PROOF_PEER] = "peer",   [PROOF_NONE] = "none",       [PROOF_NOT_ASKED] = "not asked",
+    [PROOF_TOKEN] = "token", [PROOF_SESSION] = "session", [PROOF_CERTIFICATE] = "certificate"};
 
 static cJSON *identity_document(const struct identity *who)
 {

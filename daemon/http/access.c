@@ -6,7 +6,8 @@
  * request shows a token (RFC 6750), or the cookie of a session that a token
  * opened. A cookie holds random bits of its own, never the token; the daemon
  * has the SHA-256 of them, and asks the table of tokens again at each request,
- * so that a token that expires or is revoked takes its sessions along.
+ * so that a token that expires or is revoked takes its sessions along. On a
+ * Unix socket the kernel tells whose process asks, which may be enough.
  *
  * A cookie is sent by the browser whoever asks it to. Two things keep pages of
  * other sites from using it: SameSite=Strict, and the rules of http/origin.c.
@@ -14,6 +15,9 @@
 #include "daemon/http/internal.h"
 
 #include <errno.h>
+#include <grp.h>
+#include <limits.h>
+#include <pwd.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -24,10 +28,11 @@
 #include <openssl/crypto.h>
 #include <openssl/evp.h>
 
+#include "daemon/http/text.h"
 #include "daemon/lock.h"
 #include "daemon/log.h"
 
-enum { SESSIONS_MAX = 256 };
+enum { SESSIONS_MAX = 256, PEER_RULES_MAX = 64, GROUPS_MAX = 1024 };
 static const double session_seconds = 12 * 3600; /* a working day */
 static const char session_cookie[] = "cbctd_session";
 
@@ -38,8 +43,17 @@ struct session {
 	double ends;                        /* clock_monotonic; 0: free */
 };
 
+/* Who may on Unix sockets without a token. */
+struct peer_rule {
+	bool group; /* otherwise a user */
+	unsigned id;
+	enum role role;
+};
+
 struct access {
-	const char *path; /* "": nobody is asked */
+	const char *path; /* "": there are no tokens */
+	struct peer_rule rules[PEER_RULES_MAX];
+	int rule_count; /* constant */
 	pthread_mutex_t lock;
 	struct tokens tokens; /* guarded by lock, as is all below */
 	struct session sessions[SESSIONS_MAX];
@@ -47,14 +61,64 @@ struct access {
 
 /* ---- life ---- */
 
-int access_new(const char *path, struct access **ret_access, struct error *err)
+/* "user:acq=acquire", "group:1000=view". The names are looked up once, at the start. */
+static int rule_parse(char *text, struct peer_rule *ret_rule, struct error *err)
+{
+	char *kind = strsep(&text, ":"), *name = text != NULL ? strsep(&text, "=") : NULL;
+	struct peer_rule rule = {.group = strcmp(kind, "group") == 0,
+				 .role = text != NULL ? role_parse(text) : ROLE_UNSAID};
+	const struct passwd *user = NULL;
+	const struct group *group = NULL;
+	long id;
+
+	if ((!rule.group && strcmp(kind, "user") != 0) || rule.role == ROLE_UNSAID)
+		return error_set(err, ERR_INVALID,
+				 "unix-role: expected user:NAME=ROLE or group:NAME=ROLE, and view, "
+				 "acquire or admin as its role");
+	if (rule.group)
+		group = getgrnam(name);
+	else
+		user = getpwnam(name);
+	if (group != NULL)
+		rule.id = group->gr_gid;
+	else if (user != NULL)
+		rule.id = user->pw_uid;
+	else if (index_parse(name, strlen(name), INT_MAX, &id))
+		rule.id = (unsigned)id;
+	else
+		return error_set(err, ERR_INVALID, "unix-role: there is no %s \"%.60s\"", kind, name);
+	*ret_rule = rule;
+	return 0;
+}
+
+static int rules_parse(struct access *access, const char *list, struct error *err)
+{
+	char *copy = strdup(list), *next = copy, *text;
+	int code = 0;
+
+	if (copy == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for roles");
+	while (code == 0 && (text = strsep(&next, ", ")) != NULL) {
+		if (text[0] == '\0')
+			continue;
+		if (access->rule_count == PEER_RULES_MAX)
+			code = error_set(err, ERR_INVALID, "unix-role: more than %d", PEER_RULES_MAX);
+		else
+			code = rule_parse(text, &access->rules[access->rule_count++], err);
+	}
+	free(copy);
+	return code;
+}
+
+int access_new(const struct http_options *options, struct access **ret_access, struct error *err)
 {
 	struct access *access = calloc(1, sizeof(*access));
 
 	if (access == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for tokens");
-	access->path = path;
-	if (path[0] != '\0' && tokens_read(path, &access->tokens, err) != 0) {
+	access->path = options->tokens;
+	if (rules_parse(access, options->unix_roles, err) != 0 ||
+	    (access_has_tokens(access) && tokens_read(access->path, &access->tokens, err) != 0)) {
 		free(access);
 		return err->code;
 	}
@@ -72,16 +136,43 @@ void access_free(struct access *access)
 	free(access);
 }
 
-bool access_is_asked(const struct access *access)
+bool access_has_tokens(const struct access *access)
 {
 	return access->path[0] != '\0';
+}
+
+bool access_is_asked(const struct access *access)
+{
+	return access_has_tokens(access) || access->rule_count > 0;
+}
+
+enum role access_peer_role(const struct access *access, int socket, const struct ucred *peer)
+{
+	enum role highest = ROLE_ANYONE;
+	gid_t groups[GROUPS_MAX];
+	socklen_t size = sizeof(groups);
+
+	if (access->rule_count == 0)
+		return highest;
+	if (getsockopt(socket, SOL_SOCKET, SO_PEERGROUPS, groups, &size) != 0)
+		size = 0; /* an older kernel, or more groups than anybody has */
+	for (int i = 0; i < access->rule_count; i++) {
+		const struct peer_rule *rule = &access->rules[i];
+		bool fits = rule->group ? rule->id == peer->gid : rule->id == peer->uid;
+
+		for (size_t g = 0; rule->group && g < size / sizeof(*groups); g++)
+			fits = fits || rule->id == groups[g];
+		if (fits && rule->role > highest)
+			highest = rule->role;
+	}
+	return highest;
 }
 
 int access_reload(struct access *access, struct error *err)
 {
 	struct tokens fresh, old;
 
-	if (!access_is_asked(access))
+	if (!access_has_tokens(access))
 		return 0;
 	if (tokens_read(access->path, &fresh, err) != 0)
 		return err->code;
@@ -202,6 +293,12 @@ static enum shown read_proof(struct request *request, struct identity *ret)
 	if (shown != SHOWN_NOTHING)
 		return shown;
 	cookie = MHD_lookup_connection_value(request->mhd, MHD_COOKIE_KIND, session_cookie);
+	if (request->connection->peer_role > ROLE_ANYONE) {
+		*ret = (struct identity){
+		    .role = request->connection->peer_role, .expires = TOKEN_NEVER, .proof = PROOF_PEER};
+		snprintf(ret->name, sizeof(ret->name), "uid-%u", (unsigned)request->connection->user);
+		return SHOWN_GOOD;
+	}
 	if (find_certificate(request->http->access, tls_peer_name(request->connection), ret) ||
 	    find_session(request->http->access, cookie, ret))
 		return SHOWN_GOOD;

@@ -311,7 +311,7 @@ static void fit_connections(struct http *http)
 
 static unsigned guards_of(const struct http *http)
 {
-	return (access_is_asked(http->access) ? GUARD_TOKENS : GUARD_NONE) |
+	return (access_has_tokens(http->access) ? GUARD_TOKENS : GUARD_NONE) |
 	       (http->tls != NULL ? GUARD_TLS : GUARD_NONE);
 }
 
@@ -332,7 +332,7 @@ int http_new(const struct http_options *options, struct http **ret_http, struct 
 	pthread_condattr_setclock(&monotonic, CLOCK_MONOTONIC);
 	pthread_cond_init(&http->clock_kick, &monotonic);
 	pthread_condattr_destroy(&monotonic);
-	if (access_check_routes(options->routes, err) != 0 || access_new(options->tokens, &http->access, err) != 0 ||
+	if (access_check_routes(options->routes, err) != 0 || access_new(options, &http->access, err) != 0 ||
 	    tls_new(options, &http->tls, err) != 0 || gate_open(err) != 0 ||
 	    server_names_check(options->server_names, err) != 0 ||
 	    listeners_open(options->listen, guards_of(http), http->listeners, &http->listener_count, err) != 0) {

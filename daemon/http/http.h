@@ -58,6 +58,7 @@ struct http_options {
 	const char *state_dir;    /* replies do not show paths in it */
 	/* Paths; "" and "" for no TLS. The last may be "": clients are not asked for certificates. */
 	const char *tls_certificate, *tls_key, *tls_client_authorities;
+	const char *unix_roles;     /* as config.unix_roles; "": a Unix socket's peers are nobody in particular */
 	const char *tokens;         /* the file of tokens; "": nobody is asked who they are */
 	const struct route *routes; /* ends with method == NULL */
 	void *context;              /* the handlers' */
@@ -110,7 +111,14 @@ void *request_state(const struct request *request);
 
 /* ---- who asks ---- */
 /* What showed who asks. */
-enum proof { PROOF_NONE, PROOF_NOT_ASKED /* there are no tokens */, PROOF_TOKEN, PROOF_SESSION, PROOF_CERTIFICATE };
+enum proof {
+	PROOF_NONE,
+	PROOF_NOT_ASKED /* there are no tokens */,
+	PROOF_TOKEN,
+	PROOF_SESSION,
+	PROOF_CERTIFICATE,
+	PROOF_PEER
+};
 struct identity {
 	char name[TOKEN_NAME_SIZE]; /* of the token, "" without one */
 	enum role role;             /* ROLE_ANYONE: not known; ROLE_ADMIN where nobody is asked */

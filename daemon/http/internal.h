@@ -45,6 +45,7 @@ struct connection {
 	int socket;
 	struct sockaddr_storage address;
 	uid_t user;                         /* of a Unix socket's peer */
+	enum role peer_role;                /* likewise; constant */
 	bool tls;                           /* constant */
 	bool certificate_read;              /* its thread's own, as is the next */
 	char certificate[TOKEN_NAME_SIZE];  /* common name of the client's, which was verified; "" without one */
@@ -231,10 +232,13 @@ int server_names_check(const char *names, struct error *err);
 int request_check_origin(struct request *request, struct error *err);
 
 /* ---- http/access.c: who asks, and what they may ---- */
-int access_new(const char *path, struct access **ret_access, struct error *err);
+int access_new(const struct http_options *options, struct access **ret_access, struct error *err);
 void access_free(struct access *access); /* NULL is fine */
-/* There are tokens, and whoever has none is nobody. */
+/* There are tokens, or roles for a Unix socket's peers, and whoever has none is nobody. */
 bool access_is_asked(const struct access *access);
+bool access_has_tokens(const struct access *access);
+/* The highest role of a user and its groups, ROLE_ANYONE without one; when its connection is new. */
+enum role access_peer_role(const struct access *access, int socket, const struct ucred *peer);
 /* On failure the tokens before stay. */
 int access_reload(struct access *access, struct error *err);
 int access_check_routes(const struct route *routes, struct error *err);

@@ -190,4 +190,36 @@ test_sighup_reads_the_file_again_and_keeps_the_old_one_if_it_is_bad() {
 	stop_daemon
 }
 
+test_the_kernel_tells_who_is_at_a_unix_socket() {
+	local socket=$work/peers
+	with_rules() { # RULE ...: on a Unix socket
+		local rule options=()
+		for rule; do options+=(--unix-role "$rule"); done
+		start_daemon --listen "unix:$socket" "${options[@]}"
+	}
+	with_rules "user:$(id -un)=view" "group:$(id -g)=acquire" "user:4000000=admin"
+	req GET /v1/session --unix-socket "$socket"
+	expect_status 200
+	expect_json ".name == \"uid-$(id -u)\" and .role == \"acquire\" and .proof == \"peer\""
+	req DELETE /v1/scans/1m00000000000000 --unix-socket "$socket"
+	expect_problem 404
+	# over TCP nobody is known
+	req GET /v1/session
+	expect_problem 401
+	stop_daemon
+	with_rules "user:$(id -u)=view" "group:4000000=acquire"
+	req DELETE /v1/scans/1m00000000000000 --unix-socket "$socket"
+	expect_problem 403
+	stop_daemon
+	with_rules "user:4000000=admin" "group:4000000=admin"
+	req GET /v1/session --unix-socket "$socket"
+	expect_problem 401
+	stop_daemon
+	local rule
+	for rule in root user:root=boss user:root user:=view "user:no such=view" uid:0=view group:nosuchgroup=view; do
+		! timeout 10 cbctd --listen "unix:$socket" --state-dir "$work/none" --unix-role "$rule" >"$work/refused" 2>&1 || fail "no start with $rule"
+		grep -q 'unix-role' "$work/refused" || fail "the reason in $(cat "$work/refused")"
+	done
+}
+
 stop_after_each=1 run_tests

@@ -248,4 +248,51 @@ test_client_certificates_are_as_good_as_their_row() {
 	stop_daemon
 }
 
+test_the_clients_show_tokens_and_certificates() {
+	local dir=$work/ball scan job file=$work/acquire.token
+	cbct simulate --phantom ball --views 12 --columns 24 --rows 16 --pixel 8 --source-to-isocentre 600 --source-to-detector 1000 -o "$dir" >/dev/null
+	cp "$tokens" "$work/clients"
+	cbct token new uploads --role acquire --file "$work/clients" --output "$file" 2>/dev/null
+	cbct token new arm-3 --role acquire --certificate --file "$work/clients" 2>/dev/null
+	[ "$(stat -c %a "$file")" = 600 ] || fail "a token that others cannot read"
+	! cbct token new more --file "$work/clients" --output "$file" 2>/dev/null || fail "no file is overwritten"
+	client arm /CN=arm-3
+	start_tls --tokens "$work/clients" --tls-client-ca "$keys/ca.pem"
+	export CBCT_URL=$url CBCT_CACERT=$keys/ca.pem
+	! cbct scans 2>"$work/refused" || fail "nobody without a token"
+	grep -q 'a token is wanted' "$work/refused" || fail "what is wanted: $(cat "$work/refused")"
+	! (unset CBCT_CACERT; cbct scans --token-file "$file") 2>/dev/null || fail "an authority that nobody trusts"
+	scan=$(cbct upload "$dir" --token-file "$file" | tail -1)
+	CBCT_TOKEN_FILE=$file cbct scans | grep -q "${scan##* }" || fail "the scan in the list: $scan"
+	! CBCT_TOKEN=$view cbct rm "${scan##* }" 2>"$work/refused" || fail "who may view removes nothing"
+	grep -q 'acquire is wanted' "$work/refused" || fail "the role that is wanted: $(cat "$work/refused")"
+	CBCT_TOKEN=$acquire cbct jobs
+	cbct status --cert "$keys/arm.pem" --key "$keys/arm.key" | grep -q cpu || fail "a client certificate"
+	chmod 644 "$file"
+	! cbct scans --token-file "$file" 2>"$work/refused" || fail "a token that everybody can read is not sent"
+	grep -q 'mode 0644' "$work/refused" || fail "why: $(cat "$work/refused")"
+	if "$python" -c 'import numpy, requests' 2>/dev/null; then
+		PYTHONPATH=$top/clients/python PYTHONDONTWRITEBYTECODE=1 "$python" - "$file" "$keys" <<-'END'
+			import os, sys, cbctd
+			file, keys = sys.argv[1:]
+			assert len(list(cbctd.Client(token_file=file).scans())) >= 1
+			with open(file) as text:
+			    token = text.read().strip()
+			assert len(list(cbctd.Client(token=token, cacert=keys + "/ca.pem").scans())) >= 1
+			assert len(list(cbctd.Client(cert=(keys + "/arm.pem", keys + "/arm.key")).scans())) >= 1
+			os.environ["CBCT_TOKEN"] = token
+			assert len(list(cbctd.Client().scans())) >= 1
+			os.environ["CBCT_TOKEN"] = token + "x"
+			try:
+			    list(cbctd.Client().scans())
+			except cbctd.Problem as problem:
+			    assert problem.status == 401, problem
+			else:
+			    raise AssertionError("a wrong token")
+		END
+	fi
+	CBCT_TOKEN=$acquire cbct rm "${scan##* }"
+	stop_daemon
+}
+
 stop_after_each=1 run_tests
