@@ -105,29 +105,35 @@ static void read_matrix(struct json_reader *reader, struct patient *patient)
 		make_orthogonal(patient->rotation);
 }
 
+void patient_members(struct json_reader *reader, bool required, struct patient *ret_patient)
+{
+	struct patient patient = patient_unknown;
+	int position = -1;
+	bool has_position = json_has(reader, "position"), has_matrix = json_has(reader, "world_to_patient");
+
+	if (has_position && has_matrix)
+		json_fail(reader, ERR_INVALID, "world_to_patient", "stands in place of position");
+	if (has_matrix)
+		read_matrix(reader, &patient);
+	else
+		json_choice(reader, "position", required, patient_position_names, PATIENT_POSITION_COUNT, &position);
+	if (reader->code == 0 && (has_matrix || position >= 0))
+		*ret_patient = has_matrix ? patient : patient_in((enum patient_position)position);
+}
+
 int patient_read(const cJSON *value, const char *base, struct patient *ret_patient, struct error *err)
 {
-	struct json_reader reader;
 	struct patient patient = patient_unknown;
-	int position = 0, code;
-	bool has_position, has_matrix;
+	struct json_reader reader;
+	int code = 0;
 
-	if (value == NULL || cJSON_IsNull(value)) {
-		*ret_patient = patient;
-		return 0;
+	if (value != NULL && !cJSON_IsNull(value)) {
+		json_begin(&reader, value, base, err);
+		patient_members(&reader, true, &patient);
+		code = json_end(&reader);
 	}
-	json_begin(&reader, value, base, err);
-	has_position = json_has(&reader, "position");
-	has_matrix = json_has(&reader, "world_to_patient");
-	if (has_position && has_matrix)
-		json_fail(&reader, ERR_INVALID, "world_to_patient", "stands in place of position");
-	if (has_matrix)
-		read_matrix(&reader, &patient);
-	else
-		json_choice(&reader, "position", true, patient_position_names, PATIENT_POSITION_COUNT, &position);
-	code = json_end(&reader);
 	if (code == 0)
-		*ret_patient = has_matrix ? patient : patient_in((enum patient_position)position);
+		*ret_patient = patient;
 	return code;
 }
 

@@ -47,6 +47,8 @@ struct patient patient_in(enum patient_position position);
  * Within what a few printed digits leave of a rotation, the nearest one is taken.
  */
 int patient_read(const cJSON *value, const char *base, struct patient *ret_patient, struct error *err);
+/* The same from a reader that is asked for other members, too; *ret_patient stays as it is where neither is given. */
+void patient_members(struct json_reader *reader, bool required, struct patient *ret_patient);
 /* The same member, NULL for no memory; null where not known. Reads back to the same patient. */
 cJSON *patient_json(const struct patient *patient);
 bool patient_same(const struct patient *a, const struct patient *b);

@@ -508,10 +508,35 @@ static void drop_nulls(cJSON *object)
 	}
 }
 
+/* How the patient lies may be left out where it is told who that is. */
+static int read_patient(struct scan *scan, const cJSON *patient, struct error *err)
+{
+	struct json_reader reader;
+
+	scan->patient = patient_unknown;
+	if (patient == NULL)
+		return 0;
+	json_begin(&reader, patient, "/patient", err);
+	subject_members(&reader, "patient", &scan->subject);
+	patient_members(&reader, !subject_known(&scan->subject, "patient"), &scan->patient);
+	return json_end(&reader);
+}
+
+static int read_study(struct scan *scan, const cJSON *study, struct error *err)
+{
+	struct json_reader reader;
+
+	if (study == NULL)
+		return 0;
+	json_begin(&reader, study, "/study", err);
+	subject_members(&reader, "study", &scan->subject);
+	return json_end(&reader);
+}
+
 static int read_document(struct scan *scan, const struct scan_calibrations *calibrations, struct error *err)
 {
 	struct json_reader reader;
-	const cJSON *detector, *projections, *geometry, *patient, *labels;
+	const cJSON *detector, *projections, *geometry, *patient, *study, *labels;
 	char *text = NULL; /* the document has them */
 	int code;
 
@@ -521,10 +546,13 @@ static int read_document(struct scan *scan, const struct scan_calibrations *cali
 	projections = json_member(&reader, "projections", true);
 	geometry = json_member(&reader, "geometry", true);
 	patient = json_member(&reader, "patient", false);
+	study = json_member(&reader, "study", false);
 	labels = json_member(&reader, "labels", false);
 	code = json_end(&reader);
 	if (code == 0)
-		code = patient_read(patient, "/patient", &scan->patient, err);
+		code = read_patient(scan, patient, err);
+	if (code == 0)
+		code = read_study(scan, study, err);
 	if (code == 0)
 		code = labels_read(labels, "/labels", &text, err);
 	free(text);

@@ -3,6 +3,7 @@
 
 #include "core/backend.h"
 #include "core/scan/orbit.h"
+#include "proto/subject.h"
 #include "proto/json.h"
 #include "proto/patient.h"
 
@@ -21,12 +22,13 @@ struct scan {
 	bool has_air_region;
 	int air_region[4]; /* first column, first row, last column, last row */
 	double hardening[HARDENING_MOST];
-	int hardening_count; /* coefficients, 0: none */
-	struct patient patient;
+	int hardening_count;    /* coefficients, 0: none */
+	struct patient patient; /* how the patient lies */
+	struct subject subject; /* who that is, and the study */
 	struct geometry geometry;
 	struct orbit orbit;
 	int *projection; /* [count], owned, after scan_reduce: the number of each view's projection; NULL: its own */
-	cJSON *document; /* as posted, checked: members name, patient, labels, detector, projections, geometry */
+	cJSON *document; /* as posted, checked: members name, patient, study, labels, detector, projections, geometry */
 };
 
 extern const char *const sample_names[2];   /* "float32", "uint16" */

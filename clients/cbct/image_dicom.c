@@ -6,7 +6,8 @@
  * XA: Positioner Primary and Secondary Angle, and their increments, which are one
  * step for all frames or each frame's offset from the first (C.8.7.5.1.3). Enhanced
  * XA: the same attributes in the functional groups, shared or of each frame. Patient
- * Position (0018,5100) and Patient Orientation (0020,0020) are the file's.
+ * Position (0018,5100) and Patient Orientation (0020,0020) are the file's, and so
+ * are patient and study.
  */
 #include <dirent.h>
 #include <errno.h>
@@ -43,6 +44,7 @@ struct dicom {
 	bool mirrored;
 	int patient;                /* enum patient_position, -1: not told */
 	char towards[2];            /* sides of the patient, 0: not told */
+	struct subject subject;     /* of patient and study */
 	struct dicom_values object; /* of the file itself, or of the functional groups that frames share */
 	struct dicom_values *frame; /* [frames], Enhanced XA */
 	double *increments[2];      /* primary, secondary */
@@ -176,6 +178,21 @@ static void read_patient_orientation(struct dicom *dicom, const char *text)
 	dicom->towards[1] = behind[1];
 }
 
+/* Patient and study; a value that DICOM itself would not have there is left out, and told without being shown. */
+static void read_subject(struct reader *reader)
+{
+	for (int i = 0; i < SUBJECT_COUNT; i++) {
+		const struct subject_row *row = &subject_rows[i];
+		char tag[16];
+
+		snprintf(tag, sizeof(tag), "%04x,%04x", row->group, row->element);
+		if (strcmp(tag, reader->tag) == 0 &&
+		    !subject_take(&reader->dicom->subject, (enum subject_field)i, reader->text))
+			fprintf(stderr, "note: (%s) is no value of the %s's %s, and is left out\n", tag, row->object,
+				row->name);
+	}
+}
+
 /* What the file itself says, outside of any sequence. */
 static void read_top(struct reader *reader)
 {
@@ -193,6 +210,7 @@ static void read_top(struct reader *reader)
 		else
 			*(long *)((char *)dicom + counts[i].offset) = (long)value;
 	}
+	read_subject(reader);
 	if (strcmp(reader->tag, "0018,1520") == 0)
 		read_increments(reader, 0);
 	else if (strcmp(reader->tag, "0018,1521") == 0)
@@ -317,7 +335,8 @@ static int parse_attributes(struct dicom *dicom, const char *xml, size_t length,
 {
 	struct reader reader = {.dicom = dicom, .err = err, .frame = -1, .text = malloc(TEXT_MAX)};
 
-	reader.parser = XML_ParserCreate(NULL);
+	/* dcm2xml names the encoding that it converted from. */
+	reader.parser = XML_ParserCreate("UTF-8");
 	if (reader.parser == NULL || reader.text == NULL) {
 		reader.code = error_set(err, ERR_NO_MEMORY, "no memory for attributes");
 		goto out;
@@ -338,8 +357,9 @@ out:
 static int read_attributes(struct dicom *dicom, struct error *err)
 {
 	/* Texts up to 1 MB: that of 20000 increments; a name in letters of no declared set is let through. */
-	const char *const arguments[] = {"dcm2xml",          "--quiet", "--max-read-length", "1024",
-					 "--charset-assume", "latin-1", dicom->path,         NULL};
+	const char *const arguments[] = {
+	    "dcm2xml", "--quiet",           "--max-read-length", "1024", "--charset-assume",
+	    "latin-1", "--convert-to-utf8", dicom->path,         NULL};
 	char *xml = NULL;
 	size_t length = 0;
 	int code = tool_run(arguments, "dcmtk", &xml, &length, err);
@@ -436,6 +456,7 @@ static int understand(struct image_file *file, const struct dicom *dicom, struct
 	file->columns = dicom->columns <= DETECTOR_MAX ? (int)dicom->columns : 0;
 	file->rows = dicom->rows <= DETECTOR_MAX ? (int)dicom->rows : 0;
 	file->count = dicom->frames > VIEWS_MAX ? 0 : (int)dicom->frames;
+	file->subject = dicom->subject;
 	if (file->columns < 1 || file->rows < 1 || file->count < 1)
 		return error_set(err, ERR_INVALID, "a DICOM file of %ld x %ld pixels and %ld frames", dicom->columns,
 				 dicom->rows, dicom->frames);

@@ -290,6 +290,10 @@ static int same_as_first(const struct images *images, const struct image_file *f
 				 pixel_type_names[file->type], pixel_type_names[images->type]);
 	if ((file->positions != NULL) != (images->positions != NULL))
 		return error_set(err, ERR_INVALID, "%.120s: another kind of file than the first", path);
+	for (int i = 0; i <= STUDY_UID; i++)
+		if (strcmp(file->subject.text[i], images->subject.text[i]) != 0)
+			return error_set(err, ERR_INVALID, "%.120s: its %s's %s is another than the first's", path,
+					 subject_rows[i].object, subject_rows[i].name);
 	return 0;
 }
 
@@ -336,6 +340,7 @@ static int look_into(struct images *images, int entry, struct error *err)
 		images->has_stack = file->has_stack;
 		images->stack = file->stack;
 		images->intensity = file->intensity;
+		images->subject = file->subject;
 		images->flip_columns = files->options->flip_columns;
 		images->flip_rows = files->options->flip_rows;
 		memcpy(images->pixel, file->pixel, sizeof(images->pixel));

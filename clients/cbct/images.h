@@ -5,6 +5,7 @@
 #include <stddef.h>
 
 #include "clients/cbct/options.h"
+#include "proto/subject.h"
 #include "proto/pixel.h"
 #include "proto/rtk_geometry.h"
 
@@ -46,6 +47,7 @@ struct image_file {
 	struct rtk_stack stack;           /* where the pixels lie, of a MetaImage */
 	struct image_position *positions; /* [count], owned; NULL but for DICOM */
 	const char *intensity;            /* DICOM's Pixel Intensity Relationship, "" elsewhere; a literal */
+	struct subject subject;           /* of a DICOM file; nothing told elsewhere */
 	void *state;                      /* the format's own */
 };
 
@@ -71,13 +73,14 @@ struct images {
 	struct image_position *positions; /* [count] or NULL */
 	bool flip_columns, flip_rows;     /* the images are mirrored as they are read */
 	const char *intensity;
+	struct subject subject;
 	struct images_files *files; /* images.c's own */
 };
 
 /*
  * `path` is a file, a folder (its images in the order of their numbers), or a .txt
- * or .lst file with a name a line, relative to it. All images must agree in size
- * and type. ERR_INVALID names the file that does not.
+ * or .lst file with a name a line, relative to it. All images must agree in size,
+ * type, patient and study. ERR_INVALID names the file that does not.
  */
 int images_open(const char *path, const struct image_options *options, struct images **ret_images, struct error *err);
 /* [row][column] of image `index`, mirrored as asked for. One after the other is fast, to and fro need not be. */

@@ -59,6 +59,22 @@ static const char *scan_name(const struct import_options *options)
 	return slash != NULL && slash[1] != '\0' ? slash + 1 : options->images;
 }
 
+/* How the patient lies and who that is make one member, the study another. */
+static void add_patient(cJSON *document, const struct patient *patient, const struct subject *subject)
+{
+	cJSON *told = subject_json(subject), *who = cJSON_GetObjectItemCaseSensitive(told, "patient");
+	cJSON *lies = patient->known ? patient_json(patient) : NULL, *member;
+
+	if (patient->known && who == NULL)
+		who = cJSON_AddObjectToObject(told, "patient");
+	while (lies != NULL && (member = cJSON_DetachItemFromArray(lies, 0)) != NULL)
+		cJSON_AddItemToObject(who, member->string, member);
+	while (told != NULL && (member = cJSON_DetachItemFromArray(told, 0)) != NULL)
+		cJSON_AddItemToObject(document, member->string, member);
+	cJSON_Delete(lies);
+	cJSON_Delete(told);
+}
+
 static int make_document(const struct import_options *options, struct images *images, cJSON *document,
 			 struct error *err)
 {
@@ -69,8 +85,7 @@ static int make_document(const struct import_options *options, struct images *im
 	if (code == 0)
 		code = import_values(&options->values, images, &projections, err);
 	cJSON_AddStringToObject(document, "name", scan_name(options));
-	if (patient.known)
-		cJSON_AddItemToObject(document, "patient", patient_json(&patient));
+	add_patient(document, &patient, &images->subject);
 	cJSON_AddItemToObject(document, "detector", detector);
 	cJSON_AddItemToObject(document, "projections", projections);
 	cJSON_AddItemToObject(document, "geometry", geometry);

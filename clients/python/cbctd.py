@@ -373,7 +373,8 @@ class Client:
         dtype: npt.DTypeLike = np.float32,
         name: Optional[str] = None,
         quantity: str = "line_integral",
-        patient: Union[str, npt.ArrayLike, None] = None,
+        patient: Union[str, Mapping[str, Any], npt.ArrayLike, None] = None,
+        study: Optional[Mapping[str, str]] = None,
         **projections: Any,
     ) -> Document:
         """Announces a scan; returns its document, with ``id``, ``derived`` and ``warnings``.
@@ -386,7 +387,9 @@ class Client:
             quantity: ``line_integral``, or ``intensity`` with ``air=60000`` or with `put_flat` later.
             patient: how the patient lies: ``"HFS"``, ``"HFP"``, ``"FFS"``, ``"FFP"``, ``"HFDL"``, ``"HFDR"``,
                 ``"FFDL"`` or ``"FFDR"`` on a table to which the world is fixed, or a rigid 4 x 4 matrix from the world
-                to the patient's LPS mm; None: not known, and then nothing says where left and right are.
+                to the patient's LPS mm; None: not known, and then nothing says where left and right are. A mapping is
+                the request's own member, which also has ``name``, ``id``, ``birth_date`` and ``sex``.
+            study: ``uid``, ``accession_number``, ``description`` and others, for DICOM.
             projections: more members of ``projections`` in the request, e.g. ``air``, ``saturation``.
         """
         views, rows, columns = (int(n) for n in shape)
@@ -401,6 +404,8 @@ class Client:
             request["name"] = name
         if patient is not None:
             request["patient"] = _patient(patient)
+        if study is not None:
+            request["study"] = dict(study)
         _check("scan", request)
         # A second one by mistake would stay for ever.
         return self._json("POST", "/v1/scans", json=request, repeatable=False)
@@ -1126,9 +1131,11 @@ def _volume(part: _Part) -> Volume:
     )
 
 
-def _patient(patient: Union[str, npt.ArrayLike]) -> Document:
+def _patient(patient: Union[str, Mapping[str, Any], npt.ArrayLike]) -> Document:
     if isinstance(patient, str):
         return {"position": patient}
+    if isinstance(patient, Mapping):
+        return dict(patient)
     return {"world_to_patient": np.asarray(patient, np.float64).ravel().tolist()}
 
 

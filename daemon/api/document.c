@@ -141,7 +141,7 @@ cJSON *scan_document(struct stored_scan *stored, bool brief)
 		return document;
 	}
 	add_posted(document, scan);
-	if (!scan->patient.known)
+	if (!cJSON_HasObjectItem(document, "patient"))
 		cJSON_AddNullToObject(document, "patient");
 	cJSON_AddItemToObject(document, "axes", patient_axes_json(&scan->patient));
 	if (!add_received(document, stored, facts.count)) {

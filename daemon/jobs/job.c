@@ -26,7 +26,7 @@ static struct job *job_new(struct jobs *jobs, struct job_record *record)
 		return NULL;
 	job->jobs = jobs;
 	job->record = *record;
-	record->request = record->key = NULL;
+	record->request = record->key = record->subject = NULL;
 	memcpy(job->id, record->id, sizeof(job->id));
 	memcpy(job->scan, record->scan, sizeof(job->scan));
 	job->references = 1;
@@ -339,7 +339,20 @@ int jobs_repeat(struct jobs *jobs, const char *key, const uint8_t digest[32], st
 	return 0;
 }
 
-static int fill_record(struct job_record *record, const struct job_request *request, const char *scan,
+/* The patient and the study are those of this scan, for ever; nothing else can give a job any. */
+static int copy_subject(struct job_record *record, const struct scan *scan, struct error *err)
+{
+	cJSON *document;
+
+	if (!subject_known(&scan->subject, NULL))
+		return 0;
+	document = subject_json(&scan->subject);
+	record->subject = document == NULL ? NULL : json_print(document, NULL);
+	cJSON_Delete(document);
+	return record->subject == NULL ? error_set_errno(err, ENOMEM, "job") : 0;
+}
+
+static int fill_record(struct job_record *record, const struct job_request *request, struct stored_scan *scan,
 		       const struct recon_memory *memory, const char *key, const uint8_t digest[32], struct error *err)
 {
 	cJSON *document = job_request_json(request);
@@ -349,7 +362,9 @@ static int fill_record(struct job_record *record, const struct job_request *requ
 	record->key = key == NULL ? NULL : strdup(key);
 	if (record->request == NULL || (key != NULL && record->key == NULL))
 		return error_set_errno(err, ENOMEM, "job");
-	memcpy(record->scan, scan, sizeof(record->scan));
+	if (copy_subject(record, stored_scan_parsed(scan), err) != 0)
+		return err->code;
+	memcpy(record->scan, stored_scan_id(scan), sizeof(record->scan));
 	record->priority = request->priority;
 	record->mu_water = request->recipe.mu_water;
 	record->iterations = request->recipe.algorithm != NULL ? request->recipe.iterate.iterations : 0;
@@ -408,7 +423,7 @@ int jobs_post(struct jobs *jobs, const struct job_request *request, struct store
 	struct job_record record = {0};
 	struct job *repeat = NULL, *job = NULL;
 	struct job_facts facts;
-	int code = fill_record(&record, request, stored_scan_id(scan), memory, key, digest, err);
+	int code = fill_record(&record, request, scan, memory, key, digest, err);
 
 	if (code == 0) {
 		job = job_new(jobs, &record);

@@ -30,7 +30,8 @@ void job_record_clear(struct job_record *job)
 {
 	free(job->request);
 	free(job->key);
-	job->request = job->key = NULL;
+	free(job->subject);
+	job->request = job->key = job->subject = NULL;
 }
 
 void job_records_free(struct job_record *jobs, int count)

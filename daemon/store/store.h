@@ -292,6 +292,7 @@ struct job_record {
 	double mu_water;  /* 1/mm */
 	int iterations;   /* that SART will run, 0 without */
 	char *key;        /* Idempotency-Key or NULL, owned; constant after creation */
+	char *subject;    /* subject_json of its scan as text, or NULL, owned; constant after creation */
 	uint8_t digest[32];
 	bool cancel_asked;
 	int attempts; /* 1 with the first run, one more each time that a run was lost; going on after a yield is none */

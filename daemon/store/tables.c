@@ -92,6 +92,7 @@ static const struct column job_columns[] = {
     {"stamp", COLUMN_LONG, AT(job_record, stamp), .initial = "0", .assigned = true},
     {"noise_hu", COLUMN_REAL, AT(job_record, noise_hu), .nullable = true, .changes = true},
     {"tv_alpha", COLUMN_REAL, AT(job_record, tv_alpha), .nullable = true, .changes = true},
+    {"subject", COLUMN_STRING, AT(job_record, subject), .nullable = true},
 };
 
 static const struct column volume_columns[] = {

@@ -188,6 +188,9 @@ def write_dicom(document, images, out, options):
         text += f"(0018,5100) CS [{options['patient']}]\n"
     if "orientation" in options:
         text += "(0020,0020) CS [" + options["orientation"].replace("-", "\\") + "]\n"
+    for key, value in options.items():  # who:0010,0020,LO=4711
+        if key.startswith("who:"):
+            text += f"({key[4:13]}) {key[14:16]} [{value}]\n"
     text += DICOM_PIXELS.format(**parts) + parts["pixels"]
     write_dump(text, out)
 

@@ -254,14 +254,14 @@ test_dicom_tells_how_the_patient_lies() {
 	}
 	for position in HFS HFP FFS FFDR; do
 		xa "lies$position" patient=$position
-		jq -e ".patient == {position: \"$position\"}" "$work/lies$position/scan.json" >/dev/null || fail "$position in $(head -c 200 "$work/lies$position/scan.json")"
+		jq -e ".patient == {position: \"$position\", name: \"Müller^Test\"}" "$work/lies$position/scan.json" >/dev/null || fail "$position in $(head -c 200 "$work/lies$position/scan.json")"
 		cbct recon "$work/lies$position" --fdk hann --grid 42,42,42 --spacing 2 --quiet -o "$work/lies$position" >/dev/null
 		"$python" "$here/sides.py" check "$position@" "" "" "nifti,1/mm,$work/lies$position/final.nii"
 	done
 	# Nobody says: not known, and told. A patient in a chair has none of the positions.
 	for position in "" patient=SITTING; do
 		xa silent $position
-		jq -e 'has("patient") | not' "$work/silent/scan.json" >/dev/null || fail "no patient of $position"
+		jq -e '.patient == {name: "Müller^Test"}' "$work/silent/scan.json" >/dev/null || fail "no patient of $position"
 		grep -q "left and right are not known" "$work/said" || fail "said of $position, got $(cat "$work/said")"
 	done
 	how+=(--patient FFS)
@@ -269,18 +269,45 @@ test_dicom_tells_how_the_patient_lies() {
 	cmp "$work/told/scan.json" "$work/liesFFS/scan.json" || fail "--patient as the attribute"
 	how=("${how[@]:0:6}" --patient unknown)
 	xa told patient=FFS
-	jq -e 'has("patient") | not' "$work/told/scan.json" >/dev/null || fail "--patient unknown"
+	jq -e '.patient == {name: "Müller^Test"}' "$work/told/scan.json" >/dev/null || fail "--patient unknown"
 	how=("${how[@]:0:6}")
 	# At -90 degrees, the first frame, columns run to the front and rows to the feet: an image that says otherwise was mirrored.
 	xa right patient=HFS orientation=A-F
 	jq -e '.patient.position == "HFS"' "$work/right/scan.json" >/dev/null || fail "as the angles say"
 	xa wrong patient=HFS orientation=P-F
-	jq -e 'has("patient") | not' "$work/wrong/scan.json" >/dev/null || fail "sides of a mirrored image"
+	jq -e '.patient == {name: "Müller^Test"}' "$work/wrong/scan.json" >/dev/null || fail "sides of a mirrored image"
 	grep -q 'Patient Orientation P\\F contradicts' "$work/said" || fail "the contradiction, got $(cat "$work/said")"
 	how+=(--flip-columns)
 	xa wrong patient=HFS orientation=P-F
 	jq -e '.patient.position == "HFS"' "$work/wrong/scan.json" >/dev/null || fail "mirrored back"
 	refused 2 "none of HFS" cbct import "$work/wrong.dcm" --air 5 --patient supine -o "$work/never"
+}
+
+# Who it is and for which study; files of two patients are no scan, and a value that is none is not taken for one.
+test_dicom_tells_who_the_patient_is() {
+	local how=(--air 50000 --source-to-isocentre 600 --name 'who') one=(who:0010,0020,LO=4711 who:0010,0030,DA=19700228
+		who:0010,0040,CS=F who:0020,000d,UI=1.2.3 who:0008,0050,SH=A17 who:0008,0090,PN=House^G who:0008,0020,DA=20261123 who:0008,0030,TM=043059.25)
+	need_dcmtk
+	need_numpy
+	make_scans
+	xa() { # NAME [OPTION ...]
+		images dicom "$counts" "$work/$1.dump" "${@:2}"
+		mkdir -p "$work/$1"
+		(cd "$work" && dump2dcm --quiet "$1.dump" "$1/one.dcm")
+	}
+	xa who "${one[@]}"
+	cbct import "$work/who" "${how[@]}" -o "$work/scan-of-who" 2>/dev/null
+	jq -e '.patient == {name: "Müller^Test", id: "4711", birth_date: "1970-02-28", sex: "F"} and .study == {uid: "1.2.3",
+		accession_number: "A17", referring_physician: "House^G", date: "2026-11-23", time: "04:30:59"}' "$work/scan-of-who/scan.json" >/dev/null ||
+		fail "patient and study, got $(head -c 400 "$work/scan-of-who/scan.json")"
+	xa other "${one[@]}" who:0010,0020,LO=4712
+	cp "$work/other/one.dcm" "$work/who/two.dcm"
+	refused 1 "two.dcm: its patient's id is another than the first's" cbct import "$work/who" "${how[@]}" -o "$work/never"
+	xa odd "${one[@]}" who:0010,0030,DA=19700231 who:0010,0040,CS=X
+	cbct import "$work/odd" "${how[@]}" -o "$work/scan-of-odd" 2>"$work/said"
+	jq -e '.patient == {name: "Müller^Test", id: "4711"}' "$work/scan-of-odd/scan.json" >/dev/null || fail "values that are none are left out"
+	grep -q "(0010,0030) is no value of the patient's birth_date" "$work/said" || fail "told, got $(cat "$work/said")"
+	! grep -q 19700231 "$work/said" || fail "a value was shown"
 }
 
 # Read as DICOM shows them, the frames are the scan's turned by half a turn, and so is their detector.

@@ -134,6 +134,52 @@ test_labels_are_kept_and_shown() {
 	done
 }
 
+# Who it is: of the scan alone, kept with its jobs, never in a log, in metrics or in a file that does not ask for it.
+test_who_the_patient_is_stays_with_the_scan_and_its_jobs() {
+	local who='{"name": "Quarx^J\u00f6rg", "id": "ID-8315", "birth_date": "1970-02-28", "sex": "M"}' other='{"position": "FFS", "name": "Zwolle^Anna"}'
+	local study='{"uid": "1.2.3.4", "accession_number": "ACC-4711", "referring_physician": "House^G"}' first document='{"detector": {"columns": 4, "rows": 3, "pixel_mm": [1, 1]},
+		"projections": {"count": 2, "sample": "float32", "quantity": "line_integral"}, "geometry": {"kind": "circular", "source_to_isocentre_mm": 600, "source_to_detector_mm": 1000, "angle_step_deg": 180}}'
+	start_daemon
+	post() { # PATIENT STUDY: a scan and a job of it, with its subject in the catalogue
+		req POST /v1/scans -H 'Content-Type: application/json' --data-binary "$(jq -c --argjson patient "$1" --argjson study "$2" '. + {patient: $patient, study: $study}' <<<"$document")"
+		expect_status 201
+		expect_json ".patient == $1"
+		scan=$(json .id)
+		post_job '{"scan": "SCAN", "fdk": {}}'
+		! grep -q 'Quarx\|Zwolle\|8315' "$body" || fail "a name in the job's document"
+	}
+	kept() { sqlite3 "$state/catalogue.sqlite" "SELECT subject FROM jobs WHERE id = '$1'"; }
+	post "$who" "$study"
+	expect_json '.patient == null and .axes == null'
+	first=$job
+	post "$other" null
+	expect_json '.patient == {position: "FFS"}'
+	[ "$(kept "$first" | jq -cS .)" = "$(jq -cnS --argjson patient "$who" --argjson study "$study" '{patient: $patient, study: $study}')" ] || fail "the first job's, got $(kept "$first")"
+	[ "$(kept "$job" | jq -cS .)" = '{"patient":{"name":"Zwolle^Anna"}}' ] || fail "the second job's, got $(kept "$job")"
+	# A job cannot be given another's.
+	req POST /v1/jobs -H 'Content-Type: application/json' --data-binary "{\"scan\": \"$scan\", \"fdk\": {}, \"patient\": $who}"
+	expect_problem 400
+	req POST /v1/jobs -H 'Content-Type: application/json' --data-binary "{\"scan\": \"$scan\", \"fdk\": {}, \"study\": $study}"
+	expect_problem 400 /study
+	req POST /v1/scans -H 'Content-Type: application/json' --data-binary "$(jq -c '.patient = {name: "Quarx\\\\J"}' <<<"$document")"
+	expect_problem 400 /patient/name
+	! grep -q Quarx "$body" || fail "a name in a refusal"
+	req POST /v1/scans -H 'Content-Type: application/json' --data-binary "$(jq -c '.study = {date: "2026-02-30"}' <<<"$document")"
+	expect_problem 422 /study/date
+	req GET /v1/scans
+	! grep -q 'Quarx\|Zwolle' "$body" || fail "a name in the list"
+	req GET /metrics
+	! grep -q 'Quarx\|Zwolle\|8315' "$body" || fail "a name in the metrics"
+	# The catalogue is an index: made again, it has them from the directories.
+	stop_daemon
+	! grep -q 'Quarx\|Zwolle\|8315\|4711' "$work/cbctd.err" "$work/cbctd.out" || fail "a name in the log"
+	"$BUILD/cbctd" --state-dir "$state" --rebuild-catalogue >/dev/null 2>&1 || fail "the catalogue made again"
+	start_daemon
+	[ "$(kept "$first" | jq -c .patient.id)" = '"ID-8315"' ] || fail "made again, got $(kept "$first")"
+	req GET "/v1/scans/$scan"
+	expect_json ".patient == $other"
+}
+
 refused() { # STATUS POINTER PATIENT
 	req POST /v1/scans -H 'Content-Type: application/json' --data-binary "$(jq -c --argjson patient "$3" '.patient = $patient' "$work/scan/scan.json")"
 	expect_problem "$1" "$2"

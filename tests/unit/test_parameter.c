@@ -98,13 +98,13 @@ static const cJSON *find(const cJSON *json, const char *pointer)
 
 /* ---- a row ---- */
 
-struct subject {
+struct tested {
 	const char *name;
 	cJSON *(*rows)(void);
 	cJSON *(*with)(const char *pointer);
 	round_trip round_trip;
 };
-static const struct subject subjects[] = {
+static const struct tested subjects[] = {
     {"job", job_parameters_json, job_with, job_round_trip},
     {"scan", scan_parameters_json, scan_with, scan_round_trip},
 };
@@ -126,7 +126,7 @@ static double number_of(const cJSON *row, const char *name)
 }
 
 /* What became of the document with the value in the row's place; *ret_printed is NULL where it was refused. */
-static int try_value(const struct subject *subject, const cJSON *row, cJSON *value, char **ret_printed,
+static int try_value(const struct tested *subject, const cJSON *row, cJSON *value, char **ret_printed,
 		     struct error *err)
 {
 	cJSON *json = subject->with(text_of(row, "pointer"));
@@ -142,7 +142,7 @@ static int try_value(const struct subject *subject, const cJSON *row, cJSON *val
 }
 
 /* The value is refused with that code, at the row's pointer followed by `place`. */
-static void expect_refusal(const struct subject *subject, const cJSON *row, cJSON *value, int code, const char *place)
+static void expect_refusal(const struct tested *subject, const cJSON *row, cJSON *value, int code, const char *place)
 {
 	char pointer[200], *printed, *written = json_print(value, NULL);
 	struct error err;
@@ -159,7 +159,7 @@ static void expect_refusal(const struct subject *subject, const cJSON *row, cJSO
  * The value is taken and comes back as it was, and so does the whole document that is printed then. Where what several
  * parameters must fulfil together refuses it, the refusal must not be one of the range.
  */
-static void expect_taken(const struct subject *subject, const cJSON *row, const cJSON *value)
+static void expect_taken(const struct tested *subject, const cJSON *row, const cJSON *value)
 {
 	const char *pointer = text_of(row, "pointer");
 	char *printed, *again, *written = json_print(value, NULL);
@@ -184,7 +184,7 @@ static void expect_taken(const struct subject *subject, const cJSON *row, const 
 	free(written);
 }
 
-static void take(const struct subject *subject, const cJSON *row, cJSON *value)
+static void take(const struct tested *subject, const cJSON *row, cJSON *value)
 {
 	expect_taken(subject, row, value);
 	cJSON_Delete(value);
@@ -204,7 +204,7 @@ static double above(const cJSON *row)
 	return strstr(text_of(row, "type"), "integer") != NULL ? most + 1 : nextafter(most, INFINITY);
 }
 
-static void try_number(const struct subject *subject, const cJSON *row)
+static void try_number(const struct tested *subject, const cJSON *row)
 {
 	const bool whole = strcmp(text_of(row, "type"), "integer") == 0;
 	const char *word = text_of(row, "word");
@@ -235,7 +235,7 @@ static cJSON *list_of(const cJSON *row, int count, int odd, cJSON *value)
 	return list;
 }
 
-static void try_list(const struct subject *subject, const cJSON *row)
+static void try_list(const struct tested *subject, const cJSON *row)
 {
 	const int count = (int)number_of(row, "count");
 	const bool whole = strcmp(text_of(row, "type"), "integers") == 0;
@@ -261,7 +261,7 @@ static void try_list(const struct subject *subject, const cJSON *row)
 	expect_refusal(subject, row, cJSON_CreateNumber(1), ERR_INVALID, "");
 }
 
-static void try_row(const struct subject *subject, const cJSON *row)
+static void try_row(const struct tested *subject, const cJSON *row)
 {
 	const char *type = text_of(row, "type"), *pointer = text_of(row, "pointer"), *help = text_of(row, "help");
 	const cJSON *choices = cJSON_GetObjectItemCaseSensitive(row, "choices"), *choice;
@@ -290,7 +290,7 @@ static void try_row(const struct subject *subject, const cJSON *row)
 
 START_TEST(every_parameter_is_taken_within_its_range_only)
 {
-	const struct subject *subject = &subjects[_i];
+	const struct tested *subject = &subjects[_i];
 	cJSON *rows = subject->rows();
 	const cJSON *row;
 

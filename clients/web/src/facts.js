@@ -9,7 +9,7 @@ const times = (numbers, digits = 4) => numbers.map(value => number(value, digits
 
 const positions = { HFS: 'head first, on the back', HFP: 'head first, on the front', FFS: 'feet first, on the back', FFP: 'feet first, on the front',
 	HFDL: 'head first, on the left side', HFDR: 'head first, on the right side', FFDL: 'feet first, on the left side', FFDR: 'feet first, on the right side' }
-const patientText = patient => !patient ? 'not known how it lies' : patient.position ? `${patient.position}: ${positions[patient.position]}` : 'placed by a matrix'
+const patientText = patient => patient?.position ? `${patient.position}: ${positions[patient.position]}` : patient?.world_to_patient ? 'placed by a matrix' : 'not known how it lies'
 
 /* patient: of a job that says otherwise than its scan. */
 export function geometryFacts(scan, patient = scan.patient) {
