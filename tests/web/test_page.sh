@@ -118,6 +118,14 @@ browser_tests() {
 	cp "$here"/*.mjs "$tools/"
 	URL=$url OUT=$work SCAN=$scan FINISHED=$job NAME=$name CHROMIUM=$CHROMIUM HOME=$work timeout 600 node "$tools/page.mjs" 2>&1 | tee "$work/browser.log"
 	status=${PIPESTATUS[0]}
+	# the same job where the daemon asks who it is
+	stop_daemon
+	rm -f "$work/tokens"
+	VIEW=$(cbct token new ward --role view --file "$work/tokens" 2>/dev/null)
+	ACQUIRE=$(cbct token new arm-3 --role acquire --file "$work/tokens" 2>/dev/null)
+	start_daemon --threads 1 --tokens "$work/tokens"
+	VIEW=$VIEW ACQUIRE=$ACQUIRE URL=$url OUT=$work SCAN=$scan FINISHED=$job CHROMIUM=$CHROMIUM HOME=$work timeout 300 node "$tools/access.mjs" 2>&1 | tee -a "$work/browser.log"
+	status=$((status + PIPESTATUS[0]))
 	while read -r line; do
 		case $line in
 		pass\ * | FAIL\ *) echo "$(tr 'A-Z' 'a-z' <<<"${line%% *}") $(basename "$0") ${line#* }" | sed 's/ ([0-9.]* s)$//' >>"$RESULTS" ;;

@@ -28,6 +28,8 @@ export async function request(method, path, { body, headers, signal } = {}) {
 		body: body ? JSON.stringify(body) : undefined,
 		signal,
 	})
+	if (response.status === 401)
+		dispatchEvent(new Event('signed-out'))
 	if (!response.ok)
 		throw await problemOf(response)
 	return response.status === 204 ? null : response.json()

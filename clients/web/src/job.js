@@ -225,10 +225,10 @@ export class JobPage {
 		if (before && ended(before) === ended(job) && before.cancel_requested === job.cancel_requested)
 			return
 		replace(this.actions,
-			h('button', { type: 'button', onclick: () => reconstructAgain(this.#job, 'Reconstruct again with …') }, 'Reconstruct again …'),
+			h('button', { type: 'button', class: 'acquires', onclick: () => reconstructAgain(this.#job, 'Reconstruct again with …') }, 'Reconstruct again …'),
 			ended(job)
-				? h('button', { type: 'button', class: 'quiet danger-text', onclick: () => this.#remove() }, 'Remove …')
-				: h('button', { type: 'button', class: 'danger-text', disabled: job.cancel_requested, onclick: () => this.#cancel() }, 'Cancel …'))
+				? h('button', { type: 'button', class: 'quiet danger-text acquires', onclick: () => this.#remove() }, 'Remove …')
+				: h('button', { type: 'button', class: 'danger-text acquires', disabled: job.cancel_requested, onclick: () => this.#cancel() }, 'Cancel …'))
 	}
 
 	#cancel() {

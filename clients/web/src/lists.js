@@ -92,7 +92,7 @@ export class ListPage {
 			h('span', { class: 'detail' }, scan.state === 'complete' ? `${scan.projections.count} projections` : `${scan.received_count} of ${scan.projections.count} projections`,
 				` of ${scan.detector.columns} × ${scan.detector.rows}`),
 			h('span', { class: 'when' }, timeElement(scan.created)),
-			h('button', { type: 'button', class: 'quiet', 'aria-label': `Reconstruct ${scan.name || scan.id}`,
+			h('button', { type: 'button', class: 'quiet acquires', 'aria-label': `Reconstruct ${scan.name || scan.id}`,
 				onclick: () => reconstructAgain({ scan: scan.id }, `Reconstruct ${scan.name || scan.id}`) }, 'Reconstruct …'))))
 	}
 

@@ -4,6 +4,7 @@ import { get } from './api.js'
 import { ListPage } from './lists.js'
 import { JobPage } from './job.js'
 import { ScanPage } from './scan.js'
+import { keepSession } from './session.js'
 
 const devicesTime = 10000 /* ms */
 
@@ -17,9 +18,11 @@ const main = document.querySelector('main')
 const live = h('span', { class: 'live', role: 'status' })
 const devices = h('span', { class: 'devices' })
 const quarantine = h('span', { class: 'devices bad' })
-document.querySelector('.status').append(quarantine, devices, live)
+const status = document.querySelector('.status')
+status.append(quarantine, devices, live)
 
 let page = null
+let known = false /* who uses the page */
 
 const tools = {
 	title: text => document.title = `${text} · cbctd`,
@@ -45,7 +48,7 @@ function open() {
 }
 
 async function showDevices() {
-	if (document.hidden)
+	if (document.hidden || !known)
 		return
 	try {
 		const { devices: list } = await get('/v1/devices')
@@ -66,9 +69,27 @@ document.querySelector('.skip').addEventListener('click', event => {
 	main.focus()
 })
 addEventListener('hashchange', () => {
+	if (!known)
+		return
 	open()
 	main.focus({ preventScroll: true })
 })
-open()
-showDevices()
+keepSession({
+	main,
+	status,
+	open() {
+		known = true
+		open()
+		showDevices()
+	},
+	close() {
+		known = false
+		page?.close()
+		page = null
+		tools.live(null)
+		replace(devices)
+		replace(quarantine)
+		document.title = 'cbctd'
+	},
+})
 setInterval(showDevices, devicesTime)

@@ -25,8 +25,8 @@ export class ScanPage {
 		this.element = h('div', { class: 'scan' },
 			h('header', { class: 'head' }, h('a', { class: 'back', href: '#/' }, '‹ Jobs'), h('div', { class: 'title' }, this.heading, this.state),
 				h('div', { class: 'actions' },
-					h('button', { type: 'button', class: 'primary', onclick: () => this.#scan && reconstructAgain({ scan: this.#scan.id }, `Reconstruct ${this.#scan.name}`) }, 'Reconstruct …'),
-					h('button', { type: 'button', class: 'quiet danger-text', onclick: () => this.#remove() }, 'Remove …'))),
+					h('button', { type: 'button', class: 'primary acquires', onclick: () => this.#scan && reconstructAgain({ scan: this.#scan.id }, `Reconstruct ${this.#scan.name}`) }, 'Reconstruct …'),
+					h('button', { type: 'button', class: 'quiet danger-text acquires', onclick: () => this.#remove() }, 'Remove …'))),
 			this.trouble, this.warnings,
 			h('div', { class: 'columns' }, h('section', { class: 'card' }, h('h2', {}, 'Projections'), this.film.element),
 				h('div', { class: 'aside' }, h('section', { class: 'card' }, h('h2', {}, 'Geometry'), this.geometry))))

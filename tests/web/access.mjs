@@ -1,0 +1,100 @@
+/* Signing in to the page, and what it then offers: run by test_page.sh against a daemon that asks for tokens. */
+import { origin, launch, software, open, realComplaints, shoot, until, expect, test, runTests, out } from './lib.mjs'
+import { readFileSync } from 'node:fs'
+import { join } from 'node:path'
+
+const { SCAN: scan, FINISHED: finished, VIEW, ACQUIRE } = process.env
+const browser = await launch(software)
+
+async function signIn(page, token) {
+	await page.fill('#token', token)
+	await page.click('.signin button')
+}
+const tokenFor = token => ({ headers: { Authorization: `Bearer ${token}` } })
+
+test('the page asks for a token, and a wrong one gets nothing', async () => {
+	const page = await open(browser, `/#/jobs/${finished}`)
+	await page.waitForSelector('.signin')
+	await shoot(page, 'sign-in')
+	await signIn(page, `${VIEW}x`)
+	await until('a refusal', () => page.textContent('.signin .trouble'), text => text === 'No valid token.')
+	expect((await page.context().cookies()).length === 0, 'no cookie')
+	expect(await page.locator('.head').count() === 0, 'nothing of the job')
+	await page.context().close()
+})
+
+test('who may view sees volumes, events and downloads, and is offered nothing more', async () => {
+	const page = await open(browser, `/#/jobs/${finished}`)
+	await signIn(page, VIEW)
+	await page.waitForSelector('.head .badge.succeeded')
+	await page.waitForSelector('[data-plane="z"] canvas.slice:not([hidden])')
+	expect((await page.textContent('.who')).includes('ward (view)'), 'who it is')
+	const [cookie] = await page.context().cookies()
+	expect(cookie.httpOnly && cookie.sameSite === 'Strict' && cookie.value !== VIEW, `a cookie that scripts cannot read: ${JSON.stringify(cookie)}`)
+	expect(await page.evaluate(() => document.cookie) === '', 'no cookie for scripts')
+	expect(!JSON.stringify(await page.evaluate(() => ({ ...localStorage, ...sessionStorage }))).includes('cbct_'), 'the token is kept nowhere')
+	expect(await page.locator('.acquires').count() > 0 && await page.locator('.acquires:visible').count() === 0, 'no button that the role may not use')
+	/* what the browser fetches by itself has the cookie, too */
+	const [download] = await Promise.all([
+		page.waitForEvent('download'),
+		page.evaluate(job => {
+			const link = document.createElement('a')
+			link.href = `/v1/jobs/${job}/volumes/final?format=raw`
+			document.body.append(link)
+			link.click()
+		}, finished),
+	])
+	await download.saveAs(join(out, 'downloaded.raw'))
+	expect(readFileSync(join(out, 'downloaded.raw')).length === 36 * 32 * 40 * 4, 'a whole volume')
+	await page.click('.brand')
+	await page.waitForSelector('.live[data-state=on]')
+	await page.waitForSelector(`.jobs a[href="#/jobs/${finished}"]`)
+	expect(await page.locator('.acquires:visible').count() === 0, 'no button in the lists')
+	await page.context().close()
+})
+
+test('who may acquire reconstructs again and removes, until signing out', async () => {
+	const page = await open(browser, `/#/scans/${scan}`)
+	await signIn(page, ACQUIRE)
+	await page.click('text=Reconstruct …')
+	await page.click('dialog button.primary')
+	await page.waitForSelector('.head .badge')
+	const job = new URL(page.url()).hash.split('/').pop()
+	await page.click('text=/Cancel …|Remove …/')
+	await page.click('dialog button.danger')
+	await until('the end of the job', async () => {
+		const response = await fetch(`${origin}/v1/jobs/${job}`, tokenFor(VIEW))
+		return response.status === 404 || ['cancelled', 'succeeded'].includes((await response.json()).state)
+	})
+	const before = await page.context().cookies()
+	await page.click('text=Sign out')
+	await page.waitForSelector('.signin')
+	expect((await page.context().cookies()).length === 0, 'the cookie is gone')
+	const old = await fetch(`${origin}/v1/scans`, { headers: { Cookie: `${before[0].name}=${before[0].value}` } })
+	expect(old.status === 401, `the session is over, got ${old.status}`)
+	/* another one in the same browser */
+	await signIn(page, VIEW)
+	await until('who it is', () => page.textContent('.who'), text => text.includes('ward'))
+	await page.context().close()
+})
+
+test('a session that ends asks again', async () => {
+	const page = await open(browser, '/')
+	await signIn(page, VIEW)
+	await page.waitForSelector(`.jobs a[href="#/jobs/${finished}"]`)
+	const [cookie] = await page.context().cookies()
+	await fetch(`${origin}/v1/session`, { method: 'DELETE', headers: { Cookie: `${cookie.name}=${cookie.value}` } })
+	await page.click(`.jobs a[href="#/jobs/${finished}"]`)
+	await page.waitForSelector('.signin')
+	await signIn(page, VIEW)
+	await page.waitForSelector('.head .badge.succeeded')
+	await page.context().close()
+})
+
+test('no errors but refusals, and nothing against the policy', async () => {
+	const wrong = realComplaints().filter(text => !/status of 40[19]/.test(text))
+	expect(wrong.length === 0, `a silent console: ${wrong.slice(0, 5).join('\n')}`)
+})
+
+await runTests()
+await browser.close()
