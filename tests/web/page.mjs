@@ -122,7 +122,8 @@ test('planes are the daemon\'s slices, pixel by pixel', async () => {
 		expect(worst <= 1, `${plane}: the same gray, ${worst} levels off`)
 		const small = shrink(slice), others = [mirrored(small), flipped(small), mirrored(flipped(small)), transposed(small)]
 		expect(others.every(other => correlation(small, other) < 0.9), `${plane}: a slice that a mirror would change`)
-		/* And so on the screen, with all that the style sheet does to it. */
+		/* And so on the screen, with all that the style sheet does to it, but for what is written over it. */
+		await page.$$eval(`${tile(plane)} > :not(.stage), ${tile(plane)} .overlay`, labels => labels.forEach(label => label.style.visibility = 'hidden'))
 		const seen = shrink(grayOf(await page.locator(`${tile(plane)} .frame`).screenshot()))
 		const likeness = correlation(small, seen)
 		expect(likeness > 0.85 && others.every(other => correlation(other, seen) < likeness - 0.05), `${plane}: the right way round on the screen (${likeness})`)
@@ -278,6 +279,118 @@ test('window and level by dragging and by presets; a click moves the cross, the 
 	expect(await depthOf(page, 'x') < sagittal, 'the sagittal plane further to the right of the patient')
 	await page.mouse.wheel(0, -120)
 	await until('slices further up', () => depthOf(page, 'z'), index => index > axial)
+	await page.context().close()
+})
+
+/* ---- measuring ---- */
+
+const tool = (page, name) => page.click(`[aria-label=Measure] button[data-value=${name}]`)
+const measured = async page => page.$$eval('.measurements li', rows => rows.map(row => row.querySelector('.amount').textContent))
+
+async function drag(page, from, to) {
+	await page.mouse.move(...from)
+	await page.mouse.down()
+	await page.mouse.move(...to, { steps: 3 })
+	await page.mouse.up()
+}
+
+test('rulers and angles are true at any zoom and in turned planes; a region has the voxels\' mean', async () => {
+	const page = await openFinished(), spacing = [3, 3.4, 2.8], size = [36, 32, 40]
+	const { origin_mm: corner } = (await api(`/v1/jobs/${finished}/volumes`)).volumes[0]
+	const middle = corner.map((start, i) => start + (size[i] - 1) / 2 * spacing[i])
+	/* Where a place of a plane is on the screen: right and down in mm from its middle, of a frame that wide and high. */
+	const place = async (plane, [width, height], right, down) => spot(page, plane, 0.5 + right / width, 0.5 + down / height)
+	const upright = [size[0] * spacing[0], size[1] * spacing[1]]
+
+	await tool(page, 'ruler')
+	await drag(page, await place('z', upright, -20, -15), await place('z', upright, 25, 10))
+	await tool(page, 'angle')
+	for (const at of [[30, 0], [0, 0], [0, -30]])
+		await page.mouse.click(...await place('z', upright, ...at))
+	await tool(page, 'ellipse')
+	const [a, b] = [18, 13]
+	await drag(page, await place('z', upright, -24 - a, -20 - b), await place('z', upright, -24 + a, -20 + b))
+	await shoot(page, 'measured')
+	let [ruler, angle, region] = await measured(page)
+	expect(Math.abs(parseFloat(ruler) - Math.hypot(45, 25)) < 1.4, `${Math.hypot(45, 25)} mm, got ${ruler}`)
+	expect(Math.abs(parseFloat(angle) - 90) < 1.5, `90 degrees, got ${angle}`)
+
+	/* The mean of the voxels whose middles lie within, from the daemon's own file. */
+	const voxels = new Int16Array(await (await fetch(`${origin}/v1/jobs/${finished}/volumes/final?format=raw&type=int16`)).arrayBuffer())
+	const inside = [], z = await depthOf(page, 'z')
+	for (let y = 0; y < size[1]; y++) {
+		for (let x = 0; x < size[0]; x++) {
+			const at = [x, y].map((index, i) => corner[i] + index * spacing[i] - middle[i] - [-24, -20][i])
+			if ((at[0] / a) ** 2 + (at[1] / b) ** 2 <= 1)
+				inside.push(voxels[(z * size[1] + y) * size[0] + x])
+		}
+	}
+	const mean = inside.reduce((sum, value) => sum + value, 0) / inside.length
+	expect(Math.abs(parseFloat(region.replace('−', '-')) - mean) < 0.5, `a mean of ${mean} HU, got ${region}`)
+	expect(Math.abs(parseFloat(region.split('HU, ')[1]) - Math.PI * a * b) < 0.03 * Math.PI * a * b, `an area of ${Math.PI * a * b} mm2, got ${region}`)
+
+	/* Zoomed three times about the middle. */
+	await page.focus(tile('z'))
+	await page.mouse.move(...await spot(page, 'z', 0.5, 0.5))
+	for (let i = 0; i < 5; i++)
+		await page.keyboard.press('+')
+	const zoom = 1.25 ** 5
+	await tool(page, 'ruler')
+	await drag(page, await place('z', upright, -12 * zoom, -10 * zoom), await place('z', upright, 10 * zoom, 9 * zoom))
+	ruler = (await measured(page))[3]
+	expect(Math.abs(parseFloat(ruler) - Math.hypot(22, 19)) < 1.4, `zoomed: ${Math.hypot(22, 19)} mm, got ${ruler}`)
+	await page.keyboard.press('r')
+
+	/* The sagittal plane turned by 30 degrees about z: as wide as the box is along its columns. */
+	await page.focus(tile('z'))
+	for (let i = 0; i < 30; i++)
+		await page.keyboard.press(']')
+	await page.click('[aria-label="What is shown"] button[data-value=x]')
+	const turned = [Math.sin(Math.PI / 6) * upright[0] + Math.cos(Math.PI / 6) * upright[1], size[2] * spacing[2]]
+	expect((await page.textContent(`${tile('x')} .name`)).includes('turned'), 'said on the picture')
+	await until('a picture of it', async () => {
+		const box = await page.locator(`${tile('x')} .frame`).boundingBox()
+		return box.width / box.height - turned[0] / turned[1]
+	}, off => Math.abs(off) < 0.01)
+	expect(/^A[LR]|^P[LR]/.test(await page.textContent(`${tile('x')} .edge.left`)), 'letters of the turned plane')
+	await page.click('[aria-label=Measure] button[data-value=ruler]')
+	await page.click('[aria-label=Measure] button[data-value=ruler]')
+	await drag(page, await place('x', turned, -30, -25), await place('x', turned, 20, 15))
+	ruler = (await measured(page))[4]
+	expect(Math.abs(parseFloat(ruler) - Math.hypot(50, 40)) < 1.4, `turned: ${Math.hypot(50, 40)} mm, got ${ruler}`)
+	await shoot(page, 'measured-turned')
+
+	/* Its pixels are the daemon's. */
+	const [window, level] = await windowOf(page)
+	const [cos, sin] = [Math.cos(Math.PI / 6), Math.sin(Math.PI / 6)], here = [0, 1, 2].map(i => corner[i] + Math.floor(size[i] / 2) * spacing[i])
+	for (const slab of ['', '&thickness=10&mode=max', '&thickness=10']) {
+		await page.selectOption('[aria-label=Thickness]', slab ? '10' : '0')
+		if (slab)
+			await page.selectOption('[aria-label="Slab shows"]', slab.includes('max') ? 'max' : 'mean')
+		await page.waitForTimeout(400)
+		const drawn = await planePixels(page, 'x'), along = [0, 1].reduce((sum, i) => sum + (here[i] - middle[i]) * [cos, sin][i], 0)
+		const center = [middle[0] + along * cos, middle[1] + along * sin, middle[2]], pitch = turned[0] / drawn.width
+		const slice = await picture(`/v1/jobs/${finished}/volumes/final/slice?normal=${cos},${sin},0&up=0,0,1&center=${center}&size=${drawn.width},${drawn.height}&spacing=${pitch}&window=${window}&level=${level}${slab}`)
+		const likeness = correlation(shrink(slice), shrink(drawn))
+		expect(likeness > 0.98, `the daemon's picture of the same plane${slab}, alike by ${likeness}`)
+	}
+
+	/* A plane along two points: the cross is between them, and straight planes come back. */
+	await page.click('button:has-text("Straighten")')
+	await page.click('[aria-label="What is shown"] button[data-value=all]')
+	await tool(page, 'axis')
+	await page.mouse.click(...await place('z', upright, -30, -10))
+	await page.mouse.click(...await place('z', upright, 10, 20))
+	expect((await page.textContent(`${tile('x')} .name`)).includes('turned'), 'laid along the line')
+	await page.mouse.move(2, 2)
+	const [x, y] = (await page.textContent('.readout')).replace(/−/g, '-').match(/x (\S+)\s+y (\S+)/).slice(1).map(Number)
+	expect(Math.hypot(x - middle[0] + 10, y - middle[1] - 5) < 2, `the cross between the two, got ${x}, ${y}`)
+	await page.click('button:has-text("Reset")')
+	await page.click('.measurements li:last-child button.icon')
+	expect((await measured(page)).length === 4, 'one removed')
+	const [download] = await Promise.all([page.waitForEvent('download'), page.click('button:has-text("Export")')])
+	const exported = JSON.parse(readFileSync(await download.path(), 'utf8'))
+	expect(exported.measurements.length === 4 && Math.abs(exported.measurements[2].mean_hu - mean) < 0.5 && exported.job === finished, 'all in the file')
 	await page.context().close()
 })
 

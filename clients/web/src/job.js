@@ -1,7 +1,9 @@
 /* A job's page: its volumes as they come, and everything about how they came. */
 import { h, replace, write, throttle, newId, bytes, duration } from './dom.js'
 import { get, request, jobPath, scanPath, volumePath, listVolumes, watch } from './api.js'
-import { View, planeName, presets } from './view.js'
+import { View, planeName, presets, rotationOf } from './view.js'
+import { Measurements } from './measure.js'
+import { Tools, segments, press } from './tools.js'
 import { Viewer } from './viewer.js'
 import { Plot } from './plot.js'
 import { Film } from './film.js'
@@ -24,6 +26,8 @@ export class JobPage {
 	#mode = 'off'
 	#follow = true
 	#view = new View()
+	#measurements = new Measurements()
+	#pointed = null /* the place of the world under the mouse */
 	#abort = new AbortController()
 	#closed = false
 	#first = true
@@ -36,6 +40,10 @@ export class JobPage {
 		this.refresh = throttle(250, () => this.#refresh())
 		this.refreshVolumes = throttle(250, () => this.#refreshVolumes())
 		this.#view.addEventListener('change', ({ detail }) => this.#onView(detail))
+		this.#measurements.addEventListener('change', () => {
+			this.viewer.drawMeasurements()
+			this.second?.drawMeasurements()
+		})
 		document.addEventListener('keydown', this.onKey = event => this.#key(event))
 		this.refresh()
 		this.refreshVolumes()
@@ -55,7 +63,8 @@ export class JobPage {
 		this.trouble = h('div', { class: 'notice bad', role: 'alert', hidden: true })
 		this.stage = h('div', { class: 'stages', 'data-mode': 'off', hidden: true })
 		this.empty = h('p', { class: 'empty' }, 'No volume yet: the first appears here by itself.')
-		this.viewer = new Viewer(this.#view, { label: 'Volume', step: way => this.#step(way), shown: () => this.#onPicture() })
+		this.viewer = this.#makeViewer('Volume', () => this.#onPicture())
+		this.tools = new Tools(this.#view, this.#measurements, { voxels: () => this.viewer.voxels, facts: () => ({ job: this.id, scan: this.#job.scan, volume: this.#selected }) })
 		this.second = null
 		this.stage.append(this.viewer.element)
 		this.stage.addEventListener('pointerdown', event => this.#grabSwipe(event), { capture: true })
@@ -73,8 +82,8 @@ export class JobPage {
 		this.fileSection = h('section', { class: 'card', hidden: true }, h('h2', {}, 'Downloads'), this.files)
 		this.progress = h('div', { class: 'progress' }, this.bar.element, this.doing, this.left)
 		this.columns = h('div', { class: 'columns' },
-			h('div', { class: 'pictures' }, this.empty, this.stage, this.estimate, this.sides, this.controls),
-			h('div', { class: 'aside' }, this.warnings, this.courseSection, this.fileSection,
+			this.pictures = h('div', { class: 'pictures' }, this.empty, this.stage, this.estimate, this.sides, this.controls),
+			h('div', { class: 'aside' }, this.warnings, this.tools.section, this.courseSection, this.fileSection,
 				h('section', { class: 'card' }, h('h2', {}, 'Projections'), this.film.element),
 				h('section', { class: 'card' }, h('h2', {}, 'Reconstruction'), this.about),
 				h('section', { class: 'card' }, h('h2', {}, 'Geometry'), this.geometry)))
@@ -83,6 +92,10 @@ export class JobPage {
 				this.progress),
 			this.announce, this.trouble, this.failure,
 			this.columns)
+	}
+
+	#makeViewer(label, shown) {
+		return new Viewer(this.#view, { label, shown, step: way => this.#step(way), measurements: this.#measurements, pointed: point => this.#point(point) })
 	}
 
 	#iterationControls() {
@@ -97,8 +110,6 @@ export class JobPage {
 	}
 
 	#viewControls() {
-		const radio = (name, entries, current, act) => h('div', { class: 'segments', role: 'group', 'aria-label': name }, entries.map(([value, label, hint]) =>
-			h('button', { type: 'button', title: hint ?? null, 'data-value': value, 'aria-pressed': String(value === current), onclick: () => act(value) }, label)))
 		this.presets = h('div', { class: 'segments', role: 'group', 'aria-label': 'Window presets' }, presets.map((preset, i) =>
 			h('button', { type: 'button', 'data-preset': preset.name, title: `W ${preset.window} L ${preset.level} (${i + 1})`, 'aria-pressed': 'false',
 				onclick: () => this.#view.setWindow(preset.window, preset.level) }, preset.name)),
@@ -110,16 +121,28 @@ export class JobPage {
 		} })
 		this.windowBox = box('Window width, HU', 'window')
 		this.levelBox = box('Window level, HU', 'level')
-		this.tools = radio('What dragging does', [['window', 'Window', 'Dragging changes window and level; a click moves the cross'], ['cross', 'Cross', 'Dragging moves the cross'],
-			['pan', 'Pan', 'Dragging moves a zoomed plane']], 'window', tool => this.#view.set({ tool }))
-		this.tiles = radio('What is shown', [['all', 'All'], ['z', ''], ['x', ''], ['y', ''], ['3d', '3D']], 'all', tile => this.#view.set({ tile }))
+		this.tiles = segments('What is shown', [['all', 'All'], ['z', ''], ['x', ''], ['y', ''], ['3d', '3D']], 'all', tile => this.#view.set({ tile, main: tile === 'all' ? this.#view.main : tile }))
 		this.#nameTiles()
 		this.readout = h('output', { class: 'readout' })
 		return [h('div', { class: 'group' }, h('span', { class: 'label' }, 'Window'), this.presets,
 			h('span', { class: 'numbers' }, h('label', {}, h('span', { 'aria-hidden': 'true' }, 'W'), this.windowBox), h('label', {}, h('span', { 'aria-hidden': 'true' }, 'L'), this.levelBox)), this.readout),
 		h('div', { class: 'group' }, h('span', { class: 'label' }, 'View'), this.tiles,
-			h('button', { type: 'button', class: 'quiet', title: 'Middle, no zoom (r)', onclick: () => this.#view.reset() }, 'Reset')),
-		h('div', { class: 'group' }, h('span', { class: 'label' }, 'Drag'), this.tools)]
+			h('button', { type: 'button', class: 'quiet', title: 'Middle, straight, no zoom (r)', onclick: () => this.#view.reset() }, 'Reset'),
+			this.foldButton = h('button', { type: 'button', 'aria-pressed': 'false', title: 'Without the column beside the pictures (b)', onclick: () => this.#fold() }, 'Wide'),
+			h('button', { type: 'button', title: 'All of the screen (f)', onclick: () => this.#fullScreen() }, 'Full screen')),
+		this.tools.element, this.tools.measuring, this.tools.slabs]
+	}
+
+	/* The column beside the pictures goes, and comes back. */
+	#fold() {
+		this.foldButton.setAttribute('aria-pressed', String(this.columns.classList.toggle('folded')))
+	}
+
+	#fullScreen() {
+		if (document.fullscreenElement)
+			document.exitFullscreen()
+		else
+			this.pictures.requestFullscreen?.()
 	}
 
 	/* The planes by the patient's axes where they are known, else by the world's. */
@@ -165,7 +188,7 @@ export class JobPage {
 			const job = await get(jobPath(this.id), this.#abort.signal)
 			const before = this.#job
 			this.#job = job
-			this.#view.set({ sides: job.axes })
+			this.#view.set({ sides: job.axes, rotation: rotationOf(job) })
 			this.sides.hidden = job.axes !== null
 			/* Of a complete one the warnings still change with the image that a job waits for. */
 			if (this.#scan === null || ((this.#scan.state !== 'complete' || before?.state === 'waiting') && !ended(job)))
@@ -200,6 +223,9 @@ export class JobPage {
 			}
 			this.#watch()
 		}
+		const shown = this.#volumes[this.#index()]
+		if (shown)
+			this.viewer.setWhat(this.#whatOf(shown))
 		this.bar.show(job)
 		write(this.doing, job.state === 'waiting' && job.waiting_for.includes('projections') ? `${scan.received_count} of ${scan.projections.count} projections are here` : doing(job))
 		write(this.left, left(job) || (job.ended ? duration(job.timings.total) : ''))
@@ -343,12 +369,21 @@ export class JobPage {
 		this.slider.setAttribute('aria-valuetext', text)
 		write(this.sliderText, text)
 		this.viewer.tag.textContent = volume.name
+		this.viewer.setWhat(this.#whatOf(volume))
+		this.tools.show()
 		this.estimate.hidden = !volume.metal
 		write(this.estimate, volume.metal ? `Within ${volume.metal.estimate_within_mm} mm of metal this volume is an estimate: do not measure there.` : '')
 		this.back.disabled = index === 0
 		this.forth.disabled = index === this.#volumes.length - 1
 		this.#showPlot()
 		this.#showFiles()
+	}
+
+	/* Which volume of which recipe, in a few words: on every picture. */
+	#whatOf(volume) {
+		const job = this.#job
+		const after = volume.iteration > 0 ? `${job?.cgls ? 'CGLS' : 'SART'} ${volume.iteration}` : 'FDK'
+		return `${volume.name} · ${after}${volume.stage !== 'fdk' && job?.tv ? ' + TV' : ''}${job?.metal ? ' · metal corrected' : ''}`
 	}
 
 	#showFiles() {
@@ -404,7 +439,7 @@ export class JobPage {
 		this.swipe.remove()
 		if (mode === 'off')
 			return
-		this.second = new Viewer(this.#view, { label: 'Volume to compare with', step: way => this.#step(way), shown: () => {} })
+		this.second = this.#makeViewer('Volume to compare with', () => {})
 		this.second.element.classList.add('second')
 		this.stage.append(this.second.element)
 		if (mode === 'swipe') {
@@ -423,6 +458,7 @@ export class JobPage {
 		this.#other = name
 		this.second.show(this.id, this.#volumes.find(volume => volume.name === name))
 		this.second.tag.textContent = name
+		this.second.setWhat(this.#whatOf(this.#volumes.find(volume => volume.name === name)))
 	}
 
 	/* The line can be taken hold of in any tile. */
@@ -458,18 +494,11 @@ export class JobPage {
 		if (changed.window || changed.level)
 			this.#writeWindow()
 		if (changed.tile)
-			this.#press(this.tiles, this.#view.tile)
-		if (changed.tool) {
-			this.#press(this.tools, this.#view.tool)
+			press(this.tiles, this.#view.tile)
+		if (changed.tool)
 			this.stage.dataset.tool = this.#view.tool
-		}
 		if (changed.position)
 			this.#read()
-	}
-
-	#press(segments, value) {
-		for (const button of segments.children)
-			button.setAttribute('aria-pressed', String(button.dataset.value === value))
 	}
 
 	#writeWindow() {
@@ -488,9 +517,16 @@ export class JobPage {
 		this.#read()
 	}
 
+	/* The mouse is there, or nowhere. */
+	#point(point) {
+		this.#pointed = point
+		this.#read()
+	}
+
+	/* Place and Hounsfield units under the mouse, else at the cross. */
 	#read() {
-		const value = this.viewer.value()
-		const place = this.#view.position.map((mm, i) => `${'xyz'[i]} ${mm.toFixed(1).replace('-', '−')}`).join('  ')
+		const at = this.#pointed ?? this.#view.position, value = this.viewer.value(at)
+		const place = at.map((mm, i) => `${'xyz'[i]} ${mm.toFixed(1).replace('-', '−')}`).join('  ')
 		write(this.readout, `${place} mm${value === null ? '' : `   ${String(value).replace('-', '−')} HU`}`)
 	}
 
@@ -506,7 +542,10 @@ export class JobPage {
 			r: () => this.#view.reset(),
 			c: () => this.#volumes.length > 1 && this.#compare(modes[(modes.indexOf(this.#mode) + 1) % 3]),
 			'?': () => this.#help(),
-			Escape: () => this.#view.set({ tile: 'all' }),
+			Escape: () => this.#view.set({ tile: 'all', tool: 'window', clicks: [] }),
+			b: () => this.#fold(),
+			f: () => this.#fullScreen(),
+			p: () => this.tools.toggleCine(),
 			',': () => this.#step(-1),
 			'.': () => this.#step(1),
 		}
@@ -521,9 +560,9 @@ export class JobPage {
 	#help() {
 		const rows = [['← →', 'iteration before, iteration after (also , and .)'], ['↑ ↓', 'slice by slice; Page Up, Page Down ten; Home, End'],
 			['Shift + arrows', 'level up and down, window wider and narrower'], ['1 2 3 4', 'bone, soft tissue, lung, full'], ['+ −', 'zoom'],
-			['m', 'this plane only, and back'], ['c', 'compare: off, side by side, swipe'], ['n', 'newest volume: go with it or stay'], ['r', 'middle, no zoom'],
-			['Mouse', 'drag: window and level; click: the cross; wheel: slices; Ctrl + wheel: zoom; right button: window; middle button: pan'],
-			['Touch', 'drag: window and level; tap: the cross; two fingers: zoom and pan']]
+			['m', 'this plane only, and back; it is then the larger one'], ['[ ]', 'turn the other two planes about this one'], ['Enter', 'measuring: takes the point at the cross'], ['b f p', 'wide, full screen, cine'], ['c', 'compare: off, side by side, swipe'], ['n', 'newest volume: go with it or stay'], ['r', 'middle, straight, no zoom'],
+			['Mouse', 'drag: window and level; click: the cross; its handles: turn the other planes; wheel: slices; Ctrl + wheel: zoom; right button: window; middle button: pan'],
+			['Touch', 'drag: slices; tap, or rest and drag: the cross; two fingers: zoom and pan']]
 		const dialog = openDialog('Keys and gestures', h('p', {}, 'The arrows act on the plane that has the focus.'),
 			h('dl', { class: 'keys' }, rows.map(([key, what]) => h('div', {}, h('dt', {}, key), h('dd', {}, what)))),
 			h('div', { class: 'row end' }, h('button', { type: 'button', onclick: () => dialog.close() }, 'Close')))
@@ -537,6 +576,7 @@ export class JobPage {
 		this.#abort.abort()
 		this.stopWatching?.()
 		document.removeEventListener('keydown', this.onKey)
+		this.tools.close()
 		this.viewer.close()
 		this.second?.close()
 		this.film.close()

@@ -2,14 +2,20 @@
  * One plane of a volume in a tile: as a picture that the daemon draws (PNG)
  * until the voxels are here, from then on drawn from them. Both are the same
  * pixels in the same place: a pixel for each voxel, stretched by the browser.
+ * Turned planes and slabs are sampled, as finely as voxels and the screen are.
  */
 import { h, write, inFrame } from './dom.js'
 import { volumePath } from './api.js'
-import { planes, axes, lettersInWords, planeEdges, planeName } from './view.js'
+import { planes, axes, lettersInWords, lettersTowards, planeEdges, planeName } from './view.js'
+import { layersOf, samplePlane } from './sample.js'
+import { times } from './vector.js'
+import { Overlay } from './overlay.js'
+import { Gestures } from './gestures.js'
 
-const clickMost = 4 /* px: a pointer that moved less has clicked */
 const narrowMost = 280 /* px: below, there is no room for words beside the letters */
-const wheelStep = 40 /* of a wheel's units: one slice */
+const quickMost = 1.5e6 /* samples that are taken at once; a finer picture follows, piece by piece */
+const restTime = 120 /* ms after which it does */
+const pieceTime = 12 /* ms of a frame for it */
 
 /* Gray levels of all int16 values, as little-endian RGBA. */
 function grayTable(window, level, table) {
@@ -41,18 +47,22 @@ export class Plane {
 	#table = new Uint32Array(65536)
 	#tableOf = ''
 	#pixels = null
-	#pointers = new Map()
-	#gesture = null
-	#wheel = 0
+	#rest = null
 
-	/* shown(): called after each picture; step(direction): another iteration is asked for. */
-	constructor(name, view, { shown, step }) {
+	/*
+	 * shown(): called after each picture; step(direction): another iteration is asked for; pointed(point): the mouse is at
+	 * this place of the world, or (null) nowhere.
+	 */
+	constructor(name, view, { shown, step, pointed, measurements }) {
 		this.name = name
 		this.#view = view
 		this.shown = shown
 		this.step = step
+		this.pointed = pointed
+		this.measurements = measurements
+		this.overlay = new Overlay(name, view, measurements)
 		this.#build()
-		this.#listen()
+		new Gestures(this, view)
 		this.draw = inFrame(() => this.#draw())
 		this.place = inFrame(() => this.#place())
 		this.resizing = new ResizeObserver(this.place)
@@ -63,37 +73,60 @@ export class Plane {
 		this.image = h('img', { class: 'slice', alt: '', draggable: false, hidden: true })
 		this.canvas = h('canvas', { class: 'slice', hidden: true, role: 'img' })
 		this.picture = h('div', { class: 'picture' }, this.image, this.canvas)
-		this.crossX = h('div', { class: 'cross vertical' })
-		this.crossY = h('div', { class: 'cross horizontal' })
-		this.frame = h('div', { class: 'frame' }, this.picture, this.crossX, this.crossY)
-		this.stage = h('div', { class: 'stage' }, this.frame)
+		this.frame = h('div', { class: 'frame' }, this.picture)
+		this.stage = h('div', { class: 'stage' }, this.frame, this.overlay.element)
 		this.where = h('span', { class: 'where' })
+		this.what = h('div', { class: 'what' })
 		this.slider = h('input', { type: 'range', class: 'depth', min: '0', step: '1',
-			oninput: () => this.#view.setIndex(planes[this.name].across, Number(this.slider.value)) })
-		this.maximise = h('button', { type: 'button', class: 'maximise', title: 'This one only (m)',
-			'aria-pressed': 'false', onclick: () => this.#maximise() })
+			oninput: () => this.#view.setDepth(this.name, Number(this.slider.value)) })
+		this.enlarge = h('button', { type: 'button', class: 'maximise', title: 'This one only (m)',
+			'aria-pressed': 'false', onclick: () => this.maximise() })
 		this.title = h('span', { class: 'name' })
 		this.edges = Object.fromEntries(['left', 'right', 'top', 'bottom'].map(side => [side, h('span', { class: `edge ${side}`, 'aria-hidden': 'true' })]))
 		this.element = h('section', { class: 'tile plane', tabindex: '0', 'data-plane': this.name },
-			this.stage, h('div', { class: 'caption' }, this.title, this.where), this.maximise, Object.values(this.edges), this.slider)
+			this.stage, h('div', { class: 'caption' }, this.title, this.where), this.what, this.enlarge, Object.values(this.edges), this.slider)
 		this.#writeSides()
 	}
 
 	#writeSides() {
 		const { sides } = this.#view
-		const name = planeName(sides, this.name), edges = planeEdges(sides, this.name)
+		const name = this.#name(), edges = this.#edgeLetters()
 		write(this.title, sides === null ? `${name} plane` : name)
 		this.element.setAttribute('aria-label', `${name} plane`)
 		this.slider.setAttribute('aria-label', `${name} plane`)
-		this.maximise.setAttribute('aria-label', `Show the ${name.toLowerCase()} plane only`)
+		this.enlarge.setAttribute('aria-label', `Show the ${name.toLowerCase()} plane only`)
 		for (const [side, letters] of Object.entries(edges)) {
 			write(this.edges[side], letters)
 			this.edges[side].title = lettersInWords(letters)
 		}
 	}
 
-	#maximise() {
-		this.#view.set({ tile: this.#view.tile === this.name ? 'all' : this.name })
+	#isStraight() {
+		return this.#view.isStraight(this.name)
+	}
+
+	#name() {
+		return `${planeName(this.#view.sides, this.name)}${this.#isStraight() ? '' : ', turned'}`
+	}
+
+	#edgeLetters() {
+		const view = this.#view
+		if (this.#isStraight() || view.grid === null)
+			return planeEdges(view.sides, this.name)
+		const { right, down } = view.frame(this.name), letters = direction => lettersTowards(view.rotation, direction)
+		return { left: letters(times(right, -1)), right: letters(right), top: letters(times(down, -1)), bottom: letters(down) }
+	}
+
+	/* This one alone, and back; it is then the larger one. */
+	maximise() {
+		const alone = this.#view.tile === this.name
+		this.#view.set({ tile: alone ? 'all' : this.name, main: this.name })
+	}
+
+	/* What is being drawn by hand, or null. */
+	draft(item) {
+		this.overlay.draft = item
+		this.place()
 	}
 
 	show(source) {
@@ -108,27 +141,38 @@ export class Plane {
 		this.draw()
 	}
 
+	/* Names the volume on the picture. */
+	setWhat(text) {
+		write(this.what, text)
+	}
+
 	/* What of the view has changed. */
 	update(changed) {
-		if (changed.sides)
+		if (changed.sides || changed.turn || changed.rotation)
 			this.#writeSides()
 		if (this.#source === null)
 			return
-		if (changed.position || changed.grid)
+		if (changed.clicks || changed.tool) {
+			const { tool, clicks } = this.#view
+			this.draft(clicks?.length > 0 ? { kind: tool, points: clicks } : null)
+		}
+		if (changed.position || changed.grid || changed.turn || changed.slab)
 			this.#setDepth()
 		if (changed.tile)
-			this.maximise.setAttribute('aria-pressed', String(this.#view.tile === this.name))
-		if (changed.position || changed.grid || changed.window || changed.level)
+			this.enlarge.setAttribute('aria-pressed', String(this.#view.tile === this.name))
+		if (changed.position || changed.grid || changed.window || changed.level || changed.turn || changed.slab)
 			this.draw()
-		if (changed.position || changed.grid || changed.zoom || changed.pan || changed.tile)
+		if (changed.position || changed.grid || changed.zoom || changed.pan || changed.tile || changed.main || changed.turn)
 			this.place()
 	}
 
 	#setDepth() {
-		const { across } = planes[this.name]
-		const index = this.#view.index(across)
-		const text = `${axes[across]} ${this.#view.position[across].toFixed(1).replace('-', '−')} mm`
-		this.slider.max = String(this.#view.grid.size[across] - 1)
+		const view = this.#view, { across } = planes[this.name], { thickness, mode } = view.slab
+		const { count, index, mm } = view.depth(this.name)
+		const slab = thickness > 0 ? `, ${{ mean: 'mean', max: 'MIP', min: 'minimum' }[mode]} of ${thickness} mm` : ''
+		const place = `${mm.toFixed(1).replace('-', '−')} mm`
+		const text = this.#isStraight() ? `${index + 1} of ${count}, ${axes[across]} ${place}${slab}` : `${place} from the middle${slab}`
+		this.slider.max = String(count - 1)
 		this.slider.value = String(index)
 		this.slider.setAttribute('aria-valuetext', text)
 		write(this.where, text)
@@ -139,20 +183,17 @@ export class Plane {
 		const view = this.#view
 		if (view.grid === null)
 			return
-		const { columns, rows } = planes[this.name]
-		const width = view.grid.size[columns] * view.grid.spacing[columns]
-		const height = view.grid.size[rows] * view.grid.spacing[rows]
+		const { width, height } = view.frame(this.name)
 		const room = this.stage.getBoundingClientRect()
 		const scale = Math.min(room.width / width, room.height / height)
-		this.element.classList.toggle('narrow', room.width < narrowMost)
+		const narrow = room.width < narrowMost || room.height < narrowMost * 0.75
+		this.element.classList.toggle('narrow', narrow)
+		this.overlay.plain = narrow
 		const [x, y] = view.pan[this.name]
-		const [crossX, crossY] = view.cross(this.name)
 		this.frame.style.width = `${width * scale}px`
 		this.frame.style.height = `${height * scale}px`
-		this.frame.classList.toggle('zoomed', view.zoom > 1)
 		this.picture.style.transform = `translate(${x * 100}%, ${y * 100}%) scale(${view.zoom})`
-		this.crossX.style.left = `${crossX * 100}%`
-		this.crossY.style.top = `${crossY * 100}%`
+		this.overlay.place({ left: (room.width - width * scale) / 2, top: (room.height - height * scale) / 2, width: width * scale, height: height * scale }, room, this.#grid)
 	}
 
 	#draw() {
@@ -166,21 +207,103 @@ export class Plane {
 	}
 
 	#drawHere() {
-		const { columns, rows, across } = planes[this.name]
-		const view = this.#view, grid = this.#grid
-		const width = grid.size[columns], height = grid.size[rows]
+		const view = this.#view
+		clearTimeout(this.#rest)
+		if (this.#tableOf !== `${view.window} ${view.level}`) {
+			grayTable(view.window, view.level, this.#table)
+			this.#tableOf = `${view.window} ${view.level}`
+		}
+		if (this.#isStraight() && view.slab.thickness === 0)
+			this.#drawVoxels()
+		else
+			this.#drawSamples()
+		this.#reveal(this.canvas)
+	}
+
+	#setSize(width, height) {
 		if (this.canvas.width !== width || this.canvas.height !== height || this.#pixels === null) {
 			this.canvas.width = width
 			this.canvas.height = height
 			this.#pixels = new ImageData(width, height)
 		}
-		if (this.#tableOf !== `${view.window} ${view.level}`) {
-			grayTable(view.window, view.level, this.#table)
-			this.#tableOf = `${view.window} ${view.level}`
-		}
-		drawPlane(grid, this.name, view.index(across, grid), width, height, this.#table, new Uint32Array(this.#pixels.data.buffer))
+	}
+
+	#drawVoxels() {
+		const { columns, rows, across } = planes[this.name], grid = this.#grid
+		const width = grid.size[columns], height = grid.size[rows]
+		this.#setSize(width, height)
+		drawPlane(grid, this.name, this.#view.index(across, grid), width, height, this.#table, new Uint32Array(this.#pixels.data.buffer))
 		this.canvas.getContext('2d').putImageData(this.#pixels, 0, 0)
-		this.#reveal(this.canvas)
+	}
+
+	/* mm of a sample: no finer than voxels, nor than the screen. */
+	#pitch() {
+		const { overlay } = this, screen = 1 / (overlay.scale * (globalThis.devicePixelRatio || 1))
+		return Math.max(Math.min(...this.#grid.spacing), overlay.scale > 0 ? screen : 0)
+	}
+
+	/* A coarse picture at once where a fine one would take long; the fine one once the hand rests. */
+	#drawSamples() {
+		const view = this.#view, grid = this.#grid, frame = view.frame(this.name), { slab } = view
+		const fine = this.#pitch(), samples = frame.width * frame.height / fine ** 2 * layersOf(frame, slab, grid)
+		const coarse = fine * Math.max(1, Math.sqrt(samples / quickMost))
+		this.#sample(frame, coarse, slab)
+		if (coarse > fine)
+			this.#rest = setTimeout(() => this.#refine(frame, fine, slab), restTime)
+	}
+
+	#sizeOf(frame, pitch) {
+		return [frame.width, frame.height].map(mm => Math.max(Math.round(mm / pitch), 1))
+	}
+
+	#sample(frame, pitch, slab) {
+		const [width, height] = this.#sizeOf(frame, pitch)
+		const values = new Float32Array(width * height)
+		samplePlane(this.#grid, frame, width, height, [frame.width / width, frame.height / height], slab, values)
+		this.#put(values, width, height)
+	}
+
+	/* Row by row, a little in each frame; whatever changes meanwhile begins anew (#drawHere). */
+	#refine(frame, pitch, slab) {
+		const grid = this.#grid, [width, height] = this.#sizeOf(frame, pitch), values = new Float32Array(width * height)
+		let row = 0
+		const piece = () => {
+			const end = performance.now() + pieceTime
+			if (this.#grid !== grid || !this.element.isConnected)
+				return
+			while (row < height && performance.now() < end) {
+				const rows = Math.min(8, height - row)
+				samplePlane(grid, frame, width, height, [frame.width / width, frame.height / height], slab, values, row, row + rows)
+				row += rows
+			}
+			if (row < height) {
+				this.#rest = setTimeout(piece)
+				return
+			}
+			this.#put(values, width, height)
+		}
+		piece()
+	}
+
+	#put(values, width, height) {
+		this.#setSize(width, height)
+		const pixels = new Uint32Array(this.#pixels.data.buffer), table = this.#table
+		for (let i = 0; i < values.length; i++)
+			pixels[i] = values[i] === values[i] ? table[Math.round(values[i]) + 32768] : 0xff000000
+		this.canvas.getContext('2d').putImageData(this.#pixels, 0, 0)
+	}
+
+	#address() {
+		const view = this.#view, { job, volume } = this.#source, { across } = planes[this.name], { thickness, mode } = view.slab
+		const slab = thickness > 0 ? `&thickness=${thickness}&mode=${mode}` : ''
+		const gray = `&window=${view.window}&level=${view.level}`
+		const path = `${volumePath(job, volume.name)}/slice`
+		if (this.#isStraight())
+			return `${path}?axis=${this.name}&index=${view.index(across)}${gray}${slab}`
+		const frame = view.frame(this.name), pitch = Math.max(Math.min(...view.grid.spacing), frame.width / 1024, frame.height / 1024)
+		const list = numbers => numbers.map(part => part.toFixed(6)).join(',')
+		return `${path}?normal=${list(view.normal(this.name))}&up=${list(times(frame.down, -1))}&center=${list(frame.center)}` +
+			`&size=${this.#sizeOf(frame, pitch).join(',')}&spacing=${pitch.toFixed(6)}${gray}${slab}`
 	}
 
 	/* One picture at a time is asked for; what has changed meanwhile is asked for behind it. */
@@ -189,13 +312,10 @@ export class Plane {
 			this.#stale = true
 			return
 		}
-		const view = this.#view
-		const { job, volume } = this.#source
-		const { across } = planes[this.name]
 		const next = h('img', { class: 'slice', alt: '', draggable: false })
 		this.#loading = true
 		this.#stale = false
-		next.src = `${volumePath(job, volume.name)}/slice?axis=${this.name}&index=${view.index(across)}&window=${view.window}&level=${view.level}`
+		next.src = this.#address()
 		try {
 			await next.decode()
 			if (this.#grid === null) {
@@ -212,7 +332,7 @@ export class Plane {
 	}
 
 	#reveal(which) {
-		const text = `${planeName(this.#view.sides, this.name)} plane of ${this.#source.volume.name} at ${this.where.textContent}`
+		const text = `${this.#name()} plane of ${this.#source.volume.name} at ${this.where.textContent}`
 		this.canvas.hidden = which !== this.canvas
 		this.image.hidden = which !== this.image
 		if (which === this.image)
@@ -222,151 +342,22 @@ export class Plane {
 		this.shown()
 	}
 
-	/* ---- pointers ---- */
-
-	#listen() {
-		const stage = this.stage
-		stage.addEventListener('pointerdown', event => this.#down(event))
-		stage.addEventListener('pointermove', event => this.#move(event))
-		for (const kind of ['pointerup', 'pointercancel', 'lostpointercapture'])
-			stage.addEventListener(kind, event => this.#up(event, kind === 'pointerup'))
-		stage.addEventListener('contextmenu', event => event.preventDefault())
-		stage.addEventListener('dblclick', () => this.#maximise())
-		stage.addEventListener('wheel', event => this.#turn(event), { passive: false })
-		this.element.addEventListener('keydown', event => this.#key(event))
+	/* The voxels that are drawn; null while the daemon draws. */
+	get voxels() {
+		return this.#grid
 	}
 
-	/* A pointer in fractions of the plane: of its frame, or of the picture within, which may be zoomed. */
-	#within(element, event) {
-		const box = element.getBoundingClientRect()
-		return [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height]
-	}
-
-	#down(event) {
-		if (this.#view.grid === null)
-			return
-		const { tool, window, level } = this.#view
-		const action = event.button === 2 ? 'window' : event.button === 1 ? 'pan' : event.shiftKey ? 'cross' : tool
-		event.preventDefault()
-		this.element.focus({ preventScroll: true })
-		this.stage.setPointerCapture(event.pointerId)
-		this.#pointers.set(event.pointerId, [event.clientX, event.clientY])
-		this.#gesture = { action, window, level, moved: this.#pointers.size > 1, button: event.button, start: [event.clientX, event.clientY] }
-		if (action === 'cross')
-			this.#view.moveWithin(this.name, ...this.#within(this.picture, event))
-	}
-
-	#move(event) {
-		const before = this.#pointers.get(event.pointerId)
-		if (!before || this.#gesture === null)
-			return
-		const gesture = this.#gesture
-		if (this.#pointers.size === 2) {
-			this.#pinch(event)
-			return
-		}
-		const dx = event.clientX - gesture.start[0], dy = event.clientY - gesture.start[1]
-		if (!gesture.moved && Math.hypot(dx, dy) < clickMost)
-			return
-		gesture.moved = true
-		if (gesture.action === 'window') {
-			const gain = Math.max(gesture.window, 100) / 250
-			this.#view.setWindow(gesture.window + dx * gain, gesture.level + dy * gain)
-		} else if (gesture.action === 'cross') {
-			this.#view.moveWithin(this.name, ...this.#within(this.picture, event))
-		} else {
-			const box = this.frame.getBoundingClientRect()
-			this.#view.panBy(this.name, (event.clientX - before[0]) / box.width, (event.clientY - before[1]) / box.height)
-		}
-		this.#pointers.set(event.pointerId, [event.clientX, event.clientY])
-	}
-
-	/* Two fingers: their distance zooms, their middle pans. */
-	#pinch(event) {
-		const before = [...this.#pointers.values()]
-		this.#pointers.set(event.pointerId, [event.clientX, event.clientY])
-		const after = [...this.#pointers.values()]
-		const distance = points => Math.max(Math.hypot(points[0][0] - points[1][0], points[0][1] - points[1][1]), 1)
-		const middle = (points, i) => (points[0][i] + points[1][i]) / 2
-		const box = this.frame.getBoundingClientRect()
-		this.#gesture.moved = true
-		this.#view.panBy(this.name, (middle(after, 0) - middle(before, 0)) / box.width, (middle(after, 1) - middle(before, 1)) / box.height)
-		this.#view.zoomTo(this.#view.zoom * distance(after) / distance(before), this.name,
-			[(middle(after, 0) - box.left) / box.width, (middle(after, 1) - box.top) / box.height])
-	}
-
-	#up(event, lifted) {
-		if (!this.#pointers.delete(event.pointerId) || this.#gesture === null)
-			return
-		if (lifted && !this.#gesture.moved && this.#gesture.button === 0)
-			this.#view.moveWithin(this.name, ...this.#within(this.picture, event))
-		if (this.#pointers.size === 0)
-			this.#gesture = null
-	}
-
-	#turn(event) {
-		if (this.#view.grid === null)
-			return
-		event.preventDefault()
-		if (event.ctrlKey || event.metaKey) {
-			this.#view.zoomTo(this.#view.zoom * Math.exp(-event.deltaY / 200), this.name, this.#within(this.frame, event))
-			return
-		}
-		this.#wheel += event.deltaMode === WheelEvent.DOM_DELTA_PIXEL ? event.deltaY : event.deltaY * wheelStep
-		const steps = Math.trunc(this.#wheel / wheelStep)
-		this.#wheel -= steps * wheelStep
-		if (steps !== 0)
-			this.#go(-steps)
-	}
-
-	/* ---- keys ---- */
-
-	#go(steps) {
-		const { across } = planes[this.name]
-		this.#view.setIndex(across, this.#view.index(across) + steps)
-	}
-
-	#key(event) {
-		const view = this.#view
-		if (view.grid === null || event.target !== this.element || event.ctrlKey || event.altKey || event.metaKey)
-			return
-		const step = Math.max(view.window / 20, 1), middle = [0.5, 0.5]
-		const keys = event.shiftKey ? {
-			ArrowUp: () => view.setWindow(view.window, view.level + step),
-			ArrowDown: () => view.setWindow(view.window, view.level - step),
-			ArrowRight: () => view.setWindow(view.window + step, view.level),
-			ArrowLeft: () => view.setWindow(view.window - step, view.level),
-			'+': () => view.zoomTo(view.zoom * 1.25, this.name, middle),
-		} : {
-			ArrowUp: () => this.#go(1),
-			ArrowDown: () => this.#go(-1),
-			PageUp: () => this.#go(10),
-			PageDown: () => this.#go(-10),
-			Home: () => this.#go(-1e6),
-			End: () => this.#go(1e6),
-			ArrowLeft: () => this.step(-1),
-			ArrowRight: () => this.step(1),
-			'+': () => view.zoomTo(view.zoom * 1.25, this.name, middle),
-			'-': () => view.zoomTo(view.zoom / 1.25, this.name, middle),
-			m: () => this.#maximise(),
-		}
-		const act = keys[event.key]
-		if (act) {
-			event.preventDefault()
-			act()
-		}
-	}
-
-	/* The Hounsfield units at the position, where they are known. */
-	value() {
+	/* The Hounsfield units of the voxel at a point, where they are known. */
+	value(point) {
 		if (this.#grid === null)
 			return null
-		const { size: [nx, ny], voxels } = this.#grid
-		const [x, y, z] = [0, 1, 2].map(axis => this.#view.index(axis, this.#grid))
-		return voxels[(z * ny + y) * nx + x]
+		const { size, spacing, origin, voxels } = this.#grid
+		const [x, y, z] = point.map((mm, axis) => Math.min(Math.max(Math.round((mm - origin[axis]) / spacing[axis]), 0), size[axis] - 1))
+		return voxels[(z * size[1] + y) * size[0] + x]
 	}
 
 	close() {
+		clearTimeout(this.#rest)
 		this.resizing.disconnect()
 	}
 }

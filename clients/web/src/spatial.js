@@ -48,8 +48,9 @@ export class Spatial {
 		this.maximise = h('button', { type: 'button', class: 'maximise', title: 'This one only (m)', 'aria-label': 'Show the rendering only',
 			'aria-pressed': 'false', onclick: () => this.#maximise() })
 		this.edges = Object.fromEntries(['left', 'right', 'top', 'bottom'].map(side => [side, h('span', { class: `edge ${side}`, 'aria-hidden': 'true' })]))
+		this.what = h('div', { class: 'what' })
 		this.element = h('section', { class: 'tile spatial', tabindex: '0', 'aria-label': 'Rendering', 'data-plane': '3d' },
-			this.stage, h('div', { class: 'caption' }, h('span', { class: 'name' }, '3D')), this.maximise, Object.values(this.edges), this.note)
+			this.stage, h('div', { class: 'caption' }, h('span', { class: 'name' }, '3D')), this.what, this.maximise, Object.values(this.edges), this.note)
 		this.turn = inFrame(() => this.#render?.turn(this.#view))
 		this.settle = throttle(settleTime, () => this.#settle())
 		this.#listen()
@@ -67,7 +68,12 @@ export class Spatial {
 	}
 
 	#maximise() {
-		this.#view.set({ tile: this.#view.tile === '3d' ? 'all' : '3d' })
+		this.#view.set({ tile: this.#view.tile === '3d' ? 'all' : '3d', main: '3d' })
+	}
+
+	/* Names the volume on the picture. */
+	setWhat(text) {
+		write(this.what, text)
 	}
 
 	/* Called when the planes of that volume are there. */

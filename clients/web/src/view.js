@@ -4,6 +4,8 @@
  * the same gray, and another iteration changes neither.
  */
 
+import { add, cross as crossProduct, dot, flat, minus, norm, times, turned, unit } from './vector.js'
+
 /* Hounsfield units. */
 export const presets = [
 	{ name: 'Bone', window: 2000, level: 300 },
@@ -44,6 +46,26 @@ export const lettersInWords = letters => [...letters].map(letter => words[letter
 /* "Axial", or "z" where only the world's axis is known. */
 export const planeName = (sides, plane) => sides === null ? plane : names[sides[axes[planes[plane].across]][0]]
 
+/*
+ * The letters at the end of any direction of length 1: up to three, the nearest first. rotation: the rows of the matrix
+ * from the world to the patient's left, back and head; null where it is not known.
+ */
+export function lettersTowards(rotation, direction) {
+	const parts = rotation === null ? direction : rotation.map(row => dot(row, direction))
+	return [0, 1, 2].filter(i => Math.abs(parts[i]) >= 0.2).sort((a, b) => Math.abs(parts[b]) - Math.abs(parts[a]))
+		.map(i => rotation === null ? `${parts[i] < 0 ? '−' : '+'}${axes[i]}` : parts[i] < 0 ? 'RAI'[i] : 'LPS'[i]).join('')
+}
+
+/* The rows of that matrix, of a job's document. */
+export function rotationOf({ patient, axes: letters }) {
+	if (!letters)
+		return null
+	if (patient?.world_to_patient)
+		return [0, 4, 8].map(row => patient.world_to_patient.slice(row, row + 3))
+	const direction = letter => 'LPS'.includes(letter) ? 1 : -1
+	return ['LR', 'PA', 'SI'].map(pair => axes.map(axis => pair.includes(letters[axis][0]) ? direction(letters[axis][0]) : 0))
+}
+
 export function planeEdges(sides, plane) {
 	const { columns, rows, down } = planes[plane]
 	return { left: lettersOf(sides, columns, true), right: lettersOf(sides, columns, false), top: lettersOf(sides, rows, down), bottom: lettersOf(sides, rows, !down) }
@@ -67,6 +89,14 @@ export function renderingEdges(sides, azimuth, elevation) {
 	return { left: end(right, -1), right: end(right, 1), top: end(top, 1), bottom: end(top, -1) }
 }
 
+/* The world's own axes. */
+const straight = { x: [1, 0, 0], y: [0, 1, 0], z: [0, 0, 1] }
+/* The sides that planes are seen from: x from the end of its axis, the others from its beginning. */
+const seenFrom = { x: 1, y: -1, z: -1 }
+/* What points to the right (1) or upwards in a plane, as far as it can; a second choice where it cannot. */
+const levels = { z: [['right', [1, 0, 0]], ['up', [0, -1, 0]]], y: [['up', [0, 0, 1]], ['right', [1, 0, 0]]], x: [['up', [0, 0, 1]], ['right', [0, 1, 0]]] }
+const levelLeast = 0.3 /* sine of the angle to the plane's normal */
+
 const clamp = (value, least, most) => Math.min(Math.max(value, least), most)
 
 export class View extends EventTarget {
@@ -76,10 +106,15 @@ export class View extends EventTarget {
 	zoom = 1
 	pan = { x: [0, 0], y: [0, 0], z: [0, 0] } /* of a plane's own width and height */
 	tile = 'all' /* all, x, y, z, 3d */
-	tool = 'window' /* what dragging does: window, cross, pan */
+	tool = matchMedia('(pointer: coarse)').matches ? 'scroll' : 'window' /* what dragging does: scroll, window, cross, pan, or what is measured */
+	clicks = [] /* of what is measured by clicks */
 	azimuth = 160
 	elevation = 12
 	grid = null /* { size, spacing, origin } */
+	turn = straight /* where the volume's axes are turned to; each plane lies across one of them */
+	slab = { thickness: 0, mode: 'mean' } /* mm, 0: a plane; mean, max or min of the samples through it */
+	main = 'z' /* the tile that is larger than the others */
+	rotation = null /* rows of the matrix from the world to the patient: rotationOf */
 	sides = null /* of the patient: { x, y, z }, letters; null: not known */
 
 	/* Any of the members above; listeners are told which. */
@@ -127,6 +162,85 @@ export class View extends EventTarget {
 		this.moveTo(position)
 	}
 
+	/* ---- planes as they are turned ---- */
+
+	/* Whether the plane is one of voxels, along the volume's axes. */
+	isStraight(name) {
+		return this.turn[name][planes[name].across] > 1 - 1e-9
+	}
+
+	normal(name) {
+		return times(this.turn[name], seenFrom[name])
+	}
+
+	/*
+	 * The plane of a tile as a rectangle in the world, about the volume's middle: center, right and down (unit vectors),
+	 * width and height, mm. It shows all of the volume that there may be.
+	 */
+	frame(name, grid = this.grid) {
+		const across = this.turn[name], normal = this.normal(name)
+		const [how, level] = levels[name].find(([, direction]) => norm(flat(direction, across)) > levelLeast) ?? levels[name][1]
+		const near = unit(flat(level, across))
+		const right = how === 'right' ? near : crossProduct(near, normal), down = crossProduct(right, normal)
+		const middle = grid.origin.map((start, i) => start + (grid.size[i] - 1) / 2 * grid.spacing[i])
+		/* A plane of voxels lies in their middle, wherever within them the cross stands. */
+		const axis = planes[name].across
+		const at = this.isStraight(name)
+			? this.position.map((mm, i) => i === axis ? grid.origin[i] + this.index(i, grid) * grid.spacing[i] : mm)
+			: this.position
+		const extent = direction => direction.reduce((sum, part, i) => sum + Math.abs(part) * grid.size[i] * grid.spacing[i], 0)
+		return { center: add(middle, across, dot(minus(at, middle), across)), right, down, width: extent(right), height: extent(down), extent: extent(across) }
+	}
+
+	/* Turns the two other planes about the normal of this one through the cross, in radians, clockwise as it is seen. */
+	turnAbout(name, angle) {
+		const turn = {}
+		for (const axis of axes) {
+			const direction = axis === name ? this.turn[axis] : unit(turned(this.turn[axis], this.normal(name), -angle))
+			/* Back to the volume's own axes without a rest of the way. */
+			const rounded = direction.map(part => Math.abs(part) < 1e-9 ? 0 : Math.abs(part) > 1 - 1e-9 ? Math.sign(part) : part)
+			turn[axis] = rounded
+		}
+		this.set({ turn })
+	}
+
+	/* Lays the planes across x and y along a line through two points, and the one across z across it, at its middle. */
+	layAlong(from, to) {
+		const line = minus(to, from)
+		if (norm(line) < 1e-6)
+			return
+		const z = unit(line[2] < 0 ? times(line, -1) : line)
+		const x = unit(flat(Math.abs(z[0]) < 0.9 ? [1, 0, 0] : [0, -1, 0], z))
+		this.set({ turn: { x, y: crossProduct(z, x), z }, position: this.#within(times(add(from, to), 0.5)) })
+	}
+
+	straighten() {
+		this.set({ turn: straight })
+	}
+
+	/* How many steps there are across a plane, and at which one the position is. */
+	depth(name) {
+		const { across } = planes[name]
+		if (this.isStraight(name))
+			return { count: this.grid.size[across], index: this.index(across), mm: this.position[across] }
+		const { extent, step, from } = this.#steps(name)
+		return { count: 2 * Math.floor(extent / 2 / step) + 1, index: Math.round(from / step) + Math.floor(extent / 2 / step), mm: from }
+	}
+
+	#steps(name) {
+		const middle = this.grid.origin.map((start, i) => start + (this.grid.size[i] - 1) / 2 * this.grid.spacing[i])
+		return { extent: this.frame(name).extent, step: Math.min(...this.grid.spacing), from: dot(minus(this.position, middle), this.turn[name]) }
+	}
+
+	setDepth(name, index) {
+		if (this.isStraight(name)) {
+			this.setIndex(planes[name].across, index)
+			return
+		}
+		const { extent, step, from } = this.#steps(name), half = Math.floor(extent / 2 / step)
+		this.set({ position: add(this.position, this.turn[name], (clamp(index, 0, 2 * half) - half) * step - from) })
+	}
+
 	setWindow(window, level) {
 		this.set({ window: clamp(Math.round(window), 1, 100000), level: clamp(Math.round(level), -100000, 100000) })
 	}
@@ -160,26 +274,25 @@ export class View extends EventTarget {
 		return this.#cross(name)
 	}
 
-	/* The position in fractions of a plane's width and height, from its upper left corner. */
-	fraction(name) {
-		const { columns, rows, down } = planes[name]
-		const along = axis => (this.position[axis] - this.grid.origin[axis] + this.grid.spacing[axis] / 2) /
-			(this.grid.size[axis] * this.grid.spacing[axis])
-		return [along(columns), down ? along(rows) : 1 - along(rows)]
+	/* A point in fractions of a plane's width and height, from its upper left corner. */
+	fraction(name, point = this.position) {
+		const { center, right, down, width, height } = this.frame(name), to = minus(point, center)
+		return [dot(to, right) / width + 0.5, dot(to, down) / height + 0.5]
 	}
 
-	/* The other way round: moves the position within a plane. */
+	/* The other way round: the point of the world there, as deep as the position is. */
+	pointAt(name, x, y) {
+		const { right, down, width, height } = this.frame(name)
+		const [fromX, fromY] = this.fraction(name)
+		return add(add(this.position, right, (x - fromX) * width), down, (y - fromY) * height)
+	}
+
+	/* Moves the position within a plane. */
 	moveWithin(name, x, y) {
-		const { columns, rows, down } = planes[name]
-		const position = [...this.position]
-		const mm = (axis, fraction) => this.grid.origin[axis] - this.grid.spacing[axis] / 2 +
-			fraction * this.grid.size[axis] * this.grid.spacing[axis]
-		position[columns] = mm(columns, x)
-		position[rows] = mm(rows, down ? y : 1 - y)
-		this.moveTo(position)
+		this.moveTo(this.pointAt(name, x, y))
 	}
 
 	reset() {
-		this.set({ position: this.#middle(), zoom: 1, pan: { x: [0, 0], y: [0, 0], z: [0, 0] }, azimuth: 160, elevation: 12 })
+		this.set({ turn: straight, position: this.#middle(), zoom: 1, pan: { x: [0, 0], y: [0, 0], z: [0, 0] }, azimuth: 160, elevation: 12 })
 	}
 }

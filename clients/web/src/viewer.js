@@ -12,15 +12,15 @@ export class Viewer {
 	#drawn = null /* the source whose planes are there */
 
 	/* step(direction): another iteration is asked for; shown(): after each picture. */
-	constructor(view, { step, shown, label }) {
+	constructor(view, { step, shown, label, pointed, measurements }) {
 		this.#view = view
-		this.planes = order.map(name => new Plane(name, view, { step, shown: () => {
+		this.planes = order.map(name => new Plane(name, view, { step, pointed, measurements, shown: () => {
 			shown()
 			this.#onPlane()
 		} }))
 		this.spatial = new Spatial(view)
 		this.tag = h('span', { class: 'tag' })
-		this.element = h('div', { class: 'viewer', role: 'group', 'aria-label': label, 'data-tile': view.tile },
+		this.element = h('div', { class: 'viewer', role: 'group', 'aria-label': label, 'data-tile': view.tile, 'data-main': view.main },
 			[...this.planes, this.spatial].map(part => part.element), this.tag)
 		this.follow = ({ detail }) => this.#update(detail)
 		view.addEventListener('change', this.follow)
@@ -29,6 +29,8 @@ export class Viewer {
 	#update(changed) {
 		if (changed.tile)
 			this.element.dataset.tile = this.#view.tile
+		if (changed.main)
+			this.element.dataset.main = this.#view.main
 		for (const part of [...this.planes, this.spatial])
 			part.update(changed)
 	}
@@ -77,9 +79,25 @@ export class Viewer {
 		}
 	}
 
-	/* HU at the position, or null. */
-	value() {
-		return this.planes[0].value()
+	/* HU at a point of the world, or null. */
+	value(point) {
+		return this.planes[0].value(point)
+	}
+
+	/* The voxels that are looked at; null while the daemon draws. */
+	get voxels() {
+		return this.planes[0].voxels
+	}
+
+	/* Names the volume on each picture. */
+	setWhat(text) {
+		for (const part of [...this.planes, this.spatial])
+			part.setWhat(text)
+	}
+
+	/* Measurements have changed. */
+	drawMeasurements() {
+		this.planes.forEach(plane => plane.place())
 	}
 
 	close() {
