@@ -321,6 +321,9 @@ int volume_stream(void *context, struct request *request, struct error *err)
 	    volume_options(request, &stream->facts, &stream->options, err) != 0 ||
 	    (after != NULL && skip_to(stream, after, err) != 0))
 		return err->code;
+	if (stream->options.dicom)
+		return error_set(err, ERR_INVALID,
+				 "format=dicom is not streamed: its objects are fetched volume by volume");
 	if (request_reply_live(request, 200, stream_read, patience, err) != 0)
 		return err->code;
 	request_reply_header(request, "Content-Type", "multipart/mixed; boundary=\"%s\"", stream->boundary);

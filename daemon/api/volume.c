@@ -122,8 +122,9 @@ int volume_verify(struct api *api, const char *job, const struct volume_record *
 	return code;
 }
 
-/* The formats of files, and the one that is for programs only. */
+/* The formats of files, the one that is for programs only, and the one that needs more than the volume's file. */
 static const char shuffled_name[] = "shuffled", shuffled_media_type[] = "application/vnd.cbct.shuffled+zstd";
+static const char dicom_name[] = "dicom";
 
 static int read_format(struct request *request, struct content_options *options, struct error *err)
 {
@@ -131,21 +132,23 @@ static int read_format(struct request *request, struct content_options *options,
 	const char *formats[16] = {NULL};
 	int format, type, count = 0;
 
-	for (; volume_formats[count].name != NULL && count < 14; count++)
+	for (; volume_formats[count].name != NULL && count < 13; count++)
 		formats[count] = volume_formats[count].name;
 	formats[count] = shuffled_name;
+	formats[count + 1] = dicom_name;
 	if (query_choice(request, "format", formats, &format, err) != 0 ||
 	    query_choice(request, "type", types, &type, err) != 0)
 		return err->code;
 	options->shuffled = format == count;
-	if (!options->shuffled) {
+	options->dicom = format == count + 1;
+	if (!options->shuffled && !options->dicom) {
 		options->format = &volume_formats[format];
 		options->type = (enum volume_type)type;
 		return 0;
 	}
 	if (type != VOLUME_INT16 && request_query(request, "type") != NULL)
 		return error_set(err, ERR_INVALID, "type is \"%.40s\", expected int16 with format=%s", types[type],
-				 shuffled_name);
+				 formats[format]);
 	options->format = volume_format_find("raw");
 	options->type = VOLUME_INT16;
 	return 0;
@@ -169,16 +172,59 @@ int volume_options(struct request *request, const struct job_facts *job, struct 
 	return 0;
 }
 
+/* What DICOM says of a volume beside its own file: of the job, and as asked for. */
+static int read_words(struct api *api, struct request *request, const struct volume_record *volume,
+		      struct content_options *options, struct error *err)
+{
+	static const char *const kinds[] = {"slices", "enhanced", NULL};
+	struct dicom_words *words = &options->words;
+	struct job_record record;
+	struct job *job;
+	int kind, position, code;
+
+	if (query_choice(request, "dicom", kinds, &kind, err) != 0 ||
+	    query_choice(request, "position", patient_position_names, &position, err) != 0)
+		return err->code;
+	for (int i = 0; i < 2 && !options->dicom; i++) {
+		const char *name = i == 0 ? "dicom" : "position";
+
+		if (request_query(request, name) != NULL)
+			return error_set(err, ERR_INVALID, "%s stands with format=dicom only", name);
+	}
+	if (!options->dicom)
+		return 0;
+	if (jobs_find(api->jobs, request_argument(request, 0), &job, err) != 0)
+		return err->code;
+	job_record(job, &record);
+	code = subject_parse(record.subject != NULL ? record.subject : "", &words->subject, err);
+	job_release(job);
+	words->enhanced = kind == 1;
+	words->position = request_query(request, "position") != NULL ? position : -1;
+	words->created = volume->created;
+	snprintf(words->volume, sizeof(words->volume), "%s", volume->name);
+	return code;
+}
+
+/* DICOM's own way of two; the others say it themselves. */
+static const char *dicom_or(const struct content_options *options, const char *slices, const char *enhanced,
+			    const char *other)
+{
+	if (!options->dicom)
+		return other;
+	return options->words.enhanced ? enhanced : slices;
+}
+
 const char *volume_media_type(const struct content_options *options)
 {
-	return options->shuffled ? shuffled_media_type : options->format->media_type;
+	return dicom_or(options, "application/zip", "application/dicom",
+			options->shuffled ? shuffled_media_type : options->format->media_type);
 }
 
 void volume_filename(const char *job, const char *name, const struct content_options *options,
 		     char ret_name[VOLUME_FILENAME_MAX])
 {
 	snprintf(ret_name, VOLUME_FILENAME_MAX, "%s-%s%s", job, name,
-		 options->shuffled ? ".shuffled.zst" : options->format->extension);
+		 dicom_or(options, ".zip", ".dcm", options->shuffled ? ".shuffled.zst" : options->format->extension));
 }
 
 /* The digest would do as well, but comes later than the volume. */
@@ -192,10 +238,15 @@ static void make_etag(const char *job, const struct volume_record *volume, const
 		      bool zstd, char *ret_etag, size_t size)
 {
 	char tag[VOLUME_TAG_MAX];
+	const char *format = dicom_or(options, "dicom-slices", "dicom-enhanced",
+				      options->shuffled ? shuffled_name : options->format->name);
+	const char *position = "";
 
+	if (options->dicom && options->words.position >= 0)
+		position = patient_position_names[options->words.position];
 	volume_tag(job, volume, tag);
-	snprintf(ret_etag, size, "\"%s-%s-%s-%d-%d%s\"", tag, options->shuffled ? shuffled_name : options->format->name,
-		 volume_type_names[options->type], options->scale, FORMAT_REVISION, zstd ? "-zstd" : "");
+	snprintf(ret_etag, size, "\"%s-%s%s-%s-%d-%d%s\"", tag, format, position, volume_type_names[options->type],
+		 options->scale, FORMAT_REVISION, zstd ? "-zstd" : "");
 }
 
 /* A part of the content that is made as it is sent. */
@@ -295,7 +346,8 @@ int volume_get(void *context, struct request *request, struct error *err)
 	bool done, packed;
 
 	if (volume_asked(api, request, &facts, &volume, err) != 0 ||
-	    volume_options(request, &facts, &options, err) != 0)
+	    volume_options(request, &facts, &options, err) != 0 ||
+	    read_words(api, request, &volume, &options, err) != 0)
 		return err->code;
 	store_volume_path(api->store, facts.id, volume.name, path);
 	if (volume_verify(api, facts.id, &volume, 0, 0, err) != 0 ||

@@ -8,6 +8,7 @@
 #include <string.h>
 #include <unistd.h>
 
+#include "daemon/volumes/series.h"
 #include "proto/scan_directory.h"
 #include "proto/zstream.h"
 
@@ -22,6 +23,7 @@ struct content {
 	struct grid grid, scaled; /* of the file, and as it is sent */
 	int factor[3];            /* voxels averaged along each axis */
 	struct content_options options;
+	struct provenance provenance; /* of DICOM; empty otherwise */
 	uint8_t header[FORMAT_HEADER_MAX];
 	size_t header_size;
 	size_t start;   /* of the voxels in the file */
@@ -81,7 +83,8 @@ static int read_file(const struct content *content, uint64_t offset, void *to, s
 static int make_header(struct content *content, const char *path, struct error *err)
 {
 	const struct content_options *options = &content->options;
-	struct provenance provenance;
+	struct provenance provenance = {0};
+	struct patient patient;
 	uint8_t stored[VOLUME_FILE_OFFSET];
 	int code = volume_own_head(content->descriptor, path, &content->grid, &content->start, &provenance, err);
 
@@ -89,7 +92,12 @@ static int make_header(struct content *content, const char *path, struct error *
 		return code;
 	code = options->format->header(&content->scaled, options->type, &provenance, content->header,
 				       &content->header_size, err);
-	provenance_clear(&provenance);
+	if (code == 0 && options->dicom)
+		code = dicom_patient(&options->words, &provenance.patient, &patient, err);
+	if (code == 0 && options->dicom)
+		content->provenance = provenance;
+	else
+		provenance_clear(&provenance);
 	/* A file from before there were extensions is sent with a header of today. */
 	content->as_stored = code == 0 && content_is_plain(content) && options->format == volume_formats &&
 			     content->start == content->header_size && content->header_size == sizeof(stored) &&
@@ -100,7 +108,7 @@ static int make_header(struct content *content, const char *path, struct error *
 
 bool content_is_packed(const struct content_options *options)
 {
-	return options->shuffled || options->format->gzip;
+	return options->shuffled || options->dicom || options->format->gzip;
 }
 
 int content_open(const char *path, const struct grid *grid, const struct content_options *options,
@@ -143,6 +151,7 @@ void content_close(struct content *content)
 		close(content->descriptor);
 	free(content->rows);
 	free(content->plane);
+	provenance_clear(&content->provenance);
 	free(content);
 }
 
@@ -327,7 +336,8 @@ ssize_t content_read(struct content *content, uint64_t offset, void *to, size_t 
 struct content_stream {
 	struct content *content;
 	struct zencoder *encoder;
-	uint64_t offset; /* of the content, read so far */
+	struct series *series; /* in place of the encoder */
+	uint64_t offset;       /* of the content, read so far */
 	size_t filled, used;
 	bool ended;
 	char block[STREAM_BLOCK];
@@ -342,8 +352,11 @@ int content_stream_new(struct content *content, int workers, struct content_stre
 		return error_set(err, ERR_NO_MEMORY, "no memory to compress a volume");
 	}
 	*stream = (struct content_stream){.content = content};
-	if ((content->options.format->gzip ? gzip_encoder_new(STREAM_LEVEL, &stream->encoder, err)
-					   : zencoder_new(STREAM_LEVEL, workers, &stream->encoder, err)) != 0) {
+	if (content->options.dicom
+		? series_new(content, &content->scaled, &content->provenance, &content->options.words, &stream->series,
+			     err) != 0
+		: (content->options.format->gzip ? gzip_encoder_new(STREAM_LEVEL, &stream->encoder, err)
+						 : zencoder_new(STREAM_LEVEL, workers, &stream->encoder, err)) != 0) {
 		content_stream_free(stream);
 		return err->code;
 	}
@@ -355,6 +368,7 @@ void content_stream_free(struct content_stream *stream)
 {
 	if (stream == NULL)
 		return;
+	series_free(stream->series);
 	content_close(stream->content);
 	zencoder_free(stream->encoder);
 	free(stream);
@@ -377,6 +391,8 @@ ssize_t content_stream_read(struct content_stream *stream, void *to, size_t size
 	size_t made = 0;
 	struct error err;
 
+	if (stream->series != NULL)
+		return series_read(stream->series, to, size);
 	/* The encoder gathers input before it gives anything; 0 would mean the end. */
 	while (made == 0 && !stream->ended) {
 		size_t consumed = 0, produced = 0;

@@ -5,6 +5,7 @@
 #include <stdint.h>
 #include <sys/types.h>
 
+#include "daemon/volumes/dicom.h"
 #include "proto/format.h"
 
 /*
@@ -16,13 +17,15 @@ struct content;
 struct content_options {
 	const struct volume_format *format;
 	enum volume_type type;
-	bool shuffled;   /* raw int16 with bytes sorted: of each plane z the low bytes [y][x], then the high ones */
+	bool shuffled; /* raw int16 with bytes sorted: of each plane z the low bytes [y][x], then the high ones */
+	bool dicom;    /* raw int16 as a ZIP of DICOM slices or one object; words tells the rest */
+	struct dicom_words words;
 	int scale;       /* 1: as it is; s: each voxel the mean of s x s x s, at the far ends of what is there */
 	double mu_water; /* 1/mm, for Hounsfield units */
 };
 enum { CONTENT_SCALE_MAX = 16 };
 
-/* Compressed by what it is: no encoding is put over that. */
+/* Compressed or packed by what it is: no encoding is put over that, and it is a stream. */
 bool content_is_packed(const struct content_options *options);
 
 int content_open(const char *path, const struct grid *grid, const struct content_options *options,
@@ -39,8 +42,8 @@ ssize_t content_read(struct content *content, uint64_t offset, void *to, size_t 
 int content_descriptor(const struct content *content, uint64_t *ret_offset);
 
 /*
- * The content as one zstd frame, or as the gzip stream that its format is, in order; as content_read otherwise.
- * Takes the content, on failure too. workers: as of zencoder_new.
+ * The content as one zstd frame, or as the gzip stream or the DICOM that its format is, in order; as content_read
+ * otherwise. Takes the content, on failure too. workers: as of zencoder_new.
  */
 struct content_stream;
 int content_stream_new(struct content *content, int workers, struct content_stream **ret_stream, struct error *err);

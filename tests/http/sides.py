@@ -262,7 +262,9 @@ def old(path: str) -> None:
         file.truncate()
 
 
-if sys.argv[1] == "make":
+if __name__ != "__main__":
+    pass
+elif sys.argv[1] == "make":
     make(sys.argv[2], "counts" in sys.argv[3:])
 elif sys.argv[1] == "old":
     old(sys.argv[2])
