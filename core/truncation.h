@@ -149,7 +149,7 @@ TRUNCATION_INLINE bool truncation_is_cut(const float *p, ptrdiff_t step, int col
 /* x of a column in the fit of c, -1/2 .. 1/2. */
 TRUNCATION_INLINE double truncation_x(int column, int columns)
 {
-	return ((double)column - 0.5 * (columns - 1)) / columns;
+	return ((double)column - 0.5 * (columns - 1)) * (1.0 / columns);
 }
 
 /* Over the columns of a row with p >= truncation_level, y = p^2. */
@@ -174,6 +174,7 @@ struct extension {
 	float body, bone; /* A and B for columns */
 	/* How far the cap is believed, 0 .. 1, and its p^2 = a + b x. */
 	float cap, cap_a, cap_b;
+	int reach; /* columns beyond the outermost one behind which it is 0 */
 };
 
 TRUNCATION_INLINE void truncation_row_add(struct truncation_row_sums *sums, double x, double p)
@@ -222,6 +223,7 @@ TRUNCATION_INLINE struct extension truncation_fit(int columns, int extend, const
 	result.c = (float)c;
 	result.share = result.outline = result.half = result.body = result.bone = 0;
 	result.cap = result.cap_a = result.cap_b = 0;
+	result.reach = 0;
 	return result;
 }
 

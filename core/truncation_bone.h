@@ -78,28 +78,55 @@ TRUNCATION_INLINE int truncation_noise_window(int columns)
 	return truncation_window(columns) > 8 ? truncation_window(columns) : 8;
 }
 
-/* From squared second differences over two windows; the smaller one, since one of them may have a cusp. */
-TRUNCATION_INLINE float truncation_deviation(const struct truncation_end *end)
+TRUNCATION_INLINE double truncation_bend2(const struct truncation_end *end, int i)
 {
-	const int window = truncation_noise_window(end->columns);
-	double bends[2] = {0, 0};
+	const float *at = end->p + i * end->step;
+	const double bend = (double)at[-end->step] - 2 * (double)at[0] + (double)at[end->step];
 
-	for (int k = 0; k < 2; k++)
-		for (int i = 1; i < window - 1; i++) {
-			const float *at = end->p + (k * window + i) * end->step;
-			const double bend = (double)at[-end->step] - 2 * (double)at[0] + (double)at[end->step];
-
-			bends[k] += bend * bend;
-		}
-	return (float)sqrt(fmin(bends[0], bends[1]) / (6 * (window - 2)));
+	return bend * bend;
+}
+/* From their sums over two windows; the smaller one, since one of them may have a cusp. */
+TRUNCATION_INLINE float truncation_deviation(const double bends[2], int columns)
+{
+	return (float)sqrt(fmin(bends[0], bends[1]) / (6 * (truncation_noise_window(columns) - 2)));
 }
 
-/* The first peak inwards that p falls behind by 2 % of itself and more than noise. */
+/* Places at which a cusp is looked for, below 0: none. */
+TRUNCATION_INLINE int truncation_cusp_last(const struct truncation_end *end)
+{
+	const int most = end->count / 4 - truncation_cusp_columns(end->columns);
+
+	return truncation_cusp_reach(end->columns) < most ? truncation_cusp_reach(end->columns) : most;
+}
+/* What noise does to the mean at a place. */
+TRUNCATION_INLINE float truncation_cusp_noise(const struct truncation_end *end)
+{
+	return 3 * end->deviation / sqrtf((float)truncation_cusp_columns(end->columns));
+}
+/* A mean that falls behind a peak by 2 % of it and more than noise. */
+TRUNCATION_INLINE bool truncation_is_behind(float value, float peak, float noise)
+{
+	return value < 0.98f * peak - noise;
+}
+/* The fall behind a peak, first seen at `at`, is looked at over as many columns as the cap has: the last of them. */
+TRUNCATION_INLINE int truncation_fall_last(int peak_at, int at, int mean, int last)
+{
+	const int cap = 2 * (peak_at + mean);
+
+	return cap < at ? at : cap < last ? cap : last;
+}
+TRUNCATION_INLINE void truncation_set_cusp(struct truncation_end *end, int peak_at, float peak, float deepest)
+{
+	end->cap = peak_at + truncation_cusp_columns(end->columns) / 2;
+	end->peak = peak;
+	end->drop = (peak - truncation_cusp_noise(end) - deepest) / peak;
+}
+
+/* The first peak inwards that p falls behind. */
 TRUNCATION_INLINE void truncation_find_cusp(struct truncation_end *end)
 {
-	const int mean = truncation_cusp_columns(end->columns), most = end->count / 4 - mean;
-	const int reach = truncation_cusp_reach(end->columns) < most ? truncation_cusp_reach(end->columns) : most;
-	const float noise = 3 * end->deviation / sqrtf((float)mean);
+	const int mean = truncation_cusp_columns(end->columns), reach = truncation_cusp_last(end);
+	const float noise = truncation_cusp_noise(end);
 	float peak = 0, deepest = 0;
 	double sum = 0;
 	int at = 0, last = reach;
@@ -114,41 +141,34 @@ TRUNCATION_INLINE void truncation_find_cusp(struct truncation_end *end)
 		if (!behind && value > peak) {
 			peak = value;
 			at = i;
-		} else if (value < 0.98f * peak - noise && (!behind || value < deepest)) {
-			/* The fall is looked at over as many columns as the cap has. */
+		} else if (truncation_is_behind(value, peak, noise) && (!behind || value < deepest)) {
 			if (!behind)
-				last = 2 * (at + mean) < i ? i : 2 * (at + mean) < reach ? 2 * (at + mean) : reach;
+				last = truncation_fall_last(at, i, mean, reach);
 			deepest = value;
 			behind = true;
 		}
 	}
-	if (!behind || at == 0)
-		return;
-	end->cap = at + mean / 2;
-	end->peak = peak;
-	end->drop = (peak - noise - deepest) / peak;
+	if (behind && at > 0)
+		truncation_set_cusp(end, at, peak, deepest);
 }
 
-/* The line through p^2 of the cap; where that does not end near, as bone does, there is no cap. */
-TRUNCATION_INLINE void truncation_fit_cap(struct truncation_end *end)
+/* Samples whose p^2 the line through the cap is fitted to; their sums are of p^2 and of -i p^2. */
+TRUNCATION_INLINE int truncation_cap_samples(const struct truncation_end *end)
 {
-	const int n = end->cap > 2 ? end->cap : 2;
+	return end->cap > 2 ? end->cap : 2;
+}
+/* The line through the cap's p^2; where that does not end near, as bone does, there is no cap. */
+TRUNCATION_INLINE void truncation_set_cap(struct truncation_end *end, double y, double xy)
+{
+	const int n = truncation_cap_samples(end);
 	/* Sums of i, i^2 over the cap. */
 	const double i1 = 0.5 * n * (n - 1), i2 = i1 * (2 * n - 1) / 3, spread = i2 - i1 * i1 / n;
-	double y = 0, xy = 0, a, b, doubt;
-	float share;
+	const double b = (xy + i1 * y / n) / spread, a = (y + b * i1) / n;
+	double doubt;
+	float share = b < 0 ? truncation_ramp(end->drop, 0.02f, 0.05f) *
+				  (1 - truncation_ramp((float)(-a / b) / (float)end->columns, 0.06f, 0.12f))
+			    : 0;
 
-	for (int i = 0; i < n; i++) {
-		const double p = fmax((double)end->p[i * end->step], 0.0);
-
-		y += p * p;
-		xy -= i * p * p;
-	}
-	b = (xy + i1 * y / n) / spread;
-	a = (y + b * i1) / n;
-	share = b < 0 ? truncation_ramp(end->drop, 0.02f, 0.05f) *
-			    (1 - truncation_ramp((float)(-a / b) / (float)end->columns, 0.06f, 0.12f))
-		      : 0;
 	if (!(share > 0)) {
 		end->cap = 0;
 		return;
@@ -160,17 +180,41 @@ TRUNCATION_INLINE void truncation_fit_cap(struct truncation_end *end)
 	end->share = share * (1 - truncation_ramp((float)doubt, 0.3f, 0.6f));
 }
 
-/* count: samples from the outermost one to where the object ends on the row's other side. */
-TRUNCATION_INLINE struct truncation_end truncation_end_of(const float *p, ptrdiff_t step, int count, int columns)
+/* An end whose cusp is still to be found. count: samples from the outermost one to where the object ends on the other
+ * side. */
+TRUNCATION_INLINE struct truncation_end truncation_end_start(const float *p, ptrdiff_t step, int count, int columns)
 {
 	struct truncation_end end = {p, step, count, columns, 0, 0, 0, 0, 0, 0, 0};
 
-	if (count < 2 * truncation_noise_window(columns))
+	return end;
+}
+/* Too few samples tell nothing of noise. */
+TRUNCATION_INLINE bool truncation_end_is_known(const struct truncation_end *end)
+{
+	return end->count >= 2 * truncation_noise_window(end->columns);
+}
+TRUNCATION_INLINE struct truncation_end truncation_end_of(const float *p, ptrdiff_t step, int count, int columns)
+{
+	struct truncation_end end = truncation_end_start(p, step, count, columns);
+	const int window = truncation_noise_window(columns);
+	double bends[2] = {0, 0}, y = 0, xy = 0;
+
+	if (!truncation_end_is_known(&end))
 		return end;
-	end.deviation = truncation_deviation(&end);
+	for (int k = 0; k < 2; k++)
+		for (int i = 1; i < window - 1; i++)
+			bends[k] += truncation_bend2(&end, k * window + i);
+	end.deviation = truncation_deviation(bends, columns);
 	truncation_find_cusp(&end);
-	if (end.cap > 0)
-		truncation_fit_cap(&end);
+	if (end.cap == 0)
+		return end;
+	for (int i = 0; i < truncation_cap_samples(&end); i++) {
+		const double sample = fmax((double)p[i * step], 0.0);
+
+		y += sample * sample;
+		xy -= i * sample * sample;
+	}
+	truncation_set_cap(&end, y, xy);
 	return end;
 }
 
@@ -193,9 +237,9 @@ enum { SHELL_BINS = 64, SHELL_OUTLINES = 14 };
 
 /* Table of all outlines, made once for a plan. Unit: the object's width within the row, x = -1/2 .. 1/2. */
 struct shell_table {
-	float outline[SHELL_OUTLINES];          /* beyond x = 1/2 */
-	float root[SHELL_OUTLINES][SHELL_BINS]; /* sqrt(x + 1/2 + outline), mirrored for the other side */
-	float inverse[SHELL_OUTLINES][SHELL_BINS];
+	float outline[SHELL_OUTLINES]; /* beyond x = 1/2 */
+	/* sqrt(x + 1/2 + outline), mirrored for the other side, and its inverse. */
+	double root[SHELL_OUTLINES][SHELL_BINS], inverse[SHELL_OUTLINES][SHELL_BINS];
 };
 
 TRUNCATION_INLINE float shell_x(int bin)
@@ -211,8 +255,10 @@ TRUNCATION_INLINE struct shell_table shell_table_make(void)
 	for (int i = 0; i < SHELL_OUTLINES; i++) {
 		table.outline[i] = (float)(least * pow(most / least, i / (SHELL_OUTLINES - 1.0)));
 		for (int bin = 0; bin < SHELL_BINS; bin++) {
-			table.root[i][bin] = sqrtf(shell_x(bin) + 0.5f + table.outline[i]);
-			table.inverse[i][bin] = 1 / table.root[i][bin];
+			const float root = sqrtf(shell_x(bin) + 0.5f + table.outline[i]);
+
+			table.root[i][bin] = (double)root;
+			table.inverse[i][bin] = (double)(1 / root);
 		}
 	}
 	return table;
@@ -264,9 +310,8 @@ TRUNCATION_INLINE struct shell_fit shell_try(const struct shell_table *table, co
 	struct shell_sums sums = {0, 0, 0, 0};
 
 	for (int bin = 0; bin < SHELL_BINS; bin++)
-		shell_sums_add(&sums, (double)table->root[i][bin] * (double)table->root[j][SHELL_BINS - 1 - bin],
-			       (double)table->inverse[i][bin] * (double)table->inverse[j][SHELL_BINS - 1 - bin],
-			       (double)bins[bin]);
+		shell_sums_add(&sums, table->root[i][bin] * table->root[j][SHELL_BINS - 1 - bin],
+			       table->inverse[i][bin] * table->inverse[j][SHELL_BINS - 1 - bin], (double)bins[bin]);
 	return shell_solve(&sums, square);
 }
 
@@ -328,25 +373,40 @@ TRUNCATION_INLINE bool shell_is_tried(float ellipse)
 	return ellipse > SHELL_ELLIPSE_LEAST && ellipse < SHELL_ELLIPSE_MOST;
 }
 
-/* The root mean square error of p where p^2 is the parabola nearest to the bins' squares. */
+/* The parabola nearest to the squares of the bins, a + x (b + c x), and its squared error for p in one of them. */
+struct shell_parabola {
+	double a, b, c;
+};
+TRUNCATION_INLINE struct shell_parabola shell_parabola_of(const struct truncation_row_sums *sums)
+{
+	/* The bins lie evenly about 0: odd powers cancel. */
+	const double spread = sums->n * sums->x4 - sums->x2 * sums->x2;
+	struct shell_parabola parabola;
+
+	parabola.c = (sums->n * sums->x2y - sums->x2 * sums->y) / spread;
+	parabola.b = sums->xy / sums->x2;
+	parabola.a = (sums->y - parabola.c * sums->x2) / sums->n;
+	return parabola;
+}
+TRUNCATION_INLINE double shell_parabola_error(const struct shell_parabola *parabola, int bin, float value)
+{
+	const double x = (double)shell_x(bin), y = parabola->a + x * (parabola->b + parabola->c * x);
+	const double error = (double)value - (y > 0 ? sqrt(y) : 0);
+
+	return error * error;
+}
+/* The root mean square error of p where p^2 is that parabola. */
 TRUNCATION_INLINE float shell_ellipse_error(const float bins[SHELL_BINS], double square)
 {
 	struct truncation_row_sums sums = {0, 0, 0, 0, 0, 0, 0, 0};
-	double c, b, a, spread, sum = 0;
+	struct shell_parabola parabola;
+	double sum = 0;
 
 	for (int bin = 0; bin < SHELL_BINS; bin++)
 		truncation_row_add(&sums, (double)shell_x(bin), (double)bins[bin]);
-	/* The bins lie evenly about 0: odd powers cancel. */
-	spread = sums.n * sums.x4 - sums.x2 * sums.x2;
-	c = (sums.n * sums.x2y - sums.x2 * sums.y) / spread;
-	b = sums.xy / sums.x2;
-	a = (sums.y - c * sums.x2) / sums.n;
-	for (int bin = 0; bin < SHELL_BINS; bin++) {
-		const double x = (double)shell_x(bin), y = a + x * (b + c * x);
-		const double error = (double)bins[bin] - (y > 0 ? sqrt(y) : 0);
-
-		sum += error * error;
-	}
+	parabola = shell_parabola_of(&sums);
+	for (int bin = 0; bin < SHELL_BINS; bin++)
+		sum += shell_parabola_error(&parabola, bin, bins[bin]);
 	return (float)sqrt(sum / square);
 }
 
@@ -412,37 +472,55 @@ struct shell {
 	struct shell_fit fit;
 };
 
-/* noise: shell_noise. */
+/* The outlines k = 0, 1, 2 about the best one of a side, for shell_refined. */
+TRUNCATION_INLINE struct shell_place shell_neighbour(struct shell_place place, int side, int k)
+{
+	const int at = place.at[side] + k - 1;
+
+	place.at[side] = at < 0 ? 0 : at < SHELL_OUTLINES ? at : SHELL_OUTLINES - 1;
+	return place;
+}
+/* What a bin adds to the sums for refined outlines. */
+TRUNCATION_INLINE void shell_refined_add(struct shell_sums *sums, const float outlines[2], int bin, float p)
+{
+	const float x = shell_x(bin);
+	const double root = sqrt((double)((x + 0.5f + outlines[0]) * (0.5f - x + outlines[1])));
+
+	shell_sums_add(sums, root, 1 / root, (double)p);
+}
+/* The shell of refined outlines. noise: shell_noise. */
+TRUNCATION_INLINE struct shell shell_of(const float outlines[2], const struct shell_sums *sums, double square,
+					float ellipse, double noise)
+{
+	struct shell shell;
+
+	shell.outlines[0] = outlines[0];
+	shell.outlines[1] = outlines[1];
+	shell.fit = shell_solve(sums, square);
+	shell.share = truncation_shell_share(shell_without_noise((double)ellipse * (double)ellipse, noise),
+					     shell_without_noise(shell.fit.residual / square, noise), &shell.fit,
+					     fmaxf(outlines[0], outlines[1]));
+	return shell;
+}
 TRUNCATION_INLINE struct shell shell_make(const struct shell_table *table, const float bins[SHELL_BINS], double square,
 					  float ellipse, double noise, struct shell_place place)
 {
-	const int *at = place.at;
 	struct shell_sums sums = {0, 0, 0, 0};
-	struct shell shell;
+	float outlines[2];
 
 	for (int side = 0; side < 2; side++) {
 		double residual[3];
 
-		for (int k = -1; k < 2; k++) {
-			int i = at[0] + (side == 0 ? k : 0), j = at[1] + (side == 1 ? k : 0);
+		for (int k = 0; k < 3; k++) {
+			const struct shell_place next = shell_neighbour(place, side, k);
 
-			i = i < 0 ? 0 : i < SHELL_OUTLINES ? i : SHELL_OUTLINES - 1;
-			j = j < 0 ? 0 : j < SHELL_OUTLINES ? j : SHELL_OUTLINES - 1;
-			residual[k + 1] = shell_try(table, bins, square, i, j).residual;
+			residual[k] = shell_try(table, bins, square, next.at[0], next.at[1]).residual;
 		}
-		shell.outlines[side] = shell_refined(table, residual, at[side]);
+		outlines[side] = shell_refined(table, residual, place.at[side]);
 	}
-	for (int bin = 0; bin < SHELL_BINS; bin++) {
-		const float x = shell_x(bin);
-		const double root = sqrt((double)((x + 0.5f + shell.outlines[0]) * (0.5f - x + shell.outlines[1])));
-
-		shell_sums_add(&sums, root, 1 / root, (double)bins[bin]);
-	}
-	shell.fit = shell_solve(&sums, square);
-	shell.share = truncation_shell_share(shell_without_noise((double)ellipse * (double)ellipse, noise),
-					     shell_without_noise(shell.fit.residual / square, noise), &shell.fit,
-					     fmaxf(shell.outlines[0], shell.outlines[1]));
-	return shell;
+	for (int bin = 0; bin < SHELL_BINS; bin++)
+		shell_refined_add(&sums, outlines, bin, bins[bin]);
+	return shell_of(outlines, &sums, square, ellipse, noise);
 }
 
 /* A sqrt(q) + B / sqrt(q), t columns beyond the outermost column's edge, below 0 within the row. */
@@ -475,15 +553,36 @@ TRUNCATION_INLINE void truncation_by_shell(struct extension *extension, const st
 	extension->bone *= scale;
 }
 
+/* Columns beside the outline in which 1/sqrt(q) is integrated; farther from it its middle is its mean within 1e-4. */
+#define SHELL_NEAR 16
+
 /* The mean over the column x beyond the outermost one; 1/sqrt(q) is not finite at the outline, but its integral is. */
 TRUNCATION_INLINE float shell_value(const struct extension *extension, int x)
 {
 	const float t = (float)x - 0.5f, middle = extension->outline - extension->half;
-	const float from = fminf((t - 0.5f - middle) / extension->half, 1);
-	const float to = fminf((t + 0.5f - middle) / extension->half, 1);
-	const float q = (extension->outline - t) * (2 * extension->half - extension->outline + t);
+	float from, to, q;
 
+	if (t < extension->outline - SHELL_NEAR)
+		return shell_at(extension, t);
+	from = fminf((t - 0.5f - middle) / extension->half, 1);
+	to = fminf((t + 0.5f - middle) / extension->half, 1);
+	q = (extension->outline - t) * (2 * extension->half - extension->outline + t);
 	return extension->body * sqrtf(fmaxf(q, 0)) + extension->bone * (asinf(to) - asinf(from));
+}
+
+/* Completes an extension: from where those of its parts that are believed at all are 0, and 2 columns for rounding. */
+TRUNCATION_INLINE void truncation_end_extension(struct extension *extension, int extend)
+{
+	const float a = extension->a, b = extension->b, c = extension->c, most = (float)extend;
+	float reach = 0;
+
+	if (extension->share < 1 && extension->cap < 1)
+		reach = c < 0 ? (-b - sqrtf(fmaxf(b * b - 4 * a * c, 0))) / (2 * c) : most;
+	if (extension->share > 0 && extension->cap < 1)
+		reach = fmaxf(reach, extension->outline);
+	if (extension->cap > 0)
+		reach = fmaxf(reach, -extension->cap_a / extension->cap_b);
+	extension->reach = (int)fminf(reach + 2, most);
 }
 
 /* The line integral x columns beyond the outermost one; 0 from where the object ends. */
@@ -492,6 +591,8 @@ TRUNCATION_INLINE float truncation_value(const struct extension *extension, int 
 	float square = extension->a + (float)x * (extension->b + (float)x * extension->c);
 	float value = square > 0 ? sqrtf(square) : 0;
 
+	if (x > extension->reach)
+		return 0;
 	if (extension->share > 0)
 		value += extension->share * (shell_value(extension, x) - value);
 	if (extension->cap > 0)

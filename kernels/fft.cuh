@@ -149,10 +149,27 @@ static __device__ __forceinline__ void dft16(float2 x[16])
 		x[k] = y[4 * (k % 4) + k / 4];
 }
 
+/* 10 = 2 x 5, likewise. */
+template <bool INVERSE>
+static __device__ __forceinline__ void dft10(float2 x[10])
+{
+	float2 a[5] = {x[0] + x[5], x[2] + x[7], x[4] + x[9], x[6] + x[1], x[8] + x[3]};
+	float2 b[5] = {x[0] - x[5], x[2] - x[7], x[4] - x[9], x[6] - x[1], x[8] - x[3]};
+
+	dft5<INVERSE>(a);
+	dft5<INVERSE>(b);
+#pragma unroll
+	for (int k = 0; k < 5; k++) {
+		x[6 * k % 10] = a[k];
+		x[(6 * k + 5) % 10] = b[k];
+	}
+}
+
 template <int COUNT, bool INVERSE>
 static __device__ __forceinline__ void dft(float2 x[COUNT])
 {
-	static_assert(COUNT == 1 || COUNT == 2 || COUNT == 3 || COUNT == 4 || COUNT == 5 || COUNT == 6 || COUNT == 8,
+	static_assert(COUNT == 1 || COUNT == 2 || COUNT == 3 || COUNT == 4 || COUNT == 5 || COUNT == 6 || COUNT == 8 ||
+			  COUNT == 10,
 		      "a transform of this many points is not here");
 	if constexpr (COUNT == 2)
 		dft2<INVERSE>(x[0], x[1]);
@@ -166,6 +183,8 @@ static __device__ __forceinline__ void dft(float2 x[COUNT])
 		dft6<INVERSE>(x);
 	else if constexpr (COUNT == 8)
 		dft8<INVERSE>(x);
+	else if constexpr (COUNT == 10)
+		dft10<INVERSE>(x);
 }
 
 #endif

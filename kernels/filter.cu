@@ -15,10 +15,13 @@
  * convolution sees only the taps -(columns - 1) .. columns - 1 of the kernel:
  * these are taken out of it and transformed anew, so that both give the same rows.
  *
- * Rows too long for that go through cuFFT in batches, and so do those that the
- * detector cuts off (core/truncation.h): rows are looked at before they are filtered,
+ * Rows that the detector cuts off (core/truncation.h) are filtered with their extensions,
+ * by a longer transform of the same kind: rows are looked at before they are filtered,
  * on the stream for what comes in, so that nobody waits for the card to come to
- * it. All are filtered as they are, those few then once more with their extension.
+ * it. All are filtered as they are unless all are cut off, and those that are then once
+ * more. The extension before column 0 lies at the end of the transform, which is periodic.
+ *
+ * Rows too long for that go through cuFFT in batches.
  */
 #include <algorithm>
 #include <cmath>
@@ -26,7 +29,7 @@
 #include <cufft.h>
 #include <vector>
 
-#include "core/truncation_bone.h"
+#include "kernels/edges.cuh"
 #include "kernels/fft.cuh"
 #include "kernels/internal.cuh"
 
@@ -34,36 +37,28 @@
 static const size_t FFT_BYTES = (size_t)16 << 20;
 /* Rows that cuFFT has room for at least; bytes that its workspace is aligned to. */
 enum { FFT_ROWS = 8, FFT_ALIGNED = 256 };
+/* Of a fused transform's length the 512th part, at most. */
+enum { HALF_MOST = 10 };
 
 /* cuFFT's part: transforms of one length, so many rows at once, in the plan's scratch with the workspace behind. */
 struct fft {
 	int length, at_once;
 	cufftHandle forward, inverse;
-	float *response; /* [length / 2 + 1], 1 / length included */
 	bool has_forward, has_inverse;
 };
 
-/* Truncation found at the edges of a batch's rows: [slot of the batch][row]. */
-struct edges {
-	float *levels; /* [slot of the batch] what is not air */
-	struct shell_table *shells;
-	unsigned char *sides; /* bit 0: cut off before column 0, bit 1: behind the last one */
-	struct extension (*fit)[2];
-	int *list; /* rows with any */
-	unsigned char *sides_host;
-	int *list_host;
-	int rows; /* that there is room for */
-	cudaEvent_t used;
-	size_t extended[2];
+/* Rows as they are, or extended ones, through a transform of one length. */
+struct transform {
+	float *response;  /* in the order of the kernel that multiplies by it, 1 / length included */
+	float2 *twiddles; /* of the fused filter: of its first factor, then [16][16] of the second */
+	struct fft fft;   /* of no length where the fused filter serves */
 };
 
-/* The filter of a plan: weights, responses and transforms. */
+/* The filter of a plan. */
 struct filter {
 	float *column_weights; /* [count][columns] */
-	float *response;       /* the fused filter's, in the order of the kernel */
-	float2 *twiddles;
-	struct fft plain, extended; /* of no length where they are not needed */
-	struct edges edges;         /* no rows without plan_options.extend */
+	struct transform plain, extended;
+	struct edges edges; /* no rows without plan_options.extend */
 };
 
 struct filter_job {
@@ -79,12 +74,13 @@ struct filter_job {
 	size_t wide_slot;
 	const float *column_weights;
 	const float *response;
-	const float2 *twiddles; /* of the first factor, then [16][16] of the second */
-	float2 roots[8];        /* exp(-2 pi i j / (2 HALF)) */
-	/* cuFFT's rows are these in place of all, and have extensions; NULL: all as they are. */
+	const float2 *twiddles;
+	float2 roots[HALF_MOST]; /* exp(-2 pi i j / (2 HALF)) */
+	/* Rows that are extended, in place of all; NULL: all as they are. */
 	const int *list;
+	int listed;
 	const unsigned char *sides;
-	const struct extension (*fit)[2];
+	const struct extension (*fit)[2]; /* [place in the list] */
 	int extend;
 };
 
@@ -122,38 +118,137 @@ static __device__ __forceinline__ float cosine_at(const filter_job &job, const r
 	return fmaf(w.along[1], c, w.along[0]) * inverse;
 }
 
+/* One of the call's rows. */
+struct row_place {
+	int view, row;
+	const float *from; /* its samples */
+	float *to;         /* its filtered ones */
+	/* Of an extended row: the sides that it is cut off at, and its place in the list. */
+	unsigned char sides;
+	int listed;
+};
+/* The row of a slot of the call. */
+static __device__ __forceinline__ row_place place_of(const filter_job &job, int i, int row)
+{
+	return {job.views[i],
+		row,
+		job.from + (size_t)job.slots[i] * job.slot + (size_t)row * job.pitch,
+		job.to + (size_t)i * job.wide_slot + (size_t)row * job.wide_pitch,
+		0,
+		0};
+}
+/* A row of the list. */
+static __device__ __forceinline__ row_place listed_place(const filter_job &job, int listed)
+{
+	int index = job.list[listed];
+	row_place place = place_of(job, index / job.rows, index % job.rows);
+
+	place.sides = job.sides[index];
+	place.listed = listed;
+	return place;
+}
+
+/* The extended row, `x` columns beyond its outermost one, weighted. */
+static __device__ __forceinline__ float extended_at(const filter_job &job, const row_place &at,
+						    const row_weight &weight, int side, int x)
+{
+	int outermost = side == 0 ? 0 : job.columns - 1, column = side == 0 ? -x : outermost + x;
+
+	if (!(at.sides >> side & 1) || x > job.fit[at.listed][side].reach)
+		return 0;
+	return truncation_value(&job.fit[at.listed][side], x) * weight.column_weights[outermost] *
+	       cosine_at(job, weight, column);
+}
+
+/* A sample of a transform of an extended row: between its padding, its extension behind it, the one before it last. */
+static __device__ __forceinline__ float sample_at(const filter_job &job, const row_place &at, const row_weight &weight,
+						  int sample, int length)
+{
+	int column = sample - job.pad;
+	bool behind = column >= job.columns && sample < length / 2;
+
+	if ((unsigned)column < (unsigned)job.columns)
+		return at.from[column] * weight.column_weights[column] * cosine_at(job, weight, column);
+	if (column < 0)
+		return 0;
+	return extended_at(job, at, weight, behind ? 1 : 0, behind ? column - (job.columns - 1) : length - sample);
+}
+
+/* Blocks that a processor is to hold at once: registers limit it, and these many for a thread do not spill. */
+static constexpr int fused_blocks(int half, int pairs, bool extended)
+{
+	const int registers = extended || half >= 8 ? 64 : 56;
+
+	return 65536 / (registers * 32 * half * pairs);
+}
+
 /* Shared memory is padded by one value in 16, so that neither order of access meets in a bank. */
-template <int HALF, int PAIRS>
-static __global__ void __launch_bounds__(32 * HALF * PAIRS) filter_fused(const filter_job job)
+template <int HALF, int PAIRS, bool EXTENDED>
+static __global__ void __launch_bounds__(32 * HALF * PAIRS, fused_blocks(HALF, PAIRS, EXTENDED))
+    filter_fused(const filter_job job)
 {
 	const int FACTOR = 2 * HALF, THREADS = 16 * FACTOR, BLOCK = 272; /* 256 and the padding */
 	__shared__ float2 shared[PAIRS][FACTOR * BLOCK];
 	float2 *s = shared[threadIdx.y];
-	int t = threadIdx.x, row = 2 * ((int)blockIdx.x * PAIRS + (int)threadIdx.y), view = job.views[blockIdx.y];
-	bool has[2] = {row < job.rows, row + 1 < job.rows};
-	const float *from = job.from + (size_t)job.slots[blockIdx.y] * job.slot + (size_t)row * job.pitch;
-	float *to = job.to + (size_t)blockIdx.y * job.wide_slot + (size_t)row * job.wide_pitch;
-	row_weight weight[2] = {weight_of(job, view, row), weight_of(job, view, row + 1)};
+	int t = threadIdx.x, first = 2 * ((int)blockIdx.x * PAIRS + (int)threadIdx.y);
+	/* The last row may have no other one beside it. */
+	int rows = EXTENDED ? job.listed : job.rows;
+	bool has[2] = {first < rows, first + 1 < rows};
 	const float2 *second = job.twiddles + FACTOR * 256;
+	row_place place[2];
+	row_weight weight[2];
 
+	if constexpr (EXTENDED) {
+		place[0] = listed_place(job, min(first, rows - 1));
+		place[1] = listed_place(job, min(first + 1, rows - 1));
+	} else {
+		place[0] = place_of(job, (int)blockIdx.y, first);
+		place[1] = place_of(job, (int)blockIdx.y, first + 1);
+	}
+	/* From a sample of one row to that of the other. */
+	const ptrdiff_t from_step = EXTENDED ? place[1].from - place[0].from : job.pitch;
+	const ptrdiff_t to_step = EXTENDED ? place[1].to - place[0].to : job.wide_pitch;
+	weight[0] = weight_of(job, place[0].view, place[0].row);
+	weight[1] = weight_of(job, place[1].view, place[1].row);
+	if (EXTENDED) {
+		/* Where a thread of the first factor finds its own values. */
+#pragma unroll 1
+		for (int i = t; i < FACTOR * 256; i += THREADS) {
+			float2 *at = s + ((i >> 8) * BLOCK + (i & 255) + ((i & 255) >> 4));
+
+			*at = make_float2(has[0] ? sample_at(job, place[0], weight[0], i, FACTOR * 256) : 0,
+					  has[1] ? sample_at(job, place[1], weight[1], i, FACTOR * 256) : 0);
+		}
+		__syncthreads();
+	}
 	for (int q = t; q < 256; q += THREADS) {
 		float2 even[HALF], odd[HALF];
 
 #pragma unroll
 		for (int j = 0; j < HALF; j++) {
-			int column = q + 256 * j - job.pad;
+			if constexpr (EXTENDED) {
+				const float2 *at = s + (j * BLOCK + q + (q >> 4));
 
-			even[j] = make_float2(0, 0);
-			if ((unsigned)column < (unsigned)job.columns) {
-				float by_column = weight[0].column_weights[column];
+				even[j] = at[0] + at[HALF * BLOCK];
+				odd[j] = at[0] - at[HALF * BLOCK];
+			} else {
+				int column = q + 256 * j - job.pad;
 
-				if (has[0])
-					even[j].x = from[column] * by_column * cosine_at(job, weight[0], column);
-				if (has[1])
-					even[j].y =
-					    from[job.pitch + column] * by_column * cosine_at(job, weight[1], column);
+				even[j] = make_float2(0, 0);
+				if ((unsigned)column < (unsigned)job.columns) {
+					float by_column = weight[0].column_weights[column];
+
+					if (has[0])
+						even[j].x = place[0].from[column] * by_column *
+							    cosine_at(job, weight[0], column);
+					if (has[1])
+						even[j].y = place[0].from[from_step + column] * by_column *
+							    cosine_at(job, weight[1], column);
+				}
+				odd[j] = even[j];
 			}
-			odd[j] = j > 0 ? multiply(even[j], job.roots[j]) : even[j];
+			if (j > 0)
+				odd[j] = multiply(odd[j], job.roots[j]);
 		}
 		dft<HALF, false>(even);
 		dft<HALF, false>(odd);
@@ -216,273 +311,29 @@ static __global__ void __launch_bounds__(32 * HALF * PAIRS) filter_fused(const f
 			if (column >= job.wide)
 				continue;
 			if (has[0])
-				to[column] = value.x;
+				place[0].to[column] = value.x;
 			if (has[1])
-				to[job.wide_pitch + column] = value.y;
+				place[0].to[to_step + column] = value.y;
 		}
-	}
-}
-
-/* ---- edges ---- */
-
-enum { EDGE_THREADS = 64, LEVEL_THREADS = 256 };
-struct batch_slots {
-	int slot[BATCH_MOST];
-};
-
-/* The block's sum, the same bits on every run; thread 0 has it. */
-static __device__ double sum_block(double value, double *shared)
-{
-	shared[threadIdx.x] = value;
-	for (int half = EDGE_THREADS / 2; half > 0; half /= 2) {
-		__syncthreads();
-		if (threadIdx.x < half)
-			shared[threadIdx.x] += shared[threadIdx.x + half];
-	}
-	__syncthreads();
-	double sum = shared[0];
-	__syncthreads();
-	return sum;
-}
-
-/* The block's least value. */
-static __device__ int least_of_block(int value, int *shared)
-{
-	shared[threadIdx.x] = value;
-	for (int half = EDGE_THREADS / 2; half > 0; half /= 2) {
-		__syncthreads();
-		if (threadIdx.x < half)
-			shared[threadIdx.x] = min(shared[threadIdx.x], shared[threadIdx.x + half]);
-	}
-	__syncthreads();
-	int least = shared[0];
-	__syncthreads();
-	return least;
-}
-
-/* A block has one view. */
-static __global__ void __launch_bounds__(LEVEL_THREADS)
-    find_levels(const filter_job job, const batch_slots slots, float *levels)
-{
-	__shared__ float shared[LEVEL_THREADS];
-	const float *p = job.from + (size_t)slots.slot[blockIdx.x] * job.slot;
-	int column_stride = truncation_stride(job.columns), row_stride = truncation_stride(job.rows);
-	int columns = (job.columns - 1) / column_stride + 1, rows = (job.rows - 1) / row_stride + 1;
-	float largest = 0;
-
-	for (int i = threadIdx.x; i < columns * rows; i += LEVEL_THREADS) {
-		int row = i / columns * row_stride, column = i % columns * column_stride;
-
-		largest = fmaxf(largest, p[(size_t)row * job.pitch + column]);
-	}
-	shared[threadIdx.x] = largest;
-	for (int half = LEVEL_THREADS / 2; half > 0; half /= 2) {
-		__syncthreads();
-		if (threadIdx.x < half)
-			shared[threadIdx.x] = fmaxf(shared[threadIdx.x], shared[threadIdx.x + half]);
-	}
-	if (threadIdx.x == 0)
-		levels[blockIdx.x] = truncation_level(shared[0]);
-}
-
-/* Shared memory of a block that looks for the shell around a row's object. */
-struct shell_search_shared {
-	double residual[SHELL_OUTLINES], square;
-	float bins[SHELL_BINS], ellipse;
-	struct shell_place place;
-	struct truncation_end ends[2];
-	int columns[EDGE_THREADS];
-};
-static_assert(EDGE_THREADS == (int)SHELL_BINS, "a thread has one bin");
-
-/* Both ends of the row's object to s->ends, by a thread of either warp. */
-static __device__ void find_ends(const float *p, int columns, float level, int sides, shell_search_shared *s)
-{
-	int t = threadIdx.x, first = columns - 1, behind = columns - 1;
-
-	for (int c = t; c < columns; c += EDGE_THREADS)
-		if (p[c] >= level) {
-			first = min(first, c);
-			behind = min(behind, columns - 1 - c);
-		}
-	first = sides & 1 ? 0 : least_of_block(first, s->columns);
-	behind = sides & 2 ? 0 : least_of_block(behind, s->columns);
-	int count = max(columns - behind - first, 1);
-	if (t == 0)
-		s->ends[0] = truncation_end_of(p + first, 1, count, columns);
-	if (t == EDGE_THREADS / 2)
-		s->ends[1] = truncation_end_of(p + first + count - 1, -1, count, columns);
-	__syncthreads();
-}
-
-/*
- * core/truncation_bone.h's search between the cusps of s->ends, a candidate a thread; thread 0 has the result. width:
- * of what lies between them, columns.
- */
-static __device__ struct shell find_shell(const struct shell_table *table, int width, shell_search_shared *s)
-{
-	int t = threadIdx.x;
-	struct shell shell = {};
-
-	s->bins[t] = shell_bin(s->ends[0].p + s->ends[0].cap, 1, 0, width, t);
-	__syncthreads();
-	if (t == 0) {
-		s->square = shell_square(s->bins);
-		s->ellipse = shell_ellipse_error(s->bins, s->square);
-		s->place = {};
-	}
-	__syncthreads();
-	if (!shell_is_tried(s->ellipse))
-		return shell;
-	for (int step = 0; step < SHELL_STEPS; step++) {
-		if (t < SHELL_OUTLINES) {
-			struct shell_place next = shell_candidate(s->place, step, t);
-
-			s->residual[t] = shell_try(table, s->bins, s->square, next.at[0], next.at[1]).residual;
-		}
-		__syncthreads();
-		if (t == 0) {
-			int best = 0;
-
-			for (int k = 1; k < SHELL_OUTLINES; k++)
-				best = s->residual[k] < s->residual[best] ? k : best;
-			s->place = shell_candidate(s->place, step, best);
-		}
-		__syncthreads();
-	}
-	if (t == 0)
-		shell =
-		    shell_make(table, s->bins, s->square, s->ellipse, shell_noise(s->ends, s->square, width), s->place);
-	return shell;
-}
-
-static __device__ struct truncation_near near_side(const float *p, int columns, int side)
-{
-	return truncation_near(side == 0 ? p : p + columns - 1, side == 0 ? 1 : -1, columns);
-}
-
-/* A block has one row; most rows end in air at both sides and cost no more than a look there. */
-static __global__ void __launch_bounds__(EDGE_THREADS)
-    find_edges(const filter_job job, const batch_slots slots, bool before, bool behind, edges found)
-{
-	__shared__ double shared[EDGE_THREADS];
-	__shared__ shell_search_shared search;
-	int row = blockIdx.x, columns = job.columns, edge = truncation_edge(columns),
-	    window = truncation_window(columns);
-	const float *p = job.from + (size_t)slots.slot[blockIdx.y] * job.slot + (size_t)row * job.pitch;
-	size_t at = (size_t)blockIdx.y * job.rows + row;
-	const float level = found.levels[blockIdx.y];
-	int sides = 0;
-
-	for (int side = 0; side < 2; side++) {
-		double sum = 0, bends = 0;
-
-		for (int i = threadIdx.x; i < edge; i += EDGE_THREADS)
-			sum += (double)p[side == 0 ? i : columns - 1 - i];
-		sum = sum_block(sum, shared);
-		if (!(side == 0 ? before : behind) || !(sum > 0) || sum < (double)level * edge ||
-		    truncation_ends_within(near_side(p, columns, side), level))
-			continue;
-		for (int i = threadIdx.x + 1; i < window - 1; i += EDGE_THREADS) {
-			const float *middle = p + (side == 0 ? i : columns - 1 - i);
-			double bend = (double)middle[-1] - 2 * (double)middle[0] + (double)middle[1];
-
-			bends += bend * bend;
-		}
-		if (!truncation_is_chance(columns, sum, sum_block(bends, shared)))
-			sides |= 1 << side;
-	}
-	if (threadIdx.x == 0)
-		found.sides[at] = (unsigned char)sides;
-	if (sides == 0)
-		return;
-	struct truncation_row_sums own = {}, row_sums;
-	for (int c = threadIdx.x; c < columns; c += EDGE_THREADS)
-		if (p[c] >= level)
-			truncation_row_add(&own, truncation_x(c, columns), (double)p[c]);
-	row_sums.n = sum_block(own.n, shared);
-	row_sums.x = sum_block(own.x, shared);
-	row_sums.x2 = sum_block(own.x2, shared);
-	row_sums.x3 = sum_block(own.x3, shared);
-	row_sums.x4 = sum_block(own.x4, shared);
-	row_sums.y = sum_block(own.y, shared);
-	row_sums.xy = sum_block(own.xy, shared);
-	row_sums.x2y = sum_block(own.x2y, shared);
-	find_ends(p, columns, level, sides, &search);
-	int width = search.ends[0].count - search.ends[0].cap - search.ends[1].cap;
-	struct shell shell = find_shell(found.shells, width, &search);
-	for (int side = 0; side < 2; side++) {
-		struct truncation_edge_sums edge_sums;
-		double y = 0, xy = 0, measured = 0;
-		const int cap = search.ends[side].cap;
-
-		for (int i = threadIdx.x; i < window; i += EDGE_THREADS) {
-			double sample = (double)p[side == 0 ? i : columns - 1 - i], value = fmax(sample, 0.0);
-
-			if (sides >> side & 1)
-				measured += (double)p[side == 0 ? i + cap : columns - 1 - i - cap];
-			y += value * value;
-			xy -= i * value * value;
-		}
-		edge_sums.y = sum_block(y, shared);
-		edge_sums.xy = sum_block(xy, shared);
-		measured = sum_block(measured, shared);
-		if (threadIdx.x > 0 || !(sides >> side & 1))
-			continue;
-		struct extension *fit = &found.fit[at][side];
-
-		*fit = truncation_fit(columns, job.extend, &row_sums, &edge_sums);
-		if (shell.share > 0)
-			truncation_by_shell(fit, &shell, side, cap, width, (float)measured, columns);
-		truncation_by_cap(fit, &search.ends[side]);
 	}
 }
 
 /* ---- cuFFT ---- */
 
-/* Source and target of one of the call's rows. */
-struct row_place {
-	int view, row;
-	size_t from, to, index;
-};
-static __device__ __forceinline__ row_place place_of(const filter_job &job, int index)
+static __device__ __forceinline__ row_place fft_place(const filter_job &job, int place)
 {
-	if (job.list != NULL)
-		index = job.list[index];
-	int i = index / job.rows, row = index - i * job.rows;
-
-	return {job.views[i], row, (size_t)job.slots[i] * job.slot + (size_t)row * job.pitch,
-		(size_t)i * job.wide_slot + (size_t)row * job.wide_pitch, (size_t)index};
-}
-
-/* The extended row, `x` columns beyond its outermost one. */
-static __device__ __forceinline__ float extended_at(const filter_job &job, const row_place &at,
-						    const row_weight &weight, int side, int x)
-{
-	int outermost = side == 0 ? 0 : job.columns - 1, column = side == 0 ? -x : outermost + x;
-
-	if (!(job.sides[at.index] >> side & 1) || x > job.extend)
-		return 0;
-	return truncation_value(&job.fit[at.index][side], x) * weight.column_weights[outermost] *
-	       cosine_at(job, weight, column);
+	return job.list != NULL ? listed_place(job, place) : place_of(job, place / job.rows, place % job.rows);
 }
 
 static __global__ void fft_fill(const filter_job job, int first, int length, float *to)
 {
-	int to_column = blockIdx.x * blockDim.x + threadIdx.x, column = to_column - job.pad;
-	float value = 0;
+	int sample = blockIdx.x * blockDim.x + threadIdx.x;
 
-	if (to_column >= length)
+	if (sample >= length)
 		return;
-	row_place at = place_of(job, first + (int)blockIdx.y);
-	row_weight weight = weight_of(job, at.view, at.row);
-	if ((unsigned)column < (unsigned)job.columns)
-		value = job.from[at.from + column] * weight.column_weights[column] * cosine_at(job, weight, column);
-	else if (job.list != NULL && column >= job.columns && column < job.columns + job.extend)
-		value = extended_at(job, at, weight, 1, column - (job.columns - 1));
-	else if (job.list != NULL && column >= length - job.extend)
-		value = extended_at(job, at, weight, 0, length - column);
-	to[(size_t)blockIdx.y * (length + 2) + to_column] = value;
+	const row_place at = fft_place(job, first + (int)blockIdx.y);
+	const row_weight weight = weight_of(job, at.view, at.row);
+	to[(size_t)blockIdx.y * (length + 2) + sample] = sample_at(job, at, weight, sample, length);
 }
 
 static __global__ void fft_multiply(const float *response, int length, float *rows)
@@ -499,14 +350,15 @@ static __global__ void fft_take(const filter_job job, int first, int length, con
 	int column = blockIdx.x * blockDim.x + threadIdx.x;
 
 	if (column < job.wide)
-		job.to[place_of(job, first + (int)blockIdx.y).to + column] =
-		    rows[(size_t)blockIdx.y * (length + 2) + column];
+		fft_place(job, first + (int)blockIdx.y).to[column] = rows[(size_t)blockIdx.y * (length + 2) + column];
 }
 
 /* The first `all` rows of the job's list, or of all. */
-static int filter_fft(struct plan *plan, const struct fft *fft, const filter_job &job, int all, struct error *err)
+static int filter_fft(struct plan *plan, const struct transform *transform, const filter_job &job, int all,
+		      struct error *err)
 {
 	cudaStream_t stream = plan->device->stream;
+	const struct fft *fft = &transform->fft;
 	float *fft_rows = plan->scratch; /* [at_once][length + 2] */
 	int length = fft->length;
 
@@ -519,8 +371,8 @@ static int filter_fft(struct plan *plan, const struct fft *fft, const filter_job
 		/* Rows left over from the batch before are transformed once more and not read. */
 		if (cufftExecR2C(fft->forward, fft_rows, (cufftComplex *)fft_rows) != CUFFT_SUCCESS)
 			return error_set(err, ERR_DEVICE, "cufftExecR2C of %d rows of %d failed", rows, length);
-		fft_multiply<<<dim3(divide_up(length / 2 + 1, 256), rows), 256, 0, stream>>>(fft->response, length,
-											     fft_rows);
+		fft_multiply<<<dim3(divide_up(length / 2 + 1, 256), rows), 256, 0, stream>>>(transform->response,
+											     length, fft_rows);
 		LAUNCHED();
 		if (cufftExecC2R(fft->inverse, (cufftComplex *)fft_rows, fft_rows) != CUFFT_SUCCESS)
 			return error_set(err, ERR_DEVICE, "cufftExecC2R of %d rows of %d failed", rows, length);
@@ -532,14 +384,14 @@ static int filter_fft(struct plan *plan, const struct fft *fft, const filter_job
 
 /* ---- making it ---- */
 
-int filter_choose(int columns)
+struct transform_length filter_choose(int columns)
 {
-	static const int halves[] = {1, 2, 3, 4, 5, 6, 8};
+	static const int halves[] = {1, 2, 3, 4, 5, 6, 8, HALF_MOST};
 
 	for (int half : halves)
 		if (columns <= 256 * half)
-			return 512 * half;
-	return 0;
+			return {512 * half, 0};
+	return {0, filter_length(columns)};
 }
 
 static size_t fft_row_bytes(int length)
@@ -555,7 +407,7 @@ size_t filter_scratch_bytes(const struct plan *plan, size_t others)
 {
 	const struct plan_shape *shape = &plan->shape;
 	const struct geometry *geometry = plan->options.geometry;
-	int longest = std::max(shape->fft_length, shape->extended_length);
+	int longest = std::max(shape->plain.fft, shape->extended.fft);
 	size_t row = fft_row_bytes(longest), view = sizeof(float) * (size_t)geometry->columns * (size_t)geometry->rows;
 	size_t share = std::max(others, view * (size_t)geometry->count) / 2;
 	size_t rows = std::min(std::min((size_t)shape->batch * (size_t)geometry->rows * row, FFT_BYTES), share);
@@ -579,28 +431,33 @@ int filter_new(struct plan *plan, struct error *err)
 	return plan->filter != NULL ? 0 : error_set(err, ERR_NO_MEMORY, "no memory for the filter");
 }
 
+static void transform_walk(struct transform *transform, const struct transform_length *length, struct arena *arena)
+{
+	if (length->fused > 0) {
+		take(arena, &transform->response, (size_t)length->fused);
+		take(arena, &transform->twiddles, (size_t)length->fused + 256);
+	} else {
+		take(arena, &transform->response, (size_t)length->fft / 2 + 1);
+	}
+}
+
 void filter_walk(struct plan *plan, struct arena *arena)
 {
 	const struct plan_shape *shape = &plan->shape;
 	struct filter measured = {}, *filter = plan->filter != NULL ? plan->filter : &measured;
-	size_t length = (size_t)shape->filter_length, batch = (size_t)shape->batch;
-	size_t rows = batch * (size_t)plan->stack.rows;
+	size_t rows = (size_t)shape->batch * (size_t)plan->stack.rows;
 
 	take(arena, &filter->column_weights, (size_t)plan->options.geometry->count * (size_t)plan->stack.columns);
-	if (length > 0) {
-		take(arena, &filter->response, length);
-		take(arena, &filter->twiddles, length + 256);
-	} else {
-		take(arena, &filter->plain.response, (size_t)shape->fft_length / 2 + 1);
-	}
-	if (shape->extended_length == 0)
+	transform_walk(&filter->plain, &shape->plain, arena);
+	if (plan->options.extend == 0)
 		return;
-	take(arena, &filter->extended.response, (size_t)shape->extended_length / 2 + 1);
+	transform_walk(&filter->extended, &shape->extended, arena);
 	take(arena, &filter->edges.shells, 1);
-	take(arena, &filter->edges.levels, batch);
+	take(arena, &filter->edges.levels, (size_t)shape->batch);
 	take(arena, &filter->edges.sides, rows);
-	take(arena, &filter->edges.fit, rows);
 	take(arena, &filter->edges.list, rows);
+	take(arena, &filter->edges.ends, 2 * rows);
+	take(arena, &filter->edges.fit, rows);
 }
 
 /* The response at another length that convolves `columns` values alike. */
@@ -638,11 +495,11 @@ static int upload(void *to, const void *from, size_t bytes, struct error *err)
 	return 0;
 }
 
-static int prepare_fused(struct plan *plan, struct error *err)
+/* given: the response of filter_length(columns). */
+static int prepare_fused(struct transform *transform, int length, int columns, const float *given, struct error *err)
 {
-	int length = plan->shape.filter_length, factor = length / 256, columns = plan->filtered.columns;
-	std::vector<double> values =
-	    response_at(plan->options.filter_response, filter_length(columns), columns, length);
+	int factor = length / 256;
+	std::vector<double> values = response_at(given, filter_length(columns), columns, length);
 	std::vector<float> response((size_t)length);
 	std::vector<float2> twiddles((size_t)length + 256);
 
@@ -666,8 +523,8 @@ static int prepare_fused(struct plan *plan, struct error *err)
 
 			twiddles[(size_t)(length + 16 * k + m)] = make_float2((float)cos(angle), (float)sin(angle));
 		}
-	TRY(upload(plan->filter->response, response.data(), response.size() * sizeof(float), err));
-	return upload(plan->filter->twiddles, twiddles.data(), twiddles.size() * sizeof(float2), err);
+	TRY(upload(transform->response, response.data(), response.size() * sizeof(float), err));
+	return upload(transform->twiddles, twiddles.data(), twiddles.size() * sizeof(float2), err);
 }
 
 /* Makes both transforms of so many rows with one workspace of *ret_bytes; false: cuFFT refuses. */
@@ -702,15 +559,16 @@ static void fft_unmake(struct fft *fft)
 	fft->has_forward = fft->has_inverse = false;
 }
 
-static int prepare_fft(struct plan *plan, struct fft *fft, int length, const float *from, struct error *err)
+static int prepare_fft(struct plan *plan, struct transform *transform, int length, const float *from, struct error *err)
 {
+	struct fft *fft = &transform->fft;
 	int half = length / 2 + 1;
 	std::vector<float> response((size_t)half);
 
 	fft->length = length;
 	for (int k = 0; k < half; k++)
 		response[(size_t)k] = from[k] / (float)length;
-	TRY(upload(fft->response, response.data(), response.size() * sizeof(float), err));
+	TRY(upload(transform->response, response.data(), response.size() * sizeof(float), err));
 	/* A workspace may be larger than the rows: fewer then. */
 	for (int rows = fft_at_once(plan, length); rows > 0; rows /= 2) {
 		size_t data = ((size_t)rows * fft_row_bytes(length) + FFT_ALIGNED - 1) / FFT_ALIGNED * FFT_ALIGNED;
@@ -745,27 +603,31 @@ static int prepare_edges(struct plan *plan, struct error *err)
 
 int filter_prepare(struct plan *plan, struct error *err)
 {
+	const struct plan_shape *shape = &plan->shape;
 	const struct plan_options *options = &plan->options;
 	struct filter *filter = plan->filter;
+	int columns = plan->filtered.columns, widest = columns + options->extend;
 	size_t bytes = (size_t)options->geometry->count * (size_t)plan->stack.columns * sizeof(float);
 
 	TRY(upload(filter->column_weights, options->column_weights, bytes, err));
-	if (plan->shape.filter_length > 0)
-		TRY(prepare_fused(plan, err));
+	if (shape->plain.fused > 0)
+		TRY(prepare_fused(&filter->plain, shape->plain.fused, columns, options->filter_response, err));
 	else
-		TRY(prepare_fft(plan, &filter->plain, plan->shape.fft_length, options->filter_response, err));
-	if (plan->shape.extended_length == 0)
+		TRY(prepare_fft(plan, &filter->plain, shape->plain.fft, options->filter_response, err));
+	if (options->extend == 0)
 		return 0;
 	TRY(prepare_edges(plan, err));
-	return prepare_fft(plan, &filter->extended, plan->shape.extended_length, options->extended_response, err);
+	if (shape->extended.fused > 0)
+		return prepare_fused(&filter->extended, shape->extended.fused, widest, options->extended_response, err);
+	return prepare_fft(plan, &filter->extended, shape->extended.fft, options->extended_response, err);
 }
 
 void filter_free(struct filter *filter)
 {
 	if (filter == NULL)
 		return;
-	fft_unmake(&filter->plain);
-	fft_unmake(&filter->extended);
+	fft_unmake(&filter->plain.fft);
+	fft_unmake(&filter->extended.fft);
 	if (filter->edges.used != NULL)
 		cudaEventDestroy(filter->edges.used);
 	free(filter->edges.sides_host);
@@ -777,11 +639,15 @@ template <int HALF>
 static void launch_fused(filter_job &job, cudaStream_t stream)
 {
 	const int pairs = HALF >= 4 ? 1 : HALF >= 2 ? 2 : 4;
+	const dim3 threads(32 * HALF, pairs);
 
 	for (int j = 0; j < HALF; j++)
 		job.roots[j] = make_float2((float)cos(M_PI * j / HALF), (float)-sin(M_PI * j / HALF));
-	filter_fused<HALF, pairs>
-	    <<<dim3(divide_up(job.rows, 2 * pairs), job.count), dim3(32 * HALF, pairs), 0, stream>>>(job);
+	if (job.list != NULL)
+		filter_fused<HALF, pairs, true><<<divide_up(job.listed, 2 * pairs), threads, 0, stream>>>(job);
+	else
+		filter_fused<HALF, pairs, false>
+		    <<<dim3(divide_up(job.rows, 2 * pairs), job.count), threads, 0, stream>>>(job);
 }
 
 static filter_job job_make(const struct plan *plan, const struct stack *from, const struct stack *to)
@@ -802,20 +668,21 @@ static filter_job job_make(const struct plan *plan, const struct stack *from, co
 	job.wide_pitch = plan->filtered.pitch;
 	job.wide_slot = plan->filtered.slot;
 	job.column_weights = plan->filter->column_weights;
-	job.response = plan->filter->response;
-	job.twiddles = plan->filter->twiddles;
 	job.views = plan->views;
 	job.slots = plan->slots;
 	job.extend = plan->options.extend;
 	return job;
 }
 
-/* Filters all rows without extending any. */
-static int filter_plain(struct plan *plan, filter_job job, struct error *err)
+/* Filters all rows as they are, or those of the list with their extensions. */
+static int filter_rows(struct plan *plan, const struct transform *transform, const struct transform_length *length,
+		       filter_job job, struct error *err)
 {
 	cudaStream_t stream = plan->device->stream;
 
-	switch (plan->shape.filter_length / 512) {
+	job.response = transform->response;
+	job.twiddles = transform->twiddles;
+	switch (length->fused / 512) {
 	case 1:
 		launch_fused<1>(job, stream);
 		break;
@@ -837,31 +704,37 @@ static int filter_plain(struct plan *plan, filter_job job, struct error *err)
 	case 8:
 		launch_fused<8>(job, stream);
 		break;
+	case HALF_MOST:
+		launch_fused<HALF_MOST>(job, stream);
+		break;
 	default:
-		return filter_fft(plan, &plan->filter->plain, job, job.count * job.rows, err);
+		return filter_fft(plan, transform, job, job.list != NULL ? job.listed : job.count * job.rows, err);
 	}
 	LAUNCHED();
 	return 0;
 }
 
+static edge_rows edge_rows_of(const filter_job &job)
+{
+	return {job.from, job.slot, job.columns, job.rows, job.pitch, job.extend};
+}
+
 /* Looks at the rows of a batch as soon as they are there; *ret_count of them are to be extended. */
-static int look_at_edges(struct plan *plan, const filter_job &job, const int *slots, cudaEvent_t there, int *ret_count,
-			 struct error *err)
+static int look_at_edges(struct plan *plan, const filter_job &job, const batch_slots &slots, cudaEvent_t there,
+			 int *ret_count, struct error *err)
 {
 	const int *pad = plan->options.pad;
 	cudaStream_t stream = plan->device->copy;
 	struct edges *edges = &plan->filter->edges;
+	const edge_rows view_rows = edge_rows_of(job);
 	int rows = job.count * job.rows, count = 0;
-	batch_slots batch = {};
 
-	for (int i = 0; i < job.count; i++)
-		batch.slot[i] = slots[i];
 	TRY(begin_arrival(plan->device, there, err));
 	TRY(begin_arrival(plan->device, edges->used, err));
-	find_levels<<<job.count, LEVEL_THREADS, 0, stream>>>(job, batch, edges->levels);
+	find_levels<<<job.count, LEVEL_THREADS, 0, stream>>>(view_rows, slots, edges->levels);
 	LAUNCHED();
-	find_edges<<<dim3(job.rows, job.count), EDGE_THREADS, 0, stream>>>(job, batch, pad[0] == 0, pad[1] == 0,
-									   *edges);
+	find_edges<<<divide_up(rows, FIT_THREADS / ROW_LANES), FIT_THREADS, 0, stream>>>(view_rows, slots, pad[0] == 0,
+											 pad[1] == 0, *edges, rows);
 	LAUNCHED();
 	CUDA_TRY(cudaMemcpyAsync(edges->sides_host, edges->sides, (size_t)rows, cudaMemcpyDeviceToHost, stream));
 	CUDA_TRY(cudaStreamSynchronize(stream));
@@ -877,17 +750,25 @@ static int look_at_edges(struct plan *plan, const filter_job &job, const int *sl
 	return 0;
 }
 
-static int filter_extended_rows(struct plan *plan, filter_job job, int count, struct error *err)
+static int filter_extended_rows(struct plan *plan, filter_job job, const batch_slots &slots, int count,
+				struct error *err)
 {
 	struct edges *edges = &plan->filter->edges;
 	cudaStream_t stream = plan->device->stream;
+	const edge_rows rows = edge_rows_of(job);
 
 	CUDA_TRY(cudaMemcpyAsync(edges->list, edges->list_host, (size_t)count * sizeof(int), cudaMemcpyHostToDevice,
 				 stream));
+	find_ends<<<divide_up(count, ENDS_ROWS), dim3(WARP, ENDS_ROWS), 0, stream>>>(rows, slots, *edges, count);
+	LAUNCHED();
+	fit_extensions<<<divide_up(count, FIT_THREADS / ROW_LANES), FIT_THREADS, 0, stream>>>(rows, slots, *edges,
+											      count);
+	LAUNCHED();
 	job.list = edges->list;
+	job.listed = count;
 	job.sides = edges->sides;
 	job.fit = edges->fit;
-	TRY(filter_fft(plan, &plan->filter->extended, job, count, err));
+	TRY(filter_rows(plan, &plan->filter->extended, &plan->shape.extended, job, err));
 	return mark_used(plan->device, edges->used, err); /* what was found is free for the next batch */
 }
 
@@ -905,18 +786,22 @@ int cuda_filter(struct plan *plan, const struct stack *from, const int *slots, c
 	job = job_make(plan, from, to);
 	job.count = count;
 	if (plan->filter->edges.rows == 0)
-		return filter_plain(plan, job, err);
+		return filter_rows(plan, &plan->filter->plain, &plan->shape.plain, job, err);
 	for (int done = 0; done < count; done += plan->shape.batch) {
+		batch_slots batch = {};
 		int extended = 0;
 
 		job.count = count - done < plan->shape.batch ? count - done : plan->shape.batch;
 		job.views = plan->views + done;
 		job.slots = plan->slots + done;
 		job.to = to->data + (size_t)done * plan->filtered.slot;
-		TRY(look_at_edges(plan, job, slots + done, from->used, &extended, err));
-		TRY(filter_plain(plan, job, err));
+		for (int i = 0; i < job.count; i++)
+			batch.slot[i] = slots[done + i];
+		TRY(look_at_edges(plan, job, batch, from->used, &extended, err));
+		if (extended < job.count * job.rows)
+			TRY(filter_rows(plan, &plan->filter->plain, &plan->shape.plain, job, err));
 		if (extended > 0)
-			TRY(filter_extended_rows(plan, job, extended, err));
+			TRY(filter_extended_rows(plan, job, batch, extended, err));
 	}
 	return 0;
 }

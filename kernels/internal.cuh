@@ -256,6 +256,12 @@ enum thrift { THRIFT_NONE, THRIFT_HALVES, THRIFT_2_PARTS, THRIFT_3_PARTS, THRIFT
  */
 enum matched { MATCHED_ANY, MATCHED_TILTED, MATCHED_UPRIGHT, MATCHED_UPRIGHT_FAR };
 
+/* Length of the filter's transform of a row: in one kernel, or by cuFFT where that is too short. */
+struct transform_length {
+	int fused; /* 0: cuFFT's */
+	int fft;   /* 0: the fused one's */
+};
+
 /* How a plan does its work; chosen once from geometry and options. */
 struct plan_shape {
 	bool untilted;    /* the fast kernels apply */
@@ -275,18 +281,17 @@ struct plan_shape {
 	enum matched matched; /* how the matched backprojection goes */
 	int batch;            /* views filtered and backprojected in one go */
 	enum thrift thrift;
-	int correction;      /* slots of the correction stack, 0 without SART */
-	bool parts;          /* it holds a part of a subset only */
-	int views_at_once;   /* that one launch of the backprojection takes; layers of the projection array */
-	int pairs_at_once;   /* that there is room for as pairs */
-	int subset;          /* views of SART's largest subset, 0 without SART */
-	bool indexed;        /* voxels are counted by an int */
-	bool few_views;      /* an update has too few views to fill the card by whole rays */
-	bool copied;         /* the volume may be projected from copies in half precision (by_view.cu) */
-	bool covered;        /* every view sees the whole grid: sum_S w_ij = views of S */
-	int filter_length;   /* of the fused filter, 0 for cuFFT */
-	int fft_length;      /* of cuFFT for all rows */
-	int extended_length; /* of cuFFT for rows that are extended, 0: none are */
+	int correction;    /* slots of the correction stack, 0 without SART */
+	bool parts;        /* it holds a part of a subset only */
+	int views_at_once; /* that one launch of the backprojection takes; layers of the projection array */
+	int pairs_at_once; /* that there is room for as pairs */
+	int subset;        /* views of SART's largest subset, 0 without SART */
+	bool indexed;      /* voxels are counted by an int */
+	bool few_views;    /* an update has too few views to fill the card by whole rays */
+	bool copied;       /* the volume may be projected from copies in half precision (by_view.cu) */
+	bool covered;      /* every view sees the whole grid: sum_S w_ij = views of S */
+	/* Of the filter, of rows as they are and of those with their extensions; 0: none are extended. */
+	struct transform_length plain, extended;
 };
 
 /* Data with a scale in half precision: projections as pairs, those of ones, the volume. */
@@ -481,7 +486,7 @@ int matched_coverage(struct plan *plan, int first, int count, struct error *err)
 size_t matched_scratch_bytes(const struct plan *plan); /* at least */
 
 /* ---- filter.cu ---- */
-int filter_choose(int columns);
+struct transform_length filter_choose(int columns);
 /* plan->filter, before the walk that carves; filter_free takes NULL. */
 int filter_new(struct plan *plan, struct error *err);
 void filter_free(struct filter *filter);

@@ -368,12 +368,9 @@ static struct plan_shape shape_of(const struct plan_options *options, enum thrif
 	shape.covered = !options->matched && is_covered(geometry, grid);
 	shape.views_at_once = at_most(geometry->count, lean_or(thrift, VIEWS_AT_ONCE));
 	if (options->column_weights != NULL) {
-		shape.filter_length = filter_choose(wide_columns(options));
-		if (shape.filter_length == 0) {
-			shape.fft_length = filter_length(wide_columns(options));
-		}
+		shape.plain = filter_choose(wide_columns(options));
 		if (options->extend > 0)
-			shape.extended_length = filter_length(wide_columns(options) + options->extend);
+			shape.extended = filter_choose(wide_columns(options) + options->extend);
 	}
 	return shape;
 }
@@ -829,9 +826,9 @@ static void summarise(struct plan *plan)
 	snprintf(plan->summary, sizeof(plan->summary), "%sforward %s%s; back %s%s%s%s; %s%s%s", saves,
 		 projector_name(plan), rows, backprojector_name(plan, false), fdk ? ", FDK's " : "",
 		 fdk ? backprojector_name(plan, true) : "", back,
-		 shape->filter_length > 0 ? "fused filter"
-		 : shape->fft_length > 0  ? "cuFFT"
-					  : "no filter",
+		 shape->plain.fused > 0 ? "fused filter"
+		 : shape->plain.fft > 0 ? "cuFFT"
+					: "no filter",
 		 plan->strategy != NULL ? "; SART " : "", plan->strategy != NULL ? plan->strategy->name : "");
 }
 

@@ -225,6 +225,7 @@ static void fit_bone(const struct filter_engine *engine, const struct rows *rows
 				truncation_by_shell(&ret->edge[side][r], &shell, side, end->cap, width, measured,
 						    rows->columns);
 			truncation_by_cap(&ret->edge[side][r], end);
+			truncation_end_extension(&ret->edge[side][r], engine->extend);
 		}
 	}
 }
