@@ -31,6 +31,7 @@ enum lock_rank {
 	LOCK_WATCHERS,   /* watch_list.lock */
 	LOCK_ACCESS,     /* access.lock */
 	LOCK_TLS,        /* tls.lock */
+	LOCK_AUDIT,      /* audit.lock */
 	LOCK_HTTP,       /* http.lock */
 	LOCK_CONNECTION, /* connection.lock */
 	LOCK_COUNT

@@ -5,10 +5,6 @@
  */
 #include "daemon/api/internal.h"
 
-static const char *const proofs[] = {
-    [PROOF_PEER] = "peer",   [PROOF_NONE] = "none",       [PROOF_NOT_ASKED] = "not asked",
-    [PROOF_TOKEN] = "token", [PROOF_SESSION] = "session", [PROOF_CERTIFICATE] = "certificate"};
-
 static cJSON *identity_document(const struct identity *who)
 {
 	cJSON *document = cJSON_CreateObject();
@@ -19,7 +15,7 @@ static cJSON *identity_document(const struct identity *who)
 	else
 		cJSON_AddNullToObject(document, "name");
 	cJSON_AddStringToObject(document, "role", role_names[who->role]);
-	cJSON_AddStringToObject(document, "proof", proofs[who->proof]);
+	cJSON_AddStringToObject(document, "proof", proof_names[who->proof]);
 	token_expiry_print(who->expires, expires);
 	if (who->expires != TOKEN_NEVER)
 		cJSON_AddStringToObject(document, "expires", expires);
@@ -43,7 +39,7 @@ int session_post(void *context, struct request *request, struct error *err)
 		return error_set(err, ERR_CONFLICT,
 				 "a session is opened by a token (Authorization: Bearer), this "
 				 "request shows: %s",
-				 proofs[who->proof]);
+				 proof_names[who->proof]);
 	if (request_reply_json(request, 201, identity_document(who), err) != 0)
 		return err->code;
 	return request_session_open(request, err);

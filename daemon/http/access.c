@@ -32,6 +32,11 @@
 #include "daemon/lock.h"
 #include "daemon/log.h"
 
+const char *const proof_names[PROOF_COUNT] = {
+    [PROOF_NONE] = "none",       [PROOF_NOT_ASKED] = "not asked",     [PROOF_TOKEN] = "token",
+    [PROOF_SESSION] = "session", [PROOF_CERTIFICATE] = "certificate", [PROOF_PEER] = "peer",
+};
+
 enum { SESSIONS_MAX = 256, PEER_RULES_MAX = 64, GROUPS_MAX = 1024 };
 static const double session_seconds = 12 * 3600; /* a working day */
 static const char session_cookie[] = "cbctd_session";

@@ -248,6 +248,7 @@ static void on_completed(void *context, struct MHD_Connection *mhd, void **state
 		if (whole && request->response_size != UNKNOWN_SIZE && !request_is_head(request))
 			atomic_fetch_add(&http->bytes_out, request->response_size);
 		log_request(request, whole);
+		audit_tell(http->audit, request, whole);
 	}
 	if (request->close)
 		drop_rest(request->connection);
@@ -373,9 +374,25 @@ static int library_start(struct http *http, struct error *err)
 	return 0;
 }
 
+/* Where nobody is asked who they are there is a log only if one is wanted. */
+static int start_audit(struct http *http, struct error *err)
+{
+	const struct http_options *options = &http->options;
+	char path[PATH_MAX];
+
+	if (strcmp(options->audit, "off") == 0 || (options->audit[0] == '\0' && !access_is_asked(http->access)))
+		return 0;
+	if (options->audit[0] != '\0')
+		snprintf(path, sizeof(path), "%s", options->audit);
+	else
+		snprintf(path, sizeof(path), "%s/audit.jsonl", options->state_dir);
+	return audit_new(path, options->audit_bytes, options->audit_files, &http->audit, err);
+}
+
 int http_start(struct http *http, struct error *err)
 {
-	if (clock_start(http, err) != 0 || library_start(http, err) != 0 || admission_start(http, err) != 0)
+	if (start_audit(http, err) != 0 || clock_start(http, err) != 0 || library_start(http, err) != 0 ||
+	    admission_start(http, err) != 0)
 		return err->code;
 	for (int i = 0; i < http->listener_count; i++)
 		printf("listening on %s\n", http->listeners[i].name);
@@ -425,6 +442,7 @@ void http_free(struct http *http)
 	http_stop(http);
 	if (http->admission_kick >= 0)
 		close(http->admission_kick);
+	audit_free(http->audit);
 	access_free(http->access);
 	tls_free(http->tls);
 	pthread_cond_destroy(&http->clock_kick);

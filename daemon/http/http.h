@@ -58,6 +58,9 @@ struct http_options {
 	const char *state_dir;    /* replies do not show paths in it */
 	/* Paths; "" and "" for no TLS. The last may be "": clients are not asked for certificates. */
 	const char *tls_certificate, *tls_key, *tls_client_authorities;
+	const char *audit;          /* as config.audit; state_dir is there once http_start is called */
+	size_t audit_bytes;         /* of a file, before it is renamed */
+	int audit_files;            /* renamed ones that are kept */
 	const char *unix_roles;     /* as config.unix_roles; "": a Unix socket's peers are nobody in particular */
 	const char *tokens;         /* the file of tokens; "": nobody is asked who they are */
 	const struct route *routes; /* ends with method == NULL */
@@ -117,8 +120,10 @@ enum proof {
 	PROOF_TOKEN,
 	PROOF_SESSION,
 	PROOF_CERTIFICATE,
-	PROOF_PEER
+	PROOF_PEER,
+	PROOF_COUNT
 };
+extern const char *const proof_names[PROOF_COUNT];
 struct identity {
 	char name[TOKEN_NAME_SIZE]; /* of the token, "" without one */
 	enum role role;             /* ROLE_ANYONE: not known; ROLE_ADMIN where nobody is asked */

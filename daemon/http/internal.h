@@ -44,10 +44,11 @@ struct connection {
 	struct MHD_Connection *mhd; /* NULL until one of its threads has taken it; guarded by lock */
 	int socket;
 	struct sockaddr_storage address;
-	uid_t user;                         /* of a Unix socket's peer */
-	enum role peer_role;                /* likewise; constant */
-	bool tls;                           /* constant */
-	bool certificate_read;              /* its thread's own, as is the next */
+	uid_t user;                                         /* of a Unix socket's peer */
+	enum role peer_role;                                /* likewise; constant */
+	bool tls;                                           /* constant */
+	bool certificate_read;                              /* its thread's own, as is the next */
+	char audited_id[20], audited_name[TOKEN_NAME_SIZE]; /* the last read that was told; its thread's own */
 	char certificate[TOKEN_NAME_SIZE];  /* common name of the client's, which was verified; "" without one */
 	struct connection *previous, *next; /* guarded by http->lock */
 	int refused; /* status of its answers while it is one too many; 0: welcome; its thread's own */
@@ -121,6 +122,7 @@ struct listener {
 struct http {
 	struct http_options options;
 	struct access *access;
+	struct audit *audit; /* NULL: there is none */
 	struct listener listeners[LISTENERS_MAX];
 	int listener_count;
 	struct tls *tls; /* NULL: none */
@@ -244,6 +246,13 @@ int access_reload(struct access *access, struct error *err);
 int access_check_routes(const struct route *routes, struct error *err);
 /* Of a request that has found its route; 0, or 0 with a reply that refuses, or an error. */
 int access_check(struct request *request, struct error *err);
+
+/* ---- http/audit.c: who asked for what ---- */
+/* most: bytes of a file, before it is renamed; keep: renamed files. */
+int audit_new(const char *path, size_t most, int keep, struct audit **ret_audit, struct error *err);
+void audit_free(struct audit *audit); /* NULL is fine */
+/* Of a request that has ended, in its thread; NULL is fine. */
+void audit_tell(struct audit *audit, const struct request *request, bool whole);
 
 /* ---- http/reply.c ---- */
 int reply_problem_of(struct request *request, const struct error *err);
