@@ -192,7 +192,7 @@ $(BUILD)/gpu_ceilings: tests/bench/gpu_ceilings.cu
 apt_install = { $$run apt-get install -y -qq --no-install-recommends $(1) >/dev/null 2>&1 || \
 	  { $$run apt-get update -qq && DEBIAN_FRONTEND=noninteractive $$run apt-get install -y -qq --no-install-recommends $(1) >/dev/null; }; }
 
-check: OPTIONAL += chromium:chromium dciodvfy:dicom3tools
+check: OPTIONAL += chromium:chromium dciodvfy:dicom3tools Orthanc:orthanc-dicomweb
 check: MODULES += nibabel:python3-nibabel pydicom:python3-pydicom gdcm:python3-gdcm
 setup: ## install the Debian packages that are missing
 	@missing=""; \

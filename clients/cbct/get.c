@@ -8,16 +8,27 @@
 #include "clients/cbct/commands.h"
 #include "clients/cbct/http.h"
 #include "clients/cbct/volume_query.h"
+#include "proto/patient.h"
 
 struct get_options {
 	const char *job, *volume, *output;
+	int dicom;    /* of dicom_kinds, or unset */
+	int position; /* enum patient_position, or unset */
 	struct volume_query query;
 	struct http_options http;
 };
 
+static const char *const dicom_kinds[] = {"slices", "enhanced"};
+
 static const struct option rows[] = {
     {"output", 'o', OPTION_TEXT, offsetof(struct get_options, output), "FILE",
      "- is standard output (default: the name that the daemon gives)", 0, 0, 0, NULL},
+    {"dicom", 0, OPTION_CHOICE, offsetof(struct get_options, dicom), "KIND",
+     "with --format dicom: slices, a ZIP of CT images, or enhanced, one Enhanced CT (default slices)", 0, 0, 2,
+     dicom_kinds},
+    {"position", 0, OPTION_CHOICE, offsetof(struct get_options, position), "POSITION",
+     "with --format dicom, where nobody has told how the patient lies: HFS, HFP, FFS, FFP, HFDL, HFDR, FFDL or FFDR", 0,
+     0, PATIENT_POSITION_COUNT, patient_position_names},
     {0},
 };
 static const struct option_group groups[] = {
@@ -37,7 +48,11 @@ static void volume_path(const struct get_options *options, char *ret_path, size_
 	char query[VOLUME_QUERY_MAX];
 
 	volume_query_text(&options->query, query);
-	snprintf(ret_path, size, "/v1/jobs/%.100s/volumes/%.100s?%s", options->job, options->volume, query);
+	snprintf(ret_path, size, "/v1/jobs/%.100s/volumes/%.100s?%s%s%s%s%s", options->job, options->volume, query,
+		 options->dicom != OPTION_UNSET_CHOICE ? "&dicom=" : "",
+		 options->dicom != OPTION_UNSET_CHOICE ? dicom_kinds[options->dicom] : "",
+		 options->position != OPTION_UNSET_CHOICE ? "&position=" : "",
+		 options->position != OPTION_UNSET_CHOICE ? patient_position_names[options->position] : "");
 }
 
 /* The whole body into `file`; ret_name is what the daemon calls it. */
@@ -99,7 +114,8 @@ static int get_run(const void *values, struct error *err)
 	return download(options, stdout, name, sizeof(name), err);
 }
 
-static const struct get_options defaults = {.query = VOLUME_QUERY_DEFAULTS};
+static const struct get_options defaults = {
+    .dicom = OPTION_UNSET_CHOICE, .position = OPTION_UNSET_CHOICE, .query = VOLUME_QUERY_DEFAULTS};
 
 static const struct positional positionals[] = {
     {"JOB", "its id", offsetof(struct get_options, job), true},

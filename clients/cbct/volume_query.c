@@ -8,7 +8,8 @@
 		name, 0, kind, offsetof(struct volume_query, member), argument, help, least, most, count, names        \
 	}
 const struct option volume_query_rows[] = {
-    ROW("format", OPTION_TEXT, format, "FORMAT", "nifti, nifti.gz, mha, nrrd or raw (default nifti)", 0, 0, 0, NULL),
+    ROW("format", OPTION_TEXT, format, "FORMAT", "nifti, nifti.gz, mha, nrrd, raw or (get) dicom (default nifti)", 0, 0,
+	0, NULL),
     ROW("type", OPTION_CHOICE, type, "TYPE", "float32 is 1/mm, int16 Hounsfield units", 0, 0, VOLUME_TYPE_COUNT,
 	volume_type_names),
     ROW("scale", OPTION_INTEGER, scale, "N", "each voxel the mean of N x N x N", 1, 64, 0, NULL),
@@ -18,8 +19,9 @@ const struct option volume_query_rows[] = {
 
 void volume_query_text(const struct volume_query *query, char ret_text[VOLUME_QUERY_MAX])
 {
-	bool has_format = query->format != NULL;
+	bool has_format = query->format != NULL, has_type = query->type != OPTION_UNSET_CHOICE;
 
-	snprintf(ret_text, VOLUME_QUERY_MAX, "type=%s&scale=%ld%s%.100s", volume_type_names[query->type], query->scale,
-		 has_format ? "&format=" : "", has_format ? query->format : "");
+	snprintf(ret_text, VOLUME_QUERY_MAX, "scale=%ld%s%s%s%.100s", query->scale, has_type ? "&type=" : "",
+		 has_type ? volume_type_names[query->type] : "", has_format ? "&format=" : "",
+		 has_format ? query->format : "");
 }

@@ -106,6 +106,13 @@ test_slices_without_a_side_are_refused() {
 	get_volume final "$work/voxels.raw" "format=raw&type=int16"
 	echo '{"PatientPosition": "FFP", "PatientName": ""}' >"$work/members.json"
 	dicom check FFP "$work/voxels.raw" "$work/members.json" "$work/told/slices/"*.dcm
+	cbct get "$job" final --format dicom --position FFP -o "$work/got.zip"
+	"$python" -m zipfile -e "$work/got.zip" "$work/got"
+	diff -r "$work/got" "$work/told/slices" || fail "the same slices by cbct"
+	cbct get "$job" final --format dicom --dicom enhanced --position FFP -o "$work/got.dcm"
+	cmp "$work/got.dcm" "$work/told/frames.dcm" || fail "the same object by cbct"
+	! cbct get "$job" final --format dicom -o "$work/never" 2>"$work/said" || fail "no side, no object"
+	grep -q "how the patient lies" "$work/said" || fail "the reason, got $(cat "$work/said")"
 	for query in "format=dicom&position=HFX" "position=HFS" "format=mha&dicom=slices" "format=dicom&type=float32" "format=dicom&dicom=both"; do
 		req GET "/v1/jobs/$job/volumes/final?$query"
 		expect_problem 400
@@ -115,6 +122,60 @@ test_slices_without_a_side_are_refused() {
 	job_of '{"position": "HFS"}'
 	req GET "/v1/jobs/$job/volumes/final?format=dicom&position=HFP"
 	expect_problem 409
+}
+
+# A real archive takes them by C-STORE and by STOW-RS, finds as many as were sent, and gives back what it was given.
+test_an_archive_takes_them_and_gives_back_the_same() {
+	local web rest dimse aet=ARCHIVE i series plugin tool
+	need_readers
+	for tool in Orthanc storescu findscu; do
+		command -v $tool >/dev/null || skip "$tool of the packages orthanc and dcmtk is not here"
+	done
+	plugin=$(ls /usr/share/orthanc/plugins/libOrthancDicomWeb.so 2>/dev/null) || skip "the plugin of the package orthanc-dicomweb is not here"
+	mkdir -p "$work/archive"
+	read -r web dimse < <("$python" -c 'import socket
+ends = [socket.socket() for _ in range(2)]
+for end in ends: end.bind(("127.0.0.1", 0))
+print(*[end.getsockname()[1] for end in ends])')
+	jq -n --arg plugin "$plugin" --arg work "$work/archive" --arg aet $aet --argjson web "$web" --argjson dimse "$dimse" '{Name: $aet, DicomAet: $aet,
+		DicomPort: $dimse, HttpPort: $web, HttpBindAddresses: ["127.0.0.1"], RemoteAccessAllowed: false, AuthenticationEnabled: false,
+		StorageDirectory: $work, IndexDirectory: $work, Plugins: [$plugin], DicomModalities: {}, DicomAlwaysAllowFind: true,
+		DicomAlwaysAllowStore: true, StorageCompression: false}' >"$work/archive.json"
+	Orthanc "$work/archive.json" >"$work/archive.log" 2>&1 &
+	archive=$!
+	trap 'kill "$archive" 2>/dev/null; wait "$archive" 2>/dev/null' EXIT
+	start_daemon
+	job_of "$(jq -c '. + {position: "HFDL"}' <<<"$who")"
+	fetch sent
+	rest=http://127.0.0.1:$web
+	for ((i = 0; i < 300; i++)); do
+		curl -sf "$rest/system" >/dev/null && break
+		kill -0 "$archive" || fail "Orthanc runs, got $(tail -3 "$work/archive.log")"
+		sleep 0.1
+	done
+	storescu -aec $aet --scan-directories 127.0.0.1 "$dimse" "$work/sent/slices" 2>"$work/said" || fail "C-STORE, got $(cat "$work/said")"
+	curl -sSf "$rest/dicom-web/studies" -H 'Accept: application/dicom+json' -H 'Content-Type: multipart/related; type="application/dicom"; boundary=between' --data-binary @<(
+		printf -- '--between\r\nContent-Type: application/dicom\r\n\r\n'
+		cat "$work/sent/frames.dcm"
+		printf '\r\n--between--\r\n'
+	) >"$work/stow" || fail "STOW-RS, got $(cat "$work/stow")"
+	series=$(dicom uids "$work/sent/slices/CT00001.dcm" | cut -d' ' -f3)
+	findscu -S -aec $aet -k QueryRetrieveLevel=IMAGE -k StudyInstanceUID=1.2.3.4.5 -k "SeriesInstanceUID=$series" -k SOPInstanceUID 127.0.0.1 "$dimse" 2>&1 |
+		grep -c 'SOPInstanceUID' >"$work/found" || true
+	[ "$(curl -sSf "$rest/dicom-web/instances?StudyInstanceUID=1.2.3.4.5" -H 'Accept: application/dicom+json' | jq length)" = 51 ] || fail "51 instances by QIDO-RS"
+	[ "$(cat "$work/found")" -ge 50 ] || fail "50 slices by C-FIND, got $(cat "$work/found")"
+	mkdir -p "$work/back"
+	for i in $(curl -sSf "$rest/instances" | jq -r '.[]'); do curl -sSf -o "$work/back/$i.dcm" "$rest/instances/$i/file"; done
+	get_volume final "$work/voxels.raw" "format=raw&type=int16"
+	members HFDL
+	mkdir -p "$work/back/slices" "$work/back/frames"
+	dicom uids "$work/back/"*.dcm | paste -d' ' - <(ls "$work/back/"*.dcm) | while read -r class _ _ _ _ file; do
+		[ "$class" = 1.2.840.10008.5.1.4.1.1.2 ] && mv "$file" "$work/back/slices" || mv "$file" "$work/back/frames"
+	done
+	dicom check HFDL "$work/voxels.raw" "$work/members.json" "$work/back/slices/"*.dcm -- "$work/back/frames/"*.dcm || fail "what came back"
+	# The archive knows them again: what is sent twice is there once.
+	storescu -aec $aet --scan-directories 127.0.0.1 "$dimse" "$work/sent/slices" 2>"$work/said" || fail "C-STORE again, got $(cat "$work/said")"
+	[ "$(curl -sSf "$rest/instances" | jq length)" = 51 ] || fail "51 instances after sending twice"
 }
 
 # Scans of many patients, posted, deleted and reconstructed at once, and the daemon killed: each job's objects are its scan's patient's.
