@@ -27,6 +27,8 @@ static const struct problem problems[] = {
     {0, 403, "foreign-origin", "A page of another site may not do this"},
     {0, 405, "method-not-allowed", "The resource does not know this method"},
     {0, 411, "length-required", "The request needs a body"},
+    {0, 412, "precondition-failed", "What is there is not what the request expects"},
+    {0, 428, "precondition-required", "The request must say what it expects to be there"},
     {0, 414, "target-too-long", "The request's target is longer than allowed"},
     {0, 415, "unsupported-encoding", "The body's encoding is not known"},
     {0, 415, "unsupported-media-type", "The body is of another type"},

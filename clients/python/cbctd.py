@@ -683,9 +683,21 @@ class Client:
         headers = {"Accept-Encoding": "identity"}
         return self._bytes(f"/v1/jobs/{job}/volumes/{name}", params, headers)
 
+    def annotations(self, job: str) -> Tuple[Document, str]:
+        """What was measured in the job's volumes, and the tag that a change of it names."""
+        reply = self._request("GET", f"/v1/jobs/{job}/annotations")
+        return dict(reply.json()), str(reply.headers["ETag"])
+
+    def annotate(self, job: str, annotations: Mapping[str, Any], tag: str) -> str:
+        """Replaces them where they still bear the tag (Problem 412 otherwise); gives the new one."""
+        reply = self._request(
+            "PUT", f"/v1/jobs/{job}/annotations", json=dict(annotations), headers={"If-Match": tag}, repeatable=False
+        )
+        return str(reply.headers["ETag"])
+
     def slice(self, job: str, name: str = "final", **query: Any) -> bytes:
         """One plane as PNG: ``axis="z"``, ``index``, ``window`` and ``level`` in Hounsfield units; ``sheet=1`` gives a
-        contact sheet."""
+        contact sheet, ``normal="1,0.5,0"`` a plane at any angle, ``thickness`` and ``mode`` a slab."""
         return self._bytes(f"/v1/jobs/{job}/volumes/{name}/slice", {key: str(value) for key, value in query.items()})
 
     # ---- the daemon ----

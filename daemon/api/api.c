@@ -4,6 +4,7 @@
  */
 #include "daemon/api/internal.h"
 
+#include "proto/annotations.h"
 #include "proto/json.h"
 
 #define IMAGE_ROUTE(id, name, ...)                                                                                     \
@@ -54,6 +55,9 @@ const struct route api_routes[] = {
     {"DELETE", "/v1/jobs/{}", ROLE_ACQUIRE, job_delete, BODY_NONE, 0, NULL, NULL, "wait"},
     {"GET", "/v1/jobs/{}/events", ROLE_VIEW, job_events, BODY_NONE, 0, NULL, NULL, "after"},
     {"GET", "/v1/events", ROLE_VIEW, all_events, BODY_NONE, 0, NULL, NULL, "after"},
+    {"GET", "/v1/jobs/{}/annotations", ROLE_VIEW, annotations_get, BODY_NONE, 0, NULL, NULL, NULL},
+    {"PUT", "/v1/jobs/{}/annotations", ROLE_ACQUIRE, annotations_put, BODY_WHOLE, ANNOTATIONS_BYTES_MAX, NULL, NULL,
+     NULL},
     {"GET", "/v1/jobs/{}/volumes", ROLE_VIEW, volume_list, BODY_NONE, 0, NULL, NULL, "limit after wait"},
     {"GET", "/v1/jobs/{}/volumes/{}", ROLE_VIEW, volume_get, BODY_NONE, 0, NULL, NULL,
      "format type scale dicom position"},

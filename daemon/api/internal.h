@@ -49,6 +49,8 @@ int volume_list(void *context, struct request *request, struct error *err);
 int volume_get(void *context, struct request *request, struct error *err);
 
 int volume_stream(void *context, struct request *request, struct error *err);
+int annotations_get(void *context, struct request *request, struct error *err);
+int annotations_put(void *context, struct request *request, struct error *err);
 int slice_get(void *context, struct request *request, struct error *err);
 
 int page_get(void *context, struct request *request, struct error *err);

@@ -191,4 +191,17 @@ int job_sync_volumes(struct job *job, struct error *err);
 int job_digest_volume(struct job *job, const struct volume_record *volume, struct error *err);
 int job_add_warning(struct job *job, const char *code, const char *detail, struct error *err);
 
+/* ---- annotations: what people have measured in its volumes (proto/annotations.h) ---- */
+/* Another one for each text; quoted, for ETags. */
+enum { ANNOTATIONS_TAG_MAX = 36 };
+void annotations_tag(const char *text, size_t length, char ret_tag[ANNOTATIONS_TAG_MAX]);
+/* The text as it is kept, ANNOTATIONS_NONE where there is none. Free *ret_text. Any thread. */
+int job_annotations(struct job *job, char **ret_text, size_t *ret_length, struct error *err);
+/*
+ * Replaces it where `fits(context, tag)` says so of the tag that it has, and tells all who watch. *ret_fits false, and
+ * nothing done: it did not. ERR_NOT_FOUND: the job is removed.
+ */
+int job_annotate(struct job *job, const char *text, size_t length, bool (*fits)(void *context, const char *tag),
+		 void *context, bool *ret_fits, struct error *err);
+
 #endif

@@ -267,6 +267,13 @@ int store_job_add_warning(struct store *store, const char *id, const struct warn
 	return code;
 }
 
+int store_job_add_event(struct store *store, const char *id, const struct event *event, struct error *err)
+{
+	int code = store_begin(store, err);
+
+	return code != 0 ? code : store_end(store, add_event(store, id, event, err), err);
+}
+
 /* ---- reading ---- */
 
 int store_job_load(struct store *store, struct job_record **ret_jobs, int *ret_count, struct error *err)

@@ -23,7 +23,7 @@
  *   STATE/catalogue.sqlite  scans, projections, jobs, volumes, history, warnings, events
  *   STATE/scans/ID/         scan.json projections.raw flat.f32 dark.f32 defects.u8 (proto/scan_directory.h)
  *                           projections.sums (proto/sums.h)
- *   STATE/jobs/ID/          NAME.nii, checkpoint.f32
+ *   STATE/jobs/ID/          NAME.nii, checkpoint.f32, annotations.json
  *   STATE/{scans,jobs}/ID/record.json  its rows of the catalogue (store/record.h)
  *
  * The directories are the truth, the catalogue is their index: what it lacks is found again in them
@@ -393,6 +393,18 @@ int store_job_remove_volume(struct store *store, const char *id, const char *nam
 /* *ret_new false, and no event, when this very warning is there already. */
 int store_job_add_warning(struct store *store, const char *id, const struct warning_record *warning,
 			  const struct event *event, bool *ret_new, struct error *err);
+
+/*
+ * A document that clients keep with the job, in its directory. ERR_NOT_FOUND: none was written yet. ERR_DAMAGED: it
+ * does not fit its checksum. Free *ret_text.
+ */
+enum { STORE_ANNOTATIONS_MAX = 8 << 20 }; /* bytes */
+int store_annotations_read(const struct store *store, const char *id, char **ret_text, size_t *ret_length,
+			   struct error *err);
+/* Replaces it, synced, then adds the event. One call at a time for a job. */
+int store_annotations_write(struct store *store, const char *id, const char *text, size_t length,
+			    const struct event *event, struct error *err);
+int store_job_add_event(struct store *store, const char *id, const struct event *event, struct error *err);
 
 /* Reads all jobs, oldest first; free the array with job_records_free. */
 int store_job_load(struct store *store, struct job_record **ret_jobs, int *ret_count, struct error *err);

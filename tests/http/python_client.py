@@ -349,6 +349,15 @@ class Volumes(Case):
         np.testing.assert_array_equal(packed.voxels, hu.voxels)
         self.assertEqual(list(self.client.volumes(job, after="final")), [])
         self.assertEqual(self.client.slice(job, axis="x", index=3, window=1000)[:8], b"\x89PNG\r\n\x1a\n")
+        self.assertEqual(self.client.slice(job, normal="1,1,0", thickness=9, mode="max")[:8], b"\x89PNG\r\n\x1a\n")
+        empty, tag = self.client.annotations(job)
+        self.assertEqual(empty, {"measurements": [], "key_images": []})
+        ruler = {"id": "1", "kind": "ruler", "points": [[0, 0, 0], [3, 4, 0]]}
+        after = self.client.annotate(job, {"measurements": [ruler]}, tag)
+        self.assertEqual(self.client.annotations(job), ({"measurements": [ruler], "key_images": []}, after))
+        with self.assertRaises(cbctd.Problem) as stale:
+            self.client.annotate(job, {}, tag)
+        self.assertEqual(stale.exception.status, 412)
         self.assertEqual(self.client.volume_file(job, format="nrrd", type="int16")[:8], b"NRRD0004")
         with self.assertRaises(ValueError):
             self.client.volume(job, dtype=np.float64)
