@@ -29,11 +29,11 @@ enum lock_rank {
 	LOCK_CHECKPOINT, /* database.checkpoint_lock, of SQLite */
 	LOCK_CHECKS,     /* store.check_lock */
 	LOCK_WATCHERS,   /* watch_list.lock */
-	LOCK_ACCESS,     /* access.lock */
 	LOCK_TLS,        /* tls.lock */
 	LOCK_AUDIT,      /* audit.lock */
 	LOCK_HTTP,       /* http.lock */
 	LOCK_CONNECTION, /* connection.lock */
+	LOCK_ACCESS,     /* access.lock */
 	LOCK_COUNT
 };
 

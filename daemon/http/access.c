@@ -343,6 +343,14 @@ int request_require(struct request *request, enum role least, struct error *err)
 						: refuse_role(request, least, err);
 }
 
+/* For the clock, which ends what goes on for longer than that. */
+static void note_identity(struct request *request)
+{
+	pthread_mutex_lock(&request->connection->lock);
+	request->connection->who = request->who;
+	pthread_mutex_unlock(&request->connection->lock);
+}
+
 int access_check(struct request *request, struct error *err)
 {
 	enum role least = request->route->role;
@@ -352,12 +360,30 @@ int access_check(struct request *request, struct error *err)
 		request->who = (struct identity){.role = ROLE_ADMIN, .expires = TOKEN_NEVER, .proof = PROOF_NOT_ASKED};
 		return 0;
 	}
-	request->who = (struct identity){.role = ROLE_ANYONE};
+	request->who = (struct identity){.role = ROLE_ANYONE, .expires = TOKEN_NEVER};
 	shown = read_proof(request, &request->who);
+	note_identity(request);
 	/* Probes and the page itself do not fail for a token that is old. */
 	if (shown == SHOWN_BAD && least > ROLE_ANYONE)
 		return refuse_unknown(request, shown, err);
 	return request_require(request, least, err);
+}
+
+bool access_still_holds(struct access *access, const struct identity *who)
+{
+	const struct token *token;
+	bool holds;
+
+	if (who->proof != PROOF_TOKEN && who->proof != PROOF_SESSION && who->proof != PROOF_CERTIFICATE)
+		return true;
+	pthread_mutex_lock(&access->lock);
+	if (who->proof == PROOF_CERTIFICATE)
+		token = tokens_find_certificate(&access->tokens, who->name);
+	else
+		token = tokens_find(&access->tokens, who->token);
+	holds = token != NULL && token_is_valid(token, time(NULL)) && token->role >= who->role;
+	pthread_mutex_unlock(&access->lock);
+	return holds;
 }
 
 const struct identity *request_identity(const struct request *request)

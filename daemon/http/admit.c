@@ -171,6 +171,7 @@ static struct connection *connection_new(struct http *http, int socket, const st
 	connection->socket = socket;
 	connection->address = *address;
 	connection->tls = tls;
+	connection->who.expires = TOKEN_NEVER;
 	if (address->ss_family == AF_UNIX && getsockopt(socket, SOL_SOCKET, SO_PEERCRED, &peer, &size) == 0) {
 		connection->user = peer.uid;
 		connection->peer_role = access_peer_role(http->access, socket, &peer);

@@ -11,6 +11,7 @@
 #include "daemon/http/internal.h"
 
 #include <math.h>
+#include <time.h>
 
 #include "daemon/log.h"
 
@@ -26,8 +27,10 @@ void connection_phase(struct connection *connection, enum phase phase, uint64_t 
 	connection->bytes = bytes;
 	connection->bytes_then = UNKNOWN_SIZE;
 	connection->woken = false;
-	if (phase == PHASE_IDLE)
+	if (phase == PHASE_IDLE) {
 		connection->patience = 0;
+		connection->who.expires = TOKEN_NEVER;
+	}
 	if (phase == PHASE_SEND)
 		connection->sent_before = live_acknowledged(connection);
 	pthread_mutex_unlock(&connection->lock);
@@ -102,6 +105,18 @@ void request_wake_by(struct request *request, double time)
 	pthread_mutex_lock(&http->lock);
 	if (time < http->clock_next)
 		pthread_cond_signal(&http->clock_kick);
+	pthread_mutex_unlock(&http->lock);
+}
+
+void connections_recheck(struct http *http)
+{
+	pthread_mutex_lock(&http->lock);
+	for (struct connection *c = http->connections; c != NULL; c = c->next) {
+		pthread_mutex_lock(&c->lock);
+		if (!access_still_holds(http->access, &c->who))
+			c->who.expires = 0;
+		pthread_mutex_unlock(&c->lock);
+	}
 	pthread_mutex_unlock(&http->lock);
 }
 
@@ -184,6 +199,8 @@ static double look(struct connection *connection, double now)
 			connection->cut = live_peer_gone(connection, now);
 		else if (connection->phase == PHASE_BODY && !connection->suspended)
 			connection->cut = body_is_broken(connection);
+		/* A stream may go on for hours; who asked for it must be known all the time. */
+		connection->cut = connection->cut || time(NULL) >= connection->who.expires;
 		if (connection->cut)
 			shutdown(connection->socket, SHUT_RDWR);
 	}

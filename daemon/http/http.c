@@ -406,6 +406,7 @@ void http_reload(struct http *http)
 
 	if (access_reload(http->access, &err) != 0)
 		log_line(LEVEL_ERROR, "the tokens that were read before stay: %s", err.text);
+	connections_recheck(http);
 	if (tls_reload(http->tls, &err) != 0)
 		log_line(LEVEL_ERROR, "the certificate that was read before stays: %s", err.text);
 }

@@ -57,10 +57,11 @@ struct connection {
 
 	pthread_mutex_t lock; /* guards all below */
 	enum phase phase;
-	double since;   /* of this phase */
-	double paused;  /* s of this phase that we made the client wait */
-	uint64_t bytes; /* of this phase's body so far, or in all when sending */
-	bool suspended; /* out of the library's hands until resumed */
+	struct identity who; /* of the request under way, whose time may be over before it ends */
+	double since;        /* of this phase */
+	double paused;       /* s of this phase that we made the client wait */
+	uint64_t bytes;      /* of this phase's body so far, or in all when sending */
+	bool suspended;      /* out of the library's hands until resumed */
 	double suspended_at;
 	bool woken;           /* request_wake came while it was not suspended */
 	double wait_until;    /* of a suspended one */
@@ -206,6 +207,8 @@ enum suspension {
 	REFUSED /* the daemon closes, or the peer has gone: give the connection up */
 };
 enum suspension connection_suspend(struct connection *connection, double until);
+/* Has the clock cut off those whose request goes on for somebody who is not known any more. */
+void connections_recheck(struct http *http);
 /* All that are suspended. */
 void connections_wake(struct http *http);
 /* None has a request under way. */
@@ -244,6 +247,8 @@ enum role access_peer_role(const struct access *access, int socket, const struct
 /* On failure the tokens before stay. */
 int access_reload(struct access *access, struct error *err);
 int access_check_routes(const struct route *routes, struct error *err);
+/* Whether what showed it still holds: not expired, not revoked. */
+bool access_still_holds(struct access *access, const struct identity *who);
 /* Of a request that has found its route; 0, or 0 with a reply that refuses, or an error. */
 int access_check(struct request *request, struct error *err);
 

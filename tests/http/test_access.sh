@@ -190,6 +190,27 @@ test_sighup_reads_the_file_again_and_keeps_the_old_one_if_it_is_bad() {
 	stop_daemon
 }
 
+# Streams may go on for hours.
+test_streams_end_with_the_token_they_were_asked_with() {
+	local short late shortly=$work/shortly stays revoked expires i
+	cp "$tokens" "$shortly"
+	late=$(cbct token new late --role view --file "$shortly" 2>/dev/null)
+	short=$(cbct token new short --role view --expires "$(date -u -d '+3 seconds' +%Y-%m-%dT%H:%M:%SZ)" --file "$shortly" 2>/dev/null)
+	start_daemon --tokens "$shortly"
+	curl -sN -o "$work/stays" "$url/v1/events" -H "Authorization: Bearer ${token[view]}" & stays=$!
+	curl -sN -o "$work/revoked" "$url/v1/events" -H "Authorization: Bearer $late" & revoked=$!
+	curl -sN -o "$work/expires" -w '%{http_code}' "$url/v1/events" -H "Authorization: Bearer $short" >"$work/expires.status" & expires=$!
+	sleep 1
+	cbct token revoke late --file "$shortly" 2>/dev/null
+	reload '5 tokens'
+	for ((i = 0; i < 60; i++)); do kill -0 $revoked 2>/dev/null || kill -0 $expires 2>/dev/null || break; sleep 0.1; done
+	! kill -0 $revoked 2>/dev/null || fail "the stream of a token that was revoked ends"
+	! kill -0 $expires 2>/dev/null || fail "the stream of a token that expired ends"
+	[ "$(cat "$work/expires.status")" = 200 ] || fail "it had begun, got $(cat "$work/expires.status")"
+	kill $stays || fail "other streams go on"
+	stop_daemon
+}
+
 test_the_kernel_tells_who_is_at_a_unix_socket() {
 	local socket=$work/peers
 	with_rules() { # RULE ...: on a Unix socket
