@@ -154,7 +154,7 @@ $(BUILD)/cbctd-held: $(call objects,$(daemon_sources) tests/http/held.c tests/lo
 
 gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench
 # Every program that a test or a benchmark runs, so that none stops compiling unseen.
-test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held faults.so cpu-bench calibrate-bench denoise watchers slices acquire) \
+test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held faults.so cpu-bench calibrate-bench denoise presets watchers slices acquire) \
                $(if $(cuda_objects),$(gpu_programs) $(BUILD)/gpu_ceilings $(BUILD)/cbct-worker-faulty,$(call objects,$(wildcard tests/bench/gpu_*.c)))
 
 # Faults of the disk, loaded into the programs by tests.
@@ -174,6 +174,10 @@ $(BUILD)/cpu-bench: $(call objects,tests/bench/bench.c) $(library)
 # Noise reduction on anatomies: on a card where there is one.
 $(BUILD)/denoise: $(call objects,tests/bench/denoise.c tests/unit/anatomy.c) $(core_objects) $(cuda_objects)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(if $(cuda_objects),$(cuda_libs)) $(LIBM)
+
+# What each preset of a job is worth on anatomies.
+$(BUILD)/presets: $(call objects,tests/bench/presets.c tests/unit/anatomy.c) $(library)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(LIBM)
 
 $(BUILD)/calibrate-bench: $(call objects,tests/bench/calibrate.c tests/unit/arm.c) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(LIBM)
@@ -240,6 +244,10 @@ fuzz: setup ## each fuzz target for FUZZ_SECONDS=10 (needs clang)
 bench-denoise: setup ## the default TV on anatomies beside the best of a sweep, a table on standard output
 	@$(MAKE) --no-print-directory -j$$(nproc) $(BUILD)/denoise >&2
 	@$(BUILD)/denoise
+
+bench-presets: setup ## time and error of each preset on a head, a wrist and an abdomen, on standard output
+	@$(MAKE) --no-print-directory -j$$(nproc) $(BUILD)/presets >&2
+	@$(BUILD)/presets
 
 bench-calibrate: setup ## a calibration of 400 views of 1240 x 960 pixels, on standard output
 	@$(MAKE) --no-print-directory -j$$(nproc) $(BUILD)/calibrate-bench >&2
@@ -323,6 +331,6 @@ clean: ## removes build/
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z_.-]+:.*## /{printf "  make %-21s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-.PHONY: all test-programs again setup demo check soak fuzz fuzzers bench bench-calibrate bench-denoise check-gpu bench-gpu asan tsan lint format rooms third-party compile_commands.json install clean help
+.PHONY: all test-programs again setup demo check soak fuzz fuzzers bench bench-calibrate bench-denoise bench-presets check-gpu bench-gpu asan tsan lint format rooms third-party compile_commands.json install clean help
 .SECONDARY:
 -include $(shell find $(BUILD) -name '*.d' 2>/dev/null)

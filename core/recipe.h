@@ -35,7 +35,8 @@ struct recipe {
 	} iterate;                                 /* whatever the algorithm */
 	struct {
 		double relaxation;
-		int subsets; /* 1 .. views; SUBSETS_VIEWS: an update after each view; SUBSETS_DEFAULT: 10 or fewer */
+		int subsets;   /* 1 .. views; SUBSETS_VIEWS: an update after each view; SUBSETS_DEFAULT: 10 or fewer */
+		bool momentum; /* core/recon/sart.c */
 	} sart;
 	struct {
 		bool on;

@@ -12,6 +12,7 @@
 
 #include "core/recon/parameters.h"
 #include "proto/parameter.h"
+#include "proto/preset.h"
 
 const char *const priority_names[PRIORITY_COUNT] = {"routine", "urgent", "stat"};
 
@@ -234,7 +235,7 @@ static int read_members(struct job_request *request, const cJSON *value, struct 
 	return json_end(&reader);
 }
 
-int job_request_read(const cJSON *value, struct job_request *ret_request, struct error *err)
+static int read_expanded(const cJSON *value, struct job_request *ret_request, struct error *err)
 {
 	struct job_request request = {0};
 	struct members members = {0};
@@ -258,6 +259,17 @@ int job_request_read(const cJSON *value, struct job_request *ret_request, struct
 	}
 	*ret_request = request;
 	return 0;
+}
+
+int job_request_read(const cJSON *value, struct job_request *ret_request, struct error *err)
+{
+	cJSON *expanded;
+	int code = job_preset_expand(value, &expanded, err);
+
+	if (code == 0)
+		code = read_expanded(expanded != NULL ? expanded : value, ret_request, err);
+	cJSON_Delete(expanded);
+	return code;
 }
 
 int job_request_parse(const char *text, size_t length, struct job_request *ret_request, struct error *err)

@@ -8,6 +8,7 @@
 #include <string.h>
 
 #include "core/recon/parameters.h"
+#include "proto/preset.h"
 #include "proto/recipe.h"
 #include "proto/scan_directory.h"
 
@@ -26,6 +27,8 @@ static const struct special {
     {"/fdk", "window", "fdk", "WINDOW", NULL, false},
     {"/fdk", "cutoff", "cutoff", "SHARE", NULL, false},
     {"/fdk", "truncation", "truncation", "auto|off", NULL, false},
+    {OBJECT_ALGORITHM, "momentum", "momentum", NULL, "go on beyond each iterate, to the same error in fewer iterations",
+     false},
     {OBJECT_ALGORITHM, "nonnegative", "negative", NULL, "let voxels be negative in the iterations", false},
     {"/tv", "method", "tv", "METHOD", NULL, false},
     {"/tv", "unit", "tv-unit", "MU", NULL, false},
@@ -140,7 +143,7 @@ static void add_option(const struct parameter *parameter, const struct algorithm
 	struct option *row = &recipe_option_rows[entry_count];
 	const bool flag = (entry->special = special_of(parameter)) != NULL && entry->special->flag != NULL;
 
-	assert(entry_count < RECIPE_OPTIONS_MAX - 2);
+	assert(entry_count < RECIPE_OPTIONS_MAX - 3);
 	entry->parameter = parameter;
 	entry->algorithm = algorithm;
 	name_option(entry);
@@ -154,6 +157,16 @@ static void add_option(const struct parameter *parameter, const struct algorithm
 	row->offset = flag ? offsetof(struct recipe_options, flags) + (size_t)entry_count * sizeof(bool)
 			   : offsetof(struct recipe_options, values) + (size_t)entry_count * sizeof(char *);
 	entry_count++;
+}
+
+static const char *preset_help(void)
+{
+	static char help[160] = "stages for a purpose, in place of those that no option names: ";
+
+	for (int i = 0; i < JOB_PRESET_COUNT; i++)
+		snprintf(help + strlen(help), sizeof(help) - strlen(help), "%s%s", i > 0 ? ", " : "",
+			 job_presets[i].name);
+	return help;
 }
 
 void recipe_options_make(void)
@@ -175,6 +188,8 @@ void recipe_options_make(void)
 			    "LIST",      "volumes to keep beside the last one, e.g. fdk,fdk-tv,1,5",
 			    0,           0,
 			    0,           NULL};
+	recipe_option_rows[entry_count + 2] = (struct option){
+	    "preset", 0, OPTION_TEXT, offsetof(struct recipe_options, preset), "NAME", preset_help(), 0, 0, 0, NULL};
 }
 
 /* ---- documents from options ---- */
@@ -407,7 +422,9 @@ int recipe_document(const struct recipe_options *options, const char *path, cons
 		put(document, "fdk", cJSON_CreateNull());
 	code = put_options(options, document, err);
 	/* Options that name a stage are beside the FDK; a document without any stage has all of them. */
-	if (code == 0 && path == NULL && names_stage(document))
+	if (options->preset != NULL)
+		put(document, "preset", cJSON_CreateString(options->preset));
+	if (code == 0 && path == NULL && options->preset == NULL && names_stage(document))
 		stage(document, "fdk");
 	if (code != 0) {
 		cJSON_Delete(document);

@@ -15,6 +15,7 @@ struct recipe_options {
 	bool flags[RECIPE_OPTIONS_MAX];
 	bool no_fdk;
 	const char *emit;
+	const char *preset; /* proto/preset.h */
 };
 extern struct option recipe_option_rows[];
 void recipe_options_make(void); /* fills the rows; once, before any command line is parsed */

@@ -85,14 +85,19 @@ _PARAMETERS: Dict[str, Dict[str, Document]] = {
         "/fdk/truncation": {"type": "choice", "choices": ["off", "auto"]},
         "/sart/iterations": {"type": "integer", "minimum": 1, "maximum": 100000},
         "/cgls/iterations": {"type": "integer", "minimum": 1, "maximum": 100000},
+        "/fista/iterations": {"type": "integer", "minimum": 1, "maximum": 100000},
         "/sart/relaxation": {"type": "number", "minimum": 1e-06, "maximum": 2},
         "/sart/subsets": {"type": "integer", "minimum": 1, "maximum": 20000, "word": "views"},
+        "/sart/momentum": {"type": "boolean"},
         "/sart/nonnegative": {"type": "boolean"},
         "/cgls/nonnegative": {"type": "boolean"},
+        "/fista/nonnegative": {"type": "boolean"},
         "/sart/stop/residual": {"type": "number", "minimum": 0, "maximum": 1000000},
         "/cgls/stop/residual": {"type": "number", "minimum": 0, "maximum": 1000000},
+        "/fista/stop/residual": {"type": "number", "minimum": 0, "maximum": 1000000},
         "/sart/stop/change": {"type": "number", "minimum": 0, "maximum": 1000000},
         "/cgls/stop/change": {"type": "number", "minimum": 0, "maximum": 1000000},
+        "/fista/stop/change": {"type": "number", "minimum": 0, "maximum": 1000000},
         "/tv/method": {"type": "choice", "choices": ["gradient", "proximal"]},
         "/tv/alpha": {"type": "number", "minimum": 0, "maximum": 1000000000, "word": "auto"},
         "/tv/strength": {"type": "choice", "choices": ["light", "medium", "strong"]},
@@ -195,7 +200,7 @@ class Volume:
         voxels: ``[z][y][x]``, float32 in 1/mm or int16 in Hounsfield units.
         spacing_mm: of voxels along the world's x, y and z.
         origin_mm: centre of voxel 0,0,0 in the world: x, y, z.
-        stage: ``fdk``, ``tv``, or the algorithm of the iterations, ``sart`` or ``cgls``.
+        stage: ``fdk``, ``tv``, or the algorithm of the iterations, ``sart``, ``cgls`` or ``fista``.
         iteration: 0 before the first.
         world_to_patient: 4 x 4, from (x, y, z, 1) of the world in mm to the patient's left, posterior and superior
             (DICOM's LPS); None: nobody has said how the patient lies, and left and right are not known.
@@ -757,13 +762,16 @@ class Client:
             patient: how the patient lies, as `Client.create_scan` has it.
             progress: bars of tqdm, where it is installed.
             keep: leaves scan and job with the daemon; otherwise they are removed, also when this is interrupted.
-            recipe: more members of the job's request, e.g. ``priority="urgent"``, ``cgls={}``.
+            recipe: more members of the job's request, e.g. ``priority="urgent"``, ``cgls={}``; with ``preset="fast"``
+                the stages that are None or ``{}`` are the preset's.
         """
         stack = np.asanyarray(projections)
         if stack.ndim != 3:
             raise ValueError(f"projections of shape {stack.shape}, expected [view][row][column]")
         sample = np.uint16 if stack.dtype == np.uint16 else np.float32
         stages = {"grid": grid, "fdk": fdk, "sart": sart, "tv": tv, "emit": list(emit), **recipe}
+        if recipe.get("preset") is not None:
+            stages = {name: stage for name, stage in stages.items() if stage or name not in ("fdk", "sart", "tv")}
         _check("job", stages)
         scan = self.create_scan(
             geometry, stack.shape, dtype=sample, name=name, quantity=quantity, patient=patient, air=air

@@ -2,14 +2,15 @@
 #include "core/recon/algorithm.h"
 
 #include <math.h>
+#include <stdlib.h>
 #include <string.h>
 
 const char *const stage_names[STAGE_COUNT] = {
-    [STAGE_LOAD] = "load", [STAGE_FDK] = "fdk",   [STAGE_SART] = "sart",
-    [STAGE_TV] = "tv",     [STAGE_SAVE] = "save", [STAGE_CGLS] = "cgls",
+    [STAGE_LOAD] = "load", [STAGE_FDK] = "fdk",   [STAGE_SART] = "sart",   [STAGE_TV] = "tv",
+    [STAGE_SAVE] = "save", [STAGE_CGLS] = "cgls", [STAGE_FISTA] = "fista",
 };
 
-const struct algorithm *const algorithms[ALGORITHM_COUNT] = {&algorithm_sart, &algorithm_cgls};
+const struct algorithm *const algorithms[ALGORITHM_COUNT] = {&algorithm_sart, &algorithm_cgls, &algorithm_fista};
 
 const struct algorithm *algorithm_find(const char *name)
 {
@@ -17,6 +18,22 @@ const struct algorithm *algorithm_find(const char *name)
 		if (strcmp(algorithms[i]->name, name) == 0)
 			return algorithms[i];
 	return NULL;
+}
+
+int checkpoint_volume(const struct problem *problem, struct volume *volume, const struct checkpoint_sink *sink,
+		      struct error *err)
+{
+	const size_t slice = (size_t)problem->grid->size[0] * (size_t)problem->grid->size[1];
+	float *piece = malloc(sizeof(float) * slice);
+	int code = piece == NULL ? error_set(err, ERR_NO_MEMORY, "no memory for a slice of a checkpoint") : 0;
+
+	for (int z = 0; z < problem->grid->size[2] && code == 0; z++) {
+		code = problem->backend->volume_download(volume, z, 1, piece, err);
+		if (code == 0)
+			code = sink->write(sink->context, piece, sizeof(float) * slice, err);
+	}
+	free(piece);
+	return code;
 }
 
 /* sqrt(part / whole) with 0/0 = 0 and x/0 = 1: rows go out as JSON, which has no infinity. */

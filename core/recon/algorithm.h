@@ -27,6 +27,7 @@ struct problem {
 	struct stack *stacks[ALGORITHM_HOLDS]; /* of all views */
 	const struct cancel *cancel;           /* or NULL */
 	bool nonnegative;                      /* the iterate has no voxel below 0 */
+	bool momentum;                         /* of SART, see core/recon/sart.c */
 };
 
 struct algorithm {
@@ -38,10 +39,12 @@ struct algorithm {
 	bool subsets;             /* its update is the backend's sart_iterate over ordered subsets */
 	/* How many problem.volumes and stacks it works in, beside projections, iterate, its copy and the plan. */
 	int volumes, stacks;
+	int momentum_volumes; /* more of them, where the recipe asks for momentum */
 	double updates; /* of SART, that take up as much noise as one iteration; 0: as many as there are subsets */
 	/* Iterations after which a start from zero has its least error on anatomies; fewer are told. 0: never told. */
 	int from_zero;
-	double work; /* of an iteration, in FDKs of the whole scan: for the progress bar */
+	bool clips_last; /* zero is enforced by the loop, behind TV, and not by `iterate` */
+	double work;     /* of an iteration, in FDKs of the whole scan: for the progress bar */
 
 	/* Allocates the rest of its state; *ret_state may stay NULL without any. The problem outlives it. */
 	int (*open)(const struct problem *problem, void **ret_state, struct error *err);
@@ -61,9 +64,23 @@ struct algorithm {
 	int (*resume)(const struct problem *problem, void *state, const char *bytes, struct error *err);
 };
 
+/* Volumes that the recipe's algorithm works in. */
+static inline int algorithm_volumes(const struct recipe *recipe)
+{
+	const struct algorithm *algorithm = recipe->algorithm;
+
+	if (algorithm == NULL)
+		return 0;
+	return algorithm->volumes + (recipe->sart.momentum ? algorithm->momentum_volumes : 0);
+}
+
 extern const struct algorithm *const algorithms[ALGORITHM_COUNT];
 /* Finds an algorithm by its name; NULL when there is none. */
 const struct algorithm *algorithm_find(const char *name);
+
+/* Writes all slices of a volume of the problem's grid into a checkpoint. */
+int checkpoint_volume(const struct problem *problem, struct volume *volume, const struct checkpoint_sink *sink,
+		      struct error *err);
 
 /*
  * The history row of one iteration, all of it finite whatever the scan was:

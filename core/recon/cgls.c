@@ -269,11 +269,6 @@ static int cgls_iterate(const struct problem *problem, void *state, bool moved, 
 
 /* ---- checkpoints: the numbers, p, r ---- */
 
-static size_t slice_floats(const struct problem *problem)
-{
-	return (size_t)problem->grid->size[0] * (size_t)problem->grid->size[1];
-}
-
 static size_t view_floats(const struct problem *problem)
 {
 	return (size_t)problem->geometry->columns * (size_t)problem->geometry->rows;
@@ -289,17 +284,14 @@ static int cgls_save(const struct problem *problem, void *state, const struct ch
 {
 	const struct backend *backend = problem->backend;
 	struct cgls *cgls = state;
-	const size_t slice = slice_floats(problem), view = view_floats(problem);
-	float *piece = malloc(sizeof(float) * (slice > view ? slice : view));
-	int code = piece == NULL ? error_set(err, ERR_NO_MEMORY, "no memory for a slice of a checkpoint") : 0;
+	const size_t view = view_floats(problem);
+	float *piece = malloc(sizeof(float) * view);
+	int code = piece == NULL ? error_set(err, ERR_NO_MEMORY, "no memory for a view of a checkpoint") : 0;
 
 	if (code == 0)
 		code = sink->write(sink->context, &cgls->numbers, sizeof(cgls->numbers), err);
-	for (int z = 0; z < problem->grid->size[2] && code == 0; z++) {
-		code = backend->volume_download(cgls->direction, z, 1, piece, err);
-		if (code == 0)
-			code = sink->write(sink->context, piece, sizeof(float) * slice, err);
-	}
+	if (code == 0)
+		code = checkpoint_volume(problem, cgls->direction, sink, err);
 	for (int i = 0; i < problem->geometry->count && code == 0; i++) {
 		code = backend->stack_download(cgls->residual, i, 1, piece, err);
 		if (code == 0)

@@ -118,12 +118,13 @@ static int walk_beside(struct recon *recon, struct walk *walk, struct error *err
 	const int slots = corrections_slots(recipe, &recon->input.linearise, geometry);
 	int code = recipe->fdk.on ? walk_fdk(recon, walk, err) : 0;
 
-	assert(algorithm == NULL || (algorithm->volumes <= ALGORITHM_HOLDS && algorithm->stacks <= ALGORITHM_HOLDS));
+	assert(algorithm == NULL ||
+	       (algorithm_volumes(recipe) <= ALGORITHM_HOLDS && algorithm->stacks <= ALGORITHM_HOLDS));
 	if (code == 0 && keeps_projections(recipe) && !has_subsets(recipe))
 		code = walk_volume(walk, &recipe->grid, &recon->before, err);
 	if (code == 0 && slots > 0)
 		code = walk_stack(walk, geometry, slots, &walk->scratch, &recon->batch, err);
-	for (int i = 0; algorithm != NULL && i < algorithm->volumes && code == 0; i++)
+	for (int i = 0; i < algorithm_volumes(recipe) && code == 0; i++)
 		code = walk_volume(walk, &recipe->grid, &recon->problem.volumes[i], err);
 	for (int i = 0; algorithm != NULL && i < algorithm->stacks && code == 0; i++)
 		code = walk_stack(walk, geometry, geometry->count, &walk->projections, &recon->problem.stacks[i], err);

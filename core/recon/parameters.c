@@ -75,6 +75,9 @@ const struct parameter recipe_parameters[] = {
      .word = "views", .counts = uses_subsets,
      .help = "Ordered subsets of the views: 1 is the simultaneous form, views an update after each view; by default "
 	     "10, or as many as there are views."},
+    {OBJECT_ALGORITHM, "momentum", PARAMETER_FLAG, AT(sart.momentum), .counts = uses_subsets,
+     .help = "Whether each iteration begins beyond the volume of the last one, in the direction that it moved: to the "
+	     "same error in fewer iterations."},
     {OBJECT_ALGORITHM, "nonnegative", PARAMETER_FLAG, AT(iterate.nonnegative), .preset = 1, .counts = iterates,
      .help = "Whether no voxel becomes less than zero."},
     {OBJECT_ALGORITHM, "stop/residual", PARAMETER_NUMBER, AT(iterate.stop_residual), RANGE(0, 1e6), .counts = iterates,

@@ -6,8 +6,8 @@
 /* The recipe's defaults, its ranges, and what is filled in where it leaves something open. */
 extern const char *const projector_names[PROJECTOR_COUNT]; /* "interpolating", "matched" */
 extern const char *const tv_strength_names[TV_STRENGTH_COUNT];
-enum { ALGORITHM_COUNT = 2 };
-extern const struct algorithm algorithm_sart, algorithm_cgls; /* core/recon/algorithm.h */
+enum { ALGORITHM_COUNT = 3 };
+extern const struct algorithm algorithm_sart, algorithm_cgls, algorithm_fista; /* core/recon/algorithm.h */
 
 void recipe_defaults(struct recipe *ret_recipe); /* nothing on; the values that `{}` stages take */
 /* TV with numbers in place of those found: alpha 0.1, and 10 steps of 0.1 or 100 iterations; unit and `on` stay. */

@@ -26,8 +26,8 @@ struct history_row {
 	double seconds; /* that the iteration took */
 };
 
-enum stage { STAGE_LOAD, STAGE_FDK, STAGE_SART, STAGE_TV, STAGE_SAVE, STAGE_CGLS, STAGE_COUNT };
-extern const char *const stage_names[STAGE_COUNT]; /* "load", "fdk", "sart", "tv", "save", "cgls" */
+enum stage { STAGE_LOAD, STAGE_FDK, STAGE_SART, STAGE_TV, STAGE_SAVE, STAGE_CGLS, STAGE_FISTA, STAGE_COUNT };
+extern const char *const stage_names[STAGE_COUNT]; /* "load", "fdk", "sart", "tv", "save", "cgls", "fista" */
 
 struct kept_volume {
 	const char *name;  /* "fdk", "fdk-tv", "iter-5", "final" */

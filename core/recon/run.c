@@ -275,6 +275,8 @@ static int iterate(struct recon *recon, struct history_row *ret_row, struct erro
 	recon->moved = recon->recipe.tv.on;
 	if (recon->recipe.tv.on)
 		code = run_tv(recon, iteration, err);
+	if (code == 0 && algorithm->clips_last && recon->recipe.iterate.nonnegative)
+		code = recon->backend->volume_maximum(0, recon->volume, recon->volume, err);
 	if (code == 0)
 		code = relax(recon, iteration, err);
 	if (code == 0)

@@ -12,8 +12,10 @@
 #include "core/recon/sart.h"
 
 #include <math.h>
+#include <stdlib.h>
 
 #include "core/recon/algorithm.h"
+#include "core/recon/momentum.h"
 
 /* ---- in plain steps ---- */
 
@@ -153,17 +155,61 @@ int sart_iterate_plainly(const struct sart_steps *steps, const struct stack *pro
 
 /* ---- the row of algorithms[] ---- */
 
+static int sart_open(const struct problem *problem, void **ret_state, struct error *err)
+{
+	struct momentum *momentum;
+
+	if (!problem->momentum)
+		return 0;
+	momentum = calloc(1, sizeof(*momentum));
+	if (momentum == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for the state of SART's momentum");
+	momentum->previous = problem->volumes[0];
+	*ret_state = momentum;
+	return 0;
+}
+
+static void sart_close(const struct problem *problem, void *state)
+{
+	(void)problem;
+	free(state);
+}
+
 static int sart_iterate(const struct problem *problem, void *state, bool moved, struct iteration_sums *ret_sums,
 			struct error *err)
 {
 	const struct backend *backend = problem->backend;
+	struct momentum *momentum = state;
+	struct iteration_sums sums;
 	int code = backend->volume_copy(problem->before, problem->volume, err);
 
-	(void)state;
 	(void)moved;
-	return code < 0 ? code
-			: backend->sart_iterate(problem->plan, problem->projections, problem->volume, problem->cancel,
-						ret_sums, err);
+	if (code == 0 && momentum != NULL)
+		code = momentum_extrapolate(problem, momentum, err);
+	if (code == 0)
+		code = backend->sart_iterate(problem->plan, problem->projections, problem->volume, problem->cancel,
+					     &sums, err);
+	if (code < 0)
+		return code;
+	if (momentum != NULL)
+		momentum_heed(momentum, &sums);
+	*ret_sums = sums;
+	return 0;
+}
+
+static size_t sart_state_bytes(const struct problem *problem)
+{
+	return problem->momentum ? momentum_bytes(problem) : 0;
+}
+
+static int sart_save(const struct problem *problem, void *state, const struct checkpoint_sink *sink, struct error *err)
+{
+	return momentum_save(problem, state, sink, err);
+}
+
+static int sart_resume(const struct problem *problem, void *state, const char *bytes, struct error *err)
+{
+	return momentum_resume(problem, state, bytes, err);
 }
 
 const struct algorithm algorithm_sart = {
@@ -173,6 +219,12 @@ const struct algorithm algorithm_sart = {
     .projector = PROJECTOR_INTERPOLATING,
     .stage = STAGE_SART,
     .subsets = true,
+    .momentum_volumes = 1,
     .work = 4,
+    .open = sart_open,
+    .close = sart_close,
     .iterate = sart_iterate,
+    .state_bytes = sart_state_bytes,
+    .save = sart_save,
+    .resume = sart_resume,
 };

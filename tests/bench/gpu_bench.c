@@ -187,7 +187,7 @@ static int compare(const void *a, const void *b)
 struct bench {
 	struct scene scene;
 	struct plan *plan;
-	struct volume *volume;
+	struct volume *volume, *previous; /* previous: momentum's */
 	struct stack *projections, *filtered;
 	int *views;
 	int repeat;                  /* calls in one measurement */
@@ -278,6 +278,13 @@ static void run_sart(struct bench *bench, struct error *err)
 	must(backend_cuda.sart_iterate(bench->plan, bench->projections, bench->volume, NULL, &sums, err), err, "sart");
 }
 
+/* What momentum adds to an iteration (core/recon/sart.c), beside the copy that each has for its history. */
+static void run_momentum(struct bench *bench, struct error *err)
+{
+	must(backend_cuda.volume_axpby(-0.5, bench->previous, 1.5, bench->volume, err), err, "axpby");
+	must(backend_cuda.volume_copy(bench->previous, bench->volume, err), err, "copy");
+}
+
 static void run_tv(struct bench *bench, struct error *err)
 {
 	must(backend_cuda.tv(bench->plan, bench->volume, bench->tv, NULL, err), err, "tv");
@@ -352,8 +359,13 @@ static void bench_geometry(const struct bench_case *c, bool untilted)
 	measure(&bench, c, kind, "backprojection", run_backproject, c->backproject[untilted]);
 	measure(&bench, c, kind, "weights and filter", run_filter, c->filter[untilted]);
 	measure(&bench, c, kind, "FDK", run_fdk, c->fdk[untilted]);
-	if (untilted)
+	if (untilted) {
 		measure(&bench, c, kind, "norms", run_norms, 0);
+		must(backend_cuda.volume_new(device, &bench.scene.grid, &bench.previous, &err), &err, "volume");
+		must(backend_cuda.volume_copy(bench.previous, bench.volume, &err), &err, "copy");
+		measure(&bench, c, kind, "momentum of an iteration", run_momentum, 0);
+		backend_cuda.volume_free(bench.previous);
+	}
 	fill_volume(&bench);
 	run_project(&bench, &err);
 	backend_cuda.plan_free(bench.plan);

@@ -15,6 +15,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "core/recon/algorithm.h"
 #include "core/recon/sart.h"
 #include "core/scan/phantom.h"
 #include "tests/bench/gpu_scene.h"
@@ -1078,7 +1079,7 @@ static void check_scales(struct device *devices[2], enum bend bend, int subsets)
 }
 
 /* FDK and ten SART iterations of the head through core/recon/recon.c, on both sides. */
-static void check_recon(struct device *devices[2], enum bend bend, bool reference, bool tv, bool matched,
+static void check_recon(struct device *devices[2], enum bend bend, bool reference, bool tv, bool matched, bool momentum,
 			double tolerance)
 {
 	struct recipe recipe;
@@ -1088,14 +1089,15 @@ static void check_recon(struct device *devices[2], enum bend bend, bool referenc
 	double rms;
 	char name[64];
 
-	snprintf(name, sizeof(name), "head, %s%s%s%s", bend_names[bend], reference ? ", reference" : "",
-		 tv ? ", TV" : "", matched ? ", matched" : "");
+	snprintf(name, sizeof(name), "head, %s%s%s%s%s", bend_names[bend], reference ? ", reference" : "",
+		 tv ? ", TV" : "", matched ? ", matched" : "", momentum ? ", momentum" : "");
 	head_make(&scene, name, bend);
 	voxels = grid_voxels(&scene.grid);
 	projections = project_head(&scene);
 	head_recipe(&recipe, &scene, reference);
 	recipe.tv.on = tv;
 	recipe_explicit_tv(&recipe, TV_GRADIENT);
+	recipe.sart.momentum = momentum;
 	recipe.projector = matched ? PROJECTOR_MATCHED : PROJECTOR_INTERPOLATING;
 	got[0] = reconstruct(&backend_cpu, devices[0], &scene, &recipe, &(struct recon_hooks){0}, projections);
 	got[1] = reconstruct(&backend_cuda, devices[1], &scene, &recipe, &(struct recon_hooks){0}, projections);
@@ -1110,7 +1112,7 @@ static void check_recon(struct device *devices[2], enum bend bend, bool referenc
 	scene_clear(&scene);
 }
 
-/* FDK and eight iterations of conjugate gradients: the algebra on both sides, and a residual that falls. */
+/* FDK and eight iterations in the algebra, on both sides; the residual of conjugate gradients falls. */
 static double last_residual;
 
 static void residual_falls(void *context, const struct history_row *row)
@@ -1121,7 +1123,8 @@ static void residual_falls(void *context, const struct history_row *row)
 	last_residual = row->residual;
 }
 
-static void check_cgls(struct device *devices[2], enum bend bend, bool reference, bool tv, double tolerance)
+static void check_algebra(struct device *devices[2], const struct algorithm *algorithm, enum bend bend, bool reference,
+			  bool tv, double tolerance)
 {
 	struct recipe recipe;
 	struct scene scene;
@@ -1130,13 +1133,13 @@ static void check_cgls(struct device *devices[2], enum bend bend, bool reference
 	bool falls[2];
 	char name[64];
 
-	snprintf(name, sizeof(name), "CGLS, %s%s%s", bend_names[bend], reference ? ", reference" : "",
+	snprintf(name, sizeof(name), "%s, %s%s%s", algorithm->name, bend_names[bend], reference ? ", reference" : "",
 		 tv ? ", TV" : "");
 	head_make(&scene, name, bend);
 	voxels = grid_voxels(&scene.grid);
 	projections = project_head(&scene);
 	head_recipe(&recipe, &scene, reference);
-	recipe_set_algorithm(&recipe, &algorithm_cgls);
+	recipe_set_algorithm(&recipe, algorithm);
 	recipe.iterate.iterations = 8;
 	recipe.tv.on = tv;
 	recipe_explicit_tv(&recipe, TV_GRADIENT);
@@ -1149,8 +1152,9 @@ static void check_cgls(struct device *devices[2], enum bend bend, bool reference
 	}
 	printf("%-34s after 8 iterations: %.1e, %.3f HU RMS\n", scene.name, difference(got[1], got[0], voxels),
 	       hu_rms(got[1], got[0], voxels));
-	expect(&scene, "conjugate gradients", difference(got[1], got[0], voxels), tolerance);
-	expect(&scene, "a residual that does not fall", !tv && !(falls[0] && falls[1]), 0);
+	expect(&scene, algorithm->name, difference(got[1], got[0], voxels), tolerance);
+	expect(&scene, "a residual that does not fall", algorithm == &algorithm_cgls && !tv && !(falls[0] && falls[1]),
+	       0);
 	for (int s = 0; s < 2; s++)
 		free(got[s]);
 	free(projections);
@@ -1758,18 +1762,22 @@ int main(int argc, char **argv)
 		check_scales(devices, BEND_NONE, subsets);
 		check_scales(devices, BEND_TURNED, subsets);
 	}
-	check_recon(devices, BEND_NONE, true, false, false, 1e-4);
-	check_recon(devices, BEND_TILTED, true, false, false, 1e-4);
+	check_recon(devices, BEND_NONE, true, false, false, false, 1e-4);
+	check_recon(devices, BEND_TILTED, true, false, false, false, 1e-4);
 	for (int bend = 0; bend < BEND_STEEP; bend++)
-		check_recon(devices, (enum bend)bend, false, false, false, 5e-3);
-	check_recon(devices, BEND_NONE, false, true, false, 2e-3);
+		check_recon(devices, (enum bend)bend, false, false, false, false, 5e-3);
+	check_recon(devices, BEND_NONE, false, true, false, false, 2e-3);
 	for (int bend = 0; bend < BEND_COUNT; bend++)
-		check_recon(devices, (enum bend)bend, true, false, true, 1e-4);
-	check_recon(devices, BEND_TILTED, false, false, true, 5e-3);
+		check_recon(devices, (enum bend)bend, true, false, true, false, 1e-4);
+	check_recon(devices, BEND_TILTED, false, false, true, false, 5e-3);
+	for (int tv = 0; tv < 2; tv++)
+		check_recon(devices, BEND_TILTED, true, tv, false, true, 1e-3);
 	for (int bend = 0; bend < 2; bend++)
-		check_cgls(devices, (enum bend)bend, true, false, 1e-3);
-	check_cgls(devices, BEND_NONE, false, false, 5e-3);
-	check_cgls(devices, BEND_TILTED, true, true, 1e-3);
+		check_algebra(devices, &algorithm_cgls, (enum bend)bend, true, false, 1e-3);
+	check_algebra(devices, &algorithm_cgls, BEND_NONE, false, false, 5e-3);
+	check_algebra(devices, &algorithm_cgls, BEND_TILTED, true, true, 1e-3);
+	check_algebra(devices, &algorithm_fista, BEND_NONE, false, false, 5e-3);
+	check_algebra(devices, &algorithm_fista, BEND_TILTED, true, true, 1e-3);
 	check_matched_beside(devices);
 	check_metal(devices, BEND_NONE, true, 1e-4);
 	check_metal(devices, BEND_TURNED, false, 5e-3);

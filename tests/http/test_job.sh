@@ -38,6 +38,45 @@ test_pipeline_keeps_the_volumes_asked_for() {
 	expect_json '[.volumes[].name] == ["iter-1", "fdk-tv", "fdk"] and .next == null'
 }
 
+# Each preset of the schema, in numbers in the job's document; stages of the request in place of the preset's.
+test_presets_become_numbers() {
+	uploaded_scan
+	local preset names
+	req GET /v1/openapi.json
+	names=$(json '.components.schemas.JobRequest.properties.preset.enum | map(values) | join(" ")')
+	for preset in $names; do
+		post_job "$small"'"preset": "'"$preset"'"}'
+		expect_json 'has("preset") | not'
+		expect_json '.fdk.window != null and (.sart == null) == ("'"$preset"'" == "preview")'
+		json '{fdk, sart, tv, metal}' >"$work/preset-$preset.json"
+	done
+	expect_json '.metal.threshold_hu == 2500'
+	jq -e '.sart.momentum and .sart.iterations < 10' "$work/preset-fast.json" >/dev/null || fail "fast"
+	jq -e '.tv.strength == "strong"' "$work/preset-low-noise.json" >/dev/null || fail "low-noise"
+	post_job "$small"'"preset": null}'
+	[ "$(json '{fdk, sart, tv, metal}')" = "$(cat "$work/preset-balanced.json")" ] || fail "balanced is not what a job without stages has"
+	post_job "$small"'"preset": "fast", "cgls": {"iterations": 2}, "tv": null}'
+	expect_json '.cgls.iterations == 2 and .sart == null and .tv == null and .fdk.window == "hann"'
+	req POST /v1/jobs -H 'Content-Type: application/json' -d "{\"scan\": \"$scan\", \"preset\": \"best\"}"
+	expect_problem 422 /preset
+	expect_json "(.detail | split(\": \")[1] | split(\", \")) == (\"$names\" | split(\" \"))"
+	req POST /v1/jobs -H 'Content-Type: application/json' -d "{\"scan\": \"$scan\", \"preset\": 3}"
+	expect_problem 400 /preset
+	[ "$(cbct submit X --print --preset bone | jq -c .)" = '{"scan":"X","preset":"bone"}' ] || fail "the option of cbct"
+}
+
+test_momentum_is_asked_for_and_told() {
+	uploaded_scan
+	post_job "$small"'"fdk": {}, "sart": {"iterations": 4, "momentum": true}, "tv": {}, "emit": [1]}'
+	expect_json '.sart.momentum == true'
+	wait_job succeeded
+	expect_json '[.history[].residual] | length == 4 and .[3] < .[0]'
+	post_job "$small"'"fdk": {}, "sart": {"iterations": 1}}'
+	expect_json '.sart.momentum == false'
+	req POST /v1/jobs -H 'Content-Type: application/json' -d "{\"scan\": \"$scan\", \"sart\": {\"momentum\": 2}}"
+	expect_problem 400 /sart/momentum
+}
+
 # Another algorithm by its name, preempted on its way: its stage, its iterates, its history, and the bits of an undisturbed run.
 test_conjugate_gradients_in_place_of_sart() {
 	uploaded_scan

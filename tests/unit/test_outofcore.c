@@ -131,23 +131,26 @@ static const struct {
 	double tolerance;
 	bool matched;
 	const struct algorithm *other; /* in place of SART */
+	bool momentum;
 } cases[] = {
-    {"FDK", &full, true, false, 0, -1, 1e-6, false, NULL},
-    {"FDK, cut off", &narrow, true, false, 0, -1, 1e-6, false, NULL},
-    {"OS-SART, cut off", &narrow, true, true, 4, -1, 1e-4, false, NULL},
-    {"FDK, displaced", &displaced, true, false, 0, -1, 1e-6, false, NULL},
-    {"SIRT", &full, false, true, 1, -1, 1e-5, false, NULL},
-    {"OS-SART", &full, true, true, 4, -1, 1e-5, false, NULL},
-    {"by view", &full, false, true, SUBSETS_VIEWS, -1, 1e-5, false, NULL},
-    {"matched", &full, true, true, 4, -1, 1e-5, true, NULL},
-    {"matched, by view", &full, false, true, SUBSETS_VIEWS, -1, 1e-5, true, NULL},
-    {"matched, seen in part", &displaced, false, true, 3, -1, 1e-5, true, NULL},
-    {"seen in part", &displaced, false, true, 3, -1, 1e-5, false, NULL},
-    {"TV by steps", &full, true, true, 4, TV_GRADIENT, 1e-4, false, NULL},
-    {"proximal TV", &full, true, true, 4, TV_PROXIMAL, 1e-4, false, NULL},
-    {"TV of the noise", &full, true, true, 4, TV_OF_THE_NOISE, 1e-4, false, NULL},
-    {"CGLS", &full, true, true, 4, -1, 1e-4, true, &algorithm_cgls},
-    {"CGLS and TV", &full, false, true, 4, TV_PROXIMAL, 1e-4, true, &algorithm_cgls},
+    {"FDK", &full, true, false, 0, -1, 1e-6, false, NULL, false},
+    {"FDK, cut off", &narrow, true, false, 0, -1, 1e-6, false, NULL, false},
+    {"OS-SART, cut off", &narrow, true, true, 4, -1, 1e-4, false, NULL, false},
+    {"FDK, displaced", &displaced, true, false, 0, -1, 1e-6, false, NULL, false},
+    {"SIRT", &full, false, true, 1, -1, 1e-5, false, NULL, false},
+    {"OS-SART", &full, true, true, 4, -1, 1e-5, false, NULL, false},
+    {"by view", &full, false, true, SUBSETS_VIEWS, -1, 1e-5, false, NULL, false},
+    {"matched", &full, true, true, 4, -1, 1e-5, true, NULL, false},
+    {"matched, by view", &full, false, true, SUBSETS_VIEWS, -1, 1e-5, true, NULL, false},
+    {"matched, seen in part", &displaced, false, true, 3, -1, 1e-5, true, NULL, false},
+    {"seen in part", &displaced, false, true, 3, -1, 1e-5, false, NULL, false},
+    {"TV by steps", &full, true, true, 4, TV_GRADIENT, 1e-4, false, NULL, false},
+    {"proximal TV", &full, true, true, 4, TV_PROXIMAL, 1e-4, false, NULL, false},
+    {"TV of the noise", &full, true, true, 4, TV_OF_THE_NOISE, 1e-4, false, NULL, false},
+    {"CGLS", &full, true, true, 4, -1, 1e-4, true, &algorithm_cgls, false},
+    {"CGLS and TV", &full, false, true, 4, TV_PROXIMAL, 1e-4, true, &algorithm_cgls, false},
+    {"FISTA and TV", &displaced, true, true, 4, TV_PROXIMAL, 1e-4, true, &algorithm_fista, false},
+    {"momentum and TV", &full, true, true, 4, TV_OF_THE_NOISE, 1e-4, false, NULL, true},
 };
 
 START_TEST(outofcore_give_what_the_whole_gives)
@@ -164,8 +167,9 @@ START_TEST(outofcore_give_what_the_whole_gives)
 	recipe.fdk.on = cases[_i].fdk;
 	recipe.algorithm = cases[_i].other != NULL ? cases[_i].other : cases[_i].sart ? &algorithm_sart : NULL;
 	recipe.sart.subsets = cases[_i].subsets;
+	recipe.sart.momentum = cases[_i].momentum;
 	recipe.projector = cases[_i].matched ? PROJECTOR_MATCHED : PROJECTOR_INTERPOLATING;
-	recipe.iterate.iterations = 2;
+	recipe.iterate.iterations = cases[_i].momentum ? 3 : 2;
 	recipe.emit = emit;
 	recipe.emits = cases[_i].fdk ? 1 : 0;
 	if (cases[_i].tv >= 0) {

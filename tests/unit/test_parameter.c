@@ -49,7 +49,9 @@ static char *scan_round_trip(const char *text, struct error *err)
 /* The document that a row is put into: with every stage, and with the algorithm that the pointer names. */
 static cJSON *job_with(const char *pointer)
 {
-	const char *const algorithm = strncmp(pointer, "/cgls/", 6) == 0 ? "cgls" : "sart";
+	const char *const algorithm = strncmp(pointer, "/cgls/", 6) == 0    ? "cgls"
+				      : strncmp(pointer, "/fista/", 7) == 0 ? "fista"
+									    : "sart";
 	cJSON *json = cJSON_Parse("{\"scan\":\"a\",\"grid\":{\"size\":[8,8,8],\"spacing_mm\":[1,1,1]},\"fdk\":{},"
 				  "\"tv\":{},\"metal\":{}}");
 

@@ -68,6 +68,12 @@ static const char *const requests[] = {
     "{\"scan\":\"a\",\"cgls\":{\"iterations\":3,\"nonnegative\":false,\"stop\":{\"residual\":0.1}},\"projector\":"
     "\"interpolating\"}",
     "{\"scan\":\"a\",\"fdk\":{},\"cgls\":{},\"sart\":null}",
+    "{\"scan\":\"a\",\"fdk\":{},\"sart\":{\"momentum\":true}}",
+    "{\"scan\":\"a\",\"fista\":{\"iterations\":12}}",
+    "{\"scan\":\"a\",\"preset\":\"fast\",\"tv\":null}",
+    "{\"scan\":\"a\",\"preset\":\"low-noise\",\"cgls\":{}}",
+    "{\"scan\":\"a\",\"preset\":\"bone\"}",
+    "{\"preset\":\"metal\",\"scan\":\"a\"}",
     "{\"scan\":\"a\",\"sart\":{\"subsets\":60,\"iterations\":100000,\"stop\":{\"change\":1e-9}},"
     "\"emit\":[100000,7,3,7]}",
     "{\"scan\":\"a\",\"sart\":{},\"tv\":{\"alpha\":0,\"step\":0.25,\"iterations\":1,\"unit\":3.3e-5,"
@@ -104,6 +110,34 @@ START_TEST(requests_come_back_the_same)
 			job_request_clear(&request);
 			job_request_clear(&back);
 		}
+	}
+}
+END_TEST
+
+/* A preset is its stages in numbers; `balanced`, what a request without stages has. */
+START_TEST(a_preset_is_what_it_stands_for)
+{
+	static const char *const pairs[][2] = {
+	    {"{\"scan\":\"a\",\"preset\":\"preview\"}", "{\"scan\":\"a\",\"fdk\":{}}"},
+	    {"{\"scan\":\"a\",\"preset\":\"balanced\"}", "{\"scan\":\"a\"}"},
+	    {"{\"scan\":\"a\",\"preset\":\"metal\",\"tv\":null}",
+	     "{\"scan\":\"a\",\"fdk\":{},\"sart\":{},\"metal\":{}}"},
+	    {"{\"scan\":\"a\",\"preset\":\"low-noise\",\"tv\":{},\"sart\":null}",
+	     "{\"scan\":\"a\",\"fdk\":{},\"tv\":{}}"},
+	    {"{\"scan\":\"a\",\"preset\":\"balanced\",\"fista\":{}}",
+	     "{\"scan\":\"a\",\"fdk\":{},\"fista\":{},\"tv\":{}}"},
+	    {"{\"scan\":\"a\",\"preset\":null,\"fdk\":{}}", "{\"scan\":\"a\",\"fdk\":{}}"},
+	};
+	struct job_request requests[2];
+	struct error err;
+
+	for (size_t k = 0; k < sizeof(pairs) / sizeof(pairs[0]); k++) {
+		for (int i = 0; i < 2; i++)
+			ck_assert_msg(job_request_parse(pairs[k][i], strlen(pairs[k][i]), &requests[i], &err) == 0,
+				      "%s", err.text);
+		ck_assert_msg(job_request_same(&requests[0], &requests[1]), "%s", pairs[k][0]);
+		job_request_clear(&requests[0]);
+		job_request_clear(&requests[1]);
 	}
 }
 END_TEST
@@ -306,6 +340,10 @@ static const struct {
     {"{\"scan\":\"a\",\"sart\":{\"iterations\":1.5}}", ERR_INVALID, "/sart/iterations", "whole"},
     {"{\"scan\":\"a\",\"sart\":{\"relaxation\":0}}", ERR_IMPOSSIBLE, "/sart/relaxation", "0"},
     {"{\"scan\":\"a\",\"sart\":{\"relaxation\":2.1}}", ERR_IMPOSSIBLE, "/sart/relaxation", "2.1"},
+    {"{\"scan\":\"a\",\"preset\":\"best\"}", ERR_IMPOSSIBLE, "/preset", "preview, fast"},
+    {"{\"scan\":\"a\",\"preset\":[]}", ERR_INVALID, "/preset", "name"},
+    {"{\"scan\":\"a\",\"preset\":\"fast\",\"sart\":{\"momentum\":1}}", ERR_INVALID, "/sart/momentum", "true or false"},
+    {"{\"scan\":\"a\",\"preset\":\"fast\",\"speed\":1}", ERR_INVALID, "/speed", "nobody knows"},
     {"{\"scan\":\"a\",\"sart\":{},\"cgls\":{}}", ERR_IMPOSSIBLE, "/cgls", "one algorithm"},
     {"{\"scan\":\"a\",\"cgls\":{\"iterations\":0}}", ERR_IMPOSSIBLE, "/cgls/iterations", "0"},
     {"{\"scan\":\"a\",\"cgls\":{\"subsets\":2}}", ERR_INVALID, "/cgls/subsets", "nobody knows"},
@@ -422,6 +460,7 @@ Suite *recipe_suite(void)
 	tcase_add_checked_fixture(tests, open_scan, close_scan);
 	tcase_add_test(tests, requests_come_back_the_same);
 	tcase_add_test(tests, different_requests_are_not_the_same);
+	tcase_add_test(tests, a_preset_is_what_it_stands_for);
 	tcase_add_test(tests, defaults_are_the_contracts);
 	tcase_add_test(tests, numbers_of_tv_mean_explicit_steps_and_none_means_auto);
 	tcase_add_test(tests, the_grid_is_centred_unless_it_says_otherwise);

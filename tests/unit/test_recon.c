@@ -1127,10 +1127,14 @@ START_TEST(what_does_not_fit_is_refused_before_it_is_allocated)
 }
 END_TEST
 
-/* _i: FDK alone, then with each algorithm; metal asks for a stack and a volume to work in. */
+/*
+ * _i: FDK alone, then with each algorithm, then SART with momentum, which asks for a volume more; metal asks for a
+ * stack and a volume to work in.
+ */
 START_TEST(what_is_allocated_is_what_was_said)
 {
-	const struct algorithm *algorithm = _i / 2 == 0 ? NULL : algorithms[_i / 2 - 1];
+	const bool momentum = _i / 2 > ALGORITHM_COUNT;
+	const struct algorithm *algorithm = _i / 2 == 0 ? NULL : momentum ? &algorithm_sart : algorithms[_i / 2 - 1];
 	struct grid grid = grid_of(48, 44, 40, 1, 1, 1);
 	struct recipe recipe = recipe_on(&grid);
 	struct recon_memory memory;
@@ -1146,6 +1150,7 @@ START_TEST(what_is_allocated_is_what_was_said)
 	recipe.fdk.on = true;
 	recipe.metal.on = _i % 2 == 1;
 	recipe_set_algorithm(&recipe, algorithm);
+	recipe.sart.momentum = momentum;
 	ck_assert_int_eq(backend_cpu.open(0, &(struct device_options){.memory_limit = 1 << 28}, &device, &err), 0);
 	ck_assert_int_eq(recon_memory(&backend_cpu, device, &scene.geometry, &plain, &recipe, &memory, &err), 0);
 	backend_cpu.describe(device, &before);
@@ -2256,7 +2261,7 @@ Suite *recon_suite(void)
 	tcase_add_test(pipeline, tv_after_a_sart_that_is_not_there_is_told);
 	tcase_add_test(pipeline, views_must_be_there_once_each);
 	tcase_add_test(pipeline, what_does_not_fit_is_refused_before_it_is_allocated);
-	tcase_add_loop_test(pipeline, what_is_allocated_is_what_was_said, 0, 2 * (1 + ALGORITHM_COUNT));
+	tcase_add_loop_test(pipeline, what_is_allocated_is_what_was_said, 0, 2 * (2 + ALGORITHM_COUNT));
 	tcase_add_test(pipeline, fdk_alone_does_not_keep_the_projections);
 	tcase_add_loop_test(pipeline, impossible_recipes_are_refused_by_their_field, 0, COUNT(refusals));
 	tcase_add_test(pipeline, resolving_writes_every_default_and_is_stable);

@@ -8,7 +8,7 @@ import { readFileSync } from 'node:fs'
 import { resolve } from 'node:path'
 import { pathToFileURL } from 'node:url'
 
-const { groups, stageText, valueText } = await import(pathToFileURL(resolve(process.argv[2])))
+const { groups, presets, stageText, valueText } = await import(pathToFileURL(resolve(process.argv[2])))
 const rows = JSON.parse(readFileSync(process.argv[3], 'utf8')).job
 
 /* Lists have a field for each number. The grid's corner has none: the form keeps the grid about its middle. */
@@ -46,6 +46,12 @@ for (const [pointer, row] of wanted) {
 for (const pointer of fields.keys())
 	if (!wanted.has(pointer) && !others.has(pointer))
 		differences.push(`${pointer}: a field of a parameter that does not exist`)
+
+/* The presets are those of the schema. */
+const schema = readFileSync(resolve(process.argv[2], '../../../../proto/openapi.yaml'), 'utf8')
+const named = /enum: \[(preview, [^\]]*), null\]/.exec(schema)?.[1].split(', ') ?? []
+if ([...named].sort().join() !== presets.map(([name]) => name).sort().join())
+	differences.push(`presets ${presets.map(([name]) => name)}, ${named} are expected`)
 
 /* What a job has is shown: every field with a value of its own. */
 const job = {}

@@ -50,7 +50,7 @@ function parameterFacts(job) {
 
 export function jobFacts(job) {
 	const timings = job.timings ?? {}
-	const spent = ['waiting', 'queued', 'load', 'fdk', 'sart', 'cgls', 'tv', 'save'].filter(name => timings[name] > 0.05).map(name => `${name} ${duration(timings[name])}`)
+	const spent = ['waiting', 'queued', 'load', 'fdk', 'sart', 'cgls', 'fista', 'tv', 'save'].filter(name => timings[name] > 0.05).map(name => `${name} ${duration(timings[name])}`)
 	return list([
 		['Grid', job.grid && `${times(job.grid.size)} at ${times(job.grid.spacing_mm, 3)} mm, from ${job.grid.origin_mm.map(mm => number(mm, 4)).join(', ')} mm`],
 		...parameterFacts(job),

@@ -4,7 +4,7 @@
  */
 import { h, replace, newId } from './dom.js'
 import { request, newKey, Problem } from './api.js'
-import { groups, members, path, at } from './parameters.js'
+import { groups, members, presets, path, at } from './parameters.js'
 
 function put(value, pointer, what) {
 	const keys = path(pointer), last = keys.pop()
@@ -27,6 +27,7 @@ export class JobForm {
 	#initial
 	#fields = new Map() /* pointer -> { field, input, error } */
 	#switches = new Map() /* pointer of a group -> checkbox */
+	#stages = [] /* fieldsets that a preset stands in place of */
 	#key = newKey()
 
 	/* base: a job's document, or { scan }; done(job) after it was taken. */
@@ -40,9 +41,19 @@ export class JobForm {
 		this.trouble = h('p', { class: 'trouble', role: 'alert', hidden: true })
 		this.submit = h('button', { type: 'submit', class: 'primary' }, 'Reconstruct')
 		this.element = h('form', { class: 'job-form', novalidate: true, onsubmit: event => this.#submit(event) },
-			groups.map(group => this.#group(group)), this.trouble,
+			this.#presets(), groups.map(group => this.#group(group)), this.trouble,
 			h('div', { class: 'row end' }, h('button', { type: 'button', onclick: cancel }, 'Close'), this.submit))
 		this.element.addEventListener('input', () => this.#key = newKey())
+	}
+
+	/* Stages for a purpose, in place of those below. */
+	#presets() {
+		this.preset = h('select', { name: '/preset' }, h('option', { value: '' }, 'as below'), presets.map(([name, text]) => h('option', { value: name }, text)))
+		this.preset.addEventListener('change', () => {
+			for (const stage of this.#stages)
+				stage.hidden = this.preset.value !== ''
+		})
+		return h('fieldset', {}, h('legend', {}, 'Purpose'), h('div', { class: 'fields' }, h('label', { class: 'field choice wide' }, h('span', { class: 'label' }, 'Preset'), this.preset)))
 	}
 
 	#group(group) {
@@ -63,7 +74,10 @@ export class JobForm {
 		adapt()
 		this.#switches.set(group.pointer, box)
 		this.#fields.set(group.pointer, { input: box, error })
-		return h('fieldset', {}, h('legend', {}, h('label', {}, box, ` ${group.title}`)), body, off, error)
+		const element = h('fieldset', {}, h('legend', {}, h('label', {}, box, ` ${group.title}`)), body, off, error)
+		if (group.pointer !== '/grid')
+			this.#stages.push(element)
+		return element
 	}
 
 	#field(field) {
@@ -74,7 +88,7 @@ export class JobForm {
 			input = h('select', {}, [...(field.values.includes(value) || value === undefined || value === null ? [] : [value]), ...field.values]
 				.map(name => h('option', { value: name, selected: name === value }, name)))
 		else if (field.kind === 'flag')
-			input = h('input', { type: 'checkbox', checked: value ?? true })
+			input = h('input', { type: 'checkbox', checked: value ?? field.unset ?? true })
 		else
 			input = h('input', { type: 'text', inputmode: field.kind === 'number' ? 'decimal' : null, autocomplete: 'off', spellcheck: 'false', placeholder: field.empty ?? 'default',
 				value: field.write ? field.write(value) : value === undefined || value === null ? '' : String(value) })
@@ -110,6 +124,13 @@ export class JobForm {
 				put(document, pointer, field.read ? field.read(raw) : raw)
 		}
 		this.#keepMiddle(document.grid)
+		if (this.preset.value === '')
+			return document
+		/* What is kept after an iteration goes by the iterations below; without a projector each algorithm has its own. */
+		for (const pointer of [...this.#switches.keys(), '/emit', '/projector'])
+			if (pointer !== '/grid')
+				delete document[path(pointer)[0]]
+		document.preset = this.preset.value
 		return document
 	}
 

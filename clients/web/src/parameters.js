@@ -16,7 +16,7 @@ const text = (pointer, label, options) => ({ pointer, label, kind: 'text', ...op
 
 /*
  * label: with the unit behind a comma. kind: how it is asked for. hint, empty, wide, write, read: of the form. word:
- * that may stand in place of the number. zero: what 0 means.
+ * that may stand in place of the number. zero: what 0 means. unset: what a flag is where the job has none, else true.
  * A group with a pointer is a stage: the form leaves it out by its checkbox. What is empty is left to the daemon's
  * defaults.
  */
@@ -33,12 +33,16 @@ export const groups = [
 	{ title: 'SART', pointer: '/sart', optional: true, algorithm: true, off: 'no iterations', fields: [
 		number('/sart/iterations', 'Iterations', { step: 1 }), number('/sart/relaxation', 'Relaxation'),
 		text('/sart/subsets', 'Subsets', { hint: 'or views', word: 'views', read: numberOrText }),
-		flag('/sart/nonnegative', 'Never below zero'),
+		flag('/sart/momentum', 'Momentum', { unset: false }), flag('/sart/nonnegative', 'Never below zero'),
 		number('/sart/stop/residual', 'Stop at residual', { zero: 'never' }), number('/sart/stop/change', 'Stop at change', { zero: 'never' }),
 	] },
 	{ title: 'Conjugate gradients', pointer: '/cgls', optional: true, algorithm: true, rare: true, off: 'not in place of SART', fields: [
 		number('/cgls/iterations', 'Iterations', { step: 1 }), flag('/cgls/nonnegative', 'Never below zero'),
 		number('/cgls/stop/residual', 'Stop at residual', { zero: 'never' }), number('/cgls/stop/change', 'Stop at change', { zero: 'never' }),
+	] },
+	{ title: 'FISTA', pointer: '/fista', optional: true, algorithm: true, rare: true, off: 'not in place of SART', fields: [
+		number('/fista/iterations', 'Iterations', { step: 1 }), flag('/fista/nonnegative', 'Never below zero'),
+		number('/fista/stop/residual', 'Stop at residual', { zero: 'never' }), number('/fista/stop/change', 'Stop at change', { zero: 'never' }),
 	] },
 	{ title: 'Total variation', pointer: '/tv', optional: true, off: 'no smoothing', fields: [
 		choice('/tv/method', 'Method', ['proximal', 'gradient']), choice('/tv/strength', 'Strength', ['light', 'medium', 'strong']),
@@ -52,6 +56,12 @@ export const groups = [
 		choice('/priority', 'Priority', ['routine', 'urgent', 'stat']), choice('/precision', 'Precision', ['standard', 'reference']),
 		choice('/projector', 'Projector', ['interpolating', 'matched']), number('/mu_water', 'Water, 1/mm'),
 	] },
+]
+/* Stages for a purpose, and what each is for. */
+export const presets = [
+	['balanced', 'Balanced: smoothed as much as the noise asks for'], ['preview', 'Preview: FDK alone, the first picture'],
+	['fast', 'Fast: near balanced in two thirds of its time'], ['low-noise', 'Low noise: smoother; small contrasts of 30 HU are lost'],
+	['bone', 'Bone: sharper and noisier'], ['metal', 'Metal: balanced, without its streaks'],
 ]
 /* Members of a job's document that are parts of its request, whether they have a field above or not. */
 export const members = [...new Set([...groups.flatMap(({ pointer, fields }) => pointer ? [pointer] : fields.map(field => field.pointer)).map(pointer => path(pointer)[0]),

@@ -27,7 +27,7 @@ export function doing(job) {
 		/* The one under way, from 1 on; 0 is before the first. */
 		if (job.iterations > 0 && job.iteration > 0)
 			return `iteration ${job.iteration} of ${job.iterations}`
-		return { load: 'loading', fdk: 'FDK', tv: 'TV', save: 'saving', sart: 'SART', cgls: 'conjugate gradients' }[job.stage] ?? ''
+		return { load: 'loading', fdk: 'FDK', tv: 'TV', save: 'saving', sart: 'SART', cgls: 'conjugate gradients', fista: 'FISTA' }[job.stage] ?? ''
 	}
 	if (job.state === 'failed')
 		return job.error?.detail ?? ''
