@@ -294,7 +294,36 @@ async function drag(page, from, to) {
 	await page.mouse.up()
 }
 
+/* Nothing is measured in the job. */
+const forget = () => api(`/v1/jobs/${finished}/annotations`, { method: 'PUT', headers: { 'Content-Type': 'application/json', 'If-Match': '*' }, body: '{}' })
+
+test('what one measures is kept with the job and shown to all who look at it', async () => {
+	await forget()
+	const [one, other] = [await openFinished(), await openFinished()]
+	const ruler = async (page, from, to) => {
+		await tool(page, 'ruler')
+		await drag(page, await spot(page, 'z', ...from), await spot(page, 'z', ...to))
+		await tool(page, 'ruler')
+	}
+	await ruler(one, [0.3, 0.3], [0.6, 0.3])
+	await until('the other page has it', () => measured(other), list => list.length === 1)
+	expect(String(await measured(one)) === String(await measured(other)), 'the same length')
+	/* Both at once: none is lost. */
+	await Promise.all([ruler(one, [0.3, 0.5], [0.5, 0.5]), ruler(other, [0.4, 0.7], [0.8, 0.7])])
+	await until('all three on both', async () => [await measured(one), await measured(other)], lists => lists.every(list => list.length === 3) && String([...lists[0]].sort()) === String([...lists[1]].sort()))
+	const { measurements } = await until('and kept', () => api(`/v1/jobs/${finished}/annotations`), document => document.measurements.length === 3)
+	expect(new Set(measurements.map(item => item.id)).size === 3, 'each with a number of its own')
+	await one.click('.measurements li >> nth=0 >> button.icon')
+	await until('removed for both', () => measured(other), list => list.length === 2)
+	await one.context().close()
+	await other.reload()
+	await until('there after a reload', () => measured(other), list => list.length === 2)
+	await other.context().close()
+	await forget()
+})
+
 test('rulers and angles are true at any zoom and in turned planes; a region has the voxels\' mean', async () => {
+	await forget()
 	const page = await openFinished(), spacing = [3, 3.4, 2.8], size = [36, 32, 40]
 	const { origin_mm: corner } = (await api(`/v1/jobs/${finished}/volumes`)).volumes[0]
 	const middle = corner.map((start, i) => start + (size[i] - 1) / 2 * spacing[i])
@@ -392,6 +421,7 @@ test('rulers and angles are true at any zoom and in turned planes; a region has 
 	const exported = JSON.parse(readFileSync(await download.path(), 'utf8'))
 	expect(exported.measurements.length === 4 && Math.abs(exported.measurements[2].mean_hu - mean) < 0.5 && exported.job === finished, 'all in the file')
 	await page.context().close()
+	await forget()
 })
 
 /* ---- numbers ---- */

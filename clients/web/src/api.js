@@ -21,7 +21,7 @@ async function problemOf(response) {
 	return new Problem(response.status, document)
 }
 
-export async function request(method, path, { body, headers, signal } = {}) {
+async function ask(method, path, { body, headers, signal } = {}) {
 	const response = await fetch(path, {
 		method,
 		headers: { Accept: 'application/json', ...(body ? { 'Content-Type': 'application/json' } : {}), ...headers },
@@ -32,7 +32,18 @@ export async function request(method, path, { body, headers, signal } = {}) {
 		dispatchEvent(new Event('signed-out'))
 	if (!response.ok)
 		throw await problemOf(response)
+	return response
+}
+
+export async function request(method, path, options) {
+	const response = await ask(method, path, options)
 	return response.status === 204 ? null : response.json()
+}
+
+/* The same with the tag that a change of what is there must name. */
+export async function requestTagged(method, path, options) {
+	const response = await ask(method, path, options)
+	return { document: await response.json(), tag: response.headers.get('ETag') }
 }
 
 export const get = (path, signal) => request('GET', path, { signal })
@@ -59,7 +70,7 @@ export async function listVolumes(job, signal) {
 	return volumes.reverse()
 }
 
-const kinds = ['state', 'progress', 'volume', 'warning', 'end', 'removed']
+const kinds = ['state', 'progress', 'volume', 'warning', 'annotations', 'end', 'removed']
 const retryAfter = 5000 /* ms: the browser itself comes again where the connection broke, not where it was refused */
 const hiddenFor = 30000 /* ms: a browser has six connections to a daemon, for all of its pages together */
 

@@ -3,11 +3,12 @@ import { h, replace, write, throttle, newId, bytes, duration } from './dom.js'
 import { get, request, jobPath, scanPath, volumePath, listVolumes, watch } from './api.js'
 import { View, planeName, presets, rotationOf } from './view.js'
 import { Measurements } from './measure.js'
+import { Annotations } from './annotations.js'
 import { Tools, segments, press } from './tools.js'
 import { Viewer } from './viewer.js'
 import { Plot } from './plot.js'
 import { Film } from './film.js'
-import { Bar, badge, doing, left, ended } from './state.js'
+import { Bar, badge, doing, left, ended, stateWord } from './state.js'
 import { geometryFacts, jobFacts, warningList } from './facts.js'
 import { reconstructAgain, confirmed, openDialog } from './form.js'
 
@@ -37,6 +38,7 @@ export class JobPage {
 		this.live = live
 		this.title = title
 		this.#build()
+		this.annotations = new Annotations(jobId, this.#measurements, { signal: this.#abort.signal, failed: error => this.tools.tell(`Not kept with the job: ${error.message}`) })
 		this.refresh = throttle(250, () => this.#refresh())
 		this.refreshVolumes = throttle(250, () => this.#refreshVolumes())
 		this.#view.addEventListener('change', ({ detail }) => this.#onView(detail))
@@ -168,9 +170,16 @@ export class JobPage {
 		if (ended(this.#job)) {
 			this.stopWatching?.()
 			this.live(null)
+			/* Its own events are over; what is measured in it goes on. */
+			this.stopListening ??= watch('/v1/events?after=latest', (kind, data) => kind === 'annotations' && data.job === this.id && this.annotations.load(data.etag),
+				connected => connected && this.annotations.load())
 			return
 		}
-		this.stopWatching ??= watch(`${jobPath(this.id)}/events?after=latest`, kind => {
+		this.stopWatching ??= watch(`${jobPath(this.id)}/events?after=latest`, (kind, data) => {
+			if (kind === 'annotations') {
+				this.annotations.load(data.etag)
+				return
+			}
 			this.refresh()
 			if (kind === 'volume' || kind === 'end')
 				this.refreshVolumes()
@@ -218,7 +227,7 @@ export class JobPage {
 		if (before?.state !== job.state) {
 			replace(this.badge, badge(job.state))
 			if (before) {
-				write(this.announce, `The job is ${job.state}`)
+				write(this.announce, `The job is ${stateWord(job.state)}`)
 				this.refreshVolumes()
 			}
 			this.#watch()
@@ -575,6 +584,7 @@ export class JobPage {
 		this.refreshVolumes.cancel()
 		this.#abort.abort()
 		this.stopWatching?.()
+		this.stopListening?.()
 		document.removeEventListener('keydown', this.onKey)
 		this.tools.close()
 		this.viewer.close()

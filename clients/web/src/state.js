@@ -3,10 +3,15 @@ import { h, duration } from './dom.js'
 
 const signs = { waiting: '◌', queued: '◔', running: '◑', succeeded: '●', failed: '✕', cancelled: '⊘' }
 
+/* For people; the class has the API's word. */
+const words = { queued: 'in the queue', succeeded: 'ready' }
+
 export const ended = job => ['succeeded', 'failed', 'cancelled'].includes(job.state)
 
+export const stateWord = state => words[state] ?? state
+
 export function badge(state) {
-	return h('span', { class: `badge ${state}` }, h('span', { 'aria-hidden': 'true' }, signs[state] ?? '○'), ` ${state}`)
+	return h('span', { class: `badge ${state}` }, h('span', { 'aria-hidden': 'true' }, signs[state] ?? '○'), ` ${stateWord(state)}`)
 }
 
 /* What a job may wait for beside projections and its turn, in words. */

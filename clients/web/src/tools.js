@@ -41,7 +41,8 @@ export class Tools {
 		this.slabs = h('div', { class: 'group' }, h('span', { class: 'label' }, 'Slab'), this.thickness, this.mode, this.straight, this.cine)
 		this.list = h('ul', { class: 'measurements' })
 		this.save = h('button', { type: 'button', onclick: () => this.#export() }, 'Export')
-		this.section = h('section', { class: 'card', hidden: true }, h('h2', {}, 'Measurements'), this.list, this.save)
+		this.trouble = h('p', { class: 'trouble', role: 'alert', hidden: true })
+		this.section = h('section', { class: 'card', hidden: true }, h('h2', {}, 'Measurements'), this.trouble, this.list, this.save)
 		view.addEventListener('change', this.follow = ({ detail }) => this.#update(detail))
 		measurements.addEventListener('change', () => this.show())
 	}
@@ -90,11 +91,18 @@ export class Tools {
 	/* The list; again when another volume is looked at. */
 	show() {
 		const { items } = this.measurements, grid = this.voxels()
+		this.trouble.hidden = true
 		this.section.hidden = items.length === 0
 		replace(this.list, items.map(item => h('li', { 'data-id': item.id },
 			h('button', { type: 'button', class: 'quiet', title: 'Go there', onclick: () => this.#goTo(item) }, `${item.id}: ${kinds[item.kind].name}`),
 			h('span', { class: 'amount' }, resultOf(item, grid)),
 			h('button', { type: 'button', class: 'icon', 'aria-label': `Remove measurement ${item.id}`, onclick: () => this.measurements.remove(item.id) }, '×'))))
+	}
+
+	/* What went wrong with keeping them; until the next change. */
+	tell(text) {
+		write(this.trouble, text)
+		this.trouble.hidden = false
 	}
 
 	#goTo({ points }) {
