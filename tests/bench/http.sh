@@ -101,6 +101,6 @@ export CURL_CA_BUNDLE=$work/certificate.pem
 start_daemon "$work/tls" --backend cpu --tls-cert "$work/certificate.pem" --tls-key "$work/key.pem"
 bench_put "upload, one body, TLS" send_whole 1
 bench_put "upload, $count PUTs, 4 connections, TLS" send_parallel 4
-rm -rf "$work/all" "$work/views"
+rm -rf "$work"/{all,views,curl.*,key.pem,certificate.pem}
 
 printf '%s\n' "${results[@]}" | jq -s '{results: .}' >"$BUILD/bench/http.json"
