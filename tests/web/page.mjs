@@ -449,7 +449,7 @@ test('the plot has the points of the history on a logarithmic axis', async () =>
 test('warnings, parameters, geometry, projections and downloads', async () => {
 	const page = await openFinished()
 	const about = await page.textContent('section.card:has(h2:text("Reconstruction"))')
-	for (const text of ['window hann, cutoff 1 of Nyquist, truncated rows auto', 'iterations 7, relaxation 1, subsets 10, never below zero yes, stop at residual never',
+	for (const text of ['window hann, cutoff 1 of Nyquist, truncated rows auto', 'iterations 7, relaxation 1, subsets 10, momentum no, never below zero yes, stop at residual never',
 		'method proximal, strength medium, alpha auto', 'Metalnone', 'Projectorinterpolating', 'Precisionstandard', 'Water0.0192 1/mm', 'Keep volumesfdk, 1, 2, 4, 6'])
 		expect(about.includes(text), `"${text}" in: ${about}`)
 	expect(await page.textContent('h1') === name, 'the scan\'s name as a text')
