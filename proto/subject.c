@@ -146,11 +146,30 @@ static int representation_of(enum subject_field field)
 	return i;
 }
 
+/*
+ * Controls beyond ASCII, U+0080 .. U+009F, and those that turn what follows round for the eye alone, U+202A .. U+202E
+ * and U+2066 .. U+2069: a name that is not what it looks like.
+ */
+static bool has_unseen(const char *text)
+{
+	const unsigned char *at = (const unsigned char *)text;
+
+	for (; *at != '\0'; at++) {
+		if ((at[0] == 0xc2 && at[1] < 0xa0) ||
+		    (at[0] == 0xe2 && at[1] == 0x80 && at[2] >= 0xaa && at[2] <= 0xae) ||
+		    (at[0] == 0xe2 && at[1] == 0x81 && at[2] >= 0xa6 && at[2] <= 0xa9))
+			return true;
+	}
+	return false;
+}
+
 static const char *check(enum subject_field field, const char *text, int *ret_code)
 {
 	const size_t length = strlen(text);
 
 	*ret_code = ERR_INVALID;
+	if (has_unseen(text))
+		return "no control character and no change of the direction of writing is expected";
 	if (text[0] == ' ' || text[length - 1] == ' ')
 		return "no blank at either end is expected: DICOM does not keep it";
 	return representations[representation_of(field)].check(text, ret_code);

@@ -57,7 +57,7 @@ static enum role roles_parse(char *words)
 
 bool token_expiry_parse(const char *text, int64_t *ret_expires)
 {
-	struct tm when = {0};
+	struct tm when = {0}, given;
 	const char *end;
 
 	if (strcmp(text, never) == 0) {
@@ -71,8 +71,10 @@ bool token_expiry_parse(const char *text, int64_t *ret_expires)
 	}
 	if (end == NULL || *end != '\0')
 		return false;
+	given = when;
 	*ret_expires = timegm(&when);
-	return true;
+	/* A day that its month does not have becomes another one. */
+	return when.tm_mday == given.tm_mday && when.tm_mon == given.tm_mon;
 }
 
 void token_expiry_print(int64_t expires, char ret_text[32])

@@ -111,6 +111,8 @@ static int token_make(const struct token_options *options, struct token *ret_tok
 	token.expires = time(NULL) + options->days * 86400;
 	if (options->expires != NULL && !token_expiry_parse(options->expires, &token.expires))
 		return error_set(err, ERR_USAGE, "--expires is a date, a time as 2027-01-31T00:00:00Z, or never");
+	if (token.expires <= time(NULL))
+		return error_set(err, ERR_USAGE, "--expires %s is over already", options->expires);
 	if (getrandom(random, sizeof(random), 0) != (ssize_t)sizeof(random))
 		return error_set_errno(err, errno, "random bits");
 	token_text(random, ret_text);

@@ -37,7 +37,7 @@ const char *const proof_names[PROOF_COUNT] = {
     [PROOF_SESSION] = "session", [PROOF_CERTIFICATE] = "certificate", [PROOF_PEER] = "peer",
 };
 
-enum { SESSIONS_MAX = 256, PEER_RULES_MAX = 64, GROUPS_MAX = 1024 };
+enum { SESSIONS_MAX = 1024, SESSIONS_OF_TOKEN = 16, PEER_RULES_MAX = 64, GROUPS_MAX = 1024 };
 static const double session_seconds = 12 * 3600; /* a working day */
 static const char session_cookie[] = "cbctd_session";
 
@@ -146,9 +146,14 @@ bool access_has_tokens(const struct access *access)
 	return access->path[0] != '\0';
 }
 
+bool access_has_peers(const struct access *access)
+{
+	return access->rule_count > 0;
+}
+
 bool access_is_asked(const struct access *access)
 {
-	return access_has_tokens(access) || access->rule_count > 0;
+	return access_has_tokens(access) || access_has_peers(access);
 }
 
 enum role access_peer_role(const struct access *access, int socket, const struct ucred *peer)
@@ -393,16 +398,27 @@ const struct identity *request_identity(const struct request *request)
 
 /* ---- sessions ---- */
 
-/* The one that is over, else the one that ends first. With the lock held. */
-static struct session *session_place(struct access *access)
+/*
+ * A place that is free. Who opens more than SESSIONS_OF_TOKEN loses the oldest of its own; only where hundreds of
+ * tokens have filled the table does somebody lose another's. With the lock held.
+ */
+static struct session *session_place(struct access *access, const uint8_t token[TOKEN_DIGEST_BYTES])
 {
-	struct session *place = &access->sessions[0];
+	struct session *oldest = &access->sessions[0], *own = NULL;
+	double now = clock_monotonic();
+	int count = 0;
 
-	for (int i = 1; i < SESSIONS_MAX; i++) {
-		if (access->sessions[i].ends < place->ends)
-			place = &access->sessions[i];
+	for (int i = 0; i < SESSIONS_MAX; i++) {
+		struct session *session = &access->sessions[i];
+
+		if (session->ends < oldest->ends)
+			oldest = session;
+		if (now < session->ends && memcmp(session->token, token, TOKEN_DIGEST_BYTES) == 0) {
+			count++;
+			own = own == NULL || session->ends < own->ends ? session : own;
+		}
 	}
-	return place;
+	return count >= SESSIONS_OF_TOKEN ? own : oldest;
 }
 
 static void set_cookie(struct request *request, const char *value, double seconds)
@@ -425,7 +441,7 @@ int request_session_open(struct request *request, struct error *err)
 		return error_set(err, ERR_INTERNAL, "the digest of a session cannot be made");
 	memcpy(fresh.token, request->who.token, sizeof(fresh.token));
 	pthread_mutex_lock(&access->lock);
-	*session_place(access) = fresh;
+	*session_place(access, fresh.token) = fresh;
 	pthread_mutex_unlock(&access->lock);
 	set_cookie(request, value, session_seconds);
 	return 0;

@@ -313,7 +313,8 @@ static void fit_connections(struct http *http)
 static unsigned guards_of(const struct http *http)
 {
 	return (access_has_tokens(http->access) ? GUARD_TOKENS : GUARD_NONE) |
-	       (http->tls != NULL ? GUARD_TLS : GUARD_NONE);
+	       (http->tls != NULL ? GUARD_TLS : GUARD_NONE) |
+	       (access_has_peers(http->access) ? GUARD_PEERS : GUARD_NONE);
 }
 
 int http_new(const struct http_options *options, struct http **ret_http, struct error *err)

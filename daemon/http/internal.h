@@ -172,7 +172,7 @@ const struct framing *gate_refusal(const struct connection *connection);
 void gate_free(struct gate *gate);
 
 /* ---- http/listen.c: addresses and sockets ---- */
-enum guard { GUARD_NONE = 0, GUARD_TOKENS = 1, GUARD_TLS = 2 };
+enum guard { GUARD_NONE = 0, GUARD_TOKENS = 1, GUARD_TLS = 2, GUARD_PEERS = 4 };
 /* guards: what there is of enum guard; with both, others than loopback addresses are allowed. */
 int listeners_open(const char *listen, unsigned guards, struct listener ret_listeners[LISTENERS_MAX], int *ret_count,
 		   struct error *err);
@@ -239,6 +239,8 @@ int request_check_origin(struct request *request, struct error *err);
 /* ---- http/access.c: who asks, and what they may ---- */
 int access_new(const struct http_options *options, struct access **ret_access, struct error *err);
 void access_free(struct access *access); /* NULL is fine */
+/* Users of a Unix socket are known by the kernel: whoever is not in the list shows a token. */
+bool access_has_peers(const struct access *access);
 /* There are tokens, or roles for a Unix socket's peers, and whoever has none is nobody. */
 bool access_is_asked(const struct access *access);
 bool access_has_tokens(const struct access *access);

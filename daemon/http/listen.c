@@ -69,7 +69,7 @@ static int open_tcp(const char *text, unsigned guards, struct listener *listener
 {
 	struct addrinfo hints = {.ai_flags = AI_NUMERICHOST | AI_NUMERICSERV | AI_PASSIVE, .ai_socktype = SOCK_STREAM};
 	struct addrinfo *found = NULL;
-	const char *colon = strrchr(text, ':');
+	const char *colon = strrchr(text, ':'), *address = text;
 	char host[80];
 	size_t length;
 	double port;
@@ -79,10 +79,10 @@ static int open_tcp(const char *text, unsigned guards, struct listener *listener
 		return error_set(err, ERR_INVALID, "listen: \"%s\" is neither ADDR:PORT nor unix:PATH", text);
 	length = (size_t)(colon - text);
 	if (text[0] == '[' && text[length - 1] == ']') {
-		text++;
+		address++;
 		length -= 2;
 	}
-	snprintf(host, sizeof(host), "%.*s", (int)length, text);
+	snprintf(host, sizeof(host), "%.*s", (int)length, address);
 	if (strcmp(host, "localhost") == 0)
 		snprintf(host, sizeof(host), "127.0.0.1");
 	/* The resolver takes a port modulo 65536. */
@@ -91,7 +91,7 @@ static int open_tcp(const char *text, unsigned guards, struct listener *listener
 	if (getaddrinfo(host, colon + 1, &hints, &found) != 0)
 		return error_set(err, ERR_INVALID, "listen: \"%s\" is no numeric address with a port", text);
 	listener->tls = (guards & GUARD_TLS) != 0;
-	if (is_loopback(found->ai_addr) || guards == (GUARD_TOKENS | GUARD_TLS))
+	if (is_loopback(found->ai_addr) || (guards & GUARD_TOKENS && guards & GUARD_TLS))
 		code = bind_tcp(found, text, listener, err);
 	else
 		code = error_set(err, ERR_IMPOSSIBLE,
@@ -125,7 +125,7 @@ static int remove_stale(const struct sockaddr_un *address, struct error *err)
 	return 0;
 }
 
-static int open_unix(const char *path, struct listener *listener, struct error *err)
+static int open_unix(const char *path, unsigned guards, struct listener *listener, struct error *err)
 {
 	struct sockaddr_un address = {.sun_family = AF_UNIX};
 
@@ -138,8 +138,10 @@ static int open_unix(const char *path, struct listener *listener, struct error *
 	listener->socket = socket(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
 	if (listener->socket < 0)
 		return error_set_errno(err, errno, "socket");
-	/* The file's mode is who may connect: owner and group. Nobody can before listen(2). */
-	if (bind(listener->socket, (struct sockaddr *)&address, sizeof(address)) != 0 || chmod(path, 0660) != 0)
+	/* The file's mode is who may connect: owner and group, unless each is asked who it is. Nobody can before
+	 * listen(2). */
+	if (bind(listener->socket, (struct sockaddr *)&address, sizeof(address)) != 0 ||
+	    chmod(path, (guards & GUARD_PEERS) != 0 ? 0666 : 0660) != 0)
 		return error_set_errno(err, errno, "listen on %s", path);
 	snprintf(listener->unix_path, sizeof(listener->unix_path), "%s", path);
 	snprintf(listener->name, sizeof(listener->name), "%s%s", unix_prefix, path);
@@ -167,7 +169,7 @@ int listeners_open(const char *listen_text, unsigned guards, struct listener ret
 		listener->socket = -1;
 		count++;
 		if (strncmp(text, unix_prefix, sizeof(unix_prefix) - 1) == 0)
-			code = open_unix(text + sizeof(unix_prefix) - 1, listener, err);
+			code = open_unix(text + sizeof(unix_prefix) - 1, guards, listener, err);
 		else
 			code = open_tcp(text, guards, listener, err);
 		if (code == 0 && listen(listener->socket, SOMAXCONN) != 0)

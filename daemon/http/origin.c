@@ -106,7 +106,9 @@ static bool is_own_page(const struct request *request, const char *origin, const
 	char page[HOST_MAX];
 	long page_port;
 
-	if (!origin_parse(origin, page, &page_port))
+	/* What the network has put into a page that came without TLS is not ours. */
+	if (!origin_parse(origin, page, &page_port) ||
+	    (request->connection->tls && strncasecmp(origin, "https:", 6) != 0))
 		return false;
 	if (is_configured(request->http, page))
 		return true;

@@ -130,7 +130,9 @@ static int connection_open(struct connection *connection, struct error *err)
 		sqlite3_file_control(connection->db, "main", SQLITE_FCNTL_RESERVE_BYTES, &reserve);
 		result = sqlite3_exec(connection->db,
 				      "PRAGMA page_size = 4096; PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL;"
-				      " PRAGMA foreign_keys = ON;",
+				      " PRAGMA foreign_keys = ON;"
+				      /* What is removed may name a patient. */
+				      " PRAGMA secure_delete = ON;",
 				      NULL, NULL, NULL);
 	}
 	return result != SQLITE_OK ? connection_error(connection, result & 0xff, "open", err) : 0;

@@ -53,6 +53,8 @@ test_the_file_has_no_token_and_is_for_its_owner_alone() {
 	cbct token list --file "$tokens" | grep -q '^the-old .*expired$' || fail "the old one as expired"
 	! cbct token new the-view --file "$tokens" 2>/dev/null || fail "a name is given once"
 	! cbct token new 'a b' --file "$tokens" 2>/dev/null || fail "a name is one word"
+	! cbct token new never-born --expires 2031-02-30 --file "$tokens" 2>/dev/null || fail "no February has 30 days"
+	! cbct token new stillborn --expires 2020-01-01 --file "$tokens" 2>/dev/null || fail "a token that is over already"
 	! cbct token revoke nobody --file "$tokens" 2>/dev/null || fail "who is not there cannot be revoked"
 }
 
@@ -161,6 +163,21 @@ test_a_session_lasts_until_it_is_closed_or_its_token_revoked() {
 	stop_daemon
 }
 
+test_one_token_cannot_end_the_sessions_of_others() {
+	local cookie i own
+	start_daemon --tokens "$tokens"
+	own="Origin: $url"
+	as acquire
+	req POST /v1/session "${bearer[@]}" -H "$own"
+	cookie=(-H "Cookie: $(header set-cookie | cut -d';' -f1)")
+	as view
+	for ((i = 0; i < 40; i++)); do printf 'next\nurl = "%s/v1/session"\nrequest = POST\noutput = /dev/null\n%s\n' "$url" "header = \"${bearer[1]}\""; done | sed 1d >"$work/many"
+	timeout 60 curl -s -K "$work/many"
+	req GET /v1/session "${cookie[@]}"
+	expect_json '.name == "the-acquire" and .proof == "session"'
+	stop_daemon
+}
+
 test_sighup_reads_the_file_again_and_keeps_the_old_one_if_it_is_bad() {
 	local fresh cookie
 	start_daemon --tokens "$tokens"
@@ -224,6 +241,8 @@ test_the_kernel_tells_who_is_at_a_unix_socket() {
 	expect_json ".name == \"uid-$(id -u)\" and .role == \"acquire\" and .proof == \"peer\""
 	req DELETE /v1/scans/1m00000000000000 --unix-socket "$socket"
 	expect_problem 404
+	# each is asked who it is, so the socket is no closer than that
+	[ "$(stat -c %a "$socket")" = 666 ] || fail "mode 666, got $(stat -c %a "$socket")"
 	# over TCP nobody is known
 	req GET /v1/session
 	expect_problem 401

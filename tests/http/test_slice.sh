@@ -69,6 +69,11 @@ test_planes_and_slabs_at_any_angle_are_the_volume_resampled() {
 	req GET "$volume/slice?normal=1,1,0&size=64,48&spacing=2"
 	expect_status 200
 	[ "$(picture)" = "64 48 8 0" ] || fail "64 x 48, got $(picture)"
+	# as programs print the cosine of a right angle
+	req GET "$volume/slice?normal=0,1,0"
+	cp "$work/body" "$work/straight"
+	req GET "$volume/slice?normal=6.123233995736766e-17,1E0,0"
+	cmp -s "$work/body" "$work/straight" || fail "the same plane by numbers with an exponent"
 }
 
 test_the_sides_of_the_picture_are_told() {
@@ -94,7 +99,7 @@ test_the_sides_of_the_picture_are_told() {
 test_what_cannot_be_is_refused_by_its_name() {
 	local query
 	for query in axis=w index=15 index=-1 index=1.5 index=x "axis=x&index=31" window=0 window=-5 window=nan level=high sheet=2 \
-		normal=0,0,0 normal=1,0 normal=1,0,0,0 normal=1,x,0 normal=1,0, normal=1e3,0,0 normal= "normal=1,0,0&up=2,0,0" "normal=1,0,0&up=0,0,0" \
+		normal=0,0,0 normal=1,0 normal=1,0,0,0 normal=1,x,0 normal=1,0, normal=0x10,0,0 normal= "normal=1,0,0&up=2,0,0" "normal=1,0,0&up=0,0,0" \
 		"normal=1,0,0&center=500,0,0" "normal=1,0,0&center=1,2" "normal=1,0,0&size=0,5" "normal=1,0,0&size=5" "normal=1,0,0&size=2049,5" \
 		"normal=1,0,0&size=5.5,5" "normal=1,0,0&spacing=0" "normal=1,0,0&spacing=-1" "normal=1,0,0&axis=x" "normal=1,0,0&index=3" \
 		"normal=1,0,0&sheet=1" up=0,0,1 center=0,0,0 size=5,5 spacing=1 thickness=0 thickness=-3 thickness=thick thickness=1001 \
