@@ -49,6 +49,8 @@ const struct warning_kind warning_kinds[] = {
      "The phantom may have another size than its drawing: sizes in images may be wrong."},
     {"calibration_turn", SEVERITY_CAUTION,
      "The phantom looks the same when it is turned: the arm's angles may be off by that turn."},
+    {"calibration_turned", SEVERITY_SERIOUS,
+     "The phantom stood turned on the table when the arm was calibrated: left, right, front and back may be wrong."},
     {"calibration_views", SEVERITY_INFO,
      "Some pictures of the phantom could not be used: the arm's places there are interpolated."},
     /* ---- of the samples ---- */

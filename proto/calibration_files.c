@@ -276,6 +276,20 @@ static double source_angle(const struct view *view)
 	return atan2(view->source[1], view->source[0]);
 }
 
+static double calibrated_turn(const struct calibrated *calibrated)
+{
+	const struct geometry *sweep = &calibrated->sweep->geometry;
+	double sine = 0, cosine = 0;
+
+	for (int k = 0; k < sweep->count; k++) {
+		const double turn = source_angle(&calibrated->geometry.views[k]) - source_angle(&sweep->views[k]);
+
+		sine += sin(turn);
+		cosine += cos(turn);
+	}
+	return atan2(sine, cosine);
+}
+
 /* Whether the angles run the calibrated way round: an arm sags otherwise on its way back. */
 static void check_direction(const struct calibrated *calibrated, const double *angles, int count, cJSON *notes)
 {
@@ -293,6 +307,21 @@ static void check_direction(const struct calibrated *calibrated, const double *a
 		    "otherwise on its way back",
 		    was > 0 ? "counter-clockwise" : "clockwise", fabs(was) / degree,
 		    is > 0 ? "counter-clockwise" : "clockwise", fabs(is) / degree);
+}
+
+/*
+ * The world is that of the phantom's drawing. A phantom that was put down turned about z has turned it against the
+ * table, and a patient's sides with it; an arm that sags does so by less than a degree in the mean.
+ */
+static void check_turn(const struct calibrated *calibrated, cJSON *notes)
+{
+	const double turn = calibrated_turn(calibrated);
+
+	if (fabs(turn) > CALIBRATED_TURN_MOST)
+		note(notes, "calibration_turned",
+		     "the phantom stood turned by %.1f degrees about z against its drawing, and so do the axes of this "
+		     "scan against the table: calibrate again with the drawing, or the phantom, turned back",
+		     turn / degree);
 }
 
 /* How far the angles lie from calibrated ones at most, radians. */
@@ -342,6 +371,7 @@ int calibrated_views(const struct calibrated *calibrated, const struct scan *sca
 			     nominal->count, scan->count, far / degree);
 		check_direction(calibrated, angles, scan->count, ret_notes);
 	}
+	check_turn(calibrated, ret_notes);
 	fit_detector(calibrated, scan, &geometry, ret_notes);
 	*ret_geometry = geometry;
 	return 0;

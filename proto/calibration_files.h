@@ -37,6 +37,9 @@ struct calibrated {
 int calibrated_read(const cJSON *request, const cJSON *result, struct calibrated *ret, struct error *err);
 void calibrated_clear(struct calibrated *calibrated);
 
+/* Radians by which a phantom may stand turned about z against its drawing without a word: 3 degrees. */
+#define CALIBRATED_TURN_MOST (3 * 3.14159265358979 / 180)
+
 /*
  * The views of another scan by a calibration. angles: [count] of its sources, radians; NULL: those of the calibrated
  * sweep, view by view. Allocates ret_geometry->views, for the scan's own detector. Adds to ret_notes, a list, what is

@@ -353,7 +353,7 @@ out:
 
 /* Warnings that a geometry by a calibration brings along. */
 static const char *const note_codes[] = {"calibration_interpolated", "calibration_old", "calibration_other_detector",
-					 "calibration_other_sweep"};
+					 "calibration_other_sweep", "calibration_turned"};
 enum { NOTE_CODES = sizeof(note_codes) / sizeof(note_codes[0]), NOTE_CHARACTERS = 319 };
 
 static int read_note(const cJSON *note, int index, struct error *err)

@@ -100,6 +100,11 @@ int scan_delete(void *context, struct request *request, struct error *err)
 
 	if (store_scan_refer(api->store, request_argument(request, 0), &scan, err) != 0)
 		return err->code;
+	code = calibrations_check_scan(api->calibrations, request_argument(request, 0), err);
+	if (code != 0) {
+		stored_scan_release(scan);
+		return code;
+	}
 	code = jobs_delete_scan(api->jobs, scan, err);
 	if (code == ERR_NO_SPACE && store_reserve_spend(api->store))
 		code = jobs_delete_scan(api->jobs, scan, err);

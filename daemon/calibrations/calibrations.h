@@ -38,6 +38,8 @@ void calibrations_close(struct calibrations *calibrations);
  */
 int calibrations_post(struct calibrations *calibrations, const char *text, size_t length, char ret_id[ID_SIZE],
 		      struct error *err);
+/* ERR_CONFLICT while a calibration of this scan waits or is being made; otherwise 0. */
+int calibrations_check_scan(struct calibrations *calibrations, const char *scan, struct error *err);
 /* ERR_NOT_FOUND. One that is being made is stopped. */
 int calibrations_delete(struct calibrations *calibrations, const char *id, struct error *err);
 

@@ -125,6 +125,13 @@ static void add_warnings(cJSON *document, const cJSON *result)
 			 number_of(result, "other_turn_deg"));
 		cJSON_AddItemToArray(warnings, json_warning("calibration_turn", detail));
 	}
+	if (fabs(number_of(result, "turned_deg")) > CALIBRATED_TURN_MOST * 180 / M_PI) {
+		snprintf(detail, sizeof(detail),
+			 "the phantom stood turned by %.1f degrees about z against its drawing, and so do the axes of "
+			 "scans that use this",
+			 number_of(result, "turned_deg"));
+		cJSON_AddItemToArray(warnings, json_warning("calibration_turned", detail));
+	}
 	add_view_warning(warnings, result);
 }
 

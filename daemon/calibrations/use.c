@@ -38,6 +38,23 @@ static int open_calibrated(struct calibrations *calibrations, const char *id, st
 	return code;
 }
 
+int calibrations_check_scan(struct calibrations *calibrations, const char *scan, struct error *err)
+{
+	int code = 0;
+
+	pthread_mutex_lock(&calibrations->lock);
+	for (int i = 0; i < calibrations->count && code == 0; i++) {
+		const struct entry *entry = &calibrations->entries[i];
+
+		if (entry->state < CALIBRATION_SUCCEEDED && strcmp(entry->scan, scan) == 0)
+			code =
+			    error_set(err, ERR_CONFLICT, "calibration %s of this scan is %s: delete it first, or wait",
+				      entry->id, calibration_state_names[entry->state]);
+	}
+	pthread_mutex_unlock(&calibrations->lock);
+	return code;
+}
+
 static void note_age(const struct calibrations *calibrations, const struct calibrated *calibrated, cJSON *notes)
 {
 	const double days = (clock_realtime() - calibrated->acquired) / day;

@@ -140,6 +140,37 @@ test_what_does_not_fit_is_told() {
 }
 
 # One that was being made when the daemon was killed is made after the next start; a damaged one is set aside.
+test_a_phantom_that_stood_turned_is_told_in_every_scan() {
+	start_daemon
+	# balls of no symmetry, and the same drawing turned by a quarter against where they are
+	local phantom='{"balls_mm": [[40, 5, -38, 6], [-12, 44, -25, 6], [-42, -9, -14, 6], [8, -45, -30, 6], [31, 30, -6, 6], [-33, 27, 4, 6],
+		[-20, -36, 12, 6], [41, -17, 19, 6], [14, 39, 27, 6], [-44, 3, 33, 6], [2, -30, 40, 6], [22, 12, 47, 6]]}' drawn id
+	drawn=$phantom
+	balls
+	for id in straight turned; do
+		phantom=$drawn
+		[ $id = straight ] || phantom=$(jq -c '.balls_mm |= map([-.[1], .[0], .[2], .[3]])' <<<"$drawn")
+		calibrated
+		expect_json '.state == "succeeded"'
+		jq -e --argjson turned "$([ $id = turned ] && echo true || echo false)" '(any(.warnings[]; .code == "calibration_turned" and .severity == "serious")) == $turned and
+			((.turned_deg | fabs) > 80) == $turned' "$body" >/dev/null || fail "$id: $(jq -c '[.turned_deg, .warnings]' "$body")"
+		scan "{\"kind\": \"calibration\", \"id\": \"$calibration\"}"
+		expect_status 201
+		jq -e --argjson turned "$([ $id = turned ] && echo true || echo false)" '(any(.warnings[]; .code == "calibration_turned")) == $turned' "$body" >/dev/null ||
+			fail "$id, of a scan: $(jq -c .warnings "$body")"
+	done
+	# its pictures are still needed
+	req POST /v1/calibrations "${json[@]}" "{\"scan\": \"$balls\", \"phantom\": $phantom}"
+	calibration=$(jq -r .id "$body")
+	req DELETE "/v1/scans/$balls"
+	expect_problem 409
+	grep -q "$calibration" "$body" || fail "the calibration that is to be made: $(cat "$body")"
+	req GET "/v1/calibrations/$calibration?wait=60"
+	req DELETE "/v1/scans/$balls"
+	expect_status 204
+	stop_daemon
+}
+
 test_calibrations_outlive_crashes_and_damage_is_told() {
 	printf '#!/bin/sh\n[ "$1" != --calibrate ] || exec sleep 60\nexec "%s" "$@"\n' "$BUILD/cbct-worker" >"$work/slow"
 	chmod +x "$work/slow"
