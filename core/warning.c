@@ -91,8 +91,8 @@ const struct warning_kind warning_kinds[] = {
      "The image's voxels are coarser than what the projections show, which was smoothed to fit them; smaller voxels "
      "would show more."},
     {"iterations_settled", SEVERITY_INFO,
-     "The image's voxels are coarser than what the projections show, so that later iterations change it less; smaller "
-     "voxels would show more."},
+     "The projections show more than the image can hold, finer detail or a part of the patient beyond the detector, so "
+     "that later iterations change it less."},
     {"grid_unseen", SEVERITY_SERIOUS, "The image lies where no projection sees it: it shows nothing."},
     {"grid_too_small", SEVERITY_CAUTION, "The image was asked for as a single voxel or a line of voxels."},
     {"sparse_views", SEVERITY_CAUTION,

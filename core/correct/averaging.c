@@ -290,8 +290,9 @@ static int apply(const struct correction_job *job, void *context, enum correctio
 	sum_up(state, sums);
 	ratio = averaging_ratio(state->pixels[0], sums);
 	share = averaging_share(ratio);
-	*job->settled = settling_after(state->pixels[0], share * averaging_fineness(state->pixels[0]),
-				       settling_share(state->pixels[0], sums + AVERAGING_DISTANCES));
+	*job->settled =
+	    fmin(*job->settled, settling_after(state->pixels[0], share * averaging_fineness(state->pixels[0]),
+					       settling_share(state->pixels[0], sums + AVERAGING_DISTANCES)));
 	if (share == 0)
 		return 0;
 	for (int i = 0; i < 2; i++)

@@ -12,6 +12,7 @@
 /* One view on the host, [row][column]: line integrals as measured, through w and through w on the recipe's grid. */
 struct projection {
 	int steps;
+	const struct exterior_rows *seen;
 	const struct view *view;
 	int columns, rows;
 	const int *pad;
@@ -79,7 +80,9 @@ static struct exterior_rows subtract_row(const struct projection *of, int row)
 	double *smooth = of->smooth + at, outside = 0;
 	struct exterior_rows found = {0};
 
-	if (of->steps & EXTERIOR_BEYOND)
+	if (of->steps & EXTERIOR_BEYOND && row >= of->seen->first && row <= of->seen->last)
+		found.truncated = 1;
+	else if (of->steps & EXTERIOR_BEYOND)
 		found.truncated = is_truncated(of->pad, measured, of->columns, of->largest, of->air);
 	if (found.truncated == 0 && of->steps & EXTERIOR_OUTSIDE && of->faces != NULL &&
 	    faces_row_counts_outside(of->faces, of->view, of->columns, row, measured, explained, of->largest))
@@ -122,17 +125,29 @@ static struct exterior_rows look_at_rows(const struct exterior_volume_options *o
 	const float air = air_level(measured, columns, rows, truncation_edge(columns), largest);
 	const struct outside_rows outside =
 	    outside_rows(options->grid, &geometry->views[view], columns, rows, measured);
-	struct exterior_rows found = {.beside = outside.beside, .outside = outside.beside + outside.ends};
+	struct exterior_rows found = {
+	    .beside = outside.beside, .outside = outside.beside + outside.ends, .first = rows, .last = -1};
 
 	for (int r = 0; r < rows; r++)
-		found.truncated +=
-		    is_truncated(options->orbit->pad, measured + (size_t)r * (size_t)columns, columns, largest, air);
+		if (is_truncated(options->orbit->pad, measured + (size_t)r * (size_t)columns, columns, largest, air)) {
+			found.truncated++;
+			found.first = r < found.first ? r : found.first;
+			found.last = r;
+		}
 	return found;
+}
+
+/* A place on the field of view's rim moves over so many of a detector's rows while the arm turns. */
+static int rows_around(const struct orbit *orbit, int rows)
+{
+	return (int)ceil(orbit->field_of_view / 2 / orbit->source_radius * rows / 2);
 }
 
 int exterior_look(const struct exterior_volume_options *options, struct exterior_rows *ret_rows, struct error *err)
 {
+	const int all = options->geometry->rows, around = rows_around(options->orbit, all);
 	size_t truncated = 0, outside = 0, beside = 0;
+	int first = all, last = -1;
 	struct exterior_rows found;
 	struct exterior_views views;
 	int code = exterior_views_open(&views, options, err);
@@ -140,7 +155,8 @@ int exterior_look(const struct exterior_volume_options *options, struct exterior
 	if (code < 0)
 		return code;
 	while (exterior_views_next(&views, &code, err)) {
-#pragma omp parallel for schedule(static) reduction(+ : truncated, outside, beside)
+#pragma omp parallel for schedule(static) reduction(+ : truncated, outside, beside) reduction(min : first)                     \
+    reduction(max : last)
 		for (int i = 0; i < views.here; i++) {
 			const struct exterior_rows rows = look_at_rows(options, exterior_views_index(&views, i),
 								       views.images + (size_t)i * views.pixels);
@@ -148,10 +164,16 @@ int exterior_look(const struct exterior_volume_options *options, struct exterior
 			truncated += rows.truncated;
 			outside += rows.outside;
 			beside += rows.beside;
+			first = rows.first < first ? rows.first : first;
+			last = rows.last > last ? rows.last : last;
 		}
 	}
 	exterior_views_close(&views);
-	found = (struct exterior_rows){.truncated = truncated, .outside = outside, .beside = beside};
+	found = (struct exterior_rows){.truncated = truncated,
+				       .outside = outside,
+				       .beside = beside,
+				       .first = first - (last >= 0 ? around : 0),
+				       .last = last + (last >= 0 ? around : 0)};
 	if (code == 0 && found.outside == 0)
 		code = exterior_volume_may_go_on(options, &found.possible, err);
 	if (code == 0)
@@ -172,7 +194,8 @@ static int project(const struct exterior_volume_options *options, struct plan *p
 }
 
 int exterior_subtract(const struct exterior_volume *exterior, const struct exterior_volume_options *options, int steps,
-		      struct volume *work, struct exterior_rows *ret_rows, struct error *err)
+		      const struct exterior_rows *seen, struct volume *work, struct exterior_rows *ret_rows,
+		      struct error *err)
 {
 	const struct backend *backend = options->backend;
 	const struct geometry *geometry = options->geometry;
@@ -214,6 +237,7 @@ int exterior_subtract(const struct exterior_volume *exterior, const struct exter
 								 (size_t)geometry->columns);
 			const struct projection projection = {
 			    .steps = steps,
+			    .seen = seen,
 			    .view = &geometry->views[first + i],
 			    .columns = geometry->columns,
 			    .rows = geometry->rows,

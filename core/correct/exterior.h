@@ -16,8 +16,9 @@
  *    cancels but at the grid's faces, which stay as sharp as in SART's own
  *    projections (Ziegler, Nielsen and Grass, Med. Phys. 35, 2008, project the FDK
  *    volume without the region of interest: its voxels at the border are then neither in nor out).
- * 2. What lies beyond the field of view, in rows that are truncated or that
- *    count something outside of w's grid (core/correct/exterior_rows.h): p' - smooth(p - A w).
+ * 2. What lies beyond the field of view, in rows that are truncated in any view looked at, with a few around them for
+ *    the cone, or that count something outside of w's grid (core/correct/exterior_rows.h): p' - smooth(p - A w). A view
+ *    along the length of a body that is truncated in others has all of its shadow, and with it what lies beyond.
  *    Smooth is at each column the value of the straight line fitted to the columns
  *    up to 1/EXTERIOR_PART of the row away from it. So SART keeps FDK's means over
  *    many columns there and adds what is finer.
@@ -26,12 +27,19 @@
  * what lies beyond the field of view into it.
  */
 enum { EXTERIOR_PART = 32 };
+/*
+ * Iterations of ten updates after which they settle (core/correct/averaging.h) in a scan with truncated rows: what the
+ * coarse volume cannot hold of the exterior stays in the projections, and each iteration puts more of it into the grid.
+ */
+#define EXTERIOR_SETTLED 2
 enum { EXTERIOR_OUTSIDE = 1, EXTERIOR_BEYOND = 2 }; /* the steps, as bits */
 
 /* Numbers of the projections' rows that are concerned. */
 struct exterior_rows {
 	size_t truncated, outside;
-	size_t beside; /* of `outside`, those with rays that miss the grid and are not air; exterior_look only */
+	/* Truncated rows, from the first to the last in any view, those around them included; none: first > last. */
+	int first, last; /* exterior_look only */
+	size_t beside;   /* of `outside`, those with rays that miss the grid and are not air; exterior_look only */
 	/*
 	 * No row counts anything outside, but that cannot be excluded, for the rays through what may be there pass the
 	 * grid as well: the end of a body some mm beyond the grid's. exterior_look only.
@@ -43,11 +51,12 @@ struct exterior_rows {
 int exterior_look(const struct exterior_volume_options *options, struct exterior_rows *ret_rows, struct error *err);
 
 /*
- * These steps. Changes the projections; `work` is a volume on the recipe's grid to work in, after EXTERIOR_OUTSIDE it
- * holds w. Takes EXTERIOR_VOLUME_VIEWS more slots on the device meanwhile.
+ * These steps; seen: what exterior_look found. Changes the projections; `work` is a volume on the recipe's grid to work
+ * in, after EXTERIOR_OUTSIDE it holds w. Takes EXTERIOR_VOLUME_VIEWS more slots on the device meanwhile.
  */
 int exterior_subtract(const struct exterior_volume *exterior, const struct exterior_volume_options *options, int steps,
-		      struct volume *work, struct exterior_rows *ret_rows, struct error *err);
+		      const struct exterior_rows *seen, struct volume *work, struct exterior_rows *ret_rows,
+		      struct error *err);
 /*
  * A better start for SART than the FDK volume where not all views see a place: there FDK lacks their share, and the
  * few iterations of a job cannot make up for it. The volume becomes w there; `work` holds w.

@@ -48,7 +48,7 @@ static int subtract(const struct correction_job *job, const struct exterior_volu
 	int steps = EXTERIOR_OUTSIDE | (recipe->fdk.extend ? EXTERIOR_BEYOND : 0), code = 0;
 
 	if (exterior->goes_on && seen->truncated > 0 && !options->poor) {
-		code = exterior_subtract(exterior, options, EXTERIOR_BEYOND, job->work, &rows, err);
+		code = exterior_subtract(exterior, options, EXTERIOR_BEYOND, seen, job->work, &rows, err);
 		steps = EXTERIOR_OUTSIDE;
 	}
 	if (code == 0 && exterior->goes_on)
@@ -61,7 +61,7 @@ static int subtract(const struct correction_job *job, const struct exterior_volu
 		*ret_rows = rows;
 		return code;
 	}
-	code = exterior_subtract(exterior, options, steps, job->work, &rows, err);
+	code = exterior_subtract(exterior, options, steps, seen, job->work, &rows, err);
 	/* Iterations without FDK start from zero. */
 	if (code == 0 && exterior->goes_on && recipe->fdk.on && *job->iteration == 0)
 		code = exterior_start(exterior, options, job->work, job->volume, err);
@@ -112,8 +112,10 @@ static int apply(const struct correction_job *job, void *state, enum correction_
 	(void)time;
 	(void)ret_changed;
 	/* Rows that are cut off may be wanted as they are; what lies outside of the grid is another matter. */
-	if (!job->recipe->fdk.extend)
+	if (!job->recipe->fdk.extend) {
 		seen.truncated = 0;
+		seen.last = -1;
+	}
 	if (code < 0 || (seen.truncated + seen.outside == 0 && !seen.possible))
 		return code;
 	if (!sound && !fdk && seen.truncated > 0)
@@ -124,11 +126,17 @@ static int apply(const struct correction_job *job, void *state, enum correction_
 		return 0;
 	/* An object may end inside of the grid: FDK's blur beyond its faces is none of the object. */
 	options.inside_only = seen.outside == 0 && !seen.possible;
+	/* From zero, iterations take too long to fill what is held beside the field of view where the grid has that. */
+	options.truncated = seen.truncated > 0 && sound && fdk && !options.inside_only;
+	if (!options.truncated)
+		seen.last = -1;
 	code = exterior_volume_make(&exterior, &options, err);
 	if (code == 0)
 		code = subtract(job, &options, &seen, &exterior, &rows, err);
 	if (code == 0 && !fdk && sound && job->recipe->fdk.extend)
 		truncated_warn(job, exterior.truncated, job->geometry->columns);
+	if (code == 0 && options.truncated)
+		*job->settled = fmin(*job->settled, EXTERIOR_SETTLED);
 	if (code == 0)
 		warn_of_outside(job, rows.outside);
 	exterior_volume_clear(&exterior);

@@ -1,17 +1,17 @@
-/* The exterior's coarse volume on the recipe's grid, by linear interpolation: see exterior_volume.h. */
+/* The exterior's coarse volume read by linear interpolation, for its own rim and on the recipe's grid: see
+ * exterior_volume.h. */
 #include "core/correct/exterior_volume.h"
 
 #include <math.h>
 #include <stdlib.h>
 
 /* Between which two places of an axis a position lies, held beyond the outer ones, and how near to the second. */
-static float between(const struct grid *from, const struct grid *to, int axis, int index, int ret[2])
+static float between(const struct grid *grid, int axis, double place, int ret[2])
 {
-	const double place = to->origin[axis] + index * to->spacing[axis];
-	const double at = fmin(fmax((place - from->origin[axis]) / from->spacing[axis], 0), from->size[axis] - 1);
+	const double at = fmin(fmax((place - grid->origin[axis]) / grid->spacing[axis], 0), grid->size[axis] - 1);
 
 	ret[0] = (int)at;
-	ret[1] = ret[0] + 1 < from->size[axis] ? ret[0] + 1 : ret[0];
+	ret[1] = ret[0] + 1 < grid->size[axis] ? ret[0] + 1 : ret[0];
 	return (float)(at - ret[0]);
 }
 
@@ -21,21 +21,83 @@ struct corners {
 	float weight[8];
 };
 
-static struct corners corners_of(const struct grid *from, const struct grid *to, int x, int y, int z)
+static struct corners corners_of(const struct grid *grid, const double place[3])
 {
 	struct corners corners;
 	int at[3][2];
-	const float part[3] = {between(from, to, 0, x, at[0]), between(from, to, 1, y, at[1]),
-			       between(from, to, 2, z, at[2])};
+	const float part[3] = {between(grid, 0, place[0], at[0]), between(grid, 1, place[1], at[1]),
+			       between(grid, 2, place[2], at[2])};
 
 	for (int i = 0; i < 8; i++) {
 		const int a = i & 1, b = i >> 1 & 1, c = i >> 2;
 
-		corners.at[i] = grid_voxel(from, at[0][a], at[1][b], at[2][c]);
+		corners.at[i] = grid_voxel(grid, at[0][a], at[1][b], at[2][c]);
 		corners.weight[i] =
 		    (a ? part[0] : 1 - part[0]) * (b ? part[1] : 1 - part[1]) * (c ? part[2] : 1 - part[2]);
 	}
 	return corners;
+}
+
+/* The same around a voxel of another grid. */
+static struct corners corners_of_voxel(const struct grid *grid, const struct grid *of, int x, int y, int z)
+{
+	const double place[3] = {of->origin[0] + x * of->spacing[0], of->origin[1] + y * of->spacing[1],
+				 of->origin[2] + z * of->spacing[2]};
+
+	return corners_of(grid, place);
+}
+
+static float value_at(const struct exterior_volume *s, const struct corners *corners)
+{
+	float sum = 0;
+
+	for (int i = 0; i < 8; i++)
+		sum += corners->weight[i] * s->voxels[corners->at[i]];
+	return sum;
+}
+
+/* The voxel's value beside the field of view; *ret_beside is false where it lies in that. No voxel read is beside it.
+ */
+static float held(const struct exterior_volume *s, const struct orbit *orbit, double place[3], bool *ret_beside)
+{
+	const double radius = orbit->field_of_view / 2;
+	const double rim = radius - 1.5 * fmax(s->grid.spacing[0], s->grid.spacing[1]);
+	const double a = vec_dot(orbit->frame[0], place), b = vec_dot(orbit->frame[1], place);
+	const double from_axis = hypot(a, b), part = (from_axis - radius) / (EXTERIOR_MARGIN * radius);
+	struct corners corners;
+
+	*ret_beside = from_axis > radius;
+	if (from_axis <= radius || part >= 1)
+		return 0;
+	for (int i = 0; i < 3; i++)
+		place[i] += (rim / from_axis - 1) * (a * orbit->frame[0][i] + b * orbit->frame[1][i]);
+	corners = corners_of(&s->grid, place);
+	return value_at(s, &corners) * (float)(0.5 + 0.5 * cos(M_PI * part));
+}
+
+void exterior_volume_hold_rim(struct exterior_volume *s, const struct orbit *orbit, const bool *empty)
+{
+	const struct grid *grid = &s->grid;
+
+	/* A field of view of a few coarse voxels has no whole sums within its rim. */
+	if (orbit->field_of_view < 6 * fmax(grid->spacing[0], grid->spacing[1]))
+		return;
+#pragma omp parallel for schedule(static)
+	for (int z = 0; z < grid->size[2]; z++)
+		for (int y = 0; y < grid->size[1]; y++)
+			for (int x = 0; x < grid->size[0]; x++) {
+				const size_t at = grid_voxel(grid, x, y, z);
+				double place[3] = {grid->origin[0] + x * grid->spacing[0],
+						   grid->origin[1] + y * grid->spacing[1],
+						   grid->origin[2] + z * grid->spacing[2]};
+				bool beside;
+				const float value = held(s, orbit, place, &beside);
+
+				if (!beside)
+					continue;
+				s->seen[at] = false;
+				s->voxels[at] = empty[at] ? 0 : value;
+			}
 }
 
 int exterior_volume_sample(const struct exterior_volume *s, const struct grid *grid, struct volume *to,
@@ -51,12 +113,9 @@ int exterior_volume_sample(const struct exterior_volume *s, const struct grid *g
 #pragma omp parallel for schedule(static)
 		for (int y = 0; y < grid->size[1]; y++)
 			for (int x = 0; x < grid->size[0]; x++) {
-				const struct corners corners = corners_of(&s->grid, grid, x, y, z);
-				float sum = 0;
+				const struct corners corners = corners_of_voxel(&s->grid, grid, x, y, z);
 
-				for (int i = 0; i < 8; i++)
-					sum += corners.weight[i] * s->voxels[corners.at[i]];
-				slice[(size_t)y * nx + (size_t)x] = sum;
+				slice[(size_t)y * nx + (size_t)x] = value_at(s, &corners);
 			}
 		code = s->backend->volume_put(to, z, 1, slice, err);
 	}
@@ -71,7 +130,7 @@ bool exterior_volume_seen(const struct exterior_volume *s, const struct grid *gr
 #pragma omp parallel for schedule(static) reduction(&& : all)
 	for (int y = 0; y < grid->size[1]; y++)
 		for (int x = 0; x < grid->size[0]; x++) {
-			const struct corners corners = corners_of(&s->grid, grid, x, y, z);
+			const struct corners corners = corners_of_voxel(&s->grid, grid, x, y, z);
 			float sum = 0;
 
 			for (int i = 0; i < 8; i++)

@@ -54,10 +54,10 @@ static void box_add(struct box *box, const struct box *other)
 	}
 }
 
-/* The two places where a ray meets the cylinder of the field of view. */
-static void box_add_ray(struct box *box, const struct orbit *orbit, const double from[3], const double way[3])
+/* The two places where a ray meets a cylinder around the orbit's axis. */
+static void box_add_ray(struct box *box, const struct orbit *orbit, double radius, const double from[3],
+			const double way[3])
 {
-	const double radius = orbit->field_of_view / 2;
 	double a = 0, b = 0, c = -radius * radius;
 
 	for (int i = 0; i < 2; i++) {
@@ -77,8 +77,8 @@ static void box_add_ray(struct box *box, const struct orbit *orbit, const double
 	}
 }
 
-/* Around what the rays to the first and the last row meet of the field of view. */
-static void box_add_rays(struct box *box, const struct orbit *orbit, const struct geometry *geometry)
+/* Around what the rays to the first and the last row meet of that cylinder. */
+static void box_add_rays(struct box *box, const struct orbit *orbit, double radius, const struct geometry *geometry)
 {
 	enum { ALONG = 9 };
 
@@ -92,7 +92,7 @@ static void box_add_rays(struct box *box, const struct orbit *orbit, const struc
 			for (int a = 0; a < 3; a++)
 				way[a] = view->pixel0[a] + column * view->column_step[a] + row * view->row_step[a] -
 					 view->source[a];
-			box_add_ray(box, orbit, view->source, way);
+			box_add_ray(box, orbit, radius, view->source, way);
 		}
 }
 
@@ -111,9 +111,17 @@ static void grid_of_box(const struct box *box, double spacing, int most, struct 
 	}
 }
 
+static void box_widen(struct box *box, double by)
+{
+	for (int i = 0; i < 2; i++) {
+		box->low[i] -= by;
+		box->high[i] += by;
+	}
+}
+
 /*
- * Around the recipe's grid, the field of view and its rays; without the rays, or around the recipe's grid alone, where
- * the sources leave no room for more.
+ * Around the recipe's grid, the field of view, with its margin where rows are truncated, and its rays; without the
+ * margin, the rays, or around the recipe's grid alone, where the sources leave no room for more.
  */
 static void choose_grid(const struct exterior_volume_options *options, struct grid *ret)
 {
@@ -122,14 +130,16 @@ static void choose_grid(const struct exterior_volume_options *options, struct gr
 	struct error err;
 
 	orbit_covering_grid(options->orbit, options->geometry, most, &wide);
-	for (int reach = options->inside_only ? 0 : 2; reach >= 0; reach--) {
-		const struct box view = box_of(&wide);
-		struct box box = box_of(options->grid);
+	for (int reach = options->inside_only ? 0 : options->truncated ? 3 : 2; reach >= 0; reach--) {
+		const double radius = options->orbit->field_of_view / 2,
+			     margin = reach > 2 ? EXTERIOR_MARGIN * radius : 0;
+		struct box view = box_of(&wide), box = box_of(options->grid);
 
+		box_widen(&view, margin);
 		if (reach > 0)
 			box_add(&box, &view);
 		if (reach > 1)
-			box_add_rays(&box, options->orbit, options->geometry);
+			box_add_rays(&box, options->orbit, radius + margin, options->geometry);
 		grid_of_box(&box, wide.spacing[0], most, ret);
 		if (grid_check_geometry(ret, options->geometry, &err) == 0)
 			return;
@@ -177,7 +187,7 @@ static size_t larger(size_t a, size_t b)
 	return a > b ? a : b;
 }
 
-/* Memory of a job that turns out to be inside_only, or not, as the options say. */
+/* Memory of a job that turns out to be inside_only or truncated, or not, as the options say. */
 static int bytes_of(const struct exterior_volume_options *options, struct exterior_volume_bytes *ret_bytes,
 		    struct error *err)
 {
@@ -220,20 +230,27 @@ static int bytes_of(const struct exterior_volume_options *options, struct exteri
 int exterior_volume_bytes(const struct exterior_volume_options *options, struct exterior_volume_bytes *ret_bytes,
 			  struct error *err)
 {
-	struct exterior_volume_options either[2] = {*options, *options};
-	struct exterior_volume_bytes bytes[2];
+	enum { INSIDE_ONLY = 1, TRUNCATED = 2, KINDS };
+	struct exterior_volume_bytes most = {0};
 	int code = 0;
 
-	for (int i = 0; i < 2 && code == 0; i++) {
-		either[i].inside_only = i == 1;
-		code = bytes_of(&either[i], &bytes[i], err);
+	for (int kind = 0; kind < KINDS && code == 0; kind++) {
+		struct exterior_volume_options one = *options;
+		struct exterior_volume_bytes bytes;
+
+		one.inside_only = kind == INSIDE_ONLY;
+		one.truncated = kind == TRUNCATED;
+		code = bytes_of(&one, &bytes, err);
+		if (code < 0)
+			break;
+		most = (struct exterior_volume_bytes){
+		    .device = larger(most.device, bytes.device),
+		    .borrowed = larger(most.borrowed, bytes.borrowed),
+		    .host = larger(most.host, bytes.host),
+		};
 	}
 	if (code == 0)
-		*ret_bytes = (struct exterior_volume_bytes){
-		    .device = larger(bytes[0].device, bytes[1].device),
-		    .borrowed = larger(bytes[0].borrowed, bytes[1].borrowed),
-		    .host = larger(bytes[0].host, bytes[1].host),
-		};
+		*ret_bytes = most;
 	return code;
 }
 
@@ -395,6 +412,8 @@ static void keep_what_is_known(struct exterior_volume *s, const struct exterior_
 
 	if (!options->inside_only)
 		hold_ends(s, empty);
+	if (options->truncated)
+		exterior_volume_hold_rim(s, options->orbit, empty);
 #pragma omp parallel for schedule(static) reduction(+ : kept)
 	for (int z = 0; z < s->grid.size[2]; z++)
 		for (int y = 0; y < s->grid.size[1]; y++)
@@ -403,7 +422,8 @@ static void keep_what_is_known(struct exterior_volume *s, const struct exterior_
 				const struct place place = place_of(&s->grid, x, y, z);
 				const bool inside = is_inside(options->grid, place.at);
 
-				if (!inside && (empty[at] || !is_in_view(options->orbit, place.at)))
+				if (!inside &&
+				    (empty[at] || !(options->truncated || is_in_view(options->orbit, place.at))))
 					s->voxels[at] = 0;
 				s->voxels[at] *= (float)options->factor;
 				kept += !inside && s->voxels[at] != 0;

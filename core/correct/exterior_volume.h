@@ -13,6 +13,11 @@
  * it. A place that is on the rows of some views only, where FDK's sums lack the others, has the value of the nearest
  * slice towards the middle that all views see: bodies go on more often than they end.
  *
+ * In a scan whose rows are truncated, what lies beside the field of view has the value at its rim instead, wherever no
+ * view sees it through air, and fades to zero over EXTERIOR_MARGIN of the radius. A volume that ends at the rim falls
+ * as the chord of a circle does, which no smooth difference to the projections follows, and its voxels are steps there:
+ * SART put 20 to 35 HU of that into the grid (tests/bench/results/truncation.txt).
+ *
  * exterior_volume_fit makes that agree with the projections, by SART (core/correct/coarse.h). A ray near the end of the
  * grid is in it for a short part of its length, to which SART ascribes all of the ray's error: a hundredth of the
  * integral is hundreds of HU there. Slices of a trunk of +-250 mm that end inside of a panel of +-84 mm, worst error of
@@ -25,6 +30,9 @@
  * of its pixels, and for half as many where they are fitted; but not for fewer than EXTERIOR_VOLUME_LEAST a side.
  */
 enum { EXTERIOR_VOLUME_LEAST = 64, EXTERIOR_VOLUME_MOST = 128, EXTERIOR_VOLUME_VIEWS = 4 };
+
+/* Of the field of view's radius. */
+#define EXTERIOR_MARGIN 0.25
 
 /* Inputs of the model, all of them borrowed. */
 struct exterior_volume_options {
@@ -39,6 +47,7 @@ struct exterior_volume_options {
 	const int *blank;          /* [blanks], those */
 	int blanks;
 	bool poor;        /* FDK is, and not to be believed outside of the recipe's grid */
+	bool truncated;   /* rows are, so that the object goes on beside the field of view */
 	bool inside_only; /* leaves what lies outside of the recipe's grid away */
 	const struct cancel *cancel;
 };
@@ -49,8 +58,8 @@ struct exterior_volume {
 	struct fdk_weights weights;
 	struct plan *plan;
 	struct volume *volume;
-	float *voxels;       /* the same on the host, owned */
-	bool *seen;          /* [voxels], owned: on the rows of all views */
+	float *voxels; /* the same on the host, owned */
+	bool *seen; /* [voxels], owned: on the rows of all views and, where rows are truncated, in the field of view */
 	size_t truncated[2]; /* as of backend.filter_extended */
 	bool goes_on;        /* something is left outside of the recipe's grid */
 };
@@ -83,12 +92,19 @@ int exterior_volume_fit(struct exterior_volume *exterior, const struct exterior_
 bool exterior_volume_has_outside(const struct exterior_volume *exterior, const struct grid *grid);
 void exterior_volume_clear(struct exterior_volume *exterior);
 
+/*
+ * A part of exterior_volume_make, where rows are truncated. Beside the field of view the voxels on the host become the
+ * value at the same height a voxel and a half within its rim, where FDK's sums are whole, fading outwards, but for what
+ * is empty ([voxels]).
+ */
+void exterior_volume_hold_rim(struct exterior_volume *exterior, const struct orbit *orbit, const bool *empty);
 /* `to` becomes the same on the recipe's grid. */
 int exterior_volume_sample(const struct exterior_volume *exterior, const struct grid *grid, struct volume *to,
 			   struct error *err);
 /*
- * A slice of it [y][x]: 1 where all views see a place, 0 where one of them has it beside its rows, in between nearer
- * to that than a voxel of the coarse grid. True when it is 1 all over the field of view.
+ * A slice of it [y][x]: 1 where all views see a place, 0 where one of them has it beside its rows (or, where rows are
+ * truncated, beside its columns), in between nearer to that than a voxel of the coarse grid. True when it is 1 all over
+ * the field of view.
  */
 bool exterior_volume_seen(const struct exterior_volume *exterior, const struct grid *grid, int z, float *ret_slice);
 

@@ -248,7 +248,8 @@ static bool may_settle(const struct recipe *recipe)
 	return has_subsets(recipe) && recipe->sart.relaxation == 1;
 }
 
-/* Where projections show more than the grid holds, late iterations keep a falling share of their change (averaging.h).
+/* Where projections show more than the grid holds, finer edges or a body beyond the detector, late iterations keep a
+ * falling share of their change (averaging.h).
  */
 static int relax(struct recon *recon, int iteration, struct error *err)
 {

@@ -193,7 +193,8 @@ void warn_settled(const struct warning_sink *sink, const struct recipe *recipe, 
 	if (from < recipe->iterate.iterations)
 		warning_tell(
 		    sink, "iterations_settled",
-		    "the projections show edges within voxels, which iterations would overshoot beside: from the "
-		    "%d. of %d iterations on, each keeps less of its change than the one before",
+		    "the projections show what the grid cannot hold, edges within voxels or a body beyond the "
+		    "detector, and iterations would put that into it: from the %d. of %d iterations on, each keeps "
+		    "less of its change than the one before",
 		    (int)from + 1, recipe->iterate.iterations);
 }

@@ -455,10 +455,118 @@ START_TEST(blank_views_are_not_taken_for_air)
 }
 END_TEST
 
+/* ---- bodies wider than the detector ---- */
+
+static struct ellipsoid round_parts[] = {{SHAPE_CYLINDER, {110, 110, 300}, {0, 0, 0}, 0, .0192},
+					 {SHAPE_ELLIPSOID, {9, 9, 9}, {-20, 20, 0}, 0, -.00576}};
+static struct ellipsoid wide_parts[] = {{SHAPE_CYLINDER, {130, 90, 300}, {10, 0, 0}, 0, .0192}};
+static struct ellipsoid boned_parts[] = {{SHAPE_CYLINDER, {130, 90, 300}, {10, 0, 0}, 0, .0192},
+					 {SHAPE_CYLINDER, {15, 15, 300}, {10, 0, 0}, 0, .0192},
+					 {SHAPE_ELLIPSOID, {9, 9, 9}, {-20, 20, 0}, 0, -.00576},
+					 {SHAPE_CYLINDER, {8, 8, 300}, {100, 0, 0}, 0, .0288}};
+static struct ellipsoid closed_parts[] = {{SHAPE_ELLIPSOID, {130, 90, 100}, {10, 0, 0}, 0, .0192},
+					  {SHAPE_ELLIPSOID, {9, 9, 9}, {-20, 20, 0}, 0, -.00576}};
+static struct ellipsoid flat_parts[] = {{SHAPE_CYLINDER, {140, 80, 300}, {0, 0, 0}, 0, .0192},
+					{SHAPE_ELLIPSOID, {9, 9, 9}, {-20, 20, 0}, 0, -.00576}};
+
+static const struct {
+	const char *what;
+	struct phantom phantom;
+	int views;
+	double step_deg;
+	int rows, across, slices; /* of the detector; voxels of 2.2 mm */
+	double aside[2];          /* mm, the grid's centre */
+} wide[] = {
+    {"round", {2, round_parts}, 90, 4, 32, 72, 18, {0, 0}},
+    {"elliptic", {1, wide_parts}, 90, 4, 32, 72, 18, {0, 0}},
+    {"elliptic, a grid beside the axis", {1, wide_parts}, 90, 4, 32, 48, 18, {25, -15}},
+    {"elliptic, short scan", {1, wide_parts}, 70, 3, 32, 72, 18, {0, 0}},
+    {"with bone, inside and beyond", {4, boned_parts}, 90, 4, 32, 72, 18, {0, 0}},
+    {"an ellipsoid", {2, closed_parts}, 90, 4, 60, 72, 32, {0, 0}},
+    {"flat, wholly in view from two sides", {2, flat_parts}, 90, 4, 32, 84, 18, {0, 0}},
+};
+
+static void scan_of_wide(struct scene *ret_scene, int i)
+{
+	const struct orbit_spec spec = {96, wide[i].rows,    wide[i].views, {620, 1100, {3.4, 3.4}, {0, 0}, {0, 0}},
+					0,  wide[i].step_deg};
+
+	scene_orbit(ret_scene, &spec);
+	scene_add(ret_scene, &wide[i].phantom);
+}
+
+static struct grid grid_of_wide(int i)
+{
+	struct grid grid = grid_of(wide[i].across, wide[i].across, wide[i].slices, 2.2, 2.2, 2.2);
+
+	for (int axis = 0; axis < 2; axis++)
+		grid.origin[axis] += wide[i].aside[axis];
+	return grid;
+}
+
+/* Root mean square error over the field of view, HU. */
+static double error_in_view(const struct grid *grid, double radius, const float *volume, const float *truth)
+{
+	double squares = 0;
+	size_t at = 0, voxels = 0;
+
+	for (int z = 0; z < grid->size[2]; z++)
+		for (int y = 0; y < grid->size[1]; y++)
+			for (int x = 0; x < grid->size[0]; x++, at++) {
+				const double error = 1000 * ((double)volume[at] - (double)truth[at]) / MU_WATER;
+
+				if (hypot(grid->origin[0] + x * grid->spacing[0],
+					  grid->origin[1] + y * grid->spacing[1]) > radius)
+					continue;
+				squares += error * error;
+				voxels++;
+			}
+	return sqrt(squares / (double)voxels);
+}
+
+/*
+ * No iteration is worse than FDK or than the one before, but for some HU: FDK has 4 to 9 HU of water without noise, and
+ * 14 to 35 came of the first iteration and 26 to 40 of the tenth where the exterior was no better known.
+ */
+START_TEST(iterations_of_a_body_wider_than_the_detector_are_as_true_as_fdk)
+{
+	const double radius = 620 * sin(atan(0.5 * 96 * 3.4 / 1100)), some = 3.5;
+	struct grid grid = grid_of_wide(_i);
+	struct recipe recipe = sart_on(&grid);
+	float *truth = malloc(sizeof(float) * grid_voxels(&grid));
+	int emit[] = {EMIT_FDK, 1, 3};
+	struct outcome outcome = {0};
+	struct scene scene;
+	double fdk, before;
+
+	ck_assert_ptr_nonnull(truth);
+	scan_of_wide(&scene, _i);
+	phantom_voxelise(&wide[_i].phantom, &grid, 3, truth);
+	recipe.emit = emit;
+	recipe.emits = 3;
+	run(&scene, &recipe, &outcome);
+	before = fdk = error_in_view(&grid, radius, outcome_volume(&outcome, "fdk"), truth);
+	for (int i = 1; i < outcome.kept_count; i++) {
+		const double error = error_in_view(&grid, radius, outcome.kept[i].voxels, truth);
+
+		ck_assert_msg(error < fdk + some && error < before + some / 2,
+			      "%s: %s %.1f HU, before %.1f HU, FDK %.1f HU", wide[_i].what, outcome.kept[i].name, error,
+			      before, fdk);
+		before = error;
+	}
+	ck_assert_ptr_nonnull(strstr(outcome.warnings, "truncated: "));
+	ck_assert_ptr_nonnull(strstr(outcome.warnings, "iterations_settled: "));
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(truth);
+}
+END_TEST
+
 /* Any number of threads, a run that has yielded, and just the memory that the job says: the same bits. */
 START_TEST(the_same_bits_with_other_threads_after_a_yield_and_in_just_the_memory_that_was_said)
 {
-	struct grid grid = grid_between(75, 75, 5);
+	const bool is_wide = _i == 2;
+	struct grid grid = is_wide ? grid_of_wide(2) : grid_between(75, 75, 5);
 	struct recipe recipe = sart_on(&grid);
 	struct outcome whole = {.threads = 1}, first = {.threads = 2, .yield_at = 2}, second = {.threads = 2};
 	struct recon_memory memory;
@@ -466,9 +574,12 @@ START_TEST(the_same_bits_with_other_threads_after_a_yield_and_in_just_the_memory
 	struct device *device;
 	struct error err;
 
-	scan_of(&scene, CIRCLE, &trunk);
+	if (is_wide)
+		scan_of_wide(&scene, 2);
+	else
+		scan_of(&scene, CIRCLE, &trunk);
 	recipe.iterate.iterations = 3;
-	recipe.projector = _i == 0 ? PROJECTOR_INTERPOLATING : PROJECTOR_MATCHED;
+	recipe.projector = _i == 1 ? PROJECTOR_MATCHED : PROJECTOR_INTERPOLATING;
 	run(&scene, &recipe, &whole);
 	scene_run(&scene, &recipe, &first);
 	outcome_resume(&second, &first);
@@ -622,10 +733,12 @@ Suite *exterior_suite(void)
 {
 	Suite *suite = suite_create("exterior");
 	TCase *tests = tcase_create("slices"), *last = tcase_create("ends"), *bits = tcase_create("bits");
+	TCase *truncated = tcase_create("truncated");
 
 	tcase_set_timeout(tests, 0);
 	tcase_set_timeout(last, 0);
 	tcase_set_timeout(bits, 0);
+	tcase_set_timeout(truncated, 0);
 	tcase_add_loop_test(tests, the_end_slices_of_a_trunk_longer_than_the_panel_are_true, 0, COUNT(ends));
 	tcase_add_loop_test(tests, a_poor_orbit_does_not_pile_the_trunk_up, 0, 2);
 	tcase_add_loop_test(tests, a_real_abdomen_keeps_its_end_slices, 0, 2);
@@ -636,8 +749,10 @@ Suite *exterior_suite(void)
 	tcase_add_test(tests, a_tube_that_gives_less_is_not_taken_for_a_body_that_is_cut_off);
 	tcase_add_test(tests, blank_views_are_not_taken_for_air);
 	tcase_add_loop_test(bits, the_same_bits_with_other_threads_after_a_yield_and_in_just_the_memory_that_was_said,
-			    0, 2);
+			    0, 3);
 	suite_add_tcase(suite, tests);
+	tcase_add_loop_test(truncated, iterations_of_a_body_wider_than_the_detector_are_as_true_as_fdk, 0, COUNT(wide));
+	suite_add_tcase(suite, truncated);
 	tcase_add_loop_test(last, the_end_slices_are_no_worse_than_those_of_fdk_where_a_body_ends, 0, COUNT(ended));
 	tcase_add_loop_test(last, the_end_slices_are_the_same_bits_with_other_threads_and_after_a_yield, 0, 2);
 	suite_add_tcase(suite, last);
