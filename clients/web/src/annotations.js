@@ -11,8 +11,10 @@ export class Annotations {
 	#path
 	#tag = null
 	#kept = { measurements: [], key_images: [] } /* as the daemon has it */
-	#saving = false
-	#again = false
+	/* What is to be done, one after the other: a change that comes while something is read must not be lost to that. */
+	#toLoad = false
+	#toSave = false
+	#busy = false
 	#signal
 
 	/* failed(error): they could not be read or kept. */
@@ -21,7 +23,7 @@ export class Annotations {
 		this.#measurements = measurements
 		this.#signal = signal
 		this.failed = failed
-		measurements.addEventListener('change', ({ detail }) => detail.own && this.#save())
+		measurements.addEventListener('change', ({ detail }) => detail.own && this.#work({ save: true }))
 		this.load()
 	}
 
@@ -30,14 +32,33 @@ export class Annotations {
 	}
 
 	/* tag: what an event says; nothing is fetched where it is known. */
-	async load(tag = null) {
-		if (this.#saving || (tag !== null && tag === this.#tag))
+	load(tag = null) {
+		if (tag === null || tag !== this.#tag)
+			this.#work({ load: true })
+	}
+
+	async #work({ load = false, save = false }) {
+		this.#toLoad ||= load
+		this.#toSave ||= save
+		if (this.#busy)
 			return
-		try {
-			this.#take(await this.#read())
-		} catch (error) {
-			this.#tell(error)
+		this.#busy = true
+		while (this.#toLoad || this.#toSave) {
+			try {
+				await (this.#toSave ? this.#save() : this.#reload())
+			} catch (error) {
+				this.#tell(error)
+			}
 		}
+		this.#busy = false
+	}
+
+	async #reload() {
+		this.#toLoad = false
+		const found = await this.#read()
+		/* What was changed here meanwhile is saved, and joined with what others have done by that. */
+		if (!this.#toSave)
+			this.#take(found)
 	}
 
 	#take({ document, tag }) {
@@ -52,25 +73,8 @@ export class Annotations {
 			this.failed(error)
 	}
 
-	/* One at a time; what has changed meanwhile goes behind it. */
 	async #save() {
-		if (this.#saving) {
-			this.#again = true
-			return
-		}
-		this.#saving = true
-		try {
-			do {
-				this.#again = false
-				await this.#put()
-			} while (this.#again)
-		} catch (error) {
-			this.#tell(error)
-		}
-		this.#saving = false
-	}
-
-	async #put() {
+		this.#toSave = false
 		for (let tries = 0; ; tries++) {
 			const items = this.#measurements.items
 			try {
