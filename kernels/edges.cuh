@@ -18,14 +18,19 @@ struct batch_slots {
 	int slot[BATCH_MOST];
 };
 
+/* A row that is cut off: its ends as they are found, then its extensions in their place. */
+union cut_row {
+	struct truncation_end ends[2];
+	struct extension fit[2];
+};
+
 /* Truncation found at the edges of a batch's rows: [slot of the batch][row]. */
 struct edges {
 	float *levels; /* [slot of the batch] what is not air */
 	struct shell_table *shells;
-	unsigned char *sides;        /* bit 0: cut off before column 0, bit 1: behind the last one */
-	int *list;                   /* rows with any */
-	struct truncation_end *ends; /* [place in the list][side] */
-	struct extension (*fit)[2];  /* [place in the list] */
+	unsigned char *sides; /* bit 0: cut off before column 0, bit 1: behind the last one */
+	int *list;            /* rows with any */
+	union cut_row *cut;   /* [place in the list] */
 	unsigned char *sides_host;
 	int *list_host;
 	int rows; /* that there is room for */
@@ -266,7 +271,7 @@ static __global__ void __launch_bounds__(WARP *ENDS_ROWS)
 	};
 
 	if (threadIdx.x < 2)
-		found.ends[2 * (size_t)k + threadIdx.x] = ends[threadIdx.x];
+		found.cut[k].ends[threadIdx.x] = ends[threadIdx.x];
 }
 
 /* The candidate of the least residual, the first of equals. */
@@ -379,10 +384,12 @@ static __global__ void __launch_bounds__(FIT_THREADS)
 		return;
 	int index = found.list[k], columns = job.columns, window = truncation_window(columns);
 	const float *p = row_of(job, slots, index);
-	const struct truncation_end *ends = found.ends + 2 * (size_t)k;
+	/* Copies: extensions take the place of what all lanes have read. */
+	const struct truncation_end ends[2] = {found.cut[k].ends[0], found.cut[k].ends[1]};
 	struct truncation_row_sums row_sums = sum_row(p, columns, found.levels[index / job.rows], at);
 	int width = ends[0].count - ends[0].cap - ends[1].cap;
 	struct shell shell = find_shell(found.shells, ends, width, bins[threadIdx.x / ROW_LANES], at);
+	struct extension fits[2] = {};
 
 	for (int side = 0; side < 2; side++) {
 		struct truncation_edge_sums edge_sums;
@@ -409,8 +416,12 @@ static __global__ void __launch_bounds__(FIT_THREADS)
 			truncation_by_shell(&fit, &shell, side, cap, width, (float)measured, columns);
 		truncation_by_cap(&fit, &ends[side]);
 		truncation_end_extension(&fit, job.extend);
-		found.fit[k][side] = fit;
+		fits[side] = fit;
 	}
+	__syncwarp(at.mask);
+	if (at.lane == 0)
+		for (int side = 0; side < 2; side++)
+			found.cut[k].fit[side] = fits[side];
 }
 
 #endif

@@ -80,7 +80,7 @@ struct filter_job {
 	const int *list;
 	int listed;
 	const unsigned char *sides;
-	const struct extension (*fit)[2]; /* [place in the list] */
+	const union cut_row *cut; /* [place in the list], their extensions */
 	int extend;
 };
 
@@ -154,9 +154,9 @@ static __device__ __forceinline__ float extended_at(const filter_job &job, const
 {
 	int outermost = side == 0 ? 0 : job.columns - 1, column = side == 0 ? -x : outermost + x;
 
-	if (!(at.sides >> side & 1) || x > job.fit[at.listed][side].reach)
+	if (!(at.sides >> side & 1) || x > job.cut[at.listed].fit[side].reach)
 		return 0;
-	return truncation_value(&job.fit[at.listed][side], x) * weight.column_weights[outermost] *
+	return truncation_value(&job.cut[at.listed].fit[side], x) * weight.column_weights[outermost] *
 	       cosine_at(job, weight, column);
 }
 
@@ -456,8 +456,7 @@ void filter_walk(struct plan *plan, struct arena *arena)
 	take(arena, &filter->edges.levels, (size_t)shape->batch);
 	take(arena, &filter->edges.sides, rows);
 	take(arena, &filter->edges.list, rows);
-	take(arena, &filter->edges.ends, 2 * rows);
-	take(arena, &filter->edges.fit, rows);
+	take(arena, &filter->edges.cut, rows);
 }
 
 /* The response at another length that convolves `columns` values alike. */
@@ -767,7 +766,7 @@ static int filter_extended_rows(struct plan *plan, filter_job job, const batch_s
 	job.list = edges->list;
 	job.listed = count;
 	job.sides = edges->sides;
-	job.fit = edges->fit;
+	job.cut = edges->cut;
 	TRY(filter_rows(plan, &plan->filter->extended, &plan->shape.extended, job, err));
 	return mark_used(plan->device, edges->used, err); /* what was found is free for the next batch */
 }
