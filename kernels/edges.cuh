@@ -18,9 +18,15 @@ struct batch_slots {
 	int slot[BATCH_MOST];
 };
 
+/* What is kept of an end of a row until its extension is fitted: see struct truncation_end. */
+struct kept_end {
+	int air; /* samples before it */
+	int count, cap;
+	float deviation, a, b, share;
+};
 /* A row that is cut off: its ends as they are found, then its extensions in their place. */
 union cut_row {
-	struct truncation_end ends[2];
+	struct kept_end ends[2];
 	struct extension fit[2];
 };
 
@@ -265,13 +271,28 @@ static __global__ void __launch_bounds__(WARP *ENDS_ROWS)
 	const int before = sides & 1 ? 0 : air_before(row, 1, columns, level);
 	const int behind = sides & 2 ? 0 : air_before(row + columns - 1, -1, columns, level);
 	const int samples = max(columns - before - behind, 1);
-	const struct truncation_end ends[2] = {
-	    find_end(row + before, 1, samples, columns),
-	    find_end(row + columns - 1 - behind, -1, samples, columns),
-	};
 
-	if (threadIdx.x < 2)
-		found.cut[k].ends[threadIdx.x] = ends[threadIdx.x];
+	for (int side = 0; side < 2; side++) {
+		const int air = side == 0 ? before : behind;
+		const struct truncation_end end =
+		    find_end(side == 0 ? row + air : row + columns - 1 - air, side == 0 ? 1 : -1, samples, columns);
+
+		if (threadIdx.x == 0)
+			found.cut[k].ends[side] = {air, samples, end.cap, end.deviation, end.a, end.b, end.share};
+	}
+}
+
+static __device__ struct truncation_end end_kept(const struct kept_end *kept, const float *row, int side, int columns)
+{
+	struct truncation_end end = truncation_end_start(side == 0 ? row + kept->air : row + columns - 1 - kept->air,
+							 side == 0 ? 1 : -1, kept->count, columns);
+
+	end.cap = kept->cap;
+	end.deviation = kept->deviation;
+	end.a = kept->a;
+	end.b = kept->b;
+	end.share = kept->share;
+	return end;
 }
 
 /* The candidate of the least residual, the first of equals. */
@@ -385,7 +406,8 @@ static __global__ void __launch_bounds__(FIT_THREADS)
 	int index = found.list[k], columns = job.columns, window = truncation_window(columns);
 	const float *p = row_of(job, slots, index);
 	/* Copies: extensions take the place of what all lanes have read. */
-	const struct truncation_end ends[2] = {found.cut[k].ends[0], found.cut[k].ends[1]};
+	const struct truncation_end ends[2] = {end_kept(&found.cut[k].ends[0], p, 0, columns),
+					       end_kept(&found.cut[k].ends[1], p, 1, columns)};
 	struct truncation_row_sums row_sums = sum_row(p, columns, found.levels[index / job.rows], at);
 	int width = ends[0].count - ends[0].cap - ends[1].cap;
 	struct shell shell = find_shell(found.shells, ends, width, bins[threadIdx.x / ROW_LANES], at);
