@@ -98,7 +98,7 @@ static int read_helix(struct json_reader *reader, struct balls *ret_balls)
 	helix.balls = (int)balls;
 	helix.first = first * degree;
 	helix.step = step * degree;
-	helix.large = large;
+	helix.large = code[0] != '\0' ? large : NULL;
 	return balls_helix(ret_balls, &helix, reader->err);
 }
 

@@ -136,6 +136,29 @@ int balls_circles(struct balls *ret_balls, const struct ball_circles *circles, s
 	return balls_finish(ret_balls, &balls, err);
 }
 
+/*
+ * A helix that stands upside down is the same helix with its balls in the opposite order: a code that reads the same
+ * backwards but for a tenth of it, over half of its length or more, would fit that too, with a few balls missing.
+ */
+static bool reads_backwards(const bool *large, int count)
+{
+	for (int shift = -count / 2; shift <= count / 2; shift++) {
+		int both = 0, other = 0;
+
+		for (int i = 0; i < count; i++) {
+			const int behind = count - 1 - i + shift;
+
+			if (behind < 0 || behind >= count)
+				continue;
+			both++;
+			other += large[i] != large[behind];
+		}
+		if (10 * other <= both)
+			return true;
+	}
+	return false;
+}
+
 int balls_helix(struct balls *ret_balls, const struct ball_helix *helix, struct error *err)
 {
 	struct balls balls;
@@ -143,6 +166,13 @@ int balls_helix(struct balls *ret_balls, const struct ball_helix *helix, struct 
 
 	if (code < 0)
 		return code;
+	if (helix->large != NULL && reads_backwards(helix->large, helix->balls)) {
+		balls_clear(&balls);
+		return error_set_at(
+		    err, ERR_IMPOSSIBLE, "/code",
+		    "the code reads the same backwards, a tenth of it or the ends aside: a phantom upside "
+		    "down could not be told; expected another code");
+	}
 	for (int i = 0; i < balls.count; i++) {
 		const double angle = helix->first + i * helix->step;
 

@@ -60,8 +60,8 @@ struct ball_helix {
 
 /*
  * Each allocates ret->ball (free with balls_clear) and checks the phantom: ERR_INVALID for numbers that are no lengths
- * or a number of balls out of range, ERR_IMPOSSIBLE for balls that overlap, lie on a line or in a plane: a view cannot
- * be found from these. Pointers are those of the phantom's JSON.
+ * or a number of balls out of range, ERR_IMPOSSIBLE for balls that overlap, lie on a line or in a plane, and for codes
+ * that read the same backwards: a view cannot be found from these. Pointers are those of the phantom's JSON.
  */
 int balls_copy(struct balls *ret_balls, const struct ball *ball, int count, struct error *err);
 int balls_circles(struct balls *ret_balls, const struct ball_circles *circles, struct error *err);

@@ -310,6 +310,20 @@ START_TEST(a_phantom_beside_its_place_is_taken_for_no_other)
 }
 END_TEST
 
+START_TEST(a_code_that_reads_the_same_backwards_is_refused)
+{
+	/* 01101001110010110100: backwards, and 3 places on, all of it. */
+	static const bool palindrome[20] = {0, 1, 1, 0, 1, 0, 0, 1, 1, 1, 0, 0, 1, 0, 1, 1, 0, 1, 0, 0};
+	const struct ball_helix helix = {
+	    .balls = 20, .diameter = 110, .pitch = 40, .step = .628, .ball = {3, 5}, .large = palindrome};
+	struct balls balls = {0};
+	struct error err = {0};
+
+	ck_assert_int_eq(balls_helix(&balls, &helix, &err), ERR_IMPOSSIBLE);
+	ck_assert_str_eq(err.pointer, "/code");
+}
+END_TEST
+
 /* Balls of two sizes on a helix tell by themselves how the phantom was turned. */
 START_TEST(the_code_of_two_sizes_finds_a_phantom_however_it_is_turned)
 {
@@ -561,6 +575,7 @@ Suite *calibrate_suite(void)
 	tcase_add_test(tests, finds_views_that_see_half_of_the_balls);
 	tcase_add_loop_test(tests, a_phantom_beside_its_place_is_taken_for_no_other, 0,
 			    sizeof(beside) / sizeof(*beside));
+	tcase_add_test(tests, a_code_that_reads_the_same_backwards_is_refused);
 	tcase_add_test(tests, the_code_of_two_sizes_finds_a_phantom_however_it_is_turned);
 	tcase_add_test(tests, adjusting_the_balls_takes_errors_of_machining_out);
 	tcase_add_test(tests, views_between_calibrated_ones_are_the_arms);
