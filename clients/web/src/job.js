@@ -391,7 +391,8 @@ export class JobPage {
 	/* Which volume of which recipe, in a few words: on every picture. */
 	#whatOf(volume) {
 		const job = this.#job
-		const after = volume.iteration > 0 ? `${job?.cgls ? 'CGLS' : 'SART'} ${volume.iteration}` : 'FDK'
+		const method = ['cgls', 'fista'].find(name => job?.[name])?.toUpperCase() ?? 'SART'
+		const after = volume.iteration > 0 ? `${method} ${volume.iteration}` : 'FDK'
 		return `${volume.name} · ${after}${volume.stage !== 'fdk' && job?.tv ? ' + TV' : ''}${job?.metal ? ' · metal corrected' : ''}`
 	}
 
