@@ -337,6 +337,11 @@ test('rulers and angles are true at any zoom and in turned planes; a region has 
 	for (const at of [[30, 0], [0, 0], [0, -30]])
 		await page.mouse.click(...await place('z', upright, ...at))
 	await tool(page, 'ellipse')
+	/* A press that has not moved yet is drawn, too. */
+	await page.mouse.move(...await place('z', upright, 0, 0))
+	await page.mouse.down()
+	await page.evaluate(() => new Promise(resolve => requestAnimationFrame(() => requestAnimationFrame(resolve))))
+	await page.mouse.up()
 	const [a, b] = [18, 13]
 	await drag(page, await place('z', upright, -24 - a, -20 - b), await place('z', upright, -24 + a, -20 + b))
 	await shoot(page, 'measured')

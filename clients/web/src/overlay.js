@@ -98,8 +98,9 @@ export class Overlay {
 	}
 }
 
-function ellipse([middle, first, second]) {
-	const a = minus(first, middle), b = minus(second ?? first, middle)
+/* Its corners; a point until the drag has moved. */
+function ellipse([middle, first = middle, second = first]) {
+	const a = minus(first, middle), b = minus(second, middle)
 	return norm(a) > 0 ? Array.from({ length: ellipseCorners }, (_, i) => {
 		const angle = 2 * Math.PI * i / ellipseCorners
 		return add(add(middle, a, Math.cos(angle)), b, Math.sin(angle))
