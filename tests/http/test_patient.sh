@@ -135,6 +135,25 @@ test_labels_are_kept_and_shown() {
 }
 
 # Who it is: of the scan alone, kept with its jobs, never in a log, in metrics or in a file that does not ask for it.
+test_who_was_removed_is_nowhere_on_the_disk() {
+	start_daemon
+	req POST /v1/scans -H 'Content-Type: application/json' --data-binary '{"patient": {"name": "Vanishing^Vera", "id": "VAN-1"},
+		"detector": {"columns": 4, "rows": 3, "pixel_mm": [1, 1]}, "projections": {"count": 2, "sample": "float32", "quantity": "line_integral"},
+		"geometry": {"kind": "circular", "source_to_isocentre_mm": 600, "source_to_detector_mm": 1000, "angle_step_deg": 180}}'
+	expect_status 201
+	scan=$(json .id)
+	post_job '{"scan": "SCAN", "fdk": {}}'
+	grep -rq 'Vanishing^Vera' "$state" || fail "the name while the scan is there"
+	req DELETE "/v1/jobs/$job"
+	wait_job cancelled
+	req DELETE "/v1/jobs/$job"
+	expect_status 204
+	req DELETE "/v1/scans/$scan"
+	expect_status 204
+	stop_daemon
+	! grep -rl 'Vanishing^Vera\|VAN-1' "$state" || fail "no trace of the name"
+}
+
 test_who_the_patient_is_stays_with_the_scan_and_its_jobs() {
 	local who='{"name": "Quarx^J\u00f6rg", "id": "ID-8315", "birth_date": "1970-02-28", "sex": "M"}' other='{"position": "FFS", "name": "Zwolle^Anna"}'
 	local study='{"uid": "1.2.3.4", "accession_number": "ACC-4711", "referring_physician": "House^G"}' first document='{"detector": {"columns": 4, "rows": 3, "pixel_mm": [1, 1]},

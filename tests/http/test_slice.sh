@@ -103,7 +103,7 @@ test_what_cannot_be_is_refused_by_its_name() {
 		"normal=1,0,0&center=500,0,0" "normal=1,0,0&center=1,2" "normal=1,0,0&size=0,5" "normal=1,0,0&size=5" "normal=1,0,0&size=2049,5" \
 		"normal=1,0,0&size=5.5,5" "normal=1,0,0&spacing=0" "normal=1,0,0&spacing=-1" "normal=1,0,0&axis=x" "normal=1,0,0&index=3" \
 		"normal=1,0,0&sheet=1" up=0,0,1 center=0,0,0 size=5,5 spacing=1 thickness=0 thickness=-3 thickness=thick thickness=1001 \
-		"thickness=5&mode=median" mode=max "sheet=1&thickness=4" "normal=1,0,0&size=2048,2048&thickness=200"; do
+		"thickness=5&mode=median" mode=max "sheet=1&thickness=4" "normal=1,0,0&size=2048,2048&thickness=200" "normal=1,0.3,0.3&size=2048,2048&spacing=0.02&thickness=20"; do
 		req GET "$volume/slice?$query"
 		expect_problem 400
 		expect_json ".detail | contains(\"$(sed 's/.*&//; s/=.*//' <<<"$query")\")" # the last one is at fault

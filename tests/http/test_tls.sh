@@ -95,6 +95,12 @@ test_tokens_and_sessions_hold_over_tls_too() {
 	req POST /v1/session -H "Authorization: Bearer $view"
 	expect_status 201
 	[[ $(header set-cookie) == *'; HttpOnly; SameSite=Strict; Secure' ]] || fail "a cookie for TLS alone: $(header set-cookie)"
+	# what the network put into a page that came without TLS is not ours
+	req DELETE /v1/session -H "Authorization: Bearer $view" -H "Origin: http://${url#https://}"
+	expect_problem 403
+	expect_json '.type == "urn:cbctd:problem:foreign-origin"'
+	req POST /v1/session -H "Authorization: Bearer $view" -H "Origin: $url"
+	expect_status 201
 	"$python" "$top/proto/openapi.py" --json "$top/proto/openapi.yaml" >"$work/openapi.json" 2>/dev/null || req GET /v1/openapi.json -o "$work/openapi.json"
 	jq -n --arg v "$view" --arg q "$acquire" --arg a "$admin" --arg o "$old" --arg c "$(header set-cookie | sed 's/^cbctd_session=\([^;]*\);.*/\1/')" \
 		'{view: $v, acquire: $q, admin: $a, expired: $o, "cookie view": $c}' >"$work/proofs.json"
