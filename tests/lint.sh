@@ -28,8 +28,12 @@ rule "clients do not include daemon or kernels" '#include "(kernels|daemon|tests
 rule "nothing includes daemon but daemon and its tests" '#include "daemon/' $(files core kernels proto clients)
 rule "the daemon never touches CUDA" '#include [<"](cuda|cufft|kernels/)' $(files daemon)
 rule "libmicrohttpd stays in daemon/http" '#include <microhttpd' $(files daemon | grep -v '^daemon/http/')
-rule "SQLite stays in daemon/store/sqlite.c and its pages" '#include [<"](sqlite3|daemon/store/sqlite)' \
-	$(files daemon core proto clients | grep -vE '^daemon/store/sqlite(_pages)?\.[ch]$')
+rule "SQLite stays in daemon/store/sqlite.c and the files beneath it" '#include [<"](sqlite3|daemon/store/checksum_vfs)' \
+	$(files daemon core proto clients | grep -vE '^daemon/store/(sqlite|checksum_vfs)\.[ch]$')
+rule "a database knows no table of the catalogue" '#include "daemon/store/(catalogue|tables|store|internal)' \
+	daemon/store/sqlite.c daemon/store/checksum_vfs.[ch] daemon/store/backend.h
+rule "the files beneath SQLite know no statement" '\b(SELECT|INSERT|UPDATE|DELETE|CREATE|PRAGMA [a-z_]+ =)|sqlite3_(prepare|exec|step)' \
+	daemon/store/checksum_vfs.[ch]
 rule "no struct is bytes in the catalogue" 'COLUMN_BYTES.*AT\(' <(grep COLUMN_BYTES daemon/store/tables.c | grep -vE '(sha256|digest)\)')
 found "scripts that their own language cannot read" "$(
 	git ls-files '*.sh' | while read -r script; do bash -n "$script" 2>/dev/null || echo "$script"; done

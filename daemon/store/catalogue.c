@@ -180,21 +180,37 @@ static int note_row(void *context, const struct value *values, struct error *err
 	return 0;
 }
 
-int catalogue_write_record(struct catalogue *catalogue, enum table_id table, enum statement statement,
-			   const char *parent, const void *record, long long *ret_first, struct error *err)
+/* INSERT or PUT; *ret_first: the first column of the new row where that is a number, else 1; 0: nothing was new. */
+static int write_record(struct catalogue *catalogue, enum table_id table, enum statement statement, const char *owner,
+			const void *record, long long *ret_first, struct error *err)
 {
-	const struct value id = value_text(parent);
-	long long first = 0;
+	const struct value id = value_text(owner);
 	struct row row;
 	int code, count = row_of_record(&tables[table], statement, record, &id, &row, err);
 
+	*ret_first = 0;
 	code = count < 0 ? count
 			 : catalogue->backend->run(catalogue->database, SESSION_WRITER,
 						   catalogue->statements[table][statement], row.values, count, note_row,
-						   &first, err);
+						   ret_first, err);
 	row_clear(&row);
-	if (code == 0 && ret_first != NULL)
-		*ret_first = first;
+	return code;
+}
+
+int catalogue_put_row(struct catalogue *catalogue, enum table_id table, const char *owner, const void *record,
+		      long long *ret_number, struct error *err)
+{
+	bool replaces = tables[table].put == PUT_REPLACES;
+	long long first;
+	int code = tables[table].put == PUT_MOVES ? catalogue_take_row(catalogue, table, owner, record, err) : 0;
+
+	if (code == 0)
+		code = write_record(catalogue, table, replaces ? STATEMENT_PUT : STATEMENT_INSERT, owner, record,
+				    &first, err);
+	if (code == 0 && tables[table].kept > 0)
+		code = catalogue_write(catalogue, catalogue->statements[table][STATEMENT_TRIM], NULL, 0, err);
+	if (code == 0 && ret_number != NULL)
+		*ret_number = replaces ? 1 : first;
 	return code;
 }
 
@@ -205,19 +221,41 @@ int catalogue_remove_rows(struct catalogue *catalogue, enum table_id table, cons
 	return catalogue_write(catalogue, catalogue->statements[table][STATEMENT_REMOVE], &value, 1, err);
 }
 
-int catalogue_assign(struct catalogue *catalogue, enum table_id table, const char *name, const void *record,
-		     const char *id, struct error *err)
+int catalogue_set_member(struct catalogue *catalogue, enum table_id table, const char *id, const void *record,
+			 const void *member, struct error *err)
 {
+	size_t at = (size_t)((const char *)member - (const char *)record);
 	struct row row;
 	int column = 0, code;
 
-	while (strcmp(tables[table].columns[column].name, name) != 0)
+	while (!tables[table].columns[column].assigned || tables[table].columns[column].at != at) {
 		column++;
-	assert(tables[table].columns[column].assigned);
+		assert(column < tables[table].count);
+	}
 	code = row_of_column(&tables[table].columns[column], record, &row, err);
 	row.values[1] = value_text(id);
 	if (code == 0)
 		code = catalogue_write(catalogue, catalogue->assignments[table][column], row.values, 2, err);
+	row_clear(&row);
+	return code;
+}
+
+int catalogue_take_row(struct catalogue *catalogue, enum table_id table, const char *owner, const void *record,
+		       struct error *err)
+{
+	const struct column *column = tables[table].columns;
+	struct value values[2];
+	struct row row;
+	int code;
+
+	assert(tables[table].name_of != NULL);
+	while (strcmp(column->name, tables[table].name_of) != 0)
+		column++;
+	code = row_of_column(column, record, &row, err);
+	values[0] = value_text(owner);
+	values[1] = row.values[0];
+	if (code == 0)
+		code = catalogue_write(catalogue, catalogue->statements[table][STATEMENT_TAKE], values, 2, err);
 	row_clear(&row);
 	return code;
 }
@@ -246,20 +284,24 @@ static int add_record(void *context, const struct value *values, struct error *e
 	return record_of_row(listing->table, values, listing->records + (size_t)count * size, err);
 }
 
-int catalogue_list(struct catalogue *catalogue, enum table_id table, const struct value *parent, void **ret_records,
-		   int *ret_count, struct error *err)
+int catalogue_list_rows(struct catalogue *catalogue, enum table_id table, const char *owner, void *ret_records,
+			int *ret_count, struct error *err)
 {
 	struct listing listing = {.table = &tables[table]};
-	int code = catalogue_read(catalogue, catalogue->statements[table][STATEMENT_LIST], parent, parent != NULL,
-				  add_record, &listing, err);
+	const struct value id = value_text(owner);
+	int code;
 
+	assert((owner != NULL) == (tables[table].parent != NULL));
+	code = catalogue_read(catalogue, catalogue->statements[table][STATEMENT_LIST], &id, owner != NULL, add_record,
+			      &listing, err);
 	if (code != 0) {
 		for (int i = 0; i < listing.count; i++)
 			table_clear(listing.table, listing.records + (size_t)i * listing.table->size);
 		free(listing.records);
 		return code;
 	}
-	*ret_records = listing.records;
+	/* A pointer of the records' own type: all pointers to objects have one form (POSIX). */
+	memcpy(ret_records, &listing.records, sizeof(listing.records));
 	*ret_count = listing.count;
 	return 0;
 }
@@ -269,16 +311,6 @@ int catalogue_list(struct catalogue *catalogue, enum table_id table, const struc
 int catalogue_remove(struct catalogue *catalogue, enum record_kind kind, const char *id, struct error *err)
 {
 	return catalogue_remove_rows(catalogue, record_tables[kind], id, err);
-}
-
-int catalogue_set_stamp(struct catalogue *catalogue, enum record_kind kind, const char *id, long long stamp,
-			struct error *err)
-{
-	const struct catalogue_scan scan = {.stamp = stamp};
-	const struct job_record job = {.stamp = stamp};
-
-	return kind == RECORD_SCAN ? catalogue_assign(catalogue, TABLE_SCANS, "stamp", &scan, id, err)
-				   : catalogue_assign(catalogue, TABLE_JOBS, "stamp", &job, id, err);
 }
 
 struct stamp_visit {
@@ -308,7 +340,7 @@ int catalogue_stamps(struct catalogue *catalogue, enum record_kind kind,
 /* The tables whose rows go into a record beneath that of the scan or job; projections have records of their own. */
 static bool is_beneath(const struct table *table, enum record_kind kind)
 {
-	return table->parent != NULL && !table->by_number &&
+	return table->parent != NULL && !table->recorded_apart &&
 	       strcmp(table->parent, tables[record_tables[kind]].name) == 0;
 }
 

@@ -55,10 +55,9 @@ int catalogue_begin(struct catalogue *catalogue, bool synced, struct error *err)
 /* Commits when code is 0, else takes everything back. Returns code, or why the commit failed. */
 int catalogue_end(struct catalogue *catalogue, int code, struct error *err);
 
-/* ---- scans ---- */
+/* ---- records, each a row of a table ---- */
 
 struct catalogue_scan {
-	long long number; /* given by the database, for its projections */
 	char id[ID_SIZE], name[SCAN_NAME_BYTES];
 	double created; /* seconds since 1970 */
 	int columns, rows, count;
@@ -72,92 +71,114 @@ struct catalogue_scan {
 	bool closed;     /* its projections are those that are there */
 	long long stamp; /* of the record in its directory, store/record.h */
 };
-
-/*
- * Adds a scan, in a group, and the key that it was posted with; key NULL: none. *ret_number: the number that the
- * database gave it. ERR_CONFLICT: another scan has this key.
- */
-int catalogue_add_scan(struct catalogue *catalogue, const struct catalogue_scan *scan, const struct store_key *key,
-		       long long *ret_number, struct error *err);
-/* Finds the scan with this key; ret_scan "" where there is none. */
-int catalogue_find_scan_key(struct catalogue *catalogue, const char *key, char ret_scan[ID_SIZE],
-			    uint8_t ret_sha256[32], struct error *err);
-/* Reads all scans, by id; the caller frees the array. */
-int catalogue_scans(struct catalogue *catalogue, struct catalogue_scan **ret_scans, int *ret_count, struct error *err);
-/* These two change a scan's row, in a group. sha256 NULL: the scan has no such image any more. */
-int catalogue_set_image(struct catalogue *catalogue, const char *scan, enum image image, const uint8_t sha256[32],
-			struct error *err);
-int catalogue_set_closed(struct catalogue *catalogue, const char *scan, struct error *err);
-
-struct catalogue_projection {
-	long long scan; /* its number */
+struct catalogue_projection { /* of a scan */
 	int view;
 	uint8_t sha256[32];
 };
-/* Writes the row of a projection of the scan with this number, in a group; sha256 NULL: removes it. */
-int catalogue_put_projection(struct catalogue *catalogue, long long scan, int view, const uint8_t *sha256,
-			     struct error *err);
-/* Reads the projections of the scan with this number, by view; the caller frees the array. */
-int catalogue_projections(struct catalogue *catalogue, long long scan, struct catalogue_projection **ret_projections,
-			  int *ret_count, struct error *err);
+struct catalogue_scan_key { /* the Idempotency-Key that a scan was posted with */
+	const char *key;
+	uint8_t sha256[32];
+};
+struct catalogue_event {  /* of a job */
+	long long number; /* given by the database, never twice */
+	double created;   /* seconds since 1970 */
+	const char *kind, *data, *once;
+};
+/* A removed job's events go with it; that it was removed stays, under a number of theirs. The latest 1000 are kept. */
+struct catalogue_removal {
+	long long number;
+	char job[ID_SIZE];
+};
 
-/* ---- jobs ---- */
+enum table_id {
+	TABLE_SCANS,
+	TABLE_PROJECTIONS,
+	TABLE_SCAN_KEYS,
+	TABLE_JOBS,
+	TABLE_HISTORY,
+	TABLE_VOLUMES,
+	TABLE_WARNINGS,
+	TABLE_EVENTS,
+	TABLE_REMOVALS,
+	TABLE_COUNT
+};
 
-/* Adds a job, in a group. */
-int catalogue_add_job(struct catalogue *catalogue, const struct job_record *job, struct error *err);
+/* The table of a record, by its type: any other type does not compile. */
+/* clang-format off */
+#define CATALOGUE_TABLE(record) _Generic((record),              \
+	struct catalogue_scan: TABLE_SCANS,                     \
+	struct catalogue_projection: TABLE_PROJECTIONS,         \
+	struct catalogue_scan_key: TABLE_SCAN_KEYS,             \
+	struct job_record: TABLE_JOBS,                          \
+	struct history_row: TABLE_HISTORY,                      \
+	struct volume_record: TABLE_VOLUMES,                    \
+	struct warning_record: TABLE_WARNINGS,                  \
+	struct catalogue_event: TABLE_EVENTS,                   \
+	struct catalogue_removal: TABLE_REMOVALS)
+/* clang-format on */
+
+/*
+ * int catalogue_put(catalogue, const char *owner, const RECORD *record, long long *ret_number, err)
+ *
+ * Writes a record, in a group. owner: the id of the scan or job that it belongs to; NULL for scans, jobs and removals.
+ * What becomes of a row with the same key is the table's (`put` in store/tables.c): that is an error, or the first row
+ * stays, or it is replaced. *ret_number: the number that the database gave a new row, 1 in a table without numbers; 0:
+ * there was such a row, which stays. ret_number may be NULL.
+ */
+#define catalogue_put(catalogue, owner, record, ret_number, err)                                                       \
+	catalogue_put_row(catalogue, CATALOGUE_TABLE(*(record)), owner, record, ret_number, err)
+int catalogue_put_row(struct catalogue *catalogue, enum table_id table, const char *owner, const void *record,
+		      long long *ret_number, struct error *err);
+
+/*
+ * int catalogue_list(catalogue, const char *owner, RECORD **ret_records, int *ret_count, err)
+ *
+ * Reads the records of an owner, or all scans or jobs, in the order of the table: scans and jobs by id, projections by
+ * view, the rest as they were made. The caller frees the array; job records with job_records_free.
+ */
+#define catalogue_list(catalogue, owner, ret_records, ret_count, err)                                                  \
+	catalogue_list_rows(catalogue, CATALOGUE_TABLE(**(ret_records)), owner, ret_records, ret_count, err)
+int catalogue_list_rows(struct catalogue *catalogue, enum table_id table, const char *owner, void *ret_records,
+			int *ret_count, struct error *err);
+
+/*
+ * int catalogue_set(catalogue, const char *id, const RECORD *record, const void *member, err)
+ *
+ * Writes one member of a scan's or job's row, in a group: the one at the address `member` inside of the record. Its
+ * column is marked `assigned` in store/tables.c.
+ */
+#define catalogue_set(catalogue, id, record, member, err)                                                              \
+	catalogue_set_member(catalogue, CATALOGUE_TABLE(*(record)), id, record, member, err)
+int catalogue_set_member(struct catalogue *catalogue, enum table_id table, const char *id, const void *record,
+			 const void *member, struct error *err);
+
+/*
+ * int catalogue_take(catalogue, const char *owner, const RECORD *record, err)
+ *
+ * Removes the projection of this view, or the volume of this name, in a group; the other members do not matter.
+ */
+#define catalogue_take(catalogue, owner, record, err)                                                                  \
+	catalogue_take_row(catalogue, CATALOGUE_TABLE(*(record)), owner, record, err)
+int catalogue_take_row(struct catalogue *catalogue, enum table_id table, const char *owner, const void *record,
+		       struct error *err);
+
+/* ---- statements of their own: store/catalogue_rows.c ---- */
+
+/* Finds the scan with this key; ret_scan "" where there is none. */
+int catalogue_find_scan_key(struct catalogue *catalogue, const char *key, char ret_scan[ID_SIZE],
+			    uint8_t ret_sha256[32], struct error *err);
 /*
  * Writes all that changes of a job, but for its stamp, in a group. PAST_REWINDS removes its history behind
  * job->checkpoint; PAST_GOES removes all that its runs have left, but for the events of states.
  */
 int catalogue_update_job(struct catalogue *catalogue, const struct job_record *job, enum job_past past,
 			 struct error *err);
-/* Reads all jobs, by id; free with job_records_free. */
-int catalogue_jobs(struct catalogue *catalogue, struct job_record **ret_jobs, int *ret_count, struct error *err);
 /* Visits the jobs that have volumes without a digest, oldest first. */
 int catalogue_undigested(struct catalogue *catalogue, void (*visit)(void *context, const char *job), void *context,
-			 struct error *err);
-
-/* These two write a row, in a group, in place of the one of this iteration, or of the volume of this name. */
-int catalogue_put_history(struct catalogue *catalogue, const char *job, const struct history_row *row,
-			  struct error *err);
-int catalogue_put_volume(struct catalogue *catalogue, const char *job, const struct volume_record *volume,
 			 struct error *err);
 /* Writes the digest of the volume of this name and time of making, in a group, if the volume is still there. */
 int catalogue_set_digest(struct catalogue *catalogue, const char *job, const struct volume_record *volume,
 			 struct error *err);
-int catalogue_remove_volume(struct catalogue *catalogue, const char *job, const char *name, struct error *err);
-/* Adds a warning, in a group. *ret_new false: this very warning is there already. */
-int catalogue_add_warning(struct catalogue *catalogue, const char *job, const struct warning_record *warning,
-			  bool *ret_new, struct error *err);
-/* These read what a job has left, in the order of making; the caller frees the arrays. */
-int catalogue_history(struct catalogue *catalogue, const char *job, struct history_row **ret_rows, int *ret_count,
-		      struct error *err);
-int catalogue_volumes(struct catalogue *catalogue, const char *job, struct volume_record **ret_volumes, int *ret_count,
-		      struct error *err);
-int catalogue_warnings(struct catalogue *catalogue, const char *job, struct warning_record **ret_warnings,
-		       int *ret_count, struct error *err);
-
-/* ---- events ---- */
-
-/* The rows of tables that no call gives back as a whole. */
-struct catalogue_event {
-	long long number; /* given by the database, never twice */
-	double created;   /* seconds since 1970 */
-	const char *kind, *data, *once;
-};
-struct catalogue_removal {
-	long long number;
-	char job[ID_SIZE];
-};
-struct catalogue_scan_key {
-	const char *key;
-	uint8_t sha256[32];
-};
-/* Adds an event, in a group. *ret_number 0: an event of the job with this `once` is there already. */
-int catalogue_add_event(struct catalogue *catalogue, const char *job, const struct event *event, long long *ret_number,
-			struct error *err);
-/* Notes the removal of a job, in a group: an event with the number of one of the job's. The latest 1000 are kept. */
-int catalogue_add_removal(struct catalogue *catalogue, const char *job, long long number, struct error *err);
 /* Does what store_job_events says. */
 int catalogue_events(struct catalogue *catalogue, const char *job, long long after, int limit,
 		     struct event_record **ret_events, int *ret_count, struct error *err);
@@ -169,18 +190,15 @@ int catalogue_pass_events(struct catalogue *catalogue, long long least, struct e
 /* ---- scans and jobs alike: their records in the directories, store/record.h ---- */
 
 enum record_kind { RECORD_SCAN, RECORD_JOB, RECORD_KINDS };
-/* These two are called in a group. */
+/* Removes it with all that belongs to it, in a group. */
 int catalogue_remove(struct catalogue *catalogue, enum record_kind kind, const char *id, struct error *err);
-int catalogue_set_stamp(struct catalogue *catalogue, enum record_kind kind, const char *id, long long stamp,
-			struct error *err);
 /* Visits every id with its stamp, by id; a visit that returns less than zero is the last. */
 int catalogue_stamps(struct catalogue *catalogue, enum record_kind kind,
 		     int (*visit)(void *context, const char *id, long long stamp, struct error *err), void *context,
 		     struct error *err);
 /*
- * Reads all rows of a scan or job but its projections, by the names of their tables: {"jobs": [{...}], "history":
- * [...],
- * ...}. NULL in *ret_rows: there is none with this id. Free with cJSON_Delete.
+ * Reads all rows of a scan or job but its projections, by the names of their tables:
+ * {"jobs": [{...}], "history": [...], ...}. NULL in *ret_rows: there is none with this id. Free with cJSON_Delete.
  */
 int catalogue_export(struct catalogue *catalogue, enum record_kind kind, const char *id, cJSON **ret_rows,
 		     struct error *err);

@@ -25,19 +25,7 @@ int catalogue_write(struct catalogue *catalogue, const char *sql, const struct v
 /* R */
 int catalogue_read(struct catalogue *catalogue, const char *sql, const struct value *values, int count,
 		   row_function row, void *context, struct error *err);
-/*
- * W. INSERT or PUT; parent: the id of the row that it belongs to, or NULL. *ret_first: the first column of the new row
- * where that is a number, else 1; 0: nothing was new. May be NULL.
- */
-int catalogue_write_record(struct catalogue *catalogue, enum table_id table, enum statement statement,
-			   const char *parent, const void *record, long long *ret_first, struct error *err);
 /* W. The row with this id, or all of this parent. */
 int catalogue_remove_rows(struct catalogue *catalogue, enum table_id table, const char *id, struct error *err);
-/* W. One column, by its name, of the row with this id. */
-int catalogue_assign(struct catalogue *catalogue, enum table_id table, const char *name, const void *record,
-		     const char *id, struct error *err);
-/* R. All rows, or those of a parent, as an array of records, the caller's to free with what they own. */
-int catalogue_list(struct catalogue *catalogue, enum table_id table, const struct value *parent, void **ret_records,
-		   int *ret_count, struct error *err);
 
 #endif

@@ -1,32 +1,12 @@
-/* The calls of the catalogue for scans, jobs and events: store/catalogue.h. */
+/* Statements that the lists of columns do not give: store/catalogue.h. */
 #include <errno.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
 #include "daemon/store/catalogue_internal.h"
-#include "proto/clock.h"
-
-enum { REMOVALS_KEPT = 1000 /* a page that was away for longer reads its list anew */ };
 
 /* ---- scans ---- */
-
-int catalogue_add_scan(struct catalogue *catalogue, const struct catalogue_scan *scan, const struct store_key *key,
-		       long long *ret_number, struct error *err)
-{
-	int code = catalogue_write_record(catalogue, TABLE_SCANS, STATEMENT_INSERT, NULL, scan, ret_number, err);
-	struct catalogue_scan_key row;
-	long long first;
-
-	if (code != 0 || key == NULL)
-		return code;
-	row.key = key->text;
-	memcpy(row.sha256, key->digest, sizeof(row.sha256));
-	code = catalogue_write_record(catalogue, TABLE_SCAN_KEYS, STATEMENT_INSERT, scan->id, &row, &first, err);
-	if (code == 0 && first == 0)
-		return error_set(err, ERR_CONFLICT, "this Idempotency-Key was used meanwhile");
-	return code;
-}
 
 struct found_key {
 	char *scan;
@@ -58,70 +38,7 @@ int catalogue_find_scan_key(struct catalogue *catalogue, const char *key, char r
 	    &value, 1, take_key, &found, err);
 }
 
-int catalogue_scans(struct catalogue *catalogue, struct catalogue_scan **ret_scans, int *ret_count, struct error *err)
-{
-	void *records;
-	int code = catalogue_list(catalogue, TABLE_SCANS, NULL, &records, ret_count, err);
-
-	if (code == 0)
-		*ret_scans = records;
-	return code;
-}
-
-int catalogue_set_image(struct catalogue *catalogue, const char *scan, enum image image, const uint8_t sha256[32],
-			struct error *err)
-{
-	struct catalogue_scan record = {.closed = false};
-
-	record.images[image].known = sha256 != NULL;
-	if (sha256 != NULL)
-		memcpy(record.images[image].sha256, sha256, 32);
-	return catalogue_assign(catalogue, TABLE_SCANS, image_kinds[image].name, &record, scan, err);
-}
-
-int catalogue_set_closed(struct catalogue *catalogue, const char *scan, struct error *err)
-{
-	const struct catalogue_scan record = {.closed = true};
-
-	return catalogue_assign(catalogue, TABLE_SCANS, "closed", &record, scan, err);
-}
-
-static int remove_projection(struct catalogue *catalogue, long long scan, int view, struct error *err)
-{
-	const struct value values[] = {value_integer(scan), value_integer(view)};
-
-	return catalogue_write(catalogue, "DELETE FROM projections WHERE scan = $1 AND view = $2", values, 2, err);
-}
-
-int catalogue_put_projection(struct catalogue *catalogue, long long scan, int view, const uint8_t *sha256,
-			     struct error *err)
-{
-	struct catalogue_projection row = {.scan = scan, .view = view};
-
-	if (sha256 == NULL)
-		return remove_projection(catalogue, scan, view, err);
-	memcpy(row.sha256, sha256, sizeof(row.sha256));
-	return catalogue_write_record(catalogue, TABLE_PROJECTIONS, STATEMENT_PUT, NULL, &row, NULL, err);
-}
-
-int catalogue_projections(struct catalogue *catalogue, long long scan, struct catalogue_projection **ret_projections,
-			  int *ret_count, struct error *err)
-{
-	const struct value number = value_integer(scan);
-	void *records;
-	int code = catalogue_list(catalogue, TABLE_PROJECTIONS, &number, &records, ret_count, err);
-
-	if (code == 0)
-		*ret_projections = records;
-	return code;
-}
-
 /* ---- jobs ---- */
-
-int catalogue_add_job(struct catalogue *catalogue, const struct job_record *job, struct error *err)
-{
-	return catalogue_write_record(catalogue, TABLE_JOBS, STATEMENT_INSERT, NULL, job, NULL, err);
-}
 
 static int update_row(struct catalogue *catalogue, const struct job_record *job, struct error *err)
 {
@@ -174,16 +91,6 @@ int catalogue_update_job(struct catalogue *catalogue, const struct job_record *j
 	return code;
 }
 
-int catalogue_jobs(struct catalogue *catalogue, struct job_record **ret_jobs, int *ret_count, struct error *err)
-{
-	void *records;
-	int code = catalogue_list(catalogue, TABLE_JOBS, NULL, &records, ret_count, err);
-
-	if (code == 0)
-		*ret_jobs = records;
-	return code;
-}
-
 struct visit {
 	void (*visit)(void *context, const char *job);
 	void *context;
@@ -209,22 +116,6 @@ int catalogue_undigested(struct catalogue *catalogue, void (*visit)(void *contex
 			      NULL, 0, visit_id, &each, err);
 }
 
-int catalogue_put_history(struct catalogue *catalogue, const char *job, const struct history_row *row,
-			  struct error *err)
-{
-	return catalogue_write_record(catalogue, TABLE_HISTORY, STATEMENT_PUT, job, row, NULL, err);
-}
-
-/* A volume that is made again takes its place behind the others. */
-int catalogue_put_volume(struct catalogue *catalogue, const char *job, const struct volume_record *volume,
-			 struct error *err)
-{
-	int code = catalogue_remove_volume(catalogue, job, volume->name, err);
-
-	return code == 0 ? catalogue_write_record(catalogue, TABLE_VOLUMES, STATEMENT_INSERT, job, volume, NULL, err)
-			 : code;
-}
-
 int catalogue_set_digest(struct catalogue *catalogue, const char *job, const struct volume_record *volume,
 			 struct error *err)
 {
@@ -238,93 +129,7 @@ int catalogue_set_digest(struct catalogue *catalogue, const char *job, const str
 	    values, 4, err);
 }
 
-int catalogue_remove_volume(struct catalogue *catalogue, const char *job, const char *name, struct error *err)
-{
-	const struct value values[] = {value_text(job), value_text(name)};
-
-	return catalogue_write(catalogue,
-			       "DELETE FROM volumes WHERE job = (SELECT number FROM jobs WHERE id = $1) AND name = $2",
-			       values, 2, err);
-}
-
-int catalogue_add_warning(struct catalogue *catalogue, const char *job, const struct warning_record *warning,
-			  bool *ret_new, struct error *err)
-{
-	long long number;
-	int code = catalogue_write_record(catalogue, TABLE_WARNINGS, STATEMENT_INSERT, job, warning, &number, err);
-
-	if (code == 0)
-		*ret_new = number != 0;
-	return code;
-}
-
-static int list_of_job(struct catalogue *catalogue, enum table_id table, const char *job, void **ret_records,
-		       int *ret_count, struct error *err)
-{
-	const struct value id = value_text(job);
-
-	return catalogue_list(catalogue, table, &id, ret_records, ret_count, err);
-}
-
-int catalogue_history(struct catalogue *catalogue, const char *job, struct history_row **ret_rows, int *ret_count,
-		      struct error *err)
-{
-	void *records;
-	int code = list_of_job(catalogue, TABLE_HISTORY, job, &records, ret_count, err);
-
-	if (code == 0)
-		*ret_rows = records;
-	return code;
-}
-
-int catalogue_volumes(struct catalogue *catalogue, const char *job, struct volume_record **ret_volumes, int *ret_count,
-		      struct error *err)
-{
-	void *records;
-	int code = list_of_job(catalogue, TABLE_VOLUMES, job, &records, ret_count, err);
-
-	if (code == 0)
-		*ret_volumes = records;
-	return code;
-}
-
-int catalogue_warnings(struct catalogue *catalogue, const char *job, struct warning_record **ret_warnings,
-		       int *ret_count, struct error *err)
-{
-	void *records;
-	int code = list_of_job(catalogue, TABLE_WARNINGS, job, &records, ret_count, err);
-
-	if (code == 0)
-		*ret_warnings = records;
-	return code;
-}
-
 /* ---- events ---- */
-
-int catalogue_add_event(struct catalogue *catalogue, const char *job, const struct event *event, long long *ret_number,
-			struct error *err)
-{
-	const struct catalogue_event row = {
-	    .created = clock_realtime(), .kind = event->kind, .data = event->data, .once = event->once};
-
-	return catalogue_write_record(catalogue, TABLE_EVENTS, STATEMENT_INSERT, job, &row, ret_number, err);
-}
-
-int catalogue_add_removal(struct catalogue *catalogue, const char *job, long long number, struct error *err)
-{
-	const struct value kept = value_integer(REMOVALS_KEPT);
-	struct catalogue_removal row = {.number = number};
-	int code;
-
-	snprintf(row.job, sizeof(row.job), "%s", job);
-	code = catalogue_write_record(catalogue, TABLE_REMOVALS, STATEMENT_INSERT, NULL, &row, NULL, err);
-	if (code != 0)
-		return code;
-	return catalogue_write(catalogue,
-			       "DELETE FROM removals WHERE number <="
-			       " (SELECT number FROM removals ORDER BY number DESC LIMIT 1 OFFSET $1)",
-			       &kept, 1, err);
-}
 
 struct event_listing {
 	struct event_record *events;

@@ -12,6 +12,7 @@
 #include "daemon/store/deleted.h"
 #include "daemon/store/record.h"
 #include "proto/checkpoint.h"
+#include "proto/clock.h"
 
 const char *const job_state_names[JOB_STATE_COUNT] = {"waiting",   "queued", "running",
 						      "succeeded", "failed", "cancelled"};
@@ -45,10 +46,16 @@ void job_records_free(struct job_record *jobs, int count)
 
 static int add_event(struct store *store, const char *id, const struct event *event, struct error *err)
 {
+	struct catalogue_event row;
 	long long number = 0;
-	int code = event == NULL ? 0 : catalogue_add_event(store->catalogue, id, event, &number, err);
+	int code;
 
-	if (number != 0)
+	if (event == NULL)
+		return 0;
+	row = (struct catalogue_event){
+	    .created = clock_realtime(), .kind = event->kind, .data = event->data, .once = event->once};
+	code = catalogue_put(store->catalogue, id, &row, &number, err);
+	if (code == 0 && number != 0)
 		store->event_written = number;
 	return code;
 }
@@ -82,7 +89,7 @@ int store_job_insert(struct store *store, const struct job_record *job, const st
 		rmdir(directory);
 		return code;
 	}
-	code = catalogue_add_job(store->catalogue, job, err);
+	code = catalogue_put(store->catalogue, NULL, job, NULL, err);
 	if (code == 0)
 		code = add_event(store, job->id, event, err);
 	code = end_with_record(store, job->id, true, code, err);
@@ -111,10 +118,13 @@ int store_job_update(struct store *store, const struct job_record *job, const st
 static int note_removal(struct store *store, const char *id, struct error *err)
 {
 	struct event event = {.kind = "removed", .data = (char[]){"{}"}};
+	struct catalogue_removal removal = {.number = 0};
 
 	if (add_event(store, id, &event, err) != 0)
 		return err->code;
-	return catalogue_add_removal(store->catalogue, id, store->event_written, err);
+	removal.number = store->event_written;
+	snprintf(removal.job, sizeof(removal.job), "%s", id);
+	return catalogue_put(store->catalogue, NULL, &removal, NULL, err);
 }
 
 int store_job_delete(struct store *store, const char *id, struct error *err)
@@ -211,7 +221,7 @@ int store_job_add_rows(struct store *store, const char *id, const struct history
 	if (code != 0)
 		return code;
 	for (int i = 0; i < count && code == 0; i++) {
-		code = catalogue_put_history(store->catalogue, id, &rows[i], err);
+		code = catalogue_put(store->catalogue, id, &rows[i], NULL, err);
 		if (code == 0)
 			code = add_event(store, id, &events[i], err);
 	}
@@ -226,7 +236,7 @@ int store_job_add_volume(struct store *store, const char *id, const struct volum
 	if (code != 0)
 		return code;
 	/* A job that starts again keeps its volumes again: the later one is what the file holds. */
-	code = catalogue_put_volume(store->catalogue, id, volume, err);
+	code = catalogue_put(store->catalogue, id, volume, NULL, err);
 	if (code == 0)
 		code = add_event(store, id, event, err);
 	return store_end(store, code, err);
@@ -243,27 +253,29 @@ int store_job_digest_volume(struct store *store, const char *id, const struct vo
 
 int store_job_remove_volume(struct store *store, const char *id, const char *name, struct error *err)
 {
+	struct volume_record volume = {.hashed = false};
 	int code = store_begin(store, err);
 
 	if (code != 0)
 		return code;
-	return end_with_record(store, id, false, catalogue_remove_volume(store->catalogue, id, name, err), err);
+	snprintf(volume.name, sizeof(volume.name), "%s", name);
+	return end_with_record(store, id, false, catalogue_take(store->catalogue, id, &volume, err), err);
 }
 
 int store_job_add_warning(struct store *store, const char *id, const struct warning_record *warning,
 			  const struct event *event, bool *ret_new, struct error *err)
 {
-	bool new = false;
+	long long new = 0;
 	int code = store_begin(store, err);
 
 	if (code != 0)
 		return code;
-	code = catalogue_add_warning(store->catalogue, id, warning, &new, err);
-	if (new)
+	code = catalogue_put(store->catalogue, id, warning, &new, err);
+	if (code == 0 && new != 0)
 		code = add_event(store, id, event, err);
-	code = new ? end_with_record(store, id, false, code, err) : store_end(store, code, err);
+	code = new != 0 ? end_with_record(store, id, false, code, err) : store_end(store, code, err);
 	if (code == 0)
-		*ret_new = new;
+		*ret_new = new != 0;
 	return code;
 }
 
@@ -278,25 +290,25 @@ int store_job_add_event(struct store *store, const char *id, const struct event 
 
 int store_job_load(struct store *store, struct job_record **ret_jobs, int *ret_count, struct error *err)
 {
-	return catalogue_jobs(store->catalogue, ret_jobs, ret_count, err);
+	return catalogue_list(store->catalogue, NULL, ret_jobs, ret_count, err);
 }
 
 int store_job_rows(struct store *store, const char *id, struct history_row **ret_rows, int *ret_count,
 		   struct error *err)
 {
-	return catalogue_history(store->catalogue, id, ret_rows, ret_count, err);
+	return catalogue_list(store->catalogue, id, ret_rows, ret_count, err);
 }
 
 int store_job_volumes(struct store *store, const char *id, struct volume_record **ret_volumes, int *ret_count,
 		      struct error *err)
 {
-	return catalogue_volumes(store->catalogue, id, ret_volumes, ret_count, err);
+	return catalogue_list(store->catalogue, id, ret_volumes, ret_count, err);
 }
 
 int store_job_warnings(struct store *store, const char *id, struct warning_record **ret_warnings, int *ret_count,
 		       struct error *err)
 {
-	return catalogue_warnings(store->catalogue, id, ret_warnings, ret_count, err);
+	return catalogue_list(store->catalogue, id, ret_warnings, ret_count, err);
 }
 
 int store_jobs_undigested(struct store *store, void (*visit)(void *context, const char *id), void *context,

@@ -165,7 +165,7 @@ int store_sweep_jobs(struct store *store, struct error *err)
 	struct sweep sweep = {.store = store};
 	struct job_record *jobs = NULL;
 	char path[1024];
-	int code = catalogue_jobs(store->catalogue, &jobs, &sweep.job_count, err);
+	int code = catalogue_list(store->catalogue, NULL, &jobs, &sweep.job_count, err);
 
 	/* All rows are read as of one moment, which saves a start with many jobs much time: none changes before it is
 	 * read. */

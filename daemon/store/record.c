@@ -117,13 +117,22 @@ static int write_rows(struct store *store, enum record_kind kind, const char *id
 	return code;
 }
 
+static int set_stamp(struct store *store, enum record_kind kind, const char *id, struct error *err)
+{
+	const struct catalogue_scan scan = {.stamp = store->stamp};
+	const struct job_record job = {.stamp = store->stamp};
+
+	return kind == RECORD_SCAN ? catalogue_set(store->catalogue, id, &scan, &scan.stamp, err)
+				   : catalogue_set(store->catalogue, id, &job, &job.stamp, err);
+}
+
 int record_write(struct store *store, enum record_kind kind, const char *id, bool synced, struct error *err)
 {
 	long long now = (long long)(clock_realtime() * 1e6);
 	int code;
 
 	store->stamp = now > store->stamp ? now : store->stamp + 1;
-	code = catalogue_set_stamp(store->catalogue, kind, id, store->stamp, err);
+	code = set_stamp(store, kind, id, err);
 	return code == 0 ? write_rows(store, kind, id, synced, err) : code;
 }
 

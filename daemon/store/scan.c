@@ -472,6 +472,18 @@ int store_scan_repeat(struct store *store, const struct store_key *key, struct s
 	return code;
 }
 
+static int insert_key(struct store *store, const char *id, const struct store_key *key, struct error *err)
+{
+	struct catalogue_scan_key row = {.key = key->text};
+	long long number;
+	int code;
+
+	memcpy(row.sha256, key->digest, sizeof(row.sha256));
+	code = catalogue_put(store->catalogue, id, &row, &number, err);
+	return code == 0 && number == 0 ? error_set(err, ERR_CONFLICT, "this Idempotency-Key was used meanwhile")
+					: code;
+}
+
 static int insert_row(struct store *store, struct stored_scan *scan, const struct store_key *key, struct error *err)
 {
 	struct catalogue_scan row = {.created = scan->created,
@@ -487,7 +499,9 @@ static int insert_row(struct store *store, struct stored_scan *scan, const struc
 		return code;
 	memcpy(row.id, scan->id, sizeof(row.id));
 	memcpy(row.name, scan->name, sizeof(row.name));
-	code = catalogue_add_scan(store->catalogue, &row, key, &scan->number, err);
+	code = catalogue_put(store->catalogue, NULL, &row, NULL, err);
+	if (code == 0 && key != NULL)
+		code = insert_key(store, scan->id, key, err);
 	if (code == 0)
 		code = record_write(store, RECORD_SCAN, scan->id, true, err);
 	return store_end(store, code, err);

@@ -11,7 +11,6 @@ struct stored_scan {
 	/* Constant. */
 	struct store *store;
 	char id[ID_SIZE];
-	long long number; /* in the catalogue */
 	char name[SCAN_NAME_BYTES];
 	double created;
 	int columns, rows, count;
@@ -99,6 +98,13 @@ int store_forget_lost(struct stored_scan *scan, struct error *err);
 /* A thread that checks the files of scans that are suspect. */
 int store_start_checker(struct store *store, struct error *err);
 void store_stop_checker(struct store *store);
+
+/*
+ * These three write a row of the catalogue, in a group. sha256 of an image NULL: the scan has no such image any more.
+ */
+int stored_scan_put_row(const struct stored_scan *scan, int index, const uint8_t sha256[32], struct error *err);
+int stored_scan_set_image(const struct stored_scan *scan, enum image image, const uint8_t *sha256, struct error *err);
+int stored_scan_set_closed(const struct stored_scan *scan, struct error *err);
 
 /* The record of a part of the scan directory, synced: behind its file and before its row. bytes NULL: it has none. */
 int store_put_part_sum(const struct stored_scan *scan, int part, const void *bytes, size_t size, struct error *err);

@@ -5,6 +5,13 @@
 #include "daemon/log.h"
 #include "daemon/store/scan.h"
 
+int stored_scan_set_closed(const struct stored_scan *scan, struct error *err)
+{
+	const struct catalogue_scan row = {.closed = true};
+
+	return catalogue_set(scan->store->catalogue, scan->id, &row, &row.closed, err);
+}
+
 /* *ret_done: there is nothing to do. The scan's lock is held. */
 static int check_closing(const struct stored_scan *scan, bool *ret_done, struct error *err)
 {
@@ -61,7 +68,7 @@ static int close_row(struct store *store, struct stored_scan *scan, int received
 	if (code == 0)
 		code = store_put_part_sum(scan, SUMS_CLOSED, "", 0, err);
 	if (code == 0)
-		code = catalogue_set_closed(store->catalogue, scan->id, err);
+		code = stored_scan_set_closed(scan, err);
 	code = store_end(store, code, err);
 	if (code != 0) {
 		pthread_mutex_lock(&scan->lock);

@@ -25,7 +25,6 @@ static int load_scan(struct store *store, const struct catalogue_scan *row, stru
 	scan = stored_scan_new(store, row->count);
 	if (scan == NULL)
 		return error_set_errno(err, ENOMEM, "list of scans");
-	scan->number = row->number;
 	memcpy(scan->id, row->id, sizeof(scan->id));
 	memcpy(scan->name, row->name, sizeof(scan->name));
 	scan->created = row->created;
@@ -51,7 +50,7 @@ static int load_projections(struct store *store, struct stored_scan *scan, struc
 {
 	struct catalogue_projection *rows = NULL;
 	struct sum sum = {0};
-	int count = 0, code = catalogue_projections(store->catalogue, scan->number, &rows, &count, err);
+	int count = 0, code = catalogue_list(store->catalogue, scan->id, &rows, &count, err);
 
 	for (int i = 0; i < count; i++) {
 		if (rows[i].view < 0 || rows[i].view >= scan->count) {
@@ -69,7 +68,7 @@ static int load_projections(struct store *store, struct stored_scan *scan, struc
 int store_load_scans(struct store *store, struct error *err)
 {
 	struct catalogue_scan *rows = NULL;
-	int count = 0, code = catalogue_scans(store->catalogue, &rows, &count, err);
+	int count = 0, code = catalogue_list(store->catalogue, NULL, &rows, &count, err);
 
 	for (int i = 0; i < count && code == 0; i++)
 		code = load_scan(store, &rows[i], err);

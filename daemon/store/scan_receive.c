@@ -59,7 +59,15 @@ int stored_scan_open(struct stored_scan *scan, bool writing, int *ret_descriptor
 	return 0;
 }
 
-static int insert_projections(struct store *store, struct received_projection *batch, int count, struct error *err)
+int stored_scan_put_row(const struct stored_scan *scan, int index, const uint8_t sha256[32], struct error *err)
+{
+	struct catalogue_projection row = {.view = index};
+
+	memcpy(row.sha256, sha256, sizeof(row.sha256));
+	return catalogue_put(scan->store->catalogue, scan->id, &row, NULL, err);
+}
+
+static int insert_projections(struct received_projection *batch, int count, struct error *err)
 {
 	int code = 0;
 
@@ -69,8 +77,7 @@ static int insert_projections(struct store *store, struct received_projection *b
 		    !batch[i].scan->deleted && (!batch[i].scan->closing || batch[i].scan->lost[batch[i].index]);
 		if (!batch[i].stored)
 			continue;
-		code = catalogue_put_projection(store->catalogue, batch[i].scan->number, batch[i].index,
-						batch[i].sum.sha256, err);
+		code = stored_scan_put_row(batch[i].scan, batch[i].index, batch[i].sum.sha256, err);
 	}
 	return code;
 }
@@ -97,7 +104,7 @@ int store_put_projections(struct store *store, struct received_projection *batch
 	int code = store_begin_unsynced(store, err);
 
 	if (code == 0)
-		code = store_end(store, insert_projections(store, batch, count, err), err);
+		code = store_end(store, insert_projections(batch, count, err), err);
 	if (code != 0)
 		return code;
 	now = clock_monotonic();
@@ -114,6 +121,16 @@ int store_put_projections(struct store *store, struct received_projection *batch
 }
 
 /* ---- images ---- */
+
+int stored_scan_set_image(const struct stored_scan *scan, enum image image, const uint8_t *sha256, struct error *err)
+{
+	struct catalogue_scan row = {.closed = false};
+
+	row.images[image].known = sha256 != NULL;
+	if (sha256 != NULL)
+		memcpy(row.images[image].sha256, sha256, sizeof(row.images[image].sha256));
+	return catalogue_set(scan->store->catalogue, scan->id, &row, row.images[image].sha256, err);
+}
 
 size_t stored_image_bytes(const struct stored_scan *scan, enum image image)
 {
@@ -160,7 +177,7 @@ static int write_image(struct store *store, struct stored_scan *scan, enum image
 		code = store_begin(store, err);
 	if (code != 0)
 		return code;
-	return store_end(store, catalogue_set_image(store->catalogue, scan->id, image, sha256, err), err);
+	return store_end(store, stored_scan_set_image(scan, image, sha256, err), err);
 }
 
 int store_put_image(struct store *store, struct stored_scan *scan, enum image image, const void *pixels, bool *ret_new,
@@ -220,7 +237,7 @@ static int remove_image(struct store *store, struct stored_scan *scan, enum imag
 		code = store_begin(store, err);
 	if (code != 0)
 		return code;
-	return store_end(store, catalogue_set_image(store->catalogue, scan->id, image, NULL, err), err);
+	return store_end(store, stored_scan_set_image(scan, image, NULL, err), err);
 }
 
 int store_remove_image(struct store *store, struct stored_scan *scan, enum image image, struct error *err)

@@ -5,7 +5,7 @@
  * fdatasync; but for projections, whose records beside the samples are synced
  * (store/sums.c). The log is moved into the database by a thread of its own, so that
  * no commit waits for most of that. One connection writes, another reads and never
- * waits for the writer. Every page is checked as it is read (store/sqlite_pages.h).
+ * waits for the writer. Every page is checked as it is read (store/checksum_vfs.h).
  *
  * The catalogue is this process's own: the index of its log (-shm) is mapped memory
  * that nothing checks, so its file loses its name as soon as it is open. Another
@@ -27,7 +27,7 @@
 #include "daemon/log.h"
 #include "daemon/store/backend.h"
 #include "daemon/store/quarantine.h"
-#include "daemon/store/sqlite_pages.h"
+#include "daemon/store/checksum_vfs.h"
 
 extern const struct catalogue_backend catalogue_sqlite;
 

@@ -188,6 +188,7 @@ void stored_scan_lose_image(struct stored_scan *scan, enum image image)
 
 int store_forget_lost(struct stored_scan *scan, struct error *err)
 {
+	struct catalogue_projection row;
 	bool whole, lost;
 	int file, code = stored_scan_open_records(scan, &whole, &file, err);
 
@@ -204,8 +205,9 @@ int store_forget_lost(struct stored_scan *scan, struct error *err)
 		if (!lost)
 			continue;
 		code = sums_put(file, i, NULL, err);
+		row = (struct catalogue_projection){.view = i};
 		if (code == 0)
-			code = catalogue_put_projection(scan->store->catalogue, scan->number, i, NULL, err);
+			code = catalogue_take(scan->store->catalogue, scan->id, &row, err);
 	}
 	close(file);
 	return code;

@@ -90,8 +90,7 @@ static int follow_projections(struct store *store, const struct stored_scan *sca
 		return code;
 	for (int i = 0; i < scan->count && code == 0; i++) {
 		if (records->states[i] == SUM_GOOD && !row_fits(scan, i, &records->projections[i]))
-			code = catalogue_put_projection(store->catalogue, scan->number, i,
-							records->projections[i].sha256, err);
+			code = stored_scan_put_row(scan, i, records->projections[i].sha256, err);
 	}
 	return store_end(store, code, err);
 }
@@ -101,9 +100,7 @@ static int put_image(struct store *store, const struct stored_scan *scan, enum i
 {
 	int code = store_begin(store, err);
 
-	return code == 0
-		   ? store_end(store, catalogue_set_image(store->catalogue, scan->id, image, sum->sha256, err), err)
-		   : code;
+	return code == 0 ? store_end(store, stored_scan_set_image(scan, image, sum->sha256, err), err) : code;
 }
 
 /* The same of the images and of the scan's end. */
@@ -131,7 +128,7 @@ static int follow_parts(struct store *store, struct stored_scan *scan, const str
 		return code;
 	scan->closed = scan->closing = true;
 	code = store_begin(store, err);
-	return code == 0 ? store_end(store, catalogue_set_closed(store->catalogue, scan->id, err), err) : code;
+	return code == 0 ? store_end(store, stored_scan_set_closed(scan, err), err) : code;
 }
 
 /* What comes from now on has a later place in the order of arrival than all that is there. */

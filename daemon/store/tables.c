@@ -10,7 +10,7 @@
 #define AT(record, member) .at = offsetof(struct record, member), .size = sizeof(((struct record *)0)->member)
 
 static const struct column scan_columns[] = {
-    {"number", COLUMN_NUMBER, AT(catalogue_scan, number)},
+    {"number", COLUMN_NUMBER, .size = 0},
     {"id", COLUMN_TEXT, AT(catalogue_scan, id), .unique = true},
     {"name", COLUMN_TEXT, AT(catalogue_scan, name)},
     {"created", COLUMN_REAL, AT(catalogue_scan, created)},
@@ -34,7 +34,7 @@ static const struct column scan_columns[] = {
 
 /* A row: the samples are on the disk. */
 static const struct column projection_columns[] = {
-    {"scan", COLUMN_LONG, AT(catalogue_projection, scan)},
+    {"scan", COLUMN_PARENT, .size = 0},
     {"view", COLUMN_INT, AT(catalogue_projection, view)},
     {"sha256", COLUMN_BYTES, AT(catalogue_projection, sha256)},
 };
@@ -149,7 +149,6 @@ static const struct column event_columns[] = {
     {"once", COLUMN_STRING, AT(catalogue_event, once), .nullable = true},
 };
 
-/* A removed job's events go with it; that it was removed stays, under a number of theirs. */
 static const struct column removal_columns[] = {
     {"number", COLUMN_LONG, AT(catalogue_removal, number)},
     {"job", COLUMN_TEXT, AT(catalogue_removal, job)},
@@ -160,25 +159,28 @@ const struct table tables[TABLE_COUNT] = {
     [TABLE_SCANS] = {"scans", COLUMNS(scan_columns), .size = sizeof(struct catalogue_scan), .key = "id", .order = "id"},
     [TABLE_PROJECTIONS] = {"projections", COLUMNS(projection_columns), .size = sizeof(struct catalogue_projection),
 			   .key = "scan, view", .clustered = true, .parent = "scans", .reference = "scan",
-			   .by_number = true, .order = "view"},
+			   .recorded_apart = true, .order = "view", .name_of = "view", .put = PUT_REPLACES},
     [TABLE_SCAN_KEYS] = {"scan_keys", COLUMNS(scan_key_columns), .size = sizeof(struct catalogue_scan_key),
 			 .key = "key", .clustered = true, .parent = "scans", .reference = "scan", .order = "key",
-			 .keeps_first = true,
+			 .put = PUT_KEEPS,
 			 .index = "CREATE INDEX IF NOT EXISTS scan_keys_of_scan ON scan_keys (scan);"},
     [TABLE_JOBS] = {"jobs", COLUMNS(job_columns), .size = sizeof(struct job_record), .key = "id", .order = "id"},
     [TABLE_HISTORY] = {"history", COLUMNS(history_columns), .size = sizeof(struct history_row), .key = "job, iteration",
-		       .clustered = true, .parent = "jobs", .reference = "job", .order = "iteration"},
+		       .clustered = true, .parent = "jobs", .reference = "job", .order = "iteration",
+		       .put = PUT_REPLACES},
     [TABLE_VOLUMES] = {"volumes", COLUMNS(volume_columns), .size = sizeof(struct volume_record), .key = "job, name",
-		       .unique = "job, name", .parent = "jobs", .reference = "job", .order = "number"},
+		       .unique = "job, name", .parent = "jobs", .reference = "job", .order = "number",
+		       .name_of = "name", .put = PUT_MOVES},
     [TABLE_WARNINGS] = {"warnings", COLUMNS(warning_columns), .size = sizeof(struct warning_record),
 			.key = "job, code, detail", .unique = "job, code, detail", .parent = "jobs", .reference = "job",
-			.order = "number", .keeps_first = true},
+			.order = "number", .put = PUT_KEEPS},
     [TABLE_EVENTS] = {"events", COLUMNS(event_columns), .size = sizeof(struct catalogue_event), .key = "number",
-		      .parent = "jobs", .reference = "job", .order = "number", .keeps_first = true,
+		      .parent = "jobs", .reference = "job", .order = "number", .put = PUT_KEEPS,
 		      .index = "CREATE INDEX IF NOT EXISTS events_of_job ON events (job, number);"
 			       "CREATE UNIQUE INDEX IF NOT EXISTS events_once ON events (job, once);"},
+    /* A page that was away for more removals than are kept reads its list anew. */
     [TABLE_REMOVALS] = {"removals", COLUMNS(removal_columns), .size = sizeof(struct catalogue_removal), .key = "number",
-			.clustered = true, .order = "number"},
+			.clustered = true, .order = "number", .kept = 1000},
 };
 
 /* ---- statements ---- */
@@ -233,9 +235,7 @@ static void print_parameters(FILE *out, const struct table *table, enum statemen
 
 static void print_parent(FILE *out, const struct table *table)
 {
-	if (table->parent != NULL && table->by_number)
-		fprintf(out, " WHERE %s = $1", table->reference);
-	else if (table->parent != NULL)
+	if (table->parent != NULL)
 		fprintf(out, " WHERE %s = (SELECT number FROM %s WHERE id = $1)", table->reference, table->parent);
 }
 
@@ -250,7 +250,7 @@ static void print_insertion(FILE *out, const struct table *table, enum statement
 		fprintf(out, " ON CONFLICT (%s) DO UPDATE SET ", table->key);
 		print_names(out, table, statement, ", ", "excluded");
 	} else if (statement == STATEMENT_INSERT) {
-		fprintf(out, "%s RETURNING %s", table->keeps_first ? " ON CONFLICT DO NOTHING" : "",
+		fprintf(out, "%s RETURNING %s", table->put == PUT_KEEPS ? " ON CONFLICT DO NOTHING" : "",
 			table->columns[0].name);
 	}
 }
@@ -279,6 +279,15 @@ static void print_statement(FILE *out, const struct table *table, enum statement
 			print_parent(out, table);
 		else
 			fprintf(out, " WHERE id = $1");
+		break;
+	case STATEMENT_TAKE:
+		fprintf(out, "DELETE FROM %s", table->name);
+		print_parent(out, table);
+		fprintf(out, " AND %s = $2", table->name_of != NULL ? table->name_of : table->key);
+		break;
+	case STATEMENT_TRIM:
+		fprintf(out, "DELETE FROM %s WHERE %s <= (SELECT %s FROM %s ORDER BY %s DESC LIMIT 1 OFFSET %d)",
+			table->name, table->key, table->key, table->name, table->key, table->kept);
 		break;
 	default:
 		print_insertion(out, table, statement);

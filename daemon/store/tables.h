@@ -7,6 +7,7 @@
 
 #include "core/error.h"
 #include "daemon/store/backend.h"
+#include "daemon/store/catalogue.h"
 
 /*
  * The tables of the catalogue. Each has one list of its columns, and everything else is made from that list: CREATE
@@ -45,20 +46,15 @@ struct column {
 	bool assigned; /* SET writes it, alone */
 };
 
-enum table_id {
-	TABLE_SCANS,
-	TABLE_PROJECTIONS,
-	TABLE_SCAN_KEYS,
-	TABLE_JOBS,
-	TABLE_HISTORY,
-	TABLE_VOLUMES,
-	TABLE_WARNINGS,
-	TABLE_EVENTS,
-	TABLE_REMOVALS,
-	TABLE_COUNT
-};
-
 enum { COLUMNS_MAX = 48 };
+
+/* What catalogue_put does where a row with the same key is there. */
+enum put {
+	PUT_ADDS,     /* an error */
+	PUT_KEEPS,    /* the first row stays */
+	PUT_REPLACES, /* the row becomes the new one, in its place */
+	PUT_MOVES,    /* the row goes, and the new one has the last place */
+};
 
 struct table {
 	const char *name;
@@ -70,10 +66,12 @@ struct table {
 	const char *unique;    /* columns that are unique together; NULL: none */
 	const char *parent;    /* table whose row this one belongs to, and goes with; NULL: none */
 	const char *reference; /* the column with the number of that row */
-	bool by_number;        /* statements get that number; else the row's id */
+	bool recorded_apart;   /* rows are not in the parent's record.json */
 	const char *order;     /* ORDER BY of LIST */
-	bool keeps_first;      /* INSERT leaves a row with the same unique columns as it is */
-	const char *index;     /* CREATE INDEX statements; NULL: none */
+	const char *name_of;   /* column by which TAKE finds a row among its parent's; NULL: none */
+	enum put put;
+	int kept;          /* rows that are kept, those with the highest keys; 0: all */
+	const char *index; /* CREATE INDEX statements; NULL: none */
 };
 extern const struct table tables[TABLE_COUNT];
 
@@ -85,9 +83,12 @@ enum statement {
 	STATEMENT_LIST,    /* all rows, or those of the parent that is the parameter */
 	STATEMENT_GET,     /* LIST of the row with this id */
 	STATEMENT_REMOVE,  /* the row with this id, or all rows of this parent */
+	STATEMENT_TAKE,    /* the row of this parent with this name_of */
+	STATEMENT_TRIM,    /* all rows but the latest of so many */
 	STATEMENT_COUNT
 };
-/* NULL: no memory. The caller frees it; a statement for rows with an `id` is of use only for a table that has one. */
+/* NULL: no memory. The caller frees it; a statement is of use only for a table that has the `id`, name_of or `kept` in
+ * it. */
 char *table_statement(const struct table *table, enum statement statement);
 /* "UPDATE scans SET flat = $1 WHERE id = $2" for column i. */
 char *table_assignment(const struct table *table, int column);

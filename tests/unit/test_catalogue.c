@@ -8,7 +8,7 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
-#include "daemon/store/sqlite_pages.h"
+#include "daemon/store/checksum_vfs.h"
 #include "daemon/store/quarantine.h"
 #include "proto/scan_directory.h"
 #include "tests/unit/state.h"

@@ -12,7 +12,7 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
-#include "daemon/store/sqlite_pages.h"
+#include "daemon/store/checksum_vfs.h"
 #include "proto/scan_directory.h"
 #include "tests/unit/state.h"
 

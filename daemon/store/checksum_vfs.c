@@ -1,9 +1,9 @@
 /*
- * The VFS under the catalogue: store/sqlite_pages.h. A database file is written page by page when the log is moved into
+ * A VFS with checksums: store/checksum_vfs.h. A database file is written page by page when the log is moved into
  * it, so the checksum is made there, in a copy. Offsets in the log: a header of 32 bytes, then frames of 24 bytes and a
  * page (https://sqlite.org/fileformat2.html, section 4).
  */
-#include "daemon/store/sqlite_pages.h"
+#include "daemon/store/checksum_vfs.h"
 
 #include <errno.h>
 #include <fcntl.h>

@@ -1,5 +1,5 @@
-#ifndef CBCT_DAEMON_STORE_SQLITE_PAGES_H
-#define CBCT_DAEMON_STORE_SQLITE_PAGES_H
+#ifndef CBCT_DAEMON_STORE_CHECKSUM_VFS_H
+#define CBCT_DAEMON_STORE_CHECKSUM_VFS_H
 
 #include <sqlite3.h>
 #include <stdbool.h>
@@ -7,11 +7,12 @@
 #include "core/error.h"
 
 /*
- * Pages of the catalogue that check themselves. SQLite has no checksums in its database file: a flipped bit in a cell
- * is another value. So every page of 4096 bytes ends with PAGES_RESERVE bytes that SQLite leaves alone (its "reserved
- * bytes"): the letters "CBP1" and the CRC-32 of the page and its number. They are set and checked by a VFS between
- * SQLite and the file. Pages in the write-ahead log have SQLite's own checksums, which it looks at only when it
- * recovers a log; what was written since the start is held against checksums in memory.
+ * The files beneath SQLite: a VFS whose database pages check themselves. It knows pages and the log, and neither tables
+ * nor statements; a database with checksums of its own needs no such layer. SQLite has no checksums in its database
+ * file: a flipped bit in a cell is another value. So every page of 4096 bytes ends with PAGES_RESERVE bytes that SQLite
+ * leaves alone (its "reserved bytes"): the letters "CBP1" and the CRC-32 of the page and its number. They are set and
+ * checked by a VFS between SQLite and the file. Pages in the write-ahead log have SQLite's own checksums, which it
+ * looks at only when it recovers a log; what was written since the start is held against checksums in memory.
  *
  * A page that does not fit is SQLITE_IOERR_DATA.
  */
