@@ -75,7 +75,7 @@ core_sources   := $(filter-out $(simd_sources),$(wildcard core/*.c core/*/*.c))
 proto_sources  := $(wildcard proto/*.c)
 daemon_sources := $(filter-out daemon/worker.c,$(wildcard daemon/*.c daemon/*/*.c))
 # What the unit tests know of the daemon: its state, without HTTP.
-state_sources  := $(wildcard daemon/store/*.c daemon/jobs/*.c) $(patsubst %,daemon/%.c,api/document files id lock log problem process watch)
+state_sources  := $(wildcard daemon/store/*.c daemon/jobs/*.c) $(patsubst %,daemon/%.c,api/document files histogram id lock log problem process watch)
 cbct_sources   := $(wildcard clients/cbct/*.c)
 unit_sources   := $(wildcard tests/unit/*.c)
 
@@ -154,12 +154,17 @@ $(BUILD)/cbctd-held: $(call objects,$(daemon_sources) tests/http/held.c tests/lo
 
 gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench
 # Every program that a test or a benchmark runs, so that none stops compiling unseen.
-test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held faults.so cpu-bench calibrate-bench denoise presets watchers slices acquire) \
+test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held faults.so nvml-stub/libnvidia-ml.so.1 cpu-bench calibrate-bench denoise presets watchers slices acquire) \
                $(if $(cuda_objects),$(gpu_programs) $(BUILD)/gpu_ceilings $(BUILD)/cbct-worker-faulty,$(call objects,$(wildcard tests/bench/gpu_*.c)))
 
 # Faults of the disk, loaded into the programs by tests.
 $(BUILD)/faults.so: tests/http/faults.c
 	$(call say,CC  )$(CC) -std=c11 -O1 -Wall -Wextra -fPIC -shared -o $@ $< -ldl
+
+# Cards that are not there, for tests of what is told of cards.
+$(BUILD)/nvml-stub/libnvidia-ml.so.1: tests/http/nvml_stub.c
+	@mkdir -p $(@D)
+	$(call say,CC  )$(CC) -std=c11 -O1 -Wall -Wextra -fPIC -shared -o $@ $<
 
 # What `cbct recon` becomes where a card is wanted.
 $(BUILD)/cbct-cuda: $(call objects,$(cbct_sources)) $(library) $(cuda_objects)
@@ -196,7 +201,7 @@ $(BUILD)/gpu_ceilings: tests/bench/gpu_ceilings.cu
 apt_install = { $$run apt-get install -y -qq --no-install-recommends $(1) >/dev/null 2>&1 || \
 	  { $$run apt-get update -qq && DEBIAN_FRONTEND=noninteractive $$run apt-get install -y -qq --no-install-recommends $(1) >/dev/null; }; }
 
-check: OPTIONAL += chromium:chromium dciodvfy:dicom3tools Orthanc:orthanc-dicomweb
+check: OPTIONAL += chromium:chromium dciodvfy:dicom3tools Orthanc:orthanc-dicomweb promtool:prometheus
 check: MODULES += nibabel:python3-nibabel pydicom:python3-pydicom gdcm:python3-gdcm
 setup: ## install the Debian packages that are missing
 	@missing=""; \
@@ -312,7 +317,7 @@ install: all ## programs, units and example configuration under $(DESTDIR)$(pref
 	install -D -m 755 -t $(DESTDIR)$(prefix)/bin $(programs)
 	install -d $(DESTDIR)$(prefix)/lib/systemd/system
 	sed 's,@prefix@,$(prefix),g' systemd/cbctd.service.in >$(DESTDIR)$(prefix)/lib/systemd/system/cbctd.service
-	install -D -m 644 README.md $(DESTDIR)$(prefix)/share/doc/cbctd/README.md
+	install -D -m 644 -t $(DESTDIR)$(prefix)/share/doc/cbctd README.md systemd/cbctd-alerts.yaml systemd/cbctd-dashboard.json
 	STATE_DIRECTORY=/var/lib/cbctd $(BUILD)/cbctd --print-config | sed 's/^[^#]/#&/' >$(DESTDIR)$(prefix)/share/doc/cbctd/cbctd.conf
 
 # A tarball's programs look for libraries beside them (RPATH, which the libraries inherit); glibc is the system's.

@@ -12,6 +12,7 @@
 #include <unistd.h>
 
 #include "daemon/api/api.h"
+#include "daemon/cards.h"
 #include "daemon/calibrations/calibrations.h"
 #include "daemon/config.h"
 #include "daemon/intake/intake.h"
@@ -126,6 +127,8 @@ static int start_parts(const struct config *config, struct api *api, struct erro
 	if (code == 0)
 		code = uploads_new(api->store, &uploads, &api->uploads, err);
 	if (code == 0)
+		code = cards_start(&api->cards, err);
+	if (code == 0)
 		code = http_start(api->http, err);
 	return code;
 }
@@ -133,6 +136,7 @@ static int start_parts(const struct config *config, struct api *api, struct erro
 static void stop_parts(struct api *api)
 {
 	http_free(api->http);
+	cards_stop(api->cards);
 	uploads_free(api->uploads);
 	encoded_copies_free(api->copies);
 	mappings_free(api->mappings);

@@ -13,6 +13,7 @@ struct api {
 	struct mappings *mappings;
 	struct encoded_copies *copies;
 	struct calibrations *calibrations;
+	struct cards *cards;
 	struct http *http;
 	double max_wait; /* s */
 	double started;  /* clock_monotonic */

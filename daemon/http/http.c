@@ -241,12 +241,7 @@ static void on_completed(void *context, struct MHD_Connection *mhd, void **state
 	if (request == NULL)
 		return;
 	if (request->begun) {
-		int class = whole && request->status >= 100 && request->status < 600 ? request->status / 100 : 0;
-
-		atomic_fetch_add(&http->requests[class], 1);
-		atomic_fetch_add(&http->bytes_in, request->received);
-		if (whole && request->response_size != UNKNOWN_SIZE && !request_is_head(request))
-			atomic_fetch_add(&http->bytes_out, request->response_size);
+		traffic_count(http, request, whole);
 		log_request(request, whole);
 		audit_tell(http->audit, request, whole);
 	}
@@ -334,9 +329,9 @@ int http_new(const struct http_options *options, struct http **ret_http, struct 
 	pthread_condattr_setclock(&monotonic, CLOCK_MONOTONIC);
 	pthread_cond_init(&http->clock_kick, &monotonic);
 	pthread_condattr_destroy(&monotonic);
-	if (access_check_routes(options->routes, err) != 0 || access_new(options, &http->access, err) != 0 ||
-	    tls_new(options, &http->tls, err) != 0 || gate_open(err) != 0 ||
-	    server_names_check(options->server_names, err) != 0 ||
+	if (access_check_routes(options->routes, err) != 0 || traffic_new(options->routes, &http->traffic, err) != 0 ||
+	    access_new(options, &http->access, err) != 0 || tls_new(options, &http->tls, err) != 0 ||
+	    gate_open(err) != 0 || server_names_check(options->server_names, err) != 0 ||
 	    listeners_open(options->listen, guards_of(http), http->listeners, &http->listener_count, err) != 0) {
 		http_free(http);
 		return err->code;
@@ -445,20 +440,12 @@ void http_free(struct http *http)
 	if (http->admission_kick >= 0)
 		close(http->admission_kick);
 	audit_free(http->audit);
+	traffic_free(http->traffic);
 	access_free(http->access);
 	tls_free(http->tls);
 	pthread_cond_destroy(&http->clock_kick);
 	pthread_mutex_destroy(&http->lock);
 	free(http);
-}
-
-void http_statistics(struct http *http, struct http_statistics *ret)
-{
-	for (int i = 0; i < 6; i++)
-		ret->requests[i] = atomic_load(&http->requests[i]);
-	ret->bytes_in = atomic_load(&http->bytes_in);
-	ret->bytes_out = atomic_load(&http->bytes_out);
-	ret->connections = http_connections(http);
 }
 
 long http_connections(const struct http *http)

@@ -9,6 +9,7 @@
 #include <cjson/cJSON.h>
 
 #include "core/error.h"
+#include "daemon/histogram.h"
 #include "daemon/http/text.h"
 #include "proto/clock.h"
 #include "proto/tokens.h"
@@ -84,13 +85,18 @@ void http_reload(struct http *http);
 void http_stop(struct http *http);
 void http_free(struct http *http); /* NULL is fine */
 
-struct http_statistics {
-	unsigned long long requests[6]; /* by the status's first digit; [0]: broken off */
-	unsigned long long bytes_in;    /* of bodies */
-	unsigned long long bytes_out;   /* of replies that were sent whole, before compression */
-	long connections;               /* now */
+/* Requests of one route that ended with one status, since the start. */
+struct http_traffic {
+	const struct route *route;         /* NULL: they found none */
+	int status;                        /* 0: broken off */
+	unsigned long long requests;       /* never 0 */
+	unsigned long long received, sent; /* bytes of bodies; files and texts that were broken off are not in sent */
 };
-void http_statistics(struct http *http, struct http_statistics *ret);
+void http_traffic(const struct http *http, void (*visit)(void *context, const struct http_traffic *traffic),
+		  void *context);
+/* From the head of a request to the end of its answer, those that waited or went on as long as they were asked to, too.
+ * NULL: of requests that found no route. */
+const struct histogram *http_seconds(const struct http *http, const struct route *route);
 /* The number of connections that are open now; takes no lock. */
 long http_connections(const struct http *http);
 

@@ -105,6 +105,7 @@ struct request {
 	struct MHD_Response *response;
 	int status;
 	uint64_t response_size; /* UNKNOWN_SIZE or bytes */
+	uint64_t sent;          /* bytes, of a body that is made as it is sent */
 	bool close;             /* no further request on this connection */
 
 	double wait_until; /* for the next suspension */
@@ -147,7 +148,8 @@ struct http {
 	atomic_bool stopping; /* whoever waits should answer */
 	atomic_bool closing;  /* nothing may be suspended any more */
 	atomic_size_t bodies; /* bytes of whole bodies in memory */
-	atomic_ullong requests[6], bytes_in, bytes_out, request_number;
+	atomic_ullong request_number;
+	struct traffic *traffic; /* constant */
 	uint32_t id_prefix;
 };
 
@@ -253,6 +255,12 @@ int access_check_routes(const struct route *routes, struct error *err);
 bool access_still_holds(struct access *access, const struct identity *who);
 /* Of a request that has found its route; 0, or 0 with a reply that refuses, or an error. */
 int access_check(struct request *request, struct error *err);
+
+/* ---- http/traffic.c: numbers of requests, bytes and seconds ---- */
+int traffic_new(const struct route *routes, struct traffic **ret_traffic, struct error *err);
+void traffic_free(struct traffic *traffic); /* NULL is fine */
+/* Of a request that has ended, in its thread. */
+void traffic_count(struct http *http, const struct request *request, bool whole);
 
 /* ---- http/audit.c: who asked for what ---- */
 /* most: bytes of a file, before it is renamed; keep: renamed files. */

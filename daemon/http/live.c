@@ -97,8 +97,10 @@ static ssize_t live_read(void *context, uint64_t offset, char *to, size_t size)
 
 		request->wait_until = INFINITY;
 		got = live->read(request, to, size);
-		if (got > 0)
+		if (got > 0) {
+			request->sent += (uint64_t)got;
 			return got;
+		}
 		if (got == 0)
 			return MHD_CONTENT_READER_END_OF_STREAM;
 		if (got != READ_WAIT)

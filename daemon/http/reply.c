@@ -89,6 +89,7 @@ int request_reply_file(struct request *request, int status, int descriptor, uint
 }
 
 struct reader {
+	struct request *request;
 	ssize_t (*read)(void *context, uint64_t offset, void *to, size_t size);
 	void *context;
 	void (*context_free)(void *context);
@@ -101,6 +102,7 @@ static ssize_t reader_read(void *context, uint64_t offset, char *to, size_t size
 
 	if (got == 0)
 		return MHD_CONTENT_READER_END_OF_STREAM;
+	reader->request->sent += got > 0 ? (uint64_t)got : 0;
 	return got > 0 ? got : MHD_CONTENT_READER_END_WITH_ERROR;
 }
 
@@ -126,7 +128,7 @@ int request_reply_read(struct request *request, int status, uint64_t size,
 			context_free(context);
 		return error_set(err, ERR_NO_MEMORY, "no memory for a reply");
 	}
-	*reader = (struct reader){read, context, context_free};
+	*reader = (struct reader){request, read, context, context_free};
 	response = MHD_create_response_from_callback(size == UNKNOWN_SIZE ? MHD_SIZE_UNKNOWN : size, BLOCK, reader_read,
 						     reader, reader_free);
 	if (response == NULL)

@@ -51,7 +51,8 @@ struct jobs {
 	struct job **all;     /* [count], by id: oldest first */
 	int count, space;
 	struct queue queue;
-	struct jobs_statistics statistics; /* count[] is made on demand */
+	struct jobs_statistics statistics; /* what there is now is counted on demand */
+	struct histogram stages[STAGE_COUNT];
 };
 
 /* Wakes those who watch the job or all jobs; no lock is held. */

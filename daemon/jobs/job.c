@@ -643,9 +643,19 @@ double job_eta(struct job *job)
 
 void jobs_statistics(struct jobs *jobs, struct jobs_statistics *ret)
 {
+	const double now = clock_realtime();
+
 	pthread_mutex_lock(&jobs->lock);
 	*ret = jobs->statistics;
-	for (int i = 0; i < jobs->count; i++)
-		ret->count[jobs->all[i]->record.state]++;
+	ret->stages = jobs->stages;
+	for (int i = 0; i < jobs->count; i++) {
+		const struct job_record *record = &jobs->all[i]->record;
+		double *oldest = &ret->oldest[record->state][record->priority];
+		double age = now - record->created;
+
+		ret->count[record->state][record->priority]++;
+		if (age > *oldest)
+			*oldest = age;
+	}
 	pthread_mutex_unlock(&jobs->lock);
 }

@@ -1,6 +1,7 @@
 #ifndef CBCT_DAEMON_JOBS_JOB_H
 #define CBCT_DAEMON_JOBS_JOB_H
 
+#include "daemon/histogram.h"
 #include "daemon/jobs/queue.h"
 #include "daemon/store/store.h"
 #include "proto/recipe.h"
@@ -111,8 +112,13 @@ int job_queue_position(struct job *job);
 double job_eta(struct job *job);
 
 struct jobs_statistics {
-	long count[JOB_STATE_COUNT];                  /* in each state now */
-	unsigned long long started, crashed, yielded; /* since the start */
+	/* Now; the age, s, is that of the job that was posted first, 0 where there is none. */
+	long count[JOB_STATE_COUNT][PRIORITY_COUNT];
+	double oldest[JOB_STATE_COUNT][PRIORITY_COUNT];
+	/* Since the daemon's start. */
+	unsigned long long started, crashed, yielded, checkpoints, iterations;
+	unsigned long long ended[JOB_STATE_COUNT];
+	const struct histogram *stages; /* [STAGE_COUNT]: what each stage of a job took, counted when it ends */
 };
 void jobs_statistics(struct jobs *jobs, struct jobs_statistics *ret);
 

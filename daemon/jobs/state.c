@@ -188,6 +188,15 @@ static void next_record(struct job *job, enum job_state to, const struct job_cha
 		enter_end(ret, change, store_directory(job->jobs->store));
 }
 
+static void count_end(struct jobs *jobs, const struct job_record *record)
+{
+	jobs->statistics.ended[record->state]++;
+	for (int i = 0; i < STAGE_COUNT; i++) {
+		if (record->seconds[i] > 0)
+			histogram_add(&jobs->stages[i], record->seconds[i]);
+	}
+}
+
 static void show_state(struct job *job, const struct job_record *record, const struct job_change *change)
 {
 	struct jobs *jobs = job->jobs;
@@ -208,6 +217,8 @@ static void show_state(struct job *job, const struct job_record *record, const s
 		job->row_seconds = 0;
 		jobs->statistics.started++;
 	}
+	if (job_state_ended(record->state))
+		count_end(jobs, record);
 	jobs->statistics.crashed += change->crashed;
 	pthread_mutex_unlock(&jobs->lock);
 	log_line(record->state == JOB_FAILED ? LEVEL_WARNING : LEVEL_INFO, "job %s: %s -> %s%s%s%s%s", record->id,

@@ -288,6 +288,7 @@ int job_checkpointed(struct job *job, int iteration, struct error *err)
 		pthread_mutex_lock(&jobs->lock);
 		job->record.checkpoint = record.checkpoint;
 		job->record.crashes = record.crashes;
+		jobs->statistics.checkpoints++;
 		pthread_mutex_unlock(&jobs->lock);
 	}
 	pthread_mutex_unlock(&jobs->change);
@@ -316,6 +317,7 @@ static void note_rows(struct job *job, int count, int iteration)
 	job->row_seconds = job->row_seconds == 0 ? seconds : 0.5 * (job->row_seconds + seconds);
 	job->row_at = now;
 	job->record.iteration = iteration;
+	job->jobs->statistics.iterations += (unsigned long long)count;
 	pthread_mutex_unlock(&job->jobs->lock);
 }
 
