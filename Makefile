@@ -144,7 +144,7 @@ $(BUILD)/cbct: $(call objects,$(cbct_sources)) $(library)
 # A worker whose syncs can be held up, and a daemon whose digests, for the tests of what becomes of a volume meanwhile;
 # and whose catalogue can be made to refuse.
 $(BUILD)/cbct-worker-held: $(call objects,daemon/worker.c tests/http/held.c) $(library) $(cuda_objects)
-	$(call say,LINK)$(CC) $(LDFLAGS) -Wl,--wrap=fdatasync,--wrap=recon_push -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(if $(cuda_objects),$(cuda_libs)) $(LIBM)
+	$(call say,LINK)$(CC) $(LDFLAGS) -Wl,--wrap=fdatasync,--wrap=recon_push,--wrap=backend_find -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(if $(cuda_objects),$(cuda_libs)) $(LIBM)
 
 held_calls := job_digest_volume store_job_update store_job_add_volume store_job_digest_volume
 # The order of locks is asserted in that daemon, and in the unit tests (tests/lock_order.c).

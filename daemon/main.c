@@ -102,6 +102,7 @@ static int start_parts(const struct config *config, struct api *api, struct erro
 						    .devices = given > 0 ? devices : NULL,
 						    .threads = (int)config->threads,
 						    .device_memory = config->device_memory,
+						    .fallback = strcmp(config->fallback, "cpu") == 0,
 						    .checkpoint_seconds = config->checkpoint_seconds,
 						    .stop_seconds = config->stop_timeout};
 	const struct calibrations_options calibrations = {

@@ -10,7 +10,8 @@
  * and reads them from the file, which the daemon has just written. It dies with the
  * daemon, and it may die alone: what it has announced stays.
  *
- * With --calibrate it makes one calibration and ends.
+ * With --calibrate it makes one calibration and ends. With --self-test it tries its device before it says hello, and
+ * ends where that fails: how the daemon asks whether a device that failed may be used again.
  */
 #include <errno.h>
 #include <getopt.h>
@@ -23,6 +24,7 @@
 #include <time.h>
 #include <unistd.h>
 
+#include "core/recon/self_test.h"
 #include "proto/calibration_files.h"
 #include "proto/checkpoint.h"
 #include "proto/clock.h"
@@ -51,6 +53,7 @@ struct arguments {
 	const char *backend;
 	const char *calibration, *scan; /* directories; NULL: jobs are served */
 	int device, socket;
+	bool self_test;
 	struct device_options options;
 };
 
@@ -468,6 +471,8 @@ static int open_device(struct worker *worker, const struct arguments *arguments,
 	/* All workers without devices of their own share the processor. */
 	code = worker->backend->open(worker->backend->own_memory ? arguments->device : 0, &arguments->options,
 				     &worker->device, err);
+	if (code == 0 && arguments->self_test)
+		code = device_self_test(worker->backend, worker->device, err);
 	if (code != 0)
 		return code;
 	worker->backend->describe(worker->device, &hello.info);
@@ -480,6 +485,7 @@ static int usage(void)
 {
 	fputs("cbct-worker is started by cbctd:\n"
 	      "  --backend auto|cuda|cpu  --device N  --threads N  --device-memory BYTES  --socket DESCRIPTOR\n"
+	      "  --self-test\n"
 	      "  --calibrate DIR  --scan DIR  --threads N\n",
 	      stderr);
 	return EXIT_USAGE;
@@ -500,18 +506,22 @@ static bool read_number(const char *text, unsigned long long most, unsigned long
 
 static bool read_arguments(int argc, char **argv, struct arguments *ret)
 {
-	static const struct option options[] = {
-	    {"backend", required_argument, NULL, 'b'}, {"device", required_argument, NULL, 'd'},
-	    {"threads", required_argument, NULL, 't'}, {"device-memory", required_argument, NULL, 'm'},
-	    {"socket", required_argument, NULL, 's'},  {"calibrate", required_argument, NULL, 'c'},
-	    {"scan", required_argument, NULL, 'S'},    {0}};
+	static const struct option options[] = {{"backend", required_argument, NULL, 'b'},
+						{"device", required_argument, NULL, 'd'},
+						{"threads", required_argument, NULL, 't'},
+						{"device-memory", required_argument, NULL, 'm'},
+						{"socket", required_argument, NULL, 's'},
+						{"calibrate", required_argument, NULL, 'c'},
+						{"scan", required_argument, NULL, 'S'},
+						{"self-test", no_argument, NULL, 'x'},
+						{0}};
 	unsigned long long value = 0;
 	int option;
 
 	*ret = (struct arguments){.backend = "auto", .socket = 3};
 	while ((option = getopt_long(argc, argv, "", options, NULL)) != -1) {
-		if (option == '?' ||
-		    (strchr("bcS", option) == NULL && !read_number(optarg, option == 'm' ? 1ull << 60 : 65535, &value)))
+		if (option == '?' || (strchr("bcSx", option) == NULL &&
+				      !read_number(optarg, option == 'm' ? 1ull << 60 : 65535, &value)))
 			return false;
 		if (option == 'b')
 			ret->backend = optarg;
@@ -519,6 +529,8 @@ static bool read_arguments(int argc, char **argv, struct arguments *ret)
 			ret->calibration = optarg;
 		else if (option == 'S')
 			ret->scan = optarg;
+		else if (option == 'x')
+			ret->self_test = true;
 		else if (option == 'd')
 			ret->device = (int)value;
 		else if (option == 't')

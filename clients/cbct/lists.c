@@ -75,8 +75,11 @@ static void print_calibration(const cJSON *calibration)
 
 static void print_device(const cJSON *device)
 {
-	printf("%-6s %-8s %s\n", member_text(device, "backend", "?"), member_text(device, "state", "?"),
-	       member_text(device, "device", "?"));
+	const bool aside = cJSON_IsObject(cJSON_GetObjectItemCaseSensitive(device, "set_aside"));
+
+	printf("%-6s %-8s %s%s%s%s\n", member_text(device, "backend", "?"), member_text(device, "state", "?"),
+	       member_text(device, "device", "?"), aside ? ", set aside (" : "",
+	       aside ? member_text(device, "last_error", "") : "", aside ? ")" : "");
 }
 
 /* The members of array `name` of the document at `path`, one line each. */

@@ -711,6 +711,10 @@ class Client:
         """The workers and what they run on."""
         return list(self._json("GET", "/v1/devices")["devices"])
 
+    def clear_device(self, index: int) -> Document:
+        """Gives jobs again to a device that was set aside; for the role ``admin``."""
+        return self._json("POST", f"/v1/devices/{index}/clear")
+
     def quarantine(self) -> List[Document]:
         """What the daemon has set aside because it could not use it, and why."""
         return list(self._json("GET", "/v1/quarantine")["entries"])

@@ -279,8 +279,7 @@ static void add_job_facts(cJSON *document, struct job *job, const struct job_rec
 	json_add_time(document, "ended", record->ended);
 	add_timings(document, record);
 	if (record->error_code != 0)
-		cJSON_AddItemToObject(document, "error",
-				      error_document(record->error_code, record->error_pointer, record->error_text));
+		cJSON_AddItemToObject(document, "error", job_error_document(record));
 	else
 		cJSON_AddNullToObject(document, "error");
 }
@@ -381,6 +380,22 @@ cJSON *job_document(struct job *job, bool brief, struct error *err)
 
 /* ---- workers ---- */
 
+static void add_set_aside(cJSON *document, const struct worker_facts *facts)
+{
+	cJSON *object;
+
+	if (!facts->aside) {
+		cJSON_AddNullToObject(document, "set_aside");
+		return;
+	}
+	object = cJSON_AddObjectToObject(document, "set_aside");
+	json_add_time(object, "since", facts->aside_since);
+	if (facts->test_at > 0)
+		cJSON_AddNumberToObject(object, "test_in_s", fmax(facts->test_at - clock_monotonic(), 0));
+	else
+		cJSON_AddNullToObject(object, "test_in_s");
+}
+
 cJSON *worker_document(const struct worker_facts *facts)
 {
 	cJSON *document = cJSON_CreateObject(), *memory;
@@ -399,6 +414,10 @@ cJSON *worker_document(const struct worker_facts *facts)
 		cJSON_AddNumberToObject(document, "step_age_s", fmax(clock_monotonic() - facts->stepped, 0));
 	else
 		cJSON_AddNullToObject(document, "step_age_s");
+	cJSON_AddBoolToObject(document, "answers", worker_answers(facts));
+	cJSON_AddBoolToObject(document, "fallback", facts->fallback);
+	cJSON_AddNumberToObject(document, "errors", facts->faults);
+	add_set_aside(document, facts);
 	cJSON_AddNumberToObject(document, "restarts", facts->restarts);
 	add_text_or_null(document, "last_error", facts->last_error);
 	return document;

@@ -7,7 +7,7 @@
 #include "proto/openapi.h"
 #include "proto/provenance.h"
 
-enum { WORKERS_MAX = 64 };
+enum { WORKERS_MAX = 65 };
 
 static int reply_word(struct request *request, const char *word, struct error *err)
 {
@@ -77,6 +77,20 @@ int device_list(void *context, struct request *request, struct error *err)
 	for (int i = 0; i < count && i < WORKERS_MAX; i++)
 		cJSON_AddItemToArray(list, worker_document(&workers[i]));
 	return request_reply_json(request, 200, document, err);
+}
+
+int device_clear_post(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	const char *text = request_argument(request, 0);
+	struct worker_facts facts;
+	double index;
+
+	if (!number_parse(text, 0, 1e6, &index) || index != (int)index)
+		return error_set(err, ERR_NOT_FOUND, "there is no device \"%.20s\"", text);
+	if (supervise_clear(api->supervise, (int)index, &facts, err) != 0)
+		return err->code;
+	return request_reply_json(request, 200, worker_document(&facts), err);
 }
 
 int schema_get(void *context, struct request *request, struct error *err)

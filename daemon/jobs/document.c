@@ -8,14 +8,17 @@
 #include "daemon/problem.h"
 #include "proto/json.h"
 
-cJSON *error_document(int code, const char *pointer, const char *text)
+cJSON *job_error_document(const struct job_record *record)
 {
 	cJSON *document = cJSON_CreateObject();
+	cJSON *report = record->error_report[0] != '\0' ? cJSON_Parse(record->error_report) : NULL;
 
-	problem_add_type(document, problem_of_code(code));
-	cJSON_AddStringToObject(document, "detail", text);
-	if (pointer[0] != '\0')
-		cJSON_AddStringToObject(document, "pointer", pointer);
+	problem_add_type(document, problem_of_code(record->error_code));
+	cJSON_AddStringToObject(document, "detail", record->error_text);
+	if (record->error_pointer[0] != '\0')
+		cJSON_AddStringToObject(document, "pointer", record->error_pointer);
+	if (report != NULL)
+		cJSON_AddItemToObject(document, "report", report);
 	return document;
 }
 

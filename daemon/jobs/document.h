@@ -16,7 +16,10 @@
  */
 cJSON *volume_document(const char *job, const struct volume_record *volume);
 cJSON *history_row_document(const struct history_row *row);
-/* type (urn:cbctd:problem:NAME), detail, pointer where there is one: how a job says what went wrong. */
-cJSON *error_document(int code, const char *pointer, const char *text);
+/*
+ * type (urn:cbctd:problem:NAME), detail, pointer where there is one: how a failed job says what went wrong; `report`
+ * with how its last run was lost, where it was.
+ */
+cJSON *job_error_document(const struct job_record *record);
 
 #endif

@@ -1,5 +1,7 @@
 /* The end of a worker's job, decided in outcome.c and carried out here. */
 #include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
 
 #include "daemon/jobs/workers.h"
 #include "daemon/log.h"
@@ -11,6 +13,7 @@ static int record_ending(struct worker *worker, struct error *err)
 	const struct job_change change = {
 	    .error_code = ending->error_code,
 	    .error_text = ending->error_text,
+	    .report = ending->report,
 	    .checkpoint = ending->checkpoint,
 	    .crashed = ending->crashed,
 	    .yielded = ending->yielded,
@@ -108,7 +111,15 @@ bool worker_is_stale(const struct worker *worker)
 	return scan.basis != worker->basis || (worker->arriving != NULL && scan.losses != worker->losses);
 }
 
-static unsigned conditions_of(const struct worker *worker)
+/* A run that was lost is counted here, with where the job goes on; other ends leave that as it is. */
+static bool broken_off(struct worker *worker, enum worker_end end, const struct job_record *record)
+{
+	if (end == END_DIED || end == END_DEVICE)
+		return device_route(worker->supervise, worker, end) == ROUTE_END;
+	return record->crashes + 1 >= CRASHES_MAX;
+}
+
+static unsigned conditions_of(struct worker *worker, enum worker_end end)
 {
 	struct job_record record;
 	struct scan_facts scan = {0};
@@ -123,7 +134,7 @@ static unsigned conditions_of(const struct worker *worker)
 	conditions |= worker_is_stale(worker) ? CONDITION_STALE : 0;
 	conditions |= worker->arriving != NULL ? CONDITION_ARRIVING : 0;
 	conditions |= worker->checkpoint > 0 ? CONDITION_RESUMED : 0;
-	conditions |= record.crashes + 1 >= CRASHES_MAX ? CONDITION_BROKEN : 0;
+	conditions |= broken_off(worker, end, &record) ? CONDITION_BROKEN : 0;
 	conditions |= job_doubts(worker->job, scan.losses) + 1 >= CRASHES_MAX ? CONDITION_DOUBTED : 0;
 	conditions |= worker->yielding ? CONDITION_ASKED : 0;
 	return conditions;
@@ -185,30 +196,47 @@ static void carry_out(struct supervise *supervise, struct worker *worker, const 
 		job_add_warning(worker->job, "damaged_checkpoint", words->text, &ignored);
 	hold_job(supervise, worker, outcome->obstacle);
 	if (outcome->to == JOB_SUCCEEDED)
-		worker->failures = 0;
+		worker->failures = worker->faults = 0;
 }
 
 /* The words that a failed job bears, and the log otherwise. */
 static void write_text(const struct worker *worker, const struct outcome *outcome, const struct worker_words *words,
 		       char *ret_text, size_t size)
 {
-	const char *text = outcome->words == WORDS_DAEMON ? worker->failure_text : words->text;
+	const char *text = outcome->words == WORDS_DAEMON ? worker->failure_text : words->text, *between;
 	struct job_record record;
 
 	if (outcome->to == JOB_FAILED && outcome->crashed) {
 		job_record(worker->job, &record);
+		between = record.crashes > 0 ? " without a checkpoint between them" : "";
 		snprintf(ret_text, size,
-			 "it was broken off %d times, last: %.160s; it was in stage %s behind iteration %d on %.70s",
-			 record.crashes + 1, text, stage_names[record.stage], record.iteration, record.device);
+			 "it was broken off %d time%s%s, last: %.120s; it was in stage %s behind iteration %d on %.70s",
+			 record.crashes + 1, record.crashes > 0 ? "s" : "", between, text, stage_names[record.stage],
+			 record.iteration, record.device);
 		return;
 	}
 	snprintf(ret_text, size, "%.319s", outcome->reason != NULL ? outcome->reason : text);
 }
 
+static void write_report(const struct worker *worker, const struct worker_words *words,
+			 char ret_report[JOB_REPORT_SIZE])
+{
+	struct job_record record;
+	char *report;
+
+	job_record(worker->job, &record);
+	report = device_report(worker, words, record.crashes + 1);
+	/* A report that is cut off says nothing. */
+	if (report != NULL && strlen(report) < JOB_REPORT_SIZE)
+		memcpy(ret_report, report, strlen(report) + 1);
+	free(report);
+}
+
 void worker_end_job(struct supervise *supervise, struct worker *worker, const struct worker_words *words)
 {
-	unsigned conditions = conditions_of(worker);
+	unsigned conditions = conditions_of(worker, words->end);
 	struct outcome outcome = outcome_of(words->end, conditions);
+	const bool fault = device_at_fault(worker, words->end);
 	struct ending ending = {.due = true,
 				.to = outcome.to,
 				.error_code = outcome.words == WORDS_DAEMON ? worker->failure_code : words->code,
@@ -220,7 +248,11 @@ void worker_end_job(struct supervise *supervise, struct worker *worker, const st
 		worker->state = WORKER_ENDING;
 		worker->deadline = clock_monotonic() + EXIT;
 	}
+	if (fault && words->end != END_STOPPED)
+		device_fault(supervise, worker, words->text);
 	carry_out(supervise, worker, &outcome, words);
+	if (outcome.to == JOB_FAILED && outcome.crashed)
+		write_report(worker, words, ending.report);
 	write_text(worker, &outcome, words, ending.error_text, sizeof(ending.error_text));
 	worker->ending = ending;
 	worker_finish_job(supervise, worker);

@@ -83,6 +83,7 @@ static void begin(struct supervise *supervise, struct worker *worker, struct job
 {
 	struct error err;
 
+	worker->said[0] = '\0';
 	worker->job = job_reference(job);
 	worker->running = (struct queue_running){.priority = record->priority, .ticket = record->ticket};
 	worker->checkpoint = message->iteration;
@@ -140,6 +141,11 @@ static int begin_job(struct supervise *supervise, struct worker *worker, struct 
 	worker->basis = facts->basis;
 	worker->losses = facts->losses;
 	begin(supervise, worker, job, record, message);
+	worker->work = (double)grid_voxels(&message->request.recipe.grid) * facts->count;
+	if (worker->fallback)
+		device_tell_fallback(supervise, worker,
+				     record->iterations > message->iteration ? record->iterations - message->iteration
+									     : 0);
 	if (!arriving) {
 		stored_scan_release(scan);
 		return 0;
@@ -199,11 +205,12 @@ static int give_job(struct supervise *supervise, struct worker *worker, struct j
  */
 static struct job *choose_job(struct supervise *supervise, const struct worker *worker, bool *ret_arriving)
 {
-	struct job *queued = jobs_next(supervise->jobs), *waiting, *chosen;
+	const struct job_filter filter = {.fits = device_fits, .context = worker};
+	struct job *queued = jobs_next(supervise->jobs, &filter), *waiting, *chosen;
 	struct job_facts a, b;
 	bool now;
 
-	waiting = jobs_arriving(supervise->jobs, just_now(worker), &now);
+	waiting = jobs_arriving(supervise->jobs, just_now(worker), &filter, &now);
 	chosen = queued != NULL ? queued : waiting;
 	if (queued != NULL && waiting != NULL && now) {
 		job_facts(queued, &a);
@@ -242,11 +249,11 @@ void supervise_dispatch(struct supervise *supervise)
 
 void supervise_preempt(struct supervise *supervise)
 {
-	struct queue_running running[WORKERS_MAX];
-	int of[WORKERS_MAX], busy, idle, victim;
+	struct queue_running running[SLOTS_MAX];
+	int of[SLOTS_MAX], busy, idle, victim;
 	double now = clock_monotonic(), since = supervise_arrivals_since(supervise, now);
 	bool arriving;
-	struct job *waiting = jobs_arriving(supervise->jobs, since, &arriving);
+	struct job *waiting = jobs_arriving(supervise->jobs, since, NULL, &arriving);
 	struct job_facts facts = {.priority = PRIORITY_ROUTINE};
 
 	if (waiting != NULL)

@@ -24,7 +24,8 @@ struct job {
 	struct job_request request; /* see job_request */
 	struct error unreadable;    /* code 0: request is there */
 
-	int doubts; /* job_doubt, with the next; the supervisor's own */
+	struct job_trial trial; /* the supervisor's own */
+	int doubts;             /* job_doubt, with the next; the supervisor's own */
 	unsigned doubted_at;
 
 	struct watch_list watchers;

@@ -126,6 +126,7 @@ void jobs_statistics(struct jobs *jobs, struct jobs_statistics *ret);
 struct job_change {
 	int error_code; /* with JOB_FAILED */
 	const char *error_pointer, *error_text;
+	const char *report;           /* with JOB_FAILED: JSON, of a run that was lost; NULL: none */
 	int checkpoint;               /* to JOB_QUEUED: the iteration that checkpoint.f32 holds, 0: none */
 	bool crashed;                 /* to JOB_QUEUED, JOB_WAITING or JOB_FAILED: the worker died with it */
 	bool yielded;                 /* to JOB_QUEUED: it goes on later, which is no new attempt */
@@ -139,12 +140,26 @@ int job_set_state(struct job *job, enum job_state to, const struct job_change *c
 /* Waiting jobs whose scan has become ready go to the queue, but for those that are attended. */
 int jobs_promote(struct jobs *jobs, struct error *err);
 /*
- * The waiting job that an idle worker should attend, or NULL: it has FDK, and its
+ * Where a job has been, and is not to be again; the supervisor's thread alone. In memory only: after a restart of the
+ * daemon every device is worth a try.
+ */
+struct job_trial {
+	unsigned long long left; /* bit for each worker whose device the job has left */
+	int worker, deaths;      /* runs lost on this one's device without a checkpoint between them */
+	bool processor;          /* it goes on with the processor, by --fallback cpu */
+};
+/* A test of jobs that a worker could take; where one is asked for, NULL lets all of them pass. */
+struct job_filter {
+	bool (*fits)(const void *context, const struct job_trial *trial);
+	const void *context;
+};
+/*
+ * The waiting job that an idle worker should attend, or NULL: it fits, it has FDK, and its
  * projections can be converted and are not all there. Those whose projections came after `since`
  * (CLOCK_MONOTONIC) go first, the higher priority before the lower; then those
  * that came later. *ret_arriving: it is one of the former.
  */
-struct job *jobs_arriving(struct jobs *jobs, double since, bool *ret_arriving);
+struct job *jobs_arriving(struct jobs *jobs, double since, const struct job_filter *filter, bool *ret_arriving);
 /* ERR_CONFLICT when it does not wait any more, or was cancelled. */
 int job_attend(struct job *job, const char *backend, const char *device, struct error *err);
 /* The worker goes; a job that still waits is where it was before, or cancelled where that was asked for. */
@@ -168,8 +183,12 @@ int job_hold(struct job *job, enum job_obstacle obstacle, double until, unsigned
 /* Releases held jobs whose time has come and for which the disk has room; true while others are still held. */
 bool jobs_review_holds(struct jobs *jobs, double now, unsigned long long space);
 enum job_obstacle job_obstacle(struct job *job); /* any thread */
-/* The queued job that is due and not held, or NULL; it stays queued until job_set_state. */
-struct job *jobs_next(struct jobs *jobs);
+struct job_trial *job_trial(struct job *job);
+/* A job that has not ended waits for the processor. */
+bool jobs_want_processor(struct jobs *jobs);
+
+/* The queued job that is due, not held, and fits, or NULL; it stays queued until job_set_state. */
+struct job *jobs_next(struct jobs *jobs, const struct job_filter *filter);
 /* queue_victim over the jobs' queue. */
 int jobs_victim(struct jobs *jobs, const enum priority *arriving, const struct queue_running *running, int count,
 		int idle);

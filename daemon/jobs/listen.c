@@ -50,7 +50,10 @@ static void hello(struct supervise *supervise, struct worker *worker, const stru
 {
 	worker->info = message->info;
 	snprintf(worker->backend, sizeof(worker->backend), "%s", message->backend);
-	worker->last_error[0] = '\0';
+	if (worker->aside && worker->testing)
+		device_clear(supervise, worker, "it has passed its self-test");
+	if (worker->faults == 0)
+		worker->last_error[0] = '\0';
 	worker->deadline = NEVER;
 	worker->state = WORKER_IDLE;
 	worker->steps = 0;
@@ -82,6 +85,10 @@ static void add_rows(struct supervise *supervise, struct worker *worker)
 	int count = worker->row_count;
 	struct error err;
 
+	/* The latest measurement: the first iterations of a job may share the processor with its loading. */
+	if (count > 0 && worker->work > 0 && strcmp(worker->backend, "cpu") == 0)
+		supervise->processor_rate = worker->rows[count - 1].seconds / worker->work;
+
 	worker->row_count = 0;
 	if (count > 0 && job_add_rows(worker->job, worker->rows, count, &err) != 0)
 		stop_job(supervise, worker, &err);
@@ -109,6 +116,22 @@ static void job_ended(struct supervise *supervise, struct worker *worker, const 
 	worker_publish(supervise, worker);
 }
 
+/* What the report of a job that fails has for its worker's last words. */
+static void note_words(struct worker *worker, const struct message *message)
+{
+	if (message->kind == MESSAGE_PROGRESS)
+		snprintf(worker->said, sizeof(worker->said), "progress: stage %s, iteration %d",
+			 stage_names[message->stage], message->iteration);
+	else if (message->kind == MESSAGE_ROW)
+		snprintf(worker->said, sizeof(worker->said), "iteration %d is done", message->row.iteration);
+	else if (message->kind == MESSAGE_VOLUME)
+		snprintf(worker->said, sizeof(worker->said), "volume %s is there", message->name);
+	else if (message->kind == MESSAGE_CHECKPOINT)
+		snprintf(worker->said, sizeof(worker->said), "checkpoint of iteration %d", message->iteration);
+	else if (message->kind == MESSAGE_ENDED)
+		snprintf(worker->said, sizeof(worker->said), "%.159s", message->text);
+}
+
 static void on_message(struct supervise *supervise, struct worker *worker, const struct message *message)
 {
 	struct job_facts facts = {0};
@@ -130,6 +153,7 @@ static void on_message(struct supervise *supervise, struct worker *worker, const
 		job_facts(worker->job, &facts);
 	if (worker->job == NULL || worker->ending.due || strcmp(facts.id, message->job) != 0)
 		return;
+	note_words(worker, message);
 	/* Rows are recorded before anything that the worker said after them. */
 	if (message->kind != MESSAGE_ROW || worker->row_count == JOB_ROWS_MAX)
 		add_rows(supervise, worker);

@@ -38,10 +38,10 @@ static int memory_needed(const char *backend, const struct scan *scan, const str
 int supervise_check_memory(struct supervise *supervise, const struct scan *scan, const struct recipe *recipe,
 			   struct recon_memory *ret_memory, struct error *err)
 {
-	struct worker_facts facts[WORKERS_MAX];
+	struct worker_facts facts[SLOTS_MAX];
 	struct recon_memory memory, best = {0};
 	size_t most = 0;
-	int count = supervise_workers(supervise, facts, WORKERS_MAX), code;
+	int count = supervise_workers(supervise, facts, SLOTS_MAX), code;
 
 	for (int i = 0; i < count; i++) {
 		if (facts[i].bytes_free == 0)

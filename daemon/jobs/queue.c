@@ -61,9 +61,14 @@ static struct queue_entry *not_held(struct queue_entry *entry)
 	return entry;
 }
 
-struct queue_entry *queue_next(const struct queue *queue)
+struct queue_entry *queue_next(const struct queue *queue,
+			       bool (*fits)(const void *context, const struct queue_entry *entry), const void *context)
 {
-	return not_held(queue->first);
+	struct queue_entry *entry = not_held(queue->first);
+
+	while (entry != NULL && !fits(context, entry))
+		entry = not_held(entry->next);
+	return entry;
 }
 
 static bool yields_before(const struct queue_running *a, const struct queue_running *b)
@@ -90,7 +95,7 @@ static int least_of(const struct queue_running *running, int count, enum priorit
 int queue_victim(const struct queue *queue, const enum priority *arriving, const struct queue_running *running,
 		 int count, int idle)
 {
-	const struct queue_entry *entry = queue_next(queue);
+	const struct queue_entry *entry = not_held(queue->first);
 	int coming = idle;
 
 	for (int i = 0; i < count; i++)

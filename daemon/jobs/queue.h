@@ -27,8 +27,9 @@ struct queue {
 void queue_add(struct queue *queue, struct queue_entry *entry);
 void queue_remove(struct queue *queue, struct queue_entry *entry); /* not queued is fine */
 int queue_position(const struct queue_entry *entry);               /* 1 = next; 0: not queued */
-/* The first that is not held, or NULL. */
-struct queue_entry *queue_next(const struct queue *queue);
+/* The first that is not held and fits, or NULL. */
+struct queue_entry *queue_next(const struct queue *queue,
+			       bool (*fits)(const void *context, const struct queue_entry *entry), const void *context);
 
 /* A job that a worker is busy with. */
 struct queue_running {

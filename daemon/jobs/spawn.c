@@ -12,9 +12,19 @@ int child_spawn(const struct spawn_options *options, struct child *ret_child, st
 {
 	const int room = 2 * MESSAGE_BYTES_MAX; /* so that the longest message never waits for the reader */
 	char device[16], threads[16], memory[32], descriptor[16];
-	char *arguments[] = {"cbct-worker", "--backend", (char *)options->backend, "--device", device,
-			     "--threads",   threads,     "--device-memory",        memory,     "--socket",
-			     descriptor,    NULL};
+	char *arguments[] = {"cbct-worker",
+			     "--backend",
+			     (char *)options->backend,
+			     "--device",
+			     device,
+			     "--threads",
+			     threads,
+			     "--device-memory",
+			     memory,
+			     "--socket",
+			     descriptor,
+			     options->test ? "--self-test" : NULL,
+			     NULL};
 	struct child child;
 	int pair[2], code;
 

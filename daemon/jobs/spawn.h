@@ -1,6 +1,7 @@
 #ifndef CBCT_DAEMON_JOBS_SPAWN_H
 #define CBCT_DAEMON_JOBS_SPAWN_H
 
+#include <stdbool.h>
 #include <stddef.h>
 
 #include "daemon/process.h"
@@ -10,6 +11,7 @@ struct spawn_options {
 	const char *worker;  /* path of the program */
 	const char *backend; /* "auto", "cuda", "cpu" */
 	int device, threads;
+	bool test; /* it says hello after its self-test, and not at all when that fails */
 	size_t device_memory;
 };
 

@@ -56,8 +56,7 @@ cJSON *job_state_document(const struct job_record *record)
 	cJSON_AddNumberToObject(document, "iteration", record->iteration);
 	cJSON_AddNumberToObject(document, "attempts", record->attempts);
 	if (record->error_code != 0)
-		cJSON_AddItemToObject(document, "error",
-				      error_document(record->error_code, record->error_pointer, record->error_text));
+		cJSON_AddItemToObject(document, "error", job_error_document(record));
 	return document;
 }
 
@@ -148,6 +147,8 @@ static void enter_end(struct job_record *record, const struct job_change *change
 	snprintf(record->error_text, sizeof(record->error_text), "%s",
 		 change->error_text == NULL ? "" : change->error_text);
 	path_hide(record->error_text, directory);
+	snprintf(record->error_report, sizeof(record->error_report), "%s",
+		 change->report == NULL ? "" : change->report);
 }
 
 static int save_state(struct jobs *jobs, const struct job_record *record, enum job_past past, struct error *err)

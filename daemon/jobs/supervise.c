@@ -55,6 +55,13 @@ void worker_publish(struct supervise *supervise, const struct worker *worker)
 	facts.bytes_total = worker->info.bytes_total;
 	facts.bytes_free = worker->info.bytes_free;
 	facts.stepped = worker->state == WORKER_IDLE || worker->state == WORKER_BUSY ? worker->signs.stepped : 0;
+	facts.heard = worker->signs.heard;
+	facts.step_seconds = worker->signs.step_seconds;
+	facts.fallback = worker->fallback;
+	facts.faults = worker->faults;
+	facts.aside = worker->aside;
+	facts.aside_since = worker->aside_since;
+	facts.test_at = worker->state == WORKER_ABSENT ? worker->start_at : 0;
 	facts.restarts = worker->starts > 0 ? worker->starts - 1 : 0;
 	if (worker->job != NULL) {
 		job_facts(worker->job, &job);
@@ -70,14 +77,17 @@ void worker_publish(struct supervise *supervise, const struct worker *worker)
 static void start_worker(struct supervise *supervise, struct worker *worker)
 {
 	const struct spawn_options options = {.worker = supervise->worker,
-					      .backend = supervise->backend,
+					      .backend = worker->fallback ? "cpu" : supervise->backend,
 					      .device = supervise->devices[worker->index],
+					      .test = worker->aside,
 					      .threads = supervise->options.threads,
 					      .device_memory = supervise->options.device_memory};
 	struct error err;
 	double now = clock_monotonic();
 
 	worker->starts++;
+	worker->testing = worker->aside;
+	worker->hung = false;
 	if (child_spawn(&options, &worker->child, &err) != 0) {
 		worker->failures++;
 		worker->start_at = now + RESTART_LAST;
@@ -130,9 +140,30 @@ static void judge_workers(struct supervise *supervise)
 				 now - signs->heard);
 		else if (verdict == WATCHDOG_HUNG)
 			snprintf(why, sizeof(why), "finished no step for %.1f s and was killed", now - signs->stepped);
+		worker->hung = verdict == WATCHDOG_HUNG;
 		if (verdict != WATCHDOG_ALIVE)
 			worker_kill(supervise, worker, why);
 	}
+}
+
+/* When the worker's next process starts; of a device that was set aside, its next self-test. */
+static void plan_restart(struct worker *worker, const char *how, double now)
+{
+	if (worker->aside) {
+		worker->tests += worker->testing;
+		worker->start_at = now + device_test_delay(worker->tests);
+		log_line(LEVEL_WARNING, "worker %d ended with %s, its device is tested in %.0f s", worker->index, how,
+			 worker->start_at - now);
+		return;
+	}
+	worker->failures = now - worker->born > STEADY ? 1 : worker->failures + 1;
+	worker->start_at = now + restart_delay(worker->failures);
+	/* A worker that has told of its device's error dies of that, which says less. */
+	if (worker->faults == 0 || worker->killed[0] != '\0')
+		snprintf(worker->last_error, sizeof(worker->last_error), "%s",
+			 worker->killed[0] != '\0' ? worker->killed : how);
+	log_line(LEVEL_WARNING, "worker %d ended with %s, the next one starts in %.1f s", worker->index, how,
+		 worker->start_at - now);
 }
 
 static void worker_died(struct supervise *supervise, struct worker *worker, bool stopping)
@@ -151,17 +182,12 @@ static void worker_died(struct supervise *supervise, struct worker *worker, bool
 	worker->state = WORKER_ABSENT;
 	worker->deadline = NEVER;
 	if (worker->job != NULL && !worker->ending.due)
-		worker_end_job(supervise, worker,
-			       &(struct worker_words){
-				   .end = stopping ? END_STOPPED : END_DIED, .code = ERR_INTERNAL, .text = text});
-	if (!stopping) {
-		worker->failures = now - worker->born > STEADY ? 1 : worker->failures + 1;
-		worker->start_at = now + restart_delay(worker->failures);
-		snprintf(worker->last_error, sizeof(worker->last_error), "%s",
-			 worker->killed[0] != '\0' ? worker->killed : how);
-		log_line(LEVEL_WARNING, "worker %d ended with %s, the next one starts in %.1f s", worker->index, how,
-			 worker->start_at - now);
-	}
+		worker_end_job(
+		    supervise, worker,
+		    &(struct worker_words){
+			.end = stopping ? END_STOPPED : END_DIED, .code = ERR_INTERNAL, .text = text, .how = how});
+	if (!stopping)
+		plan_restart(worker, how, now);
 	worker_publish(supervise, worker);
 }
 
@@ -301,7 +327,7 @@ static void read_workers(struct supervise *supervise, const struct pollfd *fds, 
 /* Sleeps until something happens, and reads it. */
 static void wait_and_read(struct supervise *supervise, bool stopping)
 {
-	struct pollfd fds[2 * WORKERS_MAX + 1];
+	struct pollfd fds[2 * SLOTS_MAX + 1];
 	int count = supervise->count;
 	uint64_t ignored;
 
@@ -365,6 +391,7 @@ static void *supervise_loop(void *context)
 
 	while (!stop_asked(supervise)) {
 		look_at_clock(supervise, false);
+		devices_tend(supervise);
 		carry_out_cancels(supervise);
 		attend_all(supervise);
 		move_jobs(supervise);
@@ -406,9 +433,10 @@ static void set_options(struct supervise *supervise, const struct supervise_opti
 		supervise->options.checkpoint_seconds = 5;
 	if (options->stop_seconds <= 0)
 		supervise->options.stop_seconds = 20;
-	supervise->count = options->workers < 1 ? 1 : options->workers > WORKERS_MAX ? WORKERS_MAX : options->workers;
-	for (int i = 0; i < supervise->count; i++)
+	supervise->regular = options->workers < 1 ? 1 : options->workers > WORKERS_MAX ? WORKERS_MAX : options->workers;
+	for (int i = 0; i < supervise->regular; i++)
 		supervise->devices[i] = options->devices != NULL ? options->devices[i] : i;
+	supervise->count = supervise->regular + options->fallback;
 }
 
 int supervise_start(struct jobs *jobs, const struct supervise_options *options, struct supervise **ret_supervise,
@@ -428,11 +456,21 @@ int supervise_start(struct jobs *jobs, const struct supervise_options *options, 
 		return err->code;
 	}
 	for (int i = 0; i < supervise->count; i++) {
-		supervise->workers[i] = (struct worker){
-		    .index = i, .child = {.process.pidfd = -1, .socket = -1}, .deadline = NEVER, .room_since = NEVER};
-		supervise->facts[i].index = i;
+		struct worker *worker = &supervise->workers[i];
+		const bool fallback = i >= supervise->regular;
+
+		*worker = (struct worker){.supervise = supervise,
+					  .index = i,
+					  .child = {.process.pidfd = -1, .socket = -1},
+					  .deadline = NEVER,
+					  .room_since = NEVER,
+					  .fallback = fallback,
+					  .start_at = fallback ? NEVER : 0};
+		snprintf(worker->backend, sizeof(worker->backend), "%s", fallback ? "cpu" : "");
 	}
 	lock_init(&supervise->lock, LOCK_SUPERVISOR);
+	for (int i = 0; i < supervise->count; i++)
+		worker_publish(supervise, &supervise->workers[i]);
 	supervise->wake = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
 	if (supervise->wake < 0) {
 		result = errno;
@@ -474,15 +512,41 @@ void supervise_stop(struct supervise *supervise)
 	free(supervise);
 }
 
+bool worker_answers(const struct worker_facts *facts)
+{
+	const struct watchdog_signs signs = {.busy = facts->state == WORKER_BUSY,
+					     .heard = facts->heard,
+					     .stepped = facts->stepped,
+					     .step_seconds = facts->step_seconds};
+
+	return (facts->state == WORKER_IDLE || facts->state == WORKER_BUSY) &&
+	       watchdog_answers(&signs, clock_monotonic());
+}
+
 bool supervise_ready(struct supervise *supervise)
 {
 	bool ready = false;
 
 	pthread_mutex_lock(&supervise->lock);
 	for (int i = 0; i < supervise->count; i++)
-		ready |= supervise->facts[i].state == WORKER_IDLE || supervise->facts[i].state == WORKER_BUSY;
+		ready |= worker_answers(&supervise->facts[i]);
 	pthread_mutex_unlock(&supervise->lock);
 	return ready;
+}
+
+int supervise_clear(struct supervise *supervise, int index, struct worker_facts *ret_facts, struct error *err)
+{
+	if (index < 0 || index >= supervise->regular)
+		return error_set(err, ERR_NOT_FOUND, "there is no device %d, the last one is %d", index,
+				 supervise->regular - 1);
+	pthread_mutex_lock(&supervise->lock);
+	supervise->clear |= 1ull << index;
+	*ret_facts = supervise->facts[index];
+	pthread_mutex_unlock(&supervise->lock);
+	ret_facts->aside = false;
+	ret_facts->faults = 0;
+	supervise_wake(supervise);
+	return 0;
 }
 
 int supervise_workers(struct supervise *supervise, struct worker_facts *ret_facts, int most)

@@ -8,7 +8,7 @@
  *
  * One thread does all of it, and is the only one that talks to workers and
  * moves jobs out of the queue and through `running`. A worker that dies takes
- * nothing with it: its job is queued again (three times at most, then it has
+ * nothing with it: its job is queued again (route.h says how often, then it has
  * failed), and a new worker is started, later and later while they keep dying.
  *
  * A free worker attends a waiting job with FDK: the stored projections are announced
@@ -21,7 +21,8 @@
  * time is under way.
  *
  * A worker that is stopped or hangs is killed and another one started: watchdog.h
- * says after which time.
+ * says after which time. A job that a device has failed goes on with another one,
+ * and a device that fails time and again is set aside: route.h.
  *
  * Threads: any for everything below; supervise_start and supervise_stop once each.
  */
@@ -34,6 +35,7 @@ struct supervise_options {
 	const int *devices;        /* [workers], the device of each; NULL: 0 .. workers - 1 */
 	int threads;               /* of the CPU backend; 0 = all */
 	size_t device_memory;      /* bytes a worker may use; 0 = what is free */
+	bool fallback;             /* jobs whose devices fail go on with the processor */
 	double checkpoint_seconds; /* of work between two checkpoints of a job; 0 = 5 */
 	double hello_seconds;      /* until a new worker must have spoken; 0 = 30 */
 	double cancel_seconds;     /* until a worker that does not cancel is killed; 0 = 1.5 */
@@ -46,7 +48,7 @@ int supervise_start(struct jobs *jobs, const struct supervise_options *options, 
 /* Running jobs leave a checkpoint and are queued, workers end, within stop_seconds + 2. NULL is fine. */
 void supervise_stop(struct supervise *supervise);
 
-/* At least one worker is there that can take jobs (idle or busy). */
+/* At least one worker is there that can take jobs (idle or busy), and answers. */
 bool supervise_ready(struct supervise *supervise);
 
 /*
@@ -68,10 +70,27 @@ struct worker_facts {
 	size_t bytes_total, bytes_free;
 	char job[ID_SIZE];    /* "" when there is none */
 	double stepped;       /* monotonic: when it was last seen to have finished a step; 0: it does not work */
+	double heard;         /* monotonic: when something came from it */
+	double step_seconds;  /* that its step under way may take by its nature */
+	bool fallback;        /* the processor's, by --fallback cpu: there while it is needed */
+	unsigned faults;      /* errors of its device since a job succeeded on it */
+	bool aside;           /* it is given no jobs */
+	double aside_since;   /* seconds since 1970 */
+	double test_at;       /* monotonic: when its next self-test begins; 0: one is under way */
 	unsigned restarts;    /* since the daemon's start */
 	char last_error[160]; /* why the last one ended, "" */
 };
+/*
+ * A worker that has been silent, or busy with one step that was not announced as a long one, for as long as one that
+ * runs never is (watchdog.h), does not answer. Nobody has to be killed for that to be told.
+ */
+bool worker_answers(const struct worker_facts *facts);
 /* Fills at most `most` entries, returns how many there are. */
 int supervise_workers(struct supervise *supervise, struct worker_facts *ret_facts, int most);
+/*
+ * An operator says that the device of worker `index` is to be given jobs again, and to be started at once where it is
+ * not; *ret_facts is how it will be. ERR_NOT_FOUND: there is no such worker.
+ */
+int supervise_clear(struct supervise *supervise, int index, struct worker_facts *ret_facts, struct error *err);
 
 #endif

@@ -21,6 +21,13 @@ enum watchdog_verdict watchdog_judge(const struct watchdog_signs *signs, double 
 	return now - signs->stepped > step_limit(signs) ? WATCHDOG_HUNG : WATCHDOG_ALIVE;
 }
 
+bool watchdog_answers(const struct watchdog_signs *signs, double now)
+{
+	const double step = signs->step_seconds > WATCHDOG_ANSWER ? signs->step_seconds : WATCHDOG_ANSWER;
+
+	return now - signs->heard <= WATCHDOG_ANSWER && now - signs->stepped <= step;
+}
+
 double watchdog_due(const struct watchdog_signs *signs)
 {
 	const double silent = signs->heard + WATCHDOG_SILENCE, hung = signs->stepped + step_limit(signs);

@@ -23,6 +23,9 @@ double watchdog_attended(double arrived, double since, double now);
  */
 #define WATCHDOG_SILENCE 4.0
 #define WATCHDOG_STEP 13.0
+/* s without a sign or a step after which a worker is no more said to answer: it may come back, and is not killed yet.
+ */
+#define WATCHDOG_ANSWER 4.0
 
 struct watchdog_signs {
 	bool busy;      /* with a job */
@@ -33,6 +36,7 @@ struct watchdog_signs {
 };
 enum watchdog_verdict { WATCHDOG_ALIVE, WATCHDOG_SILENT, WATCHDOG_HUNG };
 enum watchdog_verdict watchdog_judge(const struct watchdog_signs *signs, double now);
+bool watchdog_answers(const struct watchdog_signs *signs, double now);
 /* When the verdict will be another one if nothing comes until then. */
 double watchdog_due(const struct watchdog_signs *signs);
 

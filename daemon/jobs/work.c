@@ -88,7 +88,7 @@ static bool goes_first(const struct candidate *a, const struct candidate *b)
 	return a->priority > b->priority;
 }
 
-struct job *jobs_arriving(struct jobs *jobs, double since, bool *ret_arriving)
+struct job *jobs_arriving(struct jobs *jobs, double since, const struct job_filter *filter, bool *ret_arriving)
 {
 	struct candidate best = {.job = NULL};
 	int count;
@@ -99,7 +99,8 @@ struct job *jobs_arriving(struct jobs *jobs, double since, bool *ret_arriving)
 		struct scan_facts facts;
 		struct error err;
 
-		if (job_obstacle(one.job) != JOB_UNHINDERED || !one.job->request.recipe.fdk.on ||
+		if ((filter != NULL && !filter->fits(filter->context, &one.job->trial)) ||
+		    job_obstacle(one.job) != JOB_UNHINDERED || !one.job->request.recipe.fdk.on ||
 		    store_scan_look(jobs->store, one.job->scan, &facts, &err) != 0 || !facts.convertible ||
 		    facts.complete || !facts.checked)
 			continue;
@@ -229,15 +230,43 @@ enum job_obstacle job_obstacle(struct job *job)
 	return obstacle;
 }
 
-struct job *jobs_next(struct jobs *jobs)
+struct job_trial *job_trial(struct job *job)
+{
+	return &job->trial;
+}
+
+bool jobs_want_processor(struct jobs *jobs)
+{
+	bool want = false;
+
+	pthread_mutex_lock(&jobs->lock);
+	for (int i = 0; i < jobs->count && !want; i++)
+		want = jobs->all[i]->trial.processor && !job_state_ended(jobs->all[i]->record.state);
+	pthread_mutex_unlock(&jobs->lock);
+	return want;
+}
+
+static struct job *job_of_entry(const struct queue_entry *entry)
+{
+	return (struct job *)((char *)entry - offsetof(struct job, entry));
+}
+
+static bool entry_fits(const void *context, const struct queue_entry *entry)
+{
+	const struct job_filter *filter = context;
+
+	return filter == NULL || filter->fits(filter->context, &job_of_entry(entry)->trial);
+}
+
+struct job *jobs_next(struct jobs *jobs, const struct job_filter *filter)
 {
 	struct queue_entry *entry;
 	struct job *job = NULL;
 
 	pthread_mutex_lock(&jobs->lock);
-	entry = queue_next(&jobs->queue);
+	entry = queue_next(&jobs->queue, entry_fits, filter);
 	if (entry != NULL) {
-		job = (struct job *)((char *)entry - offsetof(struct job, entry));
+		job = job_of_entry(entry);
 		job->references++;
 	}
 	pthread_mutex_unlock(&jobs->lock);

@@ -6,6 +6,7 @@
 
 #include "daemon/jobs/digest.h"
 #include "daemon/jobs/outcome.h"
+#include "daemon/jobs/route.h"
 #include "daemon/jobs/spawn.h"
 #include "daemon/jobs/supervise.h"
 #include "daemon/jobs/watchdog.h"
@@ -17,8 +18,9 @@
  * but where something else is said.
  */
 enum {
-	WORKERS_MAX = 64,
-	CRASHES_MAX = 3, /* workers that may die with one job, or fail to read or write for it */
+	WORKERS_MAX = 64, /* devices; one more may stand for the processor */
+	SLOTS_MAX = WORKERS_MAX + 1,
+	CRASHES_MAX = 3, /* times that a worker may fail to read or write for a job */
 };
 #define NEVER 1e300 /* a time of clock_monotonic that does not come */
 #define RETRY 1.0   /* s until a change that the disk refused is tried again */
@@ -35,6 +37,7 @@ struct ending {
 	enum job_state to;
 	int error_code;
 	char error_text[320];
+	char report[JOB_REPORT_SIZE];
 	int checkpoint;
 	bool crashed, yielded;
 	double again; /* monotonic: not before */
@@ -55,6 +58,7 @@ struct syncer {
 };
 
 struct worker {
+	struct supervise *supervise; /* its own, constant as the next */
 	int index;
 	enum worker_state state;
 	struct child child;
@@ -65,6 +69,15 @@ struct worker {
 	char backend[16];
 	struct device_info info; /* of the last hello */
 	char last_error[160];
+	bool fallback;      /* of the processor, by --fallback cpu; its process is there while it is needed */
+	unsigned faults;    /* errors of its device since a job succeeded on it */
+	bool aside;         /* its device is given no jobs until a self-test or an operator clears it */
+	bool testing;       /* its process begins with the self-test */
+	unsigned tests;     /* self-tests that have failed since it was set aside */
+	double aside_since; /* seconds since 1970 */
+	bool hung;          /* the daemon ended the process because it finished no step */
+	char said[160];     /* what its last message about a job was */
+	double work;        /* of its job: voxels times projections */
 	struct watchdog_signs signs;
 	size_t steps;     /* that it has finished by its last sign of life */
 	char killed[128]; /* why the daemon ended the process: it ...; "" as long as it has not */
@@ -95,19 +108,22 @@ struct supervise {
 	struct digester *digester;
 	char worker[1024], backend[16];
 	struct supervise_options options;
-	int count;
-	int devices[WORKERS_MAX];
+	int count;   /* of workers[] */
+	int regular; /* without the fallback */
+	int devices[SLOTS_MAX];
 	int wake; /* eventfd */
 	struct watch jobs_watch, arrivals_watch;
 	pthread_t thread;
 
-	struct worker workers[WORKERS_MAX]; /* the thread's own */
-	double dispatch_at;                 /* monotonic; the thread's own */
-	double review_at;                   /* monotonic: when jobs that are held are looked at, 0: none; its own */
-	double stop_by;                     /* monotonic: the stop's end, NEVER before it; the thread's own */
+	double processor_rate;            /* s that the processor took for an iteration, by `work`; 0: not known */
+	struct worker workers[SLOTS_MAX]; /* the thread's own, as the one before */
+	double dispatch_at;               /* monotonic; the thread's own */
+	double review_at;                 /* monotonic: when jobs that are held are looked at, 0: none; its own */
+	double stop_by;                   /* monotonic: the stop's end, NEVER before it; the thread's own */
 
 	pthread_mutex_t lock; /* guards what follows */
-	struct worker_facts facts[WORKERS_MAX];
+	struct worker_facts facts[SLOTS_MAX];
+	unsigned long long clear; /* bit for each worker that an operator wants cleared */
 	bool stop;
 };
 
@@ -137,6 +153,7 @@ struct worker_words {
 	int code;         /* enum error_code that a failed job bears */
 	int iteration;    /* with END_MADE_ROOM: of the checkpoint */
 	const char *text; /* one sentence */
+	const char *how;  /* how its process ended; NULL: it has not */
 };
 /* The worker is through with its job, which goes where outcome.c says as soon as the catalogue takes that. */
 void worker_end_job(struct supervise *supervise, struct worker *worker, const struct worker_words *words);
@@ -144,6 +161,24 @@ void worker_end_job(struct supervise *supervise, struct worker *worker, const st
 void worker_finish_job(struct supervise *supervise, struct worker *worker);
 /* The job's scan is understood otherwise than when the worker began. */
 bool worker_is_stale(const struct worker *worker);
+
+/* ---- device.c ---- */
+/* The worker's device is at fault for the end of this process, or of this job. */
+bool device_at_fault(const struct worker *worker, enum worker_end end);
+/* Counts an error of the worker's device; with DEVICE_FAULTS of them in a row it is set aside. */
+void device_fault(struct supervise *supervise, struct worker *worker, const char *what);
+/* Its device is given jobs again. */
+void device_clear(struct supervise *supervise, struct worker *worker, const char *why);
+/* Decides where the worker's job goes on, when its run was lost, and keeps that with the job. */
+enum route device_route(struct supervise *supervise, struct worker *worker, enum worker_end end);
+/* Jobs that this worker may be given. */
+bool device_fits(const void *worker, const struct job_trial *trial);
+/* Carries out what operators have asked for; starts the processor's worker when it is needed, and ends it after. */
+void devices_tend(struct supervise *supervise);
+/* The job begins on the processor though it was meant for another device: its document says so. */
+void device_tell_fallback(struct supervise *supervise, struct worker *worker, int iterations);
+/* JSON of how a job's last run was lost, for the document of a job that fails; owned by the caller. NULL: no memory. */
+char *device_report(const struct worker *worker, const struct worker_words *words, int runs);
 
 /* ---- give.c ---- */
 /* Idle workers get jobs. */

@@ -128,6 +128,9 @@ static int connection_open(struct connection *connection, struct error *err)
 	if (result == SQLITE_OK) {
 		sqlite3_busy_timeout(connection->db, 10000);
 		sqlite3_file_control(connection->db, "main", SQLITE_FCNTL_RESERVE_BYTES, &reserve);
+		/* The schema is read by statements within this one, whose results lose what says "damaged" otherwise.
+		 */
+		sqlite3_extended_result_codes(connection->db, 1);
 		result = sqlite3_exec(connection->db,
 				      "PRAGMA page_size = 4096; PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL;"
 				      " PRAGMA foreign_keys = ON;"
@@ -135,6 +138,8 @@ static int connection_open(struct connection *connection, struct error *err)
 				      " PRAGMA secure_delete = ON;",
 				      NULL, NULL, NULL);
 	}
+	if (result == SQLITE_OK)
+		sqlite3_extended_result_codes(connection->db, 0);
 	return result != SQLITE_OK ? connection_error(connection, result & 0xff, "open", err) : 0;
 }
 

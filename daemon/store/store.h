@@ -283,6 +283,7 @@ int store_remove_image(struct store *store, struct stored_scan *scan, enum image
 enum job_state { JOB_WAITING, JOB_QUEUED, JOB_RUNNING, JOB_SUCCEEDED, JOB_FAILED, JOB_CANCELLED, JOB_STATE_COUNT };
 extern const char *const job_state_names[JOB_STATE_COUNT];
 
+enum { JOB_REPORT_SIZE = 1024 };
 struct job_record {
 	char id[ID_SIZE], scan[ID_SIZE];
 	enum job_state state;
@@ -304,6 +305,7 @@ struct job_record {
 	double noise_hu, tv_alpha; /* recon_hooks.denoising; NaN before it was called */
 	int error_code;            /* 0: none */
 	char error_pointer[192], error_text[320];
+	char error_report[JOB_REPORT_SIZE];     /* JSON of how its last run was lost, "" without */
 	double created, queued, started, ended; /* seconds since 1970, 0: not yet */
 	double seconds[STAGE_COUNT];            /* spent in each stage, all attempts together */
 	enum stage stage;

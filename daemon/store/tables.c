@@ -79,6 +79,7 @@ static const struct column job_columns[] = {
     {"error_code", COLUMN_INT, AT(job_record, error_code), .changes = true},
     {"error_pointer", COLUMN_TEXT, AT(job_record, error_pointer), .changes = true},
     {"error_text", COLUMN_TEXT, AT(job_record, error_text), .changes = true},
+    {"error_report", COLUMN_TEXT, AT(job_record, error_report), .initial = "", .changes = true},
     {"created", COLUMN_REAL, AT(job_record, created)},
     {"queued", COLUMN_REAL, AT(job_record, queued), .changes = true},
     {"started", COLUMN_REAL, AT(job_record, started), .changes = true},

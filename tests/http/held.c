@@ -5,8 +5,12 @@
  * CBCT_TEST_HANG is; with --wrap=job_digest_volume, a daemon whose
  * digests do not come while that of CBCT_TEST_HOLD_DIGEST is; and with the calls
  * of the store below, a daemon that cannot record what the file of
- * CBCT_TEST_REFUSE names: "running", "digest" or "volume NAME".
+ * CBCT_TEST_REFUSE names: "running", "digest" or "volume NAME". A worker with CBCT_TEST_CARDS in its environment
+ * pretends that the processor is a card, whose calls fail while the file that it names says so: "CALL DEVICES", where
+ * CALL is "filter" or "iterate", which end in a device error, or "hang" and "kill", which do that at an iteration.
  */
+#include <signal.h>
+#include <stdbool.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -64,6 +68,78 @@ int __wrap_job_digest_volume(struct job *job, const struct volume_record *volume
 	hold("CBCT_TEST_HOLD_DIGEST");
 	return __real_job_digest_volume(job, volume, err);
 }
+
+/* ---- cards ---- */
+
+struct backend;
+const struct backend *__real_backend_find(const char *name) __attribute__((weak));
+const struct backend *__wrap_backend_find(const char *name);
+
+/* The number behind --device. */
+static char device_of_process(void)
+{
+	static char arguments[4096];
+	FILE *file = fopen("/proc/self/cmdline", "re");
+	size_t length = file == NULL ? 0 : fread(arguments, 1, sizeof(arguments) - 1, file);
+
+	if (file != NULL)
+		fclose(file);
+	for (size_t i = 0; i + 10 < length; i += strlen(arguments + i) + 1) {
+		if (strcmp(arguments + i, "--device") == 0)
+			return arguments[i + strlen("--device") + 1];
+	}
+	return '?';
+}
+
+/* The file says that this call fails on this device. */
+static bool trouble(const char *call)
+{
+	FILE *file = fopen(getenv("CBCT_TEST_CARDS"), "re");
+	char wanted[32] = "", devices[64] = "";
+	bool found = file != NULL && fscanf(file, "%31s %63s", wanted, devices) == 2 && strcmp(wanted, call) == 0 &&
+		     strchr(devices, device_of_process()) != NULL;
+
+	if (file != NULL)
+		fclose(file);
+	return found;
+}
+
+static int filter_or_fail(struct plan *plan, const struct stack *from, const int *slots, const int *views, int count,
+			  struct stack *to, struct error *err)
+{
+	if (trouble("filter"))
+		return error_set(err, ERR_DEVICE, "the card has fallen off the bus");
+	return backend_cpu.filter(plan, from, slots, views, count, to, err);
+}
+
+static int iterate_or_fail(struct plan *plan, const struct stack *projections, struct volume *volume,
+			   const struct cancel *cancel, struct iteration_sums *ret_sums, struct error *err)
+{
+	int code = backend_cpu.sart_iterate(plan, projections, volume, cancel, ret_sums, err);
+
+	if (code == 0 && trouble("iterate"))
+		code = error_set(err, ERR_DEVICE, "the card has counted an error that it cannot correct");
+	if (code == 0 && trouble("kill"))
+		raise(SIGKILL);
+	while (code == 0 && trouble("hang"))
+		nanosleep(&(struct timespec){.tv_nsec = 10000000}, NULL);
+	return code;
+}
+
+const struct backend *__wrap_backend_find(const char *name)
+{
+	static struct backend card;
+
+	if (getenv("CBCT_TEST_CARDS") == NULL || strcmp(name, "cuda") != 0)
+		return __real_backend_find(name);
+	card = backend_cpu;
+	card.name = "cuda";
+	card.filter = filter_or_fail;
+	card.sart_iterate = iterate_or_fail;
+	return &card;
+}
+
+/* ---- the catalogue ---- */
 
 static int refuse(const char *what, struct error *err)
 {

@@ -131,12 +131,12 @@ START_TEST(a_waiting_job_is_attended_and_runs_with_its_last_projection)
 	struct error err = {0};
 	bool arriving;
 
-	found = jobs_arriving(state.jobs, 0, &arriving);
+	found = jobs_arriving(state.jobs, 0, NULL, &arriving);
 	ck_assert_ptr_eq(found, job); /* also before anything has come */
 	ck_assert(!arriving);
 	job_release(found);
 	ck_assert_int_eq(job_attend(job, "cpu", "some", &err), 0);
-	ck_assert_ptr_null(jobs_arriving(state.jobs, 0, &arriving));
+	ck_assert_ptr_null(jobs_arriving(state.jobs, 0, NULL, &arriving));
 	job_reconstructed(job, 2);
 	/* its scan is ready, but it is in a worker's hands */
 	state_put(&state, growing, 0, 2, 1);
@@ -167,22 +167,23 @@ START_TEST(who_arrives_goes_before_who_does_not_then_the_higher_priority)
 	struct job *stat = state_post(&state, a, "stat"), *routine = state_post(&state, b, "routine"), *found;
 	bool arriving;
 
-	found = jobs_arriving(state.jobs, 0, &arriving);
+	found = jobs_arriving(state.jobs, 0, NULL, &arriving);
 	ck_assert_ptr_eq(found, stat);
 	ck_assert(!arriving);
 	job_release(found);
 	state_put(&state, b, 0, 0, 1);
-	found = jobs_arriving(state.jobs, 1, &arriving);
+	found = jobs_arriving(state.jobs, 1, NULL, &arriving);
 	ck_assert_ptr_eq(found, routine);
 	ck_assert(arriving);
 	job_release(found);
-	found = jobs_arriving(state.jobs, 1e300, &arriving); /* that was long ago, but the other has had none yet */
+	found =
+	    jobs_arriving(state.jobs, 1e300, NULL, &arriving); /* that was long ago, but the other has had none yet */
 	ck_assert_ptr_eq(found, routine);
 	ck_assert(!arriving);
 	job_release(found);
 	state_put(&state, a, 0, 0, 1);
 	state_put(&state, b, 1, 1, 1);
-	found = jobs_arriving(state.jobs, 1, &arriving); /* both at once */
+	found = jobs_arriving(state.jobs, 1, NULL, &arriving); /* both at once */
 	ck_assert_ptr_eq(found, stat);
 	job_release(found);
 	job_release(stat);
@@ -208,7 +209,7 @@ START_TEST(a_cancel_that_comes_between_the_end_of_a_worker_and_its_record_is_car
 		ck_assert_int_eq(state_of(job), JOB_RUNNING);
 		state_set(job, back[i], &died);
 		ck_assert_int_eq(state_of(job), JOB_CANCELLED);
-		ck_assert_ptr_null(jobs_next(state.jobs));
+		ck_assert_ptr_null(jobs_next(state.jobs, NULL));
 		job_release(job);
 	}
 }
@@ -253,7 +254,7 @@ START_TEST(a_waiting_job_is_found_again_after_a_restart)
 	stored_scan_release(growing);
 	job_release(job);
 	restart();
-	found = jobs_arriving(state.jobs, 1, &arriving);
+	found = jobs_arriving(state.jobs, 1, NULL, &arriving);
 	ck_assert_ptr_nonnull(found);
 	ck_assert(!arriving); /* in this life */
 	ck_assert_int_eq(state_of(found), JOB_WAITING);
@@ -268,7 +269,7 @@ START_TEST(one_that_yielded_stands_in_front_of_its_class)
 	const struct job_change yielded = {.checkpoint = 1, .yielded = true};
 
 	state_set(stat, JOB_CANCELLED, NULL);
-	next = jobs_next(state.jobs);
+	next = jobs_next(state.jobs, NULL);
 	ck_assert_ptr_eq(next, first);
 	job_release(next);
 	state_set(first, JOB_RUNNING, NULL);

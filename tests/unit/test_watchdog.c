@@ -55,6 +55,26 @@ START_TEST(silence_and_standing_still_are_told_from_work)
 }
 END_TEST
 
+START_TEST(a_worker_is_not_said_to_answer_before_it_is_killed)
+{
+	static const struct {
+		struct watchdog_signs signs;
+		double now;
+		bool answers;
+	} cases[] = {
+	    {{.heard = 100, .stepped = 100}, 104, true},
+	    {{.heard = 100, .stepped = 100}, 104.1, false},
+	    {{.busy = true, .heard = 104, .stepped = 100}, 104, true},
+	    {{.busy = true, .heard = 105, .stepped = 100}, 105, false},
+	    {{.busy = true, .heard = 105, .stepped = 100, .step_seconds = 60}, 105, true},
+	    {{.busy = true, .heard = 100, .stepped = 100, .step_seconds = 60}, 105, false},
+	};
+
+	for (unsigned i = 0; i < sizeof(cases) / sizeof(cases[0]); i++)
+		ck_assert_int_eq(watchdog_answers(&cases[i].signs, cases[i].now), cases[i].answers);
+}
+END_TEST
+
 Suite *watchdog_suite(void);
 Suite *watchdog_suite(void)
 {
@@ -63,6 +83,7 @@ Suite *watchdog_suite(void)
 
 	tcase_add_test(tests, patience_is_for_a_scan_whose_projections_come);
 	tcase_add_test(tests, silence_and_standing_still_are_told_from_work);
+	tcase_add_test(tests, a_worker_is_not_said_to_answer_before_it_is_killed);
 	suite_add_tcase(suite, tests);
 	return suite;
 }

@@ -52,9 +52,10 @@ async function showDevices() {
 		return
 	try {
 		const { devices: list } = await get('/v1/devices')
-		const able = list.filter(device => ['idle', 'busy'].includes(device.state))
-		write(devices, able.length > 0 ? able.map(device => device.device ?? device.backend).join(', ') : 'no worker can take a job')
-		devices.classList.toggle('bad', able.length === 0)
+		const able = list.filter(device => device.answers)
+		const aside = list.filter(device => device.set_aside).length
+		write(devices, able.length > 0 ? able.map(device => device.device ?? device.backend).join(', ') + (aside > 0 ? `, ${aside} set aside` : '') : 'no worker can take a job')
+		devices.classList.toggle('bad', able.length === 0 || aside > 0)
 		const { entries } = await get('/v1/quarantine')
 		write(quarantine, entries.length > 0 ? `${entries.length} set aside in quarantine` : '')
 		quarantine.title = entries.map(entry => `${entry.from ?? entry.name}: ${entry.why ?? 'no note'}`).join('\n')

@@ -1,0 +1,213 @@
+/* Devices that fail: where their jobs go on, and which devices get no more jobs (route.h decides). */
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "daemon/jobs/kernel_log.h"
+#include "daemon/jobs/workers.h"
+#include "daemon/log.h"
+#include "proto/clock.h"
+#include "proto/json.h"
+
+/* A processor has no driver to hang in; what it waits for is the disk. */
+static bool is_processor(const struct worker *worker)
+{
+	return worker->fallback || strcmp(worker->backend, "cpu") == 0;
+}
+
+bool device_at_fault(const struct worker *worker, enum worker_end end)
+{
+	return end == END_DEVICE || (worker->hung && !is_processor(worker));
+}
+
+static void set_aside(struct supervise *supervise, struct worker *worker)
+{
+	worker->aside = true;
+	worker->tests = 0;
+	worker->aside_since = clock_realtime();
+	log_line(LEVEL_ERROR, "device %d is set aside after %u errors in a row: %s", supervise->devices[worker->index],
+		 worker->faults, worker->last_error);
+	/* Whatever state it is in: the next process begins with the self-test. */
+	if (worker->state == WORKER_IDLE) {
+		worker->state = WORKER_ENDING;
+		worker->deadline = clock_monotonic() + EXIT;
+		worker_order(worker, MESSAGE_QUIT);
+	}
+}
+
+void device_fault(struct supervise *supervise, struct worker *worker, const char *what)
+{
+	worker->faults++;
+	snprintf(worker->last_error, sizeof(worker->last_error), "%s", what);
+	/* There is no other place to go to from the fallback. */
+	if (worker->faults >= DEVICE_FAULTS && !worker->aside && !worker->fallback)
+		set_aside(supervise, worker);
+}
+
+void device_clear(struct supervise *supervise, struct worker *worker, const char *why)
+{
+	if (worker->aside)
+		log_line(LEVEL_WARNING, "device %d is given jobs again: %s", supervise->devices[worker->index], why);
+	worker->aside = false;
+	worker->faults = 0;
+	worker->tests = 0;
+}
+
+/* Another device than the worker's, of those that the job has not left, answers. */
+static bool other_answers(const struct supervise *supervise, const struct worker *worker, unsigned long long left)
+{
+	for (int i = 0; i < supervise->regular; i++) {
+		const struct worker *other = &supervise->workers[i];
+
+		if (other != worker && !other->aside && (left >> i & 1) == 0 &&
+		    (other->state == WORKER_IDLE || other->state == WORKER_BUSY))
+			return true;
+	}
+	return false;
+}
+
+static bool all_aside(const struct supervise *supervise)
+{
+	for (int i = 0; i < supervise->regular; i++) {
+		if (!supervise->workers[i].aside)
+			return false;
+	}
+	return true;
+}
+
+enum route device_route(struct supervise *supervise, struct worker *worker, enum worker_end end)
+{
+	struct job_trial *trial = job_trial(worker->job);
+	const unsigned long long here = worker->fallback ? 0 : 1ull << worker->index;
+	struct job_record record;
+	struct route_facts facts;
+	enum route route;
+
+	job_record(worker->job, &record);
+	trial->deaths = trial->worker == worker->index && record.crashes > 0 ? trial->deaths + 1 : 1;
+	trial->worker = worker->index;
+	facts = (struct route_facts){.device_error = device_at_fault(worker, end),
+				     .deaths = trial->deaths,
+				     .runs = record.crashes + 1,
+				     .other = !worker->fallback && other_answers(supervise, worker, trial->left),
+				     .processor = supervise->count > supervise->regular && !worker->fallback};
+	route = route_of(&facts);
+	if (route == ROUTE_OTHER)
+		trial->left |= here;
+	trial->processor |= route == ROUTE_PROCESSOR;
+	return route;
+}
+
+bool device_fits(const void *context, const struct job_trial *trial)
+{
+	const struct worker *worker = context;
+	const struct supervise *supervise = worker->supervise;
+
+	if (worker->fallback)
+		return trial->processor || all_aside(supervise);
+	if (trial->processor || worker->aside)
+		return false;
+	return (trial->left >> worker->index & 1) == 0 || !other_answers(supervise, worker, trial->left);
+}
+
+/* An operator's word, from another thread. */
+static void clear_asked(struct supervise *supervise)
+{
+	unsigned long long clear;
+
+	pthread_mutex_lock(&supervise->lock);
+	clear = supervise->clear;
+	supervise->clear = 0;
+	pthread_mutex_unlock(&supervise->lock);
+	for (int i = 0; i < supervise->regular && clear != 0; i++) {
+		struct worker *worker = &supervise->workers[i];
+
+		if ((clear >> i & 1) == 0)
+			continue;
+		device_clear(supervise, worker, "an operator cleared it");
+		worker->failures = 0;
+		if (worker->state == WORKER_ABSENT)
+			worker->start_at = clock_monotonic();
+		worker_publish(supervise, worker);
+	}
+}
+
+static void tend_processor(struct supervise *supervise)
+{
+	struct worker *worker = &supervise->workers[supervise->regular];
+	const bool wanted = all_aside(supervise) || jobs_want_processor(supervise->jobs);
+
+	if (worker->state == WORKER_ABSENT && !wanted) {
+		worker->start_at = NEVER;
+	} else if (worker->state == WORKER_ABSENT && worker->start_at == NEVER) {
+		worker->start_at = clock_monotonic();
+	} else if (worker->state == WORKER_IDLE && worker->job == NULL && !wanted) {
+		worker_order(worker, MESSAGE_QUIT);
+		worker->state = WORKER_ENDING;
+		worker->deadline = clock_monotonic() + EXIT;
+		worker_publish(supervise, worker);
+	}
+}
+
+void devices_tend(struct supervise *supervise)
+{
+	clear_asked(supervise);
+	if (supervise->count > supervise->regular)
+		tend_processor(supervise);
+}
+
+void device_tell_fallback(struct supervise *supervise, struct worker *worker, int iterations)
+{
+	const double step = supervise->processor_rate * worker->work;
+	char text[320], last[160] = "all devices are set aside";
+	struct error ignored;
+	int index = job_trial(worker->job)->worker;
+
+	if (job_trial(worker->job)->processor)
+		snprintf(last, sizeof(last), "device %d failed (%.120s)", supervise->devices[index],
+			 supervise->workers[index].last_error);
+	if (step > 0 && iterations > 0)
+		snprintf(text, sizeof(text),
+			 "%s; the processor needs about %.2g s for an iteration, and %.0f s for %d of them", last, step,
+			 step * iterations, iterations);
+	else
+		snprintf(text, sizeof(text),
+			 "%s; how long the processor takes is not known before it has begun (eta_s)", last);
+	job_add_warning(worker->job, "processor_fallback", text, &ignored);
+}
+
+/* ---- the report of a job that has failed ---- */
+
+static void add_text(cJSON *object, const char *name, const char *text)
+{
+	if (text == NULL || text[0] == '\0')
+		cJSON_AddNullToObject(object, name);
+	else
+		cJSON_AddStringToObject(object, name, text);
+}
+
+char *device_report(const struct worker *worker, const struct worker_words *words, int runs)
+{
+	cJSON *document = cJSON_CreateObject(), *device;
+	char kernel[240], *text;
+	int number = 0;
+
+	kernel_log_line(KERNEL_LOG, worker->child.process.pid, worker->born, kernel, sizeof(kernel));
+	cJSON_AddNumberToObject(document, "runs", runs);
+	add_text(document, "last_message", worker->said);
+	add_text(document, "ended", words->how);
+	if (words->how != NULL && sscanf(words->how, "signal %d", &number) == 1)
+		cJSON_AddNumberToObject(document, "signal", number);
+	else
+		cJSON_AddNullToObject(document, "signal");
+	add_text(document, "kernel", kernel);
+	device = cJSON_AddObjectToObject(document, "device");
+	cJSON_AddNumberToObject(device, "index", worker->index);
+	add_text(device, "name", worker->info.name);
+	add_text(device, "driver", worker->info.driver);
+	cJSON_AddNumberToObject(device, "errors", worker->faults);
+	cJSON_AddBoolToObject(device, "set_aside", worker->aside);
+	text = json_print(document, NULL);
+	cJSON_Delete(document);
+	return text;
+}
