@@ -40,8 +40,9 @@ struct saver {
 	bool ended, abandoned, synced;
 	struct error trouble;
 	size_t taken; /* bytes of `blank` that the preparers have populated, or are about to */
+	bool set;     /* `blank` is mapped, by the first of the preparers */
 	bool enough;  /* they shall stop */
-	bool refused; /* the disk had no pages for all of it */
+	bool refused; /* the disk had no space or no pages for all of it */
 
 	bool sealed; /* constant */
 	struct seal_maker seal;
@@ -52,6 +53,7 @@ struct saver {
 	struct mapped file;
 	pthread_t syncer;
 
+	/* The first preparer's while they run, the caller's when they have been joined. */
 	struct mapped blank;
 	char blank_path[PATH_MAX];
 	pthread_t preparers[PREPARERS];
@@ -108,12 +110,13 @@ static size_t file_bytes(const struct saver *saver, size_t content)
 
 /* ---- the next file ---- */
 
-static void *prepare_loop(void *context)
+static void populate_blank(struct saver *saver)
 {
-	struct saver *saver = context;
 	struct error ignored;
 
 	pthread_mutex_lock(&saver->lock);
+	while (!saver->set && !saver->refused && !saver->enough)
+		pthread_cond_wait(&saver->changed, &saver->lock);
 	while (!saver->enough && !saver->refused && saver->taken < saver->blank.size) {
 		size_t first = saver->taken, bytes = smaller(PIECE_BYTES, saver->blank.size - first);
 		int code;
@@ -125,24 +128,52 @@ static void *prepare_loop(void *context)
 		saver->refused |= code != 0;
 	}
 	pthread_mutex_unlock(&saver->lock);
+}
+
+static void *prepare_loop(void *context)
+{
+	populate_blank(context);
 	return NULL;
 }
 
+/* Setting the file's space aside takes tens of milliseconds where the file system has no call for it. */
+static void *map_blank(void *context)
+{
+	struct saver *saver = context;
+	struct mapped *blank = &saver->blank;
+	struct error ignored;
+	bool mapped = blank->bytes != NULL || durable_map(&blank->file, blank->size, &blank->bytes, &ignored) == 0;
+
+	pthread_mutex_lock(&saver->lock);
+	saver->set = mapped;
+	saver->refused = !mapped;
+	pthread_cond_broadcast(&saver->changed);
+	pthread_mutex_unlock(&saver->lock);
+	populate_blank(saver);
+	return NULL;
+}
+
+/* Behind it there is a blank file with its space, or none. */
 static void stop_preparing(struct saver *saver)
 {
+	if (saver->preparing == 0)
+		return;
 	pthread_mutex_lock(&saver->lock);
 	saver->enough = true;
+	pthread_cond_broadcast(&saver->changed);
 	pthread_mutex_unlock(&saver->lock);
 	while (saver->preparing > 0)
 		pthread_join(saver->preparers[--saver->preparing], NULL);
 	saver->blank.populated = saver->refused ? 0 : saver->taken;
+	if (saver->blank.bytes == NULL)
+		durable_abandon(&saver->blank.file);
 }
 
 static void drop_blank(struct saver *saver)
 {
+	stop_preparing(saver);
 	if (saver->blank.bytes == NULL)
 		return;
-	stop_preparing(saver);
 	unmap(&saver->blank);
 	durable_abandon(&saver->blank.file);
 }
@@ -152,20 +183,24 @@ void saver_prepare(struct saver *saver, const char *path, size_t content)
 	size_t bytes = file_bytes(saver, content);
 	struct error ignored;
 
+	/* Once more over all of it: pages that were written back meanwhile cost as much as new ones. */
+	stop_preparing(saver);
 	if (saver->blank.bytes != NULL && saver->blank.size != bytes)
 		drop_blank(saver);
 	if (saver->blank.bytes == NULL) {
 		snprintf(saver->blank_path, sizeof(saver->blank_path), "%s", path);
-		if (map_new(&saver->blank, saver->blank_path, bytes, &ignored) != 0)
+		saver->blank = (struct mapped){.size = bytes};
+		if (durable_open(&saver->blank.file, saver->blank_path, 0, &ignored) != 0)
 			return;
 	}
-	/* Once more over all of it: pages that were written back meanwhile cost as much as new ones. */
-	stop_preparing(saver);
 	saver->taken = 0;
-	saver->enough = saver->refused = false;
+	saver->set = saver->enough = saver->refused = false;
 	while (saver->preparing < PREPARERS &&
-	       pthread_create(&saver->preparers[saver->preparing], NULL, prepare_loop, saver) == 0)
+	       pthread_create(&saver->preparers[saver->preparing], NULL,
+			      saver->preparing == 0 ? map_blank : prepare_loop, saver) == 0)
 		saver->preparing++;
+	if (saver->preparing == 0 && saver->blank.bytes == NULL)
+		durable_abandon(&saver->blank.file);
 }
 
 /* ---- the thread of a file ---- */
@@ -298,11 +333,11 @@ bool saver_busy(const struct saver *saver)
 
 static int take_file(struct saver *saver, size_t size, struct error *err)
 {
+	stop_preparing(saver);
 	if (saver->blank.bytes == NULL || saver->blank.size != size) {
 		drop_blank(saver); /* of no use, and its space may be needed */
 		return map_new(&saver->file, saver->path, size, err);
 	}
-	stop_preparing(saver);
 	saver->file = saver->blank;
 	saver->file.file.path = saver->path;
 	saver->blank.bytes = NULL;

@@ -17,23 +17,27 @@ static const float STILL = 0.1f, LARGER = 3, WILDER = 9, FARTHER = 3, STEADY = 4
 static const double MOST = 0.1;      /* of all pixels */
 static const double AXIS_PIXELS = 4; /* between a ray and the axis */
 
-/* Over the views looked at; p counts from the first one that a pixel is good in, so that rounding leaves no variance.
+/*
+ * Over the views looked at, [row][column] each, so that many pixels are added at once; p counts from the first view
+ * that a pixel is good in, so that rounding leaves no variance.
  */
 struct sums {
-	float first, p, p2;
-	float e, e2, magnitude; /* of e */
-	int views;
+	float *views; /* those that the pixel is good in */
+	float *first, *p, *p2;
+	float *e, *e2, *magnitude; /* of e */
+	float *all;                /* the memory of these */
 };
+enum { SUMS = 7 };
 
 struct stuck {
 	const struct linearise *linearise;
 	const struct geometry *geometry;
 	int views;
-	struct sums *sums;  /* [row][column] */
-	float *values;      /* [row][column], line integrals of a view */
-	float *medians;     /* [row][column], of each pixel's neighbours in the view */
-	unsigned char *bad; /* [row][column], of the view: the pixel says nothing there */
-	bool *some_bad;     /* [row], of the view */
+	struct sums sums;
+	float *values;  /* [row][column], line integrals of a view */
+	float *medians; /* [row][column], of each pixel's neighbours in the view */
+	float *good;    /* [row][column], of the view: 1; 0 where the pixel says nothing */
+	bool *some_bad; /* [row], of the view */
 	unsigned char *map;
 	float largest;         /* line integral */
 	struct beside *beside; /* NULL: the caller's thread does it all */
@@ -131,6 +135,22 @@ static void beside_free(struct beside *beside)
 	free(beside);
 }
 
+static void sums_new(struct sums *ret, size_t pixels)
+{
+	float *all = calloc(SUMS * pixels, sizeof(*all));
+
+	if (all == NULL)
+		return;
+	*ret = (struct sums){.all = all,
+			     .views = all,
+			     .first = all + pixels,
+			     .p = all + 2 * pixels,
+			     .p2 = all + 3 * pixels,
+			     .e = all + 4 * pixels,
+			     .e2 = all + 5 * pixels,
+			     .magnitude = all + 6 * pixels};
+}
+
 int stuck_new(const struct linearise *linearise, const struct geometry *geometry, bool beside, struct stuck **ret_stuck,
 	      struct error *err)
 {
@@ -147,13 +167,13 @@ int stuck_new(const struct linearise *linearise, const struct geometry *geometry
 	stuck->linearise = linearise;
 	stuck->geometry = geometry;
 	stuck->views = geometry->count < STUCK_VIEWS ? geometry->count : STUCK_VIEWS;
-	stuck->sums = calloc(pixels, sizeof(*stuck->sums));
+	sums_new(&stuck->sums, pixels);
 	stuck->values = malloc(pixels * sizeof(*stuck->values));
 	stuck->medians = malloc(pixels * sizeof(*stuck->medians));
-	stuck->bad = malloc(pixels);
+	stuck->good = malloc(pixels * sizeof(*stuck->good));
 	stuck->some_bad = malloc((size_t)geometry->rows * sizeof(*stuck->some_bad));
 	stuck->map = calloc(pixels, 1);
-	if (stuck->sums == NULL || stuck->values == NULL || stuck->medians == NULL || stuck->bad == NULL ||
+	if (stuck->sums.all == NULL || stuck->values == NULL || stuck->medians == NULL || stuck->good == NULL ||
 	    stuck->some_bad == NULL || stuck->map == NULL) {
 		stuck_free(stuck);
 		return error_set(err, ERR_NO_MEMORY, "no memory to look for stuck pixels in %d x %d", geometry->columns,
@@ -173,10 +193,10 @@ void stuck_free(struct stuck *stuck)
 	if (stuck == NULL)
 		return;
 	beside_free(stuck->beside);
-	free(stuck->sums);
+	free(stuck->sums.all);
 	free(stuck->values);
 	free(stuck->medians);
-	free(stuck->bad);
+	free(stuck->good);
 	free(stuck->some_bad);
 	free(stuck->map);
 	free(stuck);
@@ -193,15 +213,14 @@ bool stuck_wants(const struct stuck *stuck, int view)
 static void read_row(struct stuck *stuck, const void *samples, int row)
 {
 	const size_t columns = (size_t)stuck->geometry->columns, from = (size_t)row * columns;
-	unsigned char some = 0;
-	float last = 0;
+	float last = 0, good = 0;
 
 	for (size_t at = from; at < from + columns; at++) {
-		stuck->bad[at] = linearise_pixel(stuck->linearise, samples, at, &last) != PIXEL_GOOD;
+		stuck->good[at] = linearise_pixel(stuck->linearise, samples, at, &last) == PIXEL_GOOD ? 1 : 0;
 		stuck->values[at] = last;
-		some |= stuck->bad[at];
+		good += stuck->good[at];
 	}
-	stuck->some_bad[row] = some != 0;
+	stuck->some_bad[row] = good < (float)columns;
 }
 
 /* Beside an edge of the detector there is no other side: the neighbours lie along the edge and straight inwards. */
@@ -259,7 +278,7 @@ static float median_of(const struct stuck *stuck, int column, int row)
 
 	neighbours_of(stuck->geometry, column, row, near);
 	for (int i = 0; i < NEIGHBOURS; i++)
-		if (!stuck->bad[near[i]])
+		if (stuck->good[near[i]] != 0)
 			values[count++] = stuck->values[near[i]];
 	if (count == 0)
 		return stuck->values[(size_t)row * (size_t)stuck->geometry->columns + (size_t)column];
@@ -267,56 +286,56 @@ static float median_of(const struct stuck *stuck, int column, int row)
 	return 0.5f * (values[(count - 1) / 2] + values[count / 2]);
 }
 
+static inline void exchange(float *low, float *high)
+{
+	const float a = *low, b = *high;
+
+	*low = a < b ? a : b;
+	*high = a > b ? a : b;
+}
+
 /*
- * The medians of a row's pixels that have neighbours on all sides, for many columns at once: the exchanges are those of
- * Batcher's merge sort of eight values (Batcher 1968) but those that the middle two do not depend on.
+ * The exchanges are those of Batcher's merge sort of eight values (Batcher 1968) but those that the middle two do not
+ * depend on. They are written out, so that the compiler keeps many pixels' values in registers.
  */
+static inline float median_of_eight(float a, float b, float c, float d, float e, float f, float g, float h)
+{
+	exchange(&a, &b), exchange(&c, &d), exchange(&e, &f), exchange(&g, &h);
+	exchange(&a, &c), exchange(&b, &d), exchange(&e, &g), exchange(&f, &h);
+	exchange(&b, &c), exchange(&f, &g);
+	exchange(&a, &e), exchange(&b, &f), exchange(&c, &g), exchange(&d, &h);
+	exchange(&c, &e), exchange(&d, &f);
+	exchange(&d, &e);
+	return 0.5f * (d + e);
+}
+
+/* The medians of a row's pixels that have neighbours on all sides. */
 static void medians_inside(const struct stuck *stuck, int row)
 {
-	static const int exchanges[][2] = {{0, 1}, {2, 3}, {4, 5}, {6, 7}, {0, 2}, {1, 3}, {4, 6}, {5, 7}, {1, 2},
-					   {5, 6}, {0, 4}, {1, 5}, {2, 6}, {3, 7}, {2, 4}, {3, 5}, {3, 4}};
-	enum { LANES = 16, EXCHANGES = sizeof(exchanges) / sizeof(exchanges[0]) };
-	const int columns = stuck->geometry->columns, behind = columns - AWAY;
-	const float *at = stuck->values + (size_t)row * (size_t)columns;
-
-	for (int first = AWAY; first < behind; first += LANES) {
-		const int count = behind - first < LANES ? behind - first : LANES;
-		float values[NEIGHBOURS][LANES] = {{0}};
-
-		for (int i = 0; i < NEIGHBOURS; i++)
-			memcpy(values[i], at + AWAY * (AROUND[i][0] * columns + AROUND[i][1]) + first,
-			       (size_t)count * sizeof(*at));
-		for (int k = 0; k < EXCHANGES; k++) {
-			float *low = values[exchanges[k][0]], *high = values[exchanges[k][1]];
+	const ptrdiff_t columns = stuck->geometry->columns;
+	const float *at = stuck->values + row * columns, *before = at - AWAY * columns, *behind = at + AWAY * columns;
+	float *medians = stuck->medians + row * columns;
 
 #pragma omp simd
-			for (int lane = 0; lane < LANES; lane++) {
-				const float a = low[lane], b = high[lane];
-
-				low[lane] = a < b ? a : b;
-				high[lane] = a > b ? a : b;
-			}
-		}
-		for (int lane = 0; lane < count; lane++)
-			stuck->medians[(size_t)row * (size_t)columns + (size_t)(first + lane)] =
-			    0.5f * (values[NEIGHBOURS / 2 - 1][lane] + values[NEIGHBOURS / 2][lane]);
-	}
+	for (ptrdiff_t c = AWAY; c < columns - AWAY; c++)
+		medians[c] = median_of_eight(before[c - AWAY], before[c], before[c + AWAY], at[c - AWAY], at[c + AWAY],
+					     behind[c - AWAY], behind[c], behind[c + AWAY]);
 }
 
 /* Again, without the neighbours that say nothing, for those pixels of medians_inside that have such. */
 static void medians_beside_bad(const struct stuck *stuck, int row)
 {
 	const int columns = stuck->geometry->columns;
-	const unsigned char *at = stuck->bad + (size_t)row * (size_t)columns;
+	const float *at = stuck->good + (size_t)row * (size_t)columns;
 
 	if (!stuck->some_bad[row - AWAY] && !stuck->some_bad[row] && !stuck->some_bad[row + AWAY])
 		return;
 	for (int column = AWAY; column < columns - AWAY; column++) {
-		unsigned char some = 0;
+		float good = 0;
 
 		for (int i = 0; i < NEIGHBOURS; i++)
-			some |= at[AWAY * (AROUND[i][0] * columns + AROUND[i][1]) + column];
-		if (some)
+			good += at[AWAY * (AROUND[i][0] * columns + AROUND[i][1]) + column];
+		if (good < NEIGHBOURS)
 			stuck->medians[(size_t)row * (size_t)columns + (size_t)column] = median_of(stuck, column, row);
 	}
 }
@@ -335,23 +354,29 @@ static void medians_of_row(const struct stuck *stuck, int row)
 			stuck->medians[(size_t)row * (size_t)columns + (size_t)column] = median_of(stuck, column, row);
 }
 
+/* Without branches, so that the compiler adds several pixels at once. */
 static void add_row(struct stuck *stuck, int row)
 {
-	const size_t columns = (size_t)stuck->geometry->columns, from = (size_t)row * columns;
+	const int columns = stuck->geometry->columns;
+	const size_t from = (size_t)row * (size_t)columns;
+	const float *values = stuck->values + from, *medians = stuck->medians + from, *good = stuck->good + from;
+	float *views = stuck->sums.views + from, *first = stuck->sums.first + from, *p = stuck->sums.p + from,
+	      *p2 = stuck->sums.p2 + from, *e = stuck->sums.e + from, *e2 = stuck->sums.e2 + from,
+	      *magnitude = stuck->sums.magnitude + from;
 
-	for (size_t at = from; at < from + columns; at++) {
-		struct sums *sums = &stuck->sums[at];
-		const float p = stuck->values[at], e = p - stuck->medians[at];
+#pragma omp simd
+	for (int c = 0; c < columns; c++) {
+		const float apart = good[c] * (values[c] - medians[c]);
+		float moved;
 
-		if (stuck->bad[at])
-			continue;
-		if (sums->views++ == 0)
-			sums->first = p;
-		sums->p += p - sums->first;
-		sums->p2 += (p - sums->first) * (p - sums->first);
-		sums->e += e;
-		sums->e2 += e * e;
-		sums->magnitude += fabsf(e);
+		first[c] += views[c] == 0 ? good[c] * values[c] : 0;
+		moved = good[c] * (values[c] - first[c]);
+		views[c] += good[c];
+		p[c] += moved;
+		p2[c] += moved * moved;
+		e[c] += apart;
+		e2[c] += apart * apart;
+		magnitude[c] += fabsf(apart);
 	}
 }
 
@@ -393,16 +418,16 @@ struct behaviour {
 	float spread;             /* mean |e| squared, in units of the mean square: small where few views make it */
 };
 
-static struct behaviour behaviour_of(const struct sums *sums)
+static struct behaviour behaviour_of(const struct sums *sums, size_t at)
 {
-	const float n = sums->views > 0 ? (float)sums->views : 1, mean = sums->p / n, e = sums->e / n;
+	const float n = fmaxf(sums->views[at], 1), mean = sums->p[at] / n, e = sums->e[at] / n, e2 = sums->e2[at];
 
 	return (struct behaviour){
-	    .varies = fmaxf(sums->p2 / n - mean * mean, 0),
-	    .rms = sqrtf(sums->e2 / n),
+	    .varies = fmaxf(sums->p2[at] / n - mean * mean, 0),
+	    .rms = sqrtf(e2 / n),
 	    .mean = fabsf(e),
-	    .wanders = fmaxf(sums->e2 / n - e * e, 0),
-	    .spread = sums->e2 > 0 ? sums->magnitude * sums->magnitude / (n * sums->e2) : 0,
+	    .wanders = fmaxf(e2 / n - e * e, 0),
+	    .spread = e2 > 0 ? sums->magnitude[at] * sums->magnitude[at] / (n * e2) : 0,
 	};
 }
 
@@ -431,12 +456,12 @@ static bool is_on_axis(const struct stuck *stuck, int column, int row)
 /* True if a pixel was good in half of the views at least. */
 static bool is_known(const struct stuck *stuck, size_t at)
 {
-	return 2 * stuck->sums[at].views >= stuck->views;
+	return 2 * stuck->sums.views[at] >= (float)stuck->views;
 }
 
-static float mean_of(const struct sums *sums)
+static float mean_of(const struct sums *sums, size_t at)
 {
-	return sums->first + sums->p / (float)(sums->views > 0 ? sums->views : 1);
+	return sums->first[at] + sums->p[at] / fmaxf(sums->views[at], 1);
 }
 
 /*
@@ -446,24 +471,25 @@ static float mean_of(const struct sums *sums)
 static bool is_alone(const struct stuck *stuck, int column, int row, bool wanders)
 {
 	const int columns = stuck->geometry->columns, rows = stuck->geometry->rows;
-	const struct sums *own = &stuck->sums[(size_t)row * (size_t)columns + (size_t)column];
-	const float e = own->e / (float)own->views, least = 0.25f * behaviour_of(own).wanders;
+	const struct sums *sums = &stuck->sums;
+	const size_t own = (size_t)row * (size_t)columns + (size_t)column;
+	const float e = sums->e[own] / sums->views[own], least = 0.25f * behaviour_of(sums, own).wanders;
 	int like = 0, bad = 0;
 
 	for (int i = 0; i < NEIGHBOURS; i++) {
 		const int r = row + AROUND[i][0], c = column + AROUND[i][1];
-		const struct sums *other;
+		const size_t other = (size_t)r * (size_t)columns + (size_t)c;
 		float apart;
 
 		if (r < 0 || r >= rows || c < 0 || c >= columns)
 			continue;
-		if (!is_known(stuck, (size_t)r * (size_t)columns + (size_t)c)) {
+		if (!is_known(stuck, other)) {
 			bad++;
 			continue;
 		}
-		other = &stuck->sums[(size_t)r * (size_t)columns + (size_t)c];
-		apart = mean_of(own) - mean_of(other);
-		like += wanders ? behaviour_of(other).wanders > least : !(e > 0 ? apart > 0.5f * e : apart < 0.5f * e);
+		apart = mean_of(sums, own) - mean_of(sums, other);
+		like += wanders ? behaviour_of(sums, other).wanders > least
+				: !(e > 0 ? apart > 0.5f * e : apart < 0.5f * e);
 	}
 	return like <= 1 && bad <= NEIGHBOURS - BESIDE_LEAST;
 }
@@ -472,7 +498,7 @@ static bool is_stuck(const struct stuck *stuck, int column, int row)
 {
 	const float whole = fminf(stuck->largest, 1);
 	const size_t at = (size_t)row * (size_t)stuck->geometry->columns + (size_t)column;
-	const struct behaviour own = behaviour_of(&stuck->sums[at]);
+	const struct behaviour own = behaviour_of(&stuck->sums, at);
 	float varies[NEIGHBOURS], rms[NEIGHBOURS], mean[NEIGHBOURS], wanders[NEIGHBOURS];
 	size_t near[NEIGHBOURS];
 
@@ -483,7 +509,7 @@ static bool is_stuck(const struct stuck *stuck, int column, int row)
 		return false;
 	neighbours_of(stuck->geometry, column, row, near);
 	for (int i = 0; i < NEIGHBOURS; i++) {
-		const struct behaviour other = behaviour_of(&stuck->sums[near[i]]);
+		const struct behaviour other = behaviour_of(&stuck->sums, near[i]);
 
 		const bool known = is_known(stuck, near[i]);
 
