@@ -146,7 +146,7 @@ $(BUILD)/cbct: $(call objects,$(cbct_sources)) $(library)
 $(BUILD)/cbct-worker-held: $(call objects,daemon/worker.c tests/http/held.c) $(library) $(cuda_objects)
 	$(call say,LINK)$(CC) $(LDFLAGS) -Wl,--wrap=fdatasync,--wrap=recon_push,--wrap=backend_find -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(if $(cuda_objects),$(cuda_libs)) $(LIBM)
 
-held_calls := job_digest_volume store_job_update store_job_add_volume store_job_digest_volume
+held_calls := live_get jobs_promote store_job_volumes job_digest_volume store_job_update store_job_add_volume store_job_digest_volume
 # The order of locks is asserted in that daemon, and in the unit tests (tests/lock_order.c).
 lock_calls := lock_init pthread_mutex_lock pthread_mutex_unlock pthread_mutex_destroy pthread_cond_wait pthread_cond_timedwait
 $(BUILD)/cbctd-held: $(call objects,$(daemon_sources) tests/http/held.c tests/lock_order.c) $(BUILD)/proto/openapi.o $(BUILD)/web/assets.o $(library)
@@ -201,7 +201,7 @@ $(BUILD)/gpu_ceilings: tests/bench/gpu_ceilings.cu
 apt_install = { $$run apt-get install -y -qq --no-install-recommends $(1) >/dev/null 2>&1 || \
 	  { $$run apt-get update -qq && DEBIAN_FRONTEND=noninteractive $$run apt-get install -y -qq --no-install-recommends $(1) >/dev/null; }; }
 
-check: OPTIONAL += chromium:chromium dciodvfy:dicom3tools Orthanc:orthanc-dicomweb promtool:prometheus
+check: OPTIONAL += chromium:chromium dciodvfy:dicom3tools Orthanc:orthanc-dicomweb promtool:prometheus systemd-analyze:systemd
 check: MODULES += nibabel:python3-nibabel pydicom:python3-pydicom gdcm:python3-gdcm
 setup: ## install the Debian packages that are missing
 	@missing=""; \
@@ -313,21 +313,33 @@ compile_commands.json: ## how each C file is compiled, for editors
 format: ## clang-format over everything
 	@clang-format -i $$(git ls-files '*.c' '*.h' '*.cu' '*.cuh')
 
-install: all ## programs, units and example configuration under $(DESTDIR)$(prefix)
+sysconfdir ?= $(if $(filter /usr,$(prefix)),/etc,$(prefix)/etc)
+docdir      = $(prefix)/share/doc/cbctd
+configure   = sed 's,@prefix@,$(prefix),g;s,@sysconfdir@,$(sysconfdir),g;s,@docdir@,$(docdir),g'
+install: all ## programs, units, settings and documents under $(DESTDIR)$(prefix)
 	install -D -m 755 -t $(DESTDIR)$(prefix)/bin $(programs)
-	install -d $(DESTDIR)$(prefix)/lib/systemd/system
-	sed 's,@prefix@,$(prefix),g' systemd/cbctd.service.in >$(DESTDIR)$(prefix)/lib/systemd/system/cbctd.service
-	install -D -m 644 -t $(DESTDIR)$(prefix)/share/doc/cbctd README.md systemd/cbctd-alerts.yaml systemd/cbctd-dashboard.json
-	STATE_DIRECTORY=/var/lib/cbctd $(BUILD)/cbctd --print-config | sed 's/^[^#]/#&/' >$(DESTDIR)$(prefix)/share/doc/cbctd/cbctd.conf
+	install -d $(addprefix $(DESTDIR),$(prefix)/lib/systemd/system $(prefix)/lib/tmpfiles.d $(docdir))
+	install -d -m 750 $(DESTDIR)$(sysconfdir)/cbctd
+	$(configure) systemd/cbctd.service.in >$(DESTDIR)$(prefix)/lib/systemd/system/cbctd.service
+	$(configure) systemd/cbctd.tmpfiles.in >$(DESTDIR)$(prefix)/lib/tmpfiles.d/cbctd.conf
+	install -D -m 644 -t $(DESTDIR)$(prefix)/lib/systemd/system systemd/cbctd.socket
+	install -D -m 644 systemd/cbctd.sysusers $(DESTDIR)$(prefix)/lib/sysusers.d/cbctd.conf
+	install -m 644 -t $(DESTDIR)$(docdir) README.md docs/operation.md systemd/cbctd-alerts.yaml systemd/cbctd-dashboard.json
+	STATE_DIRECTORY=/var/lib/cbctd $(BUILD)/cbctd --print-config | sed 's/^[^#]/#&/' >$(DESTDIR)$(docdir)/cbctd.conf
+	[ -e $(DESTDIR)$(sysconfdir)/cbctd/cbctd.conf ] || \
+		install -m 640 $(DESTDIR)$(docdir)/cbctd.conf $(DESTDIR)$(sysconfdir)/cbctd/cbctd.conf
 
 # A tarball's programs look for libraries beside them (RPATH, which the libraries inherit); glibc is the system's.
+bundle: prefix = /opt/cbctd
+bundle: docdir = /opt/cbctd
 bundle: ## a tarball that runs on a machine with a driver only, unpacked as /opt/cbctd
 	@$(MAKE) --no-print-directory BUILD=$(BUILD)/bundled BUNDLE=1 all
 	@set -e; to=$(BUILD)/bundle/cbctd; rm -rf $(BUILD)/bundle; mkdir -p $$to/bin $$to/lib; \
 	for p in $(notdir $(programs)); do cp $(BUILD)/bundled/$$p $$to/bin/; strip $$to/bin/$$p; done; \
 	ldd $$to/bin/* | awk '/=> \// { print $$3 }' | sort -u | \
 	grep -vE '/(libc|libm|libdl|libpthread|librt|libresolv|libcuda)\.so|/ld-linux' | xargs cp -L -t $$to/lib; \
-	cp README.md $$to/; sed 's,@prefix@,/opt/cbctd,g' systemd/cbctd.service.in >$$to/cbctd.service; tar -C $(BUILD)/bundle -cf - cbctd | zstd -q -T0 -f -o $(BUILD)/cbctd.tar.zst; \
+	cp README.md docs/operation.md systemd/cbctd.socket $$to/; mkdir $$to/etc $$to/etc/cbctd; $(configure) systemd/cbctd.service.in >$$to/cbctd.service; \
+	$(configure) systemd/cbctd.sysusers >$$to/sysusers.conf; STATE_DIRECTORY=/var/lib/cbctd $(BUILD)/bundled/cbctd --print-config | sed 's/^[^#]/#&/' >$$to/etc/cbctd/cbctd.conf; tar -C $(BUILD)/bundle -cf - cbctd | zstd -q -T0 -f -o $(BUILD)/cbctd.tar.zst; \
 	ls -l $(BUILD)/cbctd.tar.zst
 
 clean: ## removes build/
@@ -338,4 +350,4 @@ help: ## this list
 
 .PHONY: all test-programs again setup demo check soak fuzz fuzzers bench bench-calibrate bench-denoise bench-presets check-gpu bench-gpu asan tsan lint format rooms third-party compile_commands.json install clean help
 .SECONDARY:
--include $(shell find $(BUILD) -name '*.d' 2>/dev/null)
+-include $(shell find $(BUILD) -type f -name '*.d' 2>/dev/null)

@@ -353,6 +353,30 @@ void config_clear(struct config *config)
 	}
 }
 
+void config_compare(const struct config *a, const struct config *b, char *ret_names, size_t size)
+{
+	size_t length = 0;
+
+	ret_names[0] = '\0';
+	for (int i = 0; i < SETTING_COUNT && length < size; i++) {
+		const struct setting *setting = &settings[i];
+		const void *left = (const char *)a + setting->offset, *right = (const char *)b + setting->offset;
+		bool same;
+
+		if (is_text(setting))
+			same = strcmp(*(char *const *)left, *(char *const *)right) == 0;
+		else if (setting->kind == KIND_INTEGER)
+			same = *(const long *)left == *(const long *)right;
+		else if (setting->kind == KIND_BYTES)
+			same = *(const size_t *)left == *(const size_t *)right;
+		else
+			same = *(const double *)left == *(const double *)right;
+		if (!same)
+			length += (size_t)snprintf(ret_names + length, size - length, "%s%s", length > 0 ? ", " : "",
+						   setting->name);
+	}
+}
+
 void config_help(FILE *out)
 {
 	fputs("usage: cbctd [--NAME VALUE ...]\n\n"

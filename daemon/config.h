@@ -35,6 +35,9 @@ void config_clear(struct config *config);
 enum { INDICES_MOST = 64 };
 int config_indices(const char *text, int *ret_indices, int most);
 
+/* The names of the settings that differ, with ", " between them, as far as there is room; "" where none does. */
+void config_compare(const struct config *a, const struct config *b, char *ret_names, size_t size);
+
 void config_help(FILE *out);
 /* Every setting as it is now, as a config file. */
 void config_print(const struct config *config, FILE *out);

@@ -29,6 +29,7 @@ enum lock_rank {
 	LOCK_CHECKPOINT, /* database.checkpoint_lock, of SQLite */
 	LOCK_CHECKS,     /* store.check_lock */
 	LOCK_CARDS,      /* cards.lock */
+	LOCK_FEEDER,     /* feeder.lock */
 	LOCK_WATCHERS,   /* watch_list.lock */
 	LOCK_TLS,        /* tls.lock */
 	LOCK_AUDIT,      /* audit.lock */

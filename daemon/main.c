@@ -18,6 +18,7 @@
 #include "daemon/intake/intake.h"
 #include "daemon/jobs/jobs.h"
 #include "daemon/log.h"
+#include "daemon/notify.h"
 #include "daemon/store/store.h"
 #include "daemon/volumes/volumes.h"
 #include "proto/provenance.h"
@@ -91,6 +92,64 @@ static int start_http(const struct config *config, struct api *api, struct error
 	return http_new(&options, &api->http, err);
 }
 
+/* ---- what the service manager is told ---- */
+
+static int check_http(void *context, double seconds, struct error *err)
+{
+	const struct api *api = context;
+
+	return http_probe(api->http, seconds, err);
+}
+
+static int check_supervisor(void *context, double seconds, struct error *err)
+{
+	const struct api *api = context;
+
+	return supervise_probe(api->supervise, seconds, err);
+}
+
+/* Reads a row that is not there: a catalogue that hangs keeps the feeder, and so the watchdog gets nothing. */
+static int check_catalogue(void *context, double seconds, struct error *err)
+{
+	const struct api *api = context;
+	struct volume_record *volumes = NULL;
+	int count, code;
+
+	(void)seconds;
+	code = store_job_volumes(api->store, "none", &volumes, &count, err);
+	free(volumes);
+	return code == ERR_NOT_FOUND ? 0 : code;
+}
+
+static const struct feeder_check checks[] = {
+    {"HTTP", check_http}, {"the supervisor", check_supervisor}, {"the catalogue", check_catalogue}, {NULL, NULL}};
+
+/* Scans are taken without a worker, too: they cannot be repeated. */
+static void tell_status(void *context, char *ret_text, size_t size)
+{
+	const struct api *api = context;
+	struct jobs_statistics jobs;
+	long count[JOB_STATE_COUNT] = {0};
+
+	jobs_statistics(api->jobs, &jobs);
+	for (int i = 0; i < JOB_STATE_COUNT; i++)
+		for (int j = 0; j < PRIORITY_COUNT; j++)
+			count[i] += jobs.count[i][j];
+	snprintf(ret_text, size, "%s, %ld running, %ld queued, %ld waiting",
+		 supervise_ready(api->supervise) ? "ready" : "no worker can take a job", count[JOB_RUNNING],
+		 count[JOB_QUEUED], count[JOB_WAITING]);
+}
+
+static int start_feeder(struct api *api, struct feeder **ret_feeder, struct error *err)
+{
+	const struct feeder_options options = {.checks = checks, .context = api, .status = tell_status};
+	char status[256];
+
+	tell_status(api, status, sizeof(status));
+	notify_send("READY=1\nSTATUS=%s", status);
+	return feeder_start(&options, ret_feeder, err);
+}
+
 static int start_parts(const struct config *config, struct api *api, struct error *err)
 {
 	const struct store_hooks hooks = {.failed = on_failure};
@@ -148,15 +207,48 @@ static void stop_parts(struct api *api)
 	store_close(api->store);
 }
 
-/* Settings are read at the start alone; the files that some of them name are read again. */
-static void reload(struct api *api)
+/* The command line, with what was made of it. */
+struct arguments {
+	int count;
+	char **values;
+	struct config *config;
+};
+
+/* Of the settings only the level of the log may change while the daemon runs. */
+static void reload_settings(const struct arguments *arguments)
 {
-	log_line(LEVEL_INFO, "SIGHUP: reading tokens and certificates again");
+	struct config *config = arguments->config, fresh;
+	enum config_action action;
+	struct error err = {0};
+	char names[300], *level;
+
+	if (config_load(arguments->count, arguments->values, &fresh, &action, &err) != 0) {
+		log_line(LEVEL_ERROR, "the settings that were read before stay: %s", err.text);
+		return;
+	}
+	log_set_level(level_named(fresh.log_level));
+	/* The new level is the daemon's from now on, and no difference. */
+	level = config->log_level;
+	config->log_level = fresh.log_level;
+	config_compare(config, &fresh, names, sizeof(names));
+	fresh.log_level = level;
+	if (names[0] != '\0')
+		log_line(LEVEL_WARNING, "changed settings that count from the next start on: %s", names);
+	config_clear(&fresh);
+}
+
+/* Settings are read at the start, but for the level of the log; the files that some of them name are read again. */
+static void reload(struct api *api, const struct arguments *arguments)
+{
+	notify_send("RELOADING=1\nMONOTONIC_USEC=%.0f", 1e6 * clock_monotonic());
+	log_line(LEVEL_INFO, "SIGHUP: reading settings, tokens and certificates again");
+	reload_settings(arguments);
 	http_reload(api->http);
+	notify_send("READY=1");
 }
 
 /* A terminal that is closed ends nothing. */
-static int wait_for_stop(const sigset_t *stops, struct api *api)
+static int wait_for_stop(const sigset_t *stops, struct api *api, const struct arguments *arguments)
 {
 	int signal_number = 0;
 
@@ -164,25 +256,32 @@ static int wait_for_stop(const sigset_t *stops, struct api *api)
 		sigwait(stops, &signal_number);
 		if (signal_number != SIGHUP)
 			return signal_number;
-		reload(api);
+		reload(api, arguments);
 	}
 }
 
-static int run(const struct config *config)
+static int run(const struct arguments *arguments)
 {
+	const struct config *config = arguments->config;
 	struct api api = {.max_wait = config->max_wait, .started = clock_monotonic()};
+	struct feeder *feeder = NULL;
 	struct error err = {0};
 	sigset_t stops;
 	int signal_number = 0, code;
 
 	log_set_level(level_named(config->log_level));
+	notify_open();
 	raise_descriptors();
 	block_signals(&stops);
 	code = start_parts(config, &api, &err);
+	if (code == 0)
+		code = start_feeder(&api, &feeder, &err);
 	if (code != 0)
 		log_line(LEVEL_ERROR, "cbctd cannot start: %s", err.text);
 	else
-		signal_number = wait_for_stop(&stops, &api);
+		signal_number = wait_for_stop(&stops, &api, arguments);
+	notify_send("STOPPING=1");
+	feeder_stop(feeder);
 	if (signal_number != 0)
 		log_line(LEVEL_INFO, "stopping: %s",
 			 atomic_load(&failed) ? "the disk failed" : strsignal(signal_number));
@@ -230,7 +329,7 @@ int main(int argc, char **argv)
 	else if (action == CONFIG_REBUILD)
 		status = rebuild(&config);
 	else
-		status = run(&config);
+		status = run(&(struct arguments){argc, argv, &config});
 	config_clear(&config);
 	return status;
 }

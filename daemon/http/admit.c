@@ -149,7 +149,8 @@ bool admission_reconsider(struct connection *connection)
 static void connection_enter(struct http *http, struct connection *connection)
 {
 	pthread_mutex_lock(&http->lock);
-	judge(http, connection);
+	if (connection->address.ss_family != AF_UNSPEC) /* a probe takes nobody's place */
+		judge(http, connection);
 	connection->next = http->connections;
 	if (http->connections != NULL)
 		http->connections->previous = connection;
@@ -287,6 +288,63 @@ static bool accept_from(struct http *http, const struct listener *listener)
 	return true;
 }
 
+/* True: the admission thread looks at what has changed. */
+static bool kick(struct http *http)
+{
+	const uint64_t one = 1;
+
+	return write(http->admission_kick, &one, sizeof(one)) == (ssize_t)sizeof(one);
+}
+
+void admission_probe(struct http *http, int socket, bool tls)
+{
+	bool full;
+
+	pthread_mutex_lock(&http->lock);
+	full = http->probe_count == PROBES_MAX;
+	if (!full) {
+		http->probes[http->probe_count].socket = socket;
+		http->probes[http->probe_count++].tls = tls;
+	}
+	pthread_mutex_unlock(&http->lock);
+	if (full)
+		close(socket);
+	else
+		kick(http);
+}
+
+void admission_forget_probes(struct http *http)
+{
+	pthread_mutex_lock(&http->lock);
+	while (http->probe_count > 0)
+		close(http->probes[--http->probe_count].socket);
+	pthread_mutex_unlock(&http->lock);
+}
+
+static void admit_probes(struct http *http)
+{
+	const struct sockaddr_storage nobody = {.ss_family = AF_UNSPEC};
+	uint64_t ignored;
+	bool some = true;
+
+	if (read(http->admission_kick, &ignored, sizeof(ignored)) < 0)
+		return;
+	while (some) {
+		int socket = -1;
+		bool tls = false;
+
+		pthread_mutex_lock(&http->lock);
+		some = http->probe_count > 0;
+		if (some) {
+			socket = http->probes[--http->probe_count].socket;
+			tls = http->probes[http->probe_count].tls;
+		}
+		pthread_mutex_unlock(&http->lock);
+		if (some)
+			admit(http, socket, &nobody, sizeof(nobody.ss_family), tls);
+	}
+}
+
 static void *run_admission(void *context)
 {
 	struct http *http = context;
@@ -300,6 +358,8 @@ static void *run_admission(void *context)
 
 		if (ready < 0 && errno != EINTR)
 			log_line(LEVEL_ERROR, "poll: %s", strerror(errno));
+		if (ready > 0 && polls[0].revents != 0)
+			admit_probes(http);
 		room = true;
 		for (int i = 0; i < http->listener_count && !atomic_load(&http->admission_stop); i++) {
 			room = accept_from(http, &http->listeners[i]) && room;
@@ -312,7 +372,7 @@ int admission_start(struct http *http, struct error *err)
 {
 	int code;
 
-	http->admission_kick = eventfd(0, EFD_CLOEXEC);
+	http->admission_kick = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
 	if (http->admission_kick < 0)
 		return error_set_errno(err, errno, "eventfd");
 	code = pthread_create(&http->admission, NULL, run_admission, http);
@@ -324,12 +384,10 @@ int admission_start(struct http *http, struct error *err)
 
 void admission_end(struct http *http)
 {
-	const uint64_t one = 1;
-
 	if (!http->admission_runs)
 		return;
 	atomic_store(&http->admission_stop, true);
-	if (write(http->admission_kick, &one, sizeof(one)) == (ssize_t)sizeof(one))
+	if (kick(http))
 		pthread_join(http->admission, NULL);
 	http->admission_runs = false;
 }

@@ -97,6 +97,8 @@ void http_traffic(const struct http *http, void (*visit)(void *context, const st
 /* From the head of a request to the end of its answer, those that waited or went on as long as they were asked to, too.
  * NULL: of requests that found no route. */
 const struct histogram *http_seconds(const struct http *http, const struct route *route);
+/* ERR_BUSY when a thread of the server does not answer a connection within that time. One thread at a time. */
+int http_probe(struct http *http, double seconds, struct error *err);
 /* The number of connections that are open now; takes no lock. */
 long http_connections(const struct http *http);
 

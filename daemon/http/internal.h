@@ -17,6 +17,7 @@ enum {
 	ARGUMENTS_MAX = 4,
 	QUERIES_MAX = 16,
 	SEGMENTS_MAX = 12,
+	PROBES_MAX = 128, /* the daemon's connections to itself, of one look */
 	LISTENERS_MAX = 8,
 	REQUEST_ID_SIZE = 24,
 	DESCRIPTORS_MAX = 1 << 20
@@ -137,7 +138,12 @@ struct http {
 	int admission_kick;  /* an eventfd */
 	double exhausted_at; /* the last time that there was no descriptor; the thread's own */
 
-	pthread_mutex_t lock; /* guards the list, the clock's fields; taken before a connection's lock */
+	pthread_mutex_t lock; /* guards the list, the probes, the clock's fields; taken before a connection's lock */
+	struct {
+		int socket;
+		bool tls;
+	} probes[PROBES_MAX]; /* [probe_count], which the admission thread has yet to take */
+	int probe_count;
 	struct connection *connections;
 	atomic_long connection_count; /* changed under the lock */
 	pthread_t clock;
@@ -156,6 +162,10 @@ struct http {
 /* ---- http/admit.c: who gets a connection ---- */
 int admission_start(struct http *http, struct error *err);
 void admission_end(struct http *http);
+/* Takes a connection of the daemon's own as if it had been accepted. */
+void admission_probe(struct http *http, int socket, bool tls);
+/* Closes those that were never taken. */
+void admission_forget_probes(struct http *http);
 /* A connection that was one too many asks for something: is it welcome by now? */
 bool admission_reconsider(struct connection *connection);
 /* The library has it now, or no more. */
@@ -175,7 +185,10 @@ void gate_free(struct gate *gate);
 
 /* ---- http/listen.c: addresses and sockets ---- */
 enum guard { GUARD_NONE = 0, GUARD_TOKENS = 1, GUARD_TLS = 2, GUARD_PEERS = 4 };
-/* guards: what there is of enum guard; with both, others than loopback addresses are allowed. */
+/*
+ * guards: what there is of enum guard; with both, others than loopback addresses are allowed. Sockets that a service
+ * manager has opened for this process (LISTEN_FDS, sd_listen_fds(3)) take the place of all in `listen`.
+ */
 int listeners_open(const char *listen, unsigned guards, struct listener ret_listeners[LISTENERS_MAX], int *ret_count,
 		   struct error *err);
 void listener_close(struct listener *listener);

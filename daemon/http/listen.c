@@ -4,8 +4,10 @@
  */
 #include "daemon/http/internal.h"
 #include "daemon/http/text.h"
+#include "daemon/log.h"
 
 #include <errno.h>
+#include <fcntl.h>
 #include <netdb.h>
 #include <netinet/in.h>
 #include <stdio.h>
@@ -64,6 +66,19 @@ static int bind_tcp(const struct addrinfo *address, const char *text, struct lis
 	return name_socket(listener, err);
 }
 
+/* Of an address beyond loopback. */
+static int check_guards(const char *text, unsigned guards, struct error *err)
+{
+	if (guards & GUARD_TOKENS && guards & GUARD_TLS)
+		return 0;
+	return error_set(
+	    err, ERR_IMPOSSIBLE,
+	    "listen: %s is reached from other machines; without tokens and TLS only loopback addresses and "
+	    "Unix sockets are allowed%s%s",
+	    text, (guards & GUARD_TOKENS) != 0 ? "" : "; --tokens is not given",
+	    (guards & GUARD_TLS) != 0 ? "" : "; --tls-cert is not given");
+}
+
 /* ADDR:PORT with a numeric address, [ADDR]:PORT for IPv6, or localhost:PORT. */
 static int open_tcp(const char *text, unsigned guards, struct listener *listener, struct error *err)
 {
@@ -91,14 +106,9 @@ static int open_tcp(const char *text, unsigned guards, struct listener *listener
 	if (getaddrinfo(host, colon + 1, &hints, &found) != 0)
 		return error_set(err, ERR_INVALID, "listen: \"%s\" is no numeric address with a port", text);
 	listener->tls = (guards & GUARD_TLS) != 0;
-	if (is_loopback(found->ai_addr) || (guards & GUARD_TOKENS && guards & GUARD_TLS))
+	code = is_loopback(found->ai_addr) ? 0 : check_guards(text, guards, err);
+	if (code == 0)
 		code = bind_tcp(found, text, listener, err);
-	else
-		code = error_set(err, ERR_IMPOSSIBLE,
-				 "listen: %s is reached from other machines; without tokens and TLS only loopback "
-				 "addresses and Unix sockets are allowed%s%s",
-				 text, (guards & GUARD_TOKENS) != 0 ? "" : "; --tokens is not given",
-				 (guards & GUARD_TLS) != 0 ? "" : "; --tls-cert is not given");
 	freeaddrinfo(found);
 	return code;
 }
@@ -148,12 +158,74 @@ static int open_unix(const char *path, unsigned guards, struct listener *listene
 	return 0;
 }
 
+/*
+ * A socket that the service manager listens on for us: it stays when the daemon ends, and so does its file. Whoever
+ * reaches it must be asked as on one of our own.
+ */
+static int inherit(int descriptor, unsigned guards, struct listener *listener, struct error *err)
+{
+	struct sockaddr_un path;
+	socklen_t length = sizeof(int);
+	int type = 0, listens = 0;
+
+	listener->socket = descriptor;
+	if (getsockopt(descriptor, SOL_SOCKET, SO_TYPE, &type, &length) != 0 || type != SOCK_STREAM ||
+	    getsockopt(descriptor, SOL_SOCKET, SO_ACCEPTCONN, &listens, &length) != 0 || !listens)
+		return error_set(err, ERR_INVALID,
+				 "descriptor %d of LISTEN_FDS is no stream socket that is listened on", descriptor);
+	if (fcntl(descriptor, F_SETFD, FD_CLOEXEC) != 0 || fcntl(descriptor, F_SETFL, O_NONBLOCK) != 0)
+		return error_set_errno(err, errno, "descriptor %d of LISTEN_FDS", descriptor);
+	length = sizeof(path);
+	memset(&path, 0, sizeof(path));
+	if (getsockname(descriptor, (struct sockaddr *)&path, &length) == 0 && path.sun_family == AF_UNIX) {
+		snprintf(listener->name, sizeof(listener->name), "%s%s", unix_prefix, path.sun_path);
+		return 0;
+	}
+	listener->tls = (guards & GUARD_TLS) != 0;
+	if (name_socket(listener, err) != 0)
+		return err->code;
+	return is_loopback((const struct sockaddr *)&listener->address) ? 0 : check_guards(listener->name, guards, err);
+}
+
+/* sd_listen_fds(3): descriptors from 3 on, if they are meant for this process. 0: there are none. */
+static int inherited_count(void)
+{
+	const char *pid = getenv("LISTEN_PID"), *count = getenv("LISTEN_FDS");
+	int sockets = pid != NULL && count != NULL && strtol(pid, NULL, 10) == (long)getpid() ? atoi(count) : 0;
+
+	unsetenv("LISTEN_PID");
+	unsetenv("LISTEN_FDS");
+	unsetenv("LISTEN_FDNAMES");
+	return sockets;
+}
+
+static int listeners_inherit(int sockets, unsigned guards, struct listener ret_listeners[LISTENERS_MAX], int *ret_count,
+			     struct error *err)
+{
+	enum { FIRST = 3 };
+
+	if (sockets > LISTENERS_MAX)
+		return error_set(err, ERR_INVALID, "LISTEN_FDS has %d sockets, at most %d are listened on", sockets,
+				 LISTENERS_MAX);
+	log_line(LEVEL_INFO, "%d sockets of the service manager take the place of the setting listen", sockets);
+	for (int i = 0; i < sockets; i++) {
+		memset(&ret_listeners[i], 0, sizeof(ret_listeners[i]));
+		if (inherit(FIRST + i, guards, &ret_listeners[i], err) != 0)
+			return err->code;
+	}
+	*ret_count = sockets;
+	return 0;
+}
+
 int listeners_open(const char *listen_text, unsigned guards, struct listener ret_listeners[LISTENERS_MAX],
 		   int *ret_count, struct error *err)
 {
-	char *copy = strdup(listen_text), *next = copy, *text;
-	int count = 0, code = 0;
+	char *copy, *next, *text;
+	int count = 0, code = 0, sockets = inherited_count();
 
+	if (sockets > 0)
+		return listeners_inherit(sockets, guards, ret_listeners, ret_count, err);
+	copy = next = strdup(listen_text);
 	if (copy == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for listeners");
 	while (code == 0 && (text = strsep(&next, ", ")) != NULL) {

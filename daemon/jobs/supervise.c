@@ -17,6 +17,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/eventfd.h>
+#include <time.h>
 #include <unistd.h>
 
 #include "daemon/lock.h"
@@ -396,6 +397,7 @@ static void *supervise_loop(void *context)
 		attend_all(supervise);
 		move_jobs(supervise);
 		wait_and_read(supervise, false);
+		atomic_fetch_add(&supervise->turns, 1);
 	}
 	quit_workers(supervise);
 	while (!all_absent(supervise)) {
@@ -521,6 +523,21 @@ bool worker_answers(const struct worker_facts *facts)
 
 	return (facts->state == WORKER_IDLE || facts->state == WORKER_BUSY) &&
 	       watchdog_answers(&signs, clock_monotonic());
+}
+
+int supervise_probe(struct supervise *supervise, double seconds, struct error *err)
+{
+	const unsigned long long before = atomic_load(&supervise->turns);
+	const struct timespec moment = {.tv_nsec = 5000000};
+	const double end = clock_monotonic() + seconds;
+
+	supervise_wake(supervise);
+	while (atomic_load(&supervise->turns) == before) {
+		if (clock_monotonic() >= end)
+			return error_set(err, ERR_BUSY, "its thread has not come round for %.1f s", seconds);
+		nanosleep(&moment, NULL);
+	}
+	return 0;
 }
 
 bool supervise_ready(struct supervise *supervise)

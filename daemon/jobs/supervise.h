@@ -48,6 +48,12 @@ int supervise_start(struct jobs *jobs, const struct supervise_options *options, 
 /* Running jobs leave a checkpoint and are queued, workers end, within stop_seconds + 2. NULL is fine. */
 void supervise_stop(struct supervise *supervise);
 
+/*
+ * ERR_BUSY when the supervisor's thread does not come round within that time: nobody starts workers, gives them jobs or
+ * finds those that hang. Waits for it.
+ */
+int supervise_probe(struct supervise *supervise, double seconds, struct error *err);
+
 /* At least one worker is there that can take jobs (idle or busy), and answers. */
 bool supervise_ready(struct supervise *supervise);
 

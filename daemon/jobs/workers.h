@@ -121,6 +121,8 @@ struct supervise {
 	double review_at;                 /* monotonic: when jobs that are held are looked at, 0: none; its own */
 	double stop_by;                   /* monotonic: the stop's end, NEVER before it; the thread's own */
 
+	atomic_ullong turns; /* of the thread's loop */
+
 	pthread_mutex_t lock; /* guards what follows */
 	struct worker_facts facts[SLOTS_MAX];
 	unsigned long long clear; /* bit for each worker that an operator wants cleared */

@@ -5,11 +5,14 @@
  * CBCT_TEST_HANG is; with --wrap=job_digest_volume, a daemon whose
  * digests do not come while that of CBCT_TEST_HOLD_DIGEST is; and with the calls
  * of the store below, a daemon that cannot record what the file of
- * CBCT_TEST_REFUSE names: "running", "digest" or "volume NAME". A worker with CBCT_TEST_CARDS in its environment
+ * CBCT_TEST_REFUSE names: "running", "digest" or "volume NAME"; and a daemon in which the part hangs that the file of
+ * CBCT_TEST_STUCK names: "http", "thread" (one of the server's, the first that is asked), "supervisor" or "catalogue".
+ * A worker with CBCT_TEST_CARDS in its environment
  * pretends that the processor is a card, whose calls fail while the file that it names says so: "CALL DEVICES", where
  * CALL is "filter" or "iterate", which end in a device error, or "hang" and "kill", which do that at an iteration.
  */
 #include <signal.h>
+#include <stdatomic.h>
 #include <stdbool.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -17,6 +20,7 @@
 #include <time.h>
 #include <unistd.h>
 
+#include "daemon/http/http.h"
 #include "daemon/jobs/job.h"
 
 /* Weak: a program has one of them. */
@@ -41,6 +45,15 @@ int __real_store_job_digest_volume(struct store *store, const char *id, const st
 				   struct error *err) __attribute__((weak));
 int __wrap_store_job_digest_volume(struct store *store, const char *id, const struct volume_record *volume,
 				   struct error *err);
+
+int __real_live_get(void *context, struct request *request, struct error *err) __attribute__((weak));
+int __wrap_live_get(void *context, struct request *request, struct error *err);
+int __real_jobs_promote(struct jobs *jobs, struct error *err) __attribute__((weak));
+int __wrap_jobs_promote(struct jobs *jobs, struct error *err);
+int __real_store_job_volumes(struct store *store, const char *id, struct volume_record **ret_volumes, int *ret_count,
+			     struct error *err) __attribute__((weak));
+int __wrap_store_job_volumes(struct store *store, const char *id, struct volume_record **ret_volumes, int *ret_count,
+			     struct error *err);
 
 static void hold(const char *variable)
 {
@@ -141,18 +154,55 @@ const struct backend *__wrap_backend_find(const char *name)
 
 /* ---- the catalogue ---- */
 
-static int refuse(const char *what, struct error *err)
+/* Whether the file that the variable names has that line. */
+static bool says(const char *variable, const char *what)
 {
-	const char *path = getenv("CBCT_TEST_REFUSE");
+	const char *path = getenv(variable);
 	FILE *file = path == NULL ? NULL : fopen(path, "re");
 	char wanted[64] = "";
 
 	if (file == NULL)
-		return 0;
+		return false;
 	if (fgets(wanted, sizeof(wanted), file) != NULL)
 		wanted[strcspn(wanted, "\n")] = '\0';
 	fclose(file);
-	return strcmp(wanted, what) == 0 ? error_set(err, ERR_INTERNAL, "catalogue: refused") : 0;
+	return strcmp(wanted, what) == 0;
+}
+
+static int refuse(const char *what, struct error *err)
+{
+	return says("CBCT_TEST_REFUSE", what) ? error_set(err, ERR_INTERNAL, "catalogue: refused") : 0;
+}
+
+static void hang(const char *part)
+{
+	const struct timespec moment = {.tv_nsec = 10000000};
+
+	while (says("CBCT_TEST_STUCK", part))
+		nanosleep(&moment, NULL);
+}
+
+int __wrap_live_get(void *context, struct request *request, struct error *err)
+{
+	static atomic_flag one = ATOMIC_FLAG_INIT;
+
+	hang("http");
+	if (says("CBCT_TEST_STUCK", "thread") && !atomic_flag_test_and_set(&one))
+		hang("thread");
+	return __real_live_get(context, request, err);
+}
+
+int __wrap_jobs_promote(struct jobs *jobs, struct error *err)
+{
+	hang("supervisor");
+	return __real_jobs_promote(jobs, err);
+}
+
+int __wrap_store_job_volumes(struct store *store, const char *id, struct volume_record **ret_volumes, int *ret_count,
+			     struct error *err)
+{
+	hang("catalogue");
+	return __real_store_job_volumes(store, id, ret_volumes, ret_count, err);
 }
 
 int __wrap_store_job_update(struct store *store, const struct job_record *job, const struct event *event,

@@ -1,6 +1,6 @@
 /*
  * In place of libnvidia-ml.so.1, the management library of NVIDIA's driver, for machines without a card: two cards
- * whose readings stand in the file $CBCT_TEST_CARDS, a line for each: temperature, bytes in use, corrected and
+ * whose readings stand in the file $CBCT_TEST_NVML, a line for each: temperature, bytes in use, corrected and
  * uncorrected errors (negative: it has no error correction). A card without a line is lost.
  */
 #include <stdio.h>
@@ -22,7 +22,7 @@ static char handles[CARDS]; /* a card's handle is the address of its place */
 
 static int read_card(const void *device, struct reading *ret)
 {
-	const char *path = getenv("CBCT_TEST_CARDS");
+	const char *path = getenv("CBCT_TEST_NVML");
 	long index = (const char *)device - handles;
 	FILE *file = path != NULL ? fopen(path, "r") : NULL;
 	int result = LOST;
