@@ -35,6 +35,16 @@ rule "a database knows no table of the catalogue" '#include "daemon/store/(catal
 rule "the files beneath SQLite know no statement" '\b(SELECT|INSERT|UPDATE|DELETE|CREATE|PRAGMA [a-z_]+ =)|sqlite3_(prepare|exec|step)' \
 	daemon/store/checksum_vfs.[ch]
 rule "no struct is bytes in the catalogue" 'COLUMN_BYTES.*AT\(' <(grep COLUMN_BYTES daemon/store/tables.c | grep -vE '(sha256|digest)\)')
+found "daemon/THREADS.md does not name the file of a thread" "$(
+	grep -l 'pthread_create(' $(files daemon) | sed 's,^daemon/,,' | while read -r file; do
+		grep -q "^|.*\`$file\`" daemon/THREADS.md || echo "$file"
+	done
+)"
+found "daemon/THREADS.md names a file that is not there" "$(
+	grep -oE '`[a-z/_]+\.[ch]`' daemon/THREADS.md | tr -d '`' | sort -u | while read -r file; do
+		[ -e "$file" ] || [ -e "daemon/$file" ] || echo "$file"
+	done
+)"
 found "scripts that their own language cannot read" "$(
 	git ls-files '*.sh' | while read -r script; do bash -n "$script" 2>/dev/null || echo "$script"; done
 	git ls-files '*.py' | while read -r script; do

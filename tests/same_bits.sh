@@ -3,11 +3,13 @@
 #
 #     tests/same_bits.sh COMMIT [SUITE...]
 #
-# builds the unit tests of COMMIT, in a worktree under build/, and those of the present tree, both with tests/digests.c
-# linked in, runs the suites in both and compares the digests of all volumes that the tests read. Volumes of a test
-# that only one of the two has are counted apart. COMMIT's digests are kept in build/same_bits for the next time.
-# Fails where a volume differs. Both trees run with the same number of threads, on the same machine: digests of
-# different processors are not comparable. MAKE_FLAGS are further words for make.
+# builds COMMIT, in a worktree under build/, and the present tree, runs the suites in both and compares the digests of
+# all volumes. A suite is one of the unit tests, with tests/digests.c linked in, which notes every volume that a test
+# reads, or `http/test_phantom`: phantoms of all kinds through the daemon, whose volumes and true objects are files.
+# Without SUITE: all unit tests that reconstruct, and the phantoms. Volumes of a test that only one of the two has are
+# counted apart. COMMIT's digests are kept in build/same_bits for the next time. Fails where a volume differs. Both
+# trees run with the same number of threads, on the same machine: digests of different processors are not comparable.
+# MAKE_FLAGS are further words for make.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -15,41 +17,53 @@ cd "$(dirname "$0")/.."
 commit=$(git rev-parse --verify --short=12 "$1^{commit}")
 shift
 suites=("$@")
-[ ${#suites[@]} -gt 0 ] || suites=(phantom study recon exterior metal outofcore algorithm)
+if [ ${#suites[@]} = 0 ]; then
+	mapfile -t suites < <(grep -lE 'recon_read|unit/(scene|anatomy)\.h' tests/unit/test_*.c | sed 's,.*/test_,,;s,\.c$,,')
+	suites+=(http/test_phantom)
+fi
+file_of() { echo "$at/$1.${2//\//.}"; } # COMMIT-OR-new SUITE
 at=$PWD/build/same_bits
 mkdir -p "$at"
 
 # Object files of the two trees stay apart, and those of the linked-in file from the build's own.
 gcc -std=c11 -D_GNU_SOURCE -O2 -I. -c -o "$at/digests.o" tests/digests.c
 
-# digests TREE BUILD FILE SUITE: runs a suite of TREE's unit tests.
+# digests TREE BUILD FILE SUITE: runs a suite of TREE. A test that fails leaves its volumes all the same, and is told.
 digests() {
-	local tree=$1 build=$2 file=$3 suite=$4
+	local tree=$1 build=$2 file=$3 suite=$4 status=0
 	rm -f "$file.part"
 	touch "$file.part"
-	# A test that fails leaves its volumes all the same, and is told.
-	(cd "$tree" && DIGESTS=$file.part timeout "${SECONDS_MOST:-1500}" "$build/unit" "$suite" >"$file.log") ||
-		{ echo "same_bits: $suite failed in $tree:"; tail -n 5 "$file.log"; }
+	if [[ $suite == http/* ]]; then
+		(cd "$tree" && BUILD=$build timeout "${SECONDS_MOST:-1500}" tests/run.sh "$suite" >"$file.log" 2>&1) || status=$?
+		# TEST FIRST COUNT DIGEST; a file is one volume.
+		(cd "$build/test/${suite#http/}" && find . -name '*.nii' -print0 | sort -z | xargs -0r sha256sum) |
+			awk '{ print $2, 0, 0, $1 }' >"$file.part"
+	else
+		(cd "$tree" && DIGESTS=$file.part timeout "${SECONDS_MOST:-1500}" "$build/unit" "$suite" >"$file.log") || status=$?
+	fi
+	[ $status = 0 ] || { echo "same_bits: $suite failed in $tree:"; tail -n 5 "$file.log"; }
 	mv "$file.part" "$file"
 }
-unit() { # TREE BUILD
+build() { # TREE BUILD
 	# shellcheck disable=SC2086
 	make -s -C "$1" CUDA=0 BUILD="$2" LDFLAGS="-Wl,--wrap=recon_read $at/digests.o" ${MAKE_FLAGS:-} "$2/unit"
+	# shellcheck disable=SC2086
+	[[ " ${suites[*]} " != *" http/"* ]] || make -s -C "$1" CUDA=0 BUILD="$2" ${MAKE_FLAGS:-} "$2"/{cbctd,cbct,cbct-worker}
 }
 
 old=$at/tree.$commit
 missing=()
-for suite in "${suites[@]}"; do [ -e "$at/$commit.$suite" ] || missing+=("$suite"); done
+for suite in "${suites[@]}"; do [ -e "$(file_of "$commit" "$suite")" ] || missing+=("$suite"); done
 if [ ${#missing[@]} -gt 0 ]; then
 	[ -e "$old/Makefile" ] || git worktree add -q --detach "$old" "$commit"
-	unit "$old" "$at/old"
+	build "$old" "$at/old"
 	# Test data beside the project are found from both trees.
 	[ ! -e ../shared ] || ln -sfn "$(realpath ../shared)" "$at/shared"
-	for suite in "${missing[@]}"; do digests "$old" "$at/old" "$at/$commit.$suite" "$suite"; done
+	for suite in "${missing[@]}"; do digests "$old" "$at/old" "$(file_of "$commit" "$suite")" "$suite"; done
 	git worktree remove --force "$old"
 fi
-unit . "$at/new"
-for suite in "${suites[@]}"; do digests . "$at/new" "$at/new.$suite" "$suite"; done
+build . "$at/new"
+for suite in "${suites[@]}"; do digests . "$at/new" "$(file_of new "$suite")" "$suite"; done
 
 failed=0
 for suite in "${suites[@]}"; do
@@ -66,6 +80,6 @@ for suite in "${suites[@]}"; do
 			print ""
 			for (test in tests) print "    " test
 			exit differ > 0
-		}' "$at/$commit.$suite" "$at/new.$suite" || failed=1
+		}' "$(file_of "$commit" "$suite")" "$(file_of new "$suite")" || failed=1
 done
 exit $failed

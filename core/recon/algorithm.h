@@ -25,6 +25,7 @@ struct problem {
 	/* The algorithm's own, as many as its row asks for, not cleared. */
 	struct volume *volumes[ALGORITHM_HOLDS];
 	struct stack *stacks[ALGORITHM_HOLDS]; /* of all views */
+	const int *views;                      /* [geometry.count]: 0, 1, 2 ... */
 	const struct cancel *cancel;           /* or NULL */
 	bool nonnegative;                      /* the iterate has no voxel below 0 */
 	bool momentum;                         /* of SART, see core/recon/sart.c */
@@ -77,6 +78,18 @@ static inline int algorithm_volumes(const struct recipe *recipe)
 extern const struct algorithm *const algorithms[ALGORITHM_COUNT];
 /* Finds an algorithm by its name; NULL when there is none. */
 const struct algorithm *algorithm_find(const char *name);
+
+/* ---- steps over all views: core/recon/problem.c ---- */
+
+/* y = A x. */
+int problem_project(const struct problem *problem, const struct volume *x, struct stack *y, struct error *err);
+/* y += A^T x. */
+int problem_backproject(const struct problem *problem, const struct stack *x, struct volume *y, struct error *err);
+/* Finds 1 / L, L the ray's length in the grid in mm; 0 where it misses or grazes it. `before` is worked in. */
+int problem_weigh_rays(const struct problem *problem, struct stack *lengths, struct stack *ret_weights,
+		       struct error *err);
+/* Returns the shortest side of a voxel, mm. */
+double problem_shortest(const struct problem *problem);
 
 /* Writes all slices of a volume of the problem's grid into a checkpoint. */
 int checkpoint_volume(const struct problem *problem, struct volume *volume, const struct checkpoint_sink *sink,

@@ -38,7 +38,6 @@ struct cgls {
 	struct stack *projected;  /* q, likewise; or W r */
 	struct stack *weights;    /* W, 1/mm */
 	bool weighted;            /* W is known */
-	int *views;               /* [views]: 0, 1, 2 ... */
 	/* Numbers that a resumed run needs beside p and r. */
 	struct cgls_numbers {
 		double gradient2; /* ||s||^2 of the iteration before, 0 before the first */
@@ -52,28 +51,16 @@ static const double LONGER = 3, STEEPER = 100;
 
 static void cgls_close(const struct problem *problem, void *state)
 {
-	struct cgls *cgls = state;
-
 	(void)problem;
-	if (cgls == NULL)
-		return;
-	free(cgls->views);
-	free(cgls);
+	free(state);
 }
 
 static int cgls_open(const struct problem *problem, void **ret_state, struct error *err)
 {
-	const int views = problem->geometry->count;
 	struct cgls *cgls = calloc(1, sizeof(*cgls));
 
-	if (cgls != NULL)
-		cgls->views = malloc(sizeof(int) * (size_t)views);
-	if (cgls == NULL || cgls->views == NULL) {
-		cgls_close(problem, cgls);
-		return error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", views);
-	}
-	for (int i = 0; i < views; i++)
-		cgls->views[i] = i;
+	if (cgls == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for the state of CGLS");
 	cgls->direction = problem->volumes[0];
 	cgls->residual = problem->stacks[0];
 	cgls->projected = problem->stacks[1];
@@ -83,34 +70,12 @@ static int cgls_open(const struct problem *problem, void **ret_state, struct err
 }
 
 /* y = A x over all views, 0 on rays that are left out. */
-static int project(const struct problem *problem, const struct cgls *cgls, const struct volume *x, struct stack *y,
-		   struct error *err)
+static int project(const struct problem *problem, const struct volume *x, struct stack *y, struct error *err)
 {
-	const int views = problem->geometry->count;
-	int code = cancel_check(problem->cancel, err);
+	int code = problem_project(problem, x, y, err);
 
-	if (code == 0)
-		code = problem->backend->project(problem->plan, x, cgls->views, views, y, err);
-	return code == 0 ? problem->backend->stack_mask(problem->projections, NULL, views, y, err) : code;
-}
-
-/* W = 1 / L, L the ray's length in the grid; 0 where it misses or grazes it. `before` is worked in. */
-static int make_weights(const struct problem *problem, struct cgls *cgls, struct error *err)
-{
-	const struct backend *backend = problem->backend;
-	const double *spacing = problem->grid->spacing;
-	const double least = RAY_LENGTH_LEAST * fmin(fmin(spacing[0], spacing[1]), spacing[2]);
-	const int views = problem->geometry->count;
-	int code = backend->volume_fill(problem->before, 1, err);
-
-	if (code == 0)
-		code = project(problem, cgls, problem->before, cgls->projected, err);
-	if (code == 0)
-		code = backend->stack_fill(cgls->weights, views, 1, err);
-	if (code == 0)
-		code = backend->stack_divide(cgls->projected, least, views, cgls->weights, err);
-	cgls->weighted = code == 0;
-	return code;
+	return code == 0 ? problem->backend->stack_mask(problem->projections, NULL, problem->geometry->count, y, err)
+			 : code;
 }
 
 /* r = b - A x, and ||b||^2. */
@@ -126,7 +91,7 @@ static int residual_of(const struct problem *problem, struct cgls *cgls, struct 
 	if (code == 0)
 		code = backend->stack_dot(problem->plan, NULL, r, r, views, &cgls->numbers.data2, err);
 	if (code == 0)
-		code = project(problem, cgls, problem->volume, cgls->projected, err);
+		code = project(problem, problem->volume, cgls->projected, err);
 	return code == 0 ? backend->stack_axpby(-1, cgls->projected, NULL, views, 1, r, err) : code;
 }
 
@@ -148,10 +113,7 @@ static int gradient(const struct problem *problem, const struct cgls *cgls, stru
 	if (code == 0)
 		code = backend->volume_fill(s, 0, err);
 	if (code == 0)
-		code = cancel_check(problem->cancel, err);
-	if (code == 0)
-		code =
-		    backend->backproject(problem->plan, cgls->projected, cgls->views, views, BACKPROJECT_PLAIN, s, err);
+		code = problem_backproject(problem, cgls->projected, s, err);
 	if (code == 0 && problem->nonnegative)
 		code = backend->volume_maximum(-far, problem->volume, s, err);
 	return code == 0 ? backend->volume_dot(problem->plan, s, s, ret_gradient2, err) : code;
@@ -163,7 +125,7 @@ static int line_search(const struct problem *problem, const struct cgls *cgls, d
 	const struct backend *backend = problem->backend;
 	const int views = problem->geometry->count;
 	double slope = 0, length2 = 0;
-	int code = project(problem, cgls, cgls->direction, cgls->projected, err);
+	int code = project(problem, cgls->direction, cgls->projected, err);
 
 	if (code == 0)
 		code = backend->stack_dot(problem->plan, cgls->weights, cgls->residual, cgls->projected, views, &slope,
@@ -240,8 +202,9 @@ static int cgls_iterate(const struct problem *problem, void *state, bool moved, 
 	struct cgls *cgls = state;
 	struct iteration_sums sums;
 	double step = 0;
-	int code = cgls->weighted ? 0 : make_weights(problem, cgls, err);
+	int code = cgls->weighted ? 0 : problem_weigh_rays(problem, cgls->projected, cgls->weights, err);
 
+	cgls->weighted = code == 0;
 	if (code == 0 && moved)
 		code = take_over(problem, cgls, err);
 	if (code == 0 && cgls->numbers.gradient2 > 0)

@@ -32,83 +32,26 @@ struct fista {
 	struct stack *weights;  /* W, 1/mm; 0 where a ray misses the grid or grazes it */
 	bool weighted;          /* W, C and ||p||^2 are known */
 	double data2;           /* ||p||^2 over the rays that are not left out */
-	int *views;             /* [views]: 0, 1, 2 ... */
 };
 
 static void fista_close(const struct problem *problem, void *state)
 {
-	struct fista *fista = state;
-
 	(void)problem;
-	if (fista == NULL)
-		return;
-	free(fista->views);
-	free(fista);
+	free(state);
 }
 
 static int fista_open(const struct problem *problem, void **ret_state, struct error *err)
 {
-	const int views = problem->geometry->count;
 	struct fista *fista = calloc(1, sizeof(*fista));
 
-	if (fista != NULL)
-		fista->views = malloc(sizeof(int) * (size_t)views);
-	if (fista == NULL || fista->views == NULL) {
-		fista_close(problem, fista);
-		return error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", views);
-	}
-	for (int i = 0; i < views; i++)
-		fista->views[i] = i;
+	if (fista == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for the state of FISTA");
 	fista->momentum.previous = problem->volumes[0];
 	fista->columns = problem->volumes[1];
 	fista->rays = problem->stacks[0];
 	fista->weights = problem->stacks[1];
 	*ret_state = fista;
 	return 0;
-}
-
-static double shortest(const struct problem *problem)
-{
-	const double *mm = problem->grid->spacing;
-
-	return fmin(fmin(mm[0], mm[1]), mm[2]);
-}
-
-/* y = A x over all views. */
-static int project(const struct problem *problem, const struct fista *fista, const struct volume *x, struct stack *y,
-		   struct error *err)
-{
-	int code = cancel_check(problem->cancel, err);
-
-	return code == 0 ? problem->backend->project(problem->plan, x, fista->views, problem->geometry->count, y, err)
-			 : code;
-}
-
-/* y += A^T x over all views. */
-static int backproject(const struct problem *problem, const struct fista *fista, const struct stack *x,
-		       struct volume *y, struct error *err)
-{
-	int code = cancel_check(problem->cancel, err);
-
-	return code == 0 ? problem->backend->backproject(problem->plan, x, fista->views, problem->geometry->count,
-							 BACKPROJECT_PLAIN, y, err)
-			 : code;
-}
-
-/* W = 1 / L. `before` and `rays` are worked in. */
-static int weigh_rays(const struct problem *problem, struct fista *fista, struct error *err)
-{
-	const struct backend *backend = problem->backend;
-	const int views = problem->geometry->count;
-	int code = backend->volume_fill(problem->before, 1, err);
-
-	if (code == 0)
-		code = project(problem, fista, problem->before, fista->rays, err);
-	if (code == 0)
-		code = backend->stack_fill(fista->weights, views, 1, err);
-	return code == 0 ? backend->stack_divide(fista->rays, RAY_LENGTH_LEAST * shortest(problem), views,
-						 fista->weights, err)
-			 : code;
 }
 
 /* C = A^T 1, and ||p||^2. `before` and `rays` are worked in. */
@@ -121,12 +64,12 @@ static int sum_columns(const struct problem *problem, struct fista *fista, struc
 	if (code == 0)
 		code = backend->volume_fill(fista->columns, 0, err);
 	if (code == 0)
-		code = backproject(problem, fista, fista->rays, fista->columns, err);
+		code = problem_backproject(problem, fista->rays, fista->columns, err);
 	if (code == 0)
 		code = backend->volume_fill(problem->before, 1, err);
 	if (code == 0)
-		code =
-		    backend->volume_maximum(COLUMN_SUM_LEAST * shortest(problem), problem->before, fista->columns, err);
+		code = backend->volume_maximum(COLUMN_SUM_LEAST * problem_shortest(problem), problem->before,
+					       fista->columns, err);
 	if (code == 0)
 		code = backend->stack_axpby(1, problem->projections, NULL, views, 0, fista->rays, err);
 	if (code == 0)
@@ -141,7 +84,7 @@ static int residual(const struct problem *problem, const struct fista *fista, do
 	const struct backend *backend = problem->backend;
 	const int views = problem->geometry->count;
 	struct stack *rays = fista->rays;
-	int code = project(problem, fista, problem->volume, rays, err);
+	int code = problem_project(problem, problem->volume, rays, err);
 
 	if (code == 0)
 		code = backend->stack_axpby(1, problem->projections, NULL, views, -1, rays, err);
@@ -159,7 +102,7 @@ static int step(const struct problem *problem, const struct fista *fista, struct
 	int code = backend->volume_fill(problem->before, 0, err);
 
 	if (code == 0)
-		code = backproject(problem, fista, fista->rays, problem->before, err);
+		code = problem_backproject(problem, fista->rays, problem->before, err);
 	if (code == 0)
 		code = backend->volume_divide(fista->columns, 0, problem->before, err);
 	if (code == 0)
@@ -176,7 +119,7 @@ static int fista_iterate(const struct problem *problem, void *state, bool moved,
 
 	(void)moved;
 	if (!fista->weighted) {
-		code = weigh_rays(problem, fista, err);
+		code = problem_weigh_rays(problem, fista->rays, fista->weights, err);
 		if (code == 0)
 			code = sum_columns(problem, fista, err);
 		fista->weighted = code == 0;

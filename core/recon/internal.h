@@ -42,6 +42,7 @@ struct recon {
 	bool smoothed;                   /* while a volume is kept, `before` has the iterate */
 
 	unsigned char *pushed; /* [views] */
+	int *views;            /* [views]: 0, 1, 2 ... */
 	int pushed_count;
 
 	struct volume_noise noise; /* where it is measured */

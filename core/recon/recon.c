@@ -67,8 +67,11 @@ static int recon_prepare(struct recon *recon, struct error *err)
 		return code;
 	recon->work_total = recipe_work(recipe, &recon->input.linearise);
 	recon->pushed = calloc((size_t)geometry->count, 1);
-	if (recon->pushed == NULL)
+	recon->views = calloc((size_t)geometry->count, sizeof(*recon->views));
+	if (recon->pushed == NULL || recon->views == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for the list of %d views", geometry->count);
+	for (int i = 0; i < geometry->count; i++)
+		recon->views[i] = i;
 	return 0;
 }
 
@@ -123,6 +126,7 @@ static int open_algorithm(struct recon *recon, struct error *err)
 	recon->problem.projections = recon->projections;
 	recon->problem.volume = recon->volume;
 	recon->problem.before = recon->before;
+	recon->problem.views = recon->views;
 	recon->problem.cancel = &recon->cancel;
 	recon->problem.nonnegative = recon->recipe.iterate.nonnegative;
 	recon->problem.momentum = recon->recipe.sart.momentum;
@@ -198,6 +202,7 @@ void recon_clear(struct recon *recon)
 	input_clear(&recon->input);
 	geometry_clear(&recon->upright);
 	free(recon->pushed);
+	free(recon->views);
 }
 
 void recon_free(struct recon *recon)

@@ -48,62 +48,40 @@ int calibration_list(void *context, struct request *request, struct error *err)
 
 /* ---- one, and waiting for its end ---- */
 
-struct waiter {
-	struct calibrations *calibrations;
-	struct watch watch;
-	double until; /* clock_monotonic */
-};
-
-static void wake_request(void *context)
+static void watch_library(void *calibrations, struct watch *watch)
 {
-	request_wake(context);
+	calibrations_watch(calibrations, watch);
 }
 
-static void waiter_free(void *state)
+static void leave_library(void *calibrations, struct watch *watch)
 {
-	struct waiter *waiter = state;
-
-	calibrations_unwatch(waiter->calibrations, &waiter->watch);
-	free(waiter);
+	calibrations_unwatch(calibrations, watch);
 }
 
-static int wait_begin(struct api *api, struct request *request, struct error *err)
+static int wait_for_end(struct api *api, struct request *request, struct error *err)
 {
-	struct waiter *waiter = calloc(1, sizeof(*waiter));
+	static const struct wait_kind kind = {watch_library, leave_library};
 	double seconds;
 
-	if (waiter == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory to wait for a calibration");
-	if (wait_read(api, request, 0, &seconds, err) != 0) {
-		free(waiter);
-		return err->code;
-	}
-	waiter->calibrations = api->calibrations;
-	waiter->until = clock_monotonic() + seconds;
-	waiter->watch = (struct watch){.wake = wake_request, .context = request};
-	calibrations_watch(api->calibrations, &waiter->watch);
-	request_set_state(request, waiter, waiter_free);
-	return 0;
+	return wait_read(api, request, 0, &seconds, err) != 0
+		   ? err->code
+		   : wait_begin(request, &kind, api->calibrations, seconds, err);
 }
 
 int calibration_get(void *context, struct request *request, struct error *err)
 {
 	struct api *api = context;
 	const char *id = request_argument(request, 0);
-	const struct waiter *waiter;
 	cJSON *document;
 	bool ended;
 
-	if (request_state(request) == NULL && wait_begin(api, request, err) != 0)
+	if (wait_subject(request) == NULL && wait_for_end(api, request, err) != 0)
 		return err->code;
-	waiter = request_state(request);
 	if (calibration_document(api->calibrations, id, true, &document, &ended, err) != 0)
 		return err->code;
 	cJSON_Delete(document);
-	if (!ended && clock_monotonic() < waiter->until && !request_stopping(request)) {
-		request_wait_until(request, waiter->until);
+	if (!ended && wait_goes_on(request))
 		return HTTP_WAIT;
-	}
 	if (calibration_document(api->calibrations, id, false, &document, NULL, err) != 0)
 		return err->code;
 	return request_reply_json(request, 200, document, err);

@@ -103,15 +103,22 @@ int entity_select(struct request *request, const struct entity *entity, struct s
 		  struct error *err);
 void entity_headers(struct request *request, const struct entity *entity, const struct selection *selection);
 
-/* ---- waiting for a job to change: api/job.c ---- */
+/* ---- waiting until something changes: api/wait.c ---- */
 /* ?wait=SECONDS, or Prefer: wait=N; `initial` when neither is there, and never more than api->max_wait. */
 int wait_read(struct api *api, struct request *request, double initial, double *ret_seconds, struct error *err);
-/* Takes the reference to the job. From now on the request is woken at each change of it: look once more after this. */
-int job_wait_begin(struct request *request, struct job *job, double seconds, struct error *err);
-/* The request's reference; NULL before it waits. */
-struct job *job_waited_for(struct request *request);
+/* Adds a watch to the subject that a request waits for; takes the watch away, and the request's reference with it. */
+struct wait_kind {
+	void (*watch)(void *subject, struct watch *watch);
+	void (*leave)(void *subject, struct watch *watch);
+};
+/* From now on the request is woken at each change of the subject: look once more after this. ERR_NO_MEMORY. */
+int wait_begin(struct request *request, const struct wait_kind *kind, void *subject, double seconds, struct error *err);
+/* NULL before the request waits. */
+void *wait_subject(struct request *request);
 /* True: answer HTTP_WAIT. False: the time is over. */
-bool job_wait_goes_on(struct request *request);
+bool wait_goes_on(struct request *request);
+/* The same for a job, whose reference it takes, also on failure: api/job.c. */
+int job_wait_begin(struct request *request, struct job *job, double seconds, struct error *err);
 
 /* As store_volume_verify; damage is a warning of the job, too. */
 int volume_verify(struct api *api, const char *job, const struct volume_record *volume, uint64_t first, uint64_t bytes,

@@ -109,71 +109,25 @@ int job_list(void *context, struct request *request, struct error *err)
 
 /* ---- waiting for what becomes of one ---- */
 
-struct waiter {
-	struct job *job;
-	struct watch watch;
-	double until; /* clock_monotonic */
-};
-
-static void wake_request(void *context)
+static void watch_job(void *job, struct watch *watch)
 {
-	request_wake(context);
+	job_watch(job, watch);
 }
 
-static void waiter_free(void *state)
+static void leave_job(void *job, struct watch *watch)
 {
-	struct waiter *waiter = state;
-
-	job_unwatch(waiter->job, &waiter->watch);
-	job_release(waiter->job);
-	free(waiter);
-}
-
-int wait_read(struct api *api, struct request *request, double initial, double *ret_seconds, struct error *err)
-{
-	const char *wait = request_query(request, "wait");
-	double seconds = initial;
-
-	if (wait == NULL)
-		prefer_wait(request_header(request, "Prefer"), &seconds);
-	else if (!number_parse(wait, 0, 1e9, &seconds))
-		return error_set(err, ERR_INVALID, "wait is \"%.40s\", expected a number of seconds from 0 on", wait);
-	*ret_seconds = seconds < api->max_wait ? seconds : api->max_wait;
-	return 0;
+	job_unwatch(job, watch);
+	job_release(job);
 }
 
 int job_wait_begin(struct request *request, struct job *job, double seconds, struct error *err)
 {
-	struct waiter *waiter = calloc(1, sizeof(*waiter));
+	static const struct wait_kind kind = {watch_job, leave_job};
+	int code = wait_begin(request, &kind, job, seconds, err);
 
-	if (waiter == NULL) {
+	if (code != 0)
 		job_release(job);
-		return error_set(err, ERR_NO_MEMORY, "no memory to wait for a job");
-	}
-	waiter->job = job;
-	waiter->until = clock_monotonic() + seconds;
-	waiter->watch.wake = wake_request;
-	waiter->watch.context = request;
-	job_watch(job, &waiter->watch);
-	request_set_state(request, waiter, waiter_free);
-	return 0;
-}
-
-struct job *job_waited_for(struct request *request)
-{
-	struct waiter *waiter = request_state(request);
-
-	return waiter != NULL ? waiter->job : NULL;
-}
-
-bool job_wait_goes_on(struct request *request)
-{
-	struct waiter *waiter = request_state(request);
-
-	if (clock_monotonic() >= waiter->until || request_stopping(request))
-		return false;
-	request_wait_until(request, waiter->until);
-	return true;
+	return code;
 }
 
 /* ---- one, and waiting for its end ---- */
@@ -181,13 +135,13 @@ bool job_wait_goes_on(struct request *request)
 /* The job's document, once it has ended or the time is over. */
 static int wait_end(struct request *request, int status, struct error *err)
 {
-	struct job *job = job_waited_for(request);
+	struct job *job = wait_subject(request);
 	struct job_facts facts;
 
 	job_facts(job, &facts);
 	if (facts.removed)
 		return error_set(err, ERR_NOT_FOUND, "job %s was removed", facts.id);
-	if (!facts.ended && job_wait_goes_on(request))
+	if (!facts.ended && wait_goes_on(request))
 		return HTTP_WAIT;
 	return reply_job(request, status, job, err);
 }

@@ -46,7 +46,7 @@ static int list_volumes(struct api *api, struct request *request, const struct p
 		return code;
 	for (int i = 0; i < count; i++)
 		hashed = hashed && volumes[i].hashed;
-	if (!hashed && job_wait_goes_on(request))
+	if (!hashed && wait_goes_on(request))
 		code = HTTP_WAIT;
 	else
 		code = reply_page(request, facts.id, page, volumes, count, err);
@@ -63,11 +63,11 @@ int volume_list(void *context, struct request *request, struct error *err)
 
 	if (page_read(request, &page, err) != 0)
 		return err->code;
-	if (job_waited_for(request) == NULL && (wait_read(api, request, patience, &seconds, err) != 0 ||
-						jobs_find(api->jobs, request_argument(request, 0), &job, err) != 0 ||
-						job_wait_begin(request, job, seconds, err) != 0))
+	if (wait_subject(request) == NULL && (wait_read(api, request, patience, &seconds, err) != 0 ||
+					      jobs_find(api->jobs, request_argument(request, 0), &job, err) != 0 ||
+					      job_wait_begin(request, job, seconds, err) != 0))
 		return err->code;
-	return list_volumes(api, request, &page, job_waited_for(request), err);
+	return list_volumes(api, request, &page, wait_subject(request), err);
 }
 
 int volume_find(struct api *api, const struct job_facts *job, const char *name, struct volume_record *ret_volume,
