@@ -98,7 +98,7 @@ TRUNCATION_INLINE int truncation_cusp_last(const struct truncation_end *end)
 
 	return truncation_cusp_reach(end->columns) < most ? truncation_cusp_reach(end->columns) : most;
 }
-/* What noise does to the mean at a place. */
+/* Noise of the mean at a place: three standard deviations. */
 TRUNCATION_INLINE float truncation_cusp_noise(const struct truncation_end *end)
 {
 	return 3 * end->deviation / sqrtf((float)truncation_cusp_columns(end->columns));
@@ -480,7 +480,7 @@ TRUNCATION_INLINE struct shell_place shell_neighbour(struct shell_place place, i
 	place.at[side] = at < 0 ? 0 : at < SHELL_OUTLINES ? at : SHELL_OUTLINES - 1;
 	return place;
 }
-/* What a bin adds to the sums for refined outlines. */
+/* Adds a bin to the sums for refined outlines. */
 TRUNCATION_INLINE void shell_refined_add(struct shell_sums *sums, const float outlines[2], int bin, float p)
 {
 	const float x = shell_x(bin);

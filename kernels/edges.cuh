@@ -18,7 +18,7 @@ struct batch_slots {
 	int slot[BATCH_MOST];
 };
 
-/* What is kept of an end of a row until its extension is fitted: see struct truncation_end. */
+/* The part of an end of a row that is kept until its extension is fitted: see struct truncation_end. */
 struct kept_end {
 	int air; /* samples before it */
 	int count, cap;
@@ -90,6 +90,25 @@ static __device__ __forceinline__ double sum_lanes(double value, unsigned lanes)
 	for (int other = 1; other < ROW_LANES; other *= 2)
 		value += __shfl_xor_sync(lanes, value, other);
 	return value;
+}
+
+/* The moments over the lanes of a row. ODD: with those of odd order, which bins about the middle do not need. */
+template <bool ODD>
+static __device__ __forceinline__ truncation_row_sums sum_moments(const truncation_row_sums &own, unsigned lanes)
+{
+	truncation_row_sums sums = {};
+
+	sums.n = sum_lanes(own.n, lanes);
+	if (ODD)
+		sums.x = sum_lanes(own.x, lanes);
+	sums.x2 = sum_lanes(own.x2, lanes);
+	if (ODD)
+		sums.x3 = sum_lanes(own.x3, lanes);
+	sums.x4 = sum_lanes(own.x4, lanes);
+	sums.y = sum_lanes(own.y, lanes);
+	sums.xy = sum_lanes(own.xy, lanes);
+	sums.x2y = sum_lanes(own.x2y, lanes);
+	return sums;
 }
 
 /* A row's threads are ROW_LANES neighbours of a warp; the warp's other row goes its own way. */
@@ -311,7 +330,7 @@ static __device__ __forceinline__ int least_of_lanes(double residual, int candid
 	return candidate;
 }
 
-/* Both sides' outlines about the best place, refined, in a lane for each neighbour. */
+/* Refines the outlines of both sides about the best place, a lane for each neighbour. */
 static __device__ void refine_outlines(const struct shell_table *table, const float *bins, double square,
 				       struct shell_place place, const row_lanes &at, float ret_outlines[2])
 {
@@ -346,12 +365,7 @@ static __device__ struct shell find_shell(const struct shell_table *table, const
 	}
 	__syncwarp(at.mask);
 	square = sum_lanes(square, at.mask);
-	sums.n = sum_lanes(sums.n, at.mask);
-	sums.x2 = sum_lanes(sums.x2, at.mask);
-	sums.x4 = sum_lanes(sums.x4, at.mask);
-	sums.y = sum_lanes(sums.y, at.mask);
-	sums.xy = sum_lanes(sums.xy, at.mask);
-	sums.x2y = sum_lanes(sums.x2y, at.mask);
+	sums = sum_moments<false>(sums, at.mask);
 	struct shell_parabola parabola = shell_parabola_of(&sums);
 	for (int bin = at.lane; bin < SHELL_BINS; bin += ROW_LANES)
 		error += shell_parabola_error(&parabola, bin, bins[bin]);
@@ -377,20 +391,12 @@ static __device__ struct shell find_shell(const struct shell_table *table, const
 
 static __device__ struct truncation_row_sums sum_row(const float *p, int columns, float level, const row_lanes &at)
 {
-	struct truncation_row_sums own = {}, sums;
+	struct truncation_row_sums own = {};
 
 	for (int c = at.lane; c < columns; c += ROW_LANES)
 		if (p[c] >= level)
 			truncation_row_add(&own, truncation_x(c, columns), (double)p[c]);
-	sums.n = sum_lanes(own.n, at.mask);
-	sums.x = sum_lanes(own.x, at.mask);
-	sums.x2 = sum_lanes(own.x2, at.mask);
-	sums.x3 = sum_lanes(own.x3, at.mask);
-	sums.x4 = sum_lanes(own.x4, at.mask);
-	sums.y = sum_lanes(own.y, at.mask);
-	sums.xy = sum_lanes(own.xy, at.mask);
-	sums.x2y = sum_lanes(own.x2y, at.mask);
-	return sums;
+	return sum_moments<true>(own, at.mask);
 }
 
 /* ROW_LANES threads have a row of the list. */

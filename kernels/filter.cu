@@ -37,7 +37,7 @@
 static const size_t FFT_BYTES = (size_t)16 << 20;
 /* Rows that cuFFT has room for at least; bytes that its workspace is aligned to. */
 enum { FFT_ROWS = 8, FFT_ALIGNED = 256 };
-/* Of a fused transform's length the 512th part, at most. */
+/* The largest 512th part of a fused transform's length. */
 enum { HALF_MOST = 10 };
 
 /* cuFFT's part: transforms of one length, so many rows at once, in the plan's scratch with the workspace behind. */
@@ -123,7 +123,7 @@ struct row_place {
 	int view, row;
 	const float *from; /* its samples */
 	float *to;         /* its filtered ones */
-	/* Of an extended row: the sides that it is cut off at, and its place in the list. */
+	/* The sides that an extended row is cut off at, and its place in the list. */
 	unsigned char sides;
 	int listed;
 };

@@ -290,7 +290,7 @@ struct plan_shape {
 	bool few_views;    /* an update has too few views to fill the card by whole rays */
 	bool copied;       /* the volume may be projected from copies in half precision (by_view.cu) */
 	bool covered;      /* every view sees the whole grid: sum_S w_ij = views of S */
-	/* Of the filter, of rows as they are and of those with their extensions; 0: none are extended. */
+	/* Lengths of the filter's transforms, of rows as they are and of extended ones; 0: none are extended. */
 	struct transform_length plain, extended;
 };
 

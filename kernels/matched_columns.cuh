@@ -149,7 +149,7 @@ static __device__ __forceinline__ void upright_add(const run_place &place_of, co
 	}
 }
 
-/* What the rays of one axis in one view give to a run. */
+/* Adds the rays of one axis in one view to a run. */
 template <int WINDOW, bool ENDS>
 static __device__ __forceinline__ void upright_gather(const matched_job &job, const device_view &g,
 						      const float *projection, const run_place &place_of, float reach,

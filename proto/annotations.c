@@ -14,7 +14,7 @@ static const struct kind kinds[] = {
     {"ruler", 2, 2}, {"angle", 3, 3}, {"ellipse", 3, 3}, {"freehand", 3, ANNOTATION_POINTS_MAX}};
 enum { KINDS = sizeof(kinds) / sizeof(kinds[0]) };
 
-/* Of 1 to 40 characters, and no two alike among those before `entry`. */
+/* Reads an id of 1 to 40 characters, which no entry before `entry` has. */
 static void read_id(struct json_reader *reader, const cJSON *entry)
 {
 	char id[TEXT_BYTES(40)] = "";

@@ -4,7 +4,7 @@
 #include "proto/json.h"
 
 /*
- * What people have measured in a job's volumes, and the views that they have chosen to show:
+ * Annotations of a job: measurements in its volumes, and views that people have chosen to show:
  *
  *   {"measurements": [{"id": "1", "kind": "ruler", "points": [[x, y, z], ...], "label": "..."}],
  *    "key_images": [{"id": "1", "volume": "final", "caption": "...", "created": "...", "window": 2000, "level": 300,
@@ -23,7 +23,7 @@ enum {
 
 /* Reads it strictly and prints it anew: *ret_text is the caller's (free). Errors point to the member. */
 int annotations_read(const char *text, size_t length, char **ret_text, size_t *ret_length, struct error *err);
-/* Of a job that has none. */
+/* The document of a job without annotations. */
 #define ANNOTATIONS_NONE "{\"measurements\":[],\"key_images\":[]}"
 
 #endif

@@ -34,7 +34,7 @@ struct audit_mark {
  * ends. ret_line has no line feed. 0 when it does not fit, or the digest cannot be made; otherwise its length.
  */
 size_t audit_line(struct audit_mark *mark, const char *members, char ret_line[AUDIT_LINE_MAX]);
-/* What a line says of itself; false where it is none. */
+/* Reads number and chain of a line of the log; false where it is none. */
 bool audit_line_mark(const char *line, size_t length, struct audit_mark *ret_mark);
 /* Whether a line fits its own number and chain behind the line of `before`. */
 bool audit_line_fits(const char *line, size_t length, const struct audit_mark *before);

@@ -134,7 +134,7 @@ int balls_parse(const char *text, size_t length, struct balls *ret_balls, struct
 
 /* ---- pictures ---- */
 
-/* What one thread needs to turn samples into line integrals. */
+/* The plan and buffers with which one thread turns samples into line integrals. */
 struct reader {
 	struct plan *plan;
 	struct stack *stack; /* one slot */

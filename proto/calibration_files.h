@@ -11,7 +11,8 @@
  *   result.json   {"ended", "error": null} and the members of calibration_json; or
  *                 {"ended", "error": {"code": enum error_code, "detail", "pointer"}}: written by cbct-worker
  *
- * Both end with their checksums (proto/seal.h). A directory without a result is a calibration that is still to be made.
+ * Request and result end with their checksums (proto/seal.h). A directory without a result is a calibration that is
+ * still to be made.
  */
 #define CALIBRATION_REQUEST "request.json"
 #define CALIBRATION_RESULT "result.json"
@@ -27,7 +28,7 @@ int sealed_read(const char *path, cJSON **ret_document, struct error *err);
  */
 int calibration_run(const char *directory, const char *scan_directory, struct error *err);
 
-/* What was found, read again from both documents; pointers are owned. Free with calibrated_clear. */
+/* A finished calibration, read again from both documents; pointers are owned. Free with calibrated_clear. */
 struct calibrated {
 	struct scan *sweep; /* the scan of the phantom: nominal geometry, detector */
 	double acquired;    /* when that scan was made, seconds since 1970 */

@@ -306,7 +306,7 @@ bool checkpointer_due(const struct checkpointer *checkpointer)
 	return !checkpointer->busy && clock_monotonic() >= checkpointer->due;
 }
 
-/* What was the newest has its second name before the file that takes its first one is synced. */
+/* The checkpoint before gets its second name before the file that takes its first name is synced. */
 static void *sync_and_name(void *context)
 {
 	struct checkpointer *checkpointer = context;

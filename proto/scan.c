@@ -942,7 +942,7 @@ static void warn_hardening(cJSON *list, const struct scan *scan)
 	}
 }
 
-/* What the calibration that the geometry comes from had to tell. */
+/* Adds the warnings of the calibration that the geometry comes from. */
 static void warn_notes(cJSON *list, const struct scan *scan)
 {
 	const cJSON *geometry = cJSON_GetObjectItemCaseSensitive(scan->document, "geometry"), *note;

@@ -1,4 +1,4 @@
-/* Who was scanned, and for which study: see subject.h. */
+/* The patient and the study of a scan: see subject.h. */
 #include "proto/subject.h"
 
 #include <ctype.h>

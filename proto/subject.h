@@ -7,7 +7,7 @@
 #include "proto/json.h"
 
 /*
- * Who was scanned, and for which study: members of "patient" and "study" in a scan's document, in DICOM's words
+ * The patient and the study of a scan: members of "patient" and "study" in a scan's document, in DICOM's words
  * (PS3.3 C.7.1.1 and C.7.2.1) and within the limits of DICOM's value representations (PS3.5 6.2), so that all that is
  * accepted can be written. Dates are YYYY-MM-DD, times HH:MM:SS.
  *

@@ -9,7 +9,7 @@
 #include "core/error.h"
 
 /*
- * Who may ask the daemon for what: the file of tokens, which `cbct token` writes and cbctd reads. A line has four
+ * The file of tokens, each with the roles that it gives, which `cbct token` writes and cbctd reads. A line has four
  * words, and # begins a comment:
  *
  *   NAME     ROLES          EXPIRES                SECRET

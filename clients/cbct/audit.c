@@ -27,7 +27,7 @@ static int check_line(const char *path, long number, const char *line, size_t le
 
 	if (!audit_line_mark(line, length, &mark))
 		return error_set(err, ERR_DAMAGED, "%s:%ld is no line of an audit log", path, number);
-	/* What is older may have been removed for its age: the chain then begins with what is there. */
+	/* Older lines may have been removed for their age: the chain then begins with the first line that is there. */
 	if (!check->begun && mark.number > 1) {
 		check->first = mark.number;
 	} else if (!audit_line_fits(line, length, &check->mark)) {

@@ -78,7 +78,7 @@ static void scale_say(const struct calibration *calibration)
 	    calibration->diameter_ratio, calibration->distance_ratio);
 }
 
-/* What a person wants to know at once. */
+/* Prints the figures that a person looks for first. */
 static void result_say(const struct calibration *calibration)
 {
 	scale_say(calibration);

@@ -123,7 +123,7 @@ static const struct option_group groups[] = {
 
 /* ---- the scan ---- */
 
-/* What was posted, out of what the daemon makes of it. */
+/* Parses the scan that was posted out of the daemon's document of it. */
 static int scan_of_reply(cJSON *reply, struct scan **ret_scan, struct error *err)
 {
 	static const char *const members[] = {"name", "detector", "projections", "geometry"};

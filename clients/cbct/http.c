@@ -40,7 +40,7 @@ struct http {
 	double retry_after; /* s, of the last reply */
 };
 
-/* What the body's callback knows of the transfer. */
+/* The state of a transfer, for the callback that takes its body. */
 struct transfer {
 	struct http *http;
 	const struct http_request *request;

@@ -193,7 +193,7 @@ static void read_subject(struct reader *reader)
 	}
 }
 
-/* What the file itself says, outside of any sequence. */
+/* Reads an element of the file itself, outside of any sequence. */
 static void read_top(struct reader *reader)
 {
 	struct dicom *dicom = reader->dicom;
@@ -305,7 +305,7 @@ static void XMLCALL add_text(void *context, const char *text, int length)
 {
 	struct reader *reader = context;
 
-	/* What is longer than any number of angles is none of ours. */
+	/* No list of angles is as long: the text is of another kind. */
 	if (!reader->in_element || (size_t)length >= TEXT_MAX - reader->length)
 		return;
 	memcpy(reader->text + reader->length, text, (size_t)length);
@@ -441,7 +441,7 @@ static int find_positions(struct image_file *file, const struct dicom *dicom, st
 		position->source_to_detector = values->number[TO_DETECTOR];
 		position->source_to_isocentre = values->number[TO_ISOCENTRE];
 		position->patient = dicom->patient;
-		/* Of the first frame: the others turn. */
+		/* The first frame gives the direction; the others are turned from it. */
 		if (k == 0)
 			memcpy(position->towards, dicom->towards, sizeof(position->towards));
 	}

@@ -165,8 +165,7 @@ static bool has_extension(const char *path, const char *const *extensions)
 	return false;
 }
 
-/* Of several kinds in a folder those that bear a mark are meant: .mhd and not the .raw beside it, no notes, no lists.
- */
+/* In a folder of several kinds, files with a header are meant: .mhd and not the .raw beside it, no notes, no lists. */
 static int keep_one_format(struct images_files *files, const char *path, struct error *err)
 {
 	static const char *const raw_names[] = {".raw", ".bin", ".img", ".dat", ".f32", ".u16", NULL};

@@ -15,7 +15,7 @@
  * images.c; each is one file image_NAME.c.
  */
 
-/* What the command line says of images. */
+/* Options of the command line about images. */
 struct image_options {
 	const char *pattern;          /* of the names in a folder, NULL: all that are images */
 	double size[2];               /* columns, rows of raw files; NaN: none given */

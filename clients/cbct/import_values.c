@@ -207,7 +207,7 @@ static int check_values(const struct import_values *options, enum quantity quant
 int import_values(const struct import_values *options, struct images *images, cJSON **ret_projections,
 		  struct error *err)
 {
-	/* What is known of counts without a look at them. */
+	/* Counts need no look: they are whole and not negative. */
 	struct survey survey = {.least = 0, .most = INFINITY, .whole = true};
 	enum quantity quantity = QUANTITY_INTENSITY;
 	enum sample sample = SAMPLE_UINT16;

@@ -6,7 +6,7 @@
 #include "clients/cbct/images.h"
 #include "proto/scan.h"
 
-/* What the numbers of images mean: what the command line says, or what they look like. */
+/* The meaning of the numbers in images: the command line tells it, or they are looked at. */
 struct import_values {
 	int quantity, sample; /* enum quantity, enum sample, or unset */
 	double air;           /* counts; NaN: not given */

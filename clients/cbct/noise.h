@@ -7,7 +7,7 @@
 #include "core/backend.h"
 
 /*
- * What a detector makes of exact line integrals p. In this order, each where it is on:
+ * The detector's imperfections, applied to exact line integrals p in this order, each where it is on:
  *
  *   multiplicative A   p (1 - A r), r uniform in 0..1 (the noise of the 2010 study)
  *   photons N          n ~ Poisson(N exp(-p)); p = -ln(max(n, 1) / N)

@@ -1,4 +1,4 @@
-/* What is simulated: see object.h. */
+/* The object of a simulation: see object.h. */
 #include "clients/cbct/object.h"
 
 #include <math.h>

@@ -4,7 +4,7 @@
 #include "clients/cbct/volume_input.h"
 #include "core/scan/phantom.h"
 
-/* What is simulated: an analytic phantom, a phantom of balls, or a voxel volume. */
+/* The object of a simulation: an analytic phantom, a phantom of balls, or a voxel volume. */
 struct object_options {
 	int phantom;       /* an index into phantom_names, or unset */
 	const char *balls; /* file of a phantom as proto/calibration.h reads it */

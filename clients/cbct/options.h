@@ -22,7 +22,7 @@ enum option_kind {
 	OPTION_CHOICE   /* int, an index into `names` */
 };
 
-/* What a value is while nobody has given it; help shows no default then. */
+/* Values that nobody has given; help shows no default for them. */
 #define OPTION_UNSET_INTEGER (-9223372036854775807L)
 #define OPTION_UNSET_NUMBER __builtin_nan("")
 #define OPTION_UNSET_3                                                                                                 \

@@ -19,7 +19,7 @@ int output_close(FILE *file, const char *path, struct error *err)
 {
 	bool failed = ferror(file) != 0;
 
-	/* Both matter: a full disk may show only when the last buffer goes out. */
+	/* Writing and closing can fail: a full disk may show only when the last buffer goes out. */
 	if ((file == stdout ? fflush(file) : fclose(file)) != 0)
 		return error_set_errno(err, errno, "%.200s", path);
 	return failed ? error_set(err, ERR_IO, "%.200s cannot be written", path) : 0;

@@ -38,7 +38,7 @@ static const struct special {
     {"", "mu_water", "mu-water", "MU", NULL, false},
 };
 
-/* What stands behind a row of recipe_option_rows. */
+/* The parameter or algorithm behind a row of recipe_option_rows. */
 static struct entry {
 	const struct parameter *parameter;
 	const struct algorithm *algorithm; /* that the option chooses, with its iterations; else NULL */

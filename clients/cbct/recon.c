@@ -40,7 +40,7 @@ static const struct option_group groups[] = {
     {0},
 };
 
-/* What the hooks show. */
+/* State of the display, for the hooks. */
 struct display {
 	struct progress *progress;
 	int iterations;

@@ -49,7 +49,7 @@ static const struct option_group groups[] = {
     {0},
 };
 
-/* What is not given of window and level: from the slice's range. */
+/* Takes window and level from the slice's range where they are not given. */
 static void find_window(const float *voxels, const struct grid *grid, int axis, long index, double *window,
 			double *level)
 {

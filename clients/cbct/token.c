@@ -45,7 +45,7 @@ static void file_close(struct token_file *file)
 	tokens_clear(&file->tokens);
 }
 
-/* Who waited for the lock may hold that of a file which has been replaced meanwhile: then once more. */
+/* While this process waited, the locked file may have been replaced by another: the lock is taken once more then. */
 static int file_lock(const char *path, struct token_file *file, struct error *err)
 {
 	struct stat now;

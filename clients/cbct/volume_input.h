@@ -4,7 +4,7 @@
 #include "clients/cbct/options.h"
 #include "proto/format.h"
 
-/* What the command line adds to a volume file: headers tell grids, raw files do not. */
+/* Options of the command line about a volume file: headers tell the grid, raw files do not. */
 struct volume_options {
 	double size[3];    /* voxels along x, y, z; NaN: from the file */
 	double spacing[3]; /* mm; NaN: from the file, 1 for raw */

@@ -9,7 +9,7 @@
 void warning_print(const char *code, const char *detail);
 /* The same for each of a list of warnings as the API gives it; NULL is none. */
 void warnings_print(const cJSON *list);
-/* Those of a scan that no daemon has told of. */
+/* Prints the warnings of a scan that no daemon has seen. */
 void warnings_print_scan(const struct scan *scan);
 
 #endif

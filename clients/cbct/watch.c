@@ -31,7 +31,7 @@ static const struct option_group groups[] = {
     {0},
 };
 
-/* What is on the terminal, and who has failed beside the one that draws it. */
+/* The progress bar on the terminal, and the failure of the thread beside the one that draws it. */
 struct view {
 	pthread_mutex_t lock; /* guards progress */
 	struct progress *progress;

@@ -342,8 +342,9 @@ static int find_round(const struct run *run, double turn, bool again, struct err
 }
 
 /*
- * First from the nominal geometry; then those that were refused begin once more, from where their neighbours stand.
- * They only begin there: their own shadows alone say where they end.
+ * The first round begins from the nominal geometry; views that it refused begin once more, from where their neighbours
+ * stand.
+ * The search for a pose only begins there: the view's own shadows alone say where it ends.
  */
 static int find_views(struct run *run, double turn, struct error *err)
 {

@@ -172,7 +172,7 @@ int volume_options(struct request *request, const struct job_facts *job, struct 
 	return 0;
 }
 
-/* What DICOM says of a volume beside its own file: of the job, and as asked for. */
+/* Reads the words that DICOM wants beside the volume's own file, from the job and from the request. */
 static int read_words(struct api *api, struct request *request, const struct volume_record *volume,
 		      struct content_options *options, struct error *err)
 {

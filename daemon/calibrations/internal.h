@@ -41,7 +41,7 @@ struct calibrations {
 void calibration_path(const struct calibrations *calibrations, const char *id, const char *file, char ret_path[1024]);
 /* NULL where there is none; the lock is held. */
 struct entry *calibration_entry(struct calibrations *calibrations, const char *id);
-/* Both documents; the result is NULL where there is none yet. ERR_NOT_FOUND, ERR_DAMAGED. */
+/* Reads request and result; the result is NULL where there is none yet. ERR_NOT_FOUND, ERR_DAMAGED. */
 int calibration_read(struct calibrations *calibrations, const char *id, cJSON **ret_request, cJSON **ret_result,
 		     struct error *err);
 

@@ -22,7 +22,7 @@ static void drain(const struct calibrations *calibrations)
 {
 	eventfd_t count;
 
-	/* It does not block, and there may be nothing. */
+	/* The eventfd does not block; EAGAIN: nobody has written to it. */
 	if (eventfd_read(calibrations->wake, &count) != 0 && errno != EAGAIN)
 		log_line(LEVEL_ERROR, "the calibrator's eventfd: %s", strerror(errno));
 }

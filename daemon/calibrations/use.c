@@ -1,4 +1,4 @@
-/* What scans and pictures take from a calibration: calibrations.h. */
+/* The uses of a calibration, by scans and for pictures: calibrations.h. */
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>

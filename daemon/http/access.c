@@ -1,5 +1,5 @@
 /*
- * Who asks, and whether this route is for them.
+ * The gate of access: finds the role of a client and holds it against the route.
  *
  * Without a file of tokens everybody who reaches the daemon may do everything:
  * it listens on loopback and Unix sockets only (http/listen.c). With one, a
@@ -48,7 +48,7 @@ struct session {
 	double ends;                        /* clock_monotonic; 0: free */
 };
 
-/* Who may on Unix sockets without a token. */
+/* A role for a user or group on Unix sockets, without a token. */
 struct peer_rule {
 	bool group; /* otherwise a user */
 	unsigned id;

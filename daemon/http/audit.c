@@ -3,7 +3,7 @@
  * server threads hand over, so that no request waits for the disk. It syncs once
  * a second while there is something new, before a file is renamed, and at the end.
  *
- * What is told: each request that may change something, each that is refused for
+ * Lines of the log: each request that may change something, each that is refused for
  * who asks, and reads of a scan, job or calibration. A connection's reads of one
  * and the same are told once, until it has read of another: a page that looks at
  * a job asks for hundreds of slices. Names of scans and patients are in bodies,

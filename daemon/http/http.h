@@ -121,7 +121,7 @@ void request_set_state(struct request *request, void *state, void (*state_free)(
 void *request_state(const struct request *request);
 
 /* ---- who asks ---- */
-/* What showed who asks. */
+/* The proof of a client's identity. */
 enum proof {
 	PROOF_NONE,
 	PROOF_NOT_ASKED /* there are no tokens */,

@@ -226,7 +226,7 @@ enum suspension connection_suspend(struct connection *connection, double until);
 void connections_recheck(struct http *http);
 /* All that are suspended. */
 void connections_wake(struct http *http);
-/* None has a request under way. */
+/* True where no connection has a request under way. */
 bool connections_idle(struct http *http);
 
 /* ---- http/live.c: replies without an end in sight ---- */
@@ -266,7 +266,7 @@ int access_reload(struct access *access, struct error *err);
 int access_check_routes(const struct route *routes, struct error *err);
 /* Whether what showed it still holds: not expired, not revoked. */
 bool access_still_holds(struct access *access, const struct identity *who);
-/* Of a request that has found its route; 0, or 0 with a reply that refuses, or an error. */
+/* Checks a request that has found its route: 0, with a reply where it is refused, or an error. */
 int access_check(struct request *request, struct error *err);
 
 /* ---- http/traffic.c: numbers of requests, bytes and seconds ---- */
@@ -279,7 +279,7 @@ void traffic_count(struct http *http, const struct request *request, bool whole)
 /* most: bytes of a file, before it is renamed; keep: renamed files. */
 int audit_new(const char *path, size_t most, int keep, struct audit **ret_audit, struct error *err);
 void audit_free(struct audit *audit); /* NULL is fine */
-/* Of a request that has ended, in its thread; NULL is fine. */
+/* Adds the line of a request that has ended, in its thread; audit NULL is fine. */
 void audit_tell(struct audit *audit, const struct request *request, bool whole);
 
 /* ---- http/reply.c ---- */

@@ -90,7 +90,7 @@ static bool is_ours(const struct request *request, const char *host)
 		if (is_address(&http->listeners[i].address, host))
 			return true;
 	}
-	/* Who listens on all addresses is reached by each. */
+	/* A daemon that listens on all addresses is reached by each. */
 	return getsockname(request->connection->socket, (struct sockaddr *)&own, &size) == 0 && is_address(&own, host);
 }
 
@@ -106,7 +106,7 @@ static bool is_own_page(const struct request *request, const char *origin, const
 	char page[HOST_MAX];
 	long page_port;
 
-	/* What the network has put into a page that came without TLS is not ours. */
+	/* The network may have changed a page that came without TLS: it is another origin then. */
 	if (!origin_parse(origin, page, &page_port) ||
 	    (request->connection->tls && strncasecmp(origin, "https:", 6) != 0))
 		return false;

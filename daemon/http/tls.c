@@ -10,7 +10,7 @@
  * which is all that a client of the last ten years needs. AES-128 goes first:
  * nobody breaks it, and it is a quarter faster than AES-256.
  *
- * What the gate (http/gate.c) looks at is what GnuTLS has decrypted.
+ * The gate (http/gate.c) looks at bytes that GnuTLS has decrypted.
  */
 #include "daemon/http/internal.h"
 
@@ -33,7 +33,7 @@ const char tls_priorities[] = "NORMAL:-VERS-ALL:+VERS-TLS1.3:+VERS-TLS1.2:-KX-AL
 			      "+AES-128-GCM:+AES-256-GCM:+CHACHA20-POLY1305:-SIGN-RSA-SHA1:-SIGN-ECDSA-SHA1:"
 			      "%SERVER_PRECEDENCE";
 
-/* What was read from the files, and stays as it is. */
+/* Credentials as they were read from the files; constant. */
 struct credentials {
 	gnutls_pcert_st chain[CHAIN_MAX];
 	unsigned chain_length;
@@ -289,7 +289,7 @@ static bool is_trusted(struct tls *tls, gnutls_x509_crt_t *chain, unsigned lengt
 	unsigned status = ~0u;
 	int code = GNUTLS_E_NO_CERTIFICATE_FOUND;
 
-	/* They are kept for longer than this takes, should others take their place meanwhile. */
+	/* Credentials that others replace are kept for longer than this takes. */
 	pthread_mutex_lock(&tls->lock);
 	clients = tls->credentials->clients;
 	pthread_mutex_unlock(&tls->lock);

@@ -65,7 +65,7 @@ struct upload {
 	bool holds;   /* projections count only when the body's end, or a break, has shown that they are right */
 	bool spoiled; /* the body was wrong */
 
-	/* Of an image: what is doubtful about it. The writer's until the slot is settled, then the connection's. */
+	/* Warnings about an image. They are the writer's until the slot is settled, then the connection's. */
 	cJSON *warnings;
 
 	/* Guarded by uploads.lock. */

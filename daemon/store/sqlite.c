@@ -134,7 +134,7 @@ static int connection_open(struct connection *connection, struct error *err)
 		result = sqlite3_exec(connection->db,
 				      "PRAGMA page_size = 4096; PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL;"
 				      " PRAGMA foreign_keys = ON;"
-				      /* What is removed may name a patient. */
+				      /* Rows that are removed may name a patient. */
 				      " PRAGMA secure_delete = ON;",
 				      NULL, NULL, NULL);
 	}

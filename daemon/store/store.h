@@ -39,7 +39,7 @@
  *
  * Threads: every function may be called from any thread. Writing calls wait for
  * one commit at a time (about 0.3 ms each); reading calls never wait for them.
- * None is called with a lock held, except where a lock says so itself.
+ * No hook is called with a lock held, except where a lock says so itself.
  *
  * A commit or sync that fails for any other reason than a full disk is final:
  * hooks.failed is called (once, in the thread of the failure), every later

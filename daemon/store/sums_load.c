@@ -131,7 +131,7 @@ static int follow_parts(struct store *store, struct stored_scan *scan, const str
 	return code == 0 ? store_end(store, stored_scan_set_closed(scan, err), err) : code;
 }
 
-/* What comes from now on has a later place in the order of arrival than all that is there. */
+/* Projections that come from now on have a later place in the order of arrival than all that are there. */
 static void raise_order_floor(struct stored_scan *scan)
 {
 	for (int i = 0; i < scan->count; i++) {

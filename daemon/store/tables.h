@@ -48,7 +48,7 @@ struct column {
 
 enum { COLUMNS_MAX = 48 };
 
-/* What catalogue_put does where a row with the same key is there. */
+/* The rule of a table for catalogue_put where a row with the same key is there. */
 enum put {
 	PUT_ADDS,     /* an error */
 	PUT_KEEPS,    /* the first row stays */

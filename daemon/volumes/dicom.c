@@ -12,12 +12,12 @@
 #define CT_IMAGE "1.2.840.10008.5.1.4.1.1.2"
 #define ENHANCED_CT_IMAGE "1.2.840.10008.5.1.4.1.1.2.1"
 #define EXPLICIT_LITTLE_ENDIAN "1.2.840.10008.1.2.1"
-/* Of this program; by the rule of the root 2.25, a UUID as a number. */
+/* UID of this program: a UUID as a number, by the rule of the root 2.25. */
 #define IMPLEMENTATION "2.25.208437269145863218905713340955731662842"
 
 enum { UID_SIZE = 65, DS_SIZE = 17 /* characters of a decimal string, and its end */ };
 static const uint32_t undefined = 0xffffffff; /* length */
-/* Of an original frame an Enhanced CT tells tube and exposure, which a scan does not know. */
+/* Frames are derived: an Enhanced CT tells tube and exposure of an original one, which a scan does not know. */
 static const char frame_type[] = "DERIVED\\PRIMARY\\VOLUME\\NONE";
 
 int dicom_patient(const struct dicom_words *words, const struct patient *told, struct patient *ret_patient,
@@ -233,7 +233,7 @@ static void put_subject(struct object *o, const struct subject *subject, enum su
 
 /* ---- modules ---- */
 
-/* What the objects of a volume have in common, and what this one is. */
+/* The attributes that the objects of a volume share, and the place of this one. */
 struct instance {
 	const struct dicom_words *words;
 	const struct grid *grid;
@@ -254,7 +254,7 @@ static void name_all(struct instance *image)
 	char place[512];
 	size_t used = 0;
 
-	/* What the patient's coordinates are, and where the voxels lie in them. */
+	/* The frame of reference goes by the patient's coordinates and the place of the voxels in them. */
 	for (int i = 0; i < 3; i++)
 		used += (size_t)snprintf(place + used, sizeof(place) - used, "%.9f %.9f %.9f %.9f ",
 					 image->patient.rotation[i][0] + 0.0, image->patient.rotation[i][1] + 0.0,

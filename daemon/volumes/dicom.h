@@ -14,7 +14,7 @@
  * by whichever daemon it is written, another grid or another placement of the patient has others.
  */
 
-/* What the volume's own file does not tell. */
+/* Words of a DICOM file that the volume's own file does not have. */
 struct dicom_words {
 	struct subject subject;
 	int position; /* enum patient_position for a volume whose file says of none; -1: not given */

@@ -43,7 +43,8 @@ static int entry_name(int slice, char ret_name[NAME_MAX_LENGTH])
 	return snprintf(ret_name, NAME_MAX_LENGTH, "CT%05d.dcm", slice + 1);
 }
 
-/* What both headers of an entry have: version 2.0, names in ASCII, stored, and no time but the first of MS-DOS. */
+/* Writes the fields that both headers of an entry share: version 2.0, names in ASCII, stored, the first time of MS-DOS.
+ */
 static void put_entry(uint8_t **at, const struct entry *entry, int name_length)
 {
 	put(at, 2, 20);
