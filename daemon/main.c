@@ -35,13 +35,20 @@ static void on_failure(void *context, const char *what)
 	kill(getpid(), SIGTERM);
 }
 
-static enum log_level level_named(const char *name)
+/* The place of a setting's choice among those names, the last of which is left. */
+static int place_of(const char *name, const char *const *names, int count)
 {
-	int level = 0;
+	int place = 0;
 
-	while (level < LEVEL_COUNT - 1 && strcmp(log_level_names[level], name) != 0)
-		level++;
-	return (enum log_level)level;
+	while (place < count - 1 && strcmp(names[place], name) != 0)
+		place++;
+	return place;
+}
+
+static void set_log(const struct config *config)
+{
+	log_set_level((enum log_level)place_of(config->log_level, log_level_names, LEVEL_COUNT));
+	log_set_format((enum log_format)place_of(config->log_format, log_format_names, LOG_FORMAT_COUNT), NULL);
 }
 
 /* A descriptor for each connection and more: as many as we may have, within reason. */
@@ -226,7 +233,7 @@ static void reload_settings(const struct arguments *arguments)
 		log_line(LEVEL_ERROR, "the settings that were read before stay: %s", err.text);
 		return;
 	}
-	log_set_level(level_named(fresh.log_level));
+	log_set_level((enum log_level)place_of(fresh.log_level, log_level_names, LEVEL_COUNT));
 	/* The new level is the daemon's from now on, and no difference. */
 	level = config->log_level;
 	config->log_level = fresh.log_level;
@@ -269,7 +276,7 @@ static int run(const struct arguments *arguments)
 	sigset_t stops;
 	int signal_number = 0, code;
 
-	log_set_level(level_named(config->log_level));
+	set_log(config);
 	notify_open();
 	raise_descriptors();
 	block_signals(&stops);
@@ -294,7 +301,7 @@ static int rebuild(const struct config *config)
 	struct store_repairs repairs;
 	struct error err;
 
-	log_set_level(level_named(config->log_level));
+	set_log(config);
 	if (store_rebuild(config->state_dir, &repairs, &err) != 0) {
 		log_line(LEVEL_ERROR, "the catalogue cannot be made again: %s", err.text);
 		return 1;

@@ -179,6 +179,7 @@ static enum MHD_Result on_request(void *context, struct MHD_Connection *mhd, con
 				  const char *version, const char *data, size_t *size, void **state)
 {
 	struct request *request = *state;
+	enum MHD_Result result;
 
 	(void)context;
 	(void)mhd;
@@ -186,11 +187,15 @@ static enum MHD_Result on_request(void *context, struct MHD_Connection *mhd, con
 	(void)version;
 	if (request == NULL) /* there was no memory for it */
 		return MHD_NO;
+	log_set_request(request->id, request->trace);
 	if (!request->begun)
-		return on_header(request, method);
-	if (*size > 0)
-		return on_body(request, data, size);
-	return on_whole(request);
+		result = on_header(request, method);
+	else if (*size > 0)
+		result = on_body(request, data, size);
+	else
+		result = on_whole(request);
+	log_set_request(NULL, NULL);
+	return result;
 }
 
 /* The library's first word of a request; what is returned becomes its state. */
@@ -242,7 +247,9 @@ static void on_completed(void *context, struct MHD_Connection *mhd, void **state
 		return;
 	if (request->begun) {
 		traffic_count(http, request, whole);
+		log_set_request(request->id, request->trace);
 		log_request(request, whole);
+		log_set_request(NULL, NULL);
 		audit_tell(http->audit, request, whole);
 	}
 	if (request->close)

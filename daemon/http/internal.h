@@ -19,7 +19,9 @@ enum {
 	SEGMENTS_MAX = 12,
 	PROBES_MAX = 128, /* the daemon's connections to itself, of one look */
 	LISTENERS_MAX = 8,
-	REQUEST_ID_SIZE = 24,
+	REQUEST_ID_SIZE = 65, /* also of one that the client gives */
+	TRACE_ID_SIZE = 33,
+	TRACE_PARENT_SIZE = 56,
 	DESCRIPTORS_MAX = 1 << 20
 };
 
@@ -81,7 +83,9 @@ struct request {
 	struct http *http;
 	struct connection *connection;
 	struct MHD_Connection *mhd;
-	char id[REQUEST_ID_SIZE];
+	char id[REQUEST_ID_SIZE];             /* its X-Request-Id, or one of ours */
+	char trace[TRACE_ID_SIZE];            /* of traceparent; "" without */
+	char trace_parent[TRACE_PARENT_SIZE]; /* likewise */
 	double started;
 	char *target;  /* as it was sent; owned */
 	char *decoded; /* what arguments and queries point into; owned */
@@ -242,6 +246,8 @@ struct request *request_new(struct http *http, struct connection *connection, co
 void request_free(struct request *request); /* NULL is fine */
 /* Method, framing, route; 0, or the reply is set (code < 0 when it is not). */
 int request_read_header(struct request *request, const char *method, struct error *err);
+/* X-Request-Id and traceparent go back with the reply. */
+void request_reply_ids(struct request *request);
 /* Replies with the gate's reasons, and lets the connection end. */
 int request_refuse(struct request *request, struct error *err);
 

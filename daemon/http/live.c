@@ -159,6 +159,6 @@ int request_reply_live(struct request *request, int status,
 	request->response = response;
 	request->status = status;
 	request->response_size = UNKNOWN_SIZE;
-	request_reply_header(request, "X-Request-Id", "%s", request->id);
+	request_reply_ids(request);
 	return 0;
 }

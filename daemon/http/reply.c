@@ -24,7 +24,7 @@ static int set_response(struct request *request, int status, struct MHD_Response
 	request->response = response;
 	request->status = status;
 	request->response_size = size;
-	request_reply_header(request, "X-Request-Id", "%s", request->id);
+	request_reply_ids(request);
 	return 0;
 }
 

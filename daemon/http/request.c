@@ -334,11 +334,59 @@ static int read_header(struct request *request, struct error *err)
 	return code;
 }
 
+/* ---- whose request it is in other systems' logs ---- */
+
+/* Text that is safe in a log and a header: nothing that ends a field, and not much of it. */
+static void read_request_id(struct request *request)
+{
+	static const char allowed[] = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789._-";
+	const char *given = request_header(request, "X-Request-Id");
+	size_t length = given != NULL ? strlen(given) : 0;
+
+	if (length > 0 && length < sizeof(request->id) && strspn(given, allowed) == length)
+		memcpy(request->id, given, length + 1);
+}
+
+static bool is_hex(const char *text, size_t length)
+{
+	return strspn(text, "0123456789abcdef") >= length;
+}
+
+/*
+ * W3C Trace Context, 3.2: "00-TRACE-PARENT-FLAGS" of 2, 32, 16 and 2 lower-case hexadecimal digits; a version that
+ * comes later may have more behind them. Neither id is all zeros.
+ */
+static void read_trace(struct request *request)
+{
+	enum { TRACE = 3, PARENT = 36, FLAGS = 53, LENGTH = 55 };
+	const char *given = request_header(request, "traceparent");
+	size_t length = given != NULL ? strlen(given) : 0;
+
+	if (length < LENGTH || (length > LENGTH && (memcmp(given, "00", 2) == 0 || given[LENGTH] != '-')) ||
+	    memcmp(given, "ff", 2) == 0 || given[TRACE - 1] != '-' || given[PARENT - 1] != '-' ||
+	    given[FLAGS - 1] != '-' || !is_hex(given, 2) || !is_hex(given + TRACE, 32) || !is_hex(given + PARENT, 16) ||
+	    !is_hex(given + FLAGS, 2) || strspn(given + TRACE, "0") >= 32 || strspn(given + PARENT, "0") >= 16)
+		return;
+	snprintf(request->trace, sizeof(request->trace), "%.32s", given + TRACE);
+	snprintf(request->trace_parent, sizeof(request->trace_parent), "%.55s", given);
+}
+
+void request_reply_ids(struct request *request)
+{
+	request_reply_header(request, "X-Request-Id", "%s", request->id);
+	if (request->trace_parent[0] != '\0')
+		request_reply_header(request, "traceparent", "%s", request->trace_parent);
+}
+
 int request_read_header(struct request *request, const char *method, struct error *err)
 {
 	int code;
 
 	snprintf(request->method, sizeof(request->method), "%s", method);
+	if (gate_refusal(request->connection) == NULL) {
+		read_request_id(request);
+		read_trace(request);
+	}
 	code = read_header(request, err);
 	if (code != 0)
 		code = reply_problem_of(request, err);
