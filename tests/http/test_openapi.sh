@@ -74,6 +74,16 @@ test_parameters_of_the_schema_are_those_of_the_tables() {
 	"$python" "$top/clients/python/parameters.py" --check <"$work/parameters.json" || fail "the Python client's table"
 }
 
+# Members that no table has: presets, the patient and the study, lists, phantoms of calibrations.
+test_bounds_of_the_schema_are_those_of_the_daemon() {
+	local python=${PYTHON:-/usr/bin/python3}
+	"$python" -c 'import yaml' 2>/dev/null || skip "python3-yaml is not here"
+	start_daemon
+	"$python" "$top/proto/openapi.py" --json "$top/proto/openapi.yaml" >"$work/openapi.json"
+	"$python" "$top/tests/openapi/bounds.py" "$url" "$work/openapi.json" || fail "the daemon with the bounds of proto/openapi.yaml"
+	stop_daemon
+}
+
 # A parameter that nobody knows is refused, and the refusal names those of the schema.
 test_query_parameters_are_those_of_the_schema() {
 	local method path names count=0
