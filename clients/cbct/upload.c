@@ -23,7 +23,8 @@
 #include "proto/scan_directory.h"
 #include "proto/zstream.h"
 
-enum { CONNECTIONS_MAX = 64, RUN_BYTES = 16 << 20 };
+/* Projections count with the end of their request: a job that waits for them has little left to read behind the last. */
+enum { CONNECTIONS_MAX = 64, RUN_BYTES = 4 << 20 };
 
 struct upload_options {
 	const char *directory;
@@ -36,7 +37,7 @@ struct upload_options {
 	}
 const struct option upload_rows[] = {
     ROW("connections", OPTION_INTEGER, connections, "N", "at once", 1, CONNECTIONS_MAX),
-    ROW("run", OPTION_INTEGER, run, "N", "projections in one request (default: about 16 MB)", 1, VIEWS_MAX),
+    ROW("run", OPTION_INTEGER, run, "N", "projections in one request (default: about 4 MB)", 1, VIEWS_MAX),
     ROW("zstd", OPTION_FLAG, zstd, NULL, "compress on the way", 0, 0),
     ROW("quiet", OPTION_FLAG, quiet, NULL, "no progress bar", 0, 0),
     {0},
