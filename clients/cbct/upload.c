@@ -23,7 +23,8 @@
 #include "proto/scan_directory.h"
 #include "proto/zstream.h"
 
-/* Projections count with the end of their request: a job that waits for them has little left to read behind the last. */
+/* Projections count with the end of their request: a job that waits for them has little left to read behind the last.
+ */
 enum { CONNECTIONS_MAX = 64, RUN_BYTES = 4 << 20 };
 
 struct upload_options {
