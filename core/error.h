@@ -28,7 +28,8 @@ enum error_code {
 	 * nothing that depends on these bytes may be believed or acknowledged any more (500).
 	 */
 	ERR_SYNC = -13,
-	ERR_DAMAGED = -14 /* what the disk holds is not what was written (500) */
+	ERR_DAMAGED = -14, /* what the disk holds is not what was written (500) */
+	ERR_LIMIT = -15    /* who asks has as much as one may have (429) */
 };
 
 struct error {

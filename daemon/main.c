@@ -173,12 +173,19 @@ static int start_parts(const struct config *config, struct api *api, struct erro
 						    .stop_seconds = config->stop_timeout};
 	const struct calibrations_options calibrations = {
 	    .worker = supervise.worker, .threads = (int)config->threads, .age = config->calibration_age};
+	const struct store_limits limits = {.jobs = config->max_jobs,
+					    .client_jobs = config->client_jobs,
+					    .client_scans = config->client_scans,
+					    .bytes = config->max_bytes,
+					    .client_bytes = config->client_bytes};
 	int code;
 
 	/* The addresses first: a mistake there should be said before anything is touched. */
 	code = start_http(config, api, err);
 	if (code == 0)
 		code = store_open(config->state_dir, &hooks, &api->store, err);
+	if (code == 0)
+		store_set_limits(api->store, &limits);
 	if (code == 0)
 		code = jobs_open(api->store, &api->jobs, err);
 	if (code == 0)

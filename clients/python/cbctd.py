@@ -711,6 +711,10 @@ class Client:
         """The workers and what they run on."""
         return list(self._json("GET", "/v1/devices")["devices"])
 
+    def limits(self) -> Document:
+        """How many jobs, scans and bytes this client and all together have, and may have."""
+        return self._json("GET", "/v1/limits")
+
     def clear_device(self, index: int) -> Document:
         """Gives jobs again to a device that was set aside; for the role ``admin``."""
         return self._json("POST", f"/v1/devices/{index}/clear")

@@ -25,6 +25,7 @@ const struct route api_routes[] = {
     {"GET", "/metrics", ROLE_VIEW, metrics_get, BODY_NONE, 0, NULL, NULL, NULL},
     {"GET", "/v1/devices", ROLE_VIEW, device_list, BODY_NONE, 0, NULL, NULL, NULL},
     {"POST", "/v1/devices/{}/clear", ROLE_ADMIN, device_clear_post, BODY_NONE, 0, NULL, NULL, NULL},
+    {"GET", "/v1/limits", ROLE_VIEW, limits_get, BODY_NONE, 0, NULL, NULL, NULL},
     {"GET", "/v1/quarantine", ROLE_VIEW, quarantine_get, BODY_NONE, 0, NULL, NULL, NULL},
     {"GET", "/v1/openapi.json", ROLE_ANYONE, schema_get, BODY_NONE, 0, NULL, NULL, NULL},
 

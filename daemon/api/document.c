@@ -131,6 +131,7 @@ cJSON *scan_document(struct stored_scan *stored, bool brief)
 	cJSON_AddStringToObject(document, "name", facts.name);
 	cJSON_AddStringToObject(document, "href", href);
 	cJSON_AddStringToObject(document, "state", facts.complete ? "complete" : "receiving");
+	add_text_or_null(document, "client", facts.client);
 	json_add_time(document, "created", facts.created);
 	cJSON_AddNumberToObject(document, "received_count", facts.received);
 	for (int i = 0; i < IMAGE_COUNT; i++)
@@ -273,6 +274,7 @@ static void add_job_facts(cJSON *document, struct job *job, const struct job_rec
 	add_denoising(document, record);
 	cJSON_AddNumberToObject(document, "attempts", record->attempts);
 	cJSON_AddBoolToObject(document, "cancel_requested", record->cancel_asked);
+	add_text_or_null(document, "client", record->client);
 	json_add_time(document, "created", record->created);
 	json_add_time(document, "queued", record->queued);
 	json_add_time(document, "started", record->started);

@@ -64,6 +64,7 @@ int ready_get(void *context, struct request *request, struct error *err);
 int metrics_get(void *context, struct request *request, struct error *err);
 int device_list(void *context, struct request *request, struct error *err);
 int device_clear_post(void *context, struct request *request, struct error *err);
+int limits_get(void *context, struct request *request, struct error *err);
 int quarantine_get(void *context, struct request *request, struct error *err);
 int schema_get(void *context, struct request *request, struct error *err);
 

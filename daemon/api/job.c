@@ -26,8 +26,8 @@ static int reply_accepted(struct request *request, struct job *job, struct error
 }
 
 /* Everything that only the scan and the workers can tell, then the job itself. */
-static int post_resolved(struct api *api, struct job_request *wanted, struct stored_scan *scan, const char *key,
-			 const uint8_t digest[32], struct job **ret_job, struct error *err)
+static int post_resolved(struct api *api, struct job_request *wanted, struct stored_scan *scan, const char *client,
+			 const char *key, const uint8_t digest[32], struct job **ret_job, struct error *err)
 {
 	struct recon_memory memory;
 	bool fresh;
@@ -35,23 +35,27 @@ static int post_resolved(struct api *api, struct job_request *wanted, struct sto
 	if (job_request_resolve(wanted, stored_scan_measured(scan), err) != 0 ||
 	    supervise_check_memory(api->supervise, stored_scan_measured(scan), &wanted->recipe, &memory, err) != 0)
 		return err->code;
-	return jobs_post(api->jobs, wanted, scan, &memory, key, digest, ret_job, &fresh, err);
+	return jobs_post(api->jobs, wanted, scan, &memory, client, key, digest, ret_job, &fresh, err);
 }
 
-static int post(struct api *api, const char *text, size_t length, const char *key, const uint8_t digest[32],
+static int post(struct api *api, struct request *request, const char *key, const uint8_t digest[32],
 		struct job **ret_job, struct error *err)
 {
 	struct job_request wanted;
 	struct stored_scan *scan;
+	size_t length;
+	const char *text = request_body(request, &length);
+	char client[CLIENT_SIZE];
 	int code;
 
 	if (job_request_parse(text, length, &wanted, err) != 0)
 		return err->code;
+	request_client(request, client);
 	code = store_scan_find(api->store, wanted.scan, &scan, err);
 	if (code == ERR_NOT_FOUND)
 		snprintf(err->pointer, sizeof(err->pointer), "/scan");
 	if (code == 0) {
-		code = post_resolved(api, &wanted, scan, key, digest, ret_job, err);
+		code = post_resolved(api, &wanted, scan, client, key, digest, ret_job, err);
 		stored_scan_release(scan);
 	}
 	job_request_clear(&wanted);
@@ -63,15 +67,13 @@ int job_post(void *context, struct request *request, struct error *err)
 	struct api *api = context;
 	struct job *job = NULL;
 	struct store_key key;
-	size_t length;
-	const char *text = request_body(request, &length);
 	int code;
 
 	code = idempotency_read(request, &key, err);
 	if (code == 0 && key.text != NULL)
 		code = jobs_repeat(api->jobs, key.text, key.digest, &job, err);
 	if (code == 0 && job == NULL)
-		code = post(api, text, length, key.text, key.digest, &job, err);
+		code = post(api, request, key.text, key.digest, &job, err);
 	if (code == 0)
 		code = reply_accepted(request, job, err);
 	job_release(job);

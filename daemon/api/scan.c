@@ -9,11 +9,14 @@ static int post(struct api *api, struct request *request, const struct store_key
 	struct scan *scan = NULL;
 	size_t length;
 	const char *text = request_body(request, &length);
+	char client[CLIENT_SIZE];
 	int code;
+
+	request_client(request, client);
 
 	if (scan_parse_calibrated(text, length, &calibrations, &scan, err) != 0)
 		return err->code;
-	code = store_scan_create(api->store, scan, key->text != NULL ? key : NULL, ret_scan, err);
+	code = store_scan_create(api->store, scan, client, key->text != NULL ? key : NULL, ret_scan, err);
 	if (code != 0)
 		scan_free(scan);
 	return code == ERR_CONFLICT ? store_scan_repeat(api->store, key, ret_scan, err) : code;

@@ -93,6 +93,38 @@ int device_clear_post(void *context, struct request *request, struct error *err)
 	return request_reply_json(request, 200, worker_document(&facts), err);
 }
 
+/* ---- limits ---- */
+
+static void add_limit(cJSON *document, const char *name, double used, double most)
+{
+	cJSON *object = cJSON_AddObjectToObject(document, name);
+
+	cJSON_AddNumberToObject(object, "used", used);
+	if (most > 0)
+		cJSON_AddNumberToObject(object, "most", most);
+	else
+		cJSON_AddNullToObject(object, "most");
+}
+
+int limits_get(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	const struct store_limits *limits = store_limits(api->store);
+	cJSON *document = cJSON_CreateObject(), *part;
+	char client[CLIENT_SIZE];
+
+	request_client(request, client);
+	cJSON_AddStringToObject(document, "client", client);
+	part = cJSON_AddObjectToObject(document, "own");
+	add_limit(part, "jobs", (double)jobs_open_count(api->jobs, client), (double)limits->client_jobs);
+	add_limit(part, "scans", (double)store_scans_of(api->store, client), (double)limits->client_scans);
+	add_limit(part, "bytes", (double)store_bytes(api->store, client), (double)limits->client_bytes);
+	part = cJSON_AddObjectToObject(document, "all");
+	add_limit(part, "jobs", (double)jobs_open_count(api->jobs, NULL), (double)limits->jobs);
+	add_limit(part, "bytes", (double)store_bytes(api->store, NULL), (double)limits->bytes);
+	return request_reply_json(request, 200, document, err);
+}
+
 int schema_get(void *context, struct request *request, struct error *err)
 {
 	const struct entity entity = {

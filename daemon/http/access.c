@@ -14,6 +14,7 @@
  */
 #include "daemon/http/internal.h"
 
+#include <arpa/inet.h>
 #include <errno.h>
 #include <grp.h>
 #include <limits.h>
@@ -394,6 +395,26 @@ bool access_still_holds(struct access *access, const struct identity *who)
 const struct identity *request_identity(const struct request *request)
 {
 	return &request->who;
+}
+
+void request_client(const struct request *request, char ret_client[CLIENT_SIZE])
+{
+	const struct connection *connection = request->connection;
+	const struct sockaddr_storage *address = &connection->address;
+	char text[INET6_ADDRSTRLEN] = "nobody";
+
+	if (request->who.name[0] != '\0') {
+		snprintf(ret_client, CLIENT_SIZE, "%s", request->who.name);
+		return;
+	}
+	if (address->ss_family == AF_UNIX)
+		snprintf(text, sizeof(text), "uid-%u", (unsigned)connection->user);
+	else if (address->ss_family == AF_INET)
+		inet_ntop(AF_INET, &((const struct sockaddr_in *)(const void *)address)->sin_addr, text, sizeof(text));
+	else if (address->ss_family == AF_INET6)
+		inet_ntop(AF_INET6, &((const struct sockaddr_in6 *)(const void *)address)->sin6_addr, text,
+			  sizeof(text));
+	snprintf(ret_client, CLIENT_SIZE, "%s", text);
 }
 
 /* ---- sessions ---- */

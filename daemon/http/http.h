@@ -141,6 +141,12 @@ struct identity {
 };
 /* The request's. It may do what its route is about: that was seen to before its handler is called. */
 const struct identity *request_identity(const struct request *request);
+/*
+ * The client that limits and shares count for: the name of the token or certificate, "uid-N" at a Unix socket, and
+ * the address of who shows neither.
+ */
+enum { CLIENT_SIZE = TOKEN_NAME_SIZE };
+void request_client(const struct request *request, char ret_client[CLIENT_SIZE]);
 /* For a handler that gives more to some: 0, or 0 with a reply that refuses (request_replied), or an error. */
 int request_require(struct request *request, enum role least, struct error *err);
 bool request_replied(const struct request *request);

@@ -166,6 +166,8 @@ static int reply_problem(struct request *request, const struct problem *problem,
 		return err->code;
 	if (problem->status == 503)
 		request_reply_header(request, "Retry-After", "1");
+	if (problem->status == 429)
+		request_reply_header(request, "Retry-After", "5");
 	if (problem->status == 507) /* somebody has to make room first */
 		request_reply_header(request, "Retry-After", "30");
 	return 0;

@@ -286,14 +286,10 @@ static int refuse_connection(struct request *request, struct error *err)
 	int status = request->connection->refused;
 
 	request->close = true;
-	if (request_reply_problem(request, status == 429 ? "too-many-connections" : "busy", err,
-				  "%ld connections%s are open already",
-				  status == 429 ? request->http->options.max_connections_per_address
-						: request->http->options.max_connections,
-				  status == 429 ? " of this address" : "") != 0)
-		return err->code;
-	request_reply_header(request, "Retry-After", "1");
-	return 0;
+	return request_reply_problem(
+	    request, status == 429 ? "too-many-connections" : "busy", err, "%ld connections%s are open already",
+	    status == 429 ? request->http->options.max_connections_per_address : request->http->options.max_connections,
+	    status == 429 ? " of this address" : "");
 }
 
 /* A refused body is read and dropped, so that the client comes to reading the answer; unless it waits for our word. */

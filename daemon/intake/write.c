@@ -112,7 +112,8 @@ static int write_claimed(struct slot *slot, struct error *err)
 {
 	const struct upload *upload = slot->upload;
 
-	if (check_lost(slot, err) == 0 && write_slot(slot, err) == 0) {
+	if (check_lost(slot, err) == 0 && stored_scan_take_room(upload->scan, upload->descriptor, err) == 0 &&
+	    write_slot(slot, err) == 0) {
 		sync_file_range(upload->descriptor, (off_t)slot->index * (off_t)slot->size, (off_t)slot->size,
 				SYNC_FILE_RANGE_WRITE);
 		if (hash_slot(slot, err) == 0) {

@@ -36,11 +36,23 @@ struct job {
 	struct hold hold;
 	int references; /* one of them is the array's */
 	bool removed;
-	double stage_since;  /* monotonic seconds, while running; 0 before this process saw it run */
-	double run_since;    /* monotonic seconds */
-	double run_fraction; /* at run_since */
-	double row_at;       /* monotonic seconds of the last history row, or of the last moment before the first */
-	double row_seconds;  /* smoothed time from row to row, 0 before the first */
+	struct client *client;         /* constant; what it points to is not */
+	bool active;                   /* counted in its client's */
+	double charged;                /* monotonic: its time on a device is counted up to then */
+	bool bytes_known;              /* false of jobs that had ended before the start, until somebody asks */
+	unsigned long long kept_bytes; /* of its volumes: that it may make, or once it has ended that are there */
+	double stage_since;            /* monotonic seconds, while running; 0 before this process saw it run */
+	double run_since;              /* monotonic seconds */
+	double run_fraction;           /* at run_since */
+	double row_at;      /* monotonic seconds of the last history row, or of the last moment before the first */
+	double row_seconds; /* smoothed time from row to row, 0 before the first */
+};
+
+/* Somebody who has posted jobs; there until the end. */
+struct client {
+	char name[STORE_CLIENT_SIZE];
+	struct queue_client share;
+	struct client *next;
 };
 
 struct jobs {
@@ -52,9 +64,25 @@ struct jobs {
 	struct job **all;     /* [count], by id: oldest first */
 	int count, space;
 	struct queue queue;
+	struct client *clients;
 	struct jobs_statistics statistics; /* what there is now is counted on demand */
 	struct histogram stages[STAGE_COUNT];
 };
+
+/* ---- jobs/share.c ---- */
+/* The client's own, made where there is none; NULL: no memory. jobs->lock is held, as by the next. */
+struct client *jobs_client(struct jobs *jobs, const char *name);
+/* The job's state has changed: whether it counts among its client's, and its time up to now. */
+void job_share(struct job *job);
+/* The time of all that run is counted up to now. */
+void jobs_charge(struct jobs *jobs);
+/* ERR_LIMIT, ERR_BUSY, ERR_NO_SPACE: one more job of this client is too many. jobs->change is held. */
+int jobs_check_limits(struct jobs *jobs, const struct job *job, struct error *err);
+/* Bytes of the volumes that the job may make. */
+unsigned long long job_bytes_wanted(const struct job_request *request);
+/* An ended job's bytes are those that it has left. */
+int job_count_bytes(struct job *job, struct error *err);
+unsigned long long jobs_bytes(void *jobs, const char *client);
 
 /* Wakes those who watch the job or all jobs; no lock is held. */
 void job_wake(struct job *job);

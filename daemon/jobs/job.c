@@ -237,6 +237,7 @@ static int recover(struct job *job, struct error *err)
 	case JOB_QUEUED:
 		job->entry.priority = job->record.priority;
 		job->entry.ticket = job->record.ticket;
+		job_share(job);
 		queue_add(&job->jobs->queue, &job->entry);
 		return 0;
 	case JOB_WAITING:
@@ -262,6 +263,16 @@ static int load_jobs(struct jobs *jobs, struct error *err)
 			break;
 		}
 		read_request(job);
+		job->client = jobs_client(jobs, job->record.client);
+		if (job->client == NULL) {
+			job_free(job);
+			code = error_set_errno(err, ENOMEM, "list of jobs");
+			break;
+		}
+		job->entry.client = &job->client->share;
+		job->bytes_known = !job_state_ended(job->record.state);
+		if (job->bytes_known)
+			job->kept_bytes = job_bytes_wanted(&job->request);
 		array_insert(jobs, job);
 		id_floor(job->id);
 		if (job->record.ticket >= jobs->next_ticket)
@@ -272,6 +283,7 @@ static int load_jobs(struct jobs *jobs, struct error *err)
 	for (int i = 0; i < jobs->count && code == 0; i++)
 		code = recover(jobs->all[i], err);
 	pthread_mutex_unlock(&jobs->change);
+	store_count_volumes(jobs->store, jobs_bytes, jobs);
 	return code;
 }
 
@@ -305,6 +317,10 @@ void jobs_close(struct jobs *jobs)
 		job_free(jobs->all[i]);
 	}
 	free(jobs->all);
+	for (struct client *client = jobs->clients, *next; client != NULL; client = next) {
+		next = client->next;
+		free(client);
+	}
 	watch_list_destroy(&jobs->watchers);
 	pthread_mutex_destroy(&jobs->lock);
 	pthread_mutex_destroy(&jobs->change);
@@ -353,7 +369,8 @@ static int copy_subject(struct job_record *record, const struct scan *scan, stru
 }
 
 static int fill_record(struct job_record *record, const struct job_request *request, struct stored_scan *scan,
-		       const struct recon_memory *memory, const char *key, const uint8_t digest[32], struct error *err)
+		       const struct recon_memory *memory, const char *client, const char *key, const uint8_t digest[32],
+		       struct error *err)
 {
 	cJSON *document = job_request_json(request);
 
@@ -365,6 +382,7 @@ static int fill_record(struct job_record *record, const struct job_request *requ
 	if (copy_subject(record, stored_scan_parsed(scan), err) != 0)
 		return err->code;
 	memcpy(record->scan, stored_scan_id(scan), sizeof(record->scan));
+	snprintf(record->client, sizeof(record->client), "%s", client);
 	record->priority = request->priority;
 	record->mu_water = request->recipe.mu_water;
 	record->iterations = request->recipe.algorithm != NULL ? request->recipe.iterate.iterations : 0;
@@ -393,8 +411,14 @@ static int insert_job(struct jobs *jobs, struct job *job, struct stored_scan *sc
 		record->ticket = jobs->next_ticket++;
 		record->queued = record->created;
 	}
+	code = jobs_check_limits(jobs, job, err);
+	if (code != 0)
+		return code;
 	pthread_mutex_lock(&jobs->lock);
 	code = array_reserve(jobs, err);
+	job->client = jobs_client(jobs, record->client);
+	if (code == 0 && job->client == NULL)
+		code = error_set_errno(err, ENOMEM, "client");
 	pthread_mutex_unlock(&jobs->lock);
 	if (code == 0)
 		code = job_event_make(&event, "state", job_state_document(record), err);
@@ -405,8 +429,10 @@ static int insert_job(struct jobs *jobs, struct job *job, struct stored_scan *sc
 	if (code != 0)
 		return code;
 	pthread_mutex_lock(&jobs->lock);
+	job->entry.client = &job->client->share;
 	array_insert(jobs, job);
 	job->references++;
+	job_share(job);
 	if (record->state == JOB_QUEUED) {
 		job->entry.priority = record->priority;
 		job->entry.ticket = record->ticket;
@@ -417,18 +443,22 @@ static int insert_job(struct jobs *jobs, struct job *job, struct stored_scan *sc
 }
 
 int jobs_post(struct jobs *jobs, const struct job_request *request, struct stored_scan *scan,
-	      const struct recon_memory *memory, const char *key, const uint8_t digest[32], struct job **ret_job,
-	      bool *ret_new, struct error *err)
+	      const struct recon_memory *memory, const char *client, const char *key, const uint8_t digest[32],
+	      struct job **ret_job, bool *ret_new, struct error *err)
 {
 	struct job_record record = {0};
 	struct job *repeat = NULL, *job = NULL;
 	struct job_facts facts;
-	int code = fill_record(&record, request, scan, memory, key, digest, err);
+	int code = fill_record(&record, request, scan, memory, client, key, digest, err);
 
 	if (code == 0) {
 		job = job_new(jobs, &record);
 		code =
 		    job == NULL ? error_set_errno(err, ENOMEM, "job") : job_request_copy(&job->request, request, err);
+	}
+	if (code == 0) {
+		job->kept_bytes = job_bytes_wanted(request);
+		job->bytes_known = true;
 	}
 	job_record_clear(&record);
 	if (code != 0) {
@@ -615,7 +645,7 @@ int job_queue_position(struct job *job)
 	int position;
 
 	pthread_mutex_lock(&job->jobs->lock);
-	position = queue_position(&job->entry);
+	position = queue_position(&job->jobs->queue, &job->entry);
 	pthread_mutex_unlock(&job->jobs->lock);
 	return position;
 }

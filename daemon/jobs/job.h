@@ -56,11 +56,12 @@ int jobs_repeat(struct jobs *jobs, const char *key, const uint8_t digest[32], st
  * A new job of a resolved request, queued when the scan is ready and waiting
  * otherwise. The request is copied. key may be NULL; if the key was used
  * meanwhile, what jobs_repeat would say. *ret_new: false for such a repeat.
- * ERR_NOT_FOUND, pointer "/scan", when the scan was deleted meanwhile.
+ * ERR_NOT_FOUND, pointer "/scan", when the scan was deleted meanwhile; ERR_LIMIT, ERR_BUSY, ERR_NO_SPACE where the
+ * client, or all of them, have as much as they may have.
  */
 int jobs_post(struct jobs *jobs, const struct job_request *request, struct stored_scan *scan,
-	      const struct recon_memory *memory, const char *key, const uint8_t digest[32], struct job **ret_job,
-	      bool *ret_new, struct error *err);
+	      const struct recon_memory *memory, const char *client, const char *key, const uint8_t digest[32],
+	      struct job **ret_job, bool *ret_new, struct error *err);
 
 int jobs_find(struct jobs *jobs, const char *id, struct job **ret_job, struct error *err); /* ERR_NOT_FOUND */
 struct job *job_reference(struct job *job);
@@ -110,6 +111,9 @@ void job_record(struct job *job, struct job_record *ret_record);
 int job_queue_position(struct job *job);
 /* Seconds to go, or negative when nobody can know. */
 double job_eta(struct job *job);
+
+/* Jobs of a client, or (NULL) of all, that have not ended. */
+long jobs_open_count(struct jobs *jobs, const char *client);
 
 struct jobs_statistics {
 	/* Now; the age, s, is that of the job that was posted first, 0 where there is none. */

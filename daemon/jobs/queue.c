@@ -43,14 +43,59 @@ void queue_remove(struct queue *queue, struct queue_entry *entry)
 	entry->queued = false;
 }
 
-int queue_position(const struct queue_entry *entry)
+/* ---- clients ---- */
+
+void queue_know(struct queue *queue, struct queue_client *client)
 {
-	int position = 0;
+	client->next = queue->clients;
+	queue->clients = client;
+}
+
+void queue_enter(struct queue *queue, struct queue_client *client)
+{
+	double least = -1;
+
+	for (const struct queue_client *other = queue->clients; other != NULL; other = other->next) {
+		if (other != client && other->active > 0 && (least < 0 || other->used < least))
+			least = other->used;
+	}
+	if (client->active++ == 0 && client->used < least)
+		client->used = least;
+}
+
+void queue_leave(struct queue_client *client)
+{
+	assert(client->active > 0);
+	client->active--;
+}
+
+/* In a round of one job of each client, the n-th of each, who comes first. */
+static bool has_used_less(const struct queue_entry *a, const struct queue_entry *b)
+{
+	return a->client->used != b->client->used ? a->client->used < b->client->used : a->ticket < b->ticket;
+}
+
+int queue_position(struct queue *queue, const struct queue_entry *entry)
+{
+	int position = 1, own = 0;
 
 	if (!entry->queued)
 		return 0;
-	for (; entry != NULL; entry = entry->previous)
-		position++;
+	for (struct queue_entry *other = queue->first; other != NULL; other = other->next) {
+		other->client->rank = 0;
+		own += other->priority == entry->priority && other->client == entry->client &&
+		       other->ticket <= entry->ticket;
+	}
+	for (struct queue_entry *other = queue->first; other != NULL; other = other->next) {
+		int rank;
+
+		if (other->priority != entry->priority) {
+			position += other->priority > entry->priority;
+			continue;
+		}
+		rank = ++other->client->rank;
+		position += rank < own || (rank == own && has_used_less(other, entry));
+	}
 	return position;
 }
 
@@ -64,11 +109,16 @@ static struct queue_entry *not_held(struct queue_entry *entry)
 struct queue_entry *queue_next(const struct queue *queue,
 			       bool (*fits)(const void *context, const struct queue_entry *entry), const void *context)
 {
-	struct queue_entry *entry = not_held(queue->first);
+	struct queue_entry *best = NULL;
 
-	while (entry != NULL && !fits(context, entry))
-		entry = not_held(entry->next);
-	return entry;
+	for (struct queue_entry *entry = not_held(queue->first); entry != NULL; entry = not_held(entry->next)) {
+		if (best != NULL && entry->priority < best->priority)
+			break;
+		/* In the order of tickets: of equals the first stays. */
+		if ((best == NULL || entry->client->used < best->client->used) && fits(context, entry))
+			best = entry;
+	}
+	return best;
 }
 
 static bool yields_before(const struct queue_running *a, const struct queue_running *b)

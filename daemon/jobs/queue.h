@@ -6,13 +6,25 @@
 #include "proto/recipe.h"
 
 /*
- * The order of jobs: stat before urgent before routine, and in the order of their
- * tickets within a priority. A job keeps the ticket of its first time in the
- * queue, so one that yielded stands in front of its class again.
+ * The order of jobs: stat before urgent before routine; within a priority the client goes first that has used the
+ * devices for the shortest time, and of each client's jobs the one with the lowest ticket. A job keeps the ticket of
+ * its first time in the queue, so one that yielded stands in front of its client's others again.
+ *
+ * Time is counted from when a client comes to have jobs that are queued or run: one that comes anew, or comes back,
+ * begins with the least that any of the others has used, so that nobody saves time up (start-time fair queueing, Goyal,
+ * Vin and Cheng 1996).
  *
  * Plain data, no lock of its own: jobs.lock guards the one that the daemon has.
  */
+struct queue_client {
+	double used; /* s of devices, beside what it was lifted to when it came */
+	int active;  /* jobs that are queued or run */
+	int rank;    /* of queue_position alone */
+	struct queue_client *next;
+};
+
 struct queue_entry {
+	struct queue_client *client; /* never NULL */
 	enum priority priority;
 	long long ticket;
 	bool queued;
@@ -22,12 +34,20 @@ struct queue_entry {
 
 struct queue {
 	struct queue_entry *first;
+	struct queue_client *clients;
 };
+
+/* A client that has never had a job; it stays until the queue is given up. */
+void queue_know(struct queue *queue, struct queue_client *client);
+/* One job more is queued or runs; one less. */
+void queue_enter(struct queue *queue, struct queue_client *client);
+void queue_leave(struct queue_client *client);
 
 void queue_add(struct queue *queue, struct queue_entry *entry);
 void queue_remove(struct queue *queue, struct queue_entry *entry); /* not queued is fine */
-int queue_position(const struct queue_entry *entry);               /* 1 = next; 0: not queued */
-/* The first that is not held and fits, or NULL. */
+/* 1 = next, if all jobs took as long and no others came; 0: not queued. */
+int queue_position(struct queue *queue, const struct queue_entry *entry);
+/* The one that goes first of those that are not held and fit, or NULL. */
 struct queue_entry *queue_next(const struct queue *queue,
 			       bool (*fits)(const void *context, const struct queue_entry *entry), const void *context);
 

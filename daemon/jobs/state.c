@@ -207,6 +207,7 @@ static void show_state(struct job *job, const struct job_record *record, const s
 	from = job->record.state;
 	job->record = *record;
 	queue_remove(&jobs->queue, &job->entry);
+	job_share(job);
 	if (record->state == JOB_QUEUED) {
 		job->entry.priority = record->priority;
 		job->entry.ticket = record->ticket;
@@ -236,6 +237,7 @@ int job_change_state(struct job *job, enum job_state to, const struct job_change
 	bool removed;
 	enum job_state from;
 	enum job_past past = PAST_STAYS;
+	struct error ignored;
 	unsigned basis;
 	int code;
 
@@ -269,8 +271,11 @@ int job_change_state(struct job *job, enum job_state to, const struct job_change
 	show_state(job, &record, change);
 	if (past == PAST_GOES)
 		store_job_remove_volumes(job->jobs->store, record.id);
-	if (job_state_ended(to))
+	if (job_state_ended(to)) {
 		store_job_tidy(job->jobs->store, record.id);
+		/* Where the rows cannot be read it counts for what it might have kept. */
+		job_count_bytes(job, &ignored);
+	}
 	return 0;
 }
 

@@ -264,6 +264,8 @@ struct job *jobs_next(struct jobs *jobs, const struct job_filter *filter)
 	struct job *job = NULL;
 
 	pthread_mutex_lock(&jobs->lock);
+	if (jobs->queue.first != NULL)
+		jobs_charge(jobs);
 	entry = queue_next(&jobs->queue, entry_fits, filter);
 	if (entry != NULL) {
 		job = job_of_entry(entry);

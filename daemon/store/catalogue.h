@@ -58,7 +58,7 @@ int catalogue_end(struct catalogue *catalogue, int code, struct error *err);
 /* ---- records, each a row of a table ---- */
 
 struct catalogue_scan {
-	char id[ID_SIZE], name[SCAN_NAME_BYTES];
+	char id[ID_SIZE], name[SCAN_NAME_BYTES], client[STORE_CLIENT_SIZE];
 	double created; /* seconds since 1970 */
 	int columns, rows, count;
 	enum sample sample;

@@ -23,6 +23,9 @@ enum { RECENT_SCANS = 16 };
 struct store {
 	char directory[900]; /* constant, as hooks */
 	struct store_hooks hooks;
+	struct store_limits limits; /* constant after the start, as the next two */
+	unsigned long long (*volumes_bytes)(void *context, const char *client);
+	void *volumes_context;
 	int lock_file;
 	/* Held from the commit of a scan's row to its place in the array: who finds its key finds the scan. First of
 	 * all. */

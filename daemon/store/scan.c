@@ -371,7 +371,7 @@ static int check_space(const struct store *store, unsigned long long bytes, stru
 	return code;
 }
 
-/* The whole file is there before anything is accepted for it: no projection fails half-way on a full disk. */
+/* A file of holes: who announces scans takes no room from others. */
 static int make_projections(const char *directory, unsigned long long bytes, struct error *err)
 {
 	char path[1100];
@@ -381,12 +381,10 @@ static int make_projections(const char *directory, unsigned long long bytes, str
 	file = open(path, O_RDWR | O_CREAT | O_EXCL | O_CLOEXEC, 0640);
 	if (file < 0)
 		return error_set_errno(err, errno, "make %s", path);
-	result = posix_fallocate(file, 0, (off_t)bytes);
-	if (result == EFBIG)
-		result = ENOSPC;
-	if (result != 0)
-		code = error_set_errno(err, result, "room for %llu bytes of projections", bytes);
-	else if (fsync(file) < 0)
+	if (ftruncate(file, (off_t)bytes) != 0) {
+		result = errno == EFBIG ? ENOSPC : errno;
+		code = error_set_errno(err, result, "file for %llu bytes of projections", bytes);
+	} else if (fsync(file) < 0)
 		code = error_set_sync(err, errno, "fsync %s", path);
 	close(file);
 	return code;
@@ -499,6 +497,7 @@ static int insert_row(struct store *store, struct stored_scan *scan, const struc
 		return code;
 	memcpy(row.id, scan->id, sizeof(row.id));
 	memcpy(row.name, scan->name, sizeof(row.name));
+	memcpy(row.client, scan->client, sizeof(row.client));
 	code = catalogue_put(store->catalogue, NULL, &row, NULL, err);
 	if (code == 0 && key != NULL)
 		code = insert_key(store, scan->id, key, err);
@@ -530,6 +529,8 @@ static int insert_scan(struct store *store, struct stored_scan *scan, struct sca
 	code = scans_reserve(store, err);
 	pthread_mutex_unlock(&store->scans_lock);
 	if (code == 0)
+		code = store_check_scans(store, scan->client, err);
+	if (code == 0)
 		code = insert_row(store, scan, key, err);
 	if (code == 0) {
 		pthread_mutex_lock(&store->scans_lock);
@@ -543,7 +544,7 @@ static int insert_scan(struct store *store, struct stored_scan *scan, struct sca
 	return code;
 }
 
-int store_scan_create(struct store *store, struct scan *parsed, const struct store_key *key,
+int store_scan_create(struct store *store, struct scan *parsed, const char *client, const struct store_key *key,
 		      struct stored_scan **ret_scan, struct error *err)
 {
 	struct stored_scan *scan = stored_scan_new(store, parsed->count);
@@ -552,13 +553,16 @@ int store_scan_create(struct store *store, struct scan *parsed, const struct sto
 	if (scan == NULL)
 		return error_set_errno(err, ENOMEM, "scan of %d projections", parsed->count);
 	memcpy(scan->name, parsed->name, sizeof(scan->name));
+	snprintf(scan->client, sizeof(scan->client), "%s", client);
 	scan->created = clock_realtime();
 	scan->columns = parsed->geometry.columns;
 	scan->rows = parsed->geometry.rows;
 	scan->sample = parsed->sample;
 	scan->quantity = parsed->quantity;
 	scan->air = parsed->air;
-	code = id_make(scan->id, err);
+	code = store_check_scans(store, scan->client, err);
+	if (code == 0)
+		code = id_make(scan->id, err);
 	if (code != 0)
 		goto out;
 	code = make_files(store, parsed, scan, err);

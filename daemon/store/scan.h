@@ -11,7 +11,7 @@ struct stored_scan {
 	/* Constant. */
 	struct store *store;
 	char id[ID_SIZE];
-	char name[SCAN_NAME_BYTES];
+	char name[SCAN_NAME_BYTES], client[STORE_CLIENT_SIZE];
 	double created;
 	int columns, rows, count;
 	enum sample sample;
@@ -26,9 +26,11 @@ struct stored_scan {
 	struct scan *parsed;
 	struct scan *measured; /* of a closed one: what of it is there; NULL: all of it, or not parsed */
 	bool recent;
-	bool removed; /* from the array: whoever refers to it now may use its parsed form */
+	bool has_room; /* on the disk, for all projections, or is just given it: what limits count */
+	bool removed;  /* from the array: whoever refers to it now may use its parsed form */
 
 	pthread_mutex_t lock;    /* guards what follows */
+	bool room;               /* the disk has it, and no projection needs to ask for it */
 	unsigned char *progress; /* [count], enum progress */
 	/*
 	 * [count], of those that are stored. `bytes` 0: only the SHA-256 is known, from the catalogue; the record of
@@ -61,6 +63,9 @@ int scans_reserve(struct store *store, struct error *err);
 void scans_insert(struct store *store, struct stored_scan *scan);
 /* A reference, or NULL where there is no such scan. will_use: its parsed form is worth keeping. */
 struct stored_scan *scans_find(struct store *store, const char *id, bool will_use);
+
+/* ERR_LIMIT when the client has as many scans as it may have; store/limits.c. */
+int store_check_scans(struct store *store, const char *client, struct error *err);
 
 bool stored_scan_deleted(struct stored_scan *scan);
 /* With the scan's lock held: every projection that it will ever have is there. */

@@ -91,6 +91,7 @@ void stored_scan_facts(struct stored_scan *scan, struct scan_facts *ret)
 	    .damaged = scan->damaged,
 	};
 	memcpy(ret->name, scan->name, sizeof(ret->name));
+	memcpy(ret->client, scan->client, sizeof(ret->client));
 	pthread_mutex_lock(&scan->lock);
 	ret->received = scan->received;
 	ret->closed = scan->closed;

@@ -27,6 +27,7 @@ static int load_scan(struct store *store, const struct catalogue_scan *row, stru
 		return error_set_errno(err, ENOMEM, "list of scans");
 	memcpy(scan->id, row->id, sizeof(scan->id));
 	memcpy(scan->name, row->name, sizeof(scan->name));
+	memcpy(scan->client, row->client, sizeof(scan->client));
 	scan->created = row->created;
 	scan->columns = row->columns;
 	scan->rows = row->rows;
@@ -77,6 +78,7 @@ int store_load_scans(struct store *store, struct error *err)
 		code = load_projections(store, store->scans[i], err);
 		if (code == 0)
 			code = store_load_sums(store, store->scans[i], err);
+		store->scans[i]->has_room = store->scans[i]->room = store->scans[i]->received > 0;
 	}
 	return code;
 }

@@ -95,6 +95,30 @@ struct store_statistics {
 };
 void store_statistics(struct store *store, struct store_statistics *ret);
 
+/* ---- limits: store/limits.c ---- */
+
+/* A client is who makes scans and jobs, by the name that the API gives it. */
+enum { STORE_CLIENT_SIZE = 80 };
+/* 0: no limit. */
+struct store_limits {
+	long jobs, client_jobs; /* that have not ended */
+	long client_scans;
+	unsigned long long bytes, client_bytes; /* of projections and kept volumes */
+};
+/* A share of the bytes that volumes may not take: what is being acquired cannot be had again. */
+#define STORE_ACQUISITION_SHARE 0.1
+/* Before the jobs are opened, and before any other thread has the store. */
+void store_set_limits(struct store *store, const struct store_limits *limits);
+const struct store_limits *store_limits(const struct store *store);
+/* The bytes of volumes are known to the owner of the jobs: of a client, or (NULL) of all. Set once, at the start. */
+void store_count_volumes(struct store *store, unsigned long long (*bytes)(void *context, const char *client),
+			 void *context);
+/* Bytes of scans that have room on the disk, and of volumes. client NULL: all. */
+unsigned long long store_bytes(struct store *store, const char *client);
+long store_scans_of(struct store *store, const char *client);
+/* ERR_NO_SPACE when a client cannot have that many bytes of volumes more. */
+int store_check_volumes(struct store *store, const char *client, unsigned long long more, struct error *err);
+
 /* ---- scans ---- */
 
 /* An Idempotency-Key and the SHA-256 of the body of the request that it came with; borrowed. */
@@ -105,11 +129,12 @@ struct store_key {
 
 /*
  * Takes the parsed scan over (on success only), makes its directory with
- * scan.json and projections.raw at full size. ERR_NO_SPACE when the disk cannot
- * hold all of it. key may be NULL; ERR_CONFLICT when another request has used it
- * meanwhile: store_scan_repeat finds the scan that it made. The reference is the caller's.
+ * scan.json and projections.raw at full size, which has room on the disk once the first projection comes.
+ * ERR_NO_SPACE when the disk cannot hold all of it; ERR_LIMIT when the client has too many scans. key may be NULL;
+ * ERR_CONFLICT when another request has used it meanwhile: store_scan_repeat finds the scan that it made. The reference
+ * is the caller's.
  */
-int store_scan_create(struct store *store, struct scan *scan, const struct store_key *key,
+int store_scan_create(struct store *store, struct scan *scan, const char *client, const struct store_key *key,
 		      struct stored_scan **ret_scan, struct error *err);
 /*
  * The scan that this key made before: *ret_scan stays NULL where there is none (and 0 is returned). ERR_CONFLICT: the
@@ -148,7 +173,7 @@ void store_scan_directory(const struct store *store, const char *id, char ret_pa
  * Convertible: so is whatever else makes line integrals of them. Ready: both, and nothing of it is being checked.
  */
 struct scan_facts {
-	char name[SCAN_NAME_BYTES];
+	char name[SCAN_NAME_BYTES], client[STORE_CLIENT_SIZE];
 	double created; /* seconds since 1970 */
 	int columns, rows, count;
 	enum sample sample;
@@ -244,6 +269,13 @@ enum claim { CLAIM_GRANTED, CLAIM_STORED, CLAIM_BUSY };
 int stored_scan_claim(struct stored_scan *scan, int index, enum claim *ret_claim, struct error *err);
 void stored_scan_unclaim(struct stored_scan *scan, int index);
 
+/*
+ * Room on the disk for all of the scan's projections, taken once, before the first of them is written to this
+ * descriptor of projections.raw: no projection fails half-way on a full disk. ERR_NO_SPACE when the disk or a limit has
+ * no room.
+ */
+int stored_scan_take_room(struct stored_scan *scan, int descriptor, struct error *err);
+
 /* A descriptor of projections.raw, the caller's to close; close-on-exec. */
 int stored_scan_open(struct stored_scan *scan, bool writing, int *ret_descriptor, struct error *err);
 /* The same of projections.sums, for writing. */
@@ -288,12 +320,13 @@ struct job_record {
 	char id[ID_SIZE], scan[ID_SIZE];
 	enum job_state state;
 	enum priority priority;
-	long long ticket; /* place among its priority, 0 before it was ever queued */
-	char *request;    /* job_request_json as text, owned; constant after creation */
-	double mu_water;  /* 1/mm */
-	int iterations;   /* that SART will run, 0 without */
-	char *key;        /* Idempotency-Key or NULL, owned; constant after creation */
-	char *subject;    /* subject_json of its scan as text, or NULL, owned; constant after creation */
+	long long ticket;               /* place among its priority, 0 before it was ever queued */
+	char *request;                  /* job_request_json as text, owned; constant after creation */
+	double mu_water;                /* 1/mm */
+	int iterations;                 /* that SART will run, 0 without */
+	char *key;                      /* Idempotency-Key or NULL, owned; constant after creation */
+	char client[STORE_CLIENT_SIZE]; /* who posted it; constant after creation */
+	char *subject;                  /* subject_json of its scan as text, or NULL, owned; constant after creation */
 	uint8_t digest[32];
 	bool cancel_asked;
 	int attempts; /* 1 with the first run, one more each time that a run was lost; going on after a yield is none */

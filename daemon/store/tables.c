@@ -13,6 +13,7 @@ static const struct column scan_columns[] = {
     {"number", COLUMN_NUMBER, .size = 0},
     {"id", COLUMN_TEXT, AT(catalogue_scan, id), .unique = true},
     {"name", COLUMN_TEXT, AT(catalogue_scan, name)},
+    {"client", COLUMN_TEXT, AT(catalogue_scan, client), .initial = ""},
     {"created", COLUMN_REAL, AT(catalogue_scan, created)},
     {"columns", COLUMN_INT, AT(catalogue_scan, columns)},
     {"rows", COLUMN_INT, AT(catalogue_scan, rows)},
@@ -93,6 +94,7 @@ static const struct column job_columns[] = {
     {"stamp", COLUMN_LONG, AT(job_record, stamp), .initial = "0", .assigned = true},
     {"noise_hu", COLUMN_REAL, AT(job_record, noise_hu), .nullable = true, .changes = true},
     {"tv_alpha", COLUMN_REAL, AT(job_record, tv_alpha), .nullable = true, .changes = true},
+    {"client", COLUMN_TEXT, AT(job_record, client), .initial = ""},
     {"subject", COLUMN_STRING, AT(job_record, subject), .nullable = true},
 };
 

@@ -108,7 +108,7 @@ struct stored_scan *state_scan(struct state *state, int count, bool intensity)
 		 " \"source_to_detector_mm\": 1100, \"first_angle_deg\": 0, \"angle_step_deg\": %.17g}}",
 		 count, intensity ? "intensity" : "line_integral", 360.0 / count);
 	ck_assert_msg(scan_parse(text, strlen(text), &scan, &err) == 0, "%s", err.text);
-	ck_assert_msg(store_scan_create(state->store, scan, NULL, &stored, &err) == 0, "%s", err.text);
+	ck_assert_msg(store_scan_create(state->store, scan, "somebody", NULL, &stored, &err) == 0, "%s", err.text);
 	return stored;
 }
 
@@ -164,7 +164,8 @@ struct job *state_post(struct state *state, struct stored_scan *scan, const char
 		 stored_scan_id(scan), priority);
 	ck_assert_msg(job_request_parse(text, strlen(text), &request, &err) == 0, "%s", err.text);
 	ck_assert_msg(job_request_resolve(&request, stored_scan_parsed(scan), &err) == 0, "%s", err.text);
-	ck_assert_msg(jobs_post(state->jobs, &request, scan, NULL, NULL, NULL, &job, &new, &err) == 0, "%s", err.text);
+	ck_assert_msg(jobs_post(state->jobs, &request, scan, NULL, "somebody", NULL, NULL, &job, &new, &err) == 0, "%s",
+		      err.text);
 	ck_assert(new);
 	job_request_clear(&request);
 	return job;

@@ -466,7 +466,7 @@ static int post_with_key(const char *key, int mark, struct job **ret_job, bool *
 	snprintf(text, sizeof(text), "{\"scan\": \"%s\", \"fdk\": {}}", stored_scan_id(scan));
 	ck_assert_int_eq(job_request_parse(text, strlen(text), &request, err), 0);
 	ck_assert_int_eq(job_request_resolve(&request, stored_scan_parsed(scan), err), 0);
-	code = jobs_post(state.jobs, &request, scan, NULL, key, digest, ret_job, ret_new, err);
+	code = jobs_post(state.jobs, &request, scan, NULL, "somebody", key, digest, ret_job, ret_new, err);
 	job_request_clear(&request);
 	return code;
 }

@@ -22,21 +22,24 @@ static const char *order_of(const struct queue *queue)
 START_TEST(higher_priority_goes_first_and_equals_in_their_order)
 {
 	struct queue queue = {0};
+	struct queue_client client = {.used = 7};
 	struct queue_entry entries[] = {
 	    {.priority = PRIORITY_ROUTINE, .ticket = 1}, {.priority = PRIORITY_URGENT, .ticket = 2},
 	    {.priority = PRIORITY_ROUTINE, .ticket = 3}, {.priority = PRIORITY_STAT, .ticket = 4},
 	    {.priority = PRIORITY_URGENT, .ticket = 5},  {.priority = PRIORITY_STAT, .ticket = 6}};
 
-	for (int i = 5; i >= 0; i--)
+	for (int i = 5; i >= 0; i--) {
+		entries[i].client = &client;
 		queue_add(&queue, &entries[i]);
+	}
 	ck_assert_str_eq(order_of(&queue), "4 6 2 5 1 3");
-	ck_assert_int_eq(queue_position(&entries[3]), 1);
-	ck_assert_int_eq(queue_position(&entries[2]), 6);
+	ck_assert_int_eq(queue_position(&queue, &entries[3]), 1);
+	ck_assert_int_eq(queue_position(&queue, &entries[2]), 6);
 	queue_remove(&queue, &entries[1]);
 	queue_remove(&queue, &entries[3]);
 	queue_remove(&queue, &entries[2]);
 	ck_assert_str_eq(order_of(&queue), "6 5 1");
-	ck_assert_int_eq(queue_position(&entries[2]), 0);
+	ck_assert_int_eq(queue_position(&queue, &entries[2]), 0);
 	queue_remove(&queue, &entries[2]); /* not queued: nothing happens */
 	/* One that yielded keeps its ticket and stands in front of its class. */
 	queue_add(&queue, &entries[1]);
@@ -147,6 +150,101 @@ START_TEST(the_lowest_and_latest_makes_room_for_the_higher)
 }
 END_TEST
 
+static bool all_fit(const void *context, const struct queue_entry *entry)
+{
+	(void)context;
+	(void)entry;
+	return true;
+}
+
+static bool is_not(const void *context, const struct queue_entry *entry)
+{
+	return entry != context;
+}
+
+START_TEST(the_client_goes_first_that_has_used_the_least)
+{
+	struct queue_client a = {.used = 10}, b = {.used = 3};
+	struct queue_entry entries[] = {{.client = &a, .priority = PRIORITY_ROUTINE, .ticket = 1},
+					{.client = &a, .priority = PRIORITY_ROUTINE, .ticket = 2},
+					{.client = &b, .priority = PRIORITY_ROUTINE, .ticket = 3},
+					{.client = &b, .priority = PRIORITY_ROUTINE, .ticket = 4},
+					{.client = &a, .priority = PRIORITY_URGENT, .ticket = 5}};
+	struct queue queue = {0};
+
+	for (int i = 0; i < 5; i++)
+		queue_add(&queue, &entries[i]);
+	/* Priority goes before shares. */
+	ck_assert_ptr_eq(queue_next(&queue, all_fit, NULL), &entries[4]);
+	/* In turns, by what they have used. */
+	ck_assert_int_eq(queue_position(&queue, &entries[4]), 1);
+	ck_assert_int_eq(queue_position(&queue, &entries[2]), 2);
+	ck_assert_int_eq(queue_position(&queue, &entries[0]), 3);
+	ck_assert_int_eq(queue_position(&queue, &entries[3]), 4);
+	ck_assert_int_eq(queue_position(&queue, &entries[1]), 5);
+	queue_remove(&queue, &entries[4]);
+	ck_assert_ptr_eq(queue_next(&queue, all_fit, NULL), &entries[2]);
+	ck_assert_ptr_eq(queue_next(&queue, is_not, &entries[2]), &entries[3]);
+	entries[2].held = entries[3].held = true;
+	ck_assert_ptr_eq(queue_next(&queue, all_fit, NULL), &entries[0]);
+	entries[2].held = entries[3].held = false;
+	/* Equals in the order of their tickets. */
+	b.used = 10;
+	ck_assert_ptr_eq(queue_next(&queue, all_fit, NULL), &entries[0]);
+	b.used = 10.5;
+	ck_assert_ptr_eq(queue_next(&queue, all_fit, NULL), &entries[0]);
+}
+END_TEST
+
+START_TEST(nobody_saves_time_up)
+{
+	struct queue_client a = {0}, b = {0}, c = {0};
+	struct queue queue = {0};
+
+	queue_know(&queue, &a);
+	queue_know(&queue, &b);
+	queue_know(&queue, &c);
+	queue_enter(&queue, &a);
+	ck_assert_double_eq(a.used, 0);
+	a.used = 1000;
+	/* One that comes later begins where the others are, and not before them for the next 1000 s. */
+	queue_enter(&queue, &b);
+	ck_assert_double_eq(b.used, 1000);
+	b.used = 1010;
+	queue_enter(&queue, &c);
+	ck_assert_double_eq(c.used, 1000);
+	/* With jobs there it keeps what it has; one that has used more keeps that, too. */
+	a.used = 2000;
+	queue_enter(&queue, &c);
+	ck_assert_double_eq(c.used, 1000);
+	queue_leave(&a);
+	queue_enter(&queue, &a);
+	ck_assert_double_eq(a.used, 2000);
+}
+END_TEST
+
+/* Jobs of one second and of ten: what counts is the time. */
+START_TEST(long_and_short_jobs_share_the_time)
+{
+	struct queue_client slow = {0}, quick = {0};
+	struct queue_entry entries[2] = {{.client = &slow, .priority = PRIORITY_ROUTINE, .ticket = 1},
+					 {.client = &quick, .priority = PRIORITY_ROUTINE, .ticket = 2}};
+	struct queue queue = {0};
+	double given[2] = {0};
+
+	for (int i = 0; i < 2; i++)
+		queue_add(&queue, &entries[i]);
+	for (int turn = 0; turn < 1100; turn++) {
+		const int next = (int)(queue_next(&queue, all_fit, NULL) - entries);
+		const double seconds = next == 0 ? 10 : 1;
+
+		given[next] += seconds;
+		entries[next].client->used += seconds;
+	}
+	ck_assert_double_le(given[0] > given[1] ? given[0] - given[1] : given[1] - given[0], 10);
+}
+END_TEST
+
 START_TEST(ids_sort_by_the_time_of_making)
 {
 	char before[ID_SIZE], id[ID_SIZE];
@@ -188,6 +286,9 @@ Suite *queue_suite(void)
 	TCase *tests = tcase_create("queue");
 
 	tcase_add_test(tests, higher_priority_goes_first_and_equals_in_their_order);
+	tcase_add_test(tests, the_client_goes_first_that_has_used_the_least);
+	tcase_add_test(tests, nobody_saves_time_up);
+	tcase_add_test(tests, long_and_short_jobs_share_the_time);
 	tcase_add_test(tests, the_lowest_and_latest_makes_room_for_the_higher);
 	tcase_add_test(tests, ids_sort_by_the_time_of_making);
 	tcase_add_test(tests, what_is_no_id_is_refused);

@@ -92,14 +92,25 @@ START_TEST(a_projection_has_one_writer_at_a_time)
 }
 END_TEST
 
-START_TEST(the_file_of_the_projections_has_its_full_size_at_once)
+START_TEST(the_file_of_the_projections_has_its_full_size_at_once_and_room_with_the_first)
 {
 	struct stored_scan *scan = state_scan(&state, 10, false);
 	struct stat status;
+	struct error err = {0};
+	int file;
 
 	ck_assert_int_eq(stat(state_path(&state, "scans/%s/projections.raw", stored_scan_id(scan)), &status), 0);
 	ck_assert_int_eq(status.st_size, 10 * 4 * 3 * 4);
+	ck_assert_int_eq(status.st_blocks, 0);
+	ck_assert_uint_eq(store_bytes(state.store, NULL), 0);
+	ck_assert_int_eq(stored_scan_open(scan, true, &file, &err), 0);
+	ck_assert_int_eq(stored_scan_take_room(scan, file, &err), 0);
+	close(file);
+	ck_assert_int_eq(stat(state_path(&state, "scans/%s/projections.raw", stored_scan_id(scan)), &status), 0);
+	ck_assert_int_eq(status.st_size, 10 * 4 * 3 * 4);
 	ck_assert_int_ge(status.st_blocks * 512, status.st_size);
+	ck_assert_uint_eq(store_bytes(state.store, "somebody"), 10 * 4 * 3 * 4);
+	ck_assert_uint_eq(store_bytes(state.store, "another"), 0);
 	stored_scan_release(scan);
 }
 END_TEST
@@ -122,7 +133,7 @@ START_TEST(a_scan_beyond_the_disk_is_refused_before_anything_is_made)
 	if (available > scan_projection_bytes(scan) * 20000ull) {
 		printf("SKIP unit a disk of more than a terabyte cannot be too small\n");
 	} else {
-		ck_assert_int_eq(store_scan_create(state.store, scan, NULL, &stored, &err), ERR_NO_SPACE);
+		ck_assert_int_eq(store_scan_create(state.store, scan, "somebody", NULL, &stored, &err), ERR_NO_SPACE);
 		ck_assert_str_eq(err.pointer, "/projections/count");
 		ck_assert_ptr_null(stored);
 		ck_assert_int_eq(rmdir(state_path(&state, "scans")), 0); /* nothing is in it */
@@ -735,7 +746,7 @@ Suite *store_suite(void)
 	tcase_add_checked_fixture(tests, set_up, tear_down);
 	tcase_add_test(tests, projections_are_known_again_after_a_restart);
 	tcase_add_test(tests, a_projection_has_one_writer_at_a_time);
-	tcase_add_test(tests, the_file_of_the_projections_has_its_full_size_at_once);
+	tcase_add_test(tests, the_file_of_the_projections_has_its_full_size_at_once_and_room_with_the_first);
 	tcase_add_test(tests, a_scan_beyond_the_disk_is_refused_before_anything_is_made);
 	tcase_add_test(tests, scans_are_listed_newest_first_from_a_cursor);
 	tcase_add_test(tests, a_deleted_scan_takes_no_more_projections);

@@ -1,0 +1,147 @@
+/* Shares of clients: whose jobs go first, and how many they may have (queue.h, store.h's limits). */
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "daemon/jobs/internal.h"
+#include "proto/clock.h"
+
+struct client *jobs_client(struct jobs *jobs, const char *name)
+{
+	struct client *client;
+
+	for (client = jobs->clients; client != NULL; client = client->next) {
+		if (strcmp(client->name, name) == 0)
+			return client;
+	}
+	client = calloc(1, sizeof(*client));
+	if (client == NULL)
+		return NULL;
+	snprintf(client->name, sizeof(client->name), "%s", name);
+	client->next = jobs->clients;
+	jobs->clients = client;
+	queue_know(&jobs->queue, &client->share);
+	return client;
+}
+
+static void charge(struct job *job, double now)
+{
+	if (job->charged > 0)
+		job->client->share.used += now - job->charged;
+	job->charged = job->record.state == JOB_RUNNING ? now : 0;
+}
+
+void job_share(struct job *job)
+{
+	const bool active = job->record.state == JOB_QUEUED || job->record.state == JOB_RUNNING;
+
+	charge(job, clock_monotonic());
+	if (active && !job->active)
+		queue_enter(&job->jobs->queue, &job->client->share);
+	else if (!active && job->active)
+		queue_leave(&job->client->share);
+	job->active = active;
+}
+
+void jobs_charge(struct jobs *jobs)
+{
+	const double now = clock_monotonic();
+
+	for (int i = 0; i < jobs->count; i++) {
+		if (jobs->all[i]->charged > 0)
+			charge(jobs->all[i], now);
+	}
+}
+
+unsigned long long job_bytes_wanted(const struct job_request *request)
+{
+	const struct recipe *recipe = &request->recipe;
+
+	/* The last volume is kept as "final" beside those that were asked for. */
+	return (unsigned long long)(recipe->emits + 1) * grid_voxels(&recipe->grid) * sizeof(float);
+}
+
+int job_count_bytes(struct job *job, struct error *err)
+{
+	unsigned long long sum = 0;
+	struct volume_record *volumes;
+	int count, code = store_job_volumes(job->jobs->store, job->id, &volumes, &count, err);
+
+	if (code != 0)
+		return code;
+	for (int i = 0; i < count; i++)
+		sum += volumes[i].bytes;
+	free(volumes);
+	pthread_mutex_lock(&job->jobs->lock);
+	job->kept_bytes = sum;
+	job->bytes_known = true;
+	pthread_mutex_unlock(&job->jobs->lock);
+	return 0;
+}
+
+static bool is_of(const struct job *job, const char *client)
+{
+	return client == NULL || strcmp(job->client->name, client) == 0;
+}
+
+/* A reference to a job whose volumes were never counted, or NULL. */
+static struct job *take_uncounted(struct jobs *jobs)
+{
+	struct job *job = NULL;
+
+	pthread_mutex_lock(&jobs->lock);
+	for (int i = 0; i < jobs->count && job == NULL; i++) {
+		if (!jobs->all[i]->bytes_known)
+			job = jobs->all[i];
+	}
+	if (job != NULL) {
+		job->bytes_known = true; /* also where its rows cannot be read: once is enough */
+		job->references++;
+	}
+	pthread_mutex_unlock(&jobs->lock);
+	return job;
+}
+
+unsigned long long jobs_bytes(void *context, const char *client)
+{
+	struct jobs *jobs = context;
+	unsigned long long sum = 0;
+	struct error ignored;
+	struct job *job;
+
+	while ((job = take_uncounted(jobs)) != NULL) {
+		job_count_bytes(job, &ignored);
+		job_release(job);
+	}
+	pthread_mutex_lock(&jobs->lock);
+	for (int i = 0; i < jobs->count; i++)
+		sum += is_of(jobs->all[i], client) ? jobs->all[i]->kept_bytes : 0;
+	pthread_mutex_unlock(&jobs->lock);
+	return sum;
+}
+
+long jobs_open_count(struct jobs *jobs, const char *client)
+{
+	long count = 0;
+
+	pthread_mutex_lock(&jobs->lock);
+	for (int i = 0; i < jobs->count; i++)
+		count += is_of(jobs->all[i], client) && !job_state_ended(jobs->all[i]->record.state);
+	pthread_mutex_unlock(&jobs->lock);
+	return count;
+}
+
+int jobs_check_limits(struct jobs *jobs, const struct job *job, struct error *err)
+{
+	const struct store_limits *limits = store_limits(jobs->store);
+	const char *client = job->record.client;
+
+	if (limits->client_jobs > 0 && jobs_open_count(jobs, client) >= limits->client_jobs)
+		return error_set(err, ERR_LIMIT,
+				 "%.60s has %ld jobs that have not ended, which is as many as one client may have",
+				 client, limits->client_jobs);
+	if (limits->jobs > 0 && jobs_open_count(jobs, NULL) >= limits->jobs)
+		return error_set(err, ERR_BUSY, "%ld jobs have not ended, which is as many as there may be",
+				 limits->jobs);
+	return store_check_volumes(jobs->store, client, job->kept_bytes, err);
+}

@@ -1,0 +1,151 @@
+/* How much a client, and all of them together, may have: store.h. */
+#include <errno.h>
+#include <fcntl.h>
+#include <string.h>
+
+#include "daemon/store/scan.h"
+
+void store_set_limits(struct store *store, const struct store_limits *limits)
+{
+	store->limits = *limits;
+}
+
+const struct store_limits *store_limits(const struct store *store)
+{
+	return &store->limits;
+}
+
+void store_count_volumes(struct store *store, unsigned long long (*bytes)(void *context, const char *client),
+			 void *context)
+{
+	store->volumes_bytes = bytes;
+	store->volumes_context = context;
+}
+
+static bool is_of(const struct stored_scan *scan, const char *client)
+{
+	return client == NULL || strcmp(scan->client, client) == 0;
+}
+
+static unsigned long long all_projections(const struct stored_scan *scan)
+{
+	return (unsigned long long)stored_scan_bytes(scan) * (unsigned long long)scan->count;
+}
+
+unsigned long long store_bytes(struct store *store, const char *client)
+{
+	unsigned long long sum =
+	    store->volumes_bytes != NULL ? store->volumes_bytes(store->volumes_context, client) : 0;
+
+	pthread_mutex_lock(&store->scans_lock);
+	for (int i = 0; i < store->scan_count; i++) {
+		if (store->scans[i]->has_room && is_of(store->scans[i], client))
+			sum += all_projections(store->scans[i]);
+	}
+	pthread_mutex_unlock(&store->scans_lock);
+	return sum;
+}
+
+long store_scans_of(struct store *store, const char *client)
+{
+	long count = 0;
+
+	pthread_mutex_lock(&store->scans_lock);
+	for (int i = 0; i < store->scan_count; i++)
+		count += is_of(store->scans[i], client);
+	pthread_mutex_unlock(&store->scans_lock);
+	return count;
+}
+
+int store_check_scans(struct store *store, const char *client, struct error *err)
+{
+	const long most = store->limits.client_scans;
+
+	if (most == 0 || store_scans_of(store, client) < most)
+		return 0;
+	return error_set(err, ERR_LIMIT, "%.60s has %ld scans, which is as many as one client may have", client, most);
+}
+
+/* used: of what there is without `more`. */
+static int check_bytes(const char *whose, unsigned long long used, unsigned long long more, unsigned long long most,
+		       struct error *err)
+{
+	if (most == 0 || (used <= most && more <= most - used))
+		return 0;
+	return error_set(err, ERR_NO_SPACE, "%llu bytes more are too many for %.60s: %llu of %llu are taken", more,
+			 whose, used, most);
+}
+
+int store_check_volumes(struct store *store, const char *client, unsigned long long more, struct error *err)
+{
+	const struct store_limits *limits = &store->limits;
+	const unsigned long long most = (unsigned long long)((double)limits->bytes * (1 - STORE_ACQUISITION_SHARE));
+	int code = 0;
+
+	if (limits->client_bytes > 0)
+		code = check_bytes(client, store_bytes(store, client), more, limits->client_bytes, err);
+	if (code == 0 && limits->bytes > 0)
+		code = check_bytes("volumes", store_bytes(store, NULL), more, most, err);
+	return code;
+}
+
+/* Counts the scan's bytes from here on. ERR_NO_SPACE, and they are not counted: a limit has no room for them. */
+static int count_room(struct stored_scan *scan, struct error *err)
+{
+	struct store *store = scan->store;
+	const struct store_limits *limits = &store->limits;
+	const unsigned long long more = all_projections(scan);
+	unsigned long long own = 0, all = 0;
+	bool counted;
+	int code = 0;
+
+	if (store->volumes_bytes != NULL && limits->client_bytes > 0)
+		own = store->volumes_bytes(store->volumes_context, scan->client);
+	if (store->volumes_bytes != NULL && limits->bytes > 0)
+		all = store->volumes_bytes(store->volumes_context, NULL);
+	pthread_mutex_lock(&store->scans_lock);
+	counted = scan->has_room;
+	for (int i = 0; i < store->scan_count && !counted; i++) {
+		const struct stored_scan *other = store->scans[i];
+
+		all += other->has_room ? all_projections(other) : 0;
+		own += other->has_room && is_of(other, scan->client) ? all_projections(other) : 0;
+	}
+	if (!counted)
+		code = check_bytes(scan->client, own, more, limits->client_bytes, err);
+	if (!counted && code == 0)
+		code = check_bytes("the daemon", all, more, limits->bytes, err);
+	if (code == 0)
+		scan->has_room = true;
+	pthread_mutex_unlock(&store->scans_lock);
+	return code;
+}
+
+int stored_scan_take_room(struct stored_scan *scan, int descriptor, struct error *err)
+{
+	bool there;
+	int code, result;
+
+	pthread_mutex_lock(&scan->lock);
+	there = scan->room;
+	pthread_mutex_unlock(&scan->lock);
+	if (there)
+		return 0;
+	code = count_room(scan, err);
+	if (code != 0)
+		return code;
+	/* The C library's posix_fallocate would write where a file system has no such call, beside other writers. */
+	do
+		result = fallocate(descriptor, 0, 0, (off_t)all_projections(scan)) == 0 ? 0 : errno;
+	while (result == EINTR);
+	if (result != 0 && result != EOPNOTSUPP && result != ENOSYS) {
+		pthread_mutex_lock(&scan->store->scans_lock);
+		scan->has_room = false;
+		pthread_mutex_unlock(&scan->store->scans_lock);
+		return error_set_errno(err, result, "room for %llu bytes of projections", all_projections(scan));
+	}
+	pthread_mutex_lock(&scan->lock);
+	scan->room = true;
+	pthread_mutex_unlock(&scan->lock);
+	return 0;
+}

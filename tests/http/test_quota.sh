@@ -1,0 +1,155 @@
+#!/usr/bin/env bash
+# Limits for each client and for all, and shares of the devices' time.
+. "$(dirname "$0")/lib.sh"
+program=cbctd-held # asserts the order of locks
+
+scan_dir=$work/ball
+cbct simulate --phantom ball --scale 30 --density 0.02 --views 20 --arc 360 --columns 64 --rows 48 --pixel 4 -o "$scan_dir" >/dev/null || exit 1
+bytes=$((20 * 64 * 48 * 4)) # of its projections
+grid='"grid": {"size": [16, 16, 16], "spacing_mm": [4, 4, 4]}' # volumes of 16384 bytes
+
+make_tokens() { # NAME ...: tokens for acquisition
+	local name
+	for name; do
+		[ -s "$work/$name.token" ] || cbct token new "$name" --role acquire --file "$work/tokens" >"$work/$name.token" || return 1
+	done
+}
+as() { # NAME: who asks from now on
+	who=(-H "Authorization: Bearer $(grep -o 'cbct_[A-Za-z0-9_-]*' "$work/$1.token" | head -1)")
+}
+ask() { req "$1" "$2" "${who[@]}" "${@:3}"; }
+new_scan() { # STATUS
+	ask POST /v1/scans -H 'Content-Type: application/json' --data-binary @"$scan_dir/scan.json"
+	expect_status "$1"
+	[ "$1" != 201 ] || scan=$(json .id)
+}
+fill() { # STATUS: of a PUT of all projections
+	ask PUT "/v1/scans/$scan/projections" -T "$scan_dir/projections.raw"
+	expect_status "$1"
+}
+new_job() { # STATUS RECIPE
+	ask POST /v1/jobs -H 'Content-Type: application/json' --data-binary "${2//SCAN/$scan}"
+	expect_status "$1"
+	[ "$1" != 202 ] || job=$(json .id)
+}
+limited() { # OPTION ...
+	rm -rf "$state"
+	start_daemon --tokens "$work/tokens" "$@"
+	as a
+}
+retry_after() { [ "$(header retry-after)" -ge 1 ] || fail "Retry-After"; }
+
+make_tokens a b || exit 1
+
+test_scans_of_a_client() {
+	limited --client-scans 2
+	new_scan 201
+	new_scan 201
+	new_scan 429
+	retry_after
+	expect_json '.type == "urn:cbctd:problem:limit-reached" and (.detail | contains("2 scans"))'
+	as b
+	new_scan 201
+	expect_json '.client == "b"'
+	as a
+	ask GET /v1/limits
+	expect_json '.client == "a" and .own.scans == {"used": 2, "most": 2} and .own.jobs == {"used": 0, "most": null}'
+	ask GET /v1/scans
+	ask DELETE "/v1/scans/$(json '[.scans[] | select(.client == "a")][0].id')"
+	new_scan 201
+}
+
+test_jobs_that_have_not_ended() {
+	limited --client-jobs 2 --max-jobs 3
+	new_scan 201
+	new_job 202 "{\"scan\": \"SCAN\", $grid}"
+	new_job 202 "{\"scan\": \"SCAN\", $grid}"
+	new_job 429 "{\"scan\": \"SCAN\", $grid}"
+	retry_after
+	as b
+	new_job 202 "{\"scan\": \"SCAN\", $grid}"
+	expect_json '.client == "b"'
+	new_job 503 "{\"scan\": \"SCAN\", $grid}"
+	retry_after
+	ask GET /v1/limits
+	expect_json '.own.jobs == {"used": 1, "most": 2} and .all.jobs == {"used": 3, "most": 3}'
+	ask DELETE "/v1/jobs/$job"
+	new_job 202 "{\"scan\": \"SCAN\", $grid}"
+	# The limit is one of the file's jobs, too.
+	stop_daemon
+	start_daemon --tokens "$work/tokens" --client-jobs 2 --max-jobs 3
+	new_job 503 "{\"scan\": \"SCAN\", $grid}"
+}
+
+test_bytes_are_taken_when_they_come() {
+	local free before
+	limited --client-bytes $((2 * bytes))
+	new_scan 201 && first=$scan
+	new_scan 201 && second=$scan
+	new_scan 201
+	ask GET /v1/limits
+	expect_json '.own.bytes.used == 0'
+	[ "$(stat -c %b "$state/scans/$scan/projections.raw")" = 0 ] || fail "no room for a scan that was announced alone"
+	fill 201
+	scan=$first && fill 201
+	scan=$second && fill 507
+	retry_after
+	expect_json '.detail | contains("are too many for a")'
+	ask GET "/v1/scans/$second"
+	expect_json '.received_count == 0'
+	ask GET /v1/limits
+	expect_json ".own.bytes.used == $((2 * bytes))"
+	as b
+	new_scan 201
+	fill 201
+	as a
+	ask DELETE "/v1/scans/$first"
+	expect_status 204
+	scan=$second && fill 201
+}
+
+test_volumes_leave_room_for_acquisition() {
+	# Nine tenths of it are this scan and two volumes, kept by one job; the whole is room for another scan.
+	limited --max-bytes $((2 * bytes + 40000))
+	new_scan 201
+	fill 201
+	new_job 202 "{\"scan\": \"SCAN\", $grid, \"fdk\": {}}"
+	for _ in $(seq 100); do
+		ask GET "/v1/jobs/$job?wait=30"
+		[ "$(json .state)" != succeeded ] || break
+	done
+	ask GET /v1/limits
+	expect_json ".all.bytes.used == $((bytes + 16384))"
+	new_job 507 "{\"scan\": \"SCAN\", \"grid\": {\"size\": [48, 48, 48], \"spacing_mm\": [2, 2, 2]}, \"fdk\": {}}"
+	retry_after
+	new_scan 201
+	fill 201
+	new_scan 201
+	fill 507
+	# Counted again from what is there.
+	stop_daemon
+	start_daemon --tokens "$work/tokens" --max-bytes $((2 * bytes + 40000))
+	ask GET /v1/limits
+	expect_json ".all.bytes.used == $((2 * bytes + 16384))"
+}
+
+test_equal_jobs_take_turns_by_clients() {
+	local recipe="{\"scan\": \"SCAN\", $grid, \"sart\": {\"iterations\": 60, \"subsets\": \"views\"}}" i jobs=()
+	limited
+	new_scan 201
+	fill 201
+	for ((i = 0; i < 6; i++)); do new_job 202 "$recipe"; done
+	as b
+	new_job 202 "$recipe"
+	# Of seven it came last, and is not the last to be made: its client has used less.
+	expect_json '.queue_position == null or .queue_position <= 2'
+	for ((i = 0; i < 60; i++)); do
+		ask GET "/v1/jobs/$job?wait=30"
+		[ "$(json .state)" != succeeded ] || break
+	done
+	expect_json '.state == "succeeded"'
+	ask GET /v1/jobs
+	expect_json '[.jobs[] | select(.client == "a" and .state == "queued")] | length >= 2'
+}
+
+stop_after_each=1 run_tests
