@@ -35,6 +35,9 @@ rule "a database knows no table of the catalogue" '#include "daemon/store/(catal
 rule "the files beneath SQLite know no statement" '\b(SELECT|INSERT|UPDATE|DELETE|CREATE|PRAGMA [a-z_]+ =)|sqlite3_(prepare|exec|step)' \
 	daemon/store/checksum_vfs.[ch]
 rule "no struct is bytes in the catalogue" 'COLUMN_BYTES.*AT\(' <(grep COLUMN_BYTES daemon/store/tables.c | grep -vE '(sha256|digest)\)')
+found "the README's glossary has at most 30 words" "$(
+	sed -n '/^## Glossary/,/^## C/p' README.md | grep -c '^| ' | awk '{ $1 -= 1 } $1 > 30'
+)"
 found "daemon/THREADS.md does not name the file of a thread" "$(
 	grep -l 'pthread_create(' $(files daemon) | sed 's,^daemon/,,' | while read -r file; do
 		grep -q "^|.*\`$file\`" daemon/THREADS.md || echo "$file"
