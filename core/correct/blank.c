@@ -69,7 +69,13 @@ static int warn(const struct correction_job *job, void *state, struct error *err
 	(void)err;
 	for (int i = 0; i < input->counts.blank; i++)
 		first = input->blank[i] < first ? input->blank[i] : first;
-	if (input->counts.blank > 0)
+	if (input->empty > 0)
+		warning_tell(job->warnings, "blank_views",
+			     "%d projections show nothing, the first of them is %d: %d have no good pixel, and %d one "
+			     "value or mere noise all over, as with a closed shutter or without the patient. They are "
+			     "left out, the others stand in for them",
+			     input->counts.blank, first, input->counts.blank - input->empty, input->empty);
+	else if (input->counts.blank > 0)
 		warning_tell(
 		    job->warnings, "blank_views",
 		    "%d projections have no good pixel, the first of them is %d: they are left out, the others stand "
@@ -81,7 +87,8 @@ static int warn(const struct correction_job *job, void *state, struct error *err
 extern const struct correction correction_blank_views;
 const struct correction correction_blank_views = {
     .name = "blank_views",
-    .summary = "views without a good pixel: the others stand in for them in FDK, iterations leave them out",
+    .summary = "views without a good pixel or that show nothing: the others stand in for them in FDK, iterations leave "
+	       "them out",
     .times = 1U << CORRECT_AFTER_FDK | 1U << CORRECT_BEFORE_ITERATING,
     .needs = NEEDS_VOLUME,
     .apply = apply,

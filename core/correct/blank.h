@@ -3,7 +3,7 @@
 
 #include "core/correct/correction.h"
 
-/* Views without a good pixel: their slots are 0 and say nothing. */
+/* Views without a good pixel, and views that show nothing (content.h): their slots are 0 and say nothing. */
 
 /* Factor by which an FDK volume is too low without blank views: the others stand in for them in equal shares. */
 double blank_factor(const struct correction_job *job);

@@ -75,7 +75,8 @@ int input_open(struct input *ret_input, const struct linearise *linearise, const
 		input.pixels = (size_t)geometry->columns * (size_t)geometry->rows;
 		input.look_every = geometry->count / 32 + 1;
 		input.blank = calloc((size_t)geometry->count, sizeof(*input.blank));
-		if (input.blank == NULL)
+		input.content = calloc((size_t)geometry->count, sizeof(*input.content));
+		if (input.blank == NULL || input.content == NULL)
 			code = error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", geometry->count);
 	}
 	if (code < 0)
@@ -98,6 +99,7 @@ void input_clear(struct input *input)
 	free(input->projection);
 	defect_map_clear(&input->map);
 	free(input->blank);
+	free(input->content);
 	*input = (struct input){0};
 }
 
@@ -109,17 +111,30 @@ static float line_integral(const struct input *input, const void *samples, size_
 	return linearise_pixel(&input->linearise, samples, at, &p) == PIXEL_GOOD ? p + input->log_air : NAN;
 }
 
-static void look_at_line_integrals(struct input *input, const void *samples)
+/* Samples of a view, about 4096 spread over it in blocks. */
+static struct view_content look_at_line_integrals(struct input *input, const void *samples, int columns, int rows)
 {
-	for (size_t i = 0; i < input->pixels; i += input->pixels / 4096 + 1) {
-		const float p = line_integral(input, samples, i);
+	const int most = CONTENT_BLOCKS * CONTENT_SAMPLES;
+	const int across = columns < most ? columns : most, along = rows < most ? rows : most;
+	struct content_sums sums = {.any = false};
 
-		if (isnan(p))
-			continue;
-		input->sum += (double)p;
-		input->most = p > input->most ? p : input->most;
-		input->looked_at++;
+	for (int j = 0; j < along; j++) {
+		const size_t row = (size_t)((long long)j * rows / along);
+
+		for (int i = 0; i < across; i++) {
+			const size_t column = (size_t)((long long)i * columns / across);
+			const float p = line_integral(input, samples, row * (size_t)columns + column);
+
+			if (isnan(p))
+				continue;
+			content_add(&sums, j * CONTENT_BLOCKS / along * CONTENT_BLOCKS + i * CONTENT_BLOCKS / across,
+				    p);
+			input->sum += (double)p;
+			input->most = p > input->most ? p : input->most;
+			input->looked_at++;
+		}
 	}
+	return content_of(&sums);
 }
 
 static int exchanged(uint16_t sample)
@@ -217,11 +232,40 @@ static void add_counts(struct defect_counts *counts, const struct defect_counts 
 	counts->air_most = fmaxf(counts->air_most, view->air_most);
 }
 
+/* True for a closed shutter: many samples have no count at all, and the others no more structure than noise. */
+static bool is_dark(const struct defect_counts *counts, const struct view_content *content, size_t pixels)
+{
+	const double many = 0.2;
+
+	return counts->blank == 0 && content->plain && (double)counts->zero > many * (double)pixels;
+}
+
+int input_empty_slot(const struct input *input, const struct backend *backend, struct stack *to, int slot,
+		     struct error *err)
+{
+	float *zero = calloc(input->pixels, sizeof(*zero));
+	int code;
+
+	if (zero == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a view");
+	code = backend->stack_upload(to, slot, 1, zero, err);
+	free(zero);
+	return code;
+}
+
+static void add_blank(struct input *input, int view)
+{
+	input->blank[input->counts.blank++] = view;
+	input->empty++;
+}
+
 int input_take(struct input *input, const struct backend *backend, struct plan *plan, const void *samples, int view,
 	       int slot, struct stack *to, const void **ret_upright, struct error *err)
 {
 	/* Views are linearised one by one, so that those with defects, and each one's own air, are known. */
 	const struct defect_counts before = input->counts;
+	const int columns = input->turned ? input->rows : input->columns;
+	const int rows = input->turned ? input->columns : input->rows;
 	struct defect_counts counts = {0};
 	int code;
 
@@ -233,23 +277,62 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 	if (code < 0)
 		return code;
 	add_counts(&input->counts, &counts);
+	if (counts.blank > 0)
+		input->blank[before.blank] = view;
 	input->log_air = counts.air_most > 0 ? logf(counts.air_most) : 0;
-	look_at_line_integrals(input, samples);
+	input->content[view] = look_at_line_integrals(input, samples, columns, rows);
+	if (is_dark(&counts, &input->content[view], input->pixels)) {
+		add_blank(input, view);
+		code = input_empty_slot(input, backend, to, slot, err);
+	}
 	if (input->linearise.sample == SAMPLE_UINT16)
 		look_at_bytes(input, samples);
-	if (view % input->look_every == 0)
-		code = look_at_ends(input, samples, input->turned ? input->rows : input->columns,
-				    input->turned ? input->columns : input->rows, err);
+	if (code == 0 && view % input->look_every == 0)
+		code = look_at_ends(input, samples, columns, rows, err);
 	if (code < 0)
 		return code;
 	input->views++;
 	/* Defects of the map do not count: every view has them. */
 	input->defective_views +=
 	    defects_total(&input->counts) - input->counts.mapped > defects_total(&before) - before.mapped;
-	if (input->counts.blank > before.blank)
-		input->blank[before.blank] = view;
 	*ret_upright = samples;
 	return 0;
+}
+
+/* Whether a view of the scan is blank, [count], owned by the caller; NULL for no memory. */
+static bool *blank_flags(const struct input *input, int count)
+{
+	bool *flags = calloc((size_t)count, sizeof(*flags));
+
+	for (int i = 0; flags != NULL && i < input->counts.blank; i++)
+		flags[input->blank[i]] = true;
+	return flags;
+}
+
+int input_settle(struct input *input, const struct orbit *orbit, struct error *err)
+{
+	bool *blank = blank_flags(input, orbit->count), *empty = calloc((size_t)orbit->count, sizeof(*empty));
+	int code = 0;
+
+	if (input->views > 0 && input->counts.blank == input->views)
+		code = error_set(err, ERR_IMPOSSIBLE,
+				 "none of the %d projections has a good pixel: %zu of their samples are in the defect "
+				 "map, %zu not above the dark, %zu saturated, %zu not finite",
+				 input->views, input->counts.mapped, input->counts.zero, input->counts.saturated,
+				 input->counts.not_finite);
+	else if (blank == NULL || empty == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", orbit->count);
+	if (code == 0)
+		code = content_find_empty(input->content, blank, orbit, empty, err);
+	if (code >= 0) {
+		input->even = content_is_even(input->content, blank, orbit->count);
+		for (int view = 0; view < orbit->count; view++)
+			if (empty[view])
+				add_blank(input, view);
+	}
+	free(blank);
+	free(empty);
+	return code;
 }
 
 void input_goes_on(const struct input *input, bool ret_ends[2])
@@ -273,15 +356,4 @@ double input_blank_share(const struct input *input, const struct orbit *orbit)
 		all += orbit_axis_weight(orbit, k);
 	/* Views that weigh next to nothing on the axis, as an arc's two ends, cannot stand in for the blank ones. */
 	return blank < (1 - 1e-6) * all ? blank / all : 0;
-}
-
-int input_check(const struct input *input, struct error *err)
-{
-	if (input->views == 0 || input->counts.blank < input->views)
-		return 0;
-	return error_set(err, ERR_IMPOSSIBLE,
-			 "none of the %d projections has a good pixel: %zu of their samples are in the defect map, %zu "
-			 "not above the dark, %zu saturated, %zu not finite",
-			 input->views, input->counts.mapped, input->counts.zero, input->counts.saturated,
-			 input->counts.not_finite);
 }

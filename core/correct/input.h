@@ -1,6 +1,7 @@
 #ifndef CBCT_CORE_INPUT_H
 #define CBCT_CORE_INPUT_H
 
+#include "core/correct/content.h"
 #include "core/correct/defects.h"
 
 /* The samples that a reconstruction was given: how they come, and statistics of those seen so far. */
@@ -13,8 +14,14 @@ struct input {
 	struct defect_map map;
 	struct defect_counts counts;
 	int views, defective_views; /* linearised so far, and those of them with defects */
-	int *blank;                 /* [counts.blank], owned: views without a good pixel, in the order they came */
-	size_t pixels;              /* of a view */
+	/*
+	 * [counts.blank], owned: views without a good pixel or of a closed shutter, in the order they came, and behind
+	 * them, once all have come, those that show nothing. `empty` of them have good pixels.
+	 */
+	int *blank, empty;
+	bool even;                    /* no view shows an object */
+	struct view_content *content; /* [views of the scan], owned */
+	size_t pixels;                /* of a view */
 	float log_air; /* of the latest view's own air: line integrals are larger by it; 0 without a region */
 	/* Statistics of about 4096 pixels of each view. */
 	double sum; /* of line integrals */
@@ -54,6 +61,16 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 	       int slot, struct stack *to, const void **ret_upright, struct error *err);
 
 /*
+ * Called once, when all views have come: those that show nothing (content.h) are blank ones from now on. Returns how
+ * many it found, the last ones of the list; ERR_IMPOSSIBLE where no view has a good pixel.
+ */
+int input_settle(struct input *input, const struct orbit *orbit, struct error *err);
+
+/* Makes a view's slot 0, as that of a view without a good pixel. */
+int input_empty_slot(const struct input *input, const struct backend *backend, struct stack *to, int slot,
+		     struct error *err);
+
+/*
  * Tells whether the object extends beyond the first row, [0], and the last one, [1]: more than a quarter of the views
  * looked at have it there.
  */
@@ -64,7 +81,5 @@ double input_air_off_share(const struct input *input);
 
 /* The share that blank views have in FDK's density on the axis, 0 .. 1. */
 double input_blank_share(const struct input *input, const struct orbit *orbit);
-/* ERR_IMPOSSIBLE where no view has a good pixel. */
-int input_check(const struct input *input, struct error *err);
 
 #endif

@@ -218,6 +218,16 @@ static void warn_of_line_integrals(const struct input *input, const struct warni
 		    input->looked_at);
 }
 
+/* A scan in which no view shows an object; of nothing above 0 the words are those of the line integrals. */
+static void warn_of_no_object(const struct input *input, const struct warning_sink *sink)
+{
+	if (input->even && (input->most > 0 || input->linearise.quantity == QUANTITY_INTENSITY))
+		warning_tell(sink, "no_object",
+			     "all of %d projections have one value or mere noise all over, line integrals of %.3g in "
+			     "the mean: there was nothing in the beam, or no beam",
+			     input->views, input->looked_at > 0 ? input->sum / (double)input->looked_at : 0);
+}
+
 /* Samples with their bytes exchanged are noise. So are 8 bits in the upper byte, but for being below 256 the other
  * way. */
 static void warn_of_bytes(const struct input *input, const struct warning_sink *sink)
@@ -262,6 +272,7 @@ static int warn_of_samples(const struct correction_job *job, void *state, struct
 	(void)state;
 	warn_of_air_level(job->input, job->warnings);
 	warn_of_line_integrals(job->input, job->warnings);
+	warn_of_no_object(job->input, job->warnings);
 	warn_of_bytes(job->input, job->warnings);
 	return warn_of_unseen_slices(job, err);
 }

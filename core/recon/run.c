@@ -4,6 +4,7 @@
  */
 #include <math.h>
 #include <stdio.h>
+#include <stdlib.h>
 #include <time.h>
 
 #include "core/correct/averaging.h"
@@ -188,6 +189,60 @@ static int correct(struct recon *recon, enum correction_time time, struct error 
 	return code == 0 && changed ? measure(recon, NULL, &recon->norms, err) : code;
 }
 
+/* Makes a view's slot what it was when FDK took it; projections that are not kept had the view's mean, but for noise.
+ */
+static int restore_view(struct recon *recon, int view, int slot, struct error *err)
+{
+	const size_t pixels = (size_t)recon->geometry->columns * (size_t)recon->geometry->rows;
+	float *plain;
+	int code;
+
+	if (keeps_projections(&recon->recipe))
+		return 0;
+	plain = malloc(pixels * sizeof(*plain));
+	if (plain == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a view");
+	for (size_t i = 0; i < pixels; i++)
+		plain[i] = recon->input.content[view].mean;
+	code = recon->backend->stack_upload(recon->projections, slot, 1, plain, err);
+	free(plain);
+	return code;
+}
+
+/* Takes views out of the FDK volume again, which is a sum over the views. */
+static int take_back(struct recon *recon, const int *views, int count, struct error *err)
+{
+	const struct backend *backend = recon->backend;
+	int code = fdk_flush(&recon->fdk, recon->projections, recon->volume, err);
+
+	if (code == 0)
+		code = backend->volume_axpby(-1, recon->volume, 0, recon->volume, err);
+	for (int i = 0; i < count && code == 0; i++) {
+		const int slot = keeps_projections(&recon->recipe) ? views[i] : recon->fdk.pending;
+
+		code = restore_view(recon, views[i], slot, err);
+		if (code == 0)
+			code = fdk_add(&recon->fdk, views[i], slot, recon->projections, recon->volume, err);
+	}
+	if (code == 0)
+		code = fdk_flush(&recon->fdk, recon->projections, recon->volume, err);
+	return code == 0 ? backend->volume_axpby(-1, recon->volume, 0, recon->volume, err) : code;
+}
+
+/* Once all views have come: those that show nothing are left out of the FDK volume, and their slots say nothing. */
+static int leave_out_empty(struct recon *recon, struct error *err)
+{
+	const int found = input_settle(&recon->input, &recon->orbit, err);
+	const int *views = recon->input.blank + recon->input.counts.blank - (found > 0 ? found : 0);
+	int code = found < 0 ? found : 0;
+
+	if (found > 0 && recon_runs_fdk(recon))
+		code = take_back(recon, views, found, err);
+	for (int i = 0; i < found && code == 0 && keeps_projections(&recon->recipe); i++)
+		code = input_empty_slot(&recon->input, recon->backend, recon->projections, views[i], err);
+	return code;
+}
+
 /* The FDK volume and what is made of it before the first iteration. */
 static int finish_fdk(struct recon *recon, struct error *err)
 {
@@ -361,7 +416,7 @@ int recon_run(struct recon *recon, struct error *err)
 
 	if (code < 0)
 		return code;
-	code = input_check(&recon->input, err);
+	code = leave_out_empty(recon, err);
 	if (code < 0)
 		return code;
 	recon->ran = true;

@@ -1,0 +1,49 @@
+#!/usr/bin/env bash
+# Views that show nothing among those of a head, four of 60: told, and left out, in a job of all defaults; and a scan
+# that shows nothing at all: told.
+. "$(dirname "$0")/lib.sh"
+
+head=(--phantom head --scale 60 --density 0.02 --views 60 --arc 360 --columns 64 --rows 48 --pixel 4
+	--source-to-isocentre 620 --source-to-detector 1100 --raw air --sample float32 --photons 50000)
+cbct simulate "${head[@]}" -o "$work/good" >/dev/null || exit 1
+cp -r "$work/good" "$work/empty"
+cp -r "$work/good" "$work/air"
+/usr/bin/env python3 - "$work/good/projections.raw" "$work/empty/projections.raw" "$work/air/projections.raw" <<'EOF' || exit 1
+import array, random, sys
+random.seed(5)
+pixels, views = 64 * 48, 60
+good = array.array('f', open(sys.argv[1], 'rb').read())
+empty = array.array('f', good)
+air = array.array('f', good)
+for view in range(views):
+    for i in range(pixels):
+        air[view * pixels + i] = random.gauss(60000, 270)
+        if view in (7, 8, 30):
+            empty[view * pixels + i] = air[view * pixels + i]
+        elif view == 52:
+            empty[view * pixels + i] = 30000
+open(sys.argv[2], 'wb').write(empty.tobytes())
+open(sys.argv[3], 'wb').write(air.tobytes())
+EOF
+grid='"grid": {"size": [40, 40, 28], "spacing_mm": [2.8, 2.8, 2.8]}'
+
+test_views_that_show_nothing_are_told_and_left_out() {
+	reconstruct "$work/good" "{\"scan\": \"SCAN\", $grid}"
+	expect_json '.warnings | all(.code != "blank_views" and .code != "no_object")'
+	get_volume final "$work/good.nii"
+	reconstruct "$work/empty" "{\"scan\": \"SCAN\", $grid}"
+	expect_json '[.warnings[] | select(.code == "blank_views") | .severity, (.detail | test("^4 projections show nothing, the first of them is 7"))] == ["caution", true]'
+	expect_json '.warnings | all(.code != "no_object")'
+	get_volume final "$work/empty.nii"
+	# What four views of 60 take away; 40 HU where they are believed.
+	expect_number "$(cbct compare --json "$work/empty.nii" "$work/good.nii" | jq '.rmse / 0.0192 * 1000')" '<' 12 "RMSE in HU"
+}
+
+test_a_scan_of_air_is_told() {
+	reconstruct "$work/air" "{\"scan\": \"SCAN\", $grid, \"fdk\": {}}"
+	expect_json '[.warnings[] | select(.code == "no_object") | .severity] == ["serious"]'
+	expect_json '.warnings | all(.code != "blank_views")'
+}
+
+start_daemon
+run_tests

@@ -1,0 +1,332 @@
+/* Views that show nothing (core/correct/content.h) are told and left out, and views of an object are none of them. */
+#include <check.h>
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "core/correct/content.h"
+#include "tests/unit/data.h"
+#include "tests/unit/scene.h"
+
+Suite *content_suite(void);
+
+enum { COLUMNS = 48, ROWS = 32, PIXELS = COLUMNS * ROWS, VIEWS = 60, EVERY = 15, FIRST = 7 };
+static const double AIR = 50000;
+
+static unsigned random_state;
+static double normal(void)
+{
+	double sum = -6;
+
+	for (int k = 0; k < 12; k++) {
+		random_state = random_state * 1664525u + 1013904223u;
+		sum += (random_state >> 8) / 16777216.0;
+	}
+	return sum;
+}
+
+/* ---- the search itself ---- */
+
+/* What the detector shows less of from view to view, or the other side of, is an object; a sudden gap is none. */
+START_TEST(a_gap_among_views_of_an_object_is_found)
+{
+	enum { COUNT = 24 };
+	static const struct {
+		const char *structure; /* a digit for each view, tenths */
+		double step, noise;    /* degrees; line integral */
+		const char *empty;
+	} rows[] = {
+	    {"999999990999999999999999", 15, .02, "000000001000000000000000"},
+	    {"999999990999999999999999", 15, .2, "000000000000000000000000"}, /* mostly noise */
+	    {"099999999999999999999900", 15, 0, "100000000000000000000011"},  /* over the end of a full turn */
+	    {"009999999999999999999990", 8, 0, "110000000000000000000001"},   /* at the ends of an arc */
+	    {"999999641001469999999999", 15, 0, "000000000000000000000000"},  /* leaves and comes back */
+	    {"999999900000000999999999", 15, 0, "000000000000000000000000"},  /* away for 120 degrees */
+	    {"999999900000000999999999", 8, 0, "000000011111111000000000"},
+	    {"000000000000000000000000", 15, .02, "000000000000000000000000"},
+	    {"090909090909090909090909", 15, .02, "000000000000000000000000"}, /* too many */
+	};
+
+	for (size_t i = 0; i < sizeof(rows) / sizeof(rows[0]); i++) {
+		const struct orbit_spec spec = {
+		    8, 8, COUNT, {600, 1100, {10, 10}, {0, 0}, {0, 0}}, 30, _i ? -rows[i].step : rows[i].step};
+		struct view_content views[COUNT];
+		const bool skip[COUNT] = {false};
+		bool empty[COUNT];
+		struct scene scene;
+		struct orbit orbit;
+		struct error err;
+		int found = 0;
+
+		scene_orbit(&scene, &spec);
+		ck_assert_int_eq(orbit_analyse(&orbit, &scene.geometry, &err), 0);
+		for (int k = 0; k < COUNT; k++) {
+			const float value = (float)(rows[i].structure[k] - '0') / 10;
+
+			views[k] = (struct view_content){.structure = value,
+							 .mean = value,
+							 .noise = (float)rows[i].noise,
+							 .plain = (double)value <= rows[i].noise};
+			found += rows[i].empty[k] == '1';
+		}
+		ck_assert_int_eq(content_find_empty(views, skip, &orbit, empty, &err), found);
+		for (int k = 0; k < COUNT; k++)
+			ck_assert_msg(empty[k] == (rows[i].empty[k] == '1'), "row %zu, view %d", i, k);
+		orbit_clear(&orbit);
+		scene_clear(&scene);
+	}
+}
+END_TEST
+
+/* ---- whole reconstructions ---- */
+
+enum kind { NO_OBJECT, VALUE, NOISY_VALUE, SHUTTER, DARK_LEVEL };
+enum { TRIES = 10 };
+
+/* A sample of a view that shows nothing, in counts. */
+static double sample_of(enum kind kind)
+{
+	switch (kind) {
+	case NO_OBJECT:
+		return AIR * (1 + 0.01 * normal());
+	case VALUE:
+		return 0.4 * AIR;
+	case NOISY_VALUE:
+		return AIR * (0.4 + 0.004 * normal());
+	case SHUTTER:
+		return 10 * normal();
+	default:
+		return 300 + 5 * normal();
+	}
+}
+
+static double error_of(const struct scene *scene, const struct recipe *recipe, const float *samples, const float *truth,
+		       const char *told)
+{
+	struct outcome outcome = {.samples = samples,
+				  .linearise = {.sample = SAMPLE_FLOAT32, .quantity = QUANTITY_INTENSITY, .air = AIR}};
+	double error;
+
+	run(scene, recipe, &outcome);
+	ck_assert_msg(strstr(outcome.warnings, told) != NULL, "%s", outcome.warnings);
+	ck_assert_msg(strstr(outcome.warnings, "no_object") == NULL, "%s", outcome.warnings);
+	error = relative_error(outcome.last, truth, grid_voxels(&outcome.grid));
+	outcome_clear(&outcome);
+	return error;
+}
+
+/*
+ * Four of 60 views that show nothing: the result is that of the same views without a good pixel, which are known to be
+ * left out. FDK alone keeps no projections and takes the mean of such a view out again, but not its noise.
+ */
+START_TEST(views_that_show_nothing_are_told_and_left_out)
+{
+	static const struct orbit_spec spec = {COLUMNS, ROWS, VIEWS, {600, 1100, {4, 4}, {0, 0}, {0, 0}}, 0, 6};
+	static const struct {
+		enum kind kind;
+		const struct algorithm *algorithm; /* NULL: FDK alone */
+	} tries[TRIES] = {
+	    {NO_OBJECT, NULL},
+	    {VALUE, NULL},
+	    {NOISY_VALUE, NULL},
+	    {SHUTTER, NULL},
+	    {DARK_LEVEL, NULL},
+	    {NO_OBJECT, &algorithm_sart},
+	    {NOISY_VALUE, &algorithm_sart},
+	    {SHUTTER, &algorithm_sart},
+	    {NO_OBJECT, &algorithm_cgls},
+	    {NOISY_VALUE, &algorithm_cgls},
+	};
+	struct ellipsoid balls[] = {
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {38, 38, 32}, .centre = {2, -3, 1}, .density = 0.02},
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {8, 8, 8}, .centre = {14, 6, 4}, .density = 0.02},
+	};
+	const struct phantom phantom = {.count = 2, .parts = balls};
+	const struct grid grid = grid_of(24, 24, 16, 3.6, 3.6, 3.6);
+	struct recipe recipe = recipe_on(&grid);
+	struct scene scene;
+	float *samples = malloc(sizeof(float) * PIXELS * VIEWS), *truth = malloc(sizeof(float) * grid_voxels(&grid));
+	double without, error;
+
+	recipe.fdk.on = true;
+	recipe.algorithm = tries[_i].algorithm;
+	recipe.iterate.iterations = 2;
+	random_state = (unsigned)_i;
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	phantom_voxelise(&phantom, &grid, 3, truth);
+	for (int i = 0; i < PIXELS * VIEWS; i++)
+		samples[i] = i / PIXELS % EVERY == FIRST
+				 ? 0
+				 : (float)(AIR * exp(-(double)scene.projections[i]) * (1 + 0.01 * normal()));
+	without = error_of(&scene, &recipe, samples, truth, "blank_views: 4 projections have no good pixel");
+	for (int i = 0; i < PIXELS * VIEWS; i++)
+		if (i / PIXELS % EVERY == FIRST)
+			samples[i] = (float)sample_of(tries[_i].kind);
+	error = error_of(&scene, &recipe, samples, truth,
+			 "blank_views: 4 projections show nothing, the first of them is 7");
+	ck_assert_msg(error < 1.02 * without, "%.4f, %.4f without the views", error, without);
+	scene_clear(&scene);
+	free(samples);
+	free(truth);
+}
+END_TEST
+
+/* Two warnings must not be there: of views that show nothing, and of a scan that does. */
+static void expect_silence(const struct scene *scene, const struct linearise *linearise, const char *name)
+{
+	const struct grid grid = grid_of(8, 8, scene->geometry.rows > 1 ? 8 : 1, 5, 5, 5);
+	struct recipe recipe = recipe_on(&grid);
+	struct outcome outcome = {.threads = 1, .linearise = *linearise};
+
+	recipe.fdk.on = true;
+	run(scene, &recipe, &outcome);
+	ck_assert_msg(strstr(outcome.warnings, "blank_views") == NULL && strstr(outcome.warnings, "no_object") == NULL,
+		      "%s: %s", name, outcome.warnings);
+	outcome_clear(&outcome);
+}
+
+static const struct {
+	const char *name;
+	int rows, views;
+	double step, offset;         /* degrees; of the detector along its rows, mm */
+	double photons, drift;       /* 0: exact; of air's line integral */
+	struct ellipsoid objects[2]; /* a density of 0: none */
+} scans[] = {
+    {"a ball far off-centre", 32, 60, 6, 0, 1e5, 0, {{SHAPE_ELLIPSOID, {9, 9, 9}, {45, 20, 0}, 0, .02}}},
+    {"a ball that leaves the detector", 32, 60, 6, 0, 1e5, 0, {{SHAPE_ELLIPSOID, {6, 6, 6}, {62, 0, 0}, 0, .02}}},
+    {"the same on an arc", 32, 50, -4, 0, 0, 0, {{SHAPE_ELLIPSOID, {6, 6, 6}, {55, 20, 0}, 0, .02}}},
+    {"one row", 1, 60, 6, 0, 1e4, 0, {{SHAPE_CYLINDER, {35, 25, 9}, {10, 5, 0}, 0, .02}}},
+    {"a body wider than the detector", 32, 60, 6, 0, 1e5, 0, {{SHAPE_CYLINDER, {140, 80, 90}, {20, 0, 0}, 0, .02}}},
+    {"a plate wider than the detector", 32, 40, 5, 0, 1e5, 0, {{SHAPE_BOX, {120, 6, 90}, {0, 10, 0}, .3, .02}}},
+    {"a thin plate", 32, 90, 4, 0, 1e5, 0, {{SHAPE_BOX, {40, 2.5, 30}, {0, 10, 0}, .3, .02}}},
+    {"an arc with few views", 32, 7, 28, 0, 1e5, 0, {{SHAPE_BOX, {30, 8, 20}, {20, 10, 0}, 0, .02}}},
+    {"three views", 32, 3, 60, 0, 0, 0, {{SHAPE_ELLIPSOID, {10, 30, 10}, {20, 0, 0}, 0, .02}}},
+    {"a tube that drifts", 32, 60, 6, 0, 1e5, .2, {{SHAPE_ELLIPSOID, {20, 14, 12}, {30, 0, 0}, 0, .02}}},
+    {"a displaced detector", 32, 60, 6, 60, 1e5, 0, {{SHAPE_ELLIPSOID, {60, 40, 30}, {0, 0, 0}, 0, .02}}},
+    {"few photons", 32, 60, 6, 0, 500, 0, {{SHAPE_ELLIPSOID, {40, 12, 30}, {0, 0, 0}, 0, .002}}},
+    {"two beads",
+     32,
+     60,
+     6,
+     0,
+     1e5,
+     0,
+     {{SHAPE_ELLIPSOID, {4, 4, 4}, {20, 0, 0}, 0, .05}, {SHAPE_ELLIPSOID, {4, 4, 4}, {-25, 9, 8}, 0, .05}}},
+};
+
+START_TEST(no_view_of_an_object_is_taken_for_nothing)
+{
+	const struct orbit_spec spec = {
+	    COLUMNS, scans[_i].rows, scans[_i].views, {600, 1100, {4, 4}, {scans[_i].offset, 0}, {0, 0}},
+	    20,      scans[_i].step};
+	struct ellipsoid objects[2];
+	const struct phantom phantom = {.count = 2, .parts = objects};
+	const struct linearise linearise = {.sample = SAMPLE_FLOAT32};
+	struct scene scene;
+
+	memcpy(objects, scans[_i].objects, sizeof(objects));
+	objects[1].shape = SHAPE_ELLIPSOID;
+	for (int k = 0; k < 3; k++)
+		objects[1].semi_axes[k] = objects[1].semi_axes[k] > 0 ? objects[1].semi_axes[k] : 1;
+	random_state = (unsigned)_i;
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	for (int i = 0; i < COLUMNS * scans[_i].rows * scans[_i].views; i++) {
+		const double p = (double)scene.projections[i], photons = scans[_i].photons;
+		const double seen = photons > 0 ? exp(-p) + sqrt(exp(-p) / photons) * normal() : exp(-p);
+
+		scene.projections[i] =
+		    (float)(-log(fmax(seen, 1e-4)) + scans[_i].drift * sin(i / (COLUMNS * scans[_i].rows) * .3));
+	}
+	expect_silence(&scene, &linearise, scans[_i].name);
+	scene_clear(&scene);
+}
+END_TEST
+
+/* Measured scans. */
+START_TEST(measured_views_all_show_something)
+{
+	static const struct {
+		const char *name;
+		int columns, rows, views, skipped; /* skipped: images before the first view */
+		double first, step;                /* degrees */
+		struct circular circular;
+	} data[] = {
+	    {"htc_tb_real.f32.zst", 560, 1, 549, 0, 27, .5, {410.66, 553.74, {.2, .2}, {0, 0}, {0, 0}}},
+	    {"htc_solid_disc_real.f32.zst", 560, 1, 61, 0, 181, .5, {410.66, 553.74, {.2, .2}, {0, 0}, {0, 0}}},
+	    {"ctsimu_tetra_raw.f32.zst", 150, 150, 21, 4, 0, 18, {300, 400, {1.3, 1.3}, {0, 0}, {0, 0}}},
+	};
+	const struct orbit_spec spec = {data[_i].columns,  data[_i].rows,  data[_i].views,
+					data[_i].circular, data[_i].first, data[_i].step};
+	const size_t pixels = (size_t)data[_i].columns * (size_t)data[_i].rows;
+	float *values = data_f32(data[_i].name, pixels * (size_t)(data[_i].views + data[_i].skipped));
+	struct linearise linearise = {.sample = SAMPLE_FLOAT32};
+	struct scene scene;
+
+	if (values == NULL)
+		return;
+	if (data[_i].skipped > 0) {
+		linearise.quantity = QUANTITY_INTENSITY;
+		linearise.image[IMAGE_DARK] = values;
+		linearise.image[IMAGE_FLAT] = values + pixels;
+	}
+	scene_orbit(&scene, &spec);
+	memcpy(scene.projections, values + pixels * (size_t)data[_i].skipped,
+	       pixels * (size_t)data[_i].views * sizeof(*values));
+	expect_silence(&scene, &linearise, data[_i].name);
+	scene_clear(&scene);
+	free(values);
+}
+END_TEST
+
+/* Nothing but air, as counts or line integrals, with much noise or none; a bead of a few pixels is an object. */
+START_TEST(a_scan_of_air_is_told)
+{
+	static const struct orbit_spec spec = {COLUMNS, ROWS, 30, {600, 1100, {4, 4}, {0, 0}, {0, 0}}, 0, 12};
+	struct ellipsoid bead = {.shape = SHAPE_ELLIPSOID, .semi_axes = {3, 3, 3}, .centre = {9, 0, 3}, .density = .02};
+	const struct phantom phantom = {.count = 1, .parts = &bead};
+	const double noises[] = {0, .001, .05};
+	const struct grid grid = grid_of(8, 8, 8, 5, 5, 5);
+	const bool counts = _i % 2 != 0, has_bead = _i >= 6;
+	struct recipe recipe = recipe_on(&grid);
+	struct outcome outcome = {.threads = 1};
+	struct scene scene;
+
+	recipe.fdk.on = true;
+	random_state = (unsigned)_i;
+	scene_orbit(&scene, &spec);
+	if (has_bead)
+		scene_add(&scene, &phantom);
+	for (int i = 0; i < PIXELS * 30; i++) {
+		const double share = exp(-(double)scene.projections[i]) * (1 + noises[_i / 2 % 3] * normal());
+
+		scene.projections[i] = (float)(counts ? AIR * share : -log(share));
+	}
+	if (counts)
+		outcome.linearise =
+		    (struct linearise){.sample = SAMPLE_FLOAT32, .quantity = QUANTITY_INTENSITY, .air = AIR};
+	run(&scene, &recipe, &outcome);
+	ck_assert_msg((strstr(outcome.warnings, "no_object: ") != NULL ||
+		       strstr(outcome.warnings, "nothing but air in the scan") != NULL) == !has_bead,
+		      "%d: %s", _i, outcome.warnings);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
+Suite *content_suite(void)
+{
+	Suite *suite = suite_create("content");
+	TCase *tests = tcase_create("content");
+
+	tcase_set_timeout(tests, 60);
+	tcase_add_loop_test(tests, a_gap_among_views_of_an_object_is_found, 0, 2);
+	tcase_add_loop_test(tests, views_that_show_nothing_are_told_and_left_out, 0, TRIES);
+	tcase_add_loop_test(tests, no_view_of_an_object_is_taken_for_nothing, 0,
+			    (int)(sizeof(scans) / sizeof(scans[0])));
+	tcase_add_loop_test(tests, measured_views_all_show_something, 0, 3);
+	tcase_add_loop_test(tests, a_scan_of_air_is_told, 0, 10);
+	suite_add_tcase(suite, tests);
+	return suite;
+}
