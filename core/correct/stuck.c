@@ -13,6 +13,8 @@
 enum { NEIGHBOURS = 8, AWAY = 2, BESIDE_LEAST = 4 }; /* good pixels right beside one that is taken for alone */
 
 static const float MATTERS = 0.03f, APART = 0.1f; /* of the photons, or of the largest line integral below 1 */
+static const float BEYOND = 0.1f;                 /* of the root mean square of e */
+static const float TIP = 0.1f;                    /* of the mean of e */
 static const float STILL = 0.1f, LARGER = 3, WILDER = 9, FARTHER = 3, STEADY = 4, IN_FEW_VIEWS = 0.25f;
 static const double MOST = 0.1;      /* of all pixels */
 static const double AXIS_PIXELS = 4; /* between a ray and the axis */
@@ -25,9 +27,10 @@ struct sums {
 	float *views; /* those that the pixel is good in */
 	float *first, *p, *p2;
 	float *e, *e2, *magnitude; /* of e */
+	float *beyond2;            /* squares of what p lies beyond all of its neighbours by */
 	float *all;                /* the memory of these */
 };
-enum { SUMS = 7 };
+enum { SUMS = 8 };
 
 struct stuck {
 	const struct linearise *linearise;
@@ -36,6 +39,7 @@ struct stuck {
 	struct sums sums;
 	float *values;  /* [row][column], line integrals of a view */
 	float *medians; /* [row][column], of each pixel's neighbours in the view */
+	float *beyond;  /* [row][column], what the pixel lies beyond all of them by, 0 within their range */
 	float *good;    /* [row][column], of the view: 1; 0 where the pixel says nothing */
 	bool *some_bad; /* [row], of the view */
 	unsigned char *map;
@@ -148,7 +152,8 @@ static void sums_new(struct sums *ret, size_t pixels)
 			     .p2 = all + 3 * pixels,
 			     .e = all + 4 * pixels,
 			     .e2 = all + 5 * pixels,
-			     .magnitude = all + 6 * pixels};
+			     .magnitude = all + 6 * pixels,
+			     .beyond2 = all + 7 * pixels};
 }
 
 int stuck_new(const struct linearise *linearise, const struct geometry *geometry, bool beside, struct stuck **ret_stuck,
@@ -170,11 +175,12 @@ int stuck_new(const struct linearise *linearise, const struct geometry *geometry
 	sums_new(&stuck->sums, pixels);
 	stuck->values = malloc(pixels * sizeof(*stuck->values));
 	stuck->medians = malloc(pixels * sizeof(*stuck->medians));
+	stuck->beyond = malloc(pixels * sizeof(*stuck->beyond));
 	stuck->good = malloc(pixels * sizeof(*stuck->good));
 	stuck->some_bad = malloc((size_t)geometry->rows * sizeof(*stuck->some_bad));
 	stuck->map = calloc(pixels, 1);
-	if (stuck->sums.all == NULL || stuck->values == NULL || stuck->medians == NULL || stuck->good == NULL ||
-	    stuck->some_bad == NULL || stuck->map == NULL) {
+	if (stuck->sums.all == NULL || stuck->values == NULL || stuck->medians == NULL || stuck->beyond == NULL ||
+	    stuck->good == NULL || stuck->some_bad == NULL || stuck->map == NULL) {
 		stuck_free(stuck);
 		return error_set(err, ERR_NO_MEMORY, "no memory to look for stuck pixels in %d x %d", geometry->columns,
 				 geometry->rows);
@@ -196,6 +202,7 @@ void stuck_free(struct stuck *stuck)
 	free(stuck->sums.all);
 	free(stuck->values);
 	free(stuck->medians);
+	free(stuck->beyond);
 	free(stuck->good);
 	free(stuck->some_bad);
 	free(stuck->map);
@@ -269,21 +276,33 @@ static void sort(float values[NEIGHBOURS], int count)
 	}
 }
 
-/* Median of the good neighbours; the pixel's own value where none is good, which is_stuck takes for no stuck one. */
-static float median_of(const struct stuck *stuck, int column, int row)
+/* 0 from least to most. */
+static inline float beyond_range(float p, float least, float most)
 {
+	const float below = least - p, above = p - most, beyond = below > above ? below : above;
+
+	return beyond > 0 ? beyond : 0;
+}
+
+/*
+ * Compares a pixel to its good neighbours, to their median and range; to itself where none is good, which is_stuck
+ * takes for no stuck one.
+ */
+static void compare_to_good(const struct stuck *stuck, int column, int row)
+{
+	const size_t at = (size_t)row * (size_t)stuck->geometry->columns + (size_t)column;
 	size_t near[NEIGHBOURS];
-	float values[NEIGHBOURS];
+	float values[NEIGHBOURS] = {stuck->values[at]};
 	int count = 0;
 
 	neighbours_of(stuck->geometry, column, row, near);
 	for (int i = 0; i < NEIGHBOURS; i++)
 		if (stuck->good[near[i]] != 0)
 			values[count++] = stuck->values[near[i]];
-	if (count == 0)
-		return stuck->values[(size_t)row * (size_t)stuck->geometry->columns + (size_t)column];
+	count = count > 0 ? count : 1;
 	sort(values, count);
-	return 0.5f * (values[(count - 1) / 2] + values[count / 2]);
+	stuck->medians[at] = 0.5f * (values[(count - 1) / 2] + values[count / 2]);
+	stuck->beyond[at] = beyond_range(stuck->values[at], values[0], values[count - 1]);
 }
 
 static inline void exchange(float *low, float *high)
@@ -295,10 +314,12 @@ static inline void exchange(float *low, float *high)
 }
 
 /*
- * The exchanges are those of Batcher's merge sort of eight values (Batcher 1968) but those that the middle two do not
- * depend on. They are written out, so that the compiler keeps many pixels' values in registers.
+ * Median of eight values, and what p lies beyond all of them by. The exchanges are those of Batcher's merge sort
+ * (Batcher 1968) but those that the middle two and the outermost two do not depend on. They are written out, so that
+ * the compiler keeps many pixels' values in registers.
  */
-static inline float median_of_eight(float a, float b, float c, float d, float e, float f, float g, float h)
+static inline float compare_to_eight(float a, float b, float c, float d, float e, float f, float g, float h, float p,
+				     float *ret_beyond)
 {
 	exchange(&a, &b), exchange(&c, &d), exchange(&e, &f), exchange(&g, &h);
 	exchange(&a, &c), exchange(&b, &d), exchange(&e, &g), exchange(&f, &h);
@@ -306,24 +327,25 @@ static inline float median_of_eight(float a, float b, float c, float d, float e,
 	exchange(&a, &e), exchange(&b, &f), exchange(&c, &g), exchange(&d, &h);
 	exchange(&c, &e), exchange(&d, &f);
 	exchange(&d, &e);
+	*ret_beyond = beyond_range(p, a, h);
 	return 0.5f * (d + e);
 }
 
-/* The medians of a row's pixels that have neighbours on all sides. */
-static void medians_inside(const struct stuck *stuck, int row)
+/* Compares a row's pixels that have neighbours on all sides. */
+static void compare_inside(const struct stuck *stuck, int row)
 {
 	const ptrdiff_t columns = stuck->geometry->columns;
 	const float *at = stuck->values + row * columns, *before = at - AWAY * columns, *behind = at + AWAY * columns;
-	float *medians = stuck->medians + row * columns;
+	float *medians = stuck->medians + row * columns, *beyond = stuck->beyond + row * columns;
 
 #pragma omp simd
 	for (ptrdiff_t c = AWAY; c < columns - AWAY; c++)
-		medians[c] = median_of_eight(before[c - AWAY], before[c], before[c + AWAY], at[c - AWAY], at[c + AWAY],
-					     behind[c - AWAY], behind[c], behind[c + AWAY]);
+		medians[c] = compare_to_eight(before[c - AWAY], before[c], before[c + AWAY], at[c - AWAY], at[c + AWAY],
+					      behind[c - AWAY], behind[c], behind[c + AWAY], at[c], &beyond[c]);
 }
 
-/* Again, without the neighbours that say nothing, for those pixels of medians_inside that have such. */
-static void medians_beside_bad(const struct stuck *stuck, int row)
+/* Again, without the neighbours that say nothing, for those pixels of compare_inside that have such. */
+static void compare_beside_bad(const struct stuck *stuck, int row)
 {
 	const int columns = stuck->geometry->columns;
 	const float *at = stuck->good + (size_t)row * (size_t)columns;
@@ -336,22 +358,22 @@ static void medians_beside_bad(const struct stuck *stuck, int row)
 		for (int i = 0; i < NEIGHBOURS; i++)
 			good += at[AWAY * (AROUND[i][0] * columns + AROUND[i][1]) + column];
 		if (good < NEIGHBOURS)
-			stuck->medians[(size_t)row * (size_t)columns + (size_t)column] = median_of(stuck, column, row);
+			compare_to_good(stuck, column, row);
 	}
 }
 
-static void medians_of_row(const struct stuck *stuck, int row)
+static void compare_row(const struct stuck *stuck, int row)
 {
 	const int columns = stuck->geometry->columns;
 	const bool inside = edge_at(row, stuck->geometry->rows) == 0;
 
 	if (inside) {
-		medians_inside(stuck, row);
-		medians_beside_bad(stuck, row);
+		compare_inside(stuck, row);
+		compare_beside_bad(stuck, row);
 	}
 	for (int column = 0; column < columns; column++)
 		if (!inside || edge_at(column, columns) != 0)
-			stuck->medians[(size_t)row * (size_t)columns + (size_t)column] = median_of(stuck, column, row);
+			compare_to_good(stuck, column, row);
 }
 
 /* Without branches, so that the compiler adds several pixels at once. */
@@ -359,10 +381,11 @@ static void add_row(struct stuck *stuck, int row)
 {
 	const int columns = stuck->geometry->columns;
 	const size_t from = (size_t)row * (size_t)columns;
-	const float *values = stuck->values + from, *medians = stuck->medians + from, *good = stuck->good + from;
+	const float *values = stuck->values + from, *medians = stuck->medians + from, *good = stuck->good + from,
+		    *beyond = stuck->beyond + from;
 	float *views = stuck->sums.views + from, *first = stuck->sums.first + from, *p = stuck->sums.p + from,
 	      *p2 = stuck->sums.p2 + from, *e = stuck->sums.e + from, *e2 = stuck->sums.e2 + from,
-	      *magnitude = stuck->sums.magnitude + from;
+	      *magnitude = stuck->sums.magnitude + from, *beyond2 = stuck->sums.beyond2 + from;
 
 #pragma omp simd
 	for (int c = 0; c < columns; c++) {
@@ -377,6 +400,7 @@ static void add_row(struct stuck *stuck, int row)
 		e[c] += apart;
 		e2[c] += apart * apart;
 		magnitude[c] += fabsf(apart);
+		beyond2[c] += good[c] * beyond[c] * beyond[c];
 	}
 }
 
@@ -393,7 +417,7 @@ static void add_view(struct stuck *stuck, const void *samples)
 			read_row(stuck, samples, row);
 #pragma omp for schedule(static)
 		for (int row = 0; row < rows; row++) {
-			medians_of_row(stuck, row);
+			compare_row(stuck, row);
 			add_row(stuck, row);
 		}
 	}
@@ -415,6 +439,7 @@ void stuck_add(struct stuck *stuck, const void *samples)
 struct behaviour {
 	float varies;             /* variance of p */
 	float rms, mean, wanders; /* of e: root mean square, mean's magnitude, variance */
+	float beyond;             /* root mean square of what p lies beyond all neighbours by */
 	float spread;             /* mean |e| squared, in units of the mean square: small where few views make it */
 };
 
@@ -425,6 +450,7 @@ static struct behaviour behaviour_of(const struct sums *sums, size_t at)
 	return (struct behaviour){
 	    .varies = fmaxf(sums->p2[at] / n - mean * mean, 0),
 	    .rms = sqrtf(e2 / n),
+	    .beyond = sqrtf(sums->beyond2[at] / n),
 	    .mean = fabsf(e),
 	    .wanders = fmaxf(e2 / n - e * e, 0),
 	    .spread = e2 > 0 ? sums->magnitude[at] * sums->magnitude[at] / (n * e2) : 0,
@@ -490,6 +516,9 @@ static bool is_alone(const struct stuck *stuck, int column, int row, bool wander
 		apart = mean_of(sums, own) - mean_of(sums, other);
 		like += wanders ? behaviour_of(sums, other).wanders > least
 				: !(e > 0 ? apart > 0.5f * e : apart < 0.5f * e);
+		/* An object's tip lies between what is beside it and the object. */
+		if (!wanders && (e > 0 ? apart < -TIP * e : apart > -TIP * e))
+			return false;
 	}
 	return like <= 1 && bad <= NEIGHBOURS - BESIDE_LEAST;
 }
@@ -499,6 +528,7 @@ static bool is_stuck(const struct stuck *stuck, int column, int row)
 	const float whole = fminf(stuck->largest, 1);
 	const size_t at = (size_t)row * (size_t)stuck->geometry->columns + (size_t)column;
 	const struct behaviour own = behaviour_of(&stuck->sums, at);
+	const bool is_beyond = own.beyond > BEYOND * own.rms;
 	float varies[NEIGHBOURS], rms[NEIGHBOURS], mean[NEIGHBOURS], wanders[NEIGHBOURS];
 	size_t near[NEIGHBOURS];
 
@@ -522,10 +552,11 @@ static bool is_stuck(const struct stuck *stuck, int column, int row)
 	sort(rms, NEIGHBOURS);
 	sort(mean, NEIGHBOURS);
 	sort(wanders, NEIGHBOURS);
-	if (own.varies < STILL * varies[2] && own.rms > LARGER * rms[NEIGHBOURS / 2])
+	if (is_beyond && own.varies < STILL * varies[2] && own.rms > LARGER * rms[NEIGHBOURS / 2])
 		return true;
-	if (own.wanders > MATTERS * MATTERS * whole * whole && own.wanders > WILDER * wanders[NEIGHBOURS - 2] &&
-	    own.spread > IN_FEW_VIEWS && own.rms > LARGER * rms[NEIGHBOURS - 2] && is_alone(stuck, column, row, true))
+	if (is_beyond && own.wanders > MATTERS * MATTERS * whole * whole &&
+	    own.wanders > WILDER * wanders[NEIGHBOURS - 2] && own.spread > IN_FEW_VIEWS &&
+	    own.rms > LARGER * rms[NEIGHBOURS - 2] && is_alone(stuck, column, row, true))
 		return true;
 	return own.mean > APART * whole && own.mean > FARTHER * mean[NEIGHBOURS - 2] &&
 	       own.mean * own.mean > STEADY * STEADY * own.wanders && is_alone(stuck, column, row, false) &&

@@ -25,6 +25,10 @@
  *            such a shadow, one pixel in all views, lies on the axis of the rotation:
  *            pixels whose rays pass it are left out.
  *
+ * For the first two, p also lies outside of the range of its neighbours, by a tenth of e at least (root mean squares);
+ * for the last, none of the pixels beside it lies beyond p by a tenth of e. An object's edge or tip, and the axis of a
+ * body that looks the same from all sides, lie between what is beside them, however coarse the pixels are.
+ *
  * A neighbour that says nothing, as one of the scan's map, is left out of m, and where that is
  * so in most views it counts as one that speaks for the pixel in the comparisons above.
  *

@@ -172,6 +172,69 @@ START_TEST(an_object_is_no_stuck_pixel)
 }
 END_TEST
 
+/* A number of its own for each call. */
+static double between(double least, double most)
+{
+	return least + (most - least) * uniform();
+}
+
+/* One or two ellipsoids, cylinders or boxes, thin or thick, long or short, centred or not, for a field of view. */
+static int random_parts(double field, double height, struct ellipsoid ret_parts[2])
+{
+	static const enum shape shapes[] = {SHAPE_ELLIPSOID, SHAPE_CYLINDER, SHAPE_BOX};
+	const int count = uniform() < 0.5 ? 1 : 2;
+
+	for (int k = 0; k < count; k++) {
+		const double size = between(.1, 1.2) * field, aside = between(0, .35) * field, where = between(0, 6.28);
+		const bool centred = uniform() < .3, round = uniform() < .3, is_long = uniform() < .4;
+
+		ret_parts[k] = (struct ellipsoid){
+		    .shape = shapes[(int)between(0, 2.999)],
+		    .semi_axes = {size, round ? size : size * between(.2, 1),
+				  is_long ? 500 : between(.2, 1.5) * height},
+		    .centre = {centred ? 0 : aside * cos(where), centred ? 0 : aside * sin(where),
+			       between(-.3, .3) * height},
+		    .angle = between(0, 3.14),
+		    .density = between(.01, .04),
+		};
+	}
+	return count;
+}
+
+/* Exact line integrals of smooth objects on pixels of any size: an edge, a tip or an axis is no stuck pixel. */
+START_TEST(no_pixel_size_makes_stuck_pixels)
+{
+	random_state = (unsigned)_i + 1;
+	for (int scan = 0; scan < 100; scan++) {
+		const int columns = (int)between(6, 96), rows = (int)between(5, 48), views = (int)between(8, 120);
+		const double pixel = between(1, 300. / columns), radius = between(400, 800);
+		const double arc = uniform() < .6 ? 360 : between(180, 240);
+		const struct orbit_spec spec = {
+		    columns, rows, views, {radius, 1100, {pixel, pixel}, {0, 0}, {0, 0}}, between(0, 360), arc / views};
+		const struct linearise linearise = {.sample = SAMPLE_FLOAT32};
+		const size_t pixels = (size_t)columns * (size_t)rows;
+		struct ellipsoid parts[2];
+		struct phantom phantom = {.parts = parts};
+		struct stuck *stuck;
+		struct scene scene;
+		struct error err;
+
+		phantom.count = random_parts(radius * sin(atan(columns * pixel / 2200)), rows * pixel * .27, parts);
+		scene_orbit(&scene, &spec);
+		scene_add(&scene, &phantom);
+		ck_assert_int_eq(stuck_new(&linearise, &scene.geometry, false, &stuck, &err), 0);
+		ck_assert_ptr_nonnull(stuck);
+		for (int view = 0; view < views; view++)
+			if (stuck_wants(stuck, view))
+				stuck_add(stuck, scene.projections + (size_t)view * pixels);
+		ck_assert_msg(stuck_find(stuck) == NULL, "scan %d: %d views of %d x %d pixels of %.1f mm, %g degrees",
+			      scan, views, columns, rows, pixel, arc);
+		stuck_free(stuck);
+		scene_clear(&scene);
+	}
+}
+END_TEST
+
 /*
  * 1 % of the pixels, but for corners, the axis where nothing moves, and what noise hides. Beside a faulty pixel one may
  * be taken for another.
@@ -261,6 +324,7 @@ Suite *stuck_suite(void)
 
 	tcase_set_timeout(tests, 0);
 	tcase_add_loop_test(tests, an_object_is_no_stuck_pixel, 0, 4);
+	tcase_add_loop_test(tests, no_pixel_size_makes_stuck_pixels, 0, 2);
 	tcase_add_loop_test(tests, a_pixel_that_does_not_follow_is_found, 0, 4);
 	tcase_add_loop_test(tests, a_neighbour_of_mapped_pixels_is_judged_by_good_ones, 0, 4);
 	tcase_add_test(tests, a_thread_of_its_own_finds_the_same);
