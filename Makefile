@@ -154,7 +154,7 @@ $(BUILD)/cbctd-held: $(call objects,$(daemon_sources) tests/http/held.c tests/lo
 
 gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench
 # Every program that a test or a benchmark runs, so that none stops compiling unseen.
-test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held faults.so nvml-stub/libnvidia-ml.so.1 cpu-bench calibrate-bench denoise presets watchers slices acquire) \
+test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held manual faults.so nvml-stub/libnvidia-ml.so.1 cpu-bench calibrate-bench denoise presets watchers slices acquire) \
                $(if $(cuda_objects),$(gpu_programs) $(BUILD)/gpu_ceilings $(BUILD)/cbct-worker-faulty,$(call objects,$(wildcard tests/bench/gpu_*.c)))
 
 # Faults of the disk, loaded into the programs by tests.
@@ -316,7 +316,11 @@ format: ## clang-format over everything
 sysconfdir ?= $(if $(filter /usr,$(prefix)),/etc,$(prefix)/etc)
 docdir      = $(prefix)/share/doc/cbctd
 configure   = sed 's,@prefix@,$(prefix),g;s,@sysconfdir@,$(sysconfdir),g;s,@docdir@,$(docdir),g'
-install: all ## programs, units, settings and documents under $(DESTDIR)$(prefix)
+# Man pages and completions are what the programs' --help says.
+$(BUILD)/manual: $(programs) packages/manual.py
+	$(call say,MAN )rm -rf $@ && $(PYTHON) packages/manual.py $(BUILD) $@
+
+install: all $(BUILD)/manual ## programs, units, settings, man pages and documents under $(DESTDIR)$(prefix)
 	install -D -m 755 -t $(DESTDIR)$(prefix)/bin $(programs)
 	install -d $(addprefix $(DESTDIR),$(prefix)/lib/systemd/system $(prefix)/lib/tmpfiles.d $(docdir))
 	install -d -m 750 $(DESTDIR)$(sysconfdir)/cbctd
@@ -326,8 +330,35 @@ install: all ## programs, units, settings and documents under $(DESTDIR)$(prefix
 	install -D -m 644 systemd/cbctd.sysusers $(DESTDIR)$(prefix)/lib/sysusers.d/cbctd.conf
 	install -m 644 -t $(DESTDIR)$(docdir) README.md docs/operation.md systemd/cbctd-alerts.yaml systemd/cbctd-dashboard.json
 	STATE_DIRECTORY=/var/lib/cbctd $(BUILD)/cbctd --print-config | sed 's/^[^#]/#&/' >$(DESTDIR)$(docdir)/cbctd.conf
+	install -D -m 644 -t $(DESTDIR)$(prefix)/share/man/man1 $(BUILD)/manual/man/cbct.1
+	install -D -m 644 -t $(DESTDIR)$(prefix)/share/man/man8 $(BUILD)/manual/man/cbctd.8 $(BUILD)/manual/man/cbct-worker.8
+	install -D -m 644 -t $(DESTDIR)$(prefix)/share/bash-completion/completions $(BUILD)/manual/completions/bash/cbct
+	ln -sf cbct $(DESTDIR)$(prefix)/share/bash-completion/completions/cbctd
+	install -D -m 644 -t $(DESTDIR)$(prefix)/share/zsh/site-functions $(BUILD)/manual/completions/zsh/_cbct
+	install -D -m 644 -t $(DESTDIR)$(prefix)/share/fish/vendor_completions.d $(BUILD)/manual/completions/fish/cbct.fish
 	[ -e $(DESTDIR)$(sysconfdir)/cbctd/cbctd.conf ] || \
 		install -m 640 $(DESTDIR)$(docdir)/cbctd.conf $(DESTDIR)$(sysconfdir)/cbctd/cbctd.conf
+
+# The package for every machine has the worker without CUDA; the one for cards has the other as cbct-worker-cuda.
+$(BUILD)/packaged/cbct-worker: $(call objects,daemon/worker.c) $(library)
+	@mkdir -p $(@D)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(LIBM)
+$(BUILD)/packaged/cbct-worker-cuda: $(call objects,daemon/worker.c) $(library) $(cuda_objects)
+	@mkdir -p $(@D)
+	$(call say,LINK)$(CC) $(LDFLAGS) -Wl,-rpath,'$$ORIGIN/../lib/cbctd' -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(cuda_paths) -lcufft -lcudart -lstdc++ $(LIBM)
+
+VERSION ?= $(shell sed -n 's/^.define CBCT_VERSION "\(.*\)"/\1/p' proto/version.h)
+deb: all $(BUILD)/manual $(BUILD)/packaged/cbct-worker $(if $(cuda_objects),$(BUILD)/packaged/cbct-worker-cuda) ## Debian packages in build/deb/, another one for NVIDIA cards where CUDA is built
+	@rm -rf $(BUILD)/packaged/root && $(MAKE) --no-print-directory -o all install DESTDIR=$(abspath $(BUILD)/packaged/root) prefix=/usr >$(BUILD)/packaged/log
+	@install -m 755 $(BUILD)/packaged/cbct-worker $(BUILD)/packaged/root/usr/bin/cbct-worker
+	@packages/deb.sh $(BUILD)/packaged/root $(VERSION) $(BUILD)/deb $(if $(cuda_objects),$(BUILD)/packaged/cbct-worker-cuda)
+
+# A mirror of the base image, or one made by debootstrap: make container CONTAINER_BASE=localhost/bookworm
+CONTAINER_BASE ?= docker.io/library/debian:bookworm-slim
+container: deb ## an OCI image of the package, with buildah, podman or docker
+	@for tool in "buildah build" "podman build" "docker build"; do command -v $${tool%% *} >/dev/null && break; tool=; done; \
+	[ -n "$$tool" ] || { echo "make container needs buildah, podman or docker: apt-get install buildah" >&2; exit 1; }; \
+	$$tool -q -f packages/Containerfile --build-arg BASE=$(CONTAINER_BASE) -t cbctd:$(VERSION) $(BUILD)/deb
 
 # A tarball's programs look for libraries beside them (RPATH, which the libraries inherit); glibc is the system's.
 bundle: prefix = /opt/cbctd
@@ -348,6 +379,6 @@ clean: ## removes build/
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z_.-]+:.*## /{printf "  make %-21s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-.PHONY: all test-programs again setup demo check soak fuzz fuzzers bench bench-calibrate bench-denoise bench-presets check-gpu bench-gpu asan tsan lint format rooms third-party compile_commands.json install clean help
+.PHONY: all test-programs again setup demo check soak fuzz fuzzers bench bench-calibrate bench-denoise bench-presets check-gpu bench-gpu asan tsan lint format rooms third-party compile_commands.json install deb container clean help
 .SECONDARY:
--include $(shell find $(BUILD) -type f -name '*.d' 2>/dev/null)
+-include $(shell find $(BUILD) -path $(BUILD)/test -prune -o -type f -name '*.d' -print 2>/dev/null)

@@ -15,6 +15,7 @@ extern char **environ;
 
 void worker_path(char *ret_path, size_t size)
 {
+	static const char *const names[] = {"cbct-worker-cuda", "cbct-worker"};
 	char self[1024];
 	ssize_t length = readlink("/proc/self/exe", self, sizeof(self) - 1);
 	char *slash;
@@ -24,9 +25,11 @@ void worker_path(char *ret_path, size_t size)
 		slash = strrchr(self, '/');
 		if (slash != NULL) {
 			*slash = '\0';
-			snprintf(ret_path, size, "%s/cbct-worker", self);
-			if (access(ret_path, X_OK) == 0)
-				return;
+			for (int i = 0; i < 2; i++) {
+				snprintf(ret_path, size, "%s/%s", self, names[i]);
+				if (access(ret_path, X_OK) == 0)
+					return;
+			}
 		}
 	}
 	snprintf(ret_path, size, "cbct-worker");

@@ -12,7 +12,10 @@ struct process {
 	int pidfd; /* readable once it has ended */
 };
 
-/* Where cbct-worker is when nobody says: beside this program, else by PATH. */
+/*
+ * Where the worker is when nobody says: beside this program as cbct-worker-cuda (which a package of its own brings) or
+ * cbct-worker, else by PATH.
+ */
 void worker_path(char *ret_path, size_t size);
 
 /*
