@@ -30,6 +30,7 @@ enum lock_rank {
 	LOCK_CHECKS,     /* store.check_lock */
 	LOCK_CARDS,      /* cards.lock */
 	LOCK_FEEDER,     /* feeder.lock */
+	LOCK_KEEPER,     /* keeper.lock */
 	LOCK_WATCHERS,   /* watch_list.lock */
 	LOCK_TLS,        /* tls.lock */
 	LOCK_AUDIT,      /* audit.lock */

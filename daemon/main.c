@@ -203,12 +203,15 @@ static int start_parts(const struct config *config, struct api *api, struct erro
 	if (code == 0)
 		code = cards_start(&api->cards, err);
 	if (code == 0)
+		code = keeper_start(api, config->keep, &api->keeper, err);
+	if (code == 0)
 		code = http_start(api->http, err);
 	return code;
 }
 
 static void stop_parts(struct api *api)
 {
+	keeper_stop(api->keeper);
 	http_free(api->http);
 	cards_stop(api->cards);
 	uploads_free(api->uploads);

@@ -711,6 +711,10 @@ class Client:
         """The workers and what they run on."""
         return list(self._json("GET", "/v1/devices")["devices"])
 
+    def pin(self, what: str, pinned: bool = True) -> None:
+        """Keeps ``scans/ID`` or ``jobs/ID`` whatever its age (``--keep`` of the daemon), or no more."""
+        self._request("PUT" if pinned else "DELETE", f"/v1/{what}/pin")
+
     def limits(self) -> Document:
         """How many jobs, scans and bytes this client and all together have, and may have."""
         return self._json("GET", "/v1/limits")

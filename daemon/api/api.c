@@ -37,6 +37,8 @@ const struct route api_routes[] = {
     {"POST", "/v1/scans", ROLE_ACQUIRE, scan_post, BODY_WHOLE, JSON_BYTES_MAX, NULL, NULL, NULL},
     {"GET", "/v1/scans/{}", ROLE_VIEW, scan_get, BODY_NONE, 0, NULL, NULL, NULL},
     {"DELETE", "/v1/scans/{}", ROLE_ACQUIRE, scan_delete, BODY_NONE, 0, NULL, NULL, NULL},
+    {"PUT", "/v1/scans/{}/pin", ROLE_ACQUIRE, scan_pin_put, BODY_NONE, 0, NULL, NULL, NULL},
+    {"DELETE", "/v1/scans/{}/pin", ROLE_ACQUIRE, scan_pin_delete, BODY_NONE, 0, NULL, NULL, NULL},
     {"POST", "/v1/scans/{}/complete", ROLE_ACQUIRE, scan_complete, BODY_NONE, 0, NULL, NULL, NULL},
     IMAGES(IMAGE_ROUTE) // one for each
     {"PUT", "/v1/scans/{}/projections", ROLE_ACQUIRE, projections_put, BODY_STREAM, 0, projections_begin, upload_take,
@@ -55,6 +57,8 @@ const struct route api_routes[] = {
     {"POST", "/v1/jobs", ROLE_ACQUIRE, job_post, BODY_WHOLE, JSON_BYTES_MAX, NULL, NULL, NULL},
     {"GET", "/v1/jobs/{}", ROLE_VIEW, job_get, BODY_NONE, 0, NULL, NULL, "wait"},
     {"DELETE", "/v1/jobs/{}", ROLE_ACQUIRE, job_delete, BODY_NONE, 0, NULL, NULL, "wait"},
+    {"PUT", "/v1/jobs/{}/pin", ROLE_ACQUIRE, job_pin_put, BODY_NONE, 0, NULL, NULL, NULL},
+    {"DELETE", "/v1/jobs/{}/pin", ROLE_ACQUIRE, job_pin_delete, BODY_NONE, 0, NULL, NULL, NULL},
     {"GET", "/v1/jobs/{}/events", ROLE_VIEW, job_events, BODY_NONE, 0, NULL, NULL, "after"},
     {"GET", "/v1/events", ROLE_VIEW, all_events, BODY_NONE, 0, NULL, NULL, "after"},
     {"GET", "/v1/jobs/{}/annotations", ROLE_VIEW, annotations_get, BODY_NONE, 0, NULL, NULL, NULL},

@@ -15,9 +15,14 @@ struct api {
 	struct calibrations *calibrations;
 	struct cards *cards;
 	struct http *http;
-	double max_wait; /* s */
-	double started;  /* clock_monotonic */
+	struct keeper *keeper; /* NULL: everything is kept */
+	double max_wait;       /* s */
+	double started;        /* clock_monotonic */
 };
+
+/* Removes what is older than `seconds` (0: nothing), from now on; after all others were started. */
+int keeper_start(struct api *api, double seconds, struct keeper **ret_keeper, struct error *err);
+void keeper_stop(struct keeper *keeper); /* NULL is fine; before any other is stopped */
 
 /* Every endpoint; their context is a struct api. Ends with method == NULL. */
 extern const struct route api_routes[];

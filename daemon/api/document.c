@@ -132,6 +132,7 @@ cJSON *scan_document(struct stored_scan *stored, bool brief)
 	cJSON_AddStringToObject(document, "href", href);
 	cJSON_AddStringToObject(document, "state", facts.complete ? "complete" : "receiving");
 	add_text_or_null(document, "client", facts.client);
+	cJSON_AddBoolToObject(document, "pinned", facts.pinned);
 	json_add_time(document, "created", facts.created);
 	cJSON_AddNumberToObject(document, "received_count", facts.received);
 	for (int i = 0; i < IMAGE_COUNT; i++)
@@ -275,6 +276,7 @@ static void add_job_facts(cJSON *document, struct job *job, const struct job_rec
 	cJSON_AddNumberToObject(document, "attempts", record->attempts);
 	cJSON_AddBoolToObject(document, "cancel_requested", record->cancel_asked);
 	add_text_or_null(document, "client", record->client);
+	cJSON_AddBoolToObject(document, "pinned", record->pinned);
 	json_add_time(document, "created", record->created);
 	json_add_time(document, "queued", record->queued);
 	json_add_time(document, "started", record->started);

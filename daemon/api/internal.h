@@ -65,6 +65,10 @@ int metrics_get(void *context, struct request *request, struct error *err);
 int device_list(void *context, struct request *request, struct error *err);
 int device_clear_post(void *context, struct request *request, struct error *err);
 int limits_get(void *context, struct request *request, struct error *err);
+int job_pin_put(void *context, struct request *request, struct error *err);
+int job_pin_delete(void *context, struct request *request, struct error *err);
+int scan_pin_put(void *context, struct request *request, struct error *err);
+int scan_pin_delete(void *context, struct request *request, struct error *err);
 int quarantine_get(void *context, struct request *request, struct error *err);
 int schema_get(void *context, struct request *request, struct error *err);
 
@@ -120,6 +124,9 @@ void *wait_subject(struct request *request);
 bool wait_goes_on(struct request *request);
 /* The same for a job, whose reference it takes, also on failure: api/job.c. */
 int job_wait_begin(struct request *request, struct job *job, double seconds, struct error *err);
+
+/* A removed job's files are forgotten: a descriptor or mapping that is still open would keep their space. */
+void job_forget_files(struct api *api, struct job *job);
 
 /* As store_volume_verify; damage is a warning of the job, too. */
 int volume_verify(struct api *api, const char *job, const struct volume_record *volume, uint64_t first, uint64_t bytes,

@@ -163,8 +163,7 @@ int job_get(void *context, struct request *request, struct error *err)
 	return wait_end(request, 200, err);
 }
 
-/* The job's files are gone; a descriptor or mapping that is still open would keep their space. */
-static void forget_files(struct api *api, struct job *job)
+void job_forget_files(struct api *api, struct job *job)
 {
 	char directory[1024];
 	struct job_facts facts;
@@ -193,7 +192,7 @@ int job_delete(void *context, struct request *request, struct error *err)
 		code = jobs_delete(api->jobs, job, &removed, err);
 	if (code != 0 || removed) {
 		if (removed)
-			forget_files(api, job);
+			job_forget_files(api, job);
 		job_release(job);
 		return removed ? request_reply_empty(request, 204, err) : code;
 	}

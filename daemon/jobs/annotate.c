@@ -1,4 +1,4 @@
-/* Annotations of a job: job.h. */
+/* What people keep with a job, its annotations, and that it is pinned: job.h. */
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -78,5 +78,32 @@ int job_annotate(struct job *job, const char *text, size_t length, bool (*fits)(
 	if (code == 0 && fit)
 		job_wake(job);
 	*ret_fits = fit;
+	return code;
+}
+
+int job_pin(struct job *job, bool pinned, struct error *err)
+{
+	struct jobs *jobs = job->jobs;
+	struct job_record record;
+	bool removed;
+	int code = 0;
+
+	pthread_mutex_lock(&jobs->change);
+	pthread_mutex_lock(&jobs->lock);
+	record = job->record;
+	removed = job->removed;
+	pthread_mutex_unlock(&jobs->lock);
+	if (removed)
+		code = error_set(err, ERR_NOT_FOUND, "there is no job \"%s\" any more", job->id);
+	else if (record.pinned != pinned) {
+		record.pinned = pinned;
+		code = store_job_update(jobs->store, &record, NULL, NULL, PAST_STAYS, err);
+	}
+	if (code == 0) {
+		pthread_mutex_lock(&jobs->lock);
+		job->record.pinned = pinned;
+		pthread_mutex_unlock(&jobs->lock);
+	}
+	pthread_mutex_unlock(&jobs->change);
 	return code;
 }

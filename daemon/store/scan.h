@@ -48,9 +48,10 @@ struct stored_scan {
 	bool image_lost[IMAGE_COUNT]; /* as of projections */
 	bool document_damaged;        /* scan.json */
 	bool suspect;                 /* all of its files are to be checked before it is used (store/sums.c) */
-	bool deleted;                 /* written in a group of the catalogue too, as the next */
-	bool closing;                 /* takes no new projections */
-	bool closed;                  /* and that is on the disk */
+	bool pinned;
+	bool deleted; /* written in a group of the catalogue too, as the next */
+	bool closing; /* takes no new projections */
+	bool closed;  /* and that is on the disk */
 
 	struct watch_list watchers;
 };

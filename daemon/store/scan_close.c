@@ -1,8 +1,9 @@
-/* Scans that are completed with the projections that are there: store.h. */
+/* Scans that are completed with the projections that are there, and scans that are pinned: store.h. */
 #include <errno.h>
 #include <stdlib.h>
 
 #include "daemon/log.h"
+#include "daemon/store/record.h"
 #include "daemon/store/scan.h"
 
 int stored_scan_set_closed(const struct stored_scan *scan, struct error *err)
@@ -120,6 +121,32 @@ int store_scan_close(struct store *store, struct stored_scan *scan, struct error
 	if (code == 0) {
 		watch_wake(&scan->watchers);
 		watch_wake(&store->arrivals);
+	}
+	return code;
+}
+
+int store_scan_pin(struct store *store, struct stored_scan *scan, bool pinned, struct error *err)
+{
+	const struct catalogue_scan row = {.pinned = pinned};
+	bool deleted;
+	int code = store_begin(store, err);
+
+	if (code != 0)
+		return code;
+	pthread_mutex_lock(&scan->lock);
+	deleted = scan->deleted;
+	pthread_mutex_unlock(&scan->lock);
+	if (deleted)
+		return store_end(store, error_set(err, ERR_NOT_FOUND, "there is no scan \"%s\" any more", scan->id),
+				 err);
+	code = catalogue_set(store->catalogue, scan->id, &row, &row.pinned, err);
+	if (code == 0)
+		code = record_write(store, RECORD_SCAN, scan->id, true, err);
+	code = store_end(store, code, err);
+	if (code == 0) {
+		pthread_mutex_lock(&scan->lock);
+		scan->pinned = pinned;
+		pthread_mutex_unlock(&scan->lock);
 	}
 	return code;
 }

@@ -95,6 +95,7 @@ void stored_scan_facts(struct stored_scan *scan, struct scan_facts *ret)
 	pthread_mutex_lock(&scan->lock);
 	ret->received = scan->received;
 	ret->closed = scan->closed;
+	ret->pinned = scan->pinned;
 	ret->complete = stored_scan_complete(scan);
 	ret->convertible = is_convertible(scan);
 	ret->checked = !scan->suspect;

@@ -40,6 +40,7 @@ static int load_scan(struct store *store, const struct catalogue_scan *row, stru
 		memcpy(scan->image_sha256[i], row->images[i].sha256, sizeof(scan->image_sha256[i]));
 	}
 	scan->closed = scan->closing = row->closed;
+	scan->pinned = row->pinned;
 	store_scan_directory(store, scan->id, directory);
 	scan->gone = access(directory, F_OK) != 0 && errno == ENOENT;
 	id_floor(scan->id);

@@ -189,6 +189,7 @@ struct scan_facts {
 	bool closed;                  /* by store_scan_close, with projections missing */
 	bool complete, convertible, ready;
 	double arrived; /* when the last projection came, seconds of CLOCK_MONOTONIC; 0: none since the start */
+	bool pinned;    /* it stays whatever its age */
 	unsigned basis; /* another number: an image came or it was closed, what was made of its projections is void */
 	bool deleted;
 	bool damaged; /* its files were not there at the start */
@@ -250,6 +251,9 @@ void store_unwatch_arrivals(struct store *store, struct watch *watch);
  */
 enum { VIEWS_LEAST = 2 }; /* an arc has two ends */
 int store_scan_close(struct store *store, struct stored_scan *scan, struct error *err);
+
+/* A pinned scan stays whatever its age. ERR_NOT_FOUND: it was deleted. */
+int store_scan_pin(struct store *store, struct stored_scan *scan, bool pinned, struct error *err);
 
 /* ---- projections on their way in ---- */
 /*
@@ -329,6 +333,7 @@ struct job_record {
 	char *subject;                  /* subject_json of its scan as text, or NULL, owned; constant after creation */
 	uint8_t digest[32];
 	bool cancel_asked;
+	bool pinned;  /* it stays whatever its age */
 	int attempts; /* 1 with the first run, one more each time that a run was lost; going on after a yield is none */
 	int crashes;  /* workers that died with it */
 	int checkpoint; /* iteration that checkpoint.f32 holds, 0: none */

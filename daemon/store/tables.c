@@ -29,6 +29,7 @@ static const struct column scan_columns[] = {
 	 .nullable = true,                                                                                             \
 	 .assigned = true},
     IMAGES(IMAGE_COLUMN) // SHA-256 of each image
+    {"pinned", COLUMN_BOOL, AT(catalogue_scan, pinned), .initial = "0", .assigned = true},
     {"closed", COLUMN_BOOL, AT(catalogue_scan, closed), .initial = "0", .assigned = true},
     {"stamp", COLUMN_LONG, AT(catalogue_scan, stamp), .initial = "0", .assigned = true},
 };
@@ -61,6 +62,7 @@ static const struct column job_columns[] = {
     {"idempotency_key", COLUMN_STRING, AT(job_record, key), .nullable = true, .unique = true},
     {"request_sha256", COLUMN_BYTES, AT(job_record, digest), .nullable = true},
     {"cancel_asked", COLUMN_BOOL, AT(job_record, cancel_asked), .changes = true},
+    {"pinned", COLUMN_BOOL, AT(job_record, pinned), .initial = "0", .changes = true},
     {"attempts", COLUMN_INT, AT(job_record, attempts), .changes = true},
     {"crashes", COLUMN_INT, AT(job_record, crashes), .changes = true},
     {"checkpoint", COLUMN_INT, AT(job_record, checkpoint), .changes = true},

@@ -152,4 +152,63 @@ test_equal_jobs_take_turns_by_clients() {
 	expect_json '[.jobs[] | select(.client == "a" and .state == "queued")] | length >= 2'
 }
 
+gone() { # PATH
+	local end=$((SECONDS + 60))
+	until ask GET "$1" && [ "$status" = 404 ]; do
+		[ $SECONDS -lt $end ] || fail "$1 removed"
+		sleep 0.2
+	done
+}
+
+test_what_is_old_goes_unless_it_is_pinned() {
+	local old pinned complete open announced
+	limited --keep 4
+	new_scan 201 && complete=$scan
+	fill 201
+	new_job 202 "{\"scan\": \"SCAN\", $grid, \"fdk\": {}}" && old=$job
+	new_job 202 "{\"scan\": \"SCAN\", $grid, \"fdk\": {}}" && pinned=$job
+	for _ in 1 2; do
+		ask PUT "/v1/jobs/$pinned/pin"
+		expect_status 204
+	done
+	new_scan 201 && announced=$scan
+	new_scan 201 && open=$scan
+	expect_json '.pinned == false'
+	ask PUT "/v1/scans/$open/pin"
+	expect_status 204
+	ask GET "/v1/scans/$open"
+	expect_json '.pinned'
+	gone "/v1/jobs/$old"
+	[ ! -e "$state/jobs/$old" ] || fail "no files of a job that was removed"
+	gone "/v1/scans/$announced"
+	ask GET "/v1/jobs/$pinned"
+	expect_json '.state == "succeeded" and .pinned'
+	for scan in "$complete" "$open"; do
+		ask GET "/v1/scans/$scan"
+		expect_status 200
+	done
+	# Pins outlive a restart, and a catalogue that is made again.
+	stop_daemon
+	rm "$state"/catalogue.sqlite*
+	start_daemon --tokens "$work/tokens"
+	ask GET "/v1/scans/$open"
+	expect_json '.pinned and .client == "a"'
+	ask GET "/v1/jobs/$pinned"
+	expect_json '.pinned and .client == "a"'
+	stop_daemon
+	start_daemon --tokens "$work/tokens" --keep 1
+	ask DELETE "/v1/scans/$open/pin"
+	expect_status 204
+	ask DELETE "/v1/jobs/$pinned/pin"
+	expect_status 204
+	gone "/v1/scans/$open"
+	gone "/v1/jobs/$pinned"
+	ask GET "/v1/scans/$complete"
+	expect_status 200
+	ask PUT "/v1/jobs/$pinned/pin"
+	expect_problem 404
+	ask PUT "/v1/scans/$open/pin"
+	expect_problem 404
+}
+
 stop_after_each=1 run_tests
