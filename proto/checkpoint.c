@@ -476,7 +476,7 @@ static int iteration_of(const char *path)
 	return iteration;
 }
 
-int checkpoint_resume(struct recon *recon, const char *path, const struct checkpoint_wish *wish,
+int checkpoint_resume(struct recon *recon, const char *path, const struct checkpoint_target *target,
 		      struct history *history, struct error *ret_damage, struct error *err)
 {
 	const char *slash = strrchr(path, '/'), *first = path, *second;
@@ -489,12 +489,12 @@ int checkpoint_resume(struct recon *recon, const char *path, const struct checkp
 	if (snprintf(before, sizeof(before), "%.*s%s", directory, path, CHECKPOINT_FILE_BEFORE) >= (int)sizeof(before))
 		return error_set(err, ERR_INVALID, "a path of %zu bytes is too long", strlen(path));
 	second = before;
-	if (iteration_of(path) != wish->iteration && iteration_of(before) == wish->iteration) {
+	if (iteration_of(path) != target->iteration && iteration_of(before) == target->iteration) {
 		first = before;
 		second = path;
 	}
-	code = resume_from(recon, first, wish->latest, history, err);
-	if (code != ERR_INVALID || resume_from(recon, second, wish->latest, history, &other) != 0)
+	code = resume_from(recon, first, target->latest, history, err);
+	if (code != ERR_INVALID || resume_from(recon, second, target->latest, history, &other) != 0)
 		return code;
 	*ret_damage = *err;
 	return 0;

@@ -26,19 +26,19 @@ int history_add(struct history *history, const struct history_row *row, struct e
 
 /* Writes the checkpoint durably, as the only one. For a run that stops here. */
 int checkpoint_save(struct recon *recon, const struct history *history, const char *directory, struct error *err);
-/* Removes those of the directory. For a run that begins: they are of another one, and must not serve for it. */
+/* Removes the checkpoints of the directory. For a run that begins: they are of another one, and must not serve it. */
 void checkpoint_remove(const char *directory);
 
 /* The iteration that the checkpoint expected by the caller is of, and the latest that may serve where it is damaged. */
-struct checkpoint_wish {
+struct checkpoint_target {
 	int iteration, latest;
 };
 /*
  * Gives an opened recon the checkpoint at `path`, or the one before it in the same directory: whichever is of the
- * iteration that is wished for, else the newest. Where that is missing or damaged the other one serves; *ret_damage
+ * target iteration, else the newest. Where that is missing or damaged the other one serves; *ret_damage
  * then says why, its code is 0 otherwise. The history is replaced by that of the checkpoint. Without any: ERR_INVALID.
  */
-int checkpoint_resume(struct recon *recon, const char *path, const struct checkpoint_wish *wish,
+int checkpoint_resume(struct recon *recon, const char *path, const struct checkpoint_target *target,
 		      struct history *history, struct error *ret_damage, struct error *err);
 
 /*

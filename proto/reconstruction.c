@@ -413,12 +413,12 @@ static int resume(struct reconstruction *reconstruction, struct error *err)
 {
 	struct run *run = &reconstruction->run;
 	const int known = reconstruction->iteration;
-	const struct checkpoint_wish wish = {.iteration = known,
-					     .latest = latest_checkpoint(reconstruction->options->recipe, known)};
+	const struct checkpoint_target target = {.iteration = known,
+						 .latest = latest_checkpoint(reconstruction->options->recipe, known)};
 	struct error damage;
 	char detail[512];
 	int code =
-	    checkpoint_resume(run->recon, reconstruction->options->checkpoint, &wish, &run->history, &damage, err);
+	    checkpoint_resume(run->recon, reconstruction->options->checkpoint, &target, &run->history, &damage, err);
 
 	if (code != 0)
 		return code;
