@@ -260,7 +260,7 @@ static int key_line(struct header_text *h, const char *prefix, const cJSON *valu
 	return 0;
 }
 
-/* All of the provenance as keys: cbct_job, cbct_recipe_fdk ... */
+/* Writes the whole provenance as keys: cbct_job, cbct_recipe_fdk ... */
 static int keys(struct header_text *h, const struct provenance *provenance, const char *unit, bool nrrd,
 		struct error *err)
 {

@@ -73,7 +73,7 @@ enum { UTF8_BYTES_MOST = 4 }; /* of a character */
 #define TEXT_BYTES(most) (UTF8_BYTES_MOST * (most) + 1)
 /* Characters of Unicode, as JSON Schema counts them, in valid UTF-8. */
 size_t utf8_length(const char *text);
-/* One of `names` (`count` entries); gives its index. */
+/* Reads one of `names` (`count` entries) as its index. */
 void json_choice(struct json_reader *reader, const char *name, bool required, const char *const *names, int count,
 		 int *ret);
 /* Exactly `count` numbers. */

@@ -62,7 +62,7 @@ int scan_reduce(struct scan *scan, const unsigned char *present, struct error *e
 
 size_t sample_bytes(enum sample sample);
 size_t scan_projection_bytes(const struct scan *scan); /* columns * rows * sample */
-/* All of it but the images; borrows from the scan. */
+/* The scan's struct linearise, all of it but the images; it borrows from the scan. */
 struct linearise scan_linearise(const struct scan *scan);
 
 /* Every scalar parameter of the document as parameter_json has it (proto/parameter.h). NULL for no memory. */

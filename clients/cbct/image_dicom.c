@@ -158,7 +158,7 @@ static void read_number(struct reader *reader, enum number number)
 		fail(reader, ERR_INVALID, "a number is expected");
 }
 
-/* One of the positions that a table has; a patient in a chair is none of them. */
+/* Reads the patient's position on a table; a patient in a chair has none. */
 static void read_patient_position(struct dicom *dicom, const char *text)
 {
 	for (int i = 0; i < PATIENT_POSITION_COUNT; i++)
@@ -476,7 +476,7 @@ static bool dicom_recognise(const unsigned char *head, size_t length)
 	return length >= 132 && memcmp(head + 128, "DICM", 4) == 0;
 }
 
-/* All of them: dcmdump writes a file for each piece that it finds. */
+/* Every file is removed: dcmdump writes one for each piece that it finds. */
 static void remove_files(struct dicom *dicom)
 {
 	DIR *directory = dicom->directory[0] != '\0' ? opendir(dicom->directory) : NULL;

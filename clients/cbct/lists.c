@@ -150,7 +150,7 @@ static int rm_run(const void *values, struct error *err)
 	return code;
 }
 
-/* So that who ends a scan too early sees it. */
+/* The line shows a scan that was ended too early. */
 static void print_completed(const cJSON *scan)
 {
 	const cJSON *projections = cJSON_GetObjectItemCaseSensitive(scan, "projections");

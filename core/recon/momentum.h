@@ -28,7 +28,7 @@ int momentum_extrapolate(const struct problem *problem, struct momentum *momentu
 /* Begins anew where the residual has risen. */
 void momentum_heed(struct momentum *momentum, const struct iteration_sums *sums);
 
-/* Its part of a checkpoint, see struct algorithm. */
+/* The momentum's part of a checkpoint, see struct algorithm. */
 size_t momentum_bytes(const struct problem *problem);
 int momentum_save(const struct problem *problem, const struct momentum *momentum, const struct checkpoint_sink *sink,
 		  struct error *err);

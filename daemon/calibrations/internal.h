@@ -49,7 +49,7 @@ int calibration_read(struct calibrations *calibrations, const char *id, cJSON **
 int calibration_load(struct calibrations *calibrations, const char *id, struct entry *ret_entry, struct error *err);
 
 /* ---- document.c ---- */
-/* All of the brief document but state and age. result may be NULL. NULL: no memory. */
+/* Makes the brief document but for state and age. result may be NULL. NULL: no memory. */
 cJSON *calibration_brief(const char *id, const cJSON *request, const cJSON *result, const struct error *failure);
 /* Members that are left out of brief documents. */
 void calibration_add_rest(cJSON *document, const cJSON *request, const cJSON *result);

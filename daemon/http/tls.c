@@ -280,7 +280,7 @@ int tls_certificate(gnutls_session_t session, const struct gnutls_cert_retr_st *
 	return 0;
 }
 
-/* One of the authorities vouches for the chain, whose first certificate is that of a client. */
+/* True if an authority vouches for the chain, whose first certificate is that of a client. */
 static bool is_trusted(struct tls *tls, gnutls_x509_crt_t *chain, unsigned length)
 {
 	gnutls_typed_vdata_st purpose = {.type = GNUTLS_DT_KEY_PURPOSE_OID,

@@ -457,7 +457,7 @@ static int convert(const struct catalogue_site *site, struct error *err)
 		return code;
 	if (rename(copy, path) != 0)
 		return error_set_errno(err, errno, "rename %s", copy);
-	/* All of it is in the copy; it must not be applied to that. */
+	/* The copy has all of the log, which must not be applied to it again. */
 	catalogue_path(site, "-wal", path);
 	unlink(path);
 	log_line(LEVEL_INFO, "the catalogue has checksums now");

@@ -403,7 +403,7 @@ void store_job_remove_checkpoint(const struct store *store, const char *id);
 void store_job_remove_volumes(const struct store *store, const char *id);
 /* The checkpoint, and what a worker that died left half-written or prepared: an ended job has no use for it. */
 void store_job_tidy(const struct store *store, const char *id);
-/* All of them or none, each with its event. */
+/* Adds all of the rows or none, each with its event. */
 int store_job_add_rows(struct store *store, const char *id, const struct history_row *rows, const struct event *events,
 		       int count, struct error *err);
 /*

@@ -85,7 +85,7 @@ static ssize_t source_read(struct source *source, void *to, size_t size)
 	return got;
 }
 
-/* All of it. */
+/* Copies the whole source into the sink. */
 static int pour(struct encoded *encoded, struct source *source, struct sink *sink, struct error *err)
 {
 	ssize_t got = 1;
