@@ -89,6 +89,10 @@ const struct warning_kind warning_kinds[] = {
     /* ---- of the reconstruction ---- */
     {"truncated", SEVERITY_CAUTION,
      "The patient is wider than the detector: gray values are estimates, most of all near the rim of the image."},
+    {"faint_from_zero", SEVERITY_SERIOUS,
+     "The patient is wider than the detector, and the reconstruction began with an empty image: it is too faint, most "
+     "of "
+     "all towards its rim."},
     {"outside_grid", SEVERITY_INFO, "The patient goes on outside of the image, and the image allows for it."},
     {"averaged_pixels", SEVERITY_INFO,
      "The image's voxels are coarser than what the projections show, which was smoothed to fit them; smaller voxels "

@@ -82,6 +82,43 @@ static void warn_of_outside(const struct correction_job *job, size_t rows)
 		    100 * (double)rows / all, truncated_row_name(job));
 }
 
+/* The distance of the grid's farthest side from the axis, mm. */
+static double reach_of(const struct grid *grid, const struct orbit *orbit)
+{
+	double farthest = 0;
+
+	for (int side = 0; side < 4; side++) {
+		const int axis = side / 2;
+		double place[3];
+
+		for (int a = 0; a < 3; a++)
+			place[a] = grid->origin[a] + grid->spacing[a] * (grid->size[a] - 1) / 2;
+		place[axis] += (side % 2 ? 0.5 : -0.5) * grid->spacing[axis] * grid->size[axis];
+		farthest = fmax(farthest, hypot(vec_dot(orbit->frame[0], place), vec_dot(orbit->frame[1], place)));
+	}
+	return farthest;
+}
+
+/*
+ * Where the object goes on beside the field of view and the grid does, too, iterations from zero spread the object over
+ * all of the grid that a ray meets. Those that begin with FDK have it in its place from the first one on
+ * (tests/bench/results/truncation.txt).
+ */
+static void warn_of_zero(const struct correction_job *job)
+{
+	const double beyond = 1.04, radius = job->orbit->field_of_view / 2;
+	const double reach = reach_of(&job->recipe->grid, job->orbit);
+
+	if (reach > beyond * radius)
+		warning_tell(
+		    job->warnings, "faint_from_zero",
+		    "the object reaches beyond the detector, and the grid (%.4g mm from the axis) beyond the "
+		    "field of view (%.4g mm): iterations from zero put a part of the object there, and HU "
+		    "within are wrong by some tens to hundreds. Begin with the FDK volume (\"fdk\": {}), or end "
+		    "the grid with the field of view",
+		    reach, radius);
+}
+
 /*
  * The exterior is found from the projections alone, so that a run that goes on from an iterate gives the same bits.
  * `work` holds the iterate before the iteration, which the first iteration writes anyway.
@@ -133,8 +170,9 @@ static int apply(const struct correction_job *job, void *state, enum correction_
 	code = exterior_volume_make(&exterior, &options, err);
 	if (code == 0)
 		code = subtract(job, &options, &seen, &exterior, &rows, err);
-	if (code == 0 && !fdk && sound && job->recipe->fdk.extend)
-		truncated_warn(job, exterior.truncated, job->geometry->columns);
+	if (code == 0 && !fdk && sound && job->recipe->fdk.extend &&
+	    truncated_warn(job, exterior.truncated, job->geometry->columns))
+		warn_of_zero(job);
 	if (code == 0 && options.truncated)
 		*job->settled = fmin(*job->settled, EXTERIOR_SETTLED);
 	if (code == 0)

@@ -15,7 +15,7 @@ const char *truncated_row_name(const struct correction_job *job)
 	return row_of(job->input->turned);
 }
 
-void truncated_warn(const struct correction_job *job, const size_t rows[2], int extend)
+bool truncated_warn(const struct correction_job *job, const size_t rows[2], int extend)
 {
 	/* Share of rows below which noise may have done it: by chance it does 1.7 % with 100 photons in air. */
 	const double few = 0.02;
@@ -35,7 +35,7 @@ void truncated_warn(const struct correction_job *job, const size_t rows[2], int 
 	const double share = fmin(1, fmax(first, last) / all);
 
 	if (first < few * all && last < few * all)
-		return;
+		return false;
 	warning_tell(
 	    job->warnings, "truncated",
 	    "the object reaches beyond the detector: %.3g %% of the %ss are cut off at the first %s and %.3g %% "
@@ -43,6 +43,7 @@ void truncated_warn(const struct correction_job *job, const size_t rows[2], int 
 	    "%.0f HU within %.0f mm of its axis, and from there outwards by more, up to %.0f HU at its rim, at %.0f mm",
 	    100 * first / all, row, column, 100 * last / all, extend, column, fmax(5, share * inner),
 	    inner_share * radius, fmax(10, share * rim), radius);
+	return true;
 }
 
 static bool wanted(const struct recipe *recipe, const struct linearise *linearise)

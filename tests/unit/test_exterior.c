@@ -562,6 +562,46 @@ START_TEST(iterations_of_a_body_wider_than_the_detector_are_as_true_as_fdk)
 }
 END_TEST
 
+/*
+ * From zero, on a grid that goes on beyond the field of view, a part of a body that goes on there, too, is put there:
+ * 100 to 300 HU. It is told then, and not where the grid ends with the field, the run begins with FDK, or the body ends
+ * in the field.
+ */
+START_TEST(a_body_that_is_spread_beyond_the_field_of_view_is_told)
+{
+	static const struct orbit_spec spec = {48, 16, 48, {620, 1100, {6, 6}, {0, 0}, {0, 0}}, 0, 7.5};
+	static const struct {
+		double radius; /* mm, of the body; the field of view's is 80 */
+		int across;    /* voxels of 4 mm */
+		bool fdk, told;
+	} tries[] = {{110, 64, false, true}, {110, 44, false, true}, {110, 40, false, false},
+		     {110, 64, true, false}, {60, 64, false, false}, {110, 24, false, false}};
+	struct ellipsoid body = {
+	    SHAPE_CYLINDER, {tries[_i].radius, tries[_i].radius * .9, 300}, {0, 0, 0}, 0, MU_WATER};
+	const struct phantom phantom = {1, &body};
+	const struct grid grid = grid_of(tries[_i].across, tries[_i].across, 8, 4, 4, 4);
+	struct recipe recipe = sart_on(&grid);
+	float *truth = malloc(sizeof(float) * grid_voxels(&grid));
+	struct outcome outcome = {.threads = 1};
+	struct scene scene;
+	double error;
+
+	recipe.fdk.on = tries[_i].fdk;
+	recipe.iterate.iterations = tries[_i].fdk ? 2 : 10;
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	phantom_voxelise(&phantom, &grid, 3, truth);
+	run(&scene, &recipe, &outcome);
+	error = error_in_view(&grid, 70, outcome.last, truth);
+	ck_assert_msg((strstr(outcome.warnings, "faint_from_zero: ") != NULL) == tries[_i].told, "%d: %s", _i,
+		      outcome.warnings);
+	ck_assert_msg(error < 60 || tries[_i].told, "%d: %.1f HU, and not a word", _i, error);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(truth);
+}
+END_TEST
+
 /* Any number of threads, a run that has yielded, and just the memory that the job says: the same bits. */
 START_TEST(the_same_bits_with_other_threads_after_a_yield_and_in_just_the_memory_that_was_said)
 {
@@ -752,6 +792,7 @@ Suite *exterior_suite(void)
 			    0, 3);
 	suite_add_tcase(suite, tests);
 	tcase_add_loop_test(truncated, iterations_of_a_body_wider_than_the_detector_are_as_true_as_fdk, 0, COUNT(wide));
+	tcase_add_loop_test(truncated, a_body_that_is_spread_beyond_the_field_of_view_is_told, 0, 6);
 	suite_add_tcase(suite, truncated);
 	tcase_add_loop_test(last, the_end_slices_are_no_worse_than_those_of_fdk_where_a_body_ends, 0, COUNT(ended));
 	tcase_add_loop_test(last, the_end_slices_are_the_same_bits_with_other_threads_and_after_a_yield, 0, 2);
