@@ -1,6 +1,9 @@
 /* Some of a scan's projections on the host: see exterior_views.h. */
 #include "core/correct/exterior_views.h"
 
+#ifdef _OPENMP
+#include <omp.h>
+#endif
 #include <stdlib.h>
 
 enum { VIEWS_LOOKED_AT = 32, TOGETHER_MOST = 16 };
@@ -18,6 +21,10 @@ int exterior_views_open(struct exterior_views *ret_views, const struct exterior_
 	    .together = TOGETHER_MOST,
 	};
 
+#ifdef _OPENMP
+	if (views.together > omp_get_max_threads())
+		views.together = omp_get_max_threads();
+#endif
 	while (views.together > 1 &&
 	       (views.together > views.count || (size_t)views.together * views.pixels * sizeof(float) > BYTES_MOST))
 		views.together--;
