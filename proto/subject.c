@@ -29,7 +29,11 @@ static const char *check_name(const char *text, int *ret_code)
 {
 	const char *const expected = "at most 3 groups (\"=\") of at most 64 characters and 5 components (\"^\") are "
 				     "expected, without a backslash";
+	const char *const empty = "a name is expected, \"^\" and \"=\" stand between its parts";
 	int groups = 1, components = 1, characters = 0;
+
+	if (strspn(text, "^= ") == strlen(text))
+		return empty;
 
 	(void)ret_code;
 	for (; *text != '\0'; text++) {
@@ -110,7 +114,8 @@ static const char *check_date(const char *text, int *ret_code)
 	month = two_digits(text + 5);
 	day = two_digits(text + 8);
 	leap = (year % 4 == 0 && year % 100 != 0) || year % 400 == 0;
-	if (month >= 1 && month <= 12 && day >= 1 && day <= days[month - 1] + (month == 2 && leap))
+	/* The calendar that DICOM's dates are of begins with the year 1. */
+	if (year >= 1 && month >= 1 && month <= 12 && day >= 1 && day <= days[month - 1] + (month == 2 && leap))
 		return NULL;
 	*ret_code = ERR_IMPOSSIBLE;
 	return "no calendar has this date";

@@ -1,4 +1,6 @@
 /* cbct scans, jobs, calibrations, status, complete, rm: what the daemon knows, a line each. */
+#include <string.h>
+
 #include "clients/cbct/commands.h"
 #include "clients/cbct/http.h"
 
@@ -68,9 +70,15 @@ static void print_calibration(const cJSON *calibration)
 {
 	const double day = 86400;
 
-	printf("%-20s %-10s %6.3f mm  %4.0f days  %s\n", member_text(calibration, "id", "?"),
-	       member_text(calibration, "state", "?"), member_number(calibration, "residual_isocentre_mm", 0),
-	       member_number(calibration, "age_s", 0) / day, member_text(calibration, "arm", ""));
+	const cJSON *residual = cJSON_GetObjectItemCaseSensitive(calibration, "residual_isocentre_mm");
+	char text[32] = "";
+
+	/* One that failed, or is being made, has none that means anything. */
+	if (cJSON_IsNumber(residual) && strcmp(member_text(calibration, "state", ""), "succeeded") == 0)
+		snprintf(text, sizeof(text), "%.3f mm", residual->valuedouble);
+	printf("%-20s %-10s %9s  %4.0f days  %s\n", member_text(calibration, "id", "?"),
+	       member_text(calibration, "state", "?"), text, member_number(calibration, "age_s", 0) / day,
+	       member_text(calibration, "arm", ""));
 }
 
 static void print_device(const cJSON *device)

@@ -59,7 +59,8 @@ struct peer_rule {
 struct access {
 	const char *path; /* "": there are no tokens */
 	struct peer_rule rules[PEER_RULES_MAX];
-	int rule_count; /* constant */
+	int rule_count;              /* constant */
+	_Atomic unsigned generation; /* of the tokens: grows when they are read again */
 	pthread_mutex_t lock;
 	struct tokens tokens; /* guarded by lock, as is all below */
 	struct session sessions[SESSIONS_MAX];
@@ -191,6 +192,7 @@ int access_reload(struct access *access, struct error *err)
 	old = access->tokens;
 	access->tokens = fresh;
 	pthread_mutex_unlock(&access->lock);
+	atomic_fetch_add(&access->generation, 1);
 	tokens_clear(&old);
 	log_line(LEVEL_INFO, "%d tokens in %s", fresh.count, access->path);
 	return 0;
@@ -367,6 +369,7 @@ int access_check(struct request *request, struct error *err)
 		return 0;
 	}
 	request->who = (struct identity){.role = ROLE_ANYONE, .expires = TOKEN_NEVER};
+	request->who_generation = atomic_load(&request->http->access->generation);
 	shown = read_proof(request, &request->who);
 	note_identity(request);
 	/* Probes and the page itself do not fail for a token that is old. */
@@ -390,6 +393,20 @@ bool access_still_holds(struct access *access, const struct identity *who)
 	holds = token != NULL && token_is_valid(token, time(NULL)) && token->role >= who->role;
 	pthread_mutex_unlock(&access->lock);
 	return holds;
+}
+
+int access_confirm(struct request *request, struct error *err)
+{
+	struct access *access = request->http->access;
+	const unsigned generation = atomic_load(&access->generation);
+
+	if (request->who.proof <= PROOF_NOT_ASKED ||
+	    (generation == request->who_generation && time(NULL) < request->who.expires))
+		return 0;
+	if (!access_still_holds(access, &request->who))
+		return refuse_unknown(request, SHOWN_BAD, err);
+	request->who_generation = generation;
+	return 0;
 }
 
 const struct identity *request_identity(const struct request *request)

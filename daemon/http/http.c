@@ -28,9 +28,8 @@
 enum {
 	CONNECTION_MEMORY = 128 << 10 /* pieces of a body are at most half of it */
 };
-static const size_t bodies_max = 256 << 20;   /* bytes of whole bodies in memory, of all requests together */
-static const uint64_t drop_most = 2ull << 30; /* bytes dropped for the sake of an answer; then the connection goes */
-static const double stop_grace = 2;           /* s */
+static const size_t bodies_max = 256 << 20; /* bytes of whole bodies in memory, of all requests together */
+static const double stop_grace = 2;         /* s */
 
 /* ---- one request ---- */
 
@@ -126,16 +125,30 @@ static enum MHD_Result stream_body(struct request *request, const char *data, si
 	return MHD_YES;
 }
 
+/*
+ * Bytes of a body that are dropped for the sake of an answer; then the connection goes. Who was refused by the header
+ * gets fewer: before that, nothing of the body was taken.
+ */
+static uint64_t drop_most(const struct request *request)
+{
+	const bool at_once = request->received == 0 || request->received < request->dropped;
+
+	return at_once && (request->status == 401 || request->status == 403) ? REFUSED_DROP_MOST : 2ull << 30;
+}
+
 static enum MHD_Result on_body(struct request *request, const char *data, size_t *size)
 {
 	size_t came = *size;
 	enum MHD_Result result = MHD_YES;
 	struct error err = {0};
 
+	if (!request->dropping && access_confirm(request, &err) != 0)
+		return MHD_NO;
+	request->dropping |= request->response != NULL;
 	if (request->dropping || request->route->body == BODY_NONE) {
 		request->dropped += came;
 		*size = 0;
-		result = request->dropped <= drop_most ? MHD_YES : MHD_NO;
+		result = request->dropped <= drop_most(request) ? MHD_YES : MHD_NO;
 	} else if (request->route->body == BODY_WHOLE) {
 		*size = 0;
 		if (keep_body(request, data, came, &err) != 0)
@@ -156,6 +169,8 @@ static enum MHD_Result on_whole(struct request *request)
 	/* The body was refused on its way, and ended before its time. */
 	if (request->response == NULL && gate_refusal(request->connection) != NULL &&
 	    request_refuse(request, &err) != 0)
+		return MHD_NO;
+	if (request->response == NULL && access_confirm(request, &err) != 0)
 		return MHD_NO;
 	while (request->response == NULL) {
 		enum suspension outcome;

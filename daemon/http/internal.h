@@ -16,6 +16,8 @@
 enum {
 	ARGUMENTS_MAX = 4,
 	QUERIES_MAX = 16,
+	REFUSED_DROP_MOST =
+	    1 << 20, /* bytes of a body that are read of who may not send it, so that the answer is read */
 	SEGMENTS_MAX = 12,
 	PROBES_MAX = 128, /* the daemon's connections to itself, of one look */
 	LISTENERS_MAX = 8,
@@ -92,6 +94,7 @@ struct request {
 	char method[16];
 	const struct route *route;
 	struct identity who;
+	unsigned who_generation; /* of the tokens that knew it */
 	const char *arguments[ARGUMENTS_MAX];
 	struct {
 		const char *name, *value;
@@ -280,6 +283,11 @@ int traffic_new(const struct route *routes, struct traffic **ret_traffic, struct
 void traffic_free(struct traffic *traffic); /* NULL is fine */
 /* Of a request that has ended, in its thread. */
 void traffic_count(struct http *http, const struct request *request, bool whole);
+
+/*
+ * While a body comes, and at its end: who sends it is still known, or the reply is set that refuses. 0, or an error.
+ */
+int access_confirm(struct request *request, struct error *err);
 
 /* ---- http/audit.c: who asked for what ---- */
 /* most: bytes of a file, before it is renamed; keep: renamed files. */

@@ -297,6 +297,8 @@ static bool should_drop(struct request *request)
 {
 	if (request->close || MHD_lookup_connection_value(request->mhd, MHD_HEADER_KIND, "Expect") != NULL)
 		return false;
+	if (request->status == 401 || request->status == 403)
+		return request->chunked || request->content_length <= REFUSED_DROP_MOST;
 	return request->chunked || (uint64_t)request->content_length <= drop_max;
 }
 

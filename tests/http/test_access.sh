@@ -228,6 +228,49 @@ test_streams_end_with_the_token_they_were_asked_with() {
 	stop_daemon
 }
 
+# Bytes that come when the token is gone are nobody's: none is stored.
+test_an_upload_ends_with_its_token() {
+	local gone=$work/gone late upload large i
+	cp "$tokens" "$gone"
+	late=$(cbct token new late --role acquire --file "$gone" 2>/dev/null)
+	start_daemon --tokens "$gone"
+	as acquire
+	large=${document/\"columns\": 16/\"columns\": 512}
+	req POST /v1/scans "${bearer[@]}" "${json[@]}" --data-binary "${large/\"rows\": 12/\"rows\": 4096}"
+	expect_status 201
+	scan=$(json .id)
+	i=$(json '.detector.columns * .detector.rows * 4')
+	head -c "$i" /dev/zero >"$work/late.raw"
+	curl -s -o "$work/late.body" -w '%{http_code}' --limit-rate $((i / 4)) -T "$work/late.raw" "$url/v1/scans/$scan/projections/0" \
+		-H "Authorization: Bearer $late" >"$work/late.status" & upload=$!
+	sleep 1
+	cbct token revoke late --file "$gone" 2>/dev/null
+	reload '4 tokens'
+	wait $upload || true
+	# The clock may cut it off before the next bytes are refused.
+	[[ $(cat "$work/late.status") != 2* ]] || fail "401 or a connection that is closed, got $(cat "$work/late.status")"
+	req GET "/v1/scans/$scan" "${bearer[@]}"
+	expect_json '.received_count == 0'
+	# Others' are taken.
+	req PUT "/v1/scans/$scan/projections/0" "${bearer[@]}" -T "$work/late.raw"
+	expect_status 201
+	stop_daemon
+}
+
+# Who may not send a large body is told so, and the body is not read for that.
+test_a_large_body_is_not_read_of_who_is_not_known() {
+	start_daemon --tokens "$tokens"
+	truncate -s 300M "$work/large.raw"
+	curl -s -o "$work/large.body" -w '%{http_code} %{size_upload}' -H 'Expect:' -T "$work/large.raw" "$url/v1/scans/1m00000000000000/projections" >"$work/large.status" || true
+	read -r status sent <"$work/large.status" || true
+	[ "$status" = 401 ] || [ "$status" = 000 ] || fail "401 or a connection that is closed, got $status"
+	[ "$sent" -lt 100000000 ] || fail "less than the body of 300 MB, got $sent"
+	as view
+	req PUT /v1/scans/1m00000000000000/projections "${bearer[@]}" -T "$work/late.raw"
+	expect_problem 403
+	stop_daemon
+}
+
 test_the_kernel_tells_who_is_at_a_unix_socket() {
 	local socket=$work/peers
 	with_rules() { # RULE ...: on a Unix socket

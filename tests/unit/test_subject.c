@@ -80,6 +80,9 @@ static const struct {
 	const char *pointer;
 } bads[] = {
     {"/patient", "{\"name\": \"a\\\\b\"}", ERR_INVALID, "/patient/name"},
+    {"/patient", "{\"name\": \"^\"}", ERR_INVALID, "/patient/name"},
+    {"/patient", "{\"name\": \"==\"}", ERR_INVALID, "/patient/name"},
+    {"/patient", "{\"birth_date\": \"0000-01-01\"}", ERR_IMPOSSIBLE, "/patient/birth_date"},
     {"/patient", "{\"name\": \"a=b=c=d\"}", ERR_INVALID, "/patient/name"},
     {"/patient", "{\"name\": \"a^b^c^d^e^f\"}", ERR_INVALID, "/patient/name"},
     {"/patient", "{\"name\": \" a\"}", ERR_INVALID, "/patient/name"},
