@@ -105,6 +105,20 @@ python=${PYTHON:-/usr/bin/python3}
 found "docs/rooms.svg is drawn from the includes" "$("$python" docs/rooms.py --check 2>&1)"
 found "docs/third-party.md has every library and every package of the page" "$("$python" docs/third-party.py --check 2>&1)"
 
+# http/NAME:TEST, unit/NAME:TEST; without :TEST the file. Commits in the first column of the track record.
+found "tests and commits that docs/risks.md and docs/track-record.md name exist" "$(
+	grep -ohE '`(http|unit|web)/[a-z_]+(:[a-z0-9_]+)?`' docs/risks.md docs/track-record.md | tr -d '`' | sort -u | while IFS=: read -r file name; do
+		case $file in
+		unit/*) path=tests/unit/test_${file#unit/}.c pattern="START_TEST($name)" ;;
+		*) path=tests/${file%/*}/test_${file#*/}.sh pattern="$name()" ;;
+		esac
+		grep -qF -- "${name:+$pattern}" "$path" 2>/dev/null || echo "$file${name:+:$name}"
+	done
+	git rev-parse --is-shallow-repository 2>/dev/null | grep -q false && grep -oE '^\| `[0-9a-f]{7}`' docs/track-record.md | tr -d '|` ' | while read -r commit; do
+		git cat-file -e "$commit^{commit}" 2>/dev/null || echo "commit $commit"
+	done
+)"
+
 found "files that CONTRIBUTING.md and README.md name exist" "$(grep -ohE '`(clients|core|daemon|docs|kernels|proto|tests)/[A-Za-z0-9_./-]+`' \
 	CONTRIBUTING.md README.md | tr -d '`' | grep -vE 'NAME|ROOM' | sort -u | while read -r path; do [ -e "$path" ] || echo "$path"; done)"
 
