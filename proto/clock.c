@@ -4,22 +4,12 @@
 #include <math.h>
 #include <stdio.h>
 
-static double clock_read(clockid_t clock)
+double clock_realtime(void)
 {
 	struct timespec now;
 
-	clock_gettime(clock, &now);
+	clock_gettime(CLOCK_REALTIME, &now);
 	return (double)now.tv_sec + (double)now.tv_nsec * 1e-9;
-}
-
-double clock_monotonic(void)
-{
-	return clock_read(CLOCK_MONOTONIC);
-}
-
-double clock_realtime(void)
-{
-	return clock_read(CLOCK_REALTIME);
 }
 
 struct timespec clock_timespec(double at)

@@ -3,10 +3,10 @@
 
 #include <time.h>
 
-/* The time, for all that is above core. Any thread. */
+#include "core/clock.h"
 
-/* Seconds since some moment in the past; never goes back: for waiting and for measuring. */
-double clock_monotonic(void);
+/* The time beside core's clock_monotonic, for all that is above core. Any thread. */
+
 /* Seconds since 1970; an operator or NTP may set this clock back: for what people read. */
 double clock_realtime(void);
 

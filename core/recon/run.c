@@ -5,8 +5,8 @@
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
-#include <time.h>
 
+#include "core/clock.h"
 #include "core/correct/averaging.h"
 #include "core/recon/internal.h"
 #include "core/recon/noise.h"
@@ -289,14 +289,6 @@ static int correct_again(struct recon *recon, struct error *err)
 	return correct(recon, CORRECT_RESUMED, err);
 }
 
-static double now(void)
-{
-	struct timespec time;
-
-	clock_gettime(CLOCK_MONOTONIC, &time);
-	return (double)time.tv_sec + 1e-9 * (double)time.tv_nsec;
-}
-
 /* A relaxation that was asked for is kept to. */
 static bool may_settle(const struct recipe *recipe)
 {
@@ -319,7 +311,7 @@ static int iterate(struct recon *recon, struct history_row *ret_row, struct erro
 {
 	const struct algorithm *algorithm = recon->recipe.algorithm;
 	int iteration = recon->iteration + 1;
-	double begin = now(), norm2_before = recon->norms.norm2;
+	double begin = clock_monotonic(), norm2_before = recon->norms.norm2;
 	struct iteration_sums sums;
 	int code;
 
@@ -341,7 +333,7 @@ static int iterate(struct recon *recon, struct history_row *ret_row, struct erro
 		code = algorithm_row(iteration, &sums, &recon->norms, norm2_before, ret_row, err);
 	if (code < 0)
 		return code;
-	ret_row->seconds = now() - begin;
+	ret_row->seconds = clock_monotonic() - begin;
 	recon->iteration = iteration;
 	return 0;
 }
