@@ -58,7 +58,7 @@ OPENMP ?= -fopenmp
 pkg_cflags := $(call pkg,--cflags,$(all_libs))
 # Errors of the maths library are not read from errno, traps are off: the compiler may vectorise.
 override CFLAGS += -std=c11 -D_GNU_SOURCE -I. $(WARN) $(or $(OPENMP),-Wno-unknown-pragmas) -fno-math-errno \
-                   -fno-trapping-math -MMD -MP $(pkg_cflags) \
+                   -fno-trapping-math -MMD -MP $(pkg_cflags) -ffile-prefix-map=$(CURDIR)=. \
                    $(if $(SANITIZE),-fsanitize=$(SANITIZE) -fno-omit-frame-pointer)
 bundle_flags := -Wl,--disable-new-dtags,-rpath,'$$ORIGIN/../lib'
 override LDFLAGS += $(if $(BUNDLE),$(bundle_flags)) $(OPENMP) $(if $(SANITIZE),-fsanitize=$(SANITIZE))
@@ -302,6 +302,12 @@ python-parameters: all ## the table of parameters in clients/python/cbctd.py
 third-party: all ## docs/third-party.md, the parts of others with version and licence
 	@$(PYTHON) docs/third-party.py $(BUILD)
 
+sbom: all ## build/sbom.json, the bill of materials (CycloneDX)
+	@$(PYTHON) packages/sbom.py $(BUILD) >$(BUILD)/sbom.json.part && mv $(BUILD)/sbom.json.part $(BUILD)/sbom.json && ls $(BUILD)/sbom.json
+
+reproducible: ## builds twice in different folders and compares programs and packages byte by byte
+	@packages/reproducible.sh CUDA=$(CUDA) $(if $(cuda_objects),CUDA_ARCH="$(CUDA_ARCH)")
+
 # For clangd and other tools. What make would run to compile each C file; CUDA's are left out, clang takes other options.
 c_sources = $(shell find clients core daemon proto tests -name node_modules -prune -o -name '*.c' -print | sort)
 compile_commands.json: ## how each C file is compiled, for editors
@@ -379,6 +385,6 @@ clean: ## removes build/
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z_.-]+:.*## /{printf "  make %-21s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-.PHONY: all test-programs again setup demo check soak fuzz fuzzers bench bench-calibrate bench-denoise bench-presets check-gpu bench-gpu asan tsan lint format rooms third-party compile_commands.json install deb container clean help
+.PHONY: all test-programs again setup demo check soak fuzz fuzzers bench bench-calibrate bench-denoise bench-presets check-gpu bench-gpu asan tsan lint format rooms third-party compile_commands.json install deb container sbom reproducible clean help
 .SECONDARY:
 -include $(shell find $(BUILD) -path $(BUILD)/test -prune -o -type f -name '*.d' -print 2>/dev/null)

@@ -111,16 +111,21 @@ def cuda_table():
             "| libstdc++6 | the compiler's | GPL-3+ with GCC Runtime Library Exception | cbct-worker, cbct-cuda |"]
 
 
+def page_parts(licences):
+    """Name, version and licence of each npm package in the page's bundle."""
+    blocks = re.split(r"^-{78}$", licences.read_text(), flags=re.MULTILINE)
+    return [re.search(r"^(\S+) (\d\S*): (.+)$", block, re.MULTILINE).groups() for block in blocks]
+
+
 def page_table(build):
     texts = list((build / "web" / "files").glob("licences-*.txt"))
     if len(texts) != 1:
         sys.exit("docs/third-party.py: the page is not built here (npm)")
+    parts = page_parts(texts[0])
     out = ["## In the page", "",
            "The npm packages in the page's bundle. The daemon serves their licences, the page links to them.", "",
            "| npm package | version | licence |", "|---|---|---|"]
-    for block in re.split(r"^-{78}$", texts[0].read_text(), flags=re.MULTILINE):
-        name, version, licence = re.search(r"^(\S+) (\d\S*): (.+)$", block, re.MULTILINE).groups()
-        out.append(f"| {name} | {version} | {licence} |")
+    out += [f"| {name} | {version} | {licence} |" for name, version, licence in parts]
     lock = json.loads((ROOT / "clients/web/package-lock.json").read_text())["packages"]["node_modules/esbuild"]
     out += ["", f"esbuild {lock['version']} ({lock['license']}) makes the bundle and is not part of it."]
     return out
@@ -153,4 +158,5 @@ def main():
     TABLE.write_text(HEAD.format(debian=debian) + "".join("\n" + "\n".join(s) + "\n" for s in sections))
 
 
-main()
+if __name__ == "__main__":
+    main()

@@ -91,4 +91,30 @@ test_man_pages_and_completions_have_every_command_and_setting() {
 	fi
 }
 
+# Held against what readelf, ldd and the page's own list say, each by itself.
+test_the_bill_of_materials_is_what_the_programs_need() {
+	local program library file bom=$work/sbom.json
+	[ -e /var/lib/dpkg/status ] || skip "no Debian, whose packages are told"
+	"$top/packages/sbom.py" "$BUILD" >"$bom" || fail "a bill"
+	jq -e '.bomFormat == "CycloneDX" and .specVersion == "1.5" and (.serialNumber | startswith("urn:uuid:"))' "$bom" >/dev/null || fail "its kind"
+	jq -e '([.components[]."bom-ref"] | length == (unique | length)) and ([.components[]."bom-ref"] + ["product:cbctd"]) as $all |
+		([.dependencies[] | .ref, .dependsOn[]] - $all) == []' "$bom" >/dev/null || fail "every reference has one component"
+	jq -e 'all(.components[]; (.version | length > 0) and (.type == "application" or .licenses != null or .supplier != null))' "$bom" >/dev/null || fail "versions and licences"
+	for program in cbctd cbct-worker cbct; do
+		diff <(readelf -d "$BUILD/$program" | sed -n 's/.*(NEEDED).*\[\(.*\)\]/\1/p' | sort) \
+			<(jq -r --arg p "program:$program" '.dependencies[] | select(.ref == $p).dependsOn[] | select(startswith("library:")) | ltrimstr("library:")' "$bom" | sort) ||
+			fail "what $program needs"
+		ldd "$BUILD/$program" | awk '/=> \// { print $1, $3 }' | while read -r library file; do
+			[ "$(jq -r --arg l "$library" '.components[] | select(.name == $l).hashes[0].content' "$bom")" = "$(sha256sum <"$file" | cut -d' ' -f1)" ] ||
+				fail "$library of $program with its digest"
+		done
+	done
+	if ls "$BUILD"/web/files/licences-*.txt >/dev/null 2>&1; then
+		for library in $(jq -r '.dependencies | to_entries[] | "\(.key)@\(.value)"' "$top/clients/web/package.json"); do
+			jq -e --arg p "pkg:npm/${library/#@/%40}" 'any(.components[]; .purl == $p)' "$bom" >/dev/null || fail "$library of the page"
+		done
+	fi
+	"$top/packages/sbom.py" "$BUILD" | cmp - "$bom" || fail "the same bill again"
+}
+
 run_tests
