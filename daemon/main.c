@@ -231,7 +231,7 @@ struct arguments {
 	struct config *config;
 };
 
-/* Of the settings only the level of the log may change while the daemon runs. */
+/* Only one setting, the level of the log, may change while the daemon runs. */
 static void reload_settings(const struct arguments *arguments)
 {
 	struct config *config = arguments->config, fresh;

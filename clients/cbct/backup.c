@@ -173,7 +173,7 @@ static void note_file(cJSON *files, const char *path, unsigned long long bytes, 
 
 /* ---- one directory ---- */
 
-/* What the daemon makes again, or what is only its own: no part of a backup. */
+/* Files that the daemon makes again or that are only its own: no part of a backup. */
 static bool is_left_out(const char *path)
 {
 	const char *name = strrchr(path, '/') != NULL ? strrchr(path, '/') + 1 : path;
@@ -409,7 +409,7 @@ static int write_manifest(const struct copy *copy, struct error *err)
 	return code;
 }
 
-/* What stands beside scans and jobs: calibrations, quarantine, the audit log, the list of deletions. */
+/* Files beside scans and jobs: calibrations, quarantine, the audit log, the list of deletions. */
 static int copy_rest(struct copy *copy, struct error *err)
 {
 	struct dirent **names = NULL;

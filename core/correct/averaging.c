@@ -42,7 +42,7 @@ double averaging_share(double ratio)
 
 double settling_share(double pixels, const struct averaging_sums sums[2])
 {
-	/* Of objects of voxels at most, and so much more with edges. */
+	/* The bound for objects of voxels, and how much more sharp edges have. */
 	const double smooth = fmax(0.135, 0.2 - 0.07 * (pixels - 1.3)), sharper = 0.03;
 	double ratio;
 

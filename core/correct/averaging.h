@@ -80,7 +80,7 @@ double settling_share(double pixels, const struct averaging_sums sums[2]);
 double settling_after(double pixels, double averaged, double share);
 /* The same in iterations of so many updates. The first two bring most of what there is, and stay whole. */
 double settling_from(double after, double updates);
-/* Of the iteration's change (counted from 1), the share that is kept. */
+/* Returns the share of an iteration's change that is kept; iterations count from 1. */
 double settling_relaxation(int iteration, double after, double updates);
 
 #endif

@@ -9,7 +9,7 @@
 
 static const double PI = 3.14159265358979323846;
 
-/* What vanishes in an empty view. A value other than air's leaves the attenuation, but no structure. */
+/* The content that vanishes in an empty view. A value other than air's leaves the attenuation, but no structure. */
 enum measure { ATTENUATION, STRUCTURE, MEASURES };
 
 static const double FAINT = 0.15, FULL = 0.5, OTHER = 0.25; /* shares of what a quarter of the views exceeds */

@@ -31,7 +31,7 @@
  */
 enum { EXTERIOR_VOLUME_LEAST = 64, EXTERIOR_VOLUME_MOST = 128, EXTERIOR_VOLUME_VIEWS = 4 };
 
-/* Of the field of view's radius. */
+/* Margin about the field of view, as a share of its radius. */
 #define EXTERIOR_MARGIN 0.25
 
 /* Inputs of the model, all of them borrowed. */

@@ -1,4 +1,4 @@
-/* What alternates from slice to slice where no view sees it: see alternation.h. */
+/* Alternation from slice to slice that no view sees: see alternation.h. */
 #include "core/recon/alternation.h"
 
 #include <math.h>
@@ -16,7 +16,7 @@ enum { STEP_LEAST = 8, NODES_MOST = 32 };
 static const double ROWS_LEAST = 0.7, ROWS_MOST = 1.4;
 /* A slice whose body is smaller says nothing. */
 enum { BODY_LEAST = 16 };
-/* Of water's density, or of the object's where that is more: 40 HU. */
+/* The least alternation that counts, as a share of water's density, or of the object's where that is more: 40 HU. */
 static const double LITTLE = 0.04;
 /* Slices at hand at a time. */
 enum { WINDOW = 3 };
@@ -49,7 +49,7 @@ static void sights_make(const struct geometry *geometry, int most, struct sights
 		view_matrix(&geometry->views[view], ret->matrix[ret->count++]);
 }
 
-/* What the rows of one view see at this place: the sum of (1 - |s|) (1 - 2 |s|)^2, and that of the weights. */
+/* Adds the rows of one view at this place: the sum of (1 - |s|) (1 - 2 |s|)^2, and that of the weights. */
 static bool add_view(const struct sights *sights, int view, const double world[3], double height, double sums[2])
 {
 	const double above[3] = {world[0], world[1], world[2] + height};

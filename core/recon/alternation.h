@@ -4,7 +4,7 @@
 #include "core/backend.h"
 
 /*
- * What alternates from slice to slice where no view sees it.
+ * Alternation from slice to slice that no view sees.
  *
  * Where a detector's rows are as far apart as the slices and lie on the borders between them, a ray is the mean of two
  * slices. Errors of opposite signs in neighbouring slices then cancel in every ray, and nothing holds them back: a flat
@@ -37,8 +37,8 @@ struct alternation_report {
 	double amplitude; /* the most of a slice's mean of w a over the body, 1/mm */
 };
 
-/* Of alternation at a place of the grid, in voxels; 1 where no view sees the place, or rows and slices differ in
- * height. */
+/* Returns how visible alternation is at a place of the grid, in voxels; 1 where no view sees the place, or rows and
+ * slices differ in height. */
 double alternation_visibility(const struct geometry *geometry, const struct grid *grid, const double place[3]);
 
 /* Bytes of the host's memory, at most. */

@@ -1,4 +1,4 @@
-/* What is not kept for ever: `--keep`. And PUT, DELETE of /v1/{jobs,scans}/ID/pin. */
+/* Jobs and scans that are not kept for ever: `--keep`. And PUT, DELETE of /v1/{jobs,scans}/ID/pin. */
 #include <errno.h>
 #include <math.h>
 #include <pthread.h>

@@ -257,7 +257,7 @@ static void put_card(FILE *out, const char *name, int index, const struct nvml_c
 	fprintf(out, "%s} %.17g\n", more, value);
 }
 
-/* What the driver tells of NVIDIA cards; without one the families stand there without a sample. */
+/* Figures of the driver about NVIDIA cards; without one the families stand there without a sample. */
 static void write_cards(FILE *out, struct api *api)
 {
 	struct nvml_card cards[CARDS_MAX];

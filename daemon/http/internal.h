@@ -281,7 +281,7 @@ int access_check(struct request *request, struct error *err);
 /* ---- http/traffic.c: numbers of requests, bytes and seconds ---- */
 int traffic_new(const struct route *routes, struct traffic **ret_traffic, struct error *err);
 void traffic_free(struct traffic *traffic); /* NULL is fine */
-/* Of a request that has ended, in its thread. */
+/* Counts a request that has ended, in its thread. */
 void traffic_count(struct http *http, const struct request *request, bool whole);
 
 /*

@@ -66,7 +66,7 @@ static int bind_tcp(const struct addrinfo *address, const char *text, struct lis
 	return name_socket(listener, err);
 }
 
-/* Of an address beyond loopback. */
+/* Checks the guards that an address beyond loopback needs. */
 static int check_guards(const char *text, unsigned guards, struct error *err)
 {
 	if (guards & GUARD_TOKENS && guards & GUARD_TLS)

@@ -1,11 +1,11 @@
-/* What was asked of each route and how it was answered, in numbers, for /metrics. */
+/* Requests and replies of each route in numbers, for /metrics. */
 #include "daemon/http/internal.h"
 
 #include <stdlib.h>
 
 enum { STATUS_FIRST = 100, STATUS_END = 600, STATUS_SLOTS = STATUS_END - STATUS_FIRST + 1 };
 
-/* Of one route. A slot for each status, the last for requests that were broken off. */
+/* Counters of one route. A slot for each status, the last for requests that were broken off. */
 struct traffic {
 	struct {
 		atomic_ullong requests, received, sent;

@@ -1,4 +1,4 @@
-/* What people keep with a job, its annotations, and that it is pinned: job.h. */
+/* Annotations and pins, which people keep with a job: job.h. */
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>

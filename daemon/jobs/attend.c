@@ -28,7 +28,7 @@ int worker_record_running(struct worker *worker, struct error *err)
 	return 0;
 }
 
-/* Of a closed scan, those that it was closed without are not waited for. */
+/* Projections that a scan was closed without are not waited for. */
 static int projections_of(const struct scan_facts *facts)
 {
 	return facts->closed ? facts->received + facts->lost : facts->count;

@@ -116,7 +116,7 @@ static void job_ended(struct supervise *supervise, struct worker *worker, const 
 	worker_publish(supervise, worker);
 }
 
-/* What the report of a job that fails has for its worker's last words. */
+/* Keeps the worker's last words for the report of a job that fails. */
 static void note_words(struct worker *worker, const struct message *message)
 {
 	if (message->kind == MESSAGE_PROGRESS)
