@@ -14,6 +14,7 @@
 #include <dirent.h>
 #include <errno.h>
 #include <fcntl.h>
+#include <ftw.h>
 #include <limits.h>
 #include <linux/fs.h>
 #include <stdlib.h>
@@ -178,7 +179,7 @@ static bool is_left_out(const char *path)
 {
 	const char *name = strrchr(path, '/') != NULL ? strrchr(path, '/') + 1 : path;
 
-	return strcmp(path, "lock") == 0 || strcmp(path, "reserve") == 0 ||
+	return strcmp(path, "lock") == 0 || strcmp(path, "reserve") == 0 || strcmp(path, "restored") == 0 ||
 	       strncmp(path, "catalogue.sqlite", strlen("catalogue.sqlite")) == 0 || strstr(name, ".tmp") != NULL ||
 	       strcmp(path, MANIFEST) == 0;
 }
@@ -434,6 +435,44 @@ struct backup_options {
 	const char *from, *to;
 };
 
+/* A copy within what is copied would be copied, too, and so on. */
+static int check_outside(const char *from, const char *to, struct error *err)
+{
+	char parent[PATH_MAX], root[PATH_MAX], above[PATH_MAX], *slash;
+	size_t length;
+
+	snprintf(parent, sizeof(parent), "%s", to);
+	for (length = strlen(parent); length > 1 && parent[length - 1] == '/'; length--)
+		parent[length - 1] = '\0';
+	slash = strrchr(parent, '/');
+	if (slash == NULL)
+		snprintf(parent, sizeof(parent), ".");
+	else
+		slash[slash == parent ? 1 : 0] = '\0';
+	if (realpath(from, root) == NULL || realpath(parent, above) == NULL)
+		return error_set_errno(err, errno, "%s", slash != NULL ? parent : from);
+	length = strlen(root);
+	if (strncmp(above, root, length) == 0 && (above[length] == '\0' || above[length] == '/'))
+		return error_set(err, ERR_INVALID, "%s lies within %s", to, from);
+	return 0;
+}
+
+static int remove_entry(const char *path, const struct stat *status, int kind, struct FTW *place)
+{
+	(void)status;
+	(void)kind;
+	(void)place;
+	return remove(path);
+}
+
+/* What was made in vain, all of it our own. */
+static void remove_target(const char *path)
+{
+	enum { DESCRIPTORS = 16 };
+
+	nftw(path, remove_entry, DESCRIPTORS, FTW_DEPTH | FTW_PHYS | FTW_MOUNT);
+}
+
 /* A directory of its own: nothing of another backup may be taken for a part of this one. */
 static int make_target(const char *from, const char *to, struct error *err)
 {
@@ -442,6 +481,8 @@ static int make_target(const char *from, const char *to, struct error *err)
 
 	if (stat(from, &status) != 0 || !S_ISDIR(status.st_mode))
 		return error_set(err, ERR_NOT_FOUND, "%s is no directory", from);
+	if (check_outside(from, to, err) != 0)
+		return err->code;
 	if (mkdir(to, 0700) != 0 && (errno != EEXIST || rmdir(to) != 0 || mkdir(to, 0700) != 0))
 		return error_set(err, ERR_CONFLICT, "%s: %s", to, strerror(errno));
 	code = make_directory(from, to, err);
@@ -454,6 +495,7 @@ static int backup_run(const void *values, struct error *err)
 	struct copy copy = {
 	    .from = options->from, .to = options->to, .files = cJSON_CreateArray(), .block = malloc(BLOCK)};
 	char jobs[PATH_MAX], scans[PATH_MAX];
+	bool made;
 	int code = copy.block != NULL && copy.files != NULL ? 0 : error_set(err, ERR_NO_MEMORY, "no memory for a copy");
 
 	if (code == 0)
@@ -465,6 +507,7 @@ static int backup_run(const void *values, struct error *err)
 				 copy.from);
 	if (code == 0)
 		code = make_target(copy.from, copy.to, err);
+	made = code == 0;
 	if (code == 0)
 		code = copy_rest(&copy, err);
 	if (code == 0)
@@ -475,6 +518,8 @@ static int backup_run(const void *values, struct error *err)
 		code = sync_all(copy.to, err);
 	if (code == 0)
 		code = write_manifest(&copy, err);
+	if (code != 0 && made)
+		remove_target(copy.to);
 	if (code == 0)
 		printf("%d files, %.1f MB, %d of them shared\n", cJSON_GetArraySize(copy.files), 1e-6 * copy.bytes,
 		       copy.linked);
@@ -553,11 +598,27 @@ static int read_manifest(const char *from, cJSON **ret_manifest, struct error *e
 	return code;
 }
 
+/* Tells the daemon why there is no catalogue (store/reconcile.c). */
+static int note_restored(const char *to, struct error *err)
+{
+	char path[PATH_MAX];
+	int file, code = path_under(path, to, "restored", err);
+
+	if (code != 0)
+		return code;
+	file = open(path, O_WRONLY | O_CREAT | O_CLOEXEC, 0600);
+	if (file < 0)
+		return error_set_errno(err, errno, "%s", path);
+	close(file);
+	return 0;
+}
+
 static int restore_run(const void *values, struct error *err)
 {
 	const struct backup_options *options = values;
 	struct copy copy = {.from = options->from, .block = malloc(BLOCK)};
 	char beside[PATH_MAX];
+	bool made;
 	cJSON *manifest = NULL;
 	const cJSON *file;
 	int code = copy.block != NULL ? 0 : error_set(err, ERR_NO_MEMORY, "no memory for a copy"), count = 0;
@@ -572,6 +633,7 @@ static int restore_run(const void *values, struct error *err)
 		code = error_set(err, ERR_CONFLICT, "%s: %s", options->to, strerror(errno));
 	if (code == 0)
 		code = make_target(copy.from, copy.to, err);
+	made = code == 0;
 	cJSON_ArrayForEach(file, cJSON_GetObjectItemCaseSensitive(manifest, "files"))
 	{
 		if (code == 0)
@@ -579,11 +641,15 @@ static int restore_run(const void *values, struct error *err)
 		count++;
 	}
 	if (code == 0)
+		code = note_restored(copy.to, err);
+	if (code == 0)
 		code = sync_all(copy.to, err);
 	if (code == 0 && rename(copy.to, options->to) != 0)
 		code = error_set_errno(err, errno, "%s", options->to);
 	if (code == 0)
 		code = durable_sync_names(options->to, err);
+	else if (made)
+		remove_target(copy.to);
 	if (code == 0)
 		printf("%d files, %.1f MB, as they were at %s\n", count, 1e-6 * copy.bytes,
 		       member_text(manifest, "made", "?"));

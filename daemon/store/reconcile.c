@@ -315,8 +315,18 @@ static int pass_over_events(struct store *store, struct error *err)
 	return catalogue_pass_events(store->catalogue, (long long)((clock_realtime() - 1577836800.0) * 1e3), err);
 }
 
+/* `cbct restore` copies no catalogue, and leaves this file so that its absence is no loss. It counts once. */
+static bool was_restored(const struct store *store)
+{
+	char path[1024];
+
+	snprintf(path, sizeof(path), "%s/restored", store->directory);
+	return unlink(path) == 0;
+}
+
 int store_reconcile(struct store *store, bool fresh, struct error *err)
 {
+	const bool restored = fresh && was_restored(store);
 	const struct store_repairs *repairs = &store->repairs;
 	char why[QUARANTINE_WHY_MAX];
 	int code = store_begin(store, err), found;
@@ -337,7 +347,7 @@ int store_reconcile(struct store *store, bool fresh, struct error *err)
 	log_line(LEVEL_WARNING, "catalogue: %s", why);
 	/* A catalogue that was damaged has a note already; and one record may be ahead of the commit that a crash cut
 	 * off. */
-	return repairs->remade || (!fresh && found == 1)
+	return repairs->remade || (!fresh && found == 1) || restored
 		   ? 0
 		   : quarantine_note(store->directory, "catalogue.sqlite", why, err);
 }

@@ -67,9 +67,9 @@ test_a_copy_of_a_daemon_at_work_goes_on_to_the_same_bits() {
 	wait_job succeeded
 	get_volume final "$work/resumed.nii" format=raw
 	cmp "$work/undisturbed.nii" "$work/resumed.nii" || fail "the bits of the job that was running"
-	# No directory was set aside; that the catalogue is a new one is told.
-	req GET /v1/quarantine
-	expect_json '[.entries[] | select(.from != "catalogue.sqlite")] == []'
+	req GET /v1/quarantine # also that the catalogue is a new one is no loss
+	expect_json '.entries == []'
+	[ ! -e "$work/restored/restored" ] || fail "the next loss of the catalogue is told"
 }
 
 # Jobs and scans come and go while it copies: whatever is in the copy is whole.
@@ -117,8 +117,11 @@ test_what_is_damaged_or_no_backup_is_refused() {
 	printf 'x' | dd of="$file" bs=1 seek=1000 conv=notrunc status=none
 	cbct restore "$work/copy" "$work/restored" 2>"$work/said" && fail "a damaged file is found"
 	grep -q "scans/.*/projections.raw is not what was backed up" "$work/said" || fail "which: $(cat "$work/said")"
-	[ ! -e "$work/restored" ] || fail "nothing has the name"
-	rm -rf "$work/restored.restored"
+	[ ! -e "$work/restored" ] && [ ! -e "$work/restored.restored" ] || fail "nothing is left of it"
+	cbct backup "$state" "$state/copy" 2>"$work/said" && fail "no backup within itself"
+	grep -q 'lies within' "$work/said" && [ ! -e "$state/copy" ] || fail "why: $(cat "$work/said")"
+	(cd "$state" && cbct backup . copy 2>"$work/said") && fail "nor by a relative path"
+	[ ! -e "$state/copy" ] || fail "nothing was made"
 	jq '.files[0].path = "../../escape"' "$work/copy/backup.json" >"$work/list" && cp "$work/list" "$work/copy/backup.json"
 	cbct restore "$work/copy" "$work/restored" 2>"$work/said" && fail "a path that leads out"
 	grep -q 'no path within the backup' "$work/said" || fail "why: $(cat "$work/said")"
