@@ -235,15 +235,17 @@ static void write_workers(FILE *out, struct api *api)
 	struct worker_facts workers[WORKERS_MAX];
 	int count = supervise_workers(api->supervise, workers, WORKERS_MAX);
 	int states[WORKER_STATE_COUNT] = {0};
-	double restarts = 0;
+	double restarts = 0, aside = 0;
 
 	for (int i = 0; i < count && i < WORKERS_MAX; i++) {
 		states[workers[i].state]++;
 		restarts += workers[i].restarts;
+		aside += workers[i].aside;
 	}
 	describe(out, "workers", "gauge", "Workers, by state.");
 	for (int i = 0; i < WORKER_STATE_COUNT; i++)
 		fprintf(out, "cbctd_workers{state=\"%s\"} %d\n", worker_state_names[i], states[i]);
+	single(out, "devices_aside", "gauge", "Devices that are given no jobs because of repeated errors.", aside);
 	single(out, "worker_restarts_total", "counter", "Workers started again after they had died.", restarts);
 }
 
