@@ -49,7 +49,13 @@ struct correction_job {
 	struct volume *work;         /* on the recipe's grid, to work in */
 	const struct input *input;   /* what was seen of the samples so far (core/correct/input.h) */
 	const int *iteration;        /* iterations that are done */
-	double *settled;             /* iterations after which relaxation falls (averaging.h); INFINITY: never */
+	/*
+	 * Called before the start of the iterations is changed, where the object is wider than the detector and they
+	 * begin with FDK.
+	 */
+	int (*wide)(void *context, struct error *err);
+	void *wide_context;
+	double *settled; /* iterations after which relaxation falls (averaging.h); INFINITY: never */
 	const struct warning_sink *warnings;
 	const struct cancel *cancel;
 };

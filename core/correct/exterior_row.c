@@ -168,6 +168,8 @@ static int apply(const struct correction_job *job, void *state, enum correction_
 	if (!options.truncated)
 		seen.last = -1;
 	code = exterior_volume_make(&exterior, &options, err);
+	if (code == 0 && options.truncated && *job->iteration == 0)
+		code = job->wide(job->wide_context, err);
 	if (code == 0)
 		code = subtract(job, &options, &seen, &exterior, &rows, err);
 	if (code == 0 && !fdk && sound && job->recipe->fdk.extend &&

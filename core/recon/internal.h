@@ -7,6 +7,7 @@
 #include "core/recon/algorithm.h"
 #include "core/recon/alternation.h"
 #include "core/recon/ends.h"
+#include "core/recon/rim.h"
 #include "core/warning.h"
 
 /* Declarations that recon.c (life, views), run.c (the run) and memory.c (the memory it takes) share. */
@@ -39,6 +40,7 @@ struct recon {
 	void *algorithm_state;
 	struct ends *ends;               /* the end slices of volumes that are kept; NULL: they are the iterate's */
 	struct alternation *alternation; /* from slice to slice, not in volumes that are kept; NULL: views see it */
+	struct rim *rim;                 /* of the field of view, in volumes that are kept; NULL: it is the iterate's */
 	bool smoothed;                   /* while a volume is kept, `before` has the iterate */
 
 	unsigned char *pushed; /* [views] */
@@ -77,6 +79,12 @@ static inline bool recon_runs_fdk(const struct recon *recon)
 static inline bool recipe_has_ends(const struct recipe *recipe)
 {
 	return recipe->fdk.on && recipe->algorithm != NULL;
+}
+
+/* Without FDK, or without its noise taken out before the iterations, the rim is the iterate's. */
+static inline bool recipe_has_rim(const struct recipe *recipe)
+{
+	return recipe_has_ends(recipe) && (!recipe->tv.on || recipe->tv.after_fdk);
 }
 
 /* Calls the hook at the beginning of what `stage` says. */

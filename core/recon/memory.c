@@ -164,6 +164,8 @@ static size_t kept_bytes(const struct recon *recon)
 
 	if (recipe_has_ends(recipe))
 		bytes += ends_bytes(&recipe->grid, recon->geometry, &recon->orbit);
+	if (recipe_has_rim(recipe))
+		bytes += rim_bytes(&recipe->grid, &recon->orbit);
 	if (recipe->algorithm != NULL)
 		bytes += alternation_bytes(&recipe->grid);
 	return bytes;

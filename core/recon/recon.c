@@ -87,6 +87,14 @@ static int open_plan(struct recon *recon, struct error *err)
 	return code == 0 ? recon->backend->volume_fill(recon->volume, 0, err) : code;
 }
 
+/* The rim is that of the volume that the iterations begin with. */
+static int begin_rim(void *context, struct error *err)
+{
+	struct recon *recon = context;
+
+	return recon->rim != NULL ? rim_begin(recon->rim, recon->backend, recon->volume, err) : 0;
+}
+
 static int open_corrections(struct recon *recon, struct error *err)
 {
 	const struct correction_job job = {
@@ -104,6 +112,8 @@ static int open_corrections(struct recon *recon, struct error *err)
 	    .work = recon->before,
 	    .input = &recon->input,
 	    .iteration = &recon->iteration,
+	    .wide = begin_rim,
+	    .wide_context = recon,
 	    .settled = &recon->settled,
 	    .warnings = &recon->warnings,
 	    .cancel = &recon->cancel,
@@ -144,6 +154,15 @@ static int open_ends(struct recon *recon, struct error *err)
 			&recon->ends, err);
 }
 
+static int open_rim(struct recon *recon, struct error *err)
+{
+	const struct recipe *recipe = &recon->recipe;
+
+	if (!recipe_has_rim(recipe))
+		return 0;
+	return rim_new(&recipe->grid, &recon->orbit, recipe->iterate.nonnegative, &recon->rim, err);
+}
+
 int recon_open(const struct backend *backend, struct device *device, const struct geometry *geometry,
 	       const struct linearise *linearise, const struct recipe *recipe, const struct recon_hooks *hooks,
 	       struct recon **ret_recon, struct error *err)
@@ -173,6 +192,8 @@ int recon_open(const struct backend *backend, struct device *device, const struc
 		code = open_algorithm(recon, err);
 	if (code == 0)
 		code = open_ends(recon, err);
+	if (code == 0)
+		code = open_rim(recon, err);
 	if (code == 0 && recon->recipe.algorithm != NULL)
 		code = alternation_new(&recon->recipe.grid, recon->geometry, recon->recipe.mu_water,
 				       &recon->alternation, err);
@@ -189,6 +210,7 @@ void recon_clear(struct recon *recon)
 	if (recon->algorithm_state != NULL)
 		recon->recipe.algorithm->close(&recon->problem, recon->algorithm_state);
 	ends_free(recon->ends);
+	rim_free(recon->rim);
 	alternation_free(recon->alternation);
 	corrections_close(&recon->corrections);
 	recon_release(recon);
@@ -297,10 +319,10 @@ static size_t algorithm_bytes(const struct recon *recon)
 
 size_t recon_state_bytes(const struct recon *recon)
 {
-	return algorithm_bytes(recon) + ends_state_bytes(recon->ends);
+	return algorithm_bytes(recon) + ends_state_bytes(recon->ends) + rim_state_bytes(recon->rim);
 }
 
-/* Writes the algorithm's state, and behind it the end slices that the iterations began with. */
+/* Writes the algorithm's state, and behind it the end slices and the rim that the iterations began with. */
 int recon_save_state(struct recon *recon, const struct checkpoint_sink *sink, struct error *err)
 {
 	int code = 0;
@@ -309,15 +331,19 @@ int recon_save_state(struct recon *recon, const struct checkpoint_sink *sink, st
 		code = recon->recipe.algorithm->save(&recon->problem, recon->algorithm_state, sink, err);
 	if (code == 0 && recon->ends != NULL)
 		code = sink->write(sink->context, ends_state(recon->ends), ends_state_bytes(recon->ends), err);
+	if (code == 0 && rim_state_bytes(recon->rim) > 0)
+		code = sink->write(sink->context, rim_state(recon->rim), rim_state_bytes(recon->rim), err);
 	return code;
 }
 
 int recon_resume_state(struct recon *recon, const char *bytes, size_t size, struct error *err)
 {
-	const size_t own = algorithm_bytes(recon);
+	const size_t own = algorithm_bytes(recon), whole = recon_state_bytes(recon);
+	/* The rim stands behind the rest where the run had one. */
+	const size_t rim = recon->rim != NULL ? rim_bytes(&recon->recipe.grid, &recon->orbit) : 0;
 	int code = 0;
 
-	if (!recon->resumed || size != recon_state_bytes(recon))
+	if (!recon->resumed || (size != whole && size != whole + rim))
 		return error_set(err, ERR_INVALID, "%zu bytes of an algorithm that holds %zu", size,
 				 recon_state_bytes(recon));
 	if (own > 0) {
@@ -327,6 +353,8 @@ int recon_resume_state(struct recon *recon, const char *bytes, size_t size, stru
 	}
 	if (code == 0 && recon->ends != NULL)
 		ends_resume(recon->ends, bytes + own);
+	if (code == 0 && size > whole)
+		code = rim_resume(recon->rim, bytes + whole, err);
 	return code;
 }
 

@@ -91,6 +91,22 @@ static int show_smoothed(struct recon *recon, struct volume_norms *norms, struct
 	return code;
 }
 
+/* The rim of the field of view as it is kept; `before`, which no iteration reads, has the iterate. */
+static int show_rim(struct recon *recon, struct volume_norms *norms, struct error *err)
+{
+	bool changed = false;
+	int code = 0;
+
+	if (rim_state_bytes(recon->rim) == 0 || recon->iteration == 0)
+		return 0;
+	if (recon->alternation == NULL)
+		code = recon->backend->volume_copy(recon->before, recon->volume, err);
+	if (code == 0)
+		code = rim_show(recon->rim, recon->backend, recon->volume, &changed, err);
+	recon->smoothed = recon->smoothed || changed;
+	return code == 0 && changed ? measure(recon, NULL, norms, err) : code;
+}
+
 /* The end slices of an iterate as they are kept; the last one's are told of where they are uncertain. */
 static int show_ends(struct recon *recon, struct volume_norms *norms, struct error *err)
 {
@@ -135,6 +151,8 @@ static int keep(struct recon *recon, const char *name, const char *stage, struct
 		return 0;
 	recon_tell_progress(recon, STAGE_SAVE, recon->iteration);
 	code = show_smoothed(recon, &kept.norms, err);
+	if (code == 0)
+		code = show_rim(recon, &kept.norms, err);
 	if (code == 0)
 		code = show_ends(recon, &kept.norms, err);
 	if (code == 0)
