@@ -59,6 +59,9 @@ umask 022
 main=$work/cbctd
 cp -a "$root" "$main"
 rm -f "$main/usr/bin/cbct-cuda"
+# Modes are those of a package, whatever the umask of the build was.
+find "$main" -type d ! -path "$main/etc/cbctd" -exec chmod 755 {} +
+find "$main/usr" -type f ! -perm /100 -exec chmod 644 {} +
 for program in "$main"/usr/bin/*; do strip --strip-unneeded "$program"; done
 find "$main/usr/share/man" -type f -name '*.[18]' -exec gzip -9n {} +
 needs=$(depends /nowhere "$main"/usr/bin/*)
