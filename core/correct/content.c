@@ -25,7 +25,7 @@ static const double ASIDE = 0.5; /* of half a row, from the median of all views'
 static const double NEAR = 15, SHORT[MEASURES] = {[ATTENUATION] = 91, [STRUCTURE] = 45};
 /* Standard deviations by which the spread of the blocks' means exceeds that of noise before it counts as structure. */
 static const double SIGNIFICANT = 5;
-enum { MOST = 3 };                   /* one view in so many */
+enum { MOST = 2 };                   /* one view in so many */
 static const double OUTSTANDING = 8; /* standard deviations of a pixel */
 
 void content_add(struct content_sums *sums, int block, float p)
