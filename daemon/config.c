@@ -143,6 +143,9 @@ static int setting_set(const struct setting *setting, struct config *config, con
 		return set_text(field(setting, config), value, add, err);
 
 	number = parse_amount(value, setting->kind == KIND_BYTES);
+	/* A part of a byte would become 0, which says something else. */
+	if (setting->kind == KIND_BYTES && number > 0 && number < 1)
+		number = NAN;
 	if (!(number >= setting->least && number <= setting->most) ||
 	    (setting->kind == KIND_INTEGER && number != floor(number)))
 		return error_set(err, ERR_INVALID, "%s: \"%s\" is not a%s from %g to %g%s", source, value,

@@ -70,7 +70,9 @@ static void drop_scan(struct api *api, struct stored_scan *scan, double now, dou
 
 	stored_scan_facts(scan, &facts);
 	changed = last_change(api, scan, facts.created);
-	if (facts.complete || facts.pinned || facts.deleted || now - changed <= seconds)
+	if (facts.asked > 0)
+		changed = fmax(changed, now - (clock_monotonic() - facts.asked));
+	if (facts.complete || facts.pinned || facts.deleted || now - changed <= seconds || stored_scan_in_use(scan))
 		return;
 	code = calibrations_check_scan(api->calibrations, id, &err);
 	if (code == 0)

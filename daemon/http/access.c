@@ -414,6 +414,14 @@ const struct identity *request_identity(const struct request *request)
 	return &request->who;
 }
 
+static bool is_loopback(const struct sockaddr_storage *address)
+{
+	if (address->ss_family == AF_INET)
+		return ntohl(((const struct sockaddr_in *)(const void *)address)->sin_addr.s_addr) >> 24 == 127;
+	return address->ss_family == AF_INET6 &&
+	       IN6_IS_ADDR_LOOPBACK(&((const struct sockaddr_in6 *)(const void *)address)->sin6_addr);
+}
+
 void request_client(const struct request *request, char ret_client[CLIENT_SIZE])
 {
 	const struct connection *connection = request->connection;
@@ -426,6 +434,8 @@ void request_client(const struct request *request, char ret_client[CLIENT_SIZE])
 	}
 	if (address->ss_family == AF_UNIX)
 		snprintf(text, sizeof(text), "uid-%u", (unsigned)connection->user);
+	else if (is_loopback(address)) /* whoever is on this machine may take any of its addresses */
+		snprintf(text, sizeof(text), "127.0.0.1");
 	else if (address->ss_family == AF_INET)
 		inet_ntop(AF_INET, &((const struct sockaddr_in *)(const void *)address)->sin_addr, text, sizeof(text));
 	else if (address->ss_family == AF_INET6)

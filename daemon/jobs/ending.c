@@ -131,6 +131,7 @@ static unsigned conditions_of(struct worker *worker, enum worker_end end)
 	conditions |= record.cancel_asked ? CONDITION_CANCELLED : 0;
 	conditions |= worker->failure_code != 0 ? CONDITION_UNRECORDED : 0;
 	conditions |= worker->failure_code == ERR_NO_SPACE ? CONDITION_FULL : 0;
+	conditions |= worker->failure_code == ERR_IO || worker->failure_code == ERR_NO_MEMORY ? CONDITION_TROUBLE : 0;
 	conditions |= worker_is_stale(worker) ? CONDITION_STALE : 0;
 	conditions |= worker->arriving != NULL ? CONDITION_ARRIVING : 0;
 	conditions |= worker->checkpoint > 0 ? CONDITION_RESUMED : 0;

@@ -76,7 +76,7 @@ struct client *jobs_client(struct jobs *jobs, const char *name);
 void job_share(struct job *job);
 /* The time of all that run is counted up to now. */
 void jobs_charge(struct jobs *jobs);
-/* ERR_LIMIT, ERR_BUSY, ERR_NO_SPACE: one more job of this client is too many. jobs->change is held. */
+/* ERR_LIMIT, ERR_BUSY, ERR_QUOTA: one more job of this client is too many. jobs->change is held. */
 int jobs_check_limits(struct jobs *jobs, const struct job *job, struct error *err);
 /* Bytes of the volumes that the job may make. */
 unsigned long long job_bytes_wanted(const struct job_request *request);

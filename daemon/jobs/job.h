@@ -56,7 +56,7 @@ int jobs_repeat(struct jobs *jobs, const char *key, const uint8_t digest[32], st
  * A new job of a resolved request, queued when the scan is ready and waiting
  * otherwise. The request is copied. key may be NULL; if the key was used
  * meanwhile, what jobs_repeat would say. *ret_new: false for such a repeat.
- * ERR_NOT_FOUND, pointer "/scan", when the scan was deleted meanwhile; ERR_LIMIT, ERR_BUSY, ERR_NO_SPACE where the
+ * ERR_NOT_FOUND, pointer "/scan", when the scan was deleted meanwhile; ERR_LIMIT, ERR_BUSY, ERR_QUOTA where the
  * client, or all of them, have as much as they may have.
  */
 int jobs_post(struct jobs *jobs, const struct job_request *request, struct stored_scan *scan,

@@ -29,6 +29,10 @@ static const struct row {
      CONDITION_UNRECORDED | CONDITION_FULL,
      0,
      {.to = BACK, .from = FROM_RECORDED, .obstacle = JOB_NO_SPACE, .words = WORDS_DAEMON}},
+    {ANY,
+     CONDITION_UNRECORDED | CONDITION_TROUBLE,
+     CONDITION_BROKEN,
+     {.to = BACK, .from = FROM_RECORDED, .crashed = true, .obstacle = JOB_DISK_TROUBLE, .words = WORDS_DAEMON}},
     {ANY, CONDITION_UNRECORDED, 0, {.to = JOB_FAILED, .words = WORDS_DAEMON}},
     /* A stale run comes back too: the job that begins again sees that its basis differs, and leaves the checkpoint. */
     {1 << END_MADE_ROOM, 0, 0, {.to = BACK, .from = FROM_SAID, .yielded = true, .reason = "it made room"}},

@@ -37,7 +37,8 @@ enum condition {
 	CONDITION_BROKEN = 1 << 6,     /* with this one, the job was broken off as often as it may be */
 	CONDITION_DOUBTED = 1 << 7,    /* time and again, no file of a scan that a worker found damaged was damaged */
 	CONDITION_ASKED = 1 << 8,      /* the worker was asked to make room */
-	CONDITION_ALL = (1 << 9) - 1
+	CONDITION_TROUBLE = 1 << 9,    /* with UNRECORDED: a file or memory could not be had, which may pass */
+	CONDITION_ALL = (1 << 10) - 1
 };
 
 /* The point from which the job goes on. */

@@ -135,13 +135,12 @@ int jobs_check_limits(struct jobs *jobs, const struct job *job, struct error *er
 {
 	const struct store_limits *limits = store_limits(jobs->store);
 	const char *client = job->record.client;
+	const long own = jobs_open_count(jobs, client), all = jobs_open_count(jobs, NULL);
 
-	if (limits->client_jobs > 0 && jobs_open_count(jobs, client) >= limits->client_jobs)
-		return error_set(err, ERR_LIMIT,
-				 "%.60s has %ld jobs that have not ended, which is as many as one client may have",
-				 client, limits->client_jobs);
-	if (limits->jobs > 0 && jobs_open_count(jobs, NULL) >= limits->jobs)
-		return error_set(err, ERR_BUSY, "%ld jobs have not ended, which is as many as there may be",
-				 limits->jobs);
+	if (limits->client_jobs > 0 && own >= limits->client_jobs)
+		return error_set(err, ERR_LIMIT, "jobs of %.60s that have not ended: %ld; one client may have %ld",
+				 client, own, limits->client_jobs);
+	if (limits->jobs > 0 && all >= limits->jobs)
+		return error_set(err, ERR_BUSY, "jobs that have not ended: %ld; there may be %ld", all, limits->jobs);
 	return store_check_volumes(jobs->store, client, job->kept_bytes, err);
 }

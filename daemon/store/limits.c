@@ -59,11 +59,24 @@ long store_scans_of(struct store *store, const char *client)
 
 int store_check_scans(struct store *store, const char *client, struct error *err)
 {
-	const long most = store->limits.client_scans;
+	const long most = store->limits.client_scans, own = most == 0 ? 0 : store_scans_of(store, client);
 
-	if (most == 0 || store_scans_of(store, client) < most)
+	if (most == 0 || own < most)
 		return 0;
-	return error_set(err, ERR_LIMIT, "%.60s has %ld scans, which is as many as one client may have", client, most);
+	return error_set(err, ERR_LIMIT, "scans of %.60s: %ld; one client may have %ld", client, own, most);
+}
+
+int store_check_size(struct store *store, unsigned long long bytes, struct error *err)
+{
+	const struct store_limits *limits = &store->limits;
+	unsigned long long most = limits->client_bytes;
+
+	if (most == 0 || (limits->bytes > 0 && limits->bytes < most))
+		most = limits->bytes;
+	if (most == 0 || bytes <= most)
+		return 0;
+	return error_set_at(err, ERR_IMPOSSIBLE, "/projections/count",
+			    "the projections are %llu bytes, of which one may have %llu", bytes, most);
 }
 
 /* used: of what there is without `more`. */
@@ -72,8 +85,8 @@ static int check_bytes(const char *whose, unsigned long long used, unsigned long
 {
 	if (most == 0 || (used <= most && more <= most - used))
 		return 0;
-	return error_set(err, ERR_NO_SPACE, "%llu bytes more are too many for %.60s: %llu of %llu are taken", more,
-			 whose, used, most);
+	return error_set(err, ERR_QUOTA, "%llu bytes more are too many for %.60s: %llu of %llu are taken", more, whose,
+			 used, most);
 }
 
 int store_check_volumes(struct store *store, const char *client, unsigned long long more, struct error *err)
@@ -89,7 +102,7 @@ int store_check_volumes(struct store *store, const char *client, unsigned long l
 	return code;
 }
 
-/* Counts the scan's bytes from here on. ERR_NO_SPACE, and they are not counted: a limit has no room for them. */
+/* Counts the scan's bytes from here on. ERR_QUOTA, and they are not counted: a limit has no room for them. */
 static int count_room(struct stored_scan *scan, struct error *err)
 {
 	struct store *store = scan->store;

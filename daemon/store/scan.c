@@ -357,6 +357,17 @@ int store_scan_list(struct store *store, const char *after, int limit, struct st
 	return 0;
 }
 
+bool stored_scan_in_use(struct stored_scan *scan)
+{
+	bool used;
+
+	/* The array's and the caller's are the other two. */
+	pthread_mutex_lock(&scan->store->scans_lock);
+	used = scan->references > 2;
+	pthread_mutex_unlock(&scan->store->scans_lock);
+	return used;
+}
+
 /* ---- making ---- */
 
 static int check_space(const struct store *store, unsigned long long bytes, struct error *err)
@@ -561,6 +572,9 @@ int store_scan_create(struct store *store, struct scan *parsed, const char *clie
 	scan->quantity = parsed->quantity;
 	scan->air = parsed->air;
 	code = store_check_scans(store, scan->client, err);
+	if (code == 0)
+		code = store_check_size(
+		    store, (unsigned long long)scan_projection_bytes(parsed) * (unsigned long long)parsed->count, err);
 	if (code == 0)
 		code = id_make(scan->id, err);
 	if (code != 0)

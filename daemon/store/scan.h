@@ -42,6 +42,7 @@ struct stored_scan {
 	int lost_count;
 	unsigned losses; /* since the start: projections that were stored and are not any more */
 	int received;
+	double asked;   /* monotonic: somebody came with one of them, new or not; 0: not since the start */
 	double arrived; /* monotonic: the last of them, 0: before the start */
 	enum progress image[IMAGE_COUNT];
 	uint8_t image_sha256[IMAGE_COUNT][32];
@@ -65,7 +66,11 @@ void scans_insert(struct store *store, struct stored_scan *scan);
 /* A reference, or NULL where there is no such scan. will_use: its parsed form is worth keeping. */
 struct stored_scan *scans_find(struct store *store, const char *id, bool will_use);
 
-/* ERR_LIMIT when the client has as many scans as it may have; store/limits.c. */
+/*
+ * store/limits.c. ERR_IMPOSSIBLE when a scan of that many bytes is beyond a limit whatever else there is; ERR_LIMIT
+ * when the client has as many scans as it may have.
+ */
+int store_check_size(struct store *store, unsigned long long bytes, struct error *err);
 int store_check_scans(struct store *store, const char *client, struct error *err);
 
 bool stored_scan_deleted(struct stored_scan *scan);

@@ -107,6 +107,7 @@ void stored_scan_facts(struct stored_scan *scan, struct scan_facts *ret)
 	ret->lost = scan->lost_count;
 	ret->losses = scan->losses;
 	ret->document_damaged = scan->document_damaged;
+	ret->asked = scan->asked;
 	ret->arrived = scan->arrived;
 	ret->basis = basis_of(scan);
 	ret->deleted = scan->deleted;

@@ -20,6 +20,7 @@ int stored_scan_claim(struct stored_scan *scan, int index, enum claim *ret_claim
 		return error_set(err, ERR_NOT_FOUND, "projection %d of a scan that has 0 .. %d", index,
 				 scan->count - 1);
 	pthread_mutex_lock(&scan->lock);
+	scan->asked = clock_monotonic();
 	if (scan->deleted) {
 		code = error_set(err, ERR_NOT_FOUND, "scan %s was deleted meanwhile", scan->id);
 	} else if (scan->progress[index] == MISSING && scan->closing && !scan->lost[index]) {

@@ -116,7 +116,7 @@ void store_count_volumes(struct store *store, unsigned long long (*bytes)(void *
 /* Bytes of scans that have room on the disk, and of volumes. client NULL: all. */
 unsigned long long store_bytes(struct store *store, const char *client);
 long store_scans_of(struct store *store, const char *client);
-/* ERR_NO_SPACE when a client cannot have that many bytes of volumes more. */
+/* ERR_QUOTA when a client cannot have that many bytes of volumes more. */
 int store_check_volumes(struct store *store, const char *client, unsigned long long more, struct error *err);
 
 /* ---- scans ---- */
@@ -188,6 +188,7 @@ struct scan_facts {
 	bool checked;                 /* its files are not being held against their checksums just now */
 	bool closed;                  /* by store_scan_close, with projections missing */
 	bool complete, convertible, ready;
+	double asked; /* when somebody came with one, new or not, seconds of CLOCK_MONOTONIC; 0: not since the start */
 	double arrived; /* when the last projection came, seconds of CLOCK_MONOTONIC; 0: none since the start */
 	bool pinned;    /* it stays whatever its age */
 	unsigned basis; /* another number: an image came or it was closed, what was made of its projections is void */
@@ -252,6 +253,8 @@ void store_unwatch_arrivals(struct store *store, struct watch *watch);
 enum { VIEWS_LEAST = 2 }; /* an arc has two ends */
 int store_scan_close(struct store *store, struct stored_scan *scan, struct error *err);
 
+/* Somebody else refers to it just now: an upload that may take its time, a job that begins. */
+bool stored_scan_in_use(struct stored_scan *scan);
 /* A pinned scan stays whatever its age. ERR_NOT_FOUND: it was deleted. */
 int store_scan_pin(struct store *store, struct stored_scan *scan, bool pinned, struct error *err);
 
@@ -275,8 +278,8 @@ void stored_scan_unclaim(struct stored_scan *scan, int index);
 
 /*
  * Room on the disk for all of the scan's projections, taken once, before the first of them is written to this
- * descriptor of projections.raw: no projection fails half-way on a full disk. ERR_NO_SPACE when the disk or a limit has
- * no room.
+ * descriptor of projections.raw: no projection fails half-way on a full disk. ERR_NO_SPACE when the disk has no room,
+ * ERR_QUOTA when a limit has none.
  */
 int stored_scan_take_room(struct stored_scan *scan, int descriptor, struct error *err);
 

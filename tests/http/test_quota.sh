@@ -47,7 +47,7 @@ test_scans_of_a_client() {
 	new_scan 201
 	new_scan 429
 	retry_after
-	expect_json '.type == "urn:cbctd:problem:limit-reached" and (.detail | contains("2 scans"))'
+	expect_json '.type == "urn:cbctd:problem:limit-reached" and (.detail | contains("scans of a: 2; one client may have 2"))'
 	as b
 	new_scan 201
 	expect_json '.client == "b"'
@@ -82,7 +82,7 @@ test_jobs_that_have_not_ended() {
 }
 
 test_bytes_are_taken_when_they_come() {
-	local free before
+	local first second option
 	limited --client-bytes $((2 * bytes))
 	new_scan 201 && first=$scan
 	new_scan 201 && second=$scan
@@ -94,7 +94,7 @@ test_bytes_are_taken_when_they_come() {
 	scan=$first && fill 201
 	scan=$second && fill 507
 	retry_after
-	expect_json '.detail | contains("are too many for a")'
+	expect_json '.type == "urn:cbctd:problem:limit-of-bytes" and (.detail | contains("are too many for a"))'
 	ask GET "/v1/scans/$second"
 	expect_json '.received_count == 0'
 	ask GET /v1/limits
@@ -106,6 +106,14 @@ test_bytes_are_taken_when_they_come() {
 	ask DELETE "/v1/scans/$first"
 	expect_status 204
 	scan=$second && fill 201
+	# What can never have room is refused when it is announced.
+	stop_daemon
+	start_daemon --tokens "$work/tokens" --client-bytes $((bytes - 1))
+	new_scan 422
+	expect_problem 422 /projections/count
+	for option in --client-bytes --max-bytes; do
+		! "$BUILD/cbctd" $option 0.5 --print-config >/dev/null 2>&1 || fail "$option 0.5 refused: that is no limit"
+	done
 }
 
 test_volumes_leave_room_for_acquisition() {

@@ -13,7 +13,8 @@ enum {
 	RESUMED = CONDITION_RESUMED,
 	BROKEN = CONDITION_BROKEN,
 	DOUBTED = CONDITION_DOUBTED,
-	ASKED = CONDITION_ASKED
+	ASKED = CONDITION_ASKED,
+	TROUBLE = CONDITION_TROUBLE
 };
 
 /* In the order of the table; a case names the row that is to decide it. */
@@ -54,42 +55,51 @@ static const struct {
      END_DIED,
      FULL | BROKEN,
      {.to = JOB_QUEUED, .from = FROM_RECORDED, .obstacle = JOB_NO_SPACE, .words = WORDS_DAEMON}},
-    {5, END_OTHER, UNRECORDED, {.to = JOB_FAILED, .words = WORDS_DAEMON}},
-    {5, END_DONE, UNRECORDED | STALE, {.to = JOB_FAILED, .words = WORDS_DAEMON}},
-    {5, END_DIED, UNRECORDED | ARRIVING, {.to = JOB_FAILED, .words = WORDS_DAEMON}},
+    {5,
+     END_OTHER,
+     UNRECORDED | TROUBLE,
+     {.to = JOB_QUEUED, .from = FROM_RECORDED, .crashed = true, .obstacle = JOB_DISK_TROUBLE, .words = WORDS_DAEMON}},
+    {5,
+     END_DONE,
+     UNRECORDED | TROUBLE | ARRIVING,
+     {.to = JOB_WAITING, .from = FROM_RECORDED, .crashed = true, .obstacle = JOB_DISK_TROUBLE, .words = WORDS_DAEMON}},
+    {6, END_OTHER, UNRECORDED | TROUBLE | BROKEN, {.to = JOB_FAILED, .words = WORDS_DAEMON}},
+    {6, END_OTHER, UNRECORDED, {.to = JOB_FAILED, .words = WORDS_DAEMON}},
+    {6, END_DONE, UNRECORDED | STALE, {.to = JOB_FAILED, .words = WORDS_DAEMON}},
+    {6, END_DIED, UNRECORDED | ARRIVING, {.to = JOB_FAILED, .words = WORDS_DAEMON}},
     /* It made room. */
-    {6, END_MADE_ROOM, ASKED, {.to = JOB_QUEUED, .from = FROM_SAID, .yielded = true}},
-    {6, END_MADE_ROOM, ARRIVING | ASKED, {.to = JOB_WAITING, .from = FROM_SAID, .yielded = true}},
-    {6, END_MADE_ROOM, STALE, {.to = JOB_QUEUED, .from = FROM_SAID, .yielded = true}},
+    {7, END_MADE_ROOM, ASKED, {.to = JOB_QUEUED, .from = FROM_SAID, .yielded = true}},
+    {7, END_MADE_ROOM, ARRIVING | ASKED, {.to = JOB_WAITING, .from = FROM_SAID, .yielded = true}},
+    {7, END_MADE_ROOM, STALE, {.to = JOB_QUEUED, .from = FROM_SAID, .yielded = true}},
     /* The scan is understood otherwise. */
-    {7, END_OTHER, STALE, {.to = JOB_QUEUED}},
-    {7, END_OTHER, STALE | ARRIVING, {.to = JOB_WAITING}},
-    {7, END_DONE, STALE, {.to = JOB_QUEUED}},
-    {7, END_DIED, STALE | BROKEN, {.to = JOB_QUEUED}},
-    {7, END_DAMAGED, STALE | DOUBTED, {.to = JOB_QUEUED}},
+    {8, END_OTHER, STALE, {.to = JOB_QUEUED}},
+    {8, END_OTHER, STALE | ARRIVING, {.to = JOB_WAITING}},
+    {8, END_DONE, STALE, {.to = JOB_QUEUED}},
+    {8, END_DIED, STALE | BROKEN, {.to = JOB_QUEUED}},
+    {8, END_DAMAGED, STALE | DOUBTED, {.to = JOB_QUEUED}},
     /* The disk is full. */
-    {8, END_NO_SPACE, 0, {.to = JOB_QUEUED, .from = FROM_RECORDED, .obstacle = JOB_NO_SPACE}},
-    {8, END_NO_SPACE, ARRIVING | BROKEN, {.to = JOB_WAITING, .from = FROM_RECORDED, .obstacle = JOB_NO_SPACE}},
+    {9, END_NO_SPACE, 0, {.to = JOB_QUEUED, .from = FROM_RECORDED, .obstacle = JOB_NO_SPACE}},
+    {9, END_NO_SPACE, ARRIVING | BROKEN, {.to = JOB_WAITING, .from = FROM_RECORDED, .obstacle = JOB_NO_SPACE}},
     /* Broken off as often as may be. */
-    {9, END_DIED, BROKEN, {.to = JOB_FAILED, .crashed = true}},
-    {9, END_DEVICE, BROKEN, {.to = JOB_FAILED, .crashed = true}},
-    {9, END_IO, BROKEN | ARRIVING, {.to = JOB_FAILED, .crashed = true}},
+    {10, END_DIED, BROKEN, {.to = JOB_FAILED, .crashed = true}},
+    {10, END_DEVICE, BROKEN, {.to = JOB_FAILED, .crashed = true}},
+    {10, END_IO, BROKEN | ARRIVING, {.to = JOB_FAILED, .crashed = true}},
     /* Broken off, and tried again. */
-    {10, END_DIED, 0, {.to = JOB_QUEUED, .from = FROM_RECORDED, .crashed = true}},
-    {10, END_DIED, ARRIVING, {.to = JOB_WAITING, .from = FROM_RECORDED, .crashed = true}},
-    {10, END_DEVICE, RESUMED, {.to = JOB_QUEUED, .from = FROM_RECORDED, .crashed = true}},
-    {11, END_IO, 0, {.to = JOB_QUEUED, .from = FROM_RECORDED, .crashed = true, .obstacle = JOB_DISK_TROUBLE}},
-    {11, END_IO, ARRIVING, {.to = JOB_WAITING, .from = FROM_RECORDED, .crashed = true, .obstacle = JOB_DISK_TROUBLE}},
+    {11, END_DIED, 0, {.to = JOB_QUEUED, .from = FROM_RECORDED, .crashed = true}},
+    {11, END_DIED, ARRIVING, {.to = JOB_WAITING, .from = FROM_RECORDED, .crashed = true}},
+    {11, END_DEVICE, RESUMED, {.to = JOB_QUEUED, .from = FROM_RECORDED, .crashed = true}},
+    {12, END_IO, 0, {.to = JOB_QUEUED, .from = FROM_RECORDED, .crashed = true, .obstacle = JOB_DISK_TROUBLE}},
+    {12, END_IO, ARRIVING, {.to = JOB_WAITING, .from = FROM_RECORDED, .crashed = true, .obstacle = JOB_DISK_TROUBLE}},
     /* The scan is damaged, or the worker's memory. */
-    {12, END_DAMAGED, DOUBTED, {.to = JOB_FAILED}},
-    {13, END_DAMAGED, 0, {.to = JOB_WAITING, .check_scan = true}},
-    {13, END_DAMAGED, ARRIVING | BROKEN, {.to = JOB_WAITING, .check_scan = true}},
+    {13, END_DAMAGED, DOUBTED, {.to = JOB_FAILED}},
+    {14, END_DAMAGED, 0, {.to = JOB_WAITING, .check_scan = true}},
+    {14, END_DAMAGED, ARRIVING | BROKEN, {.to = JOB_WAITING, .check_scan = true}},
     /* The checkpoint is damaged. */
-    {14, END_INVALID, RESUMED, {.to = JOB_QUEUED, .warn = true}},
+    {15, END_INVALID, RESUMED, {.to = JOB_QUEUED, .warn = true}},
     /* Anything else is the job's own failure. */
-    {15, END_INVALID, 0, {.to = JOB_FAILED}},
-    {15, END_OTHER, 0, {.to = JOB_FAILED}},
-    {15, END_OTHER, ARRIVING | RESUMED | BROKEN | DOUBTED | ASKED, {.to = JOB_FAILED}},
+    {16, END_INVALID, 0, {.to = JOB_FAILED}},
+    {16, END_OTHER, 0, {.to = JOB_FAILED}},
+    {16, END_OTHER, ARRIVING | RESUMED | BROKEN | DOUBTED | ASKED, {.to = JOB_FAILED}},
 };
 enum { CASES = sizeof(cases) / sizeof(cases[0]) };
 
@@ -123,7 +133,7 @@ START_TEST(each_row_decides_a_case)
 }
 END_TEST
 
-/* All 5632 combinations of an end and conditions. */
+/* All 11264 combinations of an end and conditions. */
 START_TEST(what_holds_for_every_end)
 {
 	enum worker_end end = (enum worker_end)_i;

@@ -1,0 +1,245 @@
+/*
+ * One call that fails, for tests: loaded with LD_PRELOAD into the daemon and its workers. CBCT_EVERY is
+ *
+ *   PROGRAM CALL N KIND FILE
+ *
+ * and the N-th CALL (write, pwrite, fsync, fdatasync, rename, link, mmap, fallocate, open, read, pread, accept, malloc)
+ * of a process of PROGRAM ("cbctd", "cbct-worker"; the held ones too) fails, once: KIND is an error number, or "short"
+ * for half of the bytes. FILE.fired is made then, and while it is there no other process fails. FILE.count grows by a
+ * byte for each call of the program that N would count. The C library's own calls (stdio) are not seen.
+ */
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <stdarg.h>
+#include <stdatomic.h>
+#include <stdbool.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/mman.h>
+#include <sys/socket.h>
+#include <sys/stat.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+extern void *__libc_malloc(size_t size);
+extern void *__libc_calloc(size_t count, size_t size);
+extern void *__libc_realloc(void *memory, size_t size);
+
+static char wanted[32], fired[600];
+static long number;
+static int error_number; /* 0: short */
+static int counter = -1; /* descriptor of FILE.count */
+static atomic_long calls;
+
+__attribute__((constructor)) static void arm(void)
+{
+	const char *text = getenv("CBCT_EVERY");
+	char program[32], kind[16], file[500], count[600];
+
+	if (text == NULL || sscanf(text, "%31s %31s %ld %15s %499s", program, wanted, &number, kind, file) != 5 ||
+	    strncmp(program_invocation_short_name, program, strlen(program)) != 0) {
+		wanted[0] = '\0';
+		return;
+	}
+	error_number = atoi(kind);
+	snprintf(fired, sizeof(fired), "%s.fired", file);
+	snprintf(count, sizeof(count), "%s.count", file);
+	counter = (int)syscall(SYS_openat, AT_FDCWD, count, O_WRONLY | O_CREAT | O_APPEND | O_CLOEXEC, 0600);
+}
+
+/* Counts a call; true when this is the one. Nothing here goes through what is wrapped. */
+static bool is_it(const char *call)
+{
+	int saved = errno;
+	long file;
+
+	if (wanted[0] == '\0' || strcmp(call, wanted) != 0)
+		return false;
+	if (number == 0)
+		syscall(SYS_write, counter, "x", 1);
+	if (atomic_fetch_add(&calls, 1) + 1 != number) {
+		errno = saved;
+		return false;
+	}
+	file = syscall(SYS_openat, AT_FDCWD, fired, O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, 0600);
+	if (file >= 0)
+		syscall(SYS_close, (int)file);
+	errno = saved;
+	return file >= 0;
+}
+
+/*
+ * A file or a socket. Writes to an eventfd or to a pipe that the same process reads, which wake a thread, do not fail
+ * like that in any system.
+ */
+static bool is_storage(int file)
+{
+	struct stat status;
+
+	return fstat(file, &status) == 0 && (S_ISREG(status.st_mode) || S_ISSOCK(status.st_mode));
+}
+
+#define REAL(name) ((__typeof__(&name))dlsym(RTLD_NEXT, #name))
+
+/* With `short`, the real call gets half of the bytes. */
+#define FAIL(call)                                                                                                     \
+	do {                                                                                                           \
+		if (is_it(call)) {                                                                                     \
+			errno = error_number;                                                                          \
+			return -1;                                                                                     \
+		}                                                                                                      \
+	} while (0)
+#define FAIL_OR_HALVE(call, size)                                                                                      \
+	do {                                                                                                           \
+		if (is_it(call)) {                                                                                     \
+			if (error_number != 0) {                                                                       \
+				errno = error_number;                                                                  \
+				return -1;                                                                             \
+			}                                                                                              \
+			size = size > 1 ? size / 2 : size;                                                             \
+		}                                                                                                      \
+	} while (0)
+
+ssize_t write(int file, const void *from, size_t size)
+{
+	if (is_storage(file))
+		FAIL_OR_HALVE("write", size);
+	return REAL(write)(file, from, size);
+}
+
+ssize_t pwrite(int file, const void *from, size_t size, off_t offset)
+{
+	FAIL_OR_HALVE("pwrite", size);
+	return REAL(pwrite)(file, from, size, offset);
+}
+
+ssize_t pwrite64(int file, const void *from, size_t size, off64_t offset)
+{
+	FAIL_OR_HALVE("pwrite", size);
+	return REAL(pwrite64)(file, from, size, offset);
+}
+
+ssize_t read(int file, void *to, size_t size)
+{
+	if (is_storage(file))
+		FAIL_OR_HALVE("read", size);
+	return REAL(read)(file, to, size);
+}
+
+ssize_t pread(int file, void *to, size_t size, off_t offset)
+{
+	FAIL_OR_HALVE("pread", size);
+	return REAL(pread)(file, to, size, offset);
+}
+
+ssize_t pread64(int file, void *to, size_t size, off64_t offset)
+{
+	FAIL_OR_HALVE("pread", size);
+	return REAL(pread64)(file, to, size, offset);
+}
+
+int fsync(int file)
+{
+	FAIL("fsync");
+	return REAL(fsync)(file);
+}
+
+int fdatasync(int file)
+{
+	FAIL("fdatasync");
+	return REAL(fdatasync)(file);
+}
+
+int rename(const char *from, const char *to)
+{
+	FAIL("rename");
+	return REAL(rename)(from, to);
+}
+
+int link(const char *from, const char *to)
+{
+	FAIL("link");
+	return REAL(link)(from, to);
+}
+
+int fallocate(int file, int mode, off_t offset, off_t length)
+{
+	FAIL("fallocate");
+	return REAL(fallocate)(file, mode, offset, length);
+}
+
+int accept4(int socket, struct sockaddr *address, socklen_t *length, int flags)
+{
+	FAIL("accept");
+	return REAL(accept4)(socket, address, length, flags);
+}
+
+void *mmap(void *at, size_t size, int protection, int flags, int file, off_t offset)
+{
+	if (is_it("mmap")) {
+		errno = error_number;
+		return MAP_FAILED;
+	}
+	return REAL(mmap)(at, size, protection, flags, file, offset);
+}
+
+static mode_t mode_of(int flags, va_list arguments)
+{
+	return (flags & (O_CREAT | O_TMPFILE)) != 0 ? va_arg(arguments, mode_t) : 0;
+}
+
+int open(const char *path, int flags, ...)
+{
+	va_list arguments;
+	mode_t mode;
+
+	va_start(arguments, flags);
+	mode = mode_of(flags, arguments);
+	va_end(arguments);
+	FAIL("open");
+	return REAL(open)(path, flags, mode);
+}
+
+int open64(const char *path, int flags, ...)
+{
+	va_list arguments;
+	mode_t mode;
+
+	va_start(arguments, flags);
+	mode = mode_of(flags, arguments);
+	va_end(arguments);
+	FAIL("open");
+	return REAL(open64)(path, flags, mode);
+}
+
+/* ---- memory ---- */
+
+void *malloc(size_t size)
+{
+	if (is_it("malloc")) {
+		errno = ENOMEM;
+		return NULL;
+	}
+	return __libc_malloc(size);
+}
+
+void *calloc(size_t count, size_t size)
+{
+	if (is_it("malloc")) {
+		errno = ENOMEM;
+		return NULL;
+	}
+	return __libc_calloc(count, size);
+}
+
+void *realloc(void *memory, size_t size)
+{
+	if (is_it("malloc")) {
+		errno = ENOMEM;
+		return NULL;
+	}
+	return __libc_realloc(memory, size);
+}

@@ -1,0 +1,228 @@
+#!/usr/bin/env python3
+"""One call after the other of the daemon and its worker fails once, in a small scan from POST to download.
+
+every.py BUILD WORK [--stride K] [--seconds S] [PROGRAM:CALL:KIND ...]
+
+A reference run counts the calls. Then each N-th of them (in steps of K; by default all) fails in a run of its own, with
+build/every.so (tests/http/every.c). What holds in each: no program ends by a signal that was not sent, nothing hangs,
+whatever was acknowledged is there and has the right bytes, also after a restart, a volume has the bits of the reference,
+and a job that was acknowledged ends as succeeded. Prints a row for each PROGRAM:CALL:KIND; exit status 1 when something
+did not hold.
+"""
+import argparse
+import http.client
+import json
+import os
+import random
+import shutil
+import signal
+import struct
+import subprocess
+import sys
+import time
+from typing import Dict, List, Optional, Tuple
+
+EIO, EINTR, ENOSPC, EMFILE, ENOMEM = 5, 4, 28, 24, 12
+KINDS = {
+    "write": [EIO, EINTR, "short"], "pwrite": [EIO, EINTR, "short"], "read": [EIO, EINTR, "short"],
+    "pread": [EIO, EINTR, "short"], "fsync": [EIO], "fdatasync": [EIO], "rename": [EIO], "link": [EIO],
+    "mmap": [ENOMEM], "fallocate": [ENOSPC, EINTR], "open": [EMFILE, EINTR], "accept": [EMFILE, EINTR],
+    "malloc": [ENOMEM],
+}
+VIEWS, COLUMNS, ROWS = 8, 24, 16
+SCAN = {
+    "detector": {"columns": COLUMNS, "rows": ROWS, "pixel_mm": [4, 4]},
+    "projections": {"count": VIEWS, "sample": "float32", "quantity": "line_integral"},
+    "geometry": {"kind": "circular", "source_to_isocentre_mm": 600, "source_to_detector_mm": 1000,
+                 "first_angle_deg": 0, "angle_step_deg": 360 / VIEWS},
+}
+JOB = {"grid": {"size": [16, 16, 8], "spacing_mm": [4, 4, 6]}, "fdk": {},
+       "sart": {"iterations": 2, "subsets": 2}, "emit": ["fdk"]}
+PATIENCE = 60.0  # s that no step of a run takes, on a machine however loaded
+rng = random.Random(1)
+VIEW = [struct.pack(f"<{COLUMNS * ROWS}f", *(rng.random() for _ in range(COLUMNS * ROWS))) for _ in range(VIEWS)]
+
+
+class Gone(Exception):
+    """The daemon has ended."""
+
+
+class Daemon:
+    def __init__(self, build: str, work: str, every: Optional[str]) -> None:
+        environment = dict(os.environ, OMP_NUM_THREADS="1")
+        if every is not None:
+            environment.update(LD_PRELOAD=f"{build}/every.so", CBCT_EVERY=every)
+        self.out = open(f"{work}/out", "w+b")
+        self.err = open(f"{work}/err", "ab")
+        self.process = subprocess.Popen(
+            [f"{build}/cbctd", "--listen", "127.0.0.1:0", "--state-dir", f"{work}/state", "--backend", "cpu",
+             "--threads", "1"], stdout=self.out, stderr=self.err, env=environment)
+        self.port = 0
+        end = time.monotonic() + PATIENCE
+        while self.port == 0 and self.process.poll() is None:
+            text = open(f"{work}/out", "rb").read().decode()
+            if text.startswith("listening on ") and text.endswith("\n"):
+                self.port = int(text.rsplit(":", 1)[1].strip().rstrip("/"))
+            elif time.monotonic() > end:
+                raise AssertionError("the daemon hangs at its start")
+            else:
+                time.sleep(0.005)
+
+    def ask(self, method: str, path: str, body: Optional[bytes] = None, headers: Dict[str, str] = {}) -> Tuple[int, bytes]:
+        """A reply, or 0 where the connection broke though the daemon lives."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE)
+        try:
+            connection.request(method, path, body, headers)
+            reply = connection.getresponse()
+            return reply.status, reply.read()
+        except TimeoutError:
+            raise AssertionError(f"{method} {path} hangs") from None
+        except (http.client.HTTPException, OSError):
+            if self.process.poll() is not None:
+                raise Gone from None
+            time.sleep(0.05)
+            if self.process.poll() is not None:
+                raise Gone from None
+            return 0, b""
+        finally:
+            connection.close()
+
+    def insist(self, method: str, path: str, body: Optional[bytes] = None, headers: Dict[str, str] = {}) -> bytes:
+        """What a client does: it asks again where that helps. One call fails; the next try meets none."""
+        for _ in range(40):
+            status, reply = self.ask(method, path, body, headers)
+            if 200 <= status < 300:
+                return reply
+            if 400 <= status < 500:
+                raise AssertionError(f"{method} {path}: {status} {reply[:300]!r}")
+            time.sleep(0.05)
+        raise AssertionError(f"{method} {path} does not go on: {status} {reply[:300]!r}")
+
+    def stop(self) -> int:
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGTERM)
+        try:
+            return self.process.wait(PATIENCE)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+            raise AssertionError("the daemon hangs at its stop") from None
+        finally:
+            self.out.close()
+            self.err.close()
+
+
+class Client:
+    """Knows what was acknowledged, and goes on from there with another daemon."""
+
+    def __init__(self) -> None:
+        self.scan = self.job = ""
+        self.views: List[int] = []
+
+    def run(self, daemon: Daemon) -> bytes:
+        headers = {"Content-Type": "application/json", "Idempotency-Key": "scan"}
+        if not self.scan:
+            self.scan = json.loads(daemon.insist("POST", "/v1/scans", json.dumps(SCAN).encode(), headers))["id"]
+        for view in self.views:
+            self.check(daemon, view)
+        for view in range(VIEWS):
+            if view not in self.views:
+                daemon.insist("PUT", f"/v1/scans/{self.scan}/projections/{view}", VIEW[view])
+                self.views.append(view)
+        if not self.job:
+            body = json.dumps({**JOB, "scan": self.scan}).encode()
+            self.job = json.loads(daemon.insist("POST", "/v1/jobs", body, {**headers, "Idempotency-Key": "job"}))["id"]
+        end = time.monotonic() + PATIENCE
+        while True:
+            job = json.loads(daemon.insist("GET", f"/v1/jobs/{self.job}?wait=5"))
+            if job["state"] in ("succeeded", "failed", "cancelled"):
+                break
+            assert time.monotonic() < end, f"the job goes on for ever: {job['state']} {job['waiting_for']}"
+        assert job["state"] == "succeeded", f"the job {job['state']}: {job['error']}"
+        self.check(daemon, VIEWS - 1)
+        return daemon.insist("GET", f"/v1/jobs/{self.job}/volumes/final?format=raw")
+
+    def check(self, daemon: Daemon, view: int) -> None:
+        got = daemon.insist("GET", f"/v1/scans/{self.scan}/projections/{view}")
+        assert got == VIEW[view], f"projection {view} was acknowledged and has other bytes"
+
+
+def ended(status: int, what: str) -> None:
+    assert status >= 0, f"{what} ended by signal {-status}"
+    assert status in (0, 1), f"{what} ended with {status}"
+
+
+def one_run(build: str, work: str, every: Optional[str]) -> bytes:
+    """The volume, of a run in which at most one call fails, and of what is there after it."""
+    shutil.rmtree(f"{work}/state", ignore_errors=True)
+    open(f"{work}/err", "w").close()
+    client, volume = Client(), None
+    daemon = Daemon(build, work, every)
+    try:
+        if daemon.port != 0:
+            volume = client.run(daemon)
+    except Gone:
+        pass
+    except BaseException:
+        daemon.process.kill()
+        daemon.stop()
+        raise
+    ended(daemon.stop(), "the daemon")
+    daemon = Daemon(build, work, None)
+    try:
+        assert daemon.port != 0, "the daemon does not start again"
+        again = client.run(daemon)
+    except Gone:
+        raise AssertionError("the daemon ended without a fault") from None
+    finally:
+        status = daemon.stop()
+    ended(status, "the daemon")
+    assert volume is None or volume == again, "the volume has other bytes after a restart"
+    return again
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("build")
+    parser.add_argument("work")
+    parser.add_argument("--stride", type=int, default=1)
+    parser.add_argument("--seconds", type=float, default=1e9, help="ends after that, wherever it is")
+    parser.add_argument("what", nargs="*")
+    options = parser.parse_intermixed_args()
+    shutil.rmtree(options.work, ignore_errors=True)
+    os.makedirs(options.work)
+    mark = f"{options.work}/call"
+    reference = one_run(options.build, options.work, None)
+    end, wrong, total = time.monotonic() + options.seconds, 0, 0
+    what = options.what or [f"{p}:{c}:{k}" for p in ("cbctd", "cbct-worker") for c in KINDS for k in KINDS[c]]
+    counts: Dict[str, int] = {}
+    for row in what:
+        program, call, kind = row.split(":")
+        if f"{program}:{call}" not in counts:
+            if os.path.exists(f"{mark}.count"):
+                os.unlink(f"{mark}.count")
+            one_run(options.build, options.work, f"{program} {call} 0 0 {mark}")
+            counts[f"{program}:{call}"] = os.path.getsize(f"{mark}.count") if os.path.exists(f"{mark}.count") else 0
+        count, bad, runs, hit = counts[f"{program}:{call}"], 0, 0, 0
+        for number in range(1 + options.stride // 2 if count > options.stride else 1, count + 1, options.stride):
+            if time.monotonic() > end:
+                break
+            if os.path.exists(f"{mark}.fired"):
+                os.unlink(f"{mark}.fired")
+            runs += 1
+            try:
+                assert one_run(options.build, options.work, f"{program} {call} {number} {kind} {mark}") == reference, \
+                    "the volume has other bits"
+            except AssertionError as error:
+                bad += 1
+                print(f"  {row}:{number}: {error}", flush=True)
+            hit += os.path.exists(f"{mark}.fired")
+        wrong += bad
+        total += hit
+        print(f"{row:28} {count:6} calls, {runs:5} runs, {hit:5} failed calls, {bad:3} did not hold", flush=True)
+    print(f"{total} calls failed, {wrong} runs did not hold")
+    return wrong > 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
