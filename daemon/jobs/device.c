@@ -163,6 +163,9 @@ void device_tell_fallback(struct supervise *supervise, struct worker *worker, in
 	struct error ignored;
 	int index = job_trial(worker->job)->worker;
 
+	/* A run that was lost on the processor has been told of at its beginning. */
+	if (index == worker->index)
+		return;
 	if (job_trial(worker->job)->processor)
 		snprintf(last, sizeof(last), "device %d failed (%.120s)", supervise->devices[index],
 			 supervise->workers[index].last_error);

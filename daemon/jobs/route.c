@@ -5,7 +5,8 @@ static const double TEST_FIRST = 60, TEST_LAST = 3600; /* s */
 
 enum route route_of(const struct route_facts *facts)
 {
-	if (!facts->device_error && facts->deaths < ROUTE_DEATHS)
+	/* Runs that are lost on devices in turn are never two on one of them. */
+	if (!facts->device_error && facts->deaths < ROUTE_DEATHS && facts->runs < ROUTE_RUNS_MOST)
 		return ROUTE_SAME;
 	if (facts->other && facts->runs < ROUTE_RUNS_MOST)
 		return ROUTE_OTHER;

@@ -32,6 +32,24 @@ static unsigned long long all_projections(const struct stored_scan *scan)
 	return (unsigned long long)stored_scan_bytes(scan) * (unsigned long long)scan->count;
 }
 
+/* Of its flat, dark and defects, also those that are being written. */
+static unsigned long long images_of(struct stored_scan *scan)
+{
+	unsigned long long sum = 0;
+
+	pthread_mutex_lock(&scan->lock);
+	for (int image = 0; image < IMAGE_COUNT; image++)
+		sum += scan->image[image] != MISSING ? stored_image_bytes(scan, image) : 0;
+	pthread_mutex_unlock(&scan->lock);
+	return sum;
+}
+
+/* With store.scans_lock held. */
+static unsigned long long room_of(struct stored_scan *scan)
+{
+	return (scan->has_room ? all_projections(scan) : 0) + images_of(scan);
+}
+
 unsigned long long store_bytes(struct store *store, const char *client)
 {
 	unsigned long long sum =
@@ -39,8 +57,8 @@ unsigned long long store_bytes(struct store *store, const char *client)
 
 	pthread_mutex_lock(&store->scans_lock);
 	for (int i = 0; i < store->scan_count; i++) {
-		if (store->scans[i]->has_room && is_of(store->scans[i], client))
-			sum += all_projections(store->scans[i]);
+		if (is_of(store->scans[i], client))
+			sum += room_of(store->scans[i]);
 	}
 	pthread_mutex_unlock(&store->scans_lock);
 	return sum;
@@ -119,10 +137,10 @@ static int count_room(struct stored_scan *scan, struct error *err)
 	pthread_mutex_lock(&store->scans_lock);
 	counted = scan->has_room;
 	for (int i = 0; i < store->scan_count && !counted; i++) {
-		const struct stored_scan *other = store->scans[i];
+		const unsigned long long room = room_of(store->scans[i]);
 
-		all += other->has_room ? all_projections(other) : 0;
-		own += other->has_room && is_of(other, scan->client) ? all_projections(other) : 0;
+		all += room;
+		own += is_of(store->scans[i], scan->client) ? room : 0;
 	}
 	if (!counted)
 		code = check_bytes(scan->client, own, more, limits->client_bytes, err);
@@ -131,6 +149,23 @@ static int count_room(struct stored_scan *scan, struct error *err)
 	if (code == 0)
 		scan->has_room = true;
 	pthread_mutex_unlock(&store->scans_lock);
+	return code;
+}
+
+int store_check_image_room(struct stored_scan *scan, enum image image, struct error *err)
+{
+	struct store *store = scan->store;
+	const struct store_limits *limits = &store->limits;
+	int code = 0;
+
+	/* The image is counted already. */
+	if (limits->client_bytes > 0)
+		code = check_bytes(scan->client, store_bytes(store, scan->client), 0, limits->client_bytes, err);
+	if (code == 0 && limits->bytes > 0)
+		code = check_bytes("the daemon", store_bytes(store, NULL), 0, limits->bytes, err);
+	if (code != 0)
+		error_set(err, code, "the %s of %zu bytes goes beyond a limit of bytes", image_kinds[image].title,
+			  stored_image_bytes(scan, image));
 	return code;
 }
 

@@ -124,5 +124,7 @@ int store_check_part(const struct stored_scan *scan, enum sums_part part, const 
 		     struct error *err);
 /* A stored image is read; ERR_DAMAGED: it does not fit its SHA-256, and is lost now. */
 int store_check_image(struct stored_scan *scan, enum image image, struct error *err);
+/* ERR_QUOTA when an image that is being written goes beyond a limit of bytes. */
+int store_check_image_room(struct stored_scan *scan, enum image image, struct error *err);
 
 #endif

@@ -204,7 +204,9 @@ int store_put_image(struct store *store, struct stored_scan *scan, enum image im
 		if (code != 0)
 			return code;
 	}
-	code = write_image(store, scan, image, pixels, sha256, err);
+	code = store_check_image_room(scan, image, err);
+	if (code == 0)
+		code = write_image(store, scan, image, pixels, sha256, err);
 	pthread_mutex_lock(&scan->lock);
 	scan->image[image] = code == 0 ? STORED : MISSING;
 	if (code == 0) {

@@ -103,7 +103,7 @@ enum { STORE_CLIENT_SIZE = 80 };
 struct store_limits {
 	long jobs, client_jobs; /* that have not ended */
 	long client_scans;
-	unsigned long long bytes, client_bytes; /* of projections and kept volumes */
+	unsigned long long bytes, client_bytes; /* of projections, images and kept volumes */
 };
 /* A share of the bytes that volumes may not take: what is being acquired cannot be had again. */
 #define STORE_ACQUISITION_SHARE 0.1
@@ -113,7 +113,7 @@ const struct store_limits *store_limits(const struct store *store);
 /* The bytes of volumes are known to the owner of the jobs: of a client, or (NULL) of all. Set once, at the start. */
 void store_count_volumes(struct store *store, unsigned long long (*bytes)(void *context, const char *client),
 			 void *context);
-/* Bytes of scans that have room on the disk, and of volumes. client NULL: all. */
+/* Bytes of scans that have room on the disk, of images, and of volumes. client NULL: all. */
 unsigned long long store_bytes(struct store *store, const char *client);
 long store_scans_of(struct store *store, const char *client);
 /* ERR_QUOTA when a client cannot have that many bytes of volumes more. */

@@ -81,6 +81,22 @@ test_jobs_that_have_not_ended() {
 	new_job 503 "{\"scan\": \"SCAN\", $grid}"
 }
 
+test_images_are_counted() {
+	limited --client-bytes $((bytes + 64 * 48))
+	new_scan 201
+	head -c $((64 * 48)) /dev/zero >"$work/map"
+	ask PUT "/v1/scans/$scan/defects" -T "$work/map"
+	expect_status 201
+	ask GET /v1/limits
+	expect_json ".own.bytes.used == $((64 * 48))"
+	new_scan 201
+	fill 201
+	ask PUT "/v1/scans/$scan/defects" -T "$work/map"
+	expect_status 507
+	retry_after
+	expect_json '.detail | contains("defect map of 3072 bytes")'
+}
+
 test_bytes_are_taken_when_they_come() {
 	local first second option
 	limited --client-bytes $((2 * bytes))

@@ -41,9 +41,9 @@ END_TEST
 
 START_TEST(no_job_goes_on_for_ever)
 {
-	for (int i = 0; i < 8; i++) {
+	for (int i = 0; i < 16; i++) {
 		const struct route_facts facts = {.device_error = i & 1,
-						  .deaths = ROUTE_DEATHS,
+						  .deaths = i & 8 ? 1 : ROUTE_DEATHS,
 						  .runs = ROUTE_RUNS_MOST,
 						  .other = i & 2,
 						  .processor = i & 4};
