@@ -70,7 +70,8 @@ const struct warning_kind warning_kinds[] = {
     {"damaged_checkpoint", SEVERITY_INFO,
      "What the job had saved for a restart was damaged on the disk and was left out; the result is the same."},
     {"processor_fallback", SEVERITY_CAUTION,
-     "The device that should have made the image failed: it is made by the processor, which takes longer; the result is the same."},
+     "The device that should have made the image failed: it is made by the processor, which takes longer; the result "
+     "is the same."},
     {"defect_map", SEVERITY_INFO, "Bad pixels of the detector were replaced from their neighbours."},
     {"defects_wide", SEVERITY_SERIOUS,
      "Bad pixels of the detector are too many, or too close together, to be filled in: the image may be wrong there."},
