@@ -27,6 +27,7 @@ static const double NEAR = 15, SHORT[MEASURES] = {[ATTENUATION] = 91, [STRUCTURE
 static const double SIGNIFICANT = 5;
 enum { MOST = 2 };                   /* one view in so many */
 static const double OUTSTANDING = 8; /* standard deviations of a pixel */
+static const double OFTEN = 0.2;     /* of neighbouring views */
 
 void content_add(struct content_sums *sums, int block, float p)
 {
@@ -104,18 +105,9 @@ struct view_content content_of(const struct content_sums *sums)
 	};
 }
 
-bool content_is_even(const struct view_content *views, const bool *skip, int count)
+bool content_shows(const struct view_content *view)
 {
-	int some = 0;
-
-	for (int i = 0; i < count; i++) {
-		if (skip[i])
-			continue;
-		if (!views[i].plain || (double)views[i].peak > OUTSTANDING * (double)views[i].pixel)
-			return false;
-		some++;
-	}
-	return some > 0;
+	return !view->plain || (double)view->peak > OUTSTANDING * (double)view->pixel;
 }
 
 /* ---- the views along the orbit ---- */
@@ -317,5 +309,151 @@ int content_find_empty(const struct view_content *views, const bool *skip, const
 	if (MOST * found <= all)
 		return found;
 	memset(ret_empty, 0, (size_t)orbit->count * sizeof(*ret_empty));
+	return 0;
+}
+
+/* ---- small objects in scans that look even ---- */
+
+/* A scale's image has half of the columns and rows of the one before; the blocks show what is larger than the last. */
+static bool halve_size(int *columns, int *rows)
+{
+	if (*columns < 2 * CONTENT_BLOCKS || *rows < 2 * CONTENT_BLOCKS)
+		return false;
+	*columns /= 2;
+	*rows /= 2;
+	return true;
+}
+
+/* Means of 2 x 2 pixels, in place; of the good ones among them. */
+static void halve(float *image, int columns, int half_columns, int half_rows)
+{
+	for (int r = 0; r < half_rows; r++)
+		for (int c = 0; c < half_columns; c++) {
+			const float *from = image + 2 * ((size_t)r * (size_t)columns + (size_t)c);
+			const float four[4] = {from[0], from[1], from[columns], from[columns + 1]};
+			float sum = 0;
+			int good = 0;
+
+			for (int i = 0; i < 4; i++)
+				if (!isnan(four[i])) {
+					sum += four[i];
+					good++;
+				}
+			image[(size_t)r * (size_t)half_columns + (size_t)c] = good > 0 ? sum / (float)good : NAN;
+		}
+}
+
+/* The brightest mean of width x width pixels, by its first pixel; below 0 where several are alike, as in a view of one
+ * value. */
+static int brightest_of(const float *image, int columns, int rows, int width)
+{
+	int brightest = -1, alike = 0;
+	float most = 0;
+
+	for (int i = 0; i < columns * rows; i++) {
+		float sum = 0;
+
+		if (i % columns + width > columns || i / columns + width > rows)
+			continue;
+		for (int k = 0; k < width * width; k++)
+			sum += image[i + k / width * columns + k % width];
+		if (isnan(sum))
+			continue;
+		if (brightest < 0 || sum > most) {
+			brightest = i;
+			most = sum;
+			alike = 1;
+		} else {
+			alike += sum >= most;
+		}
+	}
+	return alike == 1 ? brightest : -1;
+}
+
+void content_search(float *image, int columns, int rows, int ret_brightest[CONTENT_SCALES])
+{
+	int scale = 0, before;
+
+	ret_brightest[scale++] = brightest_of(image, columns, rows, 1);
+	do {
+		ret_brightest[scale++] = brightest_of(image, columns, rows, 2);
+		before = columns;
+		if (!halve_size(&columns, &rows))
+			break;
+		halve(image, before, columns, rows);
+	} while (scale < CONTENT_SCALES);
+	for (; scale < CONTENT_SCALES; scale++)
+		ret_brightest[scale] = -1;
+}
+
+/* How far an object in the field of view moves along a row, and along a column, from one view to the next; step: angle.
+ */
+static int near_columns(int columns, double step)
+{
+	return (int)ceil(columns * fmin(0.25, 0.75 * step));
+}
+
+static int near_rows(int rows)
+{
+	return rows >= 32 ? rows / 16 : 1;
+}
+
+/* The chance that two of so many places, both anywhere, are at most `apart` from each other. */
+static double chance_near(int places, int apart)
+{
+	const double n = places, d = apart < places - 1 ? apart : places - 1;
+
+	return ((2 * d + 1) * n - d * (d + 1)) / (n * n);
+}
+
+/*
+ * True if the brightest places of neighbouring views are near to each other more often than by chance, or often in one
+ * and the same pixel: the noise of a flat image is the same in all views, and does that more seldom even where it is as
+ * strong as that of the views.
+ */
+static bool stays_near(const struct ring *ring, double step, int scale, int columns, int rows)
+{
+	const int apart[2] = {near_columns(columns, step), near_rows(rows)};
+	const double same = 1.0 / ((double)columns * rows);
+	const double chance =
+	    (chance_near(columns, apart[0]) * chance_near(rows, apart[1]) - same) / fmax(1 - same, same);
+	double pairs = 0, near = 0, alike = 0;
+
+	for (int i = 0; i + 1 < ring->count; i++) {
+		const int a = content_at(ring, i)->brightest[scale], b = content_at(ring, i + 1)->brightest[scale];
+
+		if (a < 0 || b < 0)
+			continue;
+		if (a == b) {
+			alike++;
+			continue;
+		}
+		pairs++;
+		near += abs(a % columns - b % columns) <= apart[0] && abs(a / columns - b / columns) <= apart[1];
+	}
+	if (alike > fmax(2, OFTEN * (alike + pairs)))
+		return true;
+	return near > 1 + pairs * chance + SIGNIFICANT * sqrt(pairs * chance * (1 - chance));
+}
+
+int content_is_even(const struct view_content *views, const bool *skip, const struct orbit *orbit, int columns,
+		    int rows, bool *ret_even, struct error *err)
+{
+	struct ring ring;
+	bool even = true;
+	int code = ring_make(&ring, ATTENUATION, views, skip, orbit, err);
+
+	if (code < 0)
+		return code;
+	for (int i = 0; i < ring.count && even; i++)
+		even = !content_shows(content_at(&ring, i));
+	for (int scale = 0; scale < CONTENT_SCALES && even; scale++) {
+		/* The first two are both of the view as it is. */
+		if (scale > 1 && !halve_size(&columns, &rows))
+			break;
+		even = !stays_near(&ring, orbit->arc / orbit->count, scale, columns, rows);
+	}
+	*ret_even = even && ring.count > 0;
+	free(ring.places);
 	return 0;
 }

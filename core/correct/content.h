@@ -11,6 +11,7 @@
  * it. A view with a closed shutter, without the patient, or with one value everywhere has no more spread than that.
  */
 enum { CONTENT_BLOCKS = 8, CONTENT_SAMPLES = 8 }; /* along each axis: blocks, and pixels of a block that are sampled */
+enum { CONTENT_SCALES = 8 };                      /* at which a small object is looked for, most */
 
 struct view_content {
 	float mean;      /* of the blocks' means; a line integral, as the following */
@@ -22,6 +23,12 @@ struct view_content {
 	 * block. */
 	float centre, structure_centre;
 	bool plain; /* the spread is that of noise alone */
+	/*
+	 * Of content_search, where it was called: the brightest pixel of the whole view, [0], the brightest mean of
+	 * 2 x 2 pixels, [1], and of 2 x 2 means of 2 x 2 pixels, of 4 x 4 and so on; its row times the columns of that
+	 * scale plus its column, or below 0 where none is brightest.
+	 */
+	int brightest[CONTENT_SCALES];
 };
 
 /* The sums of one view; zero before the first sample. */
@@ -47,7 +54,17 @@ struct view_content content_of(const struct content_sums *sums);
 int content_find_empty(const struct view_content *views, const bool *skip, const struct orbit *orbit, bool *ret_empty,
 		       struct error *err);
 
-/* True if no view that is not to be skipped shows any structure or a single pixel that stands out of the noise. */
-bool content_is_even(const struct view_content *views, const bool *skip, int count);
+/* True if a view shows structure, or a sampled pixel that stands out of the noise. */
+bool content_shows(const struct view_content *view);
+/* Looks at every line integral of a view, NAN for a defect; `image`, [row][column], is worked in. */
+void content_search(float *image, int columns, int rows, int ret_brightest[CONTENT_SCALES]);
+/*
+ * *ret_even: no view that is not to be skipped shows anything, and neither do all of them together: a small or faint
+ * object is often the brightest place of a view, and lies near to itself in the next view along the orbit, whereas
+ * noise has its brightest place anywhere. All of those views must have been searched where content_shows of none is
+ * true; columns, rows: of the detector. ERR_NO_MEMORY.
+ */
+int content_is_even(const struct view_content *views, const bool *skip, const struct orbit *orbit, int columns,
+		    int rows, bool *ret_even, struct error *err);
 
 #endif

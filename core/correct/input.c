@@ -74,6 +74,7 @@ int input_open(struct input *ret_input, const struct linearise *linearise, const
 		input.linearise.image[IMAGE_DEFECTS] = input.map.map;
 		input.pixels = (size_t)geometry->columns * (size_t)geometry->rows;
 		input.look_every = geometry->count / 32 + 1;
+		input.even = true;
 		input.blank = calloc((size_t)geometry->count, sizeof(*input.blank));
 		input.content = calloc((size_t)geometry->count, sizeof(*input.content));
 		if (input.blank == NULL || input.content == NULL)
@@ -135,6 +136,25 @@ static struct view_content look_at_line_integrals(struct input *input, const voi
 		}
 	}
 	return content_of(&sums);
+}
+
+/* Looks for a small object at every pixel of a view, while no view before has shown anything. */
+static int look_at_all(struct input *input, const void *samples, int columns, int rows, struct view_content *view,
+		       struct error *err)
+{
+	float *image;
+
+	input->even = input->even && !content_shows(view);
+	if (!input->even)
+		return 0;
+	image = malloc(input->pixels * sizeof(*image));
+	if (image == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a view");
+	for (size_t i = 0; i < input->pixels; i++)
+		image[i] = line_integral(input, samples, i);
+	content_search(image, columns, rows, view->brightest);
+	free(image);
+	return 0;
 }
 
 static int exchanged(uint16_t sample)
@@ -284,6 +304,8 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 	if (is_dark(&counts, &input->content[view], input->pixels)) {
 		add_blank(input, view);
 		code = input_empty_slot(input, backend, to, slot, err);
+	} else if (counts.blank == 0) {
+		code = look_at_all(input, samples, columns, rows, &input->content[view], err);
 	}
 	if (input->linearise.sample == SAMPLE_UINT16)
 		look_at_bytes(input, samples);
@@ -325,11 +347,15 @@ int input_settle(struct input *input, const struct orbit *orbit, struct error *e
 	if (code == 0)
 		code = content_find_empty(input->content, blank, orbit, empty, err);
 	if (code >= 0) {
-		input->even = content_is_even(input->content, blank, orbit->count);
-		for (int view = 0; view < orbit->count; view++)
-			if (empty[view])
-				add_blank(input, view);
+		const int found = code, columns = input->turned ? input->rows : input->columns;
+		const int rows = input->turned ? input->columns : input->rows;
+
+		code = content_is_even(input->content, blank, orbit, columns, rows, &input->even, err);
+		code = code < 0 ? code : found;
 	}
+	for (int view = 0; view < orbit->count && code >= 0; view++)
+		if (empty[view])
+			add_blank(input, view);
 	free(blank);
 	free(empty);
 	return code;

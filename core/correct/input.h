@@ -19,7 +19,7 @@ struct input {
 	 * them, once all have come, those that show nothing. `empty` of them have good pixels.
 	 */
 	int *blank, empty;
-	bool even;                    /* no view shows an object */
+	bool even;                    /* no view shows an object; of those that have come, until all have */
 	struct view_content *content; /* [views of the scan], owned */
 	size_t pixels;                /* of a view */
 	float log_air; /* of the latest view's own air: line integrals are larger by it; 0 without a region */

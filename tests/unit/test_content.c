@@ -316,6 +316,52 @@ START_TEST(a_scan_of_air_is_told)
 }
 END_TEST
 
+/*
+ * A small or faint object shows in all views together: a ball of 2 mm of twice water and of water in noise, off the
+ * axis and on it, on a coarse detector and on one where most pixels are not sampled. Views of air whose flat image is
+ * as noisy as they are show nothing.
+ */
+START_TEST(a_faint_object_in_every_view_is_no_air)
+{
+	static const struct {
+		int fine;
+		double density, x, noise, flat;
+	} rows[] = {{1, .027, 5, .007, 0},    {1, .0135, 5, .007, 0}, {1, .0135, 0, .007, 0}, {4, .027, 5, .02, 0},
+		    {4, .0135, 5, .02, .005}, {1, 0, 0, .007, .007},  {4, 0, 0, .02, .02},    {4, 0, 0, .2, 0}};
+	const int fine = rows[_i].fine, columns = 47 * fine, lines = 31 * fine, views = 40;
+	const struct orbit_spec spec = {columns, lines, views, {600, 1000, {2.0 / fine, 2.0 / fine}, {0, 0}, {0, 0}},
+					0,       9};
+	struct ellipsoid ball = {.shape = SHAPE_ELLIPSOID,
+				 .semi_axes = {1, 1, 1},
+				 .centre = {rows[_i].x, rows[_i].x * .6, 0},
+				 .density = rows[_i].density};
+	const struct phantom phantom = {.count = 1, .parts = &ball};
+	const struct grid grid = grid_of(8, 8, 8, 5, 5, 5);
+	const size_t pixels = (size_t)columns * (size_t)lines;
+	double *flat = malloc(pixels * sizeof(*flat));
+	struct recipe recipe = recipe_on(&grid);
+	struct outcome outcome = {.threads = 1};
+	struct scene scene;
+
+	ck_assert_ptr_nonnull(flat);
+	recipe.fdk.on = true;
+	random_state = (unsigned)_i;
+	for (size_t i = 0; i < pixels; i++)
+		flat[i] = rows[_i].flat * normal();
+	scene_orbit(&scene, &spec);
+	if (rows[_i].density > 0)
+		scene_add(&scene, &phantom);
+	for (size_t i = 0; i < pixels * (size_t)views; i++)
+		scene.projections[i] += (float)(flat[i % pixels] + rows[_i].noise * normal());
+	run(&scene, &recipe, &outcome);
+	ck_assert_msg((strstr(outcome.warnings, "no_object: ") != NULL) == !(rows[_i].density > 0), "%d: %s", _i,
+		      outcome.warnings);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(flat);
+}
+END_TEST
+
 Suite *content_suite(void)
 {
 	Suite *suite = suite_create("content");
@@ -328,6 +374,7 @@ Suite *content_suite(void)
 			    (int)(sizeof(scans) / sizeof(scans[0])));
 	tcase_add_loop_test(tests, measured_views_all_show_something, 0, 3);
 	tcase_add_loop_test(tests, a_scan_of_air_is_told, 0, 10);
+	tcase_add_loop_test(tests, a_faint_object_in_every_view_is_no_air, 0, 8);
 	suite_add_tcase(suite, tests);
 	return suite;
 }
