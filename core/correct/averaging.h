@@ -3,6 +3,7 @@
 
 #include <stddef.h>
 
+#include "core/recipe.h"
 #include "core/scan/grid.h"
 #include "core/scan/orbit.h"
 
@@ -37,9 +38,20 @@
  */
 #define SETTLING_NONE 1.2
 
-/* Pixels a voxel, below which nothing is averaged, and from which on the mean has its full width. */
-#define AVERAGING_NONE 2.25
-#define AVERAGING_FULL 3
+/*
+ * The mean. The volume's linear interpolation c converges to the projections of the object, hat * c = k * f, k being
+ * the mean over pixels; what an image shows is the mean over voxels, box * f. In second moments, a voxel's width being
+ * 1, hat has 1/6 and box 1/12: both agree where k has 1/4, three boxes of a voxel. Ten iterations do not converge, and
+ * an image that is a little sharper is nearer to the truth: two boxes of .85 voxel, at any number of pixels a voxel.
+ * TV with explicit numbers lowers what is narrow by as much as iterations overshoot there, and keeps one box
+ * (tests/bench/results/denoise.txt).
+ */
+struct averaging_mean {
+	double none, full; /* pixels a voxel: up to `none` there is no mean, from `full` on it has its width */
+	double voxels;     /* its width */
+	int passes;        /* it is taken so many times */
+};
+struct averaging_mean averaging_mean(const struct recipe *recipe);
 
 /* Ratios D(v/2) / D(v) up to which an object is the grid's, and from which on it has edges. */
 #define AVERAGING_SMOOTH 0.145
@@ -47,13 +59,15 @@
 
 /* Voxels' sizes in pixels at the isocentre: across the orbit's axis, as columns go, and along it, as rows go. */
 void averaging_pixels(const struct orbit *orbit, const struct grid *grid, double ret_pixels[2]);
-/* 0 where pixels are no finer than AVERAGING_NONE, 1 from AVERAGING_FULL on, and linear between them. */
-double averaging_fineness(double pixels);
+/* 0 up to mean->none pixels, 1 from mean->full on, and linear between them. */
+double averaging_fineness(const struct averaging_mean *mean, double pixels);
 
-/* Sums over pairs of neighbouring rows: of products of second differences, and of the squares of these products. */
+/* Sums over pairs of rows: of products of second differences, and of the squares of these products. */
 struct averaging_sums {
-	double product, square;
-	size_t count;
+	struct averaging_sum {
+		double product, square;
+		size_t count;
+	} of_rows[2]; /* one and two apart */
 };
 /*
  * Adds one view's, [row][column], at a distance of `apart` columns, from every row_step-th row on; pairs with NaN are
@@ -62,8 +76,8 @@ struct averaging_sums {
 int averaging_add(const float *view, int columns, int rows, int row_step, int apart, struct averaging_sums *sums,
 		  struct error *err);
 /*
- * D(pixels / 2) / D(pixels) from D at whole distances: sums[i] at averaging_distances' i-th. 0 where noise hides it, or
- * where there is nothing.
+ * D(pixels / 2) / D(pixels) from D at whole distances: sums[i] at averaging_distances' i-th. The larger of what rows
+ * one apart say and what, with those two apart, rows 0 apart would. 0 where noise hides it, or where there is nothing.
  */
 enum { AVERAGING_DISTANCES = 4 };
 void averaging_distances(double pixels, int ret_distances[AVERAGING_DISTANCES]);

@@ -251,7 +251,8 @@ static double reach_after_sart(const struct volume_noise *noise, const struct re
 	const double fineness = sqrt(pixel[0] * pixel[1]) / cbrt(mm[0] * mm[1] * mm[2]);
 	const double updates = recipe_updates(recipe, orbit) / UPDATES;
 	const double streaks = FEW * pow(FEW_VIEWS / fmax(orbit->count, FEWEST_VIEWS), 4);
-	const double left = 1 - (1 - AVERAGED) * averaging_fineness(1 / fineness);
+	const struct averaging_mean mean = averaging_mean(recipe);
+	const double left = 1 - (1 - AVERAGED) * averaging_fineness(&mean, 1 / fineness);
 	const double edges =
 	    EDGES * left * fmax(0, 1 - pow(fineness / FINE, 4)) * pow(noise->contrast / (STRONG * recipe->mu_water), 3);
 	const double noisy = SART_NOISE * pow(noise->sigma, NOISE_POWER) * pow(noise->contrast, 1 - NOISE_POWER) *

@@ -5,8 +5,10 @@
 #include <check.h>
 #include <math.h>
 #include <stdlib.h>
+#include <string.h>
 
 #include "core/correct/averaging.h"
+#include "core/recon/algorithm.h"
 #include "tests/unit/anatomy.h"
 #include "tests/unit/scene.h"
 
@@ -170,6 +172,88 @@ START_TEST(without_structure_nothing_is_decided)
 }
 END_TEST
 
+/* Root mean square in the body, HU. */
+static double body_error(const float *volume, const float *truth, size_t voxels)
+{
+	double sum = 0;
+	size_t count = 0;
+
+	for (size_t i = 0; i < voxels; i++)
+		if ((double)truth[i] > .5 * .0192) {
+			sum += pow(((double)volume[i] - (double)truth[i]) / .0192 * 1000, 2);
+			count++;
+		}
+	return sqrt(sum / (double)count);
+}
+
+/*
+ * A skull of two voxels, tilted against the rows nearly everywhere, _i: pixels a voxel. With all pixels, or one mean
+ * over a voxel, ten iterations end at 250, 254, 177 and 125 HU, where FDK has 59, 57, 65 and 95.
+ */
+START_TEST(iterations_of_a_skull_on_coarse_voxels_are_no_worse_than_fdk)
+{
+	static const double pixels[] = {2.25, 2.34, 2.76, 3.3};
+	enum { ACROSS = 27, MOST = 10 };
+	const double voxel = 3, pixel = voxel / pixels[_i], water = .0192;
+	struct ellipsoid parts[] = {
+	    {SHAPE_ELLIPSOID, {36, 29.5, 28.8}, {1, 2, .7}, 10, 2.2 * water},
+	    {SHAPE_ELLIPSOID, {30, 23.5, 22.8}, {1, 2, .7}, 10, -1.2 * water},
+	    {SHAPE_ELLIPSOID, {7, 5.4, 7}, {10.8, 0, 0}, 0, -.04 * water},
+	};
+	const struct phantom skull = {3, parts};
+	const struct orbit_spec spec = {(int)(90 / pixel) + 4,
+					(int)(72 / pixel) + 6,
+					40,
+					{620, 1100, {pixel / 620 * 1100, pixel / 620 * 1100}, {0, 0}, {0, 0}},
+					0,
+					9};
+	const struct grid grid = grid_of(ACROSS, ACROSS, ACROSS, voxel, voxel, voxel);
+	float *truth = malloc(sizeof(*truth) * grid_voxels(&grid));
+	struct recipe recipe = recipe_on(&grid);
+	struct outcome outcome = {.threads = 1};
+	int emit[] = {EMIT_FDK};
+	struct scene scene;
+	double fdk, last;
+
+	ck_assert_ptr_nonnull(truth);
+	phantom_voxelise(&skull, &grid, 5, truth);
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &skull);
+	recipe.fdk.on = true;
+	recipe.emit = emit;
+	recipe.emits = 1;
+	recipe_set_algorithm(&recipe, &algorithm_sart);
+	recipe.iterate.iterations = MOST;
+	run(&scene, &recipe, &outcome);
+	fdk = body_error(outcome_volume(&outcome, "fdk"), truth, grid_voxels(&grid));
+	last = body_error(outcome_volume(&outcome, "final"), truth, grid_voxels(&grid));
+	ck_assert_msg(last < 1.02 * fdk, "%g pixels a voxel: FDK %.1f HU, SART %.1f", pixels[_i], fdk, last);
+	ck_assert_ptr_nonnull(strstr(outcome.warnings, "averaged_pixels: "));
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(truth);
+}
+END_TEST
+
+/* TV with explicit numbers is balanced by hand against what iterations make of the projections. */
+START_TEST(the_mean_is_narrower_where_tv_has_explicit_numbers)
+{
+	const struct grid grid = grid_of(8, 8, 8, 1, 1, 1);
+	struct recipe recipe = recipe_on(&grid);
+	struct averaging_mean mean = averaging_mean(&recipe);
+
+	ck_assert_int_eq(mean.passes, 2);
+	recipe.tv.on = true;
+	mean = averaging_mean(&recipe);
+	ck_assert_double_eq(averaging_fineness(&mean, 2), 0);
+	ck_assert_double_eq(averaging_fineness(&mean, 2.3), 1);
+	recipe_explicit_tv(&recipe, TV_GRADIENT);
+	mean = averaging_mean(&recipe);
+	ck_assert_int_eq(mean.passes, 1);
+	ck_assert_double_eq(averaging_fineness(&mean, 2.25), 0);
+}
+END_TEST
+
 Suite *averaging_suite(void)
 {
 	Suite *suite = suite_create("averaging");
@@ -181,6 +265,8 @@ Suite *averaging_suite(void)
 	tcase_add_test(decision, the_change_of_late_iterations_falls_the_earlier_the_finer_the_pixels);
 	tcase_add_loop_test(decision, anatomy_has_edges_within_voxels_whatever_the_noise, 0, ANATOMY_COUNT);
 	tcase_add_test(decision, without_structure_nothing_is_decided);
+	tcase_add_loop_test(decision, iterations_of_a_skull_on_coarse_voxels_are_no_worse_than_fdk, 0, 4);
+	tcase_add_test(decision, the_mean_is_narrower_where_tv_has_explicit_numbers);
 	suite_add_tcase(suite, decision);
 	return suite;
 }
