@@ -44,6 +44,7 @@ struct stuck {
 	bool *some_bad; /* [row], of the view */
 	unsigned char *map;
 	float largest;         /* line integral */
+	bool tells_dead;       /* a pixel that never changes is none of the object's */
 	struct beside *beside; /* NULL: the caller's thread does it all */
 };
 
@@ -520,7 +521,27 @@ static bool is_alone(const struct stuck *stuck, int column, int row, bool wander
 		if (!wanders && (e > 0 ? apart < -TIP * e : apart > -TIP * e))
 			return false;
 	}
-	return like <= 1 && bad <= NEIGHBOURS - BESIDE_LEAST;
+	/* Something small that turns near the axis stays on two pixels in turn. */
+	return like <= (wanders && is_on_axis(stuck, column, row) ? 0 : 1) && bad <= NEIGHBOURS - BESIDE_LEAST;
+}
+
+/* True if a pixel has one value in all views, and not air's. */
+static bool is_dead(const struct stuck *stuck, size_t at, float whole)
+{
+	const struct sums *sums = &stuck->sums;
+
+	return is_known(stuck, at) && sums->p2[at] == 0 && fabsf(sums->first[at]) > MATTERS * whole;
+}
+
+/* False where many pixels never change: in a scan without noise those in air do not, nor what is round. */
+static bool tells_dead_pixels(const struct stuck *stuck)
+{
+	const size_t pixels = (size_t)stuck->geometry->rows * (size_t)stuck->geometry->columns;
+	size_t unchanged = 0;
+
+	for (size_t at = 0; at < pixels; at++)
+		unchanged += is_known(stuck, at) && stuck->sums.p2[at] == 0;
+	return (double)unchanged <= MOST * (double)pixels;
 }
 
 static bool is_stuck(const struct stuck *stuck, int column, int row)
@@ -532,6 +553,8 @@ static bool is_stuck(const struct stuck *stuck, int column, int row)
 	float varies[NEIGHBOURS], rms[NEIGHBOURS], mean[NEIGHBOURS], wanders[NEIGHBOURS];
 	size_t near[NEIGHBOURS];
 
+	if (stuck->tells_dead && is_dead(stuck, at, whole))
+		return true;
 	if (!is_known(stuck, at) || own.rms < MATTERS * whole)
 		return false;
 	/* A corner has neighbours on one side only. */
@@ -573,6 +596,7 @@ const unsigned char *stuck_find(struct stuck *stuck)
 		beside_wait(stuck->beside);
 		pthread_mutex_unlock(&stuck->beside->lock);
 	}
+	stuck->tells_dead = tells_dead_pixels(stuck);
 #pragma omp parallel for schedule(dynamic, 16) reduction(+ : count)
 	for (int row = 0; row < rows; row++)
 		for (int column = 0; column < columns; column++) {

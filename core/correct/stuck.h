@@ -29,6 +29,10 @@
  * for the last, none of the pixels beside it lies beyond p by a tenth of e. An object's edge or tip, and the axis of a
  * body that looks the same from all sides, lie between what is beside them, however coarse the pixels are.
  *
+ *   dead     p is the same number in all views, and not air's. A detector that noise is in has no such
+ *            pixel; where more than a tenth of all pixels never change, this is not looked for. Lines and
+ *            patches of such pixels are found, which the comparisons above are blind to.
+ *
  * A neighbour that says nothing, as one of the scan's map, is left out of m, and where that is
  * so in most views it counts as one that speaks for the pixel in the comparisons above.
  *

@@ -235,6 +235,87 @@ START_TEST(no_pixel_size_makes_stuck_pixels)
 }
 END_TEST
 
+enum { SMALL_COLUMNS = 49, SMALL_ROWS = 33, SMALL_VIEWS = 40, SMALL = SMALL_COLUMNS * SMALL_ROWS };
+
+/* What is found in a scan of a few parts, line integrals with that noise; `spoiled` pixels hold .6 in all views. */
+static size_t find_in_small(struct ellipsoid *parts, int count, double noise, const bool *spoiled)
+{
+	const struct orbit_spec spec = {
+	    SMALL_COLUMNS, SMALL_ROWS, SMALL_VIEWS, {600, 1000, {2, 2}, {0, 0}, {0, 0}}, 0, 360. / SMALL_VIEWS};
+	const struct linearise linearise = {.sample = SAMPLE_FLOAT32};
+	struct phantom phantom = {.parts = parts, .count = count};
+	const unsigned char *map;
+	struct stuck *stuck;
+	struct scene scene;
+	struct error err;
+	size_t found = 0;
+
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	ck_assert_int_eq(stuck_new(&linearise, &scene.geometry, false, &stuck, &err), 0);
+	for (int view = 0; view < SMALL_VIEWS; view++) {
+		float *values = scene.projections + (size_t)view * SMALL;
+
+		for (size_t i = 0; i < SMALL; i++)
+			values[i] = spoiled != NULL && spoiled[i]
+					? 0.6f
+					: values[i] + (float)(noise * (uniform() + uniform() + uniform() - 1.5) * 2);
+		if (stuck_wants(stuck, view))
+			stuck_add(stuck, values);
+	}
+	map = stuck_find(stuck);
+	for (size_t i = 0; i < SMALL && map != NULL; i++)
+		found += map[i];
+	stuck_free(stuck);
+	scene_clear(&scene);
+	return found;
+}
+
+/* Its shadow stays on two pixels in turn, and each of them does what the other does not. */
+START_TEST(a_bead_near_the_axis_is_no_stuck_pixel)
+{
+	random_state = 3;
+	for (int bead = 0; bead < 40; bead++) {
+		const double apart = between(.4, 4.5), where = between(0, 6.28), z = between(-12, 12);
+		struct ellipsoid parts[2] = {
+		    {.shape = SHAPE_CYLINDER, .semi_axes = {20, 20, 200}, .density = .02},
+		    {.shape = SHAPE_ELLIPSOID,
+		     .semi_axes = {.8, .8, .8},
+		     .centre = {apart * cos(where), apart * sin(where), z},
+		     .density = bead % 2 ? .4 : .12},
+		};
+		const size_t found = find_in_small(parts, 2, bead % 3 ? 0 : .01, NULL);
+
+		ck_assert_msg(found == 0, "%zu pixels: a bead %.2f mm off the axis, at %.1f mm", found, apart, z);
+	}
+}
+END_TEST
+
+/* Nothing else holds one value in all views: a dead column, a dead row, a dead patch. */
+START_TEST(pixels_that_never_change_are_found_together)
+{
+	struct ellipsoid parts[] = {
+	    {.shape = SHAPE_CYLINDER, .semi_axes = {20, 16, 200}, .centre = {3, 2, 0}, .density = .02}};
+
+	for (int kind = 0; kind < 3; kind++) {
+		bool spoiled[SMALL];
+		size_t all = 0, found;
+
+		for (int i = 0; i < SMALL; i++) {
+			const int column = i % SMALL_COLUMNS, row = i / SMALL_COLUMNS;
+
+			spoiled[i] = kind == 0   ? column == 17
+				     : kind == 1 ? row == 12
+						 : abs(column - 30) <= 2 && abs(row - 15) <= 2;
+			all += spoiled[i];
+		}
+		found = find_in_small(parts, 1, .01, spoiled);
+		ck_assert_msg(found <= all && (double)found >= 0.85 * (double)all, "kind %d: %zu of %zu", kind, found,
+			      all);
+	}
+}
+END_TEST
+
 /*
  * 1 % of the pixels, but for corners, the axis where nothing moves, and what noise hides. Beside a faulty pixel one may
  * be taken for another.
@@ -325,6 +406,8 @@ Suite *stuck_suite(void)
 	tcase_set_timeout(tests, 0);
 	tcase_add_loop_test(tests, an_object_is_no_stuck_pixel, 0, 4);
 	tcase_add_loop_test(tests, no_pixel_size_makes_stuck_pixels, 0, 2);
+	tcase_add_test(tests, a_bead_near_the_axis_is_no_stuck_pixel);
+	tcase_add_test(tests, pixels_that_never_change_are_found_together);
 	tcase_add_loop_test(tests, a_pixel_that_does_not_follow_is_found, 0, 4);
 	tcase_add_loop_test(tests, a_neighbour_of_mapped_pixels_is_judged_by_good_ones, 0, 4);
 	tcase_add_test(tests, a_thread_of_its_own_finds_the_same);
