@@ -7,16 +7,22 @@
 
 #include "daemon/api/internal.h"
 
-int idempotency_read(struct request *request, struct store_key *ret_key, struct error *err)
+int idempotency_read(struct request *request, char ret_text[IDEMPOTENCY_SIZE], struct store_key *ret_key,
+		     struct error *err)
 {
-	enum { KEY_MAX = 255 };
+	const char *client = request_identity(request)->name;
 	struct store_key key = {.text = request_header(request, "Idempotency-Key")};
 	size_t length;
 	const char *body = request_body(request, &length);
 
-	if (key.text != NULL && (key.text[0] == '\0' || strlen(key.text) > KEY_MAX))
+	if (key.text != NULL && (key.text[0] == '\0' || strlen(key.text) > IDEMPOTENCY_KEY_MAX))
 		return error_set(err, ERR_INVALID, "Idempotency-Key has %zu bytes, expected 1 to %d", strlen(key.text),
-				 KEY_MAX);
+				 IDEMPOTENCY_KEY_MAX);
+	/* No header has a line break: keys of clients with a name are none of those without. */
+	if (key.text != NULL && client[0] != '\0') {
+		snprintf(ret_text, IDEMPOTENCY_SIZE, "%s\n%s", client, key.text);
+		key.text = ret_text;
+	}
 	if (EVP_Digest(body, length, key.digest, NULL, EVP_sha256(), NULL) != 1)
 		return error_set(err, ERR_INTERNAL, "the digest of a request cannot be made");
 	*ret_key = key;

@@ -86,8 +86,13 @@ int page_read_ids(struct request *request, struct page *ret_page, struct error *
 int query_choice(struct request *request, const char *name, const char *const *names, int *ret_index,
 		 struct error *err);
 
-/* The request's Idempotency-Key, and the SHA-256 of its body; text is NULL where it has none. */
-int idempotency_read(struct request *request, struct store_key *ret_key, struct error *err);
+/*
+ * The request's Idempotency-Key, and the SHA-256 of its body; text is NULL where it has none. A client with a name, of
+ * a token or certificate, has keys of its own: the key is then made of both, in ret_text.
+ */
+enum { IDEMPOTENCY_KEY_MAX = 255, IDEMPOTENCY_SIZE = TOKEN_NAME_SIZE + 1 + IDEMPOTENCY_KEY_MAX + 1 };
+int idempotency_read(struct request *request, char ret_text[IDEMPOTENCY_SIZE], struct store_key *ret_key,
+		     struct error *err);
 
 /* Bytes that do not change while they bear this tag. */
 struct entity {

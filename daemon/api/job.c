@@ -66,10 +66,11 @@ int job_post(void *context, struct request *request, struct error *err)
 {
 	struct api *api = context;
 	struct job *job = NULL;
+	char text[IDEMPOTENCY_SIZE];
 	struct store_key key;
 	int code;
 
-	code = idempotency_read(request, &key, err);
+	code = idempotency_read(request, text, &key, err);
 	if (code == 0 && key.text != NULL)
 		code = jobs_repeat(api->jobs, key.text, key.digest, &job, err);
 	if (code == 0 && job == NULL)

@@ -26,8 +26,9 @@ int scan_post(void *context, struct request *request, struct error *err)
 {
 	struct api *api = context;
 	struct stored_scan *stored = NULL;
+	char text[IDEMPOTENCY_SIZE];
 	struct store_key key;
-	int code = idempotency_read(request, &key, err);
+	int code = idempotency_read(request, text, &key, err);
 
 	if (code == 0 && key.text != NULL)
 		code = store_scan_repeat(api->store, &key, &stored, err);

@@ -81,6 +81,29 @@ test_jobs_that_have_not_ended() {
 	new_job 503 "{\"scan\": \"SCAN\", $grid}"
 }
 
+test_each_client_has_its_own_keys() {
+	local first kind text made
+	limited
+	for kind in scans jobs; do
+		send() { # STATUS BODY
+			ask POST /v1/$kind -H 'Content-Type: application/json' -H 'Idempotency-Key: 1' --data-binary "$2"
+			expect_status "$1"
+		}
+		[ $kind = scans ] && text=$(cat "$scan_dir/scan.json") made=201 || text="{\"scan\": \"$scan\", $grid}" made=202
+		as a
+		send $made "$text"
+		first=$(json .id)
+		as b
+		send $made "$text"
+		[ "$(json .id)" != "$first" ] || fail "the other client's"
+		expect_json '.client == "b"'
+		as a
+		send $made "$text"
+		expect_json ".id == \"$first\""
+		scan=$first
+	done
+}
+
 test_images_are_counted() {
 	limited --client-bytes $((bytes + 64 * 48))
 	new_scan 201
