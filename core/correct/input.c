@@ -367,6 +367,18 @@ void input_goes_on(const struct input *input, bool ret_ends[2])
 		ret_ends[end] = 4 * input->ends[end] > input->views_looked_at;
 }
 
+double input_shown(const struct input *input)
+{
+	double sum = 0;
+
+	for (int i = 0; i < input->views; i++)
+		sum += pow((double)input->content[i].mean, 2) + pow((double)input->content[i].structure, 2);
+	for (int i = 0; i < input->counts.blank; i++)
+		sum -= pow((double)input->content[input->blank[i]].mean, 2) +
+		       pow((double)input->content[input->blank[i]].structure, 2);
+	return input->views > 0 ? fmax(0, sum) / input->views : 0;
+}
+
 double input_air_off_share(const struct input *input)
 {
 	return input->views_looked_at > 0 ? (double)input->far_off / input->views_looked_at : 0;

@@ -76,6 +76,9 @@ int input_empty_slot(const struct input *input, const struct backend *backend, s
  */
 void input_goes_on(const struct input *input, bool ret_ends[2]);
 
+/* The mean of p^2 of what the views show, without their noise; blank views count as nothing. */
+double input_shown(const struct input *input);
+
 /* The share of views in which air is so far from 0 that it does not pass for air: none of that is an object. */
 double input_air_off_share(const struct input *input);
 

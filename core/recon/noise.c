@@ -294,3 +294,63 @@ int noise_measure(const struct backend *backend, struct volume *volume, const st
 	free(slices);
 	return code;
 }
+
+/* ---- projections ---- */
+
+enum { PIECE = 32, APART_IN_ROW = 2 }; /* columns: of a piece, and between the values of a difference */
+
+/* Adds up the squares of a piece of a row, and what noise has in them. */
+static void add_piece(const float *p, int columns, struct projection_squares *sums)
+{
+	/* |d| of normal noise of deviation s has the median 0.6745 sqrt(6) s. */
+	const double median_of_one = 0.6745 * sqrt(6);
+	float bends[PIECE];
+	int count = 0, good = 0;
+
+	for (int i = 0; i < columns; i++) {
+		if (isnan(p[i]))
+			continue;
+		sums->all += (double)p[i] * (double)p[i];
+		good++;
+		if (i >= 2 * APART_IN_ROW) {
+			const float bend = p[i] - 2 * p[i - APART_IN_ROW] + p[i - 2 * APART_IN_ROW];
+
+			if (!isnan(bend))
+				bends[count++] = fabsf(bend);
+		}
+	}
+	sums->rays += good;
+	if (count == 0)
+		return;
+	qsort(bends, (size_t)count, sizeof(*bends), compare_floats);
+	sums->noise += good * pow((double)bends[count / 2] / median_of_one, 2);
+}
+
+int noise_of_projections(const struct backend *backend, struct stack *projections, const struct geometry *geometry,
+			 struct projection_squares *ret_squares, struct error *err)
+{
+	const int columns = geometry->columns, every = geometry->count / 32 + 1;
+	float *view = malloc(sizeof(*view) * (size_t)columns * (size_t)geometry->rows);
+	struct projection_squares squares = {0};
+	int code = 0;
+
+	if (view == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a view");
+	for (int k = 0; k < geometry->count && code == 0; k += every) {
+		code = backend->stack_download(projections, k, 1, view, err);
+		for (int r = 0; r < geometry->rows && code == 0; r++)
+			for (int c = 0; c < columns; c += PIECE)
+				add_piece(view + (size_t)r * (size_t)columns + c,
+					  columns - c < PIECE ? columns - c : PIECE, &squares);
+	}
+	free(view);
+	if (code == 0 && squares.rays > 0)
+		*ret_squares = (struct projection_squares){
+		    .rays = squares.rays,
+		    .all = squares.all / squares.rays,
+		    .noise = fmin(squares.noise, squares.all) / squares.rays,
+		};
+	else
+		*ret_squares = (struct projection_squares){0};
+	return code;
+}

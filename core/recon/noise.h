@@ -21,6 +21,20 @@ int noise_measure(const struct backend *backend, struct volume *volume, const st
 /* Measures the noise of slices [z][y][x] in the host's memory. */
 int noise_of_slices(const float *slices, const int size[3], struct volume_noise *ret_noise, struct error *err);
 
+/* Means over the rays of projections. */
+struct projection_squares {
+	double rays;  /* how many were looked at */
+	double all;   /* of p^2 */
+	double noise; /* the part of it that noise has */
+};
+/*
+ * Looks at every view, or at about 32 of them; rays that are left out do not count. The noise is that of second
+ * differences along pieces of rows, between every second pixel, since a detector's blur makes neighbours alike: their
+ * median in a piece is that of noise, where edges and thin objects are in less than half of it.
+ */
+int noise_of_projections(const struct backend *backend, struct stack *projections, const struct geometry *geometry,
+			 struct projection_squares *ret_squares, struct error *err);
+
 enum noise_stage { NOISE_OF_FDK, NOISE_OF_SART };
 /*
  * The alpha of TV_PROXIMAL behind FDK or behind each SART iteration, in the recipe's gray levels and of its strength;

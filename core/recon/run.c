@@ -363,6 +363,20 @@ static bool is_last(const struct recipe *recipe, const struct history_row *row)
 	       (recipe->iterate.stop_change > 0 && row->change <= recipe->iterate.stop_change);
 }
 
+/* Told of the last iteration. The projections' noise is looked at only where it may be that which is unexplained. */
+static int tell_residual(const struct recon *recon, const struct history_row *row, struct error *err)
+{
+	struct projection_squares squares;
+	int code;
+
+	if (!residual_is_high(row))
+		return 0;
+	code = noise_of_projections(recon->backend, recon->projections, recon->geometry, &squares, err);
+	if (code == 0)
+		warn_residual(&recon->warnings, row, &squares, input_shown(&recon->input));
+	return code;
+}
+
 static int run_iterations(struct recon *recon, struct error *err)
 {
 	const struct recon_hooks *hooks = recon->hooks;
@@ -390,9 +404,9 @@ static int run_iterations(struct recon *recon, struct error *err)
 		if (hooks->row != NULL)
 			hooks->row(hooks->context, &row);
 		if (last)
-			warn_residual(&recon->warnings, &row);
+			code = tell_residual(recon, &row, err);
 		snprintf(name, sizeof(name), "iter-%d", row.iteration);
-		if (is_wanted(&recon->recipe, row.iteration))
+		if (code == 0 && is_wanted(&recon->recipe, row.iteration))
 			code = keep(recon, name, recon->recipe.algorithm->name, err);
 		if (code < 0)
 			return code;

@@ -4,7 +4,6 @@
 #include <math.h>
 
 #include "core/recon/algorithm.h"
-#include "core/recon/noise.h"
 
 /* True if any view's detector has the shadow of one of 9 x 9 x 9 places that span the grid. */
 static bool is_seen(const struct grid *grid, const struct geometry *geometry)
@@ -127,18 +126,37 @@ void warn_recipe(const struct warning_sink *sink, const struct geometry *geometr
 			     "TV was wanted after SART iterations, and there are none: the FDK volume is left alone");
 }
 
-void warn_residual(const struct warning_sink *sink, const struct history_row *row)
+/* The first iteration meets the projections before it has explained any of them. */
+bool residual_is_high(const struct history_row *row)
 {
 	const double implausible = 0.5;
 
-	/* The first iteration meets the projections before it has explained any of them. */
-	if (row->iteration < 2 || !(row->residual > implausible))
+	return row->iteration >= 2 && row->residual > implausible;
+}
+
+void warn_residual(const struct warning_sink *sink, const struct history_row *row,
+		   const struct projection_squares *squares, double shown)
+{
+	/* The estimate's error, and what of its own noise a volume adds to that of a ray that it has not seen. */
+	const double implausible = 0.25, of_noise = 1.2;
+	/* Of what the projections showed, where that is clearly more than noise: nothing of it is left for the grid. */
+	const double little = 0.03, clear = 0.5, error = 0.1;
+	const double left = squares->all - squares->noise, residual2 = row->residual * row->residual * squares->all;
+
+	if (!residual_is_high(row))
 		return;
-	warning_tell(
-	    sink, "residual_high",
-	    "after %d iterations the volume still leaves %.3g of the projections unexplained (residual): geometry, "
-	    "grid or projections do not fit each other, or far more iterations are needed",
-	    row->iteration, row->residual);
+	if (residual2 - of_noise * squares->noise > implausible * left)
+		warning_tell(sink, "residual_high",
+			     "after %d iterations the volume still leaves %.3g of the projections unexplained "
+			     "(residual), and noise is %.3g of them: geometry, grid or projections do not fit each "
+			     "other, or far more iterations are needed",
+			     row->iteration, row->residual, sqrt(squares->noise / squares->all));
+	else if (shown > clear * squares->noise && left < little * shown + error * squares->noise)
+		warning_tell(sink, "residual_high",
+			     "after %d iterations the volume leaves %.3g of the projections unexplained (residual): "
+			     "next to nothing of what they show lies in the grid, which has the wrong place, or the "
+			     "geometry has",
+			     row->iteration, row->residual);
 }
 
 void warn_tv(const struct warning_sink *sink, const struct recipe *recipe, const struct volume_noise *noise,

@@ -4,6 +4,7 @@
 #include "core/scan/orbit.h"
 #include "core/recon/alternation.h"
 #include "core/recon/ends.h"
+#include "core/recon/noise.h"
 #include "core/recon/recon.h"
 #include "core/warning.h"
 
@@ -15,8 +16,14 @@
  */
 void warn_recipe(const struct warning_sink *sink, const struct geometry *geometry, const struct orbit *orbit,
 		 const struct recipe *recipe);
-/* "residual_high": SART has ended, and the volume explains less than half of the projections. */
-void warn_residual(const struct warning_sink *sink, const struct history_row *row);
+/* True if the volume leaves more than half of the projections unexplained, by noise or otherwise. */
+bool residual_is_high(const struct history_row *row);
+/*
+ * "residual_high": the iterations have ended, residual_is_high, and not by noise alone. squares: of the projections as
+ * the iterations see them; shown: the mean of p^2 of the object in the projections as they came.
+ */
+void warn_residual(const struct warning_sink *sink, const struct history_row *row,
+		   const struct projection_squares *squares, double shown);
 /* "tv_without_effect": explicit settings that cannot move a voxel by a fair share of the noise. */
 void warn_tv(const struct warning_sink *sink, const struct recipe *recipe, const struct volume_noise *noise,
 	     const struct orbit *orbit);
