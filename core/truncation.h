@@ -30,7 +30,8 @@
  *   not its end the line through the outermost columns is not air where it leaves the
  *               detector: an object that ends within an edge of many columns is whole;
  *   not chance  three times the deviation that noise gives to that mean, noise as
- *               estimated from the second differences of the columns beside the edge.
+ *               estimated from the second differences of the columns beside the edge,
+ *               of 16 at least: from fewer it is often too small by chance.
  *
  * So an object of any p is extended alike: an abdomen whose largest p is 4, or
  * 0.0004, is right by 6 HU, by 169 without. Nothing but the view has a part in it,
@@ -68,6 +69,13 @@ TRUNCATION_INLINE int truncation_window(int columns)
 
 	return window < columns ? window : columns;
 }
+/* Columns at an edge that noise is estimated from: of a small detector more than those of the fit. */
+TRUNCATION_INLINE int truncation_bends(int columns)
+{
+	const int window = truncation_window(columns) > 16 ? truncation_window(columns) : 16;
+
+	return window < columns ? window : columns;
+}
 
 /* The view's largest p is that of about 64 x 64 of its rays: of every so many columns and rows. */
 TRUNCATION_INLINE int truncation_stride(int count)
@@ -101,7 +109,7 @@ TRUNCATION_INLINE float truncation_level_of_many(float largest)
  * each. */
 TRUNCATION_INLINE bool truncation_is_chance(int columns, double sum, double bends)
 {
-	const int window = truncation_window(columns);
+	const int window = truncation_bends(columns);
 
 	return window > 2 && 6 * (window - 2) * sum * sum < 9 * truncation_edge(columns) * bends;
 }
@@ -130,7 +138,7 @@ TRUNCATION_INLINE bool truncation_ends_within(struct truncation_near near, float
 /* A side of a row by its outermost column and the way from one to the next. */
 TRUNCATION_INLINE bool truncation_is_cut(const float *p, ptrdiff_t step, int columns, float level)
 {
-	const int edge = truncation_edge(columns), window = truncation_window(columns);
+	const int edge = truncation_edge(columns), window = truncation_bends(columns);
 	double sum = 0, bends = 0;
 
 	for (int i = 0; i < edge; i++)

@@ -125,7 +125,7 @@ static __device__ __forceinline__ row_lanes lanes_of_row(void)
 
 static __device__ bool is_cut(const float *p, ptrdiff_t step, int columns, float level, const row_lanes &at)
 {
-	const int edge = truncation_edge(columns), window = truncation_window(columns);
+	const int edge = truncation_edge(columns), window = truncation_bends(columns);
 	double sum = 0, bends = 0;
 
 	for (int i = at.lane; i < edge; i += ROW_LANES)

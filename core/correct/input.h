@@ -19,6 +19,11 @@ struct input {
 	 * them, once all have come, those that show nothing. `empty` of them have good pixels.
 	 */
 	int *blank, empty;
+	/*
+	 * Rows of blank views that the filter had counted as cut off before it was known that they show nothing: in all
+	 * that it has counted they are twice, since they are filtered once more when they are taken out.
+	 */
+	size_t cut_blank[2];
 	bool even;                    /* no view shows an object; of those that have come, until all have */
 	struct view_content *content; /* [views of the scan], owned */
 	size_t pixels;                /* of a view */

@@ -26,7 +26,7 @@ bool truncated_warn(const struct correction_job *job, const size_t rows[2], int 
 	const double inner = 45, rim = 90, inner_share = 0.6;
 	const double radius = job->orbit->field_of_view / 2;
 	const char *const row = row_of(job->input->turned), *const column = row_of(!job->input->turned);
-	const double all = (double)job->geometry->count * job->geometry->rows;
+	const double all = (double)(job->geometry->count - job->input->counts.blank) * job->geometry->rows;
 	/* Rows whose ends the tube alone keeps from 0 are extended as well, which does no harm, and are none cut off.
 	 */
 	const size_t off = (size_t)(input_air_off_share(job->input) * all);
@@ -62,6 +62,11 @@ static int apply(const struct correction_job *job, void *state, enum correction_
 	(void)state;
 	(void)time;
 	(void)ret_changed;
+	for (int side = 0; side < 2 && code == 0; side++) {
+		const size_t twice = 2 * job->input->cut_blank[side];
+
+		rows[side] -= twice < rows[side] ? twice : rows[side];
+	}
 	if (code == 0)
 		truncated_warn(job, rows, job->extend);
 	return code;

@@ -231,8 +231,11 @@ static int restore_view(struct recon *recon, int view, int slot, struct error *e
 static int take_back(struct recon *recon, const int *views, int count, struct error *err)
 {
 	const struct backend *backend = recon->backend;
+	size_t cut[2] = {0}, *cut_blank = recon->input.cut_blank;
 	int code = fdk_flush(&recon->fdk, recon->projections, recon->volume, err);
 
+	if (code == 0)
+		code = backend->filter_extended(recon->plan, cut, err);
 	if (code == 0)
 		code = backend->volume_axpby(-1, recon->volume, 0, recon->volume, err);
 	for (int i = 0; i < count && code == 0; i++) {
@@ -244,6 +247,10 @@ static int take_back(struct recon *recon, const int *views, int count, struct er
 	}
 	if (code == 0)
 		code = fdk_flush(&recon->fdk, recon->projections, recon->volume, err);
+	if (code == 0)
+		code = backend->filter_extended(recon->plan, cut_blank, err);
+	for (int side = 0; side < 2 && code == 0; side++)
+		cut_blank[side] -= cut[side];
 	return code == 0 ? backend->volume_axpby(-1, recon->volume, 0, recon->volume, err) : code;
 }
 

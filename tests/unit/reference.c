@@ -231,7 +231,8 @@ static double side_mean(const float *row, int columns, bool behind, int k)
 
 bool reference_is_cut(const float *row, int columns, bool behind, double not_air)
 {
-	const int edge = columns / 64 > 4 ? columns / 64 : 4, window = columns / 16 > 4 ? columns / 16 : 4;
+	const int edge = columns / 64 > 4 ? columns / 64 : 4, wide = columns / 16 > 16 ? columns / 16 : 16;
+	const int window = wide < columns ? wide : columns;
 	double mean = 0, square = 0;
 
 	for (int i = 0; i < edge; i++)

@@ -111,6 +111,7 @@ static double error_of(const struct scene *scene, const struct recipe *recipe, c
 	run(scene, recipe, &outcome);
 	ck_assert_msg(strstr(outcome.warnings, told) != NULL, "%s", outcome.warnings);
 	ck_assert_msg(strstr(outcome.warnings, "no_object") == NULL, "%s", outcome.warnings);
+	ck_assert_msg(strstr(outcome.warnings, "truncated: ") == NULL, "%s", outcome.warnings);
 	error = relative_error(outcome.last, truth, grid_voxels(&outcome.grid));
 	outcome_clear(&outcome);
 	return error;
@@ -354,6 +355,7 @@ START_TEST(a_faint_object_in_every_view_is_no_air)
 	for (size_t i = 0; i < pixels * (size_t)views; i++)
 		scene.projections[i] += (float)(flat[i % pixels] + rows[_i].noise * normal());
 	run(&scene, &recipe, &outcome);
+	ck_assert_msg(strstr(outcome.warnings, "truncated: ") == NULL, "%d: %s", _i, outcome.warnings);
 	ck_assert_msg((strstr(outcome.warnings, "no_object: ") != NULL) == !(rows[_i].density > 0), "%d: %s", _i,
 		      outcome.warnings);
 	outcome_clear(&outcome);

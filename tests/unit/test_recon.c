@@ -568,6 +568,8 @@ START_TEST(a_residual_of_noise_is_none_of_the_geometry)
 	ck_assert_msg((strstr(outcome.warnings, "residual_high: ") != NULL) ==
 			  (rows[_i].wrong == GRID_ASIDE || rows[_i].wrong == SHUFFLED),
 		      "%g: %s", outcome.rows[outcome.row_count - 1].residual, outcome.warnings);
+	ck_assert_msg(rows[_i].wrong == BLUR || strstr(outcome.warnings, "truncated: ") == NULL, "%s",
+		      outcome.warnings);
 	outcome_clear(&outcome);
 	scene_clear(&made);
 	scene_clear(&scene);
