@@ -60,6 +60,19 @@ static double last_change(const struct api *api, struct stored_scan *scan, doubl
 	return fmax(created, (double)status.st_mtim.tv_sec);
 }
 
+/*
+ * A scan that was ended, or that the disk has damaged a part of, is none whose acquisition broke off: what it still has
+ * may be all that there is of a patient.
+ */
+static bool is_unfinished(const struct scan_facts *facts)
+{
+	bool damaged = facts->lost > 0 || facts->document_damaged || facts->damaged;
+
+	for (int image = 0; image < IMAGE_COUNT; image++)
+		damaged |= facts->lost_image[image];
+	return !facts->complete && !facts->closed && !damaged;
+}
+
 static void drop_scan(struct api *api, struct stored_scan *scan, double now, double seconds)
 {
 	const char *id = stored_scan_id(scan);
@@ -72,7 +85,8 @@ static void drop_scan(struct api *api, struct stored_scan *scan, double now, dou
 	changed = last_change(api, scan, facts.created);
 	if (facts.asked > 0)
 		changed = fmax(changed, now - (clock_monotonic() - facts.asked));
-	if (facts.complete || facts.pinned || facts.deleted || now - changed <= seconds || stored_scan_in_use(scan))
+	if (!is_unfinished(&facts) || facts.pinned || facts.deleted || now - changed <= seconds ||
+	    stored_scan_in_use(scan))
 		return;
 	code = calibrations_check_scan(api->calibrations, id, &err);
 	if (code == 0)

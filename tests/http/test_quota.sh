@@ -207,6 +207,26 @@ gone() { # PATH
 	done
 }
 
+test_a_scan_that_the_disk_has_damaged_stays() {
+	local damaged
+	limited --keep 3
+	new_scan 201 && damaged=$scan
+	fill 201
+	printf '\377' | dd of="$state/scans/$damaged/projections.raw" bs=1 seek=100 conv=notrunc 2>/dev/null
+	ask GET "/v1/scans/$damaged/projections/0"
+	expect_status 500
+	new_scan 201
+	gone "/v1/scans/$scan"
+	ask GET "/v1/scans/$damaged"
+	expect_json '.missing == [[0, 0]] and .received_count == 19'
+	stop_daemon
+	start_daemon --tokens "$work/tokens" --keep 1
+	new_scan 201
+	gone "/v1/scans/$scan"
+	ask GET "/v1/scans/$damaged"
+	expect_json '.missing == [[0, 0]] and .received_count == 19'
+}
+
 test_what_is_old_goes_unless_it_is_pinned() {
 	local old pinned complete open announced
 	limited --keep 4
