@@ -1,12 +1,13 @@
 #!/usr/bin/env bash
-# Every test: the house's rules, the unit tests, then the black-box tests over HTTP, JOBS parts (one for each processor)
-# at a time. What cannot run here is skipped aloud. Closes with `N passed, N failed, N skipped`.
+# Every test: the house's rules, the unit tests, then the black-box tests over HTTP, JOBS parts (one for each processor
+# and one more, since many of them wait most of the time) at a time. What cannot run here is skipped aloud. Closes with
+# `N passed, N failed, N skipped`.
 # Usage: tests/run.sh [--soak] [FILTER ...]   only the parts whose path has one of the words in it; --soak: the long
 # tests of tests/soak in place of all others
 set -uo pipefail
 cd "$(dirname "$0")/.."
 export BUILD=${BUILD:-build}
-JOBS=${JOBS:-$(nproc)}
+JOBS=${JOBS:-$(($(nproc) + 1))}
 out=$BUILD/test/parts
 rm -rf "$BUILD"/test/{exchanges,reported.*,parts}
 mkdir -p "$out"

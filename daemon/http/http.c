@@ -229,10 +229,12 @@ static void log_request(const struct request *request, bool whole)
 	enum log_level level = whole && request->status >= 500 && request->status != 503 && request->status != 505
 				   ? LEVEL_WARNING
 				   : LEVEL_DEBUG;
+	const int path = (int)strcspn(request->target, "?");
 
-	log_line(level, "request id=%s method=%s target=%.200s status=%d bytes=%llu seconds=%.4f%s", request->id,
-		 request->method, request->target, request->status, (unsigned long long)request->received,
-		 clock_monotonic() - request->started, whole ? "" : " broken");
+	/* Without the query: it is no place for a token, but somebody will put one there. */
+	log_line(level, "request id=%s method=%s target=%.*s status=%d bytes=%llu seconds=%.4f%s", request->id,
+		 request->method, path < 200 ? path : 200, request->target, request->status,
+		 (unsigned long long)request->received, clock_monotonic() - request->started, whole ? "" : " broken");
 }
 
 /*

@@ -292,7 +292,7 @@ test_a_worker_that_dies_in_the_middle() {
 	reconstructed 10
 	kill -9 "$(worker_of)"
 	wait_job failed
-	expect_json '.error.detail | test("3 times, last: its worker ended with signal 9 .*; it was in stage fdk behind iteration 0 on .")'
+	expect_json '.error.detail | test("3 times without a checkpoint between them, last: its worker ended with signal 9 .*; it was in stage fdk behind iteration 0 on .")'
 }
 
 test_a_daemon_that_dies_or_stops_in_the_middle() {

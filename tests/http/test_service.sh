@@ -44,8 +44,9 @@ test_a_reload_takes_the_level_of_the_log_and_tells_what_has_to_wait() {
 	printf 'log-level = debug\nmax-wait = 17\nthreads = 3\n' >"$work/cbctd.conf"
 	kill -HUP "$(cat "$work/daemon.pid")"
 	log_has 'count from the next start on: threads, max-wait$'
-	req GET /livez
+	req GET '/livez?token=cbct_secret'
 	log_has 'target=/livez'
+	! grep -q cbct_secret "$work/cbctd.err" || fail "no query in the log"
 	echo 'log-level = loud' >"$work/cbctd.conf"
 	kill -HUP "$(cat "$work/daemon.pid")"
 	log_has 'the settings that were read before stay: .*cbctd.conf:1: log-level: "loud"'
