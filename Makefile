@@ -154,7 +154,7 @@ $(BUILD)/cbctd-held: $(call objects,$(daemon_sources) tests/http/held.c tests/lo
 
 gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench
 # Every program that a test or a benchmark runs, so that none stops compiling unseen.
-test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held manual faults.so every.so nvml-stub/libnvidia-ml.so.1 cpu-bench calibrate-bench denoise presets watchers slices acquire) \
+test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held manual faults.so every.so simulated-nvml/libnvidia-ml.so.1 cpu-bench calibrate-bench denoise presets watchers slices acquire) \
                $(if $(cuda_objects),$(gpu_programs) $(BUILD)/gpu_ceilings $(BUILD)/cbct-worker-faulty,$(call objects,$(wildcard tests/bench/gpu_*.c)))
 
 # Faults of the disk, loaded into the programs by tests.
@@ -166,7 +166,7 @@ $(BUILD)/every.so: tests/http/every.c
 	$(call say,CC  )$(CC) -std=c11 -O1 -Wall -Wextra -fPIC -shared -o $@ $< -ldl
 
 # Cards that are not there, for tests of what is told of cards.
-$(BUILD)/nvml-stub/libnvidia-ml.so.1: tests/http/nvml_stub.c
+$(BUILD)/simulated-nvml/libnvidia-ml.so.1: tests/http/simulated_nvml.c
 	@mkdir -p $(@D)
 	$(call say,CC  )$(CC) -std=c11 -O1 -Wall -Wextra -fPIC -shared -o $@ $<
 

@@ -64,7 +64,7 @@ test_rights_and_directories_that_are_none() {
 test_cards_and_their_troubles() {
 	fit
 	printf '61 1000000 3 2\n91 20000000000 -1 -1\n' >"$work/cards"
-	doctor LD_LIBRARY_PATH="$BUILD/nvml-stub" CBCT_TEST_NVML="$work/cards" cbct doctor --json "$work/fit"
+	doctor LD_LIBRARY_PATH="$BUILD/simulated-nvml" CBCT_TEST_NVML="$work/cards" cbct doctor --json "$work/fit"
 	has card ok "NVIDIA's driver 570.86.15"
 	has card ok 'card 0 is A "test" card with 24575 of 24576 MiB free, 61 degrees'
 	has card problem 'card 0 had 2 errors that could not be corrected'
@@ -72,7 +72,7 @@ test_cards_and_their_troubles() {
 	has card note 'more than half of the memory of card 1'
 	[ -e /dev/nvidiactl ] || has card problem '/dev/nvidiactl is not there'
 	: >"$work/cards"
-	doctor LD_LIBRARY_PATH="$BUILD/nvml-stub" CBCT_TEST_NVML="$work/cards" cbct doctor --json "$work/fit"
+	doctor LD_LIBRARY_PATH="$BUILD/simulated-nvml" CBCT_TEST_NVML="$work/cards" cbct doctor --json "$work/fit"
 	has card problem 'card 0 does not answer'
 }
 

@@ -143,5 +143,5 @@ test_metrics_that_alerts_and_dashboard_name_are_there() {
 }
 
 printf '61 1000000 3 2\n48 5000 -1 -1\n' >"$work/cards"
-LD_LIBRARY_PATH=$BUILD/nvml-stub${LD_LIBRARY_PATH:+:$LD_LIBRARY_PATH} CBCT_TEST_NVML=$work/cards program=cbctd-held start_daemon || exit 1
+LD_LIBRARY_PATH=$BUILD/simulated-nvml${LD_LIBRARY_PATH:+:$LD_LIBRARY_PATH} CBCT_TEST_NVML=$work/cards program=cbctd-held start_daemon || exit 1
 run_tests

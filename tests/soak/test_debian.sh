@@ -9,10 +9,10 @@ daemon_pid=
 in_debian() { chroot "$chroot" env -i PATH=/usr/sbin:/usr/bin:/sbin:/bin DEBIAN_FRONTEND=noninteractive "$@"; }
 package() { # VERSION
 	make -C "$top" --no-print-directory -o all deb CUDA=0 BUILD="$BUILD" VERSION="$1" >"$work/made" 2>&1 || fail "make deb: $(tail -5 "$work/made")"
-	cp "$BUILD/deb/cbctd_$1_amd64.deb" "$chroot/root/"
+	install -D -m 644 -t "$chroot/packages" "$BUILD/deb/cbctd_$1_amd64.deb"
 }
 install_package() { # VERSION
-	in_debian apt-get install -y -qq --no-install-recommends "/root/cbctd_$1_amd64.deb" >"$work/apt.log" 2>&1 || fail "apt-get install: $(tail -5 "$work/apt.log")"
+	in_debian apt-get install -y -qq --no-install-recommends "/packages/cbctd_$1_amd64.deb" >"$work/apt.log" 2>&1 || fail "apt-get install: $(tail -5 "$work/apt.log")"
 }
 # As the unit does, which nothing runs here.
 start_in_debian() {
