@@ -154,15 +154,15 @@ $(BUILD)/cbctd-held: $(call objects,$(daemon_sources) tests/http/held.c tests/lo
 
 gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench
 # Every program that a test or a benchmark runs, so that none stops compiling unseen.
-test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held manual faults.so every.so simulated-nvml/libnvidia-ml.so.1 cpu-bench calibrate-bench denoise presets watchers slices acquire) \
+test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held manual faults.so every.so live_bytes.so simulated-nvml/libnvidia-ml.so.1 cpu-bench calibrate-bench denoise presets watchers slices acquire) \
                $(if $(cuda_objects),$(gpu_programs) $(BUILD)/gpu_ceilings $(BUILD)/cbct-worker-faulty,$(call objects,$(wildcard tests/bench/gpu_*.c)))
 
 # Faults of the disk, loaded into the programs by tests.
 $(BUILD)/faults.so: tests/http/faults.c
 	$(call say,CC  )$(CC) -std=c11 -O1 -Wall -Wextra -fPIC -shared -o $@ $< -ldl
 
-# One call that fails, loaded into the programs by tests.
-$(BUILD)/every.so: tests/http/every.c
+# One call that fails, or a count of what is allocated, loaded into the programs by tests.
+$(BUILD)/every.so $(BUILD)/live_bytes.so: $(BUILD)/%.so: tests/http/%.c
 	$(call say,CC  )$(CC) -std=c11 -O1 -Wall -Wextra -fPIC -shared -o $@ $< -ldl
 
 # Cards that are not there, for tests of what is told of cards.
