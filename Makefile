@@ -43,11 +43,11 @@ OPTIONAL := node:nodejs npm:npm
 MODULES  := yaml:python3-yaml jsonschema:python3-jsonschema numpy:python3-numpy requests:python3-requests
 
 core_libs   := kissfft-float
-proto_libs  := libcjson libzstd libpng zlib
-daemon_libs := libmicrohttpd gnutls sqlite3 libcrypto
+proto_libs  := libcjson libzstd libpng zlib libcrypto
+daemon_libs := libmicrohttpd gnutls sqlite3
 # Other tools' files: the client reads and writes them, the daemon and the worker know none of them.
 files_libs  := expat libtiff-4
-cbct_libs   := libcurl libcrypto $(files_libs)
+cbct_libs   := libcurl $(files_libs)
 all_libs    := $(core_libs) $(proto_libs) $(daemon_libs) $(cbct_libs)
 
 pkg = $(shell pkg-config $(1) $(2) 2>/dev/null)
@@ -114,7 +114,7 @@ $(BUILD)/kernels/%.o: kernels/%.cu
 
 # The daemon and the client use the library's backends by table; only the worker,
 # the client's `recon` and the GPU tests know of CUDA's row (core/backend.c).
-$(library): $(core_objects) $(call objects,$(proto_sources))
+$(library): $(core_objects) $(call objects,$(proto_sources)) $(BUILD)/proto/commit.o
 	@rm -f $@
 	$(call say,AR  )$(AR) qcs $@ $^
 
@@ -123,6 +123,16 @@ $(BUILD)/proto/openapi.c: proto/openapi.py proto/openapi.yaml
 	$(call say,YAML)$(PYTHON) $^ >$@.part && mv $@.part $@
 
 $(BUILD)/proto/openapi.o: $(BUILD)/proto/openapi.c
+	$(call say,CC  )$(CC) $(CFLAGS) -c -o $@ $<
+
+# The commit of the sources, which volumes carry; "" where nobody knows it. The file changes only when the commit does.
+COMMIT ?= $(shell git describe --always --dirty --abbrev=12 --exclude '*' 2>/dev/null)
+$(BUILD)/proto/commit.c: again
+	@mkdir -p $(@D)
+	@printf '#include "proto/version.h"\nconst char program_commit[] = "%s";\n' "$(COMMIT)" >$@.part; \
+	cmp -s $@.part $@ && rm $@.part || mv $@.part $@
+
+$(BUILD)/proto/commit.o: $(BUILD)/proto/commit.c
 	$(call say,CC  )$(CC) $(CFLAGS) -c -o $@ $<
 
 # The page for the clinician is part of the daemon; without npm there is a plain one.
@@ -175,7 +185,7 @@ $(BUILD)/cbct-cuda: $(call objects,$(cbct_sources)) $(library) $(cuda_objects)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(cbct_libs) $(proto_libs) $(core_libs)) $(cuda_libs) $(LIBM)
 
 $(BUILD)/unit: $(call objects,$(unit_sources) $(state_sources) tests/lock_order.c) $(library)
-	$(call say,LINK)$(CC) $(LDFLAGS) $(lock_calls:%=-Wl$(comma)--wrap=%) -o $@ $^ $(call pkg,--libs,check sqlite3 libcrypto $(files_libs) $(proto_libs) $(core_libs)) $(LIBM)
+	$(call say,LINK)$(CC) $(LDFLAGS) $(lock_calls:%=-Wl$(comma)--wrap=%) -o $@ $^ $(call pkg,--libs,check sqlite3 $(files_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
 $(BUILD)/cpu-bench: $(call objects,tests/bench/bench.c) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(LIBM)
@@ -240,7 +250,7 @@ FUZZ_SECONDS ?= 10
 fuzzers := $(patsubst tests/fuzz/%.c,$(BUILD)/%,$(wildcard tests/fuzz/fuzz_*.c))
 
 $(BUILD)/fuzz_%: $(BUILD)/tests/fuzz/fuzz_%.o $(call objects,daemon/http/text.c daemon/http/framing.c clients/cbct/numbers.c clients/cbct/npy.c) $(library)
-	$(call say,LINK)$(CC) $(LDFLAGS) -fsanitize=fuzzer -o $@ $^ $(call pkg,--libs,libcrypto $(files_libs) $(proto_libs) $(core_libs)) $(LIBM)
+	$(call say,LINK)$(CC) $(LDFLAGS) -fsanitize=fuzzer -o $@ $^ $(call pkg,--libs,$(files_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
 fuzzers: $(fuzzers)
 

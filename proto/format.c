@@ -76,7 +76,7 @@ static const struct patient *placed(const struct provenance *provenance)
 
 /* ---- NIfTI ---- */
 
-static const char *const unit_names[VOLUME_TYPE_COUNT] = {"1/mm", "HU"};
+const char *const volume_units[VOLUME_TYPE_COUNT] = {"1/mm", "HU"};
 
 static void put16(uint8_t *at, int value)
 {
@@ -192,11 +192,11 @@ static int nifti_header(const struct grid *grid, enum volume_type type, const st
 	put_float(h + NIFTI_VOX_OFFSET, NIFTI_VOXELS);
 	put_float(h + NIFTI_SCL_SLOPE, 1);
 	h[NIFTI_XYZT_UNITS] = 2; /* mm */
-	provenance_sentence(provenance, unit_names[type], (char *)h + NIFTI_DESCRIP, 80);
+	provenance_sentence(provenance, volume_units[type], (char *)h + NIFTI_DESCRIP, 80);
 	put_place(h, grid, placed(provenance));
 	memcpy(h + NIFTI_MAGIC, "n+1", 4);
 	*ret_length = NIFTI_VOXELS;
-	return put_extension(h, provenance, unit_names[type], err);
+	return put_extension(h, provenance, volume_units[type], err);
 }
 
 /* ---- text headers ---- */
@@ -312,8 +312,8 @@ static int mha_header(const struct grid *grid, enum volume_type type, const stru
 
 	directions(grid, placed(provenance), axes, origin);
 	line(&h, "ObjectType = Image\nNDims = 3\n");
-	comment(&h, "Comment = ", provenance, unit_names[type]);
-	code = keys(&h, provenance, unit_names[type], false, err);
+	comment(&h, "Comment = ", provenance, volume_units[type]);
+	code = keys(&h, provenance, volume_units[type], false, err);
 	line(&h, "BinaryData = True\nBinaryDataByteOrderMSB = False\nCompressedData = False\nTransformMatrix =");
 	for (int i = 0; i < 3; i++)
 		three(&h, " ", axes[i], " ", i < 2 ? "" : "\n");
@@ -336,7 +336,7 @@ static int nrrd_header(const struct grid *grid, enum volume_type type, const str
 
 	directions(grid, placed(provenance), axes, origin);
 	line(&h, "NRRD0004\n");
-	comment(&h, "# ", provenance, unit_names[type]);
+	comment(&h, "# ", provenance, volume_units[type]);
 	line(&h, "type: %s\ndimension: 3\nspace: left-posterior-superior\n", type == VOLUME_INT16 ? "short" : "float");
 	line(&h, "sizes: %d %d %d\nspace directions:", grid->size[0], grid->size[1], grid->size[2]);
 	for (int i = 0; i < 3; i++) {
@@ -347,7 +347,7 @@ static int nrrd_header(const struct grid *grid, enum volume_type type, const str
 	line(&h, "\nkinds: domain domain domain\nendian: little\nencoding: raw\n");
 	three(&h, "space origin: (", origin, ",", ")\n");
 	line(&h, "space units: \"mm\" \"mm\" \"mm\"\n");
-	code = keys(&h, provenance, unit_names[type], true, err);
+	code = keys(&h, provenance, volume_units[type], true, err);
 	line(&h, "\n");
 	*ret_length = h.length;
 	return code;

@@ -12,10 +12,38 @@ void provenance_clear(struct provenance *provenance)
 	provenance->recipe = NULL;
 }
 
+/* The members that are texts, in their order. */
+static const struct {
+	const char *name;
+	size_t offset, size;
+} texts[] = {
+#define TEXT(member)                                                                                                   \
+	{                                                                                                              \
+#member, offsetof(struct provenance, member), sizeof(((struct provenance *)0)->member)                 \
+	}
+    TEXT(program),       TEXT(stage),   TEXT(job),    TEXT(scan),        TEXT(scan_name),
+    TEXT(commit),        TEXT(backend), TEXT(device), TEXT(scan_digest), TEXT(projections_digest),
+    TEXT(recipe_digest),
+#undef TEXT
+};
+enum { TEXTS = sizeof(texts) / sizeof(texts[0]) };
+
 static void add_text(cJSON *json, const char *name, const char *text)
 {
 	if (text[0] != '\0')
 		cJSON_AddStringToObject(json, name, text);
+}
+
+static void add_images(cJSON *json, const struct provenance *provenance)
+{
+	cJSON *images = cJSON_CreateObject();
+
+	for (int i = 0; i < IMAGE_COUNT; i++)
+		add_text(images, image_kinds[i].name, provenance->image_digest[i]);
+	if (images != NULL && images->child != NULL)
+		cJSON_AddItemToObject(json, "images", images);
+	else
+		cJSON_Delete(images);
 }
 
 cJSON *provenance_json(const struct provenance *provenance, const char *unit)
@@ -23,14 +51,14 @@ cJSON *provenance_json(const struct provenance *provenance, const char *unit)
 	const struct patient *patient = &provenance->patient;
 	cJSON *json = cJSON_CreateObject(), *matrix;
 
-	add_text(json, "program", provenance->program);
-	cJSON_AddStringToObject(json, "unit", unit);
-	add_text(json, "stage", provenance->stage);
-	if (provenance->stage[0] != '\0')
-		cJSON_AddNumberToObject(json, "iteration", provenance->iteration);
-	add_text(json, "job", provenance->job);
-	add_text(json, "scan", provenance->scan);
-	add_text(json, "scan_name", provenance->scan_name);
+	for (int i = 0; i < TEXTS; i++) {
+		add_text(json, texts[i].name, (const char *)provenance + texts[i].offset);
+		if (strcmp(texts[i].name, "program") == 0)
+			cJSON_AddStringToObject(json, "unit", unit);
+		if (strcmp(texts[i].name, "stage") == 0 && provenance->stage[0] != '\0')
+			cJSON_AddNumberToObject(json, "iteration", provenance->iteration);
+	}
+	add_images(json, provenance);
 	cJSON_AddStringToObject(json, "left_right", patient->known ? "known" : "not known");
 	cJSON_AddItemToObject(json, "patient", patient_json(patient));
 	if (patient->known) {
@@ -62,16 +90,16 @@ int provenance_read(const cJSON *json, struct provenance *ret_provenance, struct
 	struct provenance provenance = {0};
 	const cJSON *iteration = cJSON_GetObjectItemCaseSensitive(json, "iteration");
 	const cJSON *recipe = cJSON_GetObjectItemCaseSensitive(json, "recipe");
+	const cJSON *images = cJSON_GetObjectItemCaseSensitive(json, "images");
 	int code =
 	    patient_read(cJSON_GetObjectItemCaseSensitive(json, "patient"), "/patient", &provenance.patient, err);
 
 	if (code != 0)
 		return code;
-	read_text(json, "program", provenance.program, sizeof(provenance.program));
-	read_text(json, "stage", provenance.stage, sizeof(provenance.stage));
-	read_text(json, "job", provenance.job, sizeof(provenance.job));
-	read_text(json, "scan", provenance.scan, sizeof(provenance.scan));
-	read_text(json, "scan_name", provenance.scan_name, sizeof(provenance.scan_name));
+	for (int i = 0; i < TEXTS; i++)
+		read_text(json, texts[i].name, (char *)&provenance + texts[i].offset, texts[i].size);
+	for (int i = 0; i < IMAGE_COUNT; i++)
+		read_text(images, image_kinds[i].name, provenance.image_digest[i], DIGEST_TEXT_MAX);
 	if (cJSON_IsNumber(iteration))
 		provenance.iteration = iteration->valueint;
 	if (cJSON_IsObject(recipe)) {

@@ -167,6 +167,11 @@ static void run_warning(void *context, const char *code, const char *detail)
 
 /* ---- kept volumes ---- */
 
+static void set_text(char *ret, size_t size, const char *text)
+{
+	snprintf(ret, size, "%s", text != NULL ? text : "");
+}
+
 /* Slices of one piece: whole ones, at least one. */
 static int slices_of_a_piece(const struct grid *grid, size_t bytes, size_t *ret_slice)
 {
@@ -363,11 +368,19 @@ struct reconstruction {
 	struct device *device;
 	const struct reconstruction_options *options;
 	int iteration; /* that the checkpoint is expected to hold */
+	int announced; /* projections of scan.json, also those that never come */
 	struct linearise linearise;
 	/* Looks for stuck pixels in the views as they pass; NULL before the recon is opened, and where too few are. */
 	struct stuck *stuck;
 	bool looked; /* its answer is known */
 };
+
+static int projection_of(const struct reconstruction *reconstruction, int view)
+{
+	const int *projection = reconstruction->files.scan->projection;
+
+	return projection == NULL ? view : projection[view];
+}
 
 static int allocate(struct reconstruction *reconstruction, struct error *err)
 {
@@ -485,25 +498,70 @@ static int heed_stuck_pixels(struct reconstruction *reconstruction, bool *ret_ag
 	return open_recon(reconstruction, err);
 }
 
-static void set_text(char *ret, size_t size, const char *text)
-{
-	snprintf(ret, size, "%s", text != NULL ? text : "");
-}
-
 /* Sets the provenance in the volumes' files, but for stage and iteration. */
 static int set_provenance(struct reconstruction *reconstruction, const struct reconstruction_options *options,
 			  struct error *err)
 {
 	struct provenance *provenance = &reconstruction->run.provenance;
 	const struct scan *scan = reconstruction->files.scan;
+	struct device_info info;
+	int code;
 
 	provenance->patient = options->patient != NULL ? *options->patient : scan->patient;
 	set_text(provenance->program, sizeof(provenance->program), options->program);
 	set_text(provenance->job, sizeof(provenance->job), options->job);
 	set_text(provenance->scan, sizeof(provenance->scan), options->scan);
 	set_text(provenance->scan_name, sizeof(provenance->scan_name), scan->name);
+	set_text(provenance->commit, sizeof(provenance->commit), program_commit);
+	set_text(provenance->backend, sizeof(provenance->backend), reconstruction->backend->name);
+	reconstruction->backend->describe(reconstruction->device, &info);
+	set_text(provenance->device, sizeof(provenance->device), info.name);
 	provenance->recipe = recipe_json(options->recipe);
-	return provenance->recipe != NULL ? 0 : error_set(err, ERR_NO_MEMORY, "no memory for a recipe");
+	if (provenance->recipe == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a recipe");
+	code = digest_recipe(provenance->recipe, provenance->recipe_digest, err);
+	return code == 0 ? digest_scan(scan, provenance->scan_digest, err) : code;
+}
+
+/* Sets the digests of the images and, once all have been pushed, of the projections, where the directory has records.
+ */
+static int set_digests(struct reconstruction *reconstruction, struct error *err)
+{
+	struct provenance *provenance = &reconstruction->run.provenance;
+	const struct scan_files *files = &reconstruction->files;
+	uint8_t *sha256;
+	struct sum *sums;
+	unsigned char *states;
+	int code = 0;
+
+	if (files->sums < 0)
+		return 0;
+	sha256 = calloc((size_t)reconstruction->announced, DIGEST_BYTES);
+	sums = calloc((size_t)reconstruction->announced, sizeof(*sums));
+	states = calloc((size_t)reconstruction->announced, 1);
+	if (sha256 == NULL || sums == NULL || states == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for %d digests", reconstruction->announced);
+	if (code == 0)
+		code = sums_get(files->sums, 0, reconstruction->announced, 0, sums, states, err);
+	for (int i = 0; i < files->scan->count && code == 0; i++) {
+		const int k = projection_of(reconstruction, i);
+
+		if (states[k] == SUM_GOOD)
+			memcpy(sha256 + (size_t)k * DIGEST_BYTES, sums[k].sha256, DIGEST_BYTES);
+	}
+	if (code == 0)
+		code = digest_projections(sha256, reconstruction->announced, provenance->projections_digest, err);
+	for (int i = 0; i < IMAGE_COUNT && code == 0; i++) {
+		if (files->image[i] == NULL)
+			continue;
+		code = sums_get(files->sums, image_kinds[i].slot, 1, 0, sums, states, err);
+		if (code == 0 && states[0] == SUM_GOOD)
+			digest_text(sums[0].sha256, provenance->image_digest[i]);
+	}
+	free(sha256);
+	free(sums);
+	free(states);
+	return code;
 }
 
 int reconstruction_open(const struct backend *backend, struct device *device,
@@ -528,6 +586,8 @@ int reconstruction_open(const struct backend *backend, struct device *device,
 						     .keep = run_keep,
 						     .denoising = run_denoising,
 						     .warning = run_warning};
+	reconstruction->backend = backend;
+	reconstruction->device = device;
 	reconstruction->files.projections = reconstruction->files.sums = -1;
 	code = scan_files_open(options->scan_directory, &reconstruction->files, err);
 	if (code == 0 && options->checked && reconstruction->files.sums < 0)
@@ -535,11 +595,11 @@ int reconstruction_open(const struct backend *backend, struct device *device,
 	if (code == 0)
 		code = set_provenance(reconstruction, options, err);
 	if (code == 0)
+		reconstruction->announced = reconstruction->files.scan->count;
+	if (code == 0)
 		code = options->present == NULL ? 0 : scan_reduce(reconstruction->files.scan, options->present, err);
 	if (code == 0)
 		code = allocate(reconstruction, err);
-	reconstruction->backend = backend;
-	reconstruction->device = device;
 	reconstruction->options = options;
 	reconstruction->iteration = options->iteration;
 	reconstruction->resumed = options->checkpoint != NULL;
@@ -668,13 +728,6 @@ out:
 	return code;
 }
 
-static int projection_of(const struct reconstruction *reconstruction, int view)
-{
-	const int *projection = reconstruction->files.scan->projection;
-
-	return projection == NULL ? view : projection[view];
-}
-
 /* Into samples, at most a batch of views from `view` on; neighbours in the file in one go. */
 static int read_views(struct reconstruction *reconstruction, int view, int count, struct error *err)
 {
@@ -767,6 +820,8 @@ int reconstruction_finish(struct reconstruction *reconstruction, struct error *e
 
 	if (code == 0 && again)
 		code = reconstruction_push_rest(reconstruction, err);
+	if (code == 0)
+		code = set_digests(reconstruction, err);
 	if (code == 0)
 		code = recon_run(reconstruction->recon, err);
 

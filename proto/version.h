@@ -4,4 +4,7 @@
 /* The version of all programs together; files, `--version` and /livez show it. */
 #define CBCT_VERSION "1.0.0"
 
+/* The commit of the sources that the program was built from, with "-dirty" where they were changed; "": not known. */
+extern const char program_commit[];
+
 #endif

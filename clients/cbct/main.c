@@ -20,7 +20,7 @@ static const struct command *const commands[] = {
     &command_watch,        &command_get,       &command_recon,           &command_compare, &command_slice,
     &command_scans,        &command_jobs,      &command_status,          &command_rm,      &command_complete,
     &command_parameters,   &command_calibrate, &command_token,           &command_audit,   &command_calibrate_scan,
-    &command_calibrations, &command_doctor,    &command_backup,          &command_restore,
+    &command_calibrations, &command_doctor,    &command_backup,          &command_restore, &command_reproduce,
 };
 enum { COMMAND_COUNT = sizeof(commands) / sizeof(commands[0]) };
 

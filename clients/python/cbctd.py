@@ -688,6 +688,10 @@ class Client:
         headers = {"Accept-Encoding": "identity"}
         return self._bytes(f"/v1/jobs/{job}/volumes/{name}", params, headers)
 
+    def provenance(self, job: str, name: str = "final") -> Document:
+        """What a kept volume was made from: digests of scan and projections, recipe, program, device."""
+        return self._json("GET", f"/v1/jobs/{job}/volumes/{name}/provenance")
+
     def annotations(self, job: str) -> Tuple[Document, str]:
         """What was measured in the job's volumes, and the tag that a change of it names."""
         reply = self._request("GET", f"/v1/jobs/{job}/annotations")

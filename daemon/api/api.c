@@ -67,6 +67,7 @@ const struct route api_routes[] = {
     {"GET", "/v1/jobs/{}/volumes", ROLE_VIEW, volume_list, BODY_NONE, 0, NULL, NULL, "limit after wait"},
     {"GET", "/v1/jobs/{}/volumes/{}", ROLE_VIEW, volume_get, BODY_NONE, 0, NULL, NULL,
      "format type scale dicom position"},
+    {"GET", "/v1/jobs/{}/volumes/{}/provenance", ROLE_VIEW, provenance_get, BODY_NONE, 0, NULL, NULL, NULL},
     {"GET", "/v1/jobs/{}/volumes/{}/slice", ROLE_VIEW, slice_get, BODY_NONE, 0, NULL, NULL,
      "axis index window level sheet normal up center size spacing thickness mode"},
     {"GET", "/v1/jobs/{}/stream", ROLE_VIEW, volume_stream, BODY_NONE, 0, NULL, NULL, "format type scale after"},

@@ -8,6 +8,7 @@
 
 #include "daemon/log.h"
 #include "proto/clock.h"
+#include "proto/digest.h"
 #include "proto/json.h"
 
 static void add_text_or_null(cJSON *object, const char *name, const char *text)
@@ -116,6 +117,22 @@ static void add_scan_warnings(cJSON *document, const struct scan *scan, const st
 	cJSON_AddItemToObject(document, "warnings", warnings);
 }
 
+/* Digests of what volumes are made from; of the projections null until all are there. */
+static void add_digests(cJSON *document, struct stored_scan *stored, const struct scan *scan,
+			const struct scan_facts *facts)
+{
+	cJSON *digests = cJSON_AddObjectToObject(document, "digests");
+	char text[DIGEST_TEXT_MAX];
+	struct error ignored;
+
+	if (digest_scan(scan, text, &ignored) == 0)
+		cJSON_AddStringToObject(digests, "scan", text);
+	if (facts->complete && stored_scan_digest(stored, text, &ignored) == 0)
+		cJSON_AddStringToObject(digests, "projections", text);
+	else
+		cJSON_AddNullToObject(digests, "projections");
+}
+
 cJSON *scan_document(struct stored_scan *stored, bool brief)
 {
 	const struct scan *scan = stored_scan_parsed(stored);
@@ -150,6 +167,7 @@ cJSON *scan_document(struct stored_scan *stored, bool brief)
 		cJSON_Delete(document);
 		return NULL;
 	}
+	add_digests(document, stored, scan, &facts);
 	scan = stored_scan_measured(stored);
 	cJSON_AddItemToObject(document, "derived", scan_derived(scan));
 	add_scan_warnings(document, scan, &facts);

@@ -47,6 +47,7 @@ int all_events(void *context, struct request *request, struct error *err);
 
 int volume_list(void *context, struct request *request, struct error *err);
 int volume_get(void *context, struct request *request, struct error *err);
+int provenance_get(void *context, struct request *request, struct error *err);
 
 int volume_stream(void *context, struct request *request, struct error *err);
 int annotations_get(void *context, struct request *request, struct error *err);

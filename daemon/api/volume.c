@@ -1,7 +1,9 @@
 /* /v1/jobs/{}/volumes */
+#include <fcntl.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <unistd.h>
 
 #include "daemon/api/internal.h"
 
@@ -372,4 +374,55 @@ int volume_get(void *context, struct request *request, struct error *err)
 		return err->code;
 	entity_headers(request, &entity, &selection);
 	return 0;
+}
+
+static int job_started(struct api *api, const char *id, double *ret_started, struct error *err)
+{
+	struct job_record record;
+	struct job *job;
+	int code = jobs_find(api->jobs, id, &job, err);
+
+	if (code != 0)
+		return code;
+	job_record(job, &record);
+	*ret_started = record.started;
+	job_release(job);
+	return 0;
+}
+
+/* What the file says of where it comes from, and the times, which the file has not: it has the same bits each time. */
+int provenance_get(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	struct provenance provenance = {0};
+	struct volume_record volume;
+	struct job_facts facts;
+	struct grid grid;
+	cJSON *document;
+	char path[1024];
+	size_t start;
+	double started = 0;
+	int file, code = volume_asked(api, request, &facts, &volume, err);
+
+	if (code == 0)
+		code = job_started(api, facts.id, &started, err);
+	if (code == 0)
+		code = volume_verify(api, facts.id, &volume, 0, 0, err);
+	if (code != 0)
+		return code;
+	store_volume_path(api->store, facts.id, volume.name, path);
+	file = open(path, O_RDONLY | O_CLOEXEC);
+	if (file < 0)
+		return error_set(err, ERR_NOT_FOUND, "the volume is not there any more");
+	grid = volume.grid;
+	code = volume_own_head(file, path, &grid, &start, &provenance, err);
+	close(file);
+	if (code != 0)
+		return code;
+	document = provenance_json(&provenance, volume_units[VOLUME_FLOAT32]);
+	provenance_clear(&provenance);
+	cJSON_AddStringToObject(document, "volume", volume.name);
+	json_add_time(document, "made", volume.created);
+	json_add_time(document, "started", started);
+	return request_reply_json(request, 200, document, err);
 }

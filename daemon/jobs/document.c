@@ -2,10 +2,10 @@
 #include "daemon/jobs/document.h"
 
 #include <math.h>
-#include <openssl/evp.h>
 #include <stdio.h>
 
 #include "daemon/problem.h"
+#include "proto/digest.h"
 #include "proto/json.h"
 
 cJSON *job_error_document(const struct job_record *record)
@@ -34,21 +34,10 @@ cJSON *history_row_document(const struct history_row *row)
 	return document;
 }
 
-/* As RFC 9530 writes it in Content-Digest: of the raw float32 voxels. */
-static void add_digest(cJSON *object, const uint8_t sha256[32])
-{
-	unsigned char base64[64];
-	char text[96];
-
-	EVP_EncodeBlock(base64, sha256, 32);
-	snprintf(text, sizeof(text), "sha-256=:%s:", (const char *)base64);
-	cJSON_AddStringToObject(object, "digest", text);
-}
-
 cJSON *volume_document(const char *job, const struct volume_record *volume)
 {
 	cJSON *document = cJSON_CreateObject(), *statistics;
-	char href[128];
+	char href[128], digest[DIGEST_TEXT_MAX];
 
 	snprintf(href, sizeof(href), "/v1/jobs/%s/volumes/%s", job, volume->name);
 	cJSON_AddStringToObject(document, "name", volume->name);
@@ -59,8 +48,12 @@ cJSON *volume_document(const char *job, const struct volume_record *volume)
 	cJSON_AddItemToObject(document, "spacing_mm", cJSON_CreateDoubleArray(volume->grid.spacing, 3));
 	cJSON_AddItemToObject(document, "origin_mm", cJSON_CreateDoubleArray(volume->grid.origin, 3));
 	cJSON_AddNumberToObject(document, "bytes", (double)volume->bytes);
-	if (volume->hashed)
-		add_digest(document, volume->sha256);
+	if (volume->hashed) { /* of the raw float32 voxels */
+		digest_text(volume->sha256, digest);
+		cJSON_AddStringToObject(document, "digest", digest);
+	}
+	snprintf(href, sizeof(href), "/v1/jobs/%s/volumes/%s/provenance", job, volume->name);
+	cJSON_AddStringToObject(document, "provenance", href);
 	statistics = cJSON_AddObjectToObject(document, "statistics");
 	cJSON_AddNumberToObject(statistics, "minimum", volume->norms.minimum);
 	cJSON_AddNumberToObject(statistics, "maximum", volume->norms.maximum);

@@ -10,6 +10,7 @@
 #include "daemon/store/quarantine.h"
 #include "daemon/watch.h"
 #include "proto/recipe.h"
+#include "proto/digest.h"
 #include "proto/sums.h"
 
 /*
@@ -207,6 +208,8 @@ void stored_scan_received(struct stored_scan *scan, unsigned char *ret_flags);
 int stored_scan_leading(struct stored_scan *scan);
 /* False when it is not stored. ret_sum->bytes 0: only its SHA-256 is known yet. */
 bool stored_scan_sum(struct stored_scan *scan, int index, struct sum *ret_sum);
+/* Digest over the digests of the projections that are stored, as digest_projections of proto/digest.h has it. */
+int stored_scan_digest(struct stored_scan *scan, char ret_text[DIGEST_TEXT_MAX], struct error *err);
 
 /* The projections that were found damaged: flags[count]. */
 void stored_scan_lost(struct stored_scan *scan, unsigned char *ret_flags);

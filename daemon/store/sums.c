@@ -213,6 +213,23 @@ int store_forget_lost(struct stored_scan *scan, struct error *err)
 	return code;
 }
 
+int stored_scan_digest(struct stored_scan *scan, char ret_text[DIGEST_TEXT_MAX], struct error *err)
+{
+	uint8_t *sha256 = calloc((size_t)scan->count, DIGEST_BYTES);
+	int code;
+
+	if (sha256 == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for %d digests", scan->count);
+	pthread_mutex_lock(&scan->lock);
+	for (int i = 0; i < scan->count; i++)
+		if (scan->progress[i] == STORED)
+			memcpy(sha256 + (size_t)i * DIGEST_BYTES, scan->sums[i].sha256, DIGEST_BYTES);
+	pthread_mutex_unlock(&scan->lock);
+	code = digest_projections(sha256, scan->count, ret_text, err);
+	free(sha256);
+	return code;
+}
+
 /* ---- reading ---- */
 
 static bool fits_sha256(const void *bytes, size_t size, const uint8_t sha256[32])

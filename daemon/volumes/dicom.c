@@ -292,17 +292,31 @@ static void date(struct instance *image)
 	strftime(image->now, sizeof(image->now), "%Y%m%d%H%M%S", &when);
 }
 
-/* "SART iteration 5 of cbctd 1.0.0, from cone-beam projections; recipe {...}", within the 1024 characters of ST. */
+/* Adds a part behind what the text has, where there is room for all of it. */
+static void add_part(char *text, size_t size, const char *before, const char *part)
+{
+	const size_t length = strlen(text);
+
+	if (part != NULL && part[0] != '\0' && length + strlen(before) + strlen(part) < size)
+		snprintf(text + length, size - length, "%s%s", before, part);
+}
+
+/*
+ * "SART iteration 5 of cbctd 1.0.0, from cone-beam projections; recipe {...}; digests", as much of it as fits the 1024
+ * characters of ST: half a recipe is none.
+ */
 static void put_derivation(struct object *o, const struct instance *image)
 {
 	const struct provenance *p = image->provenance;
 	char *recipe = p->recipe != NULL ? provenance_text(p->recipe) : NULL, text[1025];
-	int length = snprintf(text, sizeof(text), "reconstructed from cone-beam projections: %s, iteration %d; %s",
-			      p->stage, p->iteration, p->program);
 
-	/* A backslash separates values elsewhere, here it is as good as any; half a recipe is none. */
-	if (recipe != NULL && (size_t)length + strlen(recipe) + 10 < sizeof(text))
-		snprintf(text + length, sizeof(text) - (size_t)length, "; recipe %s", recipe);
+	snprintf(text, sizeof(text), "reconstructed from cone-beam projections: %s, iteration %d; %s", p->stage,
+		 p->iteration, p->program);
+	add_part(text, sizeof(text), " of commit ", p->commit);
+	/* A backslash separates values elsewhere, here it is as good as any. */
+	add_part(text, sizeof(text), "; recipe ", recipe);
+	add_part(text, sizeof(text), "; projections ", p->projections_digest);
+	add_part(text, sizeof(text), "; scan ", p->scan_digest);
 	free(recipe);
 	put_text(o, 0x00082111, "ST", text);
 }

@@ -298,6 +298,8 @@ class Volumes(Case):
     def test_arrays_are_the_files_and_lie_the_same_way(self) -> None:
         job = self.finished(fdk={}, sart={"iterations": 2}, emit=["fdk", 1])
         names = [document["name"] for document in self.client.volume_list(job)]
+        made = self.client.provenance(job, names[0])
+        self.assertEqual((made["job"], made["volume"], made["unit"]), (job, names[0], "1/mm"))
         streamed = list(self.client.volumes(job))
         self.assertEqual([volume.name for volume in streamed], names)
         self.assertEqual(names, ["fdk", "iter-1", "final"])

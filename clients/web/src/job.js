@@ -421,7 +421,8 @@ export class JobPage {
 		const size = volume => volume.bytes / (type.value === 'int16' ? 2 : 1) / Number(scale.value) ** 3
 		replace(list, [...this.#volumes].reverse().map(volume => h('li', { class: volume.name === this.#selected ? 'current' : '' },
 			h('a', { href: volumePath(this.id, volume.name) + query, download: '' }, volume.name),
-			h('span', {}, volumeText(volume)), h('span', { class: 'amount' }, bytes(size(volume))))))
+			h('span', {}, volumeText(volume)), h('span', { class: 'amount' }, bytes(size(volume))),
+			h('a', { href: `${volumePath(this.id, volume.name)}/provenance`, title: 'Scan, projections, recipe, program and device, as digests and words' }, 'made from'))))
 	}
 
 	/* ---- comparison ---- */
