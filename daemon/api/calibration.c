@@ -18,6 +18,7 @@ int calibration_post(void *context, struct request *request, struct error *err)
 	    request_reply_json(request, 202, document, err) != 0)
 		return err->code;
 	request_reply_header(request, "Location", "/v1/calibrations/%s", id);
+	request_made(request, id);
 	return 0;
 }
 

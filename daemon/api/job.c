@@ -22,6 +22,7 @@ static int reply_accepted(struct request *request, struct job *job, struct error
 	if (reply_job(request, 202, job, err) != 0)
 		return err->code;
 	request_reply_header(request, "Location", "/v1/jobs/%s", facts.id);
+	request_made(request, facts.id);
 	return 0;
 }
 

@@ -86,7 +86,7 @@ static void drop_scan(struct api *api, struct stored_scan *scan, double now, dou
 	if (facts.asked > 0)
 		changed = fmax(changed, now - (clock_monotonic() - facts.asked));
 	if (!is_unfinished(&facts) || facts.pinned || facts.deleted || now - changed <= seconds ||
-	    stored_scan_in_use(scan))
+	    stored_scan_in_use(scan) || jobs_pin_scan(api->jobs, id))
 		return;
 	code = calibrations_check_scan(api->calibrations, id, &err);
 	if (code == 0)

@@ -37,8 +37,10 @@ int scan_post(void *context, struct request *request, struct error *err)
 	if (code != 0)
 		return code;
 	code = request_reply_json(request, 201, scan_document(stored, false), err);
-	if (code == 0)
+	if (code == 0) {
 		request_reply_header(request, "Location", "/v1/scans/%s", stored_scan_id(stored));
+		request_made(request, stored_scan_id(stored));
+	}
 	stored_scan_release(stored);
 	return code;
 }

@@ -40,7 +40,12 @@ const char *const proof_names[PROOF_COUNT] = {
 
 enum { SESSIONS_MAX = 1024, SESSIONS_OF_TOKEN = 16, PEER_RULES_MAX = 64, GROUPS_MAX = 1024 };
 static const double session_seconds = 12 * 3600; /* a working day */
+/*
+ * Cookies are a host's, whatever the port (RFC 6265, 8.5): the name has the port, so that the daemons of one host do
+ * not overwrite each other's.
+ */
 static const char session_cookie[] = "cbctd_session";
+enum { COOKIE_NAME_MAX = 40 };
 
 /* Guarded by access.lock. */
 struct session {
@@ -260,6 +265,28 @@ static struct session *session_find(struct access *access, const char *cookie)
 	return found;
 }
 
+/* "cbctd_session_2228", the port as the browser has it, which may be a proxy's; without a port no more than the name.
+ */
+static const char *cookie_name(struct request *request, char ret_name[COOKIE_NAME_MAX])
+{
+	const char *authority = request_header(request, "Host");
+	char host[HOST_MAX];
+	long port = -1;
+
+	if (authority == NULL || !authority_parse(authority, strlen(authority), host, &port) || port < 0)
+		snprintf(ret_name, COOKIE_NAME_MAX, "%s", session_cookie);
+	else
+		snprintf(ret_name, COOKIE_NAME_MAX, "%s_%ld", session_cookie, port);
+	return ret_name;
+}
+
+static const char *cookie_value(struct request *request)
+{
+	char name[COOKIE_NAME_MAX];
+
+	return MHD_lookup_connection_value(request->mhd, MHD_COOKIE_KIND, cookie_name(request, name));
+}
+
 static bool find_session(struct access *access, const char *cookie, struct identity *ret)
 {
 	const struct session *session;
@@ -305,7 +332,7 @@ static enum shown read_proof(struct request *request, struct identity *ret)
 
 	if (shown != SHOWN_NOTHING)
 		return shown;
-	cookie = MHD_lookup_connection_value(request->mhd, MHD_COOKIE_KIND, session_cookie);
+	cookie = cookie_value(request);
 	if (request->connection->peer_role > ROLE_ANYONE) {
 		*ret = (struct identity){
 		    .role = request->connection->peer_role, .expires = TOKEN_NEVER, .proof = PROOF_PEER};
@@ -471,8 +498,10 @@ static struct session *session_place(struct access *access, const uint8_t token[
 
 static void set_cookie(struct request *request, const char *value, double seconds)
 {
+	char name[COOKIE_NAME_MAX];
+
 	request_reply_header(request, "Set-Cookie", "%s=%s; Path=/; Max-Age=%.0f; HttpOnly; SameSite=Strict%s",
-			     session_cookie, value, seconds, request->connection->tls ? "; Secure" : "");
+			     cookie_name(request, name), value, seconds, request->connection->tls ? "; Secure" : "");
 }
 
 int request_session_open(struct request *request, struct error *err)
@@ -498,7 +527,7 @@ int request_session_open(struct request *request, struct error *err)
 void request_session_close(struct request *request)
 {
 	struct access *access = request->http->access;
-	const char *cookie = MHD_lookup_connection_value(request->mhd, MHD_COOKIE_KIND, session_cookie);
+	const char *cookie = cookie_value(request);
 	struct session *session;
 
 	pthread_mutex_lock(&access->lock);

@@ -53,7 +53,7 @@ static bool same_host(const struct connection *a, const struct connection *b)
 
 /*
  * How little a connection is needed, with its lock held: what is idle the
- * longest first, then the slowest transfer; negative: it is left alone.
+ * longest first, then the slowest transfer, before all a stream whose client has gone; negative: it is left alone.
  */
 static double dispensable(const struct connection *connection, double now)
 {
@@ -61,7 +61,12 @@ static double dispensable(const struct connection *connection, double now)
 	double age = now - connection->since, rate = (double)connection->http->options.minimum_rate;
 	uint64_t moved = connection->bytes;
 
-	if (connection->cut || connection->suspended)
+	if (connection->cut)
+		return -1;
+	/* The clock would see it within two seconds. */
+	if (connection->patience > 0 && live_hung_up(connection))
+		return INFINITY;
+	if (connection->suspended)
 		return -1;
 	if (connection->phase == PHASE_IDLE)
 		return age >= idle_after ? idle + age : -1;
@@ -104,6 +109,7 @@ static bool make_room(struct http *http, const struct connection *like)
 	if (victim->mhd != NULL)
 		shutdown(victim->socket, SHUT_RDWR);
 	pthread_mutex_unlock(&victim->lock);
+	pthread_cond_signal(&http->clock_kick); /* resumes one that is suspended, for its end */
 	return true;
 }
 

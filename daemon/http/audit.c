@@ -447,6 +447,8 @@ void audit_tell(struct audit *audit, const struct request *request, bool whole)
 		return;
 	if (request->route != NULL && request->arguments[0] != NULL && id_valid(request->arguments[0]))
 		of = request->arguments[0];
+	else if (request->made[0] != '\0')
+		of = request->made;
 	if (!is_wanted(request, of))
 		return;
 	clock_text(clock_realtime(), now);

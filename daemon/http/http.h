@@ -117,6 +117,8 @@ int64_t request_content_length(const struct request *request);
 const char *request_body(const struct request *request, size_t *ret_length);
 
 /* The handler's own, freed with the request; one at most. */
+/* The audit log names this as what the request is of: a scan, job or calibration that it has made. */
+void request_made(struct request *request, const char *id);
 void request_set_state(struct request *request, void *state, void (*state_free)(void *state));
 void *request_state(const struct request *request);
 

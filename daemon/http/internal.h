@@ -10,6 +10,7 @@
 
 #include "daemon/http/http.h"
 #include "daemon/http/framing.h"
+#include "daemon/id.h"
 
 /* Shared by the files of this room; no other room includes this header. */
 
@@ -96,6 +97,7 @@ struct request {
 	struct identity who;
 	unsigned who_generation; /* of the tokens that knew it */
 	const char *arguments[ARGUMENTS_MAX];
+	char made[ID_SIZE]; /* by this request; "" without */
 	struct {
 		const char *name, *value;
 	} queries[QUERIES_MAX];

@@ -434,6 +434,11 @@ const char *request_body(const struct request *request, size_t *ret_length)
 	return request->body != NULL ? request->body : "";
 }
 
+void request_made(struct request *request, const char *id)
+{
+	snprintf(request->made, sizeof(request->made), "%s", id);
+}
+
 void request_set_state(struct request *request, void *state, void (*state_free)(void *state))
 {
 	request->state = state;

@@ -52,6 +52,12 @@ void upload_unreference_and_unlock(struct upload *upload)
 	pthread_mutex_unlock(&uploads->lock);
 	if (!last)
 		return;
+	if (upload->descriptor >= 0 && upload->target.kind == UPLOAD_PROJECTIONS &&
+	    stored_scan_return_room(upload->scan, upload->descriptor)) {
+		pthread_mutex_lock(&uploads->lock);
+		uploads_requeue(uploads);
+		pthread_mutex_unlock(&uploads->lock);
+	}
 	if (upload->descriptor >= 0)
 		close(upload->descriptor);
 	if (upload->sums >= 0)

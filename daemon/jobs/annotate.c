@@ -81,6 +81,17 @@ int job_annotate(struct job *job, const char *text, size_t length, bool (*fits)(
 	return code;
 }
 
+bool jobs_pin_scan(struct jobs *jobs, const char *scan)
+{
+	bool pinned = false;
+
+	pthread_mutex_lock(&jobs->lock);
+	for (int i = 0; i < jobs->count && !pinned; i++)
+		pinned = jobs->all[i]->record.pinned && strcmp(jobs->all[i]->scan, scan) == 0;
+	pthread_mutex_unlock(&jobs->lock);
+	return pinned;
+}
+
 int job_pin(struct job *job, bool pinned, struct error *err)
 {
 	struct jobs *jobs = job->jobs;

@@ -56,7 +56,8 @@ struct client {
 };
 
 struct jobs {
-	struct store *store; /* constant */
+	struct store *store; /* constant, as the next */
+	double opened;       /* monotonic */
 	struct watch_list watchers;
 	pthread_mutex_t change; /* one change at a time; held over its commit; guards next_ticket */
 	long long next_ticket;
@@ -78,6 +79,14 @@ void job_share(struct job *job);
 void jobs_charge(struct jobs *jobs);
 /* ERR_LIMIT, ERR_BUSY, ERR_QUOTA: one more job of this client is too many. jobs->change is held. */
 int jobs_check_limits(struct jobs *jobs, const struct job *job, struct error *err);
+/*
+ * Where --max-jobs keep this one out: cancels the job that has waited longest for projections of which none come, of a
+ * client that has no fewer jobs. False: there is none. jobs->change is held; *ret_cancelled is a reference, and whoever
+ * watches it is to be woken without the lock.
+ */
+bool jobs_make_place(struct jobs *jobs, const struct job *job, struct job **ret_cancelled);
+/* jobs->change is held: the request to cancel is on the disk before it is shown, so that a restart carries it out. */
+int job_ask_cancel(struct job *job, struct error *err);
 /* Bytes of the volumes that the job may make. */
 unsigned long long job_bytes_wanted(const struct job_request *request);
 /* An ended job's bytes are those that it has left. */

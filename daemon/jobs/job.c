@@ -295,6 +295,7 @@ int jobs_open(struct store *store, struct jobs **ret_jobs, struct error *err)
 	if (jobs == NULL)
 		return error_set_errno(err, ENOMEM, "jobs");
 	jobs->store = store;
+	jobs->opened = clock_monotonic();
 	jobs->next_ticket = 1;
 	lock_init(&jobs->change, LOCK_CHANGE);
 	lock_init(&jobs->lock, LOCK_JOBS);
@@ -447,7 +448,7 @@ int jobs_post(struct jobs *jobs, const struct job_request *request, struct store
 	      struct job **ret_job, bool *ret_new, struct error *err)
 {
 	struct job_record record = {0};
-	struct job *repeat = NULL, *job = NULL;
+	struct job *repeat = NULL, *job = NULL, *cancelled = NULL;
 	struct job_facts facts;
 	int code = fill_record(&record, request, scan, memory, client, key, digest, err);
 
@@ -470,7 +471,12 @@ int jobs_post(struct jobs *jobs, const struct job_request *request, struct store
 		code = jobs_repeat(jobs, key, digest, &repeat, err);
 	if (code == 0 && repeat == NULL)
 		code = insert_job(jobs, job, scan, err);
+	if (code == ERR_BUSY && repeat == NULL && jobs_make_place(jobs, job, &cancelled))
+		code = insert_job(jobs, job, scan, err);
 	pthread_mutex_unlock(&jobs->change);
+	if (cancelled != NULL)
+		job_wake(cancelled);
+	job_release(cancelled);
 	if (code != 0 || repeat != NULL) {
 		job_free(job);
 		if (code == 0) {
@@ -488,8 +494,7 @@ int jobs_post(struct jobs *jobs, const struct job_request *request, struct store
 	return 0;
 }
 
-/* jobs->change is held: the request to cancel is on the disk before it is shown, so that a restart carries it out. */
-static int ask_cancel(struct job *job, struct error *err)
+int job_ask_cancel(struct job *job, struct error *err)
 {
 	struct job_record record;
 	int code;
@@ -538,7 +543,7 @@ int jobs_delete(struct jobs *jobs, struct job *job, bool *ret_removed, struct er
 	else if (facts.ended)
 		code = remove_job(jobs, job, err);
 	else if (facts.state == JOB_RUNNING || facts.attended)
-		code = ask_cancel(job, err);
+		code = job_ask_cancel(job, err);
 	else
 		code = job_change_state(job, JOB_CANCELLED, &asked, err);
 	pthread_mutex_unlock(&jobs->change);

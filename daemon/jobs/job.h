@@ -78,6 +78,8 @@ int jobs_list(struct jobs *jobs, const char *after, int limit, struct job **ret_
  * removed with its rows and files. *ret_removed says which it was.
  */
 int jobs_delete(struct jobs *jobs, struct job *job, bool *ret_removed, struct error *err);
+/* A pinned job uses this scan: neither goes for its age. */
+bool jobs_pin_scan(struct jobs *jobs, const char *scan);
 /* A pinned job stays whatever its age. ERR_NOT_FOUND: it is removed. */
 int job_pin(struct job *job, bool pinned, struct error *err);
 /* Deletes a scan with its files. ERR_CONFLICT, naming the job, while one that has not ended uses the scan. */

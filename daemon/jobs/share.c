@@ -1,9 +1,11 @@
 /* Shares of clients: whose jobs go first, and how many they may have (queue.h, store.h's limits). */
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
 #include "daemon/jobs/internal.h"
+#include "daemon/log.h"
 #include "proto/clock.h"
 
 struct client *jobs_client(struct jobs *jobs, const char *name)
@@ -126,7 +128,8 @@ long jobs_open_count(struct jobs *jobs, const char *client)
 
 	pthread_mutex_lock(&jobs->lock);
 	for (int i = 0; i < jobs->count; i++)
-		count += is_of(jobs->all[i], client) && !job_state_ended(jobs->all[i]->record.state);
+		count += is_of(jobs->all[i], client) && !job_state_ended(jobs->all[i]->record.state) &&
+			 !jobs->all[i]->record.cancel_asked;
 	pthread_mutex_unlock(&jobs->lock);
 	return count;
 }
@@ -143,4 +146,99 @@ int jobs_check_limits(struct jobs *jobs, const struct job *job, struct error *er
 	if (limits->jobs > 0 && all >= limits->jobs)
 		return error_set(err, ERR_BUSY, "jobs that have not ended: %ld; there may be %ld", all, limits->jobs);
 	return store_check_volumes(jobs->store, client, job->kept_bytes, err);
+}
+
+/* The index of a job among all that may give its place, oldest first from `from` on; -1: none. jobs->lock is held. */
+static int next_waiting(const struct jobs *jobs, int from)
+{
+	for (int i = from; i < jobs->count; i++) {
+		const struct job_record *record = &jobs->all[i]->record;
+
+		if (record->state == JOB_WAITING && !record->pinned && !record->cancel_asked)
+			return i;
+	}
+	return -1;
+}
+
+/*
+ * s since anything came for the job. Its own age is by the clock of the day, which may have been set: it is no older
+ * than this daemon, then.
+ */
+static double idle_seconds(struct jobs *jobs, const struct job *job, double created)
+{
+	const double now = clock_monotonic();
+	double idle = fmin(clock_realtime() - created, now - jobs->opened);
+	struct scan_facts facts;
+	struct stored_scan *scan;
+	struct error ignored;
+
+	if (store_scan_refer(jobs->store, job->scan, &scan, &ignored) != 0)
+		return idle;
+	stored_scan_facts(scan, &facts);
+	if (facts.asked > 0)
+		idle = fmin(idle, now - facts.asked);
+	stored_scan_release(scan);
+	return idle;
+}
+
+/* A reference to the job that has waited longest of those that may give their place; NULL: none. */
+static struct job *find_idle(struct jobs *jobs, const char *client, double *ret_idle)
+{
+	const long own = jobs_open_count(jobs, client);
+	struct job *longest = NULL;
+	double most = store_limits(jobs->store)->job_patience;
+
+	for (int i = 0;; i++) {
+		struct job *job = NULL;
+		double created = 0, idle;
+
+		pthread_mutex_lock(&jobs->lock);
+		i = next_waiting(jobs, i);
+		if (i >= 0) {
+			job = jobs->all[i];
+			job->references++;
+			created = job->record.created;
+		}
+		pthread_mutex_unlock(&jobs->lock);
+		if (job == NULL)
+			break;
+		idle = idle_seconds(jobs, job, created);
+		if (idle >= most && (is_of(job, client) || jobs_open_count(jobs, job->client->name) >= own)) {
+			job_release(longest);
+			longest = job;
+			most = *ret_idle = idle;
+		} else {
+			job_release(job);
+		}
+	}
+	return longest;
+}
+
+bool jobs_make_place(struct jobs *jobs, const struct job *job, struct job **ret_cancelled)
+{
+	const struct store_limits *limits = store_limits(jobs->store);
+	struct job *idle = NULL;
+	char reason[160];
+	const struct job_change change = {.reason = reason};
+	struct error err;
+	double seconds = 0;
+	int code;
+
+	/* Nobody goes for a job that finds no place all the same. */
+	if (limits->jobs == 0 || jobs_open_count(jobs, NULL) < limits->jobs ||
+	    store_check_volumes(jobs->store, job->record.client, job->kept_bytes, &err) != 0)
+		return false;
+	idle = find_idle(jobs, job->record.client, &seconds);
+	if (idle == NULL)
+		return false;
+	snprintf(reason, sizeof(reason), "another one takes its place: nothing came for it for %.0f s", seconds);
+	/* A worker that holds what has come so far is asked to leave it. */
+	code =
+	    idle->record.attended ? job_ask_cancel(idle, &err) : job_change_state(idle, JOB_CANCELLED, &change, &err);
+	if (code == 0)
+		log_line(LEVEL_WARNING, "job %s: %s", idle->id, reason);
+	else
+		log_line(LEVEL_WARNING, "job %s keeps its place: %s", idle->id, err.text);
+	*ret_cancelled = idle;
+	return code == 0;
 }

@@ -3,6 +3,7 @@
 #include <fcntl.h>
 #include <string.h>
 
+#include "daemon/log.h"
 #include "daemon/store/scan.h"
 
 void store_set_limits(struct store *store, const struct store_limits *limits)
@@ -20,6 +21,11 @@ void store_count_volumes(struct store *store, unsigned long long (*bytes)(void *
 {
 	store->volumes_bytes = bytes;
 	store->volumes_context = context;
+}
+
+unsigned long long store_volumes_most(const struct store_limits *limits)
+{
+	return (unsigned long long)((double)limits->bytes * (1 - STORE_ACQUISITION_SHARE));
 }
 
 static bool is_of(const struct stored_scan *scan, const char *client)
@@ -110,13 +116,25 @@ static int check_bytes(const char *whose, unsigned long long used, unsigned long
 int store_check_volumes(struct store *store, const char *client, unsigned long long more, struct error *err)
 {
 	const struct store_limits *limits = &store->limits;
-	const unsigned long long most = (unsigned long long)((double)limits->bytes * (1 - STORE_ACQUISITION_SHARE));
+	const unsigned long long all = store_volumes_most(limits), own = limits->client_bytes;
+	unsigned long long used;
 	int code = 0;
 
-	if (limits->client_bytes > 0)
-		code = check_bytes(client, store_bytes(store, client), more, limits->client_bytes, err);
-	if (code == 0 && limits->bytes > 0)
-		code = check_bytes("volumes", store_bytes(store, NULL), more, most, err);
+	/* A client that waits for room would wait for ever. */
+	if ((all > 0 && more > all) || (own > 0 && more > own))
+		return error_set_at(err, ERR_IMPOSSIBLE, "/grid",
+				    "the job's volumes are %llu bytes, of which there may be %llu", more,
+				    own > 0 && (all == 0 || own < all) ? own : all);
+	if (own > 0)
+		code = check_bytes(client, store_bytes(store, client), more, own, err);
+	if (code != 0 || all == 0)
+		return code;
+	used = store_bytes(store, NULL);
+	if (used > all || more > all - used)
+		code = error_set(err, ERR_QUOTA,
+				 "%llu bytes more are too many for volumes: %llu are taken, of the limit of %llu they "
+				 "may have %llu; the rest is reserved for what is being acquired",
+				 more, used, limits->bytes, all);
 	return code;
 }
 
@@ -196,4 +214,32 @@ int stored_scan_take_room(struct stored_scan *scan, int descriptor, struct error
 	scan->room = true;
 	pthread_mutex_unlock(&scan->lock);
 	return 0;
+}
+
+bool stored_scan_return_room(struct stored_scan *scan, int descriptor)
+{
+	bool unused;
+
+	pthread_mutex_lock(&scan->lock);
+	unused = scan->room && !scan->returning && scan->received == 0 && scan->lost_count == 0;
+	for (int i = 0; i < scan->count && unused; i++)
+		unused = scan->progress[i] == MISSING;
+	if (unused) {
+		scan->returning = true;
+		scan->room = false;
+	}
+	pthread_mutex_unlock(&scan->lock);
+	if (!unused)
+		return false;
+	/* Where a file system cannot do that the blocks stay until the scan goes, and count no more. */
+	if (fallocate(descriptor, FALLOC_FL_PUNCH_HOLE | FALLOC_FL_KEEP_SIZE, 0, (off_t)all_projections(scan)) != 0)
+		log_line(LEVEL_DEBUG, "scan %s: the room of what was refused is not given back: %s", scan->id,
+			 strerror(errno));
+	pthread_mutex_lock(&scan->store->scans_lock);
+	scan->has_room = false;
+	pthread_mutex_unlock(&scan->store->scans_lock);
+	pthread_mutex_lock(&scan->lock);
+	scan->returning = false;
+	pthread_mutex_unlock(&scan->lock);
+	return true;
 }

@@ -31,6 +31,7 @@ struct stored_scan {
 
 	pthread_mutex_t lock;    /* guards what follows */
 	bool room;               /* the disk has it, and no projection needs to ask for it */
+	bool returning;          /* the room is being given back: nobody gets a claim meanwhile */
 	unsigned char *progress; /* [count], enum progress */
 	/*
 	 * [count], of those that are stored. `bytes` 0: only the SHA-256 is known, from the catalogue; the record of

@@ -25,6 +25,8 @@ int stored_scan_claim(struct stored_scan *scan, int index, enum claim *ret_claim
 		code = error_set(err, ERR_NOT_FOUND, "scan %s was deleted meanwhile", scan->id);
 	} else if (scan->progress[index] == MISSING && scan->closing && !scan->lost[index]) {
 		code = error_set(err, ERR_CONFLICT, "the scan was completed without projection %d", index);
+	} else if (scan->returning) {
+		*ret_claim = CLAIM_BUSY;
 	} else if (scan->progress[index] == MISSING) {
 		scan->progress[index] = CLAIMED;
 		*ret_claim = CLAIM_GRANTED;

@@ -103,11 +103,14 @@ enum { STORE_CLIENT_SIZE = 80 };
 /* 0: no limit. */
 struct store_limits {
 	long jobs, client_jobs; /* that have not ended */
+	double job_patience;    /* s without a projection after which a job that waits gives its place to another one */
 	long client_scans;
 	unsigned long long bytes, client_bytes; /* of projections, images and kept volumes */
 };
 /* A share of the bytes that volumes may not take: what is being acquired cannot be had again. */
 #define STORE_ACQUISITION_SHARE 0.1
+/* The bytes beyond which no volume is made any more; 0: no limit. */
+unsigned long long store_volumes_most(const struct store_limits *limits);
 /* Before the jobs are opened, and before any other thread has the store. */
 void store_set_limits(struct store *store, const struct store_limits *limits);
 const struct store_limits *store_limits(const struct store *store);
@@ -117,7 +120,10 @@ void store_count_volumes(struct store *store, unsigned long long (*bytes)(void *
 /* Bytes of scans that have room on the disk, of images, and of volumes. client NULL: all. */
 unsigned long long store_bytes(struct store *store, const char *client);
 long store_scans_of(struct store *store, const char *client);
-/* ERR_QUOTA when a client cannot have that many bytes of volumes more. */
+/*
+ * ERR_QUOTA when a client cannot have that many bytes of volumes more; ERR_IMPOSSIBLE, pointer "/grid": nor could it if
+ * there were nothing else.
+ */
 int store_check_volumes(struct store *store, const char *client, unsigned long long more, struct error *err);
 
 /* ---- scans ---- */
@@ -285,6 +291,11 @@ void stored_scan_unclaim(struct stored_scan *scan, int index);
  * ERR_QUOTA when a limit has none.
  */
 int stored_scan_take_room(struct stored_scan *scan, int descriptor, struct error *err);
+/*
+ * Gives the room back where no projection came to be stored and none is being written. True: it did; whoever met
+ * CLAIM_BUSY meanwhile asks again.
+ */
+bool stored_scan_return_room(struct stored_scan *scan, int descriptor);
 
 /* A descriptor of projections.raw, the caller's to close; close-on-exec. */
 int stored_scan_open(struct stored_scan *scan, bool writing, int *ret_descriptor, struct error *err);

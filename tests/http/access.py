@@ -81,6 +81,8 @@ def main() -> int:
         tokens = json.load(file)
     peer = connection(url, sys.argv[4] if len(sys.argv) > 4 else None)
     bearer = lambda token: ("Authorization", f"Bearer {token}")
+    port = url.rpartition(":")[2].strip("/")
+    cookie = f"cbctd_session_{port}" if port.isdecimal() else "cbctd_session"
     good = bearer(tokens["admin"])
     # what is shown: header fields, and who that is, or the status and the error that refuse it
     shown: Dict[str, Tuple[List[Header], str, int, str]] = {
@@ -98,13 +100,13 @@ def main() -> int:
         "Basic": ([("Authorization", "Basic YWRtaW46YWRtaW4=")], "", 401, "invalid_token"),
         "a token twice": ([good, good], "", 400, "twice"),
         "a good token and a wrong one": ([good, bearer("x")], "", 400, "twice"),
-        "a cookie that nobody gave": ([("Cookie", f"cbctd_session={tokens['admin']}")], "", 401, ""),
+        "a cookie that nobody gave": ([("Cookie", f"{cookie}={tokens['admin']}")], "", 401, ""),
         "a token of 20 kB": ([bearer("x" * 20000)], "", 401, "invalid_token"),
     }
     for role in ROLES[1:]:
         shown[f"a token for {role}"] = ([bearer(tokens[role])], role, 0, "")
         if f"cookie {role}" in tokens:
-            shown[f"a session for {role}"] = ([("Cookie", f"cbctd_session={tokens[f'cookie {role}']}")], role, 0, "")
+            shown[f"a session for {role}"] = ([("Cookie", f"{cookie}={tokens[f'cookie {role}']}")], role, 0, "")
     shown["a token in another case of Bearer"] = ([("authorization", f"bearer  {tokens['view']}")], "view", 0, "")
 
     wrong = 0

@@ -81,7 +81,7 @@ test_the_daemon_starts_with_a_good_file_only() {
 }
 
 test_each_operation_is_for_the_roles_that_the_schema_says() {
-	local role name=cbctd_session
+	local role name=cbctd_session_[0-9]*
 	start_daemon --tokens "$tokens" --listen "unix:$work/socket"
 	"$python" "$top/proto/openapi.py" --json "$top/proto/openapi.yaml" >"$work/openapi.json" 2>/dev/null || req GET /v1/openapi.json -o "$work/openapi.json"
 	for role in view acquire admin; do
@@ -128,6 +128,32 @@ test_roles_work_from_scan_to_volume() {
 	stop_daemon
 }
 
+# A browser sends cookies to all ports of a host.
+test_two_daemons_of_one_host_keep_their_sessions() {
+	local jar=$work/jar first
+	rm -f "$jar"
+	start_daemon --tokens "$tokens"
+	as view
+	req POST /v1/session "${bearer[@]}" -c "$jar" -b "$jar"
+	expect_status 201
+	first=$url
+	"$BUILD/cbctd" --listen 127.0.0.1:0 --state-dir "$work/second" --backend cpu --tokens "$tokens" >"$work/second.out" 2>/dev/null &
+	for _ in $(seq 200); do
+		url=$(sed -n 's/^listening on \(http:\)/\1/p' "$work/second.out")
+		[ -z "$url" ] || break
+		sleep 0.05
+	done
+	req POST /v1/session "${bearer[@]}" -c "$jar" -b "$jar"
+	expect_status 201
+	req GET /v1/session -b "$jar"
+	expect_status 200
+	kill %1
+	url=$first
+	req GET /v1/session -b "$jar"
+	expect_json '.proof == "session"'
+	stop_daemon
+}
+
 test_a_session_lasts_until_it_is_closed_or_its_token_revoked() {
 	local cookie own
 	start_daemon --tokens "$tokens"
@@ -157,7 +183,7 @@ test_a_session_lasts_until_it_is_closed_or_its_token_revoked() {
 	expect_problem 403
 	req DELETE /v1/session "${cookie[@]}" -H "$own"
 	expect_status 204
-	[[ $(header set-cookie) == 'cbctd_session=; '*'Max-Age=0'* ]] || fail "the browser forgets it: $(header set-cookie)"
+	[[ $(header set-cookie) == "cbctd_session_${url##*:}=; "*'Max-Age=0'* ]] || fail "the browser forgets it: $(header set-cookie)"
 	req GET /v1/session "${cookie[@]}"
 	expect_problem 401
 	stop_daemon

@@ -29,6 +29,7 @@ test_each_change_each_refusal_and_who_reads_is_told() {
 	a=(-H "Authorization: Bearer $acquire") v=(-H "Authorization: Bearer $view")
 	req POST /v1/scans "${a[@]}" "${json[@]}" --data-binary "$document"
 	scan=$(json .id)
+	told ".what == \"POST /v1/scans\" and .status == 201 and .of == \"$scan\""
 	told '.what == "POST /v1/scans" and .status == 201 and .who == "the-acquire" and .role == "acquire" and .proof == "token" and .from == "127.0.0.1" and (.request | length > 0) and (.time | endswith("Z"))'
 	req DELETE "/v1/scans/$scan" "${v[@]}"
 	told ".what == \"DELETE /v1/scans/{}\" and .of == \"$scan\" and .status == 403 and .who == \"the-view\""
@@ -74,6 +75,8 @@ test_what_was_changed_removed_or_cut_shows() {
 	what="a changed chain" && sed '2s/"chain":"./"chain":"x/' "$log" >"$forged" && broken
 	what="half a line" && head -c -20 "$log" >"$forged" && broken
 	what="a line of something else" && { cat "$log"; echo '{}'; } >"$forged" && broken
+	what="a file without a line" && : >"$forged" && broken
+	tail -n +3 "$log" >"$forged" && cbct audit verify "$forged" >"$work/verified" && grep -q 'caution: lines 1 to 2 are not here' "$work/verified" || fail "a beginning that was cut is told"
 	what="an end that was cut" && head -n -2 "$log" >"$forged" && cbct audit verify "$forged" && broken --mark "$mark"
 }
 

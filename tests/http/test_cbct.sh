@@ -234,6 +234,25 @@ test_an_interrupted_upload_goes_on() {
 	[ "$(cbct upload "$work/broken" --scan "$scan")" = "$scan" ] || fail "the same scan"
 }
 
+# Two patients' projections never become one scan.
+test_an_upload_goes_on_with_its_own_scan_alone() {
+	local one=$((48 * 32 * 4))
+	cbct simulate -o "$work/broken" "${ball[@]}" "${small[@]}" --photons 1000
+	post_scan "$work/broken"
+	head -c $((one * 9)) "$work/broken/projections.raw" >"$work/part"
+	req PUT "/v1/scans/$scan/projections/3-11" -T "$work/part"
+	expect_status 201
+	cp -r "$work/broken" "$work/other"
+	jq '.patient.position = "FFP"' "$work/broken/scan.json" >"$work/other/scan.json"
+	expect_exit 1 cbct upload "$work/other" --scan "$scan"
+	grep -q "scan $scan is another one: its patient is not what scan.json says" "$work/said" || fail "why: $(cat "$work/said")"
+	cp "$work/broken/scan.json" "$work/other/scan.json"
+	expect_exit 1 cbct upload "$work/other" --scan "$scan" # its fourth projection is another one
+	grep -q "scan $scan is another one: .*projection 3 is stored already, with other bytes" "$work/said" || fail "why: $(cat "$work/said")"
+	req GET "/v1/scans/$scan"
+	expect_json '.received == [[3, 11]]'
+}
+
 test_failures_are_told() {
 	cbct simulate -o "$work/scan" "${ball[@]}" "${small[@]}"
 	scan=$(cbct upload "$work/scan")

@@ -169,6 +169,10 @@ test_volumes_leave_room_for_acquisition() {
 	expect_json ".all.bytes.used == $((bytes + 16384))"
 	new_job 507 "{\"scan\": \"SCAN\", \"grid\": {\"size\": [48, 48, 48], \"spacing_mm\": [2, 2, 2]}, \"fdk\": {}}"
 	retry_after
+	expect_json '.detail | contains("the rest is reserved for what is being acquired")'
+	# For what could never be there is nothing to wait.
+	new_job 422 "{\"scan\": \"SCAN\", \"grid\": {\"size\": [80, 80, 80], \"spacing_mm\": [1, 1, 1]}, \"fdk\": {}}"
+	expect_problem 422 /grid
 	new_scan 201
 	fill 201
 	new_scan 201
@@ -197,6 +201,81 @@ test_equal_jobs_take_turns_by_clients() {
 	expect_json '.state == "succeeded"'
 	ask GET /v1/jobs
 	expect_json '[.jobs[] | select(.client == "a" and .state == "queued")] | length >= 2'
+}
+
+test_a_put_that_is_refused_leaves_its_room() {
+	local i
+	limited --client-bytes $bytes
+	new_scan 201
+	ask PUT "/v1/scans/$scan/projections" -T "$scan_dir/projections.raw" -H "Content-Digest: sha-256=:AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA=:"
+	expect_status 400
+	for i in $(seq 100); do
+		ask GET /v1/limits
+		[ "$(json .own.bytes.used)" != 0 ] || break
+		sleep 0.05
+	done
+	expect_json '.own.bytes.used == 0'
+	[ "$(stat -c %b "$state/scans/$scan/projections.raw")" = 0 ] || fail "nor on the disk"
+	new_scan 201
+	fill 201
+	ask GET "/v1/scans/$scan/projections/19"
+	cmp "$body" <(tail -c $((64 * 48 * 4)) "$scan_dir/projections.raw") || fail "the bytes of a scan that has room"
+}
+
+# A refused and a good upload of one scan at once: nothing of the good one is lost when room is given back.
+test_room_is_given_back_under_other_uploads() {
+	local i refused
+	limited
+	for ((i = 0; i < 12; i++)); do
+		new_scan 201
+		curl -s -o /dev/null "${who[@]}" -T "$scan_dir/projections.raw" -H "Content-Digest: sha-256=:AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA=:" "$url/v1/scans/$scan/projections" &
+		refused=$!
+		[ $((i % 2)) = 0 ] || sleep 0.02
+		ask PUT "/v1/scans/$scan/projections" -T "$scan_dir/projections.raw"
+		expect_status 201
+		wait $refused
+		cmp "$state/scans/$scan/projections.raw" "$scan_dir/projections.raw" || fail "the bytes of round $i"
+		ask GET "/v1/scans/$scan"
+		expect_json '.missing == []'
+	done
+}
+
+test_a_job_for_which_nothing_comes_gives_its_place() {
+	local idle=() pinned fed i
+	limited --max-jobs 4 --job-patience 3
+	new_scan 201
+	for i in 1 2 3; do new_job 202 "{\"scan\": \"SCAN\", $grid}" && idle+=("$job"); done
+	pinned=${idle[0]}
+	ask PUT "/v1/jobs/$pinned/pin"
+	new_scan 201 && fed=$scan
+	new_job 202 "{\"scan\": \"SCAN\", $grid}"
+	as b
+	new_scan 201
+	new_job 503 "{\"scan\": \"SCAN\", $grid}"
+	retry_after
+	for i in 1 2 3 4 5 6; do # views of the fourth come now and then
+		head -c $((64 * 48 * 4)) "$scan_dir/projections.raw" >"$work/one"
+		as a
+		scan=$fed
+		ask PUT "/v1/scans/$fed/projections/$i" -T "$work/one"
+		sleep 0.6
+	done
+	as b
+	new_scan 201
+	new_job 202 "{\"scan\": \"SCAN\", $grid}"
+	ask GET "/v1/jobs/${idle[1]}"
+	expect_json '.state == "cancelled"'
+	new_job 202 "{\"scan\": \"SCAN\", $grid}"
+	ask GET "/v1/jobs/${idle[2]}"
+	expect_json '.state == "cancelled"'
+	# Neither one that is pinned nor one that is fed gives way.
+	new_job 503 "{\"scan\": \"SCAN\", $grid}"
+	grep -q "job ${idle[1]}: .*another one takes its place: nothing came for it for" "$work/cbctd.err" || fail "told in the log"
+	ask GET /v1/limits
+	expect_json '.all.jobs == {"used": 4, "most": 4} and .own.jobs.used == 2'
+	# A client that has more than another one takes no place of that one.
+	as a
+	new_job 503 "{\"scan\": \"SCAN\", $grid}"
 }
 
 gone() { # PATH
@@ -228,7 +307,7 @@ test_a_scan_that_the_disk_has_damaged_stays() {
 }
 
 test_what_is_old_goes_unless_it_is_pinned() {
-	local old pinned complete open announced
+	local old pinned complete open announced unfinished cancelled # its scan is pinned with it
 	limited --keep 4
 	new_scan 201 && complete=$scan
 	fill 201
@@ -238,6 +317,10 @@ test_what_is_old_goes_unless_it_is_pinned() {
 		ask PUT "/v1/jobs/$pinned/pin"
 		expect_status 204
 	done
+	new_scan 201 && unfinished=$scan
+	new_job 202 "{\"scan\": \"SCAN\", $grid, \"fdk\": {}}" && cancelled=$job
+	ask PUT "/v1/jobs/$cancelled/pin"
+	ask DELETE "/v1/jobs/$cancelled"
 	new_scan 201 && announced=$scan
 	new_scan 201 && open=$scan
 	expect_json '.pinned == false'
@@ -250,6 +333,10 @@ test_what_is_old_goes_unless_it_is_pinned() {
 	gone "/v1/scans/$announced"
 	ask GET "/v1/jobs/$pinned"
 	expect_json '.state == "succeeded" and .pinned'
+	ask GET "/v1/jobs/$cancelled"
+	expect_json '.state == "cancelled"'
+	ask GET "/v1/scans/$unfinished"
+	expect_status 200
 	for scan in "$complete" "$open"; do
 		ask GET "/v1/scans/$scan"
 		expect_status 200

@@ -102,7 +102,7 @@ test_tokens_and_sessions_hold_over_tls_too() {
 	req POST /v1/session -H "Authorization: Bearer $view" -H "Origin: $url"
 	expect_status 201
 	"$python" "$top/proto/openapi.py" --json "$top/proto/openapi.yaml" >"$work/openapi.json" 2>/dev/null || req GET /v1/openapi.json -o "$work/openapi.json"
-	jq -n --arg v "$view" --arg q "$acquire" --arg a "$admin" --arg o "$old" --arg c "$(header set-cookie | sed 's/^cbctd_session=\([^;]*\);.*/\1/')" \
+	jq -n --arg v "$view" --arg q "$acquire" --arg a "$admin" --arg o "$old" --arg c "$(header set-cookie | sed 's/^cbctd_session_[0-9]*=\([^;]*\);.*/\1/')" \
 		'{view: $v, acquire: $q, admin: $a, expired: $o, "cookie view": $c}' >"$work/proofs.json"
 	"$python" "$here/access.py" "$url" "$work/openapi.json" "$work/proofs.json" "$keys/ca.pem"
 	stop_daemon
