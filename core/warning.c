@@ -79,6 +79,17 @@ const struct warning_kind warning_kinds[] = {
      "Some pixels of the detector do not follow the others and were replaced from their neighbours."},
     {"defects", SEVERITY_CAUTION, "Some samples could not be used and were replaced from their neighbours."},
     {"blank_views", SEVERITY_CAUTION, "Some projections are empty or show nothing, and were left out."},
+    {"dark_parts", SEVERITY_CAUTION,
+     "Some projections are dark in a part of the detector, and were left out where that was possible."},
+    {"frozen_views", SEVERITY_CAUTION,
+     "Some projections are copies of the ones before them, and were left out where that was possible."},
+    {"dose_steps", SEVERITY_CAUTION,
+     "Some projections were taken with another dose than those beside them, and were left out where that was "
+     "possible."},
+    {"shifted_views", SEVERITY_SERIOUS,
+     "Some projections lie aside of the others, as when the patient or the arm moves; they were left out where that "
+     "was "
+     "possible."},
     {"no_object", SEVERITY_SERIOUS, "No projection shows anything: the image is empty."},
     {"air_region", SEVERITY_CAUTION, "The brightness of air changed during the scan, and was corrected."},
     {"air_level", SEVERITY_CAUTION,

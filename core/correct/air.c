@@ -6,7 +6,10 @@
 
 enum { LOOKED_AT = 64 }; /* rows */
 
-/* Levels of air, line integrals: the least drift that matters, and the most that a tube drifts. */
+/*
+ * Levels of air, line integrals: the least drift that matters, and the most that a tube drifts; more of it may be an
+ * object, but below 0 none is.
+ */
 static const float LEAST = 0.02f, MOST = 0.15f;
 /* The most that air can have, as a share of the view's largest line integral. */
 static const float LITTLE = 0.25f;
@@ -47,10 +50,10 @@ float air_level(const float *view, int columns, int rows, int edge, float larges
 				good++;
 			}
 		}
-	if (good == 0 || fabsf(sum) < LEAST * (float)good || fabsf(sum) > MOST * (float)good)
+	if (good == 0 || fabsf(sum) < LEAST * (float)good || sum > MOST * (float)good)
 		return 0;
 	sum /= (float)good;
-	if (fabsf(sum) > LITTLE * largest)
+	if (sum > -MOST && fabsf(sum) > LITTLE * largest)
 		return 0;
 	for (int i = 0; i < looked_at; i++) {
 		bool same = true;

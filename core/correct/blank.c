@@ -1,6 +1,7 @@
 /* Blank views: see blank.h. */
 #include "core/correct/blank.h"
 
+#include <math.h>
 #include <stdlib.h>
 
 #include "core/correct/input.h"
@@ -60,35 +61,101 @@ static int apply(const struct correction_job *job, void *state, enum correction_
 	return time == CORRECT_AFTER_FDK ? blank_make_up(job, job->volume, ret_changed, err) : leave_out(job, err);
 }
 
+/* Outliers of a kind: how many, the first of them, and the one that is the worst. */
+struct outlier_report {
+	int count, first, worst;
+	float amount; /* of the worst */
+};
+
+static struct outlier_report report_of(const struct input *input, int views, enum outlier_kind kind)
+{
+	struct outlier_report report = {0};
+
+	for (int i = views - 1; i >= 0; i--) {
+		const struct outlier *outlier = &input->outliers[i];
+
+		if (outlier->kind != kind)
+			continue;
+		report.count++;
+		report.first = i;
+		if (fabsf(outlier->amount) >= fabsf(report.amount)) {
+			report.worst = i;
+			report.amount = outlier->amount;
+		}
+	}
+	return report;
+}
+
+/* Outliers can be left out all, or where no projections are kept some of them. */
+static void warn_of_outliers(const struct input *input, int views, const struct warning_sink *sink)
+{
+	struct outlier_report reports[OUTLIER_KINDS];
+	const char *done;
+	int count = 0;
+
+	for (int kind = OUTLIER_DARK; kind < OUTLIER_KINDS; kind++) {
+		reports[kind] = report_of(input, views, (enum outlier_kind)kind);
+		count += reports[kind].count;
+	}
+	done = input->left_out == count ? "They are left out, the others stand in for them"
+	       : 3 * count > views      ? "They are too many to be left out"
+					: "Not all of them could be left out: FDK alone keeps no projections";
+	if (reports[OUTLIER_DARK].count > 0)
+		warning_tell(sink, "dark_parts",
+			     "%d projections, the first of them is %d, have parts without a usable sample that those "
+			     "beside them have, %.3g %% of projection %d. %s",
+			     reports[OUTLIER_DARK].count, reports[OUTLIER_DARK].first,
+			     100 * (double)reports[OUTLIER_DARK].amount, reports[OUTLIER_DARK].worst, done);
+	if (reports[OUTLIER_FROZEN].count > 0)
+		warning_tell(sink, "frozen_views",
+			     "%d projections, the first of them is %d, are the very ones before them. %s",
+			     reports[OUTLIER_FROZEN].count, reports[OUTLIER_FROZEN].first, done);
+	if (reports[OUTLIER_LEVEL].count > 0)
+		warning_tell(sink, "dose_steps",
+			     "%d projections, the first of them is %d, were taken with another dose than those beside "
+			     "them: %.3g times as bright all over in projection %d. %s",
+			     reports[OUTLIER_LEVEL].count, reports[OUTLIER_LEVEL].first,
+			     exp(-(double)reports[OUTLIER_LEVEL].amount), reports[OUTLIER_LEVEL].worst, done);
+	if (reports[OUTLIER_SHIFTED].count > 0)
+		warning_tell(sink, "shifted_views",
+			     "%d projections, the first of them is %d, lie aside of those beside them, by %.3g %% of "
+			     "the detector in projection %d: did the patient or the arm move? %s",
+			     reports[OUTLIER_SHIFTED].count, reports[OUTLIER_SHIFTED].first,
+			     100 * fabs((double)reports[OUTLIER_SHIFTED].amount), reports[OUTLIER_SHIFTED].worst, done);
+}
+
 static int warn(const struct correction_job *job, void *state, struct error *err)
 {
 	const struct input *input = job->input;
+	const int nothing = input->counts.blank - input->left_out, empty = input->empty - input->left_out;
 	int first = job->geometry->count;
 
 	(void)state;
 	(void)err;
-	for (int i = 0; i < input->counts.blank; i++)
+	/* Outliers are the last ones of the list. */
+	for (int i = 0; i < nothing; i++)
 		first = input->blank[i] < first ? input->blank[i] : first;
-	if (input->empty > 0)
+	warn_of_outliers(input, job->geometry->count, job->warnings);
+	if (empty > 0)
 		warning_tell(job->warnings, "blank_views",
 			     "%d projections show nothing, the first of them is %d: %d have no good pixel, and %d one "
 			     "value or mere noise all over, as with a closed shutter or without the patient. They are "
 			     "left out, the others stand in for them",
-			     input->counts.blank, first, input->counts.blank - input->empty, input->empty);
-	else if (input->counts.blank > 0)
+			     nothing, first, nothing - empty, empty);
+	else if (nothing > 0)
 		warning_tell(
 		    job->warnings, "blank_views",
 		    "%d projections have no good pixel, the first of them is %d: they are left out, the others stand "
 		    "in for them",
-		    input->counts.blank, first);
+		    nothing, first);
 	return 0;
 }
 
 extern const struct correction correction_blank_views;
 const struct correction correction_blank_views = {
     .name = "blank_views",
-    .summary = "views without a good pixel or that show nothing: the others stand in for them in FDK, iterations leave "
-	       "them out",
+    .summary = "views without a good pixel, that show nothing or do not follow those beside them: the others stand in "
+	       "for them in FDK, iterations leave them out",
     .times = 1U << CORRECT_AFTER_FDK | 1U << CORRECT_BEFORE_ITERATING,
     .needs = NEEDS_VOLUME,
     .apply = apply,

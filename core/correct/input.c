@@ -75,9 +75,12 @@ int input_open(struct input *ret_input, const struct linearise *linearise, const
 		input.pixels = (size_t)geometry->columns * (size_t)geometry->rows;
 		input.look_every = geometry->count / 32 + 1;
 		input.even = true;
+		input.good[0] = input.good[1] = -1;
 		input.blank = calloc((size_t)geometry->count, sizeof(*input.blank));
 		input.content = calloc((size_t)geometry->count, sizeof(*input.content));
-		if (input.blank == NULL || input.content == NULL)
+		input.profiles = calloc((size_t)geometry->count, sizeof(*input.profiles));
+		input.outliers = calloc((size_t)geometry->count, sizeof(*input.outliers));
+		if (input.blank == NULL || input.content == NULL || input.profiles == NULL || input.outliers == NULL)
 			code = error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", geometry->count);
 	}
 	if (code < 0)
@@ -101,6 +104,10 @@ void input_clear(struct input *input)
 	defect_map_clear(&input->map);
 	free(input->blank);
 	free(input->content);
+	free(input->profiles);
+	free(input->outliers);
+	for (int i = 0; i < input->copy_count; i++)
+		free(input->copies[i].slot);
 	*input = (struct input){0};
 }
 
@@ -112,12 +119,15 @@ static float line_integral(const struct input *input, const void *samples, size_
 	return linearise_pixel(&input->linearise, samples, at, &p) == PIXEL_GOOD ? p + input->log_air : NAN;
 }
 
-/* Samples of a view, about 4096 spread over it in blocks. */
-static struct view_content look_at_line_integrals(struct input *input, const void *samples, int columns, int rows)
+/* Samples of a view, about 4096 spread over it in blocks; unusable: share of all of its samples. */
+static struct view_content look_at_line_integrals(struct input *input, const void *samples, int columns, int rows,
+						  double unusable, struct view_profile *ret_profile)
 {
 	const int most = CONTENT_BLOCKS * CONTENT_SAMPLES;
 	const int across = columns < most ? columns : most, along = rows < most ? rows : most;
 	struct content_sums sums = {.any = false};
+	struct profile_sums profile = {0};
+	struct view_content content;
 
 	for (int j = 0; j < along; j++) {
 		const size_t row = (size_t)((long long)j * rows / along);
@@ -125,17 +135,20 @@ static struct view_content look_at_line_integrals(struct input *input, const voi
 		for (int i = 0; i < across; i++) {
 			const size_t column = (size_t)((long long)i * columns / across);
 			const float p = line_integral(input, samples, row * (size_t)columns + column);
+			const int block = j * CONTENT_BLOCKS / along * CONTENT_BLOCKS + i * CONTENT_BLOCKS / across;
 
+			profile_add(&profile, i, j, block, p);
 			if (isnan(p))
 				continue;
-			content_add(&sums, j * CONTENT_BLOCKS / along * CONTENT_BLOCKS + i * CONTENT_BLOCKS / across,
-				    p);
+			content_add(&sums, block, p);
 			input->sum += (double)p;
 			input->most = p > input->most ? p : input->most;
 			input->looked_at++;
 		}
 	}
-	return content_of(&sums);
+	content = content_of(&sums);
+	*ret_profile = profile_of(&profile, &sums, content.noise, unusable);
+	return content;
 }
 
 /* Looks for a small object at every pixel of a view, while no view before has shown anything. */
@@ -273,6 +286,12 @@ int input_empty_slot(const struct input *input, const struct backend *backend, s
 	return code;
 }
 
+/* Of a view, without the map's. */
+static double unusable_share(const struct defect_counts *counts, size_t pixels)
+{
+	return (double)(defects_total(counts) - counts->mapped) / (double)pixels;
+}
+
 static void add_blank(struct input *input, int view)
 {
 	input->blank[input->counts.blank++] = view;
@@ -300,7 +319,8 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 	if (counts.blank > 0)
 		input->blank[before.blank] = view;
 	input->log_air = counts.air_most > 0 ? logf(counts.air_most) : 0;
-	input->content[view] = look_at_line_integrals(input, samples, columns, rows);
+	input->content[view] = look_at_line_integrals(input, samples, columns, rows,
+						      unusable_share(&counts, input->pixels), &input->profiles[view]);
 	if (is_dark(&counts, &input->content[view], input->pixels)) {
 		add_blank(input, view);
 		code = input_empty_slot(input, backend, to, slot, err);
@@ -331,10 +351,66 @@ static bool *blank_flags(const struct input *input, int count)
 	return flags;
 }
 
-int input_settle(struct input *input, const struct orbit *orbit, struct error *err)
+int input_copy(struct input *input, const struct backend *backend, struct stack *from, int view, int slot,
+	       struct error *err)
+{
+	const struct view_profile *profiles = input->profiles;
+	const int good = input->good[0], earlier = input->good[1], gap = abs(view - good);
+	float *copy;
+	int code;
+
+	/* What lasts for longer is no outlier. */
+	if (good < 0 || gap > OUTLIERS_RUN ||
+	    !outliers_suspect(&profiles[view], &profiles[good], gap, earlier < 0 ? NULL : &profiles[earlier])) {
+		input->good[1] = good < 0 || gap > OUTLIERS_RUN ? -1 : good;
+		input->good[0] = view;
+		return 0;
+	}
+	if (input->copy_count == COPIES_MOST)
+		return 0;
+	copy = malloc(input->pixels * sizeof(*copy));
+	if (copy == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a view");
+	code = backend->stack_download(from, slot, 1, copy, err);
+	if (code < 0) {
+		free(copy);
+		return code;
+	}
+	input->copies[input->copy_count].view = view;
+	input->copies[input->copy_count++].slot = copy;
+	return 0;
+}
+
+const float *input_copy_of(const struct input *input, int view)
+{
+	for (int i = 0; i < input->copy_count; i++)
+		if (input->copies[i].view == view)
+			return input->copies[i].slot;
+	return NULL;
+}
+
+/* Adds the outliers that can be left out to the blank views; returns how many. `skip`: views that are none. */
+static int add_outliers(struct input *input, const bool *skip, const struct orbit *orbit, bool keeps_all,
+			struct error *err)
+{
+	const int before = input->left_out;
+	int code = outliers_find(input->profiles, skip, orbit, input->outliers, err);
+
+	for (int view = 0; view < orbit->count && code > 0; view++) {
+		if (input->outliers[view].kind == OUTLIER_NONE)
+			continue;
+		if (!keeps_all && input_copy_of(input, view) == NULL)
+			continue;
+		add_blank(input, view);
+		input->left_out++;
+	}
+	return code < 0 ? code : input->left_out - before;
+}
+
+int input_settle(struct input *input, const struct orbit *orbit, bool keeps_all, struct error *err)
 {
 	bool *blank = blank_flags(input, orbit->count), *empty = calloc((size_t)orbit->count, sizeof(*empty));
-	int code = 0;
+	int code = 0, found = 0;
 
 	if (input->views > 0 && input->counts.blank == input->views)
 		code = error_set(err, ERR_IMPOSSIBLE,
@@ -347,18 +423,22 @@ int input_settle(struct input *input, const struct orbit *orbit, struct error *e
 	if (code == 0)
 		code = content_find_empty(input->content, blank, orbit, empty, err);
 	if (code >= 0) {
-		const int found = code, columns = input->turned ? input->rows : input->columns;
+		const int columns = input->turned ? input->rows : input->columns;
 		const int rows = input->turned ? input->columns : input->rows;
 
+		found = code;
 		code = content_is_even(input->content, blank, orbit, columns, rows, &input->even, err);
-		code = code < 0 ? code : found;
 	}
-	for (int view = 0; view < orbit->count && code >= 0; view++)
+	for (int view = 0; view < orbit->count && code >= 0; view++) {
 		if (empty[view])
 			add_blank(input, view);
+		blank[view] = blank[view] || empty[view];
+	}
+	if (code >= 0)
+		code = add_outliers(input, blank, orbit, keeps_all, err);
 	free(blank);
 	free(empty);
-	return code;
+	return code < 0 ? code : found + code;
 }
 
 void input_goes_on(const struct input *input, bool ret_ends[2])

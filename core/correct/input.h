@@ -3,6 +3,10 @@
 
 #include "core/correct/content.h"
 #include "core/correct/defects.h"
+#include "core/correct/outliers.h"
+
+/* Views of a job that keeps no projections which may have to be taken out of the FDK volume again, at most. */
+enum { COPIES_MOST = 12 };
 
 /* The samples that a reconstruction was given: how they come, and statistics of those seen so far. */
 struct input {
@@ -16,9 +20,20 @@ struct input {
 	int views, defective_views; /* linearised so far, and those of them with defects */
 	/*
 	 * [counts.blank], owned: views without a good pixel or of a closed shutter, in the order they came, and behind
-	 * them, once all have come, those that show nothing. `empty` of them have good pixels.
+	 * them, once all have come, those that show nothing and outliers that are left out. `empty` of them have good
+	 * pixels, and `left_out` of those are outliers.
 	 */
-	int *blank, empty;
+	int *blank, empty, left_out;
+	/* [views of the scan], owned; the second one of input_settle. */
+	struct view_profile *profiles;
+	struct outlier *outliers;
+	/* [row][column], line integrals as FDK took them, of views that may be outliers, owned. */
+	struct {
+		int view;
+		float *slot;
+	} copies[COPIES_MOST];
+	int copy_count;
+	int good[2]; /* the last view that input_copy did not copy, and the one before it; -1: none */
 	/*
 	 * Rows of blank views that the filter had counted as cut off before it was known that they show nothing: in all
 	 * that it has counted they are twice, since they are filtered once more when they are taken out.
@@ -66,10 +81,20 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 	       int slot, struct stack *to, const void **ret_upright, struct error *err);
 
 /*
- * Called once, when all views have come: those that show nothing (content.h) are blank ones from now on. Returns how
- * many it found, the last ones of the list; ERR_IMPOSSIBLE where no view has a good pixel.
+ * Copies a view's slot of `from`, as FDK takes it, where the view differs from the last one that was not copied and may
+ * be an outlier: for jobs that keep no projections.
  */
-int input_settle(struct input *input, const struct orbit *orbit, struct error *err);
+int input_copy(struct input *input, const struct backend *backend, struct stack *from, int view, int slot,
+	       struct error *err);
+/* The copy of a view; NULL: there is none. */
+const float *input_copy_of(const struct input *input, int view);
+
+/*
+ * Called once, when all views have come: those that show nothing (content.h), and outliers (outliers.h) if all views
+ * are kept or there is a copy, are blank ones from now on. Returns how many it found, the last ones of the list;
+ * ERR_IMPOSSIBLE where no view has a good pixel.
+ */
+int input_settle(struct input *input, const struct orbit *orbit, bool keeps_all, struct error *err);
 
 /* Makes a view's slot 0, as that of a view without a good pixel. */
 int input_empty_slot(const struct input *input, const struct backend *backend, struct stack *to, int slot,

@@ -178,10 +178,24 @@ const struct correction correction_defects = {
 
 /* ---- what gives reason to doubt ---- */
 
+static bool is_air_too_bright(const struct input *input)
+{
+	return input->linearise.quantity == QUANTITY_INTENSITY && input->off > 0 && (double)input->air_least < NEGATIVE;
+}
+
 static void warn_of_air_level(const struct input *input, const struct warning_sink *sink)
 {
 	if (input->off == 0)
 		return;
+	if (is_air_too_bright(input)) {
+		warning_tell(
+		    sink, "brighter_than_air",
+		    "both ends of nearly all rows are up to %.3g times as bright as the flat image or \"air\", "
+		    "less the dark, in %d of %d projections that were looked at: all that is measured is too "
+		    "thin by it. Nothing of that is taken out; an air_region makes up for it",
+		    exp(-(double)input->air_least), input->off, input->views_looked_at);
+		return;
+	}
 	warning_tell(
 	    sink, "air_level",
 	    "both ends of nearly all rows have line integrals between %.3g and %.3g, where air is 0, in %d of %d "
@@ -195,7 +209,7 @@ static void warn_of_line_integrals(const struct input *input, const struct warni
 	const double mean = input->looked_at > 0 ? input->sum / (double)input->looked_at : 0;
 
 	if (input->linearise.quantity == QUANTITY_INTENSITY) {
-		if (mean < NEGATIVE)
+		if (mean < NEGATIVE && !is_air_too_bright(input))
 			warning_tell(sink, "brighter_than_air",
 				     "the projections are %.4g times as bright as the flat image or \"air\", less the "
 				     "dark, in the mean of logarithms: line integrals are %.4g",

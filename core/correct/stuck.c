@@ -10,14 +10,16 @@
 #include <stdlib.h>
 #include <string.h>
 
+enum { ACROSS = 10, BESIDE = 3 }; /* pixels of a row: how far one is looked beside, and those that must be well there */
 enum { NEIGHBOURS = 8, AWAY = 2, BESIDE_LEAST = 4 }; /* good pixels right beside one that is taken for alone */
 
 static const float MATTERS = 0.03f, APART = 0.1f; /* of the photons, or of the largest line integral below 1 */
 static const float BEYOND = 0.1f;                 /* of the root mean square of e */
 static const float TIP = 0.1f;                    /* of the mean of e */
 static const float STILL = 0.1f, LARGER = 3, WILDER = 9, FARTHER = 3, STEADY = 4, IN_FEW_VIEWS = 0.25f;
-static const double MOST = 0.1;      /* of all pixels */
-static const double AXIS_PIXELS = 4; /* between a ray and the axis */
+static const float LOST = 0.35f, LOST_LEAST = 8; /* of the views looked at: share, and number */
+static const double MOST = 0.1;                  /* of all pixels */
+static const double AXIS_PIXELS = 4;             /* between a ray and the axis */
 
 /*
  * Over the views looked at, [row][column] each, so that many pixels are added at once; p counts from the first view
@@ -525,12 +527,15 @@ static bool is_alone(const struct stuck *stuck, int column, int row, bool wander
 	return like <= (wanders && is_on_axis(stuck, column, row) ? 0 : 1) && bad <= NEIGHBOURS - BESIDE_LEAST;
 }
 
+static bool never_changes(const struct stuck *stuck, size_t at)
+{
+	return is_known(stuck, at) && stuck->sums.p2[at] == 0;
+}
+
 /* True if a pixel has one value in all views, and not air's. */
 static bool is_dead(const struct stuck *stuck, size_t at, float whole)
 {
-	const struct sums *sums = &stuck->sums;
-
-	return is_known(stuck, at) && sums->p2[at] == 0 && fabsf(sums->first[at]) > MATTERS * whole;
+	return never_changes(stuck, at) && fabsf(stuck->sums.first[at]) > MATTERS * whole;
 }
 
 /* False where many pixels never change: in a scan without noise those in air do not, nor what is round. */
@@ -540,8 +545,73 @@ static bool tells_dead_pixels(const struct stuck *stuck)
 	size_t unchanged = 0;
 
 	for (size_t at = 0; at < pixels; at++)
-		unchanged += is_known(stuck, at) && stuck->sums.p2[at] == 0;
+		unchanged += never_changes(stuck, at);
 	return (double)unchanged <= MOST * (double)pixels;
+}
+
+/* The share of the views in which a pixel says nothing. */
+static float lost_share(const struct stuck *stuck, size_t at)
+{
+	return 1 - stuck->sums.views[at] / (float)stuck->views;
+}
+
+/* True if a pixel says nothing in a quarter as many views as another at most. */
+static bool is_well(const struct stuck *stuck, size_t at, size_t own, float whole)
+{
+	(void)whole;
+	return lost_share(stuck, at) <= 0.25f * lost_share(stuck, own);
+}
+
+/* True if a pixel shows an object in most views, and changes with it. */
+static bool shows_change(const struct stuck *stuck, size_t at, size_t own, float whole)
+{
+	const float mean = mean_of(&stuck->sums, at), varies = behaviour_of(&stuck->sums, at).varies;
+
+	(void)own;
+	return is_known(stuck, at) && mean > MATTERS * whole && mean * mean > varies &&
+	       varies > MATTERS * MATTERS * whole * whole;
+}
+
+/* True if within ACROSS pixels of its row, on both sides of a pixel, there are three beside each other that are so. */
+static bool is_between(const struct stuck *stuck, int column, int row, float whole,
+		       bool (*is_so)(const struct stuck *stuck, size_t at, size_t own, float whole))
+{
+	const size_t own = (size_t)row * (size_t)stuck->geometry->columns + (size_t)column;
+	int run = 0;
+
+	for (int step = -1; step <= 1; step += 2) {
+		const int room = step < 0 ? column : stuck->geometry->columns - 1 - column;
+
+		run = 0;
+		for (int i = 1; i <= room && i <= ACROSS && run < BESIDE; i++)
+			run = is_so(stuck, own + (size_t)(step * i), own, whole) ? run + 1 : 0;
+		if (run < BESIDE)
+			return false;
+	}
+	return true;
+}
+
+/*
+ * True if a pixel never changes between such as show an object in most views. No object does that, even without noise:
+ * a ray passes in some view whatever turns farther from the axis.
+ */
+static bool is_dead_in_object(const struct stuck *stuck, int column, int row, float whole)
+{
+	return never_changes(stuck, (size_t)row * (size_t)stuck->geometry->columns + (size_t)column) &&
+	       is_between(stuck, column, row, whole, shows_change);
+}
+
+/*
+ * True if a pixel says nothing in many views, and those on both sides of it in its row seldom do: it died since the
+ * flat was taken, and what it says otherwise is noise about the dark. Metal hides pixels side by side, or on the axis.
+ */
+static bool is_lost(const struct stuck *stuck, int column, int row, float whole)
+{
+	const size_t own = (size_t)row * (size_t)stuck->geometry->columns + (size_t)column;
+
+	return lost_share(stuck, own) >= LOST && (float)stuck->views - stuck->sums.views[own] >= LOST_LEAST &&
+	       stuck->sums.views[own] > 0 && is_between(stuck, column, row, whole, is_well) &&
+	       !is_on_axis(stuck, column, row);
 }
 
 static bool is_stuck(const struct stuck *stuck, int column, int row)
@@ -553,7 +623,8 @@ static bool is_stuck(const struct stuck *stuck, int column, int row)
 	float varies[NEIGHBOURS], rms[NEIGHBOURS], mean[NEIGHBOURS], wanders[NEIGHBOURS];
 	size_t near[NEIGHBOURS];
 
-	if (stuck->tells_dead && is_dead(stuck, at, whole))
+	if ((stuck->tells_dead && is_dead(stuck, at, whole)) || is_dead_in_object(stuck, column, row, whole) ||
+	    is_lost(stuck, column, row, whole))
 		return true;
 	if (!is_known(stuck, at) || own.rms < MATTERS * whole)
 		return false;

@@ -267,6 +267,10 @@ static int push_view(struct recon *recon, const void *samples, int view, struct 
 	recon->work_done += WORK_LOAD / recon->geometry->count;
 	if (!recon_runs_fdk(recon))
 		return 0;
+	if (!keeps_projections(&recon->recipe))
+		code = input_copy(&recon->input, recon->backend, recon->projections, view, slot, err);
+	if (code < 0)
+		return code;
 	recon->work_done += WORK_FDK / recon->geometry->count;
 	return fdk_add(&recon->fdk, view, slot, recon->projections, recon->volume, err);
 }

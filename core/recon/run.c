@@ -207,16 +207,21 @@ static int correct(struct recon *recon, enum correction_time time, struct error 
 	return code == 0 && changed ? measure(recon, NULL, &recon->norms, err) : code;
 }
 
-/* Makes a view's slot what it was when FDK took it; projections that are not kept had the view's mean, but for noise.
+/*
+ * Makes a view's slot what it was when FDK took it. Of projections that are not kept there is a copy of what may be an
+ * outlier; a view that shows nothing had its mean, but for noise.
  */
 static int restore_view(struct recon *recon, int view, int slot, struct error *err)
 {
 	const size_t pixels = (size_t)recon->geometry->columns * (size_t)recon->geometry->rows;
+	const float *copy = input_copy_of(&recon->input, view);
 	float *plain;
 	int code;
 
 	if (keeps_projections(&recon->recipe))
 		return 0;
+	if (copy != NULL)
+		return recon->backend->stack_upload(recon->projections, slot, 1, copy, err);
 	plain = malloc(pixels * sizeof(*plain));
 	if (plain == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a view");
@@ -254,10 +259,11 @@ static int take_back(struct recon *recon, const int *views, int count, struct er
 	return code == 0 ? backend->volume_axpby(-1, recon->volume, 0, recon->volume, err) : code;
 }
 
-/* Once all views have come: those that show nothing are left out of the FDK volume, and their slots say nothing. */
+/* Once all views have come: those that show nothing, and outliers, are left out of the FDK volume, and their slots say
+ * nothing. */
 static int leave_out_empty(struct recon *recon, struct error *err)
 {
-	const int found = input_settle(&recon->input, &recon->orbit, err);
+	const int found = input_settle(&recon->input, &recon->orbit, keeps_projections(&recon->recipe), err);
 	const int *views = recon->input.blank + recon->input.counts.blank - (found > 0 ? found : 0);
 	int code = found < 0 ? found : 0;
 

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Views that show nothing among those of a head, four of 60: told, and left out, in a job of all defaults; and a scan
-# that shows nothing at all: told.
+# Views that show nothing, or do not follow those beside them, among those of a head, four of 60: told, and left out, in
+# a job of all defaults; and a scan that shows nothing at all: told.
 . "$(dirname "$0")/lib.sh"
 
 head=(--phantom head --scale 60 --density 0.02 --views 60 --arc 360 --columns 64 --rows 48 --pixel 4
@@ -8,13 +8,15 @@ head=(--phantom head --scale 60 --density 0.02 --views 60 --arc 360 --columns 64
 cbct simulate "${head[@]}" -o "$work/good" >/dev/null || exit 1
 cp -r "$work/good" "$work/empty"
 cp -r "$work/good" "$work/air"
-/usr/bin/env python3 - "$work/good/projections.raw" "$work/empty/projections.raw" "$work/air/projections.raw" <<'EOF' || exit 1
+cp -r "$work/good" "$work/outliers"
+/usr/bin/env python3 - "$work"/{good,empty,air,outliers}/projections.raw <<'EOF' || exit 1
 import array, random, sys
 random.seed(5)
 pixels, views = 64 * 48, 60
 good = array.array('f', open(sys.argv[1], 'rb').read())
 empty = array.array('f', good)
 air = array.array('f', good)
+outliers = array.array('f', good)
 for view in range(views):
     for i in range(pixels):
         air[view * pixels + i] = random.gauss(60000, 270)
@@ -22,8 +24,15 @@ for view in range(views):
             empty[view * pixels + i] = air[view * pixels + i]
         elif view == 52:
             empty[view * pixels + i] = 30000
+        if view in (7, 8):
+            outliers[view * pixels + i] *= 0.5
+        elif view == 30:
+            outliers[view * pixels + i] *= i % 64 < 32
+        elif view == 52:
+            outliers[view * pixels + i] = good[51 * pixels + i]
 open(sys.argv[2], 'wb').write(empty.tobytes())
 open(sys.argv[3], 'wb').write(air.tobytes())
+open(sys.argv[4], 'wb').write(outliers.tobytes())
 EOF
 grid='"grid": {"size": [40, 40, 28], "spacing_mm": [2.8, 2.8, 2.8]}'
 
@@ -37,6 +46,17 @@ test_views_that_show_nothing_are_told_and_left_out() {
 	get_volume final "$work/empty.nii"
 	# What four views of 60 take away; 40 HU where they are believed.
 	expect_number "$(cbct compare --json "$work/empty.nii" "$work/good.nii" | jq '.rmse / 0.0192 * 1000')" '<' 12 "RMSE in HU"
+}
+
+# Two views at half dose, one whose left half is dark, a copy of the view before.
+test_views_that_do_not_follow_are_told_and_left_out() {
+	reconstruct "$work/outliers" "{\"scan\": \"SCAN\", $grid}"
+	for told in 'dose_steps ^2 projections, the first of them is 7,' 'dark_parts ^1 projections, the first of them is 30,' \
+		'frozen_views ^1 projections, the first of them is 52,'; do
+		expect_json "[.warnings[] | select(.code == \"${told%% *}\") | .severity, (.detail | test(\"${told#* }\"))] == [\"caution\", true]"
+	done
+	get_volume final "$work/outliers.nii"
+	expect_number "$(cbct compare --json "$work/outliers.nii" "$work/good.nii" | jq '.rmse / 0.0192 * 1000')" '<' 12 "RMSE in HU"
 }
 
 test_a_scan_of_air_is_told() {

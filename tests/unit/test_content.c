@@ -174,17 +174,96 @@ START_TEST(views_that_show_nothing_are_told_and_left_out)
 }
 END_TEST
 
-/* Two warnings must not be there: of views that show nothing, and of a scan that does. */
+/* A sample of a view of this kind from those of the right views; `last`: the one before, of those that are right. */
+enum outlying { HALF_DARK, HALF_DOSE, MORE_DOSE, ASIDE_IN_ROWS, ASIDE_IN_COLUMNS, FROZEN, OUTLYING };
+static double outlying_sample(enum outlying kind, const float *right, const float *last, int at)
+{
+	const int column = at % COLUMNS, row = at / COLUMNS;
+
+	switch (kind) {
+	case HALF_DARK:
+		return column < COLUMNS / 2 ? 0 : (double)right[at];
+	case HALF_DOSE:
+		return 0.5 * (double)right[at];
+	case MORE_DOSE:
+		return 1.3 * (double)right[at];
+	case ASIDE_IN_ROWS:
+		return column < 5 ? AIR : (double)right[at - 5];
+	case ASIDE_IN_COLUMNS:
+		return row < 5 ? AIR : (double)right[at - 5 * COLUMNS];
+	default:
+		return (double)last[at];
+	}
+}
+
+/*
+ * Four of 60 views, two and two beside each other, that are dark in one half, taken with another dose, aside by some
+ * pixels or copies of the one before: told, and the result is that of the same views without a good pixel.
+ */
+START_TEST(views_that_do_not_follow_are_told_and_left_out)
+{
+	static const struct orbit_spec spec = {COLUMNS, ROWS, VIEWS, {600, 1100, {4, 4}, {0, 0}, {0, 0}}, 0, 6};
+	static const char *const told[OUTLYING] = {"dark_parts: 4 projections, the first of them is 7",
+						   "dose_steps: 4 projections, the first of them is 7",
+						   "dose_steps: 4 projections, the first of them is 7",
+						   "shifted_views: 4 projections, the first of them is 7",
+						   "shifted_views: 4 projections, the first of them is 7",
+						   "frozen_views: 4 projections, the first of them is 7"};
+	static const bool outlies[VIEWS] = {[7] = true, [8] = true, [30] = true, [31] = true};
+	struct ellipsoid balls[] = {
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {38, 34, 26}, .centre = {2, -3, 1}, .density = 0.02},
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {8, 8, 8}, .centre = {14, 6, 4}, .density = 0.02},
+	};
+	const struct phantom phantom = {.count = 2, .parts = balls};
+	const struct grid grid = grid_of(24, 24, 16, 3.6, 3.6, 3.6);
+	struct recipe recipe = recipe_on(&grid);
+	struct scene scene;
+	float *right = malloc(sizeof(float) * PIXELS * VIEWS), *truth = malloc(sizeof(float) * grid_voxels(&grid));
+	float *samples = malloc(sizeof(float) * PIXELS * VIEWS);
+	double without, error;
+
+	recipe.fdk.on = true;
+	recipe.algorithm = _i >= OUTLYING ? &algorithm_sart : NULL;
+	recipe.iterate.iterations = 2;
+	random_state = (unsigned)_i;
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	phantom_voxelise(&phantom, &grid, 3, truth);
+	for (int i = 0; i < PIXELS * VIEWS; i++) {
+		right[i] = (float)(AIR * exp(-(double)scene.projections[i]) * (1 + 0.01 * normal()));
+		samples[i] = outlies[i / PIXELS] ? 0 : right[i];
+	}
+	without = error_of(&scene, &recipe, samples, truth, "blank_views: 4 projections have no good pixel");
+	for (int i = 0, last = 0; i < PIXELS * VIEWS; i++) {
+		const int view = i / PIXELS;
+
+		last = outlies[view] ? last : view;
+		if (outlies[view])
+			samples[i] = (float)outlying_sample(_i % OUTLYING, right + view * PIXELS, right + last * PIXELS,
+							    i % PIXELS);
+	}
+	error = error_of(&scene, &recipe, samples, truth, told[_i % OUTLYING]);
+	ck_assert_msg(error < 1.02 * without, "%.4f, %.4f without the views", error, without);
+	scene_clear(&scene);
+	free(samples);
+	free(right);
+	free(truth);
+}
+END_TEST
+
+/* Warnings that must not be there: of views that show nothing or do not follow, and of a scan that shows nothing. */
 static void expect_silence(const struct scene *scene, const struct linearise *linearise, const char *name)
 {
+	static const char *const codes[] = {"blank_views", "no_object",     "dark_parts",
+					    "dose_steps",  "shifted_views", "frozen_views"};
 	const struct grid grid = grid_of(8, 8, scene->geometry.rows > 1 ? 8 : 1, 5, 5, 5);
 	struct recipe recipe = recipe_on(&grid);
 	struct outcome outcome = {.threads = 1, .linearise = *linearise};
 
 	recipe.fdk.on = true;
 	run(scene, &recipe, &outcome);
-	ck_assert_msg(strstr(outcome.warnings, "blank_views") == NULL && strstr(outcome.warnings, "no_object") == NULL,
-		      "%s: %s", name, outcome.warnings);
+	for (size_t i = 0; i < sizeof(codes) / sizeof(*codes); i++)
+		ck_assert_msg(strstr(outcome.warnings, codes[i]) == NULL, "%s: %s", name, outcome.warnings);
 	outcome_clear(&outcome);
 }
 
@@ -372,6 +451,7 @@ Suite *content_suite(void)
 	tcase_set_timeout(tests, 60);
 	tcase_add_loop_test(tests, a_gap_among_views_of_an_object_is_found, 0, 2);
 	tcase_add_loop_test(tests, views_that_show_nothing_are_told_and_left_out, 0, TRIES);
+	tcase_add_loop_test(tests, views_that_do_not_follow_are_told_and_left_out, 0, 2 * OUTLYING);
 	tcase_add_loop_test(tests, no_view_of_an_object_is_taken_for_nothing, 0,
 			    (int)(sizeof(scans) / sizeof(scans[0])));
 	tcase_add_loop_test(tests, measured_views_all_show_something, 0, 3);
