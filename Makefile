@@ -381,6 +381,7 @@ CONTAINER_BASE ?= docker.io/library/debian:bookworm-slim
 container: deb ## an OCI image of the package, with buildah, podman or docker
 	@for tool in "buildah build" "podman build" "docker build"; do command -v $${tool%% *} >/dev/null && break; tool=; done; \
 	[ -n "$$tool" ] || { echo "make container needs buildah, podman or docker: apt-get install buildah" >&2; exit 1; }; \
+	case $$tool in docker*) ;; *) tool="$$tool --format docker" ;; esac; \
 	$$tool -q -f packages/Containerfile --build-arg BASE=$(CONTAINER_BASE) -t cbctd:$(VERSION) $(BUILD)/deb
 
 # A tarball's programs look for libraries beside them (RPATH, which the libraries inherit); glibc is the system's.

@@ -9,7 +9,8 @@
  * while it was copied is left out.
  *
  * backup.json names each file with its size and SHA-256, and is written last, when all else is on the disk: without it
- * there is no backup.
+ * there is no backup. backup.json.sha256 is its own digest, as sha256sum writes one. A backup may have come from
+ * anywhere: what is restored are regular files within its directory, never what a link or a pipe in it leads to.
  */
 #include <dirent.h>
 #include <errno.h>
@@ -35,7 +36,9 @@
 #include "proto/version.h"
 
 #define MANIFEST "backup.json"
-enum { FORMAT = 1, DIGEST_HEX = 65, BLOCK = 1 << 20, TRIES = 5 };
+#define DIGEST MANIFEST ".sha256"
+/* Format 1 had no digest of the manifest. */
+enum { FORMAT_FIRST = 1, FORMAT = 2, DIGEST_HEX = 65, BLOCK = 1 << 20, TRIES = 5 };
 static const size_t manifest_most = 1 << 30;
 
 struct copy {
@@ -44,6 +47,7 @@ struct copy {
 	char *block;           /* [BLOCK] */
 	double bytes;
 	int linked;
+	bool foreign; /* `from` is a backup, whose links are not followed */
 };
 
 static int path_under(char ret_path[PATH_MAX], const char *root, const char *path, struct error *err)
@@ -55,6 +59,27 @@ static int path_under(char ret_path[PATH_MAX], const char *root, const char *pat
 }
 
 /* ---- one file ---- */
+
+/* A descriptor of the path under `root`, by names alone: -1 (ELOOP, ENOTDIR) where one of them is a link. */
+static int open_inside(const char *root, const char *path)
+{
+	int folder = open(root, O_PATH | O_DIRECTORY | O_CLOEXEC), file = -1;
+
+	while (folder >= 0) {
+		const char *slash = strchr(path, '/');
+		char name[NAME_MAX + 1];
+		int next;
+
+		snprintf(name, sizeof(name), "%.*s", slash != NULL ? (int)(slash - path) : NAME_MAX, path);
+		if (slash == NULL)
+			file = openat(folder, name, O_RDONLY | O_NOFOLLOW | O_NONBLOCK | O_CLOEXEC);
+		next = slash == NULL ? -1 : openat(folder, name, O_PATH | O_DIRECTORY | O_NOFOLLOW | O_CLOEXEC);
+		close(folder);
+		folder = next;
+		path = slash != NULL ? slash + 1 : path;
+	}
+	return file;
+}
 
 /* Copies and hashes; writes nothing where `to` is -1. */
 static int copy_bytes(struct copy *copy, int from, int to, const char *path, unsigned long long *ret_bytes,
@@ -130,11 +155,16 @@ static int copy_file(struct copy *copy, const char *path, bool link, unsigned lo
 		code = path_under(target, copy->to, path, err);
 	if (code != 0)
 		return code;
-	from = open(source, O_RDONLY | O_CLOEXEC | O_NOFOLLOW);
+	from = copy->foreign ? open_inside(copy->from, path)
+			     : open(source, O_RDONLY | O_NOFOLLOW | O_NONBLOCK | O_CLOEXEC);
 	if (from < 0)
 		return error_set(err, errno == ENOENT ? ERR_NOT_FOUND : ERR_IO, "%s: %s", source, strerror(errno));
 	if (fstat(from, &status) != 0) {
 		code = error_set_errno(err, errno, "%s", source);
+		goto out;
+	}
+	if (!S_ISREG(status.st_mode)) {
+		code = error_set(err, ERR_INVALID, "%.200s is no regular file", source);
 		goto out;
 	}
 	unlink(target); /* of a try before */
@@ -181,7 +211,7 @@ static bool is_left_out(const char *path)
 
 	return strcmp(path, "lock") == 0 || strcmp(path, "reserve") == 0 || strcmp(path, "restored") == 0 ||
 	       strncmp(path, "catalogue.sqlite", strlen("catalogue.sqlite")) == 0 || strstr(name, ".tmp") != NULL ||
-	       strcmp(path, MANIFEST) == 0;
+	       strcmp(path, MANIFEST) == 0 || strcmp(path, DIGEST) == 0;
 }
 
 /* Records before lists, lists before samples, whatever else first. */
@@ -380,13 +410,29 @@ static int sync_all(const char *path, struct error *err)
 	return code;
 }
 
+static int digest_text(const char *text, size_t length, char ret_digest[DIGEST_HEX], struct error *err)
+{
+	unsigned char digest[EVP_MAX_MD_SIZE];
+
+	if (EVP_Digest(text, length, digest, NULL, EVP_sha256(), NULL) != 1)
+		return error_set(err, ERR_INTERNAL, "no SHA-256 of " MANIFEST);
+	for (int i = 0; i < 32; i++)
+		snprintf(ret_digest + 2 * i, 3, "%02x", digest[i]);
+	return 0;
+}
+
+/* The line that sha256sum -c reads. */
+static void digest_line(const char digest[DIGEST_HEX], char ret_line[DIGEST_HEX + 16])
+{
+	snprintf(ret_line, DIGEST_HEX + 16, "%s  " MANIFEST "\n", digest);
+}
+
 static int write_manifest(const struct copy *copy, struct error *err)
 {
 	cJSON *manifest = cJSON_CreateObject();
-	char path[PATH_MAX], now[CLOCK_TEXT_SIZE], *text;
-	struct durable file;
+	char path[PATH_MAX], now[CLOCK_TEXT_SIZE], digest[DIGEST_HEX] = "", line[DIGEST_HEX + 16], *text;
 	size_t length = 0;
-	int code = path_under(path, copy->to, MANIFEST, err);
+	int code;
 
 	clock_text(clock_realtime(), now);
 	cJSON_AddNumberToObject(manifest, "format", FORMAT);
@@ -397,15 +443,16 @@ static int write_manifest(const struct copy *copy, struct error *err)
 	cJSON_Delete(manifest);
 	if (text == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for " MANIFEST);
+	code = digest_text(text, length, digest, err);
+	digest_line(digest, line);
 	if (code == 0)
-		code = durable_open(&file, path, length, err);
-	if (code == 0) {
-		code = durable_write(&file, text, length, err);
-		if (code == 0)
-			code = durable_commit(&file, err);
-		else
-			durable_abandon(&file);
-	}
+		code = path_under(path, copy->to, DIGEST, err);
+	if (code == 0)
+		code = file_write_durable(path, line, strlen(line), err);
+	if (code == 0)
+		code = path_under(path, copy->to, MANIFEST, err);
+	if (code == 0)
+		code = file_write_durable(path, text, length, err);
 	free(text);
 	return code;
 }
@@ -486,6 +533,9 @@ static int make_target(const char *from, const char *to, struct error *err)
 	if (mkdir(to, 0700) != 0 && (errno != EEXIST || rmdir(to) != 0 || mkdir(to, 0700) != 0))
 		return error_set(err, ERR_CONFLICT, "%s: %s", to, strerror(errno));
 	code = make_directory(from, to, err);
+	/* All of it is for those who may read the daemon's own alone. */
+	if (code == 0 && chmod(to, status.st_mode & 0750) != 0)
+		code = error_set_errno(err, errno, "%s", to);
 	return code;
 }
 
@@ -581,19 +631,53 @@ static int restore_file(struct copy *copy, const cJSON *file, struct error *err)
 	return code;
 }
 
-static int read_manifest(const char *from, cJSON **ret_manifest, struct error *err)
+/* A file of the backup's own, of which nothing has told the size. */
+static int read_own(const char *from, const char *name, char **ret_text, size_t *ret_length, struct error *err)
 {
-	char path[PATH_MAX], *text = NULL;
-	size_t length;
-	int code = path_under(path, from, MANIFEST, err);
+	char path[PATH_MAX];
+	struct stat status;
+	int code = path_under(path, from, name, err);
+
+	if (code == 0 && lstat(path, &status) == 0 && !S_ISREG(status.st_mode))
+		code = error_set(err, ERR_INVALID, "%.200s is no regular file", path);
+	return code != 0 ? code : file_read(path, manifest_most, ret_text, ret_length, err);
+}
+
+static int check_manifest(const char *from, const char *text, size_t length, struct error *err)
+{
+	char digest[DIGEST_HEX] = "", line[DIGEST_HEX + 16], *expected = NULL;
+	size_t expected_length;
+	int code = read_own(from, DIGEST, &expected, &expected_length, err);
 
 	if (code == 0)
-		code = file_read(path, manifest_most, &text, &length, err);
+		code = digest_text(text, length, digest, err);
+	digest_line(digest, line);
+	if (code == 0 && strcmp(expected, line) != 0)
+		code = error_set(err, ERR_DAMAGED,
+				 "%.200s/" MANIFEST " is damaged: its SHA-256 is %s, " DIGEST " has %.64s", from,
+				 digest, expected);
+	free(expected);
+	return code;
+}
+
+static int read_manifest(const char *from, cJSON **ret_manifest, struct error *err)
+{
+	char *text = NULL;
+	size_t length;
+	double format = 0;
+	int code = read_own(from, MANIFEST, &text, &length, err);
+
 	if (code == 0) {
 		*ret_manifest = cJSON_ParseWithLength(text, length);
-		if (*ret_manifest == NULL || member_number(*ret_manifest, "format", 0) != FORMAT)
-			code = error_set(err, ERR_INVALID, "%s is no list of a backup", path);
+		format = member_number(*ret_manifest, "format", 0);
+		if (format != FORMAT && format != FORMAT_FIRST)
+			code = error_set(err, ERR_INVALID, "%.200s/" MANIFEST " is no list of a backup", from);
 	}
+	if (code == 0 && format == FORMAT)
+		code = check_manifest(from, text, length, err);
+	else if (code == 0)
+		fprintf(stderr,
+			"this backup was made before lists had digests: whether the list is whole is not known\n");
 	free(text);
 	return code;
 }
@@ -616,7 +700,7 @@ static int note_restored(const char *to, struct error *err)
 static int restore_run(const void *values, struct error *err)
 {
 	const struct backup_options *options = values;
-	struct copy copy = {.from = options->from, .block = malloc(BLOCK)};
+	struct copy copy = {.from = options->from, .block = malloc(BLOCK), .foreign = true};
 	char beside[PATH_MAX];
 	bool made;
 	cJSON *manifest = NULL;

@@ -122,7 +122,42 @@ test_what_is_damaged_or_no_backup_is_refused() {
 	grep -q 'lies within' "$work/said" && [ ! -e "$state/copy" ] || fail "why: $(cat "$work/said")"
 	(cd "$state" && cbct backup . copy 2>"$work/said") && fail "nor by a relative path"
 	[ ! -e "$state/copy" ] || fail "nothing was made"
-	jq '.files[0].path = "../../escape"' "$work/copy/backup.json" >"$work/list" && cp "$work/list" "$work/copy/backup.json"
+	cp -r "$work/copy" "$work/good"
+	relist() { # FILTER: another list, with its digest
+		rm -rf "$work/copy" "$work/restored"
+		cp -r "$work/good" "$work/copy"
+		jq "$1" "$work/good/backup.json" >"$work/copy/backup.json"
+		(cd "$work/copy" && sha256sum backup.json >backup.json.sha256)
+	}
+	(cd "$work/copy" && sha256sum --quiet -c backup.json.sha256) || fail "a digest that sha256sum reads"
+	jq '.files |= .[:-1]' "$work/good/backup.json" >"$work/copy/backup.json"
+	cbct restore "$work/copy" "$work/restored" 2>"$work/said" && fail "a list that was changed is found"
+	grep -q 'backup.json is damaged' "$work/said" || fail "why: $(cat "$work/said")"
+	rm "$work/copy/backup.json.sha256"
+	cbct restore "$work/copy" "$work/restored" 2>"$work/said" && fail "the digest is not optional"
+	# A pipe keeps nobody waiting, and a link leads nowhere.
+	file=$(jq -r '.files[0].path' "$work/good/backup.json")
+	relist .
+	rm "$work/copy/$file" && mkfifo "$work/copy/$file"
+	timeout 10 "$BUILD/cbct" restore "$work/copy" "$work/restored" 2>"$work/said" && fail "a pipe is no file"
+	grep -q 'is no regular file' "$work/said" || fail "why: $(cat "$work/said")"
+	relist .
+	mv "$work/copy/$file" "$work/elsewhere" && ln -s "$work/elsewhere" "$work/copy/$file"
+	cbct restore "$work/copy" "$work/restored" 2>"$work/said" && fail "a link is no file"
+	relist .
+	mv "$work/copy/scans" "$work/scans" && ln -s "$work/scans" "$work/copy/scans"
+	cbct restore "$work/copy" "$work/restored" 2>"$work/said" && fail "nor is one that is a link's"
+	rm -r "$work/scans" "$work/copy/backup.json" && mkfifo "$work/copy/backup.json"
+	timeout 10 "$BUILD/cbct" restore "$work/copy" "$work/restored" 2>"$work/said" && fail "a pipe is no list"
+	grep -q 'is no regular file' "$work/said" || fail "why: $(cat "$work/said")"
+	relist '.format = 1'
+	file=$(cd "$work/copy" && find scans -name projections.raw)
+	dd if="$state/$file" of="$work/copy/$file" status=none # the one that was damaged above
+	rm "$work/copy/backup.json.sha256"
+	cbct restore "$work/copy" "$work/restored" 2>"$work/said" || fail "a backup of the first version: $(cat "$work/said")"
+	grep -q 'before lists had digests' "$work/said" || fail "told: $(cat "$work/said")"
+	[[ $(stat -c %a "$work/restored") == 7[05]0 ]] || fail "for nobody else to read"
+	relist '.files[0].path = "../../escape"'
 	cbct restore "$work/copy" "$work/restored" 2>"$work/said" && fail "a path that leads out"
 	grep -q 'no path within the backup' "$work/said" || fail "why: $(cat "$work/said")"
 	rm "$work/copy/backup.json"
