@@ -167,7 +167,7 @@ $(BUILD)/cbctd-held: $(call objects,$(daemon_sources) tests/http/held.c tests/lo
 
 gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench
 # Every program that a test or a benchmark runs, so that none stops compiling unseen.
-test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held manual faults.so every.so live_bytes.so simulated-nvml/libnvidia-ml.so.1 cpu-bench calibrate-bench denoise presets watchers slices acquire) \
+test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held manual faults.so every.so live_bytes.so simulated-nvml/libnvidia-ml.so.1 cpu-bench calibrate-bench denoise presets watchers slices acquire paper-project) \
                $(if $(cuda_objects),$(gpu_programs) $(BUILD)/gpu_ceilings $(BUILD)/cbct-worker-faulty,$(call objects,$(wildcard tests/bench/gpu_*.c)))
 
 # Faults of the disk, loaded into the programs by tests.
@@ -278,6 +278,18 @@ bench-calibrate: setup ## a calibration of 400 views of 1240 x 960 pixels, on st
 bench: setup ## CPU and HTTP benchmarks, results in build/bench/
 	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/cpu-bench $(BUILD)/acquire $(BUILD)/watchers $(BUILD)/slices
 	@BUILD=$(BUILD) tests/bench/run.sh
+
+# Shares nothing with the project: projections of voxel objects for `make paper`.
+$(BUILD)/paper-project: tests/paper/project.c
+	@mkdir -p $(@D)
+	$(call say,CC  )$(CC) -std=c11 -O2 -Wall -Wextra -Wpedantic $(OPENMP) -o $@ $< -lm
+
+# PAPER=small: up to 64^3 voxels (10 minutes on two cores); PAPER=all: all; by default all with a GPU.
+PAPER ?= auto
+paper: MODULES += matplotlib:python3-matplotlib
+paper: setup ## the study's experiments through the daemon, a report in build/paper/ (PAPER=small or all)
+	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/paper-project
+	@OMP_WAIT_POLICY=passive $(PYTHON) tests/paper/experiments.py --build $(BUILD) --size $(PAPER) --results $(BUILD)/paper/results
 
 # A worker that can be made to fault, for the test of what becomes of that.
 $(BUILD)/tests/gpu/fault.o: tests/gpu/fault.cu
@@ -403,6 +415,6 @@ clean: ## removes build/
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z_.-]+:.*## /{printf "  make %-21s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-.PHONY: all test-programs again setup demo check soak fuzz fuzzers bench bench-calibrate bench-denoise bench-presets check-gpu bench-gpu asan tsan lint format rooms third-party compile_commands.json install deb container sbom reproducible clean help
+.PHONY: all test-programs again setup demo check soak fuzz fuzzers paper bench bench-calibrate bench-denoise bench-presets check-gpu bench-gpu asan tsan lint format rooms third-party compile_commands.json install deb container sbom reproducible clean help
 .SECONDARY:
 -include $(shell find $(BUILD) -path $(BUILD)/test -prune -o -type f -name '*.d' -print 2>/dev/null)

@@ -30,7 +30,8 @@ cJSON *history_row_document(const struct history_row *row)
 	cJSON_AddNumberToObject(document, "residual", row->residual);
 	cJSON_AddNumberToObject(document, "change", row->change);
 	cJSON_AddNumberToObject(document, "tv", row->tv);
-	json_add_seconds(document, "seconds", row->seconds);
+	/* An iteration on a GPU may take less than a millisecond. */
+	cJSON_AddNumberToObject(document, "seconds", round(row->seconds * 1e6) / 1e6);
 	return document;
 }
 
