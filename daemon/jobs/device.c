@@ -6,6 +6,7 @@
 #include "daemon/jobs/kernel_log.h"
 #include "daemon/jobs/workers.h"
 #include "daemon/log.h"
+#include "proto/calibration_files.h"
 #include "proto/clock.h"
 #include "proto/json.h"
 
@@ -20,11 +21,86 @@ bool device_at_fault(const struct worker *worker, enum worker_end end)
 	return end == END_DEVICE || (worker->hung && !is_processor(worker));
 }
 
+/* ---- what outlives a restart: STATE/devices.json ---- */
+
+static void devices_path(const struct supervise *supervise, char ret_path[1024])
+{
+	snprintf(ret_path, 1024, "%s/devices.json", store_directory(jobs_store(supervise->jobs)));
+}
+
+/* A disk that does not take it costs no more than a device that is given a job again after a restart. */
+static void devices_save(const struct supervise *supervise)
+{
+	cJSON *document = cJSON_CreateObject(), *list = cJSON_AddArrayToObject(document, "set_aside");
+	struct error err;
+	char path[1024];
+
+	cJSON_AddStringToObject(document, "backend", supervise->backend);
+	for (int i = 0; i < supervise->regular; i++) {
+		cJSON *device;
+
+		if (!supervise->workers[i].aside)
+			continue;
+		device = cJSON_CreateObject();
+		cJSON_AddNumberToObject(device, "device", supervise->devices[i]);
+		cJSON_AddNumberToObject(device, "since", supervise->workers[i].aside_since);
+		cJSON_AddStringToObject(device, "error", supervise->workers[i].last_error);
+		cJSON_AddItemToArray(list, device);
+	}
+	devices_path(supervise, path);
+	if (sealed_write(path, document, &err) != 0)
+		log_line(LEVEL_WARNING, "which devices are set aside is forgotten at the next start: %s", err.text);
+	cJSON_Delete(document);
+}
+
+static void put_aside(struct supervise *supervise, const cJSON *device)
+{
+	const cJSON *index = cJSON_GetObjectItemCaseSensitive(device, "device"),
+		    *since = cJSON_GetObjectItemCaseSensitive(device, "since"),
+		    *text = cJSON_GetObjectItemCaseSensitive(device, "error");
+
+	for (int i = 0; i < supervise->regular; i++) {
+		struct worker *worker = &supervise->workers[i];
+
+		if (!cJSON_IsNumber(index) || supervise->devices[i] != index->valueint)
+			continue;
+		worker->aside = true;
+		worker->aside_since = cJSON_IsNumber(since) ? since->valuedouble : 0;
+		worker->faults = DEVICE_FAULTS;
+		snprintf(worker->last_error, sizeof(worker->last_error), "%s",
+			 cJSON_IsString(text) ? text->valuestring : "");
+		log_line(LEVEL_WARNING, "device %d was set aside before this start (%s): it is tested first",
+			 index->valueint, worker->last_error);
+	}
+}
+
+void devices_load(struct supervise *supervise)
+{
+	cJSON *document = NULL;
+	const cJSON *backend, *device;
+	struct error err;
+	char path[1024];
+	int code;
+
+	devices_path(supervise, path);
+	code = sealed_read(path, &document, &err);
+	if (code != 0 && code != ERR_NOT_FOUND)
+		log_line(LEVEL_WARNING, "which devices were set aside is not known: %s", err.text);
+	backend = cJSON_GetObjectItemCaseSensitive(document, "backend");
+	/* Device 0 of another backend is another one. */
+	if (cJSON_IsString(backend) && strcmp(backend->valuestring, supervise->backend) == 0) {
+		cJSON_ArrayForEach(device, cJSON_GetObjectItemCaseSensitive(document, "set_aside"))
+		    put_aside(supervise, device);
+	}
+	cJSON_Delete(document);
+}
+
 static void set_aside(struct supervise *supervise, struct worker *worker)
 {
 	worker->aside = true;
 	worker->tests = 0;
 	worker->aside_since = clock_realtime();
+	devices_save(supervise);
 	log_line(LEVEL_ERROR, "device %d is set aside after %u errors in a row: %s", supervise->devices[worker->index],
 		 worker->faults, worker->last_error);
 	/* Whatever state it is in: the next process begins with the self-test. */
@@ -46,9 +122,13 @@ void device_fault(struct supervise *supervise, struct worker *worker, const char
 
 void device_clear(struct supervise *supervise, struct worker *worker, const char *why)
 {
-	if (worker->aside)
+	const bool aside = worker->aside;
+
+	if (aside)
 		log_line(LEVEL_WARNING, "device %d is given jobs again: %s", supervise->devices[worker->index], why);
 	worker->aside = false;
+	if (aside)
+		devices_save(supervise);
 	worker->faults = 0;
 	worker->tests = 0;
 }
@@ -66,10 +146,16 @@ static bool other_answers(const struct supervise *supervise, const struct worker
 	return false;
 }
 
-static bool all_aside(const struct supervise *supervise)
+/* Set aside, or DEVICE_FAULTS processes in a row have ended without a hello, as without a driver. */
+static bool is_out(const struct worker *worker)
+{
+	return worker->aside || worker->mute > DEVICE_FAULTS;
+}
+
+static bool all_out(const struct supervise *supervise)
 {
 	for (int i = 0; i < supervise->regular; i++) {
-		if (!supervise->workers[i].aside)
+		if (!is_out(&supervise->workers[i]))
 			return false;
 	}
 	return true;
@@ -104,7 +190,7 @@ bool device_fits(const void *context, const struct job_trial *trial)
 	const struct supervise *supervise = worker->supervise;
 
 	if (worker->fallback)
-		return trial->processor || all_aside(supervise);
+		return trial->processor || all_out(supervise);
 	if (trial->processor || worker->aside)
 		return false;
 	return (trial->left >> worker->index & 1) == 0 || !other_answers(supervise, worker, trial->left);
@@ -135,7 +221,7 @@ static void clear_asked(struct supervise *supervise)
 static void tend_processor(struct supervise *supervise)
 {
 	struct worker *worker = &supervise->workers[supervise->regular];
-	const bool wanted = all_aside(supervise) || jobs_want_processor(supervise->jobs);
+	const bool wanted = all_out(supervise) || jobs_want_processor(supervise->jobs);
 
 	if (worker->state == WORKER_ABSENT && !wanted) {
 		worker->start_at = NEVER;
@@ -159,7 +245,7 @@ void devices_tend(struct supervise *supervise)
 void device_tell_fallback(struct supervise *supervise, struct worker *worker, int iterations)
 {
 	const double step = supervise->processor_rate * worker->work;
-	char text[320], last[160] = "all devices are set aside";
+	char text[320], last[160] = "all devices are set aside or do not answer";
 	struct error ignored;
 	int index = job_trial(worker->job)->worker;
 

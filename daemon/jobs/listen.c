@@ -52,6 +52,7 @@ static void hello(struct supervise *supervise, struct worker *worker, const stru
 	snprintf(worker->backend, sizeof(worker->backend), "%s", message->backend);
 	if (worker->aside && worker->testing)
 		device_clear(supervise, worker, "it has passed its self-test");
+	worker->mute = 0;
 	worker->deadline = NEVER;
 	worker->state = WORKER_IDLE;
 	worker->steps = 0;

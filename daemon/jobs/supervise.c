@@ -89,6 +89,7 @@ static void start_worker(struct supervise *supervise, struct worker *worker)
 	worker->starts++;
 	worker->testing = worker->aside;
 	worker->hung = false;
+	worker->mute++; /* until it says hello */
 	if (child_spawn(&options, &worker->child, &err) != 0) {
 		worker->failures++;
 		worker->start_at = now + RESTART_LAST;
@@ -471,6 +472,7 @@ int supervise_start(struct jobs *jobs, const struct supervise_options *options, 
 		snprintf(worker->backend, sizeof(worker->backend), "%s", fallback ? "cpu" : "");
 	}
 	lock_init(&supervise->lock, LOCK_SUPERVISOR);
+	devices_load(supervise);
 	for (int i = 0; i < supervise->count; i++)
 		worker_publish(supervise, &supervise->workers[i]);
 	supervise->wake = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);

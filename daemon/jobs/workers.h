@@ -74,6 +74,7 @@ struct worker {
 	bool aside;         /* its device is given no jobs until a self-test or an operator clears it */
 	bool testing;       /* its process begins with the self-test */
 	unsigned tests;     /* self-tests that have failed since it was set aside */
+	unsigned mute;      /* processes in a row without a hello, the one that is starting included */
 	double aside_since; /* seconds since 1970 */
 	bool hung;          /* the daemon ended the process because it finished no step */
 	char said[160];     /* what its last message about a job was */
@@ -165,6 +166,8 @@ void worker_finish_job(struct supervise *supervise, struct worker *worker);
 bool worker_is_stale(const struct worker *worker);
 
 /* ---- device.c ---- */
+/* Devices that were set aside before this start still are; each begins with its self-test. Before any worker starts. */
+void devices_load(struct supervise *supervise);
 /* The worker's device is at fault for the end of this process, or of this job. */
 bool device_at_fault(const struct worker *worker, enum worker_end end);
 /* Counts an error of the worker's device; with DEVICE_FAULTS of them in a row it is set aside. */

@@ -57,7 +57,7 @@ test_deaths_without_progress_move_it_too() {
 }
 
 test_a_device_with_repeated_errors_is_set_aside() {
-	local i
+	local i since
 	start_posted --devices 0,1
 	devices_become '[.devices[].state] == ["idle", "idle"]'
 	trouble filter 0
@@ -73,6 +73,12 @@ test_a_device_with_repeated_errors_is_set_aside() {
 	post_job "$recipe"
 	wait_job succeeded
 	expect_json '.attempts == 1'
+	# A restart forgets neither: it begins with the self-test, which fails as before.
+	since=$(curl -s "$url/v1/devices" | jq -r '.devices[0].set_aside.since')
+	stop_daemon
+	start_daemon --worker "$BUILD/cbct-worker-held" --threads 1 --devices 0,1
+	devices_become ".devices[0] | .errors == 3 and .set_aside.since == \"$since\" and .answers == false and .state == \"absent\" and .set_aside.test_in_s > 20"
+	grep -q 'device 0 was set aside before this start' "$work/cbctd.err" || fail "told in the log"
 	for i in 7 2 x 0.5 -1; do
 		req POST "/v1/devices/$i/clear"
 		expect_problem 404
@@ -82,6 +88,9 @@ test_a_device_with_repeated_errors_is_set_aside() {
 	expect_status 200
 	expect_json '.index == 0 and .set_aside == null and .errors == 0'
 	devices_become '.devices[0].state == "idle" and .devices[0].answers and .devices[0].errors == 0'
+	stop_daemon
+	start_daemon --worker "$BUILD/cbct-worker-held" --threads 1 --devices 0,1
+	devices_become '.devices[0] | .set_aside == null and .errors == 0 and .state == "idle"'
 }
 
 test_all_devices_are_set_aside() {
@@ -154,6 +163,19 @@ test_the_processor_takes_the_jobs_of_devices_that_are_set_aside() {
 	post_job "$recipe"
 	wait_job succeeded
 	expect_json '.attempts == 1 and ([.warnings[] | select(.code == "processor_fallback") | .detail][0] | startswith("all devices are set aside"))'
+}
+
+# As after an upgrade without the driver: no process of the card ever says hello.
+test_the_processor_takes_the_jobs_of_devices_that_never_answer() {
+	rm -rf "$state" "$CBCT_TEST_CARDS"
+	(unset CBCT_TEST_CARDS && start_daemon --threads 1 --devices 63 --fallback cpu)
+	url=$(sed -n 's/^listening on \(http:\)/\1/p' "$work/cbctd.out")
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "$recipe"
+	wait_job succeeded
+	expect_json '.backend == "cpu" and ([.warnings[] | select(.code == "processor_fallback") | .detail][0] | startswith("all devices are set aside or do not answer"))'
+	devices_become '.devices[0].set_aside == null and .devices[0].answers == false'
 }
 
 # The worker that hangs is killed 13 s after its last step; who asks is told before that.
