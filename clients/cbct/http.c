@@ -289,7 +289,7 @@ int http_send(struct http *http, const struct http_request *request, struct http
 	struct http_reply reply = {0};
 	struct transfer transfer = {http, request, &reply};
 	struct curl_slist *headers = NULL;
-	const char *retry_after;
+	const char *retry_after, *digest;
 	char url[1200];
 	long status = 0;
 	CURLcode result;
@@ -305,9 +305,12 @@ int http_send(struct http *http, const struct http_request *request, struct http
 	curl_easy_setopt(http->easy, CURLOPT_WRITEFUNCTION, on_body);
 	curl_easy_setopt(http->easy, CURLOPT_WRITEDATA, &transfer);
 	curl_easy_setopt(http->easy, CURLOPT_ACCEPT_ENCODING, request->decompress ? "zstd" : NULL);
+	curl_easy_setopt(http->easy, CURLOPT_NOBODY, 0L);
 	if (request->body != NULL) {
 		curl_easy_setopt(http->easy, CURLOPT_POSTFIELDSIZE_LARGE, (curl_off_t)request->length);
 		curl_easy_setopt(http->easy, CURLOPT_POSTFIELDS, request->body);
+	} else if (strcmp(request->method, "HEAD") == 0) {
+		curl_easy_setopt(http->easy, CURLOPT_NOBODY, 1L);
 	} else {
 		curl_easy_setopt(http->easy, CURLOPT_HTTPGET, 1L);
 	}
@@ -321,6 +324,8 @@ int http_send(struct http *http, const struct http_request *request, struct http
 	http->retry_after = retry_after != NULL ? strtod(retry_after, NULL) : 0;
 	http->unreachable = result == CURLE_COULDNT_CONNECT || result == CURLE_COULDNT_RESOLVE_HOST;
 	disposition_name(reply_header(http, "Content-Disposition"), reply.name);
+	digest = reply_header(http, "Repr-Digest");
+	snprintf(reply.digest, sizeof(reply.digest), "%s", digest != NULL ? digest : "");
 	*ret_reply = reply;
 	/* A refusal that came before the whole body was sent counts, though the sending broke. */
 	if (status >= 400)

@@ -43,6 +43,7 @@ struct http_reply {
 	char *body; /* ends with a zero byte beyond its length; "" when `write` took it */
 	size_t length;
 	char name[HTTP_NAME_MAX]; /* file name of Content-Disposition, "" without */
+	char digest[64];          /* Repr-Digest, "" without */
 };
 
 /*

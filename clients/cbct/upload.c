@@ -1,8 +1,8 @@
 /*
  * cbct upload: a scan directory (proto/scan_directory.h) to the daemon. Projections go in
  * runs over several connections at once; what the daemon says is missing is
- * sent, so that an interrupted upload goes on with --scan ID, and a run whose
- * reply was lost is sent again at no harm.
+ * sent, so that an interrupted upload goes on with --scan ID (once that is known to be the same scan: same_scan.h), and
+ * a run whose reply was lost is sent again at no harm.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -18,6 +18,7 @@
 
 #include "clients/cbct/commands.h"
 #include "clients/cbct/progress.h"
+#include "clients/cbct/same_scan.h"
 #include "clients/cbct/upload.h"
 #include "clients/cbct/warning.h"
 #include "proto/scan_directory.h"
@@ -289,46 +290,6 @@ static int begin(struct http *http, struct upload *upload, const struct scan *sc
 	return 0;
 }
 
-/*
- * A scan to go on with must be the one of this directory, or two patients' projections would become one scan: what the
- * directory says of it is what the daemon has, and a projection that is there has the same bytes.
- */
-static int check_same(const cJSON *document, const struct scan *scan, struct error *err)
-{
-	const cJSON *own, *other;
-
-	cJSON_ArrayForEach(own, scan->document)
-	{
-		other = cJSON_GetObjectItemCaseSensitive(document, own->string);
-		/* The daemon puts the matrices in place of a calibration's name. */
-		if (strcmp(own->string, "geometry") == 0 && strcmp(member_text(own, "kind", ""), "calibration") == 0)
-			continue;
-		if (!cJSON_Compare(own, other, true))
-			return error_set(err, ERR_CONFLICT,
-					 "scan %.60s is another one: its %s is not what scan.json says",
-					 member_text(document, "id", ""), own->string);
-	}
-	return 0;
-}
-
-/* Sends the first projection that is there once more: the daemon refuses other bytes. */
-static int check_received(struct http *http, const struct upload *upload, const cJSON *received, struct error *err)
-{
-	const cJSON *first = cJSON_GetArrayItem(cJSON_GetArrayItem(received, 0), 0);
-	struct error why;
-	char path[160];
-	int code;
-
-	if (!cJSON_IsNumber(first))
-		return 0;
-	snprintf(path, sizeof(path), "/v1/scans/%s/projections/%d", upload->id, first->valueint);
-	code = put(http, path, upload->all + (size_t)first->valueint * upload->one, upload->one, upload->options->zstd,
-		   err);
-	why = *err;
-	return code != ERR_CONFLICT ? code
-				    : error_set(err, code, "scan %s is another one: %.200s", upload->id, why.text);
-}
-
 static int map_projections(struct upload *upload, const struct scan_files *files, struct error *err)
 {
 	size_t length = upload->one * (size_t)files->scan->count;
@@ -357,6 +318,8 @@ static int upload_files(struct upload *upload, const struct scan_files *files, s
 
 	if (upload->options->run != OPTION_UNSET_INTEGER)
 		most = (int)upload->options->run;
+	if (code == 0 && upload->options->scan != NULL)
+		code = scan_check_same(http, upload->options->scan, files, upload->all, err);
 	if (code == 0)
 		code = begin(http, upload, scan, &document, err);
 	if (code == 0) {
@@ -365,13 +328,8 @@ static int upload_files(struct upload *upload, const struct scan_files *files, s
 		puts(upload->id);
 		fflush(stdout);
 	}
-	if (code == 0 && upload->options->scan != NULL)
-		code = check_same(document, scan, err);
-	if (code == 0 && upload->options->scan != NULL)
-		code = check_received(http, upload, cJSON_GetObjectItemCaseSensitive(document, "received"), err);
-	if (code == 0) {
+	if (code == 0)
 		code = make_runs(upload, cJSON_GetObjectItemCaseSensitive(document, "missing"), scan->count, most, err);
-	}
 	if (code == 0)
 		code = send_images(http, upload, files, err);
 	if (code == 0)

@@ -6,6 +6,7 @@
 #include <unistd.h>
 
 #include "daemon/api/internal.h"
+#include "proto/digest.h"
 #include "proto/slice.h"
 
 /* ---- in ---- */
@@ -225,7 +226,7 @@ static int reply_picture(struct request *request, struct stored_scan *stored, in
 static int reply_samples(struct request *request, const struct scan *scan, int descriptor, int index,
 			 const uint8_t sha256[32], struct error *err)
 {
-	char etag[ETAG_MAX], filename[96];
+	char etag[ETAG_MAX], filename[96], digest[DIGEST_TEXT_MAX];
 	struct entity entity = {.etag = etag,
 				.size = scan_projection_bytes(scan),
 				.media_type = "application/octet-stream",
@@ -243,6 +244,8 @@ static int reply_samples(struct request *request, const struct scan *scan, int d
 			       selection.length, err) != 0)
 		return err->code;
 	entity_headers(request, &entity, &selection);
+	digest_text(sha256, digest);
+	request_reply_header(request, "Repr-Digest", "%s", digest);
 	return 0;
 }
 

@@ -234,23 +234,45 @@ test_an_interrupted_upload_goes_on() {
 	[ "$(cbct upload "$work/broken" --scan "$scan")" = "$scan" ] || fail "the same scan"
 }
 
-# Two patients' projections never become one scan.
+# A scan of another patient, of the same detector or not, half received or whole, never takes a projection of this one.
 test_an_upload_goes_on_with_its_own_scan_alone() {
-	local one=$((48 * 32 * 4))
-	cbct simulate -o "$work/broken" "${ball[@]}" "${small[@]}" --photons 1000
-	post_scan "$work/broken"
-	head -c $((one * 9)) "$work/broken/projections.raw" >"$work/part"
-	req PUT "/v1/scans/$scan/projections/3-11" -T "$work/part"
+	local tiny=(--views 8 --columns 16 --rows 16 --pixel 16) one=$((16 * 16 * 4)) whole id digest
+	cbct simulate -o "$work/theirs" "${ball[@]}" "${tiny[@]}" --name first --patient HFS
+	cbct simulate -o "$work/ours" --phantom shepp-logan "${tiny[@]}" --name second --patient HFS
+	cbct simulate -o "$work/turned" "${ball[@]}" "${tiny[@]}" --name first --patient FFP
+	cbct simulate -o "$work/finer" "${ball[@]}" "${tiny[@]}" --rows 20 --name first --patient HFS
+	whole=$(cbct upload "$work/theirs")
+	post_scan "$work/theirs"
+	expect_exit 1 cbct upload "$work/ours" --scan "$scan" # that nothing is stored yet makes it no other
+	jq 'del(.patient)' "$work/theirs/scan.json" >"$work/ours/scan.json"
+	expect_exit 1 cbct upload "$work/ours" --scan "$scan"
+	grep -q "/patient" "$work/said" || fail "the patient in: $(cat "$work/said")"
+	cbct simulate -o "$work/ours" --phantom shepp-logan "${tiny[@]}" --name second --patient HFS
+	head -c $((one * 4)) "$work/theirs/projections.raw" >"$work/part"
+	req PUT "/v1/scans/$scan/projections/0-3" -T "$work/part"
 	expect_status 201
-	cp -r "$work/broken" "$work/other"
-	jq '.patient.position = "FFP"' "$work/broken/scan.json" >"$work/other/scan.json"
-	expect_exit 1 cbct upload "$work/other" --scan "$scan"
-	grep -q "scan $scan is another one: its patient is not what scan.json says" "$work/said" || fail "why: $(cat "$work/said")"
-	cp "$work/broken/scan.json" "$work/other/scan.json"
-	expect_exit 1 cbct upload "$work/other" --scan "$scan" # its fourth projection is another one
-	grep -q "scan $scan is another one: .*projection 3 is stored already, with other bytes" "$work/said" || fail "why: $(cat "$work/said")"
-	req GET "/v1/scans/$scan"
-	expect_json '.received == [[3, 11]]'
+	for id in "$scan" "$whole"; do
+		expect_exit 1 cbct upload "$work/ours" --scan "$id"
+		grep -q "/name" "$work/said" || fail "the name in: $(cat "$work/said")"
+		expect_exit 1 cbct upload "$work/turned" --scan "$id"
+		grep -q "/patient/position" "$work/said" || fail "the position in: $(cat "$work/said")"
+		expect_exit 1 cbct upload "$work/finer" --scan "$id"
+		grep -q "/detector/rows" "$work/said" || fail "the rows in: $(cat "$work/said")"
+		# The document is the same, the samples of one projection are not.
+		jq '.labels.room = "2"' "$work/theirs/scan.json" >"$work/ours/scan.json"
+		cp "$work/theirs/projections.raw" "$work/ours/projections.raw"
+		expect_exit 0 cbct upload "$work/ours" --scan "$whole"
+		printf 'x' | dd of="$work/ours/projections.raw" bs=1 seek=$((one * 3 + 17)) conv=notrunc status=none
+		expect_exit 1 cbct upload "$work/ours" --scan "$id"
+		grep -q "projection 3 " "$work/said" || fail "projection 3 in: $(cat "$work/said")"
+		cbct simulate -o "$work/ours" --phantom shepp-logan "${tiny[@]}" --name second --patient HFS
+	done
+	url_get_missing "$scan" '[[4,7]]'
+	req GET "/v1/scans/$scan/projections/3"
+	digest=$(openssl dgst -sha256 -binary "$body" | base64)
+	[ "$(header Repr-Digest)" = "sha-256=:$digest:" ] || fail "the projection's digest, got $(header Repr-Digest)"
+	[ "$(cbct upload "$work/theirs" --scan "$scan")" = "$scan" ] || fail "the same scan"
+	url_get_missing "$scan" '[]'
 }
 
 test_failures_are_told() {
