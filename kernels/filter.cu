@@ -174,12 +174,13 @@ static __device__ __forceinline__ float sample_at(const filter_job &job, const r
 	return extended_at(job, at, weight, behind ? 1 : 0, behind ? column - (job.columns - 1) : length - sample);
 }
 
-/* Blocks that a processor is to hold at once: registers limit it, and these many for a thread do not spill. */
+/*
+ * Blocks that a processor is to hold at once: registers limit it, and 64 for a thread do not spill. 0: the compiler
+ * chooses, 48 to 56 registers; asked for what these allow, it makes worse code of them.
+ */
 static constexpr int fused_blocks(int half, int pairs, bool extended)
 {
-	const int registers = extended || half >= 8 ? 64 : 56;
-
-	return 65536 / (registers * 32 * half * pairs);
+	return extended || half >= 8 ? 65536 / (64 * 32 * half * pairs) : 0;
 }
 
 /* Shared memory is padded by one value in 16, so that neither order of access meets in a bank. */
@@ -202,12 +203,12 @@ static __global__ void __launch_bounds__(32 * HALF * PAIRS, fused_blocks(HALF, P
 		place[0] = listed_place(job, min(first, rows - 1));
 		place[1] = listed_place(job, min(first + 1, rows - 1));
 	} else {
+		/* One pointer and a pitch for both rows: fewer registers. */
 		place[0] = place_of(job, (int)blockIdx.y, first);
-		place[1] = place_of(job, (int)blockIdx.y, first + 1);
+		place[1] = place[0];
+		place[1].row = first + 1;
 	}
-	/* From a sample of one row to that of the other. */
-	const ptrdiff_t from_step = EXTENDED ? place[1].from - place[0].from : job.pitch;
-	const ptrdiff_t to_step = EXTENDED ? place[1].to - place[0].to : job.wide_pitch;
+	float *to = EXTENDED ? place[1].to : place[0].to + job.wide_pitch;
 	weight[0] = weight_of(job, place[0].view, place[0].row);
 	weight[1] = weight_of(job, place[1].view, place[1].row);
 	if (EXTENDED) {
@@ -242,7 +243,7 @@ static __global__ void __launch_bounds__(32 * HALF * PAIRS, fused_blocks(HALF, P
 						even[j].x = place[0].from[column] * by_column *
 							    cosine_at(job, weight[0], column);
 					if (has[1])
-						even[j].y = place[0].from[from_step + column] * by_column *
+						even[j].y = place[0].from[job.pitch + column] * by_column *
 							    cosine_at(job, weight[1], column);
 				}
 				odd[j] = even[j];
@@ -313,7 +314,7 @@ static __global__ void __launch_bounds__(32 * HALF * PAIRS, fused_blocks(HALF, P
 			if (has[0])
 				place[0].to[column] = value.x;
 			if (has[1])
-				place[0].to[to_step + column] = value.y;
+				to[column] = value.y;
 		}
 	}
 }

@@ -251,10 +251,9 @@ enum { ROWS_APART = 4 };   /* rows of a thread that share columns, but no values
 enum thrift { THRIFT_NONE, THRIFT_HALVES, THRIFT_2_PARTS, THRIFT_3_PARTS, THRIFT_4_PARTS, THRIFT_LEAN };
 
 /*
- * The matched backprojection, by what its rays are like: no ray along z and the detector's columns along z, rows at
- * least a voxel or half a voxel apart; no ray along z; any.
+ * The matched backprojection, by what its rays are like: any; no ray along z; none, and the detector's columns along z.
  */
-enum matched { MATCHED_ANY, MATCHED_TILTED, MATCHED_UPRIGHT, MATCHED_UPRIGHT_FAR };
+enum matched { MATCHED_ANY, MATCHED_TILTED, MATCHED_UPRIGHT };
 
 /* Length of the filter's transform of a row: in one kernel, or by cuFFT where that is too short. */
 struct transform_length {

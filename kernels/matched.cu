@@ -14,22 +14,58 @@ static __global__ void __launch_bounds__(SIDE *SIDE, 3) backproject_matched(cons
 	matched_thread(job, blockIdx.x * SIDE + threadIdx.x, blockIdx.y * SIDE + threadIdx.y, blockIdx.z * MATCHED_RUN);
 }
 
-template <int WINDOW>
-static __global__ void __launch_bounds__(COLUMNS_THREADS, 3) backproject_upright(const matched_job job)
+/* Adds the rays of one axis in one view, `view` of those whose pencils were found, to the block's runs. */
+template <bool ENDS>
+static __device__ __forceinline__ void add_pencils(const matched_job &job, const device_view &g,
+						   const float *projection, int view, int axis, int tx, int ty,
+						   upright_tile &tile, float sum[COLUMN_RUN])
 {
+	const int slice = axis == ACROSS_X ? tx : ty, fast = axis == ACROSS_X ? ty : tx;
+	const int most = tile.most[view][axis], times = (most + PENCILS - 1) / PENCILS;
+	const int count = times > 0 ? (most + times - 1) / times : 0;
+	const tile_forms *forms = tile.forms[view][axis];
+	const pencil_range *ranges = tile.range[view][axis];
+	const bool both = tile.most[view][1 - axis] > 0;
+
+	for (int done = 0; done < most; done += count) {
+		find_profiles<ENDS>(job, g, axis, forms, ranges, both, done, count, projection, tile);
+		__syncthreads();
+		take_profiles(job, forms[slice], ranges[slice], slice, fast, done, count, tile, sum);
+		__syncthreads();
+	}
+}
+
+template <bool ENDS>
+static __device__ __forceinline__ void add_upright(const matched_job &job, int tx, int ty, upright_tile &tile,
+						   float sum[COLUMN_RUN])
+{
+	for (int first = 0; first < job.count; first += TILE_VIEWS) {
+		const int views = min(TILE_VIEWS, job.count - first);
+
+		__syncthreads(); /* nobody reads those of the views before */
+		find_pencils(job, first, views, tile);
+		__syncthreads();
+		for (int i = 0; i < 2 * views; i++)
+			add_pencils<ENDS>(job, job.geometry[job.views[first + i / 2]],
+					  job.from + (size_t)(first + i / 2) * job.slot, i / 2, i % 2, tx, ty, tile,
+					  sum);
+	}
+}
+
+static __global__ void __launch_bounds__(TILE *TILE, 4) backproject_upright(const matched_job job)
+{
+	__shared__ upright_tile tile;
 	const int *size = job.grid.size;
-	int x = blockIdx.x * COLUMNS_WIDE + threadIdx.x, y = blockIdx.y * COLUMNS_HIGH + threadIdx.y;
-	int z = blockIdx.z * COLUMN_RUN;
-	bool ends = z == 0 || z + COLUMN_RUN >= size[2];
+	/* A warp has eight runs by four: of either axis a few slices, and few runs of each. */
+	const int t = (int)(threadIdx.y * TILE + threadIdx.x);
+	const int tx = t % 8 + t / 32 % 2 * 8, ty = t / 8 % 4 + t / 64 * 4;
+	const int x = (int)blockIdx.x * TILE + tx, y = (int)blockIdx.y * TILE + ty, z = (int)blockIdx.z * COLUMN_RUN;
 	float sum[COLUMN_RUN] = {};
 
-	columns_walk(job, x, y, z,
-		     [&](const device_view &g, const float *projection, const run_place &place, float reach, bool) {
-			     if (ends)
-				     upright_gather<WINDOW, true>(job, g, projection, place, reach, sum);
-			     else
-				     upright_gather<WINDOW, false>(job, g, projection, place, reach, sum);
-		     });
+	if (z == 0 || z + COLUMN_RUN >= size[2])
+		add_upright<true>(job, tx, ty, tile, sum);
+	else
+		add_upright<false>(job, tx, ty, tile, sum);
 #pragma unroll
 	for (int n = 0; n < COLUMN_RUN; n++)
 		if (x < size[0] && y < size[1] && z + n < size[2])
@@ -115,11 +151,9 @@ static int launch_back(struct plan *plan, const matched_job &job, struct error *
 	cudaStream_t stream = plan->device->stream;
 
 	switch (plan->shape.matched) {
-	case MATCHED_UPRIGHT_FAR:
-		backproject_upright<2><<<blocks, threads, 0, stream>>>(job);
-		break;
 	case MATCHED_UPRIGHT:
-		backproject_upright<4><<<blocks, threads, 0, stream>>>(job);
+		blocks = dim3(divide_up(size[0], TILE), divide_up(size[1], TILE), divide_up(size[2], COLUMN_RUN));
+		backproject_upright<<<blocks, dim3(TILE, TILE), 0, stream>>>(job);
 		break;
 	case MATCHED_TILTED:
 		backproject_tilted<<<blocks, threads, 0, stream>>>(job);

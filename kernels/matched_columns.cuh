@@ -7,12 +7,13 @@
  * quotients of linear forms in the row r: beside the run's voxels at n(r) / d(r), and p(r) / d(r) voxels above the
  * first of them.
  *
- * Where the detector's columns lie along z, upright_gather: n and d are the same for all rows, so a pencil has one
- * weight across, and its rows cross the slice in equal steps. A voxel takes from the rows around its own place among
- * them.
+ * Where the detector's columns lie along z, upright: n and d are the same for all rows, so a pencil has one weight
+ * across, and its rows cross the slice in equal steps.
  *
- * Else tilted_gather: the rows that come near are known from two divisions, and each ray is met once. It gives to the
- * two voxels that it passes between, of which two sums go along with the rows.
+ * Else tilted: the rows that come near are known from two divisions.
+ *
+ * Either way each ray is met once, and gives to the two voxels that it passes between, of which two sums go along with
+ * the rows.
  *
  * A ray near the diagonal may belong to either axis, one near a side of the grid may cross a part of the slice only.
  */
@@ -73,6 +74,8 @@ static __device__ __forceinline__ bool is_of_axis(const device_view &g, int axis
 	       axis;
 }
 
+static const float SLOPE_LEAST = 1e-6f;
+
 /* Which of a run's rays need a closer look. */
 struct run_place {
 	matched_run run;
@@ -81,116 +84,259 @@ struct run_place {
 	float fast_centre, row_centre; /* of the run's first voxel, from the middle of the grid */
 };
 
-static const float SLOPE_LEAST = 1e-6f;
-
 /* ---- upright ---- */
 
-/* Rows around a voxel's place among them: those up to a voxel away, where they lie at least so many voxels apart. */
-template <int WINDOW>
-static __device__ __forceinline__ bool window_holds(float spacing)
+/*
+ * A block has a tile of runs. The weights along z are a pencil's alone, so what it gives to a slice's runs but for the
+ * weight across, its profile, is found once and taken by all runs beside it.
+ */
+enum { TILE = 16, PENCILS = 26, TILE_VIEWS = 4 }; /* runs to a side; pencils of a slice, and views, at a time */
+enum { PROFILE_ROWS = 4 };                        /* that a thread has on their way */
+
+/* The pencils, first .. last, that come near a slice of the tile. */
+struct pencil_range {
+	int first, last;
+};
+/* A view's linear forms for a slice of the tile, as run_forms of its first run; up and rise have a part by rows. */
+struct tile_forms {
+	float along[2], across[2], slope[2], up[3], rise[3];
+	float reach; /* beyond a voxel, of pencils that give to it; below 0: none of the axis comes near */
+};
+/* What a pencil's profile counts in the four runs from `first` on, from the tile's first one. */
+struct pencil_weights {
+	int first;
+	float weight[4];
+};
+
+struct upright_tile {
+	/* 9 and 26 keep lanes of one slice, and of eight, mostly in different banks. */
+	float2 profile[TILE][PENCILS][COLUMN_RUN / 2 + 1];
+	pencil_weights weights[TILE][PENCILS];
+	tile_forms forms[TILE_VIEWS][2][TILE];
+	pencil_range range[TILE_VIEWS][2][TILE];
+	int most[TILE_VIEWS][2]; /* pencils of a slice */
+};
+
+/* The run of a slice's first voxel in the block's tile. */
+static __device__ __forceinline__ matched_run tile_run(int axis, int slice)
 {
-	return spacing * (float)(WINDOW / 2) >= 1.0f;
+	const int x = (int)blockIdx.x * TILE, y = (int)blockIdx.y * TILE, z = (int)blockIdx.z * COLUMN_RUN;
+
+	return axis == ACROSS_X ? matched_run{axis, x + slice, y, z} : matched_run{axis, y + slice, x, z};
+}
+
+/* The column whose pencil crosses the slice at `fast`, from the middle of the detector. */
+static __device__ __forceinline__ float column_at(const tile_forms &f, float fast)
+{
+	return __fdividef(fmaf(fast, f.along[0], -f.across[0]), fmaf(-fast, f.along[1], f.across[1]));
+}
+
+/* The columns whose pencils cross the slice from one to another place. */
+static __device__ __forceinline__ pencil_range columns_between(const tile_forms &f, float from, float to, int columns)
+{
+	const float middle = 0.5f * (float)(columns - 1), margin = 1e-3f;
+	float a = column_at(f, from), b = column_at(f, to);
+
+	return {(int)ceilf(fmaxf(fminf(a, b) + middle - margin, 0.0f)),
+		(int)floorf(fminf(fmaxf(a, b) + middle + margin, (float)(columns - 1)))};
+}
+
+/* tile_forms.reach, for all voxels of a slice. */
+static __device__ __forceinline__ float tile_reach(const device_view &g, const slice_axes &axes, const matched_run &run)
+{
+	const float margin = 1e-3f, half = 0.5f * (float)(TILE - 1);
+	float across = fabsf((float)run.slice - 0.5f * (float)(axes.across - 1) - g.source[run.axis]);
+	float fast = fabsf((float)run.fast + half - 0.5f * (float)(axes.fast - 1) - g.source[1 - run.axis]);
+
+	if (run.slice >= axes.across || fast - half - 2 > across * (1 + margin) + margin)
+		return -1;
+	return 1 + margin + fminf((fast + half + 2) / fmaxf(across, margin), 1.0f);
+}
+
+/* Finds the pencils that come near in the next views, each thread those of one slice. */
+static __device__ __forceinline__ void find_pencils(const matched_job &job, int first, int count, upright_tile &tile)
+{
+	const int t = (int)(threadIdx.y * TILE + threadIdx.x), slice = t % TILE, axis = t / TILE % 2,
+		  view = t / TILE / 2;
+
+	if (view >= count)
+		return;
+	const device_view &g = job.geometry[job.views[first + view]];
+	const slice_axes axes = axes_of(job.grid, axis);
+	const matched_run run = tile_run(axis, slice);
+	const run_forms of = forms_of(g, axes, run);
+	tile_forms &forms = tile.forms[view][axis][slice];
+	pencil_range range = {0, -1};
+	int most;
+
+	for (int i = 0; i < 3; i++) {
+		if (i < 2) {
+			forms.along[i] = of.along[i];
+			forms.across[i] = of.across[i];
+			forms.slope[i] = of.slope[i];
+		}
+		forms.up[i] = of.up[i];
+		forms.rise[i] = of.rise[i];
+	}
+	forms.reach = tile_reach(g, axes, run);
+	if (forms.reach >= 0)
+		range = columns_between(forms, -forms.reach, (float)(TILE - 1) + forms.reach, job.columns);
+	if (range.last < range.first)
+		range = {0, -1};
+	tile.range[view][axis][slice] = range;
+	most = range.last - range.first + 1;
+	for (int lanes = TILE / 2; lanes > 0; lanes /= 2)
+		most = max(most, __shfl_xor_sync(0xffffu << (t & TILE), most, lanes));
+	if (slice == 0)
+		tile.most[view][axis] = most;
 }
 
 /*
- * Adds what the run takes from a pencil. values: row 0 of its column, zeros beyond the detector's rows; place: of the
- * run's first voxel among the rows, then `apart` from voxel to voxel; whole, part: the weight across of rays that cross
- * the slice as a whole, and with the part of it that the grid's sides leave. WINDOW / 2 rows to either side come in
- * question.
+ * B of matched.cuh for the four voxels beside a pencil at y, times `part`; run: of the tile's first voxel, which y is
+ * counted from.
  */
-template <int WINDOW, bool ENDS, bool HELD>
-static __device__ __forceinline__ void upright_add(const run_place &place_of, const pencil &p, int pitch, int rows,
-						   const float *values, float place, float apart, float spacing,
-						   float whole, float part, float from, float to, float inverse,
-						   float sum[COLUMN_RUN])
+static __device__ __forceinline__ pencil_weights weights_of(const slice_axes &axes, const matched_run &run, float y,
+							    float slope, float part)
 {
-	const float *at[WINDOW];
-	float steep = fabsf(spacing);
+	const float inverse = reciprocal(fmaxf(slope, SLOPE_LEAST));
+	pencil_weights w;
+	float right;
+	int first = split(y, right) - 1, j = run.fast + first;
+
+	w.first = first;
+	if (j >= 2 && j + 3 < axes.fast - 2) {
+		float a = __saturatef(fmaf(-right, inverse, 1.0f)), b = __saturatef(fmaf(right - 1.0f, inverse, 1.0f));
+		float sixth = slope * (1.0f / 6.0f), k0 = sixth * a * a * a, k1 = sixth * b * b * b;
+
+		w.weight[0] = part * k0;
+		w.weight[1] = part * (fmaf(-2.0f, k0, k1) + (1.0f - right));
+		w.weight[2] = part * (fmaf(-2.0f, k1, k0) + right);
+		w.weight[3] = part * k1;
+	} else {
+		for (int i = 0; i < 4; i++)
+			w.weight[i] = part * part_across(y + (float)run.fast, j + i, axes.fast, slope, inverse);
+	}
+	return w;
+}
+
+/*
+ * The profile of a pencil: what its rays give to the voxels of a run, but for its weights. Rays cross the slice in
+ * equal steps, `up` of the row r in the middle at 0; each is met once and gives to the two voxels that it passes
+ * between.
+ */
+template <bool ENDS>
+static __device__ __forceinline__ void
+find_profile(const matched_job &job, const tile_forms &f, const slice_axes &axes, const matched_run &run, int column,
+	     const float *values, bool of_axis, pencil_weights *ret_weights, float profile[COLUMN_RUN])
+{
+	const float c = (float)column - 0.5f * (float)(job.columns - 1), half = 0.5f * (float)(job.rows - 1);
+	const float margin = 1e-3f, inverse = reciprocal(fmaf(f.along[1], c, f.along[0]));
+	float y = fmaf(f.across[1], c, f.across[0]) * inverse, slope = fmaf(f.slope[1], c, f.slope[0]) * inverse;
+	float from = -0.5f, to = 0.5f, lower = 0, upper = 0;
+
+	clip(y + (float)run.fast - 0.5f * (float)(axes.fast - 1), slope, 0.5f * (float)axes.fast, from, to);
+	float part = of_axis ? fabsf(inverse) * (ENDS ? 1.0f : fmaxf(to - from, 0.0f)) : 0.0f;
+	float up = fmaf(f.up[1], c, f.up[0]) * inverse, apart = f.up[2] * inverse, rows_apart = reciprocal(apart);
+	float low = (-1.0f - up) * rows_apart, high = ((float)COLUMN_RUN - up) * rows_apart;
+	int first = (int)ceilf(fmaxf(fminf(low, high) - margin, -half) + half);
+	int last = (int)floorf(fminf(fmaxf(low, high) + margin, half) + half);
+	const bool upwards = apart > 0;
+	const ptrdiff_t step = upwards ? job.pitch : -(ptrdiff_t)job.pitch;
+	const float *row = values + (upwards ? first : last) * (ptrdiff_t)job.pitch + column;
+	float r = (float)(upwards ? first : last) - half, sign = upwards ? 1.0f : -1.0f;
+	int at = -2;
+
+	*ret_weights = weights_of(axes, run, y, fabsf(slope), part);
+	/* Rows beyond the last one give to no voxel of the run, those beyond the detector's are zeros. */
+	for (int n = first; n <= last; n += PROFILE_ROWS) {
+		float give[PROFILE_ROWS];
 
 #pragma unroll
-	for (int m = 0; m < WINDOW; m++)
-		at[m] = values + (m - (WINDOW / 2 - 1)) * pitch;
+		for (int m = 0; m < PROFILE_ROWS; m++, row += step)
+			give[m] = *row;
 #pragma unroll
-	for (int k = 0; k < COLUMN_RUN; k++) {
-		float pos = fmaf((float)k, apart, place), fraction, total = 0;
-		int row = split(pos, fraction);
-
-		if (HELD) {
-			/* Far beyond the rows only zeros are in reach: eight of them are there. */
-			row = min(max(row, -WINDOW / 2 - 1), rows + WINDOW / 2);
-			fraction = pos - (float)row;
-		}
-		int offset = row * pitch;
-#pragma unroll
-		for (int m = 0; m < WINDOW; m++) {
-			float away = fraction - (float)(m - (WINDOW / 2 - 1));
-			float weight = __saturatef(fmaf(-steep,
-							HELD             ? fabsf(away)
-							: m < WINDOW / 2 ? away
-									 : -away,
-							1.0f));
+		for (int m = 0; m < PROFILE_ROWS; m++, r += sign) {
+			float here = fmaf(r, apart, up), above;
 
 			if (ENDS) {
-				int voxel = place_of.run.row + k;
-				float above = -away * spacing;
+				float begin = from, end = to;
 
-				if ((voxel == 0 && above < 0) || (voxel == place_of.axes.rows - 1 && above > 0)) {
-					float r = (float)(row + m - (WINDOW / 2 - 1)) - 0.5f * (float)(rows - 1);
-					float begin = from, end = to;
-
-					clip(above + place_of.row_centre + (float)k, at_row(p.rise, r) * inverse,
-					     0.5f * (float)place_of.axes.rows, begin, end);
-					weight = part > 0 ? whole * fmaxf(end - begin, 0.0f) / part : 0;
-				}
+				clip(here + (float)run.row - 0.5f * (float)(axes.rows - 1),
+				     fmaf(f.rise[2], r, fmaf(f.rise[1], c, f.rise[0])) * inverse,
+				     0.5f * (float)axes.rows, begin, end);
+				give[m] *= fmaxf(end - begin, 0.0f);
+				here = fminf(fmaxf(here, (float)-run.row), (float)(axes.rows - 1 - run.row));
 			}
-			total = fmaf(weight, at[m][offset], total);
+			int now = split(here, above);
+			bool moved = now != at;
+
+			if (now > at + 1) {
+				if ((unsigned)(at + 1) < COLUMN_RUN)
+					profile[at + 1] = upper;
+				for (int k = max(at + 2, 0); k < min(now, (int)COLUMN_RUN); k++)
+					profile[k] = 0;
+				upper = 0;
+			}
+			if (moved && (unsigned)at < COLUMN_RUN)
+				profile[at] = lower;
+			lower = fmaf(-above, give[m], give[m]) + (moved ? upper : lower);
+			upper = fmaf(above, give[m], moved ? 0.0f : upper);
+			at = now;
 		}
-		sum[k] = fmaf(part, total, sum[k]);
+	}
+	if ((unsigned)at < COLUMN_RUN)
+		profile[at] = lower;
+	if ((unsigned)(at + 1) < COLUMN_RUN)
+		profile[at + 1] = upper;
+	for (int k = max(at + 2, 0); k < COLUMN_RUN; k++)
+		profile[k] = 0;
+}
+
+/* The profiles of `count` pencils of each slice, from the range's `done` on. */
+template <bool ENDS>
+static __device__ __forceinline__ void find_profiles(const matched_job &job, const device_view &g, int axis,
+						     const tile_forms *forms, const pencil_range *ranges, bool both,
+						     int done, int count, const float *projection, upright_tile &tile)
+{
+	const slice_axes axes = axes_of(job.grid, axis);
+	const float inverse = 1.0f / (float)count;
+
+	for (int i = (int)(threadIdx.y * TILE + threadIdx.x); i < TILE * count; i += TILE * TILE) {
+		int slice = (int)(((float)i + 0.5f) * inverse), pencil = i - slice * count;
+		int column = ranges[slice].first + done + pencil;
+		const float c = (float)column - 0.5f * (float)(job.columns - 1);
+
+		if (column <= ranges[slice].last)
+			find_profile<ENDS>(job, forms[slice], axes, tile_run(axis, slice), column, projection,
+					   !both || is_of_axis(g, axis, c, 0), &tile.weights[slice][pencil],
+					   &tile.profile[slice][pencil][0].x);
 	}
 }
 
-/* Adds the rays of one axis in one view to a run. */
-template <int WINDOW, bool ENDS>
-static __device__ __forceinline__ void upright_gather(const matched_job &job, const device_view &g,
-						      const float *projection, const run_place &place_of, float reach,
-						      float sum[COLUMN_RUN])
+/* Adds to the thread's run what it takes from the profiles. */
+static __device__ __forceinline__ void take_profiles(const matched_job &job, const tile_forms &forms,
+						     const pencil_range &range, int slice, int fast, int done,
+						     int count, const upright_tile &tile, float sum[COLUMN_RUN])
 {
-	const matched_run &run = place_of.run;
-	run_forms f = forms_of(g, place_of.axes, run);
-	/* Columns whose pencils cross the slice within reach of the voxels. */
-	float middle = 0.5f * (float)(job.columns - 1), margin = 1e-3f;
-	float a = (reach * f.along[0] - f.across[0]) / (f.across[1] - reach * f.along[1]);
-	float b = (-reach * f.along[0] - f.across[0]) / (f.across[1] + reach * f.along[1]);
-	int first = (int)ceilf(fmaxf(fminf(a, b) + middle - margin, 0.0f));
-	int last = (int)floorf(fminf(fmaxf(a, b) + middle + margin, (float)(job.columns - 1)));
+	const int start = range.first + done;
+	pencil_range mine = columns_between(forms, (float)fast - forms.reach, (float)fast + forms.reach, job.columns);
+	int first = max(mine.first, start), last = min(min(mine.last, range.last), start + count - 1);
 
 	for (int column = first; column <= last; column++) {
-		float c = (float)column - middle, from = -0.5f, to = 0.5f;
-		pencil p = pencil_of(f, c);
-		float inverse = 1.0f / p.along.value, y = p.across.value * inverse, slope = p.slope.value * inverse;
+		const pencil_weights &w = tile.weights[slice][column - start];
+		const float2 *profile = tile.profile[slice][column - start];
+		const int place = fast - w.first;
 
-		if (place_of.diagonal && !is_of_axis(g, run.axis, c, 0))
+		if ((unsigned)place >= 4)
 			continue;
-		clip(y + place_of.fast_centre, slope, 0.5f * (float)place_of.axes.fast, from, to);
-		float whole = fabsf(inverse) * part_across(y + (float)run.fast, run.fast, place_of.axes.fast,
-							   fabsf(slope), 1.0f / fmaxf(fabsf(slope), SLOPE_LEAST));
-		float part = whole * fmaxf(to - from, 0.0f);
+		const float weight = w.weight[place];
+#pragma unroll
+		for (int k = 0; k < COLUMN_RUN / 2; k++) {
+			float2 two = profile[k];
 
-		if (!(part > 0))
-			continue;
-		float spacing = p.up.change * inverse, apart = 1.0f / spacing;
-		float place = fmaf(-p.up.value * inverse, apart, 0.5f * (float)(job.rows - 1));
-		float end = fmaf((float)(COLUMN_RUN - 1), apart, place), low = fminf(place, end),
-		      high = fmaxf(place, end);
-
-		if (high < (float)(-WINDOW / 2) || low > (float)(job.rows - 1 + WINDOW / 2))
-			continue;
-		if (low >= 1.0f - WINDOW / 2 && high < (float)(job.rows + WINDOW / 2 - 1))
-			upright_add<WINDOW, ENDS, false>(place_of, p, job.pitch, job.rows, projection + column, place,
-							 apart, spacing, whole, part, from, to, inverse, sum);
-		else
-			upright_add<WINDOW, ENDS, true>(place_of, p, job.pitch, job.rows, projection + column, place,
-							apart, spacing, whole, part, from, to, inverse, sum);
+			sum[2 * k] = fmaf(weight, two.x, sum[2 * k]);
+			sum[2 * k + 1] = fmaf(weight, two.y, sum[2 * k + 1]);
+		}
 	}
 }
 

@@ -258,15 +258,9 @@ static bool is_before_source(const struct geometry *geometry, const struct grid 
 
 static enum matched choose_matched(const struct plan_options *options, bool z_rays)
 {
-	double least, most;
-	int sign;
-
 	if (z_rays || !is_before_source(options->geometry, options->grid))
 		return MATCHED_ANY;
-	if (!is_upright(options->geometry))
-		return MATCHED_TILTED;
-	row_spacing(options->geometry, options->grid, &least, &most, &sign);
-	return least >= 1.01 ? MATCHED_UPRIGHT_FAR : least >= 0.505 ? MATCHED_UPRIGHT : MATCHED_TILTED;
+	return is_upright(options->geometry) ? MATCHED_UPRIGHT : MATCHED_TILTED;
 }
 
 static void choose_rows(const struct plan_options *options, struct plan_shape *shape)
