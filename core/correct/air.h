@@ -3,8 +3,8 @@
 
 /*
  * The line integral of air in a view whose tube gives more or less than the flat says: both ends of nearly all rows
- * have the same small one, or one below 0, level over some columns. A body that is cut off has none such: 2 mm within the outline of
- * one of 300 mm it is 1 already. 0: air is 0, by a hundredth or so, or the ends are no air.
+ * have the same small one, or one below 0, level over some columns. A body that is cut off has none such: 2 mm within
+ * the outline of one of 300 mm it is 1 already. 0: air is 0, by a hundredth or so, or the ends are no air.
  *
  * view: line integrals [row][column], NAN where there is none; about 64 of the rows are looked at. edge: columns at an
  * end whose mean is taken, truncation_edge of the detector; the next ones are held against it, so that 4 * edge columns

@@ -40,8 +40,8 @@ __attribute__((constructor)) static void arm(void)
 	if (file < 0)
 		return;
 	mapped = ftruncate(file, sizeof(*live)) == 0
-			 ? mmap(NULL, sizeof(*live), PROT_READ | PROT_WRITE, MAP_SHARED, file, 0)
-			 : MAP_FAILED;
+		     ? mmap(NULL, sizeof(*live), PROT_READ | PROT_WRITE, MAP_SHARED, file, 0)
+		     : MAP_FAILED;
 	close(file);
 	if (mapped == MAP_FAILED)
 		return;
