@@ -3,10 +3,12 @@
 
 #include <errno.h>
 #include <fcntl.h>
+#include <stdbool.h>
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/stat.h>
 #include <unistd.h>
 
 #include "daemon/log.h"
@@ -15,6 +17,8 @@
 
 enum {
 	RECORD = 32,
+	KEY = 1 + ID_LENGTH, /* kind and id */
+	IDENTITY = 11,       /* of a directory, behind the key */
 	SUMMED = RECORD - 4,
 	KEPT_LEAST = 16384,
 	BYTES_MAX = 64 << 20,
@@ -25,21 +29,46 @@ struct deleted {
 	int file;
 	off_t end; /* where the next one goes */
 	int count;
-	char (*keys)[1 + ID_SIZE]; /* [count], sorted: kind and id */
+	uint8_t (*records)[RECORD]; /* [count], sorted by kind and id */
 };
 
 static int compare_keys(const void *a, const void *b)
 {
-	return memcmp(a, b, 1 + ID_LENGTH);
+	return memcmp(a, b, KEY);
 }
 
-static void record_make(uint8_t record[RECORD], enum deleted_kind kind, const char *id)
+static void put_little(uint8_t *to, int bytes, uint64_t value)
+{
+	for (int i = 0; i < bytes; i++)
+		to[i] = (uint8_t)(value >> 8 * i);
+}
+
+/* False, and an identity that no directory has, where there is none. */
+static bool identity_of(const char *directory, uint8_t ret_identity[IDENTITY])
+{
+	struct statx found;
+	uint8_t birth[12];
+
+	memset(ret_identity, 0xff, IDENTITY);
+	if (statx(AT_FDCWD, directory, AT_SYMLINK_NOFOLLOW, STATX_INO | STATX_BTIME, &found) != 0)
+		return false;
+	/* Inodes are used again; a file system that knows no times of birth says zeros. */
+	put_little(birth, 8, (uint64_t)found.stx_btime.tv_sec);
+	put_little(birth + 8, 4, found.stx_btime.tv_nsec);
+	put_little(ret_identity, 8, found.stx_ino);
+	put_little(ret_identity + 8, 3, checksum(0, birth, sizeof(birth)));
+	return true;
+}
+
+static void record_make(uint8_t record[RECORD], enum deleted_kind kind, const char *id,
+			const uint8_t identity[IDENTITY])
 {
 	uint32_t sum;
 
 	memset(record, 0, RECORD);
 	record[0] = (uint8_t)kind;
 	memcpy(record + 1, id, ID_LENGTH);
+	memcpy(record + KEY, identity, IDENTITY);
 	sum = checksum(0, record, SUMMED);
 	for (int i = 0; i < 4; i++)
 		record[SUMMED + i] = (uint8_t)(sum >> 8 * i);
@@ -51,7 +80,7 @@ static bool record_good(const uint8_t record[RECORD])
 	char id[ID_SIZE] = "";
 
 	memcpy(id, record + 1, ID_LENGTH);
-	record_make(again, record[0], id);
+	record_make(again, record[0], id, record + KEY);
 	return (record[0] == DELETED_SCAN || record[0] == DELETED_JOB) && memcmp(record, again, RECORD) == 0;
 }
 
@@ -63,12 +92,12 @@ static int take_records(struct deleted *deleted, const uint8_t *text, size_t len
 
 	while (records > 0 && memcmp(text + (records - 1) * RECORD, blank, RECORD) == 0)
 		records--;
-	deleted->keys = calloc(records + 1, sizeof(*deleted->keys));
-	if (deleted->keys == NULL)
+	deleted->records = calloc(records + 1, sizeof(*deleted->records));
+	if (deleted->records == NULL)
 		return error_set_errno(err, ENOMEM, "list of %zu deletions", records);
 	for (size_t i = 0; i < records; i++) {
 		if (record_good(text + i * RECORD))
-			memcpy(deleted->keys[deleted->count++], text + i * RECORD, 1 + ID_LENGTH);
+			memcpy(deleted->records[deleted->count++], text + i * RECORD, RECORD);
 		else
 			damaged++;
 	}
@@ -76,7 +105,7 @@ static int take_records(struct deleted *deleted, const uint8_t *text, size_t len
 		log_line(LEVEL_ERROR, "%zu of %zu records in \"deleted\" are damaged and passed over", damaged,
 			 records);
 	deleted->end = (off_t)(records * RECORD);
-	qsort(deleted->keys, (size_t)deleted->count, sizeof(*deleted->keys), compare_keys);
+	qsort(deleted->records, (size_t)deleted->count, sizeof(*deleted->records), compare_keys);
 	return 0;
 }
 
@@ -140,24 +169,46 @@ void deleted_free(struct deleted *deleted)
 		return;
 	if (deleted->file >= 0)
 		close(deleted->file);
-	free(deleted->keys);
+	free(deleted->records);
 	free(deleted);
 }
 
-bool deleted_has(const struct deleted *deleted, enum deleted_kind kind, const char *id)
+enum deletion deleted_find(const struct deleted *deleted, enum deleted_kind kind, const char *id, const char *directory)
 {
-	char key[1 + ID_SIZE] = "";
+	static const uint8_t unknown[IDENTITY];
+	uint8_t key[KEY], identity[IDENTITY];
+	enum deletion found = DELETION_NONE;
 
-	key[0] = (char)kind;
+	key[0] = (uint8_t)kind;
 	memcpy(key + 1, id, ID_LENGTH);
-	return bsearch(key, deleted->keys, (size_t)deleted->count, sizeof(*deleted->keys), compare_keys) != NULL;
+	if (deleted->count == 0 ||
+	    bsearch(key, deleted->records, (size_t)deleted->count, sizeof(*deleted->records), compare_keys) == NULL)
+		return DELETION_NONE;
+	if (!identity_of(directory, identity))
+		return DELETION_SAME;
+	/* An id that came back may have been deleted again. */
+	for (int i = 0; i < deleted->count; i++) {
+		const uint8_t *was = deleted->records[i] + KEY;
+
+		if (compare_keys(key, deleted->records[i]) != 0)
+			continue;
+		if (memcmp(was, identity, IDENTITY) == 0)
+			return DELETION_SAME;
+		if (memcmp(was, unknown, IDENTITY) == 0)
+			found = DELETION_UNKNOWN;
+		else if (found == DELETION_NONE)
+			found = DELETION_OTHER;
+	}
+	return found;
 }
 
-int deleted_add(struct deleted *deleted, enum deleted_kind kind, const char *id, struct error *err)
+int deleted_add(struct deleted *deleted, enum deleted_kind kind, const char *id, const char *directory,
+		struct error *err)
 {
-	uint8_t record[RECORD];
+	uint8_t record[RECORD], identity[IDENTITY];
 
-	record_make(record, kind, id);
+	identity_of(directory, identity);
+	record_make(record, kind, id, identity);
 	if (pwrite(deleted->file, record, sizeof(record), deleted->end) != (ssize_t)sizeof(record))
 		return error_set_errno(err, errno, "the deletion of %s cannot be recorded", id);
 	if (fdatasync(deleted->file) != 0)

@@ -1,6 +1,7 @@
 /*
  * At the start: the catalogue is held against the directories of scans and jobs. What clients have deleted goes from
- * both; otherwise each directory has what the catalogue needs (store/record.h, proto/sums.h), so
+ * both (store/deleted.h), but a directory that was put back after that is one like any other; otherwise each directory
+ * has what the catalogue needs (store/record.h, proto/sums.h), so
  *
  *   row            record.json               what is done
  *   as the record  as the row                nothing: one look at its time of modification
@@ -71,9 +72,12 @@ static int add_known(void *context, const char *id, long long stamp, struct erro
 	return 0;
 }
 
-static bool was_deleted(const struct reconciliation *r, const char *id)
+static enum deletion deletion_of(const struct reconciliation *r, const char *id)
 {
-	return deleted_has(r->store->deleted, r->kind == RECORD_SCAN ? DELETED_SCAN : DELETED_JOB, id);
+	char path[1024];
+
+	record_directory(r->store, r->kind, id, path);
+	return deleted_find(r->store->deleted, r->kind == RECORD_SCAN ? DELETED_SCAN : DELETED_JOB, id, path);
 }
 
 /* A crash came between a deletion and its row, or the catalogue is older than the deletion. */
@@ -82,7 +86,9 @@ static int drop_deleted(struct reconciliation *r, struct error *err)
 	int code = 0;
 
 	for (int i = 0; i < r->count && code == 0; i++) {
-		if (!was_deleted(r, r->rows[i].id))
+		const enum deletion deletion = deletion_of(r, r->rows[i].id);
+
+		if (deletion == DELETION_NONE || deletion == DELETION_OTHER)
 			continue;
 		log_line(LEVEL_INFO, "%s %s was deleted: its row is removed", record_words[r->kind].kind,
 			 r->rows[i].id);
@@ -175,8 +181,9 @@ static int take_in(struct reconciliation *r, const char *id, const char *path, s
 	int code = record_read(path, r->kind, id, &record, &why);
 
 	if (code == 0) {
-		log_line(LEVEL_WARNING, "%s %s is not in the catalogue: it is added again from its directory",
-			 record_words[r->kind].kind, id);
+		log_line(LEVEL_WARNING, "%s %s is not in the catalogue: it is added again from its directory%s",
+			 record_words[r->kind].kind, id,
+			 deletion_of(r, id) == DELETION_OTHER ? ", which was put back after it was deleted" : "");
 		code = apply(r, record, &why);
 		cJSON_Delete(record);
 		if (code != 0 && code != ERR_INVALID)
@@ -199,15 +206,19 @@ static int look_at_directory(void *context, const char *name, struct error *err)
 {
 	struct reconciliation *r = context;
 	struct known key, *known;
+	enum deletion deletion;
 	char path[1024];
 
 	if (!id_valid(name))
 		return 0; /* not ours */
 	record_directory(r->store, r->kind, name, path);
-	if (was_deleted(r, name)) {
+	deletion = deletion_of(r, name);
+	if (deletion == DELETION_SAME) {
 		log_line(LEVEL_INFO, "%s %s was deleted: its files are removed", record_words[r->kind].kind, name);
 		return directory_remove(path, err);
 	}
+	if (deletion == DELETION_UNKNOWN)
+		return set_aside(r, name, "it was deleted, and may have been put back since", err);
 	memcpy(key.id, name, sizeof(key.id));
 	known = r->count == 0 ? NULL : bsearch(&key, r->rows, (size_t)r->count, sizeof(key), compare_known);
 	if (known == NULL)

@@ -15,6 +15,7 @@
 #include "daemon/log.h"
 #include "daemon/store/deleted.h"
 #include "daemon/store/quarantine.h"
+#include "daemon/store/record.h"
 #include "proto/clock.h"
 
 /* ---- opening ---- */
@@ -309,7 +310,11 @@ int store_end(struct store *store, int code, struct error *err)
 
 int store_note_deletion(struct store *store, int kind, const char *id, struct error *err)
 {
-	int code = deleted_add(store->deleted, (enum deleted_kind)kind, id, err);
+	char directory[1024];
+	int code;
+
+	record_directory(store, kind == DELETED_SCAN ? RECORD_SCAN : RECORD_JOB, id, directory);
+	code = deleted_add(store->deleted, (enum deleted_kind)kind, id, directory, err);
 
 	if (code != 0)
 		store_distrust(store, err);

@@ -96,6 +96,53 @@ test_an_older_catalogue_loses_nothing_and_brings_nothing_back() {
 	stop_daemon
 }
 
+# Somebody deletes by mistake and puts the directories back from a backup: they are there again, also after a restart,
+# and can be deleted like any others. What an earlier version has deleted is kept aside.
+test_what_is_put_back_after_a_deletion_is_kept() {
+	local round
+	made
+	known before
+	for round in 1 2; do
+		cp -r "$state/scans/$scan" "$work/scan.copy"
+		cp -r "$state/jobs/$job" "$work/job.copy"
+		req DELETE "/v1/jobs/$job"
+		expect_status 204
+		req DELETE "/v1/scans/$scan"
+		expect_status 204
+		stop_daemon KILL
+		mv "$work/scan.copy" "$state/scans/$scan"
+		mv "$work/job.copy" "$state/jobs/$job"
+		start_daemon
+		known_as_before
+		stop_daemon
+		start_daemon # the second time they are nothing new
+		known_as_before
+		[ "$(grep -c "put back after it was deleted" "$work/cbctd.err")" = $((2 * round)) ] || fail "two lines each time: $(grep "put back" "$work/cbctd.err")"
+	done
+	cp -r "$state/scans/$scan" "$work/scan.copy"
+	req DELETE "/v1/jobs/$job"
+	req DELETE "/v1/scans/$scan"
+	expect_status 204
+	stop_daemon
+	mv "$work/scan.copy" "$state/scans/$scan"
+	python3 - "$state/deleted" <<-'END' # as earlier versions wrote them
+		import struct, sys, zlib
+		data = bytearray(open(sys.argv[1], "rb").read())
+		for at in range(0, len(data), 32):
+		    if data[at]:
+		        data[at + 17 : at + 28] = bytes(11)
+		        data[at + 28 : at + 32] = struct.pack("<I", zlib.crc32(data[at : at + 28]))
+		open(sys.argv[1], "wb").write(data)
+	END
+	start_daemon
+	req GET "/v1/scans/$scan"
+	expect_problem 404
+	req GET /v1/quarantine
+	expect_json ".entries | map(select(.from == \"scans/$scan\" and (.why | test(\"deleted\")))) | length == 1"
+	[ -s "$state/quarantine/$(json ".entries[] | select(.from == \"scans/$scan\").name")/projections.raw" ] || fail "the projections, kept"
+	stop_daemon
+}
+
 test_a_damaged_catalogue_is_set_aside_and_made_again() {
 	made
 	stop_daemon

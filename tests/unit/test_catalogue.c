@@ -9,6 +9,7 @@
 #include <unistd.h>
 
 #include "daemon/store/checksum_vfs.h"
+#include "daemon/store/deleted.h"
 #include "daemon/store/quarantine.h"
 #include "proto/scan_directory.h"
 #include "tests/unit/state.h"
@@ -269,7 +270,8 @@ START_TEST(what_was_deleted_does_not_come_back)
 	struct stored_scan *scan = state_scan(&state, 3, false);
 	struct error err = {0};
 	struct job *job = NULL;
-	char other[ID_SIZE], *before;
+	struct deleted *deleted = NULL;
+	char other[ID_SIZE], there[600], *before;
 	bool removed;
 
 	memcpy(other, stored_scan_id(scan), sizeof(other));
@@ -288,8 +290,12 @@ START_TEST(what_was_deleted_does_not_come_back)
 	before = picture();
 	state_close(&state);
 	/* A crash before the files went, and an older catalogue. */
-	ck_assert_int_eq(mkdir(state_path(&state, "scans/%s", other), 0700), 0);
+	snprintf(there, sizeof(there), "%s", state_path(&state, "scans/%s", other));
+	ck_assert_int_eq(mkdir(there, 0700), 0);
 	path_fill(state_path(&state, "scans/%s/projections.raw", other));
+	ck_assert_int_eq(deleted_open(state_path(&state, "."), &deleted, &err), 0);
+	ck_assert_int_eq(deleted_add(deleted, DELETED_SCAN, other, there, &err), 0);
+	deleted_free(deleted);
 	copy_file("older", "catalogue.sqlite");
 	state_reopen(&state);
 	same_picture(before);
