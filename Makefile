@@ -167,7 +167,7 @@ $(BUILD)/cbctd-held: $(call objects,$(daemon_sources) tests/http/held.c tests/lo
 
 gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench
 # Every program that a test or a benchmark runs, so that none stops compiling unseen.
-test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held manual faults.so every.so live_bytes.so simulated-nvml/libnvidia-ml.so.1 cpu-bench calibrate-bench denoise presets watchers slices acquire paper-project) \
+test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held manual faults.so every.so live_bytes.so simulated-nvml/libnvidia-ml.so.1 cpu-bench calibrate-bench denoise presets stopping watchers slices acquire paper-project) \
                $(if $(cuda_objects),$(gpu_programs) $(BUILD)/gpu_ceilings $(BUILD)/cbct-worker-faulty,$(call objects,$(wildcard tests/bench/gpu_*.c)))
 
 # Faults of the disk, loaded into the programs by tests.
@@ -199,6 +199,10 @@ $(BUILD)/denoise: $(call objects,tests/bench/denoise.c tests/unit/anatomy.c) $(c
 
 # What each preset of a job is worth on anatomies.
 $(BUILD)/presets: $(call objects,tests/bench/presets.c tests/unit/anatomy.c) $(library)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(LIBM)
+
+# How far from the best iteration automatic stops are.
+$(BUILD)/stopping: $(call objects,tests/bench/stopping.c tests/unit/anatomy.c) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(LIBM)
 
 $(BUILD)/calibrate-bench: $(call objects,tests/bench/calibrate.c tests/unit/arm.c) $(library)
@@ -270,6 +274,10 @@ bench-denoise: setup ## the default TV on anatomies beside the best of a sweep, 
 bench-presets: setup ## time and error of each preset on a head, a wrist and an abdomen, on standard output
 	@$(MAKE) --no-print-directory -j$$(nproc) $(BUILD)/presets >&2
 	@$(BUILD)/presets
+
+bench-stopping: setup ## how far from the best iteration "iterations": "auto" ends, on standard output
+	@$(MAKE) --no-print-directory -j$$(nproc) $(BUILD)/stopping >&2
+	@$(BUILD)/stopping
 
 bench-calibrate: setup ## a calibration of 400 views of 1240 x 960 pixels, on standard output
 	@$(MAKE) --no-print-directory -j$$(nproc) $(BUILD)/calibrate-bench >&2
@@ -415,6 +423,6 @@ clean: ## removes build/
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z_.-]+:.*## /{printf "  make %-21s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-.PHONY: all test-programs again setup demo check soak fuzz fuzzers paper bench bench-calibrate bench-denoise bench-presets check-gpu bench-gpu asan tsan lint format rooms third-party compile_commands.json install deb container sbom reproducible clean help
+.PHONY: all test-programs again setup demo check soak fuzz fuzzers paper bench bench-calibrate bench-denoise bench-presets bench-stopping check-gpu bench-gpu asan tsan lint format rooms third-party compile_commands.json install deb container sbom reproducible clean help
 .SECONDARY:
 -include $(shell find $(BUILD) -path $(BUILD)/test -prune -o -type f -name '*.d' -print 2>/dev/null)

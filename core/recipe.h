@@ -30,6 +30,8 @@ struct recipe {
 	const struct algorithm *algorithm; /* of algorithms[], core/recon/algorithm.h; NULL: no iterations */
 	struct {
 		int iterations;
+		bool automatic;                    /* they end by themselves (core/recon/stopping.h) ... */
+		int most;                          /* ... behind so many at the latest */
 		bool nonnegative;                  /* no voxel below 0 */
 		double stop_residual, stop_change; /* 0: never */
 	} iterate;                                 /* whatever the algorithm */
@@ -55,6 +57,12 @@ struct recipe {
 	int emits;
 	bool reference_precision;
 };
+
+/* Iterations that the recipe's algorithm has at most. */
+static inline int recipe_iterations(const struct recipe *recipe)
+{
+	return recipe->iterate.automatic ? recipe->iterate.most : recipe->iterate.iterations;
+}
 
 enum { ITERATIONS_MAX = 100000, GRID_DEFAULT_MOST = 512, METAL_HU_LEAST = 500, METAL_HU_MOST = 1000000 };
 /* Voxels nearer to metal than this are an estimate: most of their rays lie in the metal's shadows. */

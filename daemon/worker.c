@@ -220,6 +220,13 @@ static void on_denoising(void *context, double noise_hu, double alpha)
 	report(context, &message);
 }
 
+static void on_stopped(void *context, const struct recon_stop *stop)
+{
+	struct message message = {.kind = MESSAGE_STOPPED, .stop = *stop};
+
+	report(context, &message);
+}
+
 static void on_warning(void *context, const char *code, const char *detail)
 {
 	struct message message = {.kind = MESSAGE_WARNING};
@@ -345,6 +352,7 @@ static int run_job(struct worker *worker, const struct message *start, struct er
 							     .progress = on_progress,
 							     .row = on_row,
 							     .denoising = on_denoising,
+							     .stopped = on_stopped,
 							     .warning = on_warning},
 						   .on_volume = on_volume,
 						   .on_settled = on_settled,

@@ -27,6 +27,7 @@ enum field_type {
 	FIELD_SIZE,
 	FIELD_BOOL,
 	FIELD_STAGE,
+	FIELD_RULE,
 	FIELD_BITS,
 	FIELD_GRID,
 	FIELD_REQUEST
@@ -107,6 +108,13 @@ static const struct field noise_fields[] = {FIELD("job", FIELD_STRING, job),
 					    FIELD("noise_hu", FIELD_NUMBER, noise_hu),
 					    FIELD("alpha", FIELD_NUMBER, alpha),
 					    {0}};
+static const struct field stopped_fields[] = {FIELD("job", FIELD_STRING, job),
+					      FIELD("rule", FIELD_RULE, stop.rule),
+					      FIELD("iteration", FIELD_INT, stop.iteration),
+					      FIELD("residual", FIELD_NUMBER, stop.residual),
+					      FIELD("change", FIELD_NUMBER, stop.change),
+					      FIELD("noise", FIELD_NUMBER, stop.noise),
+					      {0}};
 static const struct field warning_fields[] = {
     FIELD("job", FIELD_STRING, job), FIELD("code", FIELD_STRING, code_name), FIELD("detail", FIELD_STRING, text), {0}};
 static const struct field ended_fields[] = {FIELD("job", FIELD_STRING, job),
@@ -134,6 +142,7 @@ static const struct {
     [MESSAGE_SETTLED] = {"settled", settled_fields},
     [MESSAGE_CHECKPOINT] = {"checkpoint", checkpoint_fields},
     [MESSAGE_NOISE] = {"noise", noise_fields},
+    [MESSAGE_STOPPED] = {"stopped", stopped_fields},
     [MESSAGE_WARNING] = {"warning", warning_fields},
     [MESSAGE_ENDED] = {"ended", ended_fields},
 };
@@ -192,6 +201,8 @@ static cJSON *field_json(const struct field *field, const struct message *messag
 		return cJSON_CreateBool(*(const bool *)at);
 	case FIELD_STAGE:
 		return cJSON_CreateString(stage_names[*(const enum stage *)at]);
+	case FIELD_RULE:
+		return cJSON_CreateString(stop_rule_names[*(const enum stop_rule *)at]);
 	case FIELD_BITS:
 		return bytes_json(at, field->size);
 	case FIELD_GRID:
@@ -368,6 +379,10 @@ static void read_field(struct json_reader *reader, const struct field *field, st
 	case FIELD_STAGE:
 		json_choice(reader, field->name, true, stage_names, STAGE_COUNT, &choice);
 		*(enum stage *)at = (enum stage)choice;
+		break;
+	case FIELD_RULE:
+		json_choice(reader, field->name, true, stop_rule_names, STOP_RULE_COUNT, &choice);
+		*(enum stop_rule *)at = (enum stop_rule)choice;
 		break;
 	case FIELD_BOOL:
 		json_bool(reader, field->name, true, at);

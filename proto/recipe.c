@@ -427,7 +427,7 @@ static bool add_rows(cJSON *list, const struct parameter *parameter, struct reci
 
 		recipe_set_algorithm(recipe, algorithms[i]);
 		recipe_object(parameter, algorithms[i], object);
-		if (!own || parameter_counts(parameter, recipe))
+		if (algorithm_has(algorithms[i], parameter))
 			added = add_row(list, parameter, object, recipe);
 	}
 	return added;

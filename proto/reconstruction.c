@@ -157,6 +157,14 @@ static void run_denoising(void *context, double noise_hu, double alpha)
 		hooks->recon.denoising(hooks->recon.context, noise_hu, alpha);
 }
 
+static void run_stopped(void *context, const struct recon_stop *stop)
+{
+	const struct reconstruction_hooks *hooks = ((struct run *)context)->hooks;
+
+	if (hooks->recon.stopped != NULL)
+		hooks->recon.stopped(hooks->recon.context, stop);
+}
+
 static void run_warning(void *context, const char *code, const char *detail)
 {
 	const struct reconstruction_hooks *hooks = ((struct run *)context)->hooks;
@@ -201,7 +209,7 @@ static bool ends_with_volume(const struct recipe *recipe, enum stage stage, int 
 	if (stage == STAGE_TV && iteration == 0)
 		return emits(recipe, EMIT_FDK_TV) || recipe->algorithm == NULL;
 	return recipe->algorithm != NULL && stage == recipe->algorithm->stage &&
-	       (iteration == recipe->iterate.iterations || emits(recipe, iteration));
+	       (iteration == recipe_iterations(recipe) || emits(recipe, iteration));
 }
 
 static int open_saver(struct run *run, struct error *err)
@@ -585,6 +593,7 @@ int reconstruction_open(const struct backend *backend, struct device *device,
 						     .row = run_row,
 						     .keep = run_keep,
 						     .denoising = run_denoising,
+						     .stopped = run_stopped,
 						     .warning = run_warning};
 	reconstruction->backend = backend;
 	reconstruction->device = device;

@@ -324,16 +324,6 @@ static int choose_algorithm(const struct recipe_options *options, const cJSON *d
 	return 0;
 }
 
-/* True if the parameter is one of that algorithm's, or none of an algorithm at all. */
-static bool fits_algorithm(const struct parameter *parameter, const struct algorithm *algorithm)
-{
-	struct recipe recipe;
-
-	recipe_defaults(&recipe);
-	recipe_set_algorithm(&recipe, algorithm);
-	return strcmp(parameter->object, OBJECT_ALGORITHM) != 0 || parameter_counts(parameter, &recipe);
-}
-
 static int put_option(const struct recipe_options *options, int i, const struct algorithm *algorithm, cJSON *document,
 		      struct error *err)
 {
@@ -342,7 +332,7 @@ static int put_option(const struct recipe_options *options, int i, const struct 
 	cJSON *value = NULL;
 	int code = 0;
 
-	if (!fits_algorithm(entry->parameter, algorithm))
+	if (!algorithm_has(algorithm, entry->parameter))
 		return error_set(err, ERR_USAGE, "--%s is no option of --%s", entry->name, algorithm->name);
 	if (options->no_fdk && strcmp(entry->parameter->object, "/fdk") == 0)
 		return error_set(err, ERR_USAGE, "--no-fdk together with --%s, an option of the FDK", entry->name);

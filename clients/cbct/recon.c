@@ -65,6 +65,15 @@ static void on_row(void *context, const struct history_row *row)
 	display->residual = row->residual;
 }
 
+static void on_stopped(void *context, const struct recon_stop *stop)
+{
+	struct display *display = context;
+
+	progress_clear(display->progress);
+	fprintf(stderr, "%d iterations: ended by %s (residual %.4g, noise %.4g, change %.4g)\n", stop->iteration,
+		stop_rule_names[stop->rule], stop->residual, stop->noise, stop->change);
+}
+
 static void on_warning(void *context, const char *code, const char *detail)
 {
 	struct display *display = context;
@@ -169,10 +178,14 @@ static int pipeline_run(const struct recon_options *options, const struct job_re
 	const struct backend *backend = backend_find(options->backend);
 	const char *output = options->output != NULL ? options->output : options->directory;
 	const struct device_options device_options = {.threads = (int)options->threads};
-	struct display display = {.iterations = recipe->algorithm != NULL ? recipe->iterate.iterations : 0,
+	struct display display = {.iterations = recipe->algorithm != NULL ? recipe_iterations(recipe) : 0,
 				  .residual = -1};
 	const struct reconstruction_hooks hooks = {
-	    .recon = {.context = &display, .progress = on_progress, .row = on_row, .warning = on_warning},
+	    .recon = {.context = &display,
+		      .progress = on_progress,
+		      .row = on_row,
+		      .stopped = on_stopped,
+		      .warning = on_warning},
 	    .on_volume = on_volume,
 	};
 	const struct reconstruction_options run = {.scan_directory = options->directory,

@@ -38,6 +38,19 @@ struct view {
 	atomic_bool failed;
 };
 
+/* Whether the program says when the job's iterations end. */
+static bool is_automatic(const cJSON *job)
+{
+	const cJSON *stage;
+
+	cJSON_ArrayForEach(stage, job)
+	{
+		if (cJSON_IsObject(stage) && strcmp(member_text(stage, "iterations", ""), "auto") == 0)
+			return true;
+	}
+	return false;
+}
+
 static void show(struct view *view, const cJSON *job)
 {
 	const cJSON *history = cJSON_GetObjectItemCaseSensitive(job, "history");
@@ -65,8 +78,8 @@ static void show(struct view *view, const cJSON *job)
 		used += snprintf(text + used, sizeof(text) - (size_t)used, ", %.10g of %.10g projections",
 				 member_number(views, "received", 0), member_number(views, "of", 0));
 	if (iterations > 0)
-		used += snprintf(text + used, sizeof(text) - (size_t)used, "  iteration %.10g of %.10g",
-				 member_number(job, "iteration", 0), iterations);
+		used += snprintf(text + used, sizeof(text) - (size_t)used, "  iteration %.10g of %s%.10g",
+				 member_number(job, "iteration", 0), is_automatic(job) ? "at most " : "", iterations);
 	if (rows > 0)
 		snprintf(text + used, sizeof(text) - (size_t)used, "  residual %.4g",
 			 member_number(cJSON_GetArrayItem(history, rows - 1), "residual", 0));

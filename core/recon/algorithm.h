@@ -31,6 +31,14 @@ struct problem {
 	bool momentum;                         /* of SART, see core/recon/sart.c */
 };
 
+/* When automatic iterations end (core/recon/stopping.h). */
+struct stop_limits {
+	/* The volume has changed by less than `change`, and so much of the projections' relative noise, of its norm. */
+	double change, change_of_noise;
+	double fall; /* the residual has fallen by less than this share of it; 0: it does not count */
+	int least;   /* iterations at least */
+};
+
 struct algorithm {
 	const char *name;         /* the recipe's member, the stage of its volumes: "sart" */
 	const char *summary;      /* for documentation */
@@ -44,6 +52,7 @@ struct algorithm {
 	double updates; /* of SART, that take up as much noise as one iteration; 0: as many as there are subsets */
 	/* Iterations after which a start from zero has its least error on anatomies; fewer are told. 0: never told. */
 	int from_zero;
+	struct stop_limits stops[2], momentum_stops[2]; /* without TV, and with it */
 	bool clips_last; /* zero is enforced by the loop, behind TV, and not by `iterate` */
 	double work;     /* of an iteration, in FDKs of the whole scan: for the progress bar */
 

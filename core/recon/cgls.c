@@ -288,6 +288,7 @@ const struct algorithm algorithm_cgls = {
     .stacks = 3,
     .updates = 2,
     .from_zero = 12,
+    .stops = {{.fall = .004, .least = 3}, {.change = .003, .least = 3}},
     .work = 4,
     .open = cgls_open,
     .close = cgls_close,

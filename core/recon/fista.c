@@ -162,6 +162,8 @@ const struct algorithm algorithm_fista = {
     .stacks = 2,
     .updates = 1,
     .from_zero = 30,
+    /* The change falls, grows while momentum gathers, and falls for good. */
+    .stops = {{.change = .0031, .least = 20}, {.change = .0031, .least = 20}},
     .work = 4,
     .clips_last = true,
     .open = fista_open,

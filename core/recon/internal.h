@@ -8,6 +8,7 @@
 #include "core/recon/alternation.h"
 #include "core/recon/ends.h"
 #include "core/recon/rim.h"
+#include "core/recon/stopping.h"
 #include "core/warning.h"
 
 /* Declarations that recon.c (life, views), run.c (the run) and memory.c (the memory it takes) share. */
@@ -55,7 +56,9 @@ struct recon {
 	double settled;           /* iterations after which relaxation falls; INFINITY: never */
 	bool moved;               /* the iterate is not the one that the algorithm left */
 	struct volume_norms norms;
+	struct stopping stopping;     /* of automatic iterations */
 	double work_done, work_total; /* in FDKs of the whole scan */
+	double fraction;              /* of the work, as it was told last: it does not fall */
 };
 
 /*
@@ -67,6 +70,17 @@ static const double WORK_LOAD = 0.2, WORK_FDK = 1, WORK_TV = 0.2;
 static inline double iteration_work(const struct recipe *recipe)
 {
 	return recipe->algorithm->work + (recipe->tv.on ? WORK_TV : 0);
+}
+
+/* Iterations to come behind `iteration`: of automatic ones as many as most runs have. */
+static inline int iterations_left(const struct recipe *recipe, int iteration)
+{
+	const int most = recipe_iterations(recipe) - iteration;
+	const struct stop_limits limits = stopping_limits(recipe, false);
+	const int usual = limits.least > STOPPING_TYPICAL ? limits.least : STOPPING_TYPICAL;
+	const int typical = iteration < usual ? usual - iteration : 1;
+
+	return recipe->iterate.automatic && typical < most ? typical : most;
 }
 
 /* A resumed run starts from an iterate and makes no FDK volume. */

@@ -29,6 +29,10 @@ static bool iterates(const void *recipe)
 {
 	return ((const struct recipe *)recipe)->algorithm != NULL;
 }
+static bool stops_itself(const void *recipe)
+{
+	return iterates(recipe) && ((const struct recipe *)recipe)->iterate.automatic;
+}
 static bool uses_subsets(const void *recipe)
 {
 	return iterates(recipe) && ((const struct recipe *)recipe)->algorithm->subsets;
@@ -67,7 +71,10 @@ const struct parameter recipe_parameters[] = {
     {"/fdk", "truncation", PARAMETER_SWITCH, AT(fdk.extend), NAMES(truncation_names), .preset = 1, .counts = runs_fdk,
      .help = "Whether rows that the detector cuts off are extended before they are filtered."},
     {OBJECT_ALGORITHM, "iterations", PARAMETER_INTEGER, AT(iterate.iterations), RANGE(1, ITERATIONS_MAX), .preset = 10,
-     .counts = iterates, .help = "Iterations of the algorithm."},
+     .word = "auto", .word_offset = offsetof(struct recipe, iterate.automatic), .counts = iterates,
+     .help = "Iterations of the algorithm; auto ends them by the noise, the residual and the change."},
+    {OBJECT_ALGORITHM, "max_iterations", PARAMETER_INTEGER, AT(iterate.most), RANGE(1, ITERATIONS_MAX), .preset = 30,
+     .counts = stops_itself, .help = "Most iterations where they are auto."},
     /* Each update is a projection for 1, a reflection for 2, and grows beyond that. */
     {OBJECT_ALGORITHM, "relaxation", PARAMETER_NUMBER, AT(sart.relaxation), RANGE(1e-6, 2), .preset = 1,
      .counts = uses_subsets, .help = "Factor of each update."},
@@ -114,6 +121,16 @@ const struct parameter recipe_parameters[] = {
      .help = "Attenuation of water, which Hounsfield units and the default gray level go by."},
 };
 const int recipe_parameter_count = sizeof(recipe_parameters) / sizeof(recipe_parameters[0]);
+
+bool algorithm_has(const struct algorithm *algorithm, const struct parameter *parameter)
+{
+	struct recipe recipe;
+
+	recipe_defaults(&recipe);
+	recipe_set_algorithm(&recipe, algorithm);
+	recipe.iterate.automatic = true;
+	return strcmp(parameter->object, OBJECT_ALGORITHM) != 0 || parameter_counts(parameter, &recipe);
+}
 
 void recipe_object(const struct parameter *parameter, const struct algorithm *algorithm,
 		   char ret_object[PARAMETER_POINTER_MAX])

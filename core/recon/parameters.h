@@ -12,6 +12,9 @@
 extern const struct parameter recipe_parameters[];
 extern const int recipe_parameter_count;
 
+/* True if the parameter is one of that algorithm's, be it beside other members alone, or none of an algorithm at all.
+ */
+bool algorithm_has(const struct algorithm *algorithm, const struct parameter *parameter);
 /* Pointer of the object whose member the parameter is in a recipe with that algorithm. */
 void recipe_object(const struct parameter *parameter, const struct algorithm *algorithm,
 		   char ret_object[PARAMETER_POINTER_MAX]);

@@ -113,7 +113,7 @@ static int check_parameters(const struct recipe *recipe, struct error *err)
 static int check_emit(const struct recipe *recipe, struct error *err)
 {
 	for (int i = 0; i < recipe->emits; i++) {
-		int emit = recipe->emit[i], last = recipe->algorithm != NULL ? recipe->iterate.iterations : 0;
+		int emit = recipe->emit[i], last = recipe->algorithm != NULL ? recipe_iterations(recipe) : 0;
 		char pointer[32];
 
 		snprintf(pointer, sizeof(pointer), "/emit/%d", i);

@@ -5,8 +5,10 @@
  */
 #include "core/recon/recon.h"
 
+#include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
+#include <string.h>
 
 #include "core/outofcore/outofcore.h"
 #include "core/recon/internal.h"
@@ -20,7 +22,7 @@ static double recipe_work(const struct recipe *recipe, const struct linearise *l
 	if (recipe->fdk.on)
 		work += WORK_FDK + (recipe->tv.on && recipe->tv.after_fdk ? WORK_TV : 0);
 	if (recipe->algorithm != NULL)
-		work += recipe->iterate.iterations * iteration_work(recipe);
+		work += iterations_left(recipe, 0) * iteration_work(recipe);
 	return work;
 }
 
@@ -299,9 +301,9 @@ int recon_resume(struct recon *recon, const float *volume, int iteration, struct
 
 	if (recon->recipe.algorithm == NULL)
 		return error_set(err, ERR_INVALID, "without iterations there is none to go on from");
-	if (iteration < 0 || iteration > recon->recipe.iterate.iterations)
+	if (iteration < 0 || iteration > recipe_iterations(&recon->recipe))
 		return error_set(err, ERR_INVALID, "iteration %d to go on from: there are 0 to %d", iteration,
-				 recon->recipe.iterate.iterations);
+				 recipe_iterations(&recon->recipe));
 	if (recon->pushed_count > 0 || recon->ran)
 		return error_set(err, ERR_CONFLICT, "an iterate came after %d views", recon->pushed_count);
 	code = recon->backend->volume_upload(recon->volume, volume, err);
@@ -309,8 +311,8 @@ int recon_resume(struct recon *recon, const float *volume, int iteration, struct
 		return code;
 	recon->resumed = true;
 	recon->iteration = iteration;
-	recon->work_done = recon->work_total - WORK_LOAD -
-			   (recon->recipe.iterate.iterations - iteration) * iteration_work(&recon->recipe);
+	recon->work_done = fmax(0, recon->work_total - WORK_LOAD -
+				       iterations_left(&recon->recipe, iteration) * iteration_work(&recon->recipe));
 	return 0;
 }
 
@@ -321,9 +323,15 @@ static size_t algorithm_bytes(const struct recon *recon)
 	return algorithm != NULL && algorithm->state_bytes != NULL ? algorithm->state_bytes(&recon->problem) : 0;
 }
 
+static size_t stopping_bytes(const struct recon *recon)
+{
+	return recon->recipe.algorithm != NULL && recon->recipe.iterate.automatic ? sizeof(recon->stopping) : 0;
+}
+
 size_t recon_state_bytes(const struct recon *recon)
 {
-	return algorithm_bytes(recon) + ends_state_bytes(recon->ends) + rim_state_bytes(recon->rim);
+	return algorithm_bytes(recon) + ends_state_bytes(recon->ends) + rim_state_bytes(recon->rim) +
+	       stopping_bytes(recon);
 }
 
 /* Writes the algorithm's state, and behind it the end slices and the rim that the iterations began with. */
@@ -335,6 +343,8 @@ int recon_save_state(struct recon *recon, const struct checkpoint_sink *sink, st
 		code = recon->recipe.algorithm->save(&recon->problem, recon->algorithm_state, sink, err);
 	if (code == 0 && recon->ends != NULL)
 		code = sink->write(sink->context, ends_state(recon->ends), ends_state_bytes(recon->ends), err);
+	if (code == 0 && stopping_bytes(recon) > 0)
+		code = sink->write(sink->context, &recon->stopping, sizeof(recon->stopping), err);
 	if (code == 0 && rim_state_bytes(recon->rim) > 0)
 		code = sink->write(sink->context, rim_state(recon->rim), rim_state_bytes(recon->rim), err);
 	return code;
@@ -357,6 +367,8 @@ int recon_resume_state(struct recon *recon, const char *bytes, size_t size, stru
 	}
 	if (code == 0 && recon->ends != NULL)
 		ends_resume(recon->ends, bytes + own);
+	if (code == 0 && stopping_bytes(recon) > 0)
+		memcpy(&recon->stopping, bytes + own + ends_state_bytes(recon->ends), sizeof(recon->stopping));
 	if (code == 0 && size > whole)
 		code = rim_resume(recon->rim, bytes + whole, err);
 	return code;

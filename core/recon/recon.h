@@ -38,6 +38,17 @@ struct kept_volume {
 	double estimate_mm; /* what is nearer to metal is an estimate (METAL_ESTIMATE_MM); 0: there is no metal */
 };
 
+/* Rules that end iterations that are left to the program: core/recon/stopping.h. */
+enum stop_rule { STOP_NOT, STOP_NOISE, STOP_RESIDUAL, STOP_CHANGE, STOP_CEILING, STOP_RULE_COUNT };
+extern const char *const stop_rule_names[STOP_RULE_COUNT]; /* "none", "noise", "residual", "change", "ceiling" */
+
+/* How such iterations ended. */
+struct recon_stop {
+	enum stop_rule rule;
+	int iteration;
+	double residual, change, noise; /* of the last row; noise: ||noise|| / ||p||, estimated */
+};
+
 struct recon;
 
 struct recon_hooks {
@@ -61,6 +72,8 @@ struct recon_hooks {
 	 * follows SART, or FDK where there is no SART; 0 where nothing is to be smoothed.
 	 */
 	void (*denoising)(void *context, double noise_hu, double alpha);
+	/* With automatic iterations, behind the row of the last one. */
+	void (*stopped)(void *context, const struct recon_stop *stop);
 	/* A code of core/warning.h and the technical detail. */
 	void (*warning)(void *context, const char *code, const char *detail);
 }; /* any of them may be NULL */

@@ -16,10 +16,9 @@
 
 void recon_tell_progress(struct recon *recon, enum stage stage, int iteration)
 {
-	double fraction = recon->work_done / recon->work_total;
-
+	recon->fraction = fmax(recon->fraction, fmin(1, recon->work_done / recon->work_total));
 	if (recon->hooks->progress != NULL)
-		recon->hooks->progress(recon->hooks->context, stage, iteration, fraction < 1 ? fraction : 1);
+		recon->hooks->progress(recon->hooks->context, stage, iteration, recon->fraction);
 }
 
 static bool is_wanted(const struct recipe *recipe, int emit)
@@ -369,9 +368,43 @@ static int iterate(struct recon *recon, struct history_row *ret_row, struct erro
 	return 0;
 }
 
+/* The noise that iterations are not to take for the object. A resumed run has it from its checkpoint. */
+static int begin_stopping(struct recon *recon, struct error *err)
+{
+	struct projection_squares squares;
+	int code;
+
+	if (!recon->recipe.iterate.automatic || recon->iteration > 0)
+		return 0;
+	code = noise_of_projections(recon->backend, recon->projections, recon->geometry, &squares, err);
+	if (code == 0 && squares.all > 0)
+		recon->stopping.noise = sqrt(squares.noise / squares.all);
+	return code;
+}
+
+/* Whether automatic iterations end with this row, which is told; and how many there will be. */
+static bool stops_by_itself(struct recon *recon, const struct history_row *row)
+{
+	const struct recipe *recipe = &recon->recipe;
+	const int most = recipe_iterations(recipe);
+	const struct stop_limits limits = stopping_limits(recipe, isfinite(recon->settled));
+	const int expected = stopping_expected(&recon->stopping, &limits, row, most);
+	const enum stop_rule rule = stopping_heed(&recon->stopping, &limits, row, most);
+	const struct recon_stop stop = {.rule = rule,
+					.iteration = row->iteration,
+					.residual = row->residual,
+					.change = row->change,
+					.noise = recon->stopping.noise};
+
+	recon->work_total = recon->work_done + (expected - row->iteration) * iteration_work(recipe);
+	if (rule != STOP_NOT && recon->hooks->stopped != NULL)
+		recon->hooks->stopped(recon->hooks->context, &stop);
+	return rule != STOP_NOT;
+}
+
 static bool is_last(const struct recipe *recipe, const struct history_row *row)
 {
-	return row->iteration >= recipe->iterate.iterations ||
+	return row->iteration >= recipe_iterations(recipe) ||
 	       (recipe->iterate.stop_residual > 0 && row->residual <= recipe->iterate.stop_residual) ||
 	       (recipe->iterate.stop_change > 0 && row->change <= recipe->iterate.stop_change);
 }
@@ -393,11 +426,13 @@ static int tell_residual(const struct recon *recon, const struct history_row *ro
 static int run_iterations(struct recon *recon, struct error *err)
 {
 	const struct recon_hooks *hooks = recon->hooks;
-	bool last = recon->iteration >= recon->recipe.iterate.iterations, changed;
+	bool last = recon->iteration >= recipe_iterations(&recon->recipe), changed;
 	int failed = last ? 0 : corrections_apply(&recon->corrections, CORRECT_BEFORE_ITERATING, &changed, err);
 
 	if (failed == 0 && !last && recon->ends != NULL && recon->iteration == 0)
 		failed = ends_begin(recon->ends, recon->backend, recon->volume, err);
+	if (failed == 0 && !last)
+		failed = begin_stopping(recon, err);
 	if (failed < 0)
 		return failed;
 	if (may_settle(&recon->recipe) && recon->iteration == 0)
@@ -416,6 +451,8 @@ static int run_iterations(struct recon *recon, struct error *err)
 		last = is_last(&recon->recipe, &row);
 		if (hooks->row != NULL)
 			hooks->row(hooks->context, &row);
+		if (recon->recipe.iterate.automatic)
+			last = stops_by_itself(recon, &row) || last;
 		if (last)
 			code = tell_residual(recon, &row, err);
 		snprintf(name, sizeof(name), "iter-%d", row.iteration);

@@ -220,6 +220,8 @@ const struct algorithm algorithm_sart = {
     .stage = STAGE_SART,
     .subsets = true,
     .momentum_volumes = 1,
+    .stops = {{.change = .006, .change_of_noise = .2, .least = 2}, {.change = .005, .least = 2}},
+    .momentum_stops = {{.change = .012, .change_of_noise = .25, .least = 2}, {.change = .0135, .least = 2}},
     .work = 4,
     .open = sart_open,
     .close = sart_close,

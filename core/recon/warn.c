@@ -115,12 +115,12 @@ void warn_recipe(const struct warning_sink *sink, const struct geometry *geometr
 		    grid->size[2] * grid->spacing[2]);
 	warn_of_small_grid(sink, grid);
 	warn_of_sparse_views(sink, orbit, grid);
-	if (recipe->algorithm != NULL && !recipe->fdk.on && recipe->iterate.iterations < recipe->algorithm->from_zero)
+	if (recipe->algorithm != NULL && !recipe->fdk.on && recipe_iterations(recipe) < recipe->algorithm->from_zero)
 		warning_tell(
 		    sink, "not_converged",
 		    "%d iterations of %s from zero are too few: begin with the FDK volume (\"fdk\": {}), or ask "
 		    "for %d and more",
-		    recipe->iterate.iterations, recipe->algorithm->name, recipe->algorithm->from_zero);
+		    recipe_iterations(recipe), recipe->algorithm->name, recipe->algorithm->from_zero);
 	if (recipe->tv.on && !recipe->tv.after_fdk && recipe->algorithm == NULL)
 		warning_tell(sink, "tv_without_sart",
 			     "TV was wanted after SART iterations, and there are none: the FDK volume is left alone");
@@ -208,11 +208,11 @@ void warn_alternation(const struct warning_sink *sink, const struct recipe *reci
 
 void warn_settled(const struct warning_sink *sink, const struct recipe *recipe, double from)
 {
-	if (from < recipe->iterate.iterations)
+	if (from < recipe_iterations(recipe))
 		warning_tell(
 		    sink, "iterations_settled",
 		    "the projections show what the grid cannot hold, edges within voxels or a body beyond the "
 		    "detector, and iterations would put that into it: from the %d. of %d iterations on, each keeps "
 		    "less of its change than the one before",
-		    (int)from + 1, recipe->iterate.iterations);
+		    (int)from + 1, recipe_iterations(recipe));
 }

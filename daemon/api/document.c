@@ -291,6 +291,10 @@ static void add_job_facts(cJSON *document, struct job *job, const struct job_rec
 	add_text_or_null(document, "plan", record->plan);
 	add_memory(document, &record->memory);
 	add_denoising(document, record);
+	if (record->stop.rule != STOP_NOT)
+		cJSON_AddItemToObject(document, "stopped", stop_document(&record->stop));
+	else
+		cJSON_AddNullToObject(document, "stopped");
 	cJSON_AddNumberToObject(document, "attempts", record->attempts);
 	cJSON_AddBoolToObject(document, "cancel_requested", record->cancel_asked);
 	add_text_or_null(document, "client", record->client);

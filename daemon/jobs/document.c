@@ -35,6 +35,28 @@ cJSON *history_row_document(const struct history_row *row)
 	return document;
 }
 
+cJSON *stop_document(const struct recon_stop *stop)
+{
+	static const char *const reasons[STOP_RULE_COUNT] = {
+	    [STOP_NOISE] = "the volume has taken up most of the projections' noise",
+	    [STOP_RESIDUAL] = "the last iteration explained next to nothing more of the projections",
+	    [STOP_CHANGE] = "the last iteration changed next to nothing",
+	    [STOP_CEILING] = "max_iterations were run",
+	};
+	cJSON *document = cJSON_CreateObject();
+
+	cJSON_AddStringToObject(document, "rule", stop_rule_names[stop->rule]);
+	cJSON_AddNumberToObject(document, "iteration", stop->iteration);
+	cJSON_AddNumberToObject(document, "residual", stop->residual);
+	cJSON_AddNumberToObject(document, "change", stop->change);
+	if (stop->noise > 0)
+		cJSON_AddNumberToObject(document, "noise", stop->noise);
+	else
+		cJSON_AddNullToObject(document, "noise");
+	cJSON_AddStringToObject(document, "reason", reasons[stop->rule]);
+	return document;
+}
+
 cJSON *volume_document(const char *job, const struct volume_record *volume)
 {
 	cJSON *document = cJSON_CreateObject(), *statistics;

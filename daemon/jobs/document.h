@@ -14,6 +14,8 @@
  * name, stage, iteration, size, spacing_mm, origin_mm, bytes, digest (once it is known), statistics, metal (where there
  * is any), created, href.
  */
+/* "rule", "iteration", "residual", "change", "noise" (null: not known) and "reason", a sentence. */
+cJSON *stop_document(const struct recon_stop *stop);
 cJSON *volume_document(const char *job, const struct volume_record *volume);
 cJSON *history_row_document(const struct history_row *row);
 /*

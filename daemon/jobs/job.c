@@ -386,7 +386,7 @@ static int fill_record(struct job_record *record, const struct job_request *requ
 	snprintf(record->client, sizeof(record->client), "%s", client);
 	record->priority = request->priority;
 	record->mu_water = request->recipe.mu_water;
-	record->iterations = request->recipe.algorithm != NULL ? request->recipe.iterate.iterations : 0;
+	record->iterations = request->recipe.algorithm != NULL ? recipe_iterations(&request->recipe) : 0;
 	record->noise_hu = record->tv_alpha = NAN;
 	if (memory != NULL)
 		record->memory = *memory;
@@ -660,12 +660,16 @@ double job_eta(struct job *job)
 {
 	double now = clock_monotonic(), eta = -1;
 	const struct job_record *record = &job->record;
+	const struct job_request *request;
+	struct error ignored;
+	/* How many there will be, the share that is done tells. */
+	const bool automatic = job_request(job, &request, &ignored) == 0 && request->recipe.iterate.automatic;
 
 	pthread_mutex_lock(&job->jobs->lock);
 	if (record->state == JOB_RUNNING) {
 		double done = record->fraction - job->run_fraction;
 
-		if (job->row_seconds > 0 && record->iterations > 0) {
+		if (job->row_seconds > 0 && record->iterations > 0 && !automatic) {
 			eta = (record->iterations - record->iteration) * job->row_seconds - (now - job->row_at);
 			eta = eta < 0 ? 0 : eta;
 		} else if (done > 0.01) {

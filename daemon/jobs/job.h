@@ -204,6 +204,8 @@ int jobs_victim(struct jobs *jobs, const enum priority *arriving, const struct q
 void job_set_plan(struct job *job, const struct recon_memory *memory, const char *plan);
 /* recon_hooks.denoising. Memory only, until the next change of state, as is the progress. */
 void job_set_denoising(struct job *job, double noise_hu, double alpha);
+/* How its automatic iterations ended, with an event; one that a run after a crash ends in again is told once. */
+int job_set_stop(struct job *job, const struct recon_stop *stop, struct error *err);
 /*
  * A checkpoint of that iteration is on the disk: the job goes on from it when its worker or the daemon is lost, and
  * workers that died before count against it no more. In one commit.

@@ -163,6 +163,9 @@ static void on_message(struct supervise *supervise, struct worker *worker, const
 	case MESSAGE_NOISE:
 		job_set_denoising(worker->job, message->noise_hu, message->alpha);
 		break;
+	case MESSAGE_STOPPED:
+		code = job_set_stop(worker->job, &message->stop, &err);
+		break;
 	case MESSAGE_RECONSTRUCTED:
 		worker->reconstructed = message->count;
 		job_reconstructed(worker->job, message->count);

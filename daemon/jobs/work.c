@@ -302,6 +302,34 @@ void job_set_denoising(struct job *job, double noise_hu, double alpha)
 	pthread_mutex_unlock(&job->jobs->lock);
 }
 
+int job_set_stop(struct job *job, const struct recon_stop *stop, struct error *err)
+{
+	struct jobs *jobs = job->jobs;
+	struct job_record record;
+	struct event event = {0};
+	int code = 0;
+
+	pthread_mutex_lock(&jobs->change);
+	pthread_mutex_lock(&jobs->lock);
+	record = job->record;
+	pthread_mutex_unlock(&jobs->lock);
+	if (record.stop.rule != stop->rule || record.stop.iteration != stop->iteration) {
+		record.stop = *stop;
+		code = job_event_make(&event, "stop", stop_document(stop), err);
+		if (code == 0)
+			code = store_job_update(jobs->store, &record, &event, NULL, PAST_STAYS, err);
+		free(event.data);
+		if (code == 0) {
+			pthread_mutex_lock(&jobs->lock);
+			job->record.stop = *stop;
+			pthread_mutex_unlock(&jobs->lock);
+			job_wake(job);
+		}
+	}
+	pthread_mutex_unlock(&jobs->change);
+	return code;
+}
+
 int job_checkpointed(struct job *job, int iteration, struct error *err)
 {
 	struct jobs *jobs = job->jobs;

@@ -358,7 +358,9 @@ struct job_record {
 	char backend[16], device[96], plan[160];
 	struct recon_memory memory;
 	double noise_hu, tv_alpha; /* recon_hooks.denoising; NaN before it was called */
-	int error_code;            /* 0: none */
+	/* How automatic iterations ended; STOP_NOT: they have not. */
+	struct recon_stop stop;
+	int error_code; /* 0: none */
 	char error_pointer[192], error_text[320];
 	char error_report[JOB_REPORT_SIZE];     /* JSON of how its last run was lost, "" without */
 	double created, queued, started, ended; /* seconds since 1970, 0: not yet */

@@ -98,6 +98,12 @@ static const struct column job_columns[] = {
     {"tv_alpha", COLUMN_REAL, AT(job_record, tv_alpha), .nullable = true, .changes = true},
     {"client", COLUMN_TEXT, AT(job_record, client), .initial = ""},
     {"subject", COLUMN_STRING, AT(job_record, subject), .nullable = true},
+    {"stop_rule", COLUMN_CHOICE, AT(job_record, stop.rule), .names = stop_rule_names, .choices = STOP_RULE_COUNT,
+     .initial = "none", .changes = true},
+    {"stop_iteration", COLUMN_INT, AT(job_record, stop.iteration), .initial = "0", .changes = true},
+    {"stop_residual", COLUMN_REAL, AT(job_record, stop.residual), .initial = "0", .changes = true},
+    {"stop_change", COLUMN_REAL, AT(job_record, stop.change), .initial = "0", .changes = true},
+    {"stop_noise", COLUMN_REAL, AT(job_record, stop.noise), .initial = "0", .changes = true},
 };
 
 static const struct column volume_columns[] = {

@@ -288,6 +288,35 @@ test_a_scan_alone_is_a_whole_job() {
 	expect_problem 422
 }
 
+test_iterations_may_end_by_themselves() {
+	uploaded_scan
+	local stage end
+	for stage in '"sart": {"iterations": "auto"}, "tv": {}' '"sart": {"iterations": "auto", "momentum": true}' '"cgls": {"iterations": "auto"}'; do
+		post_job "$small"'"fdk": {}, '"$stage"', "emit": [1]}'
+		expect_json '.stopped == null and .iterations == 30 and ([.sart, .cgls][] | select(. != null) | .iterations == "auto" and .max_iterations == 30)'
+		wait_job succeeded
+		expect_json '.iteration == (.history | length) and .iteration < 30 and .progress == 1'
+		expect_json '.stopped | .iteration > 1 and .noise >= 0 and (.reason | length > 0) and (.rule | IN("noise", "residual", "change"))'
+		expect_json '.stopped.iteration == .iteration and .stopped.residual == .history[-1].residual'
+		end=$(json .iteration)
+		req GET "/v1/jobs/$job/volumes"
+		expect_json "[.volumes[] | [.name, .iteration]] == [[\"final\", $end], [\"iter-1\", 1]]"
+		req GET "/v1/jobs/$job/events" -N
+		[ "$(grep -c '^event: stop' "$body")" = 1 ] || fail "one event of the stop"
+		grep -A1 '^event: stop' "$body" | sed -n 's/^data: //p' | jq -e ".iteration == $end" >/dev/null || fail "its iteration"
+	done
+	post_job "$small"'"sart": {"iterations": "auto", "max_iterations": 1}}'
+	wait_job succeeded
+	expect_json '.iteration == 1 and .iterations == 1 and .stopped.rule == "ceiling"'
+	post_job "$small"'"sart": {"iterations": 2}}'
+	wait_job succeeded
+	expect_json '.stopped == null and (.sart | has("max_iterations") | not)'
+	req POST /v1/jobs -H 'Content-Type: application/json' -d "$(echo "$small" | sed "s/SCAN/$scan/")\"sart\": {\"max_iterations\": 5}}"
+	expect_problem 400 /sart/max_iterations
+	req POST /v1/jobs -H 'Content-Type: application/json' -d "$(echo "$small" | sed "s/SCAN/$scan/")\"sart\": {\"iterations\": \"auto\"}, \"emit\": [31]}"
+	expect_problem 422 /emit/0
+}
+
 test_stop_rules() {
 	uploaded_scan
 	post_job "$small"'"sart": {"iterations": 500, "stop": {"residual": 0.2}}}'

@@ -152,6 +152,14 @@ static int on_keep(void *context, struct recon *recon, const struct kept_volume 
 	return recon_read(recon, 0, volume->grid->size[2], outcome->kept[i].voxels, err);
 }
 
+static void on_stopped(void *context, const struct recon_stop *stop)
+{
+	struct outcome *outcome = context;
+
+	outcome->stops++;
+	outcome->stop = *stop;
+}
+
 static void on_denoising(void *context, double noise_hu, double alpha)
 {
 	struct outcome *outcome = context;
@@ -206,6 +214,7 @@ void scene_run(const struct scene *scene, const struct recipe *recipe, struct ou
 	    .row = on_row,
 	    .keep = on_keep,
 	    .denoising = on_denoising,
+	    .stopped = on_stopped,
 	    .warning = on_warning,
 	};
 	struct device *device;

@@ -64,6 +64,8 @@ struct outcome {
 	int row_count;
 	char log[SCENE_LOG_MOST]; /* each hook in its order: "fdk tv fdk-tv! sart tv row1 ..." */
 	char warnings[1024];      /* "code: detail\n" */
+	struct recon_stop stop;   /* told last; rule STOP_NOT: none was */
+	int stops;                /* times that one was told */
 	double fraction;          /* of the last progress; the test ends where it falls */
 	int asked;
 	float *last; /* the iterate as it was at the end, kept or not */

@@ -70,7 +70,7 @@ export async function listVolumes(job, signal) {
 	return volumes.reverse()
 }
 
-const kinds = ['state', 'progress', 'volume', 'warning', 'annotations', 'end', 'removed']
+const kinds = ['state', 'progress', 'volume', 'warning', 'stop', 'annotations', 'end', 'removed']
 const retryAfter = 5000 /* ms: the browser itself comes again where the connection broke, not where it was refused */
 const hiddenFor = 30000 /* ms: a browser has six connections to a daemon, for all of its pages together */
 

@@ -56,6 +56,7 @@ export function jobFacts(job) {
 		...parameterFacts(job),
 		['Noise', job.denoising ? `${number(job.denoising.noise_hu)} HU` : null],
 		['Alpha found', job.tv?.alpha === 'auto' && job.denoising ? (job.denoising.alpha === null ? 'nothing to smooth' : number(job.denoising.alpha)) : null],
+		['Ended after', job.stopped ? `${job.stopped.iteration} iterations: ${job.stopped.reason}` : null],
 		['Runs on', job.device ? `${job.device} (${job.backend})` : job.backend],
 		['Memory', job.memory ? bytes(job.memory.total) : null],
 		['Asked for', timeElement(job.created)],

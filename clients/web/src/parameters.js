@@ -31,17 +31,17 @@ export const groups = [
 		choice('/fdk/truncation', 'Truncated rows', ['auto', 'off']),
 	] },
 	{ title: 'SART', pointer: '/sart', optional: true, algorithm: true, off: 'no iterations', fields: [
-		number('/sart/iterations', 'Iterations', { step: 1 }), number('/sart/relaxation', 'Relaxation'),
+		text('/sart/iterations', 'Iterations', { hint: 'or auto', word: 'auto', read: numberOrText }), number('/sart/max_iterations', 'At most, with auto', { step: 1 }), number('/sart/relaxation', 'Relaxation'),
 		text('/sart/subsets', 'Subsets', { hint: 'or views', word: 'views', read: numberOrText }),
 		flag('/sart/momentum', 'Momentum', { unset: false }), flag('/sart/nonnegative', 'Never below zero'),
 		number('/sart/stop/residual', 'Stop at residual', { zero: 'never' }), number('/sart/stop/change', 'Stop at change', { zero: 'never' }),
 	] },
 	{ title: 'Conjugate gradients', pointer: '/cgls', optional: true, algorithm: true, rare: true, off: 'not in place of SART', fields: [
-		number('/cgls/iterations', 'Iterations', { step: 1 }), flag('/cgls/nonnegative', 'Never below zero'),
+		text('/cgls/iterations', 'Iterations', { hint: 'or auto', word: 'auto', read: numberOrText }), number('/cgls/max_iterations', 'At most, with auto', { step: 1 }), flag('/cgls/nonnegative', 'Never below zero'),
 		number('/cgls/stop/residual', 'Stop at residual', { zero: 'never' }), number('/cgls/stop/change', 'Stop at change', { zero: 'never' }),
 	] },
 	{ title: 'FISTA', pointer: '/fista', optional: true, algorithm: true, rare: true, off: 'not in place of SART', fields: [
-		number('/fista/iterations', 'Iterations', { step: 1 }), flag('/fista/nonnegative', 'Never below zero'),
+		text('/fista/iterations', 'Iterations', { hint: 'or auto', word: 'auto', read: numberOrText }), number('/fista/max_iterations', 'At most, with auto', { step: 1 }), flag('/fista/nonnegative', 'Never below zero'),
 		number('/fista/stop/residual', 'Stop at residual', { zero: 'never' }), number('/fista/stop/change', 'Stop at change', { zero: 'never' }),
 	] },
 	{ title: 'Total variation', pointer: '/tv', optional: true, off: 'no smoothing', fields: [

@@ -17,6 +17,9 @@ export function badge(state) {
 /* What a job may wait for beside projections and its turn, in words. */
 const obstacles = { flat: 'the flat image', space: 'room on the disk', disk: 'the disk, which failed to read or write' }
 
+/* The program says when its iterations end. */
+const automatic = job => [job.sart, job.cgls, job.fista].some(stage => stage?.iterations === 'auto')
+
 /* What it is doing, in words. */
 export function doing(job) {
 	if (job.cancel_requested && !ended(job))
@@ -31,12 +34,12 @@ export function doing(job) {
 	if (job.state === 'running') {
 		/* The one under way, from 1 on; 0 is before the first. */
 		if (job.iterations > 0 && job.iteration > 0)
-			return `iteration ${job.iteration} of ${job.iterations}`
+			return `iteration ${job.iteration} of ${automatic(job) ? 'at most ' : ''}${job.iterations}`
 		return { load: 'loading', fdk: 'FDK', tv: 'TV', save: 'saving', sart: 'SART', cgls: 'conjugate gradients', fista: 'FISTA' }[job.stage] ?? ''
 	}
 	if (job.state === 'failed')
 		return job.error?.detail ?? ''
-	return [job.iterations > 0 ? `${job.iteration} of ${job.iterations} iterations` : 'FDK', job.grid?.size?.join(' × ')].filter(Boolean).join(' · ')
+	return [job.iterations > 0 ? automatic(job) ? `${job.iteration} iterations` : `${job.iteration} of ${job.iterations} iterations` : 'FDK', job.grid?.size?.join(' × ')].filter(Boolean).join(' · ')
 }
 
 export function left(job) {
