@@ -175,6 +175,7 @@ static int start_parts(const struct config *config, struct api *api, struct erro
 	    .worker = supervise.worker, .threads = (int)config->threads, .age = config->calibration_age};
 	const struct store_limits limits = {.jobs = config->max_jobs,
 					    .job_patience = config->job_patience,
+					    .keep = config->keep,
 					    .client_jobs = config->client_jobs,
 					    .client_scans = config->client_scans,
 					    .bytes = config->max_bytes,

@@ -1,4 +1,4 @@
-/* cbct scans, jobs, calibrations, status, complete, rm: what the daemon knows, a line each. */
+/* cbct scans, jobs, calibrations, status, limits, complete, pin, unpin, rm: what the daemon knows, a line each. */
 #include <string.h>
 
 #include "clients/cbct/commands.h"
@@ -158,6 +158,78 @@ static int rm_run(const void *values, struct error *err)
 	return code;
 }
 
+/* PUT or DELETE of the pin of a job, or else of a scan. */
+static int set_pin(const struct list_options *options, const char *method, struct error *err)
+{
+	static const char *const kinds[] = {"jobs", "scans"};
+	cJSON *document = NULL;
+	char path[100];
+	int code = ERR_NOT_FOUND;
+
+	for (size_t i = 0; i < sizeof(kinds) / sizeof(kinds[0]) && code == ERR_NOT_FOUND; i++) {
+		snprintf(path, sizeof(path), "/v1/%s/%.63s/pin", kinds[i], options->id);
+		code = fetch(options, method, path, &document, err);
+	}
+	if (code == ERR_NOT_FOUND)
+		code = error_set(err, code, "there is neither a job nor a scan \"%s\"", options->id);
+	cJSON_Delete(document);
+	return code;
+}
+
+static int pin_run(const void *values, struct error *err)
+{
+	return set_pin(values, "PUT", err);
+}
+
+static int unpin_run(const void *values, struct error *err)
+{
+	return set_pin(values, "DELETE", err);
+}
+
+static void print_limit(const cJSON *limits, const char *whose, const char *what)
+{
+	const cJSON *limit = cJSON_GetObjectItemCaseSensitive(limits, what);
+	const double used = member_number(limit, "used", 0), most = member_number(limit, "most", -1);
+	const bool bytes = strcmp(what, "bytes") == 0;
+	const double unit = bytes ? 1e6 : 1;
+	const char *name = bytes ? "MB" : what;
+
+	if (most >= 0)
+		printf("%-4s %12.*f of %.*f %s, %.*f left\n", whose, bytes, used / unit, bytes, most / unit, name,
+		       bytes, (most > used ? most - used : 0) / unit);
+	else
+		printf("%-4s %12.*f %s\n", whose, bytes, used / unit, name);
+}
+
+static int limits_run(const void *values, struct error *err)
+{
+	const struct list_options *options = values;
+	cJSON *document = NULL;
+	const cJSON *own, *all;
+	int code = fetch(options, "GET", "/v1/limits", &document, err);
+
+	if (code == 0 && options->json) {
+		code = document_print(document, err);
+	} else if (code == 0) {
+		own = cJSON_GetObjectItemCaseSensitive(document, "own");
+		all = cJSON_GetObjectItemCaseSensitive(document, "all");
+		printf("of %s\n", member_text(document, "client", "?"));
+		print_limit(own, "own", "jobs");
+		print_limit(own, "own", "scans");
+		print_limit(own, "own", "bytes");
+		print_limit(all, "all", "jobs");
+		print_limit(all, "all", "bytes");
+		if (member_number(all, "reserve", -1) >= 0)
+			printf("of which %.1f MB are reserved for what is being acquired\n",
+			       member_number(all, "reserve", 0) / 1e6);
+		if (member_number(document, "keep_s", -1) >= 0)
+			printf("what has ended or broken off is kept for %.1f h, unless it is pinned\n",
+			       member_number(document, "keep_s", 0) / 3600);
+	}
+	cJSON_Delete(document);
+	return code;
+}
+
 /* The line shows a scan that was ended too early. */
 static void print_completed(const cJSON *scan)
 {
@@ -191,6 +263,11 @@ static const struct positional rm_positionals[] = {
     {0},
 };
 
+static const struct positional pin_positionals[] = {
+    {"ID", "of a job or a scan", offsetof(struct list_options, id), true},
+    {0},
+};
+
 static const struct positional complete_positionals[] = {
     {"SCAN", "its id", offsetof(struct list_options, id), true},
     {0},
@@ -216,3 +293,14 @@ const struct command command_rm = {
     rm_positionals, rm_groups,
     &defaults,      sizeof(defaults),
     rm_run};
+const struct command command_pin = {"pin",           "keeps a job with its scan, or a scan, whatever its age",
+				    pin_positionals, rm_groups,
+				    &defaults,       sizeof(defaults),
+				    pin_run};
+const struct command command_unpin = {
+    "unpin",  "lets a job or scan go for its age again", pin_positionals, rm_groups, &defaults, sizeof(defaults),
+    unpin_run};
+const struct command command_limits = {"limits",  "jobs, scans and bytes that there are, and how many there may be",
+				       none,      status_groups,
+				       &defaults, sizeof(defaults),
+				       limits_run};

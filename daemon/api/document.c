@@ -133,6 +133,11 @@ static void add_digests(cJSON *document, struct stored_scan *stored, const struc
 		cJSON_AddNullToObject(digests, "projections");
 }
 
+static void add_kept_until(cJSON *document, double until)
+{
+	json_add_time(document, "kept_until", isfinite(until) ? until : 0);
+}
+
 cJSON *scan_document(struct stored_scan *stored, bool brief)
 {
 	const struct scan *scan = stored_scan_parsed(stored);
@@ -150,6 +155,7 @@ cJSON *scan_document(struct stored_scan *stored, bool brief)
 	cJSON_AddStringToObject(document, "state", facts.complete ? "complete" : "receiving");
 	add_text_or_null(document, "client", facts.client);
 	cJSON_AddBoolToObject(document, "pinned", facts.pinned);
+	add_kept_until(document, stored_scan_kept_until(stored));
 	json_add_time(document, "created", facts.created);
 	cJSON_AddNumberToObject(document, "received_count", facts.received);
 	for (int i = 0; i < IMAGE_COUNT; i++)
@@ -299,6 +305,7 @@ static void add_job_facts(cJSON *document, struct job *job, const struct job_rec
 	cJSON_AddBoolToObject(document, "cancel_requested", record->cancel_asked);
 	add_text_or_null(document, "client", record->client);
 	cJSON_AddBoolToObject(document, "pinned", record->pinned);
+	add_kept_until(document, job_kept_until(job));
 	json_add_time(document, "created", record->created);
 	json_add_time(document, "queued", record->queued);
 	json_add_time(document, "started", record->started);

@@ -5,7 +5,6 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <sys/stat.h>
 
 #include "daemon/api/internal.h"
 #include "daemon/lock.h"
@@ -31,69 +30,36 @@ struct keeper {
 	bool stop;
 };
 
-static void drop_job(struct api *api, struct job *job, double now, double seconds)
+static void drop_job(struct api *api, struct job *job, double now)
 {
 	struct job_record record;
 	struct error err;
 	bool removed = false;
 
-	job_record(job, &record);
-	if (!job_state_ended(record.state) || record.pinned || now - record.ended <= seconds)
+	if (now <= job_kept_until(job))
 		return;
-	log_line(LEVEL_INFO, "job %s ended %.0f s ago, and is kept for %.0f s", record.id, now - record.ended, seconds);
+	job_record(job, &record);
+	log_line(LEVEL_INFO, "job %s ended %.0f s ago, which is longer than such jobs are kept", record.id,
+		 now - record.ended);
 	if (jobs_delete(api->jobs, job, &removed, &err) != 0)
 		log_line(LEVEL_WARNING, "job %s stays: %s", record.id, err.text);
 	if (removed)
 		job_forget_files(api, job);
 }
 
-/* When the last of it came, by its file; or when it was announced. */
-static double last_change(const struct api *api, struct stored_scan *scan, double created)
-{
-	char directory[1024], path[1100];
-	struct stat status;
-
-	store_scan_directory(api->store, stored_scan_id(scan), directory);
-	snprintf(path, sizeof(path), "%s/projections.sums", directory);
-	if (stat(path, &status) != 0)
-		return created;
-	return fmax(created, (double)status.st_mtim.tv_sec);
-}
-
-/*
- * A scan that was ended, or that the disk has damaged a part of, is none whose acquisition broke off: what it still has
- * may be all that there is of a patient.
- */
-static bool is_unfinished(const struct scan_facts *facts)
-{
-	bool damaged = facts->lost > 0 || facts->document_damaged || facts->damaged;
-
-	for (int image = 0; image < IMAGE_COUNT; image++)
-		damaged |= facts->lost_image[image];
-	return !facts->complete && !facts->closed && !damaged;
-}
-
-static void drop_scan(struct api *api, struct stored_scan *scan, double now, double seconds)
+static void drop_scan(struct api *api, struct stored_scan *scan, double now)
 {
 	const char *id = stored_scan_id(scan);
-	struct scan_facts facts;
 	struct error err;
-	double changed;
 	int code;
 
-	stored_scan_facts(scan, &facts);
-	changed = last_change(api, scan, facts.created);
-	if (facts.asked > 0)
-		changed = fmax(changed, now - (clock_monotonic() - facts.asked));
-	if (!is_unfinished(&facts) || facts.pinned || facts.deleted || now - changed <= seconds ||
-	    stored_scan_in_use(scan) || jobs_pin_scan(api->jobs, id))
+	if (now <= stored_scan_kept_until(scan) || stored_scan_in_use(scan) || jobs_pin_scan(api->jobs, id))
 		return;
 	code = calibrations_check_scan(api->calibrations, id, &err);
 	if (code == 0)
 		code = jobs_delete_scan(api->jobs, scan, &err);
 	if (code == 0)
-		log_line(LEVEL_INFO, "scan %s was unfinished for %.0f s, and is kept for %.0f s", id, now - changed,
-			 seconds);
+		log_line(LEVEL_INFO, "scan %s was unfinished, and got nothing for as long as such scans are kept", id);
 	else if (code != ERR_CONFLICT) /* a job uses it */
 		log_line(LEVEL_WARNING, "scan %s stays: %s", id, err.text);
 }
@@ -123,7 +89,7 @@ static void look_at_jobs(struct keeper *keeper, double now)
 		for (int i = 0; i < count; i++) {
 			job_facts(jobs[i], &facts);
 			memcpy(after, facts.id, sizeof(after));
-			drop_job(keeper->api, jobs[i], now, keeper->seconds);
+			drop_job(keeper->api, jobs[i], now);
 			job_release(jobs[i]);
 		}
 	}
@@ -142,7 +108,7 @@ static void look_at_scans(struct keeper *keeper, double now)
 			       &ignored) == 0) {
 		for (int i = 0; i < count; i++) {
 			memcpy(after, stored_scan_id(scans[i]), sizeof(after));
-			drop_scan(keeper->api, scans[i], now, keeper->seconds);
+			drop_scan(keeper->api, scans[i], now);
 			stored_scan_release(scans[i]);
 		}
 	}

@@ -122,6 +122,14 @@ int limits_get(void *context, struct request *request, struct error *err)
 	part = cJSON_AddObjectToObject(document, "all");
 	add_limit(part, "jobs", (double)jobs_open_count(api->jobs, NULL), (double)limits->jobs);
 	add_limit(part, "bytes", (double)store_bytes(api->store, NULL), (double)limits->bytes);
+	if (limits->bytes > 0)
+		cJSON_AddNumberToObject(part, "reserve", (double)(limits->bytes - store_volumes_most(limits)));
+	else
+		cJSON_AddNullToObject(part, "reserve");
+	if (limits->keep > 0)
+		cJSON_AddNumberToObject(document, "keep_s", limits->keep);
+	else
+		cJSON_AddNullToObject(document, "keep_s");
 	return request_reply_json(request, 200, document, err);
 }
 

@@ -1,4 +1,5 @@
 /* Annotations and pins, which people keep with a job: job.h. */
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -79,6 +80,18 @@ int job_annotate(struct job *job, const char *text, size_t length, bool (*fits)(
 		job_wake(job);
 	*ret_fits = fit;
 	return code;
+}
+
+double job_kept_until(struct job *job)
+{
+	const double keep = store_limits(job->jobs->store)->keep;
+	double until = INFINITY;
+
+	pthread_mutex_lock(&job->jobs->lock);
+	if (keep > 0 && job_state_ended(job->record.state) && !job->record.pinned)
+		until = job->record.ended + keep;
+	pthread_mutex_unlock(&job->jobs->lock);
+	return until;
 }
 
 bool jobs_pin_scan(struct jobs *jobs, const char *scan)

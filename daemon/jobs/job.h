@@ -78,6 +78,8 @@ int jobs_list(struct jobs *jobs, const char *after, int limit, struct job **ret_
  * removed with its rows and files. *ret_removed says which it was.
  */
 int jobs_delete(struct jobs *jobs, struct job *job, bool *ret_removed, struct error *err);
+/* When an ended job goes for its age (store_limits.keep), seconds since 1970; INFINITY: it stays. */
+double job_kept_until(struct job *job);
 /* A pinned job uses this scan: neither goes for its age. */
 bool jobs_pin_scan(struct jobs *jobs, const char *scan);
 /* A pinned job stays whatever its age. ERR_NOT_FOUND: it is removed. */

@@ -1,10 +1,14 @@
 /* How much a client, and all of them together, may have: store.h. */
 #include <errno.h>
 #include <fcntl.h>
+#include <math.h>
+#include <stdio.h>
 #include <string.h>
+#include <sys/stat.h>
 
 #include "daemon/log.h"
 #include "daemon/store/scan.h"
+#include "proto/clock.h"
 
 void store_set_limits(struct store *store, const struct store_limits *limits)
 {
@@ -242,4 +246,42 @@ bool stored_scan_return_room(struct stored_scan *scan, int descriptor)
 	scan->returning = false;
 	pthread_mutex_unlock(&scan->lock);
 	return true;
+}
+
+/* ---- age ---- */
+
+/* When the last of it came, by its file; or when it was announced. */
+static double last_change(const struct stored_scan *scan, const struct scan_facts *facts)
+{
+	char directory[1024], path[1100];
+	double changed = facts->created;
+	struct stat status;
+
+	store_scan_directory(scan->store, scan->id, directory);
+	snprintf(path, sizeof(path), "%s/projections.sums", directory);
+	if (stat(path, &status) == 0)
+		changed = fmax(changed, (double)status.st_mtim.tv_sec);
+	if (facts->asked > 0)
+		changed = fmax(changed, clock_realtime() - (clock_monotonic() - facts->asked));
+	return changed;
+}
+
+static bool is_unfinished(const struct scan_facts *facts)
+{
+	bool damaged = facts->lost > 0 || facts->document_damaged || facts->damaged;
+
+	for (int image = 0; image < IMAGE_COUNT; image++)
+		damaged |= facts->lost_image[image];
+	return !facts->complete && !facts->closed && !damaged;
+}
+
+double stored_scan_kept_until(struct stored_scan *scan)
+{
+	const double keep = scan->store->limits.keep;
+	struct scan_facts facts;
+
+	if (keep == 0)
+		return INFINITY;
+	stored_scan_facts(scan, &facts);
+	return is_unfinished(&facts) && !facts.pinned && !facts.deleted ? last_change(scan, &facts) + keep : INFINITY;
 }

@@ -106,6 +106,7 @@ struct store_limits {
 	double job_patience;    /* s without a projection after which a job that waits gives its place to another one */
 	long client_scans;
 	unsigned long long bytes, client_bytes; /* of projections, images and kept volumes */
+	double keep;                            /* s after which what has ended, or broke off, is removed */
 };
 /* A share of the bytes that volumes may not take: what is being acquired cannot be had again. */
 #define STORE_ACQUISITION_SHARE 0.1
@@ -173,6 +174,12 @@ const struct scan *stored_scan_parsed(struct stored_scan *scan);
 const struct scan *stored_scan_measured(struct stored_scan *scan);
 const char *stored_scan_id(const struct stored_scan *scan);
 /* STATE/scans/ID */
+/*
+ * When the scan goes for its age (store_limits.keep), seconds since 1970: it is not complete, and nothing came since.
+ * INFINITY: it stays, also as a scan that was ended or that the disk has damaged a part of, since what such a scan
+ * still has may be all that there is of a patient.
+ */
+double stored_scan_kept_until(struct stored_scan *scan);
 void store_scan_directory(const struct store *store, const char *id, char ret_path[1024]);
 
 /*

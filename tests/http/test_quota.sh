@@ -166,7 +166,9 @@ test_volumes_leave_room_for_acquisition() {
 		[ "$(json .state)" != succeeded ] || break
 	done
 	ask GET /v1/limits
-	expect_json ".all.bytes.used == $((bytes + 16384))"
+	expect_json ".all.bytes.used == $((bytes + 16384)) and .all.reserve == ($((2 * bytes + 40000)) * 0.1 | ceil) and .keep_s == null"
+	CBCT_TOKEN=${who[1]##* } cbct limits >"$work/said"
+	grep -qE '^all +0.3 of 0.5 MB, 0.3 left$' "$work/said" && grep -q 'are reserved for what is being acquired' "$work/said" || fail "limits in words: $(cat "$work/said")"
 	new_job 507 "{\"scan\": \"SCAN\", \"grid\": {\"size\": [48, 48, 48], \"spacing_mm\": [2, 2, 2]}, \"fdk\": {}}"
 	retry_after
 	expect_json '.detail | contains("the rest is reserved for what is being acquired")'
@@ -324,15 +326,20 @@ test_what_is_old_goes_unless_it_is_pinned() {
 	new_scan 201 && announced=$scan
 	new_scan 201 && open=$scan
 	expect_json '.pinned == false'
-	ask PUT "/v1/scans/$open/pin"
-	expect_status 204
+	expect_json '((.kept_until | sub("[.][0-9]+Z"; "Z") | fromdate) - (now | floor)) as $s | $s >= 2 and $s <= 5'
+	export CBCT_TOKEN=${who[1]##* }
+	cbct pin "$open"
 	ask GET "/v1/scans/$open"
-	expect_json '.pinned'
+	expect_json '.pinned and .kept_until == null'
+	! cbct pin nothing 2>"$work/said" || fail "nothing to pin"
+	grep -q 'neither a job nor a scan "nothing"' "$work/said" || fail "why: $(cat "$work/said")"
+	cbct limits >"$work/said"
+	grep -q '^of a$' "$work/said" && grep -qE '^own +[0-9]+ scans$' "$work/said" || fail "limits in words: $(cat "$work/said")"
 	gone "/v1/jobs/$old"
 	[ ! -e "$state/jobs/$old" ] || fail "no files of a job that was removed"
 	gone "/v1/scans/$announced"
 	ask GET "/v1/jobs/$pinned"
-	expect_json '.state == "succeeded" and .pinned'
+	expect_json '.state == "succeeded" and .pinned and .kept_until == null'
 	ask GET "/v1/jobs/$cancelled"
 	expect_json '.state == "cancelled"'
 	ask GET "/v1/scans/$unfinished"
@@ -351,8 +358,7 @@ test_what_is_old_goes_unless_it_is_pinned() {
 	expect_json '.pinned and .client == "a"'
 	stop_daemon
 	start_daemon --tokens "$work/tokens" --keep 1
-	ask DELETE "/v1/scans/$open/pin"
-	expect_status 204
+	cbct unpin "$open"
 	ask DELETE "/v1/jobs/$pinned/pin"
 	expect_status 204
 	gone "/v1/scans/$open"

@@ -3,7 +3,7 @@ import { origin, launch, software, open, realComplaints, shoot, until, expect, t
 import { readFileSync } from 'node:fs'
 import { join } from 'node:path'
 
-const { SCAN: scan, FINISHED: finished, VIEW, ACQUIRE } = process.env
+const { SCAN: scan, FINISHED: finished, VIEW, ACQUIRE, ADMIN } = process.env
 const browser = await launch(software)
 
 async function signIn(page, token) {
@@ -76,6 +76,63 @@ test('who may acquire reconstructs again and removes, until signing out', async 
 	await signIn(page, VIEW)
 	await until('who it is', () => page.textContent('.who'), text => text.includes('ward'))
 	await page.context().close()
+})
+
+test('what is bounded is told in words, and jobs and scans are pinned', async () => {
+	const page = await open(browser, `/#/jobs/${finished}`)
+	await signIn(page, ACQUIRE)
+	await page.waitForSelector('.head .badge.succeeded')
+	await until('when it goes', () => page.textContent('.aside'), text => /Kept\s*until .*unless it is pinned/.test(text))
+	const pin = page.locator('.actions button', { hasText: /^(Pin|Unpin)$/ })
+	await pin.click()
+	await until('a pinned job', () => page.textContent('.aside'), text => text.includes('pinned: whatever its age'))
+	await shoot(page, 'pinned')
+	const document = await (await fetch(`${origin}/v1/jobs/${finished}`, tokenFor(VIEW))).json()
+	expect(document.pinned && document.kept_until === null, `a pin that the daemon knows: ${document.pinned}`)
+	await page.click('.brand')
+	const limits = page.locator('.limits')
+	await until('the limits', () => limits.textContent(), text => /Jobs of all that have not ended: 0 of 5, 5 left/.test(text))
+	const text = await limits.textContent()
+	for (const words of ['Your room: 0 B of 1.07 GB', '215 MB of it are reserved', 'removed after 24 h 0 min unless they are pinned'])
+		expect(text.includes(words), `${words} in ${text}`)
+	await until('the pin in the list', () => page.textContent('.jobs'), shown => shown.includes('pinned'))
+	await limits.scrollIntoViewIfNeeded()
+	await shoot(page, 'limits')
+	await page.goto(`${origin}/#/scans/${scan}`)
+	await pin.click()
+	await until('a pinned scan', () => page.textContent('.aside'), shown => shown.includes('pinned: whatever its age'))
+	await pin.click()
+	await until('no pin any more', () => pin.textContent(), shown => shown === 'Pin')
+	await page.context().close()
+})
+
+test('a device that is set aside is told, and an administrator clears it', async () => {
+	for (const [token, may] of [[ACQUIRE, false], [ADMIN, true]]) {
+		const page = await open(browser, '/')
+		const cleared = []
+		await page.route('**/v1/devices', async route => {
+			const response = await route.fetch()
+			const document = await response.json()
+			if (response.ok() && cleared.length === 0)
+				Object.assign(document.devices[0], { set_aside: { since: document.devices[0].since, test_in_s: 60 }, errors: 3, last_error: 'the card has fallen off the bus', answers: false })
+			await route.fulfill({ response, json: document })
+		})
+		await page.route('**/v1/devices/*/clear', async route => {
+			cleared.push(`${route.request().method()} ${new URL(route.request().url()).pathname}`)
+			await route.fulfill({ json: {} })
+		})
+		await signIn(page, token)
+		const notice = page.locator('.notice', { hasText: 'is set aside after 3 errors and is given no jobs: the card has fallen off the bus' })
+		await notice.waitFor()
+		expect(await notice.locator('button').isVisible() === may, 'a button for who may press it')
+		await shoot(page, `set-aside-${may}`)
+		if (may) {
+			await notice.locator('button').click()
+			await notice.waitFor({ state: 'hidden' })
+			expect(cleared.join() === 'POST /v1/devices/0/clear', `one request, got ${cleared}`)
+		}
+		await page.context().close()
+	}
 })
 
 test('a session that ends asks again', async () => {

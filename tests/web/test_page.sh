@@ -123,8 +123,9 @@ browser_tests() {
 	rm -f "$work/tokens"
 	VIEW=$(cbct token new ward --role view --file "$work/tokens" 2>/dev/null)
 	ACQUIRE=$(cbct token new arm-3 --role acquire --file "$work/tokens" 2>/dev/null)
-	start_daemon --threads 1 --tokens "$work/tokens"
-	VIEW=$VIEW ACQUIRE=$ACQUIRE URL=$url OUT=$work SCAN=$scan FINISHED=$job CHROMIUM=$CHROMIUM HOME=$work timeout 300 node "$tools/access.mjs" 2>&1 | tee -a "$work/browser.log"
+	ADMIN=$(cbct token new office --role admin --file "$work/tokens" 2>/dev/null)
+	start_daemon --threads 1 --tokens "$work/tokens" --keep 86400 --max-jobs 5 --client-bytes 1G --max-bytes 2G
+	VIEW=$VIEW ACQUIRE=$ACQUIRE ADMIN=$ADMIN URL=$url OUT=$work SCAN=$scan FINISHED=$job CHROMIUM=$CHROMIUM HOME=$work timeout 300 node "$tools/access.mjs" 2>&1 | tee -a "$work/browser.log"
 	status=$((status + PIPESTATUS[0]))
 	while read -r line; do
 		case $line in

@@ -11,6 +11,9 @@ const positions = { HFS: 'head first, on the back', HFP: 'head first, on the fro
 	HFDL: 'head first, on the left side', HFDR: 'head first, on the right side', FFDL: 'feet first, on the left side', FFDR: 'feet first, on the right side' }
 const patientText = patient => patient?.position ? `${patient.position}: ${positions[patient.position]}` : patient?.world_to_patient ? 'placed by a matrix' : 'not known how it lies'
 
+/* How long --keep leaves a job or scan; null where nothing is said. */
+const keptText = thing => thing.pinned ? 'pinned: whatever its age' : thing.kept_until ? ['until ', timeElement(thing.kept_until), ', unless it is pinned'] : null
+
 /* patient: of a job that says otherwise than its scan. */
 export function geometryFacts(scan, patient = scan.patient) {
 	const derived = scan.derived ?? {}
@@ -30,6 +33,7 @@ export function geometryFacts(scan, patient = scan.patient) {
 		['Given as', { circular: 'a circle', matrices: 'one matrix a view', views: 'source and detector of each view' }[scan.geometry?.kind]],
 		['Values', `${projections.quantity === 'intensity' ? 'counts' : 'line integrals'}, ${projections.sample}`],
 		['Received', timeElement(scan.created)],
+		['Kept', keptText(scan)],
 	])
 }
 
@@ -62,6 +66,7 @@ export function jobFacts(job) {
 		['Asked for', timeElement(job.created)],
 		['Ended', job.ended ? timeElement(job.ended) : null],
 		['Time', spent.length > 0 ? spent.join(', ') : null],
+		['Kept', keptText(job)],
 		['Attempts', job.attempts > 1 ? String(job.attempts) : null],
 		['Id', h('code', {}, job.id)],
 	])

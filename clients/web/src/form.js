@@ -233,3 +233,18 @@ export function confirmed(title, question, verb, act) {
 	const dialog = openDialog(title, h('p', {}, question), trouble,
 		h('div', { class: 'row end' }, h('button', { type: 'button', onclick: () => dialog.close() }, 'Keep it'), yes))
 }
+
+/* Pins a job or scan, or takes its pin away; changed() reads it again. */
+export function pinButton({ pinned }, path, changed) {
+	const button = h('button', { type: 'button', class: 'quiet acquires', title: pinned ? 'It is kept whatever its age' : 'Keep it whatever its age', onclick: async () => {
+		button.disabled = true
+		try {
+			await request(pinned ? 'DELETE' : 'PUT', `${path}/pin`)
+		} catch (error) {
+			openDialog('It cannot be pinned', h('p', {}, error.message))
+			button.disabled = false
+		}
+		changed()
+	} }, pinned ? 'Unpin' : 'Pin')
+	return button
+}

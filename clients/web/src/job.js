@@ -10,7 +10,7 @@ import { Plot } from './plot.js'
 import { Film } from './film.js'
 import { Bar, badge, doing, left, ended, stateWord } from './state.js'
 import { geometryFacts, jobFacts, warningList } from './facts.js'
-import { reconstructAgain, confirmed, openDialog } from './form.js'
+import { reconstructAgain, confirmed, openDialog, pinButton } from './form.js'
 
 const pollTime = 1500 /* ms: progress and time left are not told as events */
 const swipeReach = 12 /* px to either side of the line */
@@ -257,10 +257,11 @@ export class JobPage {
 
 	#showActions(before) {
 		const job = this.#job
-		if (before && ended(before) === ended(job) && before.cancel_requested === job.cancel_requested)
+		if (before && ended(before) === ended(job) && before.cancel_requested === job.cancel_requested && before.pinned === job.pinned)
 			return
 		replace(this.actions,
 			h('button', { type: 'button', class: 'acquires', onclick: () => reconstructAgain(this.#job, 'Reconstruct again with …') }, 'Reconstruct again …'),
+			pinButton(job, jobPath(this.id), () => this.refresh()),
 			ended(job)
 				? h('button', { type: 'button', class: 'quiet danger-text acquires', onclick: () => this.#remove() }, 'Remove …')
 				: h('button', { type: 'button', class: 'danger-text acquires', disabled: job.cancel_requested, onclick: () => this.#cancel() }, 'Cancel …'))

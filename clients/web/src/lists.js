@@ -1,11 +1,31 @@
 /* The first page: jobs with their states as they change, and the scans. */
-import { h, replace, write, throttle, timeElement } from './dom.js'
+import { h, replace, write, throttle, timeElement, bytes, duration } from './dom.js'
 import { get, id, watch, volumePath } from './api.js'
 import { Bar, badge, doing, left, ended } from './state.js'
 import { reconstructAgain } from './form.js'
 
 const pollTime = 2000 /* ms, while a job runs */
 const pageSize = 50
+
+const plain = value => String(value)
+
+/* What is bounded, in words: used, of how much, and what that means where it is reached. Empty where nothing is. */
+export function limitLines({ own, all, keep_s }) {
+	const line = (name, { used, most }, text, reached) => most === null ? null
+		: `${name}: ${text(used)} of ${text(most)}, ${used >= most ? reached : `${text(most - used)} left`}`
+	const volumesMost = all.reserve === null ? null : all.bytes.most - all.reserve
+	return [
+		line('Your jobs that have not ended', own.jobs, plain, 'more are refused until one ends'),
+		line('Your scans', own.scans, plain, 'more are refused until one is removed'),
+		line('Your room', own.bytes, bytes, 'more is refused until something is removed'),
+		line('Jobs of all that have not ended', all.jobs, plain, 'more are refused until one ends'),
+		line('Room of all', all.bytes, bytes, 'more is refused until something is removed'),
+		volumesMost !== null && (all.bytes.used >= volumesMost
+			? `No room for volumes: the last ${bytes(all.reserve)} are reserved for what is being acquired. Remove jobs or scans, or ask an administrator.`
+			: `${bytes(all.reserve)} of it are reserved for what is being acquired.`),
+		keep_s !== null && `Jobs that have ended, and scans that broke off, are removed after ${duration(keep_s)} unless they are pinned.`,
+	].filter(Boolean)
+}
 
 export class ListPage {
 	#rows = new Map() /* id -> row */
@@ -24,7 +44,9 @@ export class ListPage {
 		this.scans = h('ul', { class: 'scans' })
 		this.scanSection = h('section', { hidden: true }, h('h2', {}, 'Scans'), this.scans)
 		this.trouble = h('div', { class: 'notice bad', role: 'alert', hidden: true })
-		this.element = h('div', { class: 'lists' }, h('h1', {}, 'Jobs'), this.trouble, this.noJobs, this.jobs, this.more, this.scanSection)
+		this.limits = h('ul', { class: 'limits' })
+		this.limitSection = h('section', { hidden: true }, h('h2', {}, 'Limits'), this.limits)
+		this.element = h('div', { class: 'lists' }, h('h1', {}, 'Jobs'), this.trouble, this.noJobs, this.jobs, this.more, this.scanSection, this.limitSection)
 		this.refresh = throttle(500, () => this.#refresh())
 		this.refresh()
 		this.stopWatching = watch('/v1/events?after=latest', () => this.refresh(), connected => {
@@ -47,6 +69,7 @@ export class ListPage {
 			this.#scans = new Map(scans.scans.map(scan => [scan.id, scan]))
 			this.trouble.hidden = true
 			this.#show()
+			this.#showLimits(limitLines(await get('/v1/limits', this.#abort.signal)))
 		} catch (error) {
 			if (this.#closed)
 				return
@@ -80,6 +103,11 @@ export class ListPage {
 		this.#showScans()
 	}
 
+	#showLimits(lines) {
+		this.limitSection.hidden = lines.length === 0
+		replace(this.limits, lines.map(line => h('li', {}, line)))
+	}
+
 	#showScans() {
 		const scans = [...this.#scans.values()]
 		this.scanSection.hidden = scans.length === 0
@@ -91,6 +119,7 @@ export class ListPage {
 			h('a', { class: 'name', href: `#/scans/${id(scan.id)}` }, scan.name || `Scan ${scan.id}`),
 			h('span', { class: 'detail' }, scan.state === 'complete' ? `${scan.projections.count} projections` : `${scan.received_count} of ${scan.projections.count} projections`,
 				` of ${scan.detector.columns} × ${scan.detector.rows}`),
+			scan.pinned && h('span', { class: 'detail' }, 'pinned'),
 			h('span', { class: 'when' }, timeElement(scan.created)),
 			h('button', { type: 'button', class: 'quiet acquires', 'aria-label': `Reconstruct ${scan.name || scan.id}`,
 				onclick: () => reconstructAgain({ scan: scan.id }, `Reconstruct ${scan.name || scan.id}`) }, 'Reconstruct …'))))
@@ -127,7 +156,7 @@ class Row {
 			this.badge.dataset.state = job.state
 			replace(this.badge, badge(job.state))
 		}
-		write(this.detail, [doing(job), left(job)].filter(Boolean).join(' · '))
+		write(this.detail, [doing(job), left(job), job.pinned && 'pinned'].filter(Boolean).join(' · '))
 		if (this.when.dataset.at !== job.created) {
 			this.when.dataset.at = job.created
 			replace(this.when, timeElement(job.created))

@@ -1,6 +1,6 @@
 /* The page's frame: which of its pages the address names, and how the daemon is. */
 import { h, replace, write } from './dom.js'
-import { get } from './api.js'
+import { get, request } from './api.js'
 import { ListPage } from './lists.js'
 import { JobPage } from './job.js'
 import { ScanPage } from './scan.js'
@@ -18,6 +18,8 @@ const main = document.querySelector('main')
 const live = h('span', { class: 'live', role: 'status' })
 const devices = h('span', { class: 'devices' })
 const quarantine = h('span', { class: 'devices bad' })
+const aside = h('div', { class: 'notice bad', role: 'status', hidden: true })
+main.before(aside)
 const status = document.querySelector('.status')
 status.append(quarantine, devices, live)
 
@@ -47,15 +49,39 @@ function open() {
 	scrollTo(0, 0)
 }
 
+/* Devices that are given no jobs, why, and the operator's word that they may have some again. */
+function showAside(list) {
+	const state = JSON.stringify(list.map(device => [device.index, device.last_error]))
+	if (aside.dataset.state === state)
+		return
+	aside.dataset.state = state
+	aside.hidden = list.length === 0
+	replace(aside, list.map(device => {
+		const trouble = h('span', { class: 'trouble' })
+		const clear = h('button', { type: 'button', class: 'administers', 'aria-label': `Clear device ${device.device_index}`, onclick: async () => {
+			clear.disabled = true
+			try {
+				await request('POST', `/v1/devices/${device.index}/clear`)
+				await showDevices()
+			} catch (error) {
+				write(trouble, error.message)
+				clear.disabled = false
+			}
+		} }, 'Clear')
+		return h('p', {}, `Device ${device.device_index}${device.device ? ` (${device.device})` : ''} is set aside after ${device.errors} errors and is given no jobs: ${device.last_error ?? 'no reason is known'} `, clear, ' ', trouble)
+	}))
+}
+
 async function showDevices() {
 	if (document.hidden || !known)
 		return
 	try {
 		const { devices: list } = await get('/v1/devices')
 		const able = list.filter(device => device.answers)
-		const aside = list.filter(device => device.set_aside).length
-		write(devices, able.length > 0 ? able.map(device => device.device ?? device.backend).join(', ') + (aside > 0 ? `, ${aside} set aside` : '') : 'no worker can take a job')
-		devices.classList.toggle('bad', able.length === 0 || aside > 0)
+		const without = list.filter(device => device.set_aside).length
+		showAside(list.filter(device => device.set_aside))
+		write(devices, able.length > 0 ? able.map(device => device.device ?? device.backend).join(', ') + (without > 0 ? `, ${without} set aside` : '') : 'no worker can take a job')
+		devices.classList.toggle('bad', able.length === 0 || without > 0)
 		const { entries } = await get('/v1/quarantine')
 		write(quarantine, entries.length > 0 ? `${entries.length} set aside in quarantine` : '')
 		quarantine.title = entries.map(entry => `${entry.from ?? entry.name}: ${entry.why ?? 'no note'}`).join('\n')
@@ -89,6 +115,7 @@ keepSession({
 		page = null
 		tools.live(null)
 		replace(devices)
+		showAside([])
 		replace(quarantine)
 		document.title = 'cbctd'
 	},

@@ -3,7 +3,7 @@ import { h, replace, throttle, write } from './dom.js'
 import { get, request, scanPath } from './api.js'
 import { Film } from './film.js'
 import { geometryFacts, warningList } from './facts.js'
-import { reconstructAgain, confirmed } from './form.js'
+import { reconstructAgain, confirmed, pinButton } from './form.js'
 
 const pollTime = 1500 /* ms, while projections arrive */
 
@@ -26,6 +26,7 @@ export class ScanPage {
 			h('header', { class: 'head' }, h('a', { class: 'back', href: '#/' }, '‹ Jobs'), h('div', { class: 'title' }, this.heading, this.state),
 				h('div', { class: 'actions' },
 					h('button', { type: 'button', class: 'primary acquires', onclick: () => this.#scan && reconstructAgain({ scan: this.#scan.id }, `Reconstruct ${this.#scan.name}`) }, 'Reconstruct …'),
+					this.pin = h('span', {}),
 					h('button', { type: 'button', class: 'quiet danger-text acquires', onclick: () => this.#remove() }, 'Remove …'))),
 			this.trouble, this.warnings,
 			h('div', { class: 'columns' }, h('section', { class: 'card' }, h('h2', {}, 'Projections'), this.film.element),
@@ -45,6 +46,10 @@ export class ScanPage {
 			write(this.state, scan.state === 'complete' ? 'complete' : `${scan.received_count} of ${scan.projections.count} projections are here`)
 			replace(this.warnings, warningList(scan.warnings))
 			replace(this.geometry, geometryFacts(scan))
+			if (this.pin.dataset.pinned !== String(scan.pinned)) {
+				this.pin.dataset.pinned = scan.pinned
+				replace(this.pin, pinButton(scan, scanPath(this.id), () => this.refresh()))
+			}
 			this.film.show(scan)
 		} catch (error) {
 			if (this.#closed)
