@@ -1040,6 +1040,50 @@ START_TEST(an_orbit_that_leans_over_is_told_about_its_own_axis)
 }
 END_TEST
 
+static void turn_about_z(double *vector, double angle)
+{
+	const double x = vector[0], y = vector[1];
+
+	vector[0] = cos(angle) * x - sin(angle) * y;
+	vector[1] = sin(angle) * x + cos(angle) * y;
+}
+
+/* About x, and a horizontal line between x and y. */
+START_TEST(every_slice_of_a_leaning_orbit_s_default_grid_is_seen_by_all_views)
+{
+	const struct sweep sweep = {72, 56, 4, 0, 5, 72, {0, 0}, 0};
+	const double leans[] = {5, 12, 18, 25, 35, 50, 70, 85, 90}, turns[] = {0, 30, 45};
+	enum { LEANS = sizeof(leans) / sizeof(*leans) };
+	const double lean = leans[_i % LEANS] * DEGREE, turn = turns[_i / LEANS] * DEGREE;
+	struct geometry geometry = geometry_of(&sweep, NULL);
+	struct orbit orbit;
+	struct error err = {0};
+	struct grid grid;
+	int unseen[2];
+
+	for (int k = 0; k < geometry.count; k++) {
+		double *vectors[] = {geometry.views[k].source, geometry.views[k].pixel0, geometry.views[k].column_step,
+				     geometry.views[k].row_step};
+
+		for (int i = 0; i < 4; i++) {
+			lean_over(vectors[i], lean);
+			turn_about_z(vectors[i], turn);
+		}
+	}
+	orbit = orbit_of(&geometry);
+	orbit_default_grid(&orbit, &geometry, 256, &grid);
+	ck_assert_int_eq(orbit_unseen_slices(&orbit, &geometry, &grid, unseen, &err), 0);
+	ck_assert_msg(unseen[0] + unseen[1] == 0, "%g degrees: %d and %d of %d slices", leans[_i % LEANS], unseen[0],
+		      unseen[1], grid.size[2]);
+	/* The field of view is 66 voxels wide, and 52 slices are seen upright. */
+	for (int i = 0; i < 3; i++)
+		ck_assert_msg(grid.size[i] >= 16, "%g degrees: %d voxels along axis %d", leans[_i % LEANS],
+			      grid.size[i], i);
+	orbit_clear(&orbit);
+	geometry_clear(&geometry);
+}
+END_TEST
+
 Suite *orbit_suite(void);
 Suite *orbit_suite(void)
 {
@@ -1058,6 +1102,7 @@ Suite *orbit_suite(void)
 	tcase_add_test(facts, a_real_c_arm_s_orbit_is_a_short_scan);
 	tcase_add_test(facts, directions_are_counted_without_their_opposites);
 	tcase_add_test(facts, an_orbit_that_leans_over_is_told_about_its_own_axis);
+	tcase_add_loop_test(facts, every_slice_of_a_leaning_orbit_s_default_grid_is_seen_by_all_views, 0, 27);
 	suite_add_tcase(suite, facts);
 	tcase_add_test(weights, conjugate_rays_sum_to_two);
 	tcase_add_test(weights, filtered_backprojection_gives_the_density_back);
