@@ -747,6 +747,15 @@ void json_text(struct json_reader *reader, const char *name, bool required, int 
 		json_string(reader, name, required, ret, TEXT_BYTES((size_t)most));
 }
 
+bool has_control(const char *text)
+{
+	const unsigned char *at = (const unsigned char *)text;
+
+	while (*at != '\0' && *at >= 0x20 && *at != 0x7f && !(at[0] == 0xc2 && at[1] < 0xa0))
+		at++;
+	return *at != '\0';
+}
+
 void json_string(struct json_reader *reader, const char *name, bool required, char *ret, size_t size)
 {
 	const cJSON *member = json_member(reader, name, required);
@@ -763,11 +772,9 @@ void json_string(struct json_reader *reader, const char *name, bool required, ch
 		json_fail(reader, ERR_INVALID, name, "%zu bytes, at most %zu are expected", length, size - 1);
 		return;
 	}
-	for (size_t i = 0; i < length; i++) {
-		if ((unsigned char)member->valuestring[i] < 0x20 || member->valuestring[i] == 0x7f) {
-			json_fail(reader, ERR_INVALID, name, "a control character at byte %zu", i);
-			return;
-		}
+	if (has_control(member->valuestring)) {
+		json_fail(reader, ERR_INVALID, name, "a control character");
+		return;
 	}
 	memcpy(ret, member->valuestring, length + 1);
 }

@@ -12,14 +12,6 @@ static int fail(struct error *err, int code, const char *base, const char *what)
 	return code;
 }
 
-static bool has_control(const char *text)
-{
-	for (; *text != '\0'; text++)
-		if ((unsigned char)*text < 0x20 || *text == 0x7f)
-			return true;
-	return false;
-}
-
 static int check_label(const cJSON *label, const char *base, struct error *err)
 {
 	char what[100];

@@ -508,18 +508,22 @@ static void drop_nulls(cJSON *object)
 	}
 }
 
-/* How the patient lies may be left out where it is told who that is. */
+/* How the patient lies and who that is may both be left out: one of whom nothing is told is none. */
 static int read_patient(struct scan *scan, const cJSON *patient, struct error *err)
 {
 	struct json_reader reader;
+	int code;
 
 	scan->patient = patient_unknown;
 	if (patient == NULL)
 		return 0;
 	json_begin(&reader, patient, "/patient", err);
 	subject_members(&reader, "patient", &scan->subject);
-	patient_members(&reader, !subject_known(&scan->subject, "patient"), &scan->patient);
-	return json_end(&reader);
+	patient_members(&reader, false, &scan->patient);
+	code = json_end(&reader);
+	if (code == 0 && !scan->patient.known && !subject_known(&scan->subject, "patient"))
+		cJSON_DeleteItemFromObjectCaseSensitive(scan->document, "patient");
+	return code;
 }
 
 static int read_study(struct scan *scan, const cJSON *study, struct error *err)

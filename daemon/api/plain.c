@@ -350,18 +350,23 @@ static void put_job(FILE *out, struct api *api, const cJSON *job, bool ended, co
 }
 
 /* ?volume=NAME, else the newest; ?window= is the place of a preset. */
-static void read_choice(struct request *request, struct shown *shown)
+static int read_choice(struct request *request, struct shown *shown, struct error *err)
 {
 	const char *volume = request_query(request, "volume"), *window = request_query(request, "window");
 
-	shown->preset = &presets[0];
-	if (window != NULL && window[0] >= '0' && window[0] < '0' + PRESET_COUNT && window[1] == '\0')
-		shown->preset = &presets[window[0] - '0'];
-	shown->chosen = shown->count - 1;
+	long preset = 0;
+
+	if (window != NULL && !index_parse(window, strlen(window), PRESET_COUNT - 1, &preset))
+		return error_set(err, ERR_INVALID, "window is \"%.40s\", expected 0 to %d", window, PRESET_COUNT - 1);
+	shown->preset = &presets[preset];
+	shown->chosen = volume == NULL ? shown->count - 1 : -1;
 	for (int i = 0; volume != NULL && i < shown->count; i++) {
 		if (strcmp(volume, shown->volumes[i].name) == 0)
 			shown->chosen = i;
 	}
+	if (volume != NULL && shown->chosen < 0)
+		return error_set(err, ERR_NOT_FOUND, "job %s has no volume \"%.40s\"", shown->job, volume);
+	return 0;
 }
 
 static int reply_job(struct api *api, struct request *request, struct job *job, struct error *err)
@@ -380,7 +385,10 @@ static int reply_job(struct api *api, struct request *request, struct job *job, 
 		return err->code;
 	shown.job = facts.id;
 	shown.volumes = volumes;
-	read_choice(request, &shown);
+	if (read_choice(request, &shown, err) != 0) {
+		free(volumes);
+		return err->code;
+	}
 	shown.patient = job_request(job, &asked, err) == 0 ? asked->patient : patient_unknown;
 	document = job_document(job, false, err);
 	if (document == NULL) {

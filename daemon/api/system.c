@@ -42,9 +42,12 @@ static int reply_ready(struct request *request, const struct api *api, struct er
 int ready_get(void *context, struct request *request, struct error *err)
 {
 	struct api *api = context;
+	struct error why;
 
 	if (!supervise_ready(api->supervise))
 		return error_set(err, ERR_BUSY, "no worker can take a job");
+	if (store_check_directory(api->store, &why) != 0)
+		return error_set(err, ERR_BUSY, "the state directory is gone, nothing can be stored");
 	return reply_ready(request, api, err);
 }
 

@@ -14,13 +14,20 @@ static const double patience = 30;
 static int reply_page(struct request *request, const char *job, const struct page *page,
 		      const struct volume_record *volumes, int count, struct error *err)
 {
-	cJSON *document = cJSON_CreateObject(), *list = cJSON_AddArrayToObject(document, "volumes");
-	int first = count - 1, last;
+	cJSON *document, *list;
+	int behind = count, first, last;
 
 	for (int i = 0; page->after != NULL && i < count; i++) {
 		if (strcmp(volumes[i].name, page->after) == 0)
-			first = i - 1;
+			behind = i;
 	}
+	/* A first page instead would have a client go round for ever. */
+	if (page->after != NULL && behind == count)
+		return error_set(err, ERR_INVALID, "after is \"%.40s\", expected the name of a volume of the job",
+				 page->after);
+	document = cJSON_CreateObject();
+	list = cJSON_AddArrayToObject(document, "volumes");
+	first = behind - 1;
 	last = first >= page->limit ? first - page->limit + 1 : 0;
 	for (int i = first; i >= last; i--)
 		cJSON_AddItemToArray(list, volume_document(job, &volumes[i]));

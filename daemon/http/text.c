@@ -158,25 +158,89 @@ static bool sha256_parse(const char *text, size_t length, uint8_t ret_sha256[32]
 	return true;
 }
 
-int content_digest_parse(const char *header, bool *ret_given, uint8_t ret_sha256[32], struct error *err)
-{
-	static const char name[] = "sha-256=";
-	bool given = false;
+/* ---- dictionaries of structured fields, RFC 8941 3.2, 4.2.2 ---- */
 
-	while (header != NULL && *header != '\0') {
+static size_t key_length(const char *text)
+{
+	size_t length = strspn(text, "abcdefghijklmnopqrstuvwxyz*");
+
+	return length == 0 ? 0 : length + strspn(text + length, "abcdefghijklmnopqrstuvwxyz0123456789_-.*");
+}
+
+/* Of a byte sequence, ":" base64 ":"; 0: there is none. */
+static size_t bytes_length(const char *text)
+{
+	size_t length = 1 + strspn(text + 1, "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/=");
+
+	return text[0] == ':' && text[length] == ':' ? length + 1 : 0;
+}
+
+/* Of a bare item: a string, a byte sequence, or a token, number or boolean; 0: there is none. */
+static size_t item_length(const char *text)
+{
+	size_t length = 1;
+
+	if (text[0] == ':')
+		return bytes_length(text);
+	if (text[0] != '"')
+		return strspn(text, "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789!#$%&'*+-.^_`|~:/?");
+	while (text[length] >= ' ' && text[length] < 0x7f && text[length] != '"')
+		length += text[length] == '\\' && text[length + 1] != '\0' ? 2 : 1;
+	return text[length] == '"' ? length + 1 : 0;
+}
+
+/* Moves *at behind parameters, ";" key ["=" item]; false: malformed. */
+static bool pass_parameters(const char **at)
+{
+	while (**at == ';') {
 		size_t length;
 
-		header = header + strspn(header, " \t,");
-		length = strcspn(header, " \t,;");
-		if (strncmp(header, name, sizeof(name) - 1) == 0) {
-			if (!sha256_parse(header + sizeof(name) - 1, length - (sizeof(name) - 1), ret_sha256))
-				return error_set(err, ERR_INVALID,
-						 "Content-Digest: sha-256 is \"%.60s\", expected 32 bytes in base64 "
-						 "between colons",
-						 header);
-			given = true;
-		}
-		header += strcspn(header, ",");
+		*at += 1 + strspn(*at + 1, " ");
+		length = key_length(*at);
+		if (length == 0)
+			return false;
+		*at += length;
+		if (**at != '=')
+			continue;
+		length = item_length(*at + 1);
+		if (length == 0)
+			return false;
+		*at += 1 + length;
+	}
+	return true;
+}
+
+/* Moves *at behind a member and the comma to the next one, or to the end; false: malformed. */
+static bool pass_member_end(const char **at)
+{
+	if (!pass_parameters(at))
+		return false;
+	*at += strspn(*at, " \t");
+	if (**at == '\0')
+		return true;
+	if (**at != ',')
+		return false;
+	*at += 1 + strspn(*at + 1, " \t");
+	return **at != '\0';
+}
+
+int content_digest_parse(const char *header, bool *ret_given, uint8_t ret_sha256[32], struct error *err)
+{
+	const char *at = header != NULL ? header + strspn(header, " ") : "";
+	bool given = false;
+
+	while (*at != '\0') {
+		const size_t key = key_length(at), bytes = key > 0 && at[key] == '=' ? bytes_length(at + key + 1) : 0;
+		const bool known = key == strlen("sha-256") && strncmp(at, "sha-256", key) == 0;
+
+		if (bytes == 0 || (known && !sha256_parse(at + key + 1, bytes, ret_sha256)))
+			return error_set(err, ERR_INVALID,
+					 "Content-Digest is \"%.80s\", expected is sha-256=:BASE64: with 32 bytes", at);
+		given = given || known;
+		at += key + 1 + bytes;
+		if (!pass_member_end(&at))
+			return error_set(err, ERR_INVALID, "Content-Digest goes on with \"%.80s\", which is no member",
+					 at);
 	}
 	*ret_given = given;
 	return 0;

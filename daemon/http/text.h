@@ -33,8 +33,9 @@ bool accepts_coding(const char *header, const char *coding);
 bool etag_in(const char *header, const char *etag, bool weak);
 
 /*
- * Content-Digest (RFC 9530): *ret_given tells whether it has a sha-256; other
- * algorithms are ignored. ERR_INVALID for one that is not 32 bytes of base64 between colons.
+ * Content-Digest (RFC 9530), a dictionary of byte sequences (RFC 8941), whose keys are lower case: *ret_given tells
+ * whether it has a sha-256; other algorithms are ignored. ERR_INVALID where it is none, or a sha-256 is not of 32
+ * bytes.
  */
 int content_digest_parse(const char *header /* or NULL */, bool *ret_given, uint8_t ret_sha256[32], struct error *err);
 

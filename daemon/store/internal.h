@@ -27,6 +27,8 @@ struct store {
 	unsigned long long (*volumes_bytes)(void *context, const char *client);
 	void *volumes_context;
 	int lock_file;
+	dev_t device; /* of the directory, constant, as the next */
+	ino_t inode;
 	/* Held from the commit of a scan's row to its place in the array: who finds its key finds the scan. First of
 	 * all. */
 	pthread_mutex_t insertion_lock;

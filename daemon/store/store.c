@@ -23,6 +23,7 @@
 static int take_directory(struct store *store, struct error *err)
 {
 	static const char *const rooms[] = {"", "/scans", "/jobs"};
+	struct stat status;
 	char path[1024];
 	int code;
 
@@ -41,6 +42,10 @@ static int take_directory(struct store *store, struct error *err)
 			return error_set(err, ERR_CONFLICT, "%s is in use by another cbctd", store->directory);
 		return error_set_errno(err, errno, "lock %s", path);
 	}
+	if (stat(store->directory, &status) != 0)
+		return error_set_errno(err, errno, "%s", store->directory);
+	store->device = status.st_dev;
+	store->inode = status.st_ino;
 	return deleted_open(store->directory, &store->deleted, err);
 }
 
@@ -161,8 +166,13 @@ int store_open(const char *directory, const struct store_hooks *hooks, struct st
 int store_rebuild(const char *directory, struct store_repairs *ret, struct error *err)
 {
 	struct store *store = NULL;
-	int code = open_store(directory, NULL, true, &store, err);
+	char scans[1024];
+	int code;
 
+	/* A path with a typing error would be made, with an empty catalogue. */
+	if (snprintf(scans, sizeof(scans), "%s/scans", directory) < (int)sizeof(scans) && access(scans, F_OK) != 0)
+		return error_set_errno(err, errno, "%s is no state directory: %s", directory, scans);
+	code = open_store(directory, NULL, true, &store, err);
 	if (code == 0)
 		*ret = store->repairs;
 	store_close(store);
@@ -177,6 +187,17 @@ void store_repairs(const struct store *store, struct store_repairs *ret)
 const char *store_directory(const struct store *store)
 {
 	return store->directory;
+}
+
+int store_check_directory(const struct store *store, struct error *err)
+{
+	struct stat status;
+
+	if (stat(store->directory, &status) != 0)
+		return error_set_errno(err, errno, "state directory");
+	if (status.st_dev != store->device || status.st_ino != store->inode)
+		return error_set(err, ERR_IO, "state directory: another one is in its place");
+	return 0;
 }
 
 /* ---- the disk ---- */

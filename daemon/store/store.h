@@ -61,6 +61,11 @@ int store_open(const char *directory, const struct store_hooks *hooks, struct st
 void store_close(struct store *store); /* NULL is fine; all references must be back */
 /* The path that was given to store_open; lives as long as the store. */
 const char *store_directory(const struct store *store);
+/*
+ * ERR_IO where that path is not the directory that was opened any more: it was moved or removed, or its disk is gone.
+ * Any thread.
+ */
+int store_check_directory(const struct store *store, struct error *err);
 
 /* Any thread. Does nothing unless err is of a sync that failed (ERR_SYNC); then the store has failed, see above. */
 void store_distrust(struct store *store, const struct error *err);

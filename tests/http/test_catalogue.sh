@@ -96,6 +96,40 @@ test_an_older_catalogue_loses_nothing_and_brings_nothing_back() {
 	stop_daemon
 }
 
+# The disk is unmounted, or somebody moves the directory: nothing is acknowledged, and whoever watches the service knows.
+test_a_state_directory_that_is_gone_is_told() {
+	made
+	mv "$state" "$work/moved"
+	req GET /readyz
+	expect_problem 503
+	expect_json '.detail | test("state directory")'
+	mkdir "$state"
+	req GET /readyz
+	expect_problem 503
+	rmdir "$state"
+	mv "$work/moved" "$state"
+	expect_ready ""
+	# Of the kept volumes: a page goes on behind one that is there.
+	req GET "/v1/jobs/$job/volumes?limit=1"
+	req GET "/v1/jobs/$job/volumes?after=$(json .next)"
+	expect_json '[.volumes[].name] == ["fdk"]'
+	req GET "/v1/jobs/$job/volumes?after=fdk"
+	expect_json '.volumes == [] and .next == null'
+	for name in nope iter-9; do
+		req GET "/v1/jobs/$job/volumes?after=$name"
+		expect_problem 400
+		req GET "/plain/$job?volume=$name"
+		expect_problem 404
+	done
+	for window in 3 -1 x; do
+		req GET "/plain/$job?window=$window"
+		expect_problem 400
+	done
+	req GET "/plain/$job?window=2&volume=fdk"
+	expect_status 200
+	stop_daemon
+}
+
 # Somebody deletes by mistake and puts the directories back from a backup: they are there again, also after a restart,
 # and can be deleted like any others. What an earlier version has deleted is kept aside.
 test_what_is_put_back_after_a_deletion_is_kept() {
@@ -189,6 +223,11 @@ test_the_catalogue_is_made_again_when_asked() {
 	fi
 	grep -q "in use by another" "$work/rebuilt" || fail "why: $(cat "$work/rebuilt")"
 	stop_daemon
+	if "$BUILD/cbctd" --state-dir "$work/staet" --rebuild-catalogue >"$work/rebuilt" 2>&1; then
+		fail "a refusal where there is nothing"
+	fi
+	grep -q "is no state directory" "$work/rebuilt" || fail "why: $(cat "$work/rebuilt")"
+	[ ! -e "$work/staet" ] || fail "a directory that was not there, still not there"
 	"$BUILD/cbctd" --state-dir "$state" --rebuild-catalogue >"$work/rebuilt"
 	grep -q "has 1 scans and 1 jobs again; 0 " "$work/rebuilt" || fail "what was made: $(cat "$work/rebuilt")"
 	start_daemon

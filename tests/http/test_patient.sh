@@ -207,13 +207,32 @@ test_what_is_no_position_and_no_rigid_transform_is_refused() {
 	need_nibabel
 	start_daemon
 	refused 400 /patient/position '{"position": "supine"}'
-	refused 400 /patient/position '{}'
 	refused 400 /patient/world_to_patient '{"position": "HFS", "world_to_patient": [1,0,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1]}'
 	refused 400 /patient/world_to_patient '{"world_to_patient": [1,0,0, 0,1,0, 0,0,1]}'
 	refused 422 /patient/world_to_patient '{"world_to_patient": [-1,0,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1]}'
 	expect_json '.detail | contains("mirror")'
 	refused 422 /patient/world_to_patient '{"world_to_patient": [1,0.1,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1]}'
 	refused 422 /patient/world_to_patient '{"world_to_patient": [1,0,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,2]}'
+}
+
+# As of a console that always sends its fields, of somebody whom nobody knows yet.
+test_a_patient_of_whom_nothing_is_told_is_none() {
+	local patient
+	need_nibabel
+	start_daemon
+	for patient in '{"name": "", "id": "", "birth_date": "", "sex": ""}' '{"sex": null, "id": null}' '{"position": null, "name": null}' '{}'; do
+		req POST /v1/scans -H 'Content-Type: application/json' --data-binary "$(jq -c --argjson patient "$patient" '.patient = $patient' "$work/scan/scan.json")"
+		expect_status 201
+		expect_json '.patient == null and .axes == null'
+	done
+	req POST /v1/scans -H 'Content-Type: application/json' --data-binary "$(jq -c '.patient = {position: "FFS", name: "", id: ""}' "$work/scan/scan.json")"
+	expect_status 201
+	expect_json '.patient.position == "FFS" and .axes.z == "I"'
+	# A name has no control characters, the second block of them included.
+	for name in '\u007f' 'a\u0085b' '\u009f'; do
+		req POST /v1/scans -H 'Content-Type: application/json' --data-binary "$(jq -c ".name = \"$name\"" "$work/scan/scan.json")"
+		expect_problem 400 /name
+	done
 }
 
 test_recon_without_a_daemon_and_the_tools_know_the_sides() {

@@ -177,8 +177,25 @@ test_digest_is_checked_and_a_wrong_one_stores_nothing() {
 	expect_status 201
 	req GET "/v1/scans/$scan"
 	expect_json '.received == [[0, 1]]'
-	put /2-3 -H "Content-Digest: sha-256=oops" -T "$work/a"
-	expect_problem 400
+	# What is no dictionary of digests (RFC 8941, RFC 9530) is refused, not passed over.
+	local field
+	for field in "sha-256=oops" "sha-256=$wrong" "SHA-256=:$right:" "sha-256 = :$right:" "sha-256=:$right" "sha-256=\"$right\"" xx "sha-256" \
+		"sha-256=:$right:," "sha-256=:$right: x=:AAAA:" "sha-512=(:AAAA:)" "sha-512=:AAAA:, sha-256=:short:" "sha-256=:$right:;=1" "?"; do
+		put /2-3 -H "Content-Digest: $field" -T "$work/a"
+		expect_problem 400
+	done
+	for field in "sha-256=:$wrong:;x=1" "sha-512=:AAAA:, sha-256=:$wrong:" "sha-256=:$right:,sha-256=:$wrong:"; do
+		put /2-3 -H "Content-Digest: $field" -T "$work/a"
+		expect_problem 400
+		expect_json '.detail | test("does not fit")'
+	done
+	# Other algorithms are ignored.
+	put /2-3 -H "Content-Digest: sha-512=:AAAA:;why=\"a\\\"b\";n , *x=:AA==:" -T "$work/a"
+	expect_status 201
+	put /2-3 -H "Content-Digest: sha-512=:AAAA:, sha-256=:$right:" -T "$work/a"
+	expect_status 200
+	put /2-3 -H "Content-Digest;" -T "$work/a"
+	expect_status 200
 }
 
 test_a_broken_connection_keeps_the_whole_projections_before_it() {
