@@ -8,12 +8,13 @@
 int calibration_post(void *context, struct request *request, struct error *err)
 {
 	struct api *api = context;
-	char id[ID_SIZE];
+	char id[ID_SIZE], client[CLIENT_SIZE];
 	cJSON *document;
 	size_t length;
 	const char *text = request_body(request, &length);
 
-	if (calibrations_post(api->calibrations, text, length, id, err) != 0 ||
+	request_client(request, client);
+	if (calibrations_post(api->calibrations, client, text, length, id, err) != 0 ||
 	    calibration_document(api->calibrations, id, false, &document, NULL, err) != 0 ||
 	    request_reply_json(request, 202, document, err) != 0)
 		return err->code;

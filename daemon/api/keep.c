@@ -127,6 +127,7 @@ static void look(struct keeper *keeper)
 		return;
 	look_at_jobs(keeper, now);
 	look_at_scans(keeper, now);
+	calibrations_expire(keeper->api->calibrations, now - keeper->seconds);
 }
 
 static void *keep(void *context)

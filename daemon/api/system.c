@@ -119,11 +119,11 @@ int limits_get(void *context, struct request *request, struct error *err)
 	request_client(request, client);
 	cJSON_AddStringToObject(document, "client", client);
 	part = cJSON_AddObjectToObject(document, "own");
-	add_limit(part, "jobs", (double)jobs_open_count(api->jobs, client), (double)limits->client_jobs);
+	add_limit(part, "jobs", (double)store_unended(api->store, client), (double)limits->client_jobs);
 	add_limit(part, "scans", (double)store_scans_of(api->store, client), (double)limits->client_scans);
 	add_limit(part, "bytes", (double)store_bytes(api->store, client), (double)limits->client_bytes);
 	part = cJSON_AddObjectToObject(document, "all");
-	add_limit(part, "jobs", (double)jobs_open_count(api->jobs, NULL), (double)limits->jobs);
+	add_limit(part, "jobs", (double)store_unended(api->store, NULL), (double)limits->jobs);
 	add_limit(part, "bytes", (double)store_bytes(api->store, NULL), (double)limits->bytes);
 	if (limits->bytes > 0)
 		cJSON_AddNumberToObject(part, "reserve", (double)(limits->bytes - store_volumes_most(limits)));

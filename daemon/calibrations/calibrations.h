@@ -34,10 +34,13 @@ void calibrations_close(struct calibrations *calibrations);
 
 /*
  * Reads the body of POST /v1/calibrations and takes it up; on the disk when this returns. ERR_NOT_FOUND: no such scan;
- * ERR_CONFLICT: the scan lacks projections or air; ERR_INVALID, ERR_IMPOSSIBLE: the phantom.
+ * ERR_CONFLICT: the scan lacks projections or air; ERR_INVALID, ERR_IMPOSSIBLE: the phantom;
+ * ERR_LIMIT, ERR_BUSY, ERR_QUOTA: a limit of jobs, among which it counts, or of bytes.
  */
-int calibrations_post(struct calibrations *calibrations, const char *text, size_t length, char ret_id[ID_SIZE],
-		      struct error *err);
+int calibrations_post(struct calibrations *calibrations, const char *client, const char *text, size_t length,
+		      char ret_id[ID_SIZE], struct error *err);
+/* Removes those that have failed before that time; others stay, since scans of months to come use them. */
+void calibrations_expire(struct calibrations *calibrations, double before);
 /* ERR_CONFLICT while a calibration of this scan waits or is being made; otherwise 0. */
 int calibrations_check_scan(struct calibrations *calibrations, const char *scan, struct error *err);
 /* ERR_NOT_FOUND. One that is being made is stopped. */

@@ -146,6 +146,7 @@ cJSON *calibration_brief(const char *id, const cJSON *request, const cJSON *resu
 	snprintf(href, sizeof(href), "/v1/calibrations/%s", id);
 	cJSON_AddStringToObject(document, "id", id);
 	cJSON_AddStringToObject(document, "href", href);
+	add_copy(document, "client", request);
 	add_copy(document, "arm", request);
 	add_copy(document, "scan", request);
 	json_add_time(document, "created", number_of(request, "created"));

@@ -15,8 +15,10 @@ extern const char *const calibration_state_names[];
 struct entry {
 	char id[ID_SIZE], scan[ID_SIZE];
 	enum calibration_state state;
-	double acquired; /* seconds since 1970 */
-	cJSON *brief;    /* all of the brief document but state and age, owned */
+	double acquired, ended; /* seconds since 1970 */
+	char client[STORE_CLIENT_SIZE];
+	unsigned long long bytes; /* of its files */
+	cJSON *brief;             /* all of the brief document but state and age, owned */
 };
 
 struct calibrations {

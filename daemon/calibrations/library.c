@@ -4,6 +4,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/eventfd.h>
+#include <sys/stat.h>
 #include <unistd.h>
 
 #include "daemon/calibrations/internal.h"
@@ -102,6 +103,66 @@ int calibration_read(struct calibrations *calibrations, const char *id, cJSON **
 	return 0;
 }
 
+/* ---- limits ---- */
+
+static bool is_of(const struct entry *entry, const char *client)
+{
+	return client == NULL || strcmp(entry->client, client) == 0;
+}
+
+static unsigned long long bytes_of(void *context, const char *client)
+{
+	struct calibrations *calibrations = context;
+	unsigned long long sum = 0;
+
+	pthread_mutex_lock(&calibrations->lock);
+	for (int i = 0; i < calibrations->count; i++)
+		sum += is_of(&calibrations->entries[i], client) ? calibrations->entries[i].bytes : 0;
+	pthread_mutex_unlock(&calibrations->lock);
+	return sum;
+}
+
+static bool has_ended(const struct entry *entry)
+{
+	return entry->state == CALIBRATION_SUCCEEDED || entry->state == CALIBRATION_FAILED;
+}
+
+static long unended_of(void *context, const char *client)
+{
+	struct calibrations *calibrations = context;
+	long count = 0;
+
+	pthread_mutex_lock(&calibrations->lock);
+	for (int i = 0; i < calibrations->count; i++)
+		count += is_of(&calibrations->entries[i], client) && !has_ended(&calibrations->entries[i]);
+	pthread_mutex_unlock(&calibrations->lock);
+	return count;
+}
+
+void calibrations_expire(struct calibrations *calibrations, double before)
+{
+	char id[ID_SIZE];
+	struct error err;
+	bool found;
+
+	do {
+		found = false;
+		pthread_mutex_lock(&calibrations->lock);
+		for (int i = 0; i < calibrations->count && !found; i++) {
+			const struct entry *entry = &calibrations->entries[i];
+
+			found = entry->state == CALIBRATION_FAILED && entry->ended > 0 && entry->ended < before;
+			if (found)
+				memcpy(id, entry->id, sizeof(id));
+		}
+		pthread_mutex_unlock(&calibrations->lock);
+		if (found && calibrations_delete(calibrations, id, &err) != 0) {
+			log_line(LEVEL_WARNING, "calibration %s stays: %s", id, err.text);
+			return;
+		}
+	} while (found);
+}
+
 /* ---- the start ---- */
 
 /* The error of a result; code 0 where there is none. */
@@ -121,11 +182,20 @@ static void read_failure(const cJSON *result, struct error *ret_failure)
 		 cJSON_IsString(pointer) ? pointer->valuestring : "");
 }
 
+static unsigned long long file_bytes(const struct calibrations *calibrations, const char *id, const char *file)
+{
+	char path[1024];
+	struct stat status;
+
+	calibration_path(calibrations, id, file, path);
+	return stat(path, &status) == 0 ? (unsigned long long)status.st_size : 0;
+}
+
 int calibration_load(struct calibrations *calibrations, const char *id, struct entry *ret_entry, struct error *err)
 {
 	cJSON *request = NULL, *result = NULL;
 	struct entry entry = {.state = CALIBRATION_QUEUED};
-	const cJSON *scan, *acquired;
+	const cJSON *scan, *acquired, *client, *ended;
 	struct error failure;
 	int code = calibration_read(calibrations, id, &request, &result, err);
 
@@ -141,6 +211,12 @@ int calibration_load(struct calibrations *calibrations, const char *id, struct e
 	}
 	snprintf(entry.scan, sizeof(entry.scan), "%s", scan->valuestring);
 	entry.acquired = acquired->valuedouble;
+	client = cJSON_GetObjectItemCaseSensitive(request, "client"); /* older ones have none */
+	snprintf(entry.client, sizeof(entry.client), "%s", cJSON_IsString(client) ? client->valuestring : "");
+	ended = cJSON_GetObjectItemCaseSensitive(result, "ended");
+	entry.ended = cJSON_IsNumber(ended) ? ended->valuedouble : 0;
+	entry.bytes =
+	    file_bytes(calibrations, id, CALIBRATION_REQUEST) + file_bytes(calibrations, id, CALIBRATION_RESULT);
 	if (result != NULL)
 		entry.state = failure.code == 0 ? CALIBRATION_SUCCEEDED : CALIBRATION_FAILED;
 	entry.brief = calibration_brief(id, request, result, &failure);
@@ -197,6 +273,7 @@ int calibrations_open(struct store *store, const struct calibrations_options *op
 	else
 		worker_path(calibrations->worker, sizeof(calibrations->worker));
 	lock_init(&calibrations->lock, LOCK_CALIBRATED);
+	store_count(store, &(struct store_counter){bytes_of, unended_of, calibrations});
 	watch_list_init(&calibrations->watchers);
 	calibrations->wake = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
 	code = calibrations->wake < 0 ? error_set_errno(err, errno, "library of calibrations") : 0;
@@ -333,8 +410,8 @@ static int make_directory(struct calibrations *calibrations, const char *id, con
 	return code;
 }
 
-int calibrations_post(struct calibrations *calibrations, const char *text, size_t length, char ret_id[ID_SIZE],
-		      struct error *err)
+int calibrations_post(struct calibrations *calibrations, const char *client, const char *text, size_t length,
+		      char ret_id[ID_SIZE], struct error *err)
 {
 	cJSON *body = NULL, *request = cJSON_CreateObject();
 	char scan[64] = "", id[ID_SIZE];
@@ -345,6 +422,11 @@ int calibrations_post(struct calibrations *calibrations, const char *text, size_
 		code = read_body(body, scan, request, err);
 	if (code == 0)
 		code = add_scan(calibrations, scan, request, err);
+	cJSON_AddStringToObject(request, "client", client);
+	if (code == 0)
+		code = store_check_unended(calibrations->store, client, err);
+	if (code == 0)
+		code = store_check_bytes(calibrations->store, client, length, err);
 	if (code == 0)
 		code = id_make(id, err);
 	if (code == 0)
@@ -435,7 +517,7 @@ int calibration_document(struct calibrations *calibrations, const char *id, bool
 	entry = calibration_entry(calibrations, id);
 	if (entry != NULL) {
 		document = copy_brief(entry);
-		ended = entry->state == CALIBRATION_SUCCEEDED || entry->state == CALIBRATION_FAILED;
+		ended = has_ended(entry);
 	}
 	pthread_mutex_unlock(&calibrations->lock);
 	if (entry == NULL)

@@ -11,6 +11,7 @@
 
 #include "daemon/calibrations/internal.h"
 #include "daemon/log.h"
+#include "proto/clock.h"
 
 void calibrator_wake(struct calibrations *calibrations)
 {
@@ -114,12 +115,15 @@ static void settle(struct calibrations *calibrations, const char *id, int code, 
 		 code != 0 ? ": " : "", code != 0 ? failure.text : "");
 	pthread_mutex_lock(&calibrations->lock);
 	entry = calibration_entry(calibrations, id);
-	if (entry != NULL)
+	if (entry != NULL) {
 		entry->state = CALIBRATION_FAILED;
+		entry->ended = loaded.ended > 0 ? loaded.ended : clock_realtime();
+	}
 	if (entry != NULL && loaded.brief != NULL) {
 		cJSON_Delete(entry->brief);
 		entry->brief = loaded.brief;
 		entry->state = loaded.state;
+		entry->bytes = loaded.bytes > 0 ? loaded.bytes : entry->bytes;
 		loaded.brief = NULL;
 	}
 	pthread_mutex_unlock(&calibrations->lock);

@@ -92,6 +92,7 @@ unsigned long long job_bytes_wanted(const struct job_request *request);
 /* An ended job's bytes are those that it has left. */
 int job_count_bytes(struct job *job, struct error *err);
 unsigned long long jobs_bytes(void *jobs, const char *client);
+long jobs_unended(void *jobs, const char *client);
 
 /* Wakes those who watch the job or all jobs; no lock is held. */
 void job_wake(struct job *job);

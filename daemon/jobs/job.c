@@ -283,7 +283,7 @@ static int load_jobs(struct jobs *jobs, struct error *err)
 	for (int i = 0; i < jobs->count && code == 0; i++)
 		code = recover(jobs->all[i], err);
 	pthread_mutex_unlock(&jobs->change);
-	store_count_volumes(jobs->store, jobs_bytes, jobs);
+	store_count(jobs->store, &(struct store_counter){jobs_bytes, jobs_unended, jobs});
 	return code;
 }
 

@@ -118,9 +118,6 @@ int job_queue_position(struct job *job);
 /* Seconds to go, or negative when nobody can know. */
 double job_eta(struct job *job);
 
-/* Jobs of a client, or (NULL) of all, that have not ended. */
-long jobs_open_count(struct jobs *jobs, const char *client);
-
 struct jobs_statistics {
 	/* Now; the age, s, is that of the job that was posted first, 0 where there is none. */
 	long count[JOB_STATE_COUNT][PRIORITY_COUNT];

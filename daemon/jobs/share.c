@@ -122,8 +122,9 @@ unsigned long long jobs_bytes(void *context, const char *client)
 	return sum;
 }
 
-long jobs_open_count(struct jobs *jobs, const char *client)
+long jobs_unended(void *context, const char *client)
 {
+	struct jobs *jobs = context;
 	long count = 0;
 
 	pthread_mutex_lock(&jobs->lock);
@@ -136,15 +137,10 @@ long jobs_open_count(struct jobs *jobs, const char *client)
 
 int jobs_check_limits(struct jobs *jobs, const struct job *job, struct error *err)
 {
-	const struct store_limits *limits = store_limits(jobs->store);
 	const char *client = job->record.client;
-	const long own = jobs_open_count(jobs, client), all = jobs_open_count(jobs, NULL);
 
-	if (limits->client_jobs > 0 && own >= limits->client_jobs)
-		return error_set(err, ERR_LIMIT, "jobs of %.60s that have not ended: %ld; one client may have %ld",
-				 client, own, limits->client_jobs);
-	if (limits->jobs > 0 && all >= limits->jobs)
-		return error_set(err, ERR_BUSY, "jobs that have not ended: %ld; there may be %ld", all, limits->jobs);
+	if (store_check_unended(jobs->store, client, err) != 0)
+		return err->code;
 	return store_check_volumes(jobs->store, client, job->kept_bytes, err);
 }
 
@@ -184,7 +180,7 @@ static double idle_seconds(struct jobs *jobs, const struct job *job, double crea
 /* A reference to the job that has waited longest of those that may give their place; NULL: none. */
 static struct job *find_idle(struct jobs *jobs, const char *client, double *ret_idle)
 {
-	const long own = jobs_open_count(jobs, client);
+	const long own = jobs_unended(jobs, client);
 	struct job *longest = NULL;
 	double most = store_limits(jobs->store)->job_patience;
 
@@ -203,7 +199,7 @@ static struct job *find_idle(struct jobs *jobs, const char *client, double *ret_
 		if (job == NULL)
 			break;
 		idle = idle_seconds(jobs, job, created);
-		if (idle >= most && (is_of(job, client) || jobs_open_count(jobs, job->client->name) >= own)) {
+		if (idle >= most && (is_of(job, client) || jobs_unended(jobs, job->client->name) >= own)) {
 			job_release(longest);
 			longest = job;
 			most = *ret_idle = idle;
@@ -225,7 +221,7 @@ bool jobs_make_place(struct jobs *jobs, const struct job *job, struct job **ret_
 	int code;
 
 	/* Nobody goes for a job that finds no place all the same. */
-	if (limits->jobs == 0 || jobs_open_count(jobs, NULL) < limits->jobs ||
+	if (limits->jobs == 0 || store_unended(jobs->store, NULL) < limits->jobs ||
 	    store_check_volumes(jobs->store, job->record.client, job->kept_bytes, &err) != 0)
 		return false;
 	idle = find_idle(jobs, job->record.client, &seconds);

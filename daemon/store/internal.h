@@ -24,8 +24,8 @@ struct store {
 	char directory[900]; /* constant, as hooks */
 	struct store_hooks hooks;
 	struct store_limits limits; /* constant after the start, as the next two */
-	unsigned long long (*volumes_bytes)(void *context, const char *client);
-	void *volumes_context;
+	struct store_counter counters[STORE_COUNTERS];
+	int counter_count;
 	int lock_file;
 	dev_t device; /* of the directory, constant, as the next */
 	ino_t inode;

@@ -20,11 +20,40 @@ const struct store_limits *store_limits(const struct store *store)
 	return &store->limits;
 }
 
-void store_count_volumes(struct store *store, unsigned long long (*bytes)(void *context, const char *client),
-			 void *context)
+void store_count(struct store *store, const struct store_counter *counter)
 {
-	store->volumes_bytes = bytes;
-	store->volumes_context = context;
+	store->counters[store->counter_count++] = *counter;
+}
+
+static unsigned long long counted_bytes(const struct store *store, const char *client)
+{
+	unsigned long long sum = 0;
+
+	for (int i = 0; i < store->counter_count; i++)
+		sum += store->counters[i].bytes(store->counters[i].context, client);
+	return sum;
+}
+
+long store_unended(struct store *store, const char *client)
+{
+	long sum = 0;
+
+	for (int i = 0; i < store->counter_count; i++)
+		sum += store->counters[i].unended(store->counters[i].context, client);
+	return sum;
+}
+
+int store_check_unended(struct store *store, const char *client, struct error *err)
+{
+	const struct store_limits *limits = &store->limits;
+	const long own = store_unended(store, client), all = store_unended(store, NULL);
+
+	if (limits->client_jobs > 0 && own >= limits->client_jobs)
+		return error_set(err, ERR_LIMIT, "jobs of %.60s that have not ended: %ld; one client may have %ld",
+				 client, own, limits->client_jobs);
+	if (limits->jobs > 0 && all >= limits->jobs)
+		return error_set(err, ERR_BUSY, "jobs that have not ended: %ld; there may be %ld", all, limits->jobs);
+	return 0;
 }
 
 unsigned long long store_volumes_most(const struct store_limits *limits)
@@ -62,8 +91,7 @@ static unsigned long long room_of(struct stored_scan *scan)
 
 unsigned long long store_bytes(struct store *store, const char *client)
 {
-	unsigned long long sum =
-	    store->volumes_bytes != NULL ? store->volumes_bytes(store->volumes_context, client) : 0;
+	unsigned long long sum = counted_bytes(store, client);
 
 	pthread_mutex_lock(&store->scans_lock);
 	for (int i = 0; i < store->scan_count; i++) {
@@ -152,10 +180,10 @@ static int count_room(struct stored_scan *scan, struct error *err)
 	bool counted;
 	int code = 0;
 
-	if (store->volumes_bytes != NULL && limits->client_bytes > 0)
-		own = store->volumes_bytes(store->volumes_context, scan->client);
-	if (store->volumes_bytes != NULL && limits->bytes > 0)
-		all = store->volumes_bytes(store->volumes_context, NULL);
+	if (limits->client_bytes > 0)
+		own = counted_bytes(store, scan->client);
+	if (limits->bytes > 0)
+		all = counted_bytes(store, NULL);
 	pthread_mutex_lock(&store->scans_lock);
 	counted = scan->has_room;
 	for (int i = 0; i < store->scan_count && !counted; i++) {
@@ -174,17 +202,24 @@ static int count_room(struct stored_scan *scan, struct error *err)
 	return code;
 }
 
-int store_check_image_room(struct stored_scan *scan, enum image image, struct error *err)
+int store_check_bytes(struct store *store, const char *client, unsigned long long more, struct error *err)
 {
-	struct store *store = scan->store;
 	const struct store_limits *limits = &store->limits;
 	int code = 0;
 
-	/* The image is counted already. */
 	if (limits->client_bytes > 0)
-		code = check_bytes(scan->client, store_bytes(store, scan->client), 0, limits->client_bytes, err);
+		code = check_bytes(client, store_bytes(store, client), more, limits->client_bytes, err);
 	if (code == 0 && limits->bytes > 0)
-		code = check_bytes("the daemon", store_bytes(store, NULL), 0, limits->bytes, err);
+		code = check_bytes("the daemon", store_bytes(store, NULL), more, limits->bytes, err);
+	return code;
+}
+
+int store_check_image_room(struct stored_scan *scan, enum image image, struct error *err)
+{
+	struct store *store = scan->store;
+	/* The image is counted already. */
+	int code = store_check_bytes(store, scan->client, 0, err);
+
 	if (code != 0)
 		error_set(err, code, "the %s of %zu bytes goes beyond a limit of bytes", image_kinds[image].title,
 			  stored_image_bytes(scan, image));

@@ -120,10 +120,22 @@ unsigned long long store_volumes_most(const struct store_limits *limits);
 /* Before the jobs are opened, and before any other thread has the store. */
 void store_set_limits(struct store *store, const struct store_limits *limits);
 const struct store_limits *store_limits(const struct store *store);
-/* The bytes of volumes are known to the owner of the jobs: of a client, or (NULL) of all. Set once, at the start. */
-void store_count_volumes(struct store *store, unsigned long long (*bytes)(void *context, const char *client),
-			 void *context);
-/* Bytes of scans that have room on the disk, of images, and of volumes. client NULL: all. */
+/* What the owner of jobs, and that of calibrations, have of a client, or (NULL) of all. */
+struct store_counter {
+	unsigned long long (*bytes)(void *context, const char *client); /* of volumes, of calibrations */
+	long (*unended)(void *context, const char *client);
+	void *context;
+};
+enum { STORE_COUNTERS = 2 };
+/* At the start, before any other thread has the store. */
+void store_count(struct store *store, const struct store_counter *counter);
+/* Jobs and calibrations that have not ended. client NULL: all. */
+long store_unended(struct store *store, const char *client);
+/* ERR_LIMIT, ERR_BUSY: the client, or all together, have as many of these as they may have. */
+int store_check_unended(struct store *store, const char *client, struct error *err);
+/* ERR_QUOTA when a limit has no room for that many bytes more of the client. */
+int store_check_bytes(struct store *store, const char *client, unsigned long long more, struct error *err);
+/* Bytes of scans that have room on the disk, of images, volumes and calibrations. client NULL: all. */
 unsigned long long store_bytes(struct store *store, const char *client);
 long store_scans_of(struct store *store, const char *client);
 /*

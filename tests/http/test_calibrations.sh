@@ -100,6 +100,48 @@ test_a_sagging_arm_is_calibrated_and_its_scans_use_it() {
 	stop_daemon
 }
 
+test_they_count_among_the_jobs_and_the_bytes() {
+	local phantom='{"kind": "circles", "balls": 12, "diameter_mm": 110, "distance_mm": 90, "ball_mm": 3.2, "shift_deg": 15}' before ask
+	rm -rf "$state"
+	start_daemon --client-jobs 1 --keep 2
+	balls
+	ask="{\"scan\": \"$balls\", \"phantom\": $phantom}"
+	req GET /v1/limits
+	before=$(json .own.bytes.used)
+	req POST /v1/calibrations "${json[@]}" "$ask"
+	expect_status 202
+	expect_json '.client == "127.0.0.1"'
+	calibration=$(json .id)
+	req POST /v1/calibrations "${json[@]}" "$ask"
+	expect_problem 429
+	expect_json '.detail | contains("jobs of 127.0.0.1 that have not ended: 1; one client may have 1")'
+	req POST /v1/jobs "${json[@]}" "{\"scan\": \"$balls\"}"
+	expect_problem 429
+	req GET "/v1/calibrations/$calibration?wait=60"
+	expect_json '.state == "succeeded"'
+	req GET /v1/limits
+	expect_json ".own.jobs.used == 0 and .own.bytes.used > $before + 1000"
+	before=$(json .own.bytes.used)
+	# One that fails goes for its age, one that succeeded does not. What is there is counted again.
+	req POST /v1/calibrations "${json[@]}" "{\"scan\": \"$balls\", \"phantom\": {\"kind\": \"circles\", \"balls\": 12, \"diameter_mm\": 40, \"distance_mm\": 20, \"ball_mm\": 9, \"shift_deg\": 15}}"
+	expect_status 202
+	req GET "$(header location)?wait=60"
+	expect_json '.state == "failed"'
+	stop_daemon
+	start_daemon --keep 2 --client-bytes $((before + 100))
+	for _ in $(seq 100); do
+		req GET /v1/calibrations
+		[ "$(json '.calibrations | length')" != 1 ] || break
+		sleep 0.2
+	done
+	expect_json ".calibrations | length == 1 and .[0].id == \"$calibration\""
+	req GET /v1/limits
+	expect_json ".own.bytes.used == $before"
+	req POST /v1/calibrations "${json[@]}" "$ask"
+	expect_problem 507
+	stop_daemon
+}
+
 test_what_does_not_fit_is_told() {
 	start_daemon
 	balls
