@@ -63,7 +63,7 @@ declare -A doors=(
 	[core/scan]="geometry|grid|image|orbit|phantom"
 	[core/cpu]="none"
 	[core/correct]="averaging|correction|images|input|stuck"
-	[core/recon]="algorithm|parameters|recipe|recon|self_test"
+	[core/recon]="algorithm|parameters|quality|recipe|recon|self_test"
 )
 door() { echo "$1/(${doors[$1]:-$(basename "$1")})\.h"; }
 for top in core daemon; do

@@ -133,6 +133,35 @@ static int hash_volume(const char *path, const struct volume_record *volume, con
 	return code;
 }
 
+/* What the slices in the middle show. The file has just been held against its checksums. */
+static int measure_quality(const char *path, const struct volume_record *volume, double mu_water,
+			   struct volume_quality *ret_quality, struct error *err)
+{
+	struct grid grid = volume->grid;
+	const size_t slice = (size_t)grid.size[0] * (size_t)grid.size[1] * sizeof(float);
+	int file = open(path, O_RDONLY | O_CLOEXEC), first, code;
+	float *slices;
+	size_t start;
+
+	if (file < 0)
+		return error_set_errno(err, errno, "%s cannot be opened", path);
+	if (grid.size[2] > QUALITY_SLICES)
+		grid.size[2] = QUALITY_SLICES;
+	first = (volume->grid.size[2] - grid.size[2]) / 2;
+	slices = malloc(slice * (size_t)grid.size[2]);
+	code = slices == NULL ? error_set_errno(err, ENOMEM, "slices") : 0;
+	if (code == 0)
+		code = volume_own_start(file, path, &volume->grid, &start, err);
+	if (code == 0)
+		code =
+		    file_read_at(file, slices, slice * (size_t)grid.size[2], start + slice * (size_t)first, path, err);
+	if (code == 0)
+		code = quality_of_slices(slices, &grid, mu_water, ret_quality, err);
+	free(slices);
+	close(file);
+	return code;
+}
+
 static bool same_file(const char *a, const char *b)
 {
 	struct stat of_a, of_b;
@@ -151,6 +180,7 @@ static bool copy_digest(struct store *store, const char *job, const struct volum
 		store_volume_path(store, job, volumes[i].name, other);
 		if (volumes[i].hashed && same_file(path, other)) {
 			memcpy(volume->sha256, volumes[i].sha256, sizeof(volume->sha256));
+			volume->quality = volumes[i].quality;
 			return true;
 		}
 	}
@@ -167,8 +197,11 @@ static int make_digest(struct digester *digester, struct job *job, const struct 
 
 	job_facts(job, &facts);
 	store_volume_path(store, facts.id, volume->name, path);
-	if (!copy_digest(store, facts.id, volumes, count, volume))
+	if (!copy_digest(store, facts.id, volumes, count, volume)) {
 		code = hash_volume(path, volume, &digester->stop, volume->sha256, err);
+		if (code == 0)
+			code = measure_quality(path, volume, facts.mu_water, &volume->quality, err);
+	}
 	/* The volume was settled when it was announced; but it may have been made again since. */
 	if (code == 0)
 		code = durable_settle_named(path, err);
@@ -270,6 +303,7 @@ static void *digest_loop(void *context)
 
 	/* The priority is that of this thread alone; a failure is no trouble. */
 	setpriority(PRIO_PROCESS, (id_t)gettid(), NICENESS);
+	backend_host_threads(1); /* of this thread's own */
 	pthread_mutex_lock(&digester->lock);
 	while (!atomic_load(&digester->stop)) {
 		bool done;

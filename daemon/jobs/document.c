@@ -57,6 +57,24 @@ cJSON *stop_document(const struct recon_stop *stop)
 	return document;
 }
 
+static void add_quality(cJSON *document, const struct volume_quality *quality)
+{
+	const struct {
+		const char *name;
+		double value;
+	} members[] = {{"noise_hu", quality->noise_hu},
+		       {"streak_hu", quality->streak_hu},
+		       {"ring_hu", quality->ring_hu},
+		       {"edge_mm", quality->edge_mm}};
+	cJSON *object = cJSON_AddObjectToObject(document, "quality");
+
+	for (size_t i = 0; i < sizeof(members) / sizeof(members[0]); i++)
+		if (isfinite(members[i].value))
+			cJSON_AddNumberToObject(object, members[i].name, members[i].value);
+		else
+			cJSON_AddNullToObject(object, members[i].name);
+}
+
 cJSON *volume_document(const char *job, const struct volume_record *volume)
 {
 	cJSON *document = cJSON_CreateObject(), *statistics;
@@ -87,6 +105,8 @@ cJSON *volume_document(const char *job, const struct volume_record *volume)
 	if (volume->estimate_mm > 0)
 		cJSON_AddNumberToObject(cJSON_AddObjectToObject(document, "metal"), "estimate_within_mm",
 					volume->estimate_mm);
+	if (volume->hashed)
+		add_quality(document, &volume->quality);
 	json_add_time(document, "created", volume->created);
 	return document;
 }

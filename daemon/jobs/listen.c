@@ -1,5 +1,6 @@
 /* Messages from the workers and to them (proto/message.h). */
 #include <errno.h>
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -69,7 +70,8 @@ static int add_volume(struct worker *worker, const struct message *message, stru
 				       .grid = message->grid,
 				       .bytes = message->bytes,
 				       .norms = message->norms,
-				       .estimate_mm = message->estimate_mm};
+				       .estimate_mm = message->estimate_mm,
+				       .quality = {NAN, NAN, NAN, NAN}};
 
 	snprintf(volume.name, sizeof(volume.name), "%s", message->name);
 	snprintf(volume.stage, sizeof(volume.stage), "%s", message->volume_stage);

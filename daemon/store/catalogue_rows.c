@@ -119,14 +119,21 @@ int catalogue_undigested(struct catalogue *catalogue, void (*visit)(void *contex
 int catalogue_set_digest(struct catalogue *catalogue, const char *job, const struct volume_record *volume,
 			 struct error *err)
 {
-	const struct value values[] = {value_bytes(volume->sha256, sizeof(volume->sha256)), value_text(job),
-				       value_text(volume->name), value_real(volume->created)};
+	const struct volume_quality *quality = &volume->quality;
+	const struct value values[] = {value_bytes(volume->sha256, sizeof(volume->sha256)),
+				       value_real(quality->noise_hu),
+				       value_real(quality->streak_hu),
+				       value_real(quality->ring_hu),
+				       value_real(quality->edge_mm),
+				       value_text(job),
+				       value_text(volume->name),
+				       value_real(volume->created)};
 
 	return catalogue_write(
 	    catalogue,
-	    "UPDATE volumes SET sha256 = $1 WHERE job = (SELECT number FROM jobs WHERE id = $2) AND name = $3"
-	    " AND created = $4",
-	    values, 4, err);
+	    "UPDATE volumes SET sha256 = $1, noise_hu = $2, streak_hu = $3, ring_hu = $4, edge_mm = $5"
+	    " WHERE job = (SELECT number FROM jobs WHERE id = $6) AND name = $7 AND created = $8",
+	    values, 8, err);
 }
 
 /* ---- events ---- */

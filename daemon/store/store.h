@@ -5,6 +5,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "core/recon/quality.h"
 #include "core/scan/image.h"
 #include "daemon/id.h"
 #include "daemon/store/quarantine.h"
@@ -406,8 +407,9 @@ struct volume_record {
 	bool hashed;        /* this is known, and its file is on the disk: */
 	uint8_t sha256[32]; /* of the voxels */
 	struct volume_norms norms;
-	double estimate_mm; /* kept_volume's */
-	double created;     /* seconds since 1970; another one when it is made again */
+	double estimate_mm;            /* kept_volume's */
+	struct volume_quality quality; /* known with the digest */
+	double created;                /* seconds since 1970; another one when it is made again */
 };
 
 struct warning_record {

@@ -132,6 +132,10 @@ static const struct column volume_columns[] = {
     {"not_finite", COLUMN_LONG, AT(volume_record, norms.not_finite)},
     {"created", COLUMN_REAL, AT(volume_record, created)},
     {"estimate_mm", COLUMN_REAL, AT(volume_record, estimate_mm), .initial = "0"},
+    {"noise_hu", COLUMN_REAL, AT(volume_record, quality.noise_hu), .nullable = true},
+    {"streak_hu", COLUMN_REAL, AT(volume_record, quality.streak_hu), .nullable = true},
+    {"ring_hu", COLUMN_REAL, AT(volume_record, quality.ring_hu), .nullable = true},
+    {"edge_mm", COLUMN_REAL, AT(volume_record, quality.edge_mm), .nullable = true},
 };
 
 static const struct column history_columns[] = {

@@ -13,7 +13,7 @@
 
 #define SUITES(row)                                                                                                    \
 	row(error) row(geometry) row(orbit) row(filter) row(phantom) row(raw) row(content) row(recon) row(algorithm)   \
-	    row(stopping) row(noise) row(averaging) row(alternation) row(exterior) row(metal) row(stuck)               \
+	    row(stopping) row(quality) row(noise) row(averaging) row(alternation) row(exterior) row(metal) row(stuck)  \
 		row(outofcore) row(study) row(backend) row(json) row(scan) row(recipe) row(parameter) row(format)      \
 		    row(patient) row(subject) row(metaimage) row(rtk_geometry) row(slice) row(sums)                    \
 			row(scan_directory) row(message) row(queue) row(outcome) row(watchdog) row(route) row(lock)    \

@@ -59,11 +59,12 @@ export function newKey() {
 }
 
 /* All volumes of a job, in the order of their making; their digests are not waited for. */
-export async function listVolumes(job, signal) {
+/* wait: seconds for digests and quality, which come behind everything else. */
+export async function listVolumes(job, signal, wait = 0) {
 	const volumes = []
 	let after = null
 	do {
-		const page = await get(`${jobPath(job)}/volumes?limit=1000&wait=0${after ? `&after=${id(after)}` : ''}`, signal)
+		const page = await get(`${jobPath(job)}/volumes?limit=1000&wait=${wait}${after ? `&after=${id(after)}` : ''}`, signal)
 		volumes.push(...page.volumes)
 		after = page.next
 	} while (after)

@@ -1,5 +1,5 @@
 /* A job's page: its volumes as they come, and everything about how they came. */
-import { h, replace, write, throttle, newId, bytes, duration } from './dom.js'
+import { h, replace, write, throttle, newId, bytes, duration, number } from './dom.js'
 import { get, request, jobPath, scanPath, volumePath, listVolumes, watch } from './api.js'
 import { View, planeName, presets, rotationOf } from './view.js'
 import { Measurements } from './measure.js'
@@ -15,6 +15,16 @@ import { reconstructAgain, confirmed, openDialog, pinButton } from './form.js'
 const pollTime = 1500 /* ms: progress and time left are not told as events */
 const swipeReach = 12 /* px to either side of the line */
 const plainLimits = [-3000, 30000] /* HU: beyond, the numbers are no attenuation of a patient */
+
+/* What can be measured without the truth, in a line; rings and streaks where they are seen beside the noise. */
+function qualityText(quality) {
+	if (!quality)
+		return ''
+	const { noise_hu: noise, edge_mm: edge, ring_hu: rings, streak_hu: streaks } = quality
+	const seen = value => value !== null && value > Math.max(3, 0.4 * (noise ?? 0))
+	return [noise !== null && `Noise ${number(noise, 2)} HU`, edge !== null && `edges ${number(edge, 2)} mm wide`,
+		seen(rings) && `rings of ${number(rings, 2)} HU`, seen(streaks) && `streaks of ${number(streaks, 2)} HU`].filter(Boolean).join(', ')
+}
 
 const volumeText = volume => volume.iteration > 0 ? `iteration ${volume.iteration}` : volume.stage === 'tv' ? 'FDK and TV' : 'FDK'
 
@@ -74,6 +84,7 @@ export class JobPage {
 		this.film = new Film()
 		this.sides = h('p', { class: 'sides', hidden: true }, 'Left and right are not known: neither scan nor job says how the patient lies. The letters are those of the table\'s axes.')
 		this.estimate = h('p', { class: 'estimate', hidden: true })
+		this.quality = h('p', { class: 'quality', title: 'Measured in the middle slices: noise in even tissue, the blur across the surface, and rings and streaks beside the noise' })
 		this.controls = h('div', { class: 'controls', hidden: true }, this.#iterationControls(), this.#viewControls(), this.#compareControls())
 		this.warnings = h('div', {})
 		this.failure = h('div', {})
@@ -84,7 +95,7 @@ export class JobPage {
 		this.fileSection = h('section', { class: 'card', hidden: true }, h('h2', {}, 'Downloads'), this.files)
 		this.progress = h('div', { class: 'progress' }, this.bar.element, this.doing, this.left)
 		this.columns = h('div', { class: 'columns' },
-			this.pictures = h('div', { class: 'pictures' }, this.empty, this.stage, this.estimate, this.sides, this.controls),
+			this.pictures = h('div', { class: 'pictures' }, this.empty, this.stage, this.estimate, this.quality, this.sides, this.controls),
 			h('div', { class: 'aside' }, this.warnings, this.tools.section, this.courseSection, this.fileSection,
 				h('section', { class: 'card' }, h('h2', {}, 'Projections'), this.film.element),
 				h('section', { class: 'card' }, h('h2', {}, 'Reconstruction'), this.about),
@@ -183,6 +194,8 @@ export class JobPage {
 			this.refresh()
 			if (kind === 'volume' || kind === 'end')
 				this.refreshVolumes()
+			if (kind === 'end')
+				this.#refreshVolumes(30)
 		}, connected => {
 			this.live(connected)
 			if (connected) { /* what happened before it stood */
@@ -290,9 +303,10 @@ export class JobPage {
 
 	/* ---- volumes ---- */
 
-	async #refreshVolumes() {
+	/* wait: see listVolumes. */
+	async #refreshVolumes(wait = 0) {
 		try {
-			const volumes = await listVolumes(this.id, this.#abort.signal)
+			const volumes = await listVolumes(this.id, this.#abort.signal, wait)
 			if (this.#closed || JSON.stringify(volumes) === JSON.stringify(this.#volumes))
 				return
 			if (this.#volumes.length > 0 && volumes.length > this.#volumes.length)
@@ -381,6 +395,7 @@ export class JobPage {
 		this.viewer.tag.textContent = volume.name
 		this.viewer.setWhat(this.#whatOf(volume))
 		this.tools.show()
+		write(this.quality, qualityText(volume.quality))
 		this.estimate.hidden = !volume.metal
 		write(this.estimate, volume.metal ? `Within ${volume.metal.estimate_within_mm} mm of metal this volume is an estimate: do not measure there.` : '')
 		this.back.disabled = index === 0
