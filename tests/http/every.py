@@ -20,10 +20,10 @@ import struct
 import subprocess
 import sys
 import time
-from typing import Dict, List, Optional, Tuple
+from typing import Dict, List, Optional, Tuple, Union
 
 EIO, EINTR, ENOSPC, EMFILE, ENOMEM = 5, 4, 28, 24, 12
-KINDS = {
+KINDS: Dict[str, List[Union[int, str]]] = {
     "write": [EIO, EINTR, "short"], "pwrite": [EIO, EINTR, "short"], "read": [EIO, EINTR, "short"],
     "pread": [EIO, EINTR, "short"], "fsync": [EIO], "fdatasync": [EIO], "rename": [EIO], "link": [EIO],
     "mmap": [ENOMEM], "fallocate": [ENOSPC, EINTR], "open": [EMFILE, EINTR], "accept": [EMFILE, EINTR],
