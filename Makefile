@@ -256,8 +256,13 @@ soak: setup ## the long tests: faults by the thousand, sweeps over anatomy and n
 FUZZ_SECONDS ?= 10
 fuzzers := $(patsubst tests/fuzz/%.c,$(BUILD)/%,$(wildcard tests/fuzz/fuzz_*.c))
 
-$(BUILD)/fuzz_%: $(BUILD)/tests/fuzz/fuzz_%.o $(call objects,daemon/http/text.c daemon/http/framing.c clients/cbct/numbers.c clients/cbct/npy.c) $(library)
-	$(call say,LINK)$(CC) $(LDFLAGS) -fsanitize=fuzzer -o $@ $^ $(call pkg,--libs,$(files_libs) $(proto_libs) $(core_libs)) $(LIBM)
+# Of these a fuzz target takes what it needs.
+$(BUILD)/fuzzed.a: $(call objects,$(filter-out daemon/main.c clients/cbct/main.c,$(daemon_sources) $(cbct_sources)))
+	@rm -f $@
+	$(call say,AR  )$(AR) qcs $@ $^
+
+$(BUILD)/fuzz_%: $(BUILD)/tests/fuzz/fuzz_%.o $(BUILD)/fuzzed.a $(library)
+	$(call say,LINK)$(CC) $(LDFLAGS) -fsanitize=fuzzer -o $@ $^ $(call pkg,--libs,$(daemon_libs) $(cbct_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
 fuzzers: $(fuzzers)
 

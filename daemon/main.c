@@ -11,6 +11,9 @@
 #include <sys/resource.h>
 #include <unistd.h>
 
+#include <openssl/crypto.h>
+#include <openssl/evp.h>
+
 #include "daemon/api/api.h"
 #include "daemon/cards.h"
 #include "daemon/calibrations/calibrations.h"
@@ -279,6 +282,20 @@ static int wait_for_stop(const sigset_t *stops, struct api *api, const struct ar
 	}
 }
 
+/*
+ * The library of digests prepares itself at its first use, once: where it gets no memory then, it has failed for good,
+ * and crashes where it is used all the same. So that happens here, before there is any work, and is looked at.
+ */
+static int prepare_digests(struct error *err)
+{
+	unsigned char digest[EVP_MAX_MD_SIZE];
+
+	if (OPENSSL_init_crypto(0, NULL) != 1 || OSSL_LIB_CTX_get0_global_default() == NULL ||
+	    EVP_Digest("", 0, digest, NULL, EVP_sha256(), NULL) != 1)
+		return error_set(err, ERR_NO_MEMORY, "no memory for digests");
+	return 0;
+}
+
 static int run(const struct arguments *arguments)
 {
 	const struct config *config = arguments->config;
@@ -292,7 +309,9 @@ static int run(const struct arguments *arguments)
 	notify_open();
 	raise_descriptors();
 	block_signals(&stops);
-	code = start_parts(config, &api, &err);
+	code = prepare_digests(&err);
+	if (code == 0)
+		code = start_parts(config, &api, &err);
 	if (code == 0)
 		code = start_feeder(&api, &feeder, &err);
 	if (code != 0)
@@ -337,7 +356,7 @@ int main(int argc, char **argv)
 	setenv("OMP_WAIT_POLICY", "passive", 0);
 	if (config_load(argc, argv, &config, &action, &err) != 0) {
 		fprintf(stderr, "cbctd: %s\n", err.text);
-		return 2;
+		return err.code == ERR_NO_MEMORY ? 1 : 2; /* with 2 the service manager does not try again */
 	}
 	if (action == CONFIG_HELP)
 		config_help(stdout);

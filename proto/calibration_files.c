@@ -194,11 +194,15 @@ static int read_balls(const cJSON *result, struct calibrated *calibrated, struct
 
 int calibrated_read(const cJSON *request, const cJSON *result, struct calibrated *ret, struct error *err)
 {
-	struct calibrated calibrated = {0};
-	char *text = json_print(cJSON_GetObjectItemCaseSensitive(request, "sweep"), NULL);
+	const cJSON *sweep = cJSON_GetObjectItemCaseSensitive(request, "sweep");
 	const cJSON *acquired = cJSON_GetObjectItemCaseSensitive(request, "acquired");
+	struct calibrated calibrated = {0};
+	char *text;
 	int code;
 
+	if (!cJSON_IsObject(sweep))
+		return error_set(err, ERR_INVALID, "the calibration's request has no scan");
+	text = json_print(sweep, NULL);
 	if (text == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a calibration");
 	calibrated.acquired = cJSON_IsNumber(acquired) ? acquired->valuedouble : 0;

@@ -35,16 +35,22 @@ static void row_pack(const struct history_row *row, double ret[ROW_NUMBERS])
 	ret[4] = row->seconds;
 }
 
-static struct history_row row_unpack(const char *bytes)
+/* False where the row is not of that iteration, or not finite. */
+static bool row_unpack(const char *bytes, int iteration, struct history_row *ret_row)
 {
 	double numbers[ROW_NUMBERS];
 
 	memcpy(numbers, bytes, sizeof(numbers));
-	return (struct history_row){.iteration = (int)numbers[0],
-				    .residual = numbers[1],
-				    .change = numbers[2],
-				    .tv = numbers[3],
-				    .seconds = numbers[4]};
+	for (int i = 0; i < ROW_NUMBERS; i++) {
+		if (!isfinite(numbers[i]))
+			return false;
+	}
+	*ret_row = (struct history_row){.iteration = iteration,
+					.residual = numbers[1],
+					.change = numbers[2],
+					.tv = numbers[3],
+					.seconds = numbers[4]};
+	return numbers[0] == iteration;
 }
 
 int history_add(struct history *history, const struct history_row *row, struct error *err)
@@ -68,9 +74,12 @@ static int read_history(const char *bytes, int count, struct history *history, s
 
 	history->count = 0;
 	for (int i = 0; i < count && code == 0; i++) {
-		const struct history_row row = row_unpack(bytes + (size_t)i * ROW_BYTES);
+		struct history_row row;
 
-		code = history_add(history, &row, err);
+		if (row_unpack(bytes + (size_t)i * ROW_BYTES, i + 1, &row))
+			code = history_add(history, &row, err);
+		else
+			code = error_set(err, ERR_INVALID, "row %d of the history makes no sense", i + 1);
 	}
 	return code;
 }
@@ -418,7 +427,7 @@ static int resume_from(struct recon *recon, const char *path, int latest, struct
 	int file = open(path, O_RDONLY | O_CLOEXEC), code;
 	struct checkpoint_facts facts = {0};
 	struct seal seal = {0};
-	size_t at;
+	size_t at, state;
 	char *bytes = MAP_FAILED;
 
 	if (file < 0 && errno == ENOENT)
@@ -439,20 +448,19 @@ static int resume_from(struct recon *recon, const char *path, int latest, struct
 	if (code == 0 && facts.iteration > latest)
 		code = error_set(err, ERR_INVALID, "%.200s is of iteration %d: a volume of one before that is missing",
 				 path, facts.iteration);
+	at = CHECKPOINT_FILE_OFFSET + grid_voxels(recon_grid(recon)) * sizeof(float);
+	state = recon_state_bytes(recon);
+	if (code == 0)
+		code = read_history(bytes + at + state + facts.metal, facts.rows, history, err);
 	if (code == 0)
 		code = recon_resume(recon, (const float *)(const void *)(bytes + CHECKPOINT_FILE_OFFSET),
 				    facts.iteration, err);
 	if (code == 0)
 		code = recon_resume_noise(recon, &facts.noise, err);
-	at = CHECKPOINT_FILE_OFFSET + grid_voxels(recon_grid(recon)) * sizeof(float);
 	if (code == 0)
-		code = recon_resume_state(recon, bytes + at, recon_state_bytes(recon), err);
-	at += recon_state_bytes(recon);
+		code = recon_resume_state(recon, bytes + at, state, err);
 	if (code == 0 && facts.metal > 0)
-		code = recon_resume_found(recon, bytes + at, facts.metal, err);
-	at += facts.metal;
-	if (code == 0)
-		code = read_history(bytes + at, facts.rows, history, err);
+		code = recon_resume_found(recon, bytes + at + state, facts.metal, err);
 out:
 	if (bytes != MAP_FAILED)
 		munmap(bytes, seal.content);

@@ -24,7 +24,7 @@ int idempotency_read(struct request *request, char ret_text[IDEMPOTENCY_SIZE], s
 		key.text = ret_text;
 	}
 	if (EVP_Digest(body, length, key.digest, NULL, EVP_sha256(), NULL) != 1)
-		return error_set(err, ERR_INTERNAL, "the digest of a request cannot be made");
+		return error_set(err, ERR_NO_MEMORY, "the digest of a request cannot be made");
 	*ret_key = key;
 	return 0;
 }

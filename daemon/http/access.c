@@ -515,7 +515,7 @@ int request_session_open(struct request *request, struct error *err)
 		return error_set_errno(err, errno, "random bits for a session");
 	token_text(random, value);
 	if (!digest_text(value, fresh.cookie))
-		return error_set(err, ERR_INTERNAL, "the digest of a session cannot be made");
+		return error_set(err, ERR_NO_MEMORY, "the digest of a session cannot be made");
 	memcpy(fresh.token, request->who.token, sizeof(fresh.token));
 	pthread_mutex_lock(&access->lock);
 	*session_place(access, fresh.token) = fresh;

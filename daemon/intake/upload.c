@@ -419,7 +419,7 @@ int upload_data(struct upload *upload, const void *data, size_t size, size_t *re
 	int code = consume(upload, data, size, &taken, err);
 
 	if (upload->digest != NULL && EVP_DigestUpdate(upload->digest, data, taken) != 1 && code >= 0)
-		code = error_set(err, ERR_INTERNAL, "the digest of a body cannot be made");
+		code = error_set(err, ERR_NO_MEMORY, "the digest of a body cannot be made");
 	upload->wire += taken;
 	if (code >= 0 && upload->wire > most)
 		code = error_set(err, ERR_TOO_LARGE,
@@ -439,7 +439,7 @@ static int check_digest(struct upload *upload, struct error *err)
 	if (upload->digest == NULL)
 		return 0;
 	if (EVP_DigestFinal_ex(upload->digest, found, &length) != 1)
-		return error_set(err, ERR_INTERNAL, "the digest of a body cannot be made");
+		return error_set(err, ERR_NO_MEMORY, "the digest of a body cannot be made");
 	if (memcmp(found, upload->promised, sizeof(found)) != 0) {
 		unsigned char text[64];
 

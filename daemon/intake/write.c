@@ -48,7 +48,7 @@ static int write_slot(const struct slot *slot, struct error *err)
 static int hash_slot(struct slot *slot, struct error *err)
 {
 	if (EVP_Digest(slot->data, slot->size, slot->sum.sha256, NULL, EVP_sha256(), NULL) != 1)
-		return error_set(err, ERR_INTERNAL, "the digest of a projection cannot be made");
+		return error_set(err, ERR_NO_MEMORY, "the digest of a projection cannot be made");
 	slot->sum.crc = checksum(0, slot->data, slot->size);
 	slot->sum.bytes = slot->size;
 	return 0;

@@ -211,6 +211,8 @@ void worker_read(struct supervise *supervise, struct worker *worker, bool died, 
 	bool got = true;
 	int code = message == NULL ? error_set_errno(&err, ENOMEM, "message") : 0;
 
+	if (worker->unheard)
+		code = error_set(&err, ERR_IO, "a message was lost");
 	while (code == 0 && got && clock_monotonic() < end) {
 		code = message_receive(worker->child.socket, 0, message, &got, &err);
 		if (code == 0 && got) {
@@ -221,6 +223,8 @@ void worker_read(struct supervise *supervise, struct worker *worker, bool died, 
 	add_rows(supervise, worker);
 	free(message);
 	*ret_gone = code != 0;
-	if (code != 0 && code != ERR_IO)
+	if (code != 0 && code != ERR_IO) {
 		log_line(LEVEL_ERROR, "worker %d: %s", worker->index, err.text);
+		worker->unheard = true;
+	}
 }

@@ -97,6 +97,7 @@ static void start_worker(struct supervise *supervise, struct worker *worker)
 		log_line(LEVEL_ERROR, "worker %d: %s", worker->index, err.text);
 	} else {
 		worker->state = WORKER_STARTING;
+		worker->unheard = false;
 		worker->born = now;
 		worker->killed[0] = '\0';
 		worker->deadline = now + supervise->options.hello_seconds;

@@ -77,8 +77,9 @@ struct worker {
 	unsigned mute;      /* processes in a row without a hello, the one that is starting included */
 	double aside_since; /* seconds since 1970 */
 	bool hung;          /* the daemon ended the process because it finished no step */
-	char said[160];     /* what its last message about a job was */
-	double work;        /* of its job: voxels times projections */
+	bool unheard;   /* a message of this process was lost: later ones are not listened to, they may build on it */
+	char said[160]; /* what its last message about a job was */
+	double work;    /* of its job: voxels times projections */
 	struct watchdog_signs signs;
 	size_t steps;     /* that it has finished by its last sign of life */
 	char killed[128]; /* why the daemon ended the process: it ...; "" as long as it has not */

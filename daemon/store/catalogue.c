@@ -354,10 +354,10 @@ static int export_row(void *context, const struct value *values, struct error *e
 	const struct exported *exported = context;
 	cJSON *object = json_of_row(exported->table, values);
 
-	if (object == NULL)
-		return error_set_errno(err, ENOMEM, "rows of %s", exported->table->name);
-	cJSON_AddItemToArray(exported->list, object);
-	return 0;
+	if (object != NULL && cJSON_AddItemToArray(exported->list, object))
+		return 0;
+	cJSON_Delete(object);
+	return error_set_errno(err, ENOMEM, "rows of %s", exported->table->name);
 }
 
 static int export_rows(struct catalogue *catalogue, enum table_id table, enum statement statement, const char *id,
@@ -366,6 +366,8 @@ static int export_rows(struct catalogue *catalogue, enum table_id table, enum st
 	struct exported exported = {&tables[table], cJSON_AddArrayToObject(rows, tables[table].name)};
 	const struct value value = value_text(id);
 
+	if (exported.list == NULL)
+		return error_set_errno(err, ENOMEM, "rows of %s", tables[table].name);
 	return catalogue->backend->run(catalogue->database, SESSION_WRITER, catalogue->statements[table][statement],
 				       &value, 1, export_row, &exported, err);
 }

@@ -39,7 +39,7 @@ static void record_path(const struct store *store, enum record_kind kind, const 
 static int record_text(struct store *store, enum record_kind kind, const char *id, char **ret_text, struct error *err)
 {
 	cJSON *record, *rows = NULL;
-	char *text = NULL, *body;
+	char *text = NULL, *body = NULL;
 	size_t length = 0;
 	int code = catalogue_export(store->catalogue, kind, id, &rows, err);
 
@@ -48,10 +48,12 @@ static int record_text(struct store *store, enum record_kind kind, const char *i
 	if (code != 0 || rows == NULL)
 		return code;
 	record = cJSON_CreateObject();
-	cJSON_AddStringToObject(record, "kind", record_words[kind].kind);
-	cJSON_AddStringToObject(record, "id", id);
-	cJSON_AddItemToObject(record, "rows", rows);
-	body = json_print(record, &length);
+	if (cJSON_AddStringToObject(record, "kind", record_words[kind].kind) != NULL &&
+	    cJSON_AddStringToObject(record, "id", id) != NULL && cJSON_AddItemToObject(record, "rows", rows)) {
+		rows = NULL;
+		body = json_print(record, &length);
+	}
+	cJSON_Delete(rows);
 	cJSON_Delete(record);
 	text = body == NULL ? NULL : malloc(FIRST_LINE + length + 2);
 	/* The body's own brace goes: the checksum is its first member. */

@@ -281,7 +281,10 @@ cJSON *json_of_value(const struct value *value)
 		for (size_t i = 0; i < value->size; i++)
 			snprintf(hex + 2 * i, 3, "%02x", ((const unsigned char *)value->bytes)[i]);
 		object = cJSON_CreateObject();
-		cJSON_AddStringToObject(object, "hex", hex);
+		if (cJSON_AddStringToObject(object, "hex", hex) == NULL) {
+			cJSON_Delete(object);
+			object = NULL;
+		}
 		free(hex);
 		return object;
 	default:
@@ -298,8 +301,16 @@ cJSON *json_of_row(const struct table *table, const struct value *values)
 
 		if (!column_takes_part(column, STATEMENT_LIST))
 			continue;
-		if (column->type != COLUMN_NUMBER)
-			cJSON_AddItemToObject(object, column->name, json_of_value(values));
+		if (column->type != COLUMN_NUMBER) {
+			cJSON *member = json_of_value(values);
+
+			/* A row that lacks a column would be read with that column's default. */
+			if (!cJSON_AddItemToObject(object, column->name, member)) {
+				cJSON_Delete(member);
+				cJSON_Delete(object);
+				return NULL;
+			}
+		}
 		values++;
 	}
 	return object;

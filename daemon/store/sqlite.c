@@ -210,12 +210,10 @@ static struct value column_value(sqlite3_stmt *statement, int column)
 
 	switch (sqlite3_column_type(statement, column)) {
 	case SQLITE_INTEGER:
-		value.type = VALUE_INTEGER;
-		value.integer = sqlite3_column_int64(statement, column);
+		value = (struct value){.type = VALUE_INTEGER, .integer = sqlite3_column_int64(statement, column)};
 		break;
 	case SQLITE_FLOAT:
-		value.type = VALUE_REAL;
-		value.real = sqlite3_column_double(statement, column);
+		value = (struct value){.type = VALUE_REAL, .real = sqlite3_column_double(statement, column)};
 		break;
 	case SQLITE_TEXT:
 		value.type = VALUE_TEXT;
@@ -226,8 +224,6 @@ static struct value column_value(sqlite3_stmt *statement, int column)
 		value.type = VALUE_BYTES;
 		value.bytes = sqlite3_column_blob(statement, column);
 		value.size = (size_t)sqlite3_column_bytes(statement, column);
-		break;
-	default:
 		break;
 	}
 	return value;
@@ -242,9 +238,12 @@ static int step_all(struct connection *connection, sqlite3_stmt *statement, row_
 
 	assert(count <= RESULTS_MAX);
 	while ((result = sqlite3_step(statement)) == SQLITE_ROW && code == 0) {
-		for (int i = 0; i < count; i++)
+		for (int i = 0; i < count && code == 0; i++) {
 			values[i] = column_value(statement, i);
-		if (row != NULL)
+			if (values[i].type == VALUE_TEXT && values[i].bytes == NULL)
+				code = error_set_errno(err, ENOMEM, "a row of the catalogue");
+		}
+		if (row != NULL && code == 0)
 			code = row(context, values, err);
 	}
 	if (code == 0 && result != SQLITE_DONE)

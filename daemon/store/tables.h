@@ -111,7 +111,7 @@ struct row {
 };
 /*
  * The parameters of a statement in their order, for INSERT, RESTORE, PUT and UPDATE; parent: the value of
- * COLUMN_PARENT. Returns how many. ERR_NO_MEMORY below zero.
+ * COLUMN_PARENT. Returns how many. ERR_NO_MEMORY below zero; row_clear is the caller's then, too.
  */
 int row_of_record(const struct table *table, enum statement statement, const void *record, const struct value *parent,
 		  struct row *ret_row, struct error *err);
@@ -132,7 +132,7 @@ cJSON *json_of_row(const struct table *table, const struct value *values);
 /*
  * The parameters of RESTORE or PUT from such an object; members that are no columns are passed over, columns that are
  * missing take their defaults. ERR_INVALID: one has none, or a value is invalid. `bytes` of all values belong to
- * ret_row (row_clear) or to the object.
+ * ret_row (row_clear, on failure too) or to the object.
  */
 int row_of_json(const struct table *table, enum statement statement, const cJSON *object, const struct value *parent,
 		struct row *ret_row, struct error *err);

@@ -36,7 +36,7 @@ struct sink {
 static int take(struct sink *sink, const char *data, size_t size, struct error *err)
 {
 	if (EVP_DigestUpdate(sink->hash, data, size) != 1)
-		return error_set(err, ERR_INTERNAL, "a digest cannot be made");
+		return error_set(err, ERR_NO_MEMORY, "a digest cannot be made");
 	for (size_t done = 0; sink->file >= 0 && done < size;) {
 		ssize_t put = pwrite(sink->file, data + done, size - done, (off_t)(sink->size + done));
 
@@ -153,7 +153,7 @@ int sink_end(struct sink *sink, uint64_t *ret_size, uint8_t ret_sha256[32], stru
 		return err->code;
 	}
 	if (EVP_DigestFinal_ex(sink->hash, ret_sha256, NULL) != 1)
-		return error_set(err, ERR_INTERNAL, "a digest cannot be made");
+		return error_set(err, ERR_NO_MEMORY, "a digest cannot be made");
 	*ret_size = sink->size;
 	return 0;
 }

@@ -3,7 +3,8 @@
  *
  *   PROGRAM CALL N KIND FILE
  *
- * and the N-th CALL (write, pwrite, fsync, fdatasync, rename, link, mmap, fallocate, open, read, pread, accept, malloc)
+ * and the N-th CALL (write, pwrite, fsync, fdatasync, rename, link, mmap, fallocate, open, read, pread, accept, malloc,
+ * send, recv; each stands for all calls of its kind, open for openat, malloc for calloc and realloc)
  * of a process of PROGRAM ("cbctd", "cbct-worker"; the held ones too) fails, once: KIND is an error number, or "short"
  * for half of the bytes. FILE.fired is made then, and while it is there no other process fails. FILE.count grows by a
  * byte for each call of the program that N would count. The C library's own calls (stdio) are not seen.
@@ -19,6 +20,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/mman.h>
+#include <sys/sendfile.h>
 #include <sys/socket.h>
 #include <sys/stat.h>
 #include <sys/syscall.h>
@@ -171,6 +173,68 @@ int fallocate(int file, int mode, off_t offset, off_t length)
 	return REAL(fallocate)(file, mode, offset, length);
 }
 
+int linkat(int from_folder, const char *from, int to_folder, const char *to, int flags)
+{
+	FAIL("link");
+	return REAL(linkat)(from_folder, from, to_folder, to, flags);
+}
+
+/* Its result is the number of the error, which it does not retry. */
+int posix_fallocate(int file, off_t offset, off_t length)
+{
+	return is_it("fallocate") ? error_number : REAL(posix_fallocate)(file, offset, length);
+}
+
+ssize_t send(int socket, const void *from, size_t size, int flags)
+{
+	FAIL_OR_HALVE("send", size);
+	return REAL(send)(socket, from, size, flags);
+}
+
+ssize_t sendmsg(int socket, const struct msghdr *message, int flags)
+{
+	if (error_number != 0)
+		FAIL("send");
+	return REAL(sendmsg)(socket, message, flags);
+}
+
+ssize_t recv(int socket, void *to, size_t size, int flags)
+{
+	FAIL_OR_HALVE("recv", size);
+	return REAL(recv)(socket, to, size, flags);
+}
+
+ssize_t sendto(int socket, const void *from, size_t size, int flags, const struct sockaddr *to, socklen_t length)
+{
+	FAIL_OR_HALVE("send", size);
+	return REAL(sendto)(socket, from, size, flags, to, length);
+}
+
+ssize_t sendfile64(int to, int from, off64_t *offset, size_t size)
+{
+	FAIL_OR_HALVE("send", size);
+	return REAL(sendfile64)(to, from, offset, size);
+}
+
+ssize_t recvfrom(int socket, void *to, size_t size, int flags, struct sockaddr *from, socklen_t *length)
+{
+	FAIL_OR_HALVE("recv", size);
+	return REAL(recvfrom)(socket, to, size, flags, from, length);
+}
+
+ssize_t recvmsg(int socket, struct msghdr *message, int flags)
+{
+	if (error_number != 0)
+		FAIL("recv");
+	return REAL(recvmsg)(socket, message, flags);
+}
+
+int accept(int socket, struct sockaddr *address, socklen_t *length)
+{
+	FAIL("accept");
+	return REAL(accept)(socket, address, length);
+}
+
 int accept4(int socket, struct sockaddr *address, socklen_t *length, int flags)
 {
 	FAIL("accept");
@@ -184,6 +248,11 @@ void *mmap(void *at, size_t size, int protection, int flags, int file, off_t off
 		return MAP_FAILED;
 	}
 	return REAL(mmap)(at, size, protection, flags, file, offset);
+}
+
+void *mmap64(void *at, size_t size, int protection, int flags, int file, off64_t offset)
+{
+	return mmap(at, size, protection, flags, file, offset);
 }
 
 static mode_t mode_of(int flags, va_list arguments)
@@ -213,6 +282,18 @@ int open64(const char *path, int flags, ...)
 	va_end(arguments);
 	FAIL("open");
 	return REAL(open64)(path, flags, mode);
+}
+
+int openat(int folder, const char *path, int flags, ...)
+{
+	va_list arguments;
+	mode_t mode;
+
+	va_start(arguments, flags);
+	mode = mode_of(flags, arguments);
+	va_end(arguments);
+	FAIL("open");
+	return REAL(openat)(folder, path, flags, mode);
 }
 
 /* ---- memory ---- */

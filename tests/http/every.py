@@ -1,16 +1,19 @@
 #!/usr/bin/env python3
 """One call after the other of the daemon and its worker fails once, in a small scan from POST to download.
 
-every.py BUILD WORK [--stride K] [--seconds S] [PROGRAM:CALL:KIND ...]
+every.py BUILD WORK [--stride K] [--seconds S] [--processes P] [PROGRAM:CALL:KIND ...]
 
 A reference run counts the calls. Then each N-th of them (in steps of K; by default all) fails in a run of its own, with
 build/every.so (tests/http/every.c). What holds in each: no program ends by a signal that was not sent, nothing hangs,
-whatever was acknowledged is there and has the right bytes, also after a restart, a volume has the bits of the reference,
+whatever was acknowledged is there and has the right bytes, also after a restart (half of them without the
+catalogue, which is made again from the directories), a volume has the bits of the reference,
 and a job that was acknowledged ends as succeeded. Prints a row for each PROGRAM:CALL:KIND; exit status 1 when something
 did not hold.
 """
 import argparse
+import concurrent.futures
 import http.client
+import itertools
 import json
 import os
 import random
@@ -19,6 +22,7 @@ import signal
 import struct
 import subprocess
 import sys
+import threading
 import time
 from typing import Dict, List, Optional, Tuple, Union
 
@@ -27,7 +31,7 @@ KINDS: Dict[str, List[Union[int, str]]] = {
     "write": [EIO, EINTR, "short"], "pwrite": [EIO, EINTR, "short"], "read": [EIO, EINTR, "short"],
     "pread": [EIO, EINTR, "short"], "fsync": [EIO], "fdatasync": [EIO], "rename": [EIO], "link": [EIO],
     "mmap": [ENOMEM], "fallocate": [ENOSPC, EINTR], "open": [EMFILE, EINTR], "accept": [EMFILE, EINTR],
-    "malloc": [ENOMEM],
+    "malloc": [ENOMEM], "send": [EINTR, "short"], "recv": [EINTR, "short"],
 }
 VIEWS, COLUMNS, ROWS = 8, 24, 16
 SCAN = {
@@ -152,8 +156,9 @@ def ended(status: int, what: str) -> None:
     assert status in (0, 1), f"{what} ended with {status}"
 
 
-def one_run(build: str, work: str, every: Optional[str]) -> bytes:
-    """The volume, of a run in which at most one call fails, and of what is there after it."""
+def one_run(build: str, work: str, every: Optional[str], rebuilt: bool = False) -> bytes:
+    """The volume, of a run in which at most one call fails, and of what is there after it. rebuilt: by a catalogue that is
+    made again from the directories."""
     shutil.rmtree(f"{work}/state", ignore_errors=True)
     open(f"{work}/err", "w").close()
     client, volume = Client(), None
@@ -168,6 +173,9 @@ def one_run(build: str, work: str, every: Optional[str]) -> bytes:
         daemon.stop()
         raise
     ended(daemon.stop(), "the daemon")
+    for name in os.listdir(f"{work}/state") if rebuilt and os.path.exists(f"{work}/state") else []:
+        if name.startswith("catalogue.sqlite"):
+            os.unlink(f"{work}/state/{name}")
     daemon = Daemon(build, work, None)
     try:
         assert daemon.port != 0, "the daemon does not start again"
@@ -187,39 +195,66 @@ def main() -> int:
     parser.add_argument("work")
     parser.add_argument("--stride", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=1e9, help="ends after that, wherever it is")
+    parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("what", nargs="*")
     options = parser.parse_intermixed_args()
     shutil.rmtree(options.work, ignore_errors=True)
     os.makedirs(options.work)
-    mark = f"{options.work}/call"
-    reference = one_run(options.build, options.work, None)
-    end, wrong, total = time.monotonic() + options.seconds, 0, 0
-    what = options.what or [f"{p}:{c}:{k}" for p in ("cbctd", "cbct-worker") for c in KINDS for k in KINDS[c]]
-    counts: Dict[str, int] = {}
-    for row in what:
+    place = threading.local()
+    places = itertools.count()
+
+    def folder() -> str:
+        """Of this thread."""
+        if not hasattr(place, "path"):
+            place.path = f"{options.work}/{next(places)}"
+            os.makedirs(place.path)
+        return str(place.path)
+
+    def count(pair: str) -> int:
+        program, call = pair.split(":")
+        mark = f"{folder()}/{pair}"
+        one_run(options.build, folder(), f"{program} {call} 0 0 {mark}")
+        return os.path.getsize(f"{mark}.count") if os.path.exists(f"{mark}.count") else 0
+
+    def fail(row: str, number: int) -> Optional[Tuple[bool, str]]:
+        """Whether the call failed, and what did not hold then. None: there was no time left."""
         program, call, kind = row.split(":")
-        if f"{program}:{call}" not in counts:
-            if os.path.exists(f"{mark}.count"):
-                os.unlink(f"{mark}.count")
-            one_run(options.build, options.work, f"{program} {call} 0 0 {mark}")
-            counts[f"{program}:{call}"] = os.path.getsize(f"{mark}.count") if os.path.exists(f"{mark}.count") else 0
-        count, bad, runs, hit = counts[f"{program}:{call}"], 0, 0, 0
-        for number in range(1 + options.stride // 2 if count > options.stride else 1, count + 1, options.stride):
-            if time.monotonic() > end:
-                break
-            if os.path.exists(f"{mark}.fired"):
-                os.unlink(f"{mark}.fired")
-            runs += 1
-            try:
-                assert one_run(options.build, options.work, f"{program} {call} {number} {kind} {mark}") == reference, \
-                    "the volume has other bits"
-            except AssertionError as error:
-                bad += 1
-                print(f"  {row}:{number}: {error}", flush=True)
-            hit += os.path.exists(f"{mark}.fired")
-        wrong += bad
-        total += hit
-        print(f"{row:28} {count:6} calls, {runs:5} runs, {hit:5} failed calls, {bad:3} did not hold", flush=True)
+        mark = f"{folder()}/{row}:{number}"
+        if time.monotonic() > end:
+            return None
+        try:
+            volume = one_run(options.build, folder(), f"{program} {call} {number} {kind} {mark}", number % 2 == 1)
+            wrong = "" if volume == reference else "the volume has other bits"
+        except AssertionError as error:
+            wrong = str(error)
+            shutil.copy(f"{folder()}/err", f"{options.work}/{row}:{number}.log")
+        except Exception as error:
+            wrong = f"the test itself: {error!r}"
+        return os.path.exists(f"{mark}.fired"), wrong
+
+    reference = one_run(options.build, folder(), None)
+    end = time.monotonic() + options.seconds
+    what = options.what or [f"{p}:{c}:{k}" for p in ("cbctd", "cbct-worker") for c in KINDS for k in KINDS[c]]
+    wrong = total = 0
+    with concurrent.futures.ThreadPoolExecutor(options.processes) as pool:
+        pairs = sorted({row.rsplit(":", 1)[0] for row in what})
+        counts = dict(zip(pairs, pool.map(count, pairs)))
+        runs = {}
+        for row in what:
+            calls = counts[row.rsplit(":", 1)[0]]
+            numbers = range(1 + options.stride // 2 if calls > options.stride else 1, calls + 1, options.stride)
+            runs[row] = [(number, pool.submit(fail, row, number)) for number in numbers]
+        for row, futures in runs.items():
+            done = [(number, future.result()) for number, future in futures]
+            made = [(number, result) for number, result in done if result is not None]
+            for number, (_, text) in made:
+                if text:
+                    print(f"  {row}:{number}: {text}", flush=True)
+            hit, bad = sum(result[0] for _, result in made), sum(result[1] != "" for _, result in made)
+            wrong += bad
+            total += hit
+            print(f"{row:28} {counts[row.rsplit(':', 1)[0]]:6} calls, {len(made):5} runs, {hit:5} failed calls, {bad:3} did not hold",
+                  flush=True)
     print(f"{total} calls failed, {wrong} runs did not hold")
     return wrong > 0
 

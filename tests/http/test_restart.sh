@@ -520,7 +520,7 @@ test_two_daemons_do_not_share_a_state_directory() {
 }
 
 test_settings_as_flag_line_and_environment() {
-	"$BUILD/cbctd" --help | grep -q -- --state-dir || fail "--help with --state-dir"
+	[[ $("$BUILD/cbctd" --help) == *--state-dir* ]] || fail "--help with --state-dir"
 	local name
 	for name in cbctd cbct-worker cbct cbct-cuda; do
 		[ -x "$BUILD/$name" ] || continue

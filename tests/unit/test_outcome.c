@@ -181,7 +181,7 @@ START_TEST(a_code_says_how_a_worker_was_through)
 	ck_assert_int_eq(worker_end_of(ERR_IO), END_IO);
 	ck_assert_int_eq(worker_end_of(ERR_DAMAGED), END_DAMAGED);
 	ck_assert_int_eq(worker_end_of(ERR_INVALID), END_INVALID);
-	ck_assert_int_eq(worker_end_of(ERR_NO_MEMORY), END_OTHER);
+	ck_assert_int_eq(worker_end_of(ERR_NO_MEMORY), END_IO);
 	ck_assert_int_eq(worker_end_of(ERR_CANCELLED), END_OTHER);
 }
 END_TEST
