@@ -48,6 +48,8 @@ daemon_libs := libmicrohttpd gnutls sqlite3
 # Other tools' files: the client reads and writes them, the daemon and the worker know none of them.
 files_libs  := expat libtiff-4
 cbct_libs   := libcurl $(files_libs)
+# cbct-dicom, which sends volumes to archives.
+dicom_libs  := libcurl
 all_libs    := $(core_libs) $(proto_libs) $(daemon_libs) $(cbct_libs)
 
 pkg = $(shell pkg-config $(1) $(2) 2>/dev/null)
@@ -73,7 +75,8 @@ flags_avx512 := -mavx512f -mavx512bw -mavx512dq -mavx512vl -mfma -mprefer-vector
 simd_sources   := $(wildcard core/cpu/*_simd.c)
 core_sources   := $(filter-out $(simd_sources),$(wildcard core/*.c core/*/*.c))
 proto_sources  := $(wildcard proto/*.c)
-daemon_sources := $(filter-out daemon/worker.c,$(wildcard daemon/*.c daemon/*/*.c))
+dicom_sources  := $(wildcard daemon/dicom/*.c)
+daemon_sources := $(filter-out daemon/worker.c $(dicom_sources),$(wildcard daemon/*.c daemon/*/*.c))
 # What the unit tests know of the daemon: its state, without HTTP.
 state_sources  := $(wildcard daemon/store/*.c daemon/jobs/*.c) $(patsubst %,daemon/%.c,api/document files histogram id lock log problem process watch)
 cbct_sources   := $(wildcard clients/cbct/*.c)
@@ -95,7 +98,7 @@ cuda_code    := $(foreach a,$(CUDA_ARCH),-gencode arch=compute_$(a),code=sm_$(a)
                 -gencode arch=compute_$(lastword $(CUDA_ARCH)),code=compute_$(lastword $(CUDA_ARCH))
 endif
 
-programs := $(BUILD)/cbctd $(BUILD)/cbct-worker $(BUILD)/cbct $(if $(cuda_objects),$(BUILD)/cbct-cuda)
+programs := $(BUILD)/cbctd $(BUILD)/cbct-worker $(BUILD)/cbct-dicom $(BUILD)/cbct $(if $(cuda_objects),$(BUILD)/cbct-cuda)
 
 all: $(programs) ## the programs, in build/
 
@@ -150,6 +153,9 @@ $(BUILD)/cbctd: $(call objects,$(daemon_sources)) $(BUILD)/proto/openapi.o $(BUI
 
 $(BUILD)/cbct-worker: $(call objects,daemon/worker.c) $(library) $(cuda_objects)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(if $(cuda_objects),$(cuda_libs)) $(LIBM)
+
+$(BUILD)/cbct-dicom: $(call objects,$(dicom_sources)) $(library)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(dicom_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
 $(BUILD)/cbct: $(call objects,$(cbct_sources)) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(cbct_libs) $(proto_libs) $(core_libs)) $(LIBM)

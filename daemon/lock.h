@@ -11,6 +11,7 @@
  */
 enum lock_rank {
 	LOCK_UPLOADS,    /* uploads.lock */
+	LOCK_SENDINGS,   /* sendings.lock */
 	LOCK_CHANGE,     /* jobs.change */
 	LOCK_EVENTS,     /* event_ring.lock */
 	LOCK_INSERTION,  /* store.insertion_lock */

@@ -22,6 +22,7 @@
 #include "daemon/jobs/jobs.h"
 #include "daemon/log.h"
 #include "daemon/notify.h"
+#include "daemon/sendings/sendings.h"
 #include "daemon/store/store.h"
 #include "daemon/volumes/volumes.h"
 #include "proto/provenance.h"
@@ -176,6 +177,8 @@ static int start_parts(const struct config *config, struct api *api, struct erro
 						    .stop_seconds = config->stop_timeout};
 	const struct calibrations_options calibrations = {
 	    .worker = supervise.worker, .threads = (int)config->threads, .age = config->calibration_age};
+	const struct sendings_options sendings = {
+	    .file = config->destinations, .pause = config->send_pause, .limit = config->send_limit};
 	const struct store_limits limits = {.jobs = config->max_jobs,
 					    .job_patience = config->job_patience,
 					    .keep = config->keep,
@@ -197,6 +200,8 @@ static int start_parts(const struct config *config, struct api *api, struct erro
 		code = supervise_start(api->jobs, &supervise, &api->supervise, err);
 	if (code == 0)
 		code = calibrations_open(api->store, &calibrations, &api->calibrations, err);
+	if (code == 0)
+		code = sendings_open(api->jobs, &sendings, &api->sendings, err);
 	if (code == 0)
 		code = event_ring_new(api->store, &api->events, err);
 	if (code == 0)
@@ -223,6 +228,7 @@ static void stop_parts(struct api *api)
 	encoded_copies_free(api->copies);
 	mappings_free(api->mappings);
 	event_ring_free(api->events);
+	sendings_close(api->sendings);
 	calibrations_close(api->calibrations);
 	supervise_stop(api->supervise);
 	jobs_close(api->jobs);
@@ -263,9 +269,10 @@ static void reload_settings(const struct arguments *arguments)
 static void reload(struct api *api, const struct arguments *arguments)
 {
 	notify_send("RELOADING=1\nMONOTONIC_USEC=%.0f", 1e6 * clock_monotonic());
-	log_line(LEVEL_INFO, "SIGHUP: reading settings, tokens and certificates again");
+	log_line(LEVEL_INFO, "SIGHUP: reading settings, tokens, certificates and destinations again");
 	reload_settings(arguments);
 	http_reload(api->http);
+	sendings_reload(api->sendings);
 	notify_send("READY=1");
 }
 

@@ -4,6 +4,7 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <signal.h>
+#include <stdbool.h>
 #include <spawn.h>
 #include <stdio.h>
 #include <string.h>
@@ -13,26 +14,33 @@
 
 extern char **environ;
 
-void worker_path(char *ret_path, size_t size)
+/* True where there is a program of this name beside this one. */
+static bool find_beside(const char *name, char *ret_path, size_t size)
 {
-	static const char *const names[] = {"cbct-worker-cuda", "cbct-worker"};
 	char self[1024];
 	ssize_t length = readlink("/proc/self/exe", self, sizeof(self) - 1);
 	char *slash;
 
-	if (length > 0) {
-		self[length] = '\0';
-		slash = strrchr(self, '/');
-		if (slash != NULL) {
-			*slash = '\0';
-			for (int i = 0; i < 2; i++) {
-				snprintf(ret_path, size, "%s/%s", self, names[i]);
-				if (access(ret_path, X_OK) == 0)
-					return;
-			}
-		}
-	}
-	snprintf(ret_path, size, "cbct-worker");
+	if (length <= 0)
+		return false;
+	self[length] = '\0';
+	slash = strrchr(self, '/');
+	if (slash == NULL)
+		return false;
+	snprintf(ret_path, size, "%.*s/%s", (int)(slash - self), self, name);
+	return access(ret_path, X_OK) == 0;
+}
+
+void worker_path(char *ret_path, size_t size)
+{
+	if (!find_beside("cbct-worker-cuda", ret_path, size))
+		program_path("cbct-worker", ret_path, size);
+}
+
+void program_path(const char *name, char *ret_path, size_t size)
+{
+	if (!find_beside(name, ret_path, size))
+		snprintf(ret_path, size, "%s", name);
 }
 
 /* Sets the descriptors that the child inherits: no input, our output and error, the given one. */

@@ -18,6 +18,9 @@ struct process {
  */
 void worker_path(char *ret_path, size_t size);
 
+/* Where a program of ours is: beside this one, else by PATH. */
+void program_path(const char *name, char *ret_path, size_t size);
+
 /*
  * Starts a program with these arguments (the first is its name, the last NULL). It has standard output and error of
  * ours, no input, `descriptor` as its descriptor 3 (-1: none), and nothing else; a terminal's Ctrl-C does not reach it.

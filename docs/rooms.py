@@ -24,6 +24,8 @@ ROOMS = {
     "daemon/intake": "uploads",
     "daemon/jobs": "queue, supervisor",
     "daemon/calibrations": "library of calibrations",
+    "daemon/sendings": "volumes to archives",
+    "daemon/dicom": "cbct-dicom",
     "daemon/volumes": "files, slices, streams, events",
     "daemon/http": "connections, requests, replies",
     "daemon/store": "catalogue, scan directories",

@@ -15,7 +15,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 TABLE = ROOT / "docs" / "third-party.md"
-PROGRAMS = ("cbctd", "cbct-worker", "cbct")
+PROGRAMS = ("cbctd", "cbct-worker", "cbct-dicom", "cbct")
 # Packages whose copyright file is prose. Read in Debian 12.
 PROSE = {
     "libc6": "LGPL-2.1+",

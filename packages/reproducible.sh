@@ -32,7 +32,7 @@ fi
 (umask 027 && TZ=Asia/Tokyo LC_ALL=C.UTF-8 HOME=$work build "$two" 1 "$@")
 
 failed=0 count=0
-for file in $(cd "$first" && ls -d cbctd cbct-worker cbct cbct-cuda deb/*.deb 2>/dev/null); do
+for file in $(cd "$first" && ls -d cbctd cbct-worker cbct-dicom cbct cbct-cuda deb/*.deb 2>/dev/null); do
 	count=$((count + 1))
 	if cmp -s "$first/$file" "$two/build/$file"; then
 		echo "same   $file  $(sha256sum <"$first/$file" | cut -c1-16)"

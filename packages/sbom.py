@@ -24,7 +24,7 @@ third_party = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(third_party)
 
 BUILD = Path(sys.argv[1])
-PROGRAMS = [name for name in ("cbctd", "cbct-worker", "cbct", "cbct-cuda") if (BUILD / name).exists()]
+PROGRAMS = [name for name in ("cbctd", "cbct-worker", "cbct-dicom", "cbct", "cbct-cuda") if (BUILD / name).exists()]
 # Of CUDA's toolkit, which is in no Debian package here.
 CUDA = re.compile(r"lib(cudart|cufft|cuda|nv)")
 

@@ -38,6 +38,7 @@ void job_request_clear(struct job_request *request)
 {
 	recipe_clear(&request->recipe);
 	free(request->labels);
+	free(request->send);
 	*request = (struct job_request){0};
 }
 
@@ -49,9 +50,10 @@ int job_request_copy(struct job_request *ret_request, const struct job_request *
 	if (code != 0)
 		return code;
 	copy.labels = request->labels == NULL ? NULL : strdup(request->labels);
-	if (request->labels != NULL && copy.labels == NULL) {
-		recipe_clear(&copy.recipe);
-		return error_set(err, ERR_NO_MEMORY, "no memory for labels");
+	copy.send = request->send == NULL ? NULL : strdup(request->send);
+	if ((request->labels != NULL && copy.labels == NULL) || (request->send != NULL && copy.send == NULL)) {
+		job_request_clear(&copy);
+		return error_set(err, ERR_NO_MEMORY, "no memory for a job");
 	}
 	*ret_request = copy;
 	return 0;
@@ -205,7 +207,7 @@ static bool names_no_stage(const cJSON *value)
 
 /* The members of the document itself, and those whose objects are still to be read. */
 struct members {
-	const cJSON *stages[STAGES], *algorithms[ALGORITHM_COUNT], *patient, *labels;
+	const cJSON *stages[STAGES], *algorithms[ALGORITHM_COUNT], *patient, *labels, *send;
 };
 
 static int read_members(struct job_request *request, const cJSON *value, struct members *ret, struct error *err)
@@ -225,6 +227,7 @@ static int read_members(struct job_request *request, const cJSON *value, struct 
 	}
 	ret->patient = json_member(&reader, "patient", false);
 	ret->labels = json_member(&reader, "labels", false);
+	ret->send = json_member(&reader, "send", false);
 	if (names_no_stage(value)) {
 		request->recipe.fdk.on = request->recipe.tv.on = true;
 		recipe_set_algorithm(&request->recipe, &algorithm_sart);
@@ -247,6 +250,8 @@ static int read_expanded(const cJSON *value, struct job_request *ret_request, st
 		code = patient_read(members.patient, "/patient", &request.patient, err);
 	if (code == 0)
 		code = labels_read(members.labels, "/labels", &request.labels, err);
+	if (code == 0)
+		code = sends_read(members.send, "/send", &request.send, err);
 	for (int i = 0; i < STAGES && code == 0; i++)
 		if (members.stages[i] != NULL)
 			code = stages[i].read(&request.recipe, members.stages[i], err);
@@ -392,6 +397,7 @@ bool job_request_same(const struct job_request *a, const struct job_request *b)
 {
 	return strcmp(a->scan, b->scan) == 0 && a->priority == b->priority && patient_same(&a->patient, &b->patient) &&
 	       strcmp(a->labels != NULL ? a->labels : "", b->labels != NULL ? b->labels : "") == 0 &&
+	       strcmp(a->send != NULL ? a->send : "", b->send != NULL ? b->send : "") == 0 &&
 	       recipe_same(&a->recipe, &b->recipe);
 }
 
@@ -402,6 +408,7 @@ cJSON *job_request_json(const struct job_request *request)
 	if (document != NULL && add(document, "scan", cJSON_CreateString(request->scan)) &&
 	    add(document, "patient", patient_json(&request->patient)) &&
 	    (request->labels == NULL || add(document, "labels", cJSON_Parse(request->labels))) &&
+	    (request->send == NULL || add(document, "send", cJSON_Parse(request->send))) &&
 	    add_emit(document, &request->recipe) &&
 	    add(document, "priority", cJSON_CreateString(priority_names[request->priority])))
 		return document;

@@ -5,6 +5,7 @@
 #include "core/recon/recon.h"
 #include "proto/labels.h"
 #include "proto/scan.h"
+#include "proto/send.h"
 
 enum priority { PRIORITY_ROUTINE, PRIORITY_URGENT, PRIORITY_STAT, PRIORITY_COUNT };
 extern const char *const priority_names[PRIORITY_COUNT];
@@ -15,6 +16,7 @@ struct job_request {
 	char scan[64];
 	enum priority priority;
 	char *labels;           /* JSON, owned; NULL for none */
+	char *send;             /* sends_text, owned; NULL: the job says nothing of it */
 	struct patient patient; /* of the scan, once resolved, unless the job says otherwise */
 	struct recipe recipe;   /* owned */
 };

@@ -57,8 +57,9 @@ found "scripts that their own language cannot read" "$(
 # The rooms of core/ and daemon/, lowest first, each with those beneath it whose doors it may use; a room's own files
 # may include each other. A room's doors are the headers that others may include: ROOM/ROOM.h, or those named in doors.
 core_rooms=("scan:" "calibrate: scan" "cpu: scan" "outofcore: scan" "correct: scan" "recon: scan outofcore correct")
-daemon_rooms=("http:" "store:" "volumes: store" "jobs: store" "calibrations: store" "intake: http store"
-	"api: http store volumes jobs calibrations intake")
+daemon_rooms=("http:" "store:" "volumes: store" "jobs: store" "calibrations: store" "sendings: store jobs"
+	"dicom:" "intake: http store"
+	"api: http store volumes jobs calibrations sendings intake")
 declare -A doors=(
 	[core/scan]="geometry|grid|image|orbit|phantom"
 	[core/cpu]="none"

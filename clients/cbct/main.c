@@ -21,7 +21,7 @@ static const struct command *const commands[] = {
     &command_scans,    &command_jobs,    &command_status,          &command_rm,           &command_complete,
     &command_pin,      &command_unpin,   &command_limits,          &command_parameters,   &command_calibrate,
     &command_token,    &command_audit,   &command_calibrate_scan,  &command_calibrations, &command_doctor,
-    &command_backup,   &command_restore, &command_reproduce,
+    &command_backup,   &command_restore, &command_reproduce,       &command_send,         &command_destinations,
 };
 enum { COMMAND_COUNT = sizeof(commands) / sizeof(commands[0]) };
 

@@ -707,6 +707,24 @@ class Client:
         )
         return str(reply.headers["ETag"])
 
+    def send(self, job: str, to: str, volumes: Union[str, Sequence[Union[int, str]], None] = None) -> List[Document]:
+        """Sends volumes of a job to a destination, once it has ended: ``"last"`` (the default), ``"all"`` or a list of
+        iterations. May be repeated. Returns the job's sendings."""
+        body: Document = {"to": to} if volumes is None else {"to": to, "volumes": volumes}
+        return list(self._json("POST", f"/v1/jobs/{job}/send", json=body)["sendings"])
+
+    def sendings(self, job: str) -> List[Document]:
+        """Where the job's volumes are sent to, and how far that is."""
+        return list(self._json("GET", f"/v1/jobs/{job}/send")["sendings"])
+
+    def stop_sending(self, job: str, to: str) -> None:
+        """No attempt to send volumes of the job to this destination follows."""
+        self._request("DELETE", f"/v1/jobs/{job}/send/{to}")
+
+    def destinations(self, wait: float = 0) -> List[Document]:
+        """The archives that volumes can be sent to; with ``wait``, asked now whether they answer."""
+        return list(self._json("GET", "/v1/destinations", params={"wait": f"{wait:.3f}"})["destinations"])
+
     def slice(self, job: str, name: str = "final", **query: Any) -> bytes:
         """One plane as PNG: ``axis="z"``, ``index``, ``window`` and ``level`` in Hounsfield units; ``sheet=1`` gives a
         contact sheet, ``normal="1,0.5,0"`` a plane at any angle, ``thickness`` and ``mode`` a slab."""

@@ -13,6 +13,7 @@ struct api {
 	struct mappings *mappings;
 	struct encoded_copies *copies;
 	struct calibrations *calibrations;
+	struct sendings *sendings;
 	struct cards *cards;
 	struct http *http;
 	struct keeper *keeper; /* NULL: everything is kept */

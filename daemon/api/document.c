@@ -354,6 +354,21 @@ static int add_warnings(cJSON *document, struct store *store, const char *id, st
 	return 0;
 }
 
+static int add_sendings(cJSON *document, struct job *job, struct error *err)
+{
+	struct sending_record *sendings;
+	int count, code = job_sendings(job, &sendings, &count, err);
+	cJSON *list;
+
+	if (code != 0)
+		return code;
+	list = cJSON_AddArrayToObject(document, "sendings");
+	for (int i = 0; i < count; i++)
+		cJSON_AddItemToArray(list, sending_document(&sendings[i]));
+	free(sendings);
+	return 0;
+}
+
 static int add_history(cJSON *document, struct store *store, const char *id, struct error *err)
 {
 	struct history_row *rows;
@@ -400,6 +415,8 @@ cJSON *job_document(struct job *job, bool brief, struct error *err)
 		code = add_volume_count(document, store, record.id, err);
 		if (code == 0)
 			code = add_warnings(document, store, record.id, err);
+		if (code == 0)
+			code = add_sendings(document, job, err);
 		if (code == 0)
 			code = add_history(document, store, record.id, err);
 	}

@@ -6,6 +6,7 @@
 #include "daemon/calibrations/calibrations.h"
 #include "daemon/intake/intake.h"
 #include "daemon/jobs/jobs.h"
+#include "daemon/sendings/sendings.h"
 #include "daemon/store/store.h"
 #include "daemon/volumes/volumes.h"
 
@@ -41,6 +42,13 @@ int job_post(void *context, struct request *request, struct error *err);
 int job_list(void *context, struct request *request, struct error *err);
 int job_get(void *context, struct request *request, struct error *err);
 int job_delete(void *context, struct request *request, struct error *err);
+
+int destination_list(void *context, struct request *request, struct error *err);
+int send_post(void *context, struct request *request, struct error *err);
+int send_get(void *context, struct request *request, struct error *err);
+int send_delete(void *context, struct request *request, struct error *err);
+/* What a job that says nothing sends; ERR_IMPOSSIBLE, ERR_CONFLICT: what it says cannot be done. */
+int send_resolve(struct api *api, struct job_request *wanted, struct error *err);
 
 int job_events(void *context, struct request *request, struct error *err);
 int all_events(void *context, struct request *request, struct error *err);

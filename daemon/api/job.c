@@ -33,10 +33,12 @@ static int post_resolved(struct api *api, struct job_request *wanted, struct sto
 	struct recon_memory memory;
 	bool fresh;
 
-	if (job_request_resolve(wanted, stored_scan_measured(scan), err) != 0 ||
+	if (job_request_resolve(wanted, stored_scan_measured(scan), err) != 0 || send_resolve(api, wanted, err) != 0 ||
 	    supervise_check_memory(api->supervise, stored_scan_measured(scan), &wanted->recipe, &memory, err) != 0)
 		return err->code;
-	return jobs_post(api->jobs, wanted, scan, &memory, client, key, digest, ret_job, &fresh, err);
+	if (jobs_post(api->jobs, wanted, scan, &memory, client, key, digest, ret_job, &fresh, err) != 0)
+		return err->code;
+	return wanted->send != NULL ? sendings_adopt(api->sendings, *ret_job, err) : 0;
 }
 
 static int post(struct api *api, struct request *request, const char *key, const uint8_t digest[32],

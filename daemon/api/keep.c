@@ -36,9 +36,10 @@ static void drop_job(struct api *api, struct job *job, double now)
 	struct error err;
 	bool removed = false;
 
-	if (now <= job_kept_until(job))
-		return;
 	job_record(job, &record);
+	/* What an archive is still to get is kept until it has it, or has failed to. */
+	if (now <= job_kept_until(job) || sendings_pending(api->sendings, record.id))
+		return;
 	log_line(LEVEL_INFO, "job %s ended %.0f s ago, which is longer than such jobs are kept", record.id,
 		 now - record.ended);
 	if (jobs_delete(api->jobs, job, &removed, &err) != 0)

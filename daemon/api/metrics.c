@@ -228,6 +228,23 @@ static void write_jobs(FILE *out, struct api *api)
 	}
 }
 
+static void write_sendings(FILE *out, struct api *api)
+{
+	struct sendings_statistics sendings;
+
+	sendings_statistics(api->sendings, &sendings);
+	describe(out, "sendings", "gauge", "Volumes that are to be sent to archives, by state.");
+	for (int i = 0; i <= SENDING_SENDING; i++)
+		fprintf(out, "cbctd_sendings{state=\"%s\"} %ld\n", sending_state_names[i], sendings.count[i]);
+	single(out, "oldest_unsent_seconds", "gauge",
+	       "Since the oldest volume that is queued or being sent was to be sent; 0 without one.", sendings.oldest);
+	single(out, "sending_attempts_total", "counter", "Attempts to send a volume.", (double)sendings.attempts);
+	describe(out, "sendings_ended_total", "counter", "Volumes that were sent or could not be, by how it ended.");
+	for (int i = SENDING_SENT; i < SENDING_STATE_COUNT; i++)
+		fprintf(out, "cbctd_sendings_ended_total{state=\"%s\"} %llu\n", sending_state_names[i],
+			sendings.ended[i]);
+}
+
 /* ---- workers and cards ---- */
 
 static void write_workers(FILE *out, struct api *api)
@@ -382,6 +399,7 @@ int metrics_get(void *context, struct request *request, struct error *err)
 	write_disk(out, api);
 	write_repairs(out, api);
 	write_jobs(out, api);
+	write_sendings(out, api);
 	write_workers(out, api);
 	write_cards(out, api);
 	write_process(out);

@@ -57,6 +57,32 @@ cJSON *stop_document(const struct recon_stop *stop)
 	return document;
 }
 
+cJSON *sending_document(const struct sending_record *sending)
+{
+	cJSON *document = cJSON_CreateObject();
+
+	if (document == NULL)
+		return NULL;
+	cJSON_AddStringToObject(document, "to", sending->destination);
+	if (sending->volume[0] != '\0')
+		cJSON_AddStringToObject(document, "volume", sending->volume);
+	else
+		cJSON_AddNullToObject(document, "volume");
+	cJSON_AddItemToObject(document, "volumes", send_volumes_json(sending->volumes));
+	cJSON_AddStringToObject(document, "state", sending_state_names[sending->state]);
+	cJSON_AddNumberToObject(document, "attempts", sending->attempts);
+	cJSON_AddNumberToObject(document, "instances", sending->instances);
+	cJSON_AddNumberToObject(document, "stored", sending->stored);
+	if (sending->error[0] != '\0')
+		cJSON_AddStringToObject(document, "error", sending->error);
+	else
+		cJSON_AddNullToObject(document, "error");
+	json_add_time(document, "created", sending->created);
+	json_add_time(document, "next", sending->next);
+	json_add_time(document, "ended", sending->ended);
+	return document;
+}
+
 static void add_quality(cJSON *document, const struct volume_quality *quality)
 {
 	const struct {

@@ -17,6 +17,8 @@
 /* "rule", "iteration", "residual", "change", "noise" (null: not known) and "reason", a sentence. */
 cJSON *stop_document(const struct recon_stop *stop);
 cJSON *volume_document(const char *job, const struct volume_record *volume);
+/* to, volume (null: not known yet), volumes, state, attempts, instances, stored, error, created, next, ended. */
+cJSON *sending_document(const struct sending_record *sending);
 cJSON *history_row_document(const struct history_row *row);
 /*
  * type (urn:cbctd:problem:NAME), detail, pointer where there is one: how a failed job says what went wrong; `report`

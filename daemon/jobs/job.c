@@ -257,18 +257,14 @@ static int load_jobs(struct jobs *jobs, struct error *err)
 		return code;
 	for (int i = 0; i < count && code == 0; i++) {
 		job = job_new(jobs, &records[i]);
-		if (job == NULL || array_reserve(jobs, err) != 0) {
+		if (job != NULL && array_reserve(jobs, err) == 0)
+			job->client = jobs_client(jobs, job->record.client);
+		if (job == NULL || job->client == NULL) {
 			job_free(job);
 			code = error_set_errno(err, ENOMEM, "list of jobs");
 			break;
 		}
 		read_request(job);
-		job->client = jobs_client(jobs, job->record.client);
-		if (job->client == NULL) {
-			job_free(job);
-			code = error_set_errno(err, ENOMEM, "list of jobs");
-			break;
-		}
 		job->entry.client = &job->client->share;
 		job->bytes_known = !job_state_ended(job->record.state);
 		if (job->bytes_known)
@@ -399,6 +395,7 @@ static int fill_record(struct job_record *record, const struct job_request *requ
 /* jobs->change is held. */
 static int insert_job(struct jobs *jobs, struct job *job, struct stored_scan *scan, struct error *err)
 {
+	struct sending_record sendings[SENDS_MOST];
 	struct job_record *record = &job->record;
 	struct scan_facts facts;
 	struct event event;
@@ -425,7 +422,7 @@ static int insert_job(struct jobs *jobs, struct job *job, struct stored_scan *sc
 		code = job_event_make(&event, "state", job_state_document(record), err);
 	if (code != 0)
 		return code;
-	code = store_job_insert(jobs->store, record, &event, err);
+	code = store_job_insert(jobs->store, record, sendings, job_wanted_sendings(job, sendings), &event, err);
 	free(event.data);
 	if (code != 0)
 		return code;

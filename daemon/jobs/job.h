@@ -225,6 +225,13 @@ int job_sync_volumes(struct job *job, struct error *err);
 int job_digest_volume(struct job *job, const struct volume_record *volume, struct error *err);
 int job_add_warning(struct job *job, const char *code, const char *detail, struct error *err);
 
+/* ---- sendings of its volumes to archives; the rules are those of daemon/sendings ---- */
+/* Free the array. Any thread. */
+int job_sendings(struct job *job, struct sending_record **ret_sendings, int *ret_count, struct error *err);
+/* As store_job_put_sendings, with the event of each. ERR_NOT_FOUND: the job is removed. */
+int job_put_sendings(struct job *job, const struct sending_record *sendings, int count, const char *taken,
+		     struct error *err);
+
 /* ---- annotations: what people have measured in its volumes (proto/annotations.h) ---- */
 /* Another one for each text; quoted, for ETags. */
 enum { ANNOTATIONS_TAG_MAX = 36 };

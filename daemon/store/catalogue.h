@@ -99,6 +99,7 @@ enum table_id {
 	TABLE_HISTORY,
 	TABLE_VOLUMES,
 	TABLE_WARNINGS,
+	TABLE_SENDINGS,
 	TABLE_EVENTS,
 	TABLE_REMOVALS,
 	TABLE_COUNT
@@ -114,6 +115,7 @@ enum table_id {
 	struct history_row: TABLE_HISTORY,                      \
 	struct volume_record: TABLE_VOLUMES,                    \
 	struct warning_record: TABLE_WARNINGS,                  \
+	struct sending_record: TABLE_SENDINGS,                  \
 	struct catalogue_event: TABLE_EVENTS,                   \
 	struct catalogue_removal: TABLE_REMOVALS)
 /* clang-format on */
@@ -156,7 +158,8 @@ int catalogue_set_member(struct catalogue *catalogue, enum table_id table, const
 /*
  * int catalogue_take(catalogue, const char *owner, const RECORD *record, err)
  *
- * Removes the projection of this view, or the volume of this name, in a group; the other members do not matter.
+ * Removes the projection of this view, or the volume or sending of this name, in a group; the other members do not
+ * matter.
  */
 #define catalogue_take(catalogue, owner, record, err)                                                                  \
 	catalogue_take_row(catalogue, CATALOGUE_TABLE(*(record)), owner, record, err)
@@ -177,6 +180,9 @@ int catalogue_update_job(struct catalogue *catalogue, const struct job_record *j
 /* Visits the jobs that have volumes without a digest, oldest first. */
 int catalogue_undigested(struct catalogue *catalogue, void (*visit)(void *context, const char *job), void *context,
 			 struct error *err);
+/* Visits the jobs with sendings that have not ended, oldest first. */
+int catalogue_unsent(struct catalogue *catalogue, void (*visit)(void *context, const char *job), void *context,
+		     struct error *err);
 /* Writes the digest of the volume of this name and time of making, in a group, if the volume is still there. */
 int catalogue_set_digest(struct catalogue *catalogue, const char *job, const struct volume_record *volume,
 			 struct error *err);

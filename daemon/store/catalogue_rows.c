@@ -116,6 +116,17 @@ int catalogue_undigested(struct catalogue *catalogue, void (*visit)(void *contex
 			      NULL, 0, visit_id, &each, err);
 }
 
+int catalogue_unsent(struct catalogue *catalogue, void (*visit)(void *context, const char *job), void *context,
+		     struct error *err)
+{
+	struct visit each = {visit, context};
+
+	return catalogue_read(catalogue,
+			      "SELECT id FROM jobs WHERE number IN (SELECT job FROM sendings WHERE ended = 0)"
+			      " ORDER BY number",
+			      NULL, 0, visit_id, &each, err);
+}
+
 int catalogue_set_digest(struct catalogue *catalogue, const char *job, const struct volume_record *volume,
 			 struct error *err)
 {

@@ -17,6 +17,9 @@
 const char *const job_state_names[JOB_STATE_COUNT] = {"waiting",   "queued", "running",
 						      "succeeded", "failed", "cancelled"};
 
+const char *const sending_state_names[SENDING_STATE_COUNT] = {"waiting",   "queued", "sending", "sent",
+							      "committed", "failed", "stopped"};
+
 void store_job_directory(const struct store *store, const char *id, char ret_path[1024])
 {
 	snprintf(ret_path, 1024, "%s/jobs/%s", store->directory, id);
@@ -76,7 +79,8 @@ static int end_with_record(struct store *store, const char *id, bool synced, int
 	return code;
 }
 
-int store_job_insert(struct store *store, const struct job_record *job, const struct event *event, struct error *err)
+int store_job_insert(struct store *store, const struct job_record *job, const struct sending_record *sendings,
+		     int count, const struct event *event, struct error *err)
 {
 	char directory[1024];
 	int code;
@@ -90,6 +94,8 @@ int store_job_insert(struct store *store, const struct job_record *job, const st
 		return code;
 	}
 	code = catalogue_put(store->catalogue, NULL, job, NULL, err);
+	for (int i = 0; i < count && code == 0; i++)
+		code = catalogue_put(store->catalogue, job->id, &sendings[i], NULL, err);
 	if (code == 0)
 		code = add_event(store, job->id, event, err);
 	code = end_with_record(store, job->id, true, code, err);
@@ -279,6 +285,26 @@ int store_job_add_warning(struct store *store, const char *id, const struct warn
 	return code;
 }
 
+int store_job_put_sendings(struct store *store, const char *id, const struct sending_record *sendings,
+			   const struct event *events, int count, const char *taken, struct error *err)
+{
+	struct sending_record gone = {.name = ""};
+	int code = store_begin(store, err);
+
+	if (code != 0)
+		return code;
+	if (taken != NULL) {
+		snprintf(gone.name, sizeof(gone.name), "%s", taken);
+		code = catalogue_take(store->catalogue, id, &gone, err);
+	}
+	for (int i = 0; i < count && code == 0; i++) {
+		code = catalogue_put(store->catalogue, id, &sendings[i], NULL, err);
+		if (code == 0)
+			code = add_event(store, id, &events[i], err);
+	}
+	return end_with_record(store, id, true, code, err);
+}
+
 int store_job_add_event(struct store *store, const char *id, const struct event *event, struct error *err)
 {
 	int code = store_begin(store, err);
@@ -309,6 +335,18 @@ int store_job_warnings(struct store *store, const char *id, struct warning_recor
 		       struct error *err)
 {
 	return catalogue_list(store->catalogue, id, ret_warnings, ret_count, err);
+}
+
+int store_job_sendings(struct store *store, const char *id, struct sending_record **ret_sendings, int *ret_count,
+		       struct error *err)
+{
+	return catalogue_list(store->catalogue, id, ret_sendings, ret_count, err);
+}
+
+int store_jobs_unsent(struct store *store, void (*visit)(void *context, const char *id), void *context,
+		      struct error *err)
+{
+	return catalogue_unsent(store->catalogue, visit, context, err);
 }
 
 int store_jobs_undigested(struct store *store, void (*visit)(void *context, const char *id), void *context,

@@ -416,6 +416,38 @@ struct warning_record {
 	char code[64], detail[512];
 };
 
+/*
+ * A volume that goes, went, or is to go to a destination. WAITING: the job has not ended, nobody knows yet which
+ * volumes there will be. QUEUED: its turn, or the next try, is to come. SENT: the destination has been read back, and
+ * has all of it. COMMITTED: it has also promised to keep it. STOPPED: a client has ended it.
+ */
+enum sending_state {
+	SENDING_WAITING,
+	SENDING_QUEUED,
+	SENDING_SENDING,
+	SENDING_SENT,
+	SENDING_COMMITTED,
+	SENDING_FAILED,
+	SENDING_STOPPED,
+	SENDING_STATE_COUNT
+};
+extern const char *const sending_state_names[SENDING_STATE_COUNT];
+
+enum { SENDING_NAME_SIZE = DESTINATION_NAME_SIZE + 33 };
+struct sending_record {
+	char name[SENDING_NAME_SIZE]; /* among the job's: "pacs/final", "pacs" while it is waiting */
+	char destination[DESTINATION_NAME_SIZE];
+	char volume[32];                 /* "": not known yet */
+	char volumes[SEND_VOLUMES_SIZE]; /* send_wish's */
+	enum sending_state state;
+	int attempts;
+	int instances, stored; /* objects of the volume; those that the destination has, as last seen */
+	char error[320];       /* of the last attempt, "" after one that succeeded */
+	double created;        /* seconds since 1970, as the next two: asked for, the last time */
+	double next;           /* the next attempt; 0: none is to come, or at once */
+	double ended;          /* 0: it has not */
+};
+
 /* An entry of a job's events: numbers grow, are never used twice, and are what Last-Event-ID holds. */
 struct event_record {
 	long long number;
@@ -430,7 +462,8 @@ struct event {
 	char *data;       /* JSON text */
 	const char *once; /* NULL, or: of all events of the job with this name, the first is the only one */
 };
-int store_job_insert(struct store *store, const struct job_record *job, const struct event *event, struct error *err);
+int store_job_insert(struct store *store, const struct job_record *job, const struct sending_record *sendings,
+		     int count, const struct event *event, struct error *err);
 /*
  * The rows that a job's runs have left stay (PAST_STAYS); with PAST_REWINDS the history behind the checkpoint goes,
  * with PAST_GOES all history, volumes, warnings and events, but for its states.
@@ -478,6 +511,19 @@ int store_job_remove_volume(struct store *store, const char *id, const char *nam
 /* *ret_new false, and no event, when this very warning is there already. */
 int store_job_add_warning(struct store *store, const char *id, const struct warning_record *warning,
 			  const struct event *event, bool *ret_new, struct error *err);
+
+/*
+ * Writes sendings, new ones or those with their names anew, each with its event; the one named `taken` (NULL: none)
+ * goes. All or nothing.
+ */
+int store_job_put_sendings(struct store *store, const char *id, const struct sending_record *sendings,
+			   const struct event *events, int count, const char *taken, struct error *err);
+/* In the order of their names; free the array. */
+int store_job_sendings(struct store *store, const char *id, struct sending_record **ret_sendings, int *ret_count,
+		       struct error *err);
+/* The jobs with sendings that have not ended. */
+int store_jobs_unsent(struct store *store, void (*visit)(void *context, const char *id), void *context,
+		      struct error *err);
 
 /*
  * A document that clients keep with the job, in its directory. ERR_NOT_FOUND: none was written yet. ERR_DAMAGED: it

@@ -154,6 +154,22 @@ static const struct column warning_columns[] = {
     {"detail", COLUMN_TEXT, AT(warning_record, detail)},
 };
 
+static const struct column sending_columns[] = {
+    {"job", COLUMN_PARENT, .size = 0},
+    {"name", COLUMN_TEXT, AT(sending_record, name)},
+    {"destination", COLUMN_TEXT, AT(sending_record, destination)},
+    {"volume", COLUMN_TEXT, AT(sending_record, volume)},
+    {"volumes", COLUMN_TEXT, AT(sending_record, volumes)},
+    {"state", COLUMN_CHOICE, AT(sending_record, state), .names = sending_state_names, .choices = SENDING_STATE_COUNT},
+    {"attempts", COLUMN_INT, AT(sending_record, attempts)},
+    {"instances", COLUMN_INT, AT(sending_record, instances)},
+    {"stored", COLUMN_INT, AT(sending_record, stored)},
+    {"error", COLUMN_TEXT, AT(sending_record, error)},
+    {"created", COLUMN_REAL, AT(sending_record, created)},
+    {"next", COLUMN_REAL, AT(sending_record, next)},
+    {"ended", COLUMN_REAL, AT(sending_record, ended)},
+};
+
 static const struct column event_columns[] = {
     {"number", COLUMN_SEQUENCE, AT(catalogue_event, number)}, /* clients resume from it */
     {"job", COLUMN_PARENT, .size = 0},
@@ -189,6 +205,9 @@ const struct table tables[TABLE_COUNT] = {
     [TABLE_WARNINGS] = {"warnings", COLUMNS(warning_columns), .size = sizeof(struct warning_record),
 			.key = "job, code, detail", .unique = "job, code, detail", .parent = "jobs", .reference = "job",
 			.order = "number", .put = PUT_KEEPS},
+    [TABLE_SENDINGS] = {"sendings", COLUMNS(sending_columns), .size = sizeof(struct sending_record), .key = "job, name",
+			.clustered = true, .parent = "jobs", .reference = "job", .order = "name", .name_of = "name",
+			.put = PUT_REPLACES},
     [TABLE_EVENTS] = {"events", COLUMNS(event_columns), .size = sizeof(struct catalogue_event), .key = "number",
 		      .parent = "jobs", .reference = "job", .order = "number", .put = PUT_KEEPS,
 		      .index = "CREATE INDEX IF NOT EXISTS events_of_job ON events (job, number);"

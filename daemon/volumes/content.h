@@ -5,7 +5,7 @@
 #include <stdint.h>
 #include <sys/types.h>
 
-#include "daemon/volumes/dicom.h"
+#include "proto/dicom.h"
 #include "proto/format.h"
 
 /*

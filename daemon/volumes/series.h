@@ -4,7 +4,7 @@
 #include <sys/types.h>
 
 #include "daemon/volumes/content.h"
-#include "daemon/volumes/dicom.h"
+#include "proto/dicom.h"
 
 /*
  * The bytes of a volume as DICOM, in order: a ZIP of its slices (stored, PKWARE's APPNOTE 6.3), or one object with all

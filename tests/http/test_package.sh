@@ -100,7 +100,7 @@ test_the_bill_of_materials_is_what_the_programs_need() {
 	jq -e '([.components[]."bom-ref"] | length == (unique | length)) and ([.components[]."bom-ref"] + ["product:cbctd"]) as $all |
 		([.dependencies[] | .ref, .dependsOn[]] - $all) == []' "$bom" >/dev/null || fail "every reference has one component"
 	jq -e 'all(.components[]; (.version | length > 0) and (.type == "application" or .licenses != null or .supplier != null))' "$bom" >/dev/null || fail "versions and licences"
-	for program in cbctd cbct-worker cbct; do
+	for program in cbctd cbct-worker cbct-dicom cbct; do
 		diff <(readelf -d "$BUILD/$program" | sed -n 's/.*(NEEDED).*\[\(.*\)\]/\1/p' | sort) \
 			<(jq -r --arg p "program:$program" '.dependencies[] | select(.ref == $p).dependsOn[] | select(startswith("library:")) | ltrimstr("library:")' "$bom" | sort) ||
 			fail "what $program needs"

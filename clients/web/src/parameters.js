@@ -65,7 +65,7 @@ export const presets = [
 ]
 /* Members of a job's document that are parts of its request, whether they have a field above or not. */
 export const members = [...new Set([...groups.flatMap(({ pointer, fields }) => pointer ? [pointer] : fields.map(field => field.pointer)).map(pointer => path(pointer)[0]),
-	'patient', 'labels'])]
+	'patient', 'labels', 'send'])]
 
 /* ---- as words ---- */
 

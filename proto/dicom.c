@@ -1,5 +1,5 @@
 /* DICOM objects of a volume: dicom.h. Numbers of the standard are those of PS3.3 2023. */
-#include "daemon/volumes/dicom.h"
+#include "proto/dicom.h"
 
 #include <math.h>
 #include <openssl/sha.h>
@@ -8,12 +8,6 @@
 #include <stdlib.h>
 #include <string.h>
 #include <time.h>
-
-#define CT_IMAGE "1.2.840.10008.5.1.4.1.1.2"
-#define ENHANCED_CT_IMAGE "1.2.840.10008.5.1.4.1.1.2.1"
-#define EXPLICIT_LITTLE_ENDIAN "1.2.840.10008.1.2.1"
-/* UID of this program: a UUID as a number, by the rule of the root 2.25. */
-#define IMPLEMENTATION "2.25.208437269145863218905713340955731662842"
 
 enum { UID_SIZE = 65, DS_SIZE = 17 /* characters of a decimal string, and its end */ };
 static const uint32_t undefined = 0xffffffff; /* length */
@@ -335,9 +329,9 @@ static void put_meta(struct object *o, const struct instance *image, const char 
 	put_bytes(o, "\0\1", 2);
 	put_text(o, 0x00020002, "UI", class);
 	put_text(o, 0x00020003, "UI", image->instance);
-	put_text(o, 0x00020010, "UI", EXPLICIT_LITTLE_ENDIAN);
-	put_text(o, 0x00020012, "UI", IMPLEMENTATION);
-	put_text(o, 0x00020013, "SH", "CBCTD");
+	put_text(o, 0x00020010, "UI", DICOM_EXPLICIT_LITTLE_ENDIAN);
+	put_text(o, 0x00020012, "UI", DICOM_IMPLEMENTATION);
+	put_text(o, 0x00020013, "SH", DICOM_IMPLEMENTATION_VERSION);
 	length = (uint32_t)(o->size - at);
 	for (int i = 0; i < 4 && !o->failed; i++)
 		o->bytes[at - 4 + (size_t)i] = (uint8_t)(length >> 8 * i);
@@ -542,7 +536,7 @@ static void put_acquisition(struct object *o, const struct instance *image)
 int dicom_head(const struct dicom_words *words, const struct grid *grid, const struct provenance *provenance, int z,
 	       size_t pixels, struct dicom_head *ret_head, struct error *err)
 {
-	const char *class = words->enhanced ? ENHANCED_CT_IMAGE : CT_IMAGE;
+	const char *class = words->enhanced ? DICOM_ENHANCED_CT_IMAGE : DICOM_CT_IMAGE;
 	struct instance image = {.words = words, .grid = grid, .provenance = provenance, .z = z};
 	struct object o = {0};
 
@@ -575,5 +569,7 @@ int dicom_head(const struct dicom_words *words, const struct grid *grid, const s
 	}
 	*ret_head = (struct dicom_head){.bytes = o.bytes, .size = o.size};
 	memcpy(ret_head->instance, image.instance, sizeof(ret_head->instance));
+	memcpy(ret_head->series, image.series, sizeof(ret_head->series));
+	memcpy(ret_head->study, image.study, sizeof(ret_head->study));
 	return 0;
 }

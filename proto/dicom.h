@@ -1,7 +1,6 @@
-#ifndef CBCT_DAEMON_VOLUMES_DICOM_H
-#define CBCT_DAEMON_VOLUMES_DICOM_H
+#ifndef CBCT_PROTO_DICOM_H
+#define CBCT_PROTO_DICOM_H
 
-#include "daemon/id.h"
 #include "proto/format.h"
 #include "proto/subject.h"
 
@@ -34,8 +33,16 @@ int dicom_patient(const struct dicom_words *words, const struct patient *told, s
 struct dicom_head {
 	uint8_t *bytes;
 	size_t size;
-	char instance[65]; /* SOP Instance UID */
+	char instance[65], series[65], study[65]; /* their UIDs */
 };
+/* Of the objects' SOP class and transfer syntax. */
+#define DICOM_CT_IMAGE "1.2.840.10008.5.1.4.1.1.2"
+#define DICOM_ENHANCED_CT_IMAGE "1.2.840.10008.5.1.4.1.1.2.1"
+#define DICOM_EXPLICIT_LITTLE_ENDIAN "1.2.840.10008.1.2.1"
+/* UID of this program: a UUID as a number, by the rule of the root 2.25; and its version. */
+#define DICOM_IMPLEMENTATION "2.25.208437269145863218905713340955731662842"
+#define DICOM_IMPLEMENTATION_VERSION "CBCTD"
+
 /* The head of slice z, or of all slices (enhanced). `pixels` bytes of pixels follow it. ERR_NO_MEMORY. */
 int dicom_head(const struct dicom_words *words, const struct grid *grid, const struct provenance *provenance, int z,
 	       size_t pixels, struct dicom_head *ret_head, struct error *err);

@@ -1,0 +1,353 @@
+/*
+ * DICOMweb (PS3.18): objects go by STOW-RS (10.5), several requests at once; what the archive has is asked by QIDO-RS
+ * (10.6). There is no storage commitment in DICOMweb.
+ */
+#include <curl/curl.h>
+#include <pthread.h>
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "daemon/dicom/dicom.h"
+#include "proto/scan_directory.h"
+
+enum {
+	CONNECTIONS = 3,
+	BATCH_BYTES = 8 << 20, /* of a request, or one object */
+	REPLY_MOST = 64 << 20,
+	TOKEN_MOST = 1 << 14,
+	PAGE = 1000, /* instances asked for at a time */
+	CONNECT_SECONDS = 10,
+	SILENT_SECONDS = 60
+};
+static const char boundary[] = "cbctd-7f1c0b1e9d5a4c6f8e2b3a4d5c6e7f80";
+
+struct reply {
+	char *bytes;
+	size_t size, space;
+	long status;
+};
+
+static size_t take(char *from, size_t size, size_t count, void *context)
+{
+	struct reply *reply = context;
+	const size_t length = size * count;
+
+	if (reply->size + length + 1 > reply->space) {
+		const size_t space = 2 * reply->space + length + 1024;
+		char *grown = space <= REPLY_MOST ? realloc(reply->bytes, space) : NULL;
+
+		if (grown == NULL)
+			return 0;
+		reply->bytes = grown;
+		reply->space = space;
+	}
+	memcpy(reply->bytes + reply->size, from, length);
+	reply->size += length;
+	reply->bytes[reply->size] = '\0';
+	return length;
+}
+
+/* "Authorization: Bearer ..." of the token in the destination's file. */
+static int add_token(const cJSON *destination, struct curl_slist **headers, struct error *err)
+{
+	const char *path = destination_text(destination, "token_file");
+	char *text, line[TOKEN_MOST + 40];
+	size_t length;
+
+	if (path[0] == '\0')
+		return 0;
+	if (file_read(path, TOKEN_MOST, &text, &length, err) != 0)
+		return err->code;
+	snprintf(line, sizeof(line), "Authorization: Bearer %.*s", (int)strcspn(text, "\r\n"), text);
+	explicit_bzero(text, length);
+	free(text);
+	*headers = curl_slist_append(*headers, line);
+	explicit_bzero(line, sizeof(line));
+	return 0;
+}
+
+static CURL *open_connection(const cJSON *destination)
+{
+	CURL *curl = curl_easy_init();
+	const char *authority = destination_text(destination, "ca_file");
+
+	if (curl == NULL)
+		return NULL;
+	curl_easy_setopt(curl, CURLOPT_NOSIGNAL, 1L);
+	curl_easy_setopt(curl, CURLOPT_CONNECTTIMEOUT, (long)CONNECT_SECONDS);
+	curl_easy_setopt(curl, CURLOPT_LOW_SPEED_LIMIT, 1L);
+	curl_easy_setopt(curl, CURLOPT_LOW_SPEED_TIME, (long)SILENT_SECONDS);
+	/* A token goes to the archive alone. */
+	curl_easy_setopt(curl, CURLOPT_FOLLOWLOCATION, 0L);
+	if (authority[0] != '\0')
+		curl_easy_setopt(curl, CURLOPT_CAINFO, authority);
+	return curl;
+}
+
+/* One request; body NULL: GET. The reply's bytes are the caller's, on failure too. */
+static int exchange(CURL *curl, const cJSON *destination, const char *url, const struct reply *body,
+		    struct reply *ret_reply, struct error *err)
+{
+	struct curl_slist *headers = curl_slist_append(NULL, "Accept: application/dicom+json");
+	char type[160];
+	CURLcode result = CURLE_OK;
+	int code = add_token(destination, &headers, err);
+
+	*ret_reply = (struct reply){.bytes = NULL};
+	if (body != NULL) {
+		snprintf(type, sizeof(type), "Content-Type: multipart/related; type=\"application/dicom\"; boundary=%s",
+			 boundary);
+		headers = curl_slist_append(headers, type);
+		headers = curl_slist_append(headers, "Expect:");
+		curl_easy_setopt(curl, CURLOPT_POST, 1L);
+		curl_easy_setopt(curl, CURLOPT_POSTFIELDS, body->bytes);
+		curl_easy_setopt(curl, CURLOPT_POSTFIELDSIZE_LARGE, (curl_off_t)body->size);
+	} else {
+		curl_easy_setopt(curl, CURLOPT_HTTPGET, 1L);
+	}
+	if (code == 0) {
+		curl_easy_setopt(curl, CURLOPT_URL, url);
+		curl_easy_setopt(curl, CURLOPT_HTTPHEADER, headers);
+		curl_easy_setopt(curl, CURLOPT_WRITEFUNCTION, take);
+		curl_easy_setopt(curl, CURLOPT_WRITEDATA, ret_reply);
+		result = curl_easy_perform(curl);
+		curl_easy_getinfo(curl, CURLINFO_RESPONSE_CODE, &ret_reply->status);
+	}
+	curl_slist_free_all(headers);
+	if (result != CURLE_OK)
+		code = error_set(err, ERR_BUSY, "it cannot be reached: %s", curl_easy_strerror(result));
+	return code;
+}
+
+/* The words of an archive's own replies may name a patient: the number is all that is told. */
+static int refuse(long status, const char *what, struct error *err)
+{
+	const char *why = status == 401 || status == 403 ? " (the token is not accepted)"
+			  : status == 404                ? " (is the url that of its DICOMweb?)"
+			  : status == 413                ? " (the request is too large for it)"
+			  : status == 507                ? " (its disk is full)"
+							 : "";
+
+	return error_set(err, ERR_IO, "it answered %s with %ld%s", what, status, why);
+}
+
+static void make_url(const cJSON *destination, char *ret_url, size_t size, const char *format, ...)
+    __attribute__((format(printf, 4, 5)));
+static void make_url(const cJSON *destination, char *ret_url, size_t size, const char *format, ...)
+{
+	const char *base = destination_text(destination, "url");
+	size_t length = strlen(base);
+	va_list args;
+
+	while (length > 0 && base[length - 1] == '/')
+		length--;
+	length = (size_t)snprintf(ret_url, size, "%.*s", (int)length, base);
+	va_start(args, format);
+	vsnprintf(ret_url + length, size - length, format, args);
+	va_end(args);
+}
+
+static int web_ask(const cJSON *destination, struct error *err)
+{
+	CURL *curl = open_connection(destination);
+	struct reply reply = {0};
+	char url[800];
+	int code;
+
+	if (curl == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a connection");
+	make_url(destination, url, sizeof(url), "/studies?limit=1&StudyInstanceUID=1.2.3");
+	code = exchange(curl, destination, url, NULL, &reply, err);
+	if (code == 0 && (reply.status < 200 || reply.status > 299))
+		code = refuse(reply.status, "QIDO-RS", err);
+	free(reply.bytes);
+	curl_easy_cleanup(curl);
+	return code;
+}
+
+/* ---- reading back ---- */
+
+/* Marks the instances of a page of results; returns how many it has, or an error. */
+static int take_page(const struct reply *reply, struct objects *objects, struct error *err)
+{
+	cJSON *list = reply->size > 0 ? cJSON_ParseWithLength(reply->bytes, reply->size) : cJSON_CreateArray();
+	const cJSON *one;
+	int count = 0;
+
+	if (!cJSON_IsArray(list)) {
+		cJSON_Delete(list);
+		return error_set(err, ERR_IO, "its answer to QIDO-RS is no DICOM JSON");
+	}
+	cJSON_ArrayForEach(one, list)
+	{
+		const cJSON *instance = cJSON_GetObjectItemCaseSensitive(one, "00080018");
+		const cJSON *value = cJSON_GetArrayItem(cJSON_GetObjectItemCaseSensitive(instance, "Value"), 0);
+
+		if (cJSON_IsString(value))
+			objects_mark(objects, value->valuestring);
+		count++;
+	}
+	cJSON_Delete(list);
+	return count;
+}
+
+static int web_find(const cJSON *destination, struct objects *objects, struct error *err)
+{
+	const struct dicom_head *head = &objects->list[0].head;
+	CURL *curl = open_connection(destination);
+	int code = 0, count = 1;
+	char url[1024];
+
+	if (curl == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a connection");
+	for (int i = 0; i < objects->count; i++)
+		objects->list[i].stored = false;
+	for (int offset = 0; code == 0 && count > 0 && offset < objects->count; offset += count) {
+		struct reply reply;
+
+		make_url(destination, url, sizeof(url), "/studies/%s/series/%s/instances?limit=%d&offset=%d",
+			 head->study, head->series, PAGE, offset);
+		code = exchange(curl, destination, url, NULL, &reply, err);
+		/* A series that is not there is an empty answer or a 404. */
+		if (code == 0 && (reply.status == 404 || reply.status == 204))
+			count = 0;
+		else if (code == 0 && reply.status != 200)
+			code = refuse(reply.status, "QIDO-RS", err);
+		else if (code == 0)
+			count = take_page(&reply, objects, err);
+		if (count < 0)
+			code = count;
+		free(reply.bytes);
+	}
+	curl_easy_cleanup(curl);
+	return code;
+}
+
+/* ---- sending ---- */
+
+struct load {
+	const cJSON *destination;
+	const struct objects *objects;
+	pthread_mutex_t lock; /* guards the next two */
+	int next;             /* object that nobody has taken yet */
+	struct error error;   /* the first */
+};
+
+static bool put(struct reply *body, const void *bytes, size_t size)
+{
+	return take((char *)(uintptr_t)bytes, 1, size, body) == size;
+}
+
+static int add_part(struct reply *body, const struct objects *objects, int place, struct error *err)
+{
+	char head[160];
+	uint8_t *bytes;
+	size_t size, dataset;
+	bool added;
+
+	if (object_make(objects, place, &bytes, &size, &dataset, err) != 0)
+		return err->code;
+	snprintf(head, sizeof(head), "\r\n--%s\r\nContent-Type: application/dicom\r\n\r\n", boundary);
+	/* The first delimiter has no line's end before it. */
+	added = put(body, body->size == 0 ? head + 2 : head, strlen(head) - (body->size == 0 ? 2 : 0)) &&
+		put(body, bytes, size);
+	free(bytes);
+	return added ? 0 : error_set(err, ERR_NO_MEMORY, "no memory for a request");
+}
+
+/* Takes objects until a request is full; *ret_count 0: all are taken. */
+static int fill(struct load *load, struct reply *body, int *ret_count, struct error *err)
+{
+	char end[80];
+	int code = 0, place;
+
+	body->size = 0;
+	*ret_count = 0;
+	while (code == 0 && (body->size == 0 || body->size + body->size / (size_t)*ret_count < BATCH_BYTES)) {
+		pthread_mutex_lock(&load->lock);
+		while (load->next < load->objects->count && load->objects->list[load->next].stored)
+			load->next++;
+		place = load->error.code == 0 && load->next < load->objects->count ? load->next++ : -1;
+		pthread_mutex_unlock(&load->lock);
+		if (place < 0)
+			break;
+		code = add_part(body, load->objects, place, err);
+		(*ret_count)++;
+	}
+	snprintf(end, sizeof(end), "\r\n--%s--\r\n", boundary);
+	if (code == 0 && *ret_count > 0 && !put(body, end, strlen(end)))
+		code = error_set(err, ERR_NO_MEMORY, "no memory for a request");
+	return code;
+}
+
+/* 200: all, 202: some, 409: none was stored; which, and why, its FailedSOPSequence says. */
+static int judge(const struct reply *reply, struct error *err)
+{
+	cJSON *document = reply->size > 0 ? cJSON_ParseWithLength(reply->bytes, reply->size) : NULL;
+	const cJSON *sequence = cJSON_GetObjectItemCaseSensitive(document, "00081198"), *first, *reason;
+	const cJSON *failed = cJSON_GetObjectItemCaseSensitive(sequence, "Value");
+	const int count = cJSON_GetArraySize(failed);
+	int code = 0;
+
+	first = cJSON_GetArrayItem(failed, 0);
+	reason = cJSON_GetArrayItem(
+	    cJSON_GetObjectItemCaseSensitive(cJSON_GetObjectItemCaseSensitive(first, "00081197"), "Value"), 0);
+	if (count > 0)
+		code = error_set(err, ERR_IO, "it refused %d objects, reason 0x%04x", count,
+				 cJSON_IsNumber(reason) ? (unsigned)reason->valueint : 0);
+	else if (reply->status != 200 && reply->status != 202)
+		code = refuse(reply->status, "STOW-RS", err);
+	cJSON_Delete(document);
+	return code;
+}
+
+static void *send_some(void *context)
+{
+	struct load *load = context;
+	CURL *curl = open_connection(load->destination);
+	struct reply body = {0}, reply = {0};
+	struct error err = {0};
+	char url[800];
+	int count = 0, code = curl == NULL ? error_set(&err, ERR_NO_MEMORY, "no memory for a connection") : 0;
+
+	make_url(load->destination, url, sizeof(url), "/studies");
+	while (code == 0 && (code = fill(load, &body, &count, &err)) == 0 && count > 0) {
+		code = exchange(curl, load->destination, url, &body, &reply, &err);
+		if (code == 0)
+			code = judge(&reply, &err);
+		free(reply.bytes);
+		if (code == 0)
+			report_progress(count);
+	}
+	if (code != 0) {
+		pthread_mutex_lock(&load->lock);
+		if (load->error.code == 0)
+			load->error = err;
+		pthread_mutex_unlock(&load->lock);
+	}
+	free(body.bytes);
+	if (curl != NULL)
+		curl_easy_cleanup(curl);
+	return NULL;
+}
+
+static int web_store(const cJSON *destination, const struct objects *objects, struct error *err)
+{
+	struct load load = {.destination = destination, .objects = objects, .lock = PTHREAD_MUTEX_INITIALIZER};
+	pthread_t threads[CONNECTIONS];
+	int count = 0;
+
+	while (count < CONNECTIONS - 1 && pthread_create(&threads[count], NULL, send_some, &load) == 0)
+		count++;
+	send_some(&load);
+	for (int i = 0; i < count; i++)
+		pthread_join(threads[i], NULL);
+	pthread_mutex_destroy(&load.lock);
+	if (load.error.code != 0)
+		*err = load.error;
+	return load.error.code;
+}
+
+const struct archive archive_web = {"dicomweb", web_ask, web_find, web_store, NULL};

@@ -1,0 +1,234 @@
+/*
+ * Destinations: a JSON file {"destinations": [{"name": ..., "kind": "dicomweb", ...}]}. Their secrets are in
+ * files of their own, which cbct-dicom alone reads.
+ */
+#include <fcntl.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "daemon/log.h"
+#include "daemon/sendings/internal.h"
+#include "proto/scan_directory.h"
+
+enum { FILE_MOST = 1 << 20, DESTINATIONS_MOST = 64 };
+
+static const char *const kind_names[DESTINATION_KIND_COUNT] = {"dicomweb"};
+static const char *const objects_names[] = {"slices", "enhanced"};
+static const char *const rule_names[] = {"none", "last", "all"};
+
+void destinations_free(struct destination *destinations, int count)
+{
+	for (int i = 0; i < count; i++)
+		cJSON_Delete(destinations[i].row);
+	free(destinations);
+}
+
+struct destination *destination_find(const struct sendings *sendings, const char *name)
+{
+	for (int i = 0; i < sendings->destination_count; i++)
+		if (strcmp(sendings->destinations[i].name, name) == 0)
+			return &sendings->destinations[i];
+	return NULL;
+}
+
+/* ---- reading ---- */
+
+static void read_web(struct json_reader *reader, struct destination *ret)
+{
+	char path[1024] = "";
+
+	json_string(reader, "url", true, ret->address, sizeof(ret->address));
+	json_string(reader, "token_file", false, path, sizeof(path));
+	json_string(reader, "ca_file", false, path, sizeof(path));
+	if (reader->code == 0 && strncmp(ret->address, "http://", 7) != 0 && strncmp(ret->address, "https://", 8) != 0)
+		json_fail(reader, ERR_INVALID, "url", "expected http:// or https://");
+	/* A document shows the URL. */
+	if (reader->code == 0 && strpbrk(ret->address, "@?#") != NULL)
+		json_fail(reader, ERR_INVALID, "url",
+			  "a URL with a name, password or query is not taken; a token stands in token_file");
+}
+
+static int read_row(const cJSON *value, int place, struct destination *ret, struct error *err)
+{
+	int kind = 0, objects = 0, rule = 0;
+	struct json_reader reader;
+	char pointer[64];
+
+	snprintf(pointer, sizeof(pointer), "/destinations/%d", place);
+	json_begin(&reader, value, pointer, err);
+	json_string(&reader, "name", true, ret->name, sizeof(ret->name));
+	json_choice(&reader, "kind", true, kind_names, DESTINATION_KIND_COUNT, &kind);
+	json_choice(&reader, "objects", false, objects_names, 2, &objects);
+	json_choice(&reader, "send", false, rule_names, 3, &rule);
+	if (reader.code == 0 && !destination_name_valid(ret->name))
+		json_fail(&reader, ERR_INVALID, "name", "\"%s\" is no name: letters, digits, -, _ and .", ret->name);
+	read_web(&reader, ret);
+	ret->kind = (enum destination_kind)kind;
+	ret->enhanced = objects == 1;
+	snprintf(ret->rule, sizeof(ret->rule), "%s", rule > 0 ? rule_names[rule] : "");
+	ret->wanted = true;
+	return json_end(&reader);
+}
+
+static int read_list(const cJSON *list, struct destination **ret_destinations, int *ret_count, struct error *err)
+{
+	const int count = cJSON_GetArraySize(list);
+	struct destination *read;
+	const cJSON *one;
+	int i = 0, code = 0;
+
+	if (!cJSON_IsArray(list) || count > DESTINATIONS_MOST)
+		return error_set_at(err, ERR_INVALID, "/destinations", "expected a list of at most %d destinations",
+				    DESTINATIONS_MOST);
+	read = calloc((size_t)count + 1, sizeof(*read));
+	if (read == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for destinations");
+	cJSON_ArrayForEach(one, list)
+	{
+		code = read_row(one, i, &read[i], err);
+		for (int k = 0; k < i && code == 0; k++)
+			if (strcmp(read[k].name, read[i].name) == 0)
+				code = error_set(err, ERR_INVALID, "two destinations are called %s", read[i].name);
+		if (code == 0 && (read[i].row = cJSON_Duplicate(one, true)) == NULL)
+			code = error_set(err, ERR_NO_MEMORY, "no memory for destinations");
+		i++;
+		if (code != 0)
+			break;
+	}
+	if (code != 0) {
+		destinations_free(read, i);
+		return code;
+	}
+	*ret_destinations = read;
+	*ret_count = count;
+	return 0;
+}
+
+int destinations_read(const char *file, struct destination **ret_destinations, int *ret_count, struct error *err)
+{
+	struct json_reader reader;
+	struct error cause = {0};
+	cJSON *document = NULL;
+	const cJSON *list;
+	char *text = NULL;
+	size_t length;
+	int code;
+
+	*ret_destinations = NULL;
+	*ret_count = 0;
+	if (file[0] == '\0')
+		return 0;
+	code = file_read(file, FILE_MOST, &text, &length, &cause);
+	if (code == 0)
+		code = json_parse(text, length, &document, &cause);
+	if (code == 0) {
+		json_begin(&reader, document, "", &cause);
+		list = json_member(&reader, "destinations", true);
+		code = json_end(&reader);
+		if (code == 0)
+			code = read_list(list, ret_destinations, ret_count, &cause);
+	}
+	free(text);
+	cJSON_Delete(document);
+	return code == 0 ? 0
+			 : error_set(err, code, "destinations %.100s: %.40s%s%.160s", file, cause.pointer,
+				     cause.pointer[0] != '\0' ? ": " : "", cause.text);
+}
+
+void sendings_reload(struct sendings *sendings)
+{
+	struct destination *fresh, *old;
+	struct error err = {0};
+	int count, old_count;
+
+	if (destinations_read(sendings->file, &fresh, &count, &err) != 0) {
+		log_line(LEVEL_ERROR, "the destinations that were read before stay: %s", err.text);
+		return;
+	}
+	pthread_mutex_lock(&sendings->lock);
+	old = sendings->destinations;
+	old_count = sendings->destination_count;
+	sendings->destinations = fresh;
+	sendings->destination_count = count;
+	/* What was changed may be the reason why something could not be sent. */
+	for (int i = 0; i < sendings->count; i++)
+		sendings->entries[i].record.next = 0;
+	pthread_mutex_unlock(&sendings->lock);
+	destinations_free(old, old_count);
+	sender_wake(sendings);
+}
+
+/* ---- what the API shows ---- */
+
+static long unsent(const struct sendings *sendings, const char *name)
+{
+	long count = 0;
+
+	for (int i = 0; i < sendings->count; i++)
+		count += strcmp(sendings->entries[i].record.destination, name) == 0;
+	return count;
+}
+
+static cJSON *document_of(const struct sendings *sendings, const struct destination *one)
+{
+	cJSON *document = cJSON_CreateObject();
+
+	cJSON_AddStringToObject(document, "name", one->name);
+	cJSON_AddStringToObject(document, "kind", kind_names[one->kind]);
+	cJSON_AddStringToObject(document, "address", one->address);
+	cJSON_AddStringToObject(document, "objects", objects_names[one->enhanced]);
+	cJSON_AddStringToObject(document, "send", one->rule[0] != '\0' ? one->rule : rule_names[0]);
+	if (one->known)
+		cJSON_AddBoolToObject(document, "reachable", one->reachable);
+	else
+		cJSON_AddNullToObject(document, "reachable");
+	if (one->detail[0] != '\0')
+		cJSON_AddStringToObject(document, "detail", one->detail);
+	else
+		cJSON_AddNullToObject(document, "detail");
+	json_add_time(document, "checked", one->checked);
+	cJSON_AddNumberToObject(document, "unsent", (double)unsent(sendings, one->name));
+	return document;
+}
+
+cJSON *destinations_document(struct sendings *sendings)
+{
+	cJSON *document = cJSON_CreateObject(), *list = cJSON_AddArrayToObject(document, "destinations");
+
+	pthread_mutex_lock(&sendings->lock);
+	for (int i = 0; i < sendings->destination_count; i++)
+		cJSON_AddItemToArray(list, document_of(sendings, &sendings->destinations[i]));
+	pthread_mutex_unlock(&sendings->lock);
+	return document;
+}
+
+void destinations_ask(struct sendings *sendings)
+{
+	pthread_mutex_lock(&sendings->lock);
+	for (int i = 0; i < sendings->destination_count; i++)
+		sendings->destinations[i].wanted = true;
+	pthread_mutex_unlock(&sendings->lock);
+	sender_wake(sendings);
+}
+
+bool destinations_asked(struct sendings *sendings)
+{
+	bool asked = false;
+
+	pthread_mutex_lock(&sendings->lock);
+	for (int i = 0; i < sendings->destination_count; i++)
+		asked |= sendings->destinations[i].wanted;
+	pthread_mutex_unlock(&sendings->lock);
+	return asked;
+}
+
+void destinations_watch(struct sendings *sendings, struct watch *watch)
+{
+	watch_add(&sendings->watchers, watch);
+}
+
+void destinations_unwatch(struct sendings *sendings, struct watch *watch)
+{
+	watch_remove(&sendings->watchers, watch);
+}

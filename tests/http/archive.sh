@@ -1,0 +1,74 @@
+# Orthanc with its DICOMweb plugin, sourced by tests that send to it; needs lib.sh and $python.
+
+need_archive() {
+	trap stop_peers EXIT # of the test
+	rm -rf "$work/archive"
+	plugin=$(ls /usr/share/orthanc/plugins/libOrthancDicomWeb.so 2>/dev/null) && command -v Orthanc >/dev/null ||
+		skip "Orthanc of the package orthanc-dicomweb is not here"
+	"$python" -c 'import gdcm, numpy, pydicom' 2>/dev/null || skip "python3-pydicom or python3-gdcm is not here"
+	[ -e "$work/scan/scan.json" ] || { mkdir -p "$work/scan" && "$python" "$top/tests/http/sides.py" make "$work/scan"; }
+}
+# start_archive: with what it had; sets $archive (its process), $rest (its address), $web and $dimse (its ports).
+start_archive() {
+	local i
+	mkdir -p "$work/archive"
+	[ -n "${web:-}" ] || read -r web dimse commit < <("$python" "$top/tests/http/send.py" ports 3)
+	jq -n --arg plugin "$plugin" --arg work "$work/archive" --argjson web "$web" --argjson dimse "$dimse" --argjson commit "$commit" '{
+		Name: "ARCHIVE", DicomAet: "ARCHIVE", DicomCheckCalledAet: true, DicomPort: $dimse, HttpPort: $web, HttpBindAddresses: ["127.0.0.1"],
+		RemoteAccessAllowed: false, AuthenticationEnabled: false, StorageDirectory: $work, IndexDirectory: $work, Plugins: [$plugin],
+		DicomModalities: {cbctd: ["CBCTD", "127.0.0.1", $commit]}, DicomAlwaysAllowFind: true, DicomAlwaysAllowStore: true,
+		StorageCompression: false, OverwriteInstances: false}' >"$work/archive.json"
+	Orthanc "$work/archive.json" >>"$work/archive.log" 2>&1 &
+	archive=$!
+	echo $archive >>"$work/peers"
+	rest=http://127.0.0.1:$web
+	for ((i = 0; i < 300; i++)); do
+		curl -sf "$rest/system" >/dev/null && return 0
+		kill -0 "$archive" || fail "Orthanc runs, got $(tail -3 "$work/archive.log")"
+		sleep 0.05
+	done
+	fail "Orthanc answers"
+}
+kill_archive() {
+	kill -9 "$archive"
+	wait "$archive" 2>/dev/null || true
+}
+# start_peer MODE: an archive of send.py; sets $peer_port, its requests are in $work/peer.log
+start_peer() {
+	local i
+	: >"$work/peer.log"
+	: >"$work/peer.port"
+	"$python" "$top/tests/http/send.py" web "$1" "$work/peer.log" >"$work/peer.port" &
+	peer=$!
+	echo $peer >>"$work/peers"
+	for ((i = 0; i < 200; i++)); do
+		peer_port=$(cat "$work/peer.port")
+		[ -z "$peer_port" ] || return 0
+		sleep 0.05
+	done
+	fail "an archive that does wrong"
+}
+stop_peers() {
+	local pid
+	[ ! -e "$work/peers" ] || while read -r pid; do kill -9 "$pid" 2>/dev/null || true; done <"$work/peers"
+	rm -f "$work/peers"
+}
+
+# fetched DIRECTORY: every object that the archive has
+fetched() {
+	local i
+	rm -rf "$1"
+	mkdir -p "$1"
+	for i in $(curl -sSf "$rest/instances" | jq -r '.[]'); do curl -sSf -o "$1/$i.dcm" "$rest/instances/$i/file"; done
+}
+# destinations JSON ...: the file, one object each
+destinations() { printf '%s\n' "$@" | jq -s '{destinations: .}' >"$work/destinations.json"; }
+# sending_becomes STATE [SECONDS [VOLUME]]: of $job
+sending_becomes() {
+	local end=$((SECONDS + ${2:-30}))
+	until req GET "/v1/jobs/$job/send" && jq -e --arg state "$1" --arg volume "${3:-}" '[.sendings[] | select($volume == "" or .volume == $volume)] |
+		length > 0 and all(.state == $state)' "$body" >/dev/null; do
+		[ $SECONDS -lt $end ] || fail "sendings of $job are $1: $(cat "$body")"
+		sleep 0.2
+	done
+}
