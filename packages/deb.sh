@@ -3,12 +3,14 @@
 # built. Usage: packages/deb.sh ROOT VERSION OUT [CUDA-WORKER]
 #   ROOT         where `make install DESTDIR=ROOT prefix=/usr` has put everything
 #   CUDA-WORKER  a cbct-worker with the CUDA backend
+#   MAINTAINER   in the environment: who gives the package out, "NAME <ADDRESS>"
 # The same input and SOURCE_DATE_EPOCH give the same bytes.
 set -euo pipefail
 root=$1 version=$2 out=$3 cuda=${4:-}
 here=$(cd "$(dirname "$0")" && pwd)
 architecture=$(dpkg --print-architecture)
 export SOURCE_DATE_EPOCH=${SOURCE_DATE_EPOCH:-$(git -C "$here" log -1 --format=%ct 2>/dev/null || date +%s)}
+maintainer=${MAINTAINER:-the maintainers of cbctd <root@localhost>}
 mkdir -p "$out"
 
 # The Debian packages of the libraries that these programs name; those of the libraries' own are their packages' affair.
@@ -41,11 +43,23 @@ build() {
 	echo "$file"
 }
 
+# What Debian wants to be told with each package; the lines for lintian come from standard input.
+documents() { # NAME FOLDER COPYRIGHT
+	local to=$2/usr/share/doc/$1 line
+	mkdir -p "$to" "$2/usr/share/lintian/overrides"
+	printf '%s\n' "$3" >"$to/copyright"
+	printf '%s (%s) unstable; urgency=medium\n\n  * The commits of the project say what has changed.\n\n -- %s  %s\n' \
+		"$1" "$version" "$maintainer" "$(LC_ALL=C date -u -R -d "@$SOURCE_DATE_EPOCH")" | gzip -9n >"$to/changelog.gz"
+	while read -r line; do
+		if [ "${line:0:1}" = '#' ]; then echo "$line"; else echo "$1: $line"; fi
+	done >"$2/usr/share/lintian/overrides/$1"
+}
+
 control() { # NAME FOLDER DEPENDS MORE: the description is standard input's
 	mkdir -p "$2/DEBIAN"
 	{
 		printf 'Package: %s\nVersion: %s\nArchitecture: %s\nSection: science\nPriority: optional\n' "$1" "$version" "$architecture"
-		printf 'Maintainer: the maintainers of cbctd <root@localhost>\nDepends: %s\n' "$3"
+		printf 'Maintainer: %s\nDepends: %s\n' "$maintainer" "$3"
 		[ -z "$4" ] || printf '%s\n' "$4"
 		printf 'Installed-Size: %s\n' "$(du -sk --exclude=DEBIAN "$2" | cut -f1)"
 		cat
@@ -64,6 +78,14 @@ find "$main" -type d ! -path "$main/etc/cbctd" -exec chmod 755 {} +
 find "$main/usr" -type f ! -perm /100 -exec chmod 644 {} +
 for program in "$main"/usr/bin/*; do strip --strip-unneeded "$program"; done
 find "$main/usr/share/man" -type f -name '*.[18]' -exec gzip -9n {} +
+documents cbctd "$main" 'No licence is chosen: that is for the owner of cbctd to do. The web page has parts of others, whose licences it
+shows; libraries are those of Debian, each under its own licence (/usr/share/doc/LIBRARY/copyright).' <<'TEXT'
+# Tokens and keys lie beside the settings.
+non-standard-dir-perm 0750 != 0755 [etc/cbctd/]
+non-standard-file-perm 0640 != 0644 [etc/cbctd/cbctd.conf]
+# No helper of debhelper is needed for it.
+maintainer-script-calls-systemctl
+TEXT
 needs=$(depends /nowhere "$main"/usr/bin/*)
 control cbctd "$main" "$needs" "Recommends: systemd
 Suggests: dcmtk, cbctd-cuda" <<'TEXT'
@@ -85,11 +107,23 @@ if [ -n "$cuda" ]; then
 	mkdir -p "$own"
 	# CUDA's own libraries are in no package of Debian's main; the worker finds them by its RUNPATH.
 	ldd "$cuda" | awk '/=> \// && /lib(cufft|cudart)/ { print $3 }' | xargs -r cp -L -t "$own"
+	# CUDA 13 has left drivers behind that 12 still takes.
+	driver=525
+	[ ! -e "$own/libcudart.so.13" ] || driver=580
+	documents cbctd-cuda "$card" "No licence is chosen: that is for the owner of cbctd to do. The libraries in /usr/lib/cbctd are NVIDIA's, of the CUDA
+Toolkit, under its End User License Agreement, which lets them be given out with a program." <<'TEXT'
+# CUDA's libraries are in no package of Debian's main.
+embedded-library
+shared-library-lacks-stack-section
+hardening-no-fortify-functions
+maintainer-script-calls-systemctl
+custom-library-search-path
+TEXT
 	needs=$(depends "$own" "$card/usr/bin/cbct-worker-cuda")
-	control cbctd-cuda "$card" "cbctd (= $version), $needs" "" <<'TEXT'
+	control cbctd-cuda "$card" "cbctd (= $version), $needs" "" <<TEXT
 Description: cone-beam CT reconstruction on NVIDIA cards
  The worker of cbctd for NVIDIA cards, with the libraries of CUDA that it needs.
- The driver (525 or later) is not part of it. cbctd takes this worker as soon as
+ The driver ($driver or later) is not part of it. cbctd takes this worker as soon as
  it is there.
 TEXT
 	install -m 755 "$here/debian/cuda.postinst" "$card/DEBIAN/postinst"

@@ -32,6 +32,22 @@ stop_in_debian() {
 	wait "$daemon_pid" || fail "exit status 0: $(tail -3 "$work/cbctd.err")"
 }
 
+# Beside the first one, where `make deb` has made it; without a card its worker is taken, finds none and is the processor's.
+package_for_cards() {
+	local file=$BUILD/deb/cbctd-cuda_1.0.0_amd64.deb pid
+	[ -e "$file" ] || { echo "  the package for cards is not tried: CUDA is not built here"; return 0; }
+	install -m 644 -t "$chroot/packages" "$file"
+	in_debian apt-get install -y -qq --no-install-recommends "/packages/${file##*/}" >"$work/apt.log" 2>&1 || fail "the package for cards: $(tail -5 "$work/apt.log")"
+	! in_debian ldd /usr/bin/cbct-worker-cuda | grep 'not found' || fail "all of its libraries"
+	start_in_debian
+	for pid in $(pgrep -x cbct-worker-cud) $(pgrep -x cbct-worker); do
+		[ "$(readlink "/proc/$pid/root")" != "$chroot" ] || [[ $(readlink "/proc/$pid/exe") == */cbct-worker-cuda ]] || fail "the daemon takes it: $(readlink "/proc/$pid/exe")"
+	done
+	stop_in_debian
+	in_debian apt-get purge -y -qq cbctd-cuda >"$work/apt.log" 2>&1 || fail "its removal: $(tail -5 "$work/apt.log")"
+	[ ! -e "$chroot/usr/lib/cbctd" ] && [ ! -e "$chroot/usr/bin/cbct-worker-cuda" ] || fail "nothing of it is left"
+}
+
 leave_debian() {
 	[ -z "$daemon_pid" ] || kill "$daemon_pid" 2>/dev/null || true
 	! mountpoint -q "$chroot/proc" || umount -l "$chroot/proc"
@@ -52,6 +68,7 @@ test_life_in_a_bare_debian() {
 	in_debian getent passwd cbctd >/dev/null || fail "the user"
 	in_debian stat -c %U:%G:%a /var/lib/cbctd | grep -qx cbctd:cbctd:750 || fail "the state directory is the user's"
 	[ "$(in_debian stat -c %U:%G:%a /etc/cbctd/cbctd.conf)" = root:cbctd:640 ] || fail "the settings are for the service to read"
+	package_for_cards
 	start_in_debian
 	cbct simulate -o "$work/scan" --phantom head --views 24 --columns 24 --rows 20 --pixel 6 >/dev/null
 	reconstruct "$work/scan" '{"scan": "SCAN", "sart": {"iterations": 3}}'
