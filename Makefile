@@ -309,6 +309,10 @@ paper: MODULES += matplotlib:python3-matplotlib
 paper: setup ## the study's experiments through the daemon, a report in build/paper/ (PAPER=small or all)
 	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/paper-project
 	@OMP_WAIT_POLICY=passive $(PYTHON) tests/paper/experiments.py --build $(BUILD) --size $(PAPER) --results $(BUILD)/paper/results
+	@$(PYTHON) tests/paper/report.py $(BUILD)/paper/results $(BUILD)/paper/paper
+
+paper-report: ## docs/paper.html again, from the results that are kept in tests/paper/results
+	@mkdir -p $(BUILD)/paper && $(PYTHON) tests/paper/report.py tests/paper/results $(BUILD)/paper/kept && cp $(BUILD)/paper/kept.html docs/paper.html
 
 # A worker that can be made to fault, for the test of what becomes of that.
 $(BUILD)/tests/gpu/fault.o: tests/gpu/fault.cu
@@ -434,6 +438,6 @@ clean: ## removes build/
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z_.-]+:.*## /{printf "  make %-21s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-.PHONY: all test-programs again setup demo check soak fuzz fuzzers paper bench bench-calibrate bench-denoise bench-presets bench-stopping check-gpu bench-gpu asan tsan lint format rooms third-party compile_commands.json install deb container sbom reproducible clean help
+.PHONY: all test-programs again setup demo check soak fuzz fuzzers paper paper-report bench bench-calibrate bench-denoise bench-presets bench-stopping check-gpu bench-gpu asan tsan lint format rooms third-party compile_commands.json install deb container sbom reproducible clean help
 .SECONDARY:
 -include $(shell find $(BUILD) -path $(BUILD)/test -prune -o -type f -name '*.d' -print 2>/dev/null)

@@ -16,4 +16,13 @@ test_tv_halves_the_error_that_noise_drives_up() {
 		fail "50 rows with residual and seconds"
 }
 
+test_one_report_of_the_results() {
+	"$python" -c 'import matplotlib' 2>/dev/null || skip "python3-matplotlib is not here"
+	"$python" -c 'import requests' 2>/dev/null || skip "python3-requests is not here"
+	timeout 100 "$python" "$top/tests/paper/report.py" "$work/results" "$work/paper" >/dev/null || fail "a report of what the test before has left"
+	[ "$(grep -c '<img alt=' "$work/paper.html")" -ge 2 ] || fail "pictures in the report"
+	! grep -E 'src="[^d]|href=' "$work/paper.html" || fail "a report that needs no other file"
+	[ "$(head -c 5 "$work/paper.pdf")" = %PDF- ] || fail "a PDF"
+}
+
 run_tests

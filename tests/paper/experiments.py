@@ -8,6 +8,7 @@ A new experiment is a row of SCANS or RUNS.
 import argparse
 import os
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -29,7 +30,8 @@ CUBE, WATER = objects.CUBE_MM, objects.WATER
 @dataclass(frozen=True)
 class Scan:
     """What is scanned, and how. kind: voxels and exact are the head on side^3 voxels, projected through its voxels or by
-    exact integrals; anatomy is a slab of the real CT volume, arm the whole of it through a C-arm's matrices."""
+    exact integrals; anatomy is a slab of the real CT volume; arm is the whole of it, at half its size so that the
+    detector holds it, through a C-arm's matrices."""
 
     kind: str
     side: int
@@ -54,7 +56,8 @@ SCANS = {
     "fig8": Scan("voxels", 256, 100, 559, 0.529, small=False),
     "fig9": Scan("anatomy", 256, 100, 339, 0.713, small=False),
     "fig11": Scan("anatomy", 256, 100, 339, 0.713, noise=True, small=False),
-    "arm": Scan("arm", 0, 248, 0, 1.232, noise=True, small=False),
+    "arm": Scan("arm", 0, 248, 616, 0.616, noise=True, small=False),
+    "arm-binned": Scan("arm", 0, 248, 308, 1.232, noise=True, small=False),
 }
 SLAB = 33  # slices of the anatomy
 
@@ -72,7 +75,8 @@ class Run:
     curve: bool = False
     times: int = 1  # that it is run; the fastest counts
     processors: bool = False  # also on one thread and on all threads of the processor
-    part: str = "paper"  # of the report: paper, faster, better
+    part: str = "paper"  # of the report: paper, faster, better, stop
+    twin: str = ""  # of a job that ends by itself: the run with a number of iterations that shows where it should have ended
 
 
 RAM_LAK = {"fdk": {"window": "ram-lak"}}
@@ -82,6 +86,10 @@ ONE_STEP = {**PAPER_TV, "iterations": 1}
 
 def _sart(iterations, subsets="views", **more):
     return {"sart": {"iterations": iterations, "subsets": subsets, **more}}
+
+
+def _auto(**more):
+    return {"sart": {"iterations": "auto", "max_iterations": 30, **more}}
 
 
 def _proximal(alpha, iterations=20):
@@ -105,10 +113,11 @@ RUNS = [
     Run("fig11-plain", "fig11", "SART view by view", _sart(200), FIG11),
     Run("fig11-tv", "fig11", "SART view by view, TV", {**_sart(200), "tv": ONE_STEP}, FIG11),
     # ---- to the same error in fewer iterations ----
+    Run("views", "fig5", "view by view", {**RAM_LAK, **_sart(100)}, (50, 100), True, part="faster"),
     Run("at-once", "fig5", "all views at once", {**RAM_LAK, **_sart(100, 1)}, (50, 100), True, part="faster"),
     Run("at-once-momentum", "fig5", "all views at once, momentum", {**RAM_LAK, **_sart(50, 1, momentum=True)}, (50,), True, part="faster"),
     Run("ten", "fig5", "10 subsets", {**RAM_LAK, **_sart(50, 10)}, (20, 50), True, part="faster"),
-    Run("ten-momentum", "fig5", "10 subsets, momentum", {**RAM_LAK, **_sart(50, 10, momentum=True)}, (20, 50), True, part="faster"),
+    Run("ten-momentum", "fig5", "10 subsets, momentum", {**RAM_LAK, **_sart(100, 10, momentum=True)}, (20, 50, 100), True, part="faster"),
     Run("cgls", "fig5", "conjugate gradients", {**RAM_LAK, "cgls": {"iterations": 30}}, (15, 30), True, part="faster"),
     Run("fista", "fig5", "FISTA", {**RAM_LAK, "fista": {"iterations": 50}}, (50,), True, part="faster"),
     Run("exact-tv", "fig5-exact", "FDK hann, 10 subsets, TV", {"fdk": {}, **_sart(10, 10), "tv": PAPER_TV}, ("fdk", 5, 10), True, part="better"),
@@ -118,10 +127,24 @@ RUNS = [
     Run("fig7-fista", "fig7", "FISTA, proximal TV", {"fista": {"iterations": 60}, **_proximal(25)}, (60,), True, part="better"),
     Run("fig7-exact-tv", "fig7-exact", "SART view by view, TV", {**_sart(50), "tv": PAPER_TV}, (50,), True, part="better"),
     Run("fig7-exact-fista", "fig7-exact", "FISTA, proximal TV", {"fista": {"iterations": 40}, **_proximal(16)}, (40,), True, part="better"),
-    Run("fig11-default", "fig11", "FDK, 10 subsets, TV of the noise found", {"fdk": {}, **_sart(10, 10), "tv": {}}, ("fdk", 10), True, part="better"),
+    Run("fig11-default", "fig11", "FDK, 10 subsets, TV of the noise found", {"fdk": {}, **_sart(30, 10), "tv": {}}, ("fdk", 10, 30), True, part="better"),
+    Run("fig11-ten-steps", "fig11", "SART view by view, ten steps of TV", {**_sart(200), "tv": PAPER_TV}, FIG11, part="better"),
     Run("fig11-fista", "fig11", "FISTA, proximal TV", {"fista": {"iterations": 50}, **_proximal(16)}, (50,), part="better"),
-    Run("arm-default", "arm", "FDK, 10 subsets, TV of the noise found", {"fdk": {}, **_sart(10, 10), "tv": {}}, ("fdk", 10), True, part="better"),
-    Run("arm-momentum", "arm", "the same, momentum", {"fdk": {}, **_sart(8, 10, momentum=True), "tv": {}}, (4, 8), True, part="better"),
+    *(
+        run
+        for scan in ("arm", "arm-binned")
+        for run in (
+            Run(f"{scan}-default", scan, "FDK, 10 subsets, TV of the noise found", {"fdk": {}, **_sart(30, 10), "tv": {}}, ("fdk", 10, 30), True, part="better"),
+            Run(f"{scan}-momentum", scan, "the same, momentum", {"fdk": {}, **_sart(8, 10, momentum=True), "tv": {}}, (4, 8), True, part="better"),
+            Run(f"{scan}-strong", scan, "the same, strong TV", {"fdk": {}, **_sart(8, 10, momentum=True), "tv": {"strength": "strong"}}, (8,), True, part="better"),
+            Run(f"{scan}-fista", scan, "FISTA, TV of the noise found", {"fdk": {}, "fista": {"iterations": 20}, "tv": {}}, (20,), True, part="better"),
+        )
+    ),
+    # ---- iterations that end by themselves ----
+    Run("fig5-auto", "fig5", "FDK, 10 subsets", {**RAM_LAK, **_auto(subsets=10)}, (), True, part="stop", twin="ten"),
+    Run("fig7-auto", "fig7", "13 subsets", _auto(subsets=13), (), True, part="stop", twin="fig7-ordered"),
+    Run("fig11-auto", "fig11", "FDK, 10 subsets, TV of the noise found", {"fdk": {}, **_auto(subsets=10), "tv": {}}, (), True, part="stop", twin="fig11-default"),
+    Run("arm-auto", "arm", "FDK, 10 subsets, TV of the noise found", {"fdk": {}, **_auto(subsets=10), "tv": {}}, (), True, part="stop", twin="arm-default"),
 ]
 
 
@@ -140,9 +163,10 @@ def _geometry(scan, data):
     """([view][4][3] for paper-project, what the daemon is told, rows, columns)"""
     if scan.kind == "arm":
         matrices = np.load(os.path.join(data, "carm_kct_248.npy"))
-        # Pixels of 2 x 2: column c of them is at 2 c + .5 of the detector's.
-        binned = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]]) @ matrices
-        return objects.of_matrices(binned), cbctd.Geometry.matrices(binned, (scan.pixel_mm,) * 2), 240, 308
+        # Of a detector of 616 x 480; column c of pixels of 2 x 2 is its column 2 c + .5.
+        n = 616 // scan.pixels
+        matrices = np.array([[1 / n, 0, (1 / n - 1) / 2], [0, 1 / n, (1 / n - 1) / 2], [0, 0, 1]]) @ matrices
+        return objects.of_matrices(matrices), cbctd.Geometry.matrices(matrices, (scan.pixel_mm,) * 2), 480 // n, scan.pixels
     views = objects.circle(scan.views, scan.pixels, scan.pixels, scan.pixel_mm)
     told = cbctd.Geometry.circular(
         objects.SOURCE_TO_ISOCENTRE,
@@ -160,8 +184,11 @@ def _object(scan, data):
         return objects.head_voxels(scan.side, 8 if scan.kind == "exact" else 2), spacing, None
     if scan.kind == "anatomy":
         truth = objects.anatomy_voxels(data, (256, 256, SLAB), 0.5, (60.5, 50, 44))
-        return None if truth is None else (truth, (CUBE / 256,) * 3, None)
-    truth = objects.anatomy_voxels(data, (244, 202, 128), 0.5, (60.5, 50, 55.5))
+        if truth is None:
+            return None
+        truth[[0, -1]] = 0  # the object ends within the grid
+        return truth, (CUBE / 256,) * 3, None
+    truth = objects.anatomy_voxels(data, (122, 101, 112), 1, (60.5, 50, 55.5))
     if truth is None:
         return None
     body = np.zeros(truth.shape, bool)
@@ -209,11 +236,14 @@ def post(client, name, options):
 
 
 def _window(scan):
-    """Gray scale of a picture in 1/mm: of the head up to .45 of its skull, of anatomy -250 to 450 HU."""
-    return (0.0, 0.45 * WATER) if scan.kind in ("voxels", "exact") else (0.75 * WATER, 1.45 * WATER)
+    """Gray scale of a picture in 1/mm: of the head up to .45 of its skull, of anatomy -250 to 450 HU, with Fig 11's noise
+    -1000 to 1500 HU."""
+    if scan.kind in ("voxels", "exact"):
+        return 0.0, 0.45 * WATER
+    return (0.0, 2.5 * WATER) if scan.kind == "anatomy" and scan.noise else (0.75 * WATER, 1.45 * WATER)
 
 
-SLICES = {"fig5": 25, "fig5-exact": 25, "fig7": 23, "fig7-exact": 23, "table1": 16, "fig8": 100, "fig9": 16, "fig11": 16, "arm": 64}
+SLICES = {"fig5": 25, "fig5-exact": 25, "fig7": 23, "fig7-exact": 23, "table1": 16, "fig8": 100, "fig9": 16, "fig11": 16, "arm": 57, "arm-binned": 57}
 # Value in 1/mm, red, green, blue, opacity per mm: soft tissue red and thin, bone ivory and dense.
 TRANSFER = (
     (0.0, 0, 0, 0, 0),
@@ -234,7 +264,8 @@ def _recipe(run, posted):
     recipe = {key: dict(value) if isinstance(value, dict) else value for key, value in run.recipe.items()}
     if recipe.get("tv", {}).get("unit") == "maximum/64":
         recipe["tv"]["unit"] = posted.facts["maximum"] / 64
-    last = next(recipe[name]["iterations"] for name in ("sart", "cgls", "fista") if name in recipe)
+    stage = next(recipe[name] for name in ("sart", "cgls", "fista") if name in recipe)
+    last = stage.get("max_iterations", stage["iterations"])
     wanted = {n for n in run.shown if n != last}
     if run.curve:
         wanted |= set(range(1, last)) | ({"fdk"} if "fdk" in recipe else set())
@@ -289,6 +320,8 @@ def measure(client, run, posted, device):
         "scan": run.scan,
         "facts": posted.facts,
         "recipe": {key: job.get(key) for key in ("fdk", "sart", "cgls", "fista", "tv", "projector", "precision")},
+        "twin": run.twin,
+        "stopped": job.get("stopped"),
         "shown": list(run.shown),
         "slice": at,
         "window_per_mm": [low, high],
@@ -362,6 +395,7 @@ def main():
     options = parser.parse_args()
     options.project = options.project or os.path.join(options.build, "paper-project")
     os.makedirs(options.results, exist_ok=True)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that the daemon is ended, too
     began = time.monotonic()
     devices = _devices(options)
     small = options.size == "small" or (options.size == "auto" and devices[0][0] != "cuda")
