@@ -286,10 +286,12 @@ int input_empty_slot(const struct input *input, const struct backend *backend, s
 	return code;
 }
 
-/* Of a view, without the map's. */
+/* Of a view, without the map's; 0 where they are too few to tell. */
 static double unusable_share(const struct defect_counts *counts, size_t pixels)
 {
-	return (double)(defects_total(counts) - counts->mapped) / (double)pixels;
+	const size_t least = 1024;
+
+	return pixels < least ? 0 : (double)(defects_total(counts) - counts->mapped) / (double)pixels;
 }
 
 static void add_blank(struct input *input, int view)

@@ -15,11 +15,12 @@ static const float LEVEL = 0.1f, LEVEL_AT_END = 0.3f; /* line integrals; at an a
 static const float CALM = 4;                          /* times what the sides differ by */
 static const float AGREE = 0.25f, NOISE = 3;          /* of the level; standard deviations of a block's mean */
 static const double MOST_BLOCKS = 0.85;               /* that agree */
-static const double EXPLAINED = 1.0 / 9, APART = 16, FAINT = 0.03; /* squares; of the profile's root mean square */
-static const float ROUNDING = 1e-4f;                               /* of what a view shows */
-static const double SHIFT = 1.5, TURNING = 1;                      /* samples; of the detector's width, times 1 - cos */
-static const double SAME = 1e-5;                                   /* radians, between views at one angle */
-static const double WIDE = 25;                                     /* degrees that more than SHORT views may take */
+static const double EXPLAINED = 1.0 / 16, APART = 16, FAINT = 0.03; /* squares; of the profile's root mean square */
+static const float ROUNDING = 1e-4f;                                /* of what a view shows */
+static const float AIR = 0.1f;                                      /* of the profile's largest value */
+static const double SHIFT = 1.5, TURNING = 1;     /* samples; of the detector's width, times 1 - cos */
+static const double SAME = 1e-5;                  /* radians, between views at one angle */
+static const double WIDE = 30, WIDE_OF_MANY = 25; /* degrees between the sides, of more than SHORT views */
 enum { SHORT = 4 };
 enum { MOST = 3 }; /* one view in so many */
 
@@ -163,6 +164,17 @@ static double profiles_apart(const struct view_profile *a, const struct view_pro
 	return apart_by(a->along[0], b->along[0], 0);
 }
 
+/* True if a profile ends in air on both sides; what a body beyond the detector does at its edge may look like a shift.
+ */
+static bool ends_in_air(const float *profile, int count)
+{
+	float most = 0;
+
+	for (int i = 0; i < count; i++)
+		most = fmaxf(most, profile[i]); /* NAN is never the larger */
+	return profile[0] <= AIR * most && profile[count - 1] <= AIR * most;
+}
+
 static bool is_shifted_along(const struct between *at, int axis, float *ret_amount)
 {
 	const float *own = at->view->along[axis], *before = at->before->along[axis], *behind = at->behind->along[axis];
@@ -176,6 +188,8 @@ static bool is_shifted_along(const struct between *at, int axis, float *ret_amou
 		middle[i] = between_values(at, before[i], behind[i]);
 		count += !isnan(own[i]);
 	}
+	if (count == 0 || !ends_in_air(before, count) || !ends_in_air(behind, count))
+		return false;
 	if (!isfinite(off) || off < APART * (sides + 2 * noise) || off < FAINT * FAINT * apart_by(middle, none, 0))
 		return false;
 	for (int s = -count; s <= count; s++) {
@@ -245,6 +259,17 @@ static double angle_at(const struct ring *ring, int place)
 	return ring->places[(place + ring->count) % ring->count].angle + turn * 2 * PI;
 }
 
+/* From one side of a run to the other; beyond an arc's end to as far as the run goes on the other side. */
+static double angle_between(const struct ring *ring, int first, int run)
+{
+	const bool before = view_at(ring, first - 1) >= 0, behind = view_at(ring, first + run) >= 0;
+
+	if (before && behind)
+		return angle_at(ring, first + run) - angle_at(ring, first - 1);
+	return 2 * (before ? angle_at(ring, first + run - 1) - angle_at(ring, first - 1)
+			   : angle_at(ring, first + run) - angle_at(ring, first));
+}
+
 static struct between between_of(const struct ring *ring, int first, int run, int place)
 {
 	const int before = view_at(ring, first - 1), behind = view_at(ring, first + run);
@@ -271,7 +296,7 @@ static int mark_run(const struct ring *ring, int first, int run, enum outlier_ki
 
 	if (sides[0] < 0 && sides[1] < 0)
 		return 0;
-	if (run > SHORT && angle_at(ring, first + run) - angle_at(ring, first - 1) > WIDE * PI / 180)
+	if (angle_between(ring, first, run) > (run > SHORT ? WIDE_OF_MANY : WIDE) * PI / 180)
 		return 0;
 	for (int i = 0; i < 2; i++)
 		if (sides[i] >= 0 && ret_outliers[sides[i]].kind != OUTLIER_NONE)

@@ -15,15 +15,16 @@
  *            grows and shrinks from view to view.
  *   level    All blocks of the detector, those of air and those of the object alike, differ from what lies between
  *            both sides by about the same line integral, which is at least .1 and four times what the sides differ by.
- *   shifted  The profile along rows or columns lies aside: moved by so many pixels it is what it should be, to a ninth
- *            of the squared difference, and the difference is 16 times (squared) that of the sides. The path of a
- *            point about the axis turns back at its ends, by 1 - cos of the angle to either side; a shift is more.
+ *   shifted  The profile along rows or columns lies aside: moved by so many pixels it is what it should be, to a
+ * sixteenth of the squared difference, and the difference is 16 times (squared) that of the sides. The path of a point
+ * about the axis turns back at its ends, by 1 - cos of the angle to either side; a shift is more. Only of objects that
+ * end within the detector.
  *
  *   frozen   The profile is that of the view before to the last bit, where most views differ from the one before by
  * more than rounding.
  *
- * Up to OUTLIERS_RUN such views may stand together, more than four of them within 25 degrees, and a third of all at
- * most can be left out.
+ * Up to OUTLIERS_RUN such views may stand together, within 30 degrees from side to side, more than four within 25, and
+ * a third of all at most can be left out.
  */
 enum { OUTLIERS_RUN = 10, OUTLIERS_SAMPLES = CONTENT_BLOCKS * CONTENT_SAMPLES };
 

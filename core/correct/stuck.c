@@ -10,13 +10,18 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { ACROSS = 10, BESIDE = 3 }; /* pixels of a row: how far one is looked beside, and those that must be well there */
+enum {
+	ACROSS = 10,
+	LOST_ACROSS = 5,
+	BESIDE = 3
+}; /* pixels of a row: how far one is looked beside, and those that must be well there */
 enum { NEIGHBOURS = 8, AWAY = 2, BESIDE_LEAST = 4 }; /* good pixels right beside one that is taken for alone */
 
 static const float MATTERS = 0.03f, APART = 0.1f; /* of the photons, or of the largest line integral below 1 */
 static const float BEYOND = 0.1f;                 /* of the root mean square of e */
 static const float TIP = 0.1f;                    /* of the mean of e */
 static const float STILL = 0.1f, LARGER = 3, WILDER = 9, FARTHER = 3, STEADY = 4, IN_FEW_VIEWS = 0.25f;
+static const float CHANGES = 0.05f;              /* of its mean: few counts are alike in all views by rounding */
 static const float LOST = 0.35f, LOST_LEAST = 8; /* of the views looked at: share, and number */
 static const double MOST = 0.1;                  /* of all pixels */
 static const double AXIS_PIXELS = 4;             /* between a ray and the axis */
@@ -569,11 +574,11 @@ static bool shows_change(const struct stuck *stuck, size_t at, size_t own, float
 
 	(void)own;
 	return is_known(stuck, at) && mean > MATTERS * whole && mean * mean > varies &&
-	       varies > MATTERS * MATTERS * whole * whole;
+	       varies > MATTERS * MATTERS * whole * whole && varies > CHANGES * CHANGES * mean * mean;
 }
 
-/* True if within ACROSS pixels of its row, on both sides of a pixel, there are three beside each other that are so. */
-static bool is_between(const struct stuck *stuck, int column, int row, float whole,
+/* True if within so many pixels of its row, on both sides of a pixel, there are three beside each other that are so. */
+static bool is_between(const struct stuck *stuck, int column, int row, int within, float whole,
 		       bool (*is_so)(const struct stuck *stuck, size_t at, size_t own, float whole))
 {
 	const size_t own = (size_t)row * (size_t)stuck->geometry->columns + (size_t)column;
@@ -583,7 +588,7 @@ static bool is_between(const struct stuck *stuck, int column, int row, float who
 		const int room = step < 0 ? column : stuck->geometry->columns - 1 - column;
 
 		run = 0;
-		for (int i = 1; i <= room && i <= ACROSS && run < BESIDE; i++)
+		for (int i = 1; i <= room && i <= within && run < BESIDE; i++)
 			run = is_so(stuck, own + (size_t)(step * i), own, whole) ? run + 1 : 0;
 		if (run < BESIDE)
 			return false;
@@ -598,20 +603,32 @@ static bool is_between(const struct stuck *stuck, int column, int row, float who
 static bool is_dead_in_object(const struct stuck *stuck, int column, int row, float whole)
 {
 	return never_changes(stuck, (size_t)row * (size_t)stuck->geometry->columns + (size_t)column) &&
-	       is_between(stuck, column, row, whole, shows_change);
+	       is_between(stuck, column, row, ACROSS, whole, shows_change);
+}
+
+static bool says_little(const struct stuck *stuck, size_t at)
+{
+	return lost_share(stuck, at) >= LOST && (float)stuck->views - stuck->sums.views[at] >= LOST_LEAST &&
+	       stuck->sums.views[at] > 0;
 }
 
 /*
- * True if a pixel says nothing in many views, and those on both sides of it in its row seldom do: it died since the
- * flat was taken, and what it says otherwise is noise about the dark. Metal hides pixels side by side, or on the axis.
+ * True if a pixel says nothing in many views, as half of its column does, and those on both sides of it in its row
+ * seldom do: it died since the flat was taken, and what it says otherwise is noise about the dark. What metal hides for
+ * so long is as wide as its path about the axis.
  */
 static bool is_lost(const struct stuck *stuck, int column, int row, float whole)
 {
-	const size_t own = (size_t)row * (size_t)stuck->geometry->columns + (size_t)column;
+	const size_t columns = (size_t)stuck->geometry->columns;
+	const int rows = stuck->geometry->rows;
+	int like = 0;
 
-	return lost_share(stuck, own) >= LOST && (float)stuck->views - stuck->sums.views[own] >= LOST_LEAST &&
-	       stuck->sums.views[own] > 0 && is_between(stuck, column, row, whole, is_well) &&
-	       !is_on_axis(stuck, column, row);
+	if (!says_little(stuck, (size_t)row * columns + (size_t)column) ||
+	    !is_between(stuck, column, row, LOST_ACROSS, whole, is_well))
+		return false;
+	for (int r = 0; r < rows; r++)
+		like += says_little(stuck, (size_t)r * columns + (size_t)column);
+	return 2 * like >= rows && !is_on_axis(stuck, column, row);
 }
 
 static bool is_stuck(const struct stuck *stuck, int column, int row)

@@ -35,9 +35,10 @@
  *
  *            Where the nearest pixels that change, on both sides in the row, show an object in most views, a pixel
  *            that does not is found without noise, too: with any value, as one of a column of zeros.
- *   lost     The pixel says nothing (not above the dark) in a third of the views, and those on both sides of it in
- *            the row in a quarter as many at most: one that died since the flat was taken, whose other values
- *            are noise about the dark. Rays that pass the axis are left out, for metal there.
+ *   lost     The pixel says nothing (not above the dark) in a third of the views, as half of its column does, and
+ *            those within some pixels on both sides in the row in a quarter as many at most: a column that died since
+ *            the flat was taken, whose other values are noise about the dark. Rays that pass the axis are left
+ *            out, for metal there.
  *
  * A neighbour that says nothing, as one of the scan's map, is left out of m, and where that is
  * so in most views it counts as one that speaks for the pixel in the comparisons above.
