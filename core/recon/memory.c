@@ -9,6 +9,7 @@
 #include "core/correct/correction.h"
 #include "core/outofcore/outofcore.h"
 #include "core/recon/internal.h"
+#include "core/recon/thin.h"
 
 /* An iteration goes over all projections, and so may a correction that the recipe asks for. */
 bool keeps_projections(const struct recipe *recipe)
@@ -168,6 +169,8 @@ static size_t kept_bytes(const struct recon *recon)
 		bytes += rim_bytes(&recipe->grid, &recon->orbit);
 	if (recipe->algorithm != NULL)
 		bytes += alternation_bytes(&recipe->grid);
+	if (thin_width(recipe, &recon->orbit) > 0)
+		bytes += thin_bytes(&recipe->grid);
 	return bytes;
 }
 

@@ -10,6 +10,7 @@
 #include "core/correct/averaging.h"
 #include "core/recon/internal.h"
 #include "core/recon/noise.h"
+#include "core/recon/thin.h"
 #include "core/recon/warn.h"
 
 /* ---- hooks ---- */
@@ -90,6 +91,27 @@ static int show_smoothed(struct recon *recon, struct volume_norms *norms, struct
 	return code;
 }
 
+/* An iterate of slices thinner than rows are apart, without the rows; `before`, which no iteration reads, has the
+ * iterate. */
+static int show_thick(struct recon *recon, struct volume_norms *norms, struct error *err)
+{
+	const double width = thin_width(&recon->recipe, &recon->orbit);
+	int code = 0;
+
+	if (width == 0 || recon->iteration == 0)
+		return 0;
+	if (recon->alternation == NULL)
+		code = recon->backend->volume_copy(recon->before, recon->volume, err);
+	if (code == 0)
+		code = thin_show(width, recon->backend, recon->before, recon->volume, &recon->recipe.grid, err);
+	recon->smoothed = true;
+	if (code == 0)
+		code = measure(recon, NULL, norms, err);
+	if (code == 0 && recon->ended)
+		warn_thin(&recon->warnings, width);
+	return code;
+}
+
 /* The rim of the field of view as it is kept; `before`, which no iteration reads, has the iterate. */
 static int show_rim(struct recon *recon, struct volume_norms *norms, struct error *err)
 {
@@ -98,7 +120,7 @@ static int show_rim(struct recon *recon, struct volume_norms *norms, struct erro
 
 	if (rim_state_bytes(recon->rim) == 0 || recon->iteration == 0)
 		return 0;
-	if (recon->alternation == NULL)
+	if (recon->alternation == NULL && !recon->smoothed)
 		code = recon->backend->volume_copy(recon->before, recon->volume, err);
 	if (code == 0)
 		code = rim_show(recon->rim, recon->backend, recon->volume, &changed, err);
@@ -150,6 +172,8 @@ static int keep(struct recon *recon, const char *name, const char *stage, struct
 		return 0;
 	recon_tell_progress(recon, STAGE_SAVE, recon->iteration);
 	code = show_smoothed(recon, &kept.norms, err);
+	if (code == 0)
+		code = show_thick(recon, &kept.norms, err);
 	if (code == 0)
 		code = show_rim(recon, &kept.norms, err);
 	if (code == 0)

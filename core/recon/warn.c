@@ -206,6 +206,16 @@ void warn_alternation(const struct warning_sink *sink, const struct recipe *reci
 		    report->amplitude / hu, report->slices);
 }
 
+void warn_thin(const struct warning_sink *sink, double width)
+{
+	warning_tell(
+	    sink, "slices_smoothed",
+	    "a row of the detector is %.3g slices high at the isocentre, and with the matched pair of "
+	    "projectors the slices between the rows get nothing of their own: kept volumes are means over "
+	    "%.3g slices along z. Slices of the rows' distance, or \"projector\": \"interpolating\", need none",
+	    width, width);
+}
+
 void warn_settled(const struct warning_sink *sink, const struct recipe *recipe, double from)
 {
 	if (from < recipe_iterations(recipe))

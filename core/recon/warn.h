@@ -34,4 +34,6 @@ void warn_settled(const struct warning_sink *sink, const struct recipe *recipe, 
 /* "slices_smoothed": what alternated from slice to slice, seen by no view, was more than a little. */
 void warn_alternation(const struct warning_sink *sink, const struct recipe *recipe,
 		      const struct alternation_report *report);
+/* "slices_smoothed": kept volumes are means over so many slices (thin.h). */
+void warn_thin(const struct warning_sink *sink, double width);
 #endif

@@ -139,6 +139,52 @@ START_TEST(kept_volumes_are_smoothed_and_the_iterate_is_not)
 }
 END_TEST
 
+/*
+ * Slices of a third of the rows' distance, iterated with the matched pair (_i 0: SART, 1: CGLS): kept volumes have no
+ * rows in them, and it is told; the iterate has.
+ */
+START_TEST(slices_that_no_ray_feeds_are_not_carved)
+{
+	const double pixel = 2, slice = pixel / 3;
+	struct ellipsoid parts[] = {
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {26, 22, 16}, .centre = {1, 2, .3}, .density = .0192},
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {7, 7, 7}, .centre = {-9, -4, -3}, .density = .0192}};
+	const struct phantom phantom = {.parts = parts, .count = 2};
+	const struct orbit_spec spec = {
+	    40, 26, 60, {620, 1100, {pixel / 620 * 1100, pixel / 620 * 1100}, {0, 0}, {0, 0}}, 0, 6};
+	const struct grid grid = grid_of(32, 32, 60, 2, 2, slice);
+	const size_t voxels = grid_voxels(&grid);
+	float *truth = malloc(sizeof(*truth) * voxels);
+	struct recipe recipe = recipe_on(&grid);
+	struct outcome thin = {.threads = 1}, plain = {.threads = 1};
+	double kept, iterate, other;
+	struct scene scene;
+
+	ck_assert_ptr_nonnull(truth);
+	phantom_voxelise(&phantom, &grid, 3, truth);
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	recipe.fdk.on = true;
+	recipe_set_algorithm(&recipe, &algorithm_sart);
+	run(&scene, &recipe, &plain);
+	recipe_set_algorithm(&recipe, _i ? &algorithm_cgls : &algorithm_sart);
+	recipe.projector = PROJECTOR_MATCHED;
+	run(&scene, &recipe, &thin);
+	other = relative_error(outcome_volume(&plain, "final"), truth, voxels);
+	kept = relative_error(outcome_volume(&thin, "final"), truth, voxels);
+	iterate = relative_error(thin.last, truth, voxels);
+	ck_assert_msg(kept < (_i ? 0.93 : 0.85) * iterate && kept < (_i ? 1.25 : 1.1) * other,
+		      "kept %.4f, the iterate %.4f, the other pair %.4f", kept, iterate, other);
+	ck_assert_msg(strstr(thin.warnings, "slices_smoothed: a row of the detector is 3 slices high") != NULL, "%s",
+		      thin.warnings);
+	ck_assert_ptr_null(strstr(plain.warnings, "slices_smoothed: "));
+	outcome_clear(&thin);
+	outcome_clear(&plain);
+	scene_clear(&scene);
+	free(truth);
+}
+END_TEST
+
 Suite *alternation_suite(void)
 {
 	Suite *suite = suite_create("alternation");
@@ -148,6 +194,7 @@ Suite *alternation_suite(void)
 	tcase_add_test(tests, views_see_alternation_as_far_as_their_rows_lie_within_slices);
 	tcase_add_test(tests, flat_ends_between_rows_do_not_make_iterations_worse_than_fdk);
 	tcase_add_test(tests, kept_volumes_are_smoothed_and_the_iterate_is_not);
+	tcase_add_loop_test(tests, slices_that_no_ray_feeds_are_not_carved, 0, 2);
 	suite_add_tcase(suite, tests);
 	return suite;
 }
