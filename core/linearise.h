@@ -86,6 +86,15 @@ LINEARISE_INLINE bool linearise_mapped(const struct linearise *linearise, size_t
 	return map != NULL && ((const unsigned char *)map)[at] != 0;
 }
 
+/*
+ * Counts above the dark that say nothing yet: a whole number beside a dark that is a mean is 0 up to a half. Float
+ * counts may be in any unit.
+ */
+LINEARISE_INLINE float linearise_least(const struct linearise *linearise)
+{
+	return linearise->sample == SAMPLE_UINT16 ? 0.5f : 0;
+}
+
 /* (I - dark) / (flat - dark); anything for a defect. For intensities; the defect map is not used. */
 LINEARISE_INLINE enum pixel_kind linearise_transmission(const struct linearise *linearise, float sample, size_t at,
 							float saturation, float *ret)
@@ -98,7 +107,7 @@ LINEARISE_INLINE enum pixel_kind linearise_transmission(const struct linearise *
 		return PIXEL_NOT_FINITE;
 	if (!(sample < saturation))
 		return PIXEL_SATURATED;
-	return above > 0 ? PIXEL_GOOD : PIXEL_ZERO;
+	return above > linearise_least(linearise) ? PIXEL_GOOD : PIXEL_ZERO;
 }
 
 /* p of a pixel, without the view's own air and hardening. */

@@ -400,6 +400,44 @@ START_TEST(a_blank_view_is_told_and_is_not_air)
 }
 END_TEST
 
+/* Whole numbers beside a dark that is a mean: half a count above it is none, as those are that lie below. */
+START_TEST(less_than_half_a_count_is_no_measurement)
+{
+	struct recipe recipe = recipe_of(false);
+	struct outcome outcome = {.threads = 1};
+	float *flat = malloc(sizeof(float) * PIXELS), *dark = malloc(sizeof(float) * PIXELS);
+	uint16_t *samples = malloc(sizeof(*samples) * PIXELS * VIEWS);
+	struct scene scene;
+	char told[64];
+	int none = 0;
+
+	make_scene(&scene);
+	for (int i = 0; i < PIXELS; i++) {
+		flat[i] = 50000;
+		dark[i] = 10.6f;
+	}
+	for (int i = 0; i < PIXELS * VIEWS; i++) {
+		const bool behind_metal = noise((unsigned)i) < 0.01;
+
+		samples[i] = behind_metal ? (uint16_t)(11 + i % 2)
+					  : (uint16_t)lround(10.6 + 49989.4 * exp(-(double)scene.projections[i]));
+		none += behind_metal && i % 2 == 0;
+	}
+	outcome.samples = samples;
+	outcome.linearise = (struct linearise){.sample = SAMPLE_UINT16,
+					       .quantity = QUANTITY_INTENSITY,
+					       .image = {[IMAGE_FLAT] = flat, [IMAGE_DARK] = dark}};
+	run(&scene, &recipe, &outcome);
+	snprintf(told, sizeof(told), "defects: %d samples", none);
+	ck_assert_msg(strstr(outcome.warnings, told) != NULL, "%s: %s", told, outcome.warnings);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(samples);
+	free(flat);
+	free(dark);
+}
+END_TEST
+
 /*
  * Where a short scan begins and ends, a view counts for little, and in its middle for
  * more than the mean: what stands in for blank views follows that, to 3 HU.
@@ -877,6 +915,7 @@ Suite *raw_suite(void)
 	tcase_add_loop_test(volumes, an_object_in_the_air_region_is_told, 0, 2);
 	tcase_add_test(volumes, a_tube_that_drifts_makes_no_object_beyond_the_rows);
 	tcase_add_loop_test(volumes, projections_brighter_than_air_are_told, 0, 3);
+	tcase_add_test(volumes, less_than_half_a_count_is_no_measurement);
 	tcase_add_loop_test(volumes, a_blank_view_is_told_and_is_not_air, 0, 2);
 	tcase_add_loop_test(volumes, a_detector_on_its_side_gives_the_same_volume, 0, 2);
 	tcase_add_test(volumes, blank_views_of_a_short_scan_leave_the_level);
