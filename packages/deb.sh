@@ -85,6 +85,8 @@ non-standard-dir-perm 0750 != 0755 [etc/cbctd/]
 non-standard-file-perm 0640 != 0644 [etc/cbctd/cbctd.conf]
 # No helper of debhelper is needed for it.
 maintainer-script-calls-systemctl
+# There is no licence to give notice of.
+copyright-without-copyright-notice
 TEXT
 needs=$(depends /nowhere "$main"/usr/bin/*)
 control cbctd "$main" "$needs" "Recommends: systemd
@@ -118,6 +120,8 @@ shared-library-lacks-stack-section
 hardening-no-fortify-functions
 maintainer-script-calls-systemctl
 custom-library-search-path
+# There is no licence to give notice of.
+copyright-without-copyright-notice
 TEXT
 	needs=$(depends "$own" "$card/usr/bin/cbct-worker-cuda")
 	control cbctd-cuda "$card" "cbctd (= $version), $needs" "" <<TEXT
