@@ -261,5 +261,5 @@ def render(volume, spacing, transfer, azimuth=-90.0, elevation=45.0, width=240, 
 
 def write_json(path, document):
     with open(path, "w", encoding="ascii") as file:
-        json.dump(document, file, indent=1, sort_keys=False)
+        json.dump(document, file)
         file.write("\n")
