@@ -72,3 +72,41 @@ sending_becomes() {
 		sleep 0.2
 	done
 }
+
+recipe='"grid": {"size": [41, 36, 50], "spacing_mm": [2, 2.4, 1.7], "origin_mm": [-40, -42, -41.65]}, "fdk": {}'
+# kills COUNT: so many series sent, with a kill -9 of daemon, cbct-dicom or archive in the middle of each; all arrive once.
+kills() {
+	local k i pid
+	: >"$work/jobs"
+	start_archive
+	destinations '{"name": "pacs", "kind": "dicomweb", "url": "http://127.0.0.1:'$web'/dicom-web"}'
+	start_daemon --destinations "$work/destinations.json" --send-pause 0.1
+	for ((k = 1; k <= $1; k++)); do
+		jq -c --arg k $k '.patient = {position: "HFS", name: "Name\($k)^x", id: "id-\($k)"} | .study = {accession_number: "acc\($k)", uid: "1.2.\($k)"}' "$work/scan/scan.json" >"$work/posted.json"
+		scan=$(curl -sSf "$url/v1/scans" -H 'Content-Type: application/json' -d @"$work/posted.json" | jq -r .id)
+		post_job "{\"scan\": \"SCAN\", $recipe, \"send\": [\"pacs\"]}"
+		echo "$k $scan $job" >>"$work/jobs"
+		curl -sSf -T "$work/scan/projections.raw" "$url/v1/scans/$scan/projections" >/dev/null
+		for ((i = 0; i < 400; i++)); do
+			[ "$(curl -s "$url/v1/jobs/$job/send" | jq -r '.sendings[0].state')" != waiting ] && break
+			sleep 0.01
+		done
+		sleep 0.0$((k * 17 % 10))
+		case $((k % 3)) in
+		0)
+			kill -9 "$(cat "$work/daemon.pid")"
+			sleep 0.2
+			start_daemon --destinations "$work/destinations.json" --send-pause 0.1
+			;;
+		1) for pid in $(pgrep -P "$(cat "$work/daemon.pid")" cbct-dicom || true); do kill -9 "$pid"; done ;;
+		2)
+			kill_archive
+			start_archive
+			;;
+		esac
+	done
+	while read -r k scan job; do sending_becomes sent 60; done <"$work/jobs"
+	fetched "$work/back"
+	"$python" "$top/tests/http/send.py" whose "$work/back" "$work/jobs" >"$work/whose" || fail "each object has its own patient"
+	[ "$(cat "$work/whose")" = "$(for ((k = 1; k <= $1; k++)); do echo "$k 50 "; done)" ] || fail "50 objects of each, once, got $(grep -v " 50 $" "$work/whose")"
+}
