@@ -10,6 +10,7 @@
 enum { BLOCKS = CONTENT_BLOCKS * CONTENT_BLOCKS, BLOCKS_LEAST = 6, VIEWS_LEAST = 8 };
 
 static const double PI = 3.14159265358979323846;
+static const float ABRUPT = 0.6f; /* of the largest difference in a run */
 static const float DARK = 0.08f, BESIDE = 0.25f;
 static const float LEVEL = 0.1f, LEVEL_AT_END = 0.3f; /* line integrals; at an arc's ends only one side is known */
 static const float CALM = 4;                          /* times what the sides differ by */
@@ -288,6 +289,18 @@ static struct between between_of(const struct ring *ring, int first, int run, in
 	return at;
 }
 
+/* True if a run's views differ from its sides by much the same; a wide plate that turns does so more and then less. */
+static bool is_abrupt(const struct outlier *found, int run)
+{
+	float least = INFINITY, most = 0;
+
+	for (int i = 0; i < run; i++) {
+		least = fminf(least, fabsf(found[i].amount));
+		most = fmaxf(most, fabsf(found[i].amount));
+	}
+	return least >= ABRUPT * most;
+}
+
 /* Marks the views of a run that are all outliers of one kind between the same good ones; returns how many. */
 static int mark_run(const struct ring *ring, int first, int run, enum outlier_kind kind, struct outlier *ret_outliers)
 {
@@ -312,6 +325,8 @@ static int mark_run(const struct ring *ring, int first, int run, enum outlier_ki
 			return 0;
 		found[i].kind = kind;
 	}
+	if (!is_abrupt(found, run))
+		return 0;
 	for (int i = 0; i < run; i++)
 		ret_outliers[view_at(ring, first + i)] = found[i];
 	return run;
