@@ -158,8 +158,8 @@ static void start(void)
 				       .threads = 2,
 				       .max_connections = 100,
 				       .max_connections_per_address = 100,
-				       .header_timeout = 60,
-				       .transfer_grace = 30,
+				       .header_timeout = 0.2,
+				       .transfer_grace = 1,
 				       .minimum_rate = 1};
 	struct error err = {0};
 
