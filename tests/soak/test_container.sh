@@ -7,8 +7,16 @@ export STORAGE_DRIVER=vfs BUILDAH_ISOLATION=chroot
 storage=(--root "$work/storage" --runroot "$work/run")
 running=
 
+descendants() { # PID: innermost first
+	local child
+	for child in $(pgrep -P "$1"); do
+		descendants "$child"
+		echo "$child"
+	done
+}
 leave() {
-	[ -z "$running" ] || kill "$running" 2>/dev/null || true
+	# buildah passes no signal on.
+	[ -z "$running" ] || kill $(descendants "$running") "$running" 2>/dev/null || true
 	wait 2>/dev/null || true
 	"$real" "${storage[@]}" rm -a >/dev/null 2>&1 || true
 	"$real" "${storage[@]}" rmi -a -f >/dev/null 2>&1 || true
