@@ -129,6 +129,8 @@ static void write_http(FILE *out, struct api *api)
 			break;
 	}
 	single(out, "connections", "gauge", "Open connections.", (double)http_connections(api->http));
+	single(out, "audit_fails", "gauge", "1 while the audit log cannot be written and its lines are lost.",
+	       http_audit_fails(api->http));
 }
 
 static void write_uploads(FILE *out, struct api *api)

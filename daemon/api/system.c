@@ -22,20 +22,22 @@ int live_get(void *context, struct request *request, struct error *err)
 	return reply_word(request, "alive, " CBCTD_PROGRAM "\n", err);
 }
 
-/* Ready all the same: what is set aside hinders nobody, but somebody should look at it. */
+/* Ready all the same: what is set aside, and an audit log that has no room, hinder nobody, but somebody should look. */
 static int reply_ready(struct request *request, const struct api *api, struct error *err)
 {
 	struct quarantined *entries;
-	char text[1024];
+	char text[1024], quarantine[100];
 	int count;
 
 	if (quarantine_list(store_directory(api->store), &entries, &count, err) != 0)
 		return err->code;
-	if (count == 0)
-		snprintf(text, sizeof(text), "ready\n");
-	else
-		snprintf(text, sizeof(text), "ready\nquarantine: %d set aside, see /v1/quarantine\n", count);
 	free(entries);
+	if (count == 0)
+		snprintf(quarantine, sizeof(quarantine), "%s", "");
+	else
+		snprintf(quarantine, sizeof(quarantine), "quarantine: %d set aside, see /v1/quarantine\n", count);
+	snprintf(text, sizeof(text), "ready\n%s%s", quarantine,
+		 http_audit_fails(api->http) ? "audit: it cannot be written, lines are lost, see the log\n" : "");
 	return reply_word(request, text, err);
 }
 

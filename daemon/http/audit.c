@@ -10,8 +10,8 @@
  * which nothing here sees; of paths only ids are told.
  *
  * A log that cannot be written stops no acquisition: it is an error in the
- * daemon's log, and the next line that can be written has the number of those
- * lost.
+ * daemon's log, /readyz and /metrics tell of it, and the next line that can be
+ * written has the number of those lost.
  */
 #include "daemon/http/internal.h"
 
@@ -54,7 +54,9 @@ struct audit {
 	int file;
 	size_t size;
 	struct audit_mark mark;
-	bool unsynced, failed;
+	bool unsynced;
+
+	_Atomic bool failed; /* the last line was lost, or may be */
 };
 
 /* ---- the file ---- */
@@ -203,17 +205,16 @@ static int file_resume(struct audit *audit, struct error *err)
 
 /* ---- the thread ---- */
 
-static void complain(struct audit *audit, const char *what)
+static void complain(struct audit *audit, const char *what, const char *why)
 {
-	if (!audit->failed)
-		log_line(LEVEL_ERROR, "audit: %s: %s; lines are lost until it is mended", what, strerror(errno));
-	audit->failed = true;
+	if (!atomic_exchange(&audit->failed, true))
+		log_line(LEVEL_ERROR, "audit: %s: %s; lines are lost until it is mended", what, why);
 }
 
 static void file_sync(struct audit *audit)
 {
 	if (audit->unsynced && fdatasync(audit->file) != 0)
-		complain(audit, "sync");
+		complain(audit, "sync", strerror(errno));
 	audit->unsynced = false;
 }
 
@@ -236,7 +237,7 @@ static void file_rename(struct audit *audit)
 	remove_oldest(audit);
 	return;
 failed:
-	complain(audit, "a full file cannot be renamed");
+	complain(audit, "a full file cannot be renamed", strerror(errno));
 }
 
 /* False where the line is lost. */
@@ -251,19 +252,22 @@ static bool write_line(struct audit *audit, const char *members)
 	if (length == 0)
 		return false;
 	line[length++] = '\n';
-	if (audit->file < 0 && file_open(audit, &err) != 0)
+	if (audit->file < 0 && file_open(audit, &err) != 0) {
+		complain(audit, "it cannot be opened", err.text);
 		return false;
+	}
 	if (audit->size > 0 && audit->size + length > audit->most)
 		file_rename(audit);
 	written = write(audit->file, line, length);
 	if (written != (ssize_t)length) {
-		complain(audit, audit->path);
+		/* A part was written where the disk had room for no more. */
+		complain(audit, audit->path, strerror(written < 0 ? errno : ENOSPC));
 		/* Half a line must not stand before the next. */
 		if (written > 0 && ftruncate(audit->file, (off_t)audit->size) != 0)
-			complain(audit, "its end");
+			complain(audit, "its end", strerror(errno));
 		return false;
 	}
-	audit->failed = false;
+	atomic_store(&audit->failed, false);
 	audit->size += length;
 	audit->mark = next;
 	audit->unsynced = true;
@@ -398,6 +402,11 @@ void audit_free(struct audit *audit)
 	pthread_mutex_destroy(&audit->lock);
 	free(audit->queue);
 	free(audit);
+}
+
+bool http_audit_fails(const struct http *http)
+{
+	return http->audit != NULL && atomic_load(&http->audit->failed);
 }
 
 /* ---- what requests tell ---- */

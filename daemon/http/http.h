@@ -99,6 +99,8 @@ void http_traffic(const struct http *http, void (*visit)(void *context, const st
 const struct histogram *http_seconds(const struct http *http, const struct route *route);
 /* ERR_BUSY when a thread of the server does not answer a connection within that time. One thread at a time. */
 int http_probe(struct http *http, double seconds, struct error *err);
+/* There is an audit log, and it cannot be written: lines are lost. Takes no lock. */
+bool http_audit_fails(const struct http *http);
 /* The number of connections that are open now; takes no lock. */
 long http_connections(const struct http *http);
 

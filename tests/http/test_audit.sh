@@ -120,6 +120,29 @@ test_files_are_renamed_and_the_oldest_removed() {
 	! cbct audit verify "$work/elsewhere.jsonl" 2>/dev/null || fail "a removed file shows"
 }
 
+test_a_log_that_cannot_be_written_is_told() {
+	fresh
+	ln -sf /dev/full "$work/full.jsonl" # as a full disk is
+	start_daemon --tokens "$tokens" --audit "$work/full.jsonl"
+	a=(-H "Authorization: Bearer $acquire")
+	req POST /v1/scans "${a[@]}" "${json[@]}" --data-binary "$document"
+	expect_status 201
+	req GET /metrics "${a[@]}"
+	grep -qx 'cbctd_audit_fails 1' "$body" || fail "it in the metrics"
+	req GET /readyz
+	expect_status 200
+	[[ $(sed -n 2p "$body") == "audit: it cannot be written"* ]] || fail "it in /readyz: $(cat "$body")"
+	stop_daemon
+	grep -q 'audit: .*full.jsonl: No space left on device; lines are lost' "$work/cbctd.err" || fail "the reason: $(grep audit "$work/cbctd.err" | tail -3)"
+	rm "$work/full.jsonl"
+	start_daemon --tokens "$tokens" --audit "$work/full.jsonl"
+	req GET /metrics "${a[@]}"
+	grep -qx 'cbctd_audit_fails 0' "$body" || fail "that it can be written again"
+	req GET /readyz
+	[ "$(cat "$body")" = ready ] || fail "nothing more: $(cat "$body")"
+	stop_daemon
+}
+
 test_without_tokens_there_is_one_only_if_it_is_wanted() {
 	fresh
 	start_daemon
