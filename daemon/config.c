@@ -6,6 +6,7 @@
 #include <stdbool.h>
 #include <stdlib.h>
 #include <string.h>
+#include <unistd.h>
 
 #include "proto/scan_directory.h"
 
@@ -209,6 +210,7 @@ static int load_line(struct config *config, char *line, const char *place, bool 
 {
 	const struct setting *setting;
 	char source[256], *value;
+	size_t length;
 
 	line = trim(line);
 	if (line[0] == '\0' || line[0] == '#')
@@ -223,8 +225,12 @@ static int load_line(struct config *config, char *line, const char *place, bool 
 		return error_set(err, ERR_INVALID, "%s: no setting is called \"%s\"", place, line);
 	if (given[setting - settings] && setting->kind != KIND_LIST)
 		return error_set(err, ERR_INVALID, "%s: \"%s\" is set a second time", place, line);
+	value = trim(value);
+	length = strlen(value);
+	if (length >= 2 && value[0] == '"' && value[length - 1] == '"')
+		return error_set(err, ERR_INVALID, "%s: %s: values have no quotes around them", place, line);
 	snprintf(source, sizeof(source), "%s: %s", place, line);
-	if (setting_set(setting, config, trim(value), given[setting - settings], source, err) != 0)
+	if (setting_set(setting, config, value, given[setting - settings], source, err) != 0)
 		return err->code;
 	given[setting - settings] = true;
 	return 0;
@@ -264,6 +270,24 @@ static int load_environment(struct config *config, struct error *err)
 			code = setting_set(&settings[i], config, value, false, name, err);
 	}
 	return code;
+}
+
+void config_unknown_variables(void (*visit)(const char *name))
+{
+	const size_t prefix = strlen("CBCTD_");
+	char known[96], name[96];
+
+	for (char **entry = environ; *entry != NULL; entry++) {
+		bool found = strncmp(*entry, "CBCTD_", prefix) != 0;
+
+		snprintf(name, sizeof(name), "%.*s", (int)strcspn(*entry, "="), *entry);
+		for (int i = 0; i < SETTING_COUNT && !found; i++) {
+			variable_name(&settings[i], known, sizeof(known));
+			found = strcmp(known, name) == 0;
+		}
+		if (!found)
+			visit(name);
+	}
 }
 
 /* only_config: looks for --config alone. */

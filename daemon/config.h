@@ -40,6 +40,11 @@ void config_compare(const struct config *a, const struct config *b, char *ret_na
 
 void config_help(FILE *out);
 /* Every setting as it is now, as a config file. */
+/*
+ * Visits each variable of the environment that begins as those of settings do and is none. It may be another program's:
+ * a cluster gives its services such names.
+ */
+void config_unknown_variables(void (*visit)(const char *name));
 void config_print(const struct config *config, FILE *out);
 
 #endif

@@ -55,6 +55,11 @@ static void set_log(const struct config *config)
 	log_set_format((enum log_format)place_of(config->log_format, log_format_names, LOG_FORMAT_COUNT), NULL);
 }
 
+static void tell_unknown(const char *name)
+{
+	log_line(LEVEL_WARNING, "%s: no setting has this name, it is ignored", name);
+}
+
 /* A descriptor for each connection and more: as many as we may have, within reason. */
 static void raise_descriptors(void)
 {
@@ -313,6 +318,7 @@ static int run(const struct arguments *arguments)
 	int signal_number = 0, code;
 
 	set_log(config);
+	config_unknown_variables(tell_unknown);
 	notify_open();
 	raise_descriptors();
 	block_signals(&stops);
@@ -349,6 +355,13 @@ static int rebuild(const struct config *config)
 	return 0;
 }
 
+static void print(const struct config *config)
+{
+	set_log(config);
+	config_unknown_variables(tell_unknown);
+	config_print(config, stdout);
+}
+
 int main(int argc, char **argv)
 {
 	enum config_action action;
@@ -370,7 +383,7 @@ int main(int argc, char **argv)
 	else if (action == CONFIG_VERSION)
 		puts(CBCTD_PROGRAM);
 	else if (action == CONFIG_PRINT)
-		config_print(&config, stdout);
+		print(&config);
 	else if (action == CONFIG_REBUILD)
 		status = rebuild(&config);
 	else

@@ -190,6 +190,16 @@ static int compare_numbers(const void *a, const void *b)
 	return (x > y) - (x < y);
 }
 
+/* ERR_NO_SPACE on a full disk, which takes a part at last. */
+static int write_block(int file, const char *block, size_t size, off_t at, struct error *err)
+{
+	const ssize_t written = pwrite(file, block, size, at);
+
+	return written == (ssize_t)size
+		   ? 0
+		   : error_set_errno(err, written < 0 ? errno : ENOSPC, "a file of 32 MiB to write");
+}
+
 /* The median of `count` syncs of 4 KiB, and what a block of some MB takes with its sync; s. */
 static int measure_syncs(const char *directory, double *ret_sync, double *ret_rate, struct error *err)
 {
@@ -208,7 +218,7 @@ static int measure_syncs(const char *directory, double *ret_sync, double *ret_ra
 	unlink(path);
 	memset(block, 0x5a, BLOCK);
 	for (int i = 0; i < SYNCS && code == 0; i++) {
-		code = pwrite(file, block, SMALL, (off_t)i * SMALL) == SMALL ? 0 : error_set_errno(err, errno, "write");
+		code = write_block(file, block, SMALL, (off_t)i * SMALL, err);
 		start = clock_monotonic();
 		if (code == 0 && fdatasync(file) != 0)
 			code = error_set_errno(err, errno, "fdatasync");
@@ -216,7 +226,7 @@ static int measure_syncs(const char *directory, double *ret_sync, double *ret_ra
 	}
 	start = clock_monotonic();
 	for (int i = 0; i < BLOCKS && code == 0; i++)
-		code = pwrite(file, block, BLOCK, (off_t)i * BLOCK) == BLOCK ? 0 : error_set_errno(err, errno, "write");
+		code = write_block(file, block, BLOCK, (off_t)i * BLOCK, err);
 	if (code == 0 && fdatasync(file) != 0)
 		code = error_set_errno(err, errno, "fdatasync");
 	*ret_rate = BLOCKS * (double)BLOCK / (clock_monotonic() - start);
@@ -277,8 +287,10 @@ static void look_at_syncs(struct visit *visit)
 	struct error err;
 
 	if (measure_syncs(visit->directory, &sync, &rate, &err) != 0) {
-		found(visit, VERDICT_PROBLEM, "run it as the user of the service: sudo -u cbctd cbct doctor", "%s",
-		      err.text);
+		found(visit, VERDICT_PROBLEM,
+		      err.code == ERR_NO_SPACE ? "make room: delete scans and jobs, or a larger disk"
+					       : "run it as the user of the service: sudo -u cbctd cbct doctor",
+		      "%s", err.text);
 		return;
 	}
 	if (sync < impossible)

@@ -35,6 +35,7 @@ struct http {
 	CURL *easy;
 	char *authorization; /* a header field, or NULL */
 	char *base;          /* no slash at the end */
+	char *socket;        /* the path of a Unix socket, or NULL */
 	char message[CURL_ERROR_SIZE];
 	bool unreachable;
 	double retry_after; /* s, of the last reply */
@@ -123,8 +124,9 @@ int http_new(const struct http_options *options, struct http **ret_http, struct 
 	if (http != NULL) {
 		http->easy = curl_easy_init();
 		http->base = strdup(url);
+		http->socket = socket != NULL ? strdup(socket) : NULL;
 	}
-	if (http == NULL || http->easy == NULL || http->base == NULL) {
+	if (http == NULL || http->easy == NULL || http->base == NULL || (socket != NULL && http->socket == NULL)) {
 		http_free(http);
 		return error_set(err, ERR_NO_MEMORY, "no memory for a connection");
 	}
@@ -157,6 +159,7 @@ void http_free(struct http *http)
 		return;
 	curl_easy_cleanup(http->easy);
 	free(http->base);
+	free(http->socket);
 	free(http->authorization);
 	free(http);
 }
@@ -280,6 +283,14 @@ static int problem(const struct http_request *request, const struct http_reply *
 /* No reply, or one that broke off. */
 static int no_reply(struct http *http, CURLcode result, struct error *err)
 {
+	long reason = 0;
+
+	/* The library speaks of a host and a port, also where there is a socket. */
+	if (http->socket != NULL && http->unreachable) {
+		curl_easy_getinfo(http->easy, CURLINFO_OS_ERRNO, &reason);
+		return error_set(err, ERR_IO, "unix:%s: %s", http->socket,
+				 reason != 0 ? strerror((int)reason) : "nobody listens there");
+	}
 	return error_set(err, ERR_IO, "%s: %s", http->base,
 			 http->message[0] != 0 ? http->message : curl_easy_strerror(result));
 }

@@ -291,6 +291,7 @@ test_failures_are_told() {
 	grep -q cancelled "$work/said" || fail "that the job was cancelled"
 	expect_exit 1 env CBCT_URL=http://127.0.0.1:1 cbct scans
 	expect_exit 1 env CBCT_URL=unix:/nonexistent cbct scans
+	grep -q 'unix:/nonexistent: No such file' "$work/said" || fail "the socket and the reason in: $(cat "$work/said")"
 	truncate -s -1 "$work/scan/projections.raw"
 	expect_exit 1 cbct upload "$work/scan"
 }

@@ -45,6 +45,16 @@ test_a_sync_that_does_nothing_is_found() {
 	grep -qE 'cbct doctor: [0-9]+ problems?$' "$work/errors" || fail "how many: $(cat "$work/errors")"
 }
 
+test_a_full_disk_is_called_so() {
+	disk=$work/small # not local: the trap runs after the function
+	mkdir -p "$disk"
+	mount -t tmpfs -o size=1m none "$disk" 2>/dev/null || skip "no permission to mount a small tmpfs"
+	trap 'umount "$disk"' EXIT
+	doctor cbct doctor --json "$disk"
+	has sync problem 'No space left on device'
+	jq -e 'any(.[]; .subject == "sync" and (.advice | test("make room")))' "$report" >/dev/null || fail "what to do: $(jq -c . "$report")"
+}
+
 test_rights_and_directories_that_are_none() {
 	mkdir -p "$work/open" && chmod 755 "$work/open"
 	doctor cbct doctor --json "$work/open"

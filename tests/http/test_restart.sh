@@ -533,6 +533,13 @@ test_settings_as_flag_line_and_environment() {
 	sed 's/^listen.*/listen = 127.0.0.1:4444/' "$work/config" >"$work/config2"
 	"$BUILD/cbctd" --config "$work/config2" --print-config | grep -q '127.0.0.1:4444' || fail "the config file's value"
 	"$BUILD/cbctd" --config "$work/config2" --listen 127.0.0.1:5555 --print-config | grep -q '127.0.0.1:5555' || fail "the flag before the file"
+	CBCTD_MAX_JOB=4 "$BUILD/cbctd" --print-config 2>"$work/out" >/dev/null || fail "a variable of somebody else's, perhaps"
+	grep -q 'warning: CBCTD_MAX_JOB: no setting' "$work/out" || fail "the unknown variable, told: $(cat "$work/out")"
+	"$BUILD/cbctd" --print-config 2>"$work/out" >/dev/null
+	[ ! -s "$work/out" ] || fail "nothing to tell: $(cat "$work/out")"
+	echo 'state-dir = "/tmp/x"' >"$work/config3"
+	! "$BUILD/cbctd" --config "$work/config3" --print-config >"$work/out" 2>&1 || fail "quotes refused"
+	grep -q 'config3:1: state-dir: values have no quotes' "$work/out" || fail "why: $(cat "$work/out")"
 	if "$BUILD/cbctd" --listen 0.0.0.0:0 --state-dir "$work/other" >"$work/out" 2>&1; then
 		fail "a refusal to listen beyond loopback without tokens and TLS"
 	fi
