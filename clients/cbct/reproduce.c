@@ -13,6 +13,7 @@
 #include "clients/cbct/tool.h"
 #include "clients/cbct/watch.h"
 #include "proto/format.h"
+#include "proto/patient.h"
 #include "proto/recipe.h"
 #include "proto/scan_directory.h"
 
@@ -317,6 +318,35 @@ static int tell_result(const struct work *work, const float *was, const float *i
 	return error_set(err, ERR_IO, "the volume is not the same");
 }
 
+/*
+ * Voxels elsewhere, or on another side, are another volume whatever their bits. Files keep places as float32 or in
+ * decimals. Where one of both does not know how the patient lies, their axes may be other ones.
+ */
+static int compare_places(const struct work *work, const struct grid grid[2], double axes[2][3][3], struct error *err)
+{
+	const struct patient *was = &work->was.patient, *is = &work->is.patient;
+	const double part = 1e-4; /* of a voxel */
+
+	for (int i = 0; i < 3; i++) {
+		const double voxel = grid[1].spacing[i];
+
+		if (fabs(grid[0].spacing[i] - voxel) * grid[1].size[i] > part * voxel)
+			return error_set(err, ERR_IO, "voxels: were %g mm wide along axis %d, are %g",
+					 grid[0].spacing[i], i, voxel);
+	}
+	if (was->known && is->known && !patient_same(was, is))
+		return error_set(err, ERR_IO, "patient: lies otherwise in the file than in the scan");
+	for (int i = 0; i < 3 && patient_same(was, is); i++) {
+		if (fabs(grid[0].origin[i] - grid[1].origin[i]) > part * grid[1].spacing[i])
+			return error_set(err, ERR_IO, "place: the first voxel was at %g mm along axis %d, is at %g",
+					 grid[0].origin[i], i, grid[1].origin[i]);
+		for (int j = 0; j < 3; j++)
+			if (fabs(axes[0][i][j] - axes[1][i][j]) * grid[1].size[i] > part)
+				return error_set(err, ERR_IO, "axis %d is turned", i);
+	}
+	return 0;
+}
+
 static int compare(struct work *work, struct error *err)
 {
 	struct grid grid[2] = {0};
@@ -335,6 +365,8 @@ static int compare(struct work *work, struct error *err)
 				 "cut out",
 				 grid[0].size[0], grid[0].size[1], grid[0].size[2], grid[1].size[0], grid[1].size[1],
 				 grid[1].size[2]);
+	if (code == 0)
+		code = compare_places(work, grid, axes, err);
 	/* From a directory the volume is always in 1/mm. */
 	if (code == 0 && work->hu && !hu) {
 		const size_t count = grid_voxels(&grid[1]);

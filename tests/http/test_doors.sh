@@ -139,7 +139,8 @@ test_names_that_are_none_are_refused_at_the_start() {
 		if cbctd --listen 127.0.0.1:0 --state-dir "$work/other" --server-name "$name" >/dev/null 2>"$work/refused"; then fail "$name refused"; fi
 		grep -q 'server-name' "$work/refused" || fail "the setting's name, got $(cat "$work/refused")"
 	done
-	cbctd --print-config --server-name ct1 --server-name ct2 | grep -qx 'server-name = ct1, ct2' || fail "both names"
+	cbctd --print-config --server-name ct1 --server-name ct2 >"$work/config"
+	grep -qx 'server-name = ct1, ct2' "$work/config" || fail "both names"
 }
 
 start_daemon --listen "unix:$work/socket" --server-name ct-1.hospital.example --server-name ct2 || exit 1

@@ -132,6 +132,17 @@ test_a_changed_recipe_is_named() {
 	said "not the same bits"
 }
 
+test_voxels_that_lie_elsewhere_are_named() {
+	curl -sf "$url/v1/jobs/$made/volumes/final?format=mha" -o "$work/place.mha"
+	in_header "$work/place.mha" "ElementSpacing = 4" "ElementSpacing = 3"
+	! again "$work/place.mha" || fail "another spacing"
+	grep -qF "voxels: were 3 mm wide along axis 0, are 4" "$work/said.err" || fail "the spacing's name, got $(cat "$work/said.err")"
+	curl -sf "$url/v1/jobs/$made/volumes/final?format=mha" -o "$work/place.mha"
+	in_header "$work/place.mha" "Offset = -" "Offset =  "
+	! again "$work/place.mha" || fail "another place"
+	grep -qF "place: the first voxel was at" "$work/said.err" || fail "the place's name, got $(cat "$work/said.err")"
+}
+
 test_another_device_is_told_with_the_bound_of_its_precision() {
 	cp "$work/final.nii" "$work/device.nii"
 	in_header "$work/device.nii" '"backend":"cpu"' '"backend":"gpu"'
