@@ -71,7 +71,7 @@ test_lists_of_devices() {
 		fi
 		grep -q -- '--devices' "$work/refused" || fail "a message about --devices, got $(cat "$work/refused")"
 	done
-	"$BUILD/cbctd" --devices 0,2 --print-config | grep -q '^devices *= *0,2' || fail "devices = 0,2"
+	"$BUILD/cbctd" --devices 0,2 --print-config | grep '^devices *= *0,2' >/dev/null || fail "devices = 0,2"
 }
 
 start_daemon --devices $devices --threads 1 || exit 1
