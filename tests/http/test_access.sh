@@ -130,7 +130,7 @@ test_roles_work_from_scan_to_volume() {
 
 # A browser sends cookies to all ports of a host.
 test_two_daemons_of_one_host_keep_their_sessions() {
-	local jar=$work/jar first
+	local jar=$work/jar first second
 	rm -f "$jar"
 	start_daemon --tokens "$tokens"
 	as view
@@ -138,6 +138,7 @@ test_two_daemons_of_one_host_keep_their_sessions() {
 	expect_status 201
 	first=$url
 	"$BUILD/cbctd" --listen 127.0.0.1:0 --state-dir "$work/second" --backend cpu --tokens "$tokens" >"$work/second.out" 2>/dev/null &
+	second=$!
 	for _ in $(seq 200); do
 		url=$(sed -n 's/^listening on \(http:\)/\1/p' "$work/second.out")
 		[ -z "$url" ] || break
@@ -147,7 +148,8 @@ test_two_daemons_of_one_host_keep_their_sessions() {
 	expect_status 201
 	req GET /v1/session -b "$jar"
 	expect_status 200
-	kill %1
+	kill "$second"
+	wait "$second" || fail "the second daemon ends well"
 	url=$first
 	req GET /v1/session -b "$jar"
 	expect_json '.proof == "session"'
