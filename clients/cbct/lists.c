@@ -1,13 +1,18 @@
 /* cbct scans, jobs, calibrations, status, limits, complete, pin, unpin, rm: what the daemon knows, a line each. */
+#include <ctype.h>
+#include <stdio.h>
 #include <string.h>
 
 #include "clients/cbct/commands.h"
 #include "clients/cbct/http.h"
 
+enum { QUERY_MAX = 4096 };
+
 struct list_options {
 	const char *id;
 	long limit;
 	bool json;
+	const char *state, *scan, *priority, *label, *text;
 	struct http_options http;
 };
 
@@ -23,8 +28,34 @@ static const struct option list_rows[] = {
     ROW("limit", OPTION_INTEGER, limit, "N", "the newest so many", 1, 1000),
     {0},
 };
+static const struct option common_rows[] = {
+    ROW("state", OPTION_TEXT, state, "NAME[,NAME]", "those in one of these states", 0, 0),
+    ROW("label", OPTION_TEXT, label, "NAME[=VALUE]", "those with this label", 0, 0),
+    ROW("text", OPTION_TEXT, text, "TEXT", "those with this in id, name or label", 0, 0),
+    {0},
+};
+static const struct option job_rows[] = {
+    ROW("scan", OPTION_TEXT, scan, "SCAN", "those of this scan", 0, 0),
+    ROW("priority", OPTION_TEXT, priority, "NAME[,NAME]", "those of one of these priorities", 0, 0),
+    {0},
+};
 static const struct option_group list_groups[] = {
     {"options", list_rows, 0},
+    {"", json_rows, 0},
+    {"", http_option_rows, offsetof(struct list_options, http)},
+    {0},
+};
+static const struct option_group scans_groups[] = {
+    {"options", list_rows, 0},
+    {"", common_rows, 0},
+    {"", json_rows, 0},
+    {"", http_option_rows, offsetof(struct list_options, http)},
+    {0},
+};
+static const struct option_group jobs_groups[] = {
+    {"options", list_rows, 0},
+    {"", common_rows, 0},
+    {"", job_rows, 0},
     {"", json_rows, 0},
     {"", http_option_rows, offsetof(struct list_options, http)},
     {0},
@@ -107,21 +138,46 @@ static int list(const struct list_options *options, const char *path, const char
 	return code;
 }
 
+/* Adds &name=value with the value's bytes as RFC 3986 has them; what has no room is left out. */
+static void add_query(char path[QUERY_MAX], const char *name, const char *value)
+{
+	size_t length = strlen(path);
+
+	if (value == NULL || length + strlen(name) + 3 * strlen(value) + 3 > QUERY_MAX)
+		return;
+	length += (size_t)snprintf(path + length, QUERY_MAX - length, "&%s=", name);
+	for (; *value != '\0'; value++) {
+		const unsigned char byte = (unsigned char)*value;
+
+		length += (size_t)snprintf(path + length, QUERY_MAX - length, isalnum(byte) ? "%c" : "%%%02X", byte);
+	}
+}
+
+static void list_path(const struct list_options *options, const char *what, char ret_path[QUERY_MAX])
+{
+	snprintf(ret_path, QUERY_MAX, "/v1/%s?limit=%ld", what, options->limit);
+	add_query(ret_path, "state", options->state);
+	add_query(ret_path, "scan", options->scan);
+	add_query(ret_path, "priority", options->priority);
+	add_query(ret_path, "label", options->label);
+	add_query(ret_path, "text", options->text);
+}
+
 static int scans_run(const void *values, struct error *err)
 {
 	const struct list_options *options = values;
-	char path[80];
+	char path[QUERY_MAX];
 
-	snprintf(path, sizeof(path), "/v1/scans?limit=%ld", options->limit);
+	list_path(options, "scans", path);
 	return list(options, path, "scans", print_scan, err);
 }
 
 static int jobs_run(const void *values, struct error *err)
 {
 	const struct list_options *options = values;
-	char path[80];
+	char path[QUERY_MAX];
 
-	snprintf(path, sizeof(path), "/v1/jobs?limit=%ld", options->limit);
+	list_path(options, "jobs", path);
 	return list(options, path, "jobs", print_job, err);
 }
 
@@ -280,9 +336,9 @@ const struct command command_complete = {"complete",
 					 &defaults,
 					 sizeof(defaults),
 					 complete_run};
-const struct command command_scans = {"scans",   "the newest scans", none,     list_groups,
+const struct command command_scans = {"scans",   "the newest scans", none,     scans_groups,
 				      &defaults, sizeof(defaults),   scans_run};
-const struct command command_jobs = {"jobs",    "the newest jobs", none,    list_groups,
+const struct command command_jobs = {"jobs",    "the newest jobs", none,    jobs_groups,
 				     &defaults, sizeof(defaults),  jobs_run};
 const struct command command_calibrations = {"calibrations",   "the newest calibrations", none, list_groups, &defaults,
 					     sizeof(defaults), calibrations_run};

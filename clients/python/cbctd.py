@@ -422,9 +422,9 @@ class Client:
         """The scan's document; ``missing`` has the runs [first, last] of projections that are not there."""
         return self._json("GET", f"/v1/scans/{scan}")
 
-    def scans(self) -> Iterator[Document]:
-        """All scans, newest first."""
-        return self._pages("/v1/scans", "scans")
+    def scans(self, **wanted: str) -> Iterator[Document]:
+        """Scans, newest first; all, or those with ``state``, ``label`` and ``text`` as the API has them."""
+        return self._pages("/v1/scans", "scans", wanted)
 
     def delete_scan(self, scan: str) -> None:
         """Removes a scan with its projections; `Problem` 409 while a job uses it."""
@@ -571,9 +571,9 @@ class Client:
         """The job's document as it is."""
         return self._json("GET", f"/v1/jobs/{job}")
 
-    def jobs(self) -> Iterator[Document]:
-        """All jobs, newest first."""
-        return self._pages("/v1/jobs", "jobs")
+    def jobs(self, **wanted: str) -> Iterator[Document]:
+        """Jobs, newest first; all, or those with ``state``, ``scan``, ``priority``, ``label`` and ``text``."""
+        return self._pages("/v1/jobs", "jobs", wanted)
 
     def wait(self, job: str, timeout: Optional[float] = None) -> Document:
         """The job's document when it has ended. `JobFailed` unless it succeeded, `TimeoutError` after so many s."""
@@ -891,10 +891,10 @@ class Client:
     def _bytes(self, path: str, params: Mapping[str, str], headers: Optional[Mapping[str, str]] = None) -> bytes:
         return bytes(self._request("GET", path, params=params, headers=headers).content)
 
-    def _pages(self, path: str, name: str) -> Iterator[Document]:
+    def _pages(self, path: str, name: str, wanted: Mapping[str, str] = {}) -> Iterator[Document]:
         after: Optional[str] = None
         while True:
-            page = self._json("GET", path, params={} if after is None else {"after": after})
+            page = self._json("GET", path, params={**wanted, **({} if after is None else {"after": after})})
             yield from page[name]
             after = page["next"]
             if after is None:

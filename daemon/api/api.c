@@ -33,7 +33,7 @@ const struct route api_routes[] = {
     {"GET", "/v1/session", ROLE_VIEW, session_get, BODY_NONE, 0, NULL, NULL, NULL},
     {"DELETE", "/v1/session", ROLE_VIEW, session_delete, BODY_NONE, 0, NULL, NULL, NULL},
 
-    {"GET", "/v1/scans", ROLE_VIEW, scan_list, BODY_NONE, 0, NULL, NULL, "limit after"},
+    {"GET", "/v1/scans", ROLE_VIEW, scan_list, BODY_NONE, 0, NULL, NULL, "limit after state label text"},
     {"POST", "/v1/scans", ROLE_ACQUIRE, scan_post, BODY_WHOLE, JSON_BYTES_MAX, NULL, NULL, NULL},
     {"GET", "/v1/scans/{}", ROLE_VIEW, scan_get, BODY_NONE, 0, NULL, NULL, NULL},
     {"DELETE", "/v1/scans/{}", ROLE_ACQUIRE, scan_delete, BODY_NONE, 0, NULL, NULL, NULL},
@@ -53,7 +53,7 @@ const struct route api_routes[] = {
     {"DELETE", "/v1/calibrations/{}", ROLE_ACQUIRE, calibration_delete, BODY_NONE, 0, NULL, NULL, NULL},
     {"GET", "/v1/calibrations/{}/views/{}", ROLE_VIEW, calibration_view_get, BODY_NONE, 0, NULL, NULL, NULL},
 
-    {"GET", "/v1/jobs", ROLE_VIEW, job_list, BODY_NONE, 0, NULL, NULL, "limit after"},
+    {"GET", "/v1/jobs", ROLE_VIEW, job_list, BODY_NONE, 0, NULL, NULL, "limit after state scan priority label text"},
     {"POST", "/v1/jobs", ROLE_ACQUIRE, job_post, BODY_WHOLE, JSON_BYTES_MAX, NULL, NULL, NULL},
     {"GET", "/v1/jobs/{}", ROLE_VIEW, job_get, BODY_NONE, 0, NULL, NULL, "wait"},
     {"DELETE", "/v1/jobs/{}", ROLE_ACQUIRE, job_delete, BODY_NONE, 0, NULL, NULL, "wait"},

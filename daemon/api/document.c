@@ -291,6 +291,7 @@ static void add_job_facts(cJSON *document, struct job *job, const struct job_rec
 	add_waiting_for(document, scan, record, job_obstacle(job));
 	add_views(document, scan, record);
 	add_number_or_null(document, "eta_s", job_eta(job));
+	add_number_or_null(document, "start_s", job_start_in(job));
 	add_number_or_null(document, "queue_position", position > 0 ? position : -1);
 	add_text_or_null(document, "backend", record->backend);
 	add_text_or_null(document, "device", record->device);

@@ -3,7 +3,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "daemon/api/internal.h"
+#include "daemon/api/filter.h"
 
 /* ---- POST ---- */
 
@@ -86,18 +86,49 @@ int job_post(void *context, struct request *request, struct error *err)
 
 /* ---- lists ---- */
 
+/* A page of those that fit; *ret_more: more of them come behind it. */
+static int list_fitting(struct api *api, const struct filter *filter, const struct page *page, struct job **ret_jobs,
+			int *ret_count, bool *ret_more, struct error *err)
+{
+	const char *after = page->after;
+	struct job *some[PAGE_DEFAULT];
+	struct job_facts facts;
+	int count, found = 0, code = 0;
+	bool rest = true, more = false;
+
+	while (rest && !more && code == 0) {
+		code = jobs_list(api->jobs, after, PAGE_DEFAULT, some, &count, &rest, err);
+		for (int i = 0; code == 0 && i < count; i++) {
+			bool fits = !more && filter_fits_job(api, filter, some[i]);
+
+			job_facts(some[i], &facts);
+			after = facts.id;
+			if (fits && found < page->limit) {
+				ret_jobs[found++] = some[i];
+				continue;
+			}
+			more = more || fits;
+			job_release(some[i]);
+		}
+	}
+	*ret_count = found;
+	*ret_more = more;
+	return code;
+}
+
 int job_list(void *context, struct request *request, struct error *err)
 {
 	struct api *api = context;
 	struct job *jobs[PAGE_MAX];
 	struct job_facts last;
+	struct filter filter;
 	cJSON *document, *list;
 	struct page page;
 	int count;
 	bool more;
 
-	if (page_read_ids(request, &page, err) != 0 ||
-	    jobs_list(api->jobs, page.after, page.limit, jobs, &count, &more, err) != 0)
+	if (page_read_ids(request, &page, err) != 0 || filter_read_jobs(request, &filter, err) != 0 ||
+	    list_fitting(api, &filter, &page, jobs, &count, &more, err) != 0)
 		return err->code;
 	document = cJSON_CreateObject();
 	list = cJSON_AddArrayToObject(document, "jobs");

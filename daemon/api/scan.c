@@ -1,5 +1,7 @@
 /* /v1/scans */
-#include "daemon/api/internal.h"
+#include <stdio.h>
+
+#include "daemon/api/filter.h"
 
 /* A new scan, or the one that another request with the same key has made at the same time. */
 static int post(struct api *api, struct request *request, const struct store_key *key, struct stored_scan **ret_scan,
@@ -45,17 +47,48 @@ int scan_post(void *context, struct request *request, struct error *err)
 	return code;
 }
 
+/* A page of those that fit; *ret_more: more of them come behind it. */
+static int list_fitting(struct api *api, const struct filter *filter, const struct page *page,
+			struct stored_scan **ret_scans, int *ret_count, bool *ret_more, struct error *err)
+{
+	struct stored_scan *some[PAGE_DEFAULT];
+	char after[ID_SIZE];
+	int count, found = 0, code = 0;
+	bool rest = true, more = false;
+
+	snprintf(after, sizeof(after), "%s", page->after != NULL ? page->after : "");
+	while (rest && !more && code == 0) {
+		code = store_scan_list(api->store, after[0] != '\0' ? after : NULL, PAGE_DEFAULT, some, &count, &rest,
+				       err);
+		for (int i = 0; code == 0 && i < count; i++) {
+			bool fits = !more && filter_fits_scan(api, filter, some[i]);
+
+			snprintf(after, sizeof(after), "%s", stored_scan_id(some[i]));
+			if (fits && found < page->limit) {
+				ret_scans[found++] = some[i];
+				continue;
+			}
+			more = more || fits;
+			stored_scan_release(some[i]);
+		}
+	}
+	*ret_count = found;
+	*ret_more = more;
+	return code;
+}
+
 int scan_list(void *context, struct request *request, struct error *err)
 {
 	struct api *api = context;
 	struct stored_scan *scans[PAGE_MAX];
+	struct filter filter;
 	cJSON *document, *list;
 	struct page page;
 	int count;
 	bool more;
 
-	if (page_read_ids(request, &page, err) != 0 ||
-	    store_scan_list(api->store, page.after, page.limit, scans, &count, &more, err) != 0)
+	if (page_read_ids(request, &page, err) != 0 || filter_read_scans(request, &filter, err) != 0 ||
+	    list_fitting(api, &filter, &page, scans, &count, &more, err) != 0)
 		return err->code;
 	document = cJSON_CreateObject();
 	list = cJSON_AddArrayToObject(document, "scans");

@@ -24,6 +24,11 @@ struct job {
 	struct job_request request; /* see job_request */
 	struct error unreadable;    /* code 0: request is there */
 
+	struct job_extent {
+		int views;
+		double samples;
+	} extent; /* of its scan; 0: it has gone */
+
 	struct job_trial trial; /* the supervisor's own */
 	int doubts;             /* job_doubt, with the next; the supervisor's own */
 	unsigned doubted_at;
@@ -55,6 +60,14 @@ struct client {
 	struct client *next;
 };
 
+/* Seconds a unit of work in a stage: forecast.c. */
+enum { JOB_RATES = 64 };
+struct job_rate {
+	enum stage stage;
+	unsigned variant;
+	double seconds;
+};
+
 struct jobs {
 	struct store *store; /* constant, as the next */
 	double opened;       /* monotonic */
@@ -68,7 +81,13 @@ struct jobs {
 	struct client *clients;
 	struct jobs_statistics statistics; /* what there is now is counted on demand */
 	struct histogram stages[STAGE_COUNT];
+	struct job_rate rate[JOB_RATES];
+	int rates, oldest_rate;
 };
+
+/* ---- jobs/forecast.c ---- */
+/* What a job that has succeeded took, for those that come. jobs->lock is held, or nobody else has the jobs yet. */
+void job_measure(struct job *job, const struct job_record *record);
 
 /* ---- jobs/share.c ---- */
 /* The client's own, made where there is none; NULL: no memory. jobs->lock is held, as by the next. */

@@ -247,9 +247,16 @@ static int recover(struct job *job, struct error *err)
 	}
 }
 
+static struct job_extent extent_of(const struct scan_facts *scan)
+{
+	return (struct job_extent){scan->count, (double)scan->count * scan->columns * scan->rows};
+}
+
 static int load_jobs(struct jobs *jobs, struct error *err)
 {
 	struct job_record *records;
+	struct scan_facts facts;
+	struct error ignored;
 	struct job *job;
 	int count, code = store_job_load(jobs->store, &records, &count, err);
 
@@ -269,6 +276,9 @@ static int load_jobs(struct jobs *jobs, struct error *err)
 		job->bytes_known = !job_state_ended(job->record.state);
 		if (job->bytes_known)
 			job->kept_bytes = job_bytes_wanted(&job->request);
+		if (store_scan_look(jobs->store, job->scan, &facts, &ignored) == 0)
+			job->extent = extent_of(&facts);
+		job_measure(job, &job->record);
 		array_insert(jobs, job);
 		id_floor(job->id);
 		if (job->record.ticket >= jobs->next_ticket)
@@ -402,6 +412,7 @@ static int insert_job(struct jobs *jobs, struct job *job, struct stored_scan *sc
 	int code;
 
 	stored_scan_facts(scan, &facts);
+	job->extent = extent_of(&facts);
 	if (facts.deleted)
 		return error_set_at(err, ERR_NOT_FOUND, "/scan", "there is no scan \"%s\" any more", record->scan);
 	record->state = facts.ready ? JOB_QUEUED : JOB_WAITING;
@@ -650,31 +661,6 @@ int job_queue_position(struct job *job)
 	position = queue_position(&job->jobs->queue, &job->entry);
 	pthread_mutex_unlock(&job->jobs->lock);
 	return position;
-}
-
-/* Estimates from the time between history rows; before the first one, from the share of the whole that is done. */
-double job_eta(struct job *job)
-{
-	double now = clock_monotonic(), eta = -1;
-	const struct job_record *record = &job->record;
-	const struct job_request *request;
-	struct error ignored;
-	/* How many there will be, the share that is done tells. */
-	const bool automatic = job_request(job, &request, &ignored) == 0 && request->recipe.iterate.automatic;
-
-	pthread_mutex_lock(&job->jobs->lock);
-	if (record->state == JOB_RUNNING) {
-		double done = record->fraction - job->run_fraction;
-
-		if (job->row_seconds > 0 && record->iterations > 0 && !automatic) {
-			eta = (record->iterations - record->iteration) * job->row_seconds - (now - job->row_at);
-			eta = eta < 0 ? 0 : eta;
-		} else if (done > 0.01) {
-			eta = (now - job->run_since) * (1 - record->fraction) / done;
-		}
-	}
-	pthread_mutex_unlock(&job->jobs->lock);
-	return eta;
 }
 
 void jobs_statistics(struct jobs *jobs, struct jobs_statistics *ret)

@@ -115,8 +115,10 @@ int job_request(const struct job *job, const struct job_request **ret_request, s
 void job_record(struct job *job, struct job_record *ret_record);
 /* 1 = next; 0 when it is not queued. */
 int job_queue_position(struct job *job);
-/* Seconds to go, or negative when nobody can know. */
+/* Seconds until it has ended, waiting for its turn included; negative where nobody can know. */
 double job_eta(struct job *job);
+/* Seconds until a queued job has a device; negative where nobody can know, or it is not queued. */
+double job_start_in(struct job *job);
 
 struct jobs_statistics {
 	/* Now; the age, s, is that of the job that was posted first, 0 where there is none. */

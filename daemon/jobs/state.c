@@ -219,8 +219,10 @@ static void show_state(struct job *job, const struct job_record *record, const s
 		job->row_seconds = 0;
 		jobs->statistics.started++;
 	}
-	if (job_state_ended(record->state))
+	if (job_state_ended(record->state)) {
 		count_end(jobs, record);
+		job_measure(job, record);
+	}
 	jobs->statistics.crashed += change->crashed;
 	pthread_mutex_unlock(&jobs->lock);
 	log_line(record->state == JOB_FAILED ? LEVEL_WARNING : LEVEL_INFO, "job %s: %s -> %s%s%s%s%s", record->id,

@@ -358,6 +358,9 @@ void job_progress(struct job *job, enum stage stage, int iteration, double fract
 {
 	pthread_mutex_lock(&job->jobs->lock);
 	job_account_stage(job);
+	/* What comes before the first iteration of a run is no part of its time. */
+	if (job->row_seconds == 0 && iteration > job->record.iteration)
+		job->row_at = clock_monotonic();
 	job->record.stage = stage;
 	job->record.iteration = iteration;
 	/* Only forward, and no surprise from a worker's arithmetic. */
@@ -372,7 +375,6 @@ static void note_rows(struct job *job, int count, int iteration)
 
 	pthread_mutex_lock(&job->jobs->lock);
 	seconds = (now - job->row_at) / count;
-	/* The first row's time holds the loading too, the later ones count more. */
 	job->row_seconds = job->row_seconds == 0 ? seconds : 0.5 * (job->row_seconds + seconds);
 	job->row_at = now;
 	job->record.iteration = iteration;

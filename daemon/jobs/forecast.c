@@ -1,0 +1,183 @@
+/*
+ * How long jobs still take: job_eta and job_start_in of job.h.
+ *
+ * A running job is judged by its own iterations. What has not begun is judged by jobs before it: each stage of a job
+ * that succeeded gives seconds a unit of work on that kind of device, and a stage of the same kind takes as many. Where
+ * a stage was never measured, or iterations end by themselves, nobody can know.
+ */
+#include <math.h>
+#include <string.h>
+
+#include "core/recon/algorithm.h"
+#include "daemon/jobs/internal.h"
+#include "proto/clock.h"
+
+static const double not_queued = 1e-3; /* s between being queued and running: less, and it was attended before */
+
+/* What a stage's time depends on, beside the amount of its work: another rate for each. */
+static unsigned variant_of(const struct recipe *recipe, enum stage stage)
+{
+	unsigned precise = recipe->reference_precision;
+
+	switch (stage) {
+	case STAGE_FDK:
+		return precise | (recipe->metal.on ? 2u : 0) | (recipe->fdk.extend ? 4u : 0);
+	case STAGE_TV:
+		return precise | (unsigned)recipe->tv.options.method << 1;
+	case STAGE_SART:
+	case STAGE_CGLS:
+	case STAGE_FISTA:
+		return precise | (unsigned)recipe->projector << 1;
+	default:
+		return 0;
+	}
+}
+
+static double tv_passes(const struct recipe *recipe, int iterations)
+{
+	if (!recipe->tv.on)
+		return 0;
+	return iterations + (recipe->tv.after_fdk && recipe->fdk.on);
+}
+
+/* The amount of work in each stage; 0: the job has no such stage. */
+static void work_of(const struct recipe *recipe, const struct job_extent *extent, int iterations,
+		    double ret_work[STAGE_COUNT])
+{
+	const double voxels = (double)recipe->grid.size[0] * recipe->grid.size[1] * recipe->grid.size[2];
+
+	memset(ret_work, 0, STAGE_COUNT * sizeof(ret_work[0]));
+	ret_work[STAGE_LOAD] = extent->samples;
+	ret_work[STAGE_FDK] = recipe->fdk.on ? voxels * extent->views : 0;
+	if (recipe->algorithm != NULL)
+		ret_work[recipe->algorithm->stage] = iterations * voxels * extent->views;
+	ret_work[STAGE_TV] = voxels * tv_passes(recipe, iterations);
+	ret_work[STAGE_SAVE] = voxels * (recipe->emits + 1);
+}
+
+static struct job_rate *rate_of(struct jobs *jobs, const struct recipe *recipe, enum stage stage)
+{
+	for (int i = 0; i < jobs->rates; i++) {
+		struct job_rate *rate = &jobs->rate[i];
+
+		if (rate->stage == stage && rate->variant == variant_of(recipe, stage))
+			return rate;
+	}
+	return NULL;
+}
+
+void job_measure(struct job *job, const struct job_record *record)
+{
+	const struct recipe *recipe = &job->request.recipe;
+	struct jobs *jobs = job->jobs;
+	double work[STAGE_COUNT];
+
+	/* Of a lost run, or of one that went along with the acquisition, the times are not those of the work. */
+	const bool plain = record->attempts == 1 && record->started - record->queued > not_queued;
+
+	if (job->unreadable.code != 0 || record->state != JOB_SUCCEEDED || job->extent.views == 0 || !plain)
+		return;
+	work_of(recipe, &job->extent, record->iteration, work);
+	for (enum stage stage = 0; stage < STAGE_COUNT; stage++) {
+		struct job_rate *rate = rate_of(jobs, recipe, stage);
+
+		if (!(work[stage] > 0))
+			continue;
+		if (rate == NULL && jobs->rates < JOB_RATES)
+			rate = &jobs->rate[jobs->rates++];
+		else if (rate == NULL)
+			rate = &jobs->rate[jobs->oldest_rate++ % JOB_RATES];
+		*rate = (struct job_rate){stage, variant_of(recipe, stage), record->seconds[stage] / work[stage]};
+	}
+}
+
+/* Seconds on a device from beginning to end; NAN: nobody knows. jobs->lock is held. */
+static double whole(struct job *job)
+{
+	const struct recipe *recipe = &job->request.recipe;
+	double work[STAGE_COUNT], seconds = 0;
+
+	if (job->unreadable.code != 0 || job->extent.views == 0 ||
+	    (recipe->algorithm != NULL && recipe->iterate.automatic))
+		return NAN;
+	work_of(recipe, &job->extent, recipe->algorithm != NULL ? recipe->iterate.iterations : 0, work);
+	for (enum stage stage = 0; stage < STAGE_COUNT; stage++) {
+		const struct job_rate *rate = rate_of(job->jobs, recipe, stage);
+
+		if (work[stage] > 0 && rate == NULL)
+			return NAN;
+		if (work[stage] > 0)
+			seconds += work[stage] * rate->seconds;
+	}
+	return seconds;
+}
+
+/* Of a job that runs. */
+static double rest(struct job *job, double now)
+{
+	const struct job_record *record = &job->record;
+	const bool automatic = job->unreadable.code == 0 && job->request.recipe.iterate.automatic;
+	const double done = record->fraction - job->run_fraction, first = whole(job);
+	double left = NAN;
+
+	/* How many iterations end by themselves, the share that is done tells. */
+	if (job->row_seconds > 0 && record->iterations > 0 && !automatic)
+		left = (record->iterations - record->iteration) * job->row_seconds - (now - job->row_at);
+	else if (!isnan(first))
+		left = first * (1 - job->run_fraction) - (now - job->run_since);
+	else if (done > 0.01)
+		left = (now - job->run_since) * (1 - record->fraction) / done;
+	return left < 0 ? 0 : left;
+}
+
+/* A queued job's seconds until a device is free for it. */
+static double wait_of(struct job *job, double now)
+{
+	const struct jobs *jobs = job->jobs;
+	double ahead = 0;
+	int running = 0;
+
+	for (int i = 0; i < jobs->count; i++) {
+		struct job *other = jobs->all[i];
+		const struct queue_entry *entry = &other->entry;
+
+		if (other->record.state == JOB_RUNNING) {
+			ahead += rest(other, now);
+			running++;
+		} else if (entry->queued && other != job &&
+			   (entry->priority > job->entry.priority ||
+			    (entry->priority == job->entry.priority && entry->ticket < job->entry.ticket))) {
+			ahead += whole(other) * (1 - other->record.fraction);
+		}
+	}
+	return running > 1 ? ahead / running : ahead;
+}
+
+static double known(double seconds)
+{
+	return isnan(seconds) ? -1 : seconds;
+}
+
+double job_start_in(struct job *job)
+{
+	double now = clock_monotonic(), seconds = NAN;
+
+	pthread_mutex_lock(&job->jobs->lock);
+	if (job->record.state == JOB_QUEUED && job->hold.obstacle == JOB_UNHINDERED)
+		seconds = wait_of(job, now);
+	pthread_mutex_unlock(&job->jobs->lock);
+	return known(seconds);
+}
+
+double job_eta(struct job *job)
+{
+	double now = clock_monotonic(), seconds = NAN;
+
+	pthread_mutex_lock(&job->jobs->lock);
+	if (job->record.state == JOB_RUNNING)
+		seconds = rest(job, now);
+	else if (job->record.state == JOB_QUEUED && job->hold.obstacle == JOB_UNHINDERED)
+		seconds = wait_of(job, now) + whole(job) * (1 - job->record.fraction);
+	pthread_mutex_unlock(&job->jobs->lock);
+	return known(seconds);
+}
