@@ -82,14 +82,20 @@ static ssize_t read_nothing(void *context, uint64_t offset, void *to, size_t siz
 	return 0;
 }
 
+static void add_caching(struct request *request, const struct entity *entity)
+{
+	request_reply_header(request, "ETag", "%s", entity->etag);
+	request_reply_header(request, "Vary", "Accept-Encoding");
+	request_reply_header(request, "Cache-Control", "%s",
+			     entity->caching != NULL ? entity->caching : "private, no-cache");
+}
+
 static int reply_not_modified(struct request *request, const struct entity *entity, struct error *err)
 {
 	/* A 304 has the headers of a 200, the length too, but no body is ever sent. */
 	if (request_reply_read(request, 304, entity->size, read_nothing, NULL, NULL, err) != 0)
 		return err->code;
-	request_reply_header(request, "ETag", "%s", entity->etag);
-	request_reply_header(request, "Vary", "Accept-Encoding");
-	request_reply_header(request, "Cache-Control", "private, no-cache");
+	add_caching(request, entity);
 	return 0;
 }
 
@@ -135,9 +141,7 @@ void entity_headers(struct request *request, const struct entity *entity, const 
 	request_reply_header(request, "Content-Type", "%s", entity->media_type);
 	if (entity->filename != NULL)
 		request_reply_header(request, "Content-Disposition", "attachment; filename=\"%s\"", entity->filename);
-	request_reply_header(request, "ETag", "%s", entity->etag);
-	request_reply_header(request, "Vary", "Accept-Encoding");
-	request_reply_header(request, "Cache-Control", "private, no-cache");
+	add_caching(request, entity);
 	if (entity->size != UNKNOWN_SIZE)
 		request_reply_header(request, "Accept-Ranges", "bytes");
 	if (selection->status == 206)

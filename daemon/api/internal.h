@@ -109,6 +109,7 @@ struct entity {
 	uint64_t size;    /* UNKNOWN_SIZE: no ranges */
 	const char *media_type;
 	const char *filename; /* NULL: none, it is shown where it is asked for */
+	const char *caching;  /* Cache-Control; NULL: clients keep it, and ask each time whether it has changed */
 };
 /*
  * If-None-Match, Range and If-Range. *ret_done: the reply is set (304, 416);

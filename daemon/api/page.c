@@ -30,7 +30,8 @@ static int reply_asset(struct request *request, const struct asset *asset, const
 {
 	bool gzip = accepts_coding(request_header(request, "Accept-Encoding"), "gzip");
 	char etag[64];
-	struct entity entity = {.etag = etag, .size = UNKNOWN_SIZE, .media_type = asset->media_type};
+	struct entity entity = {
+	    .etag = etag, .size = UNKNOWN_SIZE, .media_type = asset->media_type, .caching = caching};
 	struct selection selection;
 	bool done;
 	int code;
@@ -43,13 +44,10 @@ static int reply_asset(struct request *request, const struct asset *asset, const
 	if (code != 0)
 		return code;
 	if (!done) {
-		request_reply_header(request, "Content-Type", "%s", asset->media_type);
-		request_reply_header(request, "ETag", "%s", etag);
-		request_reply_header(request, "Vary", "Accept-Encoding");
+		entity_headers(request, &entity, &selection);
 		if (gzip)
 			request_reply_header(request, "Content-Encoding", "gzip");
 	}
-	request_reply_header(request, "Cache-Control", "%s", caching);
 	request_reply_header(request, "Content-Security-Policy", "%s", policy);
 	request_reply_header(request, "X-Content-Type-Options", "nosniff");
 	request_reply_header(request, "Referrer-Policy", "no-referrer");

@@ -341,7 +341,7 @@ int slice_get(void *context, struct request *request, struct error *err)
 	struct job_facts facts;
 	struct asked asked = {0};
 	char etag[480];
-	struct entity entity = {.etag = etag, .size = UNKNOWN_SIZE};
+	struct entity entity = {.etag = etag, .size = UNKNOWN_SIZE, .media_type = "image/png"};
 	struct selection selection;
 	bool done;
 
@@ -353,9 +353,7 @@ int slice_get(void *context, struct request *request, struct error *err)
 		return done ? 0 : err->code;
 	if (reply_drawn(api, request, facts.id, &volume, &asked, err) != 0)
 		return err->code;
-	request_reply_header(request, "Content-Type", "image/png");
-	request_reply_header(request, "ETag", "%s", etag);
-	request_reply_header(request, "Cache-Control", "private, no-cache");
+	entity_headers(request, &entity, &selection);
 	reply_sides(api, request, &asked.oblique);
 	return 0;
 }

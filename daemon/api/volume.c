@@ -366,8 +366,10 @@ int volume_get(void *context, struct request *request, struct error *err)
 	zstd = options.shuffled || (zstd && !packed);
 	make_etag(facts.id, &volume, &options, zstd, etag, sizeof(etag));
 	volume_filename(facts.id, volume.name, &options, filename);
-	entity = (struct entity){etag, zstd || packed ? UNKNOWN_SIZE : content_size(content),
-				 volume_media_type(&options), filename};
+	entity = (struct entity){.etag = etag,
+				 .size = zstd || packed ? UNKNOWN_SIZE : content_size(content),
+				 .media_type = volume_media_type(&options),
+				 .filename = filename};
 	if (entity_select(request, &entity, &selection, &done, err) != 0 || done) {
 		content_close(content);
 		return done ? 0 : err->code;

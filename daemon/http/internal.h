@@ -253,6 +253,11 @@ void request_free(struct request *request); /* NULL is fine */
 int request_read_header(struct request *request, const char *method, struct error *err);
 /* X-Request-Id and traceparent go back with the reply. */
 void request_reply_ids(struct request *request);
+/*
+ * The reply, whose reference is taken over; NULL: there was no memory for it (ERR_NO_MEMORY). size: bytes of its body,
+ * UNKNOWN_SIZE where only its end will tell.
+ */
+int reply_set(struct request *request, int status, struct MHD_Response *response, uint64_t size, struct error *err);
 /* Replies with the gate's reasons, and lets the connection end. */
 int request_refuse(struct request *request, struct error *err);
 

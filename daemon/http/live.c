@@ -151,14 +151,9 @@ int request_reply_live(struct request *request, int status,
 		*live = (struct live){request, read};
 		response = MHD_create_response_from_callback(MHD_SIZE_UNKNOWN, BLOCK, live_read, live, live_free);
 	}
-	if (response == NULL) {
+	if (response == NULL)
 		free(live);
-		return error_set(err, ERR_NO_MEMORY, "no memory for a reply");
-	}
-	watch_peer(request->connection, patience);
-	request->response = response;
-	request->status = status;
-	request->response_size = UNKNOWN_SIZE;
-	request_reply_ids(request);
-	return 0;
+	else
+		watch_peer(request->connection, patience);
+	return reply_set(request, status, response, UNKNOWN_SIZE, err);
 }

@@ -15,8 +15,18 @@
 
 /* ---- bodies ---- */
 
-static int set_response(struct request *request, int status, struct MHD_Response *response, uint64_t size,
-			struct error *err)
+/*
+ * A reply to HEAD, and a 304, has no body. Where nobody knows how long the body would be, libmicrohttpd 0.9.75
+ * announces chunks and sends the last of them, which the client takes for the beginning of the next reply. Without
+ * chunks such a reply ends with its connection.
+ */
+static void end_with_connection(struct request *request)
+{
+	MHD_set_response_options(request->response, MHD_RF_HTTP_1_0_COMPATIBLE_STRICT, MHD_RO_END);
+	request->close = true;
+}
+
+int reply_set(struct request *request, int status, struct MHD_Response *response, uint64_t size, struct error *err)
 {
 	if (response == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a reply");
@@ -24,6 +34,8 @@ static int set_response(struct request *request, int status, struct MHD_Response
 	request->response = response;
 	request->status = status;
 	request->response_size = size;
+	if (size == UNKNOWN_SIZE && (status == 304 || request_is_head(request)))
+		end_with_connection(request);
 	request_reply_ids(request);
 	return 0;
 }
@@ -35,7 +47,7 @@ int request_reply_bytes(struct request *request, int status, void *data, size_t 
 
 	if (response == NULL)
 		free(data);
-	return set_response(request, status, response, length, err);
+	return reply_set(request, status, response, length, err);
 }
 
 int request_reply_text(struct request *request, int status, const char *media_type, char *text, size_t length,
@@ -66,16 +78,15 @@ int request_reply_empty(struct request *request, int status, struct error *err)
 {
 	char nothing[] = "";
 
-	return set_response(request, status, MHD_create_response_from_buffer(0, nothing, MHD_RESPMEM_MUST_COPY), 0,
-			    err);
+	return reply_set(request, status, MHD_create_response_from_buffer(0, nothing, MHD_RESPMEM_MUST_COPY), 0, err);
 }
 
 int request_reply_constant(struct request *request, int status, const void *data, size_t length, struct error *err)
 {
 	/* The library never writes to what is persistent. */
-	return set_response(request, status,
-			    MHD_create_response_from_buffer(length, (void *)(uintptr_t)data, MHD_RESPMEM_PERSISTENT),
-			    length, err);
+	return reply_set(request, status,
+			 MHD_create_response_from_buffer(length, (void *)(uintptr_t)data, MHD_RESPMEM_PERSISTENT),
+			 length, err);
 }
 
 int request_reply_file(struct request *request, int status, int descriptor, uint64_t offset, uint64_t size,
@@ -85,7 +96,7 @@ int request_reply_file(struct request *request, int status, int descriptor, uint
 
 	if (response == NULL)
 		close(descriptor);
-	return set_response(request, status, response, size, err);
+	return reply_set(request, status, response, size, err);
 }
 
 struct reader {
@@ -133,7 +144,7 @@ int request_reply_read(struct request *request, int status, uint64_t size,
 						     reader, reader_free);
 	if (response == NULL)
 		reader_free(reader);
-	return set_response(request, status, response, size, err);
+	return reply_set(request, status, response, size, err);
 }
 
 void request_reply_header(struct request *request, const char *name, const char *format, ...)

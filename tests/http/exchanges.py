@@ -3,9 +3,9 @@
 
 Usage: exchanges.py openapi.json FILE ...
 
-A failure: a path, method, status, media type, header or query parameter that the schema does not have; a JSON body or
-event that does not fit its schema or has a member that it does not name; a request that was accepted though the
-schema forbids it. Operations that no test has exercised are reported.
+A failure: a path, method, status, media type, header or query parameter that the schema does not have; a header that
+comes twice; a JSON body or event that does not fit its schema or has a member that it does not name; a request that was
+accepted though the schema forbids it. Operations that no test has exercised are reported.
 """
 import collections
 import json
@@ -26,10 +26,9 @@ class Exchange:
     def __init__(self, line: str) -> None:
         self.method, self.target, status, headers, self.sent, self.body = line.rstrip("\n").split("\t", 5)
         self.status = int(status)
-        self.headers = {
-            name.strip().lower(): value.strip()
-            for name, _, value in (field.partition(":") for field in headers.split("\x1f") if field)
-        }
+        fields = [(name.strip().lower(), value.strip()) for name, _, value in (field.partition(":") for field in headers.split("\x1f") if field)]
+        self.headers = dict(fields)
+        self.doubled = {name for name, count in collections.Counter(name for name, _ in fields).items() if count > 1}
         self.media_type = self.headers.get("content-type", "").partition(";")[0].strip()
         url = urllib.parse.urlsplit(self.target)
         self.path = url.path
@@ -150,6 +149,8 @@ class Judge:
         for name, header in response.get("headers", {}).items():
             if self.document.deref(header).get("required") and name.lower() not in exchange.headers:
                 yield f"no {name} header"
+        for name in exchange.doubled - {"set-cookie"}:
+            yield f"the header {name} comes twice"
         if not exchange.has_body:
             return
         if exchange.media_type not in content:

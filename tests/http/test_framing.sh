@@ -9,6 +9,11 @@ test_malformed_requests_are_refused_with_a_problem() { raw malformed; }
 test_what_is_well_formed_is_understood() { raw fine; }
 test_no_request_is_smuggled_in_another() { raw smuggling; }
 test_requests_back_to_back_cut_anywhere() { raw pipelining; }
+test_replies_without_a_body_end_with_their_head() {
+	cbct simulate -o "$work/scan" --phantom ball --views 20 --columns 16 --rows 16 --pixel 12 >/dev/null
+	reconstruct "$work/scan" '{"scan": "SCAN", "grid": {"size": [12, 12, 12], "spacing_mm": [8, 8, 8]}, "fdk": {}}'
+	raw bodiless "$scan" "$job"
+}
 test_bad_requests_leave_nothing_behind() {
 	# a sanitizer keeps what is freed for a while
 	[ "${SANITIZED:-0}" = 0 ] || skip "memory is not counted under a sanitizer"
