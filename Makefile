@@ -50,6 +50,12 @@ files_libs  := expat libtiff-4
 cbct_libs   := libcurl $(files_libs)
 # cbct-dicom, which sends volumes to archives.
 dicom_libs  := libcurl
+# Its C-STORE, worklist and listener, by DCMTK, are built where libdcmtk-dev is found (its .pc asks for more than there is).
+CXX_DCMTK   := $(shell $(CXX) -x c++ -E -include dcmtk/config/osconfig.h /dev/null >/dev/null 2>&1 && echo 1)
+ifeq ($(CXX_DCMTK),1)
+dcmtk_objects = $(patsubst %.cc,$(BUILD)/%.o,$(wildcard daemon/dicom/*.cc))
+dcmtk_libs   := -ldcmnet -ldcmdata -loflog -lofstd -lstdc++
+endif
 all_libs    := $(core_libs) $(proto_libs) $(daemon_libs) $(cbct_libs)
 
 pkg = $(shell pkg-config $(1) $(2) 2>/dev/null)
@@ -62,6 +68,8 @@ pkg_cflags := $(call pkg,--cflags,$(all_libs))
 override CFLAGS += -std=c11 -D_GNU_SOURCE -I. $(WARN) $(or $(OPENMP),-Wno-unknown-pragmas) -fno-math-errno \
                    -fno-trapping-math -MMD -MP $(pkg_cflags) -ffile-prefix-map=$(CURDIR)=. \
                    $(if $(SANITIZE),-fsanitize=$(SANITIZE) -fno-omit-frame-pointer)
+cxx_flags     = -O2 -g -std=c++17 -I. $(WARN) -MMD -MP -ffile-prefix-map=$(CURDIR)=. \
+                $(if $(SANITIZE),-fsanitize=$(SANITIZE) -fno-omit-frame-pointer)
 bundle_flags := -Wl,--disable-new-dtags,-rpath,'$$ORIGIN/../lib'
 override LDFLAGS += $(if $(BUNDLE),$(bundle_flags)) $(OPENMP) $(if $(SANITIZE),-fsanitize=$(SANITIZE))
 LIBM := -lm -lpthread
@@ -105,6 +113,10 @@ all: $(programs) ## the programs, in build/
 $(BUILD)/%.o: %.c
 	@mkdir -p $(@D)
 	$(call say,CC  )$(CC) $(CFLAGS) -c -o $@ $<
+
+$(BUILD)/%.o: %.cc
+	@mkdir -p $(@D)
+	$(call say,CXX )$(CXX) $(cxx_flags) -c -o $@ $<
 
 define simd_rule
 $(BUILD)/%.$(1).o: %.c
@@ -154,8 +166,8 @@ $(BUILD)/cbctd: $(call objects,$(daemon_sources)) $(BUILD)/proto/openapi.o $(BUI
 $(BUILD)/cbct-worker: $(call objects,daemon/worker.c) $(library) $(cuda_objects)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(if $(cuda_objects),$(cuda_libs)) $(LIBM)
 
-$(BUILD)/cbct-dicom: $(call objects,$(dicom_sources)) $(library)
-	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(dicom_libs) $(proto_libs) $(core_libs)) $(LIBM)
+$(BUILD)/cbct-dicom: $(call objects,$(dicom_sources)) $(dcmtk_objects) $(library)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(dicom_libs) $(proto_libs) $(core_libs)) $(dcmtk_libs) $(LIBM)
 
 $(BUILD)/cbct: $(call objects,$(cbct_sources)) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(cbct_libs) $(proto_libs) $(core_libs)) $(LIBM)
@@ -228,7 +240,7 @@ $(BUILD)/gpu_ceilings: tests/bench/gpu_ceilings.cu
 apt_install = { $$run apt-get install -y -qq --no-install-recommends $(1) >/dev/null 2>&1 || \
 	  { $$run apt-get update -qq && DEBIAN_FRONTEND=noninteractive $$run apt-get install -y -qq --no-install-recommends $(1) >/dev/null; }; }
 
-check: OPTIONAL += chromium:chromium dciodvfy:dicom3tools Orthanc:orthanc-dicomweb promtool:prometheus systemd-analyze:systemd
+check: OPTIONAL += g++:g++ /usr/include/dcmtk/dcmnet/scu.h:libdcmtk-dev chromium:chromium dciodvfy:dicom3tools Orthanc:orthanc-dicomweb promtool:prometheus systemd-analyze:systemd
 check: MODULES += nibabel:python3-nibabel pydicom:python3-pydicom gdcm:python3-gdcm
 setup: ## install the Debian packages that are missing
 	@missing=""; \
@@ -241,7 +253,7 @@ setup: ## install the Debian packages that are missing
 	if [ "$$(id -u)" != 0 ] && ! sudo -n true 2>/dev/null; then \
 		echo "please type:  sudo apt-get install -y --no-install-recommends$$missing" >&2; exit 1; fi; \
 	$(call apt_install,$$missing)
-	@wanted=""; for pair in $(OPTIONAL); do command -v $${pair%%:*} >/dev/null 2>&1 || wanted="$$wanted $${pair##*:}"; done; \
+	@wanted=""; for pair in $(OPTIONAL); do command -v $${pair%%:*} >/dev/null 2>&1 || [ -e $${pair%%:*} ] || wanted="$$wanted $${pair##*:}"; done; \
 	[ -z "$$wanted" ] && exit 0; \
 	run=""; [ "$$(id -u)" = 0 ] || run="sudo -n"; \
 	echo "installing:$$wanted"; \

@@ -727,6 +727,16 @@ void json_bool(struct json_reader *reader, const char *name, bool required, bool
 		json_fail(reader, ERR_INVALID, name, "%s, true or false is expected", type_name(member));
 }
 
+bool utf8_valid(const char *text)
+{
+	size_t left = strlen(text), size;
+
+	for (; left > 0; text += size, left -= size)
+		if ((size = utf8_sequence(text, left)) == 0)
+			return false;
+	return true;
+}
+
 size_t utf8_length(const char *text)
 {
 	size_t length = 0;

@@ -73,6 +73,7 @@ enum { UTF8_BYTES_MOST = 4 }; /* of a character */
 #define TEXT_BYTES(most) (UTF8_BYTES_MOST * (most) + 1)
 /* Whether valid UTF-8 has a control character: up to U+001F, or U+007F .. U+009F. */
 bool has_control(const char *text);
+bool utf8_valid(const char *text);
 /* Characters of Unicode, as JSON Schema counts them, in valid UTF-8. */
 size_t utf8_length(const char *text);
 /* Reads one of `names` (`count` entries) as its index. */

@@ -22,6 +22,7 @@ static const struct command *const commands[] = {
     &command_pin,      &command_unpin,   &command_limits,          &command_parameters,   &command_calibrate,
     &command_token,    &command_audit,   &command_calibrate_scan,  &command_calibrations, &command_doctor,
     &command_backup,   &command_restore, &command_reproduce,       &command_send,         &command_destinations,
+    &command_worklist,
 };
 enum { COMMAND_COUNT = sizeof(commands) / sizeof(commands[0]) };
 

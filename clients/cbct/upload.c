@@ -21,6 +21,7 @@
 #include "clients/cbct/same_scan.h"
 #include "clients/cbct/upload.h"
 #include "clients/cbct/warning.h"
+#include "clients/cbct/worklist.h"
 #include "proto/scan_directory.h"
 #include "proto/zstream.h"
 
@@ -38,6 +39,9 @@ struct upload_options {
 		name, 0, kind, offsetof(struct upload_settings, member), argument, help, least, most, 0, NULL          \
 	}
 const struct option upload_rows[] = {
+    ROW("worklist", OPTION_TEXT, worklist, "STEP", "patient and study of this step of the worklist (cbct worklist)", 0,
+	0),
+    ROW("key", OPTION_TEXT, key, "TEXT", "another upload with the same key is the same scan", 0, 0),
     ROW("connections", OPTION_INTEGER, connections, "N", "at once", 1, CONNECTIONS_MAX),
     ROW("run", OPTION_INTEGER, run, "N", "projections in one request (default: about 4 MB)", 1, VIEWS_MAX),
     ROW("zstd", OPTION_FLAG, zstd, NULL, "compress on the way", 0, 0),
@@ -276,8 +280,15 @@ static int begin(struct http *http, struct upload *upload, const struct scan *sc
 	if (given != NULL) {
 		snprintf(path, sizeof(path), "/v1/scans/%.63s", given);
 		code = http_json(http, "GET", path, &document, err);
+	} else if (upload->options->worklist != NULL) {
+		cJSON *posted = cJSON_Duplicate(scan->document, true);
+
+		code = worklist_apply(http, upload->options->worklist, posted, err);
+		if (code == 0)
+			code = http_post(http, "/v1/scans", posted, upload->options->key, &document, err);
+		cJSON_Delete(posted);
 	} else {
-		code = http_post(http, "/v1/scans", scan->document, NULL, &document, err);
+		code = http_post(http, "/v1/scans", scan->document, upload->options->key, &document, err);
 	}
 	if (code != 0)
 		return code;

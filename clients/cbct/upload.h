@@ -5,12 +5,14 @@
 
 /* How a scan directory goes to the daemon. */
 struct upload_settings {
-	const char *scan; /* go on with this one; NULL: a new one */
+	const char *scan;     /* go on with this one; NULL: a new one */
+	const char *key;      /* the new one's Idempotency-Key; NULL: none */
+	const char *worklist; /* the step of the worklist that patient and study come from; NULL: the scan's own */
 	long connections, run;
 	bool zstd, quiet;
 	struct http_options http;
 };
-extern const struct option upload_rows[]; /* connections, run, zstd, quiet */
+extern const struct option upload_rows[]; /* all others */
 #define UPLOAD_DEFAULTS                                                                                                \
 	{                                                                                                              \
 		.connections = 4, .run = OPTION_UNSET_INTEGER                                                          \

@@ -65,6 +65,7 @@ const struct route api_routes[] = {
     {"PUT", "/v1/jobs/{}/annotations", ROLE_ACQUIRE, annotations_put, BODY_WHOLE, ANNOTATIONS_BYTES_MAX, NULL, NULL,
      NULL},
     {"GET", "/v1/destinations", ROLE_VIEW, destination_list, BODY_NONE, 0, NULL, NULL, "wait"},
+    {"GET", "/v1/worklist", ROLE_ACQUIRE, worklist_get, BODY_NONE, 0, NULL, NULL, "wait"},
     {"GET", "/v1/jobs/{}/send", ROLE_VIEW, send_get, BODY_NONE, 0, NULL, NULL, NULL},
     {"POST", "/v1/jobs/{}/send", ROLE_ACQUIRE, send_post, BODY_WHOLE, JSON_BYTES_MAX, NULL, NULL, NULL},
     {"DELETE", "/v1/jobs/{}/send/{}", ROLE_ACQUIRE, send_delete, BODY_NONE, 0, NULL, NULL, NULL},

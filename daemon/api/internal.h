@@ -44,6 +44,7 @@ int job_get(void *context, struct request *request, struct error *err);
 int job_delete(void *context, struct request *request, struct error *err);
 
 int destination_list(void *context, struct request *request, struct error *err);
+int worklist_get(void *context, struct request *request, struct error *err);
 int send_post(void *context, struct request *request, struct error *err);
 int send_get(void *context, struct request *request, struct error *err);
 int send_delete(void *context, struct request *request, struct error *err);

@@ -1,10 +1,12 @@
-/* /v1/destinations and /v1/jobs/{}/send: volumes to archives. */
+/* /v1/destinations, /v1/worklist and /v1/jobs/{}/send: volumes to archives. */
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
 #include "daemon/api/internal.h"
 #include "proto/json.h"
+
+enum { WORKLIST_WAIT = 15 /* s, unless the request says otherwise */ };
 
 int send_resolve(struct api *api, struct job_request *wanted, struct error *err)
 {
@@ -51,6 +53,24 @@ int destination_list(void *context, struct request *request, struct error *err)
 	if (destinations_asked(api->sendings) && wait_goes_on(request))
 		return HTTP_WAIT;
 	return request_reply_json(request, 200, destinations_document(api->sendings), err);
+}
+
+/* Asks it anew, and replies what it has told last where it does not answer in time. */
+int worklist_get(void *context, struct request *request, struct error *err)
+{
+	static const struct wait_kind kind = {watch_destinations, leave_destinations};
+	struct api *api = context;
+	double seconds;
+
+	if (request_state(request) == NULL) {
+		if (wait_read(api, request, WORKLIST_WAIT, &seconds, err) != 0 || worklist_ask(api->sendings, err) != 0)
+			return err->code;
+		if (wait_begin(request, &kind, api->sendings, seconds, err) != 0)
+			return err->code;
+	}
+	if (worklist_asked(api->sendings) && wait_goes_on(request))
+		return HTTP_WAIT;
+	return request_reply_json(request, 200, worklist_document(api->sendings), err);
 }
 
 /* ---- a job's sendings ---- */

@@ -8,6 +8,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/socket.h>
+#include <sys/time.h>
 #include <unistd.h>
 
 #include "daemon/dicom/dicom.h"
@@ -15,7 +16,7 @@
 
 enum { DAEMON = 3 /* descriptor */, TASK_MOST = 1 << 20, READINGS = 4 };
 
-static const struct archive *const archives[] = {&archive_web};
+static const struct archive *const archives[] = {&archive_web, &archive_network};
 
 const char *destination_text(const cJSON *destination, const char *name)
 {
@@ -24,9 +25,23 @@ const char *destination_text(const cJSON *destination, const char *name)
 	return cJSON_IsString(member) ? member->valuestring : "";
 }
 
+double destination_number(const cJSON *destination, const char *name, double otherwise)
+{
+	const cJSON *member = cJSON_GetObjectItemCaseSensitive(destination, name);
+
+	return cJSON_IsNumber(member) ? member->valuedouble : otherwise;
+}
+
+double destination_patience(const cJSON *destination, double bytes)
+{
+	const double least_rate = 32768; /* bytes/s */
+
+	return destination_number(destination, "timeout_s", 60) + bytes / least_rate;
+}
+
 /* ---- the daemon ---- */
 
-static void tell(cJSON *value)
+void tell(cJSON *value)
 {
 	char *text = json_print(value, NULL), *line = NULL;
 
@@ -46,6 +61,32 @@ void report_progress(int count)
 
 	cJSON_AddNumberToObject(value, "stored", atomic_fetch_add(&acknowledged, count) + count);
 	tell(value);
+}
+
+void report_transaction(const char *uid)
+{
+	cJSON *value = cJSON_CreateObject();
+
+	cJSON_AddStringToObject(value, "transaction", uid);
+	tell(value);
+}
+
+/* Nothing but what a signal's handler may call. */
+static void give_up(int number)
+{
+	static const char line[] = "{\"end\": \"failed\", \"reachable\": false, \"permanent\": false, "
+				   "\"error\": \"it answers too slowly\"}\n";
+
+	(void)number;
+	send(DAEMON, line, sizeof(line) - 1, MSG_NOSIGNAL);
+	_exit(1);
+}
+
+void patience(double seconds)
+{
+	const struct itimerval timer = {.it_value = {.tv_sec = (time_t)seconds + 1}};
+
+	setitimer(ITIMER_REAL, &timer, NULL);
 }
 
 static cJSON *read_task(struct error *err)
@@ -103,19 +144,37 @@ static int read_back(const struct archive *archive, const cJSON *destination, st
 			       objects_stored(objects), objects->count);
 }
 
-static int send_volume(const struct archive *archive, const cJSON *destination, struct objects *objects,
-		       bool *ret_committed, struct error *err)
+/* An archive that cannot be asked gives its word, or is taken at it. */
+static int prove(const cJSON *destination, enum promise promise, struct error *err)
+{
+	if (promise != PROMISE_UNKNOWN || cJSON_IsTrue(cJSON_GetObjectItemCaseSensitive(destination, "unproven")))
+		return 0;
+	return error_set(
+	    err, ERR_IO,
+	    "it acknowledged all objects, and knows neither C-FIND nor storage commitment: whether it keeps "
+	    "them cannot be seen (\"unproven\": true takes its word)");
+}
+
+/* again: what it says it has is sent, too, since it would not promise to keep it. */
+static int send_volume(const struct archive *archive, const cJSON *destination, struct objects *objects, bool again,
+		       enum promise *ret_promise, struct error *err)
 {
 	int code = archive->find(destination, objects, err);
+	const bool answers = code != ERR_NOT_FOUND;
 
+	code = answers ? code : 0;
+	for (int i = 0; i < objects->count && again; i++)
+		objects->list[i].stored = false;
 	if (code == 0 && objects_stored(objects) < objects->count) {
 		code = archive->store(destination, objects, err);
-		if (code == 0)
+		if (code == 0 && answers)
 			code = read_back(archive, destination, objects, err);
 	}
+	for (int i = 0; i < objects->count && code == 0 && !answers; i++)
+		objects->list[i].stored = true;
 	if (code == 0 && archive->commit != NULL)
-		code = archive->commit(destination, objects, ret_committed, err);
-	return code;
+		code = archive->commit(destination, objects, ret_promise, err);
+	return code == 0 && !answers ? prove(destination, *ret_promise, err) : code;
 }
 
 /* What no later attempt would change. */
@@ -124,11 +183,15 @@ static bool is_permanent(int code)
 	return code == ERR_CONFLICT || code == ERR_DAMAGED || code == ERR_IMPOSSIBLE;
 }
 
-static void finish(int code, bool asked, bool committed, const struct objects *objects, const struct error *err)
+static void finish(int code, bool asked, enum promise promise, const struct objects *objects, const struct error *err)
 {
 	cJSON *end = cJSON_CreateObject();
 
-	cJSON_AddStringToObject(end, "end", code != 0 ? "failed" : committed ? "committed" : "sent");
+	cJSON_AddStringToObject(end, "end",
+				code != 0                  ? "failed"
+				: promise == PROMISE_GIVEN ? "committed"
+				: promise == PROMISE_ASKED ? "asked"
+							   : "sent");
 	cJSON_AddBoolToObject(end, "reachable", asked ? code == 0 : code != ERR_BUSY);
 	cJSON_AddBoolToObject(end, "permanent", is_permanent(code));
 	cJSON_AddNumberToObject(end, "instances", objects->count);
@@ -146,29 +209,17 @@ static const struct archive *archive_of(const cJSON *destination)
 	return NULL;
 }
 
-int main(void)
+/* A destination: whether it answers, or a volume to it. */
+static void carry_out(const cJSON *task)
 {
+	const cJSON *destination = cJSON_GetObjectItemCaseSensitive(task, "destination");
+	const struct archive *archive = archive_of(destination);
+	const bool asks = !cJSON_HasObjectItem(task, "job"), again = cJSON_HasObjectItem(task, "again");
+	enum promise promise = PROMISE_UNKNOWN;
 	struct objects objects = {.file = -1};
-	const struct archive *archive;
-	const cJSON *destination;
 	struct error err = {0};
-	bool committed = false, asks;
-	pthread_t watcher;
-	cJSON *task;
 	int code;
 
-	signal(SIGPIPE, SIG_IGN);
-	task = read_task(&err);
-	if (task == NULL) {
-		fprintf(stderr, "cbct-dicom: %s\n", err.text);
-		return 2;
-	}
-	curl_global_init(CURL_GLOBAL_DEFAULT);
-	if (pthread_create(&watcher, NULL, watch_daemon, NULL) != 0)
-		return 1;
-	destination = cJSON_GetObjectItemCaseSensitive(task, "destination");
-	archive = archive_of(destination);
-	asks = !cJSON_HasObjectItem(task, "job");
 	if (archive == NULL)
 		code = error_set(&err, ERR_IMPOSSIBLE, "there is no such kind of destination");
 	else if (asks)
@@ -176,9 +227,38 @@ int main(void)
 	else
 		code = objects_open(task, &objects, &err);
 	if (archive != NULL && !asks && code == 0)
-		code = send_volume(archive, destination, &objects, &committed, &err);
-	finish(code, asks, committed, &objects, &err);
+		code = send_volume(archive, destination, &objects, again, &promise, &err);
+	finish(code, asks, promise, &objects, &err);
 	objects_close(&objects);
+}
+
+int main(void)
+{
+	const cJSON *worklist, *listening;
+	struct objects none = {.file = -1};
+	struct error err = {0};
+	pthread_t watcher;
+	cJSON *task;
+
+	signal(SIGPIPE, SIG_IGN);
+	signal(SIGALRM, give_up);
+	task = read_task(&err);
+	if (task == NULL) {
+		fprintf(stderr, "cbct-dicom: %s\n", err.text);
+		return 2;
+	}
+	curl_global_init(CURL_GLOBAL_DEFAULT);
+	worklist = cJSON_GetObjectItemCaseSensitive(task, "worklist");
+	listening = cJSON_GetObjectItemCaseSensitive(task, "listen");
+	/* The listener forks, and watches the daemon itself. */
+	if (listening != NULL)
+		finish(listener_run(listening, &err), true, PROMISE_UNKNOWN, &none, &err);
+	else if (pthread_create(&watcher, NULL, watch_daemon, NULL) != 0)
+		return 1;
+	else if (worklist != NULL)
+		finish(worklist_ask(worklist, &err), true, PROMISE_UNKNOWN, &none, &err);
+	else
+		carry_out(task);
 	cJSON_Delete(task);
 	/* The thread that watches the daemon is not waited for. */
 	_exit(0);

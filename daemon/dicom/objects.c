@@ -36,6 +36,7 @@ static int read_task(const cJSON *task, struct objects *objects, char ret_path[1
 	json_begin(&reader, task, "", err);
 	json_member(&reader, "destination", true);
 	json_member(&reader, "subject", false);
+	json_member(&reader, "again", false);
 	json_member(&reader, "scan", true);
 	json_string(&reader, "job", true, ret_job, 64);
 	json_string(&reader, "path", true, ret_path, 1024);
@@ -184,4 +185,44 @@ void objects_mark(struct objects *objects, const char *instance)
 	for (int i = 0; i < objects->count; i++)
 		if (strcmp(objects->list[i].head.instance, instance) == 0)
 			objects->list[i].stored = true;
+}
+
+/* ---- objects that several threads send ---- */
+
+int load_next(struct load *load)
+{
+	int place;
+
+	pthread_mutex_lock(&load->lock);
+	while (load->next < load->objects->count && load->objects->list[load->next].stored)
+		load->next++;
+	place = load->error.code == 0 && load->next < load->objects->count ? load->next++ : -1;
+	pthread_mutex_unlock(&load->lock);
+	return place;
+}
+
+void load_fail(struct load *load, const struct error *err)
+{
+	pthread_mutex_lock(&load->lock);
+	if (load->error.code == 0)
+		load->error = *err;
+	pthread_mutex_unlock(&load->lock);
+}
+
+int load_run(const cJSON *destination, const struct objects *objects, int threads, void *(*work)(void *load),
+	     struct error *err)
+{
+	struct load load = {.destination = destination, .objects = objects, .lock = PTHREAD_MUTEX_INITIALIZER};
+	pthread_t others[8];
+	int count = 0;
+
+	while (count < threads - 1 && count < 8 && pthread_create(&others[count], NULL, work, &load) == 0)
+		count++;
+	work(&load);
+	for (int i = 0; i < count; i++)
+		pthread_join(others[i], NULL);
+	pthread_mutex_destroy(&load.lock);
+	if (load.error.code != 0)
+		*err = load.error;
+	return load.error.code;
 }

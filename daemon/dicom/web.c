@@ -3,7 +3,7 @@
  * (10.6). There is no storage commitment in DICOMweb.
  */
 #include <curl/curl.h>
-#include <pthread.h>
+#include <math.h>
 #include <stdarg.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -18,8 +18,7 @@ enum {
 	REPLY_MOST = 64 << 20,
 	TOKEN_MOST = 1 << 14,
 	PAGE = 1000, /* instances asked for at a time */
-	CONNECT_SECONDS = 10,
-	SILENT_SECONDS = 60
+	CONNECT_SECONDS = 10
 };
 static const char boundary[] = "cbctd-7f1c0b1e9d5a4c6f8e2b3a4d5c6e7f80";
 
@@ -77,8 +76,6 @@ static CURL *open_connection(const cJSON *destination)
 		return NULL;
 	curl_easy_setopt(curl, CURLOPT_NOSIGNAL, 1L);
 	curl_easy_setopt(curl, CURLOPT_CONNECTTIMEOUT, (long)CONNECT_SECONDS);
-	curl_easy_setopt(curl, CURLOPT_LOW_SPEED_LIMIT, 1L);
-	curl_easy_setopt(curl, CURLOPT_LOW_SPEED_TIME, (long)SILENT_SECONDS);
 	/* A token goes to the archive alone. */
 	curl_easy_setopt(curl, CURLOPT_FOLLOWLOCATION, 0L);
 	if (authority[0] != '\0')
@@ -109,6 +106,9 @@ static int exchange(CURL *curl, const cJSON *destination, const char *url, const
 	}
 	if (code == 0) {
 		curl_easy_setopt(curl, CURLOPT_URL, url);
+		/* Of the whole exchange: an answer may come a byte at a time. */
+		curl_easy_setopt(curl, CURLOPT_TIMEOUT,
+				 (long)ceil(destination_patience(destination, body != NULL ? (double)body->size : 0)));
 		curl_easy_setopt(curl, CURLOPT_HTTPHEADER, headers);
 		curl_easy_setopt(curl, CURLOPT_WRITEFUNCTION, take);
 		curl_easy_setopt(curl, CURLOPT_WRITEDATA, ret_reply);
@@ -227,14 +227,6 @@ static int web_find(const cJSON *destination, struct objects *objects, struct er
 
 /* ---- sending ---- */
 
-struct load {
-	const cJSON *destination;
-	const struct objects *objects;
-	pthread_mutex_t lock; /* guards the next two */
-	int next;             /* object that nobody has taken yet */
-	struct error error;   /* the first */
-};
-
 static bool put(struct reply *body, const void *bytes, size_t size)
 {
 	return take((char *)(uintptr_t)bytes, 1, size, body) == size;
@@ -266,11 +258,7 @@ static int fill(struct load *load, struct reply *body, int *ret_count, struct er
 	body->size = 0;
 	*ret_count = 0;
 	while (code == 0 && (body->size == 0 || body->size + body->size / (size_t)*ret_count < BATCH_BYTES)) {
-		pthread_mutex_lock(&load->lock);
-		while (load->next < load->objects->count && load->objects->list[load->next].stored)
-			load->next++;
-		place = load->error.code == 0 && load->next < load->objects->count ? load->next++ : -1;
-		pthread_mutex_unlock(&load->lock);
+		place = load_next(load);
 		if (place < 0)
 			break;
 		code = add_part(body, load->objects, place, err);
@@ -321,12 +309,8 @@ static void *send_some(void *context)
 		if (code == 0)
 			report_progress(count);
 	}
-	if (code != 0) {
-		pthread_mutex_lock(&load->lock);
-		if (load->error.code == 0)
-			load->error = err;
-		pthread_mutex_unlock(&load->lock);
-	}
+	if (code != 0)
+		load_fail(load, &err);
 	free(body.bytes);
 	if (curl != NULL)
 		curl_easy_cleanup(curl);
@@ -335,19 +319,7 @@ static void *send_some(void *context)
 
 static int web_store(const cJSON *destination, const struct objects *objects, struct error *err)
 {
-	struct load load = {.destination = destination, .objects = objects, .lock = PTHREAD_MUTEX_INITIALIZER};
-	pthread_t threads[CONNECTIONS];
-	int count = 0;
-
-	while (count < CONNECTIONS - 1 && pthread_create(&threads[count], NULL, send_some, &load) == 0)
-		count++;
-	send_some(&load);
-	for (int i = 0; i < count; i++)
-		pthread_join(threads[i], NULL);
-	pthread_mutex_destroy(&load.lock);
-	if (load.error.code != 0)
-		*err = load.error;
-	return load.error.code;
+	return load_run(destination, objects, CONNECTIONS, send_some, err);
 }
 
 const struct archive archive_web = {"dicomweb", web_ask, web_find, web_store, NULL};

@@ -1,6 +1,6 @@
 /*
- * Destinations: a JSON file {"destinations": [{"name": ..., "kind": "dicomweb", ...}]}. Their secrets are in
- * files of their own, which cbct-dicom alone reads.
+ * Destinations: a JSON file {"destinations": [{"name": ..., "kind": "dicomweb" | "dimse", ...}]}, with what
+ * application.c reads. Their secrets are in files of their own, which cbct-dicom alone reads.
  */
 #include <fcntl.h>
 #include <stdio.h>
@@ -13,9 +13,8 @@
 
 enum { FILE_MOST = 1 << 20, DESTINATIONS_MOST = 64 };
 
-static const char *const kind_names[DESTINATION_KIND_COUNT] = {"dicomweb"};
+static const char *const kind_names[DESTINATION_KIND_COUNT] = {"dicomweb", "dimse"};
 static const char *const objects_names[] = {"slices", "enhanced"};
-static const char *const rule_names[] = {"none", "last", "all"};
 
 void destinations_free(struct destination *destinations, int count)
 {
@@ -49,10 +48,42 @@ static void read_web(struct json_reader *reader, struct destination *ret)
 			  "a URL with a name, password or query is not taken; a token stands in token_file");
 }
 
+static void read_network(struct json_reader *reader, struct destination *ret)
+{
+	bool unproven;
+
+	application_peer(reader, ret->address, sizeof(ret->address));
+	ret->promise_seconds = 600;
+	json_number(reader, "commitment_s", false, 0, 1e6, &ret->promise_seconds);
+	json_bool(reader, "unproven", false, &unproven);
+}
+
+/* "none", "last", "all", or a list of iterations as a job's "volumes". */
+static void read_rule(struct json_reader *reader, char ret_rule[SEND_VOLUMES_SIZE])
+{
+	const cJSON *value = json_member(reader, "send", false);
+	struct send_wish wish;
+	cJSON *wanted;
+
+	ret_rule[0] = '\0';
+	if (reader->code != 0 || value == NULL || (cJSON_IsString(value) && strcmp(value->valuestring, "none") == 0))
+		return;
+	wanted = cJSON_CreateObject();
+	cJSON_AddStringToObject(wanted, "to", "rule");
+	cJSON_AddItemToObject(wanted, "volumes", cJSON_Duplicate(value, true));
+	if (send_wish_read(wanted, "", &wish, reader->err) != 0)
+		json_fail(reader, ERR_INVALID, "send",
+			  "expected \"none\", \"last\", \"all\" or a list of iterations, \"fdk\" and \"fdk-tv\"");
+	else
+		memcpy(ret_rule, wish.volumes, SEND_VOLUMES_SIZE);
+	cJSON_Delete(wanted);
+}
+
 static int read_row(const cJSON *value, int place, struct destination *ret, struct error *err)
 {
-	int kind = 0, objects = 0, rule = 0;
 	struct json_reader reader;
+	int kind = 0, objects = 0;
+	double seconds;
 	char pointer[64];
 
 	snprintf(pointer, sizeof(pointer), "/destinations/%d", place);
@@ -60,13 +91,17 @@ static int read_row(const cJSON *value, int place, struct destination *ret, stru
 	json_string(&reader, "name", true, ret->name, sizeof(ret->name));
 	json_choice(&reader, "kind", true, kind_names, DESTINATION_KIND_COUNT, &kind);
 	json_choice(&reader, "objects", false, objects_names, 2, &objects);
-	json_choice(&reader, "send", false, rule_names, 3, &rule);
+	read_rule(&reader, ret->rule);
 	if (reader.code == 0 && !destination_name_valid(ret->name))
 		json_fail(&reader, ERR_INVALID, "name", "\"%s\" is no name: letters, digits, -, _ and .", ret->name);
-	read_web(&reader, ret);
+	if (kind == DESTINATION_DIMSE) {
+		read_network(&reader, ret);
+	} else {
+		read_web(&reader, ret);
+		json_number(&reader, "timeout_s", false, 1, 3600, &seconds);
+	}
 	ret->kind = (enum destination_kind)kind;
 	ret->enhanced = objects == 1;
-	snprintf(ret->rule, sizeof(ret->rule), "%s", rule > 0 ? rule_names[rule] : "");
 	ret->wanted = true;
 	return json_end(&reader);
 }
@@ -105,7 +140,8 @@ static int read_list(const cJSON *list, struct destination **ret_destinations, i
 	return 0;
 }
 
-int destinations_read(const char *file, struct destination **ret_destinations, int *ret_count, struct error *err)
+int destinations_read(const char *file, struct destination **ret_destinations, int *ret_count,
+		      struct application *ret_application, struct error *err)
 {
 	struct json_reader reader;
 	struct error cause = {0};
@@ -117,6 +153,7 @@ int destinations_read(const char *file, struct destination **ret_destinations, i
 
 	*ret_destinations = NULL;
 	*ret_count = 0;
+	*ret_application = (struct application){.title = ""};
 	if (file[0] == '\0')
 		return 0;
 	code = file_read(file, FILE_MOST, &text, &length, &cause);
@@ -125,9 +162,12 @@ int destinations_read(const char *file, struct destination **ret_destinations, i
 	if (code == 0) {
 		json_begin(&reader, document, "", &cause);
 		list = json_member(&reader, "destinations", true);
+		application_read(&reader, ret_application);
 		code = json_end(&reader);
 		if (code == 0)
 			code = read_list(list, ret_destinations, ret_count, &cause);
+		if (code != 0)
+			application_free(ret_application);
 	}
 	free(text);
 	cJSON_Delete(document);
@@ -138,11 +178,12 @@ int destinations_read(const char *file, struct destination **ret_destinations, i
 
 void sendings_reload(struct sendings *sendings)
 {
+	struct application application, old_application;
 	struct destination *fresh, *old;
 	struct error err = {0};
 	int count, old_count;
 
-	if (destinations_read(sendings->file, &fresh, &count, &err) != 0) {
+	if (destinations_read(sendings->file, &fresh, &count, &application, &err) != 0) {
 		log_line(LEVEL_ERROR, "the destinations that were read before stay: %s", err.text);
 		return;
 	}
@@ -151,11 +192,15 @@ void sendings_reload(struct sendings *sendings)
 	old_count = sendings->destination_count;
 	sendings->destinations = fresh;
 	sendings->destination_count = count;
+	old_application = sendings->application;
+	sendings->application = application;
+	sendings->listener_stale = true;
 	/* What was changed may be the reason why something could not be sent. */
 	for (int i = 0; i < sendings->count; i++)
 		sendings->entries[i].record.next = 0;
 	pthread_mutex_unlock(&sendings->lock);
 	destinations_free(old, old_count);
+	application_free(&old_application);
 	sender_wake(sendings);
 }
 
@@ -166,7 +211,8 @@ static long unsent(const struct sendings *sendings, const char *name)
 	long count = 0;
 
 	for (int i = 0; i < sendings->count; i++)
-		count += strcmp(sendings->entries[i].record.destination, name) == 0;
+		count += strcmp(sendings->entries[i].record.destination, name) == 0 &&
+			 sendings->entries[i].record.state != SENDING_SENT;
 	return count;
 }
 
@@ -178,7 +224,8 @@ static cJSON *document_of(const struct sendings *sendings, const struct destinat
 	cJSON_AddStringToObject(document, "kind", kind_names[one->kind]);
 	cJSON_AddStringToObject(document, "address", one->address);
 	cJSON_AddStringToObject(document, "objects", objects_names[one->enhanced]);
-	cJSON_AddStringToObject(document, "send", one->rule[0] != '\0' ? one->rule : rule_names[0]);
+	cJSON_AddItemToObject(document, "send",
+			      one->rule[0] != '\0' ? send_volumes_json(one->rule) : cJSON_CreateString("none"));
 	if (one->known)
 		cJSON_AddBoolToObject(document, "reachable", one->reachable);
 	else

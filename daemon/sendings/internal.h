@@ -5,18 +5,20 @@
 
 #include "daemon/process.h"
 #include "daemon/sendings/sendings.h"
+#include "proto/json.h"
 
 /* Shared by the files of this room. */
 
-enum destination_kind { DESTINATION_DICOMWEB, DESTINATION_KIND_COUNT };
+enum destination_kind { DESTINATION_DICOMWEB, DESTINATION_DIMSE, DESTINATION_KIND_COUNT };
 
 struct destination {
 	char name[DESTINATION_NAME_SIZE];
 	enum destination_kind kind;
 	char rule[SEND_VOLUMES_SIZE]; /* volumes of jobs that say nothing; "": none */
 	bool enhanced;
-	char address[320]; /* for people: the URL */
-	cJSON *row;        /* as the file has it, for cbct-dicom; owned */
+	double promise_seconds; /* after which an unanswered request for storage commitment is made again */
+	char address[320];      /* for people: the URL, or TITLE@HOST:PORT */
+	cJSON *row;             /* as the file has it, for cbct-dicom; owned */
 	/* Whether it answers. */
 	bool wanted;           /* it is to be asked */
 	bool known, reachable; /* the last answer */
@@ -31,10 +33,18 @@ struct entry {
 	struct sending_record record;
 };
 
-enum { TRANSFERS_MOST = 4, TRANSFER_LINE_MAX = 4096 };
-/* A run of cbct-dicom; the sender's own. */
+/* Our own application entity, as the file of destinations has it. */
+enum { TITLE_SIZE = 17 };
+struct application {
+	char title[TITLE_SIZE];
+	cJSON *listen, *worklist; /* for cbct-dicom, NULL: there is none; owned */
+};
+
+enum { TRANSFERS_MOST = 4, TRANSFER_LISTENER = TRANSFERS_MOST, TRANSFER_WORKLIST, TRANSFER_COUNT };
+enum { TRANSFER_LINE_MAX = 16384 };
+/* A run of cbct-dicom; the sender's own. The first TRANSFERS_MOST send, or ask destinations. */
 struct transfer {
-	bool runs, over;
+	bool runs, over, kept; /* kept: it was promised while the process ran */
 	char destination[DESTINATION_NAME_SIZE], job[ID_SIZE], name[SENDING_NAME_SIZE]; /* job "": it only asks */
 	struct process process;
 	int socket;
@@ -42,6 +52,14 @@ struct transfer {
 	char line[TRANSFER_LINE_MAX];
 	size_t filled;
 	cJSON *result; /* the last line; NULL: none came */
+};
+
+struct worklist {
+	bool wanted;     /* it is to be asked */
+	double checked;  /* seconds since 1970, 0: never */
+	char error[320]; /* "": it has answered */
+	cJSON *steps;    /* a list; NULL: it has never answered; owned */
+	int nobodys;     /* entries whose patient could not be read */
 };
 
 struct sendings {
@@ -52,7 +70,9 @@ struct sendings {
 	int wake; /* eventfd, of the sender */
 	struct watch watch;
 	struct watch_list watchers;
-	struct transfer transfers[TRANSFERS_MOST]; /* the sender's */
+	struct transfer transfers[TRANSFER_COUNT]; /* the sender's */
+	double listen_at;                          /* clock_monotonic: when the listener may start; the sender's */
+	cJSON *steps;                              /* those of the worklist that have come so far; the sender's */
 
 	pthread_mutex_t lock; /* guards what follows; held over commits of sendings' rows: one change at a time */
 	struct destination *destinations;
@@ -61,17 +81,34 @@ struct sendings {
 	int count, space;
 	unsigned long long ended[SENDING_STATE_COUNT], attempts;
 	bool stop;
+	struct application application;
+	struct worklist worklist;
+	bool listener_stale; /* it runs with rows that are no longer in the file */
 
 	pthread_t thread;
 	bool has_thread;
 };
 
 /* ---- destinations.c ---- */
-/* The caller frees with destinations_free. */
-int destinations_read(const char *file, struct destination **ret_destinations, int *ret_count, struct error *err);
+/* The caller frees with destinations_free and application_free. */
+int destinations_read(const char *file, struct destination **ret_destinations, int *ret_count,
+		      struct application *ret_application, struct error *err);
 void destinations_free(struct destination *destinations, int count);
 /* NULL where there is none; the lock is held. */
 struct destination *destination_find(const struct sendings *sendings, const char *name);
+
+/* ---- application.c ---- */
+/* Reads the members title, listen and worklist of the file. */
+void application_read(struct json_reader *reader, struct application *ret);
+void application_free(struct application *application);
+/* A host, a port and the title of an application entity there. */
+void application_peer(struct json_reader *reader, char *ret_address, size_t size);
+/* The line that the listener or the worklist's process gets, free; NULL: there is none, or no memory. */
+char *application_task(const struct sendings *sendings, int transfer);
+/* Lines of these processes; the lock is held. */
+void application_take(struct sendings *sendings, int transfer, const cJSON *line);
+/* One of them has ended; the lock is held. */
+void application_ended(struct sendings *sendings, int transfer, const cJSON *result, const char *how);
 
 /* ---- queue.c; the lock is held ---- */
 struct entry *entry_find(struct sendings *sendings, const char *job, const char *name);
@@ -79,21 +116,25 @@ struct entry *entry_find(struct sendings *sendings, const char *job, const char 
 int entry_change(struct sendings *sendings, struct entry *entry, const struct sending_record *record,
 		 struct error *err);
 void entry_drop(struct sendings *sendings, struct entry *entry);
+/* The entry that waits for the answer to this request for storage commitment; NULL: none. */
+struct entry *entry_promised(struct sendings *sendings, const char *transaction);
 /* A waiting entry whose job has ended becomes a sending for each volume, or fails. */
 int entry_expand(struct sendings *sendings, struct entry *entry, struct job *job, struct error *err);
 int entries_load(struct sendings *sendings, struct error *err);
 
 /* ---- sender.c ---- */
 void sender_wake(struct sendings *sendings);
+/* Takes the answer to a request for storage commitment; the lock is held. */
+void sender_promised(struct sendings *sendings, const char *transaction, int kept, int refused, int reason);
 int sender_start(struct sendings *sendings, struct error *err);
 void sender_stop(struct sendings *sendings);
 
 /* ---- task.c ---- */
 /*
- * The line that cbct-dicom gets, free; job NULL: whether the destination answers. ERR_NOT_FOUND, ERR_DAMAGED: the
- * volume. The lock is held.
+ * The line that cbct-dicom gets, free; job and sending NULL: whether the destination answers. ERR_NOT_FOUND,
+ * ERR_DAMAGED: the volume. The lock is held.
  */
-int task_make(struct sendings *sendings, const struct destination *destination, struct job *job, const char *volume,
-	      char **ret_line, struct error *err);
+int task_make(struct sendings *sendings, const struct destination *destination, struct job *job,
+	      const struct sending_record *sending, char **ret_line, struct error *err);
 
 #endif

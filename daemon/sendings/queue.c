@@ -26,6 +26,14 @@ struct entry *entry_find(struct sendings *sendings, const char *job, const char 
 	return NULL;
 }
 
+struct entry *entry_promised(struct sendings *sendings, const char *transaction)
+{
+	for (int i = 0; i < sendings->count && transaction[0] != '\0'; i++)
+		if (strcmp(sendings->entries[i].record.transaction, transaction) == 0)
+			return &sendings->entries[i];
+	return NULL;
+}
+
 static int entry_add(struct sendings *sendings, const char *job, const struct sending_record *record, struct error *err)
 {
 	const int space = sendings->space == 0 ? 16 : 2 * sendings->space;
@@ -425,7 +433,8 @@ void sendings_statistics(struct sendings *sendings, struct sendings_statistics *
 		const struct sending_record *record = &sendings->entries[i].record;
 
 		ret->count[record->state]++;
-		if (record->state != SENDING_WAITING && now - record->created > ret->oldest)
+		if (record->state != SENDING_WAITING && record->state != SENDING_SENT &&
+		    now - record->created > ret->oldest)
 			ret->oldest = now - record->created;
 	}
 	memcpy(ret->ended, sendings->ended, sizeof(ret->ended));
@@ -460,7 +469,8 @@ int sendings_open(struct jobs *jobs, const struct sendings_options *options, str
 	sendings->wake = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
 	code = sendings->wake < 0 ? error_set_errno(err, errno, "eventfd") : 0;
 	if (code == 0)
-		code = destinations_read(sendings->file, &sendings->destinations, &sendings->destination_count, err);
+		code = destinations_read(sendings->file, &sendings->destinations, &sendings->destination_count,
+					 &sendings->application, err);
 	if (code == 0)
 		code = entries_load(sendings, err);
 	if (code == 0)
@@ -481,6 +491,9 @@ void sendings_close(struct sendings *sendings)
 	if (sendings->wake >= 0)
 		close(sendings->wake);
 	destinations_free(sendings->destinations, sendings->destination_count);
+	application_free(&sendings->application);
+	cJSON_Delete(sendings->worklist.steps);
+	cJSON_Delete(sendings->steps);
 	free(sendings->entries);
 	watch_list_destroy(&sendings->watchers);
 	pthread_mutex_destroy(&sendings->lock);

@@ -111,11 +111,55 @@ static void write_outcome(struct sendings *sendings, struct entry *entry, const 
 			 record->error);
 }
 
+/* The row of what was sent and may yet be promised to be kept: asked again later, until the limit. */
+static void await_promise(const struct sendings *sendings, struct sending_record *record)
+{
+	const struct destination *destination = destination_find(sendings, record->destination);
+	const double now = clock_realtime();
+
+	if (destination == NULL || (sendings->limit > 0 && now - record->created > sendings->limit))
+		return;
+	record->ended = 0;
+	record->next = now + destination->promise_seconds;
+}
+
+void sender_promised(struct sendings *sendings, const char *transaction, int kept, int refused, int reason)
+{
+	struct entry *entry = entry_promised(sendings, transaction);
+	struct sending_record record;
+	char why[160];
+
+	if (entry == NULL)
+		return;
+	record = entry->record;
+	/* Its process has not ended yet: it counts then. */
+	for (int i = 0; i < TRANSFERS_MOST; i++)
+		if (record.state == SENDING_SENDING && sendings->transfers[i].runs &&
+		    strcmp(sendings->transfers[i].job, entry->job) == 0 &&
+		    strcmp(sendings->transfers[i].name, record.name) == 0 && refused == 0)
+			sendings->transfers[i].kept = true;
+	if (record.state == SENDING_SENDING && refused == 0)
+		return;
+	snprintf(why, sizeof(why), "it promises to keep %d of %d objects, reason 0x%04x", kept, record.instances,
+		 (unsigned)reason);
+	if (record.state == SENDING_SENT && refused == 0 && kept >= record.instances) {
+		record.state = SENDING_COMMITTED;
+		record.next = 0;
+		record.ended = clock_realtime();
+	} else if (record.state == SENDING_SENT) {
+		fail_attempt(sendings, &record, false, why);
+		snprintf(record.transaction, sizeof(record.transaction), SENDING_REFUSED);
+	}
+	write_outcome(sendings, entry, &record);
+}
+
 static void settle_sending(struct sendings *sendings, const struct transfer *transfer, const char *how)
 {
 	struct entry *entry = entry_find(sendings, transfer->job, transfer->name);
 	const char *end = member_text(transfer->result, "end");
-	const bool sent = strcmp(end, "sent") == 0 || strcmp(end, "committed") == 0;
+	const bool asked = strcmp(end, "asked") == 0,
+		   committed = strcmp(end, "committed") == 0 || (asked && transfer->kept);
+	const bool sent = strcmp(end, "sent") == 0 || asked || committed;
 	struct sending_record record;
 	char why[320];
 
@@ -129,10 +173,12 @@ static void settle_sending(struct sendings *sendings, const struct transfer *tra
 	if (transfer->result == NULL)
 		snprintf(why, sizeof(why), "the process that sends ended: %s", how);
 	if (sent) {
-		record.state = strcmp(end, "committed") == 0 ? SENDING_COMMITTED : SENDING_SENT;
+		record.state = committed ? SENDING_COMMITTED : SENDING_SENT;
 		record.error[0] = '\0';
 		record.next = 0;
 		record.ended = clock_realtime();
+		if (asked && !committed)
+			await_promise(sendings, &record);
 	} else {
 		fail_attempt(sendings, &record,
 			     cJSON_IsTrue(cJSON_GetObjectItemCaseSensitive(transfer->result, "permanent")), why);
@@ -199,19 +245,43 @@ static int start_process(struct sendings *sendings, struct transfer *transfer, c
 	transfer->heard = clock_monotonic();
 	transfer->filled = 0;
 	transfer->result = NULL;
-	transfer->over = false;
+	transfer->kept = transfer->over = false;
 	transfer->runs = true;
 	return 0;
 }
 
-static void take_line(struct transfer *transfer, size_t length)
+/* A request for storage commitment goes out: its answer may come before the process ends. */
+static void note_transaction(struct sendings *sendings, const struct transfer *transfer, const char *uid)
 {
+	struct entry *entry = entry_find(sendings, transfer->job, transfer->name);
+	struct sending_record record;
+	struct error err;
+
+	if (uid[0] == '\0' || entry == NULL || entry->record.state != SENDING_SENDING)
+		return;
+	record = entry->record;
+	snprintf(record.transaction, sizeof(record.transaction), "%s", uid);
+	/* One that is not recorded is asked again. */
+	if (entry_change(sendings, entry, &record, &err) != 0)
+		log_line(LEVEL_WARNING, "job %s: a request for storage commitment cannot be recorded: %s",
+			 transfer->job, err.text);
+}
+
+static void take_line(struct sendings *sendings, struct transfer *transfer, size_t length)
+{
+	const int place = (int)(transfer - sendings->transfers);
 	cJSON *value;
 	struct error ignored;
 
 	transfer->heard = clock_monotonic();
 	if (json_parse(transfer->line, length, &value, &ignored) != 0)
 		return;
+	pthread_mutex_lock(&sendings->lock);
+	if (place >= TRANSFERS_MOST)
+		application_take(sendings, place, value);
+	else
+		note_transaction(sendings, transfer, member_text(value, "transaction"));
+	pthread_mutex_unlock(&sendings->lock);
 	if (cJSON_GetObjectItemCaseSensitive(value, "end") != NULL) {
 		cJSON_Delete(transfer->result);
 		transfer->result = value;
@@ -221,7 +291,7 @@ static void take_line(struct transfer *transfer, size_t length)
 }
 
 /* Reads what has come. */
-static void listen_to(struct transfer *transfer)
+static void listen_to(struct sendings *sendings, struct transfer *transfer)
 {
 	ssize_t got = recv(transfer->socket, transfer->line + transfer->filled,
 			   sizeof(transfer->line) - transfer->filled, MSG_DONTWAIT);
@@ -235,7 +305,7 @@ static void listen_to(struct transfer *transfer)
 	while ((end = memchr(transfer->line, '\n', transfer->filled)) != NULL) {
 		const size_t length = (size_t)(end - transfer->line);
 
-		take_line(transfer, length);
+		take_line(sendings, transfer, length);
 		transfer->filled -= length + 1;
 		memmove(transfer->line, end + 1, transfer->filled);
 	}
@@ -252,7 +322,10 @@ static void finish(struct sendings *sendings, struct transfer *transfer)
 	process_reap(&transfer->process, how, sizeof(how));
 	close(transfer->socket);
 	pthread_mutex_lock(&sendings->lock);
-	settle(sendings, transfer, how);
+	if (transfer - sendings->transfers < TRANSFERS_MOST)
+		settle(sendings, transfer, how);
+	else
+		application_ended(sendings, (int)(transfer - sendings->transfers), transfer->result, how);
 	pthread_mutex_unlock(&sendings->lock);
 	cJSON_Delete(transfer->result);
 	transfer->result = NULL;
@@ -265,7 +338,7 @@ static void finish(struct sendings *sendings, struct transfer *transfer)
 /* A clock that was set back makes nobody wait longer than a pause. */
 static bool is_due(const struct entry *entry, double now)
 {
-	return entry->record.state == SENDING_QUEUED &&
+	return (entry->record.state == SENDING_QUEUED || entry->record.state == SENDING_SENT) &&
 	       (entry->record.next <= now || entry->record.next > now + PAUSE_MOST);
 }
 
@@ -283,7 +356,7 @@ static bool run_attempt(struct sendings *sendings, const struct entry *entry, st
 		    error_set(err, ERR_NOT_FOUND, "there is no destination \"%s\" any more", entry->record.destination);
 	else if (jobs_find(sendings->jobs, entry->job, &job, err) != 0)
 		*ret_code = err->code;
-	else if (task_make(sendings, destination, job, entry->record.volume, &line, err) != 0)
+	else if (task_make(sendings, destination, job, &entry->record, &line, err) != 0)
 		*ret_code = err->code == ERR_NOT_FOUND ? ERR_DAMAGED : err->code;
 	else {
 		memcpy(transfer->destination, entry->record.destination, sizeof(transfer->destination));
@@ -386,13 +459,41 @@ static void start_asking(struct sendings *sendings)
 	}
 }
 
+/* The listener, and the worklist's process where it is asked. */
+static void start_application(struct sendings *sendings)
+{
+	for (int i = TRANSFER_LISTENER; i <= TRANSFER_WORKLIST; i++) {
+		struct transfer *transfer = &sendings->transfers[i];
+		const bool wanted =
+		    i == TRANSFER_WORKLIST ? sendings->worklist.wanted : clock_monotonic() >= sendings->listen_at;
+		char *line = wanted && !transfer->runs ? application_task(sendings, i) : NULL;
+		struct error err;
+
+		if (line == NULL)
+			continue;
+		transfer->destination[0] = transfer->job[0] = transfer->name[0] = '\0';
+		if (i == TRANSFER_WORKLIST) {
+			sendings->steps = cJSON_CreateArray();
+			sendings->worklist.nobodys = 0;
+		} else {
+			sendings->listener_stale = false;
+		}
+		if (start_process(sendings, transfer, line, &err) != 0)
+			application_ended(sendings, i, NULL, err.text);
+		free(line);
+	}
+}
+
 /* A process whose sending has ended without it: it was stopped, or its job is removed. */
 static bool is_unwanted(struct sendings *sendings, const struct transfer *transfer)
 {
 	const struct entry *entry;
+	const bool listens = transfer == &sendings->transfers[TRANSFER_LISTENER];
 
-	if (sendings->stop || clock_monotonic() - transfer->heard > SILENCE_MOST)
+	if (sendings->stop || (clock_monotonic() - transfer->heard > SILENCE_MOST && !listens))
 		return true;
+	if (listens || transfer == &sendings->transfers[TRANSFER_WORKLIST])
+		return listens && sendings->listener_stale;
 	if (transfer->job[0] == '\0')
 		return destination_find(sendings, transfer->destination) == NULL;
 	entry = entry_find(sendings, transfer->job, transfer->name);
@@ -406,16 +507,21 @@ static int look(struct sendings *sendings, bool *ret_stop)
 
 	pthread_mutex_lock(&sendings->lock);
 	review(sendings);
-	for (int i = 0; i < TRANSFERS_MOST; i++)
+	for (int i = 0; i < TRANSFER_COUNT; i++)
 		if (sendings->transfers[i].runs && is_unwanted(sendings, &sendings->transfers[i]))
 			process_kill(&sendings->transfers[i].process);
 	if (!sendings->stop) {
 		start_due(sendings);
 		start_asking(sendings);
+		start_application(sendings);
 	}
+	if (!sendings->transfers[TRANSFER_LISTENER].runs && sendings->application.listen != NULL)
+		next = fmin(next, fmax(0, sendings->listen_at - clock_monotonic()));
 	now = clock_realtime();
 	for (int i = 0; i < sendings->count; i++)
-		if (sendings->entries[i].record.state == SENDING_QUEUED && sendings->entries[i].record.next > now)
+		if ((sendings->entries[i].record.state == SENDING_QUEUED ||
+		     sendings->entries[i].record.state == SENDING_SENT) &&
+		    sendings->entries[i].record.next > now)
 			next = fmin(next, sendings->entries[i].record.next - now);
 	*ret_stop = sendings->stop;
 	pthread_mutex_unlock(&sendings->lock);
@@ -424,7 +530,7 @@ static int look(struct sendings *sendings, bool *ret_stop)
 
 static bool any_runs(const struct sendings *sendings)
 {
-	for (int i = 0; i < TRANSFERS_MOST; i++)
+	for (int i = 0; i < TRANSFER_COUNT; i++)
 		if (sendings->transfers[i].runs)
 			return true;
 	return false;
@@ -437,19 +543,19 @@ static void *sender_loop(void *context)
 
 	jobs_watch(sendings->jobs, &sendings->watch);
 	for (;;) {
-		struct pollfd fds[1 + TRANSFERS_MOST] = {{.fd = sendings->wake, .events = POLLIN}};
+		struct pollfd fds[1 + TRANSFER_COUNT] = {{.fd = sendings->wake, .events = POLLIN}};
 		const int wait = look(sendings, &stop);
 
 		if (stop && !any_runs(sendings))
 			break;
-		for (int i = 0; i < TRANSFERS_MOST; i++)
+		for (int i = 0; i < TRANSFER_COUNT; i++)
 			fds[1 + i] = (struct pollfd){
 			    .fd = sendings->transfers[i].runs ? sendings->transfers[i].socket : -1, .events = POLLIN};
-		poll(fds, 1 + TRANSFERS_MOST, wait);
+		poll(fds, 1 + TRANSFER_COUNT, wait);
 		drain(sendings);
-		for (int i = 0; i < TRANSFERS_MOST; i++) {
+		for (int i = 0; i < TRANSFER_COUNT; i++) {
 			if (fds[1 + i].revents != 0)
-				listen_to(&sendings->transfers[i]);
+				listen_to(sendings, &sendings->transfers[i]);
 			if (sendings->transfers[i].runs && sendings->transfers[i].over)
 				finish(sendings, &sendings->transfers[i]);
 		}

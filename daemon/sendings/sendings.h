@@ -17,6 +17,10 @@
  * from `pause` to a quarter of an hour, until `limit` is over. Objects have the same UIDs in every attempt, and those
  * that the destination has already are not sent again.
  *
+ * Where the destination knows storage commitment, it is then asked to keep the objects. Its answer comes to the
+ * listener, a cbct-dicom process that takes what peers send: the volume is committed, or sent again. Without an answer
+ * the request is made again.
+ *
  * Destinations are read from a JSON file, at the start and by sendings_reload.
  *
  * Threads: any, but sendings_open and sendings_close once each.
@@ -65,6 +69,14 @@ bool destinations_asked(struct sendings *sendings);
 /* Woken when one has answered, or could not. */
 void destinations_watch(struct sendings *sendings, struct watch *watch);
 void destinations_unwatch(struct sendings *sendings, struct watch *watch);
+
+/* ---- the modality worklist ---- */
+/* Has it asked. ERR_NOT_FOUND: there is none. */
+int worklist_ask(struct sendings *sendings, struct error *err);
+/* True while it is still to be asked; destinations_watch's watchers are woken by its answer, too. */
+bool worklist_asked(struct sendings *sendings);
+/* {"steps": [...], ...} as it was told last. NULL: no memory. */
+cJSON *worklist_document(struct sendings *sendings);
 
 struct sendings_statistics {
 	long count[SENDING_STATE_COUNT];               /* of those that have not ended */

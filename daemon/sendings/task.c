@@ -61,16 +61,22 @@ static int add_volume(struct sendings *sendings, cJSON *task, struct job *job, c
 	return 0;
 }
 
-int task_make(struct sendings *sendings, const struct destination *destination, struct job *job, const char *volume,
-	      char **ret_line, struct error *err)
+int task_make(struct sendings *sendings, const struct destination *destination, struct job *job,
+	      const struct sending_record *sending, char **ret_line, struct error *err)
 {
-	cJSON *task = cJSON_CreateObject();
+	cJSON *task = cJSON_CreateObject(), *row;
 	char *text = NULL, *line;
 	int code = 0;
 
-	cJSON_AddItemToObject(task, "destination", cJSON_Duplicate(destination->row, true));
-	if (job != NULL)
-		code = add_volume(sendings, task, job, volume, err);
+	row = cJSON_AddItemToObject(task, "destination", cJSON_Duplicate(destination->row, true))
+		  ? cJSON_GetObjectItemCaseSensitive(task, "destination")
+		  : NULL;
+	cJSON_AddStringToObject(row, "own_title", sendings->application.title);
+	if (sending != NULL)
+		code = add_volume(sendings, task, job, sending->volume, err);
+	/* What it would not promise to keep is sent again. */
+	if (sending != NULL && strcmp(sending->transaction, SENDING_REFUSED) == 0)
+		cJSON_AddTrueToObject(task, "again");
 	if (code == 0)
 		text = json_print(task, NULL);
 	cJSON_Delete(task);

@@ -419,7 +419,8 @@ struct warning_record {
 /*
  * A volume that goes, went, or is to go to a destination. WAITING: the job has not ended, nobody knows yet which
  * volumes there will be. QUEUED: its turn, or the next try, is to come. SENT: the destination has been read back, and
- * has all of it. COMMITTED: it has also promised to keep it. STOPPED: a client has ended it.
+ * has all of it; while it has not ended, an answer to a request for storage commitment is to come. COMMITTED: it has
+ * also promised to keep it. STOPPED: a client has ended it.
  */
 enum sending_state {
 	SENDING_WAITING,
@@ -446,7 +447,9 @@ struct sending_record {
 	double created;        /* seconds since 1970, as the next two: asked for, the last time */
 	double next;           /* the next attempt; 0: none is to come, or at once */
 	double ended;          /* 0: it has not */
+	char transaction[65];  /* UID of the last request for storage commitment; SENDING_REFUSED: its answer was no */
 };
+#define SENDING_REFUSED "refused"
 
 /* An entry of a job's events: numbers grow, are never used twice, and are what Last-Event-ID holds. */
 struct event_record {

@@ -168,6 +168,7 @@ static const struct column sending_columns[] = {
     {"created", COLUMN_REAL, AT(sending_record, created)},
     {"next", COLUMN_REAL, AT(sending_record, next)},
     {"ended", COLUMN_REAL, AT(sending_record, ended)},
+    {"transaction_uid", COLUMN_TEXT, AT(sending_record, transaction), .initial = ""},
 };
 
 static const struct column event_columns[] = {

@@ -13,9 +13,11 @@ start_archive() {
 	local i
 	mkdir -p "$work/archive"
 	[ -n "${web:-}" ] || read -r web dimse commit < <("$python" "$top/tests/http/send.py" ports 3)
-	jq -n --arg plugin "$plugin" --arg work "$work/archive" --argjson web "$web" --argjson dimse "$dimse" --argjson commit "$commit" '{
+	mkdir -p "$work/worklist"
+	jq -n --arg plugin "$plugin" --arg worklists "${plugin%/*}/libModalityWorklists.so" --arg worklist "$work/worklist" --arg work "$work/archive" --argjson web "$web" --argjson dimse "$dimse" --argjson commit "$commit" '{
 		Name: "ARCHIVE", DicomAet: "ARCHIVE", DicomCheckCalledAet: true, DicomPort: $dimse, HttpPort: $web, HttpBindAddresses: ["127.0.0.1"],
-		RemoteAccessAllowed: false, AuthenticationEnabled: false, StorageDirectory: $work, IndexDirectory: $work, Plugins: [$plugin],
+		RemoteAccessAllowed: false, AuthenticationEnabled: false, StorageDirectory: $work, IndexDirectory: $work, Plugins: [$plugin, $worklists],
+		Worklists: {Enable: true, Database: $worklist},
 		DicomModalities: {cbctd: ["CBCTD", "127.0.0.1", $commit]}, DicomAlwaysAllowFind: true, DicomAlwaysAllowStore: true,
 		StorageCompression: false, OverwriteInstances: false}' >"$work/archive.json"
 	Orthanc "$work/archive.json" >>"$work/archive.log" 2>&1 &
