@@ -241,7 +241,7 @@ apt_install = { $$run apt-get install -y -qq --no-install-recommends $(1) >/dev/
 	  { $$run apt-get update -qq && DEBIAN_FRONTEND=noninteractive $$run apt-get install -y -qq --no-install-recommends $(1) >/dev/null; }; }
 
 check: OPTIONAL += g++:g++ /usr/include/dcmtk/dcmnet/scu.h:libdcmtk-dev chromium:chromium dciodvfy:dicom3tools Orthanc:orthanc-dicomweb promtool:prometheus systemd-analyze:systemd
-check: MODULES += nibabel:python3-nibabel pydicom:python3-pydicom gdcm:python3-gdcm
+check: MODULES += matplotlib:python3-matplotlib nibabel:python3-nibabel pydicom:python3-pydicom gdcm:python3-gdcm
 setup: ## install the Debian packages that are missing
 	@missing=""; \
 	for pair in $(COMMANDS); do command -v $${pair%%:*} >/dev/null 2>&1 || missing="$$missing $${pair##*:}"; done; \
@@ -340,7 +340,7 @@ check-gpu: ## the CUDA backend against the CPU's, and through the daemon; skippe
 	@BUILD=$(BUILD) tests/gpu/end_to_end.sh
 	@BUILD=$(BUILD) tests/gpu/sanitize.sh
 
-bench-gpu: ## times of the CUDA backend beside their goals and the card's ceilings, results in build/bench/
+bench-gpu: ## times of the CUDA backend beside goals, peers, ceilings and the last kept result, in build/bench/
 	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/gpu_bench $(BUILD)/gpu_ceilings
 	@BUILD=$(BUILD) tests/bench/gpu.sh
 else

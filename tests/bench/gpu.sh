@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# Times of the CUDA backend: the ceilings of this card, every operation beside its goal and as a part of them, and whole
-# jobs through HTTP. Writes $BUILD/bench/gpu.json with clocks and driver, prints tables. Skipped aloud without a device.
+# Times of the CUDA backend: the ceilings of this card, every operation, and whole jobs through HTTP; then each row beside its
+# goal, the best peer, the ceilings and the last kept result (gpu_rows.py), which fails where one is a tenth slower than that.
+# Writes $BUILD/bench/gpu.json with clocks and driver, with PICTURE=1 (needs matplotlib) gpu.svg too. Skipped aloud without a device.
 # Usage: tests/bench/gpu.sh [gpu_bench's options]
 set -euo pipefail
 cd "$(dirname "$0")/../.."
@@ -23,3 +24,4 @@ jq --slurpfile ceilings "$out/gpu_ceilings.json" --rawfile state "$out/gpu_state
 	{date: $date, commit: $commit, device: $s[0], driver: $s[1], clocks_mhz: {sm: ($s[2] | tonumber), memory: ($s[3] | tonumber)},
 	 power_limit_w: ($s[4] | tonumber), ceilings: $ceilings[0], results: .results}' "$out/gpu_times.json" >"$out/gpu.json"
 BUILD=$BUILD tests/bench/gpu_jobs.sh | tee "$out/gpu_jobs.txt"
+"${PYTHON:-/usr/bin/python3}" tests/bench/gpu_rows.py "$out/gpu.json" ${PICTURE:+--picture "$out/gpu.svg"}

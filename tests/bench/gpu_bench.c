@@ -2,7 +2,7 @@
  * Times of the CUDA backend: cases A to E at 620 mm and 1100 mm, any geometry
  * (the detector turned by a degree) and untilted. Medians of repeats behind a
  * warm-up, data on the device, the host's call and the final wait included.
- * Prints a table with the goals beside the times, writes JSON when given a file.
+ * Prints the times, writes JSON when given a file; gpu_rows.py has goals and peers.
  *
  *   gpu_bench [--cases ABCDET] [--what WORDS] [--geometry any|untilted] [--precision standard|reference] [--json FILE]
  *             [--ceilings FILE]
@@ -27,8 +27,6 @@ extern const struct backend backend_cuda;
 struct bench_case {
 	char letter;
 	struct scene_options options;
-	/* ms: any geometry, untilted; 0: none stated */
-	double project[2], backproject[2], filter[2], fdk[2], sirt[2], subsets[2], views[2], matched[2];
 	int sirt_count; /* iterations in one measurement */
 	double samples; /* 1e9, of the forward projection along dominant axes; 0: not counted */
 };
@@ -42,14 +40,6 @@ static const struct bench_case cases[] = {
       .pixel = {.529, .529},
       .size = {256, 256, 256},
       .spacing = {.3725, .3725, .3725}},
-     {2.35, 2.2},
-     {1.55, 1.25},
-     {0, 0},
-     {1.9, 1.5},
-     {4.2, 3.6},
-     {5.5, 5},
-     {10, 8},
-     {10, 8},
      1,
      2.393},
     {'B',
@@ -60,14 +50,6 @@ static const struct bench_case cases[] = {
       .pixel = {.713, .713},
       .size = {256, 256, 33},
       .spacing = {.3725, .3725, .3725}},
-     {0, 0},
-     {0, 0},
-     {0, 0},
-     {0, 0},
-     {.9, .8},
-     {0, 0},
-     {2.5, 2.2},
-     {0, 0},
      1,
      0},
     {'C',
@@ -78,14 +60,6 @@ static const struct bench_case cases[] = {
       .pixel = {6.88, 6.88},
       .size = {32, 32, 32},
       .spacing = {2.98, 2.98, 2.98}},
-     {0, 0},
-     {0, 0},
-     {0, 0},
-     {0, 0},
-     {.6, .6},
-     {0, 0},
-     {0, 0},
-     {0, 0},
      20,
      0},
     {'D',
@@ -96,14 +70,6 @@ static const struct bench_case cases[] = {
       .pixel = {.308, .308},
       .size = {512, 512, 512},
       .spacing = {.1862, .1862, .1862}},
-     {70, 50},
-     {60, 42},
-     {3, 3},
-     {66, 47},
-     {135, 95},
-     {0, 0},
-     {330, 300},
-     {300, 220},
      1,
      70.31},
     {'E',
@@ -114,14 +80,6 @@ static const struct bench_case cases[] = {
       .pixel = {.2888, .2888},
       .size = {1024, 1024, 1024},
       .spacing = {.0931, .0931, .0931}},
-     {240, 175},
-     {700, 500},
-     {0, 0},
-     {715, 515},
-     {0, 0},
-     {0, 0},
-     {0, 0},
-     {0, 0},
      1,
      229},
 };
@@ -158,21 +116,18 @@ static double part_of_ceiling(const struct bench_case *c, const char *what, doub
 	return 0;
 }
 
-static void report(char letter, const char *kind, const char *what, double milliseconds, double goal, double part)
+static void report(char letter, const char *kind, const char *what, double milliseconds, double part)
 {
 	printf("%c %-9s %-22s %10.3f ms", letter, kind, what, milliseconds);
-	if (goal > 0)
-		printf("   goal %8.2f  %5.2f x%s", goal, milliseconds / goal, milliseconds <= goal ? "" : "  -");
 	if (part > 0)
 		printf("   %3.0f %% of the ceiling", 100 * part);
 	printf("\n");
 	fflush(stdout);
 	if (json != NULL)
-		fprintf(
-		    json,
-		    "%s\n  {\"case\": \"%c\", \"geometry\": \"%s\", \"what\": \"%s\", \"ms\": %.4f, \"goal_ms\": %g, "
-		    "\"of_ceiling\": %.3f}",
-		    json_first ? "" : ",", letter, kind, what, milliseconds, goal, part);
+		fprintf(json,
+			"%s\n  {\"case\": \"%c\", \"geometry\": \"%s\", \"what\": \"%s\", \"ms\": %.4f, "
+			"\"of_ceiling\": %.3f}",
+			json_first ? "" : ",", letter, kind, what, milliseconds, part);
 	json_first = false;
 }
 
@@ -217,17 +172,15 @@ static double milliseconds_of(struct bench *bench, operation *run, double budget
 	return times[count / 2];
 }
 
-static void measure(struct bench *bench, const struct bench_case *c, const char *kind, const char *what, operation *run,
-		    double goal)
+static void measure(struct bench *bench, const struct bench_case *c, const char *kind, const char *what, operation *run)
 {
 	const double budget = 1.5;
-
 	double milliseconds;
 
 	if (strstr(what, what_wanted) == NULL)
 		return;
 	milliseconds = milliseconds_of(bench, run, budget);
-	report(c->letter, kind, what, milliseconds, goal, part_of_ceiling(c, what, milliseconds));
+	report(c->letter, kind, what, milliseconds, part_of_ceiling(c, what, milliseconds));
 }
 
 static void run_project(struct bench *bench, struct error *err)
@@ -319,7 +272,7 @@ static void make_plan(struct bench *bench, struct sart_options *sart, int subset
 }
 
 static void bench_sart(struct bench *bench, const struct bench_case *c, const char *kind, int subsets, const char *what,
-		       double goal, int repeat)
+		       int repeat)
 {
 	struct sart_options sart = {.relaxation = 1, .nonnegative = true};
 
@@ -327,7 +280,7 @@ static void bench_sart(struct bench *bench, const struct bench_case *c, const ch
 		return;
 	make_plan(bench, &sart, subsets, NULL);
 	bench->repeat = repeat;
-	measure(bench, c, kind, what, run_sart, goal);
+	measure(bench, c, kind, what, run_sart);
 	bench->repeat = 1;
 	backend_cuda.plan_free(bench->plan);
 	subsets_clear(&sart.subsets);
@@ -355,30 +308,29 @@ static void bench_geometry(const struct bench_case *c, bool untilted)
 	     &err, "stack");
 	printf("%c: %s\n", c->letter, backend_cuda.plan_summary(bench.plan));
 	fill_volume(&bench);
-	measure(&bench, c, kind, "forward projection", run_project, c->project[untilted]);
-	measure(&bench, c, kind, "backprojection", run_backproject, c->backproject[untilted]);
-	measure(&bench, c, kind, "weights and filter", run_filter, c->filter[untilted]);
-	measure(&bench, c, kind, "FDK", run_fdk, c->fdk[untilted]);
+	measure(&bench, c, kind, "forward projection", run_project);
+	measure(&bench, c, kind, "backprojection", run_backproject);
+	measure(&bench, c, kind, "weights and filter", run_filter);
+	measure(&bench, c, kind, "FDK", run_fdk);
 	if (untilted) {
-		measure(&bench, c, kind, "norms", run_norms, 0);
+		measure(&bench, c, kind, "norms", run_norms);
 		must(backend_cuda.volume_new(device, &bench.scene.grid, &bench.previous, &err), &err, "volume");
 		must(backend_cuda.volume_copy(bench.previous, bench.volume, &err), &err, "copy");
-		measure(&bench, c, kind, "momentum of an iteration", run_momentum, 0);
+		measure(&bench, c, kind, "momentum of an iteration", run_momentum);
 		backend_cuda.volume_free(bench.previous);
 	}
 	fill_volume(&bench);
 	run_project(&bench, &err);
 	backend_cuda.plan_free(bench.plan);
-	bench_sart(&bench, c, kind, 1, c->sirt_count == 1 ? "SIRT iteration" : "20 SIRT iterations", c->sirt[untilted],
-		   c->sirt_count);
+	bench_sart(&bench, c, kind, 1, c->sirt_count == 1 ? "SIRT iteration" : "20 SIRT iterations", c->sirt_count);
 	if (c->letter == 'A' || c->letter == 'D') {
 		bench.matched = true;
-		bench_sart(&bench, c, kind, 1, "matched SIRT iteration", c->matched[untilted], 1);
+		bench_sart(&bench, c, kind, 1, "matched SIRT iteration", 1);
 		bench.matched = false;
 	}
 	if (!big) {
-		bench_sart(&bench, c, kind, 10, "OS-SART iteration, 10", c->subsets[untilted], 1);
-		bench_sart(&bench, c, kind, count, "SART iteration by view", c->views[untilted], 1);
+		bench_sart(&bench, c, kind, 10, "OS-SART iteration, 10", 1);
+		bench_sart(&bench, c, kind, count, "SART iteration by view", 1);
 	}
 	backend_cuda.stack_free(bench.filtered);
 	backend_cuda.stack_free(bench.projections);
@@ -412,7 +364,7 @@ static void bench_cut_off(const struct bench_case *c)
 		bench.views[i] = i;
 		must(backend_cuda.stack_upload(bench.projections, i, 1, view, &err), &err, "upload");
 	}
-	measure(&bench, c, "untilted", "filter, rows cut off", run_filter, 0);
+	measure(&bench, c, "untilted", "filter, rows cut off", run_filter);
 	must(backend_cuda.filter_extended(bench.plan, cut, &err), &err, "filter");
 	if (cut[0] != cut[1] || cut[0] % ((size_t)options.rows * (size_t)options.views) != 0) {
 		fprintf(stderr, "%zu and %zu rows were extended\n", cut[0], cut[1]);
@@ -427,7 +379,7 @@ static void bench_cut_off(const struct bench_case *c)
 }
 
 /* One step of TV: ten of them less none, so that the copies around do not count. */
-static void bench_tv(int size, const double goals[TV_METHOD_COUNT])
+static void bench_tv(int size)
 {
 	const struct scene_options options = {.columns = 16,
 					      .rows = 16,
@@ -454,7 +406,7 @@ static void bench_tv(int size, const double goals[TV_METHOD_COUNT])
 			backend_cuda.plan_free(bench.plan);
 		}
 		snprintf(what, sizeof(what), "TV %s step %d", tv_method_names[method], size);
-		report(size == 256 ? 'A' : 'D', "-", what, (times[1] - times[0]) / 20, goals[method], 0);
+		report(size == 256 ? 'A' : 'D', "-", what, (times[1] - times[0]) / 20, 0);
 	}
 	backend_cuda.volume_free(bench.volume);
 	scene_clear(&bench.scene);
@@ -640,8 +592,8 @@ int main(int argc, char **argv)
 			bench_cut_off(&cases[i]);
 	}
 	if (strchr(wanted, 'T') != NULL) {
-		bench_tv(256, (const double[]){.07, .14});
-		bench_tv(512, (const double[]){.50, 1.05});
+		bench_tv(256);
+		bench_tv(512);
 	}
 	if (json != NULL) {
 		fprintf(json, "\n]}\n");
