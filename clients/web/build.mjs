@@ -36,7 +36,10 @@ const outputOf = (result, source) => basename(Object.entries(result.metafile.out
 const worker = await build({ ...common, entryPoints: ['src/decode.js'], format: 'iife' })
 const page = await build({
 	...common, entryPoints: ['src/main.js', 'src/style.css'], format: 'esm', splitting: true,
-	define: { DECODE_WORKER: JSON.stringify(`/assets/${outputOf(worker, 'src/decode.js')}`) },
+	define: {
+		DECODE_WORKER: JSON.stringify(`/assets/${outputOf(worker, 'src/decode.js')}`),
+		LANGUAGES: JSON.stringify(readdirSync(join(here, 'src/lang')).map(file => basename(file, '.js')).sort()),
+	},
 })
 
 /* ---- licences ---- */

@@ -102,6 +102,64 @@ test('of a job that begins anew a volume that is there is shown in place of the 
 	await page.context().close()
 })
 
+/* ---- the list ---- */
+
+test('the list stands by state, says what tells jobs of a scan apart and how long is left, and is searched', async () => {
+	const grid = { size: [40, 40, 40], spacing_mm: [3, 3, 3] }, sirt = { iterations: 3, subsets: 1 }
+	const [sharp, smooth] = await Promise.all(['ram-lak', 'hann'].map(window => post('/v1/jobs', { scan, grid, fdk: { window }, sart: sirt, labels: { side: `list ${window}` } })))
+	await Promise.all([sharp, smooth].map(job => ended(job.id)))
+	const running = await post('/v1/jobs', { scan, grid, fdk: {}, sart: { ...sirt, iterations: 100000 } })
+	const queued = await post('/v1/jobs', { scan, grid, fdk: {}, sart: sirt, priority: 'routine' })
+	const empty = await post('/v1/scans', { name: 'hip', ...await api(`/v1/scans/${scan}`).then(({ detector, projections, geometry }) => ({ detector, projections, geometry })) })
+	const waiting = await post('/v1/jobs', { scan: empty.id, grid, fdk: {} })
+	const page = await open(browser, '/'), row = job => `a[href="#/jobs/${job.id}"]`
+	await page.waitForSelector(`.jobs.running ${row(running)}`)
+	await page.waitForSelector(`.jobs.waiting ${row(waiting)}`)
+	expect((await page.textContent(`.jobs.waiting ${row(waiting)}`)).includes('0 of 56 projections are here'), 'what it waits for')
+	await until('the queue folded, with its time', () => page.textContent('details.part summary'), text => /In the queue\s*1 job, all are ready in \d/.test(text))
+	expect(!await page.isVisible(row(queued)), 'folded')
+	await page.click('details.part summary')
+	await until('waiting apart from computing', () => page.textContent(row(queued)), text => /starts in .*, ready in /.test(text))
+	const said = await page.textContent(`.jobs.today ${row(sharp)}`)
+	expect(said.includes('window ram-lak') && said.includes('FDK + SART 3') && said.includes('list ram-lak'), `what is its own, got ${said}`)
+	const picture = await page.locator(`${row(sharp)} .thumb`).boundingBox()
+	expect(picture.width >= 120, `a large picture, got ${picture.width}`)
+	await shoot(page, 'list-states')
+	await page.fill('[type=search]', 'LIST RAM')
+	await until('what was searched for', () => page.locator('.jobs a').count(), count => count === 1)
+	expect(await page.isVisible(row(sharp)), 'the right one')
+	await page.fill('[type=search]', 'nothing like that')
+	await until('no job', () => page.isVisible('text=No job is like that.'))
+	await page.fill('[type=search]', '')
+	await page.selectOption('[name=state]', 'waiting')
+	await until('those that wait', () => page.locator('.jobs a').count(), count => count > 0)
+	expect(await page.locator('.jobs:not(.waiting) a').count() === 0, 'and no other')
+	for (const job of [running, queued, waiting])
+		await api(`/v1/jobs/${job.id}`, { method: 'DELETE' })
+	await Promise.all([running, queued, waiting].map(job => ended(job.id)))
+	await page.context().close()
+})
+
+test('light or dark and the language are chosen, and stay chosen; the pictures are dark', async () => {
+	const page = await openFinished({ colorScheme: 'light', locale: 'de-DE' })
+	const ground = () => page.evaluate(() => Math.max(...getComputedStyle(document.documentElement).backgroundColor.match(/\d+/g).map(Number)))
+	expect(await page.getAttribute('html', 'lang') === 'de', 'the browser\'s language')
+	expect(await badge(page).then(text => text.includes('fertig')), 'its words')
+	await page.click('button.theme')
+	expect(await ground() < 60, 'a dark ground')
+	await page.reload()
+	await planePixels(page, 'z')
+	expect(await ground() < 60, 'still dark')
+	await page.click('button.theme')
+	expect(await ground() > 200, 'light again')
+	expect(await page.evaluate(() => getComputedStyle(document.querySelector('.viewer')).backgroundColor) === 'rgb(0, 0, 0)', 'black around the pictures')
+	await shoot(page, 'german')
+	await page.selectOption('.tongue', 'en')
+	await page.waitForSelector('.head .badge:has-text("ready")')
+	expect(await page.getAttribute('html', 'lang') === 'en', 'English')
+	await page.context().close()
+})
+
 /* ---- pictures ---- */
 
 const half = 6 /* voxels off the middle, where the solid has no mirror plane */
@@ -501,7 +559,7 @@ test('two iterations side by side and under a swipe', async () => {
 	await page.mouse.click(...await spot(page, 'z', 0.3, 0.3))
 	const depth = selector => page.inputValue(`${selector} [data-plane=x] .depth`)
 	expect(await depth('.viewer:not(.second)') === await depth('.viewer.second'), 'the same place')
-	await page.selectOption('[aria-label="Compare with"]', 'iter-2')
+	await page.selectOption('[aria-label="Compare with"]', 'volume iter-2')
 	await until('the other one', () => page.getAttribute('.viewer.second', 'data-volume'), shown => shown === 'iter-2')
 	await page.waitForSelector('.viewer.second [data-plane="3d"][data-shown=iter-2]')
 	await shoot(page, 'side-by-side')
@@ -526,6 +584,87 @@ test('two iterations side by side and under a swipe', async () => {
 	await page.click('[aria-label=Comparison] button:has-text("Off")')
 	expect(await page.locator('.viewer').count() === 1, 'one viewer again')
 	await page.context().close()
+})
+
+test('another job and a file from disk are compared in mm, whatever their grids', async () => {
+	/* The same object on another grid, of a patient who lies otherwise: its file has other axes than the world. */
+	const other = await post('/v1/jobs', { scan, grid: { size: [50, 60, 44], spacing_mm: [2, 1.8, 2.5], origin_mm: [-48, -52, -50] }, fdk: {}, sart: { iterations: 7 }, patient: { position: 'FFDR' } })
+	await ended(other.id)
+	const page = await openFinished()
+	await page.click('button:has-text("Side by side")')
+	await page.waitForSelector(`[aria-label="Compare with"] option[value="job ${other.id}"]`, { state: 'attached' })
+	await page.selectOption('[aria-label="Compare with"]', `job ${other.id}`)
+	await until('the other job', () => page.textContent('.viewer.second [data-plane=z] .what'), text => text.includes('50 × 60 × 44'))
+	const alike = async what => {
+		await page.mouse.click(...await spot(page, 'z', 0.35, 0.4))
+		for (const plane of ['z', 'x', 'y']) {
+			await until(`${what}: the same place across ${plane}`, async () =>
+				correlation(shrink(await planePixels(page, plane)), shrink(await planePixels(page, plane, '.viewer.second'))), likeness => likeness > 0.93)
+			const [first, second] = await Promise.all(['.viewer:not(.second)', '.viewer.second'].map(viewer => page.locator(`${viewer} [data-plane=${plane}] .frame`).boundingBox()))
+			expect(Math.abs(first.width - second.width) < 1 && Math.abs(first.height - second.height) < 1, `${what}: of the same size across ${plane}`)
+		}
+	}
+	await alike('another job')
+	await shoot(page, 'compare-job')
+	/* Files: in 1/mm of a job with other axes, packed; then one of this patient. */
+	const lain = await open(browser, `/#/jobs/${other.id}`)
+	await planePixels(lain, 'z')
+	await lain.waitForSelector('.head .badge.succeeded')
+	await lain.click('button:has-text("Side by side")')
+	for (const [where, job, query] of [[page, finished, 'format=nifti'], [lain, other.id, 'format=nifti.gz&type=int16']]) {
+		const buffer = Buffer.from(await (await fetch(`${origin}/v1/jobs/${job}/volumes/final?${query}`)).arrayBuffer())
+		const [chooser] = await Promise.all([where.waitForEvent('filechooser'), where.selectOption('[aria-label="Compare with"]', 'open')])
+		await chooser.setFiles({ name: 'before.nii', mimeType: 'application/octet-stream', buffer })
+		await where.waitForSelector('.viewer.second[data-volume="before.nii"]')
+		for (const plane of ['z', 'x', 'y'])
+			await until(`the file of ${query} across ${plane}`, async () => correlation(shrink(await planePixels(where, plane)), shrink(await planePixels(where, plane, '.viewer.second'))), likeness => likeness > 0.985)
+	}
+	const [chooser] = await Promise.all([page.waitForEvent('filechooser'), page.selectOption('[aria-label="Compare with"]', 'open')])
+	await chooser.setFiles({ name: 'wrong.nii', mimeType: 'application/octet-stream', buffer: Buffer.alloc(400) })
+	await until('what is no NIfTI is told', () => page.textContent('.comparing .trouble'), text => text === 'wrong.nii: this is no NIfTI-1 file')
+	await lain.context().close()
+	await page.context().close()
+})
+
+test('key images are kept with the job, gone back to, and saved with a caption and no name', async () => {
+	await forget()
+	const [page, other] = [await openFinished(), await openFinished()]
+	await page.click('[data-preset="Soft tissue"]')
+	await page.focus(tile('z'))
+	for (let i = 0; i < 20; i++)
+		await page.keyboard.press(']')
+	await page.keyboard.press('m')
+	await page.keyboard.press('k')
+	await page.fill('dialog input[type=text]', 'screw L4')
+	await page.click('dialog button.primary')
+	const { key_images: [kept] } = await until('kept', () => api(`/v1/jobs/${finished}/annotations`), document => document.key_images.length === 1)
+	expect(kept.caption === 'screw L4' && kept.volume === 'final' && kept.window === 400, `what was seen: ${JSON.stringify(kept)}`)
+	await until('shown to others', () => other.textContent('.key-images'), text => text.includes('screw L4'))
+	await other.click('.key-images .picture-button')
+	expect(String(await windowOf(other)) === '400,40', 'its window')
+	/* An oblique one: the same pixels as where it was taken. */
+	await page.keyboard.press('m')
+	await page.click('[aria-label="What is shown"] button[data-value=x]')
+	const drawn = await planePixels(page, 'x')
+	await page.keyboard.press('k')
+	await page.click('dialog button.primary')
+	await until('two', () => other.locator('.key-images li').count(), count => count === 2)
+	await other.click('button:has-text("Reset")')
+	await other.click('.key-images li >> nth=1 >> .picture-button')
+	expect((await other.textContent(`${tile('x')} .name`)).includes('turned'), 'turned as it was')
+	await other.click('[aria-label="What is shown"] button[data-value=x]')
+	await until('the same plane', async () => correlation(shrink(drawn), shrink(await planePixels(other, 'x'))), likeness => likeness > 0.99)
+	const [download] = await Promise.all([page.waitForEvent('download'), page.click('.key-images li >> nth=0 >> text=PNG')])
+	const file = grayOf(readFileSync(await download.path()))
+	expect(file.width === 900 && file.height > 960, `a picture with a caption below, got ${file.width} x ${file.height}`)
+	const rows = (from, to) => file.pixels.slice(from * file.width, to * file.width)
+	expect(rows(0, 900).filter(value => value > 100).length > 5000 && rows(905, file.height).filter(value => value > 200).length > 200, 'a body above, words below')
+	await shoot(page, 'key-images')
+	await page.click('.key-images li >> nth=0 >> button.icon')
+	await until('removed for all', () => other.locator('.key-images li').count(), count => count === 1)
+	await other.context().close()
+	await page.context().close()
+	await forget()
 })
 
 /* ---- hands ---- */

@@ -70,6 +70,12 @@ test_the_page_knows_every_parameter() {
 		fail "clients/web/src/parameters.js with the table that \`cbct parameters\` shows"
 }
 
+# lang/de.js has every text that the sources have, with the same values in it.
+test_every_language_has_every_text() {
+	command -v node >/dev/null || skip "node is not here"
+	node "$here/strings.mjs" "$top/clients/web/src" || fail "each file of clients/web/src/lang with all texts"
+}
+
 # What stands for the whole page where npm is not.
 test_the_plain_page_shows_jobs_and_escapes_names() {
 	start_daemon

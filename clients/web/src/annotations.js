@@ -1,5 +1,5 @@
 /*
- * Measurements as they are kept with the job: read at the start and whenever somebody has changed them, written after
+ * Measurements and key images as they are kept with the job: read at the start and whenever somebody has changed them, written after
  * each change of one's own. Where two change at once, the second reads again and both are there.
  */
 import { jobPath, requestTagged } from './api.js'
@@ -7,7 +7,7 @@ import { jobPath, requestTagged } from './api.js'
 const triesMost = 5
 
 export class Annotations {
-	#measurements
+	#lists /* name in the document -> KeptList */
 	#path
 	#tag = null
 	#kept = { measurements: [], key_images: [] } /* as the daemon has it */
@@ -18,12 +18,13 @@ export class Annotations {
 	#signal
 
 	/* failed(error): they could not be read or kept. */
-	constructor(job, measurements, { signal, failed }) {
+	constructor(job, lists, { signal, failed }) {
 		this.#path = `${jobPath(job)}/annotations`
-		this.#measurements = measurements
+		this.#lists = Object.entries(lists)
 		this.#signal = signal
 		this.failed = failed
-		measurements.addEventListener('change', ({ detail }) => detail.own && this.#work({ save: true }))
+		for (const [, list] of this.#lists)
+			list.addEventListener('change', ({ detail }) => detail.own && this.#work({ save: true }))
 		this.load()
 	}
 
@@ -64,8 +65,10 @@ export class Annotations {
 	#take({ document, tag }) {
 		this.#kept = document
 		this.#tag = tag
-		if (JSON.stringify(document.measurements) !== JSON.stringify(this.#measurements.items))
-			this.#measurements.replace(document.measurements)
+		for (const [name, list] of this.#lists) {
+			if (JSON.stringify(document[name]) !== JSON.stringify(list.items))
+				list.replace(document[name])
+		}
 	}
 
 	#tell(error) {
@@ -76,12 +79,12 @@ export class Annotations {
 	async #save() {
 		this.#toSave = false
 		for (let tries = 0; ; tries++) {
-			const items = this.#measurements.items
+			const items = Object.fromEntries(this.#lists.map(([name, list]) => [name, list.items]))
 			try {
 				if (this.#tag === null)
 					throw Object.assign(new Error('not read yet'), { status: 412 })
 				const { document, tag } = await requestTagged('PUT', this.#path,
-					{ body: { ...this.#kept, measurements: items }, headers: { 'If-Match': this.#tag }, signal: this.#signal })
+					{ body: items, headers: { 'If-Match': this.#tag }, signal: this.#signal })
 				this.#kept = document
 				this.#tag = tag
 				return
@@ -95,14 +98,20 @@ export class Annotations {
 
 	/* What others have made of it since, without what was removed here and with what was added here. */
 	#join({ document, tag }) {
-		const before = new Set(this.#kept.measurements.map(item => item.id)), here = this.#measurements.items
-		const ids = new Set(here.map(item => item.id))
-		const theirs = document.measurements.filter(item => ids.has(item.id) || !before.has(item.id)), taken = new Set(theirs.map(item => item.id))
-		let last = Math.max(0, ...[...taken, ...ids].map(Number).filter(Number.isFinite))
-		/* Where both have made one of the same number, the one from here takes the next. */
-		const added = here.filter(item => !before.has(item.id)).map(item => taken.has(item.id) ? { ...item, id: String(++last) } : item)
+		const before = this.#kept
 		this.#kept = document
 		this.#tag = tag
-		this.#measurements.replace([...theirs, ...added])
+		for (const [name, list] of this.#lists)
+			list.replace(joined(before[name], document[name], list.items))
 	}
+}
+
+/* before: as both began; theirs and here: what became of it. */
+function joined(before, theirs, here) {
+	const known = new Set(before.map(item => item.id)), ids = new Set(here.map(item => item.id))
+	const stay = theirs.filter(item => ids.has(item.id) || !known.has(item.id)), taken = new Set(stay.map(item => item.id))
+	let last = Math.max(0, ...[...taken, ...ids].map(Number).filter(Number.isFinite))
+	/* Where both have made one of the same number, the one from here takes the next. */
+	const added = here.filter(item => !known.has(item.id)).map(item => taken.has(item.id) ? { ...item, id: String(++last) } : item)
+	return [...stay, ...added]
 }

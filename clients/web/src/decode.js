@@ -3,10 +3,11 @@
  * times smaller than int16, and puts its bytes in order: of each plane z first
  * the low bytes [y][x], then the high ones.
  *
- * In: { number, path, size }; out: { number, voxels } (Int16Array, Hounsfield
- * units [z][y][x]) or { number, error }. { cancel: number } ends one.
+ * In: { number, path, size }, or { number, file, place } for a NIfTI file from disk (nifti.js); out: { number, voxels } (Int16Array, Hounsfield
+ * units [z][y][x]), { number, grid } of a file, or { number, error }. { cancel: number } ends one.
  */
 import { Decompress } from 'fzstd'
+import { readNifti } from './nifti.js'
 
 const running = new Map()
 
@@ -51,7 +52,11 @@ onmessage = async ({ data }) => {
 		running.get(data.cancel)?.abort()
 		return
 	}
-	const { number, path, size } = data
+	const { number, path, size, file, place } = data
+	if (file) {
+		readNifti(file, place).then(grid => postMessage({ number, grid }, [grid.voxels.buffer]), error => postMessage({ number, error: error.message }))
+		return
+	}
 	const controller = new AbortController()
 	running.set(number, controller)
 	try {

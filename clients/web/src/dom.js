@@ -2,6 +2,7 @@
  * Elements and texts. Whatever comes from the daemon becomes text nodes and
  * properties, never markup.
  */
+import { language, t } from './lang.js'
 
 /* h('button', { class: 'quiet', onclick: f, 'aria-label': 'Close' }, 'text', child, null, [more]) */
 export function h(name, properties, ...children) {
@@ -60,7 +61,7 @@ export function number(value, digits = 3) {
 		const [mantissa, exponent] = value.toExponential(digits - 1).split('e')
 		return `${mantissa.replace('-', '−')} × 10${superscript(Number(exponent))}`
 	}
-	return value.toLocaleString('en', { maximumSignificantDigits: digits, useGrouping: size >= 1e4 }).replace('-', '−')
+	return value.toLocaleString(language(), { maximumSignificantDigits: digits, useGrouping: size >= 1e4 }).replace('-', '−')
 }
 
 const superscripts = '⁰¹²³⁴⁵⁶⁷⁸⁹'
@@ -96,10 +97,10 @@ export function moment(text) {
 	if (!text)
 		return '–'
 	const date = new Date(text), today = new Date()
-	const time = date.toLocaleTimeString([], { hour: '2-digit', minute: '2-digit' })
+	const time = date.toLocaleTimeString(language() === 'en' ? [] : language(), { hour: '2-digit', minute: '2-digit' })
 	return date.toDateString() === today.toDateString()
-		? `today ${time}`
-		: `${date.toLocaleDateString([], { day: 'numeric', month: 'short', year: date.getFullYear() === today.getFullYear() ? undefined : 'numeric' })} ${time}`
+		? t('today {time}', { time })
+		: `${date.toLocaleDateString(language() === 'en' ? [] : language(), { day: 'numeric', month: 'short', year: date.getFullYear() === today.getFullYear() ? undefined : 'numeric' })} ${time}`
 }
 
 export function timeElement(text) {

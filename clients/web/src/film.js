@@ -1,6 +1,7 @@
 /* The projections of a scan as a film: a slider, a button to let it run, the angle where it is known. */
 import { h, write, number } from './dom.js'
 import { scanPath } from './api.js'
+import { t } from './lang.js'
 
 const frameTime = 80 /* ms */
 
@@ -31,8 +32,8 @@ export class Film {
 
 	constructor() {
 		this.image = h('img', { alt: '', draggable: false })
-		this.slider = h('input', { type: 'range', min: '0', step: '1', value: '0', 'aria-label': 'Projection', oninput: () => this.#show(Number(this.slider.value)) })
-		this.play = h('button', { type: 'button', class: 'play', 'aria-pressed': 'false', 'aria-label': 'Play', onclick: () => this.#toggle() })
+		this.slider = h('input', { type: 'range', min: '0', step: '1', value: '0', 'aria-label': t('Projection'), oninput: () => this.#show(Number(this.slider.value)) })
+		this.play = h('button', { type: 'button', class: 'play', 'aria-pressed': 'false', 'aria-label': t('Play'), onclick: () => this.#toggle() })
 		this.label = h('output', {})
 		this.screen = h('div', { class: 'screen' }, this.image)
 		this.element = h('div', { class: 'film' }, this.screen, h('div', { class: 'row' }, this.play, this.slider), this.label)
@@ -58,7 +59,7 @@ export class Film {
 	async #show(k) {
 		const count = this.#scan.projections.count
 		const there = this.#has(k)
-		const text = `${k + 1} of ${count}${angle(this.#scan, k)}${there ? '' : ', not here yet'}`
+		const text = `${t('{n} of {all}', { n: k + 1, all: count })}${angle(this.#scan, k)}${there ? '' : t(', not here yet')}`
 		write(this.label, text)
 		this.slider.setAttribute('aria-valuetext', text)
 		this.screen.classList.toggle('missing', !there)
@@ -69,7 +70,7 @@ export class Film {
 			return
 		this.#loading = true
 		while (this.#wanted !== null) {
-			const next = h('img', { alt: `Projection ${this.#wanted + 1}`, draggable: false })
+			const next = h('img', { alt: t('Projection {n}', { n: this.#wanted + 1 }), draggable: false })
 			next.src = `${scanPath(this.#scan.id)}/projections/${this.#wanted}?format=png`
 			next.dataset.projection = String(this.#wanted)
 			this.#wanted = null
@@ -87,7 +88,7 @@ export class Film {
 	#toggle() {
 		const playing = this.#timer === null
 		this.play.setAttribute('aria-pressed', String(playing))
-		this.play.setAttribute('aria-label', playing ? 'Pause' : 'Play')
+		this.play.setAttribute('aria-label', playing ? t('Pause') : t('Play'))
 		if (playing) {
 			this.#timer = setInterval(() => this.#advance(), frameTime)
 		} else {

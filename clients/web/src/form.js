@@ -5,6 +5,7 @@
 import { h, replace, newId } from './dom.js'
 import { request, newKey, Problem } from './api.js'
 import { groups, members, presets, path, at } from './parameters.js'
+import { t } from './lang.js'
 
 function put(value, pointer, what) {
 	const keys = path(pointer), last = keys.pop()
@@ -39,32 +40,32 @@ export class JobForm {
 				this.#initial[member] = structuredCloneOf(base[member])
 		}
 		this.trouble = h('p', { class: 'trouble', role: 'alert', hidden: true })
-		this.submit = h('button', { type: 'submit', class: 'primary' }, 'Reconstruct')
+		this.submit = h('button', { type: 'submit', class: 'primary' }, t('Reconstruct'))
 		this.element = h('form', { class: 'job-form', novalidate: true, onsubmit: event => this.#submit(event) },
 			this.#presets(), groups.map(group => this.#group(group)), this.trouble,
-			h('div', { class: 'row end' }, h('button', { type: 'button', onclick: cancel }, 'Close'), this.submit))
+			h('div', { class: 'row end' }, h('button', { type: 'button', onclick: cancel }, t('Close')), this.submit))
 		this.element.addEventListener('input', () => this.#key = newKey())
 	}
 
 	/* Stages for a purpose, in place of those below. */
 	#presets() {
-		this.preset = h('select', { name: '/preset' }, h('option', { value: '' }, 'as below'), presets.map(([name, text]) => h('option', { value: name }, text)))
+		this.preset = h('select', { name: '/preset' }, h('option', { value: '' }, t('as below')), presets.map(([name, text]) => h('option', { value: name }, t(text))))
 		this.preset.addEventListener('change', () => {
 			for (const stage of this.#stages)
 				stage.hidden = this.preset.value !== ''
 		})
-		return h('fieldset', {}, h('legend', {}, 'Purpose'), h('div', { class: 'fields' }, h('label', { class: 'field choice wide' }, h('span', { class: 'label' }, 'Preset'), this.preset)))
+		return h('fieldset', {}, h('legend', {}, t('Purpose')), h('div', { class: 'fields' }, h('label', { class: 'field choice wide' }, h('span', { class: 'label' }, t('Preset')), this.preset)))
 	}
 
 	#group(group) {
 		const body = h('div', { class: group.three ? 'fields three' : 'fields' }, group.fields.map(field => this.#field(field)))
 		if (!group.optional)
-			return h('fieldset', {}, h('legend', {}, group.title), body)
+			return h('fieldset', {}, h('legend', {}, t(group.title)), body)
 		const value = this.#initial[path(group.pointer)[0]]
 		/* A job from nothing has all stages; which grid, the daemon knows best. */
 		const fresh = members.every(member => this.#initial[member] === undefined) && group.pointer !== '/grid' && !group.rare
 		const box = h('input', { type: 'checkbox', checked: fresh || (value !== undefined && value !== null) })
-		const off = h('p', { class: 'off' }, group.off)
+		const off = h('p', { class: 'off' }, t(group.off))
 		const error = h('p', { class: 'trouble', hidden: true, id: newId('error') })
 		const adapt = () => {
 			body.hidden = !box.checked
@@ -74,7 +75,7 @@ export class JobForm {
 		adapt()
 		this.#switches.set(group.pointer, box)
 		this.#fields.set(group.pointer, { input: box, error })
-		const element = h('fieldset', {}, h('legend', {}, h('label', {}, box, ` ${group.title}`)), body, off, error)
+		const element = h('fieldset', {}, h('legend', {}, h('label', {}, box, ` ${t(group.title)}`)), body, off, error)
 		if (group.pointer !== '/grid')
 			this.#stages.push(element)
 		return element
@@ -90,16 +91,16 @@ export class JobForm {
 		else if (field.kind === 'flag')
 			input = h('input', { type: 'checkbox', checked: value ?? field.unset ?? true })
 		else
-			input = h('input', { type: 'text', inputmode: field.kind === 'number' ? 'decimal' : null, autocomplete: 'off', spellcheck: 'false', placeholder: field.empty ?? 'default',
+			input = h('input', { type: 'text', inputmode: field.kind === 'number' ? 'decimal' : null, autocomplete: 'off', spellcheck: 'false', placeholder: field.empty ? t(field.empty) : t('default'),
 				value: field.write ? field.write(value) : value === undefined || value === null ? '' : String(value) })
 		if (field.kind === 'choice' && (value === undefined || value === null)) {
-			input.prepend(h('option', { value: '' }, 'default'))
+			input.prepend(h('option', { value: '' }, t('default')))
 			input.value = ''
 		}
 		input.setAttribute('name', field.pointer)
 		this.#fields.set(field.pointer, { field, input, error, initial: field.kind === 'flag' ? input.checked : input.value })
 		return h('label', { class: `field ${field.kind}${field.wide ? ' wide' : ''}` },
-			h('span', { class: 'label' }, field.label, field.hint ? h('small', {}, ` ${field.hint}`) : null), input, error)
+			h('span', { class: 'label' }, t(field.label), field.hint ? h('small', {}, ` ${t(field.hint)}`) : null), input, error)
 	}
 
 	/* The document before with what was changed. Text that is no number goes as it is: the daemon says so best. */
@@ -231,20 +232,20 @@ export function confirmed(title, question, verb, act) {
 		}
 	} }, verb)
 	const dialog = openDialog(title, h('p', {}, question), trouble,
-		h('div', { class: 'row end' }, h('button', { type: 'button', onclick: () => dialog.close() }, 'Keep it'), yes))
+		h('div', { class: 'row end' }, h('button', { type: 'button', onclick: () => dialog.close() }, t('Keep it')), yes))
 }
 
 /* Pins a job or scan, or takes its pin away; changed() reads it again. */
 export function pinButton({ pinned }, path, changed) {
-	const button = h('button', { type: 'button', class: 'quiet acquires', title: pinned ? 'It is kept whatever its age' : 'Keep it whatever its age', onclick: async () => {
+	const button = h('button', { type: 'button', class: 'quiet acquires', title: pinned ? t('It is kept whatever its age') : t('Keep it whatever its age'), onclick: async () => {
 		button.disabled = true
 		try {
 			await request(pinned ? 'DELETE' : 'PUT', `${path}/pin`)
 		} catch (error) {
-			openDialog('It cannot be pinned', h('p', {}, error.message))
+			openDialog(t('It cannot be pinned'), h('p', {}, error.message))
 			button.disabled = false
 		}
 		changed()
-	} }, pinned ? 'Unpin' : 'Pin')
+	} }, pinned ? t('Unpin') : t('Pin'))
 	return button
 }

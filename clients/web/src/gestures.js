@@ -194,7 +194,7 @@ export class Gestures {
 		const draft = this.#plane.overlay.draft
 		this.#drop()
 		if (draft && moved && draft.points.length > (draft.kind === 'freehand' ? 2 : 1) && draft.points.some(point => norm(minus(point, draft.points[0])) > 0))
-			this.#plane.measurements.add(draft.kind, draft.points)
+			this.#plane.measurements.add({ kind: draft.kind, points: draft.points })
 	}
 
 	#drop() {
@@ -217,7 +217,7 @@ export class Gestures {
 			this.#view.layAlong(...points)
 			this.#view.set({ tool: 'window' })
 		} else {
-			this.#plane.measurements.add(kind, points)
+			this.#plane.measurements.add({ kind, points })
 		}
 	}
 

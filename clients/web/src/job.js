@@ -2,15 +2,19 @@
 import { h, replace, write, throttle, newId, bytes, duration, number } from './dom.js'
 import { get, request, jobPath, scanPath, volumePath, listVolumes, watch } from './api.js'
 import { View, planeName, presets, rotationOf } from './view.js'
-import { Measurements } from './measure.js'
+import { KeptList } from './kept.js'
+import { KeyImages } from './keyimages.js'
 import { Annotations } from './annotations.js'
 import { Tools, segments, press } from './tools.js'
 import { Viewer } from './viewer.js'
 import { Plot } from './plot.js'
+import { Others } from './compare.js'
 import { Film } from './film.js'
 import { Bar, badge, doing, left, ended, stateWord } from './state.js'
 import { geometryFacts, jobFacts, warningList } from './facts.js'
+import { nameOf } from './lists.js'
 import { reconstructAgain, confirmed, openDialog, pinButton } from './form.js'
+import { t } from './lang.js'
 
 const pollTime = 1500 /* ms: progress and time left are not told as events */
 const swipeReach = 12 /* px to either side of the line */
@@ -26,18 +30,18 @@ function qualityText(quality) {
 		seen(rings) && `rings of ${number(rings, 2)} HU`, seen(streaks) && `streaks of ${number(streaks, 2)} HU`].filter(Boolean).join(', ')
 }
 
-const volumeText = volume => volume.iteration > 0 ? `iteration ${volume.iteration}` : volume.stage === 'tv' ? 'FDK and TV' : 'FDK'
+const volumeText = volume => volume.iteration > 0 ? t('iteration {n}', { n: volume.iteration }) : volume.stage === 'tv' ? t('FDK and TV') : 'FDK'
 
 export class JobPage {
 	#job = null
 	#scan = null
 	#volumes = []
 	#selected = null /* name */
-	#other = null /* name, of the comparison */
 	#mode = 'off'
 	#follow = true
 	#view = new View()
-	#measurements = new Measurements()
+	#measurements = new KeptList()
+	#chosen = new KeptList() /* key images */
 	#pointed = null /* the place of the world under the mouse */
 	#abort = new AbortController()
 	#closed = false
@@ -48,7 +52,7 @@ export class JobPage {
 		this.live = live
 		this.title = title
 		this.#build()
-		this.annotations = new Annotations(jobId, this.#measurements, { signal: this.#abort.signal, failed: error => this.tools.tell(`Not kept with the job: ${error.message}`) })
+		this.annotations = new Annotations(jobId, { measurements: this.#measurements, key_images: this.#chosen }, { signal: this.#abort.signal, failed: error => this.tools.tell(t('Not kept with the job: {why}', { why: error.message })) })
 		this.refresh = throttle(250, () => this.#refresh())
 		this.refreshVolumes = throttle(250, () => this.#refreshVolumes())
 		this.#view.addEventListener('change', ({ detail }) => this.#onView(detail))
@@ -67,22 +71,26 @@ export class JobPage {
 	#build() {
 		this.heading = h('h1', {}, '…')
 		this.badge = h('span', {})
-		this.bar = new Bar('Progress')
+		this.bar = new Bar(t('Progress'))
 		this.doing = h('span', { class: 'doing' })
 		this.left = h('span', { class: 'left' })
 		this.announce = h('p', { class: 'hidden', 'aria-live': 'polite' })
 		this.actions = h('div', { class: 'actions' })
 		this.trouble = h('div', { class: 'notice bad', role: 'alert', hidden: true })
 		this.stage = h('div', { class: 'stages', 'data-mode': 'off', hidden: true })
-		this.empty = h('p', { class: 'empty' }, 'No volume yet: the first appears here by itself.')
-		this.viewer = this.#makeViewer('Volume', () => this.#onPicture())
+		this.empty = h('p', { class: 'empty' }, t('No volume yet: the first appears here by itself.'))
+		this.viewer = this.#makeViewer(t('Volume'), () => this.#onPicture())
 		this.tools = new Tools(this.#view, this.#measurements, { voxels: () => this.viewer.voxels, facts: () => ({ job: this.id, scan: this.#job.scan, volume: this.#selected }) })
+		this.keyImages = new KeyImages(this.#view, this.#chosen, this.#measurements, {
+			facts: () => ({ job: this.id, name: this.#scan?.name, volume: this.#selected, what: this.#volumes[this.#index()] ? this.#whatOf(this.#volumes[this.#index()]) : '', voxels: this.viewer.voxels }),
+			show: name => this.#choose(this.#volumes.findIndex(volume => volume.name === name)),
+		})
 		this.second = null
 		this.stage.append(this.viewer.element)
 		this.stage.addEventListener('pointerdown', event => this.#grabSwipe(event), { capture: true })
 		this.plot = new Plot(iteration => this.#selectIteration(iteration))
 		this.film = new Film()
-		this.sides = h('p', { class: 'sides', hidden: true }, 'Left and right are not known: neither scan nor job says how the patient lies. The letters are those of the table\'s axes.')
+		this.sides = h('p', { class: 'sides', hidden: true }, t('Left and right are not known: neither scan nor job says how the patient lies. The letters are those of the table\'s axes.'))
 		this.estimate = h('p', { class: 'estimate', hidden: true })
 		this.quality = h('p', { class: 'quality', title: 'Measured in the middle slices: noise in even tissue, the blur across the surface, and rings and streaks beside the noise' })
 		this.controls = h('div', { class: 'controls', hidden: true }, this.#iterationControls(), this.#viewControls(), this.#compareControls())
@@ -91,17 +99,17 @@ export class JobPage {
 		this.about = h('div', {})
 		this.geometry = h('div', {})
 		this.files = h('div', {})
-		this.courseSection = h('section', { class: 'card', hidden: true }, h('h2', {}, 'Convergence'), this.plot.element)
-		this.fileSection = h('section', { class: 'card', hidden: true }, h('h2', {}, 'Downloads'), this.files)
+		this.courseSection = h('section', { class: 'card', hidden: true }, h('h2', {}, t('Convergence')), this.plot.element)
+		this.fileSection = h('section', { class: 'card', hidden: true }, h('h2', {}, t('Downloads')), this.files)
 		this.progress = h('div', { class: 'progress' }, this.bar.element, this.doing, this.left)
 		this.columns = h('div', { class: 'columns' },
 			this.pictures = h('div', { class: 'pictures' }, this.empty, this.stage, this.estimate, this.quality, this.sides, this.controls),
-			h('div', { class: 'aside' }, this.warnings, this.tools.section, this.courseSection, this.fileSection,
-				h('section', { class: 'card' }, h('h2', {}, 'Projections'), this.film.element),
-				h('section', { class: 'card' }, h('h2', {}, 'Reconstruction'), this.about),
-				h('section', { class: 'card' }, h('h2', {}, 'Geometry'), this.geometry)))
+			h('div', { class: 'aside' }, this.warnings, this.keyImages.section, this.tools.section, this.courseSection, this.fileSection,
+				h('section', { class: 'card' }, h('h2', {}, t('Projections')), this.film.element),
+				h('section', { class: 'card' }, h('h2', {}, t('Reconstruction')), this.about),
+				h('section', { class: 'card' }, h('h2', {}, t('Geometry')), this.geometry)))
 		this.element = h('div', { class: 'job' },
-			h('header', { class: 'head' }, h('a', { class: 'back', href: '#/' }, '‹ Jobs'), h('div', { class: 'title' }, this.heading, this.badge), this.actions,
+			h('header', { class: 'head' }, h('a', { class: 'back', href: '#/' }, t('‹ Jobs')), h('div', { class: 'title' }, this.heading, this.badge), this.actions,
 				this.progress),
 			this.announce, this.trouble, this.failure,
 			this.columns)
@@ -116,33 +124,33 @@ export class JobPage {
 		this.sliderText = h('output', { for: this.slider.id, class: 'volume-name' })
 		this.marks = h('div', { class: 'marks', 'aria-hidden': 'true' })
 		this.followBox = h('input', { type: 'checkbox', checked: true, onchange: () => this.#setFollow(this.followBox.checked) })
-		this.back = h('button', { type: 'button', class: 'icon', 'aria-label': 'Previous kept iteration', title: 'Previous (←)', onclick: () => this.#step(-1) }, '‹')
-		this.forth = h('button', { type: 'button', class: 'icon', 'aria-label': 'Next kept iteration', title: 'Next (→)', onclick: () => this.#step(1) }, '›')
-		return h('div', { class: 'group iterations' }, h('label', { for: this.slider.id, class: 'label' }, 'Iteration'), this.back,
-			h('div', { class: 'track' }, this.slider, this.marks), this.forth, this.sliderText, h('label', { class: 'check' }, this.followBox, ' Newest'))
+		this.back = h('button', { type: 'button', class: 'icon', 'aria-label': t('Previous kept iteration'), title: t('Previous (←)'), onclick: () => this.#step(-1) }, '‹')
+		this.forth = h('button', { type: 'button', class: 'icon', 'aria-label': t('Next kept iteration'), title: t('Next (→)'), onclick: () => this.#step(1) }, '›')
+		return h('div', { class: 'group iterations' }, h('label', { for: this.slider.id, class: 'label' }, t('Iteration')), this.back,
+			h('div', { class: 'track' }, this.slider, this.marks), this.forth, this.sliderText, h('label', { class: 'check' }, this.followBox, ` ${t('Newest')}`))
 	}
 
 	#viewControls() {
-		this.presets = h('div', { class: 'segments', role: 'group', 'aria-label': 'Window presets' }, presets.map((preset, i) =>
+		this.presets = h('div', { class: 'segments', role: 'group', 'aria-label': t('Window presets') }, presets.map((preset, i) =>
 			h('button', { type: 'button', 'data-preset': preset.name, title: `W ${preset.window} L ${preset.level} (${i + 1})`, 'aria-pressed': 'false',
-				onclick: () => this.#view.setWindow(preset.window, preset.level) }, preset.name)),
-		h('button', { type: 'button', 'data-preset': 'Full', title: `All values (${presets.length + 1})`, 'aria-pressed': 'false', onclick: () => this.#fullWindow() }, 'Full'))
+				onclick: () => this.#view.setWindow(preset.window, preset.level) }, t(preset.name))),
+		h('button', { type: 'button', 'data-preset': 'Full', title: t('All values ({key})', { key: presets.length + 1 }), 'aria-pressed': 'false', onclick: () => this.#fullWindow() }, t('Full')))
 		const box = (label, key) => h('input', { type: 'number', 'aria-label': label, step: '10', onchange: event => {
 			const value = Number(event.target.value)
 			this.#view.setWindow(key === 'window' ? value : this.#view.window, key === 'level' ? value : this.#view.level)
 			this.#writeWindow()
 		} })
-		this.windowBox = box('Window width, HU', 'window')
-		this.levelBox = box('Window level, HU', 'level')
-		this.tiles = segments('What is shown', [['all', 'All'], ['z', ''], ['x', ''], ['y', ''], ['3d', '3D']], 'all', tile => this.#view.set({ tile, main: tile === 'all' ? this.#view.main : tile }))
+		this.windowBox = box(t('Window width, HU'), 'window')
+		this.levelBox = box(t('Window level, HU'), 'level')
+		this.tiles = segments(t('What is shown'), [['all', t('All')], ['z', ''], ['x', ''], ['y', ''], ['3d', '3D']], 'all', tile => this.#view.set({ tile, main: tile === 'all' ? this.#view.main : tile }))
 		this.#nameTiles()
 		this.readout = h('output', { class: 'readout' })
-		return [h('div', { class: 'group' }, h('span', { class: 'label' }, 'Window'), this.presets,
+		return [h('div', { class: 'group' }, h('span', { class: 'label' }, t('Window')), this.presets,
 			h('span', { class: 'numbers' }, h('label', {}, h('span', { 'aria-hidden': 'true' }, 'W'), this.windowBox), h('label', {}, h('span', { 'aria-hidden': 'true' }, 'L'), this.levelBox)), this.readout),
-		h('div', { class: 'group' }, h('span', { class: 'label' }, 'View'), this.tiles,
-			h('button', { type: 'button', class: 'quiet', title: 'Middle, straight, no zoom (r)', onclick: () => this.#view.reset() }, 'Reset'),
-			this.foldButton = h('button', { type: 'button', 'aria-pressed': 'false', title: 'Without the column beside the pictures (b)', onclick: () => this.#fold() }, 'Wide'),
-			h('button', { type: 'button', title: 'All of the screen (f)', onclick: () => this.#fullScreen() }, 'Full screen')),
+		h('div', { class: 'group' }, h('span', { class: 'label' }, t('View')), this.tiles,
+			h('button', { type: 'button', class: 'quiet', title: t('Middle, straight, no zoom (r)'), onclick: () => this.#view.reset() }, t('Reset')),
+			this.foldButton = h('button', { type: 'button', 'aria-pressed': 'false', title: t('Without the column beside the pictures (b)'), onclick: () => this.#fold() }, t('Wide')),
+			h('button', { type: 'button', title: t('All of the screen (f)'), onclick: () => this.#fullScreen() }, t('Full screen')), this.keyImages.button),
 		this.tools.element, this.tools.measuring, this.tools.slabs]
 	}
 
@@ -165,13 +173,12 @@ export class JobPage {
 	}
 
 	#compareControls() {
-		this.modes = h('div', { class: 'segments', role: 'group', 'aria-label': 'Comparison' }, [['off', 'Off'], ['side', 'Side by side'], ['swipe', 'Swipe']].map(([value, label]) =>
+		this.modes = h('div', { class: 'segments', role: 'group', 'aria-label': t('Comparison') }, [['off', t('Off')], ['side', t('Side by side')], ['swipe', t('Swipe')]].map(([value, label]) =>
 			h('button', { type: 'button', 'data-value': value, 'aria-pressed': String(value === 'off'), onclick: () => this.#compare(value) }, label)))
-		this.otherBox = h('select', { 'aria-label': 'Compare with', onchange: () => this.#showOther(this.otherBox.value) })
-		this.swipe = h('input', { type: 'range', class: 'swipe', min: '0', max: '1000', value: '500', 'aria-label': 'Swipe: how much is the other volume',
+		this.others = new Others({ job: () => this.#job, chosen: () => this.#showOther() })
+		this.swipe = h('input', { type: 'range', class: 'swipe', min: '0', max: '1000', value: '500', 'aria-label': t('Swipe: how much is the other volume'),
 			oninput: () => this.#setSwipe(Number(this.swipe.value) / 1000) })
-		this.comparing = h('span', { class: 'comparing', hidden: true }, h('label', {}, 'with ', this.otherBox))
-		return h('div', { class: 'group' }, h('span', { class: 'label' }, 'Compare'), this.modes, this.comparing, h('button', { type: 'button', class: 'quiet', onclick: () => this.#help() }, 'Keys'))
+		return h('div', { class: 'group' }, h('span', { class: 'label' }, t('Compare')), this.modes, this.others.element, h('button', { type: 'button', class: 'quiet', onclick: () => this.#help() }, t('Keys')))
 	}
 
 	/* ---- what the daemon says ---- */
@@ -227,20 +234,20 @@ export class JobPage {
 			return
 		if (error.status === 404) {
 			clearInterval(this.timer)
-			write(this.heading, 'No such job')
+			write(this.heading, t('No such job'))
 			this.progress.hidden = this.columns.hidden = true
 		}
-		replace(this.trouble, error.status ? error.message : 'The daemon cannot be reached; this page goes on by itself once it answers again.')
+		replace(this.trouble, error.status ? error.message : t('The daemon cannot be reached; this page goes on by itself once it answers again.'))
 		this.trouble.hidden = false
 	}
 
 	#showJob(before) {
 		const job = this.#job, scan = this.#scan
-		write(this.heading, scan.name || `Scan ${scan.id}`)
+		write(this.heading, nameOf(scan))
 		if (before?.state !== job.state) {
 			replace(this.badge, badge(job.state))
 			if (before) {
-				write(this.announce, `The job is ${stateWord(job.state)}`)
+				write(this.announce, t('The job is {state}', { state: stateWord(job.state) }))
 				this.refreshVolumes()
 			}
 			this.#watch()
@@ -249,7 +256,7 @@ export class JobPage {
 		if (shown)
 			this.viewer.setWhat(this.#whatOf(shown))
 		this.bar.show(job)
-		write(this.doing, job.state === 'waiting' && job.waiting_for.includes('projections') ? `${scan.received_count} of ${scan.projections.count} projections are here` : doing(job))
+		write(this.doing, job.state === 'waiting' && job.waiting_for.includes('projections') ? t('{n} of {all} projections are here', { n: scan.received_count, all: scan.projections.count }) : doing(job))
 		write(this.left, left(job) || (job.ended ? duration(job.timings.total) : ''))
 		this.title(`${ended(job) ? '' : `${Math.round(job.progress * 100)} % · `}${scan.name || scan.id}`)
 		this.#showActions(before)
@@ -257,14 +264,14 @@ export class JobPage {
 		const warnings = [...scan.warnings, ...job.warnings]
 		replace(this.warnings, warningList(warnings))
 		this.warnings.hidden = warnings.length === 0
-		replace(this.failure, job.error ? h('div', { class: 'notice bad' }, `It failed: ${job.error.detail}`) : null)
+		replace(this.failure, job.error ? h('div', { class: 'notice bad' }, t('It failed: {why}', { why: job.error.detail })) : null)
 		replace(this.about, jobFacts(job))
 		if (this.#first)
 			replace(this.geometry, geometryFacts(scan, job.patient))
 		this.#first = false
 		this.film.show(scan)
 		if (ended(job) && this.#volumes.length === 0)
-			write(this.empty, 'This job kept no volume.')
+			write(this.empty, t('This job kept no volume.'))
 		this.#showPlot()
 	}
 
@@ -273,22 +280,22 @@ export class JobPage {
 		if (before && ended(before) === ended(job) && before.cancel_requested === job.cancel_requested && before.pinned === job.pinned)
 			return
 		replace(this.actions,
-			h('button', { type: 'button', class: 'acquires', onclick: () => reconstructAgain(this.#job, 'Reconstruct again with …') }, 'Reconstruct again …'),
+			h('button', { type: 'button', class: 'acquires', onclick: () => reconstructAgain(this.#job, t('Reconstruct again with …')) }, t('Reconstruct again …')),
 			pinButton(job, jobPath(this.id), () => this.refresh()),
 			ended(job)
-				? h('button', { type: 'button', class: 'quiet danger-text acquires', onclick: () => this.#remove() }, 'Remove …')
-				: h('button', { type: 'button', class: 'danger-text acquires', disabled: job.cancel_requested, onclick: () => this.#cancel() }, 'Cancel …'))
+				? h('button', { type: 'button', class: 'quiet danger-text acquires', onclick: () => this.#remove() }, t('Remove …'))
+				: h('button', { type: 'button', class: 'danger-text acquires', disabled: job.cancel_requested, onclick: () => this.#cancel() }, t('Cancel …')))
 	}
 
 	#cancel() {
-		confirmed('Cancel this job?', 'The volumes that are kept so far stay.', 'Cancel the job', async () => {
+		confirmed(t('Cancel this job?'), t('The volumes that are kept so far stay.'), t('Cancel the job'), async () => {
 			await request('DELETE', jobPath(this.id))
 			this.refresh()
 		})
 	}
 
 	#remove() {
-		confirmed('Remove this job?', 'Its volumes are removed with it; the scan and its projections stay.', 'Remove', async () => {
+		confirmed(t('Remove this job?'), t('Its volumes are removed with it; the scan and its projections stay.'), t('Remove'), async () => {
 			await request('DELETE', jobPath(this.id))
 			location.hash = '#/'
 		})
@@ -310,7 +317,7 @@ export class JobPage {
 			if (this.#closed || JSON.stringify(volumes) === JSON.stringify(this.#volumes))
 				return
 			if (this.#volumes.length > 0 && volumes.length > this.#volumes.length)
-				write(this.announce, `New volume: ${volumes.at(-1).name}`)
+				write(this.announce, t('New volume: {name}', { name: volumes.at(-1).name }))
 			this.#volumes = volumes
 			this.#showVolumes()
 		} catch (error) {
@@ -389,15 +396,16 @@ export class JobPage {
 		const index = this.#index(), volume = this.#volumes[index]
 		this.viewer.show(this.id, volume)
 		this.slider.value = String(index)
-		const text = `${volume.name === 'final' ? 'final' : volume.name}${volume.name === 'final' || volume.iteration === 0 ? `, ${volumeText(volume)}` : ''}`
+		const text = `${t(volume.name)}${volume.name === 'final' || volume.iteration === 0 ? `, ${volumeText(volume)}` : ''}`
 		this.slider.setAttribute('aria-valuetext', text)
 		write(this.sliderText, text)
 		this.viewer.tag.textContent = volume.name
 		this.viewer.setWhat(this.#whatOf(volume))
 		this.tools.show()
+		this.keyImages.show()
 		write(this.quality, qualityText(volume.quality))
 		this.estimate.hidden = !volume.metal
-		write(this.estimate, volume.metal ? `Within ${volume.metal.estimate_within_mm} mm of metal this volume is an estimate: do not measure there.` : '')
+		write(this.estimate, volume.metal ? t('Within {mm} mm of metal this volume is an estimate: do not measure there.', { mm: volume.metal.estimate_within_mm }) : '')
 		this.back.disabled = index === 0
 		this.forth.disabled = index === this.#volumes.length - 1
 		this.#showPlot()
@@ -409,16 +417,16 @@ export class JobPage {
 		const job = this.#job
 		const method = ['cgls', 'fista'].find(name => job?.[name])?.toUpperCase() ?? 'SART'
 		const after = volume.iteration > 0 ? `${method} ${volume.iteration}` : 'FDK'
-		return `${volume.name} · ${after}${volume.stage !== 'fdk' && job?.tv ? ' + TV' : ''}${job?.metal ? ' · metal corrected' : ''}`
+		return `${volume.name} · ${after}${volume.stage !== 'fdk' && job?.tv ? ' + TV' : ''}${job?.metal ? t(' · metal corrected') : ''}`
 	}
 
 	#showFiles() {
 		if (!this.#files) {
 			const select = (label, values) => h('select', { 'aria-label': label, onchange: () => this.#writeLinks() }, values.map(([value, text]) => h('option', { value }, text)))
 			this.#files = {
-				format: select('Format', [['nifti', 'NIfTI'], ['nifti.gz', 'NIfTI, gzip'], ['mha', 'MetaImage'], ['nrrd', 'NRRD'], ['raw', 'raw']]),
-				type: select('Values', [['int16', 'HU, int16'], ['float32', '1/mm, float32']]),
-				scale: select('Resolution', [['1', 'full'], ['2', 'half'], ['4', 'quarter']]),
+				format: select(t('Format'), [['nifti', 'NIfTI'], ['nifti.gz', 'NIfTI, gzip'], ['mha', 'MetaImage'], ['nrrd', 'NRRD'], ['raw', t('raw')]]),
+				type: select(t('Values'), [['int16', 'HU, int16'], ['float32', '1/mm, float32']]),
+				scale: select(t('Resolution'), [['1', t('full')], ['2', t('half')], ['4', t('quarter')]]),
 				list: h('ul', { class: 'files' }),
 			}
 			replace(this.files, h('div', { class: 'row choices' }, this.#files.format, this.#files.type, this.#files.scale), this.#files.list)
@@ -438,27 +446,21 @@ export class JobPage {
 		replace(list, [...this.#volumes].reverse().map(volume => h('li', { class: volume.name === this.#selected ? 'current' : '' },
 			h('a', { href: volumePath(this.id, volume.name) + query, download: '' }, volume.name),
 			h('span', {}, volumeText(volume)), h('span', { class: 'amount' }, bytes(size(volume))),
-			h('a', { href: `${volumePath(this.id, volume.name)}/provenance`, title: 'Scan, projections, recipe, program and device, as digests and words' }, 'made from'))))
+			h('a', { href: `${volumePath(this.id, volume.name)}/provenance`, title: t('Scan, projections, recipe, program and device, as digests and words') }, t('made from')))))
 	}
 
 	/* ---- comparison ---- */
 
 	#listOthers() {
-		const options = this.#volumes.map(volume => h('option', { value: volume.name }, volume.name))
-		replace(this.otherBox, options)
-		if (!this.#volumes.some(volume => volume.name === this.#other))
-			this.#other = this.#volumes[0].name
-		this.otherBox.value = this.#other
-		for (const button of this.modes.children)
-			button.disabled = button.dataset.value !== 'off' && this.#volumes.length < 2
+		this.others.list(this.#volumes, this.#selected)
 		if (this.second)
-			this.#showOther(this.#other)
+			this.#showOther()
 	}
 
 	#compare(mode) {
 		this.#mode = mode
 		this.stage.dataset.mode = mode
-		this.comparing.hidden = mode === 'off'
+		this.others.element.hidden = mode === 'off'
 		for (const button of this.modes.children)
 			button.setAttribute('aria-pressed', String(button.dataset.value === mode))
 		this.second?.close()
@@ -466,7 +468,7 @@ export class JobPage {
 		this.swipe.remove()
 		if (mode === 'off')
 			return
-		this.second = this.#makeViewer('Volume to compare with', () => {})
+		this.second = this.#makeViewer(t('Volume to compare with'), () => {})
 		this.second.element.classList.add('second')
 		this.stage.append(this.second.element)
 		if (mode === 'swipe') {
@@ -475,17 +477,17 @@ export class JobPage {
 			this.stage.append(this.swipe)
 			this.#setSwipe(Number(this.swipe.value) / 1000)
 		}
-		if (this.#other === this.#selected)
-			this.#other = this.#volumes.find(volume => volume.name !== this.#selected)?.name ?? this.#selected
-		this.otherBox.value = this.#other
-		this.#showOther(this.#other)
+		this.others.avoid(this.#selected)
+		this.others.fetch(this.#abort.signal)
+		this.#showOther()
 	}
 
-	#showOther(name) {
-		this.#other = name
-		this.second.show(this.id, this.#volumes.find(volume => volume.name === name))
-		this.second.tag.textContent = name
-		this.second.setWhat(this.#whatOf(this.#volumes.find(volume => volume.name === name)))
+	async #showOther() {
+		try {
+			await this.others.show(this.second, volume => this.#whatOf(volume), this.#abort.signal)
+		} catch (error) {
+			this.#showError(error)
+		}
 	}
 
 	/* The line can be taken hold of in any tile. */
@@ -567,12 +569,13 @@ export class JobPage {
 		const keys = {
 			n: () => this.#setFollow(!this.#follow),
 			r: () => this.#view.reset(),
-			c: () => this.#volumes.length > 1 && this.#compare(modes[(modes.indexOf(this.#mode) + 1) % 3]),
+			c: () => this.#compare(modes[(modes.indexOf(this.#mode) + 1) % 3]),
 			'?': () => this.#help(),
 			Escape: () => this.#view.set({ tile: 'all', tool: 'window', clicks: [] }),
 			b: () => this.#fold(),
 			f: () => this.#fullScreen(),
 			p: () => this.tools.toggleCine(),
+			k: () => this.keyImages.ask(),
 			',': () => this.#step(-1),
 			'.': () => this.#step(1),
 		}
@@ -585,14 +588,15 @@ export class JobPage {
 	}
 
 	#help() {
-		const rows = [['← →', 'iteration before, iteration after (also , and .)'], ['↑ ↓', 'slice by slice; Page Up, Page Down ten; Home, End'],
-			['Shift + arrows', 'level up and down, window wider and narrower'], ['1 2 3 4', 'bone, soft tissue, lung, full'], ['+ −', 'zoom'],
-			['m', 'this plane only, and back; it is then the larger one'], ['[ ]', 'turn the other two planes about this one'], ['Enter', 'measuring: takes the point at the cross'], ['b f p', 'wide, full screen, cine'], ['c', 'compare: off, side by side, swipe'], ['n', 'newest volume: go with it or stay'], ['r', 'middle, straight, no zoom'],
-			['Mouse', 'drag: window and level; click: the cross; its handles: turn the other planes; wheel: slices; Ctrl + wheel: zoom; right button: window; middle button: pan'],
-			['Touch', 'drag: slices; tap, or rest and drag: the cross; two fingers: zoom and pan']]
-		const dialog = openDialog('Keys and gestures', h('p', {}, 'The arrows act on the plane that has the focus.'),
+		const rows = [['← →', t('iteration before, iteration after (also , and .)')], ['↑ ↓', t('slice by slice; Page Up, Page Down ten; Home, End')],
+			[t('Shift + arrows'), t('level up and down, window wider and narrower')], ['1 2 3 4', t('bone, soft tissue, lung, full')], ['+ −', t('zoom')],
+			['m', t('this plane only, and back; it is then the larger one')], ['[ ]', t('turn the other two planes about this one')], ['Enter', t('measuring: takes the point at the cross')],
+			['b f p', t('wide, full screen, cine')], ['k', t('key image')], ['c', t('compare: off, side by side, swipe')], ['n', t('newest volume: go with it or stay')], ['r', t('middle, straight, no zoom')],
+			[t('Mouse'), t('drag: window and level; click: the cross; its handles: turn the other planes; wheel: slices; Ctrl + wheel: zoom; right button: window; middle button: pan')],
+			[t('Touch'), t('drag: slices; tap, or rest and drag: the cross; two fingers: zoom and pan')]]
+		const dialog = openDialog(t('Keys and gestures'), h('p', {}, t('The arrows act on the plane that has the focus.')),
 			h('dl', { class: 'keys' }, rows.map(([key, what]) => h('div', {}, h('dt', {}, key), h('dd', {}, what)))),
-			h('div', { class: 'row end' }, h('button', { type: 'button', onclick: () => dialog.close() }, 'Close')))
+			h('div', { class: 'row end' }, h('button', { type: 'button', onclick: () => dialog.close() }, t('Close'))))
 	}
 
 	close() {

@@ -5,6 +5,8 @@ import { ListPage } from './lists.js'
 import { JobPage } from './job.js'
 import { ScanPage } from './scan.js'
 import { keepSession } from './session.js'
+import { themeButton } from './theme.js'
+import { loadLanguage, languages, language, chooseLanguage, t } from './lang.js'
 
 const devicesTime = 10000 /* ms */
 
@@ -14,6 +16,8 @@ const routes = [
 	[/^#\/scans\/([^/]+)$/, (tools, scan) => new ScanPage(decodeURIComponent(scan), tools)],
 ]
 
+await loadLanguage()
+
 const main = document.querySelector('main')
 const live = h('span', { class: 'live', role: 'status' })
 const devices = h('span', { class: 'devices' })
@@ -21,7 +25,11 @@ const quarantine = h('span', { class: 'devices bad' })
 const aside = h('div', { class: 'notice bad', role: 'status', hidden: true })
 main.before(aside)
 const status = document.querySelector('.status')
-status.append(quarantine, devices, live)
+const tongue = h('select', { 'aria-label': t('Language'), class: 'tongue', onchange: event => chooseLanguage(event.target.value) },
+	languages.map(code => h('option', { value: code, selected: code === language() }, code.toUpperCase())))
+status.append(quarantine, devices, live, tongue, themeButton())
+for (const [selector, text] of [['.skip', t('To the content')], ['footer [href="/plain"]', t('Plain page')], ['footer [href="/v1/openapi.json"]', t('Interface')], ['footer [href*=licences]', t('Licences')]])
+	document.querySelector(selector).textContent = text
 
 let page = null
 let known = false /* who uses the page */
@@ -31,7 +39,7 @@ const tools = {
 	/* true: events come; false: the connection is broken; null: nothing is listened to. */
 	live: connected => {
 		live.dataset.state = connected === null ? 'off' : connected ? 'on' : 'broken'
-		write(live, connected === null ? '' : connected ? 'live' : 'reconnecting …')
+		write(live, connected === null ? '' : connected ? t('live') : t('reconnecting …'))
 	},
 }
 
@@ -45,7 +53,7 @@ function open() {
 			break
 		}
 	}
-	replace(main, page ? page.element : h('p', { class: 'empty' }, 'There is nothing here. ', h('a', { href: '#/' }, 'All jobs')))
+	replace(main, page ? page.element : h('p', { class: 'empty' }, t('There is nothing here. '), h('a', { href: '#/' }, t('All jobs'))))
 	scrollTo(0, 0)
 }
 
@@ -58,7 +66,7 @@ function showAside(list) {
 	aside.hidden = list.length === 0
 	replace(aside, list.map(device => {
 		const trouble = h('span', { class: 'trouble' })
-		const clear = h('button', { type: 'button', class: 'administers', 'aria-label': `Clear device ${device.device_index}`, onclick: async () => {
+		const clear = h('button', { type: 'button', class: 'administers', 'aria-label': t('Clear device {n}', { n: device.device_index }), onclick: async () => {
 			clear.disabled = true
 			try {
 				await request('POST', `/v1/devices/${device.index}/clear`)
@@ -67,8 +75,8 @@ function showAside(list) {
 				write(trouble, error.message)
 				clear.disabled = false
 			}
-		} }, 'Clear')
-		return h('p', {}, `Device ${device.device_index}${device.device ? ` (${device.device})` : ''} is set aside after ${device.errors} errors and is given no jobs: ${device.last_error ?? 'no reason is known'} `, clear, ' ', trouble)
+		} }, t('Clear'))
+		return h('p', {}, t('Device {n} is set aside after {errors} errors and is given no jobs: {why} ', { n: `${device.device_index}${device.device ? ` (${device.device})` : ''}`, errors: device.errors, why: device.last_error ?? t('no reason is known') }), clear, ' ', trouble)
 	}))
 }
 
@@ -80,11 +88,11 @@ async function showDevices() {
 		const able = list.filter(device => device.answers)
 		const without = list.filter(device => device.set_aside).length
 		showAside(list.filter(device => device.set_aside))
-		write(devices, able.length > 0 ? able.map(device => device.device ?? device.backend).join(', ') + (without > 0 ? `, ${without} set aside` : '') : 'no worker can take a job')
+		write(devices, able.length > 0 ? able.map(device => device.device ?? device.backend).join(', ') + (without > 0 ? t(', {n} set aside', { n: without }) : '') : t('no worker can take a job'))
 		devices.classList.toggle('bad', able.length === 0 || without > 0)
 		const { entries } = await get('/v1/quarantine')
-		write(quarantine, entries.length > 0 ? `${entries.length} set aside in quarantine` : '')
-		quarantine.title = entries.map(entry => `${entry.from ?? entry.name}: ${entry.why ?? 'no note'}`).join('\n')
+		write(quarantine, entries.length > 0 ? t('{n} set aside in quarantine', { n: entries.length }) : '')
+		quarantine.title = entries.map(entry => `${entry.from ?? entry.name}: ${entry.why ?? t('no note')}`).join('\n')
 	} catch {
 		write(devices, '')
 		write(quarantine, '')

@@ -113,29 +113,3 @@ export function resultOf(item, grid) {
 	const values = found.count > 0 ? `${minusSign(found.mean.toFixed(1))} ± ${found.deviation.toFixed(1)} HU, ` : ''
 	return `${values}${found.area < 100 ? found.area.toFixed(1) : Math.round(found.area)} mm²`
 }
-
-/* The measurements of a job; listeners are told of each change. */
-export class Measurements extends EventTarget {
-	items = []
-
-	#tell(own) {
-		this.dispatchEvent(new CustomEvent('change', { detail: { own } }))
-	}
-
-	add(kind, points) {
-		const number = 1 + Math.max(0, ...this.items.map(item => Number(item.id) || 0))
-		this.items = [...this.items, { id: String(number), kind, points }]
-		this.#tell(true)
-	}
-
-	remove(id) {
-		this.items = this.items.filter(item => item.id !== id)
-		this.#tell(true)
-	}
-
-	/* As somebody else has left them. */
-	replace(items) {
-		this.items = items
-		this.#tell(false)
-	}
-}

@@ -86,7 +86,7 @@ export class Overlay {
 	}
 
 	#shape(item, grid) {
-		const places = (item.kind === 'ellipse' ? ellipse(item.points) : item.points).map(point => this.at(point))
+		const places = corners(item).map(point => this.at(point))
 		const closed = item.kind === 'ellipse' || item.kind === 'freehand' && item !== this.draft
 		const path = svg('path', { d: `M${places.map(([x, y]) => `${x.toFixed(1)},${y.toFixed(1)}`).join('L')}${closed ? 'Z' : ''}` })
 		const ends = closed || item.kind === 'freehand' ? [] : places.map(([x, y]) => svg('circle', { cx: x, cy: y, r: 3 }))
@@ -97,6 +97,9 @@ export class Overlay {
 		return svg('g', { class: `shape ${item.kind}`, 'data-id': item.id ?? 'draft' }, path, ...ends, text)
 	}
 }
+
+/* What is drawn of a measurement: its points, of an ellipse points on it. */
+export const corners = item => item.kind === 'ellipse' ? ellipse(item.points) : item.points
 
 /* Its corners; a point until the drag has moved. */
 function ellipse([middle, first = middle, second = first]) {

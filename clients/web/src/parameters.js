@@ -70,19 +70,19 @@ export const members = [...new Set([...groups.flatMap(({ pointer, fields }) => p
 /* ---- as words ---- */
 
 /* The value of a field in a job, with its unit; null where the job has none. */
-export function valueText(job, { pointer, label, zero, write, empty }, format) {
+export function valueText(job, { pointer, label, zero, write, empty }, format, t = text => text) {
 	const value = at(job, pointer), unit = label.split(', ')[1]
 	if (value === undefined || value === null)
 		return null
 	if (write)
-		return write(value) || empty
+		return write(value) || t(empty)
 	if (typeof value === 'boolean')
-		return value ? 'yes' : 'no'
-	return typeof value !== 'number' ? String(value) : value === 0 && zero ? zero : `${format(value)}${unit ? ` ${unit}` : ''}`
+		return t(value ? 'yes' : 'no')
+	return typeof value !== 'number' ? String(value) : value === 0 && zero ? t(zero) : `${format(value)}${unit ? ` ${unit}` : ''}`
 }
 
 /* All fields of a stage that the job has: "window hann, cutoff 1 of Nyquist". */
-export function stageText(job, group, format) {
-	const name = ({ label }) => label.split(', ')[0].toLowerCase()
-	return group.fields.map(field => [name(field), valueText(job, field, format)]).filter(([, text]) => text !== null).map(parts => parts.join(' ')).join(', ')
+export function stageText(job, group, format, t = text => text) {
+	const name = ({ label }) => t(label).split(', ')[0].toLowerCase()
+	return group.fields.map(field => [name(field), valueText(job, field, format, t)]).filter(([, text]) => text !== null).map(parts => parts.join(' ')).join(', ')
 }

@@ -11,6 +11,7 @@ import { layersOf, samplePlane } from './sample.js'
 import { times } from './vector.js'
 import { Overlay } from './overlay.js'
 import { Gestures } from './gestures.js'
+import { t } from './lang.js'
 
 const narrowMost = 280 /* px: below, there is no room for words beside the letters */
 const quickMost = 1.5e6 /* samples that are taken at once; a finer picture follows, piece by piece */
@@ -40,7 +41,7 @@ function drawPlane({ size: [nx, ny], voxels }, name, index, width, height, table
 
 export class Plane {
 	#view
-	#source = null /* { job, volume } */
+	#source = null /* { job, volume, linked } */
 	#grid = null /* with voxels, once they are here */
 	#loading = false
 	#stale = false
@@ -79,7 +80,7 @@ export class Plane {
 		this.what = h('div', { class: 'what' })
 		this.slider = h('input', { type: 'range', class: 'depth', min: '0', step: '1',
 			oninput: () => this.#view.setDepth(this.name, Number(this.slider.value)) })
-		this.enlarge = h('button', { type: 'button', class: 'maximise', title: 'This one only (m)',
+		this.enlarge = h('button', { type: 'button', class: 'maximise', title: t('This one only (m)'),
 			'aria-pressed': 'false', onclick: () => this.maximise() })
 		this.title = h('span', { class: 'name' })
 		this.edges = Object.fromEntries(['left', 'right', 'top', 'bottom'].map(side => [side, h('span', { class: `edge ${side}`, 'aria-hidden': 'true' })]))
@@ -91,10 +92,10 @@ export class Plane {
 	#writeSides() {
 		const { sides } = this.#view
 		const name = this.#name(), edges = this.#edgeLetters()
-		write(this.title, sides === null ? `${name} plane` : name)
-		this.element.setAttribute('aria-label', `${name} plane`)
-		this.slider.setAttribute('aria-label', `${name} plane`)
-		this.enlarge.setAttribute('aria-label', `Show the ${name.toLowerCase()} plane only`)
+		write(this.title, sides === null ? t('{name} plane', { name }) : name)
+		this.element.setAttribute('aria-label', t('{name} plane', { name }))
+		this.slider.setAttribute('aria-label', t('{name} plane', { name }))
+		this.enlarge.setAttribute('aria-label', t('Show the {name} plane only', { name: name.toLowerCase() }))
 		for (const [side, letters] of Object.entries(edges)) {
 			write(this.edges[side], letters)
 			this.edges[side].title = lettersInWords(letters)
@@ -106,7 +107,7 @@ export class Plane {
 	}
 
 	#name() {
-		return `${planeName(this.#view.sides, this.name)}${this.#isStraight() ? '' : ', turned'}`
+		return `${planeName(this.#view.sides, this.name)}${this.#isStraight() ? '' : t(', turned')}`
 	}
 
 	#edgeLetters() {
@@ -169,9 +170,9 @@ export class Plane {
 	#setDepth() {
 		const view = this.#view, { across } = planes[this.name], { thickness, mode } = view.slab
 		const { count, index, mm } = view.depth(this.name)
-		const slab = thickness > 0 ? `, ${{ mean: 'mean', max: 'MIP', min: 'minimum' }[mode]} of ${thickness} mm` : ''
+		const slab = thickness > 0 ? t(', {mode} of {mm} mm', { mode: { mean: t('mean'), max: 'MIP', min: t('minimum') }[mode], mm: thickness }) : ''
 		const place = `${mm.toFixed(1).replace('-', '−')} mm`
-		const text = this.#isStraight() ? `${index + 1} of ${count}, ${axes[across]} ${place}${slab}` : `${place} from the middle${slab}`
+		const text = this.#isStraight() ? `${t('{n} of {all}', { n: index + 1, all: count })}, ${axes[across]} ${place}${slab}` : `${t('{place} from the middle', { place })}${slab}`
 		this.slider.max = String(count - 1)
 		this.slider.value = String(index)
 		this.slider.setAttribute('aria-valuetext', text)
@@ -213,7 +214,7 @@ export class Plane {
 			grayTable(view.window, view.level, this.#table)
 			this.#tableOf = `${view.window} ${view.level}`
 		}
-		if (this.#isStraight() && view.slab.thickness === 0)
+		if (this.#isStraight() && view.slab.thickness === 0 && !this.#source.linked)
 			this.#drawVoxels()
 		else
 			this.#drawSamples()
@@ -298,7 +299,7 @@ export class Plane {
 		const slab = thickness > 0 ? `&thickness=${thickness}&mode=${mode}` : ''
 		const gray = `&window=${view.window}&level=${view.level}`
 		const path = `${volumePath(job, volume.name)}/slice`
-		if (this.#isStraight())
+		if (this.#isStraight() && !this.#source.linked)
 			return `${path}?axis=${this.name}&index=${view.index(across)}${gray}${slab}`
 		const frame = view.frame(this.name), pitch = Math.max(Math.min(...view.grid.spacing), frame.width / 1024, frame.height / 1024)
 		const list = numbers => numbers.map(part => part.toFixed(6)).join(',')
@@ -332,7 +333,7 @@ export class Plane {
 	}
 
 	#reveal(which) {
-		const text = `${this.#name()} plane of ${this.#source.volume.name} at ${this.where.textContent}`
+		const text = t('{plane} plane of {volume} at {place}', { plane: this.#name(), volume: this.#source.volume.name, place: this.where.textContent })
 		this.canvas.hidden = which !== this.canvas
 		this.image.hidden = which !== this.image
 		if (which === this.image)

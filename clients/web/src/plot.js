@@ -4,6 +4,7 @@
  * of magnitude. The same numbers stand in a table for those who do not see it.
  */
 import { h, svg, replace, number, superscript, duration } from './dom.js'
+import { t } from './lang.js'
 
 const series = [
 	{ key: 'residual', name: 'Residual', hint: '‖p − A v‖ / ‖p‖' },
@@ -66,8 +67,8 @@ export class Plot {
 		this.picture = svg('svg', { class: 'plot', role: 'img' })
 		this.reading = h('p', { class: 'reading' })
 		this.table = h('table', {})
-		this.details = h('details', { ontoggle: () => this.#fill() }, h('summary', {}, 'As a table'), 
-			h('div', { class: 'scroll', tabindex: '0', role: 'region', 'aria-label': 'History as a table' }, this.table))
+		this.details = h('details', { ontoggle: () => this.#fill() }, h('summary', {}, t('As a table')), 
+			h('div', { class: 'scroll', tabindex: '0', role: 'region', 'aria-label': t('History as a table') }, this.table))
 		this.element = h('div', { class: 'course' }, this.picture, this.reading, this.details)
 		this.picture.addEventListener('pointermove', event => this.#point(event))
 		this.picture.addEventListener('pointerleave', () => this.#read(this.#selectedRow()))
@@ -103,8 +104,8 @@ export class Plot {
 		const last = this.#rows.at(-1)
 		const height = series.length * panel + foot
 		this.picture.setAttribute('viewBox', `0 0 ${width} ${height}`)
-		this.picture.setAttribute('aria-label', `Convergence over ${this.#rows.length} iterations: ` +
-			series.map(one => `${one.name.toLowerCase()} ${number(last[one.key])}`).join(', '))
+		this.picture.setAttribute('aria-label', t('Convergence over {n} iterations: ', { n: this.#rows.length }) +
+			series.map(one => `${t(one.name).toLowerCase()} ${number(last[one.key])}`).join(', '))
 		this.cursor = svg('line', { class: 'cursor', y1: top - 6, y2: series.length * panel })
 		replace(this.picture, series.map((one, i) => this.#panel(one, i * panel)), this.#iterations(series.length * panel), this.cursor)
 		this.#setCursor(this.#selected)
@@ -115,14 +116,14 @@ export class Plot {
 		const y0 = offset + top, y1 = offset + panel - 8
 		let low = Math.log10(Math.min(...values)), high = Math.log10(Math.max(...values))
 		if (!Number.isFinite(low))
-			return svg('text', { class: 'name', x: left, y: offset + 14 }, `${one.name}: no value above zero`)
+			return svg('text', { class: 'name', x: left, y: offset + 14 }, t('{name}: no value above zero', { name: t(one.name) }))
 		const margin = Math.max((high - low) * 0.08, 0.04)
 		low -= margin
 		high += margin
 		const y = value => y1 - (Math.log10(value) - low) / (high - low) * (y1 - y0)
 		const group = svg('g', { class: `panel ${one.key}` },
-			svg('text', { class: 'name', x: left, y: offset + 14 }, one.name),
-			svg('text', { class: 'hint', x: width - right, y: offset + 14, 'text-anchor': 'end' }, one.hint))
+			svg('text', { class: 'name', x: left, y: offset + 14 }, t(one.name)),
+			svg('text', { class: 'hint', x: width - right, y: offset + 14, 'text-anchor': 'end' }, t(one.hint)))
 		for (const tick of ticks(low, high)) {
 			const at = y(10 ** tick.at)
 			group.append(svg('line', { class: 'grid', x1: left, x2: width - right, y1: at, y2: at }),
@@ -141,7 +142,7 @@ export class Plot {
 		const first = this.#rows[0].iteration, last = this.#rows.at(-1).iteration
 		return svg('g', { class: 'iterations' }, ...steps(first, Math.max(last, first + 1)).filter(step => step <= last || first === last && step === first)
 			.map(step => svg('text', { class: 'tick', x: this.#x(step), y: at + 10, 'text-anchor': 'middle' }, String(step))),
-		svg('text', { class: 'hint', x: 0, y: at + 10 }, 'iteration'))
+		svg('text', { class: 'hint', x: 0, y: at + 10 }, t('iteration')))
 	}
 
 	#setCursor(iteration) {
@@ -172,8 +173,8 @@ export class Plot {
 	}
 
 	#read(row) {
-		this.reading.textContent = `Iteration ${row.iteration}: residual ${number(row.residual)}, change ${number(row.change)}, ` +
-			`TV ${number(row.tv)}, ${duration(row.seconds)}${this.#kept.has(row.iteration) ? ', kept' : ''}`
+		this.reading.textContent = t('Iteration {n}: residual {residual}, change {change}, TV {tv}, {time}',
+			{ n: row.iteration, residual: number(row.residual), change: number(row.change), tv: number(row.tv), time: duration(row.seconds) }) + (this.#kept.has(row.iteration) ? t(', kept') : '')
 		if (row.iteration === this.#selected || !this.picture.matches(':hover'))
 			this.#setCursor(this.#selected)
 	}
@@ -181,8 +182,8 @@ export class Plot {
 	#fill() {
 		if (!this.details.open)
 			return
-		const head = ['Iteration', 'Residual', 'Change', 'TV', 'Time'].map(name => h('th', { scope: 'col' }, name))
-		replace(this.table, h('caption', { class: 'hidden' }, 'History'), h('thead', {}, h('tr', {}, head)),
+		const head = [t('Iteration'), t('Residual'), t('Change'), 'TV', t('Time')].map(name => h('th', { scope: 'col' }, name))
+		replace(this.table, h('caption', { class: 'hidden' }, t('History')), h('thead', {}, h('tr', {}, head)),
 			h('tbody', {}, this.#rows.slice(-1000).map(row => h('tr', {}, h('th', { scope: 'row' }, String(row.iteration)),
 				h('td', {}, number(row.residual)), h('td', {}, number(row.change)), h('td', {}, number(row.tv)), h('td', {}, duration(row.seconds))))))
 	}

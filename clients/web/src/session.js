@@ -6,6 +6,7 @@
  */
 import { h, replace } from './dom.js'
 import { request } from './api.js'
+import { t } from './lang.js'
 
 /* Resolves with who it is; null: somebody has to sign in. What else goes wrong is thrown. */
 async function identify() {
@@ -21,7 +22,7 @@ async function identify() {
 function tokenForm(done) {
 	const input = h('input', { id: 'token', type: 'password', required: true, autocomplete: 'current-password', spellcheck: 'false' })
 	const trouble = h('p', { class: 'trouble', role: 'alert', hidden: true })
-	const submit = h('button', { class: 'primary' }, 'Sign in')
+	const submit = h('button', { class: 'primary' }, t('Sign in'))
 
 	async function send(event) {
 		event.preventDefault()
@@ -31,14 +32,14 @@ function tokenForm(done) {
 			await request('POST', '/v1/session', { headers: { Authorization: `Bearer ${input.value.trim()}` } })
 			done()
 		} catch (error) {
-			trouble.textContent = error.status === 401 ? 'No valid token.' : error.message
+			trouble.textContent = error.status === 401 ? t('No valid token.') : error.message
 			trouble.hidden = false
 			submit.disabled = false
 			input.select()
 		}
 	}
-	return h('form', { class: 'card signin', onsubmit: send }, h('h1', {}, 'Sign in'),
-		h('label', { for: 'token' }, 'Token'), input, trouble, h('div', { class: 'row end' }, submit))
+	return h('form', { class: 'card signin', onsubmit: send }, h('h1', {}, t('Sign in')),
+		h('label', { for: 'token' }, t('Token')), input, trouble, h('div', { class: 'row end' }, submit))
 }
 
 /*
@@ -48,7 +49,7 @@ function tokenForm(done) {
  */
 export function keepSession({ main, status, open, close }) {
 	const name = h('span', {})
-	const leave = h('button', { type: 'button', class: 'quiet', onclick: signOut }, 'Sign out')
+	const leave = h('button', { type: 'button', class: 'quiet', onclick: signOut }, t('Sign out'))
 	const who = h('span', { class: 'who', hidden: true }, name, ' ', leave)
 	let opened = false
 	status.append(who)

@@ -1,8 +1,9 @@
 /* The tile of the rendering. Without WebGL 2 it shows a contact sheet that the daemon draws. */
 import { h, write, inFrame, throttle } from './dom.js'
 import { volumePath } from './api.js'
-import { fetchVoxels, scaleFor } from './voxels.js'
+import { fetchVoxels, scaleFor, thinned } from './voxels.js'
 import { lettersInWords, planeEdges, renderingEdges } from './view.js'
+import { t } from './lang.js'
 
 const settleTime = 150 /* ms: the rendering follows the window once the hand rests; each change costs a whole volume */
 
@@ -42,14 +43,14 @@ export class Spatial {
 	constructor(view) {
 		this.#view = view
 		this.note = h('p', { class: 'note' })
-		this.canvas = h('canvas', { class: 'render', role: 'img', 'aria-label': 'Rendering in three dimensions' })
+		this.canvas = h('canvas', { class: 'render', role: 'img', 'aria-label': t('Rendering in three dimensions') })
 		this.sheet = h('img', { class: 'sheet', alt: '', hidden: true })
 		this.stage = h('div', { class: 'stage' }, this.canvas, this.sheet, h('div', { class: 'grip' }))
-		this.maximise = h('button', { type: 'button', class: 'maximise', title: 'This one only (m)', 'aria-label': 'Show the rendering only',
+		this.maximise = h('button', { type: 'button', class: 'maximise', title: t('This one only (m)'), 'aria-label': t('Show the rendering only'),
 			'aria-pressed': 'false', onclick: () => this.#maximise() })
 		this.edges = Object.fromEntries(['left', 'right', 'top', 'bottom'].map(side => [side, h('span', { class: `edge ${side}`, 'aria-hidden': 'true' })]))
 		this.what = h('div', { class: 'what' })
-		this.element = h('section', { class: 'tile spatial', tabindex: '0', 'aria-label': 'Rendering', 'data-plane': '3d' },
+		this.element = h('section', { class: 'tile spatial', tabindex: '0', 'aria-label': t('Rendering'), 'data-plane': '3d' },
 			this.stage, h('div', { class: 'caption' }, h('span', { class: 'name' }, '3D')), this.what, this.maximise, Object.values(this.edges), this.note)
 		this.turn = inFrame(() => this.#render?.turn(this.#view))
 		this.settle = throttle(settleTime, () => this.#settle())
@@ -111,7 +112,7 @@ export class Spatial {
 				this.canvas.addEventListener('webglcontextlost', () => this.#fail())
 			}
 			if (this.#grid === null) {
-				const grid = await fetchVoxels(source.job, source.volume, scaleFor(source.volume, voxelsMost()))
+				const grid = source.grid ? thinned(source.grid, voxelsMost()) : await fetchVoxels(source.job, source.volume, scaleFor(source.volume, voxelsMost()))
 				if (source !== this.#source)
 					return
 				await this.#render.show(grid, this.#view)
@@ -135,13 +136,15 @@ export class Spatial {
 
 	#showSheet() {
 		const { job, volume } = this.#source
+		if (job === null)
+			return
 		const { window, level } = this.#view
 		this.canvas.hidden = true
 		this.sheet.hidden = false
 		this.#writeSides()
 		this.sheet.src = `${volumePath(job, volume.name)}/slice?sheet=1&axis=z&window=${window}&level=${level}`
-		this.sheet.alt = `Contact sheet of ${volume.name}`
-		this.note.textContent = 'This browser has no WebGL 2: a contact sheet in place of the rendering'
+		this.sheet.alt = t('Contact sheet of {name}', { name: volume.name })
+		this.note.textContent = t('This browser has no WebGL 2: a contact sheet in place of the rendering')
 		this.element.dataset.shown = volume.name
 	}
 

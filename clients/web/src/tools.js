@@ -1,12 +1,13 @@
 /* Beside the pictures: what dragging does, measuring, slabs, cine and full screen. */
 import { h, replace, write } from './dom.js'
 import { kinds, lengthOf, angleOf, resultOf, statisticsOf } from './measure.js'
+import { t } from './lang.js'
 
 const thicknesses = [0, 1, 2, 3, 5, 10, 15, 20, 30] /* mm */
 const cineTime = 60 /* ms a slice */
-const hands = [['scroll', 'Slices', 'Dragging goes through the slices'], ['window', 'Window', 'Dragging changes window and level; a click moves the cross'],
-	['cross', 'Cross', 'Dragging moves the cross'], ['pan', 'Pan', 'Dragging moves a zoomed plane']]
-const axisHint = 'Click two points of a screw, or of any line: planes are laid along it and across it'
+const hands = () => [['scroll', t('Slices'), t('Dragging goes through the slices')], ['window', t('Window'), t('Dragging changes window and level; a click moves the cross')],
+	['cross', t('Cross'), t('Dragging moves the cross')], ['pan', t('Pan'), t('Dragging moves a zoomed plane')]]
+const axisHint = () => t('Click two points of a screw, or of any line: planes are laid along it and across it')
 
 export const segments = (name, entries, current, act) => h('div', { class: 'segments', role: 'group', 'aria-label': name }, entries.map(([value, label, hint]) =>
 	h('button', { type: 'button', title: hint ?? null, 'data-value': value, 'aria-pressed': String(value === current), onclick: () => act(value) }, label)))
@@ -26,23 +27,23 @@ export class Tools {
 		this.measurements = measurements
 		this.voxels = voxels
 		this.facts = facts
-		this.hands = segments('What dragging does', hands, view.tool, tool => this.#choose(tool))
-		this.measures = segments('Measure', [...Object.entries(kinds).map(([kind, { name, hint }]) => [kind, name, hint]), ['axis', 'Along a line', axisHint]],
+		this.hands = segments(t('What dragging does'), hands(), view.tool, tool => this.#choose(tool))
+		this.measures = segments(t('Measure'), [...Object.entries(kinds).map(([kind, { name, hint }]) => [kind, t(name), t(hint)]), ['axis', t('Along a line'), axisHint()]],
 			view.tool, tool => this.#choose(tool === view.tool ? 'window' : tool))
 		this.hint = h('span', { class: 'hint', role: 'status' })
-		this.thickness = h('select', { 'aria-label': 'Thickness', onchange: () => this.#setSlab() },
-			thicknesses.map(mm => h('option', { value: String(mm) }, mm === 0 ? 'thin' : `${mm} mm`)))
-		this.mode = h('select', { 'aria-label': 'Slab shows', disabled: true, onchange: () => this.#setSlab() },
-			[['mean', 'mean'], ['max', 'maximum (MIP)'], ['min', 'minimum']].map(([value, text]) => h('option', { value }, text)))
-		this.straight = h('button', { type: 'button', class: 'quiet', title: 'Planes along the axes again', disabled: true, onclick: () => view.straighten() }, 'Straighten')
-		this.cine = h('button', { type: 'button', 'aria-pressed': 'false', title: 'Through all slices, and back (p)', onclick: () => this.toggleCine() }, 'Cine')
-		this.element = h('div', { class: 'group' }, h('span', { class: 'label' }, 'Drag'), this.hands)
-		this.measuring = h('div', { class: 'group' }, h('span', { class: 'label' }, 'Measure'), this.measures, this.hint)
-		this.slabs = h('div', { class: 'group' }, h('span', { class: 'label' }, 'Slab'), this.thickness, this.mode, this.straight, this.cine)
+		this.thickness = h('select', { 'aria-label': t('Thickness'), onchange: () => this.#setSlab() },
+			thicknesses.map(mm => h('option', { value: String(mm) }, mm === 0 ? t('thin') : `${mm} mm`)))
+		this.mode = h('select', { 'aria-label': t('Slab shows'), disabled: true, onchange: () => this.#setSlab() },
+			[['mean', t('mean')], ['max', t('maximum (MIP)')], ['min', t('minimum')]].map(([value, text]) => h('option', { value }, text)))
+		this.straight = h('button', { type: 'button', class: 'quiet', title: t('Planes along the axes again'), disabled: true, onclick: () => view.straighten() }, t('Straighten'))
+		this.cine = h('button', { type: 'button', 'aria-pressed': 'false', title: t('Through all slices, and back (p)'), onclick: () => this.toggleCine() }, t('Cine'))
+		this.element = h('div', { class: 'group' }, h('span', { class: 'label' }, t('Drag')), this.hands)
+		this.measuring = h('div', { class: 'group' }, h('span', { class: 'label' }, t('Measure')), this.measures, this.hint)
+		this.slabs = h('div', { class: 'group' }, h('span', { class: 'label' }, t('Slab')), this.thickness, this.mode, this.straight, this.cine)
 		this.list = h('ul', { class: 'measurements' })
-		this.save = h('button', { type: 'button', onclick: () => this.#export() }, 'Export')
+		this.save = h('button', { type: 'button', onclick: () => this.#export() }, t('Export'))
 		this.trouble = h('p', { class: 'trouble', role: 'alert', hidden: true })
-		this.section = h('section', { class: 'card', hidden: true }, h('h2', {}, 'Measurements'), this.trouble, this.list, this.save)
+		this.section = h('section', { class: 'card', hidden: true }, h('h2', {}, t('Measurements')), this.trouble, this.list, this.save)
 		view.addEventListener('change', this.follow = ({ detail }) => this.#update(detail))
 		measurements.addEventListener('change', () => this.show())
 	}
@@ -56,7 +57,7 @@ export class Tools {
 		if (changed.tool) {
 			press(this.hands, view.tool)
 			press(this.measures, view.tool)
-			write(this.hint, view.tool === 'axis' ? axisHint : kinds[view.tool] ? `${kinds[view.tool].hint}; Enter takes the cross` : '')
+			write(this.hint, view.tool === 'axis' ? axisHint() : kinds[view.tool] ? `${t(kinds[view.tool].hint)}; ${t('Enter takes the cross')}` : '')
 		}
 		if (changed.turn)
 			this.straight.disabled = ['x', 'y', 'z'].every(name => view.isStraight(name))
@@ -94,9 +95,9 @@ export class Tools {
 		this.trouble.hidden = true
 		this.section.hidden = items.length === 0
 		replace(this.list, items.map(item => h('li', { 'data-id': item.id },
-			h('button', { type: 'button', class: 'quiet', title: 'Go there', onclick: () => this.#goTo(item) }, `${item.id}: ${kinds[item.kind].name}`),
+			h('button', { type: 'button', class: 'quiet', title: t('Go there'), onclick: () => this.#goTo(item) }, `${item.id}: ${t(kinds[item.kind].name)}`),
 			h('span', { class: 'amount' }, resultOf(item, grid)),
-			h('button', { type: 'button', class: 'icon', 'aria-label': `Remove measurement ${item.id}`, onclick: () => this.measurements.remove(item.id) }, '×'))))
+			h('button', { type: 'button', class: 'icon', 'aria-label': t('Remove measurement {id}', { id: item.id }), onclick: () => this.measurements.remove(item.id) }, '×'))))
 	}
 
 	/* What went wrong with keeping them; until the next change. */

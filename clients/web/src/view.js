@@ -5,6 +5,7 @@
  */
 
 import { add, cross as crossProduct, dot, flat, minus, norm, times, turned, unit } from './vector.js'
+import { t } from './lang.js'
 
 /* Hounsfield units. */
 export const presets = [
@@ -29,8 +30,8 @@ export const planes = {
  * how the patient lies: then nothing here says left, right, front, back, head or feet.
  */
 const opposite = { R: 'L', L: 'R', A: 'P', P: 'A', S: 'I', I: 'S' }
-const words = { R: 'right', L: 'left', A: 'anterior', P: 'posterior', S: 'superior', I: 'inferior' }
-const names = { L: 'Sagittal', R: 'Sagittal', A: 'Coronal', P: 'Coronal', S: 'Axial', I: 'Axial' }
+const words = () => ({ R: t('right'), L: t('left'), A: t('anterior'), P: t('posterior'), S: t('superior'), I: t('inferior') })
+const names = { L: 'Sagittal', R: 'Sagittal', A: 'Coronal', P: 'Coronal', S: 'Axial', I: 'Axial' } /* English: the page's words are t(name) */
 
 /* The letters at the end of a world's axis: its +, or the other one. */
 function lettersOf(sides, axis, negative) {
@@ -41,10 +42,10 @@ function lettersOf(sides, axis, negative) {
 }
 
 /* In words, for a tooltip: "LP" is left and posterior. */
-export const lettersInWords = letters => [...letters].map(letter => words[letter]).filter(Boolean).join(' and ') || `towards ${letters}`
+export const lettersInWords = letters => [...letters].map(letter => words()[letter]).filter(Boolean).join(t(' and ')) || t('towards {letters}', { letters })
 
 /* "Axial", or "z" where only the world's axis is known. */
-export const planeName = (sides, plane) => sides === null ? plane : names[sides[axes[planes[plane].across]][0]]
+export const planeName = (sides, plane) => sides === null ? plane : t(names[sides[axes[planes[plane].across]][0]])
 
 /*
  * The letters at the end of any direction of length 1: up to three, the nearest first. rotation: the rows of the matrix
@@ -212,6 +213,24 @@ export class View extends EventTarget {
 		const z = unit(line[2] < 0 ? times(line, -1) : line)
 		const x = unit(flat(Math.abs(z[0]) < 0.9 ? [1, 0, 0] : [0, -1, 0], z))
 		this.set({ turn: { x, y: crossProduct(z, x), z }, position: this.#within(times(add(from, to), 0.5)) })
+	}
+
+	/*
+	 * The plane that is seen along `normal` with `up` upwards, in the tile across the axis that is the nearest; the
+	 * cross is at its center.
+	 */
+	face(normal, up, center) {
+		const along = axis => dot(normal, times(straight[axis], seenFrom[axis]))
+		const name = axes.find(axis => along(axis) > 1 - 1e-6)
+		if (name !== undefined) {
+			this.set({ turn: straight, main: name, tile: this.tile === 'all' ? 'all' : name, position: this.#within(center) })
+			return
+		}
+		const nearest = axes.reduce((best, axis) => Math.abs(along(axis)) > Math.abs(along(best)) ? axis : best)
+		const across = unit(times(normal, seenFrom[nearest])), top = unit(flat(up, across)), other = crossProduct(top, across)
+		/* Right-handed, as the volume's own. */
+		const turn = nearest === 'z' ? { x: times(other, -1), y: times(top, -1), z: across } : nearest === 'x' ? { x: across, y: other, z: top } : { x: times(other, -1), y: across, z: top }
+		this.set({ turn, main: nearest, tile: this.tile === 'all' ? 'all' : nearest, position: this.#within(center) })
 	}
 
 	straighten() {

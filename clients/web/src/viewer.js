@@ -35,22 +35,37 @@ export class Viewer {
 			part.update(changed)
 	}
 
-	/* Place and window stay; the picture before stays until the new one is there. */
-	show(job, volume) {
+	/*
+	 * Place and window stay; the picture before stays until the new one is there. linked: of another grid, in the places
+	 * (mm) of the one that the view is of.
+	 */
+	show(job, volume, linked = false) {
 		const before = this.#source
 		if (before && before.job === job && before.volume.name === volume.name && before.volume.created === volume.created)
 			return
-		if (before)
+		if (before?.job)
 			cancelVoxels(before.job, before.volume, 1)
-		const source = { job, volume }
+		const source = { job, volume, linked }
 		this.#source = source
-		this.#view.setGrid(volume)
+		if (!linked)
+			this.#view.setGrid(volume)
 		this.element.dataset.volume = volume.name
 		const held = heldVoxels(job, volume, 1)
 		for (const plane of this.planes) {
 			plane.show(source)
 			if (held)
 				plane.setVoxels(held)
+		}
+	}
+
+	/* Voxels that are no volume of the daemon's, in the places of the view's. */
+	showGrid(name, grid) {
+		const volume = { name, created: String(Math.random()), size: grid.size, spacing_mm: grid.spacing, origin_mm: grid.origin }
+		this.#source = { job: null, volume, linked: true, grid }
+		this.element.dataset.volume = name
+		for (const plane of this.planes) {
+			plane.show(this.#source)
+			plane.setVoxels(grid)
 		}
 	}
 
@@ -64,7 +79,7 @@ export class Viewer {
 			if (source !== this.#source)
 				return
 			this.spatial.show(source)
-			if (probeGraphics() !== null && countOf(source.volume.size) <= wholeMost)
+			if (source.job !== null && probeGraphics() !== null && countOf(source.volume.size) <= wholeMost)
 				this.#fetch(source)
 		})
 	}

@@ -23,7 +23,7 @@ function startWorker() {
 		if (data.error)
 			reject(new Error(data.error))
 		else
-			resolve(data.voxels)
+			resolve(data.grid ?? data.voxels)
 	}
 	worker.onerror = event => {
 		for (const { reject } of waiting.values())
@@ -33,13 +33,20 @@ function startWorker() {
 	}
 }
 
-function decode(number, path, size) {
+function ask(number, message) {
 	if (worker === null)
 		startWorker()
 	return new Promise((resolve, reject) => {
 		waiting.set(number, { resolve, reject })
-		worker.postMessage({ number, path, size })
+		worker.postMessage({ number, ...message })
 	})
+}
+
+/* A promise of { size, spacing, origin, voxels } of a NIfTI file from disk; place: as readNifti (nifti.js) has it. */
+export const readFile = (file, place) => ask(++lastNumber, { file, place })
+
+function decode(number, path, size) {
+	return ask(number, { path, size })
 }
 
 /* Size, spacing and place of a volume whose voxels are means of scale^3 (at the far ends of what is there). */
@@ -105,6 +112,20 @@ export function fetchVoxels(job, volume, scale) {
 	cache.set(key, entry)
 	makeRoom(key)
 	return entry.promise
+}
+
+/* So few voxels of a grid as `most`, each for scale^3 of them. */
+export function thinned(grid, most) {
+	const scale = scaleFor({ size: grid.size, spacing_mm: grid.spacing, origin_mm: grid.origin }, most), { size: [nx, ny], voxels } = grid
+	if (scale === 1)
+		return grid
+	const size = grid.size.map(count => Math.floor(count / scale)), thin = new Int16Array(countOf(size))
+	let at = 0
+	for (let z = 0; z < size[2]; z++)
+		for (let y = 0; y < size[1]; y++)
+			for (let x = 0; x < size[0]; x++)
+				thin[at++] = voxels[(z * scale * ny + y * scale) * nx + x * scale]
+	return { size, spacing: grid.spacing.map(step => step * scale), origin: grid.origin, voxels: thin }
 }
 
 /* What is not here yet and nobody waits for any more need not come. */
