@@ -151,7 +151,7 @@ export class JobPage {
 			h('button', { type: 'button', class: 'quiet', title: t('Middle, straight, no zoom (r)'), onclick: () => this.#view.reset() }, t('Reset')),
 			this.foldButton = h('button', { type: 'button', 'aria-pressed': 'false', title: t('Without the column beside the pictures (b)'), onclick: () => this.#fold() }, t('Wide')),
 			h('button', { type: 'button', title: t('All of the screen (f)'), onclick: () => this.#fullScreen() }, t('Full screen')), this.keyImages.button),
-		this.tools.element, this.tools.measuring, this.tools.slabs]
+		this.tools.element, this.tools.measuring, this.tools.slabs, this.tools.solid]
 	}
 
 	/* The column beside the pictures goes, and comes back. */

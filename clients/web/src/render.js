@@ -8,6 +8,10 @@ import { Niivue, NVImage, SLICE_TYPE } from '@niivue/niivue'
 const headerBytes = 352
 /* From clear to ivory; opaque soon, so that it has a surface. */
 const ivory = { R: [70, 205, 255], G: [52, 186, 250], B: [42, 160, 238], A: [0, 110, 220], I: [0, 90, 255] }
+/* Steel blue, from where no bone is any more. */
+const steel = { R: [0, 90, 190], G: [0, 150, 225], B: [0, 215, 255], A: [0, 140, 255], I: [0, 8, 255] }
+const metalLeast = 2600 /* HU */
+const metalMost = 4500
 const airMost = -250 /* HU: a window that reaches below would wrap the patient in fog */
 
 function nifti({ size, spacing, origin, voxels }) {
@@ -35,26 +39,29 @@ export class Render {
 	#nv
 	#size = ''
 
-	static async open(canvas) {
+	/* share: of the screen's pixels, 0: all of them. */
+	static async open(canvas, share) {
 		const render = new Render()
 		const nv = new Niivue({
 			interactive: false, dragAndDropEnabled: false, isResizeCanvas: true, logLevel: 'silent', loadingText: '',
-			backColor: [0, 0, 0, 1], show3Dcrosshair: false, isOrientCube: false, isColorbar: false, gradientAmount: 0,
+			backColor: [0, 0, 0, 1], show3Dcrosshair: false, isOrientCube: false, isColorbar: false, gradientAmount: 0, clipPlaneColor: [0, 0, 0, 0], forceDevicePixelRatio: share,
 		})
 		await nv.attachToCanvas(canvas, true)
 		nv.addColormap('ivory', ivory)
+		nv.addColormap('steel', steel)
 		nv.setSliceType(SLICE_TYPE.RENDER)
 		render.#nv = nv
 		return render
 	}
 
 	/* The limits keep still from one iteration to the next; so does the brightness. */
-	async show(grid, view) {
+	async show(grid, view, metal) {
 		const nv = this.#nv
 		const [low, high] = this.#limits(view)
-		const place = JSON.stringify([grid.size, grid.spacing, grid.origin])
+		const place = JSON.stringify([grid.size, grid.spacing, grid.origin, metal])
 		if (nv.volumes.length > 0 && this.#size === place) {
-			nv.volumes[0].img.set(grid.voxels)
+			for (const volume of nv.volumes)
+				volume.img.set(grid.voxels)
 			nv.volumes[0].cal_min = low
 			nv.volumes[0].cal_max = high
 			nv.updateGLVolume()
@@ -64,6 +71,8 @@ export class Render {
 		while (nv.volumes.length > 0)
 			nv.removeVolumeByIndex(0)
 		nv.addVolume(image)
+		if (metal)
+			nv.addVolume(await NVImage.loadFromUrl({ url: nifti(grid), name: 'metal.nii', colormap: 'steel', cal_min: metalLeast, cal_max: metalMost }))
 		this.#size = place
 		nv.setVolumeRenderIllumination(0.7)
 		this.turn(view)
@@ -85,7 +94,12 @@ export class Render {
 
 	turn(view) {
 		const nv = this.#nv
-		nv.scene.volScaleMultiplier = 1.15
+		const { scale, shift, clip } = view.solid, most = Math.max(...nv.volumes.map(volume => Math.max(...volume.dimsMM ?? [0])), 1)
+		nv.scene.volScaleMultiplier = 1.15 * scale
+		nv.position = [shift[0] * most, -shift[1] * most, 0]
+		/* Across the line of sight. */
+		nv.scene.clipPlaneDepthAziElevs = [[0, 0, 0]]
+		nv.setClipPlane(clip > 0 ? [0.6 - 1.2 * clip, view.azimuth, view.elevation] : [2, 0, 0])
 		nv.setRenderAzimuthElevation(view.azimuth, view.elevation)
 	}
 

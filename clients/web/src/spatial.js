@@ -1,10 +1,16 @@
 /* The tile of the rendering. Without WebGL 2 it shows a contact sheet that the daemon draws. */
 import { h, write, inFrame, throttle } from './dom.js'
+import { Mip } from './mip.js'
 import { volumePath } from './api.js'
 import { fetchVoxels, scaleFor, thinned } from './voxels.js'
 import { lettersInWords, planeEdges, renderingEdges } from './view.js'
 import { t } from './lang.js'
 
+const restTime = 300 /* ms of rest after which software draws */
+const softwareShare = 0.5 /* of the screen's pixels that software draws */
+const scaleMost = 8
+const metalVoxels = 20 /* that are metal before there is any */
+const metalLeast = 2600 /* HU */
 const settleTime = 150 /* ms: the rendering follows the window once the hand rests; each change costs a whole volume */
 
 let graphics
@@ -30,7 +36,7 @@ function probe() {
 }
 
 const touch = matchMedia('(pointer: coarse)').matches
-const voxelsMost = () => probeGraphics().software ? 96 ** 3 : touch ? 192 ** 3 : 256 ** 3
+const voxelsMost = () => probeGraphics()?.software ? 96 ** 3 : touch ? 192 ** 3 : 256 ** 3
 
 export class Spatial {
 	#view
@@ -39,20 +45,25 @@ export class Spatial {
 	#grid = null
 	#failed = false
 	#gesture = null
+	#metal = false /* the grid has some */
+	#rendered = null /* the source that the rendering has */
+	#pointers = new Map()
 
 	constructor(view) {
 		this.#view = view
 		this.note = h('p', { class: 'note' })
 		this.canvas = h('canvas', { class: 'render', role: 'img', 'aria-label': t('Rendering in three dimensions') })
+		this.flat = h('canvas', { class: 'render flat', role: 'img', 'aria-label': t('Maximum along each ray'), hidden: true })
+		this.mip = new Mip(this.flat)
 		this.sheet = h('img', { class: 'sheet', alt: '', hidden: true })
-		this.stage = h('div', { class: 'stage' }, this.canvas, this.sheet, h('div', { class: 'grip' }))
+		this.stage = h('div', { class: 'stage' }, this.canvas, this.flat, this.sheet, h('div', { class: 'grip' }))
 		this.maximise = h('button', { type: 'button', class: 'maximise', title: t('This one only (m)'), 'aria-label': t('Show the rendering only'),
 			'aria-pressed': 'false', onclick: () => this.#maximise() })
 		this.edges = Object.fromEntries(['left', 'right', 'top', 'bottom'].map(side => [side, h('span', { class: `edge ${side}`, 'aria-hidden': 'true' })]))
 		this.what = h('div', { class: 'what' })
 		this.element = h('section', { class: 'tile spatial', tabindex: '0', 'aria-label': t('Rendering'), 'data-plane': '3d' },
 			this.stage, h('div', { class: 'caption' }, h('span', { class: 'name' }, '3D')), this.what, this.maximise, Object.values(this.edges), this.note)
-		this.turn = inFrame(() => this.#render?.turn(this.#view))
+		this.turn = inFrame(() => this.#turned())
 		this.settle = throttle(settleTime, () => this.#settle())
 		this.#listen()
 		this.#writeSides()
@@ -88,12 +99,39 @@ export class Spatial {
 	update(changed) {
 		if (changed.tile)
 			this.maximise.setAttribute('aria-pressed', String(this.#view.tile === '3d'))
-		if (changed.azimuth || changed.elevation)
+		if (changed.azimuth || changed.elevation || changed.solid)
 			this.turn()
+		if (changed.solid)
+			this.settle()
 		if (changed.azimuth || changed.elevation || changed.sides)
 			this.#writeSides()
 		if (changed.window || changed.level)
 			this.settle()
+	}
+
+	/* Software takes its time: it draws once the hand rests. */
+	#turned() {
+		clearTimeout(this.rest)
+		if (this.#view.solid.mode === 'mip')
+			this.#drawMip()
+		else if (probeGraphics()?.software)
+			this.rest = setTimeout(() => this.#render?.turn(this.#view), restTime)
+		else
+			this.#render?.turn(this.#view)
+	}
+
+	#drawMip() {
+		if (this.#grid !== null)
+			this.mip.draw(this.#grid, this.#view)
+	}
+
+	/* What of the tile is seen. */
+	#reveal() {
+		const { mode } = this.#view.solid
+		this.canvas.hidden = mode !== 'surface' || this.#failed
+		this.flat.hidden = mode !== 'mip'
+		this.sheet.hidden = mode !== 'surface' || !this.#failed
+		write(this.note, mode === 'off' ? t('The rendering is off') : this.#failed && mode === 'surface' ? t('This browser has no WebGL 2: a contact sheet in place of the rendering') : '')
 	}
 
 	/* Brings the rendering to the newest volume and window, one step at a time. */
@@ -101,30 +139,47 @@ export class Spatial {
 		const source = this.#source
 		if (source === null || !this.element.isConnected)
 			return
-		if (this.#failed) {
+		const { mode } = this.#view.solid
+		this.#reveal()
+		if (mode === 'off')
+			return
+		if (this.#failed && mode === 'surface') {
 			this.#showSheet()
 			return
 		}
 		try {
-			if (this.#render === null) {
-				const { Render } = await import('./render.js')
-				this.#render = await Render.open(this.canvas)
-				this.canvas.addEventListener('webglcontextlost', () => this.#fail())
-			}
 			if (this.#grid === null) {
 				const grid = source.grid ? thinned(source.grid, voxelsMost()) : await fetchVoxels(source.job, source.volume, scaleFor(source.volume, voxelsMost()))
 				if (source !== this.#source)
 					return
-				await this.#render.show(grid, this.#view)
 				this.#grid = grid
-			} else {
-				this.#render.window(this.#view)
+				this.#metal = hasMetal(grid)
+				if (this.#metal)
+					this.#view.fromBehind()
 			}
+			if (mode === 'mip')
+				this.#drawMip()
+			else
+				await this.#drawSurface(source)
 			this.element.dataset.shown = source.volume.name
 		} catch (error) {
 			if (error.message !== 'aborted')
 				this.#fail()
 		}
+	}
+
+	async #drawSurface(source) {
+		if (this.#render === null) {
+			const { Render } = await import('./render.js')
+			this.#render = await Render.open(this.canvas, probeGraphics().software ? softwareShare : 0)
+			this.canvas.addEventListener('webglcontextlost', () => this.#fail())
+		}
+		if (this.#rendered === source) {
+			this.#render.window(this.#view)
+			return
+		}
+		await this.#render.show(this.#grid, this.#view, this.#metal)
+		this.#rendered = source
 	}
 
 	#fail() {
@@ -139,12 +194,10 @@ export class Spatial {
 		if (job === null)
 			return
 		const { window, level } = this.#view
-		this.canvas.hidden = true
-		this.sheet.hidden = false
+		this.#reveal()
 		this.#writeSides()
 		this.sheet.src = `${volumePath(job, volume.name)}/slice?sheet=1&axis=z&window=${window}&level=${level}`
 		this.sheet.alt = t('Contact sheet of {name}', { name: volume.name })
-		this.note.textContent = t('This browser has no WebGL 2: a contact sheet in place of the rendering')
 		this.element.dataset.shown = volume.name
 	}
 
@@ -154,18 +207,52 @@ export class Spatial {
 			event.preventDefault()
 			this.element.focus({ preventScroll: true })
 			stage.setPointerCapture(event.pointerId)
-			this.#gesture = { x: event.clientX, y: event.clientY, azimuth: this.#view.azimuth, elevation: this.#view.elevation }
+			this.#pointers.set(event.pointerId, [event.clientX, event.clientY])
+			const pans = event.button !== 0 || event.shiftKey
+			this.#gesture = { pans, x: event.clientX, y: event.clientY, azimuth: this.#view.azimuth, elevation: this.#view.elevation }
 		})
-		stage.addEventListener('pointermove', event => {
-			if (this.#gesture)
-				this.#turnTo(this.#gesture.azimuth - (event.clientX - this.#gesture.x) / 2,
-					this.#gesture.elevation + (event.clientY - this.#gesture.y) / 2)
-		})
-		for (const kind of ['pointerup', 'pointercancel', 'lostpointercapture'])
-			stage.addEventListener(kind, () => this.#gesture = null)
+		stage.addEventListener('pointermove', event => this.#move(event))
+		for (const kind of ['pointerup', 'pointercancel', 'lostpointercapture']) {
+			stage.addEventListener(kind, event => {
+				this.#pointers.delete(event.pointerId)
+				this.#gesture = null
+			})
+		}
+		stage.addEventListener('wheel', event => {
+			event.preventDefault()
+			this.#zoom(Math.exp(-event.deltaY / 400))
+		}, { passive: false })
 		stage.addEventListener('contextmenu', event => event.preventDefault())
 		stage.addEventListener('dblclick', () => this.#maximise())
 		this.element.addEventListener('keydown', event => this.#key(event))
+	}
+
+	/* One finger, or the mouse, turns; two, or another button, pan, and their distance zooms. */
+	#move(event) {
+		const before = this.#pointers.get(event.pointerId)
+		if (!before)
+			return
+		const others = [...this.#pointers].filter(([id]) => id !== event.pointerId).map(([, place]) => place)
+		this.#pointers.set(event.pointerId, [event.clientX, event.clientY])
+		if (others.length > 0) {
+			const [[x, y]] = others, distance = ([px, py]) => Math.max(Math.hypot(px - x, py - y), 1)
+			this.#zoom(distance([event.clientX, event.clientY]) / distance(before))
+			this.#pan((event.clientX - before[0]) / 2, (event.clientY - before[1]) / 2)
+		} else if (this.#gesture?.pans) {
+			this.#pan(event.clientX - before[0], event.clientY - before[1])
+		} else if (this.#gesture) {
+			this.#turnTo(this.#gesture.azimuth - (event.clientX - this.#gesture.x) / 2, this.#gesture.elevation + (event.clientY - this.#gesture.y) / 2)
+		}
+	}
+
+	#zoom(factor) {
+		const { solid } = this.#view
+		this.#view.set({ solid: { ...solid, scale: Math.min(Math.max(solid.scale * factor, 0.5), scaleMost) } })
+	}
+
+	#pan(dx, dy) {
+		const { solid } = this.#view, box = this.stage.getBoundingClientRect(), side = Math.min(box.width, box.height)
+		this.#view.set({ solid: { ...solid, shift: [solid.shift[0] + dx / side, solid.shift[1] + dy / side] } })
 	}
 
 	#turnTo(azimuth, elevation) {
@@ -180,6 +267,8 @@ export class Spatial {
 			ArrowUp: () => this.#turnTo(view.azimuth, view.elevation - 5),
 			ArrowDown: () => this.#turnTo(view.azimuth, view.elevation + 5),
 			m: () => this.#maximise(),
+			'+': () => this.#zoom(1.25),
+			'-': () => this.#zoom(0.8),
 		}
 		if (event.target !== this.element || event.ctrlKey || event.altKey || event.metaKey || !keys[event.key])
 			return
@@ -189,8 +278,19 @@ export class Spatial {
 
 	close() {
 		this.settle.cancel()
+		clearTimeout(this.rest)
+		this.mip.close()
+		this.#rendered = null
 		this.#render?.close()
 		this.#render = null
 		this.#source = null
 	}
+}
+
+/* A speck of noise is none. */
+function hasMetal({ voxels }) {
+	let count = 0
+	for (let i = 0; i < voxels.length && count < metalVoxels; i++)
+		count += voxels[i] > metalLeast ? 1 : 0
+	return count >= metalVoxels
 }

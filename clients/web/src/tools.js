@@ -40,6 +40,10 @@ export class Tools {
 		this.element = h('div', { class: 'group' }, h('span', { class: 'label' }, t('Drag')), this.hands)
 		this.measuring = h('div', { class: 'group' }, h('span', { class: 'label' }, t('Measure')), this.measures, this.hint)
 		this.slabs = h('div', { class: 'group' }, h('span', { class: 'label' }, t('Slab')), this.thickness, this.mode, this.straight, this.cine)
+		this.modes = segments(t('3D shows'), [['surface', t('Surface')], ['mip', 'MIP', t('The maximum along each ray')], ['off', t('Off')]], view.solid.mode, mode => view.set({ solid: { ...view.solid, mode } }))
+		this.clip = h('input', { type: 'range', min: '0', max: '100', value: '0', class: 'clip', 'aria-label': t('Cut away from the front'),
+			oninput: () => view.set({ solid: { ...view.solid, clip: Number(this.clip.value) / 100 } }) })
+		this.solid = h('div', { class: 'group' }, h('span', { class: 'label' }, '3D'), this.modes, h('label', { class: 'check' }, t('Cut'), ' ', this.clip))
 		this.list = h('ul', { class: 'measurements' })
 		this.save = h('button', { type: 'button', onclick: () => this.#export() }, t('Export'))
 		this.trouble = h('p', { class: 'trouble', role: 'alert', hidden: true })
@@ -58,6 +62,10 @@ export class Tools {
 			press(this.hands, view.tool)
 			press(this.measures, view.tool)
 			write(this.hint, view.tool === 'axis' ? axisHint() : kinds[view.tool] ? `${t(kinds[view.tool].hint)}; ${t('Enter takes the cross')}` : '')
+		}
+		if (changed.solid) {
+			press(this.modes, view.solid.mode)
+			this.clip.value = String(Math.round(view.solid.clip * 100))
 		}
 		if (changed.turn)
 			this.straight.disabled = ['x', 'y', 'z'].every(name => view.isStraight(name))

@@ -109,8 +109,10 @@ export class View extends EventTarget {
 	tile = 'all' /* all, x, y, z, 3d */
 	tool = matchMedia('(pointer: coarse)').matches ? 'scroll' : 'window' /* what dragging does: scroll, window, cross, pan, or what is measured */
 	clicks = [] /* of what is measured by clicks */
+	first = 160 /* azimuth of the beginning */
 	azimuth = 160
 	elevation = 12
+	solid = { mode: 'surface', clip: 0, scale: 1, shift: [0, 0] } /* the rendering: surface, mip or off; share that is cut away from the front; of the tile */
 	grid = null /* { size, spacing, origin } */
 	turn = straight /* where the volume's axes are turned to; each plane lies across one of them */
 	slab = { thickness: 0, mode: 'mean' } /* mm, 0: a plane; mean, max or min of the samples through it */
@@ -312,6 +314,15 @@ export class View extends EventTarget {
 	}
 
 	reset() {
-		this.set({ turn: straight, position: this.#middle(), zoom: 1, pan: { x: [0, 0], y: [0, 0], z: [0, 0] }, azimuth: 160, elevation: 12 })
+		this.set({ turn: straight, position: this.#middle(), zoom: 1, pan: { x: [0, 0], y: [0, 0], z: [0, 0] }, azimuth: this.first, elevation: 12, solid: { ...this.solid, clip: 0, scale: 1, shift: [0, 0] } })
+	}
+
+	/* From behind, where a surgeon looks at screws from; as long as nobody has turned it. */
+	fromBehind() {
+		if (this.rotation === null || this.azimuth !== this.first)
+			return
+		const [x, y] = this.rotation[1]
+		this.first = (Math.atan2(x, y) * 180 / Math.PI + 340) % 360
+		this.set({ azimuth: this.first })
 	}
 }

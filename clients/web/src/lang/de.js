@@ -414,4 +414,11 @@ export const strings = {
 	'From disk': 'Von der Festplatte',
 	'NIfTI file …': 'NIfTI-Datei …',
 	'{name} is being read …': '{name} wird gelesen …',
+	'Maximum along each ray': 'Maximum längs jedes Strahls',
+	'The maximum along each ray': 'Das Maximum längs jedes Strahls',
+	'The rendering is off': 'Die 3D-Ansicht ist aus',
+	'3D shows': '3D zeigt',
+	'Surface': 'Oberfläche',
+	'Cut': 'Schnitt',
+	'Cut away from the front': 'Von vorn wegschneiden',
 }
