@@ -587,6 +587,34 @@ test('3D: the maximum along each ray is the daemon\'s, the rendering is zoomed, 
 	await page.context().close()
 })
 
+test('a volume goes to the archive by a button, and how far it is stands beside it', async () => {
+	const page = await browser.newContext({ viewport: { width: 1440, height: 900 } }).then(context => context.newPage())
+	page.setDefaultTimeout(60000)
+	const sending = { to: 'pacs', volume: 'final', volumes: 'last', attempts: 1, instances: 0, stored: 0, error: null, created: new Date().toISOString(), next: null, ended: null }
+	let sendings = []
+	await page.route('**/v1/destinations', route => route.fulfill({ json: { destinations: [{ name: 'pacs', kind: 'dicomweb', address: 'http://archive/', objects: 'slices', send: 'none', reachable: true, detail: null, checked: null, unsent: 0 }] } }))
+	await page.route(`**/v1/jobs/${finished}`, async route => {
+		const response = await route.fetch()
+		await route.fulfill({ response, json: { ...await response.json(), sendings } })
+	})
+	await page.route(`**/v1/jobs/${finished}/send`, route => {
+		expect(JSON.stringify(route.request().postDataJSON()) === '{"to":"pacs","volumes":"last"}', 'what is sent')
+		sendings = [{ ...sending, state: 'queued', error: 'the archive cannot be reached', next: new Date(Date.now() + 60000).toISOString() }]
+		return route.fulfill({ status: 202, json: { sendings } })
+	})
+	await page.goto(`${origin}${finishedPath}`)
+	await page.click('button:has-text("Send to archive")')
+	await until('its state', () => page.textContent('.sendings'), text => /pacs final: in the queue.*the archive cannot be reached; tried again today/.test(text))
+	await accessible(page, 'the job with an archive')
+	sendings = [{ ...sending, state: 'sent', instances: 40, stored: 40 }]
+	await page.reload()
+	await until('the end of it', () => page.textContent('.sendings'), text => text.includes('sent: the archive has all of it (40 of 40 objects)'))
+	await page.context().close()
+	const plain = await openFinished()
+	expect(!await plain.isVisible('button:has-text("Send to archive")'), 'no button where there is no archive')
+	await plain.context().close()
+})
+
 /* ---- two volumes ---- */
 
 test('two iterations side by side and under a swipe', async () => {
@@ -750,6 +778,16 @@ test('"reconstruct again" shows what is wrong at its field, then posts a job', a
 	const page = await openFinished()
 	const field = pointer => `dialog [name="${pointer}"]`
 	await page.click('button:has-text("Reconstruct again")')
+	const cards = await page.$$eval('dialog .preset', all => all.map(card => card.textContent))
+	expect(cards.length === 7 && cards.filter(text => /about [\d.]+ (s|min)/.test(text)).length === 6, `a card for each purpose with its time, got ${cards}`)
+	expect((await page.textContent('dialog .expert summary')).includes('FDK + SART 7 + TV'), 'what the fold holds')
+	await page.setViewportSize({ width: 1366, height: 768 })
+	await shoot(page, 'presets')
+	for (const name of ['Reconstruct', 'Close']) {
+		const box = await page.locator('dialog .row.end button', { hasText: name }).boundingBox()
+		expect(box.y + box.height <= 768, `${name} in sight at 1366 x 768`)
+	}
+	await page.click('dialog .expert summary')
 	await page.fill(field('/sart/iterations'), '0')
 	await page.click('dialog button[type=submit]')
 	await page.waitForSelector(`${field('/sart/iterations')}[aria-invalid=true]`)
@@ -781,6 +819,7 @@ test('a grid that is asked for again with other voxels stays about its middle', 
 	await ended(job.id)
 	const page = await open(browser, `/#/jobs/${job.id}`)
 	await page.click('button:has-text("Reconstruct again")')
+	await page.click('dialog .expert summary')
 	await page.fill('dialog [name="/grid/size/0"]', '40')
 	await page.fill('dialog [name="/grid/spacing_mm/0"]', '2')
 	await page.click('dialog button[type=submit]')

@@ -71,7 +71,7 @@ export async function listVolumes(job, signal, wait = 0) {
 	return volumes.reverse()
 }
 
-const kinds = ['state', 'progress', 'volume', 'warning', 'stop', 'annotations', 'end', 'removed']
+const kinds = ['state', 'progress', 'volume', 'warning', 'stop', 'annotations', 'sending', 'end', 'removed']
 const retryAfter = 5000 /* ms: the browser itself comes again where the connection broke, not where it was refused */
 const hiddenFor = 30000 /* ms: a browser has six connections to a daemon, for all of its pages together */
 

@@ -2,10 +2,24 @@
  * "Reconstruct again with ...": a job's request as a form, from the table of
  * its parameters. A problem (RFC 9457) is shown at the field its pointer names.
  */
-import { h, replace, newId } from './dom.js'
+import { h, replace, newId, duration } from './dom.js'
+import { recipeText } from './state.js'
 import { request, newKey, Problem } from './api.js'
 import { groups, members, presets, path, at } from './parameters.js'
 import { t } from './lang.js'
+
+/* Iterations of each preset, and passes of TV. */
+const work = { preview: [0, 0], fast: [4, 5], balanced: [10, 11], 'low-noise': [10, 11], bone: [10, 10], metal: [10, 11] }
+
+/* Seconds that a preset takes on the grid of a job that has ended, by what its own steps took; null: nobody knows. */
+function forecast({ timings, iteration, tv, state }, preset) {
+	const [iterations, passes] = work[preset] ?? [NaN]
+	if (state !== 'succeeded' || !timings || !(timings.fdk > 0))
+		return null
+	const step = iterations === 0 ? 0 : timings.sart / iteration, pass = passes === 0 ? 0 : tv ? timings.tv / (iteration + 1) : NaN
+	const seconds = timings.load + timings.fdk + timings.save + iterations * step + passes * pass
+	return Number.isFinite(seconds) && (iterations === 0 || step > 0) ? seconds : null
+}
 
 function put(value, pointer, what) {
 	const keys = path(pointer), last = keys.pop()
@@ -30,10 +44,15 @@ export class JobForm {
 	#switches = new Map() /* pointer of a group -> checkbox */
 	#stages = [] /* fieldsets that a preset stands in place of */
 	#key = newKey()
+	#base
+	#fresh /* from a scan, not from another job */
 
 	/* base: a job's document, or { scan }; done(job) after it was taken. */
 	constructor(base, { done, cancel }) {
 		this.done = done
+		this.#base = base
+		this.#fresh = members.every(member => base[member] === undefined)
+		this.preset = this.#fresh ? 'balanced' : ''
 		this.#initial = { scan: base.scan }
 		for (const member of members) {
 			if (base[member] !== undefined)
@@ -42,19 +61,34 @@ export class JobForm {
 		this.trouble = h('p', { class: 'trouble', role: 'alert', hidden: true })
 		this.submit = h('button', { type: 'submit', class: 'primary' }, t('Reconstruct'))
 		this.element = h('form', { class: 'job-form', novalidate: true, onsubmit: event => this.#submit(event) },
-			this.#presets(), groups.map(group => this.#group(group)), this.trouble,
+			this.#presets(), this.#expert(), this.trouble,
 			h('div', { class: 'row end' }, h('button', { type: 'button', onclick: cancel }, t('Close')), this.submit))
 		this.element.addEventListener('input', () => this.#key = newKey())
 	}
 
-	/* Stages for a purpose, in place of those below. */
+	/* Stages for a purpose as cards, in place of those below; the last one is what stands below. */
 	#presets() {
-		this.preset = h('select', { name: '/preset' }, h('option', { value: '' }, t('as below')), presets.map(([name, text]) => h('option', { value: name }, t(text))))
-		this.preset.addEventListener('change', () => {
+		const choose = name => {
+			this.preset = name
 			for (const stage of this.#stages)
-				stage.hidden = this.preset.value !== ''
-		})
-		return h('fieldset', {}, h('legend', {}, t('Purpose')), h('div', { class: 'fields' }, h('label', { class: 'field choice wide' }, h('span', { class: 'label' }, t('Preset')), this.preset)))
+				stage.hidden = name !== ''
+		}
+		const card = (value, text) => {
+			const [title, what] = text.split(': '), time = value === '' ? null : forecast(this.#base, value)
+			const radio = h('input', { type: 'radio', name: '/preset', value, checked: value === this.preset, onchange: () => choose(value) })
+			return h('label', { class: 'preset' }, radio, h('strong', {}, title), h('span', {}, what), time !== null && h('span', { class: 'amount' }, t('about {time}', { time: duration(time) })))
+		}
+		return h('fieldset', {}, h('legend', {}, t('Purpose')), h('div', { class: 'presets' }, presets.map(([value, text]) => card(value, t(text))),
+			card('', `${t('Own')}: ${this.#fresh ? t('all parameters by hand') : t('as this job, with what is changed below')}`)))
+	}
+
+	/* The fields of all groups, folded; what they hold stands on the fold. */
+	#expert() {
+		const fields = groups.map(group => this.#group(group)), words = this.#fresh ? '' : recipeText(this.#base)
+		this.expert = h('details', { class: 'expert' }, h('summary', {}, t('All parameters'), words && h('span', { class: 'detail' }, ` ${words}${this.#base.grid ? `, ${this.#base.grid.size.join(' × ')}` : ''}`)), fields)
+		for (const stage of this.#stages)
+			stage.hidden = this.preset !== ''
+		return this.expert
 	}
 
 	#group(group) {
@@ -63,7 +97,7 @@ export class JobForm {
 			return h('fieldset', {}, h('legend', {}, t(group.title)), body)
 		const value = this.#initial[path(group.pointer)[0]]
 		/* A job from nothing has all stages; which grid, the daemon knows best. */
-		const fresh = members.every(member => this.#initial[member] === undefined) && group.pointer !== '/grid' && !group.rare
+		const fresh = this.#fresh && group.pointer !== '/grid' && !group.rare
 		const box = h('input', { type: 'checkbox', checked: fresh || (value !== undefined && value !== null) })
 		const off = h('p', { class: 'off' }, t(group.off))
 		const error = h('p', { class: 'trouble', hidden: true, id: newId('error') })
@@ -125,13 +159,13 @@ export class JobForm {
 				put(document, pointer, field.read ? field.read(raw) : raw)
 		}
 		this.#keepMiddle(document.grid)
-		if (this.preset.value === '')
+		if (this.preset === '')
 			return document
 		/* What is kept after an iteration goes by the iterations below; without a projector each algorithm has its own. */
 		for (const pointer of [...this.#switches.keys(), '/emit', '/projector'])
 			if (pointer !== '/grid')
 				delete document[path(pointer)[0]]
-		document.preset = this.preset.value
+		document.preset = this.preset
 		return document
 	}
 
@@ -183,6 +217,8 @@ export class JobForm {
 		found.input.setAttribute('aria-invalid', 'true')
 		found.input.setAttribute('aria-describedby', found.error.id)
 		found.input.closest('.fields')?.removeAttribute('hidden')
+		if (this.expert.contains(found.input))
+			this.expert.open = true
 		found.input.focus()
 	}
 }

@@ -9,6 +9,7 @@ import { Tools, segments, press } from './tools.js'
 import { Viewer } from './viewer.js'
 import { Plot } from './plot.js'
 import { Others } from './compare.js'
+import { Sendings } from './send.js'
 import { Film } from './film.js'
 import { Bar, badge, doing, left, ended, stateWord } from './state.js'
 import { geometryFacts, jobFacts, warningList } from './facts.js'
@@ -85,6 +86,7 @@ export class JobPage {
 			facts: () => ({ job: this.id, name: this.#scan?.name, volume: this.#selected, what: this.#volumes[this.#index()] ? this.#whatOf(this.#volumes[this.#index()]) : '', voxels: this.viewer.voxels }),
 			show: name => this.#choose(this.#volumes.findIndex(volume => volume.name === name)),
 		})
+		this.sendings = new Sendings(this.id, { signal: this.#abort.signal, changed: () => this.refresh() })
 		this.second = null
 		this.stage.append(this.viewer.element)
 		this.stage.addEventListener('pointerdown', event => this.#grabSwipe(event), { capture: true })
@@ -104,7 +106,7 @@ export class JobPage {
 		this.progress = h('div', { class: 'progress' }, this.bar.element, this.doing, this.left)
 		this.columns = h('div', { class: 'columns' },
 			this.pictures = h('div', { class: 'pictures' }, this.empty, this.stage, this.estimate, this.quality, this.sides, this.controls),
-			h('div', { class: 'aside' }, this.warnings, this.keyImages.section, this.tools.section, this.courseSection, this.fileSection,
+			h('div', { class: 'aside' }, this.warnings, this.keyImages.section, this.tools.section, this.sendings.section, this.courseSection, this.fileSection,
 				h('section', { class: 'card' }, h('h2', {}, t('Projections')), this.film.element),
 				h('section', { class: 'card' }, h('h2', {}, t('Reconstruction')), this.about),
 				h('section', { class: 'card' }, h('h2', {}, t('Geometry')), this.geometry)))
@@ -189,8 +191,7 @@ export class JobPage {
 			this.stopWatching?.()
 			this.live(null)
 			/* Its own events are over; what is measured in it goes on. */
-			this.stopListening ??= watch('/v1/events?after=latest', (kind, data) => kind === 'annotations' && data.job === this.id && this.annotations.load(data.etag),
-				connected => connected && this.annotations.load())
+			this.stopListening ??= watch('/v1/events?after=latest', (kind, data) => data.job === this.id && this.#hearAfter(kind, data), connected => connected && this.annotations.load())
 			return
 		}
 		this.stopWatching ??= watch(`${jobPath(this.id)}/events?after=latest`, (kind, data) => {
@@ -210,6 +211,13 @@ export class JobPage {
 				this.refreshVolumes()
 			}
 		})
+	}
+
+	#hearAfter(kind, data) {
+		if (kind === 'annotations')
+			this.annotations.load(data.etag)
+		else if (kind === 'sending')
+			this.refresh()
 	}
 
 	async #refresh() {
@@ -265,6 +273,7 @@ export class JobPage {
 		replace(this.warnings, warningList(warnings))
 		this.warnings.hidden = warnings.length === 0
 		replace(this.failure, job.error ? h('div', { class: 'notice bad' }, t('It failed: {why}', { why: job.error.detail })) : null)
+		this.sendings.show(job)
 		replace(this.about, jobFacts(job))
 		if (this.#first)
 			replace(this.geometry, geometryFacts(scan, job.patient))
