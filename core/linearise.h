@@ -6,6 +6,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "core/detector.h"
 #include "core/scan/image.h"
 
 /*
@@ -41,6 +42,10 @@ struct linearise {
 	/* p' = sum over k of hardening[k] p^k, the last step before defects are replaced; count 0 for none. */
 	const double *hardening;
 	int hardening_count;
+	/* Of intensities, before all else (core/correct/lag.h, scatter.h); NULL: none. A backend knows neither. */
+	const struct lag_model *lag;
+	const struct scatter_model *scatter;
+	const int *numbers; /* [views], rising: each view's number in the order of time; NULL: its own */
 };
 enum { HARDENING_MOST = 8 }; /* coefficients */
 

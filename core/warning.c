@@ -55,6 +55,15 @@ const struct warning_kind warning_kinds[] = {
      "Some pictures of the phantom could not be used: the arm's places there are interpolated."},
     /* ---- of the samples ---- */
     {"beam_hardening", SEVERITY_CAUTION, "The correction for beam hardening looks wrong: gray values may be off."},
+    {"lag_order", SEVERITY_CAUTION,
+     "The projections seem not to be in the order in which they were taken: the correction of the detector's lag may "
+     "do harm."},
+    {"scatter_constant", SEVERITY_CAUTION,
+     "Scattered radiation was taken for the same everywhere: gray values are off, most of all near the patient's "
+     "surface."},
+    {"scatter_limited", SEVERITY_CAUTION,
+     "The correction for scattered radiation wanted to take nearly all of the signal in some places: gray values may "
+     "be wrong there."},
     {"air_saturated", SEVERITY_SERIOUS, "The value given for air is one at which the detector is saturated."},
     {"incomplete", SEVERITY_CAUTION, "The scan was broken off: the image is made of the projections that arrived."},
     {"no_flat", SEVERITY_SERIOUS, "The scan lacks its flat image: nothing can be reconstructed before it arrives."},

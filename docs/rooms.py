@@ -35,6 +35,7 @@ ROOMS = {
     "proto": "JSON, file formats, messages",
     "core/recon": "algorithms, the run",
     "core/calibrate": "an arm's geometry from balls",
+    "core/fit": "models of tube and detector",
     "core/correct": "corrections",
     "core/outofcore": "a backend over a backend",
     "core/cpu": "CPU backend",

@@ -256,6 +256,8 @@ static int source_open(struct source *source, const struct scan_files *files, st
 	*source = (struct source){.files = files, .backend = backend_find("cpu")};
 	for (int i = 0; i < IMAGE_COUNT; i++)
 		linearise.image[i] = files->image[i];
+	linearise.lag = NULL; /* neither moves a shadow's edges */
+	linearise.scatter = NULL;
 	pthread_mutex_init(&source->lock, NULL);
 	if (linearise.quantity == QUANTITY_INTENSITY && linearise.air <= 0 && linearise.image[IMAGE_FLAT] == NULL)
 		return error_set(err, ERR_IMPOSSIBLE, "intensities need an air value or a flat image, none is there");

@@ -16,6 +16,7 @@
 #include "core/warning.h"
 
 #include "proto/calibration.h"
+#include "proto/detector.h"
 #include "proto/labels.h"
 #include "proto/parameter.h"
 
@@ -125,6 +126,9 @@ struct linearise scan_linearise(const struct scan *scan)
 	    .has_air_region = scan->has_air_region,
 	    .hardening = scan->hardening,
 	    .hardening_count = scan->hardening_count,
+	    .lag = scan->lag.count > 0 ? &scan->lag : NULL,
+	    .scatter = scan->scatter.count > 0 || scan->scatter.fraction > 0 ? &scan->scatter : NULL,
+	    .numbers = scan->projection,
 	};
 
 	memcpy(linearise.air_region, scan->air_region, sizeof(linearise.air_region));
@@ -197,6 +201,13 @@ static int read_projections(struct scan *scan, const cJSON *projections, struct 
 	integrals = scan->quantity == QUANTITY_LINE_INTEGRAL;
 	read_air_region(&reader, scan);
 	read_hardening(&reader, scan);
+	lag_read(&reader, &scan->lag);
+	scatter_read(&reader, &scan->scatter);
+	if (integrals && scan->lag.count > 0)
+		json_fail(&reader, ERR_INVALID, "lag", "line integrals have no lag any more, it belongs to intensity");
+	if (integrals && (scan->scatter.count > 0 || scan->scatter.fraction > 0))
+		json_fail(&reader, ERR_INVALID, "scatter",
+			  "scatter cannot be taken off line integrals, it belongs to intensity");
 	if (integrals && scan->has_air_region)
 		json_fail(&reader, ERR_INVALID, "air_region", "line integrals have no air, it belongs to intensity");
 	if (integrals && scan->air != 0)
@@ -946,6 +957,26 @@ static void warn_hardening(cJSON *list, const struct scan *scan)
 	}
 }
 
+/* Lag goes from each view to the next in time, which are neighbours in angle, too, but where the arm turns back. */
+static void warn_lag(cJSON *list, const struct scan *scan)
+{
+	const double many = 0.05;
+	const struct orbit *orbit = &scan->orbit;
+	int turns = 0;
+
+	if (scan->lag.count == 0)
+		return;
+	for (int i = 2; i < orbit->count; i++)
+		turns += remainder(orbit->angle[i] - orbit->angle[i - 1], 2 * M_PI) *
+			     remainder(orbit->angle[i - 1] - orbit->angle[i - 2], 2 * M_PI) <
+			 0;
+	if (turns > many * orbit->count)
+		warn(list, "lag_order",
+		     "the arm turns back %d times in %d views: lag is taken off in the order of the projections' "
+		     "numbers, which must be that of time",
+		     turns, orbit->count);
+}
+
 /* Adds the warnings of the calibration that the geometry comes from. */
 static void warn_notes(cJSON *list, const struct scan *scan)
 {
@@ -985,6 +1016,7 @@ cJSON *scan_warnings(const struct scan *scan)
 	warn_uneven_distances(list, &scan->geometry);
 	warn_mirrored(list, &scan->geometry, orbit->turned);
 	warn_hardening(list, scan);
+	warn_lag(list, scan);
 	warn_air(list, scan);
 	return list;
 }

@@ -22,9 +22,11 @@ struct scan {
 	bool has_air_region;
 	int air_region[4]; /* first column, first row, last column, last row */
 	double hardening[HARDENING_MOST];
-	int hardening_count;    /* coefficients, 0: none */
-	struct patient patient; /* how the patient lies */
-	struct subject subject; /* who that is, and the study */
+	int hardening_count;          /* coefficients, 0: none */
+	struct lag_model lag;         /* count 0: none */
+	struct scatter_model scatter; /* neither kernels nor a fraction: none */
+	struct patient patient;       /* how the patient lies */
+	struct subject subject;       /* who that is, and the study */
 	struct geometry geometry;
 	struct orbit orbit;
 	int *projection; /* [count], owned, after scan_reduce: the number of each view's projection; NULL: its own */

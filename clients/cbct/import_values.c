@@ -11,6 +11,8 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "proto/scan_directory.h"
+
 #define ROW(name, kind, member, argument, help, least, most, count, names)                                             \
 	{                                                                                                              \
 		name, 0, kind, offsetof(struct import_values, member), argument, help, least, most, count, names       \
@@ -25,6 +27,11 @@ const struct option import_value_rows[] = {
 	"pixels that see air in every view, from column C0 and row R0 to C1 and R1: their mean is each view's own air",
 	0, DETECTOR_MAX, 4, NULL),
     ROW("beam-hardening", OPTION_TEXT, hardening, "C0,C1,...", "p becomes C0 + C1 p + C2 p^2 and so on", 0, 0, 0, NULL),
+    ROW("correct", OPTION_TEXT, correct, "FILE",
+	"members of the scan's projections as cbct fit-lag, fit-scatter and fit-hardening write them: JSON objects, "
+	"one "
+	"behind the other",
+	0, 0, 0, NULL),
     ROW("saturation", OPTION_NUMBER, saturation, "COUNTS", "from which on a pixel says nothing", 1e-6, 1e12, 0, NULL),
     ROW("flat", OPTION_TEXT, flat, "IMAGES", "of the open beam in place of --air; several are averaged", 0, 0, 0, NULL),
     ROW("dark", OPTION_TEXT, dark, "IMAGES", "without beam; several are averaged", 0, 0, 0, NULL),
@@ -191,6 +198,40 @@ static int add_hardening(const char *text, cJSON *json, struct error *err)
 	return 0;
 }
 
+/* Adds the members of the objects in a file. The daemon's checks are made of the whole document. */
+static int add_corrections(const char *path, cJSON *json, struct error *err)
+{
+	static const char *const known[] = {"lag", "scatter", "beam_hardening"};
+	char *text = NULL;
+	size_t length;
+	const char *at;
+	int code = file_read(path, JSON_BYTES_MAX, &text, &length, err);
+
+	at = text;
+	while (code == 0 && at[strspn(at, " \t\r\n")] != '\0') {
+		cJSON *object = cJSON_ParseWithOpts(at, &at, false);
+		int found = 0;
+
+		for (size_t i = 0; object != NULL && i < sizeof(known) / sizeof(known[0]); i++) {
+			cJSON *member = cJSON_DetachItemFromObjectCaseSensitive(object, known[i]);
+
+			found += member != NULL;
+			if (member != NULL && cJSON_GetObjectItemCaseSensitive(json, known[i]) != NULL) {
+				cJSON_Delete(member);
+				code = error_set(err, ERR_USAGE, "%.160s: %s is told twice", path, known[i]);
+			} else if (member != NULL) {
+				cJSON_AddItemToObject(json, known[i], member);
+			}
+		}
+		if (code == 0 && (found == 0 || object->child != NULL))
+			code = error_set(err, ERR_INVALID,
+					 "%.160s: JSON objects with lag, scatter or beam_hardening are expected", path);
+		cJSON_Delete(object);
+	}
+	free(text);
+	return code;
+}
+
 static int check_values(const struct import_values *options, enum quantity quantity, struct error *err)
 {
 	if (options->scale == 0 || !isfinite(options->scale) || !isfinite(options->bias))
@@ -249,6 +290,8 @@ int import_values(const struct import_values *options, struct images *images, cJ
 		cJSON_AddNumberToObject(json, "saturation", options->saturation);
 	if (options->hardening != NULL)
 		code = add_hardening(options->hardening, json, err);
+	if (code == 0 && options->correct != NULL)
+		code = add_corrections(options->correct, json, err);
 	if (code != 0)
 		cJSON_Delete(json);
 	else

@@ -14,6 +14,7 @@ struct import_values {
 	double air_region[4]; /* first column and row, last column and row; NaN: none */
 	const char *flat, *dark, *defects;
 	const char *hardening; /* "C0,C1,C2": p' = C0 + C1 p + C2 p^2 ..., NULL: none */
+	const char *correct;   /* a file of members of projections, from cbct fit-...; NULL: none */
 	double scale, bias;    /* a value is scale * stored + bias */
 };
 extern const struct option import_value_rows[];

@@ -1,22 +1,26 @@
 /* The table of corrections, and what goes over it: see correction.h. */
 #include "core/correct/correction.h"
 
+#include <stdlib.h>
 #include <string.h>
 
+#include "core/correct/counts.h"
 #include "core/correct/input.h"
 
-extern const struct correction correction_flat_dark, correction_air_region, correction_hardening, correction_defects,
-    correction_samples, correction_truncation, correction_exterior, correction_blank_views, correction_metal,
-    correction_averaging;
+extern const struct correction correction_lag, correction_scatter, correction_flat_dark, correction_air_region,
+    correction_hardening, correction_defects, correction_samples, correction_truncation, correction_exterior,
+    correction_blank_views, correction_metal, correction_averaging;
 
 /*
- * In the order in which they run. Defects of the map are known before an air region's mean is taken, and hardening is
- * that of line integrals. The exterior goes before what leaves rays out, which it could not see through. Blank views
- * are made up for before metal is looked for. Pixels are averaged when the rays that are left out are known.
+ * In the order in which they run. The detector's lag is of all that it has counted, scatter too. Defects of the map are
+ * known before an air region's mean is taken, and hardening is that of line integrals. The exterior goes before what
+ * leaves rays out, which it could not see through. Blank views are made up for before metal is looked for. Pixels are
+ * averaged when the rays that are left out are known.
  */
 const struct correction *const corrections[CORRECTION_COUNT] = {
-    &correction_flat_dark,  &correction_defects,  &correction_air_region,  &correction_hardening, &correction_samples,
-    &correction_truncation, &correction_exterior, &correction_blank_views, &correction_metal,     &correction_averaging,
+    &correction_lag,        &correction_scatter,     &correction_flat_dark, &correction_defects,
+    &correction_air_region, &correction_hardening,   &correction_samples,   &correction_truncation,
+    &correction_exterior,   &correction_blank_views, &correction_metal,     &correction_averaging,
 };
 
 static bool is_wanted(const struct correction *row, const struct recipe *recipe, const struct linearise *linearise)
@@ -89,6 +93,11 @@ int corrections_open(struct correction_chain *ret_chain, const struct correction
 	int code = 0;
 
 	*ret_chain = (struct correction_chain){.job = *job, .input = input};
+	if (counts_wanted(&input->given)) {
+		ret_chain->counts = malloc(input->pixels * sizeof(float));
+		if (ret_chain->counts == NULL)
+			return error_set(err, ERR_NO_MEMORY, "no memory for the counts of a view");
+	}
 	for (int i = 0; i < CORRECTION_COUNT && code == 0; i++)
 		if (corrections[i]->open != NULL && chain_has(ret_chain, i))
 			code = corrections[i]->open(&ret_chain->job, &ret_chain->state[i], err);
@@ -103,6 +112,22 @@ void corrections_close(struct correction_chain *chain)
 		if (corrections[i]->close != NULL)
 			corrections[i]->close(chain->state[i]);
 	memset(chain->state, 0, sizeof(chain->state));
+	free(chain->counts);
+	chain->counts = NULL;
+}
+
+/* Corrects the counts of a view, chain->counts. */
+static int correct_counts(struct correction_chain *chain, const void *samples, int view, struct error *err)
+{
+	const struct input *input = chain->input;
+	int code = 0;
+
+	counts_take(&input->given, samples, input->pixels, chain->counts);
+	for (int i = 0; i < CORRECTION_COUNT && code == 0; i++)
+		if (corrections[i]->counts != NULL && chain_has(chain, i))
+			code = corrections[i]->counts(&chain->job, chain->state[i], view, chain->counts, err);
+	counts_give(&input->given, samples, input->pixels, chain->counts);
+	return code;
 }
 
 int corrections_take(struct correction_chain *chain, const void *samples, int view, int slot, struct stack *to,
@@ -110,8 +135,16 @@ int corrections_take(struct correction_chain *chain, const void *samples, int vi
 {
 	const struct defect_counts before = chain->input->counts;
 	struct correction_view taken = {.view = view, .slot = slot, .to = to, .before = &before};
-	int code =
-	    input_take(chain->input, chain->job.backend, chain->job.plan, samples, view, slot, to, &taken.samples, err);
+	int code = 0;
+
+	input_look_at_bytes(chain->input, samples);
+	if (chain->counts != NULL) {
+		code = correct_counts(chain, samples, view, err);
+		samples = chain->counts;
+	}
+	if (code == 0)
+		code = input_take(chain->input, chain->job.backend, chain->job.plan, samples, view, slot, to,
+				  &taken.samples, err);
 
 	for (int i = 0; i < CORRECTION_COUNT && code == 0; i++)
 		if (corrections[i]->view != NULL && chain_has(chain, i))

@@ -103,6 +103,11 @@ struct correction {
 	int (*open)(const struct correction_job *job, void **ret_state, struct error *err);
 	void (*close)(void *state); /* NULL is fine */
 
+	/*
+	 * At SAMPLES, before all else: changes counts above the dark, [row][column] as the detector has them, NaN where
+	 * a pixel says nothing. The row is wanted where counts_wanted (counts.h) is.
+	 */
+	int (*counts)(const struct correction_job *job, void *state, int view, float *counts, struct error *err);
 	/* At SAMPLES and LINE_INTEGRALS. The slot has the view's line integrals already. */
 	int (*view)(const struct correction_job *job, void *state, const struct correction_view *view,
 		    struct error *err);
@@ -126,7 +131,7 @@ struct correction {
 	int (*resume)(const struct correction_job *job, void *state, const void *bytes, size_t size, struct error *err);
 };
 
-enum { CORRECTION_COUNT = 10 };
+enum { CORRECTION_COUNT = 12 };
 extern const struct correction *const corrections[CORRECTION_COUNT];
 
 /* The corrections of one reconstruction. */
@@ -135,6 +140,7 @@ struct correction_chain {
 	struct input *input;
 	const struct linearise *linearise;
 	void *state[CORRECTION_COUNT];
+	float *counts; /* of a view, owned; NULL where no row changes counts */
 };
 
 /* ---- going over the table ---- */

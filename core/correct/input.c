@@ -8,6 +8,7 @@
 
 #include "core/correct/air.h"
 #include "core/correct/correction.h"
+#include "core/correct/counts.h"
 #include "core/truncation.h"
 
 /* [row][column] to [column][row], pixels of 1, 2 or 4 bytes. */
@@ -60,7 +61,8 @@ static int turn(struct input *input, struct error *err)
 int input_open(struct input *ret_input, const struct linearise *linearise, const struct geometry *geometry, bool turned,
 	       struct error *err)
 {
-	struct input input = {.linearise = *linearise,
+	struct input input = {.given = *linearise,
+			      .linearise = counts_linearise(linearise),
 			      .turned = turned,
 			      .columns = turned ? geometry->rows : geometry->columns,
 			      .rows = turned ? geometry->columns : geometry->rows};
@@ -92,7 +94,7 @@ int input_open(struct input *ret_input, const struct linearise *linearise, const
 
 size_t input_view_bytes(const struct input *input)
 {
-	return linearise_sample_bytes(&input->linearise) * (size_t)input->columns * (size_t)input->rows;
+	return linearise_sample_bytes(&input->given) * (size_t)input->columns * (size_t)input->rows;
 }
 
 void input_clear(struct input *input)
@@ -175,8 +177,12 @@ static int exchanged(uint16_t sample)
 	return sample >> 8 | (sample & 255) << 8;
 }
 
-static void look_at_bytes(struct input *input, const uint16_t *samples)
+void input_look_at_bytes(struct input *input, const void *raw)
 {
+	const uint16_t *samples = raw;
+
+	if (input->given.sample != SAMPLE_UINT16)
+		return;
 	for (size_t i = 1; i < input->pixels; i += input->pixels / 4096 + 1) {
 		input->rough[0] += abs(samples[i] - samples[i - 1]);
 		input->rough[1] += abs(exchanged(samples[i]) - exchanged(samples[i - 1]));
@@ -329,8 +335,6 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 	} else if (counts.blank == 0) {
 		code = look_at_all(input, samples, columns, rows, &input->content[view], err);
 	}
-	if (input->linearise.sample == SAMPLE_UINT16)
-		look_at_bytes(input, samples);
 	if (code == 0 && view % input->look_every == 0)
 		code = look_at_ends(input, samples, columns, rows, err);
 	if (code < 0)

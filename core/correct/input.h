@@ -10,7 +10,8 @@ enum { COPIES_MOST = 12 };
 
 /* The samples that a reconstruction was given: how they come, and statistics of those seen so far. */
 struct input {
-	struct linearise linearise; /* as given, with the whole map; exchanged where `turned` */
+	struct linearise given;     /* of the samples as they come */
+	struct linearise linearise; /* with the whole map, of counts that were corrected; exchanged where `turned` */
 	bool turned;                /* rows and columns of all images are exchanged on their way in */
 	int columns, rows;          /* as they come */
 	/* Owned, with rows and columns exchanged; NULL where not turned: linearise's images, and room for a view. */
@@ -74,9 +75,13 @@ int input_open(struct input *ret_input, const struct linearise *linearise, const
 	       struct error *err);
 void input_clear(struct input *input);
 
+/* Of the samples as they come. */
 size_t input_view_bytes(const struct input *input);
+/* Looks at a view's samples as they come, for signs that their bytes are in the wrong order. */
+void input_look_at_bytes(struct input *input, const void *samples);
 
-/* linearise of one view into a slot. *ret_upright: the samples, or their rows and columns exchanged where `turned`. */
+/* linearise of one view into a slot; the samples are those that corrections of counts have left. *ret_upright: the
+ * samples, or their rows and columns exchanged where `turned`. */
 int input_take(struct input *input, const struct backend *backend, struct plan *plan, const void *samples, int view,
 	       int slot, struct stack *to, const void **ret_upright, struct error *err);
 

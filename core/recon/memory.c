@@ -7,6 +7,7 @@
 
 #include "core/recon/algorithm.h"
 #include "core/correct/correction.h"
+#include "core/correct/counts.h"
 #include "core/outofcore/outofcore.h"
 #include "core/recon/internal.h"
 #include "core/recon/thin.h"
@@ -291,7 +292,7 @@ int recon_memory(const struct backend *backend, struct device *device, const str
 		    .pad = {recon.orbit.pad[0], recon.orbit.pad[1]},
 		    .extend = recipe->fdk.extend ? recon.geometry->columns : 0,
 		};
-		recon.input.linearise = *linearise;
+		recon.input.linearise = counts_linearise(linearise);
 		options = plan_options(&recon);
 		code = recon_choose_device(&recon, &options, err);
 		recon.weights = (struct fdk_weights){0};

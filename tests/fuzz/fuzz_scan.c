@@ -49,6 +49,8 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 	PROMISE(memcmp(scan->geometry.views, again->geometry.views, sizeof(struct view) * (size_t)scan->count) == 0);
 	PROMISE(memcmp(scan->air_region, again->air_region, sizeof(scan->air_region)) == 0);
 	PROMISE(memcmp(scan->hardening, again->hardening, sizeof(scan->hardening)) == 0);
+	PROMISE(memcmp(&scan->lag, &again->lag, sizeof(scan->lag)) == 0);
+	PROMISE(memcmp(&scan->scatter, &again->scatter, sizeof(scan->scatter)) == 0);
 	reduce(again);
 	free(text);
 	scan_free(scan);

@@ -27,7 +27,8 @@ TRIED = [
     ("/v1/scans", "ScanRequest", SCAN,
      ["/name", "/patient/position", "/patient/name", "/patient/id", "/patient/sex", "/study/uid", "/study/id",
       "/study/accession_number", "/study/description", "/study/referring_physician", "/projections/beam_hardening",
-      "/projections/air_region", "/patient/world_to_patient"]),
+      "/projections/air_region", "/projections/lag", "/projections/scatter/kernels", "/projections/scatter/fraction",
+      "/patient/world_to_patient"]),
     ("/v1/jobs", "JobRequest", {"scan": "SCAN"}, ["/preset"]),
     ("/v1/calibrations", "CalibrationRequest", {"scan": "SCAN", "phantom": CIRCLES},
      ["/arm", "/phantom/kind", "/phantom/circles", "/phantom/balls", "/phantom/diameter_mm", "/phantom/distance_mm",
@@ -39,6 +40,8 @@ TRIED = [
 LISTS = {
     "/projections/beam_hardening": [0, 1] + [0] * 6,
     "/projections/air_region": [0, 0, 1, 1],
+    "/projections/lag": [{"share": 0.01, "frames": 3}] * 4,
+    "/projections/scatter/kernels": [{"amplitude": 0.1, "power": 1, "width_mm": 100}] * 4,
     "/patient/world_to_patient": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1],
 }
 

@@ -1,0 +1,190 @@
+/* Scattered radiation as a row of corrections[]: taken off each view's counts, by kernels or as a constant (scatter.h).
+ */
+#include <math.h>
+#include <stdlib.h>
+
+#include "core/correct/correction.h"
+#include "core/correct/input.h"
+#include "core/correct/scatter.h"
+
+/* At least this share of a count is left: no model is so good that it could take more. */
+static const float KEPT_LEAST = 0.05f;
+/* Samples that are held at that share, from which on it is told. */
+static const double LIMITED_MANY = 0.01;
+
+struct state {
+	struct scatter *scatter;
+	float *total; /* [row][column] against air */
+	double shares, share_most;
+	size_t limited;
+	int views;
+};
+
+static bool is_wanted(const struct recipe *recipe, const struct linearise *linearise)
+{
+	(void)recipe;
+	return linearise->scatter != NULL;
+}
+
+static int check(const struct linearise *linearise, const struct geometry *geometry, struct error *err)
+{
+	(void)geometry;
+	if (linearise->scatter != NULL && linearise->quantity != QUANTITY_INTENSITY)
+		return error_set(err, ERR_INVALID, "scatter cannot be taken off line integrals, but off intensities");
+	return 0;
+}
+
+static void close_state(void *context)
+{
+	struct state *state = context;
+
+	if (state == NULL)
+		return;
+	scatter_free(state->scatter);
+	free(state->total);
+	free(state);
+}
+
+static int open_state(const struct correction_job *job, void **ret_state, struct error *err)
+{
+	const struct input *input = job->input;
+	const struct view *view = &job->geometry->views[0];
+	const double pitch[2] = {vec_norm(view->column_step), vec_norm(view->row_step)};
+	const double pixel[2] = {pitch[input->turned ? 1 : 0], pitch[input->turned ? 0 : 1]};
+	struct state *state = calloc(1, sizeof(*state));
+	int code = 0;
+
+	if (state != NULL)
+		state->total = malloc(input->pixels * sizeof(*state->total));
+	if (state == NULL || state->total == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for the scatter of a view");
+	if (code == 0)
+		code = scatter_new(input->given.scatter, input->columns, input->rows, pixel, &state->scatter, err);
+	if (code < 0)
+		close_state(state);
+	else
+		*ret_state = state;
+	return code;
+}
+
+/* What a pixel counts above the dark in air. */
+static float range_of(const struct linearise *linearise, size_t at)
+{
+	return linearise_counts(linearise, IMAGE_FLAT, at, linearise->air) -
+	       linearise_counts(linearise, IMAGE_DARK, at, 0);
+}
+
+/* Counts against air, without pixels of the map. */
+static void totals_take(const struct input *input, const float *counts, float *ret_total)
+{
+	const struct linearise *given = &input->given;
+
+#pragma omp parallel for schedule(static)
+	for (size_t i = 0; i < input->pixels; i++) {
+		const bool marked = linearise_mapped(given, i) || (given->stuck != NULL && given->stuck[i]);
+
+		ret_total[i] = marked ? NAN : counts[i] / range_of(given, i);
+	}
+}
+
+/* The mean of what is in the air region, without scatter; 1 without a region. */
+static double air_of(const struct state *state, const struct input *input, double scattered)
+{
+	const int *region = input->given.air_region;
+	float line[DETECTOR_MAX];
+	double sum = 0;
+	size_t good = 0;
+
+	if (!input->given.has_air_region)
+		return 1;
+	for (int row = region[1]; row <= region[3]; row++) {
+		scatter_row(state->scatter, row, line);
+		for (int column = region[0]; column <= region[2]; column++) {
+			const float total = state->total[(size_t)row * (size_t)input->columns + (size_t)column];
+
+			sum += isnan(total) ? 0 : (double)total - scattered * (double)line[column];
+			good += !isnan(total);
+		}
+	}
+	return good > 0 && sum > 0 ? sum / (double)good : 1;
+}
+
+/* Estimates the view's scatter against its own air, part of which is scatter itself. */
+static void estimate(struct state *state, const struct input *input)
+{
+	double air = air_of(state, input, 0);
+
+	for (int step = 0; step < (input->given.has_air_region ? 2 : 1); step++) {
+		scatter_estimate(state->scatter, state->total, air);
+		air = air_of(state, input, 1);
+	}
+}
+
+static int take_out(const struct correction_job *job, void *context, int view, float *counts, struct error *err)
+{
+	struct state *state = context;
+	const struct input *input = job->input;
+	size_t limited = 0;
+	double share;
+
+	(void)view;
+	(void)err;
+	totals_take(input, counts, state->total);
+	estimate(state, input);
+#pragma omp parallel for schedule(static) reduction(+ : limited)
+	for (int row = 0; row < input->rows; row++) {
+		float line[DETECTOR_MAX];
+
+		scatter_row(state->scatter, row, line);
+		for (int column = 0; column < input->columns; column++) {
+			const size_t at = (size_t)row * (size_t)input->columns + (size_t)column;
+			const float left = counts[at] - line[column] * range_of(&input->given, at);
+
+			limited += left < KEPT_LEAST * counts[at];
+			counts[at] = isnan(counts[at]) ? NAN : fmaxf(left, KEPT_LEAST * counts[at]);
+		}
+	}
+	share = scatter_share(state->scatter);
+	state->shares += share;
+	state->share_most = fmax(state->share_most, share);
+	state->limited += limited;
+	state->views++;
+	return 0;
+}
+
+static int warn(const struct correction_job *job, void *context, struct error *err)
+{
+	const struct state *state = context;
+	const struct scatter_model *model = job->input->given.scatter;
+	const double samples = (double)job->input->pixels * state->views;
+
+	(void)err;
+	if (state->views == 0)
+		return 0;
+	if (model->fraction > 0)
+		warning_tell(job->warnings, "scatter_constant",
+			     "scatter was taken for the same all over the detector, %.3g of the primary behind the "
+			     "densest part: %.3g %% of the counts on average",
+			     model->fraction, 100 * state->shares / state->views);
+	if ((double)state->limited > LIMITED_MANY * samples)
+		warning_tell(job->warnings, "scatter_limited",
+			     "the scatter's estimate leaves less than %.2g of the counts of %.3g %% of the samples, "
+			     "which were held there; it is %.3g %% of the counts on average, %.3g %% at most",
+			     (double)KEPT_LEAST, 100 * (double)state->limited / samples,
+			     100 * state->shares / state->views, 100 * state->share_most);
+	return 0;
+}
+
+extern const struct correction correction_scatter;
+const struct correction correction_scatter = {
+    .name = "scatter",
+    .summary = "scattered radiation, estimated from the view itself, is taken off the counts",
+    .times = 1U << CORRECT_SAMPLES,
+    .needs = NEEDS_WHOLE_IMAGES,
+    .wanted = is_wanted,
+    .check = check,
+    .open = open_state,
+    .close = close_state,
+    .counts = take_out,
+    .warn = warn,
+};

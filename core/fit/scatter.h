@@ -1,0 +1,30 @@
+#ifndef CBCT_CORE_FIT_SCATTER_H
+#define CBCT_CORE_FIT_SCATTER_H
+
+#include "core/correct/scatter.h"
+
+/*
+ * Kernels for core/correct/scatter.h from exposures whose scatter is known at some places: behind beam stops in a
+ * second exposure, or everywhere.
+ *
+ * The residual is the error of the line integral that the correction leaves: what the estimate from the whole
+ * exposure lacks of the known scatter, against the primary. The kernels are of different widths, with amplitude,
+ * exponent, power and asymmetry of their own.
+ */
+struct scatter_exposure {
+	const float *total;   /* [row][column], against air; NaN for pixels that say nothing */
+	const float *scatter; /* the same; NaN where it is not known */
+};
+
+struct scatter_fit {
+	struct scatter_model model;
+	double rms; /* of the line integral's error */
+	double rms_without;
+	int known; /* places that were compared */
+};
+
+/* ERR_IMPOSSIBLE where too few places are known, or the scatter is not below the total. */
+int scatter_fit(const struct scatter_exposure *exposures, int count, int columns, int rows, const double pixel_mm[2],
+		int kernels, struct scatter_fit *ret_fit, struct error *err);
+
+#endif

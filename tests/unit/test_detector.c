@@ -1,0 +1,542 @@
+/*
+ * What tube, object and detector add to the counts: lag, from a convolution in time that is written down here, and
+ * scatter, from a Monte Carlo simulation (montecarlo.h); what is left of both in volumes, and fits of their models.
+ */
+#include <check.h>
+#include <math.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "core/correct/lag.h"
+#include "core/fit/hardening.h"
+#include "core/fit/lag.h"
+#include "core/fit/scatter.h"
+#include "tests/unit/montecarlo.h"
+#include "tests/unit/scene.h"
+
+Suite *detector_suite(void);
+
+static const double WATER = 0.0192, AIR = 50000, DARK = 300;
+
+static struct recipe fdk_on(int nx, int nz, double spacing)
+{
+	struct grid grid = grid_of(nx, nx, nz, spacing, spacing, spacing);
+	struct recipe recipe = recipe_on(&grid);
+
+	recipe.fdk.on = true;
+	return recipe;
+}
+
+static double hu(double attenuation)
+{
+	return 1000 * attenuation / WATER;
+}
+
+/* ---- lag ---- */
+
+enum { COLUMNS = 72, ROWS = 40, PIXELS = COLUMNS * ROWS, VIEWS = 120 };
+static const struct orbit_spec orbit = {COLUMNS, ROWS, VIEWS, {600, 1100, {4, 4}, {0, 0}, {0, 0}}, 0, 3};
+static const struct lag_model LAG = {4, {{0.012, 1.2}, {0.009, 6}, {0.006, 25}, {0.003, 120}}}; /* 3 % in all */
+
+/* A body far off the axis, so that its edges sweep over the detector, with bone. */
+static void make_scene(struct scene *ret)
+{
+	struct ellipsoid parts[] = {
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {40, 55, 60}, .centre = {15, -10, 0}, .density = WATER},
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {12, 10, 30}, .centre = {35, 5, 0}, .density = WATER},
+	};
+	struct phantom phantom = {.count = 2, .parts = parts};
+
+	scene_orbit(ret, &orbit);
+	scene_add(ret, &phantom);
+}
+
+/*
+ * Counts with what the detector keeps of all earlier frames, summed frame by frame: of a signal x, (1 - r) r^(k-1) of
+ * each share comes k frames later.
+ */
+static float *counts_with_lag(const struct scene *scene, const struct lag_model *lag, bool dark)
+{
+	float *counts = malloc(sizeof(float) * PIXELS * VIEWS);
+
+	ck_assert_ptr_nonnull(counts);
+	for (int view = 0; view < VIEWS; view++)
+		for (int i = 0; i < PIXELS; i++) {
+			double sum = 0;
+
+			for (int before = 0; before <= view; before++) {
+				const double x = AIR * exp(-(double)scene->projections[before * PIXELS + i]);
+				double part = before == view ? 1 : 0;
+
+				for (int n = 0; n < lag->count; n++) {
+					const double r = exp(-1 / lag->terms[n].frames);
+
+					part += lag->terms[n].share *
+						(before == view ? -1 : (1 - r) * pow(r, view - before - 1));
+				}
+				sum += part * x;
+			}
+			counts[view * PIXELS + i] = (float)(sum + (dark ? DARK : 0));
+		}
+	return counts;
+}
+
+static double largest_difference(const float *a, const float *b, size_t count)
+{
+	double most = 0;
+
+	for (size_t i = 0; i < count; i++)
+		most = fmax(most, fabs((double)a[i] - (double)b[i]));
+	return most;
+}
+
+START_TEST(lag_of_three_percent_leaves_no_ghost)
+{
+	const struct recipe recipe = fdk_on(48, 20, 3.2);
+	struct outcome ideal = {0}, with = {0}, without = {0};
+	float dark[PIXELS], flat[PIXELS];
+	struct scene scene;
+	float *counts;
+
+	make_scene(&scene);
+	run(&scene, &recipe, &ideal);
+	counts = counts_with_lag(&scene, &LAG, true);
+	for (int i = 0; i < PIXELS; i++) {
+		dark[i] = (float)DARK;
+		flat[i] = (float)(AIR + DARK);
+	}
+	with.samples = without.samples = counts;
+	with.linearise = without.linearise = (struct linearise){.sample = SAMPLE_FLOAT32,
+								.quantity = QUANTITY_INTENSITY,
+								.image[IMAGE_FLAT] = flat,
+								.image[IMAGE_DARK] = dark};
+	with.linearise.lag = &LAG;
+	run(&scene, &recipe, &without);
+	run(&scene, &recipe, &with);
+	/* Floats lie between the two; a voxel of the ghost is 5 HU at most, and was 20. */
+	ck_assert_double_gt(hu(largest_difference(without.last, ideal.last, grid_voxels(&ideal.grid))), 15);
+	ck_assert_double_lt(hu(largest_difference(with.last, ideal.last, grid_voxels(&ideal.grid))), 5);
+	free(counts);
+	outcome_clear(&ideal);
+	outcome_clear(&with);
+	outcome_clear(&without);
+	scene_clear(&scene);
+}
+END_TEST
+
+/* Pixels that say nothing stay what they were, in kind and number. */
+START_TEST(corrected_counts_keep_their_defects)
+{
+	const struct recipe recipe = fdk_on(24, 10, 6.4);
+	const struct scatter_model constant = {.fraction = 0.2};
+	struct outcome plain = {0}, corrected = {0};
+	uint16_t *samples = malloc(sizeof(uint16_t) * PIXELS * VIEWS);
+	struct scene scene;
+
+	make_scene(&scene);
+	for (int i = 0; i < PIXELS * VIEWS; i++)
+		samples[i] = (uint16_t)(AIR * exp(-(double)scene.projections[i]));
+	samples[5 * PIXELS + 700] = 0;
+	samples[6 * PIXELS + 701] = 65535;
+	samples[7 * PIXELS + 702] = 65535;
+	plain.samples = corrected.samples = samples;
+	plain.linearise = corrected.linearise =
+	    (struct linearise){.sample = SAMPLE_UINT16, .quantity = QUANTITY_INTENSITY, .air = AIR};
+	corrected.linearise.lag = &LAG;
+	corrected.linearise.scatter = &constant;
+	run(&scene, &recipe, &plain);
+	run(&scene, &recipe, &corrected);
+	ck_assert_ptr_nonnull(strstr(plain.warnings, "3 samples"));
+	ck_assert_ptr_nonnull(strstr(plain.warnings, "1 not above the dark, 2 saturated, 0 not finite"));
+	ck_assert_ptr_nonnull(strstr(corrected.warnings, strstr(plain.warnings, "defects: ")));
+	ck_assert_ptr_nonnull(strstr(corrected.warnings, "scatter_constant: "));
+	outcome_clear(&plain);
+	outcome_clear(&corrected);
+	scene_clear(&scene);
+	free(samples);
+}
+END_TEST
+
+START_TEST(lag_wants_views_in_the_order_of_time)
+{
+	const struct recipe recipe = fdk_on(24, 10, 6.4);
+	struct outcome outcome = {0};
+	struct scene scene;
+	int order[VIEWS];
+
+	make_scene(&scene);
+	for (int i = 0; i < VIEWS; i++)
+		order[i] = i < 2 ? 1 - i : i;
+	outcome.order = order;
+	outcome.linearise =
+	    (struct linearise){.sample = SAMPLE_FLOAT32, .quantity = QUANTITY_INTENSITY, .air = AIR, .lag = &LAG};
+	scene_run(&scene, &recipe, &outcome);
+	ck_assert_int_eq(outcome.code, ERR_CONFLICT);
+	ck_assert_str_eq(outcome.err.text, "projection 0 came behind projection 1: lag is of their order");
+	outcome_clear(&outcome);
+	outcome = (struct outcome){.linearise = {.sample = SAMPLE_FLOAT32, .lag = &LAG}};
+	scene_run(&scene, &recipe, &outcome);
+	ck_assert_int_eq(outcome.code, ERR_INVALID);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
+/* A steady signal is the same before and behind frames that are missing, also before the first one. */
+START_TEST(lag_bridges_missing_frames)
+{
+	const int first = _i == 0 ? 0 : 40, missing = 7;
+	struct lag *lag = NULL;
+	struct error err;
+	double traps[4] = {0}, x = 1000;
+
+	ck_assert_int_eq(lag_new(&LAG, 1, &lag, &err), 0);
+	for (int k = 0; k < 90; k++) {
+		double y = x;
+		float signal;
+
+		for (int n = 0; n < 4; n++) {
+			const double r = exp(-1 / LAG.terms[n].frames);
+
+			y += (1 - r) * traps[n] - LAG.terms[n].share * x;
+			traps[n] = r * traps[n] + LAG.terms[n].share * x;
+		}
+		signal = (float)y;
+		if (k < first || (k >= 60 && k < 60 + missing))
+			continue;
+		lag_take(lag, k, &signal);
+		/* Frames that are missing are taken for as bright as the next one is with its lag. */
+		ck_assert_double_eq_tol((double)signal, x, first == 0 && k < 60 ? 1e-3 : 0.003 * x);
+	}
+	lag_free(lag);
+}
+END_TEST
+
+/* Frames before and behind the end of the beam, with the noise of a mean over many pixels. */
+START_TEST(lag_is_fitted_from_the_end_of_the_beam)
+{
+	enum { FRAMES = 400, ON = 150 };
+	double signal[FRAMES], traps[4] = {0};
+	struct lag_fit fit;
+	struct error err;
+
+	for (int k = 0; k < FRAMES; k++) {
+		const double x = k < ON ? 20000 : 0;
+
+		signal[k] = x;
+		for (int n = 0; n < 4; n++) {
+			const double r = exp(-1 / LAG.terms[n].frames);
+
+			signal[k] += (1 - r) * traps[n] - LAG.terms[n].share * x;
+			traps[n] = r * traps[n] + LAG.terms[n].share * x;
+		}
+		signal[k] += 0.05 * sin(12.9898 * k * k);
+	}
+	ck_assert_msg(lag_fit(signal, FRAMES, ON, &fit, &err) == 0, "%s", err.text);
+	ck_assert_double_lt(fit.left, 0.02 * fit.without);
+	/* The terms are not unique, their response to a pulse is: the first frames of it, and all of the first 50. */
+	for (int k = 1; k <= 50; k += 7) {
+		double wanted = 0, got = 0;
+
+		for (int n = 0; n < 4; n++)
+			wanted += LAG.terms[n].share * (1 - exp(-1 / LAG.terms[n].frames)) *
+				  exp(-(k - 1) / LAG.terms[n].frames);
+		for (int n = 0; n < fit.model.count; n++)
+			got += fit.model.terms[n].share * (1 - exp(-1 / fit.model.terms[n].frames)) *
+			       exp(-(k - 1) / fit.model.terms[n].frames);
+		ck_assert_double_eq_tol(got, wanted, 0.05 * wanted + 2e-6);
+	}
+	ck_assert_int_eq(lag_fit(signal, FRAMES, ON + 5, &fit, &err), ERR_IMPOSSIBLE);
+	ck_assert_int_eq(lag_fit(signal, FRAMES, ON - 5, &fit, &err), ERR_IMPOSSIBLE);
+	ck_assert_int_eq(lag_fit(signal, ON + 4, ON, &fit, &err), ERR_IMPOSSIBLE);
+	for (int k = ON; k < FRAMES; k++)
+		signal[k] = 0;
+	ck_assert_int_eq(lag_fit(signal, FRAMES, ON, &fit, &err), ERR_IMPOSSIBLE);
+	ck_assert_ptr_nonnull(strstr(err.text, "there is no lag"));
+}
+END_TEST
+
+/* ---- scatter ---- */
+
+enum { WIDE = 100, HIGH = 76, ACROSS = 20, ALONG = 15, ANGLES = 8, TURNS = 96 };
+static const struct orbit_spec scattering = {WIDE, HIGH, TURNS, {620, 1100, {4, 4}, {0, 0}, {0, 0}}, 0, 3.75};
+
+/* Bilinear between the centres of Monte Carlo's cells. */
+static double cell_value(const float *cells, int column, int row)
+{
+	const double x = fmin(fmax((column + 0.5) * ACROSS / WIDE - 0.5, 0), ACROSS - 1.001);
+	const double y = fmin(fmax((row + 0.5) * ALONG / HIGH - 0.5, 0), ALONG - 1.001);
+	const int i = (int)x, j = (int)y;
+	const float *at = cells + j * ACROSS + i;
+
+	return (1 - (y - j)) * ((1 - (x - i)) * (double)at[0] + (x - i) * (double)at[1]) +
+	       (y - j) * ((1 - (x - i)) * (double)at[ACROSS] + (x - i) * (double)at[ACROSS + 1]);
+}
+
+/* Primary and scatter of one exposure, against air. */
+static struct scatter_exposure expose(const struct phantom *phantom, const struct geometry *geometry)
+{
+	const struct montecarlo montecarlo = {phantom, geometry, 260, ACROSS, ALONG, 2500, 7};
+	float cells[ACROSS * ALONG], *total = malloc(sizeof(float) * WIDE * HIGH);
+	float *scatter = malloc(sizeof(float) * WIDE * HIGH);
+
+	ck_assert(total != NULL && scatter != NULL);
+	phantom_project(phantom, geometry, 0, total);
+	montecarlo_scatter(&montecarlo, 0, cells);
+	for (int i = 0; i < WIDE * HIGH; i++) {
+		scatter[i] = (float)cell_value(cells, i % WIDE, i / WIDE);
+		total[i] = expf(-total[i]);
+	}
+	return (struct scatter_exposure){total, scatter};
+}
+
+static struct geometry some_views(int count)
+{
+	struct orbit_spec spec = scattering;
+	struct scene scene;
+
+	spec.views = count;
+	spec.step_deg = 360.0 / count;
+	scene_orbit(&scene, &spec);
+	free(scene.projections);
+	return scene.geometry;
+}
+
+/* Plates that do not cover the beam, and bottles of water. */
+enum { FITTED = 6 };
+static void expose_all(struct scatter_exposure ret[FITTED])
+{
+	struct ellipsoid parts[FITTED] = {
+	    {.shape = SHAPE_BOX, .semi_axes = {40, 60, 60}, .density = WATER},
+	    {.shape = SHAPE_BOX, .semi_axes = {80, 70, 70}, .density = WATER},
+	    {.shape = SHAPE_BOX, .semi_axes = {70, 60, 160}, .centre = {0, 40, 0}, .density = WATER},
+	    {.shape = SHAPE_CYLINDER, .semi_axes = {50, 50, 100}, .density = WATER},
+	    {.shape = SHAPE_CYLINDER, .semi_axes = {75, 75, 90}, .density = WATER},
+	    {.shape = SHAPE_CYLINDER, .semi_axes = {60, 90, 100}, .centre = {0, -30, 10}, .density = WATER},
+	};
+	struct geometry geometry = some_views(1);
+
+#pragma omp parallel for schedule(dynamic)
+	for (int i = 0; i < FITTED; i++)
+		ret[i] = expose(&(struct phantom){.count = 1, .parts = &parts[i]}, &geometry);
+	geometry_clear(&geometry);
+}
+
+/* Kernels for that beam whose scatter is `scale` times as much, as another grid makes it. */
+static void fit_kernels(const struct scatter_exposure exposures[FITTED], double scale, struct scatter_fit *ret)
+{
+	struct scatter_exposure scaled[FITTED];
+	float *all = malloc(sizeof(float) * 2 * FITTED * WIDE * HIGH);
+	struct error err;
+
+	ck_assert_ptr_nonnull(all);
+	for (int i = 0; i < FITTED; i++) {
+		float *total = all + (size_t)(2 * i) * WIDE * HIGH, *scatter = total + WIDE * HIGH;
+
+		for (int k = 0; k < WIDE * HIGH; k++) {
+			scatter[k] = (float)scale * exposures[i].scatter[k];
+			total[k] = exposures[i].total[k] + scatter[k];
+		}
+		scaled[i] = (struct scatter_exposure){total, scatter};
+	}
+	ck_assert_msg(scatter_fit(scaled, FITTED, WIDE, HIGH, (const double[]){4, 4}, 1, ret, &err) == 0, "%s",
+		      err.text);
+	free(all);
+}
+
+/* A head with a skull, and a thigh with its bone; a flat part of each, by its centre and radius. */
+static struct ellipsoid head[] = {
+    {.semi_axes = {75, 92, 95}, .density = 1.9 * 0.0192},
+    {.semi_axes = {69, 86, 89}, .density = -0.9 * 0.0192},
+    {.semi_axes = {10, 20, 20}, .centre = {30, 10, 0}, .density = -0.2 * 0.0192},
+};
+static struct ellipsoid thigh[] = {
+    {.shape = SHAPE_CYLINDER, .semi_axes = {70, 75, 120}, .density = 0.0192},
+    {.shape = SHAPE_CYLINDER, .semi_axes = {17, 17, 120}, .centre = {-20, 8, 0}, .density = 0.9 * 0.0192},
+};
+static const struct patient {
+	const char *name;
+	struct phantom phantom;
+	double flat[4][3];
+	double radius;
+} patients[] = {
+    {"head", {3, head}, {{0, 0, 0}, {-30, 0, 0}, {0, -40, 0}, {0, 50, 0}}, 10},
+    {"thigh", {2, thigh}, {{15, 0, 0}, {0, -40, 0}, {0, 45, 0}, {35, 0, 0}}, 10},
+};
+
+/* Scatter of some angles, [angle][cell]. */
+static float *scatter_of(const struct phantom *phantom)
+{
+	struct geometry geometry = some_views(ANGLES);
+	const struct montecarlo montecarlo = {phantom, &geometry, 260, ACROSS, ALONG, 2500, 11};
+	float *cells = malloc(sizeof(float) * ANGLES * ACROSS * ALONG);
+
+	ck_assert_ptr_nonnull(cells);
+#pragma omp parallel for schedule(dynamic)
+	for (int i = 0; i < ANGLES; i++)
+		montecarlo_scatter(&montecarlo, i, cells + i * ACROSS * ALONG);
+	geometry_clear(&geometry);
+	return cells;
+}
+
+/* Counts with scatter, between two of its angles. */
+static float *counts_with_scatter(const struct scene *scene, const float *cells, double scale)
+{
+	float *counts = malloc(sizeof(float) * WIDE * HIGH * TURNS);
+
+	ck_assert_ptr_nonnull(counts);
+	for (int view = 0; view < TURNS; view++) {
+		const double at = (double)view * ANGLES / TURNS;
+		const int before = (int)at;
+		const float *first = cells + before * ACROSS * ALONG;
+		const float *second = cells + (before + 1) % ANGLES * ACROSS * ALONG;
+
+		for (int i = 0; i < WIDE * HIGH; i++) {
+			const int pixel = view * WIDE * HIGH + i;
+			const double scatter = (1 - (at - before)) * cell_value(first, i % WIDE, i / WIDE) +
+					       (at - before) * cell_value(second, i % WIDE, i / WIDE);
+
+			counts[pixel] = (float)(AIR * (exp(-(double)scene->projections[pixel]) + scale * scatter));
+		}
+	}
+	return counts;
+}
+
+/* The mean error in flat parts, HU. */
+static double flat_error(const struct patient *patient, const struct outcome *got, const struct outcome *ideal)
+{
+	double sum = 0;
+
+	for (int i = 0; i < 4; i++)
+		sum += hu(mean_near(got->last, &got->grid, patient->flat[i], patient->radius) -
+			  mean_near(ideal->last, &ideal->grid, patient->flat[i], patient->radius)) /
+		       4;
+	return sum;
+}
+
+/* What is left in the flat parts of a scan with so much scatter, against the scan without. */
+static void correct(const struct patient *patient, const struct scatter_exposure exposures[FITTED])
+{
+	const double ratios[] = {0.2, 0.5, 1};
+	const struct recipe recipe = fdk_on(52, 16, 4);
+	const int amid = HIGH / 2 * WIDE + WIDE / 2;
+	struct outcome ideal = {0};
+	struct scene scene;
+	float *cells = scatter_of(&patient->phantom);
+
+	scene_orbit(&scene, &scattering);
+	scene_add(&scene, &patient->phantom);
+	run(&scene, &recipe, &ideal);
+	for (int r = 0; r < 3; r++) {
+		const double primary = exp(-(double)scene.projections[amid]);
+		const double scale = ratios[r] * primary / cell_value(cells, WIDE / 2, HIGH / 2);
+		float *counts = counts_with_scatter(&scene, cells, scale);
+		struct outcome with = {.samples = counts}, without = {.samples = counts};
+		struct scatter_fit fit;
+		double left, was;
+
+		fit_kernels(exposures, scale, &fit);
+		with.linearise = without.linearise =
+		    (struct linearise){.sample = SAMPLE_FLOAT32, .quantity = QUANTITY_INTENSITY, .air = AIR};
+		with.linearise.scatter = &fit.model;
+		run(&scene, &recipe, &without);
+		run(&scene, &recipe, &with);
+		was = flat_error(patient, &without, &ideal);
+		left = flat_error(patient, &with, &ideal);
+		printf("%s, scatter of %.0f %% of the primary: %.1f HU without, %.1f HU with\n", patient->name,
+		       100 * ratios[r], was, left);
+		ck_assert_double_lt(was, -40);
+		ck_assert_msg(fabs(left) < 20, "%s, %.0f %%: %.1f HU are left of %.1f", patient->name, 100 * ratios[r],
+			      left, was);
+		outcome_clear(&with);
+		outcome_clear(&without);
+		free(counts);
+	}
+	outcome_clear(&ideal);
+	scene_clear(&scene);
+	free(cells);
+}
+
+/*
+ * Scatter of 20, 50 and 100 % of the primary amid the first view, taken off with kernels that were fitted on other
+ * objects, of the same beam.
+ */
+START_TEST(scatter_is_taken_off_objects_that_its_kernels_were_not_fitted_on)
+{
+	struct scatter_exposure exposures[FITTED];
+
+	expose_all(exposures);
+	for (size_t i = 0; i < sizeof(patients) / sizeof(patients[0]); i++)
+		correct(&patients[i], exposures);
+	for (int i = 0; i < FITTED; i++) {
+		free((void *)exposures[i].total);
+		free((void *)exposures[i].scatter);
+	}
+}
+END_TEST
+
+/* Steps of water as a beam of three energies hardens in them: the polynomial makes them straight. */
+START_TEST(hardening_is_fitted_from_steps_of_water)
+{
+	const double share[] = {0.3, 0.5, 0.2}, attenuation[] = {0.0268, 0.0206, 0.0171};
+	struct hardening_point points[12];
+	struct hardening_fit fit;
+	struct error err;
+	double start = 0;
+
+	for (int i = 0; i < 12; i++) {
+		double left = 0;
+
+		points[i].length = 20.0 * (i + 1);
+		for (int e = 0; e < 3; e++)
+			left += share[e] * exp(-attenuation[e] * points[i].length);
+		points[i].p = -log(left);
+	}
+	for (int e = 0; e < 3; e++)
+		start += share[e] * attenuation[e];
+	ck_assert_msg(hardening_fit(points, 12, 3, 0, &fit, &err) == 0, "%s", err.text);
+	ck_assert_int_eq(fit.count, 4);
+	ck_assert_double_eq(fit.coefficients[0], 0);
+	/* The beam's attenuation before it hardens, from steps that begin at 20 mm. */
+	ck_assert_double_eq_tol(fit.attenuation, start, 0.03 * start);
+	ck_assert_double_lt(fit.rms, 0.05 * fit.rms_without);
+	/* A given attenuation, and steps between those of the fit. */
+	ck_assert_int_eq(hardening_fit(points, 12, 3, 0.0192, &fit, &err), 0);
+	for (double length = 30; length < 240; length += 20) {
+		double left = 0, p = 0;
+
+		for (int e = 0; e < 3; e++)
+			left += share[e] * exp(-attenuation[e] * length);
+		for (int k = 3; k >= 0; k--)
+			p = p * -log(left) + fit.coefficients[k];
+		ck_assert_double_eq_tol(p, 0.0192 * length, 0.004 * 0.0192 * length);
+	}
+	ck_assert_int_eq(hardening_fit(points, 3, 3, 0, &fit, &err), ERR_IMPOSSIBLE);
+	ck_assert_str_eq(err.text, "3 different lengths, a polynomial of degree 3 needs 4");
+	points[4].p = -1;
+	ck_assert_int_eq(hardening_fit(points, 12, 3, 0, &fit, &err), ERR_INVALID);
+	ck_assert_str_eq(err.text, "point 4: a line integral of -1 behind 100 mm, both must be above 0");
+}
+END_TEST
+
+Suite *detector_suite(void)
+{
+	Suite *suite = suite_create("detector");
+	TCase *lag = tcase_create("lag"), *scatter = tcase_create("scatter"), *fits = tcase_create("fits");
+
+	tcase_set_timeout(lag, 120);
+	tcase_add_test(lag, lag_of_three_percent_leaves_no_ghost);
+	tcase_add_test(lag, corrected_counts_keep_their_defects);
+	tcase_add_test(lag, lag_wants_views_in_the_order_of_time);
+	tcase_add_loop_test(lag, lag_bridges_missing_frames, 0, 2);
+	tcase_add_test(lag, lag_is_fitted_from_the_end_of_the_beam);
+	suite_add_tcase(suite, lag);
+	tcase_set_timeout(scatter, 300);
+	tcase_add_test(scatter, scatter_is_taken_off_objects_that_its_kernels_were_not_fitted_on);
+	suite_add_tcase(suite, scatter);
+	tcase_add_test(fits, hardening_is_fitted_from_steps_of_water);
+	suite_add_tcase(suite, fits);
+	return suite;
+}
