@@ -58,7 +58,7 @@ int load_run(const cJSON *destination, const struct objects *objects, int thread
 	     struct error *err);
 
 /* ---- kinds of archives ---- */
-enum promise { PROMISE_UNKNOWN, PROMISE_ASKED, PROMISE_GIVEN };
+enum promise { PROMISE_UNKNOWN, PROMISE_ASKED, PROMISE_GIVEN, PROMISE_REFUSED /* with an error */ };
 
 struct archive {
 	const char *kind;

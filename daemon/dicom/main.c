@@ -194,6 +194,7 @@ static void finish(int code, bool asked, enum promise promise, const struct obje
 							   : "sent");
 	cJSON_AddBoolToObject(end, "reachable", asked ? code == 0 : code != ERR_BUSY);
 	cJSON_AddBoolToObject(end, "permanent", is_permanent(code));
+	cJSON_AddBoolToObject(end, "refused", promise == PROMISE_REFUSED);
 	cJSON_AddNumberToObject(end, "instances", objects->count);
 	cJSON_AddNumberToObject(end, "stored", objects->list != NULL ? objects_stored(objects) : 0);
 	if (code != 0)

@@ -154,10 +154,10 @@ static int network_commit(const cJSON *destination, const struct objects *object
 		code = dimse_commit(dimse, objects->class, instances, objects->count, transaction, PROMISE_SECONDS,
 				    &answered, &promise, err);
 	}
-	if (code == 0 && answered)
-		code = judge_promise(objects, &promise, err);
 	if (code == 0)
 		*ret_promise = answered ? PROMISE_GIVEN : PROMISE_ASKED;
+	if (code == 0 && answered && (code = judge_promise(objects, &promise, err)) != 0)
+		*ret_promise = PROMISE_REFUSED;
 	if (dimse != NULL)
 		dimse_close(dimse);
 	free(instances);

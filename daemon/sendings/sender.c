@@ -182,6 +182,8 @@ static void settle_sending(struct sendings *sendings, const struct transfer *tra
 	} else {
 		fail_attempt(sendings, &record,
 			     cJSON_IsTrue(cJSON_GetObjectItemCaseSensitive(transfer->result, "permanent")), why);
+		if (cJSON_IsTrue(cJSON_GetObjectItemCaseSensitive(transfer->result, "refused")))
+			snprintf(record.transaction, sizeof(record.transaction), SENDING_REFUSED);
 	}
 	write_outcome(sendings, entry, &record);
 }

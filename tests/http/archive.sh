@@ -35,12 +35,13 @@ kill_archive() {
 	kill -9 "$archive"
 	wait "$archive" 2>/dev/null || true
 }
-# start_peer MODE: an archive of send.py; sets $peer_port, its requests are in $work/peer.log
+# start_peer MODE [dimse]: an archive of send.py, or of peer.py; sets $peer_port, its requests are in $work/peer.log
 start_peer() {
-	local i
+	local i with=("$top/tests/http/send.py" web)
+	[ "${2:-}" != dimse ] || with=("$top/tests/http/peer.py")
 	: >"$work/peer.log"
 	: >"$work/peer.port"
-	"$python" "$top/tests/http/send.py" web "$1" "$work/peer.log" >"$work/peer.port" &
+	"$python" "${with[@]}" "$1" "$work/peer.log" >"$work/peer.port" &
 	peer=$!
 	echo $peer >>"$work/peers"
 	for ((i = 0; i < 200; i++)); do
@@ -76,12 +77,18 @@ sending_becomes() {
 }
 
 recipe='"grid": {"size": [41, 36, 50], "spacing_mm": [2, 2.4, 1.7], "origin_mm": [-40, -42, -41.65]}, "fdk": {}'
-# kills COUNT: so many series sent, with a kill -9 of daemon, cbct-dicom or archive in the middle of each; all arrive once.
+# kills COUNT [dimse]: so many series sent, with a kill -9 of daemon, cbct-dicom or archive in the middle of each; all arrive
+# once. By DICOM's own protocol each is committed, too.
 kills() {
-	local k i pid
+	local k i pid kind=${2:-dicomweb}
 	: >"$work/jobs"
 	start_archive
-	destinations '{"name": "pacs", "kind": "dicomweb", "url": "http://127.0.0.1:'$web'/dicom-web"}'
+	if [ $kind = dicomweb ]; then
+		destinations '{"name": "pacs", "kind": "dicomweb", "url": "http://127.0.0.1:'$web'/dicom-web"}'
+	else
+		jq -n '{listen: {port: '$commit', address: "127.0.0.1", peers: ["ARCHIVE"]}, destinations: [
+			{name: "pacs", kind: "dimse", host: "127.0.0.1", port: '$dimse', title: "ARCHIVE", commitment_s: 2}]}' >"$work/destinations.json"
+	fi
 	start_daemon --destinations "$work/destinations.json" --send-pause 0.1
 	for ((k = 1; k <= $1; k++)); do
 		jq -c --arg k $k '.patient = {position: "HFS", name: "Name\($k)^x", id: "id-\($k)"} | .study = {accession_number: "acc\($k)", uid: "1.2.\($k)"}' "$work/scan/scan.json" >"$work/posted.json"
@@ -107,7 +114,7 @@ kills() {
 			;;
 		esac
 	done
-	while read -r k scan job; do sending_becomes sent 60; done <"$work/jobs"
+	while read -r k scan job; do sending_becomes $([ $kind = dicomweb ] && echo sent || echo committed) 60; done <"$work/jobs"
 	fetched "$work/back"
 	"$python" "$top/tests/http/send.py" whose "$work/back" "$work/jobs" >"$work/whose" || fail "each object has its own patient"
 	[ "$(cat "$work/whose")" = "$(for ((k = 1; k <= $1; k++)); do echo "$k 50 "; done)" ] || fail "50 objects of each, once, got $(grep -v " 50 $" "$work/whose")"

@@ -48,6 +48,57 @@ test_a_series_is_stored_found_and_committed() {
 	"$python" "$top/tests/http/dicom.py" check HFS "$work/voxels.raw" "$work/members.json" "$work/back/slices/"*.dcm -- "$work/back/frames/"*.dcm || fail "what came back"
 }
 
+test_peers_that_do_wrong() {
+	local mode
+	need_dcmtk
+	for mode in keeps lies refuses regrets unasked silent drips hangs-up; do
+		start_peer $mode dimse
+		jq -n --arg mode $mode '{destinations: [{name: "pacs", kind: "dimse", host: "127.0.0.1", port: '"$peer_port"', title: "PEER", commitment_s: 1,
+			timeout_s: 1}]}' >"$work/destinations.json"
+		start_daemon --destinations "$work/destinations.json" --send-pause 0.1 \
+			--send-limit $([[ $mode == regrets || $mode == keeps || $mode == hangs-up || $mode == unasked ]] && echo 60 || echo 0.1)
+		job_of "$who" '["pacs"]'
+		case $mode in
+		keeps) # It answers where it was asked: no listener is needed.
+			sending_becomes committed
+			[ "$(grep -c ^0001 "$work/peer.log")" = 50 ] || fail "each object once"
+			;;
+		lies)
+			sending_becomes failed
+			expect_json '.sendings[0].error | contains("it has 0 of 50")'
+			;;
+		refuses)
+			sending_becomes failed
+			expect_json '.sendings[0].error | contains("0xa700")'
+			;;
+		regrets) # It says that it has all, and would not keep them: they are sent again.
+			sending_becomes committed
+			expect_json '.sendings[0].attempts == 2'
+			[ "$(grep -c ^0001 "$work/peer.log")" = 100 ] || fail "each object twice, got $(grep -c ^0001 "$work/peer.log")"
+			;;
+		unasked)
+			until req GET "/v1/jobs/$job/send" && jq -e '.sendings[0].error != null' "$body" >/dev/null; do sleep 0.05; done
+			expect_json '.sendings[0].error | contains("takes its word")'
+			jq '.destinations[0].unproven = true' "$work/destinations.json" >"$work/taken.json"
+			cp "$work/taken.json" "$work/destinations.json"
+			kill -HUP "$(cat "$work/daemon.pid")"
+			sending_becomes sent
+			;;
+		silent | drips)
+			sending_becomes failed
+			expect_json '.sendings[0].error | contains("too slowly") or contains("C-STORE") or contains("C-FIND")'
+			;;
+		hangs-up)
+			sending_becomes committed 60
+			expect_json '.sendings[0] | .stored == 50 and .attempts > 1'
+			;;
+		esac
+		stop_daemon
+		kill -9 $peer
+	done
+	! grep -q Doe "$work/cbctd.err" || fail "no patient in the log"
+}
+
 # step NAME PATIENT ID DATE ACCESSION [LINE ...]: an entry of the archive's worklist; lines of dump2dcm beside its own
 step() {
 	local name=$1 patient=$2 id=$3 date=$4 accession=$5
