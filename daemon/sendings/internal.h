@@ -44,7 +44,7 @@ enum { TRANSFERS_MOST = 4, TRANSFER_LISTENER = TRANSFERS_MOST, TRANSFER_WORKLIST
 enum { TRANSFER_LINE_MAX = 16384 };
 /* A run of cbct-dicom; the sender's own. The first TRANSFERS_MOST send, or ask destinations. */
 struct transfer {
-	bool runs, over, kept; /* kept: it was promised while the process ran */
+	bool runs, over;
 	char destination[DESTINATION_NAME_SIZE], job[ID_SIZE], name[SENDING_NAME_SIZE]; /* job "": it only asks */
 	struct process process;
 	int socket;

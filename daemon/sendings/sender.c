@@ -132,21 +132,17 @@ void sender_promised(struct sendings *sendings, const char *transaction, int kep
 	if (entry == NULL)
 		return;
 	record = entry->record;
-	/* Its process has not ended yet: it counts then. */
-	for (int i = 0; i < TRANSFERS_MOST; i++)
-		if (record.state == SENDING_SENDING && sendings->transfers[i].runs &&
-		    strcmp(sendings->transfers[i].job, entry->job) == 0 &&
-		    strcmp(sendings->transfers[i].name, record.name) == 0 && refused == 0)
-			sendings->transfers[i].kept = true;
-	if (record.state == SENDING_SENDING && refused == 0)
-		return;
+	/* Its process listens for the answer, too: the request was its last deed. */
+	if (record.state == SENDING_SENDING)
+		record.instances = record.stored = kept + refused;
 	snprintf(why, sizeof(why), "it promises to keep %d of %d objects, reason 0x%04x", kept, record.instances,
 		 (unsigned)reason);
-	if (record.state == SENDING_SENT && refused == 0 && kept >= record.instances) {
+	if (refused == 0 && kept > 0 && kept >= record.instances) {
 		record.state = SENDING_COMMITTED;
 		record.next = 0;
 		record.ended = clock_realtime();
-	} else if (record.state == SENDING_SENT) {
+		record.error[0] = '\0';
+	} else {
 		fail_attempt(sendings, &record, false, why);
 		snprintf(record.transaction, sizeof(record.transaction), SENDING_REFUSED);
 	}
@@ -157,8 +153,7 @@ static void settle_sending(struct sendings *sendings, const struct transfer *tra
 {
 	struct entry *entry = entry_find(sendings, transfer->job, transfer->name);
 	const char *end = member_text(transfer->result, "end");
-	const bool asked = strcmp(end, "asked") == 0,
-		   committed = strcmp(end, "committed") == 0 || (asked && transfer->kept);
+	const bool asked = strcmp(end, "asked") == 0, committed = strcmp(end, "committed") == 0;
 	const bool sent = strcmp(end, "sent") == 0 || asked || committed;
 	struct sending_record record;
 	char why[320];
@@ -177,7 +172,7 @@ static void settle_sending(struct sendings *sendings, const struct transfer *tra
 		record.error[0] = '\0';
 		record.next = 0;
 		record.ended = clock_realtime();
-		if (asked && !committed)
+		if (asked)
 			await_promise(sendings, &record);
 	} else {
 		fail_attempt(sendings, &record,
@@ -247,7 +242,7 @@ static int start_process(struct sendings *sendings, struct transfer *transfer, c
 	transfer->heard = clock_monotonic();
 	transfer->filled = 0;
 	transfer->result = NULL;
-	transfer->kept = transfer->over = false;
+	transfer->over = false;
 	transfer->runs = true;
 	return 0;
 }

@@ -107,7 +107,7 @@ kills() {
 			sleep 0.2
 			start_daemon --destinations "$work/destinations.json" --send-pause 0.1
 			;;
-		1) for pid in $(pgrep -P "$(cat "$work/daemon.pid")" cbct-dicom || true); do kill -9 "$pid"; done ;;
+		1) for pid in $(pgrep -P "$(cat "$work/daemon.pid")" cbct-dicom || true); do kill -9 "$pid" 2>/dev/null || true; done ;;
 		2)
 			kill_archive
 			start_archive

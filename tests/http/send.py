@@ -3,7 +3,7 @@
 
 Usage: send.py ports COUNT            free ports
        send.py web MODE LOG           a DICOMweb archive on a free port, which it prints. MODE: lies (acknowledges, keeps
-           nothing), forgets (keeps every other object), refuses (403 to STOW-RS), slow (a second for each request), token (401
+           nothing), forgets (keeps every other object), refuses (403 to STOW-RS), slow (a second for each request), drips (a byte of a reply every 0.2 s), token (401
            without the token "secret-token", keeps all). LOG: a line for each request
        send.py whose DIRECTORY JOBS   every object of the directory (files of DICOM) has the patient of its job; JOBS: a line
            "K SCAN JOB" for each, whose patient is "NameK^x", id-K, accK; prints for each job how many objects it has, twice
@@ -43,7 +43,13 @@ class Archive(BaseHTTPRequestHandler):
         self.send_header("Content-Type", "application/dicom+json")
         self.send_header("Content-Length", str(len(body)))
         self.end_headers()
-        self.wfile.write(body)
+        if self.mode == "drips":
+            for place in range(len(body)):
+                self.wfile.write(body[place:place + 1])
+                self.wfile.flush()
+                time.sleep(0.2)
+        else:
+            self.wfile.write(body)
 
     def refused(self) -> bool:
         if self.mode == "slow":
@@ -59,6 +65,8 @@ class Archive(BaseHTTPRequestHandler):
         offset = int(re.search(r"offset=(\d+)", self.path)[1]) if "offset=" in self.path else 0
         with self.lock:
             found = self.kept[offset:] if "/instances" in self.path else []
+        if self.mode == "drips":
+            found = ["1.2.3"] * 20
         self.reply(200, json.dumps([{"00080018": {"vr": "UI", "Value": [uid]}} for uid in found]).encode())
 
     def do_POST(self) -> None:

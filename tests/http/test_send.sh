@@ -99,9 +99,9 @@ test_an_archive_that_is_away_and_comes_back() {
 test_archives_that_lie_forget_and_refuse() {
 	local mode
 	need_archive
-	for mode in lies forgets refuses; do
+	for mode in lies forgets refuses drips; do
 		start_peer $mode
-		destinations '{"name": "pacs", "kind": "dicomweb", "url": "http://127.0.0.1:'$peer_port'"}'
+		destinations '{"name": "pacs", "kind": "dicomweb", "url": "http://127.0.0.1:'$peer_port'", "timeout_s": 1}'
 		start_daemon --destinations "$work/destinations.json" --send-pause 0.1 --send-limit $([ $mode = forgets ] && echo 60 || echo 0.1)
 		job_of "$who" '["pacs"]'
 		case $mode in
@@ -118,6 +118,11 @@ test_archives_that_lie_forget_and_refuse() {
 			sending_becomes failed
 			expect_json '.sendings[0].error | contains("STOW-RS with 403")'
 			! grep -q "Doe" "$work/cbctd.err" || fail "no patient in the log"
+			;;
+		# A whole answer has a second, however much of it comes.
+		drips)
+			sending_becomes failed
+			expect_json '.sendings[0].error | contains("Timeout was reached")'
 			;;
 		esac
 		stop_daemon
