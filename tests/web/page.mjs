@@ -523,7 +523,7 @@ test('warnings, parameters, geometry, projections and downloads', async () => {
 	await film.focus()
 	for (let i = 0; i < 3; i++)
 		await page.keyboard.press('ArrowRight')
-	await page.waitForSelector('.film img[data-projection="3"]')
+	await page.waitForSelector('.film canvas[data-projection="3"]')
 	await page.click('.film .play')
 	await until('the film runs', () => film.inputValue(), value => Number(value) > 4)
 	await page.click('.film .play')
@@ -613,6 +613,37 @@ test('a volume goes to the archive by a button, and how far it is stands beside 
 	const plain = await openFinished()
 	expect(!await plain.isVisible('button:has-text("Send to archive")'), 'no button where there is no archive')
 	await plain.context().close()
+})
+
+test('while a scan is acquired its newest projection is large, as -ln, with its defects and the share', async () => {
+	const { detector } = await api(`/v1/scans/${scan}`), count = detector.columns * detector.rows
+	const counts = await post('/v1/scans', { name: 'counts', detector, projections: { count: 4, sample: 'uint16', quantity: 'intensity', air: 50000 },
+		geometry: { kind: 'circular', source_to_isocentre_mm: 620, source_to_detector_mm: 1100, angle_step_deg: 90 } })
+	const job = await post('/v1/jobs', { scan: counts.id, grid: { size: [20, 20, 20], spacing_mm: [5, 5, 5] }, fdk: {} })
+	/* Steps of exp(-i): as -ln they are even; one dead and one saturated pixel. */
+	const put = (k, dead) => {
+		const values = Uint16Array.from({ length: count }, (_, i) => Math.round(50000 * Math.exp(-Math.floor(i % detector.columns / 8) / 4)))
+		;[values[0], values[1]] = dead ? [0, 65535] : [values[0], values[1]]
+		return api(`/v1/scans/${counts.id}/projections/${k}`, { method: 'PUT', body: values })
+	}
+	await put(0, false)
+	const page = await open(browser, `/#/jobs/${job.id}`)
+	await page.waitForSelector('.acquiring .film canvas[data-projection="0"]')
+	await put(2, true)
+	await page.waitForSelector('.acquiring .film canvas[data-projection="2"][data-defects="2"]')
+	await until('the share', () => page.textContent('.acquiring .share'), text => text.startsWith('2 of 4 projections are here (50 %)'))
+	const row = await page.evaluate(() => Array.from(document.querySelector('.film canvas').getContext('2d').getImageData(0, 5, 64, 1).data.filter((_, i) => i % 4 === 0)))
+	const steps = [1, 2, 3, 4, 5, 6].map(i => row[8 * i + 4] - row[8 * i - 4])
+	expect(Math.max(...steps) - Math.min(...steps) <= 2 && steps[0] > 20, `even steps of gray, got ${steps}`)
+	const corner = await page.evaluate(() => Array.from(document.querySelector('.film canvas').getContext('2d').getImageData(0, 0, 2, 1).data))
+	expect(corner[0] > 200 && corner[1] < 60 && corner[4] > 200 && corner[5] < 60, `defects in red, got ${corner}`)
+	expect((await page.locator('.acquiring canvas').boundingBox()).height > 300, 'large')
+	await shoot(page, 'acquiring')
+	await put(1, false)
+	await put(3, false)
+	await planePixels(page, 'z')
+	expect(!await page.isVisible('.acquiring') && await page.isVisible('.aside .film'), 'beside the volume once there is one')
+	await page.context().close()
 })
 
 /* ---- two volumes ---- */
@@ -849,7 +880,7 @@ test('a phone: one column, nothing beside the screen', async () => {
 	await fits(page, 'the list')
 	await shoot(page, 'phone-list')
 	await page.goto(`${origin}/#/scans/${scan}`)
-	await page.waitForSelector('.film img[data-projection="0"]')
+	await page.waitForSelector('.film canvas[data-projection="0"]')
 	await fits(page, 'the scan')
 	await page.context().close()
 })
@@ -870,7 +901,7 @@ for (const scheme of ['light', 'dark']) {
 		await shoot(page, `list-${scheme}`)
 		await accessible(page, 'the list')
 		await page.goto(`${origin}/#/scans/${scan}`)
-		await page.waitForSelector('.film img[data-projection="0"]')
+		await page.waitForSelector('.film canvas[data-projection="0"]')
 		await shoot(page, `scan-${scheme}`)
 		await accessible(page, 'the scan')
 		await page.context().close()

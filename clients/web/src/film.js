@@ -1,7 +1,7 @@
 /* The projections of a scan as a film: a slider, a button to let it run, the angle where it is known. */
 import { h, write, number } from './dom.js'
-import { scanPath } from './api.js'
-import { t } from './lang.js'
+import { fetchProjection, drawProjection } from './projection.js'
+import { t, t2 } from './lang.js'
 
 const frameTime = 80 /* ms */
 
@@ -29,14 +29,20 @@ export class Film {
 	#timer = null
 	#loading = false
 	#wanted = null
+	#newest = true /* goes with what comes, until somebody looks for another one */
+	#abort = new AbortController()
 
 	constructor() {
-		this.image = h('img', { alt: '', draggable: false })
-		this.slider = h('input', { type: 'range', min: '0', step: '1', value: '0', 'aria-label': t('Projection'), oninput: () => this.#show(Number(this.slider.value)) })
+		this.canvas = h('canvas', { role: 'img' })
+		this.slider = h('input', { type: 'range', min: '0', step: '1', value: '0', 'aria-label': t('Projection'), oninput: () => {
+			this.#newest = false
+			this.#show(Number(this.slider.value))
+		} })
 		this.play = h('button', { type: 'button', class: 'play', 'aria-pressed': 'false', 'aria-label': t('Play'), onclick: () => this.#toggle() })
 		this.label = h('output', {})
-		this.screen = h('div', { class: 'screen' }, this.image)
-		this.element = h('div', { class: 'film' }, this.screen, h('div', { class: 'row' }, this.play, this.slider), this.label)
+		this.defects = h('span', { class: 'detail' })
+		this.screen = h('div', { class: 'screen' }, this.canvas)
+		this.element = h('div', { class: 'film' }, this.screen, h('div', { class: 'row' }, this.play, this.slider), h('div', { class: 'row' }, this.label, this.defects))
 	}
 
 	/* Again and again while the scan grows. */
@@ -47,6 +53,8 @@ export class Film {
 		this.slider.max = String(scan.projections.count - 1)
 		this.screen.style.aspectRatio = `${scan.detector.columns * scan.detector.pixel_mm[0]} / ${scan.detector.rows * scan.detector.pixel_mm[1]}`
 		this.screen.classList.toggle('upward', upward(scan))
+		if (scan.state === 'receiving' && this.#newest && scan.received.length > 0)
+			this.slider.value = String(scan.received.at(-1)[1])
 		if (first || grown)
 			this.#show(Number(this.slider.value))
 	}
@@ -70,16 +78,16 @@ export class Film {
 			return
 		this.#loading = true
 		while (this.#wanted !== null) {
-			const next = h('img', { alt: t('Projection {n}', { n: this.#wanted + 1 }), draggable: false })
-			next.src = `${scanPath(this.#scan.id)}/projections/${this.#wanted}?format=png`
-			next.dataset.projection = String(this.#wanted)
+			const next = this.#wanted
 			this.#wanted = null
 			try {
-				await next.decode()
-				this.image.replaceWith(next)
-				this.image = next
+				const defects = drawProjection(this.canvas, this.#scan, await fetchProjection(this.#scan, next, this.#abort.signal))
+				this.canvas.dataset.projection = String(next)
+				this.canvas.dataset.defects = String(defects)
+				this.canvas.setAttribute('aria-label', t('Projection {n}', { n: next + 1 }))
+				write(this.defects, defects > 0 ? t2(defects, '{n} defect pixel is red', '{n} defect pixels are red') : '')
 			} catch {
-				/* gone, with its scan */
+				/* gone, with its scan, or the page */
 			}
 		}
 		this.#loading = false
@@ -112,6 +120,7 @@ export class Film {
 	}
 
 	close() {
+		this.#abort.abort()
 		clearInterval(this.#timer)
 	}
 }

@@ -80,6 +80,8 @@ export class JobPage {
 		this.trouble = h('div', { class: 'notice bad', role: 'alert', hidden: true })
 		this.stage = h('div', { class: 'stages', 'data-mode': 'off', hidden: true })
 		this.empty = h('p', { class: 'empty' }, t('No volume yet: the first appears here by itself.'))
+		this.share = h('p', { class: 'share' })
+		this.acquiring = h('div', { class: 'acquiring card', hidden: true }, this.share)
 		this.viewer = this.#makeViewer(t('Volume'), () => this.#onPicture())
 		this.tools = new Tools(this.#view, this.#measurements, { voxels: () => this.viewer.voxels, facts: () => ({ job: this.id, scan: this.#job.scan, volume: this.#selected }) })
 		this.keyImages = new KeyImages(this.#view, this.#chosen, this.#measurements, {
@@ -105,9 +107,9 @@ export class JobPage {
 		this.fileSection = h('section', { class: 'card', hidden: true }, h('h2', {}, t('Downloads')), this.files)
 		this.progress = h('div', { class: 'progress' }, this.bar.element, this.doing, this.left)
 		this.columns = h('div', { class: 'columns' },
-			this.pictures = h('div', { class: 'pictures' }, this.empty, this.stage, this.estimate, this.quality, this.sides, this.controls),
+			this.pictures = h('div', { class: 'pictures' }, this.acquiring, this.empty, this.stage, this.estimate, this.quality, this.sides, this.controls),
 			h('div', { class: 'aside' }, this.warnings, this.keyImages.section, this.tools.section, this.sendings.section, this.courseSection, this.fileSection,
-				h('section', { class: 'card' }, h('h2', {}, t('Projections')), this.film.element),
+				this.filmSection = h('section', { class: 'card' }, h('h2', {}, t('Projections')), this.film.element),
 				h('section', { class: 'card' }, h('h2', {}, t('Reconstruction')), this.about),
 				h('section', { class: 'card' }, h('h2', {}, t('Geometry')), this.geometry)))
 		this.element = h('div', { class: 'job' },
@@ -278,10 +280,24 @@ export class JobPage {
 		if (this.#first)
 			replace(this.geometry, geometryFacts(scan, job.patient))
 		this.#first = false
+		this.#showAcquiring(job)
 		this.film.show(scan)
 		if (ended(job) && this.#volumes.length === 0)
 			write(this.empty, t('This job kept no volume.'))
 		this.#showPlot()
+	}
+
+	/* As long as there is no volume, what is acquired is the picture: the newest projection, large. */
+	#showAcquiring(job) {
+		const large = this.#volumes.length === 0 && !ended(job), { received, reconstructed, of } = job.views ?? {}
+		if (large === this.acquiring.hidden) {
+			this.acquiring.hidden = !large
+			;(large ? this.acquiring : this.filmSection).append(this.film.element)
+			this.filmSection.hidden = large
+		}
+		this.empty.hidden = large || this.#volumes.length > 0
+		if (large && of)
+			write(this.share, `${t('{n} of {all} projections are here', { n: received, all: of })} (${Math.round(100 * received / of)} %)${job.fdk && reconstructed > 0 ? `, ${t('{n} of them in FDK so far', { n: reconstructed })}` : ''}`)
 	}
 
 	#showActions(before) {
@@ -336,7 +352,9 @@ export class JobPage {
 
 	#showVolumes() {
 		const volumes = this.#volumes
-		this.empty.hidden = volumes.length > 0
+		if (this.#job)
+			this.#showAcquiring(this.#job)
+		this.empty.hidden ||= volumes.length > 0
 		this.stage.hidden = this.controls.hidden = this.fileSection.hidden = volumes.length === 0
 		this.slider.max = String(Math.max(volumes.length - 1, 0))
 		this.slider.disabled = volumes.length < 2
