@@ -908,6 +908,25 @@ for (const scheme of ['light', 'dark']) {
 	})
 }
 
+test('the interface is a page to read, and has every operation of the schema', async () => {
+	const page = await open(browser, '/#/interface'), schema = await api('/v1/openapi.json')
+	await page.waitForSelector('.subject .entry')
+	const said = await page.$$eval('.entry summary', all => all.map(entry => entry.textContent))
+	for (const [path, item] of Object.entries(schema.paths)) {
+		for (const method of ['get', 'put', 'post', 'delete'].filter(name => item[name]))
+			expect(said.some(text => text.startsWith(`${method.toUpperCase()} ${path} ${item[method].summary}`)), `${method} ${path}`)
+	}
+	await page.fill('[type=search]', 'ask for a reconstruction')
+	await page.click('.entry:not([hidden]) summary')
+	await until('an example', () => page.textContent('.entry:not([hidden])'), text => text.includes('"preset": "fast"'))
+	await page.click('.entry:not([hidden]) a:has-text("JobRequest")')
+	await page.waitForSelector('#schema-JobRequest[open] dt:has-text("sart")')
+	await accessible(page, 'the interface')
+	await fits(page, 'the interface')
+	await shoot(page, 'interface')
+	await page.context().close()
+})
+
 /* ---- other browsers ---- */
 
 test('without WebGL 2 the daemon draws: slices and a contact sheet as PNG', async () => {

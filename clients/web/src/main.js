@@ -4,6 +4,7 @@ import { get, request } from './api.js'
 import { ListPage } from './lists.js'
 import { JobPage } from './job.js'
 import { ScanPage } from './scan.js'
+import { ReferencePage } from './reference.js'
 import { keepSession } from './session.js'
 import { themeButton } from './theme.js'
 import { loadLanguage, languages, language, chooseLanguage, t } from './lang.js'
@@ -13,6 +14,7 @@ const devicesTime = 10000 /* ms */
 const routes = [
 	[/^#?\/?$/, tools => new ListPage(tools)],
 	[/^#\/jobs\/([^/]+)$/, (tools, job) => new JobPage(decodeURIComponent(job), tools)],
+	[/^#\/interface$/, tools => new ReferencePage(tools)],
 	[/^#\/scans\/([^/]+)$/, (tools, scan) => new ScanPage(decodeURIComponent(scan), tools)],
 ]
 
@@ -28,7 +30,7 @@ const status = document.querySelector('.status')
 const tongue = h('select', { 'aria-label': t('Language'), class: 'tongue', onchange: event => chooseLanguage(event.target.value) },
 	languages.map(code => h('option', { value: code, selected: code === language() }, code.toUpperCase())))
 status.append(quarantine, devices, live, tongue, themeButton())
-for (const [selector, text] of [['.skip', t('To the content')], ['footer [href="/plain"]', t('Plain page')], ['footer [href="/v1/openapi.json"]', t('Interface')], ['footer [href*=licences]', t('Licences')]])
+for (const [selector, text] of [['.skip', t('To the content')], ['footer [href="/plain"]', t('Plain page')], ['footer [href="#/interface"]', t('Interface')], ['footer [href*=licences]', t('Licences')]])
 	document.querySelector(selector).textContent = text
 
 let page = null

@@ -439,4 +439,10 @@ export const strings = {
 	'{n} of them in FDK so far': '{n} davon bisher in FDK',
 	'{n} defect pixel is red': '{n} defektes Pixel ist rot',
 	'{n} defect pixels are red': '{n} defekte Pixel sind rot',
+	'Path or word': 'Pfad oder Wort',
+	'Schemas': 'Schemata',
+	'Request': 'Anfrage',
+	' or ': ' oder ',
+	'list of ': 'Liste von ',
+	'What holds for all of it': 'Was für alles gilt',
 }
