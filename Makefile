@@ -357,6 +357,9 @@ tsan: setup ## the daemon's tests under the thread sanitizer (OpenMP's runtime l
 lint: ## who includes whom, and the house's other rules
 	@tests/lint.sh
 
+pictures: all ## docs/page.png and docs/before-after.png, those of the README, from a real run
+	@docs/pictures.sh
+
 rooms: ## docs/rooms.svg, the picture of who includes whom
 	@$(PYTHON) docs/rooms.py
 
@@ -450,6 +453,6 @@ clean: ## removes build/
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z_.-]+:.*## /{printf "  make %-21s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-.PHONY: all test-programs again setup demo check soak fuzz fuzzers paper paper-report bench bench-calibrate bench-denoise bench-presets bench-stopping check-gpu bench-gpu asan tsan lint format rooms third-party compile_commands.json install deb container sbom reproducible clean help
+.PHONY: all test-programs again setup demo check soak fuzz fuzzers paper paper-report bench bench-calibrate bench-denoise bench-presets bench-stopping check-gpu bench-gpu asan tsan lint format rooms pictures third-party compile_commands.json install deb container sbom reproducible clean help
 .SECONDARY:
 -include $(shell find $(BUILD) -path $(BUILD)/test -prune -o -type f -name '*.d' -print 2>/dev/null)

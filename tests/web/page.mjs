@@ -132,8 +132,7 @@ test('the list stands by state, says what tells jobs of a scan apart and how lon
 	await until('no job', () => page.isVisible('text=No job is like that.'))
 	await page.fill('[type=search]', '')
 	await page.selectOption('[name=state]', 'waiting')
-	await until('those that wait', () => page.locator('.jobs a').count(), count => count > 0)
-	expect(await page.locator('.jobs:not(.waiting) a').count() === 0, 'and no other')
+	await until('those that wait and no other', async () => [await page.locator('.jobs.waiting a').count(), await page.locator('.jobs:not(.waiting) a').count()], ([waits, others]) => waits > 0 && others === 0)
 	for (const job of [running, queued, waiting])
 		await api(`/v1/jobs/${job.id}`, { method: 'DELETE' })
 	await Promise.all([running, queued, waiting].map(job => ended(job.id)))
@@ -924,6 +923,103 @@ test('the interface is a page to read, and has every operation of the schema', a
 	await accessible(page, 'the interface')
 	await fits(page, 'the interface')
 	await shoot(page, 'interface')
+	await page.context().close()
+})
+
+for (const [width, height] of [[1366, 768], [1024, 768], [844, 390], [390, 844]]) {
+	test(`${width} x ${height}: room for the picture, targets for fingers, nothing beside the screen, in both themes`, async () => {
+		const touch = Math.min(width, height) < 500
+		const page = await openFinished({ viewport: { width, height }, isMobile: touch, hasTouch: touch, colorScheme: 'dark' })
+		await page.waitForSelector(`${tile('3d')}[data-shown=final]`)
+		for (const theme of ['dark', 'light']) {
+			await page.evaluate(name => document.documentElement.dataset.theme = name, theme)
+			await fits(page, `the job in ${theme}`)
+			if (width === 390)
+				await accessible(page, `the job in ${theme}`)
+			await shoot(page, `${width}x${height}-${theme}`)
+		}
+		const picture = await page.locator('.viewer').boundingBox(), large = await page.locator(tile('z')).boundingBox()
+		expect(large.width * large.height > 0.4 * width * height * (touch ? 0.9 : 0.75), `a large plane, got ${large.width} x ${large.height}`)
+		if (width === 844)
+			expect(picture.height >= 0.8 * height && picture.y + picture.height <= height, `four fifths of the height in sight, got ${picture.height} from ${picture.y}`)
+		if (touch) {
+			const small = await page.$$eval('.controls button, .actions button, .tile button', all => all.filter(button => button.offsetParent).map(button => [button.textContent || button.ariaLabel, button.getBoundingClientRect()])
+				.filter(([, box]) => box.width < 43.5 || box.height < 43.5).map(([text, box]) => `${text} ${box.width} x ${box.height}`))
+			expect(small.length === 0, `targets of 44 px, got ${small}`)
+			/* One finger goes through slices, one that rests sets the cross; beside the picture the page scrolls. */
+			const before = await depthOf(page, 'z'), frame = await page.locator(`${tile('z')} .stage`).boundingBox(), client = await page.context().newCDPSession(page)
+			const finger = (type, x, y) => client.send('Input.dispatchTouchEvent', { type, touchPoints: type === 'touchEnd' ? [] : [{ x, y }] })
+			const [x, y] = [frame.x + frame.width * 0.2, frame.y + frame.height * 0.7]
+			await finger('touchStart', x, y)
+			for (let i = 1; i <= 5; i++)
+				await finger('touchMove', x, y - 10 * i)
+			await finger('touchEnd')
+			await until('slices further', () => depthOf(page, 'z'), index => index > before)
+			const sagittal = await depthOf(page, 'x')
+			await finger('touchStart', x, y)
+			await until('the cross where the finger rests', () => depthOf(page, 'x'), index => index !== sagittal)
+			await finger('touchEnd')
+			expect(await page.evaluate(() => document.documentElement.scrollHeight > innerHeight), 'more below')
+		}
+		await page.goto(`${origin}/#/`)
+		await page.waitForSelector('.jobs a')
+		await fits(page, 'the list')
+		await page.context().close()
+	})
+}
+
+test('a surgeon\'s questions take three clicks or fewer', async () => {
+	await forget()
+	const another = await post('/v1/jobs', { scan, grid: { size: [20, 20, 20], spacing_mm: [5, 5, 5] }, fdk: {} })
+	await ended(another.id)
+	const page = await open(browser, '/')
+	let clicks = 0
+	const click = async (selector, options) => {
+		clicks++
+		await page.click(selector, options)
+	}
+	const at = async (x, y) => {
+		clicks++
+		await page.mouse.click(...await spot(page, 'z', x, y))
+	}
+	const few = (question, from = 0) => {
+		expect(clicks - from <= 3, `${question} ${clicks - from} clicks`)
+		clicks = 0
+	}
+	await page.waitForSelector(`.jobs a[href="#/jobs/${finished}"] .badge.succeeded`)
+	few('is it done?')
+	await click(`.jobs a[href="#/jobs/${finished}"]`)
+	await planePixels(page, 'z')
+	expect(await edges(page, 'z') === 'R L A P' && await page.textContent('h1') === name && /final · SART 7 \+ TV/.test(await page.textContent(`${tile('z')} .what`)) && /Noise/.test(await page.textContent('.pictures')), 'whose, which side, which recipe, how good')
+	few('my patient, side, recipe, quality?')
+	await click('[aria-label=Measure] button[data-value=axis]')
+	await at(0.3, 0.4)
+	await at(0.6, 0.6)
+	expect((await page.textContent(`${tile('x')} .name`)).includes('turned'), 'planes along the screw')
+	few('is the screw in the bone?')
+	await page.click('button:has-text("Reset")')
+	await click('[aria-label=Measure] button[data-value=ruler]')
+	clicks++
+	await drag(page, await spot(page, 'z', 0.3, 0.3), await spot(page, 'z', 0.6, 0.3))
+	await until('a length', () => measured(page), list => list.length === 1)
+	few('how long is it?')
+	await click('button:has-text("Swipe")')
+	await page.waitForSelector('[aria-label="Compare with"] option[value="job ' + another.id + '"]', { state: 'attached' })
+	await click('[aria-label="Compare with"]')
+	clicks++
+	await page.selectOption('[aria-label="Compare with"]', `job ${another.id}`)
+	few('did it change?')
+	await page.keyboard.press('Escape')
+	await click('button:has-text("Key image")')
+	await click('dialog button.primary')
+	few('how do I show it?')
+	await click('button:has-text("Reconstruct again")')
+	await click('dialog .preset:has-text("Bone")')
+	await click('dialog button[type=submit]')
+	await page.waitForSelector('dialog', { state: 'detached' })
+	few('can it be sharper?')
+	await ended(new URL(page.url()).hash.split('/').pop())
+	await forget()
 	await page.context().close()
 })
 
