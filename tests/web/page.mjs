@@ -926,46 +926,52 @@ test('the interface is a page to read, and has every operation of the schema', a
 	await page.context().close()
 })
 
-for (const [width, height] of [[1366, 768], [1024, 768], [844, 390], [390, 844]]) {
-	test(`${width} x ${height}: room for the picture, targets for fingers, nothing beside the screen, in both themes`, async () => {
-		const touch = Math.min(width, height) < 500
-		const page = await openFinished({ viewport: { width, height }, isMobile: touch, hasTouch: touch, colorScheme: 'dark' })
+for (const sizes of [[[1366, 768], [1024, 768]], [[844, 390]], [[390, 844]]]) {
+	const [[first, second]] = sizes, touch = Math.min(first, second) < 500
+	test(`${sizes.map(size => size.join(' x ')).join(', ')}: room for the picture, targets for fingers, nothing beside the screen, in both themes`, async () => {
+		const page = await openFinished({ viewport: { width: first, height: second }, isMobile: touch, hasTouch: touch, colorScheme: 'dark' })
 		await page.waitForSelector(`${tile('3d')}[data-shown=final]`)
-		for (const theme of ['dark', 'light']) {
-			await page.evaluate(name => document.documentElement.dataset.theme = name, theme)
-			await fits(page, `the job in ${theme}`)
-			if (width === 390)
-				await accessible(page, `the job in ${theme}`)
-			await shoot(page, `${width}x${height}-${theme}`)
+		for (const [width, height] of sizes) {
+			await page.setViewportSize({ width, height })
+			for (const theme of ['dark', 'light']) {
+				await page.evaluate(name => document.documentElement.dataset.theme = name, theme)
+				await fits(page, `the job in ${theme}`)
+				if (width === 390)
+					await accessible(page, `the job in ${theme}`)
+				await shoot(page, `${width}x${height}-${theme}`)
+			}
+			const picture = await page.locator('.viewer').boundingBox(), large = await page.locator(tile('z')).boundingBox()
+			expect(large.width * large.height > (touch ? 0.36 : 0.3) * width * height, `a large plane, got ${large.width} x ${large.height}`)
+			if (width === 844)
+				expect(picture.height >= 0.8 * height && picture.y + picture.height <= height, `four fifths of the height in sight, got ${picture.height} from ${picture.y}`)
 		}
-		const picture = await page.locator('.viewer').boundingBox(), large = await page.locator(tile('z')).boundingBox()
-		expect(large.width * large.height > 0.4 * width * height * (touch ? 0.9 : 0.75), `a large plane, got ${large.width} x ${large.height}`)
-		if (width === 844)
-			expect(picture.height >= 0.8 * height && picture.y + picture.height <= height, `four fifths of the height in sight, got ${picture.height} from ${picture.y}`)
-		if (touch) {
-			const small = await page.$$eval('.controls button, .actions button, .tile button', all => all.filter(button => button.offsetParent).map(button => [button.textContent || button.ariaLabel, button.getBoundingClientRect()])
-				.filter(([, box]) => box.width < 43.5 || box.height < 43.5).map(([text, box]) => `${text} ${box.width} x ${box.height}`))
-			expect(small.length === 0, `targets of 44 px, got ${small}`)
-			/* One finger goes through slices, one that rests sets the cross; beside the picture the page scrolls. */
-			const before = await depthOf(page, 'z'), frame = await page.locator(`${tile('z')} .stage`).boundingBox(), client = await page.context().newCDPSession(page)
-			const finger = (type, x, y) => client.send('Input.dispatchTouchEvent', { type, touchPoints: type === 'touchEnd' ? [] : [{ x, y }] })
-			const [x, y] = [frame.x + frame.width * 0.2, frame.y + frame.height * 0.7]
-			await finger('touchStart', x, y)
-			for (let i = 1; i <= 5; i++)
-				await finger('touchMove', x, y - 10 * i)
-			await finger('touchEnd')
-			await until('slices further', () => depthOf(page, 'z'), index => index > before)
-			const sagittal = await depthOf(page, 'x')
-			await finger('touchStart', x, y)
-			await until('the cross where the finger rests', () => depthOf(page, 'x'), index => index !== sagittal)
-			await finger('touchEnd')
-			expect(await page.evaluate(() => document.documentElement.scrollHeight > innerHeight), 'more below')
-		}
+		if (touch)
+			await fingers(page)
 		await page.goto(`${origin}/#/`)
 		await page.waitForSelector('.jobs a')
 		await fits(page, 'the list')
 		await page.context().close()
 	})
+}
+
+/* Targets of 44 px; one finger goes through slices, one that rests sets the cross, and the page scrolls. */
+async function fingers(page) {
+	const small = await page.$$eval('.controls button, .actions button, .tile button', all => all.filter(button => button.offsetParent).map(button => [button.textContent || button.ariaLabel, button.getBoundingClientRect()])
+		.filter(([, box]) => box.width < 43.5 || box.height < 43.5).map(([text, box]) => `${text} ${box.width} x ${box.height}`))
+	expect(small.length === 0, `targets of 44 px, got ${small}`)
+	const before = await depthOf(page, 'z'), frame = await page.locator(`${tile('z')} .stage`).boundingBox(), client = await page.context().newCDPSession(page)
+	const finger = (type, x, y) => client.send('Input.dispatchTouchEvent', { type, touchPoints: type === 'touchEnd' ? [] : [{ x, y }] })
+	const [x, y] = [frame.x + frame.width * 0.2, frame.y + frame.height * 0.7]
+	await finger('touchStart', x, y)
+	for (let i = 1; i <= 5; i++)
+		await finger('touchMove', x, y - 10 * i)
+	await finger('touchEnd')
+	await until('slices further', () => depthOf(page, 'z'), index => index > before)
+	const sagittal = await depthOf(page, 'x')
+	await finger('touchStart', x, y)
+	await until('the cross where the finger rests', () => depthOf(page, 'x'), index => index !== sagittal)
+	await finger('touchEnd')
+	expect(await page.evaluate(() => document.documentElement.scrollHeight > innerHeight), 'more below')
 }
 
 test('a surgeon\'s questions take three clicks or fewer', async () => {
