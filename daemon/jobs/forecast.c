@@ -130,27 +130,31 @@ static double rest(struct job *job, double now)
 	return left < 0 ? 0 : left;
 }
 
+/* What the jobs that run still take; the newest ones run, so that old jobs are not looked at. */
+static double all_rest(const struct jobs *jobs, double now)
+{
+	double seconds = 0;
+	int left = jobs->running;
+
+	for (int i = jobs->count - 1; i >= 0 && left > 0; i--) {
+		if (jobs->all[i]->record.state != JOB_RUNNING)
+			continue;
+		seconds += rest(jobs->all[i], now);
+		left--;
+	}
+	return seconds;
+}
+
 /* A queued job's seconds until a device is free for it. */
 static double wait_of(struct job *job, double now)
 {
 	const struct jobs *jobs = job->jobs;
-	double ahead = 0;
-	int running = 0;
+	double ahead = all_rest(jobs, now);
 
-	for (int i = 0; i < jobs->count; i++) {
-		struct job *other = jobs->all[i];
-		const struct queue_entry *entry = &other->entry;
-
-		if (other->record.state == JOB_RUNNING) {
-			ahead += rest(other, now);
-			running++;
-		} else if (entry->queued && other != job &&
-			   (entry->priority > job->entry.priority ||
-			    (entry->priority == job->entry.priority && entry->ticket < job->entry.ticket))) {
-			ahead += whole(other) * (1 - other->record.fraction);
-		}
-	}
-	return running > 1 ? ahead / running : ahead;
+	/* By priority, then by ticket. */
+	for (struct queue_entry *entry = jobs->queue.first; entry != NULL && entry != &job->entry; entry = entry->next)
+		ahead += whole(job_of_entry(entry)) * (1 - job_of_entry(entry)->record.fraction);
+	return jobs->running > 1 ? ahead / jobs->running : ahead;
 }
 
 static double known(double seconds)

@@ -83,7 +83,11 @@ struct jobs {
 	struct histogram stages[STAGE_COUNT];
 	struct job_rate rate[JOB_RATES];
 	int rates, oldest_rate;
+	int running; /* jobs in this state */
 };
+
+/* The job whose place in the queue this is. */
+struct job *job_of_entry(const struct queue_entry *entry);
 
 /* ---- jobs/forecast.c ---- */
 /* What a job that has succeeded took, for those that come. jobs->lock is held, or nobody else has the jobs yet. */

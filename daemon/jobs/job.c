@@ -279,6 +279,7 @@ static int load_jobs(struct jobs *jobs, struct error *err)
 		if (store_scan_look(jobs->store, job->scan, &facts, &ignored) == 0)
 			job->extent = extent_of(&facts);
 		job_measure(job, &job->record);
+		jobs->running += job->record.state == JOB_RUNNING;
 		array_insert(jobs, job);
 		id_floor(job->id);
 		if (job->record.ticket >= jobs->next_ticket)

@@ -206,6 +206,7 @@ static void show_state(struct job *job, const struct job_record *record, const s
 	pthread_mutex_lock(&jobs->lock);
 	from = job->record.state;
 	job->record = *record;
+	jobs->running += (record->state == JOB_RUNNING) - (from == JOB_RUNNING);
 	queue_remove(&jobs->queue, &job->entry);
 	job_share(job);
 	if (record->state == JOB_QUEUED) {

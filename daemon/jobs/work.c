@@ -246,7 +246,7 @@ bool jobs_want_processor(struct jobs *jobs)
 	return want;
 }
 
-static struct job *job_of_entry(const struct queue_entry *entry)
+struct job *job_of_entry(const struct queue_entry *entry)
 {
 	return (struct job *)((char *)entry - offsetof(struct job, entry));
 }

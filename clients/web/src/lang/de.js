@@ -516,4 +516,6 @@ export const strings = {
 	'The noise reduction that was asked for is too weak for this scan: the image is about as noisy as without it.': 'Die verlangte Glättung ist für diesen Scan zu schwach: Das Bild rauscht etwa wie ohne sie.',
 	'There is metal: what is shown within 10 mm of it is an estimate.': 'Es gibt Metall: Was näher als 10 mm daran gezeigt wird, ist eine Schätzung.',
 	'No metal was found in the image.': 'Im Bild wurde kein Metall gefunden.',
+	'gray levels': 'Graustufen',
+	'‖v − v before‖ / ‖v before‖': '‖v − v zuvor‖ / ‖v zuvor‖',
 }
