@@ -12,6 +12,7 @@ comma := ,
 NVCC ?= nvcc
 # Debian's own, which sees Debian's modules.
 PYTHON ?= /usr/bin/python3
+# POSTGRESQL=0 leaves the catalogue in PostgreSQL out.
 # CUDA=0 leaves the CUDA backend out; otherwise it is built where nvcc is found and its libraries can be linked.
 # nvcc itself says where they are: the one on the PATH may be a link or a script.
 ifneq ($(CUDA),0)
@@ -45,6 +46,9 @@ MODULES  := yaml:python3-yaml jsonschema:python3-jsonschema numpy:python3-numpy 
 core_libs   := kissfft-float
 proto_libs  := libcjson libzstd libpng zlib libcrypto
 daemon_libs := libmicrohttpd gnutls sqlite3
+# The catalogue in PostgreSQL is left out where libpq's header is not installed, and the setting refused by name. The
+# library is loaded when it is asked for.
+postgresql  := $(if $(filter 0,$(POSTGRESQL)),,$(shell pkg-config --exists libpq 2>/dev/null && echo libpq))
 # Other tools' files: the client reads and writes them, the daemon and the worker know none of them.
 files_libs  := expat libtiff-4
 cbct_libs   := libcurl $(files_libs)
@@ -63,7 +67,7 @@ pkg = $(shell pkg-config $(1) $(2) 2>/dev/null)
 WARN   := -Wall -Wextra -Wpedantic $(if $(filter 1,$(WERROR)),-Werror)
 CFLAGS ?= -O2 -g
 OPENMP ?= -fopenmp
-pkg_cflags := $(call pkg,--cflags,$(all_libs))
+pkg_cflags := $(call pkg,--cflags,$(all_libs) $(postgresql))
 # Errors of the maths library are not read from errno, traps are off: the compiler may vectorise.
 override CFLAGS += -std=c11 -D_GNU_SOURCE -I. $(WARN) $(or $(OPENMP),-Wno-unknown-pragmas) -fno-math-errno \
                    -fno-trapping-math -MMD -MP $(pkg_cflags) -ffile-prefix-map=$(CURDIR)=. \
@@ -84,9 +88,10 @@ simd_sources   := $(wildcard core/cpu/*_simd.c)
 core_sources   := $(filter-out $(simd_sources),$(wildcard core/*.c core/*/*.c))
 proto_sources  := $(wildcard proto/*.c)
 dicom_sources  := $(wildcard daemon/dicom/*.c)
-daemon_sources := $(filter-out daemon/worker.c $(dicom_sources),$(wildcard daemon/*.c daemon/*/*.c))
+without        := $(if $(postgresql),,$(wildcard daemon/store/postgresql*.c))
+daemon_sources := $(filter-out daemon/worker.c $(dicom_sources) $(without),$(wildcard daemon/*.c daemon/*/*.c))
 # What the unit tests know of the daemon: its state, without HTTP.
-state_sources  := $(wildcard daemon/store/*.c daemon/jobs/*.c) $(patsubst %,daemon/%.c,api/document files histogram id lock log problem process watch)
+state_sources  := $(filter-out $(without),$(wildcard daemon/store/*.c daemon/jobs/*.c)) $(patsubst %,daemon/%.c,api/document files histogram id lock log problem process watch)
 cbct_sources   := $(wildcard clients/cbct/*.c)
 unit_sources   := $(wildcard tests/unit/*.c)
 
@@ -183,9 +188,13 @@ lock_calls := lock_init pthread_mutex_lock pthread_mutex_unlock pthread_mutex_de
 $(BUILD)/cbctd-held: $(call objects,$(daemon_sources) tests/http/held.c tests/lock_order.c) $(BUILD)/proto/openapi.o $(BUILD)/web/assets.o $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) $(patsubst %,-Wl$(comma)--wrap=%,$(held_calls) $(lock_calls)) -o $@ $^ $(call pkg,--libs,$(daemon_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
+# As where libpq is not installed.
+$(BUILD)/cbctd-without-postgresql: $(filter-out $(BUILD)/daemon/store/postgresql%,$(call objects,$(daemon_sources))) $(BUILD)/proto/openapi.o $(BUILD)/web/assets.o $(library)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(daemon_libs) $(proto_libs) $(core_libs)) $(LIBM)
+
 gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench
 # Every program that a test or a benchmark runs, so that none stops compiling unseen.
-test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held manual faults.so every.so live_bytes.so simulated-nvml/libnvidia-ml.so.1 cpu-bench calibrate-bench denoise presets stopping watchers slices acquire paper-project) \
+test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held cbctd-without-postgresql manual faults.so every.so live_bytes.so simulated-nvml/libnvidia-ml.so.1 cpu-bench calibrate-bench denoise presets stopping watchers slices acquire paper-project) \
                $(if $(cuda_objects),$(gpu_programs) $(BUILD)/gpu_ceilings $(BUILD)/cbct-worker-faulty,$(call objects,$(wildcard tests/bench/gpu_*.c)))
 
 # Faults of the disk, loaded into the programs by tests.
@@ -240,6 +249,7 @@ $(BUILD)/gpu_ceilings: tests/bench/gpu_ceilings.cu
 apt_install = { $$run apt-get install -y -qq --no-install-recommends $(1) >/dev/null 2>&1 || \
 	  { $$run apt-get update -qq && DEBIAN_FRONTEND=noninteractive $$run apt-get install -y -qq --no-install-recommends $(1) >/dev/null; }; }
 
+check: OPTIONAL += pg_config:libpq-dev pg_ctlcluster:postgresql
 check: OPTIONAL += g++:g++ /usr/include/dcmtk/dcmnet/scu.h:libdcmtk-dev chromium:chromium dciodvfy:dicom3tools Orthanc:orthanc-dicomweb promtool:prometheus systemd-analyze:systemd
 check: MODULES += matplotlib:python3-matplotlib nibabel:python3-nibabel pydicom:python3-pydicom gdcm:python3-gdcm
 setup: ## install the Debian packages that are missing

@@ -30,7 +30,8 @@ enum error_code {
 	ERR_SYNC = -13,
 	ERR_DAMAGED = -14, /* what the disk holds is not what was written (500) */
 	ERR_LIMIT = -15,   /* who asks has as much as one may have (429) */
-	ERR_QUOTA = -16    /* the same of bytes (507) */
+	ERR_QUOTA = -16,   /* the same of bytes (507) */
+	ERR_AWAY = -17     /* a database cannot be reached: nothing was changed, and that passes (503) */
 };
 
 struct error {

@@ -10,7 +10,7 @@
 
 #include "proto/scan_directory.h"
 
-enum kind { KIND_TEXT, KIND_LIST, KIND_CHOICE, KIND_INDICES, KIND_INTEGER, KIND_BYTES, KIND_SECONDS };
+enum kind { KIND_TEXT, KIND_ADDRESS, KIND_LIST, KIND_CHOICE, KIND_INDICES, KIND_INTEGER, KIND_BYTES, KIND_SECONDS };
 
 /* The default is read by the same parser as any other value. */
 static const struct setting {
@@ -44,8 +44,8 @@ static void *field(const struct setting *setting, struct config *config)
 
 static bool is_text(const struct setting *setting)
 {
-	return setting->kind == KIND_TEXT || setting->kind == KIND_LIST || setting->kind == KIND_CHOICE ||
-	       setting->kind == KIND_INDICES;
+	return setting->kind == KIND_TEXT || setting->kind == KIND_ADDRESS || setting->kind == KIND_LIST ||
+	       setting->kind == KIND_CHOICE || setting->kind == KIND_INDICES;
 }
 
 static const struct setting *setting_find(const char *name, size_t length)
@@ -161,6 +161,28 @@ static int setting_set(const struct setting *setting, struct config *config, con
 	return 0;
 }
 
+/* Prints an address without the password in it, scheme://user:PASSWORD@host/...?password=PASSWORD&... */
+static void print_hidden(FILE *out, const char *text)
+{
+	static const char scheme[] = "://", key[] = "password=";
+	const char *user = strstr(text, scheme), *last = strrchr(text, '@'), *password, *end;
+
+	/* A password that is not written as it should be may have any character: all up to the last @ is hidden. */
+	user = user == NULL ? text : user + strlen(scheme);
+	password = last == NULL ? NULL : memchr(user, ':', last > user ? (size_t)(last - user) : 0);
+	if (password != NULL) {
+		fprintf(out, "%.*s:***", (int)(password - text), text);
+		text = last;
+	}
+	while ((password = strstr(text, key)) != NULL) {
+		password += strlen(key);
+		end = password + strcspn(password, "&");
+		fprintf(out, "%.*s***", (int)(password - text), text);
+		text = end;
+	}
+	fputs(text, out);
+}
+
 /* systemd gives several directories separated by colons; the first is ours. */
 static int state_dir_default(char **ret_path, struct error *err)
 {
@@ -217,7 +239,9 @@ static int load_line(struct config *config, char *line, const char *place, bool 
 		return 0;
 	value = strchr(line, '=');
 	if (value == NULL)
-		return error_set(err, ERR_INVALID, "%s: \"%s\" is not NAME = VALUE", place, line);
+		/* What stands behind the first word may be a password. */
+		return error_set(err, ERR_INVALID, "%s: \"%.*s\" is not NAME = VALUE", place,
+				 (int)strcspn(line, " \t:"), line);
 	*value++ = '\0';
 	line = trim(line);
 	setting = setting_find(line, strlen(line));
@@ -436,7 +460,11 @@ void config_print(const struct config *config, FILE *out)
 		fprintf(out, "# %s\n", setting->help);
 		if (strcmp(setting->name, "config") == 0)
 			fprintf(out, "# config = %s\n", *(char *const *)value); /* no line of a config file itself */
-		else if (is_text(setting))
+		else if (setting->kind == KIND_ADDRESS) {
+			fprintf(out, "%s = ", setting->name);
+			print_hidden(out, *(char *const *)value);
+			fputc('\n', out);
+		} else if (is_text(setting))
 			fprintf(out, "%s = %s\n", setting->name, *(char *const *)value);
 		else if (setting->kind == KIND_INTEGER)
 			fprintf(out, "%s = %ld\n", setting->name, *(const long *)value);

@@ -12,6 +12,7 @@
  * bytes size_t, other numbers long.
  */
 #define SETTING_TEXT char *
+#define SETTING_ADDRESS char *
 #define SETTING_LIST char *
 #define SETTING_CHOICE char *
 #define SETTING_INDICES char *

@@ -28,6 +28,8 @@ enum lock_rank {
 	LOCK_VERIFIED,   /* verified.lock */
 	LOCK_PAGES,      /* pages.lock */
 	LOCK_CHECKPOINT, /* database.checkpoint_lock, of SQLite */
+	LOCK_CONNECTOR,  /* database.lock, of PostgreSQL */
+	LOCK_UNDONE,     /* store.undone_lock */
 	LOCK_CHECKS,     /* store.check_lock */
 	LOCK_CARDS,      /* cards.lock */
 	LOCK_FEEDER,     /* feeder.lock */

@@ -134,7 +134,8 @@ static int check_catalogue(void *context, double seconds, struct error *err)
 	(void)seconds;
 	code = store_job_volumes(api->store, "none", &volumes, &count, err);
 	free(volumes);
-	return code == ERR_NOT_FOUND ? 0 : code;
+	/* A server that is away is no reason to end the daemon, which waits for it and has workers that go on. */
+	return code == ERR_NOT_FOUND || code == ERR_AWAY ? 0 : code;
 }
 
 static const struct feeder_check checks[] = {
@@ -168,7 +169,8 @@ static int start_feeder(struct api *api, struct feeder **ret_feeder, struct erro
 
 static int start_parts(const struct config *config, struct api *api, struct error *err)
 {
-	const struct store_hooks hooks = {.failed = on_failure};
+	const struct store_options hooks = {
+	    .failed = on_failure, .catalogue = config->catalogue, .catalogue_timeout = config->catalogue_timeout};
 	const struct uploads_options uploads = {.buffer = config->upload_buffer, .failed = on_failure};
 	int devices[INDICES_MOST], given = config_indices(config->devices, devices, INDICES_MOST);
 	const struct supervise_options supervise = {.worker = config->worker[0] != '\0' ? config->worker : NULL,
@@ -342,11 +344,13 @@ static int run(const struct arguments *arguments)
 
 static int rebuild(const struct config *config)
 {
+	const struct store_options options = {.catalogue = config->catalogue,
+					      .catalogue_timeout = config->catalogue_timeout};
 	struct store_repairs repairs;
 	struct error err;
 
 	set_log(config);
-	if (store_rebuild(config->state_dir, &repairs, &err) != 0) {
+	if (store_rebuild(config->state_dir, &options, &repairs, &err) != 0) {
 		log_line(LEVEL_ERROR, "the catalogue cannot be made again: %s", err.text);
 		return 1;
 	}
@@ -374,7 +378,8 @@ int main(int argc, char **argv)
 	 * ones take the processor from the one that they wait for as soon as anything else runs beside them.
 	 */
 	setenv("OMP_WAIT_POLICY", "passive", 0);
-	if (config_load(argc, argv, &config, &action, &err) != 0) {
+	if (config_load(argc, argv, &config, &action, &err) != 0 ||
+	    (action != CONFIG_HELP && action != CONFIG_VERSION && store_check_catalogue(config.catalogue, &err) != 0)) {
 		fprintf(stderr, "cbctd: %s\n", err.text);
 		return err.code == ERR_NO_MEMORY ? 1 : 2; /* with 2 the service manager does not try again */
 	}

@@ -26,6 +26,7 @@ PROSE = {
 # Programs and modules that are run or imported, not linked: package, what for.
 BESIDE = (
     ("dcmtk", "`cbct import` runs its programs to read DICOM"),
+    ("libpq5", "`cbctd` loads it where `--catalogue postgresql://...` is set"),
     ("python3-numpy", "`clients/python/cbctd.py`"),
     ("python3-requests", "`clients/python/cbctd.py`"),
 )

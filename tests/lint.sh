@@ -20,7 +20,7 @@ rule() {
 files() { find "$@" -name node_modules -prune -o \( -name '*.[ch]' -o -name '*.cu' -o -name '*.cuh' \) -print 2>/dev/null; }
 
 rule "core includes core only" '#include "(kernels|proto|daemon|clients|tests)/' $(files core)
-rule "core is mathematics: no JSON, HTTP, SQL, compression, CUDA" '#include <(cjson|microhttpd|sqlite3|zstd|curl|png|openssl|cuda)' $(files core)
+rule "core is mathematics: no JSON, HTTP, SQL, compression, CUDA" '#include <(cjson|microhttpd|sqlite3|libpq|zstd|curl|png|openssl|cuda)' $(files core)
 rule "core neither logs nor exits" '\b(printf|fprintf|perror|exit|abort|puts) *\(' $(files core)
 rule "kernels include core only" '#include "(proto|daemon|clients|tests)/' $(files kernels)
 rule "proto includes core and proto only" '#include "(kernels|daemon|clients|tests)/' $(files proto)
@@ -30,8 +30,10 @@ rule "the daemon never touches CUDA" '#include [<"](cuda|cufft|kernels/)' $(file
 rule "libmicrohttpd stays in daemon/http" '#include <microhttpd' $(files daemon | grep -v '^daemon/http/')
 rule "SQLite stays in daemon/store/sqlite.c and the files beneath it" '#include [<"](sqlite3|daemon/store/checksum_vfs)' \
 	$(files daemon core proto clients | grep -vE '^daemon/store/(sqlite|checksum_vfs)\.[ch]$')
+rule "PostgreSQL stays in daemon/store/postgresql*" '#include [<"](libpq|daemon/store/postgresql)' \
+	$(files daemon core proto clients | grep -vE '^daemon/store/postgresql(_[a-z]+)?\.[ch]$')
 rule "a database knows no table of the catalogue" '#include "daemon/store/(catalogue|tables|store|internal)' \
-	daemon/store/sqlite.c daemon/store/checksum_vfs.[ch] daemon/store/backend.h
+	daemon/store/sqlite.c daemon/store/checksum_vfs.[ch] daemon/store/postgresql*.[ch] daemon/store/backend.h
 rule "the files beneath SQLite know no statement" '\b(SELECT|INSERT|UPDATE|DELETE|CREATE|PRAGMA [a-z_]+ =)|sqlite3_(prepare|exec|step)' \
 	daemon/store/checksum_vfs.[ch]
 rule "no struct is bytes in the catalogue" 'COLUMN_BYTES.*AT\(' <(grep COLUMN_BYTES daemon/store/tables.c | grep -vE '(sha256|digest)\)')

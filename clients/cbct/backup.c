@@ -210,7 +210,7 @@ static bool is_left_out(const char *path)
 	const char *name = strrchr(path, '/') != NULL ? strrchr(path, '/') + 1 : path;
 
 	return strcmp(path, "lock") == 0 || strcmp(path, "reserve") == 0 || strcmp(path, "restored") == 0 ||
-	       strncmp(path, "catalogue.sqlite", strlen("catalogue.sqlite")) == 0 || strstr(name, ".tmp") != NULL ||
+	       strncmp(path, "catalogue.", strlen("catalogue.")) == 0 || strstr(name, ".tmp") != NULL ||
 	       strcmp(path, MANIFEST) == 0 || strcmp(path, DIGEST) == 0;
 }
 

@@ -155,6 +155,10 @@ static void write_store(FILE *out, struct api *api)
 	single(out, "projections_stored_total", "counter", "Projections stored.", (double)store.projections_stored);
 	single(out, "commits_total", "counter", "Transactions of the catalogue.", (double)store.commits);
 	single(out, "commit_seconds_total", "counter", "Time they took.", store.commit_seconds);
+	describe(out, "catalogue_up", "gauge", "0 while the catalogue's database cannot be reached, by its engine.");
+	fprintf(out, "cbctd_catalogue_up{engine=\"%s\"} %d\n", store.engine, !store_away(api->store));
+	single(out, "catalogue_connections_lost_total", "counter",
+	       "Connections with the catalogue's database that were lost.", (double)store.engine_losses);
 }
 
 static void write_disk(FILE *out, struct api *api)

@@ -46,6 +46,8 @@ int ready_get(void *context, struct request *request, struct error *err)
 	struct api *api = context;
 	struct error why;
 
+	if (store_away(api->store))
+		return error_set(err, ERR_AWAY, "the catalogue's database cannot be reached, nothing can be stored");
 	if (!supervise_ready(api->supervise))
 		return error_set(err, ERR_BUSY, "no worker can take a job");
 	if (store_check_directory(api->store, &why) != 0)

@@ -184,7 +184,7 @@ static int give_job(struct supervise *supervise, struct worker *worker, struct j
 	}
 	if (code != 0)
 		store_distrust(jobs_store(supervise->jobs), &why);
-	if (code == ERR_NO_SPACE || code == ERR_NO_MEMORY || code == ERR_SYNC) {
+	if (code == ERR_NO_SPACE || code == ERR_NO_MEMORY || code == ERR_SYNC || code == ERR_AWAY) {
 		*err = why;
 	} else if (code == ERR_IO && job_hold(job, JOB_DISK_TROUBLE, clock_monotonic() + RETRY, 0) < BEGINNINGS_MAX) {
 		log_line(LEVEL_WARNING, "job %s cannot begin yet: %s", record.id, why.text);

@@ -80,19 +80,27 @@ static int add_volume(struct worker *worker, const struct message *message, stru
 	return job_add_volume(worker->job, &volume, err);
 }
 
-/* A commit each takes longer than the iterations of a small job: those that are there to read share one. */
-static void add_rows(struct supervise *supervise, struct worker *worker)
+/*
+ * A commit each takes longer than the iterations of a small job: those that are there to read share one. ERR_AWAY: the
+ * rows are still to be recorded.
+ */
+static int add_rows(struct supervise *supervise, struct worker *worker)
 {
-	int count = worker->row_count;
+	int count = worker->row_count, code = 0;
 	struct error err;
 
 	/* The latest measurement: the first iterations of a job may share the processor with its loading. */
 	if (count > 0 && worker->work > 0 && strcmp(worker->backend, "cpu") == 0)
 		supervise->processor_rate = worker->rows[count - 1].seconds / worker->work;
 
+	if (count > 0)
+		code = job_add_rows(worker->job, worker->rows, count, &err);
+	if (code == ERR_AWAY)
+		return code;
 	worker->row_count = 0;
-	if (count > 0 && job_add_rows(worker->job, worker->rows, count, &err) != 0)
+	if (code != 0)
 		stop_job(supervise, worker, &err);
+	return 0;
 }
 
 static void alive(struct supervise *supervise, struct worker *worker, const struct message *message)
@@ -133,7 +141,8 @@ static void note_words(struct worker *worker, const struct message *message)
 		snprintf(worker->said, sizeof(worker->said), "%.159s", message->text);
 }
 
-static void on_message(struct supervise *supervise, struct worker *worker, const struct message *message)
+/* ERR_AWAY: the message is still to be heard, once the catalogue can take it. */
+static int on_message(struct supervise *supervise, struct worker *worker, const struct message *message)
 {
 	struct job_facts facts = {0};
 	struct error err;
@@ -142,22 +151,23 @@ static void on_message(struct supervise *supervise, struct worker *worker, const
 	if (message->kind == MESSAGE_HELLO) {
 		if (worker->state == WORKER_STARTING)
 			hello(supervise, worker, message);
-		return;
+		return 0;
 	}
 	worker->signs.heard = clock_monotonic();
 	if (message->kind == MESSAGE_ALIVE) {
 		alive(supervise, worker, message);
-		return;
+		return 0;
 	}
 	worker->signs.stepped = worker->signs.heard;
 	if (worker->job != NULL)
 		job_facts(worker->job, &facts);
 	if (worker->job == NULL || worker->ending.due || strcmp(facts.id, message->job) != 0)
-		return;
+		return 0;
 	note_words(worker, message);
 	/* Rows are recorded before anything that the worker said after them. */
-	if (message->kind != MESSAGE_ROW || worker->row_count == JOB_ROWS_MAX)
-		add_rows(supervise, worker);
+	if ((message->kind != MESSAGE_ROW || worker->row_count == JOB_ROWS_MAX) &&
+	    add_rows(supervise, worker) == ERR_AWAY)
+		return ERR_AWAY;
 	switch (message->kind) {
 	case MESSAGE_OPENED:
 		job_set_plan(worker->job, &message->memory, message->plan);
@@ -180,8 +190,8 @@ static void on_message(struct supervise *supervise, struct worker *worker, const
 		worker->rows[worker->row_count++] = message->row;
 		break;
 	case MESSAGE_VOLUME:
-		worker->unsettled++;
 		code = add_volume(worker, message, &err);
+		worker->unsettled += code != ERR_AWAY;
 		break;
 	case MESSAGE_SETTLED:
 		worker->unsettled--;
@@ -199,29 +209,63 @@ static void on_message(struct supervise *supervise, struct worker *worker, const
 	default:
 		break;
 	}
-	if (code != 0)
+	if (code != 0 && code != ERR_AWAY)
 		stop_job(supervise, worker, &err);
+	return code == ERR_AWAY ? code : 0;
+}
+
+/* The message that was held back, or the next one of the socket. */
+static int next_message(struct worker *worker, struct message **ret_message, bool *ret_got, struct error *err)
+{
+	struct message *message = worker->held;
+	int code;
+
+	worker->held = NULL;
+	if (message != NULL) {
+		*ret_message = message;
+		*ret_got = true;
+		return 0;
+	}
+	message = malloc(sizeof(*message));
+	code = message == NULL ? error_set_errno(err, ENOMEM, "message")
+			       : message_receive(worker->child.socket, 0, message, ret_got, err);
+	if (code != 0 || !*ret_got)
+		free(message);
+	else
+		*ret_message = message;
+	return code;
+}
+
+void worker_forget_held(struct worker *worker)
+{
+	if (worker->held != NULL)
+		message_clear(worker->held);
+	free(worker->held);
+	worker->held = NULL;
 }
 
 void worker_read(struct supervise *supervise, struct worker *worker, bool died, bool *ret_gone)
 {
-	struct message *message = malloc(sizeof(*message));
 	double end = died ? NEVER : clock_monotonic() + TURN;
+	struct message *message = NULL;
 	struct error err;
 	bool got = true;
-	int code = message == NULL ? error_set_errno(&err, ENOMEM, "message") : 0;
+	int code = 0;
 
 	if (worker->unheard)
 		code = error_set(&err, ERR_IO, "a message was lost");
 	while (code == 0 && got && clock_monotonic() < end) {
-		code = message_receive(worker->child.socket, 0, message, &got, &err);
-		if (code == 0 && got) {
-			on_message(supervise, worker, message);
-			message_clear(message);
+		code = next_message(worker, &message, &got, &err);
+		if (code != 0 || !got)
+			break;
+		if (on_message(supervise, worker, message) == ERR_AWAY) {
+			worker->held = message;
+			break;
 		}
+		message_clear(message);
+		free(message);
 	}
 	add_rows(supervise, worker);
-	free(message);
 	*ret_gone = code != 0;
 	if (code != 0 && code != ERR_IO) {
 		log_line(LEVEL_ERROR, "worker %d: %s", worker->index, err.text);

@@ -26,7 +26,8 @@
 
 static const double RESTART_FIRST = 0.1, RESTART_LAST = 30; /* s between a death and the next start */
 static const double STEADY = 60;                            /* s of life after which earlier deaths are forgotten */
-static const double LOOK = 1; /* s between two looks whether a job that is held may go on */
+static const double AWAY_LOOK = 0.1; /* s between two looks whether the catalogue is there again */
+static const double LOOK = 1;        /* s between two looks whether a job that is held may go on */
 
 const char *const worker_state_names[WORKER_STATE_COUNT] = {"absent", "starting", "idle", "busy", "ending"};
 
@@ -177,6 +178,10 @@ static void worker_died(struct supervise *supervise, struct worker *worker, bool
 
 	/* The worker's last messages come first: they may say that the job is done. */
 	worker_read(supervise, worker, true, &gone);
+	if ((worker->held != NULL || worker->row_count > 0) && !stopping)
+		return; /* they are heard, and the process reaped, when the catalogue is there again */
+	worker_forget_held(worker);
+	worker->row_count = 0;
 	child_reap(&worker->child, how, sizeof(how));
 	if (worker->killed[0] != '\0')
 		snprintf(text, sizeof(text), "its worker %s", worker->killed);
@@ -244,6 +249,8 @@ static int poll_timeout(const struct supervise *supervise, bool stopping)
 
 		double patience = worker_patience_ends(worker);
 
+		if (worker->held != NULL)
+			next = 0;
 		if (worker->ending.due && worker->ending.again < next)
 			next = worker->ending.again;
 		if (worker->arriving != NULL && !worker->ending.due && worker->again > now && worker->again < next)
@@ -314,7 +321,7 @@ static void read_workers(struct supervise *supervise, const struct pollfd *fds, 
 
 		if (worker->state == WORKER_ABSENT)
 			continue;
-		if (fds[2 * i].revents != 0)
+		if (fds[2 * i].revents != 0 || worker->held != NULL)
 			worker_read(supervise, worker, false, &gone);
 		if (fds[2 * i + 1].revents != 0) {
 			worker_died(supervise, worker, stopping);
@@ -351,6 +358,31 @@ static void wait_and_read(struct supervise *supervise, bool stopping)
 		log_line(LEVEL_DEBUG, "eventfd: %s", strerror(errno));
 	read_workers(supervise, fds, stopping);
 	judge_workers(supervise);
+}
+
+/*
+ * While the catalogue is away nothing that a worker says can be recorded, and nothing be decided that has to be: the
+ * workers go on, what they say waits in their sockets, and nobody is found silent because of that. True: it is away.
+ */
+static bool wait_for_catalogue(struct supervise *supervise)
+{
+	struct pollfd fd = {.fd = supervise->wake, .events = POLLIN};
+	const bool there = !store_away(jobs_store(supervise->jobs));
+	uint64_t ignored;
+
+	if (there && !supervise->held)
+		return false;
+	supervise->held = !there;
+	for (int i = 0; i < supervise->count && there; i++) {
+		struct worker *worker = &supervise->workers[i];
+
+		worker->signs.heard = worker->signs.stepped = clock_monotonic();
+		if (worker->deadline < worker->signs.heard + EXIT)
+			worker->deadline = worker->signs.heard + EXIT;
+	}
+	if (!there && poll(&fd, 1, (int)(1000 * AWAY_LOOK)) > 0 && read(supervise->wake, &ignored, sizeof(ignored)) < 0)
+		log_line(LEVEL_DEBUG, "eventfd: %s", strerror(errno));
+	return !there;
 }
 
 static void quit_workers(struct supervise *supervise)
@@ -393,6 +425,10 @@ static void *supervise_loop(void *context)
 	struct supervise *supervise = context;
 
 	while (!stop_asked(supervise)) {
+		if (wait_for_catalogue(supervise)) {
+			atomic_fetch_add(&supervise->turns, 1);
+			continue;
+		}
 		look_at_clock(supervise, false);
 		devices_tend(supervise);
 		carry_out_cancels(supervise);
@@ -411,6 +447,7 @@ static void *supervise_loop(void *context)
 		if (supervise->workers[i].syncer.running)
 			worker_finish_job(supervise, &supervise->workers[i]);
 		worker_stop_attending(&supervise->workers[i]);
+		worker_forget_held(&supervise->workers[i]);
 		job_release(supervise->workers[i].job);
 		supervise->workers[i].job = NULL;
 	}

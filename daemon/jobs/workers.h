@@ -89,9 +89,11 @@ struct worker {
 	int checkpoint;      /* that it began from */
 	size_t volume_bytes; /* of one volume of its job */
 	int unsettled;       /* volumes that it has announced and not settled */
-	/* The latest rows of its history, which the catalogue has yet to take; none between two turns. */
+	/* The latest rows of its history, which the catalogue has yet to take; none between two turns but while it is
+	 * away. */
 	struct history_row rows[JOB_ROWS_MAX];
 	int row_count;
+	struct message *held; /* that the catalogue could not take, being away; NULL: none */
 	bool cancelling, yielding;
 	double room_since; /* monotonic: it was asked to make room for projections that came later; NEVER */
 	/* While its job waits for the rest of its projections: the scan, a reference; NULL otherwise. */
@@ -123,6 +125,7 @@ struct supervise {
 	double review_at;                 /* monotonic: when jobs that are held are looked at, 0: none; its own */
 	double stop_by;                   /* monotonic: the stop's end, NEVER before it; the thread's own */
 
+	bool held;           /* the catalogue is away, nobody is listened to and judged; its own */
 	atomic_ullong turns; /* of the thread's loop */
 
 	pthread_mutex_t lock; /* guards what follows */
@@ -145,6 +148,8 @@ void worker_publish(struct supervise *supervise, const struct worker *worker);
  * rows are recorded. *ret_gone at the end of the stream, or when it makes no sense.
  */
 void worker_read(struct supervise *supervise, struct worker *worker, bool died, bool *ret_gone);
+/* A message that the catalogue could not take is dropped. */
+void worker_forget_held(struct worker *worker);
 /* Sends a message that has no more to it than its kind. */
 void worker_order(struct worker *worker, enum message_kind kind);
 /* The worker is to end its job soon; it is killed if it does not. */

@@ -15,15 +15,13 @@
  * Two sessions: all writing goes through SESSION_WRITER, within a transaction, but for the upgrade's look at what is
  * there; SESSION_READER reads what is committed and never waits for the writer. The catalogue holds a lock of each
  * session over every call with it, so that a session is used by one thread at a time. Errors: ERR_NO_SPACE, ERR_BUSY
- * (another program holds the database) and ERR_NO_MEMORY may pass; with ERR_IO of the writer the backend has called
+ * (another program holds the database), ERR_AWAY (its server cannot be reached, once calls are made from several
+ * threads; before, the start fails) and ERR_NO_MEMORY may pass; with ERR_IO of the writer the backend has called
  * site->failed, after which nothing more is written; ERR_INTERNAL: a row breaks a rule of its table. A statement that
  * fails may spoil its transaction: the next call is `end` without commit, or ROLLBACK TO a savepoint
  * (catalogue_import).
  *
- * A trial with PostgreSQL and libpq (273 lines) showed that these 14 functions are enough: parameters are prepared
- * without types, which it infers from the columns; integer is BIGINT, real DOUBLE PRECISION; the version is the comment
- * of a schema; `synced` is synchronous_commit; `freeze` is REPEATABLE READ. It needs an address beside the directory: a
- * setting, and a member of struct catalogue_site.
+ * Two of them: sqlite.c, and postgresql.c, which is left out where libpq is not installed.
  */
 enum value_type { VALUE_NULL, VALUE_INTEGER, VALUE_REAL, VALUE_TEXT, VALUE_BYTES };
 struct value {
@@ -53,15 +51,22 @@ struct dialect {
 /* The catalogue's place and its hooks; they live longer than the database that was opened with them. */
 struct catalogue_site {
 	char directory[900];
+	char address[1024]; /* of its server, as the user gave it; it may have a password and is never told */
+	double timeout;     /* s until a server that says nothing counts as lost */
 	void *context;
 	void (*failed)(void *context, const char *what); /* what is committed can no longer be trusted to stay */
 	bool (*make_room)(void *context);                /* the disk is full: true where there is more room now */
 	_Atomic bool damaged;                            /* set by the backend: the catalogue is to be made again */
+	_Atomic bool away;                               /* set by the backend: its server cannot be reached just now */
+	_Atomic unsigned long losses;                    /* of connections */
 };
 
 struct catalogue_backend {
-	const char *name;
+	const char *name; /* alone or before :// in the setting */
+	const char *file; /* in the state directory, by which a note in quarantine/ names the catalogue */
 	struct dialect dialect;
+	/* ERR_INVALID, without a word of the address: it cannot be one. NULL: there is no address. */
+	int (*check)(const char *address, struct error *err);
 	/*
 	 * Changes nothing. *ret_version: 0 where there is no catalogue yet. What does not fit is damaged, and a
 	 * failure. *ret_interrupted: a process ended without closing it.
@@ -85,7 +90,12 @@ struct catalogue_backend {
 	int (*script)(void *database, const char *sql, struct error *err);
 	/* synced: the commit is on the disk when end returns; else a power cut may take it until a later one is. */
 	int (*begin)(void *database, bool synced, struct error *err);
-	int (*end)(void *database, bool commit, struct error *err); /* a commit that fails is rolled back */
+	/*
+	 * A commit that fails is rolled back. ERR_AWAY: nobody knows. The next `begin` that succeeds is on a connection
+	 * that sees what became of it, and then `committed` tells.
+	 */
+	int (*end)(void *database, bool commit, struct error *err);
+	bool (*committed)(void *database); /* NULL where `end` never returns ERR_AWAY */
 	/* All that the reader sees from now on is of one moment, or of the present again. */
 	int (*freeze)(void *database, bool frozen, struct error *err);
 

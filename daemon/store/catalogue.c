@@ -13,11 +13,17 @@
 #include "daemon/store/upgrade.h"
 
 extern const struct catalogue_backend catalogue_sqlite;
+extern const struct catalogue_backend catalogue_postgresql __attribute__((weak));
 
-/* The first is used. */
-static const struct catalogue_backend *const catalogue_backends[] = {&catalogue_sqlite};
+/* NULL: what it needs was not there when this was built. */
+static const struct {
+	const char *name;
+	bool address; /* it has one */
+	const struct catalogue_backend *backend;
+} engines[] = {{"sqlite", false, &catalogue_sqlite}, {"postgresql", true, &catalogue_postgresql}};
+enum { ENGINE_COUNT = sizeof(engines) / sizeof(engines[0]) };
 
-static const enum table_id record_tables[RECORD_KINDS] = {TABLE_SCANS, TABLE_JOBS};
+const enum table_id catalogue_record_tables[RECORD_KINDS] = {TABLE_SCANS, TABLE_JOBS};
 
 /* ---- opening ---- */
 
@@ -38,19 +44,54 @@ static int make_statements(struct catalogue *catalogue, struct error *err)
 	return made ? 0 : error_set_errno(err, ENOMEM, "catalogue");
 }
 
-int catalogue_new(const char *directory, const struct catalogue_hooks *hooks, struct catalogue **ret_catalogue,
-		  struct error *err)
+/* The address itself is not told: it may have a password. */
+static int find_engine(const char *address, const struct catalogue_backend **ret_backend, struct error *err)
 {
-	struct catalogue *catalogue = calloc(1, sizeof(*catalogue));
-	int code;
+	for (int i = 0; i < ENGINE_COUNT; i++) {
+		const size_t length = strlen(engines[i].name);
 
+		if (strncmp(address, engines[i].name, length) != 0 ||
+		    (engines[i].address ? strncmp(address + length, "://", 3) != 0 : address[length] != '\0'))
+			continue;
+		if (engines[i].backend == NULL)
+			return error_set(err, ERR_INVALID,
+					 "the catalogue is to be %s://..., but this cbctd was built "
+					 "without libpq (Debian's libpq-dev)",
+					 engines[i].name);
+		*ret_backend = engines[i].backend;
+		return 0;
+	}
+	return error_set(err, ERR_INVALID, "the catalogue is to be \"%.*s\"; sqlite and postgresql://... are known",
+			 (int)strcspn(address, ":/@"), address);
+}
+
+int catalogue_check_address(const char *address, struct error *err)
+{
+	const struct catalogue_backend *backend;
+	int code = find_engine(address, &backend, err);
+
+	return code == 0 && backend->check != NULL ? backend->check(address, err) : code;
+}
+
+int catalogue_new(const struct catalogue_place *place, const struct catalogue_hooks *hooks,
+		  struct catalogue **ret_catalogue, struct error *err)
+{
+	const struct catalogue_backend *backend = NULL;
+	struct catalogue *catalogue;
+	int code = find_engine(place->address, &backend, err);
+
+	if (code != 0)
+		return code;
+	catalogue = calloc(1, sizeof(*catalogue));
 	if (catalogue == NULL)
 		return error_set_errno(err, ENOMEM, "catalogue");
-	snprintf(catalogue->site.directory, sizeof(catalogue->site.directory), "%s", directory);
+	snprintf(catalogue->site.directory, sizeof(catalogue->site.directory), "%s", place->directory);
+	snprintf(catalogue->site.address, sizeof(catalogue->site.address), "%s", place->address);
+	catalogue->site.timeout = place->timeout;
 	catalogue->site.context = hooks->context;
 	catalogue->site.failed = hooks->failed;
 	catalogue->site.make_room = hooks->make_room;
-	catalogue->backend = catalogue_backends[0];
+	catalogue->backend = backend;
 	for (int i = 0; i < SESSION_COUNT; i++)
 		lock_init(&catalogue->locks[i], LOCK_CATALOGUE);
 	code = make_statements(catalogue, err);
@@ -72,6 +113,8 @@ void catalogue_free(struct catalogue *catalogue)
 	if (catalogue == NULL)
 		return;
 	close_database(catalogue);
+	catalogue_forget_former(catalogue);
+	free(catalogue->former);
 	for (int i = 0; i < SESSION_COUNT; i++)
 		pthread_mutex_destroy(&catalogue->locks[i]);
 	for (int i = 0; i < TABLE_COUNT; i++) {
@@ -110,6 +153,26 @@ bool catalogue_damaged(const struct catalogue *catalogue)
 	return atomic_load(&catalogue->site.damaged);
 }
 
+bool catalogue_away(const struct catalogue *catalogue)
+{
+	return atomic_load(&catalogue->site.away);
+}
+
+const char *catalogue_engine(const struct catalogue *catalogue)
+{
+	return catalogue->backend->name;
+}
+
+const char *catalogue_file(const struct catalogue *catalogue)
+{
+	return catalogue->backend->file;
+}
+
+unsigned long catalogue_losses(const struct catalogue *catalogue)
+{
+	return atomic_load(&catalogue->site.losses);
+}
+
 int catalogue_set_aside(struct catalogue *catalogue, const char *why, struct error *err)
 {
 	close_database(catalogue);
@@ -135,6 +198,10 @@ int catalogue_begin(struct catalogue *catalogue, bool synced, struct error *err)
 
 	pthread_mutex_lock(&catalogue->locks[SESSION_WRITER]);
 	code = catalogue->backend->begin(catalogue->database, synced, err);
+	if (code == 0 && catalogue->unsettled != SETTLED)
+		code = catalogue_settle(catalogue, synced, err);
+	catalogue->group_event = 0;
+	catalogue->group_removes = false;
 	if (code != 0)
 		pthread_mutex_unlock(&catalogue->locks[SESSION_WRITER]);
 	return code;
@@ -144,10 +211,17 @@ int catalogue_end(struct catalogue *catalogue, int code, struct error *err)
 {
 	struct error ignored;
 
-	if (code == 0)
+	if (code == 0) {
 		code = catalogue->backend->end(catalogue->database, true, err);
-	else
+		if (code == ERR_AWAY)
+			catalogue->unsettled = UNKNOWN;
+		if ((code == 0 || catalogue->group_removes) && catalogue->group_event > catalogue->acknowledged)
+			catalogue->acknowledged = catalogue->group_event;
+	} else {
 		catalogue->backend->end(catalogue->database, false, &ignored);
+	}
+	if (catalogue->unsettled == SETTLED)
+		catalogue_forget_former(catalogue);
 	pthread_mutex_unlock(&catalogue->locks[SESSION_WRITER]);
 	return code;
 }
@@ -160,10 +234,23 @@ int catalogue_write(struct catalogue *catalogue, const char *sql, const struct v
 	return catalogue->backend->run(catalogue->database, SESSION_WRITER, sql, values, count, NULL, NULL, err);
 }
 
+/* What a group whose end is not known may have left is seen by nobody. */
+static int settle_before_reading(struct catalogue *catalogue, struct error *err)
+{
+	int code = catalogue_begin(catalogue, true, err);
+
+	return code == 0 ? catalogue_end(catalogue, 0, err) : code;
+}
+
 int catalogue_read(struct catalogue *catalogue, const char *sql, const struct value *values, int count,
 		   row_function row, void *context, struct error *err)
 {
-	int code;
+	int code = 0;
+
+	if (catalogue->unsettled != SETTLED)
+		code = settle_before_reading(catalogue, err);
+	if (code != 0)
+		return code;
 
 	pthread_mutex_lock(&catalogue->locks[SESSION_READER]);
 	code = catalogue->backend->run(catalogue->database, SESSION_READER, sql, values, count, row, context, err);
@@ -197,13 +284,24 @@ static int write_record(struct catalogue *catalogue, enum table_id table, enum s
 	return code;
 }
 
+static int note_fresh(struct catalogue *catalogue, enum table_id table, const void *record, struct error *err)
+{
+	const enum record_kind kind = table == TABLE_SCANS ? RECORD_SCAN : RECORD_JOB;
+	const struct catalogue_scan *scan = record;
+	const struct job_record *job = record;
+
+	return catalogue_note_former(catalogue, kind, kind == RECORD_SCAN ? scan->id : job->id, true, err);
+}
+
 int catalogue_put_row(struct catalogue *catalogue, enum table_id table, const char *owner, const void *record,
 		      long long *ret_number, struct error *err)
 {
 	bool replaces = tables[table].put == PUT_REPLACES;
-	long long first;
+	long long first = 0;
 	int code = tables[table].put == PUT_MOVES ? catalogue_take_row(catalogue, table, owner, record, err) : 0;
 
+	if (code == 0 && (table == TABLE_SCANS || table == TABLE_JOBS))
+		code = note_fresh(catalogue, table, record, err);
 	if (code == 0)
 		code = write_record(catalogue, table, replaces ? STATEMENT_PUT : STATEMENT_INSERT, owner, record,
 				    &first, err);
@@ -211,6 +309,9 @@ int catalogue_put_row(struct catalogue *catalogue, enum table_id table, const ch
 		code = catalogue_write(catalogue, catalogue->statements[table][STATEMENT_TRIM], NULL, 0, err);
 	if (code == 0 && ret_number != NULL)
 		*ret_number = replaces ? 1 : first;
+	if (code == 0 && table == TABLE_EVENTS && first > catalogue->group_event)
+		catalogue->group_event = first;
+	catalogue->group_removes |= table == TABLE_REMOVALS;
 	return code;
 }
 
@@ -233,6 +334,9 @@ int catalogue_set_member(struct catalogue *catalogue, enum table_id table, const
 		assert(column < tables[table].count);
 	}
 	code = row_of_column(&tables[table].columns[column], record, &row, err);
+	if (code == 0)
+		code =
+		    catalogue_note_former(catalogue, table == TABLE_SCANS ? RECORD_SCAN : RECORD_JOB, id, false, err);
 	row.values[1] = value_text(id);
 	if (code == 0)
 		code = catalogue_write(catalogue, catalogue->assignments[table][column], row.values, 2, err);
@@ -310,7 +414,7 @@ int catalogue_list_rows(struct catalogue *catalogue, enum table_id table, const 
 
 int catalogue_remove(struct catalogue *catalogue, enum record_kind kind, const char *id, struct error *err)
 {
-	return catalogue_remove_rows(catalogue, record_tables[kind], id, err);
+	return catalogue_remove_rows(catalogue, catalogue_record_tables[kind], id, err);
 }
 
 struct stamp_visit {
@@ -341,7 +445,7 @@ int catalogue_stamps(struct catalogue *catalogue, enum record_kind kind,
 static bool is_beneath(const struct table *table, enum record_kind kind)
 {
 	return table->parent != NULL && !table->recorded_apart &&
-	       strcmp(table->parent, tables[record_tables[kind]].name) == 0;
+	       strcmp(table->parent, tables[catalogue_record_tables[kind]].name) == 0;
 }
 
 struct exported {
@@ -375,7 +479,7 @@ static int export_rows(struct catalogue *catalogue, enum table_id table, enum st
 int catalogue_export(struct catalogue *catalogue, enum record_kind kind, const char *id, cJSON **ret_rows,
 		     struct error *err)
 {
-	enum table_id own = record_tables[kind];
+	enum table_id own = catalogue_record_tables[kind];
 	cJSON *rows = cJSON_CreateObject();
 	int code = export_rows(catalogue, own, STATEMENT_GET, id, rows, err);
 
@@ -416,7 +520,7 @@ static int import_own(struct catalogue *catalogue, enum record_kind kind, const 
 	int code = kind == RECORD_JOB ? catalogue_upgrade_job(row, err) : 0;
 
 	if (code == 0)
-		code = import_row(catalogue, record_tables[kind], STATEMENT_PUT, NULL, row, err);
+		code = import_row(catalogue, catalogue_record_tables[kind], STATEMENT_PUT, NULL, row, err);
 	cJSON_Delete(row);
 	return code;
 }
@@ -424,7 +528,7 @@ static int import_own(struct catalogue *catalogue, enum record_kind kind, const 
 static int import_rows(struct catalogue *catalogue, enum record_kind kind, const char *id, const cJSON *rows,
 		       struct error *err)
 {
-	const char *name = tables[record_tables[kind]].name;
+	const char *name = tables[catalogue_record_tables[kind]].name;
 	const cJSON *row;
 	int code =
 	    import_own(catalogue, kind, cJSON_GetArrayItem(cJSON_GetObjectItemCaseSensitive(rows, name), 0), err);

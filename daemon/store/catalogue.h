@@ -28,8 +28,15 @@ struct catalogue_hooks {
 
 /* ---- opening ---- */
 
-int catalogue_new(const char *directory, const struct catalogue_hooks *hooks, struct catalogue **ret_catalogue,
-		  struct error *err);
+/* Which database, and how long it may take to answer. */
+struct catalogue_place {
+	const char *directory, *address; /* STATE; "sqlite", or "postgresql://..." with all that libpq knows */
+	double timeout;                  /* s */
+};
+/* ERR_INVALID: no database is called so, or this cbctd was built without what it needs. */
+int catalogue_check_address(const char *address, struct error *err);
+int catalogue_new(const struct catalogue_place *place, const struct catalogue_hooks *hooks,
+		  struct catalogue **ret_catalogue, struct error *err);
 void catalogue_free(struct catalogue *catalogue); /* NULL is fine; closes it */
 /*
  * Opens, checks and upgrades it, anew where it is open, or makes an empty one (*ret_fresh). *ret_interrupted: a process
@@ -38,6 +45,11 @@ void catalogue_free(struct catalogue *catalogue); /* NULL is fine; closes it */
  */
 int catalogue_open(struct catalogue *catalogue, bool *ret_fresh, bool *ret_interrupted, struct error *err);
 bool catalogue_damaged(const struct catalogue *catalogue);
+/* Its database cannot be reached just now. Any thread. */
+bool catalogue_away(const struct catalogue *catalogue);
+const char *catalogue_engine(const struct catalogue *catalogue);   /* "sqlite" */
+const char *catalogue_file(const struct catalogue *catalogue);     /* its name in the state directory */
+unsigned long catalogue_losses(const struct catalogue *catalogue); /* of connections, since the start */
 /* Closes it and moves it to quarantine/; it is whole then, and empty. */
 int catalogue_set_aside(struct catalogue *catalogue, const char *why, struct error *err);
 /* The start is over and requests come; a thread of the backend may begin to tidy up. */
@@ -52,7 +64,12 @@ int catalogue_freeze(struct catalogue *catalogue, bool frozen, struct error *err
  * is no group.
  */
 int catalogue_begin(struct catalogue *catalogue, bool synced, struct error *err);
-/* Commits when code is 0, else takes everything back. Returns code, or why the commit failed. */
+/*
+ * Commits when code is 0, else takes everything back. Returns code, or why the commit failed. ERR_AWAY: what a group
+ * has changed of the own rows of scans and jobs, and its events, do not last, even where the database had committed
+ * them before its answer was lost: the next group finds these rows as they were. A removal lasts. Of other rows some
+ * may stay that were told to have failed: who tries again writes the same ones.
+ */
 int catalogue_end(struct catalogue *catalogue, int code, struct error *err);
 
 /* ---- records, each a row of a table ---- */

@@ -43,8 +43,12 @@ int catalogue_find_scan_key(struct catalogue *catalogue, const char *key, char r
 static int update_row(struct catalogue *catalogue, const struct job_record *job, struct error *err)
 {
 	struct row row;
-	int code, count = row_of_record(&tables[TABLE_JOBS], STATEMENT_UPDATE, job, NULL, &row, err);
+	int code, count;
 
+	code = catalogue_note_former(catalogue, RECORD_JOB, job->id, false, err);
+	if (code != 0)
+		return code;
+	count = row_of_record(&tables[TABLE_JOBS], STATEMENT_UPDATE, job, NULL, &row, err);
 	if (count >= 0)
 		row.values[count] = value_text(job->id);
 	code = count < 0 ? count
@@ -206,7 +210,11 @@ int catalogue_events(struct catalogue *catalogue, const char *job, long long aft
 
 int catalogue_last_event(struct catalogue *catalogue, long long *ret_number, struct error *err)
 {
-	return catalogue->backend->last_number(catalogue->database, tables[TABLE_EVENTS].name, ret_number, err);
+	int code = catalogue->backend->last_number(catalogue->database, tables[TABLE_EVENTS].name, ret_number, err);
+
+	if (code == 0)
+		catalogue->acknowledged = *ret_number;
+	return code;
 }
 
 int catalogue_pass_events(struct catalogue *catalogue, long long least, struct error *err)

@@ -22,7 +22,7 @@ enum { RECENT_SCANS = 16 };
 
 struct store {
 	char directory[900]; /* constant, as hooks */
-	struct store_hooks hooks;
+	struct store_options hooks;
 	struct store_limits limits; /* constant after the start, as the next two */
 	struct store_counter counters[STORE_COUNTERS];
 	int counter_count;
@@ -38,6 +38,13 @@ struct store {
 	long long stamp;              /* of the latest record that was written; store/record.h */
 	long long event_written;      /* by the group under way, 0: none */
 	struct store_repairs repairs; /* constant after the start, as the next two */
+	/* Records that are ahead of their rows, which could not be read; put right in the next group. */
+	pthread_mutex_t undone_lock; /* guards the next two */
+	struct undone {
+		enum record_kind kind;
+		char id[ID_SIZE];
+	} * undone;
+	int undone_count;
 	bool opened;
 	bool interrupted;    /* the process before did not end as it should */
 	_Atomic bool failed; /* a commit did not reach the disk: nothing is acknowledged any more */

@@ -146,8 +146,8 @@ int store_job_delete(struct store *store, const char *id, struct error *err)
 	if (code == 0)
 		code = catalogue_remove(store->catalogue, RECORD_JOB, id, err);
 	code = store_end(store, code, err);
-	/* The job counts as deleted from its note on: on a full disk the row goes at the next start. */
-	return code == ERR_NO_SPACE ? 0 : code;
+	/* The job counts as deleted from its note on: its row goes at the next start, where it cannot now. */
+	return code == ERR_NO_SPACE || code == ERR_AWAY ? 0 : code;
 }
 
 void store_job_remove_files(const struct store *store, const char *id)

@@ -360,5 +360,5 @@ int store_reconcile(struct store *store, bool fresh, struct error *err)
 	 * off. */
 	return repairs->remade || (!fresh && found == 1) || restored
 		   ? 0
-		   : quarantine_note(store->directory, "catalogue.sqlite", why, err);
+		   : quarantine_note(store->directory, catalogue_file(store->catalogue), why, err);
 }

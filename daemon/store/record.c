@@ -138,28 +138,90 @@ int record_write(struct store *store, enum record_kind kind, const char *id, boo
 	return code == 0 ? write_rows(store, kind, id, synced, err) : code;
 }
 
-void record_undo(struct store *store, enum record_kind kind, const char *id)
+/* In a group. */
+static int write_former(struct store *store, enum record_kind kind, const char *id, struct error *err)
 {
 	char path[1100], *text = NULL;
+	int code = record_text(store, kind, id, &text, err);
+
+	record_path(store, kind, id, path);
+	if (code == 0 && text != NULL)
+		code = write_file(path, text, store->stamp, true, err);
+	else if (code == 0 && unlink(path) != 0 && errno != ENOENT)
+		log_line(LEVEL_WARNING, "%s stays: %s", path, strerror(errno));
+	free(text);
+	return code;
+}
+
+static int add_undone(struct store *store, enum record_kind kind, const char *id, struct error *err)
+{
+	struct undone *more;
+	int code = 0;
+
+	pthread_mutex_lock(&store->undone_lock);
+	more = realloc(store->undone, (size_t)(store->undone_count + 1) * sizeof(*more));
+	if (more == NULL) {
+		code = error_set_errno(err, ENOMEM, "record");
+	} else {
+		store->undone = more;
+		more[store->undone_count] = (struct undone){.kind = kind};
+		memcpy(more[store->undone_count++].id, id, ID_SIZE);
+	}
+	pthread_mutex_unlock(&store->undone_lock);
+	return code;
+}
+
+static void tell_ahead(enum record_kind kind, const char *id, const struct error *err)
+{
+	log_line(LEVEL_WARNING, "%s %s: its record is ahead of the catalogue: %s", record_words[kind].kind, id,
+		 err->text);
+}
+
+void record_undo(struct store *store, enum record_kind kind, const char *id)
+{
 	struct error err;
 	int code;
 
 	if (atomic_load(&store->failed))
 		return; /* the process ends; which of both was written stays open, as with a commit */
-	record_path(store, kind, id, path);
 	code = catalogue_begin(store->catalogue, true, &err);
-	if (code == 0) {
-		code = record_text(store, kind, id, &text, &err);
-		if (code == 0 && text != NULL)
-			code = write_file(path, text, store->stamp, true, &err);
-		else if (code == 0 && unlink(path) != 0 && errno != ENOENT)
-			log_line(LEVEL_WARNING, "%s stays: %s", path, strerror(errno));
-		code = catalogue_end(store->catalogue, code, &err);
-	}
+	if (code == 0)
+		code = catalogue_end(store->catalogue, write_former(store, kind, id, &err), &err);
+	if (code == ERR_AWAY)
+		code = add_undone(store, kind, id, &err);
 	if (code != 0)
-		log_line(LEVEL_WARNING, "%s %s: its record is ahead of the catalogue: %s", record_words[kind].kind, id,
-			 err.text);
-	free(text);
+		tell_ahead(kind, id, &err);
+}
+
+/* False: there is none. */
+static bool take_undone(struct store *store, struct undone *ret)
+{
+	bool any;
+
+	pthread_mutex_lock(&store->undone_lock);
+	any = store->undone_count > 0;
+	if (any)
+		*ret = store->undone[--store->undone_count];
+	pthread_mutex_unlock(&store->undone_lock);
+	return any;
+}
+
+void record_undo_rest(struct store *store)
+{
+	struct undone undone;
+	char directory[1024];
+	struct error err;
+	int code = 0;
+
+	while (code != ERR_AWAY && take_undone(store, &undone)) {
+		code = write_former(store, undone.kind, undone.id, &err);
+		record_directory(store, undone.kind, undone.id, directory);
+		rmdir(directory); /* of a job that was not posted after all; any other is not empty */
+		if (code == ERR_AWAY)
+			code = add_undone(store, undone.kind, undone.id, &err) == 0 ? ERR_AWAY : err.code;
+		if (code != 0 && code != ERR_AWAY)
+			tell_ahead(undone.kind, undone.id, &err);
+	}
 }
 
 /* ---- reading ---- */

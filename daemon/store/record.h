@@ -44,6 +44,8 @@ int record_write(struct store *store, enum record_kind kind, const char *id, boo
 /* After a group that was rolled back, outside of any, best effort: the record of the rows as they are; without a row it
  * is removed. */
 void record_undo(struct store *store, enum record_kind kind, const char *id);
+/* Does the same of those for which the catalogue was away, in a group. */
+void record_undo_rest(struct store *store);
 
 /* True where the record is a file of no bytes. */
 bool record_empty(const struct store *store, enum record_kind kind, const char *id);

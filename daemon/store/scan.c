@@ -619,8 +619,8 @@ int store_scan_delete(struct store *store, struct stored_scan *scan, struct erro
 		return store_end(store, code, err);
 	}
 	code = store_end(store, catalogue_remove(store->catalogue, RECORD_SCAN, scan->id, err), err);
-	/* The scan counts as deleted from its note on: on a full disk the row goes at the next start. */
-	if (code != 0 && code != ERR_NO_SPACE)
+	/* The scan counts as deleted from its note on: its row goes at the next start, where it cannot now. */
+	if (code != 0 && code != ERR_NO_SPACE && code != ERR_AWAY)
 		return code;
 	pthread_mutex_lock(&store->scans_lock);
 	array_remove(store, scan);

@@ -675,6 +675,7 @@ static int set_aside(const struct catalogue_site *site, const char *why, struct 
 
 const struct catalogue_backend catalogue_sqlite = {
     .name = "sqlite",
+    .file = "catalogue.sqlite",
     .dialect = {.integer = "INTEGER",
 		.real = "REAL",
 		.text = "TEXT",

@@ -121,11 +121,23 @@ static bool make_room(void *context)
 	return store_reserve_spend(context);
 }
 
-static int open_store(const char *directory, const struct store_hooks *hooks, bool rebuild, struct store **ret_store,
+static struct catalogue_place place_of(const char *directory, const struct store_options *hooks)
+{
+	struct catalogue_place place = {directory, "sqlite", 5};
+
+	if (hooks != NULL && hooks->catalogue != NULL)
+		place.address = hooks->catalogue;
+	if (hooks != NULL && hooks->catalogue_timeout > 0)
+		place.timeout = hooks->catalogue_timeout;
+	return place;
+}
+
+static int open_store(const char *directory, const struct store_options *hooks, bool rebuild, struct store **ret_store,
 		      struct error *err)
 {
 	struct store *store = calloc(1, sizeof(*store));
 	struct catalogue_hooks own = {.context = store, .failed = on_failure, .make_room = make_room};
+	struct catalogue_place place = place_of(directory, hooks);
 	int code;
 
 	if (store == NULL)
@@ -142,11 +154,12 @@ static int open_store(const char *directory, const struct store_hooks *hooks, bo
 	lock_init(&store->insertion_lock, LOCK_INSERTION);
 	lock_init(&store->scans_lock, LOCK_SCANS);
 	lock_init(&store->check_lock, LOCK_CHECKS);
+	lock_init(&store->undone_lock, LOCK_UNDONE);
 	pthread_cond_init(&store->check_due, NULL);
 	watch_list_init(&store->arrivals);
 	code = verified_new(&store->verified, err);
 	if (code == 0)
-		code = catalogue_new(directory, &own, &store->catalogue, err);
+		code = catalogue_new(&place, &own, &store->catalogue, err);
 	if (code == 0)
 		code = open_catalogue(store, rebuild, err);
 	if (code != 0) {
@@ -158,12 +171,13 @@ static int open_store(const char *directory, const struct store_hooks *hooks, bo
 	return 0;
 }
 
-int store_open(const char *directory, const struct store_hooks *hooks, struct store **ret_store, struct error *err)
+int store_open(const char *directory, const struct store_options *hooks, struct store **ret_store, struct error *err)
 {
 	return open_store(directory, hooks, false, ret_store, err);
 }
 
-int store_rebuild(const char *directory, struct store_repairs *ret, struct error *err)
+int store_rebuild(const char *directory, const struct store_options *hooks, struct store_repairs *ret,
+		  struct error *err)
 {
 	struct store *store = NULL;
 	char scans[1024];
@@ -172,7 +186,7 @@ int store_rebuild(const char *directory, struct store_repairs *ret, struct error
 	/* A path with a typing error would be made, with an empty catalogue. */
 	if (snprintf(scans, sizeof(scans), "%s/scans", directory) < (int)sizeof(scans) && access(scans, F_OK) != 0)
 		return error_set_errno(err, errno, "%s is no state directory: %s", directory, scans);
-	code = open_store(directory, NULL, true, &store, err);
+	code = open_store(directory, hooks, true, &store, err);
 	if (code == 0)
 		*ret = store->repairs;
 	store_close(store);
@@ -281,6 +295,8 @@ void store_close(struct store *store)
 	verified_free(store->verified);
 	pthread_cond_destroy(&store->check_due);
 	pthread_mutex_destroy(&store->check_lock);
+	pthread_mutex_destroy(&store->undone_lock);
+	free(store->undone);
 	pthread_mutex_destroy(&store->scans_lock);
 	pthread_mutex_destroy(&store->insertion_lock);
 	if (store->lock_file >= 0)
@@ -298,7 +314,19 @@ static int begin(struct store *store, bool synced, struct error *err)
 		code = error_set(err, ERR_IO, "the catalogue has failed before; nothing more is stored");
 		catalogue_end(store->catalogue, code, err);
 	}
+	if (code == 0)
+		record_undo_rest(store);
 	return code;
+}
+
+int store_check_catalogue(const char *address, struct error *err)
+{
+	return catalogue_check_address(address, err);
+}
+
+bool store_away(const struct store *store)
+{
+	return catalogue_away(store->catalogue);
 }
 
 int store_begin(struct store *store, struct error *err)
@@ -348,6 +376,8 @@ void store_statistics(struct store *store, struct store_statistics *ret)
 	    .projections_stored = atomic_load(&store->projections_stored),
 	    .commits = atomic_load(&store->commits),
 	    .commit_seconds = (double)atomic_load(&store->commit_microseconds) * 1e-6,
+	    .engine = catalogue_engine(store->catalogue),
+	    .engine_losses = catalogue_losses(store->catalogue),
 	};
 	pthread_mutex_lock(&store->scans_lock);
 	ret->scans = store->scan_count;

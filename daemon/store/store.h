@@ -22,7 +22,8 @@
  *   STATE/deleted           ids that clients have deleted (store/deleted.h)
  *   STATE/calibrations/     of another room (daemon/calibrations/calibrations.h)
  *   STATE/quarantine/       files that were found and belong nowhere (store/quarantine.h)
- *   STATE/catalogue.sqlite  scans, projections, jobs, volumes, history, warnings, events
+ *   STATE/catalogue.sqlite  scans, projections, jobs, volumes, history, warnings, events; or, in its place,
+ *   STATE/catalogue.postgresql  the name of the schema of a PostgreSQL database that has them
  *   STATE/scans/ID/         scan.json projections.raw flat.f32 dark.f32 defects.u8 (proto/scan_directory.h)
  *                           projections.sums (proto/sums.h)
  *   STATE/jobs/ID/          NAME.nii, checkpoint.f32, annotations.json
@@ -46,19 +47,23 @@
  * A commit or sync that fails for any other reason than a full disk is final:
  * hooks.failed is called (once, in the thread of the failure), every later
  * writing call returns ERR_IO, and the process should end without acknowledging
- * anything more. A full disk is ERR_NO_SPACE, changes nothing, and may pass.
+ * anything more. A full disk is ERR_NO_SPACE, changes nothing, and may pass. So does ERR_AWAY: the catalogue is
+ * another server's, which cannot be reached just now.
  */
 struct store;
 struct stored_scan; /* counted references */
 
-struct store_hooks {
+struct store_options {
 	void *context;
+	/* Where the catalogue is: "sqlite", in STATE, or "postgresql://...". NULL: sqlite. Copied. */
+	const char *catalogue;
+	double catalogue_timeout; /* s until its server counts as away; 0: 5 */
 	/* Optional. Must not call into the store. */
 	void (*failed)(void *context, const char *what);
 };
 
 /* Makes STATE where it is missing. ERR_CONFLICT: another process has it. hooks may be NULL, else are copied. */
-int store_open(const char *directory, const struct store_hooks *hooks, struct store **ret_store, struct error *err);
+int store_open(const char *directory, const struct store_options *hooks, struct store **ret_store, struct error *err);
 void store_close(struct store *store); /* NULL is fine; all references must be back */
 /* The path that was given to store_open; lives as long as the store. */
 const char *store_directory(const struct store *store);
@@ -92,13 +97,21 @@ void store_repairs(const struct store *store, struct store_repairs *ret);
  * Moves the catalogue of a state directory that no daemon uses to quarantine/ and makes it again, with what is whole in
  * quarantine/ put back to its place.
  */
-int store_rebuild(const char *directory, struct store_repairs *ret, struct error *err);
+int store_rebuild(const char *directory, const struct store_options *hooks, struct store_repairs *ret,
+		  struct error *err);
+
+/* ERR_INVALID: no database is called so, or this cbctd was built without what it needs. */
+int store_check_catalogue(const char *address, struct error *err);
+/* The server of the catalogue cannot be reached: calls return ERR_AWAY until it can. Any thread. */
+bool store_away(const struct store *store);
 
 struct store_statistics {
 	long scans;
 	unsigned long long projections_stored; /* since the start */
 	unsigned long long commits;
-	double commit_seconds; /* sum */
+	double commit_seconds;       /* sum */
+	const char *engine;          /* of the catalogue, constant: "sqlite" */
+	unsigned long engine_losses; /* connections with it that were lost */
 };
 void store_statistics(struct store *store, struct store_statistics *ret);
 

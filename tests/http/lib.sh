@@ -15,12 +15,13 @@ rm -rf "$work"
 mkdir -p "$work"
 
 # start_daemon [OPTION ...]: sets $url; the state directory is $state (kept over restarts), the port a free one or $port,
-# the program cbctd or $program.
+# the program cbctd or $program. CBCT_TEST_CATALOGUE is the --catalogue of all daemons (tests/postgresql.sh).
 state=$work/state
 start_daemon() {
 	local out=$work/cbctd.out i daemon_pid
 	: >"$out"
-	"$BUILD/${program:-cbctd}" --listen "127.0.0.1:${port:-0}" --state-dir "$state" --backend "$BACKEND" "$@" >"$out" 2>>"$work/cbctd.err" &
+	"$BUILD/${program:-cbctd}" --listen "127.0.0.1:${port:-0}" --state-dir "$state" --backend "$BACKEND" \
+		${CBCT_TEST_CATALOGUE:+--catalogue "$CBCT_TEST_CATALOGUE"} "$@" >"$out" 2>>"$work/cbctd.err" &
 	daemon_pid=$!
 	echo "$daemon_pid" >"$work/daemon.pid"
 	for ((i = 0; i < 300; i++)); do
@@ -63,6 +64,9 @@ fail() {
 skip() {
 	echo "$*" >"$work/skip"
 	exit 77
+}
+need_sqlite() { # where CBCT_TEST_CATALOGUE says another one
+	[ -z "${CBCT_TEST_CATALOGUE:-}" ] || skip "it is about SQLite's own file"
 }
 need_data() {
 	local name

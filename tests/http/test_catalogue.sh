@@ -48,6 +48,7 @@ expect_ready() { # WHAT the second line of /readyz begins with
 }
 
 test_a_lost_catalogue_is_made_again_and_told() {
+	need_sqlite
 	made
 	stop_daemon KILL
 	rm "$state"/catalogue.sqlite*
@@ -68,6 +69,7 @@ test_a_lost_catalogue_is_made_again_and_told() {
 }
 
 test_an_older_catalogue_loses_nothing_and_brings_nothing_back() {
+	need_sqlite
 	local older scan_gone
 	made
 	scan_gone=$scan older=$job
@@ -178,6 +180,7 @@ test_what_is_put_back_after_a_deletion_is_kept() {
 }
 
 test_a_damaged_catalogue_is_set_aside_and_made_again() {
+	need_sqlite
 	made
 	stop_daemon
 	# one bit of each page but the first
@@ -198,6 +201,7 @@ test_a_damaged_catalogue_is_set_aside_and_made_again() {
 
 # Under a running daemon: what it answers names the damage, and it ends; the next one has everything again.
 test_damage_of_the_log_is_named_in_the_reply() {
+	need_sqlite
 	local file
 	made
 	stop_daemon
@@ -236,6 +240,7 @@ test_the_catalogue_is_made_again_when_asked() {
 }
 
 test_what_nobody_knows_is_kept_and_comes_back_once_it_is_whole() {
+	need_sqlite
 	made
 	stop_daemon
 	cp "$state/scans/$scan/record.json" "$work/record"

@@ -363,6 +363,7 @@ test_a_damaged_image_is_told_and_can_be_sent_again() {
 }
 
 test_what_the_catalogue_lost_is_found_beside_the_data() {
+	need_sqlite
 	counts
 	start_daemon
 	post_scan "$counts_dir"

@@ -155,6 +155,7 @@ test_who_was_removed_is_nowhere_on_the_disk() {
 }
 
 test_who_the_patient_is_stays_with_the_scan_and_its_jobs() {
+	need_sqlite
 	local who='{"name": "Quarx^J\u00f6rg", "id": "ID-8315", "birth_date": "1970-02-28", "sex": "M"}' other='{"position": "FFS", "name": "Zwolle^Anna"}'
 	local study='{"uid": "1.2.3.4", "accession_number": "ACC-4711", "referring_physician": "House^G"}' first document='{"detector": {"columns": 4, "rows": 3, "pixel_mm": [1, 1]},
 		"projections": {"count": 2, "sample": "float32", "quantity": "line_integral"}, "geometry": {"kind": "circular", "source_to_isocentre_mm": 600, "source_to_detector_mm": 1000, "angle_step_deg": 180}}'

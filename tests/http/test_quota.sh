@@ -309,6 +309,7 @@ test_a_scan_that_the_disk_has_damaged_stays() {
 }
 
 test_what_is_old_goes_unless_it_is_pinned() {
+	need_sqlite
 	local old pinned complete open announced unfinished cancelled # its scan is pinned with it
 	limited --keep 4
 	new_scan 201 && complete=$scan

@@ -217,6 +217,7 @@ recorded() {
 }
 
 test_a_job_goes_on_from_the_other_checkpoint_where_one_is_damaged_or_not_recorded() {
+	need_sqlite
 	local at kind name recipe
 	recipe="{\"scan\": \"SCAN\", $grid, \"sart\": {\"iterations\": $long, \"subsets\": \"views\"}}"
 	start_daemon --checkpoint-seconds 0.3

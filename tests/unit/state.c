@@ -22,12 +22,31 @@ static void count_failure(void *context, const char *what)
 	state->failures++;
 }
 
+struct store_options state_options(struct state *state)
+{
+	return (struct store_options){
+	    .context = state, .failed = count_failure, .catalogue = getenv("CBCT_TEST_CATALOGUE")};
+}
+
+const char *state_catalogue(void)
+{
+	return getenv("CBCT_TEST_CATALOGUE") == NULL ? "catalogue.sqlite" : "catalogue.postgresql";
+}
+
+bool state_skips(const char *test)
+{
+	if (getenv("CBCT_TEST_CATALOGUE") == NULL)
+		return false;
+	printf("SKIP unit %s: it is about SQLite's own files\n", test);
+	return true;
+}
+
 static void open_again(struct state *state)
 {
-	const struct store_hooks hooks = {.context = state, .failed = count_failure};
+	const struct store_options options = state_options(state);
 	struct error err = {0};
 
-	ck_assert_msg(store_open(state->directory, &hooks, &state->store, &err) == 0, "%s", err.text);
+	ck_assert_msg(store_open(state->directory, &options, &state->store, &err) == 0, "%s", err.text);
 	ck_assert_msg(jobs_open(state->store, &state->jobs, &err) == 0, "%s", err.text);
 }
 

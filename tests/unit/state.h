@@ -13,10 +13,22 @@ struct state {
 	int turns;    /* projections that state_put has stored */
 };
 
+/* The catalogue is in SQLite, or where CBCT_TEST_CATALOGUE says. */
+struct store_options state_options(struct state *state);
 void state_open(struct state *state);   /* a new directory */
 void state_close(struct state *state);  /* as if the daemon had died: nothing is finished, the directory stays */
 void state_reopen(struct state *state); /* close, and open the same directory */
 void state_remove(struct state *state); /* close, and the directory goes */
+
+/* The catalogue's file in the directory: without it the catalogue is lost. */
+const char *state_catalogue(void);
+/* What is about SQLite's own files is skipped, aloud, where the catalogue is another database's. */
+bool state_skips(const char *test);
+#define OF_SQLITE()                                                                                                    \
+	do {                                                                                                           \
+		if (state_skips(__func__))                                                                             \
+			return;                                                                                        \
+	} while (0)
 
 /* Path of a file below the directory, in a buffer that the next call uses again. */
 const char *state_path(const struct state *state, const char *format, ...) __attribute__((format(printf, 2, 3)));

@@ -215,9 +215,9 @@ START_TEST(a_catalogue_that_is_lost_is_made_again)
 
 	state_close(&state);
 	if (_i == 0)
-		ck_assert_int_eq(unlink(state_path(&state, "catalogue.sqlite")), 0);
+		ck_assert_int_eq(unlink(state_path(&state, "%s", state_catalogue())), 0);
 	else
-		ck_assert_int_eq(truncate(state_path(&state, "catalogue.sqlite"), 0), 0);
+		ck_assert_int_eq(truncate(state_path(&state, "%s", state_catalogue()), 0), 0);
 	state_reopen(&state);
 	store_repairs(state.store, &repairs);
 	ck_assert_int_eq(repairs.found[0], 1);
@@ -232,7 +232,7 @@ START_TEST(numbers_of_events_are_not_used_again)
 	long long before = store_last_event(state.store);
 
 	state_close(&state);
-	ck_assert_int_eq(unlink(state_path(&state, "catalogue.sqlite")), 0);
+	ck_assert_int_eq(unlink(state_path(&state, "%s", state_catalogue())), 0);
 	state_reopen(&state);
 	ck_assert(store_last_event(state.store) > before);
 }
@@ -240,6 +240,7 @@ END_TEST
 
 START_TEST(an_older_catalogue_put_back_takes_nothing)
 {
+	OF_SQLITE();
 	struct stored_scan *scan = NULL;
 	struct error err = {0};
 	struct job *job;
@@ -267,6 +268,7 @@ END_TEST
 
 START_TEST(what_was_deleted_does_not_come_back)
 {
+	OF_SQLITE();
 	struct stored_scan *scan = state_scan(&state, 3, false);
 	struct error err = {0};
 	struct job *job = NULL;
@@ -307,6 +309,7 @@ END_TEST
 /* Every part of every page: one bit at a time. */
 START_TEST(a_flipped_bit_in_the_catalogue_is_found)
 {
+	OF_SQLITE();
 	enum { TRIES = 24 };
 	char *before = picture();
 	off_t size;
@@ -324,6 +327,7 @@ END_TEST
 
 START_TEST(a_catalogue_that_is_cut_off_is_made_again)
 {
+	OF_SQLITE();
 	char *before = picture();
 
 	for (int i = 1; i < 5; i++) {
@@ -339,6 +343,7 @@ END_TEST
 /* As a process that was killed leaves it: the log is there. */
 START_TEST(a_damaged_log_takes_nothing)
 {
+	OF_SQLITE();
 	char *before = picture();
 	off_t size = size_of("catalogue.sqlite-wal");
 
@@ -364,6 +369,7 @@ END_TEST
 
 START_TEST(damage_while_it_is_open_is_found)
 {
+	OF_SQLITE();
 	struct history_row *rows;
 	struct error err = {0};
 	int count;
@@ -397,7 +403,7 @@ START_TEST(a_record_that_is_lost_is_written_again)
 	state_reopen(&state);
 	ck_assert_int_gt(size_of(name), 1000);
 	state_close(&state);
-	ck_assert_int_eq(unlink(state_path(&state, "catalogue.sqlite")), 0);
+	ck_assert_int_eq(unlink(state_path(&state, "%s", state_catalogue())), 0);
 	state_reopen(&state);
 	same_picture(before);
 }
@@ -405,6 +411,7 @@ END_TEST
 
 START_TEST(what_nobody_knows_is_set_aside_and_can_come_back)
 {
+	const struct store_options options = state_options(&state);
 	char *before = picture(), name[128];
 	struct store_repairs repairs;
 	struct error err = {0};
@@ -413,7 +420,7 @@ START_TEST(what_nobody_knows_is_set_aside_and_can_come_back)
 	state_close(&state);
 	copy_file(name, "kept");
 	flip(name, 100, 2);
-	ck_assert_int_eq(unlink(state_path(&state, "catalogue.sqlite")), 0);
+	ck_assert_int_eq(unlink(state_path(&state, "%s", state_catalogue())), 0);
 	state_reopen(&state);
 	ck_assert(!path_exists(state_path(&state, "scans/%s", scan_id)));
 	ck_assert_int_eq(quarantined(), 2); /* that it was lost, and the scan */
@@ -432,7 +439,7 @@ START_TEST(what_nobody_knows_is_set_aside_and_can_come_back)
 		}
 		free(entries);
 	}
-	ck_assert_msg(store_rebuild(state.directory, &repairs, &err) == 0, "%s", err.text);
+	ck_assert_msg(store_rebuild(state.directory, &options, &repairs, &err) == 0, "%s", err.text);
 	ck_assert_int_eq(repairs.found[0], 1);
 	ck_assert_int_eq(repairs.found[1], 2);
 	state_reopen(&state);
@@ -442,6 +449,7 @@ END_TEST
 
 START_TEST(nobody_else_reads_the_catalogue)
 {
+	OF_SQLITE();
 	struct stat status;
 
 	ck_assert_int_eq(stat(state_path(&state, "catalogue.sqlite"), &status), 0);
@@ -500,6 +508,7 @@ static void make_plain(const char *path)
 /* One of a cbctd before there were checksums and records. */
 START_TEST(a_catalogue_of_an_earlier_version_is_taken_over)
 {
+	OF_SQLITE();
 	char *before = picture(), path[1024];
 	enum pages_kind kind;
 	struct error err = {0};

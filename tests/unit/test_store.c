@@ -254,7 +254,7 @@ START_TEST(a_lost_catalogue_does_not_take_the_scans_with_it)
 	memcpy(id, stored_scan_id(scan), sizeof(id));
 	stored_scan_release(scan);
 	state_close(&state);
-	ck_assert_int_eq(unlink(state_path(&state, "catalogue.sqlite")), 0);
+	ck_assert_int_eq(unlink(state_path(&state, "%s", state_catalogue())), 0);
 	state_reopen(&state);
 	ck_assert(path_exists(state_path(&state, "scans/%s/projections.raw", id)));
 }
@@ -495,6 +495,7 @@ END_TEST
 
 START_TEST(what_an_earlier_version_stored_is_checked_against_the_catalogue)
 {
+	OF_SQLITE();
 	struct stored_scan *scan = state_scan(&state, 4, true);
 	float pixels[12] = {3};
 	struct error err = {0};
@@ -539,6 +540,7 @@ END_TEST
 /* No file may grow: the log of the catalogue cannot take a commit. */
 START_TEST(a_failed_commit_is_final_and_nothing_is_acknowledged)
 {
+	OF_SQLITE();
 	struct stored_scan *scan = state_scan(&state, 3, false);
 	struct received_projection late = {.scan = scan, .index = 1};
 	struct rlimit limit, small;
@@ -614,6 +616,7 @@ END_TEST
 
 START_TEST(what_was_acknowledged_is_found_again_beside_its_data)
 {
+	OF_SQLITE();
 	struct stored_scan *scan = state_scan(&state, 10, true);
 	float pixels[12] = {3};
 	struct error err = {0};
