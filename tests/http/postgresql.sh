@@ -41,7 +41,7 @@ start_server() {
 # All of its processes, the server's first.
 server_processes() {
 	echo "$pg_pid"
-	pgrep -P "$pg_pid"
+	pgrep -P "$pg_pid" || true
 }
 kill_server() { # at once, all of it
 	local all
@@ -51,8 +51,8 @@ kill_server() { # at once, all of it
 }
 stop_postgresql() {
 	[ -n "${pg_folder:-}" ] || return 0
-	kill -CONT $(server_processes) 2>/dev/null
-	"${as_server[@]}" "$pg_programs/pg_ctl" -D "$pg_folder/server/data" -m immediate stop >/dev/null 2>&1
+	kill -CONT $(server_processes) 2>/dev/null || true
+	"${as_server[@]}" "$pg_programs/pg_ctl" -D "$pg_folder/server/data" -m immediate stop >/dev/null 2>&1 || true
 	rm -rf "$pg_folder"
 	pg_folder=
 }
