@@ -25,16 +25,41 @@ enum { SERVER_LEAST = 120000 };
  * libpq, loaded when a catalogue is in PostgreSQL: a daemon that keeps its own pays nothing for it, and its package
  * does not depend on it.
  */
-#define FUNCTIONS(X)                                                                                                   \
-	X(PQbackendPID)                                                                                                \
-	X(PQclear)                                                                                                     \
-	X(PQcmdStatus)                                                                                                 \
-	X(PQconnectdbParams) X(PQconninfoFree) X(PQconninfoParse) X(PQconsumeInput) X(PQerrorMessage)                  \
-	    X(PQescapeLiteral) X(PQfinish) X(PQflush) X(PQfreemem) X(PQftype) X(PQgetResult) X(PQgetisnull)            \
-		X(PQgetlength) X(PQgetvalue) X(PQisBusy) X(PQnfields) X(PQntuples) X(PQparameterStatus)                \
-		    X(PQresultErrorField) X(PQresultStatus) X(PQsendPrepare) X(PQsendQuery) X(PQsendQueryParams)       \
-			X(PQsendQueryPrepared) X(PQserverVersion) X(PQsetNoticeReceiver) X(PQsetnonblocking)           \
-			    X(PQsocket) X(PQstatus)
+/* clang-format off */
+#define FUNCTIONS(X) \
+	X(PQbackendPID) \
+	X(PQclear) \
+	X(PQcmdStatus) \
+	X(PQconnectdbParams) \
+	X(PQconninfoFree) \
+	X(PQconninfoParse) \
+	X(PQconsumeInput) \
+	X(PQerrorMessage) \
+	X(PQescapeLiteral) \
+	X(PQfinish) \
+	X(PQflush) \
+	X(PQfreemem) \
+	X(PQftype) \
+	X(PQgetResult) \
+	X(PQgetisnull) \
+	X(PQgetlength) \
+	X(PQgetvalue) \
+	X(PQisBusy) \
+	X(PQnfields) \
+	X(PQntuples) \
+	X(PQparameterStatus) \
+	X(PQresultErrorField) \
+	X(PQresultStatus) \
+	X(PQsendPrepare) \
+	X(PQsendQuery) \
+	X(PQsendQueryParams) \
+	X(PQsendQueryPrepared) \
+	X(PQserverVersion) \
+	X(PQsetNoticeReceiver) \
+	X(PQsetnonblocking) \
+	X(PQsocket) \
+	X(PQstatus)
+/* clang-format on */
 static struct {
 #define MEMBER(name) __typeof__(name) *name;
 	FUNCTIONS(MEMBER)
