@@ -6,6 +6,7 @@
 #include <fcntl.h>
 #include <math.h>
 #include <stdlib.h>
+#include <string.h>
 #include <sys/stat.h>
 #include <unistd.h>
 
@@ -143,5 +144,80 @@ static int npy_open(struct image_file *file, const char *path, const struct imag
 	return code;
 }
 
+/* Heimann's header, version 100: 68 bytes, then another one whose length stands there; 16-bit counts. */
+static bool his_recognise(const unsigned char *head, size_t length)
+{
+	static const unsigned char mark[] = {0, 0x70, 68, 0};
+
+	return length >= 68 && memcmp(head, mark, sizeof(mark)) == 0;
+}
+
+static int his_open(struct image_file *file, const char *path, const struct image_options *options, struct error *err)
+{
+	enum { HEAD = 68, COUNTS = 4 /* type of numbers */ };
+	unsigned char head[HEAD];
+	uint16_t word[HEAD / 2];
+	struct plain *plain;
+	size_t length = 0, expected;
+	int code = plain_new(file, path, &length, err);
+
+	(void)options;
+	if (code != 0)
+		return code;
+	plain = file->state;
+	code = file_read_at(plain->file, head, sizeof(head), 0, path, err);
+	if (code != 0)
+		return code;
+	for (size_t i = 0; i < HEAD / 2; i++)
+		word[i] = (uint16_t)(head[2 * i] | head[2 * i + 1] << 8);
+	/* The corners are pixels that the image has; those of columns come as y. */
+	file->rows = word[8] - word[6] + 1;
+	file->columns = word[9] - word[7] + 1;
+	file->count = word[10];
+	file->type = PIXEL_UINT16;
+	if (word[16] != COUNTS)
+		return error_set(err, ERR_INVALID, "numbers of type %d, %d (16-bit counts) is expected", word[16],
+				 COUNTS);
+	if (file->columns < 1 || file->rows < 1)
+		return error_set(err, ERR_INVALID, "an image of %d x %d pixels", file->columns, file->rows);
+	plain->start = HEAD + (size_t)word[5];
+	code = plain_room(file, err);
+	expected = plain->start + (size_t)file->count * plain->bytes;
+	if (code == 0 && length < expected)
+		code = error_set(err, ERR_INVALID, "%zu bytes, %zu are expected", length, expected);
+	return code;
+}
+
+/* ---- formats that are known and not read ---- */
+
+static int refuse_open(struct image_file *file, const char *path, const struct image_options *options,
+		       struct error *err)
+{
+	(void)path;
+	(void)options;
+	return error_set(err, ERR_IMPOSSIBLE, "%s: it is not read; projections as TIFF, MetaImage, NumPy or raw are",
+			 file->format->name);
+}
+
+static bool hdf5_recognise(const unsigned char *head, size_t length)
+{
+	return length >= 8 && memcmp(head, "\211HDF\r\n\032\n", 8) == 0;
+}
+
+static bool compound_recognise(const unsigned char *head, size_t length)
+{
+	return length >= 8 && memcmp(head, "\320\317\021\340\241\261\032\341", 8) == 0;
+}
+
+static bool xtekct_recognise(const unsigned char *head, size_t length)
+{
+	return length >= 8 && memcmp(head, "[XTekCT]", 8) == 0;
+}
+
 const struct image_format image_raw = {"raw", NULL, raw_open, plain_read, plain_close};
 const struct image_format image_npy = {"NumPy", npy_recognise, npy_open, plain_read, plain_close};
+const struct image_format image_his = {"Heimann .his", his_recognise, his_open, plain_read, plain_close};
+const struct image_format image_hdf5 = {"HDF5 (NeXus)", hdf5_recognise, refuse_open, plain_read, plain_close};
+const struct image_format image_compound = {"a compound file (Zeiss .txrm)", compound_recognise, refuse_open,
+					    plain_read, plain_close};
+const struct image_format image_xtekct = {"Nikon .xtekct", xtekct_recognise, refuse_open, plain_read, plain_close};

@@ -33,12 +33,15 @@ const struct option image_option_rows[] = {
      "mirror each image from left to right", 0, 0, 0, NULL},
     {"flip-rows", 0, OPTION_FLAG, offsetof(struct image_options, flip_rows), NULL,
      "mirror each image from top to bottom: for files whose first row is the highest", 0, 0, 0, NULL},
+    {"inverted", 0, OPTION_FLAG, offsetof(struct image_options, inverted), NULL,
+     "pixels of 8 or 16 bits that fall with the beam, as Elekta's .his: 255 or 65535 less each", 0, 0, 0, NULL},
     {0},
 };
 
 /* Raw is the last: nothing tells it. */
-static const struct image_format *const formats[] = {&image_metaimage, &image_tiff, &image_npy, &image_dicom,
-						     &image_raw};
+static const struct image_format *const formats[] = {&image_metaimage, &image_tiff,   &image_npy, &image_dicom,
+						     &image_his,       &image_hnd,    &image_xim, &image_hdf5,
+						     &image_compound,  &image_xtekct, &image_raw};
 enum { FORMAT_COUNT = sizeof(formats) / sizeof(formats[0]), FORMAT_RAW = FORMAT_COUNT - 1 };
 
 struct entry {
@@ -415,6 +418,19 @@ static void mirror(const struct images *images, float *pixels)
 				swap(pixels + r * columns + c, pixels + r * columns + columns - 1 - c, 1);
 }
 
+static int invert(const struct images *images, float *pixels, struct error *err)
+{
+	const size_t count = (size_t)images->columns * (size_t)images->rows;
+	const float most = images->type == PIXEL_UINT8 ? 255.0f : 65535.0f;
+
+	if (images->type != PIXEL_UINT8 && images->type != PIXEL_UINT16)
+		return error_set(err, ERR_USAGE, "--inverted is about uint8 and uint16, these are %s",
+				 pixel_type_names[images->type]);
+	for (size_t i = 0; i < count; i++)
+		pixels[i] = most - pixels[i];
+	return 0;
+}
+
 int images_read(struct images *images, int index, float *ret_pixels, struct error *err)
 {
 	struct images_files *files = images->files;
@@ -430,6 +446,8 @@ int images_read(struct images *images, int index, float *ret_pixels, struct erro
 		code = files->open.format->read(&files->open, index - files->entries[entry].first, ret_pixels, err);
 	if (code != 0)
 		return about(files->entries[entry].path, code, err);
+	if (files->options->inverted)
+		code = invert(images, ret_pixels, err);
 	mirror(images, ret_pixels);
-	return 0;
+	return code;
 }

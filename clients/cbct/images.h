@@ -23,6 +23,7 @@ struct image_options {
 	bool big_endian;              /* raw files */
 	long header;                  /* bytes before the first image of a raw file */
 	bool flip_columns, flip_rows; /* mirror each image */
+	bool inverted;                /* pixels fall with the beam */
 };
 extern const struct option image_option_rows[];
 #define IMAGE_OPTIONS_DEFAULTS                                                                                         \
@@ -61,7 +62,10 @@ struct image_format {
 	int (*read)(struct image_file *file, int index, float *ret_pixels, struct error *err);
 	void (*close)(struct image_file *file); /* frees state, which may be NULL */
 };
-extern const struct image_format image_metaimage, image_tiff, image_npy, image_dicom, image_raw;
+extern const struct image_format image_metaimage, image_tiff, image_npy, image_dicom, image_his, image_hnd, image_xim,
+    image_raw;
+/* Those that are named and not read. */
+extern const struct image_format image_hdf5, image_compound, image_xtekct;
 enum { IMAGE_HEAD = 256 }; /* bytes that recognise gets */
 
 struct images {

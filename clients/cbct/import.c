@@ -40,7 +40,9 @@ static const struct option_group groups[] = {
     {"output", output_rows, 0},
     {"", upload_rows, offsetof(struct import_options, upload)},
     {"", http_option_rows, offsetof(struct import_options, upload.http)},
-    {"images: MetaImage (.mha, .mhd), TIFF, NumPy (.npy), DICOM XA and Enhanced XA (through DCMTK's programs), raw",
+    {"images: MetaImage (.mha, .mhd), TIFF, NumPy (.npy), DICOM XA and Enhanced XA (through DCMTK's programs), Heimann "
+     ".his, "
+     "Varian .hnd and .xim, raw",
      image_option_rows, offsetof(struct import_options, image)},
     {"geometry: one of --rtk, --matrices, --astra, --angles, --angle-step; DICOM files have their own",
      import_geometry_rows, offsetof(struct import_options, geometry)},

@@ -1,7 +1,7 @@
 #!/usr/bin/python3
 """Projections of a scan directory in other tools' formats, written without any of the project's code.
 
-Usage: images.py mha|npy|tiff|pages|tiles|dicom|enhanced SCAN OUT [OPTION=VALUE ...]
+Usage: images.py mha|npy|tiff|pages|tiles|dicom|enhanced|his|hnd|xim SCAN OUT [OPTION=VALUE ...]
 """
 import json
 import os
@@ -213,6 +213,54 @@ def write_enhanced(document, images, out, options):
     write_dump(text, out)
 
 
+def write_his(images, out):
+    """Heimann's header of version 100, falling counts as Elekta writes them, all images in a file."""
+    count, rows, columns = images.shape
+    head = struct.pack("<HHHIHHHHHHHdH", 0x7000, 68, 100, 168 + images.nbytes, 100, 1, 1, rows, columns, count, 0, 0.1, 4)
+    with open(out, "wb") as file:
+        file.write(head.ljust(68 + 100, b"\0") + (65535 - images).astype("<u2").tobytes())
+
+
+def differences(image):
+    """Varian's: a table of lengths, the first row and a pixel as they are, then differences in 1, 2 or 4 bytes."""
+    rows, columns = image.shape
+    flat = image.astype(numpy.int64).ravel()
+    table, steps = [], flat[:columns + 1].astype("<i4").tobytes()
+    for i in range(columns + 1, rows * columns):
+        step = int(flat[i] - flat[i - 1] - flat[i - columns] + flat[i - columns - 1])
+        kind = 0 if -128 <= step < 128 else 1 if -32768 <= step < 32768 else 2
+        table.append(kind)
+        steps += step.to_bytes(1 << kind, "little", signed=True)
+    table += [0] * (-len(table) % 4)
+    packed = bytes(a | b << 2 | c << 4 | d << 6 for a, b, c, d in zip(*[iter(table)] * 4))
+    # A table of the size that the pixels would have with one more.
+    return packed.ljust(((rows - 1) * columns + 3) // 4, b"\0"), steps
+
+
+def write_varian(document, images, out, kind):
+    """A file for each image. .xim: every other one is not compressed."""
+    pitch = document["detector"]["pixel_mm"]
+    os.makedirs(out, exist_ok=True)
+    for k, image in enumerate(images):
+        rows, columns = image.shape
+        table, steps = differences(image)
+        if kind == "hnd":
+            head = b"VARIAN_VA_INTERNAL_1.0".ljust(120, b"\0") + struct.pack("<II", columns, rows)
+            data = (head.ljust(352, b"\0") + struct.pack("<dd", *pitch)).ljust(1024, b"\0") + table + steps
+        else:
+            data = b"VMS.XI\0\0" + struct.pack("<6i", 1, columns, rows, 32, 4, int(k % 2 == 0))
+            if k % 2 == 0:
+                data += struct.pack("<i", len(table)) + table + struct.pack("<i", len(steps)) + steps + struct.pack("<i", 4 * image.size)
+            else:
+                data += struct.pack("<i", 4 * image.size) + image.astype("<i4").tobytes()
+            data += struct.pack("<3i", 2, 5, 6) + struct.pack("<i", 4)
+            for name, value in (("KVSourceRtn", 17.5), ("PixelWidth", pitch[0] / 10), ("PixelHeight", pitch[1] / 10)):
+                data += struct.pack("<i", len(name)) + name.encode() + struct.pack("<id", 1, value)
+            data += struct.pack("<i", 4) + b"Text" + struct.pack("<ii", 2, 3) + b"abc"
+        with open(os.path.join(out, f"Proj_{k + 1:05}.{kind}"), "wb") as file:
+            file.write(data)
+
+
 def main():
     """The command line."""
     kind, scan, out = sys.argv[1:4]
@@ -232,6 +280,10 @@ def main():
         write_dicom(document, images, out, options)
     elif kind == "enhanced":
         write_enhanced(document, images, out, options)
+    elif kind == "his":
+        write_his(images, out)
+    elif kind in ("hnd", "xim"):
+        write_varian(document, images, out, kind)
     else:
         sys.exit(f"no format {kind}")
 

@@ -220,6 +220,27 @@ test_flat_and_dark_are_means() {
 		cbct import "$work/uneven/projections.raw" --size 48,32 --type uint16 --scale 1e-4 --pixel 4,3 "${circle[@]}" -o "$work/never"
 }
 
+test_images_of_linear_accelerators() {
+	local kind
+	need_numpy
+	make_scans
+	images his "$counts" "$work/all.his"
+	imports "$counts" "$work/all.his" --inverted "${circle[@]}" --pixel 4,3 --air 50000
+	for kind in hnd xim; do
+		images $kind "$counts" "$work/$kind"
+		imports "$counts" "$work/$kind" "${circle[@]}" --air 50000
+	done
+	truncate -s -9 "$work/hnd/Proj_00003.hnd"
+	refused 1 "Proj_00003.hnd: its pixels break off at 15" cbct import "$work/hnd" "${circle[@]}" --air 50000 -o "$work/never"
+	# What is known and not read is named.
+	printf '\211HDF\r\n\032\n0000' >"$work/scan.nxs"
+	refused 1 "HDF5 (NeXus): it is not read" cbct import "$work/scan.nxs" "${circle[@]}" --pixel 4,3 -o "$work/never"
+	printf '\320\317\021\340\241\261\032\341' >"$work/scan.txrm"
+	refused 1 "txrm): it is not read" cbct import "$work/scan.txrm" "${circle[@]}" --pixel 4,3 -o "$work/never"
+	printf '[XTekCT]\r\nName=x\r\n' >"$work/scan.xtekct"
+	refused 1 "Nikon .xtekct: it is not read" cbct import "$work/scan.xtekct" "${circle[@]}" --pixel 4,3 -o "$work/never"
+}
+
 # Each view's air is the mean of the first columns, which the ball does not reach: whatever the tube gave.
 test_regions_of_air_and_maps_of_defects() {
 	local here=(--size 48,32 --type uint16 --pixel 4,3 "${circle[@]}")
