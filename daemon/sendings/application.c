@@ -229,7 +229,8 @@ void application_ended(struct sendings *sendings, int transfer, const cJSON *res
 	struct worklist *worklist = &sendings->worklist;
 
 	if (transfer == TRANSFER_LISTENER) {
-		const double pause = 10; /* s before another one starts */
+		/* s before another one starts; what no attempt would change is not told all day. */
+		const double pause = cJSON_IsTrue(cJSON_GetObjectItemCaseSensitive(result, "permanent")) ? 3600 : 10;
 
 		if (!sendings->stop && !sendings->listener_stale)
 			log_line(LEVEL_ERROR, "the process that listens for DICOM associations ended: %s",

@@ -194,7 +194,9 @@ void sendings_reload(struct sendings *sendings)
 	sendings->destination_count = count;
 	old_application = sendings->application;
 	sendings->application = application;
-	sendings->listener_stale = true;
+	/* Associations that go on are not broken off for another's change. */
+	if (!cJSON_Compare(old_application.listen, application.listen, true))
+		sendings->listener_stale = true;
 	/* What was changed may be the reason why something could not be sent. */
 	for (int i = 0; i < sendings->count; i++)
 		sendings->entries[i].record.next = 0;
