@@ -32,11 +32,16 @@ struct problem {
 };
 
 /* When automatic iterations end (core/recon/stopping.h). */
+#define STOP_NOISE_MIDDLE 0.008
 struct stop_limits {
-	/* The volume has changed by less than `change`, and so much of the projections' relative noise, of its norm. */
-	double change, change_of_noise;
-	double fall; /* the residual has fallen by less than this share of it; 0: it does not count */
-	int least;   /* iterations at least */
+	/*
+	 * The volume has changed by less than this share of its norm, at STOP_NOISE_MIDDLE of relative noise in the
+	 * projections. Where there is less noise the limit goes with its power -quiet, where more, with its power loud.
+	 */
+	double change, quiet, loud;
+	double change_most; /* 0: the limit has no most */
+	double fall;        /* the residual has fallen by less than this share of it; 0: it does not count */
+	int least;          /* iterations at least */
 };
 
 struct algorithm {

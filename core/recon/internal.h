@@ -76,7 +76,7 @@ static inline double iteration_work(const struct recipe *recipe)
 static inline int iterations_left(const struct recipe *recipe, int iteration)
 {
 	const int most = recipe_iterations(recipe) - iteration;
-	const struct stop_limits limits = stopping_limits(recipe, false);
+	const struct stop_limits limits = stopping_limits(recipe);
 	const int usual = limits.least > STOPPING_TYPICAL ? limits.least : STOPPING_TYPICAL;
 	const int typical = iteration < usual ? usual - iteration : 1;
 

@@ -28,9 +28,8 @@ struct projection_squares {
 	double noise; /* the part of it that noise has */
 };
 /*
- * Looks at every view, or at about 32 of them; rays that are left out do not count. The noise is that of second
- * differences along pieces of rows, between every second pixel, since a detector's blur makes neighbours alike: their
- * median in a piece is that of noise, where edges and thin objects are in less than half of it.
+ * Looks at every view, or at about 32 of them, and at 256 rows; rays that are left out do not count. The noise is found
+ * beside the object (core/recon/projection_noise.c), mean over the rays. All is 0 where there is nothing to look at.
  */
 int noise_of_projections(const struct backend *backend, struct stack *projections, const struct geometry *geometry,
 			 struct projection_squares *ret_squares, struct error *err);

@@ -9,11 +9,16 @@
  * slices do not show enough for it. Pure; the same voxels give the same bits.
  */
 struct volume_quality {
-	/* Standard deviation of what is noise in homogeneous parts of the object, HU (core/recon/noise.h). */
+	/*
+	 * Standard deviation of what is noise in homogeneous parts of the object, HU, low frequencies included: in
+	 * cubes of soft tissue away from air and bone, slices half a cube apart differ by noise alone. Of the cubes
+	 * that quarter counts whose eighths differ least in their means: TV leaves nothing in many of them and much in
+	 * few, and those with the least noise would tell too little.
+	 */
 	double noise_hu;
 	/*
-	 * The same of what is the same in neighbouring slices, HU: mixed differences within a slice have noise and
-	 * streaks, those across slices have noise alone, and what the first have more is that of streaks.
+	 * Root mean square of what slices share in the same cubes, a plane taken off, HU: the covariance of the means
+	 * of the upper and the lower slices, which has streaks in it and no noise.
 	 */
 	double streak_hu;
 	/*
@@ -24,7 +29,7 @@ struct volume_quality {
 	double ring_hu;
 	/*
 	 * Full width at half maximum of the blur across the object's surface, mm: the mean profile of surfaces that x
-	 * and y cross within 30 degrees, its quartiles taken for those of an error function.
+	 * or y crosses within 30 degrees, its quartiles taken for those of an error function.
 	 */
 	double edge_mm;
 };

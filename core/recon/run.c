@@ -411,7 +411,7 @@ static bool stops_by_itself(struct recon *recon, const struct history_row *row)
 {
 	const struct recipe *recipe = &recon->recipe;
 	const int most = recipe_iterations(recipe);
-	const struct stop_limits limits = stopping_limits(recipe, isfinite(recon->settled));
+	const struct stop_limits limits = stopping_limits(recipe);
 	const int expected = stopping_expected(&recon->stopping, &limits, row, most);
 	const enum stop_rule rule = stopping_heed(&recon->stopping, &limits, row, most);
 	const struct recon_stop stop = {.rule = rule,

@@ -8,20 +8,18 @@ const char *const stop_rule_names[STOP_RULE_COUNT] = {
     [STOP_CHANGE] = "change", [STOP_CEILING] = "ceiling",
 };
 
-/* Share of the noise, and of the change where iterations do not settle. */
-static const double NOISE_SHARE = 0.5, UNSETTLED = 0.4;
+static const double NOISE_SHARE = 0.5;
 
-struct stop_limits stopping_limits(const struct recipe *recipe, bool settles)
+/* Relative noise at which the limits of the change were chosen, and beyond which they no longer follow it. */
+static const double NOISE_LEAST = 0.0015, NOISE_MOST = 0.1;
+
+struct stop_limits stopping_limits(const struct recipe *recipe)
 {
 	const struct algorithm *algorithm = recipe->algorithm;
 	struct stop_limits limits = algorithm->stops[recipe->tv.on];
 
 	if (recipe->sart.momentum && algorithm->subsets)
 		limits = algorithm->momentum_stops[recipe->tv.on];
-	if (algorithm->subsets && !settles) {
-		limits.change *= UNSETTLED;
-		limits.change_of_noise *= UNSETTLED;
-	}
 	if (!recipe->fdk.on && limits.least < algorithm->from_zero)
 		limits.least = algorithm->from_zero;
 	return limits;
@@ -29,7 +27,10 @@ struct stop_limits stopping_limits(const struct recipe *recipe, bool settles)
 
 static double least_change(const struct stopping *stopping, const struct stop_limits *limits)
 {
-	return limits->change + limits->change_of_noise * stopping->noise;
+	const double noise = fmin(fmax(stopping->noise, NOISE_LEAST), NOISE_MOST) / STOP_NOISE_MIDDLE;
+	const double change = limits->change * (noise < 1 ? pow(noise, -limits->quiet) : pow(noise, limits->loud));
+
+	return limits->change_most > 0 ? fmin(change, limits->change_most) : change;
 }
 
 enum stop_rule stopping_heed(struct stopping *stopping, const struct stop_limits *limits, const struct history_row *row,

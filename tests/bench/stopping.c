@@ -1,8 +1,9 @@
 /*
  * How far from the best iteration `"iterations": "auto"` stops (core/recon/stopping.h): on heads, wrists, necks and
  * abdomens (tests/unit/anatomy.h), exact line integrals with Poisson noise, and on a scan directory whose truth is a
- * volume file. `make bench-stopping` builds and runs it; tests/bench/results/algorithms.txt has what it printed. With
- * DIR TRUTH as arguments: that scan. The first argument --rows prints every row of every history in place of the table.
+ * volume file. `make bench-stopping` builds and runs it; tests/bench/results/algorithms.txt has what it printed of
+ * earlier limits. With DIR TRUTH as arguments: that scan. The first argument --rows prints every row of every history
+ * in place of the table.
  */
 #include <math.h>
 #include <stdio.h>

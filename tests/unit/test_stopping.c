@@ -14,7 +14,8 @@ Suite *stopping_suite(void);
 
 /* ---- the rules ---- */
 
-static const struct stop_limits limits = {.change = 0.01, .change_of_noise = 0.1, .fall = 0.05, .least = 2};
+static const struct stop_limits limits = {
+    .change = 0.01, .quiet = 0.5, .loud = 1, .change_most = 0.02, .fall = 0.05, .least = 2};
 
 static struct history_row row_of(int iteration, double residual, double change)
 {
@@ -36,10 +37,17 @@ static const struct {
     {{.residual = 1}, {.iteration = 2, .residual = 0.96, .change = 0.1}, 9, STOP_RESIDUAL},
     {{.residual = 1}, {.iteration = 2, .residual = 1.1, .change = 0.1}, 9, STOP_RESIDUAL},
     {{.residual = 1}, {.iteration = 2, .residual = 0.94, .change = 0.1}, 9, STOP_NOT},
-    /* The limit of the change is larger where there is noise. */
-    {{.residual = 1}, {.iteration = 2, .residual = 0.5, .change = 0.0099}, 9, STOP_CHANGE},
-    {{.residual = 1}, {.iteration = 2, .residual = 0.5, .change = 0.015}, 9, STOP_NOT},
-    {{.noise = 0.06, .residual = 1}, {.iteration = 2, .residual = 0.5, .change = 0.015}, 9, STOP_CHANGE},
+    /* The limit of the change: .01, more with less noise and with more, at most .02. */
+    {{.noise = 0.008, .residual = 1}, {.iteration = 2, .residual = 0.5, .change = 0.0099}, 9, STOP_CHANGE},
+    {{.noise = 0.008, .residual = 1}, {.iteration = 2, .residual = 0.5, .change = 0.0101}, 9, STOP_NOT},
+    {{.noise = 0.0045, .residual = 1}, {.iteration = 2, .residual = 0.5, .change = 0.0133}, 9, STOP_CHANGE},
+    {{.noise = 0.0045, .residual = 1}, {.iteration = 2, .residual = 0.5, .change = 0.0134}, 9, STOP_NOT},
+    {{.noise = 0.012, .residual = 1}, {.iteration = 2, .residual = 0.5, .change = 0.0149}, 9, STOP_CHANGE},
+    {{.noise = 0.012, .residual = 1}, {.iteration = 2, .residual = 0.5, .change = 0.0151}, 9, STOP_NOT},
+    {{.noise = 0.1, .residual = 1}, {.iteration = 2, .residual = 0.5, .change = 0.0199}, 9, STOP_CHANGE},
+    {{.noise = 0.1, .residual = 1}, {.iteration = 2, .residual = 0.5, .change = 0.0201}, 9, STOP_NOT},
+    /* Without a known noise as with the least that there was: .02 here. */
+    {{.residual = 1}, {.iteration = 2, .residual = 0.5, .change = 0.0199}, 9, STOP_CHANGE},
     /* Not before the second; at the last in any case. */
     {{.noise = 1}, {.iteration = 1, .residual = 0.1, .change = 0}, 9, STOP_NOT},
     {{.noise = 1}, {.iteration = 1, .residual = 0.1, .change = 0}, 1, STOP_CEILING},
