@@ -339,6 +339,24 @@ test('window and level by dragging and by presets; a click moves the cross, the 
 	await page.context().close()
 })
 
+test('a wider plane without the column, all of the screen, and cine through the slices', async () => {
+	const page = await openFinished({ viewport: { width: 1366, height: 768 } })
+	const width = () => page.locator(tile('z')).boundingBox().then(box => box.width), before = await width()
+	await page.click('button:has-text("Wide")')
+	await until('a wider plane', width, wide => wide > 1.2 * before)
+	expect(!await page.isVisible('.aside'), 'the column folded')
+	await page.click('button:has-text("Wide")')
+	await page.click('button:has-text("Full screen")')
+	await until('all of the screen', () => page.evaluate(() => document.fullscreenElement?.className), name => name === 'pictures')
+	expect(/final · SART 7 \+ TV/.test(await page.textContent(`${tile('z')} .what`)) && await page.isVisible(`${tile('z')} .what`) && await page.isVisible(`${tile('z')} .edge.left`), 'which volume and which side, there too')
+	await page.evaluate(() => document.exitFullscreen())
+	const start = await depthOf(page, 'z')
+	await page.click('button:has-text("Cine")')
+	await until('slices by themselves', () => depthOf(page, 'z'), index => index > start + 2)
+	await page.click('button:has-text("Cine")')
+	await page.context().close()
+})
+
 /* ---- measuring ---- */
 
 const tool = (page, name) => page.click(`[aria-label=Measure] button[data-value=${name}]`)
@@ -971,6 +989,13 @@ async function fingers(page) {
 	await finger('touchStart', x, y)
 	await until('the cross where the finger rests', () => depthOf(page, 'x'), index => index !== sagittal)
 	await finger('touchEnd')
+	const two = (type, apart) => client.send('Input.dispatchTouchEvent', { type, touchPoints: [{ x: x - apart, y, id: 0 }, { x: x + apart, y, id: 1 }] })
+	const zoom = () => page.$eval(`${tile('z')} .picture`, picture => Number(/scale\(([\d.]+)\)/.exec(picture.style.transform)[1]))
+	await two('touchStart', 15)
+	for (const apart of [20, 25, 30])
+		await two('touchMove', apart)
+	await finger('touchEnd')
+	await until('two fingers zoom', zoom, scale => scale > 1.7 && scale < 2.3)
 	expect(await page.evaluate(() => document.documentElement.scrollHeight > innerHeight), 'more below')
 }
 
