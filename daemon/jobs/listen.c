@@ -258,7 +258,8 @@ void worker_read(struct supervise *supervise, struct worker *worker, bool died, 
 		code = next_message(worker, &message, &got, &err);
 		if (code != 0 || !got)
 			break;
-		if (on_message(supervise, worker, message) == ERR_AWAY) {
+		/* A daemon that stops waits for nobody: the next start has the job go on from its checkpoint. */
+		if (on_message(supervise, worker, message) == ERR_AWAY && supervise->stop_by == NEVER) {
 			worker->held = message;
 			break;
 		}

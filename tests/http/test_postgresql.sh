@@ -151,6 +151,26 @@ test_a_server_that_stands_still_counts_as_away() {
 	expect_json '.jobs | length == 1'
 }
 
+test_a_daemon_stops_and_its_jobs_go_on_though_the_server_is_away() {
+	local started
+	undisturbed
+	start "$database"
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "$long"
+	state_becomes running
+	kill_server
+	away POST /v1/jobs -H 'Content-Type: application/json' --data-binary "${small//SCAN/$scan}"
+	stop_daemon
+	[ "$stop_status" = 0 ] || fail "exit status 0, got $stop_status"
+	start_server
+	again
+	wait_job succeeded
+	get_volume final "$work/final.raw" format=raw
+	cmp "$work/final.raw" "$work/undisturbed.raw" || fail "the bits of an undisturbed run"
+	told_once
+}
+
 # A way to the server on which commits can be lost, before or after the server has done them.
 start_lossy() {
 	need_server
