@@ -60,26 +60,27 @@ static void make_scene(struct scene *ret)
 static float *counts_with_lag(const struct scene *scene, const struct lag_model *lag, bool dark)
 {
 	float *counts = malloc(sizeof(float) * PIXELS * VIEWS);
+	double response[VIEWS] = {1}; /* frames after a signal of 1 */
 
 	ck_assert_ptr_nonnull(counts);
-	for (int view = 0; view < VIEWS; view++)
-		for (int i = 0; i < PIXELS; i++) {
-			double sum = 0;
+	for (int k = 0; k < VIEWS; k++)
+		for (int n = 0; n < lag->count; n++) {
+			const double r = exp(-1 / lag->terms[n].frames);
 
-			for (int before = 0; before <= view; before++) {
-				const double x = AIR * exp(-(double)scene->projections[before * PIXELS + i]);
-				double part = before == view ? 1 : 0;
-
-				for (int n = 0; n < lag->count; n++) {
-					const double r = exp(-1 / lag->terms[n].frames);
-
-					part += lag->terms[n].share *
-						(before == view ? -1 : (1 - r) * pow(r, view - before - 1));
-				}
-				sum += part * x;
-			}
-			counts[view * PIXELS + i] = (float)(sum + (dark ? DARK : 0));
+			response[k] += lag->terms[n].share * (k == 0 ? -1 : (1 - r) * pow(r, k - 1));
 		}
+	for (int i = 0; i < PIXELS; i++) {
+		double signal[VIEWS];
+
+		for (int view = 0; view < VIEWS; view++) {
+			double sum = dark ? DARK : 0;
+
+			signal[view] = AIR * exp(-(double)scene->projections[view * PIXELS + i]);
+			for (int before = 0; before <= view; before++)
+				sum += response[view - before] * signal[before];
+			counts[view * PIXELS + i] = (float)sum;
+		}
+	}
 	return counts;
 }
 
@@ -477,6 +478,115 @@ START_TEST(scatter_is_taken_off_objects_that_its_kernels_were_not_fitted_on)
 }
 END_TEST
 
+/* ---- both, on their way through a reconstruction ---- */
+
+static const struct scatter_model KERNEL = {.count = 1, .kernels = {{0.35, 0.1, 1.8, 290, 0.27}}};
+
+/* Columns and rows exchanged. */
+static float *exchanged(const float *images, int count, int columns, int rows)
+{
+	float *turned = malloc(sizeof(float) * (size_t)(columns * rows * count));
+
+	ck_assert_ptr_nonnull(turned);
+	for (int i = 0; i < columns * rows * count; i++) {
+		const int image = i / (columns * rows), at = i % (columns * rows);
+
+		turned[image * columns * rows + at % columns * rows + at / columns] = images[i];
+	}
+	return turned;
+}
+
+/* A detector that lies on its side: its rows stand where columns stood, and the volume is the same. */
+START_TEST(a_turned_detector_is_corrected_alike)
+{
+	const struct recipe recipe = fdk_on(32, 12, 5);
+	struct outcome upright = {0}, lying = {0};
+	struct scene scene, turned = {0};
+	float *counts, *turned_counts;
+	struct error err;
+
+	make_scene(&scene);
+	counts = counts_with_lag(&scene, &LAG, false);
+	turned_counts = exchanged(counts, VIEWS, COLUMNS, ROWS);
+	ck_assert_int_eq(geometry_exchange(&turned.geometry, &scene.geometry, &err), 0);
+	upright.samples = counts;
+	lying.samples = turned_counts;
+	upright.linearise = lying.linearise = (struct linearise){
+	    .sample = SAMPLE_FLOAT32, .quantity = QUANTITY_INTENSITY, .air = AIR, .lag = &LAG, .scatter = &KERNEL};
+	run(&scene, &recipe, &upright);
+	run(&turned, &recipe, &lying);
+	ck_assert_double_lt(relative_error(lying.last, upright.last, grid_voxels(&upright.grid)), 1e-5);
+	outcome_clear(&upright);
+	outcome_clear(&lying);
+	geometry_clear(&turned.geometry);
+	scene_clear(&scene);
+	free(counts);
+	free(turned_counts);
+}
+END_TEST
+
+/* Scatter goes with the tube's output: a tube that drifts leaves no trace where there is an air region. */
+START_TEST(scatter_follows_each_views_own_air)
+{
+	const struct recipe recipe = fdk_on(32, 12, 5);
+	struct outcome steady = {0}, drifting = {0};
+	float *counts = malloc(sizeof(float) * PIXELS * VIEWS), *drifted = malloc(sizeof(float) * PIXELS * VIEWS);
+	struct scene scene;
+
+	ck_assert(counts != NULL && drifted != NULL);
+	make_scene(&scene);
+	for (int i = 0; i < PIXELS * VIEWS; i++) {
+		counts[i] = (float)(AIR * (exp(-(double)scene.projections[i]) + 0.03));
+		drifted[i] = counts[i] * (1 - 0.4f * (float)(i / PIXELS) / VIEWS);
+	}
+	steady.samples = counts;
+	drifting.samples = drifted;
+	steady.linearise = drifting.linearise = (struct linearise){.sample = SAMPLE_FLOAT32,
+								   .quantity = QUANTITY_INTENSITY,
+								   .air = AIR,
+								   .has_air_region = true,
+								   .air_region = {0, 0, 2, ROWS - 1},
+								   .scatter = &KERNEL};
+	run(&scene, &recipe, &steady);
+	run(&scene, &recipe, &drifting);
+	ck_assert_double_lt(relative_error(drifting.last, steady.last, grid_voxels(&steady.grid)), 1e-3);
+	outcome_clear(&steady);
+	outcome_clear(&drifting);
+	scene_clear(&scene);
+	free(counts);
+	free(drifted);
+}
+END_TEST
+
+/* A run that goes on from an iterate gets the same projections, lag and all: the same bits. */
+START_TEST(counts_are_corrected_again_in_a_run_that_goes_on)
+{
+	struct recipe recipe = fdk_on(24, 8, 6.5);
+	struct outcome whole = {0}, first = {.yield_at = 2}, second = {0};
+	struct scene scene;
+	float *counts;
+
+	recipe.algorithm = &algorithm_sart;
+	recipe.iterate.iterations = 4;
+	make_scene(&scene);
+	counts = counts_with_lag(&scene, &LAG, false);
+	whole.samples = first.samples = second.samples = counts;
+	whole.linearise = first.linearise = second.linearise = (struct linearise){
+	    .sample = SAMPLE_FLOAT32, .quantity = QUANTITY_INTENSITY, .air = AIR, .lag = &LAG, .scatter = &KERNEL};
+	run(&scene, &recipe, &whole);
+	scene_run(&scene, &recipe, &first);
+	ck_assert_int_eq(first.code, ERR_BUSY);
+	outcome_resume(&second, &first);
+	run(&scene, &recipe, &second);
+	ck_assert_mem_eq(second.last, whole.last, sizeof(float) * grid_voxels(&whole.grid));
+	outcome_clear(&second);
+	outcome_clear(&first);
+	outcome_clear(&whole);
+	scene_clear(&scene);
+	free(counts);
+}
+END_TEST
+
 /* Steps of water as a beam of three energies hardens in them: the polynomial makes them straight. */
 START_TEST(hardening_is_fitted_from_steps_of_water)
 {
@@ -532,6 +642,9 @@ Suite *detector_suite(void)
 	tcase_add_test(lag, lag_wants_views_in_the_order_of_time);
 	tcase_add_loop_test(lag, lag_bridges_missing_frames, 0, 2);
 	tcase_add_test(lag, lag_is_fitted_from_the_end_of_the_beam);
+	tcase_add_test(lag, a_turned_detector_is_corrected_alike);
+	tcase_add_test(lag, scatter_follows_each_views_own_air);
+	tcase_add_test(lag, counts_are_corrected_again_in_a_run_that_goes_on);
 	suite_add_tcase(suite, lag);
 	tcase_set_timeout(scatter, 300);
 	tcase_add_test(scatter, scatter_is_taken_off_objects_that_its_kernels_were_not_fitted_on);
