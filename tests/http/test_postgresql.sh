@@ -95,9 +95,12 @@ test_all_that_was_acknowledged_is_there_after_kill_9() {
 }
 
 test_a_server_that_is_killed_and_started_again() {
-	local i accepted=() id
+	local acquired
 	undisturbed
 	start "$database"
+	post_scan "$scan_dir"
+	acquired=$scan
+	head -c $((64 * 48 * 4)) "$scan_dir/projections.raw" >"$work/one"
 	post_scan "$scan_dir"
 	post_projections "$scan_dir"
 	post_job "$long"
@@ -106,6 +109,9 @@ test_a_server_that_is_killed_and_started_again() {
 	away POST /v1/jobs -H 'Content-Type: application/json' --data-binary "${small//SCAN/$scan}"
 	away POST /v1/scans -H 'Content-Type: application/json' --data-binary "@$scan_dir/scan.json"
 	away DELETE "/v1/jobs/$job"
+	away PUT "/v1/scans/$acquired/projections/0" -T "$work/one"
+	req GET "/v1/scans/$acquired"
+	expect_json '.received == []'
 	away GET "/v1/jobs/$job/volumes"
 	away GET /readyz
 	req GET /livez
@@ -117,17 +123,21 @@ test_a_server_that_is_killed_and_started_again() {
 	start_server
 	becomes_ready
 	[ "$(metric catalogue_up)" = 1 ] || fail "cbctd_catalogue_up 1"
+	req PUT "/v1/scans/$acquired/projections/0" -T "$work/one"
+	expect_status 201
 	succeeds_with_the_same_bits
 	req GET /v1/jobs
 	expect_json '.jobs | length == 1'
 	req GET /v1/scans
-	expect_json '.scans | length == 1'
+	expect_json '.scans | length == 2'
 	stop_daemon KILL
 	again
 	req GET /v1/jobs
 	expect_json '.jobs | length == 1'
 	req GET /v1/scans
-	expect_json '.scans | length == 1'
+	expect_json '.scans | length == 2'
+	req GET "/v1/scans/$acquired"
+	expect_json '.received == [[0, 0]]'
 	req GET /readyz
 	[ "$(cat "$body")" = ready ] || fail "nothing was found or set aside, got $(cat "$body")"
 }
