@@ -99,6 +99,13 @@ static int reply_not_modified(struct request *request, const struct entity *enti
 	return 0;
 }
 
+static int reply_precondition_failed(struct request *request, const struct entity *entity, struct error *err)
+{
+	return request_reply_problem(request, "precondition-failed", err,
+				     "If-Match is \"%.120s\", what is there has %s",
+				     request_header(request, "If-Match"), entity->etag);
+}
+
 static int reply_range_outside(struct request *request, const struct entity *entity, struct error *err)
 {
 	if (request_reply_problem(request, "range-outside", err, "Range is \"%.60s\", the body has %" PRIu64 " bytes",
@@ -111,12 +118,14 @@ static int reply_range_outside(struct request *request, const struct entity *ent
 int entity_select(struct request *request, const struct entity *entity, struct selection *ret_selection, bool *ret_done,
 		  struct error *err)
 {
-	const char *condition = request_header(request, "If-Range");
+	const char *condition = request_header(request, "If-Range"), *wanted = request_header(request, "If-Match");
 	struct selection selection = {200, 0, entity->size};
 	bool ranges = entity->size != UNKNOWN_SIZE && !request_is_head(request) &&
 		      (condition == NULL || etag_in(condition, entity->etag, false));
 
 	*ret_done = true;
+	if (wanted != NULL && !etag_in(wanted, entity->etag, false))
+		return reply_precondition_failed(request, entity, err);
 	if (etag_in(request_header(request, "If-None-Match"), entity->etag, true))
 		return reply_not_modified(request, entity, err);
 	if (ranges) {

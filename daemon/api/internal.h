@@ -113,7 +113,7 @@ struct entity {
 	const char *caching;  /* Cache-Control; NULL: clients keep it, and ask each time whether it has changed */
 };
 /*
- * If-None-Match, Range and If-Range. *ret_done: the reply is set (304, 416);
+ * If-Match, If-None-Match, Range and If-Range. *ret_done: the reply is set (412, 304, 416);
  * otherwise send bytes first .. first + length - 1 with that status, then call entity_headers.
  */
 struct selection {

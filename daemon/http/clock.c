@@ -167,6 +167,15 @@ static double deadline(const struct connection *connection)
 }
 
 /*
+ * An idle connection whose client has gone with its last request: the end came with that edge of epoll, and the library
+ * waits for another one.
+ */
+static bool is_left(const struct connection *connection, double now)
+{
+	return now - connection->since >= 1 && live_hung_up(connection);
+}
+
+/*
  * A body that has stopped because its client is gone. The library waits for an
  * edge of epoll; when the end of the connection came together with the last
  * bytes there is none any more, and what had come would lie unsaved, its
@@ -199,6 +208,8 @@ static double look(struct connection *connection, double now)
 			connection->cut = live_peer_gone(connection, now);
 		else if (connection->phase == PHASE_BODY && !connection->suspended)
 			connection->cut = body_is_broken(connection);
+		else if (connection->phase == PHASE_IDLE)
+			connection->cut = is_left(connection, now);
 		/* A stream may go on for hours; who asked for it must be known all the time. */
 		connection->cut = connection->cut || time(NULL) >= connection->who.expires;
 		if (connection->cut)

@@ -17,6 +17,7 @@ struct head {
 	const char *host;
 	size_t host_length;
 	int fields, hosts, lengths, encodings, cookies;
+	char *expect;    /* the name of the field, NULL: it did not come */
 	unsigned single; /* a bit for each of single_names that came */
 	uint64_t length;
 };
@@ -26,7 +27,8 @@ static const char *const single_names[] = {"Origin",        "Sec-Fetch-Site", "I
 					   "Content-Range", "Authorization",  "If-Range",        "Last-Event-ID"};
 
 struct field {
-	const char *name, *value;
+	char *name;
+	const char *value;
 	size_t name_length, value_length;
 };
 
@@ -194,6 +196,8 @@ static bool read_field(struct framing *framing, struct head *head, const struct 
 		if (head->encodings++ > 0 || field->value_length != 7 || strncasecmp(field->value, "chunked", 7) != 0)
 			return refuse(framing, 400, "Transfer-Encoding is \"%.*s\", expected chunked, once",
 				      (int)(field->value_length < 40 ? field->value_length : 40), field->value);
+	} else if (is_name(field, "Expect")) {
+		head->expect = field->name;
 	} else if (is_name(field, "Cookie")) {
 		head->cookies += 1 + (int)count_of(field->value, field->value_length, ';') +
 				 (int)count_of(field->value, field->value_length, ',');
@@ -245,6 +249,16 @@ static bool judge_head(struct framing *framing, const struct head *head)
 		return refuse(framing, 400,
 			      "Transfer-Encoding with HTTP/1.0, which has none: where does the body end?");
 	return true;
+}
+
+/*
+ * "Expect: 100-continue" of a request without a body asks for nothing (RFC 9110, 10.1.1). The library says "100
+ * Continue" to it all the same, and then never the answer if another request follows at once.
+ */
+static void drop_needless_expectation(const struct head *head)
+{
+	if (head->expect != NULL && head->encodings == 0 && head->length == 0)
+		memcpy(head->expect, "X-None", strlen("Expect"));
 }
 
 /* ---- heads and trailers ---- */
@@ -322,6 +336,7 @@ static size_t pass_head(struct framing *framing, char *data, size_t size)
 		framing->scanned = 0;
 		return 2;
 	}
+	framing->is_head = size >= 5 && memcmp(data, "HEAD ", 5) == 0;
 	if (!find_end(framing, data, size, &length)) {
 		if (framing->status == 0 && first_line_is_fine(framing, data, size) && size >= HEAD_BYTES_MAX)
 			refuse(framing, 431, "the head has more than %d bytes", HEAD_BYTES_MAX);
@@ -336,6 +351,7 @@ static size_t pass_head(struct framing *framing, char *data, size_t size)
 	}
 	if (!read_fields(framing, &head, data + line + 2, length - line - 2) || !judge_head(framing, &head))
 		return 0;
+	drop_needless_expectation(&head);
 	framing->heads++;
 	framing->line_read = framing->empty_line = false;
 	framing->left = head.length;

@@ -39,6 +39,7 @@ struct framing {
 	size_t scanned;   /* bytes of an incomplete head or trailer that were looked at */
 	bool line_read;   /* of this head, the first line */
 	bool empty_line;  /* came before this head */
+	bool is_head;     /* this head's method is HEAD */
 	uint64_t heads;   /* that were let through */
 	int status;       /* of the refusal; 0: there is none */
 	char detail[160]; /* of the refusal, one sentence */
@@ -51,7 +52,8 @@ struct framing {
  * of these may go on. What is held back (an incomplete head, chunk line or
  * trailer) comes again in the next call, in front of what follows; it is never
  * longer than HEAD_BYTES_MAX. Blanks behind a field's value are moved before it,
- * which means the same and spares readers that forget them. After a refusal
+ * which means the same and spares readers that forget them; Expect loses its name
+ * where there is no body to wait for. After a refusal
  * (framing->status) nothing more goes on. Begins with a struct of zeros.
  */
 size_t framing_pass(struct framing *framing, char *data, size_t size);

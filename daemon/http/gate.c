@@ -39,8 +39,9 @@
 #include <string.h>
 #include <sys/resource.h>
 
-/* Stands in place of the request whose head was refused. */
+/* Stand in place of a request whose head was refused; there is no body in the answer to HEAD. */
 static const char substitute[] = "GET /refused HTTP/1.1\r\nHost: refused\r\nConnection: close\r\n\r\n";
+static const char substitute_head[] = "HEAD /refused HTTP/1.1\r\nHost: refused\r\nConnection: close\r\n\r\n";
 
 /*
  * Which connection has a descriptor; the process has one table of descriptors, and so one of these. An entry is set
@@ -135,7 +136,7 @@ static bool end_refused(struct gate *gate)
 
 	gate->length = gate->passed;
 	if (ending[0] == '\0') {
-		ending = substitute;
+		ending = gate->framing.is_head ? substitute_head : substitute;
 		gate->framing.heads++;
 	}
 	if (!hold(gate, ending, strlen(ending)))

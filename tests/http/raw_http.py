@@ -461,8 +461,34 @@ def case_bodiless(scan: str, job: str) -> None:
                     expect(fields["status"] == "304", f"{target}: 304 for its tag, got {fields}")
                     kept += fields.get("connection") != "close"
                     count += 1
+    for refused in (b"HEAD /" + b"a" * 9000 + b" HTTP/1.1", b"HEAD /livez?" + b"a&" * 300 + b" HTTP/1.1"):
+        with Peer(head(first=refused)) as peer:
+            while peer.more():
+                pass
+            expect(peer.rest.startswith(b"HTTP/1.1 4") and peer.rest.endswith(b"\r\n\r\n") and peer.rest.count(b"\r\n\r\n") == 1,
+                   f"a refusal without a body, got {peer.rest[-200:]!r}")
+    for length in ([], [b"Content-Length: 0"]):  # nothing to go on with
+        with Peer(head(b"Expect: 100-continue", *length) + OK) as peer:
+            for _ in range(2):
+                reply = peer.reply()
+                expect(reply is not None and reply[0] == 200, f"200 in spite of a needless expectation, got {reply}")
     print(f"  {count} replies of 304, {kept} of them kept their connection")
     expect(count > 20 and kept > 0, f"more than 20 replies of 304, got {count}, {kept} on connections that go on")
+
+
+def case_left() -> None:
+    """A client that shuts its side down behind a request gets the answer, and the end soon after, not by the header's timeout."""
+    peers = [Peer(OK) for _ in range(30)]
+    for peer in peers:
+        peer.socket.shutdown(socket.SHUT_WR)
+    for peer in peers:
+        reply = peer.reply()
+        expect(reply is not None and reply[0] == 200, f"200, got {reply}")
+        expect(not peer.more(), f"the end of the connection, got {peer.rest!r}")
+        peer.socket.close()
+    with Peer(b"\r\n" + head()[:20]) as peer:  # half a head is none
+        peer.socket.shutdown(socket.SHUT_WR)
+        expect(not peer.more(), f"the end of the connection, got {peer.rest!r}")
 
 
 # ---- limits ----

@@ -14,6 +14,7 @@ test_replies_without_a_body_end_with_their_head() {
 	reconstruct "$work/scan" '{"scan": "SCAN", "grid": {"size": [12, 12, 12], "spacing_mm": [8, 8, 8]}, "fdk": {}}'
 	raw bodiless "$scan" "$job"
 }
+test_a_client_that_is_done_is_let_go() { raw left; }
 test_bad_requests_leave_nothing_behind() {
 	# a sanitizer keeps what is freed for a while
 	[ "${SANITIZED:-0}" = 0 ] || skip "memory is not counted under a sanitizer"

@@ -55,6 +55,12 @@ test_tags_save_the_drawing() {
 	expect_status 200
 	req GET "$volume/slice?axis=y&index=3&level=1" -H "If-None-Match: $etag"
 	expect_status 200
+	req GET "$volume/slice?axis=y&index=3" -H "If-Match: \"another\", $etag"
+	expect_status 200
+	req GET "$volume/slice?axis=y&index=3" -H 'If-Match: "another"'
+	expect_problem 412
+	req GET "$volume/slice?axis=y&index=3" -H "If-Match: W/$etag"
+	expect_problem 412
 }
 
 test_planes_and_slabs_at_any_angle_are_the_volume_resampled() {
