@@ -12,6 +12,9 @@ enum { EMIT_FDK = 0, EMIT_FDK_TV = -1 }; /* beside iterations 1, 2, ... */
 /* Backprojection of the iterations: plan_options.matched. */
 enum projector { PROJECTOR_INTERPOLATING, PROJECTOR_MATCHED, PROJECTOR_COUNT };
 
+/* What a ray counts for beside its length: the same for all, or by the noise of its value (core/recon/weights.h). */
+enum ray_weights { RAYS_EVEN, RAYS_COUNTS, RAYS_NOISE, RAY_WEIGHTS_COUNT };
+
 /* "light", "medium", "strong": half, once, twice the balance that is found. */
 enum tv_strength { TV_LIGHT, TV_MEDIUM, TV_STRONG, TV_STRENGTH_COUNT };
 
@@ -34,6 +37,7 @@ struct recipe {
 		int most;                          /* ... behind so many at the latest */
 		bool nonnegative;                  /* no voxel below 0 */
 		double stop_residual, stop_change; /* 0: never */
+		enum ray_weights weights;          /* of algorithms that weigh rays */
 	} iterate;                                 /* whatever the algorithm */
 	struct {
 		double relaxation;

@@ -92,6 +92,7 @@ _PARAMETERS: Dict[str, Dict[str, Document]] = {
         "/sart/relaxation": {"type": "number", "minimum": 1e-06, "maximum": 2},
         "/sart/subsets": {"type": "integer", "minimum": 1, "maximum": 20000, "word": "views"},
         "/sart/momentum": {"type": "boolean"},
+        "/fista/weights": {"type": "choice", "choices": ["even", "counts", "noise"]},
         "/sart/nonnegative": {"type": "boolean"},
         "/cgls/nonnegative": {"type": "boolean"},
         "/fista/nonnegative": {"type": "boolean"},

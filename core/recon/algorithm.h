@@ -29,6 +29,7 @@ struct problem {
 	const struct cancel *cancel;           /* or NULL */
 	bool nonnegative;                      /* the iterate has no voxel below 0 */
 	bool momentum;                         /* of SART, see core/recon/sart.c */
+	enum ray_weights weights;              /* of algorithms that weigh rays */
 };
 
 /* When automatic iterations end (core/recon/stopping.h). */
@@ -51,6 +52,7 @@ struct algorithm {
 	enum projector projector; /* that a recipe without one takes */
 	enum stage stage;         /* of its iterations, in progress and timings */
 	bool subsets;             /* its update is the backend's sart_iterate over ordered subsets */
+	bool weighs;              /* rays may have statistical weights, core/recon/weights.h */
 	/* How many problem.volumes and stacks it works in, beside projections, iterate, its copy and the plan. */
 	int volumes, stacks;
 	int momentum_volumes; /* more of them, where the recipe asks for momentum */
@@ -99,9 +101,9 @@ const struct algorithm *algorithm_find(const char *name);
 int problem_project(const struct problem *problem, const struct volume *x, struct stack *y, struct error *err);
 /* y += A^T x. */
 int problem_backproject(const struct problem *problem, const struct stack *x, struct volume *y, struct error *err);
-/* Finds 1 / L, L the ray's length in the grid in mm; 0 where it misses or grazes it. `before` is worked in. */
-int problem_weigh_rays(const struct problem *problem, struct stack *lengths, struct stack *ret_weights,
-		       struct error *err);
+/* weights /= L, L the ray's length in the grid in mm; 0 where it misses or grazes it. `before` is worked in. */
+int problem_divide_by_lengths(const struct problem *problem, struct stack *lengths, struct stack *weights,
+			      struct error *err);
 /* Returns the shortest side of a voxel, mm. */
 double problem_shortest(const struct problem *problem);
 

@@ -202,8 +202,12 @@ static int cgls_iterate(const struct problem *problem, void *state, bool moved, 
 	struct cgls *cgls = state;
 	struct iteration_sums sums;
 	double step = 0;
-	int code = cgls->weighted ? 0 : problem_weigh_rays(problem, cgls->projected, cgls->weights, err);
+	int code = 0;
 
+	if (!cgls->weighted)
+		code = problem->backend->stack_fill(cgls->weights, problem->geometry->count, 1, err);
+	if (!cgls->weighted && code == 0)
+		code = problem_divide_by_lengths(problem, cgls->projected, cgls->weights, err);
 	cgls->weighted = code == 0;
 	if (code == 0 && moved)
 		code = take_over(problem, cgls, err);

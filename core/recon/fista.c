@@ -9,12 +9,13 @@
  *   z = v + beta (v - v before)                           core/recon/momentum.h
  *   v = max(0, prox_TV(z + C^-1 A^T W (p - A z)))
  *
- * W divides by the lengths of the rays in the grid, C = A^T 1 are the column sums: C^-1 A^T W A has no eigenvalue above
- * 1. The loop's proximal TV is the prox, and its alpha the balance: lambda is C / (alpha unit) in TV's gray levels, for
- * voxels that all views see the same lambda everywhere. Unlike SART's, the volume in which this ends does not depend on
- * the order of views or on where it began, and more iterations do not take up more noise. Zero is enforced behind TV
- * (clips_last): the minimiser over v >= 0 of TV's own problem is the clipped one, as its level sets are independent
- * of each other (Chambolle, EMMCVPR 2005).
+ * W divides by the lengths of the rays in the grid and multiplies with w, their statistical weights
+ * (core/recon/weights.h), which are 1 unless the recipe asks for others. C = A^T w are the column sums: C^-1 A^T W A
+ * has no eigenvalue above 1. The loop's proximal TV is the prox, and its alpha the balance: lambda is C / (alpha unit)
+ * in TV's gray levels, for voxels that all views see the same lambda everywhere. Unlike SART's, the volume in which
+ * this ends does not depend on the order of views or on where it began, and more iterations do not take up more noise.
+ * Zero is enforced behind TV (clips_last): the minimiser over v >= 0 of TV's own problem is the clipped one, as its
+ * level sets are independent of each other (Chambolle, EMMCVPR 2005).
  *
  * A^T is the transpose of A with the matched pair, which is the default; with the interpolating pair this is a method
  * without an objective. Without TV it is SIRT with momentum.
@@ -24,6 +25,7 @@
 
 #include "core/recon/algorithm.h"
 #include "core/recon/momentum.h"
+#include "core/recon/weights.h"
 
 struct fista {
 	struct momentum momentum;
@@ -54,12 +56,12 @@ static int fista_open(const struct problem *problem, void **ret_state, struct er
 	return 0;
 }
 
-/* C = A^T 1, and ||p||^2. `before` and `rays` are worked in. */
+/* C = A^T w, `weights` being w, and ||p||^2. `before` and `rays` are worked in. */
 static int sum_columns(const struct problem *problem, struct fista *fista, struct error *err)
 {
 	const struct backend *backend = problem->backend;
 	const int views = problem->geometry->count;
-	int code = backend->stack_fill(fista->rays, views, 1, err);
+	int code = backend->stack_axpby(1, fista->weights, NULL, views, 0, fista->rays, err);
 
 	if (code == 0)
 		code = backend->volume_fill(fista->columns, 0, err);
@@ -78,8 +80,22 @@ static int sum_columns(const struct problem *problem, struct fista *fista, struc
 			 : code;
 }
 
-/* rays = W (p - A z), and ||p - A z||^2. */
-static int residual(const struct problem *problem, const struct fista *fista, double *ret_residual2, struct error *err)
+/* W, C and ||p||^2. */
+static int weigh(const struct problem *problem, struct fista *fista, struct error *err)
+{
+	int code = weights_of_rays(problem, problem->weights, fista->weights, err);
+
+	if (code == 0)
+		code = sum_columns(problem, fista, err);
+	if (code == 0)
+		code = problem_divide_by_lengths(problem, fista->rays, fista->weights, err);
+	fista->weighted = code == 0;
+	return code;
+}
+
+/* rays = W (p - A z), and ||p - A z||^2; *ret_objective2 is what momentum heeds: the same with statistical weights. */
+static int residual(const struct problem *problem, const struct fista *fista, double *ret_residual2,
+		    double *ret_objective2, struct error *err)
 {
 	const struct backend *backend = problem->backend;
 	const int views = problem->geometry->count;
@@ -92,6 +108,9 @@ static int residual(const struct problem *problem, const struct fista *fista, do
 		code = backend->stack_mask(problem->projections, NULL, views, rays, err);
 	if (code == 0)
 		code = backend->stack_dot(problem->plan, NULL, rays, rays, views, ret_residual2, err);
+	*ret_objective2 = *ret_residual2;
+	if (code == 0 && problem->weights != RAYS_EVEN)
+		code = backend->stack_dot(problem->plan, fista->weights, rays, rays, views, ret_objective2, err);
 	return code == 0 ? backend->stack_multiply(fista->weights, views, rays, err) : code;
 }
 
@@ -114,28 +133,22 @@ static int fista_iterate(const struct problem *problem, void *state, bool moved,
 			 struct error *err)
 {
 	struct fista *fista = state;
-	struct iteration_sums sums = {0};
-	int code = 0;
+	struct iteration_sums sums = {0}, heeded;
+	int code = fista->weighted ? 0 : weigh(problem, fista, err);
 
 	(void)moved;
-	if (!fista->weighted) {
-		code = problem_weigh_rays(problem, fista->rays, fista->weights, err);
-		if (code == 0)
-			code = sum_columns(problem, fista, err);
-		fista->weighted = code == 0;
-	}
 	if (code == 0)
 		code = problem->backend->volume_copy(problem->before, problem->volume, err);
 	if (code == 0)
 		code = momentum_extrapolate(problem, &fista->momentum, err);
 	if (code == 0)
-		code = residual(problem, fista, &sums.residual2, err);
+		code = residual(problem, fista, &sums.residual2, &heeded.residual2, err);
 	if (code == 0)
 		code = step(problem, fista, err);
 	if (code < 0)
 		return code;
-	sums.projection2 = fista->data2;
-	momentum_heed(&fista->momentum, &sums);
+	heeded.projection2 = sums.projection2 = fista->data2;
+	momentum_heed(&fista->momentum, &heeded);
 	*ret_sums = sums;
 	return 0;
 }
@@ -158,6 +171,7 @@ const struct algorithm algorithm_fista = {
     .iterations = 20,
     .projector = PROJECTOR_MATCHED,
     .stage = STAGE_FISTA,
+    .weighs = true,
     .volumes = 2,
     .stacks = 2,
     .updates = 1,

@@ -37,6 +37,10 @@ static bool uses_subsets(const void *recipe)
 {
 	return iterates(recipe) && ((const struct recipe *)recipe)->algorithm->subsets;
 }
+static bool weighs_rays(const void *recipe)
+{
+	return iterates(recipe) && ((const struct recipe *)recipe)->algorithm->weighs;
+}
 static bool runs_tv(const void *recipe)
 {
 	return ((const struct recipe *)recipe)->tv.on;
@@ -85,6 +89,10 @@ const struct parameter recipe_parameters[] = {
     {OBJECT_ALGORITHM, "momentum", PARAMETER_FLAG, AT(sart.momentum), .counts = uses_subsets,
      .help = "Whether each iteration begins beyond the volume of the last one, in the direction that it moved: to the "
 	     "same error in fewer iterations."},
+    {OBJECT_ALGORITHM, "weights", PARAMETER_CHOICE, AT(iterate.weights), NAMES(ray_weights_names), .preset = RAYS_EVEN,
+     .counts = weighs_rays,
+     .help =
+	 "What rays count for: all the same, or by the noise that their counts have, or that the projections show."},
     {OBJECT_ALGORITHM, "nonnegative", PARAMETER_FLAG, AT(iterate.nonnegative), .preset = 1, .counts = iterates,
      .help = "Whether no voxel becomes less than zero."},
     {OBJECT_ALGORITHM, "stop/residual", PARAMETER_NUMBER, AT(iterate.stop_residual), RANGE(0, 1e6), .counts = iterates,

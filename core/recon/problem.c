@@ -27,18 +27,15 @@ double problem_shortest(const struct problem *problem)
 	return fmin(fmin(mm[0], mm[1]), mm[2]);
 }
 
-int problem_weigh_rays(const struct problem *problem, struct stack *lengths, struct stack *ret_weights,
-		       struct error *err)
+int problem_divide_by_lengths(const struct problem *problem, struct stack *lengths, struct stack *weights,
+			      struct error *err)
 {
 	const struct backend *backend = problem->backend;
-	const int views = problem->geometry->count;
 	int code = backend->volume_fill(problem->before, 1, err);
 
 	if (code == 0)
 		code = problem_project(problem, problem->before, lengths, err);
-	if (code == 0)
-		code = backend->stack_fill(ret_weights, views, 1, err);
-	return code == 0 ? backend->stack_divide(lengths, RAY_LENGTH_LEAST * problem_shortest(problem), views,
-						 ret_weights, err)
+	return code == 0 ? backend->stack_divide(lengths, RAY_LENGTH_LEAST * problem_shortest(problem),
+						 problem->geometry->count, weights, err)
 			 : code;
 }

@@ -10,6 +10,7 @@
 #include <string.h>
 
 const char *const tv_strength_names[TV_STRENGTH_COUNT] = {"light", "medium", "strong"};
+const char *const ray_weights_names[RAY_WEIGHTS_COUNT] = {"even", "counts", "noise"};
 const char *const projector_names[PROJECTOR_COUNT] = {"interpolating", "matched"};
 
 void recipe_defaults(struct recipe *ret_recipe)

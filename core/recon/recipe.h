@@ -4,6 +4,7 @@
 #include "core/recipe.h"
 
 /* The recipe's defaults, its ranges, and what is filled in where it leaves something open. */
+extern const char *const ray_weights_names[RAY_WEIGHTS_COUNT];
 extern const char *const projector_names[PROJECTOR_COUNT]; /* "interpolating", "matched" */
 extern const char *const tv_strength_names[TV_STRENGTH_COUNT];
 enum { ALGORITHM_COUNT = 3 };

@@ -142,6 +142,7 @@ static int open_algorithm(struct recon *recon, struct error *err)
 	recon->problem.cancel = &recon->cancel;
 	recon->problem.nonnegative = recon->recipe.iterate.nonnegative;
 	recon->problem.momentum = recon->recipe.sart.momentum;
+	recon->problem.weights = recon->recipe.iterate.weights;
 	recon->moved = true;
 	return algorithm->open != NULL ? algorithm->open(&recon->problem, &recon->algorithm_state, err) : 0;
 }

@@ -41,7 +41,7 @@ export const groups = [
 		number('/cgls/stop/residual', 'Stop at residual', { zero: 'never' }), number('/cgls/stop/change', 'Stop at change', { zero: 'never' }),
 	] },
 	{ title: 'FISTA', pointer: '/fista', optional: true, algorithm: true, rare: true, off: 'not in place of SART', fields: [
-		text('/fista/iterations', 'Iterations', { hint: 'or auto', word: 'auto', read: numberOrText }), number('/fista/max_iterations', 'At most, with auto', { step: 1 }), flag('/fista/nonnegative', 'Never below zero'),
+		text('/fista/iterations', 'Iterations', { hint: 'or auto', word: 'auto', read: numberOrText }), number('/fista/max_iterations', 'At most, with auto', { step: 1 }), choice('/fista/weights', 'Weights of rays', ['even', 'counts', 'noise']), flag('/fista/nonnegative', 'Never below zero'),
 		number('/fista/stop/residual', 'Stop at residual', { zero: 'never' }), number('/fista/stop/change', 'Stop at change', { zero: 'never' }),
 	] },
 	{ title: 'Total variation', pointer: '/tv', optional: true, off: 'no smoothing', fields: [

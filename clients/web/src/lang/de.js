@@ -386,6 +386,7 @@ export const strings = {
 	'the last one only': 'nur das letzte',
 	'Precision': 'Genauigkeit',
 	'Projector': 'Projektor',
+	'Weights of rays': 'Gewichte der Strahlen',
 	'Water, 1/mm': 'Wasser, 1/mm',
 	'Ruler': 'Strecke',
 	'Angle': 'Winkel',
