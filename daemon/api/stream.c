@@ -108,12 +108,8 @@ static int begin_body(struct stream *stream, const struct encoded_facts *facts)
 {
 	unsigned char digest[64];
 	char *text = NULL;
-	struct error err;
 	int length;
 
-	/* The encoded copy may have been made a while ago, and its bytes may be those of the kept file. */
-	if (volume_verify(stream->api, stream->facts.id, &stream->volume, 0, stream->volume.bytes, &err) != 0)
-		return -1;
 	EVP_EncodeBlock(digest, facts->sha256, sizeof(facts->sha256));
 	length = asprintf(&text, "Content-Length: %llu\r\nContent-Digest: sha-256=:%s:\r\n\r\n",
 			  (unsigned long long)facts->size, (const char *)digest);
@@ -187,8 +183,12 @@ static ssize_t next_part(struct stream *stream)
 		return -1;
 	if (name[0] != '\0') {
 		code = volume_find(stream->api, &stream->facts, name, &volume, &err);
-		/* A volume whose file is gone is left out before its part begins; the job's document has a warning. */
-		if (code == 0 && volume_verify(stream->api, stream->facts.id, &volume, 0, 0, &err) == ERR_DAMAGED)
+		/*
+		 * A damaged volume is left out before its part begins; the job's document has a warning. An encoded
+		 * copy may have been made before the damage, and its bytes may be those of the kept file.
+		 */
+		if (code == 0 &&
+		    volume_verify(stream->api, stream->facts.id, &volume, 0, volume.bytes, &err) == ERR_DAMAGED)
 			return 0;
 		if (code == 0)
 			return begin_part(stream, &volume);

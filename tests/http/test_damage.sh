@@ -217,6 +217,21 @@ test_files_that_are_gone_are_told_before_the_first_request() {
 	stop_daemon
 }
 
+test_a_stream_leaves_a_damaged_volume_out_and_goes_on() {
+	local file
+	start_daemon
+	reconstruct "$scan_dir" "${small%\}}, \"emit\": [\"fdk\", 1]}"
+	file=$state/jobs/$job/fdk.nii
+	flip "$file" $(($(stat -c %s "$file") / 2))
+	for _ in 1 2; do # not known yet, then known
+		curl -sf --max-time 20 -o "$work/stream" "$url/v1/jobs/$job/stream?format=raw" || fail "a stream that ends properly"
+		[ "$(grep -ac '^CBCT-Volume: ' "$work/stream")" = 2 ] || fail "the two whole volumes: $(grep -a '^CBCT-Volume' "$work/stream")"
+		! grep -aq '^CBCT-Volume: fdk' "$work/stream" || fail "no part of the damaged one"
+		grep -aq 'damaged_volume' "$work/stream" || fail "the job's document tells"
+	done
+	stop_daemon
+}
+
 test_a_file_that_is_cut_off_under_the_daemon() {
 	start_daemon
 	reconstruct "$scan_dir" "$small"
@@ -416,9 +431,9 @@ test_a_damaged_volume_is_told_and_never_sent() {
 	req GET "/v1/jobs/$job/volumes/final?format=raw" -r 2100000-2100099
 	expect_damaged
 	for query in format=raw type=int16; do # streamed before, and not
-		! curl -sf --max-time 20 -o "$work/stream" "$url/v1/jobs/$job/stream?$query" || fail "a stream that breaks off"
-		grep -q 'CBCT-Volume: final' "$work/stream" || fail "the head of a part"
-		! grep -q 'Content-Length' "$work/stream" || fail "no bytes of what is damaged"
+		curl -sf --max-time 20 -o "$work/stream" "$url/v1/jobs/$job/stream?$query" || fail "a stream that ends properly"
+		! grep -aq 'CBCT-Volume' "$work/stream" || fail "nothing of what is damaged"
+		grep -aq 'damaged_volume' "$work/stream" || fail "the job's document tells"
 	done
 	flip "$(made)" $third # as it was
 	is_undisturbed
