@@ -52,8 +52,8 @@ static bool same_host(const struct connection *a, const struct connection *b)
 }
 
 /*
- * How little a connection is needed, with its lock held: what is idle the
- * longest first, then the slowest transfer, before all a stream whose client has gone; negative: it is left alone.
+ * How little a connection is needed, with its lock held: what is idle the longest first, then the slowest transfer,
+ * before all a stream, or a request that waits, whose client has gone; negative: it is left alone.
  */
 static double dispensable(const struct connection *connection, double now)
 {
@@ -64,14 +64,15 @@ static double dispensable(const struct connection *connection, double now)
 	if (connection->cut)
 		return -1;
 	/* The clock would see it within two seconds. */
-	if (connection->patience > 0 && live_hung_up(connection))
+	if ((connection->patience > 0 || (connection->suspended && connection->phase == PHASE_HANDLE)) &&
+	    live_hung_up(connection))
 		return INFINITY;
 	if (connection->suspended)
 		return -1;
 	if (connection->phase == PHASE_IDLE)
 		return age >= idle_after ? idle + age : -1;
 	age -= connection->paused;
-	if (age < judged_after || connection->phase == PHASE_HANDLE || moved == UNKNOWN_SIZE)
+	if (age < judged_after || connection->phase == PHASE_HANDLE || connection->patience > 0)
 		return -1;
 	if (connection->phase == PHASE_SEND) {
 		uint64_t sent = live_acknowledged(connection);

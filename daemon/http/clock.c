@@ -26,13 +26,17 @@ void connection_phase(struct connection *connection, enum phase phase, uint64_t 
 	connection->paused = 0;
 	connection->bytes = bytes;
 	connection->bytes_then = UNKNOWN_SIZE;
+	connection->made = 0;
+	connection->kept_up_at = connection->since;
 	connection->woken = false;
 	if (phase == PHASE_IDLE) {
 		connection->patience = 0;
 		connection->who.expires = TOKEN_NEVER;
 	}
-	if (phase == PHASE_SEND)
+	if (phase == PHASE_SEND) {
 		connection->sent_before = live_acknowledged(connection);
+		connection->taken_then = connection->sent_before == UNKNOWN_SIZE ? 0 : connection->sent_before;
+	}
 	pthread_mutex_unlock(&connection->lock);
 }
 
@@ -40,6 +44,13 @@ void connection_progress(struct connection *connection, uint64_t bytes)
 {
 	pthread_mutex_lock(&connection->lock);
 	connection->bytes += bytes;
+	pthread_mutex_unlock(&connection->lock);
+}
+
+void connection_made(struct connection *connection, uint64_t bytes)
+{
+	pthread_mutex_lock(&connection->lock);
+	connection->made += bytes;
 	pthread_mutex_unlock(&connection->lock);
 }
 
@@ -159,7 +170,7 @@ static double deadline(const struct connection *connection)
 	case PHASE_BODY:
 	case PHASE_SEND:
 		if (connection->bytes == UNKNOWN_SIZE)
-			return INFINITY; /* still guarded by the library's idle time */
+			return INFINITY; /* see is_stalled */
 		break;
 	}
 	return connection->since + connection->paused + options->transfer_grace +
@@ -187,6 +198,28 @@ static bool body_is_broken(struct connection *connection)
 
 	connection->bytes_then = connection->bytes;
 	return stopped && live_hung_up(connection);
+}
+
+/*
+ * A reply whose length nobody knew, and whose client reads it slower than the minimum rate for as long as any body may
+ * be late. A stream that has nothing to say is suspended.
+ */
+static bool is_stalled(struct connection *connection, double now)
+{
+	const struct http_options *options = &connection->http->options;
+	uint64_t taken;
+
+	if (connection->phase != PHASE_SEND || connection->bytes != UNKNOWN_SIZE)
+		return false;
+	taken = live_acknowledged(connection);
+	if (taken == UNKNOWN_SIZE) /* a Unix socket holds little */
+		taken = connection->made;
+	if (connection->suspended || (double)(taken - connection->taken_then) >=
+					 (double)options->minimum_rate * fmax(1, now - connection->kept_up_at)) {
+		connection->taken_then = taken;
+		connection->kept_up_at = now;
+	}
+	return now - connection->kept_up_at >= options->transfer_grace;
 }
 
 /* Looks at one connection; returns when to look again. With http->lock held: the socket is not closed meanwhile. */
@@ -221,7 +254,7 @@ static double look(struct connection *connection, double now)
 			resume(connection);
 			next = INFINITY;
 		}
-	} else if (!connection->cut && deadline(connection) <= now) {
+	} else if (!connection->cut && (deadline(connection) <= now || is_stalled(connection, now))) {
 		cut = connection->cut = true;
 		slow = connection->phase;
 		shutdown(connection->socket, SHUT_RDWR);

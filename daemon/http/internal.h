@@ -73,6 +73,9 @@ struct connection {
 	double wait_until;    /* of a suspended one */
 	bool cut;             /* shut down for its pace, for another's sake, or because its peer has gone */
 	uint64_t sent_before; /* bytes that the peer had acknowledged when this phase began; of PHASE_SEND */
+	uint64_t made;        /* bytes of a reply of unknown length that the library has asked for */
+	uint64_t taken_then;  /* bytes that the client had taken when it was last seen to keep up, */
+	double kept_up_at;    /* and when that was; or when there was nothing to send */
 	double looked_at;     /* by the clock, whether the peer is there */
 	uint64_t bytes_then;  /* of a body, when that was */
 
@@ -225,6 +228,8 @@ int clock_start(struct http *http, struct error *err);
 void clock_end(struct http *http);
 void connection_phase(struct connection *connection, enum phase phase, uint64_t bytes);
 void connection_progress(struct connection *connection, uint64_t bytes);
+/* So many bytes more of a reply of unknown length have gone to the library. */
+void connection_made(struct connection *connection, uint64_t bytes);
 enum suspension {
 	SUSPENDED,
 	WOKEN,  /* not suspended: something has happened already, look again */

@@ -99,6 +99,7 @@ static ssize_t live_read(void *context, uint64_t offset, char *to, size_t size)
 		got = live->read(request, to, size);
 		if (got > 0) {
 			request->sent += (uint64_t)got;
+			connection_made(request->connection, (uint64_t)got);
 			return got;
 		}
 		if (got == 0)

@@ -113,7 +113,10 @@ static ssize_t reader_read(void *context, uint64_t offset, char *to, size_t size
 
 	if (got == 0)
 		return MHD_CONTENT_READER_END_OF_STREAM;
-	reader->request->sent += got > 0 ? (uint64_t)got : 0;
+	if (got > 0) {
+		reader->request->sent += (uint64_t)got;
+		connection_made(reader->request->connection, (uint64_t)got);
+	}
 	return got > 0 ? got : MHD_CONTENT_READER_END_WITH_ERROR;
 }
 

@@ -581,6 +581,46 @@ def case_slow_readers(limit: str) -> None:
         acquisition_gets_in(view, other)
 
 
+def case_stalled(job: str, path: str = "") -> None:
+    """Replies of unknown length that nobody takes from the socket are cut off; who reads slowly, or waits, is left."""
+    volume = f"/v1/jobs/{job}/volumes/final"
+    forms = [(volume, [b"Accept-Encoding: zstd"]), (volume + "?format=nifti.gz", []), (f"/v1/jobs/{job}/stream?format=raw", [])]
+
+    def ask(target: str, fields: List[bytes]) -> Peer:
+        return Peer(head(*fields, first=f"GET {target} HTTP/1.1".encode()), path, window=4096)
+
+    stalled = [ask(*form) for form in forms]
+    slow = ask(*forms[0])
+    waiting = ask("/v1/events", [])
+    for _ in range(30):  # 6 s, at three times the minimum rate
+        time.sleep(0.2)
+        wanted = len(slow.rest) + 40000
+        while len(slow.rest) < wanted and slow.more():
+            pass
+    for peer, (target, _) in zip(stalled, forms):
+        while peer.more():
+            pass
+        expect(peer.rest.startswith(b"HTTP/1.1 200") and not peer.rest.endswith(b"0\r\n\r\n"), f"{target} to be cut off, got {len(peer.rest)} bytes and the end")
+    for wanted in range(len(slow.rest), len(slow.rest) + 400000, 50000):
+        while len(slow.rest) < wanted and slow.more():
+            pass
+        expect(len(slow.rest) >= wanted, f"a slow reader to get on, got {len(slow.rest)} bytes")
+    waiting.rest = b""
+    expect(not waiting.ended(), "a watcher to stay")
+
+
+def case_vanished(job: str) -> None:
+    """Clients that went away while their request waits make room for others."""
+    peers = [Peer(head(first=f"GET /v1/jobs/{job}?wait=60 HTTP/1.1".encode())) for _ in range(12)]
+    time.sleep(0.5)
+    for peer in peers:
+        peer.socket.close()
+    for _ in range(3):
+        with Peer(OK) as peer:
+            reply = peer.reply()
+            expect(reply is not None and reply[0] == 200, f"200 in the place of one that has gone, got {reply}")
+
+
 def case_busy(limit: str, refusal: str, path: str = "") -> None:
     """As many watchers as there are places: they stay, others may write only."""
     scan = posted_scan(path)

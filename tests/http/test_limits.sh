@@ -17,6 +17,20 @@ test_slow_uploads_and_readers_make_room() {
 	raw slow_uploads 20
 	raw slow_readers 20
 }
+test_readers_of_what_has_no_known_length_are_held_to_the_pace() {
+	start_daemon --transfer-grace 2 --minimum-rate 64K --listen "unix:$work/socket"
+	cbct simulate -o "$work/scan" --phantom head --views 8 --columns 24 --rows 24 --pixel 8 --photons 2000 >/dev/null
+	reconstruct "$work/scan" '{"scan": "SCAN", "grid": {"size": [144, 144, 144], "spacing_mm": [0.7, 0.7, 0.7]}, "fdk": {"window": "ram-lak"}}'
+	raw stalled "$job"
+	raw stalled "$job" "$work/socket"
+}
+test_clients_that_vanish_while_they_wait_make_room() {
+	start_daemon --max-connections 12 --max-connections-per-address 12
+	cbct simulate -o "$work/scan" --phantom ball --views 4 --columns 8 --rows 8 --pixel 20 >/dev/null
+	post_scan "$work/scan"
+	post_job '{"scan": "SCAN", "fdk": {}}' # waits for its projections
+	raw vanished "$job"
+}
 test_where_all_are_busy_reading_is_refused_and_writing_served() {
 	start_daemon --max-connections 40
 	raw busy 20 429
