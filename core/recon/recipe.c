@@ -66,6 +66,11 @@ int recipe_copy(struct recipe *ret_recipe, const struct recipe *recipe, struct e
 
 /* The minimiser without the volume that enters it is a constant; explicit steps may go without. */
 static const double proximal_alpha_least = 1e-9;
+/*
+ * Explicit steps are stable while step (alpha + 4 W / epsilon) is at most 2 (core/cpu/tv.c): more than this leaves
+ * nothing for the differences, and beyond 2 a step overshoots by more than it mends, without bound.
+ */
+static const double gradient_pull_most = 1.9;
 
 static int check_tv(const struct recipe *recipe, struct error *err)
 {
@@ -78,6 +83,12 @@ static int check_tv(const struct recipe *recipe, struct error *err)
 		return error_set_at(err, ERR_IMPOSSIBLE, "/tv/alpha",
 				    "%.10g, the proximal method wants a number of at least %.10g", tv->alpha,
 				    proximal_alpha_least);
+	if (tv->method == TV_GRADIENT && tv->alpha * tv->step > gradient_pull_most)
+		return error_set_at(
+		    err, ERR_IMPOSSIBLE, "/tv/alpha",
+		    "%.6g times the step of %.6g is %.4g, at most %.6g is stable; the proximal method has no "
+		    "such bound",
+		    tv->alpha, tv->step, tv->alpha * tv->step, gradient_pull_most);
 	return 0;
 }
 

@@ -27,8 +27,9 @@ function qualityText(quality) {
 		return ''
 	const { noise_hu: noise, edge_mm: edge, ring_hu: rings, streak_hu: streaks } = quality
 	const seen = value => value !== null && value > Math.max(3, 0.4 * (noise ?? 0))
-	return [noise !== null && `Noise ${number(noise, 2)} HU`, edge !== null && `edges ${number(edge, 2)} mm wide`,
-		seen(rings) && `rings of ${number(rings, 2)} HU`, seen(streaks) && `streaks of ${number(streaks, 2)} HU`].filter(Boolean).join(', ')
+	const said = [noise !== null && t('noise {n} HU', { n: number(noise, 2) }), edge !== null && t('edges {n} mm wide', { n: number(edge, 2) }),
+		seen(rings) && t('rings of {n} HU', { n: number(rings, 2) }), seen(streaks) && t('streaks of {n} HU', { n: number(streaks, 2) })].filter(Boolean)
+	return said.length > 0 ? t('Measured: {what}', { what: said.join(', ') }) : t('Too little of it is even for noise and edges to be measured.')
 }
 
 const volumeText = volume => volume.iteration > 0 ? t('iteration {n}', { n: volume.iteration }) : volume.stage === 'tv' ? t('FDK and TV') : 'FDK'
