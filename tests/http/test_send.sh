@@ -49,7 +49,7 @@ test_a_volume_arrives_once_whole_and_in_its_place() {
 	req GET "/v1/events?after=0" --max-time 1 || true
 	[ "$(grep -A1 '^event: sending' "$body" | grep -o '"state":"[a-z]*"' | paste -sd' ')" = '"state":"queued" "state":"sending" "state":"sent"' ] ||
 		fail "events queued, sending, sent, got $(grep -A1 '^event: sending' "$body")"
-	curl -s "$url/metrics" | grep -qx 'cbctd_sendings_ended_total{state="sent"} 1' || fail "a metric of what was sent"
+	grep -qx 'cbctd_sendings_ended_total{state="sent"} 1' <(curl -s "$url/metrics") || fail "a metric of what was sent"
 }
 
 test_kills_in_the_middle() {
@@ -84,7 +84,7 @@ test_an_archive_that_is_away_and_comes_back() {
 	start_daemon --destinations "$work/destinations.json" --send-pause 0.2
 	req GET "/v1/jobs/$job/send"
 	expect_json '[.sendings[] | [.to, .state]] | sort == [["nowhere", "stopped"], ["pacs", "queued"]] or . == [["nowhere", "stopped"], ["pacs", "sending"]]'
-	curl -s "$url/metrics" | grep -Eq '^cbctd_oldest_unsent_seconds [0-9.]*[1-9]' || fail "the age of what is unsent"
+	grep -Eq '^cbctd_oldest_unsent_seconds [0-9.]*[1-9]' <(curl -s "$url/metrics") || fail "the age of what is unsent"
 	start_archive
 	until req GET "/v1/jobs/$job/send" && jq -e 'any(.sendings[]; .to == "pacs" and .state == "sent" and .stored == 50)' "$body" >/dev/null; do sleep 0.2; done
 	[ "$(curl -sSf "$rest/instances" | jq length)" = 50 ] || fail "50 objects"

@@ -53,7 +53,7 @@ boot_debian() {
 main_pid() { inside systemctl show -P MainPID cbctd; }
 journal_has() { # TEXT
 	local end=$((SECONDS + ${2:-5}))
-	until inside journalctl -u cbctd --no-pager -o cat | grep -qF -- "$1"; do
+	until grep -qF -- "$1" <(inside journalctl -u cbctd --no-pager -o cat); do
 		[ $SECONDS -lt $end ] || fail "the journal has \"$1\": $(inside journalctl -u cbctd --no-pager -n 20)"
 		sleep 0.2
 	done
@@ -102,7 +102,7 @@ test_the_life_of_the_service() {
 	req GET /v1/jobs
 	journal_has "target=/v1/jobs "
 	[ "$(main_pid)" = "$pid" ] || fail "the same process"
-	inside journalctl -u cbctd --no-pager "CBCT_JOB=$job" | grep -q . || fail "the journal has the job's fields"
+	grep -q . <(inside journalctl -u cbctd --no-pager "CBCT_JOB=$job") || fail "the journal has the job's fields"
 
 	# A daemon that is stopped by a signal feeds no watchdog: systemd ends it, and another one goes on.
 	ended=$SECONDS
