@@ -1040,7 +1040,9 @@ test('a surgeon\'s questions take three clicks or fewer', async () => {
 	await click('button:has-text("Reconstruct again")')
 	await click('dialog .preset:has-text("Bone")')
 	const posted = page.waitForRequest(request => request.method() === 'POST' && request.url().endsWith('/v1/jobs'))
-	await page.route('**/v1/jobs', route => route.abort())
+	await page.route('**/v1/jobs', route => route.request().method() === 'POST'
+		? route.fulfill({ status: 422, contentType: 'application/problem+json', body: '{"title": "not now", "status": 422, "detail": "a test"}' })
+		: route.continue())
 	await click('dialog button[type=submit]')
 	expect((await posted).postDataJSON().preset === 'bone', 'a job for bone')
 	few('can it be sharper?')
