@@ -83,7 +83,7 @@ static int check_tv(const struct recipe *recipe, struct error *err)
 		return error_set_at(err, ERR_IMPOSSIBLE, "/tv/alpha",
 				    "%.10g, the proximal method wants a number of at least %.10g", tv->alpha,
 				    proximal_alpha_least);
-	if (tv->method == TV_GRADIENT && tv->alpha * tv->step > gradient_pull_most)
+	if (tv->method == TV_GRADIENT && tv->alpha * tv->step > gradient_pull_most * (1 + 1e-9))
 		return error_set_at(
 		    err, ERR_IMPOSSIBLE, "/tv/alpha",
 		    "%.6g times the step of %.6g is %.4g, at most %.6g is stable; the proximal method has no "

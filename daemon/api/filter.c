@@ -46,14 +46,24 @@ static int check_names(const char *what, const char *list, const char *const *na
 	return 0;
 }
 
+/* Of UTF-8: bytes that continue a character are none of their own. */
+static size_t characters_of(const char *text)
+{
+	size_t count = 0;
+
+	for (; *text != '\0'; text++)
+		count += ((unsigned char)*text & 0xc0) != 0x80;
+	return count;
+}
+
 static int read_common(struct request *request, struct filter *ret, struct error *err)
 {
 	ret->state = request_query(request, "state");
 	ret->label = request_query(request, "label");
 	ret->text = request_query(request, "text");
-	if (ret->text != NULL && strlen(ret->text) > TEXT_MOST)
-		return error_set(err, ERR_INVALID, "text has %zu bytes, expected at most %d", strlen(ret->text),
-				 TEXT_MOST);
+	if (ret->text != NULL && characters_of(ret->text) > TEXT_MOST)
+		return error_set(err, ERR_INVALID, "text has %zu characters, expected at most %d",
+				 characters_of(ret->text), TEXT_MOST);
 	if (ret->label != NULL && (ret->label[0] == '\0' || ret->label[0] == '='))
 		return error_set(err, ERR_INVALID, "label is \"%.60s\", expected a name, or NAME=VALUE", ret->label);
 	return 0;

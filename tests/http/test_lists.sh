@@ -97,6 +97,8 @@ test_what_nobody_knows_is_refused_with_what_is_known() {
 	EOT
 	req GET "/v1/jobs?text=$(printf 'x%.0s' {1..201})"
 	expect_problem 400
+	# characters, not bytes
+	expect_list "/v1/jobs?text=$(printf '%%C3%%A4%.0s' {1..200})"
 }
 
 # One worker: a long job runs, two more are queued. Their iterations are of the same kind as those of the job before.

@@ -397,6 +397,22 @@ static const struct {
      "64 bytes"},
 };
 
+/* .1 times 19 is a little more than 1.9 in binary. */
+START_TEST(explicit_steps_at_their_bound_are_taken)
+{
+	static const char *const texts[] = {"{\"scan\":\"a\",\"fdk\":{},\"tv\":{\"step\":19}}",
+					    "{\"scan\":\"a\",\"fdk\":{},\"tv\":{\"alpha\":1,\"step\":1.9}}"};
+
+	for (int i = 0; i < 2; i++) {
+		struct job_request request = {.scan = ""};
+		struct error err = {0};
+
+		ck_assert_msg(parse_and_resolve(texts[i], &request, &err) == 0, "%s: %s", texts[i], err.text);
+		job_request_clear(&request);
+	}
+}
+END_TEST
+
 START_TEST(bad_requests_are_refused_by_their_pointer)
 {
 	for (size_t i = 0; i < sizeof(refused) / sizeof(refused[0]); i++) {
@@ -469,6 +485,7 @@ Suite *recipe_suite(void)
 	tcase_add_test(tests, the_grid_is_centred_unless_it_says_otherwise);
 	tcase_add_test(tests, emitted_volumes_are_sorted_and_each_once);
 	tcase_add_test(tests, bad_requests_are_refused_by_their_pointer);
+	tcase_add_test(tests, explicit_steps_at_their_bound_are_taken);
 	tcase_add_test(tests, a_list_of_too_many_volumes_is_refused);
 	tcase_add_test(tests, subsets_left_out_are_ten_or_as_many_as_views);
 	suite_add_tcase(suite, tests);
