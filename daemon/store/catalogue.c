@@ -62,7 +62,7 @@ static int find_engine(const char *address, const struct catalogue_backend **ret
 		return 0;
 	}
 	return error_set(err, ERR_INVALID, "the catalogue is to be \"%.*s\"; sqlite and postgresql://... are known",
-			 (int)strcspn(address, ":/@"), address);
+			 (int)strcspn(address, ":/@= "), address);
 }
 
 int catalogue_check_address(const char *address, struct error *err)

@@ -316,7 +316,7 @@ test_a_password_is_never_shown() {
 	done
 	echo 'catalogue postgresql://cbctd:secret@host/db' >"$work/wrong.conf"
 	! "$BUILD/cbctd" --config "$work/wrong.conf" --print-config 2>&1 | grep -q secret || fail "no password in a complaint of a line"
-	for address in 'postgresql://cbctd:secret@host:notaport/db' 'postgresql://cbctd:secret@[::1/db' 'postgresql://cbctd:secret/two@host/db' 'mysql://cbctd:secret@host' 'postgresql:secret' \
+	for address in 'postgresql://cbctd:secret@host:notaport/db' 'postgresql://cbctd:secret@[::1/db' 'postgresql://cbctd:secret/two@host/db' 'mysql://cbctd:secret@host' 'postgresql:secret' 'host=127.0.0.1 password=secret' \
 		'postgresql://cbctd:secret@/postgres?host=/nonexistent' 'postgresql://cbctd:secret@host/db?nothing=here'; do
 		if timeout 60 "$BUILD/cbctd" --listen 127.0.0.1:0 --state-dir "$work/none" --catalogue "$address" >"$work/told" 2>&1; then fail "$address refused"; fi
 		! grep -q secret "$work/told" || fail "no password in: $(cat "$work/told")"
