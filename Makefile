@@ -194,7 +194,7 @@ $(BUILD)/cbctd-without-postgresql: $(filter-out $(BUILD)/daemon/store/postgresql
 
 gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench
 # Every program that a test or a benchmark runs, so that none stops compiling unseen.
-test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held cbctd-without-postgresql manual faults.so every.so live_bytes.so simulated-nvml/libnvidia-ml.so.1 cpu-bench calibrate-bench denoise presets stopping watchers slices acquire paper-project) \
+test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held cbctd-without-postgresql manual faults.so every.so live_bytes.so simulated-nvml/libnvidia-ml.so.1 cpu-bench calibrate-bench agreement denoise presets stopping methods watchers slices acquire paper-project rabbitct) \
                $(if $(cuda_objects),$(gpu_programs) $(BUILD)/gpu_ceilings $(BUILD)/cbct-worker-faulty,$(call objects,$(wildcard tests/bench/gpu_*.c)))
 
 # Faults of the disk, loaded into the programs by tests.
@@ -224,6 +224,10 @@ $(BUILD)/cpu-bench: $(call objects,tests/bench/bench.c) $(library)
 $(BUILD)/denoise: $(call objects,tests/bench/denoise.c tests/unit/anatomy.c) $(core_objects) $(cuda_objects)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(if $(cuda_objects),$(cuda_libs)) $(LIBM)
 
+# Backprojection alone, by the rules and the files of RabbitCT.
+$(BUILD)/rabbitct: $(call objects,tests/bench/rabbitct.c tests/bench/gpu_scene.c) $(core_objects) $(cuda_objects)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(if $(cuda_objects),$(cuda_libs)) $(LIBM)
+
 # What each preset of a job is worth on anatomies.
 $(BUILD)/presets: $(call objects,tests/bench/presets.c tests/unit/anatomy.c) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(LIBM)
@@ -231,6 +235,14 @@ $(BUILD)/presets: $(call objects,tests/bench/presets.c tests/unit/anatomy.c) $(l
 # How far from the best iteration automatic stops are.
 $(BUILD)/stopping: $(call objects,tests/bench/stopping.c tests/unit/anatomy.c) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(LIBM)
+
+# Every method beside the others.
+$(BUILD)/methods: $(call objects,tests/bench/methods.c tests/unit/anatomy.c) $(library)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(LIBM)
+
+# What the check of the geometry says of scans whose geometry is known.
+$(BUILD)/agreement: $(call objects,tests/bench/agreement.c tests/unit/arm.c) $(library)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(LIBM)
 
 $(BUILD)/calibrate-bench: $(call objects,tests/bench/calibrate.c tests/unit/arm.c) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(LIBM)
@@ -251,7 +263,7 @@ apt_install = { $$run apt-get install -y -qq --no-install-recommends $(1) >/dev/
 
 check: OPTIONAL += pg_config:libpq-dev pg_ctlcluster:postgresql
 check: OPTIONAL += g++:g++ /usr/include/dcmtk/dcmnet/scu.h:libdcmtk-dev chromium:chromium dciodvfy:dicom3tools Orthanc:orthanc-dicomweb promtool:prometheus systemd-analyze:systemd
-check: MODULES += matplotlib:python3-matplotlib nibabel:python3-nibabel pydicom:python3-pydicom gdcm:python3-gdcm
+check: MODULES += matplotlib:python3-matplotlib nibabel:python3-nibabel pydicom:python3-pydicom gdcm:python3-gdcm h5py:python3-h5py olefile:python3-olefile
 setup: ## install the Debian packages that are missing
 	@missing=""; \
 	for pair in $(COMMANDS); do command -v $${pair%%:*} >/dev/null 2>&1 || missing="$$missing $${pair##*:}"; done; \
@@ -285,7 +297,7 @@ FUZZ_SECONDS ?= 10
 fuzzers := $(patsubst tests/fuzz/%.c,$(BUILD)/%,$(wildcard tests/fuzz/fuzz_*.c))
 
 # Of these a fuzz target takes what it needs.
-$(BUILD)/fuzzed.a: $(call objects,$(filter-out daemon/main.c clients/cbct/main.c,$(daemon_sources) $(cbct_sources)))
+$(BUILD)/fuzzed.a: $(call objects,$(filter-out daemon/main.c clients/cbct/main.c,$(daemon_sources) daemon/dicom/answer.c $(cbct_sources)))
 	@rm -f $@
 	$(call say,AR  )$(AR) qcs $@ $^
 
@@ -312,9 +324,25 @@ bench-stopping: setup ## how far from the best iteration "iterations": "auto" en
 	@$(MAKE) --no-print-directory -j$$(nproc) $(BUILD)/stopping >&2
 	@$(BUILD)/stopping
 
+bench-methods: setup ## every method at its best on three anatomies, 26 to 200 views, three levels of noise, on standard output
+	@$(MAKE) --no-print-directory -j$$(nproc) $(BUILD)/methods >&2
+	@seq 0 $$(($$($(BUILD)/methods --list) - 1)) | xargs -P $$(nproc) -I N sh -c '$(BUILD)/methods N >$(BUILD)/methods.N'
+	@cat $$(ls -v $(BUILD)/methods.[0-9]*)
+
+bench-agreement: setup ## what the check of the geometry says of known scans, on standard output
+	@$(MAKE) --no-print-directory -j$$(nproc) $(BUILD)/agreement >&2
+	@$(BUILD)/agreement
+
 bench-calibrate: setup ## a calibration of 400 views of 1240 x 960 pixels, on standard output
 	@$(MAKE) --no-print-directory -j$$(nproc) $(BUILD)/calibrate-bench >&2
 	@$(BUILD)/calibrate-bench
+
+# RABBITCT=FILE: the real data set; else one of the same form with 60 views. RABBITCT_LOLA=PROGRAM: the public runner,
+# whose LolaASM then runs beside on as many threads.
+RABBITCT_SIZES ?= 256 512
+bench-rabbitct: ## RabbitCT's backprojection in GUPS, with its errors in HU, on standard output
+	@$(MAKE) --no-print-directory -j$$(nproc) $(BUILD)/rabbitct >&2
+	@BUILD=$(BUILD) RABBITCT=$(RABBITCT) RABBITCT_LOLA=$(RABBITCT_LOLA) tests/bench/rabbitct.sh $(RABBITCT_SIZES)
 
 bench: setup ## CPU and HTTP benchmarks, results in build/bench/
 	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/cpu-bench $(BUILD)/acquire $(BUILD)/watchers $(BUILD)/slices
@@ -463,6 +491,6 @@ clean: ## removes build/
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z_.-]+:.*## /{printf "  make %-21s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-.PHONY: all test-programs again setup demo check soak fuzz fuzzers paper paper-report bench bench-calibrate bench-denoise bench-presets bench-stopping check-gpu bench-gpu asan tsan lint format rooms pictures third-party compile_commands.json install deb container sbom reproducible clean help
+.PHONY: all test-programs again setup demo check soak fuzz fuzzers paper paper-report bench bench-agreement bench-calibrate bench-denoise bench-presets bench-stopping bench-methods check-gpu bench-gpu asan tsan lint format rooms pictures third-party compile_commands.json install deb container sbom reproducible clean help
 .SECONDARY:
 -include $(shell find $(BUILD) -path $(BUILD)/test -prune -o -type f -name '*.d' -print 2>/dev/null)

@@ -58,14 +58,16 @@ found "scripts that their own language cannot read" "$(
 )"
 # The rooms of core/ and daemon/, lowest first, each with those beneath it whose doors it may use; a room's own files
 # may include each other. A room's doors are the headers that others may include: ROOM/ROOM.h, or those named in doors.
-core_rooms=("scan:" "calibrate: scan" "cpu: scan" "outofcore: scan" "correct: scan" "fit: scan correct" "recon: scan outofcore correct")
+core_rooms=("scan:" "calibrate: scan" "cpu: scan" "outofcore: scan" "refine: scan" "correct: scan refine" "fit: scan correct" "recon: scan outofcore correct")
 daemon_rooms=("http:" "store:" "volumes: store" "jobs: store" "calibrations: store" "sendings: store jobs"
-	"dicom:" "intake: http store"
-	"api: http store volumes jobs calibrations sendings intake")
+	"fleet: store jobs" "dicom:" "intake: http store"
+	"api: http store volumes jobs calibrations sendings fleet intake")
 declare -A doors=(
+	[daemon/store]="store|ledger"
 	[core/scan]="geometry|grid|image|orbit|phantom"
 	[core/cpu]="none"
 	[core/correct]="averaging|correction|counts|images|input|lag|scatter|stuck"
+	[core/refine]="agreement|reduced"
 	[core/fit]="hardening|lag|scatter"
 	[core/recon]="algorithm|parameters|quality|recipe|recon|self_test"
 )

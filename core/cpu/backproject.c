@@ -11,30 +11,30 @@ static int parts(int size, int part)
 	return (size + part - 1) / part;
 }
 
-static void tile_shape(const struct plan *plan, enum backprojection weight, int ret_shape[3])
+static void tile_shape(const struct plan *plan, int ret_shape[3])
 {
 	int along = plan->along_z ? 2 : 0, across = plan->along_z ? 0 : 2;
 
 	ret_shape[along] = TILE_ALONG;
-	ret_shape[across] = plan->across[weight];
-	ret_shape[1] = plan->across[weight];
+	ret_shape[across] = plan->across;
+	ret_shape[1] = plan->across;
 }
 
-int tile_count(const struct plan *plan, enum backprojection weight)
+int tile_count(const struct plan *plan)
 {
 	int shape[3], count = 1;
 
-	tile_shape(plan, weight, shape);
+	tile_shape(plan, shape);
 	for (int i = 0; i < 3; i++)
 		count *= parts(plan->grid.size[i], shape[i]);
 	return count;
 }
 
-void tile_at(const struct plan *plan, enum backprojection weight, int index, struct tile *ret_tile)
+void tile_at(const struct plan *plan, int index, struct tile *ret_tile)
 {
 	int shape[3];
 
-	tile_shape(plan, weight, shape);
+	tile_shape(plan, shape);
 	for (int i = 0; i < 3; i++) {
 		int count = parts(plan->grid.size[i], shape[i]), left;
 
@@ -49,10 +49,9 @@ void tile_at(const struct plan *plan, enum backprojection weight, int index, str
 size_t tile_floats(const struct plan *plan)
 {
 	const int size = plan->grid.size[plan->along_z ? 2 : 0];
-	const int across = plan->across[plan->across[0] < plan->across[1]];
 
-	return (size_t)across * (size_t)across * (size_t)parts(size < TILE_ALONG ? size : TILE_ALONG, LANES_MOST) *
-	       LANES_MOST;
+	return (size_t)plan->across * (size_t)plan->across *
+	       (size_t)parts(size < TILE_ALONG ? size : TILE_ALONG, LANES_MOST) * LANES_MOST;
 }
 
 int tile_lines(const struct plan *plan, const struct tile *tile)
@@ -89,7 +88,7 @@ int cpu_backproject(struct plan *plan, const struct stack *from, const int *view
 {
 	const struct plan *seen = weight == BACKPROJECT_FDK ? plan->filtered : plan;
 	const bool matched = plan->matched && weight == BACKPROJECT_PLAIN;
-	const int tiles = tile_count(plan, weight);
+	const int tiles = tile_count(plan);
 
 	if (from->columns != seen->columns)
 		return error_set(err, ERR_INTERNAL, "%d columns to backproject instead of %d", from->columns,
@@ -102,7 +101,7 @@ int cpu_backproject(struct plan *plan, const struct stack *from, const int *view
 		float *sums = plan_scratch(plan);
 		struct tile tile;
 
-		tile_at(plan, weight, t, &tile);
+		tile_at(plan, t, &tile);
 		memset(sums, 0, tile_floats(plan) * sizeof(float));
 		for (int i = 0; i < count; i++) {
 			const float *projection = stack_slot(from, i);

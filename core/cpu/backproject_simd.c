@@ -15,10 +15,16 @@ struct line {
 	int column_origin, row_origin;
 };
 
+/* The pixel below a position, the nearest one of the detector where it lies beside that. */
+static inline int pixel_near(double position, int size)
+{
+	return position > 0 ? (int)(position < size - 1 ? position : size - 1) : 0;
+}
+
 static void line_set(const struct plan *plan, const double m[12], const struct tile *tile, int index, struct line *ret)
 {
 	const int axis = plan->along_z ? 2 : 0, across = plan->along_z ? 0 : 2;
-	double at[3], column, row, middle;
+	double at[3], column, row, middle, inverse;
 	struct line line;
 
 	at[axis] = tile->first[axis];
@@ -29,10 +35,9 @@ static void line_set(const struct plan *plan, const double m[12], const struct t
 	line.depth = m[8] * at[0] + m[9] * at[1] + m[10] * at[2] + m[11];
 	line.depth_step = m[8 + axis];
 	middle = .5 * (tile->count[axis] - 1);
-	line.column_origin = (int)fmin(fmax((column + middle * m[axis]) / (line.depth + middle * line.depth_step), 0),
-				       plan->columns - 1);
-	line.row_origin =
-	    (int)fmin(fmax((row + middle * m[4 + axis]) / (line.depth + middle * line.depth_step), 0), plan->rows - 1);
+	inverse = 1 / (line.depth + middle * line.depth_step);
+	line.column_origin = pixel_near((column + middle * m[axis]) * inverse, plan->columns);
+	line.row_origin = pixel_near((row + middle * m[4 + axis]) * inverse, plan->rows);
 	line.column = column - line.column_origin * line.depth;
 	line.column_step = m[axis] - line.column_origin * line.depth_step;
 	line.row = row - line.row_origin * line.depth;
@@ -59,19 +64,41 @@ static inline vi neighbours(vf position, int size, int origin, vf *ret_upper)
 }
 
 /*
- * Where LANES voxels of a line fall on the detector, for each group of them in a
- * tile well inside of it: column and row run one way along a line, so its ends
- * bound both.
+ * Where each group of LANES voxels of a line falls on the detector: column and row run one way along a line, so its
+ * ends bound both.
  */
-enum { GROUPS = TILE_ALONG / LANES };
+enum { GROUPS = TILE_ALONG / LANES, COLUMNS_MOST = 5 };
+/*
+ * The most registers of a column that are looked up in: six of AVX-512 still cost less than a gather, four of AVX2 more
+ * (a permutation there reaches one register only).
+ */
+#if defined(SIMD_avx512)
+enum { REGISTERS_MOST = 6 };
+#else
+enum { REGISTERS_MOST = 2 };
+#endif
+enum place { OUTSIDE, EDGE, INSIDE };
 struct line_groups {
-	int columns[GROUPS];             /* 2 or 3 neighbouring ones hold all samples; 0: they lie too far apart */
+	enum place place[GROUPS];
+	/* Inside: 2 to COLUMNS_MOST neighbouring columns hold all samples; 0: they lie too far apart. */
+	int columns[GROUPS];
+	int registers[GROUPS];           /* of LANES rows that hold all samples of a column: 2, 4 or 6 */
 	int column[GROUPS], row[GROUPS]; /* the lowest, counted from the line's origin */
 };
 
-static void line_groups_set(const struct line *line, int count, struct line_groups *ret)
+/* Pixels, above what single precision may err, by which a group lies well inside of the detector or well outside. */
+static const double EDGE_MARGIN = 2e-3;
+
+static enum place place_of(double least, double most, int size)
 {
-	const double margin = 1e-3; /* rows, above what single precision may err: a window has no index -1 */
+	if (least >= EDGE_MARGIN && most <= size - 1 - EDGE_MARGIN)
+		return INSIDE;
+	return most <= -1 - EDGE_MARGIN || least >= size + EDGE_MARGIN ? OUTSIDE : EDGE;
+}
+
+static void line_groups_set(const struct plan *plan, const struct line *line, int count, struct line_groups *ret)
+{
+	const double margin = .5 * EDGE_MARGIN; /* rows: a window has no index -1 */
 
 	for (int g = 0; g * LANES < count; g++) {
 		const int first = g * LANES, last = first + LANES < count ? first + LANES - 1 : count - 1;
@@ -81,32 +108,71 @@ static void line_groups_set(const struct line *line, int count, struct line_grou
 		const double c1 = (line->column + last * line->column_step) * inverse1;
 		const double r0 = (line->row + first * line->row_step) * inverse0;
 		const double r1 = (line->row + last * line->row_step) * inverse1;
-		const double column = floor(c0 < c1 ? c0 : c1), row = floor((r0 < r1 ? r0 : r1) - margin);
-		const double across = (c0 < c1 ? c1 : c0) - column, along = (r0 < r1 ? r1 : r0) - row + margin;
+		const double c_least = c0 < c1 ? c0 : c1, c_most = c0 < c1 ? c1 : c0;
+		const double r_least = r0 < r1 ? r0 : r1, r_most = r0 < r1 ? r1 : r0;
+		const double column = floor(c_least), row = floor(r_least - margin);
+		const double across = c_most - column, along = r_most - row + margin;
+		const enum place by_column =
+		    place_of(c_least + line->column_origin, c_most + line->column_origin, plan->columns);
+		const enum place by_row = place_of(r_least + line->row_origin, r_most + line->row_origin, plan->rows);
 
+		/* What lies behind the source, or cannot be compared, is worked out voxel by voxel. */
+		ret->place[g] = inverse0 > 0 && inverse1 > 0 ? (by_column < by_row ? by_column : by_row) : EDGE;
+		if (ret->place[g] != INSIDE)
+			continue;
 		ret->column[g] = (int)column;
 		ret->row[g] = (int)row;
-		ret->columns[g] = along >= 2 * LANES - 1 || across >= 2 ? 0 : across < 1 ? 2 : 3;
+		ret->registers[g] = along < 2 * LANES - 1 ? 2 : along < 4 * LANES - 1 ? 4 : 6;
+		ret->columns[g] =
+		    along >= REGISTERS_MOST * LANES - 1 || across >= COLUMNS_MOST - 1 ? 0 : (int)across + 2;
 	}
 }
 
-/* Bilinear samples at `column` and `row` counted from `pixel`, which see 2 or 3 columns and 2 LANES rows. */
-static inline vf window_samples(const float *pixel, int rows, int columns, vf column, vf row)
+/*
+ * Bilinear samples at `column` and `row` counted from `pixel`, which see so many columns and registers of LANES rows.
+ * Where a voxel is several pixels large the rows between are read in vain, and still cost less than a gather.
+ */
+static inline __attribute__((always_inline)) vf window_samples(const float *pixel, int rows, int columns, int registers,
+							       vf column, vf row)
 {
 	const vf zero = vf_all(0), one = vf_all(1);
-	const vf left = columns == 2 ? one - column : vf_max(one - column, zero);
-	const vf right = columns == 2 ? zero : vf_max(column - one, zero);
-	const vf weights[3] = {left, columns == 2 ? column : one - left - right, right};
 	vf upper, below = zero, above = zero;
 	vi index = vf_split(row, &upper);
 
 	for (int j = 0; j < columns; j++, pixel += rows) {
-		const vf low = vf_load(pixel), high = vf_load(pixel + LANES);
+		const vf from = column - (float)j;
+		const vf weight =
+		    columns == 2 ? (j == 0 ? one - column : column) : vf_max(one - vf_max(from, -from), zero);
 
-		below = vf_fma(weights[j], vf_window(low, high, index), below);
-		above = vf_fma(weights[j], vf_window(low, high, index + 1), above);
+		below = vf_fma(weight, vf_windows(pixel, registers, index), below);
+		above = vf_fma(weight, vf_windows(pixel, registers, index + 1), above);
 	}
 	return vf_fma(upper, above - below, below);
+}
+
+/* The same with both counts known to the compiler. */
+static inline vf window_samples_of(const float *pixel, int rows, int columns, int registers, vf column, vf row)
+{
+	switch (8 * registers + columns) {
+#define CASE(REGISTERS, COLUMNS)                                                                                       \
+	case 8 * (REGISTERS) + (COLUMNS):                                                                              \
+		return window_samples(pixel, rows, COLUMNS, REGISTERS, column, row)
+		CASE(2, 2);
+		CASE(2, 3);
+		CASE(2, 4);
+		CASE(2, 5);
+		CASE(4, 2);
+		CASE(4, 3);
+		CASE(4, 4);
+		CASE(4, 5);
+		CASE(6, 2);
+		CASE(6, 3);
+		CASE(6, 4);
+		CASE(6, 5);
+#undef CASE
+	default:
+		return window_samples(pixel, rows, columns, registers, column, row);
+	}
 }
 
 static inline vf gathered_samples(const struct plan *plan, const struct line *line, const float *pixel, vf column,
@@ -125,8 +191,21 @@ static inline vf gathered_samples(const struct plan *plan, const struct line *li
 	return vf_fma(right, p10 - p00, p00);
 }
 
+/* Samples without weight of LANES voxels whose places are inside. */
+static inline vf inside_samples(const struct plan *plan, const struct line *line, const struct line_groups *groups,
+				int g, const float *origin, vf column, vf row)
+{
+	const float *pixel = origin + (ptrdiff_t)groups->column[g] * plan->rows + groups->row[g];
+
+	if (groups->columns[g] == 0)
+		return gathered_samples(plan, line, origin, column, row);
+	return window_samples_of(pixel, plan->rows, groups->columns[g], groups->registers[g],
+				 column - (float)groups->column[g], row - (float)groups->row[g]);
+}
+
+/* sums NULL with projection NULL, cover NULL: not wanted. */
 static inline void backproject_line(const struct plan *plan, const struct line *line, int count, float distance2,
-				    bool inside, const float *projection, float *sums, float *cover)
+				    const float *projection, float *sums, float *cover)
 {
 	const vf column0 = vf_all((float)line->column), column_step = vf_all((float)line->column_step);
 	const vf row0 = vf_all((float)line->row), row_step = vf_all((float)line->row_step);
@@ -136,8 +215,7 @@ static inline void backproject_line(const struct plan *plan, const struct line *
 
 	if (projection != NULL)
 		origin += (size_t)line->column_origin * (size_t)plan->rows + (size_t)line->row_origin;
-	if (inside)
-		line_groups_set(line, count, &groups);
+	line_groups_set(plan, line, count, &groups);
 	for (int g = 0; g * LANES < count; g++) {
 		const size_t at = (size_t)g * LANES;
 		const vf lane = vf_iota() + (float)at;
@@ -146,23 +224,17 @@ static inline void backproject_line(const struct plan *plan, const struct line *
 		const vf row = vf_fma(lane, row_step, row0) * inverse;
 		vf weight = vf_all(1), sample;
 
-		if (!inside) {
+		if (groups.place[g] == OUTSIDE)
+			continue;
+		if (groups.place[g] == EDGE)
 			weight = cover_of(column, plan->columns, line->column_origin) *
 				 cover_of(row, plan->rows, line->row_origin);
-			if (cover != NULL)
-				vf_store(cover + at, vf_load(cover + at) + weight);
-			if (projection == NULL)
-				continue;
-		}
-		if (inside && groups.columns[g] > 0) {
-			const vf c = column - (float)groups.column[g], r = row - (float)groups.row[g];
-			const float *pixel = origin + (ptrdiff_t)groups.column[g] * plan->rows + groups.row[g];
-
-			sample = groups.columns[g] == 2 ? window_samples(pixel, plan->rows, 2, c, r)
-							: window_samples(pixel, plan->rows, 3, c, r);
-		} else {
-			sample = gathered_samples(plan, line, origin, column, row);
-		}
+		if (cover != NULL)
+			vf_store(cover + at, vf_load(cover + at) + weight);
+		if (projection == NULL)
+			continue;
+		sample = groups.place[g] == INSIDE ? inside_samples(plan, line, &groups, g, origin, column, row)
+						   : gathered_samples(plan, line, origin, column, row);
 		if (distance2 > 0)
 			weight *= distance2 * inverse * inverse;
 		vf_store(sums + at, vf_fma(weight, sample, vf_load(sums + at)));
@@ -311,8 +383,6 @@ static void backproject_columns(const struct plan *plan, const double m[12], con
 /* True when all eight corners fall well inside of the detector: then all voxels do. */
 static bool tile_inside(const struct plan *plan, const double m[12], const struct tile *tile)
 {
-	const double margin = 2e-3; /* pixels, above what single precision may err */
-
 	for (int corner = 0; corner < 8; corner++) {
 		double at[3], depth, column, row;
 
@@ -321,8 +391,8 @@ static bool tile_inside(const struct plan *plan, const double m[12], const struc
 		depth = m[8] * at[0] + m[9] * at[1] + m[10] * at[2] + m[11];
 		column = (m[0] * at[0] + m[1] * at[1] + m[2] * at[2] + m[3]) / depth;
 		row = (m[4] * at[0] + m[5] * at[1] + m[6] * at[2] + m[7]) / depth;
-		if (!(column >= margin && column <= plan->columns - 1 - margin && row >= margin &&
-		      row <= plan->rows - 1 - margin))
+		if (!(column >= EDGE_MARGIN && column <= plan->columns - 1 - EDGE_MARGIN && row >= EDGE_MARGIN &&
+		      row <= plan->rows - 1 - EDGE_MARGIN))
 			return false;
 	}
 	return true;
@@ -349,11 +419,8 @@ bool SIMD_NAME(backproject)(const struct plan *plan, int view_index, const struc
 		size_t at = (size_t)i * tile->stride;
 
 		line_set(plan, view->matrix, tile, i, &line);
-		if (inside)
-			backproject_line(plan, &line, count, distance2, true, projection, sums + at, NULL);
-		else
-			backproject_line(plan, &line, count, distance2, false, projection,
-					 sums != NULL ? sums + at : NULL, cover != NULL ? cover + at : NULL);
+		backproject_line(plan, &line, count, distance2, projection, sums != NULL ? sums + at : NULL,
+				 cover != NULL && !inside ? cover + at : NULL);
 	}
 	return inside;
 }

@@ -24,12 +24,11 @@
  * last one; every allocation has them, zeroed.
  */
 enum {
-	SLACK = 64,
-	LANES_MOST = 16,     /* of any instruction set */
-	BLOCK_COLUMNS = 16,  /* of a projection that are handed out together */
-	TILE_ACROSS = 4,     /* voxels of a tile across its lines */
-	MATCHED_ACROSS = 16, /* the same for the matched backprojection, whose rays reach two voxels beyond a tile */
-	TILE_ALONG = 512,    /* and at most so many along one */
+	SLACK = 96,
+	LANES_MOST = 16,    /* of any instruction set */
+	BLOCK_COLUMNS = 16, /* of a projection that are handed out together */
+	TILE_ACROSS = 16,   /* voxels of a tile across its lines at most: few pixels are then read for two tiles */
+	TILE_ALONG = 512,   /* and at most so many along one */
 	TILE_LINES = TILE_ACROSS * TILE_ACROSS,
 	PULSE_TILES = 16, /* one in so many small tiles counts as a step: the counter is shared by all threads */
 	BLEND_MARGIN = 2 * LANES_MOST, /* floats beside a column of voxels in scratch, for windows beyond its ends */
@@ -78,10 +77,10 @@ struct plan {
 	double spacing_least; /* mm */
 	bool untilted;        /* rows of the detector across z, columns along z, lanes along both */
 	bool fans;            /* untilted, and no ray passes more voxels along z than across */
+	int across;           /* voxels of a tile across its lines */
 	bool along_z;         /* backprojection takes voxels along z together, else along x */
 	bool along_rows;      /* projection takes pixels along a column of the detector together, else along a row */
 	bool matched;         /* plain backprojection is the transpose of the projection */
-	int across[2];        /* voxels of a tile across its lines, by enum backprojection */
 	char summary[96];
 
 	struct linearise linearise;
@@ -245,7 +244,7 @@ static inline size_t project_scratch_floats(const struct plan *plan)
 /* Scratch for a column: of each row its height, its ray, and two floats for each voxel across a tile; with margins. */
 static inline size_t matched_scratch_floats(const struct plan *plan)
 {
-	return plan->matched ? (10 + 2 * MATCHED_ACROSS) * (lanes_padded(plan->rows) + 2 * ROWS_MARGIN) : 0;
+	return plan->matched ? (10 + 2 * TILE_ACROSS) * (lanes_padded(plan->rows) + 2 * ROWS_MARGIN) : 0;
 }
 
 static inline float *plan_scratch(const struct plan *plan)
@@ -287,8 +286,8 @@ int column_blocks(const struct plan *plan);
 int cpu_backproject(struct plan *plan, const struct stack *from, const int *views, int count,
 		    enum backprojection weight, struct volume *to, struct error *err);
 /* Tiles that the grid is cut into; tile_at gives one of them. */
-int tile_count(const struct plan *plan, enum backprojection weight);
-void tile_at(const struct plan *plan, enum backprojection weight, int index, struct tile *ret_tile);
+int tile_count(const struct plan *plan);
+void tile_at(const struct plan *plan, int index, struct tile *ret_tile);
 size_t tile_floats(const struct plan *plan); /* of the largest tile's sums */
 int tile_lines(const struct plan *plan, const struct tile *tile);
 /* The voxels of one line of a tile: first float in a volume, floats from one to the next, how many. */

@@ -25,8 +25,8 @@ struct column {
 	 * of them reaches.
 	 */
 	float *height;
-	float *value[MATCHED_ACROSS], *step[MATCHED_ACROSS];
-	int begin[MATCHED_ACROSS], end[MATCHED_ACROSS];
+	float *value[TILE_ACROSS], *step[TILE_ACROSS];
+	int begin[TILE_ACROSS], end[TILE_ACROSS];
 	float lowest, highest; /* height of those that give anything */
 };
 
@@ -45,13 +45,13 @@ static void column_set(const struct plan *plan, const struct cpu_view *view, int
 	for (int i = 0; i < 3; i++)
 		ret->direction[i] = view->pixel0[i] + index * view->column_step[i];
 	ret->height = scratch + ROWS_MARGIN;
-	for (int j = 0; j < MATCHED_ACROSS; j++) {
+	for (int j = 0; j < TILE_ACROSS; j++) {
 		ret->value[j] = ret->height + (size_t)(1 + 2 * j) * floats;
 		ret->step[j] = ret->value[j] + floats;
 	}
 	for (int k = 0; k < 2 * LANES; k++) /* far from all voxels */
 		ret->height[ret->first - 2 * LANES + k] = ret->height[(ret->last / LANES + 1) * LANES + k] = -1e6f;
-	ret->groups = (struct group *)(void *)(ret->height - ROWS_MARGIN + (size_t)(1 + 2 * MATCHED_ACROSS) * floats);
+	ret->groups = (struct group *)(void *)(ret->height - ROWS_MARGIN + (size_t)(1 + 2 * TILE_ACROSS) * floats);
 }
 
 /*

@@ -58,6 +58,21 @@ static bool rays_lie_flat(const struct geometry *geometry, const struct grid *gr
 	return true;
 }
 
+/*
+ * The matched pair's rays reach two voxels beyond a tile, whatever its size. Others take less where a small grid would
+ * not give all threads a tile.
+ */
+static int tile_across(const struct plan *plan)
+{
+	enum { ACROSS_LEAST = 4, TILES_WANTED = 64 };
+	const int sides[2] = {plan->grid.size[1], plan->grid.size[plan->along_z ? 0 : 2]};
+	int ret = TILE_ACROSS;
+
+	while (!plan->matched && ret > ACROSS_LEAST && (sides[0] / ret) * (sides[1] / ret) < TILES_WANTED)
+		ret /= 2;
+	return ret;
+}
+
 /* Everything about the plan that takes no memory to know. */
 static void plan_shape(const struct plan_options *options, struct plan *ret)
 {
@@ -79,8 +94,7 @@ static void plan_shape(const struct plan_options *options, struct plan *ret)
 	ret->untilted = ret->along_z && ret->along_rows && geometry_is_untilted(geometry);
 	ret->fans = ret->untilted && rays_lie_flat(geometry, grid);
 	ret->matched = options->matched;
-	ret->across[BACKPROJECT_FDK] = TILE_ACROSS;
-	ret->across[BACKPROJECT_PLAIN] = ret->matched ? MATCHED_ACROSS : TILE_ACROSS;
+	ret->across = tile_across(ret);
 	ret->linearise = options->linearise;
 	ret->filter_batch = at_least_one(share, geometry->count);
 	if (options->sart != NULL) {

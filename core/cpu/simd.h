@@ -171,6 +171,13 @@ static inline vf vf_window(vf low, vf high, vi index)
 	return (vf)_mm512_permutex2var_ps((__m512)low, (__m512i)index, (__m512)high);
 }
 
+/* a where the index is at least `least`, else b. */
+static inline vf vf_where_reached(vi index, int least, vf a, vf b)
+{
+	return (vf)_mm512_mask_mov_ps((__m512)b, _mm512_cmpge_epi32_mask((__m512i)index, _mm512_set1_epi32(least)),
+				      (__m512)a);
+}
+
 #elif defined(SIMD_avx2)
 
 static inline vf vf_min(vf a, vf b)
@@ -211,6 +218,13 @@ static inline vf vf_window(vf low, vf high, vi index)
 
 	/* bit 3 of the index chooses the register: moved to the sign */
 	return (vf)_mm256_blendv_ps(a, b, _mm256_castsi256_ps(_mm256_slli_epi32((__m256i)index, 28)));
+}
+
+static inline vf vf_where_reached(vi index, int least, vf a, vf b)
+{
+	const __m256i reached = _mm256_cmpgt_epi32((__m256i)index, _mm256_set1_epi32(least - 1));
+
+	return (vf)_mm256_blendv_ps((__m256)b, (__m256)a, _mm256_castsi256_ps(reached));
 }
 
 #else
@@ -270,7 +284,26 @@ static inline vf vf_window(vf low, vf high, vi index)
 	return v;
 }
 
+static inline vf vf_where_reached(vi index, int least, vf a, vf b)
+{
+	for (int l = 0; l < LANES; l++)
+		b[l] = index[l] >= least ? a[l] : b[l];
+	return b;
+}
+
 #endif
+
+/* Looks up each lane's index, below registers x LANES, in so many registers that follow each other: 2, 4 or 6. */
+static inline __attribute__((always_inline)) vf vf_windows(const float *from, int registers, vi index)
+{
+	vf ret = vf_window(vf_load(from), vf_load(from + LANES), index);
+
+	for (int r = 2; r < registers; r += 2)
+		ret =
+		    vf_where_reached(index, r * LANES,
+				     vf_window(vf_load(from + r * LANES), vf_load(from + (r + 1) * LANES), index), ret);
+	return ret;
+}
 
 /*
  * Linear interpolation in a row at positions that are not negative and below
