@@ -37,6 +37,13 @@ const struct warning_kind warning_kinds[] = {
      "The centre of rotation falls outside of the detector: the calibration may be that of another detector."},
     {"mirrored_views", SEVERITY_SERIOUS, "Some projections are mirrored against the others: the image is wrong."},
     {"mirrored_columns", SEVERITY_SERIOUS, "The projections may be mirrored: left and right may be exchanged."},
+    /* ---- of the projections against the geometry ---- */
+    {"geometry_doubtful", SEVERITY_CAUTION,
+     "The projections do not quite fit each other where the arm is said to have stood: fine detail may be blurred or "
+     "doubled."},
+    {"geometry_wrong", SEVERITY_SERIOUS,
+     "The projections do not fit each other: the arm stood elsewhere than the scan says, or the patient moved; the "
+     "image may be wrong."},
     /* ---- of a calibration, and of a scan that uses one ---- */
     {"calibration_interpolated", SEVERITY_INFO,
      "The arm's places in this scan are interpolated between those that were calibrated."},

@@ -9,18 +9,18 @@
 
 extern const struct correction correction_lag, correction_scatter, correction_flat_dark, correction_air_region,
     correction_hardening, correction_defects, correction_samples, correction_truncation, correction_exterior,
-    correction_blank_views, correction_metal, correction_averaging;
+    correction_blank_views, correction_metal, correction_averaging, correction_agreement;
 
 /*
  * In the order in which they run. The detector's lag is of all that it has counted, scatter too. Defects of the map are
  * known before an air region's mean is taken, and hardening is that of line integrals. The exterior goes before what
  * leaves rays out, which it could not see through. Blank views are made up for before metal is looked for. Pixels are
- * averaged when the rays that are left out are known.
+ * averaged when the rays that are left out are known. The check of the geometry changes nothing.
  */
 const struct correction *const corrections[CORRECTION_COUNT] = {
-    &correction_lag,        &correction_scatter,     &correction_flat_dark, &correction_defects,
-    &correction_air_region, &correction_hardening,   &correction_samples,   &correction_truncation,
-    &correction_exterior,   &correction_blank_views, &correction_metal,     &correction_averaging,
+    &correction_lag,       &correction_scatter,   &correction_flat_dark,  &correction_defects,  &correction_air_region,
+    &correction_hardening, &correction_samples,   &correction_truncation, &correction_exterior, &correction_blank_views,
+    &correction_metal,     &correction_averaging, &correction_agreement,
 };
 
 static bool is_wanted(const struct correction *row, const struct recipe *recipe, const struct linearise *linearise)
@@ -138,6 +138,7 @@ int corrections_take(struct correction_chain *chain, const void *samples, int vi
 	int code = 0;
 
 	input_look_at_bytes(chain->input, samples);
+	samples = input_bin(chain->input, samples);
 	if (chain->counts != NULL) {
 		code = correct_counts(chain, samples, view, err);
 		samples = chain->counts;

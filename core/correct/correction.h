@@ -55,7 +55,8 @@ struct correction_job {
 	 */
 	int (*wide)(void *context, struct error *err);
 	void *wide_context;
-	double *settled; /* iterations after which relaxation falls (averaging.h); INFINITY: never */
+	struct recon_agreement *agreement; /* what the check of the geometry finds goes there */
+	double *settled;                   /* iterations after which relaxation falls (averaging.h); INFINITY: never */
 	const struct warning_sink *warnings;
 	const struct cancel *cancel;
 };
@@ -73,6 +74,7 @@ struct correction_bytes {
 	size_t device;   /* beside `borrowed` */
 	size_t borrowed; /* of the job's plan's block (plan_options.lends) */
 	size_t host;     /* out of core (core/outofcore/outofcore.h) */
+	size_t aside;    /* the host's whatever the device is: the job's, too, where its device works in that */
 };
 /* The job before anything is open; the recipe is resolved. */
 struct correction_ask {
@@ -131,7 +133,7 @@ struct correction {
 	int (*resume)(const struct correction_job *job, void *state, const void *bytes, size_t size, struct error *err);
 };
 
-enum { CORRECTION_COUNT = 12 };
+enum { CORRECTION_COUNT = 13 };
 extern const struct correction *const corrections[CORRECTION_COUNT];
 
 /* The corrections of one reconstruction. */

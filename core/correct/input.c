@@ -58,23 +58,41 @@ static int turn(struct input *input, struct error *err)
 	return code;
 }
 
-int input_open(struct input *ret_input, const struct linearise *linearise, const struct geometry *geometry, bool turned,
-	       struct error *err)
+/* Defects are counted among the detector's own pixels; the map, and what is wide in it, is that of the blocks. */
+static void take_found(struct defect_map *map, const struct defect_map *found)
 {
-	struct input input = {.given = *linearise,
-			      .linearise = counts_linearise(linearise),
-			      .turned = turned,
-			      .columns = turned ? geometry->rows : geometry->columns,
-			      .rows = turned ? geometry->columns : geometry->rows};
-	int code = turned ? turn(&input, err) : 0;
+	map->given = found->given;
+	map->dead = found->dead;
+	map->hot = found->hot;
+	map->noisy = found->noisy;
+	map->stuck = found->stuck;
+}
+
+int input_open(struct input *ret_input, const struct linearise *linearise, const struct geometry *geometry, int n,
+	       bool turned, struct error *err)
+{
+	struct input input = {.turned = turned};
+	int code = corrections_check(linearise, geometry, err), columns, rows;
 
 	if (code == 0)
-		code = corrections_check(&input.linearise, geometry, err);
+		code = binning_open(&input.binning, linearise, geometry, n, err);
+	if (code < 0)
+		return code;
+	input.given = input.binning.binned;
+	input.linearise = counts_linearise(&input.given);
+	input.columns = input.binning.blocks.count[0];
+	input.rows = input.binning.blocks.count[1];
+	columns = turned ? input.rows : input.columns;
+	rows = turned ? input.columns : input.rows;
+	if (turned)
+		code = turn(&input, err);
 	if (code == 0)
-		code = defect_map_make(&input.map, &input.linearise, geometry->columns, geometry->rows, err);
+		code = defect_map_make(&input.map, &input.linearise, columns, rows, err);
+	if (code == 0 && n > 1)
+		take_found(&input.map, &input.binning.found);
 	if (code == 0) {
 		input.linearise.image[IMAGE_DEFECTS] = input.map.map;
-		input.pixels = (size_t)geometry->columns * (size_t)geometry->rows;
+		input.pixels = (size_t)columns * (size_t)rows;
 		input.look_every = geometry->count / 32 + 1;
 		input.even = true;
 		input.good[0] = input.good[1] = -1;
@@ -94,7 +112,9 @@ int input_open(struct input *ret_input, const struct linearise *linearise, const
 
 size_t input_view_bytes(const struct input *input)
 {
-	return linearise_sample_bytes(&input->given) * (size_t)input->columns * (size_t)input->rows;
+	const struct binning *binning = &input->binning;
+
+	return linearise_sample_bytes(&binning->given) * (size_t)binning->columns * (size_t)binning->rows;
 }
 
 void input_clear(struct input *input)
@@ -104,6 +124,7 @@ void input_clear(struct input *input)
 	free(input->stuck);
 	free(input->projection);
 	defect_map_clear(&input->map);
+	binning_clear(&input->binning);
 	free(input->blank);
 	free(input->content);
 	free(input->profiles);
@@ -179,16 +200,22 @@ static int exchanged(uint16_t sample)
 
 void input_look_at_bytes(struct input *input, const void *raw)
 {
+	const size_t pixels = (size_t)input->binning.columns * (size_t)input->binning.rows;
 	const uint16_t *samples = raw;
 
-	if (input->given.sample != SAMPLE_UINT16)
+	if (input->binning.given.sample != SAMPLE_UINT16)
 		return;
-	for (size_t i = 1; i < input->pixels; i += input->pixels / 4096 + 1) {
+	for (size_t i = 1; i < pixels; i += pixels / 4096 + 1) {
 		input->rough[0] += abs(samples[i] - samples[i - 1]);
 		input->rough[1] += abs(exchanged(samples[i]) - exchanged(samples[i - 1]));
 		if (exchanged(samples[i]) > input->largest)
 			input->largest = exchanged(samples[i]);
 	}
+}
+
+const void *input_bin(struct input *input, const void *samples)
+{
+	return binning_view(&input->binning, samples);
 }
 
 /* True if the mean of a piece of the row, 1/32 of it or 8 pixels, reaches the level. */

@@ -1,6 +1,7 @@
 #ifndef CBCT_CORE_INPUT_H
 #define CBCT_CORE_INPUT_H
 
+#include "core/correct/binning.h"
 #include "core/correct/content.h"
 #include "core/correct/defects.h"
 #include "core/correct/outliers.h"
@@ -10,10 +11,11 @@ enum { COPIES_MOST = 12 };
 
 /* The samples that a reconstruction was given: how they come, and statistics of those seen so far. */
 struct input {
-	struct linearise given;     /* of the samples as they come */
+	struct binning binning;     /* of the samples as they come */
+	struct linearise given;     /* of samples with their pixels binned */
 	struct linearise linearise; /* with the whole map, of counts that were corrected; exchanged where `turned` */
 	bool turned;                /* rows and columns of all images are exchanged on their way in */
-	int columns, rows;          /* as they come */
+	int columns, rows;          /* as they come, binned */
 	/* Owned, with rows and columns exchanged; NULL where not turned: linearise's images, and room for a view. */
 	void *image[IMAGE_COUNT], *stuck, *projection;
 	struct defect_map map;
@@ -68,17 +70,20 @@ struct input {
 };
 
 /*
- * Checks linearise against the detector; looks for defects in its images. turned: the geometry is that of
- * geometry_exchange, linearise and all samples are as before that. Free with input_clear.
+ * Checks linearise against the detector; looks for defects in its images. geometry is that of the samples as they come,
+ * n x n of whose pixels are taken as one. turned: rows and columns are exchanged behind that, for a job whose geometry
+ * is geometry_exchange's. Free with input_clear.
  */
-int input_open(struct input *ret_input, const struct linearise *linearise, const struct geometry *geometry, bool turned,
-	       struct error *err);
+int input_open(struct input *ret_input, const struct linearise *linearise, const struct geometry *geometry, int n,
+	       bool turned, struct error *err);
 void input_clear(struct input *input);
 
 /* Of the samples as they come. */
 size_t input_view_bytes(const struct input *input);
 /* Looks at a view's samples as they come, for signs that their bytes are in the wrong order. */
 void input_look_at_bytes(struct input *input, const void *samples);
+/* A view's samples with their pixels binned; valid until the next call. */
+const void *input_bin(struct input *input, const void *samples);
 
 /* linearise of one view into a slot; the samples are those that corrections of counts have left. *ret_upright: the
  * samples, or their rows and columns exchanged where `turned`. */

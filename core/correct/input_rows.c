@@ -140,30 +140,33 @@ static int warn_of_defects(const struct correction_job *job, void *state, struct
 	const struct defect_map *map = &input->map;
 	const size_t found = defects_total(counts) - counts->mapped;
 	const size_t mapped = map->given + map->dead + map->hot + map->noisy;
-	const double pixels = (double)job->geometry->columns * job->geometry->rows;
+	const struct binning *binning = &input->binning;
+	const double samples = (double)input->pixels * input->views;
+	const double pixels = (double)binning->columns * binning->rows;
+	const char *fate =
+	    binning->n == 1 ? "replaced from their neighbours" : "left out of the blocks of binned pixels";
 
 	(void)state;
 	(void)err;
-	if (map->map != NULL && mapped > 0)
-		warning_tell(
-		    job->warnings, "defect_map",
-		    "%zu pixels (%.3g %%) of every projection were replaced from their neighbours: %zu of the given "
-		    "map, and %zu dead, %zu hot and %zu noisy ones that the flat and dark images show",
-		    mapped, 100 * (double)mapped / pixels, map->given, map->dead, map->hot, map->noisy);
-	defect_map_warn(map, job->geometry->columns, job->geometry->rows, job->warnings);
+	if (mapped > 0)
+		warning_tell(job->warnings, "defect_map",
+			     "%zu pixels (%.3g %%) of every projection were %s: %zu of the given "
+			     "map, and %zu dead, %zu hot and %zu noisy ones that the flat and dark images show",
+			     mapped, 100 * (double)mapped / pixels, fate, map->given, map->dead, map->hot, map->noisy);
+	defect_map_warn(map, binning->columns, binning->rows, job->warnings);
 	if (map->stuck > 0)
-		warning_tell(
-		    job->warnings, "stuck_pixels",
-		    "%zu pixels (%.3g %%) do not follow their neighbours over the views and were replaced from them; "
-		    "a map of the detector's defects with the scan is the surer way",
-		    map->stuck, 100 * (double)map->stuck / pixels);
+		warning_tell(job->warnings, "stuck_pixels",
+			     "%zu pixels (%.3g %%) do not follow their neighbours over the views and were %s; "
+			     "a map of the detector's defects with the scan is the surer way",
+			     map->stuck, 100 * (double)map->stuck / pixels,
+			     binning->n == 1 ? "replaced from them" : fate);
 	if (found > 0)
 		warning_tell(
 		    job->warnings, "defects",
 		    "%zu samples (%.3g %%) in %d projections were replaced from their neighbours: %zu not above the "
 		    "dark, %zu saturated, %zu not finite or without a flat",
-		    found, 100 * (double)found / (pixels * input->views), input->defective_views, counts->zero,
-		    counts->saturated, counts->not_finite);
+		    found, 100 * (double)found / samples, input->defective_views, counts->zero, counts->saturated,
+		    counts->not_finite);
 	return 0;
 }
 

@@ -17,8 +17,9 @@ struct recon {
 	const struct backend *backend;
 	struct device *device;
 	struct device *outofcore;        /* out-of-core wrapper around `device`; NULL when the job fits as a whole */
-	const struct geometry *geometry; /* that which was given, or `upright` */
-	struct geometry upright;         /* owned, empty where the given one was that */
+	const struct geometry *given;    /* of the samples as they come */
+	const struct geometry *geometry; /* that all goes by: given, `binned` or `upright` */
+	struct geometry binned, upright; /* owned, empty where pixels are taken as they are and rows as they lie */
 	const struct recon_hooks *hooks;
 	struct cancel cancel;
 	struct warning_sink warnings;
@@ -53,8 +54,9 @@ struct recon {
 
 	bool resumed, ran, ended; /* ended: behind the last iteration */
 	int iteration;            /* done so far */
-	double settled;           /* iterations after which relaxation falls; INFINITY: never */
-	bool moved;               /* the iterate is not the one that the algorithm left */
+	struct recon_agreement agreement;
+	double settled; /* iterations after which relaxation falls; INFINITY: never */
+	bool moved;     /* the iterate is not the one that the algorithm left */
 	struct volume_norms norms;
 	struct stopping stopping;     /* of automatic iterations */
 	double work_done, work_total; /* in FDKs of the whole scan */
@@ -113,8 +115,8 @@ bool has_subsets(const struct recipe *recipe);
 struct plan_options plan_options(const struct recon *recon);
 
 /*
- * The first step of an opening: the orbit, the geometry that all goes by (recon->geometry goes in and comes out), the
- * recipe resolved, and its subsets. All that takes no memory of the device. Whatever it returns, recon_clear.
+ * The first step of an opening, from recon->given: the recipe resolved, the geometry that all goes by and its orbit,
+ * and the subsets. All that takes no memory of the device. Whatever it returns, recon_clear.
  */
 int recon_describe(struct recon *recon, const struct recipe *recipe, struct error *err);
 /*

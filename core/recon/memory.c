@@ -207,13 +207,13 @@ static int memory_on(const struct backend *backend, struct device *device, struc
 	memory.scratch = bytes.scratch + bytes.raw + beside.scratch;
 	if (backend == &backend_outofcore) {
 		/* The device holds slabs of one volume at a time, or a correction's; the host has all the rest. */
-		memory.host = bytes.host + beside.host + around.host + kept;
+		memory.host = bytes.host + beside.host + around.host + around.aside + kept;
 		if (around.device > memory.volumes + memory.scratch)
 			memory.scratch = around.device - memory.volumes;
 	} else {
 		/* A backend without memory of its own works in the host's. */
 		memory.projections = planned.projections + beside.projections;
-		memory.scratch += around.device + (backend->own_memory ? 0 : kept);
+		memory.scratch += around.device + (backend->own_memory ? 0 : kept + around.aside);
 	}
 	memory.total = memory.projections + memory.volumes + memory.scratch;
 	if (device != NULL) {
@@ -241,16 +241,28 @@ int recon_choose_device(struct recon *recon, struct plan_options *options, struc
 
 /* ---- the job before its views ---- */
 
-/*
- * The orbit, and the geometry that all goes by: FDK filters along the rows, so that a detector that lies on its side
- * has its rows and columns exchanged, in recon->upright. That stays empty for any other.
- */
+/* Takes the pixels of the geometry as the recipe says. */
+static int bin_pixels(struct recon *recon, struct error *err)
+{
+	int code;
+
+	if (recon->recipe.binning == 1)
+		return 0;
+	code = geometry_bin(&recon->binned, recon->given, recon->recipe.binning, err);
+	if (code < 0)
+		return code;
+	recon->geometry = &recon->binned;
+	orbit_clear(&recon->orbit);
+	return orbit_analyse(&recon->orbit, recon->geometry, err);
+}
+
+/* FDK filters along the rows, so that a detector that lies on its side has its rows and columns exchanged. */
 static int stand_up(struct recon *recon, struct error *err)
 {
-	int code = orbit_analyse(&recon->orbit, recon->geometry, err);
+	int code;
 
-	if (code < 0 || !recon->orbit.turned)
-		return code;
+	if (!recon->orbit.turned)
+		return 0;
 	orbit_clear(&recon->orbit);
 	code = geometry_exchange(&recon->upright, recon->geometry, err);
 	if (code < 0)
@@ -261,12 +273,17 @@ static int stand_up(struct recon *recon, struct error *err)
 
 int recon_describe(struct recon *recon, const struct recipe *recipe, struct error *err)
 {
-	int code = stand_up(recon, err);
+	int code = orbit_analyse(&recon->orbit, recon->given, err);
 
+	recon->geometry = recon->given;
 	if (code == 0)
 		code = recipe_copy(&recon->recipe, recipe, err);
 	if (code == 0)
-		code = recipe_resolve(&recon->recipe, recon->geometry, &recon->orbit, err);
+		code = recipe_resolve(&recon->recipe, recon->given, &recon->orbit, err);
+	if (code == 0)
+		code = bin_pixels(recon, err);
+	if (code == 0)
+		code = stand_up(recon, err);
 	if (code < 0 || !has_subsets(&recon->recipe))
 		return code;
 	recon->sart.relaxation = recon->recipe.sart.relaxation;
@@ -280,8 +297,9 @@ int recon_memory(const struct backend *backend, struct device *device, const str
 		 struct error *err)
 {
 	float some = 0; /* stands for the weights: only whether there are any is asked here */
-	struct recon recon = {.backend = backend, .device = device, .geometry = geometry};
+	struct recon recon = {.backend = backend, .device = device, .given = geometry};
 	struct plan_options options;
+	struct linearise binned;
 	int code = recon_describe(&recon, recipe, err);
 
 	if (code == 0) {
@@ -292,7 +310,8 @@ int recon_memory(const struct backend *backend, struct device *device, const str
 		    .pad = {recon.orbit.pad[0], recon.orbit.pad[1]},
 		    .extend = recipe->fdk.extend ? recon.geometry->columns : 0,
 		};
-		recon.input.linearise = counts_linearise(linearise);
+		binned = binning_linearise(linearise, recon.recipe.binning);
+		recon.input.linearise = counts_linearise(&binned);
 		options = plan_options(&recon);
 		code = recon_choose_device(&recon, &options, err);
 		recon.weights = (struct fdk_weights){0};

@@ -116,6 +116,7 @@ static int open_corrections(struct recon *recon, struct error *err)
 	    .iteration = &recon->iteration,
 	    .wide = begin_rim,
 	    .wide_context = recon,
+	    .agreement = &recon->agreement,
 	    .settled = &recon->settled,
 	    .warnings = &recon->warnings,
 	    .cancel = &recon->cancel,
@@ -177,14 +178,15 @@ int recon_open(const struct backend *backend, struct device *device, const struc
 		return error_set(err, ERR_NO_MEMORY, "no memory for a reconstruction");
 	recon->backend = backend;
 	recon->device = device;
-	recon->geometry = geometry;
+	recon->given = geometry;
 	recon->hooks = hooks;
 	recon->settled = INFINITY;
 	recon->cancel = (struct cancel){.asked = hooks->cancelled, .context = hooks->context};
 	recon->warnings = (struct warning_sink){.context = hooks->context, .tell = hooks->warning};
 	code = recon_describe(recon, recipe, err);
 	if (code == 0)
-		code = input_open(&recon->input, linearise, recon->geometry, recon->geometry != geometry, err);
+		code = input_open(&recon->input, linearise, geometry, recon->recipe.binning,
+				  recon->geometry == &recon->upright, err);
 	if (code == 0)
 		code = recon_prepare(recon, err);
 	if (code == 0)
@@ -226,6 +228,7 @@ void recon_clear(struct recon *recon)
 		backend_outofcore.close(recon->outofcore);
 	input_clear(&recon->input);
 	geometry_clear(&recon->upright);
+	geometry_clear(&recon->binned);
 	free(recon->pushed);
 	free(recon->views);
 }

@@ -74,6 +74,8 @@ struct recon_hooks {
 	void (*denoising)(void *context, double noise_hu, double alpha);
 	/* With automatic iterations, behind the row of the last one. */
 	void (*stopped)(void *context, const struct recon_stop *stop);
+	/* Once all views have come, where they show enough: how well they agree with the geometry. */
+	void (*agreement)(void *context, const struct recon_agreement *agreement);
 	/* A code of core/warning.h and the technical detail. */
 	void (*warning)(void *context, const char *code, const char *detail);
 }; /* any of them may be NULL */

@@ -521,6 +521,8 @@ int recon_run(struct recon *recon, struct error *err)
 	if (!recon->resumed) {
 		warn_recipe(&recon->warnings, recon->geometry, &recon->orbit, recipe);
 		code = corrections_warn(&recon->corrections, err);
+		if (code == 0 && recon->agreement.views > 0 && recon->hooks->agreement != NULL)
+			recon->hooks->agreement(recon->hooks->context, &recon->agreement);
 	}
 	if (code == 0)
 		code = cancel_check(&recon->cancel, err);

@@ -314,6 +314,46 @@ int geometry_exchange(struct geometry *ret_geometry, const struct geometry *geom
 	return 0;
 }
 
+struct pixel_blocks geometry_blocks(const struct geometry *geometry, int n)
+{
+	const int pixels[2] = {geometry->columns, geometry->rows};
+	struct pixel_blocks blocks;
+
+	for (int i = 0; i < 2; i++) {
+		blocks.size[i] = pixels[i] == 1 ? 1 : n;
+		blocks.count[i] = pixels[i] / blocks.size[i];
+		blocks.first[i] = (pixels[i] - blocks.count[i] * blocks.size[i]) / 2;
+	}
+	return blocks;
+}
+
+/* pixel0' is the middle of the first block: first + (size - 1) / 2 pixels along both steps. */
+int geometry_bin(struct geometry *ret_geometry, const struct geometry *geometry, int n, struct error *err)
+{
+	const struct pixel_blocks blocks = geometry_blocks(geometry, n);
+	int code;
+
+	if (blocks.count[0] == 0 || blocks.count[1] == 0)
+		return error_set(err, ERR_IMPOSSIBLE, "a detector of %d x %d pixels has no %d x %d of them",
+				 geometry->columns, geometry->rows, blocks.size[0], blocks.size[1]);
+	code = geometry_copy(ret_geometry, geometry, err);
+	if (code < 0)
+		return code;
+	ret_geometry->columns = blocks.count[0];
+	ret_geometry->rows = blocks.count[1];
+	for (int k = 0; k < geometry->count; k++) {
+		struct view *view = &ret_geometry->views[k];
+
+		for (int i = 0; i < 3; i++) {
+			view->pixel0[i] += (blocks.first[0] + 0.5 * (blocks.size[0] - 1)) * view->column_step[i] +
+					   (blocks.first[1] + 0.5 * (blocks.size[1] - 1)) * view->row_step[i];
+			view->column_step[i] *= blocks.size[0];
+			view->row_step[i] *= blocks.size[1];
+		}
+	}
+	return 0;
+}
+
 void view_matrix(const struct view *view, double ret_matrix[12])
 {
 	double w[3], a[3][3], length, scale;

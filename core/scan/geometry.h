@@ -58,6 +58,18 @@ int geometry_copy(struct geometry *ret_geometry, const struct geometry *geometry
 int geometry_exchange(struct geometry *ret_geometry, const struct geometry *geometry, struct error *err);
 void geometry_clear(struct geometry *geometry);
 
+/* Blocks of `size` pixels that become one, as many as the detector holds; the first begins at pixel `first`. */
+struct pixel_blocks {
+	int size[2], first[2], count[2]; /* along columns and rows */
+};
+/*
+ * Blocks of n x n pixels, of n x 1 on a detector of one row. Pixels that no block takes are left out, half of them at
+ * each side. The count is 0 where the detector is smaller than a block.
+ */
+struct pixel_blocks geometry_blocks(const struct geometry *geometry, int n);
+/* Makes the geometry of the detector whose pixels are these blocks; ERR_IMPOSSIBLE where there are none. */
+int geometry_bin(struct geometry *ret_geometry, const struct geometry *geometry, int n, struct error *err);
+
 /* Column step for row step. */
 void view_exchange(struct view *view);
 

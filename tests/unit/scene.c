@@ -160,6 +160,11 @@ static void on_stopped(void *context, const struct recon_stop *stop)
 	outcome->stop = *stop;
 }
 
+static void on_agreement(void *context, const struct recon_agreement *agreement)
+{
+	((struct outcome *)context)->agreement = *agreement;
+}
+
 static void on_denoising(void *context, double noise_hu, double alpha)
 {
 	struct outcome *outcome = context;
@@ -214,6 +219,7 @@ void scene_run(const struct scene *scene, const struct recipe *recipe, struct ou
 	    .row = on_row,
 	    .keep = on_keep,
 	    .denoising = on_denoising,
+	    .agreement = on_agreement,
 	    .stopped = on_stopped,
 	    .warning = on_warning,
 	};

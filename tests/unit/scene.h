@@ -62,11 +62,12 @@ struct outcome {
 	int kept_count;
 	struct history_row rows[SCENE_ROWS_MOST];
 	int row_count;
-	char log[SCENE_LOG_MOST]; /* each hook in its order: "fdk tv fdk-tv! sart tv row1 ..." */
-	char warnings[1024];      /* "code: detail\n" */
-	struct recon_stop stop;   /* told last; rule STOP_NOT: none was */
-	int stops;                /* times that one was told */
-	double fraction;          /* of the last progress; the test ends where it falls */
+	char log[SCENE_LOG_MOST];         /* each hook in its order: "fdk tv fdk-tv! sart tv row1 ..." */
+	char warnings[1024];              /* "code: detail\n" */
+	struct recon_agreement agreement; /* told last; views 0: none was */
+	struct recon_stop stop;           /* told last; rule STOP_NOT: none was */
+	int stops;                        /* times that one was told */
+	double fraction;                  /* of the last progress; the test ends where it falls */
 	int asked;
 	float *last; /* the iterate as it was at the end, kept or not */
 	char *state; /* what recon_save_state gave then */

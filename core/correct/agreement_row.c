@@ -1,0 +1,130 @@
+/*
+ * The check of the geometry as a row of corrections[]: it corrects nothing, and holds the views against each other
+ * once all have come (core/refine/agreement.h). It works in the host's memory and on its processor, whatever the device
+ * is: the scan is small by then.
+ */
+#include <stdlib.h>
+
+#include "core/correct/correction.h"
+#include "core/correct/input.h"
+#include "core/refine/agreement.h"
+
+struct state {
+	struct reduced reduced;
+	float *view; /* [row][column] of the scan, on its way into bins */
+};
+
+static void close_row(void *opaque)
+{
+	struct state *state = opaque;
+
+	if (state == NULL)
+		return;
+	reduced_clear(&state->reduced);
+	free(state->view);
+	free(state);
+}
+
+/* Without a state there is nothing to check. */
+static int open_row(const struct correction_job *job, void **ret_state, struct error *err)
+{
+	const size_t pixels = (size_t)job->geometry->columns * (size_t)job->geometry->rows;
+	struct state *state;
+	int code;
+
+	if (!agreement_is_possible(job->geometry, job->orbit))
+		return 0;
+	state = calloc(1, sizeof(*state));
+	if (state == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for the check of the geometry");
+	code = reduced_open(&state->reduced, job->geometry, job->orbit, AGREEMENT_VIEWS_MOST, AGREEMENT_BINS_MOST, err);
+	state->view = malloc(pixels * sizeof(*state->view));
+	if (code == 0 && state->view == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for a view");
+	if (code < 0)
+		close_row(state);
+	else
+		*ret_state = state;
+	return code;
+}
+
+static int bytes(const struct correction_ask *ask, struct correction_bytes *bytes, struct error *err)
+{
+	struct reduced reduced;
+	size_t working = 0;
+	int code;
+
+	if (!agreement_is_possible(ask->geometry, ask->orbit))
+		return 0;
+	code = reduced_open(&reduced, ask->geometry, ask->orbit, AGREEMENT_VIEWS_MOST, AGREEMENT_BINS_MOST, err);
+	if (code < 0)
+		return code;
+	code = agreement_bytes(&reduced, &working, err);
+	bytes->aside += working + reduced_bytes(ask->geometry, AGREEMENT_VIEWS_MOST, AGREEMENT_BINS_MOST) +
+			(size_t)ask->geometry->columns * (size_t)ask->geometry->rows * sizeof(float);
+	reduced_clear(&reduced);
+	return code;
+}
+
+static int take_view(const struct correction_job *job, void *opaque, const struct correction_view *view,
+		     struct error *err)
+{
+	struct state *state = opaque;
+	int code;
+
+	if (state == NULL || !reduced_wants(&state->reduced, view->view))
+		return 0;
+	code = job->backend->stack_download(view->to, view->slot, 1, state->view, err);
+	if (code == 0)
+		reduced_take(&state->reduced, view->view, state->view);
+	return code;
+}
+
+static void tell(const struct correction_job *job, const struct agreement *agreement, double bin)
+{
+	const enum agreement_grade grade = agreement_grade(agreement, bin);
+
+	if (grade == AGREEMENT_GOOD)
+		return;
+	warning_tell(
+	    job->warnings, grade == AGREEMENT_WRONG ? "geometry_wrong" : "geometry_doubtful",
+	    "projections and geometry disagree by at least %.2g mm at the isocentre (root mean square over %d views; "
+	    "%.2g mm is what noise and the object's own detail make uncertain); view %d is farthest off, by %.2g mm",
+	    agreement->mm, agreement->measured, agreement->sigma_mm, agreement->worst, agreement->worst_mm);
+}
+
+static int warn(const struct correction_job *job, void *opaque, struct error *err)
+{
+	struct state *state = opaque;
+	struct agreement agreement;
+	int code;
+
+	if (state == NULL)
+		return 0;
+	for (int i = 0; i < job->input->counts.blank; i++)
+		reduced_leave_out(&state->reduced, job->input->blank[i]);
+	code = agreement_measure(&state->reduced, job->cancel, &agreement, err);
+	if (code < 0)
+		return code;
+	if (agreement_is_known(&agreement)) {
+		tell(job, &agreement, reduced_bin(&state->reduced, job->orbit));
+		job->agreement->mm = agreement.mm;
+		job->agreement->sigma_mm = agreement.sigma_mm;
+		job->agreement->views = agreement.measured;
+	}
+	agreement_clear(&agreement);
+	return 0;
+}
+
+extern const struct correction correction_agreement;
+const struct correction correction_agreement = {
+    .name = "agreement",
+    .summary = "projections are held against each other, and a geometry that does not fit them is told",
+    .times = 1U << CORRECT_LINE_INTEGRALS,
+    .needs = NEEDS_WHOLE_IMAGES,
+    .bytes = bytes,
+    .open = open_row,
+    .close = close_row,
+    .view = take_view,
+    .warn = warn,
+};

@@ -1,0 +1,278 @@
+/* Views beside the reprojection of the other ones: see agreement.h. */
+#include "core/refine/agreement.h"
+
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+#ifdef _OPENMP
+#include <omp.h>
+#endif
+
+#include "core/fdk.h"
+#include "core/refine/shift.h"
+
+enum { HALVES = 2, VIEWS_LEAST = 48, BINS_LEAST = 24, MEASURED_LEAST = 24 };
+static const double ARC_LEAST = 2.8; /* radians; a shorter arc's volume is too far from the object */
+/* Bins at the isocentre, and sigmas, from which on the geometry is doubtful; bins from which on it is wrong. */
+static const double DOUBTFUL = 0.09, BEYOND_SIGMA = 2, WRONG = 0.15;
+
+/* The reconstruction of half of the views. */
+struct half {
+	struct orbit orbit;
+	struct grid grid;
+	struct fdk_weights weights;
+	struct plan *plan;
+	struct fdk fdk;
+	struct stack *measured, *made; /* of all views, and of half of them */
+	struct volume *volume;
+	const struct reduced *reduced;
+	struct device *device;
+	const struct cancel *cancel;
+};
+
+bool agreement_is_possible(const struct geometry *geometry, const struct orbit *orbit)
+{
+	return geometry->count >= VIEWS_LEAST && geometry->columns >= BINS_LEAST && geometry->rows >= BINS_LEAST &&
+	       orbit->arc >= ARC_LEAST && orbit->field_of_view > 0;
+}
+
+static int half_of(int count)
+{
+	return (count + 1) / HALVES;
+}
+
+static struct plan_options plan_options_of(const struct half *half)
+{
+	struct plan_options options = {
+	    .geometry = &half->reduced->geometry,
+	    .grid = &half->grid,
+	    .linearise = {.sample = SAMPLE_FLOAT32},
+	    .column_weights = half->weights.columns,
+	    .filter_response = half->weights.response,
+	    .pad = {half->weights.pad[0], half->weights.pad[1]},
+	    .extend = half->weights.extend,
+	    .extended_response = half->weights.extended,
+	    .no_samples = true,
+	};
+
+	memcpy(options.axis, half->weights.axis, sizeof(options.axis));
+	return options;
+}
+
+static int describe(struct half *half, const struct reduced *reduced, struct error *err)
+{
+	const struct geometry *geometry = &reduced->geometry;
+	int code;
+
+	*half = (struct half){.reduced = reduced};
+	code = orbit_analyse(&half->orbit, geometry, err);
+	if (code < 0)
+		return code;
+	orbit_covering_grid(&half->orbit, geometry, AGREEMENT_BINS_MOST, &half->grid);
+	return fdk_weights_make(&half->weights, &half->orbit, geometry, WINDOW_HANN, 1, true, err);
+}
+
+static void half_clear(struct half *half)
+{
+	const struct backend *backend = &backend_cpu;
+
+	backend->volume_free(half->volume);
+	backend->stack_free(half->measured);
+	backend->stack_free(half->made);
+	fdk_clear(&half->fdk);
+	backend->plan_free(half->plan);
+	fdk_weights_clear(&half->weights);
+	orbit_clear(&half->orbit);
+	backend->close(half->device);
+}
+
+int agreement_bytes(const struct reduced *reduced, size_t *ret_bytes, struct error *err)
+{
+	const struct geometry *geometry = &reduced->geometry;
+	const struct backend *backend = &backend_cpu;
+	struct plan_bytes bytes = {0};
+	struct half half;
+	int code = describe(&half, reduced, err);
+
+	if (code == 0) {
+		const struct plan_options plan = plan_options_of(&half);
+
+		code = backend->plan_bytes(NULL, &plan, &bytes, err);
+	}
+	if (code == 0)
+		*ret_bytes = bytes.volumes + bytes.scratch + bytes.raw + backend->volume_bytes(&half.grid) +
+			     fdk_bytes(backend, geometry, half.weights.pad) +
+			     backend->stack_bytes(geometry->columns, geometry->rows, geometry->count) +
+			     backend->stack_bytes(geometry->columns, geometry->rows, half_of(geometry->count));
+	half_clear(&half);
+	return code;
+}
+
+/* The threads that the caller's other work on the host is shared among. */
+static int host_threads(void)
+{
+#ifdef _OPENMP
+	return omp_get_max_threads();
+#else
+	return 1;
+#endif
+}
+
+static int open_half(struct half *half, struct error *err)
+{
+	const struct geometry *geometry = &half->reduced->geometry;
+	const struct backend *backend = &backend_cpu;
+	const struct plan_options plan = plan_options_of(half);
+	int code = backend->open(0, &(struct device_options){.threads = host_threads()}, &half->device, err);
+
+	if (code == 0)
+		code = backend->plan_new(half->device, &plan, &half->plan, err);
+	if (code == 0)
+		code = fdk_open(&half->fdk, backend, half->device, half->plan, geometry, half->weights.pad, err);
+	if (code == 0)
+		code = backend->stack_new(half->device, geometry->columns, geometry->rows, geometry->count,
+					  &half->measured, err);
+	if (code == 0)
+		code = backend->stack_new(half->device, geometry->columns, geometry->rows, half_of(geometry->count),
+					  &half->made, err);
+	return code == 0 ? backend->volume_new(half->device, &half->grid, &half->volume, err) : code;
+}
+
+/* Reprojects the views of one half, whose numbers are `views`, from a volume made of the others. */
+static int reproject(struct half *half, int which, int *views, int *ret_count, struct error *err)
+{
+	const struct backend *backend = &backend_cpu;
+	const int count = half->reduced->geometry.count;
+	int others = 0, code = backend->volume_fill(half->volume, 0, err);
+
+	for (int k = 0; k < count && code == 0; k++) {
+		if (k % HALVES == which)
+			views[others++] = k;
+		else if (half->reduced->known[k])
+			code = fdk_add(&half->fdk, k, k, half->measured, half->volume, err);
+		if (code == 0)
+			code = cancel_check(half->cancel, err);
+	}
+	if (code == 0)
+		code = fdk_flush(&half->fdk, half->measured, half->volume, err);
+	/* The weights are those of all views. */
+	if (code == 0)
+		code = backend->volume_axpby(HALVES, half->volume, 0, half->volume, err);
+	*ret_count = others;
+	return code == 0 ? backend->project(half->plan, half->volume, views, others, half->made, err) : code;
+}
+
+static int measure_half(struct half *half, int which, int *views, float *made, struct view_agreement *ret_views,
+			struct error *err)
+{
+	const struct reduced *reduced = half->reduced;
+	const struct geometry *geometry = &reduced->geometry;
+	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
+	int count, code = reproject(half, which, views, &count, err), failed = 0;
+
+	if (code == 0)
+		code = backend_cpu.stack_download(half->made, 0, count, made, err);
+	if (code < 0)
+		return code;
+#pragma omp parallel for schedule(dynamic) reduction(min : failed)
+	for (int i = 0; i < count; i++) {
+		struct view_agreement *view = &ret_views[views[i]];
+		struct image_shift shift;
+		struct error why;
+		const int found =
+		    !reduced->known[views[i]]
+			? 0
+			: image_shift_find(reduced->projections + (size_t)views[i] * pixels, made + (size_t)i * pixels,
+					   geometry->columns, geometry->rows, &shift, &why);
+
+		failed = found < failed ? found : failed;
+		pulse_beat();
+		view->measured = found > 0;
+		for (int a = 0; a < 2 && found > 0; a++) {
+			view->shift[a] = shift.bins[a] * half->orbit.pixel_at_isocentre[a];
+			view->sigma[a] = shift.sigma[a] * half->orbit.pixel_at_isocentre[a];
+		}
+	}
+	return failed < 0 ? error_set(err, failed, "no memory to compare views of %d x %d bins", geometry->columns,
+				      geometry->rows)
+			  : 0;
+}
+
+static void summarise(struct agreement *agreement, const struct reduced *reduced)
+{
+	double squares = 0, sigmas = 0;
+
+	for (int k = 0; k < reduced->geometry.count; k++) {
+		const struct view_agreement *view = &agreement->views[k];
+		const double square = pow(view->shift[0], 2) + pow(view->shift[1], 2);
+
+		if (!view->measured)
+			continue;
+		squares += square;
+		sigmas += pow(view->sigma[0], 2) + pow(view->sigma[1], 2);
+		agreement->measured++;
+		if (sqrt(square) > agreement->worst_mm) {
+			agreement->worst_mm = sqrt(square);
+			agreement->worst = reduced->views[k];
+		}
+	}
+	if (agreement->measured == 0)
+		return;
+	agreement->mm = sqrt(fmax(0, squares - sigmas) / agreement->measured);
+	agreement->sigma_mm = sqrt(sigmas / agreement->measured);
+}
+
+int agreement_measure(const struct reduced *reduced, const struct cancel *cancel, struct agreement *ret_agreement,
+		      struct error *err)
+{
+	const struct geometry *geometry = &reduced->geometry;
+	const size_t count = (size_t)geometry->count, pixels = (size_t)geometry->columns * (size_t)geometry->rows;
+	struct agreement agreement = {.views = calloc(count, sizeof(*agreement.views))};
+	float *made = malloc((size_t)half_of(geometry->count) * pixels * sizeof(*made));
+	int *views = malloc(count * sizeof(*views));
+	struct half half;
+	int code = describe(&half, reduced, err);
+
+	if (code == 0 && (agreement.views == NULL || made == NULL || views == NULL))
+		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views in bins", geometry->count);
+	half.cancel = cancel;
+	if (code == 0)
+		code = open_half(&half, err);
+	if (code == 0)
+		code = backend_cpu.stack_upload(half.measured, 0, geometry->count, reduced->projections, err);
+	for (int which = 0; which < HALVES && code == 0; which++)
+		code = measure_half(&half, which, views, made, agreement.views, err);
+	if (code == 0)
+		summarise(&agreement, reduced);
+	half_clear(&half);
+	free(made);
+	free(views);
+	if (code < 0)
+		agreement_clear(&agreement);
+	else
+		*ret_agreement = agreement;
+	return code;
+}
+
+bool agreement_is_known(const struct agreement *agreement)
+{
+	return agreement->measured >= MEASURED_LEAST;
+}
+
+enum agreement_grade agreement_grade(const struct agreement *agreement, double bin)
+{
+	/* mm^2 is the mean square without that of sigma. */
+	const double raw = hypot(agreement->mm, agreement->sigma_mm);
+
+	if (!agreement_is_known(agreement) || agreement->mm < DOUBTFUL * bin ||
+	    raw < BEYOND_SIGMA * agreement->sigma_mm)
+		return AGREEMENT_GOOD;
+	return agreement->mm < WRONG * bin ? AGREEMENT_DOUBTFUL : AGREEMENT_WRONG;
+}
+
+void agreement_clear(struct agreement *agreement)
+{
+	free(agreement->views);
+	*agreement = (struct agreement){0};
+}

@@ -1,0 +1,237 @@
+/*
+ * The shift between two images, by least squares of their difference over the gradients of their mean (Lucas and Kanade
+ * 1981), with a turn, a scale and a gain beside it, iteratively reweighted with Tukey's biweight.
+ */
+#include "core/refine/shift.h"
+
+#include <math.h>
+#include <stdbool.h>
+#include <stdlib.h>
+#include <string.h>
+
+enum { UNKNOWNS = 5, PASSES = 4, EDGE = 3 };
+/* Standard deviations of the two Gaussians between which detail counts, bins. */
+static const double FINE = 1, COARSE = 2.5;
+static const double TUKEY = 4.685, MAD = 1.4826; /* 95 % efficiency; of a normal distribution's median deviation */
+
+/* Images [row][column] of one view. */
+struct pair {
+	int columns, rows;
+	float *image, *other, *narrow, *wide, *work; /* [rows * columns] each, of one allocation */
+};
+
+/* ---- detail ---- */
+
+static void smooth_along(const float *from, size_t step, int count, const float *kernel, int reach, float *to)
+{
+	for (int i = 0; i < count; i++) {
+		float sum = 0;
+
+		for (int k = -reach; k <= reach; k++) {
+			const int at = i + k < 0 ? 0 : i + k >= count ? count - 1 : i + k;
+
+			sum += kernel[k + reach] * from[(size_t)at * step];
+		}
+		to[(size_t)i * step] = sum;
+	}
+}
+
+static void smooth(const struct pair *pair, const float *from, double sigma, float *to)
+{
+	enum { REACH_MOST = 8 };
+	const int reach = (int)ceil(3 * sigma);
+	float kernel[2 * REACH_MOST + 1], sum = 0;
+
+	for (int i = -reach; i <= reach; i++)
+		sum += kernel[i + reach] = (float)exp(-i * i / (2 * sigma * sigma));
+	for (int i = 0; i <= 2 * reach; i++)
+		kernel[i] /= sum;
+	for (int r = 0; r < pair->rows; r++)
+		smooth_along(from + (size_t)r * (size_t)pair->columns, 1, pair->columns, kernel, reach,
+			     pair->work + (size_t)r * (size_t)pair->columns);
+	for (int c = 0; c < pair->columns; c++)
+		smooth_along(pair->work + c, (size_t)pair->columns, pair->rows, kernel, reach, to + c);
+}
+
+static void keep_detail(const struct pair *pair, const float *from, float *to)
+{
+	const size_t pixels = (size_t)pair->columns * (size_t)pair->rows;
+
+	smooth(pair, from, FINE, pair->narrow);
+	smooth(pair, from, COARSE, pair->wide);
+	for (size_t i = 0; i < pixels; i++)
+		to[i] = pair->narrow[i] - pair->wide[i];
+}
+
+/* ---- least squares ---- */
+
+struct normal {
+	double matrix[UNKNOWNS][UNKNOWNS], right[UNKNOWNS];
+	double squares, weights; /* of what is left */
+};
+
+/* Inverts a symmetric positive definite matrix in place; false where it is none to rounding. */
+static bool invert(double matrix[UNKNOWNS][UNKNOWNS])
+{
+	double wide[UNKNOWNS][2 * UNKNOWNS] = {{0}};
+
+	for (int i = 0; i < UNKNOWNS; i++) {
+		memcpy(wide[i], matrix[i], sizeof(matrix[i]));
+		wide[i][UNKNOWNS + i] = 1;
+	}
+	for (int i = 0; i < UNKNOWNS; i++) {
+		const double pivot = wide[i][i];
+
+		if (!(pivot > 1e-10 * matrix[i][i]) || !(pivot > 0))
+			return false;
+		for (int j = 0; j < 2 * UNKNOWNS; j++)
+			wide[i][j] /= pivot;
+		for (int r = 0; r < UNKNOWNS; r++) {
+			const double factor = wide[r][i];
+
+			for (int j = 0; j < 2 * UNKNOWNS && r != i; j++)
+				wide[r][j] -= factor * wide[i][j];
+		}
+	}
+	for (int i = 0; i < UNKNOWNS; i++)
+		memcpy(matrix[i], wide[i] + UNKNOWNS, sizeof(matrix[i]));
+	return true;
+}
+
+/* The derivative at a pixel of the mean of both images, by differences of fourth order: detail is few bins wide. */
+static double gradient(const struct pair *pair, size_t at, size_t step)
+{
+	const float *p = pair->image, *q = pair->other;
+	const double near = (double)p[at + step] - (double)p[at - step] + (double)q[at + step] - (double)q[at - step];
+	const double far =
+	    (double)p[at + 2 * step] - (double)p[at - 2 * step] + (double)q[at + 2 * step] - (double)q[at - 2 * step];
+
+	return (8 * near - far) / 24;
+}
+
+/* Derivatives of `other` by the unknowns: the shifts, a turn and a scale about the middle, and the gain. */
+static void derivatives(const struct pair *pair, int column, int row, double ret[UNKNOWNS])
+{
+	const size_t at = (size_t)row * (size_t)pair->columns + (size_t)column;
+	const double gx = gradient(pair, at, 1), gy = gradient(pair, at, (size_t)pair->columns);
+	const double x = (column - 0.5 * (pair->columns - 1)) / pair->columns;
+	const double y = (row - 0.5 * (pair->rows - 1)) / pair->columns;
+
+	ret[0] = -gx;
+	ret[1] = -gy;
+	ret[2] = y * gx - x * gy;
+	ret[3] = -x * gx - y * gy;
+	ret[4] = (double)pair->other[at];
+}
+
+/* What is left of the difference beyond `cut` has no weight; what is left of each pixel goes to ret_left. */
+static int add_up(const struct pair *pair, const double unknowns[UNKNOWNS], double cut, struct normal *ret_normal,
+		  float *ret_left)
+{
+	struct normal sums = {.weights = 0};
+	int count = 0;
+
+	for (int row = EDGE; row < pair->rows - EDGE; row++)
+		for (int column = EDGE; column < pair->columns - EDGE; column++) {
+			const size_t at = (size_t)row * (size_t)pair->columns + (size_t)column;
+			const double difference = (double)pair->image[at] - (double)pair->other[at];
+			double d[UNKNOWNS], left = difference, share, weight;
+
+			derivatives(pair, column, row, d);
+			for (int i = 0; i < UNKNOWNS; i++)
+				left -= d[i] * unknowns[i];
+			share = fabs(left) / cut;
+			weight = share < 1 ? pow(1 - share * share, 2) : 0;
+			for (int i = 0; i < UNKNOWNS; i++) {
+				for (int j = 0; j < UNKNOWNS; j++)
+					sums.matrix[i][j] += weight * d[i] * d[j];
+				sums.right[i] += weight * d[i] * difference;
+			}
+			sums.squares += weight * left * left;
+			sums.weights += weight;
+			ret_left[count++] = (float)fabs(left);
+		}
+	*ret_normal = sums;
+	return count;
+}
+
+/* The value that half of the others are below; changes their order (Hoare 1961). */
+static double median_of(float *values, int count)
+{
+	int low = 0, high = count - 1;
+	const int wanted = count / 2;
+
+	while (low < high) {
+		const float pivot = values[(low + high) / 2];
+		int i = low, j = high;
+
+		while (i <= j) {
+			while (values[i] < pivot)
+				i++;
+			while (values[j] > pivot)
+				j--;
+			if (i <= j) {
+				const float value = values[i];
+
+				values[i++] = values[j];
+				values[j--] = value;
+			}
+		}
+		if (wanted <= j)
+			high = j;
+		else if (wanted >= i)
+			low = i;
+		else
+			break;
+	}
+	return (double)values[wanted];
+}
+
+static bool fit(const struct pair *pair, struct image_shift *ret_shift)
+{
+	/* A smoothed pixel shares its noise with so many others. */
+	const double alike = fmax(1, 4 * acos(-1) * FINE * FINE);
+	double unknowns[UNKNOWNS] = {0}, cut = INFINITY, variance;
+	struct normal normal;
+
+	for (int pass = 0; pass <= PASSES; pass++) {
+		const int count = add_up(pair, unknowns, cut, &normal, pair->work);
+
+		variance = normal.squares / normal.weights;
+		if (!(normal.weights > 0) || !invert(normal.matrix))
+			return false;
+		memset(unknowns, 0, sizeof(unknowns));
+		for (int i = 0; i < UNKNOWNS; i++)
+			for (int j = 0; j < UNKNOWNS; j++)
+				unknowns[i] += normal.matrix[i][j] * normal.right[j];
+		cut = TUKEY * MAD * median_of(pair->work, count) + 1e-12;
+	}
+	for (int a = 0; a < 2; a++) {
+		ret_shift->bins[a] = unknowns[a];
+		ret_shift->sigma[a] = sqrt(alike * variance * normal.matrix[a][a]);
+	}
+	return true;
+}
+
+int image_shift_find(const float *image, const float *other, int columns, int rows, struct image_shift *ret_shift,
+		     struct error *err)
+{
+	const size_t pixels = (size_t)columns * (size_t)rows;
+	float *all = malloc(5 * pixels * sizeof(*all));
+	const struct pair pair = {.columns = columns,
+				  .rows = rows,
+				  .image = all,
+				  .other = all + pixels,
+				  .narrow = all + 2 * pixels,
+				  .wide = all + 3 * pixels,
+				  .work = all + 4 * pixels};
+	bool found;
+
+	if (all == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for images of %d x %d", columns, rows);
+	keep_detail(&pair, image, pair.image);
+	keep_detail(&pair, other, pair.other);
+	found = fit(&pair, ret_shift);
+	free(all);
+	return found;
+}

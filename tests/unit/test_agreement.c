@@ -1,0 +1,348 @@
+/*
+ * The check of the geometry: exact line integrals through bodies of ellipsoids, as an arm takes them that stands where
+ * the scan says, or elsewhere.
+ */
+#include <check.h>
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "core/refine/agreement.h"
+#include "core/refine/shift.h"
+#include "tests/unit/arm.h"
+#include "tests/unit/scene.h"
+
+enum { COLUMNS = 78, ROWS = 60, VIEWS = 60, PARTS_MOST = 64 };
+static const double PIXEL = 4.928, WATER = 0.0192;
+
+static double uniform(uint64_t *state)
+{
+	*state = *state * 6364136223846793005u + 1442695040888963407u;
+	return ((double)(*state >> 33) + .5) / 2147483648.0;
+}
+
+struct body {
+	struct ellipsoid parts[PARTS_MOST];
+	int count;
+};
+
+static void add(struct body *body, enum shape shape, double a, double b, double c, double x, double y, double z,
+		double hu)
+{
+	ck_assert_int_lt(body->count, PARTS_MOST);
+	body->parts[body->count++] = (struct ellipsoid){
+	    .shape = shape, .semi_axes = {a, b, c}, .centre = {x, y, z}, .angle = x + y, .density = WATER * hu / 1000};
+}
+
+enum scene_kind { SKULL, SKULL_AND_NECK, SCREWS, ABDOMEN, KINDS };
+
+static void make_body(struct body *body, enum scene_kind kind)
+{
+	const bool wide = kind == ABDOMEN;
+	uint64_t random = 17 + (uint64_t)kind;
+
+	body->count = 0;
+	if (wide) {
+		add(body, SHAPE_CYLINDER, 160, 112, 140, 0, 0, 0, 1000);
+		for (int i = -4; i <= 4; i++)
+			add(body, SHAPE_CYLINDER, 22, 18, 11, 0, 62, i * 30, 400);
+	} else {
+		add(body, SHAPE_ELLIPSOID, 74, 90, 78, 0, 0, 8, 1700);
+		add(body, SHAPE_ELLIPSOID, 67, 83, 71, 0, 0, 8, -680);
+	}
+	if (kind == SKULL_AND_NECK)
+		add(body, SHAPE_CYLINDER, 40, 45, 80, 0, 10, -90, 1000);
+	for (int i = 0; kind == SCREWS && i < 4; i++)
+		add(body, SHAPE_ELLIPSOID, 24, 1.8, 1.8, 6 * i, 8 * i - 10, 16 * i - 30, 9000);
+	for (int i = 0; i < 16; i++) {
+		const double turn = 6.28 * uniform(&random), out = (wide ? 100 : 60) * sqrt(uniform(&random));
+		const double size = 2 + 7 * uniform(&random), hu = 60 + 300 * uniform(&random);
+
+		add(body, SHAPE_ELLIPSOID, size, size, size, out * cos(turn), out * sin(turn),
+		    120 * uniform(&random) - 60, uniform(&random) < .5 ? hu : -hu);
+	}
+}
+
+/* The scan as the arm takes it; photons in a pixel of the open beam, 0: no noise. */
+static float *take(const struct arm *arm, enum scene_kind kind, double photons)
+{
+	const size_t pixels = (size_t)arm->columns * (size_t)arm->rows;
+	float *projections = malloc((size_t)arm->count * pixels * sizeof(*projections));
+	struct body body;
+	uint64_t random = 5;
+
+	ck_assert_ptr_nonnull(projections);
+	make_body(&body, kind);
+	for (int k = 0; k < arm->count; k++) {
+		const struct phantom phantom = {.count = body.count, .parts = body.parts};
+		struct view view = arm_view(arm, k);
+		const struct geometry one = {.columns = arm->columns, .rows = arm->rows, .count = 1, .views = &view};
+
+		phantom_project(&phantom, &one, 0, projections + (size_t)k * pixels);
+	}
+	for (size_t i = 0; photons > 0 && i < (size_t)arm->count * pixels; i++) {
+		const double counted = photons * exp(-(double)projections[i]);
+		const double normal = sqrt(-2 * log(uniform(&random))) * cos(2 * M_PI * uniform(&random));
+
+		projections[i] = (float)-log(fmax(.5, counted + sqrt(counted) * normal) / photons);
+	}
+	return projections;
+}
+
+static struct arm arm_of(double arc_deg)
+{
+	return (struct arm){.columns = COLUMNS,
+			    .rows = ROWS,
+			    .count = VIEWS,
+			    .pixel = PIXEL,
+			    .first = .4,
+			    .step = arc_deg * M_PI / 180 / (arc_deg < 360 ? VIEWS - 1 : VIEWS),
+			    .seed = 3};
+}
+
+struct figures {
+	struct agreement agreement;
+	double bin;
+};
+
+/* What the check says of the scan where the geometry says `said`. */
+static struct figures check(const struct geometry *said, const float *projections, bool backwards, int left_out)
+{
+	const size_t pixels = (size_t)said->columns * (size_t)said->rows;
+	struct figures figures;
+	struct orbit orbit;
+	struct reduced reduced;
+	struct error err;
+
+	ck_assert_int_eq(orbit_analyse(&orbit, said, &err), 0);
+	ck_assert(agreement_is_possible(said, &orbit));
+	ck_assert_msg(reduced_open(&reduced, said, &orbit, AGREEMENT_VIEWS_MOST, AGREEMENT_BINS_MOST, &err) == 0, "%s",
+		      err.text);
+	for (int i = 0; i < said->count; i++) {
+		const int k = backwards ? said->count - 1 - i : i;
+
+		if (reduced_wants(&reduced, k))
+			reduced_take(&reduced, k, projections + (size_t)k * pixels);
+	}
+	if (left_out >= 0)
+		reduced_leave_out(&reduced, left_out);
+	figures.bin = reduced_bin(&reduced, &orbit);
+	ck_assert_msg(agreement_measure(&reduced, NULL, &figures.agreement, &err) == 0, "%s", err.text);
+	reduced_clear(&reduced);
+	orbit_clear(&orbit);
+	return figures;
+}
+
+static struct geometry circle_of(const struct arm *arm)
+{
+	struct geometry geometry;
+	struct error err;
+
+	ck_assert_int_eq(arm_nominal_geometry(arm, &geometry, &err), 0);
+	return geometry;
+}
+
+/* False alarms: short scans and full turns, without noise and with much. */
+START_TEST(a_geometry_that_fits_is_not_doubted)
+{
+	static const double arcs[] = {200, 360}, photons[] = {0, 3000};
+	const enum scene_kind kind = (enum scene_kind)(_i / 2);
+	const struct arm arm = arm_of(arcs[_i % 2]);
+	float *projections = take(&arm, kind, photons[(_i + (int)kind) % 2]);
+	struct geometry circle = circle_of(&arm);
+	struct figures found = check(&circle, projections, false, -1);
+
+	ck_assert_msg(agreement_grade(&found.agreement, found.bin) == AGREEMENT_GOOD, "%g mm +- %g of bins of %g",
+		      found.agreement.mm, found.agreement.sigma_mm, found.bin);
+	ck_assert_int_eq(found.agreement.measured, VIEWS);
+	agreement_clear(&found.agreement);
+	geometry_clear(&circle);
+	free(projections);
+}
+END_TEST
+
+static const struct {
+	const char *name;
+	double sag, jitter; /* of the arm */
+	double column;      /* mm, at the isocentre, by which the geometry says that the detector stands aside */
+	double lift;        /* mm, along z, by which arm and object move against each other behind the middle view */
+	double mm[2];       /* that the check says: the least and the most */
+} departures[] = {
+    {"an arm that sags, and a circle", 1, 0, 0, 0, {.4, 4}},
+    {"views each of which stands elsewhere", 1e-9, .9, 0, 0, {.42, 1.2}},
+    {"a detector that stands aside by 1.5 mm", 0, 0, 1.5, 0, {.45, 1.6}},
+    {"a patient who moves by 3 mm amid the scan", 0, 0, 0, 3, {.42, 3}},
+};
+
+START_TEST(a_geometry_that_does_not_fit_is_told)
+{
+	static const enum scene_kind kinds[] = {SKULL, SKULL_AND_NECK, SCREWS};
+	const enum scene_kind kind = kinds[_i % 3];
+	struct arm arm = arm_of(200);
+	struct geometry said = circle_of(&arm);
+	struct figures found;
+	float *projections;
+
+	arm.sag = departures[_i].sag;
+	arm.jitter = departures[_i].jitter;
+	projections = take(&arm, kind, 20000);
+	for (int k = 0; k < VIEWS; k++)
+		for (int a = 0; a < 3; a++) {
+			struct view *view = &said.views[k];
+			const double lift = a == 2 && k > VIEWS / 2 ? departures[_i].lift : 0;
+
+			view->pixel0[a] += departures[_i].column * 1100 / 620 * view->column_step[a] / PIXEL - lift;
+			view->source[a] -= lift;
+		}
+	found = check(&said, projections, false, -1);
+	ck_assert_msg(agreement_grade(&found.agreement, found.bin) == AGREEMENT_WRONG, "%s: %g mm +- %g",
+		      departures[_i].name, found.agreement.mm, found.agreement.sigma_mm);
+	ck_assert_msg(found.agreement.mm > departures[_i].mm[0] && found.agreement.mm < departures[_i].mm[1],
+		      "%s: %g mm", departures[_i].name, found.agreement.mm);
+	agreement_clear(&found.agreement);
+	geometry_clear(&said);
+	free(projections);
+}
+END_TEST
+
+/* The view that stands elsewhere by 4 mm, and no other, is the one that is named; left out it is not missed. */
+START_TEST(one_view_that_stands_elsewhere_is_named)
+{
+	enum { ASIDE = 23 };
+	const struct arm arm = arm_of(200);
+	float *projections = take(&arm, SKULL, 20000);
+	struct geometry said = circle_of(&arm);
+	struct figures found;
+
+	for (int a = 0; a < 3; a++)
+		said.views[ASIDE].pixel0[a] += 4 * 1100. / 620 * said.views[ASIDE].row_step[a] / PIXEL;
+	found = check(&said, projections, false, -1);
+	ck_assert_int_eq(found.agreement.worst, ASIDE);
+	ck_assert_msg(fabs(found.agreement.worst_mm - 4) < .5, "%g mm", found.agreement.worst_mm);
+	agreement_clear(&found.agreement);
+	found = check(&said, projections, false, ASIDE);
+	ck_assert_int_eq(found.agreement.measured, VIEWS - 1);
+	ck_assert_int_eq(agreement_grade(&found.agreement, found.bin), AGREEMENT_GOOD);
+	ck_assert_int_ne(found.agreement.worst, ASIDE);
+	agreement_clear(&found.agreement);
+	geometry_clear(&said);
+	free(projections);
+}
+END_TEST
+
+START_TEST(the_same_bits_in_any_order_and_by_any_number_of_threads)
+{
+	const struct arm arm = arm_of(200);
+	float *projections = take(&arm, SKULL, 20000);
+	struct geometry circle = circle_of(&arm);
+	struct figures one, other;
+
+	backend_host_threads(1);
+	one = check(&circle, projections, false, 7);
+	backend_host_threads(3);
+	other = check(&circle, projections, true, 7);
+	backend_host_threads(0);
+	ck_assert_mem_eq(one.agreement.views, other.agreement.views, VIEWS * sizeof(*one.agreement.views));
+	ck_assert(one.agreement.mm == other.agreement.mm && one.agreement.sigma_mm == other.agreement.sigma_mm);
+	agreement_clear(&one.agreement);
+	agreement_clear(&other.agreement);
+	geometry_clear(&circle);
+	free(projections);
+}
+END_TEST
+
+/* Nothing to see in a view is no shift, and nothing in all views is no number. */
+START_TEST(even_views_are_not_measured)
+{
+	const struct arm arm = arm_of(200);
+	float *projections = calloc((size_t)VIEWS * COLUMNS * ROWS, sizeof(*projections));
+	struct geometry circle = circle_of(&arm);
+	struct figures found;
+
+	ck_assert_ptr_nonnull(projections);
+	found = check(&circle, projections, false, -1);
+	ck_assert(!agreement_is_known(&found.agreement));
+	ck_assert_int_eq(agreement_grade(&found.agreement, found.bin), AGREEMENT_GOOD);
+	agreement_clear(&found.agreement);
+	geometry_clear(&circle);
+	free(projections);
+}
+END_TEST
+
+/*
+ * Spots whose formula is known, moved by a share of a bin and brightened. A tenth of them is hidden by something else.
+ * One step of a linearised fit may be off by some percent of half a bin.
+ */
+START_TEST(a_shift_is_found_beside_what_hides_a_part)
+{
+	static const double shifts[][2] = {{0, 0}, {.31, -.22}, {-.5, .4}};
+	float image[ROWS * COLUMNS], other[ROWS * COLUMNS];
+	struct image_shift found;
+	struct error err;
+
+	for (int r = 0; r < ROWS; r++)
+		for (int c = 0; c < COLUMNS; c++)
+			for (int which = 0; which < 2; which++) {
+				float *to = (which ? other : image) + r * COLUMNS + c;
+
+				*to = 0;
+				for (int i = 0; i < 30; i++) {
+					const double x = c - (7 * i * i + 5) % COLUMNS - (which ? 0 : shifts[_i][0]);
+					const double y = r - (11 * i * i + 9 * i) % ROWS - (which ? 0 : shifts[_i][1]);
+
+					*to += (float)((which ? 1 : 1.02) * exp(-(x * x + y * y) / 8));
+				}
+				if (!which && c > 70)
+					*to += (float)(3 * ((r + c) % 5));
+			}
+	ck_assert_int_eq(image_shift_find(image, other, COLUMNS, ROWS, &found, &err), 1);
+	for (int a = 0; a < 2; a++)
+		ck_assert_msg(fabs(found.bins[a] - shifts[_i][a]) < .01 + .06 * fabs(shifts[_i][a]), "%g, not %g",
+			      found.bins[a], shifts[_i][a]);
+}
+END_TEST
+
+/* A job says it, and with which numbers; the recipe's volume is not touched by it. */
+START_TEST(a_reconstruction_tells_it)
+{
+	struct arm arm = arm_of(200);
+	struct scene scene = {.geometry = circle_of(&arm)};
+	struct outcome outcome = {0};
+	struct recipe recipe;
+
+	arm.sag = _i;
+	scene.projections = take(&arm, SKULL, 20000);
+	recipe_defaults(&recipe);
+	recipe.fdk.on = true;
+	recipe.has_grid = true;
+	recipe.grid = (struct grid){.size = {24, 24, 16}, .spacing = {8, 8, 8}};
+	run(&scene, &recipe, &outcome);
+	ck_assert_int_eq(outcome.agreement.views, VIEWS);
+	ck_assert_msg((strstr(outcome.warnings, "geometry_wrong: ") != NULL) == (_i == 1), "%s", outcome.warnings);
+	ck_assert(strstr(outcome.warnings, "geometry_doubtful") == NULL);
+	ck_assert_msg((outcome.agreement.mm > .4) == (_i == 1), "%g mm", outcome.agreement.mm);
+	outcome_clear(&outcome);
+	recipe_clear(&recipe);
+	scene_clear(&scene);
+}
+END_TEST
+
+Suite *agreement_suite(void);
+Suite *agreement_suite(void)
+{
+	Suite *suite = suite_create("agreement");
+	TCase *known = tcase_create("known");
+
+	tcase_set_timeout(known, 120);
+	tcase_add_loop_test(known, a_geometry_that_fits_is_not_doubted, 0, 2 * KINDS);
+	tcase_add_loop_test(known, a_geometry_that_does_not_fit_is_told, 0,
+			    (int)(sizeof(departures) / sizeof(departures[0])));
+	tcase_add_test(known, one_view_that_stands_elsewhere_is_named);
+	tcase_add_test(known, the_same_bits_in_any_order_and_by_any_number_of_threads);
+	tcase_add_test(known, even_views_are_not_measured);
+	tcase_add_loop_test(known, a_shift_is_found_beside_what_hides_a_part, 0, 3);
+	tcase_add_loop_test(known, a_reconstruction_tells_it, 0, 2);
+	suite_add_tcase(suite, known);
+	return suite;
+}
