@@ -52,6 +52,7 @@ struct recipe {
 		struct tv_options options; /* alpha counts for nothing where it is found */
 	} tv;
 	enum projector projector;
+	int binning; /* pixels a side that are taken as one (core/correct/binning.h); BINNING_AUTO until resolved */
 	struct {
 		bool on; /* needs fdk.on */
 		double threshold_hu;
@@ -67,6 +68,14 @@ static inline int recipe_iterations(const struct recipe *recipe)
 {
 	return recipe->iterate.automatic ? recipe->iterate.most : recipe->iterate.iterations;
 }
+
+enum { BINNING_AUTO = -1, BINNING_MOST = 8 };
+
+/* How well the projections agree with the geometry, core/refine/agreement.h. */
+struct recon_agreement {
+	int views;           /* that were measured; 0: they say nothing, and all is 0 */
+	double mm, sigma_mm; /* at the isocentre */
+};
 
 enum { ITERATIONS_MAX = 100000, GRID_DEFAULT_MOST = 512, METAL_HU_LEAST = 500, METAL_HU_MOST = 1000000 };
 /* Voxels nearer to metal than this are an estimate: most of their rays lie in the metal's shadows. */

@@ -157,6 +157,14 @@ static void run_denoising(void *context, double noise_hu, double alpha)
 		hooks->recon.denoising(hooks->recon.context, noise_hu, alpha);
 }
 
+static void run_agreement(void *context, const struct recon_agreement *agreement)
+{
+	const struct reconstruction_hooks *hooks = ((struct run *)context)->hooks;
+
+	if (hooks->recon.agreement != NULL)
+		hooks->recon.agreement(hooks->recon.context, agreement);
+}
+
 static void run_stopped(void *context, const struct recon_stop *stop)
 {
 	const struct reconstruction_hooks *hooks = ((struct run *)context)->hooks;
@@ -594,6 +602,7 @@ int reconstruction_open(const struct backend *backend, struct device *device,
 						     .keep = run_keep,
 						     .denoising = run_denoising,
 						     .stopped = run_stopped,
+						     .agreement = run_agreement,
 						     .warning = run_warning};
 	reconstruction->backend = backend;
 	reconstruction->device = device;

@@ -99,7 +99,7 @@ static void update_tile(const struct plan *plan, const struct subset *subset, in
 	int everywhere = 0;
 	struct tile tile;
 
-	tile_at(plan, BACKPROJECT_PLAIN, index, &tile);
+	tile_at(plan, index, &tile);
 	memset(sums, 0, 2 * floats * sizeof(float));
 	for (int i = 0; i < count; i++)
 		everywhere += add_view(plan, subset->views[begin + i], &tile, plan->corrections + (size_t)i * pixels,
@@ -125,7 +125,7 @@ static int run_subset(struct plan *plan, const struct subset *subset, const stru
 		      struct volume *volume, const struct cancel *cancel, struct iteration_sums *sums,
 		      struct error *err)
 {
-	const int tiles = tile_count(plan, BACKPROJECT_PLAIN);
+	const int tiles = tile_count(plan);
 
 	for (int begin = 0; begin < subset->count; begin += plan->batch) {
 		int left = subset->count - begin, count = left < plan->batch ? left : plan->batch;

@@ -5,9 +5,12 @@
  */
 #include "core/recon/parameters.h"
 
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+
+#include "core/correct/averaging.h"
 
 const char *const tv_strength_names[TV_STRENGTH_COUNT] = {"light", "medium", "strong"};
 const char *const ray_weights_names[RAY_WEIGHTS_COUNT] = {"even", "counts", "noise"};
@@ -156,6 +159,16 @@ static int check_grid(const struct recipe *recipe, const struct geometry *geomet
 	return code;
 }
 
+static int check_binning(const struct recipe *recipe, const struct geometry *geometry, struct error *err)
+{
+	const struct pixel_blocks blocks = geometry_blocks(geometry, recipe->binning > 0 ? recipe->binning : 1);
+
+	if (blocks.count[0] > 0 && blocks.count[1] > 0)
+		return 0;
+	return error_set_at(err, ERR_IMPOSSIBLE, "/binning", "a detector of %d x %d pixels has no %d x %d of them",
+			    geometry->columns, geometry->rows, blocks.size[0], blocks.size[1]);
+}
+
 int recipe_check(const struct recipe *recipe, const struct geometry *geometry, struct error *err)
 {
 	int code;
@@ -165,6 +178,8 @@ int recipe_check(const struct recipe *recipe, const struct geometry *geometry, s
 		    err, ERR_IMPOSSIBLE,
 		    "neither \"fdk\" nor an algorithm, \"sart\" or another, is given: there is nothing to run");
 	code = check_parameters(recipe, err);
+	if (code == 0)
+		code = check_binning(recipe, geometry, err);
 	if (code == 0 && recipe->algorithm != NULL && recipe->algorithm->subsets)
 		code = check_subsets(recipe, geometry->count, err);
 	if (code == 0 && recipe->tv.on)
@@ -179,15 +194,58 @@ int recipe_check(const struct recipe *recipe, const struct geometry *geometry, s
 	return code;
 }
 
+/* As many pixels as the shorter of a voxel's sides spans, so that the projections keep what voxels can show. */
+static int binning_of_voxels(const struct recipe *recipe, const struct geometry *geometry, const struct orbit *orbit)
+{
+	const double rounding = 1e-6;
+	double pixels[2];
+	int binning;
+
+	if (!recipe->has_grid)
+		return 1;
+	averaging_pixels(orbit, &recipe->grid, pixels);
+	binning = (int)fmin(BINNING_MOST, fmax(1, fmin(pixels[0], pixels[1]) + rounding));
+	while (binning > 1 &&
+	       (geometry_blocks(geometry, binning).count[0] == 0 || geometry_blocks(geometry, binning).count[1] == 0))
+		binning--;
+	return binning;
+}
+
+/* The grid for the pixels as they are taken. */
+static int choose_grid(struct recipe *recipe, const struct geometry *geometry, const struct orbit *orbit,
+		       struct error *err)
+{
+	struct geometry binned = {0};
+	struct orbit own = {0};
+	int code;
+
+	if (recipe->binning == 1) {
+		orbit_default_grid(orbit, geometry, GRID_DEFAULT_MOST, &recipe->grid);
+		return 0;
+	}
+	code = geometry_bin(&binned, geometry, recipe->binning, err);
+	if (code == 0)
+		code = orbit_analyse(&own, &binned, err);
+	if (code == 0)
+		orbit_default_grid(&own, &binned, GRID_DEFAULT_MOST, &recipe->grid);
+	orbit_clear(&own);
+	geometry_clear(&binned);
+	return code;
+}
+
 int recipe_resolve(struct recipe *recipe, const struct geometry *geometry, const struct orbit *orbit, struct error *err)
 {
 	struct recipe resolved = *recipe;
-	int code;
+	int code = recipe_check(&resolved, geometry, err);
 
-	if (!resolved.has_grid)
-		orbit_default_grid(orbit, geometry, GRID_DEFAULT_MOST, &resolved.grid);
+	if (code == 0 && resolved.binning == BINNING_AUTO)
+		resolved.binning = binning_of_voxels(&resolved, geometry, orbit);
+	if (code == 0 && !resolved.has_grid)
+		code = choose_grid(&resolved, geometry, orbit, err);
 	else if (!resolved.has_origin)
 		grid_centre(&resolved.grid);
+	if (code < 0)
+		return code;
 	resolved.has_grid = resolved.has_origin = true;
 	if (resolved.tv.options.unit == 0)
 		resolved.tv.options.unit = resolved.mu_water / 1000;

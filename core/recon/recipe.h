@@ -21,9 +21,10 @@ int recipe_copy(struct recipe *ret_recipe, const struct recipe *recipe, struct e
  */
 int recipe_check(const struct recipe *recipe, const struct geometry *geometry, struct error *err);
 /*
- * Writes out what was left open: the grid (orbit_default_grid, at most
- * GRID_DEFAULT_MOST voxels a side) or its origin, and tv.options.unit =
- * mu_water / 1000; then checks. A resolved recipe stays as it is.
+ * Writes out what was left open: the binning (as many pixels as a side of the given grid's voxels spans at the
+ * isocentre; 1 without a grid), the grid (orbit_default_grid of binned pixels, at most GRID_DEFAULT_MOST voxels a side)
+ * or its origin, and tv.options.unit = mu_water / 1000; then checks. geometry and orbit are the detector's own,
+ * whatever the binning. A resolved recipe stays as it is.
  */
 int recipe_resolve(struct recipe *recipe, const struct geometry *geometry, const struct orbit *orbit,
 		   struct error *err);

@@ -143,6 +143,8 @@ RUNS = [
             Run(f"{scan}-fista", scan, "FISTA, TV of the noise found", {"fdk": {}, "fista": {"iterations": 20}, "tv": {}}, (20,), True, part="better"),
         )
     ),
+    Run("arm-blocks", "arm", "2 x 2 pixels as one, momentum, steps of TV", {"binning": 2, "fdk": {}, **_sart(20, 10, momentum=True), "tv": {"alpha": 1 / 0.7, "after": "sart"}}, (20,), True, part="better"),
+    Run("arm-blocks-light", "arm", "the same, light TV of the noise found", {"binning": 2, "fdk": {}, **_sart(20, 10, momentum=True), "tv": {"strength": "light"}}, (20,), True, part="better"),
     # ---- iterations that end by themselves ----
     Run("fig5-auto", "fig5", "FDK, 10 subsets", {**RAM_LAK, **_auto(subsets=10)}, (), True, part="stop", twin="ten"),
     Run("fig7-auto", "fig7", "13 subsets", _auto(subsets=13), (), True, part="stop", twin="fig7-ordered"),
