@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # How soon the page shows a finished job of 256^3 voxels on loopback: Chromium without a graphics card, nothing cached, medians
-# of five. A table, and $BUILD/bench/page.json. Measures the machine as it is: leave it alone meanwhile.
+# of five; how long each step of a walk through it holds the page up; planes and slabs of 512^3 voxels. A table, and
+# $BUILD/bench/page.json and steps.json. Measures the machine as it is: leave it alone meanwhile.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 BUILD=$(realpath "${BUILD:-build}")
@@ -24,3 +25,9 @@ URL=$url JOB=$job CHROMIUM=$CHROMIUM HOME=$work node "$tools/bench.mjs" >"$BUILD
 jq -r '"page, first picture of 256^3            \(.first_picture_ms) ms (goal 2000)",
 	"page, voxels of all planes here         \(.voxels_ms) ms",
 	"page, rendering, without graphics card  \(.rendering_ms) ms"' "$BUILD/bench/page.json"
+
+cp tests/bench/steps.mjs "$tools/steps.mjs"
+URL=$url JOB=$job CHROMIUM=$CHROMIUM HOME=$work node "$tools/steps.mjs" >"$BUILD/bench/steps.json"
+echo "longest task of the page in each step, ms of the processor and of the clock (goal 100):"
+jq -r 'to_entries[] | "  \(.key): \(.value.cpu_ms) \(.value.ms)"' "$BUILD/bench/steps.json"
+node tests/bench/planes.mjs clients/web/src/sample.js

@@ -4,7 +4,8 @@
  *
  * Usage: slices PORT JOB SIZE COUNT SECONDS [AXIS]. Each of COUNT connections
  * asks for a plane of random axis (or AXIS) and index, PNG, and for the next one
- * as soon as it has it. One thread and one epoll.
+ * as soon as it has it. AXIS oblique: SIZE x SIZE pixels of a plane through the
+ * volume's middle at a random angle. One thread and one epoll.
  */
 #include <arpa/inet.h>
 #include <netinet/in.h>
@@ -43,12 +44,17 @@ static double now(void)
 static bool ask(struct browser *browser)
 {
 	static const char *const axes[] = {"x", "y", "z"};
-	char request[256];
-	int length =
-	    snprintf(request, sizeof(request),
-		     "GET /v1/jobs/%s/volumes/final/slice?axis=%s&index=%ld HTTP/1.1\r\nHost: localhost\r\n\r\n", job,
-		     axis != NULL ? axis : axes[random() % 3], random() % size);
+	char plane[128], request[256];
+	int length;
 
+	if (axis != NULL && strcmp(axis, "oblique") == 0)
+		snprintf(plane, sizeof(plane), "normal=%ld,%ld,%ld&up=0,0,1&size=%d,%d", random() % 199 - 99,
+			 100 + random() % 99, random() % 199 - 99, size, size);
+	else
+		snprintf(plane, sizeof(plane), "axis=%s&index=%ld", axis != NULL ? axis : axes[random() % 3],
+			 random() % size);
+	length = snprintf(request, sizeof(request),
+			  "GET /v1/jobs/%s/volumes/final/slice?%s HTTP/1.1\r\nHost: localhost\r\n\r\n", job, plane);
 	browser->asked = now();
 	browser->head_length = 0;
 	return send(browser->socket, request, (size_t)length, 0) == length;

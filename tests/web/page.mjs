@@ -155,7 +155,41 @@ test('light or dark and the language are chosen, and stay chosen; the pictures a
 	await page.context().close()
 })
 
+test('what the daemon refuses is said in the page\'s language, with the numbers behind it', async () => {
+	const page = await openFinished({ locale: 'de-DE' })
+	await page.click('button:has-text("Noch einmal rekonstruieren")')
+	await page.click('dialog .expert summary')
+	await page.fill('dialog [name="/sart/iterations"]', '0')
+	await page.click('dialog button[type=submit]')
+	await page.waitForSelector('dialog [name="/sart/iterations"][aria-invalid=true]')
+	const said = await page.textContent(`#${await page.getAttribute('dialog [name="/sart/iterations"]', 'aria-describedby')}`)
+	expect(/^(Die Anfrage ist fehlerhaft|Das ist so nicht ausführbar): .*expected/.test(said), `a German sentence and the numbers, got ${said}`)
+	await page.goto(`${origin}/#/jobs/nothing`)
+	await until('no such job', () => page.textContent('.notice.bad:not([hidden])'), text => text.startsWith('Das gibt es nicht: '))
+	await page.context().close()
+})
+
 /* ---- pictures ---- */
+
+test('voxels that do not come are asked for again, which is told; until then the daemon draws', async () => {
+	const context = await browser.newContext({ viewport: { width: 1440, height: 900 } }), page = await context.newPage()
+	page.setDefaultTimeout(60000)
+	let refused = 0
+	await context.route('**/volumes/*format=shuffled*', route => refused++ < 2 ? route.fulfill({ status: 503, body: '' }) : route.continue())
+	await page.goto(`${origin}${finishedPath}`)
+	await until('told', () => page.textContent('.fetching'), text => /^The voxels did not come \(the daemon answered 503\).*again in \d+ s\.$/.test(text))
+	expect(await page.isVisible('.fetching') && await page.isVisible(`${tile('z')} img.slice`), 'the daemon\'s picture meanwhile')
+	await planePixels(page, 'z')
+	await until('the rendering, too', () => page.getAttribute(tile('3d'), 'data-shown'), shown => shown === 'final')
+	expect(!await page.isVisible('.fetching') && refused > 2, 'no more of it')
+	/* A volume that has gone is not asked for again. */
+	refused = 0
+	await context.unroute('**/volumes/*format=shuffled*')
+	await context.route('**/volumes/*format=shuffled*', route => (refused++, route.fulfill({ status: 404, body: '' })))
+	await page.reload()
+	await until('told', () => page.textContent('.fetching'), text => text.includes('cannot be fetched (the daemon answered 404)'))
+	await context.close()
+})
 
 const half = 6 /* voxels off the middle, where the solid has no mirror plane */
 

@@ -76,6 +76,17 @@ test_every_language_has_every_text() {
 	node "$here/strings.mjs" "$top/clients/web/src" || fail "each file of clients/web/src/lang with all texts"
 }
 
+# Planes, slabs and files from disk against volumes in closed form.
+test_the_page_samples_volumes_as_they_are() {
+	command -v node >/dev/null || skip "node is not here"
+	node "$here/sampling.mjs" "$top/clients/web/src" || fail "samples where they lie"
+}
+
+test_the_page_has_a_sentence_for_every_problem() {
+	command -v node >/dev/null || skip "node is not here"
+	node "$here/problems.mjs" "$top/clients/web/src/problems.js" "$top/daemon/problem.c" || fail "the sentences of daemon/problem.c"
+}
+
 # What stands for the whole page where npm is not.
 test_the_plain_page_shows_jobs_and_escapes_names() {
 	start_daemon

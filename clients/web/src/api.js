@@ -1,10 +1,11 @@
 /* The daemon's HTTP interface: documents, problems (RFC 9457) and events. Paths are of this origin, always. */
+import { problemText } from './problems.js'
+import { t } from './lang.js'
 
 export class Problem extends Error {
 	constructor(status, document) {
-		super(document.detail || document.title || `status ${status}`)
+		super(problemText(document) || t('the daemon answered {status}', { status }))
 		this.status = status
-		this.title = document.title ?? ''
 		this.pointer = document.pointer ?? null
 	}
 }
@@ -16,8 +17,6 @@ async function problemOf(response) {
 	} catch {
 		/* a proxy's own page */
 	}
-	if (!document.detail)
-		document.detail = `the daemon answered ${response.status} ${response.statusText}`.trim()
 	return new Problem(response.status, document)
 }
 

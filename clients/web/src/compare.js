@@ -4,7 +4,7 @@
  */
 import { h, replace, write } from './dom.js'
 import { get, id, listVolumes } from './api.js'
-import { readFile } from './voxels.js'
+import { readFile, troubleText } from './voxels.js'
 import { recipeText } from './state.js'
 import { rotationOf } from './view.js'
 import { t } from './lang.js'
@@ -95,7 +95,7 @@ export class Others {
 			write(this.trouble, '')
 			this.chosen()
 		} catch (error) {
-			write(this.trouble, `${file.name}: ${error.message}`)
+			write(this.trouble, `${file.name}: ${troubleText(error)}`)
 		}
 	}
 

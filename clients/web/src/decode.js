@@ -4,10 +4,11 @@
  * the low bytes [y][x], then the high ones.
  *
  * In: { number, path, size }, or { number, file, place } for a NIfTI file from disk (nifti.js); out: { number, voxels } (Int16Array, Hounsfield
- * units [z][y][x]), { number, grid } of a file, or { number, error }. { cancel: number } ends one.
+ * units [z][y][x]), { number, grid } of a file, or { number, error } (trouble.js). { cancel: number } ends one.
  */
 import { Decompress } from 'fzstd'
 import { readNifti } from './nifti.js'
+import { Trouble, posted } from './trouble.js'
 
 const running = new Map()
 
@@ -15,12 +16,12 @@ const running = new Map()
 async function unpack(path, bytes, signal) {
 	const response = await fetch(path, { signal })
 	if (!response.ok)
-		throw new Error(`the volume could not be fetched (${response.status})`)
+		throw new Trouble('status', { status: response.status })
 	const packed = new Uint8Array(bytes)
 	let filled = 0
 	const stream = new Decompress(chunk => {
 		if (filled + chunk.length > bytes)
-			throw new Error('the volume is longer than its size says')
+			throw new Trouble('length', { n: filled + chunk.length, wanted: bytes })
 		packed.set(chunk, filled)
 		filled += chunk.length
 	})
@@ -32,7 +33,7 @@ async function unpack(path, bytes, signal) {
 		stream.push(value)
 	}
 	if (filled !== bytes)
-		throw new Error(`the volume has ${filled} bytes, expected ${bytes}`)
+		throw new Trouble('length', { n: filled, wanted: bytes })
 	return packed
 }
 
@@ -54,7 +55,7 @@ onmessage = async ({ data }) => {
 	}
 	const { number, path, size, file, place } = data
 	if (file) {
-		readNifti(file, place).then(grid => postMessage({ number, grid }, [grid.voxels.buffer]), error => postMessage({ number, error: error.message }))
+		readNifti(file, place).then(grid => postMessage({ number, grid }, [grid.voxels.buffer]), error => postMessage({ number, error: posted(error) }))
 		return
 	}
 	const controller = new AbortController()
@@ -64,7 +65,7 @@ onmessage = async ({ data }) => {
 		const voxels = unshuffle(packed, size)
 		postMessage({ number, voxels }, [voxels.buffer])
 	} catch (error) {
-		postMessage({ number, error: controller.signal.aborted ? 'aborted' : error.message })
+		postMessage({ number, error: posted(controller.signal.aborted ? new Trouble('aborted') : error) })
 	} finally {
 		running.delete(number)
 	}

@@ -8,6 +8,7 @@ import { Annotations } from './annotations.js'
 import { Tools, segments, press } from './tools.js'
 import { Viewer } from './viewer.js'
 import { Plot } from './plot.js'
+import { troubleText } from './voxels.js'
 import { Others } from './compare.js'
 import { Sendings } from './send.js'
 import { Film } from './film.js'
@@ -15,6 +16,7 @@ import { Bar, badge, doing, left, ended, stateWord } from './state.js'
 import { geometryFacts, jobFacts, warningList } from './facts.js'
 import { nameOf } from './lists.js'
 import { reconstructAgain, confirmed, openDialog, pinButton } from './form.js'
+import { problemText } from './problems.js'
 import { t } from './lang.js'
 
 const pollTime = 1500 /* ms: progress and time left are not told as events */
@@ -96,6 +98,7 @@ export class JobPage {
 		this.plot = new Plot(iteration => this.#selectIteration(iteration))
 		this.film = new Film()
 		this.sides = h('p', { class: 'sides', hidden: true }, t('Left and right are not known: neither scan nor job says how the patient lies. The letters are those of the table\'s axes.'))
+		this.fetching = h('p', { class: 'fetching', role: 'status', hidden: true })
 		this.estimate = h('p', { class: 'estimate', hidden: true })
 		this.quality = h('p', { class: 'quality', title: 'Measured in the middle slices: noise in even tissue, the blur across the surface, and rings and streaks beside the noise' })
 		this.controls = h('div', { class: 'controls', hidden: true }, this.#iterationControls(), this.#viewControls(), this.#compareControls())
@@ -108,7 +111,7 @@ export class JobPage {
 		this.fileSection = h('section', { class: 'card', hidden: true }, h('h2', {}, t('Downloads')), this.files)
 		this.progress = h('div', { class: 'progress' }, this.bar.element, this.doing, this.left)
 		this.columns = h('div', { class: 'columns' },
-			this.pictures = h('div', { class: 'pictures' }, this.acquiring, this.empty, this.stage, this.estimate, this.quality, this.sides, this.controls),
+			this.pictures = h('div', { class: 'pictures' }, this.acquiring, this.empty, this.stage, this.fetching, this.estimate, this.quality, this.sides, this.controls),
 			h('div', { class: 'aside' }, this.warnings, this.keyImages.section, this.tools.section, this.sendings.section, this.courseSection, this.fileSection,
 				this.filmSection = h('section', { class: 'card' }, h('h2', {}, t('Projections')), this.film.element),
 				h('section', { class: 'card' }, h('h2', {}, t('Reconstruction')), this.about),
@@ -121,7 +124,15 @@ export class JobPage {
 	}
 
 	#makeViewer(label, shown) {
-		return new Viewer(this.#view, { label, shown, step: way => this.#step(way), measurements: this.#measurements, pointed: point => this.#point(point) })
+		return new Viewer(this.#view, { label, shown, troubled: (error, seconds) => this.#tellFetching(error, seconds), step: way => this.#step(way), measurements: this.#measurements, pointed: point => this.#point(point) })
+	}
+
+	/* The voxels did not come; seconds: until they are asked for again, null: never. error null: they are there. */
+	#tellFetching(error, seconds) {
+		this.fetching.hidden = error === null
+		if (error !== null)
+			write(this.fetching, seconds === null ? t('The voxels cannot be fetched ({why}): the daemon draws the planes.', { why: troubleText(error) })
+				: t('The voxels did not come ({why}): the daemon draws the planes, and they are asked for again in {time}.', { why: troubleText(error), time: duration(seconds) }))
 	}
 
 	#iterationControls() {
@@ -275,7 +286,7 @@ export class JobPage {
 		const warnings = [...scan.warnings, ...job.warnings]
 		replace(this.warnings, warningList(warnings))
 		this.warnings.hidden = warnings.length === 0
-		replace(this.failure, job.error ? h('div', { class: 'notice bad' }, t('It failed: {why}', { why: job.error.detail })) : null)
+		replace(this.failure, job.error ? h('div', { class: 'notice bad' }, t('It failed: {why}', { why: problemText(job.error) })) : null)
 		this.sendings.show(job)
 		replace(this.about, jobFacts(job))
 		if (this.#first)

@@ -2,7 +2,7 @@
  * The maximum along each ray through a volume, seen as the rendering is: a slab as thick as all of it. Coarse at once, then
  * as fine as voxels are, a few rows at a time, so that the page goes on meanwhile. Needs no graphics card.
  */
-import { samplePlane } from './sample.js'
+import { samplerOf } from './sample.js'
 import { norm } from './vector.js'
 
 const coarsePixels = 72
@@ -36,23 +36,27 @@ export class Mip {
 
 	#sample(picture, side) {
 		const values = new Float32Array(side * side)
-		samplePlane(picture.grid, picture.frame, side, side, [picture.reach / side, picture.reach / side], picture.slab, values)
+		this.#samplerOf(picture, side)(values)
 		this.#put(picture, values, side)
 	}
 
 	#refine(picture) {
-		const side = finePixels, values = new Float32Array(side * side)
+		const side = finePixels, values = new Float32Array(side * side), sample = this.#samplerOf(picture, side)
 		let row = 0
 		const piece = () => {
 			const end = performance.now() + pieceTime
 			for (; row < side && performance.now() < end; row++)
-				samplePlane(picture.grid, picture.frame, side, side, [picture.reach / side, picture.reach / side], picture.slab, values, row, row + 1)
+				sample(values, row, row + 1)
 			if (row < side)
 				this.#timer = setTimeout(piece)
 			else
 				this.#put(picture, values, side)
 		}
 		piece()
+	}
+
+	#samplerOf({ grid, frame, reach, slab }, side) {
+		return samplerOf(grid, frame, side, side, [reach / side, reach / side], slab)
 	}
 
 	#put({ window, level }, values, side) {

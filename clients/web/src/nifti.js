@@ -3,6 +3,9 @@
  * (sform, else qform) tells where it lies in the patient; `rotation` and `shift` (rows of world -> patient's left, back,
  * head, mm) where that is in the world. A file along the world's axes keeps its voxels; another one is sampled on `grid`.
  */
+import { sampleAt, isWithin } from './sample.js'
+import { Trouble } from './trouble.js'
+
 const types = { 2: ['Uint8', 1], 4: ['Int16', 2], 8: ['Int32', 4], 16: ['Float32', 4], 64: ['Float64', 8], 256: ['Int8', 1], 512: ['Uint16', 2], 768: ['Uint32', 4] }
 const attenuationMost = 3 /* values that are all smaller are 1/mm, as no CT in HU is */
 const alongLeast = 1 - 1e-5
@@ -31,10 +34,10 @@ function readHeader(buffer) {
 	const header = new DataView(buffer)
 	const little = buffer.byteLength >= 352 && header.getInt32(0, true) === 348
 	if (buffer.byteLength < 352 || (!little && header.getInt32(0, false) !== 348) || header.getUint8(344) !== 0x6e)
-		throw new Error('this is no NIfTI-1 file')
+		throw new Trouble('not-nifti')
 	const size = [42, 44, 46].map(at => Math.max(header.getInt16(at, little), 1)), type = types[header.getInt16(70, little)]
 	if (!type)
-		throw new Error(`values of type ${header.getInt16(70, little)} are not read`)
+		throw new Trouble('type', { type: header.getInt16(70, little) })
 	const spacing = [80, 84, 88].map(at => Math.abs(header.getFloat32(at, little)) || 1), slope = header.getFloat32(112, little) || 1, intercept = header.getFloat32(116, little) || 0
 	return { little, size, type, from: header.getFloat32(108, little), slope, intercept, matrix: matrixOf(header, little, spacing) }
 }
@@ -43,7 +46,7 @@ function readHeader(buffer) {
 function hounsfield(buffer, { little, size, type: [name, bytes], from, slope, intercept }, water) {
 	const count = size[0] * size[1] * size[2], view = new DataView(buffer)
 	if (buffer.byteLength < from + count * bytes)
-		throw new Error(`the file has ${buffer.byteLength} bytes, expected ${from + count * bytes}`)
+		throw new Trouble('file-length', { n: buffer.byteLength, wanted: from + count * bytes })
 	const read = view[`get${name}`].bind(view), voxels = new Int16Array(count)
 	let most = 0
 	for (let i = 0; i < count; i++)
@@ -92,25 +95,25 @@ function inverse([[a, b, c, p], [d, e, f, q], [g, h, i, r]]) {
 	return m.map(row => [...row, -(row[0] * p + row[1] * q + row[2] * r)])
 }
 
-/* On another grid, the nearest voxel of each place; air outside of the file. */
-function resampled(voxels, [nx, ny, nz], world, { size, spacing, origin }) {
-	const back = inverse(world), to = new Int16Array(size[0] * size[1] * size[2]).fill(-1000)
+/* On another grid, between the eight nearest voxels of each place; air outside of the file. */
+function resampled(voxels, fileSize, world, { size, spacing, origin }) {
+	const back = inverse(world), file = { size: fileSize, voxels }, to = new Int16Array(size[0] * size[1] * size[2]).fill(-1000)
 	let at = 0
 	for (let k = 0; k < size[2]; k++) {
 		for (let j = 0; j < size[1]; j++) {
 			const y = origin[1] + j * spacing[1], z = origin[2] + k * spacing[2]
 			const start = back.map(row => row[0] * origin[0] + row[1] * y + row[2] * z + row[3])
 			for (let i = 0; i < size[0]; i++, at++) {
-				const u = Math.round(start[0] + back[0][0] * spacing[0] * i), v = Math.round(start[1] + back[1][0] * spacing[0] * i), w = Math.round(start[2] + back[2][0] * spacing[0] * i)
-				if (u >= 0 && v >= 0 && w >= 0 && u < nx && v < ny && w < nz)
-					to[at] = voxels[(w * ny + v) * nx + u]
+				const u = start[0] + back[0][0] * spacing[0] * i, v = start[1] + back[1][0] * spacing[0] * i, w = start[2] + back[2][0] * spacing[0] * i
+				if (isWithin(file, u, v, w))
+					to[at] = Math.round(sampleAt(file, u, v, w))
 			}
 		}
 	}
 	return { size, spacing, origin, voxels: to }
 }
 
-/* { size, spacing, origin, voxels } of a File. water: 1/mm. Fails with a sentence. */
+/* { size, spacing, origin, voxels } of a File. water: 1/mm. Fails with a Trouble. */
 export async function readNifti(file, { rotation, shift, water, grid }) {
 	const buffer = await unpacked(file), header = readHeader(buffer)
 	const world = toWorld(header.matrix, rotation, shift), spacing = [0, 1, 2].map(j => Math.hypot(world[0][j], world[1][j], world[2][j]))

@@ -7,13 +7,13 @@
 import { h, write, inFrame } from './dom.js'
 import { volumePath } from './api.js'
 import { planes, axes, lettersInWords, lettersTowards, planeEdges, planeName } from './view.js'
-import { layersOf, samplePlane } from './sample.js'
+import { layersOf, samplerOf } from './sample.js'
 import { times } from './vector.js'
 import { Overlay } from './overlay.js'
 import { Gestures } from './gestures.js'
 import { t } from './lang.js'
 
-const narrowMost = 280 /* px: below, there is no room for words beside the letters */
+const narrowMost = 280, tinyMost = 170 /* px: below, there is no room for words beside the letters, nor for letters beside the plane's name */
 const quickMost = 1.5e6 /* samples that are taken at once; a finer picture follows, piece by piece */
 const restTime = 120 /* ms after which it does */
 const pieceTime = 12 /* ms of a frame for it */
@@ -84,7 +84,7 @@ export class Plane {
 			'aria-pressed': 'false', onclick: () => this.maximise() })
 		this.title = h('span', { class: 'name' })
 		this.edges = Object.fromEntries(['left', 'right', 'top', 'bottom'].map(side => [side, h('span', { class: `edge ${side}`, 'aria-hidden': 'true' })]))
-		this.element = h('section', { class: 'tile plane', tabindex: '0', 'data-plane': this.name },
+		this.element = h('div', { class: 'tile plane', role: 'group', tabindex: '0', 'data-plane': this.name },
 			this.stage, h('div', { class: 'caption' }, this.title, this.where), this.what, this.enlarge, Object.values(this.edges), this.slider)
 		this.#writeSides()
 	}
@@ -189,6 +189,7 @@ export class Plane {
 		const scale = Math.min(room.width / width, room.height / height)
 		const narrow = room.width < narrowMost || room.height < narrowMost * 0.75
 		this.element.classList.toggle('narrow', narrow)
+		this.element.classList.toggle('tiny', room.width < tinyMost)
 		this.overlay.plain = narrow
 		const [x, y] = view.pan[this.name]
 		this.frame.style.width = `${width * scale}px`
@@ -260,13 +261,14 @@ export class Plane {
 	#sample(frame, pitch, slab) {
 		const [width, height] = this.#sizeOf(frame, pitch)
 		const values = new Float32Array(width * height)
-		samplePlane(this.#grid, frame, width, height, [frame.width / width, frame.height / height], slab, values)
+		samplerOf(this.#grid, frame, width, height, [frame.width / width, frame.height / height], slab)(values)
 		this.#put(values, width, height)
 	}
 
 	/* Row by row, a little in each frame; whatever changes meanwhile begins anew (#drawHere). */
 	#refine(frame, pitch, slab) {
 		const grid = this.#grid, [width, height] = this.#sizeOf(frame, pitch), values = new Float32Array(width * height)
+		const sample = samplerOf(grid, frame, width, height, [frame.width / width, frame.height / height], slab)
 		let row = 0
 		const piece = () => {
 			const end = performance.now() + pieceTime
@@ -274,7 +276,7 @@ export class Plane {
 				return
 			while (row < height && performance.now() < end) {
 				const rows = Math.min(8, height - row)
-				samplePlane(grid, frame, width, height, [frame.width / width, frame.height / height], slab, values, row, row + rows)
+				sample(values, row, row + rows)
 				row += rows
 			}
 			if (row < height) {

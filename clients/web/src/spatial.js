@@ -2,7 +2,7 @@
 import { h, write, inFrame, throttle } from './dom.js'
 import { Mip } from './mip.js'
 import { volumePath } from './api.js'
-import { fetchVoxels, scaleFor, thinned } from './voxels.js'
+import { fetchUntil, scaleFor, thinned } from './voxels.js'
 import { lettersInWords, planeEdges, renderingEdges } from './view.js'
 import { t } from './lang.js'
 
@@ -61,7 +61,7 @@ export class Spatial {
 			'aria-pressed': 'false', onclick: () => this.#maximise() })
 		this.edges = Object.fromEntries(['left', 'right', 'top', 'bottom'].map(side => [side, h('span', { class: `edge ${side}`, 'aria-hidden': 'true' })]))
 		this.what = h('div', { class: 'what' })
-		this.element = h('section', { class: 'tile spatial', tabindex: '0', 'aria-label': t('Rendering'), 'data-plane': '3d' },
+		this.element = h('div', { class: 'tile spatial', role: 'group', tabindex: '0', 'aria-label': t('Rendering'), 'data-plane': '3d' },
 			this.stage, h('div', { class: 'caption' }, h('span', { class: 'name' }, '3D')), this.what, this.maximise, Object.values(this.edges), this.note)
 		this.turn = inFrame(() => this.#turned())
 		this.settle = throttle(settleTime, () => this.#settle())
@@ -149,8 +149,8 @@ export class Spatial {
 		}
 		try {
 			if (this.#grid === null) {
-				const grid = source.grid ? thinned(source.grid, voxelsMost()) : await fetchVoxels(source.job, source.volume, scaleFor(source.volume, voxelsMost()))
-				if (source !== this.#source)
+				const grid = source.grid ? thinned(source.grid, voxelsMost()) : await fetchUntil(source.job, source.volume, scaleFor(source.volume, voxelsMost()), { wanted: () => source === this.#source, told: () => {} })
+				if (grid === null || source !== this.#source)
 					return
 				this.#grid = grid
 				this.#metal = hasMetal(grid)
@@ -162,9 +162,8 @@ export class Spatial {
 			else
 				await this.#drawSurface(source)
 			this.element.dataset.shown = source.volume.name
-		} catch (error) {
-			if (error.message !== 'aborted')
-				this.#fail()
+		} catch {
+			this.#fail()
 		}
 	}
 

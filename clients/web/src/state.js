@@ -1,5 +1,6 @@
 /* How the states of jobs look: a word and a sign, not a colour alone. */
 import { h, duration } from './dom.js'
+import { problemText } from './problems.js'
 import { t, t2 } from './lang.js'
 
 const signs = { waiting: '◌', queued: '◔', running: '◑', succeeded: '●', failed: '✕', cancelled: '⊘' }
@@ -42,7 +43,7 @@ export function doing(job) {
 		return stages()[job.stage] ?? ''
 	}
 	if (job.state === 'failed')
-		return job.error?.detail ?? ''
+		return job.error ? problemText(job.error) : ''
 	return [iterationsText(job), job.grid?.size?.join(' × ')].filter(Boolean).join(' · ')
 }
 

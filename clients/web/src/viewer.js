@@ -2,7 +2,7 @@
 import { h } from './dom.js'
 import { Plane } from './plane.js'
 import { Spatial, probeGraphics } from './spatial.js'
-import { countOf, fetchVoxels, heldVoxels, cancelVoxels, wholeMost } from './voxels.js'
+import { countOf, fetchUntil, heldVoxels, cancelVoxels, wholeMost } from './voxels.js'
 
 const order = ['z', 'x', 'y']
 
@@ -11,8 +11,12 @@ export class Viewer {
 	#source = null
 	#drawn = null /* the source whose planes are there */
 
-	/* step(direction): another iteration is asked for; shown(): after each picture. */
-	constructor(view, { step, shown, label, pointed, measurements }) {
+	/*
+	 * step(direction): another iteration is asked for; shown(): after each picture; troubled(error, seconds): the voxels did not come, and
+	 * when they are asked for again (fetchUntil); null: they are there.
+	 */
+	constructor(view, { step, shown, label, pointed, measurements, troubled }) {
+		this.troubled = troubled
 		this.#view = view
 		this.planes = order.map(name => new Plane(name, view, { step, pointed, measurements, shown: () => {
 			shown()
@@ -85,13 +89,10 @@ export class Viewer {
 	}
 
 	async #fetch(source) {
-		try {
-			const grid = await fetchVoxels(source.job, source.volume, 1)
-			if (source === this.#source)
-				this.planes.forEach(plane => plane.setVoxels(grid))
-		} catch {
-			/* the daemon goes on drawing the planes */
-		}
+		/* Meanwhile the daemon goes on drawing the planes. */
+		const grid = await fetchUntil(source.job, source.volume, 1, { wanted: () => source === this.#source, told: this.troubled })
+		if (grid !== null && source === this.#source)
+			this.planes.forEach(plane => plane.setVoxels(grid))
 	}
 
 	/* HU at a point of the world, or null. */

@@ -3,13 +3,21 @@
  * scale, the ones not looked at for longest given up first.
  */
 import { volumePath } from './api.js'
+import { Trouble } from './trouble.js'
+import { t } from './lang.js'
 
 const touch = matchMedia('(pointer: coarse)').matches
 const memory = navigator.deviceMemory ?? (touch ? 2 : 8) /* GB, at most 8 is told */
 
 /* Voxels of the largest volume that is fetched whole; beyond, planes are drawn by the daemon. */
 export const wholeMost = memory >= 8 && !touch ? 512 ** 3 : memory >= 4 ? 320 ** 3 : 256 ** 3
+const retryFirst = 1000, retryMost = 30000 /* ms: between tries, twice as long each time */
 const cacheMost = memory >= 8 && !touch ? 1024e6 : 256e6 /* bytes */
+
+/* What went wrong, in words; what a browser says itself is as it says it. */
+const words = () => ({ 'status': t('the daemon answered {status}'), 'length': t('{n} bytes came, expected {wanted}'), 'not-nifti': t('this is no NIfTI-1 file'),
+	'type': t('values of type {type} are not read'), 'file-length': t('the file has {n} bytes, expected {wanted}'), 'decoder': t('the decoder could not be started') })
+export const troubleText = ({ code, values, message }) => words()[code]?.replace(/\{(\w+)\}/g, (_, name) => values[name]) ?? message
 
 let worker = null, lastNumber = 0
 const waiting = new Map()
@@ -21,13 +29,13 @@ function startWorker() {
 		const { resolve, reject } = waiting.get(data.number)
 		waiting.delete(data.number)
 		if (data.error)
-			reject(new Error(data.error))
+			reject(Object.assign(new Trouble(data.error.code, data.error.values), { message: data.error.message }))
 		else
 			resolve(data.grid ?? data.voxels)
 	}
-	worker.onerror = event => {
+	worker.onerror = () => {
 		for (const { reject } of waiting.values())
-			reject(new Error(event.message || 'the decoder could not be started'))
+			reject(new Trouble('decoder'))
 		waiting.clear()
 		worker = null
 	}
@@ -112,6 +120,31 @@ export function fetchVoxels(job, volume, scale) {
 	cache.set(key, entry)
 	makeRoom(key)
 	return entry.promise
+}
+
+/* A volume that has gone, or that one may not see, does not come by asking again. */
+const isFinal = ({ code, values }) => code === 'aborted' || (code === 'status' && values.status < 500 && values.status !== 429)
+
+/*
+ * The same, tried again until it comes or wanted() says no more: then null, as where it cannot come. told(error, seconds) after each
+ * failure, with the time until the next try (null: there is none); told(null) once it is there.
+ */
+export async function fetchUntil(job, volume, scale, { wanted, told }) {
+	for (let wait = retryFirst; wanted(); wait = Math.min(2 * wait, retryMost)) {
+		try {
+			const grid = await fetchVoxels(job, volume, scale)
+			told(null)
+			return grid
+		} catch (error) {
+			if (!wanted() || error.code === 'aborted')
+				return null
+			told(error, isFinal(error) ? null : wait / 1000)
+			if (isFinal(error))
+				return null
+			await new Promise(resolve => setTimeout(resolve, wait))
+		}
+	}
+	return null
 }
 
 /* So few voxels of a grid as `most`, each for scale^3 of them. */
