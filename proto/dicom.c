@@ -21,13 +21,33 @@ int dicom_patient(const struct dicom_words *words, const struct patient *told, s
 		return error_set(
 		    err, ERR_CONFLICT,
 		    "nobody has said how the patient lies, and a CT image must say it: give the job or the "
-		    "scan a patient, or ask with position=HFS, or whichever it is");
+		    "scan a patient");
 	if (told->known && words->position >= 0 && told->position != words->position)
 		return error_set(err, ERR_CONFLICT, "position is %s, but the volume's patient lies %s",
 				 patient_position_names[words->position],
 				 told->position >= 0 ? patient_position_names[told->position] : "by a matrix");
 	*ret_patient = told->known ? *told : patient_in((enum patient_position)words->position);
 	return 0;
+}
+
+const char *const dicom_kind_names[DICOM_KIND_COUNT + 1] = {"slices", "enhanced", "xray-3d", NULL};
+
+static const struct {
+	const char *uid, *name;
+} classes[DICOM_KIND_COUNT] = {
+    [DICOM_SLICES] = {"1.2.840.10008.5.1.4.1.1.2", "CT Image Storage"},
+    [DICOM_ENHANCED] = {"1.2.840.10008.5.1.4.1.1.2.1", "Enhanced CT Image Storage"},
+    [DICOM_XRAY_3D] = {"1.2.840.10008.5.1.4.1.1.13.1.1", "X-Ray 3D Angiographic Image Storage"},
+};
+
+const char *dicom_class(enum dicom_kind kind)
+{
+	return classes[kind].uid;
+}
+
+const char *dicom_class_name(enum dicom_kind kind)
+{
+	return classes[kind].name;
 }
 
 /* ---- UIDs ---- */
@@ -240,6 +260,11 @@ struct instance {
 	    event[UID_SIZE];
 };
 
+static bool is_multiframe(const struct instance *image)
+{
+	return image->words->kind != DICOM_SLICES;
+}
+
 static void name_all(struct instance *image)
 {
 	const struct provenance *p = image->provenance;
@@ -258,7 +283,7 @@ static void name_all(struct instance *image)
 		snprintf(image->study, UID_SIZE, "%.64s", study);
 	make_uid(image->frame, "cbctd frame %s %s", p->scan, place);
 	make_uid(image->series, "cbctd series %s %s %s %s %d %d %d %s", image->study, p->job, image->words->volume,
-		 image->words->enhanced ? "enhanced" : "slices", g->size[0], g->size[1], g->size[2], place);
+		 dicom_kind_names[image->words->kind], g->size[0], g->size[1], g->size[2], place);
 	make_uid(image->instance, "cbctd instance %s %d", image->series, image->z);
 	make_uid(image->event, "cbctd event %s", p->scan);
 	make_uid(image->dimensions, "cbctd dimensions %s", image->series);
@@ -337,9 +362,70 @@ static void put_meta(struct object *o, const struct instance *image, const char 
 		o->bytes[at - 4 + (size_t)i] = (uint8_t)(length >> 8 * i);
 }
 
+/* ---- what it was made from: PS3.3 C.7.6.16.2.6 and table 10-3 ---- */
+
+static void put_code(struct object *o, uint32_t tag, const char *value, const char *scheme, const char *meaning)
+{
+	begin_group(o, tag);
+	put_text(o, 0x00080100, "SH", value);
+	put_text(o, 0x00080102, "SH", scheme);
+	put_text(o, 0x00080104, "LO", meaning);
+	end_group(o);
+}
+
+/* Each object in an item of its own, with the purpose of the reference where it stands for pixels. */
+static void put_references(struct object *o, const struct instance *image, uint32_t tag, bool purpose)
+{
+	const cJSON *source = image->words->source, *instance;
+	const char *class = cJSON_GetStringValue(cJSON_GetObjectItemCaseSensitive(source, "class"));
+
+	begin_sequence(o, tag);
+	cJSON_ArrayForEach(instance, cJSON_GetObjectItemCaseSensitive(source, "instances"))
+	{
+		begin_item(o);
+		put_text(o, 0x00081150, "UI", class);
+		put_text(o, 0x00081155, "UI", instance->valuestring);
+		if (purpose)
+			put_code(o, 0x0040a170, "121322", "DCM", "Source image for image processing operation");
+		end_item(o);
+	}
+	end_sequence(o);
+}
+
+/* Derivation Image, of all frames. */
+static void put_derivation_group(struct object *o, const struct instance *image)
+{
+	const bool iterative = image->provenance->iteration > 0;
+
+	begin_group(o, 0x00089124);
+	put_references(o, image, 0x00082112, true);
+	put_code(o, 0x00089215, iterative ? "113963" : "113962", "DCM",
+		 iterative ? "Iterative Reconstruction" : "Filtered Back Projection");
+	end_group(o);
+}
+
+/* The series of the references, which an object with frames must tell. */
+static void put_source_series(struct object *o, const struct instance *image, uint32_t instances)
+{
+	begin_group(o, 0x00081115);
+	put_references(o, image, instances, false);
+	put_text(o, 0x0020000e, "UI",
+		 cJSON_GetStringValue(cJSON_GetObjectItemCaseSensitive(image->words->source, "series")));
+	end_group(o);
+}
+
+/* Source Image Evidence (C.8.15.2 of Enhanced CT); X-Ray 3D has Common Instance Reference (C.12.2) in its place. */
+static void put_evidence(struct object *o, const struct instance *image)
+{
+	begin_group(o, 0x00089154);
+	put_source_series(o, image, 0x00081199);
+	put_text(o, 0x0020000d, "UI", image->study);
+	end_group(o);
+}
+
 static void put_identification(struct object *o, const struct instance *image, const char *class)
 {
-	const bool enhanced = image->words->enhanced;
+	const bool enhanced = is_multiframe(image);
 
 	put_text(o, 0x00080005, "CS", "ISO_IR 192");
 	put_text(o, 0x00080008, "CS", enhanced ? frame_type : "ORIGINAL\\PRIMARY\\AXIAL");
@@ -350,19 +436,25 @@ static void put_identification(struct object *o, const struct instance *image, c
 	put_subject(o, &image->words->subject, STUDY_DATE);
 	put_text(o, 0x00080021, "DA", image->date);
 	put_text(o, 0x00080023, "DA", image->date);
-	if (enhanced)
+	if (image->words->kind == DICOM_ENHANCED)
 		put_text(o, 0x0008002a, "DT", image->now);
 	put_subject(o, &image->words->subject, STUDY_TIME);
 	put_text(o, 0x00080031, "TM", image->time);
 	put_text(o, 0x00080033, "TM", image->time);
 	put_subject(o, &image->words->subject, STUDY_ACCESSION_NUMBER);
-	put_text(o, 0x00080060, "CS", "CT");
+	put_text(o, 0x00080060, "CS", image->words->kind == DICOM_XRAY_3D ? "XA" : "CT");
 	put_text(o, 0x00080070, "LO", "cbctd");
 	put_subject(o, &image->words->subject, STUDY_REFERRING_PHYSICIAN);
 	put_subject(o, &image->words->subject, STUDY_DESCRIPTION);
 	put_format(o, 0x0008103e, "LO", "CBCT %.20s %.16s", image->words->volume, image->provenance->stage);
 	put_text(o, 0x00081090, "LO", "cbctd");
+	if (image->words->kind == DICOM_XRAY_3D && image->words->source != NULL)
+		put_source_series(o, image, 0x0008114a);
 	put_derivation(o, image);
+	if (!enhanced && image->words->source != NULL)
+		put_references(o, image, 0x00082112, true);
+	if (image->words->kind == DICOM_ENHANCED && image->words->source != NULL)
+		put_evidence(o, image);
 	if (enhanced) {
 		put_text(o, 0x00089205, "CS", "MONOCHROME");
 		put_text(o, 0x00089206, "CS", "VOLUME");
@@ -389,39 +481,47 @@ static void put_relationship(struct object *o, const struct instance *image)
 	put_text(o, 0x0020000e, "UI", image->series);
 	put_subject(o, &image->words->subject, STUDY_ID);
 	put_format(o, 0x00200011, "IS", "%d", series_number(image));
-	if (!image->words->enhanced)
+	if (!is_multiframe(image))
 		put_text(o, 0x00200012, "IS", "1");
 	put_format(o, 0x00200013, "IS", "%d", image->z + 1);
-	if (!image->words->enhanced) {
+	if (!is_multiframe(image)) {
 		memcpy(orientation, image->row, sizeof(image->row));
 		memcpy(orientation + 3, image->column, sizeof(image->column));
 		put_decimals(o, 0x00200032, 3, image->position);
 		put_decimals(o, 0x00200037, 6, orientation);
 	}
 	put_text(o, 0x00200052, "UI", image->frame);
-	if (!image->words->enhanced)
+	if (!is_multiframe(image))
 		put_text(o, 0x00200060, "CS", ""); /* left or right of a paired part: not told */
 	put_text(o, 0x00201040, "LO", "");
 	provenance_sentence(image->provenance, "HU", sentence, sizeof(sentence));
 	put_text(o, 0x00204000, "LT", sentence);
 }
 
+/* From fat to bone: a viewer that is told none takes the first slice's own, which is of air. */
+static void put_window(struct object *o)
+{
+	put_text(o, 0x00281050, "DS", "400");
+	put_text(o, 0x00281051, "DS", "2000");
+}
+
 static void put_matrix(struct object *o, const struct instance *image)
 {
 	put_short(o, 0x00280002, 1);
 	put_text(o, 0x00280004, "CS", "MONOCHROME2");
-	if (image->words->enhanced)
+	if (is_multiframe(image))
 		put_format(o, 0x00280008, "IS", "%d", image->grid->size[2]);
 	put_short(o, 0x00280010, (unsigned)image->grid->size[1]);
 	put_short(o, 0x00280011, (unsigned)image->grid->size[0]);
-	if (!image->words->enhanced)
+	if (!is_multiframe(image))
 		put_decimals(o, 0x00280030, 2, (const double[]){image->grid->spacing[1], image->grid->spacing[0]});
 	put_short(o, 0x00280100, 16);
 	put_short(o, 0x00280101, 16);
 	put_short(o, 0x00280102, 15);
 	put_short(o, 0x00280103, 1);
 	put_text(o, 0x00280301, "CS", "NO");
-	if (!image->words->enhanced) {
+	if (!is_multiframe(image)) {
+		put_window(o);
 		put_text(o, 0x00281052, "DS", "0");
 		put_text(o, 0x00281053, "DS", "1");
 		put_text(o, 0x00281054, "LO", "HU");
@@ -429,7 +529,17 @@ static void put_matrix(struct object *o, const struct instance *image)
 	put_text(o, 0x00282110, "CS", "00");
 }
 
-/* ---- Enhanced CT, PS3.3 A.38.1: what all frames share, and where each lies ---- */
+/* ---- Enhanced CT, PS3.3 A.38.1, X-Ray 3D Angiographic, A.53: what all frames share, and where each lies ---- */
+
+static void put_frame_type(struct object *o, uint32_t tag)
+{
+	begin_group(o, tag);
+	put_text(o, 0x00089007, "CS", frame_type);
+	put_text(o, 0x00089205, "CS", "MONOCHROME");
+	put_text(o, 0x00089206, "CS", "VOLUME");
+	put_text(o, 0x00089207, "CS", "NONE");
+	end_group(o);
+}
 
 static void put_shared_groups(struct object *o, const struct instance *image)
 {
@@ -439,15 +549,16 @@ static void put_shared_groups(struct object *o, const struct instance *image)
 	memcpy(orientation, image->row, sizeof(image->row));
 	memcpy(orientation + 3, image->column, sizeof(image->column));
 	begin_group(o, 0x52009229);
-	begin_group(o, 0x00189329); /* CT Image Frame Type */
-	put_text(o, 0x00089007, "CS", frame_type);
-	put_text(o, 0x00089205, "CS", "MONOCHROME");
-	put_text(o, 0x00089206, "CS", "VOLUME");
-	put_text(o, 0x00089207, "CS", "NONE");
-	end_group(o);
-	begin_group(o, 0x00189477); /* Irradiation Event Identification: the scan is one */
-	put_text(o, 0x00083010, "UI", image->event);
-	end_group(o);
+	if (image->words->source != NULL)
+		put_derivation_group(o, image);
+	if (image->words->kind == DICOM_ENHANCED) {
+		put_frame_type(o, 0x00189329); /* CT Image Frame Type */
+		begin_group(o, 0x00189477);    /* Irradiation Event Identification: the scan is one */
+		put_text(o, 0x00083010, "UI", image->event);
+		end_group(o);
+	} else {
+		put_frame_type(o, 0x00189504); /* X-Ray 3D Frame Type */
+	}
 	begin_group(o, 0x00209071); /* Frame Anatomy: not known which */
 	begin_group(o, 0x00082218);
 	put_text(o, 0x00080100, "SH", "38266002");
@@ -463,6 +574,9 @@ static void put_shared_groups(struct object *o, const struct instance *image)
 	put_decimal(o, 0x00180050, grid->spacing[2]);
 	put_decimal(o, 0x00180088, grid->spacing[2]);
 	put_decimals(o, 0x00280030, 2, (const double[]){grid->spacing[1], grid->spacing[0]});
+	end_group(o);
+	begin_group(o, 0x00289132); /* Frame VOI LUT */
+	put_window(o);
 	end_group(o);
 	begin_group(o, 0x00289145); /* Pixel Value Transformation */
 	put_text(o, 0x00281052, "DS", "0");
@@ -519,24 +633,24 @@ static void put_dimensions(struct object *o, const struct instance *image)
 
 static void put_acquisition(struct object *o, const struct instance *image)
 {
-	if (!image->words->enhanced) {
+	if (!is_multiframe(image)) {
 		put_decimal(o, 0x00180050, image->grid->spacing[2]);
 		put_text(o, 0x00180060, "DS", "");
 		put_decimal(o, 0x00180088, image->grid->spacing[2]);
 	}
-	if (image->words->enhanced)
+	if (is_multiframe(image))
 		put_text(o, 0x00181000, "LO", "not told"); /* the arm's number, which may not be empty here */
 	put_text(o, 0x00181020, "LO", image->provenance->program);
 	put_text(o, 0x00185100, "CS",
 		 image->patient.position >= 0 ? patient_position_names[image->patient.position] : "");
-	if (image->words->enhanced)
+	if (is_multiframe(image))
 		put_text(o, 0x00189004, "CS", "PRODUCT");
 }
 
 int dicom_head(const struct dicom_words *words, const struct grid *grid, const struct provenance *provenance, int z,
 	       size_t pixels, struct dicom_head *ret_head, struct error *err)
 {
-	const char *class = words->enhanced ? DICOM_ENHANCED_CT_IMAGE : DICOM_CT_IMAGE;
+	const char *class = dicom_class(words->kind);
 	struct instance image = {.words = words, .grid = grid, .provenance = provenance, .z = z};
 	struct object o = {0};
 
@@ -549,10 +663,10 @@ int dicom_head(const struct dicom_words *words, const struct grid *grid, const s
 	put_identification(&o, &image, class);
 	put_acquisition(&o, &image);
 	put_relationship(&o, &image);
-	if (words->enhanced)
+	if (is_multiframe(&image))
 		put_dimensions(&o, &image);
 	put_matrix(&o, &image);
-	if (words->enhanced) {
+	if (is_multiframe(&image)) {
 		begin_sequence(&o, 0x00400555); /* Acquisition Context: none */
 		end_sequence(&o);
 		put_text(&o, 0x20500020, "CS", "IDENTITY");

@@ -74,18 +74,23 @@ static const char *check_sex(const char *text, int *ret_code)
 }
 
 /* Components are numbers without leading zeros. */
-static const char *check_uid(const char *text, int *ret_code)
+bool uid_valid(const char *text)
 {
-	bool good = strlen(text) <= 64 && strspn(text, "0123456789.") == strlen(text);
+	bool good = strlen(text) <= UID_MOST && strspn(text, "0123456789.") == strlen(text);
 
-	(void)ret_code;
 	for (const char *at = text; good; at++) {
 		good = isdigit((unsigned char)at[0]) && !(at[0] == '0' && isdigit((unsigned char)at[1]));
 		at = strchr(at, '.');
 		if (at == NULL)
 			break;
 	}
-	return good ? NULL : "a UID is expected: at most 64 characters, numbers with dots between them";
+	return good;
+}
+
+static const char *check_uid(const char *text, int *ret_code)
+{
+	(void)ret_code;
+	return uid_valid(text) ? NULL : UID_EXPECTED;
 }
 
 /* Numbers of `pattern`'s digits 'd' in their places, with its other characters between them. */
@@ -253,6 +258,7 @@ int subject_parse(const char *text, struct subject *ret_subject, struct error *e
 	json_begin(&reader, document, "", err);
 	patient = json_member(&reader, "patient", false);
 	study = json_member(&reader, "study", false);
+	json_member(&reader, "source", false); /* source.h's */
 	code = json_end(&reader);
 	if (code == 0)
 		code = read_object(patient, "patient", ret_subject, err);

@@ -28,6 +28,11 @@ enum subject_field { /* up to STUDY_UID: those that tell one patient and study f
 		     SUBJECT_COUNT
 };
 
+enum { UID_MOST = 64 /* characters */ };
+#define UID_EXPECTED "a UID is expected: at most 64 characters, numbers with dots between them"
+/* PS3.5 9.1: not empty, components without leading zeros. */
+bool uid_valid(const char *text);
+
 enum { SUBJECT_MOST = 3 * 64 + 2 }; /* characters of the longest, a name of three component groups */
 
 struct subject {

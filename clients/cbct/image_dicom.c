@@ -42,9 +42,10 @@ struct dicom {
 	long columns, rows, frames, bits, bits_stored, is_signed, samples;
 	char relationship[RELATIONSHIP_MAX]; /* of the pixels to the intensity: "LIN", "LOG", "DISP" */
 	bool mirrored;
-	int patient;                /* enum patient_position, -1: not told */
-	char towards[2];            /* sides of the patient, 0: not told */
-	struct subject subject;     /* of patient and study */
+	int patient;            /* enum patient_position, -1: not told */
+	char towards[2];        /* sides of the patient, 0: not told */
+	struct subject subject; /* of patient and study */
+	struct image_source source;
 	struct dicom_values object; /* of the file itself, or of the functional groups that frames share */
 	struct dicom_values *frame; /* [frames], Enhanced XA */
 	double *increments[2];      /* primary, secondary */
@@ -193,6 +194,20 @@ static void read_subject(struct reader *reader)
 	}
 }
 
+/* UIDs of the object; one that is none is not told. */
+static void read_source(struct reader *reader)
+{
+	struct image_source *source = &reader->dicom->source;
+	const struct {
+		const char *tag;
+		char *to;
+	} uids[] = {{"0008,0016", source->class}, {"0008,0018", source->instance}, {"0020,000e", source->series}};
+
+	for (size_t i = 0; i < sizeof(uids) / sizeof(uids[0]); i++)
+		if (strcmp(reader->tag, uids[i].tag) == 0 && uid_valid(reader->text))
+			snprintf(uids[i].to, UID_MOST + 1, "%s", reader->text);
+}
+
 /* Reads an element of the file itself, outside of any sequence. */
 static void read_top(struct reader *reader)
 {
@@ -211,6 +226,7 @@ static void read_top(struct reader *reader)
 			*(long *)((char *)dicom + counts[i].offset) = (long)value;
 	}
 	read_subject(reader);
+	read_source(reader);
 	if (strcmp(reader->tag, "0018,1520") == 0)
 		read_increments(reader, 0);
 	else if (strcmp(reader->tag, "0018,1521") == 0)
@@ -457,6 +473,7 @@ static int understand(struct image_file *file, const struct dicom *dicom, struct
 	file->rows = dicom->rows <= DETECTOR_MAX ? (int)dicom->rows : 0;
 	file->count = dicom->frames > VIEWS_MAX ? 0 : (int)dicom->frames;
 	file->subject = dicom->subject;
+	file->source = dicom->source;
 	if (file->columns < 1 || file->rows < 1 || file->count < 1)
 		return error_set(err, ERR_INVALID, "a DICOM file of %ld x %ld pixels and %ld frames", dicom->columns,
 				 dicom->rows, dicom->frames);

@@ -49,11 +49,16 @@ static int plain_new(struct image_file *file, const char *path, size_t *ret_leng
 	return 0;
 }
 
-static int plain_room(struct image_file *file, struct error *err)
+/* Room for one image. A file of so many bytes must have as many: a header alone takes no memory. */
+static int plain_room(struct image_file *file, size_t length, int images, struct error *err)
 {
 	struct plain *plain = file->state;
+	size_t expected;
 
 	plain->bytes = (size_t)file->columns * (size_t)file->rows * pixel_bytes(file->type);
+	expected = plain->start + (size_t)images * plain->bytes;
+	if (length < expected)
+		return error_set(err, ERR_INVALID, "%zu bytes, %zu are expected", length, expected);
 	plain->image = malloc(plain->bytes);
 	return plain->image != NULL ? 0 : error_set(err, ERR_NO_MEMORY, "no memory for %zu bytes", plain->bytes);
 }
@@ -90,7 +95,7 @@ static int raw_open(struct image_file *file, const char *path, const struct imag
 	file->type = (enum pixel_type)options->type;
 	plain->start = (size_t)options->header;
 	plain->big_endian = options->big_endian;
-	code = plain_room(file, err);
+	code = plain_room(file, length, 0, err);
 	if (code != 0)
 		return code;
 	pixels = length > plain->start ? length - plain->start : 0;
@@ -111,7 +116,7 @@ static int npy_open(struct image_file *file, const char *path, const struct imag
 	struct plain *plain;
 	struct npy npy;
 	char head[NPY_HEAD_MAX];
-	size_t length = 0, expected, head_length;
+	size_t length = 0, head_length;
 	int code = plain_new(file, path, &length, err);
 
 	(void)options;
@@ -137,11 +142,7 @@ static int npy_open(struct image_file *file, const char *path, const struct imag
 	file->type = npy.type;
 	plain->start = npy.start;
 	plain->big_endian = npy.big_endian;
-	code = plain_room(file, err);
-	expected = plain->start + (size_t)file->count * plain->bytes;
-	if (code == 0 && length < expected)
-		code = error_set(err, ERR_INVALID, "%zu bytes, %zu are expected", length, expected);
-	return code;
+	return plain_room(file, length, file->count, err);
 }
 
 /* Heimann's header, version 100: 68 bytes, then another one whose length stands there; 16-bit counts. */
@@ -158,7 +159,7 @@ static int his_open(struct image_file *file, const char *path, const struct imag
 	unsigned char head[HEAD];
 	uint16_t word[HEAD / 2];
 	struct plain *plain;
-	size_t length = 0, expected;
+	size_t length = 0;
 	int code = plain_new(file, path, &length, err);
 
 	(void)options;
@@ -178,46 +179,13 @@ static int his_open(struct image_file *file, const char *path, const struct imag
 	if (word[16] != COUNTS)
 		return error_set(err, ERR_INVALID, "numbers of type %d, %d (16-bit counts) is expected", word[16],
 				 COUNTS);
-	if (file->columns < 1 || file->rows < 1)
-		return error_set(err, ERR_INVALID, "an image of %d x %d pixels", file->columns, file->rows);
+	if (file->columns < 1 || file->rows < 1 || file->count < 1)
+		return error_set(err, ERR_INVALID, "%d images of %d x %d pixels", file->count, file->columns,
+				 file->rows);
 	plain->start = HEAD + (size_t)word[5];
-	code = plain_room(file, err);
-	expected = plain->start + (size_t)file->count * plain->bytes;
-	if (code == 0 && length < expected)
-		code = error_set(err, ERR_INVALID, "%zu bytes, %zu are expected", length, expected);
-	return code;
-}
-
-/* ---- formats that are known and not read ---- */
-
-static int refuse_open(struct image_file *file, const char *path, const struct image_options *options,
-		       struct error *err)
-{
-	(void)path;
-	(void)options;
-	return error_set(err, ERR_IMPOSSIBLE, "%s: it is not read; projections as TIFF, MetaImage, NumPy or raw are",
-			 file->format->name);
-}
-
-static bool hdf5_recognise(const unsigned char *head, size_t length)
-{
-	return length >= 8 && memcmp(head, "\211HDF\r\n\032\n", 8) == 0;
-}
-
-static bool compound_recognise(const unsigned char *head, size_t length)
-{
-	return length >= 8 && memcmp(head, "\320\317\021\340\241\261\032\341", 8) == 0;
-}
-
-static bool xtekct_recognise(const unsigned char *head, size_t length)
-{
-	return length >= 8 && memcmp(head, "[XTekCT]", 8) == 0;
+	return plain_room(file, length, file->count, err);
 }
 
 const struct image_format image_raw = {"raw", NULL, raw_open, plain_read, plain_close};
 const struct image_format image_npy = {"NumPy", npy_recognise, npy_open, plain_read, plain_close};
 const struct image_format image_his = {"Heimann .his", his_recognise, his_open, plain_read, plain_close};
-const struct image_format image_hdf5 = {"HDF5 (NeXus)", hdf5_recognise, refuse_open, plain_read, plain_close};
-const struct image_format image_compound = {"a compound file (Zeiss .txrm)", compound_recognise, refuse_open,
-					    plain_read, plain_close};
-const struct image_format image_xtekct = {"Nikon .xtekct", xtekct_recognise, refuse_open, plain_read, plain_close};

@@ -16,6 +16,7 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
+#include "clients/cbct/http.h"
 #include "proto/scan_directory.h"
 
 const struct option image_option_rows[] = {
@@ -41,7 +42,7 @@ const struct option image_option_rows[] = {
 /* Raw is the last: nothing tells it. */
 static const struct image_format *const formats[] = {&image_metaimage, &image_tiff,   &image_npy, &image_dicom,
 						     &image_his,       &image_hnd,    &image_xim, &image_hdf5,
-						     &image_compound,  &image_xtekct, &image_raw};
+						     &image_txrm,      &image_xtekct, &image_raw};
 enum { FORMAT_COUNT = sizeof(formats) / sizeof(formats[0]), FORMAT_RAW = FORMAT_COUNT - 1 };
 
 struct entry {
@@ -90,6 +91,7 @@ static void file_close(struct image_file *file)
 	if (file->format != NULL)
 		file->format->close(file);
 	free(file->positions);
+	free(file->circle.degrees);
 	memset(file, 0, sizeof(*file));
 }
 
@@ -121,8 +123,10 @@ static int file_open(struct image_file *ret, const char *path, const struct imag
 
 	if (code != 0)
 		return code;
-	*ret = (struct image_file){
-	    .format = formats[format], .pixel = {OPTION_UNSET_NUMBER, OPTION_UNSET_NUMBER}, .intensity = ""};
+	*ret = (struct image_file){.format = formats[format],
+				   .pixel = {OPTION_UNSET_NUMBER, OPTION_UNSET_NUMBER},
+				   .intensity = "",
+				   .circle = IMAGE_CIRCLE_UNKNOWN};
 	code = ret->format->open(ret, path, options, err);
 	if (code == 0)
 		code = file_check(ret, err);
@@ -314,6 +318,33 @@ static int add_positions(struct images *images, const struct image_file *file, s
 	return 0;
 }
 
+/* Objects of several series, or of none, are referenced by nothing. */
+static int add_source(struct images *images, const struct image_file *file, int entry, struct error *err)
+{
+	const struct image_source *source = &file->source;
+	const bool told = source->class[0] != '\0' && source->series[0] != '\0' && source->instance[0] != '\0';
+	cJSON *one;
+
+	if (entry == 0 && told) {
+		images->source = cJSON_CreateObject();
+		cJSON_AddStringToObject(images->source, "class", source->class);
+		cJSON_AddStringToObject(images->source, "series", source->series);
+		cJSON_AddArrayToObject(images->source, "instances");
+	}
+	if (images->source == NULL)
+		return 0;
+	if (!told || strcmp(member_text(images->source, "class", ""), source->class) != 0 ||
+	    strcmp(member_text(images->source, "series", ""), source->series) != 0) {
+		cJSON_Delete(images->source);
+		images->source = NULL;
+		return 0;
+	}
+	one = cJSON_CreateString(source->instance);
+	return cJSON_AddItemToArray(cJSON_GetObjectItemCaseSensitive(images->source, "instances"), one)
+		   ? 0
+		   : error_set(err, ERR_NO_MEMORY, "no memory for an object's UID");
+}
+
 static int open_entry(struct images *images, int entry, struct error *err)
 {
 	struct images_files *files = images->files;
@@ -343,6 +374,10 @@ static int look_into(struct images *images, int entry, struct error *err)
 		images->stack = file->stack;
 		images->intensity = file->intensity;
 		images->subject = file->subject;
+		if (files->count == 1) {
+			images->circle = file->circle;
+			files->open.circle.degrees = NULL; /* the series has them now */
+		}
 		images->flip_columns = files->options->flip_columns;
 		images->flip_rows = files->options->flip_rows;
 		memcpy(images->pixel, file->pixel, sizeof(images->pixel));
@@ -351,6 +386,8 @@ static int look_into(struct images *images, int entry, struct error *err)
 	}
 	if (code == 0)
 		code = add_positions(images, file, err);
+	if (code == 0)
+		code = add_source(images, file, entry, err);
 	if (code == 0 && images->count + file->count > VIEWS_MAX)
 		code = error_set(err, ERR_IMPOSSIBLE, "more than %d images", VIEWS_MAX);
 	files->entries[entry].first = images->count;
@@ -392,6 +429,8 @@ void images_free(struct images *images)
 	free(images->files->entries);
 	free(images->files);
 	free(images->positions);
+	free(images->circle.degrees);
+	cJSON_Delete(images->source);
 	free(images);
 }
 

@@ -5,6 +5,7 @@
 #include <stddef.h>
 
 #include "clients/cbct/options.h"
+#include "proto/source.h"
 #include "proto/subject.h"
 #include "proto/pixel.h"
 #include "proto/rtk_geometry.h"
@@ -39,6 +40,24 @@ struct image_position {
 	char towards[2]; /* the patient's sides that columns and rows run to: L R A P H F; 0: not told */
 };
 
+/* The circle that a scanner's own file tells; NaN and NULL: not told. */
+struct image_circle {
+	double *degrees;                                /* gantry angles, one for each image, owned */
+	double source_to_isocentre, source_to_detector; /* mm */
+	double detector_offset[2];                      /* mm, 0 where it is not told */
+	double air;                                     /* counts of the open beam */
+};
+#define IMAGE_CIRCLE_UNKNOWN                                                                                           \
+	{                                                                                                              \
+		.source_to_isocentre = OPTION_UNSET_NUMBER, .source_to_detector = OPTION_UNSET_NUMBER,                 \
+		.air = OPTION_UNSET_NUMBER                                                                             \
+	}
+
+/* The DICOM object that a file is; "": not told, or none. */
+struct image_source {
+	char class[UID_MOST + 1], series[UID_MOST + 1], instance[UID_MOST + 1];
+};
+
 struct image_file {
 	const struct image_format *format;
 	int columns, rows, count; /* of one image; images */
@@ -49,7 +68,9 @@ struct image_file {
 	struct image_position *positions; /* [count], owned; NULL but for DICOM */
 	const char *intensity;            /* DICOM's Pixel Intensity Relationship, "" elsewhere; a literal */
 	struct subject subject;           /* of a DICOM file; nothing told elsewhere */
-	void *state;                      /* the format's own */
+	struct image_source source;
+	struct image_circle circle;
+	void *state; /* the format's own */
 };
 
 struct image_format {
@@ -63,9 +84,7 @@ struct image_format {
 	void (*close)(struct image_file *file); /* frees state, which may be NULL */
 };
 extern const struct image_format image_metaimage, image_tiff, image_npy, image_dicom, image_his, image_hnd, image_xim,
-    image_raw;
-/* Those that are named and not read. */
-extern const struct image_format image_hdf5, image_compound, image_xtekct;
+    image_hdf5, image_txrm, image_xtekct, image_raw;
 enum { IMAGE_HEAD = 256 }; /* bytes that recognise gets */
 
 struct images {
@@ -78,6 +97,8 @@ struct images {
 	bool flip_columns, flip_rows;     /* the images are mirrored as they are read */
 	const char *intensity;
 	struct subject subject;
+	struct image_circle circle; /* of a series that is one file */
+	cJSON *source;              /* proto/source.h, owned; NULL where not all files are objects of one series */
 	struct images_files *files; /* images.c's own */
 };
 

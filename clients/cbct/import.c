@@ -41,10 +41,9 @@ static const struct option_group groups[] = {
     {"", upload_rows, offsetof(struct import_options, upload)},
     {"", http_option_rows, offsetof(struct import_options, upload.http)},
     {"images: MetaImage (.mha, .mhd), TIFF, NumPy (.npy), DICOM XA and Enhanced XA (through DCMTK's programs), Heimann "
-     ".his, "
-     "Varian .hnd and .xim, raw",
+     ".his, Varian .hnd and .xim, Nikon .xtekct, Zeiss .txrm, NeXus and Data Exchange in HDF5 (through libhdf5), raw",
      image_option_rows, offsetof(struct import_options, image)},
-    {"geometry: one of --rtk, --matrices, --astra, --angles, --angle-step; DICOM files have their own",
+    {"geometry: one of --rtk, --matrices, --astra, --angles, --angle-step; DICOM and scanners' own files have theirs",
      import_geometry_rows, offsetof(struct import_options, geometry)},
     {"numbers", import_value_rows, offsetof(struct import_options, values)},
     {0},
@@ -88,6 +87,8 @@ static int make_document(const struct import_options *options, struct images *im
 		code = import_values(&options->values, images, &projections, err);
 	cJSON_AddStringToObject(document, "name", scan_name(options));
 	add_patient(document, &patient, &images->subject);
+	if (images->source != NULL)
+		cJSON_AddItemToObject(document, "source", cJSON_Duplicate(images->source, true));
 	cJSON_AddItemToObject(document, "detector", detector);
 	cJSON_AddItemToObject(document, "projections", projections);
 	cJSON_AddItemToObject(document, "geometry", geometry);

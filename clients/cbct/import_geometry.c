@@ -213,9 +213,11 @@ static int list_angles(const struct import_geometry *options, const struct image
 	size_t count = 0;
 	int code = 0;
 
+	const bool told = options->angles == NULL && isnan(options->angle_step) && images->circle.degrees != NULL;
+
 	if (options->angles != NULL)
 		code = numbers_read(options->angles, &numbers, &count, err);
-	else if (isnan(options->angle_step) && images->count > 1)
+	else if (isnan(options->angle_step) && images->count > 1 && !told)
 		code = error_set(
 		    err, ERR_USAGE,
 		    "nothing tells the geometry: --rtk, --matrices, --astra, --angles or --angle-step is needed");
@@ -224,6 +226,8 @@ static int list_angles(const struct import_geometry *options, const struct image
 	for (int k = 0; k < images->count && code == 0; k++) {
 		double angle = options->first_angle + (k > 0 ? k * options->angle_step : 0);
 
+		if (told)
+			angle = options->first_angle + images->circle.degrees[k];
 		if (numbers != NULL)
 			angle = numbers[k] / (options->radians ? degree : 1);
 		ret_degrees[k] = sign * angle;
@@ -253,13 +257,20 @@ static void note_centre(const struct images *images)
 static int from_angles(const struct import_geometry *options, const struct images *images, cJSON **ret_geometry,
 		       struct error *err)
 {
+	const struct image_circle *told = &images->circle;
+	const double to_isocentre =
+	    isnan(options->source_to_isocentre) ? told->source_to_isocentre : options->source_to_isocentre;
+	const double to_detector =
+	    isnan(options->source_to_detector) ? told->source_to_detector : options->source_to_detector;
+	const double offset[2] = {told->detector_offset[0] + options->detector_offset[0],
+				  told->detector_offset[1] + options->detector_offset[1]};
 	double *degrees;
 	cJSON *json;
 	int code;
 
 	if (images->has_stack)
 		note_centre(images);
-	if (isnan(options->source_to_isocentre) || isnan(options->source_to_detector))
+	if (isnan(to_isocentre) || isnan(to_detector))
 		return error_set(err, ERR_USAGE, "angles need --source-to-isocentre and --source-to-detector");
 	degrees = malloc((size_t)images->count * sizeof(*degrees));
 	if (degrees == NULL)
@@ -268,10 +279,10 @@ static int from_angles(const struct import_geometry *options, const struct image
 	if (code == 0) {
 		json = cJSON_CreateObject();
 		cJSON_AddStringToObject(json, "kind", "circular");
-		cJSON_AddNumberToObject(json, "source_to_isocentre_mm", options->source_to_isocentre);
-		cJSON_AddNumberToObject(json, "source_to_detector_mm", options->source_to_detector);
+		cJSON_AddNumberToObject(json, "source_to_isocentre_mm", to_isocentre);
+		cJSON_AddNumberToObject(json, "source_to_detector_mm", to_detector);
 		cJSON_AddItemToObject(json, "angles_deg", cJSON_CreateDoubleArray(degrees, images->count));
-		cJSON_AddItemToObject(json, "detector_offset_mm", cJSON_CreateDoubleArray(options->detector_offset, 2));
+		cJSON_AddItemToObject(json, "detector_offset_mm", cJSON_CreateDoubleArray(offset, 2));
 		cJSON_AddItemToObject(json, "source_offset_mm", cJSON_CreateDoubleArray(options->source_offset, 2));
 		*ret_geometry = json;
 	}
@@ -437,7 +448,7 @@ static int read_patient(const char *text, struct patient *ret, struct error *err
 			 "--patient: '%.40s' is none of HFS, HFP, FFS, FFP, HFDL, HFDR, FFDL, FFDR and unknown", text);
 }
 
-static int check_options(const struct import_geometry *options, struct error *err)
+static int check_options(const struct import_geometry *options, const struct images *images, struct error *err)
 {
 	bool offsets = options->detector_offset[0] != 0 || options->detector_offset[1] != 0 ||
 		       options->source_offset[0] != 0 || options->source_offset[1] != 0;
@@ -449,7 +460,7 @@ static int check_options(const struct import_geometry *options, struct error *er
 				 "one of --rtk, --matrices, --astra, --angles and --angle-step at a time");
 	if (options->radians && options->angles == NULL)
 		return error_set(err, ERR_USAGE, "--radians goes with --angles");
-	if (options->clockwise && !angles)
+	if (options->clockwise && !angles && images->circle.degrees == NULL)
 		return error_set(err, ERR_USAGE, "--clockwise goes with --angles or --angle-step");
 	if (options->first_pixel != 0 && options->matrices == NULL)
 		return error_set(err, ERR_USAGE, "--first-pixel goes with --matrices");
@@ -473,7 +484,7 @@ int import_geometry(const struct import_geometry *options, const struct images *
 {
 	bool given = !isnan(options->pixel[0]);
 	double pixel[2];
-	int code = check_options(options, err);
+	int code = check_options(options, images, err);
 
 	if (code == 0)
 		code = read_patient(options->patient, ret_patient, err);

@@ -164,8 +164,9 @@ static int find_air(const struct import_values *options, struct images *images, 
 	struct survey now = *survey;
 	int code = 0;
 
-	*ret_air = options->air;
-	if (!isnan(options->air) || options->flat != NULL)
+	*ret_air = isnan(options->air) && isnan(options->air_region[0]) && options->flat == NULL ? images->circle.air
+												 : options->air;
+	if (!isnan(*ret_air) || options->flat != NULL)
 		return 0;
 	if (!isfinite(now.most))
 		code = look_through(options, images, &now, err);

@@ -184,6 +184,10 @@ static int destinations_run(const void *values, struct error *err)
 		code = http_json(http, "GET", "/v1/destinations?wait=15", &document, err);
 	if (code == 0)
 		code = print(options, document, "destinations", print_destination, err);
+	/* A script that asks whether its archive answers is not told yes. */
+	if (code == 0 && cJSON_GetArraySize(cJSON_GetObjectItemCaseSensitive(document, "destinations")) == 0)
+		code = error_set(err, ERR_NOT_FOUND,
+				 "the daemon knows no destinations: its setting `destinations` names a file of them");
 	cJSON_Delete(document);
 	http_free(http);
 	return code;

@@ -55,8 +55,9 @@ int dimse_echo(struct dimse *dimse, struct error *err) DIMSE_WEAK;
 /* The SOP Instance UIDs of a series, `most` at most. */
 int dimse_find(struct dimse *dimse, const char *study, const char *series, int most,
 	       void (*found)(void *context, const char *instance), void *context, struct error *err) DIMSE_WEAK;
-/* A file of DICOM (PS3.10) in explicit little endian. */
-int dimse_store(struct dimse *dimse, const uint8_t *bytes, size_t size, struct error *err) DIMSE_WEAK;
+/* A file of DICOM (PS3.10) in explicit little endian. sent: so many bytes of it have gone out. */
+int dimse_store(struct dimse *dimse, const uint8_t *bytes, size_t size, void (*sent)(const void *context, size_t bytes),
+		const void *context, struct error *err) DIMSE_WEAK;
 
 /* ---- storage commitment (PS3.4 annex J) ---- */
 /* What became of a request. */
@@ -103,6 +104,9 @@ struct dimse_serving {
 	const char *directory;
 	int seconds; /* for each message */
 	void (*promised)(void *context, const struct dimse_promise *promise);
+	void (*accepted)(void *context); /* the association begins */
+	/* There is none; the title that called, printable ASCII, "" where none came. */
+	void (*refused)(void *context, const char *title, const char *why);
 	void *context;
 };
 /*

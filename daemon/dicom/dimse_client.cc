@@ -99,6 +99,15 @@ class Client : public DcmSCU
 		return EC_Normal;
 	}
 
+	const void *sent_context = nullptr;
+	void (*sent)(const void *context, size_t bytes) = nullptr;
+
+	void notifySENDProgress(const unsigned long bytes) override
+	{
+		if (sent != nullptr)
+			sent(sent_context, bytes);
+	}
+
       private:
 	PromptLayer layer;
 };
@@ -250,7 +259,8 @@ int dimse_find(struct dimse *dimse, const char *study, const char *series, int m
 
 /* ---- C-STORE ---- */
 
-int dimse_store(struct dimse *dimse, const uint8_t *bytes, size_t size, struct error *err)
+int dimse_store(struct dimse *dimse, const uint8_t *bytes, size_t size, void (*sent)(const void *context, size_t bytes),
+		const void *context, struct error *err)
 {
 	DcmInputBufferStream stream;
 	DcmFileFormat file;
@@ -263,6 +273,8 @@ int dimse_store(struct dimse *dimse, const uint8_t *bytes, size_t size, struct e
 	file.transferEnd();
 	if (condition.bad())
 		return error_set(err, ERR_INTERNAL, "an object that was made is none: %.100s", condition.text());
+	dimse->client.sent = sent;
+	dimse->client.sent_context = context;
 	condition = dimse->client.sendSTORERequest(dimse->presentation, "", file.getDataset(), status);
 	if (condition.bad())
 		return broken("C-STORE", condition, err);

@@ -59,10 +59,27 @@ class Server : public DcmSCP
 
 	OFBool checkCallingAETitleAccepted(const OFString &calling) override
 	{
+		caller = calling;
 		for (const char *const *caller = serving->callers; *caller != nullptr; caller++)
 			if (calling == *caller)
 				return OFTrue;
 		return OFFalse;
+	}
+
+	void notifyAssociationAcknowledge() override
+	{
+		begun = true;
+		serving->accepted(serving->context);
+	}
+
+	void refuseAssociation(const DcmRefuseReasonType reason) override
+	{
+		tell_refusal(reason == DCMSCP_CALLED_AE_TITLE_NOT_RECOGNIZED ? "it calls another title than ours"
+			     : reason == DCMSCP_CALLING_AE_TITLE_NOT_RECOGNIZED
+				 ? "it is none of the peers that may call"
+			     : reason == DCMSCP_NO_PRESENTATION_CONTEXTS ? "it asks for nothing that is served here"
+									 : "its request is none that is understood");
+		DcmSCP::refuseAssociation(reason);
 	}
 
 	OFBool stopAfterCurrentAssociation() override
@@ -83,8 +100,24 @@ class Server : public DcmSCP
 		return DcmSCP::handleIncomingCommand(message, info);
 	}
 
+      public:
+	bool begun = false; // or refused, and told
+
+	void tell_refusal(const char *why)
+	{
+		char title[17] = "";
+
+		for (size_t i = 0; i < caller.size() && i < sizeof(title) - 1; i++) {
+			title[i] = (char)(caller[i] >= 0x20 && caller[i] <= 0x7e ? caller[i] : '?');
+			title[i + 1] = '\0';
+		}
+		begun = true;
+		serving->refused(serving->context, title, why);
+	}
+
       private:
 	int stored = 0;
+	OFString caller;
 
 	OFCondition store(T_DIMSE_C_StoreRQ &request, T_ASC_PresentationContextID presentation)
 	{
@@ -203,6 +236,8 @@ int dimse_serve(const struct dimse_serving *serving, int connection, struct erro
 		if (serving->directory != nullptr)
 			server.addPresentationContext(stored, syntaxes);
 	OFCondition condition = server.listen();
+	if (!server.begun)
+		server.tell_refusal("what it sends is no request for an association");
 	if (condition.bad() && condition != NET_EC_StopAfterAssociation &&
 	    condition != NET_EC_StopAfterConnectionTimeout)
 		return error_set(err, ERR_IO, "an association: %.160s", condition.text());

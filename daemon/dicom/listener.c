@@ -1,8 +1,8 @@
 /*
  * The listener: what peers send to our application entity. Each association has a process of its own, a child of this
  * one: answers of storage commitment become a line {"promise": ...} to the daemon; runs of projections become files,
- * and, once nothing more of a run has come for a while, a scan, by `cbct import`. A run whose import fails stays, as
- * failed-RUN.
+ * and, once nothing more of a run has come for a while, a scan, by `cbct import`, and where the configuration says so a
+ * job, by `cbct submit`. A run whose import fails stays, as failed-RUN.
  *
  * Files of a run are there until its scan is whole; the run's name is the scan's Idempotency-Key, so that a run that is
  * imported again, after a crash or because it was sent twice, is the same scan.
@@ -10,6 +10,7 @@
 #include <arpa/inet.h>
 #include <dirent.h>
 #include <errno.h>
+#include <fcntl.h>
 #include <netinet/in.h>
 #include <poll.h>
 #include <signal.h>
@@ -28,10 +29,14 @@
 
 #include "daemon/dicom/dicom.h"
 #include "daemon/dicom/dimse.h"
+#include "proto/json.h"
 
 enum {
 	DAEMON = 3,
 	CHILDREN_MOST = 16,      /* associations at a time */
+	ADDRESS_MOST = 8,        /* of them from one address, so that none shuts out all others */
+	REQUEST_MOST = 5,        /* s that a connection may take until its association begins */
+	TELL_EVERY = 10,         /* s between two lines about refusals */
 	ASSOCIATION_MOST = 3600, /* s */
 	PEERS_MOST = 64,
 	ARGUMENTS_MOST = 64,
@@ -44,10 +49,14 @@ struct listener {
 	const char *callers[PEERS_MOST + 1];
 	char directory[900]; /* "": no objects are taken */
 	double quiet;        /* s */
+	time_t told;         /* of the last refusal */
+	int untold;          /* refusals since then */
 	struct {
 		pid_t pid; /* 0: none */
 		int pidfd;
-	} children[CHILDREN_MOST + 1]; /* the last one imports */
+		struct in_addr address; /* of the peer */
+		int said;               /* what it says of its association; -1 for an import */
+	} children[CHILDREN_MOST + 1];  /* the last one imports */
 };
 
 static const cJSON *receive_of(const struct listener *listener)
@@ -69,8 +78,31 @@ static void promised(void *context, const struct dimse_promise *promise)
 	tell(line);
 }
 
+/* A child's words for the listener, which alone knows how much was told lately. */
+struct refusal {
+	char title[17], why[80];
+};
+
+static void accepted(void *context)
+{
+	(void)context;
+	alarm(ASSOCIATION_MOST);
+}
+
+static void refused(void *context, const char *title, const char *why)
+{
+	const int *said = context;
+	struct refusal refusal = {.title = ""};
+
+	snprintf(refusal.title, sizeof(refusal.title), "%s", title);
+	snprintf(refusal.why, sizeof(refusal.why), "%s", why);
+	/* A listener that is gone needs none. */
+	if (write(*said, &refusal, sizeof(refusal)) < 0)
+		alarm(1);
+}
+
 /* The child: ends with the association, or with the listener. */
-static void serve(const struct listener *listener, int connection)
+static void serve(const struct listener *listener, int connection, int said)
 {
 	const double most = destination_number(receive_of(listener), "max_bytes", 4294967296.0);
 	const struct rlimit files = {(rlim_t)most, (rlim_t)most};
@@ -78,56 +110,134 @@ static void serve(const struct listener *listener, int connection)
 					      .callers = listener->callers,
 					      .directory = listener->directory[0] != '\0' ? listener->directory : NULL,
 					      .seconds = (int)destination_patience(listener->options, 0),
-					      .promised = promised};
+					      .promised = promised,
+					      .accepted = accepted,
+					      .refused = refused,
+					      .context = &said};
 	struct error err = {0};
 
 	prctl(PR_SET_PDEATHSIG, SIGKILL);
 	signal(SIGXFSZ, SIG_IGN);
 	signal(SIGALRM, SIG_DFL);
 	setrlimit(RLIMIT_FSIZE, &files);
-	alarm(ASSOCIATION_MOST);
+	/* Until the association begins: who only connects, or sends its request a byte at a time, is cut off. */
+	alarm(REQUEST_MOST);
 	_exit(dimse_serve(&serving, connection, &err) == 0 ? 0 : 1);
 }
 
-static void note_child(struct listener *listener, int place, pid_t pid)
+static void tell_refusal(struct listener *listener, struct in_addr address, const char *title, const char *why)
 {
-	if (pid < 0)
+	const time_t now = time(NULL);
+	cJSON *line, *told;
+	char text[INET_ADDRSTRLEN], more[60] = "";
+
+	/* One line for many: a scanner of ports fills no log. A clock that was set back silences nobody. */
+	if (now >= listener->told && now - listener->told < TELL_EVERY) {
+		listener->untold++;
 		return;
+	}
+	if (listener->untold > 0)
+		snprintf(more, sizeof(more), " (and %d others before it)", listener->untold);
+	listener->told = now;
+	listener->untold = 0;
+	line = cJSON_CreateObject();
+	told = cJSON_AddObjectToObject(line, "refused");
+	cJSON_AddStringToObject(told, "address", inet_ntop(AF_INET, &address, text, sizeof(text)));
+	cJSON_AddStringToObject(told, "title", title);
+	cJSON_AddStringToObject(told, "why", why);
+	cJSON_AddStringToObject(told, "more", more);
+	tell(line);
+}
+
+static void note_child(struct listener *listener, int place, pid_t pid, struct in_addr address, int said)
+{
+	if (pid < 0) {
+		if (said >= 0)
+			close(said);
+		return;
+	}
 	listener->children[place].pid = pid;
 	listener->children[place].pidfd = (int)syscall(SYS_pidfd_open, pid, 0);
+	listener->children[place].address = address;
+	listener->children[place].said = said;
+}
+
+/* A free place for a peer of this address; -1: it has its share, or all are taken. */
+static int place_for(const struct listener *listener, struct in_addr address)
+{
+	int place = -1, count = 0;
+
+	for (int i = 0; i < CHILDREN_MOST; i++) {
+		if (listener->children[i].pid == 0)
+			place = i;
+		else
+			count += listener->children[i].address.s_addr == address.s_addr;
+	}
+	return count < ADDRESS_MOST ? place : -1;
 }
 
 static void accept_one(struct listener *listener)
 {
-	const int connection = accept4(listener->socket, NULL, NULL, SOCK_CLOEXEC);
-	int place = 0;
-	pid_t pid;
+	struct sockaddr_in peer = {.sin_family = AF_INET};
+	socklen_t length = sizeof(peer);
+	const int connection = accept4(listener->socket, (struct sockaddr *)&peer, &length, SOCK_CLOEXEC);
+	const int place = connection >= 0 ? place_for(listener, peer.sin_addr) : -1;
+	int ends[2] = {-1, -1};
+	pid_t pid = -1;
 
 	if (connection < 0)
 		return;
-	while (place < CHILDREN_MOST && listener->children[place].pid != 0)
-		place++;
-	pid = place < CHILDREN_MOST ? fork() : -1;
+	if (place < 0)
+		tell_refusal(listener, peer.sin_addr, "", "there are too many associations at once");
+	else if (pipe2(ends, O_CLOEXEC | O_NONBLOCK) == 0)
+		pid = fork();
 	if (pid == 0)
-		serve(listener, connection);
+		serve(listener, connection, ends[1]);
 	close(connection);
-	note_child(listener, place, pid);
+	if (ends[1] >= 0)
+		close(ends[1]);
+	if (place >= 0)
+		note_child(listener, place, pid, peer.sin_addr, ends[0]);
 }
 
 static void reap(struct listener *listener, int place)
 {
-	waitpid(listener->children[place].pid, NULL, 0);
+	const int said = listener->children[place].said;
+	struct refusal refusal;
+	int status = 0;
+
+	waitpid(listener->children[place].pid, &status, 0);
 	close(listener->children[place].pidfd);
 	listener->children[place].pid = 0;
+	if (said < 0)
+		return;
+	if (read(said, &refusal, sizeof(refusal)) == sizeof(refusal))
+		tell_refusal(listener, listener->children[place].address, refusal.title, refusal.why);
+	else if (WIFSIGNALED(status) && WTERMSIG(status) == SIGALRM)
+		tell_refusal(listener, listener->children[place].address, "", "it takes too long");
+	close(said);
 }
 
 /* ---- runs become scans ---- */
+
+/* The options that say where the daemon is; returns how many arguments there are now. */
+static int add_connection(const struct listener *listener, int count, char *arguments[ARGUMENTS_MOST])
+{
+	static const char *const connections[] = {"url", "token-file", "cacert"};
+
+	for (size_t i = 0; i < sizeof(connections) / sizeof(connections[0]); i++) {
+		const char *value = destination_text(receive_of(listener), connections[i]);
+
+		if (value[0] != '\0' && asprintf(&arguments[count], "--%s=%s", connections[i], value) > 0)
+			count++;
+	}
+	return count;
+}
 
 /* `cbct import RUN --url ... `: members of "import" are options of the same names. */
 static void import_arguments(const struct listener *listener, const char *run, const char *key,
 			     char *arguments[ARGUMENTS_MOST])
 {
-	static const char *const connections[] = {"url", "token-file", "cacert"};
 	const cJSON *receive = receive_of(listener), *option;
 	int count = 0;
 
@@ -137,12 +247,7 @@ static void import_arguments(const struct listener *listener, const char *run, c
 	arguments[count++] = strdup("--quiet");
 	arguments[count++] = strdup("--key");
 	arguments[count++] = strdup(key);
-	for (size_t i = 0; i < sizeof(connections) / sizeof(connections[0]); i++) {
-		const char *value = destination_text(receive, connections[i]);
-
-		if (value[0] != '\0' && asprintf(&arguments[count], "--%s=%s", connections[i], value) > 0)
-			count++;
-	}
+	count = add_connection(listener, count, arguments);
 	cJSON_ArrayForEach(option, cJSON_GetObjectItemCaseSensitive(receive, "import"))
 	{
 		char **next = &arguments[count];
@@ -183,8 +288,8 @@ static void read_end(int file, char ret[IMPORT_LINE])
 	ret[got > 0 ? got : 0] = '\0';
 }
 
-/* Runs it; `said` ends with the scan's id, or with why there is none. */
-static bool run_import(char *const *arguments, char said[IMPORT_LINE])
+/* Runs it, and frees the arguments; `said` ends with the id of what was made, or with why there is none. */
+static bool run_client(char **arguments, char said[IMPORT_LINE])
 {
 	const int out = memfd_create("out", MFD_CLOEXEC), errors = memfd_create("errors", MFD_CLOEXEC);
 	int status = -1;
@@ -202,7 +307,49 @@ static bool run_import(char *const *arguments, char said[IMPORT_LINE])
 	read_end(done ? out : errors, said);
 	close(out);
 	close(errors);
+	for (int i = 0; arguments[i] != NULL; i++)
+		free(arguments[i]);
 	return done;
+}
+
+/* The last line that is not empty, without its end. */
+static const char *last_line(char *text)
+{
+	char *end = text + strlen(text), *line;
+
+	while (end > text && (end[-1] == '\n' || end[-1] == ' '))
+		*--end = '\0';
+	line = strrchr(text, '\n');
+	return line != NULL ? line + 1 : text;
+}
+
+/* Posts the job that runs get here, once however often it is asked for. */
+static void submit_job(const struct listener *listener, const char *scan, const char *key, cJSON *told)
+{
+	const cJSON *job = cJSON_GetObjectItemCaseSensitive(receive_of(listener), "job");
+	char *text = job != NULL ? json_print(job, NULL) : NULL, *arguments[ARGUMENTS_MOST] = {NULL};
+	/* Not closed by the program that reads it. */
+	const int file = text != NULL ? memfd_create("job", 0) : -1;
+	char said[IMPORT_LINE] = "no memory for a job";
+	int count = 0;
+	bool done = false;
+
+	if (job == NULL)
+		return;
+	if (file >= 0 && write(file, text, strlen(text)) == (ssize_t)strlen(text)) {
+		arguments[count++] = strdup("cbct");
+		arguments[count++] = strdup("submit");
+		arguments[count++] = strdup(scan);
+		count += asprintf(&arguments[count], "/proc/self/fd/%d", file) > 0;
+		arguments[count++] = strdup("--once");
+		arguments[count++] = strdup(key);
+		arguments[add_connection(listener, count, arguments)] = NULL;
+		done = run_client(arguments, said);
+	}
+	cJSON_AddStringToObject(told, done ? "job" : "error", last_line(said));
+	if (file >= 0)
+		close(file);
+	free(text);
 }
 
 static void remove_run(const char *path)
@@ -215,17 +362,6 @@ static void remove_run(const char *path)
 	if (directory != NULL)
 		closedir(directory);
 	rmdir(path);
-}
-
-/* The last line that is not empty, without its end. */
-static const char *last_line(char *text)
-{
-	char *end = text + strlen(text), *line;
-
-	while (end > text && (end[-1] == '\n' || end[-1] == ' '))
-		*--end = '\0';
-	line = strrchr(text, '\n');
-	return line != NULL ? line + 1 : text;
 }
 
 /* In a process of its own. */
@@ -241,11 +377,11 @@ static void import_run(const struct listener *listener, const char *name)
 	snprintf(failed, sizeof(failed), "%s/failed-%.64s", listener->directory, name);
 	snprintf(key, sizeof(key), "received-%.64s", name);
 	import_arguments(listener, path, key, arguments);
-	done = run_import(arguments, said);
-	for (int i = 0; arguments[i] != NULL; i++)
-		free(arguments[i]);
+	done = run_client(arguments, said);
 	cJSON_AddStringToObject(told, done ? "scan" : "error", last_line(said));
 	if (done) {
+		/* The run goes after its job: a crash between both has both made again, and they are the same. */
+		submit_job(listener, last_line(said), key, told);
 		remove_run(path);
 	} else {
 		/* An older one of the same name was told already. */
@@ -283,7 +419,7 @@ static int import_quiet(struct listener *listener)
 			pid = fork();
 			if (pid == 0)
 				import_run(listener, entry->d_name);
-			note_child(listener, CHILDREN_MOST, pid);
+			note_child(listener, CHILDREN_MOST, pid, (struct in_addr){0}, -1);
 		} else if (wait < 0 || listener->quiet - age < wait)
 			wait = listener->quiet - age;
 	}

@@ -70,6 +70,20 @@ static int network_find(const cJSON *destination, struct objects *objects, struc
 	return code;
 }
 
+/* What an object's bytes may take is not its answer's, byte by byte: those that have gone out need none any more. */
+struct sending {
+	const cJSON *destination;
+	size_t size;
+};
+
+static void sent(const void *context, size_t bytes)
+{
+	const struct sending *sending = context;
+
+	patience(
+	    destination_patience(sending->destination, bytes < sending->size ? (double)(sending->size - bytes) : 0));
+}
+
 static void *send_some(void *context)
 {
 	struct load *load = context;
@@ -80,16 +94,17 @@ static void *send_some(void *context)
 	/* An archive that can be asked and does not take the class will never. */
 	if (code == ERR_NOT_FOUND)
 		code = error_set(&err, ERR_IMPOSSIBLE, "it does not take %s: \"objects\" of its row chooses another",
-				 strcmp(load->objects->class, DICOM_CT_IMAGE) == 0 ? "CT Image Storage"
-										   : "Enhanced CT Image Storage");
+				 dicom_class_name(load->objects->words.kind));
 	while (code == 0 && (place = load_next(load)) >= 0) {
 		uint8_t *bytes = NULL;
 		size_t size, dataset;
 
 		code = object_make(load->objects, place, &bytes, &size, &dataset, &err);
 		if (code == 0) {
+			const struct sending sending = {load->destination, size};
+
 			patience(destination_patience(load->destination, (double)size));
-			code = dimse_store(dimse, bytes, size, &err);
+			code = dimse_store(dimse, bytes, size, sent, &sending, &err);
 		}
 		free(bytes);
 		if (code == 0)

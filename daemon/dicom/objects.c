@@ -94,16 +94,20 @@ int objects_open(const cJSON *task, struct objects *ret_objects, struct error *e
 	char path[1024], job[64];
 	int code;
 
-	objects.words.enhanced = strcmp(destination_text(destination, "objects"), "enhanced") == 0;
-	objects.class = objects.words.enhanced ? DICOM_ENHANCED_CT_IMAGE : DICOM_CT_IMAGE;
+	for (int i = 0; i < DICOM_KIND_COUNT; i++)
+		if (strcmp(destination_text(destination, "objects"), dicom_kind_names[i]) == 0)
+			objects.words.kind = (enum dicom_kind)i;
+	objects.class = dicom_class(objects.words.kind);
+	objects.words.source = cJSON_Duplicate(
+	    cJSON_GetObjectItemCaseSensitive(cJSON_GetObjectItemCaseSensitive(task, "subject"), "source"), true);
 	code = read_task(task, &objects, path, job, err);
 	if (code == 0)
 		code = read_subject(task, &objects.words.subject, err);
 	if (code == 0)
 		code = open_volume(&objects, path, job, err);
 	if (code == 0) {
-		objects.count = objects.words.enhanced ? 1 : objects.grid.size[2];
-		objects.planes = objects.words.enhanced ? objects.grid.size[2] : 1;
+		objects.count = objects.words.kind != DICOM_SLICES ? 1 : objects.grid.size[2];
+		objects.planes = objects.words.kind != DICOM_SLICES ? objects.grid.size[2] : 1;
 		objects.plane_voxels = (size_t)objects.grid.size[0] * (size_t)objects.grid.size[1];
 		code = make_heads(&objects, err);
 	}
@@ -120,6 +124,8 @@ void objects_close(struct objects *objects)
 		free(objects->list[i].head.bytes);
 	free(objects->list);
 	objects->list = NULL;
+	cJSON_Delete(objects->words.source);
+	objects->words.source = NULL;
 	provenance_clear(&objects->provenance);
 	if (objects->file >= 0)
 		close(objects->file);

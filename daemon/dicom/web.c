@@ -8,7 +8,9 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <time.h>
 
+#include "daemon/dicom/answer.h"
 #include "daemon/dicom/dicom.h"
 #include "proto/scan_directory.h"
 
@@ -46,6 +48,29 @@ static size_t take(char *from, size_t size, size_t count, void *context)
 	reply->size += length;
 	reply->bytes[reply->size] = '\0';
 	return length;
+}
+
+/* How long the answer may still take, once the request has gone out. */
+struct answer_limit {
+	curl_off_t request; /* bytes */
+	double seconds;     /* from then on */
+	struct timespec since;
+};
+
+/* Not 0: the exchange is broken off. The time that a large request may take is not the answer's, byte by byte. */
+static int watch_answer(void *context, curl_off_t expected, curl_off_t received, curl_off_t whole, curl_off_t sent)
+{
+	struct answer_limit *limit = context;
+	struct timespec now;
+
+	(void)expected;
+	(void)received;
+	(void)whole;
+	clock_gettime(CLOCK_MONOTONIC, &now);
+	if (sent < limit->request || limit->since.tv_sec == 0)
+		limit->since = now;
+	return (double)(now.tv_sec - limit->since.tv_sec) + 1e-9 * (double)(now.tv_nsec - limit->since.tv_nsec) >
+	       limit->seconds;
 }
 
 /* "Authorization: Bearer ..." of the token in the destination's file. */
@@ -88,6 +113,8 @@ static int exchange(CURL *curl, const cJSON *destination, const char *url, const
 		    struct reply *ret_reply, struct error *err)
 {
 	struct curl_slist *headers = curl_slist_append(NULL, "Accept: application/dicom+json");
+	struct answer_limit limit = {.request = body != NULL ? (curl_off_t)body->size : 0,
+				     .seconds = destination_patience(destination, 0)};
 	char type[160];
 	CURLcode result = CURLE_OK;
 	int code = add_token(destination, &headers, err);
@@ -109,6 +136,9 @@ static int exchange(CURL *curl, const cJSON *destination, const char *url, const
 		/* Of the whole exchange: an answer may come a byte at a time. */
 		curl_easy_setopt(curl, CURLOPT_TIMEOUT,
 				 (long)ceil(destination_patience(destination, body != NULL ? (double)body->size : 0)));
+		curl_easy_setopt(curl, CURLOPT_NOPROGRESS, 0L);
+		curl_easy_setopt(curl, CURLOPT_XFERINFOFUNCTION, watch_answer);
+		curl_easy_setopt(curl, CURLOPT_XFERINFODATA, &limit);
 		curl_easy_setopt(curl, CURLOPT_HTTPHEADER, headers);
 		curl_easy_setopt(curl, CURLOPT_WRITEFUNCTION, take);
 		curl_easy_setopt(curl, CURLOPT_WRITEDATA, ret_reply);
@@ -116,21 +146,11 @@ static int exchange(CURL *curl, const cJSON *destination, const char *url, const
 		curl_easy_getinfo(curl, CURLINFO_RESPONSE_CODE, &ret_reply->status);
 	}
 	curl_slist_free_all(headers);
-	if (result != CURLE_OK)
+	if (result == CURLE_ABORTED_BY_CALLBACK)
+		code = error_set(err, ERR_BUSY, "it answers too slowly");
+	else if (result != CURLE_OK)
 		code = error_set(err, ERR_BUSY, "it cannot be reached: %s", curl_easy_strerror(result));
 	return code;
-}
-
-/* The words of an archive's own replies may name a patient: the number is all that is told. */
-static int refuse(long status, const char *what, struct error *err)
-{
-	const char *why = status == 401 || status == 403 ? " (the token is not accepted)"
-			  : status == 404                ? " (is the url that of its DICOMweb?)"
-			  : status == 413                ? " (the request is too large for it)"
-			  : status == 507                ? " (its disk is full)"
-							 : "";
-
-	return error_set(err, ERR_IO, "it answered %s with %ld%s", what, status, why);
 }
 
 static void make_url(const cJSON *destination, char *ret_url, size_t size, const char *format, ...)
@@ -161,7 +181,7 @@ static int web_ask(const cJSON *destination, struct error *err)
 	make_url(destination, url, sizeof(url), "/studies?limit=1&StudyInstanceUID=1.2.3");
 	code = exchange(curl, destination, url, NULL, &reply, err);
 	if (code == 0 && (reply.status < 200 || reply.status > 299))
-		code = refuse(reply.status, "QIDO-RS", err);
+		code = answer_refusal(reply.status, "QIDO-RS", err);
 	free(reply.bytes);
 	curl_easy_cleanup(curl);
 	return code;
@@ -169,28 +189,9 @@ static int web_ask(const cJSON *destination, struct error *err)
 
 /* ---- reading back ---- */
 
-/* Marks the instances of a page of results; returns how many it has, or an error. */
-static int take_page(const struct reply *reply, struct objects *objects, struct error *err)
+static void mark(void *context, const char *instance)
 {
-	cJSON *list = reply->size > 0 ? cJSON_ParseWithLength(reply->bytes, reply->size) : cJSON_CreateArray();
-	const cJSON *one;
-	int count = 0;
-
-	if (!cJSON_IsArray(list)) {
-		cJSON_Delete(list);
-		return error_set(err, ERR_IO, "its answer to QIDO-RS is no DICOM JSON");
-	}
-	cJSON_ArrayForEach(one, list)
-	{
-		const cJSON *instance = cJSON_GetObjectItemCaseSensitive(one, "00080018");
-		const cJSON *value = cJSON_GetArrayItem(cJSON_GetObjectItemCaseSensitive(instance, "Value"), 0);
-
-		if (cJSON_IsString(value))
-			objects_mark(objects, value->valuestring);
-		count++;
-	}
-	cJSON_Delete(list);
-	return count;
+	objects_mark(context, instance);
 }
 
 static int web_find(const cJSON *destination, struct objects *objects, struct error *err)
@@ -214,9 +215,9 @@ static int web_find(const cJSON *destination, struct objects *objects, struct er
 		if (code == 0 && (reply.status == 404 || reply.status == 204))
 			count = 0;
 		else if (code == 0 && reply.status != 200)
-			code = refuse(reply.status, "QIDO-RS", err);
+			code = answer_refusal(reply.status, "QIDO-RS", err);
 		else if (code == 0)
-			count = take_page(&reply, objects, err);
+			count = answer_instances(reply.bytes, reply.size, mark, objects, err);
 		if (count < 0)
 			code = count;
 		free(reply.bytes);
@@ -270,27 +271,6 @@ static int fill(struct load *load, struct reply *body, int *ret_count, struct er
 	return code;
 }
 
-/* 200: all, 202: some, 409: none was stored; which, and why, its FailedSOPSequence says. */
-static int judge(const struct reply *reply, struct error *err)
-{
-	cJSON *document = reply->size > 0 ? cJSON_ParseWithLength(reply->bytes, reply->size) : NULL;
-	const cJSON *sequence = cJSON_GetObjectItemCaseSensitive(document, "00081198"), *first, *reason;
-	const cJSON *failed = cJSON_GetObjectItemCaseSensitive(sequence, "Value");
-	const int count = cJSON_GetArraySize(failed);
-	int code = 0;
-
-	first = cJSON_GetArrayItem(failed, 0);
-	reason = cJSON_GetArrayItem(
-	    cJSON_GetObjectItemCaseSensitive(cJSON_GetObjectItemCaseSensitive(first, "00081197"), "Value"), 0);
-	if (count > 0)
-		code = error_set(err, ERR_IO, "it refused %d objects, reason 0x%04x", count,
-				 cJSON_IsNumber(reason) ? (unsigned)reason->valueint : 0);
-	else if (reply->status != 200 && reply->status != 202)
-		code = refuse(reply->status, "STOW-RS", err);
-	cJSON_Delete(document);
-	return code;
-}
-
 static void *send_some(void *context)
 {
 	struct load *load = context;
@@ -304,7 +284,7 @@ static void *send_some(void *context)
 	while (code == 0 && (code = fill(load, &body, &count, &err)) == 0 && count > 0) {
 		code = exchange(curl, load->destination, url, &body, &reply, &err);
 		if (code == 0)
-			code = judge(&reply, &err);
+			code = answer_stored(reply.bytes, reply.size, reply.status, &err);
 		free(reply.bytes);
 		if (code == 0)
 			report_progress(count);

@@ -2,29 +2,63 @@
  * Our own application entity: the members "title", "listen" and "worklist" of the file of destinations, the listener's
  * process, and the worklist as its peer has told it last.
  */
+#include <arpa/inet.h>
+#include <errno.h>
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <unistd.h>
 
 #include "daemon/log.h"
 #include "daemon/sendings/internal.h"
 #include "proto/clock.h"
+#include "proto/recipe.h"
 #include "proto/worklist.h"
 
 /* PS3.5 6.2: AE. The default repertoire without backslash and controls, no blanks around. */
+static void check_title(struct json_reader *reader, const char *name, const char *title)
+{
+	const size_t length = strlen(title);
+	bool good = length > 0 && length < TITLE_SIZE && title[0] != ' ' && title[length - 1] != ' ';
+
+	for (size_t i = 0; i < length; i++)
+		good = good && title[i] >= 0x20 && title[i] <= 0x7e && title[i] != '\\';
+	if (!good)
+		json_fail(reader, ERR_INVALID, name,
+			  "an application entity's title has 1 to 16 ASCII characters without \\ and without blanks "
+			  "around");
+}
+
 static void read_title(struct json_reader *reader, const char *name, bool required, char ret[TITLE_SIZE])
 {
+	const bool told = json_has(reader, name);
+
 	json_string(reader, name, required, ret, TITLE_SIZE);
-	for (const char *at = ret; reader->code == 0 && *at != '\0'; at++)
-		if (*at < 0x20 || *at > 0x7e || *at == '\\' || (*at == ' ' && (at == ret || at[1] == '\0'))) {
-			json_fail(reader, ERR_INVALID, name,
-				  "an application entity's title has up to 16 ASCII characters without \\ and without "
-				  "blanks around");
-			return;
-		}
-	if (reader->code == 0 && required && ret[0] == '\0')
-		json_fail(reader, ERR_INVALID, name, "it is empty");
+	if (reader->code == 0 && told)
+		check_title(reader, name, ret);
+}
+
+/* A name or an IPv4 address, as a resolver takes it: what is none would be looked up in vain at every attempt. */
+static void read_host(struct json_reader *reader, char *ret, size_t size)
+{
+	static const char letters[] = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789.-_";
+
+	json_string(reader, "host", true, ret, size);
+	if (reader->code == 0 &&
+	    (ret[0] == '\0' || strchr(".-", ret[0]) != NULL || strspn(ret, letters) != strlen(ret)))
+		json_fail(reader, ERR_INVALID, "host", "expected the name or the IPv4 address of a host");
+}
+
+void application_file(struct json_reader *reader, const char *name)
+{
+	char path[1024] = "";
+
+	if (!json_has(reader, name))
+		return;
+	json_string(reader, name, true, path, sizeof(path));
+	if (reader->code == 0 && access(path, R_OK) != 0)
+		json_fail(reader, ERR_INVALID, name, "the file %.200s cannot be read: %s", path, strerror(errno));
 }
 
 void application_peer(struct json_reader *reader, char *ret_address, size_t size)
@@ -33,7 +67,7 @@ void application_peer(struct json_reader *reader, char *ret_address, size_t size
 	double seconds;
 	long port = 104;
 
-	json_string(reader, "host", true, host, sizeof(host));
+	read_host(reader, host, sizeof(host));
 	json_integer(reader, "port", true, 1, 65535, &port);
 	read_title(reader, "title", true, title);
 	json_number(reader, "timeout_s", false, 1, 3600, &seconds);
@@ -55,39 +89,113 @@ static void read_worklist(const cJSON *value, struct json_reader *outer)
 		outer->code = reader.code;
 }
 
-/* Options of `cbct import`: texts, numbers and true. */
+/*
+ * Options of `cbct import` about images, geometry and numbers; what it connects to and what it writes is not the file's
+ * to say. http/dimse holds this list against the program's own help.
+ */
+static const char *const import_options[] = {
+    "name",
+    "pattern",
+    "size",
+    "type",
+    "big-endian",
+    "header",
+    "flip-columns",
+    "flip-rows",
+    "inverted",
+    "rtk",
+    "trust",
+    "matrices",
+    "first-pixel",
+    "astra",
+    "angles",
+    "first-angle",
+    "angle-step",
+    "clockwise",
+    "radians",
+    "pixel",
+    "source-to-isocentre",
+    "source-to-detector",
+    "detector-offset",
+    "patient",
+    "source-offset",
+    "quantity",
+    "sample",
+    "air",
+    "air-region",
+    "beam-hardening",
+    "correct",
+    "saturation",
+    "flat",
+    "dark",
+    "defects",
+    "scale",
+    "bias",
+};
+
 static void check_import(struct json_reader *reader, const cJSON *import)
 {
 	const cJSON *option;
 
-	cJSON_ArrayForEach(option, import)
-	{
-		const char *name = option->string;
-
-		if (strspn(name, "abcdefghijklmnopqrstuvwxyz-") != strlen(name) || name[0] == '-' ||
-		    !(cJSON_IsString(option) || cJSON_IsNumber(option) || cJSON_IsTrue(option)))
-			json_fail(reader, ERR_INVALID, "import",
-				  "\"%.40s\": expected an option of cbct import, with a "
-				  "text, a number or true",
-				  name);
-	}
 	if (import != NULL && !cJSON_IsObject(import))
 		json_fail(reader, ERR_INVALID, "import", "expected an object");
+	cJSON_ArrayForEach(option, import)
+	{
+		bool known = false;
+		char place[80];
+
+		for (size_t i = 0; i < sizeof(import_options) / sizeof(import_options[0]); i++)
+			known |= strcmp(option->string, import_options[i]) == 0;
+		snprintf(place, sizeof(place), "import/%.60s", option->string);
+		if (!known)
+			json_fail(reader, ERR_INVALID, place,
+				  "expected an option of cbct import about images, geometry or numbers");
+		else if (!(cJSON_IsString(option) || cJSON_IsNumber(option) || cJSON_IsTrue(option)))
+			json_fail(reader, ERR_INVALID, place, "expected a text, a number or true");
+	}
+}
+
+/* The job of each run: as it would be posted, but for the scan, which is yet to come. */
+static void check_job(struct json_reader *reader, const cJSON *job)
+{
+	cJSON *whole = cJSON_IsObject(job) ? cJSON_Duplicate(job, true) : NULL;
+	struct job_request request;
+	struct error cause = {0};
+	char place[sizeof(cause.pointer) + 8];
+
+	if (job == NULL || reader->code != 0)
+		return;
+	if (whole == NULL || cJSON_HasObjectItem(job, "scan")) {
+		json_fail(reader, ERR_INVALID, "job", "expected a job's document without its scan");
+	} else {
+		cJSON_AddStringToObject(whole, "scan", "received");
+		if (job_request_read(whole, &request, &cause) != 0) {
+			snprintf(place, sizeof(place), "job%s", cause.pointer);
+			json_fail(reader, ERR_INVALID, place, "%.160s", cause.text);
+		} else {
+			job_request_clear(&request);
+		}
+	}
+	cJSON_Delete(whole);
 }
 
 static void read_receive(const cJSON *value, struct json_reader *outer)
 {
 	struct json_reader reader;
-	char path[1024] = "";
+	char url[1024] = "";
 	double number;
 
 	json_begin(&reader, value, "/listen/receive", outer->err);
-	json_string(&reader, "url", true, path, sizeof(path));
-	json_string(&reader, "token-file", false, path, sizeof(path));
-	json_string(&reader, "cacert", false, path, sizeof(path));
+	json_string(&reader, "url", true, url, sizeof(url));
+	if (reader.code == 0 && strncmp(url, "http://", 7) != 0 && strncmp(url, "https://", 8) != 0 &&
+	    strncmp(url, "unix:/", 6) != 0)
+		json_fail(&reader, ERR_INVALID, "url", "expected http://, https:// or unix:/PATH");
+	application_file(&reader, "token-file");
+	application_file(&reader, "cacert");
 	json_number(&reader, "quiet_s", false, 0.1, 3600, &number);
 	json_number(&reader, "max_bytes", false, 1024, 1e13, &number);
 	check_import(&reader, json_member(&reader, "import", false));
+	check_job(&reader, json_member(&reader, "job", false));
 	if (json_end(&reader) != 0)
 		outer->code = reader.code;
 }
@@ -96,13 +204,17 @@ static void read_listen(const cJSON *value, struct json_reader *outer)
 {
 	const cJSON *peers, *peer, *receive;
 	struct json_reader reader;
-	char address[64] = "";
+	char address[64] = "", place[32];
+	struct in_addr ignored;
 	double seconds;
+	int count = 0;
 	long port;
 
 	json_begin(&reader, value, "/listen", outer->err);
 	json_integer(&reader, "port", true, 1, 65535, &port);
 	json_string(&reader, "address", false, address, sizeof(address));
+	if (reader.code == 0 && json_has(&reader, "address") && inet_pton(AF_INET, address, &ignored) != 1)
+		json_fail(&reader, ERR_INVALID, "address", "expected an IPv4 address to listen on");
 	json_number(&reader, "timeout_s", false, 1, 3600, &seconds);
 	peers = json_member(&reader, "peers", true);
 	receive = json_member(&reader, "receive", false);
@@ -111,8 +223,9 @@ static void read_listen(const cJSON *value, struct json_reader *outer)
 		json_fail(&reader, ERR_INVALID, "peers", "expected a list of 1 to 64 titles that may call");
 	cJSON_ArrayForEach(peer, peers)
 	{
-		if (reader.code == 0 && (!cJSON_IsString(peer) || strlen(peer->valuestring) >= TITLE_SIZE))
-			json_fail(&reader, ERR_INVALID, "peers", "expected titles of up to 16 characters");
+		snprintf(place, sizeof(place), "peers/%d", count++);
+		if (reader.code == 0)
+			check_title(&reader, place, cJSON_IsString(peer) ? peer->valuestring : "");
 	}
 	if (reader.code == 0 && receive != NULL)
 		read_receive(receive, &reader);
@@ -192,10 +305,30 @@ static int number_of(const cJSON *object, const char *name)
 	return cJSON_IsNumber(member) ? member->valueint : 0;
 }
 
+static void take_received(const cJSON *received)
+{
+	const char *scan = text_of(received, "scan"), *job = text_of(received, "job"),
+		   *error = text_of(received, "error");
+
+	if (scan[0] == '\0')
+		log_line(LEVEL_ERROR,
+			 "a run of projections that was received cannot be imported, and stays in received/: %.300s",
+			 error);
+	else if (error[0] != '\0')
+		log_line(LEVEL_ERROR, "a run of projections that was received is scan %.40s, and gets no job: %.300s",
+			 scan, error);
+	else if (job[0] != '\0')
+		log_line(LEVEL_INFO, "a run of projections that was received is scan %.40s, reconstructed by job %.40s",
+			 scan, job);
+	else
+		log_line(LEVEL_INFO, "a run of projections that was received is scan %.40s", scan);
+}
+
 static void take_listener(struct sendings *sendings, const cJSON *line)
 {
 	const cJSON *promise = cJSON_GetObjectItemCaseSensitive(line, "promise");
 	const cJSON *received = cJSON_GetObjectItemCaseSensitive(line, "received");
+	const cJSON *refused = cJSON_GetObjectItemCaseSensitive(line, "refused");
 
 	if (cJSON_HasObjectItem(line, "listening"))
 		log_line(LEVEL_INFO, "listening for DICOM associations as %s, port %d", sendings->application.title,
@@ -203,12 +336,13 @@ static void take_listener(struct sendings *sendings, const cJSON *line)
 	if (promise != NULL)
 		sender_promised(sendings, text_of(promise, "transaction"), number_of(promise, "kept"),
 				number_of(promise, "refused"), number_of(promise, "reason"));
-	if (received != NULL && text_of(received, "scan")[0] != '\0')
-		log_line(LEVEL_INFO, "a run of projections that was received is scan %.40s", text_of(received, "scan"));
-	else if (received != NULL)
-		log_line(LEVEL_ERROR,
-			 "a run of projections that was received cannot be imported, and stays in received/: %.300s",
-			 text_of(received, "error"));
+	if (received != NULL)
+		take_received(received);
+	if (refused != NULL)
+		log_line(LEVEL_WARNING, "an association from %.40s, %s, is refused: %.160s%s",
+			 text_of(refused, "address"),
+			 text_of(refused, "title")[0] != '\0' ? text_of(refused, "title") : "without a title",
+			 text_of(refused, "why"), text_of(refused, "more"));
 }
 
 void application_take(struct sendings *sendings, int transfer, const cJSON *line)
@@ -239,6 +373,12 @@ void application_ended(struct sendings *sendings, int transfer, const cJSON *res
 		sendings->listener_stale = false;
 		return;
 	}
+	/* Another worklist is asked in its place; nobody waits for what the old one would have said. */
+	if (sendings->worklist_stale) {
+		cJSON_Delete(sendings->steps);
+		sendings->steps = NULL;
+		return;
+	}
 	worklist->wanted = false;
 	worklist->checked = clock_realtime();
 	snprintf(worklist->error, sizeof(worklist->error), "%s", result != NULL ? error : how);
@@ -249,6 +389,14 @@ void application_ended(struct sendings *sendings, int transfer, const cJSON *res
 	}
 	cJSON_Delete(sendings->steps);
 	sendings->steps = NULL;
+}
+
+void worklist_forget(struct sendings *sendings)
+{
+	cJSON_Delete(sendings->worklist.steps);
+	sendings->worklist =
+	    (struct worklist){.wanted = sendings->worklist.wanted && sendings->application.worklist != NULL};
+	sendings->worklist_stale = true;
 }
 
 /* ---- what the API shows ---- */
@@ -287,7 +435,13 @@ cJSON *worklist_document(struct sendings *sendings)
 			      worklist->steps != NULL ? cJSON_Duplicate(worklist->steps, true) : cJSON_CreateArray());
 	cJSON_AddNumberToObject(document, "not_shown", worklist->nobodys);
 	json_add_time(document, "checked", worklist->checked);
-	if (worklist->error[0] != '\0')
+	if (worklist->wanted)
+		cJSON_AddStringToObject(
+		    document, "detail",
+		    worklist->checked > 0
+			? "it has not answered yet: these are the steps that it told when it was asked before"
+			: "it has not answered yet");
+	else if (worklist->error[0] != '\0')
 		cJSON_AddStringToObject(document, "detail", worklist->error);
 	else
 		cJSON_AddNullToObject(document, "detail");

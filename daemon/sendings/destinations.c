@@ -14,7 +14,6 @@
 enum { FILE_MOST = 1 << 20, DESTINATIONS_MOST = 64 };
 
 static const char *const kind_names[DESTINATION_KIND_COUNT] = {"dicomweb", "dimse"};
-static const char *const objects_names[] = {"slices", "enhanced"};
 
 void destinations_free(struct destination *destinations, int count)
 {
@@ -35,11 +34,9 @@ struct destination *destination_find(const struct sendings *sendings, const char
 
 static void read_web(struct json_reader *reader, struct destination *ret)
 {
-	char path[1024] = "";
-
 	json_string(reader, "url", true, ret->address, sizeof(ret->address));
-	json_string(reader, "token_file", false, path, sizeof(path));
-	json_string(reader, "ca_file", false, path, sizeof(path));
+	application_file(reader, "token_file");
+	application_file(reader, "ca_file");
 	if (reader->code == 0 && strncmp(ret->address, "http://", 7) != 0 && strncmp(ret->address, "https://", 8) != 0)
 		json_fail(reader, ERR_INVALID, "url", "expected http:// or https://");
 	/* A document shows the URL. */
@@ -90,7 +87,7 @@ static int read_row(const cJSON *value, int place, struct destination *ret, stru
 	json_begin(&reader, value, pointer, err);
 	json_string(&reader, "name", true, ret->name, sizeof(ret->name));
 	json_choice(&reader, "kind", true, kind_names, DESTINATION_KIND_COUNT, &kind);
-	json_choice(&reader, "objects", false, objects_names, 2, &objects);
+	json_choice(&reader, "objects", false, dicom_kind_names, DICOM_KIND_COUNT, &objects);
 	read_rule(&reader, ret->rule);
 	if (reader.code == 0 && !destination_name_valid(ret->name))
 		json_fail(&reader, ERR_INVALID, "name", "\"%s\" is no name: letters, digits, -, _ and .", ret->name);
@@ -101,9 +98,17 @@ static int read_row(const cJSON *value, int place, struct destination *ret, stru
 		json_number(&reader, "timeout_s", false, 1, 3600, &seconds);
 	}
 	ret->kind = (enum destination_kind)kind;
-	ret->enhanced = objects == 1;
+	ret->objects = (enum dicom_kind)objects;
 	ret->wanted = true;
 	return json_end(&reader);
+}
+
+static int two_of(const char *name, int place, struct error *err)
+{
+	char pointer[64];
+
+	snprintf(pointer, sizeof(pointer), "/destinations/%d/name", place);
+	return error_set_at(err, ERR_INVALID, pointer, "two destinations are called %s", name);
 }
 
 static int read_list(const cJSON *list, struct destination **ret_destinations, int *ret_count, struct error *err)
@@ -124,7 +129,7 @@ static int read_list(const cJSON *list, struct destination **ret_destinations, i
 		code = read_row(one, i, &read[i], err);
 		for (int k = 0; k < i && code == 0; k++)
 			if (strcmp(read[k].name, read[i].name) == 0)
-				code = error_set(err, ERR_INVALID, "two destinations are called %s", read[i].name);
+				code = two_of(read[i].name, i, err);
 		if (code == 0 && (read[i].row = cJSON_Duplicate(one, true)) == NULL)
 			code = error_set(err, ERR_NO_MEMORY, "no memory for destinations");
 		i++;
@@ -138,6 +143,30 @@ static int read_list(const cJSON *list, struct destination **ret_destinations, i
 	*ret_destinations = read;
 	*ret_count = count;
 	return 0;
+}
+
+/* The jobs of received runs send to destinations that there are. */
+static int check_received(const cJSON *listen, const struct destination *destinations, int count, struct error *err)
+{
+	const cJSON *receive = cJSON_GetObjectItemCaseSensitive(listen, "receive");
+	const cJSON *job = cJSON_GetObjectItemCaseSensitive(receive, "job");
+	const char base[] = "/listen/receive/job/send";
+	struct send_wish wishes[SENDS_MOST];
+	char *text = NULL, pointer[sizeof(base) + 16];
+	int code = sends_read(cJSON_GetObjectItemCaseSensitive(job, "send"), base, &text, err), wanted;
+
+	wanted = code == 0 ? sends_parse(text, wishes) : 0;
+	for (int i = 0; i < wanted && code == 0; i++) {
+		bool known = false;
+
+		for (int k = 0; k < count; k++)
+			known |= strcmp(destinations[k].name, wishes[i].to) == 0;
+		snprintf(pointer, sizeof(pointer), "%s/%d", base, i);
+		if (!known)
+			code = error_set_at(err, ERR_INVALID, pointer, "there is no destination \"%s\"", wishes[i].to);
+	}
+	free(text);
+	return code;
 }
 
 int destinations_read(const char *file, struct destination **ret_destinations, int *ret_count,
@@ -166,14 +195,38 @@ int destinations_read(const char *file, struct destination **ret_destinations, i
 		code = json_end(&reader);
 		if (code == 0)
 			code = read_list(list, ret_destinations, ret_count, &cause);
-		if (code != 0)
+		if (code == 0)
+			code = check_received(ret_application->listen, *ret_destinations, *ret_count, &cause);
+		if (code != 0) {
+			destinations_free(*ret_destinations, *ret_count);
+			*ret_destinations = NULL;
+			*ret_count = 0;
 			application_free(ret_application);
+		}
 	}
 	free(text);
 	cJSON_Delete(document);
 	return code == 0 ? 0
 			 : error_set(err, code, "destinations %.100s: %.40s%s%.160s", file, cause.pointer,
 				     cause.pointer[0] != '\0' ? ": " : "", cause.text);
+}
+
+/* What is known of a destination stays where its row has stayed; another row is another archive. The lock is held. */
+static void inherit(struct sendings *sendings, struct destination *fresh, int count)
+{
+	for (int i = 0; i < count; i++) {
+		const struct destination *old = destination_find(sendings, fresh[i].name);
+
+		fresh[i].edition = ++sendings->editions;
+		if (old == NULL || !cJSON_Compare(old->row, fresh[i].row, true))
+			continue;
+		fresh[i].edition = old->edition;
+		fresh[i].known = old->known;
+		fresh[i].reachable = old->reachable;
+		fresh[i].checked = old->checked;
+		fresh[i].checked_at = old->checked_at;
+		memcpy(fresh[i].detail, old->detail, sizeof(fresh[i].detail));
+	}
 }
 
 void sendings_reload(struct sendings *sendings)
@@ -188,6 +241,7 @@ void sendings_reload(struct sendings *sendings)
 		return;
 	}
 	pthread_mutex_lock(&sendings->lock);
+	inherit(sendings, fresh, count);
 	old = sendings->destinations;
 	old_count = sendings->destination_count;
 	sendings->destinations = fresh;
@@ -197,6 +251,10 @@ void sendings_reload(struct sendings *sendings)
 	/* Associations that go on are not broken off for another's change. */
 	if (!cJSON_Compare(old_application.listen, application.listen, true))
 		sendings->listener_stale = true;
+	if (!cJSON_Compare(old_application.worklist, application.worklist, true))
+		worklist_forget(sendings);
+	/* A port that was taken may be free by now. */
+	sendings->listen_at = 0;
 	/* What was changed may be the reason why something could not be sent. */
 	for (int i = 0; i < sendings->count; i++)
 		sendings->entries[i].record.next = 0;
@@ -225,7 +283,7 @@ static cJSON *document_of(const struct sendings *sendings, const struct destinat
 	cJSON_AddStringToObject(document, "name", one->name);
 	cJSON_AddStringToObject(document, "kind", kind_names[one->kind]);
 	cJSON_AddStringToObject(document, "address", one->address);
-	cJSON_AddStringToObject(document, "objects", objects_names[one->enhanced]);
+	cJSON_AddStringToObject(document, "objects", dicom_kind_names[one->objects]);
 	cJSON_AddItemToObject(document, "send",
 			      one->rule[0] != '\0' ? send_volumes_json(one->rule) : cJSON_CreateString("none"));
 	if (one->known)

@@ -5,6 +5,7 @@
 
 #include "daemon/process.h"
 #include "daemon/sendings/sendings.h"
+#include "proto/dicom.h"
 #include "proto/json.h"
 
 /* Shared by the files of this room. */
@@ -15,10 +16,12 @@ struct destination {
 	char name[DESTINATION_NAME_SIZE];
 	enum destination_kind kind;
 	char rule[SEND_VOLUMES_SIZE]; /* volumes of jobs that say nothing; "": none */
-	bool enhanced;
+	enum dicom_kind objects;
 	double promise_seconds; /* after which an unanswered request for storage commitment is made again */
 	char address[320];      /* for people: the URL, or TITLE@HOST:PORT */
 	cJSON *row;             /* as the file has it, for cbct-dicom; owned */
+	unsigned long
+	    edition; /* another one for each row that was ever read: answers belong to the row that was asked */
 	/* Whether it answers. */
 	bool wanted;           /* it is to be asked */
 	bool known, reachable; /* the last answer */
@@ -46,6 +49,7 @@ enum { TRANSFER_LINE_MAX = 16384 };
 struct transfer {
 	bool runs, over;
 	char destination[DESTINATION_NAME_SIZE], job[ID_SIZE], name[SENDING_NAME_SIZE]; /* job "": it only asks */
+	unsigned long edition; /* of the destination's row that it was given */
 	struct process process;
 	int socket;
 	double heard; /* clock_monotonic */
@@ -71,7 +75,6 @@ struct sendings {
 	struct watch watch;
 	struct watch_list watchers;
 	struct transfer transfers[TRANSFER_COUNT]; /* the sender's */
-	double listen_at;                          /* clock_monotonic: when the listener may start; the sender's */
 	cJSON *steps;                              /* those of the worklist that have come so far; the sender's */
 
 	pthread_mutex_t lock; /* guards what follows; held over commits of sendings' rows: one change at a time */
@@ -83,7 +86,9 @@ struct sendings {
 	bool stop;
 	struct application application;
 	struct worklist worklist;
-	bool listener_stale; /* it runs with rows that are no longer in the file */
+	double listen_at;                    /* clock_monotonic: when the listener may start */
+	unsigned long editions;              /* how many rows of destinations were read */
+	bool listener_stale, worklist_stale; /* the process runs with a row that is no longer in the file */
 
 	pthread_t thread;
 	bool has_thread;
@@ -103,6 +108,11 @@ void application_read(struct json_reader *reader, struct application *ret);
 void application_free(struct application *application);
 /* A host, a port and the title of an application entity there. */
 void application_peer(struct json_reader *reader, char *ret_address, size_t size);
+/* Another worklist is to be asked from now on: what the old one told is dropped. The lock is held. */
+void worklist_forget(struct sendings *sendings);
+/* The path of a file that cbct-dicom, or a program that it starts, will read: one that cannot be read now is refused.
+ */
+void application_file(struct json_reader *reader, const char *name);
 /* The line that the listener or the worklist's process gets, free; NULL: there is none, or no memory. */
 char *application_task(const struct sendings *sendings, int transfer);
 /* Lines of these processes; the lock is held. */

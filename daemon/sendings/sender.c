@@ -39,11 +39,13 @@ static void drain(const struct sendings *sendings)
 
 /* ---- results; the lock is held ---- */
 
-static void note_answer(struct sendings *sendings, const char *name, bool reachable, const char *detail)
+/* edition: of the row that was asked; nothing is learnt about another one of the same name. */
+static void note_answer(struct sendings *sendings, const char *name, unsigned long edition, bool reachable,
+			const char *detail)
 {
 	struct destination *destination = destination_find(sendings, name);
 
-	if (destination == NULL)
+	if (destination == NULL || destination->edition != edition)
 		return;
 	if (reachable && destination->known && !destination->reachable) {
 		log_line(LEVEL_INFO, "destination %s answers again", name);
@@ -190,10 +192,10 @@ static void settle(struct sendings *sendings, struct transfer *transfer, const c
 
 	snprintf(none, sizeof(none), "the process that asks ended: %s", how);
 	if (transfer->result != NULL)
-		note_answer(sendings, transfer->destination,
+		note_answer(sendings, transfer->destination, transfer->edition,
 			    cJSON_IsTrue(cJSON_GetObjectItemCaseSensitive(transfer->result, "reachable")), error);
 	else if (transfer->job[0] == '\0')
-		note_answer(sendings, transfer->destination, false, none);
+		note_answer(sendings, transfer->destination, transfer->edition, false, none);
 	if (transfer->job[0] != '\0')
 		settle_sending(sendings, transfer, how);
 }
@@ -357,6 +359,7 @@ static bool run_attempt(struct sendings *sendings, const struct entry *entry, st
 		*ret_code = err->code == ERR_NOT_FOUND ? ERR_DAMAGED : err->code;
 	else {
 		memcpy(transfer->destination, entry->record.destination, sizeof(transfer->destination));
+		transfer->edition = destination->edition;
 		memcpy(transfer->job, entry->job, sizeof(transfer->job));
 		memcpy(transfer->name, entry->record.name, sizeof(transfer->name));
 		*ret_code = start_process(sendings, transfer, line, err);
@@ -448,10 +451,11 @@ static void start_asking(struct sendings *sendings)
 		if (!one->wanted || transfer == NULL || is_busy(sendings, one->name))
 			continue;
 		memcpy(transfer->destination, one->name, sizeof(one->name));
+		transfer->edition = one->edition;
 		transfer->job[0] = transfer->name[0] = '\0';
 		if (task_make(sendings, one, NULL, NULL, &line, &err) != 0 ||
 		    start_process(sendings, transfer, line, &err) != 0)
-			note_answer(sendings, one->name, false, err.text);
+			note_answer(sendings, one->name, one->edition, false, err.text);
 		free(line);
 	}
 }
@@ -472,6 +476,7 @@ static void start_application(struct sendings *sendings)
 		if (i == TRANSFER_WORKLIST) {
 			sendings->steps = cJSON_CreateArray();
 			sendings->worklist.nobodys = 0;
+			sendings->worklist_stale = false;
 		} else {
 			sendings->listener_stale = false;
 		}
@@ -490,9 +495,12 @@ static bool is_unwanted(struct sendings *sendings, const struct transfer *transf
 	if (sendings->stop || (clock_monotonic() - transfer->heard > SILENCE_MOST && !listens))
 		return true;
 	if (listens || transfer == &sendings->transfers[TRANSFER_WORKLIST])
-		return listens && sendings->listener_stale;
-	if (transfer->job[0] == '\0')
-		return destination_find(sendings, transfer->destination) == NULL;
+		return listens ? sendings->listener_stale : sendings->worklist_stale;
+	if (transfer->job[0] == '\0') {
+		const struct destination *asked = destination_find(sendings, transfer->destination);
+
+		return asked == NULL || asked->edition != transfer->edition;
+	}
 	entry = entry_find(sendings, transfer->job, transfer->name);
 	return entry == NULL || entry->record.state != SENDING_SENDING;
 }

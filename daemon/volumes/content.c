@@ -92,8 +92,14 @@ static int make_header(struct content *content, const char *path, struct error *
 		return code;
 	code = options->format->header(&content->scaled, options->type, &provenance, content->header,
 				       &content->header_size, err);
-	if (code == 0 && options->dicom)
-		code = dicom_patient(&options->words, &provenance.patient, &patient, err);
+	if (code == 0 && options->dicom && dicom_patient(&options->words, &provenance.patient, &patient, err) != 0) {
+		const struct error cause = *err;
+
+		/* Who asks for a volume can tell it; who sends one cannot. */
+		code = cause.code;
+		if (options->words.position < 0)
+			error_set(err, code, "%s, or ask with position=HFS, or whichever it is", cause.text);
+	}
 	if (code == 0 && options->dicom)
 		content->provenance = provenance;
 	else
@@ -116,8 +122,10 @@ int content_open(const char *path, const struct grid *grid, const struct content
 {
 	struct content *content = calloc(1, sizeof(*content));
 
-	if (content == NULL)
+	if (content == NULL) {
+		cJSON_Delete(options->words.source);
 		return error_set(err, ERR_NO_MEMORY, "no memory to read a volume");
+	}
 	content->grid = *grid;
 	content->options = *options;
 	content->voxel_bytes = volume_type_bytes(options->type);
@@ -152,6 +160,7 @@ void content_close(struct content *content)
 	free(content->rows);
 	free(content->plane);
 	provenance_clear(&content->provenance);
+	cJSON_Delete(content->options.words.source);
 	free(content);
 }
 

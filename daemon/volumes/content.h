@@ -19,7 +19,7 @@ struct content_options {
 	enum volume_type type;
 	bool shuffled; /* raw int16 with bytes sorted: of each plane z the low bytes [y][x], then the high ones */
 	bool dicom;    /* raw int16 as a ZIP of DICOM slices or one object; words tells the rest */
-	struct dicom_words words;
+	struct dicom_words words; /* words.source is the content's, from content_open on, also where that fails */
 	int scale;       /* 1: as it is; s: each voxel the mean of s x s x s, at the far ends of what is there */
 	double mu_water; /* 1/mm, for Hounsfield units */
 };

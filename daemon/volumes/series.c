@@ -198,7 +198,7 @@ void series_free(struct series *series)
 /* The next piece; false where the volume cannot be read. */
 static bool next_piece(struct series *series)
 {
-	const bool zip = !series->words->enhanced;
+	const bool zip = series->words->kind == DICOM_SLICES;
 	bool made = true;
 
 	series->used = series->filled = 0;

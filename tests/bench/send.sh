@@ -2,8 +2,8 @@
 # How long 512 slices of 512 x 512 take to Orthanc, from the request to the archive's promise (C-STORE) or proof (STOW-RS), in
 # seconds. tests/bench/send.sh; needs the packages that `make check` installs for tests of archives.
 . "$(dirname "$0")/../http/lib.sh"
-python=${PYTHON:-/usr/bin/python3}
 . "$top/tests/http/archive.sh"
+program=cbctd # without the checks of tests
 
 measure() {
 	local to began patient

@@ -1,4 +1,8 @@
-# Orthanc with its DICOMweb plugin, sourced by tests that send to it; needs lib.sh and $python.
+# Archives for the tests that send to them: Orthanc with its DICOMweb plugin, and some that do wrong. Sourced behind lib.sh.
+python=${PYTHON:-/usr/bin/python3}
+stop_after_each=1
+program=cbctd-held
+[ -e "$BUILD/cbctd-held" ] || program=cbctd
 
 need_archive() {
 	trap stop_peers EXIT # of the test
@@ -76,6 +80,14 @@ sending_becomes() {
 	done
 }
 
+# job_of PATIENT [SEND]: reconstructed
+job_of() {
+	mkdir -p "$work/posted"
+	ln -sf "$work/scan/projections.raw" "$work/posted/projections.raw"
+	jq -c --argjson patient "$1" '.patient = $patient | .study = {uid: "1.2.3.4.5", accession_number: "A17"}' "$work/scan/scan.json" >"$work/posted/scan.json"
+	reconstruct "$work/posted" "{\"scan\": \"SCAN\", $recipe${2:+, \"send\": $2}}"
+}
+who='{"position": "HFS", "name": "Doe^Jane", "id": "4711"}'
 recipe='"grid": {"size": [41, 36, 50], "spacing_mm": [2, 2.4, 1.7], "origin_mm": [-40, -42, -41.65]}, "fdk": {}'
 # kills COUNT [dimse]: so many series sent, with a kill -9 of daemon, cbct-dicom or archive in the middle of each; all arrive
 # once. By DICOM's own protocol each is committed, too.

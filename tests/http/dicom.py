@@ -3,7 +3,8 @@
 
 Usage: dicom.py check POSITION VOXELS.raw MEMBERS.json OBJECT ...
            VOXELS: the same volume as raw int16 [z][y][x]; MEMBERS: what attributes must say, by keyword; OBJECT: all
-           slices, or one object with frames, or both with -- between. POSITION as of sides.py, whose object it is.
+           slices, or one object with frames, or several of these with -- between. POSITION as of sides.py, whose object it is.
+       dicom.py sources OBJECT ...       the UIDs that each references as its sources, wherever it must, behind their class
        dicom.py uids OBJECT ...          the UIDs of each, to compare
        dicom.py who NAME/.../OBJECT ...  NAME (before the file, or its "slices"), the patient's name and id, accession number,
            study UID: a line for each that differs
@@ -112,9 +113,20 @@ KEYS = {
 }
 
 if sys.argv[1] == "check":
-    one, _, two = "\n".join(sys.argv[5:]).partition("\n--\n")
-    for group in filter(None, (one, two)):
+    for group in "\n".join(sys.argv[5:]).split("\n--\n"):
         check(*sys.argv[2:5], group.split("\n"))
+elif sys.argv[1] == "sources":
+    for path in sys.argv[2:]:
+        data = pydicom.dcmread(path, stop_before_pixels=True)
+        shared = data.SharedFunctionalGroupsSequence[0].DerivationImageSequence[0] if "SharedFunctionalGroupsSequence" in data else data
+        lists = [shared.SourceImageSequence]
+        if "SourceImageEvidenceSequence" in data:
+            lists.append(data.SourceImageEvidenceSequence[0].ReferencedSeriesSequence[0].ReferencedSOPSequence)
+        elif shared is not data:
+            lists.append(data.ReferencedSeriesSequence[0].ReferencedInstanceSequence)
+        said = [" ".join([one[0].ReferencedSOPClassUID] + [item.ReferencedSOPInstanceUID for item in one]) for one in lists]
+        len(set(said)) == 1 or fail(f"{path}: {said}")
+        print(said[0])
 else:
     lines = []
     for path in sys.argv[2:]:

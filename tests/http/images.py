@@ -1,7 +1,7 @@
 #!/usr/bin/python3
 """Projections of a scan directory in other tools' formats, written without any of the project's code.
 
-Usage: images.py mha|npy|tiff|pages|tiles|dicom|enhanced|his|hnd|xim SCAN OUT [OPTION=VALUE ...]
+Usage: images.py mha|npy|tiff|pages|tiles|dicom|enhanced|his|hnd|xim|xtekct|nexus|exchange|txrm SCAN OUT [OPTION=VALUE ...]
 """
 import json
 import os
@@ -261,6 +261,130 @@ def write_varian(document, images, out, kind):
             file.write(data)
 
 
+def stage_angles(document):
+    """Degrees of the table that turns the object, which is the source the other way round."""
+    geometry = document["geometry"]
+    if "angles_deg" in geometry:
+        return [-angle for angle in geometry["angles_deg"]]
+    first, step = geometry.get("first_angle_deg", 0), geometry["angle_step_deg"]
+    return [-(first + k * step) for k in range(document["projections"]["count"])]
+
+
+def write_xtekct(document, images, out):
+    """OUT.xtekct, with carriage returns, and OUT_0001.tif and so on."""
+    geometry, angles = document["geometry"], stage_angles(document)
+    count, rows, columns = images.shape
+    lines = {"Name": "ball", "VoxelsX": columns, "DetectorPixelsX": columns, "DetectorPixelsY": rows,
+             "DetectorPixelSizeX": document["detector"]["pixel_mm"][0], "DetectorPixelSizeY": document["detector"]["pixel_mm"][1],
+             "SrcToObject": geometry["source_to_isocentre_mm"], "SrcToDetector": geometry["source_to_detector_mm"],
+             "DetectorOffsetX": 0, "DetectorOffsetY": 0, "Projections": count, "InitialAngle": repr(angles[0]),
+             "AngularStep": repr(angles[1] - angles[0]), "WhiteLevel": 50000, "Scale": 1}
+    with open(out + ".xtekct", "w", encoding="utf-8", newline="") as file:
+        file.write("[XTekCT]\r\n" + "".join(f"{key}={value}\r\n" for key, value in lines.items()) + "[Xrays]\r\nXraykV=120\r\n")
+    for k, image in enumerate(images):
+        write_tiff(image[None], f"{out}_{k + 1:04}.tif")
+
+
+def write_hdf5(document, images, out, nexus):
+    """By h5py: NXtomo with a flat image at either end and lengths in several units, or Data Exchange, compressed."""
+    import h5py
+
+    geometry, pitch, angles = document["geometry"], document["detector"]["pixel_mm"], stage_angles(document)
+    with h5py.File(out, "w") as file:
+        if not nexus:
+            file.create_dataset("exchange/data", data=images, chunks=(1,) + images.shape[1:], compression="gzip", shuffle=True)
+            file["exchange/theta"] = numpy.array(angles, "f8")
+            return
+        flat = numpy.full_like(images[:1], 50000)
+        detector = file.create_group("entry/instrument/detector")
+        detector["data"] = numpy.concatenate([flat, images, flat])
+        detector["image_key"] = numpy.array([1] + [0] * len(images) + [1], "i4")
+        file["entry/sample/rotation_angle"] = numpy.array([0] + angles + [0], "f8")
+        to_axis, to_detector = geometry["source_to_isocentre_mm"], geometry["source_to_detector_mm"]
+        for name, value, unit in (("instrument/detector/x_pixel_size", pitch[0] * 1e3, "um"), ("instrument/detector/y_pixel_size", pitch[1], numpy.bytes_("mm")),
+                                  ("instrument/detector/distance", (to_detector - to_axis) / 1e3, "m"), ("instrument/source/distance", -to_axis / 10, "cm")):
+            file["entry/" + name] = value
+            file["entry/" + name].attrs["units"] = unit
+
+
+def write_compound(streams, out):
+    """[MS-CFB] of the version 3: {(storage, name): bytes}. Children hang to the right, one below the other."""
+    end, free, sector = 0xFFFFFFFE, 0xFFFFFFFF, 512
+    storages = list(dict.fromkeys(storage for storage, _ in streams))
+    small, mini, data, fat, entries = b"", [], b"", [], []
+
+    def place(content):
+        nonlocal data
+        if not content:
+            return end
+        first, count = len(fat), -(-len(content) // sector)
+        fat.extend([*range(first + 1, first + count), end])
+        data += content.ljust(count * sector, b"\0")
+        return first
+
+    def entry(name, kind, right=free, child=free, start=0, size=0):
+        text = (name + "\0").encode("utf-16-le")
+        return text.ljust(64, b"\0") + struct.pack("<HBB3I16sI8s8sIQ", len(text), kind, 1, free, right, child, b"", 0, b"", b"", start, size)
+
+    place_of = {}
+    for key, content in streams.items():
+        if len(content) >= 4096:
+            place_of[key] = place(content)
+            continue
+        count = -(-len(content) // 64)
+        place_of[key] = len(mini) if count else end
+        mini.extend([*range(len(mini) + 1, len(mini) + count), end] if count else [])
+        small += content.ljust(count * 64, b"\0")
+    at = 1 + len(storages)
+    for i, storage in enumerate(storages):
+        inside = [key for key in streams if key[0] == storage]
+        entries.append(entry(storage, 1, 2 + i if i + 1 < len(storages) else free, at))
+        at += len(inside)
+    for storage in storages:
+        inside = [key for key in streams if key[0] == storage]
+        for i, key in enumerate(inside):
+            here = 1 + len(entries)
+            entries.append(entry(key[1], 2, here + 1 if i + 1 < len(inside) else free, free, place_of[key], len(streams[key])))
+    root = entry("Root Entry", 5, free, 1, place(small), len(small))
+    directory = place(root + b"".join(entries))
+    places = b"".join(struct.pack("<I", value) for value in mini)
+    minis = place(places.ljust(-(-len(places) // sector) * sector, b"\xff"))
+    count = 1
+    while count * 128 < len(fat) + count:
+        count += 1
+    first = len(fat)
+    table = fat + [0xFFFFFFFD] * count
+    table += [free] * (count * 128 - len(table))
+    assert count <= 109
+    head = b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1" + bytes(16) + struct.pack("<HHHHH6xIIIIIIIIII", 0x3E, 3, 0xFFFE, 9, 6, 0, count, directory, 0, 4096, minis, -(-len(places) // sector), end, 0, 0)[:-4]
+    head += b"".join(struct.pack("<I", first + i if i < count else free) for i in range(109))
+    with open(out, "wb") as file:
+        file.write(head + data + struct.pack(f"<{len(table)}I", *table))
+
+
+def write_txrm(document, images, out):
+    """Streams of Zeiss's; python3-olefile, which others wrote, reads the file back where it is here."""
+    geometry, count = document["geometry"], len(images)
+    to_axis, to_detector = geometry["source_to_isocentre_mm"], geometry["source_to_detector_mm"]
+    pitch = document["detector"]["pixel_mm"][0]
+    streams = {("ImageInfo", name): struct.pack("<i", value) for name, value in
+               (("ImageWidth", images.shape[2]), ("ImageHeight", images.shape[1]), ("NoOfImages", count), ("DataType", 5))}
+    streams["ImageInfo", "Angles"] = numpy.array(stage_angles(document), "<f4").tobytes()
+    streams["ImageInfo", "PixelSize"] = struct.pack("<f", 1e3 * pitch * to_axis / to_detector)
+    streams["ImageInfo", "StoRADistance"] = numpy.full(count, -to_axis, "<f4").tobytes()
+    streams["ImageInfo", "DtoRADistance"] = numpy.full(count, to_detector - to_axis, "<f4").tobytes()
+    for k, image in enumerate(images):
+        streams[f"ImageData{k // 100 + 1}", f"Image{k + 1}"] = image.astype("<u2").tobytes()
+    write_compound(streams, out)
+    try:
+        import olefile
+    except ImportError:
+        return
+    with olefile.OleFileIO(out) as ole:
+        for (storage, name), content in streams.items():
+            assert ole.openstream([storage, name]).read() == content, name
+
+
 def main():
     """The command line."""
     kind, scan, out = sys.argv[1:4]
@@ -284,6 +408,12 @@ def main():
         write_his(images, out)
     elif kind in ("hnd", "xim"):
         write_varian(document, images, out, kind)
+    elif kind == "xtekct":
+        write_xtekct(document, images, out)
+    elif kind in ("nexus", "exchange"):
+        write_hdf5(document, images, out, kind == "nexus")
+    elif kind == "txrm":
+        write_txrm(document, images, out)
     else:
         sys.exit(f"no format {kind}")
 

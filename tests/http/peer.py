@@ -1,7 +1,11 @@
 #!/usr/bin/python3
-"""An archive of DICOM's own protocol (PS3.8, PS3.7) that does right or wrong, on a free port of 127.0.0.1, which it prints.
+"""Peers of DICOM's own protocol (PS3.8, PS3.7): an archive that does right or wrong, on a free port of 127.0.0.1, which it prints,
+and callers.
 
-Usage: peer.py MODE LOG   LOG: a line for each message. MODE:
+Usage: peer.py idle PORT ADDRESS COUNT    COUNT connections from ADDRESS that say nothing; prints "open" once all are there, and
+                                          "closed" when the first one is closed; ends at the end of its input
+       peer.py echo PORT ADDRESS TITLE    an association from ADDRESS as TITLE with CBCTD: prints accepted, refused or closed
+       peer.py MODE LOG                   an archive; LOG: a line for each message. MODE:
     keeps     keeps all, and promises so on the association that asks
     lies      acknowledges all, keeps nothing
     refuses   answers C-STORE with A700
@@ -10,6 +14,7 @@ Usage: peer.py MODE LOG   LOG: a line for each message. MODE:
     silent    never answers C-STORE
     drips     answers C-FIND a byte every 0.2 s
     hangs-up  breaks the connection at every 20th object
+    hangs     accepts associations, and answers nothing on them
 """
 import socket
 import struct
@@ -175,6 +180,8 @@ class Association:
                 if flags & 1 and fields[0x0800] != 0x0101:
                     continue
                 dataset, parts[0] = parts[0], b""
+                if self.mode == "hangs":
+                    continue
                 if fields[0x0100] == 1:
                     self.store(context, fields)
                 elif fields[0x0100] == 0x20:
@@ -203,4 +210,38 @@ def main(mode, log):
         threading.Thread(target=serve, args=(connection, mode, log), daemon=True).start()
 
 
-main(*sys.argv[1:3])
+def call(port, address):
+    connection = socket.create_connection(("127.0.0.1", int(port)), source_address=(address, 0))
+    connection.settimeout(30)
+    return connection
+
+
+def idle(port, address, count):
+    connections = [call(port, address) for _ in range(int(count))]
+    print("open", flush=True)
+    try:
+        print("closed" if connections[0].recv(1) == b"" else "spoken to", flush=True)
+    except ConnectionError:
+        print("closed", flush=True)
+    sys.stdin.read()
+
+
+def echo(port, address, title):
+    context = item(0x30, b"1.2.840.10008.1.1") + item(0x40, b"1.2.840.10008.1.2")
+    body = struct.pack(">HH16s16s32x", 1, 0, b"CBCTD".ljust(16), title.encode().ljust(16))
+    body += item(0x10, b"1.2.840.10008.3.1.1.1") + item(0x20, bytes([1, 0, 0, 0]) + context)
+    body += item(0x50, item(0x51, struct.pack(">I", 16384)) + item(0x52, b"1.2.3"))
+    try:
+        connection = call(port, address)
+        connection.sendall(struct.pack(">BBI", 1, 0, len(body)) + body)
+        print({2: "accepted", 3: "refused"}.get(take(connection, 1)[0], "closed"))
+    except ConnectionError:
+        print("closed")
+
+
+if sys.argv[1] == "idle":
+    idle(*sys.argv[2:5])
+elif sys.argv[1] == "echo":
+    echo(*sys.argv[2:5])
+else:
+    main(*sys.argv[1:3])

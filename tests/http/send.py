@@ -3,7 +3,7 @@
 
 Usage: send.py ports COUNT            free ports
        send.py web MODE LOG           a DICOMweb archive on a free port, which it prints. MODE: lies (acknowledges, keeps
-           nothing), forgets (keeps every other object), refuses (403 to STOW-RS), slow (a second for each request), drips (a byte of a reply every 0.2 s), token (401
+           nothing), forgets (keeps every other object), refuses (403 to STOW-RS), slow (a second for each request), drips (a byte of a reply every 0.2 s), drips-late (only of that to STOW-RS), token (401
            without the token "secret-token", keeps all). LOG: a line for each request
        send.py whose DIRECTORY JOBS   every object of the directory (files of DICOM) has the patient of its job; JOBS: a line
            "K SCAN JOB" for each, whose patient is "NameK^x", id-K, accK; prints for each job how many objects it has, twice
@@ -43,7 +43,7 @@ class Archive(BaseHTTPRequestHandler):
         self.send_header("Content-Type", "application/dicom+json")
         self.send_header("Content-Length", str(len(body)))
         self.end_headers()
-        if self.mode == "drips":
+        if self.mode == "drips" or (self.mode == "drips-late" and self.command == "POST"):
             for place in range(len(body)):
                 self.wfile.write(body[place:place + 1])
                 self.wfile.flush()

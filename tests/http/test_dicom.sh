@@ -30,6 +30,9 @@ fetch() { # NAME [QUERY [SLICES]]: the slices, and the one object, in $work/NAME
 	[[ $(header content-type) == application/zip* && $(header content-disposition) == *"final.zip"* ]] || fail "a zip"
 	"$python" -m zipfile -e "$body" "$work/$1/slices" || fail "a zip that is whole"
 	[ "$(ls "$work/$1/slices" | wc -l)" = "${3:-50}" ] || fail "${3:-50} slices, got $(ls "$work/$1/slices" | wc -l)"
+	req GET "/v1/jobs/$job/volumes/final?format=dicom&dicom=xray-3d${2:-}"
+	expect_status 200
+	cp "$body" "$work/$1/xray.dcm"
 	req GET "/v1/jobs/$job/volumes/final?format=dicom&dicom=enhanced${2:-}"
 	expect_status 200
 	[[ $(header content-type) == application/dicom* && $(header content-disposition) == *"final.dcm"* ]] || fail "an object"
@@ -45,6 +48,7 @@ members() { # POSITION: what every object must say
 		StudyInstanceUID: "1.2.3.4.5", AccessionNumber: "A17", StudyDescription: "Knie", ReferringPhysicianName: "House^G",
 		StudyDate: "20261123", StudyTime: "043000", StudyID: "S1", PatientPosition: $position, LossyImageCompression: "00",
 		Modality: "CT"}' >"$work/members.json"
+	jq '.Modality = "XA"' "$work/members.json" >"$work/xray.json"
 }
 test_every_position_is_read_back_voxel_for_voxel_and_place_for_place() {
 	local position
@@ -57,7 +61,9 @@ test_every_position_is_read_back_voxel_for_voxel_and_place_for_place() {
 		fetch here "&position=$position"
 		members $position
 		dicom check $position "$work/voxels.raw" "$work/members.json" "$work/here/slices/"*.dcm -- "$work/here/frames.dcm" || fail "$position"
+		dicom check $position "$work/voxels.raw" "$work/xray.json" "$work/here/xray.dcm" || fail "X-Ray 3D in $position"
 		conforms "$work/here/slices/CT00050.dcm"
+		conforms "$work/here/xray.dcm"
 		conforms "$work/here/frames.dcm"
 	done
 	for position in tilted HFDR; do
@@ -66,7 +72,9 @@ test_every_position_is_read_back_voxel_for_voxel_and_place_for_place() {
 		fetch here
 		members "${position/tilted/}"
 		dicom check $position "$work/voxels.raw" "$work/members.json" "$work/here/slices/"*.dcm -- "$work/here/frames.dcm" || fail "$position"
+		dicom check $position "$work/voxels.raw" "$work/xray.json" "$work/here/xray.dcm" || fail "X-Ray 3D in $position"
 		conforms "$work/here/slices/CT00001.dcm"
+		conforms "$work/here/xray.dcm"
 		conforms "$work/here/frames.dcm"
 	done
 }
@@ -90,6 +98,37 @@ test_the_same_volume_has_the_same_uids_and_another_has_others() {
 	[ "$(cut -d' ' -f2 "$work/uids" | sort -u | wc -l)" = 77 ] || fail "an instance's UID for each of the 77 objects"
 	[ "$(cut -d' ' -f3 "$work/uids" | sort -u | wc -l)" = 4 ] || fail "4 series"
 	[ "$(cut -d' ' -f4,5 "$work/uids" | sort -u | wc -l)" = 1 ] || fail "one study and frame of reference"
+}
+
+# Volumes reference the objects that their projections were, also when the scan is gone; a scan of no objects references none.
+test_the_objects_of_the_projections_are_referenced() {
+	local source='{"class": "1.2.840.10008.5.1.4.1.1.12.1", "series": "1.2.9", "instances": ["1.2.9.1", "1.2.9.2", "1.2.9.3"]}' bad file
+	need_readers
+	start_daemon
+	job_of '{"position": "HFS"}'
+	fetch without
+	! dicom sources "$work/without/slices/CT00001.dcm" 2>/dev/null || fail "no sources"
+	jq -c --argjson source "$source" '.source = $source' "$work/posted/scan.json" >"$work/with.json"
+	for bad in '.source.class = "x"' '.source.instances = []' '.source.instances[1] = "01.2"' 'del(.source.series)' '.source.more = 1' '.source = 1'; do
+		jq -c "$bad" "$work/with.json" >"$work/bad.json"
+		req POST /v1/scans -H 'Content-Type: application/json' --data-binary @"$work/bad.json"
+		expect_status 400
+		expect_json '.pointer | startswith("/source")'
+	done
+	mv "$work/with.json" "$work/posted/scan.json"
+	reconstruct "$work/posted" "{\"scan\": \"SCAN\", $recipe}"
+	req GET "/v1/scans/$scan"
+	expect_json ".source == $source"
+	req DELETE "/v1/scans/$scan"
+	expect_status 204
+	fetch with
+	[ "$(dicom sources "$work/with/slices/CT00001.dcm" "$work/with/slices/CT00050.dcm" "$work/with/frames.dcm" "$work/with/xray.dcm" | sort -u)" = \
+		"1.2.840.10008.5.1.4.1.1.12.1 1.2.9.1 1.2.9.2 1.2.9.3" ] || fail "the sources"
+	for file in slices/CT00001.dcm frames.dcm xray.dcm; do
+		conforms "$work/with/$file"
+		# A viewer that is told no window takes the first slice's own range, which is of air.
+		[ "$(dcmdump +s +P 0028,1050 +P 0028,1051 "$work/with/$file" | grep -oE '\[[0-9]+\]' | paste -sd' ')" = "[400] [2000]" ] || fail "a window in $file"
+	done
 }
 
 # A CT image says where the patient's left is: without that, there is none, unless the request says it.

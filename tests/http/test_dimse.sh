@@ -1,23 +1,12 @@
 #!/usr/bin/env bash
 # DICOM's own protocol: C-STORE, C-FIND, storage commitment; the worklist; runs of projections that are received.
 . "$(dirname "$0")/lib.sh"
-python=${PYTHON:-/usr/bin/python3}
 . "$(dirname "$0")/archive.sh"
-stop_after_each=1
-program=cbctd-held
-[ -e "$BUILD/cbctd-held" ] || program=cbctd
 
 need_dcmtk() {
 	need_archive
 	ldd "$BUILD/cbct-dicom" | grep libdcmnet >/dev/null || skip "cbct-dicom was built without libdcmtk-dev"
 }
-job_of() { # PATIENT [SEND]: reconstructed
-	mkdir -p "$work/posted"
-	ln -sf "$work/scan/projections.raw" "$work/posted/projections.raw"
-	jq -c --argjson patient "$1" '.patient = $patient | .study = {uid: "1.2.3.4.5", accession_number: "A17"}' "$work/scan/scan.json" >"$work/posted/scan.json"
-	reconstruct "$work/posted" "{\"scan\": \"SCAN\", $recipe${2:+, \"send\": $2}}"
-}
-who='{"position": "HFS", "name": "Doe^Jane", "id": "4711"}'
 listening() { echo '{"port": '$commit', "address": "127.0.0.1", "peers": ["ARCHIVE", "CARM"]'"${1:-}"'}'; }
 
 test_a_series_is_stored_found_and_committed() {
@@ -161,7 +150,7 @@ xa() {
 }
 
 test_a_run_that_is_received_is_a_scan() {
-	local one=(who:0010,0020,LO=4711 who:0020,000d,UI=1.2.3 who:0008,0050,SH=A17 who:0020,000e,UI=1.2.3.5)
+	local again one=(who:0010,0020,LO=4711 who:0020,000d,UI=1.2.3 who:0008,0050,SH=A17 who:0020,000e,UI=1.2.3.5)
 	need_dcmtk
 	[ -n "${commit:-}" ] || read -r web dimse commit < <("$python" "$top/tests/http/send.py" ports 3)
 	jq -n --argjson listen "$(listening ', "receive": {"url": "unix:'"$work"'/sock", "quiet_s": 0.3, "import": {"air": 50000, "source-to-isocentre": 600}}')" \
@@ -175,12 +164,37 @@ test_a_run_that_is_received_is_a_scan() {
 	scan=$(jq -r '.scans[0].id' "$body")
 	req GET "/v1/scans/$scan"
 	expect_json '.patient.id == "4711" and .patient.position == "HFS" and .study == {uid: "1.2.3", accession_number: "A17"} and .missing == []'
+	expect_json '.source == {class: "1.2.840.10008.5.1.4.1.1.12.1", series: "1.2.3.5", instances: ["1.2.3.4.5.6"]}'
 	cbct import "$work/run.dcm" --air 50000 --source-to-isocentre 600 -o "$work/run.scan" --quiet 2>/dev/null
 	req GET "/v1/scans/$scan/projections/7"
 	dd if="$work/run.scan/projections.raw" bs="$(stat -c %s "$body")" skip=7 count=1 status=none | cmp - "$body" || fail "the projections"
+	# By configuration it is reconstructed, too: its volume goes where the job says, once, however often it is sent.
+	start_peer keeps dimse
+	jq '.listen.receive.job = {preset: "preview", labels: {from: "the arm"}, send: ["pacs"]} |
+		.destinations = [{name: "pacs", kind: "dimse", host: "127.0.0.1", port: '"$peer_port"', title: "PEER"}]' "$work/destinations.json" >"$work/with.json"
+	cp "$work/with.json" "$work/destinations.json"
+	: >"$work/cbctd.err"
+	kill -HUP "$(cat "$work/daemon.pid")"
+	until grep -q "listening for DICOM" "$work/cbctd.err"; do sleep 0.05; done
+	for again in 1 2; do
+		storescu -aet CARM -aec CBCTD 127.0.0.1 "$commit" "$work/run.dcm" 2>"$work/said" || fail "C-STORE with a job"
+		until [ "$(grep -c "is scan $scan, reconstructed by job" "$work/cbctd.err")" = $again ]; do sleep 0.05; done
+	done
+	req GET "/v1/jobs?scan=$scan"
+	expect_json '.jobs | length == 1'
+	job=$(jq -r '.jobs[0].id' "$body")
+	wait_job succeeded 120
+	req GET "/v1/jobs/$job"
+	expect_json '.scan == "'"$scan"'" and .labels == {from: "the arm"} and .patient.position == "HFS"'
+	sending_becomes committed
+	jq 'del(.listen.receive.job)' "$work/destinations.json" >"$work/with.json"
+	cp "$work/with.json" "$work/destinations.json"
+	: >"$work/cbctd.err"
+	kill -HUP "$(cat "$work/daemon.pid")"
+	until grep -q "listening for DICOM" "$work/cbctd.err"; do sleep 0.05; done
 	# Sent twice, it is the same scan; who is not known, calls another or sends something else is refused.
 	storescu -aet CARM -aec CBCTD 127.0.0.1 "$commit" "$work/run.dcm" 2>"$work/said" || fail "C-STORE again"
-	until [ "$(grep -c "that was received is scan $scan" "$work/cbctd.err")" = 2 ]; do sleep 0.05; done
+	until grep -q "that was received is scan $scan" "$work/cbctd.err"; do sleep 0.05; done
 	! storescu -aet STRANGER -aec CBCTD 127.0.0.1 "$commit" "$work/run.dcm" 2>/dev/null || fail "a stranger is refused"
 	! storescu -aet CARM -aec OTHER 127.0.0.1 "$commit" "$work/run.dcm" 2>/dev/null || fail "another title is refused"
 	echoscu -aet CARM -aec CBCTD 127.0.0.1 "$commit" || fail "C-ECHO"
@@ -196,6 +210,119 @@ test_a_run_that_is_received_is_a_scan() {
 	req GET /v1/scans
 	expect_json '[.scans[] | select(.name == "1.2.3.4.5.6")] | length == 1'
 	! grep -E '4711|A17|Müller' "$work/cbctd.err" || fail "no patient in the log"
+}
+
+# What stands wrongly in the file is refused by its place in it, at the start and by SIGHUP: later nobody is there to see.
+test_mistakes_in_the_file_of_destinations_are_refused() {
+	local good bad pointer pid
+	need_dcmtk
+	[ -n "${commit:-}" ] || read -r web dimse commit < <("$python" "$top/tests/http/send.py" ports 3)
+	good=$(jq -nc --argjson listen "$(listening ', "receive": {"url": "unix:/sock", "import": {"air": 5}, "job": {"fdk": {}, "send": ["a"]}}')" '{title: "CBCTD", listen: $listen,
+		worklist: {host: "ris.example", port: 104, title: "RIS"}, destinations: [{name: "a", kind: "dimse", host: "127.0.0.1", port: 9, title: "A"},
+		{name: "b", kind: "dicomweb", url: "http://127.0.0.1:9"}]}')
+	echo "$good" >"$work/destinations.json"
+	start_daemon --destinations "$work/destinations.json"
+	while IFS='|' read -r pointer bad; do
+		jq -c "$bad" <<<"$good" >"$work/destinations.json"
+		: >"$work/refused"
+		! timeout 20 cbctd --listen 127.0.0.1:0 --state-dir "$work/other" --destinations "$work/destinations.json" >/dev/null 2>"$work/refused" || fail "no start with $bad"
+		grep -qF "$pointer: " "$work/refused" || fail "$pointer, got $(cat "$work/refused")"
+		: >"$work/cbctd.err"
+		kill -HUP "$(cat "$work/daemon.pid")"
+		until grep -q "destinations that were read before stay" "$work/cbctd.err"; do sleep 0.05; done
+		grep -qF "$pointer: " "$work/cbctd.err" || fail "$pointer by SIGHUP, got $(cat "$work/cbctd.err")"
+	done <<-'END'
+		/title|.title = ""
+		/destinations/0/host|.destinations[0].host = ""
+		/destinations/0/host|.destinations[0].host = "pacs example"
+		/destinations/0/title|.destinations[0].title = ""
+		/destinations/1/name|.destinations[1].name = "a"
+		/destinations/1/token_file|.destinations[1].token_file = "/nowhere/token"
+		/destinations/1/ca_file|.destinations[1].ca_file = "/nowhere/ca"
+		/worklist/host|.worklist.host = "-x"
+		/listen/address|.listen.address = "localhost"
+		/listen/address|.listen.address = ""
+		/listen/peers/1|.listen.peers[1] = ""
+		/listen/peers/1|.listen.peers[1] = "A\\\\B"
+		/listen/receive/url|.listen.receive.url = "ftp://host/"
+		/listen/receive/token-file|.listen.receive."token-file" = "/nowhere/token"
+		/listen/receive/import/url|.listen.receive.import.url = "http://elsewhere"
+		/listen/receive/import/output|.listen.receive.import.output = "/tmp"
+		/listen/receive/import/aire|.listen.receive.import.aire = 5
+		/listen/receive/import/air|.listen.receive.import.air = false
+		/listen/receive/job|.listen.receive.job.scan = "S"
+		/listen/receive/job/fdk|.listen.receive.job.fdk = 7
+		/listen/receive/job/send/0|.listen.receive.job.send = ["nobody"]
+	END
+	# The options of import are those that the program has, but for what it connects to and writes.
+	sed -n '/^static const char \*const import_options/,/^};/p' "$top/daemon/sendings/application.c" | grep -o '"[a-z-]*"' | tr -d '"' | sort >"$work/known"
+	cbct import --help | sed -n '/^images/,$p' | grep -o '^  --[a-z-]*' | tr -d ' ' | sed 's/^--//' | sort >"$work/has"
+	echo name | sort - "$work/has" | diff - "$work/known" || fail "the options of cbct import"
+}
+
+# One address has its share of the places, and who says nothing does not keep them.
+test_idle_connections_shut_nobody_out() {
+	local k
+	need_dcmtk
+	[ -n "${commit:-}" ] || read -r web dimse commit < <("$python" "$top/tests/http/send.py" ports 3)
+	jq -n --argjson listen "$(listening)" '{listen: $listen, destinations: []}' >"$work/destinations.json"
+	start_daemon --destinations "$work/destinations.json"
+	until grep -q "listening for DICOM" "$work/cbctd.err"; do sleep 0.05; done
+	coproc idle { exec "$python" "$top/tests/http/peer.py" idle "$commit" 127.0.0.1 20; }
+	echo "$idle_PID" >>"$work/peers"
+	exec {said}<&"${idle[0]}"
+	read -r k <&$said
+	[ "$("$python" "$top/tests/http/peer.py" echo "$commit" 127.0.0.2 CARM)" = accepted ] || fail "a peer of another address is heard"
+	until grep -q "an association from 127.0.0.1, without a title, is refused: there are too many" "$work/cbctd.err"; do sleep 0.05; done
+	read -r k <&$said
+	[ "$k" = closed ] || fail "who says nothing is cut off"
+	until echoscu -aet CARM -aec CBCTD 127.0.0.1 "$commit"; do sleep 0.2; done
+	# A refusal is told with its reason and the title that called; many are one line.
+	[ "$("$python" "$top/tests/http/peer.py" echo "$commit" 127.0.0.3 STRANGER)" = refused ] || fail "a stranger is refused"
+	for k in 1 2 3 4 5; do "$python" "$top/tests/http/peer.py" echo "$commit" 127.0.0.3 STRANGER >/dev/null; done
+	until grep -q "an association from 127.0.0.3, STRANGER, is refused: it is none of the peers that may call" "$work/cbctd.err"; do
+		"$python" "$top/tests/http/peer.py" echo "$commit" 127.0.0.3 STRANGER >/dev/null
+		sleep 0.5
+	done
+	[ "$(grep -c 'is refused' "$work/cbctd.err")" -lt 8 ] || fail "one line for many, got $(grep 'is refused' "$work/cbctd.err")"
+}
+
+# A worklist that hangs says so, and one that comes in its place is asked at once.
+test_a_worklist_that_hangs_is_told_and_replaced() {
+	need_dcmtk
+	start_peer hangs dimse
+	rm -rf "$work/worklist"
+	mkdir -p "$work/worklist"
+	step S2 'Smith^John' 12 "$(date +%Y%m%d)" A12
+	start_archive
+	jq -n '{destinations: [], worklist: {host: "127.0.0.1", port: '"$peer_port"', title: "PEER", timeout_s: 600}}' >"$work/destinations.json"
+	start_daemon --destinations "$work/destinations.json"
+	! cbct destinations >"$work/said" 2>&1 || fail "there are no destinations"
+	grep -q "no destinations" "$work/said" || fail "no destinations, got $(cat "$work/said")"
+	req GET "/v1/worklist?wait=1"
+	expect_status 200
+	expect_json '.steps == [] and .checked == null and (.detail | contains("has not answered yet"))'
+	jq -n '{destinations: [], worklist: {host: "127.0.0.1", port: '"$dimse"', title: "ARCHIVE"}}' >"$work/destinations.json"
+	kill -HUP "$(cat "$work/daemon.pid")"
+	until req GET "/v1/worklist?wait=1" && jq -e '.detail == null and (.steps | map(.id)) == ["S2"]' "$body" >/dev/null; do sleep 0.2; done
+	# What another worklist told is not shown as this one's.
+	jq -n '{destinations: [], worklist: {host: "127.0.0.1", port: '"$peer_port"', title: "PEER"}}' >"$work/destinations.json"
+	kill -HUP "$(cat "$work/daemon.pid")"
+	until req GET "/v1/worklist?wait=0" && jq -e '.steps == []' "$body" >/dev/null; do sleep 0.05; done
+}
+
+# What one row's archive does says nothing of another's of the same name.
+test_a_changed_destination_is_another_archive() {
+	need_dcmtk
+	start_peer hangs dimse
+	start_archive
+	jq -n '{destinations: [{name: "pacs", kind: "dimse", host: "127.0.0.1", port: '"$peer_port"', title: "PEER", timeout_s: 600}]}' >"$work/destinations.json"
+	start_daemon --destinations "$work/destinations.json"
+	until grep -q ^0030 "$work/peer.log"; do sleep 0.05; done
+	jq -n '{destinations: [{name: "pacs", kind: "dimse", host: "127.0.0.1", port: '"$dimse"', title: "ARCHIVE"}]}' >"$work/destinations.json"
+	kill -HUP "$(cat "$work/daemon.pid")"
+	until req GET /v1/destinations && jq -e '.destinations[0] | .reachable and .detail == null' "$body" >/dev/null; do sleep 0.05; done
+	! grep -q "answers again" "$work/cbctd.err" || fail "it never was away"
 }
 
 run_tests

@@ -232,13 +232,42 @@ test_images_of_linear_accelerators() {
 	done
 	truncate -s -9 "$work/hnd/Proj_00003.hnd"
 	refused 1 "Proj_00003.hnd: its pixels break off at 15" cbct import "$work/hnd" "${circle[@]}" --air 50000 -o "$work/never"
-	# What is known and not read is named.
-	printf '\211HDF\r\n\032\n0000' >"$work/scan.nxs"
-	refused 1 "HDF5 (NeXus): it is not read" cbct import "$work/scan.nxs" "${circle[@]}" --pixel 4,3 -o "$work/never"
-	printf '\320\317\021\340\241\261\032\341' >"$work/scan.txrm"
-	refused 1 "txrm): it is not read" cbct import "$work/scan.txrm" "${circle[@]}" --pixel 4,3 -o "$work/never"
-	printf '[XTekCT]\r\nName=x\r\n' >"$work/scan.xtekct"
-	refused 1 "Nikon .xtekct: it is not read" cbct import "$work/scan.xtekct" "${circle[@]}" --pixel 4,3 -o "$work/never"
+}
+
+# Scanners' own files tell pitch, distances and angles. Angles of a float32 have 7 digits: 600 mm times 2e-7 and a bit.
+test_files_of_industrial_scanners() {
+	local pixel=(--pixel 4,3) distances=(--source-to-isocentre 600 --source-to-detector 1000)
+	need_numpy
+	make_scans
+	images xtekct "$counts" "$work/ball"
+	imports "$counts" "$work/ball.xtekct"
+	same_views "$work/back" "$counts" 1e-9 "Nikon"
+	rm "$work/ball_0007.tif"
+	refused 1 "its image 7: " cbct import "$work/ball.xtekct" -o "$work/never"
+	sed -i '/^SrcToObject/d' "$work/ball.xtekct"
+	refused 1 "it does not tell SrcToObject" cbct import "$work/ball.xtekct" -o "$work/never"
+	images txrm "$counts" "$work/ball.txrm"
+	imports "$counts" "$work/ball.txrm" --air 50000 "${pixel[@]}"
+	same_views "$work/back" "$counts" 1e-3 "Zeiss"
+	# A pixel of Zeiss's is square.
+	cbct import "$work/ball.txrm" --air 50000 -o "$work/square" 2>/dev/null
+	jq -e '.detector.pixel_mm | all(. - 4 | . * . < 1e-10)' "$work/square/scan.json" >/dev/null || fail "4 mm, got $(jq -c .detector.pixel_mm "$work/square/scan.json")"
+	head -c 20000 "$work/ball.txrm" >"$work/short.txrm"
+	refused 1 "the compound file is broken" cbct import "$work/short.txrm" --air 50000 -o "$work/never"
+	/usr/bin/python3 -c 'import h5py' 2>/dev/null || skip "python3-h5py is not here: HDF5 was not read"
+	images nexus "$counts" "$work/ball.nxs"
+	imports "$counts" "$work/ball.nxs" --air 50000
+	grep -q "2 images of the file are no projections" "$work/said" || fail "flat images are told, got $(cat "$work/said")"
+	same_views "$work/back" "$counts" 1e-9 "NeXus"
+	images exchange "$counts" "$work/ball.h5"
+	imports "$counts" "$work/ball.h5" --air 50000 "${pixel[@]}" "${distances[@]}"
+	same_views "$work/back" "$counts" 1e-9 "Data Exchange"
+	cbct import "$work/ball.h5" --air 50000 "${pixel[@]}" "${distances[@]}" --clockwise -o "$work/other" 2>/dev/null
+	cmp <(jq '.geometry.angles_deg | map(-.)' "$work/other/scan.json") <(jq '.geometry.angles_deg' "$work/back/scan.json") || fail "--clockwise"
+	head -c 3000 "$work/ball.h5" >"$work/short.h5"
+	refused 1 "libhdf5 cannot read it" cbct import "$work/short.h5" "${pixel[@]}" "${distances[@]}" -o "$work/never"
+	/usr/bin/python3 -c 'import h5py, sys; h5py.File(sys.argv[1], "w")["a"] = 1' "$work/other.h5"
+	refused 1 "it has neither NeXus's" cbct import "$work/other.h5" "${pixel[@]}" "${distances[@]}" -o "$work/never"
 }
 
 # Each view's air is the mean of the first columns, which the ball does not reach: whatever the tube gave.

@@ -2,7 +2,6 @@
 # 200 series sent to an archive by either protocol, with a kill -9 of the daemon, of cbct-dicom or of the archive in the middle of
 # each: every one arrives once, whole, with its own patient. SEND_KILLS is another number.
 . "$(dirname "$0")/../http/lib.sh"
-python=${PYTHON:-/usr/bin/python3}
 . "$top/tests/http/archive.sh"
 
 test_every_series_arrives_once() {
