@@ -70,7 +70,9 @@ static int set_text(char **text, const char *value, bool add, struct error *err)
 {
 	char *fresh = NULL;
 
-	if (!add || *text == NULL)
+	if (add && value[0] == '\0')
+		return 0;
+	if (!add || *text == NULL || **text == '\0')
 		fresh = strdup(value);
 	else if (asprintf(&fresh, "%s, %s", *text, value) < 0)
 		fresh = NULL;
@@ -251,7 +253,8 @@ static int load_line(struct config *config, char *line, const char *place, bool 
 		return error_set(err, ERR_INVALID, "%s: \"%s\" is set a second time", place, line);
 	value = trim(value);
 	length = strlen(value);
-	if (length >= 2 && value[0] == '"' && value[length - 1] == '"')
+	/* One alone too: a list's first value and its last would be quotes around them all. */
+	if (length > 0 && (value[0] == '"' || value[length - 1] == '"'))
 		return error_set(err, ERR_INVALID, "%s: %s: values have no quotes around them", place, line);
 	snprintf(source, sizeof(source), "%s: %s", place, line);
 	if (setting_set(setting, config, value, given[setting - settings], source, err) != 0)
@@ -271,6 +274,9 @@ static int load_file(struct config *config, const char *path, struct error *err)
 	code = file_read(path, CONFIG_BYTES_MAX, &text, &length, err);
 	if (code != 0)
 		return code;
+	/* Text ends there, and what is behind it would be left out in silence. */
+	if (strlen(text) != length)
+		code = error_set(err, ERR_INVALID, "%.100s: it has a zero byte", path);
 	next = text;
 	while (code == 0 && (line = strsep(&next, "\n")) != NULL) {
 		snprintf(place, sizeof(place), "%.100s:%d", path, ++number);
@@ -451,6 +457,18 @@ void config_help(FILE *out)
 	      out);
 }
 
+/* With as many digits as it takes to read the same number again. */
+static void print_number(FILE *out, const char *name, double value)
+{
+	char text[40];
+	int digits = 6;
+
+	do
+		snprintf(text, sizeof(text), "%.*g", digits, value);
+	while (strtod(text, NULL) != value && digits++ < 17);
+	fprintf(out, "%s = %s\n", name, text);
+}
+
 void config_print(const struct config *config, FILE *out)
 {
 	for (int i = 0; i < SETTING_COUNT; i++) {
@@ -471,6 +489,6 @@ void config_print(const struct config *config, FILE *out)
 		else if (setting->kind == KIND_BYTES)
 			fprintf(out, "%s = %zu\n", setting->name, *(const size_t *)value);
 		else
-			fprintf(out, "%s = %g\n", setting->name, *(const double *)value);
+			print_number(out, setting->name, *(const double *)value);
 	}
 }

@@ -11,20 +11,20 @@
 #include <sys/resource.h>
 #include <unistd.h>
 
-#include <openssl/crypto.h>
-#include <openssl/evp.h>
-
 #include "daemon/api/api.h"
 #include "daemon/cards.h"
 #include "daemon/calibrations/calibrations.h"
 #include "daemon/config.h"
+#include "daemon/fleet/fleet.h"
 #include "daemon/intake/intake.h"
 #include "daemon/jobs/jobs.h"
 #include "daemon/log.h"
 #include "daemon/notify.h"
+#include "daemon/process.h"
 #include "daemon/sendings/sendings.h"
 #include "daemon/store/store.h"
 #include "daemon/volumes/volumes.h"
+#include "proto/digest.h"
 #include "proto/provenance.h"
 
 enum { STREAM_THREADS = 2 }; /* that hash and compress what is streamed: the others are the worker's */
@@ -167,13 +167,47 @@ static int start_feeder(struct api *api, struct feeder **ret_feeder, struct erro
 	return feeder_start(&options, ret_feeder, err);
 }
 
+/* ---- the fleet ---- */
+
+/* The machine's name stands for the daemon's where nobody says another one. */
+static const char *host_of(const struct config *config)
+{
+	static char name[256];
+
+	if (config->fleet_host[0] != '\0')
+		return config->fleet_host;
+	if (gethostname(name, sizeof(name) - 1) != 0)
+		return "";
+	return name;
+}
+
+static struct fleet_options fleet_options_of(const struct config *config)
+{
+	const char *own = config->fleet_database, *catalogue = config->catalogue;
+
+	return (struct fleet_options){.name = config->fleet,
+				      .database = own[0] != '\0' ? own : catalogue,
+				      .host = host_of(config),
+				      .url = config->fleet_address,
+				      .lease = config->fleet_lease,
+				      .timeout = config->catalogue_timeout};
+}
+
 static int start_parts(const struct config *config, struct api *api, struct error *err)
 {
 	const struct store_options hooks = {
 	    .failed = on_failure, .catalogue = config->catalogue, .catalogue_timeout = config->catalogue_timeout};
 	const struct uploads_options uploads = {.buffer = config->upload_buffer, .failed = on_failure};
+	const struct fleet_options fleet = fleet_options_of(config);
 	int devices[INDICES_MOST], given = config_indices(config->devices, devices, INDICES_MOST);
-	const struct supervise_options supervise = {.worker = config->worker[0] != '\0' ? config->worker : NULL,
+	char cbct[1024];
+	const struct remote_options remote = {.program = config->fleet[0] != '\0' ? cbct : NULL,
+					      .token_file = config->fleet_token,
+					      .authorities = config->fleet_authorities,
+					      .host = fleet.host,
+					      .lease = config->fleet_lease};
+	const struct supervise_options supervise = {.remote = remote,
+						    .worker = config->worker[0] != '\0' ? config->worker : NULL,
 						    .backend = config->backend,
 						    .workers = given > 0 ? given : (int)config->workers,
 						    .devices = given > 0 ? devices : NULL,
@@ -195,6 +229,7 @@ static int start_parts(const struct config *config, struct api *api, struct erro
 					    .client_bytes = config->client_bytes};
 	int code;
 
+	program_path("cbct", cbct, sizeof(cbct));
 	/* The addresses first: a mistake there should be said before anything is touched. */
 	code = start_http(config, api, err);
 	if (code == 0)
@@ -223,11 +258,15 @@ static int start_parts(const struct config *config, struct api *api, struct erro
 		code = keeper_start(api, config->keep, &api->keeper, err);
 	if (code == 0)
 		code = http_start(api->http, err);
+	/* Other hosts may come as soon as they are told of this one. */
+	if (code == 0 && config->fleet[0] != '\0')
+		code = fleet_start(api->jobs, api->supervise, &fleet, &api->fleet, err);
 	return code;
 }
 
 static void stop_parts(struct api *api)
 {
+	fleet_stop(api->fleet);
 	keeper_stop(api->keeper);
 	http_free(api->http);
 	cards_stop(api->cards);
@@ -296,20 +335,6 @@ static int wait_for_stop(const sigset_t *stops, struct api *api, const struct ar
 	}
 }
 
-/*
- * The library of digests prepares itself at its first use, once: where it gets no memory then, it has failed for good,
- * and crashes where it is used all the same. So that happens here, before there is any work, and is looked at.
- */
-static int prepare_digests(struct error *err)
-{
-	unsigned char digest[EVP_MAX_MD_SIZE];
-
-	if (OPENSSL_init_crypto(0, NULL) != 1 || OSSL_LIB_CTX_get0_global_default() == NULL ||
-	    EVP_Digest("", 0, digest, NULL, EVP_sha256(), NULL) != 1)
-		return error_set(err, ERR_NO_MEMORY, "no memory for digests");
-	return 0;
-}
-
 static int run(const struct arguments *arguments)
 {
 	const struct config *config = arguments->config;
@@ -324,7 +349,7 @@ static int run(const struct arguments *arguments)
 	notify_open();
 	raise_descriptors();
 	block_signals(&stops);
-	code = prepare_digests(&err);
+	code = digest_prepare(&err);
 	if (code == 0)
 		code = start_parts(config, &api, &err);
 	if (code == 0)
@@ -359,6 +384,15 @@ static int rebuild(const struct config *config)
 	return 0;
 }
 
+/* What no start could mend is said before anything is touched. */
+static int check_settings(const struct config *config, struct error *err)
+{
+	const struct fleet_options fleet = fleet_options_of(config);
+	int code = store_check_catalogue(config->catalogue, err);
+
+	return code == 0 && config->fleet[0] != '\0' ? fleet_check(&fleet, err) : code;
+}
+
 static void print(const struct config *config)
 {
 	set_log(config);
@@ -379,7 +413,7 @@ int main(int argc, char **argv)
 	 */
 	setenv("OMP_WAIT_POLICY", "passive", 0);
 	if (config_load(argc, argv, &config, &action, &err) != 0 ||
-	    (action != CONFIG_HELP && action != CONFIG_VERSION && store_check_catalogue(config.catalogue, &err) != 0)) {
+	    (action != CONFIG_HELP && action != CONFIG_VERSION && check_settings(&config, &err) != 0)) {
 		fprintf(stderr, "cbctd: %s\n", err.text);
 		return err.code == ERR_NO_MEMORY ? 1 : 2; /* with 2 the service manager does not try again */
 	}

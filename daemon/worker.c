@@ -28,6 +28,7 @@
 #include "proto/calibration_files.h"
 #include "proto/checkpoint.h"
 #include "proto/clock.h"
+#include "proto/digest.h"
 #include "proto/heartbeat.h"
 #include "proto/message.h"
 #include "proto/provenance.h"
@@ -220,6 +221,13 @@ static void on_denoising(void *context, double noise_hu, double alpha)
 	report(context, &message);
 }
 
+static void on_agreement(void *context, const struct recon_agreement *agreement)
+{
+	struct message message = {.kind = MESSAGE_AGREEMENT, .agreement = *agreement};
+
+	report(context, &message);
+}
+
 static void on_stopped(void *context, const struct recon_stop *stop)
 {
 	struct message message = {.kind = MESSAGE_STOPPED, .stop = *stop};
@@ -353,6 +361,7 @@ static int run_job(struct worker *worker, const struct message *start, struct er
 							     .row = on_row,
 							     .denoising = on_denoising,
 							     .stopped = on_stopped,
+							     .agreement = on_agreement,
 							     .warning = on_warning},
 						   .on_volume = on_volume,
 						   .on_settled = on_settled,
@@ -581,7 +590,7 @@ int main(int argc, char **argv)
 	if (arguments.calibration != NULL)
 		return make_calibration(&arguments);
 	worker.socket = arguments.socket;
-	if (open_device(&worker, &arguments, &err) != 0) {
+	if (digest_prepare(&err) != 0 || open_device(&worker, &arguments, &err) != 0) {
 		say(&err);
 		status = EXIT_START;
 	} else {

@@ -8,24 +8,24 @@
 #include "clients/cbct/commands.h"
 #include "clients/cbct/http.h"
 #include "clients/cbct/volume_query.h"
+#include "proto/dicom.h"
 #include "proto/patient.h"
 
 struct get_options {
 	const char *job, *volume, *output;
-	int dicom;    /* of dicom_kinds, or unset */
+	int dicom;    /* enum dicom_kind, or unset */
 	int position; /* enum patient_position, or unset */
 	struct volume_query query;
 	struct http_options http;
 };
 
-static const char *const dicom_kinds[] = {"slices", "enhanced"};
-
 static const struct option rows[] = {
     {"output", 'o', OPTION_TEXT, offsetof(struct get_options, output), "FILE",
      "- is standard output (default: the name that the daemon gives)", 0, 0, 0, NULL},
     {"dicom", 0, OPTION_CHOICE, offsetof(struct get_options, dicom), "KIND",
-     "with --format dicom: slices, a ZIP of CT images, or enhanced, one Enhanced CT (default slices)", 0, 0, 2,
-     dicom_kinds},
+     "with --format dicom: slices, a ZIP of CT images; enhanced, one Enhanced CT; xray-3d, one X-Ray 3D Angiographic "
+     "(default slices)",
+     0, 0, DICOM_KIND_COUNT, dicom_kind_names},
     {"position", 0, OPTION_CHOICE, offsetof(struct get_options, position), "POSITION",
      "with --format dicom, where nobody has told how the patient lies: HFS, HFP, FFS, FFP, HFDL, HFDR, FFDL or FFDR", 0,
      0, PATIENT_POSITION_COUNT, patient_position_names},
@@ -50,7 +50,7 @@ static void volume_path(const struct get_options *options, char *ret_path, size_
 	volume_query_text(&options->query, query);
 	snprintf(ret_path, size, "/v1/jobs/%.100s/volumes/%.100s?%s%s%s%s%s", options->job, options->volume, query,
 		 options->dicom != OPTION_UNSET_CHOICE ? "&dicom=" : "",
-		 options->dicom != OPTION_UNSET_CHOICE ? dicom_kinds[options->dicom] : "",
+		 options->dicom != OPTION_UNSET_CHOICE ? dicom_kind_names[options->dicom] : "",
 		 options->position != OPTION_UNSET_CHOICE ? "&position=" : "",
 		 options->position != OPTION_UNSET_CHOICE ? patient_position_names[options->position] : "");
 }

@@ -22,7 +22,7 @@ static const struct command *const commands[] = {
     &command_pin,           &command_unpin,   &command_limits,          &command_parameters,   &command_calibrate,
     &command_token,         &command_audit,   &command_calibrate_scan,  &command_calibrations, &command_doctor,
     &command_backup,        &command_restore, &command_reproduce,       &command_send,         &command_destinations,
-    &command_fit_hardening, &command_fit_lag, &command_fit_scatter,     &command_worklist,
+    &command_fit_hardening, &command_fit_lag, &command_fit_scatter,     &command_worklist,     &command_remote,
 };
 enum { COMMAND_COUNT = sizeof(commands) / sizeof(commands[0]) };
 

@@ -74,6 +74,15 @@ static void on_stopped(void *context, const struct recon_stop *stop)
 		stop_rule_names[stop->rule], stop->residual, stop->noise, stop->change);
 }
 
+static void on_agreement(void *context, const struct recon_agreement *agreement)
+{
+	struct display *display = context;
+
+	progress_clear(display->progress);
+	fprintf(stderr, "projections and geometry disagree by %.3g mm at the isocentre, +- %.3g mm a view\n",
+		agreement->mm, agreement->sigma_mm);
+}
+
 static void on_warning(void *context, const char *code, const char *detail)
 {
 	struct display *display = context;
@@ -185,6 +194,7 @@ static int pipeline_run(const struct recon_options *options, const struct job_re
 		      .progress = on_progress,
 		      .row = on_row,
 		      .stopped = on_stopped,
+		      .agreement = on_agreement,
 		      .warning = on_warning},
 	    .on_volume = on_volume,
 	};

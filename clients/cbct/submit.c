@@ -7,7 +7,7 @@
 #include "clients/cbct/watch.h"
 
 struct submit_options {
-	const char *scan, *recipe;
+	const char *scan, *recipe, *once;
 	struct recipe_options pipeline;
 	bool wait, print;
 	struct http_options http;
@@ -15,6 +15,8 @@ struct submit_options {
 
 static const struct option rows[] = {
     {"wait", 0, OPTION_FLAG, offsetof(struct submit_options, wait), NULL, "and watch it to its end", 0, 0, 0, NULL},
+    {"once", 0, OPTION_TEXT, offsetof(struct submit_options, once), "TEXT",
+     "another job with the same text is the same job", 0, 0, 0, NULL},
     {"print", 0, OPTION_FLAG, offsetof(struct submit_options, print), NULL, "print the document and send nothing", 0, 0,
      0, NULL},
     {0},
@@ -26,18 +28,18 @@ static const struct option_group groups[] = {
     {0},
 };
 
-/* With a key of its own, so that asking again after a lost reply makes no second job. */
-static int post(struct http *http, const cJSON *document, cJSON **ret_job, struct error *err)
+/* With a key, the caller's or one of its own, so that asking again after a lost reply makes no second job. */
+static int post(struct http *http, const cJSON *document, const char *once, cJSON **ret_job, struct error *err)
 {
 	uint64_t random[2] = {0, 0};
 	char key[40];
 	int code, attempt = 0;
 
-	if (getrandom(random, sizeof(random), 0) != (ssize_t)sizeof(random))
+	if (once == NULL && getrandom(random, sizeof(random), 0) != (ssize_t)sizeof(random))
 		return error_set(err, ERR_IO, "no random numbers for a key");
 	snprintf(key, sizeof(key), "%016llx%016llx", (unsigned long long)random[0], (unsigned long long)random[1]);
 	do
-		code = http_post(http, "/v1/jobs", document, key, ret_job, err);
+		code = http_post(http, "/v1/jobs", document, once != NULL ? once : key, ret_job, err);
 	while (!http_unreachable(http) && http_again(http, code, attempt++));
 	return code;
 }
@@ -50,7 +52,7 @@ static int submit(const struct submit_options *options, const cJSON *document, s
 	int code = http_new(&options->http, &http, err);
 
 	if (code == 0)
-		code = post(http, document, &job, err);
+		code = post(http, document, options->once, &job, err);
 	if (code == 0) {
 		id = member_text(job, "id", "");
 		puts(id);

@@ -127,29 +127,40 @@ static int compress(const unsigned char *data, size_t length, unsigned char **re
 	return 0;
 }
 
+static int put_once(struct http *http, const char *path, const void *body, size_t length, const char *encoding,
+		    struct error *err)
+{
+	char digest[100];
+	const struct http_request request = {.method = "PUT",
+					     .path = path,
+					     .body = body,
+					     .length = length,
+					     .headers = {"Content-Type: application/octet-stream", digest, encoding}};
+	struct http_reply reply;
+	int code = digest_header(body, length, digest, err);
+
+	if (code != 0)
+		return code;
+	code = http_send(http, &request, &reply, err);
+	http_reply_clear(&reply);
+	return code;
+}
+
+int upload_put(struct http *http, const char *path, const void *data, size_t length, struct error *err)
+{
+	return put_once(http, path, data, length, NULL, err);
+}
+
 static int put(struct http *http, const char *path, const void *data, size_t length, bool zstd, struct error *err)
 {
 	unsigned char *packed = NULL;
-	char digest[100];
-	struct http_request request = {.method = "PUT", .path = path, .body = data, .length = length};
-	int code = 0, attempt = 0;
+	int code = zstd ? compress(data, length, &packed, &length, err) : 0, attempt = 0;
 
-	request.headers[0] = "Content-Type: application/octet-stream";
-	request.headers[1] = digest;
-	if (zstd) {
-		code = compress(data, length, &packed, &request.length, err);
-		request.body = packed;
-		request.headers[2] = "Content-Encoding: zstd";
-	}
 	if (code == 0)
-		code = digest_header(request.body, request.length, digest, err);
-	if (code == 0)
-		do {
-			struct http_reply reply;
-
-			code = http_send(http, &request, &reply, err);
-			http_reply_clear(&reply);
-		} while (http_again(http, code, attempt++));
+		do
+			code = put_once(http, path, zstd ? packed : data, length,
+					zstd ? "Content-Encoding: zstd" : NULL, err);
+		while (http_again(http, code, attempt++));
 	free(packed);
 	return code;
 }

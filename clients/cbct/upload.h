@@ -18,6 +18,9 @@ extern const struct option upload_rows[]; /* all others */
 		.connections = 4, .run = OPTION_UNSET_INTEGER                                                          \
 	}
 
+/* PUT of bytes with their Content-Digest: one try. */
+int upload_put(struct http *http, const char *path, const void *data, size_t length, struct error *err);
+
 /* Prints the scan's id on standard output as soon as it has one. */
 int upload_directory(const char *directory, const struct upload_settings *settings, struct error *err);
 

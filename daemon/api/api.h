@@ -16,6 +16,7 @@ struct api {
 	struct sendings *sendings;
 	struct cards *cards;
 	struct http *http;
+	struct fleet *fleet;   /* NULL: it is in none */
 	struct keeper *keeper; /* NULL: everything is kept */
 	double max_wait;       /* s */
 	double started;        /* clock_monotonic */

@@ -229,6 +229,21 @@ static void add_denoising(cJSON *document, const struct job_record *record)
 	add_number_or_null(object, "alpha", record->tv_alpha > 0 ? record->tv_alpha : -1);
 }
 
+/* Adds how well the projections agree with the geometry; null before that is known, and where it cannot be. */
+static void add_agreement(cJSON *document, const struct recon_agreement *agreement)
+{
+	cJSON *object;
+
+	if (agreement->views == 0) {
+		cJSON_AddNullToObject(document, "geometry_agreement");
+		return;
+	}
+	object = cJSON_AddObjectToObject(document, "geometry_agreement");
+	cJSON_AddNumberToObject(object, "mm", agreement->mm);
+	cJSON_AddNumberToObject(object, "sigma_mm", agreement->sigma_mm);
+	cJSON_AddNumberToObject(object, "views", agreement->views);
+}
+
 /* How many are there, and how many of them the reconstruction has; null when the scan has gone. */
 static void add_views(cJSON *document, const struct scan_facts *scan, const struct job_record *record)
 {
@@ -298,6 +313,7 @@ static void add_job_facts(cJSON *document, struct job *job, const struct job_rec
 	add_text_or_null(document, "plan", record->plan);
 	add_memory(document, &record->memory);
 	add_denoising(document, record);
+	add_agreement(document, &record->agreement);
 	if (record->stop.rule != STOP_NOT)
 		cJSON_AddItemToObject(document, "stopped", stop_document(&record->stop));
 	else

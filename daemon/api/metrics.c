@@ -12,6 +12,7 @@
 
 #include "core/recon/algorithm.h"
 #include "daemon/api/internal.h"
+#include "daemon/fleet/fleet.h"
 #include "daemon/cards.h"
 
 enum { WORKERS_MAX = 64 };
@@ -159,6 +160,24 @@ static void write_store(FILE *out, struct api *api)
 	fprintf(out, "cbctd_catalogue_up{engine=\"%s\"} %d\n", store.engine, !store_away(api->store));
 	single(out, "catalogue_connections_lost_total", "counter",
 	       "Connections with the catalogue's database that were lost.", (double)store.engine_losses);
+}
+
+static void write_fleet(FILE *out, const struct api *api)
+{
+	struct fleet_facts facts;
+
+	if (api->fleet == NULL)
+		return;
+	fleet_look(api->fleet, &facts);
+	single(out, "fleet_up", "gauge", "0 while the fleet's database cannot be reached.", facts.joined);
+	describe(out, "fleet_jobs", "gauge",
+		 "Jobs that other hosts may take or have, those that run there, and those of others here.");
+	fprintf(out, "cbctd_fleet_jobs{way=\"offered\"} %d\n", facts.offered);
+	fprintf(out, "cbctd_fleet_jobs{way=\"given\"} %d\n", facts.given);
+	fprintf(out, "cbctd_fleet_jobs{way=\"taken\"} %d\n", facts.taken);
+	single(out, "fleet_claims_total", "counter", "Jobs of other hosts that were claimed.", (double)facts.claims);
+	single(out, "fleet_connections_lost_total", "counter", "Connections with the fleet's database that were lost.",
+	       (double)facts.losses);
 }
 
 static void write_disk(FILE *out, struct api *api)
@@ -402,6 +421,7 @@ int metrics_get(void *context, struct request *request, struct error *err)
 	write_http(out, api);
 	write_uploads(out, api);
 	write_store(out, api);
+	write_fleet(out, api);
 	write_disk(out, api);
 	write_repairs(out, api);
 	write_jobs(out, api);

@@ -79,7 +79,7 @@ static void put_head(FILE *out, const char *title, bool again)
 		fputs("<meta http-equiv=\"refresh\" content=\"5\">\n", out);
 	fputs("<title>", out);
 	put_text(out, title);
-	fputs(" - cbctd</title>\n</head>\n<body>\n", out);
+	fputs(" - cbctd</title>\n</head>\n<body>\n<main>\n", out);
 	if (assets[0].name == NULL)
 		fputs("<p>This daemon was built without its web page, since npm or its registry could not be reached; "
 		      "this plain one needs neither.</p>\n",
@@ -89,7 +89,7 @@ static void put_head(FILE *out, const char *title, bool again)
 /* Takes the text that was written to `out`. */
 static int reply_page(struct request *request, FILE *out, char **text, size_t *length, struct error *err)
 {
-	fputs("</body>\n</html>\n", out);
+	fputs("</main>\n</body>\n</html>\n", out);
 	if (fclose(out) != 0) {
 		free(*text);
 		return error_set(err, ERR_NO_MEMORY, "no memory for a page");
@@ -185,7 +185,7 @@ static void put_choices(FILE *out, const struct shown *shown)
 {
 	const char *chosen = shown->volumes[shown->chosen].name;
 
-	fputs("<nav>Volume: ", out);
+	fputs("<nav aria-label=\"Volume\">Volume: ", out);
 	for (int i = 0; i < shown->count; i++) {
 		if (i == shown->chosen)
 			fprintf(out, "<strong>%s</strong> ", chosen);
@@ -193,7 +193,7 @@ static void put_choices(FILE *out, const struct shown *shown)
 			fprintf(out, "<a href=\"/plain/%s?volume=%s&amp;window=%d\">%s</a> ", shown->job,
 				shown->volumes[i].name, (int)(shown->preset - presets), shown->volumes[i].name);
 	}
-	fputs("</nav>\n<nav>Window: ", out);
+	fputs("</nav>\n<nav aria-label=\"Window\">Window: ", out);
 	for (int i = 0; i < PRESET_COUNT; i++) {
 		if (&presets[i] == shown->preset)
 			fprintf(out, "<strong>%s</strong> ", presets[i].name);

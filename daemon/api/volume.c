@@ -6,6 +6,7 @@
 #include <unistd.h>
 
 #include "daemon/api/internal.h"
+#include "proto/source.h"
 
 /* s that a list waits for digests: longer than a disk takes for a volume, or something is wrong with it. */
 static const double patience = 30;
@@ -185,13 +186,12 @@ int volume_options(struct request *request, const struct job_facts *job, struct 
 static int read_words(struct api *api, struct request *request, const struct volume_record *volume,
 		      struct content_options *options, struct error *err)
 {
-	static const char *const kinds[] = {"slices", "enhanced", NULL};
 	struct dicom_words *words = &options->words;
 	struct job_record record;
 	struct job *job;
 	int kind, position, code;
 
-	if (query_choice(request, "dicom", kinds, &kind, err) != 0 ||
+	if (query_choice(request, "dicom", dicom_kind_names, &kind, err) != 0 ||
 	    query_choice(request, "position", patient_position_names, &position, err) != 0)
 		return err->code;
 	for (int i = 0; i < 2 && !options->dicom; i++) {
@@ -206,8 +206,10 @@ static int read_words(struct api *api, struct request *request, const struct vol
 		return err->code;
 	job_record(job, &record);
 	code = subject_parse(record.subject != NULL ? record.subject : "", &words->subject, err);
+	if (code == 0)
+		words->source = source_of(record.subject);
 	job_release(job);
-	words->enhanced = kind == 1;
+	words->kind = (enum dicom_kind)kind;
 	words->position = request_query(request, "position") != NULL ? position : -1;
 	words->created = volume->created;
 	snprintf(words->volume, sizeof(words->volume), "%s", volume->name);
@@ -215,12 +217,12 @@ static int read_words(struct api *api, struct request *request, const struct vol
 }
 
 /* DICOM's own way of two; the others say it themselves. */
-static const char *dicom_or(const struct content_options *options, const char *slices, const char *enhanced,
+static const char *dicom_or(const struct content_options *options, const char *slices, const char *frames,
 			    const char *other)
 {
 	if (!options->dicom)
 		return other;
-	return options->words.enhanced ? enhanced : slices;
+	return options->words.kind != DICOM_SLICES ? frames : slices;
 }
 
 const char *volume_media_type(const struct content_options *options)
@@ -247,7 +249,7 @@ static void make_etag(const char *job, const struct volume_record *volume, const
 		      bool zstd, char *ret_etag, size_t size)
 {
 	char tag[VOLUME_TAG_MAX];
-	const char *format = dicom_or(options, "dicom-slices", "dicom-enhanced",
+	const char *format = dicom_or(options, "dicom-slices", dicom_kind_names[options->words.kind],
 				      options->shuffled ? shuffled_name : options->format->name);
 	const char *position = "";
 
@@ -356,10 +358,11 @@ int volume_get(void *context, struct request *request, struct error *err)
 
 	if (volume_asked(api, request, &facts, &volume, err) != 0 ||
 	    volume_options(request, &facts, &options, err) != 0 ||
-	    read_words(api, request, &volume, &options, err) != 0)
+	    volume_verify(api, facts.id, &volume, 0, 0, err) != 0)
 		return err->code;
 	store_volume_path(api->store, facts.id, volume.name, path);
-	if (volume_verify(api, facts.id, &volume, 0, 0, err) != 0 ||
+	/* What the words own is the content's. */
+	if (read_words(api, request, &volume, &options, err) != 0 ||
 	    content_open(path, &volume.grid, &options, &content, err) != 0)
 		return err->code;
 	packed = content_is_packed(&options);

@@ -13,7 +13,7 @@
 /* A processor has no driver to hang in; what it waits for is the disk. */
 static bool is_processor(const struct worker *worker)
 {
-	return worker->fallback || strcmp(worker->backend, "cpu") == 0;
+	return worker->fallback || worker->remote || strcmp(worker->backend, "cpu") == 0;
 }
 
 bool device_at_fault(const struct worker *worker, enum worker_end end)
@@ -176,7 +176,7 @@ enum route device_route(struct supervise *supervise, struct worker *worker, enum
 				     .deaths = trial->deaths,
 				     .runs = record.crashes + 1,
 				     .other = !worker->fallback && other_answers(supervise, worker, trial->left),
-				     .processor = supervise->count > supervise->regular && !worker->fallback};
+				     .processor = supervise->options.fallback && !worker->fallback};
 	route = route_of(&facts);
 	if (route == ROUTE_OTHER)
 		trial->left |= here;
@@ -189,6 +189,8 @@ bool device_fits(const void *context, const struct job_trial *trial)
 	const struct worker *worker = context;
 	const struct supervise *supervise = worker->supervise;
 
+	if (worker->remote || trial->place != 0)
+		return worker->remote && remote_fits(worker, trial);
 	if (worker->fallback)
 		return trial->processor || all_out(supervise);
 	if (trial->processor || worker->aside)
@@ -238,7 +240,7 @@ static void tend_processor(struct supervise *supervise)
 void devices_tend(struct supervise *supervise)
 {
 	clear_asked(supervise);
-	if (supervise->count > supervise->regular)
+	if (supervise->options.fallback)
 		tend_processor(supervise);
 }
 

@@ -94,6 +94,8 @@ void worker_finish_job(struct supervise *supervise, struct worker *worker)
 	job_release(worker->job);
 	worker->job = NULL;
 	worker->ending = (struct ending){0};
+	if (worker->remote)
+		remote_spend(supervise, worker);
 	worker_publish(supervise, worker);
 }
 
@@ -165,9 +167,15 @@ static void hold_job(struct supervise *supervise, struct worker *worker, enum jo
 	struct error ignored;
 
 	if (obstacle == JOB_NO_SPACE) {
-		/* Room for one more volume than now. */
 		store_space(jobs_store(supervise->jobs), &available, &ignored);
-		job_hold(worker->job, obstacle, 0, available + worker->volume_bytes);
+		/*
+		 * Room for one more volume than now. Where there is room for that and a checkpoint already, somebody
+		 * else used the disk for a moment or a quota is at work, and nothing may ever come free.
+		 */
+		if (available / 4 > worker->volume_bytes)
+			job_hold(worker->job, obstacle, clock_monotonic() + SPACE_RETRY, 0);
+		else
+			job_hold(worker->job, obstacle, 0, available + worker->volume_bytes);
 	} else if (obstacle == JOB_DISK_TROUBLE) {
 		job_record(worker->job, &record);
 		job_hold(worker->job, obstacle, clock_monotonic() + RETRY * (1 << record.crashes % CRASHES_MAX), 0);
@@ -233,7 +241,7 @@ static void write_report(const struct worker *worker, const struct worker_words 
 	free(report);
 }
 
-void worker_end_job(struct supervise *supervise, struct worker *worker, const struct worker_words *words)
+static void end_job(struct supervise *supervise, struct worker *worker, const struct worker_words *words)
 {
 	unsigned conditions = conditions_of(worker, words->end);
 	struct outcome outcome = outcome_of(words->end, conditions);
@@ -245,7 +253,7 @@ void worker_end_job(struct supervise *supervise, struct worker *worker, const st
 				.crashed = outcome.crashed,
 				.yielded = outcome.yielded};
 
-	if (worker_leaves(words->end, conditions)) {
+	if (worker_leaves(words->end, conditions) && worker->state != WORKER_ABSENT) {
 		worker->state = WORKER_ENDING;
 		worker->deadline = clock_monotonic() + EXIT;
 	}
@@ -257,4 +265,16 @@ void worker_end_job(struct supervise *supervise, struct worker *worker, const st
 	write_text(worker, &outcome, words, ending.error_text, sizeof(ending.error_text));
 	worker->ending = ending;
 	worker_finish_job(supervise, worker);
+}
+
+void worker_end_job(struct supervise *supervise, struct worker *worker, const struct worker_words *words)
+{
+	struct worker_words judged = *words;
+
+	if (worker->remote) {
+		judged.end = remote_end(worker, words->end, words->code);
+		if (judged.end != words->end)
+			judged.iteration = 0; /* checkpoints of another host stay there */
+	}
+	end_job(supervise, worker, &judged);
 }

@@ -17,13 +17,14 @@ static const double not_queued = 1e-3; /* s between being queued and running: le
 /* What a stage's time depends on, beside the amount of its work: another rate for each. */
 static unsigned variant_of(const struct recipe *recipe, enum stage stage)
 {
-	unsigned precise = recipe->reference_precision;
+	/* Rays per voxel are fewer with binning. */
+	unsigned precise = recipe->reference_precision | (unsigned)recipe->binning << 8;
 
 	switch (stage) {
 	case STAGE_FDK:
 		return precise | (recipe->metal.on ? 2u : 0) | (recipe->fdk.extend ? 4u : 0);
 	case STAGE_TV:
-		return precise | (unsigned)recipe->tv.options.method << 1;
+		return recipe->reference_precision | (unsigned)recipe->tv.options.method << 1;
 	case STAGE_SART:
 	case STAGE_CGLS:
 	case STAGE_FISTA:

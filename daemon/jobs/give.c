@@ -261,7 +261,8 @@ void supervise_preempt(struct supervise *supervise)
 	job_release(waiting);
 	do {
 		busy = idle = 0;
-		for (int i = 0; i < supervise->count; i++) {
+		/* Other hosts make room by their own queues. */
+		for (int i = 0; i < supervise->local; i++) {
 			struct worker *worker = &supervise->workers[i];
 
 			idle += worker->state == WORKER_IDLE && worker->job == NULL;

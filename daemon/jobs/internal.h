@@ -41,6 +41,7 @@ struct job {
 	struct hold hold;
 	int references; /* one of them is the array's */
 	bool removed;
+	bool stays;                    /* job_stay */
 	struct client *client;         /* constant; what it points to is not */
 	bool active;                   /* counted in its client's */
 	double charged;                /* monotonic: its time on a device is counted up to then */

@@ -363,14 +363,17 @@ int jobs_repeat(struct jobs *jobs, const char *key, const uint8_t digest[32], st
 	return 0;
 }
 
-/* The patient and the study are those of this scan, for ever; nothing else can give a job any. */
+/* The patient, the study and the source are those of this scan, for ever; nothing else can give a job any. */
 static int copy_subject(struct job_record *record, const struct scan *scan, struct error *err)
 {
+	const cJSON *source = cJSON_GetObjectItemCaseSensitive(scan->document, "source");
 	cJSON *document;
 
-	if (!subject_known(&scan->subject, NULL))
+	if (!subject_known(&scan->subject, NULL) && source == NULL)
 		return 0;
 	document = subject_json(&scan->subject);
+	if (source != NULL)
+		cJSON_AddItemToObject(document, "source", cJSON_Duplicate(source, true));
 	record->subject = document == NULL ? NULL : json_print(document, NULL);
 	cJSON_Delete(document);
 	return record->subject == NULL ? error_set_errno(err, ENOMEM, "job") : 0;

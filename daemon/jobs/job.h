@@ -131,6 +131,23 @@ struct jobs_statistics {
 };
 void jobs_statistics(struct jobs *jobs, struct jobs_statistics *ret);
 
+/* ---- jobs that other hosts compute: jobs/offer.c ---- */
+
+/* A job with an Idempotency-Key that begins so is another daemon's: it is computed here, and no one else is to. */
+#define JOB_MIRROR_KEY "fleet:"
+bool job_is_mirror(const struct job_record *record);
+struct job_offer {
+	char id[ID_SIZE], scan[ID_SIZE];
+	enum priority priority;
+};
+/*
+ * Queued jobs that another host may compute, in the order of the queue behind the first `skip` of it, at most `most`.
+ * Returns how many. Not those that are held, have a checkpoint, are another daemon's, or stay.
+ */
+int jobs_offers(struct jobs *jobs, int skip, struct job_offer *ret_offers, int most);
+/* From now on the job is computed here alone; in memory only. */
+void job_stay(struct job *job);
+
 /* ---- calls of the supervisor, in its one thread ---- */
 struct job_change {
 	int error_code; /* with JOB_FAILED */
@@ -153,6 +170,8 @@ int jobs_promote(struct jobs *jobs, struct error *err);
  * daemon every device is worth a try.
  */
 struct job_trial {
+	int place;               /* slot of the host that has claimed it (supervise.h), 0: none */
+	int given_back;          /* runs that other hosts have begun and not ended */
 	unsigned long long left; /* bit for each worker whose device the job has left */
 	int worker, deaths;      /* runs lost on this one's device without a checkpoint between them */
 	bool processor;          /* it goes on with the processor, by --fallback cpu */
@@ -205,6 +224,8 @@ int jobs_victim(struct jobs *jobs, const enum priority *arriving, const struct q
 void job_set_plan(struct job *job, const struct recon_memory *memory, const char *plan);
 /* recon_hooks.denoising. Memory only, until the next change of state, as is the progress. */
 void job_set_denoising(struct job *job, double noise_hu, double alpha);
+/* recon_hooks.agreement; the same. */
+void job_set_agreement(struct job *job, const struct recon_agreement *agreement);
 /* How its automatic iterations ended, with an event; one that a run after a crash ends in again is told once. */
 int job_set_stop(struct job *job, const struct recon_stop *stop, struct error *err);
 /*

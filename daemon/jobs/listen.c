@@ -90,7 +90,7 @@ static int add_rows(struct supervise *supervise, struct worker *worker)
 	struct error err;
 
 	/* The latest measurement: the first iterations of a job may share the processor with its loading. */
-	if (count > 0 && worker->work > 0 && strcmp(worker->backend, "cpu") == 0)
+	if (count > 0 && worker->work > 0 && !worker->remote && strcmp(worker->backend, "cpu") == 0)
 		supervise->processor_rate = worker->rows[count - 1].seconds / worker->work;
 
 	if (count > 0)
@@ -174,6 +174,9 @@ static int on_message(struct supervise *supervise, struct worker *worker, const 
 		break;
 	case MESSAGE_NOISE:
 		job_set_denoising(worker->job, message->noise_hu, message->alpha);
+		break;
+	case MESSAGE_AGREEMENT:
+		job_set_agreement(worker->job, &message->agreement);
 		break;
 	case MESSAGE_STOPPED:
 		code = job_set_stop(worker->job, &message->stop, &err);

@@ -25,10 +25,12 @@ static int memory_needed(const char *backend, const struct scan *scan, const str
 	const struct backend *row = backend_find(backend);
 	const struct geometry *geometry = &scan->geometry;
 	const struct linearise linearise = scan_linearise(scan);
+	struct pixel_blocks blocks;
 
 	if (row != NULL)
 		return recon_memory(row, NULL, geometry, &linearise, recipe, ret_memory, err);
-	*ret_memory = (struct recon_memory){.projections = (size_t)geometry->columns * (size_t)geometry->rows *
+	blocks = geometry_blocks(geometry, recipe->binning);
+	*ret_memory = (struct recon_memory){.projections = (size_t)blocks.count[0] * (size_t)blocks.count[1] *
 							   (size_t)geometry->count * sizeof(float),
 					    .volumes = 2 * grid_voxels(&recipe->grid) * sizeof(float)};
 	ret_memory->total = ret_memory->projections + ret_memory->volumes;

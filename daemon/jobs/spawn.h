@@ -25,6 +25,12 @@ struct child {
  * SOCK_SEQPACKET pair as descriptor 3, and nothing else.
  */
 int child_spawn(const struct spawn_options *options, struct child *ret_child, struct error *err);
+/* Another host in place of a device: cbct remote. Texts that are "" are not passed on. */
+struct spawn_remote {
+	const char *program, *host, *claim, *url, *token_file, *authorities;
+	double lease; /* s */
+};
+int child_spawn_remote(const struct spawn_remote *options, struct child *ret_child, struct error *err);
 /* After pidfd became readable: collects it, closes both descriptors, says how it ended ("signal 9 (Killed)"). */
 void child_reap(struct child *child, char *ret_how, size_t size);
 

@@ -76,6 +76,22 @@ void worker_publish(struct supervise *supervise, const struct worker *worker)
 
 /* ---- the life of a worker ---- */
 
+static int spawn_remote(struct supervise *supervise, struct worker *worker, struct error *err)
+{
+	const struct remote_options *remote = &supervise->options.remote;
+	char claim[160];
+	const struct spawn_remote options = {.program = remote->program,
+					     .host = worker->place.host,
+					     .claim = claim,
+					     .url = worker->place.url,
+					     .token_file = remote->token_file,
+					     .authorities = remote->authorities,
+					     .lease = remote->lease};
+
+	place_claim(remote->host, worker->place.job, worker->place.number, claim, sizeof(claim));
+	return child_spawn_remote(&options, &worker->child, err);
+}
+
 static void start_worker(struct supervise *supervise, struct worker *worker)
 {
 	const struct spawn_options options = {.worker = supervise->worker,
@@ -91,9 +107,12 @@ static void start_worker(struct supervise *supervise, struct worker *worker)
 	worker->testing = worker->aside;
 	worker->hung = false;
 	worker->mute++; /* until it says hello */
-	if (child_spawn(&options, &worker->child, &err) != 0) {
+	if ((worker->remote ? spawn_remote(supervise, worker, &err) : child_spawn(&options, &worker->child, &err)) !=
+	    0) {
 		worker->failures++;
 		worker->start_at = now + RESTART_LAST;
+		if (worker->remote)
+			remote_spend(supervise, worker);
 		snprintf(worker->last_error, sizeof(worker->last_error), "%.150s", err.text);
 		log_line(LEVEL_ERROR, "worker %d: %s", worker->index, err.text);
 	} else {
@@ -194,7 +213,9 @@ static void worker_died(struct supervise *supervise, struct worker *worker, bool
 		    supervise, worker,
 		    &(struct worker_words){
 			.end = stopping ? END_STOPPED : END_DIED, .code = ERR_INTERNAL, .text = text, .how = how});
-	if (!stopping)
+	if (worker->remote)
+		remote_spend(supervise, worker);
+	else if (!stopping)
 		plan_restart(worker, how, now);
 	worker_publish(supervise, worker);
 }
@@ -431,6 +452,7 @@ static void *supervise_loop(void *context)
 		}
 		look_at_clock(supervise, false);
 		devices_tend(supervise);
+		remote_tend(supervise);
 		carry_out_cancels(supervise);
 		attend_all(supervise);
 		move_jobs(supervise);
@@ -456,6 +478,18 @@ static void *supervise_loop(void *context)
 
 /* ---- from other threads ---- */
 
+static void copy_remote(struct supervise *supervise, const struct remote_options *options)
+{
+	struct remote_options *copy = &supervise->options.remote;
+	const char **texts[] = {&copy->program, &copy->token_file, &copy->authorities, &copy->host};
+
+	*copy = *options;
+	for (size_t i = 0; i < sizeof(texts) / sizeof(texts[0]) && options->program != NULL; i++) {
+		snprintf(supervise->remote[i], sizeof(supervise->remote[i]), "%s", *texts[i]);
+		*texts[i] = supervise->remote[i];
+	}
+}
+
 static void set_options(struct supervise *supervise, const struct supervise_options *options)
 {
 	if (options->worker != NULL && options->worker[0] != '\0')
@@ -477,7 +511,9 @@ static void set_options(struct supervise *supervise, const struct supervise_opti
 	supervise->regular = options->workers < 1 ? 1 : options->workers > WORKERS_MAX ? WORKERS_MAX : options->workers;
 	for (int i = 0; i < supervise->regular; i++)
 		supervise->devices[i] = options->devices != NULL ? options->devices[i] : i;
-	supervise->count = supervise->regular + options->fallback;
+	supervise->local = supervise->regular + options->fallback;
+	supervise->count = supervise->local + (options->remote.program != NULL ? PLACES_MAX : 0);
+	copy_remote(supervise, &options->remote);
 }
 
 int supervise_start(struct jobs *jobs, const struct supervise_options *options, struct supervise **ret_supervise,
@@ -492,13 +528,13 @@ int supervise_start(struct jobs *jobs, const struct supervise_options *options, 
 	supervise->stop_by = NEVER;
 	set_options(supervise, options);
 	/* A worker makes them hardly faster than a processor hashes them. */
-	if (digester_start(jobs, supervise->count, &supervise->digester, err) != 0) {
+	if (digester_start(jobs, supervise->local, &supervise->digester, err) != 0) {
 		free(supervise);
 		return err->code;
 	}
 	for (int i = 0; i < supervise->count; i++) {
 		struct worker *worker = &supervise->workers[i];
-		const bool fallback = i >= supervise->regular;
+		const bool remote = i >= supervise->local, fallback = i >= supervise->regular && !remote;
 
 		*worker = (struct worker){.supervise = supervise,
 					  .index = i,
@@ -506,7 +542,8 @@ int supervise_start(struct jobs *jobs, const struct supervise_options *options, 
 					  .deadline = NEVER,
 					  .room_since = NEVER,
 					  .fallback = fallback,
-					  .start_at = fallback ? NEVER : 0};
+					  .remote = remote,
+					  .start_at = fallback || remote ? NEVER : 0};
 		snprintf(worker->backend, sizeof(worker->backend), "%s", fallback ? "cpu" : "");
 	}
 	lock_init(&supervise->lock, LOCK_SUPERVISOR);
@@ -585,7 +622,7 @@ bool supervise_ready(struct supervise *supervise)
 	bool ready = false;
 
 	pthread_mutex_lock(&supervise->lock);
-	for (int i = 0; i < supervise->count; i++)
+	for (int i = 0; i < supervise->local; i++)
 		ready |= worker_answers(&supervise->facts[i]);
 	pthread_mutex_unlock(&supervise->lock);
 	return ready;
@@ -608,10 +645,10 @@ int supervise_clear(struct supervise *supervise, int index, struct worker_facts 
 
 int supervise_workers(struct supervise *supervise, struct worker_facts *ret_facts, int most)
 {
-	int count = supervise->count < most ? supervise->count : most;
+	int count = supervise->local < most ? supervise->local : most;
 
 	pthread_mutex_lock(&supervise->lock);
 	memcpy(ret_facts, supervise->facts, (size_t)count * sizeof(*ret_facts));
 	pthread_mutex_unlock(&supervise->lock);
-	return supervise->count;
+	return supervise->local;
 }

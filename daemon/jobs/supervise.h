@@ -4,7 +4,7 @@
 #include "daemon/jobs/job.h"
 
 /*
- * Workers: started, given jobs, watched, restarted.
+ * Workers: started, given jobs, watched, restarted; and jobs that other hosts compute.
  *
  * One thread does all of it, and is the only one that talks to workers and
  * moves jobs out of the queue and through `running`. A worker that dies takes
@@ -28,7 +28,17 @@
  */
 struct supervise;
 
+/* How jobs go to other hosts, and who this one is. Strings are copied. */
+struct remote_options {
+	const char *program;     /* path of cbct; NULL: no job goes anywhere */
+	const char *token_file;  /* shown to the other host; "": none */
+	const char *authorities; /* who signs the other host's certificate; "": whom the system trusts */
+	const char *host;        /* the name of this one in the fleet */
+	double lease;            /* s without an answer after which a host is lost */
+};
+
 struct supervise_options {
+	struct remote_options remote;
 	const char *worker;        /* path of cbct-worker; NULL: beside this program, else from PATH */
 	const char *backend;       /* "auto", "cuda", "cpu" */
 	int workers;               /* 0 = 1 */
@@ -65,6 +75,26 @@ bool supervise_ready(struct supervise *supervise);
 int supervise_check_memory(struct supervise *supervise, const struct scan *scan, const struct recipe *recipe,
 			   struct recon_memory *ret_memory, struct error *err);
 
+/*
+ * ---- jobs that other hosts compute: jobs/remote.c ----
+ *
+ * A place is another host that has claimed one of the queued jobs. Each has a process in a slot of its own, which is a
+ * worker as any other to its job; a job that is given back is queued again. A place that is no more among those that
+ * are set has its job taken back. A place is spent when the process has gone: its job has ended or is queued again, or
+ * could not be given to it. It stays so until it is no more among those that are set; numbers never come twice.
+ */
+enum { PLACES_MAX = 16 };
+struct place {
+	char job[ID_SIZE];
+	char host[64], url[256];
+	long long number; /* of the claim, above 0 */
+};
+/* The key of the job on the other host: by it that host knows whose it is. */
+void place_claim(const char *owner, const char *job, long long number, char *ret_text, size_t size);
+void supervise_set_places(struct supervise *supervise, const struct place *places, int count);
+/* Returns how many are spent. */
+int supervise_spent(struct supervise *supervise, struct place ret_places[PLACES_MAX]);
+
 /* A copy of what is known of one worker, for GET /v1/devices, /readyz and /metrics. */
 enum worker_state { WORKER_ABSENT, WORKER_STARTING, WORKER_IDLE, WORKER_BUSY, WORKER_ENDING, WORKER_STATE_COUNT };
 extern const char *const worker_state_names[WORKER_STATE_COUNT];
@@ -91,7 +121,7 @@ struct worker_facts {
  * runs never is (watchdog.h), does not answer. Nobody has to be killed for that to be told.
  */
 bool worker_answers(const struct worker_facts *facts);
-/* Fills at most `most` entries, returns how many there are. */
+/* Fills at most `most` entries, returns how many there are; those of other hosts are none of them. */
 int supervise_workers(struct supervise *supervise, struct worker_facts *ret_facts, int most);
 /*
  * An operator says that the device of worker `index` is to be given jobs again, and to be started at once where it is

@@ -302,6 +302,13 @@ void job_set_denoising(struct job *job, double noise_hu, double alpha)
 	pthread_mutex_unlock(&job->jobs->lock);
 }
 
+void job_set_agreement(struct job *job, const struct recon_agreement *agreement)
+{
+	pthread_mutex_lock(&job->jobs->lock);
+	job->record.agreement = *agreement;
+	pthread_mutex_unlock(&job->jobs->lock);
+}
+
 int job_set_stop(struct job *job, const struct recon_stop *stop, struct error *err)
 {
 	struct jobs *jobs = job->jobs;

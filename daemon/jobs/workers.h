@@ -18,13 +18,14 @@
  * but where something else is said.
  */
 enum {
-	WORKERS_MAX = 64, /* devices; one more may stand for the processor */
-	SLOTS_MAX = WORKERS_MAX + 1,
+	WORKERS_MAX = 64, /* devices; one more may stand for the processor, and others for other hosts */
+	SLOTS_MAX = WORKERS_MAX + 1 + PLACES_MAX,
 	CRASHES_MAX = 3, /* times that a worker may fail to read or write for a job */
 };
-#define NEVER 1e300 /* a time of clock_monotonic that does not come */
-#define RETRY 1.0   /* s until a change that the disk refused is tried again */
-#define EXIT 2.0    /* s that a worker has to exit by itself */
+#define NEVER 1e300     /* a time of clock_monotonic that does not come */
+#define RETRY 1.0       /* s until a change that the disk refused is tried again */
+#define SPACE_RETRY 5.0 /* s until a job goes on that met a full disk, which has room by now */
+#define EXIT 2.0        /* s that a worker has to exit by itself */
 /*
  * s without a projection after which a worker that waits for some is anybody's: an arm that turns sends several a
  * second, and an arm that has stopped has nothing to lose but what the worker has reconstructed.
@@ -69,6 +70,9 @@ struct worker {
 	char backend[16];
 	struct device_info info; /* of the last hello */
 	char last_error[160];
+	bool remote;        /* of another host: jobs/remote.c */
+	struct place place; /* with remote; number 0: none */
+	bool spent;         /* with remote: the place is */
 	bool fallback;      /* of the processor, by --fallback cpu; its process is there while it is needed */
 	unsigned faults;    /* errors of its device since a job succeeded on it */
 	bool aside;         /* its device is given no jobs until a self-test or an operator clears it */
@@ -112,8 +116,10 @@ struct supervise {
 	struct digester *digester;
 	char worker[1024], backend[16];
 	struct supervise_options options;
-	int count;   /* of workers[] */
-	int regular; /* without the fallback */
+	char remote[4][1024]; /* texts of options.remote */
+	int count;            /* of workers[] */
+	int regular;          /* without the fallback and those of other hosts */
+	int local;            /* without those of other hosts */
 	int devices[SLOTS_MAX];
 	int wake; /* eventfd */
 	struct watch jobs_watch, arrivals_watch;
@@ -130,6 +136,8 @@ struct supervise {
 
 	pthread_mutex_t lock; /* guards what follows */
 	struct worker_facts facts[SLOTS_MAX];
+	struct place places[PLACES_MAX], spent[PLACES_MAX];
+	int place_count, spent_count;
 	unsigned long long clear; /* bit for each worker that an operator wants cleared */
 	bool stop;
 };
@@ -190,6 +198,16 @@ void devices_tend(struct supervise *supervise);
 void device_tell_fallback(struct supervise *supervise, struct worker *worker, int iterations);
 /* JSON of how a job's last run was lost, for the document of a job that fails; owned by the caller. NULL: no memory. */
 char *device_report(const struct worker *worker, const struct worker_words *words, int runs);
+
+/* ---- remote.c ---- */
+/* Slots follow the places that are set. */
+void remote_tend(struct supervise *supervise);
+/* The slot's process is through with its job, or has gone. */
+void remote_spend(struct supervise *supervise, struct worker *worker);
+/* The job that this slot is there for. */
+bool remote_fits(const struct worker *worker, const struct job_trial *trial);
+/* How a run on another host ends for its job: what fails there is no failure of the job. */
+enum worker_end remote_end(const struct worker *worker, enum worker_end end, int code);
 
 /* ---- give.c ---- */
 /* Idle workers get jobs. */

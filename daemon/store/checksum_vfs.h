@@ -39,14 +39,15 @@ int pages_seal(const char *path, struct error *err);
 
 /*
  * A log that a process left behind, read as SQLite does when it recovers it: frames up to the last whole transaction.
- * Those behind the first frame that does not fit are lost for SQLite. Where the process or the machine ended in the
- * midst of a transaction, that one has no end, or is the last.
+ * Those behind the first frame that does not fit are lost for SQLite. Where the machine lost its power, that is as it
+ * should be for all that was written since the last sync of the log, and damage for what was synced.
  */
 struct log_facts {
 	long frames;       /* that are good; 0 too where there is no log */
 	long commits_lost; /* ends of transactions behind the first frame that is not */
 	int version;       /* the user_version that they leave; -1: that of the database file */
-	bool damaged;      /* more of it does not fit than one transaction in the midst of which everything ended */
+	long synced;       /* frames that were synced, as far as that was noted; 0: nothing says so */
+	bool damaged;      /* some of those do not fit */
 };
 int log_check(const char *path, struct log_facts *ret, struct error *err);
 

@@ -86,9 +86,14 @@ int store_job_insert(struct store *store, const struct job_record *job, const st
 	int code;
 
 	store_job_directory(store, job->id, directory);
-	if (mkdir(directory, 0700) != 0) /* synced with its record */
-		return error_set_errno(err, errno, "mkdir %s", directory);
-	code = store_begin(store, err);
+	/*
+	 * Its name is synced for itself: that of the record below, in a directory whose name is lost, would keep
+	 * nothing where a file system does not sync the names on the way to a file with it, as the journals of ext4 and
+	 * XFS do.
+	 */
+	code = directory_make(directory, err);
+	if (code == 0)
+		code = store_begin(store, err);
 	if (code != 0) {
 		rmdir(directory);
 		return code;

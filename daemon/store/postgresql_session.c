@@ -46,6 +46,7 @@ enum { SERVER_LEAST = 120000 };
 	X(PQgetvalue) \
 	X(PQisBusy) \
 	X(PQnfields) \
+	X(PQnotifies) \
 	X(PQntuples) \
 	X(PQparameterStatus) \
 	X(PQresultErrorField) \
@@ -435,6 +436,37 @@ int session_run(struct pg_session *session, const char *sql, const struct value 
 	for (int i = 0; i < parameters.owned_count; i++)
 		free(parameters.owned[i]);
 	return code;
+}
+
+static bool take_notifications(struct pg_session *session)
+{
+	PGnotify *notification;
+	bool some = false;
+
+	while ((notification = pq.PQnotifies(session->pg)) != NULL) {
+		pq.PQfreemem(notification);
+		some = true;
+	}
+	return some;
+}
+
+int session_wait(struct pg_session *session, int descriptor, double seconds, struct error *err)
+{
+	struct pollfd fds[2];
+	int ready;
+
+	if (session->pg == NULL)
+		return session_away(err, "the connection was lost");
+	/* Those that came with the answer to another question. */
+	if (take_notifications(session))
+		return 0;
+	fds[0] = (struct pollfd){.fd = pq.PQsocket(session->pg), .events = POLLIN};
+	fds[1] = (struct pollfd){.fd = descriptor, .events = POLLIN};
+	ready = poll(fds, 2, seconds <= 0 ? 0 : (int)(1000 * seconds) + 1);
+	if (ready > 0 && fds[0].revents != 0 && pq.PQconsumeInput(session->pg) == 0)
+		return lose(session, pq.PQerrorMessage(session->pg), err);
+	take_notifications(session);
+	return 0;
 }
 
 int session_quote(struct pg_session *session, const char *text, char *ret_quoted, size_t size, struct error *err)

@@ -46,6 +46,12 @@ int session_ask(struct pg_session *session, const char *sql, row_function row, v
 int session_run(struct pg_session *session, const char *sql, const struct value *values, int count, row_function row,
 		void *context, struct error *err);
 
+/*
+ * Sleeps until a notification has come (LISTEN), `descriptor` can be read, or so many seconds have passed. Whichever it
+ * was, and what the notifications say, is not told.
+ */
+int session_wait(struct pg_session *session, int descriptor, double seconds, struct error *err);
+
 /* The text as a literal of SQL, quotes included. */
 int session_quote(struct pg_session *session, const char *text, char *ret_quoted, size_t size, struct error *err);
 

@@ -240,9 +240,7 @@ static int make_directories(struct reconciliation *r, struct error *err)
 		if (r->rows[i].stamp != 0)
 			log_line(LEVEL_ERROR, "job %s: its directory is gone, with all volumes", r->rows[i].id);
 		record_directory(r->store, r->kind, r->rows[i].id, path);
-		if (mkdir(path, 0700) != 0)
-			return error_set_errno(err, errno, "mkdir %s", path);
-		if (write_again(r, r->rows[i].id, err) != 0)
+		if (directory_make(path, err) != 0 || write_again(r, r->rows[i].id, err) != 0)
 			return err->code;
 	}
 	return 0;

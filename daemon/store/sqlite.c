@@ -478,9 +478,8 @@ static int look_at_files(const struct catalogue_site *site, enum pages_kind *ret
 	if (code == 0 && *ret_kind != PAGES_NONE)
 		code = log_check(log_path, ret_log, err);
 	if (code == 0 && ret_log->damaged)
-		code = error_set(err, ERR_IO,
-				 "its log is damaged: %ld transactions are lost behind the %ld frames that are good",
-				 ret_log->commits_lost, ret_log->frames);
+		code = error_set(err, ERR_IO, "its log is damaged: %ld frames of it are good, and %ld were synced",
+				 ret_log->frames, ret_log->synced);
 	return code;
 }
 

@@ -8,6 +8,7 @@
 #include <string.h>
 #include <sys/file.h>
 #include <sys/stat.h>
+#include <time.h>
 #include <unistd.h>
 
 #include "daemon/files.h"
@@ -19,6 +20,23 @@
 #include "proto/clock.h"
 
 /* ---- opening ---- */
+
+/* s: what a killed daemon was just starting holds its lock until that process has become another program. */
+static const double LOCK_PATIENCE = 1;
+
+static int take_lock(struct store *store, const char *path, struct error *err)
+{
+	const double until = clock_monotonic() + LOCK_PATIENCE;
+
+	while (flock(store->lock_file, LOCK_EX | LOCK_NB) < 0) {
+		if (errno != EWOULDBLOCK)
+			return error_set_errno(err, errno, "lock %s", path);
+		if (clock_monotonic() >= until)
+			return error_set(err, ERR_CONFLICT, "%s is in use by another cbctd", store->directory);
+		nanosleep(&(const struct timespec){.tv_nsec = 20000000}, NULL);
+	}
+	return 0;
+}
 
 static int take_directory(struct store *store, struct error *err)
 {
@@ -37,11 +55,9 @@ static int take_directory(struct store *store, struct error *err)
 	store->lock_file = open(path, O_RDWR | O_CREAT | O_CLOEXEC, 0600);
 	if (store->lock_file < 0)
 		return error_set_errno(err, errno, "open %s", path);
-	if (flock(store->lock_file, LOCK_EX | LOCK_NB) < 0) {
-		if (errno == EWOULDBLOCK)
-			return error_set(err, ERR_CONFLICT, "%s is in use by another cbctd", store->directory);
-		return error_set_errno(err, errno, "lock %s", path);
-	}
+	code = take_lock(store, path, err);
+	if (code != 0)
+		return code;
 	if (stat(store->directory, &status) != 0)
 		return error_set_errno(err, errno, "%s", store->directory);
 	store->device = status.st_dev;

@@ -385,7 +385,7 @@ struct job_record {
 	int iterations;                 /* that SART will run, 0 without */
 	char *key;                      /* Idempotency-Key or NULL, owned; constant after creation */
 	char client[STORE_CLIENT_SIZE]; /* who posted it; constant after creation */
-	char *subject;                  /* subject_json of its scan as text, or NULL, owned; constant after creation */
+	char *subject; /* subject_json and "source" of its scan as text, or NULL, owned; constant after creation */
 	uint8_t digest[32];
 	bool cancel_asked;
 	bool pinned;  /* it stays whatever its age */
@@ -395,7 +395,8 @@ struct job_record {
 	unsigned basis; /* of its scan, when it ran last */
 	char backend[16], device[96], plan[160];
 	struct recon_memory memory;
-	double noise_hu, tv_alpha; /* recon_hooks.denoising; NaN before it was called */
+	double noise_hu, tv_alpha;        /* recon_hooks.denoising; NaN before it was called */
+	struct recon_agreement agreement; /* recon_hooks.agreement; all 0 before it was called */
 	/* How automatic iterations ended; STOP_NOT: they have not. */
 	struct recon_stop stop;
 	int error_code; /* 0: none */

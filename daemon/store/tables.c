@@ -104,7 +104,12 @@ static const struct column job_columns[] = {
     {"stop_residual", COLUMN_REAL, AT(job_record, stop.residual), .initial = "0", .changes = true},
     {"stop_change", COLUMN_REAL, AT(job_record, stop.change), .initial = "0", .changes = true},
     {"stop_noise", COLUMN_REAL, AT(job_record, stop.noise), .initial = "0", .changes = true},
+    {"agreement_views", COLUMN_INT, AT(job_record, agreement.views), .initial = "0", .changes = true},
+    {"agreement_mm", COLUMN_REAL, AT(job_record, agreement.mm), .initial = "0", .changes = true},
+    {"agreement_sigma_mm", COLUMN_REAL, AT(job_record, agreement.sigma_mm), .initial = "0", .changes = true},
 };
+
+_Static_assert(sizeof(job_columns) / sizeof(job_columns[0]) <= COLUMNS_MAX, "a row has room for a job");
 
 static const struct column volume_columns[] = {
     {"number", COLUMN_NUMBER, .size = 0},

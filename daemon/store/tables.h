@@ -46,7 +46,7 @@ struct column {
 	bool assigned; /* SET writes it, alone */
 };
 
-enum { COLUMNS_MAX = 48 };
+enum { COLUMNS_MAX = 56 };
 
 /* The rule of a table for catalogue_put where a row with the same key is there. */
 enum put {

@@ -1,0 +1,358 @@
+#!/usr/bin/env bash
+# A fleet: daemons that compute each other's jobs, with their ledger in a PostgreSQL server of Debian's (docs/fleet.md).
+# An owner has no device here unless a test says so: its jobs can only be computed elsewhere.
+. "$(dirname "$0")/lib.sh"
+. "$here/postgresql.sh"
+[ -z "${CBCT_TEST_CATALOGUE:-}" ] || unset CBCT_TEST_CATALOGUE
+
+scan_dir=$work/scan
+cbct simulate -o "$scan_dir" --phantom head --scale 70 --views 50 --columns 48 --rows 36 --pixel 7 >/dev/null
+cbct simulate -o "$work/counts" --phantom head --scale 70 --views 30 --columns 48 --rows 36 --pixel 7 --photons 30000 >/dev/null
+grid='"grid": {"size": [32, 32, 24], "spacing_mm": [5, 5, 5]}'
+small="{\"scan\": \"SCAN\", $grid, \"fdk\": {}, \"sart\": {\"iterations\": 3}, \"tv\": {}, \"emit\": [\"fdk\", 1]}"
+long="{\"scan\": \"SCAN\", $grid, \"fdk\": {}, \"sart\": {\"iterations\": 300}, \"emit\": [\"fdk\", 100]}"
+[ "${SANITIZED:-0}" = 0 ] || long=${long/300/60} long=${long/100/20}
+
+start_postgresql || { [ -n "${why:-}" ] || exit 1; }
+pkg-config --exists libpq 2>/dev/null || why="libpq is not installed"
+hosts=()
+trap 'stop_hosts; stop_postgresql' EXIT
+printf '#!/bin/sh\nexec false\n' >"$work/no-device"
+chmod +x "$work/no-device"
+lease=3
+
+need_server() { [ -z "${why:-}" ] || skip "$why"; }
+# start_host NAME [OPTION ...]: a daemon of the fleet; its address is in NAME.url, its process in NAME.pid
+start_host() {
+	local name=$1 out=$work/$1.out port=$((20000 + RANDOM % 10000)) i
+	shift
+	hosts+=("$name")
+	for ((i = 0; i < 20; i++)); do
+		: >"$out"
+		"$BUILD/cbctd-held" --listen "127.0.0.1:$port" --state-dir "$work/$name" --backend cpu --threads 1 --fleet test \
+			--fleet-database "$database" --fleet-lease "$lease" --fleet-host "$name" "${@//PORT/$port}" >"$out" 2>>"$work/$name.err" &
+		echo $! >"$work/$name.pid"
+		until [ -s "$out" ] || ! kill -0 "$(cat "$work/$name.pid")" 2>/dev/null; do sleep 0.05; done
+		[ -s "$out" ] && break
+		port=$((20000 + RANDOM % 10000))
+	done
+	sed -n 's/^listening on //p' "$out" >"$work/$name.url"
+	[ -s "$work/$name.url" ] || fail "host $name, got $(tail -3 "$work/$name.err")"
+}
+taker() { start_host "$1" --fleet-address http://127.0.0.1:PORT "${@:2}"; }
+owner() { start_host "$1" --worker "$work/no-device" "${@:2}"; }
+stop_host() { # NAME [SIGNAL]
+	local pid
+	pid=$(cat "$work/$1.pid" 2>/dev/null) || return 0
+	rm -f "$work/$1.pid"
+	kill "-${2:-TERM}" "$pid" 2>/dev/null || true
+	while kill -0 "$pid" 2>/dev/null; do sleep 0.05; done
+}
+stop_hosts() {
+	local file name
+	for file in "$work"/*.pid; do
+		[ -e "$file" ] || continue
+		name=${file##*/}
+		kill -CONT "$(cat "$file")" 2>/dev/null
+		stop_host "${name%.pid}" KILL
+	done
+}
+begin() { # each test has a fleet of its own
+	need_server
+	stop_hosts
+	rm -rf "$work"/{a,b,c,undisturbed} "$work"/{a,b,c}.err
+	sql 'SET client_min_messages = error; DROP SCHEMA IF EXISTS cbctd_fleet_test CASCADE'
+}
+at() { url=$(cat "$work/$1.url"); } # NAME: requests go to that host from now on
+given_to() { # HOST: $job runs there
+	local i
+	for ((i = 0; i < 600; i++)); do
+		req GET "/v1/jobs/$job"
+		expect_status 200
+		[[ $(json '.state == "running" and (.device | startswith("'"$1"':"))') = true ]] && return 0
+		sleep 0.05
+	done
+	fail "job $job on $1, got $(json '{state, device}')"
+}
+progresses() { # $job has done an iteration
+	local i
+	for ((i = 0; i < 600; i++)); do
+		req GET "/v1/jobs/$job"
+		[ "$(json '.history | length > 0')" = true ] && return 0
+		sleep 0.05
+	done
+	fail "iterations of $job, got $(head -c 600 "$body")"
+}
+# undisturbed DIR JOB NAME: the bits of that job from a daemon that is in no fleet, and how well its geometry fits
+undisturbed() {
+	local state=$work/undisturbed url
+	[ -e "$work/$3.raw" ] && return
+	start_daemon --threads 1
+	reconstruct "$1" "$2"
+	req GET "/v1/jobs/$job"
+	jq .geometry_agreement "$body" >"$work/$3.agreement"
+	get_volume final "$work/$3.raw" format=raw
+	cp "$work/$3.raw" "$work/$3.keep"
+	stop_daemon
+}
+same_bits() { # NAME
+	get_volume final "$work/final.raw" format=raw
+	cmp "$work/final.raw" "$work/$1.raw" || fail "the bits of an undisturbed run"
+}
+told_once() { # Nothing of the job is told twice: one end, each iteration once.
+	curl -s --max-time 20 "$url/v1/jobs/$job/events" >"$work/events"
+	[ "$(grep -c '^event: end' "$work/events")" = 1 ] || fail "one end, got: $(grep -A 2 '^event: end' "$work/events")"
+	[ "$(grep -A 1 '^event: progress' "$work/events" | grep -o '"iteration":[0-9]*' | sort | uniq -d | wc -l)" = 0 ] || fail "each iteration once"
+}
+nothing_left() { # HOST: neither jobs nor scans of others
+	local i
+	at "$1"
+	for ((i = 0; i < 400; i++)); do
+		[ "$(curl -s "$url/v1/jobs" | jq '.jobs | length')$(curl -s "$url/v1/scans" | jq '.scans | length')" = 00 ] && return 0
+		sleep 0.05
+	done
+	fail "nothing of others on $1, got $(curl -s "$url/v1/jobs" | jq -c '[.jobs[] | {id, state}]') $(curl -s "$url/v1/scans" | jq -c '[.scans[].name]')"
+}
+empty_ledger() {
+	local i
+	for ((i = 0; i < 200; i++)); do
+		[ "$(sql 'SELECT count(*) FROM cbctd_fleet_test.offers')" = 0 ] && return 0
+		sleep 0.05
+	done
+	fail "no offers, got $(sql 'SELECT * FROM cbctd_fleet_test.offers')"
+}
+
+test_the_ledger_gives_each_offer_to_one_and_knows_old_numbers() {
+	need_server
+	CBCT_TEST_CATALOGUE=$database "$BUILD/unit" ledger >"$work/unit" 2>&1 || { cat "$work/unit"; fail "the unit tests"; }
+	grep -q '^100%: Checks: 8' "$work/unit" || fail "all of them passed: $(cat "$work/unit")"
+}
+
+test_a_job_is_computed_by_another_host_to_the_same_bits() {
+	begin
+	undisturbed "$scan_dir" "$small" small
+	taker a
+	owner c
+	at c
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "$small"
+	wait_job succeeded
+	expect_json '(.device | startswith("a: ")) and .backend == "cpu" and .attempts == 1 and .error == null and (.plan | length > 0) and .memory.total > 0'
+	expect_json '(.history | length == 3) and .volumes == 3 and .denoising.noise_hu != null and .progress == 1'
+	expect_json ".geometry_agreement.views > 0 and .geometry_agreement == $(cat "$work/small.agreement")"
+	same_bits small
+	told_once
+	# The file is this daemon's: its ids, its scan's name.
+	req GET "/v1/jobs/$job/volumes/fdk/provenance"
+	expect_status 200
+	expect_json ".job == \"$job\" and .scan == \"$scan\" and .scan_name == \"simulated\" and .stage == \"fdk\""
+	curl -s "$url/v1/jobs/$job/volumes/final" >"$work/final.nii"
+	cbct reproduce "$work/final.nii" --url "$url" --from "$work/c/scans/$scan" >"$work/reproduced" 2>&1 || fail "the same volume again: $(cat "$work/reproduced")"
+	nothing_left a
+	empty_ledger
+}
+
+test_counts_with_their_images_and_a_patient_who_stays_at_home() {
+	begin
+	local with_images='.detector += {} | .name = "Doe^Jane" | .patient = {"position": "FFP", "name": "Doe^Jane", "id": "4711"} | .labels = {"ward": "secret"}'
+	rm -rf "$work/patient"
+	cp -r "$work/counts" "$work/patient"
+	jq "$with_images" "$work/counts/scan.json" >"$work/patient/scan.json"
+	undisturbed "$work/patient" "$small" patient
+	taker a --log-level debug
+	owner c
+	at c
+	post_scan "$work/patient"
+	post_projections "$work/patient"
+	post_job "$small"
+	wait_job succeeded
+	same_bits patient
+	req GET "/v1/jobs/$job/volumes/final/provenance"
+	expect_json '.left_right == "known" and .patient.position == "FFP"'
+	nothing_left a
+	! grep -rqE 'Doe|4711|secret' "$work/a" "$work/a.err" || fail "nothing of the patient on another host: $(grep -rlE 'Doe|4711|secret' "$work/a" "$work/a.err")"
+}
+
+test_a_taker_that_is_killed_costs_a_job_nothing_but_time() {
+	begin
+	undisturbed "$scan_dir" "$long" long
+	taker a
+	owner c
+	at c
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "$long"
+	given_to a
+	progresses
+	stop_host a KILL
+	taker b
+	at c
+	given_to b
+	wait_job succeeded
+	expect_json '.attempts == 1 and .error == null and (.device | startswith("b: "))'
+	same_bits long
+	told_once
+	# It comes back, and finds that what it had is another's.
+	taker a
+	nothing_left a
+	nothing_left b
+	empty_ledger
+}
+
+test_a_zombie_is_not_heard() {
+	begin
+	undisturbed "$scan_dir" "$long" long
+	taker a
+	owner c
+	at c
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "$long"
+	given_to a
+	progresses
+	kill -STOP "$(cat "$work/a.pid")" # its worker goes on
+	taker b
+	at c
+	given_to b
+	kill -CONT "$(cat "$work/a.pid")"
+	wait_job succeeded
+	expect_json '.attempts == 1 and (.device | startswith("b: "))'
+	same_bits long
+	told_once
+	nothing_left a
+	nothing_left b
+}
+
+test_an_owner_that_is_killed_goes_on_where_the_other_host_is() {
+	begin
+	undisturbed "$scan_dir" "$long" long
+	taker a
+	owner c
+	at c
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "$long"
+	given_to a
+	progresses
+	stop_host c KILL
+	owner c
+	at c
+	wait_job succeeded
+	expect_json '.error == null and (.device | startswith("a: "))'
+	[ "$(grep -c 'of host c is claimed' "$work/a.err")" = 1 ] || fail "one claim: $(grep 'is claimed' "$work/a.err")"
+	same_bits long
+	told_once
+	nothing_left a
+	empty_ledger
+	[ "$(curl -s "$(cat "$work/c.url")/metrics" | grep -c '^cbctd_fleet_up 1$')" = 1 ] || fail "metrics of the fleet"
+}
+
+test_a_cart_alone_goes_on_and_gives_nothing_away_that_it_can_do_itself() {
+	begin
+	undisturbed "$scan_dir" "$small" small
+	# The fleet's database is not there: nothing waits for it.
+	start_host b --fleet-database postgresql://cbctd@127.0.0.1:1/none
+	at b
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "$small"
+	wait_job succeeded
+	expect_json '.device | startswith("b:") | not'
+	same_bits small
+	grep -q 'the fleet cannot be reached, jobs go on here' "$work/b.err" || fail "that it is told"
+	stop_host b
+	taker a
+	start_host b
+	at b
+	post_job "$small"
+	wait_job succeeded
+	expect_json '.device | startswith("a:") | not'
+}
+
+test_a_database_that_goes_away_stops_no_job() {
+	begin
+	undisturbed "$scan_dir" "$long" long
+	taker a
+	owner c
+	at c
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "$long"
+	given_to a
+	kill_server
+	wait_job succeeded
+	expect_json '.attempts == 1 and (.device | startswith("a: "))'
+	same_bits long
+	told_once
+	start_server
+	# What comes now goes there again.
+	post_job "$small"
+	wait_job succeeded
+	nothing_left a
+}
+
+test_a_cancel_reaches_the_other_host_and_an_urgent_job_goes_first_there() {
+	begin
+	taker a
+	owner c
+	at c
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "$long"
+	given_to a
+	progresses
+	local first=$job
+	post_job "${small/\"fdk\"/\"priority\": \"stat\", \"fdk\"}"
+	wait_job succeeded
+	req GET "/v1/jobs/$first"
+	expect_json '.state == "running"'
+	job=$first
+	req DELETE "/v1/jobs/$job"
+	expect_status 202
+	wait_job cancelled 30
+	nothing_left a
+	empty_ledger
+}
+
+test_tokens_and_tls_between_daemons() {
+	begin
+	openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 2 -subj /CN=localhost -addext 'subjectAltName=IP:127.0.0.1,DNS:localhost' \
+		-keyout "$work/key.pem" -out "$work/cert.pem" 2>/dev/null
+	chmod 600 "$work/key.pem"
+	rm -f "$work/tokens" "$work/token"
+	(umask 077; cbct token new peer --role acquire --file "$work/tokens" >"$work/token")
+	start_host a --fleet-address https://127.0.0.1:PORT --tokens "$work/tokens" --tls-cert "$work/cert.pem" --tls-key "$work/key.pem"
+	# Without the token, and without the authority, nothing is given.
+	owner c
+	at c
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "$small"
+	sleep 2
+	req GET "/v1/jobs/$job"
+	expect_json '.state == "queued"'
+	stop_host c
+	owner c --fleet-token "$work/token" --fleet-cacert "$work/cert.pem"
+	at c
+	wait_job succeeded
+	expect_json '.device | startswith("a: ")'
+}
+
+test_settings_that_cannot_be_right_are_refused() {
+	local told
+	refused() {
+		if told=$("$BUILD/cbctd" --listen 127.0.0.1:0 --state-dir "$work/none" "$@" 2>&1); then fail "$* refused"; fi
+		[ ! -e "$work/none" ] || fail "nothing was touched"
+	}
+	refused --fleet test
+	refused --fleet 'a b' --fleet-database postgresql://host/db
+	refused --fleet test --fleet-database postgresql://host/db --fleet-host 'a b'
+	refused --fleet test --fleet-database 'postgresql://cbctd:secret@host:none/db'
+	! grep -q secret <<<"$told" || fail "no password in: $told"
+	if told=$("$BUILD/cbctd-without-postgresql" --listen 127.0.0.1:0 --state-dir "$work/none" --fleet test --fleet-database postgresql://host/db 2>&1); then fail "refused"; fi
+	grep -q 'built without libpq' <<<"$told" || fail "the reason, got $told"
+	! "$BUILD/cbctd" --fleet test --fleet-database 'postgresql://cbctd:secret@host/db' --print-config 2>&1 | grep -q secret || fail "no password is printed"
+}
+
+run_tests
