@@ -27,6 +27,7 @@ PROSE = {
 BESIDE = (
     ("dcmtk", "`cbct import` runs its programs to read DICOM"),
     ("libpq5", "`cbctd` loads it where `--catalogue postgresql://...` is set"),
+    ("libhdf5-103-1", "`cbct import` loads it for HDF5 files (NeXus)"),
     ("python3-numpy", "`clients/python/cbctd.py`"),
     ("python3-requests", "`clients/python/cbctd.py`"),
 )

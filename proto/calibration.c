@@ -261,7 +261,7 @@ static int source_open(struct source *source, const struct scan_files *files, st
 	pthread_mutex_init(&source->lock, NULL);
 	if (linearise.quantity == QUANTITY_INTENSITY && linearise.air <= 0 && linearise.image[IMAGE_FLAT] == NULL)
 		return error_set(err, ERR_IMPOSSIBLE, "intensities need an air value or a flat image, none is there");
-	code = input_open(&source->input, &linearise, &files->scan->geometry, false, err);
+	code = input_open(&source->input, &linearise, &files->scan->geometry, 1, false, err);
 	return code == 0 ? source->backend->open(0, &options, &source->device, err) : code;
 }
 

@@ -1,11 +1,22 @@
 /* Digests of what a volume was made from: digest.h. */
 #include "proto/digest.h"
 
+#include <openssl/crypto.h>
 #include <openssl/evp.h>
 #include <stdio.h>
 #include <stdlib.h>
 
 #include "proto/json.h"
+
+int digest_prepare(struct error *err)
+{
+	unsigned char digest[EVP_MAX_MD_SIZE];
+
+	if (OPENSSL_init_crypto(0, NULL) != 1 || OSSL_LIB_CTX_get0_global_default() == NULL ||
+	    EVP_Digest("", 0, digest, NULL, EVP_sha256(), NULL) != 1)
+		return error_set(err, ERR_NO_MEMORY, "no memory for digests");
+	return 0;
+}
 
 void digest_text(const uint8_t sha256[DIGEST_BYTES], char ret_text[DIGEST_TEXT_MAX])
 {
@@ -38,7 +49,7 @@ static int digest_json(const cJSON *value, char ret_text[DIGEST_TEXT_MAX], struc
 
 int digest_scan(const struct scan *scan, char ret_text[DIGEST_TEXT_MAX], struct error *err)
 {
-	static const char *const of_the_patient[] = {"name", "labels", "patient", "study"};
+	static const char *const of_the_patient[] = {"name", "labels", "patient", "study", "source"};
 	cJSON *document = cJSON_Duplicate(scan->document, true);
 	int code;
 

@@ -12,6 +12,12 @@
  */
 enum { DIGEST_BYTES = 32, DIGEST_TEXT_MAX = 64 };
 
+/*
+ * The library of digests prepares itself at its first use, once: where it gets no memory then, it has failed for good
+ * in this process, and crashes where it is used all the same. So programs that last call this before there is any work.
+ */
+int digest_prepare(struct error *err);
+
 void digest_text(const uint8_t sha256[DIGEST_BYTES], char ret_text[DIGEST_TEXT_MAX]);
 
 /*

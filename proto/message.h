@@ -43,6 +43,7 @@ enum message_kind {
 	MESSAGE_SETTLED,       /* job, name: that file is on the disk; before the job ends, but for what failed */
 	MESSAGE_CHECKPOINT,    /* job, iteration: a checkpoint of it is on the disk */
 	MESSAGE_NOISE,         /* job, noise_hu, alpha: what TV goes by, see recon_hooks.denoising */
+	MESSAGE_AGREEMENT,     /* job, agreement: how well the projections agree with the geometry */
 	MESSAGE_STOPPED,       /* job, stop: how automatic iterations ended */
 	MESSAGE_WARNING,       /* job, code, detail */
 	MESSAGE_ENDED, /* job, code (0, ERR_CANCELLED, ERR_BUSY = yielded at `iteration`, or what failed), text */
@@ -68,6 +69,7 @@ struct message {
 	double step_seconds;
 	struct history_row row;
 	double noise_hu, alpha;
+	struct recon_agreement agreement;
 	struct recon_stop stop;
 	char name[32], volume_stage[16];
 	struct grid grid;

@@ -19,6 +19,7 @@
 #include "proto/detector.h"
 #include "proto/labels.h"
 #include "proto/parameter.h"
+#include "proto/source.h"
 
 const char *const sample_names[2] = {"float32", "uint16"};
 const char *const quantity_names[2] = {"line_integral", "intensity"};
@@ -551,7 +552,7 @@ static int read_study(struct scan *scan, const cJSON *study, struct error *err)
 static int read_document(struct scan *scan, const struct scan_calibrations *calibrations, struct error *err)
 {
 	struct json_reader reader;
-	const cJSON *detector, *projections, *geometry, *patient, *study, *labels;
+	const cJSON *detector, *projections, *geometry, *patient, *study, *labels, *source;
 	char *text = NULL; /* the document has them */
 	int code;
 
@@ -563,11 +564,14 @@ static int read_document(struct scan *scan, const struct scan_calibrations *cali
 	patient = json_member(&reader, "patient", false);
 	study = json_member(&reader, "study", false);
 	labels = json_member(&reader, "labels", false);
+	source = json_member(&reader, "source", false);
 	code = json_end(&reader);
 	if (code == 0)
 		code = read_patient(scan, patient, err);
 	if (code == 0)
 		code = read_study(scan, study, err);
+	if (code == 0)
+		code = source_check(source, err);
 	if (code == 0)
 		code = labels_read(labels, "/labels", &text, err);
 	free(text);

@@ -30,7 +30,8 @@ struct scan {
 	struct geometry geometry;
 	struct orbit orbit;
 	int *projection; /* [count], owned, after scan_reduce: the number of each view's projection; NULL: its own */
-	cJSON *document; /* as posted, checked: members name, patient, study, labels, detector, projections, geometry */
+	cJSON *document; /* as posted, checked: members name, patient, study, source, labels, detector, projections,
+			    geometry */
 };
 
 extern const char *const sample_names[2];   /* "float32", "uint16" */

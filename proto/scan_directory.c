@@ -25,11 +25,19 @@
 
 int file_read_at(int file, void *ret_to, size_t size, size_t offset, const char *path, struct error *err)
 {
+	bool again = false;
+
 	for (size_t done = 0; done < size;) {
 		ssize_t got = pread(file, (char *)ret_to + done, size - done, (off_t)(offset + done));
 
 		if (got < 0 && errno == EINTR)
 			continue;
+		/* A link that was reset fails one read. What cannot be read is given up as damaged, so it is tried
+		 * twice. */
+		if (got < 0 && errno == EIO && !again) {
+			again = true;
+			continue;
+		}
 		if (got < 0)
 			return error_set_errno(err, errno, "%s cannot be read", path);
 		if (got == 0)

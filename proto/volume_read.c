@@ -565,7 +565,9 @@ int volume_own_head(int file, const char *path, const struct grid *grid, size_t 
 
 	if (code == 0 && start == NIFTI_VOXELS) {
 		code = file_read_at(file, head, sizeof(head), 0, path, err);
-		if (code == 0 && own_extension(head, &provenance, err) != 0)
+		if (code == 0)
+			code = own_extension(head, &provenance, err);
+		if (code != 0 && code != ERR_NO_MEMORY && code != ERR_IO)
 			code = error_set(err, ERR_INVALID, "%.200s is damaged: its header cannot be read", path);
 	}
 	if (code != 0)

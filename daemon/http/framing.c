@@ -23,8 +23,9 @@ struct head {
 };
 
 /* Fields of one value: a proxy may go by the first of two where this daemon goes by the last, or the other way. */
-static const char *const single_names[] = {"Origin",        "Sec-Fetch-Site", "Idempotency-Key", "Content-Type",
-					   "Content-Range", "Authorization",  "If-Range",        "Last-Event-ID"};
+static const char *const single_names[] = {"Origin",       "Sec-Fetch-Site", "Idempotency-Key",
+					   "Content-Type", "Content-Range",  "Authorization",
+					   "If-Range",     "Last-Event-ID",  "Expect"};
 
 struct field {
 	char *name;

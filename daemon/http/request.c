@@ -15,6 +15,7 @@
 #include <strings.h>
 
 #include "daemon/http/text.h"
+#include "proto/json.h"
 
 static const uint64_t drop_max = 1ull << 30; /* a body that is read to its end only to give an answer */
 
@@ -57,6 +58,12 @@ void request_free(struct request *request)
 
 /* ---- the target ---- */
 
+/* What stands in documents is UTF-8, and so is what they are searched for, and what a refusal repeats. */
+static bool decode_query(char *text)
+{
+	return percent_decode(text, true) && utf8_valid(text);
+}
+
 static bool read_query(struct request *request, char *text)
 {
 	char *pair;
@@ -68,8 +75,8 @@ static bool read_query(struct request *request, char *text)
 			continue;
 		if (value != NULL)
 			*value++ = '\0';
-		if (request->query_count == QUERIES_MAX || !percent_decode(pair, true) ||
-		    (value != NULL && !percent_decode(value, true)))
+		if (request->query_count == QUERIES_MAX || !decode_query(pair) ||
+		    (value != NULL && !decode_query(value)))
 			return false;
 		request->queries[request->query_count].name = pair;
 		request->queries[request->query_count++].value = value != NULL ? value : "";
@@ -169,7 +176,8 @@ static int read_target(struct request *request, struct error *err)
 	if (query != NULL)
 		*query++ = '\0';
 	if (query != NULL && !read_query(request, query))
-		return error_set(err, ERR_INVALID, "the query has a bad %%-escape or more than %d parameters",
+		return error_set(err, ERR_INVALID,
+				 "the query has a bad %%-escape, text that is no UTF-8, or more than %d parameters",
 				 QUERIES_MAX);
 	count = read_path(path, segments);
 	if (count < 0)

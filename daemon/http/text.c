@@ -170,9 +170,12 @@ static size_t key_length(const char *text)
 /* Of a byte sequence, ":" base64 ":"; 0: there is none. */
 static size_t bytes_length(const char *text)
 {
-	size_t length = 1 + strspn(text + 1, "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/=");
+	size_t length;
 
-	return text[0] == ':' && text[length] == ':' ? length + 1 : 0;
+	if (text[0] != ':')
+		return 0;
+	length = 1 + strspn(text + 1, "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/=");
+	return text[length] == ':' ? length + 1 : 0;
 }
 
 /* Of a bare item: a string, a byte sequence, or a token, number or boolean; 0: there is none. */

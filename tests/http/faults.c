@@ -4,7 +4,7 @@
  *
  *   CALL ERRNO PART TIMES PASS
  *
- * and of the calls of CALL (fsync, fdatasync, open, pread) on a path that has PART
+ * and of the calls of CALL (fsync, fdatasync, fallocate, open, pread) on a path that has PART
  * in it, PASS succeed and the next TIMES fail with that number. The file is read at each call, so that a
  * test may write and remove it while the programs run; the calls of all processes
  * are counted together, in the file CBCT_TEST_FAULTS.count.
@@ -93,6 +93,20 @@ int fsync(int file)
 int fdatasync(int file)
 {
 	return fault_of("fdatasync", file) != 0 ? -1 : REAL(fdatasync)(file);
+}
+
+int fallocate(int file, int mode, off_t offset, off_t length)
+{
+	return fault_of("fallocate", file) != 0 ? -1 : REAL(fallocate)(file, mode, offset, length);
+}
+
+/* Its result is the number of the error. */
+int posix_fallocate(int file, off_t offset, off_t length)
+{
+	const int saved = errno, number = fault_of("fallocate", file);
+
+	errno = saved;
+	return number != 0 ? number : REAL(posix_fallocate)(file, offset, length);
 }
 
 ssize_t pread(int file, void *to, size_t size, off_t offset)

@@ -8,8 +8,8 @@ each older one is deleted with its job, so that the daemon has as much to rememb
 WORK/samples.csv has a row after each scan. A line is fitted to each quantity over the number of scans, after a warm-up;
 exit status 1 where one rises by more than its bound.
 
-The warm-up: WARM scans, since the catalogue keeps the last 1,000 removals of jobs (store/tables.c), whose pages come into
-SQLite's caches with some 70 bytes a scan, and no more come then. A run of fewer than about twice that many scans is judged by
+The warm-up: WARM scans, since the catalogue keeps the last 1,000 removals of jobs (store/tables.c), and its database
+grows by them until then. A run of fewer than about twice that many scans is judged by
 descriptors and threads, of which not one may come, and by the worker's live bytes.
 
 The bounds. Live bytes (build/live_bytes.so counts them): 16 a scan, since the smallest block that malloc gives has 24,

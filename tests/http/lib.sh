@@ -68,6 +68,15 @@ skip() {
 need_sqlite() { # where CBCT_TEST_CATALOGUE says another one
 	[ -z "${CBCT_TEST_CATALOGUE:-}" ] || skip "it is about SQLite's own file"
 }
+in_own_mounts() { # COMMAND ...: what it mounts is there for itself alone, and goes with it
+	local as_root=()
+	[ "$(id -u)" = 0 ] || as_root=(--user --map-root-user)
+	unshare "${as_root[@]}" --mount "$@"
+}
+need_mounts() {
+	[ -e /dev/fuse ] || skip "there is no /dev/fuse"
+	in_own_mounts true 2>/dev/null || skip "nobody may mount here"
+}
 need_data() {
 	local name
 	for name; do [ -e "$DATA/$name" ] || skip "test data $name is not here"; done

@@ -199,6 +199,7 @@ MALFORMED = {
     "xchunked": (400, head(b"Transfer-Encoding: xchunked", first=b"POST /v1/scans HTTP/1.1") + b"0\r\n\r\n"),
     "chunked behind a vertical tab": (400, head(b"Transfer-Encoding: \x0bchunked", first=b"POST /v1/scans HTTP/1.1") + b"0\r\n\r\n"),
     "two origins": (400, head(b"Origin: http://localhost", b"Origin: http://evil.example", b"Content-Type: application/json", b"Content-Length: 2", first=b"POST /v1/scans HTTP/1.1") + b"{}"),
+    "an expectation twice": (400, head(b"Expect: 100-continue", b"Expect: 100-continue")),
     "two sites": (400, head(b"Sec-Fetch-Site: same-origin", b"sec-fetch-site: cross-site", b"Content-Type: application/json", b"Content-Length: 2", first=b"POST /v1/scans HTTP/1.1") + b"{}"),
     "two keys": (400, head(b"Idempotency-Key: a", b"Idempotency-Key: b", b"Content-Type: application/json", b"Content-Length: 2", first=b"POST /v1/scans HTTP/1.1") + b"{}"),
     "two types": (400, head(b"Content-Type: text/plain", b"Content-Type: application/json", b"Content-Length: 2", first=b"POST /v1/scans HTTP/1.1") + b"{}"),

@@ -69,6 +69,32 @@ test_a_job_that_meets_a_full_disk_waits_for_room() {
 	stop_daemon
 }
 
+test_a_disk_that_was_full_for_a_moment_is_tried_again() {
+	faulty_daemon
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	fault fallocate 28 final.nii 1
+	post_job "{\"scan\": \"SCAN\", $small, \"fdk\": {}}"
+	wait_job succeeded
+	[ -s "$work/faults.count" ] || fail "a volume that met a full disk"
+	no_fault
+	stop_daemon
+}
+
+test_a_read_that_fails_once_is_no_damage() {
+	faulty_daemon
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	fault pread 5 projections.raw 1
+	req GET "/v1/scans/$scan/projections/3"
+	expect_status 200
+	[ -s "$work/faults.count" ] || fail "a read that failed"
+	no_fault
+	req GET "/v1/scans/$scan"
+	expect_json '.missing == []'
+	stop_daemon
+}
+
 test_a_full_disk_can_be_emptied() {
 	local done_job filled=0
 	small_disk 24m

@@ -78,6 +78,29 @@ test_momentum_is_asked_for_and_told() {
 }
 
 # Another algorithm by its name, preempted on its way: its stage, its iterates, its history, and the bits of an undisturbed run.
+# A pixel is 2.4 mm at the isocentre. Of 64 x 48 pixels, 2 x 2 as one leave a quarter of the projections' memory.
+test_pixels_are_taken_as_one() {
+	uploaded_scan
+	local coarse='"scan": "SCAN", "grid": {"size": [20, 20, 16], "spacing_mm": [5, 5, 5]}, "fdk": {}, "sart": {"iterations": 2}' all
+	post_job "{$coarse}"
+	expect_json '.binning == 1'
+	wait_job succeeded
+	all=$(json .memory.projections)
+	post_job "{$coarse, "'"binning": "auto"}'
+	expect_json '.binning == 2'
+	wait_job succeeded
+	# Buffers are padded by some bytes.
+	expect_json ".memory.projections * 4 / $all | . > 0.99 and . < 1.01"
+	post_job '{"scan": "SCAN", "fdk": {}, "binning": "auto"}'
+	expect_json '.binning == 1'
+	post_job '{"scan": "SCAN", "fdk": {}, "binning": 8}'
+	expect_json '.binning == 8 and .grid.size[0] <= 9'
+	wait_job succeeded
+	req POST /v1/jobs -H 'Content-Type: application/json' -d "{\"scan\": \"$scan\", \"fdk\": {}, \"binning\": 9}"
+	expect_status 422
+	expect_json '.pointer == "/binning"'
+}
+
 test_conjugate_gradients_in_place_of_sart() {
 	uploaded_scan
 	post_job "$small"'"fdk": {}, "cgls": {"iterations": 6}, "emit": ["fdk", 2]}'

@@ -99,6 +99,12 @@ test_what_nobody_knows_is_refused_with_what_is_known() {
 	expect_problem 400
 	# characters, not bytes
 	expect_list "/v1/jobs?text=$(printf '%%C3%%A4%.0s' {1..200})"
+	# bytes that are no UTF-8 stand in no document, nor in a refusal's
+	for query in text=%FF label=a%3D%C3 text=%ED%A0%80 'text=%C0%AF'; do
+		req GET "/v1/jobs?$query"
+		expect_status 400
+		expect_json '.detail | contains("UTF-8")'
+	done
 }
 
 # One worker: a long job runs, two more are queued. Their iterations are of the same kind as those of the job before.

@@ -541,6 +541,15 @@ test_settings_as_flag_line_and_environment() {
 	echo 'state-dir = "/tmp/x"' >"$work/config3"
 	! "$BUILD/cbctd" --config "$work/config3" --print-config >"$work/out" 2>&1 || fail "quotes refused"
 	grep -q 'config3:1: state-dir: values have no quotes' "$work/out" || fail "why: $(cat "$work/out")"
+	# what is behind a zero byte would be left out
+	printf 'threads = 2\n\0\nbackend = cpu\n' >"$work/config4"
+	! "$BUILD/cbctd" --config "$work/config4" --print-config >"$work/out" 2>&1 || fail "a zero byte refused"
+	grep -q 'config4: it has a zero byte' "$work/out" || fail "why: $(cat "$work/out")"
+	# what is printed reads as it was: all digits, and no address of nothing
+	printf 'listen = 127.0.0.1:1\nlisten =\nheader-timeout = 12.3456789\n' >"$work/config5"
+	"$BUILD/cbctd" --config "$work/config5" --print-config >"$work/config6"
+	grep -q '^header-timeout = 12.3456789$' "$work/config6" || fail "all digits: $(grep timeout "$work/config6")"
+	grep -q '^listen = 127.0.0.1:1$' "$work/config6" || fail "one address: $(grep ^listen "$work/config6")"
 	if "$BUILD/cbctd" --listen 0.0.0.0:0 --state-dir "$work/other" >"$work/out" 2>&1; then
 		fail "a refusal to listen beyond loopback without tokens and TLS"
 	fi

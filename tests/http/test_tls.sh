@@ -79,6 +79,18 @@ test_nothing_older_than_tls_1_2_and_no_weak_cipher() {
 	stop_daemon
 }
 
+# alert OPTION ...: the alert that openssl names as the reason why it was refused
+alert() { openssl s_client -connect "${url#https://}" "$@" </dev/null 2>&1 | sed -n "s/.*alert \([^:]*\):.*SSL alert number.*/\1/p"; }
+
+test_who_is_refused_in_a_handshake_is_told_why() {
+	start_tls
+	[ "$(alert -tls1_1 -cipher 'ALL:@SECLEVEL=0')" = "protocol version" ] || fail "an old version: $(alert -tls1_1 -cipher 'ALL:@SECLEVEL=0')"
+	[ "$(alert -tls1_2 -cipher AES128-SHA:@SECLEVEL=0)" = "handshake failure" ] || fail "no cipher in common"
+	req GET /livez
+	expect_status 200
+	stop_daemon
+}
+
 test_what_is_sent_through_tls_is_read_by_the_letter() {
 	local raw
 	start_tls
