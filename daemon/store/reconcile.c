@@ -100,10 +100,10 @@ static int drop_deleted(struct reconciliation *r, struct error *err)
 
 /* ---- a directory with a row ---- */
 
-static int write_again(struct reconciliation *r, const char *id, struct error *err)
+static int write_again(struct reconciliation *r, const struct known *known, struct error *err)
 {
 	r->unsynced = true;
-	return record_write(r->store, r->kind, id, false, err);
+	return record_write_again(r->store, r->kind, known->id, known->stamp, err);
 }
 
 static int apply(struct reconciliation *r, const cJSON *record, struct error *err)
@@ -128,7 +128,7 @@ static int settle_difference(struct reconciliation *r, const struct known *known
 		if (code != ERR_NOT_FOUND || known->stamp != 0) /* else an earlier cbctd made it */
 			log_line(LEVEL_WARNING, "%s %s: %s: it is written again", kind, known->id,
 				 code == ERR_NOT_FOUND ? "its " RECORD_FILE " is missing" : why.text);
-		return write_again(r, known->id, err);
+		return write_again(r, known, err);
 	}
 	own = record_own_stamp(r->kind, record);
 	if (own > known->stamp) {
@@ -138,7 +138,7 @@ static int settle_difference(struct reconciliation *r, const struct known *known
 	} else if (own < known->stamp) {
 		log_line(LEVEL_WARNING, "%s %s: its " RECORD_FILE " is behind the catalogue and written again", kind,
 			 known->id);
-		code = write_again(r, known->id, err);
+		code = write_again(r, known, err);
 	} else {
 		record_touch(r->store, r->kind, known->id, own);
 	}
@@ -240,7 +240,7 @@ static int make_directories(struct reconciliation *r, struct error *err)
 		if (r->rows[i].stamp != 0)
 			log_line(LEVEL_ERROR, "job %s: its directory is gone, with all volumes", r->rows[i].id);
 		record_directory(r->store, r->kind, r->rows[i].id, path);
-		if (directory_make(path, err) != 0 || write_again(r, r->rows[i].id, err) != 0)
+		if (directory_make(path, err) != 0 || write_again(r, &r->rows[i], err) != 0)
 			return err->code;
 	}
 	return 0;

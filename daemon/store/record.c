@@ -101,9 +101,9 @@ static int write_file(const char *path, const char *text, long long stamp, bool 
 	return code;
 }
 
-static int write_rows(struct store *store, enum record_kind kind, const char *id, bool synced, struct error *err)
+static int write_rows(struct store *store, enum record_kind kind, const char *id, long long stamp, bool synced,
+		      struct error *err)
 {
-	long long stamp = store->stamp;
 	char path[1100], *text = NULL;
 	int code = record_text(store, kind, id, &text, err);
 
@@ -135,7 +135,12 @@ int record_write(struct store *store, enum record_kind kind, const char *id, boo
 
 	store->stamp = now > store->stamp ? now : store->stamp + 1;
 	code = set_stamp(store, kind, id, err);
-	return code == 0 ? write_rows(store, kind, id, synced, err) : code;
+	return code == 0 ? write_rows(store, kind, id, store->stamp, synced, err) : code;
+}
+
+int record_write_again(struct store *store, enum record_kind kind, const char *id, long long stamp, struct error *err)
+{
+	return stamp == 0 ? record_write(store, kind, id, false, err) : write_rows(store, kind, id, stamp, false, err);
 }
 
 /* In a group. */

@@ -41,6 +41,12 @@ void record_directory(const struct store *store, enum record_kind kind, const ch
  * acknowledged.
  */
 int record_write(struct store *store, enum record_kind kind, const char *id, bool synced, struct error *err);
+/*
+ * The record of a row that is as it was, whose stamp is `stamp`; the caller syncs it. The row is not written, so that
+ * where the power goes before the start's commit, nothing is ahead of the catalogue. 0: an earlier cbctd gave the row
+ * no stamp, and it gets one.
+ */
+int record_write_again(struct store *store, enum record_kind kind, const char *id, long long stamp, struct error *err);
 /* After a group that was rolled back, outside of any, best effort: the record of the rows as they are; without a row it
  * is removed. */
 void record_undo(struct store *store, enum record_kind kind, const char *id);

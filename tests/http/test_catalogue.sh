@@ -68,6 +68,26 @@ test_a_lost_catalogue_is_made_again_and_told() {
 	stop_daemon
 }
 
+test_a_start_that_is_cut_off_while_it_writes_records_again_leaves_nothing_ahead() {
+	need_sqlite
+	made
+	post_scan "$scan_dir"
+	post_scan "$scan_dir"
+	stop_daemon
+	rm "$state"/scans/*/record.json "$state"/jobs/*/record.json
+	mkdir -p "$work/copy"
+	cp "$state"/catalogue.sqlite* "$work/copy"
+	start_daemon
+	stop_daemon
+	[ "$(find "$state/scans" "$state/jobs" -name record.json | wc -l)" = 4 ] || fail "each record is there again"
+	# As if the power had gone before the start's commit: the records of all, the catalogue of before.
+	rm "$state"/catalogue.sqlite*
+	cp "$work/copy"/* "$state"
+	start_daemon
+	expect_ready ""
+	stop_daemon
+}
+
 test_an_older_catalogue_loses_nothing_and_brings_nothing_back() {
 	need_sqlite
 	local older scan_gone
