@@ -134,7 +134,7 @@ browser_tests() {
 	fi
 	read -r url scan job <"$work/prepared"
 	cp "$here"/*.mjs "$tools/"
-	URL=$url OUT=$work SCAN=$scan FINISHED=$job NAME=$name CHROMIUM=$CHROMIUM HOME=$work timeout 600 node "$tools/page.mjs" 2>&1 | tee "$work/browser.log"
+	URL=$url OUT=$work SCAN=$scan FINISHED=$job NAME=$name CHROMIUM=$CHROMIUM HOME=$work timeout -k 20 600 node "$tools/page.mjs" 2>&1 | tee "$work/browser.log"
 	status=${PIPESTATUS[0]}
 	# the same job where the daemon asks who it is
 	stop_daemon
@@ -143,7 +143,7 @@ browser_tests() {
 	ACQUIRE=$(cbct token new arm-3 --role acquire --file "$work/tokens" 2>/dev/null)
 	ADMIN=$(cbct token new office --role admin --file "$work/tokens" 2>/dev/null)
 	start_daemon --threads 1 --tokens "$work/tokens" --keep 86400 --max-jobs 5 --client-bytes 1G --max-bytes 2G
-	VIEW=$VIEW ACQUIRE=$ACQUIRE ADMIN=$ADMIN URL=$url OUT=$work SCAN=$scan FINISHED=$job CHROMIUM=$CHROMIUM HOME=$work timeout 300 node "$tools/access.mjs" 2>&1 | tee -a "$work/browser.log"
+	VIEW=$VIEW ACQUIRE=$ACQUIRE ADMIN=$ADMIN URL=$url OUT=$work SCAN=$scan FINISHED=$job CHROMIUM=$CHROMIUM HOME=$work timeout -k 20 300 node "$tools/access.mjs" 2>&1 | tee -a "$work/browser.log"
 	status=$((status + PIPESTATUS[0]))
 	while read -r line; do
 		case $line in
