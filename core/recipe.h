@@ -52,7 +52,8 @@ struct recipe {
 		struct tv_options options; /* alpha counts for nothing where it is found */
 	} tv;
 	enum projector projector;
-	int binning; /* pixels a side that are taken as one (core/correct/binning.h); BINNING_AUTO until resolved */
+	bool hold_out; /* some views have no part in the volumes, which are held against them (core/recon/held_out.h) */
+	int binning;   /* pixels a side that are taken as one (core/correct/binning.h); BINNING_AUTO until resolved */
 	struct {
 		bool on; /* needs fdk.on */
 		double threshold_hu;

@@ -270,6 +270,7 @@ static int on_volume(void *context, const struct kept_volume *volume, const stru
 				  .grid = *volume->grid,
 				  .norms = volume->norms,
 				  .estimate_mm = volume->estimate_mm,
+				  .support = volume->support,
 				  .bytes = saved->bytes};
 
 	snprintf(message.name, sizeof(message.name), "%s", volume->name);

@@ -100,6 +100,11 @@ static const struct field volume_fields[] = {FIELD("job", FIELD_STRING, job),
 					     FIELD("mean", FIELD_NUMBER, norms.mean),
 					     FIELD("not_finite", FIELD_SIZE, norms.not_finite),
 					     FIELD("estimate_mm", FIELD_NUMBER, estimate_mm),
+					     FIELD("metal_share", FIELD_NUMBER, support.metal),
+					     FIELD("estimated_share", FIELD_NUMBER, support.estimated),
+					     FIELD("held_out", FIELD_INT, support.held_out),
+					     FIELD("held_residual", FIELD_NUMBER, support.held_residual),
+					     FIELD("used_residual", FIELD_NUMBER, support.used_residual),
 					     {0}};
 static const struct field settled_fields[] = {FIELD("job", FIELD_STRING, job), FIELD("name", FIELD_STRING, name), {0}};
 static const struct field checkpoint_fields[] = {

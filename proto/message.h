@@ -38,8 +38,8 @@ enum message_kind {
 	MESSAGE_RECONSTRUCTED, /* job, count: projections reconstructed so far */
 	MESSAGE_PROGRESS,      /* job, stage, iteration, fraction */
 	MESSAGE_ROW,           /* job, row */
-	MESSAGE_VOLUME,        /* job, name, stage, iteration, bytes, norms, estimate_mm: the file is there, whole, for
-				  everybody */
+	MESSAGE_VOLUME,        /* job, name, stage, iteration, bytes, norms, estimate_mm, support: the file is there,
+				  whole, for everybody */
 	MESSAGE_SETTLED,       /* job, name: that file is on the disk; before the job ends, but for what failed */
 	MESSAGE_CHECKPOINT,    /* job, iteration: a checkpoint of it is on the disk */
 	MESSAGE_NOISE,         /* job, noise_hu, alpha: what TV goes by, see recon_hooks.denoising */
@@ -75,6 +75,7 @@ struct message {
 	struct grid grid;
 	struct volume_norms norms;
 	double estimate_mm;
+	struct volume_support support;
 	size_t bytes;
 	char code_name[64], text[512]; /* WARNING: code and detail; ENDED: text */
 	int code;

@@ -127,12 +127,13 @@ static void warn_of_outliers(const struct input *input, int views, const struct 
 static int warn(const struct correction_job *job, void *state, struct error *err)
 {
 	const struct input *input = job->input;
-	const int nothing = input->counts.blank - input->left_out, empty = input->empty - input->left_out;
+	const int others = input->left_out + input->held_out;
+	const int nothing = input->counts.blank - others, empty = input->empty - others;
 	int first = job->geometry->count;
 
 	(void)state;
 	(void)err;
-	/* Outliers are the last ones of the list. */
+	/* Outliers and views that are held out are the last ones of the list. */
 	for (int i = 0; i < nothing; i++)
 		first = input->blank[i] < first ? input->blank[i] : first;
 	warn_of_outliers(input, job->geometry->count, job->warnings);
@@ -154,8 +155,8 @@ static int warn(const struct correction_job *job, void *state, struct error *err
 extern const struct correction correction_blank_views;
 const struct correction correction_blank_views = {
     .name = "blank_views",
-    .summary = "views without a good pixel, that show nothing or do not follow those beside them: the others stand in "
-	       "for them in FDK, iterations leave them out",
+    .summary = "views without a good pixel, that show nothing, do not follow those beside them or are held out: the "
+	       "others stand in for them in FDK, iterations leave them out",
     .times = 1U << CORRECT_AFTER_FDK | 1U << CORRECT_BEFORE_ITERATING,
     .needs = NEEDS_VOLUME,
     .apply = apply,

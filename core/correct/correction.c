@@ -188,6 +188,13 @@ int corrections_show(struct correction_chain *chain, double *ret_estimate_mm, st
 	return code;
 }
 
+void corrections_mark(const struct correction_chain *chain, struct correction_marks *marks)
+{
+	for (int i = 0; i < CORRECTION_COUNT; i++)
+		if (corrections[i]->mark != NULL && chain_has(chain, i))
+			corrections[i]->mark(&chain->job, chain->state[i], marks);
+}
+
 int corrections_hide(struct correction_chain *chain, struct error *err)
 {
 	int code = 0;

@@ -85,6 +85,14 @@ struct correction_ask {
 	const struct recipe *recipe;
 };
 
+/* Voxels in some slices of a volume that is kept. */
+struct correction_marks {
+	const int *slices; /* [count], z, ascending */
+	int count;
+	unsigned char *marked; /* [count][y][x]: not 0 where the voxel is an estimate */
+	size_t metal;          /* voxels of metal in all slices */
+};
+
 struct correction {
 	const char *name;    /* "metal" */
 	const char *summary; /* for documentation */
@@ -126,6 +134,9 @@ struct correction {
 	 */
 	int (*show)(const struct correction_job *job, void *state, double *ret_estimate_mm, struct error *err);
 	int (*hide)(const struct correction_job *job, void *state, struct error *err);
+	/* Marks the voxels that are estimates where `show` has given a distance, and counts metal. NULL: there are
+	 * none. */
+	void (*mark)(const struct correction_job *job, const void *state, struct correction_marks *marks);
 	/*
 	 * Findings of AFTER_FDK, bytes that the state owns; `resume` gets them back in a resumed run. One row has any.
 	 */
@@ -167,6 +178,7 @@ int corrections_take(struct correction_chain *chain, const void *samples, int vi
 int corrections_apply(struct correction_chain *chain, enum correction_time time, bool *ret_changed, struct error *err);
 int corrections_warn(struct correction_chain *chain, struct error *err);
 int corrections_show(struct correction_chain *chain, double *ret_estimate_mm, struct error *err);
+void corrections_mark(const struct correction_chain *chain, struct correction_marks *marks);
 int corrections_hide(struct correction_chain *chain, struct error *err);
 const void *corrections_found(const struct correction_chain *chain, size_t *ret_bytes);
 /* ERR_INVALID where the job has no correction that finds anything. */

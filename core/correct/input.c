@@ -474,6 +474,13 @@ int input_settle(struct input *input, const struct orbit *orbit, bool keeps_all,
 	return code < 0 ? code : found + code;
 }
 
+void input_hold_out(struct input *input, const int *views, int count)
+{
+	for (int i = 0; i < count; i++)
+		add_blank(input, views[i]);
+	input->held_out += count;
+}
+
 void input_goes_on(const struct input *input, bool ret_ends[2])
 {
 	for (int end = 0; end < 2; end++)

@@ -23,10 +23,10 @@ struct input {
 	int views, defective_views; /* linearised so far, and those of them with defects */
 	/*
 	 * [counts.blank], owned: views without a good pixel or of a closed shutter, in the order they came, and behind
-	 * them, once all have come, those that show nothing and outliers that are left out. `empty` of them have good
-	 * pixels, and `left_out` of those are outliers.
+	 * them, once all have come, those that show nothing, outliers that are left out, and views that are held out.
+	 * `empty` of them have good pixels, `left_out` of those are outliers, and `held_out` are held out.
 	 */
-	int *blank, empty, left_out;
+	int *blank, empty, left_out, held_out;
 	/* [views of the scan], owned; the second one of input_settle. */
 	struct view_profile *profiles;
 	struct outlier *outliers;
@@ -105,6 +105,9 @@ const float *input_copy_of(const struct input *input, int view);
  * ERR_IMPOSSIBLE where no view has a good pixel.
  */
 int input_settle(struct input *input, const struct orbit *orbit, bool keeps_all, struct error *err);
+
+/* Called once, behind input_settle: these views, none of them blank, are blank ones from now on. */
+void input_hold_out(struct input *input, const int *views, int count);
 
 /* Makes a view's slot 0, as that of a view without a good pixel. */
 int input_empty_slot(const struct input *input, const struct backend *backend, struct stack *to, int slot,

@@ -1,6 +1,7 @@
 /* Metal as a correction: see metal.c. */
 #include <math.h>
 #include <stdlib.h>
+#include <string.h>
 
 #include "core/correct/blank.h"
 #include "core/correct/input.h"
@@ -233,6 +234,57 @@ static int hide(const struct correction_job *job, void *state, struct error *err
 	return metal->voxels_count == 0 ? 0 : metal_hide(metal, &tools, job->volume, err);
 }
 
+/* Voxels x[0] .. x[1] of a row. */
+struct metal_run {
+	int x[2], y, z;
+	size_t count; /* entries of the list */
+};
+
+/* The run that begins with an entry of the list, which is in order. */
+static struct metal_run run_at(const struct metal *metal, size_t i, int columns)
+{
+	const struct metal_voxel *voxel = &metal->voxels[i];
+	const uint32_t row = (uint32_t)columns;
+	struct metal_run run = {.y = (int)(voxel->at / row), .z = (int)voxel->z, .count = 1};
+
+	while (i + run.count < metal->voxels_count && voxel[run.count].z == voxel->z &&
+	       voxel[run.count].at == voxel->at + run.count && voxel[run.count].at % row != 0)
+		run.count++;
+	run.x[0] = (int)(voxel->at % row);
+	run.x[1] = run.x[0] + (int)run.count - 1;
+	return run;
+}
+
+/* Marks what lies in a slice within METAL_ESTIMATE_MM of a run whose own slice is dz mm away. */
+static void mark_around(const struct grid *grid, const struct metal_run *run, double dz, unsigned char *slice)
+{
+	const double *mm = grid->spacing, square = (double)METAL_ESTIMATE_MM * METAL_ESTIMATE_MM - dz * dz;
+	const int reach = square >= 0 ? (int)(sqrt(square) / mm[1]) : -1;
+
+	for (int y = run->y - reach < 0 ? 0 : run->y - reach; y <= run->y + reach && y < grid->size[1]; y++) {
+		const int half = (int)(sqrt(fmax(0, square - pow((y - run->y) * mm[1], 2))) / mm[0]);
+		const int first = run->x[0] - half < 0 ? 0 : run->x[0] - half;
+		const int last = run->x[1] + half < grid->size[0] ? run->x[1] + half : grid->size[0] - 1;
+
+		memset(slice + grid_voxel(grid, first, y, 0), 1, (size_t)(last - first + 1));
+	}
+}
+
+static void mark(const struct correction_job *job, const void *state, struct correction_marks *marks)
+{
+	const struct grid *grid = &job->recipe->grid;
+	const struct metal *metal = state;
+	struct metal_run run;
+
+	for (size_t i = 0; i < metal->voxels_count; i += run.count) {
+		run = run_at(metal, i, grid->size[0]);
+		for (int k = 0; k < marks->count; k++)
+			mark_around(grid, &run, (run.z - marks->slices[k]) * grid->spacing[2],
+				    marks->marked + grid_voxel(grid, 0, 0, k));
+	}
+	marks->metal += metal->found;
+}
+
 static const void *found(const void *state, size_t *ret_bytes)
 {
 	const struct metal *metal = state;
@@ -263,6 +315,7 @@ const struct correction correction_metal = {
     .apply = apply,
     .show = show,
     .hide = hide,
+    .mark = mark,
     .found = found,
     .resume = resume,
 };

@@ -7,8 +7,10 @@
 #include "core/recon/algorithm.h"
 #include "core/recon/alternation.h"
 #include "core/recon/ends.h"
+#include "core/recon/held_out.h"
 #include "core/recon/rim.h"
 #include "core/recon/stopping.h"
+#include "core/recon/support.h"
 #include "core/warning.h"
 
 /* Declarations that recon.c (life, views), run.c (the run) and memory.c (the memory it takes) share. */
@@ -43,6 +45,9 @@ struct recon {
 	struct ends *ends;               /* the end slices of volumes that are kept; NULL: they are the iterate's */
 	struct alternation *alternation; /* from slice to slice, not in volumes that are kept; NULL: views see it */
 	struct rim *rim;                 /* of the field of view, in volumes that are kept; NULL: it is the iterate's */
+	struct support *support;         /* NULL until a volume is kept */
+	struct held_out *held_out;       /* NULL where no view is held out */
+	struct stack *forecast;          /* what a volume says of views that are held out; NULL where none are */
 	bool smoothed;                   /* while a volume is kept, `before` has the iterate */
 
 	unsigned char *pushed; /* [views] */

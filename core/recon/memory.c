@@ -12,12 +12,13 @@
 #include "core/recon/internal.h"
 #include "core/recon/thin.h"
 
-/* An iteration goes over all projections, and so may a correction that the recipe asks for. */
+/* An iteration goes over all projections, and so may a correction that the recipe asks for; volumes are held against
+ * some of them. */
 bool keeps_projections(const struct recipe *recipe)
 {
 	const struct linearise none = {.sample = SAMPLE_FLOAT32};
 
-	return recipe->algorithm != NULL || corrections_need(recipe, &none, NEEDS_ALL_VIEWS);
+	return recipe->algorithm != NULL || recipe->hold_out || corrections_need(recipe, &none, NEEDS_ALL_VIEWS);
 }
 
 bool has_subsets(const struct recipe *recipe)
@@ -126,6 +127,8 @@ static int walk_beside(struct recon *recon, struct walk *walk, struct error *err
 		code = walk_volume(walk, &recipe->grid, &recon->before, err);
 	if (code == 0 && slots > 0)
 		code = walk_stack(walk, geometry, slots, &walk->scratch, &recon->batch, err);
+	if (code == 0 && recipe->hold_out)
+		code = walk_stack(walk, geometry, HELD_OUT_SLOTS, &walk->scratch, &recon->forecast, err);
 	for (int i = 0; i < algorithm_volumes(recipe) && code == 0; i++)
 		code = walk_volume(walk, &recipe->grid, &recon->problem.volumes[i], err);
 	for (int i = 0; algorithm != NULL && i < algorithm->stacks && code == 0; i++)
@@ -149,6 +152,7 @@ void recon_release(struct recon *recon)
 		backend->volume_free(recon->problem.volumes[i]);
 		backend->stack_free(recon->problem.stacks[i]);
 	}
+	backend->stack_free(recon->forecast);
 	backend->stack_free(recon->batch);
 	backend->volume_free(recon->before);
 	backend->volume_free(recon->volume);
@@ -158,12 +162,14 @@ void recon_release(struct recon *recon)
 
 /* ---- the sum ---- */
 
-/* The host's, for what is taken out of volumes that are kept. */
+/* The host's, for what is taken out of volumes that are kept, and said of them. */
 static size_t kept_bytes(const struct recon *recon)
 {
 	const struct recipe *recipe = &recon->recipe;
-	size_t bytes = 0;
+	size_t bytes = support_bytes(&recipe->grid);
 
+	if (recipe->hold_out)
+		bytes += held_out_bytes(recon->geometry);
 	if (recipe_has_ends(recipe))
 		bytes += ends_bytes(&recipe->grid, recon->geometry, &recon->orbit);
 	if (recipe_has_rim(recipe))

@@ -191,6 +191,8 @@ int recon_open(const struct backend *backend, struct device *device, const struc
 		code = recon_prepare(recon, err);
 	if (code == 0)
 		code = open_plan(recon, err);
+	if (code == 0 && recon->recipe.hold_out)
+		code = held_out_new(&recon->orbit, recon->geometry, &recon->held_out, err);
 	if (code == 0)
 		code = open_corrections(recon, err);
 	if (code == 0)
@@ -214,6 +216,8 @@ void recon_clear(struct recon *recon)
 {
 	if (recon->algorithm_state != NULL)
 		recon->recipe.algorithm->close(&recon->problem, recon->algorithm_state);
+	support_free(recon->support);
+	held_out_free(recon->held_out);
 	ends_free(recon->ends);
 	rim_free(recon->rim);
 	alternation_free(recon->alternation);
@@ -271,7 +275,7 @@ static int push_view(struct recon *recon, const void *samples, int view, struct 
 	recon->pushed[view] = 1;
 	recon->pushed_count++;
 	recon->work_done += WORK_LOAD / recon->geometry->count;
-	if (!recon_runs_fdk(recon))
+	if (!recon_runs_fdk(recon) || held_out_has(recon->held_out, view))
 		return 0;
 	if (!keeps_projections(&recon->recipe))
 		code = input_copy(&recon->input, recon->backend, recon->projections, view, slot, err);

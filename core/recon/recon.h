@@ -29,6 +29,13 @@ struct history_row {
 enum stage { STAGE_LOAD, STAGE_FDK, STAGE_SART, STAGE_TV, STAGE_SAVE, STAGE_CGLS, STAGE_FISTA, STAGE_COUNT };
 extern const char *const stage_names[STAGE_COUNT]; /* "load", "fdk", "sart", "tv", "save", "cgls", "fista" */
 
+/* How far a kept volume stands on what was measured: core/recon/support.h, core/recon/held_out.h. */
+struct volume_support {
+	double metal, estimated;             /* shares of the object, 0 .. 1; NaN: the volume shows none */
+	int held_out;                        /* views that had no part in it; 0: none, and the residuals are NaN */
+	double held_residual, used_residual; /* ||p - A v|| / ||p|| over them, and over as many views beside them */
+};
+
 struct kept_volume {
 	const char *name;  /* "fdk", "fdk-tv", "iter-5", "final" */
 	const char *stage; /* "fdk", "tv" (TV after the FDK), "sart" (an iteration, its TV included) */
@@ -36,6 +43,7 @@ struct kept_volume {
 	const struct grid *grid;
 	struct volume_norms norms;
 	double estimate_mm; /* what is nearer to metal is an estimate (METAL_ESTIMATE_MM); 0: there is no metal */
+	struct volume_support support;
 };
 
 /* Rules that end iterations that are left to the program: core/recon/stopping.h. */

@@ -156,6 +156,21 @@ static int hide(struct recon *recon, struct error *err)
 	return code;
 }
 
+/* How far the volume, as it is kept, stands on what was measured. */
+static int find_support(struct recon *recon, struct volume_support *ret_support, struct error *err)
+{
+	int code = 0;
+
+	if (recon->support == NULL)
+		code = support_new(recon->geometry, &recon->orbit, &recon->recipe.grid, recon->recipe.mu_water,
+				   &recon->corrections, &recon->support, err);
+	if (code == 0)
+		code = support_measure(recon->support, recon->backend, recon->volume, ret_support, err);
+	return code == 0 ? held_out_measure(recon->held_out, recon->backend, recon->plan, recon->volume,
+					    recon->forecast, ret_support, err)
+			 : code;
+}
+
 /* A volume is kept with what corrections show in it, the metal; the iterate is worked on without. */
 static int keep(struct recon *recon, const char *name, const char *stage, struct error *err)
 {
@@ -182,6 +197,8 @@ static int keep(struct recon *recon, const char *name, const char *stage, struct
 		code = corrections_show(&recon->corrections, &kept.estimate_mm, err);
 	if (code == 0 && kept.estimate_mm > 0)
 		code = measure(recon, NULL, &kept.norms, err);
+	if (code == 0)
+		code = find_support(recon, &kept.support, err);
 	if (code == 0)
 		code = recon->hooks->keep(recon->hooks->context, recon, &kept, err);
 	return code < 0 ? code : hide(recon, err);
@@ -255,7 +272,7 @@ static int restore_view(struct recon *recon, int view, int slot, struct error *e
 	return code;
 }
 
-/* Takes views out of the FDK volume again, which is a sum over the views. */
+/* Takes views out of the FDK volume again, which is a sum over the views; it never had those that are held out. */
 static int take_back(struct recon *recon, const int *views, int count, struct error *err)
 {
 	const struct backend *backend = recon->backend;
@@ -269,6 +286,8 @@ static int take_back(struct recon *recon, const int *views, int count, struct er
 	for (int i = 0; i < count && code == 0; i++) {
 		const int slot = keeps_projections(&recon->recipe) ? views[i] : recon->fdk.pending;
 
+		if (held_out_has(recon->held_out, views[i]))
+			continue;
 		code = restore_view(recon, views[i], slot, err);
 		if (code == 0)
 			code = fdk_add(&recon->fdk, views[i], slot, recon->projections, recon->volume, err);
@@ -282,9 +301,37 @@ static int take_back(struct recon *recon, const int *views, int count, struct er
 	return code == 0 ? backend->volume_axpby(-1, recon->volume, 0, recon->volume, err) : code;
 }
 
+/* Makes the slots of views say nothing, where there are such slots. */
+static int empty_slots(struct recon *recon, const int *views, int count, struct error *err)
+{
+	int code = 0;
+
+	for (int i = 0; i < count && code == 0 && keeps_projections(&recon->recipe); i++)
+		code = input_empty_slot(&recon->input, recon->backend, recon->projections, views[i], err);
+	return code;
+}
+
+/* Keeps what the views show that are held out; they are blank ones from now on, and FDK has not had them. */
+static int hold_out(struct recon *recon, struct error *err)
+{
+	struct input *input = &recon->input;
+	const int *views;
+	int count, code;
+
+	if (recon->held_out == NULL)
+		return 0;
+	code =
+	    held_out_take(recon->held_out, recon->backend, recon->projections, input->blank, input->counts.blank, err);
+	if (code < 0)
+		return code;
+	views = held_out_views(recon->held_out, &count);
+	input_hold_out(input, views, count);
+	return empty_slots(recon, views, count, err);
+}
+
 /* Once all views have come: those that show nothing, and outliers, are left out of the FDK volume, and their slots say
- * nothing. */
-static int leave_out_empty(struct recon *recon, struct error *err)
+ * nothing; so do those of views that are held out. */
+static int leave_out(struct recon *recon, struct error *err)
 {
 	const int found = input_settle(&recon->input, &recon->orbit, keeps_projections(&recon->recipe), err);
 	const int *views = recon->input.blank + recon->input.counts.blank - (found > 0 ? found : 0);
@@ -292,9 +339,9 @@ static int leave_out_empty(struct recon *recon, struct error *err)
 
 	if (found > 0 && recon_runs_fdk(recon))
 		code = take_back(recon, views, found, err);
-	for (int i = 0; i < found && code == 0 && keeps_projections(&recon->recipe); i++)
-		code = input_empty_slot(&recon->input, recon->backend, recon->projections, views[i], err);
-	return code;
+	if (code == 0)
+		code = empty_slots(recon, views, found, err);
+	return code == 0 ? hold_out(recon, err) : code;
 }
 
 /* The FDK volume and what is made of it before the first iteration. */
@@ -514,7 +561,7 @@ int recon_run(struct recon *recon, struct error *err)
 
 	if (code < 0)
 		return code;
-	code = leave_out_empty(recon, err);
+	code = leave_out(recon, err);
 	if (code < 0)
 		return code;
 	recon->ran = true;

@@ -83,22 +83,34 @@ cJSON *sending_document(const struct sending_record *sending)
 	return document;
 }
 
-static void add_quality(cJSON *document, const struct volume_quality *quality)
+static void add_measured(cJSON *object, const char *name, double value)
 {
-	const struct {
-		const char *name;
-		double value;
-	} members[] = {{"noise_hu", quality->noise_hu},
-		       {"streak_hu", quality->streak_hu},
-		       {"ring_hu", quality->ring_hu},
-		       {"edge_mm", quality->edge_mm}};
-	cJSON *object = cJSON_AddObjectToObject(document, "quality");
+	if (isfinite(value))
+		cJSON_AddNumberToObject(object, name, value);
+	else
+		cJSON_AddNullToObject(object, name);
+}
 
-	for (size_t i = 0; i < sizeof(members) / sizeof(members[0]); i++)
-		if (isfinite(members[i].value))
-			cJSON_AddNumberToObject(object, members[i].name, members[i].value);
-		else
-			cJSON_AddNullToObject(object, members[i].name);
+static void add_quality(cJSON *document, const struct volume_record *volume)
+{
+	const struct volume_quality *quality = &volume->quality;
+	const struct volume_support *support = &volume->support;
+	cJSON *object = cJSON_AddObjectToObject(document, "quality"), *held_out;
+
+	add_measured(object, "noise_hu", quality->noise_hu);
+	add_measured(object, "streak_hu", quality->streak_hu);
+	add_measured(object, "ring_hu", quality->ring_hu);
+	add_measured(object, "edge_mm", quality->edge_mm);
+	add_measured(object, "metal_share", support->metal);
+	add_measured(object, "estimated_share", support->estimated);
+	if (support->held_out == 0) {
+		cJSON_AddNullToObject(object, "held_out");
+		return;
+	}
+	held_out = cJSON_AddObjectToObject(object, "held_out");
+	cJSON_AddNumberToObject(held_out, "views", support->held_out);
+	add_measured(held_out, "residual", support->held_residual);
+	add_measured(held_out, "used_residual", support->used_residual);
 }
 
 cJSON *volume_document(const char *job, const struct volume_record *volume)
@@ -132,7 +144,7 @@ cJSON *volume_document(const char *job, const struct volume_record *volume)
 		cJSON_AddNumberToObject(cJSON_AddObjectToObject(document, "metal"), "estimate_within_mm",
 					volume->estimate_mm);
 	if (volume->hashed)
-		add_quality(document, &volume->quality);
+		add_quality(document, volume);
 	json_add_time(document, "created", volume->created);
 	return document;
 }

@@ -71,6 +71,7 @@ static int add_volume(struct worker *worker, const struct message *message, stru
 				       .bytes = message->bytes,
 				       .norms = message->norms,
 				       .estimate_mm = message->estimate_mm,
+				       .support = message->support,
 				       .quality = {NAN, NAN, NAN, NAN}};
 
 	snprintf(volume.name, sizeof(volume.name), "%s", message->name);

@@ -422,6 +422,7 @@ struct volume_record {
 	uint8_t sha256[32]; /* of the voxels */
 	struct volume_norms norms;
 	double estimate_mm;            /* kept_volume's */
+	struct volume_support support; /* kept_volume's */
 	struct volume_quality quality; /* known with the digest */
 	double created;                /* seconds since 1970; another one when it is made again */
 };

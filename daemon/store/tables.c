@@ -141,6 +141,11 @@ static const struct column volume_columns[] = {
     {"streak_hu", COLUMN_REAL, AT(volume_record, quality.streak_hu), .nullable = true},
     {"ring_hu", COLUMN_REAL, AT(volume_record, quality.ring_hu), .nullable = true},
     {"edge_mm", COLUMN_REAL, AT(volume_record, quality.edge_mm), .nullable = true},
+    {"metal_share", COLUMN_REAL, AT(volume_record, support.metal), .nullable = true},
+    {"estimated_share", COLUMN_REAL, AT(volume_record, support.estimated), .nullable = true},
+    {"held_out", COLUMN_INT, AT(volume_record, support.held_out), .initial = "0"},
+    {"held_residual", COLUMN_REAL, AT(volume_record, support.held_residual), .nullable = true},
+    {"used_residual", COLUMN_REAL, AT(volume_record, support.used_residual), .nullable = true},
 };
 
 static const struct column history_columns[] = {

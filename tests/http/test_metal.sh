@@ -43,6 +43,7 @@ told() { # once, with severity and a sentence, and in the document of each volum
 	expect_json '[.warnings[] | select(.code == "metal")] | length == 1 and .[0].severity == "caution" and (.[0].summary | test("within 10 mm of it is an estimate"))'
 	req GET "/v1/jobs/$job/volumes"
 	expect_json '(.volumes | length == 2) and (.volumes | all(.metal == {"estimate_within_mm": 10}))'
+	expect_json '.volumes | all(.quality | .metal_share > 0 and .metal_share < 0.05 and .estimated_share > 3 * .metal_share and .estimated_share < 0.5)'
 	req GET "/v1/jobs/$job/events" --max-time 5
 	grep -q '"metal":{"estimate_within_mm":10}' "$body" || fail "the event of a volume with metal"
 	req GET "/plain/$job"

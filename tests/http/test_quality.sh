@@ -19,7 +19,7 @@ reconstructed() {
 	wait_job succeeded
 	get_volume final "$work/$1.raw" format=raw
 	req GET "/v1/jobs/$job/volumes"
-	expect_json '.volumes[0].quality | has("noise_hu") and has("streak_hu") and has("ring_hu") and has("edge_mm")'
+	expect_json '.volumes[0].quality | has("noise_hu") and has("streak_hu") and has("ring_hu") and has("edge_mm") and .metal_share == 0 and .held_out == null'
 	json '.volumes[0].quality' >"$work/$1.json"
 }
 
@@ -58,6 +58,62 @@ test_quality_is_that_which_numpy_finds() {
 		'{clean: $a[0], noisy: $b[0], rings: $c[0]}' >"$work/quality.json"
 	"$python" "$here/quality.py" "$work/quality.json" "$work/clean.raw" "$work/noisy.raw" "$work/rings.raw" 80 80 32 1.25 ||
 		fail "the quality that numpy finds: $(cat "$work/quality.json")"
+}
+
+# quality_of JOB: the member of its last volume, $work/quality.json
+quality_of() {
+	reconstruct "$work/$1" "$2"
+	get_volume final "$work/$1.raw" format=raw
+	req GET "/v1/jobs/$job/volumes"
+	json '.volumes[-1].quality' >"$work/$1.json"
+}
+
+# A whole ball in projections whose noise is known: they are exact integrals with and without it. What iterations take
+# up of the noise is missing from the residual of the projections that were used, and is on top of it in the others.
+test_projections_that_are_held_out_tell_what_was_made_of_noise() {
+	"$python" -c 'import numpy' 2>/dev/null || skip "numpy is not here"
+	local ball=(--phantom ball --scale 34 --density 0.0192 --views 60 --arc 360 --columns 64 --rows 64 --pixel 2
+		--source-to-isocentre 600 --source-to-detector 1000) grid='"grid": {"size": [60, 60, 60], "spacing_mm": [1.25, 1.25, 1.25]}' noise
+	cbct simulate "${ball[@]}" -o "$work/exact" >/dev/null || fail "cbct simulate"
+	cbct simulate "${ball[@]}" --photons 200 --seed 5 -o "$work/held" >/dev/null || fail "cbct simulate"
+	noise=$("$python" - "$work"/{exact,held}/projections.raw <<-'END'
+		import sys
+		import numpy as np
+		exact, noisy = (np.fromfile(name, "<f4").astype(float) for name in sys.argv[1:])
+		print(np.linalg.norm(noisy - exact) / np.linalg.norm(noisy))
+	END
+	) || fail "numpy"
+	quality_of held "{\"scan\": \"SCAN\", $grid, \"fdk\": {}, \"sart\": {\"iterations\": 12}, \"hold_out\": true}"
+	req GET "/v1/jobs/$job"
+	expect_json '.hold_out and ([.warnings[] | select(.code == "blank_views")] | length == 0)'
+	expect_number "$(jq .held_out.views "$work/held.json")" '==' 3 "projections of 60 that are held out"
+	expect_number "$(jq '.held_out | .used_residual / .residual' "$work/held.json")" '<' 0.97 "residual of those that were used"
+	expect_number "$(jq ".held_out.residual / $noise" "$work/held.json")" '>' 1.015 "residual of those that were held out, in noise, half a percent of which is chance"
+	quality_of held "{\"scan\": \"SCAN\", $grid, \"fdk\": {}, \"sart\": {\"iterations\": 12}, \"tv\": {}, \"hold_out\": true}"
+	# TV takes up next to none: what is left over is the noise, and a ball's surface in voxels.
+	expect_number "$(jq ".held_out.residual / $noise" "$work/held.json")" '>' 0.95 "with TV, in noise"
+	expect_number "$(jq ".held_out.residual / $noise" "$work/held.json")" '<' 1.1 "with TV, in noise"
+	expect_number "$(jq .estimated_share "$work/held.json")" '<' 0.001 "share of estimates in a ball that all projections see"
+}
+
+# A detector too narrow for the ball: rays through a point at rho from the axis leave more than 20 degrees out from
+# r / sin(80 degrees) on, r being the radius of the field of view.
+test_what_the_projections_do_not_measure_is_told() {
+	"$python" -c 'import numpy' 2>/dev/null || skip "numpy is not here"
+	made narrow --columns 40
+	quality_of narrow '{"scan": "SCAN", "grid": {"size": [80, 80, 32], "spacing_mm": [1.25, 1.25, 1.25]}, "fdk": {}}'
+	"$python" - "$work/narrow.raw" "$(jq .estimated_share "$work/narrow.json")" <<-'END' || fail "the share that numpy finds"
+		import sys
+		import numpy as np
+		volume = np.fromfile(sys.argv[1], "<f4").reshape(32, 80, 80)
+		x = 1.25 * (np.arange(80) - 39.5)
+		rho = np.hypot(x[:, None], x[None, :])[None]
+		r = 600 * np.sin(np.arctan(40 / 1000)) / np.sin(np.radians(81))
+		whole = volume >= 0.0096
+		share = (whole & (rho > r)).sum() / whole.sum()
+		print(f"estimated_share: {float(sys.argv[2]):.3g}, numpy {share:.3g}")
+		sys.exit(not (share > 0.1 and abs(share - float(sys.argv[2])) < 0.03))
+	END
 }
 
 start_daemon || exit 1

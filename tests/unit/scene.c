@@ -146,6 +146,7 @@ static int on_keep(void *context, struct recon *recon, const struct kept_volume 
 	outcome->kept[i].iteration = volume->iteration;
 	outcome->kept[i].norms = volume->norms;
 	outcome->kept[i].estimate_mm = volume->estimate_mm;
+	outcome->kept[i].support = volume->support;
 	outcome->kept[i].voxels = malloc(sizeof(float) * grid_voxels(volume->grid));
 	ck_assert_ptr_nonnull(outcome->kept[i].voxels);
 	note(outcome, volume->name, "!");

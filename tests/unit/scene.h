@@ -57,6 +57,7 @@ struct outcome {
 		int iteration;
 		struct volume_norms norms;
 		double estimate_mm;
+		struct volume_support support;
 		float *voxels;
 	} kept[SCENE_KEPT_MOST];
 	int kept_count;

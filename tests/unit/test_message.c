@@ -184,7 +184,8 @@ START_TEST(numbers_come_back_the_same_and_nan_as_nan)
 				   .bytes = 1ull << 40,
 				   .grid = {{7, 8, 9}, {0.1, 0.2, 0.7}, {-1.1, 2e-7, 3}},
 				   .norms = {1.0 / 3, INFINITY, 2, -0.5, 0.7, 0.01, 4},
-				   .estimate_mm = 10};
+				   .estimate_mm = 10,
+				   .support = {0.1, 1.0 / 7, 5, 0.3, NAN}};
 	back = through(&message);
 	ck_assert_str_eq(back.name, "iter-5");
 	ck_assert_str_eq(back.volume_stage, "sart");
@@ -197,6 +198,11 @@ START_TEST(numbers_come_back_the_same_and_nan_as_nan)
 	ck_assert_double_eq(back.norms.minimum, -0.5);
 	ck_assert_uint_eq(back.norms.not_finite, 4);
 	ck_assert_double_eq(back.estimate_mm, 10);
+	ck_assert_double_eq(back.support.metal, 0.1);
+	ck_assert_double_eq(back.support.estimated, 1.0 / 7);
+	ck_assert_int_eq(back.support.held_out, 5);
+	ck_assert_double_eq(back.support.held_residual, 0.3);
+	ck_assert(isnan(back.support.used_residual));
 	message = (struct message){.kind = MESSAGE_SETTLED, .name = "final"};
 	back = through(&message);
 	ck_assert_str_eq(back.name, "final");

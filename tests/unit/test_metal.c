@@ -201,6 +201,13 @@ START_TEST(streaks_fall_and_the_metal_stays)
 		ck_assert_double_eq(highest, outcome.kept[i].norms.maximum); /* statistics are those of what is kept */
 		ck_assert_double_eq(outcome.kept[i].estimate_mm, 10);
 		ck_assert_double_eq(streaks.kept[i].estimate_mm, 0);
+		/* Across the axis metal has 137 mm^2 of the body's 8850, what is within 10 mm of it about 1830. */
+		ck_assert_double_gt(outcome.kept[i].support.metal, 0.8 * 0.0154);
+		ck_assert_double_lt(outcome.kept[i].support.metal, 2 * 0.0154);
+		ck_assert_double_gt(outcome.kept[i].support.estimated, 0.18);
+		ck_assert_double_lt(outcome.kept[i].support.estimated, 0.26);
+		ck_assert_double_eq(streaks.kept[i].support.metal, 0);
+		ck_assert_double_lt(streaks.kept[i].support.estimated, 0.01);
 	}
 	for (int i = 0; i < outcome.row_count; i++) /* the metal is not in what is iterated */
 		ck_assert_double_lt(outcome.rows[i].residual, streaks.rows[i].residual);

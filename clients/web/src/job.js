@@ -23,14 +23,19 @@ const pollTime = 1500 /* ms: progress and time left are not told as events */
 const swipeReach = 12 /* px to either side of the line */
 const plainLimits = [-3000, 30000] /* HU: beyond, the numbers are no attenuation of a patient */
 
-/* What can be measured without the truth, in a line; rings and streaks where they are seen beside the noise. */
+/* What can be measured without the truth, in a line; rings and streaks where they are seen beside the noise, shares of
+ * half a percent and more. */
 function qualityText(quality) {
 	if (!quality)
 		return ''
-	const { noise_hu: noise, edge_mm: edge, ring_hu: rings, streak_hu: streaks } = quality
+	const { noise_hu: noise, edge_mm: edge, ring_hu: rings, streak_hu: streaks, metal_share: metal, estimated_share: estimated, held_out: held } = quality
+	const percent = share => number(100 * share, 2)
 	const seen = value => value !== null && value > Math.max(3, 0.4 * (noise ?? 0))
 	const said = [noise !== null && t('noise {n} HU', { n: number(noise, 2) }), edge !== null && t('edges {n} mm wide', { n: number(edge, 2) }),
-		seen(rings) && t('rings of {n} HU', { n: number(rings, 2) }), seen(streaks) && t('streaks of {n} HU', { n: number(streaks, 2) })].filter(Boolean)
+		seen(rings) && t('rings of {n} HU', { n: number(rings, 2) }), seen(streaks) && t('streaks of {n} HU', { n: number(streaks, 2) }),
+		metal > 0 && t('{n} % of it metal', { n: percent(metal) }),
+		estimated >= 0.005 && (metal > 0 ? t('{n} % estimated, near metal or beyond the projections', { n: percent(estimated) }) : t('{n} % estimated, beyond the projections', { n: percent(estimated) })),
+		held?.residual != null && t('projections held out are off by {n} %, those used by {m} %', { n: percent(held.residual), m: percent(held.used_residual) })].filter(Boolean)
 	return said.length > 0 ? t('Measured: {what}', { what: said.join(', ') }) : t('Too little of it is even for noise and edges to be measured.')
 }
 
@@ -100,7 +105,7 @@ export class JobPage {
 		this.sides = h('p', { class: 'sides', hidden: true }, t('Left and right are not known: neither scan nor job says how the patient lies. The letters are those of the table\'s axes.'))
 		this.fetching = h('p', { class: 'fetching', role: 'status', hidden: true })
 		this.estimate = h('p', { class: 'estimate', hidden: true })
-		this.quality = h('p', { class: 'quality', title: 'Measured in the middle slices: noise in even tissue, the blur across the surface, and rings and streaks beside the noise' })
+		this.quality = h('p', { class: 'quality', title: t('Measured in the middle slices: noise in even tissue, the blur across the surface, and rings and streaks beside the noise. Estimated is what too few directions of rays pass or what lies near metal') })
 		this.controls = h('div', { class: 'controls', hidden: true }, this.#iterationControls(), this.#viewControls(), this.#compareControls())
 		this.warnings = h('div', {})
 		this.failure = h('div', {})
