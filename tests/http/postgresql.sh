@@ -2,6 +2,10 @@
 # own, as a user that is not root, on a Unix socket in that folder and on nothing else. The database is thrown away, so
 # nothing is synced: what a `kill -9` of the server leaves is in the kernel's memory.
 
+# s for one unit test, in place of check's 4: a store that is opened asks the server hundreds of times, and a test opens up
+# to seven of them, which takes a second alone and many on a machine with much else to do.
+export CK_DEFAULT_TIMEOUT=120
+
 # Sets $database, the address for --catalogue. Returns 1 where there is no server to start, with $why.
 start_postgresql() {
 	local programs
