@@ -10,8 +10,13 @@
  */
 #include "daemon/http/internal.h"
 
+#include <errno.h>
+#include <fcntl.h>
 #include <math.h>
+#include <string.h>
+#include <sys/socket.h>
 #include <time.h>
+#include <unistd.h>
 
 #include "daemon/log.h"
 
@@ -265,6 +270,68 @@ static double look(struct connection *connection, double now)
 	return next;
 }
 
+/* ---- connections that are closed, but for what their peers still send ---- */
+
+static const double LINGER = 5;         /* s */
+static const double LINGER_LOOK = 0.05; /* s between two looks */
+
+/* False when its end has come. */
+static bool drop_rest(const struct lingering *lingering)
+{
+	enum { MOST = 64 };
+	char rest[16384];
+	ssize_t got = 1;
+
+	for (int i = 0; i < MOST && got > 0; i++)
+		got = recv(lingering->socket, rest, sizeof(rest), MSG_DONTWAIT);
+	return got > 0 || (got < 0 && (errno == EAGAIN || errno == EINTR));
+}
+
+/* With http->lock held, as the next. Returns when to look again. */
+static double look_at_lingering(struct http *http, double now)
+{
+	int kept = 0;
+
+	for (int i = 0; i < http->lingering_count; i++) {
+		if (drop_rest(&http->lingering[i]) && now < http->lingering[i].until)
+			http->lingering[kept++] = http->lingering[i];
+		else
+			close(http->lingering[i].socket);
+	}
+	http->lingering_count = kept;
+	return kept > 0 ? now + LINGER_LOOK : INFINITY;
+}
+
+static void end_lingering(struct http *http, int count)
+{
+	for (int i = 0; i < count; i++)
+		close(http->lingering[i].socket);
+	http->lingering_count -= count;
+	memmove(http->lingering, http->lingering + count, (size_t)http->lingering_count * sizeof(*http->lingering));
+}
+
+void connection_linger(struct connection *connection)
+{
+	struct http *http = connection->http;
+	struct lingering lingering = {.until = clock_monotonic() + LINGER};
+
+	tls_end(connection);
+	shutdown(connection->socket, SHUT_WR);
+	lingering.socket = fcntl(connection->socket, F_DUPFD_CLOEXEC, 0);
+	/* Where there is no descriptor for it, what has come by now is dropped. */
+	if (lingering.socket < 0) {
+		drop_rest(&(struct lingering){.socket = connection->socket});
+		return;
+	}
+	pthread_mutex_lock(&http->lock);
+	if (http->lingering_count == LINGERING_MAX)
+		end_lingering(http, 1);
+	http->lingering[http->lingering_count++] = lingering;
+	if (clock_monotonic() + LINGER_LOOK < http->clock_next)
+		pthread_cond_signal(&http->clock_kick);
+	pthread_mutex_unlock(&http->lock);
+}
+
 static void *run_clock(void *context)
 {
 	struct http *http = context;
@@ -274,13 +341,14 @@ static void *run_clock(void *context)
 		double now = clock_monotonic();
 		struct timespec until;
 
-		http->clock_next = now + 1;
+		http->clock_next = fmin(now + 1, look_at_lingering(http, now));
 		for (struct connection *c = http->connections; c != NULL; c = c->next)
 			http->clock_next = fmin(http->clock_next, look(c, now));
 		http->clock_next = fmax(http->clock_next, now + resolution);
 		until = clock_timespec(http->clock_next);
 		pthread_cond_timedwait(&http->clock_kick, &http->lock, &until);
 	}
+	end_lingering(http, http->lingering_count);
 	pthread_mutex_unlock(&http->lock);
 	return NULL;
 }

@@ -16,7 +16,7 @@ struct head {
 	size_t authority_length;
 	const char *host;
 	size_t host_length;
-	int fields, hosts, lengths, encodings, cookies;
+	int fields, hosts, lengths, encodings, cookies, digests;
 	char *expect;    /* the name of the field, NULL: it did not come */
 	unsigned single; /* a bit for each of single_names that came */
 	uint64_t length;
@@ -197,6 +197,8 @@ static bool read_field(struct framing *framing, struct head *head, const struct 
 		if (head->encodings++ > 0 || field->value_length != 7 || strncasecmp(field->value, "chunked", 7) != 0)
 			return refuse(framing, 400, "Transfer-Encoding is \"%.*s\", expected chunked, once",
 				      (int)(field->value_length < 40 ? field->value_length : 40), field->value);
+	} else if (is_name(field, "Content-Digest")) {
+		head->digests++;
 	} else if (is_name(field, "Expect")) {
 		head->expect = field->name;
 	} else if (is_name(field, "Cookie")) {
@@ -416,7 +418,10 @@ static size_t pass_chunk_end(struct framing *framing, const char *data, size_t s
 	return 2;
 }
 
-/* Trailer fields (7.1.2) go on, but for those that would have another meaning in front. */
+/*
+ * Trailer fields (7.1.2) go on, but for those that would have another meaning in front, and for a digest: it would not
+ * be checked, and the client take its samples for checked.
+ */
 static size_t pass_trailer(struct framing *framing, char *data, size_t size)
 {
 	struct head head = {0};
@@ -432,6 +437,11 @@ static size_t pass_trailer(struct framing *framing, char *data, size_t size)
 		return 0;
 	if (head.hosts + head.lengths + head.encodings + head.cookies > 0) {
 		refuse(framing, 400, "the trailer has a field that belongs into the head");
+		return 0;
+	}
+	if (head.digests > 0) {
+		refuse(framing, 400,
+		       "Content-Digest is in the trailer, where it is not checked: it belongs into the head");
 		return 0;
 	}
 	framing->state = FRAMING_HEAD;

@@ -53,8 +53,11 @@ static enum MHD_Result on_header(struct request *request, const char *method)
 	if (request_read_header(request, method, &err) != 0)
 		return MHD_NO;
 	/* Without a body the library comes back at once, as at the end of one. */
-	if (request->response != NULL && !request->dropping)
+	if (request->response != NULL && !request->dropping) {
+		/* A body that nobody reads cannot be told from the next request. */
+		request->close = request->close || request->chunked || request->content_length > 0;
 		return answer(request);
+	}
 	return MHD_YES;
 }
 
@@ -237,21 +240,6 @@ static void log_request(const struct request *request, bool whole)
 		 (unsigned long long)request->received, clock_monotonic() - request->started, whole ? "" : " broken");
 }
 
-/*
- * The answer is out and the connection closes. What the client has sent beyond
- * would make the kernel reset it, and the answer would be lost on its way.
- */
-static void drop_rest(struct connection *connection)
-{
-	enum { MOST = 64 };
-	char rest[16384];
-
-	tls_end(connection);
-	shutdown(connection->socket, SHUT_WR);
-	for (int i = 0; i < MOST && recv(connection->socket, rest, sizeof(rest), MSG_DONTWAIT) > 0; i++)
-		;
-}
-
 static void on_completed(void *context, struct MHD_Connection *mhd, void **state, enum MHD_RequestTerminationCode how)
 {
 	struct http *http = context;
@@ -270,7 +258,7 @@ static void on_completed(void *context, struct MHD_Connection *mhd, void **state
 		audit_tell(http->audit, request, whole);
 	}
 	if (request->close)
-		drop_rest(request->connection);
+		connection_linger(request->connection);
 	connection_phase(request->connection, PHASE_IDLE, 0);
 	request->connection->request = NULL;
 	request_free(request);

@@ -17,6 +17,7 @@
 enum {
 	ARGUMENTS_MAX = 4,
 	QUERIES_MAX = 16,
+	LINGERING_MAX = 64, /* beyond them, the oldest is closed */
 	REFUSED_DROP_MOST =
 	    1 << 20, /* bytes of a body that are read of who may not send it, so that the answer is read */
 	SEGMENTS_MAX = 12,
@@ -156,6 +157,11 @@ struct http {
 		bool tls;
 	} probes[PROBES_MAX]; /* [probe_count], which the admission thread has yet to take */
 	int probe_count;
+	struct lingering {
+		int socket;
+		double until;       /* monotonic */
+	} lingering[LINGERING_MAX]; /* [lingering_count], the oldest first: closed for the library, but not for peers */
+	int lingering_count;
 	struct connection *connections;
 	atomic_long connection_count; /* changed under the lock */
 	pthread_t clock;
@@ -226,6 +232,12 @@ void tls_end(struct connection *connection);
 /* ---- http/clock.c: deadlines, and connections that wait ---- */
 int clock_start(struct http *http, struct error *err);
 void clock_end(struct http *http);
+/*
+ * The library is about to close the connection, whose peer may still be sending: its socket stays until the peer has
+ * ended, or for some seconds, and what comes is dropped. The kernel would answer it with a reset otherwise, which takes
+ * replies with it that are on their way. The thread of the connection.
+ */
+void connection_linger(struct connection *connection);
 void connection_phase(struct connection *connection, enum phase phase, uint64_t bytes);
 void connection_progress(struct connection *connection, uint64_t bytes);
 /* So many bytes more of a reply of unknown length have gone to the library. */

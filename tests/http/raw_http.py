@@ -4,6 +4,8 @@
 Usage: raw_http.py PORT CASE [ARGUMENT ...]     exits with 1 and says what it expected
 With RAW_TLS_CA=FILE in the environment the bytes go through TLS, whose certificate that authority has signed.
 """
+import base64
+import hashlib
 import json
 import os
 import re
@@ -11,6 +13,7 @@ import resource
 import socket
 import ssl
 import sys
+import threading
 import time
 from typing import List, Optional, Tuple
 
@@ -235,6 +238,7 @@ MALFORMED = {
     "a trailer without a colon": (400, chunked(b"0\r\nX\r\n\r\n")),
     "a folded trailer": (400, chunked(b"0\r\nX: a\r\n b\r\n\r\n")),
     "a length in a trailer": (400, chunked(b"0\r\nContent-Length: 5\r\n\r\n")),
+    "a digest in a trailer": (400, chunked(b"0\r\nContent-Digest: sha-256=:AAAA:\r\n\r\n")),
     "Host in a trailer": (400, chunked(b"0\r\nHost: evil.example\r\n\r\n")),
     "an endless trailer": (431, chunked(b"0\r\n" + b"X: a\r\n" * 5000)),
     "24,000 parameters": (414, head(first=b"GET /v1/scans?" + b"a=1&" * 24000 + b" HTTP/1.1")),
@@ -338,6 +342,38 @@ def case_smuggling() -> None:
             expect(not peer.more(), "no third answer")
         except socket.timeout:
             pass
+
+
+def case_refused_early() -> None:
+    """A body that is refused by its head and sent all the same does not cost the replies before it, however slowly they are read."""
+    before = head(first=b"GET /v1/openapi.json HTTP/1.1") * 3
+    for expectation in ((b"Expect: 100-continue",), ()):
+        for size in (10, 70_000, 3_000_000):
+            first = b"PUT /v1/scans/nope/projections HTTP/1.1"
+            with Peer(before + head(b"Content-Length: %d" % size, *expectation, first=first), window=8192) as peer:
+                sender = threading.Thread(target=peer.send, args=(b"x" * size,))
+                sender.start()
+                time.sleep(0.2)
+                got = []
+                while len(got) < 4:
+                    reply = peer.reply()
+                    got.append(reply and reply[0])
+                    if reply is None:
+                        break
+                expect(got == [200, 200, 200, 404], f"all replies before a body of {size} bytes ({expectation}), got {got}")
+                expect(not expectation or reply[1]["connection"].lower() == "close", f"the end is told, got {reply[1]}")
+                sender.join()
+
+
+def case_digest_behind(scan: str, size: str) -> None:
+    """A digest in the trailer is refused, right or wrong, and nothing of the body is kept."""
+    body = b"\0" * int(size)
+    right = base64.b64encode(hashlib.sha256(body).digest())
+    for digest in (right, base64.b64encode(hashlib.sha256(b"other").digest())):
+        data = head(b"Transfer-Encoding: chunked", first=b"PUT /v1/scans/%s/projections/0 HTTP/1.1" % scan.encode())
+        with Peer(data + b"%x\r\n" % len(body) + body + b"\r\n0\r\nContent-Digest: sha-256=:" + digest + b":\r\n\r\n") as peer:
+            reply = peer.reply()
+            expect(reply is not None and reply[0] == 400 and b"trailer" in reply[2], f"400, got {reply}")
 
 
 def case_pipelining() -> None:
