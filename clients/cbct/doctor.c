@@ -8,6 +8,7 @@
 #include <math.h>
 #include <pwd.h>
 #include <stdarg.h>
+#include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/resource.h>
@@ -20,6 +21,7 @@
 
 #include "clients/cbct/commands.h"
 #include "clients/cbct/http.h"
+#include "core/host_memory.h"
 #include "proto/clock.h"
 #include "proto/nvml.h"
 
@@ -371,35 +373,21 @@ static void look_at_limits(struct visit *visit)
 		      (unsigned long long)locked.rlim_max >> 10);
 }
 
-/* A line of /proc/meminfo, in bytes. */
-static double memory_of(const char *name)
-{
-	char line[128];
-	double kilobytes = 0;
-	FILE *file = fopen("/proc/meminfo", "re");
-
-	while (file != NULL && fgets(line, sizeof(line), file) != NULL) {
-		if (strncmp(line, name, strlen(name)) == 0)
-			kilobytes = strtod(line + strlen(name), NULL);
-	}
-	if (file != NULL)
-		fclose(file);
-	return 1024 * kilobytes;
-}
-
 static void look_at_memory(struct visit *visit)
 {
 	const double enough = 8e9; /* 512^3 with seven volumes of float32 and its projections */
-	double total = memory_of("MemTotal:"), available = memory_of("MemAvailable:");
-	char limit[64];
+	struct host_memory host;
 
-	found(visit, available < enough ? VERDICT_NOTE : VERDICT_OK,
-	      available < enough ? "a grid of 512^3 on the processor takes about 8 GB; smaller grids take less" : NULL,
-	      "%.1f of %.1f GB are available", 1e-9 * available, 1e-9 * total);
-	read_line("/sys/fs/cgroup/memory.max", limit, sizeof(limit));
-	if (limit[0] >= '0' && limit[0] <= '9')
-		found(visit, VERDICT_NOTE, NULL, "of them %.1f GB for this container or service",
-		      1e-9 * strtod(limit, NULL));
+	host_memory(&host);
+	found(visit, (double)host.available < enough ? VERDICT_NOTE : VERDICT_OK,
+	      (double)host.available < enough
+		  ? "a grid of 512^3 on the processor takes about 8 GB; smaller grids take less"
+		  : NULL,
+	      "%.1f of %.1f GB are available", 1e-9 * (double)host.available, 1e-9 * (double)host.total);
+	if (host.limit != SIZE_MAX)
+		found(visit, VERDICT_NOTE,
+		      "MemoryMax= of the service or the container's limit, where jobs are refused for want of memory",
+		      "a control group allows %.1f GB", 1e-9 * (double)host.limit);
 }
 
 static void look_at_daemon(struct visit *visit)

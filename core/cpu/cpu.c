@@ -5,12 +5,10 @@
  */
 #include "core/cpu/cpu.h"
 
-#include <fcntl.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/mman.h>
-#include <unistd.h>
 
 #ifdef _OPENMP
 #include <omp.h>
@@ -18,6 +16,8 @@
 #if defined(__x86_64__)
 #include <cpuid.h>
 #endif
+
+#include "core/host_memory.h"
 
 /* ---- the device ---- */
 
@@ -140,41 +140,20 @@ static void cpu_close(struct device *device)
 
 /* ---- memory ---- */
 
-/*
- * Memory that can be had without swapping, the page cache counted as free: only /proc/meminfo says it, sysinfo(2)
- * counts a cache full of projections as used.
- */
-static size_t memory_available(size_t total)
-{
-	char text[512], *found;
-	int file = open("/proc/meminfo", O_RDONLY | O_CLOEXEC);
-	ssize_t length = file < 0 ? -1 : read(file, text, sizeof(text) - 1);
-
-	if (file >= 0)
-		close(file);
-	if (length > 0) {
-		text[length] = '\0';
-		found = strstr(text, "MemAvailable:");
-		if (found != NULL)
-			return (size_t)strtoull(found + strlen("MemAvailable:"), NULL, 10) << 10;
-	}
-	return total / 2;
-}
-
 static void cpu_describe(struct device *device, struct device_info *ret_info)
 {
-	size_t total = (size_t)sysconf(_SC_PHYS_PAGES) * (size_t)sysconf(_SC_PAGESIZE);
-	size_t available = memory_available(total);
+	struct host_memory host;
 
-	*ret_info = (struct device_info){.bytes_total = total, .bytes_free = available};
+	host_memory(&host);
+	*ret_info = (struct device_info){.bytes_total = host.total, .bytes_free = host.available};
 	snprintf(ret_info->name, sizeof(ret_info->name), "%s", device->name);
 	if (device->memory_limit > 0) {
 		size_t left =
 		    device->memory_limit > device->memory_used ? device->memory_limit - device->memory_used : 0;
 
-		if (device->memory_limit < total)
+		if (device->memory_limit < host.total)
 			ret_info->bytes_total = device->memory_limit;
-		if (left < available)
+		if (left < host.available)
 			ret_info->bytes_free = left;
 	}
 }

@@ -277,6 +277,22 @@ static void add_text(cJSON *object, const char *name, const char *text)
 		cJSON_AddStringToObject(object, name, text);
 }
 
+static void add_starved(cJSON *report, const struct worker *worker)
+{
+	const size_t limit = starve_limit(worker);
+	cJSON *object;
+
+	if (!worker->starved) {
+		cJSON_AddNullToObject(report, "out_of_memory");
+		return;
+	}
+	object = cJSON_AddObjectToObject(report, "out_of_memory");
+	if (limit > 0)
+		cJSON_AddNumberToObject(object, "limit", (double)limit);
+	else
+		cJSON_AddNullToObject(object, "limit");
+}
+
 char *device_report(const struct worker *worker, const struct worker_words *words, int runs)
 {
 	cJSON *document = cJSON_CreateObject(), *device;
@@ -292,6 +308,7 @@ char *device_report(const struct worker *worker, const struct worker_words *word
 	else
 		cJSON_AddNullToObject(document, "signal");
 	add_text(document, "kernel", kernel);
+	add_starved(document, worker);
 	device = cJSON_AddObjectToObject(document, "device");
 	cJSON_AddNumberToObject(device, "index", worker->index);
 	add_text(device, "name", worker->info.name);

@@ -176,7 +176,7 @@ static void hold_job(struct supervise *supervise, struct worker *worker, enum jo
 			job_hold(worker->job, obstacle, clock_monotonic() + SPACE_RETRY, 0);
 		else
 			job_hold(worker->job, obstacle, 0, available + worker->volume_bytes);
-	} else if (obstacle == JOB_DISK_TROUBLE) {
+	} else if (obstacle == JOB_DISK_TROUBLE || obstacle == JOB_NO_MEMORY) {
 		job_record(worker->job, &record);
 		job_hold(worker->job, obstacle, clock_monotonic() + RETRY * (1 << record.crashes % CRASHES_MAX), 0);
 	}

@@ -205,8 +205,8 @@ void job_reconstructed(struct job *job, int count);
  * (clock_monotonic) and before the disk has `space` bytes free; it keeps its place in the queue, and others go before
  * it. Returns how often in a row it was held for this obstacle.
  */
-enum job_obstacle { JOB_UNHINDERED, JOB_NO_SPACE, JOB_DISK_TROUBLE, JOB_OBSTACLE_COUNT };
-extern const char *const job_obstacle_names[JOB_OBSTACLE_COUNT]; /* as in `waiting_for`: "space", "disk" */
+enum job_obstacle { JOB_UNHINDERED, JOB_NO_SPACE, JOB_DISK_TROUBLE, JOB_NO_MEMORY, JOB_OBSTACLE_COUNT };
+extern const char *const job_obstacle_names[JOB_OBSTACLE_COUNT]; /* as in `waiting_for`: "space", "disk", "memory" */
 int job_hold(struct job *job, enum job_obstacle obstacle, double until, unsigned long long space);
 /* Releases held jobs whose time has come and for which the disk has room; true while others are still held. */
 bool jobs_review_holds(struct jobs *jobs, double now, unsigned long long space);

@@ -1,7 +1,7 @@
 /* Whether a job fits into the memory that the workers have: supervise.h. */
 #include <string.h>
-#include <unistd.h>
 
+#include "core/host_memory.h"
 #include "daemon/jobs/workers.h"
 
 /*
@@ -10,9 +10,10 @@
  */
 static size_t memory_available(const struct worker_facts *facts)
 {
-	size_t host = (size_t)sysconf(_SC_PHYS_PAGES) * (size_t)sysconf(_SC_PAGESIZE);
+	struct host_memory host;
 
-	return strcmp(facts->backend, "cpu") == 0 || facts->bytes_total > host ? facts->bytes_total : host;
+	host_memory(&host);
+	return strcmp(facts->backend, "cpu") == 0 || facts->bytes_total > host.total ? facts->bytes_total : host.total;
 }
 
 /*

@@ -39,10 +39,11 @@ static const struct row {
     /* Whatever the worker says of it, and if it dies over it: that is no fault of the job's. */
     {ANY, CONDITION_STALE, 0, {.to = BACK, .reason = "its scan is understood otherwise now"}},
     {1 << END_NO_SPACE, 0, 0, {.to = BACK, .from = FROM_RECORDED, .obstacle = JOB_NO_SPACE}},
-    {LOST | 1 << END_IO, CONDITION_BROKEN, 0, {.to = JOB_FAILED, .crashed = true}},
+    {LOST | 1 << END_IO | 1 << END_NO_MEMORY, CONDITION_BROKEN, 0, {.to = JOB_FAILED, .crashed = true}},
     {LOST, 0, 0, {.to = BACK, .from = FROM_RECORDED, .crashed = true}},
-    /* No descriptor or no memory was free, or a disk was slow to answer. */
+    /* No descriptor was free, or a disk was slow to answer. */
     {1 << END_IO, 0, 0, {.to = BACK, .from = FROM_RECORDED, .crashed = true, .obstacle = JOB_DISK_TROUBLE}},
+    {1 << END_NO_MEMORY, 0, 0, {.to = BACK, .from = FROM_RECORDED, .crashed = true, .obstacle = JOB_NO_MEMORY}},
     /* The files are whole, time and again: the memory of this worker or of its machine is at fault. */
     {1 << END_DAMAGED, CONDITION_DOUBTED, 0, {.to = JOB_FAILED}},
     /* The job waits until the files were checked, and for what is to be sent again. */
@@ -93,7 +94,7 @@ enum worker_end worker_end_of(int code)
 		    {ERR_DEVICE, END_DEVICE},
 		    {ERR_NO_SPACE, END_NO_SPACE},
 		    {ERR_IO, END_IO},
-		    {ERR_NO_MEMORY, END_IO},
+		    {ERR_NO_MEMORY, END_NO_MEMORY},
 		    {ERR_DAMAGED, END_DAMAGED},
 		    {ERR_INVALID, END_INVALID}};
 

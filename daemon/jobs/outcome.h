@@ -15,7 +15,8 @@ enum worker_end {
 	END_SYNC,      /* a sync failed: the disk is no longer trusted */
 	END_DEVICE,    /* its device failed, and the process is about to exit */
 	END_NO_SPACE,  /* the disk is full */
-	END_IO,        /* a file could not be read or written, or memory was not to be had; it may pass */
+	END_IO,        /* a file could not be read or written; it may pass */
+	END_NO_MEMORY, /* memory was not to be had, or the kernel has ended the process for want of it; it may pass */
 	END_DAMAGED,   /* what it read of the scan does not fit its checksums */
 	END_INVALID,   /* what it was given makes no sense to it, a checkpoint for one */
 	END_OTHER,     /* any other error */

@@ -116,6 +116,7 @@ static void start_worker(struct supervise *supervise, struct worker *worker)
 		snprintf(worker->last_error, sizeof(worker->last_error), "%.150s", err.text);
 		log_line(LEVEL_ERROR, "worker %d: %s", worker->index, err.text);
 	} else {
+		starve_begin(worker);
 		worker->state = WORKER_STARTING;
 		worker->unheard = false;
 		worker->born = now;
@@ -193,7 +194,7 @@ static void worker_died(struct supervise *supervise, struct worker *worker, bool
 {
 	char how[128], text[160];
 	double now = clock_monotonic();
-	bool gone;
+	bool gone, starved;
 
 	/* The worker's last messages come first: they may say that the job is done. */
 	worker_read(supervise, worker, true, &gone);
@@ -202,6 +203,7 @@ static void worker_died(struct supervise *supervise, struct worker *worker, bool
 	worker_forget_held(worker);
 	worker->row_count = 0;
 	child_reap(&worker->child, how, sizeof(how));
+	starved = starve_ended(supervise, worker, how, sizeof(how));
 	if (worker->killed[0] != '\0')
 		snprintf(text, sizeof(text), "its worker %s", worker->killed);
 	else
@@ -209,10 +211,13 @@ static void worker_died(struct supervise *supervise, struct worker *worker, bool
 	worker->state = WORKER_ABSENT;
 	worker->deadline = NEVER;
 	if (worker->job != NULL && !worker->ending.due)
-		worker_end_job(
-		    supervise, worker,
-		    &(struct worker_words){
-			.end = stopping ? END_STOPPED : END_DIED, .code = ERR_INTERNAL, .text = text, .how = how});
+		worker_end_job(supervise, worker,
+			       &(struct worker_words){.end = stopping  ? END_STOPPED
+							     : starved ? END_NO_MEMORY
+								       : END_DIED,
+						      .code = starved ? ERR_NO_MEMORY : ERR_INTERNAL,
+						      .text = text,
+						      .how = how});
 	if (worker->remote)
 		remote_spend(supervise, worker);
 	else if (!stopping)

@@ -12,7 +12,7 @@
 #include "proto/durable.h"
 #include "proto/json.h"
 
-const char *const job_obstacle_names[JOB_OBSTACLE_COUNT] = {"", "space", "disk"};
+const char *const job_obstacle_names[JOB_OBSTACLE_COUNT] = {"", "space", "disk", "memory"};
 
 static int promote(struct jobs *jobs, struct job *job, struct error *err)
 {

@@ -4,6 +4,7 @@
 #include <pthread.h>
 #include <stdatomic.h>
 
+#include "core/host_memory.h"
 #include "daemon/jobs/digest.h"
 #include "daemon/jobs/outcome.h"
 #include "daemon/jobs/route.h"
@@ -70,17 +71,20 @@ struct worker {
 	char backend[16];
 	struct device_info info; /* of the last hello */
 	char last_error[160];
-	bool remote;        /* of another host: jobs/remote.c */
-	struct place place; /* with remote; number 0: none */
-	bool spent;         /* with remote: the place is */
-	bool fallback;      /* of the processor, by --fallback cpu; its process is there while it is needed */
-	unsigned faults;    /* errors of its device since a job succeeded on it */
-	bool aside;         /* its device is given no jobs until a self-test or an operator clears it */
-	bool testing;       /* its process begins with the self-test */
-	unsigned tests;     /* self-tests that have failed since it was set aside */
-	unsigned mute;      /* processes in a row without a hello, the one that is starting included */
-	double aside_since; /* seconds since 1970 */
-	bool hung;          /* the daemon ended the process because it finished no step */
+	bool remote;               /* of another host: jobs/remote.c */
+	struct place place;        /* with remote; number 0: none */
+	bool spent;                /* with remote: the place is */
+	bool fallback;             /* of the processor, by --fallback cpu; its process is there while it is needed */
+	unsigned faults;           /* errors of its device since a job succeeded on it */
+	bool aside;                /* its device is given no jobs until a self-test or an operator clears it */
+	bool testing;              /* its process begins with the self-test */
+	unsigned tests;            /* self-tests that have failed since it was set aside */
+	unsigned mute;             /* processes in a row without a hello, the one that is starting included */
+	double aside_since;        /* seconds since 1970 */
+	bool hung;                 /* the daemon ended the process because it finished no step */
+	struct memory_group group; /* that bounds the memory of this process */
+	unsigned long kills;       /* for want of memory in the group, which explain no end of this process */
+	bool starved;              /* the kernel has ended this process for want of memory */
 	bool unheard;   /* a message of this process was lost: later ones are not listened to, they may build on it */
 	char said[160]; /* what its last message about a job was */
 	double work;    /* of its job: voxels times projections */
@@ -198,6 +202,14 @@ void devices_tend(struct supervise *supervise);
 void device_tell_fallback(struct supervise *supervise, struct worker *worker, int iterations);
 /* JSON of how a job's last run was lost, for the document of a job that fails; owned by the caller. NULL: no memory. */
 char *device_report(const struct worker *worker, const struct worker_words *words, int runs);
+
+/* ---- starve.c ---- */
+/* The worker's new process is there: which control group bounds its memory. */
+void starve_begin(struct worker *worker);
+/* The process has ended, as `how` says. True, and told there, where the kernel has ended it for want of memory. */
+bool starve_ended(struct supervise *supervise, struct worker *worker, char *how, size_t size);
+/* Bytes that its control group allows; 0: no limit below the machine's memory. */
+size_t starve_limit(const struct worker *worker);
 
 /* ---- remote.c ---- */
 /* Slots follow the places that are set. */

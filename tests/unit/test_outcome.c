@@ -84,22 +84,28 @@ static const struct {
     {10, END_DIED, BROKEN, {.to = JOB_FAILED, .crashed = true}},
     {10, END_DEVICE, BROKEN, {.to = JOB_FAILED, .crashed = true}},
     {10, END_IO, BROKEN | ARRIVING, {.to = JOB_FAILED, .crashed = true}},
+    {10, END_NO_MEMORY, BROKEN, {.to = JOB_FAILED, .crashed = true}},
     /* Broken off, and tried again. */
     {11, END_DIED, 0, {.to = JOB_QUEUED, .from = FROM_RECORDED, .crashed = true}},
     {11, END_DIED, ARRIVING, {.to = JOB_WAITING, .from = FROM_RECORDED, .crashed = true}},
     {11, END_DEVICE, RESUMED, {.to = JOB_QUEUED, .from = FROM_RECORDED, .crashed = true}},
     {12, END_IO, 0, {.to = JOB_QUEUED, .from = FROM_RECORDED, .crashed = true, .obstacle = JOB_DISK_TROUBLE}},
     {12, END_IO, ARRIVING, {.to = JOB_WAITING, .from = FROM_RECORDED, .crashed = true, .obstacle = JOB_DISK_TROUBLE}},
+    {13, END_NO_MEMORY, 0, {.to = JOB_QUEUED, .from = FROM_RECORDED, .crashed = true, .obstacle = JOB_NO_MEMORY}},
+    {13,
+     END_NO_MEMORY,
+     ARRIVING | RESUMED,
+     {.to = JOB_WAITING, .from = FROM_RECORDED, .crashed = true, .obstacle = JOB_NO_MEMORY}},
     /* The scan is damaged, or the worker's memory. */
-    {13, END_DAMAGED, DOUBTED, {.to = JOB_FAILED}},
-    {14, END_DAMAGED, 0, {.to = JOB_WAITING, .check_scan = true}},
-    {14, END_DAMAGED, ARRIVING | BROKEN, {.to = JOB_WAITING, .check_scan = true}},
+    {14, END_DAMAGED, DOUBTED, {.to = JOB_FAILED}},
+    {15, END_DAMAGED, 0, {.to = JOB_WAITING, .check_scan = true}},
+    {15, END_DAMAGED, ARRIVING | BROKEN, {.to = JOB_WAITING, .check_scan = true}},
     /* The checkpoint is damaged. */
-    {15, END_INVALID, RESUMED, {.to = JOB_QUEUED, .warn = true}},
+    {16, END_INVALID, RESUMED, {.to = JOB_QUEUED, .warn = true}},
     /* Anything else is the job's own failure. */
-    {16, END_INVALID, 0, {.to = JOB_FAILED}},
-    {16, END_OTHER, 0, {.to = JOB_FAILED}},
-    {16, END_OTHER, ARRIVING | RESUMED | BROKEN | DOUBTED | ASKED, {.to = JOB_FAILED}},
+    {17, END_INVALID, 0, {.to = JOB_FAILED}},
+    {17, END_OTHER, 0, {.to = JOB_FAILED}},
+    {17, END_OTHER, ARRIVING | RESUMED | BROKEN | DOUBTED | ASKED, {.to = JOB_FAILED}},
 };
 enum { CASES = sizeof(cases) / sizeof(cases[0]) };
 
@@ -133,7 +139,7 @@ START_TEST(each_row_decides_a_case)
 }
 END_TEST
 
-/* All 11264 combinations of an end and conditions. */
+/* All 12288 combinations of an end and conditions. */
 START_TEST(what_holds_for_every_end)
 {
 	enum worker_end end = (enum worker_end)_i;
@@ -181,7 +187,7 @@ START_TEST(a_code_says_how_a_worker_was_through)
 	ck_assert_int_eq(worker_end_of(ERR_IO), END_IO);
 	ck_assert_int_eq(worker_end_of(ERR_DAMAGED), END_DAMAGED);
 	ck_assert_int_eq(worker_end_of(ERR_INVALID), END_INVALID);
-	ck_assert_int_eq(worker_end_of(ERR_NO_MEMORY), END_IO);
+	ck_assert_int_eq(worker_end_of(ERR_NO_MEMORY), END_NO_MEMORY);
 	ck_assert_int_eq(worker_end_of(ERR_CANCELLED), END_OTHER);
 }
 END_TEST

@@ -305,6 +305,7 @@ export const strings = {
 	'the check of its files': 'die Prüfung seiner Dateien',
 	'the dark image': 'das Dunkelbild',
 	'the disk, which failed to read or write': 'die Platte, die nicht lesen oder schreiben konnte',
+	'memory, of which there was not enough': 'Arbeitsspeicher, von dem es nicht genug gab',
 	'the flat image': 'das Hellbild',
 	'the map of defects': 'die Karte der Defekte',
 	'thin': 'dünn',
