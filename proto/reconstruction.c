@@ -16,6 +16,7 @@
 
 #include "core/recon/algorithm.h"
 #include "core/correct/stuck.h"
+#include "core/pulse.h"
 #include "proto/checkpoint.h"
 #include "proto/durable.h"
 #include "proto/format.h"
@@ -33,8 +34,12 @@ enum {
 	PLACE_BYTES = 64 << 20 /* straight into a file: long enough for a device to overlap its own pieces */
 };
 
-/* A disk that is spun down, or busy with another's writes, is waited for; then it takes so many bytes a second. */
-static const double SLOW_DISK_SECONDS = 60, SLOW_DISK_RATE = 10e6;
+/*
+ * s that a disk may take for one step: a disk that is spun down, or busy with another's writes, is waited for, for as
+ * long as the kernel waits for a disk's answer. Large files are read, written and synced in pieces, each of them a
+ * step.
+ */
+static const double SLOW_DISK = 30;
 
 struct run {
 	const struct reconstruction_hooks *hooks;
@@ -60,14 +65,11 @@ struct run {
 
 static int settle(struct run *run, bool wait, struct error *err);
 
-/* `volumes` of the iterate's size go to the disk, or come from there, at the rate of a slow one; 0: they are there. */
-static void disk_step(struct run *run, int volumes)
+/* Until the next call, with false, the steps are those of a disk. */
+static void disk_steps(struct run *run, bool begin)
 {
-	const double bytes = run->recon != NULL ? (double)grid_voxels(recon_grid(run->recon)) * sizeof(float) : 0;
-
 	if (run->hooks->on_step != NULL)
-		run->hooks->on_step(run->hooks->recon.context,
-				    volumes > 0 ? SLOW_DISK_SECONDS + volumes * bytes / SLOW_DISK_RATE : 0);
+		run->hooks->on_step(run->hooks->recon.context, begin ? SLOW_DISK : 0);
 }
 
 /* Asked so often that a volume is reported settled soon after it is. */
@@ -106,9 +108,9 @@ static int keep_checkpoint(struct run *run, struct error *err)
 	code = settle(run, false, err);
 	if (code != 0 || (run->saver != NULL && saver_busy(run->saver)))
 		return code;
-	disk_step(run, 1);
+	disk_steps(run, true);
 	code = checkpointer_begin(run->checkpointer, run->recon, &run->history, err);
-	disk_step(run, 0);
+	disk_steps(run, false);
 	return code;
 }
 
@@ -354,14 +356,14 @@ static int run_keep(void *context, struct recon *recon, const struct kept_volume
 	bool linked = false;
 	int code = path_join(saved.path, sizeof(saved.path), run->directory, kept->name, ".nii", err);
 
-	disk_step(run, 2);
+	disk_steps(run, true);
 	if (code == 0)
 		code = link_volume(run, kept, &saved, &linked, err);
 	if (code == 0 && !linked)
 		code = settle(run, true, err);
 	if (code == 0 && !linked)
 		code = write_volume(run, recon, kept, &saved, err);
-	disk_step(run, 0);
+	disk_steps(run, false);
 	if (code == 0 && run->hooks->on_volume != NULL)
 		code = run->hooks->on_volume(run->hooks->recon.context, kept, &saved, err);
 	return code != 0 ? code : settle(run, false, err);
@@ -678,6 +680,7 @@ static void read_pieces(int file, char *ret_to, size_t offset, struct piece *pie
 		if (file_read_at(file, ret_to + piece->first, piece->size, offset + piece->first, "projections.raw",
 				 &piece->error) == 0)
 			piece->crc = checksum(0, ret_to + piece->first, piece->size);
+		pulse_beat();
 	}
 }
 
@@ -768,9 +771,9 @@ static int push_some(struct reconstruction *reconstruction, int count, struct er
 	const size_t bytes = scan_projection_bytes(reconstruction->files.scan);
 	int code;
 
-	disk_step(&reconstruction->run, 1);
+	disk_steps(&reconstruction->run, true);
 	code = read_views(reconstruction, reconstruction->pushed, count, err);
-	disk_step(&reconstruction->run, 0);
+	disk_steps(&reconstruction->run, false);
 	for (int i = 0; i < count; i++)
 		reconstruction->views[i] = reconstruction->pushed + i;
 	for (int i = 0; i < count && code == 0 && reconstruction->stuck != NULL && !reconstruction->looked; i++)
@@ -844,7 +847,7 @@ int reconstruction_finish(struct reconstruction *reconstruction, struct error *e
 		code = recon_run(reconstruction->recon, err);
 
 	/* Announced volumes are settled, however the run ends. */
-	disk_step(run, 3);
+	disk_steps(run, true);
 	if (run->trouble.code == 0)
 		settle(run, true, &run->trouble);
 	/* A checkpoint on its way would take the place of one that is written now. */

@@ -19,6 +19,7 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
+#include "core/pulse.h"
 #include "proto/durable.h"
 #include "proto/seal.h"
 
@@ -258,6 +259,7 @@ static void *sync_loop(void *context)
 		gone = given;
 		if (err.code == 0)
 			write_back(&saver->file.file, before, at, end, &err);
+		pulse_beat();
 		before = at;
 		at = end;
 		pthread_mutex_lock(&saver->lock);

@@ -8,6 +8,7 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
+#include "core/pulse.h"
 #include "proto/scan_directory.h"
 #include "proto/sums.h"
 
@@ -133,6 +134,7 @@ int seal_first_damaged(const struct seal *seal, const void *content)
 
 		if (checksum(0, bytes, seal_block_bytes(seal, block)) != seal->blocks[block] && block < damaged)
 			damaged = block;
+		pulse_beat();
 	}
 	return damaged < seal->count ? damaged : -1;
 }

@@ -163,6 +163,7 @@ static void cpu_describe(struct device *device, struct device_info *ret_info)
  * of kilobytes apart, and a table of 4 KiB pages does not reach that far.
  */
 static const size_t LARGE_PAGE = (size_t)2 << 20;
+static const size_t STEP_BYTES = (size_t)256 << 20; /* that are cleared between two beats of the pulse */
 
 void *cpu_allocate(struct device *device, size_t bytes, const char *what, struct error *err)
 {
@@ -188,7 +189,10 @@ void *cpu_allocate(struct device *device, size_t bytes, const char *what, struct
 	}
 	if (alignment == LARGE_PAGE)
 		madvise(memory, bytes, MADV_HUGEPAGE); /* a hint: without it everything works, slower */
-	memset(memory, 0, bytes);
+	for (size_t at = 0; at < bytes; at += STEP_BYTES) {
+		memset((char *)memory + at, 0, bytes - at < STEP_BYTES ? bytes - at : STEP_BYTES);
+		pulse_beat();
+	}
 	device->memory_used += bytes;
 	return memory;
 }

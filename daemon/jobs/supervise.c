@@ -227,17 +227,36 @@ static void worker_died(struct supervise *supervise, struct worker *worker, bool
 
 /* ---- the loop ---- */
 
+/*
+ * A process that was killed in a call of the kernel which does not return, of a disk or a driver, stays for as long.
+ * Nothing of it runs any more, so its job is cancelled without it; the worker's next process waits for its end.
+ */
+static void cancel_without(struct supervise *supervise, struct worker *worker)
+{
+	char text[160];
+
+	worker_forget_held(worker);
+	worker->row_count = 0;
+	snprintf(text, sizeof(text), "its worker %s", worker->killed);
+	worker_end_job(supervise, worker,
+		       &(struct worker_words){.end = END_OTHER, .code = ERR_CANCELLED, .text = text});
+}
+
 static void carry_out_cancels(struct supervise *supervise)
 {
 	struct job_facts facts;
 
 	for (int i = 0; i < supervise->count; i++) {
 		struct worker *worker = &supervise->workers[i];
+		const bool killed = worker->state == WORKER_ENDING && worker->killed[0] != '\0';
 
-		if (worker->state != WORKER_BUSY || worker->job == NULL || worker->cancelling)
+		if (worker->job == NULL || worker->ending.due ||
+		    (!killed && (worker->state != WORKER_BUSY || worker->cancelling)))
 			continue;
 		job_facts(worker->job, &facts);
-		if (facts.cancel_asked)
+		if (facts.cancel_asked && killed)
+			cancel_without(supervise, worker);
+		else if (facts.cancel_asked)
 			worker_cancel(supervise, worker);
 	}
 }

@@ -89,6 +89,21 @@ test_a_worker_that_hangs_in_a_step() {
 	expect_json '.attempts == 2'
 }
 
+test_a_worker_that_hangs_on_its_disk() {
+	local first hold=$work/hold
+	rm -rf "$state"
+	CBCT_TEST_HOLD=$hold start_daemon --worker "$BUILD/cbct-worker-held"
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	: >"$hold"
+	post_job "{\"scan\": \"SCAN\", $grid, \"fdk\": {}}"
+	first=$(worker_of)
+	replaced "$first" "finished no step for 3[0-9][.][0-9] s"
+	rm "$hold"
+	wait_job succeeded 240
+	expect_json '.attempts == 2'
+}
+
 test_a_cancel_of_a_job_whose_worker_does_not_heed_it() {
 	local first how
 	start_posted
@@ -105,6 +120,35 @@ test_a_cancel_of_a_job_whose_worker_does_not_heed_it() {
 		rm -f "$hang"
 		ready_again
 	done
+	post_job "{\"scan\": \"SCAN\", $grid, \"fdk\": {}}"
+	wait_job succeeded
+}
+
+# As one in a call of the kernel that does not return: a signal does not end it.
+test_a_cancel_of_a_job_whose_worker_cannot_be_killed() {
+	local first i
+	freezer=/sys/fs/cgroup/freezer/cbct-test-$$ # not local: the trap runs after the function
+	mkdir "$freezer" 2>/dev/null || skip "nobody may make a control group here that freezes processes"
+	trap 'echo THAWED >"$freezer/freezer.state"; stop_daemon; rmdir "$freezer"' EXIT
+	start_posted
+	post_job "${recipe/$many/5000}"
+	state_becomes running
+	first=$(worker_of)
+	echo "$first" >"$freezer/cgroup.procs"
+	echo FROZEN >"$freezer/freezer.state"
+	for ((i = 0; i < 100; i++)); do
+		[ "$(cat "$freezer/freezer.state")" = FROZEN ] && break
+		sleep 0.05
+	done
+	req DELETE "/v1/jobs/$job?wait=60"
+	expect_status 202
+	expect_json '.state == "cancelled"'
+	kill -0 "$first" || fail "worker $first, which is frozen, is still there"
+	req GET /readyz
+	expect_status 503
+	echo THAWED >"$freezer/freezer.state"
+	replaced "$first" "did not cancel"
+	ready_again
 	post_job "{\"scan\": \"SCAN\", $grid, \"fdk\": {}}"
 	wait_job succeeded
 }
