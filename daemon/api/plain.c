@@ -16,13 +16,14 @@ static const char policy[] = "default-src 'none'; style-src 'self'; img-src 'sel
 			     "form-action 'none'; frame-ancestors 'none'";
 
 static const char style[] =
-    ":root{color-scheme:light dark;font:16px/1.5 system-ui,sans-serif}"
-    "body{max-width:62rem;margin:0 auto;padding:1rem}"
+    ":root{color-scheme:light dark;background:Canvas;color:CanvasText;font:16px/1.5 system-ui,sans-serif}"
+    "body{max-width:62rem;margin:0 auto;padding:1rem;overflow-wrap:anywhere}"
     "table{border-collapse:collapse;width:100%}th,td{text-align:left;padding:.3rem .6rem .3rem 0;"
     "border-bottom:1px solid color-mix(in srgb,currentColor 20%,transparent)}"
     ".planes{display:flex;flex-wrap:wrap;gap:.5rem}"
     ".planes img{background:#000;max-width:100%;min-width:12rem;flex:1 1 12rem;object-fit:contain}"
-    "nav a,p a{margin-right:.8rem}";
+    "nav a,p a{margin-right:.8rem}"
+    "@media(pointer:coarse){a{display:inline-flex;align-items:center;min-width:44px;min-height:44px}}";
 
 static const struct preset {
 	const char *name;
@@ -75,11 +76,11 @@ static void put_head(FILE *out, const char *title, bool again)
 	      "<meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n"
 	      "<link rel=\"stylesheet\" href=\"/plain.css\">\n<link rel=\"icon\" href=\"data:,\">\n",
 	      out);
-	if (again)
-		fputs("<meta http-equiv=\"refresh\" content=\"5\">\n", out);
 	fputs("<title>", out);
 	put_text(out, title);
 	fputs(" - cbctd</title>\n</head>\n<body>\n<main>\n", out);
+	if (again) /* a page that reloads by itself takes the place away from who reads it */
+		fputs("<p><a href=\"\">Look again</a></p>\n", out);
 	if (assets[0].name == NULL)
 		fputs("<p>This daemon was built without its web page, since npm or its registry could not be reached; "
 		      "this plain one needs neither.</p>\n",

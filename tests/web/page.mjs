@@ -38,10 +38,13 @@ async function openFinished(options) {
 	return page
 }
 
-async function accessible(page, what) {
-	await page.evaluate(axe)
-	const { violations } = await page.evaluate(() => axe.run(document, { resultTypes: ['violations'] }))
-	expect(violations.length === 0, `${what} without barriers: ${JSON.stringify(violations.map(one => [one.id, one.nodes[0].html, one.nodes[0].failureSummary]))}`)
+/* rules: only those of axe, where the others cannot find anything new. */
+async function accessible(page, what, rules) {
+	if (!await page.evaluate('"axe" in window'))
+		await page.evaluate(axe)
+	const violations = await page.evaluate(async runOnly => (await axe.run(document, { resultTypes: ['violations'], selectors: false, ...runOnly && { runOnly } })).violations
+		.map(({ id, nodes: [{ html, failureSummary }] }) => [id, html, failureSummary]), rules)
+	expect(violations.length === 0, `${what} without barriers: ${JSON.stringify(violations)}`)
 }
 
 async function fits(page, what) {
@@ -218,25 +221,64 @@ test('planes are the daemon\'s slices, pixel by pixel', async () => {
 	await page.context().close()
 })
 
-test('the rendering shows the patient from the front, the left to the right', async () => {
-	const page = await openFinished()
-	await page.waitForSelector(`${tile('3d')}[data-shown=final]`)
+/* Software that says it were a card, as which WebGL 2 is then used. */
+async function pretendCard(page) {
+	await page.addInitScript(() => {
+		const { getParameter } = WebGL2RenderingContext.prototype, unmaskedRenderer = 0x9246
+		WebGL2RenderingContext.prototype.getParameter = function (name) {
+			return name === unmaskedRenderer ? 'a graphics card' : getParameter.call(this, name)
+		}
+	})
+	await page.reload()
+}
+
+for (const graphics of ['software', 'a graphics card']) {
+	test(`the rendering by ${graphics} shows the patient from the front, the left to the right`, async () => {
+		const page = await openFinished()
+		if (graphics !== 'software')
+			await pretendCard(page)
+		await page.waitForSelector(`${tile('3d')}[data-shown=final]`)
+		expect(page.requests.some(url => url.includes('/render-')) === (graphics !== 'software'), 'NiiVue where a card draws, and only there')
+		await page.focus(tile('3d'))
+		for (let i = 0; i < 4; i++)
+			await page.keyboard.press('ArrowLeft')
+		for (let i = 0; i < 2; i++)
+			await page.keyboard.press('ArrowUp')
+		await page.evaluate(() => document.activeElement.blur())
+		await page.$$eval(`${tile('3d')} > :not(.stage)`, labels => labels.forEach(label => label.style.visibility = 'hidden'))
+		await rendered(page, 0, 0.2, 'the solid from the front')
+		expect(await edges(page, '3d') === 'R L S I', `the patient's left to the right, got ${await edges(page, '3d')}`)
+		/* Further round: from its left, with the back to the right. */
+		await page.focus(tile('3d'))
+		for (let i = 0; i < 18; i++)
+			await page.keyboard.press('ArrowRight')
+		await page.evaluate(() => document.activeElement.blur())
+		await rendered(page, 1, 0.1, 'the solid from its left') /* where it is nearly the same upside down */
+		expect(await edges(page, '3d') === 'A P S I', `the patient's back to the right, got ${await edges(page, '3d')}`)
+		await page.context().close()
+	})
+}
+
+test('without a card 3D is drawn at half size while one turns, finely after a rest, and in pieces', async () => {
+	const page = await openFinished(), flat = `${tile('3d')} canvas.flat`
+	await page.waitForSelector(`${flat}[data-side="384"]`)
+	await page.evaluate(selector => {
+		const canvas = document.querySelector(selector)
+		window.drawn = []
+		new MutationObserver(() => canvas.dataset.side && window.drawn.push([canvas.dataset.side, Number(canvas.dataset.pieces)])).observe(canvas, { attributeFilter: ['data-pieces', 'data-side'] })
+	}, flat)
 	await page.focus(tile('3d'))
-	for (let i = 0; i < 4; i++)
-		await page.keyboard.press('ArrowLeft')
-	for (let i = 0; i < 2; i++)
-		await page.keyboard.press('ArrowUp')
-	await page.evaluate(() => document.activeElement.blur())
-	await page.$$eval(`${tile('3d')} > :not(.stage)`, labels => labels.forEach(label => label.style.visibility = 'hidden'))
-	await rendered(page, 0, 0.2, 'the solid from the front')
-	expect(await edges(page, '3d') === 'R L S I', `the patient's left to the right, got ${await edges(page, '3d')}`)
-	/* Further round: from its left, with the back to the right. */
-	await page.focus(tile('3d'))
-	for (let i = 0; i < 18; i++)
-		await page.keyboard.press('ArrowRight')
-	await page.evaluate(() => document.activeElement.blur())
-	await rendered(page, 1, 0.1, 'the solid from its left') /* where it is nearly the same upside down */
-	expect(await edges(page, '3d') === 'A P S I', `the patient's back to the right, got ${await edges(page, '3d')}`)
+	for (const mode of ['surface', 'mip']) {
+		await page.click(`[aria-label="3D shows"] button[data-value=${mode}]`)
+		await page.waitForSelector(`${flat}[data-side="384"]`)
+		await page.evaluate(() => window.drawn = [])
+		await page.focus(tile('3d'))
+		for (let i = 0; i < 5; i++)
+			await page.keyboard.press('ArrowLeft')
+		const drawn = await until('a fine picture', () => page.evaluate(() => window.drawn), list => list.length > 1 && list.at(-1)[0] === '384')
+		expect(drawn[0][0] === '192' && drawn.at(-1)[0] === '384', `${mode}: half size first, got ${drawn}`)
+		expect(drawn.every(([side, pieces]) => pieces >= side / 48), `${mode}: 48 rows at most at once, got ${drawn}`)
+	}
 	await page.context().close()
 })
 
@@ -259,7 +301,7 @@ async function rendered(page, columns, margin, what) {
 	}
 	const a = shrink(cropped(shadow, 0.5))
 	await until(what, async () => {
-		const seen = grayOf(await page.locator(`${tile('3d')} canvas:not(.flat)`).screenshot())
+		const seen = grayOf(await page.locator(`${tile('3d')} canvas.render:not([hidden])`).screenshot())
 		if (!seen.pixels.some(value => value > 60))
 			return { nothing: true }
 		const b = shrink(cropped(seen, 60, 12))
@@ -324,13 +366,13 @@ test('another iteration changes the pixels, and neither window nor place', async
 	const page = await openFinished()
 	await page.click('[data-preset="Soft tissue"]')
 	await page.mouse.click(...await spot(page, 'z', 0.4, 0.6))
-	const place = await page.textContent('.readout'), before = await planePixels(page, 'z'), rendering = await page.locator(`${tile('3d')} canvas:not(.flat)`).screenshot()
+	const place = await page.textContent('.readout'), before = await planePixels(page, 'z'), rendering = await page.locator(`${tile('3d')} canvas.render:not([hidden])`).screenshot()
 	await page.focus('.iterations input[type=range]')
 	await page.keyboard.press('Home')
 	await until('the first volume', () => shownVolume(page), shown => shown === 'fdk')
 	await until('other pixels', async () => differ(before, await planePixels(page, 'z')))
 	await page.waitForSelector(`${tile('3d')}[data-shown=fdk]`)
-	expect(!rendering.equals(await page.locator(`${tile('3d')} canvas:not(.flat)`).screenshot()), 'another rendering')
+	expect(!rendering.equals(await page.locator(`${tile('3d')} canvas.render:not([hidden])`).screenshot()), 'another rendering')
 	expect(String(await windowOf(page)) === '400,40', 'the window kept')
 	expect((await page.textContent('.readout')).split('mm')[0] === place.split('mm')[0], 'the place kept')
 	expect(!await page.isChecked('.iterations input[type=checkbox]'), 'the newest no longer followed')
@@ -909,11 +951,7 @@ test('a grid that is asked for again with other voxels stays about its middle', 
 test('a phone: one column, nothing beside the screen', async () => {
 	const page = await openFinished({ viewport: { width: 390, height: 844 }, deviceScaleFactor: 2, isMobile: true, hasTouch: true })
 	await page.waitForSelector(`${tile('3d')}[data-shown=final]`)
-	for (const theme of ['dark', 'light']) {
-		await page.evaluate(name => document.documentElement.dataset.theme = name, theme)
-		await fits(page, `the job in ${theme}`)
-		await accessible(page, `the job in ${theme}`)
-	}
+	await fits(page, 'the job')
 	await fingers(page)
 	await page.click('button:has-text("Reset")')
 	await shoot(page, 'phone', { fullPage: true })
@@ -937,24 +975,18 @@ test('a phone: one column, nothing beside the screen', async () => {
 })
 
 for (const scheme of ['light', 'dark']) {
-	test(`${scheme}: colours of the system, no barriers`, async () => {
+	test(`${scheme}: colours of the system`, async () => {
 		const page = await openFinished({ colorScheme: scheme })
 		await page.waitForSelector(`${tile('3d')}[data-shown=final]`)
 		const ground = await page.evaluate(() => getComputedStyle(document.documentElement).backgroundColor.match(/\d+/g).map(Number))
 		expect(scheme === 'dark' ? Math.max(...ground) < 60 : Math.min(...ground) > 200, `a ${scheme} ground, got ${ground}`)
 		await shoot(page, `job-${scheme}`)
-		await accessible(page, 'the job')
-		await page.click('button:has-text("Reconstruct again")')
-		await accessible(page, 'the form')
-		await page.keyboard.press('Escape')
 		await page.goto(`${origin}/#/`)
 		await page.waitForSelector('.jobs .thumb img')
 		await shoot(page, `list-${scheme}`)
-		await accessible(page, 'the list')
 		await page.goto(`${origin}/#/scans/${scan}`)
 		await page.waitForSelector('.film canvas[data-projection="0"]')
 		await shoot(page, `scan-${scheme}`)
-		await accessible(page, 'the scan')
 		await page.context().close()
 	})
 }
@@ -1001,11 +1033,8 @@ for (const sizes of [[[1366, 768], [1024, 768]], [[844, 390]]]) {
 	})
 }
 
-/* Targets of 44 px; one finger goes through slices, one that rests sets the cross, and the page scrolls. */
+/* One finger goes through slices, one that rests sets the cross, and the page scrolls. */
 async function fingers(page) {
-	const small = await page.$$eval('.controls button, .actions button, .tile button', all => all.filter(button => button.offsetParent).map(button => [button.textContent || button.ariaLabel, button.getBoundingClientRect()])
-		.filter(([, box]) => box.width < 43.5 || box.height < 43.5).map(([text, box]) => `${text} ${box.width} x ${box.height}`))
-	expect(small.length === 0, `targets of 44 px, got ${small}`)
 	const before = await depthOf(page, 'z'), frame = await page.locator(`${tile('z')} .stage`).boundingBox(), client = await page.context().newCDPSession(page)
 	const finger = (type, x, y) => client.send('Input.dispatchTouchEvent', { type, touchPoints: type === 'touchEnd' ? [] : [{ x, y }] })
 	const [x, y] = [frame.x + frame.width * 0.2, frame.y + frame.height * 0.7]
@@ -1028,59 +1057,174 @@ async function fingers(page) {
 	expect(await page.evaluate(() => document.documentElement.scrollHeight > innerHeight), 'more below')
 }
 
-test('a surgeon\'s questions take three clicks or fewer', async () => {
+/* Whatever a finger presses is 44 px wide and high; of a box to tick, its label. */
+async function targets(page, what) {
+	const small = await page.$$eval('a[href]:not(.skip), button, select, summary, input:not([type=file])', all => all.filter(one => one.checkVisibility({ visibilityProperty: true }))
+		.map(one => ['checkbox', 'radio'].includes(one.type) ? one.closest('label') : one).map(one => [one.ariaLabel || one.textContent || one.name || one.className, one.getBoundingClientRect()])
+		.filter(([, box]) => box.width < 43.5 || box.height < 43.5).map(([text, box]) => `${text} ${box.width.toFixed(1)} x ${box.height.toFixed(1)}`))
+	expect(small.length === 0, `${what}: targets of 44 px, got ${small.join(', ')}`)
+}
+
+/* What is written on a tile can be read: no letter lies below other words. */
+async function readable(page, what) {
+	const covered = await page.$$eval('.viewer .tile', tiles => tiles.filter(tile => tile.checkVisibility()).flatMap(tile => {
+		const words = [...tile.querySelectorAll('.edge, .caption, .what, .maximise, .scale-bar text')].filter(one => one.checkVisibility() && (one.textContent || one.ariaLabel))
+			.map(one => [one.className.baseVal ?? `${one.className} ${one.textContent}`, one.getBoundingClientRect()])
+		return words.flatMap(([one, a], i) => words.slice(i + 1).filter(([, b]) => a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom)
+			.map(([other]) => `${tile.dataset.plane}: ${one} and ${other}`))
+	}))
+	expect(covered.length === 0, `${what}: words beside each other, got ${covered.join(', ')}`)
+}
+
+test('no barriers, targets for fingers and nothing covered: every page, at every size, light and dark', async () => {
+	const { detector, projections, geometry } = await api(`/v1/scans/${scan}`)
+	const arriving = await post('/v1/scans', { name: 'arriving', detector, projections, geometry })
+	const acquiring = await post('/v1/jobs', { scan: arriving.id, grid: { size: [20, 20, 20], spacing_mm: [5, 5, 5] }, fdk: {} })
+	await api(`/v1/scans/${arriving.id}/projections/0`, { method: 'PUT', body: await (await fetch(`${origin}/v1/scans/${scan}/projections/0`)).arrayBuffer() })
+	const drawn = `${tile('z')} canvas.slice:not([hidden])`
+	const pages = [
+		['the list', '/#/', page => page.waitForSelector('.jobs .thumb img')],
+		['the job', finishedPath, page => page.waitForSelector(drawn)],
+		['the form', finishedPath, async page => {
+			await page.waitForSelector('.head .badge.succeeded')
+			await page.click('button:has-text("Reconstruct again")')
+			await page.click('dialog .expert summary')
+		}],
+		['the scan', `/#/scans/${scan}`, page => page.waitForSelector('.film canvas[data-projection="0"]')],
+		['the acquisition', `/#/jobs/${acquiring.id}`, page => page.waitForSelector('.acquiring .film canvas[data-projection="0"]')],
+		['the interface', '/#/interface', async page => {
+			await page.waitForSelector('.subject .entry')
+			await page.fill('[type=search]', 'annotations') /* all of it has a test of its own */
+			await page.click('.entry:not([hidden]) summary')
+		}],
+		['the plain list', '/plain', page => page.waitForSelector('td a')],
+		['the plain job', `/plain/${finished}`, page => page.waitForSelector('.planes img')],
+	]
+	const wrong = [], note = check => check.catch(error => wrong.push(error.message))
+	const look = async (sizes, options) => {
+		for (const [name, path, ready] of pages) {
+			const page = await open(browser, path, { ...options, colorScheme: 'light' })
+			await ready(page)
+			for (const [width, height] of sizes) {
+				const what = `${name} at ${width} x ${height}`
+				await page.setViewportSize({ width, height })
+				await page.evaluate(() => new Promise(resolve => requestAnimationFrame(() => requestAnimationFrame(resolve))))
+				await page.emulateMedia({ colorScheme: 'light' })
+				await note(accessible(page, `${what}, light`))
+				await page.emulateMedia({ colorScheme: 'dark' })
+				await note(accessible(page, `${what}, dark`, ['color-contrast'])) /* only colours differ */
+				await note(fits(page, what))
+				await note(readable(page, what))
+				if (options.hasTouch)
+					await note(targets(page, what))
+				await shoot(page, `${name.replace(/ /g, '-')}-${width}x${height}`)
+			}
+			await page.context().close()
+		}
+	}
+	await Promise.all([look([[1440, 900], [1366, 768]], {}), look([[1024, 768], [844, 390], [390, 844]], { isMobile: true, hasTouch: true })])
+	expect(wrong.length === 0, `all pages as they should be:\n${wrong.join('\n')}`)
+	await api(`/v1/jobs/${acquiring.id}`, { method: 'DELETE' })
+	await ended(acquiring.id)
+})
+
+/* docs/surgeon.md, question by question; of each a picture. */
+test('each of a surgeon\'s ten questions takes three clicks or fewer', async () => {
 	await forget()
+	const long = await post('/v1/jobs', { scan, grid: { size: [40, 40, 40], spacing_mm: [3, 3, 3] }, fdk: {}, sart: { iterations: 100000 } })
 	const page = await open(browser, '/')
-	let clicks = 0
-	const click = async (selector, options) => {
+	await page.route('**/v1/destinations', route => route.fulfill({ json: { destinations: [{ name: 'pacs', kind: 'dicomweb', address: 'http://archive/', objects: 'slices', send: 'none', reachable: true, detail: null, checked: null, unsent: 0 }] } }))
+	let clicks = 0, answered = 0
+	const click = async selector => {
 		clicks++
-		await page.click(selector, options)
+		await page.click(selector)
 	}
 	const at = async (x, y) => {
 		clicks++
 		await page.mouse.click(...await spot(page, 'z', x, y))
 	}
-	const few = (question, from = 0) => {
-		expect(clicks - from <= 3, `${question} ${clicks - from} clicks`)
-		clicks = 0
+	const along = async (from, to) => {
+		clicks++
+		await drag(page, await spot(page, 'z', ...from), await spot(page, 'z', ...to))
 	}
-	await page.waitForSelector(`.jobs a[href="#/jobs/${finished}"] .badge.succeeded`)
-	few('is it done?')
-	await click(`.jobs a[href="#/jobs/${finished}"]`)
-	await planePixels(page, 'z')
-	await until('whose, which side, which recipe', async () => [await edges(page, 'z'), await page.textContent('h1'), await page.textContent(`${tile('z')} .what`)], seen => String(seen) === `R L A P,${name},final · SART 7 + TV`)
-	await until('how good', () => page.textContent('.quality'), text => text !== '')
-	few('my patient, side, recipe, quality?')
-	await click('[aria-label=Measure] button[data-value=axis]')
-	await at(0.3, 0.4)
-	await at(0.6, 0.6)
-	expect((await page.textContent(`${tile('x')} .name`)).includes('turned'), 'planes along the screw')
-	few('is the screw in the bone?')
+	/* From where the question is asked: the list, or the job. */
+	const question = async (what, answer) => {
+		clicks = 0
+		await answer()
+		expect(clicks <= 3, `${what} ${clicks} clicks`)
+		answered++
+		await shoot(page, `question-${answered}`)
+	}
+	await question('is it done?', () => page.waitForSelector(`.jobs.today a[href="#/jobs/${finished}"] .badge.succeeded`))
+	await question('how long still?', () => until('the time left', () => page.textContent(`.jobs.running a[href="#/jobs/${long.id}"]`), text => /left/.test(text)))
+	await api(`/v1/jobs/${long.id}`, { method: 'DELETE' })
+	await question('is this my patient, and which side is which?', async () => {
+		await click(`.jobs a[href="#/jobs/${finished}"]`)
+		await planePixels(page, 'z')
+		await until('name and sides', async () => [await page.textContent('h1'), await edges(page, 'z')], seen => String(seen) === `${name},R L A P`)
+	})
+	await question('is the screw in the bone?', async () => {
+		await click('[aria-label=Measure] button[data-value=axis]')
+		await at(0.3, 0.4)
+		await at(0.6, 0.6)
+		expect((await page.textContent(`${tile('x')} .name`)).includes('turned'), 'planes along the screw')
+	})
 	await page.click('button:has-text("Reset")')
-	await click('[aria-label=Measure] button[data-value=ruler]')
-	clicks++
-	await drag(page, await spot(page, 'z', 0.3, 0.3), await spot(page, 'z', 0.6, 0.3))
-	await until('a length', () => measured(page), list => list.length === 1)
-	few('how long is it?')
-	await click('button:has-text("Swipe")')
-	await click('[aria-label="Compare with"]')
-	clicks++
-	await page.selectOption('[aria-label="Compare with"]', { index: 2 })
-	few('did it change?')
+	await question('how long is it?', async () => {
+		await click('[aria-label=Measure] button[data-value=ruler]')
+		await along([0.3, 0.3], [0.6, 0.3])
+		await until('a length', () => measured(page), list => list.length === 1 && / mm$/.test(list[0]))
+	})
+	clicks = 0
+	await click('[aria-label=Measure] button[data-value=angle]')
+	await along([0.7, 0.5], [0.4, 0.5])
+	await at(0.4, 0.8)
+	await until('an angle', () => measured(page), list => list.length === 2 && /^(89|90)\.\d°$/.test(list[1]))
+	expect(clicks === 3, `what is the angle? ${clicks} clicks`)
+	await shoot(page, 'question-5-angle')
 	await page.keyboard.press('Escape')
-	await click('button:has-text("Key image")')
-	await click('dialog button.primary')
-	few('how do I show it?')
-	await click('button:has-text("Reconstruct again")')
-	await click('dialog .preset:has-text("Bone")')
-	const posted = page.waitForRequest(request => request.method() === 'POST' && request.url().endsWith('/v1/jobs'))
-	await page.route('**/v1/jobs', route => route.request().method() === 'POST'
-		? route.fulfill({ status: 422, contentType: 'application/problem+json', body: '{"title": "not now", "status": 422, "detail": "a test"}' })
-		: route.continue())
-	await click('dialog button[type=submit]')
-	expect((await posted).postDataJSON().preset === 'bone', 'a job for bone')
-	few('can it be sharper?')
+	await question('how good is this image?', () => until('in a line', () => page.textContent('.quality'), text => /^(Measured: noise|Too little)/.test(text)))
+	await question('which reconstruction am I looking at?', async () => {
+		await until('its recipe', () => page.textContent(`${tile('z')} .what`), text => text === 'final · SART 7 + TV')
+		await click('.iterations button >> nth=0')
+		await until('an earlier one', () => page.textContent(`${tile('z')} .what`), text => text.startsWith('iter-'))
+	})
+	await page.keyboard.press('ArrowRight')
+	await question('did it change against the scan before?', async () => {
+		await click('button:has-text("Swipe")')
+		clicks += 2
+		await page.selectOption('[aria-label="Compare with"]', { index: 2 })
+		await planePixels(page, 'z', '.viewer.second')
+	})
+	await page.click('[aria-label=Comparison] [data-value=off]')
+	await question('can it be made sharper?', async () => {
+		await click('button:has-text("Reconstruct again")')
+		await click('dialog .preset:has-text("Bone")')
+		await shoot(page, 'question-9-form')
+		const posted = page.waitForRequest(request => request.method() === 'POST' && request.url().endsWith('/v1/jobs'))
+		await page.route('**/v1/jobs', route => route.request().method() === 'POST'
+			? route.fulfill({ status: 422, contentType: 'application/problem+json', body: '{"title": "not now", "status": 422, "detail": "a test"}' })
+			: route.continue())
+		await click('dialog button[type=submit]')
+		expect((await posted).postDataJSON().preset === 'bone', 'a job for bone')
+	})
+	await page.keyboard.press('Escape')
+	await question('how do I show it to somebody?', async () => {
+		await click('button:has-text("Key image")')
+		await click('dialog button.primary')
+		await until('a file of it', () => page.locator('.key-images li').count(), count => count === 1)
+	})
+	clicks = 0
+	let sent = null
+	await page.route(`**/v1/jobs/${finished}/send`, route => {
+		sent = route.request().postDataJSON()
+		return route.fulfill({ status: 202, json: { sendings: [] } })
+	})
+	await click('button:has-text("Send to archive")')
+	await until('sent away', () => sent?.to, to => to === 'pacs')
+	expect(clicks <= 3 && answered === 10, `ten questions, ${answered} answered`)
 	await forget()
+	await ended(long.id)
 	await page.context().close()
 })
 

@@ -8,7 +8,7 @@ const scrollStep = 8 /* px that a finger moves for one slice */
 const pressTime = 450 /* ms: a finger that rests so long sets the cross */
 const grip = { mouse: 9, touch: 24 } /* px about a handle */
 const keyTurn = Math.PI / 180
-const drawn = ['ruler', 'ellipse', 'freehand'] /* by dragging; the others by clicks */
+const drawn = ['ruler', 'ellipse', 'freehand'] /* by dragging; the others by clicks, of which a drag is the first two */
 
 export class Gestures {
 	#plane
@@ -78,7 +78,7 @@ export class Gestures {
 		this.#pointers.set(event.pointerId, [event.clientX, event.clientY])
 		const action = this.#actionOf(event), { window, level } = view
 		clearTimeout(this.#press)
-		this.#gesture = { action, window, level, moved: this.#pointers.size > 1, button: event.button, start: [event.clientX, event.clientY], scrolled: 0 }
+		this.#gesture = { action, window, level, moved: this.#pointers.size > 1, button: event.button, start: [event.clientX, event.clientY], from: this.#point(event), scrolled: 0 }
 		if (this.#pointers.size > 1) {
 			this.#drop()
 			return
@@ -145,10 +145,17 @@ export class Gestures {
 		} else if (gesture.action === 'pan') {
 			const box = this.#plane.frame.getBoundingClientRect()
 			view.panBy(name, (event.clientX - before[0]) / box.width, (event.clientY - before[1]) / box.height)
+		} else if (this.#isFirstDrag(gesture)) {
+			this.#plane.draft({ kind: view.tool, points: [gesture.from, this.#point(event)] })
 		} else if (drawn.includes(gesture.action) && this.#plane.overlay.draft) {
 			const { kind, points } = this.#plane.overlay.draft, point = this.#point(event)
 			this.#plane.draft({ kind, points: kind === 'freehand' ? [...points, point] : kind === 'ruler' ? [points[0], point] : this.#ellipse(gesture, point) })
 		}
+	}
+
+	/* Two points at once of what is measured by clicks. */
+	#isFirstDrag({ action, button, moved }) {
+		return moved && button === 0 && action === this.#view.tool && this.#isMeasuring() && !drawn.includes(action) && !(this.#view.clicks?.length > 0)
 	}
 
 	/* Of a box from where the drag began: the middle and the ends of the half axes. */
@@ -177,10 +184,12 @@ export class Gestures {
 	#up(event, lifted) {
 		if (!this.#pointers.delete(event.pointerId) || this.#gesture === null)
 			return
-		const { action, moved, button } = this.#gesture
+		const { action, moved, button, from } = this.#gesture
 		clearTimeout(this.#press)
 		if (lifted && drawn.includes(action))
 			this.#finish(moved)
+		else if (lifted && this.#isFirstDrag(this.#gesture))
+			[from, this.#point(event)].forEach(point => this.click(point))
 		else if (lifted && !moved && button === 0 && this.#isMeasuring())
 			this.click(this.#point(event))
 		else if (lifted && !moved && button === 0)

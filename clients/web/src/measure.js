@@ -11,7 +11,7 @@ import { isWithin, sampleAt } from './sample.js'
 /* points: how many clicks it takes; null: it is drawn. */
 export const kinds = {
 	ruler: { name: 'Ruler', hint: 'drag from one end to the other', points: 2 },
-	angle: { name: 'Angle', hint: 'click one end, the vertex, the other end', points: 3 },
+	angle: { name: 'Angle', hint: 'click one end, the vertex, the other end, or drag along the first arm', points: 3 },
 	ellipse: { name: 'Ellipse', hint: 'drag from corner to corner of its box', points: 2 },
 	freehand: { name: 'Freehand', hint: 'drag around the region', points: null },
 }

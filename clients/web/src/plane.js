@@ -18,6 +18,14 @@ const quickMost = 1.5e6 /* samples that are taken at once; a finer picture follo
 const restTime = 120 /* ms after which it does */
 const pieceTime = 12 /* ms of a frame for it */
 
+/* Tells the style sheet how much room a tile has; whether that is little. */
+export function tellRoom(tile, { width, height }) {
+	const narrow = width < narrowMost || height < narrowMost * 0.75
+	tile.classList.toggle('narrow', narrow)
+	tile.classList.toggle('tiny', width < tinyMost)
+	return narrow
+}
+
 /* Gray levels of all int16 values, as little-endian RGBA. */
 function grayTable(window, level, table) {
 	const black = level - window / 2, scale = 255 / window
@@ -187,10 +195,7 @@ export class Plane {
 		const { width, height } = view.frame(this.name)
 		const room = this.stage.getBoundingClientRect()
 		const scale = Math.min(room.width / width, room.height / height)
-		const narrow = room.width < narrowMost || room.height < narrowMost * 0.75
-		this.element.classList.toggle('narrow', narrow)
-		this.element.classList.toggle('tiny', room.width < tinyMost)
-		this.overlay.plain = narrow
+		this.overlay.plain = tellRoom(this.element, room)
 		const [x, y] = view.pan[this.name]
 		this.frame.style.width = `${width * scale}px`
 		this.frame.style.height = `${height * scale}px`

@@ -4,15 +4,14 @@
  * tells it where left and right are.
  */
 import { Niivue, NVImage, SLICE_TYPE } from '@niivue/niivue'
+import { limitsOf, metalLeast } from './surface.js'
 
 const headerBytes = 352
 /* From clear to ivory; opaque soon, so that it has a surface. */
 const ivory = { R: [70, 205, 255], G: [52, 186, 250], B: [42, 160, 238], A: [0, 110, 220], I: [0, 90, 255] }
 /* Steel blue, from where no bone is any more. */
 const steel = { R: [0, 90, 190], G: [0, 150, 225], B: [0, 215, 255], A: [0, 140, 255], I: [0, 8, 255] }
-const metalLeast = 2600 /* HU */
-const metalMost = 4500
-const airMost = -250 /* HU: a window that reaches below would wrap the patient in fog */
+const metalMost = 4500 /* HU */
 
 function nifti({ size, spacing, origin, voxels }) {
 	const file = new ArrayBuffer(headerBytes + voxels.byteLength)
@@ -39,12 +38,11 @@ export class Render {
 	#nv
 	#size = ''
 
-	/* share: of the screen's pixels, 0: all of them. */
-	static async open(canvas, share) {
+	static async open(canvas) {
 		const render = new Render()
 		const nv = new Niivue({
 			interactive: false, dragAndDropEnabled: false, isResizeCanvas: true, logLevel: 'silent', loadingText: '',
-			backColor: [0, 0, 0, 1], show3Dcrosshair: false, isOrientCube: false, isColorbar: false, gradientAmount: 0, clipPlaneColor: [0, 0, 0, 0], forceDevicePixelRatio: share,
+			backColor: [0, 0, 0, 1], show3Dcrosshair: false, isOrientCube: false, isColorbar: false, gradientAmount: 0, clipPlaneColor: [0, 0, 0, 0],
 		})
 		await nv.attachToCanvas(canvas, true)
 		nv.addColormap('ivory', ivory)
@@ -57,7 +55,7 @@ export class Render {
 	/* The limits keep still from one iteration to the next; so does the brightness. */
 	async show(grid, view, metal) {
 		const nv = this.#nv
-		const [low, high] = this.#limits(view)
+		const { low, high } = limitsOf(view)
 		const place = JSON.stringify([grid.size, grid.spacing, grid.origin, metal])
 		if (nv.volumes.length > 0 && this.#size === place) {
 			for (const volume of nv.volumes)
@@ -78,17 +76,13 @@ export class Render {
 		this.turn(view)
 	}
 
-	#limits(view) {
-		/* What is darker than the middle of the window is clear, so that one looks through it at what the window is for. */
-		const low = Math.max(view.level - view.window / 10, airMost)
-		return [low, Math.max(view.level + view.window / 4, low + 100)]
-	}
-
 	window(view) {
 		const nv = this.#nv
 		if (nv.volumes.length === 0)
 			return
-		;[nv.volumes[0].cal_min, nv.volumes[0].cal_max] = this.#limits(view)
+		const { low, high } = limitsOf(view)
+		nv.volumes[0].cal_min = low
+		nv.volumes[0].cal_max = high
 		nv.updateGLVolume()
 	}
 

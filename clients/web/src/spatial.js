@@ -1,16 +1,18 @@
-/* The tile of the rendering. Without WebGL 2 it shows a contact sheet that the daemon draws. */
+/*
+ * The tile of the rendering: by a graphics card (render.js) or, where software stands for one, by the page itself, a few rows at a time
+ * (rays.js). Without WebGL 2 it shows a contact sheet that the daemon draws.
+ */
 import { h, write, inFrame, throttle } from './dom.js'
-import { Mip } from './mip.js'
+import { tellRoom } from './plane.js'
+import { Rays } from './rays.js'
+import { limitsOf, metalLeast } from './surface.js'
 import { volumePath } from './api.js'
 import { fetchUntil, scaleFor, thinned } from './voxels.js'
 import { lettersInWords, planeEdges, renderingEdges } from './view.js'
 import { t } from './lang.js'
 
-const restTime = 300 /* ms of rest after which software draws */
-const softwareShare = 0.5 /* of the screen's pixels that software draws */
 const scaleMost = 8
 const metalVoxels = 20 /* that are metal before there is any */
-const metalLeast = 2600 /* HU */
 const settleTime = 150 /* ms: the rendering follows the window once the hand rests; each change costs a whole volume */
 
 let graphics
@@ -53,8 +55,8 @@ export class Spatial {
 		this.#view = view
 		this.note = h('p', { class: 'note' })
 		this.canvas = h('canvas', { class: 'render', role: 'img', 'aria-label': t('Rendering in three dimensions') })
-		this.flat = h('canvas', { class: 'render flat', role: 'img', 'aria-label': t('Maximum along each ray'), hidden: true })
-		this.mip = new Mip(this.flat)
+		this.flat = h('canvas', { class: 'render flat', role: 'img', hidden: true })
+		this.rays = new Rays(this.flat)
 		this.sheet = h('img', { class: 'sheet', alt: '', hidden: true })
 		this.stage = h('div', { class: 'stage' }, this.canvas, this.flat, this.sheet, h('div', { class: 'grip' }))
 		this.maximise = h('button', { type: 'button', class: 'maximise', title: t('This one only (m)'), 'aria-label': t('Show the rendering only'),
@@ -64,6 +66,8 @@ export class Spatial {
 		this.element = h('div', { class: 'tile spatial', role: 'group', tabindex: '0', 'aria-label': t('Rendering'), 'data-plane': '3d' },
 			this.stage, h('div', { class: 'caption' }, h('span', { class: 'name' }, '3D')), this.what, this.maximise, Object.values(this.edges), this.note)
 		this.turn = inFrame(() => this.#turned())
+		this.resizing = new ResizeObserver(() => tellRoom(this.element, this.stage.getBoundingClientRect()))
+		this.resizing.observe(this.stage)
 		this.settle = throttle(settleTime, () => this.#settle())
 		this.#listen()
 		this.#writeSides()
@@ -109,27 +113,32 @@ export class Spatial {
 			this.settle()
 	}
 
-	/* Software takes its time: it draws once the hand rests. */
+	/* Whether the page traces the rays itself. */
+	#isTraced() {
+		const { mode } = this.#view.solid
+		return mode === 'mip' || mode === 'surface' && !this.#failed && probeGraphics().software
+	}
+
 	#turned() {
-		clearTimeout(this.rest)
-		if (this.#view.solid.mode === 'mip')
-			this.#drawMip()
-		else if (probeGraphics()?.software)
-			this.rest = setTimeout(() => this.#render?.turn(this.#view), restTime)
+		if (this.#grid === null)
+			return
+		if (this.#isTraced())
+			this.#trace()
 		else
 			this.#render?.turn(this.#view)
 	}
 
-	#drawMip() {
-		if (this.#grid !== null)
-			this.mip.draw(this.#grid, this.#view)
+	#trace() {
+		const view = this.#view
+		this.rays.draw(this.#grid, view, view.solid.mode === 'mip' ? null : { ...limitsOf(view), metal: this.#metal })
 	}
 
 	/* What of the tile is seen. */
 	#reveal() {
-		const { mode } = this.#view.solid
-		this.canvas.hidden = mode !== 'surface' || this.#failed
-		this.flat.hidden = mode !== 'mip'
+		const { mode } = this.#view.solid, traced = this.#isTraced()
+		this.canvas.hidden = mode !== 'surface' || this.#failed || traced
+		this.flat.hidden = !traced
+		this.flat.setAttribute('aria-label', mode === 'mip' ? t('Maximum along each ray') : t('Rendering in three dimensions'))
 		this.sheet.hidden = mode !== 'surface' || !this.#failed
 		write(this.note, mode === 'off' ? t('The rendering is off') : this.#failed && mode === 'surface' ? t('This browser has no WebGL 2: a contact sheet in place of the rendering') : '')
 	}
@@ -157,8 +166,8 @@ export class Spatial {
 				if (this.#metal)
 					this.#view.fromBehind()
 			}
-			if (mode === 'mip')
-				this.#drawMip()
+			if (this.#isTraced())
+				this.#trace()
 			else
 				await this.#drawSurface(source)
 			this.element.dataset.shown = source.volume.name
@@ -170,7 +179,7 @@ export class Spatial {
 	async #drawSurface(source) {
 		if (this.#render === null) {
 			const { Render } = await import('./render.js')
-			this.#render = await Render.open(this.canvas, probeGraphics().software ? softwareShare : 0)
+			this.#render = await Render.open(this.canvas)
 			this.canvas.addEventListener('webglcontextlost', () => this.#fail())
 		}
 		if (this.#rendered === source) {
@@ -277,8 +286,8 @@ export class Spatial {
 
 	close() {
 		this.settle.cancel()
-		clearTimeout(this.rest)
-		this.mip.close()
+		this.resizing.disconnect()
+		this.rays.close()
 		this.#rendered = null
 		this.#render?.close()
 		this.#render = null

@@ -409,7 +409,7 @@ export const strings = {
 	'Ellipse': 'Ellipse',
 	'Freehand': 'Freihand',
 	'drag from one end to the other': 'von einem Ende zum anderen ziehen',
-	'click one end, the vertex, the other end': 'ein Ende, den Scheitel, das andere Ende anklicken',
+	'click one end, the vertex, the other end, or drag along the first arm': 'ein Ende, den Scheitel, das andere Ende anklicken, oder den ersten Schenkel ziehen',
 	'drag from corner to corner of its box': 'von Ecke zu Ecke des Rahmens ziehen',
 	'drag around the region': 'um den Bereich ziehen',
 	'Keeps this view with the job (k)': 'Bewahrt diese Ansicht beim Auftrag auf (k)',
