@@ -17,8 +17,7 @@ static bool read_text(const char *path, char ret_text[TEXT_SIZE])
 	ssize_t got = 0;
 	size_t length = 0;
 
-	while (file >= 0 && length < TEXT_SIZE - 1 &&
-	       (got = read(file, ret_text + length, TEXT_SIZE - 1 - length)) > 0)
+	while (file >= 0 && length < TEXT_SIZE - 1 && (got = read(file, ret_text + length, TEXT_SIZE - 1 - length)) > 0)
 		length += (size_t)got;
 	if (file >= 0)
 		close(file);
@@ -153,7 +152,8 @@ unsigned long memory_group_kills(const struct memory_group *group)
 
 	if (group->directory[0] == '\0')
 		return 0;
-	snprintf(path, sizeof(path), "%s/%s", group->directory, group->unified ? "memory.events" : "memory.oom_control");
+	snprintf(path, sizeof(path), "%s/%s", group->directory,
+		 group->unified ? "memory.events" : "memory.oom_control");
 	read_text(path, text);
 	return (unsigned long)number_of(text, "oom_kill");
 }

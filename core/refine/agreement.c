@@ -12,7 +12,7 @@
 #include "core/fdk.h"
 #include "core/refine/shift.h"
 
-enum { HALVES = 2, VIEWS_LEAST = 48, BINS_LEAST = 24, MEASURED_LEAST = 24 };
+enum { HALVES = 2, VIEWS_LEAST = 64, BINS_LEAST = 24, MEASURED_LEAST = 24 };
 static const double ARC_LEAST = 2.8; /* radians; a shorter arc's volume is too far from the object */
 /* Bins at the isocentre, and sigmas, from which on the geometry is doubtful; bins from which on it is wrong. */
 static const double DOUBTFUL = 0.09, BEYOND_SIGMA = 2, WRONG = 0.15;

@@ -57,8 +57,8 @@ bool starve_ended(struct supervise *supervise, struct worker *worker, char *how,
 	if (counted)
 		take_kill(supervise, worker);
 	if (limit > 0)
-		snprintf(how + length, size - length, " by the kernel for want of memory; its control group allows %zu MiB",
-			 limit >> 20);
+		snprintf(how + length, size - length,
+			 " by the kernel for want of memory; its control group allows %zu MiB", limit >> 20);
 	else
 		snprintf(how + length, size - length, " by the kernel for want of memory");
 	return true;

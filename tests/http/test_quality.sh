@@ -29,13 +29,13 @@ test_a_job_tells_whether_the_geometry_fits() {
 	for name in circle sagging; do
 		sag=() fits=true
 		[ $name = circle ] || sag=(--sag daly) fits=false
-		cbct simulate --phantom asymmetric --scale 70 --density 0.0192 --views 60 --arc 200 --columns 80 --rows 64 --pixel 4.8 \
+		cbct simulate --phantom asymmetric --scale 70 --density 0.0192 --views 64 --arc 200 --columns 80 --rows 64 --pixel 4.8 \
 			--source-to-isocentre 620 --source-to-detector 1100 "${sag[@]}" -o "$work/$name" >/dev/null || fail "cbct simulate"
 		post_scan "$work/$name"
 		post_projections "$work/$name"
 		post_job '{"scan": "SCAN", "grid": {"size": [24, 24, 16], "spacing_mm": [6, 6, 6]}, "fdk": {}}'
 		wait_job succeeded
-		expect_json ".geometry_agreement | .views == 60 and .sigma_mm > 0 and (.mm < 0.1) == $fits and (.mm > 0.5) != $fits"
+		expect_json ".geometry_agreement | .views == 64 and .sigma_mm > 0 and (.mm < 0.1) == $fits and (.mm > 0.5) != $fits"
 		expect_json "[.warnings[] | select(.code == \"geometry_wrong\" and .severity == \"serious\")] | (length == 0) == $fits"
 		expect_json '.warnings | all(.code != "geometry_doubtful")'
 	done

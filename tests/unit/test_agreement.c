@@ -13,7 +13,7 @@
 #include "tests/unit/arm.h"
 #include "tests/unit/scene.h"
 
-enum { COLUMNS = 78, ROWS = 60, VIEWS = 60, PARTS_MOST = 64 };
+enum { COLUMNS = 78, ROWS = 60, VIEWS = 64, PARTS_MOST = 64 };
 static const double PIXEL = 4.928, WATER = 0.0192;
 
 static double uniform(uint64_t *state)
