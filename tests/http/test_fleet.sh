@@ -6,7 +6,7 @@
 [ -z "${CBCT_TEST_CATALOGUE:-}" ] || unset CBCT_TEST_CATALOGUE
 
 scan_dir=$work/scan
-cbct simulate -o "$scan_dir" --phantom head --scale 70 --views 50 --columns 48 --rows 36 --pixel 7 >/dev/null
+cbct simulate -o "$scan_dir" --phantom head --scale 70 --views 64 --columns 48 --rows 36 --pixel 7 >/dev/null
 cbct simulate -o "$work/counts" --phantom head --scale 70 --views 30 --columns 48 --rows 36 --pixel 7 --photons 30000 >/dev/null
 grid='"grid": {"size": [32, 32, 24], "spacing_mm": [5, 5, 5]}'
 small="{\"scan\": \"SCAN\", $grid, \"fdk\": {}, \"sart\": {\"iterations\": 3}, \"tv\": {}, \"emit\": [\"fdk\", 1]}"
