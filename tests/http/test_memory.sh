@@ -8,7 +8,9 @@ scan_dir=$work/ball
 cbct simulate --phantom ball --scale 30 --density 0.02 --views 60 --arc 360 --columns 64 --rows 48 --pixel 4 \
 	--source-to-isocentre 600 --source-to-detector 1000 -o "$scan_dir" >/dev/null || exit 1
 grid='"grid": {"size": [32, 32, 16], "spacing_mm": [3, 3, 4]}'
-recipe="{\"scan\": \"SCAN\", $grid, \"fdk\": {}, \"sart\": {\"iterations\": 60, \"subsets\": \"views\"}}"
+recipe_of() { # ITERATIONS
+	echo "{\"scan\": \"SCAN\", $grid, \"fdk\": {}, \"sart\": {\"iterations\": $1, \"subsets\": \"views\"}}"
+}
 
 remove_group() {
 	local i
@@ -50,7 +52,7 @@ taken = []
 end = time.monotonic() + 60
 while os.path.exists("/proc/" + sys.argv[1]) and time.monotonic() < end:
     taken.append(bytearray(1 << 20))
-    time.sleep(0.01)' "$worker"
+    time.sleep(0.001)' "$worker"
 	) || true # the kernel may take both
 	! [ -e "/proc/$worker" ] || fail "the kernel ends worker $worker"
 }
@@ -74,7 +76,8 @@ test_a_job_that_does_not_fit_into_the_group_is_refused() {
 }
 
 test_a_worker_that_is_ended_for_want_of_memory_loses_nothing() {
-	local undisturbed
+	local undisturbed recipe
+	recipe=$(recipe_of 200) # many times as long as it takes to starve it
 	make_group 300
 	start_in_group --checkpoint-seconds 0.05
 	post_scan "$scan_dir"
@@ -109,7 +112,7 @@ test_a_job_that_starves_each_time_says_so() {
 	start_in_group --checkpoint-seconds 1000
 	post_scan "$scan_dir"
 	post_projections "$scan_dir"
-	post_job "${recipe/40/5000}"
+	post_job "$(recipe_of 5000)"
 	for i in 1 2 3; do
 		state_becomes running
 		starve
