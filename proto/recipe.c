@@ -207,7 +207,7 @@ static bool names_no_stage(const cJSON *value)
 
 /* The members of the document itself, and those whose objects are still to be read. */
 struct members {
-	const cJSON *stages[STAGES], *algorithms[ALGORITHM_COUNT], *patient, *labels, *send;
+	const cJSON *stages[STAGES], *algorithms[ALGORITHM_COUNT], *patient, *labels, *send, *where;
 };
 
 static int read_members(struct job_request *request, const cJSON *value, struct members *ret, struct error *err)
@@ -228,6 +228,7 @@ static int read_members(struct job_request *request, const cJSON *value, struct 
 	ret->patient = json_member(&reader, "patient", false);
 	ret->labels = json_member(&reader, "labels", false);
 	ret->send = json_member(&reader, "send", false);
+	ret->where = json_member(&reader, "where", false);
 	if (names_no_stage(value)) {
 		request->recipe.fdk.on = request->recipe.tv.on = true;
 		recipe_set_algorithm(&request->recipe, &algorithm_sart);
@@ -252,6 +253,8 @@ static int read_expanded(const cJSON *value, struct job_request *ret_request, st
 		code = labels_read(members.labels, "/labels", &request.labels, err);
 	if (code == 0)
 		code = sends_read(members.send, "/send", &request.send, err);
+	if (code == 0)
+		code = where_read(members.where, "/where", &request.where, err);
 	for (int i = 0; i < STAGES && code == 0; i++)
 		if (members.stages[i] != NULL)
 			code = stages[i].read(&request.recipe, members.stages[i], err);
@@ -398,7 +401,7 @@ bool job_request_same(const struct job_request *a, const struct job_request *b)
 	return strcmp(a->scan, b->scan) == 0 && a->priority == b->priority && patient_same(&a->patient, &b->patient) &&
 	       strcmp(a->labels != NULL ? a->labels : "", b->labels != NULL ? b->labels : "") == 0 &&
 	       strcmp(a->send != NULL ? a->send : "", b->send != NULL ? b->send : "") == 0 &&
-	       recipe_same(&a->recipe, &b->recipe);
+	       where_same(&a->where, &b->where) && recipe_same(&a->recipe, &b->recipe);
 }
 
 cJSON *job_request_json(const struct job_request *request)
@@ -409,6 +412,7 @@ cJSON *job_request_json(const struct job_request *request)
 	    add(document, "patient", patient_json(&request->patient)) &&
 	    (request->labels == NULL || add(document, "labels", cJSON_Parse(request->labels))) &&
 	    (request->send == NULL || add(document, "send", cJSON_Parse(request->send))) &&
+	    (where_is_any(&request->where) || add(document, "where", where_json(&request->where))) &&
 	    add_emit(document, &request->recipe) &&
 	    add(document, "priority", cJSON_CreateString(priority_names[request->priority])))
 		return document;

@@ -6,6 +6,7 @@
 #include "proto/labels.h"
 #include "proto/scan.h"
 #include "proto/send.h"
+#include "proto/where.h"
 
 enum priority { PRIORITY_ROUTINE, PRIORITY_URGENT, PRIORITY_STAT, PRIORITY_COUNT };
 extern const char *const priority_names[PRIORITY_COUNT];
@@ -15,8 +16,9 @@ extern const struct parameter priority_parameter; /* of struct job_request */
 struct job_request {
 	char scan[64];
 	enum priority priority;
-	char *labels;           /* JSON, owned; NULL for none */
-	char *send;             /* sends_text, owned; NULL: the job says nothing of it */
+	char *labels; /* JSON, owned; NULL for none */
+	char *send;   /* sends_text, owned; NULL: the job says nothing of it */
+	struct where where;
 	struct patient patient; /* of the scan, once resolved, unless the job says otherwise */
 	struct recipe recipe;   /* owned */
 };

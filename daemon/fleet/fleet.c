@@ -63,23 +63,23 @@ static bool has_number(const struct place *places, int count, long long number)
 	return false;
 }
 
-static bool is_unended(struct fleet *fleet, const char *id, enum priority *ret_priority)
+static bool is_unended(struct fleet *fleet, const char *id, struct job_facts *ret_facts)
 {
-	struct job_facts facts = {.ended = true};
 	struct error ignored;
 	struct job *job;
 
+	*ret_facts = (struct job_facts){.ended = true};
 	if (jobs_find(fleet->jobs, id, &job, &ignored) == 0) {
-		job_facts(job, &facts);
+		job_facts(job, ret_facts);
 		job_release(job);
 	}
-	*ret_priority = facts.priority;
-	return !facts.ended && !facts.cancel_asked;
+	return !ret_facts->ended && !ret_facts->cancel_asked;
 }
 
-static void add_offer(struct offer *offers, int *count, const char *job, enum priority priority)
+static void add_offer(struct offer *offers, int *count, const char *job, enum priority priority,
+		      const struct where *where)
 {
-	offers[*count] = (struct offer){.priority = (int)priority, .rank = *count};
+	offers[*count] = (struct offer){.priority = (int)priority, .rank = *count, .where = *where};
 	snprintf(offers[*count].job, sizeof(offers[*count].job), "%.16s", job);
 	(*count)++;
 }
@@ -95,7 +95,7 @@ static int take_claims(struct fleet *fleet, struct place *ret_places, int *ret_c
 	struct fleet_claim claims[OFFERS_MOST];
 	struct place spent[PLACES_MAX];
 	int count = 0, spent_count, code = ledger_claimed(fleet->ledger, claims, OFFERS_MOST, &count, err);
-	enum priority priority;
+	struct job_facts facts;
 	bool had;
 
 	*ret_count = 0;
@@ -104,9 +104,9 @@ static int take_claims(struct fleet *fleet, struct place *ret_places, int *ret_c
 		const struct fleet_claim *claim = &claims[i];
 		struct place *place = &ret_places[*ret_count];
 
-		if (!is_unended(fleet, claim->job, &priority))
+		if (!is_unended(fleet, claim->job, &facts))
 			continue;
-		add_offer(offers, offer_count, claim->job, priority);
+		add_offer(offers, offer_count, claim->job, facts.priority, &facts.where);
 		if (has_number(spent, spent_count, claim->number)) {
 			code = ledger_give_back(fleet->ledger, claim, &had, err);
 			continue;
@@ -169,7 +169,7 @@ static void add_queued(struct fleet *fleet, struct offer *offers, int *count, in
 	for (int i = 0; i < found && *count < OFFERS_MOST && places < PLACES_MAX; i++) {
 		if (is_offered(offers, *count, queued[i].id) || !is_worth(fleet, &queued[i], devices))
 			continue;
-		add_offer(offers, count, queued[i].id, queued[i].priority);
+		add_offer(offers, count, queued[i].id, queued[i].priority, &queued[i].where);
 		places++;
 	}
 }
@@ -314,6 +314,10 @@ static int least_priority(const struct load *load, int devices, bool *ret_pushes
 static int take_jobs(struct fleet *fleet, struct error *err)
 {
 	const int devices = count_devices(fleet, false);
+	struct worker_facts facts[PLACES_MAX + 65];
+	double memory[PLACES_MAX + 65];
+	const int memory_count = devices_memory(
+	    facts, supervise_workers(fleet->supervise, facts, (int)(sizeof(facts) / sizeof(facts[0]))), memory);
 	const bool due =
 	    clock_monotonic() >= fleet->renewed + (fleet->options.lease / 6 < LOOK ? fleet->options.lease / 6 : LOOK);
 	bool got = true, pushes;
@@ -337,7 +341,7 @@ static int take_jobs(struct fleet *fleet, struct error *err)
 		least = least_priority(&load, devices, &pushes);
 		if (least == PRIORITY_COUNT)
 			break;
-		code = ledger_claim(fleet->ledger, least, pushes ? MANNERS : 0, claim, &got, err);
+		code = ledger_claim(fleet->ledger, least, pushes ? MANNERS : 0, memory, memory_count, claim, &got, err);
 		if (code != 0 || !got)
 			break;
 		log_line(LEVEL_INFO, "job %s of host %s is claimed, claim %lld", claim->job, claim->owner,

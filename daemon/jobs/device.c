@@ -184,6 +184,15 @@ enum route device_route(struct supervise *supervise, struct worker *worker, enum
 	return route;
 }
 
+/* By the job's "where". */
+static bool may_run(const struct worker *worker, const struct where *where)
+{
+	const struct supervise *supervise = worker->supervise;
+
+	return (double)worker->info.bytes_total >= where->memory &&
+	       where_fits(where, supervise->options.remote.host, supervise->memory, supervise->memory_count);
+}
+
 bool device_fits(const void *context, const struct job_trial *trial)
 {
 	const struct worker *worker = context;
@@ -191,6 +200,8 @@ bool device_fits(const void *context, const struct job_trial *trial)
 
 	if (worker->remote || trial->place != 0)
 		return worker->remote && remote_fits(worker, trial);
+	if (!may_run(worker, trial->where))
+		return false;
 	if (worker->fallback)
 		return trial->processor || all_out(supervise);
 	if (trial->processor || worker->aside)
@@ -237,8 +248,44 @@ static void tend_processor(struct supervise *supervise)
 	}
 }
 
+bool devices_fit(const void *context, const struct job_trial *trial)
+{
+	const struct supervise *supervise = context;
+
+	for (int i = 0; i < supervise->memory_count; i++) {
+		if (supervise->memory[i] < trial->where->memory)
+			return false;
+	}
+	return true;
+}
+
+int devices_memory(const struct worker_facts *facts, int count, double ret_memory[])
+{
+	int devices = 0;
+
+	for (int i = 0; i < count && devices < WORKERS_MAX; i++) {
+		if (!facts[i].fallback && !facts[i].aside)
+			ret_memory[devices++] = (double)facts[i].bytes_total;
+	}
+	return devices;
+}
+
+static void tell_devices(struct supervise *supervise)
+{
+	struct worker_facts facts[WORKERS_MAX + 1];
+	double memory[WORKERS_MAX];
+	int count = devices_memory(facts, supervise_workers(supervise, facts, WORKERS_MAX + 1), memory);
+
+	if (count == supervise->memory_count && memcmp(memory, supervise->memory, (size_t)count * sizeof(*memory)) == 0)
+		return;
+	memcpy(supervise->memory, memory, (size_t)count * sizeof(*memory));
+	supervise->memory_count = count;
+	jobs_set_devices(supervise->jobs, supervise->options.remote.host, memory, count);
+}
+
 void devices_tend(struct supervise *supervise)
 {
+	tell_devices(supervise);
 	clear_asked(supervise);
 	if (supervise->options.fallback)
 		tend_processor(supervise);

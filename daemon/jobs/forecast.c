@@ -146,6 +146,12 @@ static double all_rest(const struct jobs *jobs, double now)
 	return seconds;
 }
 
+/* It is queued, and a device here will come to it. */
+static bool is_coming(const struct job *job)
+{
+	return job->record.state == JOB_QUEUED && job->hold.obstacle == JOB_UNHINDERED && !job->entry.elsewhere;
+}
+
 /* A queued job's seconds until a device is free for it. */
 static double wait_of(struct job *job, double now)
 {
@@ -154,7 +160,8 @@ static double wait_of(struct job *job, double now)
 
 	/* By priority, then by ticket. */
 	for (struct queue_entry *entry = jobs->queue.first; entry != NULL && entry != &job->entry; entry = entry->next)
-		ahead += whole(job_of_entry(entry)) * (1 - job_of_entry(entry)->record.fraction);
+		if (!entry->elsewhere)
+			ahead += whole(job_of_entry(entry)) * (1 - job_of_entry(entry)->record.fraction);
 	return jobs->running > 1 ? ahead / jobs->running : ahead;
 }
 
@@ -168,7 +175,7 @@ double job_start_in(struct job *job)
 	double now = clock_monotonic(), seconds = NAN;
 
 	pthread_mutex_lock(&job->jobs->lock);
-	if (job->record.state == JOB_QUEUED && job->hold.obstacle == JOB_UNHINDERED)
+	if (is_coming(job))
 		seconds = wait_of(job, now);
 	pthread_mutex_unlock(&job->jobs->lock);
 	return known(seconds);
@@ -181,7 +188,7 @@ double job_eta(struct job *job)
 	pthread_mutex_lock(&job->jobs->lock);
 	if (job->record.state == JOB_RUNNING)
 		seconds = rest(job, now);
-	else if (job->record.state == JOB_QUEUED && job->hold.obstacle == JOB_UNHINDERED)
+	else if (is_coming(job))
 		seconds = wait_of(job, now) + whole(job) * (1 - job->record.fraction);
 	pthread_mutex_unlock(&job->jobs->lock);
 	return known(seconds);

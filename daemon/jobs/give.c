@@ -253,7 +253,8 @@ void supervise_preempt(struct supervise *supervise)
 	int of[SLOTS_MAX], busy, idle, victim;
 	double now = clock_monotonic(), since = supervise_arrivals_since(supervise, now);
 	bool arriving;
-	struct job *waiting = jobs_arriving(supervise->jobs, since, NULL, &arriving);
+	const struct job_filter any = {.fits = devices_fit, .context = supervise};
+	struct job *waiting = jobs_arriving(supervise->jobs, since, &any, &arriving);
 	struct job_facts facts = {.priority = PRIORITY_ROUTINE};
 
 	if (waiting != NULL)

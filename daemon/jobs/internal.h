@@ -85,7 +85,16 @@ struct jobs {
 	struct job_rate rate[JOB_RATES];
 	int rates, oldest_rate;
 	int running; /* jobs in this state */
+	/* jobs_set_devices */
+	bool devices_known;
+	char host[WHERE_HOST_SIZE];
+	double device_bytes[WHERE_DEVICES_MOST];
+	int devices;
 };
+
+/* ---- jobs/offer.c ---- */
+/* Whether the job may run here, by its "where", stands in its entry. jobs->lock is held. */
+void job_place(struct job *job);
 
 /* The job whose place in the queue this is. */
 struct job *job_of_entry(const struct queue_entry *entry);

@@ -30,6 +30,7 @@ static struct job *job_new(struct jobs *jobs, struct job_record *record)
 	memcpy(job->id, record->id, sizeof(job->id));
 	memcpy(job->scan, record->scan, sizeof(job->scan));
 	job->references = 1;
+	job->trial.where = &job->request.where;
 	watch_list_init(&job->watchers);
 	return job;
 }
@@ -443,6 +444,7 @@ static int insert_job(struct jobs *jobs, struct job *job, struct stored_scan *sc
 		return code;
 	pthread_mutex_lock(&jobs->lock);
 	job->entry.client = &job->client->share;
+	job_place(job);
 	array_insert(jobs, job);
 	job->references++;
 	job_share(job);
@@ -636,6 +638,7 @@ void job_facts(struct job *job, struct job_facts *ret)
 	ret->attended = job->record.attended;
 	ret->priority = job->record.priority;
 	ret->mu_water = job->record.mu_water;
+	ret->where = job->request.where;
 	pthread_mutex_unlock(&job->jobs->lock);
 }
 

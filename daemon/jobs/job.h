@@ -103,6 +103,7 @@ struct job_facts {
 	bool cancel_asked, attended;
 	enum priority priority;
 	double mu_water; /* 1/mm */
+	struct where where;
 };
 void job_facts(struct job *job, struct job_facts *ret);
 
@@ -139,10 +140,12 @@ bool job_is_mirror(const struct job_record *record);
 struct job_offer {
 	char id[ID_SIZE], scan[ID_SIZE];
 	enum priority priority;
+	struct where where;
 };
 /*
- * Queued jobs that another host may compute, in the order of the queue behind the first `skip` of it, at most `most`.
- * Returns how many. Not those that are held, have a checkpoint, are another daemon's, or stay.
+ * Queued jobs that another host may compute, in the order of the queue behind the first `skip` of it that may run here,
+ * at most `most`. Returns how many. Not those that are held or another daemon's, and not those that may run here and
+ * have a checkpoint or stay.
  */
 int jobs_offers(struct jobs *jobs, int skip, struct job_offer *ret_offers, int most);
 /* From now on the job is computed here alone; in memory only. */
@@ -170,11 +173,12 @@ int jobs_promote(struct jobs *jobs, struct error *err);
  * daemon every device is worth a try.
  */
 struct job_trial {
-	int place;               /* slot of the host that has claimed it (supervise.h), 0: none */
-	int given_back;          /* runs that other hosts have begun and not ended */
-	unsigned long long left; /* bit for each worker whose device the job has left */
-	int worker, deaths;      /* runs lost on this one's device without a checkpoint between them */
-	bool processor;          /* it goes on with the processor, by --fallback cpu */
+	const struct where *where; /* the job's own, constant */
+	int place;                 /* slot of the host that has claimed it (supervise.h), 0: none */
+	int given_back;            /* runs that other hosts have begun and not ended */
+	unsigned long long left;   /* bit for each worker whose device the job has left */
+	int worker, deaths;        /* runs lost on this one's device without a checkpoint between them */
+	bool processor;            /* it goes on with the processor, by --fallback cpu */
 };
 /* A test of jobs that a worker could take; where one is asked for, NULL lets all of them pass. */
 struct job_filter {
@@ -205,13 +209,26 @@ void job_reconstructed(struct job *job, int count);
  * (clock_monotonic) and before the disk has `space` bytes free; it keeps its place in the queue, and others go before
  * it. Returns how often in a row it was held for this obstacle.
  */
-enum job_obstacle { JOB_UNHINDERED, JOB_NO_SPACE, JOB_DISK_TROUBLE, JOB_NO_MEMORY, JOB_OBSTACLE_COUNT };
-extern const char *const job_obstacle_names[JOB_OBSTACLE_COUNT]; /* as in `waiting_for`: "space", "disk", "memory" */
+enum job_obstacle {
+	JOB_UNHINDERED,
+	JOB_NO_SPACE,
+	JOB_DISK_TROUBLE,
+	JOB_NO_MEMORY,
+	JOB_NO_HOST, /* by its "where" it may have no device here; it is not held for that */
+	JOB_OBSTACLE_COUNT
+};
+/* As in `waiting_for`: "space", "disk", "memory", "host". */
+extern const char *const job_obstacle_names[JOB_OBSTACLE_COUNT];
 int job_hold(struct job *job, enum job_obstacle obstacle, double until, unsigned long long space);
 /* Releases held jobs whose time has come and for which the disk has room; true while others are still held. */
 bool jobs_review_holds(struct jobs *jobs, double now, unsigned long long space);
 enum job_obstacle job_obstacle(struct job *job); /* any thread */
 struct job_trial *job_trial(struct job *job);
+/*
+ * This host's name and the bytes that its devices have, of which each job's "where" says whether it may run here; until
+ * it is called any job may.
+ */
+void jobs_set_devices(struct jobs *jobs, const char *host, const double *memory, int count);
 /* A job that has not ended waits for the processor. */
 bool jobs_want_processor(struct jobs *jobs);
 

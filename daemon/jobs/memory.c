@@ -38,13 +38,19 @@ static int memory_needed(const char *backend, const struct scan *scan, const str
 	return 0;
 }
 
-int supervise_check_memory(struct supervise *supervise, const struct scan *scan, const struct recipe *recipe,
+int supervise_check_memory(struct supervise *supervise, const struct scan *scan, const struct job_request *request,
 			   struct recon_memory *ret_memory, struct error *err)
 {
+	const struct recipe *recipe = &request->recipe;
 	struct worker_facts facts[SLOTS_MAX];
 	struct recon_memory memory, best = {0};
 	size_t most = 0;
 	int count = supervise_workers(supervise, facts, SLOTS_MAX), code;
+	double bytes[WORKERS_MAX];
+
+	/* What other hosts have, they know alone. */
+	if (!where_fits(&request->where, supervise->options.remote.host, bytes, devices_memory(facts, count, bytes)))
+		count = 0;
 
 	for (int i = 0; i < count; i++) {
 		if (facts[i].bytes_free == 0)

@@ -16,11 +16,12 @@ void job_stay(struct job *job)
 	pthread_mutex_unlock(&job->jobs->lock);
 }
 
-/* A checkpoint lies here, and a run elsewhere would begin without it. */
+/* A checkpoint lies here, and a run elsewhere would begin without it: better so than never. */
 static bool may_go(const struct job *job)
 {
-	return !job->entry.held && !job->stays && job->record.checkpoint == 0 && !job_is_mirror(&job->record) &&
-	       job->unreadable.code == 0;
+	const bool home = !job->entry.elsewhere && (job->stays || job->record.checkpoint != 0);
+
+	return !job->entry.held && !home && !job_is_mirror(&job->record) && job->unreadable.code == 0;
 }
 
 int jobs_offers(struct jobs *jobs, int skip, struct job_offer *ret_offers, int most)
@@ -31,12 +32,39 @@ int jobs_offers(struct jobs *jobs, int skip, struct job_offer *ret_offers, int m
 	for (const struct queue_entry *entry = jobs->queue.first; entry != NULL && count < most; entry = entry->next) {
 		const struct job *job = job_of_entry(entry);
 
-		if (skip-- > 0 || !may_go(job))
+		/* The first go to devices here, but for those that may not. */
+		if ((!entry->elsewhere && skip-- > 0) || !may_go(job))
 			continue;
 		memcpy(ret_offers[count].id, job->id, sizeof(job->id));
 		memcpy(ret_offers[count].scan, job->scan, sizeof(job->scan));
+		ret_offers[count].where = job->request.where;
 		ret_offers[count++].priority = job->record.priority;
 	}
 	pthread_mutex_unlock(&jobs->lock);
 	return count;
+}
+
+void job_place(struct job *job)
+{
+	const struct jobs *jobs = job->jobs;
+	const struct where *where = &job->request.where;
+
+	job->entry.elsewhere = job->entry.choosy = false;
+	if (where_is_any(where) || !jobs->devices_known)
+		return;
+	job->entry.elsewhere = !where_fits(where, jobs->host, jobs->device_bytes, jobs->devices);
+	for (int i = 0; i < jobs->devices; i++)
+		job->entry.choosy |= jobs->device_bytes[i] < where->memory;
+}
+
+void jobs_set_devices(struct jobs *jobs, const char *host, const double *memory, int count)
+{
+	pthread_mutex_lock(&jobs->lock);
+	jobs->devices_known = true;
+	snprintf(jobs->host, sizeof(jobs->host), "%s", host);
+	jobs->devices = count < WHERE_DEVICES_MOST ? count : WHERE_DEVICES_MOST;
+	memcpy(jobs->device_bytes, memory, (size_t)jobs->devices * sizeof(*memory));
+	for (int i = 0; i < jobs->count; i++)
+		job_place(jobs->all[i]);
+	pthread_mutex_unlock(&jobs->lock);
 }

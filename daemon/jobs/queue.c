@@ -83,12 +83,16 @@ int queue_position(struct queue *queue, const struct queue_entry *entry)
 		return 0;
 	for (struct queue_entry *other = queue->first; other != NULL; other = other->next) {
 		other->client->rank = 0;
+		if (other->elsewhere && other != entry)
+			continue;
 		own += other->priority == entry->priority && other->client == entry->client &&
 		       other->ticket <= entry->ticket;
 	}
 	for (struct queue_entry *other = queue->first; other != NULL; other = other->next) {
 		int rank;
 
+		if (other->elsewhere && other != entry)
+			continue;
 		if (other->priority != entry->priority) {
 			position += other->priority > entry->priority;
 			continue;
@@ -142,10 +146,18 @@ static int least_of(const struct queue_running *running, int count, enum priorit
 	return least;
 }
 
+/* The first from `entry` on that may push another job out. */
+static const struct queue_entry *pushing(const struct queue_entry *entry)
+{
+	while (entry != NULL && (entry->held || entry->elsewhere || entry->choosy))
+		entry = entry->next;
+	return entry;
+}
+
 int queue_victim(const struct queue *queue, const enum priority *arriving, const struct queue_running *running,
 		 int count, int idle)
 {
-	const struct queue_entry *entry = not_held(queue->first);
+	const struct queue_entry *entry = pushing(queue->first);
 	int coming = idle;
 
 	for (int i = 0; i < count; i++)
@@ -159,7 +171,7 @@ int queue_victim(const struct queue *queue, const enum priority *arriving, const
 			arriving = NULL;
 		} else {
 			next = entry->priority;
-			entry = not_held(entry->next);
+			entry = pushing(entry->next);
 		}
 		if (coming-- <= 0)
 			return least_of(running, count, next);

@@ -28,7 +28,9 @@ struct queue_entry {
 	enum priority priority;
 	long long ticket;
 	bool queued;
-	bool held;                           /* its time has not come: it keeps its place, others go before it */
+	bool held;      /* its time has not come: it keeps its place, others go before it */
+	bool elsewhere; /* it may have no device here: nobody waits for it, and it pushes nobody out */
+	bool choosy;    /* it may have some of the devices here alone: it pushes nobody out, the next might not fit */
 	struct queue_entry *previous, *next; /* the queue's */
 };
 

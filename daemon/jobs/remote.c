@@ -178,6 +178,21 @@ bool remote_fits(const struct worker *worker, const struct job_trial *trial)
 	return trial->place == worker->index && !worker->spent;
 }
 
+/*
+ * Whether the job itself is at fault, this host finds out on its own devices; where it may have none of them, it fails
+ * with what other hosts have said time and again.
+ */
+static enum worker_end end_failed(const struct worker *worker, struct job_trial *trial)
+{
+	const struct supervise *supervise = worker->supervise;
+
+	if (!where_fits(trial->where, supervise->options.remote.host, supervise->memory, supervise->memory_count) &&
+	    ++trial->given_back >= GIVEN_BACK_MOST)
+		return END_OTHER;
+	job_stay(worker->job);
+	return END_MADE_ROOM;
+}
+
 enum worker_end remote_end(const struct worker *worker, enum worker_end end, int code)
 {
 	struct job_trial *trial = job_trial(worker->job);
@@ -194,9 +209,7 @@ enum worker_end remote_end(const struct worker *worker, enum worker_end end, int
 		/* What the daemon has asked for ends as it always does. */
 		if (code == ERR_CANCELLED)
 			return end;
-		/* Whether the job itself is at fault, this host finds out on its own devices. */
-		job_stay(worker->job);
-		return END_MADE_ROOM;
+		return end_failed(worker, trial);
 	default:
 		return end;
 	}

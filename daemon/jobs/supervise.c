@@ -508,7 +508,10 @@ static void copy_remote(struct supervise *supervise, const struct remote_options
 	const char **texts[] = {&copy->program, &copy->token_file, &copy->authorities, &copy->host};
 
 	*copy = *options;
-	for (size_t i = 0; i < sizeof(texts) / sizeof(texts[0]) && options->program != NULL; i++) {
+	copy->host = options->host != NULL ? options->host : "";
+	for (size_t i = 0; i < sizeof(texts) / sizeof(texts[0]); i++) {
+		if (*texts[i] == NULL)
+			continue;
 		snprintf(supervise->remote[i], sizeof(supervise->remote[i]), "%s", *texts[i]);
 		*texts[i] = supervise->remote[i];
 	}
@@ -549,6 +552,7 @@ int supervise_start(struct jobs *jobs, const struct supervise_options *options, 
 	if (supervise == NULL)
 		return error_set_errno(err, ENOMEM, "supervisor");
 	supervise->jobs = jobs;
+	supervise->memory_count = -1;
 	supervise->stop_by = NEVER;
 	set_options(supervise, options);
 	/* A worker makes them hardly faster than a processor hashes them. */

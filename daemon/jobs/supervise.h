@@ -33,7 +33,7 @@ struct remote_options {
 	const char *program;     /* path of cbct; NULL: no job goes anywhere */
 	const char *token_file;  /* shown to the other host; "": none */
 	const char *authorities; /* who signs the other host's certificate; "": whom the system trusts */
-	const char *host;        /* the name of this one in the fleet */
+	const char *host;        /* the name of this one, in the fleet where it is in one; NULL: it has none */
 	double lease;            /* s without an answer after which a host is lost */
 };
 
@@ -72,7 +72,7 @@ bool supervise_ready(struct supervise *supervise);
  * numbers, pointer "/grid/size", when none of them could ever run it. Passes
  * while no worker has said yet what it has: the worker asks again at the start.
  */
-int supervise_check_memory(struct supervise *supervise, const struct scan *scan, const struct recipe *recipe,
+int supervise_check_memory(struct supervise *supervise, const struct scan *scan, const struct job_request *request,
 			   struct recon_memory *ret_memory, struct error *err);
 
 /*
@@ -121,6 +121,8 @@ struct worker_facts {
  * runs never is (watchdog.h), does not answer. Nobody has to be killed for that to be told.
  */
 bool worker_answers(const struct worker_facts *facts);
+/* Bytes of each device that is given jobs, of the processor's only where it is one; returns how many they are. */
+int devices_memory(const struct worker_facts *facts, int count, double ret_memory[]);
 /* Fills at most `most` entries, returns how many there are; those of other hosts are none of them. */
 int supervise_workers(struct supervise *supervise, struct worker_facts *ret_facts, int most);
 /*

@@ -12,7 +12,7 @@
 #include "proto/durable.h"
 #include "proto/json.h"
 
-const char *const job_obstacle_names[JOB_OBSTACLE_COUNT] = {"", "space", "disk", "memory"};
+const char *const job_obstacle_names[JOB_OBSTACLE_COUNT] = {"", "space", "disk", "memory", "host"};
 
 static int promote(struct jobs *jobs, struct job *job, struct error *err)
 {
@@ -226,6 +226,8 @@ enum job_obstacle job_obstacle(struct job *job)
 
 	pthread_mutex_lock(&job->jobs->lock);
 	obstacle = job->entry.held ? job->hold.obstacle : JOB_UNHINDERED;
+	if (job->entry.elsewhere && (job->record.state == JOB_WAITING || job->record.state == JOB_QUEUED))
+		obstacle = JOB_NO_HOST;
 	pthread_mutex_unlock(&job->jobs->lock);
 	return obstacle;
 }

@@ -131,6 +131,8 @@ struct supervise {
 
 	double processor_rate;            /* s that the processor took for an iteration, by `work`; 0: not known */
 	struct worker workers[SLOTS_MAX]; /* the thread's own, as the one before */
+	double memory[WORKERS_MAX];       /* devices_memory, as the jobs were told of last; the thread's own */
+	int memory_count;                 /* -1: not yet */
 	double dispatch_at;               /* monotonic; the thread's own */
 	double review_at;                 /* monotonic: when jobs that are held are looked at, 0: none; its own */
 	double stop_by;                   /* monotonic: the stop's end, NEVER before it; the thread's own */
@@ -196,7 +198,10 @@ void device_clear(struct supervise *supervise, struct worker *worker, const char
 enum route device_route(struct supervise *supervise, struct worker *worker, enum worker_end end);
 /* Jobs that this worker may be given. */
 bool device_fits(const void *worker, const struct job_trial *trial);
-/* Carries out what operators have asked for; starts the processor's worker when it is needed, and ends it after. */
+/* Whether every device here that is given jobs has the memory that a job wants. */
+bool devices_fit(const void *supervise, const struct job_trial *trial);
+/* Tells jobs what devices there are; carries out what operators have asked for; starts the processor's worker when it
+ * is needed, and ends it after. */
 void devices_tend(struct supervise *supervise);
 /* The job begins on the processor though it was meant for another device: its document says so. */
 void device_tell_fallback(struct supervise *supervise, struct worker *worker, int iterations);

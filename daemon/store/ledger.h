@@ -6,14 +6,15 @@
 
 #include "core/error.h"
 #include "daemon/id.h"
+#include "proto/where.h"
 
 /*
  * The ledger of a fleet: the schema cbctd_fleet_NAME of a PostgreSQL database, with what several daemons must agree on,
  * which jobs may be computed by another host than their owner, and which host has which of them.
  *
  *   hosts   a row for each daemon: name, address of its API, when it was last seen
- *   offers  a row for each job that others may take: owner, job, priority, place in its owner's queue, and once it is
- *           claimed the taker, the number of the claim and the end of its lease
+ *   offers  a row for each job that others may take: owner, job, priority, place in its owner's queue, where it may
+ * run, and once it is claimed the taker, the number of the claim and the end of its lease
  *
  * A claim is one statement (FOR UPDATE SKIP LOCKED): it has a number that grows over the whole fleet and is never given
  * twice, and a lease that ends by the database's clock; no host's clock is ever compared with another's. What is said
@@ -41,6 +42,7 @@ struct offer {
 	char job[ID_SIZE];
 	int priority; /* enum priority */
 	int rank;     /* place among its owner's offers, from 0: so owners take turns */
+	struct where where;
 };
 
 struct fleet_claim {
@@ -73,11 +75,11 @@ int ledger_claimed(struct ledger *ledger, struct fleet_claim *ret_claims, int mo
 /* ---- of a taker ---- */
 /*
  * Claims an offer of another owner of at least that priority that has been there for `age` s, of owners that were seen
- * within a lease: the highest priority, then the first in its owner's queue, then the oldest. *ret_got false: there is
- * none.
+ * within a lease, and that may run on this host, whose devices have memory[devices] bytes (where_fits): the highest
+ * priority, then the first in its owner's queue, then the oldest. *ret_got false: there is none.
  */
-int ledger_claim(struct ledger *ledger, int least, double age, struct fleet_claim *ret_claim, bool *ret_got,
-		 struct error *err) LEDGER_WEAK;
+int ledger_claim(struct ledger *ledger, int least, double age, const double *memory, int devices,
+		 struct fleet_claim *ret_claim, bool *ret_got, struct error *err) LEDGER_WEAK;
 /*
  * The leases of all claims of this taker begin anew, unless another has claimed the offer, or its owner was not seen
  * for twenty leases: one that starts again within that time finds what was computed meanwhile. Gives them, at most

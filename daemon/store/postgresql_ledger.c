@@ -47,7 +47,7 @@ int ledger_check(const struct ledger_options *options, struct error *err)
 /* One daemon at a time makes what is missing: CREATE ... IF NOT EXISTS of two sessions may collide. */
 static int make_tables(struct ledger *ledger, struct error *err)
 {
-	char sql[1600];
+	char sql[2000];
 	struct error ignored;
 	int code;
 
@@ -60,6 +60,10 @@ static int make_tables(struct ledger *ledger, struct error *err)
 		 "CREATE TABLE IF NOT EXISTS offers (owner text NOT NULL, job text NOT NULL, priority bigint NOT NULL,"
 		 " rank bigint NOT NULL, since timestamptz NOT NULL DEFAULT now(), taker text, number bigint,"
 		 " until timestamptz, PRIMARY KEY (owner, job));"
+		 /* Of a ledger that was made before jobs said where they may run. */
+		 "ALTER TABLE offers ADD COLUMN IF NOT EXISTS host text NOT NULL DEFAULT '',"
+		 " ADD COLUMN IF NOT EXISTS memory double precision NOT NULL DEFAULT 0,"
+		 " ADD COLUMN IF NOT EXISTS devices bigint NOT NULL DEFAULT 0;"
 		 "COMMIT",
 		 ledger->schema, ledger->schema);
 	code = session_execute(&ledger->session, sql, NULL, err);
@@ -219,6 +223,9 @@ static char *print_offers(const struct offer *offers, int count)
 		cJSON_AddStringToObject(row, "job", offers[i].job);
 		cJSON_AddNumberToObject(row, "priority", offers[i].priority);
 		cJSON_AddNumberToObject(row, "rank", offers[i].rank);
+		cJSON_AddStringToObject(row, "host", offers[i].where.host);
+		cJSON_AddNumberToObject(row, "memory", offers[i].where.memory);
+		cJSON_AddNumberToObject(row, "devices", (double)offers[i].where.devices);
 		cJSON_AddItemToArray(list, row);
 	}
 	text = list == NULL || cJSON_GetArraySize(list) != count ? NULL : json_print(list, NULL);
@@ -236,17 +243,18 @@ int ledger_offer(struct ledger *ledger, const struct offer *offers, int count, s
 	if (text == NULL)
 		return error_set_errno(err, ENOMEM, "list of %d offers", count);
 	values[1] = text_value(text);
-	code = session_run(&ledger->session,
-			   "WITH mine AS (SELECT * FROM json_to_recordset($2::json)"
-			   " AS row (job text, priority bigint, rank bigint)),"
-			   " gone AS (DELETE FROM offers WHERE owner = $1::text AND job NOT IN (SELECT job FROM mine)"
-			   " RETURNING job),"
-			   " there AS (INSERT INTO offers (owner, job, priority, rank)"
-			   " SELECT $1::text, job, priority, rank FROM mine"
-			   " ON CONFLICT (owner, job) DO UPDATE SET priority = excluded.priority, rank = excluded.rank"
-			   " WHERE (offers.priority, offers.rank) IS DISTINCT FROM (excluded.priority, excluded.rank)"
-			   " RETURNING job) SELECT job FROM there UNION ALL SELECT job FROM gone LIMIT 1",
-			   values, 2, note_change, &changed, err);
+	code =
+	    session_run(&ledger->session,
+			"WITH mine AS (SELECT * FROM json_to_recordset($2::json)"
+			" AS row (job text, priority bigint, rank bigint, host text, memory float8, devices bigint)),"
+			" gone AS (DELETE FROM offers WHERE owner = $1::text AND job NOT IN (SELECT job FROM mine)"
+			" RETURNING job),"
+			" there AS (INSERT INTO offers (owner, job, priority, rank, host, memory, devices)"
+			" SELECT $1::text, job, priority, rank, host, memory, devices FROM mine"
+			" ON CONFLICT (owner, job) DO UPDATE SET priority = excluded.priority, rank = excluded.rank"
+			" WHERE (offers.priority, offers.rank) IS DISTINCT FROM (excluded.priority, excluded.rank)"
+			" RETURNING job) SELECT job FROM there UNION ALL SELECT job FROM gone LIMIT 1",
+			values, 2, note_change, &changed, err);
 	free(text);
 	return code == 0 && changed ? tell_others(ledger, err) : code;
 }
@@ -265,24 +273,41 @@ int ledger_claimed(struct ledger *ledger, struct fleet_claim *ret_claims, int mo
 	return code;
 }
 
-int ledger_claim(struct ledger *ledger, int least, double age, struct fleet_claim *ret_claim, bool *ret_got,
-		 struct error *err)
+/* As PostgreSQL writes an array. */
+static void print_array(const double *numbers, int count, char *ret_text, size_t size)
 {
-	const struct value values[] = {text_value(ledger->host), integer_value(least), seconds_value(ledger->lease),
-				       seconds_value(age)};
+	size_t length = (size_t)snprintf(ret_text, size, "{");
+
+	for (int i = 0; i < count; i++)
+		length += (size_t)snprintf(ret_text + length, size - length, "%s%.0f", i > 0 ? "," : "", numbers[i]);
+	snprintf(ret_text + length, size - length, "}");
+}
+
+int ledger_claim(struct ledger *ledger, int least, double age, const double *memory, int devices,
+		 struct fleet_claim *ret_claim, bool *ret_got, struct error *err)
+{
+	char array[WHERE_DEVICES_MOST * 24 + 3];
+	struct value values[] = {text_value(ledger->host), integer_value(least), seconds_value(ledger->lease),
+				 seconds_value(age), text_value("")};
 	struct claims claims = {.claims = ret_claim, .most = 1};
-	int code = session_run(
+	int code;
+
+	print_array(memory, devices < WHERE_DEVICES_MOST ? devices : WHERE_DEVICES_MOST, array, sizeof(array));
+	values[4] = text_value(array);
+	code = session_run(
 	    &ledger->session,
 	    "WITH first AS (SELECT o.owner, o.job FROM offers o JOIN hosts h ON h.name = o.owner"
 	    " WHERE (o.until IS NULL OR o.until <= now()) AND o.owner <> $1::text AND o.priority >= $2::bigint"
 	    " AND o.since <= now() - $4::float8 * interval '1 second'"
 	    " AND h.seen > now() - $3::float8 * interval '1 second'"
+	    " AND o.host IN ('', $1::text) AND (o.memory = 0 AND o.devices <= 1 OR (SELECT count(*)"
+	    " FROM unnest($5::float8[]) AS bytes WHERE bytes >= o.memory) >= greatest(o.devices, 1))"
 	    " ORDER BY o.priority DESC, o.rank, o.since FOR UPDATE OF o SKIP LOCKED LIMIT 1)"
 	    " UPDATE offers SET taker = $1::text, number = nextval('claims'),"
 	    " until = now() + $3::float8 * interval '1 second'"
 	    " FROM first, hosts WHERE offers.owner = first.owner AND offers.job = first.job AND hosts.name = $1::text"
 	    " RETURNING " CLAIM_COLUMNS("offers") ", hosts.url, 0::bigint",
-	    values, 4, note_claim, &claims, err);
+	    values, 5, note_claim, &claims, err);
 
 	*ret_got = claims.count > 0;
 	return code == 0 && *ret_got ? tell_others(ledger, err) : code;

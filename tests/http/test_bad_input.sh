@@ -167,6 +167,14 @@ test_jobs() {
 422|/tv/step|.tv = {step: -0.1}
 422|/tv/unit|.tv = {unit: 0}
 400|/priority|.priority = "now"
+400|/where|.where = "here"
+400|/where/host|.where = {host: ""}
+400|/where/host|.where = {host: "a/b"}
+422|/where/memory|.where = {memory: -1}
+400|/where/memory|.where = {memory: 0.5}
+422|/where/devices|.where = {devices: 0}
+422|/where/devices|.where = {devices: 65}
+400|/where/rack|.where = {rack: 7}
 400|/emit/0|.emit = ["everything"]
 TABLE
 	# the job before all of these is still there, untouched

@@ -125,7 +125,7 @@ empty_ledger() {
 test_the_ledger_gives_each_offer_to_one_and_knows_old_numbers() {
 	need_server
 	CBCT_TEST_CATALOGUE=$database "$BUILD/unit" ledger >"$work/unit" 2>&1 || { cat "$work/unit"; fail "the unit tests"; }
-	grep -q '^100%: Checks: 8' "$work/unit" || fail "all of them passed: $(cat "$work/unit")"
+	grep -q '^100%: Checks: 9' "$work/unit" || fail "all of them passed: $(cat "$work/unit")"
 }
 
 test_a_job_is_computed_by_another_host_to_the_same_bits() {
@@ -313,6 +313,68 @@ test_a_cancel_reaches_the_other_host_and_an_urgent_job_goes_first_there() {
 	wait_job cancelled 30
 	nothing_left a
 	empty_ledger
+}
+
+# where JSON JOB: the job with that "where"
+where() { printf '%s' "${2/\"fdk\"/\"where\": $1, \"fdk\"}"; }
+waits_for_a_host() {
+	req GET "/v1/jobs/$job"
+	expect_json '.state == "queued" and .waiting_for == ["host"] and .start_s == null and .eta_s == null'
+}
+test_a_job_runs_where_it_says_and_waits_for_a_host_that_is_not_there() {
+	local absent
+	begin
+	undisturbed "$scan_dir" "$small" small
+	taker a --device-memory 400000000
+	start_host c --device-memory 300000000
+	at c
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	# The host that it names, and the one with the memory, though the owner's own device has nothing to do.
+	post_job "$(where '{"host": "a"}' "$small")"
+	wait_job succeeded
+	expect_json '(.device | startswith("a: ")) and .where == {host: "a", memory: null, devices: null}'
+	same_bits small
+	post_job "$(where '{"memory": 350000000}' "$small")"
+	wait_job succeeded
+	expect_json '(.device | startswith("a: ")) and .where.memory == 350000000'
+	post_job "$(where '{"host": "c", "memory": 300000000, "devices": 1}' "$small")"
+	wait_job succeeded
+	expect_json '.device | startswith("a: ") | not'
+	# Nobody is that host: the job waits, others go by, and another start knows it still.
+	post_job "$(where '{"host": "b"}' "${small/\"fdk\"/\"priority\": \"stat\", \"fdk\"}")"
+	absent=$job
+	waits_for_a_host
+	post_job "$(where '{"devices": 2}' "$small")"
+	waits_for_a_host
+	req DELETE "/v1/jobs/$job"
+	expect_status 202
+	post_job "$small"
+	wait_job succeeded
+	expect_json '.where == null and (.device | startswith("a: ") | not)'
+	job=$absent
+	stop_host c
+	start_host c --device-memory 300000000
+	at c
+	waits_for_a_host
+	expect_json '.where.host == "b"'
+	taker b
+	at c
+	wait_job succeeded
+	expect_json '.device | startswith("b: ")'
+	same_bits small
+	nothing_left a
+	nothing_left b
+	# A cart that is in no fleet has its name all the same.
+	stop_hosts
+	start_daemon --threads 1 --fleet-host cart
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "$(where '{"host": "cart"}' "$small")"
+	wait_job succeeded
+	post_job "$(where '{"host": "b"}' "$small")"
+	waits_for_a_host
+	stop_daemon
 }
 
 test_tokens_and_tls_between_daemons() {

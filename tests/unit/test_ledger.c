@@ -23,6 +23,9 @@ enum { HOSTS = 3, TAKERS = 12, JOBS = 240 };
 static const char *database;
 static char fleet[32];
 static struct ledger *hosts[HOSTS];
+/* Of whoever claims. */
+static double device_bytes[] = {8e9, 24e9};
+static int device_count;
 
 static struct ledger_options options_of(const char *host, double lease)
 {
@@ -82,7 +85,8 @@ static const char *claim(struct ledger *ledger, int least, struct fleet_claim *r
 	struct error err = {0};
 	bool got = true;
 
-	ck_assert_msg(ledger_claim(ledger, least, 0, ret_claim, &got, &err) == 0, "%s", err.text);
+	ck_assert_msg(ledger_claim(ledger, least, 0, device_bytes, device_count, ret_claim, &got, &err) == 0, "%s",
+		      err.text);
 	return got ? ret_claim->job : "";
 }
 
@@ -151,6 +155,47 @@ START_TEST(the_highest_priority_goes_first_and_owners_take_turns)
 	ck_assert_int_eq(claimed(hosts[1], claims), 2);
 	ck_assert_int_eq(renew(hosts[2], claims), 5);
 	ck_assert_int_eq(renew(hosts[1], claims), 0);
+	disband();
+}
+END_TEST
+
+START_TEST(an_offer_goes_where_it_may_run)
+{
+	const struct {
+		struct where where;
+		int devices; /* of host b */
+		bool goes;
+	} cases[] = {
+	    {{.host = "c"}, 2, false},
+	    {{.host = "b"}, 0, true},
+	    {{.host = "nobody"}, 2, false},
+	    {{.memory = 8e9}, 0, false},
+	    {{.memory = 8e9}, 1, true},
+	    {{.memory = 24e9}, 1, false},
+	    {{.memory = 24e9}, 2, true},
+	    {{.memory = 24e9 + 1}, 2, false},
+	    {{.devices = 1}, 0, true},
+	    {{.devices = 2}, 1, false},
+	    {{.devices = 2}, 2, true},
+	    {{.memory = 24e9, .devices = 2}, 2, false},
+	    {{.host = "b", .memory = 8e9, .devices = 2}, 2, true},
+	    {{.host = "c", .memory = 8e9, .devices = 2}, 2, false},
+	};
+	struct fleet_claim taken_claim;
+
+	form_fleet(60);
+	for (size_t i = 0; i < sizeof(cases) / sizeof(cases[0]); i++) {
+		struct offer one = offer_of("a0", 0, 0);
+
+		one.where = cases[i].where;
+		device_count = cases[i].devices;
+		offer(hosts[0], &one, 1);
+		ck_assert_msg(strcmp(claim(hosts[1], 0, &taken_claim), cases[i].goes ? "a0" : "") == 0, "case %zu", i);
+		/* The rule is one, in the database and here. */
+		ck_assert(where_fits(&one.where, "b", device_bytes, device_count) == cases[i].goes);
+		offer(hosts[0], NULL, 0);
+	}
+	device_count = 0;
 	disband();
 }
 END_TEST
@@ -359,6 +404,7 @@ Suite *ledger_suite(void)
 	}
 	tcase_set_timeout(tests, 120);
 	tcase_add_test(tests, the_highest_priority_goes_first_and_owners_take_turns);
+	tcase_add_test(tests, an_offer_goes_where_it_may_run);
 	tcase_add_test(tests, nobody_claims_its_own_or_what_is_below_the_least);
 	tcase_add_test(tests, an_old_number_changes_nothing);
 	tcase_add_test(tests, offers_that_stay_keep_their_claims);

@@ -196,6 +196,34 @@ START_TEST(the_client_goes_first_that_has_used_the_least)
 }
 END_TEST
 
+START_TEST(what_may_not_run_here_pushes_nobody_out_and_is_waited_for_by_nobody)
+{
+	struct queue_client client = {0};
+	struct queue_entry entries[] = {{.client = &client, .priority = PRIORITY_STAT, .ticket = 1},
+					{.client = &client, .priority = PRIORITY_STAT, .ticket = 2},
+					{.client = &client, .priority = PRIORITY_ROUTINE, .ticket = 3}};
+	const struct queue_running running = {.priority = PRIORITY_ROUTINE};
+	struct queue queue = {0};
+
+	for (int i = 0; i < 3; i++)
+		queue_add(&queue, &entries[i]);
+	ck_assert_int_eq(queue_victim(&queue, NULL, &running, 1, 0), 0);
+	entries[0].elsewhere = entries[1].elsewhere = true;
+	ck_assert_int_eq(queue_victim(&queue, NULL, &running, 1, 0), -1);
+	ck_assert_int_eq(queue_position(&queue, &entries[2]), 1);
+	/* Among themselves, and for whoever has a host for them, they are in order. */
+	ck_assert_int_eq(queue_position(&queue, &entries[0]), 1);
+	ck_assert_ptr_eq(queue_next(&queue, all_fit, NULL), &entries[0]);
+	/* The device that a push sets free may be one that it may not have. */
+	entries[0].elsewhere = false;
+	entries[0].choosy = true;
+	ck_assert_int_eq(queue_victim(&queue, NULL, &running, 1, 0), -1);
+	ck_assert_int_eq(queue_position(&queue, &entries[2]), 2);
+	entries[1].elsewhere = false;
+	ck_assert_int_eq(queue_victim(&queue, NULL, &running, 1, 0), 0);
+}
+END_TEST
+
 START_TEST(nobody_saves_time_up)
 {
 	struct queue_client a = {0}, b = {0}, c = {0};
@@ -287,6 +315,7 @@ Suite *queue_suite(void)
 
 	tcase_add_test(tests, higher_priority_goes_first_and_equals_in_their_order);
 	tcase_add_test(tests, the_client_goes_first_that_has_used_the_least);
+	tcase_add_test(tests, what_may_not_run_here_pushes_nobody_out_and_is_waited_for_by_nobody);
 	tcase_add_test(tests, nobody_saves_time_up);
 	tcase_add_test(tests, long_and_short_jobs_share_the_time);
 	tcase_add_test(tests, the_lowest_and_latest_makes_room_for_the_higher);

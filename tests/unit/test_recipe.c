@@ -86,6 +86,9 @@ static const char *const requests[] = {
     "{\"scan\":\"a\",\"fdk\":{},\"projector\":null,\"metal\":{\"threshold_hu\":3071.5}}",
     "{\"scan\":\"a\",\"fdk\":{},\"grid\":{\"size\":[1,8192,7],\"spacing_mm\":[0.1,0.012345678901234567,1],"
     "\"origin_mm\":[-0.1,-50.3,1e-3]}}",
+    "{\"scan\":\"a\",\"where\":{\"host\":\"gpu-1.example\"}}",
+    "{\"scan\":\"a\",\"where\":{\"host\":null,\"memory\":85899345920}}",
+    "{\"scan\":\"a\",\"where\":{\"host\":\"gpu-1.example\",\"memory\":85899345920,\"devices\":4}}",
 };
 enum { REQUESTS = sizeof(requests) / sizeof(requests[0]) };
 

@@ -294,6 +294,7 @@ export const strings = {
 	'reconnecting …': 'verbindet neu …',
 	'right': 'rechts',
 	'room on the disk': 'Platz auf der Platte',
+	'a host that may run it': 'einen Rechner, der ihn rechnen darf',
 	'routine': 'Routine',
 	'running': 'läuft',
 	'save': 'sichern',
