@@ -322,16 +322,48 @@ static void reload(struct api *api, const struct arguments *arguments)
 	notify_send("READY=1");
 }
 
-/* A terminal that is closed ends nothing. */
+/* No job is here that has not ended, and no host waits for the volumes of one. */
+static bool is_idle(const struct api *api)
+{
+	struct jobs_statistics jobs;
+	struct fleet_facts fleet = {.taken = 0};
+	long unended = 0;
+
+	jobs_statistics(api->jobs, &jobs);
+	for (int i = 0; i < JOB_STATE_COUNT; i++) {
+		for (int j = 0; j < PRIORITY_COUNT && !job_state_ended((enum job_state)i); j++)
+			unended += jobs.count[i][j];
+	}
+	if (api->fleet != NULL)
+		fleet_look(api->fleet, &fleet);
+	return unended == 0 && fleet.taken == 0;
+}
+
+/*
+ * A terminal that is closed ends nothing. 0: the daemon was idle for as long as --until-idle says. A job that comes in
+ * that very moment is as one that comes before any stop: it is given back, or waits for the next start.
+ */
 static int wait_for_stop(const sigset_t *stops, struct api *api, const struct arguments *arguments)
 {
-	int signal_number = 0;
+	const struct timespec look = {.tv_nsec = 200000000};
+	const double limit = arguments->config->until_idle;
+	double busy = clock_monotonic();
 
 	for (;;) {
-		sigwait(stops, &signal_number);
-		if (signal_number != SIGHUP)
+		const int signal_number = limit > 0 ? sigtimedwait(stops, NULL, &look) : sigwaitinfo(stops, NULL);
+
+		if (signal_number == SIGHUP)
+			reload(api, arguments);
+		else if (signal_number > 0)
 			return signal_number;
-		reload(api, arguments);
+		if (limit <= 0)
+			continue;
+		if (!is_idle(api))
+			busy = clock_monotonic();
+		if (clock_monotonic() >= busy + limit) {
+			log_line(LEVEL_INFO, "stopping: no job for %.0f s", limit);
+			return 0;
+		}
 	}
 }
 

@@ -16,7 +16,7 @@ long="{\"scan\": \"SCAN\", $grid, \"fdk\": {}, \"sart\": {\"iterations\": 300}, 
 start_postgresql || { [ -n "${why:-}" ] || exit 1; }
 pkg-config --exists libpq 2>/dev/null || why="libpq is not installed"
 hosts=()
-trap 'stop_hosts; stop_postgresql' EXIT
+trap 'stop_slurm; stop_hosts; stop_postgresql' EXIT
 printf '#!/bin/sh\nexec false\n' >"$work/no-device"
 chmod +x "$work/no-device"
 lease=3
@@ -375,6 +375,128 @@ test_a_job_runs_where_it_says_and_waits_for_a_host_that_is_not_there() {
 	post_job "$(where '{"host": "b"}' "$small")"
 	waits_for_a_host
 	stop_daemon
+}
+
+test_a_taker_ends_when_it_has_been_idle_and_not_before() {
+	local pid i
+	begin
+	undisturbed "$scan_dir" "$small" small
+	owner c
+	at c
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "$small"
+	taker a --until-idle 4
+	pid=$(cat "$work/a.pid")
+	at c
+	wait_job succeeded
+	expect_json '.device | startswith("a: ")'
+	same_bits small
+	told_once
+	for ((i = 0; i < 600; i++)); do
+		kill -0 "$pid" 2>/dev/null || break
+		sleep 0.05
+	done
+	wait "$pid" || fail "it ends well, got $?: $(tail -3 "$work/a.err")"
+	rm -f "$work/a.pid"
+	grep -q 'stopping: no job for 4 s' "$work/a.err" || fail "the reason, got $(tail -3 "$work/a.err")"
+	empty_ledger
+}
+
+# Slurm's two daemons for one host, as whoever runs the test, with no authentication but on this machine's own ports.
+start_slurm() {
+	local i port=$((20000 + RANDOM % 5000)) user
+	user=$(id -un)
+	export SLURM_CONF=$work/slurm/slurm.conf
+	mkdir -p "$work/slurm/state" "$work/slurm/spool"
+	cat >"$SLURM_CONF" <<-END
+		ClusterName=test
+		SlurmctldHost=$(hostname -s)(127.0.0.1)
+		AuthType=auth/none
+		CredType=cred/none
+		SlurmUser=$user
+		SlurmdUser=$user
+		SlurmctldPort=$port
+		SlurmdPort=$((port + 1))
+		SlurmctldPidFile=$work/slurm/slurmctld.pid
+		SlurmdPidFile=$work/slurm/slurmd.pid
+		StateSaveLocation=$work/slurm/state
+		SlurmdSpoolDir=$work/slurm/spool
+		ProctrackType=proctrack/linuxproc
+		TaskPlugin=task/none
+		SwitchType=switch/none
+		MpiDefault=none
+		JobAcctGatherType=jobacct_gather/none
+		NodeName=$(hostname -s) NodeAddr=127.0.0.1 CPUs=1 State=UNKNOWN
+		PartitionName=all Nodes=ALL Default=YES State=UP
+	END
+	slurmctld -c -D >"$work/slurm/slurmctld.out" 2>&1 &
+	echo $! >"$work/slurm/processes"
+	slurmd -D >"$work/slurm/slurmd.out" 2>&1 &
+	echo $! >>"$work/slurm/processes"
+	for ((i = 0; i < 150; i++)); do
+		[[ $(timeout 5 sinfo -h -o %t 2>/dev/null) = idle ]] && return 0
+		sleep 0.1
+	done
+	return 1
+}
+stop_slurm() {
+	local pid
+	[ -e "$work/slurm/processes" ] || return 0
+	export SLURM_CONF=$work/slurm/slurm.conf
+	timeout 10 scancel -u "$(id -un)" 2>/dev/null || true
+	timeout 10 scancel --signal=KILL --full -u "$(id -un)" 2>/dev/null || true
+	tac "$work/slurm/processes" | while read -r pid; do
+		kill "$pid" 2>/dev/null || continue
+		while kill -0 "$pid" 2>/dev/null; do sleep 0.05; done
+	done
+	rm -f "$work/slurm/processes"
+}
+# submit: a taker as a job of Slurm, whose number is in $slurm_job
+submit() {
+	local port=$((25000 + RANDOM % 5000))
+	slurm_job=$(PATH=$BUILD:$PATH LISTEN=127.0.0.1:$port ADDRESS=http://127.0.0.1:$port IDLE=4 timeout 10 \
+		sbatch --parsable -o "$work/slurm/%j.out" "$top/systemd/cbctd.sbatch" --backend cpu --threads 1 --fleet test \
+		--fleet-database "$database" --fleet-lease "$lease")
+}
+ends_well() { # $slurm_job
+	local i
+	for ((i = 0; i < 300; i++)); do
+		timeout 5 scontrol -o show job "$slurm_job" >"$work/slurm/job" 2>&1
+		! grep -qE 'JobState=(PENDING|RUNNING|COMPLETING) ' "$work/slurm/job" && break
+		sleep 0.1
+	done
+	grep -q 'JobState=COMPLETED .*ExitCode=0:0' "$work/slurm/job" || fail "COMPLETED, got $(cat "$work/slurm/job") $(tail -5 "$work/slurm/$slurm_job.out")"
+}
+test_slurm_starts_takers_drains_them_and_has_its_node_back() {
+	local tool
+	need_server
+	for tool in slurmctld slurmd sbatch; do command -v "$tool" >/dev/null || skip "Slurm is not installed"; done
+	begin
+	undisturbed "$scan_dir" "$small" small
+	start_slurm || skip "Slurm does not start here: $(tail -2 "$work"/slurm/*.out)"
+	owner c
+	at c
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "$long"
+	submit
+	given_to "slurm-$slurm_job"
+	progresses
+	timeout 10 scancel --batch --signal=TERM "$slurm_job"
+	ends_well
+	req GET "/v1/jobs/$job"
+	expect_json '.state == "queued" and .attempts == 1 and .error == null'
+	req DELETE "/v1/jobs/$job"
+	expect_status 202
+	post_job "$small"
+	submit
+	wait_job succeeded
+	expect_json ".device | startswith(\"slurm-$slurm_job: \")"
+	same_bits small
+	ends_well
+	empty_ledger
+	stop_slurm
 }
 
 test_tokens_and_tls_between_daemons() {
