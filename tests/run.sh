@@ -20,7 +20,7 @@ if [ "${1:-}" = --soak ]; then
 	shift
 	parts=(tests/soak/test_*.sh)
 else
-	parts=(tests/http/test_real.sh tests/http/test_restart.sh unit/recon unit/backend unit/outofcore tests/web/test_page.sh
+	parts=(tests/http/test_real.sh tests/http/test_fleet.sh tests/http/test_restart.sh unit/recon unit/backend unit/outofcore tests/web/test_page.sh
 		unit/study tests/http/test_supervise.sh unit/exterior tests/http/test_arriving.sh lint)
 	rest=$("$BUILD/unit" --list | sed 's,^,unit/,') || exit 1
 	for part in $rest tests/http/test_*.sh tests/web/test_*.sh; do
