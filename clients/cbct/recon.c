@@ -79,7 +79,7 @@ static void on_agreement(void *context, const struct recon_agreement *agreement)
 	struct display *display = context;
 
 	progress_clear(display->progress);
-	fprintf(stderr, "projections and geometry disagree by %.3g mm at the isocentre, +- %.3g mm a view\n",
+	fprintf(stderr, "views lie aside of what the others show by %.3g mm at the isocentre, +- %.3g mm a view\n",
 		agreement->mm, agreement->sigma_mm);
 }
 

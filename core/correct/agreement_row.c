@@ -86,11 +86,16 @@ static void tell(const struct correction_job *job, const struct agreement *agree
 
 	if (grade == AGREEMENT_GOOD)
 		return;
-	warning_tell(
-	    job->warnings, grade == AGREEMENT_WRONG ? "geometry_wrong" : "geometry_doubtful",
-	    "projections and geometry disagree by at least %.2g mm at the isocentre (root mean square over %d views; "
-	    "%.2g mm is what noise and the object's own detail make uncertain); view %d is farthest off, by %.2g mm",
-	    agreement->mm, agreement->measured, agreement->sigma_mm, agreement->worst, agreement->worst_mm);
+	warning_tell(job->warnings, grade == AGREEMENT_WRONG ? "geometry_wrong" : "geometry_doubtful",
+		     "views lie aside of what the others show by %.2g mm at the isocentre (root mean square over %d "
+		     "views; %.2g mm "
+		     "is what noise and the object's own detail make uncertain); view %d is farthest off, by %.2g mm; "
+		     "%.0f %% of a "
+		     "view's detail is not where the others show it (more than a few percent: the geometry may be off "
+		     "by more than "
+		     "these mm)",
+		     agreement->mm, agreement->measured, agreement->sigma_mm, agreement->worst, agreement->worst_mm,
+		     100 * agreement->unexplained);
 }
 
 static int warn(const struct correction_job *job, void *opaque, struct error *err)

@@ -16,8 +16,10 @@ enum { HALVES = 2, VIEWS_LEAST = 64, BINS_LEAST = 24, MEASURED_LEAST = 24 };
 static const double ARC_LEAST = 2.8; /* radians; a shorter arc's volume is too far from the object */
 /* Bins at the isocentre, and sigmas, from which on the geometry is doubtful; bins from which on it is wrong. */
 static const double DOUBTFUL = 0.09, BEYOND_SIGMA = 2, WRONG = 0.15;
+/* The unexplained share from which on the geometry is wrong: what fits stays below .3, truncated and noisy or not. */
+static const double UNEXPLAINED = 0.4;
 
-/* The reconstruction of half of the views. */
+/* The reconstruction of half of the views, and of all of them. */
 struct half {
 	struct orbit orbit;
 	struct grid grid;
@@ -25,7 +27,7 @@ struct half {
 	struct plan *plan;
 	struct fdk fdk;
 	struct stack *measured, *made; /* of all views, and of half of them */
-	struct volume *volume;
+	struct volume *volume, *whole;
 	const struct reduced *reduced;
 	struct device *device;
 	const struct cancel *cancel;
@@ -78,6 +80,7 @@ static void half_clear(struct half *half)
 	const struct backend *backend = &backend_cpu;
 
 	backend->volume_free(half->volume);
+	backend->volume_free(half->whole);
 	backend->stack_free(half->measured);
 	backend->stack_free(half->made);
 	fdk_clear(&half->fdk);
@@ -101,10 +104,12 @@ int agreement_bytes(const struct reduced *reduced, size_t *ret_bytes, struct err
 		code = backend->plan_bytes(NULL, &plan, &bytes, err);
 	}
 	if (code == 0)
-		*ret_bytes = bytes.volumes + bytes.scratch + bytes.raw + backend->volume_bytes(&half.grid) +
-			     fdk_bytes(backend, geometry, half.weights.pad) +
-			     backend->stack_bytes(geometry->columns, geometry->rows, geometry->count) +
-			     backend->stack_bytes(geometry->columns, geometry->rows, half_of(geometry->count));
+		*ret_bytes =
+		    (size_t)geometry->count * (size_t)geometry->columns * (size_t)geometry->rows * sizeof(float) +
+		    bytes.volumes + bytes.scratch + bytes.raw + 2 * backend->volume_bytes(&half.grid) +
+		    fdk_bytes(backend, geometry, half.weights.pad) +
+		    backend->stack_bytes(geometry->columns, geometry->rows, geometry->count) +
+		    backend->stack_bytes(geometry->columns, geometry->rows, half_of(geometry->count));
 	half_clear(&half);
 	return code;
 }
@@ -136,7 +141,9 @@ static int open_half(struct half *half, struct error *err)
 	if (code == 0)
 		code = backend->stack_new(half->device, geometry->columns, geometry->rows, half_of(geometry->count),
 					  &half->made, err);
-	return code == 0 ? backend->volume_new(half->device, &half->grid, &half->volume, err) : code;
+	if (code == 0)
+		code = backend->volume_new(half->device, &half->grid, &half->volume, err);
+	return code == 0 ? backend->volume_new(half->device, &half->grid, &half->whole, err) : code;
 }
 
 /* Reprojects the views of one half, whose numbers are `views`, from a volume made of the others. */
@@ -163,33 +170,81 @@ static int reproject(struct half *half, int which, int *views, int *ret_count, s
 	return code == 0 ? backend->project(half->plan, half->volume, views, others, half->made, err) : code;
 }
 
-static int measure_half(struct half *half, int which, int *views, float *made, struct view_agreement *ret_views,
-			struct error *err)
+/*
+ * Adds `sign` times the reprojections of each half of the views in half->measured from the other half to `made`,
+ * [view][row][column]; views, picture: work. half->whole becomes the volume made of all of them.
+ */
+static int add_reprojections(struct half *half, float sign, int *views, float *picture, float *made, struct error *err)
+{
+	const struct geometry *geometry = &half->reduced->geometry;
+	const struct backend *backend = &backend_cpu;
+	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
+	int code = backend->volume_fill(half->whole, 0, err);
+
+	for (int which = 0; which < HALVES && code == 0; which++) {
+		int count;
+
+		code = reproject(half, which, views, &count, err);
+		if (code == 0)
+			code = backend->volume_axpby(1.0 / HALVES, half->volume, 1, half->whole, err);
+		for (int i = 0; i < count && code == 0; i++) {
+			float *to = made + (size_t)views[i] * pixels;
+
+			code = backend->stack_download(half->made, i, 1, picture, err);
+			for (size_t j = 0; j < pixels && code == 0; j++)
+				to[j] += sign * picture[j];
+		}
+	}
+	return code;
+}
+
+/* What the others make of each view, [view][row][column]; views, picture: work. */
+static int predict(struct half *half, int *views, float *picture, float *made, struct error *err)
+{
+	const struct geometry *geometry = &half->reduced->geometry;
+	const struct backend *backend = &backend_cpu;
+	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
+	int code = add_reprojections(half, 1, views, picture, made, err);
+
+	for (int k = 0; k < geometry->count; k++)
+		views[k] = k;
+	if (code == 0)
+		code = backend->project(half->plan, half->whole, views, geometry->count, half->measured, err);
+	for (int k = 0; k < geometry->count && code == 0; k++) {
+		float *to = made + (size_t)k * pixels;
+
+		code = backend->stack_download(half->measured, k, 1, picture, err);
+		for (size_t j = 0; j < pixels && code == 0; j++)
+			to[j] += picture[j];
+	}
+	return code == 0 ? add_reprojections(half, -1, views, picture, made, err) : code;
+}
+
+static int compare_views(const struct half *half, const float *made, struct view_agreement *ret_views,
+			 struct error *err)
 {
 	const struct reduced *reduced = half->reduced;
 	const struct geometry *geometry = &reduced->geometry;
 	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
-	int count, code = reproject(half, which, views, &count, err), failed = 0;
+	int failed = 0;
 
-	if (code == 0)
-		code = backend_cpu.stack_download(half->made, 0, count, made, err);
-	if (code < 0)
-		return code;
 #pragma omp parallel for schedule(dynamic) reduction(min : failed)
-	for (int i = 0; i < count; i++) {
-		struct view_agreement *view = &ret_views[views[i]];
+	for (int k = 0; k < geometry->count; k++) {
+		struct view_agreement *view = &ret_views[k];
 		struct image_shift shift;
 		struct error why;
-		const int found =
-		    !reduced->known[views[i]]
-			? 0
-			: image_shift_find(reduced->projections + (size_t)views[i] * pixels, made + (size_t)i * pixels,
-					   geometry->columns, geometry->rows, &shift, &why);
+		const int found = !reduced->known[k] ? 0
+						     : image_shift_find(reduced->projections + (size_t)k * pixels,
+									made + (size_t)k * pixels, geometry->columns,
+									geometry->rows, &shift, &why);
 
 		failed = found < failed ? found : failed;
 		pulse_beat();
-		view->measured = found > 0;
-		for (int a = 0; a < 2 && found > 0; a++) {
+		if (found <= 0)
+			continue;
+		view->measured = true;
+		view->unexplained = shift.unexplained;
+		for (int a = 0; a < 2; a++) {
 			view->shift[a] = shift.bins[a] * half->orbit.pixel_at_isocentre[a];
 			view->sigma[a] = shift.sigma[a] * half->orbit.pixel_at_isocentre[a];
 		}
@@ -197,6 +252,25 @@ static int measure_half(struct half *half, int which, int *views, float *made, s
 	return failed < 0 ? error_set(err, failed, "no memory to compare views of %d x %d bins", geometry->columns,
 				      geometry->rows)
 			  : 0;
+}
+
+/* The least share that half of the measured views do not exceed. */
+static double median_unexplained(const struct agreement *agreement, int count)
+{
+	for (int k = 0; k < count; k++) {
+		const struct view_agreement *view = &agreement->views[k];
+		int below = 0, equal = 0;
+
+		for (int i = 0; i < count && view->measured; i++) {
+			const struct view_agreement *other = &agreement->views[i];
+
+			below += other->measured && other->unexplained < view->unexplained;
+			equal += other->measured && other->unexplained == view->unexplained;
+		}
+		if (view->measured && 2 * below < agreement->measured && 2 * (below + equal) >= agreement->measured)
+			return view->unexplained;
+	}
+	return 0;
 }
 
 static void summarise(struct agreement *agreement, const struct reduced *reduced)
@@ -221,6 +295,7 @@ static void summarise(struct agreement *agreement, const struct reduced *reduced
 		return;
 	agreement->mm = sqrt(fmax(0, squares - sigmas) / agreement->measured);
 	agreement->sigma_mm = sqrt(sigmas / agreement->measured);
+	agreement->unexplained = median_unexplained(agreement, reduced->geometry.count);
 }
 
 int agreement_measure(const struct reduced *reduced, const struct cancel *cancel, struct agreement *ret_agreement,
@@ -229,24 +304,27 @@ int agreement_measure(const struct reduced *reduced, const struct cancel *cancel
 	const struct geometry *geometry = &reduced->geometry;
 	const size_t count = (size_t)geometry->count, pixels = (size_t)geometry->columns * (size_t)geometry->rows;
 	struct agreement agreement = {.views = calloc(count, sizeof(*agreement.views))};
-	float *made = malloc((size_t)half_of(geometry->count) * pixels * sizeof(*made));
+	float *made = calloc(count * pixels, sizeof(*made)), *picture = malloc(pixels * sizeof(*picture));
 	int *views = malloc(count * sizeof(*views));
 	struct half half;
 	int code = describe(&half, reduced, err);
 
-	if (code == 0 && (agreement.views == NULL || made == NULL || views == NULL))
+	if (code == 0 && (agreement.views == NULL || made == NULL || picture == NULL || views == NULL))
 		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views in bins", geometry->count);
 	half.cancel = cancel;
 	if (code == 0)
 		code = open_half(&half, err);
 	if (code == 0)
 		code = backend_cpu.stack_upload(half.measured, 0, geometry->count, reduced->projections, err);
-	for (int which = 0; which < HALVES && code == 0; which++)
-		code = measure_half(&half, which, views, made, agreement.views, err);
+	if (code == 0)
+		code = predict(&half, views, picture, made, err);
+	if (code == 0)
+		code = compare_views(&half, made, agreement.views, err);
 	if (code == 0)
 		summarise(&agreement, reduced);
 	half_clear(&half);
 	free(made);
+	free(picture);
 	free(views);
 	if (code < 0)
 		agreement_clear(&agreement);
@@ -265,6 +343,8 @@ enum agreement_grade agreement_grade(const struct agreement *agreement, double b
 	/* mm^2 is the mean square without that of sigma. */
 	const double raw = hypot(agreement->mm, agreement->sigma_mm);
 
+	if (agreement_is_known(agreement) && agreement->unexplained > UNEXPLAINED)
+		return AGREEMENT_WRONG;
 	if (!agreement_is_known(agreement) || agreement->mm < DOUBTFUL * bin ||
 	    raw < BEYOND_SIGMA * agreement->sigma_mm)
 		return AGREEMENT_GOOD;

@@ -11,27 +11,34 @@
  * lie on each other; where they did not, the view lies aside of what the other views, above all those from near its
  * angle and from the opposite side, made of the object.
  *
+ * Half of few views, and of an object that leaves the rows, are not the object. Therefore the same is done with the
+ * projections of the volume made of all views, which fit the geometry whatever the scan's do, and what their
+ * reprojections lack is added to those of the scan.
+ *
  * The way from one to the other is the least squares solution for five unknowns, a shift along columns and rows, a
  * turn, a scale and a gain, between band-passed images (detail of a few bins: what truncation and scatter leave between
  * them is smoother), with Tukey's weights, so that metal or a cable in a part of the view does not decide.
  *
  * What all views share, such as an object that stands elsewhere, is no disagreement and does not count. Neither does a
- * slow departure that a short scan's views share with all those beside them and that no opposite view contradicts: the
- * number is a lower bound of how far the geometry is off.
+ * slow departure that a short scan's views share with all those beside them and that no opposite view contradicts. A
+ * departure of more than some bins is no small shift: then the views' detail is not where the others show it, and the
+ * share of it that is unexplained tells.
  */
 enum { AGREEMENT_VIEWS_MOST = 120, AGREEMENT_BINS_MOST = 80 };
 
 struct view_agreement {
-	bool measured;   /* the view shows enough detail */
-	double shift[2]; /* mm at the isocentre, along columns and rows */
-	double sigma[2]; /* standard deviations that these have by what the fit leaves unexplained */
+	bool measured;      /* the view shows enough detail */
+	double shift[2];    /* mm at the isocentre, along columns and rows */
+	double sigma[2];    /* standard deviations that these have by what the fit leaves unexplained */
+	double unexplained; /* share of the view's detail that the others do not show there */
 };
 
 struct agreement {
 	int measured;    /* views */
 	double mm;       /* at the isocentre: root mean square over the views, without the part that sigma explains */
 	double sigma_mm; /* root mean square of the sigmas */
-	int worst;       /* number of the view, in the scan, that lies aside most */
+	double unexplained; /* median of the views' shares */
+	int worst;          /* number of the view, in the scan, that lies aside most */
 	double worst_mm;
 	struct view_agreement *views; /* [reduced.geometry.count], owned */
 };

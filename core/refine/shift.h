@@ -7,6 +7,11 @@
 struct image_shift {
 	double bins[2];  /* along columns and rows */
 	double sigma[2]; /* standard deviations by what the fit leaves unexplained */
+	/*
+	 * The share of the detail of `image`, beyond its noise, that `other` does not show where it lies; 0 where noise
+	 * is half of the detail. A shift of more than some bins shows here and not in `bins`.
+	 */
+	double unexplained;
 };
 
 /*
