@@ -52,6 +52,7 @@ struct recipe {
 		struct tv_options options; /* alpha counts for nothing where it is found */
 	} tv;
 	enum projector projector;
+	bool rings;    /* errors of pixels' gain are looked for and mended (core/correct/rings.h) */
 	bool hold_out; /* some views have no part in the volumes, which are held against them (core/recon/held_out.h) */
 	int binning;   /* pixels a side that are taken as one (core/correct/binning.h); BINNING_AUTO until resolved */
 	struct {

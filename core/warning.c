@@ -93,6 +93,7 @@ const struct warning_kind warning_kinds[] = {
      "Bad pixels of the detector are too many, or too close together, to be filled in: the image may be wrong there."},
     {"stuck_pixels", SEVERITY_CAUTION,
      "Some pixels of the detector do not follow the others and were replaced from their neighbours."},
+    {"rings", SEVERITY_INFO, "Some pixels of the detector had changed since it was calibrated, and were corrected."},
     {"defects", SEVERITY_CAUTION, "Some samples could not be used and were replaced from their neighbours."},
     {"blank_views", SEVERITY_CAUTION, "Some projections are empty or show nothing, and were left out."},
     {"dark_parts", SEVERITY_CAUTION,

@@ -14,7 +14,9 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
+#include "core/algebra.h"
 #include "core/recon/algorithm.h"
+#include "core/correct/rings.h"
 #include "core/correct/stuck.h"
 #include "core/pulse.h"
 #include "proto/checkpoint.h"
@@ -390,7 +392,8 @@ struct reconstruction {
 	struct linearise linearise;
 	/* Looks for stuck pixels in the views as they pass; NULL before the recon is opened, and where too few are. */
 	struct stuck *stuck;
-	bool looked; /* its answer is known */
+	float *errors, *flat; /* of pixels' gain, and the image that has them; NULL where there are none */
+	bool looked;          /* what is asked of all views for their pixels is known */
 };
 
 static int projection_of(const struct reconstruction *reconstruction, int view)
@@ -495,20 +498,82 @@ static int open_first(struct reconstruction *reconstruction, struct error *err)
 	return code;
 }
 
-/*
- * Called once all views in which stuck pixels are looked for have come. Where some are found the reconstruction is
- * opened anew with their map, *ret_again, and has none of the projections: earlier ones went in with these pixels.
- */
-static int heed_stuck_pixels(struct reconstruction *reconstruction, bool *ret_again, struct error *err)
+/* Rows of a view, unverified: all of the view is when it is pushed. */
+static int read_rows(void *context, int view, int first, int rows, void *to, struct error *err)
 {
+	const struct reconstruction *reconstruction = context;
+	const struct scan_files *files = &reconstruction->files;
+	const size_t bytes = scan_projection_bytes(files->scan), row = bytes / (size_t)files->scan->geometry.rows;
+
+	return file_read_at(files->projections, to, row * (size_t)rows,
+			    (size_t)projection_of(reconstruction, view) * bytes + row * (size_t)first,
+			    "projections.raw", err);
+}
+
+/* Looks for errors of pixels' gain, beside the stuck ones; with an image that has them they are gone from counts. */
+static int look_for_rings(struct reconstruction *reconstruction, struct error *err)
+{
+	const struct geometry *geometry = &reconstruction->files.scan->geometry;
+	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
+	const struct rings_source source = {read_rows, reconstruction};
+	const struct cancel cancel = {run_cancelled, &reconstruction->run};
+	struct linearise *linearise = &reconstruction->linearise;
+	struct rings_found found;
+	char detail[160];
+	int code;
+
+	reconstruction->errors = malloc(pixels * sizeof(*reconstruction->errors));
+	if (reconstruction->errors == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory to look for rings");
+	disk_steps(&reconstruction->run, true);
+	code = rings_find(linearise, geometry, &source, &cancel, reconstruction->errors, &found, err);
+	disk_steps(&reconstruction->run, false);
+	if (code == 0 && found.pixels > 0 && linearise->quantity == QUANTITY_INTENSITY) {
+		reconstruction->flat = rings_flat(linearise, reconstruction->errors, pixels);
+		if (reconstruction->flat == NULL)
+			return error_set(err, ERR_NO_MEMORY, "no memory for a flat image");
+		linearise->image[IMAGE_FLAT] = reconstruction->flat;
+	}
+	if (code < 0 || found.pixels == 0 || reconstruction->flat != NULL) {
+		free(reconstruction->errors);
+		reconstruction->errors = NULL;
+	}
+	if (code == 0 && found.pixels > 0) {
+		snprintf(
+		    detail, sizeof(detail),
+		    "%zu pixels have another gain than the flat image says, by %.2g %% (root mean square): they are "
+		    "mended",
+		    found.pixels, 100 * found.rms);
+		run_warning(&reconstruction->run, "rings", detail);
+	}
+	return code;
+}
+
+static bool looks_for_rings(const struct reconstruction *reconstruction)
+{
+	return reconstruction->options->recipe->rings;
+}
+
+/*
+ * Called once all views that tell of pixels have come. Where pixels are stuck, or have another gain, the reconstruction
+ * is opened anew without them, *ret_again, and has none of the projections: earlier ones went in with these pixels.
+ */
+static int heed_pixels(struct reconstruction *reconstruction, bool *ret_again, struct error *err)
+{
+	int code = 0;
+
 	*ret_again = false;
-	if (reconstruction->stuck == NULL || reconstruction->looked)
+	if (reconstruction->looked)
 		return 0;
 	reconstruction->looked = true;
-	reconstruction->linearise.stuck = stuck_find(reconstruction->stuck);
-	if (reconstruction->linearise.stuck == NULL)
-		return 0;
-	*ret_again = true;
+	if (reconstruction->stuck != NULL)
+		reconstruction->linearise.stuck = stuck_find(reconstruction->stuck);
+	if (looks_for_rings(reconstruction))
+		code = look_for_rings(reconstruction, err);
+	*ret_again =
+	    reconstruction->linearise.stuck != NULL || reconstruction->flat != NULL || reconstruction->errors != NULL;
+	if (code < 0 || !*ret_again)
+		return code;
 	recon_free(reconstruction->recon);
 	reconstruction->recon = NULL;
 	reconstruction->run.recon = NULL;
@@ -647,6 +712,8 @@ void reconstruction_close(struct reconstruction *reconstruction)
 	provenance_clear(&reconstruction->run.provenance);
 	recon_free(reconstruction->recon);
 	stuck_free(reconstruction->stuck);
+	free(reconstruction->errors);
+	free(reconstruction->flat);
 	scan_files_close(&reconstruction->files);
 	free(reconstruction->views);
 	free(reconstruction->samples);
@@ -765,6 +832,17 @@ static int read_views(struct reconstruction *reconstruction, int view, int count
 	return code;
 }
 
+/* Line integrals are float32, and no flat image is held against them. */
+static void take_errors_off(struct reconstruction *reconstruction, int count)
+{
+	const struct geometry *geometry = &reconstruction->files.scan->geometry;
+	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
+	float *samples = (float *)reconstruction->samples;
+
+	for (int i = 0; i < count; i++)
+		algebra_axpby(pixels, -1, reconstruction->errors, 1, samples + (size_t)i * pixels);
+}
+
 /* At most a batch. */
 static int push_some(struct reconstruction *reconstruction, int count, struct error *err)
 {
@@ -779,6 +857,8 @@ static int push_some(struct reconstruction *reconstruction, int count, struct er
 	for (int i = 0; i < count && code == 0 && reconstruction->stuck != NULL && !reconstruction->looked; i++)
 		if (stuck_wants(reconstruction->stuck, reconstruction->views[i]))
 			stuck_add(reconstruction->stuck, reconstruction->samples + (size_t)i * bytes);
+	if (code == 0 && reconstruction->errors != NULL)
+		take_errors_off(reconstruction, count);
 	if (code == 0)
 		code = recon_push(reconstruction->recon, reconstruction->samples, reconstruction->views, count, err);
 	reconstruction->pushed += code == 0 ? count : 0;
@@ -810,16 +890,16 @@ static int look_ahead(struct reconstruction *reconstruction, struct error *err)
 	bool again;
 	int code = 0;
 
-	if (reconstruction->stuck == NULL || reconstruction->looked || reconstruction->pushed > 0)
+	if (reconstruction->looked || reconstruction->pushed > 0)
 		return 0;
 	for (int i = 0; i < reconstruction_wanted(reconstruction) && code == 0; i++) {
-		if (!stuck_wants(reconstruction->stuck, i))
+		if (reconstruction->stuck == NULL || !stuck_wants(reconstruction->stuck, i))
 			continue;
 		code = read_views(reconstruction, i, 1, err);
 		if (code == 0)
 			stuck_add(reconstruction->stuck, reconstruction->samples);
 	}
-	return code == 0 ? heed_stuck_pixels(reconstruction, &again, err) : code;
+	return code == 0 ? heed_pixels(reconstruction, &again, err) : code;
 }
 
 int reconstruction_push_rest(struct reconstruction *reconstruction, struct error *err)
@@ -834,9 +914,9 @@ int reconstruction_finish(struct reconstruction *reconstruction, struct error *e
 	struct run *run = &reconstruction->run;
 	struct error trouble;
 	bool again = false;
-	/* Where projections came one by one, stuck pixels are known only now. */
+	/* Where projections came one by one, what is wrong with pixels is known only now. */
 	int code = reconstruction->pushed == reconstruction_wanted(reconstruction)
-		       ? heed_stuck_pixels(reconstruction, &again, err)
+		       ? heed_pixels(reconstruction, &again, err)
 		       : 0;
 
 	if (code == 0 && again)

@@ -34,6 +34,7 @@ static const struct special {
     {"/tv", "unit", "tv-unit", "MU", NULL, false},
     {"/tv", "after", "tv-after-sart", NULL, "leave the FDK volume alone", false},
     {"/metal", "threshold_hu", "metal", "HU", NULL, false},
+    {"", "rings", "rings", NULL, "mend pixels whose gain has changed since the flat image", false},
     {"", "hold_out", "hold-out", NULL, "hold volumes against one view of twenty that has no part in them", false},
     {"", "precision", "reference-precision", NULL, "float32 everywhere, however slow", false},
     {"", "mu_water", "mu-water", "MU", NULL, false},

@@ -112,6 +112,7 @@ _PARAMETERS: Dict[str, Dict[str, Document]] = {
         "/metal/threshold_hu": {"type": "number", "minimum": 500, "maximum": 1000000},
         "/projector": {"type": "choice", "choices": ["interpolating", "matched"]},
         "/binning": {"type": "integer", "minimum": 1, "maximum": 8, "word": "auto"},
+        "/rings": {"type": "boolean"},
         "/hold_out": {"type": "boolean"},
         "/precision": {"type": "choice", "choices": ["standard", "reference"]},
         "/mu_water": {"type": "number", "minimum": 1e-09, "maximum": 1000},

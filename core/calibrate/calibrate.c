@@ -8,6 +8,7 @@
 #include <string.h>
 
 #include "core/calibrate/internal.h"
+#include "core/select.h"
 
 enum { PAIRS_LEAST = 7 };                /* of a view: nine unknowns, and some balls to hold them against */
 static const double SHARE_LEAST = .4;    /* of the balls whose shadows should be on the picture */
@@ -180,7 +181,7 @@ static int drop_outliers(const struct run *run, const struct pose *pose, struct 
 	for (int i = 0; i < count; i++)
 		off[i] = sorted[i] =
 		    (float)pose_rms(pose, run->request->pixel_mm, &run->calibration->balls, &pairs[i], 1, NULL);
-	limit = fmax(.1, 3.5 * dense_select(sorted, count, count / 2));
+	limit = fmax(.1, 3.5 * select_kth(sorted, count, count / 2));
 	for (int i = 0; i < count; i++)
 		if (off[i] <= limit)
 			pairs[kept++] = pairs[i];
@@ -307,7 +308,7 @@ static int refuse_uneven(const struct run *run, struct error *err)
 	for (int k = 0; k < count; k++)
 		if (run->calibration->views[k].used)
 			all[used++] = (float)run->calibration->views[k].rms;
-	limit = used > 0 ? fmax(UNEVEN_LEAST, UNEVEN_FACTOR * dense_select(all, used, used / 2)) : 0;
+	limit = used > 0 ? fmax(UNEVEN_LEAST, UNEVEN_FACTOR * select_kth(all, used, used / 2)) : 0;
 	for (int k = 0; k < count; k++) {
 		struct calibrated_view *view = &run->calibration->views[k];
 
@@ -451,7 +452,7 @@ static int summarise(struct run *run, struct error *err)
 		calibration->rms_isocentre = sqrt(squares_isocentre / (double)count);
 		calibration->turn = atan2(across, along);
 		calibration->distance_ratio = scale_ratio(run);
-		calibration->diameter_ratio = dense_select(ratios, (int)taken, (int)taken / 2);
+		calibration->diameter_ratio = select_kth(ratios, (int)taken, (int)taken / 2);
 	}
 	free(ratios);
 	return 0;

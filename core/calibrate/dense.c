@@ -53,34 +53,3 @@ void dense_eigenvalues(const double a[3][3], double ret_values[3])
 	ret_values[2] = mean + 2 * p * cos(angle + 2 * M_PI / 3);
 	ret_values[1] = 3 * mean - ret_values[0] - ret_values[2];
 }
-
-/* Hoare's selection. */
-float dense_select(float *values, int count, int k)
-{
-	int low = 0, high = count - 1;
-
-	while (low < high) {
-		const float pivot = values[(low + high) / 2];
-		int i = low, j = high;
-
-		while (i <= j) {
-			while (values[i] < pivot)
-				i++;
-			while (values[j] > pivot)
-				j--;
-			if (i <= j) {
-				const float value = values[i];
-
-				values[i++] = values[j];
-				values[j--] = value;
-			}
-		}
-		if (k <= j)
-			high = j;
-		else if (k >= i)
-			low = i;
-		else
-			break;
-	}
-	return values[k];
-}

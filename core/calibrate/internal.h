@@ -15,8 +15,6 @@ int dense_cholesky(double *a, int n);
 void dense_solve(const double *l, int n, double *x);
 /* Eigenvalues of a symmetric 3x3, largest first. */
 void dense_eigenvalues(const double a[3][3], double ret_values[3]);
-/* The k-th smallest of count values, which are reordered. */
-float dense_select(float *values, int count, int k);
 
 /* ---- shadows.c ---- */
 struct shadow {

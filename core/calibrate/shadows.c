@@ -13,6 +13,7 @@
 #include <string.h>
 
 #include "core/calibrate/internal.h"
+#include "core/select.h"
 
 enum { BLOCK_RADIUS = 2 }; /* blocks, at least, of the smallest ball: for its maximum to stand out */
 enum { RING_MOST = 1024 }; /* pixels of a ring that are looked at */
@@ -168,10 +169,10 @@ static void measure(struct shadow_finder *finder, const float *blocks, double *r
 
 	for (int i = 0; i < count; i += step)
 		finder->scratch[taken++] = blocks[i];
-	*ret_median = dense_select(finder->scratch, taken, taken / 2);
+	*ret_median = select_kth(finder->scratch, taken, taken / 2);
 	for (int i = 0; i < taken; i++)
 		finder->scratch[i] = fabsf(finder->scratch[i] - (float)*ret_median);
-	*ret_noise = MEDIAN_TO_SIGMA * dense_select(finder->scratch, taken, taken / 2);
+	*ret_noise = MEDIAN_TO_SIGMA * select_kth(finder->scratch, taken, taken / 2);
 }
 
 static bool is_highest(const struct shadow_finder *finder, const float *above, int x, int y)
@@ -226,7 +227,7 @@ static bool fit_plane(struct shadow_finder *finder, int count, struct plane *pla
 								    plane->by_y * finder->ring_y[i]));
 		scale = fmax(scale, fabs(finder->ring_x[i]));
 	}
-	plane->noise = MEDIAN_TO_SIGMA * dense_select(finder->spread, count, count / 2);
+	plane->noise = MEDIAN_TO_SIGMA * select_kth(finder->spread, count, count / 2);
 	limit = 3 * plane->noise + 1e-6;
 	for (int i = 0; i < count; i++) {
 		const double x[3] = {1, finder->ring_x[i] / scale, finder->ring_y[i] / scale};
@@ -273,7 +274,7 @@ static bool find_background(struct shadow_finder *finder, const float *image, do
 		}
 	if (count < 16)
 		return false;
-	*ret_plane = (struct plane){.at = dense_select(finder->spread, count, count / 2)};
+	*ret_plane = (struct plane){.at = select_kth(finder->spread, count, count / 2)};
 	return fit_plane(finder, count, ret_plane) && fit_plane(finder, count, ret_plane);
 }
 

@@ -11,6 +11,7 @@
 #include <stdlib.h>
 
 #include "core/calibrate/internal.h"
+#include "core/select.h"
 
 static const double GAP_MOST = 30 * M_PI / 180; /* between the neighbours of a view that is held against them */
 static const double STRAY_LEAST = 1;            /* mm at the detector: below it no view strays */
@@ -113,7 +114,7 @@ static double median_gap(const struct station *stations, int count)
 	for (int i = 0; i < count && gaps != NULL; i++)
 		gaps[i] = (float)onward(stations[i].angle, stations[(i + 1) % count].angle);
 	if (gaps != NULL)
-		median = dense_select(gaps, count, count / 2);
+		median = select_kth(gaps, count, count / 2);
 	free(gaps);
 	return median;
 }
@@ -224,7 +225,7 @@ static bool refuse_farthest(struct calibration *calibration, const struct calibr
 	}
 	if (count < 5)
 		return false;
-	limit = fmax(STRAY_LEAST / request->pixel_mm[0], STRAY_FACTOR * dense_select(scratch, count, count / 2));
+	limit = fmax(STRAY_LEAST / request->pixel_mm[0], STRAY_FACTOR * select_kth(scratch, count, count / 2));
 	if (most <= limit)
 		return false;
 	calibration->views[worst].used = false;

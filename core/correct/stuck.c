@@ -471,17 +471,12 @@ static bool is_on_axis(const struct stuck *stuck, int column, int row)
 	const struct geometry *geometry = stuck->geometry;
 
 	for (int k = 0; k < geometry->count; k++) {
-		double matrix[12], at[2][2], along[2], length;
+		double matrix[12];
 
 		if (!stuck_wants(stuck, k))
 			continue;
 		view_matrix(&geometry->views[k], matrix);
-		for (int end = 0; end < 2; end++)
-			view_project(matrix, (const double[3]){0, 0, end ? 10 : -10}, &at[end][0], &at[end][1]);
-		along[0] = at[1][0] - at[0][0];
-		along[1] = at[1][1] - at[0][1];
-		length = hypot(along[0], along[1]);
-		if (!(fabs((column - at[0][0]) * along[1] - (row - at[0][1]) * along[0]) > AXIS_PIXELS * length))
+		if (!(view_axis_distance(matrix, column, row) > AXIS_PIXELS))
 			return true;
 	}
 	return false;

@@ -8,6 +8,7 @@
 #include "core/recon/algorithm.h"
 #include "core/correct/correction.h"
 #include "core/correct/counts.h"
+#include "core/correct/rings.h"
 #include "core/outofcore/outofcore.h"
 #include "core/recon/internal.h"
 #include "core/recon/thin.h"
@@ -170,6 +171,9 @@ static size_t kept_bytes(const struct recon *recon)
 
 	if (recipe->hold_out)
 		bytes += held_out_bytes(recon->geometry);
+	if (recipe->rings)
+		bytes += rings_bytes(recon->geometry->columns * recipe->binning,
+				     recon->geometry->rows * recipe->binning, recon->geometry->count);
 	if (recipe_has_ends(recipe))
 		bytes += ends_bytes(&recipe->grid, recon->geometry, &recon->orbit);
 	if (recipe_has_rim(recipe))

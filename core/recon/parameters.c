@@ -126,6 +126,8 @@ const struct parameter recipe_parameters[] = {
     {"", "binning", PARAMETER_INTEGER, AT(binning), RANGE(1, BINNING_MOST), .preset = 1, .word = "auto",
      .unit = "pixels",
      .help = "Pixels along columns and rows that are taken as one; auto takes as many as a voxel spans."},
+    {"", "rings", PARAMETER_FLAG, AT(rings),
+     .help = "Whether pixels whose gain has changed since the flat image are found from all views and mended."},
     {"", "hold_out", PARAMETER_FLAG, AT(hold_out),
      .help = "Whether one view of twenty has no part in the volumes, which are then held against it."},
     {"", "precision", PARAMETER_SWITCH, AT(reference_precision), NAMES(precision_names),

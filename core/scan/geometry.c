@@ -381,6 +381,17 @@ double view_project(const double matrix[12], const double point[3], double *ret_
 	return depth;
 }
 
+double view_axis_distance(const double matrix[12], double column, double row)
+{
+	double at[2][2], along[2];
+
+	for (int end = 0; end < 2; end++)
+		view_project(matrix, (const double[3]){0, 0, end ? 10 : -10}, &at[end][0], &at[end][1]);
+	along[0] = at[1][0] - at[0][0];
+	along[1] = at[1][1] - at[0][1];
+	return fabs((column - at[0][0]) * along[1] - (row - at[0][1]) * along[0]) / hypot(along[0], along[1]);
+}
+
 void axis_direction(const double source[3], const double axis[3], double ret_direction[3])
 {
 	static const double z[3] = {0, 0, 1};

@@ -84,6 +84,10 @@ void view_matrix(const struct view *view, double ret_matrix[12]);
 /* Depth of a point and its pixel coordinates; the depth may be <= 0, then the pixel means nothing. */
 double view_project(const double matrix[12], const double point[3], double *ret_column, double *ret_row);
 
+/* Pixels between a pixel and the image of z, the axis of the rotation, in the view of this matrix; NAN: there is none.
+ */
+double view_axis_distance(const double matrix[12], double column, double row);
+
 /*
  * Unit vector from a source straight across to the rotation axis, which goes
  * through the isocentre along the unit vector `axis`, z where that is all 0; from

@@ -1,9 +1,11 @@
 /* Pixels that do not follow their neighbours over the views (core/correct/stuck.h), and objects that look like some. */
 #include <check.h>
 #include <math.h>
+#include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
 
+#include "core/correct/rings.h"
 #include "core/correct/stuck.h"
 #include "tests/unit/scene.h"
 
@@ -409,6 +411,210 @@ START_TEST(a_look_that_is_given_up_leaves_nothing_behind)
 }
 END_TEST
 
+/* ---- errors of gain (core/correct/rings.h) ---- */
+
+enum { DRIFT_COLUMNS = 256, DRIFT_ROWS = 160, DRIFT_PIXELS = DRIFT_COLUMNS * DRIFT_ROWS };
+
+struct drift {
+	enum object object;
+	double photons; /* 0: no noise */
+	int views;
+	double arc;   /* degrees */
+	double share; /* of the pixels whose gain is a per cent too large or too small */
+	bool counts;  /* with a flat and a dark image, in place of line integrals */
+};
+
+/* Samples as they come, of all views. */
+struct drifted {
+	const struct geometry *geometry;
+	float *samples; /* [view][row][column] */
+	int reads;
+};
+
+static int read_rows(void *context, int view, int first, int rows, void *to, struct error *err)
+{
+	struct drifted *drifted = context;
+	const size_t columns = (size_t)drifted->geometry->columns;
+
+	(void)err;
+	ck_assert(first >= 0 && rows > 0 && first + rows <= drifted->geometry->rows);
+	memcpy(to, drifted->samples + ((size_t)view * (size_t)drifted->geometry->rows + (size_t)first) * columns,
+	       (size_t)rows * columns * sizeof(float));
+#pragma omp atomic
+	drifted->reads++;
+	return 0;
+}
+
+static int fail_to_read(void *context, int view, int first, int rows, void *to, struct error *err)
+{
+	(void)context;
+	(void)first;
+	(void)rows;
+	(void)to;
+	return view == 17 ? error_set(err, ERR_IO, "gone") : 0;
+}
+
+/*
+ * Splitmix64 (Steele and others 2014): the linear generator above repeats itself from view to view where a view has a
+ * power of two of samples.
+ */
+static uint64_t even_state;
+static double even(void)
+{
+	uint64_t z = even_state += 0x9e3779b97f4a7c15u;
+
+	z = (z ^ z >> 30) * 0xbf58476d1ce4e5b9u;
+	z = (z ^ z >> 27) * 0x94d049bb133111ebu;
+	return (double)((z ^ z >> 31) >> 11) / 9007199254740992.0;
+}
+
+static const float DARK_COUNTS = 300;
+
+static float count_of(double integral, double photons)
+{
+	const double share = exp(-integral);
+	double normal = -6;
+
+	for (int k = 0; k < 12 && photons > 0; k++)
+		normal += even();
+	return (float)(FLAT * fmax(share + (photons > 0 ? normal * sqrt(share / photons) : 0), 1e-6));
+}
+
+/* Root mean squares of the errors, of what is left of them, and of what was found where there is none. */
+static void run_drift(const struct drift *drift, double ret[3], size_t *ret_false)
+{
+	const struct orbit_spec spec = {DRIFT_COLUMNS,
+					DRIFT_ROWS,
+					drift->views,
+					{620, 1100, {.75, .75}, {0, 0}, {0, 0}},
+					0,
+					drift->arc / drift->views};
+	struct phantom phantom = {.parts = (struct ellipsoid *)objects[drift->object]};
+	float *images = malloc(2 * DRIFT_PIXELS * sizeof(*images)), *flat = images, *dark = images + DRIFT_PIXELS;
+	float *errors = malloc(DRIFT_PIXELS * sizeof(*errors)), *mended;
+	double *added = calloc(DRIFT_PIXELS, sizeof(*added));
+	struct linearise linearise = {.sample = SAMPLE_FLOAT32,
+				      .quantity = drift->counts ? QUANTITY_INTENSITY : QUANTITY_LINE_INTEGRAL};
+	struct drifted drifted = {0};
+	const struct rings_source source = {read_rows, &drifted};
+	struct rings_found found;
+	struct scene scene;
+	struct error err;
+
+	even_state = 11;
+	while (phantom.count < PARTS_MOST && phantom.parts[phantom.count].semi_axes[0] > 0)
+		phantom.count++;
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	for (size_t i = 0; i < DRIFT_PIXELS; i++) {
+		added[i] = even() < drift->share ? -log(1 + (even() < .5 ? .01 : -.01)) : 0;
+		flat[i] = (float)(FLAT * (.8 + .4 * even())) + DARK_COUNTS;
+		dark[i] = DARK_COUNTS;
+	}
+	for (int view = 0; view < drift->views; view++)
+		for (size_t i = 0; i < DRIFT_PIXELS; i++) {
+			float *p = scene.projections + (size_t)view * DRIFT_PIXELS + i;
+			const double share = (double)count_of((double)*p, drift->photons) / FLAT;
+
+			*p = drift->counts ? DARK_COUNTS + (flat[i] - DARK_COUNTS) * (float)(share * exp(-added[i]))
+					   : (float)(-log(share) + added[i]);
+		}
+	if (drift->counts) {
+		linearise.image[IMAGE_FLAT] = flat;
+		linearise.image[IMAGE_DARK] = dark;
+	}
+	drifted.geometry = &scene.geometry;
+	drifted.samples = scene.projections;
+	ck_assert_int_eq(rings_find(&linearise, &scene.geometry, &source, NULL, errors, &found, &err), 0);
+	ck_assert_int_ge(drifted.reads, drift->views);
+	mended = rings_flat(&linearise, errors, DRIFT_PIXELS);
+	ret[0] = ret[1] = ret[2] = 0;
+	*ret_false = 0;
+	for (size_t i = 0; i < DRIFT_PIXELS; i++) {
+		const double e = (double)errors[i];
+
+		ret[0] += added[i] * added[i] / DRIFT_PIXELS;
+		ret[1] += (e - added[i]) * (e - added[i]) / DRIFT_PIXELS;
+		ret[2] += added[i] == 0 ? e * e / DRIFT_PIXELS : 0;
+		*ret_false += added[i] == 0 && e != 0;
+		if (drift->counts)
+			ck_assert_double_eq_tol(log((double)((flat[i] - DARK_COUNTS) / (mended[i] - DARK_COUNTS))), e,
+						2e-6);
+	}
+	for (int i = 0; i < 3; i++)
+		ret[i] = sqrt(ret[i]);
+	free(mended);
+	free(added);
+	free(errors);
+	free(images);
+	scene_clear(&scene);
+}
+
+/*
+ * A fifth of the errors at most is left, a quarter behind noise, of a full turn or a short scan; a sixth is the pixels
+ * whose rays pass the axis, which are left alone.
+ */
+START_TEST(errors_of_gain_are_found)
+{
+	for (int form = 0; form < 4; form++) {
+		const struct drift drift = {.object = HEAD,
+					    .photons = _i * 2e4,
+					    .views = 360,
+					    .arc = form == 1 ? 200 : 360,
+					    .share = form == 2 ? .02 : .005,
+					    .counts = form == 3};
+		double rms[3];
+		size_t wrong;
+
+		run_drift(&drift, rms, &wrong);
+		ck_assert_msg(rms[1] <= (_i == 0 ? .2 : .25) * rms[0],
+			      "%g photons, form %d: %.3f of the errors are left", drift.photons, form, rms[1] / rms[0]);
+	}
+}
+END_TEST
+
+/* Edges, tips, beads and metal, on the axis and aside, on full turns and short scans, with noise and without. */
+START_TEST(an_object_is_no_error_of_gain)
+{
+	for (int object = 0; object < OBJECTS; object++)
+		for (int form = 0; form < 2; form++) {
+			const struct drift drift = {.object = (enum object)object,
+						    .photons = _i * 2e4,
+						    .views = form == 1 ? 64 : 120,
+						    .arc = form == 1 ? 200 : 360};
+			double rms[3];
+			size_t wrong;
+
+			run_drift(&drift, rms, &wrong);
+			ck_assert_msg(wrong <= 1, "%s, %g photons, form %d: %zu pixels", names[object], drift.photons,
+				      form, wrong);
+		}
+}
+END_TEST
+
+START_TEST(a_view_that_cannot_be_read_is_told)
+{
+	const struct orbit_spec spec = {COLUMNS, ROWS, VIEWS, {620, 1100, {2, 2}, {0, 0}, {0, 0}}, 0, 360. / VIEWS};
+	const struct linearise linearise = {.sample = SAMPLE_FLOAT32, .quantity = QUANTITY_LINE_INTEGRAL};
+	const struct rings_source source = {fail_to_read, NULL};
+	float *errors = malloc(PIXELS * sizeof(*errors));
+	struct rings_found found;
+	struct scene scene;
+	struct error err;
+
+	scene_orbit(&scene, &spec);
+	ck_assert_int_eq(rings_find(&linearise, &scene.geometry, &source, NULL, errors, &found, &err), ERR_IO);
+	ck_assert_str_eq(err.text, "gone");
+	/* Too few views are not read at all. */
+	scene.geometry.count = RINGS_VIEWS_LEAST - 1;
+	ck_assert_int_eq(rings_find(&linearise, &scene.geometry, &source, NULL, errors, &found, &err), 0);
+	ck_assert_uint_eq(found.pixels, 0);
+	scene.geometry.count = VIEWS;
+	free(errors);
+	scene_clear(&scene);
+}
+END_TEST
+
 Suite *stuck_suite(void)
 {
 	Suite *suite = suite_create("stuck");
@@ -423,6 +629,9 @@ Suite *stuck_suite(void)
 	tcase_add_loop_test(tests, a_neighbour_of_mapped_pixels_is_judged_by_good_ones, 0, 4);
 	tcase_add_test(tests, a_thread_of_its_own_finds_the_same);
 	tcase_add_test(tests, a_look_that_is_given_up_leaves_nothing_behind);
+	tcase_add_loop_test(tests, errors_of_gain_are_found, 0, 2);
+	tcase_add_loop_test(tests, an_object_is_no_error_of_gain, 0, 2);
+	tcase_add_test(tests, a_view_that_cannot_be_read_is_told);
 	suite_add_tcase(suite, tests);
 	return suite;
 }
