@@ -439,10 +439,10 @@ install: all $(BUILD)/manual ## programs, units, settings, man pages and documen
 	$(configure) systemd/cbctd.tmpfiles.in >$(DESTDIR)$(prefix)/lib/tmpfiles.d/cbctd.conf
 	install -D -m 644 -t $(DESTDIR)$(prefix)/lib/systemd/system systemd/cbctd.socket
 	install -D -m 644 systemd/cbctd.sysusers $(DESTDIR)$(prefix)/lib/sysusers.d/cbctd.conf
-	install -m 644 -t $(DESTDIR)$(docdir) README.md docs/operation.md systemd/cbctd-alerts.yaml systemd/cbctd-dashboard.json
+	install -m 644 -t $(DESTDIR)$(docdir) README.md docs/operation.md docs/fleet.md systemd/cbctd.sbatch systemd/cbctd-alerts.yaml systemd/cbctd-dashboard.json
 	STATE_DIRECTORY=/var/lib/cbctd $(BUILD)/cbctd --print-config | sed 's/^[^#]/#&/' >$(DESTDIR)$(docdir)/cbctd.conf
 	install -D -m 644 -t $(DESTDIR)$(prefix)/share/man/man1 $(BUILD)/manual/man/cbct.1
-	install -D -m 644 -t $(DESTDIR)$(prefix)/share/man/man8 $(BUILD)/manual/man/cbctd.8 $(BUILD)/manual/man/cbct-worker.8
+	install -D -m 644 -t $(DESTDIR)$(prefix)/share/man/man8 $(addprefix $(BUILD)/manual/man/,cbctd.8 cbct-worker.8 cbct-dicom.8)
 	install -D -m 644 -t $(DESTDIR)$(prefix)/share/bash-completion/completions $(BUILD)/manual/completions/bash/cbct
 	ln -sf cbct $(DESTDIR)$(prefix)/share/bash-completion/completions/cbctd
 	install -D -m 644 -t $(DESTDIR)$(prefix)/share/zsh/site-functions $(BUILD)/manual/completions/zsh/_cbct

@@ -10,7 +10,7 @@ root=$1 version=$2 out=$3 cuda=${4:-}
 here=$(cd "$(dirname "$0")" && pwd)
 architecture=$(dpkg --print-architecture)
 export SOURCE_DATE_EPOCH=${SOURCE_DATE_EPOCH:-$(git -C "$here" log -1 --format=%ct 2>/dev/null || date +%s)}
-maintainer=${MAINTAINER:-the maintainers of cbctd <root@localhost>}
+maintainer=${MAINTAINER:-the maintainers of cbctd <cbctd@localhost>}
 mkdir -p "$out"
 
 # The Debian packages of the libraries that these programs name; those of the libraries' own are their packages' affair.
@@ -50,9 +50,12 @@ documents() { # NAME FOLDER COPYRIGHT
 	printf '%s\n' "$3" >"$to/copyright"
 	printf '%s (%s) unstable; urgency=medium\n\n  * The commits of the project say what has changed.\n\n -- %s  %s\n' \
 		"$1" "$version" "$maintainer" "$(LC_ALL=C date -u -R -d "@$SOURCE_DATE_EPOCH")" | gzip -9n >"$to/changelog.gz"
+	# Who builds a package for himself has no address to name.
+	[ -n "${MAINTAINER:-}" ] || printf '%s\n' "$1: bogus-mail-host" "$1: bogus-mail-host-in-debian-changelog" \
+		>"$2/usr/share/lintian/overrides/$1"
 	while read -r line; do
 		if [ "${line:0:1}" = '#' ]; then echo "$line"; else echo "$1: $line"; fi
-	done >"$2/usr/share/lintian/overrides/$1"
+	done >>"$2/usr/share/lintian/overrides/$1"
 }
 
 control() { # NAME FOLDER DEPENDS MORE: the description is standard input's

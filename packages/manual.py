@@ -3,8 +3,8 @@
 
     packages/manual.py BUILD OUT
 
-writes OUT/man/{cbctd.8,cbct.1,cbct-worker.8} and OUT/completions/{bash,zsh,fish}/... The help is made from the tables of
-settings, commands and options, so that these cannot say anything else.
+writes OUT/man/{cbctd.8,cbct.1,cbct-worker.8,cbct-dicom.8} and OUT/completions/{bash,zsh,fish}/... The help is made from
+the tables of settings, commands and options, so that these cannot say anything else.
 """
 import os
 import re
@@ -102,6 +102,9 @@ def write_man():
     page("cbct-worker", 8, "reconstructs for cbctd on one device",
          f".SH DESCRIPTION\nOne process for each device; cbctd starts, watches and restarts it, nobody else does.\n.PP\n.nf\n{usage}\n.fi\n"
          ".SH SEE ALSO\n.BR cbctd (8)")
+    page("cbct-dicom", 8, "speaks DICOM with archives for cbctd",
+         ".SH DESCRIPTION\nOne process for each task: a series that is sent, a question to a worklist, a port that projections come in "
+         "by. It is cbctd that starts it, with the task on descriptor 3, and nobody else does.\n.SH SEE ALSO\n.BR cbctd (8)")
 
 
 # ---- completions ----

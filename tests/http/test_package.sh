@@ -61,6 +61,13 @@ test_it_is_installed_upgraded_with_its_settings_and_removed() {
 	[ "$(find "$root/usr" -type f | wc -l)" = 0 ] || fail "nothing is left: $(find "$root/usr" -type f)"
 }
 
+# Debian's own eye on packages; what is overridden has its reason beside it (packages/deb.sh).
+test_lintian_finds_nothing() {
+	command -v lintian >/dev/null || skip "lintian is not here: apt-get install lintian"
+	package 1.0.0
+	lintian --allow-root --fail-on error,warning "$deb" >"$work/lintian" 2>&1 || fail "$(grep -E '^[EW]:' "$work/lintian")"
+}
+
 test_the_same_sources_give_the_same_package() {
 	local first
 	package 1.0.0
@@ -85,7 +92,7 @@ test_man_pages_and_completions_have_every_command_and_setting() {
 		done
 	done
 	if command -v man >/dev/null; then
-		for name in cbctd.8 cbct.1 cbct-worker.8; do
+		for name in cbctd.8 cbct.1 cbct-worker.8 cbct-dicom.8; do
 			[ -z "$(man -l --warnings=w -Tutf8 "$BUILD/manual/man/$name" 2>&1 >/dev/null)" ] || fail "$name has no mistake"
 		done
 	fi
