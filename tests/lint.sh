@@ -128,6 +128,15 @@ found "tests and commits that docs/risks.md and docs/track-record.md name exist"
 found "files that CONTRIBUTING.md and README.md name exist" "$(grep -ohE '`(clients|core|daemon|docs|kernels|proto|tests)/[A-Za-z0-9_./-]+`' \
 	CONTRIBUTING.md README.md | tr -d '`' | grep -vE 'NAME|ROOM' | sort -u | while read -r path; do [ -e "$path" ] || echo "$path"; done)"
 
+# A script without the right to run fails only where it is called by its name, which may be on a machine with a card.
+found "a file that begins with #! can be run, another can not" "$(git ls-files 2>/dev/null | while read -r file; do
+	[ -f "$file" ] || continue
+	script=no run=no
+	[ "$(head -c2 "$file" | tr -d '\0')" = '#!' ] && script=yes
+	[ -x "$file" ] && run=yes
+	[ $script = $run ] || echo "$file"
+done)"
+
 if command -v clang-format >/dev/null; then
 	for file in $(git ls-files '*.c' '*.h' '*.cu' '*.cuh' 2>/dev/null); do
 		[ -e "$file" ] || continue
