@@ -6,6 +6,7 @@
 #include <string.h>
 
 #include "core/correct/correction.h"
+#include "core/correct/projection_noise.h"
 
 /* About so many views are looked at, and of each so many pixels. */
 enum { VIEWS = 32, PIXELS = 300000 };
@@ -45,6 +46,66 @@ double averaging_fineness(const struct averaging_mean *mean, double pixels)
 double averaging_share(double ratio)
 {
 	return fmin(1, fmax(0, (ratio - AVERAGING_SMOOTH) / (AVERAGING_SHARP - AVERAGING_SMOOTH)));
+}
+
+/* ---- the mean of the default ---- */
+
+/* Pixels a voxel beyond which only edges that are seen ask for a mean, and from which on objects of voxels are seen. */
+static const double ALWAYS_MOST = 3, TOLD_FROM = 2;
+/* Iterations with that mean until their change falls: LONG of them up to TOLD_FROM pixels a voxel, SHORT from
+ * SHORT_FROM on. */
+static const double LONG = 6, SHORT = 2, SHORT_FROM = 2.5;
+enum { ALWAYS_PASSES = 2 };
+
+double averaging_part(double pixels)
+{
+	return pixels > ALWAYS_MOST ? 0 : fmin(1, fmax(0, (pixels - SETTLING_NONE) / 0.1));
+}
+
+double averaging_variance(double pixels, double ratio, double noise, double edges)
+{
+	/* Objects of voxels have ratios up to .137, what is blurred by tilted rows has .147 and more. */
+	static const double voxels = 0.137, body = 0.147;
+	static const double seen = 0.05, narrow = 0.09, wide = 0.15, narrow_to = 1.8, wide_from = 2.2;
+	/* From this share of noise on the narrow one is the better. */
+	static const double noisy = 0.25;
+	const double told = ratio > 0 ? fmin(1, fmax(0, (ratio - voxels) / (body - voxels))) : 1;
+	const double fine = fmin(1, fmax(0, (wide_from - pixels) / (wide_from - TOLD_FROM)));
+	const double thin = narrow + (seen - narrow) * edges * fine;
+	const double upto = narrow_to + (TOLD_FROM - narrow_to) * edges;
+	const double more = fmin(1, fmax(0, (pixels - upto) / (wide_from - upto)));
+
+	return averaging_part(pixels) * told * (thin + (wide - thin) * more * fmax(0, 1 - noise / noisy));
+}
+
+/* The variance of stack_average's mean: pixels at 1 .. whole on both sides, and a share of the next one. */
+static double variance_of(double width)
+{
+	const double outer = (width - 1) / 2, whole = floor(outer), part = outer - whole;
+
+	return (whole * (whole + 1) * (2 * whole + 1) / 3 + 2 * part * (whole + 1) * (whole + 1)) / width;
+}
+
+double averaging_width(double variance)
+{
+	double below = 1, above = 9;
+
+	if (!(variance > 0))
+		return 1;
+	for (int i = 0; i < 60; i++) {
+		const double middle = (below + above) / 2;
+
+		if (variance_of(middle) < variance)
+			below = middle;
+		else
+			above = middle;
+	}
+	return (below + above) / 2;
+}
+
+static double settling_averaged(double pixels)
+{
+	return LONG + (SHORT - LONG) * fmin(1, fmax(0, (pixels - TOLD_FROM) / (SHORT_FROM - TOLD_FROM)));
 }
 
 /* ---- sums ---- */
@@ -207,7 +268,9 @@ double averaging_ratio(double pixels, const struct averaging_sums sums[AVERAGING
 struct state {
 	struct averaging_mean mean;
 	double pixels[2], fineness[2];
-	int every; /* one view in so many is looked at */
+	bool always; /* the mean of the default, and not the one that edges ask for */
+	bool halves; /* D of half a voxel is looked at */
+	int every;   /* one view in so many is looked at */
 	int distances[DISTANCES];
 	struct averaging_sums (*sums)[DISTANCES]; /* [views looked at], owned */
 	int looked_at;
@@ -250,7 +313,7 @@ static int bytes(const struct correction_ask *ask, struct correction_bytes *byte
 
 	(void)err;
 	averaging_pixels(ask->orbit, &ask->recipe->grid, pixels);
-	if (averaging_fineness(&mean, pixels[0]) > 0)
+	if (averaging_fineness(&mean, pixels[0]) > 0 || (ask->averages && averaging_part(pixels[0]) > 0))
 		bytes->device += ask->backend->stack_bytes(ask->geometry->columns, ask->geometry->rows, 1);
 	return 0;
 }
@@ -272,6 +335,8 @@ static int open_state(const struct correction_job *job, void **ret_state, struct
 		state->pixels[i] = pixels[i];
 		state->fineness[i] = averaging_fineness(&state->mean, pixels[i]);
 	}
+	state->always = job->averages && averaging_part(pixels[0]) > 0;
+	state->halves = state->fineness[0] > 0 || (state->always && pixels[0] >= TOLD_FROM);
 	averaging_distances(pixels[0], state->distances);
 	for (int i = 0; i < SETTLING_DISTANCES; i++)
 		state->distances[AVERAGING_DISTANCES + i] = 1 + i;
@@ -299,7 +364,7 @@ static int look_at(const struct correction_job *job, void *context, const struct
 	if (state == NULL || view->view % state->every != 0)
 		return 0;
 	code = job->backend->stack_download(view->to, view->slot, 1, state->view, err);
-	for (int i = state->fineness[0] > 0 ? 0 : AVERAGING_DISTANCES; i < DISTANCES && code == 0; i++) {
+	for (int i = state->halves ? 0 : AVERAGING_DISTANCES; i < DISTANCES && code == 0; i++) {
 		struct averaging_sums *sums = &state->sums[view->view / state->every][i];
 
 		*sums = (struct averaging_sums){0};
@@ -323,13 +388,57 @@ static int average(const struct correction_job *job, const double widths[2], int
 	return code;
 }
 
+/* Widths of the default's mean, from what the projections show and how noisy they are before the mean. */
+static int widths_of_default(const struct correction_job *job, const struct state *state,
+			     const struct averaging_sums sums[DISTANCES], double ratio, double edges,
+			     double ret_widths[2], struct error *err)
+{
+	const double shown = structure(&sums[AVERAGING_DISTANCES], false);
+	struct projection_squares squares;
+	double noise;
+	int code = noise_of_projections(job->backend, job->projections, job->geometry, &squares, err);
+
+	if (code < 0)
+		return code;
+	/* Of white noise a second difference has six times the variance. */
+	noise = squares.noise > 0 ? 6 * squares.noise / (6 * squares.noise + shown) : 0;
+	for (int i = 0; i < 2; i++)
+		ret_widths[i] = averaging_width(averaging_variance(state->pixels[i], ratio, noise, edges) *
+						pow(state->pixels[i], 2) / ALWAYS_PASSES);
+	return 0;
+}
+
+static void tell(const struct correction_job *job, const struct state *state, double ratio, const double widths[2])
+{
+	const double *pixels = state->pixels;
+
+	if (*job->iteration > 0)
+		return;
+	if (state->always)
+		warning_tell(
+		    job->warnings, "averaged_pixels",
+		    "a voxel spans %.3g x %.3g pixels, and the projections do not show that the object is as "
+		    "coarse: iterations get means over %.3g x %.3g pixels, taken twice, FDK all pixels; voxels of "
+		    "%.3g mm would hold what the pixels show",
+		    pixels[0], pixels[1], widths[0], widths[1], SETTLING_NONE * job->orbit->pixel_at_isocentre[0]);
+	else
+		warning_tell(
+		    job->warnings, "averaged_pixels",
+		    "a voxel spans %.3g x %.3g pixels, and the projections show edges within it (power at half a "
+		    "voxel over that at a voxel: %.3f, a grid has .125): iterations get means over %.3g x %.3g "
+		    "pixels, taken %s, FDK all pixels; voxels of %.3g mm would hold what the pixels show",
+		    pixels[0], pixels[1], ratio, widths[0], widths[1], state->mean.passes == 1 ? "once" : "twice",
+		    state->mean.none * job->orbit->pixel_at_isocentre[0]);
+}
+
 /* A run that goes on gets its views again, and decides as before. */
 static int apply(const struct correction_job *job, void *context, enum correction_time time, bool *ret_changed,
 		 struct error *err)
 {
 	const struct state *state = context;
 	struct averaging_sums sums[DISTANCES];
-	double widths[2], ratio, share, edges;
+	double widths[2], ratio, share, settling, edges;
+	int code = 0;
 
 	(void)time;
 	(void)ret_changed;
@@ -338,21 +447,26 @@ static int apply(const struct correction_job *job, void *context, enum correctio
 	sum_up(state, sums);
 	ratio = averaging_ratio(state->pixels[0], sums);
 	share = averaging_share(ratio);
-	edges = fmax(share, settling_share(state->pixels[0], sums + AVERAGING_DISTANCES));
-	*job->settled = fmin(*job->settled, settling_after(state->pixels[0], share * state->fineness[0], edges));
-	if (share == 0)
+	settling = settling_share(state->pixels[0], sums + AVERAGING_DISTANCES);
+	edges = fmax(share, settling);
+	if (state->always)
+		code = widths_of_default(job, state, sums, ratio, settling, widths, err);
+	else
+		for (int i = 0; i < 2; i++)
+			widths[i] = 1 + share * state->fineness[i] * fmax(0, state->mean.voxels * state->pixels[i] - 1);
+	if (code < 0)
+		return code;
+	if (!state->always || edges == 0 || fmax(widths[0], widths[1]) <= 1)
+		*job->settled =
+		    fmin(*job->settled, settling_after(state->pixels[0], share * state->fineness[0], edges));
+	if (fmax(widths[0], widths[1]) <= 1)
 		return 0;
-	for (int i = 0; i < 2; i++)
-		widths[i] = 1 + share * state->fineness[i] * fmax(0, state->mean.voxels * state->pixels[i] - 1);
-	if (*job->iteration == 0)
-		warning_tell(
-		    job->warnings, "averaged_pixels",
-		    "a voxel spans %.3g x %.3g pixels, and the projections show edges within it (power at half a "
-		    "voxel over that at a voxel: %.3f, a grid has .125): iterations get means over %.3g x %.3g "
-		    "pixels, taken %s, FDK all pixels; voxels of %.3g mm would hold what the pixels show",
-		    state->pixels[0], state->pixels[1], ratio, widths[0], widths[1],
-		    state->mean.passes == 1 ? "once" : "twice", state->mean.none * job->orbit->pixel_at_isocentre[0]);
-	return average(job, widths, state->mean.passes, err);
+	if (state->always)
+		*job->settled =
+		    fmin(*job->settled, fmin(settling_averaged(state->pixels[0]),
+					     settling_after(state->pixels[0], share * state->fineness[0], edges)));
+	tell(job, state, ratio, widths);
+	return average(job, widths, state->always ? ALWAYS_PASSES : state->mean.passes, err);
 }
 
 const struct correction correction_averaging = {

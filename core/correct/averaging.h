@@ -53,6 +53,24 @@ struct averaging_mean {
 };
 struct averaging_mean averaging_mean(const struct recipe *recipe);
 
+/*
+ * The mean of the default, SART with TV that finds its strength (recipe_averages). From 1.2 pixels a voxel on, edges
+ * that are tilted against the rows look as an object of voxels does, and iterations overshoot at them until they are
+ * worse than FDK: skulls, heads, soft bodies. A mean that is taken where none was needed costs such iterations less
+ * than that, and leaves them better than FDK: the default has it wherever projections do not show an object of voxels,
+ * which they can from 2 pixels a voxel on. It is known by its variance, the smaller the less voxels would overshoot.
+ * TV takes out what noise is, and with a wide mean what little of the object stands above it.
+ *
+ * Its variance in voxels' squares, that of both passes together. ratio: averaging_ratio, 0 where it is not known;
+ * noise: the share of the power of second differences that is noise, 0 .. 1; edges: settling_share, where neighbouring
+ * pixels show edges that are not tilted, the mean is narrower up to 2 pixels a voxel. 0: no mean.
+ */
+double averaging_variance(double pixels, double ratio, double noise, double edges);
+/* Whether voxels of so many pixels may get that mean, 0 .. 1. */
+double averaging_part(double pixels);
+/* The width, 1 .. 9 pixels, of a mean (stack_average) of this variance in pixels' squares. */
+double averaging_width(double variance);
+
 /* Ratios D(v/2) / D(v) up to which an object is the grid's, and from which on it has edges. */
 #define AVERAGING_SMOOTH 0.145
 #define AVERAGING_SHARP 0.165

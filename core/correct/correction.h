@@ -55,6 +55,7 @@ struct correction_job {
 	 */
 	int (*wide)(void *context, struct error *err);
 	void *wide_context;
+	bool averages;                     /* recipe_averages: iterations get means over pixels (averaging.h) */
 	struct recon_agreement *agreement; /* what the check of the geometry finds goes there */
 	double *settled;                   /* iterations after which relaxation falls (averaging.h); INFINITY: never */
 	const struct warning_sink *warnings;
@@ -83,6 +84,7 @@ struct correction_ask {
 	const struct geometry *geometry;
 	const struct orbit *orbit;
 	const struct recipe *recipe;
+	bool averages; /* as in struct correction_job */
 };
 
 /* Voxels in some slices of a volume that is kept. */

@@ -194,7 +194,8 @@ static int memory_on(const struct backend *backend, struct device *device, struc
 					   .device = device,
 					   .geometry = recon->geometry,
 					   .orbit = &recon->orbit,
-					   .recipe = recipe};
+					   .recipe = recipe,
+					   .averages = recipe_averages(recipe, &recon->orbit)};
 	const size_t kept = kept_bytes(recon);
 	struct walk beside = {.backend = backend, .device = device, .measures = true}, planned = beside;
 	struct correction_bytes around = {0};

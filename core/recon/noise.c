@@ -30,7 +30,11 @@ enum { SIDES = sizeof(sides) / sizeof(sides[0]), CUBES_LEAST = 12, CUBES_MOST = 
 /* Voxels that the object's level, mean and contrast are taken from, about. */
 enum { SAMPLES = 100000 };
 
-/* A cube lies in the object when its mean is so much of the object's: fat counts, lung and a rim of air do not. */
+/*
+ * A cube lies in the object when its mean is so much of the object's: fat counts, lung and a rim of air do not. Behind
+ * a thick skull the brain is below that of the mean, and the median is the brain's: cubes of the shell alone would tell
+ * its edges for noise.
+ */
 static const double INSIDE = 0.8;
 
 /* Bone and metal count as so many times the object's mean at most: a screw says nothing of the anatomy's contrast. */
@@ -38,7 +42,7 @@ static const double BRIGHT = 2.5;
 
 /* Voxels above `level` are the object. */
 struct classes {
-	double level, mean; /* mean: of the object */
+	double level, mean, median; /* of the object */
 };
 
 /*
@@ -133,6 +137,24 @@ static int compare_floats(const void *a, const void *b)
 	return (x > y) - (x < y);
 }
 
+/* The median of the object. ERR_NO_MEMORY. */
+static int find_median(const float *slices, size_t voxels, struct classes *classes, struct error *err)
+{
+	const size_t stride = voxels / SAMPLES + 1;
+	float *values = malloc(sizeof(*values) * (voxels / stride + 1));
+	size_t count = 0;
+
+	if (values == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for the median of %zu voxels", voxels);
+	for (size_t i = 0; i < voxels; i += stride)
+		if ((double)slices[i] > classes->level && isfinite(slices[i]))
+			values[count++] = slices[i];
+	qsort(values, count, sizeof(*values), compare_floats);
+	classes->median = count > 0 ? (double)values[count / 2] : 0;
+	free(values);
+	return 0;
+}
+
 static double contrast_of(const float *slices, size_t voxels, const struct classes *classes, double variance)
 {
 	const size_t stride = voxels / SAMPLES + 1;
@@ -196,14 +218,15 @@ static int quartile_of_cubes(const float *slices, const int size[3], int side, d
 int noise_of_slices(const float *slices, const int size[3], struct volume_noise *ret_noise, struct error *err)
 {
 	const size_t voxels = (size_t)size[0] * (size_t)size[1] * (size_t)size[2];
-	const struct classes classes = classes_of(slices, voxels);
+	struct classes classes = classes_of(slices, voxels);
 	double variance = 0;
 	size_t count = 0;
-	int code = 0;
+	int code = classes.mean > 0 ? find_median(slices, voxels, &classes, err) : 0;
 
 	if (classes.mean > 0)
 		for (int i = 0; i < SIDES && code == 0 && count < CUBES_LEAST; i++)
-			code = quartile_of_cubes(slices, size, sides[i], INSIDE * classes.mean, &variance, &count, err);
+			code = quartile_of_cubes(slices, size, sides[i], INSIDE * fmin(classes.mean, classes.median),
+						 &variance, &count, err);
 	if (code < 0)
 		return code;
 	*ret_noise =
@@ -232,10 +255,12 @@ static const double SART_NOISE = 0.2, NOISE_POWER = 0.85, FINENESS_POWER = 0.9, 
  * SART's artefacts beside noise go with the contrast. Few views leave streaks. Where the detector resolves more than
  * the grid can hold (`fineness`, pixel over voxel, below FINE), strong edges overshoot: that is bone, and the third
  * power of the contrast beside STRONG of water's attenuation tells it from soft tissue. Where pixels are finer
- * still, they are averaged if they show edges (core/correct/averaging.h), and AVERAGED of it is left.
+ * still, they are averaged if they show edges (core/correct/averaging.h), and AVERAGED of it is left. The default's
+ * mean leaves as much of what contrasts up to STRONG have, less of stronger ones, since by the third power a thick
+ * skull had 50 HU an iteration, and nothing where noise is NOISY of the contrast: TV takes enough for that.
  */
 static const double FEW = 0.012, FEW_VIEWS = 60, FEWEST_VIEWS = 40;
-static const double EDGES = 0.057, FINE = 0.63, STRONG = 0.28, AVERAGED = 0.25;
+static const double EDGES = 0.057, FINE = 0.63, STRONG = 0.28, AVERAGED = 0.25, NOISY = 0.1;
 
 /* Beyond it, TV moves nothing that a float of a gray level could tell. */
 static const double ALPHA_MOST = 1e9;
@@ -250,11 +275,15 @@ static double reach_after_sart(const struct volume_noise *noise, const struct re
 	const double *mm = recipe->grid.spacing, *pixel = orbit->pixel_at_isocentre;
 	const double fineness = sqrt(pixel[0] * pixel[1]) / cbrt(mm[0] * mm[1] * mm[2]);
 	const double updates = recipe_updates(recipe, orbit) / UPDATES;
+	const double averaged = recipe_averages(recipe, orbit) ? averaging_part(1 / fineness) : 0;
 	const double streaks = FEW * pow(FEW_VIEWS / fmax(orbit->count, FEWEST_VIEWS), 4);
 	const struct averaging_mean mean = averaging_mean(recipe);
 	const double left = 1 - (1 - AVERAGED) * averaging_fineness(&mean, 1 / fineness);
-	const double edges =
-	    EDGES * left * fmax(0, 1 - pow(fineness / FINE, 4)) * pow(noise->contrast / (STRONG * recipe->mu_water), 3);
+	const double strong = noise->contrast / (STRONG * recipe->mu_water);
+	const double beside =
+	    AVERAGED * pow(fmin(strong, 1 / strong), 3) * fmax(0, 1 - noise->sigma / (NOISY * noise->contrast));
+	const double overshoot = (1 - averaged) * pow(strong, 3) + averaged * beside;
+	const double edges = EDGES * left * fmax(0, 1 - pow(fineness / FINE, 4)) * overshoot;
 	const double noisy = SART_NOISE * pow(noise->sigma, NOISE_POWER) * pow(noise->contrast, 1 - NOISE_POWER) *
 			     pow(fmin(fineness, FINENESS_MOST), FINENESS_POWER);
 

@@ -1,6 +1,7 @@
 #ifndef CBCT_CORE_NOISE_H
 #define CBCT_CORE_NOISE_H
 
+#include "core/correct/projection_noise.h"
 #include "core/recon/recon.h"
 
 /*
@@ -20,19 +21,6 @@ int noise_measure(const struct backend *backend, struct volume *volume, const st
 
 /* Measures the noise of slices [z][y][x] in the host's memory. */
 int noise_of_slices(const float *slices, const int size[3], struct volume_noise *ret_noise, struct error *err);
-
-/* Means over the rays of projections. */
-struct projection_squares {
-	double rays;  /* how many were looked at */
-	double all;   /* of p^2 */
-	double noise; /* the part of it that noise has */
-};
-/*
- * Looks at every view, or at about 32 of them, and at 256 rows; rays that are left out do not count. The noise is found
- * beside the object (core/recon/projection_noise.c), mean over the rays. All is 0 where there is nothing to look at.
- */
-int noise_of_projections(const struct backend *backend, struct stack *projections, const struct geometry *geometry,
-			 struct projection_squares *ret_squares, struct error *err);
 
 enum noise_stage { NOISE_OF_FDK, NOISE_OF_SART };
 /*

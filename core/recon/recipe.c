@@ -263,3 +263,12 @@ double recipe_updates(const struct recipe *recipe, const struct orbit *orbit)
 		   ? algorithm->updates
 		   : recipe->sart.relaxation * subsets_count(recipe->sart.subsets, orbit->count);
 }
+
+bool recipe_averages(const struct recipe *recipe, const struct orbit *orbit)
+{
+	/* Iterations of fewer updates come to little more than FDK has, and a mean would only blur them. */
+	const double least = 5;
+
+	return recipe->algorithm != NULL && recipe->algorithm->subsets && recipe->tv.on && recipe->tv.automatic &&
+	       recipe_updates(recipe, orbit) >= least;
+}

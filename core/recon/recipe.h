@@ -31,5 +31,7 @@ int recipe_resolve(struct recipe *recipe, const struct geometry *geometry, const
 
 /* Updates of SART that change the iterate as much as one iteration does. */
 double recipe_updates(const struct recipe *recipe, const struct orbit *orbit);
+/* Iterations of many updates with TV that finds its strength, the default: they get means over pixels (averaging.h). */
+bool recipe_averages(const struct recipe *recipe, const struct orbit *orbit);
 
 #endif

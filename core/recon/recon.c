@@ -116,6 +116,7 @@ static int open_corrections(struct recon *recon, struct error *err)
 	    .iteration = &recon->iteration,
 	    .wide = begin_rim,
 	    .wide_context = recon,
+	    .averages = recipe_averages(&recon->recipe, &recon->orbit),
 	    .agreement = &recon->agreement,
 	    .settled = &recon->settled,
 	    .warnings = &recon->warnings,

@@ -461,17 +461,26 @@ START_TEST(momentum_begins_anew_where_the_residual_rises)
 }
 END_TEST
 
-/* Pixels of which two and a half make a voxel, and balls with edges: told once. */
+/*
+ * Pixels of which two and a half make a voxel, and balls with edges: told once. Without TV, with the mean of the
+ * default (averaging.h), and with momentum beside it; kept iterates too.
+ */
 START_TEST(a_run_whose_pixels_are_averaged_goes_on_with_the_same_bits)
 {
 	struct grid grid = grid_of(15, 14, 14, 4.2, 4.2, 4.2);
 	struct recipe recipe = small_recipe(&algorithm_sart);
+	int emit[] = {3};
 	struct scene scene;
-	struct outcome whole = {0}, first = {.yield_at = 1}, second = {0};
+	struct outcome whole = {0}, first = {.yield_at = 2}, second = {0};
 
 	recipe.grid = grid;
 	recipe.fdk.on = true;
-	recipe.iterate.iterations = 2;
+	recipe.iterate.iterations = 4;
+	recipe.emit = emit;
+	recipe.emits = 1;
+	recipe.sart.subsets = 6;
+	recipe.tv.on = _i > 0;
+	recipe.sart.momentum = _i > 1;
 	small_scene(&scene);
 	run(&scene, &recipe, &whole);
 	ck_assert_ptr_nonnull(strstr(whole.warnings, "averaged_pixels: "));
@@ -480,6 +489,8 @@ START_TEST(a_run_whose_pixels_are_averaged_goes_on_with_the_same_bits)
 	run(&scene, &recipe, &second);
 	ck_assert_ptr_null(strstr(second.warnings, "averaged_pixels: "));
 	ck_assert_mem_eq(second.last, whole.last, sizeof(float) * grid_voxels(&grid));
+	ck_assert_mem_eq(outcome_volume(&second, "iter-3"), outcome_volume(&whole, "iter-3"),
+			 sizeof(float) * grid_voxels(&grid));
 	outcome_clear(&whole);
 	outcome_clear(&first);
 	outcome_clear(&second);
@@ -742,7 +753,7 @@ Suite *algorithm_suite(void)
 	tcase_add_loop_test(rows, a_run_that_yielded_ends_with_the_same_bits, 0, 2 * ALGORITHM_COUNT);
 	tcase_add_loop_test(rows, momentum_survives_a_yield, 0, 2);
 	tcase_add_test(rows, momentum_begins_anew_where_the_residual_rises);
-	tcase_add_test(rows, a_run_whose_pixels_are_averaged_goes_on_with_the_same_bits);
+	tcase_add_loop_test(rows, a_run_whose_pixels_are_averaged_goes_on_with_the_same_bits, 0, 3);
 	tcase_add_loop_test(rows, every_algorithm_can_be_cancelled_and_stops_by_its_rules, 0, ALGORITHM_COUNT);
 	tcase_add_loop_test(cgls, the_residual_of_conjugate_gradients_falls, 0, 4 * SCENES);
 	tcase_add_test(cgls, conjugate_gradients_by_default_are_no_worse_than_fdk);

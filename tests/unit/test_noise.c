@@ -324,7 +324,14 @@ START_TEST(iterations_do_not_grow_worse_where_a_voxel_spans_two_pixels)
 	ck_assert_msg(found[TENTH].rmse <= 1.05 * found[THIRD].rmse && found[TENTH].rmse < 0.85 * fdk.rmse,
 		      "from %.1f to %.1f HU, FDK %.1f", found[THIRD].rmse, found[TENTH].rmse, fdk.rmse);
 	if (_i == 0) {
-		/* A relaxation that was asked for is kept to, and overshoots. */
+		/*
+		 * TV with explicit numbers gets all pixels: its iterations settle too, and a relaxation that was asked
+		 * for is kept to, and overshoots.
+		 */
+		recipe_explicit_tv(&recipe, TV_PROXIMAL);
+		recipe.tv.options.alpha = alpha;
+		recipe.tv.options.iterations = 30;
+		reconstruct(&scan, &recipe, found, &alpha);
 		recipe.sart.relaxation = 0.99;
 		reconstruct(&scan, &recipe, asked, &alpha);
 		ck_assert_double_gt(asked[TENTH].rmse, 1.2 * found[TENTH].rmse);

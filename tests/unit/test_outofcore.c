@@ -271,13 +271,14 @@ static void expect_corrected_in_parts(const struct scene *scene, struct recipe *
 	result_clear(&parts);
 }
 
-/* Voxels of more than two pixels, and a body with edges. */
+/* Voxels of more than two pixels, and a body with edges: what edges ask for, and the default's mean. */
 START_TEST(pixels_are_averaged_in_parts)
 {
 	struct grid grid = grid_of(27, 25, 25, 2.7, 2.7, 2.7);
 	struct recipe recipe = recipe_on(&grid);
 	struct scene scene;
 
+	recipe.tv.on = _i > 0;
 	make_scene(&scene, &full);
 	expect_corrected_in_parts(&scene, &recipe, 1, "averaged_pixels: ", 1e-5);
 	scene_clear(&scene);
@@ -367,7 +368,7 @@ Suite *outofcore_suite(void)
 	tcase_set_timeout(tests, 300);
 	tcase_add_loop_test(tests, outofcore_give_what_the_whole_gives, 0, (int)(sizeof(cases) / sizeof(cases[0])));
 	tcase_add_test(tests, any_limit_gives_the_same_volume);
-	tcase_add_test(tests, pixels_are_averaged_in_parts);
+	tcase_add_loop_test(tests, pixels_are_averaged_in_parts, 0, 2);
 	tcase_add_loop_test(tests, what_lies_outside_of_the_grid_is_left_out_in_parts, 0, 2);
 	tcase_add_test(tests, what_metal_takes_of_the_host_is_said);
 	tcase_add_test(tests, defects_are_counted_once);

@@ -8,10 +8,10 @@
  * that of noise. Noise goes with the attenuation, and so does the object, so that quantiles are taken among pieces of
  * like line integrals.
  */
+#include "core/correct/projection_noise.h"
+
 #include <math.h>
 #include <stdlib.h>
-
-#include "core/recon/noise.h"
 
 enum { APART = 2, DIFFERENCES = 20, PIECE = DIFFERENCES + 2 * APART, CLASSES = 8, CLASS_LEAST = 16 };
 enum { VIEWS = 32, ROWS = 256 /* that are looked at, about */ };
