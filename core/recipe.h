@@ -77,6 +77,7 @@ enum { BINNING_AUTO = -1, BINNING_MOST = 8 };
 struct recon_agreement {
 	int views;           /* that were measured; 0: they say nothing, and all is 0 */
 	double mm, sigma_mm; /* at the isocentre */
+	double unexplained;  /* share of a view's detail that the others do not show there, median */
 };
 
 enum { ITERATIONS_MAX = 100000, GRID_DEFAULT_MOST = 512, METAL_HU_LEAST = 500, METAL_HU_MOST = 1000000 };

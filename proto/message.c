@@ -117,6 +117,7 @@ static const struct field agreement_fields[] = {FIELD("job", FIELD_STRING, job),
 						FIELD("views", FIELD_INT, agreement.views),
 						FIELD("mm", FIELD_NUMBER, agreement.mm),
 						FIELD("sigma_mm", FIELD_NUMBER, agreement.sigma_mm),
+						FIELD("unexplained", FIELD_NUMBER, agreement.unexplained),
 						{0}};
 static const struct field stopped_fields[] = {FIELD("job", FIELD_STRING, job),
 					      FIELD("rule", FIELD_RULE, stop.rule),

@@ -79,8 +79,10 @@ static void on_agreement(void *context, const struct recon_agreement *agreement)
 	struct display *display = context;
 
 	progress_clear(display->progress);
-	fprintf(stderr, "views lie aside of what the others show by %.3g mm at the isocentre, +- %.3g mm a view\n",
-		agreement->mm, agreement->sigma_mm);
+	fprintf(stderr,
+		"views lie aside of what the others show by %.3g mm at the isocentre, +- %.3g mm a view; %.0f %% of a "
+		"view's detail is not where the others show it\n",
+		agreement->mm, agreement->sigma_mm, 100 * agreement->unexplained);
 }
 
 static void on_warning(void *context, const char *code, const char *detail)

@@ -389,7 +389,8 @@ static int tell_findings(struct remote *remote, const cJSON *job, struct error *
 
 	fit.agreement = (struct recon_agreement){.views = (int)member_number(agreement, "views", 0),
 						 .mm = member_number(agreement, "mm", 0),
-						 .sigma_mm = member_number(agreement, "sigma_mm", 0)};
+						 .sigma_mm = member_number(agreement, "sigma_mm", 0),
+						 .unexplained = member_number(agreement, "unexplained", 0)};
 	noise.alpha = member_number(denoising, "alpha", 0);
 	stop.stop = (struct recon_stop){
 	    .rule = (enum stop_rule)choice_of(member_text(stopped, "rule", ""), stop_rule_names, STOP_RULE_COUNT),

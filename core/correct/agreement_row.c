@@ -115,6 +115,7 @@ static int warn(const struct correction_job *job, void *opaque, struct error *er
 		tell(job, &agreement, reduced_bin(&state->reduced, job->orbit));
 		job->agreement->mm = agreement.mm;
 		job->agreement->sigma_mm = agreement.sigma_mm;
+		job->agreement->unexplained = agreement.unexplained;
 		job->agreement->views = agreement.measured;
 	}
 	agreement_clear(&agreement);

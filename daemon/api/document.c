@@ -241,6 +241,7 @@ static void add_agreement(cJSON *document, const struct recon_agreement *agreeme
 	object = cJSON_AddObjectToObject(document, "geometry_agreement");
 	cJSON_AddNumberToObject(object, "mm", agreement->mm);
 	cJSON_AddNumberToObject(object, "sigma_mm", agreement->sigma_mm);
+	cJSON_AddNumberToObject(object, "unexplained", agreement->unexplained);
 	cJSON_AddNumberToObject(object, "views", agreement->views);
 }
 

@@ -107,6 +107,7 @@ static const struct column job_columns[] = {
     {"agreement_views", COLUMN_INT, AT(job_record, agreement.views), .initial = "0", .changes = true},
     {"agreement_mm", COLUMN_REAL, AT(job_record, agreement.mm), .initial = "0", .changes = true},
     {"agreement_sigma_mm", COLUMN_REAL, AT(job_record, agreement.sigma_mm), .initial = "0", .changes = true},
+    {"agreement_unexplained", COLUMN_REAL, AT(job_record, agreement.unexplained), .initial = "0", .changes = true},
 };
 
 _Static_assert(sizeof(job_columns) / sizeof(job_columns[0]) <= COLUMNS_MAX, "a row has room for a job");

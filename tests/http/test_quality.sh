@@ -36,6 +36,7 @@ test_a_job_tells_whether_the_geometry_fits() {
 		post_job '{"scan": "SCAN", "grid": {"size": [24, 24, 16], "spacing_mm": [6, 6, 6]}, "fdk": {}}'
 		wait_job succeeded
 		expect_json ".geometry_agreement | .views == 64 and .sigma_mm > 0 and (.mm < 0.1) == $fits and (.mm > 0.5) != $fits"
+		expect_json ".geometry_agreement.unexplained | if $fits then . >= 0 and . < 0.3 else . > 0.05 and . <= 1 end"
 		expect_json "[.warnings[] | select(.code == \"geometry_wrong\" and .severity == \"serious\")] | (length == 0) == $fits"
 		expect_json '.warnings | all(.code != "geometry_doubtful")'
 	done

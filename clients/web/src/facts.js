@@ -61,7 +61,7 @@ export function jobFacts(job) {
 		...parameterFacts(job),
 		[t('Noise'), job.denoising ? `${number(job.denoising.noise_hu)} HU` : null],
 		[t('Alpha found'), job.tv?.alpha === 'auto' && job.denoising ? (job.denoising.alpha === null ? t('nothing to smooth') : number(job.denoising.alpha)) : null],
-		[t('Geometry fits to'), job.geometry_agreement ? t('{mm} mm at the isocentre (one projection: ± {sigma} mm)', { mm: number(job.geometry_agreement.mm, 2), sigma: number(job.geometry_agreement.sigma_mm, 2) }) : null],
+		[t('Geometry fits to'), job.geometry_agreement ? t('{mm} mm at the isocentre (one projection: ± {sigma} mm), {share} % of the detail elsewhere', { mm: number(job.geometry_agreement.mm, 2), sigma: number(job.geometry_agreement.sigma_mm, 2), share: Math.round(100 * job.geometry_agreement.unexplained) }) : null],
 		[t('Ended after'), job.stopped ? t('{n} iterations: {why}', { n: job.stopped.iteration, why: job.stopped.reason }) : null],
 		[t('Runs on'), job.device ? `${job.device} (${job.backend})` : job.backend],
 		[t('Memory'), job.memory ? bytes(job.memory.total) : null],

@@ -57,7 +57,7 @@ export const strings = {
 	'Ended': 'Beendet',
 	'Ended after': 'Beendet nach',
 	'Geometry fits to': 'Geometrie passt auf',
-	'{mm} mm at the isocentre (one projection: ± {sigma} mm)': '{mm} mm im Isozentrum (eine Projektion: ± {sigma} mm)',
+	'{mm} mm at the isocentre (one projection: ± {sigma} mm), {share} % of the detail elsewhere': '{mm} mm im Isozentrum (eine Projektion: ± {sigma} mm), {share} % der Einzelheiten anderswo',
 	'Enter takes the cross': 'Enter nimmt das Kreuz',
 	'Export': 'Ausgeben',
 	'FDK and TV': 'FDK und TV',
