@@ -58,7 +58,7 @@ dicom_libs  := libcurl
 CXX_DCMTK   := $(shell $(CXX) -x c++ -E -include dcmtk/config/osconfig.h /dev/null >/dev/null 2>&1 && echo 1)
 ifeq ($(CXX_DCMTK),1)
 dcmtk_objects = $(patsubst %.cc,$(BUILD)/%.o,$(wildcard daemon/dicom/*.cc))
-dcmtk_libs   := -ldcmnet -ldcmdata -loflog -lofstd -lstdc++
+dcmtk_libs    = -ldcmtls -ldcmnet -ldcmdata -loflog -lofstd $(call pkg,--libs,libssl libcrypto) -lstdc++
 endif
 all_libs    := $(core_libs) $(proto_libs) $(daemon_libs) $(cbct_libs)
 

@@ -6,6 +6,7 @@
 #include <cjson/cJSON.h>
 
 #include "core/scan/grid.h"
+#include "daemon/dicom/dimse.h"
 #include "proto/dicom.h"
 
 /*
@@ -76,6 +77,10 @@ struct archive {
 		      struct error *err);
 };
 extern const struct archive archive_web, archive_network;
+
+/* ---- network.c, for worklist.c ---- */
+/* The peer of a row of the file of destinations, or of its worklist; the texts are the row's. */
+struct dimse_peer row_peer(const cJSON *row);
 
 /* ---- worklist.c, listener.c ---- */
 /* Tells the daemon the steps of the worklist, a line {"step": ...} each. */

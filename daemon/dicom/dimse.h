@@ -17,7 +17,8 @@ extern "C" {
  * DICOM's own protocol (PS3.7 DIMSE over PS3.8), by DCMTK, which is used in dimse_*.cc alone. They are built where
  * libdcmtk-dev is; elsewhere these functions are NULL (dimse_built).
  *
- * Errors: ERR_BUSY: the peer cannot be reached; ERR_IO: it answers otherwise than it should; ERR_NO_MEMORY.
+ * Errors: ERR_BUSY: the peer cannot be reached, or does not prove who it is (TLS); ERR_IO: it answers otherwise than it
+ * should; ERR_NO_MEMORY.
  * Texts never contain a peer's own words, which may name a patient.
  */
 struct dimse_peer {
@@ -26,6 +27,8 @@ struct dimse_peer {
 	const char *title; /* of the peer's application entity (called) */
 	const char *own;   /* of ours (calling) */
 	int seconds;       /* for a connection, and for each answer */
+	/* Files of PEM. authority "": no TLS. certificate and key are ours, "": we show none. */
+	const char *authority, *certificate, *key;
 };
 
 /* An association; one thread at a time. */
@@ -45,7 +48,10 @@ extern "C" {
 #define DIMSE_WEAK __attribute__((weak))
 #define dimse_built() (dimse_open != NULL)
 
-/* ERR_NOT_FOUND: the peer answers, and does not know that service. class_uid: what is to be stored, else NULL. */
+/*
+ * ERR_NOT_FOUND: the peer answers, and does not know that service; ERR_INVALID: the files for TLS. class_uid: what is
+ * to be stored, else NULL.
+ */
 int dimse_open(const struct dimse_peer *peer, enum dimse_service service, const char *class_uid,
 	       struct dimse **ret_dimse, struct error *err) DIMSE_WEAK;
 /* NULL is fine. */

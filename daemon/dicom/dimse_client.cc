@@ -3,69 +3,20 @@
 
 #include <dcmtk/dcmdata/dctk.h>
 #include <dcmtk/dcmdata/dcistrmb.h>
-#include <dcmtk/dcmnet/dcmlayer.h>
-#include <dcmtk/dcmnet/dcmtrans.h>
 #include <dcmtk/dcmnet/diutil.h>
 #include <dcmtk/dcmnet/scu.h>
 #include <dcmtk/oflog/oflog.h>
 
-#include <netinet/in.h>
-#include <netinet/tcp.h>
+#include <memory>
 #include <new>
-#include <sys/socket.h>
 
 #include "daemon/dicom/dimse_promise.h"
+#include "daemon/dicom/dimse_transport.h"
 
 namespace
 {
 
 const Uint32 pdu_bytes = 131072;
-
-// Many archives write a reply in two pieces, and the second one waits until the first is acknowledged, by the kernel 40
-// ms later: for a series of 512 objects, 14 s.
-class PromptConnection : public DcmTCPConnection
-{
-      public:
-	explicit PromptConnection(DcmNativeSocketType socket) : DcmTCPConnection(socket)
-	{
-		const int one = 1;
-
-		setsockopt(socket, IPPROTO_TCP, TCP_NODELAY, &one, sizeof(one));
-		acknowledge();
-	}
-
-	ssize_t read(void *bytes, size_t count) override
-	{
-		const ssize_t got = DcmTCPConnection::read(bytes, count);
-
-		acknowledge();
-		return got;
-	}
-
-	OFBool networkDataAvailable(int timeout) override
-	{
-		acknowledge();
-		return DcmTCPConnection::networkDataAvailable(timeout);
-	}
-
-      private:
-	// The kernel forgets it again.
-	void acknowledge()
-	{
-		const int one = 1;
-
-		setsockopt(getSocket(), IPPROTO_TCP, TCP_QUICKACK, &one, sizeof(one));
-	}
-};
-
-class PromptLayer : public DcmTransportLayer
-{
-      public:
-	DcmTransportConnection *createConnection(DcmNativeSocketType socket, OFBool) override
-	{
-		return new (std::nothrow) PromptConnection(socket);
-	}
-};
 
 // Responses to C-FIND are handed on one by one, and no more than `most` are taken.
 class Client : public DcmSCU
@@ -73,6 +24,7 @@ class Client : public DcmSCU
       public:
 	int most = 0, count = 0;
 	Uint16 status = 0;
+	DcmTransportLayer *layer = nullptr; // outlives the client
 	void *context = nullptr;
 	void (*take)(void *context, DcmDataset *dataset) = nullptr;
 
@@ -80,7 +32,7 @@ class Client : public DcmSCU
 	{
 		OFCondition condition = DcmSCU::initNetwork();
 
-		return condition.good() ? useSecureConnection(&layer) : condition;
+		return condition.good() ? useSecureConnection(layer) : condition;
 	}
 
 	OFCondition handleFINDResponse(const T_ASC_PresentationContextID presentation, QRResponse *response,
@@ -107,9 +59,6 @@ class Client : public DcmSCU
 		if (sent != nullptr)
 			sent(sent_context, bytes);
 	}
-
-      private:
-	PromptLayer layer;
 };
 
 const char *class_of(enum dimse_service service, const char *class_uid)
@@ -137,7 +86,9 @@ int broken(const char *what, const OFCondition &condition, struct error *err)
 } // namespace
 
 struct dimse {
-	Client client;
+	PromptLayer plain;
+	std::unique_ptr<SecureLayer> secure; // where the peer has an authority
+	Client client;                       // ends before its layer
 	T_ASC_PresentationContextID presentation = 0;
 };
 
@@ -157,6 +108,19 @@ int dimse_open(const struct dimse_peer *peer, enum dimse_service service, const 
 	if (service != DIMSE_STORE)
 		syntaxes.push_back(UID_LittleEndianImplicitTransferSyntax);
 	Client &client = dimse->client;
+	client.layer = &dimse->plain;
+	if (peer->authority[0] != '\0') {
+		int code;
+
+		dimse->secure.reset(new (std::nothrow) SecureLayer);
+		code = dimse->secure ? dimse->secure->prepare(peer, err)
+				     : error_set(err, ERR_NO_MEMORY, "no memory for TLS");
+		if (code != 0) {
+			delete dimse;
+			return code;
+		}
+		client.layer = dimse->secure.get();
+	}
 	client.setAETitle(peer->own);
 	client.setPeerHostName(peer->host);
 	client.setPeerPort((Uint16)peer->port);
@@ -182,8 +146,11 @@ int dimse_open(const struct dimse_peer *peer, enum dimse_service service, const 
 				 peer->own, peer->title);
 	}
 	if (condition.bad()) {
+		const char *refused = dimse->secure ? dimse->secure->refused : nullptr;
+
 		delete dimse;
-		return error_set(err, ERR_BUSY, "it cannot be reached: %.160s", condition.text());
+		return refused != nullptr ? error_set(err, ERR_BUSY, "its certificate is refused: %.100s", refused)
+					  : error_set(err, ERR_BUSY, "it cannot be reached: %.160s", condition.text());
 	}
 	dimse->presentation = client.findAnyPresentationContextID(wanted, UID_LittleEndianExplicitTransferSyntax);
 	if (dimse->presentation == 0) {

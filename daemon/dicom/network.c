@@ -10,23 +10,25 @@
 #include <unistd.h>
 
 #include "daemon/dicom/dicom.h"
-#include "daemon/dicom/dimse.h"
 
 enum { ASSOCIATIONS = 3, PROMISE_SECONDS = 1 /* for an answer on the association that asked */ };
 
-static struct dimse_peer peer_of(const cJSON *destination)
+struct dimse_peer row_peer(const cJSON *row)
 {
-	return (struct dimse_peer){.host = destination_text(destination, "host"),
-				   .port = (int)destination_number(destination, "port", 104),
-				   .title = destination_text(destination, "title"),
-				   .own = destination_text(destination, "own_title"),
-				   .seconds = (int)ceil(destination_patience(destination, 0))};
+	return (struct dimse_peer){.host = destination_text(row, "host"),
+				   .port = (int)destination_number(row, "port", 104),
+				   .title = destination_text(row, "title"),
+				   .own = destination_text(row, "own_title"),
+				   .seconds = (int)ceil(destination_patience(row, 0)),
+				   .authority = destination_text(row, "ca_file"),
+				   .certificate = destination_text(row, "certificate_file"),
+				   .key = destination_text(row, "key_file")};
 }
 
 static int begin(const cJSON *destination, enum dimse_service service, const char *class_uid, struct dimse **ret_dimse,
 		 struct error *err)
 {
-	const struct dimse_peer peer = peer_of(destination);
+	const struct dimse_peer peer = row_peer(destination);
 
 	if (!dimse_built())
 		return error_set(err, ERR_IMPOSSIBLE,

@@ -3,7 +3,6 @@
 #include <time.h>
 
 #include "daemon/dicom/dicom.h"
-#include "daemon/dicom/dimse.h"
 #include "proto/worklist.h"
 
 _Static_assert((int)STEP_FIELDS == (int)STEP_FIELD_COUNT && (int)SUBJECT_COUNT <= (int)STEP_SUBJECT_MOST,
@@ -29,11 +28,7 @@ static void day(time_t time, char ret[9])
 
 int worklist_ask(const cJSON *worklist, struct error *err)
 {
-	const struct dimse_peer peer = {.host = destination_text(worklist, "host"),
-					.port = (int)destination_number(worklist, "port", 104),
-					.title = destination_text(worklist, "title"),
-					.own = destination_text(worklist, "own_title"),
-					.seconds = (int)destination_patience(worklist, 0)};
+	const struct dimse_peer peer = row_peer(worklist);
 	uint16_t tags[SUBJECT_COUNT][2];
 	char from[9], to[9];
 	const time_t now = time(NULL);
@@ -56,7 +51,7 @@ int worklist_ask(const cJSON *worklist, struct error *err)
 	}
 	day(now, from);
 	day(now + 86400 * ((time_t)destination_number(worklist, "days", 1) - 1), to);
-	patience(2 * destination_patience(worklist, 0));
+	patience(2 * peer.seconds);
 	code = dimse_open(&peer, DIMSE_WORKLIST, NULL, &dimse, err);
 	if (code == 0)
 		code = dimse_worklist(dimse, &query, found, NULL, err);

@@ -61,6 +61,20 @@ void application_file(struct json_reader *reader, const char *name)
 		json_fail(reader, ERR_INVALID, name, "the file %.200s cannot be read: %s", path, strerror(errno));
 }
 
+/* TLS: the authority of the peer's certificate, and what we show it. */
+static void read_tls(struct json_reader *reader)
+{
+	application_file(reader, "ca_file");
+	application_file(reader, "certificate_file");
+	application_file(reader, "key_file");
+	if (reader->code != 0)
+		return;
+	if (json_has(reader, "certificate_file") != json_has(reader, "key_file"))
+		json_fail(reader, ERR_INVALID, "key_file", "certificate_file and key_file go together");
+	else if (json_has(reader, "key_file") && !json_has(reader, "ca_file"))
+		json_fail(reader, ERR_INVALID, "ca_file", "TLS needs the authority of the peer's certificate");
+}
+
 void application_peer(struct json_reader *reader, char *ret_address, size_t size)
 {
 	char host[256] = "", title[TITLE_SIZE] = "";
@@ -71,6 +85,7 @@ void application_peer(struct json_reader *reader, char *ret_address, size_t size
 	json_integer(reader, "port", true, 1, 65535, &port);
 	read_title(reader, "title", true, title);
 	json_number(reader, "timeout_s", false, 1, 3600, &seconds);
+	read_tls(reader);
 	snprintf(ret_address, size, "%s@%.250s:%ld", title, host, port);
 }
 

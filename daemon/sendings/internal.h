@@ -106,7 +106,7 @@ struct destination *destination_find(const struct sendings *sendings, const char
 /* Reads the members title, listen and worklist of the file. */
 void application_read(struct json_reader *reader, struct application *ret);
 void application_free(struct application *application);
-/* A host, a port and the title of an application entity there. */
+/* A host, a port, the title of an application entity there, and the files of TLS. */
 void application_peer(struct json_reader *reader, char *ret_address, size_t size);
 /* Another worklist is to be asked from now on: what the old one told is dropped. The lock is held. */
 void worklist_forget(struct sendings *sendings);

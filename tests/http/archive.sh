@@ -12,18 +12,18 @@ need_archive() {
 	"$python" -c 'import gdcm, numpy, pydicom' 2>/dev/null || skip "python3-pydicom or python3-gdcm is not here"
 	[ -e "$work/scan/scan.json" ] || { mkdir -p "$work/scan" && "$python" "$top/tests/http/sides.py" make "$work/scan"; }
 }
-# start_archive: with what it had; sets $archive (its process), $rest (its address), $web and $dimse (its ports).
+# start_archive: with what it had, and settings of $more; sets $archive (its process), $rest (its address), $web and $dimse (its ports).
 start_archive() {
 	local i
 	mkdir -p "$work/archive"
 	[ -n "${web:-}" ] || read -r web dimse commit < <("$python" "$top/tests/http/send.py" ports 3)
 	mkdir -p "$work/worklist"
-	jq -n --arg plugin "$plugin" --arg worklists "${plugin%/*}/libModalityWorklists.so" --arg worklist "$work/worklist" --arg work "$work/archive" --argjson web "$web" --argjson dimse "$dimse" --argjson commit "$commit" '{
+	jq -n --argjson more "${more:-{\}}" --arg plugin "$plugin" --arg worklists "${plugin%/*}/libModalityWorklists.so" --arg worklist "$work/worklist" --arg work "$work/archive" --argjson web "$web" --argjson dimse "$dimse" --argjson commit "$commit" '{
 		Name: "ARCHIVE", DicomAet: "ARCHIVE", DicomCheckCalledAet: true, DicomPort: $dimse, HttpPort: $web, HttpBindAddresses: ["127.0.0.1"],
 		RemoteAccessAllowed: false, AuthenticationEnabled: false, StorageDirectory: $work, IndexDirectory: $work, Plugins: [$plugin, $worklists],
 		Worklists: {Enable: true, Database: $worklist},
 		DicomModalities: {cbctd: ["CBCTD", "127.0.0.1", $commit]}, DicomAlwaysAllowFind: true, DicomAlwaysAllowStore: true,
-		StorageCompression: false, OverwriteInstances: false}' >"$work/archive.json"
+		StorageCompression: false, OverwriteInstances: false} + $more' >"$work/archive.json"
 	Orthanc "$work/archive.json" >>"$work/archive.log" 2>&1 &
 	archive=$!
 	echo $archive >>"$work/peers"

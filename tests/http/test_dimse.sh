@@ -37,6 +37,50 @@ test_a_series_is_stored_found_and_committed() {
 	"$python" "$top/tests/http/dicom.py" check HFS "$work/voxels.raw" "$work/members.json" "$work/back/slices/"*.dcm -- "$work/back/frames/"*.dcm || fail "what came back"
 }
 
+# certificate NAME AUTHORITY [SUBJECT ALTERNATIVE NAME]: $work/NAME.pem and .key; an authority's own AUTHORITY is itself
+certificate() {
+	local by=(-CA "$work/$2.pem" -CAkey "$work/$2.key")
+	[ "$1" != "$2" ] || by=()
+	openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 2 -subj "/CN=$1" -keyout "$work/$1.key" -out "$work/$1.pem" \
+		${3:+-addext "subjectAltName=$3" -addext basicConstraints=CA:FALSE} "${by[@]}" 2>"$work/openssl.log" || fail "a certificate: $(cat "$work/openssl.log")"
+}
+
+test_an_archive_behind_tls() {
+	local more row
+	need_dcmtk
+	certificate authority authority
+	certificate stranger stranger
+	certificate archive authority IP:127.0.0.1
+	certificate ours authority DNS:cart
+	more=$(jq -n --arg work "$work" '{DicomTlsEnabled: true, DicomTlsCertificate: "\($work)/archive.pem", DicomTlsPrivateKey: "\($work)/archive.key",
+		DicomTlsTrustedCertificates: "\($work)/authority.pem"}')
+	mkdir -p "$work/worklist"
+	step S1 'Smith^John' 11 "$(date +%Y%m%d)" A11
+	start_archive
+	row='{kind: "dimse", host: "127.0.0.1", port: '$dimse', title: "ARCHIVE", ca_file: "\($work)/authority.pem", certificate_file: "\($work)/ours.pem",
+		key_file: "\($work)/ours.key", timeout_s: 5}'
+	jq -n --arg work "$work" --argjson listen "$(listening)" "$row"' as $row | {listen: $listen, worklist: ($row | del(.kind)), destinations: [
+		$row + {name: "pacs"}, $row + {name: "stranger", ca_file: "\($work)/stranger.pem"}, $row + {name: "name", host: "localhost"},
+		($row + {name: "nobody"} | del(.certificate_file, .key_file)), ($row + {name: "plain"} | del(.ca_file, .certificate_file, .key_file))]}' >"$work/destinations.json"
+	start_daemon --destinations "$work/destinations.json" --send-pause 0.2
+	req GET "/v1/destinations?wait=20"
+	expect_json '.destinations | map(.reachable) == [true, false, false, false, false]'
+	expect_json '.destinations[1].detail | contains("certificate is refused")'
+	expect_json '.destinations[2].detail | contains("certificate is refused")'
+	job_of "$who" '["pacs"]'
+	sending_becomes committed
+	fetched "$work/back"
+	[ "$(ls "$work/back" | wc -l)" = 50 ] || fail "50 objects"
+	req GET /v1/worklist
+	expect_json '.detail == null and (.steps | map(.id)) == ["S1"]'
+	# Files that are none, and one without the other.
+	for row in '.certificate_file = "/nowhere"' 'del(.key_file)' 'del(.ca_file)'; do
+		jq '.destinations |= [.[0] | '"$row"'] | del(.worklist)' "$work/destinations.json" >"$work/wrong.json"
+		! "$BUILD/cbctd" --state-dir "$work/none" --destinations "$work/wrong.json" --listen 127.0.0.1:0 2>"$work/said" || fail "refused: $row"
+		grep -q '_file' "$work/said" || fail "the member is named: $(cat "$work/said")"
+	done
+}
+
 test_peers_that_do_wrong() {
 	local mode
 	need_dcmtk
