@@ -46,17 +46,22 @@ export function gray(png) {
 
 export const grayOf = buffer => gray(PNG.sync.read(buffer))
 
-/* Means over n x n boxes. */
+/* Means over n x n boxes of equal size, whose edges may lie within pixels. */
 export function shrink({ width, height, pixels }, n = 24) {
-	const small = new Float64Array(n * n), count = new Float64Array(n * n)
-	for (let y = 0; y < height; y++) {
-		for (let x = 0; x < width; x++) {
-			const to = Math.floor(y * n / height) * n + Math.floor(x * n / width)
-			small[to] += pixels[y * width + x]
-			count[to]++
-		}
+	const small = new Float64Array(n * n), box = width * height / n ** 2
+	/* The boxes that pixel i of `count` lies in, and how much of it in each. */
+	const shares = (i, count) => {
+		const list = []
+		for (let to = Math.floor(i * n / count); to < n && to * count / n < i + 1; to++)
+			list.push([to, Math.min(i + 1, (to + 1) * count / n) - Math.max(i, to * count / n)])
+		return list
 	}
-	return small.map((sum, i) => count[i] ? sum / count[i] : 0)
+	const columns = Array.from({ length: width }, (_, x) => shares(x, width))
+	for (let y = 0; y < height; y++) {
+		for (const [row, high] of shares(y, height))
+			columns.forEach((list, x) => list.forEach(([column, wide]) => small[row * n + column] += high * wide * pixels[y * width + x] / box))
+	}
+	return small
 }
 
 export const mirrored = (small, n = 24) => small.map((_, i) => small[Math.floor(i / n) * n + n - 1 - i % n])
