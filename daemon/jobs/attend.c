@@ -101,7 +101,8 @@ double supervise_arrivals_since(const struct supervise *supervise, double now)
 	double since = now - PATIENCE;
 	struct scan_facts facts;
 
-	for (int i = 0; i < supervise->count; i++) {
+	/* Nobody here waits for the worker of another host. */
+	for (int i = 0; i < supervise->local; i++) {
 		if (worker_patience_ends(&supervise->workers[i]) > now)
 			continue;
 		stored_scan_facts(supervise->workers[i].arriving, &facts);

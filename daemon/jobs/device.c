@@ -252,6 +252,8 @@ bool devices_fit(const void *context, const struct job_trial *trial)
 {
 	const struct supervise *supervise = context;
 
+	if (trial->place != 0)
+		return false;
 	for (int i = 0; i < supervise->memory_count; i++) {
 		if (supervise->memory[i] < trial->where->memory)
 			return false;

@@ -96,6 +96,12 @@ struct jobs {
 /* Whether the job may run here, by its "where", stands in its entry. jobs->lock is held. */
 void job_place(struct job *job);
 
+/* ---- jobs/work.c ---- */
+/* References to all that wait and are not attended, oldest first; free the array. NULL when there are none. */
+struct job **jobs_waiting(struct jobs *jobs, int *ret_count);
+/* A worker could reconstruct the waiting job's projections as they arrive. *ret_facts: of its scan. */
+bool job_attendable(struct job *job, struct scan_facts *ret_facts);
+
 /* The job whose place in the queue this is. */
 struct job *job_of_entry(const struct queue_entry *entry);
 

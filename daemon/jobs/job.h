@@ -141,6 +141,7 @@ struct job_offer {
 	char id[ID_SIZE], scan[ID_SIZE];
 	enum priority priority;
 	struct where where;
+	bool elsewhere; /* no device here may have it */
 };
 /*
  * Queued jobs that another host may compute, in the order of the queue behind the first `skip` of it that may run here,
@@ -148,6 +149,11 @@ struct job_offer {
  * have a checkpoint or stay.
  */
 int jobs_offers(struct jobs *jobs, int skip, struct job_offer *ret_offers, int most);
+/*
+ * Waiting jobs that nobody attends and another host may, whose projections have come after `since` (CLOCK_MONOTONIC),
+ * oldest first.
+ */
+int jobs_offers_arriving(struct jobs *jobs, double since, struct job_offer *ret_offers, int most);
 /* From now on the job is computed here alone; in memory only. */
 void job_stay(struct job *job);
 

@@ -1,5 +1,6 @@
 /* Jobs that other hosts may compute: job.h. */
 #include <stdio.h>
+#include <stdlib.h>
 #include <string.h>
 
 #include "daemon/jobs/internal.h"
@@ -38,10 +39,43 @@ int jobs_offers(struct jobs *jobs, int skip, struct job_offer *ret_offers, int m
 		memcpy(ret_offers[count].id, job->id, sizeof(job->id));
 		memcpy(ret_offers[count].scan, job->scan, sizeof(job->scan));
 		ret_offers[count].where = job->request.where;
+		ret_offers[count].elsewhere = entry->elsewhere;
 		ret_offers[count++].priority = job->record.priority;
 	}
 	pthread_mutex_unlock(&jobs->lock);
 	return count;
+}
+
+static void add_arriving(struct job *job, double since, struct job_offer *ret_offers, int *count)
+{
+	struct job_offer *offer = &ret_offers[*count];
+	struct scan_facts facts;
+	bool may;
+
+	pthread_mutex_lock(&job->jobs->lock);
+	may = may_go(job) && !job->record.cancel_asked;
+	*offer = (struct job_offer){
+	    .priority = job->record.priority, .where = job->request.where, .elsewhere = job->entry.elsewhere};
+	pthread_mutex_unlock(&job->jobs->lock);
+	if (!may || !job_attendable(job, &facts) || facts.arrived <= since)
+		return;
+	memcpy(offer->id, job->id, sizeof(job->id));
+	memcpy(offer->scan, job->scan, sizeof(job->scan));
+	(*count)++;
+}
+
+int jobs_offers_arriving(struct jobs *jobs, double since, struct job_offer *ret_offers, int most)
+{
+	int count, offers = 0;
+	struct job **waiting = jobs_waiting(jobs, &count);
+
+	for (int i = 0; i < count; i++) {
+		if (offers < most)
+			add_arriving(waiting[i], since, ret_offers, &offers);
+		job_release(waiting[i]);
+	}
+	free(waiting);
+	return offers;
 }
 
 void job_place(struct job *job)

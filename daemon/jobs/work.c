@@ -30,8 +30,7 @@ static int promote(struct jobs *jobs, struct job *job, struct error *err)
 	return 0;
 }
 
-/* References to all that wait and are not attended, oldest first; free the array. NULL when there are none. */
-static struct job **list_waiting(struct jobs *jobs, int *ret_count)
+struct job **jobs_waiting(struct jobs *jobs, int *ret_count)
 {
 	struct job **waiting = NULL;
 	int count = 0;
@@ -58,7 +57,7 @@ static struct job **list_waiting(struct jobs *jobs, int *ret_count)
 int jobs_promote(struct jobs *jobs, struct error *err)
 {
 	int count, code = 0, result;
-	struct job **waiting = list_waiting(jobs, &count);
+	struct job **waiting = jobs_waiting(jobs, &count);
 
 	for (int i = 0; i < count; i++) {
 		result = code == 0 ? promote(jobs, waiting[i], err) : 0;
@@ -88,21 +87,30 @@ static bool goes_first(const struct candidate *a, const struct candidate *b)
 	return a->priority > b->priority;
 }
 
+bool job_attendable(struct job *job, struct scan_facts *ret_facts)
+{
+	const enum job_obstacle obstacle = job_obstacle(job);
+	struct error err;
+
+	/* Whether a device here may have it, the caller sees to. */
+	if ((obstacle != JOB_UNHINDERED && obstacle != JOB_NO_HOST) || !job->request.recipe.fdk.on ||
+	    store_scan_look(job->jobs->store, job->scan, ret_facts, &err) != 0)
+		return false;
+	return ret_facts->convertible && !ret_facts->complete && ret_facts->checked;
+}
+
 struct job *jobs_arriving(struct jobs *jobs, double since, const struct job_filter *filter, bool *ret_arriving)
 {
 	struct candidate best = {.job = NULL};
 	int count;
-	struct job **waiting = list_waiting(jobs, &count);
+	struct job **waiting = jobs_waiting(jobs, &count);
 
 	for (int i = 0; i < count; i++) {
 		struct candidate one = {.job = waiting[i], .priority = waiting[i]->record.priority};
 		struct scan_facts facts;
-		struct error err;
 
 		if ((filter != NULL && !filter->fits(filter->context, &one.job->trial)) ||
-		    job_obstacle(one.job) != JOB_UNHINDERED || !one.job->request.recipe.fdk.on ||
-		    store_scan_look(jobs->store, one.job->scan, &facts, &err) != 0 || !facts.convertible ||
-		    facts.complete || !facts.checked)
+		    !job_attendable(one.job, &facts))
 			continue;
 		one.arrived = facts.arrived;
 		one.arriving = facts.arrived > since;

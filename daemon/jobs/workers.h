@@ -198,7 +198,7 @@ void device_clear(struct supervise *supervise, struct worker *worker, const char
 enum route device_route(struct supervise *supervise, struct worker *worker, enum worker_end end);
 /* Jobs that this worker may be given. */
 bool device_fits(const void *worker, const struct job_trial *trial);
-/* Whether every device here that is given jobs has the memory that a job wants. */
+/* Whether every device here that is given jobs has the memory that a job wants, which no other host has claimed. */
 bool devices_fit(const void *supervise, const struct job_trial *trial);
 /* Tells jobs what devices there are; carries out what operators have asked for; starts the processor's worker when it
  * is needed, and ends it after. */

@@ -315,6 +315,48 @@ test_a_cancel_reaches_the_other_host_and_an_urgent_job_goes_first_there() {
 	empty_ledger
 }
 
+# turns_until HOST: projections come, one a second, until some of $job's are reconstructed there; $next is the next to come
+turns_until() {
+	local end
+	while [ "$next" -lt 60 ]; do
+		dd if="$scan_dir/projections.raw" of="$work/projection" bs=6912 skip="$next" count=1 2>/dev/null
+		req PUT "/v1/scans/$scan/projections/$next" --data-binary @"$work/projection"
+		expect_status 201
+		next=$((next + 1))
+		end=$((SECONDS + 1))
+		while [ "$SECONDS" -le "$end" ]; do
+			req GET "/v1/jobs/$job"
+			expect_json '.state == "waiting"'
+			[ "$(json '(.device // "" | startswith("'"$1"': ")) and .views.reconstructed > 0')" = true ] && return 0
+			sleep 0.1
+		done
+	done
+	fail "job $job is attended by $1, got $(json '{state, device, views}')"
+}
+test_an_arm_that_turns_is_followed_on_another_host() {
+	local next=0
+	begin
+	undisturbed "$scan_dir" "$small" small
+	taker a
+	owner c
+	at c
+	post_scan "$scan_dir"
+	post_job "$small"
+	turns_until a
+	stop_host a KILL
+	taker b
+	at c
+	turns_until b
+	req PUT "/v1/scans/$scan/projections" --data-binary @"$scan_dir/projections.raw"
+	expect_status 201
+	wait_job succeeded
+	expect_json '(.device | startswith("b: ")) and .error == null'
+	same_bits small
+	told_once
+	nothing_left b
+	empty_ledger
+}
+
 # where JSON JOB: the job with that "where"
 where() { printf '%s' "${2/\"fdk\"/\"where\": $1, \"fdk\"}"; }
 waits_for_a_host() {

@@ -1,0 +1,64 @@
+#ifndef CBCT_DAEMON_FLEET_INTERNAL_H
+#define CBCT_DAEMON_FLEET_INTERNAL_H
+
+#include <stdatomic.h>
+
+#include "daemon/fleet/fleet.h"
+#include "daemon/store/ledger.h"
+#include "daemon/store/store.h"
+
+/* Inside of the fleet's thread: fleet.c (the loop), owner.c (offers), taker.c (claims). All of it is that one thread.
+ */
+enum {
+	OFFERS_MOST = 64, /* of this owner at a time: more than its jobs that others could begin in a turn */
+	CLAIMS_MOST = 64  /* of this host */
+};
+#define LOOK 1.0 /* s between two turns at most: notifications are hints */
+
+struct fleet {
+	struct jobs *jobs; /* constant, as the next four */
+	struct supervise *supervise;
+	struct ledger_options options;
+	char name[64], database[1024], host[LEDGER_NAME_SIZE], url[LEDGER_URL_SIZE];
+	int wake; /* eventfd */
+	struct watch watch;
+	pthread_t thread;
+	atomic_bool stop;
+
+	/* The thread's own. */
+	struct ledger *ledger; /* NULL: it cannot be reached */
+	bool told;             /* that it cannot be */
+	double joined;         /* monotonic: when it was reached */
+	double renewed, offered;
+	struct offer offers[OFFERS_MOST];
+	int offer_count;
+	struct place places[PLACES_MAX]; /* of this owner's jobs that others have claimed */
+	int place_count;
+	struct fleet_claim claims[CLAIMS_MOST]; /* of this host */
+	int claim_count;
+
+	atomic_bool is_joined;
+	atomic_int offers_now, given_now, taken_now;
+	atomic_ullong claims_made, losses;
+};
+
+/* ---- owner.c ---- */
+/* This owner's jobs are offered, and those that others have claimed are given to them. */
+int fleet_offer(struct fleet *fleet, struct error *err);
+
+/* ---- taker.c ---- */
+/* Leases are renewed, and jobs of others claimed where devices are free. */
+int fleet_take(struct fleet *fleet, struct error *err);
+
+/* ---- weigh.c ---- */
+/* What jobs want of this host's devices. */
+struct load {
+	int used[PRIORITY_COUNT]; /* devices that jobs of at least that priority want here */
+	bool begun[CLAIMS_MOST];  /* claims whose job is here */
+};
+/* With `clean`, jobs of others that this host has no claim for any more are removed. */
+void fleet_weigh(struct fleet *fleet, bool clean, struct load *ret_load);
+/* Devices here that get the first jobs of the queue; with `idle`, at once. */
+int fleet_devices(struct fleet *fleet, bool idle);
+
+#endif
