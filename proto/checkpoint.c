@@ -469,19 +469,72 @@ out:
 	return code;
 }
 
-/* The iteration that a checkpoint's first line names; 0 where there is none. */
-static int iteration_of(const char *path)
+int checkpoint_iteration(int file)
 {
 	char line[CHECKPOINT_FILE_OFFSET + 1] = "";
-	int file = open(path, O_RDONLY | O_CLOEXEC), iteration = 0;
+	int iteration;
+
+	if (pread(file, line, CHECKPOINT_FILE_OFFSET, 0) != CHECKPOINT_FILE_OFFSET ||
+	    sscanf(line, "cbctd checkpoint %d of", &iteration) != 1)
+		return 0;
+	return iteration;
+}
+
+/* 0 where there is none. */
+static int iteration_of(const char *path)
+{
+	int file = open(path, O_RDONLY | O_CLOEXEC), iteration;
 
 	if (file < 0)
 		return 0;
-	if (read(file, line, CHECKPOINT_FILE_OFFSET) != CHECKPOINT_FILE_OFFSET ||
-	    sscanf(line, "cbctd checkpoint %d of", &iteration) != 1)
-		iteration = 0;
+	iteration = checkpoint_iteration(file);
 	close(file);
 	return iteration;
+}
+
+int checkpoint_open(const char *directory, int iteration, int *ret_file, struct error *err)
+{
+	static const char *const names[] = {CHECKPOINT_FILE, CHECKPOINT_FILE_BEFORE};
+	char path[PATH_MAX];
+
+	for (size_t i = 0; i < sizeof(names) / sizeof(names[0]); i++) {
+		int file;
+
+		if (path_of(directory, names[i], path, err) != 0)
+			return err->code;
+		file = open(path, O_RDONLY | O_CLOEXEC);
+		if (file >= 0 && checkpoint_iteration(file) == iteration) {
+			*ret_file = file;
+			return 0;
+		}
+		if (file >= 0)
+			close(file);
+	}
+	return error_set(err, ERR_NOT_FOUND, "there is no checkpoint of iteration %d", iteration);
+}
+
+int checkpoint_check(int file, struct error *err)
+{
+	struct seal seal = {0};
+	char *bytes;
+	int damaged, code = seal_read(file, &seal, err);
+
+	if (code == ERR_NOT_FOUND)
+		return error_set(err, ERR_INVALID, "a checkpoint has no whole checksums");
+	if (code != 0)
+		return code;
+	bytes = mmap(NULL, seal.content, PROT_READ, MAP_PRIVATE, file, 0);
+	if (bytes == MAP_FAILED) {
+		code = error_set(err, ERR_IO, "a checkpoint cannot be mapped");
+	} else {
+		damaged = seal_first_damaged(&seal, bytes);
+		if (damaged >= 0)
+			code =
+			    error_set(err, ERR_INVALID, "block %d of a checkpoint does not fit its checksum", damaged);
+		munmap(bytes, seal.content);
+	}
+	seal_clear(&seal);
+	return code;
 }
 
 int checkpoint_resume(struct recon *recon, const char *path, const struct checkpoint_target *target,

@@ -26,6 +26,15 @@ int history_add(struct history *history, const struct history_row *row, struct e
 
 /* Writes the checkpoint durably, as the only one. For a run that stops here. */
 int checkpoint_save(struct recon *recon, const struct history *history, const char *directory, struct error *err);
+/*
+ * Opens the checkpoint of that iteration, whichever of the two files has it. ERR_NOT_FOUND: there is none. What it
+ * holds is not looked at.
+ */
+int checkpoint_open(const char *directory, int iteration, int *ret_file, struct error *err);
+/* The iteration that the first line of an open file names; 0: it is no checkpoint. */
+int checkpoint_iteration(int file);
+/* Whether the file is whole, by its seal. ERR_INVALID: it is not. */
+int checkpoint_check(int file, struct error *err);
 /* Removes the checkpoints of the directory. For a run that begins: they are of another one, and must not serve it. */
 void checkpoint_remove(const char *directory);
 

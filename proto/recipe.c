@@ -214,6 +214,7 @@ static int read_members(struct job_request *request, const cJSON *value, struct 
 {
 	const struct parameter_set set = members_of("");
 	struct json_reader reader;
+	long resume = 0;
 
 	json_begin(&reader, value, "", err);
 	json_string(&reader, "scan", true, request->scan, sizeof(request->scan));
@@ -229,6 +230,8 @@ static int read_members(struct job_request *request, const cJSON *value, struct 
 	ret->labels = json_member(&reader, "labels", false);
 	ret->send = json_member(&reader, "send", false);
 	ret->where = json_member(&reader, "where", false);
+	json_integer(&reader, "resume", false, 0, RESUME_MAX, &resume);
+	request->resume = (int)resume;
 	if (names_no_stage(value)) {
 		request->recipe.fdk.on = request->recipe.tv.on = true;
 		recipe_set_algorithm(&request->recipe, &algorithm_sart);
@@ -401,7 +404,7 @@ bool job_request_same(const struct job_request *a, const struct job_request *b)
 	return strcmp(a->scan, b->scan) == 0 && a->priority == b->priority && patient_same(&a->patient, &b->patient) &&
 	       strcmp(a->labels != NULL ? a->labels : "", b->labels != NULL ? b->labels : "") == 0 &&
 	       strcmp(a->send != NULL ? a->send : "", b->send != NULL ? b->send : "") == 0 &&
-	       where_same(&a->where, &b->where) && recipe_same(&a->recipe, &b->recipe);
+	       where_same(&a->where, &b->where) && a->resume == b->resume && recipe_same(&a->recipe, &b->recipe);
 }
 
 cJSON *job_request_json(const struct job_request *request)
@@ -413,6 +416,7 @@ cJSON *job_request_json(const struct job_request *request)
 	    (request->labels == NULL || add(document, "labels", cJSON_Parse(request->labels))) &&
 	    (request->send == NULL || add(document, "send", cJSON_Parse(request->send))) &&
 	    (where_is_any(&request->where) || add(document, "where", where_json(&request->where))) &&
+	    (request->resume == 0 || add(document, "resume", cJSON_CreateNumber(request->resume))) &&
 	    add_emit(document, &request->recipe) &&
 	    add(document, "priority", cJSON_CreateString(priority_names[request->priority])))
 		return document;

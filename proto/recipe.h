@@ -19,13 +19,15 @@ struct job_request {
 	char *labels; /* JSON, owned; NULL for none */
 	char *send;   /* sends_text, owned; NULL: the job says nothing of it */
 	struct where where;
+	int resume;             /* the job begins behind that iteration, with a checkpoint sent to it; 0: it does not */
 	struct patient patient; /* of the scan, once resolved, unless the job says otherwise */
 	struct recipe recipe;   /* owned */
 };
 void job_request_clear(struct job_request *request);
 int job_request_copy(struct job_request *ret_request, const struct job_request *request, struct error *err);
 
-enum { EMITS_MAX = 10000 }; /* each is a volume on the disk, and all of them fit into one message to the worker */
+enum { RESUME_MAX = 1000000 }; /* iterations */
+enum { EMITS_MAX = 10000 };    /* each is a volume on the disk, and all of them fit into one message to the worker */
 
 /*
  * Two steps, since the scan's name must be read before its geometry is known:

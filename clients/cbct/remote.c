@@ -8,8 +8,8 @@
  * voxel, and the files that are kept here get them here. What is sent is held against its checksums, and what comes
  * back must name the digests of what is here as those that it was made from.
  *
- * A failure there, or a link that is lost for as long as a lease, ends with "made room": the job goes on elsewhere, and
- * begins again.
+ * A failure there, or a link that is lost for as long as a lease, ends with "made room": the job goes on elsewhere,
+ * behind the last checkpoint that was fetched.
  */
 #include <math.h>
 #include <signal.h>
@@ -26,6 +26,7 @@
 #include "clients/cbct/remote.h"
 #include "clients/cbct/upload.h"
 #include "core/pulse.h"
+#include "proto/checkpoint.h"
 #include "proto/clock.h"
 #include "proto/heartbeat.h"
 #include "proto/json.h"
@@ -33,8 +34,9 @@
 #include "proto/sums.h"
 
 enum { RUN_BYTES = 4 << 20, LOOK_MS = 20, VOLUMES_MOST = 4096 };
-static const double LOOK = 0.1; /* s between two looks at the job there */
-static const double IDLE = 1;   /* s between two looks at a socket that has no job yet */
+enum { REMOTE_PIECE = 4 << 20 }; /* of a checkpoint, as PUT /v1/jobs/{job}/checkpoint/{piece} has it */
+static const double LOOK = 0.1;  /* s between two looks at the job there */
+static const double IDLE = 1;    /* s between two looks at a socket that has no job yet */
 
 struct remote_options {
 	long socket;
@@ -57,6 +59,9 @@ struct remote {
 	int announced, sent; /* projections */
 	/* What the daemon here was told already. */
 	int rows, warnings, volumes;
+	int iteration; /* of the last row */
+	struct remote_checkpoint checkpoint;
+	double waits; /* monotonic: since when the job there waits though it has all that it needs; 0: it does not */
 	bool opened, denoised, agreed, stopped;
 	char fetched[VOLUMES_MOST][32];
 };
@@ -291,6 +296,7 @@ static int send_some(struct remote *remote, struct error *err)
 static int post_job(struct remote *remote, struct error *err)
 {
 	cJSON *document = job_request_json(&remote->start->request);
+	char path[40] = "/v1/jobs";
 	int code;
 
 	if (document == NULL)
@@ -299,8 +305,76 @@ static int post_job(struct remote *remote, struct error *err)
 	cJSON_DeleteItemFromObjectCaseSensitive(document, "labels");
 	cJSON_DeleteItemFromObjectCaseSensitive(document, "send");
 	cJSON_ReplaceItemInObjectCaseSensitive(document, "scan", cJSON_CreateString(remote->scan));
-	code = post(remote, "/v1/jobs", document, remote->options->claim, remote->job, err);
+	if (remote->checkpoint.iteration > 0)
+		snprintf(path, sizeof(path), "/v1/jobs?resume=%d", remote->checkpoint.iteration);
+	code = post(remote, path, document, remote->options->claim, remote->job, err);
 	cJSON_Delete(document);
+	return code;
+}
+
+/* ---- the checkpoint that the job begins with ---- */
+
+static int asked_to_end(const struct remote *remote, struct error *err)
+{
+	if (remote->cancel)
+		return error_set(err, ERR_CANCELLED, "cancelled");
+	return remote->leave ? error_set(err, ERR_BUSY, "asked to leave") : 0;
+}
+
+/* Where it is gone the job begins anew; the rows that are here already have the same numbers. */
+static void open_checkpoint(struct remote *remote, int *ret_file)
+{
+	struct error ignored;
+
+	remote->iteration = remote->checkpoint.iteration = remote->start->iteration;
+	*ret_file = -1;
+	if (remote->start->iteration > 0 &&
+	    checkpoint_open(remote->start->job_directory, remote->start->iteration, ret_file, &ignored) == 0)
+		return;
+	remote->checkpoint.iteration = 0;
+	checkpoint_remove(remote->start->job_directory);
+}
+
+/* A job that was posted before this process began has it already. */
+static int asks_for_checkpoint(struct remote *remote, bool *ret_asks, struct error *err)
+{
+	cJSON *job = NULL;
+	const cJSON *what;
+	char path[100];
+	int code;
+
+	snprintf(path, sizeof(path), "/v1/jobs/%.63s", remote->job);
+	code = ask(remote, "GET", path, &job, err);
+	*ret_asks = false;
+	cJSON_ArrayForEach(what, cJSON_GetObjectItemCaseSensitive(job, "waiting_for"))
+	{
+		*ret_asks |= cJSON_IsString(what) && strcmp(what->valuestring, "checkpoint") == 0;
+	}
+	cJSON_Delete(job);
+	return code;
+}
+
+static int send_checkpoint(struct remote *remote, int file, struct error *err)
+{
+	char *piece = malloc(REMOTE_PIECE), path[120];
+	ssize_t length = REMOTE_PIECE;
+	bool asks = false;
+	int code = piece == NULL ? error_set(err, ERR_NO_MEMORY, "no memory for a checkpoint")
+				 : asks_for_checkpoint(remote, &asks, err);
+
+	for (int i = 0; code == 0 && asks && length == REMOTE_PIECE; i++) {
+		length = pread(file, piece, REMOTE_PIECE, (off_t)i * REMOTE_PIECE);
+		if (length < 0)
+			code = error_set(err, ERR_IO, "a checkpoint cannot be read");
+		snprintf(path, sizeof(path), "/v1/jobs/%.63s/checkpoint/%d", remote->job, i);
+		if (code == 0)
+			code = put(remote, path, piece, (size_t)length, err);
+		if (code == 0)
+			code = obey(remote, 0, err);
+		if (code == 0)
+			code = asked_to_end(remote, err);
+	}
+	free(piece);
 	return code;
 }
 
@@ -324,7 +398,8 @@ static int tell_rows(struct remote *remote, const cJSON *job, struct error *err)
 	{
 		struct message message = {.kind = MESSAGE_ROW};
 
-		if (index++ < remote->rows)
+		/* One that begins anew there repeats what was told. */
+		if (index++ < remote->rows || member_number(row, "iteration", 0) <= remote->iteration)
 			continue;
 		message.row = (struct history_row){.iteration = (int)member_number(row, "iteration", 0),
 						   .residual = member_number(row, "residual", NAN),
@@ -335,6 +410,7 @@ static int tell_rows(struct remote *remote, const cJSON *job, struct error *err)
 		if (code != 0)
 			return code;
 		remote->rows = index;
+		remote->iteration = message.row.iteration;
 	}
 	return 0;
 }
@@ -491,6 +567,33 @@ static int failure_there(const struct remote *remote, const cJSON *job, struct e
 			 member_text(job, "state", "lost"), member_text(error, "detail", "no reason was told"));
 }
 
+/* The pending checkpoint was made before the job was looked at: all before it is here when all that is there is. */
+static int keep_checkpoint(struct remote *remote, struct error *err)
+{
+	struct message message = {.kind = MESSAGE_CHECKPOINT};
+	int code;
+
+	if (remote->checkpoint.pending == 0)
+		return 0;
+	code = remote_keep_checkpoint(&remote->checkpoint, err);
+	message.iteration = remote->checkpoint.iteration;
+	return code == 0 ? tell(remote, &message, err) : code;
+}
+
+/* A job that has been sent all that it needs, and still waits: something was lost there. */
+static int heed_waiting(struct remote *remote, bool waits, struct error *err)
+{
+	if (!waits || remote->sent < remote->files.scan->count) {
+		remote->waits = 0;
+		return 0;
+	}
+	if (remote->waits == 0)
+		remote->waits = clock_monotonic();
+	return clock_monotonic() < remote->waits + remote->options->lease
+		   ? 0
+		   : error_set(err, ERR_BUSY, "on %.60s something of it was lost", remote->options->host);
+}
+
 /* Looks at the job there, and tells here what is new. *ret_done: it has succeeded, and all of it is here. */
 static int follow(struct remote *remote, bool *ret_done, struct error *err)
 {
@@ -519,6 +622,12 @@ static int follow(struct remote *remote, bool *ret_done, struct error *err)
 	/* Before its last projection was sent nobody can say what a volume must have been made from. */
 	if (code == 0 && remote->source.projections[0] != '\0' && member_number(job, "volumes", 0) > remote->volumes)
 		code = fetch_volumes(remote, &all, err);
+	if (code == 0 && all)
+		code = keep_checkpoint(remote, err);
+	if (code == 0)
+		code = heed_waiting(remote, strcmp(state, "waiting") == 0, err);
+	if (code == 0 && strcmp(state, "running") == 0)
+		remote_fetch_checkpoint(remote->http, remote->job, remote->start, &remote->checkpoint);
 	*ret_done = code == 0 && all && strcmp(state, "succeeded") == 0 && remote->volumes > 0;
 	cJSON_Delete(job);
 	remote->look = clock_monotonic() + LOOK;
@@ -528,20 +637,24 @@ static int follow(struct remote *remote, bool *ret_done, struct error *err)
 static int run(struct remote *remote, struct error *err)
 {
 	bool done = false;
-	int code = know_source(remote, err);
+	int file, code = know_source(remote, err);
 
+	open_checkpoint(remote, &file);
+	remote->checkpoint.due = clock_monotonic() + remote->start->checkpoint_seconds;
 	if (code == 0)
 		code = post_scan(remote, err);
 	if (code == 0)
 		code = post_job(remote, err);
+	if (code == 0 && file >= 0)
+		code = send_checkpoint(remote, file, err);
+	if (file >= 0)
+		close(file);
 	while (code == 0 && !done) {
 		const bool sending = remote->sent < remote->announced;
 
 		code = obey(remote, sending ? 0 : LOOK_MS, err);
-		if (code == 0 && remote->cancel)
-			return error_set(err, ERR_CANCELLED, "cancelled");
-		if (code == 0 && remote->leave)
-			return error_set(err, ERR_BUSY, "asked to leave");
+		if (code == 0)
+			code = asked_to_end(remote, err);
 		if (code == 0 && sending)
 			code = send_some(remote, err);
 		if (code == 0 && clock_monotonic() >= remote->look)
@@ -590,6 +703,7 @@ static int serve_job(struct remote *remote, const struct message *start, struct 
 	snprintf(ended.text, sizeof(ended.text), "%s", code == 0 ? "" : why.text);
 	code = tell(remote, &ended, err);
 	tidy(remote);
+	remote_drop_checkpoint(&remote->checkpoint);
 	saver_free(remote->saver);
 	remote->saver = NULL;
 	scan_files_close(&remote->files);

@@ -3,6 +3,7 @@
 
 #include "clients/cbct/http.h"
 #include "proto/digest.h"
+#include "proto/durable.h"
 #include "proto/message.h"
 #include "proto/saver.h"
 
@@ -23,5 +24,24 @@ struct remote_source {
 int remote_fetch_volume(struct http *http, const char *job, const cJSON *document, const struct message *start,
 			const struct remote_source *source, struct saver *saver, struct message *ret_volume,
 			bool *ret_here, struct error *err);
+
+/* Checkpoints that come from the other daemon, and go to it. */
+struct remote_checkpoint {
+	int iteration;       /* the last that this side has, 0: none */
+	double due;          /* monotonic: when to ask for the next */
+	int pending;         /* of `file`, which is here but not to be used yet; 0: none */
+	struct durable file; /* beside its name, which is `path` */
+	char path[1100];
+};
+/*
+ * Fetches the checkpoint of the job `job` on the other daemon, where it is of a later iteration: pending then. It must
+ * fit its seal. No failure is one of the job; the next one is asked for after start->checkpoint_seconds, or later where
+ * it would take more than a tenth of the time.
+ */
+void remote_fetch_checkpoint(struct http *http, const char *job, const struct message *start,
+			     struct remote_checkpoint *checkpoint);
+/* The pending checkpoint gets its name; all that the job has made before it is on this side's disk. */
+int remote_keep_checkpoint(struct remote_checkpoint *checkpoint, struct error *err);
+void remote_drop_checkpoint(struct remote_checkpoint *checkpoint); /* none pending is fine */
 
 #endif

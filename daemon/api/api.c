@@ -54,7 +54,7 @@ const struct route api_routes[] = {
     {"GET", "/v1/calibrations/{}/views/{}", ROLE_VIEW, calibration_view_get, BODY_NONE, 0, NULL, NULL, NULL},
 
     {"GET", "/v1/jobs", ROLE_VIEW, job_list, BODY_NONE, 0, NULL, NULL, "limit after state scan priority label text"},
-    {"POST", "/v1/jobs", ROLE_ACQUIRE, job_post, BODY_WHOLE, JSON_BYTES_MAX, NULL, NULL, NULL},
+    {"POST", "/v1/jobs", ROLE_ACQUIRE, job_post, BODY_WHOLE, JSON_BYTES_MAX, NULL, NULL, "resume"},
     {"GET", "/v1/jobs/{}", ROLE_VIEW, job_get, BODY_NONE, 0, NULL, NULL, "wait"},
     {"DELETE", "/v1/jobs/{}", ROLE_ACQUIRE, job_delete, BODY_NONE, 0, NULL, NULL, "wait"},
     {"PUT", "/v1/jobs/{}/pin", ROLE_ACQUIRE, job_pin_put, BODY_NONE, 0, NULL, NULL, NULL},
@@ -64,6 +64,9 @@ const struct route api_routes[] = {
     {"GET", "/v1/jobs/{}/annotations", ROLE_VIEW, annotations_get, BODY_NONE, 0, NULL, NULL, NULL},
     {"PUT", "/v1/jobs/{}/annotations", ROLE_ACQUIRE, annotations_put, BODY_WHOLE, ANNOTATIONS_BYTES_MAX, NULL, NULL,
      NULL},
+    {"GET", "/v1/jobs/{}/checkpoint", ROLE_VIEW, checkpoint_get, BODY_NONE, 0, NULL, NULL, NULL},
+    {"PUT", "/v1/jobs/{}/checkpoint/{}", ROLE_ACQUIRE, checkpoint_put, BODY_STREAM, 0, checkpoint_begin,
+     checkpoint_data, NULL},
     {"GET", "/v1/destinations", ROLE_VIEW, destination_list, BODY_NONE, 0, NULL, NULL, "wait"},
     {"GET", "/v1/worklist", ROLE_ACQUIRE, worklist_get, BODY_NONE, 0, NULL, NULL, "wait"},
     {"GET", "/v1/jobs/{}/send", ROLE_VIEW, send_get, BODY_NONE, 0, NULL, NULL, NULL},

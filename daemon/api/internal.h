@@ -61,6 +61,11 @@ int provenance_get(void *context, struct request *request, struct error *err);
 int volume_stream(void *context, struct request *request, struct error *err);
 int annotations_get(void *context, struct request *request, struct error *err);
 int annotations_put(void *context, struct request *request, struct error *err);
+int checkpoint_get(void *context, struct request *request, struct error *err);
+int checkpoint_begin(void *context, struct request *request, struct error *err);
+int checkpoint_data(void *context, struct request *request, const void *data, size_t size, size_t *ret_taken,
+		    struct error *err);
+int checkpoint_put(void *context, struct request *request, struct error *err);
 int slice_get(void *context, struct request *request, struct error *err);
 
 int page_get(void *context, struct request *request, struct error *err);

@@ -41,6 +41,18 @@ static int post_resolved(struct api *api, struct job_request *wanted, struct sto
 	return wanted->send != NULL ? sendings_adopt(api->sendings, *ret_job, err) : 0;
 }
 
+/* ?resume=, which is the same as the member, but no part of what an Idempotency-Key compares. */
+static int read_resume(struct request *request, struct job_request *wanted, struct error *err)
+{
+	const char *text = request_query(request, "resume");
+	long resume = wanted->resume;
+
+	if (text != NULL && !index_parse(text, strlen(text), RESUME_MAX, &resume))
+		return error_set(err, ERR_INVALID, "resume is \"%.40s\", expected 0 to %d", text, RESUME_MAX);
+	wanted->resume = (int)resume;
+	return 0;
+}
+
 static int post(struct api *api, struct request *request, const char *key, const uint8_t digest[32],
 		struct job **ret_job, struct error *err)
 {
@@ -54,9 +66,12 @@ static int post(struct api *api, struct request *request, const char *key, const
 	if (job_request_parse(text, length, &wanted, err) != 0)
 		return err->code;
 	request_client(request, client);
-	code = store_scan_find(api->store, wanted.scan, &scan, err);
-	if (code == ERR_NOT_FOUND)
-		snprintf(err->pointer, sizeof(err->pointer), "/scan");
+	code = read_resume(request, &wanted, err);
+	if (code == 0) {
+		code = store_scan_find(api->store, wanted.scan, &scan, err);
+		if (code == ERR_NOT_FOUND)
+			snprintf(err->pointer, sizeof(err->pointer), "/scan");
+	}
 	if (code == 0) {
 		code = post_resolved(api, &wanted, scan, client, key, digest, ret_job, err);
 		stored_scan_release(scan);

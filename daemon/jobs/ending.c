@@ -270,11 +270,15 @@ static void end_job(struct supervise *supervise, struct worker *worker, const st
 void worker_end_job(struct supervise *supervise, struct worker *worker, const struct worker_words *words)
 {
 	struct worker_words judged = *words;
+	struct job_record record;
 
 	if (worker->remote) {
 		judged.end = remote_end(worker, words->end, words->code);
-		if (judged.end != words->end)
-			judged.iteration = 0; /* checkpoints of another host stay there */
+		job_record(worker->job, &record);
+		judged.iteration = record.checkpoint; /* the last that was fetched */
+		if (judged.end == END_MADE_ROOM)
+			log_line(LEVEL_INFO, "job %s comes back from %s: %s", worker->place.job, worker->place.host,
+				 words->text);
 	}
 	end_job(supervise, worker, &judged);
 }

@@ -420,8 +420,8 @@ static int insert_job(struct jobs *jobs, struct job *job, struct stored_scan *sc
 	job->extent = extent_of(&facts);
 	if (facts.deleted)
 		return error_set_at(err, ERR_NOT_FOUND, "/scan", "there is no scan \"%s\" any more", record->scan);
-	record->state = facts.ready ? JOB_QUEUED : JOB_WAITING;
-	if (facts.ready) {
+	record->state = facts.ready && job->request.resume == 0 ? JOB_QUEUED : JOB_WAITING;
+	if (record->state == JOB_QUEUED) {
 		record->ticket = jobs->next_ticket++;
 		record->queued = record->created;
 	}

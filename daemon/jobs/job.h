@@ -146,7 +146,7 @@ struct job_offer {
 /*
  * Queued jobs that another host may compute, in the order of the queue behind the first `skip` of it that may run here,
  * at most `most`. Returns how many. Not those that are held or another daemon's, and not those that may run here and
- * have a checkpoint or stay.
+ * stay.
  */
 int jobs_offers(struct jobs *jobs, int skip, struct job_offer *ret_offers, int most);
 /*
@@ -220,10 +220,11 @@ enum job_obstacle {
 	JOB_NO_SPACE,
 	JOB_DISK_TROUBLE,
 	JOB_NO_MEMORY,
-	JOB_NO_HOST, /* by its "where" it may have no device here; it is not held for that */
+	JOB_NO_HOST,       /* by its "where" it may have no device here; it is not held for that */
+	JOB_NO_CHECKPOINT, /* that it is to begin with has not come; nor for that */
 	JOB_OBSTACLE_COUNT
 };
-/* As in `waiting_for`: "space", "disk", "memory", "host". */
+/* As in `waiting_for`: "space", "disk", "memory", "host", "checkpoint". */
 extern const char *const job_obstacle_names[JOB_OBSTACLE_COUNT];
 int job_hold(struct job *job, enum job_obstacle obstacle, double until, unsigned long long space);
 /* Releases held jobs whose time has come and for which the disk has room; true while others are still held. */
@@ -270,6 +271,19 @@ int job_sync_volumes(struct job *job, struct error *err);
 /* See store_job_digest_volume. */
 int job_digest_volume(struct job *job, const struct volume_record *volume, struct error *err);
 int job_add_warning(struct job *job, const char *code, const char *detail, struct error *err);
+
+/* ---- checkpoints that go from daemon to daemon: jobs/resume.c ---- */
+/* A checkpoint comes in pieces of so many bytes, the last one shorter, which may be none. */
+enum { CHECKPOINT_PIECE = 4 << 20 };
+/* Opens the job's checkpoint, which no later one changes. ERR_NOT_FOUND: it has none just now. Any thread. */
+int job_checkpoint_open(struct job *job, int *ret_file, int *ret_iteration, struct error *err);
+/*
+ * Takes a piece of the checkpoint that the job waits for, from the first on; one that came before may come again. With
+ * the last one the job may begin, whatever the pieces hold: its worker holds them against their checksums, and begins
+ * anew where they do not fit. ERR_CONFLICT: it waits for none, or for an earlier piece. ERR_INVALID: all of them are no
+ * checkpoint of that iteration.
+ */
+int job_checkpoint_take(struct job *job, long piece, const void *data, size_t length, struct error *err);
 
 /* ---- sendings of its volumes to archives; the rules are those of daemon/sendings ---- */
 /* Free the array. Any thread. */

@@ -203,6 +203,7 @@ static int on_message(struct supervise *supervise, struct worker *worker, const 
 		break;
 	case MESSAGE_CHECKPOINT:
 		code = job_checkpointed(worker->job, message->iteration, &err);
+		job_trial(worker->job)->given_back = 0;
 		break;
 	case MESSAGE_WARNING:
 		code = job_add_warning(worker->job, message->code_name, message->text, &err);

@@ -17,10 +17,9 @@ void job_stay(struct job *job)
 	pthread_mutex_unlock(&job->jobs->lock);
 }
 
-/* A checkpoint lies here, and a run elsewhere would begin without it: better so than never. */
 static bool may_go(const struct job *job)
 {
-	const bool home = !job->entry.elsewhere && (job->stays || job->record.checkpoint != 0);
+	const bool home = !job->entry.elsewhere && job->stays;
 
 	return !job->entry.held && !home && !job_is_mirror(&job->record) && job->unreadable.code == 0;
 }

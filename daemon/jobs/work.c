@@ -12,7 +12,7 @@
 #include "proto/durable.h"
 #include "proto/json.h"
 
-const char *const job_obstacle_names[JOB_OBSTACLE_COUNT] = {"", "space", "disk", "memory", "host"};
+const char *const job_obstacle_names[JOB_OBSTACLE_COUNT] = {"", "space", "disk", "memory", "host", "checkpoint"};
 
 static int promote(struct jobs *jobs, struct job *job, struct error *err)
 {
@@ -25,7 +25,7 @@ static int promote(struct jobs *jobs, struct job *job, struct error *err)
 		change = (struct job_change){.error_code = code, .error_text = why.text};
 		return job_set_state(job, JOB_FAILED, &change, err);
 	}
-	if (facts.ready)
+	if (facts.ready && job_obstacle(job) != JOB_NO_CHECKPOINT)
 		return job_set_state(job, JOB_QUEUED, &change, err);
 	return 0;
 }
@@ -94,7 +94,7 @@ bool job_attendable(struct job *job, struct scan_facts *ret_facts)
 
 	/* Whether a device here may have it, the caller sees to. */
 	if ((obstacle != JOB_UNHINDERED && obstacle != JOB_NO_HOST) || !job->request.recipe.fdk.on ||
-	    store_scan_look(job->jobs->store, job->scan, ret_facts, &err) != 0)
+	    job->request.resume > 0 || store_scan_look(job->jobs->store, job->scan, ret_facts, &err) != 0)
 		return false;
 	return ret_facts->convertible && !ret_facts->complete && ret_facts->checked;
 }
@@ -236,6 +236,8 @@ enum job_obstacle job_obstacle(struct job *job)
 	obstacle = job->entry.held ? job->hold.obstacle : JOB_UNHINDERED;
 	if (job->entry.elsewhere && (job->record.state == JOB_WAITING || job->record.state == JOB_QUEUED))
 		obstacle = JOB_NO_HOST;
+	else if (job->request.resume > 0 && job->record.state == JOB_WAITING && job->record.checkpoint == 0)
+		obstacle = JOB_NO_CHECKPOINT;
 	pthread_mutex_unlock(&job->jobs->lock);
 	return obstacle;
 }

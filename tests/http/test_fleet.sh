@@ -174,32 +174,6 @@ test_counts_with_their_images_and_a_patient_who_stays_at_home() {
 	! grep -rqE 'Doe|4711|secret' "$work/a" "$work/a.err" || fail "nothing of the patient on another host: $(grep -rlE 'Doe|4711|secret' "$work/a" "$work/a.err")"
 }
 
-test_a_taker_that_is_killed_costs_a_job_nothing_but_time() {
-	begin
-	undisturbed "$scan_dir" "$long" long
-	taker a
-	owner c
-	at c
-	post_scan "$scan_dir"
-	post_projections "$scan_dir"
-	post_job "$long"
-	given_to a
-	progresses
-	stop_host a KILL
-	taker b
-	at c
-	given_to b
-	wait_job succeeded
-	expect_json '.attempts == 1 and .error == null and (.device | startswith("b: "))'
-	same_bits long
-	told_once
-	# It comes back, and finds that what it had is another's.
-	taker a
-	nothing_left a
-	nothing_left b
-	empty_ledger
-}
-
 test_a_zombie_is_not_heard() {
 	begin
 	undisturbed "$scan_dir" "$long" long
@@ -313,6 +287,62 @@ test_a_cancel_reaches_the_other_host_and_an_urgent_job_goes_first_there() {
 	wait_job cancelled 30
 	nothing_left a
 	empty_ledger
+}
+
+# checkpoint_beyond ITERATION: the owner has a later one of $job; its iteration is in $checkpoint
+checkpoint_beyond() {
+	local i
+	for ((i = 0; i < 600; i++)); do
+		req GET "/v1/jobs/$job/checkpoint" -H 'Range: bytes=0-159'
+		checkpoint=$(header cbct-iteration)
+		[ "$status" = 206 ] && [ "${checkpoint:-0}" -gt "$1" ] && return 0
+		sleep 0.05
+	done
+	fail "a checkpoint of $job behind iteration $1, got $status $checkpoint"
+}
+# went_on_behind HOST ITERATION: the job there has made no row up to that one
+went_on_behind() {
+	local there i
+	for ((i = 0; i < 600; i++)); do
+		there=$(curl -s "$(cat "$work/$1.url")/v1/jobs" | jq -r '.jobs[0].id // ""')
+		[ -n "$there" ] && curl -s "$(cat "$work/$1.url")/v1/jobs/$there" >"$work/there" && jq -e '.history | length > 0' "$work/there" >/dev/null && break
+		sleep 0.05
+	done
+	jq -e ".history[0].iteration > $2" "$work/there" >/dev/null || fail "rows behind $2 on $1, got $(jq -c '.history[0]' "$work/there")"
+}
+test_a_job_goes_on_elsewhere_from_its_checkpoint() {
+	local checkpoint
+	begin
+	undisturbed "$scan_dir" "$long" long
+	start_host c --checkpoint-seconds 0.2
+	at c
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "$long"
+	checkpoint_beyond 0
+	stop_host c
+	# What was begun at home goes on elsewhere.
+	owner c --checkpoint-seconds 0.2
+	taker a --checkpoint-seconds 0.2
+	at c
+	given_to a
+	went_on_behind a "$checkpoint"
+	checkpoint_beyond "$((checkpoint + 20))"
+	stop_host a KILL
+	taker b --checkpoint-seconds 0.2
+	at c
+	given_to b
+	went_on_behind b "$checkpoint"
+	wait_job succeeded
+	expect_json '.error == null and (.device | startswith("b: ")) and ([.history[].iteration] == [range(1; (.history | length) + 1)])'
+	same_bits long
+	told_once
+	# It comes back, and finds that what it had is another's.
+	taker a
+	nothing_left a
+	nothing_left b
+	empty_ledger
+	[ ! -e "$work/c/jobs/$job/checkpoint.f32" ] || fail "no checkpoint is left"
 }
 
 # turns_until HOST: projections come, one a second, until some of $job's are reconstructed there; $next is the next to come

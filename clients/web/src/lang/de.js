@@ -295,6 +295,7 @@ export const strings = {
 	'right': 'rechts',
 	'room on the disk': 'Platz auf der Platte',
 	'a host that may run it': 'einen Rechner, der ihn rechnen darf',
+	'the checkpoint that it goes on from': 'den Zwischenstand, von dem er weitergeht',
 	'routine': 'Routine',
 	'running': 'läuft',
 	'save': 'sichern',
