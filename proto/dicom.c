@@ -81,6 +81,11 @@ __attribute__((format(printf, 2, 3))) static void make_uid(char ret[UID_SIZE], c
 	snprintf(ret, UID_SIZE, "2.25.%s", digits + at);
 }
 
+void dicom_step_uid(const char *job, char ret_uid[65])
+{
+	make_uid(ret_uid, "cbctd step %s", job);
+}
+
 /* ---- elements ---- */
 
 struct object {
@@ -529,6 +534,17 @@ static void put_matrix(struct object *o, const struct instance *image)
 	put_text(o, 0x00282110, "CS", "00");
 }
 
+/* What was asked for, where the scan is of a step of the worklist: Request Attributes Sequence. */
+static void put_request(struct object *o, const struct subject *subject)
+{
+	if (subject->text[STUDY_STEP_ID][0] == '\0' || subject->text[STUDY_PROCEDURE_ID][0] == '\0')
+		return;
+	begin_group(o, 0x00400275);
+	put_subject(o, subject, STUDY_STEP_ID);
+	put_subject(o, subject, STUDY_PROCEDURE_ID);
+	end_group(o);
+}
+
 /* ---- Enhanced CT, PS3.3 A.38.1, X-Ray 3D Angiographic, A.53: what all frames share, and where each lies ---- */
 
 static void put_frame_type(struct object *o, uint32_t tag)
@@ -666,6 +682,7 @@ int dicom_head(const struct dicom_words *words, const struct grid *grid, const s
 	if (is_multiframe(&image))
 		put_dimensions(&o, &image);
 	put_matrix(&o, &image);
+	put_request(&o, &words->subject);
 	if (is_multiframe(&image)) {
 		begin_sequence(&o, 0x00400555); /* Acquisition Context: none */
 		end_sequence(&o);

@@ -53,6 +53,9 @@ struct dicom_head {
 #define DICOM_IMPLEMENTATION "2.25.208437269145863218905713340955731662842"
 #define DICOM_IMPLEMENTATION_VERSION "CBCTD"
 
+/* The Modality Performed Procedure Step of a job: the same one however often it is told. */
+void dicom_step_uid(const char *job, char ret_uid[65]);
+
 /* The head of slice z, or of all slices (the other kinds). `pixels` bytes of pixels follow it. ERR_NO_MEMORY. */
 int dicom_head(const struct dicom_words *words, const struct grid *grid, const struct provenance *provenance, int z,
 	       size_t pixels, struct dicom_head *ret_head, struct error *err);

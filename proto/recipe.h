@@ -18,6 +18,9 @@ struct job_request {
 	enum priority priority;
 	char *labels; /* JSON, owned; NULL for none */
 	char *send;   /* sends_text, owned; NULL: the job says nothing of it */
+	/* Destination that is told of the job's performed procedure step, "": none; the daemon's, not in the document.
+	 */
+	char step_to[DESTINATION_NAME_SIZE];
 	struct where where;
 	int resume;             /* the job begins behind that iteration, with a checkpoint sent to it; 0: it does not */
 	struct patient patient; /* of the scan, once resolved, unless the job says otherwise */

@@ -149,7 +149,7 @@ cJSON *send_volumes_json(const char *volumes)
 	char text[SEND_VOLUMES_SIZE], *rest = text, *one;
 	cJSON *list;
 
-	if (strcmp(volumes, "last") == 0 || strcmp(volumes, "all") == 0)
+	if (strcmp(volumes, "last") == 0 || strcmp(volumes, "all") == 0 || strcmp(volumes, SEND_STEP) == 0)
 		return cJSON_CreateString(volumes);
 	list = cJSON_CreateArray();
 	snprintf(text, sizeof(text), "%s", volumes);

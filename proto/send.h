@@ -14,6 +14,10 @@ enum {
 	SENDS_MOST = 16
 };
 
+/* What stands in place of volumes where a destination is told of the job's performed procedure step; no wish of a
+ * client. */
+#define SEND_STEP "step"
+
 struct send_wish {
 	char to[DESTINATION_NAME_SIZE];
 	char volumes[SEND_VOLUMES_SIZE]; /* "last", "all", or "fdk,5,10" */

@@ -17,6 +17,8 @@ const struct subject_row subject_rows[SUBJECT_COUNT] = {
     [STUDY_REFERRING_PHYSICIAN] = {"study", "referring_physician", "PN", 0x0008, 0x0090},
     [STUDY_DATE] = {"study", "date", "DA", 0x0008, 0x0020},
     [STUDY_TIME] = {"study", "time", "TM", 0x0008, 0x0030},
+    [STUDY_STEP_ID] = {"study", "step_id", "SH", 0x0040, 0x0009},
+    [STUDY_PROCEDURE_ID] = {"study", "procedure_id", "SH", 0x0040, 0x1001},
 };
 
 /* ---- value representations, PS3.5 6.2 ---- */

@@ -25,6 +25,8 @@ enum subject_field { /* up to STUDY_UID: those that tell one patient and study f
 		     STUDY_REFERRING_PHYSICIAN,
 		     STUDY_DATE,
 		     STUDY_TIME,
+		     STUDY_STEP_ID, /* of the worklist: Scheduled Procedure Step ID, Requested Procedure ID */
+		     STUDY_PROCEDURE_ID,
 		     SUBJECT_COUNT
 };
 

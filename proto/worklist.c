@@ -48,13 +48,26 @@ static void add_date_and_time(cJSON *entry, cJSON *not_read, const char *date, c
 	add_text(entry, not_read, names[STEP_TIME], start.text[STUDY_TIME]);
 }
 
-cJSON *worklist_step(const char *const field[STEP_FIELD_COUNT], const char *const subject[SUBJECT_COUNT])
+/* What a scan takes along, so that its images and its performed step name the request. */
+static void take_request(struct subject *who, cJSON *not_read, enum subject_field field, const char *value)
+{
+	char name[40];
+
+	if (value == NULL || value[strspn(value, " ")] == '\0')
+		return;
+	if (is_readable(value) && subject_take(who, field, value))
+		return;
+	snprintf(name, sizeof(name), "%s.%s", subject_rows[field].object, subject_rows[field].name);
+	cJSON_AddItemToArray(not_read, cJSON_CreateString(name));
+}
+
+cJSON *worklist_step(const char *const field[STEP_FIELD_COUNT], const char *const subject[STUDY_STEP_ID])
 {
 	cJSON *entry = cJSON_CreateObject(), *not_read = cJSON_CreateArray(), *told;
 	struct subject who = {0};
 	bool whole = true;
 
-	for (int i = 0; i < SUBJECT_COUNT && entry != NULL; i++) {
+	for (int i = 0; i < STUDY_STEP_ID && entry != NULL; i++) {
 		char name[40];
 
 		if (subject[i] == NULL || subject[i][strspn(subject[i], " ")] == '\0')
@@ -70,6 +83,8 @@ cJSON *worklist_step(const char *const field[STEP_FIELD_COUNT], const char *cons
 			add_text(entry, not_read, names[i], field[i]);
 	if (entry != NULL)
 		add_date_and_time(entry, not_read, field[STEP_DATE], field[STEP_TIME]);
+	take_request(&who, not_read, STUDY_STEP_ID, field[STEP_ID]);
+	take_request(&who, not_read, STUDY_PROCEDURE_ID, field[STEP_PROCEDURE]);
 	told = subject_json(&who);
 	for (cJSON *member; whole && told != NULL && (member = told->child) != NULL;) {
 		cJSON_DetachItemViaPointer(told, member);

@@ -24,8 +24,8 @@ enum worklist_field {
 /*
  * The entry of values as a peer has sent them, in UTF-8 or not; NULL and "": not told. A value that is none is left
  * out, and named in "not_read". NULL for no memory, or where a value that tells one patient or study from another is
- * not read: such an entry is nobody's.
+ * not read: such an entry is nobody's. The study gets its step_id and procedure_id of the fields.
  */
-cJSON *worklist_step(const char *const field[STEP_FIELD_COUNT], const char *const subject[SUBJECT_COUNT]);
+cJSON *worklist_step(const char *const field[STEP_FIELD_COUNT], const char *const subject[STUDY_STEP_ID]);
 
 #endif

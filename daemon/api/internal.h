@@ -49,7 +49,7 @@ int send_post(void *context, struct request *request, struct error *err);
 int send_get(void *context, struct request *request, struct error *err);
 int send_delete(void *context, struct request *request, struct error *err);
 /* What a job that says nothing sends; ERR_IMPOSSIBLE, ERR_CONFLICT: what it says cannot be done. */
-int send_resolve(struct api *api, struct job_request *wanted, struct error *err);
+int send_resolve(struct api *api, const struct scan *scan, struct job_request *wanted, struct error *err);
 
 int job_events(void *context, struct request *request, struct error *err);
 int all_events(void *context, struct request *request, struct error *err);

@@ -33,12 +33,13 @@ static int post_resolved(struct api *api, struct job_request *wanted, struct sto
 	struct recon_memory memory;
 	bool fresh;
 
-	if (job_request_resolve(wanted, stored_scan_measured(scan), err) != 0 || send_resolve(api, wanted, err) != 0 ||
+	if (job_request_resolve(wanted, stored_scan_measured(scan), err) != 0 ||
+	    send_resolve(api, stored_scan_parsed(scan), wanted, err) != 0 ||
 	    supervise_check_memory(api->supervise, stored_scan_measured(scan), wanted, &memory, err) != 0)
 		return err->code;
 	if (jobs_post(api->jobs, wanted, scan, &memory, client, key, digest, ret_job, &fresh, err) != 0)
 		return err->code;
-	return wanted->send != NULL ? sendings_adopt(api->sendings, *ret_job, err) : 0;
+	return wanted->send != NULL || wanted->step_to[0] != '\0' ? sendings_adopt(api->sendings, *ret_job, err) : 0;
 }
 
 /* ?resume=, which is the same as the member, but no part of what an Idempotency-Key compares. */
@@ -224,6 +225,22 @@ void job_forget_files(struct api *api, struct job *job)
 	encoded_copies_forget(api->copies, facts.id);
 }
 
+/* A job that goes takes with it what is still to be told of its step, which would be in progress for ever. */
+static int check_step(struct api *api, struct job *job, struct error *err)
+{
+	char to[DESTINATION_NAME_SIZE];
+	struct job_facts facts;
+
+	job_facts(job, &facts);
+	if (!facts.ended || !sendings_step_pending(api->sendings, facts.id))
+		return 0;
+	sendings_step_to(api->sendings, to);
+	return error_set(err, ERR_CONFLICT,
+			 "it is still to be told how the step of this job ended: DELETE /v1/jobs/%s/send/%s gives that "
+			 "up",
+			 facts.id, to);
+}
+
 int job_delete(void *context, struct request *request, struct error *err)
 {
 	struct api *api = context;
@@ -237,7 +254,9 @@ int job_delete(void *context, struct request *request, struct error *err)
 	if (wait_read(api, request, 0, &seconds, err) != 0 ||
 	    jobs_find(api->jobs, request_argument(request, 0), &job, err) != 0)
 		return err->code;
-	code = jobs_delete(api->jobs, job, &removed, err);
+	code = check_step(api, job, err);
+	if (code == 0)
+		code = jobs_delete(api->jobs, job, &removed, err);
 	if (code == ERR_NO_SPACE && store_reserve_spend(api->store))
 		code = jobs_delete(api->jobs, job, &removed, err);
 	if (code != 0 || removed) {

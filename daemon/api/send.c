@@ -8,10 +8,19 @@
 
 enum { WORKLIST_WAIT = 15 /* s, unless the request says otherwise */ };
 
-int send_resolve(struct api *api, struct job_request *wanted, struct error *err)
+/* A step of the worklist is one of a study. */
+static bool is_of_step(const struct subject *subject)
+{
+	return subject->text[STUDY_STEP_ID][0] != '\0' && subject->text[STUDY_UID][0] != '\0';
+}
+
+int send_resolve(struct api *api, const struct scan *scan, struct job_request *wanted, struct error *err)
 {
 	struct send_wish wishes[SENDS_MOST];
 	int count;
+
+	if (is_of_step(&scan->subject))
+		sendings_step_to(api->sendings, wanted->step_to);
 
 	/* By rule: one without a patient's position fails then, and says so, rather than the job that nobody sends. */
 	if (wanted->send == NULL)

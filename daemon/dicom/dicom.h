@@ -77,10 +77,20 @@ struct archive {
 		      struct error *err);
 };
 extern const struct archive archive_web, archive_network;
+/* No archive: it is told of performed procedure steps. */
+extern const struct archive archive_step;
 
-/* ---- network.c, for worklist.c ---- */
+/* ---- objects.c, for step.c ---- */
+/* Patient and study of a task. */
+int task_subject(const cJSON *task, struct subject *ret_subject, struct error *err);
+
+/* ---- network.c, for worklist.c and step.c ---- */
 /* The peer of a row of the file of destinations, or of its worklist; the texts are the row's. */
 struct dimse_peer row_peer(const cJSON *row);
+
+/* ---- step.c ---- */
+/* Tells of a job's step; PROMISE_ASKED: its end is to come. *ret_instances grows by the objects that it names. */
+int step_tell(const cJSON *task, int *ret_instances, enum promise *ret_promise, struct error *err);
 
 /* ---- worklist.c, listener.c ---- */
 /* Tells the daemon the steps of the worklist, a line {"step": ...} each. */

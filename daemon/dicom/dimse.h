@@ -12,6 +12,7 @@ extern "C" {
 #ifdef __cplusplus
 }
 #endif
+#include <cjson/cJSON.h>
 
 /*
  * DICOM's own protocol (PS3.7 DIMSE over PS3.8), by DCMTK, which is used in dimse_*.cc alone. They are built where
@@ -36,10 +37,11 @@ struct dimse;
 
 enum dimse_service {
 	DIMSE_ECHO,
-	DIMSE_FIND,    /* Study Root Query/Retrieve */
-	DIMSE_STORE,   /* of one SOP class */
-	DIMSE_COMMIT,  /* Storage Commitment Push */
-	DIMSE_WORKLIST /* Modality Worklist */
+	DIMSE_FIND,     /* Study Root Query/Retrieve */
+	DIMSE_STORE,    /* of one SOP class */
+	DIMSE_COMMIT,   /* Storage Commitment Push */
+	DIMSE_WORKLIST, /* Modality Worklist */
+	DIMSE_STEP      /* Modality Performed Procedure Step */
 };
 
 #ifdef __cplusplus
@@ -98,6 +100,16 @@ struct dimse_query {
 int dimse_worklist(struct dimse *dimse, const struct dimse_query *query,
 		   void (*found)(void *context, const struct dimse_step *step), void *context,
 		   struct error *err) DIMSE_WEAK;
+
+/* ---- modality performed procedure steps (PS3.4 annex F) ---- */
+/*
+ * N-CREATE and N-SET of the step of this UID. attributes: an object with a member for each, named by its tag in eight
+ * hexadecimal digits; a text is its value, a list of such objects its items. A step that is there already, and one
+ * that has ended already, are no errors: an earlier attempt was heard. ERR_NOT_FOUND of N-SET: the peer knows no such
+ * step.
+ */
+int dimse_step_create(struct dimse *dimse, const char *uid, const cJSON *attributes, struct error *err) DIMSE_WEAK;
+int dimse_step_set(struct dimse *dimse, const char *uid, const cJSON *attributes, struct error *err) DIMSE_WEAK;
 
 /* ---- what peers send us ---- */
 struct dimse_serving {

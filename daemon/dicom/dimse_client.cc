@@ -51,6 +51,36 @@ class Client : public DcmSCU
 		return EC_Normal;
 	}
 
+	// N-CREATE or N-SET, which DcmSCU has not. *ret_error: Error ID (0000,0903), 0: none.
+	OFCondition request(T_ASC_PresentationContextID presentation, T_DIMSE_Message *message, DcmDataset *dataset,
+			    Uint16 *ret_status, Uint16 *ret_error)
+	{
+		const bool creates = message->CommandField == DIMSE_N_CREATE_RQ;
+		DcmDataset *detail = nullptr, *attributes = nullptr;
+		T_DIMSE_Message reply = {};
+		OFCondition condition = sendDIMSEMessage(presentation, message, dataset);
+
+		if (condition.good())
+			condition = receiveDIMSECommand(&presentation, &reply, &detail);
+		if (condition.bad())
+			return condition;
+		if (reply.CommandField != (creates ? DIMSE_N_CREATE_RSP : DIMSE_N_SET_RSP)) {
+			delete detail;
+			return DIMSE_BADMESSAGE;
+		}
+		*ret_error = 0;
+		if (detail != nullptr)
+			detail->findAndGetUint16(DCM_ErrorID, *ret_error);
+		delete detail;
+		*ret_status = creates ? reply.msg.NCreateRSP.DimseStatus : reply.msg.NSetRSP.DimseStatus;
+		if ((creates ? reply.msg.NCreateRSP.DataSetType : reply.msg.NSetRSP.DataSetType) != DIMSE_DATASET_NULL)
+			condition = receiveDIMSEDataset(&presentation, &attributes);
+		delete attributes;
+		return condition;
+	}
+
+	Uint16 requests = 0; // such ones, on an association that has no others
+
 	const void *sent_context = nullptr;
 	void (*sent)(const void *context, size_t bytes) = nullptr;
 
@@ -70,6 +100,8 @@ const char *class_of(enum dimse_service service, const char *class_uid)
 		return class_uid;
 	case DIMSE_COMMIT:
 		return UID_StorageCommitmentPushModelSOPClass;
+	case DIMSE_STEP:
+		return UID_ModalityPerformedProcedureStepSOPClass;
 	case DIMSE_WORKLIST:
 		return UID_FINDModalityWorklistInformationModel;
 	default:
@@ -348,4 +380,94 @@ int dimse_worklist(struct dimse *dimse, const struct dimse_query *query,
 	scheduled->putAndInsertString(DCM_Modality, query->modality);
 	scheduled->putAndInsertString(DCM_ScheduledStationAETitle, query->station);
 	return find(dimse, &keys, query->most, take_step, &steps, "C-FIND of the worklist", err);
+}
+
+/* ---- modality performed procedure steps ---- */
+
+static bool fill(DcmItem *item, const cJSON *attributes)
+{
+	bool good = true;
+	const cJSON *member, *one;
+
+	cJSON_ArrayForEach(member, attributes)
+	{
+		const unsigned long number = strtoul(member->string, nullptr, 16);
+		const DcmTag tag((Uint16)(number >> 16), (Uint16)(number & 0xffff));
+
+		if (cJSON_IsString(member)) {
+			good = good && item->putAndInsertString(tag, member->valuestring).good();
+			continue;
+		}
+		good = good && item->insertEmptyElement(tag).good();
+		cJSON_ArrayForEach(one, member)
+		{
+			DcmItem *inner = nullptr;
+
+			// -2: a new item at the end.
+			good = good && item->findOrCreateSequenceItem(tag, inner, -2).good() && fill(inner, one);
+		}
+	}
+	return good;
+}
+
+// Warnings are of what was taken: attributes that are optional, or beyond what the peer keeps.
+static int judge_step(const char *what, Uint16 status, struct error *err)
+{
+	static const Uint16 taken[] = {STATUS_Success, STATUS_N_MPPS_Warning_RequestedOptionalAttributesNotSupported,
+				       STATUS_N_AttributeListError, STATUS_N_AttributeValueOutOfRange};
+
+	for (Uint16 one : taken)
+		if (status == one)
+			return 0;
+	return error_set(err, ERR_IO, "it answered %s with status 0x%04x", what, status);
+}
+
+int dimse_step_create(struct dimse *dimse, const char *uid, const cJSON *attributes, struct error *err)
+{
+	T_DIMSE_Message message = {};
+	T_DIMSE_N_CreateRQ &request = message.msg.NCreateRQ;
+	Uint16 status = 0, error = 0;
+	DcmDataset dataset;
+
+	if (!fill(&dataset, attributes))
+		return error_set(err, ERR_INTERNAL, "a performed procedure step that was made is none");
+	message.CommandField = DIMSE_N_CREATE_RQ;
+	request.MessageID = ++dimse->client.requests;
+	request.DataSetType = DIMSE_DATASET_PRESENT;
+	request.opts = O_NCREATE_AFFECTEDSOPINSTANCEUID;
+	OFStandard::strlcpy(request.AffectedSOPClassUID, UID_ModalityPerformedProcedureStepSOPClass,
+			    sizeof(request.AffectedSOPClassUID));
+	OFStandard::strlcpy(request.AffectedSOPInstanceUID, uid, sizeof(request.AffectedSOPInstanceUID));
+	OFCondition condition = dimse->client.request(dimse->presentation, &message, &dataset, &status, &error);
+	if (condition.bad())
+		return broken("N-CREATE", condition, err);
+	if (status == STATUS_N_DuplicateSOPInstance)
+		return 0;
+	return judge_step("N-CREATE", status, err);
+}
+
+int dimse_step_set(struct dimse *dimse, const char *uid, const cJSON *attributes, struct error *err)
+{
+	const Uint16 ended_already = 0xa506; // PS3.4 F.7.2.2.2: it may no longer be updated
+	T_DIMSE_Message message = {};
+	T_DIMSE_N_SetRQ &request = message.msg.NSetRQ;
+	Uint16 status = 0, error = 0;
+	DcmDataset dataset;
+
+	if (!fill(&dataset, attributes))
+		return error_set(err, ERR_INTERNAL, "a performed procedure step that was made is none");
+	message.CommandField = DIMSE_N_SET_RQ;
+	request.MessageID = ++dimse->client.requests;
+	request.DataSetType = DIMSE_DATASET_PRESENT;
+	OFStandard::strlcpy(request.RequestedSOPClassUID, UID_ModalityPerformedProcedureStepSOPClass,
+			    sizeof(request.RequestedSOPClassUID));
+	OFStandard::strlcpy(request.RequestedSOPInstanceUID, uid, sizeof(request.RequestedSOPInstanceUID));
+	OFCondition condition = dimse->client.request(dimse->presentation, &message, &dataset, &status, &error);
+	if (condition.bad())
+		return broken("N-SET", condition, err);
+	if (status == STATUS_N_NoSuchSOPInstance)
+		return error_set(err, ERR_NOT_FOUND, "it does not know the performed step");
+	if (status == STATUS_N_ProcessingFailure && error == ended_already)
+		return 0;
+	return judge_step("N-SET", status, err);
 }

@@ -16,7 +16,7 @@
 
 enum { DAEMON = 3 /* descriptor */, TASK_MOST = 1 << 20, READINGS = 4 };
 
-static const struct archive *const archives[] = {&archive_web, &archive_network};
+static const struct archive *const archives[] = {&archive_web, &archive_network, &archive_step};
 
 const char *destination_text(const cJSON *destination, const char *name)
 {
@@ -210,12 +210,13 @@ static const struct archive *archive_of(const cJSON *destination)
 	return NULL;
 }
 
-/* A destination: whether it answers, or a volume to it. */
+/* A destination: whether it answers, or a volume or a step to it. */
 static void carry_out(const cJSON *task)
 {
 	const cJSON *destination = cJSON_GetObjectItemCaseSensitive(task, "destination");
 	const struct archive *archive = archive_of(destination);
-	const bool asks = !cJSON_HasObjectItem(task, "job"), again = cJSON_HasObjectItem(task, "again");
+	const bool tells = cJSON_HasObjectItem(task, "step"), asks = !tells && !cJSON_HasObjectItem(task, "job");
+	const bool again = cJSON_HasObjectItem(task, "again");
 	enum promise promise = PROMISE_UNKNOWN;
 	struct objects objects = {.file = -1};
 	struct error err = {0};
@@ -225,9 +226,9 @@ static void carry_out(const cJSON *task)
 		code = error_set(&err, ERR_IMPOSSIBLE, "there is no such kind of destination");
 	else if (asks)
 		code = archive->ask(destination, &err);
-	else
-		code = objects_open(task, &objects, &err);
-	if (archive != NULL && !asks && code == 0)
+	else if (tells)
+		code = step_tell(task, &objects.count, &promise, &err);
+	else if ((code = objects_open(task, &objects, &err)) == 0)
 		code = send_volume(archive, destination, &objects, again, &promise, &err);
 	finish(code, asks, promise, &objects, &err);
 	objects_close(&objects);

@@ -10,7 +10,7 @@
 #include "proto/json.h"
 #include "proto/scan_directory.h"
 
-static int read_subject(const cJSON *task, struct subject *ret_subject, struct error *err)
+int task_subject(const cJSON *task, struct subject *ret_subject, struct error *err)
 {
 	const cJSON *subject = cJSON_GetObjectItemCaseSensitive(task, "subject");
 	char *text;
@@ -102,7 +102,7 @@ int objects_open(const cJSON *task, struct objects *ret_objects, struct error *e
 	    cJSON_GetObjectItemCaseSensitive(cJSON_GetObjectItemCaseSensitive(task, "subject"), "source"), true);
 	code = read_task(task, &objects, path, job, err);
 	if (code == 0)
-		code = read_subject(task, &objects.words.subject, err);
+		code = task_subject(task, &objects.words.subject, err);
 	if (code == 0)
 		code = open_volume(&objects, path, job, err);
 	if (code == 0) {

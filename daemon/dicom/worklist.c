@@ -5,7 +5,7 @@
 #include "daemon/dicom/dicom.h"
 #include "proto/worklist.h"
 
-_Static_assert((int)STEP_FIELDS == (int)STEP_FIELD_COUNT && (int)SUBJECT_COUNT <= (int)STEP_SUBJECT_MOST,
+_Static_assert((int)STEP_FIELDS == (int)STEP_FIELD_COUNT && (int)STUDY_STEP_ID <= (int)STEP_SUBJECT_MOST,
 	       "dimse.h has its room");
 
 static void found(void *context, const struct dimse_step *step)
@@ -29,7 +29,7 @@ static void day(time_t time, char ret[9])
 int worklist_ask(const cJSON *worklist, struct error *err)
 {
 	const struct dimse_peer peer = row_peer(worklist);
-	uint16_t tags[SUBJECT_COUNT][2];
+	uint16_t tags[STUDY_STEP_ID][2]; /* of the entry itself; its step has fields of its own */
 	char from[9], to[9];
 	const time_t now = time(NULL);
 	struct dimse_query query = {.from = from,
@@ -37,7 +37,7 @@ int worklist_ask(const cJSON *worklist, struct error *err)
 				    .modality = destination_text(worklist, "modality"),
 				    .station = destination_text(worklist, "station"),
 				    .subject = (const uint16_t(*)[2])tags,
-				    .subject_count = SUBJECT_COUNT,
+				    .subject_count = STUDY_STEP_ID,
 				    .most = WORKLIST_MOST};
 	struct dimse *dimse = NULL;
 	int code;
@@ -45,7 +45,7 @@ int worklist_ask(const cJSON *worklist, struct error *err)
 	if (!dimse_built())
 		return error_set(err, ERR_IMPOSSIBLE,
 				 "this cbct-dicom was built without DCMTK (libdcmtk-dev): it has no worklist");
-	for (int i = 0; i < SUBJECT_COUNT; i++) {
+	for (int i = 0; i < STUDY_STEP_ID; i++) {
 		tags[i][0] = subject_rows[i].group;
 		tags[i][1] = subject_rows[i].element;
 	}

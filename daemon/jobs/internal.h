@@ -133,8 +133,9 @@ int job_count_bytes(struct job *job, struct error *err);
 unsigned long long jobs_bytes(void *jobs, const char *client);
 long jobs_unended(void *jobs, const char *client);
 
-/* The sendings that a new job begins with: one for each of its wishes; returns how many. */
-int job_wanted_sendings(const struct job *job, struct sending_record ret_sendings[SENDS_MOST]);
+/* The sendings that a new job begins with: one for each of its wishes, and its step's; returns how many. */
+enum { JOB_SENDINGS_MOST = SENDS_MOST + 1 };
+int job_wanted_sendings(const struct job *job, struct sending_record ret_sendings[JOB_SENDINGS_MOST]);
 
 /* Wakes those who watch the job or all jobs; no lock is held. */
 void job_wake(struct job *job);

@@ -410,7 +410,7 @@ static int fill_record(struct job_record *record, const struct job_request *requ
 /* jobs->change is held. */
 static int insert_job(struct jobs *jobs, struct job *job, struct stored_scan *scan, struct error *err)
 {
-	struct sending_record sendings[SENDS_MOST];
+	struct sending_record sendings[JOB_SENDINGS_MOST];
 	struct job_record *record = &job->record;
 	struct scan_facts facts;
 	struct event event;

@@ -7,10 +7,15 @@
 #include "daemon/jobs/internal.h"
 #include "proto/clock.h"
 
-int job_wanted_sendings(const struct job *job, struct sending_record ret_sendings[SENDS_MOST])
+int job_wanted_sendings(const struct job *job, struct sending_record ret_sendings[JOB_SENDINGS_MOST])
 {
-	struct send_wish wishes[SENDS_MOST];
-	const int count = sends_parse(job->request.send, wishes);
+	struct send_wish wishes[JOB_SENDINGS_MOST];
+	int count = sends_parse(job->request.send, wishes);
+
+	if (job->request.step_to[0] != '\0') {
+		wishes[count] = (struct send_wish){.volumes = SEND_STEP};
+		memcpy(wishes[count++].to, job->request.step_to, sizeof(job->request.step_to));
+	}
 
 	for (int i = 0; i < count; i++) {
 		struct sending_record *sending = &ret_sendings[i];

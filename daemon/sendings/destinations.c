@@ -13,7 +13,7 @@
 
 enum { FILE_MOST = 1 << 20, DESTINATIONS_MOST = 64 };
 
-static const char *const kind_names[DESTINATION_KIND_COUNT] = {"dicomweb", "dimse"};
+static const char *const kind_names[DESTINATION_KIND_COUNT] = {"dicomweb", "dimse", "mpps"};
 
 void destinations_free(struct destination *destinations, int count)
 {
@@ -87,12 +87,17 @@ static int read_row(const cJSON *value, int place, struct destination *ret, stru
 	json_begin(&reader, value, pointer, err);
 	json_string(&reader, "name", true, ret->name, sizeof(ret->name));
 	json_choice(&reader, "kind", true, kind_names, DESTINATION_KIND_COUNT, &kind);
-	json_choice(&reader, "objects", false, dicom_kind_names, DICOM_KIND_COUNT, &objects);
-	read_rule(&reader, ret->rule);
+	/* A destination that is told of steps takes no volumes. */
+	if (kind != DESTINATION_MPPS) {
+		json_choice(&reader, "objects", false, dicom_kind_names, DICOM_KIND_COUNT, &objects);
+		read_rule(&reader, ret->rule);
+	}
 	if (reader.code == 0 && !destination_name_valid(ret->name))
 		json_fail(&reader, ERR_INVALID, "name", "\"%s\" is no name: letters, digits, -, _ and .", ret->name);
 	if (kind == DESTINATION_DIMSE) {
 		read_network(&reader, ret);
+	} else if (kind == DESTINATION_MPPS) {
+		application_peer(&reader, ret->address, sizeof(ret->address));
 	} else {
 		read_web(&reader, ret);
 		json_number(&reader, "timeout_s", false, 1, 3600, &seconds);
@@ -116,7 +121,7 @@ static int read_list(const cJSON *list, struct destination **ret_destinations, i
 	const int count = cJSON_GetArraySize(list);
 	struct destination *read;
 	const cJSON *one;
-	int i = 0, code = 0;
+	int i = 0, code = 0, steps = 0;
 
 	if (!cJSON_IsArray(list) || count > DESTINATIONS_MOST)
 		return error_set_at(err, ERR_INVALID, "/destinations", "expected a list of at most %d destinations",
@@ -130,6 +135,10 @@ static int read_list(const cJSON *list, struct destination **ret_destinations, i
 		for (int k = 0; k < i && code == 0; k++)
 			if (strcmp(read[k].name, read[i].name) == 0)
 				code = two_of(read[i].name, i, err);
+		steps += code == 0 && read[i].kind == DESTINATION_MPPS;
+		if (steps > 1)
+			code = error_set_at(err, ERR_INVALID, "/destinations",
+					    "one destination at most is told of performed steps");
 		if (code == 0 && (read[i].row = cJSON_Duplicate(one, true)) == NULL)
 			code = error_set(err, ERR_NO_MEMORY, "no memory for destinations");
 		i++;
@@ -160,7 +169,8 @@ static int check_received(const cJSON *listen, const struct destination *destina
 		bool known = false;
 
 		for (int k = 0; k < count; k++)
-			known |= strcmp(destinations[k].name, wishes[i].to) == 0;
+			known |=
+			    destinations[k].kind != DESTINATION_MPPS && strcmp(destinations[k].name, wishes[i].to) == 0;
 		snprintf(pointer, sizeof(pointer), "%s/%d", base, i);
 		if (!known)
 			code = error_set_at(err, ERR_INVALID, pointer, "there is no destination \"%s\"", wishes[i].to);
@@ -283,7 +293,10 @@ static cJSON *document_of(const struct sendings *sendings, const struct destinat
 	cJSON_AddStringToObject(document, "name", one->name);
 	cJSON_AddStringToObject(document, "kind", kind_names[one->kind]);
 	cJSON_AddStringToObject(document, "address", one->address);
-	cJSON_AddStringToObject(document, "objects", dicom_kind_names[one->objects]);
+	if (one->kind != DESTINATION_MPPS)
+		cJSON_AddStringToObject(document, "objects", dicom_kind_names[one->objects]);
+	else
+		cJSON_AddNullToObject(document, "objects");
 	cJSON_AddItemToObject(document, "send",
 			      one->rule[0] != '\0' ? send_volumes_json(one->rule) : cJSON_CreateString("none"));
 	if (one->known)

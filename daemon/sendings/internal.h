@@ -10,7 +10,12 @@
 
 /* Shared by the files of this room. */
 
-enum destination_kind { DESTINATION_DICOMWEB, DESTINATION_DIMSE, DESTINATION_KIND_COUNT };
+enum destination_kind {
+	DESTINATION_DICOMWEB,
+	DESTINATION_DIMSE,
+	DESTINATION_MPPS, /* is told of performed procedure steps, and takes no volumes */
+	DESTINATION_KIND_COUNT
+};
 
 struct destination {
 	char name[DESTINATION_NAME_SIZE];
@@ -122,6 +127,7 @@ void application_ended(struct sendings *sendings, int transfer, const cJSON *res
 
 /* ---- queue.c; the lock is held ---- */
 struct entry *entry_find(struct sendings *sendings, const char *job, const char *name);
+int entry_add(struct sendings *sendings, const char *job, const struct sending_record *record, struct error *err);
 /* Writes the row, then changes the entry: one that has ended goes. ERR_NOT_FOUND: its job is removed, and it goes. */
 int entry_change(struct sendings *sendings, struct entry *entry, const struct sending_record *record,
 		 struct error *err);
@@ -132,6 +138,19 @@ struct entry *entry_promised(struct sendings *sendings, const char *transaction)
 int entry_expand(struct sendings *sendings, struct entry *entry, struct job *job, struct error *err);
 int entries_load(struct sendings *sendings, struct error *err);
 
+/* ---- step.c: performed procedure steps; the lock is held ---- */
+bool entry_is_step(const struct entry *entry);
+/* A waiting step has something to tell now. */
+bool step_is_due(struct sendings *sendings, const struct entry *entry);
+/* The line that cbct-dicom gets, free. */
+int step_task_make(struct sendings *sendings, const struct destination *destination, struct job *job,
+		   const struct sending_record *sending, char **ret_line, struct error *err);
+/* The row after an attempt that was heard; ended: all of the step was told. */
+void step_told(const struct entry *entry, bool ended, struct sending_record *record);
+/* Begins anew what has failed or was stopped. ERR_IMPOSSIBLE: the job has no step that is told to it. */
+int step_again(struct sendings *sendings, struct job *job, const struct send_wish *wish, bool *ret_new,
+	       struct error *err);
+
 /* ---- sender.c ---- */
 void sender_wake(struct sendings *sendings);
 /* Takes the answer to a request for storage commitment; the lock is held. */
@@ -140,6 +159,13 @@ int sender_start(struct sendings *sendings, struct error *err);
 void sender_stop(struct sendings *sendings);
 
 /* ---- task.c ---- */
+/* What cbct-dicom needs of a volume, for its objects; ERR_NOT_FOUND: it is gone. */
+int task_add_volume(struct sendings *sendings, cJSON *task, struct job *job, const char *name, bool verify,
+		    struct error *err);
+/* The destination's row, with our title. */
+void task_add_destination(const struct sendings *sendings, cJSON *task, const struct destination *destination);
+/* As the line that it gets, free; the task goes. */
+int task_line(cJSON *task, char **ret_line, struct error *err);
 /*
  * The line that cbct-dicom gets, free; job and sending NULL: whether the destination answers. ERR_NOT_FOUND,
  * ERR_DAMAGED: the volume. The lock is held.

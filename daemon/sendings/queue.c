@@ -34,7 +34,7 @@ struct entry *entry_promised(struct sendings *sendings, const char *transaction)
 	return NULL;
 }
 
-static int entry_add(struct sendings *sendings, const char *job, const struct sending_record *record, struct error *err)
+int entry_add(struct sendings *sendings, const char *job, const struct sending_record *record, struct error *err)
 {
 	const int space = sendings->space == 0 ? 16 : 2 * sendings->space;
 	struct entry *grown;
@@ -288,16 +288,29 @@ int sendings_default(struct sendings *sendings, char **ret_text, struct error *e
 /* The lock is held. */
 static int check_destination(const struct sendings *sendings, const char *name, struct error *err)
 {
+	const struct destination *one = destination_find(sendings, name);
 	char names[200] = "";
 	size_t used = 0;
 
-	if (destination_find(sendings, name) != NULL)
+	if (one != NULL && one->kind != DESTINATION_MPPS)
 		return 0;
+	if (one != NULL)
+		return error_set(err, ERR_IMPOSSIBLE, "%s is told of performed steps, and takes no volumes", name);
 	for (int i = 0; i < sendings->destination_count && used < sizeof(names); i++)
 		used += (size_t)snprintf(names + used, sizeof(names) - used, "%s%s", i > 0 ? ", " : "",
 					 sendings->destinations[i].name);
 	return error_set(err, ERR_IMPOSSIBLE, "there is no destination \"%s\"; there %s", name,
 			 used > 0 ? names : "are none (setting destinations)");
+}
+
+void sendings_step_to(struct sendings *sendings, char ret_name[DESTINATION_NAME_SIZE])
+{
+	ret_name[0] = '\0';
+	pthread_mutex_lock(&sendings->lock);
+	for (int i = 0; i < sendings->destination_count; i++)
+		if (sendings->destinations[i].kind == DESTINATION_MPPS)
+			memcpy(ret_name, sendings->destinations[i].name, DESTINATION_NAME_SIZE);
+	pthread_mutex_unlock(&sendings->lock);
 }
 
 int sendings_check(struct sendings *sendings, const struct send_wish *wishes, int count, const char *base,
@@ -355,6 +368,7 @@ int sendings_ask(struct sendings *sendings, struct job *job, const struct send_w
 		 struct error *err)
 {
 	const struct job_request *request;
+	const struct destination *one;
 	struct job_facts facts;
 	int code;
 
@@ -368,8 +382,10 @@ int sendings_ask(struct sendings *sendings, struct job *job, const struct send_w
 		return code;
 	pthread_mutex_lock(&sendings->lock);
 	job_facts(job, &facts);
-	code = check_destination(sendings, wish->to, err);
-	if (code != 0)
+	one = destination_find(sendings, wish->to);
+	if (one != NULL && one->kind == DESTINATION_MPPS)
+		code = step_again(sendings, job, wish, ret_new, err);
+	else if ((code = check_destination(sendings, wish->to, err)) != 0)
 		snprintf(err->pointer, sizeof(err->pointer), "/to");
 	else if (facts.ended && entry_find(sendings, facts.id, wish->to) == NULL)
 		code = ask_now(sendings, job, facts.id, wish, ret_new, err);
@@ -419,6 +435,17 @@ bool sendings_pending(struct sendings *sendings, const char *job)
 	pthread_mutex_lock(&sendings->lock);
 	for (int i = 0; i < sendings->count; i++)
 		pending |= strcmp(sendings->entries[i].job, job) == 0;
+	pthread_mutex_unlock(&sendings->lock);
+	return pending;
+}
+
+bool sendings_step_pending(struct sendings *sendings, const char *job)
+{
+	bool pending = false;
+
+	pthread_mutex_lock(&sendings->lock);
+	for (int i = 0; i < sendings->count; i++)
+		pending |= strcmp(sendings->entries[i].job, job) == 0 && entry_is_step(&sendings->entries[i]);
 	pthread_mutex_unlock(&sendings->lock);
 	return pending;
 }

@@ -104,13 +104,16 @@ static void write_outcome(struct sendings *sendings, struct entry *entry, const 
 		entry->record.next = clock_realtime() + sendings->pause;
 		return;
 	}
-	if (record->error[0] == '\0')
+	if (record->error[0] == '\0' && entry_is_step(&before))
+		log_line(LEVEL_INFO, "job %s: %s is told %s", before.job, record->destination,
+			 record->state == SENDING_SENT ? "how its step ended" : "that its step has begun");
+	else if (record->error[0] == '\0')
 		log_line(LEVEL_INFO, "job %s: %s is %s to %s, %d objects", before.job, record->volume,
 			 sending_state_names[record->state], record->destination, record->stored);
 	else
-		log_line(LEVEL_WARNING, "job %s: %s is not sent to %s, attempt %d%s: %s", before.job, record->volume,
-			 record->destination, record->attempts, record->state == SENDING_FAILED ? ", the last" : "",
-			 record->error);
+		log_line(LEVEL_WARNING, "job %s: %s is not sent to %s, attempt %d%s: %s", before.job,
+			 entry_is_step(&before) ? "its step" : record->volume, record->destination, record->attempts,
+			 record->state == SENDING_FAILED ? ", the last" : "", record->error);
 }
 
 /* The row of what was sent and may yet be promised to be kept: asked again later, until the limit. */
@@ -169,7 +172,9 @@ static void settle_sending(struct sendings *sendings, const struct transfer *tra
 	snprintf(why, sizeof(why), "%s", member_text(transfer->result, "error"));
 	if (transfer->result == NULL)
 		snprintf(why, sizeof(why), "the process that sends ended: %s", how);
-	if (sent) {
+	if (sent && entry_is_step(entry)) {
+		step_told(entry, !asked, &record);
+	} else if (sent) {
 		record.state = committed ? SENDING_COMMITTED : SENDING_SENT;
 		record.error[0] = '\0';
 		record.next = 0;
@@ -335,8 +340,10 @@ static void finish(struct sendings *sendings, struct transfer *transfer)
 /* ---- what is due; the lock is held ---- */
 
 /* A clock that was set back makes nobody wait longer than a pause. */
-static bool is_due(const struct entry *entry, double now)
+static bool is_due(struct sendings *sendings, const struct entry *entry, double now)
 {
+	if (entry_is_step(entry) && entry->record.state == SENDING_WAITING)
+		return step_is_due(sendings, entry);
 	return (entry->record.state == SENDING_QUEUED || entry->record.state == SENDING_SENT) &&
 	       (entry->record.next <= now || entry->record.next > now + PAUSE_MOST);
 }
@@ -375,6 +382,11 @@ static void attempt(struct sendings *sendings, struct entry *entry, struct trans
 	struct error err = {0};
 	int code;
 
+	/* Something new is to be told: its attempts and its limit are its own. */
+	if (entry_is_step(entry) && record.state == SENDING_WAITING) {
+		record.created = clock_realtime();
+		record.attempts = 0;
+	}
 	record.state = SENDING_SENDING;
 	record.attempts++;
 	record.next = 0;
@@ -405,7 +417,7 @@ static void review(struct sendings *sendings)
 			continue;
 		}
 		job_facts(job, &facts);
-		if (entry->record.state == SENDING_WAITING && facts.ended &&
+		if (entry->record.state == SENDING_WAITING && facts.ended && !entry_is_step(entry) &&
 		    entry_expand(sendings, entry, job, &err) != 0 && err.code != ERR_NOT_FOUND)
 			log_line(LEVEL_ERROR, "job %s cannot be sent: %s", facts.id, err.text);
 		job_release(job);
@@ -420,7 +432,7 @@ static struct entry *next_due(struct sendings *sendings, double now)
 	for (int i = 0; i < sendings->count; i++) {
 		struct entry *entry = &sendings->entries[i];
 
-		if (is_due(entry, now) && !is_busy(sendings, entry->record.destination) &&
+		if (is_due(sendings, entry, now) && !is_busy(sendings, entry->record.destination) &&
 		    (found == NULL || entry->record.created < found->record.created))
 			found = entry;
 	}

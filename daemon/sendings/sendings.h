@@ -21,6 +21,10 @@
  * listener, a cbct-dicom process that takes what peers send: the volume is committed, or sent again. Without an answer
  * the request is made again.
  *
+ * A destination may be one that is told of performed procedure steps in place of getting volumes. The row of such a
+ * step, of each job whose scan is of a step of the worklist, waits where others do: it is told when the job begins,
+ * and once the job has ended and all that was to be sent of it has, or has failed, how it ended.
+ *
  * Destinations are read from a JSON file, at the start and by sendings_reload.
  *
  * Threads: any, but sendings_open and sendings_close once each.
@@ -46,6 +50,8 @@ int sendings_default(struct sendings *sendings, char **ret_text, struct error *e
 /* ERR_IMPOSSIBLE with a pointer below `base` where a wish's destination is none. */
 int sendings_check(struct sendings *sendings, const struct send_wish *wishes, int count, const char *base,
 		   struct error *err);
+/* The destination that is told of the performed steps of jobs; "": there is none. */
+void sendings_step_to(struct sendings *sendings, char ret_name[DESTINATION_NAME_SIZE]);
 /* Takes up the sendings that a new job has begun with. */
 int sendings_adopt(struct sendings *sendings, struct job *job, struct error *err);
 /*
@@ -59,6 +65,9 @@ int sendings_ask(struct sendings *sendings, struct job *job, const struct send_w
 int sendings_stop(struct sendings *sendings, struct job *job, const char *destination, struct error *err);
 /* True while something of the job waits to be sent. */
 bool sendings_pending(struct sendings *sendings, const char *job);
+
+/* True while it is still to be told how the job's step has ended. */
+bool sendings_step_pending(struct sendings *sendings, const char *job);
 
 /* ---- destinations ---- */
 /* {"destinations": [...]} with what is known of each now. NULL: no memory. */

@@ -32,7 +32,8 @@ static void add_subject(cJSON *task, const struct job_record *record)
 		cJSON_AddItemToObject(task, "subject", cJSON_Parse(record->subject));
 }
 
-static int add_volume(struct sendings *sendings, cJSON *task, struct job *job, const char *name, struct error *err)
+int task_add_volume(struct sendings *sendings, cJSON *task, struct job *job, const char *name, bool verify,
+		    struct error *err)
 {
 	struct volume_record volume;
 	struct job_record record;
@@ -42,7 +43,7 @@ static int add_volume(struct sendings *sendings, cJSON *task, struct job *job, c
 
 	job_record(job, &record);
 	code = find_volume(sendings, record.id, name, &volume, err);
-	if (code == 0)
+	if (code == 0 && verify)
 		code = store_volume_verify(sendings->store, record.id, &volume, 0, volume.bytes, err);
 	if (code != 0)
 		return code;
@@ -61,31 +62,45 @@ static int add_volume(struct sendings *sendings, cJSON *task, struct job *job, c
 	return 0;
 }
 
-int task_make(struct sendings *sendings, const struct destination *destination, struct job *job,
-	      const struct sending_record *sending, char **ret_line, struct error *err)
+void task_add_destination(const struct sendings *sendings, cJSON *task, const struct destination *destination)
 {
-	cJSON *task = cJSON_CreateObject(), *row;
-	char *text = NULL, *line;
+	cJSON *row = cJSON_Duplicate(destination->row, true);
+
+	cJSON_AddStringToObject(row, "own_title", sendings->application.title);
+	cJSON_AddItemToObject(task, "destination", row);
+}
+
+int task_line(cJSON *task, char **ret_line, struct error *err)
+{
+	char *text = json_print(task, NULL), *line;
 	int code = 0;
 
-	row = cJSON_AddItemToObject(task, "destination", cJSON_Duplicate(destination->row, true))
-		  ? cJSON_GetObjectItemCaseSensitive(task, "destination")
-		  : NULL;
-	cJSON_AddStringToObject(row, "own_title", sendings->application.title);
-	if (sending != NULL)
-		code = add_volume(sendings, task, job, sending->volume, err);
-	/* What it would not promise to keep is sent again. */
-	if (sending != NULL && strcmp(sending->transaction, SENDING_REFUSED) == 0)
-		cJSON_AddTrueToObject(task, "again");
-	if (code == 0)
-		text = json_print(task, NULL);
 	cJSON_Delete(task);
-	if (code != 0)
-		return code;
 	if (text == NULL || asprintf(&line, "%s\n", text) < 0)
 		code = error_set(err, ERR_NO_MEMORY, "no memory for a task");
 	else
 		*ret_line = line;
 	free(text);
+	return code;
+}
+
+int task_make(struct sendings *sendings, const struct destination *destination, struct job *job,
+	      const struct sending_record *sending, char **ret_line, struct error *err)
+{
+	cJSON *task;
+	int code = 0;
+
+	if (sending != NULL && destination->kind == DESTINATION_MPPS)
+		return step_task_make(sendings, destination, job, sending, ret_line, err);
+	task = cJSON_CreateObject();
+	task_add_destination(sendings, task, destination);
+	if (sending != NULL)
+		code = task_add_volume(sendings, task, job, sending->volume, true, err);
+	/* What it would not promise to keep is sent again. */
+	if (sending != NULL && strcmp(sending->transaction, SENDING_REFUSED) == 0)
+		cJSON_AddTrueToObject(task, "again");
+	if (code == 0)
+		return task_line(task, ret_line, err);
+	cJSON_Delete(task);
 	return code;
 }

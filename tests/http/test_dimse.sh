@@ -162,7 +162,7 @@ test_todays_patients_come_from_the_worklist() {
 	expect_status 200
 	expect_json '.detail == null and .not_shown == 0 and (.steps | map(.id) | sort) == ["S1", "S2", "S4", "S5"]'
 	expect_json '.steps[] | select(.id == "S1") | .patient == {name: "Müller^Jane", id: "11", birth_date: "1970-02-28", sex: "F"} and .study ==
-		{uid: "1.2.3.11", accession_number: "A11", referring_physician: "House^Gregory"} and .procedure == "RPS1" and .description == "Knee, 3D"
+		{uid: "1.2.3.11", accession_number: "A11", referring_physician: "House^Gregory", step_id: "S1", procedure_id: "RPS1"} and .procedure == "RPS1" and .description == "Knee, 3D"
 		and .time == "10:30:00" and .not_read == []'
 	cbct worklist | grep 'S2 .*A12.*Smith^John' >/dev/null || fail "cbct worklist"
 	scan=$(cbct upload "$work/scan" --quiet --worklist S1)
@@ -182,6 +182,109 @@ test_todays_patients_come_from_the_worklist() {
 	expect_json '(.detail | contains("cannot be reached")) and (.steps | length) == 4'
 	! cbct worklist 2>"$work/said" || fail "what was told before is not told as today's"
 	! grep -E 'Jane|Smith' "$work/cbctd.err" || fail "no patient in the log"
+}
+
+# start_system: a department's system that knows of no steps; what it is told is in $work/steps
+start_system() {
+	[ -n "${ris:-}" ] || ris=$("$python" "$top/tests/http/send.py" ports 1)
+	"$python" "$top/tests/http/steps.py" "$ris" "$work/steps" >>"$work/system.log" 2>&1 &
+	system=$!
+	echo $system >>"$work/peers"
+	until echoscu 127.0.0.1 "$ris" 2>/dev/null; do sleep 0.1; done
+}
+stop_system() {
+	kill -9 $system
+	wait $system 2>/dev/null || true
+}
+# told: of the step of $job
+told() { jq -s --arg job "$job" '(map(select(.[0] == "create" and .[2]."00400253" == $job) | .[1])[0]) as $uid | map(select(.[1] == $uid))' "$work/steps"; }
+expect_told() { told | jq -e "$1" >/dev/null || fail "of the step, $1, got $(told)"; }
+# step_becomes CONDITION: what the job says of its step
+step_becomes() {
+	local end=$((SECONDS + 30))
+	until req GET "/v1/jobs/$job/send" && jq -e "any(.sendings[]; .to == \"ris\" and $1)" "$body" >/dev/null; do
+		[ $SECONDS -lt $end ] || fail "of the step of $job, $1: $(cat "$body")"
+		sleep 0.1
+	done
+}
+
+test_performed_steps_are_told() {
+	need_dcmtk
+	"$python" -c 'import odil' 2>/dev/null || skip "python3-odil is not here"
+	rm -rf "$work/worklist"
+	mkdir -p "$work/worklist"
+	step S1 $'M\xfcller^Jane' 11 "$(date +%Y%m%d)" A11
+	start_archive
+	: >"$work/steps"
+	start_system
+	jq -n '{worklist: {host: "127.0.0.1", port: '$dimse', title: "ARCHIVE"}, destinations: [
+		{name: "pacs", kind: "dimse", host: "127.0.0.1", port: '$dimse', title: "ARCHIVE", send: "last", commitment_s: 0},
+		{name: "ris", kind: "mpps", host: "127.0.0.1", port: '$ris', title: "RIS", timeout_s: 5}]}' >"$work/destinations.json"
+	start_daemon --destinations "$work/destinations.json" --send-pause 0.2
+	req GET "/v1/destinations?wait=10"
+	expect_json '.destinations[1] | .kind == "mpps" and .reachable and .objects == null and .send == "none"'
+	mkdir -p "$work/lying"
+	ln -sf "$work/scan/projections.raw" "$work/lying/projections.raw"
+	jq '.patient = {position: "HFS"}' "$work/scan/scan.json" >"$work/lying/scan.json"
+	scan=$(cbct upload "$work/lying" --quiet --worklist S1)
+	req GET "/v1/scans/$scan"
+	expect_json '.study.step_id == "S1" and .study.procedure_id == "RPS1"'
+	jq '{detector, projections, geometry, patient, study}' "$body" >"$work/another.json"
+	req POST /v1/jobs -H 'Content-Type: application/json' --data-binary '{"scan": "'$scan'", "fdk": {}, "send": ["ris"]}'
+	expect_problem 422
+	post_job "{\"scan\": \"SCAN\", $recipe}"
+	wait_job succeeded
+	step_becomes '.state == "sent" and .volumes == "step" and .volume == null and .instances == 50 and .stored == 50'
+	expect_told 'map(.[0]) == ["create", "set"]'
+	expect_told '.[0][2] | ."00100010" == "Müller^Jane" and ."00100020" == "11" and ."00400241" == "CBCTD" and ."00080060" == "CT" and
+		(."00400270"[0] | ."0020000d" == "1.2.3.11" and ."00080050" == "A11" and ."00400009" == "S1" and ."00401001" == "RPS1")'
+	expect_told '.[1][2] | ."00400252" == "COMPLETED" and (."00400340" | length) == 1 and ."00400340"[0]."00080054" == "ARCHIVE"'
+	# The objects that it names are those that the archive has, which name the step.
+	told | jq -r '.[1][2]."00400340"[0] | ."0020000e" as $series | ."00081140"[] | "\($series) \(."00081155")"' | sort >"$work/named"
+	fetched "$work/back"
+	"$python" - "$work/back/"*.dcm <<-'END' | sort | diff - "$work/named" || fail "the objects that the archive has"
+		import sys, pydicom
+		for name in sys.argv[1:]:
+		    data = pydicom.dcmread(name, stop_before_pixels=True)
+		    asked = data.RequestAttributesSequence[0]
+		    assert (asked.ScheduledProcedureStepID, asked.RequestedProcedureID) == ("S1", "RPS1")
+		    print(data.SeriesInstanceUID, data.SOPInstanceUID)
+	END
+	# One that is cancelled while it waits for projections.
+	post_scan_of "$work/another.json"
+	post_job "{\"scan\": \"SCAN\", $recipe, \"send\": []}"
+	step_becomes '.state == "waiting" and .attempts == 1'
+	req DELETE "/v1/jobs/$job"
+	step_becomes '.state == "sent"'
+	expect_told 'map(.[0]) == ["create", "set"]'
+	expect_told '.[1][2] | ."00400252" == "DISCONTINUED" and ."00400340" == [] and ."00400281"[0]."00080100" == "110513"'
+	# An end is told over the system's absence, which has then lost the beginning, and over a kill. Nothing was sent.
+	post_job "{\"scan\": \"SCAN\", $recipe, \"send\": []}"
+	step_becomes '.state == "waiting" and .attempts == 1'
+	stop_system
+	curl -sSf -T "$work/scan/projections.raw" "$url/v1/scans/$scan/projections" >/dev/null
+	wait_job succeeded
+	step_becomes '.state == "queued" and (.error | contains("cannot be reached"))'
+	kill -9 "$(cat "$work/daemon.pid")"
+	start_daemon --destinations "$work/destinations.json" --send-pause 0.2
+	start_system
+	step_becomes '.state == "sent"'
+	expect_told 'map(.[0]) == ["create", "create", "set"]'
+	expect_told '.[2][2] | ."00400252" == "COMPLETED" and (."00400340"[0] | ."00080054" == "" and ."00081140" == [])'
+	# A job does not go before its end is told, unless that is given up.
+	stop_system
+	post_job "{\"scan\": \"SCAN\", $recipe, \"send\": []}"
+	wait_job succeeded
+	req DELETE "/v1/jobs/$job"
+	expect_problem 409
+	req DELETE "/v1/jobs/$job/send/ris"
+	expect_status 204
+	req DELETE "/v1/jobs/$job"
+	expect_status 204
+	! grep -E 'Müller|Jane' "$work/cbctd.err" || fail "no patient in the log"
+}
+post_scan_of() {
+	scan=$(curl -sSf "$url/v1/scans" -H 'Content-Type: application/json' -d @"$1" | jq -r .id)
 }
 
 # xa NAME OPTION ...: a run of projections as an XA object
@@ -283,6 +386,8 @@ test_mistakes_in_the_file_of_destinations_are_refused() {
 		/destinations/1/name|.destinations[1].name = "a"
 		/destinations/1/token_file|.destinations[1].token_file = "/nowhere/token"
 		/destinations/1/ca_file|.destinations[1].ca_file = "/nowhere/ca"
+		/destinations/0/send|.destinations[0] = {name: "r", kind: "mpps", host: "ris.example", port: 9, title: "RIS", send: "last"}
+		/destinations|.destinations += (["r", "s"] | map({name: ., kind: "mpps", host: "ris.example", port: 9, title: "RIS"}))
 		/worklist/host|.worklist.host = "-x"
 		/listen/address|.listen.address = "localhost"
 		/listen/address|.listen.address = ""

@@ -26,7 +26,7 @@ export class Sendings {
 
 	async #ask(signal) {
 		try {
-			this.#destinations = (await get('/v1/destinations', signal)).destinations
+			this.#destinations = (await get('/v1/destinations', signal)).destinations.filter(({ kind }) => kind !== 'mpps') /* which takes no volumes */
 		} catch {
 			return /* the page says elsewhere that the daemon is away */
 		}
@@ -69,9 +69,10 @@ export class Sendings {
 		replace(this.list, job.sendings.map(sending => this.#row(sending)))
 	}
 
-	#row({ to, volume, state, instances, stored, error, next }) {
+	#row({ to, volume, volumes, state, instances, stored, error, next }) {
 		const count = instances > 0 ? ` (${t('{n} of {all} objects', { n: stored, all: instances })})` : ''
-		return h('li', { 'data-state': state }, h('span', {}, h('span', { 'aria-hidden': 'true' }, `${signs[state]} `), h('strong', {}, to), ` ${volume ?? ''}: ${words()[state]}${count}`),
+		const what = volumes === 'step' && state === 'sent' ? t('told how the step ended') : words()[state]
+		return h('li', { 'data-state': state }, h('span', {}, h('span', { 'aria-hidden': 'true' }, `${signs[state]} `), h('strong', {}, to), ` ${volume ?? ''}: ${what}${count}`),
 			underWay(state) && h('button', { type: 'button', class: 'quiet acquires', onclick: event => this.#act(event.target, () => request('DELETE', `${this.path}/${id(to)}`)) }, t('Stop')),
 			error && state !== 'sent' && state !== 'committed' && h('small', {}, next ? t('{why}; tried again {when}', { why: error, when: moment(next) }) : error))
 	}

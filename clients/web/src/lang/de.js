@@ -441,6 +441,7 @@ export const strings = {
 	'Cut away from the front': 'Von vorn wegschneiden',
 	'waits for the end of the job': 'wartet auf das Ende des Auftrags',
 	'is being sent': 'wird gesendet',
+	'told how the step ended': 'über das Ende des Schritts unterrichtet',
 	'sent: the archive has all of it': 'gesendet: Das Archiv hat alles',
 	'sent: the archive has promised to keep it': 'gesendet: Das Archiv hat die Aufbewahrung zugesagt',
 	'stopped': 'angehalten',
