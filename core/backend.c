@@ -8,7 +8,7 @@ extern const struct backend backend_cuda __attribute__((weak));
 
 const struct backend *const backends[BACKEND_COUNT] = {&backend_cuda, &backend_cpu};
 
-const char *const tv_method_names[TV_METHOD_COUNT] = {"gradient", "proximal"};
+const char *const tv_method_names[TV_METHOD_COUNT] = {"gradient", "proximal", "tgv"};
 
 const struct backend *backend_find(const char *name)
 {

@@ -47,7 +47,7 @@ struct recipe {
 	struct {
 		bool on;
 		bool after_fdk;            /* false with "after": "sart" */
-		bool automatic;            /* alpha is found from the noise (core/recon/noise.h); TV_PROXIMAL only */
+		bool automatic;            /* alpha is found from the noise (core/recon/noise.h); not for TV_GRADIENT */
 		enum tv_strength strength; /* of what is found */
 		struct tv_options options; /* alpha counts for nothing where it is found */
 	} tv;

@@ -553,6 +553,15 @@ size_t strategy_partials(const struct plan *plan); /* of an iteration */
 
 /* ---- tv.cu ---- */
 size_t tv_scratch_bytes(const struct plan_options *options);
+/* Smallest spacing / spacing along the axis; and the sum of their squares over the axes that have differences. */
+double tv_weight(const struct plan *plan, int axis);
+double tv_squared_weights(const struct plan *plan);
+
+/* ---- tgv.cu ---- */
+/* Volumes of scratch: v, u^, p, w, w^ and q. */
+enum { TGV_VOLUMES = 1 + 1 + 3 + 3 + 3 + 6 };
+int tgv_run(struct plan *plan, float *volume, const struct tv_options *tv, const struct cancel *cancel,
+	    struct error *err);
 
 /* ---- the operations of the table ---- */
 int cuda_linearise(struct plan *plan, const void *samples, int count, const int *slots, struct stack *to,

@@ -561,14 +561,15 @@ static struct plan_bytes bytes_of(const struct plan_options *options, enum thrif
 	return bytes;
 }
 
-/* A job's bound: seven volumes, ten with the proximal method's, and three stacks. */
+/* A job's bound: seven volumes, ten with the proximal method's, 21 with TGV's, and three stacks. */
 static size_t most_bytes(const struct plan_options *options)
 {
 	const struct geometry *geometry = options->geometry;
-	bool proximal = options->tv != NULL && options->tv->method == TV_PROXIMAL;
+	static const int volumes[TV_METHOD_COUNT] = {7, 10, 21};
 
-	return sizeof(float) * ((proximal ? 10 : 7) * grid_voxels(options->grid) +
-				3 * (size_t)geometry->columns * (size_t)geometry->rows * (size_t)geometry->count);
+	return sizeof(float) *
+	       ((size_t)volumes[options->tv != NULL ? options->tv->method : 0] * grid_voxels(options->grid) +
+		3 * (size_t)geometry->columns * (size_t)geometry->rows * (size_t)geometry->count);
 }
 
 static bool is_borrowed(const struct plan_options *options, size_t block)

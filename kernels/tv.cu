@@ -18,6 +18,8 @@
  * gray levels. So a step reads f, v, past and the dual variable, and writes v and the
  * dual variable: 28 bytes a voxel. In float, for reference precision, that would take
  * nine volumes of memory; there a step is two plain kernels that take five.
+ *
+ * Total generalised variation is in tgv.cu.
  */
 #include <climits>
 #include <cmath>
@@ -339,7 +341,7 @@ static void launch(const struct device *device, const tv_volumes &volumes, const
 }
 
 /* Smallest spacing / spacing. */
-static double weight_of(const struct plan *plan, int axis)
+double tv_weight(const struct plan *plan, int axis)
 {
 	const double *spacing = plan->options.grid->spacing;
 
@@ -355,20 +357,20 @@ static tv_step step_make(const struct plan *plan, double slope, double flow, dou
 	s.ny = plan->grid.size[1];
 	s.nz = plan->grid.size[2];
 	for (int i = 0; i < 3; i++) {
-		s.slope[i] = (float)(slope * weight_of(plan, i));
-		s.flow[i] = (float)(flow * weight_of(plan, i));
+		s.slope[i] = (float)(slope * tv_weight(plan, i));
+		s.flow[i] = (float)(flow * tv_weight(plan, i));
 	}
 	s.fidelity = (float)fidelity;
 	return s;
 }
 
 /* Sum of the squared weights of the axes that have differences; |grad|^2 <= 4 times that. */
-static double squared_weights(const struct plan *plan)
+double tv_squared_weights(const struct plan *plan)
 {
 	double sum = 0;
 
 	for (int i = 0; i < 3; i++)
-		sum += plan->grid.size[i] > 1 ? weight_of(plan, i) * weight_of(plan, i) : 0;
+		sum += plan->grid.size[i] > 1 ? tv_weight(plan, i) * tv_weight(plan, i) : 0;
 	return sum;
 }
 
@@ -380,6 +382,8 @@ size_t tv_scratch_bytes(const struct plan_options *options)
 		return 0;
 	if (options->tv->method == TV_GRADIENT)
 		return 2 * volume;
+	if (options->tv->method == TV_GENERALISED)
+		return TGV_VOLUMES * volume;
 	/* v, u and p in float; else three v, twice p in half precision */
 	return options->reference_precision ? 5 * volume : 6 * volume;
 }
@@ -391,7 +395,7 @@ static int run_gradient(struct plan *plan, float *volume, const struct tv_option
 	size_t voxels = grid_voxels(plan->options.grid);
 	tv_step s = step_make(plan, 1, tv->step * tv->unit, tv->step * tv->alpha);
 	double damping = fmax(2 - tv->alpha * tv->step, .1);
-	double epsilon = 4 * squared_weights(plan) * tv->step / damping * tv->unit;
+	double epsilon = 4 * tv_squared_weights(plan) * tv->step / damping * tv->unit;
 	float *from = volume, *work[2] = {plan->scratch, plan->scratch + voxels};
 
 	s.epsilon2 = fmaxf((float)(epsilon * epsilon), 1e-30f); /* a single voxel has no differences: 0, not 0/0 */
@@ -416,7 +420,7 @@ struct pace {
 };
 static pace pace_first(const struct plan *plan, const struct tv_options *tv)
 {
-	double square = fmax(4 * squared_weights(plan), 1), tau = 1 / tv->alpha;
+	double square = fmax(4 * tv_squared_weights(plan), 1), tau = 1 / tv->alpha;
 
 	return {tau, 1 / (square * tau), 0};
 }
@@ -553,6 +557,8 @@ int cuda_tv(struct plan *plan, struct volume *volume, const struct tv_options *o
 	plan_end_slices(plan);
 	if (options->method == TV_GRADIENT)
 		return run_gradient(plan, volume->data, options, cancel, err);
+	if (options->method == TV_GENERALISED)
+		return tgv_run(plan, volume->data, options, cancel, err);
 	return plan->options.reference_precision ? run_proximal_in_float(plan, volume->data, options, cancel, err)
 						 : run_proximal(plan, volume->data, options, cancel, err);
 }

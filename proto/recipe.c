@@ -97,7 +97,7 @@ static void presume_tv(struct recipe *recipe, const cJSON *value)
 	if (cJSON_IsNumber(alpha) || (no_alpha && method == TV_GRADIENT))
 		recipe_explicit_tv(recipe, method);
 	else
-		recipe->tv.options.method = method;
+		recipe_automatic_tv(recipe, method);
 }
 
 static int read_tv(struct recipe *recipe, const cJSON *value, struct error *err)

@@ -102,7 +102,7 @@ _PARAMETERS: Dict[str, Dict[str, Document]] = {
         "/sart/stop/change": {"type": "number", "minimum": 0, "maximum": 1000000},
         "/cgls/stop/change": {"type": "number", "minimum": 0, "maximum": 1000000},
         "/fista/stop/change": {"type": "number", "minimum": 0, "maximum": 1000000},
-        "/tv/method": {"type": "choice", "choices": ["gradient", "proximal"]},
+        "/tv/method": {"type": "choice", "choices": ["gradient", "proximal", "tgv"]},
         "/tv/alpha": {"type": "number", "minimum": 0, "maximum": 1000000000, "word": "auto"},
         "/tv/strength": {"type": "choice", "choices": ["light", "medium", "strong"]},
         "/tv/step": {"type": "number", "minimum": 1e-09, "maximum": 1000000000},

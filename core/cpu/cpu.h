@@ -66,6 +66,9 @@ struct cpu_view {
 
 struct filter_engine; /* filter.c */
 
+/* TGV's dual of E w: along slow, middle, fast, and across slow-middle, slow-fast, middle-fast. */
+enum { TGV_BENDS = 6 };
+
 struct plan {
 	struct device *device;
 	void *memory; /* everything that plan_walk takes, memory_bytes of it */
@@ -103,8 +106,9 @@ struct plan {
 
 	bool has_tv;
 	struct tv_options tv;
-	struct volume dual[3], ahead; /* proximal TV; without data: none */
-	float *planes;                /* TV's rolling planes, [threads][planes_floats] */
+	struct volume dual[3], ahead;                            /* proximal TV and TGV; without data: none */
+	struct volume slope[3], slope_ahead[3], bend[TGV_BENDS]; /* TGV; without data: none */
+	float *planes;                                           /* TV's rolling planes, [threads][planes_floats] */
 	size_t planes_floats;
 
 	float *scratch;        /* [threads][scratch_floats] */
@@ -137,6 +141,31 @@ struct tv_step {
 	float flow, fidelity; /* v += flow div p + fidelity (f - v) */
 	float epsilon2;       /* explicit: what smooths |grad v|, squared */
 	float sigma, theta;   /* proximal */
+};
+/*
+ * The volume as TV sees it: `fast` is contiguous. A flat volume is [y][x][1], and
+ * x takes the place of z there, so that the inner loops stay long.
+ */
+struct tv_box {
+	int slow, middle, fast;
+	size_t plane, row; /* floats */
+	struct tv_weights weights;
+};
+
+/* ---- rows of TGV's passes, tgv.c ---- */
+
+/* A row of all its volumes; [2]: along slow and middle. */
+struct tgv_row {
+	int count;
+	ptrdiff_t behind[2], before[2];                     /* floats to the rows beside, 0 where there is none */
+	float weight[2], to_behind[2], to_before[2], along; /* of differences; 0 where there is no row; along: fast */
+	float within[2];                                    /* 0 but where there are rows on both sides */
+	const float *f;
+	float *v, *ahead, *p[3], *w[3], *w_ahead[3], *q[TGV_BENDS];
+};
+struct tgv_step {
+	float sigma, inverse_unit, bend2; /* p += sigma (grad v / unit - w), q += sigma E w; bend2 |q|^2 <= 1 */
+	float flow, fidelity, tau;        /* v += flow div p + fidelity (f - v); w += tau (p - E^T q) */
 };
 
 /*
@@ -175,6 +204,8 @@ struct cpu_kernels {
 	void (*tv_update)(int count, const struct tv_flux *flux, const struct tv_flux *before,
 			  const struct tv_weights *weights, const struct tv_step *step, const float *f, float *v,
 			  float *ahead);
+	void (*tgv_dual)(const struct tgv_row *row, const struct tgv_step *step);
+	void (*tgv_primal)(const struct tgv_row *row, const struct tgv_step *step);
 };
 
 extern const struct cpu_kernels cpu_kernels_base;
@@ -298,9 +329,16 @@ int cpu_sart_iterate(struct plan *plan, const struct stack *projections, struct 
 		     const struct cancel *cancel, struct iteration_sums *ret_sums, struct error *err);
 
 /* tv.c */
+void tv_box_of(const struct plan *plan, struct tv_box *ret_box);
+/* Sum of the squared weights of the axes that have differences; |grad|^2 <= 4 times that. */
+double tv_box_weights(const struct tv_box *box);
 size_t tv_planes_floats(const struct plan *plan);
 int cpu_tv(struct plan *plan, struct volume *volume, const struct tv_options *options, const struct cancel *cancel,
 	   struct error *err);
+
+/* tgv.c */
+int tgv_run(struct plan *plan, struct volume *volume, const struct tv_options *options, const struct cancel *cancel,
+	    struct error *err);
 
 /* algebra.c */
 int cpu_volume_axpby(double a, const struct volume *x, double b, struct volume *y, struct error *err);

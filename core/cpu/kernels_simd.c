@@ -20,4 +20,6 @@ const struct cpu_kernels SIMD_NAME(cpu_kernels) = {
     .tv_flux = SIMD_NAME(tv_flux),
     .tv_dual = SIMD_NAME(tv_dual),
     .tv_update = SIMD_NAME(tv_update),
+    .tgv_dual = SIMD_NAME(tgv_dual),
+    .tgv_primal = SIMD_NAME(tgv_primal),
 };

@@ -1,7 +1,7 @@
 /*
  * The plan: one geometry in voxel units, one grid, and all memory that a job
  * needs on the way, sized so that a whole reconstruction stays within its
- * projections, three volumes (seven with proximal TV) and 15 %.
+ * projections, three volumes (seven with proximal TV, nineteen with TGV) and 15 %.
  */
 #include "core/cpu/cpu.h"
 
@@ -118,7 +118,12 @@ static bool needs_work(const struct plan *plan)
 
 static bool needs_dual(const struct plan *plan)
 {
-	return plan->has_tv && plan->tv.method == TV_PROXIMAL;
+	return plan->has_tv && plan->tv.method >= TV_PROXIMAL;
+}
+
+static bool needs_slopes(const struct plan *plan)
+{
+	return plan->has_tv && plan->tv.method == TV_GENERALISED;
 }
 
 static size_t ray_sums_count(const struct plan *plan)
@@ -143,6 +148,12 @@ static void plan_walk_volumes(struct plan *plan, struct arena *arena)
 		volume_walk(plan, &plan->dual[i], arena);
 	if (needs_dual(plan))
 		volume_walk(plan, &plan->ahead, arena);
+	for (int i = 0; needs_slopes(plan) && i < 3; i++) {
+		volume_walk(plan, &plan->slope[i], arena);
+		volume_walk(plan, &plan->slope_ahead[i], arena);
+	}
+	for (int i = 0; needs_slopes(plan) && i < TGV_BENDS; i++)
+		volume_walk(plan, &plan->bend[i], arena);
 }
 
 /* Everything that a plan of `threads` threads holds, its volumes first, which take *ret_volumes bytes. */

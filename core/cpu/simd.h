@@ -363,5 +363,7 @@ void SIMD_NAME(tv_dual)(const struct tv_row *row, const struct tv_weights *weigh
 void SIMD_NAME(tv_update)(int count, const struct tv_flux *flux, const struct tv_flux *before,
 			  const struct tv_weights *weights, const struct tv_step *step, const float *f, float *v,
 			  float *ahead);
+void SIMD_NAME(tgv_dual)(const struct tgv_row *row, const struct tgv_step *step);
+void SIMD_NAME(tgv_primal)(const struct tgv_row *row, const struct tgv_step *step);
 
 #endif

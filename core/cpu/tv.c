@@ -22,17 +22,7 @@
 
 #include <string.h>
 
-/*
- * The volume as TV sees it: `fast` is contiguous. A flat volume is [y][x][1], and
- * x takes the place of z there, so that the inner loops stay long.
- */
-struct box {
-	int slow, middle, fast;
-	size_t plane, row; /* floats */
-	struct tv_weights weights;
-};
-
-static void box_of(const struct plan *plan, struct box *ret)
+void tv_box_of(const struct plan *plan, struct tv_box *ret)
 {
 	const int *size = plan->grid.size;
 	float w[3];
@@ -40,13 +30,12 @@ static void box_of(const struct plan *plan, struct box *ret)
 	for (int i = 0; i < 3; i++)
 		w[i] = (float)(plan->spacing_least / plan->grid.spacing[i]);
 	if (size[2] == 1)
-		*ret = (struct box){size[1], 1, size[0], plan->plane, plan->plane, {w[1], w[2], w[0]}};
+		*ret = (struct tv_box){size[1], 1, size[0], plan->plane, plan->plane, {w[1], w[2], w[0]}};
 	else
-		*ret = (struct box){size[1], size[0], size[2], plan->plane, plan->row, {w[1], w[0], w[2]}};
+		*ret = (struct tv_box){size[1], size[0], size[2], plan->plane, plan->row, {w[1], w[0], w[2]}};
 }
 
-/* Sum of the squared weights of the axes that have differences; |grad|^2 <= 4 times that. */
-static double squared_weights(const struct box *box)
+double tv_box_weights(const struct tv_box *box)
 {
 	double slow = box->weights.slow, middle = box->weights.middle, fast = box->weights.fast;
 
@@ -69,13 +58,13 @@ static size_t padded(size_t floats)
 
 size_t tv_planes_floats(const struct plan *plan)
 {
-	struct box box;
+	struct tv_box box;
 
-	box_of(plan, &box);
+	tv_box_of(plan, &box);
 	return 2 * padded(box.plane) + 5 * padded((size_t)box.fast);
 }
 
-static struct part part_of(const struct plan *plan, const struct box *box, int index)
+static struct part part_of(const struct plan *plan, const struct tv_box *box, int index)
 {
 	const long long parts = plan->device->threads;
 	const size_t plane = padded(box->plane), row = padded((size_t)box->fast);
@@ -93,7 +82,7 @@ static struct part part_of(const struct plan *plan, const struct box *box, int i
 
 /* A pass of either method. The volumes are [slow][middle][fast]. */
 struct pass {
-	const struct box *box;
+	const struct tv_box *box;
 	const struct cpu_kernels *kernels;
 	float *ahead; /* whose gradient is taken: the iterate itself, or its overrelaxed twin */
 	float *v;     /* the iterate */
@@ -105,7 +94,7 @@ struct pass {
 /* Flux of one row. `next` is the plane behind, NULL at the last: then differences to the row itself, 0, are taken. */
 static void flux_row(const struct pass *pass, int plane, int row, const float *next, struct tv_flux *ret_flux)
 {
-	const struct box *box = pass->box;
+	const struct tv_box *box = pass->box;
 	const size_t at = (size_t)plane * box->plane + (size_t)row * box->row;
 	const float *u = pass->ahead + at;
 	const struct tv_row from = {
@@ -127,7 +116,7 @@ static void flux_row(const struct pass *pass, int plane, int row, const float *n
 /* Before anything is overwritten: the plane behind the part, and the flux of the plane before it. */
 static void part_begin(const struct pass *pass, const struct part *part)
 {
-	const struct box *box = pass->box;
+	const struct tv_box *box = pass->box;
 	const size_t fast = (size_t)box->fast * sizeof(float);
 
 	if (part->end < box->slow)
@@ -146,7 +135,7 @@ static void part_begin(const struct pass *pass, const struct part *part)
 
 static void part_run(const struct pass *pass, const struct part *part)
 {
-	const struct box *box = pass->box;
+	const struct tv_box *box = pass->box;
 	const size_t fast = (size_t)box->fast * sizeof(float);
 
 	for (int plane = part->begin; plane < part->end; plane++) {
@@ -204,7 +193,7 @@ static int run_gradient(const struct plan *plan, struct pass *pass, const struct
 {
 	const double damping = fmax(2 - tv->alpha * tv->step, .1);
 	/* a single voxel has no differences and needs none: but 0, not 0 / 0 */
-	const double epsilon = fmax(4 * squared_weights(pass->box) * tv->step / damping * tv->unit, 1e-15);
+	const double epsilon = fmax(4 * tv_box_weights(pass->box) * tv->step / damping * tv->unit, 1e-15);
 
 	pass->step = (struct tv_step){
 	    .flow = (float)(tv->step * tv->unit),
@@ -233,7 +222,7 @@ static const double TAU_FIRST = 1; /* times 1 / alpha */
 static int run_proximal(const struct plan *plan, struct pass *pass, const struct tv_options *tv,
 			const struct cancel *cancel, struct error *err)
 {
-	const double square = fmax(4 * squared_weights(pass->box), 1);
+	const double square = fmax(4 * tv_box_weights(pass->box), 1);
 	double tau = TAU_FIRST / tv->alpha, sigma = 1 / (square * tau);
 
 	for (int i = 0; i < tv->iterations; i++) {
@@ -258,13 +247,13 @@ static int run_proximal(const struct plan *plan, struct pass *pass, const struct
 int cpu_tv(struct plan *plan, struct volume *volume, const struct tv_options *options, const struct cancel *cancel,
 	   struct error *err)
 {
-	struct box box;
+	struct tv_box box;
 	struct pass pass = {.box = &box, .kernels = plan->device->kernels, .v = volume->data};
 	int code;
 
 	if (!plan->has_tv || options->method > plan->tv.method)
 		return error_set(err, ERR_INTERNAL, "the plan was made without this TV");
-	box_of(plan, &box);
+	tv_box_of(plan, &box);
 	code = backend_cpu.volume_copy(&plan->work, volume, err);
 	if (code < 0)
 		return code;
@@ -275,6 +264,8 @@ int cpu_tv(struct plan *plan, struct volume *volume, const struct tv_options *op
 	}
 	pass.ahead = plan->ahead.data;
 	code = backend_cpu.volume_copy(&plan->ahead, volume, err);
+	if (code == 0 && options->method == TV_GENERALISED)
+		return tgv_run(plan, volume, options, cancel, err);
 	for (int i = 0; code == 0 && i < 3; i++) {
 		pass.dual[i] = plan->dual[i].data;
 		code = backend_cpu.volume_fill(&plan->dual[i], 0, err);

@@ -304,7 +304,7 @@ double noise_reach(const struct tv_options *options)
 {
 	const double steps = options->step * options->iterations, balanced = 1 / options->alpha;
 
-	return options->unit * (options->method == TV_PROXIMAL ? balanced : fmin(steps, balanced));
+	return options->unit * (options->method == TV_GRADIENT ? fmin(steps, balanced) : balanced);
 }
 
 int noise_measure(const struct backend *backend, struct volume *volume, const struct grid *grid,

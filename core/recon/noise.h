@@ -24,13 +24,13 @@ int noise_of_slices(const float *slices, const int size[3], struct volume_noise 
 
 enum noise_stage { NOISE_OF_FDK, NOISE_OF_SART };
 /*
- * The alpha of TV_PROXIMAL behind FDK or behind each SART iteration, in the recipe's gray levels and of its strength;
- * the recipe is resolved. INFINITY: no TV.
+ * The alpha of TV_PROXIMAL and TV_GENERALISED behind FDK or behind each SART iteration, in the recipe's gray levels and
+ * of its strength; the recipe is resolved. INFINITY: no TV.
  */
 double noise_alpha(const struct volume_noise *noise, const struct recipe *recipe, const struct orbit *orbit,
 		   enum noise_stage stage);
 /*
- * How far TV with these settings can move a voxel, in 1/mm, roughly: the proximal form by 1 / alpha, explicit steps by
+ * How far TV with these settings can move a voxel, in 1/mm, roughly: the minimisers by 1 / alpha, explicit steps by
  * their sum at most.
  */
 double noise_reach(const struct tv_options *options);

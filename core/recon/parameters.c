@@ -101,7 +101,8 @@ const struct parameter recipe_parameters[] = {
      .help = "Iterations end when one of them changes the volume by at most this share of its norm; 0 is never."},
     {"/tv", "method", PARAMETER_CHOICE, AT(tv.options.method), NAMES(tv_method_names), .preset = TV_PROXIMAL,
      .counts = runs_tv,
-     .help = "Method of total variation: the minimiser itself, or explicit steps along the gradient."},
+     .help = "Method of total variation: the minimiser itself, explicit steps along the gradient, or the minimiser of "
+	     "total generalised variation, which keeps ramps."},
     {"/tv", "alpha", PARAMETER_NUMBER, AT(tv.options.alpha), RANGE(0, 1e9), .preset = PARAMETER_WORD, .word = "auto",
      .word_offset = offsetof(struct recipe, tv.automatic), .counts = runs_tv,
      .help = "Weight of the volume that enters total variation; auto finds it from the noise."},
@@ -111,7 +112,8 @@ const struct parameter recipe_parameters[] = {
      .help = "Length of a step of the gradient method."},
     {"/tv", "iterations", PARAMETER_INTEGER, AT(tv.options.iterations), RANGE(1, ITERATIONS_MAX),
      .presets = PRESET_VARIES, .preset = 30, .counts = runs_tv,
-     .help = "Steps of total variation: by default 30 with alpha auto, 100 with a number, 10 for gradient."},
+     .help = "Steps of total variation: by default 30 with alpha auto, 100 with a number, 10 for gradient, 50 and 150 "
+	     "for tgv."},
     {"/tv", "unit", PARAMETER_NUMBER, AT(tv.options.unit), RANGE(1e-12, 1e12), .presets = PRESET_OPEN,
      .counts = runs_tv, .unit = "1/mm",
      .help = "One gray level of total variation; by default mu_water / 1000, one HU."},

@@ -31,7 +31,14 @@ void recipe_explicit_tv(struct recipe *recipe, enum tv_method method)
 	tv->alpha = tv->step = 0.1;
 	/* Explicit steps are a smoothing of their own; the minimiser is one when it is reached, to about a percent
 	 * here. */
-	tv->iterations = method == TV_GRADIENT ? 10 : 100;
+	tv->iterations = method == TV_GRADIENT ? 10 : method == TV_PROXIMAL ? 100 : 150;
+}
+
+void recipe_automatic_tv(struct recipe *recipe, enum tv_method method)
+{
+	recipe->tv.automatic = true;
+	recipe->tv.options.method = method;
+	recipe->tv.options.iterations = method == TV_PROXIMAL ? 30 : 50;
 }
 
 void recipe_set_algorithm(struct recipe *recipe, const struct algorithm *algorithm)
@@ -79,13 +86,13 @@ static int check_tv(const struct recipe *recipe, struct error *err)
 {
 	const struct tv_options *tv = &recipe->tv.options;
 
-	if (recipe->tv.automatic && tv->method != TV_PROXIMAL)
+	if (recipe->tv.automatic && tv->method == TV_GRADIENT)
 		return error_set_at(err, ERR_IMPOSSIBLE, "/tv/alpha",
-				    "alpha is found for the proximal method only, explicit steps want a number");
-	if (!recipe->tv.automatic && tv->method == TV_PROXIMAL && tv->alpha < proximal_alpha_least)
+				    "alpha is found for the proximal method and for tgv, explicit steps want a number");
+	if (!recipe->tv.automatic && tv->method != TV_GRADIENT && tv->alpha < proximal_alpha_least)
 		return error_set_at(err, ERR_IMPOSSIBLE, "/tv/alpha",
-				    "%.10g, the proximal method wants a number of at least %.10g", tv->alpha,
-				    proximal_alpha_least);
+				    "%.10g, the %s method wants a number of at least %.10g", tv->alpha,
+				    tv_method_names[tv->method], proximal_alpha_least);
 	if (tv->method == TV_GRADIENT && tv->alpha * tv->step > gradient_pull_most * (1 + 1e-9))
 		return error_set_at(
 		    err, ERR_IMPOSSIBLE, "/tv/alpha",

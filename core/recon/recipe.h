@@ -13,6 +13,8 @@ extern const struct algorithm algorithm_sart, algorithm_cgls, algorithm_fista; /
 void recipe_defaults(struct recipe *ret_recipe); /* nothing on; the values that `{}` stages take */
 /* TV with numbers in place of those found: alpha 0.1, and 10 steps of 0.1 or 100 iterations; unit and `on` stay. */
 void recipe_explicit_tv(struct recipe *recipe, enum tv_method method);
+/* TV whose alpha is found, with this method's number of steps; not TV_GRADIENT. */
+void recipe_automatic_tv(struct recipe *recipe, enum tv_method method);
 /* The algorithm, with its own number of iterations and projector; NULL: none. */
 void recipe_set_algorithm(struct recipe *recipe, const struct algorithm *algorithm);
 void recipe_clear(struct recipe *recipe);

@@ -187,17 +187,11 @@ static int reply_problem(struct request *request, const struct problem *problem,
 	return 0;
 }
 
-int reply_problem_of(struct request *request, const struct error *why)
+int reply_problem_of(struct request *request, const struct error *err)
 {
-	const struct http_options *options = &request->http->options;
-	struct error told = *why, *err = &told, unable;
-	const struct problem *problem;
+	const struct problem *problem = problem_of_code(err->code);
 	char detail[sizeof(err->text)];
-
-	if (err->code == ERR_NOT_FOUND && options->missing != NULL && request->route != NULL &&
-	    options->missing(options->context, request, err))
-		return 0;
-	problem = problem_of_code(err->code);
+	struct error unable;
 
 	/* Failures of the daemon itself are for its operator: clients do not see paths. */
 	if (problem->status >= 500 && problem->status != 503)

@@ -719,3 +719,178 @@ double reference_objective(const struct grid *grid, const struct tv_options *opt
 	free(u);
 	return variation + options->alpha / 2 * fidelity;
 }
+
+/*
+ * E w as a matrix, a row for each entry of E that lies inside of the grid: E_aa at a voxel with neighbours on both
+ * sides along a, E_ab between four voxels. w_a of a voxel without a neighbour behind it along a is no variable: its
+ * column stays empty.
+ */
+struct bend_row {
+	size_t column[4];
+	double factor[4];
+	int count, kind; /* kind: index into the six of a voxel */
+	size_t voxel;
+};
+
+static bool has_behind(const struct grid *grid, const int at[3], int axis)
+{
+	return at[axis] + 1 < grid->size[axis];
+}
+
+/* Adds factor times the difference of w_a to the next voxel along b. */
+static void add_difference(const struct grid *grid, struct bend_row *row, const int at[3], int a, int b, double factor)
+{
+	int next[3] = {at[0], at[1], at[2]};
+
+	next[b]++;
+	row->column[row->count] = 3 * voxel_at(grid, next[0], next[1], next[2]) + (size_t)a;
+	row->factor[row->count++] = factor;
+	row->column[row->count] = 3 * voxel_at(grid, at[0], at[1], at[2]) + (size_t)a;
+	row->factor[row->count++] = -factor;
+}
+
+static size_t bend_rows(const struct grid *grid, struct bend_row *rows)
+{
+	const double least = fmin(fmin(grid->spacing[0], grid->spacing[1]), grid->spacing[2]);
+	size_t count = 0;
+
+	for (int z = 0; z < grid->size[2]; z++)
+		for (int y = 0; y < grid->size[1]; y++)
+			for (int x = 0; x < grid->size[0]; x++)
+				for (int a = 0; a < 3; a++)
+					for (int b = a; b < 3; b++) {
+						int at[3] = {x, y, z};
+						struct bend_row row = {.kind = a == b ? a : 2 + a + b,
+								       .voxel = voxel_at(grid, x, y, z)};
+
+						if (!has_behind(grid, at, a) || !has_behind(grid, at, b) ||
+						    (a == b && at[a] == 0))
+							continue;
+						at[a] -= a == b;
+						if (a == b) {
+							add_difference(grid, &row, at, a, a, least / grid->spacing[a]);
+						} else {
+							add_difference(grid, &row, at, a, b,
+								       least / grid->spacing[b] / 2);
+							add_difference(grid, &row, at, b, a,
+								       least / grid->spacing[a] / 2);
+						}
+						rows[count++] = row;
+					}
+	return count;
+}
+
+/* E w of each voxel, [voxel][6]; the last three count twice in the norm. */
+static void bend(const struct bend_row *rows, size_t count, const double *w, double *ret)
+{
+	for (size_t i = 0; i < count; i++) {
+		double sum = 0;
+
+		for (int k = 0; k < rows[i].count; k++)
+			sum += rows[i].factor[k] * w[rows[i].column[k]];
+		ret[6 * rows[i].voxel + (size_t)rows[i].kind] = sum;
+	}
+}
+
+static double bend_norm(const double e[6])
+{
+	return sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2] + 2 * (e[3] * e[3] + e[4] * e[4] + e[5] * e[5]));
+}
+
+/* sum |g - w| + TGV_BEND sum |E w|; e is worked in. */
+static double slopes_cost(const struct bend_row *rows, size_t count, size_t voxels, const double *g, const double *w,
+			  double *e)
+{
+	double sum = 0;
+
+	memset(e, 0, 6 * voxels * sizeof(double));
+	bend(rows, count, w, e);
+	for (size_t i = 0; i < voxels; i++) {
+		double d[3];
+
+		for (int k = 0; k < 3; k++)
+			d[k] = g[3 * i + (size_t)k] - w[3 * i + (size_t)k];
+		sum += vec_norm(d) + TGV_BEND * bend_norm(e + 6 * i);
+	}
+	return sum;
+}
+
+/* w - g drawn towards 0 by tau, the prox of |w - g|; *ahead becomes 2 w' - w. */
+static void draw(const double *g, double tau, const double *move, double *w, double *ahead)
+{
+	double d[3], length;
+
+	for (int k = 0; k < 3; k++)
+		d[k] = w[k] - tau * move[k] - g[k];
+	length = vec_norm(d);
+	for (int k = 0; k < 3; k++) {
+		const double value = g[k] + (length > tau ? d[k] * (1 - tau / length) : 0);
+
+		ahead[k] = 2 * value - w[k];
+		w[k] = value;
+	}
+}
+
+/* The least of slopes_cost over w: primal-dual steps whose primal part is the prox of |g - w| itself. */
+static double least_slopes_cost(const struct grid *grid, const double *g)
+{
+	enum { STEPS = 600, EVERY = 50 };
+	const size_t voxels = grid_voxels(grid);
+	const double tau = 1, sigma = 1 / (13 * tau);
+	struct bend_row *rows = malloc(6 * voxels * sizeof(*rows));
+	const size_t count = bend_rows(grid, rows);
+	double *w = calloc(3 * voxels, sizeof(double)), *ahead = calloc(3 * voxels, sizeof(double));
+	double *q = calloc(6 * voxels, sizeof(double)), *e = calloc(6 * voxels, sizeof(double));
+	double *move = malloc(3 * voxels * sizeof(double)), least = INFINITY;
+
+	for (int step = 0; step <= STEPS; step++) {
+		if (step % EVERY == 0)
+			least = fmin(least, slopes_cost(rows, count, voxels, g, w, e));
+		bend(rows, count, ahead, e);
+		for (size_t i = 0; i < voxels; i++) {
+			double norm;
+
+			for (int k = 0; k < 6; k++)
+				q[6 * i + (size_t)k] += sigma * e[6 * i + (size_t)k];
+			norm = fmax(1, bend_norm(q + 6 * i) / TGV_BEND);
+			for (int k = 0; k < 6; k++)
+				q[6 * i + (size_t)k] /= norm;
+		}
+		memset(move, 0, 3 * voxels * sizeof(double));
+		for (size_t i = 0; i < count; i++)
+			for (int k = 0; k < rows[i].count; k++)
+				move[rows[i].column[k]] += (rows[i].kind < 3 ? 1 : 2) * rows[i].factor[k] *
+							   q[6 * rows[i].voxel + (size_t)rows[i].kind];
+		for (size_t i = 0; i < voxels; i++)
+			draw(g + 3 * i, tau, move + 3 * i, w + 3 * i, ahead + 3 * i);
+	}
+	free(move);
+	free(e);
+	free(q);
+	free(ahead);
+	free(w);
+	free(rows);
+	return least;
+}
+
+double reference_generalised_objective(const struct grid *grid, const struct tv_options *options, const float *volume,
+				       const float *start)
+{
+	const size_t voxels = grid_voxels(grid);
+	double *u = malloc(voxels * sizeof(double)), *g = malloc(3 * voxels * sizeof(double)), fidelity = 0, cost;
+
+	for (size_t i = 0; i < voxels; i++) {
+		double away = ((double)volume[i] - (double)start[i]) / options->unit;
+
+		u[i] = (double)volume[i] / options->unit;
+		fidelity += away * away;
+	}
+	for (int z = 0; z < grid->size[2]; z++)
+		for (int y = 0; y < grid->size[1]; y++)
+			for (int x = 0; x < grid->size[0]; x++)
+				differences(grid, u, x, y, z, g + 3 * voxel_at(grid, x, y, z));
+	cost = least_slopes_cost(grid, g);
+	free(g);
+	free(u);
+	return cost + options->alpha / 2 * fidelity;
+}

@@ -34,6 +34,12 @@ struct iteration_sums reference_sart(const struct geometry *geometry, const stru
 void reference_tv_gradient(const struct grid *grid, const struct tv_options *options, double epsilon, float *volume);
 /* sum |grad u|, and the whole of what the proximal method minimises. */
 double reference_variation(const struct grid *grid, const double *u);
+/*
+ * The objective of TV_GENERALISED: over the field of slopes it is minimised here, in double precision, by steps of its
+ * own; a little above the least.
+ */
+double reference_generalised_objective(const struct grid *grid, const struct tv_options *options, const float *volume,
+				       const float *start);
 double reference_objective(const struct grid *grid, const struct tv_options *options, const float *volume,
 			   const float *start);
 

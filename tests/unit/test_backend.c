@@ -1331,6 +1331,152 @@ START_TEST(proximal_tv_is_a_minimum)
 }
 END_TEST
 
+/* Grids on which ramps and their bends have all neighbours, some, and none. */
+static const struct grid generalised_grids[] = {
+    {{19, 14, 11}, {1, 1, 1}, {0}}, {{17, 9, 12}, {.7, 1.1, .9}, {0}}, {{40, 31, 1}, {1, 1.2, 2}, {0}},
+    {{1, 23, 6}, {1, 1, 1}, {0}},   {{2, 2, 30}, {1, 1, 1}, {0}},
+};
+enum { GENERALISED_GRIDS = sizeof(generalised_grids) / sizeof(generalised_grids[0]) };
+
+static void generalised_rig(const struct grid *grid, struct rig *ret)
+{
+	const struct setup setup = {"ramp", 3, 3, 1, {200, 350, {2, 2}, {0, 0}, {0, 0}}, 0, 1, PLAIN, *grid, true};
+
+	rig_make(&setup, ret);
+	ret->tv = (struct tv_options){TV_GENERALISED, .1, 0, 400, .001};
+}
+
+/* A ramp of some levels a voxel along each axis, over each voxel's place. */
+static double ramp_at(const struct grid *grid, size_t voxel)
+{
+	const size_t nx = (size_t)grid->size[0], ny = (size_t)grid->size[1];
+
+	return 5 * (double)(voxel % nx) - 3 * (double)(voxel / nx % ny) + 2 * (double)(voxel / nx / ny);
+}
+
+START_TEST(generalised_tv_leaves_ramps)
+{
+	struct rig rig;
+	float *volume;
+
+	generalised_rig(&generalised_grids[_i], &rig);
+	volume = floats(rig.voxels);
+	FOR_EACH_MACHINE(&rig)
+	{
+		double most = 0;
+
+		for (size_t i = 0; i < rig.voxels; i++)
+			volume[i] = (float)(ramp_at(&rig.grid, i) * rig.tv.unit);
+		ok(rig.backend->volume_upload(rig.volume, volume, &err));
+		ok(rig.backend->tv(rig.plan, rig.volume, &rig.tv, NULL, &err));
+		read_volume(&rig, volume);
+		for (size_t i = 0; i < rig.voxels; i++)
+			most = fmax(most, fabs((double)volume[i] / rig.tv.unit - ramp_at(&rig.grid, i)));
+		/* up to the border; TV draws its two ends towards each other by many levels */
+		ck_assert_msg(most < .02, "grid %d, %s: %g levels", _i, machine->name, most);
+	}
+	free(volume);
+	rig_clear(&rig);
+}
+END_TEST
+
+/* The share of neighbours along x whose values are less than this apart. */
+static double share_within(const struct grid *grid, const float *volume, double least)
+{
+	size_t steps = 0, count = 0;
+
+	for (size_t i = 0; i + 1 < grid_voxels(grid); i++)
+		if ((i + 1) % (size_t)grid->size[0] != 0) {
+			steps += fabs((double)(volume[i + 1] - volume[i])) < least;
+			count++;
+		}
+	return (double)steps / (double)count;
+}
+
+/* Noise on a ramp: TV leaves it in steps, TGV does not, and comes nearer to it. */
+START_TEST(generalised_tv_smoothes_ramps_without_steps)
+{
+	const struct grid grid = {{40, 16, 12}, {1, 1, 1}, {0}};
+	const double gentle = .3; /* 1.5 levels a voxel along x */
+	struct rig rig;
+	float *start, *have;
+
+	random_state = 12;
+	generalised_rig(&grid, &rig);
+	start = floats(rig.voxels);
+	have = floats(rig.voxels);
+	for (size_t i = 0; i < rig.voxels; i++)
+		start[i] = (float)((gentle * ramp_at(&grid, i) + 40 * (uniform() - .5)) * rig.tv.unit);
+	FOR_EACH_MACHINE(&rig)
+	{
+		double error[TV_METHOD_COUNT] = {0}, steps[TV_METHOD_COUNT] = {0};
+
+		for (int method = TV_PROXIMAL; method <= TV_GENERALISED; method++) {
+			struct tv_options tv = rig.tv;
+
+			tv.method = (enum tv_method)method;
+			ok(rig.backend->volume_upload(rig.volume, start, &err));
+			ok(rig.backend->tv(rig.plan, rig.volume, &tv, NULL, &err));
+			read_volume(&rig, have);
+			for (size_t i = 0; i < rig.voxels; i++)
+				error[method] += pow((double)have[i] / tv.unit - gentle * ramp_at(&grid, i), 2);
+			steps[method] = share_within(&grid, have, .15 * tv.unit);
+		}
+		ck_assert_msg(error[TV_GENERALISED] < .6 * error[TV_PROXIMAL], "%s: %g instead of %g", machine->name,
+			      error[TV_GENERALISED], error[TV_PROXIMAL]);
+		ck_assert_msg(steps[TV_PROXIMAL] > .1 && steps[TV_GENERALISED] < .02, "%s: steps %g and %g",
+			      machine->name, steps[TV_PROXIMAL], steps[TV_GENERALISED]);
+	}
+	free(have);
+	free(start);
+	rig_clear(&rig);
+}
+END_TEST
+
+START_TEST(generalised_tv_is_a_minimum)
+{
+	struct rig rig;
+	float *start, *have, *near;
+
+	random_state = 13;
+	generalised_rig(&generalised_grids[_i], &rig);
+	rig.tv.iterations = 2000;
+	start = floats(rig.voxels);
+	have = floats(rig.voxels);
+	near = floats(rig.voxels);
+	for (size_t i = 0; i < rig.voxels; i++)
+		start[i] = (float)((ramp_at(&rig.grid, i) + 40 * (uniform() - .5)) * rig.tv.unit);
+	FOR_EACH_MACHINE(&rig)
+	{
+		const double size[] = {.3, .1, -.1, .1};
+		double best, mean = 0;
+
+		ok(rig.backend->volume_upload(rig.volume, start, &err));
+		ok(rig.backend->tv(rig.plan, rig.volume, &rig.tv, NULL, &err));
+		read_volume(&rig, have);
+		best = reference_generalised_objective(&rig.grid, &rig.tv, have, start);
+		for (size_t i = 0; i < rig.voxels; i++)
+			mean += (double)have[i] / (double)rig.voxels;
+		for (int trial = 0; trial < 4; trial++) {
+			for (size_t i = 0; i < rig.voxels; i++) {
+				const double towards = trial == 0  ? (2 * uniform() - 1) * rig.tv.unit
+						       : trial < 3 ? (double)start[i] - (double)have[i]
+								   : mean - (double)have[i];
+
+				near[i] = (float)((double)have[i] + size[trial] * towards);
+			}
+			ck_assert_msg(reference_generalised_objective(&rig.grid, &rig.tv, near, start) > best,
+				      "grid %d, %s: trial %d: %.9g, %.9g", _i, machine->name, trial, best,
+				      reference_generalised_objective(&rig.grid, &rig.tv, near, start));
+		}
+	}
+	free(near);
+	free(have);
+	free(start);
+	rig_clear(&rig);
+}
+END_TEST
+
 START_TEST(gradient_tv_is_stable_and_comes_near_the_minimum)
 {
 	struct rig rig;
@@ -1413,7 +1559,7 @@ START_TEST(bits_do_not_depend_on_threads_or_runs)
 	random_state = 10;
 	rig_make(setup, &rig);
 	rig.options.matched = _i >= WAYS;
-	rig.tv.method = _i % 2 ? TV_PROXIMAL : TV_GRADIENT;
+	rig.tv.method = (enum tv_method)(_i % TV_METHOD_COUNT);
 	volume = random_floats(rig.voxels, 0, 1);
 	projections = random_floats(rig.all_pixels, 0, 20);
 	for (int m = 0; m < count; m++) {
@@ -1794,6 +1940,8 @@ static const struct {
     {"FDK, padded and extended, packed", 0, -1, true, false, true, true, false, true, false},
     {"FDK and TV", 0, TV_GRADIENT, true, false, false, false, true, false, false},
     {"TV alone", 0, TV_PROXIMAL, false, false, false, false, true, false, false},
+    {"TGV alone", 0, TV_GENERALISED, false, false, false, false, true, false, false},
+    {"SIRT and TGV", 1, TV_GENERALISED, true, true, false, false, false, true, false},
     {"SIRT", 1, -1, false, false, false, false, false, false, false},
     {"SIRT, packed", 1, -1, true, false, false, false, false, true, false},
     {"SART by subsets", 2, -1, false, false, false, false, false, false, false},
@@ -1987,6 +2135,9 @@ Suite *backend_suite(void)
 	tcase_add_test(known, matched_sart_hardly_moves_what_rounding_touches);
 	tcase_add_test(known, proximal_tv_of_a_step_is_known);
 	tcase_add_loop_test(known, proximal_tv_is_a_minimum, 0, SETUPS);
+	tcase_add_loop_test(known, generalised_tv_leaves_ramps, 0, GENERALISED_GRIDS);
+	tcase_add_test(known, generalised_tv_smoothes_ramps_without_steps);
+	tcase_add_loop_test(known, generalised_tv_is_a_minimum, 0, GENERALISED_GRIDS);
 	tcase_add_test(known, gradient_tv_is_stable_and_comes_near_the_minimum);
 	tcase_add_loop_test(rest, bits_do_not_depend_on_threads_or_runs, 0, 2 * WAYS);
 	tcase_add_loop_test(rest, norms_are_those_of_the_volume, 0, SETUPS);

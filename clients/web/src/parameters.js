@@ -45,7 +45,7 @@ export const groups = [
 		number('/fista/stop/residual', 'Stop at residual', { zero: 'never' }), number('/fista/stop/change', 'Stop at change', { zero: 'never' }),
 	] },
 	{ title: 'Total variation', pointer: '/tv', optional: true, off: 'no smoothing', fields: [
-		choice('/tv/method', 'Method', ['proximal', 'gradient']), choice('/tv/strength', 'Strength', ['light', 'medium', 'strong']),
+		choice('/tv/method', 'Method', ['proximal', 'gradient', 'tgv']), choice('/tv/strength', 'Strength', ['light', 'medium', 'strong']),
 		text('/tv/alpha', 'Alpha', { hint: 'or auto', word: 'auto', read: numberOrText }), number('/tv/step', 'Step'),
 		number('/tv/iterations', 'Iterations', { step: 1 }), choice('/tv/after', 'After', ['fdk+sart', 'sart']), number('/tv/unit', 'Gray level, 1/mm'),
 	] },
