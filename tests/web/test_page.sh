@@ -145,6 +145,7 @@ browser_tests() {
 	start_daemon --threads 1 --tokens "$work/tokens" --keep 86400 --max-jobs 5 --client-bytes 1G --max-bytes 2G
 	VIEW=$VIEW ACQUIRE=$ACQUIRE ADMIN=$ADMIN URL=$url OUT=$work SCAN=$scan FINISHED=$job CHROMIUM=$CHROMIUM HOME=$work timeout -k 20 300 node "$tools/access.mjs" 2>&1 | tee -a "$work/browser.log"
 	status=$((status + PIPESTATUS[0]))
+	archive_test
 	while read -r line; do
 		case $line in
 		pass\ * | FAIL\ *) echo "$(tr 'A-Z' 'a-z' <<<"${line%% *}") $(basename "$0") ${line#* }" | sed 's/ ([0-9.]* s)$//' >>"$RESULTS" ;;
@@ -154,6 +155,40 @@ browser_tests() {
 		echo "FAIL the page in a browser: ended with status $status"
 		echo "fail $(basename "$0") the page in a browser: status $status" >>"$RESULTS"
 	fi
+}
+
+# The same job in the viewer of an archive that it is sent to.
+archive_test() {
+	local plugins=/usr/share/orthanc/plugins why= rest series pid
+	stop_daemon
+	if [ ! -e "$plugins/libOrthancWebViewer.so" ] || ! command -v Orthanc >/dev/null; then why="orthanc-webviewer is not here"
+	elif ! ldd "$BUILD/cbct-dicom" | grep libdcmnet >/dev/null; then why="cbct-dicom was built without libdcmtk-dev"; fi
+	if [ -n "$why" ]; then
+		echo "SKIP the archive's own viewer: $why"
+		echo "skip $(basename "$0") the archive's own viewer: $why" >>"$RESULTS"
+		return
+	fi
+	(
+		set -eEuo pipefail
+		trap - EXIT
+		. "$top/tests/http/archive.sh"
+		plugin=$plugins/libOrthancDicomWeb.so
+		more=$(jq -n --arg viewer "$plugins/libOrthancWebViewer.so" --arg cache "$work/viewer" '{Plugins: [$viewer], WebViewer: {CachePath: $cache}}')
+		start_archive
+		jq -n '{destinations: [{name: "pacs", kind: "dimse", host: "127.0.0.1", port: '$dimse', title: "ARCHIVE", commitment_s: 0}]}' >"$work/destinations.json"
+		start_daemon --threads 1 --destinations "$work/destinations.json"
+		cbct send "$job" --to pacs --wait
+		echo "$url $rest $(curl -sSf "$rest/series" | jq -r '.[0]')" >"$work/sent"
+	) >"$work/archive-prepare.log" 2>&1
+	if ! read -r url rest series <"$work/sent"; then
+		echo "FAIL the archive's own viewer: nothing was sent: $(tail -3 "$work/archive-prepare.log")" | tee -a "$work/browser.log"
+		status=$((status + 1))
+	else
+		URL=$url OUT=$work ARCHIVE=$rest SERIES=$series FINISHED=$job CHROMIUM=$CHROMIUM HOME=$work timeout -k 20 200 node "$tools/archive.mjs" 2>&1 | tee -a "$work/browser.log"
+		status=$((status + PIPESTATUS[0]))
+	fi
+	while read -r pid; do kill -9 "$pid" 2>/dev/null; done <"$work/peers"
+	rm -f "$work/peers"
 }
 
 install_tools() {
