@@ -326,8 +326,7 @@ bench-stopping: setup ## how far from the best iteration "iterations": "auto" en
 
 bench-methods: setup ## every method at its best on three anatomies, 26 to 200 views, three levels of noise, on standard output
 	@$(MAKE) --no-print-directory -j$$(nproc) $(BUILD)/methods >&2
-	@seq 0 $$(($$($(BUILD)/methods --list) - 1)) | xargs -P $$(nproc) -I N sh -c '$(BUILD)/methods N >$(BUILD)/methods.N'
-	@cat $$(ls -v $(BUILD)/methods.[0-9]*)
+	@OUT=$(BUILD)/bench/methods tests/bench/methods.sh $(BUILD)/methods && cat $(BUILD)/bench/methods/methods.txt
 
 bench-agreement: setup ## what the check of the geometry says of known scans, on standard output
 	@$(MAKE) --no-print-directory -j$$(nproc) $(BUILD)/agreement >&2

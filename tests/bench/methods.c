@@ -3,7 +3,8 @@
  * three levels of noise, and the study's Fig 7, all from exact line integrals. Each method runs at several settings,
  * and the table has the one of least error on that scan, chosen against the truth, beside what the program chooses by
  * itself. `make bench-methods` builds and runs it, a process for each processor. With numbers as
- * arguments: the scans of these numbers, for several processes beside each other; --list prints how many there are.
+ * arguments: the scans of these numbers, for several processes beside each other; 12/3 is the row of method 3 alone,
+ * 12/ the heading of scan 12. --list prints how many scans there are, and how many methods.
  */
 #include <math.h>
 #include <stdio.h>
@@ -127,21 +128,25 @@ static void make_study(struct anatomy_scan *ret)
 	phantom_clear(&head);
 }
 
-static void make_scan(int number, struct anatomy_scan *ret, char name[64])
+static struct anatomy_spec spec_of(int number)
+{
+	struct anatomy_spec spec = anatomies[number / (VIEWS * NOISES)].spec;
+
+	spec.views = views_of[number / NOISES % VIEWS];
+	spec.photons = photons_of[number % NOISES];
+	spec.seed = 500 + (unsigned)number;
+	return spec;
+}
+
+static void make_scan(int number, struct anatomy_scan *ret)
 {
 	struct anatomy_spec spec;
 
 	if (number == STUDY) {
-		snprintf(name, 64, "Fig 7, exact integrals");
 		make_study(ret);
 		return;
 	}
-	spec = anatomies[number / (VIEWS * NOISES)].spec;
-	spec.views = views_of[number / NOISES % VIEWS];
-	spec.photons = photons_of[number % NOISES];
-	spec.seed = 500 + (unsigned)number;
-	snprintf(name, 64, "%s, %d views, %.0e photons", anatomies[number / (VIEWS * NOISES)].name, spec.views,
-		 spec.photons);
+	spec = spec_of(number);
 	must(anatomy_scan_make(ret, &spec, &err));
 }
 
@@ -257,53 +262,84 @@ static struct figures run(const struct anatomy_scan *scan, struct device *device
 	return figures;
 }
 
-static void measure(int number, struct device *device)
+static void print_heading(int number)
 {
-	struct anatomy_scan scan;
-	char name[64];
+	char name[64] = "Fig 7, exact integrals";
 
-	make_scan(number, &scan, name);
+	if (number != STUDY)
+		snprintf(name, sizeof(name), "%s, %d views, %.0e photons", anatomies[number / (VIEWS * NOISES)].name,
+			 spec_of(number).views, spec_of(number).photons);
 	printf("%-32s %8s  %8s %-12s %6s %6s %5s %6s\n", name, "default", "best", "at", "SSIM", "noise", "edge",
 	       "30 HU");
-	for (int m = 0; m < METHODS; m++) {
-		struct figures own = {0}, best = {0};
-		const char *at = "";
+}
 
-		for (int s = 0; s < SETTINGS && methods[m].settings[s] != NULL; s++) {
-			const struct figures figures = run(&scan, device, m, s, number == STUDY);
+static void print_method(const struct anatomy_scan *scan, struct device *device, int method, bool study)
+{
+	struct figures own = {0}, best = {0};
+	const char *at = "";
 
-			if (s == 0)
-				own = figures;
-			if (s == 0 || figures.error < best.error) {
-				best = figures;
-				at = methods[m].settings[s];
-			}
+	for (int s = 0; s < SETTINGS && methods[method].settings[s] != NULL; s++) {
+		const struct figures figures = run(scan, device, method, s, study);
+
+		if (s == 0)
+			own = figures;
+		if (s == 0 || figures.error < best.error) {
+			best = figures;
+			at = methods[method].settings[s];
 		}
-		printf("  %-30s %8.4g  %8.4g %-12s %6.3f %6.1f %5.2f %6.2f\n", methods[m].name, own.error, best.error,
-		       at, best.ssim, best.noise, best.edge, best.contrast);
 	}
-	printf("\n");
+	printf("  %-30s %8.4g  %8.4g %-12s %6.3f %6.1f %5.2f %6.2f\n", methods[method].name, own.error, best.error, at,
+	       best.ssim, best.noise, best.edge, best.contrast);
 	fflush(stdout);
+}
+
+/* The rows of methods first .. end - 1. */
+static void measure(int number, int first, int end, struct device *device)
+{
+	struct anatomy_scan scan;
+
+	make_scan(number, &scan);
+	for (int m = first; m < end; m++)
+		print_method(&scan, device, m, number == STUDY);
 	anatomy_scan_clear(&scan);
+}
+
+/* "12", "12/3" or "12/" */
+static void measure_named(const char *argument, struct device *device)
+{
+	const char *slash = strchr(argument, '/');
+	const int number = atoi(argument), method = slash != NULL && slash[1] != '\0' ? atoi(slash + 1) : -1;
+
+	if (number < 0 || number >= SCANS || method >= METHODS) {
+		fprintf(stderr, "methods: there is no %s\n", argument);
+		exit(1);
+	}
+	if (method < 0)
+		print_heading(number);
+	if (method >= 0)
+		measure(number, method, method + 1, device);
+	else if (slash == NULL)
+		measure(number, 0, METHODS, device);
+	if (slash == NULL)
+		printf("\n");
 }
 
 int main(int argc, char **argv)
 {
 	struct device *device;
+	char all[16];
 
 	if (argc == 2 && strcmp(argv[1], "--list") == 0) {
-		printf("%d\n", SCANS);
+		printf("%d %d\n", SCANS, METHODS);
 		return 0;
 	}
 	must(backend_cpu.open(0, &(struct device_options){.threads = 1}, &device, &err));
-	for (int i = 1; i < argc; i++) {
-		const int number = atoi(argv[i]);
-
-		if (number >= 0 && number < SCANS)
-			measure(number, device);
+	for (int i = 1; i < argc; i++)
+		measure_named(argv[i], device);
+	for (int number = 0; number < SCANS && argc == 1; number++) {
+		snprintf(all, sizeof(all), "%d", number);
+		measure_named(all, device);
 	}
-	for (int number = 0; number < SCANS && argc == 1; number++)
-		measure(number, device);
 	backend_cpu.close(device);
 	return 0;
 }
