@@ -59,12 +59,10 @@ export function samplerOf(grid, frame, width, height, pixel, slab) {
 	const layers = layersOf(frame, slab, grid), steps = stepsOf(grid, frame, width, height, pixel, layers, slab.thickness)
 	const through = layers > 1 ? throughOf(grid, steps.layer, layers, slab.mode) : null
 	return (values, from = 0, to = height) => {
-		for (let row = from; row < to; row++) {
-			if (through === null)
-				drawPlane(grid, steps, row, width, values)
-			else
-				drawSlab(grid, steps, through, row, width, values)
-		}
+		if (through !== null)
+			drawSlab(grid, steps, through, from, to, width, values)
+		for (let row = from; row < to && through === null; row++)
+			drawPlane(grid, steps, row, width, values)
 	}
 }
 
@@ -116,12 +114,28 @@ function throughOf({ size: [nx, ny] }, step, layers, mode) {
 			for (let a = 0; a < parts; a++)
 				for (let layer = 0; layer < layers; layer++)
 					table[at++] = (place(c, layer, z) * ny + place(b, layer, y)) * nx + place(a, layer, x)
+	const tile = [x, y, z].filter(part => part !== 0).length > 1 ? 16 : Infinity /* pixels */
 	/* Of up to four pixels: the voxel where each begins, and its row of the table. */
-	return { table, layers, mode, x, y, z, bases: new Int32Array(4), rows: new Int32Array(4) }
+	return { table, layers, mode, tile, x, y, z, bases: new Int32Array(4), rows: new Int32Array(4) }
 }
 
-/* Pixels whose samples all lie in the volume are taken four at a time: the processor waits for four voxels at once. */
-function drawSlab(grid, steps, through, row, width, values) {
+/* Square by square where layers lie askew: what one row fetches into the processor's caches then serves the next ones. */
+function drawSlab(grid, steps, through, from, to, width, values) {
+	const { tile } = through
+	for (let top = from; top < to; top += tile) {
+		const bottom = Math.min(top + tile, to)
+		for (let left = 0; left < width; left += tile) {
+			for (let row = top; row < bottom; row++)
+				drawPart(grid, steps, through, row, left, Math.min(left + tile, width), width, values)
+		}
+	}
+}
+
+/*
+ * Of a row, columns left .. right - 1. Pixels whose samples all lie in the volume are taken four at a time: the processor
+ * waits for four voxels at once.
+ */
+function drawPart(grid, steps, through, row, left, right, width, values) {
 	const voxels = grid.voxels, nx = grid.size[0], ny = grid.size[1], nz = grid.size[2], plane = nx * ny
 	const { layers, bases, rows, x: lx, y: ly, z: lz } = through, last = layers - 1
 	const cx = steps.column[0], cy = steps.column[1], cz = steps.column[2]
@@ -133,7 +147,7 @@ function drawSlab(grid, steps, through, row, width, values) {
 			values[to - held + i] = oneThrough(voxels, through, i, 0, layers)
 		held = 0
 	}
-	for (let c = 0, to = row * width; c < width; c++, to++) {
+	for (let c = left, to = row * width + left; c < right; c++, to++) {
 		const i = Math.floor((x0 + c * cx) * parts), j = Math.floor((y0 + c * cy) * parts), k = Math.floor((z0 + c * cz) * parts)
 		const x = (i + 0.5) / parts, y = (j + 0.5) / parts, z = (k + 0.5) / parts
 		const whole = within(x, y, z, nx, ny, nz) && within(x + last * lx, y + last * ly, z + last * lz, nx, ny, nz)
@@ -155,7 +169,7 @@ function drawSlab(grid, steps, through, row, width, values) {
 			end--
 		values[to] = first < end ? oneThrough(voxels, through, 0, first, end) : NaN
 	}
-	letGo((row + 1) * width)
+	letGo(row * width + right)
 }
 
 /* Layers first .. end - 1 of one of the pixels. */
@@ -188,19 +202,19 @@ function fourThrough(voxels, { table, layers, mode, bases, rows }, values, to) {
 		values[to + 3] = sum3 / layers
 		return
 	}
-	/* The least is the largest of what is turned over. */
-	const sign = mode === 'max' ? 1 : -1
+	/* The least is the largest of what has all its bits turned over. */
+	const turned = mode === 'max' ? 0 : -1
 	let most0 = -32769, most1 = -32769, most2 = -32769, most3 = -32769
 	for (; a < end; a++, b++, c++, d++) {
-		most0 = Math.max(most0, Math.imul(sign, voxels[base0 + table[a] | 0]))
-		most1 = Math.max(most1, Math.imul(sign, voxels[base1 + table[b] | 0]))
-		most2 = Math.max(most2, Math.imul(sign, voxels[base2 + table[c] | 0]))
-		most3 = Math.max(most3, Math.imul(sign, voxels[base3 + table[d] | 0]))
+		most0 = Math.max(most0, voxels[base0 + table[a] | 0] ^ turned)
+		most1 = Math.max(most1, voxels[base1 + table[b] | 0] ^ turned)
+		most2 = Math.max(most2, voxels[base2 + table[c] | 0] ^ turned)
+		most3 = Math.max(most3, voxels[base3 + table[d] | 0] ^ turned)
 	}
-	values[to] = sign * most0
-	values[to + 1] = sign * most1
-	values[to + 2] = sign * most2
-	values[to + 3] = sign * most3
+	values[to] = most0 ^ turned
+	values[to + 1] = most1 ^ turned
+	values[to + 2] = most2 ^ turned
+	values[to + 3] = most3 ^ turned
 }
 
 const within = (x, y, z, nx, ny, nz) => x >= 0 && y >= 0 && z >= 0 && x < nx && y < ny && z < nz
