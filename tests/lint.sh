@@ -23,6 +23,8 @@ rule "core includes core only" '#include "(kernels|proto|daemon|clients|tests)/'
 rule "core is mathematics: no JSON, HTTP, SQL, compression, CUDA" '#include <(cjson|microhttpd|sqlite3|libpq|zstd|curl|png|openssl|cuda)' $(files core)
 rule "core neither logs nor exits" '\b(printf|fprintf|perror|exit|abort|puts) *\(' $(files core)
 rule "kernels include core only" '#include "(proto|daemon|clients|tests)/' $(files kernels)
+found "kernels differ between cards below 8.0 and from 8.0 on only, as .ci/run takes for granted" \
+	"$(grep -nE '^ *#.*__CUDA_ARCH__' $(files kernels tests) | grep -vE '__CUDA_ARCH__ (<|>=) 800\b')"
 rule "proto includes core and proto only" '#include "(kernels|daemon|clients|tests)/' $(files proto)
 rule "clients do not include daemon or kernels" '#include "(kernels|daemon|tests)/' $(files clients)
 rule "nothing includes daemon but daemon and its tests" '#include "daemon/' $(files core kernels proto clients)
@@ -52,9 +54,13 @@ found "daemon/THREADS.md names a file that is not there" "$(
 )"
 found "scripts that their own language cannot read" "$(
 	git ls-files '*.sh' | while read -r script; do bash -n "$script" 2>/dev/null || echo "$script"; done
-	git ls-files '*.py' | while read -r script; do
-		python3 -c 'import ast, sys; ast.parse(open(sys.argv[1]).read())' "$script" 2>/dev/null || echo "$script"
-	done
+	git ls-files '*.py' | python3 -c '
+import ast, sys
+for name in sys.stdin.read().split():
+    try:
+        ast.parse(open(name).read())
+    except SyntaxError:
+        print(name)'
 )"
 # The rooms of core/ and daemon/, lowest first, each with those beneath it whose doors it may use; a room's own files
 # may include each other. A room's doors are the headers that others may include: ROOM/ROOM.h, or those named in doors.
@@ -138,10 +144,9 @@ found "a file that begins with #! can be run, another can not" "$(git ls-files 2
 done)"
 
 if command -v clang-format >/dev/null; then
-	for file in $(git ls-files '*.c' '*.h' '*.cu' '*.cuh' 2>/dev/null); do
-		[ -e "$file" ] || continue
-		clang-format --dry-run --Werror "$file" >/dev/null 2>&1 || { echo "lint: clang-format would change $file"; failed=1; }
-	done
+	found "clang-format would change" "$(git ls-files '*.c' '*.h' '*.cu' '*.cuh' 2>/dev/null | while read -r file; do
+		[ ! -e "$file" ] || echo "$file"
+	done | xargs -r clang-format --dry-run --Werror 2>&1 | grep -E '(error|warning): |^[^ ]*clang-format' | cut -d: -f1 | sort -u)"
 else
 	echo "lint: clang-format is not here, layout unchecked"
 fi
