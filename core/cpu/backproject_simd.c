@@ -263,9 +263,14 @@ static void columns_set(const struct plan *plan, const double m[12], const struc
 	const double last_row = plan->rows - 1, row_step = 1 / m[6];
 	double x[TILE_LINES], y[TILE_LINES];
 
-	for (int i = 0; i < TILE_LINES; i++) {
-		x[i] = tile->first[0] + i % tile->count[0];
-		y[i] = tile->first[1] + i / tile->count[0];
+	/* A division for each line would be a sixth of the time of small tiles. */
+	for (int i = 0, across = 0, along = 0; i < TILE_LINES; i++) {
+		x[i] = tile->first[0] + across;
+		y[i] = tile->first[1] + along;
+		if (++across == tile->count[0]) {
+			across = 0;
+			along++;
+		}
 	}
 	for (int i = 0; i < TILE_LINES; i++) {
 		const double depth = m[8] * x[i] + m[9] * y[i] + m[11], inverse = 1 / depth;
