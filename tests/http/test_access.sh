@@ -12,9 +12,9 @@ document='{"name": "DOE^JANE knee", "detector": {"columns": 16, "rows": 12, "pix
 
 as() { bearer=(-H "Authorization: Bearer ${token[$1]}"); }
 expired() { printf '%s acquire 2020-01-01T00:00:00Z sha256:%s\n' "$1" "$(printf %s "$2" | sha256sum | cut -d' ' -f1)" >>"$tokens"; }
-log_has() { # TEXT: within 5 s, in what the daemon has logged
+log_has() { # TEXT: soon, in what the daemon has logged
 	local i
-	for ((i = 0; i < 100; i++)); do grep -q "$1" "$work/cbctd.err" && return 0; sleep 0.05; done
+	for ((i = 0; i < 2400; i++)); do grep -q "$1" "$work/cbctd.err" && return 0; sleep 0.05; done
 	fail "a line of the log with $1: $(tail -3 "$work/cbctd.err")"
 }
 reload() { # TEXT of the log
@@ -248,7 +248,7 @@ test_streams_end_with_the_token_they_were_asked_with() {
 	sleep 1
 	cbct token revoke late --file "$shortly" 2>/dev/null
 	reload '5 tokens'
-	for ((i = 0; i < 60; i++)); do kill -0 $revoked 2>/dev/null || kill -0 $expires 2>/dev/null || break; sleep 0.1; done
+	for ((i = 0; i < 1200; i++)); do kill -0 $revoked 2>/dev/null || kill -0 $expires 2>/dev/null || break; sleep 0.1; done
 	! kill -0 $revoked 2>/dev/null || fail "the stream of a token that was revoked ends"
 	! kill -0 $expires 2>/dev/null || fail "the stream of a token that expired ends"
 	[ "$(cat "$work/expires.status")" = 200 ] || fail "it had begun, got $(cat "$work/expires.status")"

@@ -162,9 +162,9 @@ test_who_only_waits_blocks_nobody() {
 	post_scan "$scan_dir"
 	post_projections "$scan_dir"
 	post_job "$fdk"
-	wait_job succeeded 60
+	wait_job succeeded
 	post_job "${fdk%\}}, \"priority\": \"stat\"}"
-	wait_job succeeded 60
+	wait_job succeeded
 	# nothing was lost
 	job=$waiting
 	scan=$growing

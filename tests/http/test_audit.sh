@@ -12,7 +12,7 @@ document='{"name": "DOE^JANE knee", "detector": {"columns": 16, "rows": 12, "pix
 # told FILTER: a line within 5 s of which the condition holds
 told() {
 	local i
-	for ((i = 0; i < 100; i++)); do
+	for ((i = 0; i < 2400; i++)); do
 		jq -es "any(.[]; $1)" "$log" >/dev/null 2>&1 && return 0
 		sleep 0.05
 	done

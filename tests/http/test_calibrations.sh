@@ -220,7 +220,7 @@ test_calibrations_outlive_crashes_and_damage_is_told() {
 	balls
 	req POST /v1/calibrations "${json[@]}" "{\"scan\": \"$balls\", \"phantom\": $phantom}"
 	calibration=$(jq -r .id "$body")
-	for ((i = 0; i < 100; i++)); do
+	for ((i = 0; i < 2400; i++)); do
 		req GET "/v1/calibrations/$calibration"
 		[ "$(jq -r .state "$body")" = running ] && break
 		sleep .05

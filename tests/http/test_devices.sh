@@ -35,13 +35,13 @@ test_each_worker_has_a_job() {
 	expect_json '.state == "queued"'
 	# Whoever comes free takes the next one.
 	req DELETE "/v1/jobs/${jobs[0]}"
-	job=${jobs[0]} && wait_job cancelled 60
+	job=${jobs[0]} && wait_job cancelled
 	running 2
 	req GET "/v1/jobs/${jobs[2]}"
 	expect_json '.state == "running"'
 	for job in "${jobs[1]}" "${jobs[2]}"; do
 		req DELETE "/v1/jobs/$job"
-		wait_job cancelled 60
+		wait_job cancelled
 	done
 }
 
@@ -55,10 +55,10 @@ test_all_devices_give_the_same_bits() {
 	post_job "$recipe"
 	second=$job
 	running 2
-	job=$first && wait_job succeeded 120
+	job=$first && wait_job succeeded
 	req GET "/v1/jobs/$first/volumes"
 	digest=$(json '.volumes[0].digest')
-	job=$second && wait_job succeeded 120
+	job=$second && wait_job succeeded
 	req GET "/v1/jobs/$second/volumes"
 	[ "$(json '.volumes[0].digest')" = "$digest" ] || fail "the digest of the other device's volume"
 }

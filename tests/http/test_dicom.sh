@@ -240,7 +240,7 @@ test_a_job_never_has_another_scans_patient() {
 	sleep 0.2
 	start_daemon
 	while read -r k scan job; do
-		wait_job succeeded 120
+		wait_job succeeded
 		[ $((k % 2)) = 0 ] || req DELETE "/v1/scans/$scan"
 	done <"$work/jobs"
 	while read -r k scan job; do

@@ -330,7 +330,7 @@ test_a_run_that_is_received_is_a_scan() {
 	req GET "/v1/jobs?scan=$scan"
 	expect_json '.jobs | length == 1'
 	job=$(jq -r '.jobs[0].id' "$body")
-	wait_job succeeded 120
+	wait_job succeeded
 	req GET "/v1/jobs/$job"
 	expect_json '.scan == "'"$scan"'" and .labels == {from: "the arm"} and .patient.position == "HFS"'
 	sending_becomes committed

@@ -159,7 +159,7 @@ test_a_moment_without_descriptors_or_with_a_slow_disk_ends_no_job() {
 	# one that stays is no moment
 	fault open 5 projections.raw 1000000
 	post_job "{\"scan\": \"SCAN\", $small, \"fdk\": {}}"
-	wait_job failed 60
+	wait_job failed
 	expect_json '.error.detail | test("3 times")'
 	no_fault
 	stop_daemon

@@ -29,7 +29,7 @@ data_of() { told "$2" | sed -n "s/^$1 //p"; }
 rows() { data_of progress "$1" | jq -s -c '[.[].iteration]'; }
 wait_for() { # FILE PATTERN
 	local i
-	for ((i = 0; i < 600; i++)); do
+	for ((i = 0; i < 2400; i++)); do
 		grep -q "$2" "$1" 2>/dev/null && return 0
 		sleep 0.05
 	done

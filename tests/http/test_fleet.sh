@@ -284,7 +284,7 @@ test_a_cancel_reaches_the_other_host_and_an_urgent_job_goes_first_there() {
 	job=$first
 	req DELETE "/v1/jobs/$job"
 	expect_status 202
-	wait_job cancelled 30
+	wait_job cancelled
 	nothing_left a
 	empty_ledger
 }

@@ -115,7 +115,7 @@ test_what_is_queued_says_when_it_begins_and_ends() {
 	wait_job succeeded
 	post_job "{\"scan\": \"$knee\", ${long/ITERATIONS/100000}}"
 	first=$job
-	for ((i = 0; i < 400; i++)); do # some of its iterations are over
+	for ((i = 0; i < 2400; i++)); do # some of its iterations are over
 		req GET "/v1/jobs/$first"
 		[ "$(json '.iteration > 20')" = true ] && break
 		sleep 0.05

@@ -8,7 +8,7 @@ simulate() { [ -e "$work/scan/scan.json" ] || cbct simulate -o "$work/scan" --ph
 # logged FILTER: a line of which that is true
 logged() {
 	local i
-	for ((i = 0; i < 100; i++)); do
+	for ((i = 0; i < 2400; i++)); do
 		jq -e -s "map(select($1)) | length > 0" "$work/cbctd.err" >/dev/null 2>&1 && return 0
 		sleep 0.05
 	done

@@ -15,7 +15,7 @@ recipe_of() { # ITERATIONS
 remove_group() {
 	local i
 	stop_daemon
-	for ((i = 0; i < 100; i++)); do
+	for ((i = 0; i < 2400; i++)); do
 		rmdir "$group" 2>/dev/null && return 0
 		sleep 0.05
 	done
@@ -83,13 +83,13 @@ test_a_worker_that_is_ended_for_want_of_memory_loses_nothing() {
 	post_scan "$scan_dir"
 	post_projections "$scan_dir"
 	post_job "$recipe"
-	wait_job succeeded 240
+	wait_job succeeded
 	req GET "/v1/jobs/$job/volumes"
 	undisturbed=$(json '.volumes[] | select(.name == "final") | .digest')
 	post_job "$recipe"
 	state_becomes running
 	starve
-	wait_job succeeded 240
+	wait_job succeeded
 	expect_json '.attempts >= 2'
 	req GET "/v1/jobs/$job/volumes"
 	[ "$(json '.volumes[] | select(.name == "final") | .digest')" = "$undisturbed" ] || fail "the bits of an undisturbed run"
@@ -99,7 +99,7 @@ test_a_worker_that_is_ended_for_want_of_memory_loses_nothing() {
 	# A kill that was told of explains no other one.
 	: >"$work/cbctd.err"
 	kill -KILL "$(worker_of)"
-	for ((i = 0; i < 200; i++)); do
+	for ((i = 0; i < 2400; i++)); do
 		grep -q 'ended with signal 9' "$work/cbctd.err" && break
 		sleep 0.05
 	done

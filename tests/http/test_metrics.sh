@@ -89,7 +89,7 @@ test_cards_are_told_of_and_lost_ones_too() {
 	metric_is "cbctd_gpu_temperature_celsius{$other}" == 48 # which has no error correction
 	! grep -q 'cbctd_gpu_memory_errors_total{gpu="1"' "$body" || fail "no errors of a card that counts none"
 	echo '62 2000000 3 2' >"$work/cards"
-	for ((i = 0; i < 80; i++)); do
+	for ((i = 0; i < 1200; i++)); do
 		scrape
 		grep -qF "cbctd_gpu_answers{$other} 0" "$body" && break
 		sleep 0.1

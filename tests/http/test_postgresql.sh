@@ -34,7 +34,7 @@ start() {
 again() { start_daemon --catalogue "$database" "$@"; }
 becomes_ready() {
 	local i
-	for ((i = 0; i < 400; i++)); do
+	for ((i = 0; i < 2400; i++)); do
 		[ "$(curl -s -o /dev/null -w '%{http_code}' "$url/readyz")" = 200 ] && return 0
 		sleep 0.05
 	done

@@ -17,7 +17,7 @@ projection() { # K
 
 running_at() { # ITERATION: waits until the job is there
 	local i
-	for ((i = 0; i < 400; i++)); do
+	for ((i = 0; i < 2400; i++)); do
 		req GET "/v1/jobs/$job"
 		[ "$(json '.iteration // 0')" -ge "$1" ] && return 0
 		sleep 0.05
@@ -68,11 +68,11 @@ test_everything_is_known_again_after_kill_9() {
 
 acknowledged_at_least() { # COUNT
 	local i
-	for ((i = 0; i < 200; i++)); do
+	for ((i = 0; i < 2400; i++)); do
 		[ "$(wc -l <"$work/acknowledged")" -lt "$1" ] || return 0
 		sleep 0.05
 	done
-	fail "$1 projections acknowledged within 10 s"
+	fail "$1 projections acknowledged"
 }
 
 test_kill_9_in_the_middle_of_uploads_loses_nothing_that_was_acknowledged() {
@@ -117,7 +117,7 @@ test_a_running_job_is_queued_again_after_kill_9() {
 	running_at 3
 	stop_daemon KILL
 	start_daemon
-	wait_job succeeded 240
+	wait_job succeeded
 	expect_json ".attempts == 2 and ([.history[].iteration] == [range(1; $long + 1)])"
 	req GET "/v1/jobs/$job/volumes"
 	expect_json "[.volumes[].name] == [\"final\", \"iter-$long\", \"iter-1\"]"
@@ -137,7 +137,7 @@ test_sigterm_leaves_a_checkpoint_and_exits_0() {
 	start_daemon
 	req GET "/v1/jobs/$job"
 	expect_json ".iteration >= $at"
-	wait_job succeeded 240
+	wait_job succeeded
 	expect_json "[.history[].iteration] == [range(1; $long + 1)]"
 	stop_daemon
 }
@@ -151,7 +151,7 @@ test_a_dead_worker_takes_nothing_with_it() {
 	running_at 2
 	worker=$(worker_of)
 	kill -9 "$worker"
-	wait_job succeeded 240
+	wait_job succeeded
 	expect_json '.attempts == 2'
 	stop_daemon
 }
@@ -164,7 +164,7 @@ held_at() {
 }
 held_behind() { # ITERATION: waits until the newest checkpoint is of a later one; prints it
 	local i at
-	for ((i = 0; i < 400; i++)); do
+	for ((i = 0; i < 6000; i++)); do
 		at=$(held_at checkpoint.f32)
 		[ "$at" -le "$1" ] || { echo "$at"; return 0; }
 		sleep 0.02
@@ -181,7 +181,7 @@ test_a_job_goes_on_from_its_newest_checkpoint_however_often_it_is_killed() {
 		post_projections "$scan_dir"
 		recipe="{\"scan\": \"SCAN\", $grid, \"fdk\": {}, $recipe, \"emit\": [20]}"
 		post_job "$recipe"
-		wait_job succeeded 240
+		wait_job succeeded
 		[ ! -e "$work/state/jobs/$job/checkpoint.f32" ] || fail "no checkpoint of a job that has ended"
 		cp "$body" "$work/undisturbed"
 		get_volume final "$work/final.undisturbed" format=raw
@@ -199,7 +199,7 @@ test_a_job_goes_on_from_its_newest_checkpoint_however_often_it_is_killed() {
 			running_at "$at"
 			expect_json '.state == "running" or .state == "queued" or .state == "succeeded"'
 		done
-		wait_job succeeded 240
+		wait_job succeeded
 		expect_json ".attempts > 3 and ([.history[].iteration] == [range(1; $many + 1)])"
 		diff <(jq -S '[.history[] | del(.seconds)]' "$body") <(jq -S '[.history[] | del(.seconds)]' "$work/undisturbed") ||
 			fail "the history of an undisturbed run"
@@ -224,7 +224,7 @@ test_a_job_goes_on_from_the_other_checkpoint_where_one_is_damaged_or_not_recorde
 	post_scan "$scan_dir"
 	post_projections "$scan_dir"
 	post_job "$recipe"
-	wait_job succeeded 240
+	wait_job succeeded
 	get_volume final "$work/final.undisturbed" format=raw
 	for kind in damaged unrecorded; do
 		post_job "$recipe"
@@ -246,7 +246,7 @@ test_a_job_goes_on_from_the_other_checkpoint_where_one_is_damaged_or_not_recorde
 			cp "$work/older"/* "$work/state"
 		fi
 		start_daemon --checkpoint-seconds 0.3
-		wait_job succeeded 240
+		wait_job succeeded
 		expect_json "[.history[].iteration] == [range(1; $long + 1)]"
 		if [ $kind = damaged ]; then
 			expect_json '[.warnings[].code] == ["damaged_checkpoint"]'
@@ -268,7 +268,7 @@ told_and_held() {
 	post_scan "$scan_dir"
 	post_projections "$scan_dir"
 	post_job "{\"scan\": \"SCAN\", $grid, \"fdk\": {}, \"sart\": {\"iterations\": 3}, \"emit\": [\"fdk\"]}"
-	for ((i = 0; i < 400; i++)); do
+	for ((i = 0; i < 2400; i++)); do
 		req GET "/v1/jobs/$job/volumes?wait=0"
 		expect_status 200
 		[ "$(json '.volumes | length')" = 0 ] || break
@@ -430,7 +430,7 @@ test_a_checkpoint_that_is_gone_begins_the_job_again() {
 	req DELETE "/v1/jobs/$job?wait=30"
 	expect_json '.state == "cancelled"'
 	job=$yielded
-	wait_job succeeded 240
+	wait_job succeeded
 	expect_json ".attempts == 2 and ([.history[].iteration] == [range(1; $long + 1)])"
 	stop_daemon
 }
@@ -565,7 +565,7 @@ test_a_unix_socket() {
 	local socket=$work/s i
 	"$BUILD/cbctd" --listen "unix:$socket" --state-dir "$work/unix-state" --backend cpu >"$work/unix.out" 2>&1 &
 	echo $! >"$work/daemon.pid"
-	for ((i = 0; i < 100; i++)); do
+	for ((i = 0; i < 2400; i++)); do
 		[ "$(curl -s -o /dev/null -w '%{http_code}' --unix-socket "$socket" http://localhost/livez)" = 200 ] && break
 		sleep 0.05
 	done

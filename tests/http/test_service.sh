@@ -55,7 +55,7 @@ test_a_reload_takes_the_level_of_the_log_and_tells_what_has_to_wait() {
 }
 log_has() { # PATTERN
 	local i
-	for ((i = 0; i < 100; i++)); do
+	for ((i = 0; i < 6000; i++)); do
 		grep -qE "$1" "$work/cbctd.err" && return 0
 		sleep 0.02
 	done

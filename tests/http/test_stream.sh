@@ -63,7 +63,7 @@ own_memory() { awk '/RssAnon/ { print $2 }' "/proc/$(cat "$work/daemon.pid")/sta
 open_files() { ls "/proc/$(cat "$work/daemon.pid")/fd" | wc -l; }
 wait_for_bytes() { # FILE COUNT
 	local i
-	for ((i = 0; i < 600; i++)); do
+	for ((i = 0; i < 2400; i++)); do
 		[ "$(stat -c %s "$1" 2>/dev/null || echo 0)" -ge "$2" ] && return 0
 		sleep 0.05
 	done

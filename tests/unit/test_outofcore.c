@@ -366,7 +366,7 @@ Suite *outofcore_suite(void)
 	Suite *suite = suite_create("outofcore");
 	TCase *tests = tcase_create("outofcore");
 
-	tcase_set_timeout(tests, 300);
+	tcase_set_timeout(tests, 0);
 	tcase_add_loop_test(tests, outofcore_give_what_the_whole_gives, 0, (int)(sizeof(cases) / sizeof(cases[0])));
 	tcase_add_test(tests, any_limit_gives_the_same_volume);
 	tcase_add_loop_test(tests, pixels_are_averaged_in_parts, 0, 2);
