@@ -32,6 +32,7 @@ enum lock_rank {
 	LOCK_UNDONE,     /* store.undone_lock */
 	LOCK_CHECKS,     /* store.check_lock */
 	LOCK_CARDS,      /* cards.lock */
+	LOCK_HOMES,      /* homes.lock */
 	LOCK_FEEDER,     /* feeder.lock */
 	LOCK_KEEPER,     /* keeper.lock */
 	LOCK_WATCHERS,   /* watch_list.lock */

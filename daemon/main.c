@@ -98,6 +98,7 @@ static int start_http(const struct config *config, struct api *api, struct error
 					     .tls_client_authorities = config->tls_client_authorities,
 					     .routes = api_routes,
 					     .context = api,
+					     .missing = elsewhere_missing,
 					     .threads = (int)config->http_threads,
 					     .max_connections = config->max_connections,
 					     .max_connections_per_address = config->max_connections_per_address,
@@ -198,7 +199,7 @@ static int start_parts(const struct config *config, struct api *api, struct erro
 	const struct store_options hooks = {
 	    .failed = on_failure, .catalogue = config->catalogue, .catalogue_timeout = config->catalogue_timeout};
 	const struct uploads_options uploads = {.buffer = config->upload_buffer, .failed = on_failure};
-	const struct fleet_options fleet = fleet_options_of(config);
+	struct fleet_options fleet = fleet_options_of(config);
 	int devices[INDICES_MOST], given = config_indices(config->devices, devices, INDICES_MOST);
 	char cbct[1024];
 	const struct remote_options remote = {.program = config->fleet[0] != '\0' ? cbct : NULL,
@@ -254,11 +255,14 @@ static int start_parts(const struct config *config, struct api *api, struct erro
 		code = uploads_new(api->store, &uploads, &api->uploads, err);
 	if (code == 0)
 		code = cards_start(&api->cards, err);
+	if (code == 0 && config->fleet[0] != '\0')
+		code = homes_new(&api->homes, err);
 	if (code == 0)
 		code = keeper_start(api, config->keep, &api->keeper, err);
 	if (code == 0)
 		code = http_start(api->http, err);
 	/* Other hosts may come as soon as they are told of this one. */
+	fleet.homes = api->homes;
 	if (code == 0 && config->fleet[0] != '\0')
 		code = fleet_start(api->jobs, api->supervise, &fleet, &api->fleet, err);
 	return code;
@@ -269,6 +273,7 @@ static void stop_parts(struct api *api)
 	fleet_stop(api->fleet);
 	keeper_stop(api->keeper);
 	http_free(api->http);
+	homes_free(api->homes);
 	cards_stop(api->cards);
 	uploads_free(api->uploads);
 	encoded_copies_free(api->copies);

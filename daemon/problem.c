@@ -25,6 +25,7 @@ static const struct problem problems[] = {
     {ERR_QUOTA, 507, "limit-of-bytes", "There are as many bytes as there may be"},
     {ERR_AWAY, 503, "catalogue-away", "The catalogue's database cannot be reached"},
     {ERR_LIMIT, 429, "limit-reached", "Who asks has as much as one may have"},
+    {0, 307, "elsewhere", "Another host of the fleet has it"},
     {0, 401, "unauthorized", "The daemon does not know who asks"},
     {0, 403, "forbidden", "Another role is wanted for this"},
     {0, 403, "foreign-origin", "A page of another site may not do this"},

@@ -139,6 +139,15 @@ int http_new(const struct http_options *options, struct http **ret_http, struct 
 		http->base[n - 1] = 0;
 	curl_easy_setopt(http->easy, CURLOPT_ERRORBUFFER, http->message);
 	curl_easy_setopt(http->easy, CURLOPT_NOSIGNAL, 1L);
+	/*
+	 * Another host of a fleet has what was asked for. The token goes along, as it would where the user names that
+	 * host: the daemon that names it could do with the token whatever it likes. Never from TLS to none.
+	 */
+	curl_easy_setopt(http->easy, CURLOPT_FOLLOWLOCATION, socket == NULL ? 1L : 0L);
+	curl_easy_setopt(http->easy, CURLOPT_MAXREDIRS, 1L);
+	curl_easy_setopt(http->easy, CURLOPT_UNRESTRICTED_AUTH, 1L);
+	curl_easy_setopt(http->easy, CURLOPT_REDIR_PROTOCOLS_STR,
+			 strncmp(url, "https:", 6) == 0 ? "https" : "http,https");
 	curl_easy_setopt(http->easy, CURLOPT_CONNECTTIMEOUT, 10L);
 	/* Between two volumes of a stream nothing may come for hours: whether the daemon is still there is asked. */
 	curl_easy_setopt(http->easy, CURLOPT_TCP_KEEPALIVE, 1L);
@@ -339,7 +348,7 @@ int http_send(struct http *http, const struct http_request *request, struct http
 	snprintf(reply.digest, sizeof(reply.digest), "%s", digest != NULL ? digest : "");
 	*ret_reply = reply;
 	/* A refusal that came before the whole body was sent counts, though the sending broke. */
-	if (status >= 400)
+	if (status >= 300)
 		return problem(request, &reply, err);
 	return result == CURLE_OK ? 0 : no_reply(http, result, err);
 }

@@ -47,9 +47,9 @@ struct http_reply {
 };
 
 /*
- * Sends one request and waits. Fails with ERR_IO when no reply came, and on
- * every status of 400 and more, with what the problem document said in err.
- * `ret_reply` is filled in both cases (http_reply_clear).
+ * Sends one request and waits; a daemon that names another host of its fleet is followed there. Fails with ERR_IO when
+ * no reply came, and on every status of 300 and more, with what the problem document said in err. `ret_reply` is filled
+ * in both cases (http_reply_clear).
  */
 int http_send(struct http *http, const struct http_request *request, struct http_reply *ret_reply, struct error *err);
 void http_reply_clear(struct http_reply *reply);

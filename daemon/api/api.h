@@ -17,6 +17,7 @@ struct api {
 	struct cards *cards;
 	struct http *http;
 	struct fleet *fleet;   /* NULL: it is in none */
+	struct homes *homes;   /* NULL: likewise */
 	struct keeper *keeper; /* NULL: everything is kept */
 	double max_wait;       /* s */
 	double started;        /* clock_monotonic */
@@ -25,6 +26,12 @@ struct api {
 /* Removes what is older than `seconds` (0: nothing), from now on; after all others were started. */
 int keeper_start(struct api *api, double seconds, struct keeper **ret_keeper, struct error *err);
 void keeper_stop(struct keeper *keeper); /* NULL is fine; before any other is stopped */
+
+/*
+ * For struct http_options: what a request names and is not here may be another host's of the fleet. 307 with that
+ * host's address then; where it has none, or was not seen, the error says so. True: a reply was set. Never waits.
+ */
+bool elsewhere_missing(void *context, struct request *request, struct error *err);
 
 /* Every endpoint; their context is a struct api. Ends with method == NULL. */
 extern const struct route api_routes[];

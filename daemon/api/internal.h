@@ -129,6 +129,10 @@ int entity_select(struct request *request, const struct entity *entity, struct s
 		  struct error *err);
 void entity_headers(struct request *request, const struct entity *entity, const struct selection *selection);
 
+/* ---- what other hosts have: api/elsewhere.c ---- */
+/* As elsewhere_missing, for what the request names by that id. */
+bool elsewhere_reply(struct api *api, struct request *request, const char *id, struct error *err);
+
 /* ---- waiting until something changes: api/wait.c ---- */
 /* ?wait=SECONDS, or Prefer: wait=N; `initial` when neither is there, and never more than api->max_wait. */
 int wait_read(struct api *api, struct request *request, double initial, double *ret_seconds, struct error *err);

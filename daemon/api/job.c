@@ -7,6 +7,8 @@
 
 /* ---- POST ---- */
 
+enum { ELSEWHERE = 1 }; /* the reply names the host that has the scan */
+
 static int reply_job(struct request *request, int status, struct job *job, struct error *err)
 {
 	cJSON *document = job_document(job, false, err);
@@ -70,8 +72,10 @@ static int post(struct api *api, struct request *request, const char *key, const
 	code = read_resume(request, &wanted, err);
 	if (code == 0) {
 		code = store_scan_find(api->store, wanted.scan, &scan, err);
-		if (code == ERR_NOT_FOUND)
+		if (code == ERR_NOT_FOUND) {
 			snprintf(err->pointer, sizeof(err->pointer), "/scan");
+			code = elsewhere_reply(api, request, wanted.scan, err) ? ELSEWHERE : err->code;
+		}
 	}
 	if (code == 0) {
 		code = post_resolved(api, &wanted, scan, client, key, digest, ret_job, err);
@@ -97,7 +101,7 @@ int job_post(void *context, struct request *request, struct error *err)
 	if (code == 0)
 		code = reply_accepted(request, job, err);
 	job_release(job);
-	return code;
+	return code == ELSEWHERE ? 0 : code;
 }
 
 /* ---- lists ---- */

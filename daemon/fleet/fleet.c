@@ -17,12 +17,27 @@ static const double REJOIN = 1;   /* s between two attempts to reach the databas
 
 /* ---- the loop ---- */
 
+static int fleet_homes(struct fleet *fleet, struct error *err)
+{
+	int code;
+
+	if (clock_monotonic() < fleet->told_at + LOOK)
+		return 0;
+	code = homes_tell(fleet->homes, fleet->jobs, fleet->ledger, err);
+	if (code == 0)
+		code = homes_read(fleet->homes, fleet->ledger, err);
+	fleet->told_at = clock_monotonic();
+	return code;
+}
+
 static int turn(struct fleet *fleet, struct error *err)
 {
 	int code = fleet_take(fleet, err);
 
 	if (code == 0)
 		code = fleet_offer(fleet, err);
+	if (code == 0)
+		code = fleet_homes(fleet, err);
 	if (code != 0 || atomic_load(&fleet->is_joined))
 		return code;
 	log_line(LEVEL_INFO, "host %s has joined the fleet %s", fleet->host, fleet->name);
@@ -53,7 +68,8 @@ static void join_again(struct fleet *fleet)
 		return;
 	}
 	fleet->joined = clock_monotonic();
-	fleet->renewed = fleet->offered = 0;
+	fleet->renewed = fleet->offered = fleet->told_at = 0;
+	homes_forget(fleet->homes);
 }
 
 static void empty(int wake)
@@ -154,6 +170,7 @@ int fleet_start(struct jobs *jobs, struct supervise *supervise, const struct fle
 		return error_set_errno(err, ENOMEM, "fleet");
 	fleet->jobs = jobs;
 	fleet->supervise = supervise;
+	fleet->homes = options->homes;
 	snprintf(fleet->name, sizeof(fleet->name), "%s", options->name);
 	snprintf(fleet->database, sizeof(fleet->database), "%s", options->database);
 	snprintf(fleet->host, sizeof(fleet->host), "%s", options->host);

@@ -1,6 +1,7 @@
 #ifndef CBCT_DAEMON_FLEET_FLEET_H
 #define CBCT_DAEMON_FLEET_FLEET_H
 
+#include "daemon/fleet/homes.h"
 #include "daemon/jobs/jobs.h"
 
 /*
@@ -26,6 +27,7 @@ struct fleet_options {
 	const char *url;      /* of this daemon's API; "": it takes no jobs of others */
 	double lease;         /* s */
 	double timeout;       /* s until the database counts as away */
+	struct homes *homes;  /* what other hosts have; kept up to date; outlives the fleet. Not of fleet_check */
 };
 
 /* The strings are copied. ERR_INVALID: they cannot be right, or this cbctd was built without libpq. */

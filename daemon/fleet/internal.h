@@ -18,6 +18,7 @@ enum {
 struct fleet {
 	struct jobs *jobs; /* constant, as the next four */
 	struct supervise *supervise;
+	struct homes *homes;
 	struct ledger_options options;
 	char name[64], database[1024], host[LEDGER_NAME_SIZE], url[LEDGER_URL_SIZE];
 	int wake; /* eventfd */
@@ -29,7 +30,7 @@ struct fleet {
 	struct ledger *ledger; /* NULL: it cannot be reached */
 	bool told;             /* that it cannot be */
 	double joined;         /* monotonic: when it was reached */
-	double renewed, offered;
+	double renewed, offered, told_at;
 	struct offer offers[OFFERS_MOST];
 	int offer_count;
 	struct place places[PLACES_MAX]; /* of this owner's jobs that others have claimed */

@@ -66,6 +66,8 @@ struct http_options {
 	const char *tokens;         /* the file of tokens; "": nobody is asked who they are */
 	const struct route *routes; /* ends with method == NULL */
 	void *context;              /* the handlers' */
+	/* Asked before a request ends with ERR_NOT_FOUND: true, and a reply is set; or the error may be changed. */
+	bool (*missing)(void *context, struct request *request, struct error *err);
 	int threads;
 	long max_connections, max_connections_per_address;
 	double header_timeout, transfer_grace; /* s */
@@ -108,6 +110,8 @@ long http_connections(const struct http *http);
 const char *request_id(const struct request *request);
 /* The i-th {} of the route's path, decoded; never NULL. */
 const char *request_argument(const struct request *request, int i);
+/* Path and query as they were sent. */
+const char *request_target(const struct request *request);
 /* The value of ?name=value, decoded; NULL when the target has no such parameter. */
 const char *request_query(const struct request *request, const char *name);
 /* The first header of that name, or NULL. */

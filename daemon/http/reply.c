@@ -187,11 +187,17 @@ static int reply_problem(struct request *request, const struct problem *problem,
 	return 0;
 }
 
-int reply_problem_of(struct request *request, const struct error *err)
+int reply_problem_of(struct request *request, const struct error *why)
 {
-	const struct problem *problem = problem_of_code(err->code);
+	const struct http_options *options = &request->http->options;
+	struct error told = *why, *err = &told, unable;
+	const struct problem *problem;
 	char detail[sizeof(err->text)];
-	struct error unable;
+
+	if (err->code == ERR_NOT_FOUND && options->missing != NULL && request->route != NULL &&
+	    options->missing(options->context, request, err))
+		return 0;
+	problem = problem_of_code(err->code);
 
 	/* Failures of the daemon itself are for its operator: clients do not see paths. */
 	if (problem->status >= 500 && problem->status != 503)

@@ -407,6 +407,11 @@ const char *request_id(const struct request *request)
 	return request->id;
 }
 
+const char *request_target(const struct request *request)
+{
+	return request->target;
+}
+
 const char *request_argument(const struct request *request, int i)
 {
 	return request->arguments[i];

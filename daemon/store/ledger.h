@@ -13,6 +13,7 @@
  * which jobs may be computed by another host than their owner, and which host has which of them.
  *
  *   hosts   a row for each daemon: name, address of its API, when it was last seen
+ *   homes   a row for each scan and job: which host has it
  *   offers  a row for each job that others may take: owner, job, priority, place in its owner's queue, where it may
  * run, and once it is claimed the taker, the number of the claim and the end of its lease
  *
@@ -64,6 +65,22 @@ void ledger_close(struct ledger *ledger) LEDGER_WEAK; /* NULL is fine */
 
 /* This host is there: to be called at least every third of a lease. */
 int ledger_seen(struct ledger *ledger, struct error *err) LEDGER_WEAK;
+
+/* ---- which host has what ---- */
+struct fleet_host {
+	char name[LEDGER_NAME_SIZE], url[LEDGER_URL_SIZE];
+	long long changes; /* grows whenever what it has changes */
+	bool away;         /* it was not seen for a lease */
+};
+/* The ids of this host's scans and jobs are these, at most HOMES_MOST. */
+enum { HOMES_MOST = 4096 };
+int ledger_tell(struct ledger *ledger, const char (*ids)[ID_SIZE], int count, struct error *err) LEDGER_WEAK;
+/* The other hosts, at most `most`. */
+int ledger_hosts(struct ledger *ledger, struct fleet_host *ret_hosts, int most, int *ret_count,
+		 struct error *err) LEDGER_WEAK;
+/* The ids of that host, in their order. */
+int ledger_homes(struct ledger *ledger, const char *host, char (*ret_ids)[ID_SIZE], int *ret_count,
+		 struct error *err) LEDGER_WEAK;
 
 /* ---- of an owner ---- */
 /* This owner's offers become these; another one of its own goes, with its claim if it has one. */

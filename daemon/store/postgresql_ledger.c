@@ -64,6 +64,9 @@ static int make_tables(struct ledger *ledger, struct error *err)
 		 "ALTER TABLE offers ADD COLUMN IF NOT EXISTS host text NOT NULL DEFAULT '',"
 		 " ADD COLUMN IF NOT EXISTS memory double precision NOT NULL DEFAULT 0,"
 		 " ADD COLUMN IF NOT EXISTS devices bigint NOT NULL DEFAULT 0;"
+		 "ALTER TABLE hosts ADD COLUMN IF NOT EXISTS changes bigint NOT NULL DEFAULT 0;"
+		 "CREATE TABLE IF NOT EXISTS homes (id text COLLATE \"C\" PRIMARY KEY, owner text NOT NULL);"
+		 "CREATE INDEX IF NOT EXISTS homes_of ON homes (owner);"
 		 "COMMIT",
 		 ledger->schema, ledger->schema);
 	code = session_execute(&ledger->session, sql, NULL, err);
@@ -208,6 +211,95 @@ static int note_change(void *context, const struct value *values, struct error *
 	(void)err;
 	*(bool *)context = true;
 	return 0;
+}
+
+/* ---- which host has what ---- */
+
+int ledger_tell(struct ledger *ledger, const char (*ids)[ID_SIZE], int count, struct error *err)
+{
+	struct value values[] = {text_value(ledger->host), text_value("")};
+	cJSON *list = cJSON_CreateArray();
+	char *text;
+	int code;
+
+	for (int i = 0; i < count; i++)
+		cJSON_AddItemToArray(list, cJSON_CreateString(ids[i]));
+	text = list == NULL || cJSON_GetArraySize(list) != count ? NULL : json_print(list, NULL);
+	cJSON_Delete(list);
+	if (text == NULL)
+		return error_set_errno(err, ENOMEM, "list of %d ids", count);
+	values[1] = text_value(text);
+	code = session_run(&ledger->session,
+			   "WITH mine AS (SELECT value AS id FROM json_array_elements_text($2::json)),"
+			   " gone AS (DELETE FROM homes WHERE owner = $1::text AND id NOT IN (SELECT id FROM mine)"
+			   " RETURNING id),"
+			   " there AS (INSERT INTO homes (id, owner) SELECT id, $1::text FROM mine"
+			   " ON CONFLICT (id) DO UPDATE SET owner = excluded.owner"
+			   " WHERE homes.owner <> excluded.owner RETURNING id)"
+			   " UPDATE hosts SET changes = changes + 1 WHERE name = $1::text"
+			   " AND (EXISTS (SELECT 1 FROM gone) OR EXISTS (SELECT 1 FROM there))",
+			   values, 2, NULL, NULL, err);
+	free(text);
+	return code;
+}
+
+struct hosts {
+	struct fleet_host *hosts;
+	int most, count;
+};
+
+static int note_host(void *context, const struct value *values, struct error *err)
+{
+	struct hosts *hosts = context;
+	struct fleet_host *host = &hosts->hosts[hosts->count];
+
+	(void)err;
+	if (hosts->count == hosts->most)
+		return 0;
+	*host = (struct fleet_host){.changes = values[2].integer, .away = values[3].integer != 0};
+	snprintf(host->name, sizeof(host->name), "%s", (const char *)values[0].bytes);
+	snprintf(host->url, sizeof(host->url), "%s", (const char *)values[1].bytes);
+	hosts->count++;
+	return 0;
+}
+
+int ledger_hosts(struct ledger *ledger, struct fleet_host *ret_hosts, int most, int *ret_count, struct error *err)
+{
+	const struct value values[] = {text_value(ledger->host), seconds_value(ledger->lease)};
+	struct hosts hosts = {.hosts = ret_hosts, .most = most};
+	int code = session_run(&ledger->session,
+			       "SELECT name, url, changes, CASE WHEN seen > now() - $2::float8 * interval '1 second'"
+			       " THEN 0::bigint ELSE 1 END FROM hosts WHERE name <> $1::text ORDER BY seen DESC",
+			       values, 2, note_host, &hosts, err);
+
+	*ret_count = hosts.count;
+	return code;
+}
+
+struct ids {
+	char (*ids)[ID_SIZE];
+	int count;
+};
+
+static int note_id(void *context, const struct value *values, struct error *err)
+{
+	struct ids *ids = context;
+
+	(void)err;
+	if (ids->count < HOMES_MOST)
+		snprintf(ids->ids[ids->count++], ID_SIZE, "%s", (const char *)values[0].bytes);
+	return 0;
+}
+
+int ledger_homes(struct ledger *ledger, const char *host, char (*ret_ids)[ID_SIZE], int *ret_count, struct error *err)
+{
+	const struct value values[] = {text_value(host)};
+	struct ids ids = {.ids = ret_ids};
+	int code = session_run(&ledger->session, "SELECT id FROM homes WHERE owner = $1::text ORDER BY id", values, 1,
+			       note_id, &ids, err);
+
+	*ret_count = ids.count;
+	return code;
 }
 
 /* ---- the calls ---- */

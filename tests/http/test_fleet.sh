@@ -345,6 +345,66 @@ test_a_job_goes_on_elsewhere_from_its_checkpoint() {
 	[ ! -e "$work/c/jobs/$job/checkpoint.f32" ] || fail "no checkpoint is left"
 }
 
+# answered_by WHAT STATUS: GET of it, here, is answered so within some seconds
+answered_by() {
+	local i
+	for ((i = 0; i < 200; i++)); do
+		req GET "$1"
+		[ "$status" = "$2" ] && return 0
+		sleep 0.05
+	done
+	fail "$1 answered with $2, got $status: $(head -c 400 "$body")"
+}
+test_a_daemon_passes_on_what_another_one_has() {
+	local home
+	begin
+	taker a
+	taker b
+	owner c # without an address
+	at a
+	home=$url
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "$small"
+	wait_job succeeded
+	at b
+	answered_by "/v1/jobs/$job" 307
+	[ "$(header location)" = "$home/v1/jobs/$job" ] || fail "Location at $home, got $(header location)"
+	expect_json '.type == "urn:cbctd:problem:elsewhere" and (.detail | contains("host a"))'
+	req GET "/v1/jobs/$job/volumes/final/slice?axis=z&index=3"
+	expect_status 307
+	[ "$(header location)" = "$home/v1/jobs/$job/volumes/final/slice?axis=z&index=3" ] || fail "path and query, got $(header location)"
+	answered_by "/v1/scans/$scan" 307
+	req PUT "/v1/scans/$scan/projections/0" --data-binary @"$scan_dir/projections.raw"
+	expect_status 307
+	req POST /v1/jobs -H 'Content-Type: application/json' --data-binary "${small//SCAN/$scan}"
+	expect_status 307
+	[ "$(header location)" = "$home/v1/jobs" ] || fail "the job is posted there, got $(header location)"
+	curl -sL "$url/v1/jobs/$job" | jq -e '.state == "succeeded"' >/dev/null || fail "who follows gets there"
+	cbct get "$job" final --url "$url" -o "$work/final.nii" >/dev/null || fail "cbct follows"
+	cmp "$work/final.nii" <(curl -s "$home/v1/jobs/$job/volumes/final") || fail "the same volume"
+	# Nobody redirects to itself: what the owner has removed is gone.
+	at a
+	req DELETE "/v1/jobs/$job"
+	expect_status 204
+	at b
+	answered_by "/v1/jobs/$job" 404
+	# A host that is away, and one that has no address.
+	stop_host a KILL
+	answered_by "/v1/scans/$scan" 503
+	expect_json '.detail | contains("host a of the fleet has it")'
+	at c
+	post_scan "$scan_dir"
+	at b
+	answered_by "/v1/scans/$scan" 404
+	for i in {1..100}; do
+		[[ $(json .detail) == *"host c of the fleet has it, which has no address"* ]] && break
+		sleep 0.05
+		req GET "/v1/scans/$scan"
+	done
+	expect_json '.detail | contains("host c of the fleet has it, which has no address")'
+}
+
 # turns_until HOST: projections come, one a second, until some of $job's are reconstructed there; $next is the next to come
 turns_until() {
 	local end
