@@ -191,6 +191,7 @@ static struct fleet_options fleet_options_of(const struct config *config)
 				      .host = host_of(config),
 				      .url = config->fleet_address,
 				      .lease = config->fleet_lease,
+				      .keep_scans = config->fleet_keep_scans,
 				      .timeout = config->catalogue_timeout};
 }
 

@@ -56,7 +56,8 @@ struct remote {
 	double contact;         /* monotonic: when the other daemon answered last */
 	double look;            /* monotonic: next look at the job */
 	bool cancel, leave;
-	int announced, sent; /* projections */
+	int announced, sent;   /* projections */
+	bool there[VIEWS_MAX]; /* projections that the other daemon had before this process */
 	/* What the daemon here was told already. */
 	int rows, warnings, volumes;
 	int iteration; /* of the last row */
@@ -222,28 +223,69 @@ static int know_projections(struct remote *remote, struct error *err)
 	return code;
 }
 
+/*
+ * The same for all jobs of the scan, so that a later one finds there what an earlier one has sent; another one where an
+ * image has changed. The other daemon knows by it whose the scan is.
+ */
+static int name_scan(const struct remote *remote, char ret_name[120], char ret_key[200], struct error *err)
+{
+	const char *claim = remote->options->claim;
+	char digests[(IMAGE_COUNT + 1) * DIGEST_TEXT_MAX], digest[DIGEST_TEXT_MAX];
+	int length = snprintf(digests, sizeof(digests), "%s", remote->source.scan);
+
+	for (int i = 0; i < IMAGE_COUNT; i++)
+		length += snprintf(digests + length, sizeof(digests) - (size_t)length, "%s", remote->source.image[i]);
+	snprintf(ret_name, 120, "%.*s/%.16s", (int)strcspn(claim, "/"), claim, remote->start->request.scan);
+	if (digest_of(digests, (size_t)length, digest, err) != 0)
+		return err->code;
+	snprintf(ret_key, 200, "%s/%s", ret_name, digest);
+	return 0;
+}
+
+/* Projections that are there already, of this job before it was lost or of another one of the scan. */
+static int know_those_there(struct remote *remote, struct error *err)
+{
+	const int count = remote->files.scan->count;
+	cJSON *document = NULL;
+	const cJSON *run;
+	char path[100];
+	int code;
+
+	snprintf(path, sizeof(path), "/v1/scans/%.63s", remote->scan);
+	code = ask(remote, "GET", path, &document, err);
+	cJSON_ArrayForEach(run, cJSON_GetObjectItemCaseSensitive(document, "received"))
+	{
+		const cJSON *first = cJSON_GetArrayItem(run, 0), *last = cJSON_GetArrayItem(run, 1);
+
+		if (!cJSON_IsNumber(first) || !cJSON_IsNumber(last))
+			continue;
+		for (int i = first->valueint; i >= 0 && i <= last->valueint && i < count; i++)
+			remote->there[i] = true;
+	}
+	cJSON_Delete(document);
+	return code;
+}
+
 static int post_scan(struct remote *remote, struct error *err)
 {
 	static const char *const private[] = {"name", "labels", "patient", "study"};
 	cJSON *document = cJSON_Duplicate(remote->files.scan->document, true);
-	const char *claim = remote->options->claim;
-	char path[120];
-	int code = 0;
+	char path[120], name[120], key[200];
+	int code = name_scan(remote, name, key, err);
 
 	for (size_t i = 0; i < sizeof(private) / sizeof(private[0]); i++)
 		cJSON_DeleteItemFromObjectCaseSensitive(document, private[i]);
-	/* By its name the other daemon knows that the scan goes with the job. */
-	if (document == NULL || cJSON_AddStringToObject(document, "name", claim) == NULL)
+	if (code == 0 && (document == NULL || cJSON_AddStringToObject(document, "name", name) == NULL))
 		code = error_set(err, ERR_NO_MEMORY, "no memory for a scan");
 	if (code == 0)
-		code = post(remote, "/v1/scans", document, claim, remote->scan, err);
+		code = post(remote, "/v1/scans", document, key, remote->scan, err);
 	cJSON_Delete(document);
 	for (int i = 0; i < IMAGE_COUNT && code == 0; i++) {
 		snprintf(path, sizeof(path), "/v1/scans/%.63s/%s", remote->scan, image_kinds[i].name);
 		if (remote->files.image[i] != NULL)
 			code = put(remote, path, remote->files.image[i], bytes_of_image(remote, i), err);
 	}
-	return code;
+	return code == 0 ? know_those_there(remote, err) : code;
 }
 
 /* Each is held against its record, as whoever reads it does. */
@@ -268,13 +310,8 @@ static int read_projections(const struct remote *remote, int first, int count, s
 	return code;
 }
 
-/* The next run of those that are there. */
-static int send_some(struct remote *remote, struct error *err)
+static int send_run(struct remote *remote, int count, size_t bytes, struct error *err)
 {
-	const size_t bytes = scan_projection_bytes(remote->files.scan);
-	const int most = bytes < RUN_BYTES ? (int)(RUN_BYTES / bytes) : 1, left = remote->announced - remote->sent;
-	const int count = left < most ? left : most;
-	struct message told = {.kind = MESSAGE_RECONSTRUCTED};
 	char *samples = malloc((size_t)count * bytes), path[160];
 	int code = samples == NULL ? error_set(err, ERR_NO_MEMORY, "no memory for %d projections", count)
 				   : read_projections(remote, remote->sent, count, bytes, samples, err);
@@ -284,6 +321,23 @@ static int send_some(struct remote *remote, struct error *err)
 	if (code == 0)
 		code = put(remote, path, samples, (size_t)count * bytes, err);
 	free(samples);
+	return code;
+}
+
+/* The next run of those that are here, but for what is there already. */
+static int send_some(struct remote *remote, struct error *err)
+{
+	const size_t bytes = scan_projection_bytes(remote->files.scan);
+	const int most = bytes < RUN_BYTES ? (int)(RUN_BYTES / bytes) : 1;
+	struct message told = {.kind = MESSAGE_RECONSTRUCTED};
+	int count = 0, code = 0;
+
+	while (remote->sent < remote->announced && remote->there[remote->sent])
+		remote->sent++;
+	while (count < most && remote->sent + count < remote->announced && !remote->there[remote->sent + count])
+		count++;
+	if (count > 0)
+		code = send_run(remote, count, bytes, err);
 	if (code != 0)
 		return code;
 	remote->sent += count;
@@ -664,8 +718,8 @@ static int run(struct remote *remote, struct error *err)
 }
 
 /*
- * Nobody needs job and scan there any more. A job that has not ended is only cancelled by this, and the scan stays: the
- * other daemon removes both when it sees that the claim has ended.
+ * Nobody needs the job there any more. One that has not ended is only cancelled by this: the other daemon removes it
+ * when it sees that the claim has ended. The scan stays for other jobs, as long as that daemon keeps it.
  */
 static void tidy(struct remote *remote)
 {
@@ -675,10 +729,6 @@ static void tidy(struct remote *remote)
 
 	snprintf(path, sizeof(path), "/v1/jobs/%.63s", remote->job);
 	if (remote->job[0] != '\0' && http_json(remote->http, "DELETE", path, &reply, &ignored) == 0)
-		cJSON_Delete(reply);
-	reply = NULL;
-	snprintf(path, sizeof(path), "/v1/scans/%.63s", remote->scan);
-	if (remote->scan[0] != '\0' && http_json(remote->http, "DELETE", path, &reply, &ignored) == 0)
 		cJSON_Delete(reply);
 }
 
@@ -783,7 +833,7 @@ static int remote_run(const void *values, struct error *err)
 	}
 static const struct option rows[] = {
     ROW("socket", OPTION_INTEGER, socket, "N", "the descriptor over which the daemon here speaks", 0, 65535),
-    ROW("claim", OPTION_TEXT, claim, "TEXT", "name and key of scan and job there, others for each claim", 0, 0),
+    ROW("claim", OPTION_TEXT, claim, "TEXT", "key of the job there, another one for each claim", 0, 0),
     ROW("host", OPTION_TEXT, host, "NAME", "what the other daemon is called here", 0, 0),
     ROW("lease", OPTION_NUMBER, lease, "SECONDS", "a daemon there that does not answer for so long is lost", 0.1,
 	86400),

@@ -27,6 +27,8 @@ static int fleet_homes(struct fleet *fleet, struct error *err)
 	if (code == 0)
 		code = homes_read(fleet->homes, fleet->ledger, err);
 	fleet->told_at = clock_monotonic();
+	if (code == 0)
+		fleet_clear_copies(fleet, false);
 	return code;
 }
 
@@ -94,6 +96,8 @@ static void leave(struct fleet *fleet)
 
 	for (int i = 0; i < fleet->claim_count && fleet->ledger != NULL; i++)
 		ledger_give_back(fleet->ledger, &fleet->claims[i], &had, &ignored);
+	fleet->claim_count = 0;
+	fleet_clear_copies(fleet, true);
 	if (fleet->ledger != NULL)
 		ledger_offer(fleet->ledger, NULL, 0, &ignored);
 	ledger_close(fleet->ledger);
@@ -171,6 +175,7 @@ int fleet_start(struct jobs *jobs, struct supervise *supervise, const struct fle
 	fleet->jobs = jobs;
 	fleet->supervise = supervise;
 	fleet->homes = options->homes;
+	fleet->keep_scans = options->keep_scans;
 	snprintf(fleet->name, sizeof(fleet->name), "%s", options->name);
 	snprintf(fleet->database, sizeof(fleet->database), "%s", options->database);
 	snprintf(fleet->host, sizeof(fleet->host), "%s", options->host);

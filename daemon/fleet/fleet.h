@@ -27,6 +27,7 @@ struct fleet_options {
 	const char *url;      /* of this daemon's API; "": it takes no jobs of others */
 	double lease;         /* s */
 	double timeout;       /* s until the database counts as away */
+	double keep_scans;    /* s that a copy of another host's scan is kept for its further jobs */
 	struct homes *homes;  /* what other hosts have; kept up to date; outlives the fleet. Not of fleet_check */
 };
 

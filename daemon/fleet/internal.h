@@ -15,6 +15,12 @@ enum {
 };
 #define LOOK 1.0 /* s between two turns at most: notifications are hints */
 
+enum { COPIES_MOST = 64 };
+struct copy {
+	char id[ID_SIZE];
+	double used; /* monotonic: when this host last had a claim of its owner's */
+};
+
 struct fleet {
 	struct jobs *jobs; /* constant, as the next four */
 	struct supervise *supervise;
@@ -38,6 +44,10 @@ struct fleet {
 	struct fleet_claim claims[CLAIMS_MOST]; /* of this host */
 	int claim_count;
 
+	double keep_scans; /* s */
+	struct copy copies[COPIES_MOST];
+	int copy_count;
+
 	atomic_bool is_joined;
 	atomic_int offers_now, given_now, taken_now;
 	atomic_ullong claims_made, losses;
@@ -46,6 +56,15 @@ struct fleet {
 /* ---- owner.c ---- */
 /* This owner's jobs are offered, and those that others have claimed are given to them. */
 int fleet_offer(struct fleet *fleet, struct error *err);
+
+/* ---- copies.c: scans of others, that this host keeps for a while so that they need not be sent for each job ---- */
+/* By its name. */
+bool copy_is(const char *name);
+/*
+ * Removes copies that no claim here may need: of scans that their owner has no more, those not used for keep_scans, and
+ * the ones not used for the longest while all take more than is free on the disk. With `all`: each of them.
+ */
+void fleet_clear_copies(struct fleet *fleet, bool all);
 
 /* ---- taker.c ---- */
 /* Leases are renewed, and jobs of others claimed where devices are free. */

@@ -36,28 +36,19 @@ static const struct fleet_claim *claim_of(const struct fleet *fleet, const char 
 	return NULL;
 }
 
-/*
- * A job of another daemon that this host has no claim for any more, with the copy of its scan, which bears the key as
- * its name: what anybody else has posted is never taken for one.
+/* A job of another daemon that this host has no claim for any more. Others' scans are no copies: none of theirs goes.
  */
 static void remove_mirror(struct fleet *fleet, struct job *job, const struct job_record *record)
 {
-	struct store *store = jobs_store(fleet->jobs);
-	struct stored_scan *scan;
 	struct scan_facts facts;
 	bool removed = false;
 	struct error err;
 
-	if (store_scan_look(store, record->scan, &facts, &err) != 0 || strcmp(facts.name, record->key) != 0)
+	if (store_scan_look(jobs_store(fleet->jobs), record->scan, &facts, &err) != 0 || !copy_is(facts.name))
 		return;
 	if (jobs_delete(fleet->jobs, job, &removed, &err) != 0 || !removed)
 		return; /* it is being cancelled: the next turn finds it ended */
 	log_line(LEVEL_INFO, "job %s was another host's, whose claim has ended: removed", record->id);
-	if (store_scan_refer(store, record->scan, &scan, &err) != 0)
-		return;
-	if (jobs_delete_scan(fleet->jobs, scan, &err) != 0)
-		log_line(LEVEL_DEBUG, "scan %s stays: %s", record->scan, err.text);
-	stored_scan_release(scan);
 }
 
 /* Another host has claimed it. */

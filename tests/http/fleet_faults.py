@@ -37,7 +37,8 @@ class Host:
         self.name, self.port, self.options = name, free_port(), options
         self.folder = options.folder / name
         self.arguments = [f"{options.build}/cbctd", "--listen", f"127.0.0.1:{self.port}", "--state-dir", str(self.folder), "--backend", "cpu",
-                          "--threads", "1", "--fleet", "soak", "--fleet-database", options.database, "--fleet-host", name, "--fleet-lease", str(LEASE)]
+                          "--threads", "1", "--fleet", "soak", "--fleet-database", options.database, "--fleet-host", name, "--fleet-lease", str(LEASE),
+                          "--fleet-keep-scans", "0"]
         self.arguments += ["--fleet-address", f"http://127.0.0.1:{self.port}"] if takes else ["--worker", str(options.no_device)]
         self.process = None
 

@@ -30,7 +30,7 @@ start_host() {
 	for ((i = 0; i < 20; i++)); do
 		: >"$out"
 		"$BUILD/cbctd-held" --listen "127.0.0.1:$port" --state-dir "$work/$name" --backend cpu --threads 1 --fleet test \
-			--fleet-database "$database" --fleet-lease "$lease" --fleet-host "$name" "${@//PORT/$port}" >"$out" 2>>"$work/$name.err" &
+			--fleet-database "$database" --fleet-lease "$lease" --fleet-keep-scans 0 --fleet-host "$name" "${@//PORT/$port}" >"$out" 2>>"$work/$name.err" &
 		echo $! >"$work/$name.pid"
 		until [ -s "$out" ] || ! kill -0 "$(cat "$work/$name.pid")" 2>/dev/null; do sleep 0.05; done
 		[ -s "$out" ] && break
@@ -403,6 +403,34 @@ test_a_daemon_passes_on_what_another_one_has() {
 		req GET "/v1/scans/$scan"
 	done
 	expect_json '.detail | contains("host c of the fleet has it, which has no address")'
+}
+
+test_a_scan_is_brought_once_for_all_its_jobs() {
+	local i stored
+	begin
+	undisturbed "$scan_dir" "$small" small
+	taker a --fleet-keep-scans 600 --log-level debug
+	owner c
+	at c
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	for i in 1 2 3; do
+		post_job "$small"
+		wait_job succeeded
+		expect_json '.device | startswith("a: ")'
+		same_bits small
+	done
+	stored=$(grep -c 'method=PUT target=/v1/scans/.*/projections' "$work/a.err")
+	[ "$stored" = 1 ] || fail "projections were sent once, got $stored times"
+	[ "$(curl -s "$(cat "$work/a.url")/v1/scans" | jq '.scans | length')" = 1 ] || fail "one copy"
+	# It goes with the scan.
+	for job in $(curl -s "$url/v1/jobs" | jq -r '.jobs[].id'); do
+		req DELETE "/v1/jobs/$job"
+		expect_status 204
+	done
+	req DELETE "/v1/scans/$scan"
+	expect_status 204
+	nothing_left a
 }
 
 # turns_until HOST: projections come, one a second, until some of $job's are reconstructed there; $next is the next to come
