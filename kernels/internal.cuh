@@ -241,7 +241,10 @@ struct device_grid {
 };
 
 enum { BATCH_MOST = 128 }; /* views that are filtered and backprojected in one go */
-enum { ROWS_APART = 4 };   /* rows of a thread that share columns, but no values */
+enum {
+	LEANING_RUN = 16
+};                       /* voxels along z, in whose height the matched pair's columns may lean by less than a voxel */
+enum { ROWS_APART = 4 }; /* rows of a thread that share columns, but no values */
 
 /*
  * How a plan saves memory, if at all: the corrections of a subset are laid out in
@@ -251,9 +254,10 @@ enum { ROWS_APART = 4 };   /* rows of a thread that share columns, but no values
 enum thrift { THRIFT_NONE, THRIFT_HALVES, THRIFT_2_PARTS, THRIFT_3_PARTS, THRIFT_4_PARTS, THRIFT_LEAN };
 
 /*
- * The matched backprojection, by what its rays are like: any; no ray along z; none, and the detector's columns along z.
+ * The matched backprojection, by what its rays are like: any; no ray along z; none, and the
+ * detector's columns along z but for a little; the same, along z.
  */
-enum matched { MATCHED_ANY, MATCHED_TILTED, MATCHED_UPRIGHT };
+enum matched { MATCHED_ANY, MATCHED_TILTED, MATCHED_LEANING, MATCHED_UPRIGHT };
 
 /* Length of the filter's transform of a row: in one kernel, or by cuFFT where that is too short. */
 struct transform_length {

@@ -3,7 +3,7 @@
  * place, others through the scratch, some views at a time. Column sums are those of ones, kept where
  * they are used again.
  */
-#include "kernels/matched_columns.cuh"
+#include "kernels/matched_pencils.cuh"
 
 enum { SIDE = 16 };                           /* of a block across z */
 enum { COLUMNS_WIDE = 32, COLUMNS_HIGH = 8 }; /* the same by columns */
@@ -12,64 +12,6 @@ enum { COLUMNS_THREADS = COLUMNS_WIDE * COLUMNS_HIGH };
 static __global__ void __launch_bounds__(SIDE *SIDE, 3) backproject_matched(const matched_job job)
 {
 	matched_thread(job, blockIdx.x * SIDE + threadIdx.x, blockIdx.y * SIDE + threadIdx.y, blockIdx.z * MATCHED_RUN);
-}
-
-/* Adds the rays of one axis in one view, `view` of those whose pencils were found, to the block's runs. */
-template <bool ENDS>
-static __device__ __forceinline__ void add_pencils(const matched_job &job, const device_view &g,
-						   const float *projection, int view, int axis, int tx, int ty,
-						   upright_tile &tile, float sum[COLUMN_RUN])
-{
-	const int slice = axis == ACROSS_X ? tx : ty, fast = axis == ACROSS_X ? ty : tx;
-	const int most = tile.most[view][axis], times = (most + PENCILS - 1) / PENCILS;
-	const int count = times > 0 ? (most + times - 1) / times : 0;
-	const tile_forms *forms = tile.forms[view][axis];
-	const pencil_range *ranges = tile.range[view][axis];
-	const bool both = tile.most[view][1 - axis] > 0;
-
-	for (int done = 0; done < most; done += count) {
-		find_profiles<ENDS>(job, g, axis, forms, ranges, both, done, count, projection, tile);
-		__syncthreads();
-		take_profiles(job, forms[slice], ranges[slice], slice, fast, done, count, tile, sum);
-		__syncthreads();
-	}
-}
-
-template <bool ENDS>
-static __device__ __forceinline__ void add_upright(const matched_job &job, int tx, int ty, upright_tile &tile,
-						   float sum[COLUMN_RUN])
-{
-	for (int first = 0; first < job.count; first += TILE_VIEWS) {
-		const int views = min(TILE_VIEWS, job.count - first);
-
-		__syncthreads(); /* nobody reads those of the views before */
-		find_pencils(job, first, views, tile);
-		__syncthreads();
-		for (int i = 0; i < 2 * views; i++)
-			add_pencils<ENDS>(job, job.geometry[job.views[first + i / 2]],
-					  job.from + (size_t)(first + i / 2) * job.slot, i / 2, i % 2, tx, ty, tile,
-					  sum);
-	}
-}
-
-static __global__ void __launch_bounds__(TILE *TILE, 4) backproject_upright(const matched_job job)
-{
-	__shared__ upright_tile tile;
-	const int *size = job.grid.size;
-	/* A warp has eight runs by four: of either axis a few slices, and few runs of each. */
-	const int t = (int)(threadIdx.y * TILE + threadIdx.x);
-	const int tx = t % 8 + t / 32 % 2 * 8, ty = t / 8 % 4 + t / 64 * 4;
-	const int x = (int)blockIdx.x * TILE + tx, y = (int)blockIdx.y * TILE + ty, z = (int)blockIdx.z * COLUMN_RUN;
-	float sum[COLUMN_RUN] = {};
-
-	if (z == 0 || z + COLUMN_RUN >= size[2])
-		add_upright<true>(job, tx, ty, tile, sum);
-	else
-		add_upright<false>(job, tx, ty, tile, sum);
-#pragma unroll
-	for (int n = 0; n < COLUMN_RUN; n++)
-		if (x < size[0] && y < size[1] && z + n < size[2])
-			matched_put(job, ((size_t)(z + n) * size[1] + y) * size[0] + x, sum[n]);
 }
 
 static __global__ void __launch_bounds__(COLUMNS_THREADS, 3) backproject_tilted(const matched_job job)
@@ -93,8 +35,66 @@ static __global__ void __launch_bounds__(COLUMNS_THREADS, 3) backproject_tilted(
 }
 
 /*
- * Values of some views times the way from the source to the pixel, mm; NULL: of ones. Around a slot's rows come the
- * zeros of a stack.
+ * Puts the sums of a tile's thread, those of the columns beside the grid with the outer ones. `shared`: of RUN rows of
+ * PENCILS_WIDE.
+ */
+template <int AXIS, int RUN>
+static __device__ __forceinline__ void put_runs(const matched_job &job, const matched_run &run, int wide, float *shared,
+						float sum[RUN])
+{
+	float(*sums)[PENCILS_WIDE] = (float(*)[PENCILS_WIDE])shared;
+	const int *size = job.grid.size;
+	const int j = (int)threadIdx.x, fast = run.fast + j, most = size[1 - AXIS];
+	const int x = AXIS == ACROSS_X ? run.slice : fast, y = AXIS == ACROSS_X ? fast : run.slice;
+
+#pragma unroll
+	for (int k = 0; k < RUN; k++)
+		sums[k][j] = sum[k];
+	__syncthreads();
+	if (j >= wide || fast < 0 || fast >= most)
+		return;
+#pragma unroll
+	for (int k = 0; k < RUN; k++) {
+		for (int i = 1; i <= PENCILS_BEYOND; i++) {
+			sum[k] += fast == 0 ? sums[k][j - i] : 0.0f;
+			sum[k] += fast == most - 1 ? sums[k][j + i] : 0.0f;
+		}
+		if (run.row + k < size[2])
+			matched_put(job, ((size_t)(run.row + k) * size[1] + y) * size[0] + x, sum[k]);
+	}
+}
+
+/* What rays of one axis give, in tiles that have `wide` columns each, those beside the grid among them. */
+template <int AXIS>
+static __global__ void __launch_bounds__(PENCILS_WIDE, PENCILS_BLOCKS)
+    backproject_leaning(const matched_job job, int wide)
+{
+	__shared__ leaning_tile tile;
+	const matched_run run = {AXIS, (int)blockIdx.x, (int)blockIdx.y * wide - PENCILS_BEYOND,
+				 (int)blockIdx.z * LEANING_RUN};
+	float sum[LEANING_RUN] = {};
+
+	leaning_thread<AXIS>(job, run, wide, tile, sum);
+	put_runs<AXIS, LEANING_RUN>(job, run, wide, tile.profile[0], sum);
+}
+
+/* The same upright. */
+template <int AXIS>
+static __global__ void __launch_bounds__(PENCILS_WIDE, PENCILS_BLOCKS)
+    backproject_upright(const matched_job job, int wide)
+{
+	__shared__ upright_tile tile;
+	const matched_run run = {AXIS, (int)blockIdx.x, (int)blockIdx.y * wide - PENCILS_BEYOND,
+				 (int)blockIdx.z * UPRIGHT_RUN};
+	float sum[UPRIGHT_RUN] = {};
+
+	upright_thread<AXIS>(job, run, wide, tile, sum);
+	put_runs<AXIS, UPRIGHT_RUN>(job, run, wide, &tile.profile[0][0].x, sum);
+}
+
+/*
+ * Values of some views times the way from the source to the pixel, mm, or from slice to slice of the ray's axis; NULL:
+ * of ones. Around a slot's rows come the zeros of a stack.
  */
 static __global__ void __launch_bounds__(256) times_way(const matched_job job, const float *from, float *to)
 {
@@ -102,7 +102,7 @@ static __global__ void __launch_bounds__(256) times_way(const matched_job job, c
 	const device_view &g = job.geometry[job.views[blockIdx.z]];
 	size_t at = blockIdx.z * job.slot + (ptrdiff_t)row * job.pitch + column;
 	float c = (float)column - 0.5f * (float)(job.columns - 1), r = (float)row - 0.5f * (float)(job.rows - 1),
-	      way = 0;
+	      way = 0, most = 0;
 
 	if (column >= job.pitch || row >= job.rows + STACK_PAD)
 		return;
@@ -111,11 +111,13 @@ static __global__ void __launch_bounds__(256) times_way(const matched_job job, c
 		return;
 	}
 	for (int i = 0; i < 3; i++) {
-		float d = form(g.direction[i], c, r) * job.grid.spacing[i];
+		float d = form(g.direction[i], c, r), length = d * job.grid.spacing[i];
 
-		way = fmaf(d, d, way);
+		way = fmaf(length, length, way);
+		most = fmaxf(most, fabsf(d));
 	}
-	to[at] = sqrtf(way) * (from != NULL ? from[at] : 1.0f);
+	way = job.steps ? sqrtf(way) / most : sqrtf(way);
+	to[at] = way * (from != NULL ? from[at] : 1.0f);
 }
 
 static matched_job job_of(const struct plan *plan, int first, int count)
@@ -131,6 +133,7 @@ static matched_job job_of(const struct plan *plan, int first, int count)
 	job.slot = plan->stack.slot;
 	job.grid = plan->grid;
 	job.z_rays = plan->shape.z_rays;
+	job.steps = plan->shape.matched >= MATCHED_LEANING;
 	return job;
 }
 
@@ -143,6 +146,37 @@ static int launch_way(struct plan *plan, const matched_job &job, const float *fr
 	return 0;
 }
 
+template <int AXIS>
+static int launch_axis(const matched_job &job, bool upright, cudaStream_t stream, struct error *err)
+{
+	const int *size = job.grid.size;
+	const int columns = size[1 - AXIS] + 2 * PENCILS_BEYOND, run = upright ? (int)UPRIGHT_RUN : (int)LEANING_RUN;
+	int tiles = divide_up(columns, PENCILS_WIDE);
+
+	/* The last one has an outer column of the grid and those beyond it. */
+	while (columns - (tiles - 1) * divide_up(columns, tiles) < 1 + PENCILS_BEYOND)
+		tiles++;
+	const dim3 blocks(size[AXIS], tiles, divide_up(size[2], run));
+	const int wide = divide_up(columns, tiles);
+
+	if (upright)
+		backproject_upright<AXIS><<<blocks, PENCILS_WIDE, 0, stream>>>(job, wide);
+	else
+		backproject_leaning<AXIS><<<blocks, PENCILS_WIDE, 0, stream>>>(job, wide);
+	LAUNCHED();
+	return 0;
+}
+
+/* A launch for either axis. What an update makes of the first may be below 0, since the second goes on from there. */
+static int launch_axes(const matched_job &job, bool upright, cudaStream_t stream, struct error *err)
+{
+	matched_job first = job;
+
+	first.use.nonnegative = false;
+	TRY(launch_axis<ACROSS_X>(first, upright, stream, err));
+	return launch_axis<ACROSS_Y>(job, upright, stream, err);
+}
+
 static int launch_back(struct plan *plan, const matched_job &job, struct error *err)
 {
 	const int *size = job.grid.size;
@@ -152,9 +186,8 @@ static int launch_back(struct plan *plan, const matched_job &job, struct error *
 
 	switch (plan->shape.matched) {
 	case MATCHED_UPRIGHT:
-		blocks = dim3(divide_up(size[0], TILE), divide_up(size[1], TILE), divide_up(size[2], COLUMN_RUN));
-		backproject_upright<<<blocks, dim3(TILE, TILE), 0, stream>>>(job);
-		break;
+	case MATCHED_LEANING:
+		return launch_axes(job, plan->shape.matched == MATCHED_UPRIGHT, stream, err);
 	case MATCHED_TILTED:
 		backproject_tilted<<<blocks, threads, 0, stream>>>(job);
 		break;

@@ -37,6 +37,7 @@ struct matched_job {
 	size_t slot;
 	device_grid grid;
 	bool z_rays; /* some rays run along z */
+	bool steps;  /* values come times the step from slice to slice in place of the way */
 	struct voxel_use use;
 	float *volume;
 };

@@ -256,25 +256,35 @@ static bool is_before_source(const struct geometry *geometry, const struct grid 
 	return true;
 }
 
+/* How far the rows lean, in voxels. */
+static double lean_in_voxels(const struct plan_options *options)
+{
+	const double *spacing = options->grid->spacing;
+	double lean = 0;
+
+	for (int k = 0; k < options->geometry->count; k++)
+		lean = fmax(lean, lean_of(&options->geometry->views[k]));
+	return lean * spacing[2] / fmin(spacing[0], spacing[1]);
+}
+
 static enum matched choose_matched(const struct plan_options *options, bool z_rays)
 {
 	if (z_rays || !is_before_source(options->geometry, options->grid))
 		return MATCHED_ANY;
-	return is_upright(options->geometry) ? MATCHED_UPRIGHT : MATCHED_TILTED;
+	if (is_upright(options->geometry))
+		return MATCHED_UPRIGHT;
+	return 1.5 * lean_in_voxels(options) * (LEANING_RUN + 2) < 0.95 ? MATCHED_LEANING : MATCHED_TILTED;
 }
 
 static void choose_rows(const struct plan_options *options, struct plan_shape *shape)
 {
 	const struct geometry *geometry = options->geometry;
-	const double *spacing = options->grid->spacing;
-	double least, most, lean = 0;
+	double least, most;
 	neighbours_choice choice;
 	int sign;
 
-	for (int k = 0; k < geometry->count; k++)
-		lean = fmax(lean, lean_of(&geometry->views[k]) * spacing[2] / fmin(spacing[0], spacing[1]));
 	shape->untilted = is_untilted(options);
-	if (!shape->untilted && !(shape->halves && lean < LEAN_MOST))
+	if (!shape->untilted && !(shape->halves && lean_in_voxels(options) < LEAN_MOST))
 		return;
 	row_spacing(geometry, options->grid, &least, &most, &sign);
 	shape->untilted = shape->untilted && sign != 0;
