@@ -45,6 +45,7 @@ struct linearise {
 	/* Of intensities, before all else (core/correct/lag.h, scatter.h); NULL: none. A backend knows neither. */
 	const struct lag_model *lag;
 	const struct scatter_model *scatter;
+	const struct scatter_source *scatter_source; /* where the model has images (core/correct/scatter_images.h) */
 	const int *numbers; /* [views], rising: each view's number in the order of time; NULL: its own */
 };
 enum { HARDENING_MOST = 8 }; /* coefficients */

@@ -68,6 +68,10 @@ const struct warning_kind warning_kinds[] = {
     {"scatter_constant", SEVERITY_CAUTION,
      "Scattered radiation was taken for the same everywhere: gray values are off, most of all near the patient's "
      "surface."},
+    {"scatter_faint", SEVERITY_CAUTION,
+     "The images of scattered radiation hardly show any: they may be in another unit, and gray values are off then."},
+    {"no_scatter", SEVERITY_CAUTION,
+     "Images of scattered radiation that the scan announces are not there yet: it waits for them."},
     {"scatter_limited", SEVERITY_CAUTION,
      "The correction for scattered radiation wanted to take nearly all of the signal in some places: gray values may "
      "be wrong there."},

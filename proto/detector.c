@@ -3,6 +3,9 @@
 
 #include <math.h>
 #include <stdio.h>
+#include <string.h>
+
+#include "core/scan/geometry.h"
 
 static const double share_sum_most = 0.9;
 
@@ -98,6 +101,24 @@ static void kernels_read(struct json_reader *reader, struct scatter_model *model
 	}
 }
 
+static void images_read(struct json_reader *reader, struct scatter_images *images)
+{
+	long columns = 0, rows = 0, every = 1;
+	const cJSON *kind = json_member(reader, "kind", false);
+
+	if (kind == NULL)
+		return;
+	if (!cJSON_IsString(kind) || strcmp(kind->valuestring, "images") != 0) {
+		json_fail(reader, ERR_INVALID, "kind",
+			  "\"images\" is expected, or no kind beside kernels or a fraction");
+		return;
+	}
+	json_integer(reader, "columns", true, 1, SCATTER_IMAGE_MOST, &columns);
+	json_integer(reader, "rows", true, 1, SCATTER_IMAGE_MOST, &rows);
+	json_integer(reader, "every", false, 1, VIEWS_MAX, &every);
+	*images = (struct scatter_images){(int)columns, (int)rows, (int)every};
+}
+
 void scatter_read(struct json_reader *reader, struct scatter_model *ret_model)
 {
 	const cJSON *object = json_member(reader, "scatter", false);
@@ -110,8 +131,11 @@ void scatter_read(struct json_reader *reader, struct scatter_model *ret_model)
 	json_begin(&inner, object, base, reader->err);
 	kernels_read(&inner, ret_model);
 	json_number(&inner, "fraction", false, 0.001, SCATTER_FRACTION_MOST, &ret_model->fraction);
-	if (inner.code == 0 && (ret_model->count > 0) == (ret_model->fraction > 0))
-		json_fail(&inner, ERR_INVALID, "", "either \"kernels\" or a \"fraction\" is expected");
+	images_read(&inner, &ret_model->images);
+	if (inner.code == 0 &&
+	    (ret_model->count > 0) + (ret_model->fraction > 0) + (ret_model->images.columns > 0) != 1)
+		json_fail(&inner, ERR_INVALID, "",
+			  "either \"kernels\" or a \"fraction\" is expected, or \"images\" as \"kind\"");
 	entry_end(reader, &inner);
 }
 

@@ -40,6 +40,7 @@ static void add_images(cJSON *json, const struct provenance *provenance)
 
 	for (int i = 0; i < IMAGE_COUNT; i++)
 		add_text(images, image_kinds[i].name, provenance->image_digest[i]);
+	add_text(images, "scatter", provenance->scatter_digest);
 	if (images != NULL && images->child != NULL)
 		cJSON_AddItemToObject(json, "images", images);
 	else
@@ -100,6 +101,7 @@ int provenance_read(const cJSON *json, struct provenance *ret_provenance, struct
 		read_text(json, texts[i].name, (char *)&provenance + texts[i].offset, texts[i].size);
 	for (int i = 0; i < IMAGE_COUNT; i++)
 		read_text(images, image_kinds[i].name, provenance.image_digest[i], DIGEST_TEXT_MAX);
+	read_text(images, "scatter", provenance.scatter_digest, DIGEST_TEXT_MAX);
 	if (cJSON_IsNumber(iteration))
 		provenance.iteration = iteration->valueint;
 	if (cJSON_IsObject(recipe)) {

@@ -19,7 +19,8 @@ struct provenance {
 	/* Digests of what the voxels were computed from (proto/digest.h), those of images as of their stored bytes. */
 	char scan_digest[DIGEST_TEXT_MAX], projections_digest[DIGEST_TEXT_MAX], recipe_digest[DIGEST_TEXT_MAX];
 	char image_digest[IMAGE_COUNT][DIGEST_TEXT_MAX];
-	cJSON *recipe; /* as resolved; owned, or NULL */
+	char scatter_digest[DIGEST_TEXT_MAX]; /* over those of the images of scatter */
+	cJSON *recipe;                        /* as resolved; owned, or NULL */
 };
 #define CBCTD_PROGRAM "cbctd " CBCT_VERSION
 #define CBCT_PROGRAM "cbct " CBCT_VERSION

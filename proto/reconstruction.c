@@ -17,6 +17,7 @@
 #include "core/algebra.h"
 #include "core/recon/algorithm.h"
 #include "core/correct/rings.h"
+#include "core/correct/scatter_images.h"
 #include "core/correct/stuck.h"
 #include "core/pulse.h"
 #include "proto/checkpoint.h"
@@ -27,6 +28,7 @@
 #include "proto/seal.h"
 #include "proto/sums.h"
 #include "proto/scan_directory.h"
+#include "proto/scatter_file.h"
 
 _Static_assert((int)VOLUME_FILE_OFFSET == (int)NIFTI_VOXELS, "a NIfTI-1 header and its extension");
 
@@ -392,6 +394,9 @@ struct reconstruction {
 	struct linearise linearise;
 	/* Looks for stuck pixels in the views as they pass; NULL before the recon is opened, and where too few are. */
 	struct stuck *stuck;
+	struct scatter_file scatter; /* where the scan has images of it */
+	int *scattered;              /* [images], the projections that have one */
+	struct scatter_source scatter_source;
 	float *errors, *flat; /* of pixels' gain, and the image that has them; NULL where there are none */
 	bool looked;          /* what is asked of all views for their pixels is known */
 };
@@ -418,6 +423,49 @@ static int allocate(struct reconstruction *reconstruction, struct error *err)
 	return 0;
 }
 
+static int read_scatter(void *context, int at, float *ret_image, struct error *err)
+{
+	const struct reconstruction *reconstruction = context;
+	const struct scatter_file *file = &reconstruction->scatter;
+	struct sum sum;
+
+	return scatter_file_read(file,
+				 scatter_image_of(&file->images, file->projections, reconstruction->scattered[at]),
+				 ret_image, &sum, err);
+}
+
+/* Opens the images of scatter, where the scan has any: those of the projections that are present. */
+static int open_scatter(struct reconstruction *reconstruction, struct error *err)
+{
+	const struct reconstruction_options *options = reconstruction->options;
+	const struct scatter_images *images = &reconstruction->files.scan->scatter.images;
+	struct scatter_source *source = &reconstruction->scatter_source;
+	struct scatter_file *file = &reconstruction->scatter;
+	bool whole;
+	int code;
+
+	if (images->columns == 0)
+		return 0;
+	code = scatter_file_open(options->scan_directory, images, reconstruction->announced, false, file, &whole, err);
+	if (options->checked && (code == ERR_NOT_FOUND || code == ERR_INVALID || (code == 0 && file->sums < 0)))
+		return error_set(err, ERR_DAMAGED, "the scan's images of scatter are damaged");
+	if (code != 0)
+		return code;
+	reconstruction->scattered = malloc((size_t)file->count * sizeof(*reconstruction->scattered));
+	if (reconstruction->scattered == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a list of %d images", file->count);
+	for (int i = 0; i < file->count; i++) {
+		const int projection = scatter_image_projection(images, file->projections, i);
+
+		if (options->present == NULL || options->present[projection])
+			reconstruction->scattered[source->count++] = projection;
+	}
+	source->context = reconstruction;
+	source->projections = reconstruction->scattered;
+	source->read = read_scatter;
+	return 0;
+}
+
 static int set_linearise(struct reconstruction *reconstruction, struct error *err)
 {
 	const struct scan_files *files = &reconstruction->files;
@@ -426,6 +474,7 @@ static int set_linearise(struct reconstruction *reconstruction, struct error *er
 	*linearise = scan_linearise(files->scan);
 	for (int i = 0; i < IMAGE_COUNT; i++)
 		linearise->image[i] = files->image[i];
+	linearise->scatter_source = &reconstruction->scatter_source;
 	if (linearise->quantity == QUANTITY_INTENSITY && linearise->air <= 0 && linearise->image[IMAGE_FLAT] == NULL)
 		return error_set(err, ERR_IMPOSSIBLE, "intensities need an air value or a flat image, none is there");
 	return 0;
@@ -606,6 +655,33 @@ static int set_provenance(struct reconstruction *reconstruction, const struct re
 	return code == 0 ? digest_scan(scan, provenance->scan_digest, err) : code;
 }
 
+/* The digest over those of the images of scatter. */
+static int set_scatter_digest(struct reconstruction *reconstruction, struct error *err)
+{
+	const struct scatter_file *file = &reconstruction->scatter;
+	uint8_t *sha256;
+	int code = 0;
+
+	if (file->count == 0 || file->sums < 0)
+		return 0;
+	sha256 = calloc((size_t)file->count, DIGEST_BYTES);
+	if (sha256 == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for %d digests", file->count);
+	for (int i = 0; i < reconstruction->scatter_source.count && code == 0; i++) {
+		const int image = scatter_image_of(&file->images, file->projections, reconstruction->scattered[i]);
+		unsigned char state = SUM_NONE;
+		struct sum sum;
+
+		code = sums_get(file->sums, image, 1, 0, &sum, &state, err);
+		if (code == 0 && state == SUM_GOOD)
+			memcpy(sha256 + (size_t)image * DIGEST_BYTES, sum.sha256, DIGEST_BYTES);
+	}
+	if (code == 0)
+		code = digest_projections(sha256, file->count, reconstruction->run.provenance.scatter_digest, err);
+	free(sha256);
+	return code;
+}
+
 /* Sets the digests of the images and, once all have been pushed, of the projections, where the directory has records.
  */
 static int set_digests(struct reconstruction *reconstruction, struct error *err)
@@ -619,6 +695,8 @@ static int set_digests(struct reconstruction *reconstruction, struct error *err)
 
 	if (files->sums < 0)
 		return 0;
+	if (set_scatter_digest(reconstruction, err) != 0)
+		return err->code;
 	sha256 = calloc((size_t)reconstruction->announced, DIGEST_BYTES);
 	sums = calloc((size_t)reconstruction->announced, sizeof(*sums));
 	states = calloc((size_t)reconstruction->announced, 1);
@@ -674,6 +752,7 @@ int reconstruction_open(const struct backend *backend, struct device *device,
 	reconstruction->backend = backend;
 	reconstruction->device = device;
 	reconstruction->files.projections = reconstruction->files.sums = -1;
+	reconstruction->options = options;
 	code = scan_files_open(options->scan_directory, &reconstruction->files, err);
 	if (code == 0 && options->checked && reconstruction->files.sums < 0)
 		code = error_set(err, ERR_DAMAGED, "the scan has no %s", SUMS_FILE);
@@ -682,10 +761,11 @@ int reconstruction_open(const struct backend *backend, struct device *device,
 	if (code == 0)
 		reconstruction->announced = reconstruction->files.scan->count;
 	if (code == 0)
+		code = open_scatter(reconstruction, err);
+	if (code == 0)
 		code = options->present == NULL ? 0 : scan_reduce(reconstruction->files.scan, options->present, err);
 	if (code == 0)
 		code = allocate(reconstruction, err);
-	reconstruction->options = options;
 	reconstruction->iteration = options->iteration;
 	reconstruction->resumed = options->checkpoint != NULL;
 	if (code == 0 && options->checkpoint_seconds > 0 && options->checkpoint == NULL)
@@ -715,6 +795,8 @@ void reconstruction_close(struct reconstruction *reconstruction)
 	free(reconstruction->errors);
 	free(reconstruction->flat);
 	scan_files_close(&reconstruction->files);
+	scatter_file_close(&reconstruction->scatter);
+	free(reconstruction->scattered);
 	free(reconstruction->views);
 	free(reconstruction->samples);
 	free(reconstruction);

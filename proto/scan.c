@@ -117,6 +117,13 @@ size_t scan_projection_bytes(const struct scan *scan)
 	return (size_t)scan->geometry.columns * (size_t)scan->geometry.rows * sample_bytes(scan->sample);
 }
 
+static bool has_scatter(const struct scan *scan)
+{
+	const struct scatter_model *scatter = &scan->scatter;
+
+	return scatter->count > 0 || scatter->fraction > 0 || scatter->images.columns > 0;
+}
+
 struct linearise scan_linearise(const struct scan *scan)
 {
 	struct linearise linearise = {
@@ -128,7 +135,7 @@ struct linearise scan_linearise(const struct scan *scan)
 	    .hardening = scan->hardening,
 	    .hardening_count = scan->hardening_count,
 	    .lag = scan->lag.count > 0 ? &scan->lag : NULL,
-	    .scatter = scan->scatter.count > 0 || scan->scatter.fraction > 0 ? &scan->scatter : NULL,
+	    .scatter = has_scatter(scan) ? &scan->scatter : NULL,
 	    .numbers = scan->projection,
 	};
 
@@ -206,7 +213,7 @@ static int read_projections(struct scan *scan, const cJSON *projections, struct 
 	scatter_read(&reader, &scan->scatter);
 	if (integrals && scan->lag.count > 0)
 		json_fail(&reader, ERR_INVALID, "lag", "line integrals have no lag any more, it belongs to intensity");
-	if (integrals && (scan->scatter.count > 0 || scan->scatter.fraction > 0))
+	if (integrals && has_scatter(scan))
 		json_fail(&reader, ERR_INVALID, "scatter",
 			  "scatter cannot be taken off line integrals, it belongs to intensity");
 	if (integrals && scan->has_air_region)
@@ -216,6 +223,11 @@ static int read_projections(struct scan *scan, const cJSON *projections, struct 
 	if (integrals && scan->saturation != 0)
 		json_fail(&reader, ERR_INVALID, "saturation", "line integrals do not saturate, intensities do");
 	bytes = scan_projection_bytes(scan) * (uint64_t)scan->count;
+	if (scatter_image_bytes(&scan->scatter.images) *
+		(uint64_t)scatter_images_count(&scan->scatter.images, scan->count) >
+	    bytes_most)
+		json_fail(&reader, ERR_IMPOSSIBLE, "scatter", "images of more than %.4g GB in all",
+			  (double)bytes_most * 1e-9);
 	if (bytes > bytes_most)
 		json_fail(&reader, ERR_IMPOSSIBLE, "count", "projections of %.4g GB in all, at most %.4g are accepted",
 			  (double)bytes * 1e-9, (double)bytes_most * 1e-9);

@@ -17,6 +17,7 @@
  *   projections.raw  [view][row][column] of the scan's sample type, preallocated
  *   projections.sums checksums of all these files (proto/sums.h); the daemon always has them
  *   flat.f32 ...     the images that are given, core/scan/image.h
+ *   scatter.raw ...  images of scatter, where the scan announces them, proto/scatter_file.h
  *
  * Kept volumes are NAME.nii files: a NIfTI header with an extension that says where
  * they come from, VOLUME_FILE_OFFSET bytes in all, and float32 voxels, so that raw

@@ -125,13 +125,6 @@ enum sum_state sum_unpack(const uint8_t record[SUMS_RECORD_BYTES], int slot, str
 
 /* ---- the file ---- */
 
-static int sums_path(const char *directory, char ret_path[PATH_MAX], struct error *err)
-{
-	if (snprintf(ret_path, PATH_MAX, "%s/%s", directory, SUMS_FILE) >= PATH_MAX)
-		return error_set(err, ERR_INVALID, "the path of %s in %.200s is too long", SUMS_FILE, directory);
-	return 0;
-}
-
 static void write_line(int count, size_t projection_bytes, char ret_line[SUMS_RECORD_BYTES])
 {
 	char text[SUMS_RECORD_BYTES];
@@ -148,19 +141,24 @@ static size_t file_bytes(int count)
 	return SUMS_FIRST + (size_t)SUMS_RECORD_BYTES * (size_t)count;
 }
 
-int sums_create(const char *directory, int count, size_t projection_bytes, struct error *err)
+int sums_create_file(const char *directory, const char *name, int count, size_t each, struct error *err)
 {
 	/* Zeros that are written, not set aside: each later sync finds its blocks in place. */
 	char path[PATH_MAX], *bytes = calloc(1, file_bytes(count));
 	int code = bytes == NULL ? error_set_errno(err, ENOMEM, "checksums of %d projections", count)
-				 : sums_path(directory, path, err);
+				 : path_join(path, sizeof(path), directory, name, "", err);
 
 	if (code == 0) {
-		write_line(count, projection_bytes, bytes);
+		write_line(count, each, bytes);
 		code = file_write_durable(path, bytes, file_bytes(count), err);
 	}
 	free(bytes);
 	return code;
+}
+
+int sums_create(const char *directory, int count, size_t projection_bytes, struct error *err)
+{
+	return sums_create_file(directory, SUMS_FILE, count, projection_bytes, err);
 }
 
 /* Whether this line is a good one, though of other numbers. */
@@ -188,11 +186,11 @@ static int check_line(int file, const char *path, int count, size_t projection_b
 			 found, count, projection_bytes);
 }
 
-int sums_open(const char *directory, bool writing, int count, size_t projection_bytes, int *ret_file, bool *ret_whole,
-	      struct error *err)
+int sums_open_file(const char *directory, const char *name, bool writing, int count, size_t each, int *ret_file,
+		   bool *ret_whole, struct error *err)
 {
 	char path[PATH_MAX];
-	int file, code = sums_path(directory, path, err);
+	int file, code = path_join(path, sizeof(path), directory, name, "", err);
 
 	if (code != 0)
 		return code;
@@ -201,12 +199,18 @@ int sums_open(const char *directory, bool writing, int count, size_t projection_
 		return error_set(err, ERR_NOT_FOUND, "%.200s does not exist", path);
 	if (file < 0)
 		return error_set_errno(err, errno, "%s cannot be opened", path);
-	code = check_line(file, path, count, projection_bytes, ret_whole, err);
+	code = check_line(file, path, count, each, ret_whole, err);
 	if (code != 0)
 		close(file);
 	else
 		*ret_file = file;
 	return code;
+}
+
+int sums_open(const char *directory, bool writing, int count, size_t projection_bytes, int *ret_file, bool *ret_whole,
+	      struct error *err)
+{
+	return sums_open_file(directory, SUMS_FILE, writing, count, projection_bytes, ret_file, ret_whole, err);
 }
 
 static off_t offset_of(int slot)

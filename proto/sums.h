@@ -27,6 +27,7 @@
  * Any thread; one writer of a record at a time.
  */
 #define SUMS_FILE "projections.sums"
+#define SUMS_SCATTER_FILE "scatter.sums" /* of images of scatter, proto/scatter_file.h; it has no parts */
 
 enum { SUMS_RECORD_BYTES = 64, SUMS_FIRST = 512 };
 
@@ -55,6 +56,7 @@ uint32_t checksum_join(uint32_t before, uint32_t after, size_t bytes);
 
 /* The file with all records blank, durably; one that was there is replaced. */
 int sums_create(const char *directory, int count, size_t projection_bytes, struct error *err);
+int sums_create_file(const char *directory, const char *name, int count, size_t each, struct error *err);
 /*
  * A descriptor, the caller's to close. ERR_NOT_FOUND where there is no file, ERR_INVALID where it is another scan's. A
  * line that is damaged is passed over (*ret_whole false, as when the file is too short): the records check themselves.
@@ -62,6 +64,8 @@ int sums_create(const char *directory, int count, size_t projection_bytes, struc
  */
 int sums_open(const char *directory, bool writing, int count, size_t projection_bytes, int *ret_file, bool *ret_whole,
 	      struct error *err);
+int sums_open_file(const char *directory, const char *name, bool writing, int count, size_t each, int *ret_file,
+		   bool *ret_whole, struct error *err);
 /* Writes a record and does not sync it; sum NULL: a blank one. */
 int sums_put(int file, int slot, const struct sum *sum, struct error *err);
 /*

@@ -217,11 +217,11 @@ static bool is_left_out(const char *path)
 /* Records before lists, lists before samples, whatever else first. */
 static int place_of(const char *name)
 {
-	static const char *const last[] = {"projections.sums", "projections.raw"};
+	static const char *const last[] = {"projections.sums", "projections.raw", "scatter.sums", "scatter.raw"};
 
 	if (strcmp(name, "record.json") == 0)
 		return -1;
-	for (int i = 0; i < 2; i++) {
+	for (int i = 0; i < 4; i++) {
 		if (strcmp(name, last[i]) == 0)
 			return 1 + i;
 	}

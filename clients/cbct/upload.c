@@ -23,6 +23,7 @@
 #include "clients/cbct/warning.h"
 #include "clients/cbct/worklist.h"
 #include "proto/scan_directory.h"
+#include "proto/scatter_file.h"
 #include "proto/zstream.h"
 
 /* Projections count with the end of their request: a job that waits for them has little left to read behind the last.
@@ -279,6 +280,40 @@ static int send_images(struct http *http, const struct upload *upload, const str
 	return code;
 }
 
+/* scatter.raw, where the scan announces images of scatter and the directory has them. */
+static int send_scatter(struct http *http, const struct upload *upload, const char *directory, const struct scan *scan,
+			struct error *err)
+{
+	const struct scatter_images *images = &scan->scatter.images;
+	const size_t bytes = scatter_image_bytes(images);
+	struct scatter_file file;
+	float *pixels = NULL;
+	bool whole;
+	int code = images->columns == 0 ? ERR_NOT_FOUND
+					: scatter_file_open(directory, images, scan->count, false, &file, &whole, err);
+
+	if (code == ERR_NOT_FOUND) /* they may come by other ways; the daemon says what it lacks */
+		return 0;
+	if (code == 0) {
+		pixels = malloc(bytes);
+		if (pixels == NULL)
+			code = error_set(err, ERR_NO_MEMORY, "no memory for an image of %zu bytes", bytes);
+		for (int i = 0; i < file.count && code == 0; i++) {
+			char path[160];
+			struct sum sum;
+
+			snprintf(path, sizeof(path), "/v1/scans/%s/scatter/%d", upload->id,
+				 scatter_image_projection(images, scan->count, i));
+			code = scatter_file_read(&file, i, pixels, &sum, err);
+			if (code == 0)
+				code = put(http, path, pixels, bytes, upload->options->zstd, err);
+		}
+		scatter_file_close(&file);
+	}
+	free(pixels);
+	return code;
+}
+
 /* The scan as the daemon knows it: posted now, or begun before. */
 static int begin(struct http *http, struct upload *upload, const struct scan *scan, cJSON **ret_document,
 		 struct error *err)
@@ -330,7 +365,7 @@ static int map_projections(struct upload *upload, const struct scan_files *files
 	return 0;
 }
 
-static int upload_files(struct upload *upload, const struct scan_files *files, struct error *err)
+static int upload_files(struct upload *upload, const char *directory, const struct scan_files *files, struct error *err)
 {
 	const struct scan *scan = files->scan;
 	cJSON *document = NULL;
@@ -355,6 +390,8 @@ static int upload_files(struct upload *upload, const struct scan_files *files, s
 	if (code == 0)
 		code = send_images(http, upload, files, err);
 	if (code == 0)
+		code = send_scatter(http, upload, directory, scan, err);
+	if (code == 0)
 		code = send_runs(upload, err);
 	cJSON_Delete(document);
 	http_free(http);
@@ -374,7 +411,7 @@ int upload_directory(const char *directory, const struct upload_settings *settin
 	if (code == 0) {
 		if (!settings->quiet)
 			upload.progress = progress_new(stderr, PROGRESS_BAR_ONLY, "uploading");
-		code = upload_files(&upload, &files, err);
+		code = upload_files(&upload, directory, &files, err);
 		progress_free(upload.progress);
 		munmap((void *)upload.all, upload.one * (size_t)files.scan->count);
 	}

@@ -491,6 +491,21 @@ class Client:
         """Sends the dark image ``[row][column]`` of a scan of intensities, float32. False when it was there."""
         return self._put_image(self.scan(scan), "dark", image, _FLOAT32)
 
+    def put_scatter(self, scan: str, view: int, image: npt.ArrayLike) -> bool:
+        """Sends the image ``[row][column]`` of a view's scatter, float32 counts, of a scan that was made with
+        ``scatter={"kind": "images", "columns": 64, "rows": 48, "every": 10}``: of view 0, every tenth and the last. False
+        when the same was there already."""
+        document = self.scan(scan)
+        scatter = document.get("scatter")
+        shape = None if scatter is None else (scatter["rows"], scatter["columns"])
+        return self._put_image(document, f"scatter/{int(view)}", image, _FLOAT32, shape)
+
+    def scatter(self, scan: str, view: int) -> Array:
+        """The image ``[row][column]`` of a view's scatter, as it was stored."""
+        scatter = self.scan(scan).get("scatter") or {}
+        body = self._request("GET", f"/v1/scans/{scan}/scatter/{int(view)}").content
+        return np.frombuffer(body, dtype=_FLOAT32).reshape(scatter["rows"], scatter["columns"])
+
     def delete_image(self, scan: str, name: str) -> None:
         """Removes the image ``flat``, ``dark`` or ``defects``, so that another one can be sent; `Problem` 409 while a job
         runs with it."""
@@ -912,11 +927,18 @@ class Client:
             if problem.status != 404:
                 raise
 
-    def _put_image(self, scan: Document, name: str, image: npt.ArrayLike, dtype: np.dtype[Any]) -> bool:
+    def _put_image(
+        self,
+        scan: Document,
+        name: str,
+        image: npt.ArrayLike,
+        dtype: np.dtype[Any],
+        shape: Optional[Tuple[int, int]] = None,
+    ) -> bool:
         array = np.asanyarray(image)
-        shape = (scan["detector"]["rows"], scan["detector"]["columns"])
-        if array.shape != shape:
-            raise ValueError(f"an image of shape {array.shape}, the detector has {shape}")
+        expected = shape or (scan["detector"]["rows"], scan["detector"]["columns"])
+        if array.shape != expected:
+            raise ValueError(f"an image of shape {array.shape}, the scan has {expected}")
         _check_cast(array.dtype, dtype)
         body = array.astype(dtype, copy=False).tobytes()
         response = self._request("PUT", f"/v1/scans/{scan['id']}/{name}", data=body)

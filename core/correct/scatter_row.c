@@ -1,20 +1,28 @@
-/* Scattered radiation as a row of corrections[]: taken off each view's counts, by kernels or as a constant (scatter.h).
+/*
+ * Scattered radiation as a row of corrections[]: taken off each view's counts, by kernels or as a constant (scatter.h),
+ * or as images of it say (scatter_images.h).
  */
 #include <math.h>
 #include <stdlib.h>
+#include <string.h>
 
 #include "core/correct/correction.h"
 #include "core/correct/input.h"
 #include "core/correct/scatter.h"
+#include "core/correct/scatter_images.h"
 
 /* At least this share of a count is left: no model is so good that it could take more. */
 static const float KEPT_LEAST = 0.05f;
 /* Samples that are held at that share, from which on it is told. */
 static const double LIMITED_MANY = 0.01;
+/* Of the counts: images with less than that are in another unit than the projections. */
+static const double FAINT = 0.001;
 
 struct state {
+	struct scatter_stack *images; /* in place of the next two */
 	struct scatter *scatter;
 	float *total; /* [row][column] against air */
+	double *sums; /* [row][2]: scatter and counts, of images */
 	double shares, share_most;
 	size_t limited;
 	int views;
@@ -41,25 +49,46 @@ static void close_state(void *context)
 	if (state == NULL)
 		return;
 	scatter_free(state->scatter);
+	scatter_stack_free(state->images);
 	free(state->total);
+	free(state->sums);
 	free(state);
 }
 
-static int open_state(const struct correction_job *job, void **ret_state, struct error *err)
+static int open_images(const struct input *input, struct state *state, struct error *err)
+{
+	const struct linearise *given = &input->given;
+	const int detector[2] = {input->binning.columns, input->binning.rows};
+
+	state->sums = malloc((size_t)input->rows * 2 * sizeof(*state->sums));
+	if (state->sums == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for %d rows", input->rows);
+	return scatter_stack_new(&given->scatter->images, given->scatter_source, &input->binning.blocks, detector,
+				 &state->images, err);
+}
+
+static int open_estimate(const struct correction_job *job, struct state *state, struct error *err)
 {
 	const struct input *input = job->input;
 	const struct view *view = &job->geometry->views[0];
 	const double pitch[2] = {vec_norm(view->column_step), vec_norm(view->row_step)};
 	const double pixel[2] = {pitch[input->turned ? 1 : 0], pitch[input->turned ? 0 : 1]};
-	struct state *state = calloc(1, sizeof(*state));
-	int code = 0;
 
-	if (state != NULL)
-		state->total = malloc(input->pixels * sizeof(*state->total));
-	if (state == NULL || state->total == NULL)
-		code = error_set(err, ERR_NO_MEMORY, "no memory for the scatter of a view");
-	if (code == 0)
-		code = scatter_new(input->given.scatter, input->columns, input->rows, pixel, &state->scatter, err);
+	state->total = malloc(input->pixels * sizeof(*state->total));
+	if (state->total == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for the scatter of a view");
+	return scatter_new(input->given.scatter, input->columns, input->rows, pixel, &state->scatter, err);
+}
+
+static int open_state(const struct correction_job *job, void **ret_state, struct error *err)
+{
+	struct state *state = calloc(1, sizeof(*state));
+	int code;
+
+	if (state == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for scatter");
+	code = job->input->given.scatter->images.columns > 0 ? open_images(job->input, state, err)
+							     : open_estimate(job, state, err);
 	if (code < 0)
 		close_state(state);
 	else
@@ -120,31 +149,78 @@ static void estimate(struct state *state, const struct input *input)
 	}
 }
 
+/* The scatter in a row, counts. */
+static void row_of(const struct state *state, const struct input *input, int row, float *ret_row)
+{
+	if (state->images != NULL) {
+		scatter_stack_row(state->images, row, ret_row);
+		return;
+	}
+	scatter_row(state->scatter, row, ret_row);
+	for (int column = 0; column < input->columns; column++)
+		ret_row[column] *= range_of(&input->given, (size_t)row * (size_t)input->columns + (size_t)column);
+}
+
+/* Takes a row's scatter off its counts; returns how many of them are held, and what scatter and counts sum up to. */
+static size_t take_row(const struct state *state, const struct input *input, int row, float *counts, double ret_sums[2])
+{
+	float line[DETECTOR_MAX];
+	size_t limited = 0;
+
+	ret_sums[0] = ret_sums[1] = 0;
+	row_of(state, input, row, line);
+	for (int column = 0; column < input->columns; column++) {
+		const float left = counts[column] - line[column], least = KEPT_LEAST * counts[column];
+
+		if (isnan(counts[column]))
+			continue;
+		ret_sums[0] += (double)line[column];
+		ret_sums[1] += (double)counts[column];
+		limited += left < least;
+		counts[column] = fmaxf(left, least);
+	}
+	return limited;
+}
+
+static double share_of(const struct state *state, const struct input *input)
+{
+	double scatter = 0, counts = 0;
+
+	if (state->images == NULL)
+		return scatter_share(state->scatter);
+	for (int row = 0; row < input->rows; row++) {
+		scatter += state->sums[2 * row];
+		counts += state->sums[2 * row + 1];
+	}
+	return counts > 0 ? scatter / counts : 0;
+}
+
 static int take_out(const struct correction_job *job, void *context, int view, float *counts, struct error *err)
 {
 	struct state *state = context;
 	const struct input *input = job->input;
+	const int *numbers = input->given.numbers;
 	size_t limited = 0;
 	double share;
+	int code = 0;
 
-	(void)view;
-	(void)err;
-	totals_take(input, counts, state->total);
-	estimate(state, input);
+	if (state->images != NULL) {
+		code = scatter_stack_take(state->images, numbers != NULL ? numbers[view] : view, err);
+	} else {
+		totals_take(input, counts, state->total);
+		estimate(state, input);
+	}
+	if (code < 0)
+		return code;
 #pragma omp parallel for schedule(static) reduction(+ : limited)
 	for (int row = 0; row < input->rows; row++) {
-		float line[DETECTOR_MAX];
+		double sums[2];
 
-		scatter_row(state->scatter, row, line);
-		for (int column = 0; column < input->columns; column++) {
-			const size_t at = (size_t)row * (size_t)input->columns + (size_t)column;
-			const float left = counts[at] - line[column] * range_of(&input->given, at);
-
-			limited += left < KEPT_LEAST * counts[at];
-			counts[at] = isnan(counts[at]) ? NAN : fmaxf(left, KEPT_LEAST * counts[at]);
-		}
+		limited += take_row(state, input, row, counts + (size_t)row * (size_t)input->columns, sums);
+		if (state->sums != NULL)
+			memcpy(state->sums + 2 * row, sums, sizeof(sums));
 	}
-	share = scatter_share(state->scatter);
+	share = share_of(state, input);
 	state->shares += share;
 	state->share_most = fmax(state->share_most, share);
 	state->limited += limited;
@@ -166,9 +242,15 @@ static int warn(const struct correction_job *job, void *context, struct error *e
 			     "scatter was taken for the same all over the detector, %.3g of the primary behind the "
 			     "densest part: %.3g %% of the counts on average",
 			     model->fraction, 100 * state->shares / state->views);
+	if (state->images != NULL && state->shares < FAINT * state->views)
+		warning_tell(
+		    job->warnings, "scatter_faint",
+		    "the images of scatter are %.3g %% of the counts on average: are they in another unit than "
+		    "the projections' counts above the dark?",
+		    100 * state->shares / state->views);
 	if ((double)state->limited > LIMITED_MANY * samples)
 		warning_tell(job->warnings, "scatter_limited",
-			     "the scatter's estimate leaves less than %.2g of the counts of %.3g %% of the samples, "
+			     "the scatter leaves less than %.2g of the counts of %.3g %% of the samples, "
 			     "which were held there; it is %.3g %% of the counts on average, %.3g %% at most",
 			     (double)KEPT_LEAST, 100 * (double)state->limited / samples,
 			     100 * state->shares / state->views, 100 * state->share_most);

@@ -68,6 +68,37 @@ static bool add_received(cJSON *document, struct stored_scan *scan, int count)
 	return true;
 }
 
+/* Of a scan that announces images of scatter: which it has; those that are missing, by their projections. */
+static bool add_scatter(cJSON *document, struct stored_scan *scan, const struct scan_facts *facts, bool brief)
+{
+	const struct scan_scatter *scatter = &facts->scatter;
+	cJSON *object, *missing;
+	unsigned char *flags;
+
+	if (scatter->count == 0)
+		return true;
+	object = cJSON_AddObjectToObject(document, "scatter");
+	cJSON_AddStringToObject(object, "kind", "images");
+	cJSON_AddNumberToObject(object, "columns", scatter->images.columns);
+	cJSON_AddNumberToObject(object, "rows", scatter->images.rows);
+	cJSON_AddNumberToObject(object, "every", scatter->images.every);
+	cJSON_AddNumberToObject(object, "count", scatter->count);
+	cJSON_AddNumberToObject(object, "received_count", scatter->received);
+	if (brief)
+		return true;
+	flags = malloc((size_t)scatter->count);
+	if (flags == NULL)
+		return false;
+	stored_scan_received_scatter(scan, flags);
+	missing = cJSON_AddArrayToObject(object, "missing");
+	for (int i = 0; i < scatter->count; i++)
+		if (flags[i] == 0)
+			cJSON_AddItemToArray(
+			    missing, cJSON_CreateNumber(scatter_image_projection(&scatter->images, facts->count, i)));
+	free(flags);
+	return true;
+}
+
 static void add_warning(cJSON *list, const char *code, const char *detail)
 {
 	cJSON_AddItemToArray(list, json_warning(code, detail));
@@ -97,6 +128,19 @@ static void add_scan_warnings(cJSON *document, const struct scan *scan, const st
 		    warnings, "no_flat",
 		    "all projections are there, but no flat image, and the scan has no air value: its jobs wait "
 		    "for PUT /v1/scans/{scan}/flat");
+	if (facts->complete && facts->scatter.wanted > 0) {
+		snprintf(detail, sizeof(detail),
+			 "%d of %d images of scatter are missing: the scan's jobs wait for PUT "
+			 "/v1/scans/{scan}/scatter/{k}",
+			 facts->scatter.wanted, facts->scatter.count);
+		add_warning(warnings, "no_scatter", detail);
+	}
+	if (facts->scatter.lost > 0) {
+		snprintf(detail, sizeof(detail),
+			 "the disk has damaged %d images of scatter: the scan's jobs wait until they are sent again",
+			 facts->scatter.lost);
+		add_warning(warnings, "damaged_image", detail);
+	}
 	if (facts->damaged)
 		add_warning(warnings, "files_missing", "the file of the projections is not there at its full size");
 	if (facts->lost > 0) {
@@ -161,6 +205,10 @@ cJSON *scan_document(struct stored_scan *stored, bool brief)
 	for (int i = 0; i < IMAGE_COUNT; i++)
 		if (facts.quantity == QUANTITY_INTENSITY || !image_kinds[i].intensities)
 			cJSON_AddBoolToObject(document, image_kinds[i].name, facts.image[i]);
+	if (!add_scatter(document, stored, &facts, brief || scan == NULL)) {
+		cJSON_Delete(document);
+		return NULL;
+	}
 	if (brief || scan == NULL) {
 		add_essence(document, &facts);
 		return document;
@@ -277,6 +325,8 @@ static void add_waiting_for(cJSON *document, const struct scan_facts *scan, cons
 		}
 		if (!scan->complete)
 			cJSON_AddItemToArray(list, cJSON_CreateString("projections"));
+		if (scan->scatter.wanted > 0)
+			cJSON_AddItemToArray(list, cJSON_CreateString("scatter"));
 		if (!scan->checked)
 			cJSON_AddItemToArray(list, cJSON_CreateString("check"));
 	}

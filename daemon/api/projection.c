@@ -1,4 +1,4 @@
-/* /v1/scans/{}/projections, and the images of core/scan/image.h */
+/* /v1/scans/{}/projections, the images of core/scan/image.h, and those of scatter */
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -81,6 +81,45 @@ int image_begin(void *context, struct request *request, struct error *err)
 		return error_set(err, ERR_IMPOSSIBLE, "the scan's quantity is line_integral; a %s is for intensity",
 				 image_kinds[image].title);
 	}
+	return begin(api, request, scan, &target, err);
+}
+
+/* The image of scatter that the request's path names by its projection. */
+static int scatter_asked(struct request *request, const struct scan *scan, int *ret_image, struct error *err)
+{
+	const struct scatter_images *images = &scan->scatter.images;
+	const char *text = request_argument(request, 1);
+	long projection;
+
+	if (images->columns == 0)
+		return error_set(err, ERR_CONFLICT,
+				 "the scan announces no images of scatter, as {\"kind\": \"images\"} in its member "
+				 "projections.scatter would");
+	if (!index_parse(text, strlen(text), scan->count - 1, &projection))
+		return error_set(err, ERR_NOT_FOUND, "projection \"%.40s\" is asked for, the scan has 0 to %d", text,
+				 scan->count - 1);
+	*ret_image = scatter_image_of(images, scan->count, (int)projection);
+	if (*ret_image < 0)
+		return error_set(
+		    err, ERR_NOT_FOUND,
+		    "projection %ld has no image of its scatter in this scan: every %d-th has, and the last",
+		    projection, images->every);
+	return 0;
+}
+
+int scatter_begin(void *context, struct request *request, struct error *err)
+{
+	struct upload_target target = {.kind = UPLOAD_SCATTER};
+	struct api *api = context;
+	struct stored_scan *scan;
+
+	if (store_scan_find(api->store, request_argument(request, 0), &scan, err) != 0)
+		return err->code;
+	if (scatter_asked(request, stored_scan_parsed(scan), &target.first, err) != 0) {
+		stored_scan_release(scan);
+		return err->code;
+	}
+	target.last = target.first;
 	return begin(api, request, scan, &target, err);
 }
 
@@ -283,6 +322,57 @@ int projection_get(void *context, struct request *request, struct error *err)
 	if (store_scan_find(api->store, request_argument(request, 0), &scan, err) != 0)
 		return err->code;
 	code = reply_projection(request, scan, err);
+	stored_scan_release(scan);
+	return code;
+}
+
+static int reply_scatter(struct request *request, struct stored_scan *stored, struct error *err)
+{
+	const struct scan *scan = stored_scan_parsed(stored);
+	char etag[ETAG_MAX], filename[96], digest[DIGEST_TEXT_MAX];
+	struct entity entity = {
+	    .etag = etag, .size = UNKNOWN_SIZE, .media_type = "application/octet-stream", .filename = filename};
+	struct selection selection;
+	struct sum sum;
+	size_t size;
+	void *pixels;
+	bool done;
+	int image;
+
+	if (scatter_asked(request, scan, &image, err) != 0)
+		return err->code;
+	size = scatter_image_bytes(&scan->scatter.images);
+	pixels = malloc(size);
+	if (pixels == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for an image of %zu bytes", size);
+	if (store_read_scatter(stored, image, pixels, &sum, err) != 0) {
+		free(pixels);
+		return err->code;
+	}
+	make_etag(sum.sha256, "", etag);
+	snprintf(filename, sizeof(filename), "%.40s-scatter-%.10s.raw", request_argument(request, 0),
+		 request_argument(request, 1));
+	if (entity_select(request, &entity, &selection, &done, err) != 0 || done) {
+		free(pixels);
+		return done ? 0 : err->code;
+	}
+	if (request_reply_bytes(request, 200, pixels, size, err) != 0)
+		return err->code;
+	entity_headers(request, &entity, &selection);
+	digest_text(sum.sha256, digest);
+	request_reply_header(request, "Repr-Digest", "%s", digest);
+	return 0;
+}
+
+int scatter_get(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	struct stored_scan *scan;
+	int code;
+
+	if (store_scan_find(api->store, request_argument(request, 0), &scan, err) != 0)
+		return err->code;
+	code = reply_scatter(request, scan, err);
 	stored_scan_release(scan);
 	return code;
 }

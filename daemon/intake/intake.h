@@ -49,12 +49,12 @@ void uploads_statistics(struct uploads *uploads, struct uploads_statistics *ret)
 
 /*
  * The target says what the body should be: projections first .. last, or the
- * image named. Reads the request's Content-Length, -Encoding and -Digest and
+ * image named, or an image of scatter, `first`. Reads the request's Content-Length, -Encoding and -Digest and
  * refuses what cannot be right: ERR_INVALID with both lengths; for an unknown
  * encoding the reply is set and *ret_upload is NULL. Takes the reference to the
  * scan, on failure too.
  */
-enum upload_kind { UPLOAD_PROJECTIONS, UPLOAD_IMAGE };
+enum upload_kind { UPLOAD_PROJECTIONS, UPLOAD_IMAGE, UPLOAD_SCATTER };
 struct upload_target {
 	enum upload_kind kind;
 	int first, last;

@@ -133,6 +133,9 @@ static void describe_expected(const struct upload *upload, char *ret_text, size_
 		snprintf(ret_text, size, "%" PRIu64 " bytes: %d projection%s of %d x %d %s", upload->expected, count,
 			 count == 1 ? "" : "s", scan->geometry.columns, scan->geometry.rows,
 			 sample_names[scan->sample]);
+	else if (upload->target.kind == UPLOAD_SCATTER)
+		snprintf(ret_text, size, "%" PRIu64 " bytes: %d x %d float32", upload->expected,
+			 scan->scatter.images.columns, scan->scatter.images.rows);
 	else if (image_kinds[upload->target.image].pixel == IMAGE_MARKS)
 		snprintf(ret_text, size, "%zu bytes: %d x %d of one byte each", pixels, scan->geometry.columns,
 			 scan->geometry.rows);
@@ -218,6 +221,15 @@ static int prepare_holding(struct upload *upload, struct error *err)
 	return 0;
 }
 
+/* Of a projection or an image. */
+static size_t bytes_of(const struct scan *scan, const struct upload_target *target)
+{
+	if (target->kind == UPLOAD_IMAGE)
+		return upload_image_bytes(scan, target->image);
+	return target->kind == UPLOAD_SCATTER ? scatter_image_bytes(&scan->scatter.images)
+					      : scan_projection_bytes(scan);
+}
+
 int upload_new(struct uploads *uploads, struct request *request, struct stored_scan *scan,
 	       const struct upload_target *target, struct upload **ret_upload, struct error *err)
 {
@@ -236,8 +248,7 @@ int upload_new(struct uploads *uploads, struct request *request, struct stored_s
 	upload->descriptor = upload->sums = -1;
 	upload->references = 1;
 	upload->next = target->first;
-	upload->slot_bytes = target->kind == UPLOAD_IMAGE ? upload_image_bytes(stored_scan_parsed(scan), target->image)
-							  : scan_projection_bytes(stored_scan_parsed(scan));
+	upload->slot_bytes = bytes_of(stored_scan_parsed(scan), target);
 	upload->expected = (uint64_t)upload->slot_bytes * (uint64_t)(target->last - target->first + 1);
 	code = read_encoding(upload, &known, err);
 	if (code == 0 && known)

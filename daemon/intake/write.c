@@ -5,6 +5,7 @@
 #include <assert.h>
 #include <errno.h>
 #include <fcntl.h>
+#include <math.h>
 #include <openssl/evp.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -236,6 +237,23 @@ static int process_image(struct slot *slot, struct error *err)
 	return 0;
 }
 
+static int process_scatter(struct slot *slot, struct error *err)
+{
+	const struct scatter_images *images = &stored_scan_parsed(slot->upload->scan)->scatter.images;
+	const float *pixels = (const float *)(const void *)slot->data; /* malloc's alignment suits any type */
+	bool created;
+
+	for (int i = 0; i < images->columns * images->rows; i++)
+		if (!isfinite(pixels[i]))
+			return error_set(
+			    err, ERR_IMPOSSIBLE, "pixel (column %d, row %d) is %s; scatter must be finite counts",
+			    i % images->columns, i / images->columns, isnan(pixels[i]) ? "NaN" : "infinite");
+	if (store_put_scatter(slot->upload->scan, slot->index, pixels, &created, err) != 0)
+		return err->code;
+	slot->outcome = created ? SLOT_CREATED : SLOT_SAME;
+	return 0;
+}
+
 static void process(struct slot *slot)
 {
 	slot->outcome = SLOT_OPEN;
@@ -243,6 +261,8 @@ static void process(struct slot *slot)
 		slot->outcome = SLOT_WRITTEN; /* a pending commit: what is held was written before */
 	else if (slot->upload->target.kind == UPLOAD_IMAGE)
 		slot->code = process_image(slot, &slot->error);
+	else if (slot->upload->target.kind == UPLOAD_SCATTER)
+		slot->code = process_scatter(slot, &slot->error);
 	else
 		slot->code = process_projection(slot, &slot->error);
 	if (slot->code != 0)

@@ -85,6 +85,7 @@ struct catalogue_scan {
 		bool known;
 		uint8_t sha256[32]; /* of the float32 pixels, or of the defect map's bytes */
 	} images[IMAGE_COUNT];
+	struct scatter_images scatter; /* columns 0: none */
 	bool pinned;
 	bool closed;     /* its projections are those that are there */
 	long long stamp; /* of the record in its directory, store/record.h */

@@ -71,7 +71,7 @@ static unsigned long long all_projections(const struct stored_scan *scan)
 	return (unsigned long long)stored_scan_bytes(scan) * (unsigned long long)scan->count;
 }
 
-/* Of its flat, dark and defects, also those that are being written. */
+/* Of its flat, dark and defects, and of its scatter, also those that are being written. */
 static unsigned long long images_of(struct stored_scan *scan)
 {
 	unsigned long long sum = 0;
@@ -79,6 +79,8 @@ static unsigned long long images_of(struct stored_scan *scan)
 	pthread_mutex_lock(&scan->lock);
 	for (int image = 0; image < IMAGE_COUNT; image++)
 		sum += scan->image[image] != MISSING ? stored_image_bytes(scan, image) : 0;
+	for (int image = 0; image < scan->scatter_count; image++)
+		sum += scan->scatter_progress[image] != MISSING ? scatter_image_bytes(&scan->scatter) : 0;
 	pthread_mutex_unlock(&scan->lock);
 	return sum;
 }
@@ -307,6 +309,7 @@ static bool is_unfinished(const struct scan_facts *facts)
 
 	for (int image = 0; image < IMAGE_COUNT; image++)
 		damaged |= facts->lost_image[image];
+	damaged |= facts->scatter.lost > 0;
 	return !facts->complete && !facts->closed && !damaged;
 }
 

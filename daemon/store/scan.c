@@ -35,6 +35,8 @@ struct stored_scan *stored_scan_free(struct stored_scan *scan)
 	scan_free(scan->measured);
 	free(scan->progress);
 	free(scan->lost);
+	free(scan->scatter_progress);
+	free(scan->scatter_lost);
 	free(scan->sums);
 	watch_list_destroy(&scan->watchers);
 	pthread_mutex_destroy(&scan->lock);
@@ -447,6 +449,8 @@ static int make_files(struct store *store, const struct scan *parsed, const stru
 	if (code == 0)
 		code = sums_create(directory, parsed->count, scan_projection_bytes(parsed), err);
 	if (code == 0)
+		code = store_make_scatter(scan, directory, err);
+	if (code == 0)
 		code = file_write_durable(path, text, strlen(text), err);
 	if (code == 0)
 		code = store_put_part_sum(scan, SUMS_SCAN, text, strlen(text), err);
@@ -501,7 +505,8 @@ static int insert_row(struct store *store, struct stored_scan *scan, const struc
 				     .count = scan->count,
 				     .sample = scan->sample,
 				     .quantity = scan->quantity,
-				     .air = scan->air};
+				     .air = scan->air,
+				     .scatter = scan->scatter};
 	int code = store_begin(store, err);
 
 	if (code != 0)
@@ -571,7 +576,9 @@ int store_scan_create(struct store *store, struct scan *parsed, const char *clie
 	scan->sample = parsed->sample;
 	scan->quantity = parsed->quantity;
 	scan->air = parsed->air;
-	code = store_check_scans(store, scan->client, err);
+	code = stored_scan_set_scatter(scan, &parsed->scatter.images, err);
+	if (code == 0)
+		code = store_check_scans(store, scan->client, err);
 	if (code == 0)
 		code = store_check_size(
 		    store, (unsigned long long)scan_projection_bytes(parsed) * (unsigned long long)parsed->count, err);

@@ -48,8 +48,12 @@ struct stored_scan {
 	enum progress image[IMAGE_COUNT];
 	uint8_t image_sha256[IMAGE_COUNT][32];
 	bool image_lost[IMAGE_COUNT]; /* as of projections */
-	bool document_damaged;        /* scan.json */
-	bool suspect;                 /* all of its files are to be checked before it is used (store/sums.c) */
+	/* Constant: images of scatter that the scan announces. The next two are [scatter_count], as of projections. */
+	struct scatter_images scatter;
+	int scatter_count;
+	unsigned char *scatter_progress, *scatter_lost;
+	bool document_damaged; /* scan.json */
+	bool suspect;          /* all of its files are to be checked before it is used (store/sums.c) */
 	bool pinned;
 	bool deleted; /* written in a group of the catalogue too, as the next */
 	bool closing; /* takes no new projections */
@@ -97,6 +101,17 @@ void stored_scan_add(struct stored_scan *scan, int index, const struct sum *sum)
  * SHA-256 only. A file that is missing, short or has a damaged line is made again from the records that are good.
  */
 int store_load_sums(struct store *store, struct stored_scan *scan, struct error *err);
+
+/*
+ * Images of scatter, store/scatter.c: their lists in memory; their files; what is there, from their records. Then, with
+ * the scan's lock held, whether those are there that a projection needs, and how many there are; all of them are read.
+ */
+int stored_scan_set_scatter(struct stored_scan *scan, const struct scatter_images *images, struct error *err);
+int store_make_scatter(const struct stored_scan *scan, const char *directory, struct error *err);
+int store_load_scatter(struct stored_scan *scan, struct error *err);
+bool stored_scan_has_scatter(const struct stored_scan *scan, int projection);
+void stored_scan_count_scatter(const struct stored_scan *scan, struct scan_scatter *ret);
+void store_check_scatter(struct stored_scan *scan);
 
 /* At the start, nobody else has the store: the samples of projections.raw behind its first `size` bytes are lost. */
 void stored_scan_lose_behind(struct stored_scan *scan, unsigned long long size);

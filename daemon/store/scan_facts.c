@@ -99,7 +99,8 @@ void stored_scan_facts(struct stored_scan *scan, struct scan_facts *ret)
 	ret->complete = stored_scan_complete(scan);
 	ret->convertible = is_convertible(scan);
 	ret->checked = !scan->suspect;
-	ret->ready = ret->complete && ret->convertible && ret->checked;
+	stored_scan_count_scatter(scan, &ret->scatter);
+	ret->ready = ret->complete && ret->convertible && ret->checked && ret->scatter.wanted == 0;
 	for (int i = 0; i < IMAGE_COUNT; i++) {
 		ret->image[i] = scan->image[i] == STORED;
 		ret->lost_image[i] = scan->image_lost[i];
@@ -146,8 +147,10 @@ int stored_scan_leading(struct stored_scan *scan)
 
 	pthread_mutex_lock(&scan->lock);
 	for (int i = 0; i < scan->count; i++) {
-		if (scan->progress[i] == STORED)
+		if (scan->progress[i] == STORED && stored_scan_has_scatter(scan, i))
 			leading++;
+		else if (scan->progress[i] == STORED)
+			break;
 		else if (!scan->closed || scan->lost[i])
 			break;
 	}

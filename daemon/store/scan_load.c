@@ -39,6 +39,11 @@ static int load_scan(struct store *store, const struct catalogue_scan *row, stru
 			scan->image[i] = STORED;
 		memcpy(scan->image_sha256[i], row->images[i].sha256, sizeof(scan->image_sha256[i]));
 	}
+	code = stored_scan_set_scatter(scan, &row->scatter, err);
+	if (code != 0) {
+		stored_scan_free(scan);
+		return code;
+	}
 	scan->closed = scan->closing = row->closed;
 	scan->pinned = row->pinned;
 	store_scan_directory(store, scan->id, directory);
@@ -79,6 +84,8 @@ int store_load_scans(struct store *store, struct error *err)
 		code = load_projections(store, store->scans[i], err);
 		if (code == 0)
 			code = store_load_sums(store, store->scans[i], err);
+		if (code == 0)
+			code = store_load_scatter(store->scans[i], err);
 		store->scans[i]->has_room = store->scans[i]->room = store->scans[i]->received > 0;
 	}
 	return code;

@@ -215,8 +215,15 @@ void store_scan_directory(const struct store *store, const char *id, char ret_pa
 
 /*
  * Memory only. Complete: every projection is there, or it was closed with those that are, and none of them was lost.
- * Convertible: so is whatever else makes line integrals of them. Ready: both, and nothing of it is being checked.
+ * Convertible: so is whatever else makes line integrals of them, but images of scatter, which come one by one as they
+ * do. Ready: all of that, and nothing of it is being checked.
  */
+struct scan_scatter {
+	struct scatter_images images;
+	int count, received; /* images */
+	int wanted;          /* that are not there and that its projections need */
+	int lost;            /* found damaged, and to be sent again */
+};
 struct scan_facts {
 	char name[SCAN_NAME_BYTES], client[STORE_CLIENT_SIZE];
 	double created; /* seconds since 1970 */
@@ -227,6 +234,7 @@ struct scan_facts {
 	int received;                 /* projections */
 	bool image[IMAGE_COUNT];      /* that are there */
 	bool lost_image[IMAGE_COUNT]; /* found damaged, and to be sent again */
+	struct scan_scatter scatter;  /* count 0: none is announced */
 	int lost;                     /* projections that were found damaged: missing until they are sent again */
 	unsigned losses;              /* grows with each of them */
 	bool document_damaged;        /* scan.json: the scan cannot be used any more */
@@ -246,8 +254,8 @@ int store_scan_look(struct store *store, const char *id, struct scan_facts *ret,
 /* flags[count]: 1 where the projection is stored. */
 void stored_scan_received(struct stored_scan *scan, unsigned char *ret_flags);
 /*
- * How many of the scan's projections are there before the first that is missing. Those that a closed scan was closed
- * without are none of its projections.
+ * How many of the scan's projections are there, with their scatter, before the first that is missing. Those that a
+ * closed scan was closed without are none of its projections.
  */
 int stored_scan_leading(struct stored_scan *scan);
 /* False when it is not stored. ret_sum->bytes 0: only its SHA-256 is known yet. */
@@ -368,6 +376,16 @@ int store_put_image(struct store *store, struct stored_scan *scan, enum image im
 		    struct error *err);
 /* Removes an image, so that another one can be put. ERR_NOT_FOUND where there is none; ERR_BUSY as above. */
 int store_remove_image(struct store *store, struct stored_scan *scan, enum image image, struct error *err);
+
+/*
+ * An image of scatter (core/detector.h), by its own number. As of an image of the detector, but that another one is not
+ * taken in place of one that is there.
+ */
+int store_put_scatter(struct stored_scan *scan, int image, const float *pixels, bool *ret_new, struct error *err);
+/* ERR_NOT_FOUND: it is not stored. ERR_DAMAGED: it is lost now. */
+int store_read_scatter(struct stored_scan *scan, int image, float *ret_pixels, struct sum *ret_sum, struct error *err);
+/* flags[count]: 1 where the image is stored. */
+void stored_scan_received_scatter(struct stored_scan *scan, unsigned char *ret_flags);
 
 /* ---- rows of jobs: for job.c, which keeps the rules; everybody else uses job.h ---- */
 

@@ -477,6 +477,7 @@ static void check_scan(struct stored_scan *scan)
 			store_check_image(scan, i, &err);
 	}
 	check_projections(scan);
+	store_check_scatter(scan);
 	if (must_end(scan->store)) /* the next start goes on */
 		return;
 	pthread_mutex_lock(&scan->lock);

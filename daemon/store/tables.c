@@ -29,6 +29,9 @@ static const struct column scan_columns[] = {
 	 .nullable = true,                                                                                             \
 	 .assigned = true},
     IMAGES(IMAGE_COLUMN) // SHA-256 of each image
+    {"scatter_columns", COLUMN_INT, AT(catalogue_scan, scatter.columns), .initial = "0"},
+    {"scatter_rows", COLUMN_INT, AT(catalogue_scan, scatter.rows), .initial = "0"},
+    {"scatter_every", COLUMN_INT, AT(catalogue_scan, scatter.every), .initial = "0"},
     {"pinned", COLUMN_BOOL, AT(catalogue_scan, pinned), .initial = "0", .assigned = true},
     {"closed", COLUMN_BOOL, AT(catalogue_scan, closed), .initial = "0", .assigned = true},
     {"stamp", COLUMN_LONG, AT(catalogue_scan, stamp), .initial = "0", .assigned = true},

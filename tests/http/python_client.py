@@ -159,6 +159,20 @@ class Scans(Case):
         document = self.client.scan(scan)
         self.assertEqual((document["flat"], document["dark"]), (True, True))
 
+    def test_images_of_scatter(self) -> None:
+        shape = self.projections.shape
+        announced = {"kind": "images", "columns": 6, "rows": 4, "every": 25}
+        scan = self.client.create_scan(
+            self.geometry, shape, dtype=np.uint16, quantity="intensity", air=50000, scatter=announced
+        )["id"]
+        image = np.arange(24.0).reshape(4, 6)
+        self.assertTrue(self.client.put_scatter(scan, 25, image))
+        self.assertFalse(self.client.put_scatter(scan, 25, image))
+        np.testing.assert_array_equal(self.client.scatter(scan, 25), image)
+        self.assertEqual(self.client.scan(scan)["scatter"]["missing"], [0, 50, 59])
+        with self.assertRaises(ValueError):
+            self.client.put_scatter(scan, 0, np.zeros(shape[1:]))
+
     def test_every_kind_of_geometry(self) -> None:
         angles = np.deg2rad(self.scan_json["geometry"]["angle_step_deg"] * np.arange(60))
         zero = np.zeros_like(angles)

@@ -19,6 +19,7 @@ SCAN: Document = {
     "projections": {"count": 12, "sample": "float32", "quantity": "intensity", "air": 60000},
     "geometry": {"kind": "circular", "source_to_isocentre_mm": 500, "source_to_detector_mm": 900, "angle_step_deg": 30},
 }
+IMAGES: Document = {"kind": "images", "columns": 8, "rows": 8}
 CIRCLES: Document = {"kind": "circles", "balls": 12, "diameter_mm": 110, "distance_mm": 90, "ball_mm": 3.2}
 HELIX: Document = {"kind": "helix", "balls": 20, "diameter_mm": 110, "pitch_mm": 90, "angle_step_deg": 20, "ball_mm": 3.2}
 
@@ -29,6 +30,9 @@ TRIED = [
       "/study/accession_number", "/study/description", "/study/referring_physician", "/projections/beam_hardening",
       "/projections/air_region", "/projections/lag", "/projections/scatter/kernels", "/projections/scatter/fraction",
       "/patient/world_to_patient"]),
+    ("/v1/scans", "ScanRequest", {**SCAN, "projections": {**SCAN["projections"], "scatter": IMAGES}},
+     ["/projections/scatter/kind", "/projections/scatter/columns", "/projections/scatter/rows",
+      "/projections/scatter/every"]),
     ("/v1/jobs", "JobRequest", {"scan": "SCAN"}, ["/preset"]),
     ("/v1/calibrations", "CalibrationRequest", {"scan": "SCAN", "phantom": CIRCLES},
      ["/arm", "/phantom/kind", "/phantom/circles", "/phantom/balls", "/phantom/diameter_mm", "/phantom/distance_mm",

@@ -10,6 +10,7 @@
 #include <string.h>
 
 #include "core/correct/lag.h"
+#include "core/correct/scatter_images.h"
 #include "core/fit/hardening.h"
 #include "core/fit/lag.h"
 #include "core/fit/scatter.h"
@@ -478,6 +479,200 @@ START_TEST(scatter_is_taken_off_objects_that_its_kernels_were_not_fitted_on)
 }
 END_TEST
 
+/* ---- images of scatter ---- */
+
+enum { COARSE = 4, EVERY = 10, IMAGES_MOST = TURNS };
+static const struct scatter_model IMAGES = {.images = {WIDE / COARSE, HIGH / COARSE, EVERY}};
+
+/* Images of a scan's scatter, in memory. */
+struct given_images {
+	int projections[IMAGES_MOST];
+	float *pixels;
+	size_t each; /* floats */
+	struct scatter_source source;
+};
+
+static int read_given(void *context, int at, float *ret_image, struct error *err)
+{
+	const struct given_images *given = context;
+
+	(void)err;
+	memcpy(ret_image, given->pixels + (size_t)at * given->each, given->each * sizeof(float));
+	return 0;
+}
+
+/* Means of COARSE x COARSE pixels of what scatter adds to the counts, in those projections that have an image. */
+static void make_images(const struct scene *scene, const float *counts, struct given_images *ret)
+{
+	const struct scatter_images *images = &IMAGES.images;
+	const int count = scatter_images_count(images, TURNS);
+
+	ret->each = (size_t)images->columns * (size_t)images->rows;
+	ret->pixels = calloc((size_t)count * ret->each, sizeof(float));
+	ck_assert_ptr_nonnull(ret->pixels);
+	for (int k = 0; k < count; k++) {
+		const int view = scatter_image_projection(images, TURNS, k);
+
+		ret->projections[k] = view;
+		for (int i = 0; i < WIDE * HIGH; i++) {
+			const int pixel = view * WIDE * HIGH + i;
+			const size_t at = (size_t)(i / WIDE / COARSE * images->columns + i % WIDE / COARSE);
+
+			ret->pixels[(size_t)k * ret->each + at] +=
+			    (float)((double)counts[pixel] - AIR * exp(-(double)scene->projections[pixel])) /
+			    (COARSE * COARSE);
+		}
+	}
+	ret->source = (struct scatter_source){ret, ret->projections, count, read_given};
+}
+
+static struct linearise with_images(const struct given_images *given)
+{
+	return (struct linearise){.sample = SAMPLE_FLOAT32,
+				  .quantity = QUANTITY_INTENSITY,
+				  .air = AIR,
+				  .scatter = &IMAGES,
+				  .scatter_source = &given->source};
+}
+
+/* Images of every tenth view, of 25 x 19 pixels, where scatter is 20, 50 and 100 % of the primary amid the first view.
+ */
+START_TEST(scatter_is_taken_off_by_coarse_images_of_some_views)
+{
+	const struct patient *patient = &patients[0];
+	const double ratios[] = {0.2, 0.5, 1};
+	const struct recipe recipe = fdk_on(52, 16, 4);
+	const int amid = HIGH / 2 * WIDE + WIDE / 2;
+	float *cells = scatter_of(&patient->phantom);
+	struct outcome ideal = {0};
+	struct scene scene;
+
+	scene_orbit(&scene, &scattering);
+	scene_add(&scene, &patient->phantom);
+	run(&scene, &recipe, &ideal);
+	for (int r = 0; r < 3; r++) {
+		const double primary = exp(-(double)scene.projections[amid]);
+		const double scale = ratios[r] * primary / cell_value(cells, WIDE / 2, HIGH / 2);
+		float *counts = counts_with_scatter(&scene, cells, scale);
+		struct outcome with = {.samples = counts};
+		struct given_images given;
+		double left;
+
+		make_images(&scene, counts, &given);
+		with.linearise = with_images(&given);
+		run(&scene, &recipe, &with);
+		left = flat_error(patient, &with, &ideal);
+		printf("%s, scatter of %.0f %% of the primary: %.2f HU with images\n", patient->name, 100 * ratios[r],
+		       left);
+		ck_assert_msg(fabs(left) < 8, "%s, %.0f %%: %.1f HU are left", patient->name, 100 * ratios[r], left);
+		ck_assert_ptr_null(strstr(with.warnings, "scatter_"));
+		outcome_clear(&with);
+		free(given.pixels);
+		free(counts);
+	}
+	outcome_clear(&ideal);
+	scene_clear(&scene);
+	free(cells);
+}
+END_TEST
+
+static int plane(void *context, int at, float *ret_image, struct error *err)
+{
+	const struct scatter_images *images = &IMAGES.images;
+
+	(void)context;
+	(void)err;
+	for (int i = 0; i < images->columns * images->rows; i++)
+		ret_image[i] = (float)(100 * at + COARSE * (i % images->columns) + 2 * COARSE * (i / images->columns));
+	return 0;
+}
+
+/* A plane that grows with the number stays one, on pixels and on blocks of them, up to the outermost centres. */
+START_TEST(images_of_scatter_are_linear_in_between)
+{
+	const int numbers[] = {10, 20, 40}, detector[] = {WIDE, HIGH}, n = _i + 1;
+	const struct scatter_source source = {NULL, numbers, 3, plane};
+	const struct pixel_blocks blocks = {{n, n}, {_i, 0}, {WIDE / n - 1, HIGH / n}};
+	/* Projections and what 100 times the image's place becomes, also backwards and beyond the first and the last.
+	 */
+	const double wanted[][2] = {{10, 0}, {15, 50}, {35, 175}, {40, 200}, {3, 0}, {90, 200}, {22, 110}};
+	struct scatter_stack *stack;
+	struct error err;
+	float row[WIDE];
+
+	ck_assert_int_eq(scatter_stack_new(&IMAGES.images, &source, &blocks, detector, &stack, &err), 0);
+	for (size_t k = 0; k < sizeof(wanted) / sizeof(wanted[0]); k++) {
+		ck_assert_int_eq(scatter_stack_take(stack, (int)wanted[k][0], &err), 0);
+		for (int r = 0; r < blocks.count[1]; r++) {
+			const double y = fmin(fmax((r + 0.5) * n - 0.5 * COARSE, 0), HIGH - COARSE);
+
+			scatter_stack_row(stack, r, row);
+			for (int c = 0; c < blocks.count[0]; c++) {
+				const double x = fmin(fmax(_i + (c + 0.5) * n - 0.5 * COARSE, 0), WIDE - COARSE);
+
+				ck_assert_double_eq_tol((double)row[c], wanted[k][1] + x + 2 * y, 1e-3);
+			}
+		}
+	}
+	scatter_stack_free(stack);
+	ck_assert_int_eq(
+	    scatter_stack_new(&IMAGES.images, &(struct scatter_source){.count = 0}, &blocks, detector, &stack, &err),
+	    ERR_IMPOSSIBLE);
+}
+END_TEST
+
+/* Every projection has one, or knows between which two it lies, whatever their numbers. */
+START_TEST(images_of_scatter_are_numbered)
+{
+	for (int projections = 1; projections < 30; projections++)
+		for (int every = 1; every < 35; every++) {
+			const struct scatter_images images = {8, 6, every};
+			int found = 0;
+
+			for (int k = 0; k < projections; k++) {
+				const int image = scatter_image_of(&images, projections, k);
+
+				ck_assert_int_eq(image >= 0, k % every == 0 || k == projections - 1);
+				if (image < 0)
+					continue;
+				ck_assert_int_eq(image, found++);
+				ck_assert_int_eq(scatter_image_projection(&images, projections, image), k);
+			}
+			ck_assert_int_eq(found, scatter_images_count(&images, projections));
+		}
+	ck_assert_int_eq(scatter_images_count(&(struct scatter_images){0}, 9), 0);
+}
+END_TEST
+
+/* Images that want nearly all of the signal, and images in a unit that no count has: told. */
+START_TEST(images_of_scatter_that_cannot_be_are_told)
+{
+	const struct recipe recipe = fdk_on(20, 8, 10);
+	const float factors[] = {3e-5F, 40};
+	float cells[ANGLES * ACROSS * ALONG], *counts;
+	struct outcome with = {0};
+	struct given_images given;
+	struct scene scene;
+
+	scene_orbit(&scene, &scattering);
+	scene_add(&scene, &patients[1].phantom);
+	for (int i = 0; i < ANGLES * ACROSS * ALONG; i++)
+		cells[i] = 0.05F;
+	counts = counts_with_scatter(&scene, cells, 1);
+	make_images(&scene, counts, &given);
+	for (size_t i = 0; i < given.each * (size_t)given.source.count; i++)
+		given.pixels[i] *= factors[_i];
+	with.samples = counts;
+	with.linearise = with_images(&given);
+	run(&scene, &recipe, &with);
+	ck_assert_ptr_nonnull(strstr(with.warnings, _i == 0 ? "scatter_faint: " : "scatter_limited: "));
+	outcome_clear(&with);
+	scene_clear(&scene);
+	free(given.pixels);
+	free(counts);
+}
+END_TEST
+
 /* ---- both, on their way through a reconstruction ---- */
 
 static const struct scatter_model KERNEL = {.count = 1, .kernels = {{0.35, 0.1, 1.8, 290, 0.27}}};
@@ -635,6 +830,7 @@ Suite *detector_suite(void)
 {
 	Suite *suite = suite_create("detector");
 	TCase *lag = tcase_create("lag"), *scatter = tcase_create("scatter"), *fits = tcase_create("fits");
+	TCase *images = tcase_create("images");
 
 	tcase_set_timeout(lag, 120);
 	tcase_add_test(lag, lag_of_three_percent_leaves_no_ghost);
@@ -649,6 +845,12 @@ Suite *detector_suite(void)
 	tcase_set_timeout(scatter, 300);
 	tcase_add_test(scatter, scatter_is_taken_off_objects_that_its_kernels_were_not_fitted_on);
 	suite_add_tcase(suite, scatter);
+	tcase_set_timeout(images, 120);
+	tcase_add_test(images, scatter_is_taken_off_by_coarse_images_of_some_views);
+	tcase_add_loop_test(images, images_of_scatter_are_linear_in_between, 0, 2);
+	tcase_add_test(images, images_of_scatter_are_numbered);
+	tcase_add_loop_test(images, images_of_scatter_that_cannot_be_are_told, 0, 2);
+	suite_add_tcase(suite, images);
 	tcase_add_test(fits, hardening_is_fitted_from_steps_of_water);
 	suite_add_tcase(suite, fits);
 	return suite;

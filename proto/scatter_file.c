@@ -1,0 +1,147 @@
+/* Images of scatter in a scan directory: see scatter_file.h. */
+#include "proto/scatter_file.h"
+
+#include <errno.h>
+#include <fcntl.h>
+#include <limits.h>
+#include <openssl/evp.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include "proto/scan_directory.h"
+
+static int open_samples(const char *directory, int flags, int *ret_file, struct error *err)
+{
+	char path[PATH_MAX];
+	int code = path_join(path, sizeof(path), directory, SCATTER_FILE, "", err);
+
+	if (code != 0)
+		return code;
+	*ret_file = open(path, flags | O_CLOEXEC, 0640);
+	if (*ret_file < 0 && errno == ENOENT)
+		return error_set(err, ERR_NOT_FOUND, "%.200s does not exist", path);
+	return *ret_file < 0 ? error_set_errno(err, errno, "%s cannot be opened", path) : 0;
+}
+
+int scatter_file_create(const char *directory, const struct scatter_images *images, int projections, struct error *err)
+{
+	const int count = scatter_images_count(images, projections);
+	const size_t bytes = scatter_image_bytes(images);
+	int file, code = open_samples(directory, O_RDWR | O_CREAT, &file, err);
+
+	if (code != 0)
+		return code;
+	if (ftruncate(file, (off_t)(bytes * (size_t)count)) != 0)
+		code = error_set_errno(err, errno == EFBIG ? ENOSPC : errno, "file for %d images of scatter", count);
+	else if (fsync(file) != 0)
+		code = error_set_sync(err, errno, "sync " SCATTER_FILE);
+	close(file);
+	return code == 0 ? sums_create_file(directory, SUMS_SCATTER_FILE, count, bytes, err) : code;
+}
+
+int scatter_file_open(const char *directory, const struct scatter_images *images, int projections, bool writing,
+		      struct scatter_file *ret_file, bool *ret_whole, struct error *err)
+{
+	struct scatter_file file = {.images = *images, .projections = projections, .sums = -1};
+	const size_t bytes = scatter_image_bytes(images);
+	struct stat status;
+	int code = open_samples(directory, writing ? O_RDWR : O_RDONLY, &file.samples, err);
+
+	if (code != 0)
+		return code;
+	file.count = scatter_images_count(images, projections);
+	if (fstat(file.samples, &status) != 0)
+		code = error_set_errno(err, errno, SCATTER_FILE);
+	else if ((size_t)status.st_size != bytes * (size_t)file.count)
+		code = error_set(
+		    err, ERR_INVALID, SCATTER_FILE ": %zu bytes, but %d images of %d x %d float32 have %zu",
+		    (size_t)status.st_size, file.count, images->columns, images->rows, bytes * (size_t)file.count);
+	if (code == 0) {
+		struct error why;
+		const int got = sums_open_file(directory, SUMS_SCATTER_FILE, writing, file.count, bytes, &file.sums,
+					       ret_whole, &why);
+
+		if (got == ERR_NOT_FOUND)
+			file.sums = -1;
+		else if (got != 0)
+			code = got, *err = why;
+	}
+	if (code != 0)
+		scatter_file_close(&file);
+	else
+		*ret_file = file;
+	return code;
+}
+
+void scatter_file_close(struct scatter_file *file)
+{
+	if (file->count > 0 && file->samples >= 0)
+		close(file->samples);
+	if (file->count > 0 && file->sums >= 0)
+		close(file->sums);
+	*file = (struct scatter_file){.samples = -1, .sums = -1};
+}
+
+static int damaged(const struct scatter_file *file, int image, struct error *err)
+{
+	return error_set(err, ERR_DAMAGED, "the image of projection %d's scatter is damaged, or was never received",
+			 scatter_image_projection(&file->images, file->projections, image));
+}
+
+int scatter_file_read(const struct scatter_file *file, int image, float *ret_image, struct sum *ret_sum,
+		      struct error *err)
+{
+	const size_t bytes = scatter_image_bytes(&file->images);
+	unsigned char state = SUM_NONE;
+	int code = file_read_at(file->samples, ret_image, bytes, bytes * (size_t)image, SCATTER_FILE, err);
+
+	if (code != 0 || file->sums < 0)
+		return code;
+	code = sums_get(file->sums, image, 1, bytes, ret_sum, &state, err);
+	if (code == 0 && (state != SUM_GOOD || ret_sum->lost || ret_sum->crc != checksum(0, ret_image, bytes)))
+		code = damaged(file, image, err);
+	return code;
+}
+
+static int put_record(const struct scatter_file *file, int image, const struct sum *sum, struct error *err)
+{
+	int code = sums_put(file->sums, image, sum, err);
+
+	if (code == 0 && fdatasync(file->sums) != 0)
+		code = error_set_sync(err, errno, "sync " SUMS_SCATTER_FILE);
+	return code;
+}
+
+int scatter_file_write(const struct scatter_file *file, int image, const float *pixels, struct error *err)
+{
+	const size_t bytes = scatter_image_bytes(&file->images);
+	const off_t offset = (off_t)bytes * image;
+	struct sum sum = {.crc = checksum(0, pixels, bytes), .bytes = bytes};
+	size_t done = 0;
+
+	if (EVP_Digest(pixels, bytes, sum.sha256, NULL, EVP_sha256(), NULL) != 1)
+		return error_set(err, ERR_INTERNAL, "SHA-256 failed");
+	while (done < bytes) {
+		const ssize_t wrote =
+		    pwrite(file->samples, (const char *)pixels + done, bytes - done, offset + (off_t)done);
+
+		if (wrote < 0 && errno == EINTR)
+			continue;
+		if (wrote <= 0)
+			return error_set_errno(err, wrote < 0 ? errno : EIO, "write " SCATTER_FILE);
+		done += (size_t)wrote;
+	}
+	if (fdatasync(file->samples) != 0)
+		return error_set_sync(err, errno, "sync " SCATTER_FILE);
+	return put_record(file, image, &sum, err);
+}
+
+int scatter_file_lose(const struct scatter_file *file, int image, struct error *err)
+{
+	struct sum sum = {.bytes = scatter_image_bytes(&file->images)};
+	unsigned char state = SUM_NONE;
+	int code = sums_get(file->sums, image, 1, sum.bytes, &sum, &state, err);
+
+	sum.lost = true;
+	return code == 0 ? put_record(file, image, &sum, err) : code;
+}

@@ -1,0 +1,214 @@
+#!/usr/bin/env bash
+# Images of scatter that somebody else has computed: PUT and GET of each, whether they come before projections, behind
+# them, or never, a restart, damage, and the programs that send them.
+. "$(dirname "$0")/lib.sh"
+
+ball=(--phantom head --scale 60 --density 0.02 --views 45 --arc 360 --columns 80 --rows 64 --pixel 3
+	--source-to-isocentre 620 --source-to-detector 1100 --raw air --sample float32)
+cbct simulate "${ball[@]}" -o "$work/good" >/dev/null || exit 1
+# Scatter that is broad and turns with the arm, half of the primary amid the head; images of 20 x 16 pixels of views 0, 10, ... 40 and 44.
+/usr/bin/env python3 - "$work" <<'EOP' || exit 1
+import array, json, math, os, sys
+work = sys.argv[1]
+columns, rows, views, wide, high = 80, 64, 45, 20, 16
+def scatter(view, x, y): # in shares of the detector
+    turn = math.cos(2 * math.pi * view / views)
+    return 9000 * math.exp(-((x - 0.5 - 0.05 * turn) ** 2 + (y - 0.5) ** 2) / 0.3) * (1 + 0.2 * turn)
+good = array.array('f', open(f'{work}/good/projections.raw', 'rb').read())
+spoiled = array.array('f', (good[(v * rows + r) * columns + c] + scatter(v, (c + 0.5) / columns, (r + 0.5) / rows)
+                            for v in range(views) for r in range(rows) for c in range(columns)))
+document = json.load(open(f'{work}/good/scan.json'))
+for name, more in (('left-in', {}), ('images', {'scatter': {'kind': 'images', 'columns': wide, 'rows': high, 'every': 10}})):
+    os.makedirs(f'{work}/{name}')
+    spoiled.tofile(open(f'{work}/{name}/projections.raw', 'wb'))
+    json.dump({**document, 'projections': {**document['projections'], **more}}, open(f'{work}/{name}/scan.json', 'w'))
+with open(f'{work}/images/scatter.raw', 'wb') as file:
+    for v in (0, 10, 20, 30, 40, 44):
+        array.array('f', (scatter(v, (c + 0.5) / wide, (r + 0.5) / high) for r in range(high) for c in range(wide))).tofile(file)
+EOP
+recipe='{"scan": "SCAN", "grid": {"size": [40, 40, 28], "spacing_mm": [2.6, 2.6, 2.6]}, "fdk": {}}'
+state=$work/state
+
+digest() {
+	req GET "/v1/jobs/$job/volumes"
+	json '.volumes[] | select(.name == "final") | .digest'
+}
+distance() { # HU, root mean square, between the volume of $job and that without scatter
+	get_volume final "$work/volume.nii"
+	cbct compare --json "$work/volume.nii" "$work/good.nii" | jq '.rmse / 0.0192 * 1000'
+}
+image_of() { # K: that of projection K, as a file
+	dd if="$work/images/scatter.raw" of="$work/image.raw" bs=1280 skip=$((($1 + 9) / 10)) count=1 status=none
+}
+put_image() { # K
+	image_of "$1"
+	req PUT "/v1/scans/$scan/scatter/$1" --data-binary @"$work/image.raw"
+}
+put_one() { # K: a projection
+	dd if="$work/images/projections.raw" of="$work/one.raw" bs=20480 skip="$1" count=1 status=none
+	req PUT "/v1/scans/$scan/projections/$1" --data-binary @"$work/one.raw"
+	expect_status 201
+}
+waits_for_scatter() {
+	local end=$((SECONDS + 60))
+	until req GET "/v1/jobs/$job" && jq -e '.state == "waiting" and (.waiting_for | index("scatter") != null)' "$body" >/dev/null; do
+		[ $SECONDS -lt $end ] || fail "a job that waits for scatter: $(json '{state, waiting_for}')"
+		sleep 0.05
+	done
+}
+
+test_images_are_taken_off_whatever_the_order_of_arrival() {
+	local first k
+	reconstruct "$work/good" "$recipe"
+	get_volume final "$work/good.nii"
+	reconstruct "$work/left-in" "$recipe"
+	expect_number "$(distance)" '>' 60 "RMSE in HU where scatter is left in"
+	# by `cbct upload`, before the projections
+	scan=$(cbct upload --quiet --url "$url" "$work/images") || fail "cbct upload"
+	req GET "/v1/scans/$scan"
+	expect_json '.scatter == {"kind": "images", "columns": 20, "rows": 16, "every": 10, "count": 6, "received_count": 6, "missing": []}'
+	expect_json '.projections.scatter.kind == "images" and ([.warnings[] | select(.code == "no_scatter")] == [])'
+	post_job "$recipe"
+	wait_job succeeded
+	expect_json '[.warnings[].code | select(startswith("scatter"))] == []'
+	expect_number "$(distance)" '<' 2 "RMSE in HU with images"
+	first=$(digest)
+	req GET "/v1/jobs/$job/volumes/final/provenance"
+	expect_json '.images.scatter | startswith("sha-256=:")'
+	# in one process, without a daemon
+	cbct recon "$work/images" -o "$work/alone" --fdk hann --grid 40,40,28 --spacing 2.6 --quiet >"$work/said" 2>&1 || fail "cbct recon: $(cat "$work/said")"
+	cbct compare --json "$work/alone/final.nii" "$work/volume.nii" | jq -e '.rmse == 0' >/dev/null || fail "the same volume by cbct recon"
+	# The job first, projections from the last to the first, and scatter amid them and behind them.
+	post_scan "$work/images"
+	post_job "$recipe"
+	for k in $(seq 44 -1 20) 0; do put_one "$k"; done
+	for k in 20 44; do put_image $k && expect_status 201; done
+	for k in $(seq 1 19); do put_one "$k"; done
+	waits_for_scatter
+	req GET "/v1/scans/$scan"
+	expect_json '.state == "complete" and .scatter.missing == [0, 10, 30, 40]'
+	expect_json '[.warnings[] | select(.code == "no_scatter")] | length == 1 and .[0].severity == "caution"'
+	for k in 40 0 30 10; do put_image $k && expect_status 201; done
+	wait_job succeeded
+	[ "$(digest)" = "$first" ] || fail "the bits of the job that came before all else"
+}
+
+test_an_image_comes_back_and_is_checked() {
+	post_scan "$work/images"
+	put_image 10
+	expect_status 201
+	put_image 10
+	expect_status 200
+	req GET "/v1/scans/$scan/scatter/10"
+	expect_status 200
+	cmp "$body" "$work/image.raw" || fail "the same bytes"
+	[ "$(header repr-digest)" = "sha-256=:$(openssl dgst -sha256 -binary "$work/image.raw" | base64):" ] || fail "its digest"
+	req GET "/v1/scans/$scan/scatter/10" -H "If-None-Match: $(header etag)"
+	expect_status 304
+	image_of 20
+	req PUT "/v1/scans/$scan/scatter/10" --data-binary @"$work/image.raw"
+	expect_problem 409
+	req GET "/v1/scans/$scan/scatter/20"
+	expect_problem 404
+	req PUT "/v1/scans/$scan/scatter/11" --data-binary @"$work/image.raw"
+	expect_problem 404
+	expect_json '.detail | contains("every 10-th")'
+	req PUT "/v1/scans/$scan/scatter/45" --data-binary @"$work/image.raw"
+	expect_problem 404
+	req PUT "/v1/scans/$scan/scatter/20" --data-binary abc
+	expect_problem 400
+	expect_json '.detail | contains("1280 bytes: 20 x 16 float32")'
+	req PUT "/v1/scans/$scan/scatter/20" -H 'Content-Digest: sha-256=:AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA=:' --data-binary @"$work/image.raw"
+	expect_problem 400
+	{ head -c 8 "$work/image.raw" && printf '\0\0\300\177' && tail -c +13 "$work/image.raw"; } >"$work/nan.raw"
+	req PUT "/v1/scans/$scan/scatter/20" --data-binary @"$work/nan.raw"
+	expect_problem 422
+	expect_json '.detail | contains("column 2, row 0")'
+	zstd -q -c "$work/image.raw" >"$work/image.zst"
+	req PUT "/v1/scans/$scan/scatter/20" -H 'Content-Encoding: zstd' --data-binary @"$work/image.zst"
+	expect_status 201
+	post_scan "$work/good"
+	req PUT "/v1/scans/$scan/scatter/0" --data-binary @"$work/image.raw"
+	expect_problem 409
+	expect_json '.detail | contains("announces no images")'
+}
+
+# Views 35 to 44 never come: their images are waited for no more, and views behind 30 have that of 30.
+test_a_scan_that_is_broken_off_wants_the_images_of_its_views() {
+	local k
+	post_scan "$work/images"
+	for k in $(seq 0 34); do put_one "$k"; done
+	for k in 0 10 20; do put_image $k && expect_status 201; done
+	post_job "$recipe"
+	req POST "/v1/scans/$scan/complete"
+	expect_status 200
+	waits_for_scatter
+	put_image 30
+	expect_status 201
+	wait_job succeeded
+}
+
+test_scans_that_cannot_be_are_refused() {
+	refuse() { # STATUS POINTER WORDS SCATTER
+		jq ".projections.scatter = $4" "$work/good/scan.json" >"$work/bad.json"
+		req POST /v1/scans -H 'Content-Type: application/json' --data-binary @"$work/bad.json"
+		expect_problem "$1" "$2"
+		expect_json ".detail | contains(\"$3\")"
+	}
+	refuse 400 /projections/scatter/kind images '{"kind": "kernels", "columns": 4, "rows": 4}'
+	refuse 400 /projections/scatter/rows '' '{"kind": "images", "columns": 4}'
+	refuse 422 /projections/scatter/columns 4096 '{"kind": "images", "columns": 4097, "rows": 4}'
+	refuse 422 /projections/scatter/every '' '{"kind": "images", "columns": 4, "rows": 4, "every": 0}'
+	refuse 400 /projections/scatter either '{"kind": "images", "columns": 4, "rows": 4, "fraction": 0.2}'
+}
+
+# The last one: the daemon that it starts has another port.
+test_what_was_stored_outlives_a_kill_and_damage_is_found() {
+	local first k
+	scan=$(cbct upload --quiet --url "$url" "$work/images")
+	post_job "$recipe"
+	wait_job succeeded
+	first=$(digest)
+	stop_daemon KILL
+	# Two bits of the image of projection 20 (the third), and the record of that of 40 (the fifth).
+	printf '\377\377' | dd of="$state/scans/$scan/scatter.raw" bs=1 seek=$((2 * 1280 + 100)) conv=notrunc status=none
+	printf '\377' | dd of="$state/scans/$scan/scatter.sums" bs=1 seek=$((512 + 4 * 64 + 9)) conv=notrunc status=none
+	start_daemon
+	req GET "/v1/scans/$scan"
+	expect_json '.scatter.missing == [40] and ([.warnings[] | select(.code == "damaged_image")] | length == 1)'
+	put_image 40
+	expect_status 201
+	post_job "$recipe"
+	waits_for_scatter
+	req GET "/v1/scans/$scan"
+	expect_json '.scatter.missing == [20]'
+	req GET "/v1/scans/$scan/scatter/20"
+	expect_problem 404
+	put_image 20
+	expect_status 201
+	wait_job succeeded
+	[ "$(digest)" = "$first" ] || fail "the same bits once the image was sent again"
+	# the lists are gone altogether: all are sent again
+	stop_daemon
+	rm "$state/scans/$scan/scatter.sums"
+	start_daemon
+	req GET "/v1/scans/$scan"
+	expect_json '.scatter.missing == [0, 10, 20, 30, 40, 44]'
+	for k in 0 10 20 30 40 44; do put_image $k && expect_status 201; done
+	post_job "$recipe"
+	wait_job succeeded
+	[ "$(digest)" = "$first" ] || fail "the same bits with new lists"
+	# and the catalogue is made again
+	stop_daemon
+	if [ -z "${CBCT_TEST_CATALOGUE:-}" ]; then
+		rm "$state"/catalogue.*
+		start_daemon
+		req GET "/v1/scans/$scan"
+		expect_json '.scatter.received_count == 6'
+		return
+	fi
+	start_daemon
+}
+
+start_daemon
+run_tests
