@@ -213,8 +213,8 @@ struct backend {
 	int (*volume_new)(struct device *device, const struct grid *grid, struct volume **ret_volume,
 			  struct error *err);
 	void (*volume_free)(struct volume *volume); /* NULL is fine */
-	/* Bytes that volume_new takes of the device's memory. */
-	size_t (*volume_bytes)(const struct grid *grid);
+	/* Bytes that volume_new takes of the device's memory; device may be NULL but for several cards. */
+	size_t (*volume_bytes)(const struct device *device, const struct grid *grid);
 	int (*volume_upload)(struct volume *volume, const float *from, struct error *err);
 	/* Slices z_first .. z_first + z_count - 1; the others stay. */
 	int (*volume_put)(struct volume *volume, int z_first, int z_count, const float *from, struct error *err);
@@ -226,8 +226,8 @@ struct backend {
 	int (*stack_new)(struct device *device, int columns, int rows, int slots, struct stack **ret_stack,
 			 struct error *err);
 	void (*stack_free)(struct stack *stack); /* NULL is fine */
-	/* Bytes that stack_new takes of the device's memory. */
-	size_t (*stack_bytes)(int columns, int rows, int slots);
+	/* Bytes that stack_new takes of the device's memory; likewise. */
+	size_t (*stack_bytes)(const struct device *device, int columns, int rows, int slots);
 	int (*stack_download)(struct stack *stack, int slot, int count, float *ret_to, struct error *err);
 	/* Line integrals [slot][row][column]; `from` has been read when it returns. */
 	int (*stack_upload)(struct stack *stack, int slot, int count, const float *from, struct error *err);
@@ -335,6 +335,40 @@ struct backend {
 	 */
 	int (*stack_average)(struct stack *y, int slot, const double width[2], struct stack *work, struct error *err);
 	int (*sync)(struct device *device, struct error *err);
+
+	/*
+	 * The parts of an iteration that several devices share (core/cards/cards.h); NULL in a backend that is made of
+	 * another one.
+	 */
+	/*
+	 * Slot i of `rays`, the projection of a volume, becomes (p - A v) / L: p is slot slots[i] of `projections`, L
+	 * the length of the rays of views[i] in `grid`, of the whole volume, which is centred where the plan's is. The
+	 * rest is as with sart_iterate; the sums are over these rays.
+	 */
+	int (*sart_correct)(struct plan *plan, const struct geometry *geometry, const struct grid *grid,
+			    const struct stack *projections, const int *slots, const int *views, int count,
+			    struct stack *rays, struct iteration_sums *ret_sums, struct error *err);
+	/* Column sums: to = sum over i of w_ij of the rays of views[i], as plain `backproject` has of ones. */
+	int (*sart_coverage)(struct plan *plan, const int *views, int count, struct volume *to, struct error *err);
+	/* v += relaxation sums / coverage, where coverage is divided by as `least` if it is smaller, and not at all at
+	 * 0. */
+	int (*sart_update)(const struct sart_options *options, double least, const struct volume *sums,
+			   const struct volume *coverage, struct volume *volume, struct error *err);
+	/*
+	 * Lets these devices read each other's memory. True: stack_pass and volume_pass work between any two of them,
+	 * and the memory that they read is not overwritten before. NULL, as the next two, where that goes through the
+	 * host.
+	 */
+	bool (*connect)(struct device *const devices[], int count);
+	/*
+	 * Rows row .. row + rows - 1 of slots from_slots[i] to row to_row and on of slots to_slots[i]; add: they are
+	 * added to what is there. Both have the same columns. Called by the thread that has the device of `to`.
+	 */
+	int (*stack_pass)(const struct stack *from, const int *from_slots, int from_row, struct stack *to,
+			  const int *to_slots, int to_row, int rows, int count, bool add, struct error *err);
+	/* `count` slices from z_from on to z_to and on; likewise. */
+	int (*volume_pass)(const struct volume *from, int z_from, struct volume *to, int z_to, int count,
+			   struct error *err);
 };
 
 /*

@@ -84,9 +84,10 @@ int fdk_open(struct fdk *ret_fdk, const struct backend *backend, struct device *
 	return code;
 }
 
-size_t fdk_bytes(const struct backend *backend, const struct geometry *geometry, const int pad[2])
+size_t fdk_bytes(const struct backend *backend, const struct device *device, const struct geometry *geometry,
+		 const int pad[2])
 {
-	return backend->stack_bytes(pad[0] + geometry->columns + pad[1], geometry->rows,
+	return backend->stack_bytes(device, pad[0] + geometry->columns + pad[1], geometry->rows,
 				    fdk_batch(backend, NULL, geometry->count));
 }
 

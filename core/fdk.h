@@ -49,7 +49,8 @@ int fdk_open(struct fdk *ret_fdk, const struct backend *backend, struct device *
 	     const struct geometry *geometry, const int pad[2], struct error *err);
 void fdk_clear(struct fdk *fdk);
 /* Bytes that fdk_open takes of the device's memory, at most. */
-size_t fdk_bytes(const struct backend *backend, const struct geometry *geometry, const int pad[2]);
+size_t fdk_bytes(const struct backend *backend, const struct device *device, const struct geometry *geometry,
+		 const int pad[2]);
 
 /* Takes the view that lies in this slot of `from`; when the batch is full, fdk_flush. */
 int fdk_add(struct fdk *fdk, int view, int slot, const struct stack *from, struct volume *to, struct error *err);

@@ -40,6 +40,7 @@ ROOMS = {
     "core/correct": "corrections",
     "core/refine": "whether the geometry fits",
     "core/outofcore": "a backend over a backend",
+    "core/cards": "several cards as one backend",
     "core/cpu": "CPU backend",
     "core/*.c": "backends' contract, FDK, filter",
     "core/scan": "geometry, grid, orbit",

@@ -169,6 +169,18 @@ static int cuda_sync(struct device *device, struct error *err)
 	return device_wait(device, err);
 }
 
+static size_t volume_bytes(const struct device *device, const struct grid *grid)
+{
+	(void)device;
+	return cuda_volume_bytes(grid);
+}
+
+static size_t stack_bytes(const struct device *device, int columns, int rows, int slots)
+{
+	(void)device;
+	return cuda_stack_bytes(columns, rows, slots);
+}
+
 /*
  * Operations on volumes and stacks, each with a mark behind it: copies from and to the
  * host wait for these marks (memory.cu).
@@ -226,7 +238,7 @@ const struct backend backend_cuda = {
     .describe = cuda_describe,
     .volume_new = cuda_volume_new,
     .volume_free = cuda_volume_free,
-    .volume_bytes = cuda_volume_bytes,
+    .volume_bytes = volume_bytes,
     .volume_upload = cuda_volume_upload,
     .volume_put = cuda_volume_put,
     .volume_download = cuda_volume_download,
@@ -234,7 +246,7 @@ const struct backend backend_cuda = {
     .volume_copy = cuda_volume_copy,
     .stack_new = cuda_stack_new,
     .stack_free = cuda_stack_free,
-    .stack_bytes = cuda_stack_bytes,
+    .stack_bytes = stack_bytes,
     .stack_download = cuda_stack_download,
     .stack_upload = cuda_stack_upload,
     .plan_bytes = cuda_plan_bytes,
@@ -262,4 +274,10 @@ const struct backend backend_cuda = {
     .stack_mask = cuda_stack_mask,
     .stack_average = cuda_stack_average,
     .sync = cuda_sync,
+    .sart_correct = NULL,
+    .sart_coverage = NULL,
+    .sart_update = NULL,
+    .connect = NULL,
+    .stack_pass = NULL,
+    .volume_pass = NULL,
 };

@@ -314,7 +314,7 @@ static int bytes(const struct correction_ask *ask, struct correction_bytes *byte
 	(void)err;
 	averaging_pixels(ask->orbit, &ask->recipe->grid, pixels);
 	if (averaging_fineness(&mean, pixels[0]) > 0 || (ask->averages && averaging_part(pixels[0]) > 0))
-		bytes->device += ask->backend->stack_bytes(ask->geometry->columns, ask->geometry->rows, 1);
+		bytes->device += ask->backend->stack_bytes(ask->device, ask->geometry->columns, ask->geometry->rows, 1);
 	return 0;
 }
 

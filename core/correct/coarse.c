@@ -191,7 +191,8 @@ int coarse_bytes(const struct coarse_options *options, struct coarse_bytes *ret_
 	if (code == 0)
 		*ret_bytes = (struct coarse_bytes){
 		    .device = bytes.volumes + bytes.scratch - bytes.block + bytes.raw +
-			      options->backend->stack_bytes(geometry->columns, geometry->rows, geometry->count),
+			      options->backend->stack_bytes(options->device, geometry->columns, geometry->rows,
+							    geometry->count),
 		    .borrowed = bytes.block,
 		    .host = bytes.host,
 		};

@@ -218,7 +218,8 @@ static int bytes_of(const struct exterior_volume_options *options, struct exteri
 	ret_bytes->borrowed = larger(bytes.block, coarse.borrowed);
 	ret_bytes->host = 0;
 	/* Filtered views; when those are gone, the coarse SART; when that has ended, projected views. */
-	ret_bytes->device = own + larger(backend->stack_bytes(wide, geometry->rows, slots), coarse.device);
+	ret_bytes->device =
+	    own + larger(backend->stack_bytes(options->device, wide, geometry->rows, slots), coarse.device);
 	/* Out of core, the device is free again after each operation, and the host holds the volume. */
 	if (bytes.host > 0) {
 		ret_bytes->device = larger(own, coarse.device);

@@ -227,6 +227,12 @@ size_t cpu_volume_bytes(const struct grid *grid)
 	return floats_bytes(plane * (size_t)grid->size[1]);
 }
 
+static size_t volume_bytes(const struct device *device, const struct grid *grid)
+{
+	(void)device;
+	return cpu_volume_bytes(grid);
+}
+
 static int cpu_volume_new(struct device *device, const struct grid *grid, struct volume **ret_volume, struct error *err)
 {
 	struct volume *volume = calloc(1, sizeof(*volume));
@@ -340,6 +346,12 @@ static size_t cpu_stack_bytes(int columns, int rows, int slots)
 	return floats_bytes((size_t)columns * (size_t)rows * (size_t)slots);
 }
 
+static size_t stack_bytes(const struct device *device, int columns, int rows, int slots)
+{
+	(void)device;
+	return cpu_stack_bytes(columns, rows, slots);
+}
+
 static int cpu_stack_new(struct device *device, int columns, int rows, int slots, struct stack **ret_stack,
 			 struct error *err)
 {
@@ -416,7 +428,7 @@ const struct backend backend_cpu = {
     .describe = cpu_describe,
     .volume_new = cpu_volume_new,
     .volume_free = cpu_volume_free,
-    .volume_bytes = cpu_volume_bytes,
+    .volume_bytes = volume_bytes,
     .volume_upload = cpu_volume_upload,
     .volume_put = cpu_volume_put,
     .volume_download = cpu_volume_download,
@@ -424,7 +436,7 @@ const struct backend backend_cpu = {
     .volume_copy = cpu_volume_copy,
     .stack_new = cpu_stack_new,
     .stack_free = cpu_stack_free,
-    .stack_bytes = cpu_stack_bytes,
+    .stack_bytes = stack_bytes,
     .stack_download = cpu_stack_download,
     .stack_upload = cpu_stack_upload,
     .plan_bytes = cpu_plan_bytes,
@@ -452,4 +464,7 @@ const struct backend backend_cpu = {
     .stack_mask = cpu_stack_mask,
     .stack_average = cpu_stack_average,
     .sync = cpu_sync,
+    .sart_correct = cpu_sart_correct,
+    .sart_coverage = cpu_sart_coverage,
+    .sart_update = cpu_sart_update,
 };

@@ -286,7 +286,7 @@ static inline float *plan_scratch(const struct plan *plan)
 /* to[i * to_stride + j] = from[j * from_stride + i], i < from_columns, j < from_rows. */
 void transpose(const float *from, size_t from_stride, int from_rows, int from_columns, float *to, size_t to_stride);
 void volume_strides(const struct grid *grid, size_t *ret_row, size_t *ret_plane);
-size_t cpu_volume_bytes(const struct grid *grid); /* backend.volume_bytes */
+size_t cpu_volume_bytes(const struct grid *grid);
 
 /* plan.c */
 int cpu_plan_bytes(struct device *device, const struct plan_options *options, struct plan_bytes *ret_bytes,
@@ -327,6 +327,12 @@ size_t tile_line(const struct plan *plan, const struct tile *tile, int line, siz
 /* sart.c */
 int cpu_sart_iterate(struct plan *plan, const struct stack *projections, struct volume *volume,
 		     const struct cancel *cancel, struct iteration_sums *ret_sums, struct error *err);
+int cpu_sart_correct(struct plan *plan, const struct geometry *geometry, const struct grid *grid,
+		     const struct stack *projections, const int *slots, const int *views, int count, struct stack *rays,
+		     struct iteration_sums *ret_sums, struct error *err);
+int cpu_sart_coverage(struct plan *plan, const int *views, int count, struct volume *to, struct error *err);
+int cpu_sart_update(const struct sart_options *options, double least, const struct volume *sums,
+		    const struct volume *coverage, struct volume *volume, struct error *err);
 
 /* tv.c */
 void tv_box_of(const struct plan *plan, struct tv_box *ret_box);

@@ -165,3 +165,92 @@ int cpu_sart_iterate(struct plan *plan, const struct stack *projections, struct 
 	*ret_sums = sums;
 	return 0;
 }
+
+/* ---- the same in parts ---- */
+
+int cpu_sart_correct(struct plan *plan, const struct geometry *geometry, const struct grid *grid,
+		     const struct stack *projections, const int *slots, const int *views, int count, struct stack *rays,
+		     struct iteration_sums *ret_sums, struct error *err)
+{
+	const double *mm = grid->spacing, least = RAY_LENGTH_LEAST * fmin(fmin(mm[0], mm[1]), mm[2]);
+	struct iteration_sums sums = {0};
+
+	(void)err;
+	/* The columns' sums are added in their order, whichever thread made them. */
+#pragma omp parallel for ordered num_threads(plan->device->threads) schedule(static, 1)
+	for (int job = 0; job < count * geometry->columns; job++) {
+		const int i = job / geometry->columns, column = job % geometry->columns;
+		const size_t at = (size_t)column * (size_t)geometry->rows;
+		const float *measured = stack_slot(projections, slots[i]) + at;
+		float *ray = rays->data + (size_t)i * (size_t)geometry->columns * (size_t)geometry->rows + at;
+		double residual2 = 0, projection2 = 0;
+
+		for (int row = 0; row < geometry->rows; row++) {
+			const bool left_out = isnan(measured[row]);
+			const double length = grid_ray_length(grid, &geometry->views[views[i]], column, row);
+			const float p = left_out ? 0 : measured[row], difference = left_out ? 0 : p - ray[row];
+
+			residual2 += (double)difference * difference;
+			projection2 += (double)p * p;
+			ray[row] = length >= least ? (float)(difference / length) : 0;
+		}
+#pragma omp ordered
+		{
+			sums.residual2 += residual2;
+			sums.projection2 += projection2;
+		}
+	}
+	pulse_beat();
+	*ret_sums = sums;
+	return 0;
+}
+
+int cpu_sart_coverage(struct plan *plan, const int *views, int count, struct volume *to, struct error *err)
+{
+	const int tiles = tile_count(plan);
+	const size_t floats = tile_floats(plan);
+
+	(void)err;
+#pragma omp parallel for num_threads(plan->device->threads) schedule(dynamic)
+	for (int t = 0; t < tiles; t++) {
+		float *cover = plan_scratch(plan) + floats, *scratch = cover + floats;
+		int everywhere = 0;
+		struct tile tile;
+
+		tile_at(plan, t, &tile);
+		memset(cover, 0, floats * sizeof(float));
+		for (int i = 0; i < count; i++)
+			everywhere += add_view(plan, views[i], &tile, NULL, NULL, cover, scratch);
+		for (int line = 0; line < tile_lines(plan, &tile); line++) {
+			int length;
+			size_t stride, at = tile_line(plan, &tile, line, &stride, &length);
+
+			for (int i = 0; i < length; i++)
+				to->data[at + (size_t)i * stride] =
+				    (float)everywhere + cover[(size_t)line * tile.stride + (size_t)i];
+		}
+		if (t % PULSE_TILES == 0)
+			pulse_beat();
+	}
+	return 0;
+}
+
+int cpu_sart_update(const struct sart_options *options, double least, const struct volume *sums,
+		    const struct volume *coverage, struct volume *volume, struct error *err)
+{
+	const float relaxation = (float)options->relaxation, smallest = (float)least;
+
+	(void)err;
+#pragma omp parallel for num_threads(volume->device->threads) schedule(static)
+	for (int y = 0; y < volume->size[1]; y++)
+		for (size_t i = (size_t)y * volume->plane; i < ((size_t)y + 1) * volume->plane; i++) {
+			const float weight = coverage->data[i];
+			float *voxel = &volume->data[i];
+
+			if (weight > 0)
+				*voxel += relaxation * sums->data[i] / fmaxf(weight, smallest);
+			if (options->nonnegative && weight > smallest && *voxel < 0)
+				*voxel = 0;
+		}
+	return 0;
+}

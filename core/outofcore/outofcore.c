@@ -91,8 +91,9 @@ static void outofcore_volume_free(struct volume *volume)
 	free(volume);
 }
 
-static size_t outofcore_volume_bytes(const struct grid *grid)
+static size_t outofcore_volume_bytes(const struct device *device, const struct grid *grid)
 {
+	(void)device;
 	(void)grid;
 	return 0; /* it lies in the host's memory */
 }
@@ -169,8 +170,9 @@ static void outofcore_stack_free(struct stack *stack)
 	free(stack);
 }
 
-static size_t outofcore_stack_bytes(int columns, int rows, int slots)
+static size_t outofcore_stack_bytes(const struct device *device, int columns, int rows, int slots)
 {
+	(void)device;
 	(void)columns;
 	(void)rows;
 	(void)slots;

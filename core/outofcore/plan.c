@@ -119,7 +119,7 @@ static int below_plan(struct below *below, const struct plan_options *options, s
 	if (code < 0)
 		return code;
 	/* plan_bytes counts the iterate, too, which the walk has by itself. */
-	below->volumes += bytes.volumes - below->backend->volume_bytes(options->grid);
+	below->volumes += bytes.volumes - below->backend->volume_bytes(below->device, options->grid);
 	below->rest += bytes.scratch + bytes.raw;
 	return 0;
 }
@@ -128,7 +128,7 @@ static int below_volume(struct below *below, const struct grid *grid, struct vol
 {
 	if (!below->measures)
 		return below->backend->volume_new(below->device, grid, ret_volume, err);
-	below->volumes += below->backend->volume_bytes(grid);
+	below->volumes += below->backend->volume_bytes(below->device, grid);
 	return 0;
 }
 
@@ -137,7 +137,7 @@ static int below_stack(struct below *below, int columns, int rows, int slots, st
 {
 	if (!below->measures)
 		return below->backend->stack_new(below->device, columns, rows, slots, ret_stack, err);
-	below->rest += below->backend->stack_bytes(columns, rows, slots);
+	below->rest += below->backend->stack_bytes(below->device, columns, rows, slots);
 	return 0;
 }
 

@@ -69,7 +69,7 @@ static int walk_volume(struct walk *walk, const struct grid *grid, struct volume
 {
 	if (!walk->measures)
 		return walk->backend->volume_new(walk->device, grid, ret_volume, err);
-	walk->volumes += walk->backend->volume_bytes(grid);
+	walk->volumes += walk->backend->volume_bytes(walk->device, grid);
 	walk->host += grid_voxels(grid) * sizeof(float);
 	return 0;
 }
@@ -82,7 +82,7 @@ static int walk_stack(struct walk *walk, const struct geometry *geometry, int sl
 
 	if (!walk->measures)
 		return walk->backend->stack_new(walk->device, columns, rows, slots, ret_stack, err);
-	*bytes += walk->backend->stack_bytes(columns, rows, slots);
+	*bytes += walk->backend->stack_bytes(walk->device, columns, rows, slots);
 	walk->host += (size_t)columns * (size_t)rows * (size_t)slots * sizeof(float);
 	return 0;
 }
@@ -94,7 +94,7 @@ static int walk_fdk(struct recon *recon, struct walk *walk, struct error *err)
 
 	if (!walk->measures)
 		return fdk_open(&recon->fdk, walk->backend, walk->device, recon->plan, recon->geometry, pad, err);
-	walk->scratch += fdk_bytes(walk->backend, recon->geometry, pad);
+	walk->scratch += fdk_bytes(walk->backend, walk->device, recon->geometry, pad);
 	return 0;
 }
 

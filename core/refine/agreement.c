@@ -106,10 +106,10 @@ int agreement_bytes(const struct reduced *reduced, size_t *ret_bytes, struct err
 	if (code == 0)
 		*ret_bytes =
 		    (size_t)geometry->count * (size_t)geometry->columns * (size_t)geometry->rows * sizeof(float) +
-		    bytes.volumes + bytes.scratch + bytes.raw + 2 * backend->volume_bytes(&half.grid) +
-		    fdk_bytes(backend, geometry, half.weights.pad) +
-		    backend->stack_bytes(geometry->columns, geometry->rows, geometry->count) +
-		    backend->stack_bytes(geometry->columns, geometry->rows, half_of(geometry->count));
+		    bytes.volumes + bytes.scratch + bytes.raw + 2 * backend->volume_bytes(NULL, &half.grid) +
+		    fdk_bytes(backend, NULL, geometry, half.weights.pad) +
+		    backend->stack_bytes(NULL, geometry->columns, geometry->rows, geometry->count) +
+		    backend->stack_bytes(NULL, geometry->columns, geometry->rows, half_of(geometry->count));
 	half_clear(&half);
 	return code;
 }

@@ -1450,8 +1450,8 @@ static float *sart_within(size_t limit, const struct scene *scene, int subsets, 
 	options.matched = matched;
 	must(backend_cuda.open(0, &open, &device, &err), &err, "open");
 	must(backend_cuda.plan_bytes(device, &options, &bytes, &err), &err, "bytes");
-	*ret_bytes = backend_cuda.stack_bytes(geometry->columns, geometry->rows, geometry->count) + bytes.volumes +
-		     bytes.scratch + bytes.raw;
+	*ret_bytes = backend_cuda.stack_bytes(NULL, geometry->columns, geometry->rows, geometry->count) +
+		     bytes.volumes + bytes.scratch + bytes.raw;
 	if (limit == 0 || *ret_bytes <= limit) {
 		must(backend_cuda.plan_new(device, &options, &side.plan, &err), &err, "plan");
 		must(backend_cuda.volume_new(device, &scene->grid, &side.volume, &err), &err, "volume");

@@ -1,6 +1,8 @@
 /* A scan and its reconstruction for the tests of the pipeline: see scene.h. */
 #include "tests/unit/scene.h"
 
+#include "core/cards/cards.h"
+
 #include <check.h>
 #include <math.h>
 #include <stdio.h>
@@ -224,15 +226,17 @@ void scene_run(const struct scene *scene, const struct recipe *recipe, struct ou
 	    .stopped = on_stopped,
 	    .warning = on_warning,
 	};
+	const struct backend *backend = outcome->cards > 0 ? &backend_cards : &backend_cpu;
 	struct device *device;
 	struct recon *recon = NULL;
 	struct error state_err;
 	const void *metal;
 
-	if (backend_cpu.open(0, &options, &device, &outcome->err) < 0)
+	if ((outcome->cards > 0 ? cards_open(&backend_cpu, NULL, outcome->cards, &options, &device, &outcome->err)
+				: backend->open(0, &options, &device, &outcome->err)) < 0)
 		ck_abort_msg("%s", outcome->err.text);
-	outcome->code = recon_open(&backend_cpu, device, &scene->geometry, &outcome->linearise, recipe, &hooks, &recon,
-				   &outcome->err);
+	outcome->code =
+	    recon_open(backend, device, &scene->geometry, &outcome->linearise, recipe, &hooks, &recon, &outcome->err);
 	if (outcome->code < 0)
 		goto out;
 	outcome->grid = *recon_grid(recon);
@@ -266,7 +270,7 @@ void scene_run(const struct scene *scene, const struct recipe *recipe, struct ou
 	ck_assert_int_eq(recon_read(recon, 0, outcome->grid.size[2], outcome->last, &outcome->err), 0);
 out:
 	recon_free(recon);
-	backend_cpu.close(device);
+	backend->close(device);
 }
 
 void run(const struct scene *scene, const struct recipe *recipe, struct outcome *outcome)

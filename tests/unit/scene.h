@@ -39,6 +39,7 @@ struct outcome {
 	int cancel_at;              /* the n-th question is answered with yes, from 1; 0: never */
 	int yield_at;               /* iteration; 0: never */
 	int threads;                /* 0: all */
+	int cards;                  /* shares of the processor that are cards of one job; 0: it is one device */
 	size_t memory_limit;        /* of the device, bytes; 0: none */
 	const float *resume;        /* iterate, or NULL */
 	int resume_iteration;

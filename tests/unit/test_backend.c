@@ -1857,8 +1857,9 @@ START_TEST(bytes_are_known_beforehand)
 		options.sart = NULL;
 		options.tv = NULL;
 		ok(backend->plan_bytes(NULL, &options, &plain, &err));
-		ck_assert_uint_ge(backend->stack_bytes(rig.geometry.columns, rig.geometry.rows, rig.geometry.count),
-				  rig.all_pixels * sizeof(float));
+		ck_assert_uint_ge(
+		    backend->stack_bytes(NULL, rig.geometry.columns, rig.geometry.rows, rig.geometry.count),
+		    rig.all_pixels * sizeof(float));
 		ck_assert_uint_eq(gradient.raw, rig.pixels * sizeof(float));
 		ck_assert_uint_ge(plain.volumes, volume);
 		/* iterate, its copy and one to work in; 15 % allow for padding */
@@ -1917,7 +1918,7 @@ START_TEST(what_was_said_to_be_needed_is_enough)
 		/* iterate and copy are among the volumes */
 		machine.options.memory_limit =
 		    bytes.volumes + bytes.scratch + (machine.backend->own_memory ? bytes.raw : 0) +
-		    2 * machine.backend->stack_bytes(rig.geometry.columns, rig.geometry.rows, rig.geometry.count);
+		    2 * machine.backend->stack_bytes(NULL, rig.geometry.columns, rig.geometry.rows, rig.geometry.count);
 		rig_open(&rig, &machine);
 		rig_close(&rig);
 	}
@@ -1968,7 +1969,7 @@ static void expect_plan_takes_what_it_says(const struct rig *rig, const struct m
 	const struct backend *backend = machine->backend;
 	const size_t before = bytes_free(backend, device);
 	/* The iterate, and its copy for SART, are the job's own; a view on its way in lies in the host's memory. */
-	const size_t beside = (rig->options.sart != NULL ? 2 : 1) * backend->volume_bytes(&rig->grid);
+	const size_t beside = (rig->options.sart != NULL ? 2 : 1) * backend->volume_bytes(NULL, &rig->grid);
 	struct plan_bytes said;
 	struct plan *plan;
 	size_t taken;
@@ -2052,11 +2053,12 @@ START_TEST(volumes_and_stacks_take_what_they_say)
 			struct stack *stack;
 
 			ok(backend->volume_new(device, &setups[k].grid, &volume, &err));
-			ck_assert_uint_eq(before - bytes_free(backend, device), backend->volume_bytes(&setups[k].grid));
+			ck_assert_uint_eq(before - bytes_free(backend, device),
+					  backend->volume_bytes(NULL, &setups[k].grid));
 			backend->volume_free(volume);
 			ok(backend->stack_new(device, setups[k].columns, setups[k].rows, 3, &stack, &err));
 			ck_assert_uint_eq(before - bytes_free(backend, device),
-					  backend->stack_bytes(setups[k].columns, setups[k].rows, 3));
+					  backend->stack_bytes(NULL, setups[k].columns, setups[k].rows, 3));
 			backend->stack_free(stack);
 			ck_assert_uint_eq(bytes_free(backend, device), before);
 		}
